@@ -1,4 +1,5 @@
-"""MessagePack for the messages of the bridge: typed, refused when malformed, never a pickle. Pure."""
+"""MessagePack for the messages of the bridge: typed, refused when malformed, never a pickle.
+Pure."""
 
 from __future__ import annotations
 

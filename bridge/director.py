@@ -1,10 +1,11 @@
 """The director of the event pedestrians, at either end of a Zenoh session.
 
-Lockstep pull: at every tick the simulator asks and waits. The director keeps no state (see `cosim.spec.events`), so a
-query may be repeated and a director killed and started again without changing the episode.
+Lockstep pull: at every tick the simulator asks and waits. The director keeps no state (see
+`cosim.spec.events`), so a query may be repeated and a director killed and started again without
+changing the episode.
 
-Both ends sign what they say with the version of their behaviours: a director that would do something else is refused,
-never believed.
+Both ends sign what they say with the version of their behaviours: a director that would do
+something else is refused, never believed.
 """
 
 from __future__ import annotations
@@ -47,11 +48,13 @@ def signed(message: msgspec.Struct, by: str) -> bytes:
 
 
 def opened(payload: bytes, kind: type[_T], by: str) -> _T:
-    """The message in `payload`. Raises EngineError when it is none, or its sender's behaviours are others than `by`."""
+    """The message in `payload`. Raises EngineError when it is none, or its sender's behaviours are
+    others than `by`."""
     envelope = decode(payload, Signed)
     if envelope.by != by:
         raise EngineError(
-            f"behaviours '{envelope.by}' met behaviours '{by}': run and director must be started from the same code"
+            f"behaviours '{envelope.by}' met behaviours '{by}': run and director must be "
+            f"started from the same code"
         )
     return decode(bytes(envelope.message), kind)
 
@@ -83,31 +86,46 @@ def _events(payload: bytes) -> tuple[Event, ...]:
 
 
 def serve_director(session: Session, key: str, react: React, by: str = "") -> None:
-    """Answer the simulator's queries on `key` with the pure function `react`. by: the version of its behaviours."""
+    """Answer the simulator's queries on `key` with the pure function `react`. by: the version of
+    its behaviours."""
     session.serve(key, lambda payload: signed(react(opened_query(payload, by)), by))
 
 
 class RemoteDirector:
-    """The simulator's end: a `cosim.episode.ports.Director` that asks over Zenoh.
+    """The simulator's end: a `cosim.episode.interfaces.Director` that asks over Zenoh.
 
-    by: the version of the simulator's behaviours. wait_s: how long an answer is waited for; waiting: told so, once
-    NOTICE_S are over.
+    by: the version of the simulator's behaviours. wait_s: how long an answer is waited for;
+    waiting: told so, once NOTICE_S are over.
     """
 
     def __init__(
-        self, session: Session, key: str, *, by: str = "", wait_s: float = 10.0, waiting: Waiting | None = None
+        self,
+        session: Session,
+        key: str,
+        *,
+        by: str = "",
+        wait_s: float = 10.0,
+        waiting: Waiting | None = None,
     ) -> None:
-        self._session, self._key, self._by = session, key, by
-        self._wait_s, self._waiting = wait_s, waiting
+        self._session = session
+        self._key = key
+        self._by = by
+        self._wait_s = wait_s
+        self._waiting = waiting
 
     def react(self, query: EventQuery) -> EventReply:
-        """The director's reply. Raises DirectorLost when none comes or it answers something else."""
+        """The director's reply. Raises DirectorLost when none comes or it answers something
+        else."""
         try:
-            reply = opened(self._ask(signed_query(query, self._by), query.tick), EventReply, self._by)
+            reply = opened(
+                self._ask(signed_query(query, self._by), query.tick), EventReply, self._by
+            )
             _check(reply, query)
         except (TimeoutError, EngineError) as error:
             why = str(error)[:LONGEST_REASON]
-            raise DirectorLost(f"director, tick {query.tick} of '{query.episode}': {why}") from error
+            raise DirectorLost(
+                f"director, tick {query.tick} of '{query.episode}': {why}"
+            ) from error
         return reply
 
     def _ask(self, payload: bytes, tick: int) -> bytes:
@@ -119,7 +137,9 @@ class RemoteDirector:
             except TimeoutError:
                 self._waiting(f"waits at tick {tick} for the director, {self._wait_s:g} s at most")
         try:
-            return self._session.ask(self._key, payload, timeout_s=self._wait_s - (time.monotonic() - began))
+            return self._session.ask(
+                self._key, payload, timeout_s=self._wait_s - (time.monotonic() - began)
+            )
         except TimeoutError:
             raise TimeoutError(f"nobody answered on '{self._key}' for {self._wait_s:g} s") from None
 
@@ -130,17 +150,23 @@ def _check(reply: EventReply, query: EventQuery) -> None:
         raise EngineError(f"it answered tick {reply.tick} of '{reply.episode}'")
     people = [event.people for event in query.events]
     if [len(state.walkers) for state in reply.states] != people:
-        raise EngineError(f"it answered with {len(reply.states)} states for {len(people)} events, or with other people")
+        raise EngineError(
+            f"it answered with {len(reply.states)} states for {len(people)} events, or with "
+            f"other people"
+        )
     known = {name for event in query.events for name in event.names}
     shown = {actor.id for actor in reply.actors}
     if len(shown) < len(reply.actors) or not shown <= known:
-        raise EngineError(f"it showed people of no event, or twice: {', '.join(sorted(shown - known)[:5])}")
+        raise EngineError(
+            f"it showed people of no event, or twice: {', '.join(sorted(shown - known)[:5])}"
+        )
     if other := [actor.id for actor in reply.actors if actor.kind != PersonKind.EVENT]:
         raise EngineError(f"it showed people of events as others: {', '.join(other[:5])}")
     walkers = [walker for state in reply.states for walker in state.walkers]
     told = sum(abs(w.x_m) + abs(w.y_m) + abs(w.heading_rad) for w in walkers)
     told += sum(
-        abs(a.x_m) + abs(a.y_m) + abs(a.heading_rad) + abs(a.speed_mps) + abs(a.pace_mps or 0.0) for a in reply.actors
+        abs(a.x_m) + abs(a.y_m) + abs(a.heading_rad) + abs(a.speed_mps) + abs(a.pace_mps or 0.0)
+        for a in reply.actors
     )
     if not math.isfinite(told):
         raise EngineError("it answered with a place, heading or speed that is no number")

@@ -12,7 +12,9 @@ _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 def name(value: str) -> str:
     """`value` if it may be one chunk of a key. Raises SpecError otherwise."""
     if not _NAME.fullmatch(value):
-        raise SpecError(f"'{value}' cannot name a run or environment: use 1 to 64 of A-Z a-z 0-9 _ -")
+        raise SpecError(
+            f"'{value}' cannot name a run or environment: use 1 to 64 of A-Z a-z 0-9 _ -"
+        )
     return value
 
 

@@ -1,7 +1,9 @@
-"""A running episode on the network: it takes injections, answers for its state, and tells what happens.
+"""A running episode on the network: it takes injections, answers for its state, and tells what
+happens.
 
-Keys, below `cosim/<run>/env/<episode>/`: `inject`, `status`, `log` and `camera` are asked (queryables); `clock`,
-`robot`, `crowd`, `signals` and `events` are told every tick (JSON). Who comes late asks for the log.
+Keys, below `cosim/<run>/env/<episode>/`: `inject`, `status`, `log` and `camera` are asked
+(queryables); `clock`, `robot`, `crowd`, `signals` and `events` are told every tick (JSON). Who
+comes late asks for the log.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ Offer = Callable[[InjectionRequest], Ack]
 
 
 def serve_injections(session: Session, key: str, offer: Offer) -> None:
-    """Take injections in as JSON or MessagePack, and answer in the same. Whatever is wrong becomes a refusal."""
+    """Take injections in as JSON or MessagePack, and answer in the same. Whatever is wrong becomes
+    a refusal."""
 
     def answer(payload: bytes) -> bytes:
         return _encoded(answer_to(payload, offer), as_json=payload[:1] in _JSON_BEGINS)
@@ -41,12 +44,18 @@ def serve_injections(session: Session, key: str, offer: Offer) -> None:
 def answer_to(payload: bytes, offer: Offer) -> Ack:
     """What becomes of a message."""
     if len(payload) > LARGEST_B:
-        return Ack(id="", status="refused", reason=f"{len(payload)} bytes: a message has at most {LARGEST_B}")
+        return Ack(
+            id="",
+            status="refused",
+            reason=f"{len(payload)} bytes: a message has at most {LARGEST_B}",
+        )
     try:
         return offer(_decoder(payload)(payload, type=InjectionRequest))
     except (msgspec.DecodeError, RecursionError, ValueError, SpecError) as error:
         words = str(error)
-        return Ack(id="", status="refused", reason=f"{words}{_found(payload, words)}{_choices(words)}")
+        return Ack(
+            id="", status="refused", reason=f"{words}{_found(payload, words)}{_choices(words)}"
+        )
 
 
 def _found(payload: bytes, error: str) -> str:
@@ -92,6 +101,10 @@ def send_injection(session: Session, key: str, injection: bytes, timeout_s: floa
     try:
         return msgspec.json.decode(session.ask(key, injection, timeout_s=timeout_s), type=Ack)
     except TimeoutError as error:
-        raise EngineError(f"{error}: the episode has ended, or is too busy; what it did is in its log") from error
+        raise EngineError(
+            f"{error}: the episode has ended, or is too busy; what it did is in its log"
+        ) from error
     except msgspec.DecodeError as error:
-        raise EngineError(f"'{key}' answered something that is no acknowledgement: {error}") from error
+        raise EngineError(
+            f"'{key}' answered something that is no acknowledgement: {error}"
+        ) from error

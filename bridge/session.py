@@ -1,7 +1,8 @@
 """Zenoh sessions: the one place that imports zenoh.
 
-Over one explicit endpoint, or within one session: no scouting, no shared memory. A handler that raises answers with its
-error instead of silence. `open_session` opens all that reach another process, as a `Connection` says.
+Over one explicit endpoint, or within one session: no scouting, no shared memory. A handler that
+raises answers with its error instead of silence. `open_session` opens all that reach another
+process, as a `Connection` says.
 """
 
 from __future__ import annotations
@@ -30,7 +31,14 @@ _SOURCE_LINE = re.compile(r" at /\S+\.rs:\d+\.?")
 """In zenoh's errors: where it was built, of no use to anybody here."""
 
 _ANSWER = "answer"
-_WRITTEN = ("zenoh/bytes", "application/msgpack", "application/json", "text/json", "text/plain", "zenoh/string")
+_WRITTEN = (
+    "zenoh/bytes",
+    "application/msgpack",
+    "application/json",
+    "text/json",
+    "text/plain",
+    "zenoh/string",
+)
 """How a message may say that it is written: as none that makes objects of any kind."""
 _LONGEST_FOLDER = 70
 """Letters: the whole path of a Unix socket has at most 107."""
@@ -39,7 +47,8 @@ _LONGEST_RETRY_S = 0.2
 
 
 class Query:
-    """A query that waits for its reply, from any thread. key: what was asked; payload: what came with it."""
+    """A query that waits for its reply, from any thread. key: what was asked; payload: what came
+    with it."""
 
     def __init__(self, query: zenoh.Query) -> None:
         self.key = str(query.key_expr)
@@ -48,14 +57,16 @@ class Query:
 
     def answer(self, payload: bytes) -> None:
         """Reply, once; to who is gone already nothing happens."""
-        query, self._query = self._query, None
+        query = self._query
+        self._query = None
         if query is not None:
             with suppress(zenoh.ZError), query:
                 query.reply(self.key, payload)
 
     def refuse(self, words: str) -> None:
         """Reply with an error."""
-        query, self._query = self._query, None
+        query = self._query
+        self._query = None
         if query is not None:
             with suppress(zenoh.ZError), query:
                 query.reply_err(words.encode())
@@ -65,7 +76,8 @@ HowHeard = Literal["answered", "refused", "late", "nobody"]
 
 
 class QueryHeard(NamedTuple):
-    """What came of a query: an answer, an error of the other side's, nothing in time, or nobody is there."""
+    """What came of a query: an answer, an error of the other side's, nothing in time, or nobody is
+    there."""
 
     how: HowHeard
     payload: bytes = b""
@@ -74,19 +86,24 @@ class QueryHeard(NamedTuple):
 class Session:
     """An open Zenoh session. Use as a context manager: a session left open keeps the process alive.
 
-    inside: of one that listens: how processes of its own run on this machine reach it, by a socket that nobody else may
-    open. They may do all; everybody else what their role may.
+    inside: of one that listens: how processes of its own run on this machine reach it, by a socket
+    that nobody else may open. They may do all; everybody else what their role may.
     """
 
-    def __init__(self, session: zenoh.Session, inside: Connection | None = None, folder: Path | None = None) -> None:
-        self._session, self._inside, self._folder = session, inside, folder
+    def __init__(
+        self, session: zenoh.Session, inside: Connection | None = None, folder: Path | None = None
+    ) -> None:
+        self._session = session
+        self._inside = inside
+        self._folder = folder
         self._queryables: list[zenoh.Queryable[None]] = []
         self._subscribers: list[zenoh.Subscriber[Any]] = []
         self._tokens: list[zenoh.LivelinessToken] = []
 
     @property
     def itself(self) -> zenoh.Session:
-        """What Zenoh opened, for the one file that answers by it without this one (`bridge.policy_server`)."""
+        """What Zenoh opened, for the one file that answers by it without this one
+        (`bridge.policy_server`)."""
         return self._session
 
     @property
@@ -102,8 +119,8 @@ class Session:
     def serve(self, key: str, handler: Handler, *, found: bool = False) -> None:
         """Answer queries on `key` with `handler(payload)`; its exceptions become error replies.
 
-        key: may hold wildcards; then queries on every key of that form are answered, each on its own.
-        found: queries on key expressions that include `key` are answered too.
+        key: may hold wildcards; then queries on every key of that form are answered, each on its
+        own. found: queries on key expressions that include `key` are answered too.
         """
 
         def answer(query: zenoh.Query) -> None:
@@ -121,8 +138,9 @@ class Session:
         self._queryables.append(self._session.declare_queryable(key, answer, complete=True))
 
     def collect(self, key: str, take: Callable[[Query], None], *, found: bool = False) -> None:
-        """Hand queries on `key` over to `take`, in a thread of Zenoh's, where nothing may wait: they are answered
-        later, elsewhere. found: see `serve`; such a query is to be answered on `key`."""
+        """Hand queries on `key` over to `take`, in a thread of Zenoh's, where nothing may wait:
+        they are answered later, elsewhere. found: see `serve`; such a query is to be answered on
+        `key`."""
 
         def handed(query: zenoh.Query) -> None:
             asked = Query(query)
@@ -134,9 +152,17 @@ class Session:
 
         self._queryables.append(self._session.declare_queryable(key, handed, complete=True))
 
-    def send(self, key: str, payload: bytes, replied: Callable[[bytes | None, str], None], *, timeout_s: float) -> None:
-        """Ask once, without waiting. `replied` is called once, in a thread of Zenoh's, where nothing may wait: with the
-        reply; or with None, and the other side's error, "" where nobody answered in time."""
+    def send(
+        self,
+        key: str,
+        payload: bytes,
+        replied: Callable[[bytes | None, str], None],
+        *,
+        timeout_s: float,
+    ) -> None:
+        """Ask once, without waiting. `replied` is called once, in a thread of Zenoh's, where
+        nothing may wait: with the reply; or with None, and the other side's error, "" where nobody
+        answered in time."""
         found: list[bytes] = []
         errors: list[str] = []
 
@@ -150,11 +176,17 @@ class Session:
             replied(found[0] if found else None, errors[0] if errors else "")
 
         hears = zenoh.handlers.Callback(heard, over, indirect=False)
-        self._session.get(key, hears, payload=payload, timeout=timeout_s, consolidation=zenoh.ConsolidationMode.NONE)
+        self._session.get(
+            key,
+            hears,
+            payload=payload,
+            timeout=timeout_s,
+            consolidation=zenoh.ConsolidationMode.NONE,
+        )
 
     def stand(self, key: str) -> Callable[[], None]:
-        """Be seen at `key` by those who `watch` it, as long as this session is there, or until what is returned is
-        called."""
+        """Be seen at `key` by those who `watch` it, as long as this session is there, or until what
+        is returned is called."""
         token = self._session.liveliness().declare_token(key)
         self._tokens.append(token)
 
@@ -165,17 +197,23 @@ class Session:
         return leave
 
     def watch(self, key: str, heard: Callable[[str, bool], None]) -> None:
-        """Call `heard(key, there)` for everybody who `stand`s at a key expression now or later, and when they go."""
+        """Call `heard(key, there)` for everybody who `stand`s at a key expression now or later, and
+        when they go."""
 
         def told(sample: zenoh.Sample) -> None:
             heard(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
-        self._subscribers.append(self._session.liveliness().declare_subscriber(key, told, history=True))
+        self._subscribers.append(
+            self._session.liveliness().declare_subscriber(key, told, history=True)
+        )
 
     def answers(self, key: str, *, timeout_s: float) -> dict[str, bytes]:
-        """Everybody's replies to one empty query on a key expression, by their keys; errors are left out."""
+        """Everybody's replies to one empty query on a key expression, by their keys; errors are
+        left out."""
         replies = self._session.get(key, timeout=timeout_s)
-        return {str(r.ok.key_expr): bytes(r.ok.payload.to_bytes()) for r in replies if r.ok is not None}
+        return {
+            str(r.ok.key_expr): bytes(r.ok.payload.to_bytes()) for r in replies if r.ok is not None
+        }
 
     def tell(self, key: str, payload: bytes) -> None:
         """Publish; whoever is slow to listen misses it."""
@@ -192,9 +230,12 @@ class Session:
     def ask_once(self, key: str, payload: bytes, *, timeout_s: float) -> QueryHeard:
         """What comes of one query, whoever answers it first."""
         began_s = time.monotonic()
-        # Unconsolidated: else a reply is held back until every other side has said that it has none.
+        # Unconsolidated: else a reply is held back until every other side has said that it has
+        # none.
         one_by_one = zenoh.ConsolidationMode.NONE
-        for reply in self._session.get(key, payload=payload, timeout=timeout_s, consolidation=one_by_one):
+        for reply in self._session.get(
+            key, payload=payload, timeout=timeout_s, consolidation=one_by_one
+        ):
             if reply.ok is not None:
                 return QueryHeard("answered", bytes(reply.ok.payload.to_bytes()))
             message = bytes(reply.err.payload.to_bytes()) if reply.err is not None else b""
@@ -206,7 +247,8 @@ class Session:
     def ask(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
         """The reply to one query. Asks again while nobody answers, until `timeout_s` is over.
 
-        Raises TimeoutError when nobody answered, EngineError when the other side answered with an error.
+        Raises TimeoutError when nobody answered, EngineError when the other side answered with an
+        error.
         """
         deadline = time.monotonic() + timeout_s
         pause_s = _FIRST_RETRY_S
@@ -240,16 +282,21 @@ class Session:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         self.close()
 
 
 def _objection(query: zenoh.Query, key: str, *, found: bool) -> str:
-    """What is against answering a query on a key, "" for nothing: it asks several at once, or would have us unpickle.
+    """What is against answering a query on a key, "" for nothing: it asks several at once, or would
+    have us unpickle.
 
     found: whether several may be asked at once."""
-    asked, written = str(query.key_expr), str(query.encoding or _WRITTEN[0])
+    asked = str(query.key_expr)
+    written = str(query.encoding or _WRITTEN[0])
     if "*" in asked and not (found and query.key_expr.includes(zenoh.KeyExpr(key))):
         return f"ask for exactly '{key}', not '{asked}'"
     if written not in _WRITTEN:
@@ -258,15 +305,18 @@ def _objection(query: zenoh.Query, key: str, *, found: bool) -> str:
 
 
 class LoneSession(Session):
-    """A session with nobody else in it and no socket: what it asks it answers itself, in the thread that asks.
+    """A session with nobody else in it and no socket: what it asks it answers itself, in the thread
+    that asks.
 
-    For one thread. Question and answer are publications, not a query: a thread of Zenoh's watches over the time of a
-    query, and on a busy machine whoever wakes it waits for a turn of its own. What interrupts the thread that asks
-    interrupts the handler.
+    For one thread. Question and answer are publications, not a query: a thread of Zenoh's watches
+    over the time of a query, and on a busy machine whoever wakes it waits for a turn of its own.
+    What interrupts the thread that asks interrupts the handler.
     """
 
     def __init__(self) -> None:
-        super().__init__(_open(settings_alone(), "cannot open a session", "Has this machine threads to spare?"))
+        super().__init__(
+            _open(settings_alone(), "cannot open a session", "Has this machine threads to spare?")
+        )
         self._served: list[tuple[_Heard, _Heard, Handler]] = []
 
     def serve(self, key: str, handler: Handler, *, found: bool = False) -> None:
@@ -278,8 +328,8 @@ class LoneSession(Session):
         self._served.append((question, answer, handler))
 
     def ask(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
-        """The answer to one question. Raises TimeoutError at once when nobody serves the key, EngineError when its
-        handler raised."""
+        """The answer to one question. Raises TimeoutError at once when nobody serves the key,
+        EngineError when its handler raised."""
         self._session.put(key, payload)
         for question, answer, handler in self._served:
             if (asked := question.try_recv()) is not None:
@@ -301,11 +351,12 @@ class LoneSession(Session):
 
 
 def open_session(connection: Connection, say: Callable[[str], None] = lambda _: None) -> Session:
-    """Open one end of a session: a hub where it listens, else a client of the hub that it connects to.
+    """Open one end of a session: a hub where it listens, else a client of the hub that it connects
+    to.
 
-    say: told, once it is open, in a line each what is insecure and which certificate ends soon. Raises AccessError for
-    certificates that do not fit, here or there (trying again changes nothing), EngineError when an endpoint is taken or
-    nobody answers.
+    say: told, once it is open, in a line each what is insecure and which certificate ends soon.
+    Raises AccessError for certificates that do not fit, here or there (trying again changes
+    nothing), EngineError when an endpoint is taken or nobody answers.
 
     >>> from cosim.spec.connection import Connection
     >>> with open_session(Connection(role="coordinator", listen="tcp/127.0.0.1:7461")) as hub:
@@ -322,7 +373,8 @@ def open_session(connection: Connection, say: Callable[[str], None] = lambda _: 
 
 
 def notices_of(connection: Connection) -> list[str]:
-    """What is insecure about a connection, and which certificate ends soon, a line each. Raises AccessError."""
+    """What is insecure about a connection, and which certificate ends soon, a line each. Raises
+    AccessError."""
     soon = ""
     if connection.tls:
         from bridge.security.identity import checked_identity
@@ -332,7 +384,9 @@ def notices_of(connection: Connection) -> list[str]:
 
 
 def _listening(connection: Connection) -> Session:
-    remedy = "Choose an address of this machine and a port that nobody uses, like tcp/127.0.0.1:7450."
+    remedy = (
+        "Choose an address of this machine and a port that nobody uses, like tcp/127.0.0.1:7450."
+    )
     failure = f"cannot listen at {connection.listen}"
     if connection.listen.startswith("unixsock-stream/"):
         inside = Connection(role=connection.role, connect=connection.listen)
@@ -341,7 +395,9 @@ def _listening(connection: Connection) -> Session:
     folder = Path(tempfile.mkdtemp(prefix="cosim-", dir=brief))
     inside = Connection(role=connection.role, connect=f"unixsock-stream/{folder}/hub.sock")
     try:
-        return Session(_open(settings_of(connection, [inside.connect]), failure, remedy), inside, folder)
+        return Session(
+            _open(settings_of(connection, [inside.connect]), failure, remedy), inside, folder
+        )
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
@@ -350,7 +406,9 @@ def _listening(connection: Connection) -> Session:
 def _connected(connection: Connection) -> Session:
     remedy = "Is a process started that listens there, by the same protocol and port?"
     try:
-        return Session(_open(settings_of(connection), f"no hub answers at {connection.connect}", remedy))
+        return Session(
+            _open(settings_of(connection), f"no hub answers at {connection.connect}", remedy)
+        )
     except EngineError as error:
         if connection.tls:
             from bridge.security.refusal import why_refused
@@ -367,4 +425,6 @@ def _open(settings: Mapping[str, object], failure: str, remedy: str) -> zenoh.Se
     try:
         return zenoh.open(config)
     except zenoh.ZError as error:
-        raise EngineError(f"Zenoh: {failure} ({_SOURCE_LINE.sub('', str(error)).rstrip('.')}). {remedy}") from error
+        raise EngineError(
+            f"Zenoh: {failure} ({_SOURCE_LINE.sub('', str(error)).rstrip('.')}). {remedy}"
+        ) from error

@@ -1,7 +1,7 @@
 """cosim: a benchmark for robots that deliver on sidewalks.
 
-This is its public face; what is not listed here is private. Names are loaded when they are first used: importing cosim
-starts no engine and imports none.
+This is its public face; what is not listed here is private. Names are loaded when they are first
+used: importing cosim starts no engine and imports none.
 
     suite = cosim.load_suite("reactive")
     table = cosim.run(suite, "orca", episodes=2)
@@ -26,21 +26,22 @@ from cosim.rounding import settle_rounding
 if TYPE_CHECKING:
     from cosim.core.errors import CosimError
     from cosim.core.state import Command
-    from cosim.episode.log import Log
-    from cosim.episode.ports import BatchPolicy, CameraSpec, Manifest, Observation, Policy, WaypointRule
+    from cosim.episode.interfaces import BatchPolicy, Observation, Policy
     from cosim.policies.load import load_policy
-    from cosim.records.record import Record
+    from cosim.results.log import Log
+    from cosim.results.record import Record
+    from cosim.spec.camera import Calibration, CameraPicture, CameraSpec
     from cosim.spec.goal import ImageGoal, Instruction, PointGoal, RoutePatch
+    from cosim.spec.manifest import Manifest, WaypointRule
     from cosim.spec.odometry import Odometry
     from cosim.spec.options import EpisodeOptions
-    from cosim.spec.picture import Calibration, CameraPicture
     from cosim.spec.policy_host import PolicyHost
     from cosim.spec.robot import Mount, Robot
     from cosim.spec.scenario import Scenario, Suite
-    from scenarios.catalog import load_suite
-    from scenarios.execution.episode import Episode
-    from scenarios.execution.suite_run import run
-    from scenarios.gym.making import make_env
+    from scenarios.episodes.episode import Episode
+    from scenarios.runs.run import run
+    from scenarios.suites.catalog import load_suite
+    from scenarios.tools.gym.make_env import make_env
 
 settle_rounding()
 
@@ -76,41 +77,43 @@ __all__ = [
 ]
 
 _HOMES = {
-    "BatchPolicy": "cosim.episode.ports",
-    "Calibration": "cosim.spec.picture",
-    "CameraPicture": "cosim.spec.picture",
-    "CameraSpec": "cosim.episode.ports",
+    "BatchPolicy": "cosim.episode.interfaces",
+    "Calibration": "cosim.spec.camera",
+    "CameraPicture": "cosim.spec.camera",
+    "CameraSpec": "cosim.spec.camera",
     "Command": "cosim.core.state",
     "CosimError": "cosim.core.errors",
-    "Episode": "scenarios.execution.episode",
+    "Episode": "scenarios.episodes.episode",
     "EpisodeOptions": "cosim.spec.options",
     "ImageGoal": "cosim.spec.goal",
     "Instruction": "cosim.spec.goal",
-    "Log": "cosim.episode.log",
-    "Manifest": "cosim.episode.ports",
+    "Log": "cosim.results.log",
+    "Manifest": "cosim.spec.manifest",
     "Mount": "cosim.spec.robot",
-    "Observation": "cosim.episode.ports",
+    "Observation": "cosim.episode.interfaces",
     "Odometry": "cosim.spec.odometry",
     "PointGoal": "cosim.spec.goal",
-    "Policy": "cosim.episode.ports",
+    "Policy": "cosim.episode.interfaces",
     "PolicyHost": "cosim.spec.policy_host",
-    "Record": "cosim.records.record",
+    "Record": "cosim.results.record",
     "Robot": "cosim.spec.robot",
     "RoutePatch": "cosim.spec.goal",
     "Scenario": "cosim.spec.scenario",
     "Suite": "cosim.spec.scenario",
-    "WaypointRule": "cosim.episode.ports",
+    "WaypointRule": "cosim.spec.manifest",
     "load_policy": "cosim.policies.load",
-    "load_suite": "scenarios.catalog",
-    "make_env": "scenarios.gym.making",
-    "run": "scenarios.execution.suite_run",
+    "load_suite": "scenarios.suites.catalog",
+    "make_env": "scenarios.tools.gym.make_env",
+    "run": "scenarios.runs.run",
 }
 """The module of each public name (PEP 562: loaded on demand)."""
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
-        raise AttributeError(f"module 'cosim' has no attribute '{name}'. It has: {', '.join(__all__)}")
+        raise AttributeError(
+            f"module 'cosim' has no attribute '{name}'. It has: {', '.join(__all__)}"
+        )
     value = globals()[name] = getattr(import_module(_HOMES[name]), name)
     return value
 

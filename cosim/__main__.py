@@ -1,4 +1,5 @@
-"""`python -m cosim` is `cosim`; Ctrl-C ends it at any moment with exit code 130, also while it loads."""
+"""`python -m cosim` is `cosim`; Ctrl-C ends it at any moment with exit code 130, also while it
+loads."""
 
 from __future__ import annotations
 
@@ -6,11 +7,23 @@ import sys
 
 from cosim import machine
 
-NEED_NO_ENGINE = ("list", "show", "score", "compare", "merge", "listen", "inject", "direct", "dataset", "train")
+NEED_NO_ENGINE = (
+    "list",
+    "show",
+    "score",
+    "compare",
+    "merge",
+    "listen",
+    "inject",
+    "direct",
+    "dataset",
+    "train",
+)
 
 
 def main() -> None:
-    """Entry point of the console script. What the machine lacks is said before anything is imported that needs it."""
+    """Entry point of the console script. What the machine lacks is said before anything is imported
+    that needs it."""
     try:
         if _starts_an_engine(sys.argv[1:]) and (refusal := machine.refusal()):
             print(f"error: {refusal}", file=sys.stderr)
@@ -26,7 +39,12 @@ def main() -> None:
 
 
 def _starts_an_engine(words: list[str]) -> bool:
-    return bool(words) and not words[0].startswith("-") and words[0] not in NEED_NO_ENGINE and "--help" not in words
+    return (
+        bool(words)
+        and not words[0].startswith("-")
+        and words[0] not in NEED_NO_ENGINE
+        and "--help" not in words
+    )
 
 
 if __name__ == "__main__":

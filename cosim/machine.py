@@ -1,7 +1,9 @@
-"""What this machine lacks: Python 3.11 with venv, and the shared libraries that the packages do not bring themselves.
+"""What this machine lacks: Python 3.11 with venv, and the shared libraries that the packages do not
+bring themselves.
 
-Runs by itself before anything is installed, with any Python 3 (`python3 -I cosim/machine.py --install`), so it imports
-nothing of this project and nothing that is not in the standard library. `make` calls it first, `cosim` when it starts.
+Runs by itself before anything is installed, with any Python 3 (`python3 -I cosim/machine.py
+--install`), so it imports nothing of this project and nothing that is not in the standard library.
+`make` calls it first, `cosim` when it starts.
 """
 
 from __future__ import annotations
@@ -26,7 +28,8 @@ LIBRARIES = {
     "libstdc++.so.6": "libstdc++6",
     "libgcc_s.so.1": "libgcc-s1",
 }
-"""What the wheels of SUMO (the first five), osmium and the others load, and the package of Debian and Ubuntu."""
+"""What the wheels of SUMO (the first five), osmium and the others load, and the package of Debian
+and Ubuntu."""
 FOR_PICTURES = {"libEGL.so.1": "libegl1"}
 """What the gl camera needs on top; its package brings Mesa's driver."""
 PYTHON = ("python3.11", "python3.11-venv")
@@ -36,7 +39,8 @@ class Machine:
     """This machine, as far as the check asks it."""
 
     def loads(self, library: str) -> bool:
-        """Can the dynamic loader open it? One that only lacks another of the tables, told by itself, is no fault."""
+        """Can the dynamic loader open it? One that only lacks another of the tables, told by
+        itself, is no fault."""
         try:
             ctypes.CDLL(library)
         except OSError as error:
@@ -55,7 +59,9 @@ class Machine:
         if version and version != "3.11":
             return f"'{python}' is Python {version}"
         if said.returncode != 0:
-            return f"'{python}' has no venv and ensurepip" if version else f"'{python}' does not run"
+            return (
+                f"'{python}' has no venv and ensurepip" if version else f"'{python}' does not run"
+            )
         return ""
 
     def can_install(self) -> bool:
@@ -66,16 +72,27 @@ class Machine:
         """Let apt-get install them, in view. Whether it did is seen by looking again."""
         environment = dict(os.environ, DEBIAN_FRONTEND="noninteractive")
         for command in (["update"], ["install", "-y", "--no-install-recommends", *packages]):
-            subprocess.run(["apt-get", "-q", *command], env=environment, stdout=sys.stderr, stdin=subprocess.DEVNULL)
+            subprocess.run(
+                ["apt-get", "-q", *command],
+                env=environment,
+                stdout=sys.stderr,
+                stdin=subprocess.DEVNULL,
+            )
 
 
 def missing(machine: Machine, wanted: dict[str, str] | None = None) -> list[str]:
-    """Those of the `wanted` libraries (by default all that are needed to run) that the machine lacks."""
-    return [library for library in (LIBRARIES if wanted is None else wanted) if not machine.loads(library)]
+    """Those of the `wanted` libraries (by default all that are needed to run) that the machine
+    lacks."""
+    return [
+        library
+        for library in (LIBRARIES if wanted is None else wanted)
+        if not machine.loads(library)
+    ]
 
 
 def refusal(machine: Machine | None = None) -> str:
-    """One message with every missing library, its package and the command that installs them; empty if none is."""
+    """One message with every missing library, its package and the command that installs them; empty
+    if none is."""
     machine = machine or Machine()
     lacking = missing(machine)
     if not lacking:
@@ -86,25 +103,46 @@ def refusal(machine: Machine | None = None) -> str:
 
 
 def check_machine(words: list[str] | None = None, machine: Machine | None = None) -> int:
-    """Check the machine before anything is set up; 0 if all is there, else 3, with the one command that mends it."""
+    """Check the machine before anything is set up; 0 if all is there, else 3, with the one command
+    that mends it."""
     options = argparse.ArgumentParser(description="Check what this machine lacks.")
-    options.add_argument("--python", default=sys.executable, help="The Python 3.11 that will be used.")
-    options.add_argument("--install", action="store_true", help="As root on Debian or Ubuntu, install what is missing.")
+    options.add_argument(
+        "--python", default=sys.executable, help="The Python 3.11 that will be used."
+    )
+    options.add_argument(
+        "--install",
+        action="store_true",
+        help="As root on Debian or Ubuntu, install what is missing.",
+    )
     asked = options.parse_args(words)
     machine = machine or Machine()
     if asked.install and machine.can_install():
         _install(machine, asked.python)
     wrong = machine.runs(asked.python)
-    lacking, plain = missing(machine), missing(machine, FOR_PICTURES)
+    lacking = missing(machine)
+    plain = missing(machine, FOR_PICTURES)
     if wrong or lacking:
-        packages = [*(PYTHON if wrong else ()), *(LIBRARIES[x] for x in lacking), *(FOR_PICTURES[x] for x in plain)]
-        found = [*([f"Python 3.11 with venv ({wrong})"] if wrong else []), *([_listed(lacking)] if lacking else [])]
+        packages = [
+            *(PYTHON if wrong else ()),
+            *(LIBRARIES[x] for x in lacking),
+            *(FOR_PICTURES[x] for x in plain),
+        ]
+        found = [
+            *([f"Python 3.11 with venv ({wrong})"] if wrong else []),
+            *([_listed(lacking)] if lacking else []),
+        ]
         _say(f"error: this machine lacks {' and '.join(found)}. {_remedy(packages)}")
         if wrong:
-            _say("Where the system has no such Python, any other 3.11 will do: make PYTHON=/path/to/python3.11")
+            _say(
+                "Where the system has no such Python, any other 3.11 will do: make "
+                "PYTHON=/path/to/python3.11"
+            )
         return EXIT_CODE
     if plain:
-        _say(f"note: no {plain[0]} here, so pictures are PyBullet's plain ones. {_remedy([*FOR_PICTURES.values()])}")
+        _say(
+            f"note: no {plain[0]} here, so pictures are PyBullet's plain ones. "
+            f"{_remedy([*FOR_PICTURES.values()])}"
+        )
     return 0
 
 
@@ -114,7 +152,10 @@ def _install(machine: Machine, python: str) -> None:
     libraries = [here[library] for library in missing(machine, here)]
     for packages in ([*PYTHON] if machine.runs(python) else [], libraries):
         if packages:
-            _say(f"This machine lacks {', '.join(packages)}: apt-get installs exactly that, because you are root.")
+            _say(
+                f"This machine lacks {', '.join(packages)}: apt-get installs exactly that, "
+                f"because you are root."
+            )
             machine.install(packages)
 
 

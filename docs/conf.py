@@ -22,8 +22,11 @@ autodoc_typehints = "none"
 default_role = "code"
 
 
-def _edit_docstring(app: Any, what: str, name: str, value: Any, options: Any, lines: list[str]) -> None:
-    """Leaves out the module's text, and marks code: an indented block after "text:" and a blank line."""
+def _edit_docstring(
+    app: Any, what: str, name: str, value: Any, options: Any, lines: list[str]
+) -> None:
+    """Leaves out the module's text, and marks code: an indented block after "text:" and a blank
+    line."""
     if what == "module":
         lines.clear()  # the page has its own introduction
     for i in range(len(lines) - 2):

@@ -1,6 +1,7 @@
 """The one door to SUMO: libsumo, typed as far as it is used here. No other file imports it.
 
-One SUMO per process: `start` and `close` are its life, `sumo` its functions meanwhile, in SUMO's own names and units.
+One SUMO per process: `start` and `close` are its life, `sumo` its functions meanwhile, in SUMO's
+own names and units.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from cosim.core.state import frozen
 
 @contextmanager
 def _unexecuted(package: str) -> Iterator[None]:
-    """Meanwhile modules of a package are imported without its `__init__`; who imports it afterwards gets all of it."""
+    """Meanwhile modules of a package are imported without its `__init__`; who imports it afterwards
+    gets all of it."""
     found = importlib.util.find_spec(package)
     if package in sys.modules or found is None or found.submodule_search_locations is None:
         yield
@@ -57,9 +59,19 @@ class _Persons(Protocol):
     def getAngle(self, name: str, /) -> float: ...
     def getWaitingTime(self, name: str, /) -> float: ...
     def add(self, name: str, edge: str, at_m: float, /, *, typeID: str = ...) -> None: ...
-    def appendWalkingStage(self, name: str, edges: list[str], until_m: float, /, *, speed: float = ...) -> None: ...
+    def appendWalkingStage(
+        self, name: str, edges: list[str], until_m: float, /, *, speed: float = ...
+    ) -> None: ...
     def moveToXY(
-        self, name: str, edge: str, x_m: float, y_m: float, angle_deg: float, mode: int, match_m: float, /
+        self,
+        name: str,
+        edge: str,
+        x_m: float,
+        y_m: float,
+        angle_deg: float,
+        mode: int,
+        match_m: float,
+        /,
     ) -> None: ...
     def setSpeed(self, name: str, mps: float, /) -> None: ...
     def remove(self, name: str, /) -> None: ...
@@ -69,7 +81,9 @@ class _Cars(Protocol):
     def getIDList(self) -> Sequence[str]: ...
     def getNextTLS(self, name: str, /) -> Sequence[tuple[str, int, float, str]]: ...
     def getWaitingTime(self, name: str, /) -> float: ...
-    def add(self, name: str, route: str, /, *, typeID: str, departLane: str, departPos: str) -> None: ...
+    def add(
+        self, name: str, route: str, /, *, typeID: str, departLane: str, departPos: str
+    ) -> None: ...
     def remove(self, name: str, /) -> None: ...
 
 
@@ -78,7 +92,9 @@ class _Lanes(Protocol):
     def getWidth(self, lane: str, /) -> float: ...
     def getShape(self, lane: str, /) -> Sequence[Sequence[float]]: ...
     def getAllowed(self, lane: str, /) -> Sequence[str]: ...
-    def getLinks(self, lane: str, /) -> Sequence[tuple[str, bool, bool, bool, str, str, str, float]]: ...
+    def getLinks(
+        self, lane: str, /
+    ) -> Sequence[tuple[str, bool, bool, bool, str, str, str, float]]: ...
 
 
 class _Edges(Protocol):
@@ -143,7 +159,8 @@ sumo: Final[Sumo] = libsumo
 
 
 def start(arguments: list[str]) -> None:
-    """Start SUMO with the arguments of its command line. Raises EngineError with all that it says."""
+    """Start SUMO with the arguments of its command line. Raises EngineError with all that it
+    says."""
     said: list[str] = []
     try:
         with _stderr_into(said):
@@ -169,7 +186,8 @@ def translated(doing: str) -> Iterator[None]:
 
 
 class NearPersons(NamedTuple):
-    """N persons, in the order of their names: xy (N, 2) where, mps (N,) how fast, and the next edges of their walks."""
+    """N persons, in the order of their names: xy (N, 2) where, mps (N,) how fast, and the next
+    edges of their walks."""
 
     names: tuple[str, ...]
     xy: Floats
@@ -178,8 +196,8 @@ class NearPersons(NamedTuple):
 
 
 class NearVehicles(NamedTuple):
-    """N vehicles, in the order of their names: xy (N, 2) where the middles of their front bumpers are, mps (N,) how
-    fast they drive, and their angles (N,)."""
+    """N vehicles, in the order of their names: xy (N, 2) where the middles of their front bumpers
+    are, mps (N,) how fast they drive, and their angles (N,)."""
 
     names: tuple[str, ...]
     xy: Floats
@@ -191,18 +209,28 @@ def persons_near(x_m: float, y_m: float, reach_m: float, crowd: Container[str]) 
     """Those of a crowd who have set out and are so near to a point."""
     of_crowd = [name for name in sorted(libsumo.person.getIDList()) if name in crowd]
     names, xy = _near(x_m, y_m, reach_m, of_crowd, _told.person_getPosition)
-    return NearPersons(names, xy, _of_each(_told.person_getSpeed, names), [*map(_told.person_getNextEdge, names)])
+    return NearPersons(
+        names, xy, _of_each(_told.person_getSpeed, names), [*map(_told.person_getNextEdge, names)]
+    )
 
 
 def vehicles_near(x_m: float, y_m: float, reach_m: float) -> NearVehicles:
     """The vehicles so near to a point."""
-    names, xy = _near(x_m, y_m, reach_m, sorted(libsumo.vehicle.getIDList()), _told.vehicle_getPosition)
-    speeds, angles = (_of_each(told, names) for told in (_told.vehicle_getSpeed, _told.vehicle_getAngle))
+    names, xy = _near(
+        x_m, y_m, reach_m, sorted(libsumo.vehicle.getIDList()), _told.vehicle_getPosition
+    )
+    speeds, angles = (
+        _of_each(told, names) for told in (_told.vehicle_getSpeed, _told.vehicle_getAngle)
+    )
     return NearVehicles(names, xy, speeds, angles)
 
 
 def _near(
-    x_m: float, y_m: float, reach_m: float, names: Sequence[str], place_of: Callable[[str], tuple[float, float]]
+    x_m: float,
+    y_m: float,
+    reach_m: float,
+    names: Sequence[str],
+    place_of: Callable[[str], tuple[float, float]],
 ) -> tuple[tuple[str, ...], Floats]:
     """Who of these is so near to a point, and where, (N, 2) metres."""
     xy = np.fromiter(chain.from_iterable(map(place_of, names)), dtype=float).reshape(-1, 2)
@@ -223,7 +251,8 @@ def put_crowd_stopwatch(timed: Callable[[str, Callable[[], None]], Callable[[], 
 
 @contextmanager
 def _stderr_into(said: list[str]) -> Iterator[None]:
-    """Collect what is written to the process's stderr: libsumo prints there what its exceptions leave out."""
+    """Collect what is written to the process's stderr: libsumo prints there what its exceptions
+    leave out."""
     sys.stderr.flush()
     with tempfile.TemporaryFile() as heard:
         kept = os.dup(2)

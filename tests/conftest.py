@@ -1,4 +1,5 @@
-"""What all tests share: how long anything is waited for, which examples are drawn, places, and the command line."""
+"""What all tests share: how long anything is waited for, which examples are drawn, places, and the
+command line."""
 
 from __future__ import annotations
 
@@ -21,13 +22,13 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 if TYPE_CHECKING:
-    from cosim.spec.pseudonym import Pseudonym
+    from cosim.spec.episode_id import Pseudonym
     from cosim.spec.scenario import Scenario
 
 ROOT = Path(__file__).parents[1]
 PATIENCE_S = 600.0
-"""How long a test waits for what must happen: far beyond what a slow and busy machine needs. A test never waits for
-it to be over, so that it costs nothing where all is well."""
+"""How long a test waits for what must happen: far beyond what a slow and busy machine needs. A test
+never waits for it to be over, so that it costs nothing where all is well."""
 
 WIDE = {"COLUMNS": "200", "NO_COLOR": "1"}
 """So that what the command line prints can be read by a test."""
@@ -56,8 +57,9 @@ def still_runs(pid: int) -> bool:
 
 
 def seed_in_order(scenarios: Sequence[Scenario]) -> int:
-    """The least seed of a run that goes through scenarios in the order in which they are given here."""
-    from cosim.spec.pseudonym import pseudonym_of
+    """The least seed of a run that goes through scenarios in the order in which they are given
+    here."""
+    from cosim.spec.episode_id import pseudonym_of
 
     def told(seed: int) -> list[Pseudonym]:
         return [pseudonym_of(seed, scenario) for scenario in scenarios]
@@ -70,10 +72,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Nets are kept between runs, for all processes, beside no user's: a folder for each state of what makes them.
+    """Nets are kept between runs, for all processes, beside no user's: a folder for each state of
+    what makes them.
 
-    Ctrl-C is heard, here and in what the tests start, also where a shell in the background has it ignored. Modules are
-    compiled once, not in each of hundreds of processes, also where that is turned off.
+    Ctrl-C is heard, here and in what the tests start, also where a shell in the background has it
+    ignored. Modules are compiled once, not in each of hundreds of processes, also where that is
+    turned off.
     """
     sys.dont_write_bytecode = False
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
@@ -85,7 +89,9 @@ def pytest_configure(config: pytest.Config) -> None:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in WIDE.items():
             patch.setenv(name, value)
-        importlib.import_module("cosim.cli.app")  # consoles look at the environment once, when they are made
+        importlib.import_module(
+            "cosim.cli.app"
+        )  # consoles look at the environment once, when they are made
 
 
 class Said(NamedTuple):
@@ -102,7 +108,8 @@ Cosim = Callable[..., Said]
 
 @pytest.fixture(scope="session")
 def cosim() -> Cosim:
-    """The command line by its own entry point, in this process: nothing is loaded anew, the rest is as for a user."""
+    """The command line by its own entry point, in this process: nothing is loaded anew, the rest is
+    as for a user."""
     return _here
 
 
@@ -115,7 +122,13 @@ def fresh_cosim() -> Cosim:
 def _in_a_process(*words: str, cwd: Path | None = None) -> Said:
     command = [sys.executable, "-m", "cosim", *words]
     done = subprocess.run(
-        command, cwd=cwd, env=os.environ | WIDE, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        command,
+        cwd=cwd,
+        env=os.environ | WIDE,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
     )
     return Said(done.returncode, done.stdout, done.stderr)
 
@@ -135,7 +148,8 @@ def _here(*words: str, cwd: Path | None = None) -> Said:
 
 @contextmanager
 def _as_a_program(words: tuple[str, ...], folder: Path) -> Iterator[None]:
-    """In a folder, with arguments; afterwards nothing is left of the program: no module of the folder, no signal."""
+    """In a folder, with arguments; afterwards nothing is left of the program: no module of the
+    folder, no signal."""
     before = Path.cwd(), sys.argv, [*sys.path], {*sys.modules}, signal.getsignal(signal.SIGTERM)
     os.chdir(folder)
     sys.argv = ["cosim", *words]
@@ -143,7 +157,8 @@ def _as_a_program(words: tuple[str, ...], folder: Path) -> Iterator[None]:
         yield
     finally:
         os.chdir(before[0])
-        sys.argv, sys.path[:] = before[1], before[2]
+        sys.argv = before[1]
+        sys.path[:] = before[2]
         for name in {*sys.modules} - before[3]:
             source = getattr(sys.modules[name], "__file__", None)
             if source and Path(source).is_relative_to(folder):

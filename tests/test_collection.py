@@ -1,4 +1,5 @@
-"""The list of tests itself: the same in every process and at any time, and names that can be read."""
+"""The list of tests itself: the same in every process and at any time, and names that can be
+read."""
 
 from __future__ import annotations
 
@@ -13,34 +14,50 @@ import pytest
 from tests.conftest import COLLECTED, PATIENCE_S
 
 ROOT = Path(__file__).parents[1]
-COLLECT = (sys.executable, "-m", "pytest", "-o", "addopts=--import-mode=importlib", "--collect-only", "-q", "tests")
+COLLECT = (
+    sys.executable,
+    "-m",
+    "pytest",
+    "-o",
+    "addopts=--import-mode=importlib",
+    "--collect-only",
+    "-q",
+    "tests",
+)
 LONGEST_PARAMETERS = 120
 
 
 @pytest.fixture(scope="module")
 def elsewhere() -> list[str]:
-    """The ids of all tests, engine tests too, as another process collects them, later and with other hashes."""
+    """The ids of all tests, engine tests too, as another process collects them, later and with
+    other hashes."""
     environment = os.environ | {"PYTHONHASHSEED": "1"}
-    done = subprocess.run(COLLECT, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=PATIENCE_S)
+    done = subprocess.run(
+        COLLECT, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=PATIENCE_S
+    )
     assert done.returncode == 0, done.stdout
     return [line for line in done.stdout.splitlines() if "::" in line]
 
 
 def unreadable(test_id: str) -> bool:
-    """Whether the parameters in an id are too long to read, or hold bytes that stand for no letter."""
+    """Whether the parameters in an id are too long to read, or hold bytes that stand for no
+    letter."""
     parameters = test_id.partition("[")[2]
     escaped = "\\" in parameters.replace(r"\\", "")
     return len(parameters) > LONGEST_PARAMETERS or escaped or not test_id.isprintable()
 
 
 def by_function(test_ids: list[str]) -> list[str]:
-    """One function after the other, each with its parameters in their order: pytest joins those that share a place."""
+    """One function after the other, each with its parameters in their order: pytest joins those
+    that share a place."""
     return sorted(test_ids, key=lambda test_id: test_id.partition("[")[0])
 
 
-def test_two_processes_collect_the_same_tests(elsewhere: list[str], request: pytest.FixtureRequest) -> None:
-    """Ids depend neither on the clock nor on the order of sets: processes that share the tests out must agree. Of a
-    part of the tests those that were asked for are compared."""
+def test_two_processes_collect_the_same_tests(
+    elsewhere: list[str], request: pytest.FixtureRequest
+) -> None:
+    """Ids depend neither on the clock nor on the order of sets: processes that share the tests out
+    must agree. Of a part of the tests those that were asked for are compared."""
     here = request.config.stash[COLLECTED]
     assert len(elsewhere) == len(set(elsewhere)) > 900
     whole = all(Path(asked).resolve() in (ROOT, ROOT / "tests") for asked in request.config.args)
@@ -54,12 +71,19 @@ def test_every_id_can_be_read(elsewhere: list[str]) -> None:
 
 
 def test_no_test_waits_for_a_time_of_its_own() -> None:
-    """Who waits for something to happen waits PATIENCE_S: a number of seconds is too short on some machine."""
+    """Who waits for something to happen waits PATIENCE_S: a number of seconds is too short on some
+    machine."""
     found = []
     for path in sorted((ROOT / "tests").rglob("*.py")):
         for call in ast.walk(ast.parse(path.read_text())):
-            limits = [k.value for k in call.keywords if k.arg == "timeout"] if isinstance(call, ast.Call) else []
-            found += [f"{path.name}:{limit.lineno}" for limit in limits if isinstance(limit, ast.Constant)]
+            limits = (
+                [k.value for k in call.keywords if k.arg == "timeout"]
+                if isinstance(call, ast.Call)
+                else []
+            )
+            found += [
+                f"{path.name}:{limit.lineno}" for limit in limits if isinstance(limit, ast.Constant)
+            ]
     assert found == []
 
 

@@ -1,4 +1,5 @@
-"""README and docs/: every example in them is accepted or run as it is written, and every link leads somewhere."""
+"""README and docs/: every example in them is accepted or run as it is written, and every link leads
+somewhere."""
 
 from __future__ import annotations
 
@@ -18,23 +19,23 @@ from typer.main import get_command
 import cosim
 from cosim.cli.app import app
 from cosim.policies import POLICIES
-from cosim.policies.load import FOLLOW
-from cosim.policies.shipped import shipped_bundles
+from cosim.policies.load import FOLLOW, shipped_bundles
 from cosim.spec.connection import checked_endpoint
 from cosim.spec.goal import GoalProtocol
 from cosim.spec.robot import ROBOTS
-from scenarios.catalog import SUITES
-from scenarios.checks import small_scenario
 from scenarios.events import EVENT_KINDS
-from scenarios.own.reading import read_own
+from scenarios.suites.catalog import SUITES
+from scenarios.suites.user_scenarios.read import read_own
+from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import ROOT, Cosim
-from tests.documents import PAGES, Block, blocks, shell_lines, text_of
+from tests.support.documents import PAGES, Block, blocks, shell_lines, text_of
 
 RUN_ELSEWHERE = {
     "from policy_server import serve": "scenarios/test_remote.py",
     "import json, zenoh": "bridge/test_step_in.py",
 }
-"""Beginnings of Python blocks that need a run at the other end, and the tests that run them as written."""
+"""Beginnings of Python blocks that need a run at the other end, and the tests that run them as
+written."""
 COMMANDS: Any = get_command(app)
 CHEAP = (
     "list ",
@@ -52,8 +53,10 @@ POLICY = re.compile(r"^class (\w+):\n    manifest = ", re.MULTILINE)
 
 
 def accepted(words: list[str]) -> dict[str, Any]:
-    """The parameters of a command line without `cosim`, parsed as the command line does and not run."""
-    command, words = COMMANDS, list(words)
+    """The parameters of a command line without `cosim`, parsed as the command line does and not
+    run."""
+    command = COMMANDS
+    words = list(words)
     while hasattr(command, "commands"):
         command = command.commands[words.pop(0)]
     parameters: dict[str, Any] = command.make_context(command.name, words).params
@@ -67,17 +70,25 @@ def ids_of(suite: str) -> set[str]:
 
 
 def unknown_names(parameters: dict[str, Any]) -> list[object]:
-    """Names in parameters that are none: of policies, suites, scenarios, events, robots, goals, endpoints."""
+    """Names in parameters that are none: of policies, suites, scenarios, events, robots, goals,
+    endpoints."""
     policies = {*POLICIES, *shipped_bundles(), FOLLOW}
     named: dict[str, set[str]] = {
-        "policy": policies, "learner": policies, "suite": {*SUITES}, "event": {*EVENT_KINDS, "static"},
-        "robot": {*ROBOTS}, "goal": {*get_args(GoalProtocol)}, "split": {"val", "test"},
-    }  # fmt: skip
+        "policy": policies,
+        "learner": policies,
+        "suite": {*SUITES},
+        "event": {*EVENT_KINDS, "static"},
+        "robot": {*ROBOTS},
+        "goal": {*get_args(GoalProtocol)},
+        "split": {"val", "test"},
+    }
     wrong: list[object] = []
     for key, valid in named.items():
         given = parameters.get(key) or ()
         for name in (given,) if isinstance(given, str) else given:
-            free = key in ("policy", "learner", "suite") and (":" in name or name.endswith((".toml", ".json")))
+            free = key in ("policy", "learner", "suite") and (
+                ":" in name or name.endswith((".toml", ".json"))
+            )
             wrong += [] if free or name in valid else [name]
     suite = parameters.get("suite")
     if suite in SUITES:
@@ -91,7 +102,8 @@ def unknown_names(parameters: dict[str, Any]) -> list[object]:
 
 @pytest.mark.parametrize("page", PAGES)
 def test_the_command_line_accepts_every_command(page: str) -> None:
-    """Each `cosim` line of a page has existing commands, options, values of their types, policies, suites, events."""
+    """Each `cosim` line of a page has existing commands, options, values of their types, policies,
+    suites, events."""
     for where, words in shell_lines(page):
         if words[0] in ("cosim", "taskset"):
             assert not unknown_names(accepted(words[words.index("cosim") + 1 :])), where
@@ -99,9 +111,12 @@ def test_the_command_line_accepts_every_command(page: str) -> None:
 
 @pytest.mark.parametrize("page", PAGES)
 def test_other_commands_name_what_there_is(page: str) -> None:
-    """Make targets, extras, modules and scripts in shell blocks exist; no other program is called."""
+    """Make targets, extras, modules and scripts in shell blocks exist; no other program is
+    called."""
     makefile = (ROOT / "Makefile").read_text()
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
     for where, words in shell_lines(page):
         match words:
             case ["make", target]:
@@ -130,12 +145,17 @@ def test_commands_in_the_text_exist(page: str) -> None:
 
 @pytest.mark.engine
 def test_cheap_commands_run_as_written(tmp_path: Path, cosim: Cosim) -> None:
-    """Lists, certificates, scenarios of one's own, one at night: each command ends well, in the order of the pages."""
+    """Lists, certificates, scenarios of one's own, one at night: each command ends well, in the
+    order of the pages."""
     (night,) = (block for block in blocks("toml", "docs/scenarios.md") if "[light]" in block.text)
     (tmp_path / "night.toml").write_text(night.text)
     ran = 0
     for words, where in {tuple(words): where for where, words in shell_lines()}.items():
-        if words[0] == "cosim" and f"{' '.join(words[1:])} ".startswith(CHEAP) and "--drive" not in words:
+        if (
+            words[0] == "cosim"
+            and f"{' '.join(words[1:])} ".startswith(CHEAP)
+            and "--drive" not in words
+        ):
             done = cosim(*words[1:], cwd=tmp_path)
             assert done.returncode == 0, (where, done.stderr)
             ran += 1
@@ -145,9 +165,13 @@ def test_cheap_commands_run_as_written(tmp_path: Path, cosim: Cosim) -> None:
 @pytest.mark.engine
 @pytest.mark.parametrize("block", PYTHON, ids=lambda block: block.name)
 def test_python_runs_as_written(
-    block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    block: Block,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """Each Python block ends well as a script. What it prints holds the comment behind `print`; a policy drives."""
+    """Each Python block ends well as a script. What it prints holds the comment behind `print`; a
+    policy drives."""
     monkeypatch.chdir(tmp_path)
     script = tmp_path / f"example_{block.line}_{Path(block.page).stem}.py"
     script.write_text(block.text)
@@ -172,7 +196,8 @@ def drives(policy: str) -> None:
 
 
 def test_python_that_needs_a_run_is_run_elsewhere() -> None:
-    """Blocks that are not run here are those of the table, and the test that is named reads the page."""
+    """Blocks that are not run here are those of the table, and the test that is named reads the
+    page."""
     others = [block for block in blocks("python") if block not in PYTHON]
     assert len(others) == len(RUN_ELSEWHERE)
     for block in others:
@@ -191,14 +216,20 @@ def test_every_block_has_a_language_that_is_tested() -> None:
     """Pages have no other blocks than those that a test reads, and output and citations as text."""
     for page in PAGES:
         languages = re.findall(r"^```(.*)\n(?:.*\n)*?```$", text_of(page), re.MULTILINE)
-        assert {*languages} <= {"bash", "python", "toml", "json", "text", "bibtex", "{eval-rst}"}, page
-        assert not re.search(r"\n\n    \S", re.sub(r"^```.*?^```$", "", text_of(page), flags=re.M | re.S)), page
+        assert {*languages} <= {"bash", "python", "toml", "json", "text", "bibtex", "{eval-rst}"}, (
+            page
+        )
+        assert not re.search(
+            r"\n\n    \S", re.sub(r"^```.*?^```$", "", text_of(page), flags=re.M | re.S)
+        ), page
     assert {block.page for block in blocks("json")} == {"docs/onnx.md"}
 
 
 def anchors(text: str) -> set[str]:
     """The anchors of a page's headings, as MyST and GitHub make them."""
-    headings = re.findall(r"^#+ (.*)$", re.sub(r"^```.*?^```$", "", text, flags=re.M | re.S), re.MULTILINE)
+    headings = re.findall(
+        r"^#+ (.*)$", re.sub(r"^```.*?^```$", "", text, flags=re.M | re.S), re.MULTILINE
+    )
     return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
@@ -225,18 +256,26 @@ def test_the_readme_is_a_page_and_names_every_other() -> None:
 
 
 def test_the_citation_is_of_this_version_and_names_the_paper() -> None:
-    """`CITATION.cff` has the project's version and licence, and the paper with all authors that the README names."""
+    """`CITATION.cff` has the project's version and licence, and the paper with all authors that the
+    README names."""
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert (cited["version"], cited["license"]) == (project["version"], project["license"])
     (paper,) = cited["references"]
-    names = " and ".join(f"{author['family-names']}, {author['given-names']}" for author in paper["authors"])
+    names = " and ".join(
+        f"{author['family-names']}, {author['given-names']}" for author in paper["authors"]
+    )
     assert names in text_of("README.md") and paper["title"] in text_of("README.md")
 
 
 def test_the_results_of_the_readme_are_those_of_the_baselines() -> None:
-    """Eight policies; each figure with an interval is in a row of the same policy on the page of all results."""
-    rows = [line.strip("| ").split(" | ") for line in text_of("README.md").splitlines() if "| camera |" in line]
+    """Eight policies; each figure with an interval is in a row of the same policy on the page of
+    all results."""
+    rows = [
+        line.strip("| ").split(" | ")
+        for line in text_of("README.md").splitlines()
+        if "| camera |" in line
+    ]
     page = text_of("docs/baselines.md").splitlines()
     results = text_of("README.md").partition("## Results")[2].partition("## ")[0]
     assert len(rows) == 5 and len(re.findall(r"^\| `", results, re.MULTILINE)) == 8

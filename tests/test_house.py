@@ -14,41 +14,58 @@ from pathlib import Path
 
 import pytest
 
-from tests.documents import PAGES
+from tests.support.documents import PAGES
 
 ROOT = Path(__file__).parents[1]
 ROOMS = ("cosim", "sumo_nets", "physics", "bridge", "scenarios")
 
 
 def test_every_top_level_name_is_ours() -> None:
-    """No other installed distribution owns one of our package names, and the console script is there."""
+    """No other installed distribution owns one of our package names, and the console script is
+    there."""
     owners = packages_distributions()
     for room in ROOMS:
         assert set(owners.get(room, ["sidewalk-cosim"])) == {"sidewalk-cosim"}
-    assert [e.value for e in entry_points(group="console_scripts", name="cosim")] == ["cosim.__main__:main"]
+    assert [e.value for e in entry_points(group="console_scripts", name="cosim")] == [
+        "cosim.__main__:main"
+    ]
 
 
 def test_the_ground_floor_imports_no_engine() -> None:
-    """Everything in cosim/ can be imported without SUMO, PyBullet, Zenoh or any other room; what learns needs PyTorch,
-    and is left out where that is not installed."""
+    """Everything in cosim/ can be imported without SUMO, PyBullet, Zenoh or any other room; what
+    learns needs PyTorch, and is left out where that is not installed."""
     modules = [
         ".".join(path.relative_to(ROOT).with_suffix("").parts)
         for path in sorted((ROOT / "cosim").rglob("*.py"))
-        if path.name not in ("__init__.py", "__main__.py") and (path.parent.name != "learning" or find_spec("torch"))
+        if path.name not in ("__init__.py", "__main__.py")
+        and (path.parent.name != "learning" or find_spec("torch"))
     ]
     code = (
-        f"import importlib, sys\nfor name in {modules!r}: importlib.import_module(name)\n"
-        "rooms = {'libsumo', 'traci', 'pybullet', 'zenoh', 'sumo_nets', 'physics', 'bridge', 'scenarios'}\n"
-        "print(sorted(rooms & set(sys.modules)))"
+        f"import importlib, sys\nfor name in {modules!r}: importlib.import_module(name)\nrooms = "
+        "{'libsumo', 'traci', 'pybullet', 'zenoh', 'sumo_nets', 'physics', 'bridge', "
+        "'scenarios'}\nprint(sorted(rooms & set(sys.modules)))"
     )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    said = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
+    )
     assert said.stdout.strip() == "[]"
 
 
 @pytest.mark.engine
 def test_the_wheel_holds_what_a_run_needs(tmp_path: Path) -> None:
-    """The built wheel carries every module, each room's type marker, the robot and the suites, and nothing else."""
-    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(tmp_path), str(ROOT)]
+    """The built wheel carries every module, each room's type marker, the robot and the suites, and
+    nothing else."""
+    command = [
+        sys.executable,
+        "-m",
+        "pip",
+        "wheel",
+        "--quiet",
+        "--no-deps",
+        "--wheel-dir",
+        str(tmp_path),
+        str(ROOT),
+    ]
     subprocess.run(command, check=True, capture_output=True)
     (wheel,) = tmp_path.glob("sidewalk_cosim-*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
@@ -56,7 +73,11 @@ def test_the_wheel_holds_what_a_run_needs(tmp_path: Path) -> None:
         assert f"{room}/py.typed" in names
         for path in (ROOT / room).rglob("*.py"):
             assert path.relative_to(ROOT).as_posix() in names
-    needed = {"scenarios/suites/long-horizon.json", "physics/robots/courier.urdf", "scenarios/own/template.toml"}
+    needed = {
+        "scenarios/suites/long-horizon.json",
+        "physics/robots/courier.urdf",
+        "scenarios/suites/user_scenarios/template.toml",
+    }
     assert {f"cosim/report/page/{name}" for name in ("page.css", "page.js", "viewer.html")} <= names
     assert needed <= names
     assert not [n for n in names if n.split("/")[0] not in ROOMS and ".dist-info" not in n]
@@ -67,7 +88,9 @@ def test_the_documents_name_files_that_exist() -> None:
     makefile = (ROOT / "Makefile").read_text()
     for name in (*PAGES, "ARCHITECTURE.md", "CONTRIBUTING.md"):
         text = (ROOT / name).read_text()
-        for path in re.findall(r"`((?:cosim|sumo_nets|physics|bridge|scenarios|tests)/[\w./-]*)`", text):
+        for path in re.findall(
+            r"`((?:cosim|sumo_nets|physics|bridge|scenarios|tests)/[\w./-]*)`", text
+        ):
             if re.fullmatch(r"cosim/\w+-v1", path):
                 continue  # an id of an environment
             assert (ROOT / path).exists(), f"{name} names {path}"
@@ -77,7 +100,8 @@ def test_the_documents_name_files_that_exist() -> None:
 
 
 def test_modules_have_telling_names_and_at_most_700_lines() -> None:
-    """No module is called utils, common, helpers, manager or misc, and none has more than 700 lines."""
+    """No module is called utils, common, helpers, manager or misc, and none has more than 700
+    lines."""
     for room in ROOMS:
         for path in (ROOT / room).rglob("*.py"):
             assert path.stem not in ("utils", "common", "helpers", "manager", "misc"), path
@@ -88,13 +112,22 @@ def test_architecture_shows_the_floors_that_are_enforced() -> None:
     """The picture of the floors is the layers of `.importlinter`, line by line."""
     contracts = configparser.ConfigParser()
     contracts.read(ROOT / ".importlinter")
-    layers = [contracts[f"importlinter:contract:{name}"]["layers"].strip() for name in ("floors", "scenarios")]
-    assert f"```\n{chr(10).join([layers[0], '', layers[1]])}\n```" in (ROOT / "ARCHITECTURE.md").read_text()
+    layers = [
+        contracts[f"importlinter:contract:{name}"]["layers"].strip()
+        for name in ("floors", "scenarios")
+    ]
+    assert (
+        f"```\n{chr(10).join([layers[0], '', layers[1]])}\n```"
+        in (ROOT / "ARCHITECTURE.md").read_text()
+    )
 
 
 def test_each_engine_is_imported_where_architecture_says() -> None:
-    """libsumo in one file, zenoh in two, PyBullet and OpenGL in one room; the document says so in these words."""
-    where: dict[str, set[str]] = {name: set() for name in ("libsumo", "zenoh", "pybullet", "moderngl")}
+    """libsumo in one file, zenoh in two, PyBullet and OpenGL in one room; the document says so in
+    these words."""
+    where: dict[str, set[str]] = {
+        name: set() for name in ("libsumo", "zenoh", "pybullet", "moderngl")
+    }
     for path in (path for room in ROOMS for path in sorted((ROOT / room).rglob("*.py"))):
         text = path.read_text()
         if not any(name in text for name in where):
@@ -110,16 +143,20 @@ def test_each_engine_is_imported_where_architecture_says() -> None:
         assert where[name] and all(path.startswith("physics/") for path in where[name])
     said = " ".join((ROOT / "ARCHITECTURE.md").read_text().split())
     assert (
-        "libsumo is imported only in `sumo_nets/engine.py`, which types it, PyBullet and moderngl only in `physics`, "
-        "zenoh only in `bridge/session.py` and in the one file that others copy, `bridge/policy_server.py`" in said
+        "libsumo is imported only in `sumo_nets/engine.py`, which types it, PyBullet and moderngl "
+        "only in `physics`, zenoh only in `bridge/session.py` and in the one file that others "
+        "copy, `bridge/policy_server.py`" in said
     )
 
 
 def test_architecture_tells_the_size_of_the_tiles_that_are_loaded() -> None:
     """The sentence about the ground's tiles names the size that the code has."""
-    from physics.world.tiles import TILE_M
+    from physics.ground.tiles import TILE_M
 
-    assert f"Tiles of {TILE_M:g} m are loaded around the robot." in (ROOT / "ARCHITECTURE.md").read_text()
+    assert (
+        f"Tiles of {TILE_M:g} m are loaded around the robot."
+        in (ROOT / "ARCHITECTURE.md").read_text()
+    )
 
 
 _LOOKS_INTO_AN_ID = re.compile(
@@ -129,7 +166,8 @@ _LOOKS_INTO_AN_ID = re.compile(
 
 
 def test_nobody_looks_into_a_persons_id() -> None:
-    """Whose a person is, and how old, are columns of `People`: no file asks how an id begins, nor for its letters."""
+    """Whose a person is, and how old, are columns of `People`: no file asks how an id begins, nor
+    for its letters."""
     guilty = (
         'ids[i][0] in "en"',
         'n.startswith("c")',

@@ -1,7 +1,8 @@
 """A private authority and the certificates that it issues, one for each role: files in a folder.
 
-`ca.pem` and `ca.key` of the authority, and beside them a folder for each role, which is copied whole to where it is
-needed. Who listens is issued for the names that others reach it by, and nobody else can stand in for it.
+`ca.pem` and `ca.key` of the authority, and beside them a folder for each role, which is copied
+whole to where it is needed. Who listens is issued for the names that others reach it by, and nobody
+else can stand in for it.
 """
 
 from __future__ import annotations
@@ -19,7 +20,11 @@ from pathlib import Path
 from typing import Final
 
 from cryptography import x509
-from cryptography.hazmat.primitives.asymmetric.ec import SECP256R1, EllipticCurvePrivateKey, generate_private_key
+from cryptography.hazmat.primitives.asymmetric.ec import (
+    SECP256R1,
+    EllipticCurvePrivateKey,
+    generate_private_key,
+)
 from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.serialization import (
     Encoding,
@@ -37,19 +42,29 @@ _CA_KEY: Final = "ca.key"
 _AUTHORITY_DAYS: Final = 3650
 _SKEW: Final = timedelta(days=1)
 """Valid from so long ago: clocks of other machines may be behind."""
-_HOST: Final = re.compile(r"(?=.{1,253}$)[A-Za-z0-9]([A-Za-z0-9-]{0,62})(\.[A-Za-z0-9]([A-Za-z0-9-]{0,62}))*")
+_HOST: Final = re.compile(
+    r"(?=.{1,253}$)[A-Za-z0-9]([A-Za-z0-9-]{0,62})(\.[A-Za-z0-9]([A-Za-z0-9-]{0,62}))*"
+)
 
 
-def make_authority(folder: Path, hosts: Sequence[str], days: int, now: datetime | None = None) -> None:
-    """Make a folder with a new authority and the certificate of a coordinator. Raises UsageError when it is there."""
+def make_authority(
+    folder: Path, hosts: Sequence[str], days: int, now: datetime | None = None
+) -> None:
+    """Make a folder with a new authority and the certificate of a coordinator. Raises UsageError
+    when it is there."""
     names = [_name(host) for host in hosts]
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"{folder} is a file: name a folder that is not there yet, like certs")
     if folder.exists() and any(folder.iterdir()):
-        raise UsageError(f"{folder} is not empty: `cosim certs role {folder} ROLE` adds to an authority that is there")
+        raise UsageError(
+            f"{folder} is not empty: `cosim certs role {folder} ROLE` adds to an authority "
+            f"that is there"
+        )
     now = datetime.now(UTC) if now is None else now
     key = generate_private_key(SECP256R1())
-    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, f"cosim authority {secrets.token_hex(4)}")])
+    subject = x509.Name(
+        [x509.NameAttribute(NameOID.COMMON_NAME, f"cosim authority {secrets.token_hex(4)}")]
+    )
     builder = _builder(subject, subject, key, now, now + timedelta(days=_AUTHORITY_DAYS))
     builder = builder.add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
     builder = builder.add_extension(_usage(signs_certificates=True), critical=True)
@@ -59,31 +74,43 @@ def make_authority(folder: Path, hosts: Sequence[str], days: int, now: datetime 
         _issue(made, "coordinator", names, days, now)
 
 
-def issue(folder: Path, role: Role, hosts: Sequence[str], days: int, *, renew: bool = False) -> Path:
-    """Issue the certificate of a role and give its folder. One that is there is replaced only if `renew`, and keeps its
-    hosts if none are given. Raises UsageError, AccessError."""
+def issue(
+    folder: Path, role: Role, hosts: Sequence[str], days: int, *, renew: bool = False
+) -> Path:
+    """Issue the certificate of a role and give its folder. One that is there is replaced only if
+    `renew`, and keeps its hosts if none are given. Raises UsageError, AccessError."""
     names = [_name(host) for host in hosts]
     place = folder / role
     if place.exists():
         if not renew:
             there = identity_in(place)
-            raise UsageError(f"{place} is there, and valid until {said(there.ends)}: --renew replaces it")
+            raise UsageError(
+                f"{place} is there, and valid until {said(there.ends)}: --renew replaces it"
+            )
         names = names or [_name(host) for host in identity_in(place).hosts]
     if role in ("coordinator", "director") and not names:
-        raise UsageError(f"others connect to a {role}: say by which names or addresses, --host NAME")
+        raise UsageError(
+            f"others connect to a {role}: say by which names or addresses, --host NAME"
+        )
     if role not in HUBS and names:
-        raise UsageError(f"--host is for those who listen, and the role {role} does not: leave out --host")
+        raise UsageError(
+            f"--host is for those who listen, and the role {role} does not: leave out --host"
+        )
     _issue(folder, role, names, days, datetime.now(UTC))
     return place
 
 
-def _issue(folder: Path, role: Role, hosts: list[x509.GeneralName], days: int, now: datetime) -> None:
+def _issue(
+    folder: Path, role: Role, hosts: list[x509.GeneralName], days: int, now: datetime
+) -> None:
     authority, signs = _authority(folder)
     key = generate_private_key(SECP256R1())
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, role)])
     ends = min(now + timedelta(days=days), authority.not_valid_after_utc)
     builder = _builder(subject, authority.subject, key, now, ends)
-    builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+    builder = builder.add_extension(
+        x509.BasicConstraints(ca=False, path_length=None), critical=True
+    )
     builder = builder.add_extension(_usage(signs_certificates=False), critical=True)
     uses = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
     builder = builder.add_extension(x509.ExtendedKeyUsage(uses), critical=False)
@@ -102,16 +129,24 @@ def _authority(folder: Path) -> tuple[x509.Certificate, EllipticCurvePrivateKey]
         key = load_pem_private_key((folder / _CA_KEY).read_bytes(), None)
         certificate = x509.load_pem_x509_certificate((folder / CA).read_bytes())
     except OSError as error:
-        raise AccessError(f"{folder} holds no authority ({error.strerror}): `cosim certs init` makes one") from error
+        raise AccessError(
+            f"{folder} holds no authority ({error.strerror}): `cosim certs init` makes one"
+        ) from error
     except (ValueError, TypeError) as error:
-        raise AccessError(f"{folder}: {CA} or {_CA_KEY} cannot be read: they are damaged") from error
+        raise AccessError(
+            f"{folder}: {CA} or {_CA_KEY} cannot be read: they are damaged"
+        ) from error
     if not isinstance(key, EllipticCurvePrivateKey) or key.public_key() != certificate.public_key():
         raise AccessError(f"{folder}: {_CA_KEY} is not the key of {CA}")
     return certificate, key
 
 
 def _builder(
-    subject: x509.Name, issuer: x509.Name, key: EllipticCurvePrivateKey, now: datetime, ends: datetime
+    subject: x509.Name,
+    issuer: x509.Name,
+    key: EllipticCurvePrivateKey,
+    now: datetime,
+    ends: datetime,
 ) -> x509.CertificateBuilder:
     return (
         x509.CertificateBuilder()
@@ -144,7 +179,9 @@ def _name(host: str) -> x509.GeneralName:
         return x509.IPAddress(ip_address(host))
     except ValueError:
         if not _HOST.fullmatch(host):
-            raise UsageError(f"--host '{host}': a name or address of a machine, like hub.lan or 10.0.0.7") from None
+            raise UsageError(
+                f"--host '{host}': a name or address of a machine, like hub.lan or 10.0.0.7"
+            ) from None
         return x509.DNSName(host)
 
 
@@ -154,7 +191,8 @@ def _pem(key: EllipticCurvePrivateKey) -> bytes:
 
 @contextmanager
 def _whole_folder(folder: Path) -> Iterator[Path]:
-    """A folder to fill beside the one that is meant, which takes its place when nothing was raised."""
+    """A folder to fill beside the one that is meant, which takes its place when nothing was
+    raised."""
     made = None
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)

@@ -18,14 +18,16 @@ from cryptography.x509.oid import NameOID
 from cosim.core.errors import AccessError
 from cosim.spec.connection import Connection, Role
 
-CA, CERTIFICATE, KEY = "ca.pem", "cert.pem", "key.pem"
+CA = "ca.pem"
+CERTIFICATE = "cert.pem"
+KEY = "key.pem"
 SOON: Final = timedelta(days=30)
 """Before the end so long it is said that a certificate ends."""
 
 
 class Identity(NamedTuple):
-    """A certificate as it was read. hosts: the names that others may reach it by; ends: when it, or what it is issued
-    by, expires."""
+    """A certificate as it was read. hosts: the names that others may reach it by; ends: when it, or
+    what it is issued by, expires."""
 
     role: Role
     hosts: tuple[str, ...]
@@ -34,7 +36,8 @@ class Identity(NamedTuple):
 
 
 def identity_in(folder: Path) -> Identity:
-    """Whose the files of a folder are. Raises AccessError when one is missing, or they do not belong together."""
+    """Whose the files of a folder are. Raises AccessError when one is missing, or they do not
+    belong together."""
     certificate, authority = (_certificate(folder / name) for name in (CERTIFICATE, CA))
     key = folder / KEY
     try:
@@ -43,7 +46,8 @@ def identity_in(folder: Path) -> Identity:
         raise AccessError(f"{key}: holds no private key without a password") from error
     if not ours:
         raise AccessError(
-            f"{key} is not the key of {folder / CERTIFICATE}: copy the whole folder from where it was made"
+            f"{key} is not the key of {folder / CERTIFICATE}: copy the whole folder from "
+            f"where it was made"
         )
     if key.stat().st_mode & stat.S_IRWXO:
         raise AccessError(f"{key} can be read by everybody on this machine: chmod 600 {key}")
@@ -51,10 +55,12 @@ def identity_in(folder: Path) -> Identity:
         certificate.verify_directly_issued_by(authority)
     except (ValueError, TypeError, InvalidSignature) as error:
         raise AccessError(
-            f"{folder / CERTIFICATE} was not issued by {folder / CA}, but by another authority: copy the whole folder "
-            "from where it was made"
+            f"{folder / CERTIFICATE} was not issued by {folder / CA}, but by another authority: "
+            "copy the whole folder from where it was made"
         ) from error
-    names = [str(name.value) for name in certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)]
+    names = [
+        str(name.value) for name in certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
+    ]
     role = next((role for role in get_args(Role) if [role] == names), None)
     if role is None:
         raise AccessError(
@@ -70,20 +76,27 @@ def identity_in(folder: Path) -> Identity:
 
 
 def checked_identity(connection: Connection, now: datetime | None = None) -> str:
-    """Check the files that one end of a session shows, and say if they end soon, else "". Raises AccessError."""
+    """Check the files that one end of a session shows, and say if they end soon, else "". Raises
+    AccessError."""
     folder = Path(connection.tls)
     found = identity_in(folder)
     now = datetime.now(UTC) if now is None else now
     if found.role != connection.role:
-        raise AccessError(f"{folder} is of the role {found.role}, and this needs {connection.role}: see `cosim certs`")
+        raise AccessError(
+            f"{folder} is of the role {found.role}, and this needs {connection.role}: see "
+            f"`cosim certs`"
+        )
     if connection.listen and not found.hosts:
         raise AccessError(f"{folder / CERTIFICATE} names no host: make it anew with --host")
     renew = f"`cosim certs role ... {found.role} --renew` makes another"
     if now > found.ends:
-        raise AccessError(f"{folder} has expired on {said(found.ends)} (here it is {said(now)}): {renew}")
+        raise AccessError(
+            f"{folder} has expired on {said(found.ends)} (here it is {said(now)}): {renew}"
+        )
     if now < found.begins:
         raise AccessError(
-            f"{folder} is valid from {said(found.begins)}, and here it is {said(now)}: is this machine's clock right?"
+            f"{folder} is valid from {said(found.begins)}, and here it is {said(now)}: is "
+            f"this machine's clock right?"
         )
     return f"{folder} expires on {said(found.ends)}: {renew}." if found.ends - now < SOON else ""
 
@@ -110,7 +123,9 @@ def _read(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except OSError as error:
-        raise AccessError(f"{path}: cannot be read: {error.strerror}: `cosim certs` makes such a folder") from error
+        raise AccessError(
+            f"{path}: cannot be read: {error.strerror}: `cosim certs` makes such a folder"
+        ) from error
 
 
 def _hosts(certificate: x509.Certificate) -> tuple[str, ...]:

@@ -1,4 +1,5 @@
-"""Why a TLS connection was refused: by another handshake, because Zenoh only says that it timed out."""
+"""Why a TLS connection was refused: by another handshake, because Zenoh only says that it timed
+out."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ _OF_THE_HUB: Final = {
     20: _OTHER_AUTHORITY,
     26: "is not of one who listens: a coordinator, a director or a policy server",
     62: "is not for the name {host}: connect to a name of it, or make it anew with --host {host}",
-    64: "is not for the address {host}: connect to a name of it, or make it anew with --host {host}",
+    64: "is not for the address {host}: connect to a name of it, or make it anew with --host "
+    "{host}",
 }
 """By OpenSSL's numbers (X509_V_ERR_...)."""
 _OF_OURS: Final = {
@@ -39,7 +41,8 @@ _OF_OURS: Final = {
 def why_refused(connection: Connection) -> str:
     """Why the other side and this one do not agree; "" where nobody answers, or they do agree."""
     host, _, port = connection.connect.partition("/")[2].rpartition(":")
-    host, folder = host.strip("[]"), Path(connection.tls)
+    host = host.strip("[]")
+    folder = Path(connection.tls)
     try:
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         context.load_verify_locations(folder / CA)
@@ -48,7 +51,9 @@ def why_refused(connection: Connection) -> str:
             socket.create_connection((host, int(port)), timeout=_PATIENCE_S) as plain,
             context.wrap_socket(plain, server_hostname=host) as guarded,
         ):
-            guarded.recv(1)  # what TLS 1.3 has against a client's certificate is said after the handshake
+            guarded.recv(
+                1
+            )  # what TLS 1.3 has against a client's certificate is said after the handshake
     except ssl.SSLCertVerificationError as error:
         words = _OF_THE_HUB.get(error.verify_code, f"was refused: {error.verify_message}")
         return f"the certificate of {connection.connect} {words.format(host=host, folder=folder)}"
@@ -56,7 +61,10 @@ def why_refused(connection: Connection) -> str:
         for name, words in _OF_OURS.items():
             if (error.reason or "").endswith(name):
                 return f"{connection.connect} refused us: the certificate in {folder} {words}"
-        return f"{connection.connect} does not answer as TLS does ({error.reason}): is it there as tls/...?"
+        return (
+            f"{connection.connect} does not answer as TLS does ({error.reason}): is it there as "
+            f"tls/...?"
+        )
     except OSError:
         return ""
     return ""

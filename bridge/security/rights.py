@@ -1,8 +1,10 @@
-"""Who may do what on a hub: by the role that a certificate names, and by the way that somebody came.
+"""Who may do what on a hub: by the role that a certificate names, and by the way that somebody
+came.
 
-What no row allows is refused: only the run itself, which comes by a socket of its own (`Session.inside`), tells where
-robot and crowd are, and only the hub gives out episodes. Where there are no certificates (TCP of this machine, or
---insecure) everybody may do what all roles that belong at such a hub may do together, and no more.
+What no row allows is refused: only the run itself, which comes by a socket of its own
+(`Session.inside`), tells where robot and crowd are, and only the hub gives out episodes. Where
+there are no certificates (TCP of this machine, or --insecure) everybody may do what all roles that
+belong at such a hub may do together, and no more.
 """
 
 from __future__ import annotations
@@ -15,8 +17,9 @@ _ENV = "cosim/*/env/*"
 
 
 class _Rights(NamedTuple):
-    """words: what they are, for whoever reads them. The rest are key expressions. ask: may be asked; hear: what is told
-    there is heard; answer: may be answered on; show: tokens of being alive may be shown."""
+    """words: what they are, for whoever reads them. The rest are key expressions. ask: may be
+    asked; hear: what is told there is heard; answer: may be answered on; show: tokens of being
+    alive may be shown."""
 
     words: str
     ask: tuple[str, ...] = ()
@@ -26,11 +29,19 @@ class _Rights(NamedTuple):
 
 
 RIGHTS: Final[dict[Role, _Rights]] = {
-    "coordinator": _Rights("ask policies and directors", ask=("cosim/*/policy/**", f"{_ENV}/director")),
+    "coordinator": _Rights(
+        "ask policies and directors", ask=("cosim/*/policy/**", f"{_ENV}/director")
+    ),
     "director": _Rights("nothing elsewhere"),
     "worker": _Rights(
         "take episodes and tell their results, ask policies and directors",
-        ask=("cosim/*/status", "cosim/*/jobs/*", "cosim/*/nets/*", "cosim/*/policy/**", f"{_ENV}/director"),
+        ask=(
+            "cosim/*/status",
+            "cosim/*/jobs/*",
+            "cosim/*/nets/*",
+            "cosim/*/policy/**",
+            f"{_ENV}/director",
+        ),
         show=("cosim/*/workers/*",),
     ),
     "policy": _Rights("answer as a policy", answer=("cosim/*/policy/**",)),
@@ -50,24 +61,37 @@ _ADMITTED: Final[dict[Role, tuple[Role, ...]]] = {
 _LARGEST_B: Final = {
     64 << 10: (f"{_ENV}/inject", "cosim/*/jobs/claim"),
     1 << 20: (f"{_ENV}/director", "cosim/*/jobs/failed"),
-    1 << 10: ("cosim/*/status", "cosim/*/nets/*", *(f"{_ENV}/{key}" for key in ("status", "log", "camera"))),
+    1 << 10: (
+        "cosim/*/status",
+        "cosim/*/nets/*",
+        *(f"{_ENV}/{key}" for key in ("status", "log", "camera")),
+    ),
 }
 """Longer messages are dropped unread. All others are bounded by what a session takes at all."""
 _ALL: Final = (
-    "put", "delete", "declare_subscriber", "query", "declare_queryable", "reply", "liveliness_token",
-    "declare_liveliness_subscriber", "liveliness_query",
-)  # fmt: skip
+    "put",
+    "delete",
+    "declare_subscriber",
+    "query",
+    "declare_queryable",
+    "reply",
+    "liveliness_token",
+    "declare_liveliness_subscriber",
+    "liveliness_query",
+)
 
 
 def access_of(connection: Connection) -> dict[str, object]:
-    """Zenoh's settings for a hub: whom it lets do what, and how long their messages may be. Of one that listens at a
-    Unix socket: none, because the file's permissions decide who comes."""
+    """Zenoh's settings for a hub: whom it lets do what, and how long their messages may be. Of one
+    that listens at a Unix socket: none, because the file's permissions decide who comes."""
     if connection.listen.startswith("unixsock-stream/"):
         return {}
     guests = _ADMITTED[connection.role]
     rules = [_rule("inside", flow, _ALL, ("**",)) for flow in ("ingress", "egress")]
     subjects: list[dict[str, object]] = [{"id": "inside", "link_protocols": ["unixsock-stream"]}]
-    policies: list[dict[str, object]] = [{"rules": ["inside ingress", "inside egress"], "subjects": ["inside"]}]
+    policies: list[dict[str, object]] = [
+        {"rules": ["inside ingress", "inside egress"], "subjects": ["inside"]}
+    ]
     if not connection.tls:
         subjects.append({"id": "anybody", "link_protocols": ["tcp"]})
     for role in guests:
@@ -75,12 +99,23 @@ def access_of(connection: Connection) -> dict[str, object]:
         rules += theirs
         if connection.tls:
             subjects.append({"id": role, "cert_common_names": [role], "link_protocols": ["tls"]})
-        policies.append({"rules": [rule["id"] for rule in theirs], "subjects": [role if connection.tls else "anybody"]})
+        policies.append(
+            {
+                "rules": [rule["id"] for rule in theirs],
+                "subjects": [role if connection.tls else "anybody"],
+            }
+        )
     limits = [
-        {"id": f"{size_b} bytes", "flows": ["ingress"], "link_protocols": ["tcp", "tls"], "messages": ["put", "query"],
-         "key_exprs": list(keys), "size_limit": size_b}
+        {
+            "id": f"{size_b} bytes",
+            "flows": ["ingress"],
+            "link_protocols": ["tcp", "tls"],
+            "messages": ["put", "query"],
+            "key_exprs": list(keys),
+            "size_limit": size_b,
+        }
         for size_b, keys in _LARGEST_B.items()
-    ]  # fmt: skip
+    ]
     control = {
         "enabled": True,
         "default_permission": "deny",
@@ -106,8 +141,14 @@ def _rules(role: Role) -> list[dict[str, object]]:
     return [rule for rule in rules if rule["key_exprs"]]
 
 
-def _rule(name: str, flow: str, messages: tuple[str, ...], keys: tuple[str, ...]) -> dict[str, object]:
+def _rule(
+    name: str, flow: str, messages: tuple[str, ...], keys: tuple[str, ...]
+) -> dict[str, object]:
     named = f"{name} {flow}" if name == "inside" else name
     return {
-        "id": named, "flows": [flow], "permission": "allow", "messages": list(messages), "key_exprs": list(keys)
-    }  # fmt: skip
+        "id": named,
+        "flows": [flow],
+        "permission": "allow",
+        "messages": list(messages),
+        "key_exprs": list(keys),
+    }

@@ -1,4 +1,5 @@
-"""How a session is set: over the endpoints that are named, found by nobody else, with no memory shared."""
+"""How a session is set: over the endpoints that are named, found by nobody else, with no memory
+shared."""
 
 from __future__ import annotations
 
@@ -24,7 +25,12 @@ CONNECTS_WITHIN_S: Final = 2.0
 
 def settings_alone() -> dict[str, object]:
     """Of a session with nobody else in it, by Zenoh's names of settings."""
-    return _ALWAYS | {"mode": "peer", "listen/endpoints": [], "connect/endpoints": [], "connect/timeout_ms": 0}
+    return _ALWAYS | {
+        "mode": "peer",
+        "listen/endpoints": [],
+        "connect/endpoints": [],
+        "connect/timeout_ms": 0,
+    }
 
 
 def settings_of(connection: Connection, own: Sequence[str] = ()) -> dict[str, object]:

@@ -1,4 +1,5 @@
-"""The command line, put together: each command stands in a file of its own, in the room of its subject."""
+"""The command line, put together: each command stands in a file of its own, in the room of its
+subject."""
 
 from __future__ import annotations
 
@@ -8,39 +9,22 @@ from typing import Annotated, NoReturn
 import typer
 from rich.markup import escape
 
-from cosim.cli.bench.bench import bench_app
-from cosim.cli.installation.cache import cache_app
-from cosim.cli.installation.verify import installation_app
-from cosim.cli.network.certs import certs_app
-from cosim.cli.network.direct import direct_app
-from cosim.cli.network.live import live_app
-from cosim.cli.network.serve import serve_app
-from cosim.cli.options.file_path import with_paths_checked
-from cosim.cli.options.panels import LEARN, MEASURE, PLACES, STEP_IN
-from cosim.cli.pictures.export import export_app
-from cosim.cli.pictures.film import film_app
-from cosim.cli.pictures.look import look_app
-from cosim.cli.places.city import city_app
-from cosim.cli.places.map import map_app
-from cosim.cli.policies.check import policy_app
-from cosim.cli.results.compare import compare_app
-from cosim.cli.results.report import report_app
-from cosim.cli.results.score import score_app
-from cosim.cli.results.show import show_app
-from cosim.cli.runs.collect import collect_app
-from cosim.cli.runs.coordinator import coordinator_app
-from cosim.cli.runs.counterfactual import counterfactual_app
-from cosim.cli.runs.dataset import dataset_app
-from cosim.cli.runs.merge import merge_app
-from cosim.cli.runs.replay import replay_app
-from cosim.cli.runs.run import run_app
-from cosim.cli.runs.status import status_app
-from cosim.cli.runs.train import train_app
-from cosim.cli.suites.catalog import list_app
-from cosim.cli.suites.scenario import scenario_app
-from cosim.cli.suites.suite import suite_app
-from cosim.cli.terminal.consoles import err
-from cosim.cli.terminal.streams import told_streams
+from cosim.cli.bench import bench_app
+from cosim.cli.collect import collect_app, dataset_app
+from cosim.cli.console import err, told_streams
+from cosim.cli.installation import cache_app, installation_app
+from cosim.cli.network import certs_app, direct_app, live_app, serve_app
+from cosim.cli.options import LEARN, MEASURE, PLACES, STEP_IN, with_paths_checked
+from cosim.cli.pictures import export_app, film_app, look_app
+from cosim.cli.places import city_app, map_app
+from cosim.cli.policy import policy_app
+from cosim.cli.replay import counterfactual_app, replay_app
+from cosim.cli.results import compare_app, merge_app, report_app, score_app, show_app
+from cosim.cli.run import run_app
+from cosim.cli.scenario import scenario_app
+from cosim.cli.suites import list_app, suite_app
+from cosim.cli.train import train_app
+from cosim.cli.workers import coordinator_app, status_app
 from cosim.core.cache import cache_limit_bytes
 from cosim.core.errors import CosimError, of_file
 
@@ -51,10 +35,10 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
     help="Sidewalk-navigation benchmark: SUMO crowds, a PyBullet robot, Zenoh between them.",
-    epilog="Examples:  \n`cosim run long-horizon --policy route --episodes 2`  \n`cosim COMMAND --help`\n\n"
-    "Exit codes: 0 done, of a run: all is scored; 1 ended, but not all is scored, or a check has failed; 2 wrong use "
-    "or bad input; 3 the machine or an engine; 130 interrupted, by Ctrl-C or SIGTERM: what is finished is kept; 141 "
-    "nobody read what it printed.",
+    epilog="Examples:  \n`cosim run long-horizon --policy route --episodes 2`  \n`cosim COMMAND "
+    "--help`\n\nExit codes: 0 done, of a run: all is scored; 1 ended, but not all is scored, or a "
+    "check has failed; 2 wrong use or bad input; 3 the machine or an engine; 130 interrupted, by "
+    "Ctrl-C or SIGTERM: what is finished is kept; 141 nobody read what it printed.",
 )
 for commands in (
     *(run_app, list_app, show_app, installation_app, cache_app),
@@ -84,15 +68,20 @@ def _say_versions(asked: bool) -> None:
 @app.callback()
 def common(
     version: Annotated[
-        bool, typer.Option("--version", callback=_say_versions, is_eager=True, help="Say the versions and end.")
+        bool,
+        typer.Option(
+            "--version", callback=_say_versions, is_eager=True, help="Say the versions and end."
+        ),
     ] = False,
 ) -> None:
-    """Options of `cosim` itself. A limit of the cache that is none is refused before anything is made."""
+    """Options of `cosim` itself. A limit of the cache that is none is refused before anything is
+    made."""
     cache_limit_bytes()
 
 
 def main() -> None:
-    """Run the command line. SIGTERM ends it as Ctrl-C does: exit code 130, nothing half-written is left."""
+    """Run the command line. SIGTERM ends it as Ctrl-C does: exit code 130, nothing half-written is
+    left."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with told_streams():
         try:

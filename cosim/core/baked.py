@@ -1,7 +1,9 @@
-"""Arrays that take long to make, kept: made once on a machine, then mapped into memory and shared by its processes.
+"""Arrays that take long to make, kept: made once on a machine, then mapped into memory and shared
+by its processes.
 
-They lie in the cache folder under a name that says what they depend on: the source that makes them and the libraries
-it stands on. What is damaged is made anew; a cache that cannot be written is done without, and that is said.
+They lie in the cache folder under a name that says what they depend on: the source that makes them
+and the libraries it stands on. What is damaged is made anew; a cache that cannot be written is done
+without, and that is said.
 """
 
 from __future__ import annotations
@@ -30,8 +32,8 @@ _MADE_WITH: Final = ("numpy", "opencv-python-headless", "pybullet", "scipy", "sh
 
 
 def sources_hash(*rooms: Path) -> str:
-    """16 hex digits of the sources in some folders and of the libraries. To be asked for when those are imported: who
-    edits them later does not change what this process makes."""
+    """16 hex digits of the sources in some folders and of the libraries. To be asked for when those
+    are imported: who edits them later does not change what this process makes."""
     seen = hashlib.sha256(" ".join(version(package) for package in _MADE_WITH).encode())
     for room in rooms:
         for source in sorted(room.rglob("*.py")):
@@ -42,7 +44,8 @@ def sources_hash(*rooms: Path) -> str:
 def baked(name: str, made_by: str, make: Callable[[], Arrays]) -> Arrays:
     """What `make` makes, write-protected: from the cache, else made now and kept.
 
-    name: of the file name, with everything `make` was told; made_by: the `sources_hash` of what it is made by.
+    name: of the file name, with everything `make` was told; made_by: the `sources_hash` of what it
+    is made by.
     """
     folder = cache_folder() / _FOLDER / f"{name}-{made_by}"
     use_entry(folder)

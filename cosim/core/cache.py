@@ -1,11 +1,13 @@
 """The cache folder: what lies in it, how large it may become, and what is forgotten.
 
-An entry is a file or a folder that can be made again: a city's net, a street map that was read, the tiles of a place,
-baked arrays. Entries are forgotten when they were not used for a month, and those used longest ago when the folder is
-larger than its limit. Imported maps count for the limit and are never forgotten.
+An entry is a file or a folder that can be made again: a city's net, a street map that was read, the
+tiles of a place, baked arrays. Entries are forgotten when they were not used for a month, and those
+used longest ago when the folder is larger than its limit. Imported maps count for the limit and are
+never forgotten.
 
-What a living process uses stays. Each process lists its entries in a file that it holds locked for its life; an entry
-of such a list that was used within the last hour is in use. Entries are listed, and taken away, under one lock.
+What a living process uses stays. Each process lists its entries in a file that it holds locked for
+its life; an entry of such a list that was used within the last hour is in use. Entries are listed,
+and taken away, under one lock.
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ MAKING: Final = ".making-"
 LIMIT_VARIABLE: Final = "COSIM_CACHE_LIMIT"
 """The environment variable with the limit in GB."""
 _DEFAULT_GB: Final = 4.0
-"""Nets and street maps of the hundred cities of the suites take 1 GB of it; the rest is for tiles and maps."""
+"""Nets and street maps of the hundred cities of the suites take 1 GB of it; the rest is for tiles
+and maps."""
 GB: Final = 10**9
 UNUSED_S: Final = 30 * 86400.0
 """Entries that were not used for longer than this are forgotten."""
@@ -43,7 +46,8 @@ _IN_USE_S: Final = 3600.0
 _LEFT_OVER_S: Final = 3600.0
 """What is half made for longer than this belongs to a process that was killed."""
 _LOOK_EVERY_S: Final = 60.0
-"""A process that writes looks for what to forget at first, and then no sooner than after this time."""
+"""A process that writes looks for what to forget at first, and then no sooner than after this
+time."""
 _FORGOTTEN: Final = ".forgotten-"
 _LISTS: Final = ".in-use"
 _LOCK: Final = ".lock"
@@ -52,7 +56,8 @@ _MOST_DEAD: Final = 32
 
 
 class CacheKind(NamedTuple):
-    """A kind of things in the cache. pattern: of their paths; words: what they are; stays: they are never forgotten."""
+    """A kind of things in the cache. pattern: of their paths; words: what they are; stays: they are
+    never forgotten."""
 
     name: str
     pattern: str
@@ -63,7 +68,9 @@ class CacheKind(NamedTuple):
 CACHE_KINDS: Final = (
     CacheKind("street maps", "read/*", "what was read from nets"),
     CacheKind("cities", "*.net.xml", "nets built from a seed"),
-    CacheKind("tiles", "tiles/*", "ground, buildings and furniture of places, as far as robots came"),
+    CacheKind(
+        "tiles", "tiles/*", "ground, buildings and furniture of places, as far as robots came"
+    ),
     CacheKind("baked", "baked/*", "textures, skies, motions of people"),
     CacheKind("maps", "maps/*", "imported maps, and places that come with SUMO", stays=True),
     CacheKind("times", "pace.jsonl", "how long episodes took here", stays=True),
@@ -71,7 +78,8 @@ CACHE_KINDS: Final = (
 
 
 class CacheEntry(NamedTuple):
-    """An entry of the cache: the bytes of the disk that it takes, and when it was last used, seconds of the epoch."""
+    """An entry of the cache: the bytes of the disk that it takes, and when it was last used,
+    seconds of the epoch."""
 
     path: Path
     kind: CacheKind
@@ -91,19 +99,24 @@ class Forgotten(NamedTuple):
 
 
 def cache_folder() -> Path:
-    """Return where what was made is kept: $COSIM_CACHE, else the user's cache folder (~/.cache/sidewalk-cosim)."""
+    """Return where what was made is kept: $COSIM_CACHE, else the user's cache folder
+    (~/.cache/sidewalk-cosim)."""
     return Path(os.environ.get("COSIM_CACHE") or user_cache_path("sidewalk-cosim"))
 
 
 def cache_limit_bytes() -> int:
-    """Return the limit of the cache folder: $COSIM_CACHE_LIMIT in GB, else 4 GB. Raises UsageError."""
+    """Return the limit of the cache folder: $COSIM_CACHE_LIMIT in GB, else 4 GB. Raises
+    UsageError."""
     text = os.environ.get(LIMIT_VARIABLE) or f"{_DEFAULT_GB:g}"
     try:
         limit_gb = float(text)
     except ValueError:
         limit_gb = math.nan
     if not 0.0 <= limit_gb < math.inf:
-        raise UsageError(f"{LIMIT_VARIABLE} is '{text}': give a number of GB from 0 on, like {_DEFAULT_GB:g} or 0.5")
+        raise UsageError(
+            f"{LIMIT_VARIABLE} is '{text}': give a number of GB from 0 on, like "
+            f"{_DEFAULT_GB:g} or 0.5"
+        )
     return round(limit_gb * GB)
 
 
@@ -119,8 +132,10 @@ def use_entry(entry: Path) -> None:
 
 
 def make_room() -> None:
-    """Forget entries, to be called before one is kept: now and then, because it takes as long as to make a few."""
-    folder, now_s = cache_folder(), time.monotonic()
+    """Forget entries, to be called before one is kept: now and then, because it takes as long as to
+    make a few."""
+    folder = cache_folder()
+    now_s = time.monotonic()
     if now_s - _looked_s.get(folder, -math.inf) >= _LOOK_EVERY_S:
         _looked_s[folder] = now_s
         forget_entries()
@@ -131,9 +146,10 @@ _looked_s: Final[dict[Path, float]] = {}
 
 
 def forget_entries(unused_s: float = UNUSED_S, limit_bytes: int | None = None) -> Forgotten:
-    """Take away entries that were not used for so long, those used longest ago beyond the limit, and what killed
-    processes have left half made. limit_bytes: by default `cache_limit_bytes`."""
-    folder, now_s = cache_folder(), time.time()
+    """Take away entries that were not used for so long, those used longest ago beyond the limit,
+    and what killed processes have left half made. limit_bytes: by default `cache_limit_bytes`."""
+    folder = cache_folder()
+    now_s = time.time()
     room = cache_limit_bytes() if limit_bytes is None else limit_bytes
     _sweep(folder, now_s)
     doomed: list[CacheEntry] = []
@@ -175,7 +191,8 @@ class _Uses:
         lists = folder / _LISTS
         lists.mkdir(parents=True, exist_ok=True)
         crowded = sum(1 for _ in os.scandir(lists)) > _MOST_DEAD
-        self._folder, self._listed = folder, set[str]()
+        self._folder = folder
+        self._listed = set[str]()
         with _locked(folder, fcntl.LOCK_EX if crowded else fcntl.LOCK_SH):
             if crowded:
                 _remove_dead(lists)
@@ -209,13 +226,18 @@ def _locked(folder: Path, how: int) -> Iterator[None]:
 
 
 def _taken_away(folder: Path, doomed: list[CacheEntry]) -> Forgotten:
-    """Move entries aside that are still as unused as they were, then remove them. Two processes do it in turn."""
-    gone, kept = [], []
+    """Move entries aside that are still as unused as they were, then remove them. Two processes do
+    it in turn."""
+    gone = []
+    kept = []
     try:
         with contextlib.ExitStack() as stack:
-            aside = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix=_FORGOTTEN, dir=folder)))
+            aside = Path(
+                stack.enter_context(tempfile.TemporaryDirectory(prefix=_FORGOTTEN, dir=folder))
+            )
             with _locked(folder, fcntl.LOCK_EX):
-                listed, now_s = _listed_by_the_living(folder / _LISTS), time.time()
+                listed = _listed_by_the_living(folder / _LISTS)
+                now_s = time.time()
                 for number, entry in enumerate(doomed):
                     used_s = _used_s(entry.path)
                     name = entry.path.relative_to(folder).as_posix()
@@ -240,7 +262,8 @@ def _listed_by_the_living(lists: Path) -> set[str]:
 
 
 def _remove_dead(lists: Path) -> None:
-    """Remove the lists that no process holds locked. To be called by who holds the cache's lock alone."""
+    """Remove the lists that no process holds locked. To be called by who holds the cache's lock
+    alone."""
     for path in lists.iterdir() if lists.is_dir() else ():
         with suppress(OSError), path.open("ab") as file:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -254,8 +277,15 @@ def _remove_own(path: Path, pid: int) -> None:
 
 
 def _sweep(folder: Path, now_s: float) -> None:
-    """Remove what killed processes have left half made. That of imports is removed by `sumo_nets.maps.scratch`."""
-    for pattern in (f"{_FORGOTTEN}*", ".building-*", "read/.writing-*", f"tiles/{MAKING}*", f"baked/{MAKING}*"):
+    """Remove what killed processes have left half made. That of imports is removed by
+    `sumo_nets.maps.scratch`."""
+    for pattern in (
+        f"{_FORGOTTEN}*",
+        ".building-*",
+        "read/.writing-*",
+        f"tiles/{MAKING}*",
+        f"baked/{MAKING}*",
+    ):
         for path in folder.glob(pattern):
             if now_s - _used_s(path) > _LEFT_OVER_S:
                 _remove(path)

@@ -1,4 +1,5 @@
-"""Integer time. A tick is one step of the crowd; the policy acts every few ticks; physics runs substeps.
+"""Integer time. A tick is one step of the crowd; the policy acts every few ticks; physics runs
+substeps.
 
 The simulation never reads a wall clock; a `Pacer` can hold it back to one.
 """
@@ -29,12 +30,14 @@ class Clock:
         if min(self.tick_ms, self.substep_ms, self.policy_ms) <= 0:
             raise SpecError(f"periods must be positive: {self}")
         if self.tick_ms % self.substep_ms:
-            raise SpecError(f"a tick of {self.tick_ms} ms is no whole number of {self.substep_ms} ms substeps")
+            raise SpecError(
+                f"a tick of {self.tick_ms} ms is no whole number of {self.substep_ms} ms substeps"
+            )
         if self.policy_ms % self.tick_ms:
             rates = ", ".join(f"{1000 // n}" for n in (250, 200, 100, 50))
             raise SpecError(
-                f"a policy period of {self.policy_ms} ms is no whole number of {self.tick_ms} ms ticks; "
-                f"usual policy rates are {rates} Hz"
+                f"a policy period of {self.policy_ms} ms is no whole number of {self.tick_ms} ms "
+                f"ticks; usual policy rates are {rates} Hz"
             )
 
     @classmethod
@@ -73,12 +76,13 @@ class Clock:
 class Pacer:
     """Holds a simulation back to a multiple of real time.
 
-    pace: simulated seconds for each second of the wall clock. clock, sleep: that wall clock, and how to wait, in
-    seconds.
+    pace: simulated seconds for each second of the wall clock. clock, sleep: that wall clock, and
+    how to wait, in seconds.
     """
 
     CATCH_UP_S: Final = 1.0
-    """A simulation that fell behind, because a policy thought or the machine was busy, makes up for so much at most."""
+    """A simulation that fell behind, because a policy thought or the machine was busy, makes up for
+    so much at most."""
 
     def __init__(
         self,
@@ -86,7 +90,9 @@ class Pacer:
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        self._pace, self._clock, self._sleep = pace, clock, sleep
+        self._pace = pace
+        self._clock = clock
+        self._sleep = sleep
         self._due_s: float | None = None
 
     def wait(self, simulated_s: float) -> None:

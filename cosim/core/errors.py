@@ -1,17 +1,16 @@
 """The errors of the project, in one tree, and the exit codes of the command line, one meaning each.
 
-CosimError                what a user can mend: shown as one message
-├── UsageError         2  a name or an option that does not exist, a policy that cannot be loaded
-├── SpecError          2  a scenario, suite or place that contradicts itself (also a ValueError)
-├── MapError           2  a street net that cannot be read or built
-├── RunError           2  a run folder that is locked, broken or of another run
-├── AccessError        2  certificates that do not fit, or a right that is lacking
-├── PolicyError        1  a policy that raised, or answered with something unusable
-├── EngineError        3  SUMO, PyBullet or Zenoh failed or was misused
-│   ├── DirectorLost   3  the director of the event pedestrians did not answer
-│   ├── RendererLost   3  the shared renderer has ended
-│   └── PolicyServerLost 3  the server of a remote policy has ended, or does not know an episode any more
-└── MachineError       3  a full disk, a folder that cannot be written, a library or program that is missing
+CosimError                what a user can mend: shown as one message ├── UsageError         2  a
+name or an option that does not exist, a policy that cannot be loaded ├── SpecError          2  a
+scenario, suite or place that contradicts itself (also a ValueError) ├── MapError           2  a
+street net that cannot be read or built ├── RunError           2  a run folder that is locked,
+broken or of another run ├── AccessError        2  certificates that do not fit, or a right that is
+lacking ├── PolicyError        1  a policy that raised, or answered with something unusable ├──
+EngineError        3  SUMO, PyBullet or Zenoh failed or was misused │   ├── DirectorLost   3  the
+director of the event pedestrians did not answer │   ├── RendererLost   3  the shared renderer has
+ended │   └── PolicyServerLost 3  the server of a remote policy has ended, or does not know an
+episode any more └── MachineError       3  a full disk, a folder that cannot be written, a library
+or program that is missing
 """
 
 from __future__ import annotations
@@ -30,10 +29,12 @@ WRONG_USE = 2
 BROKEN_MACHINE = 3
 INTERRUPTED = 130
 UNREAD = 141
-"""Nobody reads standard output any more; shells give this code to a program that a closed pipe has ended."""
+"""Nobody reads standard output any more; shells give this code to a program that a closed pipe has
+ended."""
 
 MOST_LISTED = 30
-"""Of more valid choices than these, five are listed: those most like what was asked for, else the first."""
+"""Of more valid choices than these, five are listed: those most like what was asked for, else the
+first."""
 
 
 _MOST_LETTERS = 100
@@ -82,7 +83,8 @@ class RunError(CosimError):
 
 
 class AccessError(CosimError):
-    """Certificates that do not fit, or a right that this end of a session lacks: trying again changes nothing."""
+    """Certificates that do not fit, or a right that this end of a session lacks: trying again
+    changes nothing."""
 
     exit_code = WRONG_USE
 
@@ -104,20 +106,26 @@ class DirectorLost(EngineError):
 
 
 class RendererLost(EngineError):
-    """The shared renderer has ended, or left this environment. number: which renderer of the run it was, 0 where that
-    is unknown; asked: what its policy was being asked for this environment, as "act at 3.20 s", "" if nothing."""
+    """The shared renderer has ended, or left this environment. number: which renderer of the run it
+    was, 0 where that is unknown; asked: what its policy was being asked for this environment, as
+    "act at 3.20 s", "" if nothing."""
 
     def __init__(self, number: int, asked: str = "") -> None:
-        super().__init__("the shared renderer has ended: its log in logs/ of the run folder says more")
-        self.number, self.asked = number, asked
+        super().__init__(
+            "the shared renderer has ended: its log in logs/ of the run folder says more"
+        )
+        self.number = number
+        self.asked = asked
 
 
 class PolicyServerLost(EngineError):
-    """The server of a remote policy is gone, or was begun anew: what it knew of the episode is lost."""
+    """The server of a remote policy is gone, or was begun anew: what it knew of the episode is
+    lost."""
 
 
 class MachineError(CosimError):
-    """The machine lacks something: room on the disk, a folder that can be written, a library, a program."""
+    """The machine lacks something: room on the disk, a folder that can be written, a library, a
+    program."""
 
     exit_code = BROKEN_MACHINE
 
@@ -126,22 +134,36 @@ def too_long(path: str | Path) -> UsageError:
     """The error for the path of a file or folder that no file system takes."""
     size = max(len(os.fsencode(part)) for part in Path(path).parts)
     shown = str(path) if len(str(path)) <= _SHOWN_LETTERS else f"{str(path)[:_SHOWN_LETTERS]}..."
-    what = f"a name in it has {size} bytes" if size > _LONGEST_NAME_BYTES else f"it has {len(os.fsencode(path))} bytes"
+    what = (
+        f"a name in it has {size} bytes"
+        if size > _LONGEST_NAME_BYTES
+        else f"it has {len(os.fsencode(path))} bytes"
+    )
     return UsageError(
-        f"{shown}: the path is too long: {what}. A name may have {_LONGEST_NAME_BYTES} bytes, and a path "
-        f"{_LONGEST_PATH_BYTES}: choose a shorter one"
+        f"{shown}: the path is too long: {what}. A name may have {_LONGEST_NAME_BYTES} bytes, and "
+        f"a path {_LONGEST_PATH_BYTES}: choose a shorter one"
     )
 
 
 def of_file(error: OSError) -> CosimError:
-    """The error for a file that the system refuses, where nothing more is known of it than its path."""
-    name = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else str(error.filename)
-    return too_long(name) if error.errno == errno.ENAMETOOLONG else MachineError(f"{name}: {error.strerror}")
+    """The error for a file that the system refuses, where nothing more is known of it than its
+    path."""
+    name = (
+        os.fsdecode(error.filename)
+        if isinstance(error.filename, str | bytes)
+        else str(error.filename)
+    )
+    return (
+        too_long(name)
+        if error.errno == errno.ENAMETOOLONG
+        else MachineError(f"{name}: {error.strerror}")
+    )
 
 
 def unwritable(path: Path, error: OSError, remedy: str = "") -> MachineError | UsageError:
-    """The error for a file or folder that cannot be written. Where its path leads through a file, or is one and should
-    be a folder, that is the reason; and unless there is a remedy, another path is. Its name may be too long."""
+    """The error for a file or folder that cannot be written. Where its path leads through a file,
+    or is one and should be a folder, that is the reason; and unless there is a remedy, another path
+    is. Its name may be too long."""
     if error.errno == errno.ENAMETOOLONG:
         return too_long(path)
     reason = error.strerror or str(error)
@@ -149,20 +171,30 @@ def unwritable(path: Path, error: OSError, remedy: str = "") -> MachineError | U
         for file in (path, *path.parents):
             if file.is_file():
                 reason = f"{file} is a file, no folder"
-                beside = f"like {file.parent / path.relative_to(file)}" if file != path else "with another name"
+                beside = (
+                    f"like {file.parent / path.relative_to(file)}"
+                    if file != path
+                    else "with another name"
+                )
                 remedy = remedy or f"choose a place beside it, {beside}"
                 break
-    return MachineError(f"{path}: cannot be written: {reason}: {remedy or 'choose another place, or make room'}")
+    return MachineError(
+        f"{path}: cannot be written: {reason}: {remedy or 'choose another place, or make room'}"
+    )
 
 
 def unknown(what: str, name: str, choices: Iterable[str]) -> UsageError:
-    """The error for a `name` that is none of the `choices`, which it lists: unknown("suite", "x", ["unit"])."""
+    """The error for a `name` that is none of the `choices`, which it lists: unknown("suite", "x",
+    ["unit"])."""
     valid = sorted(choices)
-    return UsageError(f"unknown {what} '{name}'. Valid choices: {listed(name, valid)}.{nearest(name, valid)}")
+    return UsageError(
+        f"unknown {what} '{name}'. Valid choices: {listed(name, valid)}.{nearest(name, valid)}"
+    )
 
 
 def listed(name: str, choices: Iterable[str]) -> str:
-    """All choices, or of many how many there are, and those most like the name: "a, b", "312, among them a, b"."""
+    """All choices, or of many how many there are, and those most like the name: "a, b", "312, among
+    them a, b"."""
     valid = sorted(choices)
     if len(valid) <= MOST_LISTED:
         return ", ".join(valid) or "none"
@@ -171,6 +203,7 @@ def listed(name: str, choices: Iterable[str]) -> str:
 
 
 def nearest(name: str, valid: Iterable[str]) -> str:
-    """The question whether the valid name most like this one was meant; "" where none is like it."""
+    """The question whether the valid name most like this one was meant; "" where none is like
+    it."""
     near = get_close_matches(name[:_MOST_LETTERS], sorted(valid), n=1, cutoff=0.5)
     return f" Did you mean {near[0]}?" if near else ""

@@ -64,8 +64,8 @@ def heading_to_sumo(heading_rad: float) -> float:
 class Polyline:
     """An open polyline measured by arc length.
 
-    points: (N, 2) metres, N >= 2; consecutive equal points are dropped. Raises ValueError when fewer than
-    two distinct points remain.
+    points: (N, 2) metres, N >= 2; consecutive equal points are dropped. Raises ValueError when
+    fewer than two distinct points remain.
     """
 
     def __init__(self, points: ArrayLike) -> None:
@@ -89,19 +89,24 @@ class Polyline:
 
     def at(self, s_m: float) -> Pose:
         """The pose at arc length `s_m` (clamped to the ends), heading along the polyline."""
-        i = min(max(int(np.searchsorted(self.s_m, s_m, side="right")) - 1, 0), len(self._lengths) - 1)
+        i = min(
+            max(int(np.searchsorted(self.s_m, s_m, side="right")) - 1, 0), len(self._lengths) - 1
+        )
         along = min(max(s_m - self.s_m[i], 0.0), self._lengths[i])
         x, y = self.points[i] + along * self._directions[i]
         dx, dy = self._directions[i]
         return Pose(float(x), float(y), math.atan2(dy, dx))
 
-    def project(self, x_m: float, y_m: float, near_s_m: tuple[float, float] | None = None) -> tuple[float, float]:
+    def project(
+        self, x_m: float, y_m: float, near_s_m: tuple[float, float] | None = None
+    ) -> tuple[float, float]:
         """Nearest point of the polyline: (arc length, signed offset, left positive), in metres.
 
-        near_s_m: search only the segments that touch this interval of arc length. A route that passes near
-        itself is projected unambiguously only with it.
+        near_s_m: search only the segments that touch this interval of arc length. A route that
+        passes near itself is projected unambiguously only with it.
         """
-        first, last = 0, len(self._lengths)
+        first = 0
+        last = len(self._lengths)
         if near_s_m is not None:
             first = max(bisect_right(self.s_m, near_s_m[0]) - 1, 0)
             last = min(bisect_left(self.s_m, near_s_m[1]), last)
@@ -120,11 +125,15 @@ class Polyline:
         """The same line with a point about every `step_m` metres; the ends stay."""
         count = max(round(self.length_m / step_m), 1)
         s = np.linspace(0.0, self.length_m, count + 1)
-        xy = np.column_stack([np.interp(s, self.s_m, self.points[:, 0]), np.interp(s, self.s_m, self.points[:, 1])])
+        xy = np.column_stack(
+            [np.interp(s, self.s_m, self.points[:, 0]), np.interp(s, self.s_m, self.points[:, 1])]
+        )
         return Polyline(xy)
 
 
-def box_disk_gap(poses: Floats, half_length_m: float, half_width_m: float, centres: Floats) -> Floats:
+def box_disk_gap(
+    poses: Floats, half_length_m: float, half_width_m: float, centres: Floats
+) -> Floats:
     """Distance from oriented boxes to points; 0 inside.
 
     poses: (T, 3) x, y, heading of the box's centre. centres: (T, N, 2) or (1, N, 2) metres.
@@ -137,11 +146,13 @@ def box_disk_gap(poses: Floats, half_length_m: float, half_width_m: float, centr
     return np.hypot(np.maximum(ahead, 0.0), np.maximum(aside, 0.0))
 
 
-def boxes_overlap(pose_a: Floats, half_a: ArrayLike, pose_b: Floats, half_b: ArrayLike) -> NDArray[np.bool_]:
+def boxes_overlap(
+    pose_a: Floats, half_a: ArrayLike, pose_b: Floats, half_b: ArrayLike
+) -> NDArray[np.bool_]:
     """Whether oriented boxes overlap, by the separating-axis theorem.
 
-    pose_a, pose_b: (..., 3) x, y, heading. half_a, half_b: (..., 2) half length, half width, metres.
-    Returns the broadcast shape of booleans.
+    pose_a, pose_b: (..., 3) x, y, heading. half_a, half_b: (..., 2) half length, half width,
+    metres. Returns the broadcast shape of booleans.
     """
     pose_a, pose_b = np.asarray(pose_a, float), np.asarray(pose_b, float)
     half_a, half_b = np.asarray(half_a, float), np.asarray(half_b, float)

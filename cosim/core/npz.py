@@ -1,7 +1,7 @@
 """Arrays from an .npz file that others made: read within bounds, or refused in words.
 
-Sizes are looked at before anything is read: neither a sparse file nor a few bytes that unpack to gigabytes fill the
-memory. Objects (pickle) are never unpacked.
+Sizes are looked at before anything is read: neither a sparse file nor a few bytes that unpack to
+gigabytes fill the memory. Objects (pickle) are never unpacked.
 """
 
 from __future__ import annotations
@@ -23,12 +23,27 @@ from cosim.core.whole_file import size_within
 MOST_NPZ_BYTES: Final = 2 << 30
 _MOST_ARRAYS: Final = 4096
 _ENDING: Final = ".npy"
-_HEADERS: Final = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+_HEADERS: Final = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
 NO_NPZ: Final = (
-    EOFError, KeyError, MemoryError, NotImplementedError, OverflowError, RuntimeError, SyntaxError, TypeError,
-    ValueError, struct.error, zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error,
-)  # fmt: skip
-"""What zipfile and numpy raise where a file is damaged, encrypted, packed otherwise, or not one of theirs."""
+    EOFError,
+    KeyError,
+    MemoryError,
+    NotImplementedError,
+    OverflowError,
+    RuntimeError,
+    SyntaxError,
+    TypeError,
+    ValueError,
+    struct.error,
+    zipfile.BadZipFile,
+    zipfile.LargeZipFile,
+    zlib.error,
+)
+"""What zipfile and numpy raise where a file is damaged, encrypted, packed otherwise, or not one of
+theirs."""
 
 
 def read_npz(
@@ -36,8 +51,8 @@ def read_npz(
 ) -> dict[str, NDArray[Any]]:
     """The arrays of a file, by name. only: of these names, each of which must be there.
 
-    Raises ValueError, which says what is wrong: no regular file, no .npz, cut off, damaged, objects in it, or more than
-    `most_bytes`, packed or unpacked. OSError passes.
+    Raises ValueError, which says what is wrong: no regular file, no .npz, cut off, damaged, objects
+    in it, or more than `most_bytes`, packed or unpacked. OSError passes.
     """
     size_within(path, most_bytes)
     with path.open("rb") as file:
@@ -45,7 +60,8 @@ def read_npz(
 
 
 def names_in_npz(path: Path) -> list[str]:
-    """The names of the arrays of a file, which are not read. Raises ValueError for what is no .npz; OSError passes."""
+    """The names of the arrays of a file, which are not read. Raises ValueError for what is no .npz;
+    OSError passes."""
     try:
         with zipfile.ZipFile(path) as held:
             return [name.removesuffix(_ENDING) for name in held.namelist()]
@@ -63,7 +79,10 @@ def arrays_in(
             size = sum(one.file_size for one in held.infolist())
             if size > most_bytes or len(held.infolist()) > _MOST_ARRAYS:
                 count = len(held.infolist())
-                raise ValueError(f"unpacks to {count} arrays of {size} bytes; at most {most_bytes} bytes are read")
+                raise ValueError(
+                    f"unpacks to {count} arrays of {size} bytes; at most {most_bytes} bytes "
+                    f"are read"
+                )
             if lacking := sorted({*(only or ())} - entries.keys()):
                 raise ValueError(f"has no array '{lacking[0]}'")
             names = [name for name in entries if only is None or name in only]
@@ -81,7 +100,10 @@ def _array(name: str, data: bytes) -> NDArray[Any]:
         raise ValueError(f"'{name}' is of another version of .npy: {version}")
     shape, by_columns, dtype = _HEADERS[version](file)
     if dtype.hasobject:
-        raise ValueError(f"'{name}' holds objects of Python, which are never unpacked: save it as an array of numbers")
+        raise ValueError(
+            f"'{name}' holds objects of Python, which are never unpacked: save it as an "
+            f"array of numbers"
+        )
     size = len(data) - file.tell()
     if math.prod(shape) * dtype.itemsize != size:
         raise ValueError(f"'{name}' should hold {shape} of {dtype}, and has {size} bytes")

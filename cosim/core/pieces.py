@@ -1,8 +1,9 @@
-"""Many small sets of arrays that belong together, kept: a file for each, in a folder named by what they depend on.
+"""Many small sets of arrays that belong together, kept: a file for each, in a folder named by what
+they depend on.
 
-Like what `cosim.core.baked` keeps, they are made once on a machine, sealed by a hash and made anew where they are
-damaged; a cache that cannot be written is done without. They are read, not mapped: there may be more than a process
-may have open.
+Like what `cosim.core.baked` keeps, they are made once on a machine, sealed by a hash and made anew
+where they are damaged; a cache that cannot be written is done without. They are read, not mapped:
+there may be more than a process may have open.
 """
 
 from __future__ import annotations
@@ -30,8 +31,9 @@ _Table = list[tuple[str, bytes, tuple[int, ...], int]]
 
 
 class Pieces:
-    """The pieces of one thing. kind: of things, names the folder that all of the kind lie in; made_of: a hash of all
-    that they depend on, "" where that is not known: then each is made when it is asked for, and none kept."""
+    """The pieces of one thing. kind: of things, names the folder that all of the kind lie in;
+    made_of: a hash of all that they depend on, "" where that is not known: then each is made when
+    it is asked for, and none kept."""
 
     def __init__(self, kind: str, made_of: str) -> None:
         self._folder = cache_folder() / kind / made_of if made_of else None
@@ -104,7 +106,9 @@ def _read(path: Path) -> Arrays:
     size = int.from_bytes(data[_SEAL_BYTES : _SEAL_BYTES + 4], "little")
     table = msgspec.msgpack.decode(held[_SEAL_BYTES + 4 : _SEAL_BYTES + 4 + size], type=_Table)
     start = _start(size)
-    return {name: np.ndarray(shape, _dtype(kind), data, start + at) for name, kind, shape, at in table}
+    return {
+        name: np.ndarray(shape, _dtype(kind), data, start + at) for name, kind, shape, at in table
+    }
 
 
 def _start(head_bytes: int) -> int:
@@ -115,4 +119,8 @@ def _start(head_bytes: int) -> int:
 @lru_cache(maxsize=64)
 def _dtype(kind: bytes) -> np.dtype[Any]:
     told = msgspec.json.decode(kind)
-    return np.dtype(told if isinstance(told, str) else [(name, one, *map(tuple, shape)) for name, one, *shape in told])
+    return np.dtype(
+        told
+        if isinstance(told, str)
+        else [(name, one, *map(tuple, shape)) for name, one, *shape in told]
+    )

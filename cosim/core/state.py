@@ -1,6 +1,7 @@
 """Snapshots of a moment: frozen values that travel between the engines.
 
-Arrays are write-protected; positions are world metres, headings radians counter-clockwise from +x, speeds m/s.
+Arrays are write-protected; positions are world metres, headings radians counter-clockwise from +x,
+speeds m/s.
 """
 
 from __future__ import annotations
@@ -20,12 +21,13 @@ PERSON_RADIUS_M = 0.3
 """Radius of every pedestrian's collision cylinder."""
 
 Doing = Literal["walk", "stand", "look", "talk", "queue", "stop", "phone", "sit"]
-"""What a pedestrian's body shows: walking, standing, looking around, talking, queueing, the stopping hand, reading a
-phone, sitting on a seat behind the place where it is."""
+"""What a pedestrian's body shows: walking, standing, looking around, talking, queueing, the
+stopping hand, reading a phone, sitting on a seat behind the place where it is."""
 
 
 class PersonKind(IntEnum):
-    """Whose a person is: of the background crowd, of an event, a resident (`CrowdSpec.residents`), or injected."""
+    """Whose a person is: of the background crowd, of an event, a resident (`CrowdSpec.residents`),
+    or injected."""
 
     CROWD = 0
     EVENT = 1
@@ -45,7 +47,9 @@ class Age(IntEnum):
     ELDERLY = 2
 
 
-def write_protected(array: Any, dtype: Any = np.float64, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
+def write_protected(
+    array: Any, dtype: Any = np.float64, shape: tuple[int, ...] | None = None
+) -> NDArray[Any]:
     """A write-protected copy of `array`."""
     copy = np.array(array, dtype=dtype)
     if shape is not None:
@@ -61,10 +65,11 @@ def frozen(array: NDArray[Any]) -> NDArray[Any]:
 
 @dataclass(frozen=True, slots=True)
 class RobotState:
-    """The robot: pose of the base centre on the ground plane, body speeds, height and tilt of the base.
+    """The robot: pose of the base centre on the ground plane, body speeds, height and tilt of the
+    base.
 
-    v_mps along the heading, w_radps counter-clockwise; z_m height of the base frame; tilt_rad angle between the
-    base's up axis and the vertical.
+    v_mps along the heading, w_radps counter-clockwise; z_m height of the base frame; tilt_rad angle
+    between the base's up axis and the vertical.
     """
 
     pose: Pose
@@ -76,12 +81,12 @@ class RobotState:
 
 @dataclass(frozen=True, slots=True)
 class People:
-    """Pedestrians of a moment. ids: N unique names; xy (N, 2) m; heading (N,) rad; speed (N,) m/s. A name says nothing
-    of who has it: kind (N,) int8 of `PersonKind`, age (N,) int8 of `Age`.
+    """Pedestrians of a moment. ids: N unique names; xy (N, 2) m; heading (N,) rad; speed (N,) m/s.
+    A name says nothing of who has it: kind (N,) int8 of `PersonKind`, age (N,) int8 of `Age`.
 
-    strides (N,): strides taken so far, whose fraction is the phase of the gait; pace (N,) m/s: the speed that the body
-    shows, which follows the speed as one starts and stops (`cosim.people.gait`). Both are for pictures: nothing else
-    reads them."""
+    strides (N,): strides taken so far, whose fraction is the phase of the gait; pace (N,) m/s: the
+    speed that the body shows, which follows the speed as one starts and stops
+    (`cosim.people.gait`). Both are for pictures: nothing else reads them."""
 
     ids: tuple[str, ...]
     xy: Floats
@@ -106,8 +111,8 @@ class People:
         kind: Any = PersonKind.CROWD,
         age: Any = Age.ADULT,
     ) -> People:
-        """Without strides and pace: people at the beginning of a stride, at the pace of their speed. kind, age: of all
-        of them, or of each."""
+        """Without strides and pace: people at the beginning of a stride, at the pace of their
+        speed. kind, age: of all of them, or of each."""
         n = len(ids)
         return cls(
             ids,
@@ -151,7 +156,8 @@ class People:
 
 @dataclass(frozen=True, slots=True)
 class Vehicles:
-    """Vehicles of a moment. xy (N, 2) m is the centre of the box; size (N, 2) m is length, width."""
+    """Vehicles of a moment. xy (N, 2) m is the centre of the box; size (N, 2) m is length,
+    width."""
 
     ids: tuple[str, ...]
     xy: Floats
@@ -180,7 +186,8 @@ NO_VEHICLES = Vehicles.of((), [], [], [], [])
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """A crosswalk signal: may one walk, and in how many seconds does that change (None: unknown or never)."""
+    """A crosswalk signal: may one walk, and in how many seconds does that change (None: unknown or
+    never)."""
 
     walk: bool
     changes_in_s: float | None = None
@@ -190,8 +197,8 @@ class Signal:
 class Street:
     """Everything that moves or changes but the robot, at one tick.
 
-    signals: crossing id -> Signal, for the signalised crossings near the robot; a crossing that is absent has
-    no signal.
+    signals: crossing id -> Signal, for the signalised crossings near the robot; a crossing that is
+    absent has no signal.
     """
 
     tick: int
@@ -216,8 +223,8 @@ class Command:
 class Planned(Command):
     """The command that follows one of waypoints, with these.
 
-    waypoints: (N, 2) float32, x ahead and y left of the robot at its observation, metres; (N, 4) with the cosine and
-    the sine of the heading there. index: which one is followed.
+    waypoints: (N, 2) float32, x ahead and y left of the robot at its observation, metres; (N, 4)
+    with the cosine and the sine of the heading there. index: which one is followed.
     """
 
     waypoints: NDArray[np.float32]
@@ -240,8 +247,8 @@ class Contact:
 class Motion:
     """What one tick of physics did.
 
-    trace: (substeps, 3) x, y, heading of the robot after each substep. contacts: in order of substeps, at most
-    one for each (substep, other).
+    trace: (substeps, 3) x, y, heading of the robot after each substep. contacts: in order of
+    substeps, at most one for each (substep, other).
     """
 
     robot: RobotState
@@ -251,7 +258,8 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """What a camera saw. rgb (H, W, 3) uint8; labels (H, W) uint8 semantic ids; depth (H, W) float32 metres."""
+    """What a camera saw. rgb (H, W, 3) uint8; labels (H, W) uint8 semantic ids; depth (H, W)
+    float32 metres."""
 
     rgb: NDArray[np.uint8]
     labels: NDArray[np.uint8] | None = None
@@ -260,8 +268,20 @@ class Frame:
 
 LABELS: Mapping[str, int] = MappingProxyType(
     {
-        "sky": 0, "road": 1, "sidewalk": 2, "crosswalk": 3, "curb": 4, "verge": 5, "ground": 6, "building": 7,
-        "barrier": 8, "prop": 9, "person": 10, "vehicle": 11, "signal": 12, "robot": 13,
+        "sky": 0,
+        "road": 1,
+        "sidewalk": 2,
+        "crosswalk": 3,
+        "curb": 4,
+        "verge": 5,
+        "ground": 6,
+        "building": 7,
+        "barrier": 8,
+        "prop": 9,
+        "person": 10,
+        "vehicle": 11,
+        "signal": 12,
+        "robot": 13,
     }
-)  # fmt: skip
+)
 """Semantic ids of a camera's label picture."""

@@ -32,7 +32,8 @@ def milliseconds(ms: float) -> str:
 
 
 def bytes_in_words(count: float) -> str:
-    """A size in words, to three figures, in decimal units as disks have them: 812 B, 4.2 MB, 1.62 GB.
+    """A size in words, to three figures, in decimal units as disks have them: 812 B, 4.2 MB, 1.62
+    GB.
 
     >>> bytes_in_words(812), bytes_in_words(4_200_000), bytes_in_words(1_618_000_000)
     ('812 B', '4.2 MB', '1.62 GB')

@@ -1,4 +1,5 @@
-"""Files written whole or not at all, whenever a process dies; and files read whole, within bounds."""
+"""Files written whole or not at all, whenever a process dies; and files read whole, within
+bounds."""
 
 from __future__ import annotations
 
@@ -18,7 +19,8 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 def size_within(path: Path, most_bytes: int) -> int:
-    """How many bytes a file holds. Raises ValueError for more, and for a folder, a pipe or a device; OSError passes."""
+    """How many bytes a file holds. Raises ValueError for more, and for a folder, a pipe or a
+    device; OSError passes."""
     about = path.stat()
     if not stat.S_ISREG(about.st_mode):
         raise ValueError("is no regular file")

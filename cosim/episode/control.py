@@ -1,7 +1,7 @@
 """From a policy's answer to a command: checks, and the rules by which waypoints are followed.
 
-The rules follow D. Shah et al., GNM (ICRA 2023), ViNT (CoRL 2023), and A. Sridhar et al., NoMaD (ICRA 2024), as their
-robots are driven: one waypoint of the answer, to be reached in one time step.
+The rules follow D. Shah et al., GNM (ICRA 2023), ViNT (CoRL 2023), and A. Sridhar et al., NoMaD
+(ICRA 2024), as their robots are driven: one waypoint of the answer, to be reached in one time step.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 from cosim.core.errors import PolicyError
 from cosim.core.geometry import Floats
 from cosim.core.state import STILL, Command, Planned
-from cosim.episode.ports import WaypointRule
+from cosim.spec.manifest import WaypointRule
 from cosim.spec.robot import Robot
 
 EPS_M = 1e-8
@@ -30,11 +30,12 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 
 def _followed(x_m: float, y_m: float, heading_rad: float | None, rule: WaypointRule) -> Command:
-    """The command for one waypoint (x forward, y left), not yet clipped. heading_rad: the one it has, None for none.
+    """The command for one waypoint (x forward, y left), not yet clipped. heading_rad: the one it
+    has, None for none.
 
-    At the robot's own place the heading is turned to, without one nothing is done. One exactly at its side is turned to
-    by a quarter. Else v = x / dt, and w = arctan(y / x) / dt (`shipped`) or atan2(y, x) / dt (`atan2`): these differ
-    behind the robot alone.
+    At the robot's own place the heading is turned to, without one nothing is done. One exactly at
+    its side is turned to by a quarter. Else v = x / dt, and w = arctan(y / x) / dt (`shipped`) or
+    atan2(y, x) / dt (`atan2`): these differ behind the robot alone.
     """
     if abs(x_m) < EPS_M and abs(y_m) < EPS_M:
         return STILL if heading_rad is None else Command(0.0, heading_rad / rule.dt_s)
@@ -51,18 +52,20 @@ def clipped(command: Command, robot: Robot) -> Command:
 
 
 def command_of(answer: object, *, rule: WaypointRule, robot: Robot) -> Command:
-    """The clipped command in a policy's answer: a Command, or waypoints (N, 2) or (N, 4) of which one is followed, as a
-    Planned.
+    """The clipped command in a policy's answer: a Command, or waypoints (N, 2) or (N, 4) of which
+    one is followed, as a Planned.
 
-    Raises PolicyError, saying what was answered, for NaN, infinities, fewer waypoints than the rule needs, more than
-    MOST_NUMBERS numbers, and anything
-    that is not real numbers of that shape: truth values, texts and complex numbers are none.
+    Raises PolicyError, saying what was answered, for NaN, infinities, fewer waypoints than the rule
+    needs, more than MOST_NUMBERS numbers, and anything that is not real numbers of that shape:
+    truth values, texts and complex numbers are none.
     """
     if isinstance(answer, Command):
         speeds = (answer.v_mps, answer.w_radps)
         numbers = [_number(speed) for speed in speeds]
         if not all(map(math.isfinite, numbers)):
-            shown = ", ".join(f"{name}={_shown(s)}" for name, s in zip(("v_mps", "w_radps"), speeds, strict=True))
+            shown = ", ".join(
+                f"{name}={_shown(s)}" for name, s in zip(("v_mps", "w_radps"), speeds, strict=True)
+            )
             raise PolicyError(f"answered Command({shown}): both must be finite numbers")
         command = clipped(Command(*numbers), robot)
         if not isinstance(answer, Planned):
@@ -83,7 +86,8 @@ def _planned(command: Command, waypoints: Floats, index: int) -> Planned:
 
 
 def _waypoints(answer: object, index: int) -> Floats:
-    """Waypoints (N, 2) or (N, 4), a copy, all of which must be finite; more of them than `index`."""
+    """Waypoints (N, 2) or (N, 4), a copy, all of which must be finite; more of them than
+    `index`."""
     try:
         array = np.asarray(answer)
     except (TypeError, ValueError) as error:  # rows of different lengths
@@ -94,7 +98,10 @@ def _waypoints(answer: object, index: int) -> Floats:
         raise PolicyError(f"answered an array of {array.dtype.name}: waypoints are real numbers")
     check_numbers(array.shape)
     if array.ndim != 2 or array.shape[0] < 1 or array.shape[1] not in _COLUMNS:
-        raise PolicyError(f"answered an array of shape {array.shape}: waypoints have shape (N, 2) or (N, 4), N >= 1")
+        raise PolicyError(
+            f"answered an array of shape {array.shape}: waypoints have shape (N, 2) or (N, "
+            f"4), N >= 1"
+        )
     with np.errstate(over="ignore"):
         waypoints = array.astype(float)
     if not np.isfinite(waypoints).all():
@@ -102,23 +109,29 @@ def _waypoints(answer: object, index: int) -> Floats:
         raise PolicyError(f"answered waypoints with NaN or infinity: {first}")
     if len(waypoints) <= index:
         raise PolicyError(
-            f"answered waypoints of shape {array.shape}, and waypoint {index} (from 0) is followed: answer at least "
-            f"{index + 1}, or say which one in the manifest, as waypoints=WaypointRule(index={len(waypoints) - 1})"
+            f"answered waypoints of shape {array.shape}, and waypoint {index} (from 0) is "
+            f"followed: answer at least {index + 1}, or say which one in the manifest, as "
+            f"waypoints=WaypointRule(index={len(waypoints) - 1})"
         )
     return waypoints
 
 
 def check_numbers(shape: Sequence[int]) -> None:
-    """Raises PolicyError for an answer whose array of this shape holds more numbers than any may."""
+    """Raises PolicyError for an answer whose array of this shape holds more numbers than any
+    may."""
     if (count := math.prod(shape)) > MOST_NUMBERS:
-        shown = ", ".join(map(str, shape[:4])) + (", ..." if len(shape) > 4 else "," * (len(shape) == 1))
+        shown = ", ".join(map(str, shape[:4])) + (
+            ", ..." if len(shape) > 4 else "," * (len(shape) == 1)
+        )
         raise PolicyError(
-            f"answered an array of shape ({shown}): {count} numbers; an answer holds at most {MOST_NUMBERS}"
+            f"answered an array of shape ({shown}): {count} numbers; an answer holds at most "
+            f"{MOST_NUMBERS}"
         )
 
 
 def _number(value: object) -> float:
-    """A real number as float, read once; NaN for anything else, and for what is beyond any float."""
+    """A real number as float, read once; NaN for anything else, and for what is beyond any
+    float."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.floating | np.integer):
         return math.nan
     try:
@@ -135,5 +148,7 @@ def _shown(value: object) -> str:
         text = repr(value)
     except Exception:  # noqa: BLE001  a repr may do anything
         return f"a {type(value).__name__}"
-    tells = len(text) <= _MOST_SHOWN and text.isprintable() and " at 0x" not in text  # an address is another every time
+    tells = (
+        len(text) <= _MOST_SHOWN and text.isprintable() and " at 0x" not in text
+    )  # an address is another every time
     return text if tells else f"a {type(value).__name__}"

@@ -1,6 +1,8 @@
-"""Goals of an episode: from the reference route and where the robot is to what its policy is told, and no more.
+"""Goals of an episode: from the reference route and where the robot is to what its policy is told,
+and no more.
 
-What is drawn comes from a generator of the goals' own. Nothing here knows of people, events or the street.
+What is drawn comes from a generator of the goals' own. Nothing here knows of people, events or the
+street.
 """
 
 from __future__ import annotations
@@ -53,8 +55,8 @@ def goals_for(
     size: tuple[int, int] = (0, 0),
     look: TakePicture | None = None,
 ) -> Goals:
-    """The goals of a scenario by a protocol. draws: what chance there is; size: width, height of the policy's pictures;
-    look: needed by `image`."""
+    """The goals of a scenario by a protocol. draws: what chance there is; size: width, height of
+    the policy's pictures; look: needed by `image`."""
     route = scenario.route_line
     if protocol == "random_point":
         return _RandomPoints(draws)
@@ -85,8 +87,9 @@ def seen_from(pose: Pose, point: Pose) -> PointGoal:
 
 
 class SubGoals:
-    """Which place of the route is the next sub-goal: one 20 m along it, kept until no more than 5 m are left to it, or
-    the robot was put back too far from it; the end of the route from 20 m before it.
+    """Which place of the route is the next sub-goal: one 20 m along it, kept until no more than 5 m
+    are left to it, or the robot was put back too far from it; the end of the route from 20 m before
+    it.
 
     >>> subgoals = SubGoals(100.0)
     >>> [subgoals.after(s_m) for s_m in (0.0, 14.0, 16.0, 85.0)]
@@ -94,7 +97,8 @@ class SubGoals:
     """
 
     def __init__(self, length_m: float) -> None:
-        self._length_m, self._s_m = length_m, math.nan
+        self._length_m = length_m
+        self._s_m = math.nan
 
     def after(self, route_s_m: float) -> float:
         """Its arc length, for a robot this far along the route."""
@@ -117,7 +121,8 @@ class _Plain:
 
 
 class _RandomPoints:
-    """Points of the paper: drawn in the robot's frame, then fixed in the street until reached, or no longer ahead."""
+    """Points of the paper: drawn in the robot's frame, then fixed in the street until reached, or
+    no longer ahead."""
 
     def __init__(self, draws: np.random.Generator) -> None:
         self._draws = draws
@@ -126,9 +131,13 @@ class _RandomPoints:
     def at(self, pose: Pose, route_s_m: float) -> PointGoal:
         goal = None if self._point is None else seen_from(pose, self._point)
         if goal is None or goal.distance_m <= _REACHED_M or goal.x_m <= 0.0:
-            ahead, aside = self._draws.uniform((_NEAREST_M, -_ASIDE_M), (_FARTHEST_M, _ASIDE_M)).tolist()
+            ahead, aside = self._draws.uniform(
+                (_NEAREST_M, -_ASIDE_M), (_FARTHEST_M, _ASIDE_M)
+            ).tolist()
             cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
-            self._point = Pose(pose.x_m + cos * ahead - sin * aside, pose.y_m + sin * ahead + cos * aside, 0.0)
+            self._point = Pose(
+                pose.x_m + cos * ahead - sin * aside, pose.y_m + sin * ahead + cos * aside, 0.0
+            )
             goal = PointGoal(ahead, aside)
         return goal
 
@@ -140,8 +149,11 @@ class _Images:
     """Pictures at the sub-goals, taken when they become the next ones, looking along the route."""
 
     def __init__(self, route: Polyline, look: TakePicture) -> None:
-        self._route, self._look, self._subgoals = route, look, SubGoals(route.length_m)
-        self._taken_s_m, self._goal = math.nan, ImageGoal(np.zeros((0, 0, 3), np.uint8))
+        self._route = route
+        self._look = look
+        self._subgoals = SubGoals(route.length_m)
+        self._taken_s_m = math.nan
+        self._goal = ImageGoal(np.zeros((0, 0, 3), np.uint8))
 
     def at(self, pose: Pose, route_s_m: float) -> ImageGoal:
         s_m = self._subgoals.after(route_s_m)
@@ -162,12 +174,16 @@ class Manoeuvre(NamedTuple):
 
 
 def manoeuvres(route: Polyline, crossings: Sequence[RouteCrossing] = ()) -> tuple[Manoeuvre, ...]:
-    """Turns and crosswalks of a route, in their order. A bend of less than 35 degrees within 12 m is none.
+    """Turns and crosswalks of a route, in their order. A bend of less than 35 degrees within 12 m
+    is none.
 
     >>> [(one.s_m, one.words) for one in manoeuvres(Polyline([(0, 0), (20, 0), (20, 20)]))]
     [(20.0, 'turn left')]
     """
-    found = [Manoeuvre(one.enter_s_m, one.leave_s_m, "cross the street at the crosswalk") for one in crossings]
+    found = [
+        Manoeuvre(one.enter_s_m, one.leave_s_m, "cross the street at the crosswalk")
+        for one in crossings
+    ]
     s_m = np.arange(1.0, route.length_m - 0.5)
     turns = np.array([_turn_at(route, s) for s in s_m.tolist()])
     bent = np.where(np.abs(turns) >= _BEND_RAD, np.sign(turns), 0.0)
@@ -184,12 +200,14 @@ def manoeuvres(route: Polyline, crossings: Sequence[RouteCrossing] = ()) -> tupl
 def _turn_at(route: Polyline, s_m: float) -> float:
     """How far the route turns around a place, to the left, in radians."""
     before, here, behind = (route.at(s).xy for s in (s_m - _ARM_M, s_m, s_m + _ARM_M))
-    (ax, ay), (bx, by) = (here - before).tolist(), (behind - here).tolist()
+    (ax, ay) = (here - before).tolist()
+    (bx, by) = (behind - here).tolist()
     return wrap_angle(math.atan2(by, bx) - math.atan2(ay, ax))
 
 
 def told_at(route_s_m: float, ways: Sequence[Manoeuvre]) -> str:
-    """The instruction at a place of a route: what is due there, and what comes next within 20 m, to 5 m.
+    """The instruction at a place of a route: what is due there, and what comes next within 20 m, to
+    5 m.
 
     >>> ways = manoeuvres(Polyline([(0, 0), (40, 0), (40, 20)]))
     >>> told_at(29.0, ways), told_at(39.0, ways)
@@ -209,12 +227,16 @@ def patch_around(pose: Pose, route: Floats) -> NDArray[np.uint8]:
     cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
     offset = route - pose.xy
     ahead_left = offset @ np.array([[cos, -sin], [sin, cos]])
-    at = 0.5 * (PATCH_PX - 1) - ahead_left / PATCH_M  # rows and columns, whole numbers in the middle of pixels
+    at = (
+        0.5 * (PATCH_PX - 1) - ahead_left / PATCH_M
+    )  # rows and columns, whole numbers in the middle of pixels
     low = np.maximum(np.ceil(np.minimum(at[:-1], at[1:]) - 1.0), 0.0).astype(int)
     high = np.minimum(np.floor(np.maximum(at[:-1], at[1:]) + 1.0) + 1.0, PATCH_PX).astype(int)
     pixels = np.zeros((PATCH_PX, PATCH_PX), np.uint8)
     for i in np.flatnonzero((low < high).all(axis=1)).tolist():
-        (top, left), (bottom, right), step = low[i], high[i], at[i + 1] - at[i]
+        (top, left) = low[i]
+        (bottom, right) = high[i]
+        step = at[i + 1] - at[i]
         off = np.moveaxis(np.mgrid[top:bottom, left:right], 0, -1) - at[i]
         along = np.clip(off @ step / max(float(step @ step), 1e-12), 0.0, 1.0)
         off -= along[..., None] * step

@@ -1,4 +1,5 @@
-"""The one tick that every episode is made of. No policy, no scoring, no recording, no drawing in it.
+"""The one tick that every episode is made of. No policy, no scoring, no recording, no drawing in
+it.
 
 A tick (0.05 s), robot and street as they are at its start:
 
@@ -6,7 +7,8 @@ A tick (0.05 s), robot and street as they are at its start:
     2 crowd     one step on, with the robot and the event pedestrians where they are now
     3 physics   ten substeps with the command; people and vehicles move evenly to their new places
 
-The crowd of a step has seen the robot one tick late, always; the robot's camera shows the street of its own tick.
+The crowd of a step has seen the robot one tick late, always; the robot's camera shows the street of
+its own tick.
 """
 
 from __future__ import annotations
@@ -16,7 +18,7 @@ from dataclasses import dataclass
 from cosim.core.clock import Clock
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import Command, Frame, RobotState, Street
-from cosim.episode.ports import Camera, Crowd, Director, World
+from cosim.episode.interfaces import Camera, Crowd, Director, World
 from cosim.episode.step import Reset, Step
 from cosim.people.neighbours import nearby_people
 from cosim.spec.events import EventQuery, EventState
@@ -38,7 +40,8 @@ class Parts:
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """An episode between two ticks. route_s_m: the robot's arc length on the route; states: of the events."""
+    """An episode between two ticks. route_s_m: the robot's arc length on the route; states: of the
+    events."""
 
     tick: int
     robot: RobotState
@@ -53,27 +56,46 @@ def begin(scenario: Scenario, parts: Parts) -> Moment:
 
 
 def tick(
-    scenario: Scenario, clock: Clock, parts: Parts, now: Moment, command: Command, frame: Frame | None = None
+    scenario: Scenario,
+    clock: Clock,
+    parts: Parts,
+    now: Moment,
+    command: Command,
+    frame: Frame | None = None,
 ) -> Step:
-    """All that happens in a tick. frame: what the policy saw before it gave the command, where it was asked now."""
+    """All that happens in a tick. frame: what the policy saw before it gave the command, where it
+    was asked now."""
     reply = parts.director.react(query(scenario, clock, now, parts.world.footprint_m))
     street_after = parts.crowd.step(now.robot, reply)
     motion = parts.world.step(command, now.street, street_after, clock.substeps)
     route_s_after_m = place_on_route(scenario.route_line, motion.robot.pose, now.route_s_m)
     return Step(
-        now.tick, now.robot, now.street, now.route_s_m, frame, command, reply, motion, street_after, route_s_after_m
+        now.tick,
+        now.robot,
+        now.street,
+        now.route_s_m,
+        frame,
+        command,
+        reply,
+        motion,
+        street_after,
+        route_s_after_m,
     )
 
 
 def after(step: Step, reset: Reset | None, parts: Parts) -> Moment:
     """The moment that a step leads to; a reset puts the robot elsewhere, at rest."""
-    robot, route_s_m = step.motion.robot, step.route_s_after_m
+    robot = step.motion.robot
+    route_s_m = step.route_s_after_m
     if reset is not None:
-        robot, route_s_m = parts.world.place(reset.pose), reset.route_s_m
+        robot = parts.world.place(reset.pose)
+        route_s_m = reset.route_s_m
     return Moment(step.tick + 1, robot, step.street_after, route_s_m, step.events.states)
 
 
-def query(scenario: Scenario, clock: Clock, now: Moment, footprint_m: tuple[float, float]) -> EventQuery:
+def query(
+    scenario: Scenario, clock: Clock, now: Moment, footprint_m: tuple[float, float]
+) -> EventQuery:
     """The question to the director at a tick."""
     return EventQuery(
         episode=scenario.id,
@@ -95,5 +117,7 @@ def query(scenario: Scenario, clock: Clock, now: Moment, footprint_m: tuple[floa
 
 def place_on_route(route: Polyline, pose: Pose, last_s_m: float) -> float:
     """Arc length of the robot on the route, searched near the last one."""
-    s_m, _ = route.project(pose.x_m, pose.y_m, (last_s_m - ROUTE_WINDOW_M, last_s_m + ROUTE_WINDOW_M))
+    s_m, _ = route.project(
+        pose.x_m, pose.y_m, (last_s_m - ROUTE_WINDOW_M, last_s_m + ROUTE_WINDOW_M)
+    )
     return s_m

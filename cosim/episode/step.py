@@ -1,4 +1,5 @@
-"""Step: all that happened in one tick, the value that the loop yields and everything else consumes."""
+"""Step: all that happened in one tick, the value that the loop yields and everything else
+consumes."""
 
 from __future__ import annotations
 
@@ -11,9 +12,11 @@ from cosim.spec.events import EventReply
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """One tick. robot, street, route_s_m: at its start; motion, street_after, route_s_after_m: at its end.
+    """One tick. robot, street, route_s_m: at its start; motion, street_after, route_s_after_m: at
+    its end.
 
-    frame: what the camera saw, on ticks on which the policy was asked. route_s_m: arc length on the route.
+    frame: what the camera saw, on ticks on which the policy was asked. route_s_m: arc length on the
+    route.
     """
 
     tick: int

@@ -1,1 +1,2 @@
-"""A small policy of one's own, learned from demonstrations: needs PyTorch, NumPy and onnx, and nothing else."""
+"""A small policy of one's own, learned from demonstrations: needs PyTorch, NumPy and onnx, and
+nothing else."""

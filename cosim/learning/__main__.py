@@ -1,4 +1,5 @@
-"""`python -m cosim.learning` is `cosim train`, in a Python that has PyTorch, NumPy and onnx and nothing else."""
+"""`python -m cosim.learning` is `cosim train`, in a Python that has PyTorch, NumPy and onnx and
+nothing else."""
 
 from __future__ import annotations
 
@@ -15,10 +16,14 @@ def _main() -> None:
     """Train by the words of the command line."""
     parser = argparse.ArgumentParser(prog="python -m cosim.learning", description=trained.__doc__)
     default = Training()
-    parser.add_argument("data", nargs="+", type=Path, help="packed demonstrations: cosim dataset pack")
+    parser.add_argument(
+        "data", nargs="+", type=Path, help="packed demonstrations: cosim dataset pack"
+    )
     parser.add_argument("-o", "--out", type=Path, required=True, help="the folder of the bundle")
     parser.add_argument("--from", dest="begin", type=Path, help="a bundle to train on from")
-    parser.add_argument("--steps", type=int, help=f"in all; by default {PLANNED_STEPS}, or as planned before")
+    parser.add_argument(
+        "--steps", type=int, help=f"in all; by default {PLANNED_STEPS}, or as planned before"
+    )
     parser.add_argument("--seed", type=int, default=default.seed)
     parser.add_argument("--batch", type=int, default=default.batch)
     parser.add_argument("--rate", type=float, default=default.rate)
@@ -29,7 +34,13 @@ def _main() -> None:
     words = vars(parser.parse_args())
     data, out, resume = words.pop("data"), words.pop("out"), words.pop("resume")
     try:
-        whole = trained(data, out, Training(**words), resume, lambda line: print(line, file=sys.stderr, flush=True))
+        whole = trained(
+            data,
+            out,
+            Training(**words),
+            resume,
+            lambda line: print(line, file=sys.stderr, flush=True),
+        )
     except CosimError as error:
         raise SystemExit(f"error: {error}") from None
     raise SystemExit(0 if whole else SOME_CRASHED)

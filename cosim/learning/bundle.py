@@ -1,4 +1,5 @@
-"""The bundle of a trained network: `model.onnx`, `manifest.json`, `example.npz`, as `--policy onnx:FOLDER` takes it."""
+"""The bundle of a trained network: `model.onnx`, `manifest.json`, `example.npz`, as `--policy
+onnx:FOLDER` takes it."""
 
 from __future__ import annotations
 
@@ -49,12 +50,16 @@ def bundle_facts(folder: Path) -> BundleFacts:
         path = folder / "manifest.json"
         return BundleFacts(str(json.loads(path.read_bytes())["name"]), digest)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise RunError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error!r}") from error
+        raise RunError(
+            f"{path}: cannot be read: {getattr(error, 'strerror', None) or error!r}"
+        ) from error
 
 
-def write_bundle(folder: Path, parameters: Parameters, examples: Examples, name: str, source: str) -> None:
-    """Write it, with the first held-out example. source: what it was made of. Raises RunError where the graph does not
-    answer as the network does, or what it answers is no number."""
+def write_bundle(
+    folder: Path, parameters: Parameters, examples: Examples, name: str, source: str
+) -> None:
+    """Write it, with the first held-out example. source: what it was made of. Raises RunError where
+    the graph does not answer as the network does, or what it answers is no number."""
     graph = graph_of(parameters)
     batch = examples.rows(examples.held_out[:1])
     inputs = {key: getattr(batch, key).cpu().numpy().astype(np.float32) for key in INPUTS}
@@ -63,7 +68,10 @@ def write_bundle(folder: Path, parameters: Parameters, examples: Examples, name:
         wanted = plan(answers(held, *(torch.from_numpy(inputs[key]) for key in INPUTS))).numpy()
     off = float(np.abs(run_graph(graph, inputs) - wanted).max())
     if not off <= _TOLERANCE:
-        raise RunError(f"{folder}: the graph answers {off:g} otherwise than the network: train anew, at a lower --rate")
+        raise RunError(
+            f"{folder}: the graph answers {off:g} otherwise than the network: train anew, at "
+            f"a lower --rate"
+        )
     example = io.BytesIO()
     np.savez_compressed(example, **{**inputs, f"expected.{PLAN}": wanted})
     manifest = {**manifest_of(name, examples.meta, source), "files": {MODEL: _facts(graph)}}
@@ -79,7 +87,9 @@ def _facts(data: bytes) -> dict[str, Any]:
 
 def source_of(meta: dict[str, Any], seed: int, begun: BundleFacts | None = None) -> str:
     """What a network was made of, by what the demonstrations say of themselves."""
-    experts, learners = (", ".join(dict.fromkeys(filter(None, meta[name]))) for name in ("policy", "learner"))
+    experts, learners = (
+        ", ".join(dict.fromkeys(filter(None, meta[name]))) for name in ("policy", "learner")
+    )
     taught = f", and would have done where {learners} drove" if learners else ""
     return f"cosim train, seed {seed}, on what {experts} drove{taught}" + (
         f"; begun with {begun.name}" if begun else ""
@@ -88,7 +98,10 @@ def source_of(meta: dict[str, Any], seed: int, begun: BundleFacts | None = None)
 
 def manifest_of(name: str, meta: dict[str, Any], source: str) -> dict[str, Any]:
     """What the graph wants and answers, by what the demonstrations say of themselves."""
-    camera = {field: meta["camera"].get(field) for field in ("width", "height", "fov_deg", "mount", "crop")}
+    camera = {
+        field: meta["camera"].get(field)
+        for field in ("width", "height", "fov_deg", "mount", "crop")
+    }
     return {
         "format": 1,
         "name": name,
@@ -106,7 +119,12 @@ def manifest_of(name: str, meta: dict[str, Any], source: str) -> dict[str, Any]:
                 "size": [WIDTH_PX, HEIGHT_PX],
                 "layout": "N(TC)HW",
             },
-            "goal": {"what": "goal_point", "values": ["x", "y"], "unit_m": GOAL_UNIT_M, "most_m": GOAL_MOST_M},
+            "goal": {
+                "what": "goal_point",
+                "values": ["x", "y"],
+                "unit_m": GOAL_UNIT_M,
+                "most_m": GOAL_MOST_M,
+            },
             "speeds": {
                 "what": "speeds",
                 "values": ["v", "w"],

@@ -1,4 +1,5 @@
-"""The curve of a training, a row for each look at the held-out episodes: a file and a picture. Needs no PyTorch."""
+"""The curve of a training, a row for each look at the held-out episodes: a file and a picture.
+Needs no PyTorch."""
 
 from __future__ import annotations
 
@@ -14,12 +15,16 @@ PICTURE: Final = "curve.png"
 
 def write_curve(folder: Path, curve: Sequence[Mapping[str, float]]) -> None:
     """Write the rows as `curve.csv`. OSError passes."""
-    lines = [",".join(curve[0]), *(",".join(f"{value:.6g}" for value in row.values()) for row in curve)]
+    lines = [
+        ",".join(curve[0]),
+        *(",".join(f"{value:.6g}" for value in row.values()) for row in curve),
+    ]
     write_whole(folder / CURVE, ("\n".join(lines) + "\n").encode())
 
 
 def draw_curve(folder: Path) -> None:
-    """Draw `curve.csv` as `curve.png`: losses, and errors of the held-out episodes, by step. Needs matplotlib."""
+    """Draw `curve.csv` as `curve.png`: losses, and errors of the held-out episodes, by step. Needs
+    matplotlib."""
     import matplotlib as mpl
 
     mpl.use("Agg")

@@ -1,4 +1,5 @@
-"""The network as an ONNX graph: written node by node from its parameters, and these read back out of one."""
+"""The network as an ONNX graph: written node by node from its parameters, and these read back out
+of one."""
 
 from __future__ import annotations
 
@@ -26,7 +27,11 @@ from cosim.learning.network import (
     turns_radps,
 )
 
-INPUTS: Final = {"pictures": (1, 3 * HISTORY, HEIGHT_PX, WIDTH_PX), "goal": (1, 2), "speeds": (1, 2)}
+INPUTS: Final = {
+    "pictures": (1, 3 * HISTORY, HEIGHT_PX, WIDTH_PX),
+    "goal": (1, 2),
+    "speeds": (1, 2),
+}
 PLAN: Final = "plan"
 _OPSET: Final = 17
 _IR: Final = 8
@@ -39,7 +44,8 @@ class _Writer:
     def __init__(self, parameters: Parameters) -> None:
         self.nodes: list[Any] = []
         self.constants = [
-            numpy_helper.from_array(value.detach().cpu().float().numpy(), name) for name, value in parameters.items()
+            numpy_helper.from_array(value.detach().cpu().float().numpy(), name)
+            for name, value in parameters.items()
         ]
 
     def made(self, kind: str, inputs: Sequence[str], output: str = "", **attributes: Any) -> str:
@@ -63,9 +69,12 @@ class _Writer:
 
 
 def graph_of(parameters: Parameters) -> bytes:
-    """The graph, its inputs and output as `network.answers` and `network.plan` have them, for one at a time."""
+    """The graph, its inputs and output as `network.answers` and `network.plan` have them, for one
+    at a time."""
     g = _Writer(parameters)
-    x = g.made("Mul", [g.made("Sub", ["pictures", g.constant("grey", 0.5)]), g.constant("contrast", 4.0)])
+    x = g.made(
+        "Mul", [g.made("Sub", ["pictures", g.constant("grey", 0.5)]), g.constant("contrast", 4.0)]
+    )
     for name, size in (("stem", 5), ("down1", 3), ("down2", 3)):
         x = g.relu(g.convolved(x, name, size))
     x = g.made("Add", [x, g.convolved(g.relu(g.convolved(x, "block2a")), "block2b")])
@@ -78,7 +87,11 @@ def graph_of(parameters: Parameters) -> bytes:
 
     sharp = g.made("Mul", [g.linear(joined, "turn"), g.constant("sharpness", SHARPNESS)])
     turn = g.made(
-        "MatMul", [g.made("Softmax", [sharp], axis=1), g.constant("turns", turns_radps().reshape(-1, 1).numpy())]
+        "MatMul",
+        [
+            g.made("Softmax", [sharp], axis=1),
+            g.constant("turns", turns_radps().reshape(-1, 1).numpy()),
+        ],
     )
     speed = g.made("Mul", [g.relu(g.linear(joined, "speed")), g.constant("cruise", CRUISE_MPS)])
     both = g.made("Concat", [speed, turn], axis=1)
@@ -98,7 +111,9 @@ def graph_of(parameters: Parameters) -> bytes:
         [helper.make_tensor_value_info(PLAN, floats, (1, WAYPOINTS, 4))],
         g.constants,
     )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR)
+    model = helper.make_model(
+        graph, opset_imports=[helper.make_opsetid("", _OPSET)], ir_version=_IR
+    )
     onnx.checker.check_model(model, full_check=True)
     return bytes(model.SerializeToString())
 
@@ -118,8 +133,8 @@ def parameters_of(path: Path) -> dict[str, torch.Tensor]:
         if shape != tuple(like.shape):
             told = "is not there" if shape is None else f"has the shape {shape}"
             raise RunError(
-                f"{path}: {name} {told}, and is wanted as {tuple(like.shape)}: train on from a bundle that this "
-                "version of cosim train made"
+                f"{path}: {name} {told}, and is wanted as {tuple(like.shape)}: train on from a "
+                "bundle that this version of cosim train made"
             )
         found[name] = torch.from_numpy(np.array(held[name], np.float32))
     return found

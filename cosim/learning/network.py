@@ -1,10 +1,12 @@
-"""The network: what the camera saw of late, the goal and the robot's speeds -> a plan; parameters are a dictionary.
+"""The network: what the camera saw of late, the goal and the robot's speeds -> a plan; parameters
+are a dictionary.
 
-It has no normalisation layers, so that the graph that is shipped holds the same parameters as the one that is trained:
-any bundle can be trained on. Residual blocks begin as the identity instead.
+It has no normalisation layers, so that the graph that is shipped holds the same parameters as the
+one that is trained: any bundle can be trained on. Residual blocks begin as the identity instead.
 
-Its plan is (B, WAYPOINTS, 4): x ahead and y to the left in metres, speed in m/s, turn in rad/s, the same in every row.
-To stop is a decision of its own, and no small speed: where it is more likely than not all four are 0.
+Its plan is (B, WAYPOINTS, 4): x ahead and y to the left in metres, speed in m/s, turn in rad/s, the
+same in every row. To stop is a decision of its own, and no small speed: where it is more likely
+than not all four are 0.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ TURN_UNIT_RADPS: Final = 0.65
 CRUISE_MPS: Final = 1.5
 """The unit of the speeds that it answers."""
 TURN_BINS: Final = 27
-"""Ways to turn, evenly from all to the left to all to the right: past either side of a thing, not the mean of both."""
+"""Ways to turn, evenly from all to the left to all to the right: past either side of a thing, not
+the mean of both."""
 SHARPNESS: Final = 2.0
 """Of the odds of the bins before their mean is taken."""
 
@@ -56,15 +59,16 @@ _SHAPES: Final[Mapping[str, tuple[int, ...]]] = {
     "stop": (1, _MIDDLE),
     "way": (2 * WAYPOINTS, _MIDDLE),
 }
-"""Of the weights; of four axes: a convolution (out, in, high, wide), of two: a linear layer (out, in). Multiples of 16
-channels are what processors compute fastest."""
+"""Of the weights; of four axes: a convolution (out, in, high, wide), of two: a linear layer (out,
+in). Multiples of 16 channels are what processors compute fastest."""
 STRIDES: Final[Mapping[str, int]] = {"stem": 2, "down1": 2, "down2": 2, "down3": 2}
 """Of the convolutions; 1 where it is not said."""
 
 
 class Answers(NamedTuple):
-    """What the network says before it is made a plan. speed: (B,), in units of CRUISE_MPS, of a robot that does not
-    stop; turn: (B, TURN_BINS) log odds; stop: (B,) log odds; way: (B, WAYPOINTS, 2) m."""
+    """What the network says before it is made a plan. speed: (B,), in units of CRUISE_MPS, of a
+    robot that does not stop; turn: (B, TURN_BINS) log odds; stop: (B,) log odds; way: (B,
+    WAYPOINTS, 2) m."""
 
     speed: Tensor
     turn: Tensor
@@ -91,8 +95,8 @@ def turns_radps(device: str | torch.device = "cpu") -> Tensor:
 
 
 def answers(parameters: Parameters, pictures: Tensor, goal: Tensor, speeds: Tensor) -> Answers:
-    """pictures: (B, 3 HISTORY, HEIGHT_PX, WIDTH_PX), 0 to 1, oldest first. goal: (B, 2), x and y in GOAL_UNIT_M.
-    speeds: (B, 2), v less its mean and w, in their units."""
+    """pictures: (B, 3 HISTORY, HEIGHT_PX, WIDTH_PX), 0 to 1, oldest first. goal: (B, 2), x and y in
+    GOAL_UNIT_M. speeds: (B, 2), v less its mean and w, in their units."""
 
     def convolved(x: Tensor, name: str) -> Tensor:
         weight, bias = parameters[f"{name}.weight"], parameters[f"{name}.bias"]

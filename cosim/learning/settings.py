@@ -13,16 +13,16 @@ from cosim.core.errors import RunError, UsageError
 PLANNED_STEPS: Final = 20_000
 """A training has so many steps unless others are asked for."""
 _LOOKS: Final = 20
-"""The held-out episodes are looked at so often in a training, at least _STEPS_APART steps apart: a look takes as long
-as thirty steps or more."""
+"""The held-out episodes are looked at so often in a training, at least _STEPS_APART steps apart: a
+look takes as long as thirty steps or more."""
 _STEPS_APART: Final = 200
 _WARM_UP: Final = 0.03
 """The rate of learning rises during this share of the steps."""
 CPU_WHEEL: Final = "pip install torch --index-url https://download.pytorch.org/whl/cpu"
 """How PyTorch's own documentation installs the build without CUDA."""
 TO_INSTALL: Final = (
-    f"{CPU_WHEEL} (0.8 GB on disk; without --index-url pip installs the build for NVIDIA GPUs, 7 GB), then "
-    "pip install 'sidewalk-cosim[train]'"
+    f"{CPU_WHEEL} (0.8 GB on disk; without --index-url pip installs the build for NVIDIA GPUs, 7 "
+    "GB), then pip install 'sidewalk-cosim[train]'"
 )
 
 
@@ -30,10 +30,11 @@ TO_INSTALL: Final = (
 class Training:
     """How a training is done. Raises UsageError.
 
-    steps: in all, from the first one on; None for those of the training that is continued, else PLANNED_STEPS.
-    batch: examples a step. rate: the highest rate of learning. device: "" for the GPU if there is one.
-    begin: a bundle whose parameters it begins with; None for new ones. name: of the policy. minutes: it stops after so
-    long, with a bundle of what it has learned by then, and can be continued.
+    steps: in all, from the first one on; None for those of the training that is continued, else
+    PLANNED_STEPS. batch: examples a step. rate: the highest rate of learning. device: "" for the
+    GPU if there is one. begin: a bundle whose parameters it begins with; None for new ones. name:
+    of the policy. minutes: it stops after so long, with a bundle of what it has learned by then,
+    and can be continued.
     """
 
     steps: int | None = None
@@ -54,7 +55,9 @@ class Training:
     @property
     def spec(self) -> dict[str, Any]:
         """Return what must be the same when a training is continued."""
-        return {name: value for name, value in asdict(self).items() if name in ("seed", "batch", "rate")}
+        return {
+            name: value for name, value in asdict(self).items() if name in ("seed", "batch", "rate")
+        }
 
 
 class Reached(NamedTuple):
@@ -74,18 +77,25 @@ def looks_after(step: int, steps: int) -> bool:
 
 
 def rate_share(step: int, steps: int) -> float:
-    """Return the share of the highest rate by which a step learns: it rises, then falls as a cosine to 0 at the end."""
-    return min((step + 1) / max(1.0, _WARM_UP * steps), 0.5 * (1.0 + math.cos(math.pi * step / steps)))
+    """Return the share of the highest rate by which a step learns: it rises, then falls as a cosine
+    to 0 at the end."""
+    return min(
+        (step + 1) / max(1.0, _WARM_UP * steps), 0.5 * (1.0 + math.cos(math.pi * step / steps))
+    )
 
 
 def planned_steps(path: Path, asked: int | None, planned: int, done: int) -> int:
-    """Return how many steps a continued training has in all: those asked for, else those planned before.
+    """Return how many steps a continued training has in all: those asked for, else those planned
+    before.
 
     Raises RunError where more are done already.
     """
     steps = planned if asked is None else asked
     if steps < done:
-        raise RunError(f"{path}: {done} steps are done, and --steps asks for {steps} in all: give more than {done}")
+        raise RunError(
+            f"{path}: {done} steps are done, and --steps asks for {steps} in all: give more "
+            f"than {done}"
+        )
     return steps
 
 
@@ -93,11 +103,15 @@ def refuse_another(path: Path, was: Mapping[str, Any], spec: Mapping[str, Any]) 
     """Raise RunError with the differences where a checkpoint is of another training."""
     if different := [name for name in spec if was.get(name) != spec[name]]:
         told = ", ".join(f"{name} {was.get(name)}, not {spec[name]}" for name in different)
-        raise RunError(f"{path}: of another training: {told}: continue it as it was begun, or choose another folder")
+        raise RunError(
+            f"{path}: of another training: {told}: continue it as it was begun, or choose "
+            f"another folder"
+        )
 
 
 def state_in_words(step: int, plans: Sequence[int]) -> str:
-    """Return what the source of a bundle adds about its training: nothing where it ended as it was first planned.
+    """Return what the source of a bundle adds about its training: nothing where it ended as it was
+    first planned.
 
     >>> state_in_words(100, [100]), state_in_words(40, [100]), state_in_words(300, [100, 300])
     ('', '; step 40 of 100', '; 100 steps, continued to 300')
@@ -108,8 +122,11 @@ def state_in_words(step: int, plans: Sequence[int]) -> str:
     return f"; {plans[0]} steps{added}" if added else ""
 
 
-def fits_in_words(training: Training, step: int, steps: int, since_s: float, per_step_s: float) -> str:
-    """Return how many of the steps fit in the minutes that there are; "" where all do. since_s: from the start on.
+def fits_in_words(
+    training: Training, step: int, steps: int, since_s: float, per_step_s: float
+) -> str:
+    """Return how many of the steps fit in the minutes that there are; "" where all do. since_s:
+    from the start on.
 
     >>> fits_in_words(Training(minutes=1.0), 4, 20_000, since_s=10.0, per_step_s=0.5)
     'about 104 of 20000 steps fit in --minutes 1: with --steps 104 a training would end by then'
@@ -130,6 +147,6 @@ def outcome_in_words(folder: Path, reached: Reached) -> str:
     if reached.whole:
         return f"{folder}: {bundle}; more steps: --resume --steps {2 * reached.steps}"
     return (
-        f"{folder}: {bundle}, stopped at step {reached.step} of {reached.steps}. Continue with --resume, or to an "
-        f"earlier end with --resume --steps N, at least {reached.step + 1}"
+        f"{folder}: {bundle}, stopped at step {reached.step} of {reached.steps}. Continue with "
+        f"--resume, or to an earlier end with --resume --steps N, at least {reached.step + 1}"
     )

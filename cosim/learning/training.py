@@ -1,8 +1,8 @@
 """Training: behaviour cloning in steps, each a function of the seed, the data and the step before.
 
-What it has learned is kept every minute in the folder (`checkpoint.pt`), so that a training that was stopped continues
-where it was and ends as one in one piece would, on the same device. At its end, and where its time is over, the bundle
-is written there.
+What it has learned is kept every minute in the folder (`checkpoint.pt`), so that a training that
+was stopped continues where it was and ends as one in one piece would, on the same device. At its
+end, and where its time is over, the bundle is written there.
 """
 
 from __future__ import annotations
@@ -20,12 +20,20 @@ from torch import Tensor
 from torch.nn import functional
 
 from cosim.core.errors import RunError, UsageError, unwritable
-from cosim.core.packed import packed_digest
+from cosim.core.packed_demos import packed_digest
 from cosim.learning.bundle import MODEL, bundle_facts, source_of, write_bundle
 from cosim.learning.curve import write_curve
 from cosim.learning.examples import Batch, Examples
 from cosim.learning.graph import parameters_of
-from cosim.learning.network import CRUISE_MPS, TURN_BINS, Parameters, answers, new_parameters, plan, turns_radps
+from cosim.learning.network import (
+    CRUISE_MPS,
+    TURN_BINS,
+    Parameters,
+    answers,
+    new_parameters,
+    plan,
+    turns_radps,
+)
 from cosim.learning.settings import (
     PLANNED_STEPS,
     Reached,
@@ -50,13 +58,15 @@ _WEIGHTS: Final = {"speed": 4.0, "turn": 1.0, "stop": 1.0, "way": 0.5}
 """Of the parts of the loss."""
 
 TellStep = Callable[[int, int, Mapping[str, float]], None]
-"""Called with the step, with how many there are in all, and with the errors of the held-out episodes, if any."""
+"""Called with the step, with how many there are in all, and with the errors of the held-out
+episodes, if any."""
 
 
 @dataclass
 class _State:
-    """The state of a training. averaged: of the parameters; curve: a row for each look at the held-out episodes; plans:
-    how many steps were planned in all, at first and whenever that was changed."""
+    """The state of a training. averaged: of the parameters; curve: a row for each look at the
+    held-out episodes; plans: how many steps were planned in all, at first and whenever that was
+    changed."""
 
     parameters: dict[str, Tensor]
     averaged: dict[str, Tensor]
@@ -66,12 +76,16 @@ class _State:
     plans: list[int]
 
 
-def train(paths: Sequence[Path], folder: Path, training: Training, resume: bool, tell: TellStep) -> Reached:
-    """Train on packed demonstrations, and write curve and bundle into a folder, also where time is over before the last
-    step. resume: continue what is there, if anything is; a training that came to its end continues with more steps.
+def train(
+    paths: Sequence[Path], folder: Path, training: Training, resume: bool, tell: TellStep
+) -> Reached:
+    """Train on packed demonstrations, and write curve and bundle into a folder, also where time is
+    over before the last step. resume: continue what is there, if anything is; a training that came
+    to its end continues with more steps.
 
-    Raises RunError for data that do not do, for a folder that holds a training that is not to be continued, or
-    another one, and where nothing is learned any more; MachineError where the folder cannot be written.
+    Raises RunError for data that do not do, for a folder that holds a training that is not to be
+    continued, or another one, and where nothing is learned any more; MachineError where the folder
+    cannot be written.
     """
     try:
         return _train(paths, folder, training, resume, tell)
@@ -79,7 +93,9 @@ def train(paths: Sequence[Path], folder: Path, training: Training, resume: bool,
         raise unwritable(folder, error) from error
 
 
-def _train(paths: Sequence[Path], folder: Path, training: Training, resume: bool, tell: TellStep) -> Reached:
+def _train(
+    paths: Sequence[Path], folder: Path, training: Training, resume: bool, tell: TellStep
+) -> Reached:
     device = _device(training.device)
     torch.manual_seed(training.seed)
     torch.backends.cudnn.deterministic = True
@@ -87,14 +103,26 @@ def _train(paths: Sequence[Path], folder: Path, training: Training, resume: bool
     began_s = time.monotonic()
     kept = folder / CHECKPOINT
     if kept.exists() and not resume:
-        raise RunError(f"{folder}: holds a training: continue it by --resume, or choose another folder")
-    begin = None if training.begin is None or kept.exists() else parameters_of(training.begin / MODEL)
+        raise RunError(
+            f"{folder}: holds a training: continue it by --resume, or choose another folder"
+        )
+    begin = (
+        None if training.begin is None or kept.exists() else parameters_of(training.begin / MODEL)
+    )
     begun = None if training.begin is None else bundle_facts(training.begin)
     examples = Examples(paths, training.seed, device)
     folder.mkdir(parents=True, exist_ok=True)
-    spec = training.spec | {"data": ", ".join(map(packed_digest, paths)), "from": begun and begun.digest}
-    state = _read(kept, training, spec, device) if kept.exists() else _begun(training, begin, device)
-    steps, first, saved_s, over = state.plans[-1], state.step, time.monotonic(), False
+    spec = training.spec | {
+        "data": ", ".join(map(packed_digest, paths)),
+        "from": begun and begun.digest,
+    }
+    state = (
+        _read(kept, training, spec, device) if kept.exists() else _begun(training, begin, device)
+    )
+    steps = state.plans[-1]
+    first = state.step
+    saved_s = time.monotonic()
+    over = False
     while state.step < steps and not over:
         lost = _stepped(state, examples, training, steps)
         state.step += 1
@@ -105,10 +133,13 @@ def _train(paths: Sequence[Path], folder: Path, training: Training, resume: bool
             row = {"step": float(state.step), **parts, **_errors(state.averaged, examples)}
             if not math.isfinite(sum(row.values())):
                 raise RunError(
-                    f"{folder}: nothing is learned any more at step {state.step}: train anew, at a lower --rate"
+                    f"{folder}: nothing is learned any more at step {state.step}: train "
+                    f"anew, at a lower --rate"
                 )
             write_curve(folder, [*state.curve, row])
-            if planned:  # a look because time is over is in the file alone: continued, the curve is that of one piece
+            # a look because time is over is in the file alone: continued, the curve is that of one
+            # piece
+            if planned:
                 state.curve.append(row)
             tell(state.step, steps, row)
         if not over and time.monotonic() - saved_s > _KEPT_EVERY_S:
@@ -118,7 +149,9 @@ def _train(paths: Sequence[Path], folder: Path, training: Training, resume: bool
         elif state.step - first in _TIMED_STEPS:
             tell(state.step, steps, {})
     _write(kept, state, spec)
-    source = source_of(examples.meta, training.seed, begun) + state_in_words(state.step, state.plans)
+    source = source_of(examples.meta, training.seed, begun) + state_in_words(
+        state.step, state.plans
+    )
     write_bundle(folder, state.averaged, examples, training.name, source)
     return Reached(state.step, steps)
 
@@ -130,7 +163,9 @@ def _device(name: str) -> torch.device:
         device = torch.device(name)
         torch.zeros(1, device=device)
     except (RuntimeError, AssertionError) as error:
-        raise UsageError(f"device '{name}' is not to be had: {str(error).splitlines()[0]}: try cpu") from error
+        raise UsageError(
+            f"device '{name}' is not to be had: {str(error).splitlines()[0]}: try cpu"
+        ) from error
     return device
 
 
@@ -138,14 +173,23 @@ def _begun(training: Training, begin: dict[str, Tensor] | None, device: torch.de
     drawn = new_parameters(training.seed) if begin is None else begin
     parameters = {name: value.to(device).requires_grad_() for name, value in drawn.items()}
     averaged = {name: value.detach().clone() for name, value in parameters.items()}
-    return _State(parameters, averaged, _optimiser(parameters, training), 0, [], [training.steps or PLANNED_STEPS])
+    return _State(
+        parameters,
+        averaged,
+        _optimiser(parameters, training),
+        0,
+        [],
+        [training.steps or PLANNED_STEPS],
+    )
 
 
 def _optimiser(parameters: Mapping[str, Tensor], training: Training) -> torch.optim.AdamW:
     return torch.optim.AdamW(parameters.values(), lr=training.rate, weight_decay=_DECAY)
 
 
-def _stepped(state: _State, examples: Examples, training: Training, steps: int) -> dict[str, Tensor]:
+def _stepped(
+    state: _State, examples: Examples, training: Training, steps: int
+) -> dict[str, Tensor]:
     """Take one step; return the parts of its loss."""
     step = state.step
     for group in state.optimiser.param_groups:
@@ -158,18 +202,23 @@ def _stepped(state: _State, examples: Examples, training: Training, steps: int) 
     kept = min(_AVERAGED, (1.0 + step) / (10.0 + step))
     with torch.no_grad():
         torch._foreach_lerp_(
-            list(state.averaged.values()), [one.detach() for one in state.parameters.values()], 1.0 - kept
+            list(state.averaged.values()),
+            [one.detach() for one in state.parameters.values()],
+            1.0 - kept,
         )
     return {name: part.detach() for name, part in parts.items()}
 
 
 def losses(parameters: Parameters, batch: Batch) -> dict[str, Tensor]:
-    """The parts of the loss. Speed and turn count where the expert does not stop; the way where it was driven."""
+    """The parts of the loss. Speed and turn count where the expert does not stop; the way where it
+    was driven."""
     said = answers(parameters, batch.pictures, batch.goal, batch.speeds)
     goes = 1.0 - batch.stop
     per_goer = 1.0 / goes.sum().clamp(min=1.0)
     off = turns_radps(batch.turn.device) - batch.turn[:, None]
-    near = (-0.5 * (off / _NARROW_RADPS) ** 2).softmax(1)  # the bin of the expert's turn, and a little its neighbours
+    near = (-0.5 * (off / _NARROW_RADPS) ** 2).softmax(
+        1
+    )  # the bin of the expert's turn, and a little its neighbours
     turn = -(near * said.turn.log_softmax(1)).sum(1)
     speed = functional.smooth_l1_loss(said.speed, batch.speed, reduction="none", beta=0.1)
     way = functional.smooth_l1_loss(said.way, batch.way, reduction="none", beta=0.2).sum(2)
@@ -182,8 +231,8 @@ def losses(parameters: Parameters, batch: Batch) -> dict[str, Tensor]:
 
 
 def _errors(parameters: Parameters, examples: Examples) -> dict[str, float]:
-    """Of the held-out episodes: mean errors of speed and turn where both go, share of right and of missed stops, and
-    the last waypoint's mean error."""
+    """Of the held-out episodes: mean errors of speed and turn where both go, share of right and of
+    missed stops, and the last waypoint's mean error."""
     rows = examples.held_out
     rows = rows[:: max(1, -(-len(rows) // _MOST_HELD_OUT))]
     sums: dict[str, float] = dict.fromkeys(
@@ -193,18 +242,24 @@ def _errors(parameters: Parameters, examples: Examples) -> dict[str, float]:
         for part in np.array_split(rows, max(1, len(rows) // 512)):
             batch = examples.rows(part)
             said = answers(parameters, batch.pictures, batch.goal, batch.speeds)
-            planned, stops = plan(said), said.stop > 0.0
+            planned = plan(said)
+            stops = said.stop > 0.0
             both = (batch.stop == 0.0) & ~stops
             speeds = planned[:, 0, 2:] - torch.stack([CRUISE_MPS * batch.speed, batch.turn], 1)
             off_m = (said.way[:, -1] - batch.way[:, -1]).norm(dim=1)
             parts = losses(parameters, batch)
             whole = sum(_WEIGHTS[name] * float(value) for name, value in parts.items())
             for name, value in (
-                ("loss", whole * len(part)), ("goers", both.sum()), ("speed", speeds[both, 0].abs().sum()),
-                ("turn", speeds[both, 1].abs().sum()), ("stops", batch.stop.sum()),
-                ("seen", (stops & (batch.stop > 0.0)).sum()), ("said", stops.sum()),
-                ("ends", batch.driven[:, -1].sum()), ("way", (off_m * batch.driven[:, -1]).sum()),
-            ):  # fmt: skip
+                ("loss", whole * len(part)),
+                ("goers", both.sum()),
+                ("speed", speeds[both, 0].abs().sum()),
+                ("turn", speeds[both, 1].abs().sum()),
+                ("stops", batch.stop.sum()),
+                ("seen", (stops & (batch.stop > 0.0)).sum()),
+                ("said", stops.sum()),
+                ("ends", batch.driven[:, -1].sum()),
+                ("way", (off_m * batch.driven[:, -1]).sum()),
+            ):
                 sums[name] += float(value)
     goers, ends = max(sums["goers"], 1.0), max(sums["ends"], 1.0)
     return {
@@ -238,12 +293,22 @@ def _read(path: Path, training: Training, spec: dict[str, Any], device: torch.de
         held = torch.load(path, map_location="cpu", weights_only=True)
         was, curve = held["spec"], held["curve"]
         plans = held["plans"] if "plans" in held else [was["steps"]]
-        parameters = {name: value.to(device).requires_grad_() for name, value in held["parameters"].items()}
+        parameters = {
+            name: value.to(device).requires_grad_() for name, value in held["parameters"].items()
+        }
         optimiser = _optimiser(parameters, training)
         optimiser.load_state_dict(held["optimiser"])
-        averaged, step = {name: value.to(device) for name, value in held["averaged"].items()}, held["step"]
+        averaged = {name: value.to(device) for name, value in held["averaged"].items()}
+        step = held["step"]
     except Exception as error:
         raise RunError(f"{path}: cannot be continued: {error}: delete it and train anew") from error
     refuse_another(path, was, spec)
     steps = planned_steps(path, training.steps, plans[-1], step)
-    return _State(parameters, averaged, optimiser, step, curve, plans if steps == plans[-1] else [*plans, steps])
+    return _State(
+        parameters,
+        averaged,
+        optimiser,
+        step,
+        curve,
+        plans if steps == plans[-1] else [*plans, steps],
+    )

@@ -10,10 +10,11 @@ from cosim.spec.events import NearbyPerson
 
 
 def nearby_people(people: People) -> tuple[NearbyPerson, ...]:
-    """Those within STEERING_NEAR_M of somebody the director moves, in the order of the street; not the events' own
-    people.
+    """Those within STEERING_NEAR_M of somebody the director moves, in the order of the street; not
+    the events' own people.
 
-    The events' people are in the states of a query. Injected people are moved by the director and see each other here.
+    The events' people are in the states of a query. Injected people are moved by the director and
+    see each other here.
     """
     if not people.kind.any():  # all are of the crowd
         return ()
@@ -26,6 +27,11 @@ def nearby_people(people: People) -> tuple[NearbyPerson, ...]:
     if not rows:
         return ()
     heading, speed = people.heading, people.speed
-    vx, vy = (speed[rows] * np.cos(heading[rows])).tolist(), (speed[rows] * np.sin(heading[rows])).tolist()
+    vx, vy = (
+        (speed[rows] * np.cos(heading[rows])).tolist(),
+        (speed[rows] * np.sin(heading[rows])).tolist(),
+    )
     told = zip(rows, people.xy[rows].tolist(), vx, vy, people.kind[rows].tolist(), strict=True)
-    return tuple(NearbyPerson(people.ids[i], x, y, u, v, PersonKind(kind)) for i, (x, y), u, v, kind in told)
+    return tuple(
+        NearbyPerson(people.ids[i], x, y, u, v, PersonKind(kind)) for i, (x, y), u, v, kind in told
+    )

@@ -1,8 +1,8 @@
 """Optimal reciprocal collision avoidance: velocities that keep a disk clear of others for a time.
 
-Source: J. van den Berg, S. J. Guy, M. Lin, D. Manocha, "Reciprocal n-body collision avoidance", Robotics Research (ISRR
-2009), Springer 2011; the names are its own. The linear programme is theirs too, after de Berg et al., "Computational
-Geometry", chapter 4 (linear programming).
+Source: J. van den Berg, S. J. Guy, M. Lin, D. Manocha, "Reciprocal n-body collision avoidance",
+Robotics Research (ISRR 2009), Springer 2011; the names are its own. The linear programme is theirs
+too, after de Berg et al., "Computational Geometry", chapter 4 (linear programming).
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ _Vector = Floats | tuple[float, float]
 
 
 class HalfPlane(NamedTuple):
-    """Velocities v (m/s) with normal . v >= offset. normal: of length 1, into the permitted side."""
+    """Velocities v (m/s) with normal . v >= offset. normal: of length 1, into the permitted
+    side."""
 
     nx: float
     ny: float
@@ -42,15 +43,17 @@ def half_plane(
     share: float,
     step_s: float,
 ) -> HalfPlane:
-    """The velocities with which a disk does its share to keep clear of another one, ORCA^tau of the paper.
+    """The velocities with which a disk does its share to keep clear of another one, ORCA^tau of the
+    paper.
 
-    apart_m (2,): from me to the other; mine_mps, other_mps (2,): velocities; radius_m: sum of both radii; horizon_s:
-    tau; share: of the avoidance that is mine, 1/2 where both avoid, 1 where the other does not; step_s: time in which
-    disks that overlap already are to be parted.
+    apart_m (2,): from me to the other; mine_mps, other_mps (2,): velocities; radius_m: sum of both
+    radii; horizon_s: tau; share: of the avoidance that is mine, 1/2 where both avoid, 1 where the
+    other does not; step_s: time in which disks that overlap already are to be parted.
 
-    The velocity obstacle VO^tau is the cone of relative velocities that lead into the disk of radius
-    `radius_m` at `apart_m` within tau: a disk at apart/tau of radius r/tau, and the legs that touch it. u is the
-    smallest change of the relative velocity that reaches the obstacle's boundary, n its outward normal there.
+    The velocity obstacle VO^tau is the cone of relative velocities that lead into the disk of
+    radius `radius_m` at `apart_m` within tau: a disk at apart/tau of radius r/tau, and the legs
+    that touch it. u is the smallest change of the relative velocity that reaches the obstacle's
+    boundary, n its outward normal there.
     """
     ax, ay = float(apart_m[0]), float(apart_m[1])
     mx, my = float(mine_mps[0]), float(mine_mps[1])
@@ -79,7 +82,8 @@ def half_plane(
 def best_velocity(planes: Sequence[HalfPlane], preferred_mps: Floats, fastest_mps: float) -> Floats:
     """The permitted velocity (2,) nearest to the preferred one, no faster than `fastest_mps`.
 
-    Where the half-planes leave none ("densely packed conditions"), the one that violates the worst of them least.
+    Where the half-planes leave none ("densely packed conditions"), the one that violates the worst
+    of them least.
     """
     speed = math.hypot(*preferred_mps)
     v = preferred_mps * min(1.0, fastest_mps / max(speed, _EPS))
@@ -95,15 +99,18 @@ def best_velocity(planes: Sequence[HalfPlane], preferred_mps: Floats, fastest_mp
 def _on_edge(
     plane: HalfPlane, others: Sequence[HalfPlane], fastest_mps: float, goal: Floats, *, toward: bool
 ) -> Floats | None:
-    """The best velocity on the edge of a half-plane that all others permit; None where they permit none.
+    """The best velocity on the edge of a half-plane that all others permit; None where they permit
+    none.
 
     goal: the velocity to be near to; or, with `toward`, the direction to go far in.
     """
     if abs(plane.offset) > fastest_mps:
         return None
     half = math.sqrt(fastest_mps**2 - plane.offset**2)
-    low, high = -half, half
-    dx, dy = plane.ny, -plane.nx
+    low = -half
+    high = half
+    dx = plane.ny
+    dy = -plane.nx
     x0, y0 = plane.nx * plane.offset, plane.ny * plane.offset
     for other in others:
         gain = dx * other.nx + dy * other.ny
@@ -125,12 +132,16 @@ def _on_edge(
     return np.array([x0 + t * dx, y0 + t * dy])
 
 
-def _least_violating(planes: Sequence[HalfPlane], first: int, v: Floats, fastest_mps: float) -> Floats:
-    """The velocity whose worst violation is least: half-planes move outward together until one velocity is permitted.
+def _least_violating(
+    planes: Sequence[HalfPlane], first: int, v: Floats, fastest_mps: float
+) -> Floats:
+    """The velocity whose worst violation is least: half-planes move outward together until one
+    velocity is permitted.
 
-    v permits the half-planes before `first`. Each half-plane that is violated more than all before it becomes the
-    worst; then its violation is made as small as it can be without any earlier one's becoming larger than it. "Not
-    larger than it" is a half-plane again: (n_j - n_i) . v >= c_j - c_i.
+    v permits the half-planes before `first`. Each half-plane that is violated more than all before
+    it becomes the worst; then its violation is made as small as it can be without any earlier one's
+    becoming larger than it. "Not larger than it" is a half-plane again: (n_j - n_i) . v >= c_j -
+    c_i.
     """
     worst = 0.0
     for i in range(first, len(planes)):
@@ -150,7 +161,12 @@ def _least_violating(planes: Sequence[HalfPlane], first: int, v: Floats, fastest
 
 
 def _no_worse(other: HalfPlane, plane: HalfPlane) -> HalfPlane | None:
-    """Where `other` is violated no more than `plane`; None for parallel ones, where one bounds the other everywhere."""
+    """Where `other` is violated no more than `plane`; None for parallel ones, where one bounds the
+    other everywhere."""
     nx, ny = other.nx - plane.nx, other.ny - plane.ny
     size = math.hypot(nx, ny)
-    return None if size < 1e-7 else HalfPlane(nx / size, ny / size, (other.offset - plane.offset) / size)
+    return (
+        None
+        if size < 1e-7
+        else HalfPlane(nx / size, ny / size, (other.offset - plane.offset) / size)
+    )

@@ -1,7 +1,8 @@
-"""How people see the obstacles of a scenario: as few bodies that stand, round which they step as round the robot.
+"""How people see the obstacles of a scenario: as few bodies that stand, round which they step as
+round the robot.
 
-What stands so near together that nobody fits between is one body. Where one reaches to the edge of the walkable ground
-people pass it on its other side.
+What stands so near together that nobody fits between is one body. Where one reaches to the edge of
+the walkable ground people pass it on its other side.
 """
 
 from __future__ import annotations
@@ -34,10 +35,13 @@ class Standing:
         self._reach_m = np.array([within_reach_m(body) for body in self._seen])
 
     def near(self, xy: Floats, margin_m: float = 0.0) -> tuple[StandingBody, ...]:
-        """The bodies round which somebody at (N, 2) metres steps, or one who is so much farther away."""
+        """The bodies round which somebody at (N, 2) metres steps, or one who is so much farther
+        away."""
         return tuple(self.bodies[i] for i in self._rows(xy, margin_m))
 
-    def stepped_round(self, before: Floats, wanted: Floats, stand: NDArray[np.bool_] | None = None) -> Floats:
+    def stepped_round(
+        self, before: Floats, wanted: Floats, stand: NDArray[np.bool_] | None = None
+    ) -> Floats:
         """As `cosim.people.yielding.stepped_round`, round all of the bodies that are near."""
         if len(self.bodies) and len(wanted):
             for i in self._rows(wanted, 0.0):
@@ -60,7 +64,9 @@ def standing_bodies(obstacles: Sequence[Obstacle], walkable: Polygon | MultiPoly
     edge = shapely.boundary(walkable)
     bodies = []
     for whole in together:
-        box = shapely.oriented_envelope(shapely.union_all(grounds[shapely.intersects(whole, grounds)]))
+        box = shapely.oriented_envelope(
+            shapely.union_all(grounds[shapely.intersects(whole, grounds)])
+        )
         corners = shapely.get_coordinates(box)
         ahead, aside = corners[1] - corners[0], corners[2] - corners[1]
         x_m, y_m = corners[:4].mean(axis=0).tolist()
@@ -78,4 +84,6 @@ def standing_bodies(obstacles: Sequence[Obstacle], walkable: Polygon | MultiPoly
 def as_met(body: StandingBody) -> RobotBody:
     """A body as one steps round it."""
     pose = Pose(body.x_m, body.y_m, body.heading_rad)
-    return RobotBody(pose, (0.5 * body.length_m, 0.5 * body.width_m), 0.0, (body.closed_x, body.closed_y))
+    return RobotBody(
+        pose, (0.5 * body.length_m, 0.5 * body.width_m), 0.0, (body.closed_x, body.closed_y)
+    )

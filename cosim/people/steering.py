@@ -1,9 +1,10 @@
 """How one who walks steers round others: a way that is open, then ORCA's half-planes.
 
-ORCA alone stops before somebody who stands in the way and stays there. So the wanted velocity is turned first to the
-nearest heading that is open for a while (RVO's choice among velocities: J. van den Berg, M. Lin, D. Manocha,
-"Reciprocal velocity obstacles for real-time multi-agent navigation", ICRA 2008); the half-planes of `cosim.people.orca`
-then share the avoidance between those who see each other, and slow down who finds nothing open."""
+ORCA alone stops before somebody who stands in the way and stays there. So the wanted velocity is
+turned first to the nearest heading that is open for a while (RVO's choice among velocities: J. van
+den Berg, M. Lin, D. Manocha, "Reciprocal velocity obstacles for real-time multi-agent navigation",
+ICRA 2008); the half-planes of `cosim.people.orca` then share the avoidance between those who see
+each other, and slow down who finds nothing open."""
 
 from __future__ import annotations
 
@@ -26,13 +27,17 @@ ROOM_M: Final = 2 * PERSON_RADIUS_M
 """Middles of two people who pass keep so far apart, as long as that leaves a way."""
 
 SHOULDER_TO_SHOULDER_M: Final = 0.45
-"""Middles of two people who touch shoulders: one squeezes through where nothing else is open. Nearer ones part."""
+"""Middles of two people who touch shoulders: one squeezes through where nothing else is open.
+Nearer ones part."""
 
 PARTED_S: Final = 0.5
 """In this time those who are too near are parted."""
 
-TURNS: Final = tuple((math.cos(math.radians(turn)), math.sin(math.radians(turn))) for turn in range(10, 120, 10))
-"""Cosine and sine of the turns that are tried to either side: in steps of 10 degrees, beyond a right angle."""
+TURNS: Final = tuple(
+    (math.cos(math.radians(turn)), math.sin(math.radians(turn))) for turn in range(10, 120, 10)
+)
+"""Cosine and sine of the turns that are tried to either side: in steps of 10 degrees, beyond a
+right angle."""
 
 GIVES: Final = 0.98
 """Those who stand nearer than two radii come no nearer than this share of their distance."""
@@ -46,7 +51,8 @@ Vector = tuple[float, float]
 
 
 class Neighbour(NamedTuple):
-    """Somebody else: where (m), how it moves (m/s), and how much of the avoidance it leaves to the one who steers.
+    """Somebody else: where (m), how it moves (m/s), and how much of the avoidance it leaves to the
+    one who steers.
 
     share: 1 for who pays no heed, 1/2 for who steers the same way.
     """
@@ -59,7 +65,8 @@ class Neighbour(NamedTuple):
 
 
 class _Disk(NamedTuple):
-    """A neighbour as the one who steers sees it: from here to it in metres, its velocity, the distance to keep."""
+    """A neighbour as the one who steers sees it: from here to it in metres, its velocity, the
+    distance to keep."""
 
     apart_m: Vector
     moving_mps: Vector
@@ -79,12 +86,14 @@ def steered(
     room_m: float = ROOM_M,
     walls: Sequence[HalfPlane] = (),
 ) -> Vector:
-    """The velocity (m/s) of one person who is at `at_m`, moves with `moving_mps` and wants `wanted_mps`.
+    """The velocity (m/s) of one person who is at `at_m`, moves with `moving_mps` and wants
+    `wanted_mps`.
 
-    No faster than wanted; exactly as wanted, to the bit, where nobody is in the way. One who wants to stand stands.
-    horizon_s: how far ahead to look; less for one who arrives before. room_m: between middles, where that is to be had;
-    less for one in a hurry. walls: half-planes of velocities that stay on
-    the ground one may walk on. Only who is nearer than NEAR_M counts, and of those behind only who is too near.
+    No faster than wanted; exactly as wanted, to the bit, where nobody is in the way. One who wants
+    to stand stands. horizon_s: how far ahead to look; less for one who arrives before. room_m:
+    between middles, where that is to be had; less for one in a hurry. walls: half-planes of
+    velocities that stay on the ground one may walk on. Only who is nearer than NEAR_M counts, and
+    of those behind only who is too near.
     """
     speed_mps = math.hypot(*wanted_mps)
     if speed_mps < _EPS:
@@ -92,13 +101,19 @@ def steered(
     disks = _seen(at_m, wanted_mps, neighbours, room_m)
     if not disks and all(_permits(wall, *wanted_mps) for wall in walls):
         return wanted_mps
-    if math.dist(moving_mps, wanted_mps) < _EPS and _meets_in_s(*wanted_mps, disks, walls, horizon_s) >= horizon_s:
+    if (
+        math.dist(moving_mps, wanted_mps) < _EPS
+        and _meets_in_s(*wanted_mps, disks, walls, horizon_s) >= horizon_s
+    ):
         return wanted_mps
     heading_mps, is_open = _most_open(wanted_mps, moving_mps, disks, walls, horizon_s)
     if not is_open:
         disks = _seen(at_m, wanted_mps, neighbours, SHOULDER_TO_SHOULDER_M)
         heading_mps, _ = _most_open(wanted_mps, moving_mps, disks, walls, horizon_s)
-    planes = [half_plane(d.apart_m, moving_mps, d.moving_mps, d.keep_m, horizon_s, d.share, PARTED_S) for d in disks]
+    planes = [
+        half_plane(d.apart_m, moving_mps, d.moving_mps, d.keep_m, horizon_s, d.share, PARTED_S)
+        for d in disks
+    ]
     planes += walls
     if all(_permits(plane, *heading_mps) for plane in planes):
         return heading_mps
@@ -106,8 +121,11 @@ def steered(
     return x_mps, y_mps
 
 
-def _seen(at_m: Vector, wanted_mps: Vector, neighbours: Sequence[Neighbour], room_m: float) -> list[_Disk]:
-    """Those who count, with the distance to keep from each: `room_m`, or what there is between them now."""
+def _seen(
+    at_m: Vector, wanted_mps: Vector, neighbours: Sequence[Neighbour], room_m: float
+) -> list[_Disk]:
+    """Those who count, with the distance to keep from each: `room_m`, or what there is between them
+    now."""
     disks = []
     for one in neighbours:
         dx, dy = one.x_m - at_m[0], one.y_m - at_m[1]
@@ -121,23 +139,32 @@ def _seen(at_m: Vector, wanted_mps: Vector, neighbours: Sequence[Neighbour], roo
 
 
 def _lets_pass(disk: _Disk, wanted_mps: Vector) -> bool:
-    """Whether somebody who steers the same way crosses from the left: of two, the one from the right goes first."""
-    (dx, dy), (vx, vy), (x, y) = disk.apart_m, disk.moving_mps, wanted_mps
+    """Whether somebody who steers the same way crosses from the left: of two, the one from the
+    right goes first."""
+    (dx, dy) = disk.apart_m
+    (vx, vy) = disk.moving_mps
+    (x, y) = wanted_mps
     across = x * vy - y * vx < -_CROSSING * math.hypot(x, y) * math.hypot(vx, vy)
     return disk.share < 1.0 and across and x * dy - y * dx > 0.0
 
 
 def _most_open(
-    wanted_mps: Vector, moving_mps: Vector, disks: Sequence[_Disk], walls: Sequence[HalfPlane], horizon_s: float
+    wanted_mps: Vector,
+    moving_mps: Vector,
+    disks: Sequence[_Disk],
+    walls: Sequence[HalfPlane],
+    horizon_s: float,
 ) -> tuple[Vector, bool]:
-    """The wanted velocity, turned no more than needed to meet nobody within the horizon, and True; else to meet the
-    latest, and False.
+    """The wanted velocity, turned no more than needed to meet nobody within the horizon, and True;
+    else to meet the latest, and False.
 
-    Of two that are turned alike, that on the side to which one moves already; to the right for who moves straight.
+    Of two that are turned alike, that on the side to which one moves already; to the right for who
+    moves straight.
     """
     x, y = wanted_mps
     disks = [disk for disk in disks if not _lets_pass(disk, wanted_mps)]
-    best, latest_s = wanted_mps, _meets_in_s(x, y, disks, walls, horizon_s)
+    best = wanted_mps
+    latest_s = _meets_in_s(x, y, disks, walls, horizon_s)
     if latest_s >= horizon_s:
         return best, True
     side = 1.0 if x * moving_mps[1] - y * moving_mps[0] > _EPS else -1.0
@@ -160,7 +187,8 @@ def _meets_in_s(
     horizon_s: float,
     enough_s: float = -1.0,
 ) -> float:
-    """When who goes on so comes too near to somebody, at most `horizon_s`; 0 where a wall is in the way.
+    """When who goes on so comes too near to somebody, at most `horizon_s`; 0 where a wall is in the
+    way.
 
     enough_s: once it is known to be no later than this, how much earlier does not matter.
     """

@@ -1,9 +1,9 @@
 """Nobody walks into the robot: how a person steps round it.
 
-SUMO's walkers see the robot as stripes, and at the edge of a crossing or corner they sometimes walk through it; our own
-people see other people (`cosim.people.steering`), the robot they see here. A person goes where it wants to go, but
-slides round the robot's outline instead of entering it. Only the person's own motion is changed: a robot that drives at
-somebody still hits them."""
+SUMO's walkers see the robot as stripes, and at the edge of a crossing or corner they sometimes walk
+through it; our own people see other people (`cosim.people.steering`), the robot they see here. A
+person goes where it wants to go, but slides round the robot's outline instead of entering it. Only
+the person's own motion is changed: a robot that drives at somebody still hits them."""
 
 from __future__ import annotations
 
@@ -25,11 +25,12 @@ DRAWS_BACK_M = 0.015
 TOUCH_M = 0.01
 ROBOT_STANDS_MPS: Final = 0.05
 STOOD_S: Final = 1.0
-"""A robot of which no point has moved faster than ROBOT_STANDS_MPS for so long stands, for people and for the referee:
-they walk round it, and who walks into it is at fault."""
+"""A robot of which no point has moved faster than ROBOT_STANDS_MPS for so long stands, for people
+and for the referee: they walk round it, and who walks into it is at fault."""
 _ROUNDING_M: Final = 1e-6
 FORESEEN_S = 0.6
-"""How far ahead people see the robot come: nobody walks into the ground it will cover in this time."""
+"""How far ahead people see the robot come: nobody walks into the ground it will cover in this
+time."""
 
 
 def outline_mps(v_mps: float, w_radps: float, half_m: tuple[float, float]) -> float:
@@ -38,7 +39,8 @@ def outline_mps(v_mps: float, w_radps: float, half_m: tuple[float, float]) -> fl
 
 
 class RobotBody(NamedTuple):
-    """The robot as people see it, or what stands: its pose, half its length and width in metres, its speed.
+    """The robot as people see it, or what stands: its pose, half its length and width in metres,
+    its speed.
 
     closed: unit vector to the side on which nobody can pass it; (0, 0) where one can on either.
     """
@@ -51,31 +53,44 @@ class RobotBody(NamedTuple):
 
 def within_reach_m(body: RobotBody) -> float:
     """How near to the robot's middle somebody must be for a step to be led round it."""
-    return math.hypot(*body.half_m) + FORESEEN_S * max(body.v_mps, 0.0) + PERSON_RADIUS_M + STEP_ROUND_GAP_M
+    return (
+        math.hypot(*body.half_m)
+        + FORESEEN_S * max(body.v_mps, 0.0)
+        + PERSON_RADIUS_M
+        + STEP_ROUND_GAP_M
+    )
 
 
-def stepped_round(before: Floats, wanted: Floats, body: RobotBody, stand: NDArray[np.bool_] | None = None) -> Floats:
+def stepped_round(
+    before: Floats, wanted: Floats, body: RobotBody, stand: NDArray[np.bool_] | None = None
+) -> Floats:
     """Where people go who want to go from `before` to `wanted`, (N, 2) metres each, near a robot.
 
-    People keep out of the ground that a moving robot is about to cover, too: who walks against it there steps aside.
-    Apart from that a step towards the robot from nearer than KEEP_M loses its
-    inward part; its length goes into the way round: to the side on which the step would pass the robot's centre.
-    That choice strengthens itself, so nobody dithers. stand (N,): who only wants to stand there comes up as near as it
-    can and draws back slowly from a robot that is nearer than KEEP_M: it would go round it and back for ever.
+    People keep out of the ground that a moving robot is about to cover, too: who walks against it
+    there steps aside. Apart from that a step towards the robot from nearer than KEEP_M loses its
+    inward part; its length goes into the way round: to the side on which the step would pass the
+    robot's centre. That choice strengthens itself, so nobody dithers. stand (N,): who only wants to
+    stand there comes up as near as it can and draws back slowly from a robot that is nearer than
+    KEEP_M: it would go round it and back for ever.
     """
     length, width = body.half_m
     ahead = FORESEEN_S * max(body.v_mps, 0.0)
-    low, high = np.array([-length, -width]), np.array([length, width])
+    low = np.array([-length, -width])
+    high = np.array([length, width])
     reach = np.array([ahead, 0.0])
     offset = wanted - body.pose.xy
-    if np.hypot(offset[:, 0], offset[:, 1]).min(initial=np.inf) > within_reach_m(body) + _ROUNDING_M:
+    if (
+        np.hypot(offset[:, 0], offset[:, 1]).min(initial=np.inf)
+        > within_reach_m(body) + _ROUNDING_M
+    ):
         return wanted
     turn = _axes(body)
     everybody = offset @ turn
     rows = np.flatnonzero(_gap(everybody, low, high + reach) < STEP_ROUND_GAP_M)
     if not len(rows):
         return wanted
-    local, near = ((before - body.pose.xy) @ turn)[rows], everybody[rows]
+    local = ((before - body.pose.xy) @ turn)[rows]
+    near = everybody[rows]
     step = near - local
     pace = np.hypot(step[:, 0], step[:, 1])
     side = np.where(local[:, 0] * step[:, 1] - local[:, 1] * step[:, 0] >= 0.0, 1.0, -1.0)
@@ -106,24 +121,28 @@ def stepped_round(before: Floats, wanted: Floats, body: RobotBody, stand: NDArra
 
 
 def comes_too_near(before: Floats, after: Floats, body: RobotBody) -> NDArray[np.bool_]:
-    """(N,) who goes from `before` to `after`, (N, 2) metres each, nearer to the robot's outline than one steps round
-    it."""
-    turn, half = _axes(body), np.array(body.half_m)
+    """(N,) who goes from `before` to `after`, (N, 2) metres each, nearer to the robot's outline
+    than one steps round it."""
+    turn = _axes(body)
+    half = np.array(body.half_m)
     gap = _gap((after - body.pose.xy) @ turn, -half, half)
-    near: NDArray[np.bool_] = (gap < STEP_ROUND_GAP_M) & (gap < _gap((before - body.pose.xy) @ turn, -half, half))
+    near: NDArray[np.bool_] = (gap < STEP_ROUND_GAP_M) & (
+        gap < _gap((before - body.pose.xy) @ turn, -half, half)
+    )
     return near
 
 
 def touches(xy: Floats, body: RobotBody, within_m: float = TOUCH_M) -> bool:
-    """Whether the disk of a person at (2,) metres meets the robot's outline, or comes so near to it."""
+    """Whether the disk of a person at (2,) metres meets the robot's outline, or comes so near to
+    it."""
     local = (np.asarray(xy) - body.pose.xy)[None] @ _axes(body)
     half = np.array(body.half_m)
     return bool(_gap(local, -half, half)[0] <= within_m)
 
 
 def _axes(body: RobotBody) -> Floats:
-    """(2, 2) ahead and left of the robot, as columns: what an offset from its middle is multiplied by to be told in its
-    frame."""
+    """(2, 2) ahead and left of the robot, as columns: what an offset from its middle is multiplied
+    by to be told in its frame."""
     cos, sin = np.cos(body.pose.heading_rad), np.sin(body.pose.heading_rad)
     return np.array([[cos, -sin], [sin, cos]])
 

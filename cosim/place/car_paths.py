@@ -1,4 +1,5 @@
-"""Where cars turn: the paths inside junctions, and the walkable ground beside crossings that they lead over."""
+"""Where cars turn: the paths inside junctions, and the walkable ground beside crossings that they
+lead over."""
 
 from __future__ import annotations
 
@@ -25,8 +26,8 @@ def paths_near(street_map: StreetMap, area: shapely.Geometry) -> list[shapely.Li
 
 
 def from_car_paths_m(street_map: StreetMap, xy: Floats) -> Floats:
-    """(N,) m: from (N, 2) points, one after the other along a way, to the nearest middle line on which cars drive
-    inside a junction; inf beyond 4 m."""
+    """(N,) m: from (N, 2) points, one after the other along a way, to the nearest middle line on
+    which cars drive inside a junction; inf beyond 4 m."""
     far_m = np.full(len(xy), np.inf)
     if len(xy) < 2:
         return far_m
@@ -47,7 +48,9 @@ def corners_driven_over(street_map: StreetMap) -> dict[str, shapely.Geometry]:
         lines = paths_near(street_map, corner.polygon)
         if not lines:
             continue
-        driven = overlay.union_all(shapely.buffer(np.array(lines), CAR_M / 2.0, cap_style="flat").tolist())
+        driven = overlay.union_all(
+            shapely.buffer(np.array(lines), CAR_M / 2.0, cap_style="flat").tolist()
+        )
         crossings = [
             strip.polygon
             for strip in street_map.near("strip", corner.polygon)

@@ -1,5 +1,5 @@
-"""What a place is: its size, what can be walked, what is wrong with it. `scenarios/builders/capacity.py` says which
-scenarios it can hold."""
+"""What a place is: its size, what can be walked, what is wrong with it.
+`scenarios/suites/capacity.py` says which scenarios it can hold."""
 
 from __future__ import annotations
 
@@ -24,15 +24,18 @@ STEEP = 0.08
 """Grade from which a walkable lane counts as steep."""
 MOSTLY = 0.5
 LARGEST = 0.6
-"""Scenarios are drawn on the largest island alone: one with less of the length than this is warned of."""
+"""Scenarios are drawn on the largest island alone: one with less of the length than this is warned
+of."""
 
 
 class NetFacts(msgspec.Struct, frozen=True, kw_only=True):
-    """What a SUMO net says beyond its StreetMap. Ids are SUMO edge ids, signals' ids of traffic lights.
+    """What a SUMO net says beyond its StreetMap. Ids are SUMO edge ids, signals' ids of traffic
+    lights.
 
-    mixed_km: lanes that people share with cars, which are not walkable here. elevation_m: lowest and highest point,
-    None for a flat net. steep, false_grades: counts of walkable lanes. no_program: signals named by crossings that
-    have no program (SUMO runs level crossings itself). levels: walkable edges on bridges or in tunnels.
+    mixed_km: lanes that people share with cars, which are not walkable here. elevation_m: lowest
+    and highest point, None for a flat net. steep, false_grades: counts of walkable lanes.
+    no_program: signals named by crossings that have no program (SUMO runs level crossings itself).
+    levels: walkable edges on bridges or in tunnels.
     """
 
     version: str
@@ -59,7 +62,8 @@ class NetFacts(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def walkable_km(self) -> float:
-        """Every lane on which SUMO lets people walk beside or off the carriageway, and those shared with cars."""
+        """Every lane on which SUMO lets people walk beside or off the carriageway, and those shared
+        with cars."""
         return self.pavement_km + self.shared_km + self.mixed_km
 
 
@@ -74,7 +78,8 @@ class Island(msgspec.Struct, frozen=True):
 class Problem(msgspec.Struct, frozen=True):
     """Something wrong at one strip or corner.
 
-    kind: island, narrow, on_road, stacked, driven_over, steep, never_green, always_green, level or misfit.
+    kind: island, narrow, on_road, stacked, driven_over, steep, never_green, always_green, level or
+    misfit.
     """
 
     kind: str
@@ -84,13 +89,13 @@ class Problem(msgspec.Struct, frozen=True):
 
 
 class MapCheck(msgspec.Struct, frozen=True, kw_only=True):
-    """What was found. reasons: why nothing can be drawn on the map, none where something may be; warnings: what to
-    change; notes: what a user should know.
+    """What was found. reasons: why nothing can be drawn on the map, none where something may be;
+    warnings: what to change; notes: what a user should know.
 
-    walkable_km: length of sidewalks and shared paths, crossings apart. overlap_share: part of the sidewalks' area that
-    lies on lanes of roads; on_road: sidewalks that do so mostly; stacked: those that cross a road where there is no
-    crossing; driven_over: corners over which cars turn. guessed_share: part of the sidewalks' length that the importer
-    made up; None if unknown.
+    walkable_km: length of sidewalks and shared paths, crossings apart. overlap_share: part of the
+    sidewalks' area that lies on lanes of roads; on_road: sidewalks that do so mostly; stacked:
+    those that cross a road where there is no crossing; driven_over: corners over which cars turn.
+    guessed_share: part of the sidewalks' length that the importer made up; None if unknown.
     features: how many buildings and things of each kind the map itself shows.
     """
 
@@ -134,7 +139,8 @@ def check_map(
     facts: NetFacts | None = None,
     guessed_share: float | None = None,
 ) -> MapCheck:
-    """Everything that can be said of a place without simulating it. graph: the place's own, made here when None."""
+    """Everything that can be said of a place without simulating it. graph: the place's own, made
+    here when None."""
     graph = WalkGraph(street_map) if graph is None else graph
     strips = list(street_map.strips.values())
     sidewalks = [s for s in strips if s.kind == "sidewalk"]
@@ -169,7 +175,8 @@ def check_map(
         crossings=len(crossings),
         signalised=sum(s.signalised for s in crossings),
         corners=len(street_map.corners),
-        roads_km=sum(_length_m(lane) for lane in street_map.lanes.values() if _is_road(lane)) / 1000.0,
+        roads_km=sum(_length_m(lane) for lane in street_map.lanes.values() if _is_road(lane))
+        / 1000.0,
         left_hand=street_map.left_hand,
         islands=islands,
         narrow=len(narrow),
@@ -198,7 +205,8 @@ def check_map(
 
 
 def on_road_shares(street_map: StreetMap, sidewalks: Sequence[Strip]) -> Floats:
-    """(N,) how much of each sidewalk's area lies on lanes that are driven on, junctions' interiors apart; 0 to 1."""
+    """(N,) how much of each sidewalk's area lies on lanes that are driven on, junctions' interiors
+    apart; 0 to 1."""
     roads = [lane.polygon for lane in street_map.lanes.values() if _is_road(lane)]
     if not roads or not sidewalks:
         return np.zeros(len(sidewalks))
@@ -211,7 +219,8 @@ def on_road_shares(street_map: StreetMap, sidewalks: Sequence[Strip]) -> Floats:
 
 
 def stacked_on_roads(street_map: StreetMap, sidewalks: Sequence[Strip]) -> list[Strip]:
-    """Sidewalks whose middle line crosses that of a lane of another edge: bridges, tunnels, or maps gone wrong."""
+    """Sidewalks whose middle line crosses that of a lane of another edge: bridges, tunnels, or maps
+    gone wrong."""
     roads = [lane for lane in street_map.lanes.values() if _is_road(lane)]
     if not roads or not sidewalks:
         return []
@@ -231,13 +240,20 @@ def _length_m(lane: Lane) -> float:
 
 
 def _marks(kind: str, strips: Sequence[Strip]) -> list[Problem]:
-    middles = [(s, Polyline(s.line[:, :2]).at(s.length_m / 2.0)) for s in strips if s.length_m > 0.0]
+    middles = [
+        (s, Polyline(s.line[:, :2]).at(s.length_m / 2.0)) for s in strips if s.length_m > 0.0
+    ]
     return [Problem(kind, s.id, round(at.x_m, 2), round(at.y_m, 2)) for s, at in middles]
 
 
 def _marks_of_corners(kind: str, grounds: Mapping[str, shapely.Geometry]) -> list[Problem]:
-    spots = shapely.get_coordinates([shapely.point_on_surface(ground) for ground in grounds.values()]).tolist()
-    return [Problem(kind, name, round(x_m, 2), round(y_m, 2)) for name, (x_m, y_m) in zip(grounds, spots, strict=True)]
+    spots = shapely.get_coordinates(
+        [shapely.point_on_surface(ground) for ground in grounds.values()]
+    ).tolist()
+    return [
+        Problem(kind, name, round(x_m, 2), round(y_m, 2))
+        for name, (x_m, y_m) in zip(grounds, spots, strict=True)
+    ]
 
 
 def _islands(graph: WalkGraph, lengths: dict[str, float]) -> tuple[Island, ...]:
@@ -249,14 +265,19 @@ def _islands(graph: WalkGraph, lengths: dict[str, float]) -> tuple[Island, ...]:
     counts = np.bincount(labels)
     total = max(float(metres.sum()), 1e-9)
     order = np.argsort(-metres, kind="stable")
-    return tuple(Island(int(counts[i]), float(metres[i]) / 1000.0, float(metres[i]) / total) for i in order)
+    return tuple(
+        Island(int(counts[i]), float(metres[i]) / 1000.0, float(metres[i]) / total) for i in order
+    )
 
 
 def _unusable(street_map: StreetMap) -> list[str]:
     if not street_map.strips:
         return ["nothing is walkable: no sidewalk, path or crossing"]
     if not street_map.corners:
-        return ["its sidewalks are not connected: the net has no walking areas; import it without --as-is"]
+        return [
+            "its sidewalks are not connected: the net has no walking areas; import it "
+            "without --as-is"
+        ]
     return []
 
 
@@ -264,22 +285,29 @@ def _torn(islands: Sequence[Island]) -> list[str]:
     if not islands or islands[0].share >= LARGEST:
         return []
     return [
-        f"the largest of {len(islands)} islands of connected walkways has {islands[0].share:.0%} of their length: "
-        "scenarios are drawn on it alone, the rest stays unused. Import another part (--bbox), whose streets have "
-        "sidewalks and crossings; a SUMO net without --as-is; or a file that was not cut through its streets. "
-        "-o map.png draws the islands"
+        f"the largest of {len(islands)} islands of connected walkways has {islands[0].share:.0%} "
+        "of their length: scenarios are drawn on it alone, the rest stays unused. Import another "
+        "part (--bbox), whose streets have sidewalks and crossings; a SUMO net without --as-is; "
+        "or a file that was not cut through its streets. -o map.png draws the islands"
     ]
 
 
 def _stairs(sidewalks: Sequence[Strip]) -> list[str]:
     steps = [s.id for s in sidewalks if s.going == "steps"]
-    return [f"{len(steps)} walkable edges are stairs, flat here: routes keep off them"] if steps else []
+    return (
+        [f"{len(steps)} walkable edges are stairs, flat here: routes keep off them"]
+        if steps
+        else []
+    )
 
 
 def _driven_over_notes(corners: Mapping[str, object]) -> list[str]:
     if not corners:
         return []
-    return [f"cars turn over {len(corners)} corners, crossings apart: routes keep off there: {_some([*corners])}"]
+    return [
+        f"cars turn over {len(corners)} corners, crossings apart: routes keep off there: "
+        f"{_some([*corners])}"
+    ]
 
 
 def _notes(facts: NetFacts | None) -> list[str]:
@@ -290,19 +318,28 @@ def _notes(facts: NetFacts | None) -> list[str]:
         notes.append(f"{facts.mixed_km:.2f} km that people share with cars are not walkable here")
     if facts.levels:
         notes.append(
-            f"{len(facts.levels)} walkable edges ({facts.levels_km:.2f} km) are on bridges or in tunnels: they lie "
+            f"{len(facts.levels)} walkable edges ({facts.levels_km:.2f} km) are on bridges "
+            f"or in tunnels: they lie "
             "level with the streets they pass over or under; routes keep off them"
         )
     if facts.widths_missing:
-        notes.append(f"{facts.widths_missing} walkable lanes name no width: SUMO's default of 3.2 m holds")
+        notes.append(
+            f"{facts.widths_missing} walkable lanes name no width: SUMO's default of 3.2 m holds"
+        )
     if facts.no_program:
-        notes.append(f"{len(facts.no_program)} level crossings are run by SUMO itself: {_some(facts.no_program)}")
+        notes.append(
+            f"{len(facts.no_program)} level crossings are run by SUMO itself: "
+            f"{_some(facts.no_program)}"
+        )
     for which, words in (("never_green", "never green"), ("always_green", "always green")):
         found: tuple[str, ...] = getattr(facts, which)
         if found:
             notes.append(f"{len(found)} signalised crossings are {words}: {_some(found)}")
     if facts.misfits:
-        notes.append(f"{len(facts.misfits)} crossings are beyond their signal's program: {_some(facts.misfits)}")
+        notes.append(
+            f"{len(facts.misfits)} crossings are beyond their signal's program: "
+            f"{_some(facts.misfits)}"
+        )
     return notes
 
 
@@ -314,15 +351,17 @@ def _land_notes(street_map: StreetMap) -> list[str]:
     if elevation.dropped:
         return [f"{span} is dropped, the ground is flat: {elevation.dropped}"]
     notes = [
-        f"{span} is kept; {elevation.missing} of {elevation.points} points had none or a false one and were "
-        f"interpolated; {elevation.clamped} places on streets were moved, by up to {elevation.moved_m:.1f} m, so that "
-        f"no street or walkway rises more than {WALK_GRADE_MAX:.0%} along its line"
+        f"{span} is kept; {elevation.missing} of {elevation.points} points had none or a false one "
+        f"and were interpolated; {elevation.clamped} places on streets were moved, by up to "
+        f"{elevation.moved_m:.1f} m, so that no street or walkway rises more than "
+        f"{WALK_GRADE_MAX:.0%} along its line"
     ]
     if elevation.steep:
         km = sum(street_map.strips[strip].length_m for strip in elevation.steep) / 1000.0
         notes.append(
-            f"{len(elevation.steep)} walkways ({km:.1f} km) are steeper than {ROBOT_GRADE_MAX:.0%} somewhere (steps, "
-            "hill paths, terraces closer together than heights can show): no robot is sent over them"
+            f"{len(elevation.steep)} walkways ({km:.1f} km) are steeper than {ROBOT_GRADE_MAX:.0%} "
+            "somewhere (steps, hill paths, terraces closer together than heights can show): no "
+            "robot is sent over them"
         )
     return notes
 

@@ -1,4 +1,5 @@
-"""What lies off the streets, where nobody walks: chosen by the map's land use, else by what it lies between.
+"""What lies off the streets, where nobody walks: chosen by the map's land use, else by what it lies
+between.
 
 Cameras and maps from above draw it from this one table. No look resembles a sidewalk.
 """
@@ -20,13 +21,15 @@ from cosim.place.street_map import LandKind, StreetMap, Strip, street_of
 _NEAR_M: Final = 4.0
 """Ground this near to a house and to the sidewalk before it is a bed."""
 _UNDER_M: Final = 0.6
-"""So far beds reach under houses that the map does not show, whose fronts are straight where a street bends."""
+"""So far beds reach under houses that the map does not show, whose fronts are straight where a
+street bends."""
 _REACH_M: Final = 12.0
 _SPLINTER_M2: Final = 1e-3
 
 
 class GroundLook(NamedTuple):
-    """seen: mean colour in pictures, sRGB from 0 to 1; drawn: colour on maps from above, 0 to 255."""
+    """seen: mean colour in pictures, sRGB from 0 to 1; drawn: colour on maps from above, 0 to
+    255."""
 
     seen: tuple[float, float, float]
     drawn: tuple[int, int, int]
@@ -43,11 +46,15 @@ PLAIN_GROUND: Final[LandKind] = "lawn"
 """What lies where neither the map nor the neighbours say anything."""
 
 _BEDS: Final[tuple[LandKind, ...]] = ("planting", "lawn", "soil")
-"""What may lie between the sidewalks of a street and its houses, drawn by the name of the street."""
+"""What may lie between the sidewalks of a street and its houses, drawn by the name of the
+street."""
 
 
-def open_ground(street_map: StreetMap, area: shapely.Polygon) -> list[tuple[LandKind, Polygon | MultiPolygon]]:
-    """What covers the plain ground within `area`: areas that do not overlap, and reach under streets and houses.
+def open_ground(
+    street_map: StreetMap, area: shapely.Polygon
+) -> list[tuple[LandKind, Polygon | MultiPolygon]]:
+    """What covers the plain ground within `area`: areas that do not overlap, and reach under
+    streets and houses.
 
     Nothing for a generated city: `physics/street/frontage.py` covers its ground."""
     if street_map.planned:
@@ -58,16 +65,24 @@ def open_ground(street_map: StreetMap, area: shapely.Polygon) -> list[tuple[Land
     for kind, whole in (*lands, *_beds(street_map, area)):
         part = overlay.intersection(whole, area)
         rest = shapely.get_parts(overlay.difference(part, taken))
-        found[kind] += [piece for piece in rest if isinstance(piece, Polygon) and piece.area > _SPLINTER_M2]
+        found[kind] += [
+            piece for piece in rest if isinstance(piece, Polygon) and piece.area > _SPLINTER_M2
+        ]
         taken = overlay.union(taken, part)
-    return [(kind, overlay.union_all(parts)) for kind, parts in found.items() if kind != PLAIN_GROUND and parts]
+    return [
+        (kind, overlay.union_all(parts))
+        for kind, parts in found.items()
+        if kind != PLAIN_GROUND and parts
+    ]
 
 
 def beside(strip: Strip, near_m: float, far_m: float) -> shapely.Geometry:
-    """What lies between two distances from the middle of a sidewalk, on the side away from its road."""
+    """What lies between two distances from the middle of a sidewalk, on the side away from its
+    road."""
     line = shapely.LineString((strip.line if strip.road_side < 0 else strip.line[::-1])[:, :2])
     one, two = (
-        shapely.buffer(line, d, cap_style="flat", join_style="mitre", single_sided=True) for d in (far_m, near_m)
+        shapely.buffer(line, d, cap_style="flat", join_style="mitre", single_sided=True)
+        for d in (far_m, near_m)
     )
     return shapely.difference(one, two)
 

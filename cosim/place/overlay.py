@@ -1,7 +1,8 @@
 """Union, difference and intersection of ground, also of shapes that GEOS gives up on.
 
-Foreign maps hold slivers, and the mitred outline of a sliver can cross itself; GEOS refuses to overlay such shapes.
-What it refuses is repaired and, if need be, snapped to a grid. What it accepts keeps its bits.
+Foreign maps hold slivers, and the mitred outline of a sliver can cross itself; GEOS refuses to
+overlay such shapes. What it refuses is repaired and, if need be, snapped to a grid. What it accepts
+keeps its bits.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ Shapes = NDArray[np.object_]
 
 
 def union(a: Any, b: Any) -> Any:
-    """The union of two shapes, or of (N,) pairs of them. Raises MapError with the place where nothing helps."""
+    """The union of two shapes, or of (N,) pairs of them. Raises MapError with the place where
+    nothing helps."""
     return _pairs(shapely.union, a, b)
 
 
@@ -41,7 +43,8 @@ def intersection(a: Any, b: Any) -> Any:
 
 
 def union_all(shapes: Sequence[shapely.Geometry] | Shapes) -> Polygon | MultiPolygon:
-    """The union of all shapes, areas as a rule. Raises MapError with the place where nothing helps."""
+    """The union of all shapes, areas as a rule. Raises MapError with the place where nothing
+    helps."""
     every = np.asarray(shapes, dtype=object)
 
     def whole(pieces: Shapes, grid_size: float | None = None) -> Any:
@@ -71,15 +74,20 @@ def _pairs(operation: Callable[..., Any], a: Any, b: Any) -> Any:
 
 
 def _tried(operation: Callable[..., Any], *shapes: Any) -> Any:
-    """The operation on the shapes as they are, else repaired, else snapped to coarser and coarser grids as well."""
+    """The operation on the shapes as they are, else repaired, else snapped to coarser and coarser
+    grids as well."""
     try:
         return operation(*shapes)
     except shapely.errors.GEOSException as error:
         refusal = error
-    mended = [shapely.make_valid(shape, method="structure", keep_collapsed=False) for shape in shapes]
+    mended = [
+        shapely.make_valid(shape, method="structure", keep_collapsed=False) for shape in shapes
+    ]
     for grid_m in (None, *GRIDS_M):
         try:
             return operation(*mended, grid_size=grid_m)
         except shapely.errors.GEOSException as error:
             refusal = error
-    raise MapError(f"the ground{where_geos_failed(refusal)} is too tangled to be put together: {refusal}") from refusal
+    raise MapError(
+        f"the ground{where_geos_failed(refusal)} is too tangled to be put together: {refusal}"
+    ) from refusal

@@ -1,4 +1,5 @@
-"""From a way over ports to the line a robot can follow: along the middle of strips, round the inside of corners."""
+"""From a way over ports to the line a robot can follow: along the middle of strips, round the
+inside of corners."""
 
 from __future__ import annotations
 
@@ -27,11 +28,12 @@ SMOOTHING_ROUNDS = 2
 def way_line(street_map: StreetMap, way: Sequence[Port], start_m: float, goal_m: float) -> Polyline:
     """The line along a way.
 
-    way: ports in order, beginning with the port by which the first strip is left and ending with the port by which
-    the last is entered. start_m, goal_m: how far from those ports the line begins on the first strip and ends on
-    the last. Raises MapError when a corner cannot be passed.
+    way: ports in order, beginning with the port by which the first strip is left and ending with
+    the port by which the last is entered. start_m, goal_m: how far from those ports the line begins
+    on the first strip and ends on the last. Raises MapError when a corner cannot be passed.
     """
-    first, last = street_map.strips[way[0].strip], street_map.strips[way[-1].strip]
+    first = street_map.strips[way[0].strip]
+    last = street_map.strips[way[-1].strip]
     pieces = [tail(first, way[0], start_m)[::-1]]
     for leave, enter in itertools.pairwise(way):
         if leave.strip == enter.strip:
@@ -51,22 +53,28 @@ def tail(strip: Strip, port: Port, length_m: float) -> Floats:
 
 
 def through_corner(street_map: StreetMap, leave: Port, enter: Port) -> Floats:
-    """The shortest line across a corner between two ports that keeps off its edges, ends included."""
+    """The shortest line across a corner between two ports that keeps off its edges, ends
+    included."""
     strips = [street_map.strips[port.strip] for port in (leave, enter)]
     corner_id = strips[0].corners[leave.end]
     if corner_id is None or corner_id != strips[1].corners[enter.end]:
         raise MapError(f"{leave} and {enter} do not meet at a corner of map '{street_map.name}'")
-    a, b = (s.line[0 if p.end == 0 else -1, :2] for s, p in zip(strips, (leave, enter), strict=True))
+    a, b = (
+        s.line[0 if p.end == 0 else -1, :2] for s, p in zip(strips, (leave, enter), strict=True)
+    )
     area = union_closed([street_map.corners[corner_id].polygon, *(s.polygon for s in strips)])
     for margin_m in MARGINS_M:
         line = shortest_inside(shapely.buffer(area, -margin_m), a, b)
         if line is not None:
             return line
-    raise MapError(f"no line through corner '{corner_id}' of map '{street_map.name}' from {leave} to {enter}")
+    raise MapError(
+        f"no line through corner '{corner_id}' of map '{street_map.name}' from {leave} to {enter}"
+    )
 
 
 def shortest_inside(area: Polygon | MultiPolygon, a: Floats, b: Floats) -> Floats | None:
-    """The shortest line from a to b inside an area, (N, 2) metres, or None. By its visibility graph."""
+    """The shortest line from a to b inside an area, (N, 2) metres, or None. By its visibility
+    graph."""
     from scipy.sparse import csr_array  # 0.2 s, and episodes have their lines
     from scipy.sparse.csgraph import dijkstra
 
@@ -95,7 +103,8 @@ def shortest_inside(area: Polygon | MultiPolygon, a: Floats, b: Floats) -> Float
 
 
 def smoothed(line: Polyline) -> Polyline:
-    """The line with its bends rounded by corner cutting and a point about every metre; the ends stay."""
+    """The line with its bends rounded by corner cutting and a point about every metre; the ends
+    stay."""
     points = line.resampled(_STEP_M).points
     for _ in range(SMOOTHING_ROUNDS):
         middle = (points[:-1] + points[1:]) / 2

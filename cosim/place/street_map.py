@@ -1,7 +1,8 @@
-"""StreetMap: what a place is. Walkable strips and corners, crossings and their signals, roads, zones.
+"""StreetMap: what a place is. Walkable strips and corners, crossings and their signals, roads,
+zones.
 
-Every place, generated or imported, is read from a SUMO net into this one value; ground, buildings, routes, crowd
-and the referee's walkable area derive from it.
+Every place, generated or imported, is read from a SUMO net into this one value; ground, buildings,
+routes, crowd and the referee's walkable area derive from it.
 """
 
 from __future__ import annotations
@@ -40,10 +41,11 @@ class Port(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class SignalPlan:
-    """A crossing's signal that goes by the clock alone: phase after phase, and again from the first.
+    """A crossing's signal that goes by the clock alone: phase after phase, and again from the
+    first.
 
-    The first one begins at offset_ms, in milliseconds of SUMO's time. durations_ms: of the phases; walks: whether one
-    may walk in each.
+    The first one begins at offset_ms, in milliseconds of SUMO's time. durations_ms: of the phases;
+    walks: whether one may walk in each.
     """
 
     offset_ms: int
@@ -55,12 +57,13 @@ class SignalPlan:
 class Strip:
     """A sidewalk or a crossing: a band of `width_m` around `line`, (N, 2) metres.
 
-    id: SUMO edge id. corners: ids of the corners at either end, None at a dead end. signalised and crosses
-    (ids of the road edges crossed) are for crossings; frontage_m, curb_m (width of curb and gutter), verge_m and
-    street_class for sidewalks. road_side: +1 when the road lies left of `line`, -1 right, 0 when there is none.
-    driveways: arc lengths of `line`, in metres, where a driveway's middle crosses the sidewalk. going: plain ground,
-    steps, or a bridge or tunnel, which share their place on the map with what lies below or above. plan: of a
-    crossing's signal; None where there is no signal, or where SUMO alone can tell what it shows.
+    id: SUMO edge id. corners: ids of the corners at either end, None at a dead end. signalised and
+    crosses (ids of the road edges crossed) are for crossings; frontage_m, curb_m (width of curb and
+    gutter), verge_m and street_class for sidewalks. road_side: +1 when the road lies left of
+    `line`, -1 right, 0 when there is none. driveways: arc lengths of `line`, in metres, where a
+    driveway's middle crosses the sidewalk. going: plain ground, steps, or a bridge or tunnel, which
+    share their place on the map with what lies below or above. plan: of a crossing's signal; None
+    where there is no signal, or where SUMO alone can tell what it shows.
     """
 
     id: str
@@ -98,7 +101,8 @@ class Corner:
 class Lane:
     """A lane that is not for walking. kind "road": driven on; "verge": between road and sidewalk.
 
-    internal: part of a junction's interior. cars: whether cars may drive on it, and not only bicycles or trams.
+    internal: part of a junction's interior. cars: whether cars may drive on it, and not only
+    bicycles or trams.
     """
 
     id: str
@@ -123,16 +127,18 @@ class Junction:
 LandKind = Literal["lawn", "planting", "soil", "yard", "water"]
 """What open land is covered with. yard: land to park, drive or work on, such as a parking lot."""
 LANDS: Final[tuple[LandKind, ...]] = get_args(LandKind)
-FeatureKind = Literal["building", "tree", "lamp", "bench", "bollard", "bin", "hydrant", "rack"] | LandKind
+FeatureKind = (
+    Literal["building", "tree", "lamp", "bench", "bollard", "bin", "hydrant", "rack"] | LandKind
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Feature:
     """A building, a thing on the street or a piece of land that the map itself shows.
 
-    x_m, y_m: its middle. heading_rad: along it, what it serves or faces to its left (the arm of a lamp) or right (who
-    sits on a bench, the front of a building). height_m: 0 where the map does not say. polygon: the ground of a building
-    or a piece of land; empty for the others.
+    x_m, y_m: its middle. heading_rad: along it, what it serves or faces to its left (the arm of a
+    lamp) or right (who sits on a bench, the front of a building). height_m: 0 where the map does
+    not say. polygon: the ground of a building or a piece of land; empty for the others.
     """
 
     kind: FeatureKind
@@ -158,10 +164,11 @@ _Piece = Strip | Corner | Lane | Junction
 class StreetMap:
     """A place. All ids are SUMO edge, lane or junction ids; the mappings are in the net's order.
 
-    bounds: x0, y0, x1, y1 in metres. net_hash: content hash of the net it was read from, and of the features where
-    there are any. features: what the map shows beside its streets; none of it stands in the way.
-    terrain: None where the place is flat; elevation: what became of the net's elevations, None when it has none.
-    planned: a generated city: its net names the class of each of its streets.
+    bounds: x0, y0, x1, y1 in metres. net_hash: content hash of the net it was read from, and of the
+    features where there are any. features: what the map shows beside its streets; none of it stands
+    in the way. terrain: None where the place is flat; elevation: what became of the net's
+    elevations, None when it has none. planned: a generated city: its net names the class of each of
+    its streets.
     """
 
     name: str
@@ -184,7 +191,8 @@ class StreetMap:
 
     @property
     def made_of(self) -> str:
-        """A hash of all that it was read from, and of what read it; "" where it is made by hand or of another one."""
+        """A hash of all that it was read from, and of what read it; "" where it is made by hand or
+        of another one."""
         return self._made_of
 
     def read_of(self, made_of: str) -> Self:
@@ -217,7 +225,10 @@ class StreetMap:
     def lands_near(self, area: shapely.Geometry) -> list[Feature]:
         """Pieces of land that the map shows and that touch `area`, the smallest first."""
         tree, lands = self._lands
-        return sorted((lands[i] for i in np.sort(tree.query(area, "intersects"))), key=lambda land: land.polygon.area)
+        return sorted(
+            (lands[i] for i in np.sort(tree.query(area, "intersects"))),
+            key=lambda land: land.polygon.area,
+        )
 
     def houses_near(self, area: shapely.Geometry) -> list[Feature]:
         """Buildings that the map shows and that touch `area`, in its order."""
@@ -233,10 +244,13 @@ class StreetMap:
         return _by_place(feature for feature in self.features if feature.kind == "building")
 
     def walkable_near(self, area: shapely.Geometry) -> Polygon | MultiPolygon:
-        """Union of the walkable pieces that touch `area`; seams closed. Raises MapError when there are none."""
+        """Union of the walkable pieces that touch `area`; seams closed. Raises MapError when there
+        are none."""
         polygons = [piece.polygon for piece in self.near("strip", area) + self.near("corner", area)]
         if not polygons:
-            raise MapError(f"nothing walkable near {shapely.centroid(area).wkt} on map '{self.name}'")
+            raise MapError(
+                f"nothing walkable near {shapely.centroid(area).wkt} on map '{self.name}'"
+            )
         return union_closed(polygons)
 
     @cached_property
@@ -246,15 +260,18 @@ class StreetMap:
         return union_closed([s.polygon for s in strips] + [c.polygon for c in corners])
 
     def locate(self, x_m: float, y_m: float, slack_m: float = 0.8) -> Located:
-        """The walkable piece at a point (up to `slack_m` beside it), else the lane there, else "off"."""
+        """The walkable piece at a point (up to `slack_m` beside it), else the lane there, else
+        "off"."""
         point = shapely.Point(x_m, y_m)
-        best, best_gap = "", slack_m
+        best = ""
+        best_gap = slack_m
         for kind in ("corner", "strip"):
             tree, pieces = self._tree(kind)
             for i in np.sort(tree.query(point, predicate="dwithin", distance=slack_m)):
                 gap = float(shapely.distance(pieces[i].polygon, point))
                 if gap < best_gap or (gap == 0.0 and not best):
-                    best, best_gap = pieces[i].id, gap
+                    best = pieces[i].id
+                    best_gap = gap
                 if gap == 0.0:
                     return Located("walk", pieces[i].id)
         tree, pieces = self._tree("lane")
@@ -283,7 +300,8 @@ def _by_place(features: Iterable[Feature]) -> tuple[shapely.STRtree, tuple[Featu
 
 
 def street_of(edge: str) -> str:
-    """What the two directions and the pieces of a street have in common: `-s12b` and `s12a` are s12, `-7#2` is 7."""
+    """What the two directions and the pieces of a street have in common: `-s12b` and `s12a` are
+    s12, `-7#2` is 7."""
     return re.sub(r"(#-?\d+|(?<=\d)[a-d])$", "", edge.removeprefix("-"))
 
 
@@ -303,8 +321,14 @@ class WalkableArea:
     def __init__(self, polygon: Polygon | MultiPolygon) -> None:
         self.polygon = polygon
         shapely.prepare(polygon)
-        rings = [shapely.get_coordinates(r) for part in shapely.get_parts(polygon) for r in shapely.get_rings(part)]
-        ends = np.concatenate([np.empty((0, 2, 2)), *(np.stack([r[:-1], r[1:]], axis=1) for r in rings)])
+        rings = [
+            shapely.get_coordinates(r)
+            for part in shapely.get_parts(polygon)
+            for r in shapely.get_rings(part)
+        ]
+        ends = np.concatenate(
+            [np.empty((0, 2, 2)), *(np.stack([r[:-1], r[1:]], axis=1) for r in rings)]
+        )
         self._sides = shapely.STRtree(np.asarray(shapely.linestrings(ends), dtype=object))
 
     def contains(self, x_m: float, y_m: float) -> bool:
@@ -316,5 +340,7 @@ class WalkableArea:
         inside: NDArray[np.bool_] = shapely.contains_xy(self.polygon, xy[:, 0], xy[:, 1])
         if not len(self._sides):
             return np.full(len(xy), -np.inf)
-        _, gap = self._sides.query_nearest(shapely.points(xy), return_distance=True, all_matches=False)
+        _, gap = self._sides.query_nearest(
+            shapely.points(xy), return_distance=True, all_matches=False
+        )
         return np.where(inside, gap, -gap)

@@ -1,8 +1,9 @@
 """WalkGraph: where one can walk on, from strip to strip, and how far it is.
 
-Nodes are ports, the two ends of every strip. Arcs lead along each strip (its length) and, at each corner, between
-every two of its ports (the straight line). A closed port is one that a barrier stops: nobody passes between it and
-its corner, but the strip behind it stays walkable from its other end.
+Nodes are ports, the two ends of every strip. Arcs lead along each strip (its length) and, at each
+corner, between every two of its ports (the straight line). A closed port is one that a barrier
+stops: nobody passes between it and its corner, but the strip behind it stays walkable from its
+other end.
 """
 
 from __future__ import annotations
@@ -37,7 +38,8 @@ CROSSING_WEIGHT = 0.5
 class Reach:
     """Everything that can be walked to from `start`.
 
-    distance_m: (P,) metres to each port of the graph, inf where it is out of reach or beyond the limit.
+    distance_m: (P,) metres to each port of the graph, inf where it is out of reach or beyond the
+    limit.
     """
 
     start: Port
@@ -69,13 +71,16 @@ class Reach:
 class WalkGraph:
     """The walking graph of a place.
 
-    ports: all P of them, both ends of each strip in the map's order. xy: (P, 2) metres. component: (P,) label of
-    the connected part each port lies in, when nothing is closed. main_strips: the strips of the longest such part.
+    ports: all P of them, both ends of each strip in the map's order. xy: (P, 2) metres. component:
+    (P,) label of the connected part each port lies in, when nothing is closed. main_strips: the
+    strips of the longest such part.
     """
 
     def __init__(self, street_map: StreetMap) -> None:
         self.street_map = street_map
-        self.ports: tuple[Port, ...] = tuple(p for s in street_map.strips for p in (Port(s, 0), Port(s, 1)))
+        self.ports: tuple[Port, ...] = tuple(
+            p for s in street_map.strips for p in (Port(s, 0), Port(s, 1))
+        )
         self._index = {strip: 2 * i for i, strip in enumerate(street_map.strips)}
         strips = list(street_map.strips.values())
         ends = [strip.line[i, :2] for strip in strips for i in (0, -1)]
@@ -100,9 +105,12 @@ class WalkGraph:
     def main_strips(self) -> frozenset[str]:
         if not self.street_map.strips:
             return frozenset()
-        labels, (_, _, lengths_m) = self.component[::2], self._along
+        labels = self.component[::2]
+        (_, _, lengths_m) = self._along
         main = np.argmax(np.bincount(labels, weights=lengths_m[: len(labels)]))
-        return frozenset(strip for strip, c in zip(self.street_map.strips, labels, strict=True) if c == main)
+        return frozenset(
+            strip for strip, c in zip(self.street_map.strips, labels, strict=True) if c == main
+        )
 
     def point(self, port: Port) -> tuple[float, float]:
         """Where a port is, in metres."""
@@ -110,34 +118,49 @@ class WalkGraph:
         return float(x), float(y)
 
     def others(self, port: Port, closed: frozenset[Port] = OPEN) -> tuple[Port, ...]:
-        """The ports that can be reached across the corner at `port`; none at a dead end or a closed port."""
+        """The ports that can be reached across the corner at `port`; none at a dead end or a closed
+        port."""
         if port in closed:
             return ()
         around = self._corner.get(port, ())
         return tuple(other for other in around if other not in closed) if closed else around
 
-    def shortest(self, start: Port, goal: Port, closed: frozenset[Port] = OPEN) -> tuple[list[Port], float] | None:
-        """The shortest way from port to port, both included, and its length in metres; None if there is none."""
+    def shortest(
+        self, start: Port, goal: Port, closed: frozenset[Port] = OPEN
+    ) -> tuple[list[Port], float] | None:
+        """The shortest way from port to port, both included, and its length in metres; None if
+        there is none."""
         reach = self.reach(start, closed)
         path = reach.path(goal)
         return None if path is None else (path, reach.to(goal))
 
-    def reach(self, start: Port, closed: frozenset[Port] = OPEN, limit_m: float = math.inf) -> Reach:
+    def reach(
+        self, start: Port, closed: frozenset[Port] = OPEN, limit_m: float = math.inf
+    ) -> Reach:
         """Distances from `start` to every port within `limit_m`."""
         from scipy.sparse.csgraph import dijkstra
 
         distance, before = dijkstra(  # type: ignore[call-overload]
-            self._arcs(closed), indices=_number(self._index, start), return_predecessors=True, limit=limit_m
+            self._arcs(closed),
+            indices=_number(self._index, start),
+            return_predecessors=True,
+            limit=limit_m,
         )
         return Reach(start, self.ports, distance, self._index, before)
 
     def wander(
-        self, rng: np.random.Generator, strip: str, forward: bool, n_edges: int, closed: frozenset[Port] = OPEN
+        self,
+        rng: np.random.Generator,
+        strip: str,
+        forward: bool,
+        n_edges: int,
+        closed: frozenset[Port] = OPEN,
     ) -> list[str]:
-        """A random walk: up to `n_edges` strip ids from `strip` on, crossings named, never past a closed port.
+        """A random walk: up to `n_edges` strip ids from `strip` on, crossings named, never past a
+        closed port.
 
-        forward: whether `strip` is walked along its line. It keeps out of strips without a way out and does not
-        end on a crossing, so it can be shorter, down to `strip` alone.
+        forward: whether `strip` is walked along its line. It keeps out of strips without a way out
+        and does not end on a crossing, so it can be shorter, down to `strip` alone.
         """
         strips = self.street_map.strips
         walk = [strip]
@@ -159,7 +182,9 @@ class WalkGraph:
             walk.pop()
         return walk
 
-    def _choices(self, port: Port, closed: frozenset[Port]) -> tuple[tuple[Port, ...], tuple[float, ...]]:
+    def _choices(
+        self, port: Port, closed: frozenset[Port]
+    ) -> tuple[tuple[Port, ...], tuple[float, ...]]:
         """Where a wanderer at a port may go on that is no dead end, and how likely."""
         choices = tuple([p for p in self.others(port, closed) if self.others(p.other, closed)])
         kinds = [self.street_map.strips[p.strip].kind for p in choices]
@@ -167,9 +192,15 @@ class WalkGraph:
 
     @cached_property
     def _along(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats]:
-        lengths = np.array([max(strip.length_m, SHORTEST_HOP_M) for strip in self.street_map.strips.values()])
+        lengths = np.array(
+            [max(strip.length_m, SHORTEST_HOP_M) for strip in self.street_map.strips.values()]
+        )
         even = 2 * np.arange(len(lengths), dtype=np.int32)
-        return np.concatenate([even, even + 1]), np.concatenate([even + 1, even]), np.tile(lengths, 2)
+        return (
+            np.concatenate([even, even + 1]),
+            np.concatenate([even + 1, even]),
+            np.tile(lengths, 2),
+        )
 
     @cached_property
     def _hops(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats]:

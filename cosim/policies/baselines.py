@@ -1,9 +1,13 @@
-"""Baselines that look at nothing: they show what the failures of the benchmark mean."""
+"""Baselines without sensors, and the replay of recorded commands."""
 
 from __future__ import annotations
 
+from cosim.core.clock import Clock
+from cosim.core.errors import RunError
+from cosim.core.geometry import Floats
 from cosim.core.state import STILL, Command
-from cosim.episode.ports import Manifest, Observation
+from cosim.episode.interfaces import Observation
+from cosim.spec.manifest import Manifest
 
 
 class Stop:
@@ -19,7 +23,8 @@ class Stop:
 
 
 class Straight:
-    """Drives straight ahead, four fifths as fast as the robot travels: the courier at walking speed."""
+    """Drives straight ahead, four fifths as fast as the robot travels: the courier at walking
+    speed."""
 
     manifest = Manifest("straight")
 
@@ -28,3 +33,25 @@ class Straight:
 
     def act(self, observation: Observation) -> Command:
         return Command(observation.robot.cruise_mps * 4 / 5, 0.0)
+
+
+class Replay:
+    """Says at every tick what was recorded there. commands: (T, 2) m/s, rad/s. It sees nothing and
+    asks nothing."""
+
+    def __init__(self, commands: Floats) -> None:
+        self.manifest = Manifest("replay", rate_hz=1.0 / Clock().tick_s, camera=None)
+        self._commands = commands
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: Observation) -> Command:
+        """Raises RunError beyond the end of the record."""
+        if observation.tick >= len(self._commands):
+            raise RunError(
+                f"the record ends after {len(self._commands)} ticks, the episode goes on: "
+                f"not the same"
+            )
+        v_mps, w_radps = self._commands[observation.tick].tolist()
+        return Command(v_mps, w_radps)

@@ -1,4 +1,5 @@
-"""Load a policy by name: a shipped one, `path/to/file.py:Class`, `package.module:Class`, or `onnx:FOLDER`."""
+"""Load a policy by name: a bundled one, `path/to/file.py:Class`, `package.module:Class` or
+`onnx:FOLDER`."""
 
 from __future__ import annotations
 
@@ -7,7 +8,7 @@ import inspect
 import math
 import os
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol, cast
@@ -16,12 +17,38 @@ import msgspec
 
 from cosim.core.clock import Clock
 from cosim.core.errors import SpecError, UsageError, unknown
-from cosim.episode.driver import LOADED_WITHIN_S, Driver, Timer, told_of
-from cosim.episode.given import with_goal
-from cosim.episode.ports import CameraSpec, Manifest, Policy
+from cosim.episode.interfaces import Policy
+from cosim.episode.manifest_checks import with_goal
+from cosim.episode.policy_caller import LOADED_WITHIN_S, Driver, Timer, told_of
 from cosim.policies import POLICIES
-from cosim.policies.own_module import importable, policy_class, policy_module, remedy_for_missing
-from cosim.policies.shipped import shipped_bundles
+from cosim.policies.onnx.manifest import MANIFEST_FILE, read_bundle_manifest
+from cosim.policies.onnx.weights import weights_file
+from cosim.policies.user_module import importable, policy_class, policy_module, remedy_for_missing
+from cosim.spec.camera import CameraSpec
+from cosim.spec.manifest import Manifest
+
+
+def shipped_bundles(below: Path = Path(__file__).parent) -> Mapping[str, Path]:
+    """The folders of the ONNX bundles that ship with the project, by name:
+    `cosim/policies/*/NAME/manifest.json`."""
+    return {
+        manifest.parent.name: manifest.parent
+        for manifest in sorted(below.glob(f"*/*/{MANIFEST_FILE}"))
+    }
+
+
+def bundle_in_words(folder: Path) -> str:
+    """Where the weights of a bundle lie, or that they are missing, and in short where they come
+    from: a run that lacks them tells it whole."""
+    bundle = read_bundle_manifest(folder)
+    facts = bundle.files.get(bundle.model)
+    try:
+        found = f"weights {weights_file(bundle.name, bundle.model, facts, bundle.source, [folder])}"
+    except UsageError:
+        found = f"weights missing ({bundle.model})"
+    origin = bundle.source.partition(",")[0].partition(";")[0]
+    return f"ONNX bundle, {found}" + (f"; from {origin}" if origin else "")
+
 
 _MOST_PX = 4096
 LONGEST_NAME = 100
@@ -37,10 +64,12 @@ OTHER_NAMES = ("path/to/file.py:Class", "package.module:Class", f"{ONNX_SCHEME}F
 
 
 def load_policy(name: str, timer: Timer | None = None, start_s: float = LOADED_WITHIN_S) -> Driver:
-    """A new policy, its manifest read. Raises UsageError when the name means nothing or the class is no policy.
+    """A new policy, its manifest read. Raises UsageError when the name means nothing or the class
+    is no policy.
 
-    timer: is told while the policy is loaded and whenever it is asked; whoever reads it ends what takes too long.
-    start_s: without a timer an ONNX graph may take so long to be loaded and to answer once.
+    timer: is told while the policy is loaded and whenever it is asked; whoever reads it ends what
+    takes too long. start_s: without a timer an ONNX graph may take so long to be loaded and to
+    answer once.
 
     >>> load_policy("route").manifest.name
     'route'
@@ -48,9 +77,13 @@ def load_policy(name: str, timer: Timer | None = None, start_s: float = LOADED_W
     name = importable(name)
     within_s = start_s if timer is None else None
     if name.startswith(ONNX_SCHEME):
-        return _by_networks(name, _bundle(Path(name.removeprefix(ONNX_SCHEME)).expanduser(), within_s), timer)
+        return _by_networks(
+            name, _bundle(Path(name.removeprefix(ONNX_SCHEME)).expanduser(), within_s), timer
+        )
     if name.startswith(REMOTE_SCHEME):
-        raise UsageError(f"policy '{name}' is served elsewhere; here it must be one that this process can load")
+        raise UsageError(
+            f"policy '{name}' is served elsewhere; here it must be one that this process can load"
+        )
     if ":" not in name:
         if name in POLICIES:
             policy = POLICIES[name]()
@@ -117,11 +150,14 @@ def _by_networks(name: str, make: Callable[[], _Networked], timer: Timer | None)
 
 
 def source_hash(policy: Policy) -> str:
-    """Of the files in which the policy's class and its base classes are written; "" when none can be read.
+    """Of the files in which the policy's class and its base classes are written; "" when none can
+    be read.
 
-    What these import, and weights that they read, is not covered: a manifest's version is to tell that.
+    What these import, and weights that they read, is not covered: a manifest's version is to tell
+    that.
     """
-    digest, read = hashlib.blake2b(digest_size=8), False
+    digest = hashlib.blake2b(digest_size=8)
+    read = False
     for one in type(policy).__mro__:
         try:
             source = Path(inspect.getfile(one)).read_bytes()
@@ -140,7 +176,9 @@ def _made(name: str) -> Policy:
     except UsageError as error:
         if not isinstance(error.__cause__, ModuleNotFoundError):
             raise
-        raise UsageError(f"{error}. {remedy_for_missing(name, error.__cause__.name or '')}") from error
+        raise UsageError(
+            f"{error}. {remedy_for_missing(name, error.__cause__.name or '')}"
+        ) from error
     if getattr(module, "__file__", None) is None:  # a folder without __init__.py, such as a run's
         words = f"'{module.__name__}' is a folder without code here"
         raise UsageError(f"policy '{name}': {words}. {remedy_for_missing(name, module.__name__)}")
@@ -153,11 +191,17 @@ def _checked(name: str, policy: Policy) -> Manifest:
     """A copy of the policy's manifest. Raises UsageError when it has none, or lacks a method."""
     with _in_words(f"policy '{name}': its manifest:"):
         manifest = getattr(policy, "manifest", None)
-        lacking = [method for method in ("reset", "act") if not callable(getattr(policy, method, None))]
+        lacking = [
+            method for method in ("reset", "act") if not callable(getattr(policy, method, None))
+        ]
     if not isinstance(manifest, Manifest):
-        raise UsageError(f"policy '{name}' has no attribute 'manifest' that is a cosim.episode.ports.Manifest")
+        raise UsageError(
+            f"policy '{name}' has no attribute 'manifest' that is a cosim.spec.manifest.Manifest"
+        )
     if lacking:
-        raise UsageError(f"policy '{name}' has no method '{lacking[0]}'; see cosim.episode.ports.Policy")
+        raise UsageError(
+            f"policy '{name}' has no method '{lacking[0]}'; see cosim.episode.interfaces.Policy"
+        )
     try:
         with_goal(manifest, None)
         told = msgspec.to_builtins(manifest)
@@ -167,13 +211,21 @@ def _checked(name: str, policy: Policy) -> Manifest:
 
 
 def checked_manifest(name: str, told: object) -> Manifest:
-    """A manifest as it was told in another process, or copied. Raises UsageError, saying what is wrong with it."""
+    """A manifest as it was told in another process, or copied. Raises UsageError, saying what is
+    wrong with it."""
     try:
         manifest = msgspec.convert(told, Manifest)
         with_goal(manifest, None)
         Clock.for_rate(manifest.rate_hz)
         wrong = _wrong(manifest)
-    except (msgspec.ValidationError, SpecError, UsageError, TypeError, ValueError, OverflowError) as error:
+    except (
+        msgspec.ValidationError,
+        SpecError,
+        UsageError,
+        TypeError,
+        ValueError,
+        OverflowError,
+    ) as error:
         raise UsageError(f"policy '{name}': its manifest: {error}") from error
     if wrong:
         raise UsageError(f"policy '{name}': its manifest's {wrong}")
@@ -183,15 +235,26 @@ def checked_manifest(name: str, told: object) -> Manifest:
 def _wrong(manifest: Manifest) -> str:
     """What is wrong with the values of a manifest; "" if nothing is."""
     for field, text in (("name", manifest.name), ("version", manifest.version)):
-        if not 0 < len(text) <= LONGEST_NAME or not text.isprintable() or "/" in text or text.startswith("."):
-            return f"{field} must be a text of 1 to {LONGEST_NAME} printable characters, without '/', not {text!r:.80}"
+        if (
+            not 0 < len(text) <= LONGEST_NAME
+            or not text.isprintable()
+            or "/" in text
+            or text.startswith(".")
+        ):
+            return (
+                f"{field} must be a text of 1 to {LONGEST_NAME} printable characters, without "
+                f"'/', not {text!r:.80}"
+            )
     cameras = [*([] if manifest.camera is None else [manifest.camera]), *manifest.cameras.values()]
     return next(filter(None, map(_wrong_camera, cameras)), "")
 
 
 def _wrong_camera(camera: CameraSpec) -> str:
     if not all(1 <= side <= _MOST_PX for side in (camera.width, camera.height)):
-        return f"camera must have sides of 1 to {_MOST_PX} pixels, not {camera.width} x {camera.height}"
+        return (
+            f"camera must have sides of 1 to {_MOST_PX} pixels, not {camera.width} x "
+            f"{camera.height}"
+        )
     if not 0.0 < camera.fov_deg < 180.0:
         return f"camera fov_deg must be between 0 and 180, not {camera.fov_deg}"
     mount = camera.mount
@@ -199,16 +262,23 @@ def _wrong_camera(camera: CameraSpec) -> str:
         map(math.isfinite, (*mount.at_m, mount.pitch_down_deg, mount.yaw_left_deg))
     ):
         angles = f"{mount.pitch_down_deg}, {mount.yaw_left_deg}"
-        return f"camera mount at_m, pitch_down_deg and yaw_left_deg must be finite, not {mount.at_m}, {angles}"
+        return (
+            f"camera mount at_m, pitch_down_deg and yaw_left_deg must be finite, not "
+            f"{mount.at_m}, {angles}"
+        )
     return ""
 
 
 @contextmanager
 def _in_words(what: str) -> Iterator[None]:
-    """Whatever the user's code raises, SystemExit included, as a UsageError; Ctrl-C stays what it is."""
+    """Whatever the user's code raises, SystemExit included, as a UsageError; Ctrl-C stays what it
+    is."""
     try:
         yield
     except BaseException as error:
-        if isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        if (
+            isinstance(error, KeyboardInterrupt)
+            and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
+        ):
             raise
         raise UsageError(f"{what} {told_of(error).removeprefix('raised ')}") from error

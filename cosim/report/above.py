@@ -15,11 +15,11 @@ from shapely.geometry import LineString, MultiPolygon, Polygon
 
 from cosim.core.geometry import Floats
 from cosim.core.state import DIRECTED, PersonKind
-from cosim.episode.log import Log
 from cosim.place.open_ground import GROUND_LOOKS, PLAIN_GROUND, open_ground
 from cosim.place.street_map import Lane, StreetMap
-from cosim.records.record import Record
 from cosim.report.legend import Image, Rgb255, legend, wide_px
+from cosim.results.log import Log
+from cosim.results.record import Record
 from cosim.spec.obstacle import footprint
 from cosim.spec.scenario import Scenario
 
@@ -42,7 +42,10 @@ VERGE: Final[Rgb255] = (150, 200, 150)
 _WALK: Final[Rgb255] = (238, 236, 230)
 _CROSSING: Final[Rgb255] = (250, 250, 190)
 _STREETS: Final = {"road": ROAD, "verge": VERGE, "walk": _WALK, "crossing": _CROSSING}
-_GROUNDS: Final[dict[str, Rgb255]] = {**{kind: look.drawn for kind, look in GROUND_LOOKS.items()}, **_STREETS}
+_GROUNDS: Final[dict[str, Rgb255]] = {
+    **{kind: look.drawn for kind, look in GROUND_LOOKS.items()},
+    **_STREETS,
+}
 ROUTE: Final[Rgb255] = (60, 120, 220)
 TRACK: Final[Rgb255] = (20, 20, 20)
 BARRIER: Final[Rgb255] = (210, 30, 30)
@@ -51,16 +54,24 @@ PERSON: Final[Rgb255] = (150, 120, 190)
 EVENT: Final[Rgb255] = (230, 120, 0)
 RESIDENT: Final[Rgb255] = (0, 140, 110)
 RESET: Final[Rgb255] = (120, 120, 120)
-FAILURES: Final[dict[str, Rgb255]] = {"collision": (220, 0, 0), "out_of_lane": (190, 0, 190), "freezing": (0, 140, 200)}
+FAILURES: Final[dict[str, Rgb255]] = {
+    "collision": (220, 0, 0),
+    "out_of_lane": (190, 0, 190),
+    "freezing": (0, 140, 200),
+}
 
 
 class Sheet:
-    """A picture of a part of the world: x east is right, y north is up. bounds: x0, y0, x1, y1 in metres."""
+    """A picture of a part of the world: x east is right, y north is up. bounds: x0, y0, x1, y1 in
+    metres."""
 
-    def __init__(self, bounds: tuple[float, float, float, float], px_per_m: float = PX_PER_M) -> None:
+    def __init__(
+        self, bounds: tuple[float, float, float, float], px_per_m: float = PX_PER_M
+    ) -> None:
         x0, y0, x1, y1 = bounds
         self.px_per_m = min(px_per_m, LONGEST_PX / max(x1 - x0, y1 - y0))
-        self._x0, self._y1 = x0, y1
+        self._x0 = x0
+        self._y1 = y1
         width, height = math.ceil((x1 - x0) * self.px_per_m), math.ceil((y1 - y0) * self.px_per_m)
         self.image: Image = np.full((height, width, 3), GROUND_COLOUR, dtype=np.uint8)
         self._labels: list[Polygon] = []
@@ -74,7 +85,9 @@ class Sheet:
     def area(self, shape: Polygon | MultiPolygon, colour: Rgb255) -> None:
         for part in shapely.get_parts(shape):
             if isinstance(part, Polygon) and not part.is_empty:
-                rings = [self.px(np.array(ring.coords)) for ring in (part.exterior, *part.interiors)]
+                rings = [
+                    self.px(np.array(ring.coords)) for ring in (part.exterior, *part.interiors)
+                ]
                 cv2.fillPoly(self.image, rings, colour, cv2.LINE_AA, 4)
 
     def line(self, xy: Floats, colour: Rgb255, width_m: float) -> None:
@@ -84,23 +97,50 @@ class Sheet:
     def dot(self, xy: Floats, colour: Rgb255, radius_m: float, *, filled: bool = True) -> None:
         radius = max(2, round(radius_m * self.px_per_m))
         for x, y in self.px(xy):
-            cv2.circle(self.image, (int(x), int(y)), radius * 16, colour, -1 if filled else 2, cv2.LINE_AA, 4)
+            cv2.circle(
+                self.image,
+                (int(x), int(y)),
+                radius * 16,
+                colour,
+                -1 if filled else 2,
+                cv2.LINE_AA,
+                4,
+            )
 
-    def text(self, xy: Sequence[float], words: str, colour: Rgb255, beside_m: float = 0.0, size: float = 0.5) -> None:
-        """Words on a light plate near a place: below it, above it or beside it, where there is least under them.
+    def text(
+        self,
+        xy: Sequence[float],
+        words: str,
+        colour: Rgb255,
+        beside_m: float = 0.0,
+        size: float = 0.5,
+    ) -> None:
+        """Words on a light plate near a place: below it, above it or beside it, where there is
+        least under them.
 
-        beside_m: clear of what is drawn so far around the place; size: of the words, in OpenCV's units.
+        beside_m: clear of what is drawn so far around the place; size: of the words, in OpenCV's
+        units.
         """
         x, y = (self.px(np.array([xy]))[0] // 16).tolist()
         clear = round(beside_m * self.px_per_m)
-        wide, tall, gap = wide_px(words, size), round(22 * size), clear + TEXT_GAP_PX
+        wide = wide_px(words, size)
+        tall = round(22 * size)
+        gap = clear + TEXT_GAP_PX
         left = x - wide // 2
-        corners = [(left, y + gap + tall), (left, y - gap), (x + gap, y + tall // 2), (x - gap - wide, y + tall // 2)]
+        corners = [
+            (left, y + gap + tall),
+            (left, y - gap),
+            (x + gap, y + tall // 2),
+            (x - gap - wide, y + tall // 2),
+        ]
         for row in (1, 2, 3):
             further = row * (tall + 10)
             corners += [(left, y + gap + tall + further), (left, y - gap - further)]
         height, width = self.image.shape[:2]
-        corners = [(max(3, min(a, width - wide - 3)), max(tall + 3, min(b, height - 5))) for a, b in corners]
+        corners = [
+            (max(3, min(a, width - wide - 3)), max(tall + 3, min(b, height - 5)))
+            for a, b in corners
+        ]
         plates = [shapely.box(a - 3, b - tall - 3, a + wide + 3, b + 5) for a, b in corners]
         mark = shapely.box(x - clear, y - clear, x + clear, y + clear)
         taken = shapely.union_all([*self._labels, mark])
@@ -110,7 +150,16 @@ class Sheet:
         self._labels += [plates[chosen], mark]
         plate = self._pixels(plates[chosen])
         plate[:] = 191 + plate // 4
-        cv2.putText(self.image, words, corners[chosen], cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
+        cv2.putText(
+            self.image,
+            words,
+            corners[chosen],
+            cv2.FONT_HERSHEY_SIMPLEX,
+            size,
+            colour,
+            1,
+            cv2.LINE_AA,
+        )
 
     def _pixels(self, box: Polygon) -> Image:
         """The part of the picture in a box of pixels."""
@@ -121,9 +170,12 @@ class Sheet:
 def draw_above(street_map: StreetMap, scenario: Scenario, record: Record, log: Log) -> Image:
     """The picture of an episode, (H, W, 3) uint8 RGB."""
     route = np.array(scenario.route)
-    low, high = route.min(axis=0) - _MARGIN_M, route.max(axis=0) + _MARGIN_M
+    low = route.min(axis=0) - _MARGIN_M
+    high = route.max(axis=0) + _MARGIN_M
     bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-    sheet = Sheet(bounds, max(PX_PER_M, USUAL_PX / max(bounds[2] - bounds[0], bounds[3] - bounds[1])))
+    sheet = Sheet(
+        bounds, max(PX_PER_M, USUAL_PX / max(bounds[2] - bounds[0], bounds[3] - bounds[1]))
+    )
     draw_streets(sheet, street_map, shapely.box(*bounds))
     draw_way_and_things(sheet, scenario)
     sheet.dot(log.people_xy[log.people_kind == PersonKind.CROWD], PERSON, 0.15)
@@ -143,7 +195,11 @@ def draw_way_and_things(sheet: Sheet, scenario: Scenario) -> None:
     """The way of a scenario, and what stands there."""
     sheet.line(np.array(scenario.route), ROUTE, 0.4)
     for barrier in scenario.barriers:
-        across = np.array([-math.sin(barrier.heading_rad), math.cos(barrier.heading_rad)]) * barrier.length_m / 2
+        across = (
+            np.array([-math.sin(barrier.heading_rad), math.cos(barrier.heading_rad)])
+            * barrier.length_m
+            / 2
+        )
         middle = np.array([barrier.x_m, barrier.y_m])
         sheet.line(np.array([middle - across, middle + across]), BARRIER, 0.5)
     for obstacle in scenario.obstacles:
@@ -166,9 +222,11 @@ def draw_streets(sheet: Sheet, street_map: StreetMap, area: Polygon) -> None:
         sheet.area(shape, _GROUNDS[kind])
 
 
-def street_areas(street_map: StreetMap, area: Polygon) -> Iterator[tuple[str, Polygon | MultiPolygon]]:
-    """What lies in a part of a map, in the order in which it is drawn: what covers open ground (`GROUND_LOOKS`), road,
-    verge, walk or crossing, and its shape."""
+def street_areas(
+    street_map: StreetMap, area: Polygon
+) -> Iterator[tuple[str, Polygon | MultiPolygon]]:
+    """What lies in a part of a map, in the order in which it is drawn: what covers open ground
+    (`GROUND_LOOKS`), road, verge, walk or crossing, and its shape."""
     yield from open_ground(street_map, area)
     lanes = [piece for piece in street_map.near("lane", area) if isinstance(piece, Lane)]
     for junction in street_map.near("junction", area):

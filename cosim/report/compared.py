@@ -8,29 +8,54 @@ from typing import Any, Final, NamedTuple
 
 import pandas as pd
 
-from cosim.judge.metrics import SUCCESS_IN_WORDS
-from cosim.records.comparison import ComparedRun, RunComparison
-from cosim.records.paired import FEWEST_CHANGED
-from cosim.records.results import BOOTSTRAP
+from cosim.results.compare import FEWEST_CHANGED, ComparedRun, RunComparison
+from cosim.results.metrics import SUCCESS_IN_WORDS
+from cosim.results.table import BOOTSTRAP
 
 _OF_THE_SUITE: Final = (
-    "success", "goal_reached", "route_completion", "spl", "failures_per_100m", "collisions_per_100m",
-    "out_of_lane_per_100m", "freezings_per_100m", "failures_per_100m_route", "velocity_mean_mps",
-    "pedestrian_collision", "other_collision", "left_lane", "broke_rule", "red_light_entries",
-    "pedestrian_distance_min_m", "clearance_min_m", "time_to_goal_s",
-)  # fmt: skip
+    "success",
+    "goal_reached",
+    "route_completion",
+    "spl",
+    "failures_per_100m",
+    "collisions_per_100m",
+    "out_of_lane_per_100m",
+    "freezings_per_100m",
+    "failures_per_100m_route",
+    "velocity_mean_mps",
+    "pedestrian_collision",
+    "other_collision",
+    "left_lane",
+    "broke_rule",
+    "red_light_entries",
+    "pedestrian_distance_min_m",
+    "clearance_min_m",
+    "time_to_goal_s",
+)
 _OF_GROUPS: Final = {"success": "SR", "route_completion": "RC", "failures_per_100m": "FC"}
 _LATEX: Final = {
-    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
-    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
-    "|": r"\textbar{}", '"': r"\textquotedbl{}",
-}  # fmt: skip
+    "\\": r"\textbackslash{}",
+    "{": r"\{",
+    "}": r"\}",
+    "&": r"\&",
+    "%": r"\%",
+    "$": r"\$",
+    "#": r"\#",
+    "_": r"\_",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    '"': r"\textquotedbl{}",
+}
 _MARKS: Final = re.compile(r"([\\`*_{}\[\]#|~$&])")
 _SIGNED: Final = re.compile(r"(?<!\S)[-+]\d[\d.]*(?!\S)")
 
 
 class WrittenTable(NamedTuple):
-    """A title, heads of columns, rows of words; names: how many columns are names, the others are figures."""
+    """A title, heads of columns, rows of words; names: how many columns are names, the others are
+    figures."""
 
     title: str
     heads: tuple[str, ...]
@@ -39,14 +64,18 @@ class WrittenTable(NamedTuple):
 
 
 def tables_of_comparison(told: RunComparison, other: ComparedRun) -> tuple[WrittenTable, ...]:
-    """Of the first run and one of the others: the whole suite by metric, and its groups by the most telling metrics.
-    What no pair of episodes has is left out."""
+    """Of the first run and one of the others: the whole suite by metric, and its groups by the most
+    telling metrics. What no pair of episodes has is left out."""
     told_of = told.differences["after"] == other.label
     rows = told.differences[told_of & (told.differences["n"] > 0)].to_dict("records")
     title = f"{other.label} (B) against {told.before.label} (A), suite {told.suite}"
     figures = ("A", "B", "B - A", "95 % of B - A", "n", "")
     whole = [row for row in rows if row["by"] == "suite" and row["metric"] in _OF_THE_SUITE]
-    tables = [WrittenTable(title, ("metric", *figures), tuple((row["metric"], *_figures(row)) for row in whole), 1)]
+    tables = [
+        WrittenTable(
+            title, ("metric", *figures), tuple((row["metric"], *_figures(row)) for row in whole), 1
+        )
+    ]
     if parts := [row for row in rows if row["by"] != "suite" and row["metric"] in _OF_GROUPS]:
         named = " and ".join(dict.fromkeys(row["by"] for row in parts))
         each = tuple((row["group"], _OF_GROUPS[row["metric"]], *_figures(row)) for row in parts)
@@ -72,7 +101,10 @@ def flips_in_words(told: RunComparison, other: ComparedRun) -> tuple[str, ...]:
     """Which scenarios the other run won, and which it lost, by name."""
     flipped = told.flipped[told.flipped["after"] == other.label]
     lines = []
-    for flip, what in (("won", f"solved by {other.label} alone"), ("lost", f"solved by {told.before.label} alone")):
+    for flip, what in (
+        ("won", f"solved by {other.label} alone"),
+        ("lost", f"solved by {told.before.label} alone"),
+    ):
         names = flipped.loc[flipped["flip"] == flip, "scenario"].tolist()
         lines.append(f"{what}, {len(names)}: {', '.join(names) or 'none'}")
     return tuple(lines)
@@ -84,13 +116,13 @@ def how_to_read(told: RunComparison) -> str:
     shown = sum(row[-3] != "-" for table in tables for row in table.rows)
     in_all = int(told.differences["low"].notna().sum())
     return (
-        f"Paired by scenario, rates pooled; intervals by drawing scenarios again in pairs, {BOOTSTRAP} times, always "
-        "the same. Within noise: the interval holds 0. Too few: it does not, but fewer than "
-        f"{FEWEST_CHANGED} scenarios changed (of a rate: of those with a failure). "
-        "Differs: it does not, and there is no verdict. "
-        f"One interval in twenty misses by chance alone: {shown} stand in these tables, {in_all} in a .csv, a row for "
-        f"every metric of every group. SR {SUCCESS_IN_WORDS}; RC share of the route done; FC failures per 100 m "
-        "travelled; the scenarios of an event are those that have one on their way."
+        "Paired by scenario, rates pooled; intervals by drawing scenarios again in pairs, "
+        f"{BOOTSTRAP} times, always the same. Within noise: the interval holds 0. Too few: it does "
+        f"not, but fewer than {FEWEST_CHANGED} scenarios changed (of a rate: of those with a "
+        "failure). Differs: it does not, and there is no verdict. One interval in twenty misses "
+        f"by chance alone: {shown} stand in these tables, {in_all} in a .csv, a row for every "
+        f"metric of every group. SR {SUCCESS_IN_WORDS}; RC share of the route done; FC failures "
+        "per 100 m travelled; the scenarios of an event are those that have one on their way."
     )
 
 
@@ -100,7 +132,11 @@ def as_markdown(told: RunComparison) -> str:
     for other in told.others:
         for table in tables_of_comparison(told, other):
             bars = ["---"] * table.names + ["---:"] * (len(table.heads) - table.names)
-            lines = (table.heads, bars, *([_in_markdown(cell) for cell in row] for row in table.rows))
+            lines = (
+                table.heads,
+                bars,
+                *([_in_markdown(cell) for cell in row] for row in table.rows),
+            )
             rows = "\n".join(f"| {' | '.join(line)} |" for line in lines)
             blocks.append(f"**{_in_markdown(table.title)}**\n\n{rows}")
         blocks.append("\n".join(f"- {_in_markdown(line)}" for line in flips_in_words(told, other)))
@@ -113,12 +149,22 @@ def as_latex(told: RunComparison) -> str:
     for other in told.others:
         for table in tables_of_comparison(told, other):
             columns = "l" * table.names + "r" * (len(table.heads) - table.names - 1) + "l"
-            head, *rows = (" & ".join(map(_in_latex, line)) + r" \\" for line in (table.heads, *table.rows))
+            head, *rows = (
+                " & ".join(map(_in_latex, line)) + r" \\" for line in (table.heads, *table.rows)
+            )
             lines = (
-                r"\begin{table}", r"\centering", rf"\caption{{{_in_latex(table.title)}}}",
-                rf"\begin{{tabular}}{{{columns}}}", r"\hline", head, r"\hline", *rows, r"\hline", r"\end{tabular}",
+                r"\begin{table}",
+                r"\centering",
+                rf"\caption{{{_in_latex(table.title)}}}",
+                rf"\begin{{tabular}}{{{columns}}}",
+                r"\hline",
+                head,
+                r"\hline",
+                *rows,
+                r"\hline",
+                r"\end{tabular}",
                 r"\end{table}",
-            )  # fmt: skip
+            )
             blocks.append("\n".join(lines))
         blocks.append("\n\n".join(map(_in_latex, flips_in_words(told, other))))
     return "\n\n".join([*blocks, *map(_in_latex, (*told.notes, how_to_read(told)))]) + "\n"

@@ -1,4 +1,5 @@
-"""Curves of a sweep: a panel for each metric, the first field along it, a line for each value of the others."""
+"""Curves of a sweep: a panel for each metric, the first field along it, a line for each value of
+the others."""
 
 from __future__ import annotations
 
@@ -24,35 +25,55 @@ _TITLES: Final = {
     "time_to_goal_s": "time to the goal, s",
 }
 _SHARES: Final = ("success", "spl", "route_completion")
-_COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#555555", "#882255")
+_COLOURS: Final = (
+    "#0072b2",
+    "#d55e00",
+    "#009e73",
+    "#cc79a7",
+    "#56b4e9",
+    "#e69f00",
+    "#555555",
+    "#882255",
+)
 _MARKS: Final = "osD^v<>P"
 _MOST_NAMED: Final = 16
 """Of more lines than this none is named."""
-_PANEL_LETTERS, _PANEL_LINES, _UPRIGHT_LETTERS, _TITLE_LETTERS, _LEGEND_LETTERS = 44, 24, 26, 120, 168
-"""Letters that fit side by side below a panel; lines that fit there upright, and the letters of each; letters that fit
-above all panels, and below them."""
-_LOW, _HIGH = 7.4, 10.4
+_PANEL_LETTERS = 44
+_PANEL_LINES = 24
+_UPRIGHT_LETTERS = 26
+_TITLE_LETTERS = 120
+_LEGEND_LETTERS = 168
+"""Letters that fit side by side below a panel; lines that fit there upright, and the letters of
+each; letters that fit above all panels, and below them."""
+_LOW = 7.4
+_HIGH = 10.4
 """The figure's height in inches, with names side by side and with upright ones."""
 _APART: Final = 0.012
-"""Lines stand so far beside each other, of the width of a panel, so that their intervals can be told apart."""
+"""Lines stand so far beside each other, of the width of a panel, so that their intervals can be
+told apart."""
 
 
-def draw_curves(summary: pd.DataFrame, fields: Sequence[str], metrics: Sequence[str], title: str) -> bytes:
-    """A PNG of the means with their intervals. summary: rows of fields, metric, mean, low, high, n. Raises MachineError
-    where the library that draws is not installed."""
+def draw_curves(
+    summary: pd.DataFrame, fields: Sequence[str], metrics: Sequence[str], title: str
+) -> bytes:
+    """A PNG of the means with their intervals. summary: rows of fields, metric, mean, low, high, n.
+    Raises MachineError where the library that draws is not installed."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
     except ImportError as error:
         raise MachineError(
-            "no picture of the sweep: matplotlib is missing: `pip install matplotlib`, then the same with --resume"
+            "no picture of the sweep: matplotlib is missing: `pip install matplotlib`, then "
+            "the same with --resume"
         ) from error
     first, *others = fields
     along, ticks = _places(summary[first])
     whole = summary.assign(_along=along)
     lines = list(whole.groupby(others, sort=False)) if others else [((), whole)]
     figure = Figure(
-        figsize=(13.0, _LOW if ticks is None or _side_by_side(ticks) else _HIGH), dpi=120, layout="constrained"
+        figsize=(13.0, _LOW if ticks is None or _side_by_side(ticks) else _HIGH),
+        dpi=120,
+        layout="constrained",
     )
     FigureCanvasAgg(figure)
     for panel, metric in zip(figure.subplots(2, -(-len(metrics) // 2)).flat, metrics, strict=True):
@@ -63,7 +84,17 @@ def draw_curves(summary: pd.DataFrame, fields: Sequence[str], metrics: Sequence[
             at = here["_along"] + shift * (number - (len(lines) - 1) / 2)
             ends = [here["mean"] - here["low"], here["high"] - here["mean"]]
             named = _named(others, values)
-            panel.errorbar(at, here["mean"], ends, color=colour, marker=mark, capsize=3, lw=1.6, ms=5, label=named)
+            panel.errorbar(
+                at,
+                here["mean"],
+                ends,
+                color=colour,
+                marker=mark,
+                capsize=3,
+                lw=1.6,
+                ms=5,
+                label=named,
+            )
         panel.set_title(_TITLES.get(metric, metric), fontsize=11)
         panel.set_xlabel(first)
         panel.grid(alpha=0.3)
@@ -77,14 +108,17 @@ def draw_curves(summary: pd.DataFrame, fields: Sequence[str], metrics: Sequence[
         handles, names = figure.axes[0].get_legend_handles_labels()
         columns = min(len(names), 4, max(1, _LEGEND_LETTERS // (6 + max(map(len, names)))))
         figure.legend(handles, names, loc="outside lower center", ncols=columns, fontsize=9)
-    figure.suptitle(textwrap.fill(f"{title}: means with 95 % intervals", _TITLE_LETTERS), fontsize=12)
+    figure.suptitle(
+        textwrap.fill(f"{title}: means with 95 % intervals", _TITLE_LETTERS), fontsize=12
+    )
     picture = io.BytesIO()
     figure.savefig(picture, format="png")
     return picture.getvalue()
 
 
 def _name_ticks(panel: Axes, names: Sequence[str]) -> None:
-    """Name places along a panel: side by side where there is room, else upright, folded, of many every second or so."""
+    """Name places along a panel: side by side where there is room, else upright, folded, of many
+    every second or so."""
     if _side_by_side(names):
         panel.set_xticks(range(len(names)), names)
         return
@@ -100,7 +134,8 @@ def _side_by_side(names: Sequence[str]) -> bool:
 
 
 def _places(values: pd.Series[Any]) -> tuple[np.ndarray, list[str] | None]:
-    """Where values stand along a panel: numbers where they are, words one after the other, with their names."""
+    """Where values stand along a panel: numbers where they are, words one after the other, with
+    their names."""
     numbers = pd.to_numeric(values, errors="coerce")
     if numbers.notna().all() and not values.map(lambda value: isinstance(value, bool)).any():
         return numbers.to_numpy(dtype=float), None

@@ -1,4 +1,5 @@
-"""How a film is laid out, and what is written in it: panels, figures, captions of events and failures."""
+"""How a film is laid out, and what is written in it: panels, figures, captions of events and
+failures."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ class Area(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Where things are in a film: the view, beside it a second view (4:3) over the map, below them all the bar."""
+    """Where things are in a film: the view, beside it a second view (4:3) over the map, below them
+    all the bar."""
 
     view: Area
     second: Area
@@ -42,7 +44,8 @@ class Layout(NamedTuple):
         bar_px = max(22, height * 44 // 720)
         tall = height - bar_px
         column = min(width * 3 // 10, tall * 4 // 7) // 4 * 4
-        left, upper = width - column, column * 3 // 4
+        left = width - column
+        upper = column * 3 // 4
         return cls(
             view=Area(0, 0, left, tall),
             second=Area(left, 0, column, upper),
@@ -77,11 +80,16 @@ def words(image: Image, text: str, at: tuple[int, int], size: float, colour: Rgb
 
 
 def bar(image: Image, area: Area, left: str, right: str, share: float) -> None:
-    """The bar along the lower edge: what runs, its figures, and how much of the way is done. Words as large as fit."""
+    """The bar along the lower edge: what runs, its figures, and how much of the way is done. Words
+    as large as fit."""
     line_px = max(2, area.height // 10)
     image[area.y :] = (18, 20, 26)
     image[area.y : area.y + line_px] = 60
-    image[area.y : area.y + line_px, : round(area.width * min(max(share, 0.0), 1.0))] = (60, 150, 250)
+    image[area.y : area.y + line_px, : round(area.width * min(max(share, 0.0), 1.0))] = (
+        60,
+        150,
+        250,
+    )
     needed = sum(cv2.getTextSize(text, _FONT, 1.0, 1)[0][0] for text in (left, right))
     size = min(max(0.4, 0.0125 * area.height), (area.width - 3 * _MARGIN_PX) / needed)
     long, tall = cv2.getTextSize(right, _FONT, size, 1)[0]
@@ -94,6 +102,8 @@ def caption(image: Image, area: Area, text: str, colour: Rgb255) -> None:
     """A line in the upper middle of an area."""
     size = max(0.5, 0.9 * area.height / 676)
     long, tall = cv2.getTextSize(text, _FONT, size, 1)[0]
-    x, y, edge = area.x + (area.width - long) // 2, area.y + tall, tall * 2 // 3
+    x = area.x + (area.width - long) // 2
+    y = area.y + tall
+    edge = tall * 2 // 3
     shade(image, (max(x - edge, 0), y - edge, x + long + edge, y + tall + edge), 0.65)
     words(image, text, (x, y + tall), size, colour)

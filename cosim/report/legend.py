@@ -1,4 +1,5 @@
-"""The band below a picture: what it shows and what its colours mean, on as many lines as that takes."""
+"""The band below a picture: what it shows and what its colours mean, on as many lines as that
+takes."""
 
 from __future__ import annotations
 
@@ -21,14 +22,19 @@ _SIZE: Final = 0.5
 
 
 def legend(image: Image, cells: Sequence[tuple[str, Rgb255]]) -> Image:
-    """The picture, (H, W, 3) uint8 RGB, with a white band below it that holds every cell: words and their colour.
+    """The picture, (H, W, 3) uint8 RGB, with a white band below it that holds every cell: words and
+    their colour.
 
-    A cell that no longer fits into a line begins the next one; one that is wider than the picture breaks at blanks.
+    A cell that no longer fits into a line begins the next one; one that is wider than the picture
+    breaks at blanks.
     """
     lines = _lines(cells, image.shape[1])
-    band: Image = np.full((LINE_PX * len(lines) + 2 * MARGIN_PX, image.shape[1], 3), 255, dtype=np.uint8)
+    band: Image = np.full(
+        (LINE_PX * len(lines) + 2 * MARGIN_PX, image.shape[1], 3), 255, dtype=np.uint8
+    )
     for row, line in enumerate(lines):
-        x, y = MARGIN_PX, MARGIN_PX + LINE_PX * row + 16
+        x = MARGIN_PX
+        y = MARGIN_PX + LINE_PX * row + 16
         for words, colour in line:
             cv2.putText(band, words, (x, y), _FONT, _SIZE, colour, 1, cv2.LINE_AA)
             x += wide_px(words) + GAP_PX

@@ -33,12 +33,15 @@ MARKS: Final[dict[str, tuple[Rgb255, str]]] = {
 """Colour and meaning of each kind of problem."""
 
 
-def draw_map(street_map: StreetMap, check: MapCheck, part: tuple[float, float, float, float] | None = None) -> Image:
+def draw_map(
+    street_map: StreetMap, check: MapCheck, part: tuple[float, float, float, float] | None = None
+) -> Image:
     """The picture of a map, or of the `part` x0, y0, x1, y1 (metres) of it, (H, W, 3) uint8 RGB."""
     x0, y0, x1, y1 = street_map.bounds if part is None else part
     margin_m = _MARGIN_M if part is None else 0.0
     bounds = (x0 - margin_m, y0 - margin_m, x1 + margin_m, y1 + margin_m)
-    sheet, area = Sheet(bounds), shapely.box(*bounds)
+    sheet = Sheet(bounds)
+    area = shapely.box(*bounds)
     draw_streets(sheet, street_map, area)
     for strip in street_map.near("strip", area):
         if isinstance(strip, Strip) and strip.signalised:
@@ -54,7 +57,8 @@ def draw_map(street_map: StreetMap, check: MapCheck, part: tuple[float, float, f
 
 
 def write_png(image: Image, path: Path) -> None:
-    """Write an RGB picture. Raises UsageError for a name that is no PNG's, MachineError where it cannot be written."""
+    """Write an RGB picture. Raises UsageError for a name that is no PNG's, MachineError where it
+    cannot be written."""
     if path.suffix.lower() != ".png":
         raise UsageError(f"{path}: cannot be written as a picture; use a name that ends in .png")
     try:
@@ -75,7 +79,11 @@ def _facts(check: MapCheck) -> list[tuple[str, Rgb255]]:
 def _scale_bar(sheet: Sheet, bounds: tuple[float, float, float, float]) -> None:
     """A bar of a round number of metres in the lower left corner."""
     width_m = bounds[2] - bounds[0]
-    bar_m = max(b for b in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000) if b == 1 or b <= width_m / 5.0)
+    bar_m = max(
+        b
+        for b in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000)
+        if b == 1 or b <= width_m / 5.0
+    )
     x, y = bounds[0] + 0.02 * width_m, bounds[1] + 0.02 * width_m
     sheet.line(np.array([[x, y], [x + bar_m, y]]), TRACK, width_m / 400.0)
     sheet.text((x, y), f"{bar_m} m", TRACK)

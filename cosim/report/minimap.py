@@ -51,50 +51,70 @@ class Minimap:
     footprint_m: length and width of the robot.
     """
 
-    def __init__(self, street_map: StreetMap, scenario: Scenario, footprint_m: tuple[float, float]) -> None:
+    def __init__(
+        self, street_map: StreetMap, scenario: Scenario, footprint_m: tuple[float, float]
+    ) -> None:
         route = np.array(scenario.route)
-        low, high = route.min(axis=0) - 4.0 * MINIMAP_REACH_M, route.max(axis=0) + 4.0 * MINIMAP_REACH_M
+        low = route.min(axis=0) - 4.0 * MINIMAP_REACH_M
+        high = route.max(axis=0) + 4.0 * MINIMAP_REACH_M
         bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
         sheet = Sheet(bounds, SHARPEST_PX_PER_M)
         draw_streets(sheet, street_map, shapely.box(*bounds))
         sheet.line(route, ROUTE, 0.2)
         for barrier in scenario.barriers:
-            across = np.array([-math.sin(barrier.heading_rad), math.cos(barrier.heading_rad)]) * barrier.length_m / 2
+            across = (
+                np.array([-math.sin(barrier.heading_rad), math.cos(barrier.heading_rad)])
+                * barrier.length_m
+                / 2
+            )
             middle = np.array([barrier.x_m, barrier.y_m])
             sheet.line(np.array([middle - across, middle + across]), BARRIER, 0.4)
         for obstacle in scenario.obstacles:
             sheet.area(footprint(obstacle), OBSTACLE)
         sheet.dot(np.array([scenario.goal]), ROUTE, 0.7)
         sheet.dot(np.array([scenario.goal]), (255, 255, 255), 0.3)
-        self._streets, self._footprint = sheet, np.array(footprint_m)
-        self._lights = {c.id: street_map.strips[c.id].line[:, :2] for c in scenario.crossings if c.signalised}
+        self._streets = sheet
+        self._footprint = np.array(footprint_m)
+        self._lights = {
+            c.id: street_map.strips[c.id].line[:, :2] for c in scenario.crossings if c.signalised
+        }
 
     def picture(
-        self, robot: RobotState, street: Street, size_px: tuple[int, int], ahead: Floats, plan: Floats | None = None
+        self,
+        robot: RobotState,
+        street: Street,
+        size_px: tuple[int, int],
+        ahead: Floats,
+        plan: Floats | None = None,
     ) -> Image:
-        """(height, width, 3) uint8 RGB; size_px: width, height; ahead: (2,) where the map shows more; plan: (N, 2)
-        waypoints that are followed, if any.
+        """(height, width, 3) uint8 RGB; size_px: width, height; ahead: (2,) where the map shows
+        more; plan: (N, 2) waypoints that are followed, if any.
 
-        People have a nose where they face; those of events are orange, residents green; a hand held up to the robot
-        is red. A word says what event people do.
+        People have a nose where they face; those of events are orange, residents green; a hand held
+        up to the robot is red. A word says what event people do.
         """
         width, height = size_px
         half_m = MINIMAP_REACH_M * np.array([width, height]) / min(width, height)
         middle = robot.pose.xy + _AHEAD_M * ahead / np.hypot(*ahead)
-        (x0, y0), (x1, y1) = (middle - half_m).tolist(), (middle + half_m).tolist()
+        (x0, y0) = (middle - half_m).tolist()
+        (x1, y1) = (middle + half_m).tolist()
         sheet = Sheet((x0, y0, x1, y1), max(width, height) / (2.0 * half_m.max()))
         sheet.image = self._ground(x0, y1, sheet.px_per_m, size_px)
         for crossing, line in self._lights.items():
             if crossing in street.signals:
                 sheet.line(line, _WALK if street.signals[crossing].walk else RED_SIGNAL, 0.4)
-        for xy, heading, size_m in zip(street.vehicles.xy, street.vehicles.heading, street.vehicles.size, strict=True):
+        for xy, heading, size_m in zip(
+            street.vehicles.xy, street.vehicles.heading, street.vehicles.size, strict=True
+        ):
             sheet.area(shapely.Polygon(_box(xy, heading, size_m)), VEHICLE)
         _draw_people(sheet, street.people)
         body = _box(robot.pose.xy, robot.pose.heading_rad, self._footprint)
         sheet.area(shapely.buffer(shapely.Polygon(body), 0.15), (255, 255, 255))
         sheet.area(shapely.Polygon(body), ROBOT)
         tip = robot.pose.xy + 0.5 * (body[0] + body[1] - 2.0 * robot.pose.xy)
-        sheet.area(shapely.Polygon([tip, 0.5 * (body[0] + body[3]), 0.5 * (body[1] + body[2])]), NOSE)
+        sheet.area(
+            shapely.Polygon([tip, 0.5 * (body[0] + body[3]), 0.5 * (body[1] + body[2])]), NOSE
+        )
         if plan is not None:
             sheet.line(plan, PLANNED, 0.12)
             sheet.dot(plan[1:], PLANNED, 0.14)
@@ -108,7 +128,11 @@ class Minimap:
         onto = np.array([[zoom, 0.0, left], [0.0, zoom, upper]])
         how = cv2.INTER_AREA if zoom > 1.0 else cv2.INTER_LINEAR
         ground: Image = cv2.warpAffine(
-            streets.image, onto, size_px, flags=how | cv2.WARP_INVERSE_MAP, borderValue=GROUND_COLOUR
+            streets.image,
+            onto,
+            size_px,
+            flags=how | cv2.WARP_INVERSE_MAP,
+            borderValue=GROUND_COLOUR,
         ).astype(np.uint8)
         return ground
 
@@ -118,7 +142,8 @@ def _draw_people(sheet: Sheet, people: People) -> None:
     event = people.are(*DIRECTED)
     ahead = np.column_stack([np.cos(people.heading), np.sin(people.heading)])
     for row in np.argsort(event, kind="stable").tolist():
-        xy, way = people.xy[row], ahead[row]
+        xy = people.xy[row]
+        way = ahead[row]
         colour = COLOURS[people.kind[row]]
         aside = 0.8 * PERSON_RADIUS_M * np.array([-way[1], way[0]])
         nose = shapely.Polygon([xy + _NOSE_M * way, xy + aside, xy - aside])
@@ -127,7 +152,9 @@ def _draw_people(sheet: Sheet, people: People) -> None:
             sheet.area(part.buffer(0.09), _INK)
         sheet.area(body, colour)
         if people.doing[row] == "stop":
-            hand = np.array([xy + (_NOSE_M + 0.1) * way + 2.0 * aside, xy + (_NOSE_M + 0.1) * way - 2.0 * aside])
+            hand = np.array(
+                [xy + (_NOSE_M + 0.1) * way + 2.0 * aside, xy + (_NOSE_M + 0.1) * way - 2.0 * aside]
+            )
             sheet.line(hand, RED_SIGNAL, 0.25)
     doing = np.array(people.doing)
     for word in dict.fromkeys(doing[event].tolist()):
@@ -140,4 +167,6 @@ def _box(xy: Floats, heading_rad: float, size_m: Floats) -> Floats:
     """(4, 2) corners of a box: fore left, fore right, aft right, aft left."""
     along = 0.5 * size_m[0] * np.array([math.cos(heading_rad), math.sin(heading_rad)])
     aside = 0.5 * size_m[1] * np.array([-math.sin(heading_rad), math.cos(heading_rad)])
-    return np.array([xy + along + aside, xy + along - aside, xy - along - aside, xy - along + aside])
+    return np.array(
+        [xy + along + aside, xy + along - aside, xy - along - aside, xy - along + aside]
+    )

@@ -1,4 +1,5 @@
-"""A scenario from above before anything is run: streets with coordinates, the way with its metres, what is on it."""
+"""A scenario from above before anything is run: streets with coordinates, the way with its metres,
+what is on it."""
 
 from __future__ import annotations
 
@@ -28,8 +29,10 @@ from cosim.spec.scenario import Scenario
 _GRID: Final[Rgb255] = (160, 172, 186)
 _INK: Final[Rgb255] = (70, 84, 104)
 _STEPS_M: Final = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0)
-_LINES, _LINES_OF_ALL = 10, 25
-"""The grid has so many lines across the picture, at most, and across that of a whole place or a part of one."""
+_LINES = 10
+_LINES_OF_ALL = 25
+"""The grid has so many lines across the picture, at most, and across that of a whole place or a
+part of one."""
 _MARGIN_M: Final = 12.0
 _LEAST_SHARE: Final = 0.6
 """The shorter side of a picture is this much of the longer, about."""
@@ -39,10 +42,14 @@ _Bounds = tuple[float, float, float, float]
 
 
 def draw_plan(
-    street_map: StreetMap, scenario: Scenario | None, *, whole: bool = False, part: _Bounds | None = None
+    street_map: StreetMap,
+    scenario: Scenario | None,
+    *,
+    whole: bool = False,
+    part: _Bounds | None = None,
 ) -> Image:
-    """The picture of a scenario, (H, W, 3) uint8 RGB; None: of the place alone. whole: of its whole place; part: what
-    lies within x0, y0, x1, y1 (metres) of it."""
+    """The picture of a scenario, (H, W, 3) uint8 RGB; None: of the place alone. whole: of its whole
+    place; part: what lies within x0, y0, x1, y1 (metres) of it."""
     bounds = part or _around(street_map.bounds if whole or scenario is None else _ends(scenario))
     lines = _LINES_OF_ALL if part or whole or scenario is None else _LINES
     longest_m = max(bounds[2] - bounds[0], bounds[3] - bounds[1])
@@ -65,7 +72,8 @@ def draw_plan(
 def _ends(scenario: Scenario) -> _Bounds:
     """What a scenario covers."""
     spots = [*scenario.route, *((event.x_m, event.y_m) for event in scenario.events)]
-    (x0, y0), (x1, y1) = np.min(spots, axis=0).tolist(), np.max(spots, axis=0).tolist()
+    (x0, y0) = np.min(spots, axis=0).tolist()
+    (x1, y1) = np.max(spots, axis=0).tolist()
     return x0, y0, x1, y1
 
 

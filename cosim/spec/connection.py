@@ -1,7 +1,7 @@
 """One end of a session over a network: what it does there, where it stands, and what guards it.
 
-An end is open to its own machine alone, or guarded by TLS, or insecure in so many words. This is decided here, before
-anything is opened.
+An end is open to its own machine alone, or guarded by TLS, or insecure in so many words. This is
+decided here, before anything is opened.
 """
 
 from __future__ import annotations
@@ -25,9 +25,10 @@ _OVER_A_FILE: Final = re.compile(r"(unixsock-stream)/([^?#]+)")
 class Connection(msgspec.Struct, frozen=True, kw_only=True):
     """An end that listens, or one that connects.
 
-    role: what it does, and whose its certificate must be. listen, connect: one of both, PROTOCOL/ADDRESS:PORT (tcp or
-    tls) or unixsock-stream/PATH. tls: a folder with `ca.pem`, `cert.pem`, `key.pem` (`cosim certs`). insecure: it may
-    reach beyond this machine without TLS. Raises UsageError.
+    role: what it does, and whose its certificate must be. listen, connect: one of both,
+    PROTOCOL/ADDRESS:PORT (tcp or tls) or unixsock-stream/PATH. tls: a folder with `ca.pem`,
+    `cert.pem`, `key.pem` (`cosim certs`). insecure: it may reach beyond this machine without TLS.
+    Raises UsageError.
 
     >>> Connection(role="worker", connect="tls/hub.lan:7447", tls="certs/worker").endpoint
     'tls/hub.lan:7447'
@@ -43,7 +44,10 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
         if bool(self.listen) == bool(self.connect):
             raise UsageError("one end of a session listens or connects: name one endpoint")
         if self.listen and self.role not in HUBS:
-            raise UsageError(f"the role {self.role} listens nowhere, it connects. Those who listen: {', '.join(HUBS)}.")
+            raise UsageError(
+                f"the role {self.role} listens nowhere, it connects. Those who listen: "
+                f"{', '.join(HUBS)}."
+            )
         protocol, address = _parts(checked_endpoint(self.endpoint, "endpoint"))
         if self.tls and self.insecure:
             raise UsageError("--tls guards and --insecure does not: choose one")
@@ -51,13 +55,13 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
             raise UsageError(f"--tls goes with tls/ADDRESS:PORT, not with {self.endpoint}")
         if protocol == "tls" and not self.tls:
             raise UsageError(
-                f"{self.endpoint} needs --tls FOLDER, which holds ca.pem, cert.pem and key.pem of the role "
-                f"{self.role}: `cosim certs` makes them"
+                f"{self.endpoint} needs --tls FOLDER, which holds ca.pem, cert.pem and key.pem of "
+                f"the role {self.role}: `cosim certs` makes them"
             )
         if not (self.tls or self.insecure or self.of_this_machine):
             raise UsageError(
-                f"{self.endpoint} is beyond this machine and unguarded: {self._danger}. Use tls/{address} with "
-                "--tls FOLDER (`cosim certs` makes it), or say --insecure"
+                f"{self.endpoint} is beyond this machine and unguarded: {self._danger}. Use "
+                f"tls/{address} with --tls FOLDER (`cosim certs` makes it), or say --insecure"
             )
 
     @property
@@ -66,7 +70,8 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
         return self.listen or self.connect
 
     def seen_by(self, other: Connection) -> Connection:
-        """The same endpoint as the end that `other` is of reaches it: in its role, with its certificates."""
+        """The same endpoint as the end that `other` is of reaches it: in its role, with its
+        certificates."""
         return msgspec.structs.replace(self, role=other.role, tls=other.tls if self.tls else "")
 
     @property
@@ -83,9 +88,13 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def _danger(self) -> str:
         if self.connect:
-            return f"whoever stands between here and {self.connect} may read and change all that is sent"
+            return (
+                f"whoever stands between here and {self.connect} may read and change all that is "
+                f"sent"
+            )
         may = {
-            "coordinator": "watch, inject pedestrians, take episodes and tell their results, and answer as a policy",
+            "coordinator": "watch, inject pedestrians, take episodes and tell their results, and "
+            "answer as a policy",
             "director": "ask it",
             "policy": "ask it and see what it answers to",
         }

@@ -1,7 +1,7 @@
 """EventKind: all there is to one kind of event, a row of a table.
 
-The table that ships is `scenarios.events.EVENT_KINDS`. Whoever draws, directs, judges or shows events is handed one, so
-that a kind is added by its row alone: `EVENT_KINDS | {MINE.name: MINE}`.
+The table that ships is `scenarios.events.EVENT_KINDS`. Whoever draws, directs, judges or shows
+events is handed one, so that a kind is added by its row alone: `EVENT_KINDS | {MINE.name: MINE}`.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from cosim.spec.events import Event, EventQuery, EventState, Walker
 
 
 class SidewalkLayout(NamedTuple):
-    """Where a drawn event is along a sidewalk. way_m: length of the way, shortest and longest; event_m: from the start
-    to the event's place, nearest and farthest, farther than its trigger reaches; half_width_m: least half of the
-    sidewalk's width."""
+    """Where a drawn event is along a sidewalk. way_m: length of the way, shortest and longest;
+    event_m: from the start to the event's place, nearest and farthest, farther than its trigger
+    reaches; half_width_m: least half of the sidewalk's width."""
 
     way_m: tuple[float, float]
     event_m: tuple[float, float]
@@ -30,18 +30,19 @@ class SidewalkLayout(NamedTuple):
 class EventKind:
     """One kind of event.
 
-    name: in scenarios, on the command line, in tables. people: fewest and most. layout: where a reactive scenario has
-    it, and the room that it needs on a long way; None over a crosswalk. group(half_width_m, rng) -> how many people a
-    drawn one has; None: any number.
+    name: in scenarios, on the command line, in tables. people: fewest and most. layout: where a
+    reactive scenario has it, and the room that it needs on a long way; None over a crosswalk.
+    group(half_width_m, rng) -> how many people a drawn one has; None: any number.
 
-    trigger_m: it begins when the robot is so far before its place along the route; below 0, when the robot has just
-    come so far past it; None, when the robot is on the crosswalk. begin(event, number) -> person `number` before that.
-    step(event, state, number, query) -> the same person a tick on, from the trigger on. ends(event, state, query) ->
-    whether what began is over: its people go their ways, and once they are out of sight they are gone.
-    pose, age: what its people show who stand while it goes on, and how old they look.
+    trigger_m: it begins when the robot is so far before its place along the route; below 0, when
+    the robot has just come so far past it; None, when the robot is on the crosswalk. begin(event,
+    number) -> person `number` before that. step(event, state, number, query) -> the same person a
+    tick on, from the trigger on. ends(event, state, query) -> whether what began is over: its
+    people go their ways, and once they are out of sight they are gone. pose, age: what its people
+    show who stand while it goes on, and how old they look.
 
-    passed_round: the robot is to pass round all of its people, never between two. ends_at: a reactive scenario of it
-    ends at the goal, or when the robot has stopped before its people.
+    passed_round: the robot is to pass round all of its people, never between two. ends_at: a
+    reactive scenario of it ends at the goal, or when the robot has stopped before its people.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """Event pedestrians: what is asked of a director at each tick, and what it answers.
 
-The director keeps no memory: the simulator sends the states it got last time, so a director can be killed and
-started again in the middle of an episode without a trace in the result.
+The director keeps no memory: the simulator sends the states it got last time, so a director can be
+killed and started again in the middle of an episode without a trace in the result.
 """
 
 from __future__ import annotations
@@ -13,19 +13,21 @@ from typing import Annotated, Final, Literal
 import msgspec
 
 from cosim.core.state import PERSON_RADIUS_M, Age, Doing, PersonKind
-from cosim.spec.ranges import ALONG_M, HEADING_RAD, WHERE_M, Ranged, Within, shown
+from cosim.spec.validation import ALONG_M, HEADING_RAD, WHERE_M, Ranged, Within, shown
 
 INJECTED_ID: Final = "ei-"
 """What the ids of injected pedestrians begin with."""
 
 
 class Event(Ranged, frozen=True, kw_only=True):
-    """One event: a pedestrian or a group on the way. kind: a row of a table of `EventKinds`, by its name.
+    """One event: a pedestrian or a group on the way. kind: a row of a table of `EventKinds`, by its
+    name.
 
-    x_m, y_m, heading_rad: the place on the middle of the sidewalk (of the crosswalk) where it happens, heading along
-    the robot's direction of travel. half_width_m: from there to either edge. half_length_m: of a crosswalk, from there
-    to either end along the heading. route_s_m: the same place as arc length of the reference route. people: how many.
-    speed_mps: walking speed. side: of the sidewalk, left (1) or right (-1).
+    x_m, y_m, heading_rad: the place on the middle of the sidewalk (of the crosswalk) where it
+    happens, heading along the robot's direction of travel. half_width_m: from there to either edge.
+    half_length_m: of a crosswalk, from there to either end along the heading. route_s_m: the same
+    place as arc length of the reference route. people: how many. speed_mps: walking speed. side: of
+    the sidewalk, left (1) or right (-1).
     """
 
     id: str
@@ -60,11 +62,12 @@ class Event(Ranged, frozen=True, kw_only=True):
 
 
 class Walker(msgspec.Struct, frozen=True, kw_only=True):
-    """One person of an event. aim_rad, pace_mps: the heading and the speed it has committed to, if it has.
+    """One person of an event. aim_rad, pace_mps: the heading and the speed it has committed to, if
+    it has.
 
-    blocked_ticks: how long it has stood against the robot. counted_ticks: how long that lasts which ends its event.
-    nearest_m: how near the robot has come to it from behind since it slowed down before it.
-    vx_mps, vy_mps: of its last step.
+    blocked_ticks: how long it has stood against the robot. counted_ticks: how long that lasts which
+    ends its event. nearest_m: how near the robot has come to it from behind since it slowed down
+    before it. vx_mps, vy_mps: of its last step.
     """
 
     x_m: float
@@ -80,10 +83,12 @@ class Walker(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class EventState(msgspec.Struct, frozen=True, kw_only=True):
-    """Where an event stands. phase: waiting for its trigger, acting, over, or gone for good. since_tick: in this phase.
+    """Where an event stands. phase: waiting for its trigger, acting, over, or gone for good.
+    since_tick: in this phase.
 
-    trigger_distance_m: along the route from the robot to the event's place when it triggered, negative behind it.
-    lane_m: how far left of the middle of the way the robot was then. robot_stood_ticks: how long the robot has stood.
+    trigger_distance_m: along the route from the robot to the event's place when it triggered,
+    negative behind it. lane_m: how far left of the middle of the way the robot was then.
+    robot_stood_ticks: how long the robot has stood.
     """
 
     phase: Literal["waiting", "acting", "over", "gone"]
@@ -96,10 +101,11 @@ class EventState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Actor(msgspec.Struct, frozen=True, kw_only=True):
-    """A pedestrian of ours as the world shows it at one tick. id: unlike all others; see `Event.names`.
+    """A pedestrian of ours as the world shows it at one tick. id: unlike all others; see
+    `Event.names`.
 
-    speed_mps: of its last step. pace_mps: the speed that its body shows where that is another: who turns or rises on
-    the spot treads.
+    speed_mps: of its last step. pace_mps: the speed that its body shows where that is another: who
+    turns or rises on the spot treads.
     """
 
     id: str
@@ -125,8 +131,9 @@ class NearbyPerson(msgspec.Struct, frozen=True, array_like=True):
 
 
 class StandingBody(msgspec.Struct, frozen=True, array_like=True):
-    """What stands in the way of people: a rectangle, length_m along its heading. closed_x, closed_y: unit vector to the
-    side on which nobody can pass it, (0, 0) where one can on either."""
+    """What stands in the way of people: a rectangle, length_m along its heading. closed_x,
+    closed_y: unit vector to the side on which nobody can pass it, (0, 0) where one can on
+    either."""
 
     x_m: float
     y_m: float
@@ -140,8 +147,9 @@ class StandingBody(msgspec.Struct, frozen=True, array_like=True):
 class EventQuery(msgspec.Struct, frozen=True, kw_only=True):
     """What the simulator sends at each tick. states: one per event, empty at the first tick.
 
-    route_s_m: the robot's arc length on the reference route. robot_length_m, robot_width_m: its outline.
-    nearby: who is near the people that the director moves, see `cosim.people.neighbours`. standing: what stands there.
+    route_s_m: the robot's arc length on the reference route. robot_length_m, robot_width_m: its
+    outline. nearby: who is near the people that the director moves, see `cosim.people.neighbours`.
+    standing: what stands there.
     """
 
     episode: str

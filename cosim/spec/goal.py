@@ -1,4 +1,5 @@
-"""Goals: what a policy is told of where to go, by a protocol that its manifest names or the run gives (`--goal`)."""
+"""Goals: what a policy is told of where to go, by a protocol that its manifest names or the run
+gives (`--goal`)."""
 
 from __future__ import annotations
 
@@ -14,7 +15,14 @@ from numpy.typing import NDArray
 from cosim.core.errors import unknown
 
 GoalProtocol = Literal[
-    "none", "route_point", "final_point", "random_point", "image", "random_image", "instruction", "route_patch"
+    "none",
+    "route_point",
+    "final_point",
+    "random_point",
+    "image",
+    "random_image",
+    "instruction",
+    "route_patch",
 ]
 
 GOALS: Final[Mapping[str, str]] = MappingProxyType(
@@ -22,14 +30,18 @@ GOALS: Final[Mapping[str, str]] = MappingProxyType(
         "none": "nothing",
         "route_point": "the next sub-goal: a point of the reference route, 5 to 20 m along it",
         "final_point": "the goal of the episode, as a point",
-        "random_point": "a point drawn 5 to 20 m ahead and up to 5 m aside, anew when it is reached or passed",
-        "image": "what the policy's camera would see at the next sub-goal, with nobody in the street",
+        "random_point": "a point drawn 5 to 20 m ahead and up to 5 m aside, anew when it is "
+        "reached or passed",
+        "image": "what the policy's camera would see at the next sub-goal, with nobody in the "
+        "street",
         "random_image": "a picture of noise, drawn once for each episode",
-        "instruction": "'Follow the sidewalk.', with each turn and crosswalk of the route before it comes",
+        "instruction": "'Follow the sidewalk.', with each turn and crosswalk of the route before "
+        "it comes",
         "route_patch": "a raster of the reference route around the robot, 80 x 80 pixels of 0.5 m",
     }
 )
-"""What a policy gets by each protocol. Points, and what is around the robot, are in the robot's frame."""
+"""What a policy gets by each protocol. Points, and what is around the robot, are in the robot's
+frame."""
 
 
 class PointGoal(msgspec.Struct, frozen=True, tag="point"):
@@ -82,11 +94,15 @@ class Instruction(msgspec.Struct, frozen=True, tag="instruction"):
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """Raises TypeError: it is a text."""
-        raise TypeError("an instruction is a text and no array: read observation.goal.text, or ask for another goal")
+        raise TypeError(
+            "an instruction is a text and no array: read observation.goal.text, or ask for "
+            "another goal"
+        )
 
 
 class RoutePatch(msgspec.Struct, frozen=True, tag="route_patch"):
-    """The reference route around the robot: (80, 80) uint8, 255 on the route and 0 beside it, 0.5 m a pixel.
+    """The reference route around the robot: (80, 80) uint8, 255 on the route and 0 beside it, 0.5 m
+    a pixel.
 
     The robot is in the middle; the first row lies 20 m ahead, the first column 20 m to the left.
 

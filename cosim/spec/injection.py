@@ -1,7 +1,8 @@
 """Injected pedestrians: what an outside client may send into a running episode, and the answer.
 
-An injection is applied at the boundary of a step, in the order of arrival. Tick and place are in the acknowledgement
-and in the episode's record, points from the robot as points on the map, so that the record alone replays the episode.
+An injection is applied at the boundary of a step, in the order of arrival. Tick and place are in
+the acknowledgement and in the episode's record, points from the robot as points on the map, so that
+the record alone replays the episode.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ _FASTEST_MPS = 3.0
 LONGEST_S = 3600.0
 _FARTHEST_M: Final = 1000.0
 
-POINT_FORMS: Final = 'a point is [x, y] on the map or {"ahead": 15, "left": 1} from the robot, in metres'
+POINT_FORMS: Final = (
+    'a point is [x, y] on the map or {"ahead": 15, "left": 1} from the robot, in metres'
+)
 """The valid forms of a point of a path, in words."""
 
 Name = Annotated[str, msgspec.Meta(pattern="^[A-Za-z0-9_-]{1,32}$")]
@@ -30,7 +33,8 @@ _FromRobot = Annotated[float, msgspec.Meta(ge=-_FARTHEST_M, le=_FARTHEST_M)]
 
 
 class RelativePoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A point from the robot, in metres: straight ahead of its middle and to its left; behind and right are negative.
+    """A point from the robot, in metres: straight ahead of its middle and to its left; behind and
+    right are negative.
 
     The robot's pose is that at the start of the tick at which the pedestrian enters.
     """
@@ -43,24 +47,33 @@ class RelativePoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """The point of the map at (x_m, y_m), from a robot at this pose, to 0.1 m."""
         dx_m, dy_m = x_m - robot.x_m, y_m - robot.y_m
         cos, sin = math.cos(robot.heading_rad), math.sin(robot.heading_rad)
-        ahead, left = (round(far_m, 1) + 0.0 for far_m in (dx_m * cos + dy_m * sin, dy_m * cos - dx_m * sin))
+        ahead, left = (
+            round(far_m, 1) + 0.0 for far_m in (dx_m * cos + dy_m * sin, dy_m * cos - dx_m * sin)
+        )
         return cls(ahead, left)
 
     def on_map(self, robot: Pose) -> tuple[float, float]:
         """The same point as x and y on the map, in metres, for a robot at this pose."""
         cos, sin = math.cos(robot.heading_rad), math.sin(robot.heading_rad)
-        return robot.x_m + self.ahead * cos - self.left * sin, robot.y_m + self.ahead * sin + self.left * cos
+        return (
+            robot.x_m + self.ahead * cos - self.left * sin,
+            robot.y_m + self.ahead * sin + self.left * cos,
+        )
 
 
 class InjectionRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A pedestrian as a client asks for it. It appears at the first point of `path`, walks along it, stays, and leaves.
+    """A pedestrian as a client asks for it. It appears at the first point of `path`, walks along
+    it, stays, and leaves.
 
-    path: points on the map (x, y in metres) or from the robot. heading_rad: which way it faces at the end, on the map;
-    by default the way it came. doing: what it shows while it stands there. stay_s: how long it stays at the end.
+    path: points on the map (x, y in metres) or from the robot. heading_rad: which way it faces at
+    the end, on the map; by default the way it came. doing: what it shows while it stands there.
+    stay_s: how long it stays at the end.
     """
 
     id: Name
-    path: Annotated[tuple[tuple[float, float] | RelativePoint, ...], msgspec.Meta(min_length=1, max_length=200)]
+    path: Annotated[
+        tuple[tuple[float, float] | RelativePoint, ...], msgspec.Meta(min_length=1, max_length=200)
+    ]
     speed_mps: float = 1.3
     heading_rad: float | None = None
     doing: Doing = "stand"
@@ -77,7 +90,9 @@ class InjectionRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
                 f"not {self.speed_mps:g}"
             )
         if not 0.0 <= self.stay_s <= LONGEST_S:
-            raise SpecError(f"pedestrian '{self.id}': stay_s must be 0 to {LONGEST_S:g}, not {self.stay_s:g}")
+            raise SpecError(
+                f"pedestrian '{self.id}': stay_s must be 0 to {LONGEST_S:g}, not {self.stay_s:g}"
+            )
         if self.heading_rad is not None and not math.isfinite(self.heading_rad):
             raise SpecError(f"pedestrian '{self.id}': heading_rad is no number")
 
@@ -88,7 +103,10 @@ class InjectionRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
     def resolved(self, robot: Pose) -> Injection:
         """The injection on the map, for a robot at this pose."""
-        points = tuple(point.on_map(robot) if isinstance(point, RelativePoint) else point for point in self.path)
+        points = tuple(
+            point.on_map(robot) if isinstance(point, RelativePoint) else point
+            for point in self.path
+        )
         return Injection(**msgspec.structs.asdict(self) | {"path": points})
 
 
@@ -106,7 +124,8 @@ class Injected(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Ack(msgspec.Struct, frozen=True, kw_only=True):
-    """The answer to an injection. tick, time_s: when it takes effect; x_m, y_m: where; reason: why it was refused."""
+    """The answer to an injection. tick, time_s: when it takes effect; x_m, y_m: where; reason: why
+    it was refused."""
 
     id: str
     status: Literal["accepted", "refused"]

@@ -1,4 +1,5 @@
-"""Obstacle: a thing that stands on the walkable ground of one scenario, and the ground that it covers."""
+"""Obstacle: a thing that stands on the walkable ground of one scenario, and the ground that it
+covers."""
 
 from __future__ import annotations
 
@@ -9,11 +10,11 @@ from typing import Annotated, Final, Literal
 import shapely
 from shapely.geometry import Polygon
 
-from cosim.spec.ranges import HEADING_RAD, WHERE_M, Ranged, Within, shown
+from cosim.spec.validation import HEADING_RAD, WHERE_M, Ranged, Within, shown
 
 ObstacleKind = Literal["bin", "bike", "sign", "planter", "box", "fence", "scooter", "cafe"]
-"""Bin on wheels, parked bike, sandwich board, planter, parcels, construction fence, parked scooter, cafe table with its
-chairs."""
+"""Bin on wheels, parked bike, sandwich board, planter, parcels, construction fence, parked scooter,
+cafe table with its chairs."""
 
 _Size = tuple[float, float, float]
 """Length along the heading, depth across it, height, in metres."""
@@ -37,7 +38,8 @@ OBSTACLE_FORMS: Final = 4 * OBSTACLE_VARIANTS
 
 
 class Obstacle(Ranged, frozen=True, kw_only=True):
-    """A thing on the way. heading_rad: of its length. form: its size, and its paint for each of them.
+    """A thing on the way. heading_rad: of its length. form: its size, and its paint for each of
+    them.
 
     >>> Obstacle(kind="bin", x_m=3.0, y_m=4.0, heading_rad=0.0, form=2).size_m
     (0.6, 0.74, 1.1)
@@ -81,4 +83,6 @@ def footprint(obstacle: Obstacle, margin_m: float = 0.0) -> Polygon:
     cos, sin = math.cos(obstacle.heading_rad), math.sin(obstacle.heading_rad)
     ahead, aside = 0.5 * length + margin_m, 0.5 * depth + margin_m
     corners = [(-ahead, -aside), (ahead, -aside), (ahead, aside), (-ahead, aside)]
-    return shapely.Polygon([(obstacle.x_m + cos * u - sin * v, obstacle.y_m + sin * u + cos * v) for u, v in corners])
+    return shapely.Polygon(
+        [(obstacle.x_m + cos * u - sin * v, obstacle.y_m + sin * u + cos * v) for u, v in corners]
+    )

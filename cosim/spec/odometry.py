@@ -24,8 +24,8 @@ ODOMETRY: Final[Mapping[str, str]] = MappingProxyType(
 
 
 class Odometry(msgspec.Struct, frozen=True):
-    """Where the robot takes itself to be: metres ahead and to the left of its start, heading counter-clockwise from the
-    start's, None for gps. Nothing in it tells where on the map that is.
+    """Where the robot takes itself to be: metres ahead and to the left of its start, heading
+    counter-clockwise from the start's, None for gps. Nothing in it tells where on the map that is.
 
     >>> pose = Odometry(12.0, 0.5, heading_rad=0.1)
     >>> pose.x_m, np.asarray(pose)
@@ -43,8 +43,9 @@ class Odometry(msgspec.Struct, frozen=True):
 
 
 class WheelNoise(NamedTuple):
-    """Standard deviations. For a whole episode: scale, of the distance; turn_scale, of turns; drift_radpm, of a turn
-    with every metre. For each metre, growing with its square root: along_m, heading_rad."""
+    """Standard deviations. For a whole episode: scale, of the distance; turn_scale, of turns;
+    drift_radpm, of a turn with every metre. For each metre, growing with its square root: along_m,
+    heading_rad."""
 
     scale: float = 0.02
     turn_scale: float = 0.03
@@ -54,8 +55,8 @@ class WheelNoise(NamedTuple):
 
 
 class GpsNoise(NamedTuple):
-    """Standard deviations in metres, of x and of y: noise_m of each fix; bias_m of what lasts for about bias_s seconds
-    (a Gauss-Markov process)."""
+    """Standard deviations in metres, of x and of y: noise_m of each fix; bias_m of what lasts for
+    about bias_s seconds (a Gauss-Markov process)."""
 
     noise_m: float = 0.5
     bias_m: float = 1.5

@@ -1,4 +1,5 @@
-"""How an episode is run, beyond what its scenario says: one value from the command line to the worker."""
+"""How an episode is run, beyond what its scenario says: one value from the command line to the
+worker."""
 
 from __future__ import annotations
 
@@ -8,12 +9,12 @@ from typing import Literal
 import msgspec
 
 from cosim.core.errors import UsageError
-from cosim.spec.collecting import Collecting
 from cosim.spec.connection import Connection
+from cosim.spec.demo_options import Collecting
+from cosim.spec.episode_id import check_seed
 from cosim.spec.goal import GoalProtocol
 from cosim.spec.injection import Injected, Live
 from cosim.spec.policy_host import PolicyRuns
-from cosim.spec.pseudonym import check_seed
 
 CameraName = Literal["gl", "bullet", "bullet-egl"]
 CameraChoice = Literal["auto", "gl", "bullet", "bullet-egl"]
@@ -21,8 +22,8 @@ MOST_LATENCY_MS = 10_000.0
 
 
 class Outside(msgspec.Struct, frozen=True, kw_only=True):
-    """A director in a process of its own. connection: to it; run: the run's name in the keys; wait_s: how long an
-    episode waits for it before it is recorded as crashed."""
+    """A director in a process of its own. connection: to it; run: the run's name in the keys;
+    wait_s: how long an episode waits for it before it is recorded as crashed."""
 
     connection: Connection
     run: str
@@ -30,37 +31,41 @@ class Outside(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RendererAt(msgspec.Struct, frozen=True, kw_only=True):
-    """The shared renderer of a run. address: where it listens; asks: whether the policy is there and asked there, for
-    all episodes together (`act_batch`)."""
+    """The shared renderer of a run. address: where it listens; asks: whether the policy is there
+    and asked there, for all episodes together (`act_batch`)."""
 
     address: str
     asks: bool
 
 
-LEAST_PACE, MOST_PACE = 0.1, 100.0
+LEAST_PACE = 0.1
+MOST_PACE = 100.0
 """Times real time: the range of a pace. Slower ones would look like an engine that hangs."""
 
 
 class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """How an episode is run. But for robot, latency and the noise of collecting, options change what is seen and kept,
-    never what happens in the street.
+    """How an episode is run. But for robot, latency and the noise of collecting, options change
+    what is seen and kept, never what happens in the street.
 
-    seed: of the run: what a policy is told in place of the scenario's name and seed is drawn from it
-    (`cosim.spec.pseudonym`), and the order of a run's episodes. None: a run draws one anew, an Episode by itself takes
-    0. robot: which drives (`cosim.spec.robot`), in place of the scenario's own. goal: what the policy is told of where
-    to go (`cosim.spec.goal`), in place of what its manifest says. suite_hash, policy_source, policy_runs: of the suite
-    that the scenario is of, of the file of the policy, and where that runs, for the record. own_camera: the policy may
-    see by a camera that the robot does not have (`cosim.episode.camera_rules`), which marks the record as nonstandard.
-    camera: what draws pictures. frames_every_s: keep a camera frame every so many seconds, 0 for none. live: where it
-    is on the air meanwhile. pace: the simulation waits for the wall clock, to run at most so many times faster than
-    real time; 0: it never waits. director: where its event pedestrians are decided, when not beside it. counterfactual:
-    compare it with its street without the robot. injections: pedestrians that were injected into the episode that this
-    one replays. renderer: what draws for the policy in place of a camera of its own. latency_ms: each command takes
-    effect so much later than the observation that it answers, rounded up to ticks of 50 ms (`cosim.episode.in_flight`).
-    real_time: in place of that, the time that the policy takes for an answer on this machine is that answer's latency,
-    and it is not asked again before: what comes out is replayed from its record, and not made again from its seed.
-    collecting: the policy is an expert, of whose drive a demonstration is kept.
-    Raises UsageError.
+    seed: of the run: what a policy is told in place of the scenario's name and seed is drawn from
+    it (`cosim.spec.episode_id`), and the order of a run's episodes. None: a run draws one anew, an
+    Episode by itself takes
+    0. robot: which drives (`cosim.spec.robot`), in place of the scenario's own. goal: what the
+    policy is told of where to go (`cosim.spec.goal`), in place of what its manifest says.
+    suite_hash, policy_source, policy_runs: of the suite that the scenario is of, of the file of the
+    policy, and where that runs, for the record. own_camera: the policy may see by a camera that the
+    robot does not have (`cosim.episode.camera_rules`), which marks the record as nonstandard.
+    camera: what draws pictures. frames_every_s: keep a camera frame every so many seconds, 0 for
+    none. live: where it is on the air meanwhile. pace: the simulation waits for the wall clock, to
+    run at most so many times faster than real time; 0: it never waits. director: where its event
+    pedestrians are decided, when not beside it. counterfactual: compare it with its street without
+    the robot. injections: pedestrians that were injected into the episode that this one replays.
+    renderer: what draws for the policy in place of a camera of its own. latency_ms: each command
+    takes effect so much later than the observation that it answers, rounded up to ticks of 50 ms
+    (`cosim.episode.command_delay`). real_time: in place of that, the time that the policy takes for
+    an answer on this machine is that answer's latency, and it is not asked again before: what comes
+    out is replayed from its record, and not made again from its seed. collecting: the policy is an
+    expert, of whose drive a demonstration is kept. Raises UsageError.
 
     >>> EpisodeOptions(camera="bullet", frames_every_s=1.0).camera
     'bullet'
@@ -88,11 +93,13 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         check_seed(self.seed)
         if not (math.isfinite(self.latency_ms) and 0.0 <= self.latency_ms <= MOST_LATENCY_MS):
-            raise UsageError(f"latency_ms must be from 0 to {MOST_LATENCY_MS:g} ms, not {self.latency_ms:g}")
+            raise UsageError(
+                f"latency_ms must be from 0 to {MOST_LATENCY_MS:g} ms, not {self.latency_ms:g}"
+            )
         if self.pace and not LEAST_PACE <= self.pace <= MOST_PACE:
             raise UsageError(
-                f"pace must be from {LEAST_PACE:g} to {MOST_PACE:g} times real time, or 0 for as fast as possible, "
-                f"not {self.pace:g}"
+                f"pace must be from {LEAST_PACE:g} to {MOST_PACE:g} times real time, or 0 for as "
+                f"fast as possible, not {self.pace:g}"
             )
         if self.real_time and self.latency_ms:
             raise UsageError("real_time measures the latency of every answer: leave latency_ms out")

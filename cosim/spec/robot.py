@@ -1,8 +1,9 @@
-"""Robots: one frozen value each, in one literal table. Whatever depends on which robot drives takes it from here.
+"""Robots: one frozen value each, in one literal table. Whatever depends on which robot drives takes
+it from here.
 
-A new robot is a row of `ROBOTS` and a URDF. Convention of the URDFs: the base frame lies on the ground in the middle of
-the robot, x ahead, y left, z up; the base link's centre of mass is `com_height_m` above it; wheels turn forward for
-positive joint speeds.
+A new robot is a row of `ROBOTS` and a URDF. Convention of the URDFs: the base frame lies on the
+ground in the middle of the robot, x ahead, y left, z up; the base link's centre of mass is
+`com_height_m` above it; wheels turn forward for positive joint speeds.
 """
 
 from __future__ import annotations
@@ -15,9 +16,11 @@ from cosim.core.errors import unknown
 
 @dataclass(frozen=True, slots=True)
 class Skid:
-    """Wheels that do not steer: it turns by their speeds. left, right: names of their joints, fore before aft.
+    """Wheels that do not steer: it turns by their speeds. left, right: names of their joints, fore
+    before aft.
 
-    torque_nm: limit of one wheel's motor. span_m: (length, width) of the rectangle of the wheels' contacts.
+    torque_nm: limit of one wheel's motor. span_m: (length, width) of the rectangle of the wheels'
+    contacts.
     """
 
     wheel_radius_m: float
@@ -28,7 +31,7 @@ class Skid:
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """All that its motors turn, in the order of `physics.world.drive`."""
+        """All that its motors turn, in the order of `physics.dynamics.drive`."""
         return self.left + self.right
 
 
@@ -36,9 +39,9 @@ class Skid:
 class Mount:
     """Where a camera sits, and what it can be there.
 
-    at_m: (x, y, z) in the base frame, metres. pitch_down_deg, yaw_left_deg: how far it looks down, and to the left of
-    ahead. fov_deg: the least and the largest vertical field of view; most_px: the largest (width, height) in pixels;
-    most_hz: the most pictures a second.
+    at_m: (x, y, z) in the base frame, metres. pitch_down_deg, yaw_left_deg: how far it looks down,
+    and to the left of ahead. fov_deg: the least and the largest vertical field of view; most_px:
+    the largest (width, height) in pixels; most_hz: the most pictures a second.
 
     >>> Mount((0.3, 0.0, 0.62), pitch_down_deg=10.0).at_m[2]
     0.62
@@ -55,23 +58,28 @@ class Mount:
     def in_words(self) -> str:
         """Where it is, and its limits."""
         at = ", ".join(f"{m:g}" for m in self.at_m)
-        side = f", {abs(self.yaw_left_deg):g} deg to the {'left' if self.yaw_left_deg > 0 else 'right'}"
+        side = (
+            f", {abs(self.yaw_left_deg):g} deg to the "
+            f"{'left' if self.yaw_left_deg > 0 else 'right'}"
+        )
         return (
-            f"at ({at}) m, {self.pitch_down_deg:g} deg down{side if self.yaw_left_deg else ''}; up to "
-            f"{self.most_px[0]} x {self.most_px[1]} px, {self.fov_deg[0]:g} to {self.fov_deg[1]:g} deg, "
-            f"{self.most_hz:g} Hz"
+            f"at ({at}) m, {self.pitch_down_deg:g} deg down{side if self.yaw_left_deg else ''}; up "
+            f"to {self.most_px[0]} x {self.most_px[1]} px, {self.fov_deg[0]:g} to "
+            f"{self.fov_deg[1]:g} deg, {self.most_hz:g} Hz"
         )
 
 
 @dataclass(frozen=True, slots=True)
 class Robot:
-    """A robot. length_m, width_m, height_m: of the box around its collision body, in whose middle the base frame lies.
+    """A robot. length_m, width_m, height_m: of the box around its collision body, in whose middle
+    the base frame lies.
 
-    urdf: a file in `physics/robots`, or an absolute path. mounts: its cameras' places by name; a policy's camera sits
-    at "front", where every robot has one, unless it says otherwise. cruise_mps: the pace at which it travels;
-    v_max_mps, w_max_radps: the most that a command can ask of it, as magnitudes; acceleration_mps2,
-    acceleration_radps2: of its motors' ramps. drive: how it moves; one that does not skid needs a class beside `Skid`,
-    and one beside `physics.world.drive.SkidDrive`.
+    urdf: a file in `physics/robots`, or an absolute path. mounts: its cameras' places by name; a
+    policy's camera sits at "front", where every robot has one, unless it says otherwise.
+    cruise_mps: the pace at which it travels; v_max_mps, w_max_radps: the most that a command can
+    ask of it, as magnitudes; acceleration_mps2, acceleration_radps2: of its motors' ramps. drive:
+    how it moves; one that does not skid needs a class beside `Skid`, and one beside
+    `physics.dynamics.drive.SkidDrive`.
 
     >>> robot_called("scout").footprint_m
     (0.5, 0.4)

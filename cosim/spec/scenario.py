@@ -21,9 +21,21 @@ from cosim.core.geometry import Polyline, Pose
 from cosim.spec.event_kind import EventKinds
 from cosim.spec.events import Event
 from cosim.spec.obstacle import Obstacle
-from cosim.spec.ranges import ALONG_M, HEADING_RAD, SEED, WHERE_M, Counted, Named, Points, Ranged, Text, Within, shown
 from cosim.spec.robot import COURIER, robot_called
 from cosim.spec.spec_file import in_lines, read_spec_file
+from cosim.spec.validation import (
+    ALONG_M,
+    HEADING_RAD,
+    SEED,
+    WHERE_M,
+    Counted,
+    Named,
+    Points,
+    Ranged,
+    Text,
+    Within,
+    shown,
+)
 
 _SCHEMA = 1
 """Version of the scenario files; a reader refuses others."""
@@ -44,8 +56,8 @@ CITY_SIZE_M = Within(200, 4000)
 
 
 class City(Ranged, frozen=True, kw_only=True, tag="city", tag_field="kind"):
-    """A procedural city. size_m: in whole centimetres. net_hash: content hash of the street net the scenario was made
-    on. roughness: of the ground, from 0 (flat) to 1."""
+    """A procedural city. size_m: in whole centimetres. net_hash: content hash of the street net the
+    scenario was made on. roughness: of the ground, from 0 (flat) to 1."""
 
     seed: Annotated[int, SEED]
     size_m: Annotated[float, CITY_SIZE_M] = 2000.0
@@ -63,8 +75,8 @@ class City(Ranged, frozen=True, kw_only=True, tag="city", tag_field="kind"):
 
 
 class CityMap(Ranged, frozen=True, kw_only=True, tag="map", tag_field="kind"):
-    """An imported map, by its name in the store of maps. seed: of what the map does not say (buildings, props).
-    roughness: of the ground, from 0 (flat) to 1."""
+    """An imported map, by its name in the store of maps. seed: of what the map does not say
+    (buildings, props). roughness: of the ground, from 0 (flat) to 1."""
 
     map: Annotated[str, _NAME]
     seed: Annotated[int, SEED] = 0
@@ -123,10 +135,10 @@ class CrowdSpec(Ranged, frozen=True, kw_only=True):
     """The street life around the robot: persons and vehicles kept within radius_m of it.
 
     density: persons per 1000 m2 of walkable ground there, in place of a number of persons.
-    residents: people besides who know the street, sit on its benches, look into its shop windows, wait at its stops
-    (`scenarios.residents`); so many are kept within 60 m of the robot.
-    Shares of the persons: groups, of those who walk in groups of two and three; elderly and children, of those who walk
-    slower than others. A child walks in a group with an adult, at the child's pace.
+    residents: people besides who know the street, sit on its benches, look into its shop windows,
+    wait at its stops (`scenarios.residents`); so many are kept within 60 m of the robot. Shares of
+    the persons: groups, of those who walk in groups of two and three; elderly and children, of
+    those who walk slower than others. A child walks in a group with an adult, at the child's pace.
     added: it is another crowd than the suite's own, asked for by who runs it.
     """
 
@@ -155,12 +167,14 @@ class CrowdSpec(Ranged, frozen=True, kw_only=True):
     def contradictions(self) -> Iterator[str]:
         if 2.0 * self.children > self.groups + 1e-9:
             yield (
-                f"crowd children must be in [0, groups / 2] = [0, {self.groups / 2:g}], not {self.children}: "
-                f"each walks in a group with an adult; give groups of {2.0 * self.children:g} or more"
+                f"crowd children must be in [0, groups / 2] = [0, {self.groups / 2:g}], not "
+                f"{self.children}: each walks in a group with an adult; give groups of "
+                f"{2.0 * self.children:g} or more"
             )
         if self.elderly + 2.0 * self.children > 1.0 + 1e-9:
             yield (
-                f"crowd elderly must be in [0, 1 - 2 children] = [0, {1.0 - 2.0 * self.children:g}], "
+                f"crowd elderly must be in [0, 1 - 2 children] = [0, "
+                f"{1.0 - 2.0 * self.children:g}], "
                 f"not {self.elderly}: children walk with adults who are not elderly"
             )
         if self.density is not None and self.persons != DEFAULT_PERSONS:
@@ -170,9 +184,10 @@ class CrowdSpec(Ranged, frozen=True, kw_only=True):
 class Light(Ranged, frozen=True, kw_only=True):
     """Time of day and weather of a scenario: what they do to pictures, and to nothing else.
 
-    hour: solar time, the sun highest at 12. cloud_cover: 0 (clear) to 1 (overcast). fog_m: the distance at which fog
-    leaves 5 % of a contrast (the meteorologists' visibility), None without fog. exposure_ev: stops brighter (+) or
-    darker (-) than the camera would choose. hdri: path of an equirectangular Radiance .hdr that replaces sky and sun.
+    hour: solar time, the sun highest at 12. cloud_cover: 0 (clear) to 1 (overcast). fog_m: the
+    distance at which fog leaves 5 % of a contrast (the meteorologists' visibility), None without
+    fog. exposure_ev: stops brighter (+) or darker (-) than the camera would choose. hdri: path of
+    an equirectangular Radiance .hdr that replaces sky and sun.
     """
 
     hour: Annotated[float, Within(0, 24)] = 13.0
@@ -194,12 +209,14 @@ Split = Literal["val", "test"]
 
 
 class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
-    """One episode to run. start: x, y, heading. route: the reference route from start to goal, in metres.
+    """One episode to run. start: x, y, heading. route: the reference route from start to goal, in
+    metres.
 
-    structure: what it is an example of: straight, curve, crosswalk, a kind of event, static, route; "" if of nothing.
+    structure: what it is an example of: straight, curve, crosswalk, a kind of event, static, route;
+    "" if of nothing.
 
-    All points are in the net's frame: x east, y north; headings in radians, 0 east, counter-clockwise. Raises SpecError
-    where fields contradict each other.
+    All points are in the net's frame: x east, y north; headings in radians, 0 east,
+    counter-clockwise. Raises SpecError where fields contradict each other.
 
     >>> Scenario(id="a", suite="mine", place=City(seed=1, size_m=500.0), seed=0, start=(0.0, 0.0, 0.0),
     ...          goal=(12.0, 0.0), route=((0.0, 0.0), (12.0, 0.0))).time_limit_s
@@ -212,7 +229,9 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
     seed: Annotated[int, SEED]
     start: tuple[float, float, float]
     goal: tuple[float, float]
-    route: Annotated[tuple[tuple[float, float], ...], Counted(0, 50_000), Points(WHERE_M.low, WHERE_M.high)]
+    route: Annotated[
+        tuple[tuple[float, float], ...], Counted(0, 50_000), Points(WHERE_M.low, WHERE_M.high)
+    ]
     crossings: Annotated[tuple[RouteCrossing, ...], Counted(0, 1000)] = ()
     barriers: Annotated[tuple[Barrier, ...], Counted(0, 1000)] = ()
     obstacles: Annotated[tuple[Obstacle, ...], Counted(0, 1000)] = ()
@@ -234,23 +253,36 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
 
     def contradictions(self) -> Iterator[str]:
         if self.schema != _SCHEMA:
-            yield f"scenario '{self.id}' has schema {shown(self.schema)}; this version reads {_SCHEMA}"
+            yield (
+                f"scenario '{self.id}' has schema {shown(self.schema)}; this version reads "
+                f"{_SCHEMA}"
+            )
         if len(self.route) < 2:
             yield f"{self.called}route needs two points or more"
             return
-        for field, (x, y), end in (("start", self.start[:2], self.route[0]), ("goal", self.goal, self.route[-1])):
+        for field, (x, y), end in (
+            ("start", self.start[:2], self.route[0]),
+            ("goal", self.goal, self.route[-1]),
+        ):
             if not abs(x - end[0]) + abs(y - end[1]) <= 1e-6:
                 yield f"{self.called}{field} {(x, y)} is not the route's end {end}"
         yield HEADING_RAD.refusal(f"{self.called}start's heading", self.start[2])
         length_m = float(np.hypot(*np.diff(self.route, axis=0).T).sum())
-        yield Within(_SHORTEST_M, _LONGEST_M).refusal(f"{self.called}the length of the route, m,", length_m)
+        yield Within(_SHORTEST_M, _LONGEST_M).refusal(
+            f"{self.called}the length of the route, m,", length_m
+        )
         if length_m <= 2.0 * self.goal_radius_m:
             yield (
                 f"{self.called}goal_radius_m must be less than half of the route's {length_m:g} m, "
                 f"not {self.goal_radius_m}"
             )
-        places = [(crossing.called, "leave_s_m", crossing.leave_s_m, _SLACK_M) for crossing in self.crossings]
-        places += [(event.called, "route_s_m", event.route_s_m, EVENT_BEYOND_M) for event in self.events]
+        places = [
+            (crossing.called, "leave_s_m", crossing.leave_s_m, _SLACK_M)
+            for crossing in self.crossings
+        ]
+        places += [
+            (event.called, "route_s_m", event.route_s_m, EVENT_BEYOND_M) for event in self.events
+        ]
         for called, field, s_m, beyond_m in places:
             if s_m > length_m + beyond_m:
                 yield f"{self.called}{called}{field} is {s_m:g}, but the route ends at {length_m:g}"
@@ -263,7 +295,8 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
         return Pose(*self.start)
 
     def driven_by(self, robot: str) -> Scenario:
-        """The same with another robot; itself where `robot` is "". Raises UsageError with the valid names."""
+        """The same with another robot; itself where `robot` is "". Raises UsageError with the valid
+        names."""
         return msgspec.structs.replace(self, robot=robot_called(robot).name) if robot else self
 
     @cached_property
@@ -306,34 +339,54 @@ def _canonical(spec: msgspec.Struct) -> bytes:
 
 
 def event_faults(scenario: Scenario, kinds: EventKinds, place: str = "$") -> Iterator[str]:
-    """What of the events of a scenario, at `place` of its file, is not of the table or not as its rows say."""
+    """What of the events of a scenario, at `place` of its file, is not of the table or not as its
+    rows say."""
     for number, event in enumerate(scenario.events):
         at = f"{place}.events[{number}]"
         if event.kind not in kinds:
-            yield f"Invalid enum value {shown(event.kind)} - at `{at}.kind`. Valid choices: {', '.join(kinds)}"
+            yield (
+                f"Invalid enum value {shown(event.kind)} - at `{at}.kind`. Valid choices: "
+                f"{', '.join(kinds)}"
+            )
             continue
         fewest, most = kinds[event.kind].people
         if not fewest <= event.people <= most:
             allowed = f"{fewest}" if fewest == most else f"{fewest} to {most}"
-            yield f"{event.called}people of '{event.kind}' must be {allowed}, not {shown(event.people)} - at `{at}`"
+            yield (
+                f"{event.called}people of '{event.kind}' must be {allowed}, not "
+                f"{shown(event.people)} - at `{at}`"
+            )
         if (kinds[event.kind].layout is None) != (event.half_length_m > 0.0):
-            crossings = " and ".join(f"'{kind.name}'" for kind in kinds.values() if kind.layout is None)
-            yield f"{event.called}half_length_m is the crosswalk's: of {crossings}, and of no other - at `{at}`"
+            crossings = " and ".join(
+                f"'{kind.name}'" for kind in kinds.values() if kind.layout is None
+            )
+            yield (
+                f"{event.called}half_length_m is the crosswalk's: of {crossings}, and of no "
+                f"other - at `{at}`"
+            )
     stops = [kind.name for kind in kinds.values() if kind.ends_at == "stop"]
     if scenario.ends_at == "stop" and not any(event.kind in stops for event in scenario.events):
         needed = " or ".join(f"'{name}'" for name in stops)
-        yield f"{scenario.called}ends_at 'stop' needs an event {needed}: somebody to stop for - at `{place}`"
+        yield (
+            f"{scenario.called}ends_at 'stop' needs an event {needed}: somebody to stop for - at "
+            f"`{place}`"
+        )
 
 
 def read_suite(path: Path, kinds: EventKinds | None = None) -> Suite:
-    """The suite in a JSON file. kinds: of events that there may be; None for a file that was read before.
+    """The suite in a JSON file. kinds: of events that there may be; None for a file that was read
+    before.
 
     Raises SpecError naming the file and the field, and what may stand there."""
     suite = read_spec_file(path, Suite)
     if not suite.scenarios:
-        raise SpecError(f"{path}: suite '{suite.name}' has no scenarios: `scenarios` needs one or more")
+        raise SpecError(
+            f"{path}: suite '{suite.name}' has no scenarios: `scenarios` needs one or more"
+        )
     if kinds is not None:
-        told = (event_faults(one, kinds, f"$.scenarios[{i}]") for i, one in enumerate(suite.scenarios))
+        told = (
+            event_faults(one, kinds, f"$.scenarios[{i}]") for i, one in enumerate(suite.scenarios)
+        )
         if faults := list(chain.from_iterable(told)):
             raise SpecError(f"{path}: {in_lines(faults)}")
     return suite
@@ -341,6 +394,8 @@ def read_suite(path: Path, kinds: EventKinds | None = None) -> Suite:
 
 def write_suite(suite: Suite, path: Path) -> None:
     """Write a suite as readable JSON: one scenario a line."""
-    head = msgspec.json.encode({"name": suite.name, "version": suite.version, "description": suite.description})
+    head = msgspec.json.encode(
+        {"name": suite.name, "version": suite.version, "description": suite.description}
+    )
     rows = b",\n".join(_canonical(s) for s in suite.scenarios)
     path.write_bytes(head[:-1] + b',"scenarios":[\n' + rows + b"\n]}\n")

@@ -1,4 +1,5 @@
-"""Choose scenarios of a suite by id, event, split and number; and find the options that chose given ones."""
+"""Choose scenarios of a suite by id, event, split and number; and find the options that chose given
+ones."""
 
 from __future__ import annotations
 
@@ -10,7 +11,8 @@ from cosim.core.errors import UsageError, unknown
 from cosim.spec.scenario import Scenario, Split, Suite
 
 STATIC: Final = "static"
-"""The structure of `reactive` scenarios of the same places and ways without an event; chosen like an event."""
+"""The structure of `reactive` scenarios of the same places and ways without an event; chosen like
+an event."""
 _MOST_NAMED: Final = 3
 """Scenarios listed by name where no other options choose them."""
 
@@ -22,7 +24,8 @@ def scenarios_chosen(
     kinds: Sequence[str] = (),
     split: str | None = None,
 ) -> tuple[Scenario, ...]:
-    """The named scenarios of a suite (all when none is named) with events of the named kinds, the first `episodes`.
+    """The named scenarios of a suite (all when none is named) with events of the named kinds, the
+    first `episodes`.
 
     kinds: of events, or `static`. split: those of val or of test alone.
 
@@ -42,7 +45,9 @@ def scenarios_chosen(
     if split is not None:
         picked = [s for s in picked if s.split == split]
         if not picked:
-            raise UsageError(f"suite '{whole.name}' has no scenarios of split '{split}' among those chosen")
+            raise UsageError(
+                f"suite '{whole.name}' has no scenarios of split '{split}' among those chosen"
+            )
     return tuple(picked[:episodes])
 
 
@@ -55,15 +60,20 @@ def selection_in_words(whole: Suite, ids: Sequence[str]) -> str:
     >>> selection_in_words(Suite(name="s", version="1", scenarios=(one, other)), ["a"])
     '1 of 2 (--episodes 1)'
     """
-    words = " ".join(_options_for(whole, ids)) or ("all" if len(ids) == len(whole.scenarios) else "by --scenario")
+    words = " ".join(_options_for(whole, ids)) or (
+        "all" if len(ids) == len(whole.scenarios) else "by --scenario"
+    )
     return f"{len(ids)} of {len(whole.scenarios)} ({words})"
 
 
 def _options_for(whole: Suite, ids: Sequence[str]) -> list[str]:
-    """The fewest options that choose exactly these scenarios; none for all of them, or where none do."""
+    """The fewest options that choose exactly these scenarios; none for all of them, or where none
+    do."""
     picked = [scenario for scenario in whole.scenarios if scenario.id in {*ids}]
     each = [_kinds_of(scenario) for scenario in picked]
-    known = [*dict.fromkeys(kind for scenario in whole.scenarios for kind in sorted(_kinds_of(scenario)))]
+    known = [
+        *dict.fromkeys(kind for scenario in whole.scenarios for kind in sorted(_kinds_of(scenario)))
+    ]
     every = tuple(kind for kind in known if any(kind in kinds for kinds in each))
     common = [(kind,) for kind in known if all(kind in kinds for kinds in each)]
     choices = product((None, *get_args(Split)), ((), *common, every), (None, len(ids)))
@@ -85,4 +95,6 @@ def _as_options(kinds: Iterable[str], split: str | None, episodes: int | None) -
 
 def _kinds_of(scenario: Scenario) -> set[str]:
     """What `--event` finds a scenario by."""
-    return {event.kind for event in scenario.events} or ({STATIC} if scenario.structure == STATIC else set())
+    return {event.kind for event in scenario.events} or (
+        {STATIC} if scenario.structure == STATIC else set()
+    )

@@ -1,4 +1,5 @@
-"""Specs in JSON files: read whole, or refused with every fault at once, each with its place in the file."""
+"""Specs in JSON files: read whole, or refused with every fault at once, each with its place in the
+file."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar, Union, get_args, get
 import msgspec
 
 from cosim.core.errors import SpecError, nearest
-from cosim.spec.ranges import MOST_SHOWN, Ranged, printable, refusal_of, rules_of, shown
+from cosim.spec.validation import MOST_SHOWN, Ranged, printable, refusal_of, rules_of, shown
 
 MOST_BYTES: Final = 1_000_000_000
 MOST_TOLD: Final = 5
@@ -30,8 +31,8 @@ Spec = TypeVar("Spec", bound=msgspec.Struct)
 
 
 def read_spec_file(path: Path, kind: type[Spec]) -> Spec:
-    """The spec in a JSON file. Raises SpecError naming the file, and of each fault the place and what may stand there:
-    one on a line, the first MOST_TOLD of them."""
+    """The spec in a JSON file. Raises SpecError naming the file, and of each fault the place and
+    what may stand there: one on a line, the first MOST_TOLD of them."""
     try:
         if path.exists() and not path.is_file():
             raise SpecError(f"{path}: is no file")
@@ -51,7 +52,9 @@ def in_lines(faults: Sequence[str], most: int = MOST_TOLD) -> str:
     """A fault as it is; of several, their number and the first `most` of them, a line each."""
     if len(faults) == 1:
         return faults[0]
-    count = f"{len(faults)} faults" if len(faults) < MOST_COUNTED else f"{MOST_COUNTED} faults or more"
+    count = (
+        f"{len(faults)} faults" if len(faults) < MOST_COUNTED else f"{MOST_COUNTED} faults or more"
+    )
     which = f"; the first {most}" if len(faults) > most else ""
     return "\n  ".join([f"{count}{which}:", *faults[:most]])
 
@@ -62,7 +65,8 @@ def _faults(data: bytes, kind: Any, error: Exception) -> Iterator[str]:
         yield f"{error} - at `$`"
         return
     try:
-        # It takes NaN and numbers without end, which the other reader refuses without naming their field.
+        # It takes NaN and numbers without end, which the other reader refuses without naming their
+        # field.
         tree = json.loads(data)
     except (ValueError, RecursionError):
         yield _malformed(data, error)
@@ -113,7 +117,8 @@ def _where(data: bytes, byte: int) -> str:
 
 
 def faults_in(tree: Any, kind: Any, place: str) -> Iterator[str]:
-    """Every fault of a value that should be of a type: those of its parts, where they have none its own."""
+    """Every fault of a value that should be of a type: those of its parts, where they have none its
+    own."""
     try:
         msgspec.convert(tree, kind)
         return
@@ -128,7 +133,10 @@ def faults_in(tree: Any, kind: Any, place: str) -> Iterator[str]:
     else:
         if isinstance(tree, str):
             message = message.replace(f"'{tree}'", shown(tree))
-        yield f"{printable(_PLACE.sub('', message), MOST_LETTERS)} - at `{place}`{_choices(kind, tree)}"
+        yield (
+            f"{printable(_PLACE.sub('', message), MOST_LETTERS)} - at "
+            f"`{place}`{_choices(kind, tree)}"
+        )
 
 
 def _of_the_whole(error: Exception) -> bool:
@@ -141,7 +149,10 @@ def _faults_below(tree: Any, kind: Any, place: str) -> Iterator[str]:
     if isinstance(tree, dict) and isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}
         for name in sorted(tree.keys() - fields.keys() - {kind.__struct_config__.tag_field}):
-            yield f"Object contains unknown field `{printable(name, MOST_SHOWN)}` - at `{place}`{_listed(fields, name)}"
+            yield (
+                f"Object contains unknown field `{printable(name, MOST_SHOWN)}` - at "
+                f"`{place}`{_listed(fields, name)}"
+            )
         for name, field in fields.items():
             if name in tree:
                 yield from faults_in(tree[name], field.type, f"{place}.{name}")
@@ -160,18 +171,22 @@ def _faults_below(tree: Any, kind: Any, place: str) -> Iterator[str]:
 
 
 def _out_of_range(tree: Any, kind: Any, place: str) -> Iterator[str]:
-    """The fields of a value that are out of their range; those of another type are told of already."""
+    """The fields of a value that are out of their range; those of another type are told of
+    already."""
     if not (isinstance(tree, dict) and isinstance(kind, type) and issubclass(kind, Ranged)):
         return
     types = {field.name: field.type for field in msgspec.structs.fields(kind)}
     for field, rule in rules_of(kind):
         with suppress(*_REFUSED):
-            if field in tree and (refusal := refusal_of(field, rule, msgspec.convert(tree[field], types[field]))):
+            if field in tree and (
+                refusal := refusal_of(field, rule, msgspec.convert(tree[field], types[field]))
+            ):
                 yield f"{refusal} - at `{place}`"
 
 
 def bare_type(kind: Any, tree: Any) -> Any:
-    """A type without its range, and without None; of several kinds of objects the one that the value says it is."""
+    """A type without its range, and without None; of several kinds of objects the one that the
+    value says it is."""
     if get_origin(kind) is Annotated:
         return bare_type(get_args(kind)[0], tree)
     if get_origin(kind) in (Union, UnionType):
@@ -192,7 +207,9 @@ def _choices(kind: Any, tree: Any) -> str:
     if get_origin(bare) is Literal:
         return _listed(get_args(bare), tree)
     if get_origin(bare) in (Union, UnionType):
-        tags = [one.__struct_config__.tag for one in get_args(bare) if hasattr(one, "__struct_config__")]
+        tags = [
+            one.__struct_config__.tag for one in get_args(bare) if hasattr(one, "__struct_config__")
+        ]
         return _listed(tags)
     return ""
 

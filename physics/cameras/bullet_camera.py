@@ -1,8 +1,8 @@
-"""BulletCamera: pictures by PyBullet's software renderer, which needs neither a GPU nor a system library, or on
-request by its EGL plugin.
+"""BulletCamera: pictures by PyBullet's software renderer, which needs neither a GPU nor a system
+library, or on request by its EGL plugin.
 
-A picture is a function of the robot's state and the street alone: same values, same pixels, whatever was drawn
-before.
+A picture is a function of the robot's state and the street alone: same values, same pixels,
+whatever was drawn before.
 """
 
 from __future__ import annotations
@@ -16,17 +16,18 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import EngineError
 from cosim.core.state import LABELS, Frame, RobotState, Street
-from cosim.episode.ports import CameraSpec
+from cosim.spec.camera import CameraSpec
+from physics.cameras.camera_base import WorldCamera
 from physics.cameras.canvas import BulletCanvas
-from physics.cameras.eyes import WorldCamera
 from physics.cameras.scene import BulletScene
 from physics.cameras.view import FAR_PLANE_M, NEAR_PLANE_M, Shot
-from physics.world.world import BulletWorld
+from physics.dynamics.world import BulletWorld
 
 _HAZE: Final = np.array([206.0, 216.0, 226.0], dtype=np.float32)
 _ZENITH: Final = np.array([92.0, 142.0, 205.0], dtype=np.float32)
 _TILES_MAX: Final = 150
-"""Tiles built before the renderer is started afresh: PyBullet gives the memory of drawn shapes back only then."""
+"""Tiles built before the renderer is started afresh: PyBullet gives the memory of drawn shapes back
+only then."""
 _CLEAR_M: Final = 20.0
 _HAZE_M: Final = 110.0
 
@@ -34,7 +35,9 @@ _HAZE_M: Final = 110.0
 class BulletCamera(WorldCamera):
     """The robot's camera in a world. Use it in a `with` block; the world need not be running."""
 
-    def __init__(self, world: BulletWorld, spec: CameraSpec, depth: bool = False, egl: bool = False) -> None:
+    def __init__(
+        self, world: BulletWorld, spec: CameraSpec, depth: bool = False, egl: bool = False
+    ) -> None:
         super().__init__(world, spec, depth)
         self._egl = egl
         self._canvas: BulletCanvas | None = None
@@ -81,8 +84,11 @@ def _hazy(rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> NDArray[np.uint
 
 
 @lru_cache(maxsize=8)
-def _sky(height: int, fov_deg: float, steep_rad: float) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """(H, 1, 3) colours where nothing is: haze at the horizon, blue above; (H, 1) which rows are below it."""
+def _sky(
+    height: int, fov_deg: float, steep_rad: float
+) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """(H, 1, 3) colours where nothing is: haze at the horizon, blue above; (H, 1) which rows are
+    below it."""
     rows = (0.5 - (np.arange(height) + 0.5) / height) * 2.0 * math.tan(math.radians(0.5 * fov_deg))
     rise = np.arctan(rows) - steep_rad
     up = np.clip(rise / 0.7, 0.0, 1.0)[:, None, None]

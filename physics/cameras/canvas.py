@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS
+from physics.dynamics.bullet import p
+from physics.ground.mesh import Mesh, as_lists
 from physics.textures.layers import Colour
-from physics.world.bullet import p
-from physics.world.mesh import Mesh, as_lists
 
 _AWAY: Final = (0.0, 0.0, -200.0)
 _UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)
@@ -31,9 +31,11 @@ _LIGHT: Final = {
 
 
 class BulletCanvas:
-    """Coloured, labelled bodies and a renderer of PyBullet's: TinyRenderer, or its EGL plugin, which needs OpenGL.
+    """Coloured, labelled bodies and a renderer of PyBullet's: TinyRenderer, or its EGL plugin,
+    which needs OpenGL.
 
-    Physics never pays for them: it runs elsewhere. Raises EngineError when the plugin does not start.
+    Physics never pays for them: it runs elsewhere. Raises EngineError when the plugin does not
+    start.
     """
 
     def __init__(self, egl: bool = False) -> None:
@@ -57,9 +59,16 @@ class BulletCanvas:
         """A form that bodies can share."""
         if self._folder is not None:
             return self._shape_of_file(mesh, Path(self._folder.name))
-        with as_lists(mesh.triangles, mesh.vertices, mesh.normals) as (indices, (vertices, normals)):
+        with as_lists(mesh.triangles, mesh.vertices, mesh.normals) as (
+            indices,
+            (vertices, normals),
+        ):
             shape: int = p.createVisualShape(
-                p.GEOM_MESH, vertices=vertices, indices=indices, normals=normals, physicsClientId=self._client
+                p.GEOM_MESH,
+                vertices=vertices,
+                indices=indices,
+                normals=normals,
+                physicsClientId=self._client,
             )
         return shape
 
@@ -90,14 +99,20 @@ class BulletCanvas:
     def paint(self, body: int, colour: Colour) -> None:
         p.changeVisualShape(body, -1, rgbaColor=(*colour, 1.0), physicsClientId=self._client)
 
-    def put(self, body: int, at_m: Sequence[float], heading_rad: float = 0.0, about_y_rad: float = 0.0) -> None:
+    def put(
+        self, body: int, at_m: Sequence[float], heading_rad: float = 0.0, about_y_rad: float = 0.0
+    ) -> None:
         """Turn a body about its own y axis, then about the vertical, and set it at (3,) metres."""
         cy, sy = math.cos(0.5 * about_y_rad), math.sin(0.5 * about_y_rad)
         cz, sz = math.cos(0.5 * heading_rad), math.sin(0.5 * heading_rad)
-        p.resetBasePositionAndOrientation(body, at_m, (-sz * sy, cz * sy, sz * cy, cz * cy), self._client)
+        p.resetBasePositionAndOrientation(
+            body, at_m, (-sz * sy, cz * sy, sz * cy, cz * cy), self._client
+        )
 
     def put_turned(self, body: int, at_m: Sequence[float], roll_pitch_yaw: Sequence[float]) -> None:
-        p.resetBasePositionAndOrientation(body, at_m, p.getQuaternionFromEuler(roll_pitch_yaw), self._client)
+        p.resetBasePositionAndOrientation(
+            body, at_m, p.getQuaternionFromEuler(roll_pitch_yaw), self._client
+        )
 
     def put_at(self, body: int, at_m: Sequence[float], turn: Sequence[float]) -> None:
         """Set a body at (3,) metres, turned by a quaternion x, y, z, w."""
@@ -107,14 +122,22 @@ class BulletCanvas:
         p.resetBasePositionAndOrientation(body, _AWAY, _UPRIGHT, self._client)
 
     def draw(
-        self, eye_m: Floats, target_m: Floats, size: tuple[int, int], fov_deg: float, near_m: float, far_m: float
+        self,
+        eye_m: Floats,
+        target_m: Floats,
+        size: tuple[int, int],
+        fov_deg: float,
+        near_m: float,
+        far_m: float,
     ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]]:
-        """Colours (H, W, 3), labels (H, W) and depth along the view (H, W) in metres. size: width, height."""
+        """Colours (H, W, 3), labels (H, W) and depth along the view (H, W) in metres. size: width,
+        height."""
         width, height = size
         view = p.computeViewMatrix(eye_m.tolist(), target_m.tolist(), (0.0, 0.0, 1.0))
         projection = list(p.computeProjectionMatrixFOV(fov_deg, width / height, near_m, far_m))
         if self._renderer == p.ER_TINY_RENDERER:
-            # It looks through a corner of each pixel: half a pixel aside, and it looks through the middle.
+            # It looks through a corner of each pixel: half a pixel aside, and it looks through the
+            # middle.
             projection[8] += 1.0 / width
             projection[9] += 1.0 / height
         _, _, rgba, depth, mask = p.getCameraImage(
@@ -131,7 +154,9 @@ class BulletCanvas:
         labels[mask < 0] = LABELS["sky"]
         depth = np.asarray(depth, dtype=np.float32).reshape(height, width)
         metres = (far_m * near_m / (far_m - (far_m - near_m) * depth)).astype(np.float32)
-        rgb = np.ascontiguousarray(np.asarray(rgba, dtype=np.uint8).reshape(height, width, 4)[..., :3])
+        rgb = np.ascontiguousarray(
+            np.asarray(rgba, dtype=np.uint8).reshape(height, width, 4)[..., :3]
+        )
         return rgb, labels, metres
 
     def _shape_of_file(self, mesh: Mesh, folder: Path) -> int:
@@ -141,7 +166,9 @@ class BulletCanvas:
         path = folder / f"{len(list(folder.iterdir()))}.obj"
         drawn = Trimesh(mesh.vertices, mesh.triangles, vertex_normals=mesh.normals, process=False)
         drawn.export(path, include_normals=True)
-        shape: int = p.createVisualShape(p.GEOM_MESH, fileName=str(path), physicsClientId=self._client)
+        shape: int = p.createVisualShape(
+            p.GEOM_MESH, fileName=str(path), physicsClientId=self._client
+        )
         return shape
 
     def _load_egl(self) -> None:
@@ -150,7 +177,8 @@ class BulletCanvas:
             raise EngineError("this PyBullet has no EGL plugin: use --camera gl or bullet")
         if p.loadPlugin(plugin.origin, "_eglRendererPlugin", self._client) < 0:
             raise EngineError(
-                "PyBullet's EGL plugin did not start: is OpenGL here (cosim doctor)? Or use --camera bullet"
+                "PyBullet's EGL plugin did not start: is OpenGL here (cosim doctor)? Or use "
+                "--camera bullet"
             )
 
     def _label(self, body: int, label: str) -> None:
@@ -160,7 +188,8 @@ class BulletCanvas:
 
 
 class Rigs:
-    """Interchangeable sets of bodies, lent out anew for each picture; what is not lent is out of sight."""
+    """Interchangeable sets of bodies, lent out anew for each picture; what is not lent is out of
+    sight."""
 
     def __init__(self, canvas: BulletCanvas, meshes: Sequence[Mesh], label: str) -> None:
         self._canvas = canvas
@@ -178,7 +207,9 @@ class Rigs:
         """One body per mesh, in their order."""
         if self._lent == len(self._rigs):
             grey = (0.5, 0.5, 0.5)
-            self._rigs.append([self._canvas.add(shape, grey, self._label) for shape in self._shapes])
+            self._rigs.append(
+                [self._canvas.add(shape, grey, self._label) for shape in self._shapes]
+            )
         self._lent += 1
         return self._rigs[self._lent - 1]
 

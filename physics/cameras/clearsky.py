@@ -13,11 +13,31 @@ from cosim.core.geometry import Floats
 LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
 """Shares of linear sRGB in luminance."""
 
-_XYZ_TO_RGB: Final = np.array([[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]])
+_XYZ_TO_RGB: Final = np.array(
+    [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
+)
 _PEREZ: Final = {
-    "Y": ((0.1787, -1.4630), (-0.3554, 0.4275), (-0.0227, 5.3251), (0.1206, -2.5771), (-0.0670, 0.3703)),
-    "x": ((-0.0193, -0.2592), (-0.0665, 0.0008), (-0.0004, 0.2125), (-0.0641, -0.8989), (-0.0033, 0.0452)),
-    "y": ((-0.0167, -0.2608), (-0.0950, 0.0092), (-0.0079, 0.2102), (-0.0441, -1.6537), (-0.0109, 0.0529)),
+    "Y": (
+        (0.1787, -1.4630),
+        (-0.3554, 0.4275),
+        (-0.0227, 5.3251),
+        (0.1206, -2.5771),
+        (-0.0670, 0.3703),
+    ),
+    "x": (
+        (-0.0193, -0.2592),
+        (-0.0665, 0.0008),
+        (-0.0004, 0.2125),
+        (-0.0641, -0.8989),
+        (-0.0033, 0.0452),
+    ),
+    "y": (
+        (-0.0167, -0.2608),
+        (-0.0950, 0.0092),
+        (-0.0079, 0.2102),
+        (-0.0441, -1.6537),
+        (-0.0109, 0.0529),
+    ),
 }
 _ZENITH: Final = {
     "x": (
@@ -36,15 +56,17 @@ _LOWEST_RAD: Final = math.radians(3.0)
 """Below this the daylight formula is held, and dimmed to what is measured of twilight."""
 _TWILIGHT_DEG: Final = (-18.0, -12.0, -6.0, -4.0, -2.0, 0.0, 3.0)
 _TWILIGHT_LOG: Final = (-6.0, -5.0, -2.75, -2.0, -1.25, -0.62, 0.0)
-"""Common logarithm of the sky's light against that at 3 degrees (after the usual tables of twilight illuminance:
-about 400 lx at sunset, 3.4 lx at -6 degrees, 0.008 lx at -12)."""
+"""Common logarithm of the sky's light against that at 3 degrees (after the usual tables of twilight
+illuminance: about 400 lx at sunset, 3.4 lx at -6 degrees, 0.008 lx at -12)."""
 
 
 def clear_sky(ways: Floats, sun: Floats, turbidity: float) -> Floats:
-    """Radiance of a cloudless sky in directions (..., 3), as linear sRGB in kcd/m2; at the horizon below it.
+    """Radiance of a cloudless sky in directions (..., 3), as linear sRGB in kcd/m2; at the horizon
+    below it.
 
-    A. J. Preetham, P. Shirley and B. Smits, A practical analytic model for daylight, SIGGRAPH 1999; below 3 degrees
-    of sun its light is dimmed along the measured twilight and turned blue, red near where the sun went down.
+    A. J. Preetham, P. Shirley and B. Smits, A practical analytic model for daylight, SIGGRAPH 1999;
+    below 3 degrees of sun its light is dimmed along the measured twilight and turned blue, red near
+    where the sun went down.
     """
     rise = math.asin(float(np.clip(sun[2], -1.0, 1.0)))
     held = max(rise, _LOWEST_RAD)
@@ -61,12 +83,21 @@ def clear_sky(ways: Floats, sun: Floats, turbidity: float) -> Floats:
     parts = {}
     for name, coefficients in _PEREZ.items():
         terms = [slope * turbidity + offset for slope, offset in coefficients]
-        parts[name] = zenith[name] * _perez(terms, cos_theta, gamma) / _perez(terms, np.ones(1), np.full(1, theta_sun))
+        parts[name] = (
+            zenith[name]
+            * _perez(terms, cos_theta, gamma)
+            / _perez(terms, np.ones(1), np.full(1, theta_sun))
+        )
     day = _rgb(parts["x"], parts["y"], parts["Y"])
     degrees = math.degrees(rise)
-    # By day the formula's horizon is too pink and too dim beside photographs: haze is nearly white, and bright.
+    # By day the formula's horizon is too pink and too dim beside photographs: haze is nearly white,
+    # and bright.
     white = (day @ LUMINANCE)[..., None] * _HAZE
-    share = 0.8 * np.exp(-np.maximum(ways[..., 2:], 0.0) / 0.12) * float(np.clip((degrees - 6.0) / 14.0, 0.0, 1.0))
+    share = (
+        0.8
+        * np.exp(-np.maximum(ways[..., 2:], 0.0) / 0.12)
+        * float(np.clip((degrees - 6.0) / 14.0, 0.0, 1.0))
+    )
     day = np.asarray(day + share * (white - day))
     dim = 10.0 ** float(np.interp(degrees, _TWILIGHT_DEG, _TWILIGHT_LOG))
     blue = float(np.clip((9.0 - degrees) / 10.0, 0.0, 1.0))
@@ -85,11 +116,14 @@ def _dusk(ways: Floats, at: Floats, day: Floats) -> Floats:
     return np.asarray(level * (blue * (1.0 - 0.85 * warm) + warm * np.array([2.3, 1.05, 0.50])))
 
 
-def _perez(terms: list[float], cos_theta: NDArray[np.floating], gamma: NDArray[np.floating]) -> Floats:
+def _perez(
+    terms: list[float], cos_theta: NDArray[np.floating], gamma: NDArray[np.floating]
+) -> Floats:
     """R. Perez's all-weather function (1993) of zenith and sun distance."""
     a, b, c, d, e = terms
     return np.asarray(
-        (1.0 + a * np.exp(b / cos_theta)) * (1.0 + c * np.exp(d * gamma) + e * np.cos(gamma) ** 2), dtype=float
+        (1.0 + a * np.exp(b / cos_theta)) * (1.0 + c * np.exp(d * gamma) + e * np.cos(gamma) ** 2),
+        dtype=float,
     )
 
 

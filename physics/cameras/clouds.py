@@ -16,18 +16,23 @@ _PER_SIDE: Final = 5.0
 """Side of the layer's repeating square, in heights of the layer."""
 
 
-def clouded(clear: Floats, ways: Floats, sun: Floats, beam: Floats, cover: float, seed: int) -> tuple[Floats, float]:
+def clouded(
+    clear: Floats, ways: Floats, sun: Floats, beam: Floats, cover: float, seed: int
+) -> tuple[Floats, float]:
     """Radiance (H, W, 3) of the sky with clouds, and the share of the sun that they let through.
 
-    clear, ways: radiance and directions of a cloudless sky; beam: (3,) sun; cover: 0 to 1. A closed sky is the
-    overcast of the CIE (P. Moon and D. E. Spencer, 1942): three times brighter at the zenith than at the horizon.
+    clear, ways: radiance and directions of a cloudless sky; beam: (3,) sun; cover: 0 to 1. A closed
+    sky is the overcast of the CIE (P. Moon and D. E. Spencer, 1942): three times brighter at the
+    zenith than at the horizon.
     """
     if cover <= 0.0:
         return np.array(clear), 1.0
     up = np.maximum(ways[..., 2], 0.0)
     above = ways[..., 2] > 0.0
     solid = np.where(above, np.cos(np.arcsin(np.clip(ways[..., 2], -1.0, 1.0))), 0.0)
-    sky_light = (clear * (solid * up)[..., None]).sum(axis=(0, 1)) / max(float((solid * up).sum()), 1e-9)
+    sky_light = (clear * (solid * up)[..., None]).sum(axis=(0, 1)) / max(
+        float((solid * up).sum()), 1e-9
+    )
     layer = _layer(seed)
     dense = _dense(layer, ways, cover, np.zeros(2))
     towards = np.asarray(sun[:2], dtype=float) / max(math.hypot(sun[0], sun[1]), 1e-9)
@@ -50,10 +55,13 @@ def clouded(clear: Floats, ways: Floats, sun: Floats, beam: Floats, cover: float
 
 
 def _layer(seed: int) -> Field:
-    """(S, S) noise of the layer, its values spread evenly over 0 to 1, so that a cover is a threshold."""
+    """(S, S) noise of the layer, its values spread evenly over 0 to 1, so that a cover is a
+    threshold."""
     noise = Noise(_SIZE, (seed, 9001))
     field = noise.warped(
-        np.asarray(noise.clouds(4) + 0.6 * noise.clouds(16) + 0.15 * noise.clouds(64), np.float32), 0.012, 8
+        np.asarray(noise.clouds(4) + 0.6 * noise.clouds(16) + 0.15 * noise.clouds(64), np.float32),
+        0.012,
+        8,
     )
     order = np.argsort(np.argsort(field, axis=None)).reshape(field.shape)
     return np.asarray(order / order.size, dtype=np.float32)

@@ -23,14 +23,17 @@ _SPOT_RAD = math.radians(4.0)
 
 
 def read_hdri(path: str) -> _Image:
-    """(H, 2H, 3) linear radiance of a Radiance .hdr picture. Raises SpecError naming the file and what is wrong."""
+    """(H, 2H, 3) linear radiance of a Radiance .hdr picture. Raises SpecError naming the file and
+    what is wrong."""
     file = Path(path)
     if not file.is_file():
         raise SpecError(f"hdri '{path}' does not exist")
     try:
         data = np.frombuffer(read_within(file, _MOST_BYTES), np.uint8)
     except (OSError, ValueError) as error:
-        raise SpecError(f"hdri '{path}' cannot be read: {getattr(error, 'strerror', error)}") from error
+        raise SpecError(
+            f"hdri '{path}' cannot be read: {getattr(error, 'strerror', error)}"
+        ) from error
     if data[:2].tobytes() != b"#?":
         raise SpecError(f"hdri '{path}' is no Radiance picture: it does not begin with '#?'")
     try:
@@ -41,7 +44,10 @@ def read_hdri(path: str) -> _Image:
         raise SpecError(f"hdri '{path}' cannot be decoded: it is cut short or damaged")
     rows, columns = picture.shape[:2]
     if columns != 2 * rows or rows < 16:
-        raise SpecError(f"hdri '{path}' is {columns} x {rows} pixels; an equirectangular sky is 2:1, from 32 x 16")
+        raise SpecError(
+            f"hdri '{path}' is {columns} x {rows} pixels; an equirectangular sky is 2:1, "
+            f"from 32 x 16"
+        )
     rgb = np.asarray(picture[..., ::-1], dtype=np.float32)
     if not np.isfinite(rgb).all() or rgb.min() < 0.0:
         raise SpecError(f"hdri '{path}' holds values that are not finite or below 0")
@@ -53,8 +59,9 @@ def read_hdri(path: str) -> _Image:
 
 
 def brightest(picture: _Image, ways: Floats) -> tuple[Floats, Floats, _Image]:
-    """Direction (3,) of the brightest spot above the horizon, its light (3,) as the radiance of a white surface that
-    faces it, and the picture without it: what exceeds the ring around the spot is taken out."""
+    """Direction (3,) of the brightest spot above the horizon, its light (3,) as the radiance of a
+    white surface that faces it, and the picture without it: what exceeds the ring around the spot
+    is taken out."""
     rows = len(picture)
     light = picture.astype(float) @ LUMINANCE
     light[rows // 2 :] = 0.0
@@ -65,7 +72,8 @@ def brightest(picture: _Image, ways: Floats) -> tuple[Floats, Floats, _Image]:
     towards = (ways * weight[..., None]).sum(axis=(0, 1))
     towards /= np.linalg.norm(towards)
     apart = np.arccos(np.clip(ways @ towards, -1.0, 1.0))
-    spot, ring = apart < _SPOT_RAD, (apart >= _SPOT_RAD) & (apart < 2.0 * _SPOT_RAD)
+    spot = apart < _SPOT_RAD
+    ring = (apart >= _SPOT_RAD) & (apart < 2.0 * _SPOT_RAD)
     around = np.median(picture[ring], axis=0)
     more = np.where(spot[..., None], np.maximum(picture - around, 0.0), 0.0)
     solid = (math.pi / rows) ** 2 * np.sqrt(np.maximum(1.0 - ways[..., 2] ** 2, 0.0))

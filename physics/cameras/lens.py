@@ -1,7 +1,9 @@
-"""Lens: what optics and sensor do to a drawn picture, as pure functions of the picture and the robot's state.
+"""Lens: what optics and sensor do to a drawn picture, as pure functions of the picture and the
+robot's state.
 
-In the order of the light: the picture slides while the shutter is open (motion blur) and while rows are read (rolling
-shutter), is bent by the lens, falls off towards the corners, is counted in electrons, and is amplified.
+In the order of the light: the picture slides while the shutter is open (motion blur) and while rows
+are read (rolling shutter), is bent by the lens, falls off towards the corners, is counted in
+electrons, and is amplified.
 """
 
 from __future__ import annotations
@@ -17,14 +19,15 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import SpecError
 from cosim.core.state import Frame, RobotState
-from cosim.episode.ports import CameraSpec, Lens
+from cosim.spec.camera import CameraSpec, Lens
 from cosim.spec.robot import Mount
 from physics.textures.layers import LINEAR, encoded
 
 GREY: Final = 0.18
 """Mean linear value that auto-exposure aims at."""
 SAMPLES_MAX: Final = 8
-"""Moments of an open shutter that are averaged; one for each 1.5 pixels that the picture moves, up to these."""
+"""Moments of an open shutter that are averaged; one for each 1.5 pixels that the picture moves, up
+to these."""
 
 _DRAWN_MAX: Final = 4096
 _OFFSETS: Final = 1 << 18
@@ -35,7 +38,8 @@ Map = NDArray[np.floating[Any]]
 
 
 def drawn(spec: CameraSpec) -> CameraSpec:
-    """The pinhole camera to draw for a camera with a lens: as sharp in the middle, and wide enough for every pixel.
+    """The pinhole camera to draw for a camera with a lens: as sharp in the middle, and wide enough
+    for every pixel.
 
     Raises SpecError where k1 and k2 fold the picture at this field of view.
     """
@@ -49,17 +53,19 @@ def drawn(spec: CameraSpec) -> CameraSpec:
     width, height = (2 * math.ceil(float(np.abs(m).max()) * focal + 0.5) for m in (x, y))
     if max(width, height) > _DRAWN_MAX:
         raise SpecError(
-            f"lens k1 {lens.k1}, k2 {lens.k2}: a picture of {width} x {height} pixels would be drawn for it"
+            f"lens k1 {lens.k1}, k2 {lens.k2}: a picture of {width} x {height} pixels would "
+            f"be drawn for it"
         )
     fov = math.degrees(2.0 * math.atan(0.5 * height / focal))
     return dataclasses.replace(spec, width=width, height=height, fov_deg=fov, lens=Lens())
 
 
 def through(spec: CameraSpec, frame: Frame, robot: RobotState, seed: int, tick: int) -> Frame:
-    """The frame of a camera with a lens, from the frame of `drawn(spec)`. Labels and depth are only moved.
+    """The frame of a camera with a lens, from the frame of `drawn(spec)`. Labels and depth are only
+    moved.
 
-    robot: the source of motion blur and skew; seed, tick: of the noise. Motion is that of the ground plane below and
-    of walls beside; people and vehicles blur as if they stood still.
+    robot: the source of motion blur and skew; seed, tick: of the noise. Motion is that of the
+    ground plane below and of walls beside; people and vehicles blur as if they stood still.
     """
     lens = spec.lens
     if lens == Lens():
@@ -67,19 +73,27 @@ def through(spec: CameraSpec, frame: Frame, robot: RobotState, seed: int, tick: 
     source = drawn(spec)
     size = (source.height, source.width)
     if frame.rgb.shape[:2] != size:
-        raise SpecError(f"the lens needs a frame of {size[1]} x {size[0]} pixels, as drawn(spec) says")
+        raise SpecError(
+            f"the lens needs a frame of {size[1]} x {size[0]} pixels, as drawn(spec) says"
+        )
     rgb = frame.rgb
     toned = bool(lens.full_well_e or lens.auto_exposure_ev or lens.vignette)
     labels, depth = frame.labels, frame.depth
-    moving = (lens.shutter_s > 0.0 or lens.readout_s > 0.0) and (robot.v_mps != 0.0 or robot.w_radps != 0.0)
+    moving = (lens.shutter_s > 0.0 or lens.readout_s > 0.0) and (
+        robot.v_mps != 0.0 or robot.w_radps != 0.0
+    )
     light: NDArray[np.floating[Any]] | None = None
     if moving or lens.k1 or lens.k2:
         flow = _flow(spec, robot) if moving else None
         moments = _moments(spec, flow)
         read = (np.arange(spec.height, dtype=np.float32)[:, None] + 0.5) / spec.height - 0.5
         read = read * np.float32(lens.readout_s)
-        labels = None if labels is None else _moved(labels, spec, source, flow, read, cv2.INTER_NEAREST)
-        depth = None if depth is None else _moved(depth, spec, source, flow, read, cv2.INTER_NEAREST)
+        labels = (
+            None if labels is None else _moved(labels, spec, source, flow, read, cv2.INTER_NEAREST)
+        )
+        depth = (
+            None if depth is None else _moved(depth, spec, source, flow, read, cv2.INTER_NEAREST)
+        )
         if len(moments) == 1:
             rgb = _moved(rgb, spec, source, flow, read, cv2.INTER_LINEAR)
         else:
@@ -91,21 +105,28 @@ def through(spec: CameraSpec, frame: Frame, robot: RobotState, seed: int, tick: 
     if toned:
         light = _sensed(LINEAR[rgb] if light is None else light, spec, seed, tick)
     if light is not None:
-        rgb = _CODES[(np.clip(light, 0.0, 1.0) * np.float32(4096.0) + np.float32(0.5)).astype(np.int16)]
+        rgb = _CODES[
+            (np.clip(light, 0.0, 1.0) * np.float32(4096.0) + np.float32(0.5)).astype(np.int16)
+        ]
     return Frame(rgb, labels, depth)
 
 
 def exposure_gain(light: NDArray[np.floating[Any]], range_ev: float) -> float:
-    """What auto-exposure multiplies a linear picture (H, W, 3) by: its mean to GREY, within +-`range_ev` stops.
+    """What auto-exposure multiplies a linear picture (H, W, 3) by: its mean to GREY, within
+    +-`range_ev` stops.
 
-    It meters the picture itself and remembers nothing, so that a picture stays a function of the state.
+    It meters the picture itself and remembers nothing, so that a picture stays a function of the
+    state.
     """
     mean = float(light.mean(axis=(0, 1)) @ np.array([0.2126, 0.7152, 0.0722]))
     return float(np.clip(GREY / max(mean, 1e-6), 2.0**-range_ev, 2.0**range_ev))
 
 
-def _sensed(light: NDArray[np.floating[Any]], spec: CameraSpec, seed: int, tick: int) -> NDArray[np.floating[Any]]:
-    """Fall of light, noise of the sensor, amplification; linear in and out. The gain amplifies the noise too."""
+def _sensed(
+    light: NDArray[np.floating[Any]], spec: CameraSpec, seed: int, tick: int
+) -> NDArray[np.floating[Any]]:
+    """Fall of light, noise of the sensor, amplification; linear in and out. The gain amplifies the
+    noise too."""
     lens = spec.lens
     if lens.vignette:
         light = light * _falloff(spec)[..., None]
@@ -128,7 +149,12 @@ def _moments(spec: CameraSpec, flow: Map | None) -> list[float]:
 
 
 def _moved(
-    picture: NDArray[Any], spec: CameraSpec, source: CameraSpec, flow: Map | None, time_s: Map, how: int
+    picture: NDArray[Any],
+    spec: CameraSpec,
+    source: CameraSpec,
+    flow: Map | None,
+    time_s: Map,
+    how: int,
 ) -> NDArray[Any]:
     """A source picture as the lens shows it, each row at its time; `time_s` (H, 1)."""
     if flow is None:
@@ -142,7 +168,9 @@ def _moved(
 def _pixels(spec: CameraSpec, source: CameraSpec, x: Map, y: Map) -> tuple[Map, Map]:
     """Columns and rows in the source picture of rays (H, W)."""
     focal = np.float32(_focal_px(spec))
-    return x * focal + np.float32(0.5 * source.width - 0.5), y * focal + np.float32(0.5 * source.height - 0.5)
+    return x * focal + np.float32(0.5 * source.width - 0.5), y * focal + np.float32(
+        0.5 * source.height - 0.5
+    )
 
 
 @lru_cache(maxsize=8)
@@ -160,9 +188,11 @@ def _focal_px(spec: CameraSpec) -> float:
 
 @lru_cache(maxsize=8)
 def _rays(spec: CameraSpec) -> tuple[Map, Map]:
-    """(H, W) x to the right and y down, in focal lengths, of the ray that each pixel of the lens sees.
+    """(H, W) x to the right and y down, in focal lengths, of the ray that each pixel of the lens
+    sees.
 
-    D. C. Brown, Photogrammetric Engineering 37 (1971): r' = r (1 + k1 r^2 + k2 r^4), solved for r by Newton's method.
+    D. C. Brown, Photogrammetric Engineering 37 (1971): r' = r (1 + k1 r^2 + k2 r^4), solved for r
+    by Newton's method.
     """
     focal = _focal_px(spec)
     x, y = np.meshgrid(
@@ -174,11 +204,14 @@ def _rays(spec: CameraSpec) -> tuple[Map, Map]:
         bent = np.hypot(x, y)
         r = bent.copy()
         for _ in range(30):
-            r -= (r * (1.0 + k1 * r**2 + k2 * r**4) - bent) / (1.0 + 3.0 * k1 * r**2 + 5.0 * k2 * r**4)
+            r -= (r * (1.0 + k1 * r**2 + k2 * r**4) - bent) / (
+                1.0 + 3.0 * k1 * r**2 + 5.0 * k2 * r**4
+            )
         out = np.linspace(0.0, float(np.abs(r).max()) if np.isfinite(r).all() else 1e3, 200)
         if np.any(1.0 + 3.0 * k1 * out**2 + 5.0 * k2 * out**4 <= 0.0):
             raise SpecError(
-                f"lens k1 {k1}, k2 {k2} fold the picture over itself within a field of view of {spec.fov_deg:g} deg at "
+                f"lens k1 {k1}, k2 {k2} fold the picture over itself within a field of view "
+                f"of {spec.fov_deg:g} deg at "
                 f"{spec.width} x {spec.height}: give a narrower fov_deg or terms nearer to 0"
             )
         scale = np.where(bent > 1e-9, r / np.maximum(bent, 1e-9), 1.0)
@@ -188,29 +221,38 @@ def _rays(spec: CameraSpec) -> tuple[Map, Map]:
 
 @lru_cache(maxsize=2)
 def _noise(seed: int, size: int) -> Map:
-    """Normal noise of a scenario: each picture takes `size` values of it from a place of its own."""
-    return _locked(np.random.default_rng([seed, 0x1E45]).standard_normal(size + _OFFSETS, dtype=np.float32))
+    """Normal noise of a scenario: each picture takes `size` values of it from a place of its
+    own."""
+    return _locked(
+        np.random.default_rng([seed, 0x1E45]).standard_normal(size + _OFFSETS, dtype=np.float32)
+    )
 
 
 @lru_cache(maxsize=8)
 def _falloff(spec: CameraSpec) -> Map:
-    """(H, W) light that arrives: 1 in the middle, cos^4 of the angle off the axis at a vignette of 1."""
+    """(H, W) light that arrives: 1 in the middle, cos^4 of the angle off the axis at a vignette of
+    1."""
     x, y = _rays(spec)
     return _locked(1.0 - spec.lens.vignette * (1.0 - (1.0 + x**2 + y**2) ** -2.0))
 
 
 @lru_cache(maxsize=8)
 def _flows(spec: CameraSpec) -> tuple[Map, Map]:
-    """(H, W, 2) how the picture moves, in focal lengths a second: per m/s ahead, and per rad/s to the left.
+    """(H, W, 2) how the picture moves, in focal lengths a second: per m/s ahead, and per rad/s to
+    the left.
 
-    H. C. Longuet-Higgins and K. Prazdny, Proc. R. Soc. B 208 (1980), over a ground plane and walls at _FAR_M.
+    H. C. Longuet-Higgins and K. Prazdny, Proc. R. Soc. B 208 (1980), over a ground plane and walls
+    at _FAR_M.
     """
     x, y = (m.astype(float) for m in _rays(spec))
-    assert isinstance(spec.mount, Mount), "a camera's mount is known once it sits on its robot: CameraSpec.on"
+    assert isinstance(spec.mount, Mount), (
+        "a camera's mount is known once it sits on its robot: CameraSpec.on"
+    )
     down, side = math.radians(spec.mount.pitch_down_deg), math.radians(spec.mount.yaw_left_deg)
     x_m, y_m, z_m = spec.mount.at_m
     near = np.maximum((y * math.cos(down) + math.sin(down)) / max(z_m, 0.05), 1.0 / _FAR_M)
-    level, right = np.array([0.0, -math.sin(down), math.cos(down)]), np.array([1.0, 0.0, 0.0])
+    level = np.array([0.0, -math.sin(down), math.cos(down)])
+    right = np.array([1.0, 0.0, 0.0])
     ahead = math.cos(side) * level + math.sin(side) * right
     left = math.sin(side) * level - math.cos(side) * right
     up = np.array([0.0, -math.cos(down), -math.sin(down)])

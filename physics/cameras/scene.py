@@ -1,4 +1,5 @@
-"""The street around a point as a canvas shows it: tiles, buildings, props, fences, signals, people, vehicles."""
+"""The street around a point as a canvas shows it: tiles, buildings, props, fences, signals, people,
+vehicles."""
 
 from __future__ import annotations
 
@@ -11,24 +12,32 @@ from cosim.core.clock import Clock
 from cosim.core.geometry import Floats, Pose
 from cosim.core.state import People, Street, Vehicles
 from physics.cameras.canvas import BulletCanvas, Rigs
-from physics.cameras.view import FORGET_M, PERSON_MARGIN_M, PROP_MARGIN_M, VEHICLE_MARGIN_M, VISIBLE_M, View
+from physics.cameras.view import (
+    FORGET_M,
+    PERSON_MARGIN_M,
+    PROP_MARGIN_M,
+    VEHICLE_MARGIN_M,
+    VISIBLE_M,
+    View,
+)
+from physics.dynamics.world import BulletWorld
+from physics.ground.tiles import Key, distance_to, keys_within, square
+from physics.people.appearance import family_of
 from physics.people.families import FAMILIES
-from physics.people.looks import family_of
 from physics.people.parts import part_colours, part_meshes, placed_parts
 from physics.robots import urdf_of
 from physics.street import props, vehicles
 from physics.street.buildings import FACADES, WINDOW_COLOUR, facade_meshes
 from physics.street.furniture import KINDS, Prop, parts_of
+from physics.street.surface import stood
 from physics.textures.layers import Colour
-from physics.world.surface import stood
-from physics.world.tiles import Key, distance_to, keys_within, square
-from physics.world.world import BulletWorld
 
 
 @dataclass(frozen=True, slots=True)
 class _TileBodies:
-    """A built tile. bodies: body -> where it belongs (x, y, z and heading); posts: the signals in it; furniture: its
-    props with the heights of their feet, at (N, 2) furniture_xy, drawn as far as (N,) seen_m."""
+    """A built tile. bodies: body -> where it belongs (x, y, z and heading); posts: the signals in
+    it; furniture: its props with the heights of their feet, at (N, 2) furniture_xy, drawn as far as
+    (N,) seen_m."""
 
     bodies: dict[int, tuple[tuple[float, float, float], float]]
     posts: list[props.SignalPost]
@@ -52,7 +61,9 @@ class BulletScene:
         self.built = 0
         self._post = canvas.shape(props.post_mesh())
         self._walkers = {family: Rigs(canvas, part_meshes(family), "person") for family in FAMILIES}
-        self._lamps = {walk: Rigs(canvas, [props.lamp_mesh(walk)], "signal") for walk in props.LAMPS}
+        self._lamps = {
+            walk: Rigs(canvas, [props.lamp_mesh(walk)], "signal") for walk in props.LAMPS
+        }
         self._vehicles: dict[tuple[vehicles.Shape, float, float], Rigs] = {}
         self._furniture: dict[tuple[str, int, int], Rigs] = {}
         self._painted: dict[int, Colour] = {}
@@ -61,7 +72,9 @@ class BulletScene:
         for barrier in world.barriers:
             size = (barrier.thickness_m, barrier.length_m)
             z = surface.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, size)
-            for mesh, colour in zip(props.barrier_meshes(barrier), (props.PROP_RED, props.PROP_WHITE), strict=True):
+            for mesh, colour in zip(
+                props.barrier_meshes(barrier), (props.PROP_RED, props.PROP_WHITE), strict=True
+            ):
                 body = canvas.add(mesh, colour, "barrier")
                 canvas.put(body, (barrier.x_m, barrier.y_m, z), barrier.heading_rad)
 
@@ -78,8 +91,13 @@ class BulletScene:
         """Set the robot's base frame there, until the next `arrange`."""
         h = self._model.com_height_m
         ahead = h * math.sin(pitch_rad)
-        x, y = pose.x_m + ahead * math.cos(pose.heading_rad), pose.y_m + ahead * math.sin(pose.heading_rad)
-        self._canvas.put_turned(self._robot, (x, y, z_m + h), (roll_rad, pitch_rad, pose.heading_rad))
+        x, y = (
+            pose.x_m + ahead * math.cos(pose.heading_rad),
+            pose.y_m + ahead * math.sin(pose.heading_rad),
+        )
+        self._canvas.put_turned(
+            self._robot, (x, y, z_m + h), (roll_rad, pitch_rad, pose.heading_rad)
+        )
 
     def _stream(self, view: View) -> None:
         x, y = float(view.eye_m[0]), float(view.eye_m[1])
@@ -103,7 +121,10 @@ class BulletScene:
         x0, y0, x1, y1 = square(key)
         middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0])
         chunk, posts = self._surface.chunk(key), self._surface.posts(key)
-        parts = [(patch.mesh, patch.colour, patch.label) for patch in (*chunk.ground, *self._surface.covers(key))]
+        parts = [
+            (patch.mesh, patch.colour, patch.label)
+            for patch in (*chunk.ground, *self._surface.covers(key))
+        ]
         for facade, mesh in facade_meshes(chunk.buildings).items():
             parts.append((mesh, WINDOW_COLOUR if facade < 0 else FACADES[facade], "building"))
         at = (float(middle[0]), float(middle[1]), 0.0)
@@ -113,7 +134,10 @@ class BulletScene:
             if len(mesh)
         }
         for post in posts:
-            bodies[self._canvas.add(self._post, props.POLE, "signal")] = self._foot(post), post.heading_rad
+            bodies[self._canvas.add(self._post, props.POLE, "signal")] = (
+                self._foot(post),
+                post.heading_rad,
+            )
         return _with_furniture(bodies, posts, chunk.props)
 
     def _foot(self, post: props.SignalPost) -> tuple[float, float, float]:
@@ -172,7 +196,8 @@ class BulletScene:
             rigs.finish()
 
     def _show_furniture(self, view: View) -> None:
-        """Props are lent their bodies like people: those out of the picture or far away cost nothing."""
+        """Props are lent their bodies like people: those out of the picture or far away cost
+        nothing."""
         for rigs in self._furniture.values():
             rigs.start()
         for tile in (*(self._tiles[key] for key in sorted(self._shown)), self._obstacles):
@@ -185,7 +210,9 @@ class BulletScene:
                 form = prop.form
                 parts = parts_of(*form)
                 if form not in self._furniture:
-                    self._furniture[form] = Rigs(self._canvas, [part.mesh for part in parts], "prop")
+                    self._furniture[form] = Rigs(
+                        self._canvas, [part.mesh for part in parts], "prop"
+                    )
                 for body, part in zip(self._furniture[form].lend(), parts, strict=True):
                     self._canvas.put(body, (prop.x_m, prop.y_m, z), prop.drawn_rad)
                     colour = part.colour or KINDS[prop.kind].paints[prop.paint]
@@ -202,4 +229,6 @@ def _with_furniture(
     furniture: tuple[tuple[Prop, float], ...],
 ) -> _TileBodies:
     xy = np.array([(prop.x_m, prop.y_m) for prop, _ in furniture]).reshape(-1, 2)
-    return _TileBodies(bodies, posts, furniture, xy, np.array([KINDS[prop.kind].seen_m for prop, _ in furniture]))
+    return _TileBodies(
+        bodies, posts, furniture, xy, np.array([KINDS[prop.kind].seen_m for prop, _ in furniture])
+    )

@@ -1,9 +1,10 @@
 """Sky: sun, sky light, clouds, fog and exposure of a scenario's light, as values for a camera.
 
-Radiance is linear sRGB; 1 is a white matt surface that faces the sun outside the air. A camera draws
+Radiance is linear sRGB; 1 is a white matt surface that faces the sun outside the air. A camera
+draws
 
-    L = albedo * (ambient(n) + sun_colour * max(0, n . sun) * lit),   L = mix(fog_colour, L, exp(-fog_per_m * distance))
-    pixel = sRGB(filmic(L * exposure))
+    L = albedo * (ambient(n) + sun_colour * max(0, n . sun) * lit),   L = mix(fog_colour, L,
+    exp(-fog_per_m * distance)) pixel = sRGB(filmic(L * exposure))
 """
 
 from __future__ import annotations
@@ -33,15 +34,16 @@ SKY_SIZE: Final = (256, 512)
 TURBIDITY: Final = 3.0
 GROUND_ALBEDO: Final = 0.2
 HOUSES: Final = 0.4
-"""What houses and trees hide of the sky over a street, weighed by the cosine: a street 1.5 times as wide as its houses
-are high. A photographed sky has its own."""
+"""What houses and trees hide of the sky over a street, weighed by the cosine: a street 1.5 times as
+wide as its houses are high. A photographed sky has its own."""
 HOUSE_ALBEDO: Final = 0.4
 
 _FULL_KLX: Final = 128.0
 _CLEAR_M: Final = 30_000.0
 _FOG_TOP_M: Final = 60.0
 _ADAPTED: Final = 0.85
-"""A camera, and an eye, make up for most of the dark, not for all of it: the power of the light that is undone."""
+"""A camera, and an eye, make up for most of the dark, not for all of it: the power of the light
+that is undone."""
 _KEY: Final = 0.85
 _LAMPS: Final = 2.2e-4 * np.array([1.0, 0.82, 0.62])
 """Light of a lamp-lit street at night, some 28 lx."""
@@ -55,11 +57,12 @@ _Image = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class Sky:
-    """Light on a scene. sun: (3,) unit vector towards it, x east, y north, z up; sun_colour: (3,), 0 when it is down
-    or covered. ambient: (3, 3) radiance of a white surface that looks up, sideways, down, without the sun.
-    radiance: (H, 2H, 3) float32 equirectangular: row 0 is the zenith, the middle column looks east, the picture's
-    right is clockwise: u = 0.5 - atan2(y, x) / 2 pi, v = 0.5 - asin(z) / pi. fog_per_m: extinction.
-    lamps: 0 by day to 1 at night. shadows: whether the sun throws any. Arrays are write-protected.
+    """Light on a scene. sun: (3,) unit vector towards it, x east, y north, z up; sun_colour: (3,),
+    0 when it is down or covered. ambient: (3, 3) radiance of a white surface that looks up,
+    sideways, down, without the sun. radiance: (H, 2H, 3) float32 equirectangular: row 0 is the
+    zenith, the middle column looks east, the picture's right is clockwise: u = 0.5 - atan2(y, x) /
+    2 pi, v = 0.5 - asin(z) / pi. fog_per_m: extinction. lamps: 0 by day to 1 at night. shadows:
+    whether the sun throws any. Arrays are write-protected.
     """
 
     sun: Floats
@@ -79,7 +82,8 @@ class Sky:
 
 @lru_cache(maxsize=8)
 def sky_of(light: Light, seed: int = 0) -> Sky:
-    """The sky of a light; seed: of the clouds. Raises SpecError naming a broken picture of the user's.
+    """The sky of a light; seed: of the clouds. Raises SpecError naming a broken picture of the
+    user's.
 
     That of the light which a scenario has by default is baked.
     """
@@ -87,10 +91,14 @@ def sky_of(light: Light, seed: int = 0) -> Sky:
         return _photographed(light) if light.hdri else _procedural(light, seed)
 
     def make() -> dict[str, NDArray[Any]]:
-        return {field: np.asarray(value) for field, value in asdict(_procedural(light, seed)).items()}
+        return {
+            field: np.asarray(value) for field, value in asdict(_procedural(light, seed)).items()
+        }
 
     kept = baked(f"sky-{seed}", _MADE_BY, make)
-    sky: dict[str, Any] = {f: np.asarray(value) if value.size > 1 else value.item() for f, value in kept.items()}
+    sky: dict[str, Any] = {
+        f: np.asarray(value) if value.size > 1 else value.item() for f, value in kept.items()
+    }
     return Sky(**sky)
 
 
@@ -103,7 +111,8 @@ def directions(rows: int) -> Floats:
 
 
 def irradiance(radiance: NDArray[np.floating], towards: Floats) -> Floats:
-    """(3,) radiance of a white matt surface facing `towards`, lit by an equirectangular (H, 2H, 3) picture."""
+    """(3,) radiance of a white matt surface facing `towards`, lit by an equirectangular (H, 2H, 3)
+    picture."""
     rows = len(radiance)
     ways = directions(rows)
     solid = (math.pi / rows) ** 2 * np.cos((0.5 - (np.arange(rows) + 0.5) / rows) * math.pi)
@@ -125,8 +134,11 @@ def _procedural(light: Light, seed: int) -> Sky:
     return _assembled(light, sun, beam, sky, lamps, fog_per_m)
 
 
-def _fogged(sky: Floats, ways: Floats, sun: Floats, beam: Floats, per_m: float) -> tuple[Floats, Floats]:
-    """Sky and sun through a layer of fog; most of the light it takes comes down all the same, from everywhere."""
+def _fogged(
+    sky: Floats, ways: Floats, sun: Floats, beam: Floats, per_m: float
+) -> tuple[Floats, Floats]:
+    """Sky and sun through a layer of fog; most of the light it takes comes down all the same, from
+    everywhere."""
     if per_m == 0.0:
         return sky, beam
     left = np.exp(-per_m * _FOG_TOP_M / np.maximum(ways[..., 2:], 0.02))
@@ -137,7 +149,9 @@ def _fogged(sky: Floats, ways: Floats, sun: Floats, beam: Floats, per_m: float) 
     return left * sky + (1.0 - left) * grey, beam * through
 
 
-def _assembled(light: Light, sun: Floats, beam: Floats, sky: Floats, lamps: float, fog_per_m: float) -> Sky:
+def _assembled(
+    light: Light, sun: Floats, beam: Floats, sky: Floats, lamps: float, fog_per_m: float
+) -> Sky:
     ways = directions(len(sky))
     above = ways[..., 2:] > 0.0
     up = irradiance(np.where(above, sky, 0.0), np.array([0.0, 0.0, 1.0])) + lamps * _LAMPS
@@ -147,12 +161,19 @@ def _assembled(light: Light, sun: Floats, beam: Floats, sky: Floats, lamps: floa
     below = sky if light.hdri else ground + (horizon - ground) * near
     whole = np.where(above, sky, below).astype(np.float32)
     compass = ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0])
-    side = np.mean([irradiance(whole, np.array(way)) for way in compass], axis=0) + 0.7 * lamps * _LAMPS
+    side = (
+        np.mean([irradiance(whole, np.array(way)) for way in compass], axis=0)
+        + 0.7 * lamps * _LAMPS
+    )
     # What a camera meters: a bright ground, and some of the sky over the street.
     bright = float((up + beam * max(float(sun[2]), 0.0) + 0.5 * horizon) @ LUMINANCE)
     exposure = _KEY * 2.0**light.exposure_ev * max(bright, 1e-5) ** -_ADAPTED
     glare = _disc(ways, sun, beam)
-    over = up if light.hdri else (1.0 - HOUSES) * up + HOUSES * HOUSE_ALBEDO * (side + _on_walls(sun, beam))
+    over = (
+        up
+        if light.hdri
+        else (1.0 - HOUSES) * up + HOUSES * HOUSE_ALBEDO * (side + _on_walls(sun, beam))
+    )
     ambient = np.stack([over, side, ground])
     whole += np.where(above, glare, 0.0).astype(np.float32)
     for array in (sun, beam, ambient, whole, horizon):
@@ -164,7 +185,9 @@ def _assembled(light: Light, sun: Floats, beam: Floats, sky: Floats, lamps: floa
 def _on_walls(sun: Floats, beam: Floats) -> Floats:
     """(3,) what the sun gives a wall, on the mean over all ways that walls face."""
     up = max(float(sun[2]), 0.0)
-    return np.asarray(beam * math.sqrt(max(1.0 - up * up, 0.0)) / math.pi) if up > 0.0 else np.zeros(3)
+    return (
+        np.asarray(beam * math.sqrt(max(1.0 - up * up, 0.0)) / math.pi) if up > 0.0 else np.zeros(3)
+    )
 
 
 def _horizon(sky: Floats, row: int) -> Floats:
@@ -173,7 +196,8 @@ def _horizon(sky: Floats, row: int) -> Floats:
 
 
 def _disc(ways: Floats, sun: Floats, beam: Floats) -> Floats:
-    """The sun's glare, drawn for the eye: its light itself is `sun_colour`, and not part of the ambient."""
+    """The sun's glare, drawn for the eye: its light itself is `sun_colour`, and not part of the
+    ambient."""
     apart = np.arccos(np.clip(ways @ sun, -1.0, 1.0))[..., None]
     return beam * (30.0 * np.exp(-((apart / 0.018) ** 2)) + 0.6 * np.exp(-apart / 0.10))
 
@@ -182,10 +206,13 @@ def _photographed(light: Light) -> Sky:
     """A sky from the user's picture, scaled so that a white horizontal surface has radiance 1."""
     picture = read_hdri(light.hdri)
     sun, spot, rest = brightest(picture, directions(len(picture)))
-    up = irradiance(np.where(directions(len(rest))[..., 2:] > 0.0, rest, 0.0), np.array([0.0, 0.0, 1.0]))
+    up = irradiance(
+        np.where(directions(len(rest))[..., 2:] > 0.0, rest, 0.0), np.array([0.0, 0.0, 1.0])
+    )
     scale = 1.0 / max(float((up + spot * max(float(sun[2]), 0.0)) @ LUMINANCE), 1e-9)
     fog_per_m = -math.log(0.05) / (light.fog_m if light.fog_m is not None else _CLEAR_M)
-    beam, sky = spot * scale, rest.astype(float) * scale
+    beam = spot * scale
+    sky = rest.astype(float) * scale
     if light.fog_m is not None:
         sky, beam = _fogged(sky, directions(len(sky)), sun, beam, fog_per_m)
     return _assembled(light, sun, beam, sky, 0.0, fog_per_m)

@@ -14,18 +14,20 @@ WAVELENGTHS_UM: Final = (0.610, 0.550, 0.465)
 
 
 def declination_rad(day_of_year: float) -> float:
-    """The sun's declination: P. I. Cooper, Solar Energy 12 (1969), 23.45 deg sin(360/365 (284 + n))."""
+    """The sun's declination: P. I. Cooper, Solar Energy 12 (1969), 23.45 deg sin(360/365 (284 +
+    n))."""
     return math.radians(23.45) * math.sin(2.0 * math.pi * (284.0 + day_of_year) / 365.0)
 
 
 def sun_direction(hour: float, day_of_year: float, latitude_deg: float) -> Floats:
     """(3,) unit vector towards the sun, x east, y north, z up; below the ground at night.
 
-    hour: solar time, 15 degrees of hour angle each (J. A. Duffie and W. A. Beckman, Solar Engineering of Thermal
-    Processes, chapter 1).
+    hour: solar time, 15 degrees of hour angle each (J. A. Duffie and W. A. Beckman, Solar
+    Engineering of Thermal Processes, chapter 1).
     """
     turn = math.radians(15.0 * (hour - 12.0))
-    tilt, place = declination_rad(day_of_year), math.radians(latitude_deg)
+    tilt = declination_rad(day_of_year)
+    place = math.radians(latitude_deg)
     east = -math.cos(tilt) * math.sin(turn)
     north = math.cos(place) * math.sin(tilt) - math.sin(place) * math.cos(tilt) * math.cos(turn)
     up = math.sin(place) * math.sin(tilt) + math.cos(place) * math.cos(tilt) * math.cos(turn)
@@ -33,7 +35,8 @@ def sun_direction(hour: float, day_of_year: float, latitude_deg: float) -> Float
 
 
 def air_mass(elevation_rad: float) -> float:
-    """Air between here and the sun, 1 towards the zenith: F. Kasten and A. T. Young, Applied Optics 28 (1989)."""
+    """Air between here and the sun, 1 towards the zenith: F. Kasten and A. T. Young, Applied Optics
+    28 (1989)."""
     degrees = max(math.degrees(elevation_rad), 0.0)
     return 1.0 / (math.sin(math.radians(degrees)) + 0.50572 * math.pow(degrees + 6.07995, -1.6364))
 
@@ -41,8 +44,8 @@ def air_mass(elevation_rad: float) -> float:
 def transmittance(elevation_rad: float, turbidity: float) -> Floats:
     """(3,) share of the sun's red, green and blue that comes through clear air.
 
-    Rayleigh and aerosol terms as in A. J. Preetham, P. Shirley and B. Smits, SIGGRAPH 1999, appendix 1. The last
-    degree to the horizon fades out: half of the disc is gone at 0.
+    Rayleigh and aerosol terms as in A. J. Preetham, P. Shirley and B. Smits, SIGGRAPH 1999,
+    appendix 1. The last degree to the horizon fades out: half of the disc is gone at 0.
     """
     mass = air_mass(elevation_rad)
     haze = 0.04608 * turbidity - 0.04586

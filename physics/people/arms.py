@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from physics.people.families import man_rest_m
 from physics.people.figure import LIMB, SMALL, Build, Sleeve
-from physics.people.lofts import Joints, Piece, Ring
+from physics.people.lofted_mesh import Joints, Piece, Ring
 from physics.people.skeleton import INDEX, REACH_RAD
 
 
@@ -15,7 +15,9 @@ def arms(build: Build, sleeve: Sleeve, loose: float = 0.0) -> list[Piece]:
     """Both arms in sleeves, and the hands."""
     pieces: list[Piece] = []
     for side, left in (("left", 1.0), ("right", -1.0)):
-        collar, shoulder, elbow, wrist = (f"{side}_{part}" for part in ("collar", "shoulder", "elbow", "wrist"))
+        collar, shoulder, elbow, wrist = (
+            f"{side}_{part}" for part in ("collar", "shoulder", "elbow", "wrist")
+        )
         keys = (
             # way along the arm from the shoulder, half depth, half width across, weights
             (-0.020, 0.020, 0.014, {"spine3": 0.1, collar: 0.5, shoulder: 0.4}),
@@ -34,7 +36,9 @@ def arms(build: Build, sleeve: Sleeve, loose: float = 0.0) -> list[Piece]:
         )
         f = build.limb
         skin = [(t, a * f, s * f, j) for t, a, s, j in keys]
-        cloth = [(t, a * f + 0.005 + 0.7 * loose, s * f + 0.005 + 0.7 * loose, j) for t, a, s, j in keys]
+        cloth = [
+            (t, a * f + 0.005 + 0.7 * loose, s * f + 0.005 + 0.7 * loose, j) for t, a, s, j in keys
+        ]
         if sleeve == "long":
             pieces.append(_arm(cloth[:-1], side, left, "top", (22, 11, 9, 7)))
             pieces.append(_arm(skin[-3:], side, left, "skin", (3, 2, 0, 0), SMALL))
@@ -63,7 +67,8 @@ def _arm(
 
 def _hand(side: str, left: float) -> list[Piece]:
     """Palm, four fingers, thumb; from some way on all in one."""
-    wrist, hand = {f"{side}_wrist": 1.0}, {f"{side}_wrist": 0.25, f"{side}_hand": 0.75}
+    wrist = {f"{side}_wrist": 1.0}
+    hand = {f"{side}_wrist": 0.25, f"{side}_hand": 0.75}
     palm = (
         (0.525, 0.0, 0.024, 0.019, wrist),
         (0.550, 0.0, 0.032, 0.018, wrist),
@@ -79,10 +84,16 @@ def _hand(side: str, left: float) -> list[Piece]:
     )
     pieces = [
         Piece(
-            "skin", tuple(on_arm(t, x, 0.0, a, s, j, left, 2.5) for t, x, a, s, j in palm), (12, 0, 0, 0), (7, 0, 0, 0)
+            "skin",
+            tuple(on_arm(t, x, 0.0, a, s, j, left, 2.5) for t, x, a, s, j in palm),
+            (12, 0, 0, 0),
+            (7, 0, 0, 0),
         ),
         Piece(
-            "skin", tuple(on_arm(t, x, 0.0, a, s, j, left, 2.5) for t, x, a, s, j in whole), (0, 8, 6, 4), (0, 6, 4, 4)
+            "skin",
+            tuple(on_arm(t, x, 0.0, a, s, j, left, 2.5) for t, x, a, s, j in whole),
+            (0, 8, 6, 4),
+            (0, 6, 4, 4),
         ),
     ]
     for x, length, spread in (
@@ -93,13 +104,21 @@ def _hand(side: str, left: float) -> list[Piece]:
     ):
         rings = [
             on_arm(
-                0.628 + length * share, x + spread * length * share, -0.010 * share**2, thick, 0.93 * thick, hand, left
+                0.628 + length * share,
+                x + spread * length * share,
+                -0.010 * share**2,
+                thick,
+                0.93 * thick,
+                hand,
+                left,
             )
             for share, thick in ((0.0, 0.0095), (0.45, 0.0095), (0.85, 0.0080), (1.0, 0.0045))
         ]
         pieces.append(Piece("skin", tuple(rings), (6, 0, 0, 0), (4, 0, 0, 0)))
     thumb = [
-        on_arm(0.560 + 0.078 * share, 0.030 + 0.052 * share, -0.008 * share, thick, thick, wrist, left)
+        on_arm(
+            0.560 + 0.078 * share, 0.030 + 0.052 * share, -0.008 * share, thick, thick, wrist, left
+        )
         for share, thick in ((0.0, 0.015), (0.35, 0.0135), (0.75, 0.0105), (1.0, 0.006))
     ]
     pieces.append(Piece("skin", tuple(thumb), (6, 5, 4, 0), (4, 3, 3, 0)))
@@ -117,7 +136,8 @@ def on_arm(
     square: float = 2.0,
     fat: float = 0.0,
 ) -> Ring:
-    """A ring on the arm, `way` from the shoulder, off its line by `ahead` and `palm` (to the back of the hand)."""
+    """A ring on the arm, `way` from the shoulder, off its line by `ahead` and `palm` (to the back
+    of the hand)."""
     x, y, z = man_rest_m()[INDEX["left_shoulder"]].tolist()
     cos, sin = math.cos(float(REACH_RAD)), math.sin(float(REACH_RAD))
     at = (

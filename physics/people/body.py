@@ -1,4 +1,5 @@
-"""Bodies: skinned meshes of people at several levels of detail, put together from lofts and fitted to a family."""
+"""Bodies: skinned meshes of people at several levels of detail, put together from lofts and fitted
+to a family."""
 
 from __future__ import annotations
 
@@ -10,15 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
+from physics.ground.mesh import smooth_normals
+from physics.people.accessories import Carried, Hair, carried, hair, headgear
 from physics.people.arms import arms
 from physics.people.clips import bind_of
 from physics.people.families import Family, man_rest_m, skeleton
-from physics.people.figure import LEVELS, MESH_LEVELS, RIBBONS, Build, Legs, Sleeve, legs, torso_pieces
+from physics.people.figure import (
+    LEVELS,
+    MESH_LEVELS,
+    RIBBONS,
+    Build,
+    Legs,
+    Sleeve,
+    legs,
+    torso_pieces,
+)
 from physics.people.head import about_head, neck_and_head
-from physics.people.lofts import Piece, lofted, tube
+from physics.people.lofted_mesh import Piece, lofted, tube
 from physics.people.skeleton import Skeleton, model_pose
-from physics.people.wear import Carried, Hair, carried, hair, headgear
-from physics.world.mesh import smooth_normals
 
 COATS: Final = ("skin", "lips", "hair", "white", "dark", "top", "bottom", "shoes", "bag", "cap")
 """What a vertex is painted as; a person has one colour for each."""
@@ -41,9 +51,10 @@ class Outfit:
 
 @dataclass(frozen=True, slots=True)
 class SkinnedBody:
-    """A skinned mesh. vertices, normals (V, 3) in the A pose, x ahead, z up, soles at 0; triangles (T, 3), front
-    counter-clockwise; joints (V, 4) uint8 rows and weights (V, 4) float32 that fall and sum to 1; coat (V,) uint8 rows
-    of COATS; fat (V,) float32, how much a vertex moves out on stouter people."""
+    """A skinned mesh. vertices, normals (V, 3) in the A pose, x ahead, z up, soles at 0; triangles
+    (T, 3), front counter-clockwise; joints (V, 4) uint8 rows and weights (V, 4) float32 that fall
+    and sum to 1; coat (V,) uint8 rows of COATS; fat (V,) float32, how much a vertex moves out on
+    stouter people."""
 
     vertices: NDArray[np.float32]
     normals: NDArray[np.float32]
@@ -56,9 +67,9 @@ class SkinnedBody:
 
 @dataclass(frozen=True, slots=True)
 class FarBody:
-    """A body of tubes, whose rings are turned towards the eye when it is drawn (`lofts.Tube`). middle, ahead, side
-    (V, 3); ring (V, 4); still (V,) whose rings are not turned; ribbon (V,) of outlines alone; the rest as in
-    SkinnedBody."""
+    """A body of tubes, whose rings are turned towards the eye when it is drawn (`lofts.Tube`).
+    middle, ahead, side (V, 3); ring (V, 4); still (V,) whose rings are not turned; ribbon (V,) of
+    outlines alone; the rest as in SkinnedBody."""
 
     middle: NDArray[np.float32]
     ahead: NDArray[np.float32]
@@ -78,15 +89,21 @@ def body(outfit: Outfit, level: int) -> SkinnedBody:
     """The body at a level of meshes: 0 is full detail."""
     if not 0 <= level < MESH_LEVELS:
         raise ValueError(f"levels of meshes go from 0 to {MESH_LEVELS - 1}: {level}")
-    surfaces = [(piece.coat, lofted(piece, level)) for piece in pieces(outfit) if piece.sides[level]]
+    surfaces = [
+        (piece.coat, lofted(piece, level)) for piece in pieces(outfit) if piece.sides[level]
+    ]
     starts = np.cumsum([0, *(len(s.vertices) for _, s in surfaces)])
     vertices = np.concatenate([s.vertices for _, s in surfaces])
-    triangles = np.concatenate([s.triangles + k for (_, s), k in zip(surfaces, starts.tolist(), strict=False)])
+    triangles = np.concatenate(
+        [s.triangles + k for (_, s), k in zip(surfaces, starts.tolist(), strict=False)]
+    )
     weights = np.concatenate([s.weights for _, s in surfaces])
     weights = _sided(vertices, weights)
     vertices = _fitted(vertices, weights, skeleton(outfit.family))
     joints, few = strongest(weights)
-    coat = np.repeat([COATS.index(coat) for coat, _ in surfaces], [len(s.vertices) for _, s in surfaces])
+    coat = np.repeat(
+        [COATS.index(coat) for coat, _ in surfaces], [len(s.vertices) for _, s in surfaces]
+    )
     return SkinnedBody(
         vertices.astype(np.float32),
         smooth_normals(vertices, triangles).astype(np.float32),
@@ -103,10 +120,13 @@ def far_body(outfit: Outfit, level: int) -> FarBody:
     """The body at a level of tubes or ribbons, MESH_LEVELS to LEVELS - 1."""
     if not MESH_LEVELS <= level < LEVELS:
         raise ValueError(f"levels of tubes go from {MESH_LEVELS} to {LEVELS - 1}: {level}")
-    ribbon, of = level == RIBBONS, min(level, RIBBONS - 1)
+    ribbon = level == RIBBONS
+    of = min(level, RIBBONS - 1)
     tubes = [(piece.coat, tube(piece, of, ribbon)) for piece in pieces(outfit) if piece.sides[of]]
     starts = np.cumsum([0, *(len(t.middle) for _, t in tubes)])
-    weights = np.concatenate([_sided(t.corners, t.weights) if t.still else t.weights for _, t in tubes])
+    weights = np.concatenate(
+        [_sided(t.corners, t.weights) if t.still else t.weights for _, t in tubes]
+    )
     even = np.concatenate([t.weights for _, t in tubes])
     family = skeleton(outfit.family)
     scale = family.height_m / 1.75
@@ -117,7 +137,9 @@ def far_body(outfit: Outfit, level: int) -> FarBody:
         (scale * np.concatenate([t.ahead for _, t in tubes])).astype(np.float32),
         (scale * np.concatenate([t.side for _, t in tubes])).astype(np.float32),
         np.concatenate([t.ring for _, t in tubes]).astype(np.float32),
-        np.concatenate([t.triangles + k for (_, t), k in zip(tubes, starts.tolist(), strict=False)]).astype(np.int32),
+        np.concatenate(
+            [t.triangles + k for (_, t), k in zip(tubes, starts.tolist(), strict=False)]
+        ).astype(np.int32),
         joints,
         few,
         coat.astype(np.uint8),
@@ -153,7 +175,8 @@ def strongest(weights: Floats) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
 
 
 def _sided(vertices: Floats, weights: Floats) -> Floats:
-    """Weights in which what a loft gives to both hips or collars goes to those of the vertex's own side."""
+    """Weights in which what a loft gives to both hips or collars goes to those of the vertex's own
+    side."""
     out = weights.copy()
     share = np.clip(0.5 + vertices[:, 1] / 0.10, 0.0, 1.0)
     share = share * share * (3.0 - 2.0 * share)
@@ -167,7 +190,8 @@ def _sided(vertices: Floats, weights: Floats) -> Floats:
 
 
 def _fitted(vertices: Floats, weights: Floats, family: Skeleton) -> Floats:
-    """Vertices of the man moved along with their joints to where a family has them, at the family's size."""
+    """Vertices of the man moved along with their joints to where a family has them, at the family's
+    size."""
     man = Skeleton(man_rest_m(), 1.75)
     scale = family.height_m / man.height_m
     _, ours = bind_of(Skeleton(family.rest_m / scale, man.height_m), model_pose())

@@ -1,9 +1,9 @@
 """Motion captures that ship with PyBullet, turned onto the SMPL joints.
 
-The files are those of DeepMimic's humanoid: a list of frames of 44 numbers: how long the frame lasts, the root's
-position and quaternion (w x y z), then chest, neck, right hip, right knee, right ankle, right shoulder, right elbow,
-and the same five of the left; knees and elbows are one angle about z, all others quaternions. Axes there: x ahead,
-y up, z right; at rest the arms hang.
+The files are those of DeepMimic's humanoid: a list of frames of 44 numbers: how long the frame
+lasts, the root's position and quaternion (w x y z), then chest, neck, right hip, right knee, right
+ankle, right shoulder, right elbow, and the same five of the left; knees and elbows are one angle
+about z, all others quaternions. Axes there: x ahead, y up, z right; at rest the arms hang.
 """
 
 from __future__ import annotations
@@ -21,15 +21,27 @@ from cosim.core.geometry import Floats
 from physics.people.skeleton import INDEX, model_pose, rodrigues
 
 _COLUMNS: Final = {
-    "pelvis": 4, "chest": 8, "neck": 12, "right_hip": 16, "right_knee": 20, "right_ankle": 21, "right_shoulder": 25,
-    "right_elbow": 29, "left_hip": 30, "left_knee": 34, "left_ankle": 35, "left_shoulder": 39, "left_elbow": 43,
-}  # fmt: skip
+    "pelvis": 4,
+    "chest": 8,
+    "neck": 12,
+    "right_hip": 16,
+    "right_knee": 20,
+    "right_ankle": 21,
+    "right_shoulder": 25,
+    "right_elbow": 29,
+    "left_hip": 30,
+    "left_knee": 34,
+    "left_ankle": 35,
+    "left_shoulder": 39,
+    "left_elbow": 43,
+}
 _HINGES: Final = ("right_knee", "right_elbow", "left_knee", "left_elbow")
 
 
 @dataclass(frozen=True, slots=True)
 class Capture:
-    """A captured motion. turns: (F, 24, 3, 3) of each joint against its parent; pelvis_m: (F, 3); axes of the body."""
+    """A captured motion. turns: (F, 24, 3, 3) of each joint against its parent; pelvis_m: (F, 3);
+    axes of the body."""
 
     frame_s: float
     turns: Floats
@@ -37,11 +49,16 @@ class Capture:
 
 
 def capture(name: str) -> Capture:
-    """The capture `humanoid3d_<name>` of pybullet_data. Raises EngineError naming file and fault."""
+    """The capture `humanoid3d_<name>` of pybullet_data. Raises EngineError naming file and
+    fault."""
     found = importlib.util.find_spec("pybullet_data")
     if found is None or not found.submodule_search_locations:
-        raise EngineError("pybullet_data is missing, which comes with PyBullet: install pybullet again")
-    return read_capture(Path(found.submodule_search_locations[0]) / "data" / "motions" / f"humanoid3d_{name}.txt")
+        raise EngineError(
+            "pybullet_data is missing, which comes with PyBullet: install pybullet again"
+        )
+    return read_capture(
+        Path(found.submodule_search_locations[0]) / "data" / "motions" / f"humanoid3d_{name}.txt"
+    )
 
 
 def read_capture(path: Path) -> Capture:
@@ -51,16 +68,27 @@ def read_capture(path: Path) -> Capture:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise EngineError(f"{path}: not a motion capture: {error}") from error
     if rows.ndim != 2 or rows.shape[1] != 44 or len(rows) < 4 or not np.isfinite(rows).all():
-        raise EngineError(f"{path}: not a motion capture: 'Frames' must be 4 or more rows of 44 numbers")
+        raise EngineError(
+            f"{path}: not a motion capture: 'Frames' must be 4 or more rows of 44 numbers"
+        )
     pelvis = rows[:, 1:4] @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
     return Capture(float(rows[0, 0]), _turns(rows), pelvis)
 
 
 def _turns(rows: Floats) -> Floats:
-    """(F, 24, 3, 3) turns against the T pose: the chest's shared among three joints, the neck's among two."""
+    """(F, 24, 3, 3) turns against the T pose: the chest's shared among three joints, the neck's
+    among two."""
     local = {name: _turn(rows, name) for name in _COLUMNS}
     turns = np.tile(np.eye(3), (len(rows), 24, 1, 1))
-    for name in ("pelvis", "right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle"):
+    for name in (
+        "pelvis",
+        "right_hip",
+        "right_knee",
+        "right_ankle",
+        "left_hip",
+        "left_knee",
+        "left_ankle",
+    ):
         turns[:, INDEX[name]] = rodrigues(local[name])
     for name in ("spine1", "spine2", "spine3"):
         turns[:, INDEX[name]] = rodrigues(local["chest"] / 3.0)
@@ -75,7 +103,8 @@ def _turns(rows: Floats) -> Floats:
 
 
 def _turn(rows: Floats, name: str) -> Floats:
-    """(F, 3) axis-angle of a joint against its parent, in our axes, both at rest with hanging arms."""
+    """(F, 3) axis-angle of a joint against its parent, in our axes, both at rest with hanging
+    arms."""
     at = _COLUMNS[name]
     if name in _HINGES:
         return np.column_stack([np.zeros(len(rows)), -rows[:, at], np.zeros(len(rows))])

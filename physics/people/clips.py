@@ -1,4 +1,5 @@
-"""All motions of all families, baked: the joints' matrices of every frame in one array that a renderer can hold."""
+"""All motions of all families, baked: the joints' matrices of every frame in one array that a
+renderer can hold."""
 
 from __future__ import annotations
 
@@ -22,7 +23,9 @@ from physics.people.gestures import GESTURE_FRAMES as LOOP_FRAMES
 from physics.people.gestures import GESTURES, LOOP_S, gesture
 from physics.people.skeleton import Skeleton, forward, model_pose, skinning
 
-STOOP_RAD: Final[Mapping[Family, float]] = MappingProxyType({"man": 0.0, "woman": 0.0, "child": 0.0, "elder": 0.34})
+STOOP_RAD: Final[Mapping[Family, float]] = MappingProxyType(
+    {"man": 0.0, "woman": 0.0, "child": 0.0, "elder": 0.34}
+)
 """How far the back is bent."""
 _MADE_BY: Final = sources_hash(Path(__file__).parent, Path(__file__).parents[2] / "cosim/people")
 
@@ -31,10 +34,10 @@ _MADE_BY: Final = sources_hash(Path(__file__).parent, Path(__file__).parents[2] 
 class Clips:
     """Baked motions. matrices: (R, 24, 3, 4) float32, one row per frame, loops one after another.
 
-    They take a vertex, as modelled, to the posed body, in the body frame (x ahead, y left, z up, the ground at 0).
-    gaits: (families, paces) first rows of strides of `stride_frames` frames; gestures: name -> (families,) first rows
-    of loops of `loop_frames` frames and `loop_s` seconds; loops: the same as (gestures, families), in the order of
-    GESTURES.
+    They take a vertex, as modelled, to the posed body, in the body frame (x ahead, y left, z up,
+    the ground at 0). gaits: (families, paces) first rows of strides of `stride_frames` frames;
+    gestures: name -> (families,) first rows of loops of `loop_frames` frames and `loop_s` seconds;
+    loops: the same as (gestures, families), in the order of GESTURES.
     """
 
     matrices: NDArray[np.float32]
@@ -55,7 +58,8 @@ def own_clips() -> Clips:
 
 
 def _made() -> Arrays:
-    """Every gait and gesture of our bodies: skeleton, stoop, and the (24, 3, 3) turns in which each is modelled."""
+    """Every gait and gesture of our bodies: skeleton, stoop, and the (24, 3, 3) turns in which each
+    is modelled."""
     bodies = [(skeleton(family), STOOP_RAD[family], model_pose()) for family in FAMILIES]
     rows: list[NDArray[np.float32]] = []
     walking = np.zeros((len(bodies), len(PACES_MPS)), dtype=np.intp)
@@ -75,6 +79,7 @@ def _made() -> Arrays:
 
 
 def bind_of(body: Skeleton, modelled: Floats) -> tuple[Floats, Floats]:
-    """Rotations (24, 3, 3) and positions (24, 3) of the joints in the pose in which a body is modelled."""
+    """Rotations (24, 3, 3) and positions (24, 3) of the joints in the pose in which a body is
+    modelled."""
     rotation, position = forward(modelled[None], body.rest_m[:1], body)
     return rotation[0], position[0]

@@ -1,4 +1,5 @@
-"""The figure: trunk and legs of a person as lofts, metres, modelled on a man of 1.75 m in an A pose.
+"""The figure: trunk and legs of a person as lofts, metres, modelled on a man of 1.75 m in an A
+pose.
 
 x ahead, y left, z up, the soles at z = 0. Families take other proportions afterwards (`body`).
 """
@@ -9,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from physics.people.lofts import Joints, Piece, Ring
+from physics.people.lofted_mesh import Joints, Piece, Ring
 
 LEVELS: Final = 5
 """Levels of detail: two of meshes, then two of tubes, then one of ribbons."""
@@ -26,8 +27,8 @@ SMALL: Final = (12, 8, 6, 4)
 
 @dataclass(frozen=True, slots=True)
 class Build:
-    """Proportions of a figure. woman: 0 a man's trunk, 1 a woman's; belly_m: how far it stands out; limb: factor on
-    the thickness of limbs; head: factor on the head."""
+    """Proportions of a figure. woman: 0 a man's trunk, 1 a woman's; belly_m: how far it stands out;
+    limb: factor on the thickness of limbs; head: factor on the head."""
 
     woman: float = 0.0
     belly_m: float = 0.0
@@ -36,20 +37,84 @@ class Build:
 
 
 def torso_pieces(build: Build, loose: float = 0.0, kind: Legs = "trousers") -> list[Piece]:
-    """Shirt, jacket or coat from the hem to the neck, and the seat of the trousers. loose: metres the cloth stands
-    off."""
+    """Shirt, jacket or coat from the hem to the neck, and the seat of the trousers. loose: metres
+    the cloth stands off."""
     w, b = build.woman, build.belly_m
     keys = (
         # z, x, half depth ahead, behind, half width (man), half width (woman), weights
-        (0.90, -0.012, 0.110 + 0.6 * b, 0.122 + 0.006 * w, 0.160, 0.176, {"pelvis": 0.9, "spine1": 0.1}),
-        (0.98, -0.012, 0.109 + 0.9 * b, 0.114 + 0.004 * w, 0.156, 0.162, {"pelvis": 0.65, "spine1": 0.35}),
-        (1.06, -0.010, 0.108 + b, 0.100 - 0.006 * w, 0.147, 0.133, {"pelvis": 0.25, "spine1": 0.65, "spine2": 0.1}),
-        (1.14, -0.008, 0.109 + 0.8 * b - 0.006 * w, 0.100, 0.150, 0.132, {"spine1": 0.5, "spine2": 0.5}),
-        (1.22, -0.006, 0.117 + 0.3 * b + 0.014 * w, 0.108, 0.163, 0.146, {"spine1": 0.1, "spine2": 0.6, "spine3": 0.3}),
-        (1.275, -0.006, 0.120 + 0.1 * b + 0.022 * w, 0.114, 0.172, 0.152, {"spine2": 0.35, "spine3": 0.65}),
+        (
+            0.90,
+            -0.012,
+            0.110 + 0.6 * b,
+            0.122 + 0.006 * w,
+            0.160,
+            0.176,
+            {"pelvis": 0.9, "spine1": 0.1},
+        ),
+        (
+            0.98,
+            -0.012,
+            0.109 + 0.9 * b,
+            0.114 + 0.004 * w,
+            0.156,
+            0.162,
+            {"pelvis": 0.65, "spine1": 0.35},
+        ),
+        (
+            1.06,
+            -0.010,
+            0.108 + b,
+            0.100 - 0.006 * w,
+            0.147,
+            0.133,
+            {"pelvis": 0.25, "spine1": 0.65, "spine2": 0.1},
+        ),
+        (
+            1.14,
+            -0.008,
+            0.109 + 0.8 * b - 0.006 * w,
+            0.100,
+            0.150,
+            0.132,
+            {"spine1": 0.5, "spine2": 0.5},
+        ),
+        (
+            1.22,
+            -0.006,
+            0.117 + 0.3 * b + 0.014 * w,
+            0.108,
+            0.163,
+            0.146,
+            {"spine1": 0.1, "spine2": 0.6, "spine3": 0.3},
+        ),
+        (
+            1.275,
+            -0.006,
+            0.120 + 0.1 * b + 0.022 * w,
+            0.114,
+            0.172,
+            0.152,
+            {"spine2": 0.35, "spine3": 0.65},
+        ),
         (1.34, -0.010, 0.113 + 0.006 * w, 0.114, 0.182, 0.160, {"spine2": 0.1, "spine3": 0.9}),
-        (1.40, -0.018, 0.094, 0.104, 0.178, 0.156, {"spine3": 0.9, "left_collar": 0.05, "right_collar": 0.05}),
-        (1.453, -0.026, 0.068, 0.082, 0.168, 0.149, {"spine3": 0.85, "left_collar": 0.075, "right_collar": 0.075}),
+        (
+            1.40,
+            -0.018,
+            0.094,
+            0.104,
+            0.178,
+            0.156,
+            {"spine3": 0.9, "left_collar": 0.05, "right_collar": 0.05},
+        ),
+        (
+            1.453,
+            -0.026,
+            0.068,
+            0.082,
+            0.168,
+            0.149,
+            {"spine3": 0.85, "left_collar": 0.075, "right_collar": 0.075},
+        ),
         (1.474, -0.030, 0.059, 0.070, 0.124, 0.110, {"spine3": 0.85, "neck": 0.15}),
         (1.491, -0.031, 0.056, 0.064, 0.080, 0.072, {"spine3": 0.7, "neck": 0.3}),
         (1.500, -0.030, 0.056, 0.060, 0.064, 0.058, {"spine3": 0.5, "neck": 0.5}),
@@ -59,14 +124,29 @@ def torso_pieces(build: Build, loose: float = 0.0, kind: Legs = "trousers") -> l
         if kind == "skirt" and z < 0.95:
             continue
         wide = man + (woman - man) * w + 0.6 * b * (0.9 < z < 1.2) + loose
-        ahead, square = front + loose, 2.5 if z < 1.4 else 2.2
+        ahead = front + loose
+        square = 2.5 if z < 1.4 else 2.2
         rings.append(
-            upright_loft((x, 0.0, z), ahead, (behind + loose) / ahead, wide, joints, square, 1.0 if z < 1.3 else 0.5)
+            upright_loft(
+                (x, 0.0, z),
+                ahead,
+                (behind + loose) / ahead,
+                wide,
+                joints,
+                square,
+                1.0 if z < 1.3 else 0.5,
+            )
         )
     if kind == "coat":
         rings = [*_tails(build, loose), *rings[1:]]
-        return [Piece("top", (_rim(rings[0], 0.03, 0.85), *rings), TORSO, (32, 16, 12, 10)), _seat(build)]
-    return [Piece("top", (_rim(rings[0], -0.004, 0.93), *rings), TORSO, (26, 13, 10, 9)), _seat(build)]
+        return [
+            Piece("top", (_rim(rings[0], 0.03, 0.85), *rings), TORSO, (32, 16, 12, 10)),
+            _seat(build),
+        ]
+    return [
+        Piece("top", (_rim(rings[0], -0.004, 0.93), *rings), TORSO, (26, 13, 10, 9)),
+        _seat(build),
+    ]
 
 
 def _rim(hem: Ring, up_m: float, size: float) -> Ring:
@@ -101,7 +181,14 @@ def _seat(build: Build) -> Piece:
     keys = (
         (0.785, -0.010, 0.040, 0.050, 0.045, {"pelvis": 0.4, "left_hip": 0.3, "right_hip": 0.3}),
         (0.805, -0.012, 0.072, 0.085, 0.095, {"pelvis": 0.4, "left_hip": 0.3, "right_hip": 0.3}),
-        (0.850, -0.014, 0.096, 0.116, 0.150 + 0.010 * w, {"pelvis": 0.6, "left_hip": 0.2, "right_hip": 0.2}),
+        (
+            0.850,
+            -0.014,
+            0.096,
+            0.116,
+            0.150 + 0.010 * w,
+            {"pelvis": 0.6, "left_hip": 0.2, "right_hip": 0.2},
+        ),
         (
             0.900,
             -0.014,
@@ -114,7 +201,9 @@ def _seat(build: Build) -> Piece:
         (1.020, -0.010, 0.098 + 0.9 * b, 0.100, 0.148 - 0.014 * w, {"pelvis": 0.4, "spine1": 0.6}),
     )
     rings = [
-        upright_loft((x, 0.0, z), front, behind / front, wide + 0.5 * b * (z > 0.9), joints, 2.4, 1.0)
+        upright_loft(
+            (x, 0.0, z), front, behind / front, wide + 0.5 * b * (z > 0.9), joints, 2.4, 1.0
+        )
         for z, x, front, behind, wide, joints in keys
     ]
     return Piece("bottom", tuple(rings), (28, 18, 0, 0), (11, 6, 0, 0))
@@ -143,13 +232,22 @@ def legs(build: Build, kind: Legs, bare: bool, loose: float = 0.0) -> list[Piece
         )
         if kind in ("trousers", "coat") or not bare:
             cloth = [
-                (z, x, y, a + 0.010 * (z < 0.5) + 0.012 * (z < 0.2), s + 0.010 * (z < 0.5) + 0.012 * (z < 0.2), j)
+                (
+                    z,
+                    x,
+                    y,
+                    a + 0.010 * (z < 0.5) + 0.012 * (z < 0.2),
+                    s + 0.010 * (z < 0.5) + 0.012 * (z < 0.2),
+                    j,
+                )
                 for z, x, y, a, s, j in keys[:-1]
             ]
             cloth[-1] = (0.085, -0.020, 0.092, 0.064, 0.056, {knee: 0.6, ankle: 0.4})
             pieces.append(_leg(cloth, left, build, "bottom", (22, 12, 8, 7)))
         else:
-            pieces.append(_leg(keys if kind == "skirt" else keys[3:], left, build, "skin", (22, 12, 8, 7)))
+            pieces.append(
+                _leg(keys if kind == "skirt" else keys[3:], left, build, "skin", (22, 12, 8, 7))
+            )
             if kind == "shorts":
                 wide = [(z, x, y, a + 0.012, s + 0.012, j) for z, x, y, a, s, j in keys[:6]]
                 pieces.append(_leg(wide, left, build, "bottom", (10, 6, 4, 3)))
@@ -167,7 +265,10 @@ def _leg(
     kept: tuple[int, ...],
 ) -> Piece:
     f = build.limb
-    rings = [upright_loft((x, y * left, z), a * f, 1.0, s * f, joints, 2.15, 0.5) for z, x, y, a, s, joints in keys]
+    rings = [
+        upright_loft((x, y * left, z), a * f, 1.0, s * f, joints, 2.15, 0.5)
+        for z, x, y, a, s, joints in keys
+    ]
     return Piece(coat, tuple(rings), LIMB, kept)
 
 
@@ -175,7 +276,13 @@ def _skirt(build: Build, loose: float) -> Piece:
     w, b = build.woman, build.belly_m
     waist = [
         upright_loft(
-            (-0.011, 0.0, z), front + b + loose, 1.03, man - (man - woman) * w + 0.6 * b + loose, joints, 2.4, 1.0
+            (-0.011, 0.0, z),
+            front + b + loose,
+            1.03,
+            man - (man - woman) * w + 0.6 * b + loose,
+            joints,
+            2.4,
+            1.0,
         )
         for z, front, man, woman, joints in (
             (0.97, 0.118, 0.164, 0.172, {"pelvis": 0.7, "spine1": 0.3}),

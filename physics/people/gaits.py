@@ -1,9 +1,11 @@
-"""Walking and running: captured trunk, head and arms over legs that are solved for feet which stand still.
+"""Walking and running: captured trunk, head and arms over legs that are solved for feet which stand
+still.
 
-A gait is one stride, from one touch of the left heel to the next, in frames at even ways along the ground. While a
-foot is down it moves back under the body by exactly that way, rolling about its heel, flat, and about its ball; so a
-body that is drawn at the phase of the way walked does not slide. Time of stance, roll of the foot, and the motion of
-trunk, head and arms are those of the captures; how far a capture's motion goes follows the stride.
+A gait is one stride, from one touch of the left heel to the next, in frames at even ways along the
+ground. While a foot is down it moves back under the body by exactly that way, rolling about its
+heel, flat, and about its ball; so a body that is drawn at the phase of the way walked does not
+slide. Time of stance, roll of the foot, and the motion of trunk, head and arms are those of the
+captures; how far a capture's motion goes follows the stride.
 """
 
 from __future__ import annotations
@@ -28,10 +30,18 @@ _HARMONICS: Final = 4
 _UPPER: Final = tuple(
     INDEX[name]
     for name in (
-        "pelvis", "spine1", "spine2", "spine3", "neck", "head", "left_shoulder", "right_shoulder", "left_elbow",
+        "pelvis",
+        "spine1",
+        "spine2",
+        "spine3",
+        "neck",
+        "head",
+        "left_shoulder",
+        "right_shoulder",
+        "left_elbow",
         "right_elbow",
     )
-)  # fmt: skip
+)
 _SPINE: Final = (INDEX["spine1"], INDEX["spine2"], INDEX["spine3"])
 _CLOSER_RAD: Final = 0.09
 """How much closer to the body arms are held than the slimmer captured figure's."""
@@ -41,10 +51,11 @@ _HEEL_M: Final = (-0.065, -0.095)
 
 @dataclass(frozen=True, slots=True)
 class _Style:
-    """What a gait takes from its capture. frames in a stride and the frame of the left heel's touch; stride_m there.
+    """What a gait takes from its capture. frames in a stride and the frame of the left heel's
+    touch; stride_m there.
 
-    stance: share of the stride a foot is down; roll: (phase, degrees the toes are up) of the left foot; lift_m of the
-    foot in swing besides; lean: share kept of the capture's mean lean.
+    stance: share of the stride a foot is down; roll: (phase, degrees the toes are up) of the left
+    foot; lift_m of the foot in swing besides; lean: share kept of the capture's mean lean.
     """
 
     name: str
@@ -61,22 +72,55 @@ class _Style:
 
 
 _WALK: Final = _Style(
-    "walk", 38, 18.0, 1.45, 0.61,
-    ((0.0, 17.0), (0.09, 0.0), (0.30, 0.0), (0.46, -17.0), (0.61, -54.0), (0.70, -48.0), (0.84, 0.0), (0.93, 15.0)),
-    0.035, 0.35, 0.058, 1.3, 1.0,
-)  # fmt: skip
+    "walk",
+    38,
+    18.0,
+    1.45,
+    0.61,
+    (
+        (0.0, 17.0),
+        (0.09, 0.0),
+        (0.30, 0.0),
+        (0.46, -17.0),
+        (0.61, -54.0),
+        (0.70, -48.0),
+        (0.84, 0.0),
+        (0.93, 15.0),
+    ),
+    0.035,
+    0.35,
+    0.058,
+    1.3,
+    1.0,
+)
 _RUN: Final = _Style(
-    "run", 24, 10.5, 2.3, 0.36,
-    ((0.0, 9.0), (0.07, 0.0), (0.15, 0.0), (0.36, -56.0), (0.52, -68.0), (0.72, -25.0), (0.90, 10.0)),
-    0.20, 0.30, 0.09, 0.8, 0.75,
-)  # fmt: skip
+    "run",
+    24,
+    10.5,
+    2.3,
+    0.36,
+    (
+        (0.0, 9.0),
+        (0.07, 0.0),
+        (0.15, 0.0),
+        (0.36, -56.0),
+        (0.52, -68.0),
+        (0.72, -25.0),
+        (0.90, 10.0),
+    ),
+    0.20,
+    0.30,
+    0.09,
+    0.8,
+    0.75,
+)
 _RUNS_FROM_MPS: Final = 2.1
 
 
 @dataclass(frozen=True, slots=True)
 class _Cycle:
-    """A capture as one smooth stride whose sides are alike. mean: (24, 3) axis-angle turns; change: (FRAMES, 24, 3)
-    what is added; bob_m, sway_m: (FRAMES,) of the pelvis, up and to the left."""
+    """A capture as one smooth stride whose sides are alike. mean: (24, 3) axis-angle turns; change:
+    (FRAMES, 24, 3) what is added; bob_m, sway_m: (FRAMES,) of the pelvis, up and to the left."""
 
     mean: Floats
     change: Floats
@@ -85,7 +129,8 @@ class _Cycle:
 
 
 def gait(knot: int, skeleton: Skeleton, stoop_rad: float = 0.0) -> tuple[Floats, Floats]:
-    """The stride at the pace `cosim.people.gait.PACES_MPS[knot]`: turns (FRAMES, 24, 3, 3), pelvis (FRAMES, 3) metres.
+    """The stride at the pace `cosim.people.gait.PACES_MPS[knot]`: turns (FRAMES, 24, 3, 3), pelvis
+    (FRAMES, 3) metres.
 
     The body stays above the origin. stoop_rad: how far the back is bent.
     """
@@ -106,7 +151,10 @@ def gait(knot: int, skeleton: Skeleton, stoop_rad: float = 0.0) -> tuple[Floats,
     pelvis = np.zeros((CYCLE_FRAMES, 3))
     pelvis[:, 1] = scale * cycle.sway_m
     stance = style.stance + (0.06 * (1.0 - share) if style is _WALK else 0.0)
-    feet = {side: _foot(style, side, stride_m, stance, share, scale, skeleton) for side in ("left", "right")}
+    feet = {
+        side: _foot(style, side, stride_m, stance, share, scale, skeleton)
+        for side in ("left", "right")
+    }
     pelvis[:, 2] = _height(style, cycle, feet, turns, pelvis, share, scale, skeleton)
     for side, (ankle, foot, toe) in feet.items():
         set_leg(turns, pelvis, side, ankle, foot, toe, skeleton)
@@ -114,23 +162,35 @@ def gait(knot: int, skeleton: Skeleton, stoop_rad: float = 0.0) -> tuple[Floats,
 
 
 def _foot(
-    style: _Style, side: str, stride_m: float, stance: float, share: float, scale: float, skeleton: Skeleton
+    style: _Style,
+    side: str,
+    stride_m: float,
+    stance: float,
+    share: float,
+    scale: float,
+    skeleton: Skeleton,
 ) -> tuple[Floats, Floats, Floats]:
-    """Ankle (FRAMES, 3) metres, turn of the foot (FRAMES, 3, 3), bend of the toes (FRAMES,) rad over a stride."""
+    """Ankle (FRAMES, 3) metres, turn of the foot (FRAMES, 3, 3), bend of the toes (FRAMES,) rad
+    over a stride."""
     phase = (np.arange(CYCLE_FRAMES) / CYCLE_FRAMES + (0.0 if side == "left" else 0.5)) % 1.0
     left = 1.0 if side == "left" else -1.0
     warped = np.where(
-        phase < stance, phase * style.stance / stance, 1.0 - (1.0 - phase) * (1.0 - style.stance) / (1.0 - stance)
+        phase < stance,
+        phase * style.stance / stance,
+        1.0 - (1.0 - phase) * (1.0 - style.stance) / (1.0 - stance),
     )
     roll = np.deg2rad(_periodic(style.roll, warped)) * min(share**0.8, 1.1)
     down = phase < stance
     swing = np.clip((phase - stance) / (1.0 - stance), 0.0, 1.0)
-    back, speed = 0.5 * stride_m * stance, stride_m * (1.0 - stance)
+    back = 0.5 * stride_m * stance
+    speed = stride_m * (1.0 - stance)
     h = swing
     ahead = (2 * h**3 - 3 * h**2 + 1) * -back + (h**3 - 2 * h**2 + h) * -0.2 * speed
     ahead += (-2 * h**3 + 3 * h**2) * back + (h**3 - h**2) * -0.6 * speed
     x = np.where(down, back - stride_m * phase, ahead) - style.behind * stride_m
-    lift = np.where(down, 0.0, style.lift_m * scale * np.sqrt(share) * np.sin(np.pi * swing**0.85) ** 1.5)
+    lift = np.where(
+        down, 0.0, style.lift_m * scale * np.sqrt(share) * np.sin(np.pi * swing**0.85) ** 1.5
+    )
     ankle_rest = skeleton.rest_m[INDEX[f"{side}_ankle"]]
     ball = skeleton.rest_m[INDEX[f"{side}_foot"]] - ankle_rest
     heel = np.array([_HEEL_M[0] * scale, 0.0, -ankle_rest[2]])
@@ -179,7 +239,8 @@ def _cycle(style: _Style) -> _Cycle:
     pelvis = taken.pelvis_m[: style.frames + 1]
     curves = np.concatenate([vectors.reshape(len(vectors), -1), pelvis[:, 1:]], axis=1)
     curves = _smooth_loop(curves, style)
-    turns, (sway, bob) = curves[:, :72].reshape(CYCLE_FRAMES, 24, 3), curves[:, 72:].T
+    turns = curves[:, :72].reshape(CYCLE_FRAMES, 24, 3)
+    (sway, bob) = curves[:, 72:].T
     other = np.roll(turns[:, list(MIRRORED)] * (-1.0, 1.0, -1.0), CYCLE_FRAMES // 2, axis=0)
     both = 0.5 * (turns + other)
     mean = both.mean(axis=0)
@@ -188,14 +249,17 @@ def _cycle(style: _Style) -> _Cycle:
     kept = np.zeros_like(mean)
     kept[list(_UPPER)] = mean[list(_UPPER)]
     half = CYCLE_FRAMES // 2
-    bob, sway = 0.5 * (bob + np.roll(bob, half)), 0.5 * (sway - np.roll(sway, half))
+    bob = 0.5 * (bob + np.roll(bob, half))
+    sway = 0.5 * (sway - np.roll(sway, half))
     return _Cycle(kept, change, bob - bob.mean(), sway - sway.mean())
 
 
 def _smooth_loop(curves: Floats, style: _Style) -> Floats:
-    """(FRAMES, C) one stride from the touch of the left heel, as a short Fourier series: a clean loop.
+    """(FRAMES, C) one stride from the touch of the left heel, as a short Fourier series: a clean
+    loop.
 
-    curves: (frames + 1, C) of the capture; what its end misses of its beginning is spread over the stride.
+    curves: (frames + 1, C) of the capture; what its end misses of its beginning is spread over the
+    stride.
     """
     frames = style.frames
     closed = curves[:-1] - (curves[-1] - curves[0]) * (np.arange(frames) / frames - 0.5)[:, None]
@@ -207,16 +271,21 @@ def _smooth_loop(curves: Floats, style: _Style) -> Floats:
 
 
 def _periodic(keys: ArrayLike, phase: Floats) -> Floats:
-    """A smooth loop through (phase, value) keys without overshoot: cubic, level at its extremes (Fritsch-Carlson)."""
+    """A smooth loop through (phase, value) keys without overshoot: cubic, level at its extremes
+    (Fritsch-Carlson)."""
     table = np.asarray(keys, dtype=float)
     x = np.concatenate([table[-1:, 0] - 1.0, table[:, 0], table[:2, 0] + 1.0])
     y = np.concatenate([table[-1:, 1], table[:, 1], table[:2, 1]])
     slope = np.diff(y) / np.diff(x)
     product = slope[:-1] * slope[1:]
-    inner = np.where(product > 0.0, 2.0 * product / np.where(product > 0.0, slope[:-1] + slope[1:], 1.0), 0.0)
+    inner = np.where(
+        product > 0.0, 2.0 * product / np.where(product > 0.0, slope[:-1] + slope[1:], 1.0), 0.0
+    )
     tangent = np.concatenate([[0.0], inner, [0.0]])
     k = np.clip(np.searchsorted(x, phase, side="right") - 1, 0, len(x) - 2)
     width = x[k + 1] - x[k]
     t = (phase - x[k]) / width
     value = (1 + 2 * t) * (1 - t) ** 2 * y[k] + t**2 * (3 - 2 * t) * y[k + 1]
-    return np.asarray(value + width * (t * (1 - t) ** 2 * tangent[k] - t**2 * (1 - t) * tangent[k + 1]))
+    return np.asarray(
+        value + width * (t * (1 - t) ** 2 * tangent[k] - t**2 * (1 - t) * tangent[k + 1])
+    )

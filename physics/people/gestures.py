@@ -1,6 +1,8 @@
-"""What people do on the spot: standing, looking around, talking, queueing, the stopping hand, reading a phone, sitting.
+"""What people do on the spot: standing, looking around, talking, queueing, the stopping hand,
+reading a phone, sitting.
 
-Each is a loop of `LOOP_S` seconds over the SMPL joints: feet on the ground, a body that breathes and shifts its weight.
+Each is a loop of `LOOP_S` seconds over the SMPL joints: feet on the ground, a body that breathes
+and shifts its weight.
 """
 
 from __future__ import annotations
@@ -22,13 +24,15 @@ LOOP_S: Final = 8.0
 SEAT_M: Final = 0.475
 """Height of the seat under who sits."""
 SEATED_BACK_M: Final = 0.59
-"""Who sits has the hips so far behind the point where it is: that is before the seat, where its legs are."""
+"""Who sits has the hips so far behind the point where it is: that is before the seat, where its
+legs are."""
 
 _PHASE: Final = 2.0 * np.pi * np.arange(GESTURE_FRAMES) / GESTURE_FRAMES
 
 
 def gesture(name: str, skeleton: Skeleton, stoop_rad: float = 0.0) -> tuple[Floats, Floats]:
-    """The loop called `name`, one of GESTURES: turns (FRAMES, 24, 3, 3) and pelvis (FRAMES, 3) metres."""
+    """The loop called `name`, one of GESTURES: turns (FRAMES, 24, 3, 3) and pelvis (FRAMES, 3)
+    metres."""
     scale = skeleton.height_m / REFERENCE_M
     bends = np.zeros((GESTURE_FRAMES, 24, 3))
     breath = np.sin(2.0 * _PHASE)
@@ -43,10 +47,19 @@ def gesture(name: str, skeleton: Skeleton, stoop_rad: float = 0.0) -> tuple[Floa
         _bend(bends, f"{side}_collar", -0.03 * left + 0.012 * left * breath, 0.0, 0.0)
     arms = GESTURES[name](bends)
     turns = rodrigues(bends)
-    pelvis = np.column_stack([np.zeros(GESTURE_FRAMES), 0.014 * scale * shift, np.zeros(GESTURE_FRAMES)])
-    pelvis[:, 2] = skeleton.rest_m[0, 2] - (0.004 + 0.004 * shift**2 + 0.03 * max(stoop_rad - 0.1, 0.0)) * scale
+    pelvis = np.column_stack(
+        [np.zeros(GESTURE_FRAMES), 0.014 * scale * shift, np.zeros(GESTURE_FRAMES)]
+    )
+    pelvis[:, 2] = (
+        skeleton.rest_m[0, 2]
+        - (0.004 + 0.004 * shift**2 + 0.03 * max(stoop_rad - 0.1, 0.0)) * scale
+    )
     for side, (upper, fore, fingers, thumb) in arms.items():
-        set_arm(turns, side, *(np.broadcast_to(v, (GESTURE_FRAMES, 3)) for v in (upper, fore, fingers, thumb)))
+        set_arm(
+            turns,
+            side,
+            *(np.broadcast_to(v, (GESTURE_FRAMES, 3)) for v in (upper, fore, fingers, thumb)),
+        )
     if name == "sit":
         _sit(turns, pelvis, skeleton, scale)
     else:
@@ -55,17 +68,30 @@ def gesture(name: str, skeleton: Skeleton, stoop_rad: float = 0.0) -> tuple[Floa
 
 
 def _stand(turns: Floats, pelvis: Floats, skeleton: Skeleton, scale: float) -> None:
-    """Set both feet flat on the ground, a little apart and turned out, the left one a little ahead."""
+    """Set both feet flat on the ground, a little apart and turned out, the left one a little
+    ahead."""
     for side, left in (("left", 1.0), ("right", -1.0)):
         ankle = skeleton.rest_m[INDEX[f"{side}_ankle"]]
         place = np.array([ankle[0] + 0.02 * left * scale, left * 0.105 * scale, ankle[2]])
-        foot = about_z(np.full(GESTURE_FRAMES, left * np.deg2rad(9.0))) @ about_y(np.zeros(GESTURE_FRAMES))
-        set_leg(turns, pelvis, side, np.tile(place, (GESTURE_FRAMES, 1)), foot, np.zeros(GESTURE_FRAMES), skeleton)
+        foot = about_z(np.full(GESTURE_FRAMES, left * np.deg2rad(9.0))) @ about_y(
+            np.zeros(GESTURE_FRAMES)
+        )
+        set_leg(
+            turns,
+            pelvis,
+            side,
+            np.tile(place, (GESTURE_FRAMES, 1)),
+            foot,
+            np.zeros(GESTURE_FRAMES),
+            skeleton,
+        )
 
 
 def _sit(turns: Floats, pelvis: Floats, skeleton: Skeleton, scale: float) -> None:
-    """Set the hips on a seat behind the place, the shanks upright where the seat ends, both feet flat on the ground."""
-    rest, hip = skeleton.rest_m, INDEX["left_hip"]
+    """Set the hips on a seat behind the place, the shanks upright where the seat ends, both feet
+    flat on the ground."""
+    rest = skeleton.rest_m
+    hip = INDEX["left_hip"]
     hips_m = SEAT_M + 0.085 * scale
     pelvis[:, 0] = -SEATED_BACK_M
     pelvis[:, 1] *= 0.3
@@ -76,11 +102,23 @@ def _sit(turns: Floats, pelvis: Floats, skeleton: Skeleton, scale: float) -> Non
         fall_m = min(max(hips_m - knee[2], 0.0), 0.8 * thigh_m)
         ahead_m = np.sqrt(thigh_m**2 - fall_m**2) - SEATED_BACK_M + 0.03 * left * scale
         place = np.array([ahead_m, left * 0.125 * scale, ankle[2]])
-        foot = about_z(np.full(GESTURE_FRAMES, left * np.deg2rad(10.0))) @ about_y(np.zeros(GESTURE_FRAMES))
-        set_leg(turns, pelvis, side, np.tile(place, (GESTURE_FRAMES, 1)), foot, np.zeros(GESTURE_FRAMES), skeleton)
+        foot = about_z(np.full(GESTURE_FRAMES, left * np.deg2rad(10.0))) @ about_y(
+            np.zeros(GESTURE_FRAMES)
+        )
+        set_leg(
+            turns,
+            pelvis,
+            side,
+            np.tile(place, (GESTURE_FRAMES, 1)),
+            foot,
+            np.zeros(GESTURE_FRAMES),
+            skeleton,
+        )
 
 
-def _bend(bends: Floats, joint: str, x: Floats | float, y: Floats | float, z: Floats | float) -> None:
+def _bend(
+    bends: Floats, joint: str, x: Floats | float, y: Floats | float, z: Floats | float
+) -> None:
     """Add axis-angle turns: x leans to the right, y forward, z turns to the left."""
     for axis, angle in enumerate((x, y, z)):
         bends[:, INDEX[joint], axis] += angle
@@ -96,7 +134,12 @@ def _ways(*ways: tuple[float, float, float]) -> Arm:
 
 
 def _hanging(left: float) -> Arm:
-    return _ways((-0.06, 0.16 * left, -1.0), (0.16, 0.07 * left, -1.0), (0.20, 0.0, -1.0), (1.0, -0.45 * left, 0.2))
+    return _ways(
+        (-0.06, 0.16 * left, -1.0),
+        (0.16, 0.07 * left, -1.0),
+        (0.20, 0.0, -1.0),
+        (1.0, -0.45 * left, 0.2),
+    )
 
 
 def _both() -> dict[str, Arm]:
@@ -118,8 +161,8 @@ def _looking(bends: Floats) -> dict[str, Arm]:
 
 
 def _talking(bends: Floats) -> dict[str, Arm]:
-    """Speaks for half of the time, elbows at the sides, both hands before the chest, the right one livelier; then
-    listens with the hands low, and nods."""
+    """Speaks for half of the time, elbows at the sides, both hands before the chest, the right one
+    livelier; then listens with the hands low, and nods."""
     speaks = 0.5 + 0.5 * np.tanh(3.0 * np.sin(_PHASE)) / np.tanh(3.0)
     beat = 0.6 * np.sin(5.0 * _PHASE) + 0.4 * np.sin(8.0 * _PHASE + 1.0)
     other = 0.6 * np.sin(4.0 * _PHASE + 2.0) + 0.4 * np.sin(7.0 * _PHASE)
@@ -130,11 +173,18 @@ def _talking(bends: Floats) -> dict[str, Arm]:
     arms: dict[str, Arm] = {}
     for side, left, swing in (("left", 1.0, 0.7 * other), ("right", -1.0, beat)):
         lively = speaks * swing
-        upper = np.column_stack([o - 0.04 + 0.16 * speaks + 0.08 * lively, left * (0.22 + 0.06 * lively), o - 1.0])
+        upper = np.column_stack(
+            [o - 0.04 + 0.16 * speaks + 0.08 * lively, left * (0.22 + 0.06 * lively), o - 1.0]
+        )
         rise = -0.75 + speaks * (1.15 + 0.55 * swing)
         fore = np.column_stack([o + 0.80, left * (-0.32 + 0.24 * speaks + 0.30 * lively), rise])
         fingers = fore + np.column_stack([o, -0.15 * left * speaks, 0.15 * speaks + 0.2 * lively])
-        arms[side] = (upper, fore, fingers, np.column_stack([o + 0.3 * (1.0 - speaks), o + 0.45 * left, o + 1.0]))
+        arms[side] = (
+            upper,
+            fore,
+            fingers,
+            np.column_stack([o + 0.3 * (1.0 - speaks), o + 0.45 * left, o + 1.0]),
+        )
     return arms
 
 
@@ -143,13 +193,18 @@ def _queueing(bends: Floats) -> dict[str, Arm]:
     _bend(bends, "neck", 0.0, 0.12 + 0.05 * np.sin(_PHASE), 0.10 * np.sin(2.0 * _PHASE))
     _bend(bends, "head", 0.0, 0.06, 0.25 * np.sin(_PHASE))
     return {
-        "left": _ways((0.10, 0.22, -1.0), (0.62, -0.58, -0.62), (0.5, -0.75, -0.62), (0.5, 0.2, 0.85)),
-        "right": _ways((0.10, -0.22, -1.0), (0.70, 0.58, -0.55), (0.55, 0.75, -0.55), (0.5, -0.2, 0.85)),
+        "left": _ways(
+            (0.10, 0.22, -1.0), (0.62, -0.58, -0.62), (0.5, -0.75, -0.62), (0.5, 0.2, 0.85)
+        ),
+        "right": _ways(
+            (0.10, -0.22, -1.0), (0.70, 0.58, -0.55), (0.55, 0.75, -0.55), (0.5, -0.2, 0.85)
+        ),
     }
 
 
 def _stopping(bends: Floats) -> dict[str, Arm]:
-    """The right arm straight out ahead at the height of the shoulder, palm to whoever comes, fingers up."""
+    """The right arm straight out ahead at the height of the shoulder, palm to whoever comes,
+    fingers up."""
     push = 0.02 * np.sin(4.0 * _PHASE)
     _bend(bends, "spine3", 0.0, -0.02, 0.16)
     _bend(bends, "neck", 0.0, 0.02, -0.10)
@@ -168,7 +223,9 @@ def _phoning(bends: Floats) -> dict[str, Arm]:
     _bend(bends, "neck", 0.0, 0.30, 0.0)
     _bend(bends, "head", 0.0, 0.28 + 0.02 * np.sin(3.0 * _PHASE), -0.06)
     return {
-        "left": _ways((0.28, 0.06, -1.0), (0.85, -0.42, 0.42), (0.80, -0.35, 0.62), (0.25, 0.75, 0.45)),
+        "left": _ways(
+            (0.28, 0.06, -1.0), (0.85, -0.42, 0.42), (0.80, -0.35, 0.62), (0.25, 0.75, 0.45)
+        ),
         "right": _hanging(-1.0),
     }
 
@@ -180,8 +237,12 @@ def _sitting(bends: Floats) -> dict[str, Arm]:
     _bend(bends, "neck", 0.0, 0.06, 0.16 * np.sin(_PHASE))
     _bend(bends, "head", 0.0, 0.04, 0.22 * np.sin(_PHASE))
     return {
-        "left": _ways((0.30, 0.22, -1.0), (0.80, -0.14, -0.64), (1.0, -0.20, -0.30), (0.35, -0.75, 0.55)),
-        "right": _ways((0.34, -0.20, -1.0), (0.80, 0.18, -0.62), (1.0, 0.26, -0.28), (0.35, 0.75, 0.55)),
+        "left": _ways(
+            (0.30, 0.22, -1.0), (0.80, -0.14, -0.64), (1.0, -0.20, -0.30), (0.35, -0.75, 0.55)
+        ),
+        "right": _ways(
+            (0.34, -0.20, -1.0), (0.80, 0.18, -0.62), (1.0, 0.26, -0.28), (0.35, 0.75, 0.55)
+        ),
     }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from physics.people.families import man_rest_m
 from physics.people.figure import SMALL, Build, upright_loft
-from physics.people.lofts import Piece, Ring, ball
+from physics.people.lofted_mesh import Piece, Ring, ball
 from physics.people.skeleton import INDEX
 
 
@@ -43,10 +43,34 @@ def neck_and_head(build: Build) -> list[Piece]:
     ]
     for left in (1.0, -1.0):
         pieces += [
-            ball("white", (0.0775, 0.0305 * left, 1.6475), (0.0090, 0.0125, 0.0058), {"head": 1.0}, (8, 0, 0, 0)),
-            ball("dark", (0.0835, 0.0300 * left, 1.6475), (0.0055, 0.0065, 0.0065), {"head": 1.0}, (8, 5, 0, 0)),
-            ball("hair", (0.0855, 0.0310 * left, 1.6670), (0.006, 0.0185, 0.0038), {"head": 1.0}, (8, 5, 0, 0)),
-            ball("skin", (-0.010, 0.076 * left * slim, 1.632), (0.017, 0.010, 0.030), {"head": 1.0}, (8, 6, 0, 0)),
+            ball(
+                "white",
+                (0.0775, 0.0305 * left, 1.6475),
+                (0.0090, 0.0125, 0.0058),
+                {"head": 1.0},
+                (8, 0, 0, 0),
+            ),
+            ball(
+                "dark",
+                (0.0835, 0.0300 * left, 1.6475),
+                (0.0055, 0.0065, 0.0065),
+                {"head": 1.0},
+                (8, 5, 0, 0),
+            ),
+            ball(
+                "hair",
+                (0.0855, 0.0310 * left, 1.6670),
+                (0.006, 0.0185, 0.0038),
+                {"head": 1.0},
+                (8, 5, 0, 0),
+            ),
+            ball(
+                "skin",
+                (-0.010, 0.076 * left * slim, 1.632),
+                (0.017, 0.010, 0.030),
+                {"head": 1.0},
+                (8, 6, 0, 0),
+            ),
         ]
     return [about_head(piece, build.head) for piece in pieces]
 
@@ -71,10 +95,17 @@ def about_head(piece: Piece, factor: float) -> Piece:
         f = 1.0 + (factor - 1.0) * ring.joints.get("head", 0.0)
         at = tuple(float(c + f * (v - c)) for c, v in zip(centre, ring.at, strict=True))
         return Ring(
-            (at[0], at[1], at[2]), _times(ring.ahead, f), _times(ring.side, f), ring.joints, ring.back, ring.square
+            (at[0], at[1], at[2]),
+            _times(ring.ahead, f),
+            _times(ring.side, f),
+            ring.joints,
+            ring.back,
+            ring.square,
         )
 
-    return Piece(piece.coat, tuple(scaled(ring) for ring in piece.rings), piece.sides, piece.rings_kept)
+    return Piece(
+        piece.coat, tuple(scaled(ring) for ring in piece.rings), piece.sides, piece.rings_kept
+    )
 
 
 def _times(vector: tuple[float, float, float], factor: float) -> tuple[float, float, float]:

@@ -1,4 +1,5 @@
-"""Legs that reach the ground and arms that point somewhere: turns of joints from where hands and feet shall be."""
+"""Legs that reach the ground and arms that point somewhere: turns of joints from where hands and
+feet shall be."""
 
 from __future__ import annotations
 
@@ -14,15 +15,25 @@ def unit(vectors: Floats) -> Floats:
 
 
 def set_leg(
-    turns: Floats, pelvis_m: Floats, side: str, ankle_m: Floats, foot: Floats, toe_rad: Floats, skeleton: Skeleton
+    turns: Floats,
+    pelvis_m: Floats,
+    side: str,
+    ankle_m: Floats,
+    foot: Floats,
+    toe_rad: Floats,
+    skeleton: Skeleton,
 ) -> Floats:
-    """Turn hip, knee, ankle and toes of (F, 24, 3, 3) turns, in place, so that the ankle is at (F, 3) with the foot
-    turned as (F, 3, 3), the toes bent up by (F,) against it. The knee points where the foot and the pelvis do.
+    """Turn hip, knee, ankle and toes of (F, 24, 3, 3) turns, in place, so that the ankle is at (F,
+    3) with the foot turned as (F, 3, 3), the toes bent up by (F,) against it. The knee points where
+    the foot and the pelvis do.
 
     Returns by how many metres (F,) the leg is too short for that.
     """
     hip, knee, ankle, toes = (INDEX[f"{side}_{part}"] for part in ("hip", "knee", "ankle", "foot"))
-    thigh, shank = skeleton.rest_m[knee] - skeleton.rest_m[hip], skeleton.rest_m[ankle] - skeleton.rest_m[knee]
+    thigh, shank = (
+        skeleton.rest_m[knee] - skeleton.rest_m[hip],
+        skeleton.rest_m[ankle] - skeleton.rest_m[knee],
+    )
     l1, l2 = float(np.linalg.norm(thigh)), float(np.linalg.norm(shank))
     pelvis = turns[:, 0]
     start = pelvis_m + pelvis @ skeleton.offsets_m[hip]
@@ -45,10 +56,15 @@ def set_leg(
     return np.asarray(wanted - far)
 
 
-def set_arm(turns: Floats, side: str, upper: Floats, fore: Floats, fingers: Floats, thumb: Floats) -> None:
-    """Turn shoulder, elbow and wrist of (F, 24, 3, 3) turns, in place: (F, 3) directions in the body frame of upper
-    arm, forearm, fingers and thumb. The forearm takes half of the hand's twist."""
-    collar, shoulder, elbow, wrist = (INDEX[f"{side}_{part}"] for part in ("collar", "shoulder", "elbow", "wrist"))
+def set_arm(
+    turns: Floats, side: str, upper: Floats, fore: Floats, fingers: Floats, thumb: Floats
+) -> None:
+    """Turn shoulder, elbow and wrist of (F, 24, 3, 3) turns, in place: (F, 3) directions in the
+    body frame of upper arm, forearm, fingers and thumb. The forearm takes half of the hand's
+    twist."""
+    collar, shoulder, elbow, wrist = (
+        INDEX[f"{side}_{part}"] for part in ("collar", "shoulder", "elbow", "wrist")
+    )
     outward = 1.0 if side == "left" else -1.0
     base = turns[:, 0]
     for joint in (INDEX["spine1"], INDEX["spine2"], INDEX["spine3"], collar):
@@ -67,19 +83,28 @@ def set_arm(turns: Floats, side: str, upper: Floats, fore: Floats, fingers: Floa
 def about_y(angle_rad: Floats) -> Floats:
     """(F, 3, 3) turns about the y axis; a positive angle dips what points ahead."""
     cos, sin, o = np.cos(angle_rad), np.sin(angle_rad), np.zeros_like(angle_rad)
-    rows = [np.stack([cos, o, sin], -1), np.stack([o, o + 1.0, o], -1), np.stack([-sin, o, cos], -1)]
+    rows = [
+        np.stack([cos, o, sin], -1),
+        np.stack([o, o + 1.0, o], -1),
+        np.stack([-sin, o, cos], -1),
+    ]
     return np.stack(rows, axis=-2)
 
 
 def about_z(angle_rad: Floats) -> Floats:
     """(F, 3, 3) turns about the vertical."""
     cos, sin, o = np.cos(angle_rad), np.sin(angle_rad), np.zeros_like(angle_rad)
-    rows = [np.stack([cos, -sin, o], -1), np.stack([sin, cos, o], -1), np.stack([o, o, o + 1.0], -1)]
+    rows = [
+        np.stack([cos, -sin, o], -1),
+        np.stack([sin, cos, o], -1),
+        np.stack([o, o, o + 1.0], -1),
+    ]
     return np.stack(rows, axis=-2)
 
 
 def _bone(along: Floats, hinge: Floats) -> Floats:
-    """(..., 3, 3) frames whose -z is (..., 3) `along` and whose y is as near as can be to `hinge`."""
+    """(..., 3, 3) frames whose -z is (..., 3) `along` and whose y is as near as can be to
+    `hinge`."""
     z = -along
     x = unit(np.cross(np.broadcast_to(hinge, z.shape), z))
     return np.stack([x, np.cross(z, x), z], axis=-1)

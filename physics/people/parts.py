@@ -1,4 +1,5 @@
-"""A person as thirteen rigid parts on the same joints in the same poses, for renderers that cannot skin."""
+"""A person as thirteen rigid parts on the same joints in the same poses, for renderers that cannot
+skin."""
 
 from __future__ import annotations
 
@@ -10,14 +11,14 @@ import numpy as np
 
 from cosim.core.geometry import Floats
 from cosim.core.state import People
+from physics.ground.mesh import Mesh, box, frustum, join
+from physics.people.appearance import ALL, family_of, look_of
 from physics.people.body import COATS
 from physics.people.clips import bind_of, own_clips
 from physics.people.families import Family, skeleton
-from physics.people.looks import ALL, family_of, look_of
 from physics.people.poses import poses
 from physics.people.skeleton import INDEX, JOINTS, model_pose
 from physics.textures.layers import Colour
-from physics.world.mesh import Mesh, box, frustum, join
 
 RIGID_PARTS: Final = (
     ("spine2", "top"),
@@ -41,7 +42,8 @@ _CARRIERS: Final = [INDEX[joint] for joint, _ in RIGID_PARTS]
 
 @dataclass(frozen=True, slots=True)
 class _Placed:
-    """Where the parts of N people are. at_m: (N, 13, 3) metres; turn: (N, 13, 4) quaternions x, y, z, w."""
+    """Where the parts of N people are. at_m: (N, 13, 3) metres; turn: (N, 13, 4) quaternions x, y,
+    z, w."""
 
     at_m: Floats
     turn: Floats
@@ -60,7 +62,13 @@ def part_meshes(family: Family) -> tuple[Mesh, ...]:
         [
             _tube(hem, _off(ribs, 0.0, 0.01 * f), (0.11 * f, 0.155 * f), (0.114 * f, 0.159 * f), 8),
             _tube(ribs, _off(base, 0.0, -0.03 * f), (0.115 * f, 0.16 * f), (0.08 * f, 0.17 * f), 8),
-            _tube(_off(base, 0.0, -0.03 * f), _off(base, 0.0, 0.03 * f), (0.08 * f, 0.17 * f), (0.06 * f, 0.06 * f), 8),
+            _tube(
+                _off(base, 0.0, -0.03 * f),
+                _off(base, 0.0, 0.03 * f),
+                (0.08 * f, 0.17 * f),
+                (0.06 * f, 0.06 * f),
+                8,
+            ),
         ]
     )
     skull = _off(joints["head"], 0.0, 0.075 * f)
@@ -73,8 +81,12 @@ def part_meshes(family: Family) -> tuple[Mesh, ...]:
                 (0.05 * f, 0.05 * f),
                 5,
             ),
-            _tube(_off(skull, 0.02, -0.12 * f), skull, (0.06 * f, 0.05 * f), (0.095 * f, 0.075 * f), 7),
-            _tube(skull, _off(skull, 0.0, 0.09 * f), (0.095 * f, 0.075 * f), (0.05 * f, 0.045 * f), 7),
+            _tube(
+                _off(skull, 0.02, -0.12 * f), skull, (0.06 * f, 0.05 * f), (0.095 * f, 0.075 * f), 7
+            ),
+            _tube(
+                skull, _off(skull, 0.0, 0.09 * f), (0.095 * f, 0.075 * f), (0.05 * f, 0.045 * f), 7
+            ),
         ]
     )
     crown = _off(skull, -0.03 * f, 0.0)
@@ -98,15 +110,31 @@ def part_meshes(family: Family) -> tuple[Mesh, ...]:
     )
     meshes: dict[str, list[Mesh]] = {"spine2": [chest], "head": [head, hair]}
     for side in ("left", "right"):
-        shoulder, elbow, wrist, hand = (joints[f"{side}_{part}"] for part in ("shoulder", "elbow", "wrist", "hand"))
+        shoulder, elbow, wrist, hand = (
+            joints[f"{side}_{part}"] for part in ("shoulder", "elbow", "wrist", "hand")
+        )
         hip, knee, ankle = (joints[f"{side}_{part}"] for part in ("hip", "knee", "ankle"))
-        meshes[f"{side}_shoulder"] = [_tube(elbow, shoulder, (0.045 * f, 0.045 * f), (0.058 * f, 0.055 * f), 5)]
-        palm = _tube(hand + 0.9 * (hand - wrist), wrist, (0.050 * f, 0.014 * f), (0.052 * f, 0.02 * f), 4)
+        meshes[f"{side}_shoulder"] = [
+            _tube(elbow, shoulder, (0.045 * f, 0.045 * f), (0.058 * f, 0.055 * f), 5)
+        ]
+        palm = _tube(
+            hand + 0.9 * (hand - wrist), wrist, (0.050 * f, 0.014 * f), (0.052 * f, 0.02 * f), 4
+        )
         meshes[f"{side}_wrist"] = [palm]
-        meshes[f"{side}_elbow"] = [_tube(wrist, elbow, (0.028 * f, 0.028 * f), (0.042 * f, 0.042 * f), 5)]
-        meshes[f"{side}_hip"] = [_tube(knee, _off(hip, 0.0, 0.03 * f), (0.06 * f, 0.06 * f), (0.095 * f, 0.085 * f), 6)]
-        shoe = box((0.275 * f, 0.09 * f, 0.075 * f), (ankle[0] + 0.075 * f, ankle[1], 0.0375 * f), skip=("bottom",))
-        meshes[f"{side}_knee"] = [join([_tube(ankle, knee, (0.05 * f, 0.05 * f), (0.062 * f, 0.06 * f), 5), shoe])]
+        meshes[f"{side}_elbow"] = [
+            _tube(wrist, elbow, (0.028 * f, 0.028 * f), (0.042 * f, 0.042 * f), 5)
+        ]
+        meshes[f"{side}_hip"] = [
+            _tube(knee, _off(hip, 0.0, 0.03 * f), (0.06 * f, 0.06 * f), (0.095 * f, 0.085 * f), 6)
+        ]
+        shoe = box(
+            (0.275 * f, 0.09 * f, 0.075 * f),
+            (ankle[0] + 0.075 * f, ankle[1], 0.0375 * f),
+            skip=("bottom",),
+        )
+        meshes[f"{side}_knee"] = [
+            join([_tube(ankle, knee, (0.05 * f, 0.05 * f), (0.062 * f, 0.06 * f), 5), shoe])
+        ]
     taken = {name: iter(list_) for name, list_ in meshes.items()}
     return tuple(next(taken[joint]).moved(-joints[joint]) for joint, _ in RIGID_PARTS)
 
@@ -117,12 +145,19 @@ def placed_parts(people: People, z_m: Floats, time_s: float) -> _Placed:
     posed = poses(people, time_s, clips)
     matrices = posed.matrices(clips)[:, _CARRIERS].astype(float)
     families = map(family_of, people.ids, people.age.tolist())
-    rest = np.array([_joints(family) for family in families]).reshape(len(people), len(RIGID_PARTS), 3)
+    rest = np.array([_joints(family) for family in families]).reshape(
+        len(people), len(RIGID_PARTS), 3
+    )
     turn = matrices[..., :3]
     at = (np.einsum("npab,npb->npa", turn, rest) + matrices[..., 3]) * posed.scale[:, None, None]
     cos, sin = np.cos(people.heading), np.sin(people.heading)
     facing = np.zeros((len(people), 1, 3, 3))
-    facing[:, 0, 0, 0], facing[:, 0, 0, 1], facing[:, 0, 1, 0], facing[:, 0, 1, 1] = cos, -sin, sin, cos
+    facing[:, 0, 0, 0], facing[:, 0, 0, 1], facing[:, 0, 1, 0], facing[:, 0, 1, 1] = (
+        cos,
+        -sin,
+        sin,
+        cos,
+    )
     facing[:, 0, 2, 2] = 1.0
     ground = np.column_stack([people.xy, z_m])[:, None]
     return _Placed((facing @ at[..., None])[..., 0] + ground, _quaternions(facing @ turn))
@@ -172,7 +207,11 @@ def _off(point: Floats, ahead_m: float, up_m: float) -> Floats:
 
 
 def _tube(
-    low: Floats, high: Floats, low_radius: tuple[float, float], high_radius: tuple[float, float], sides: int
+    low: Floats,
+    high: Floats,
+    low_radius: tuple[float, float],
+    high_radius: tuple[float, float],
+    sides: int,
 ) -> Mesh:
     """A tapered prism from one point to another; half axes ahead and across."""
     way = high - low

@@ -1,4 +1,5 @@
-"""The pose of everybody in a snapshot: a few numbers per person that say which baked frames to blend."""
+"""The pose of everybody in a snapshot: a few numbers per person that say which baked frames to
+blend."""
 
 from __future__ import annotations
 
@@ -12,10 +13,10 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Floats
 from cosim.core.state import Doing, People
 from cosim.people.gait import PACES_MPS, first_stride, relative_pace, stature_m
+from physics.people.appearance import family_of
 from physics.people.clips import Clips, own_clips
 from physics.people.families import FAMILIES, Family
 from physics.people.gestures import GESTURES
-from physics.people.looks import family_of
 
 _PACES: Final = np.array(PACES_MPS)
 _APART: Final = np.diff(_PACES)
@@ -26,15 +27,16 @@ _LOOPS: Final = {name: row for row, name in enumerate(GESTURES)}
 
 @dataclass(frozen=True, slots=True)
 class Poses:
-    """Poses of N people. rows: (N, 4) frames in the baked array; weights: (N, 4) float32 that sum to 1; scale: (N,)
-    factor on the body's size."""
+    """Poses of N people. rows: (N, 4) frames in the baked array; weights: (N, 4) float32 that sum
+    to 1; scale: (N,) factor on the body's size."""
 
     rows: NDArray[np.intp]
     weights: NDArray[np.float32]
     scale: Floats
 
     def matrices(self, clips: Clips) -> NDArray[np.float32]:
-        """(N, 24, 3, 4) matrices of the joints, blended as a renderer blends them; the scale is not in them."""
+        """(N, 24, 3, 4) matrices of the joints, blended as a renderer blends them; the scale is not
+        in them."""
         frames = clips.matrices.reshape(len(clips.matrices), -1)[self.rows]
         blend = np.matmul(self.weights[:, None, :], frames)
         return np.asarray(blend.reshape(len(self.rows), 24, 3, 4))
@@ -43,30 +45,49 @@ class Poses:
 def poses(people: People, time_s: float, clips: Clips | None = None) -> Poses:
     """How everybody stands or walks at `time_s`: a function of the snapshot alone.
 
-    Who walks is drawn between the two strides of the paces around theirs, at the phase of the strides they took; who
-    stands does what `people.doing` says; in between, as one starts or stops, the one turns into the other.
+    Who walks is drawn between the two strides of the paces around theirs, at the phase of the
+    strides they took; who stands does what `people.doing` says; in between, as one starts or stops,
+    the one turns into the other.
     """
-    bodies, loops = bodies_of(people.ids, people.age.tobytes()), loops_of(people.doing)
-    return poses_of(bodies, people.pace, people.strides, loops, time_s, own_clips() if clips is None else clips)
+    bodies = bodies_of(people.ids, people.age.tobytes())
+    loops = loops_of(people.doing)
+    return poses_of(
+        bodies, people.pace, people.strides, loops, time_s, own_clips() if clips is None else clips
+    )
 
 
 def poses_of(
-    bodies: Floats, pace: Floats, strides: Floats, loops: NDArray[np.intp], time_s: float | Floats, clips: Clips
+    bodies: Floats,
+    pace: Floats,
+    strides: Floats,
+    loops: NDArray[np.intp],
+    time_s: float | Floats,
+    clips: Clips,
 ) -> Poses:
-    """The poses of N people, of any number of streets. bodies: (N, 4), of `bodies_of`; pace, strides: (N,), as in
-    `People`; loops: (N,), of `loops_of`; time_s: of all or (N,)."""
-    family, size, offset = bodies[:, 0].astype(np.intp), bodies[:, 2], bodies[:, 3]
+    """The poses of N people, of any number of streets. bodies: (N, 4), of `bodies_of`; pace,
+    strides: (N,), as in `People`; loops: (N,), of `loops_of`; time_s: of all or (N,)."""
+    family = bodies[:, 0].astype(np.intp)
+    size = bodies[:, 2]
+    offset = bodies[:, 3]
     pace = pace * bodies[:, 1]
     knot = _PACES[1:-1].searchsorted(pace, side="right")
     faster = np.minimum(np.maximum((pace - _PACES[knot]) / _APART[knot], 0.0), 1.0)
 
-    frame, frames = strides % 1.0 * clips.stride_frames, clips.stride_frames
+    frame = strides % 1.0 * clips.stride_frames
+    frames = clips.stride_frames
     low = np.minimum(frame.astype(np.intp), frames - 1)
     late = frame - low
-    first, second = clips.gaits[family, knot], clips.gaits[family, knot + 1]
+    first = clips.gaits[family, knot]
+    second = clips.gaits[family, knot + 1]
     after = (low + 1) % frames
-    rows, weights = np.empty((len(low), 4), dtype=np.intp), np.empty((len(low), 4))
-    rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3] = first + low, first + after, second + low, second + after
+    rows = np.empty((len(low), 4), dtype=np.intp)
+    weights = np.empty((len(low), 4))
+    rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3] = (
+        first + low,
+        first + after,
+        second + low,
+        second + after,
+    )
     early, slower = 1.0 - late, 1.0 - faster
     weights[:, 0], weights[:, 1] = early * slower, late * slower
     weights[:, 2], weights[:, 3] = early * faster, late * faster
@@ -96,9 +117,11 @@ def loops_of(doing: tuple[Doing, ...]) -> NDArray[np.intp]:
 
 @lru_cache(maxsize=256)
 def bodies_of(names: tuple[str, ...], ages: bytes) -> Floats:
-    """(N, 4) of each person: row of the family, factor on the pace to that of the reference person, factor on the
-    family's body, where in a loop it is at time 0."""
-    return np.array([_body_of(name, age) for name, age in zip(names, ages, strict=True)]).reshape(-1, 4)
+    """(N, 4) of each person: row of the family, factor on the pace to that of the reference person,
+    factor on the family's body, where in a loop it is at time 0."""
+    return np.array([_body_of(name, age) for name, age in zip(names, ages, strict=True)]).reshape(
+        -1, 4
+    )
 
 
 @lru_cache(maxsize=65536)

@@ -1,8 +1,8 @@
 """The 24 joints of the SMPL layout, forward kinematics, and linear blend skinning.
 
-Source: Loper, Mahmood, Romero, Pons-Moll, Black: SMPL, a skinned multi-person linear model, ACM TOG 34(6), 2015,
-section 3. Ours are the axes: x ahead, y left, z up, metres, the soles at z = 0. The rest pose is a T: a joint that is
-not turned has the axes of the body.
+Source: Loper, Mahmood, Romero, Pons-Moll, Black: SMPL, a skinned multi-person linear model, ACM TOG
+34(6), 2015, section 3. Ours are the axes: x ahead, y left, z up, metres, the soles at z = 0. The
+rest pose is a T: a joint that is not turned has the axes of the body.
 """
 
 from __future__ import annotations
@@ -18,17 +18,63 @@ from numpy.typing import ArrayLike, NDArray
 from cosim.core.geometry import Floats
 
 JOINTS: Final = (
-    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
-    "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder",
-    "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hand", "right_hand",
-)  # fmt: skip
+    "pelvis",
+    "left_hip",
+    "right_hip",
+    "spine1",
+    "left_knee",
+    "right_knee",
+    "spine2",
+    "left_ankle",
+    "right_ankle",
+    "spine3",
+    "left_foot",
+    "right_foot",
+    "neck",
+    "left_collar",
+    "right_collar",
+    "head",
+    "left_shoulder",
+    "right_shoulder",
+    "left_elbow",
+    "right_elbow",
+    "left_wrist",
+    "right_wrist",
+    "left_hand",
+    "right_hand",
+)
 """Names in SMPL's order; a joint comes after its parent."""
 
 PARENTS: Final = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
 """Row of each joint's parent; the pelvis has none."""
 
 INDEX: Final[Mapping[str, int]] = MappingProxyType({name: k for k, name in enumerate(JOINTS)})
-MIRRORED: Final = (0, 2, 1, 3, 5, 4, 6, 8, 7, 9, 11, 10, 12, 14, 13, 15, 17, 16, 19, 18, 21, 20, 23, 22)
+MIRRORED: Final = (
+    0,
+    2,
+    1,
+    3,
+    5,
+    4,
+    6,
+    8,
+    7,
+    9,
+    11,
+    10,
+    12,
+    14,
+    13,
+    15,
+    17,
+    16,
+    19,
+    18,
+    21,
+    20,
+    23,
+    22,
+)
 """Row of each joint's counterpart on the other side."""
 
 REACH_RAD: Final = np.deg2rad(74.0)
@@ -50,12 +96,14 @@ class Skeleton:
 
 
 def rodrigues(turns_rad: ArrayLike) -> Floats:
-    """(..., 3, 3) rotations about (..., 3) axis-angle vectors (paper: the exponential of a joint's axis-angle)."""
+    """(..., 3, 3) rotations about (..., 3) axis-angle vectors (paper: the exponential of a joint's
+    axis-angle)."""
     turns = np.asarray(turns_rad, dtype=float)
     angle = np.linalg.norm(turns, axis=-1)[..., None, None]
     across = np.cross(turns[..., None, :], -np.eye(3))
     # sin a / a and (1 - cos a) / a2; scipy's own would cost every process its import, 0.3 s
-    once, twice = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
+    once = np.sinc(angle / np.pi)
+    twice = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
     return np.asarray(np.eye(3) + once * across + twice * (across @ across))
 
 
@@ -69,11 +117,12 @@ def axis_angle(matrices: Floats) -> Floats:
 def forward(turns: Floats, pelvis_m: Floats, skeleton: Skeleton) -> tuple[Floats, Floats]:
     """Joints of posed bodies: (F, 24, 3, 3) rotations and (F, 24, 3) positions in the body frame.
 
-    turns: (F, 24, 3, 3) of each joint against its parent; pelvis_m: (F, 3). The product along the chain of parents
-    of [turn | offset], as the paper's world transformation of a joint.
+    turns: (F, 24, 3, 3) of each joint against its parent; pelvis_m: (F, 3). The product along the
+    chain of parents of [turn | offset], as the paper's world transformation of a joint.
     """
     offsets = skeleton.offsets_m
-    rotation, position = np.empty_like(turns), np.empty((*turns.shape[:2], 3))
+    rotation = np.empty_like(turns)
+    position = np.empty((*turns.shape[:2], 3))
     rotation[:, 0], position[:, 0] = turns[:, 0], pelvis_m
     for joint, parent in enumerate(PARENTS[1:], start=1):
         rotation[:, joint] = rotation[:, parent] @ turns[:, joint]
@@ -82,17 +131,21 @@ def forward(turns: Floats, pelvis_m: Floats, skeleton: Skeleton) -> tuple[Floats
 
 
 def model_pose(reach_rad: float = float(REACH_RAD)) -> Floats:
-    """(24, 3, 3) turns of the A pose in which our bodies are modelled: the T with the arms let down."""
+    """(24, 3, 3) turns of the A pose in which our bodies are modelled: the T with the arms let
+    down."""
     turns = np.zeros((24, 3))
     turns[INDEX["left_shoulder"], 0], turns[INDEX["right_shoulder"], 0] = -reach_rad, reach_rad
     return rodrigues(turns)
 
 
-def skinning(rotation: Floats, position: Floats, bind: tuple[Floats, Floats]) -> NDArray[np.float32]:
-    """(F, 24, 3, 4) float32 matrices that take a vertex from the pose it was modelled in to the posed body.
+def skinning(
+    rotation: Floats, position: Floats, bind: tuple[Floats, Floats]
+) -> NDArray[np.float32]:
+    """(F, 24, 3, 4) float32 matrices that take a vertex from the pose it was modelled in to the
+    posed body.
 
-    bind: rotations (24, 3, 3) and positions (24, 3) of the joints in the modelled pose. The paper's G'(theta), which
-    removes the transformation of the rest pose.
+    bind: rotations (24, 3, 3) and positions (24, 3) of the joints in the modelled pose. The paper's
+    G'(theta), which removes the transformation of the rest pose.
     """
     turn = rotation @ np.swapaxes(bind[0], -1, -2)
     shift = position - np.einsum("fjab,jb->fja", turn, bind[1])

@@ -14,5 +14,8 @@ def urdf_of(robot: Robot) -> Path:
 
 
 def hash_of_robot(robot: Robot) -> str:
-    """Of its row and of the bodies and joints in its URDF: another robot under the same name has another."""
-    return hashlib.blake2b(repr(robot).encode() + urdf_of(robot).read_bytes(), digest_size=8).hexdigest()
+    """Of its row and of the bodies and joints in its URDF: another robot under the same name has
+    another."""
+    return hashlib.blake2b(
+        repr(robot).encode() + urdf_of(robot).read_bytes(), digest_size=8
+    ).hexdigest()

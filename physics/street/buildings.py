@@ -1,7 +1,7 @@
 """Buildings along the frontage: boxes behind the sidewalks, drawn from the street map and a seed.
 
-Each sidewalk decides on its own row of buildings, and a building belongs to the tile of its centre: what stands
-in a tile does not depend on which tiles were asked for before.
+Each sidewalk decides on its own row of buildings, and a building belongs to the tile of its centre:
+what stands in a tile does not depend on which tiles were asked for before.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Polyline
 from cosim.place.street_map import Lane, PieceKind, StreetMap, Strip
 from cosim.place.terrain import Terrain
-from physics.world.mesh import Mesh, box, join, plan_triangles, quads
-from physics.world.tiles import CURB_M, Key, key_at, square
+from physics.ground.mesh import Mesh, box, join, plan_triangles, quads
+from physics.ground.tiles import CURB_M, Key, key_at, square
 
 _MARGIN_M: Final = 0.2
 """Least distance of a building from anything walkable or driven on."""
@@ -32,9 +32,13 @@ _HEIGHT_M: Final = (6.0, 25.0)
 _WINDOW_WALL_M: Final = 4.0
 
 FACADES: Final = (
-    (0.71, 0.45, 0.36), (0.82, 0.74, 0.60), (0.60, 0.62, 0.66),
-    (0.76, 0.66, 0.52), (0.55, 0.38, 0.33), (0.84, 0.82, 0.78),
-)  # fmt: skip
+    (0.71, 0.45, 0.36),
+    (0.82, 0.74, 0.60),
+    (0.60, 0.62, 0.66),
+    (0.76, 0.66, 0.52),
+    (0.55, 0.38, 0.33),
+    (0.84, 0.82, 0.78),
+)
 WINDOW_COLOUR: Final = (0.23, 0.27, 0.33)
 
 
@@ -44,8 +48,9 @@ Wall = tuple[float, float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Building:
-    """A box on the high ground. size_m: along the street, away from it, height. heading_rad: along the sidewalk,
-    the street to its right. floor_m, base_m: the land at its front, and the lowest under it.
+    """A box on the high ground. size_m: along the street, away from it, height. heading_rad: along
+    the sidewalk, the street to its right. floor_m, base_m: the land at its front, and the lowest
+    under it.
 
     A building of the map has an outline and walls of its own; the box is then the one around it.
     """
@@ -66,10 +71,20 @@ class Building:
         """The outline on the ground."""
         if self.outline is not None:
             return self.outline
-        along = 0.5 * self.size_m[0] * np.array([math.cos(self.heading_rad), math.sin(self.heading_rad)])
-        away = 0.5 * self.size_m[1] * np.array([-math.sin(self.heading_rad), math.cos(self.heading_rad)])
+        along = (
+            0.5
+            * self.size_m[0]
+            * np.array([math.cos(self.heading_rad), math.sin(self.heading_rad)])
+        )
+        away = (
+            0.5
+            * self.size_m[1]
+            * np.array([-math.sin(self.heading_rad), math.cos(self.heading_rad)])
+        )
         middle = np.array([self.x_m, self.y_m])
-        return shapely.Polygon(middle + np.array([along + away, away - along, -along - away, along - away]))
+        return shapely.Polygon(
+            middle + np.array([along + away, away - along, -along - away, along - away])
+        )
 
 
 class _Mapped(Protocol):
@@ -83,7 +98,8 @@ class _Mapped(Protocol):
 
 
 class Frontage:
-    """The buildings of a map: `in_tile` is a pure function of the map, the seed and the tile, kept once known.
+    """The buildings of a map: `in_tile` is a pure function of the map, the seed and the tile, kept
+    once known.
 
     mapped: buildings that the map shows; near them none is made up. None: the map shows none.
     """
@@ -110,11 +126,13 @@ class Frontage:
         rng = np.random.default_rng([self._seed, zlib.crc32(strip.id.encode())])
         line = Polyline(strip.line if strip.road_side < 0 else strip.line[::-1])
         row = []
-        at_m, n = float(rng.uniform(0.0, 2.0)), 0
+        at_m = float(rng.uniform(0.0, 2.0))
+        n = 0
         while line.length_m - at_m > 4.0:
             lot = min(float(rng.uniform(*_LOT_M)), line.length_m - at_m)
             depth, height = float(rng.uniform(*_DEPTH_M)), float(rng.uniform(*_HEIGHT_M))
-            facade, gap = int(rng.integers(len(FACADES))), float(rng.choice([0.0, 0.0, 3.0]))
+            facade = int(rng.integers(len(FACADES)))
+            gap = float(rng.choice([0.0, 0.0, 3.0]))
             building = self._fitted(strip, line, at_m, lot, (depth, height, facade), n)
             if building is not None:
                 row.append(building)
@@ -123,22 +141,42 @@ class Frontage:
         return tuple(row)
 
     def _fitted(
-        self, strip: Strip, line: Polyline, at_m: float, lot_m: float, shape: tuple[float, float, int], n: int
+        self,
+        strip: Strip,
+        line: Polyline,
+        at_m: float,
+        lot_m: float,
+        shape: tuple[float, float, int],
+        n: int,
     ) -> Building | None:
-        """The building of a lot, made smaller until it keeps clear of streets; None when nothing fits."""
+        """The building of a lot, made smaller until it keeps clear of streets; None when nothing
+        fits."""
         depth, height, facade = shape
         for share_along, share_deep in ((1.0, 1.0), (1.0, 0.6), (0.7, 0.8), (0.5, 0.5)):
-            start, end = line.at(at_m), line.at(at_m + lot_m * share_along)
+            start = line.at(at_m)
+            end = line.at(at_m + lot_m * share_along)
             chord = end.xy - start.xy
-            width, deep = float(np.hypot(*chord)), depth * share_deep
+            width = float(np.hypot(*chord))
+            deep = depth * share_deep
             if width < 3.0:
                 continue
             left = np.array([-chord[1], chord[0]]) / width
-            sagitta = float(np.max((line.points - start.xy) @ left, initial=0.0, where=_between(line, at_m, lot_m)))
+            sagitta = float(
+                np.max(
+                    (line.points - start.xy) @ left, initial=0.0, where=_between(line, at_m, lot_m)
+                )
+            )
             away = sagitta + 0.5 * strip.width_m + strip.frontage_m + 0.5 * deep
             x, y = 0.5 * (start.xy + end.xy) + away * left
             heading = math.atan2(chord[1], chord[0])
-            built = Building(f"building:{strip.id}:{n}", float(x), float(y), heading, (width, deep, height), facade)
+            built = Building(
+                f"building:{strip.id}:{n}",
+                float(x),
+                float(y),
+                heading,
+                (width, deep, height),
+                facade,
+            )
             if self._clear(built):
                 return built
         return None
@@ -162,14 +200,18 @@ def _between(line: Polyline, at_m: float, lot_m: float) -> NDArray[np.bool_]:
 
 
 def on_land(building: Building, terrain: Terrain) -> Building:
-    """The building with a base down to the lowest land around it, and its floor level with the land at its front; the
-    floor of a building of the map, of which this may be a part, is known already."""
+    """The building with a base down to the lowest land around it, and its floor level with the land
+    at its front; the floor of a building of the map, of which this may be a part, is known
+    already."""
     around = shapely.get_coordinates(shapely.segmentize(building.polygon.exterior, 1.0))
     lowest = float(terrain.height(around).min())
     if building.outline is not None:
         return replace(building, base_m=min(building.floor_m, lowest))
     away = 0.5 * building.size_m[1]
-    front = building.x_m + away * math.sin(building.heading_rad), building.y_m - away * math.cos(building.heading_rad)
+    front = (
+        building.x_m + away * math.sin(building.heading_rad),
+        building.y_m - away * math.cos(building.heading_rad),
+    )
     floor = float(terrain.height([front])[0])
     return replace(building, floor_m=floor, base_m=min(floor, lowest))
 
@@ -195,13 +237,22 @@ def facade_meshes(buildings: tuple[Building, ...]) -> dict[int, Mesh]:
 def _outlined(building: Building, outline: shapely.Polygon) -> Mesh:
     """Walls and the flat roof of a building of the map."""
     x0, y0, x1, y1 = np.array(building.walls).reshape(-1, 4).T
-    ground, roof_m = building.floor_m + CURB_M, building.floor_m + CURB_M + building.size_m[2]
+    ground = building.floor_m + CURB_M
+    roof_m = building.floor_m + CURB_M + building.size_m[2]
     low, high = np.full(len(x0), ground), np.full(len(x0), roof_m)
-    at = [np.column_stack(corner) for corner in ((x0, y0, low), (x1, y1, low), (x1, y1, high), (x0, y0, high))]
+    at = [
+        np.column_stack(corner)
+        for corner in ((x0, y0, low), (x1, y1, low), (x1, y1, high), (x0, y0, high))
+    ]
     roof, _ = plan_triangles([outline])
     top = np.column_stack([roof.reshape(-1, 2), np.full(3 * len(roof), roof_m)])
     up = np.tile([0.0, 0.0, 1.0], (len(top), 1))
-    return join([quads(np.stack(at, axis=1)), Mesh(top, up, np.arange(len(top), dtype=np.int32).reshape(-1, 3))])
+    return join(
+        [
+            quads(np.stack(at, axis=1)),
+            Mesh(top, up, np.arange(len(top), dtype=np.int32).reshape(-1, 3)),
+        ]
+    )
 
 
 def _windows(building: Building) -> Mesh:
@@ -211,7 +262,11 @@ def _windows(building: Building) -> Mesh:
         length, heading = math.hypot(x1 - x0, y1 - y0), math.atan2(y1 - y0, x1 - x0)
         if length >= _WINDOW_WALL_M:
             wall = Building("", 0.0, 0.0, 0.0, (length, 0.0, building.size_m[2]), 0)
-            found.append(_openings(wall).moved((0.5 * (x0 + x1), 0.5 * (y0 + y1), building.floor_m + CURB_M), heading))
+            found.append(
+                _openings(wall).moved(
+                    (0.5 * (x0 + x1), 0.5 * (y0 + y1), building.floor_m + CURB_M), heading
+                )
+            )
     return join(found)
 
 
@@ -221,8 +276,10 @@ def _base(building: Building) -> Mesh:
         a, b = np.array(building.walls).reshape(-1, 2, 2).transpose(1, 0, 2)
     else:
         ring = shapely.get_coordinates(shapely.orient_polygons(building.polygon).exterior)
-        a, b = ring[:-1], ring[1:]
-    low, high = np.full(len(a), building.base_m), np.full(len(a), building.floor_m + CURB_M)
+        a = ring[:-1]
+        b = ring[1:]
+    low = np.full(len(a), building.base_m)
+    high = np.full(len(a), building.floor_m + CURB_M)
     at = [np.column_stack(corner) for corner in ((a, low), (b, low), (b, high), (a, high))]
     return quads(np.stack(at, axis=1))
 
@@ -235,6 +292,10 @@ def _openings(building: Building) -> Mesh:
     door = 0.6
     panes = [(-half, -door - 0.5, 0.9, 2.4), (-door, door, 0.0, 2.3), (door + 0.5, half, 0.9, 2.4)]
     storeys = int((height - 0.5) / _STOREY_M)
-    panes += [(-half, half, k * _STOREY_M + 0.9, k * _STOREY_M + 2.3) for k in range(1, min(storeys, 4))]
-    corners = [[(x0, y, z0), (x1, y, z0), (x1, y, z1), (x0, y, z1)] for x0, x1, z0, z1 in panes if x1 > x0]
+    panes += [
+        (-half, half, k * _STOREY_M + 0.9, k * _STOREY_M + 2.3) for k in range(1, min(storeys, 4))
+    ]
+    corners = [
+        [(x0, y, z0), (x1, y, z0), (x1, y, z1), (x0, y, z1)] for x0, x1, z0, z1 in panes if x1 > x0
+    ]
     return quads(np.array(corners))

@@ -1,7 +1,8 @@
-"""The free width of sidewalks on the final geometry: what their outlines and the props on them leave around the middle.
+"""The free width of sidewalks on the final geometry: what their outlines and the props on them
+leave around the middle.
 
-Measured on lines across the sidewalk, cut by its outline and by the footprints of props: every quarter of a metre and
-at every corner of a footprint.
+Measured on lines across the sidewalk, cut by its outline and by the footprints of props: every
+quarter of a metre and at every corner of a footprint.
 """
 
 from __future__ import annotations
@@ -20,12 +21,15 @@ from physics.street.placement import driveway_ground
 
 STATION_M: Final = 0.25
 _AT_ONCE: Final = 400_000
-"""Pairs of lines across and corners of outlines that are looked at in one piece, to bound the memory."""
+"""Pairs of lines across and corners of outlines that are looked at in one piece, to bound the
+memory."""
 
 
-def clear_width(strips: Iterable[Strip], props: Sequence[Prop]) -> Mapping[str, tuple[float, float]]:
-    """For each sidewalk the least width in metres that is free on both sides of its middle line: as it is, and as it
-    would be without props. 0 where the middle itself is not free."""
+def clear_width(
+    strips: Iterable[Strip], props: Sequence[Prop]
+) -> Mapping[str, tuple[float, float]]:
+    """For each sidewalk the least width in metres that is free on both sides of its middle line: as
+    it is, and as it would be without props. 0 where the middle itself is not free."""
     ground = footprints(props)
     tree = shapely.STRtree(ground)
     found = {}
@@ -33,10 +37,15 @@ def clear_width(strips: Iterable[Strip], props: Sequence[Prop]) -> Mapping[str, 
         line = Polyline(strip.line[:, :2])
         near = ground[np.sort(tree.query(strip.polygon, predicate="intersects"))]
         corners = shapely.points(shapely.get_coordinates(near))
-        stations = np.concatenate([
-            np.linspace(0.0, line.length_m, max(int(line.length_m / STATION_M), 1) + 1)[1:-1],
-            np.asarray(shapely.line_locate_point(shapely.linestrings(line.points), corners), dtype=float),
-        ])  # fmt: skip
+        stations = np.concatenate(
+            [
+                np.linspace(0.0, line.length_m, max(int(line.length_m / STATION_M), 1) + 1)[1:-1],
+                np.asarray(
+                    shapely.line_locate_point(shapely.linestrings(line.points), corners),
+                    dtype=float,
+                ),
+            ]
+        )
         if not len(stations):
             stations = np.array([0.5 * line.length_m])
         middles, aside = _across(line, stations)
@@ -54,7 +63,8 @@ def clear_width(strips: Iterable[Strip], props: Sequence[Prop]) -> Mapping[str, 
 
 
 def on_driveways(strips: Iterable[Strip], props: Sequence[Prop]) -> list[str]:
-    """Ids of the props that stand on a driveway or the flares of its ramp; cars, which belong there, apart."""
+    """Ids of the props that stand on a driveway or the flares of its ramp; cars, which belong
+    there, apart."""
     still = [prop for prop in props if prop.kind != "car"]
     ways = [way for strip in strips for way in driveway_ground(strip)]
     hit, _ = shapely.STRtree(ways).query(footprints(still), predicate="intersects")
@@ -71,11 +81,16 @@ def _across(line: Polyline, stations_m: Floats) -> tuple[Floats, Floats]:
 
 
 def _gaps(
-    middles: Floats, aside: Floats, polygons: Sequence[shapely.Geometry] | NDArray[np.object_], reach_m: float
+    middles: Floats,
+    aside: Floats,
+    polygons: Sequence[shapely.Geometry] | NDArray[np.object_],
+    reach_m: float,
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """(N,) distances from points to the first side of a polygon to their left and right, at most `reach_m`; and
-    whether a point lies within: an odd number of sides to its left."""
-    corners, ring = shapely.get_coordinates(shapely.get_rings(np.asarray(polygons, dtype=object)), return_index=True)
+    """(N,) distances from points to the first side of a polygon to their left and right, at most
+    `reach_m`; and whether a point lies within: an odd number of sides to its left."""
+    corners, ring = shapely.get_coordinates(
+        shapely.get_rings(np.asarray(polygons, dtype=object)), return_index=True
+    )
     corners, at = corners - middles[0], middles - middles[0]
     along = np.column_stack([aside[:, 1], -aside[:, 0]])
     left, right = np.full(len(middles), reach_m), np.full(len(middles), reach_m)
@@ -86,7 +101,8 @@ def _gaps(
         ahead = along[rows] @ corners.T - (along[rows] * at[rows]).sum(axis=1)[:, None]
         is_ahead = ahead > 0.0
         line, side = np.nonzero((is_ahead[:, 1:] != is_ahead[:, :-1]) & (ring[1:] == ring[:-1]))
-        u0, u1 = ahead[line, side], ahead[line, side + 1]
+        u0 = ahead[line, side]
+        u1 = ahead[line, side + 1]
         line += i
         v0 = ((corners[side] - at[line]) * aside[line]).sum(axis=1)
         v1 = ((corners[side + 1] - at[line]) * aside[line]).sum(axis=1)

@@ -1,6 +1,7 @@
 """Thin covers over the ground: what shows that open ground is no sidewalk.
 
-They are laid a few millimetres above the ground and change what cameras see, not labels, friction or what wheels touch.
+They are laid a few millimetres above the ground and change what cameras see, not labels, friction
+or what wheels touch.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from cosim.core.geometry import Floats
 from cosim.place import overlay
 from cosim.place.open_ground import open_ground
 from cosim.place.street_map import LandKind, StreetMap
-from physics.world.mesh import Mesh, join, plan_triangles, quads
-from physics.world.tiles import Tile, square
+from physics.ground.mesh import Mesh, join, plan_triangles, quads
+from physics.ground.tiles import Tile, square
 
 _LIFT_M: Final = 0.003
 _GRID_M: Final = 1e-4
@@ -27,11 +28,13 @@ _LEVEL_M: Final = 1e-6
 
 
 def covers_in(street_map: StreetMap, tile: Tile, rims: bool) -> dict[LandKind, Mesh]:
-    """What lies on the open ground of a tile, by its look; where nothing lies the ground shows its own. rims: upright
-    ones around each cover, so that a low eye does not look under it; they take two thirds of all triangles."""
+    """What lies on the open ground of a tile, by its look; where nothing lies the ground shows its
+    own. rims: upright ones around each cover, so that a low eye does not look under it; they take
+    two thirds of all triangles."""
     if "ground" not in tile.parts:
         return {}
-    ground, found = tile.parts["ground"], {}
+    ground = tile.parts["ground"]
+    found = {}
     areas = open_ground(street_map, shapely.box(*square(tile.key)))
     outline = overlay.union_all(_outlines(ground)) if areas and rims else None
     for kind, area in areas:
@@ -53,7 +56,11 @@ def _spread(mesh: Mesh, area: shapely.Geometry) -> Mesh:
     height = mesh.vertices[mesh.triangles][:, :, 2]
     level = (height > height.max() - _LEVEL_M).all(axis=1)
     sheet = overlay.intersection(overlay.union_all(_outlines(mesh)[level]), area)
-    parts = [part for part in shapely.get_parts(shapely.simplify(sheet, 1e-3)) if isinstance(part, Polygon)]
+    parts = [
+        part
+        for part in shapely.get_parts(shapely.simplify(sheet, 1e-3))
+        if isinstance(part, Polygon)
+    ]
     xy = plan_triangles(parts)[0].reshape(-1, 2) if parts else np.zeros((0, 2))
     corners = np.column_stack([xy, np.full(len(xy), height.max() + _LIFT_M)])
     up = np.tile([0.0, 0.0, 1.0], (len(xy), 1))
@@ -64,7 +71,8 @@ def _spread(mesh: Mesh, area: shapely.Geometry) -> Mesh:
 def _clipped(mesh: Mesh, area: shapely.Geometry) -> Mesh:
     """The parts of a mesh's triangles that lie in an area, lifted a little."""
     shapely.prepare(area)
-    corners, outlines = mesh.vertices[mesh.triangles], _outlines(mesh)
+    corners = mesh.vertices[mesh.triangles]
+    outlines = _outlines(mesh)
     met = np.flatnonzero(shapely.intersects(area, outlines))
     whole = shapely.contains_properly(area, outlines[met])
     kept = met[whole]
@@ -84,9 +92,11 @@ def _outlines(mesh: Mesh) -> NDArray[np.object_]:
 
 
 def _edged(mesh: Mesh, ends: shapely.Geometry | None = None) -> Mesh:
-    """A mesh with an upright rim under every edge at which it ends, so that a low eye does not look under it.
+    """A mesh with an upright rim under every edge at which it ends, so that a low eye does not look
+    under it.
 
-    ends: where it does; None: at every edge of one triangle alone, also where neighbours are divided otherwise.
+    ends: where it does; None: at every edge of one triangle alone, also where neighbours are
+    divided otherwise.
     """
     if not len(mesh):
         return mesh
@@ -97,12 +107,16 @@ def _edged(mesh: Mesh, ends: shapely.Geometry | None = None) -> Mesh:
     order = {(a, b): k for k, (a, b) in enumerate(zip(one.tolist(), two.tolist(), strict=True))}
     alone = edges[[k for (a, b), k in order.items() if (b, a) not in order and a != b]]
     if ends is not None and len(alone):
-        alone = alone[shapely.dwithin(shapely.points(alone[:, :, :2].mean(axis=1)), ends, _AT_END_M)]
+        alone = alone[
+            shapely.dwithin(shapely.points(alone[:, :, :2].mean(axis=1)), ends, _AT_END_M)
+        ]
     if not len(alone):
         return mesh
     under = alone - np.array([0.0, 0.0, _LIFT_M])
     rim = quads(np.stack([under[:, 0], under[:, 1], alone[:, 1], alone[:, 0]], axis=1))
-    lit = np.tile([0.0, 0.0, 1.0], (len(rim.vertices), 1))  # like the surface: a millimetre's wall would be a dark line
+    lit = np.tile(
+        [0.0, 0.0, 1.0], (len(rim.vertices), 1)
+    )  # like the surface: a millimetre's wall would be a dark line
     return join([mesh, Mesh(rim.vertices, lit, rim.triangles)])
 
 
@@ -110,7 +124,9 @@ def _cut(part: shapely.Geometry, corners: Floats, normals: Floats) -> Mesh:
     """A part of a triangle, (3, 3) corners and normals, as triangles in its plane."""
     pieces = [p for p in shapely.get_parts(part) if shapely.get_dimensions(p) == 2]
     at = plan_triangles(pieces)[0].reshape(-1, 2)
-    shares = np.column_stack([at, np.ones(len(at))]) @ np.linalg.inv(np.column_stack([corners[:, :2], np.ones(3)]))
+    shares = np.column_stack([at, np.ones(len(at))]) @ np.linalg.inv(
+        np.column_stack([corners[:, :2], np.ones(3)])
+    )
     z = shares @ corners[:, 2] + _LIFT_M
     slopes = shares @ normals
     slopes /= np.linalg.norm(slopes, axis=1, keepdims=True)

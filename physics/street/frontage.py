@@ -1,6 +1,8 @@
-"""What lies between sidewalks and houses in generated cities: paved before shops, gardens before homes, driveways.
+"""What lies between sidewalks and houses in generated cities: paved before shops, gardens before
+homes, driveways.
 
-It is laid over the ground, a few millimetres thick: it changes colours, not labels or friction. Nobody walks there.
+It is laid over the ground, a few millimetres thick: it changes colours, not labels or friction.
+Nobody walks there.
 """
 
 from __future__ import annotations
@@ -16,11 +18,11 @@ import shapely
 from cosim.core.geometry import Polyline
 from cosim.place.open_ground import beside
 from cosim.place.street_map import StreetMap, Strip, street_of
+from physics.ground.mesh import Mesh
+from physics.ground.tiles import DRIVEWAY_M, Tile, square
 from physics.street.covers import laid_over
 from physics.street.placement import street_style
 from physics.textures.layers import Colour
-from physics.world.mesh import Mesh
-from physics.world.tiles import DRIVEWAY_M, Tile, square
 
 _REACH_M: Final = 12.0
 _UNDER_M: Final = 0.6
@@ -43,16 +45,30 @@ _SLABS: Final = (0.62, 0.60, 0.57)
 _WARM: Final = (0.64, 0.59, 0.52)
 _COVERS: Final[Mapping[str, tuple[Cover, ...]]] = {
     "commercial": (
-        Cover("slabs-running", _SLABS), Cover("slabs-mixed", _WARM), Cover("pavers-running", (0.55, 0.53, 0.52)),
+        Cover("slabs-running", _SLABS),
+        Cover("slabs-mixed", _WARM),
+        Cover("pavers-running", (0.55, 0.53, 0.52)),
         Cover("setts", None),
     ),
-    "avenue": (Cover("slabs-square", _SLABS), Cover("slabs-worn", None), Cover("concrete-cast", None)),
-    "boulevard": (Cover("slabs-mixed", _WARM), Cover("gravel", None), Cover("pavers-mixed", (0.60, 0.56, 0.50))),
+    "avenue": (
+        Cover("slabs-square", _SLABS),
+        Cover("slabs-worn", None),
+        Cover("concrete-cast", None),
+    ),
+    "boulevard": (
+        Cover("slabs-mixed", _WARM),
+        Cover("gravel", None),
+        Cover("pavers-mixed", (0.60, 0.56, 0.50)),
+    ),
     "narrow": (Cover("setts", None), Cover("cobbles", None), Cover("slabs-worn", None)),
     "ring": (Cover("slabs-square", _SLABS), Cover("concrete-cast", None)),
-}  # fmt: skip
+}
 """What the frontage of a class of streets may be paved with; other classes have gardens."""
-_WAYS: Final = (Cover("concrete-cast", None), Cover("pavers-herringbone", (0.56, 0.52, 0.49)), Cover("gravel", None))
+_WAYS: Final = (
+    Cover("concrete-cast", None),
+    Cover("pavers-herringbone", (0.56, 0.52, 0.49)),
+    Cover("gravel", None),
+)
 _BEDS: Final = Cover("earth", None)
 
 
@@ -64,7 +80,8 @@ class Laid(NamedTuple):
 
 
 def frontage_in(street_map: StreetMap, tile: Tile, seed: int) -> list[Laid]:
-    """What lies on the open ground of a tile of a generated city, a few millimetres above it; nothing on other maps."""
+    """What lies on the open ground of a tile of a generated city, a few millimetres above it;
+    nothing on other maps."""
     if not street_map.planned or "ground" not in tile.parts:
         return []
     x0, y0, x1, y1 = square(tile.key)
@@ -78,7 +95,9 @@ def frontage_in(street_map: StreetMap, tile: Tile, seed: int) -> list[Laid]:
     triangles = tile.parts["ground"]
     found: list[Laid] = []
     taken: shapely.Geometry = shapely.Polygon()
-    for cover in sorted(areas, key=lambda cover: (cover not in _WAYS, cover.layer, cover.colour or ())):
+    for cover in sorted(
+        areas, key=lambda cover: (cover not in _WAYS, cover.layer, cover.colour or ())
+    ):
         area = shapely.union_all(areas[cover])
         found.append(Laid(laid_over(triangles, shapely.difference(area, taken)), cover))
         taken = shapely.union(taken, area)
@@ -86,14 +105,16 @@ def frontage_in(street_map: StreetMap, tile: Tile, seed: int) -> list[Laid]:
 
 
 def paved(strip: Strip) -> bool:
-    """Whether what lies before the houses of a sidewalk's street is paved; else there are gardens."""
+    """Whether what lies before the houses of a sidewalk's street is paved; else there are
+    gardens."""
     return street_style(strip.street_class) in _COVERS
 
 
 def _of(strip: Strip, seed: int) -> list[tuple[Cover, shapely.Geometry]]:
     """The frontage of a sidewalk and its driveways."""
     rng = np.random.default_rng([seed, zlib.crc32(strip.id.encode()), 0xF207])
-    edge, depth = 0.5 * strip.width_m, min(strip.frontage_m, _DEEPEST_M)
+    edge = 0.5 * strip.width_m
+    depth = min(strip.frontage_m, _DEEPEST_M)
     covers = _COVERS.get(street_style(strip.street_class))
     of_street = np.random.default_rng([seed, zlib.crc32(street_of(strip.id).encode()), 0xF207])
     found: list[tuple[Cover, shapely.Geometry]] = []

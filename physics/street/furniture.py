@@ -1,4 +1,5 @@
-"""The catalogue of street furniture: a literal table of parametric props, and the prop that stands somewhere."""
+"""The catalogue of street furniture: a literal table of parametric props, and the prop that stands
+somewhere."""
 
 from __future__ import annotations
 
@@ -13,20 +14,23 @@ import shapely
 from numpy.typing import NDArray
 
 from cosim.spec.obstacle import OBSTACLE_SIZES_M, OBSTACLE_VARIANTS, Obstacle, ObstacleKind
+from physics.ground.mesh import Part
 from physics.street import furniture_shapes as shapes
 from physics.street import obstacle_shapes
 from physics.street.furniture_shapes import METAL, WOOD, Size, Solid
 from physics.textures.layers import Colour
-from physics.world.mesh import Part
 
 Zone = Literal["verge", "curb", "frontage", "driveway"]
-"""Where a prop stands: between curb and sidewalk; on the sidewalk's edge at the curb, where there is no verge;
-between sidewalk and buildings; in the frontage at the end of a driveway."""
+"""Where a prop stands: between curb and sidewalk; on the sidewalk's edge at the curb, where there
+is no verge; between sidewalk and buildings; in the frontage at the end of a driveway."""
 
-_Forms = tuple[Callable[[Size], tuple[Solid, ...]], Callable[..., tuple[Part, ...]], tuple[Colour, ...]]
+_Forms = tuple[
+    Callable[[Size], tuple[Solid, ...]], Callable[..., tuple[Part, ...]], tuple[Colour, ...]
+]
 
 PROP_VARIANTS: Final = OBSTACLE_VARIANTS
-"""Sizes of each prop, evenly from its smallest to its largest: few, so that many props share a shape."""
+"""Sizes of each prop, evenly from its smallest to its largest: few, so that many props share a
+shape."""
 
 LEAVES: Final = ((0.22, 0.42, 0.17), (0.30, 0.48, 0.18), (0.18, 0.36, 0.22), (0.42, 0.46, 0.17))
 SIGNS: Final = ((0.12, 0.30, 0.66), (0.80, 0.12, 0.10), (0.95, 0.80, 0.12), (0.90, 0.90, 0.90))
@@ -38,7 +42,13 @@ CHAIRS: Final = ((0.70, 0.20, 0.16), (0.22, 0.34, 0.50), (0.30, 0.42, 0.26), (0.
 BIKES: Final = ((0.12, 0.24, 0.46), (0.62, 0.11, 0.12), (0.10, 0.10, 0.11), (0.20, 0.46, 0.36))
 BOARDS: Final = ((0.08, 0.09, 0.10), (0.80, 0.12, 0.10), (0.12, 0.30, 0.66), (0.95, 0.80, 0.12))
 FENCES: Final = ((0.88, 0.42, 0.08), (0.80, 0.12, 0.10))
-CARS: Final = ((0.86, 0.86, 0.87), (0.12, 0.13, 0.15), (0.55, 0.57, 0.60), (0.62, 0.11, 0.12), (0.13, 0.24, 0.48))
+CARS: Final = (
+    (0.86, 0.86, 0.87),
+    (0.12, 0.13, 0.15),
+    (0.55, 0.57, 0.60),
+    (0.62, 0.11, 0.12),
+    (0.13, 0.24, 0.48),
+)
 ROOFS: Final = ((0.24, 0.26, 0.28), (0.16, 0.30, 0.28))
 PLANTS: Final = ((0.30, 0.46, 0.20), (0.24, 0.40, 0.18), (0.55, 0.34, 0.40), (0.50, 0.50, 0.22))
 
@@ -47,10 +57,10 @@ PLANTS: Final = ((0.30, 0.46, 0.20), (0.24, 0.40, 0.18), (0.55, 0.34, 0.40), (0.
 class PropKind:
     """An entry of the catalogue.
 
-    sizes_m: smallest and largest, of what stands on the ground and is bumped into. per_100m: how many a street of a
-    class has along 100 m of one sidewalk. row: stands in a row, evenly spaced. spread_m: radius of what is above
-    the heads and may hang over a sidewalk, not into a house. seen_m: farthest it is drawn. grown: its parts differ
-    from paint to paint.
+    sizes_m: smallest and largest, of what stands on the ground and is bumped into. per_100m: how
+    many a street of a class has along 100 m of one sidewalk. row: stands in a row, evenly spaced.
+    spread_m: radius of what is above the heads and may hang over a sidewalk, not into a house.
+    seen_m: farthest it is drawn. grown: its parts differ from paint to paint.
     """
 
     name: str
@@ -71,75 +81,168 @@ class PropKind:
         return length, depth, height
 
 
-def _along(residential: float, commercial: float, avenue: float, boulevard: float, narrow: float) -> dict[str, float]:
+def _along(
+    residential: float, commercial: float, avenue: float, boulevard: float, narrow: float
+) -> dict[str, float]:
     return {
-        "residential": residential, "commercial": commercial, "avenue": avenue, "boulevard": boulevard,
-        "ring": 0.5 * avenue, "narrow": narrow,
-    }  # fmt: skip
+        "residential": residential,
+        "commercial": commercial,
+        "avenue": avenue,
+        "boulevard": boulevard,
+        "ring": 0.5 * avenue,
+        "narrow": narrow,
+    }
 
 
 CATALOGUE: Final[tuple[PropKind, ...]] = (
     PropKind(
-        "shelter", ((2.8, 1.2, 2.3), (4.0, 1.5, 2.5)), ("verge", "frontage"), _along(0.0, 0.4, 0.7, 0.6, 0.0),
-        shapes.three_walls, shapes.shelter, ROOFS, spread_m=0.2, seen_m=50.0,
+        "shelter",
+        ((2.8, 1.2, 2.3), (4.0, 1.5, 2.5)),
+        ("verge", "frontage"),
+        _along(0.0, 0.4, 0.7, 0.6, 0.0),
+        shapes.three_walls,
+        shapes.shelter,
+        ROOFS,
+        spread_m=0.2,
+        seen_m=50.0,
     ),
     PropKind(
-        "car", ((3.8, 1.7, 1.45), (4.6, 1.9, 1.45)), ("driveway",), _along(1.0, 0.4, 0.2, 0.2, 0.3),
-        shapes.block, shapes.car, CARS, seen_m=50.0,
+        "car",
+        ((3.8, 1.7, 1.45), (4.6, 1.9, 1.45)),
+        ("driveway",),
+        _along(1.0, 0.4, 0.2, 0.2, 0.3),
+        shapes.block,
+        shapes.car,
+        CARS,
+        seen_m=50.0,
     ),
     PropKind(
-        "tree", ((0.2, 0.2, 4.6), (0.4, 0.4, 7.5)), ("verge", "frontage"), _along(5.0, 2.5, 4.5, 7.0, 0.0),
-        shapes.upright_solid, shapes.tree, LEAVES, row=True, spread_m=1.8, seen_m=50.0, grown=True,
+        "tree",
+        ((0.2, 0.2, 4.6), (0.4, 0.4, 7.5)),
+        ("verge", "frontage"),
+        _along(5.0, 2.5, 4.5, 7.0, 0.0),
+        shapes.upright_solid,
+        shapes.tree,
+        LEAVES,
+        row=True,
+        spread_m=1.8,
+        seen_m=50.0,
+        grown=True,
     ),
     PropKind(
-        "lamp", ((0.12, 0.12, 4.5), (0.16, 0.16, 7.0)), ("verge", "curb", "frontage"), _along(3.0, 4.0, 3.6, 3.6, 2.5),
-        shapes.upright_solid, shapes.lamp, (METAL, (0.16, 0.24, 0.20), (0.45, 0.46, 0.47)), row=True, seen_m=50.0,
+        "lamp",
+        ((0.12, 0.12, 4.5), (0.16, 0.16, 7.0)),
+        ("verge", "curb", "frontage"),
+        _along(3.0, 4.0, 3.6, 3.6, 2.5),
+        shapes.upright_solid,
+        shapes.lamp,
+        (METAL, (0.16, 0.24, 0.20), (0.45, 0.46, 0.47)),
+        row=True,
+        seen_m=50.0,
     ),
     PropKind(
-        "fence", ((2.2, 0.4, 1.9), (4.0, 0.4, 2.1)), ("frontage",), _along(0.25, 0.35, 0.3, 0.2, 0.1),
-        shapes.block, shapes.fence, FENCES, seen_m=40.0,
+        "fence",
+        ((2.2, 0.4, 1.9), (4.0, 0.4, 2.1)),
+        ("frontage",),
+        _along(0.25, 0.35, 0.3, 0.2, 0.1),
+        shapes.block,
+        shapes.fence,
+        FENCES,
+        seen_m=40.0,
     ),
     PropKind(
-        "cafe", ((1.75, 0.6, 0.85), (1.95, 0.75, 0.85)), ("frontage",), _along(0.1, 3.0, 1.0, 2.0, 0.3),
-        shapes.table_and_chairs, shapes.cafe, CHAIRS,
+        "cafe",
+        ((1.75, 0.6, 0.85), (1.95, 0.75, 0.85)),
+        ("frontage",),
+        _along(0.1, 3.0, 1.0, 2.0, 0.3),
+        shapes.table_and_chairs,
+        shapes.cafe,
+        CHAIRS,
     ),
     PropKind(
-        "bench", ((1.4, 0.45, 0.85), (1.9, 0.55, 0.9)), ("verge", "frontage"), _along(0.8, 1.6, 1.2, 2.2, 0.1),
-        shapes.block, shapes.park_bench, (WOOD, (0.40, 0.42, 0.40)),
+        "bench",
+        ((1.4, 0.45, 0.85), (1.9, 0.55, 0.9)),
+        ("verge", "frontage"),
+        _along(0.8, 1.6, 1.2, 2.2, 0.1),
+        shapes.block,
+        shapes.park_bench,
+        (WOOD, (0.40, 0.42, 0.40)),
     ),
     PropKind(
-        "rack", ((0.75, 0.6, 0.8), (1.5, 0.75, 0.85)), ("verge", "frontage"), _along(0.4, 1.5, 0.7, 0.9, 0.1),
-        shapes.hoops, shapes.rack, ((0.60, 0.62, 0.64), (0.20, 0.22, 0.24)),
+        "rack",
+        ((0.75, 0.6, 0.8), (1.5, 0.75, 0.85)),
+        ("verge", "frontage"),
+        _along(0.4, 1.5, 0.7, 0.9, 0.1),
+        shapes.hoops,
+        shapes.rack,
+        ((0.60, 0.62, 0.64), (0.20, 0.22, 0.24)),
     ),
     PropKind(
-        "planter", ((0.7, 0.35, 0.8), (1.5, 0.5, 1.0)), ("frontage", "verge"), _along(1.5, 2.2, 0.8, 1.8, 1.2),
-        shapes.block, shapes.planter, PLANTS,
+        "planter",
+        ((0.7, 0.35, 0.8), (1.5, 0.5, 1.0)),
+        ("frontage", "verge"),
+        _along(1.5, 2.2, 0.8, 1.8, 1.2),
+        shapes.block,
+        shapes.planter,
+        PLANTS,
     ),
     PropKind(
-        "bin", ((0.42, 0.42, 0.9), (0.56, 0.56, 1.05)), ("verge", "frontage"), _along(1.2, 1.8, 1.0, 1.4, 0.4),
-        shapes.upright_solid, shapes.litter_bin, BINS,
+        "bin",
+        ((0.42, 0.42, 0.9), (0.56, 0.56, 1.05)),
+        ("verge", "frontage"),
+        _along(1.2, 1.8, 1.0, 1.4, 0.4),
+        shapes.upright_solid,
+        shapes.litter_bin,
+        BINS,
     ),
     PropKind(
-        "scooter", ((1.15, 0.45, 1.1), (1.2, 0.5, 1.15)), ("verge", "frontage"), _along(0.5, 1.6, 0.8, 0.8, 0.3),
-        shapes.block, shapes.scooter, SCOOTERS,
+        "scooter",
+        ((1.15, 0.45, 1.1), (1.2, 0.5, 1.15)),
+        ("verge", "frontage"),
+        _along(0.5, 1.6, 0.8, 0.8, 0.3),
+        shapes.block,
+        shapes.scooter,
+        SCOOTERS,
     ),
     PropKind(
-        "boxes", ((0.7, 0.4, 0.6), (1.3, 0.6, 1.1)), ("frontage",), _along(0.5, 0.9, 0.4, 0.2, 0.5),
-        shapes.block, shapes.boxes, CARTONS,
+        "boxes",
+        ((0.7, 0.4, 0.6), (1.3, 0.6, 1.1)),
+        ("frontage",),
+        _along(0.5, 0.9, 0.4, 0.2, 0.5),
+        shapes.block,
+        shapes.boxes,
+        CARTONS,
     ),
     PropKind(
-        "hydrant", ((0.28, 0.28, 0.7), (0.32, 0.32, 0.8)), ("verge", "frontage"), _along(0.7, 0.6, 0.6, 0.6, 0.3),
-        shapes.upright_solid, shapes.hydrant, HYDRANTS,
+        "hydrant",
+        ((0.28, 0.28, 0.7), (0.32, 0.32, 0.8)),
+        ("verge", "frontage"),
+        _along(0.7, 0.6, 0.6, 0.6, 0.3),
+        shapes.upright_solid,
+        shapes.hydrant,
+        HYDRANTS,
     ),
     PropKind(
-        "sign", ((0.06, 0.06, 2.5), (0.08, 0.08, 2.8)), ("verge", "curb"), _along(1.6, 2.2, 2.0, 1.6, 1.6),
-        shapes.upright_solid, shapes.sign, SIGNS, seen_m=40.0,
+        "sign",
+        ((0.06, 0.06, 2.5), (0.08, 0.08, 2.8)),
+        ("verge", "curb"),
+        _along(1.6, 2.2, 2.0, 1.6, 1.6),
+        shapes.upright_solid,
+        shapes.sign,
+        SIGNS,
+        seen_m=40.0,
     ),
     PropKind(
-        "bollard", ((0.12, 0.12, 0.75), (0.18, 0.18, 1.0)), ("verge", "curb"), _along(0.5, 2.0, 0.6, 1.0, 4.0),
-        shapes.upright_solid, shapes.bollard, (METAL, (0.72, 0.60, 0.16)), row=True,
+        "bollard",
+        ((0.12, 0.12, 0.75), (0.18, 0.18, 1.0)),
+        ("verge", "curb"),
+        _along(0.5, 2.0, 0.6, 1.0, 4.0),
+        shapes.upright_solid,
+        shapes.bollard,
+        (METAL, (0.72, 0.60, 0.16)),
+        row=True,
     ),
-)  # fmt: skip
+)
 """In the order in which they find a place: the large first."""
 
 _OBSTACLES: Final[Mapping[ObstacleKind, _Forms]] = {
@@ -155,14 +258,17 @@ _OBSTACLES: Final[Mapping[ObstacleKind, _Forms]] = {
 """Solids, parts and paints of what scenarios put on the way."""
 
 KINDS: Final[Mapping[str, PropKind]] = {kind.name: kind for kind in CATALOGUE} | {
-    f"obstacle:{name}": PropKind(f"obstacle:{name}", OBSTACLE_SIZES_M[name], (), {}, *forms, seen_m=math.inf)
+    f"obstacle:{name}": PropKind(
+        f"obstacle:{name}", OBSTACLE_SIZES_M[name], (), {}, *forms, seen_m=math.inf
+    )
     for name, forms in _OBSTACLES.items()
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Prop:
-    """A thing that stands on the street. heading_rad: of its x axis; paint: index of its kind's paints.
+    """A thing that stands on the street. heading_rad: of its x axis; paint: index of its kind's
+    paints.
 
     turned_rad: what is drawn of it is turned further by so much; what is bumped into is not.
     """

@@ -1,7 +1,9 @@
-"""What street furniture is made of: a few low-poly meshes of one colour each, and the solids to bump into.
+"""What street furniture is made of: a few low-poly meshes of one colour each, and the solids to
+bump into.
 
-A prop's own frame: x along the street, y to the left, z up from its foot; it faces -y. Each function takes the
-prop's size and makes about sixty triangles at most, because the software renderer's time is triangles.
+A prop's own frame: x along the street, y to the left, z up from its foot; it faces -y. Each
+function takes the prop's size and makes about sixty triangles at most, because the software
+renderer's time is triangles.
 """
 
 from __future__ import annotations
@@ -13,9 +15,9 @@ from typing import Final, Literal
 import numpy as np
 
 from cosim.core.geometry import Floats
+from physics.ground.mesh import Part, box, disc, frustum, join
 from physics.street.tree_shapes import SPECIES, crown, tree_trunk
 from physics.street.vehicles import vehicle_parts
-from physics.world.mesh import Part, box, disc, frustum, join
 
 Size = tuple[float, float, float]
 """Length along the street, depth across it, height, in metres."""
@@ -34,7 +36,8 @@ PANE: Final = (0.66, 0.76, 0.80)
 
 @dataclass(frozen=True, slots=True)
 class Solid:
-    """What the robot bumps into: an upright box (length, depth, height) or cylinder (diameter twice, height).
+    """What the robot bumps into: an upright box (length, depth, height) or cylinder (diameter
+    twice, height).
 
     at_m: its middle across the ground; low_m: its lower end.
     """
@@ -56,7 +59,8 @@ def block(size: Size) -> tuple[Solid, ...]:
 def three_walls(size: Size) -> tuple[Solid, ...]:
     """Back wall and both sides of a shelter that is open to the front."""
     length, depth, height = size
-    wall, side = (length, 0.08, height), (0.08, depth, height)
+    wall = (length, 0.08, height)
+    side = (0.08, depth, height)
     ends = [Solid("box", side, (s * 0.5 * (length - 0.08), 0.0)) for s in (-1, 1)]
     return Solid("box", wall, (0.0, 0.5 * (depth - 0.08))), *ends
 
@@ -72,11 +76,14 @@ def _hoops_at(length: float) -> Floats:
 
 
 def hoops(size: Size) -> tuple[Solid, ...]:
-    return tuple(Solid("box", (0.06, size[1], size[2]), (float(x), 0.0)) for x in _hoops_at(size[0]))
+    return tuple(
+        Solid("box", (0.06, size[1], size[2]), (float(x), 0.0)) for x in _hoops_at(size[0])
+    )
 
 
 def lamp(size: Size) -> tuple[Part, ...]:
-    r, h = 0.5 * size[0], size[2]
+    r = 0.5 * size[0]
+    h = size[2]
     pole = [
         frustum((r, r), (0.9 * r, 0.9 * r), 0.0, 0.8, 8),
         frustum((0.6 * r, 0.6 * r), (0.4 * r, 0.4 * r), 0.8, h - 0.02, 6),
@@ -88,13 +95,16 @@ def lamp(size: Size) -> tuple[Part, ...]:
 
 
 def sign(size: Size) -> tuple[Part, ...]:
-    """A plate on a pole, its face to the oncoming traffic, its back bare metal: a square, a disc or a triangle."""
+    """A plate on a pole, its face to the oncoming traffic, its back bare metal: a square, a disc or
+    a triangle."""
     h = size[2]
     pole = frustum((0.03, 0.03), (0.03, 0.03), 0.0, h, 6)
     shape = ((4, 0.25 * math.pi), (14, 0.0), (3, 0.0))[round(100.0 * size[0]) % 3]
-    middle, radius = (-0.040, 0.0, h - 0.31), 0.30 if shape[0] > 4 else 0.34
+    middle = (-0.040, 0.0, h - 0.31)
+    radius = 0.30 if shape[0] > 4 else 0.34
     back = disc(radius, (0.0, 0.0, 0.0), *shape).moved((0.004, 0.0, 0.0))
-    rim, face = disc(radius, (0.0, 0.0, 0.0), *shape), disc(0.86 * radius, (0.0, 0.0, 0.0), *shape)
+    rim = disc(radius, (0.0, 0.0, 0.0), *shape)
+    face = disc(0.86 * radius, (0.0, 0.0, 0.0), *shape)
     turn = [disc_.moved((0.0, 0.0, 0.0), math.pi) for disc_ in (rim, face)]
     return (
         Part(join([pole, back.moved(middle)]), ZINC, "metal-brushed"),
@@ -104,14 +114,19 @@ def sign(size: Size) -> tuple[Part, ...]:
 
 
 def hydrant(size: Size) -> tuple[Part, ...]:
-    r, h = 0.5 * size[0], size[2]
+    r = 0.5 * size[0]
+    h = size[2]
     body = [frustum((0.8 * r, 0.8 * r), (0.7 * r, 0.7 * r), 0.0, 0.75 * h, 6)]
-    body += [frustum((r, r), (0.3 * r, 0.3 * r), 0.75 * h, h, 6), box((2.0 * r, 0.1, 0.1), (0.0, 0.0, 0.55 * h))]
+    body += [
+        frustum((r, r), (0.3 * r, 0.3 * r), 0.75 * h, h, 6),
+        box((2.0 * r, 0.1, 0.1), (0.0, 0.0, 0.55 * h)),
+    ]
     return (Part(join(body), None),)
 
 
 def litter_bin(size: Size) -> tuple[Part, ...]:
-    r, h = 0.5 * size[0], size[2]
+    r = 0.5 * size[0]
+    h = size[2]
     foot = frustum((0.7 * r, 0.7 * r), (0.7 * r, 0.7 * r), 0.0, 0.08, 8)
     lid = [
         frustum((r, r), (0.6 * r, 0.6 * r), 0.92 * h, h, 8),
@@ -123,11 +138,24 @@ def litter_bin(size: Size) -> tuple[Part, ...]:
 
 def park_bench(size: Size) -> tuple[Part, ...]:
     length, depth, h = size
-    slats = [box((length, 0.25 * depth, 0.05), (0.0, y * depth, 0.45), skip=("bottom",)) for y in (-0.35, -0.05, 0.25)]
-    slats += [box((length, 0.04, 0.12), (0.0, 0.5 * depth - 0.05, h - z), skip=("bottom",)) for z in (0.06, 0.24)]
-    legs = [box((0.06, depth, 0.42), (s * (0.5 * length - 0.2), 0.0, 0.21), skip=("bottom", "top")) for s in (-1, 1)]
+    slats = [
+        box((length, 0.25 * depth, 0.05), (0.0, y * depth, 0.45), skip=("bottom",))
+        for y in (-0.35, -0.05, 0.25)
+    ]
+    slats += [
+        box((length, 0.04, 0.12), (0.0, 0.5 * depth - 0.05, h - z), skip=("bottom",))
+        for z in (0.06, 0.24)
+    ]
+    legs = [
+        box((0.06, depth, 0.42), (s * (0.5 * length - 0.2), 0.0, 0.21), skip=("bottom", "top"))
+        for s in (-1, 1)
+    ]
     legs += [
-        box((0.06, 0.05, h - 0.42), (s * (0.5 * length - 0.2), 0.5 * depth - 0.03, 0.5 * (h + 0.3)), skip=("top",))
+        box(
+            (0.06, 0.05, h - 0.42),
+            (s * (0.5 * length - 0.2), 0.5 * depth - 0.03, 0.5 * (h + 0.3)),
+            skip=("top",),
+        )
         for s in (-1, 1)
     ]
     return Part(join(slats), None, "planks"), Part(join(legs), METAL)
@@ -149,8 +177,10 @@ def planter(size: Size) -> tuple[Part, ...]:
 
 
 def bollard(size: Size) -> tuple[Part, ...]:
-    r, h = 0.5 * size[0], size[2]
-    post, band = frustum((r, r), (0.85 * r, 0.85 * r), 0.0, h, 6), frustum((r, r), (r, r), 0.78 * h, 0.9 * h, 6)
+    r = 0.5 * size[0]
+    h = size[2]
+    post = frustum((r, r), (0.85 * r, 0.85 * r), 0.0, h, 6)
+    band = frustum((r, r), (r, r), 0.78 * h, 0.9 * h, 6)
     return Part(post, None, "metal-painted"), Part(band, BANDS)
 
 
@@ -158,7 +188,10 @@ def rack(size: Size) -> tuple[Part, ...]:
     _, depth, h = size
     bars = []
     for x in _hoops_at(size[0]).tolist():
-        bars += [box((0.05, 0.05, h), (x, s * (0.5 * depth - 0.03), 0.5 * h), skip=("bottom", "top")) for s in (-1, 1)]
+        bars += [
+            box((0.05, 0.05, h), (x, s * (0.5 * depth - 0.03), 0.5 * h), skip=("bottom", "top"))
+            for s in (-1, 1)
+        ]
         bars.append(box((0.05, depth, 0.05), (x, 0.0, h - 0.025), skip=("bottom", "left", "right")))
     return (Part(join(bars), None, "metal-brushed"),)
 
@@ -169,8 +202,12 @@ def scooter(size: Size) -> tuple[Part, ...]:
     stem = box((0.05, 0.05, h - 0.1), (front - 0.06, 0.0, 0.5 * h + 0.05), skip=("bottom",))
     stem = stem.tilted(-0.1, (front, 0.0, 0.1))
     dark = [box((0.05, depth, 0.04), (front - 0.14, 0.0, h))]
-    dark += [box((0.22, 0.06, 0.22), (x, 0.0, 0.11), skip=("bottom", "top")) for x in (front, -front)]
-    return Part(join([box((length - 0.4, 0.16, 0.06), (0.0, 0.0, 0.17)), stem]), None), Part(join(dark), _DARK)
+    dark += [
+        box((0.22, 0.06, 0.22), (x, 0.0, 0.11), skip=("bottom", "top")) for x in (front, -front)
+    ]
+    return Part(join([box((length - 0.4, 0.16, 0.06), (0.0, 0.0, 0.17)), stem]), None), Part(
+        join(dark), _DARK
+    )
 
 
 def cafe(size: Size) -> tuple[Part, ...]:
@@ -183,7 +220,9 @@ def cafe(size: Size) -> tuple[Part, ...]:
         chairs.append(box((0.40, 0.40, 0.08), (x, 0.0, 0.43), skip=("bottom",)))
         back = "back" if s > 0 else "front"
         chairs.append(box((0.04, 0.40, 0.85), (x + s * 0.18, 0.0, 0.425), skip=("bottom", "top")))
-        chairs.append(box((0.04, 0.36, 0.40), (x - s * 0.16, 0.0, 0.2), skip=("bottom", "top", back)))
+        chairs.append(
+            box((0.04, 0.36, 0.40), (x - s * 0.16, 0.0, 0.2), skip=("bottom", "top", back))
+        )
     return Part(join(table), METAL), Part(join(chairs), None)
 
 
@@ -191,9 +230,19 @@ def shelter(size: Size) -> tuple[Part, ...]:
     length, depth, h = size
     roof = box((length + 0.2, depth + 0.1, 0.1), (0.0, 0.0, h))
     seat = box((length - 1.0, 0.35, 0.06), (0.0, 0.5 * depth - 0.3, 0.48), skip=("back", "front"))
-    panes = [box((length, 0.05, h - 0.3), (0.0, 0.5 * depth - 0.03, 0.5 * h + 0.05), skip=("top", "front", "back"))]
+    panes = [
+        box(
+            (length, 0.05, h - 0.3),
+            (0.0, 0.5 * depth - 0.03, 0.5 * h + 0.05),
+            skip=("top", "front", "back"),
+        )
+    ]
     panes += [
-        box((0.05, depth, h - 0.1), (s * 0.5 * (length - 0.05), 0.0, 0.5 * h - 0.05), skip=("top", "bottom"))
+        box(
+            (0.05, depth, h - 0.1),
+            (s * 0.5 * (length - 0.05), 0.0, 0.5 * h - 0.05),
+            skip=("top", "bottom"),
+        )
         for s in (-1, 1)
     ]
     return Part(join([roof, seat]), None), Part(join(panes), PANE)
@@ -203,16 +252,26 @@ def boxes(size: Size) -> tuple[Part, ...]:
     length, depth, h = size
     skip = ("bottom",)
     low = box((0.55 * length, depth, 0.6 * h), (-0.225 * length, 0.0, 0.3 * h), skip)
-    other = box((0.42 * length, 0.8 * depth, 0.45 * h), (0.29 * length, -0.05 * depth, 0.225 * h), skip)
-    high = box((0.4 * length, 0.7 * depth, 0.4 * h), (-0.2 * length, 0.0, 0.8 * h), skip).moved((0.0, 0.0, 0.0), 0.12)
+    other = box(
+        (0.42 * length, 0.8 * depth, 0.45 * h), (0.29 * length, -0.05 * depth, 0.225 * h), skip
+    )
+    high = box((0.4 * length, 0.7 * depth, 0.4 * h), (-0.2 * length, 0.0, 0.8 * h), skip).moved(
+        (0.0, 0.0, 0.0), 0.12
+    )
     return (Part(join([low, other, high]), None),)
 
 
 def fence(size: Size) -> tuple[Part, ...]:
     length, depth, h = size
     mesh = [box((length, 0.04, 0.62 * h), (0.0, 0.0, 0.6 * h))]
-    feet = [box((0.25, depth, 0.12), (s * (0.5 * length - 0.3), 0.0, 0.06), skip=("bottom",)) for s in (-1, 1)]
-    posts = [box((0.06, 0.06, h), (s * (0.5 * length - 0.3), 0.0, 0.5 * h), skip=("bottom", "top")) for s in (-1, 1)]
+    feet = [
+        box((0.25, depth, 0.12), (s * (0.5 * length - 0.3), 0.0, 0.06), skip=("bottom",))
+        for s in (-1, 1)
+    ]
+    posts = [
+        box((0.06, 0.06, h), (s * (0.5 * length - 0.3), 0.0, 0.5 * h), skip=("bottom", "top"))
+        for s in (-1, 1)
+    ]
     return Part(join(mesh), None, "wood-upright"), Part(join([*feet, *posts]), WHITE)
 
 

@@ -1,7 +1,8 @@
-"""What there is to do on a street: benches to sit on, shop windows to look into, shelters to wait at, as they stand.
+"""What there is to do on a street: benches to sit on, shop windows to look into, shelters to wait
+at, as they stand.
 
-Each spot says where one would stand or have the feet, and which way one would face; whether somebody fits there is
-for who sends people there.
+Each spot says where one would stand or have the feet, and which way one would face; whether
+somebody fits there is for who sends people there.
 """
 
 from __future__ import annotations
@@ -15,15 +16,16 @@ import shapely
 from cosim.core.geometry import wrap_angle
 from cosim.core.state import PERSON_RADIUS_M
 from cosim.place.street_map import Lane, StreetMap
+from physics.street.building_style import shop_windows
 from physics.street.buildings import Building
 from physics.street.frontage import paved
-from physics.street.fronts import shop_windows
 from physics.street.furniture import Prop
 
 What = Literal["bench", "window", "stop"]
 
 _BEFORE_M: Final = PERSON_RADIUS_M + 0.05
-"""From the edge of a bench to who sits on it: there the legs are (see `physics.people.gestures.SEATED_BACK_M`)."""
+"""From the edge of a bench to who sits on it: there the legs are (see
+`physics.people.gestures.SEATED_BACK_M`)."""
 _SEAT_M: Final = 0.36
 """From the middle of a bench to the middle of a seat: two sit on one."""
 _BY_SHELTER_M: Final = 0.45
@@ -33,8 +35,9 @@ _ROAD_M: Final = 30.0
 
 
 class InteractionSpot(NamedTuple):
-    """A place to do something. thing: id of the prop or building, and the number of the seat or window at it; spots of
-    one thing exclude each other. at_m: the point of the thing that one sits on, looks at, or waits by."""
+    """A place to do something. thing: id of the prop or building, and the number of the seat or
+    window at it; spots of one thing exclude each other. at_m: the point of the thing that one sits
+    on, looks at, or waits by."""
 
     what: What
     thing: str
@@ -44,7 +47,9 @@ class InteractionSpot(NamedTuple):
     at_m: tuple[float, float]
 
 
-def spots(street_map: StreetMap, props: Sequence[Prop], buildings: Sequence[Building]) -> Iterator[InteractionSpot]:
+def spots(
+    street_map: StreetMap, props: Sequence[Prop], buildings: Sequence[Building]
+) -> Iterator[InteractionSpot]:
     """Everything to do at these props and buildings; a thing's best spot first."""
     for prop in props:
         if prop.kind == "bench":
@@ -60,22 +65,33 @@ def spots(street_map: StreetMap, props: Sequence[Prop], buildings: Sequence[Buil
                 x = window.x_m - away_m * math.cos(window.heading_rad)
                 y = window.y_m - away_m * math.sin(window.heading_rad)
                 thing = f"{building.id}/{number}@{window.x_m:.1f},{window.y_m:.1f}"
-                yield InteractionSpot("window", thing, x, y, window.heading_rad, (window.x_m, window.y_m))
+                yield InteractionSpot(
+                    "window", thing, x, y, window.heading_rad, (window.x_m, window.y_m)
+                )
 
 
 def _seats(bench: Prop) -> Iterator[InteractionSpot]:
     """Who sits on a bench faces right of its heading, the back to its other side."""
     for number, along_m in enumerate((-_SEAT_M, _SEAT_M)):
-        seat, feet = _beside(bench, along_m, 0.0), _beside(bench, along_m, 0.5 * bench.size_m[1] + _BEFORE_M)
+        seat = _beside(bench, along_m, 0.0)
+        feet = _beside(bench, along_m, 0.5 * bench.size_m[1] + _BEFORE_M)
         yield InteractionSpot(
-            "bench", f"{bench.id}/{number}", *feet, wrap_angle(bench.heading_rad - 0.5 * math.pi), seat
+            "bench",
+            f"{bench.id}/{number}",
+            *feet,
+            wrap_angle(bench.heading_rad - 0.5 * math.pi),
+            seat,
         )
 
 
 def _by_shelter(shelter: Prop, street_map: StreetMap) -> Iterator[InteractionSpot]:
     """Before the open side of a bus shelter, looking to the road."""
     point = shapely.Point(shelter.x_m, shelter.y_m)
-    lanes = [p for p in street_map.near("lane", point.buffer(_ROAD_M)) if isinstance(p, Lane) and p.kind == "road"]
+    lanes = [
+        p
+        for p in street_map.near("lane", point.buffer(_ROAD_M))
+        if isinstance(p, Lane) and p.kind == "road"
+    ]
     if not lanes:
         return
     nearest = min(lanes, key=lambda lane: (float(shapely.distance(lane.polygon, point)), lane.id))
@@ -85,7 +101,9 @@ def _by_shelter(shelter: Prop, street_map: StreetMap) -> Iterator[InteractionSpo
     facing = wrap_angle(open_rad if ahead > 0.0 else open_rad + math.pi)
     for number, share in enumerate((-0.3, 0.0, 0.3)):
         feet = _beside(shelter, share * shelter.size_m[0], 0.5 * shelter.size_m[1] + _BY_SHELTER_M)
-        yield InteractionSpot("stop", f"{shelter.id}/{number}", *feet, facing, (shelter.x_m, shelter.y_m))
+        yield InteractionSpot(
+            "stop", f"{shelter.id}/{number}", *feet, facing, (shelter.x_m, shelter.y_m)
+        )
 
 
 def _beside(prop: Prop, along_m: float, right_m: float) -> tuple[float, float]:

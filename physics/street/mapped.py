@@ -1,4 +1,5 @@
-"""What the map itself shows beside its streets, as buildings and props: cut by tiles, found by place.
+"""What the map itself shows beside its streets, as buildings and props: cut by tiles, found by
+place.
 
 Where it shows something, nothing of the kind is made up: see `shows`.
 """
@@ -18,19 +19,20 @@ from shapely.geometry import Polygon
 from cosim.place import overlay
 from cosim.place.street_map import LANDS, Feature, StreetMap
 from cosim.place.terrain import Terrain
+from physics.ground.tiles import Key, key_at, square
 from physics.street.buildings import FACADES, Building, Wall
 from physics.street.furniture import KINDS, PROP_VARIANTS, Prop
-from physics.world.tiles import Key, key_at, square
 
 HOUSES_M: Final = 30.0
 MAPPED_NEAR_M: Final = 40.0
-"""So near to a building of the map no building is made up, and so near to a thing of the map none of its kind."""
+"""So near to a building of the map no building is made up, and so near to a thing of the map none
+of its kind."""
 _SPLINTER_M2: Final = 0.05
 
 
 class MappedThings:
-    """The buildings and things that a street map shows, for the engines; a pure function of the map. kinds: of the
-    things."""
+    """The buildings and things that a street map shows, for the engines; a pure function of the
+    map. kinds: of the things."""
 
     def __init__(self, street_map: StreetMap) -> None:
         by_kind: dict[str, list[Feature]] = defaultdict(list)
@@ -41,12 +43,15 @@ class MappedThings:
         self._floors_m = [_floor_m(house.polygon, street_map.terrain) for house in self._houses]
         self._house_tree = shapely.STRtree([house.polygon for house in self._houses])
         self._trees = {
-            kind: shapely.STRtree([shapely.Point(f.x_m, f.y_m) for f in features]) for kind, features in by_kind.items()
+            kind: shapely.STRtree([shapely.Point(f.x_m, f.y_m) for f in features])
+            for kind, features in by_kind.items()
         }
         self._trees["building"] = self._house_tree
         self.kinds = frozenset(by_kind)
         self._props: dict[Key, list[Prop]] = defaultdict(list)
-        for i, feature in enumerate(f for f in street_map.features if f.kind not in ("building", *LANDS)):
+        for i, feature in enumerate(
+            f for f in street_map.features if f.kind not in ("building", *LANDS)
+        ):
             self._props[key_at(feature.x_m, feature.y_m)].append(_prop(i, feature))
 
     @property
@@ -69,10 +74,13 @@ class MappedThings:
         return tuple(found)
 
     def shows(self, kind: str, place: shapely.Geometry) -> bool:
-        """Whether the map shows things of a kind near a place, so that none need be made up there."""
+        """Whether the map shows things of a kind near a place, so that none need be made up
+        there."""
         tree = self._trees.get(kind)
         reach = HOUSES_M if kind == "building" else MAPPED_NEAR_M
-        return tree is not None and bool(len(tree.query(place, predicate="dwithin", distance=reach)))
+        return tree is not None and bool(
+            len(tree.query(place, predicate="dwithin", distance=reach))
+        )
 
 
 def _prop(number: int, feature: Feature) -> Prop:
@@ -85,7 +93,14 @@ def _prop(number: int, feature: Feature) -> Prop:
     paint = drawn // PROP_VARIANTS % len(kind.paints)
     turned = number % 7 * 0.9 if kind.grown else 0.0
     return Prop(
-        f"prop:map:{number}", feature.kind, variant, feature.x_m, feature.y_m, feature.heading_rad, paint, turned
+        f"prop:map:{number}",
+        feature.kind,
+        variant,
+        feature.x_m,
+        feature.y_m,
+        feature.heading_rad,
+        paint,
+        turned,
     )
 
 
@@ -93,11 +108,14 @@ def _floor_m(whole: Polygon, terrain: Terrain | None) -> float:
     """The floor of a house: as high as the land around it, on average."""
     if terrain is None:
         return 0.0
-    return float(terrain.height(shapely.get_coordinates(shapely.segmentize(whole.exterior, 1.0))).mean())
+    return float(
+        terrain.height(shapely.get_coordinates(shapely.segmentize(whole.exterior, 1.0))).mean()
+    )
 
 
 def _building(number: int, house: Feature, part: Polygon, floor_m: float) -> Building:
-    """A part of a mapped building, in the box around it along its street; all parts of one bear its name and look."""
+    """A part of a mapped building, in the box around it along its street; all parts of one bear its
+    name and look."""
     part = shapely.orient_polygons(part)
     cos, sin = math.cos(house.heading_rad), math.sin(house.heading_rad)
     turn = np.array([[cos, -sin], [sin, cos]])
@@ -120,11 +138,14 @@ def _building(number: int, house: Feature, part: Polygon, floor_m: float) -> Bui
 
 
 def _walls(part: Polygon, whole: Polygon) -> tuple[Wall, ...]:
-    """The sides of a part that are sides of the whole, the outside to their right; cuts between tiles are none."""
+    """The sides of a part that are sides of the whole, the outside to their right; cuts between
+    tiles are none."""
     sides = []
     for ring in (part.exterior, *part.interiors):
         xy = shapely.get_coordinates(ring)
         sides += list(zip(xy[:-1].tolist(), xy[1:].tolist(), strict=True))
     middles = shapely.points(np.array(sides).mean(axis=1))
     outer = shapely.dwithin(middles, whole.boundary, 1e-3)
-    return tuple((*a, *b) for (a, b), is_wall in zip(sides, outer, strict=True) if is_wall and a != b)
+    return tuple(
+        (*a, *b) for (a, b), is_wall in zip(sides, outer, strict=True) if is_wall and a != b
+    )

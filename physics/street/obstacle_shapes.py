@@ -1,7 +1,7 @@
 """What the things are made of that scenarios put on the way and streets do not have of themselves.
 
-As in `furniture_shapes`: a thing's own frame has x along its length, y to the left, z up from its foot; each function
-takes the size and makes about a hundred triangles at most.
+As in `furniture_shapes`: a thing's own frame has x along its length, y to the left, z up from its
+foot; each function takes the size and makes about a hundred triangles at most.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from typing import Final
 
 import numpy as np
 
+from physics.ground.mesh import Mesh, Part, box, join, quads
 from physics.street.furniture_shapes import METAL, WHITE, Size
-from physics.world.mesh import Mesh, Part, box, join, quads
 
 _RUBBER: Final = (0.07, 0.07, 0.08)
 _RED: Final = (0.82, 0.10, 0.09)
@@ -38,12 +38,19 @@ def bike(size: Size) -> tuple[Part, ...]:
     """On its stand, its front wheel towards +x."""
     length, depth, h = size
     r = 0.335
-    rear, front = (-0.5 * length + r, r), (0.5 * length - r, r)
-    pedals, seat, head = (-0.08, 0.30), (-0.20, 0.76), (front[0] - 0.16, 0.80)
+    rear = (-0.5 * length + r, r)
+    front = (0.5 * length - r, r)
+    pedals = (-0.08, 0.30)
+    seat = (-0.20, 0.76)
+    head = (front[0] - 0.16, 0.80)
     frame = [
-        _tube(rear, pedals, 0.04), _tube(pedals, (-0.22, 0.86), 0.045), _tube(pedals, head, 0.05),
-        _tube(seat, head, 0.045), _tube(rear, seat, 0.035), _tube((head[0] - 0.05, h - 0.04), front, 0.04),
-    ]  # fmt: skip
+        _tube(rear, pedals, 0.04),
+        _tube(pedals, (-0.22, 0.86), 0.045),
+        _tube(pedals, head, 0.05),
+        _tube(seat, head, 0.045),
+        _tube(rear, seat, 0.035),
+        _tube((head[0] - 0.05, h - 0.04), front, 0.04),
+    ]
     dark = [
         box((0.26, 0.16, 0.07), (-0.24, 0.0, 0.90)),
         box((0.05, depth, 0.04), (head[0] - 0.06, 0.0, h - 0.02)),
@@ -59,15 +66,26 @@ def sandwich_board(size: Size) -> tuple[Part, ...]:
     length, depth, h = size
     lean = math.atan2(0.5 * length - 0.03, h)
     tall = (h - 0.02) / math.cos(lean)
-    boards, faces, words = [], [], []
+    boards = []
+    faces = []
+    words = []
     for side in (-1, 1):
         foot = side * (0.5 * length - 0.03)
         pivot = (foot, 0.0, 0.0)
-        boards.append(box((0.03, depth, tall), (foot, 0.0, 0.5 * tall + 0.005)).tilted(-side * lean, pivot))
-        plate = box((0.006, depth - 0.10, 0.78 * tall), (foot + side * 0.018, 0.0, 0.55 * tall), skip=("bottom",))
+        boards.append(
+            box((0.03, depth, tall), (foot, 0.0, 0.5 * tall + 0.005)).tilted(-side * lean, pivot)
+        )
+        plate = box(
+            (0.006, depth - 0.10, 0.78 * tall),
+            (foot + side * 0.018, 0.0, 0.55 * tall),
+            skip=("bottom",),
+        )
         faces.append(plate.tilted(-side * lean, pivot))
         for k, share in enumerate((0.6, 0.45, 0.5)):
-            line = ((0.008, share * depth, 0.07 * tall), (foot + side * 0.020, 0.0, (0.78 - 0.17 * k) * tall))
+            line = (
+                (0.008, share * depth, 0.07 * tall),
+                (foot + side * 0.020, 0.0, (0.78 - 0.17 * k) * tall),
+            )
             words.append(box(*line, skip=("bottom", "top")).tilted(-side * lean, pivot))
     return Part(join(boards), WHITE), Part(join(faces), None), Part(join(words), _PAPER)
 
@@ -77,11 +95,20 @@ def construction_fence(size: Size) -> tuple[Part, ...]:
     length, depth, h = size
     count = max(2 * round(length / _BOARD_M / 2.0) + 1, 3)
     step = length / count
-    fields = [box((step, 0.05, 0.25), ((k + 0.5) * step - 0.5 * length, 0.0, h - 0.125)) for k in range(count)]
+    fields = [
+        box((step, 0.05, 0.25), ((k + 0.5) * step - 0.5 * length, 0.0, h - 0.125))
+        for k in range(count)
+    ]
     bars = [box((length, 0.04, 0.04), (0.0, 0.0, z)) for z in (0.2, 0.55)]
     uprights = np.linspace(-0.5, 0.5, max(round(length / 0.3), 2) + 1) * (length - 0.06)
-    bars += [box((0.035, 0.035, h - 0.35), (float(x), 0.0, 0.5 * (h - 0.1)), skip=("top", "bottom")) for x in uprights]
-    feet = [box((0.16, depth, 0.10), (s * (0.5 * length - 0.12), 0.0, 0.05), skip=("bottom",)) for s in (-1, 1)]
+    bars += [
+        box((0.035, 0.035, h - 0.35), (float(x), 0.0, 0.5 * (h - 0.1)), skip=("top", "bottom"))
+        for x in uprights
+    ]
+    feet = [
+        box((0.16, depth, 0.10), (s * (0.5 * length - 0.12), 0.0, 0.05), skip=("bottom",))
+        for s in (-1, 1)
+    ]
     return (
         Part(join(fields[::2]), _RED),
         Part(join(fields[1::2]), WHITE),
@@ -90,8 +117,11 @@ def construction_fence(size: Size) -> tuple[Part, ...]:
     )
 
 
-def _tapered(low_m: tuple[float, float], high_m: tuple[float, float], from_m: float, to_m: float) -> Mesh:
-    """A box that widens or narrows upwards: half its length and depth at two heights; without a bottom."""
+def _tapered(
+    low_m: tuple[float, float], high_m: tuple[float, float], from_m: float, to_m: float
+) -> Mesh:
+    """A box that widens or narrows upwards: half its length and depth at two heights; without a
+    bottom."""
     turns = np.array([(1, -1), (1, 1), (-1, 1), (-1, -1)])
     low = np.column_stack([turns * low_m, np.full(4, from_m)])
     high = np.column_stack([turns * high_m, np.full(4, to_m)])
@@ -101,7 +131,8 @@ def _tapered(low_m: tuple[float, float], high_m: tuple[float, float], from_m: fl
 
 def _tube(one: tuple[float, float], other: tuple[float, float], thick_m: float) -> Mesh:
     """A square bar between two points (x, z) of the middle plane."""
-    (x0, z0), (x1, z1) = one, other
+    (x0, z0) = one
+    (x1, z1) = other
     far = math.hypot(x1 - x0, z1 - z0)
     bar = box((far, thick_m, thick_m), (x0 + 0.5 * far, 0.0, z0), skip=("front", "back"))
     return bar.tilted(-math.atan2(z1 - z0, x1 - x0), (x0, 0.0, z0))
@@ -111,13 +142,18 @@ def _wheel(radius_m: float, wide_m: float, centre_m: tuple[float, float, float])
     return _ring(radius_m, wide_m, radius_m - 0.001, centre_m)
 
 
-def _ring(radius_m: float, wide_m: float, thick_m: float, centre_m: tuple[float, float, float]) -> Mesh:
+def _ring(
+    radius_m: float, wide_m: float, thick_m: float, centre_m: tuple[float, float, float]
+) -> Mesh:
     """A wheel that rolls along x, open within: its tread and its two flanks."""
     angle = 2.0 * np.pi * np.arange(_WHEEL_SIDES + 1) / _WHEEL_SIDES
     circle = np.column_stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)])
     half = np.array([0.0, 0.5 * wide_m, 0.0])
-    outer, inner = radius_m * circle, (radius_m - thick_m) * circle
+    outer = radius_m * circle
+    inner = (radius_m - thick_m) * circle
     left = np.stack([inner[:-1], inner[1:], outer[1:], outer[:-1]], axis=1) + half
     right = np.stack([inner[:-1], outer[:-1], outer[1:], inner[1:]], axis=1) - half
-    tread = np.stack([outer[:-1] - half, outer[:-1] + half, outer[1:] + half, outer[1:] - half], axis=1)
+    tread = np.stack(
+        [outer[:-1] - half, outer[:-1] + half, outer[1:] + half, outer[1:] - half], axis=1
+    )
     return quads(np.concatenate([left, right, tread]) + np.asarray(centre_m))

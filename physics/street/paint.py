@@ -1,8 +1,8 @@
 """Paint and tactile paving: what lies on the ground without changing what the ground is.
 
-Lines between lanes and between the directions of a road, stop lines before signalised crossings, and fields of domes
-where a crossing begins. Lines belong to the tile of their middle and follow its heights; domes lie in the triangles of
-the ground, of whichever tile.
+Lines between lanes and between the directions of a road, stop lines before signalised crossings,
+and fields of domes where a crossing begins. Lines belong to the tile of their middle and follow its
+heights; domes lie in the triangles of the ground, of whichever tile.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats, Polyline
 from cosim.place.street_map import Lane, StreetMap, Strip
-from physics.world.mesh import EMPTY, Mesh, join, plan_triangles
-from physics.world.tiles import Tile, key_at, kind_of, square
+from physics.ground.mesh import EMPTY, Mesh, join, plan_triangles
+from physics.ground.tiles import Tile, key_at, kind_of, square
 
 LINE_M: Final = 0.12
 STOP_LINE_M: Final = 0.40
@@ -54,7 +54,8 @@ def paint_in(street_map: StreetMap, tile: Tile) -> Mapping[str, Mesh]:
 
 
 def _lines(street_map: StreetMap, lane: Lane) -> Iterator[Floats]:
-    """Quads (4, 2) along the inner side of a lane: dashes to the next lane, or to the other direction."""
+    """Quads (4, 2) along the inner side of a lane: dashes to the next lane, or to the other
+    direction."""
     side = -1.0 if street_map.left_hand else 1.0
     edge, _, index = lane.id.rpartition("_")
     beside = street_map.lanes.get(f"{edge}_{int(index) + 1}") if index.isdecimal() else None
@@ -74,23 +75,32 @@ def _lines(street_map: StreetMap, lane: Lane) -> Iterator[Floats]:
 
 
 def _meets(street_map: StreetMap, lane: Lane, side: float, edge: str) -> bool:
-    """Whether another road's lanes lie right beside a lane, no verge between them. side: 1 left, -1 right."""
+    """Whether another road's lanes lie right beside a lane, no verge between them. side: 1 left, -1
+    right."""
     line = Polyline(lane.line)
     x, y, heading = line.at(0.5 * line.length_m)
     aside = side * (0.5 * lane.width_m + 0.3)
     spot = shapely.Point(x - aside * math.sin(heading), y + aside * math.cos(heading))
-    return any(isinstance(piece, Lane) and piece.edge == edge for piece in street_map.near("lane", spot))
+    return any(
+        isinstance(piece, Lane) and piece.edge == edge for piece in street_map.near("lane", spot)
+    )
 
 
 def _stop_line(lane: Lane, crossings: Sequence[Strip]) -> Iterator[Floats]:
     """Quads across a lane where it ends before a signalised crossing."""
     end = shapely.Point(lane.line[-1])
     for crossing in crossings:
-        if crossing.signalised and lane.edge in crossing.crosses and end.distance(crossing.polygon) < _STOP_WITHIN_M:
+        if (
+            crossing.signalised
+            and lane.edge in crossing.crosses
+            and end.distance(crossing.polygon) < _STOP_WITHIN_M
+        ):
             line = Polyline(lane.line)
             at_m = min(line.length_m, _before(line, crossing)) - _STOP_BEFORE_M
             if at_m > 1.0:
-                yield from _band(line, np.array([at_m - STOP_LINE_M, at_m]), 0.0, lane.width_m - 0.2)
+                yield from _band(
+                    line, np.array([at_m - STOP_LINE_M, at_m]), 0.0, lane.width_m - 0.2
+                )
             return
 
 
@@ -99,7 +109,9 @@ def _before(line: Polyline, crossing: Strip) -> float:
     met = shapely.intersection(shapely.LineString(line.points), crossing.polygon)
     if shapely.is_empty(met):
         return math.inf
-    along = shapely.line_locate_point(shapely.LineString(line.points), shapely.points(shapely.get_coordinates(met)))
+    along = shapely.line_locate_point(
+        shapely.LineString(line.points), shapely.points(shapely.get_coordinates(met))
+    )
     return float(np.min(along))
 
 
@@ -128,11 +140,14 @@ def _laid(quads: Sequence[Floats], tile: Tile) -> Mesh:
 
 def _on_ground(xy: Floats, triangles: NDArray[np.int64], tile: Tile) -> Mesh:
     up = np.tile([0.0, 0.0, 1.0], (len(xy), 1))
-    return Mesh(np.column_stack([xy, tile.height(xy) + _LIFT_M]), up, np.asarray(triangles, dtype=np.int32))
+    return Mesh(
+        np.column_stack([xy, tile.height(xy) + _LIFT_M]), up, np.asarray(triangles, dtype=np.int32)
+    )
 
 
 def _fields(street_map: StreetMap, crossings: Sequence[Strip], tile: Tile) -> Mesh:
-    """Domes at both ends of the crossings, on walkable ground only: what of them lies on the tile."""
+    """Domes at both ends of the crossings, on walkable ground only: what of them lies on the
+    tile."""
     border = shapely.box(*square(tile.key))
     ends = [(line, one.width_m) for one in crossings for line in (one.line, one.line[::-1])]
     fields = [_field(street_map, Polyline(line), width_m) for line, width_m in ends]
@@ -144,7 +159,8 @@ def _fields(street_map: StreetMap, crossings: Sequence[Strip], tile: Tile) -> Me
 
 
 def _draped(field: shapely.Geometry, ground: Mesh) -> Mesh:
-    """A field cut along the triangles of the ground under it, so that it lies in them; 4 mm above."""
+    """A field cut along the triangles of the ground under it, so that it lies in them; 4 mm
+    above."""
     faces = ground.vertices[ground.triangles]
     normal = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
     x0, y0, x1, y1 = shapely.bounds(field)
@@ -171,5 +187,9 @@ def _field(street_map: StreetMap, line: Polyline, width_m: float) -> shapely.Geo
     far = near + TACTILE_M * along
     field = shapely.Polygon([near - left, far - left, far + left, near + left])
     walked = [corner.polygon for corner in street_map.near("corner", field)]
-    walked += [s.polygon for s in street_map.near("strip", field) if isinstance(s, Strip) and s.kind == "sidewalk"]
+    walked += [
+        s.polygon
+        for s in street_map.near("strip", field)
+        if isinstance(s, Strip) and s.kind == "sidewalk"
+    ]
     return shapely.intersection(field, shapely.union_all(walked)) if walked else shapely.Polygon()

@@ -1,8 +1,10 @@
-"""Where street furniture stands: drawn for each sidewalk from the street map and a seed, zone by zone.
+"""Where street furniture stands: drawn for each sidewalk from the street map and a seed, zone by
+zone.
 
-A sidewalk's props are drawn from its own generator, and a prop belongs to the tile of its middle: what stands in a
-tile does not depend on which tiles were asked for before. Along the middle of every sidewalk a band is kept free.
-No car is parked on the road: the crowd engine drives on every lane. Cars stand at the ends of driveways.
+A sidewalk's props are drawn from its own generator, and a prop belongs to the tile of its middle:
+what stands in a tile does not depend on which tiles were asked for before. Along the middle of
+every sidewalk a band is kept free. No car is parked on the road: the crowd engine drives on every
+lane. Cars stand at the ends of driveways.
 """
 
 from __future__ import annotations
@@ -19,10 +21,18 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Polyline
 from cosim.place import overlay
 from cosim.place.street_map import Lane, PieceKind, StreetMap, Strip
+from physics.ground.tiles import CURBSTONE_M, DRIVEWAY_M, RAMP_M, Key, key_at, square
 from physics.street.buildings import Frontage
-from physics.street.furniture import CATALOGUE, KINDS, PROP_VARIANTS, Prop, PropKind, Zone, footprints
+from physics.street.furniture import (
+    CATALOGUE,
+    KINDS,
+    PROP_VARIANTS,
+    Prop,
+    PropKind,
+    Zone,
+    footprints,
+)
 from physics.street.mapped import MappedThings
-from physics.world.tiles import CURBSTONE_M, DRIVEWAY_M, RAMP_M, Key, key_at, square
 
 CLEAR_HALF_M: Final = 0.6
 """The least half width of the band that is kept free along the middle of a sidewalk."""
@@ -55,17 +65,23 @@ _BY_TYPE: Final = (
 
 
 class _Band(NamedTuple):
-    """Where the props of a zone may be: distances from the middle line, positive away from the road, in metres."""
+    """Where the props of a zone may be: distances from the middle line, positive away from the
+    road, in metres."""
 
     low_m: float
     high_m: float
 
 
 class Placement:
-    """The props of a map under a seed; pure functions of map, seed and what is asked for, kept once known."""
+    """The props of a map under a seed; pure functions of map, seed and what is asked for, kept once
+    known."""
 
     def __init__(
-        self, street_map: StreetMap, seed: int, frontage: Frontage, mapped: MappedThings | None = None
+        self,
+        street_map: StreetMap,
+        seed: int,
+        frontage: Frontage,
+        mapped: MappedThings | None = None,
     ) -> None:
         self._map = street_map
         self._seed = seed
@@ -79,22 +95,34 @@ class Placement:
         """Props whose middle lies in the tile, in the net's order."""
         strips = self._map.near("strip", shapely.box(*_grown(square(key), _REACH_M)))
         props = [prop for s in strips if isinstance(s, Strip) for prop in self.on_strip(s)]
-        return (*self._mapped.props(key), *(prop for prop in props if key_at(prop.x_m, prop.y_m) == key))
+        return (
+            *self._mapped.props(key),
+            *(prop for prop in props if key_at(prop.x_m, prop.y_m) == key),
+        )
 
     def on_strip(self, strip: Strip) -> tuple[Prop, ...]:
-        """Props of a sidewalk: as drawn, without those that meet a house or what another sidewalk has drawn."""
+        """Props of a sidewalk: as drawn, without those that meet a house or what another sidewalk
+        has drawn."""
         if strip.id not in self._kept:
             props, ground = self._draw(strip)
             hit = np.zeros(len(props), dtype=bool)
             if props:
                 area = shapely.box(*_grown(shapely.total_bounds(ground), _REACH_M))
-                others = [s for s in self._map.near("strip", area) if isinstance(s, Strip) and s.id < strip.id]
+                others = [
+                    s
+                    for s in self._map.near("strip", area)
+                    if isinstance(s, Strip) and s.id < strip.id
+                ]
                 rivals = [polygon for s in others for polygon in self._draw(s)[1]]
                 rivals += list(footprints(self._mapped_in(area)))
                 hit |= _meets(ground, rivals, _GAP_M)
                 spread = np.array([KINDS[prop.kind].spread_m for prop in props])
-                hit |= _meets(shapely.buffer(ground, spread, quad_segs=2), self._houses_in(area), _MARGIN_M)
-            self._kept[strip.id] = tuple(prop for prop, is_hit in zip(props, hit, strict=True) if not is_hit)
+                hit |= _meets(
+                    shapely.buffer(ground, spread, quad_segs=2), self._houses_in(area), _MARGIN_M
+                )
+            self._kept[strip.id] = tuple(
+                prop for prop, is_hit in zip(props, hit, strict=True) if not is_hit
+            )
         return self._kept[strip.id]
 
     def _mapped_in(self, area: shapely.Polygon) -> list[Prop]:
@@ -108,12 +136,16 @@ class Placement:
         return [house for key in keys for house in self._houses[key]]
 
     def _draw(self, strip: Strip) -> tuple[list[Prop], NDArray[np.object_]]:
-        """Props of a sidewalk that fit its zones, the street and each other, and their footprints."""
+        """Props of a sidewalk that fit its zones, the street and each other, and their
+        footprints."""
         if strip.id not in self._drawn:
             props = list(draw(strip, self._seed)) if strip.kind == "sidewalk" else []
             shown = self._mapped.kinds
             props = [
-                p for p in props if p.kind not in shown or not self._mapped.shows(p.kind, shapely.Point(p.x_m, p.y_m))
+                p
+                for p in props
+                if p.kind not in shown
+                or not self._mapped.shows(p.kind, shapely.Point(p.x_m, p.y_m))
             ]
             ground = footprints(props)
             if props:
@@ -125,7 +157,8 @@ class Placement:
 
 
 def draw(strip: Strip, seed: int) -> Iterable[Prop]:
-    """Props for a sidewalk, drawn kind by kind; they may still meet each other or another street."""
+    """Props for a sidewalk, drawn kind by kind; they may still meet each other or another
+    street."""
     line = Polyline(strip.line if strip.road_side <= 0 else strip.line[::-1])
     bands = zones(strip)
     usable = line.length_m - 2.0 * PROP_END_GAP_M
@@ -140,7 +173,8 @@ def draw(strip: Strip, seed: int) -> Iterable[Prop]:
         fitting = [zone for zone in kind.zones if zone in bands]
         expected = kind.per_100m[style] * busy * usable / 100.0
         count = int(expected + rng.random())
-        variant, paint = int(rng.integers(PROP_VARIANTS)), int(rng.integers(len(kind.paints)))
+        variant = int(rng.integers(PROP_VARIANTS))
+        paint = int(rng.integers(len(kind.paints)))
         aside, phase = rng.random(2)
         if not fitting:
             continue
@@ -150,35 +184,62 @@ def draw(strip: Strip, seed: int) -> Iterable[Prop]:
             u, v, w = rng.random(3)
             if kind.row:
                 # What stands in a row is alike: one size, one distance from the curb.
-                s, share, zone = (k + 0.2 + 0.6 * phase + 0.05 * u) / count * usable, aside, fitting[0]
+                s = (k + 0.2 + 0.6 * phase + 0.05 * u) / count * usable
+                share = aside
+                zone = fitting[0]
             else:
-                s, share, zone = u * usable, v, fitting[min(int(w * len(fitting)), len(fitting) - 1)]
-                variant, paint = int(rng.integers(PROP_VARIANTS)), int(rng.integers(len(kind.paints)))
+                s = u * usable
+                share = v
+                zone = fitting[min(int(w * len(fitting)), len(fitting) - 1)]
+                variant = int(rng.integers(PROP_VARIANTS))
+                paint = int(rng.integers(len(kind.paints)))
             size = kind.size_m(variant)
             at_m = driveways[k] if zone == "driveway" else PROP_END_GAP_M + s
             turned = zone == "driveway" and _room(bands[zone]) > size[0]
-            prop = _stood(strip, line, at_m, bands[zone], share, kind, variant, paint, zone, turned, n)
-            if prop is None or (zone != "driveway" and any(_blocks(at_m, size[0], d) for d in driveways)):
+            prop = _stood(
+                strip, line, at_m, bands[zone], share, kind, variant, paint, zone, turned, n
+            )
+            if prop is None or (
+                zone != "driveway" and any(_blocks(at_m, size[0], d) for d in driveways)
+            ):
                 continue
             yield prop
             n += 1
 
 
 def _stood(
-    strip: Strip, line: Polyline, at_m: float, band: _Band, share: float, kind: PropKind, variant: int, paint: int,
-    zone: Zone, turned: bool, n: int,
-) -> Prop | None:  # fmt: skip
-    """A prop at an arc length of the line and a share of the free depth of its zone; None when it is too deep."""
+    strip: Strip,
+    line: Polyline,
+    at_m: float,
+    band: _Band,
+    share: float,
+    kind: PropKind,
+    variant: int,
+    paint: int,
+    zone: Zone,
+    turned: bool,
+    n: int,
+) -> Prop | None:
+    """A prop at an arc length of the line and a share of the free depth of its zone; None when it
+    is too deep."""
     length, depth, _ = kind.size_m(variant)
     if turned:
         length, depth = depth, length
     slack = _room(band) - depth
-    if slack < 0.0 or not PROP_END_GAP_M + 0.5 * length <= at_m <= line.length_m - PROP_END_GAP_M - 0.5 * length:
+    if (
+        slack < 0.0
+        or not PROP_END_GAP_M + 0.5 * length
+        <= at_m
+        <= line.length_m - PROP_END_GAP_M - 0.5 * length
+    ):
         return None
     x, y, along = line.at(at_m)
     away = band.low_m + 0.5 * depth + share * slack
-    heading = along + (0.5 * math.pi if turned else 0.0 if zone in ("frontage", "driveway") else math.pi)
-    x, y = x - away * math.sin(along), y + away * math.cos(along)
+    heading = along + (
+        0.5 * math.pi if turned else 0.0 if zone in ("frontage", "driveway") else math.pi
+    )
+    x = x - away * math.sin(along)
+    y = y + away * math.cos(along)
     further = 0.0
     if kind.name == "lamp" and zone == "frontage":
         further = math.pi  # its arm reaches over the sidewalk and the road, not into the houses
@@ -199,7 +260,9 @@ def zones(strip: Strip) -> dict[Zone, _Band]:
             found["curb"] = _Band(-half + _MARGIN_M, -clear_half_m(strip) - 0.01)
     frontage = min(strip.frontage_m, _ZONE_MAX_M)
     if frontage > 2.0 * _MARGIN_M:
-        found["frontage"] = found["driveway"] = _Band(half + _MARGIN_M, half + frontage - 2.0 * _MARGIN_M)
+        found["frontage"] = found["driveway"] = _Band(
+            half + _MARGIN_M, half + frontage - 2.0 * _MARGIN_M
+        )
     return found
 
 
@@ -212,7 +275,9 @@ def street_style(street_class: str) -> str:
     """The column of the catalogue for a street class of ours or a type of an imported edge."""
     if street_class in CATALOGUE[0].per_100m:
         return street_class
-    return next((ours for words, ours in _BY_TYPE if any(w in street_class for w in words)), "residential")
+    return next(
+        (ours for words, ours in _BY_TYPE if any(w in street_class for w in words)), "residential"
+    )
 
 
 def props_of(street_map: StreetMap, seed: int) -> tuple[Prop, ...]:
@@ -224,8 +289,8 @@ def props_of(street_map: StreetMap, seed: int) -> tuple[Prop, ...]:
 
 
 def driveway_ground(strip: Strip) -> list[shapely.Geometry]:
-    """For each driveway of a sidewalk what must stay open: its way from the road through verge, sidewalk and frontage,
-    and the flares of its ramp."""
+    """For each driveway of a sidewalk what must stay open: its way from the road through verge,
+    sidewalk and frontage, and the flares of its ramp."""
     line = Polyline(strip.line)
     found: list[shapely.Geometry] = []
     for at_m in strip.driveways:
@@ -240,17 +305,27 @@ def driveway_ground(strip: Strip) -> list[shapely.Geometry]:
     return found
 
 
-def _fits(street_map: StreetMap, strip: Strip, props: Sequence[Prop], ground: NDArray[np.object_]) -> NDArray[np.bool_]:
-    """Which props keep off the clear band, off other streets' ground and off each other, the earlier first."""
+def _fits(
+    street_map: StreetMap, strip: Strip, props: Sequence[Prop], ground: NDArray[np.object_]
+) -> NDArray[np.bool_]:
+    """Which props keep off the clear band, off other streets' ground and off each other, the
+    earlier first."""
     area = shapely.box(*_grown(shapely.total_bounds(ground), PROP_END_GAP_M))
     taken: list[shapely.Geometry] = []
     for piece in [piece for kind in _STREET for piece in street_map.near(kind, area)]:
         if piece is strip or (isinstance(piece, Lane) and piece.kind == "verge"):
             continue
         is_crossing = isinstance(piece, Strip) and piece.kind == "crossing"
-        taken.append(shapely.buffer(piece.polygon, PROP_END_GAP_M) if is_crossing else piece.polygon)
+        taken.append(
+            shapely.buffer(piece.polygon, PROP_END_GAP_M) if is_crossing else piece.polygon
+        )
     free = ~_meets(ground, taken, 0.02)
-    ways = [way for s in street_map.near("strip", area) if isinstance(s, Strip) for way in driveway_ground(s)]
+    ways = [
+        way
+        for s in street_map.near("strip", area)
+        if isinstance(s, Strip)
+        for way in driveway_ground(s)
+    ]
     free &= ~_meets(ground, ways, 0.0) | np.array([prop.kind == "car" for prop in props])
     half = clear_half_m(strip) if "curb" in zones(strip) else 0.5 * strip.width_m
     free &= np.asarray(shapely.distance(shapely.linestrings(strip.line), ground) >= half)
@@ -264,7 +339,9 @@ def _fits(street_map: StreetMap, strip: Strip, props: Sequence[Prop], ground: ND
     return np.asarray(free, dtype=bool)
 
 
-def _meets(ground: NDArray[np.object_], taken: Sequence[shapely.Geometry], gap_m: float) -> NDArray[np.bool_]:
+def _meets(
+    ground: NDArray[np.object_], taken: Sequence[shapely.Geometry], gap_m: float
+) -> NDArray[np.bool_]:
     hit = np.zeros(len(ground), dtype=bool)
     if taken:
         hit[shapely.STRtree(taken).query(ground, predicate="dwithin", distance=gap_m)[0]] = True
@@ -279,7 +356,8 @@ def _blocks(at_m: float, length_m: float, driveway_m: float) -> bool:
 def _keys_of(area: shapely.Geometry) -> list[Key]:
     """The tiles that the bounds of an area touch."""
     x0, y0, x1, y1 = shapely.bounds(area).tolist()
-    (i0, j0), (i1, j1) = key_at(x0, y0), key_at(x1, y1)
+    (i0, j0) = key_at(x0, y0)
+    (i1, j1) = key_at(x1, y1)
     return [(i, j) for i in range(i0, i1 + 1) for j in range(j0, j1 + 1)]
 
 

@@ -11,8 +11,8 @@ import shapely
 from cosim.core.geometry import Polyline
 from cosim.place.street_map import StreetMap, Strip
 from cosim.spec.scenario import Barrier
-from physics.world.mesh import Mesh, box, join
-from physics.world.tiles import Key, key_at, square
+from physics.ground.mesh import Mesh, box, join
+from physics.ground.tiles import Key, key_at, square
 
 PROP_RED: Final = (0.82, 0.10, 0.09)
 PROP_WHITE: Final = (0.93, 0.93, 0.91)
@@ -24,7 +24,8 @@ _BOARD_M: Final = 0.35
 
 
 def barrier_meshes(barrier: Barrier) -> tuple[Mesh, Mesh]:
-    """Red and white parts of a fence about its foot, before it is turned: x along the way it closes."""
+    """Red and white parts of a fence about its foot, before it is turned: x along the way it
+    closes."""
     count = max(2 * round(barrier.length_m / _BOARD_M / 2.0) + 1, 3)
     step = barrier.length_m / count
     red: list[Mesh] = []
@@ -32,7 +33,11 @@ def barrier_meshes(barrier: Barrier) -> tuple[Mesh, Mesh]:
     for low, high in ((0.45, 0.68), (0.77, 1.0)):
         height = (high - low) * barrier.height_m
         for k in range(count):
-            centre = (0.0, (k + 0.5) * step - 0.5 * barrier.length_m, 0.5 * (low + high) * barrier.height_m)
+            centre = (
+                0.0,
+                (k + 0.5) * step - 0.5 * barrier.length_m,
+                0.5 * (low + high) * barrier.height_m,
+            )
             board = box((0.5 * barrier.thickness_m, step, height), centre, skip=("left", "right"))
             (red if k % 2 == 0 else white).append(board)
     for side in (-1, 1):
@@ -62,18 +67,24 @@ def posts_in(street_map: StreetMap, key: Key) -> list[SignalPost]:
 
 
 def signal_posts(street_map: StreetMap, crossing: Strip) -> tuple[SignalPost, SignalPost]:
-    """The posts at both ends of a signalised crossing: at the curb beside it, where nobody walks, on the right as
-    one comes towards it unless that is walkable."""
+    """The posts at both ends of a signalised crossing: at the curb beside it, where nobody walks,
+    on the right as one comes towards it unless that is walkable."""
     line = Polyline(crossing.line)
-    first, second = (_post(street_map, crossing, Polyline(points)) for points in (line.points, line.points[::-1]))
+    first, second = (
+        _post(street_map, crossing, Polyline(points)) for points in (line.points, line.points[::-1])
+    )
     return first, second
 
 
 def _post(street_map: StreetMap, crossing: Strip, line: Polyline) -> SignalPost:
     x, y, heading = line.at(line.length_m)
     cos, sin = math.cos(heading), math.sin(heading)
-    aside, back = 0.5 * crossing.width_m + 0.3, 0.15
-    places = [(x - back * cos + side * aside * sin, y - back * sin - side * aside * cos) for side in (1, -1)]
+    aside = 0.5 * crossing.width_m + 0.3
+    back = 0.15
+    places = [
+        (x - back * cos + side * aside * sin, y - back * sin - side * aside * cos)
+        for side in (1, -1)
+    ]
     free = [at for at in places if not _walkable(street_map, at)]
     return SignalPost(crossing.id, *(free or places)[0], heading + math.pi)
 
@@ -85,7 +96,12 @@ def _walkable(street_map: StreetMap, at: tuple[float, float]) -> bool:
 
 def post_mesh() -> Mesh:
     """Pole and housing, the face towards +x."""
-    return join([box((0.08, 0.08, 2.2), (0.0, 0.0, 1.1), skip=("bottom",)), box((0.14, 0.30, 0.62), (0.03, 0.0, 2.4))])
+    return join(
+        [
+            box((0.08, 0.08, 2.2), (0.0, 0.0, 1.1), skip=("bottom",)),
+            box((0.14, 0.30, 0.62), (0.03, 0.0, 2.4)),
+        ]
+    )
 
 
 def lamp_mesh(walk: bool) -> Mesh:

@@ -1,7 +1,8 @@
 """Trees: a trunk that tapers and forks, and a crown of clumps, drawn as one closed surface.
 
-A crown is the outline of several balls as seen from its middle: the farthest of them in each direction. So the clumps
-cost no triangles that nobody sees, and every camera draws the same solid: labels need no leaf to be see-through.
+A crown is the outline of several balls as seen from its middle: the farthest of them in each
+direction. So the clumps cost no triangles that nobody sees, and every camera draws the same solid:
+labels need no leaf to be see-through.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from cosim.core.geometry import Floats
-from physics.world.mesh import Ints, Mesh, join, smooth_normals
+from physics.ground.mesh import Ints, Mesh, join, smooth_normals
 
 _SIDES: Final = 13
 _ROWS: Final = 8
@@ -25,9 +26,10 @@ _SHARP: Final = 16.0
 
 @dataclass(frozen=True, slots=True)
 class Species:
-    """How a kind of tree grows. clear: share of its height below the crown; wide: widest radius of the crown as a
-    share of the height; full: height of the widest part in the crown, 0 to 1; clumps: how many; loose: their size as a
-    share of the crown's; cover: a layer of physics.textures.walls."""
+    """How a kind of tree grows. clear: share of its height below the crown; wide: widest radius of
+    the crown as a share of the height; full: height of the widest part in the crown, 0 to 1;
+    clumps: how many; loose: their size as a share of the crown's; cover: a layer of
+    physics.textures.walls."""
 
     clear: float
     wide: float
@@ -48,7 +50,8 @@ SPECIES: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Crown:
-    """mesh: closed, from the middle outwards; shade: (V,) how much light reaches between the leaves, 0 to 1."""
+    """mesh: closed, from the middle outwards; shade: (V,) how much light reaches between the
+    leaves, 0 to 1."""
 
     mesh: Mesh
     shade: Floats
@@ -62,18 +65,24 @@ def clear_m(species: Species, height_m: float) -> float:
 def crown(species: Species, height_m: float) -> Crown:
     """The crown of a tree of a height, its foot at the origin."""
     low = clear_m(species, height_m)
-    half, wide = 0.5 * (height_m - low), species.wide * height_m
+    half = 0.5 * (height_m - low)
+    wide = species.wide * height_m
     rng = np.random.default_rng(zlib.crc32(f"{species}:{height_m:.3f}".encode()))
     rays, triangles = _globe()
     reach = _reach(rays, species, rng) * rng.uniform(0.91, 1.09, len(rays))
-    reach[[0, -1]] = 0.96 * reach[1 : 1 + _SIDES].mean(), 0.96 * reach[-1 - _SIDES : -1].mean()  # no tips at the poles
+    reach[[0, -1]] = (
+        0.96 * reach[1 : 1 + _SIDES].mean(),
+        0.96 * reach[-1 - _SIDES : -1].mean(),
+    )  # no tips at the poles
     at = rays * reach[:, None]
     widest = np.hypot(at[:, 0], at[:, 1]).max()
     bottom, top = at[:, 2].min(), at[:, 2].max()
     up = (at[:, 2] - bottom) / (top - bottom)
     at[:, :2] *= wide / widest
     at[:, 2] = low + 2.0 * half * up
-    near = np.maximum.reduceat(reach[_neighbours(triangles, len(rays))[0]], _neighbours(triangles, len(rays))[1])
+    near = np.maximum.reduceat(
+        reach[_neighbours(triangles, len(rays))[0]], _neighbours(triangles, len(rays))[1]
+    )
     crease = np.clip((reach / near - 0.66) / 0.34, 0.0, 1.0)
     shade = (0.50 + 0.50 * up**0.8) * (0.55 + 0.45 * crease)
     return Crown(Mesh(at, smooth_normals(at, triangles), triangles), shade)
@@ -95,14 +104,19 @@ def tree_trunk(species: Species, height_m: float, radius_m: float) -> Mesh:
         tip = np.array([math.cos(angle), math.sin(angle), 0.0]) * 0.6 * species.wide * height_m
         tip[2] = low + (0.22 + 0.06 * k) * (height_m - low)
         start = fork + np.array([0.0, 0.0, 0.05 * k * low])
-        tubes.append(_tube(np.stack([start, tip]), radius_m * np.array([0.36, 0.14]), around[[0, 2, 4]]))
+        tubes.append(
+            _tube(np.stack([start, tip]), radius_m * np.array([0.36, 0.14]), around[[0, 2, 4]])
+        )
     return join(tubes)
 
 
 def _globe() -> tuple[Floats, Ints]:
-    """Unit vectors (V, 3) of rings between two poles, every other ring turned by half a side; (T, 3) triangles."""
+    """Unit vectors (V, 3) of rings between two poles, every other ring turned by half a side; (T,
+    3) triangles."""
     polar = np.pi * np.arange(1, _ROWS + 1) / (_ROWS + 1)
-    turn = 2.0 * np.pi * (np.arange(_SIDES)[None, :] + 0.5 * (np.arange(_ROWS)[:, None] % 2)) / _SIDES
+    turn = (
+        2.0 * np.pi * (np.arange(_SIDES)[None, :] + 0.5 * (np.arange(_ROWS)[:, None] % 2)) / _SIDES
+    )
     ring = np.stack(
         [
             np.sin(polar)[:, None] * np.cos(turn),
@@ -116,11 +130,18 @@ def _globe() -> tuple[Floats, Ints]:
     after = (k + 1) % _SIDES
     found = [np.stack([np.zeros_like(k), 1 + k, 1 + after], axis=1)]
     for row in range(_ROWS - 1):
-        a, b = 1 + row * _SIDES, 1 + (row + 1) * _SIDES
+        a = 1 + row * _SIDES
+        b = 1 + (row + 1) * _SIDES
         if row % 2 == 0:
-            found += [np.stack([a + k, b + k, a + after], 1), np.stack([a + after, b + k, b + after], 1)]
+            found += [
+                np.stack([a + k, b + k, a + after], 1),
+                np.stack([a + after, b + k, b + after], 1),
+            ]
         else:
-            found += [np.stack([a + k, b + k, b + after], 1), np.stack([a + k, b + after, a + after], 1)]
+            found += [
+                np.stack([a + k, b + k, b + after], 1),
+                np.stack([a + k, b + after, a + after], 1),
+            ]
     last = 1 + (_ROWS - 1) * _SIDES
     found.append(np.stack([last + k, np.full_like(k, len(rays) - 1), last + after], axis=1))
     return rays, np.concatenate(found).astype(np.int32)
@@ -132,8 +153,12 @@ def _reach(rays: Floats, species: Species, rng: np.random.Generator) -> Floats:
     n = species.clumps
     up = np.linspace(-0.55, 0.95, n) + rng.uniform(-0.08, 0.08, n)
     around = golden * np.arange(n) + rng.uniform(-0.4, 0.4, n)
-    flat = np.sqrt(np.maximum(1.0 - np.clip((up - 2.0 * species.full + 1.0) / 1.2, -1.0, 1.0) ** 2, 0.05))
-    middle = (1.0 - 0.8 * species.loose) * np.column_stack([flat * np.cos(around), flat * np.sin(around), up])
+    flat = np.sqrt(
+        np.maximum(1.0 - np.clip((up - 2.0 * species.full + 1.0) / 1.2, -1.0, 1.0) ** 2, 0.05)
+    )
+    middle = (1.0 - 0.8 * species.loose) * np.column_stack(
+        [flat * np.cos(around), flat * np.sin(around), up]
+    )
     radius = species.loose * rng.uniform(0.85, 1.15, n)
     middle = np.concatenate([np.zeros((1, 3)), middle])
     radius = np.append(0.5, radius)
@@ -145,7 +170,8 @@ def _reach(rays: Floats, species: Species, rng: np.random.Generator) -> Floats:
 
 
 def _neighbours(triangles: Ints, count: int) -> tuple[Ints, Ints]:
-    """Of each corner its own number and its neighbours', one after the other, and where each corner's begin."""
+    """Of each corner its own number and its neighbours', one after the other, and where each
+    corner's begin."""
     pairs = np.concatenate([triangles[:, [i, j]] for i in range(3) for j in range(3)])
     pairs = np.unique(pairs, axis=0)
     return pairs[:, 1], np.searchsorted(pairs[:, 0], np.arange(count)).astype(np.int32)
@@ -159,7 +185,11 @@ def _tube(middles: Floats, radii: Floats, around: Floats) -> Mesh:
     after = (k + 1) % len(k)
     found = []
     for row in range(len(middles) - 1):
-        a, b = row * len(k), (row + 1) * len(k)
-        found += [np.stack([a + k, a + after, b + after], 1), np.stack([a + k, b + after, b + k], 1)]
+        a = row * len(k)
+        b = (row + 1) * len(k)
+        found += [
+            np.stack([a + k, a + after, b + after], 1),
+            np.stack([a + k, b + after, b + k], 1),
+        ]
     triangles = np.concatenate(found).astype(np.int32)
     return Mesh(at, smooth_normals(at, triangles), triangles)

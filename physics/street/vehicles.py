@@ -1,6 +1,8 @@
-"""What is drawn of vehicles: cars of several shapes, vans, lorries, buses and two-wheelers, by length and name.
+"""What is drawn of vehicles: cars of several shapes, vans, lorries, buses and two-wheelers, by
+length and name.
 
-A vehicle's own frame: x ahead, y left, the road at z = 0. A form is a few meshes of one colour each.
+A vehicle's own frame: x ahead, y left, the road at z = 0. A form is a few meshes of one colour
+each.
 """
 
 from __future__ import annotations
@@ -13,15 +15,23 @@ from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
+from physics.ground.mesh import Mesh, Part, box, join, quads
 from physics.textures.layers import Colour
-from physics.world.mesh import Mesh, Part, box, join, quads
 
 Shape = Literal["sedan", "hatchback", "estate", "suv", "van", "lorry", "bus", "scooter"]
 
 _PAINTS: Final = (
-    (0.86, 0.86, 0.87), (0.12, 0.13, 0.15), (0.55, 0.57, 0.60), (0.62, 0.11, 0.12), (0.13, 0.24, 0.48),
-    (0.20, 0.36, 0.28), (0.80, 0.68, 0.20), (0.34, 0.36, 0.39), (0.70, 0.72, 0.74), (0.44, 0.31, 0.22),
-)  # fmt: skip
+    (0.86, 0.86, 0.87),
+    (0.12, 0.13, 0.15),
+    (0.55, 0.57, 0.60),
+    (0.62, 0.11, 0.12),
+    (0.13, 0.24, 0.48),
+    (0.20, 0.36, 0.28),
+    (0.80, 0.68, 0.20),
+    (0.34, 0.36, 0.39),
+    (0.70, 0.72, 0.74),
+    (0.44, 0.31, 0.22),
+)
 GLASS: Final = (0.16, 0.20, 0.25)
 TYRE: Final = (0.07, 0.07, 0.08)
 RIM: Final = (0.58, 0.59, 0.61)
@@ -37,11 +47,13 @@ _PROUD_M: Final = 0.012
 """How far panes and lamps stand before the sheet metal."""
 
 _Profile = Sequence[tuple[float, float]]
-"""(x, z) of a convex outline seen from the right, counter-clockwise; x as a share of the length, z in metres."""
+"""(x, z) of a convex outline seen from the right, counter-clockwise; x as a share of the length, z
+in metres."""
 
 
 class _Car(NamedTuple):
-    """lower: outline of the body; waist: (x, z) of windscreen and rear window at their feet; roof: likewise above."""
+    """lower: outline of the body; waist: (x, z) of windscreen and rear window at their feet; roof:
+    likewise above."""
 
     lower: _Profile
     waist: tuple[tuple[float, float], tuple[float, float]]
@@ -50,22 +62,34 @@ class _Car(NamedTuple):
 
 _OUTLINES: Final[dict[Shape, _Car]] = {
     "sedan": _Car(
-        ((-0.5, 0.30), (0.5, 0.28), (0.5, 0.58), (0.43, 0.74), (0.22, 0.88), (-0.34, 0.92), (-0.49, 0.84)),
-        ((0.23, 0.86), (-0.36, 0.90)), ((0.05, 1.42), (-0.20, 1.42)),
+        (
+            (-0.5, 0.30),
+            (0.5, 0.28),
+            (0.5, 0.58),
+            (0.43, 0.74),
+            (0.22, 0.88),
+            (-0.34, 0.92),
+            (-0.49, 0.84),
+        ),
+        ((0.23, 0.86), (-0.36, 0.90)),
+        ((0.05, 1.42), (-0.20, 1.42)),
     ),
     "hatchback": _Car(
         ((-0.5, 0.30), (0.5, 0.28), (0.5, 0.60), (0.43, 0.76), (0.25, 0.90), (-0.48, 0.94)),
-        ((0.26, 0.88), (-0.48, 0.92)), ((0.07, 1.48), (-0.36, 1.46)),
+        ((0.26, 0.88), (-0.48, 0.92)),
+        ((0.07, 1.48), (-0.36, 1.46)),
     ),
     "estate": _Car(
         ((-0.5, 0.30), (0.5, 0.28), (0.5, 0.58), (0.43, 0.74), (0.23, 0.88), (-0.49, 0.92)),
-        ((0.24, 0.86), (-0.49, 0.90)), ((0.06, 1.45), (-0.41, 1.47)),
+        ((0.24, 0.86), (-0.49, 0.90)),
+        ((0.06, 1.45), (-0.41, 1.47)),
     ),
     "suv": _Car(
         ((-0.5, 0.38), (0.5, 0.36), (0.5, 0.72), (0.45, 0.92), (0.25, 1.04), (-0.49, 1.06)),
-        ((0.26, 1.02), (-0.49, 1.04)), ((0.10, 1.68), (-0.42, 1.70)),
+        ((0.26, 1.02), (-0.49, 1.04)),
+        ((0.10, 1.68), (-0.42, 1.70)),
     ),
-}  # fmt: skip
+}
 
 
 def paint(name: str) -> Colour:
@@ -100,7 +124,8 @@ def _car(car: _Car, length_m: float, width_m: float) -> tuple[Part, ...]:
     wheelbase = 0.29 * length_m
     wheels = [(x, s * (half - 0.08)) for x in (wheelbase, -wheelbase) for s in (1, -1)]
     tyres, rims = _wheels(wheels, 0.33 if car.roof[0][1] > 1.6 else 0.31, 0.20)
-    front, low = 0.5 * length_m, car.lower[2][1]
+    front = 0.5 * length_m
+    low = car.lower[2][1]
     lamps = [_plate(front, s * (half - 0.26), low - 0.08, 0.34, 0.14) for s in (1, -1)]
     rear = [_plate(-front, s * (half - 0.20), car.waist[1][1] - 0.22, 0.28, 0.16) for s in (1, -1)]
     return (
@@ -114,12 +139,22 @@ def _car(car: _Car, length_m: float, width_m: float) -> tuple[Part, ...]:
 
 
 def _van(length_m: float, width_m: float) -> tuple[Part, ...]:
-    half, front = 0.5 * width_m - 0.03, 0.5 * length_m
-    outline = [(-front, 0.35), (front, 0.32), (front, 0.95), (front - 0.9, 1.25), (front - 1.5, 2.25), (-front, 2.3)]
+    half = 0.5 * width_m - 0.03
+    front = 0.5 * length_m
+    outline = [
+        (-front, 0.35),
+        (front, 0.32),
+        (front, 0.95),
+        (front - 0.9, 1.25),
+        (front - 1.5, 2.25),
+        (-front, 2.3),
+    ]
     body = _hull(outline, half, half - 0.10)
     side = [
         _side_pane(
-            [(front - 1.12, 1.25), (front - 2.2, 1.25), (front - 2.2, 1.95), (front - 1.5, 1.95)], s, half - 0.05
+            [(front - 1.12, 1.25), (front - 2.2, 1.25), (front - 2.2, 1.95), (front - 1.5, 1.95)],
+            s,
+            half - 0.05,
         )
         for s in (1, -1)
     ]
@@ -129,12 +164,23 @@ def _van(length_m: float, width_m: float) -> tuple[Part, ...]:
 
 
 def _lorry(length_m: float, width_m: float) -> tuple[Part, ...]:
-    half, front = 0.5 * width_m - 0.03, 0.5 * length_m
-    cab = [(front - 1.9, 0.5), (front, 0.45), (front, 1.35), (front - 0.25, 2.5), (front - 1.9, 2.5)]
+    half = 0.5 * width_m - 0.03
+    front = 0.5 * length_m
+    cab = [
+        (front - 1.9, 0.5),
+        (front, 0.45),
+        (front, 1.35),
+        (front - 0.25, 2.5),
+        (front - 1.9, 2.5),
+    ]
     load = box((length_m - 2.1, 2.0 * half, 2.2), (-1.05, 0.0, 2.0))
     frame = box((length_m - 0.6, 1.2 * half, 0.3), (-0.2, 0.0, 0.7))
     side = [
-        _side_pane([(front - 0.25, 1.45), (front - 1.3, 1.45), (front - 1.3, 2.2), (front - 0.3, 2.2)], s, half - 0.02)
+        _side_pane(
+            [(front - 0.25, 1.45), (front - 1.3, 1.45), (front - 1.3, 2.2), (front - 0.3, 2.2)],
+            s,
+            half - 0.02,
+        )
         for s in (1, -1)
     ]
     screen = _cross_pane((front - 0.02, 1.45), (front - 0.19, 2.25), half - 0.12, half - 0.12)
@@ -143,7 +189,8 @@ def _lorry(length_m: float, width_m: float) -> tuple[Part, ...]:
 
 
 def _bus(length_m: float, width_m: float) -> tuple[Part, ...]:
-    half, front = 0.5 * width_m - 0.03, 0.5 * length_m
+    half = 0.5 * width_m - 0.03
+    front = 0.5 * length_m
     body = box((length_m, 2.0 * half, 2.65), (0.0, 0.0, 1.65))
     count = max(round((length_m - 1.6) / 1.5), 1)
     step = (length_m - 1.6) / count
@@ -153,7 +200,12 @@ def _bus(length_m: float, width_m: float) -> tuple[Part, ...]:
         low = 0.55 if k in (count - 1, count // 2) else 1.3
         for s in (1, -1):
             foot = low if s < 0 else 1.3
-            pane = [(x + step - 0.06, foot), (x + 0.06, foot), (x + 0.06, 2.5), (x + step - 0.06, 2.5)]
+            pane = [
+                (x + step - 0.06, foot),
+                (x + 0.06, foot),
+                (x + 0.06, 2.5),
+                (x + step - 0.06, 2.5),
+            ]
             side.append(_side_pane(pane, s, half))
     screen = _cross_pane((front, 1.1), (front, 2.65), half - 0.12, half - 0.12)
     back = _cross_pane((-front, 2.5), (-front, 1.5), half - 0.25, half - 0.25, back=True)
@@ -161,11 +213,22 @@ def _bus(length_m: float, width_m: float) -> tuple[Part, ...]:
 
 
 def _boxy(
-    body: Mesh, panes: Sequence[Mesh], length_m: float, half: float, radius_m: float, lamp_m: float, rear_m: float
+    body: Mesh,
+    panes: Sequence[Mesh],
+    length_m: float,
+    half: float,
+    radius_m: float,
+    lamp_m: float,
+    rear_m: float,
 ) -> tuple[Part, ...]:
-    """A large vehicle from its body and panes: wheels and lamps are added. lamp_m, rear_m: heights of the lamps."""
+    """A large vehicle from its body and panes: wheels and lamps are added. lamp_m, rear_m: heights
+    of the lamps."""
     front = 0.5 * length_m
-    wheels = [(x, s * (half - 0.12)) for x in (front - 0.22 * length_m, -front + 0.24 * length_m) for s in (1, -1)]
+    wheels = [
+        (x, s * (half - 0.12))
+        for x in (front - 0.22 * length_m, -front + 0.24 * length_m)
+        for s in (1, -1)
+    ]
     tyres, rims = _wheels(wheels, radius_m, 0.26)
     lamps = [_plate(front, s * (half - 0.25), lamp_m, 0.34, 0.18) for s in (1, -1)]
     rear = [_plate(-front, s * (half - 0.16), rear_m, 0.16, 0.40) for s in (1, -1)]
@@ -182,7 +245,11 @@ def _boxy(
 def _scooter(length_m: float, width_m: float) -> tuple[Part, ...]:
     """A two-wheeler and its rider, who wears a helmet."""
     front = 0.5 * length_m
-    body = _hull([(-0.75 * front, 0.45), (0.3 * front, 0.28), (0.62 * front, 0.95), (-0.8 * front, 0.80)], 0.16, 0.13)
+    body = _hull(
+        [(-0.75 * front, 0.45), (0.3 * front, 0.28), (0.62 * front, 0.95), (-0.8 * front, 0.80)],
+        0.16,
+        0.13,
+    )
     bar = box((0.06, min(width_m, 0.75), 0.06), (0.55 * front, 0.0, 1.02))
     torso = _hull([(-0.30, 0.78), (0.06, 0.78), (0.22, 1.42), (-0.08, 1.45)], 0.20, 0.22)
     legs = [box((0.42, 0.13, 0.16), (0.14, s * 0.17, 0.74)) for s in (1, -1)]
@@ -211,7 +278,9 @@ def _hull(outline: _Profile, half_low_m: float, half_high_m: float) -> Mesh:
     fan = np.array([(0, i, i + 1) for i in range(1, n - 1)], dtype=np.int32)
     lean = math.atan2(half_low_m - half_high_m, z.max() - z.min())
     side = np.tile([0.0, -math.cos(lean), math.sin(lean)], (n, 1))
-    return join([strips, Mesh(right, side, fan), Mesh(left, side * (1.0, -1.0, 1.0), fan[:, ::-1].copy())])
+    return join(
+        [strips, Mesh(right, side, fan), Mesh(left, side * (1.0, -1.0, 1.0), fan[:, ::-1].copy())]
+    )
 
 
 def _cabin(waist: _Profile, roof: _Profile, half_low_m: float, half_high_m: float) -> Mesh:
@@ -219,15 +288,18 @@ def _cabin(waist: _Profile, roof: _Profile, half_low_m: float, half_high_m: floa
 
 
 def _panes(waist: _Profile, roof: _Profile, half_low_m: float, half_high_m: float) -> Mesh:
-    """Windscreen, rear window, and two windows on each side, just before the cabin's sheet metal."""
+    """Windscreen, rear window, and two windows on each side, just before the cabin's sheet
+    metal."""
     foot, head, brow, sill = (
-        _towards(waist[k], roof[k], share) for k, share in ((0, 0.06), (0, 0.92), (1, 0.90), (1, 0.14))
+        _towards(waist[k], roof[k], share)
+        for k, share in ((0, 0.06), (0, 0.92), (1, 0.90), (1, 0.14))
     )
     front = _cross_pane(foot, head, half_low_m - 0.08, half_high_m - 0.06)
     rear = _cross_pane(brow, sill, half_high_m - 0.08, half_low_m - 0.12, back=True)
     (xf, zf), (xr, zr) = waist
     (tf, tz), (tr, _) = roof
-    low, high = max(zf, zr) + 0.06, tz - 0.08
+    low = max(zf, zr) + 0.06
+    high = tz - 0.08
     sides = []
     for s in (1, -1):
         share = (low - zf) / (tz - zf), (high - zf) / (tz - zf)
@@ -240,7 +312,12 @@ def _panes(waist: _Profile, roof: _Profile, half_low_m: float, half_high_m: floa
             (middle - 0.04, ends[0][1], middle - 0.04, ends[1][1]),
         ):
             y = [half_low_m - lean * (h - base) + _PROUD_M for h in (low, high)]
-            corner = [(x0, s * y[0], low), (x1, s * y[0], low), (t1, s * y[1], high), (t0, s * y[1], high)]
+            corner = [
+                (x0, s * y[0], low),
+                (x1, s * y[0], low),
+                (t1, s * y[1], high),
+                (t0, s * y[1], high),
+            ]
             sides.append(quads(np.array([corner if s > 0 else corner[::-1]])))
     return join([front, rear, *sides])
 
@@ -250,21 +327,29 @@ def _towards(a: tuple[float, float], b: tuple[float, float], share: float) -> tu
 
 
 def _cross_pane(
-    low: tuple[float, float], high: tuple[float, float], half_low_m: float, half_high_m: float, back: bool = False
+    low: tuple[float, float],
+    high: tuple[float, float],
+    half_low_m: float,
+    half_high_m: float,
+    back: bool = False,
 ) -> Mesh:
     """A pane across the vehicle from (x, z) to (x, z), seen from ahead, or from behind."""
     out = -_PROUD_M if back else _PROUD_M
-    (x0, z0), (x1, z1) = low, high
+    (x0, z0) = low
+    (x1, z1) = high
     lift = 0.6 * _PROUD_M
     corners = [
-        (x0 + out, -half_low_m, z0 + lift), (x0 + out, half_low_m, z0 + lift),
-        (x1 + out, half_high_m, z1 + lift), (x1 + out, -half_high_m, z1 + lift),
-    ]  # fmt: skip
+        (x0 + out, -half_low_m, z0 + lift),
+        (x0 + out, half_low_m, z0 + lift),
+        (x1 + out, half_high_m, z1 + lift),
+        (x1 + out, -half_high_m, z1 + lift),
+    ]
     return quads(np.array([corners]))
 
 
 def _side_pane(outline: _Profile, side: int, half_m: float) -> Mesh:
-    """A pane in the left (1) or right (-1) side; its outline (x, z) goes round from the front foot backwards."""
+    """A pane in the left (1) or right (-1) side; its outline (x, z) goes round from the front foot
+    backwards."""
     corners = [(x, side * (half_m + _PROUD_M), z) for x, z in outline]
     return quads(np.array([corners if side > 0 else corners[::-1]]))
 
@@ -274,23 +359,32 @@ def _plate(x_m: float, y_m: float, z_m: float, width_m: float, height_m: float) 
     out = math.copysign(_PROUD_M, x_m)
     half, tall = 0.5 * width_m, 0.5 * height_m
     corners = [
-        (x_m + out, y_m - half, z_m - tall), (x_m + out, y_m + half, z_m - tall),
-        (x_m + out, y_m + half, z_m + tall), (x_m + out, y_m - half, z_m + tall),
-    ]  # fmt: skip
+        (x_m + out, y_m - half, z_m - tall),
+        (x_m + out, y_m + half, z_m - tall),
+        (x_m + out, y_m + half, z_m + tall),
+        (x_m + out, y_m - half, z_m + tall),
+    ]
     return quads(np.array([corners if x_m > 0.0 else corners[::-1]]))
 
 
-def _wheels(at: Sequence[tuple[float, float]], radius_m: float, width_m: float, sides: int = 8) -> tuple[Mesh, Mesh]:
+def _wheels(
+    at: Sequence[tuple[float, float]], radius_m: float, width_m: float, sides: int = 8
+) -> tuple[Mesh, Mesh]:
     """Tyres and rims of wheels whose middles are at (x, y), the rims on the outer side."""
     angle = 2.0 * np.pi * np.arange(sides) / sides
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     fan = np.array([(0, i, i + 1) for i in range(1, sides - 1)], dtype=np.int32)
     after = (np.arange(sides) + 1) % sides
-    tyres, rims = [], []
+    tyres = []
+    rims = []
     for x, y in at:
         out = math.copysign(1.0, y)
-        rim = np.stack([x + radius_m * circle[:, 0], np.zeros(sides), radius_m * (1.0 + circle[:, 1])], axis=1)
-        outer, inner = (rim + np.array([0.0, y + k * out * 0.5 * width_m, 0.0]) for k in (1.0, -1.0))
+        rim = np.stack(
+            [x + radius_m * circle[:, 0], np.zeros(sides), radius_m * (1.0 + circle[:, 1])], axis=1
+        )
+        outer, inner = (
+            rim + np.array([0.0, y + k * out * 0.5 * width_m, 0.0]) for k in (1.0, -1.0)
+        )
         left, right = (outer, inner) if out > 0.0 else (inner, outer)
         tyres.append(quads(np.stack([left, right, right[after], left[after]], axis=1)[:, ::-1]))
         turned = fan[:, ::-1].copy() if out > 0.0 else fan

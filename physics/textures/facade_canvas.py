@@ -1,7 +1,7 @@
 """Canvas: a bay of a facade being drawn, in metres: x from the left, z up from the storey's floor.
 
-Everything is laid over the wall: where nothing is drawn the wall shows. Colours are composed linearly and
-premultiplied, so that edges stay clean in every mip-map.
+Everything is laid over the wall: where nothing is drawn the wall shows. Colours are composed
+linearly and premultiplied, so that edges stay clean in every mip-map.
 """
 
 from __future__ import annotations
@@ -21,15 +21,19 @@ _Area = tuple[slice, slice]
 
 
 class FacadeCanvas:
-    """rgb: (S, S, 3) linear, premultiplied; wall: (S, S) how much of the wall shows; gloss, glow: (S, S).
+    """rgb: (S, S, 3) linear, premultiplied; wall: (S, S) how much of the wall shows; gloss, glow:
+    (S, S).
 
-    number: of the variant; what the bays of one front have in common, such as its colour, goes by it.
+    number: of the variant; what the bays of one front have in common, such as its colour, goes by
+    it.
     """
 
     def __init__(self, noise: Noise, number: int = 0) -> None:
         size = noise.size
         self.number = number
-        self.noise, self.rng, self.size = noise, noise.rng, size
+        self.noise = noise
+        self.rng = noise.rng
+        self.size = size
         self.rgb = np.zeros((size, size, 3), np.float32)
         self.wall = np.ones((size, size), np.float32)
         self.gloss = np.zeros((size, size), np.float32)
@@ -37,7 +41,9 @@ class FacadeCanvas:
         self._x = (np.arange(size, dtype=np.float32) + 0.5) / size * BAY_M
         self._z = STOREY_M - (np.arange(size, dtype=np.float32) + 0.5) / size * STOREY_M
 
-    def box(self, x0: float, x1: float, z0: float, z1: float, colour: Colour, opacity: float = 1.0) -> None:
+    def box(
+        self, x0: float, x1: float, z0: float, z1: float, colour: Colour, opacity: float = 1.0
+    ) -> None:
         """A filled rectangle; it hides what is below, gloss and glow too."""
         (rows, columns), across, up = self._shares(x0, x1, z0, z1)
         light = linear(colour)
@@ -46,10 +52,19 @@ class FacadeCanvas:
             return
         # All but the rim is covered whole: that is most of it, and cheaper.
         full_x, full_z = _whole(across, columns.start), _whole(up, rows.start)
-        for plane, value in ((self.rgb, light), (self.wall, 0.0), (self.gloss, 0.0), (self.glow, 0.0)):
+        for plane, value in (
+            (self.rgb, light),
+            (self.wall, 0.0),
+            (self.gloss, 0.0),
+            (self.glow, 0.0),
+        ):
             plane[full_z, full_x] = value
         for x in (slice(columns.start, full_x.start), slice(full_x.stop, columns.stop)):
-            self.fill((rows, x), up[:, None] * across[None, x.start - columns.start : x.stop - columns.start], light)
+            self.fill(
+                (rows, x),
+                up[:, None] * across[None, x.start - columns.start : x.stop - columns.start],
+                light,
+            )
         for z in (slice(rows.start, full_z.start), slice(full_z.stop, rows.stop)):
             share = up[z.start - rows.start : z.stop - rows.start, None]
             inner = across[None, full_x.start - columns.start : full_x.stop - columns.start]
@@ -62,7 +77,9 @@ class FacadeCanvas:
         for plane in (self.wall, self.gloss, self.glow):
             plane[area] *= keep
 
-    def shade(self, x0: float, x1: float, z0: float, z1: float, dark: float, soft_m: float = 0.0) -> None:
+    def shade(
+        self, x0: float, x1: float, z0: float, z1: float, dark: float, soft_m: float = 0.0
+    ) -> None:
         """A shadow on whatever is there, fading out downwards over `soft_m`."""
         area, cover = self._cover(x0, x1, z0, z1)
         if soft_m:
@@ -72,17 +89,28 @@ class FacadeCanvas:
         self.wall[area] *= keep
 
     def frame(
-        self, x0: float, x1: float, z0: float, z1: float, width: float, colour: Colour, head: float = 0.8
+        self,
+        x0: float,
+        x1: float,
+        z0: float,
+        z1: float,
+        width: float,
+        colour: Colour,
+        head: float = 0.8,
     ) -> None:
-        """The outline of a rectangle, `width` inwards; the upper bar is in the shade of the wall: darker by `head`."""
+        """The outline of a rectangle, `width` inwards; the upper bar is in the shade of the wall:
+        darker by `head`."""
         dark = (head * colour[0], head * colour[1], head * colour[2])
         self.box(x0, x1, z1 - width, z1, dark)
         self.box(x0, x1, z0, z0 + width, colour)
         self.box(x0, x0 + width, z0, z1, colour)
         self.box(x1 - width, x1, z0, z1, colour)
 
-    def local(self, x0: float, x1: float, z0: float, z1: float) -> tuple[_Area, Field, Field, Field]:
-        """An area, how much of each pixel it covers, and x and z in it as shares from 0 to 1, as rows and columns."""
+    def local(
+        self, x0: float, x1: float, z0: float, z1: float
+    ) -> tuple[_Area, Field, Field, Field]:
+        """An area, how much of each pixel it covers, and x and z in it as shares from 0 to 1, as
+        rows and columns."""
         area, cover = self._cover(x0, x1, z0, z1)
         across = ((self._x[area[1]] - x0) / (x1 - x0))[None, :]
         up = ((self._z[area[0]] - z0) / (z1 - z0))[:, None]
@@ -102,9 +130,14 @@ class FacadeCanvas:
         """The pixels of a rectangle, and the shares of its columns and rows that it covers."""
         px, pz = BAY_M / self.size, STOREY_M / self.size
         columns = slice(max(0, int(np.floor(x0 / px))), min(self.size, int(np.ceil(x1 / px))))
-        rows = slice(max(0, int(np.floor((STOREY_M - z1) / pz))), min(self.size, int(np.ceil((STOREY_M - z0) / pz))))
+        rows = slice(
+            max(0, int(np.floor((STOREY_M - z1) / pz))),
+            min(self.size, int(np.ceil((STOREY_M - z0) / pz))),
+        )
         x, z = self._x[columns], self._z[rows]
-        across = np.clip(np.minimum(x1, x + 0.5 * px) - np.maximum(x0, x - 0.5 * px), 0.0, None) / px
+        across = (
+            np.clip(np.minimum(x1, x + 0.5 * px) - np.maximum(x0, x - 0.5 * px), 0.0, None) / px
+        )
         up = np.clip(np.minimum(z1, z + 0.5 * pz) - np.maximum(z0, z - 0.5 * pz), 0.0, None) / pz
         return (rows, columns), across.astype(np.float32), up.astype(np.float32)
 
@@ -112,4 +145,6 @@ class FacadeCanvas:
 def _whole(shares: Field, start: int) -> slice:
     """The run of pixels, from `start` on, that is covered whole."""
     full = np.flatnonzero(shares > 0.999)
-    return slice(start + int(full[0]), start + int(full[-1]) + 1) if len(full) else slice(start, start)
+    return (
+        slice(start + int(full[0]), start + int(full[-1]) + 1) if len(full) else slice(start, start)
+    )

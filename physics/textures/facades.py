@@ -1,4 +1,5 @@
-"""Facades: one bay by one storey, to be laid over a wall; which bays and walls go together in one building."""
+"""Facades: one bay by one storey, to be laid over a wall; which bays and walls go together in one
+building."""
 
 from __future__ import annotations
 
@@ -8,9 +9,9 @@ from functools import lru_cache
 from typing import Final
 
 from physics.textures.facade_canvas import BAY_M, STOREY_M, FacadeCanvas
-from physics.textures.fronts import FRONTS
 from physics.textures.layers import Layers, Picture, Recipe, stacked
 from physics.textures.noise import Noise
+from physics.textures.shop_fronts import FRONTS
 from physics.textures.windows import WINDOW_STYLES
 
 BAY_VARIANTS: Final = 3
@@ -19,7 +20,8 @@ BAY_VARIANTS: Final = 3
 
 @lru_cache(maxsize=4)
 def facade_layers(size_px: int = 256, seed: int = 0) -> Layers:
-    """Every bay, BAY_M wide and STOREY_M high: upper storeys, then ground floors. 256 pixels are 12 mm each."""
+    """Every bay, BAY_M wide and STOREY_M high: upper storeys, then ground floors. 256 pixels are 12
+    mm each."""
     styles = {**WINDOW_STYLES, **FRONTS}
     recipes = {
         f"{name}-{k}": Recipe((BAY_M, STOREY_M), _drawn(style, k))
@@ -40,10 +42,10 @@ def _drawn(style: Callable[[FacadeCanvas], None], number: int) -> Callable[[Nois
 
 @dataclass(frozen=True, slots=True)
 class WallStyle:
-    """What a kind of building shows. walls, roofs: names of wall layers; uppers, fronts: styles of bays, with a
-    number behind them in the layers. A building takes one wall, one roof, one upper style whose number changes from
-    bay to bay, and one front (see DOORS) of one number. tints: sRGB colours of the wall, of which it
-    takes one; empty: the wall's own colour."""
+    """What a kind of building shows. walls, roofs: names of wall layers; uppers, fronts: styles of
+    bays, with a number behind them in the layers. A building takes one wall, one roof, one upper
+    style whose number changes from bay to bay, and one front (see DOORS) of one number. tints: sRGB
+    colours of the wall, of which it takes one; empty: the wall's own colour."""
 
     walls: tuple[str, ...]
     uppers: tuple[str, ...]
@@ -54,7 +56,8 @@ class WallStyle:
 
 @dataclass(frozen=True, slots=True)
 class Front:
-    """A ground floor: the bays between its doors, a bay with a door, and one door every so many bays (at most 15)."""
+    """A ground floor: the bays between its doors, a bay with a door, and one door every so many
+    bays (at most 15)."""
 
     between: str
     door: str
@@ -76,9 +79,15 @@ DOORS: Final[Mapping[str, Front]] = {
 _SHOPS: Final = ("shop", "shop-awning", "cafe", "shop", "entrance")
 _HOMES: Final = ("entrance", "home", "home", "blank", "garage")
 _PASTELS: Final = (
-    (0.84, 0.80, 0.72), (0.82, 0.74, 0.60), (0.77, 0.66, 0.54), (0.74, 0.75, 0.70), (0.80, 0.70, 0.64),
-    (0.86, 0.84, 0.80), (0.68, 0.70, 0.72), (0.78, 0.77, 0.66),
-)  # fmt: skip
+    (0.84, 0.80, 0.72),
+    (0.82, 0.74, 0.60),
+    (0.77, 0.66, 0.54),
+    (0.74, 0.75, 0.70),
+    (0.80, 0.70, 0.64),
+    (0.86, 0.84, 0.80),
+    (0.68, 0.70, 0.72),
+    (0.78, 0.77, 0.66),
+)
 
 WALL_STYLES: Final[Mapping[str, WallStyle]] = {
     "plaster-old": WallStyle(
@@ -139,7 +148,13 @@ WALL_STYLES: Final[Mapping[str, WallStyle]] = {
         uppers=("sash", "sash-fine", "square-white", "pair-green"),
         fronts=("home", "entrance", "home"),
         roofs=("roof-tiles", "roof-slate"),
-        tints=((0.60, 0.55, 0.47), (0.80, 0.79, 0.76), (0.52, 0.36, 0.31), (0.54, 0.58, 0.59), (0.72, 0.69, 0.60)),
+        tints=(
+            (0.60, 0.55, 0.47),
+            (0.80, 0.79, 0.76),
+            (0.52, 0.36, 0.31),
+            (0.54, 0.58, 0.59),
+            (0.72, 0.69, 0.60),
+        ),
     ),
     "shed": WallStyle(
         walls=("metal-corrugated", "metal-panels"),
@@ -158,7 +173,26 @@ STREETS: Final[Mapping[str, tuple[str, ...]]] = {
     "avenue": (*_OLD, "plaster-old", "office", "office", "plaster-new", "slab"),
     "boulevard": (*_OLD, "stone", "plaster-old", "office", "plaster-new"),
     "ring": ("office", "office", "slab", "shed", "plaster-new", "brick-new"),
-    "residential": ("plaster-new", "plaster-new", "brick-new", "brick-new", "wood", "slab", "plaster-old", "brick-old"),
-    "": ("plaster-old", "plaster-old", "plaster-new", "plaster-new", "brick-old", "brick-new", "stone", "slab"),
+    "residential": (
+        "plaster-new",
+        "plaster-new",
+        "brick-new",
+        "brick-new",
+        "wood",
+        "slab",
+        "plaster-old",
+        "brick-old",
+    ),
+    "": (
+        "plaster-old",
+        "plaster-old",
+        "plaster-new",
+        "plaster-new",
+        "brick-old",
+        "brick-new",
+        "stone",
+        "slab",
+    ),
 }
-"""Which of WALL_STYLES stand in a class of streets, as often as they are named; "": wherever that is not known."""
+"""Which of WALL_STYLES stand in a class of streets, as often as they are named; "": wherever that
+is not known."""

@@ -1,4 +1,5 @@
-"""Ground: asphalt, slabs, pavers, brick, setts, curbs, grass, gravel, tactile paving, paint; and what lies where."""
+"""Ground: asphalt, slabs, pavers, brick, setts, curbs, grass, gravel, tactile paving, paint; and
+what lies where."""
 
 from __future__ import annotations
 
@@ -9,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from physics.textures.bonds import Bond, basket, courses, herringbone, random_courses
+from physics.textures.brick_patterns import Bond, basket, courses, herringbone, random_courses
 from physics.textures.layers import Colour, Generator, Layers, Picture, Recipe, stacked
 from physics.textures.noise import Field, Noise, blurred, cells, step
 from physics.textures.surface import bond_of, cracks, laid, mixed, plain, relief, shaded, stained
@@ -29,7 +30,9 @@ def ground_layers(size_px: int = 512, seed: int = 0) -> Layers:
     return stacked("ground", GROUND_RECIPES, size_px, seed)
 
 
-def _asphalt(stone: float, tone: float = 0.33, worn: float = 0.0, patches: bool = False) -> Generator:
+def _asphalt(
+    stone: float, tone: float = 0.33, worn: float = 0.0, patches: bool = False
+) -> Generator:
     def make(noise: Noise) -> Picture:
         chips = noise.grain(0.6)
         colour = (tone, tone, 1.02 * tone)
@@ -51,12 +54,15 @@ def _asphalt(stone: float, tone: float = 0.33, worn: float = 0.0, patches: bool 
 
 
 def _patches(noise: Noise) -> Field:
-    """Signed distance to the outlines of two repairs and a trench, positive inside, as a share of the side."""
+    """Signed distance to the outlines of two repairs and a trench, positive inside, as a share of
+    the side."""
     at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size
     x, y = np.meshgrid(at, at)
     repairs = ((0.27, 0.24, 0.12, 0.10), (0.70, 0.66, 0.17, 0.13), (0.50, 0.44, 0.50, 0.035))
     edges = [
-        np.minimum(half_x - np.abs(x - mx) if half_x < 0.5 else np.float32(1.0), half_y - np.abs(y - my))
+        np.minimum(
+            half_x - np.abs(x - mx) if half_x < 0.5 else np.float32(1.0), half_y - np.abs(y - my)
+        )
         for mx, my, half_x, half_y in repairs
     ]
     return np.asarray(np.max(edges, axis=0) + 0.003 * noise.clouds(8), dtype=np.float32)
@@ -70,7 +76,8 @@ def _stones(
     tint: float = 1.0,
     **look: float,
 ) -> Recipe:
-    """A laid surface. lay: its bond, given pixels and side; tint: share of the tint in the stones."""
+    """A laid surface. lay: its bond, given pixels and side; tint: share of the tint in the
+    stones."""
 
     def make(noise: Noise) -> Picture:
         whole = laid(noise, lay(noise.size, side_m), side_m, colours, joint, **look)
@@ -79,41 +86,68 @@ def _stones(
     return Recipe(side_m, make)
 
 
-def _rows(rows: int, unit_m: Sequence[float], shift: Sequence[float] = (0.0,)) -> Callable[[int, float], Bond]:
+def _rows(
+    rows: int, unit_m: Sequence[float], shift: Sequence[float] = (0.0,)
+) -> Callable[[int, float], Bond]:
     return lambda size, side_m: courses(size, side_m, rows, unit_m, shift)
 
 
 def _setts(noise: Noise) -> Picture:
     bond = random_courses(noise.rng, noise.size, 1.6, [0.1] * 16, (0.09, 0.15))
     return laid(
-        noise, bond, 1.6, ((0.50, 0.49, 0.48), (0.44, 0.43, 0.43), (0.55, 0.53, 0.51)), _DARK,
-        joint_m=0.013, bevel_m=0.016, spread=0.09, wobble_m=0.004, grain=0.04,
-    )  # fmt: skip
+        noise,
+        bond,
+        1.6,
+        ((0.50, 0.49, 0.48), (0.44, 0.43, 0.43), (0.55, 0.53, 0.51)),
+        _DARK,
+        joint_m=0.013,
+        bevel_m=0.016,
+        spread=0.09,
+        wobble_m=0.004,
+        grain=0.04,
+    )
 
 
 def _cobbles(noise: Noise) -> Picture:
     bond = bond_of(cells(noise, 14, 0.55), 1.6)
     return laid(
-        noise, bond, 1.6, ((0.50, 0.48, 0.45), (0.44, 0.43, 0.42), (0.56, 0.52, 0.47)), (0.34, 0.32, 0.29),
-        joint_m=0.016, bevel_m=0.022, spread=0.10, wobble_m=0.003, grain=0.04,
-    )  # fmt: skip
+        noise,
+        bond,
+        1.6,
+        ((0.50, 0.48, 0.45), (0.44, 0.43, 0.42), (0.56, 0.52, 0.47)),
+        (0.34, 0.32, 0.29),
+        joint_m=0.016,
+        bevel_m=0.022,
+        spread=0.10,
+        wobble_m=0.003,
+        grain=0.04,
+    )
 
 
 def _granite(noise: Noise) -> Picture:
     bond = courses(noise.size, 1.0, 1, [1.0], [0.0])
     speck = noise.grain(0.7)
-    whole = laid(noise, bond, 1.0, ((0.63, 0.62, 0.61),), _DARK, joint_m=0.006, wobble_m=0.0, grain=0.03)
-    return Picture(whole.rgb + 0.05 * (step(0.8, 1.6, speck) - 1.3 * step(1.0, 1.8, -speck))[..., None])
+    whole = laid(
+        noise, bond, 1.0, ((0.63, 0.62, 0.61),), _DARK, joint_m=0.006, wobble_m=0.0, grain=0.03
+    )
+    return Picture(
+        whole.rgb + 0.05 * (step(0.8, 1.6, speck) - 1.3 * step(1.0, 1.8, -speck))[..., None]
+    )
 
 
 def _grass(dry: float, worn: float = 0.0) -> Generator:
     def make(noise: Noise) -> Picture:
         # Blades lean every way: streaks bent by noise, so that no direction shows.
-        one, two = noise.warped(noise.streaks(256, 8), 0.03, 8), noise.warped(noise.streaks(256, 8, 1), 0.03, 8)
+        one = noise.warped(noise.streaks(256, 8), 0.03, 8)
+        two = noise.warped(noise.streaks(256, 8, 1), 0.03, 8)
         blades = 0.7 * np.maximum(one, two) + 0.45 * noise.grain(0.7) - 0.4
         tuft = noise.clouds(16)
         green = mixed((0.25, 0.31, 0.16), (0.40, 0.45, 0.25), step(-1.6, 1.8, blades + 0.5 * tuft))
-        rgb = mixed(green, (0.52, 0.48, 0.32), np.float32(dry) * step(-0.3, 2.6, noise.clouds(8) + 0.7 * blades))
+        rgb = mixed(
+            green,
+            (0.52, 0.48, 0.32),
+            np.float32(dry) * step(-0.3, 2.6, noise.clouds(8) + 0.7 * blades),
+        )
         if worn:
             bare = np.float32(worn) * step(0.3, 2.0, noise.clouds(8) + 0.35 * blades)
             rgb = mixed(rgb, plain(noise, (0.43, 0.37, 0.29), 0.02, 0.04), bare)
@@ -127,7 +161,9 @@ def _planting(noise: Noise) -> Picture:
     """Low shrubs: leaves of some centimetres, dark between them."""
     leaves = cells(noise, 40, 0.9)
     tone = noise.rng.normal(1.0, 0.18, (leaves.n, 1)).astype(np.float32)
-    palette = np.asarray(((0.24, 0.35, 0.16), (0.20, 0.30, 0.13), (0.27, 0.36, 0.19)), dtype=np.float32)
+    palette = np.asarray(
+        ((0.24, 0.35, 0.16), (0.20, 0.30, 0.13), (0.27, 0.36, 0.19)), dtype=np.float32
+    )
     green = palette[noise.rng.integers(len(palette), size=leaves.n)] * tone
     rgb = mixed((0.08, 0.12, 0.06), green[leaves.id], step(0.0, 0.006, leaves.edge))
     return Picture(shaded(rgb, 1.0 + 0.10 * noise.clouds(8) + 0.10 * noise.clouds(64)))
@@ -149,7 +185,15 @@ def _gravel(noise: Noise) -> Picture:
     bond = bond_of(cells(noise, 64, 0.9), 1.2)
     colours = ((0.58, 0.55, 0.50), (0.50, 0.47, 0.43), (0.64, 0.61, 0.56), (0.45, 0.43, 0.41))
     return laid(
-        noise, bond, 1.2, colours, (0.33, 0.30, 0.27), joint_m=0.003, bevel_m=0.007, spread=0.10, joint_tint=0.8
+        noise,
+        bond,
+        1.2,
+        colours,
+        (0.33, 0.30, 0.27),
+        joint_m=0.003,
+        bevel_m=0.007,
+        spread=0.10,
+        joint_tint=0.8,
     )
 
 
@@ -166,9 +210,20 @@ def _tactile(bars: bool) -> Generator:
         else:
             bump = 1.0 - step(0.009, 0.0165, np.hypot((x % 0.06) - 0.03, (y % 0.06) - 0.03))
         colour = ((0.74, 0.66, 0.44), (0.72, 0.64, 0.42), (0.76, 0.68, 0.47))
-        slab = laid(noise, courses(noise.size, 0.6, 2, [0.3], [0.0]), 0.6, colour, _DARK, joint_m=0.005, spread=0.02)
+        slab = laid(
+            noise,
+            courses(noise.size, 0.6, 2, [0.3], [0.0]),
+            0.6,
+            colour,
+            _DARK,
+            joint_m=0.005,
+            spread=0.02,
+        )
         soft = blurred(bump, 0.004 / 0.6 * noise.size)
-        rgb = shaded(slab.rgb, relief(blurred(bump, 1.2), 0.30) * (1.0 - 0.18 * np.clip(soft - bump, 0.0, 1.0)))
+        rgb = shaded(
+            slab.rgb,
+            relief(blurred(bump, 1.2), 0.30) * (1.0 - 0.18 * np.clip(soft - bump, 0.0, 1.0)),
+        )
         return Picture(shaded(rgb, 1.0 + 0.05 * bump), slab.alpha)
 
     return make
@@ -192,7 +247,15 @@ def _cast(noise: Noise) -> Picture:
     """Cast concrete with a joint every 1.5 m."""
     bond = courses(noise.size, 3.0, 2, [1.5], [0.0])
     whole = laid(
-        noise, bond, 3.0, _GREY[:1], (0.40, 0.39, 0.38), joint_m=0.012, spread=0.015, wobble_m=0.0, grain=0.016
+        noise,
+        bond,
+        3.0,
+        _GREY[:1],
+        (0.40, 0.39, 0.38),
+        joint_m=0.012,
+        spread=0.015,
+        wobble_m=0.0,
+        grain=0.016,
     )
     pores = step(1.9, 2.6, noise.grain(0.5))
     rgb = stained(shaded(whole.rgb, 1.0 - 0.16 * pores), noise, 0.08)
@@ -206,20 +269,36 @@ GROUND_RECIPES: Final[Mapping[str, Recipe]] = {
     "asphalt-fine": Recipe(2.0, _asphalt(0.035, 0.40)),
     "concrete-cast": Recipe(3.0, _cast),
     "slabs-square": _stones(2.0, _rows(5, [0.4]), _GREY, _DARK, joint_m=0.007, spread=0.035),
-    "slabs-running": _stones(2.4, _rows(6, [0.6], [0.0, 0.5]), _GREY, _DARK, joint_m=0.007, spread=0.035),
+    "slabs-running": _stones(
+        2.4, _rows(6, [0.6], [0.0, 0.5]), _GREY, _DARK, joint_m=0.007, spread=0.035
+    ),
     "slabs-mixed": _stones(
         2.4, _rows(6, [0.6, 0.4, 0.2], [0.0, 0.39, 0.81]), _GREY, _DARK, joint_m=0.007, spread=0.045
     ),
-    "slabs-worn": _stones(2.0, _rows(4, [0.5]), _WORN, _SAND, joint_m=0.010, spread=0.045, clouds=0.03),
-    "pavers-running": _stones(1.6, _rows(16, [0.2], [0.0, 0.5]), _GREY, _DARK, joint_m=0.005, spread=0.05),
-    "pavers-herringbone": _stones(1.6, lambda n, m: herringbone(n, m, 0.1), _GREY, _DARK, joint_m=0.005, spread=0.05),
-    "pavers-basket": _stones(1.6, lambda n, m: basket(n, m, 0.1), _GREY, _DARK, joint_m=0.005, spread=0.05),
-    "pavers-mixed": _stones(1.8, _rows(12, [0.2, 0.15, 0.25], [0.0, 0.45, 0.2]), _WORN, _DARK, spread=0.06),
-    "brick-running": _stones(1.68, _rows(16, [0.21], [0.0, 0.5]), _RED, _SAND, 0.6, joint_m=0.007, spread=0.07),
+    "slabs-worn": _stones(
+        2.0, _rows(4, [0.5]), _WORN, _SAND, joint_m=0.010, spread=0.045, clouds=0.03
+    ),
+    "pavers-running": _stones(
+        1.6, _rows(16, [0.2], [0.0, 0.5]), _GREY, _DARK, joint_m=0.005, spread=0.05
+    ),
+    "pavers-herringbone": _stones(
+        1.6, lambda n, m: herringbone(n, m, 0.1), _GREY, _DARK, joint_m=0.005, spread=0.05
+    ),
+    "pavers-basket": _stones(
+        1.6, lambda n, m: basket(n, m, 0.1), _GREY, _DARK, joint_m=0.005, spread=0.05
+    ),
+    "pavers-mixed": _stones(
+        1.8, _rows(12, [0.2, 0.15, 0.25], [0.0, 0.45, 0.2]), _WORN, _DARK, spread=0.06
+    ),
+    "brick-running": _stones(
+        1.68, _rows(16, [0.21], [0.0, 0.5]), _RED, _SAND, 0.6, joint_m=0.007, spread=0.07
+    ),
     "brick-herringbone": _stones(
         1.68, lambda n, m: herringbone(n, m, 0.105), _RED, _SAND, 0.6, joint_m=0.007, spread=0.07
     ),
-    "brick-basket": _stones(1.68, lambda n, m: basket(n, m, 0.105), _RED, _SAND, 0.6, joint_m=0.007, spread=0.07),
+    "brick-basket": _stones(
+        1.68, lambda n, m: basket(n, m, 0.105), _RED, _SAND, 0.6, joint_m=0.007, spread=0.07
+    ),
     "setts": Recipe(1.6, _setts),
     "cobbles": Recipe(1.6, _cobbles),
     "granite": Recipe(1.0, _granite),
@@ -265,12 +344,13 @@ SURFACE_LAYERS: Final[Mapping[str, tuple[str, ...]]] = {
     "yard": ("asphalt-worn",),
     "water": ("water",),
 }
-"""Layers that a kind of ground (physics.world.tiles), a material (physics.world.materials) or a look of open ground
-(cosim.place.open_ground) may show."""
+"""Layers that a kind of ground (physics.ground.tiles), a material (physics.ground.materials) or a
+look of open ground (cosim.place.open_ground) may show."""
 
 
 def layer_of(surface: str, seed: int = 0) -> str:
-    """The layer of a part of a tile, drawn from its own name and a seed: "sidewalk:brick:2" is one of brick.
+    """The layer of a part of a tile, drawn from its own name and a seed: "sidewalk:brick:2" is one
+    of brick.
 
     Ground of a kind that the table does not know is asphalt.
     """

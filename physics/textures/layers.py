@@ -1,12 +1,14 @@
 """Layers: square textures of one size, stacked as a texture array, and how a colour is put on them.
 
-A texel's albedo, everything linear (decoded from sRGB; filtering and mip-maps too are linear, GL_SRGB8_ALPHA8):
+A texel's albedo, everything linear (decoded from sRGB; filtering and mip-maps too are linear,
+GL_SRGB8_ALPHA8):
 
-    surface (ground, wall, prop):  mix(rgb, rgb / mean * tint, alpha)      without a tint of its own: rgb
-    facade over a wall:            rgb + alpha * wall                       rgb is premultiplied
+    surface (ground, wall, prop):  mix(rgb, rgb / mean * tint, alpha)      without a tint of its
+    own: rgb facade over a wall:            rgb + alpha * wall                       rgb is
+    premultiplied
 
-so that alpha is the share of the tint in a surface (mortar keeps its own colour), and the share of the wall behind in
-a facade.
+so that alpha is the share of the tint in a surface (mortar keeps its own colour), and the share of
+the wall behind in a facade.
 """
 
 from __future__ import annotations
@@ -34,10 +36,10 @@ _MADE_BY: Final = sources_hash(Path(__file__).parent)
 
 @dataclass(frozen=True, slots=True)
 class Layers:
-    """Textures of one size S. names: L, unique; rgba: (L, S, S, 4) uint8, rows down the picture, colours sRGB;
-    metres: (L, 2) width and height of a texture in the world; mean: (L, 3) linear mean colour;
-    finish: (L, S, S, 2) uint8, gloss (how much of a mirror: panes) and glow (light of its own at night).
-    Arrays are write-protected.
+    """Textures of one size S. names: L, unique; rgba: (L, S, S, 4) uint8, rows down the picture,
+    colours sRGB; metres: (L, 2) width and height of a texture in the world; mean: (L, 3) linear
+    mean colour; finish: (L, S, S, 2) uint8, gloss (how much of a mirror: panes) and glow (light of
+    its own at night). Arrays are write-protected.
     """
 
     names: tuple[str, ...]
@@ -59,7 +61,8 @@ class Layers:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """One layer before it is stacked. rgb: (S, S, 3) sRGB; alpha: (S, S) or None for 1; finish: (S, S, 2)."""
+    """One layer before it is stacked. rgb: (S, S, 3) sRGB; alpha: (S, S) or None for 1; finish: (S,
+    S, 2)."""
 
     rgb: Rgb
     alpha: Field | None = None
@@ -71,21 +74,27 @@ Generator = Callable[[Noise], Picture]
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """How a layer is made, and what it shows in metres: the side of a square, or width and height."""
+    """How a layer is made, and what it shows in metres: the side of a square, or width and
+    height."""
 
     metres: float | tuple[float, float]
     make: Generator
 
 
 def stacked(kind: str, recipes: Mapping[str, Recipe], size_px: int, seed: int) -> Layers:
-    """Every recipe's layer, in the table's order. Each has its own generator, so that a new one changes no other.
+    """Every recipe's layer, in the table's order. Each has its own generator, so that a new one
+    changes no other.
 
     kind: what they are, a word in the name under which they are kept (`cosim.core.baked`).
     """
     if size_px not in SIZES:
-        raise SpecError(f"a texture's size_px must be one of {', '.join(map(str, SIZES))}, not {size_px}")
+        raise SpecError(
+            f"a texture's size_px must be one of {', '.join(map(str, SIZES))}, not {size_px}"
+        )
     arrays = baked(f"{kind}-{size_px}-{seed}", _MADE_BY, lambda: _made(recipes, size_px, seed))
-    metres = np.array([np.broadcast_to(recipe.metres, 2) for recipe in recipes.values()], np.float32)
+    metres = np.array(
+        [np.broadcast_to(recipe.metres, 2) for recipe in recipes.values()], np.float32
+    )
     metres.flags.writeable = False
     return Layers(tuple(recipes), arrays["rgba"], metres, arrays["mean"], arrays.get("finish"))
 
@@ -111,15 +120,22 @@ def joined_layers(*stacks: Layers) -> Layers:
     """Several stacks of one size as one; names must differ, finishes are not kept."""
     names = tuple(name for stack in stacks for name in stack.names)
     if len(set(names)) != len(names) or len({stack.rgba.shape[1] for stack in stacks}) != 1:
-        raise UsageError("stacks of textures are joined when they are of one size and share no name")
-    arrays = (np.concatenate([getattr(stack, field) for stack in stacks]) for field in ("rgba", "metres", "mean"))
+        raise UsageError(
+            "stacks of textures are joined when they are of one size and share no name"
+        )
+    arrays = (
+        np.concatenate([getattr(stack, field) for stack in stacks])
+        for field in ("rgba", "metres", "mean")
+    )
     return Layers(names, *arrays)
 
 
 def linear(srgb: NDArray[np.floating] | Colour) -> NDArray[np.float32]:
     """sRGB values 0 to 1, decoded (IEC 61966-2-1)."""
     s = np.asarray(srgb, dtype=np.float32)
-    return np.where(s <= 0.04045, s / 12.92, ((np.maximum(s, 0.0) + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    return np.where(s <= 0.04045, s / 12.92, ((np.maximum(s, 0.0) + 0.055) / 1.055) ** 2.4).astype(
+        np.float32
+    )
 
 
 def encoded(value: NDArray[np.floating]) -> NDArray[np.float32]:

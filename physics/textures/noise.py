@@ -1,6 +1,8 @@
-"""Noise that tiles: every field here continues over its edges, so that a texture made of it has no seams.
+"""Noise that tiles: every field here continues over its edges, so that a texture made of it has no
+seams.
 
-All fields are (S, S), float32 where it matters for speed, with S a power of two; rows run down the picture.
+All fields are (S, S), float32 where it matters for speed, with S a power of two; rows run down the
+picture.
 """
 
 from __future__ import annotations
@@ -18,18 +20,21 @@ Ids = NDArray[np.int32]
 
 
 class Noise:
-    """The noise of one layer: shared fields, each call moved and turned afresh by the layer's own generator."""
+    """The noise of one layer: shared fields, each call moved and turned afresh by the layer's own
+    generator."""
 
     def __init__(self, size: int, seed: tuple[int, ...]) -> None:
         self.size = size
         self.rng = np.random.default_rng(seed)
 
     def clouds(self, cells: int) -> Field:
-        """Fractal noise of zero mean and unit deviation; its largest features are 1/`cells` of the side: 2, 4 .. 64."""
+        """Fractal noise of zero mean and unit deviation; its largest features are 1/`cells` of the
+        side: 2, 4 .. 64."""
         return self._moved(_clouds(self.size, cells))
 
     def grain(self, soft_px: float = 0.0) -> Field:
-        """White noise of zero mean and unit deviation, blurred over `soft_px` pixels of a 512 px texture."""
+        """White noise of zero mean and unit deviation, blurred over `soft_px` pixels of a 512 px
+        texture."""
         return self._moved(_grain(self.size, soft_px))
 
     def _moved(self, field: Field) -> Field:
@@ -39,7 +44,8 @@ class Noise:
         return np.ascontiguousarray(moved[:: 1 - 2 * (turn & 1), :: 1 - (turn & 2)])
 
     def streaks(self, cells: int, stretch: int, axis: int = 0) -> Field:
-        """Noise drawn out `stretch` times along an axis (0 down, 1 across): run marks, wood grain, brushed metal."""
+        """Noise drawn out `stretch` times along an axis (0 down, 1 across): run marks, wood grain,
+        brushed metal."""
         size = self.size
         grid = self.rng.standard_normal((max(2, cells // stretch), cells)).astype(np.float32)
         field = _resized(grid if axis == 0 else np.ascontiguousarray(grid.T), size)
@@ -53,8 +59,8 @@ class Noise:
 
 @dataclass(frozen=True, slots=True)
 class Cells:
-    """A division into cells around scattered points. id: (S, S) which cell; edge: distance to the nearest border as a
-    share of the side; n: number of cells."""
+    """A division into cells around scattered points. id: (S, S) which cell; edge: distance to the
+    nearest border as a share of the side; n: number of cells."""
 
     id: Ids
     edge: Field
@@ -62,9 +68,15 @@ class Cells:
 
 
 def cells(noise: Noise, across: int, jitter: float = 0.8) -> Cells:
-    """Cells around the points of a jittered grid of `across` x `across` (Worley's cellular pattern)."""
-    size, n = noise.size, across * across
-    at = np.stack(np.meshgrid(np.arange(across), np.arange(across)), axis=-1).reshape(-1, 2).astype(float)
+    """Cells around the points of a jittered grid of `across` x `across` (Worley's cellular
+    pattern)."""
+    size = noise.size
+    n = across * across
+    at = (
+        np.stack(np.meshgrid(np.arange(across), np.arange(across)), axis=-1)
+        .reshape(-1, 2)
+        .astype(float)
+    )
     at[:, 0] += 0.5 * (at[:, 1] % 2) * (across % 2 == 0)
     at += 0.5 + jitter * noise.rng.uniform(-0.5, 0.5, at.shape)
     pixel = np.floor(at / across * size).astype(int) % size
@@ -75,7 +87,9 @@ def cells(noise: Noise, across: int, jitter: float = 0.8) -> Cells:
     seeds[pixel[:, 1], pixel[:, 0]] = 0
     number[pixel[:, 1], pixel[:, 0]] = np.arange(n)
     wide = np.pad(seeds, margin, mode="wrap")
-    _, labels = cv2.distanceTransformWithLabels(wide, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    _, labels = cv2.distanceTransformWithLabels(
+        wide, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL
+    )
     table = np.zeros(int(labels.max()) + 1, np.int32)
     table[labels[wide == 0]] = np.pad(number, margin, mode="wrap")[wide == 0]
     whole = table[labels]
@@ -91,7 +105,9 @@ def remapped(field: Field, dx_px: Field, dy_px: Field) -> Field:
     """A tiling field read at points moved by (S, S) pixels."""
     size = len(field)
     across, down = np.meshgrid(np.arange(size, dtype=np.float32), np.arange(size, dtype=np.float32))
-    return np.asarray(cv2.remap(field, across + dx_px, down + dy_px, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP))
+    return np.asarray(
+        cv2.remap(field, across + dx_px, down + dy_px, cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
+    )
 
 
 def blurred(field: Field, sigma_px: float) -> Field:
@@ -114,7 +130,8 @@ def step(low: float, high: float, field: Field) -> Field:
 def _clouds(size: int, cells: int) -> Field:
     rng = np.random.default_rng([size, cells, 1])
     total = np.zeros((size, size), np.float32)
-    share, n = 1.0, cells
+    share = 1.0
+    n = cells
     while n <= size // 2:
         total += np.float32(share) * _resized(_grid(rng, n), size)
         share, n = 0.55 * share, 2 * n
@@ -134,7 +151,9 @@ def _grain(size: int, soft_px: float) -> Field:
     rng = np.random.default_rng([7, round(100 * soft_px)])
     field = blurred(rng.standard_normal((512, 512)).astype(np.float32), soft_px)
     if size != 512:
-        field = cv2.resize(field, (size, size), interpolation=cv2.INTER_AREA if size < 512 else cv2.INTER_LINEAR)
+        field = cv2.resize(
+            field, (size, size), interpolation=cv2.INTER_AREA if size < 512 else cv2.INTER_LINEAR
+        )
         # An area's mean is calmer than its points; half of what is lost is given back.
         field *= np.float32(np.sqrt(1.0 / max(float(field.std()), 1e-6)))
     return _locked(field / max(1.0, float(field.std())) if soft_px == 0.0 else field / field.std())

@@ -6,16 +6,20 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from physics.textures.bonds import Bond
+from physics.textures.brick_patterns import Bond
 from physics.textures.layers import Colour, Picture, Rgb
 from physics.textures.noise import Cells, Field, Noise, blurred, step
 
 
-def plain(noise: Noise, colour: Colour, clouds: float = 0.02, grain: float = 0.03, cells: int = 8) -> Rgb:
+def plain(
+    noise: Noise, colour: Colour, clouds: float = 0.02, grain: float = 0.03, cells: int = 8
+) -> Rgb:
     """One colour with large soft patches and fine grain, both given as deviations of sRGB."""
     tone = np.float32(clouds) * noise.clouds(cells) + np.float32(grain) * noise.grain()
     return np.asarray(
-        np.asarray(colour, dtype=np.float32) * (1.0 + tone[..., None] / max(sum(colour) / 3.0, 0.1)), dtype=np.float32
+        np.asarray(colour, dtype=np.float32)
+        * (1.0 + tone[..., None] / max(sum(colour) / 3.0, 0.1)),
+        dtype=np.float32,
     )
 
 
@@ -26,7 +30,8 @@ def mixed(one: Rgb | Colour, two: Rgb | Colour, share: Field) -> Rgb:
 
 
 def relief(height: Field, strength: float) -> Field:
-    """Light and shade of a height field under a high light from the upper left: factors around 1."""
+    """Light and shade of a height field under a high light from the upper left: factors around
+    1."""
     slope = np.roll(height, (-1, -1), (0, 1)) - np.roll(height, (1, 1), (0, 1))
     return np.asarray(1.0 + np.clip(np.float32(strength) * slope, -0.35, 0.35), dtype=np.float32)
 
@@ -46,8 +51,8 @@ def laid(
     clouds: float = 0.02,
     joint_tint: float = 0.35,
 ) -> Picture:
-    """Stones in joints. colours: drawn for each unit; spread: deviation of brightness from unit to unit;
-    wobble_m: how uneven edges are; joint_tint: share of the tint in the joints."""
+    """Stones in joints. colours: drawn for each unit; spread: deviation of brightness from unit to
+    unit; wobble_m: how uneven edges are; joint_tint: share of the tint in the joints."""
     pixel_m = side_m / noise.size
     width = max(joint_m, 0.9 * pixel_m)
     edge = bond.edge + np.float32(wobble_m) * noise.clouds(32) if wobble_m else bond.edge
@@ -63,7 +68,9 @@ def laid(
     tone *= relief(blurred(face, 0.7), 0.10)
     stone = palette[bond.id] * tone[..., None]
     bed = plain(noise, joint, 0.02, grain)
-    return Picture(mixed(bed, stone, face), np.float32(joint_tint) + np.float32(1.0 - joint_tint) * face)
+    return Picture(
+        mixed(bed, stone, face), np.float32(joint_tint) + np.float32(1.0 - joint_tint) * face
+    )
 
 
 def bond_of(found: Cells, side_m: float) -> Bond:

@@ -1,4 +1,5 @@
-"""Walls and roofs: plaster, brick, concrete, stone, wood, metal, tiles, gravel, glass; and what street things show."""
+"""Walls and roofs: plaster, brick, concrete, stone, wood, metal, tiles, gravel, glass; and what
+street things show."""
 
 from __future__ import annotations
 
@@ -8,16 +9,27 @@ from typing import Final
 
 import numpy as np
 
-from physics.textures.bonds import courses, random_courses
+from physics.textures.brick_patterns import courses, random_courses
 from physics.textures.layers import Colour, Generator, Layers, Picture, Recipe, stacked
 from physics.textures.noise import Field, Noise, blurred, cells, step
-from physics.textures.surface import bond_of, cracks, laid, mixed, plain, relief, shaded, stained, weathered
+from physics.textures.surface import (
+    bond_of,
+    cracks,
+    laid,
+    mixed,
+    plain,
+    relief,
+    shaded,
+    stained,
+    weathered,
+)
 
 _COURSE_M: Final = 0.075
 """A brick of 65 mm and its joint."""
 _CLAY: Final = ((0.56, 0.34, 0.27), (0.52, 0.31, 0.25), (0.60, 0.38, 0.30), (0.47, 0.29, 0.25))
 _LIME: Final = (0.66, 0.62, 0.56)
-_STRETCHER, _HEADER = 0.225, 0.1125
+_STRETCHER = 0.225
+_HEADER = 0.1125
 
 
 @lru_cache(maxsize=4)
@@ -40,7 +52,9 @@ def _plaster(rough: float, dirt: float, crazed: float = 0.0) -> Generator:
         if dirt:
             rgb = stained(weathered(rgb, noise, 0.14 * dirt), noise, 0.06 * dirt)
         if crazed:
-            rgb = shaded(rgb, 1.0 - 0.4 * np.float32(crazed) * cracks(noise, cells(noise, 4), 0.003))
+            rgb = shaded(
+                rgb, 1.0 - 0.4 * np.float32(crazed) * cracks(noise, cells(noise, 4), 0.003)
+            )
             bare = step(2.2, 2.4, noise.clouds(8) + 0.12 * noise.grain(1.2))
             rgb = mixed(rgb, plain(noise, (0.66, 0.62, 0.56), 0.02, 0.03), 0.7 * bare)
             return Picture(rgb, 1.0 - 0.7 * bare)
@@ -50,7 +64,10 @@ def _plaster(rough: float, dirt: float, crazed: float = 0.0) -> Generator:
 
 
 def _brick(
-    units: Sequence[Sequence[float]], shift: Sequence[float], colours: Sequence[Colour], joint: Colour
+    units: Sequence[Sequence[float]],
+    shift: Sequence[float],
+    colours: Sequence[Colour],
+    joint: Colour,
 ) -> Recipe:
     """A wall of 2.7 m: 36 courses, whose patterns of lengths follow each other."""
 
@@ -64,7 +81,9 @@ def _brick(
                 np.where(other[:, None], bonds[1].edge, bond.edge),
                 max(b.n for b in bonds),
             )
-        whole = laid(noise, bond, 2.7, colours, joint, joint_m=0.010, spread=0.07, grain=0.03, joint_tint=0.2)
+        whole = laid(
+            noise, bond, 2.7, colours, joint, joint_m=0.010, spread=0.07, grain=0.03, joint_tint=0.2
+        )
         return Picture(weathered(whole.rgb, noise, 0.08), whole.alpha)
 
     return Recipe(2.7, make)
@@ -73,9 +92,17 @@ def _brick(
 def _panels(noise: Noise) -> Picture:
     """Cast panels of 3 m x 1.5 m with tie holes."""
     whole = laid(
-        noise, courses(noise.size, 3.0, 2, [3.0], [0.0]), 3.0, ((0.66, 0.65, 0.63), (0.63, 0.62, 0.60)),
-        (0.30, 0.30, 0.29), joint_m=0.018, bevel_m=0.012, spread=0.02, wobble_m=0.0, grain=0.014,
-    )  # fmt: skip
+        noise,
+        courses(noise.size, 3.0, 2, [3.0], [0.0]),
+        3.0,
+        ((0.66, 0.65, 0.63), (0.63, 0.62, 0.60)),
+        (0.30, 0.30, 0.29),
+        joint_m=0.018,
+        bevel_m=0.012,
+        spread=0.02,
+        wobble_m=0.0,
+        grain=0.014,
+    )
     at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size * 3.0
     x, y = np.meshgrid(at, at)
     hole = 1.0 - step(0.012, 0.022, np.hypot((x % 1.5) - 0.75, np.abs((y % 1.5) - 0.75) - 0.4))
@@ -95,37 +122,58 @@ def _boarded(noise: Noise) -> Picture:
         ],
         [0.0, 0.35, 0.7],
     )
-    rgb = laid(noise, bond, 2.4, ((0.64, 0.63, 0.61),), (0.50, 0.49, 0.47), joint_m=0.004, spread=0.03).rgb
+    rgb = laid(
+        noise, bond, 2.4, ((0.64, 0.63, 0.61),), (0.50, 0.49, 0.47), joint_m=0.004, spread=0.03
+    ).rgb
     return Picture(weathered(shaded(rgb, 1.0 + 0.025 * noise.streaks(64, 8, 1)), noise, 0.05))
 
 
 def _ashlar(noise: Noise) -> Picture:
-    bond = random_courses(noise.rng, noise.size, 3.0, [0.3, 0.4, 0.3, 0.35, 0.4, 0.3, 0.35, 0.3, 0.3], (0.45, 0.8))
+    bond = random_courses(
+        noise.rng, noise.size, 3.0, [0.3, 0.4, 0.3, 0.35, 0.4, 0.3, 0.35, 0.3, 0.3], (0.45, 0.8)
+    )
     return _aged(
         laid(
-            noise, bond, 3.0, ((0.70, 0.66, 0.58), (0.67, 0.63, 0.56), (0.72, 0.68, 0.61)), (0.50, 0.47, 0.42),
-            joint_m=0.007, bevel_m=0.008, spread=0.03, clouds=0.035,
+            noise,
+            bond,
+            3.0,
+            ((0.70, 0.66, 0.58), (0.67, 0.63, 0.56), (0.72, 0.68, 0.61)),
+            (0.50, 0.47, 0.42),
+            joint_m=0.007,
+            bevel_m=0.008,
+            spread=0.03,
+            clouds=0.035,
         ),
         noise,
-    )  # fmt: skip
+    )
 
 
 def _rubble(noise: Noise) -> Picture:
     bond = bond_of(cells(noise, 12, 0.75), 2.4)
     return _aged(
         laid(
-            noise, bond, 2.4, ((0.58, 0.54, 0.48), (0.52, 0.49, 0.45), (0.63, 0.58, 0.50)), (0.66, 0.62, 0.55),
-            joint_m=0.020, bevel_m=0.014, spread=0.08, wobble_m=0.006, clouds=0.04,
+            noise,
+            bond,
+            2.4,
+            ((0.58, 0.54, 0.48), (0.52, 0.49, 0.45), (0.63, 0.58, 0.50)),
+            (0.66, 0.62, 0.55),
+            joint_m=0.020,
+            bevel_m=0.014,
+            spread=0.08,
+            wobble_m=0.006,
+            clouds=0.04,
         ),
         noise,
-    )  # fmt: skip
+    )
 
 
 def _aged(picture: Picture, noise: Noise) -> Picture:
     return Picture(weathered(picture.rgb, noise, 0.10), picture.alpha)
 
 
-def _boards(side_m: float, board_m: float, upright: bool, colour: Colour = (0.62, 0.54, 0.43)) -> Recipe:
+def _boards(
+    side_m: float, board_m: float, upright: bool, colour: Colour = (0.62, 0.54, 0.43)
+) -> Recipe:
     """Wooden boards; each throws a little shadow on the next."""
 
     def make(noise: Noise) -> Picture:
@@ -134,11 +182,22 @@ def _boards(side_m: float, board_m: float, upright: bool, colour: Colour = (0.62
         grain = noise.streaks(128, 32, 1) + 0.7 * noise.streaks(256, 32, 1)
         darker = tuple(0.93 * c for c in colour)
         whole = laid(
-            noise, bond, side_m, (colour, (darker[0], darker[1], darker[2])), (0.20, 0.17, 0.14),
-            joint_m=0.005, bevel_m=0.005, spread=0.035, wobble_m=0.0, grain=0.01, joint_tint=0.3,
-        )  # fmt: skip
+            noise,
+            bond,
+            side_m,
+            (colour, (darker[0], darker[1], darker[2])),
+            (0.20, 0.17, 0.14),
+            joint_m=0.005,
+            bevel_m=0.005,
+            spread=0.035,
+            wobble_m=0.0,
+            grain=0.01,
+            joint_tint=0.3,
+        )
         at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size * rows % 1.0
-        lap = np.broadcast_to((1.0 - 0.22 * np.exp(-at / 0.10) + 0.05 * at)[:, None], (noise.size,) * 2)
+        lap = np.broadcast_to(
+            (1.0 - 0.22 * np.exp(-at / 0.10) + 0.05 * at)[:, None], (noise.size,) * 2
+        )
         rgb = shaded(whole.rgb, (1.0 + 0.03 * grain) * lap.astype(np.float32))
         alpha = np.asarray(whole.alpha)
         return Picture(rgb.transpose(1, 0, 2), alpha.T) if upright else Picture(rgb, alpha)
@@ -149,7 +208,9 @@ def _boards(side_m: float, board_m: float, upright: bool, colour: Colour = (0.62
 def _corrugated(noise: Noise) -> Picture:
     """Sheet metal with upright waves of 0.1 m."""
     at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size * 20.0
-    wave = np.broadcast_to(1.0 + 0.13 * np.sin(2.0 * np.pi * at), (noise.size,) * 2).astype(np.float32)
+    wave = np.broadcast_to(1.0 + 0.13 * np.sin(2.0 * np.pi * at), (noise.size,) * 2).astype(
+        np.float32
+    )
     rgb = shaded(plain(noise, (0.66, 0.67, 0.68), 0.012, 0.008), wave)
     return Picture(shaded(rgb, 1.0 - 0.07 * step(0.5, 2.5, noise.streaks(64, 32))))
 
@@ -159,7 +220,16 @@ def _cassettes(noise: Noise) -> Picture:
     bond = courses(noise.size, 3.0, 4, [1.5], [0.0])
     tone = ((0.62, 0.63, 0.65), (0.60, 0.61, 0.63))
     whole = laid(
-        noise, bond, 3.0, tone, (0.14, 0.14, 0.15), joint_m=0.016, spread=0.015, wobble_m=0.0, grain=0.006, clouds=0.01
+        noise,
+        bond,
+        3.0,
+        tone,
+        (0.14, 0.14, 0.15),
+        joint_m=0.016,
+        spread=0.015,
+        wobble_m=0.0,
+        grain=0.006,
+        clouds=0.01,
     )
     return Picture(shaded(whole.rgb, 1.0 + 0.01 * noise.streaks(128, 64)), whole.alpha)
 
@@ -186,12 +256,18 @@ def _roof_tiles(noise: Noise) -> Picture:
     across, down = at * 10.0, at * 8.0
     column, row = np.floor(across).astype(int), np.floor(down).astype(int)
     tone = noise.rng.normal(1.0, 0.07, (8, 10)).astype(np.float32)[np.ix_(row, column)]
-    hump = 0.82 + 0.22 * np.sin(np.pi * (across % 1.0)) + 0.06 * np.cos(2.0 * np.pi * (across % 1.0 - 0.2))
+    hump = (
+        0.82
+        + 0.22 * np.sin(np.pi * (across % 1.0))
+        + 0.06 * np.cos(2.0 * np.pi * (across % 1.0 - 0.2))
+    )
     lip = 1.0 - 0.42 * np.exp(-(down % 1.0) / 0.07) + 0.06 * (down % 1.0)
     shape = (hump[None, :] * lip[:, None]).astype(np.float32)
     rgb = shaded(plain(noise, (0.55, 0.35, 0.28), 0.02, 0.025, 8), shape * tone)
     moss = step(1.0, 2.6, noise.clouds(8) + 0.4 * noise.grain(1.2))
-    return Picture(mixed(rgb, shaded(plain(noise, (0.36, 0.35, 0.24), 0.02, 0.03), shape), 0.6 * moss))
+    return Picture(
+        mixed(rgb, shaded(plain(noise, (0.36, 0.35, 0.24), 0.02, 0.03), shape), 0.6 * moss)
+    )
 
 
 def _slate(noise: Noise) -> Picture:
@@ -199,29 +275,56 @@ def _slate(noise: Noise) -> Picture:
     tones = ((0.36, 0.38, 0.41), (0.40, 0.41, 0.43), (0.33, 0.34, 0.37))
     whole = laid(noise, bond, 2.4, tones, (0.18, 0.18, 0.20), joint_m=0.005, spread=0.06)
     lip = 1.0 - 0.25 * np.exp(-((np.arange(noise.size) + 0.5) / noise.size * 12.0 % 1.0) / 0.06)
-    return Picture(shaded(whole.rgb, np.broadcast_to(lip[:, None], (noise.size,) * 2).astype(np.float32)), whole.alpha)
+    return Picture(
+        shaded(whole.rgb, np.broadcast_to(lip[:, None], (noise.size,) * 2).astype(np.float32)),
+        whole.alpha,
+    )
 
 
 def _roof_gravel(noise: Noise) -> Picture:
     bond = bond_of(cells(noise, 64, 0.9), 2.0)
     return laid(
-        noise, bond, 2.0, ((0.60, 0.58, 0.55), (0.52, 0.51, 0.49), (0.66, 0.64, 0.61)), (0.36, 0.35, 0.33),
-        joint_m=0.005, bevel_m=0.010, spread=0.08, joint_tint=0.8,
-    )  # fmt: skip
+        noise,
+        bond,
+        2.0,
+        ((0.60, 0.58, 0.55), (0.52, 0.51, 0.49), (0.66, 0.64, 0.61)),
+        (0.36, 0.35, 0.33),
+        joint_m=0.005,
+        bevel_m=0.010,
+        spread=0.08,
+        joint_tint=0.8,
+    )
 
 
 def _seamed(noise: Noise) -> Picture:
     """Sheet metal roof with a standing seam every 0.5 m."""
     at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size * 4.0 % 1.0
-    seam = 1.0 + 0.18 * np.exp(-(((at - 0.48) / 0.012) ** 2)) - 0.30 * np.exp(-(((at - 0.52) / 0.015) ** 2))
+    seam = (
+        1.0
+        + 0.18 * np.exp(-(((at - 0.48) / 0.012) ** 2))
+        - 0.30 * np.exp(-(((at - 0.52) / 0.015) ** 2))
+    )
     rgb = plain(noise, (0.48, 0.51, 0.52), 0.012, 0.008)
-    return Picture(shaded(weathered(rgb, noise, 0.08), np.broadcast_to(seam, (noise.size,) * 2).astype(np.float32)))
+    return Picture(
+        shaded(
+            weathered(rgb, noise, 0.08), np.broadcast_to(seam, (noise.size,) * 2).astype(np.float32)
+        )
+    )
 
 
 def _felt(noise: Noise) -> Picture:
     """Bitumen sheets, 1 m wide."""
     bond = courses(noise.size, 3.0, 3, [3.0], [0.0, 0.4, 0.7])
-    return laid(noise, bond, 3.0, ((0.34, 0.34, 0.35),), (0.24, 0.24, 0.25), joint_m=0.02, spread=0.03, grain=0.04)
+    return laid(
+        noise,
+        bond,
+        3.0,
+        ((0.34, 0.34, 0.35),),
+        (0.24, 0.24, 0.25),
+        joint_m=0.02,
+        spread=0.03,
+        grain=0.04,
+    )
 
 
 def _glass(noise: Noise) -> Picture:
@@ -275,10 +378,16 @@ WALLS: Final[Mapping[str, Recipe]] = {
     "brick-flemish": _brick([[_STRETCHER, _HEADER]], [0.0, 0.5], _CLAY, _LIME),
     "brick-english": _brick([[_STRETCHER], [_HEADER]], [0.0, 0.25], _CLAY, _LIME),
     "brick-dark": _brick(
-        [[_STRETCHER]], [0.0, 0.33, 0.67], ((0.33, 0.28, 0.27), (0.38, 0.31, 0.29)), (0.45, 0.43, 0.41)
+        [[_STRETCHER]],
+        [0.0, 0.33, 0.67],
+        ((0.33, 0.28, 0.27), (0.38, 0.31, 0.29)),
+        (0.45, 0.43, 0.41),
     ),
     "brick-pale": _brick(
-        [[_STRETCHER]], [0.0, 0.5], ((0.70, 0.63, 0.51), (0.66, 0.58, 0.47), (0.73, 0.67, 0.57)), _LIME
+        [[_STRETCHER]],
+        [0.0, 0.5],
+        ((0.70, 0.63, 0.51), (0.66, 0.58, 0.47), (0.73, 0.67, 0.57)),
+        _LIME,
     ),
     "brick-painted": _brick([[_STRETCHER]], [0.0, 0.5], ((0.80, 0.79, 0.76),), (0.74, 0.73, 0.70)),
     "concrete-panels": Recipe(3.0, _panels),
@@ -307,5 +416,7 @@ PROPS: Final[Mapping[str, Recipe]] = {
     "planks": _boards(0.6, 0.1, upright=False, colour=(0.55, 0.41, 0.28)),
     "metal-brushed": Recipe(0.5, _brushed),
     "metal-painted": Recipe(1.0, _painted),
-    "stone": Recipe(1.0, lambda noise: Picture(stained(plain(noise, (0.62, 0.60, 0.57), 0.03, 0.04), noise))),
+    "stone": Recipe(
+        1.0, lambda noise: Picture(stained(plain(noise, (0.62, 0.60, 0.57), 0.03, 0.04), noise))
+    ),
 }

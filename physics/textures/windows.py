@@ -1,4 +1,5 @@
-"""Windows of the upper storeys. A style is the same in every bay; what differs is what is behind the panes."""
+"""Windows of the upper storeys. A style is the same in every bay; what differs is what is behind
+the panes."""
 
 from __future__ import annotations
 
@@ -8,9 +9,20 @@ from typing import Final
 import numpy as np
 
 from physics.textures.facade_canvas import BAY_M, STOREY_M, FacadeCanvas
+from physics.textures.glazing import (
+    BROWN,
+    DARK,
+    GREEN,
+    STONE,
+    WHITE_FRAME,
+    opening,
+    pane,
+    railing,
+    sill,
+    surround,
+)
 from physics.textures.layers import Colour, linear
 from physics.textures.noise import step
-from physics.textures.panes import BROWN, DARK, GREEN, STONE, WHITE_FRAME, opening, pane, railing, sill, surround
 
 _Style = Callable[[FacadeCanvas], None]
 
@@ -64,7 +76,9 @@ def _shutters(colour: Colour) -> _Style:
             canvas.box(a, b, 0.86, 2.5, colour)
             area, cover, _, up = canvas.local(a + 0.06, b - 0.06, 0.95, 2.41)
             slats = 0.62 + 0.3 * (up * 1.46 / 0.055 % 1.0)
-            canvas.fill(area, cover, linear(colour) * np.broadcast_to(slats, cover.shape)[..., None])
+            canvas.fill(
+                area, cover, linear(colour) * np.broadcast_to(slats, cover.shape)[..., None]
+            )
             canvas.box(a + 0.05, b - 0.05, 1.60, 1.70, colour)
 
     return draw
@@ -105,7 +119,8 @@ def _arched(canvas: FacadeCanvas) -> None:
     _string_course(canvas)
     opening(canvas, x0, x1, 0.85, 2.5, WHITE_FRAME, (2, 2))
     area, _, across, up = canvas.local(x0 - 0.25, x1 + 0.25, 2.25, 2.8)
-    x, z = (across - 0.5) * (x1 - x0 + 0.5), up * 0.55
+    x = (across - 0.5) * (x1 - x0 + 0.5)
+    z = up * 0.55
     # The circle through the springers at z 0.1 and the crown at z 0.3 of this area.
     radius = (0.55**2 + 0.2**2) / (2.0 * 0.2)
     rise = z - (0.3 - radius)
@@ -118,7 +133,8 @@ def _arched(canvas: FacadeCanvas) -> None:
 
 
 def _balcony(front: Colour | None, frame: Colour) -> _Style:
-    """A balcony with a solid front, or a railing; its door and window lie in the shade behind it."""
+    """A balcony with a solid front, or a railing; its door and window lie in the shade behind
+    it."""
 
     def draw(canvas: FacadeCanvas) -> None:
         opening(canvas, 0.35, 2.65, 0.12, 2.5, frame, (3, 1), 0.12)

@@ -1,6 +1,8 @@
-"""`ped_crossing`: people cross from the far side and from behind when the robot enters the crosswalk.
+"""`ped_crossing`: people cross from the far side and from behind when the robot enters the
+crosswalk.
 
-The first comes from the front, in the middle or on the robot's line; every second one comes from behind.
+The first comes from the front, in the middle or on the robot's line; every second one comes from
+behind.
 """
 
 from __future__ import annotations
@@ -13,15 +15,24 @@ import numpy as np
 from cosim.spec.event_kind import EventKind
 from cosim.spec.events import Event, EventQuery, EventState, Walker
 from scenarios.events.sight import sight_of
-from scenarios.events.walking import along_m, edge_m, gave_up, left_m, met_m, pressed_on, walked_on, walker_at
+from scenarios.events.walking import (
+    along_m,
+    edge_m,
+    gave_up,
+    left_m,
+    met_m,
+    pressed_on,
+    walked_on,
+    walker_at,
+)
 
 _BEFORE_M: Final = 0.8
 """How far before its end of the crosswalk each one waits, and behind its other end it is done."""
 BEHIND_ROBOT_M: Final = 1.6
 """Those from behind wait this much farther back: the robot has just passed them."""
 MEETS_AMONG: Final = 2
-"""Among so few the first one walks on the robot's line wherever that is, else in the middle: who keeps to a side meets
-one of the others there."""
+"""Among so few the first one walks on the robot's line wherever that is, else in the middle: who
+keeps to a side meets one of the others there."""
 TO_LINE_M: Final = 1.5
 """It walks towards the point of its line so far ahead."""
 _ABREAST_M: Final = 0.75
@@ -50,7 +61,8 @@ def line_m(event: Event, number: int) -> float:
 
 
 def _step(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:
-    walker, sight = state.walkers[number], sight_of(event, number, query)
+    walker = state.walkers[number]
+    sight = sight_of(event, number, query)
     heading_rad = event.heading_rad + (math.pi if from_front(number) else 0.0)
     if from_front(number) and not gave_up(walker, query) and not _passed(event, walker, query):
         if number == 0:

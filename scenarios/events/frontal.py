@@ -1,9 +1,10 @@
-"""`frontal`: walks straight at the robot's current position, commits to a line, passes and walks on.
+"""`frontal`: walks straight at the robot's current position, commits to a line, passes and walks
+on.
 
 Who steps round somebody on the way takes aim anew.
 
-A robot that has stood for a second is walked round. One that has run into the robot does not push it: it stands, gives
-up, and goes round.
+A robot that has stood for a second is walked round. One that has run into the robot does not push
+it: it stands, gives up, and goes round.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ def _begin(event: Event, number: int) -> Walker:
 
 
 def _step(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:
-    walker, sight = state.walkers[number], sight_of(event, number, query)
+    walker = state.walkers[number]
+    sight = sight_of(event, number, query)
     on_rad = event.heading_rad + math.pi
     if state.phase == "over":
         return walked_on(walker, on_rad, event.speed_mps, sight)

@@ -1,7 +1,7 @@
 """An injected pedestrian: walks its path, stays at the end for its time, and is gone.
 
-It goes round people and the robot; a point of its path at which somebody or the robot stands counts as reached beside
-it.
+It goes round people and the robot; a point of its path at which somebody or the robot stands counts
+as reached beside it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from scenarios.events.walking import robot_of, turned, walked_to
 
 
 class InjectedPerson(NamedTuple):
-    """Where an injected pedestrian stands. leg: the point of its path it walks to; arrived_tick: at the last one."""
+    """Where an injected pedestrian stands. leg: the point of its path it walks to; arrived_tick: at
+    the last one."""
 
     injection: Injection
     walker: Walker
@@ -37,7 +38,9 @@ def arriving(injected: Injected) -> InjectedPerson:
     facing = injection.heading_rad or 0.0
     if others:
         facing = math.atan2(others[0][1] - y, others[0][0] - x)
-    return InjectedPerson(injection, Walker(x_m=x, y_m=y, heading_rad=facing), 1, None if others else injected.tick)
+    return InjectedPerson(
+        injection, Walker(x_m=x, y_m=y, heading_rad=facing), 1, None if others else injected.tick
+    )
 
 
 def injected_moved_on(person: InjectedPerson, query: EventQuery) -> InjectedPerson | None:
@@ -49,25 +52,39 @@ def injected_moved_on(person: InjectedPerson, query: EventQuery) -> InjectedPers
         if injection.heading_rad is not None:
             heading = turned(walker.heading_rad, injection.heading_rad, query.tick_ms / 1000)
             walker = msgspec.structs.replace(walker, heading_rad=heading)
-        return person._replace(walker=msgspec.structs.replace(walker, vx_mps=0.0, vy_mps=0.0), moved_m=0.0)
+        return person._replace(
+            walker=msgspec.structs.replace(walker, vx_mps=0.0, vy_mps=0.0), moved_m=0.0
+        )
     goal = injection.path[person.leg]
     sight = sight_of_injected(shown_id(injection), walker, query)
     after = walked_to(walker, *goal, injection.speed_mps, sight)
     reached = (
-        (after.x_m, after.y_m) == goal or place_taken(walker, goal, sight) or _robot_stands_at(goal, walker, query)
+        (after.x_m, after.y_m) == goal
+        or place_taken(walker, goal, sight)
+        or _robot_stands_at(goal, walker, query)
     )
-    vx_mps, vy_mps = ((b - a) * 1000 / query.tick_ms for a, b in ((walker.x_m, after.x_m), (walker.y_m, after.y_m)))
+    vx_mps, vy_mps = (
+        (b - a) * 1000 / query.tick_ms
+        for a, b in ((walker.x_m, after.x_m), (walker.y_m, after.y_m))
+    )
     after = msgspec.structs.replace(after, vx_mps=vx_mps, vy_mps=vy_mps)
     moved_m = math.hypot(after.x_m - walker.x_m, after.y_m - walker.y_m)
     leg = person.leg + reached
     arrived = query.tick if leg == len(injection.path) else None
-    return person._replace(walker=after, leg=min(leg, len(injection.path) - 1), arrived_tick=arrived, moved_m=moved_m)
+    return person._replace(
+        walker=after, leg=min(leg, len(injection.path) - 1), arrived_tick=arrived, moved_m=moved_m
+    )
 
 
 def _robot_stands_at(goal: tuple[float, float], walker: Walker, query: EventQuery) -> bool:
-    """Whether the robot stands where nobody can reach a point then, and the walker has come up to it."""
+    """Whether the robot stands where nobody can reach a point then, and the walker has come up to
+    it."""
     near = math.dist((walker.x_m, walker.y_m), goal) < BESIDE_M
-    return near and abs(query.robot_v_mps) < STILL_MPS and touches(np.array(goal), robot_of(query), STEP_ROUND_GAP_M)
+    return (
+        near
+        and abs(query.robot_v_mps) < STILL_MPS
+        and touches(np.array(goal), robot_of(query), STEP_ROUND_GAP_M)
+    )
 
 
 def shown_id(injection: Injection) -> str:

@@ -1,9 +1,10 @@
-"""`lateral`: crosses the robot's projected path at a right angle, to be where the robot is if that keeps its velocity.
+"""`lateral`: crosses the robot's projected path at a right angle, to be where the robot is if that
+keeps its velocity.
 
-Its direction is fixed at the trigger, and anew where it had to step round somebody; its pace goes with the robot's: it
-slows down as the robot does, and stands when the robot stands. So a robot that happens to slow down now and then has
-not let it cross. One that has stood for it is given way to no longer: it crosses, walks to the other edge of the
-sidewalk, and on along it.
+Its direction is fixed at the trigger, and anew where it had to step round somebody; its pace goes
+with the robot's: it slows down as the robot does, and stands when the robot stands. So a robot that
+happens to slow down now and then has not let it cross. One that has stood for it is given way to no
+longer: it crosses, walks to the other edge of the sidewalk, and on along it.
 """
 
 from __future__ import annotations
@@ -34,12 +35,15 @@ def _begin(event: Event, number: int) -> Walker:
 
 
 def _step(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:
-    walker, sight = state.walkers[number], sight_of(event, number, query)
+    walker = state.walkers[number]
+    sight = sight_of(event, number, query)
     if state.phase == "over":
         return walked_on(walker, event.heading_rad + math.pi, event.speed_mps, sight)
     across_rad = event.heading_rad - event.side * math.pi / 2
     if state.robot_stood_ticks * query.tick_ms >= 1000 * LET_CROSS_S:
-        return msgspec.structs.replace(walked_on(walker, across_rad, event.speed_mps, sight), aim_rad=None)
+        return msgspec.structs.replace(
+            walked_on(walker, across_rad, event.speed_mps, sight), aim_rad=None
+        )
     if walker.aim_rad is None or walker.pace_mps is None:
         aim_rad, pace_mps = _course(event, walker, query)
         walker = msgspec.structs.replace(walker, aim_rad=aim_rad, pace_mps=pace_mps)
@@ -59,7 +63,8 @@ def _ends(event: Event, state: EventState, query: EventQuery) -> bool:
 
 
 def _course(event: Event, walker: Walker, query: EventQuery) -> tuple[float, float]:
-    """The collision course; straight on at its pace for who was led aside, once the robot can be met no more."""
+    """The collision course; straight on at its pace for who was led aside, once the robot can be
+    met no more."""
     aim_rad, pace_mps = collision_course(walker, query, event.side)
     if walker.pace_mps is None:
         return aim_rad, pace_mps
@@ -72,32 +77,38 @@ def _course(event: Event, walker: Walker, query: EventQuery) -> tuple[float, flo
 
 
 def _pace_to_meet(walker: Walker, aim_rad: float, query: EventQuery) -> float | None:
-    """Metres a second at which the walker is on the robot's line when the robot is there; None once it is there, or the
-    robot past it."""
+    """Metres a second at which the walker is on the robot's line when the robot is there; None once
+    it is there, or the robot past it."""
     cos, sin = math.cos(query.robot_heading_rad), math.sin(query.robot_heading_rad)
     dx, dy = walker.x_m - query.robot_x_m, walker.y_m - query.robot_y_m
     across = cos * math.sin(aim_rad) - sin * math.cos(aim_rad)
     if abs(across) < _SQUARE:
         return None
     to_line_m = (sin * dx - cos * dy) / across
-    ahead_m = cos * (dx + math.cos(aim_rad) * to_line_m) + sin * (dy + math.sin(aim_rad) * to_line_m)
+    ahead_m = cos * (dx + math.cos(aim_rad) * to_line_m) + sin * (
+        dy + math.sin(aim_rad) * to_line_m
+    )
     if to_line_m <= PERSON_RADIUS_M or ahead_m <= 0.0:
         return None
     return min(max(to_line_m * query.robot_v_mps / ahead_m, SLOWEST_MPS), _FASTEST_MPS)
 
 
 def collision_course(walker: Walker, query: EventQuery, side: int) -> tuple[float, float]:
-    """(heading, speed) at right angles to the robot's heading, to meet the robot's centre if that keeps its velocity.
+    """(heading, speed) at right angles to the robot's heading, to meet the robot's centre if that
+    keeps its velocity.
 
     side: where the walker stands, left (1) or right (-1) of the robot's path.
     """
     cos, sin = math.cos(query.robot_heading_rad), math.sin(query.robot_heading_rad)
     dx, dy = walker.x_m - query.robot_x_m, walker.y_m - query.robot_y_m
-    ahead_m, left_m = cos * dx + sin * dy, -sin * dx + cos * dy
+    ahead_m = cos * dx + sin * dy
+    left_m = -sin * dx + cos * dy
     towards = -math.copysign(1.0, left_m if abs(left_m) > 1e-6 else side)
     in_s = max(ahead_m, 0.0) / max(query.robot_v_mps, 1e-6)
     pace_mps = abs(left_m) / max(in_s, 1e-6)
-    return query.robot_heading_rad + towards * math.pi / 2, min(max(pace_mps, SLOWEST_MPS), _FASTEST_MPS)
+    return query.robot_heading_rad + towards * math.pi / 2, min(
+        max(pace_mps, SLOWEST_MPS), _FASTEST_MPS
+    )
 
 
 LATERAL: Final = EventKind(

@@ -1,8 +1,9 @@
-"""`overtaking`: sets out when the robot has just passed it, comes from behind, faster, passes close by, and cuts in.
+"""`overtaking`: sets out when the robot has just passed it, comes from behind, faster, passes close
+by, and cuts in.
 
-Before the robot it slows down to half of the robot's speed, whatever that becomes. A robot that only keeps its course,
-at whatever speed or by fits and starts, runs into it then; one that slows down for it until it has been let in, or goes
-round it, does not. Then it walks on at its own pace.
+Before the robot it slows down to half of the robot's speed, whatever that becomes. A robot that
+only keeps its course, at whatever speed or by fits and starts, runs into it then; one that slows
+down for it until it has been let in, or goes round it, does not. Then it walks on at its own pace.
 """
 
 from __future__ import annotations
@@ -15,7 +16,16 @@ from cosim.core.state import PERSON_RADIUS_M
 from cosim.spec.event_kind import EventKind, SidewalkLayout
 from cosim.spec.events import Event, EventQuery, EventState, Walker
 from scenarios.events.sight import sight_of
-from scenarios.events.walking import along_m, edge_m, left_m, pressed_on, spot, walked_on, walked_to, walker_at
+from scenarios.events.walking import (
+    along_m,
+    edge_m,
+    left_m,
+    pressed_on,
+    spot,
+    walked_on,
+    walked_to,
+    walker_at,
+)
 
 _FASTER_MPS: Final = 0.8
 _FASTEST_MPS: Final = 3.3
@@ -42,17 +52,22 @@ def _begin(event: Event, number: int) -> Walker:
 
 
 def _step(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:
-    walker, sight = state.walkers[number], sight_of(event, number, query)
+    walker = state.walkers[number]
+    sight = sight_of(event, number, query)
     if state.phase == "over":
         return walked_on(walker, event.heading_rad, event.speed_mps, sight)
     if walker.pace_mps is not None:
         return pressed_on(_eased(event, walker, query), event.heading_rad, walker.pace_mps, sight)
-    lead_m, line_m = _lead_m(event, walker, query), left_m(event, query.robot_x_m, query.robot_y_m)
+    lead_m = _lead_m(event, walker, query)
+    line_m = left_m(event, query.robot_x_m, query.robot_y_m)
     if walker.aim_rad is None and lead_m >= _CUTS_IN_M:
         walker = msgspec.structs.replace(walker, aim_rad=event.heading_rad)
     if walker.aim_rad is None:
         line_m = _beside_m(event, line_m)
-    elif lead_m >= _BEFORE_ROBOT_M and abs(left_m(event, walker.x_m, walker.y_m) - line_m) < ON_LINE_M:
+    elif (
+        lead_m >= _BEFORE_ROBOT_M
+        and abs(left_m(event, walker.x_m, walker.y_m) - line_m) < ON_LINE_M
+    ):
         return msgspec.structs.replace(walker, pace_mps=_slowed_mps(query))
     pace_mps = min(max(event.speed_mps, query.robot_v_mps + _FASTER_MPS), _FASTEST_MPS)
     aim = spot(event, along_m(event, walker.x_m, walker.y_m) + _LOOK_AHEAD_M, line_m)
@@ -63,11 +78,15 @@ def _eased(event: Event, walker: Walker, query: EventQuery) -> Walker:
     """Its pace goes with the robot's; it counts how long the robot has come no nearer."""
     assert walker.pace_mps is not None
     change_mps = _EASES_MPS2 * query.tick_ms / 1000
-    pace_mps = walker.pace_mps + max(-change_mps, min(change_mps, _slowed_mps(query) - walker.pace_mps))
+    pace_mps = walker.pace_mps + max(
+        -change_mps, min(change_mps, _slowed_mps(query) - walker.pace_mps)
+    )
     lead_m = _lead_m(event, walker, query)
     if walker.nearest_m is None or lead_m < walker.nearest_m - _NEARER_M:
         return msgspec.structs.replace(walker, pace_mps=pace_mps, nearest_m=lead_m, counted_ticks=0)
-    return msgspec.structs.replace(walker, pace_mps=pace_mps, counted_ticks=walker.counted_ticks + 1)
+    return msgspec.structs.replace(
+        walker, pace_mps=pace_mps, counted_ticks=walker.counted_ticks + 1
+    )
 
 
 def _slowed_mps(query: EventQuery) -> float:

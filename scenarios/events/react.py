@@ -19,18 +19,21 @@ SHOWN_BEHIND_M = 30.0
 """An event's pedestrians exist while the robot is within these arc lengths of its place."""
 
 LEAVES_M = 15.0
-"""Those whose event is over are gone for good when the robot is this far from all of them: out of its sight."""
+"""Those whose event is over are gone for good when the robot is this far from all of them: out of
+its sight."""
 
 
 def react(query: EventQuery, kinds: EventKinds = EVENT_KINDS) -> EventReply:
-    """One tick of every event. A pure function of query and table. Raises SpecError when states and events do not
-    match, or an event is not of the table."""
+    """One tick of every event. A pure function of query and table. Raises SpecError when states and
+    events do not match, or an event is not of the table."""
     if strange := sorted({event.kind for event in query.events} - kinds.keys()):
         raise SpecError(f"event '{strange[0]}' is none of {', '.join(kinds)}")
     rows = [kinds[event.kind] for event in query.events]
     states = query.states or tuple(map(_waiting, rows, query.events))
     if [len(s.walkers) for s in states] != [event.people for event in query.events]:
-        raise SpecError(f"{len(query.events)} events came with {len(states)} states, or with other people")
+        raise SpecError(
+            f"{len(query.events)} events came with {len(states)} states, or with other people"
+        )
     told = list(zip(rows, query.events, states, strict=True))
     new = tuple(_advance(kind, event, state, query) for kind, event, state in told)
     actors = tuple(
@@ -63,7 +66,9 @@ def _triggered_m(trigger_m: float | None, event: Event, query: EventQuery) -> fl
 def _advance(kind: EventKind, event: Event, state: EventState, query: EventQuery) -> EventState:
     if state.phase == "gone":
         return state
-    state = msgspec.structs.replace(state, robot_stood_ticks=state.robot_stood_ticks + 1 if _stands(query) else 0)
+    state = msgspec.structs.replace(
+        state, robot_stood_ticks=state.robot_stood_ticks + 1 if _stands(query) else 0
+    )
     if state.phase == "waiting":
         gap_m = _triggered_m(kind.trigger_m, event, query)
         if gap_m is None:
@@ -77,13 +82,16 @@ def _advance(kind: EventKind, event: Event, state: EventState, query: EventQuery
             lane_m=left_m(event, query.robot_x_m, query.robot_y_m),
         )
     if state.phase == "over" and all(
-        math.hypot(w.x_m - query.robot_x_m, w.y_m - query.robot_y_m) > LEAVES_M for w in state.walkers
+        math.hypot(w.x_m - query.robot_x_m, w.y_m - query.robot_y_m) > LEAVES_M
+        for w in state.walkers
     ):
         return msgspec.structs.replace(state, phase="gone", since_tick=query.tick)
     if state.phase == "acting" and kind.ends(event, state, query):
         state = msgspec.structs.replace(state, phase="over", since_tick=query.tick)
     after = (kind.step(event, state, number, query) for number in range(event.people))
-    walkers = tuple(_timed(old, new, query.tick_ms) for old, new in zip(state.walkers, after, strict=True))
+    walkers = tuple(
+        _timed(old, new, query.tick_ms) for old, new in zip(state.walkers, after, strict=True)
+    )
     return msgspec.structs.replace(state, walkers=walkers)
 
 
@@ -95,10 +103,16 @@ def _stands(query: EventQuery) -> bool:
 def _timed(old: Walker, new: Walker, tick_ms: int) -> Walker:
     """A walker after its step, with the velocity of it."""
     vx, vy = (new.x_m - old.x_m) * 1000 / tick_ms, (new.y_m - old.y_m) * 1000 / tick_ms
-    return new if (vx, vy) == (new.vx_mps, new.vy_mps) else msgspec.structs.replace(new, vx_mps=vx, vy_mps=vy)
+    return (
+        new
+        if (vx, vy) == (new.vx_mps, new.vy_mps)
+        else msgspec.structs.replace(new, vx_mps=vx, vy_mps=vy)
+    )
 
 
-def _shown(kind: EventKind, event: Event, before: EventState, after: EventState, query: EventQuery) -> list[Actor]:
+def _shown(
+    kind: EventKind, event: Event, before: EventState, after: EventState, query: EventQuery
+) -> list[Actor]:
     pose = kind.pose if after.phase == "acting" else "stand"
     actors = []
     for name, old, new in zip(event.names, before.walkers, after.walkers, strict=True):

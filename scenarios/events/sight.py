@@ -10,7 +10,14 @@ import msgspec
 
 from cosim.core.state import PERSON_RADIUS_M, PersonKind
 from cosim.people.orca import HalfPlane
-from cosim.people.steering import HORIZON_S, ROOM_M, SHOULDER_TO_SHOULDER_M, Neighbour, Vector, steered
+from cosim.people.steering import (
+    HORIZON_S,
+    ROOM_M,
+    SHOULDER_TO_SHOULDER_M,
+    Neighbour,
+    Vector,
+    steered,
+)
 from cosim.people.yielding import STOOD_S
 from cosim.spec.events import Event, EventQuery, NearbyPerson, Walker
 
@@ -25,8 +32,8 @@ STILL_MPS = 0.1
 
 SQUEEZES_S = 3.0
 PRESSES_S = 6.0
-"""Who insists on a place and is not there after the first time squeezes through; after the second the crowd gives
-way."""
+"""Who insists on a place and is not there after the first time squeezes through; after the second
+the crowd gives way."""
 
 SAME_M = 0.001
 """Who is nearer is in the same place."""
@@ -36,10 +43,11 @@ SHARED = 0.5
 
 
 class Sight(NamedTuple):
-    """What somebody knows: the query, the people round it but not itself, the event on whose ground it stays.
+    """What somebody knows: the query, the people round it but not itself, the event on whose ground
+    it stays.
 
-    room_m: what it keeps from others where it can. robot_stands: whether the robot has stood long enough to be walked
-    round like anything that stands.
+    room_m: what it keeps from others where it can. robot_stands: whether the robot has stood long
+    enough to be walked round like anything that stands.
     """
 
     query: EventQuery
@@ -50,7 +58,8 @@ class Sight(NamedTuple):
 
 
 def sight_of(event: Event, number: int, query: EventQuery, waited_s: float = 0.0) -> Sight:
-    """The sight of person `number` of an event: it sees its fellows, people of other events, and who is near.
+    """The sight of person `number` of an event: it sees its fellows, people of other events, and
+    who is near.
 
     waited_s: how long it has been on its way to a place on which it insists.
     """
@@ -73,24 +82,31 @@ def standing_robot(query: EventQuery) -> list[Neighbour]:
     """The robot as two who stand, one behind the other."""
     quarter_m = query.robot_length_m / 4
     cos, sin = math.cos(query.robot_heading_rad), math.sin(query.robot_heading_rad)
-    return [Neighbour(query.robot_x_m + m * cos, query.robot_y_m + m * sin) for m in (quarter_m, -quarter_m)]
+    return [
+        Neighbour(query.robot_x_m + m * cos, query.robot_y_m + m * sin)
+        for m in (quarter_m, -quarter_m)
+    ]
 
 
 def sight_of_injected(name: str, person: Walker, query: EventQuery) -> Sight:
     """The sight of the injected person that is shown under this id."""
-    walkers = [walker for state in query.states if state.phase != "gone" for walker in state.walkers]
+    walkers = [
+        walker for state in query.states if state.phase != "gone" for walker in state.walkers
+    ]
     others = (_told_apart(name, person, one) for one in query.nearby if one.id != name)
     return Sight(query, [*map(fellow, walkers), *met(others)])
 
 
 def _told_apart(name: str, person: Walker, other: NearbyPerson) -> NearbyPerson:
-    """Who is in the very same place, as two are who are injected there at once, is seen a little to one side: else they
-    would walk in each other for ever."""
+    """Who is in the very same place, as two are who are injected there at once, is seen a little to
+    one side: else they would walk in each other for ever."""
     if math.hypot(other.x_m - person.x_m, other.y_m - person.y_m) > SAME_M:
         return other
     left_m = SAME_M if name < other.id else -SAME_M
     cos, sin = math.cos(person.heading_rad), math.sin(person.heading_rad)
-    return msgspec.structs.replace(other, x_m=person.x_m - left_m * sin, y_m=person.y_m + left_m * cos)
+    return msgspec.structs.replace(
+        other, x_m=person.x_m - left_m * sin, y_m=person.y_m + left_m * cos
+    )
 
 
 def fellow(walker: Walker | NearbyPerson) -> Neighbour:
@@ -101,33 +117,48 @@ def fellow(walker: Walker | NearbyPerson) -> Neighbour:
 
 def met(nearby: Iterable[NearbyPerson]) -> list[Neighbour]:
     """The crowd pays no heed; injected people and residents who walk steer the same way."""
-    return [Neighbour(b.x_m, b.y_m, b.vx_mps, b.vy_mps) if b.kind == PersonKind.CROWD else fellow(b) for b in nearby]
+    return [
+        Neighbour(b.x_m, b.y_m, b.vx_mps, b.vy_mps) if b.kind == PersonKind.CROWD else fellow(b)
+        for b in nearby
+    ]
 
 
 def place_taken(walker: Walker, goal: Vector, sight: Sight) -> bool:
-    """Whether somebody stands where the walker wants to stop, and the walker has come up to them."""
+    """Whether somebody stands where the walker wants to stop, and the walker has come up to
+    them."""
     return math.dist((walker.x_m, walker.y_m), goal) < BESIDE_M and any(
-        math.dist(other[:2], goal) < SHOULDER_TO_SHOULDER_M and math.hypot(other.vx_mps, other.vy_mps) < STILL_MPS
+        math.dist(other[:2], goal) < SHOULDER_TO_SHOULDER_M
+        and math.hypot(other.vx_mps, other.vy_mps) < STILL_MPS
         for other in sight.others
     )
 
 
 def led_round(
-    walker: Walker, wanted: Vector, sight: Sight, goal: Vector | None = None, *, insisting: bool = False
+    walker: Walker,
+    wanted: Vector,
+    sight: Sight,
+    goal: Vector | None = None,
+    *,
+    insisting: bool = False,
 ) -> Vector:
-    """Where a step ends that should end at `wanted` (m), once it is led round people; `wanted` itself where it is not.
+    """Where a step ends that should end at `wanted` (m), once it is led round people; `wanted`
+    itself where it is not.
 
-    goal: where the walker is going to stop. insisting: even if somebody is there, who will make room.
+    goal: where the walker is going to stop. insisting: even if somebody is there, who will make
+    room.
     """
     tick_s = sight.query.tick_ms / 1000
     at = (walker.x_m, walker.y_m)
     velocity = ((wanted[0] - at[0]) / tick_s, (wanted[1] - at[1]) / tick_s)
-    others, horizon_s = sight.others, HORIZON_S
+    others = sight.others
+    horizon_s = HORIZON_S
     if goal is not None:
         far_m = math.dist(at, goal)
         horizon_s = min(HORIZON_S, max(far_m / max(math.hypot(*velocity), 1e-9), tick_s))
         if insisting and far_m < COMES_UP_M:
-            others = [other for other in others if math.dist(other[:2], goal) > SHOULDER_TO_SHOULDER_M]
+            others = [
+                other for other in others if math.dist(other[:2], goal) > SHOULDER_TO_SHOULDER_M
+            ]
     if not others:
         return wanted
     vx, vy = steered(
@@ -142,8 +173,11 @@ def led_round(
     return wanted if (vx, vy) == velocity else (at[0] + vx * tick_s, at[1] + vy * tick_s)
 
 
-def edges(walker: Walker, wanted: Vector, event: Event | None, tick_s: float) -> tuple[HalfPlane, ...]:
-    """The velocities that keep somebody on the sidewalk or crosswalk of its event; none for who leaves it anyway."""
+def edges(
+    walker: Walker, wanted: Vector, event: Event | None, tick_s: float
+) -> tuple[HalfPlane, ...]:
+    """The velocities that keep somebody on the sidewalk or crosswalk of its event; none for who
+    leaves it anyway."""
     if event is None:
         return ()
     ahead_x, ahead_y = math.cos(event.heading_rad), math.sin(event.heading_rad)

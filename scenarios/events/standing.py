@@ -1,8 +1,9 @@
 """Those who stand in the way: `obstructing`, `conversing`, `queueing`, `gesturing`.
 
-They wait at the edge of the sidewalk and step to their places when triggered: on the middle of the sidewalk, or before
-a robot that does not drive there, so that who only keeps its course meets them. They stay until the robot is past, and
-the stopping hand until the robot has stood before it; then they step back.
+They wait at the edge of the sidewalk and step to their places when triggered: on the middle of the
+sidewalk, or before a robot that does not drive there, so that who only keeps its course meets them.
+They stay until the robot is past, and the stopping hand until the robot has stood before it; then
+they step back.
 """
 
 from __future__ import annotations
@@ -16,12 +17,21 @@ import numpy as np
 
 from cosim.core.geometry import Pose, wrap_angle
 from cosim.core.state import PERSON_RADIUS_M
-from cosim.judge.referee import STOP_S, stands_before
 from cosim.people.yielding import ROBOT_STANDS_MPS
+from cosim.results.referee import STOP_S, stands_before
 from cosim.spec.event_kind import EventKind, SidewalkLayout
 from cosim.spec.events import Event, EventQuery, EventState, Walker
 from scenarios.events.sight import sight_of
-from scenarios.events.walking import ON_THE_MIDDLE_M, along_m, edge_m, met_m, spot, turned, walked_to, walker_at
+from scenarios.events.walking import (
+    ON_THE_MIDDLE_M,
+    along_m,
+    edge_m,
+    met_m,
+    spot,
+    turned,
+    walked_to,
+    walker_at,
+)
 
 _TRIGGER_M: Final = 10.0
 LOOK_PERIOD_S: Final = 4.0
@@ -97,11 +107,16 @@ def _standing(places: _Places, facing: _Facing) -> _Step:
     """The steps of those who go to `places` and face somewhere there."""
 
     def step(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:
-        walker, acting = state.walkers[number], state.phase == "acting"
+        walker = state.walkers[number]
+        acting = state.phase == "acting"
         tick_s = query.tick_ms / 1000
-        x_m, y_m = spot(event, *(places(event, state.lane_m)[number] if acting else _aside(event, number)))
+        x_m, y_m = spot(
+            event, *(places(event, state.lane_m)[number] if acting else _aside(event, number))
+        )
         if (walker.x_m, walker.y_m) != (x_m, y_m):
-            sight = sight_of(event, number, query, (query.tick - state.since_tick) * tick_s if acting else 0.0)
+            sight = sight_of(
+                event, number, query, (query.tick - state.since_tick) * tick_s if acting else 0.0
+            )
             return walked_to(walker, x_m, y_m, event.speed_mps, sight, insisting=acting)
         if acting:
             heading = turned(walker.heading_rad, facing(event, walker, query, state), tick_s)

@@ -1,11 +1,12 @@
-"""PPO of Stable-Baselines3 learns to go straight on: pip install 'sidewalk-cosim[gym]' stable-baselines3
+"""PPO of Stable-Baselines3 learns to go straight on: pip install 'sidewalk-cosim[gym]'
+stable-baselines3
 
     python scenarios/examples/learn_straight_on.py --minutes 30 --processes 2 --out learned
 
-It sees 48 x 48 pixels, its speeds and the next sub-goal; the streets are those of `static` of `reactive`, with nobody
-in them. In the beginning it stands still on average, and turns at random. FOLDER/curve.csv tells how it goes on,
-FOLDER/curve.png shows it, FOLDER/model.zip is what was learned; then it is scored as any policy is, in places that it
-has never seen.
+It sees 48 x 48 pixels, its speeds and the next sub-goal; the streets are those of `static` of
+`reactive`, with nobody in them. In the beginning it stands still on average, and turns at random.
+FOLDER/curve.csv tells how it goes on, FOLDER/curve.png shows it, FOLDER/model.zip is what was
+learned; then it is scored as any policy is, in places that it has never seen.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import SubprocVecEnv, VecNormalize
 
-from scenarios.gym.learned import LearnedPolicy
+from scenarios.tools.gym.learned import LearnedPolicy
 
 SEES = cosim.Manifest("ppo", rate_hz=4.0, camera=cosim.CameraSpec(48, 48), goal="route_point")
 _COLUMNS = ("steps", "cpu_s", "episodes", "return", "success")
@@ -46,15 +47,17 @@ def static_env() -> Monitor:
 
 
 class Curve(BaseCallback):  # type: ignore[misc]
-    """Writes a row after every rollout: steps, CPU time of all processes, the latest episodes. until_s: of
-    `time.monotonic`, when the learning ends."""
+    """Writes a row after every rollout: steps, CPU time of all processes, the latest episodes.
+    until_s: of `time.monotonic`, when the learning ends."""
 
     def __init__(self, path: Path, pids: list[int], until_s: float) -> None:
         super().__init__()
         self._file = path.open("w", newline="")
         self._rows = csv.writer(self._file)
         self._rows.writerow(_COLUMNS)
-        self._pids, self._count, self._until_s = pids, 0, until_s
+        self._pids = pids
+        self._count = 0
+        self._until_s = until_s
         self._latest: deque[tuple[float, bool]] = deque(maxlen=_LATEST)
 
     def _on_step(self) -> bool:
@@ -66,9 +69,19 @@ class Curve(BaseCallback):  # type: ignore[misc]
 
     def _on_rollout_end(self) -> None:
         if self._latest:
-            returns, successes = (sum(column) / len(self._latest) for column in zip(*self._latest, strict=True))
+            returns, successes = (
+                sum(column) / len(self._latest) for column in zip(*self._latest, strict=True)
+            )
             cpu_s = time.process_time() + sum(map(cpu_s_of, self._pids))
-            self._rows.writerow([self.num_timesteps, f"{cpu_s:.1f}", self._count, f"{returns:.2f}", f"{successes:.3f}"])
+            self._rows.writerow(
+                [
+                    self.num_timesteps,
+                    f"{cpu_s:.1f}",
+                    self._count,
+                    f"{returns:.2f}",
+                    f"{successes:.3f}",
+                ]
+            )
             self._file.flush()
 
     def _on_training_end(self) -> None:
@@ -88,11 +101,20 @@ def _drawn_curve(curve: Path, output: Path) -> None:
     with curve.open() as file:
         rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(file)]
     steps = [row["steps"] for row in rows]
-    figure, (above, below) = plt.subplots(2, 1, figsize=(6.4, 4.4), sharex=True, layout="constrained")
+    figure, (above, below) = plt.subplots(
+        2, 1, figsize=(6.4, 4.4), sharex=True, layout="constrained"
+    )
     above.plot(steps, [row["success"] for row in rows], color="tab:green")
-    above.set(ylabel="success", ylim=(-0.03, 1.03), title=f"PPO, static streets: the latest {_LATEST} episodes")
+    above.set(
+        ylabel="success",
+        ylim=(-0.03, 1.03),
+        title=f"PPO, static streets: the latest {_LATEST} episodes",
+    )
     below.plot(steps, [row["return"] for row in rows])
-    below.set(ylabel="return", xlabel=f"steps of 0.25 s ({rows[-1]['cpu_s'] / 60:.0f} minutes of CPU in all)")
+    below.set(
+        ylabel="return",
+        xlabel=f"steps of 0.25 s ({rows[-1]['cpu_s'] / 60:.0f} minutes of CPU in all)",
+    )
     for axes in (above, below):
         axes.grid(alpha=0.3)
     figure.savefig(output, dpi=100)
@@ -101,25 +123,38 @@ def _drawn_curve(curve: Path, output: Path) -> None:
 def learn(
     minutes: float, processes: int, out: Path, seed: int, steps: int = 10**9, rollout: int = 256
 ) -> LearnedPolicy:
-    """What was learned in so much time, or so many steps if these are done before, with its curve in a folder."""
+    """What was learned in so much time, or so many steps if these are done before, with its curve
+    in a folder."""
     torch.set_num_threads(1)
     out.mkdir(parents=True, exist_ok=True)
     envs = SubprocVecEnv([static_env] * processes, start_method="spawn")
     try:
         pids = [process.pid for process in envs.processes]
         normal = VecNormalize(envs, norm_obs_keys=["goal", "speeds"], gamma=0.98)
-        settings = {"n_steps": rollout, "batch_size": 128, "n_epochs": 5, "gamma": 0.98, "learning_rate": 5e-4}
+        settings = {
+            "n_steps": rollout,
+            "batch_size": 128,
+            "n_epochs": 5,
+            "gamma": 0.98,
+            "learning_rate": 5e-4,
+        }
         model = sb3.PPO("MultiInputPolicy", normal, seed=seed, device="cpu", **settings)
-        model.learn(steps, callback=Curve(out / "curve.csv", pids, time.monotonic() + 60.0 * minutes))
+        model.learn(
+            steps, callback=Curve(out / "curve.csv", pids, time.monotonic() + 60.0 * minutes)
+        )
     finally:
         envs.close()
     model.save(out / "model.zip")
     normal.save(out / "normal.pkl")
-    return LearnedPolicy(lambda seen: model.predict(normal.normalize_obs(seen), deterministic=True)[0], SEES)
+    return LearnedPolicy(
+        lambda seen: model.predict(normal.normalize_obs(seen), deterministic=True)[0], SEES
+    )
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--steps", type=int, default=10**9, help="at most")
     parser.add_argument("--processes", type=int, default=2)

@@ -1,7 +1,9 @@
-"""What a street is made of: centre lines (straight, curve, S-bend, rounded corner, ring) and cross-sections, in metres.
+"""What a street is made of: centre lines (straight, curve, S-bend, rounded corner, ring) and
+cross-sections, in metres.
 
-Together with the T, X and Y junctions that the plan of a city makes of them these are the seven primitive blocks.
-Trigonometry goes through `math`, not through numpy's kernels, which differ between processors.
+Together with the T, X and Y junctions that the plan of a city makes of them these are the seven
+primitive blocks. Trigonometry goes through `math`, not through numpy's kernels, which differ
+between processors.
 """
 
 from __future__ import annotations
@@ -21,8 +23,9 @@ _STEP_M = 6.0
 
 
 class Section(NamedTuple):
-    """Cross-section of a street from its middle outwards, per direction: half of the island in the middle, lanes,
-    gutter and curb (both drawn within the lanes and the verge), verge, sidewalk, frontage."""
+    """Cross-section of a street from its middle outwards, per direction: half of the island in the
+    middle, lanes, gutter and curb (both drawn within the lanes and the verge), verge, sidewalk,
+    frontage."""
 
     median_m: float
     lanes: int
@@ -45,8 +48,8 @@ Range = tuple[float, float]
 class StreetClass(NamedTuple):
     """What streets of a class have in common: lanes per direction, ranges of widths in metres.
 
-    sidewalks_m: widths to choose from, odd multiples of SUMO's 0.64 m stripes, or walkers jump sideways at corners.
-    driveways: per metre of sidewalk.
+    sidewalks_m: widths to choose from, odd multiples of SUMO's 0.64 m stripes, or walkers jump
+    sideways at corners. driveways: per metre of sidewalk.
     """
 
     lanes: int
@@ -82,23 +85,73 @@ class StreetClass(NamedTuple):
 
 CLASSES = {
     "residential": StreetClass(
-        1, 8.33, 3, (3.0, 3.4), (1.2, 2.2), (1.92, 3.2, 3.2), (2.0, 4.5), (0.1, 0.2), (0.25, 0.4), driveways=1 / 50
+        1,
+        8.33,
+        3,
+        (3.0, 3.4),
+        (1.2, 2.2),
+        (1.92, 3.2, 3.2),
+        (2.0, 4.5),
+        (0.1, 0.2),
+        (0.25, 0.4),
+        driveways=1 / 50,
     ),
     "commercial": StreetClass(
-        1, 8.33, 4, (3.2, 3.6), (0.8, 1.4), (3.2, 4.48, 5.76), (0.6, 1.6), (0.15, 0.25), (0.25, 0.4), driveways=1 / 200
+        1,
+        8.33,
+        4,
+        (3.2, 3.6),
+        (0.8, 1.4),
+        (3.2, 4.48, 5.76),
+        (0.6, 1.6),
+        (0.15, 0.25),
+        (0.25, 0.4),
+        driveways=1 / 200,
     ),
     "avenue": StreetClass(
-        2, 13.89, 6, (3.1, 3.4), (1.2, 2.0), (3.2, 4.48), (1.0, 3.0), (0.15, 0.25), (0.3, 0.5), (0.6, 0.9), (3.2, 4.48)
+        2,
+        13.89,
+        6,
+        (3.1, 3.4),
+        (1.2, 2.0),
+        (3.2, 4.48),
+        (1.0, 3.0),
+        (0.15, 0.25),
+        (0.3, 0.5),
+        (0.6, 0.9),
+        (3.2, 4.48),
     ),
     "boulevard": StreetClass(
-        2, 13.89, 7, (3.2, 3.5), (1.8, 3.0), (4.48, 5.76), (2.0, 4.0), (0.15, 0.25), (0.3, 0.5), (1.0, 1.5), (4.48,)
+        2,
+        13.89,
+        7,
+        (3.2, 3.5),
+        (1.8, 3.0),
+        (4.48, 5.76),
+        (2.0, 4.0),
+        (0.15, 0.25),
+        (0.3, 0.5),
+        (1.0, 1.5),
+        (4.48,),
     ),
     "narrow": StreetClass(
-        1, 5.56, 2, (2.8, 3.1), (0.3, 0.5), (1.92,), (0.4, 0.8), (0.1, 0.15), (0.15, 0.25), driveways=1 / 150
+        1,
+        5.56,
+        2,
+        (2.8, 3.1),
+        (0.3, 0.5),
+        (1.92,),
+        (0.4, 0.8),
+        (0.1, 0.15),
+        (0.15, 0.25),
+        driveways=1 / 150,
     ),
-    "ring": StreetClass(1, 6.94, 5, (4.3, 4.7), (0.6, 1.2), (3.2,), (0.8, 1.5), (0.1, 0.2), (0.25, 0.4)),
+    "ring": StreetClass(
+        1, 6.94, 5, (4.3, 4.7), (0.6, 1.2), (3.2,), (0.8, 1.5), (0.1, 0.2), (0.25, 0.4)
+    ),
 }
-"""Streets of two lanes and more per direction have an island in their middle, a refuge for who crosses."""
+"""Streets of two lanes and more per direction have an island in their middle, a refuge for who
+crosses."""
 
 
 def polar(centre: Point, radius_m: float, angle_rad: float) -> Point:
@@ -122,9 +175,11 @@ def straight(a: Point, b: Point) -> Line:
 
 
 def bend(a: Point, b: Point, leave_rad: float, arrive_rad: float) -> Line:
-    """From a, leaving with heading `leave_rad`, to b, arriving with heading `arrive_rad`: a cubic Bezier."""
+    """From a, leaving with heading `leave_rad`, to b, arriving with heading `arrive_rad`: a cubic
+    Bezier."""
     handle = math.dist(a, b) / 3.0
-    c, d = polar(a, handle, leave_rad), polar(b, -handle, arrive_rad)
+    c = polar(a, handle, leave_rad)
+    d = polar(b, -handle, arrive_rad)
     count = max(4, math.ceil(math.dist(a, b) / _STEP_M))
     line = []
     for i in range(count + 1):
@@ -135,7 +190,8 @@ def bend(a: Point, b: Point, leave_rad: float, arrive_rad: float) -> Line:
 
 
 def corner(a: Point, via: Point, b: Point, radius_m: float) -> Line:
-    """From a by `via` to b, the corner rounded with `radius_m` (less where the legs are too short)."""
+    """From a by `via` to b, the corner rounded with `radius_m` (less where the legs are too
+    short)."""
     into, out = direction(a, via), direction(via, b)
     turn = math.remainder(out - into, 2.0 * math.pi)
     if abs(turn) < 0.02:
@@ -149,13 +205,15 @@ def corner(a: Point, via: Point, b: Point, radius_m: float) -> Line:
 
 
 def arc(centre: Point, radius_m: float, from_rad: float, turn_rad: float) -> Line:
-    """A circular arc that starts at the angle `from_rad` and runs through `turn_rad`, left positive."""
+    """A circular arc that starts at the angle `from_rad` and runs through `turn_rad`, left
+    positive."""
     count = max(4, math.ceil(radius_m * abs(turn_rad) / (_STEP_M / 2.0)))
     return [polar(centre, radius_m, from_rad + turn_rad * i / count) for i in range(count + 1)]
 
 
 def ring(centre: Point, radius_m: float, angles_rad: Sequence[float]) -> list[Line]:
-    """The roundabout block: counter-clockwise arcs from each of the ascending angles to the next one."""
+    """The roundabout block: counter-clockwise arcs from each of the ascending angles to the next
+    one."""
     following = [*angles_rad[1:], angles_rad[0] + 2.0 * math.pi]
     return [arc(centre, radius_m, a, b - a) for a, b in zip(angles_rad, following, strict=True)]
 
@@ -169,7 +227,11 @@ def split(line: Line, s_m: float) -> tuple[Line, Line]:
             t = (s_m - walked) / step
             cut = (p[0] + t * (q[0] - p[0]), p[1] + t * (q[1] - p[1]))
             head = [r for k, r in enumerate(line[: i + 1]) if k == 0 or math.dist(r, cut) > 1.0]
-            tail = [r for k, r in enumerate(line[i + 1 :], i + 1) if k == len(line) - 1 or math.dist(r, cut) > 1.0]
+            tail = [
+                r
+                for k, r in enumerate(line[i + 1 :], i + 1)
+                if k == len(line) - 1 or math.dist(r, cut) > 1.0
+            ]
             return [*head, cut], [cut, *tail]
         walked += step
     raise ValueError(f"cannot cut a line of {walked:.1f} m at {s_m:.1f} m")

@@ -1,6 +1,8 @@
-"""What a generated city is made of, counted on its net file: blocks, zones, walkways, signals; and what is wrong.
+"""What a generated city is made of, counted on its net file: blocks, zones, walkways, signals; and
+what is wrong.
 
-Nothing of the plan is used: everything is read back from the saved net and from the StreetMap made of it.
+Nothing of the plan is used: everything is read back from the saved net and from the StreetMap made
+of it.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from cosim.place import overlay
 from cosim.place.street_map import Lane, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
 from sumo_nets.city.signals import signal_faults
-from sumo_nets.net.netfile import read_net
+from sumo_nets.net.net_file import read_net
 
 BLOCKS = ("straight", "curve", "s_bend", "t_junction", "x_junction", "y_junction", "roundabout")
 """The seven primitive blocks."""
@@ -55,11 +57,12 @@ class Span(NamedTuple):
 class Census(NamedTuple):
     """A city in figures.
 
-    blocks: how many of each of BLOCKS. zones: widths in metres, one value per sidewalk; missing: streets where a
-    zone cannot be read back. crosswalks: crossings in the middle of a street; refuges: crossings with an island.
-    one_piece: share of the walkable area in its largest part. clear_m: free width everywhere on the walkable ground,
-    what was said to stand on it apart.
-    longest_m: the longest of all shortest walks that was found. faults: what breaks the promises of a city.
+    blocks: how many of each of BLOCKS. zones: widths in metres, one value per sidewalk; missing:
+    streets where a zone cannot be read back. crosswalks: crossings in the middle of a street;
+    refuges: crossings with an island. one_piece: share of the walkable area in its largest part.
+    clear_m: free width everywhere on the walkable ground, what was said to stand on it apart.
+    longest_m: the longest of all shortest walks that was found. faults: what breaks the promises of
+    a city.
     """
 
     name: str
@@ -90,14 +93,20 @@ class _Way(NamedTuple):
     line: Floats
 
 
-def census(path: Path, street_map: StreetMap | None = None, standing: Sequence[shapely.Geometry] = ()) -> Census:
-    """Count a city's net. street_map: of the same file, when it has been read already; standing: ground that is
-    covered by furniture."""
+def census(
+    path: Path, street_map: StreetMap | None = None, standing: Sequence[shapely.Geometry] = ()
+) -> Census:
+    """Count a city's net. street_map: of the same file, when it has been read already; standing:
+    ground that is covered by furniture."""
     place = read_net(path) if street_map is None else street_map
     net = path.read_bytes()
     root = ET.fromstring(net)
     ways = _ways(root, place)
-    medians = {e.get("id") for e in root.iter("edge") if any(lane.get("type") == "median" for lane in e.iter("lane"))}
+    medians = {
+        e.get("id")
+        for e in root.iter("edge")
+        if any(lane.get("type") == "median" for lane in e.iter("lane"))
+    }
     sidewalks = [strip for strip in place.strips.values() if strip.kind == "sidewalk"]
     crossings = [strip for strip in place.strips.values() if strip.kind == "crossing"]
     blocks, middles = _blocks(root, ways)
@@ -128,23 +137,31 @@ def census(path: Path, street_map: StreetMap | None = None, standing: Sequence[s
 
 
 def clear_width_m(
-    place: StreetMap, standing: Sequence[shapely.Geometry] = (), widest_m: float = 2.0, step_m: float = 0.05
+    place: StreetMap,
+    standing: Sequence[shapely.Geometry] = (),
+    widest_m: float = 2.0,
+    step_m: float = 0.05,
 ) -> float:
-    """The largest width, in steps, that passes everywhere: shrunk by half of it, the walkable ground around what
-    stands on it still has one piece that holds the middles of all strips."""
+    """The largest width, in steps, that passes everywhere: shrunk by half of it, the walkable
+    ground around what stands on it still has one piece that holds the middles of all strips."""
     ground: shapely.Geometry = shapely.simplify(place.walkable, 0.01)
     shapely.prepare(ground)
     if in_the_way := [thing for thing in standing if shapely.intersects(ground, thing)]:
         ground = overlay.difference(ground, overlay.union_all(in_the_way))
     lines = shapely.linestrings(
         np.concatenate([strip.line[:, :2] for strip in place.strips.values()]),
-        indices=np.repeat(np.arange(len(place.strips)), [len(strip.line) for strip in place.strips.values()]),
+        indices=np.repeat(
+            np.arange(len(place.strips)), [len(strip.line) for strip in place.strips.values()]
+        ),
     )
     middles = shapely.get_coordinates(shapely.line_interpolate_point(lines, 0.5, normalized=True))
-    low, high = 0, round(widest_m / step_m) + 1
+    low = 0
+    high = round(widest_m / step_m) + 1
     while high - low > 1:
         steps = (low + high) // 2
-        low, high = (steps, high) if _passes(ground, middles, 0.5 * steps * step_m) else (low, steps)
+        low, high = (
+            (steps, high) if _passes(ground, middles, 0.5 * steps * step_m) else (low, steps)
+        )
     return low * step_m
 
 
@@ -159,13 +176,15 @@ def _passes(ground: shapely.Geometry, middles: Floats, half_m: float) -> bool:
 
 
 def longest_walk_m(graph: WalkGraph) -> float:
-    """Length of the longest shortest walk that two sweeps find: from a far corner to the farthest port, and again."""
+    """Length of the longest shortest walk that two sweeps find: from a far corner to the farthest
+    port, and again."""
     port = graph.ports[int(np.argmin(graph.xy.sum(axis=1)))]
     longest = 0.0
     for _ in range(2):
         reach = graph.reach(port)
         distance = np.where(np.isfinite(reach.distance_m), reach.distance_m, -1.0)
-        longest, port = float(distance.max()), graph.ports[int(distance.argmax())]
+        longest = float(distance.max())
+        port = graph.ports[int(distance.argmax())]
     return longest
 
 
@@ -202,7 +221,9 @@ def _blocks(root: ET.Element, ways: Mapping[str, _Way]) -> tuple[Counter[str], s
         if node in round_about:
             continue
         order = sorted(headings)
-        widest = max((b - a) % (2.0 * math.pi) for a, b in zip(order, [*order[1:], order[0]], strict=True))
+        widest = max(
+            (b - a) % (2.0 * math.pi) for a, b in zip(order, [*order[1:], order[0]], strict=True)
+        )
         if len(order) == 2:
             middles.add(node)
         elif len(order) == 3:
@@ -214,15 +235,22 @@ def _blocks(root: ET.Element, ways: Mapping[str, _Way]) -> tuple[Counter[str], s
 
 def _shape(line: Floats) -> str:
     """The kind of a street's middle line by how far it turns left and right."""
-    headings = [math.atan2(q[1] - p[1], q[0] - p[0]) for p, q in pairwise(line.tolist()) if math.dist(p, q) > 0.05]
+    headings = [
+        math.atan2(q[1] - p[1], q[0] - p[0])
+        for p, q in pairwise(line.tolist())
+        if math.dist(p, q) > 0.05
+    ]
     turns = [math.remainder(b - a, 2.0 * math.pi) for a, b in pairwise(headings)]
-    left, right = sum(t for t in turns if t > 0.0), -sum(t for t in turns if t < 0.0)
+    left = sum(t for t in turns if t > 0.0)
+    right = -sum(t for t in turns if t < 0.0)
     if left + right < STRAIGHT_RAD:
         return "straight"
     return "s_bend" if min(left, right) > STRAIGHT_RAD else "curve"
 
 
-def _zones(place: StreetMap, ways: Mapping[str, _Way], sidewalks: Sequence[Strip]) -> tuple[dict[str, Span], int]:
+def _zones(
+    place: StreetMap, ways: Mapping[str, _Way], sidewalks: Sequence[Strip]
+) -> tuple[dict[str, Span], int]:
     """Widths of the zones of every street, and how many streets lack one."""
     lanes: dict[str, list[Lane]] = defaultdict(list)
     for lane in place.lanes.values():
@@ -248,8 +276,11 @@ def _zones(place: StreetMap, ways: Mapping[str, _Way], sidewalks: Sequence[Strip
 
 
 def _faults(found: Census, place: StreetMap, signals: Sequence[str]) -> list[str]:
-    """Which promises of a city are broken, a sentence each. Small cities need not have every block."""
-    faults = [f"no {name} block" for name, count in found.blocks.items() if not count and found.km2 > 3.0]
+    """Which promises of a city are broken, a sentence each. Small cities need not have every
+    block."""
+    faults = [
+        f"no {name} block" for name, count in found.blocks.items() if not count and found.km2 > 3.0
+    ]
     loose = sum(None in strip.corners for strip in place.strips.values())
     if found.missing:
         faults.append(f"{found.missing} streets without all of the zones {', '.join(ZONES)}")

@@ -1,8 +1,9 @@
-"""A whole city from a seed: a jittered lattice with streets removed, bent, joined by roundabouts and crosswalks.
+"""A whole city from a seed: a jittered lattice with streets removed, bent, joined by roundabouts
+and crosswalks.
 
-The plan is pure geometry and topology; `sumo_nets.city.store` makes a street net of it. A street class and its widths
-run along a whole row or column of the lattice. Metres, x east, y north; the city fills the square from 0, 0 to size_m,
-size_m."""
+The plan is pure geometry and topology; `sumo_nets.city.store` makes a street net of it. A street
+class and its widths run along a whole row or column of the lattice. Metres, x east, y north; the
+city fills the square from 0, 0 to size_m, size_m."""
 
 from __future__ import annotations
 
@@ -30,7 +31,8 @@ CLEAR_RAD = math.radians(58.0)
 
 
 class _Style(NamedTuple):
-    """Shares of what cities are made of, on average; classes: weight of each street class among rows and columns."""
+    """Shares of what cities are made of, on average; classes: weight of each street class among
+    rows and columns."""
 
     classes: dict[str, float]
     jitter: float
@@ -71,11 +73,14 @@ PURPOSES = (
 
 
 def plan_city(seed: int, size_m: float, style: str) -> CityPlan:
-    """The plan of a city; equal to the bit for equal arguments. Raises MapError for a size out of range."""
+    """The plan of a city; equal to the bit for equal arguments. Raises MapError for a size out of
+    range."""
     if style not in STYLES:
         raise unknown("city style", style, STYLES)
     if not _SIZE_M[0] <= size_m <= _SIZE_M[1]:
-        raise MapError(f"a city's size_m must be in [{_SIZE_M[0]:g}, {_SIZE_M[1]:g}], not {size_m:g}")
+        raise MapError(
+            f"a city's size_m must be in [{_SIZE_M[0]:g}, {_SIZE_M[1]:g}], not {size_m:g}"
+        )
     if seed < 0:
         raise MapError(f"a city's seed cannot be negative: {seed}")
     entropy = (seed, round(size_m * 100), sorted(STYLES).index(style))
@@ -92,8 +97,11 @@ def plan_city(seed: int, size_m: float, style: str) -> CityPlan:
 
 
 def _character(rng: np.random.Generator, style: _Style) -> tuple[_Style, float]:
-    """What one city of a style is made of, and how far apart its streets are: cities differ as a whole too."""
-    classes = {name: weight * float(rng.uniform(0.4, 1.6)) for name, weight in style.classes.items()}
+    """What one city of a style is made of, and how far apart its streets are: cities differ as a
+    whole too."""
+    classes = {
+        name: weight * float(rng.uniform(0.4, 1.6)) for name, weight in style.classes.items()
+    }
     shares = [share * float(rng.uniform(0.6, 1.4)) for share in style[2:]]
     jitter = style.jitter * float(rng.uniform(0.5, 1.1))
     return _Style(classes, jitter, *shares), float(rng.uniform(*PITCH_M))
@@ -118,11 +126,22 @@ def _lattice(
             # The border stays straight enough to remain inside the square.
             dx, dy = dx * (0.3 if i in (0, cells) else 1.0), dy * (0.3 if j in (0, cells) else 1.0)
             at[i, j] = (x + dx + wave_x.shift(x, y, size_m), y + dy + wave_y.shift(y, x, size_m))
-    names, weights = list(style.classes), np.array(list(style.classes.values()))
-    rows, columns = (class_rng.choice(names, cells + 1, p=weights / weights.sum()).tolist() for _ in range(2))
-    across, along = ([CLASSES[name].section(width_rng) for name in line] for line in (rows, columns))
-    links = [Link((i, j), (i + 1, j), rows[j], across[j]) for i in range(cells) for j in range(cells + 1)]
-    links += [Link((i, j), (i, j + 1), columns[i], along[i]) for i in range(cells + 1) for j in range(cells)]
+    names = list(style.classes)
+    weights = np.array(list(style.classes.values()))
+    rows, columns = (
+        class_rng.choice(names, cells + 1, p=weights / weights.sum()).tolist() for _ in range(2)
+    )
+    across, along = (
+        [CLASSES[name].section(width_rng) for name in line] for line in (rows, columns)
+    )
+    links = [
+        Link((i, j), (i + 1, j), rows[j], across[j]) for i in range(cells) for j in range(cells + 1)
+    ]
+    links += [
+        Link((i, j), (i, j + 1), columns[i], along[i])
+        for i in range(cells + 1)
+        for j in range(cells)
+    ]
     return Draft(at, links)
 
 
@@ -145,12 +164,20 @@ class _Wave(NamedTuple):
     @classmethod
     def draw(cls, rng: np.random.Generator, size_m: float) -> _Wave:
         length_m = float(rng.uniform(0.6, 1.2)) * size_m
-        return cls(length_m * float(rng.uniform(0.0, 0.03)), length_m, float(rng.uniform(0.0, 2.0 * math.pi)))
+        return cls(
+            length_m * float(rng.uniform(0.0, 0.03)),
+            length_m,
+            float(rng.uniform(0.0, 2.0 * math.pi)),
+        )
 
     def shift(self, along_m: float, across_m: float, size_m: float) -> float:
         """How far a point moves along one axis."""
         inside = math.sin(math.pi * (along_m - _MARGIN_M) / (size_m - 2.0 * _MARGIN_M))
-        return self.height_m * inside * math.sin(2.0 * math.pi * across_m / self.length_m + self.phase_rad)
+        return (
+            self.height_m
+            * inside
+            * math.sin(2.0 * math.pi * across_m / self.length_m + self.phase_rad)
+        )
 
 
 def _diagonals(draft: Draft, rng: np.random.Generator, share: float) -> None:
@@ -168,7 +195,8 @@ def _diagonals(draft: Draft, rng: np.random.Generator, share: float) -> None:
         dropped = [
             link
             for link in draft.links
-            if {link.a, link.b} <= corners and (link.a[1] == link.b[1] if across else link.a[0] == link.b[0])
+            if {link.a, link.b} <= corners
+            and (link.a[1] == link.b[1] if across else link.a[0] == link.b[0])
         ]
         kept = [link for link in draft.links if link not in dropped]
         for degrees in (14.0, 20.0, 26.0):
@@ -200,7 +228,10 @@ def _remove(draft: Draft, rng: np.random.Generator, share: float) -> None:
         if link.turns != (0.0, 0.0) or any(len(neighbours[end]) < 3 for end in ends):
             continue
         # Two arms make one longer street: rarely, and never two such points in a row.
-        if any(len(neighbours[near]) < 3 for end in thin for near in neighbours[end]) or len(thin) == 2:
+        if (
+            any(len(neighbours[near]) < 3 for end in thin for near in neighbours[end])
+            or len(thin) == 2
+        ):
             continue
         if thin and (slanting & set(thin) or rng.random() > 0.3):
             continue
@@ -215,7 +246,8 @@ def _remove(draft: Draft, rng: np.random.Generator, share: float) -> None:
 
 
 def _reaches(neighbours: dict[Cell, set[Cell]], start: Cell, goal: Cell) -> bool:
-    seen, front = {start}, [start]
+    seen = {start}
+    front = [start]
     while front:
         cell = front.pop()
         if cell == goal:
@@ -246,7 +278,9 @@ def _bend_streets(draft: Draft, rng: np.random.Generator, style: _Style) -> None
     for cell, mine in arms.items():
         if rng.random() > style.ys or len(mine) != 3 or draft.on_border(cell):
             continue
-        headings = sorted((draft.leaving(link, cell) % (2.0 * math.pi), i) for i, link in enumerate(mine))
+        headings = sorted(
+            (draft.leaving(link, cell) % (2.0 * math.pi), i) for i, link in enumerate(mine)
+        )
         gaps = [(headings[(k + 1) % 3][0] - headings[k][0]) % (2.0 * math.pi) for k in range(3)]
         k = max(range(3), key=lambda i: gaps[i])
         fold = min((gaps[k] - 2.0 * math.pi / 3.0) / 2.0, math.radians(28.0))
@@ -255,10 +289,12 @@ def _bend_streets(draft: Draft, rng: np.random.Generator, style: _Style) -> None
         _turn(draft, arms, mine[headings[(k + 1) % 3][1]], cell, -fold)
     middle = max(draft.at)[0] / 2.0
     for link in draft.links:
-        draw, side = rng.random(), 1.0 if rng.integers(2) else -1.0
+        draw = rng.random()
+        side = 1.0 if rng.integers(2) else -1.0
         if draft.on_border(link.a, link.b):
             # Towards the middle of the city, to stay inside its square.
-            (x, y), (p, q) = link.a, link.b
+            (x, y) = link.a
+            (p, q) = link.b
             side = math.copysign(1.0, ((p - x) * (middle - y) - (q - y) * (middle - x)))
             draw = draw if draw < style.curves else 1.0
         turn = side * math.radians(rng.uniform(18.0, 42.0))
@@ -274,25 +310,31 @@ def _bend_streets(draft: Draft, rng: np.random.Generator, style: _Style) -> None
 def _turn(draft: Draft, arms: dict[Cell, list[Link]], link: Link, cell: Cell, turn: float) -> None:
     if link.via is not None:
         return
-    before, end = link.turns, 0 if link.a == cell else 1
+    before = link.turns
+    end = 0 if link.a == cell else 1
     link.turns = (before[0] + turn, before[1]) if end == 0 else (before[0], before[1] + turn)
     if abs(link.turns[end]) > math.radians(40.0) or draft.gap(cell, arms[cell]) < CLEAR_RAD:
         link.turns = before
 
 
 def _place_roundabouts(draft: Draft, rng: np.random.Generator, share: float) -> None:
-    """Radii of the roundabouts, at interior junctions of quiet streets that are far enough from each other.
+    """Radii of the roundabouts, at interior junctions of quiet streets that are far enough from
+    each other.
 
     A large city has a few of them, whatever its share, where there is room.
     """
-    last, arms = max(draft.at)[0], draft.arms()
+    last = max(draft.at)[0]
+    arms = draft.arms()
     spare: dict[Cell, float] = {}
     for cell, mine in arms.items():
-        radius, draw = float(rng.uniform(19.0, 22.0)), rng.random()
+        radius = float(rng.uniform(19.0, 22.0))
+        draw = rng.random()
         if len(mine) < 3 or {0, last} & set(cell):
             continue
         near = {end for link in mine for end in (link.a, link.b)}
-        quiet = all(CLASSES[link.street_class].lanes == 1 and draft.chord(link) > 85.0 for link in mine)
+        quiet = all(
+            CLASSES[link.street_class].lanes == 1 and draft.chord(link) > 85.0 for link in mine
+        )
         if quiet and not near & set(draft.rings) and draft.gap(cell, mine) > math.radians(74.0):
             (spare if draw > share else draft.rings)[cell] = radius
     for cell, radius in spare.items():

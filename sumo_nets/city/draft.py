@@ -1,4 +1,5 @@
-"""A city while it is drawn: lattice points, the streets between them, roundabouts. Metres and radians."""
+"""A city while it is drawn: lattice points, the streets between them, roundabouts. Metres and
+radians."""
 
 from __future__ import annotations
 
@@ -13,7 +14,8 @@ Cell = tuple[int, int]
 
 @dataclass(slots=True)
 class Link:
-    """A street between lattice points. turns: left turn off the chord at either end; via: a rounded corner."""
+    """A street between lattice points. turns: left turn off the chord at either end; via: a rounded
+    corner."""
 
     a: Cell
     b: Cell
@@ -59,7 +61,9 @@ class Draft:
     def on_border(self, *cells: Cell) -> bool:
         """Whether all cells lie on one side of the lattice."""
         last = max(self.at)[0]
-        return any({cell[axis] for cell in cells} == {side} for axis in (0, 1) for side in (0, last))
+        return any(
+            {cell[axis] for cell in cells} == {side} for axis in (0, 1) for side in (0, last)
+        )
 
     def chord(self, link: Link) -> float:
         """Distance between the ends of a street."""

@@ -1,4 +1,5 @@
-"""The plan of a city, ready to be built: nodes, edges, crossings and roundabouts, from a finished draft."""
+"""The plan of a city, ready to be built: nodes, edges, crossings and roundabouts, from a finished
+draft."""
 
 from __future__ import annotations
 
@@ -34,7 +35,8 @@ CROSSWALK_ROOM_M = 0.4
 
 
 class Node(NamedTuple):
-    """A junction. signalised: with traffic lights. outline: of its area, where netconvert would make it too small."""
+    """A junction. signalised: with traffic lights. outline: of its area, where netconvert would
+    make it too small."""
 
     id: str
     at: Point
@@ -43,7 +45,8 @@ class Node(NamedTuple):
 
 
 class Edge(NamedTuple):
-    """One direction of a street. driveways: points of its line beside which one crosses the sidewalk."""
+    """One direction of a street. driveways: points of its line beside which one crosses the
+    sidewalk."""
 
     id: str
     tail: str
@@ -82,7 +85,8 @@ class CityPlan:
 
 @dataclass(slots=True)
 class _Parts:
-    """What the plan has so far. joints: the node where a street, by number, meets a lattice point."""
+    """What the plan has so far. joints: the node where a street, by number, meets a lattice
+    point."""
 
     nodes: dict[str, Node]
     edges: list[Edge]
@@ -92,7 +96,8 @@ class _Parts:
 
 
 def plan_of(draft: Draft, rngs: Mapping[str, np.random.Generator], crosswalks: float) -> CityPlan:
-    """The plan of a draft. crosswalks: share of the longer streets with a crosswalk in their middle."""
+    """The plan of a draft. crosswalks: share of the longer streets with a crosswalk in their
+    middle."""
     parts = _Parts({}, [], [], {}, defaultdict(list))
     numbers = {id(link): number for number, link in enumerate(draft.links)}
     for cell, arms in draft.arms().items():
@@ -108,7 +113,9 @@ def plan_of(draft: Draft, rngs: Mapping[str, np.random.Generator], crosswalks: f
     for number, link in enumerate(draft.links):
         _add_street(parts, draft, number, link, crosswalks, rngs)
     zebras = tuple(zebra for node in parts.nodes for zebra in parts.zebras[node])
-    return CityPlan(tuple(parts.nodes.values()), tuple(parts.edges), zebras, tuple(parts.rings), rngs["signals"])
+    return CityPlan(
+        tuple(parts.nodes.values()), tuple(parts.edges), zebras, tuple(parts.rings), rngs["signals"]
+    )
 
 
 def _name(cell: Cell) -> str:
@@ -116,9 +123,15 @@ def _name(cell: Cell) -> str:
 
 
 def _add_ring(
-    parts: _Parts, draft: Draft, cell: Cell, ways: list[tuple[int, Link]], width_rng: np.random.Generator
+    parts: _Parts,
+    draft: Draft,
+    cell: Cell,
+    ways: list[tuple[int, Link]],
+    width_rng: np.random.Generator,
 ) -> None:
-    name, centre, radius = _name(cell), draft.at[cell], draft.rings[cell]
+    name = _name(cell)
+    centre = draft.at[cell]
+    radius = draft.rings[cell]
     order = sorted((draft.leaving(link, cell) % (2.0 * math.pi), number) for number, link in ways)
     angles = [angle for angle, _ in order]
     around = [Node(f"{name}r{k}", polar(centre, radius, a), False) for k, a in enumerate(angles)]
@@ -141,9 +154,12 @@ def _add_street(
     crosswalks: float,
     rngs: Mapping[str, np.random.Generator],
 ) -> None:
-    """Both directions of a street, in two pieces where it has a crosswalk in its middle, and its crossings."""
+    """Both directions of a street, in two pieces where it has a crosswalk in its middle, and its
+    crossings."""
     tail, head = parts.joints[link.a, number], parts.joints[link.b, number]
-    line, name, made = _line(draft, link, tail.at, head.at), f"s{number}", CLASSES[link.street_class]
+    line = _line(draft, link, tail.at, head.at)
+    name = f"s{number}"
+    made = CLASSES[link.street_class]
     draws = rngs["crosswalks"].random(3).tolist()
     width_m = made.crossings_m[int(rngs["widths"].integers(len(made.crossings_m)))]
     blocked = sum(20.0 if end in draft.rings else 0.0 for end in (link.a, link.b))
@@ -159,26 +175,36 @@ def _add_street(
     else:
         pieces = [(name, tail, head, line)]
     for piece, start, end, shape in pieces:
-        there, back = (_driveways(way, made.driveways, rngs["driveways"]) for way in (shape, shape[::-1]))
-        parts.edges.append(Edge(piece, start.id, end.id, link.street_class, link.section, shape, there))
-        parts.edges.append(Edge(f"-{piece}", end.id, start.id, link.street_class, link.section, shape[::-1], back))
+        there, back = (
+            _driveways(way, made.driveways, rngs["driveways"]) for way in (shape, shape[::-1])
+        )
+        parts.edges.append(
+            Edge(piece, start.id, end.id, link.street_class, link.section, shape, there)
+        )
+        parts.edges.append(
+            Edge(f"-{piece}", end.id, start.id, link.street_class, link.section, shape[::-1], back)
+        )
         for node in (start, end):
             if node in (tail, head):
                 parts.zebras[node.id].append(Zebra(node.id, (piece, f"-{piece}"), width_m))
 
 
 def _across(at: Point, heading: float, half_m: float, crossing_m: float) -> tuple[Point, ...]:
-    """The rectangle of a crosswalk and the sidewalks at its ends, with room for the curb ramps beside it."""
-    ahead, aside = 0.5 * crossing_m + CROSSWALK_ROOM_M, half_m
+    """The rectangle of a crosswalk and the sidewalks at its ends, with room for the curb ramps
+    beside it."""
+    ahead = 0.5 * crossing_m + CROSSWALK_ROOM_M
+    aside = half_m
     corners = ((ahead, aside), (ahead, -aside), (-ahead, -aside), (-ahead, aside))
     cos, sin = math.cos(heading), math.sin(heading)
     return tuple((at[0] + u * cos - v * sin, at[1] + u * sin + v * cos) for u, v in corners)
 
 
 def _driveways(line: Line, per_m: float, rng: np.random.Generator) -> tuple[Point, ...]:
-    """Where driveways meet a street: `per_m` of them per metre on average, far from its ends and from each other."""
+    """Where driveways meet a street: `per_m` of them per metre on average, far from its ends and
+    from each other."""
     found: list[Point] = []
-    at, end = DRIVEWAY_CLEAR_M, length(line) - DRIVEWAY_CLEAR_M
+    at = DRIVEWAY_CLEAR_M
+    end = length(line) - DRIVEWAY_CLEAR_M
     while per_m and (at := at + float(rng.exponential(1.0 / per_m))) < end:
         found.append(split(line, at)[0][-1])
         at += DRIVEWAY_GAP_M
@@ -186,8 +212,10 @@ def _driveways(line: Line, per_m: float, rng: np.random.Generator) -> tuple[Poin
 
 
 def _line(draft: Draft, link: Link, a: Point, b: Point) -> Line:
-    """The centre line between the points where the street starts and ends, a roundabout's rim included."""
-    leave, arrive = draft.leaving(link, link.a), draft.leaving(link, link.b) + math.pi
+    """The centre line between the points where the street starts and ends, a roundabout's rim
+    included."""
+    leave = draft.leaving(link, link.a)
+    arrive = draft.leaving(link, link.b) + math.pi
     if link.via is not None:
         return corner(a, draft.at[link.via], b, 32.0)
     if link.turns == (0.0, 0.0):

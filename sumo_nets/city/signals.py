@@ -1,8 +1,9 @@
 """Signal programs of a built net: netconvert's own ones leave some crossings without any green.
 
-One stage for each pair of opposite approaches (or single approach), one more for crossings that no stage lets go.
-While a stage has green, people walk over the arms whose approach waits; turning cars yield to them. Every stage ends
-with: crossings red, cars still going while people clear the road, yellow, all red.
+One stage for each pair of opposite approaches (or single approach), one more for crossings that no
+stage lets go. While a stage has green, people walk over the arms whose approach waits; turning cars
+yield to them. Every stage ends with: crossings red, cars still going while people clear the road,
+yellow, all red.
 """
 
 from __future__ import annotations
@@ -55,7 +56,8 @@ class _Zebra(NamedTuple):
 class _Signal:
     """What one traffic light controls.
 
-    headings: of each approach at its stop line. foes[i], yields[i]: links that conflict with link i, that it yields to.
+    headings: of each approach at its stop line. foes[i], yields[i]: links that conflict with link
+    i, that it yields to.
     """
 
     id: str
@@ -75,14 +77,18 @@ class _Signal:
 
 def with_programs(net: bytes, rng: np.random.Generator) -> bytes:
     """The net with a program of ours for every traffic light, in place of netconvert's."""
-    programs = {signal.id: _program(signal, rng) for signal in _signals(ET.fromstring(net)).values()}
+    programs = {
+        signal.id: _program(signal, rng) for signal in _signals(ET.fromstring(net)).values()
+    }
 
     def ours(match: re.Match[bytes]) -> bytes:
         phases = programs.get(match[1].decode())
         if phases is None:
             return match[0]
         offset = int(rng.integers(sum(phase.duration_s for phase in phases)))
-        rows = "".join(f'        <phase duration="{p.duration_s}" state="{p.state}"/>\n' for p in phases)
+        rows = "".join(
+            f'        <phase duration="{p.duration_s}" state="{p.state}"/>\n' for p in phases
+        )
         head = f'<tlLogic id="{match[1].decode()}" type="static" programID="0" offset="{offset}">\n'
         return f"{head}{rows}    </tlLogic>".encode()
 
@@ -90,20 +96,34 @@ def with_programs(net: bytes, rng: np.random.Generator) -> bytes:
 
 
 def signal_faults(net: bytes) -> list[str]:
-    """What is wrong with the programs of a net, a sentence each: crossings without walk or clearance, clashes."""
+    """What is wrong with the programs of a net, a sentence each: crossings without walk or
+    clearance, clashes."""
     root = ET.fromstring(net)
     signals = _signals(root)
     faults = []
     for logic in root.iter("tlLogic"):
         signal = signals.get(logic.get("id", ""))
-        phases = [Phase(round(float(p.get("duration", "0"))), p.get("state", "")) for p in logic.iter("phase")]
+        phases = [
+            Phase(round(float(p.get("duration", "0"))), p.get("state", ""))
+            for p in logic.iter("phase")
+        ]
         if signal is None or any(len(phase.state) < signal.links for phase in phases):
-            faults.append(f"{logic.get('id')}: the program does not fit the links of the traffic light")
+            faults.append(
+                f"{logic.get('id')}: the program does not fit the links of the traffic light"
+            )
             continue
         for zebra in signal.zebras:
-            faults += [f"{signal.id}: crossing {zebra.id} {fault}" for fault in _walk_faults(signal, zebra, phases)]
-        faults += [f"{signal.id}: {fault}" for phase in phases for fault in _clashes(signal, phase.state)]
-    return faults + [f"{name}: no program" for name in signals.keys() - {e.get("id") for e in root.iter("tlLogic")}]
+            faults += [
+                f"{signal.id}: crossing {zebra.id} {fault}"
+                for fault in _walk_faults(signal, zebra, phases)
+            ]
+        faults += [
+            f"{signal.id}: {fault}" for phase in phases for fault in _clashes(signal, phase.state)
+        ]
+    return faults + [
+        f"{name}: no program"
+        for name in signals.keys() - {e.get("id") for e in root.iter("tlLogic")}
+    ]
 
 
 def _signals(root: ET.Element) -> dict[str, _Signal]:
@@ -116,8 +136,11 @@ def _signals(root: ET.Element) -> dict[str, _Signal]:
             continue
         signal = signals[name]
         signal.id = name
-        tail, head, index = link.get("from", ""), link.get("to", ""), int(link.get("linkIndex", "0"))
-        # Our lights have one junction each, where link indices and rows of the right-of-way matrix agree.
+        tail = link.get("from", "")
+        head = link.get("to", "")
+        index = int(link.get("linkIndex", "0"))
+        # Our lights have one junction each, where link indices and rows of the right-of-way matrix
+        # agree.
         if head.startswith(":"):
             crossed = frozenset(edges[head].get("crossingEdges", "").split())
             span = float(edges[head][0].get("length", "0"))
@@ -125,8 +148,14 @@ def _signals(root: ET.Element) -> dict[str, _Signal]:
         else:
             signal.cars.append(_Car(index, tail, head))
             if tail not in signal.headings:
-                lane = next(lane for lane in edges[tail].iter("lane") if lane.get("index") == link.get("fromLane"))
-                (x0, y0), (x1, y1) = ([float(v) for v in p.split(",")[:2]] for p in lane.get("shape", "").split()[-2:])
+                lane = next(
+                    lane
+                    for lane in edges[tail].iter("lane")
+                    if lane.get("index") == link.get("fromLane")
+                )
+                (x0, y0), (x1, y1) = (
+                    [float(v) for v in p.split(",")[:2]] for p in lane.get("shape", "").split()[-2:]
+                )
                 signal.headings[tail] = math.atan2(y1 - y0, x1 - x0)
     for name, signal in signals.items():
         for request in rows[name].iter("request") if name in rows else ():
@@ -139,24 +168,39 @@ def _signals(root: ET.Element) -> dict[str, _Signal]:
 
 
 def _stages(signal: _Signal) -> list[set[str]]:
-    """The approaches that go together: opposite ones in pairs, best pair first, the others alone."""
+    """The approaches that go together: opposite ones in pairs, best pair first, the others
+    alone."""
     names = list(signal.headings)
     pairs = sorted(
-        (abs(abs(math.remainder(signal.headings[a] - signal.headings[b], 2.0 * math.pi)) - math.pi), a, b)
+        (
+            abs(
+                abs(math.remainder(signal.headings[a] - signal.headings[b], 2.0 * math.pi))
+                - math.pi
+            ),
+            a,
+            b,
+        )
         for i, a in enumerate(names)
         for b in names[i + 1 :]
     )
     stages: list[set[str]] = []
     for off, a, b in pairs:
-        if off < OPPOSITE_RAD and not any({a, b} & stage for stage in stages) and not _deadlock(signal, {a, b}):
+        if (
+            off < OPPOSITE_RAD
+            and not any({a, b} & stage for stage in stages)
+            and not _deadlock(signal, {a, b})
+        ):
             stages.append({a, b})
     return stages + [{name} for name in names if not any(name in stage for stage in stages)]
 
 
 def _deadlock(signal: _Signal, approaches: set[str]) -> bool:
-    """Whether two cars from these approaches would wait for each other, as at some bent main roads."""
+    """Whether two cars from these approaches would wait for each other, as at some bent main
+    roads."""
     links = {car.link for car in signal.cars if car.tail in approaches}
-    return any(i in signal.yields.get(k, ()) for i in links for k in signal.yields.get(i, set()) & links)
+    return any(
+        i in signal.yields.get(k, ()) for i in links for k in signal.yields.get(i, set()) & links
+    )
 
 
 def _program(signal: _Signal, rng: np.random.Generator) -> list[Phase]:
@@ -231,7 +275,8 @@ def _clashes(signal: _Signal, state: str) -> list[str]:
         f"links {a.link} and {b.link} clash in {state}"
         for i, a in enumerate(going)
         for b in going[i + 1 :]
-        if b.link in signal.foes.get(a.link, ()) and _yields(signal, a, b, state) == _yields(signal, b, a, state)
+        if b.link in signal.foes.get(a.link, ())
+        and _yields(signal, a, b, state) == _yields(signal, b, a, state)
     ]
 
 

@@ -1,18 +1,118 @@
-"""Street nets of generated cities: built once by netconvert, kept in a cache folder, found again by name."""
+"""Build the nets of generated cities with netconvert, and cache them."""
 
 from __future__ import annotations
 
 import hashlib
 import tempfile
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
+from xml.sax.saxutils import quoteattr
 
 import msgspec
 
 from cosim.core.cache import cache_folder, make_room, use_entry
 from cosim.core.errors import MapError, unwritable
 from cosim.spec.scenario import City
-from sumo_nets.net.net_hash import net_content_hash
+from sumo_nets.city.blocks import CLASSES, Point
+from sumo_nets.city.city import plan_city
+from sumo_nets.city.plan import CityPlan, Edge
+from sumo_nets.city.signals import with_programs
+from sumo_nets.net.net_hash import net_content_hash, without_comments
+from sumo_nets.net.netconvert import netconvert
+
+_CROSSING_M = 3.2
+_NETCONVERT = (
+    "--walkingareas",
+    "--no-turnarounds.except-deadend",
+    "--junctions.corner-detail=8",
+    "--junctions.internal-link-detail=8",
+    "--offset.disable-normalization",
+    f"--default.crossing-width={_CROSSING_M}",
+    "--default.sidewalk-width=3.2",
+)
+
+
+def city_as_net(city: City, folder: Path) -> bytes:
+    """The net of a city; folder: for what is written on the way."""
+    plan = plan_city(city.seed, city.size_m, city.style)
+    return with_programs(without_comments(_converted(plan, folder).read_bytes()), plan.signal_rng)
+
+
+def _converted(plan: CityPlan, folder: Path) -> Path:
+    nodes, edges, crossings = folder / "c.nod.xml", folder / "c.edg.xml", folder / "c.con.xml"
+    rows = []
+    for node in plan.nodes:
+        kind = "traffic_light" if node.signalised else "priority"
+        shape = f' shape="{_shape(node.outline)}"' if node.outline else ""
+        rows.append(
+            f'<node id={quoteattr(node.id)} x="{node.at[0]:.2f}" y="{node.at[1]:.2f}" '
+            f'type="{kind}"{shape}/>'
+        )
+    nodes.write_text("<nodes>\n" + "\n".join(rows) + "\n</nodes>\n")
+    rings = [
+        f'<roundabout nodes="{" ".join(r.nodes)}" edges="{" ".join(r.edges)}"/>' for r in plan.rings
+    ]
+    edges.write_text("<edges>\n" + "\n".join([*map(_edge, plan.edges), *rings]) + "\n</edges>\n")
+    zebras = [
+        f'<crossing node="{z.node}" edges="{" ".join(z.edges)}" width="{z.width_m}" '
+        f'priority="true"/>'
+        for z in plan.zebras
+    ]
+    crossings.write_text("<connections>\n" + "\n".join(zebras) + "\n</connections>\n")
+    return netconvert(
+        ["-n", str(nodes), "-e", str(edges), "-x", str(crossings), *_NETCONVERT],
+        folder / "built.net.xml",
+    )
+
+
+def _edge(edge: Edge) -> str:
+    """An edge with its sidewalk as lane 0, the verge next to it, the lanes that are driven on, half
+    of the island."""
+    made = CLASSES[edge.street_class]
+    section = edge.section
+    lanes = [
+        f'allow="pedestrian" width="{section.sidewalk_m}"',
+        f'disallow="all" width="{section.verge_m}" type="green_verge"',
+        *[f'disallow="pedestrian" width="{section.lane_m}"'] * section.lanes,
+    ]
+    if section.median_m:
+        lanes.append(f'disallow="all" width="{section.median_m}" type="median"')
+    numbered = "".join(f'<lane index="{i}" {lane}/>' for i, lane in enumerate(lanes))
+    params = {
+        "street_class": edge.street_class,
+        "frontage_m": section.frontage_m,
+        "verge_m": section.verge_m,
+        "curb_m": section.curb_m,
+        "gutter_m": section.gutter_m,
+    }
+    if edge.driveways:
+        params["driveways"] = _shape(edge.driveways)
+    zones = "".join(f'<param key="{key}" value="{value}"/>' for key, value in params.items())
+    return (
+        f'<edge id={quoteattr(edge.id)} from="{edge.tail}" to="{edge.head}" '
+        f'numLanes="{len(lanes)}" speed="{made.speed_mps}" priority="{made.priority}" '
+        f'type="{edge.street_class}" spreadType="right" '
+        f'shape="{_shape(edge.line)}">{numbered}{zones}</edge>'
+    )
+
+
+def _shape(line: Sequence[Point]) -> str:
+    return " ".join(f"{x:.2f},{y:.2f}" for x, y in line)
+
+
+VAL_SEEDS = tuple(range(1, 81))
+TEST_SEEDS = tuple(range(7001, 7021))
+"""Cities that nothing was tuned on: no test, measurement or example names them."""
+SEEDS = (*VAL_SEEDS, *TEST_SEEDS)
+
+
+def shipped_cities(
+    count: int = len(SEEDS), size_m: float = 2000.0, style: str = "mixed"
+) -> tuple[City, ...]:
+    """The first `count` of the shipped cities."""
+    return tuple(City(seed=seed, size_m=size_m, style=style) for seed in SEEDS[:count])
+
 
 GENERATOR = 4
 """Version of the generator: another one for every change that changes a net."""
@@ -39,14 +139,16 @@ def city_net(city: City) -> Path:
     if city.net_hash and (found := net_content_hash(path)) != city.net_hash:
         raise MapError(
             f"{path}: the net's hash is {found}, but the scenario was made on {city.net_hash}: "
-            "delete the file to build it again; if the hash stays, the scenario is of another version of the "
+            "delete the file to build it again; if the hash stays, the scenario is of "
+            "another version of the "
             "generator or of SUMO: make the suite anew, or install the version it was made with"
         )
     return path
 
 
 def is_whole(path: Path) -> bool:
-    """Whether a net that was built here is still what was written: its last line holds the hash of all the others."""
+    """Whether a net that was built here is still what was written: its last line holds the hash of
+    all the others."""
     try:
         body, _, seal = path.read_bytes().rpartition(SEAL)
     except OSError:
@@ -59,27 +161,41 @@ def _seal(body: bytes) -> bytes:
 
 
 def write_city(city: City, folder: Path) -> City:
-    """Write a city as a folder: its net, and city.json with what it was made from. Equal to the byte when made again.
+    """Write a city as a folder: its net, and city.json with what it was made from. Equal to the
+    byte when made again.
 
-    Returns the city with the hash of its net. Raises MapError when the folder holds something else already.
+    Returns the city with the hash of its net. Raises MapError when the folder holds something else
+    already.
     """
     known = {NET_NAME, ABOUT_NAME}
     try:
-        if folder.exists() and not {p.name for p in folder.iterdir() if not p.name.startswith(".building-")} <= known:
+        if (
+            folder.exists()
+            and not {p.name for p in folder.iterdir() if not p.name.startswith(".building-")}
+            <= known
+        ):
             raise MapError(f"{folder}: is not a city's folder, and not empty: choose a new one")
         net = folder / NET_NAME
         build_city(city, net)
-        made = City(seed=city.seed, size_m=city.size_m, style=city.style, net_hash=net_content_hash(net))
-        about = {"city": made, "generator": GENERATOR, "versions": {name: version(name) for name in MADE_WITH}}
-        (folder / ABOUT_NAME).write_bytes(msgspec.json.format(msgspec.json.encode(about), indent=2) + b"\n")
+        made = City(
+            seed=city.seed, size_m=city.size_m, style=city.style, net_hash=net_content_hash(net)
+        )
+        about = {
+            "city": made,
+            "generator": GENERATOR,
+            "versions": {name: version(name) for name in MADE_WITH},
+        }
+        (folder / ABOUT_NAME).write_bytes(
+            msgspec.json.format(msgspec.json.encode(about), indent=2) + b"\n"
+        )
     except OSError as error:
         raise unwritable(folder, error) from error
     return made
 
 
 def build_city(city: City, path: Path) -> None:
-    """Build a city's net at `path`, in one move: several processes may build the same city at once. OSError passes."""
-    from sumo_nets.city.built_net import city_as_net  # with all that plans a city: most were built before
+    """Build a city's net at `path`, in one move: several processes may build the same city at once.
+    OSError passes."""
 
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".building-", dir=path.parent) as folder:

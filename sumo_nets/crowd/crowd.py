@@ -1,7 +1,8 @@
 """SumoCrowd: the people, vehicles and signals around the robot, by SUMO.
 
-One SUMO per process, and one step of it per tick. Persons, robot and event pedestrians share SUMO's sidewalks: the
-robot and the event pedestrians are mirrored in as proxies, so the crowd evades them one tick late.
+One SUMO per process, and one step of it per tick. Persons, robot and event pedestrians share SUMO's
+sidewalks: the robot and the event pedestrians are mirrored in as proxies, so the crowd evades them
+one tick late.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from cosim.core.state import (
     frozen,
     write_protected,
 )
-from cosim.episode.ports import Crowd
+from cosim.episode.interfaces import Crowd
 from cosim.people.standing import Standing
 from cosim.people.yielding import RobotBody
 from cosim.place.street_map import Port, StreetMap
@@ -38,11 +39,11 @@ from sumo_nets.crowd.demand_log import Entrances
 from sumo_nets.crowd.demand_replay import replayed_demand
 from sumo_nets.crowd.empty_street import TICK_MS, start_of
 from sumo_nets.crowd.group_cohesion import Together
+from sumo_nets.crowd.kerb_waiting import Kerbs
 from sumo_nets.crowd.lights import Signals, SumoLights
 from sumo_nets.crowd.pose_filter import PoseFilter
 from sumo_nets.crowd.proxy import Proxy, Walks
 from sumo_nets.crowd.shown_people import ShownPeople, cast_in_order, places_of
-from sumo_nets.crowd.waiting_spots import Kerbs
 from sumo_nets.engine import NearPersons, NearVehicles, sumo, translated
 
 _ROLL_TICKS = 10
@@ -58,11 +59,11 @@ _BERTH_M = (0.3, 0.45)
 class SumoCrowd(Crowd):
     """The crowd around the robot on the street net at `net_path`, of which `street_map` was read.
 
-    closed: ports where barriers stand; background walkers never pass them. start_xy: where the robot starts, metres.
-    footprint_m: its length and width. before: who entered and left a street like this one, to be let in and out again.
-    standing: what people step round besides the robot.
-    Everything random comes from `seed`: the same calls give the same streets, bit for bit. Use as a context manager.
-    entrances: who has come and gone since it was entered.
+    closed: ports where barriers stand; background walkers never pass them. start_xy: where the
+    robot starts, metres. footprint_m: its length and width. before: who entered and left a street
+    like this one, to be let in and out again. standing: what people step round besides the robot.
+    Everything random comes from `seed`: the same calls give the same streets, bit for bit. Use as a
+    context manager. entrances: who has come and gone since it was entered.
     """
 
     _running: ClassVar[SumoCrowd | None] = None
@@ -80,8 +81,12 @@ class SumoCrowd(Crowd):
         before: Entrances | None = None,
         standing: Standing | None = None,
     ) -> None:
-        self._net_path, self._map, self._spec, self._seed = net_path, street_map, spec, seed
-        self._closed, self._start_xy = closed, start_xy
+        self._net_path = net_path
+        self._map = street_map
+        self._spec = spec
+        self._seed = seed
+        self._closed = closed
+        self._start_xy = start_xy
         self._half_m = (footprint_m[0] / 2, footprint_m[1] / 2)
         self._before = before
         self._standing = Standing() if standing is None else standing
@@ -90,8 +95,8 @@ class SumoCrowd(Crowd):
     def __enter__(self) -> Self:
         if SumoCrowd._running is not None:
             raise EngineError(
-                "a SumoCrowd is already running in this process, and SUMO can run only once per process: "
-                "close it first, or use another process"
+                "a SumoCrowd is already running in this process, and SUMO can run only once per "
+                "process: close it first, or use another process"
             )
         _, rng_persons, rng_vehicles = np.random.default_rng(self._seed).spawn(3)
         self._launch(*start_of(self._seed))
@@ -104,7 +109,12 @@ class SumoCrowd(Crowd):
             raise
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
         self.close()
 
     def close(self) -> None:
@@ -129,14 +139,17 @@ class SumoCrowd(Crowd):
     def step(self, robot: RobotState, reply: EventReply, *, absent: bool = False) -> Street:
         """One tick on, with the robot and the event pedestrians where they are now.
 
-        absent: nobody is there where the robot would be; the crowd still comes and goes around that point.
+        absent: nobody is there where the robot would be; the crowd still comes and goes around that
+        point.
         """
         tick = self.street.tick
         with translated(f"stepping from tick {tick}"):
             x_m, y_m = robot.pose[:2]
             if tick % _ROLL_TICKS == 0:
                 persons, vehicles = self._found
-                self._pedestrians.roll(x_m, y_m, _seen(sumo.person.getWaitingTime, persons), self._waits_at_red)
+                self._pedestrians.roll(
+                    x_m, y_m, _seen(sumo.person.getWaitingTime, persons), self._waits_at_red
+                )
                 self._drivers.roll(x_m, y_m, _seen(sumo.vehicle.getWaitingTime, vehicles))
             if not absent:
                 self._robot.update(robot.pose)
@@ -155,10 +168,15 @@ class SumoCrowd(Crowd):
         except EngineError as error:
             raise EngineError(f"SUMO cannot start on {self._net_path}: {error}") from error
 
-    def _populate(self, rng_persons: np.random.Generator, rng_vehicles: np.random.Generator) -> None:
+    def _populate(
+        self, rng_persons: np.random.Generator, rng_vehicles: np.random.Generator
+    ) -> None:
         x_m, y_m = self._start_xy
         robot_m = (2.0 * self._half_m[0] + _BERTH_M[0], 2.0 * self._half_m[1] + _BERTH_M[1])
-        for kind, (length_m, width_m), gap_m in (("robot", robot_m, 0.5), ("event", (0.5, 0.8), 0.25)):
+        for kind, (length_m, width_m), gap_m in (
+            ("robot", robot_m, 0.5),
+            ("event", (0.5, 0.8), 0.25),
+        ):
             sumo.vehicletype.copy("DEFAULT_PEDTYPE", kind)
             sumo.vehicletype.setLength(kind, length_m)
             sumo.vehicletype.setWidth(kind, width_m)
@@ -188,7 +206,9 @@ class SumoCrowd(Crowd):
         """Those who let people and vehicles in and out; what they do is kept in `entrances`."""
         self.entrances = Entrances()
         if self._before is not None:
-            return replayed_demand(sumo, self._before, self._map, self._spec, self._closed, self._together)
+            return replayed_demand(
+                sumo, self._before, self._map, self._spec, self._closed, self._together
+            )
         kept, spec = self.entrances, self._spec
         people = Pedestrians(sumo, kept, self._map, spec, rng_persons, self._closed, self._together)
         return people, Drivers(sumo, kept, self._map, spec, rng_vehicles)
@@ -199,11 +219,17 @@ class SumoCrowd(Crowd):
             self._actors.pop(name).remove()
         for actor in actors:
             if actor.id not in self._actors:
-                self._actors[actor.id] = Proxy(sumo, self._walks, base=actor.id, kind="event", serial=self._serial)
+                self._actors[actor.id] = Proxy(
+                    sumo, self._walks, base=actor.id, kind="event", serial=self._serial
+                )
             self._actors[actor.id].update(Pose(actor.x_m, actor.y_m, actor.heading_rad))
 
-    def _read(self, tick: int, x_m: float, y_m: float, cast: list[Actor], body: RobotBody | None) -> Street:
-        persons = engine.persons_near(x_m, y_m, self._spec.radius_m + LINGER_M, self._pedestrians.ages)
+    def _read(
+        self, tick: int, x_m: float, y_m: float, cast: list[Actor], body: RobotBody | None
+    ) -> Street:
+        persons = engine.persons_near(
+            x_m, y_m, self._spec.radius_m + LINGER_M, self._pedestrians.ages
+        )
         self._found = persons, vehicles = persons, engine.vehicles_near(x_m, y_m, VEHICLE_REACH_M)
         people = self._people(persons, cast, body)
         return Street(tick, people, self._vehicles(vehicles), self._signals.near(x_m, y_m))
@@ -217,7 +243,8 @@ class SumoCrowd(Crowd):
         return self._shown.together(cast, self._pedestrians.ages, persons.names, *shown)
 
     def _vehicles(self, near: NearVehicles) -> Vehicles:
-        """SUMO's position is the middle of the front bumper; the street's is the middle of the box."""
+        """SUMO's position is the middle of the front bumper; the street's is the middle of the
+        box."""
         if near.names != self._sized[0]:
             sizes = [self._drivers.size_m(name) for name in near.names]
             self._sized = near.names, write_protected(sizes, shape=(len(sizes), 2))
@@ -243,8 +270,8 @@ def _facing(person: str) -> float:
 def _arguments(net_path: Path, sumo_seed: int, begin_s: int) -> list[str]:
     """SUMO's command line; see the options' own help for more.
 
-    Without jam times nobody squeezes through the robot. With route errors ignored, somebody who cannot walk on jumps to
-    the next edge of the walk: without, SUMO stops all persons for good.
+    Without jam times nobody squeezes through the robot. With route errors ignored, somebody who
+    cannot walk on jumps to the next edge of the walk: without, SUMO stops all persons for good.
     """
     options: dict[str, object] = {
         "net-file": net_path,

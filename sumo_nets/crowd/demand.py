@@ -1,29 +1,92 @@
-"""The rolling crowd: persons and vehicles kept around the robot, wherever in the city it goes.
-
-They enter out of its sight and are taken out once they are far from it, so a step costs the same in any city. Each
-kind draws from its own generator.
-"""
+"""The rolling crowd: persons and vehicles around the robot, and where they enter."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
 
-from cosim.core.geometry import Floats, heading_to_sumo
+from cosim.core.geometry import Floats, Polyline, Pose, heading_to_sumo
 from cosim.core.state import Age
 from cosim.place.street_map import Port, StreetMap
 from cosim.place.walk_graph import walk_graph_of
 from cosim.spec.scenario import CrowdSpec
 from sumo_nets.crowd.demand_log import Entrances, PersonEntry, VehicleEntry
+from sumo_nets.crowd.free_space import Room
 from sumo_nets.crowd.group_cohesion import Together
 from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M, GroupDraws
 from sumo_nets.crowd.proxy import ROUND_THE_CORNER_M
-from sumo_nets.crowd.room import Room
-from sumo_nets.crowd.spots import EntrySpot, Spots
 from sumo_nets.engine import Sumo
+
+
+class EntrySpot(NamedTuple):
+    """A place on the middle line of an edge, heading along it; share: of the edge's length that
+    lies before it."""
+
+    edge: str
+    share: float
+    pose: Pose
+
+    def beside(self, left_m: float, ahead_m: float) -> tuple[float, float]:
+        """A point so far to the left of it and ahead of it, in metres."""
+        cos, sin = math.cos(self.pose.heading_rad), math.sin(self.pose.heading_rad)
+        return (
+            self.pose.x_m - left_m * sin + ahead_m * cos,
+            self.pose.y_m + left_m * cos + ahead_m * sin,
+        )
+
+
+class Spots:
+    """Where somebody may enter: points every `step_m` along lines, made for the lines that are
+    asked about."""
+
+    def __init__(self, lines: Iterable[tuple[str, Floats, float, float]], step_m: float) -> None:
+        """lines: edge id, (N, 2) metres, and how much to leave free at its start and end in
+        metres."""
+        self._lines = list(lines)
+        self._step_m = step_m
+        self._made: dict[int, tuple[Floats, Floats]] = {}
+        points = [line for _, line, _, _ in self._lines]
+        starts = np.cumsum([0, *map(len, points)])[:-1]
+        if points:
+            whole = np.concatenate(points)
+            self._low = np.minimum.reduceat(whole, starts)
+            self._high = np.maximum.reduceat(whole, starts)
+
+    def ring(self, x_m: float, y_m: float, low_m: float, high_m: float) -> list[tuple[int, int]]:
+        """The spots at a distance in [low_m, high_m), each by the number of its line and its own on
+        it."""
+        if not self._lines:
+            return []
+        beside = np.maximum(np.maximum(self._low - (x_m, y_m), (x_m, y_m) - self._high), 0.0)
+        lines = np.flatnonzero((beside * beside).sum(axis=1) <= high_m * high_m + 1.0)
+        poses = [self._on(number)[1] for number in lines.tolist()]
+        numbers = np.repeat(lines, [len(on) for on in poses])
+        places = np.concatenate([np.arange(len(on)) for on in poses] or [numbers])
+        gap = np.concatenate([on[:, :2] for on in poses] or [np.zeros((0, 2))]) - (x_m, y_m)
+        here = ((gap * gap).sum(axis=1) <= high_m * high_m) & (
+            np.hypot(gap[:, 0], gap[:, 1]) >= low_m
+        )
+        return list(zip(numbers[here].tolist(), places[here].tolist(), strict=True))
+
+    def __getitem__(self, spot: tuple[int, int]) -> EntrySpot:
+        number, k = spot
+        shares, poses = self._on(number)
+        return EntrySpot(self._lines[number][0], float(shares[k]), Pose(*poses[k].tolist()))
+
+    def _on(self, number: int) -> tuple[Floats, Floats]:
+        """(N,) shares and (N, 3) poses of the spots of a line."""
+        if number not in self._made:
+            _, xy, start_m, end_m = self._lines[number]
+            line = Polyline(xy)
+            s = np.arange(start_m, line.length_m - end_m, self._step_m)
+            x, y = (np.interp([s - 0.1, s, s + 0.1], line.s_m, line.points[:, k]) for k in (0, 1))
+            poses = np.column_stack([x[1], y[1], np.arctan2(y[2] - y[0], x[2] - x[0])])
+            self._made[number] = s / line.length_m, poses
+        return self._made[number]
+
 
 SIGHT_M = 35.0
 """Nobody appears nearer to the robot than this."""
@@ -63,7 +126,8 @@ VEHICLE_TYPES: Mapping[str, tuple[float, float, float]] = {
 
 
 class Seen(NamedTuple):
-    """A person or vehicle near the robot: position (for vehicles of the front bumper) m, and seconds without moving."""
+    """A person or vehicle near the robot: position (for vehicles of the front bumper) m, and
+    seconds without moving."""
 
     x_m: float
     y_m: float
@@ -83,7 +147,11 @@ class Pedestrians:
         closed: frozenset[Port],
         together: Together,
     ) -> None:
-        self._engine, self._entrances, self._spec, self._rng, self._closed = engine, entrances, spec, rng, closed
+        self._engine = engine
+        self._entrances = entrances
+        self._spec = spec
+        self._rng = rng
+        self._closed = closed
         self._together = together
         self.ages = entrances.ages
         self._graph = walk_graph_of(street_map)
@@ -109,10 +177,14 @@ class Pedestrians:
             return self._spec.persons
         return round(self._spec.density * self._room.area_m2(x_m, y_m) / 1000.0)
 
-    def roll(self, x_m: float, y_m: float, seen: Mapping[str, Seen], at_red: Callable[[str], bool]) -> None:
-        """Take out who is far away or stuck, with all who walk along; let others in instead; keep groups together.
+    def roll(
+        self, x_m: float, y_m: float, seen: Mapping[str, Seen], at_red: Callable[[str], bool]
+    ) -> None:
+        """Take out who is far away or stuck, with all who walk along; let others in instead; keep
+        groups together.
 
-        seen: the persons within the crowd's radius and LINGER_M. at_red: whether a person waits at a red light.
+        seen: the persons within the crowd's radius and LINGER_M. at_red: whether a person waits at
+        a red light.
         """
         person, radius_m = self._engine.person, self._spec.radius_m
         fellows = self._together.fellows
@@ -123,7 +195,9 @@ class Pedestrians:
             here = seen.get(name)
             if name in gone:
                 continue
-            if here is None or (here.waiting_s > STUCK_S and not any(at_red(fellow) for fellow in fellows(name))):
+            if here is None or (
+                here.waiting_s > STUCK_S and not any(at_red(fellow) for fellow in fellows(name))
+            ):
                 gone.update(fellows(name))
                 self._remove(name)
         away_m = {name: math.hypot(p.x_m - x_m, p.y_m - y_m) for name, p in seen.items()}
@@ -131,7 +205,10 @@ class Pedestrians:
         low_m = min(max(SIGHT_M, radius_m - ENTER_M), radius_m - 10.0)
         missing = self.wanted(x_m, y_m) - len(inside)
         if self._spec.density is not None:
-            far = sorted((name for name in inside if away_m[name] > low_m), key=lambda name: (-away_m[name], name))
+            far = sorted(
+                (name for name in inside if away_m[name] > low_m),
+                key=lambda name: (-away_m[name], name),
+            )
             spare = -missing - (0 if self._groups.plain else 1)
             for name in far:
                 if len(fellows(name)) <= spare:
@@ -148,9 +225,15 @@ class Pedestrians:
                 self._engine.person.remove(fellow)
 
     def _margin_m(self, port: Port) -> float:
-        return self._widths_m[port.strip] + ROUND_THE_CORNER_M + (BARRIER_MARGIN_M if port in self._closed else 0.0)
+        return (
+            self._widths_m[port.strip]
+            + ROUND_THE_CORNER_M
+            + (BARRIER_MARGIN_M if port in self._closed else 0.0)
+        )
 
-    def _enter(self, count: int, x_m: float, y_m: float, low_m: float, seen: Mapping[str, Seen]) -> None:
+    def _enter(
+        self, count: int, x_m: float, y_m: float, low_m: float, seen: Mapping[str, Seen]
+    ) -> None:
         if count <= 0 or not (ring := self._spots.ring(x_m, y_m, low_m, self._spec.radius_m)):
             return
         taken = np.array([(p.x_m, p.y_m) for p in seen.values()], dtype=float).reshape(-1, 2)
@@ -159,19 +242,26 @@ class Pedestrians:
             if 2 * count < group.size:
                 return
             spot = self._spots[ring[int(self._rng.integers(len(ring)))]]
-            forward, drawn_mps = bool(self._rng.random() < 0.5), float(self._rng.uniform(*group.pace_mps))
+            forward = bool(self._rng.random() < 0.5)
+            drawn_mps = float(self._rng.uniform(*group.pace_mps))
             width_m = self._widths_m[spot.edge]
-            half_m = max(width_m / 2 - _EDGE_M - (group.abreast(width_m) - 1) * GROUP_STRIPE_M / 2, 0.0)
+            half_m = max(
+                width_m / 2 - _EDGE_M - (group.abreast(width_m) - 1) * GROUP_STRIPE_M / 2, 0.0
+            )
             middle_m = float(self._rng.uniform(-half_m, half_m))
             back = -1.0 if forward else 1.0
-            places = [spot.beside(middle_m + left_m, back * row_m) for left_m, row_m in group.places(width_m)]
+            places = [
+                spot.beside(middle_m + left_m, back * row_m)
+                for left_m, row_m in group.places(width_m)
+            ]
             gap = np.array(places)[:, None] - taken
             if (np.hypot(gap[..., 0], gap[..., 1]) < _PERSONAL_SPACE_M).any():
                 continue
             walk = self._graph.wander(self._rng, spot.edge, forward, _WALK_EDGES, self._closed)
             if len(walk) == 1:
                 continue
-            walk, speed_mps = self._one_way(walk, forward), group.walks_at(drawn_mps)
+            walk = self._one_way(walk, forward)
+            speed_mps = group.walks_at(drawn_mps)
             names = [self._name(age) for age in group.ages]
             for name, xy in zip(names, places, strict=True):
                 self._add(name, spot, walk, speed_mps, xy)
@@ -185,10 +275,13 @@ class Pedestrians:
     def _one_way(self, walk: list[str], forward: bool) -> list[str]:
         """A walk that SUMO takes in one direction only.
 
-        From one sidewalk onto another between the same junctions SUMO may set out in either direction, and dies where
-        the two do not meet: there the corner between them is named.
+        From one sidewalk onto another between the same junctions SUMO may set out in either
+        direction, and dies where the two do not meet: there the corner between them is named.
         """
-        first, second = ({self._engine.edge.getFromJunction(e), self._engine.edge.getToJunction(e)} for e in walk[:2])
+        first, second = (
+            {self._engine.edge.getFromJunction(e), self._engine.edge.getToJunction(e)}
+            for e in walk[:2]
+        )
         corner = self._graph.street_map.strips[walk[0]].corners[1 if forward else 0]
         return walk if first != second or corner is None else [walk[0], corner, *walk[1:]]
 
@@ -198,10 +291,14 @@ class Pedestrians:
         self.ages[name] = age
         return name
 
-    def _add(self, name: str, spot: EntrySpot, walk: list[str], speed_mps: float, xy: tuple[float, float]) -> None:
+    def _add(
+        self, name: str, spot: EntrySpot, walk: list[str], speed_mps: float, xy: tuple[float, float]
+    ) -> None:
         first_m, last_m = (self._engine.lane.getLength(f"{edge}_0") for edge in (walk[0], walk[-1]))
         angle_deg = heading_to_sumo(spot.pose.heading_rad)
-        entry = PersonEntry(name, spot.edge, spot.share * first_m, tuple(walk), last_m / 2, speed_mps, xy, angle_deg)
+        entry = PersonEntry(
+            name, spot.edge, spot.share * first_m, tuple(walk), last_m / 2, speed_mps, xy, angle_deg
+        )
         self._entrances.people[self._engine.simulation.getTime()].append(entry)
         entry.enter(self._engine)
 
@@ -217,8 +314,13 @@ class Drivers:
         spec: CrowdSpec,
         rng: np.random.Generator,
     ) -> None:
-        self._engine, self._entrances, self._spec, self._rng = engine, entrances, spec, rng
-        lanes = [lane for lane in street_map.lanes.values() if lane.kind == "road" and not lane.internal]
+        self._engine = engine
+        self._entrances = entrances
+        self._spec = spec
+        self._rng = rng
+        lanes = [
+            lane for lane in street_map.lanes.values() if lane.kind == "road" and not lane.internal
+        ]
         self._lanes: dict[str, list[str]] = {}
         lines: dict[str, Floats] = {}
         for lane in lanes:
@@ -246,13 +348,15 @@ class Drivers:
             self._enter(ring)
 
     def roll(self, x_m: float, y_m: float, seen: Mapping[str, Seen]) -> None:
-        """Take out what is far away or stuck out of sight, let others in instead, far away when possible."""
+        """Take out what is far away or stuck out of sight, let others in instead, far away when
+        possible."""
         vehicle = self._engine.vehicle
         staying = 0
         for name in sorted(vehicle.getIDList()):
             here = seen.get(name)
             if here is None or (
-                here.waiting_s > VEHICLE_STUCK_S and np.hypot(here.x_m - x_m, here.y_m - y_m) > VEHICLE_RING_M[0]
+                here.waiting_s > VEHICLE_STUCK_S
+                and np.hypot(here.x_m - x_m, here.y_m - y_m) > VEHICLE_RING_M[0]
             ):
                 self._entrances.vehicles[self._engine.simulation.getTime()].append(name)
                 vehicle.remove(name)
@@ -270,7 +374,9 @@ class Drivers:
         spot = self._spots[ring[int(self._rng.integers(len(ring)))]]
         route = self._route(spot.edge)
         kinds = list(VEHICLE_TYPES)
-        kind = kinds[int(self._rng.choice(len(kinds), p=[share for _, _, share in VEHICLE_TYPES.values()]))]
+        kind = kinds[
+            int(self._rng.choice(len(kinds), p=[share for _, _, share in VEHICLE_TYPES.values()]))
+        ]
         name = f"v{self._count}"
         self._count += 1
         position_m = spot.share * self._engine.lane.getLength(self._lanes[spot.edge][0])

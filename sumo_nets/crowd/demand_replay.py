@@ -1,4 +1,5 @@
-"""A street once more: the people and vehicles of a simulated street, let in and out again as they were."""
+"""A street once more: the people and vehicles of a simulated street, let in and out again as they
+were."""
 
 from __future__ import annotations
 
@@ -23,25 +24,30 @@ def replayed_demand(
     closed: frozenset[Port],
     together: Together,
 ) -> tuple[PedestriansAgain, DriversAgain]:
-    """Those who let the same people and vehicles in and out at the same moments. They draw nothing."""
+    """Those who let the same people and vehicles in and out at the same moments. They draw
+    nothing."""
     nothing = np.random.default_rng(0)
     people = PedestriansAgain(engine, before, street_map, spec, nothing, closed, together)
     return people, DriversAgain(engine, before, street_map, spec, nothing)
 
 
 class PedestriansAgain(Pedestrians):
-    """People who enter and leave as they did before; who set out at one moment on one walk at one speed are a group."""
+    """People who enter and leave as they did before; who set out at one moment on one walk at one
+    speed are a group."""
 
     def fill(self, x_m: float, y_m: float) -> None:
         self._again()
 
-    def roll(self, x_m: float, y_m: float, seen: Mapping[str, Seen], at_red: Callable[[str], bool]) -> None:
+    def roll(
+        self, x_m: float, y_m: float, seen: Mapping[str, Seen], at_red: Callable[[str], bool]
+    ) -> None:
         self._together.forget(self._engine.person.getIDList())
         self._together.keep(seen)
         self._again()
 
     def _again(self) -> None:
-        here, came = set(self._engine.person.getIDList()), []
+        here = set(self._engine.person.getIDList())
+        came = []
         for one in self._entrances.people.get(self._engine.simulation.getTime(), ()):
             if isinstance(one, PersonEntry):
                 one.enter(self._engine)

@@ -1,8 +1,9 @@
 """EmptyStreet: a street without background crowd or vehicles, which needs no SUMO.
 
-Of SUMO's walkers only the crowd is read, so that where there is none all that SUMO would tell is what the signals
-show, and where they go by the clock their plans tell that too. Actors are where they are, signals as with SUMO: the
-streets are those of a `SumoCrowd` with the same seed, bit for bit.
+Of SUMO's walkers only the crowd is read, so that where there is none all that SUMO would tell is
+what the signals show, and where they go by the clock their plans tell that too. Actors are where
+they are, signals as with SUMO: the streets are those of a `SumoCrowd` with the same seed, bit for
+bit.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 
 from cosim.core.errors import EngineError
 from cosim.core.state import RobotState, Street
-from cosim.episode.ports import Crowd
+from cosim.episode.interfaces import Crowd
 from cosim.place.street_map import StreetMap
 from cosim.spec.events import Actor, EventReply
 from cosim.spec.scenario import CrowdSpec
@@ -42,11 +43,14 @@ def start_of(seed: int) -> tuple[int, int]:
 
 
 class EmptyStreet(Crowd):
-    """The street of a map around actors and signals alone; `goes_by_itself` says where that is all. seed: of when the
-    signals begin; start_xy: where the robot starts, metres. Use as a context manager. entrances: nobody's."""
+    """The street of a map around actors and signals alone; `goes_by_itself` says where that is all.
+    seed: of when the signals begin; start_xy: where the robot starts, metres. Use as a context
+    manager. entrances: nobody's."""
 
     def __init__(self, street_map: StreetMap, seed: int, start_xy: tuple[float, float]) -> None:
-        self._map, self._seed, self._start_xy = street_map, seed, start_xy
+        self._map = street_map
+        self._seed = seed
+        self._start_xy = start_xy
         self._street: Street | None = None
         self.entrances = Entrances()
 
@@ -57,7 +61,12 @@ class EmptyStreet(Crowd):
         self._street = self._read(0, *self._start_xy, ())
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
         self._street = None
 
     @property
@@ -68,11 +77,16 @@ class EmptyStreet(Crowd):
         return self._street
 
     def step(self, robot: RobotState, reply: EventReply, *, absent: bool = False) -> Street:
-        """One tick on, with the event pedestrians where they are now. absent: makes no difference."""
-        self._street = self._read(self.street.tick + 1, robot.pose.x_m, robot.pose.y_m, reply.actors)
+        """One tick on, with the event pedestrians where they are now. absent: makes no
+        difference."""
+        self._street = self._read(
+            self.street.tick + 1, robot.pose.x_m, robot.pose.y_m, reply.actors
+        )
         return self._street
 
     def _read(self, tick: int, x_m: float, y_m: float, actors: tuple[Actor, ...]) -> Street:
         self._lights.now_ms += TICK_MS
-        people = self._shown.together(cast_in_order(actors, self.entrances.ages), self.entrances.ages)
+        people = self._shown.together(
+            cast_in_order(actors, self.entrances.ages), self.entrances.ages
+        )
         return Street(tick, people, signals=self._signals.near(x_m, y_m))

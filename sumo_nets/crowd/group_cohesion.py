@@ -1,9 +1,10 @@
 """Together: how the members of a group stay together, though SUMO's walkers know no groups.
 
-They have one walk and one speed, so SUMO moves them alike until somebody comes in the way, or a light turns red between
-them. Then who is ahead of the group's middle walks a little slower and who lags a little faster, and who is far ahead
-waits, but never on a crossing. Who walks behind a slower fellow changes stripes, so the group comes abreast again. On
-a wide sidewalk who has evaded somebody steps back to its fellows, where there is room.
+They have one walk and one speed, so SUMO moves them alike until somebody comes in the way, or a
+light turns red between them. Then who is ahead of the group's middle walks a little slower and who
+lags a little faster, and who is far ahead waits, but never on a crossing. Who walks behind a slower
+fellow changes stripes, so the group comes abreast again. On a wide sidewalk who has evaded somebody
+steps back to its fellows, where there is room.
 """
 
 from __future__ import annotations
@@ -28,29 +29,36 @@ _SLACK_M: Final = 0.15
 SLOWER_PER_M: Final = 0.3
 """Share of the speed by which somebody slows down for each metre ahead of the group's middle."""
 
-SLOWEST, FASTEST = 0.6, 1.1
-"""Shares of the group's speed within which its members vary; nobody hurries beyond the fastest walkers' speed."""
+SLOWEST = 0.6
+FASTEST = 1.1
+"""Shares of the group's speed within which its members vary; nobody hurries beyond the fastest
+walkers' speed."""
 
 _STEPS: Final = 20.0
 """Shares change in twentieths: small changes are not worth a call."""
 
-WAIT_M, GO_M = 2.0, 1.4
+WAIT_M = 2.0
+GO_M = 1.4
 """Who is so far ahead of the last waits, until the last is nearer than GO_M."""
 
 _BESIDE_M: Final = 1.0
 """Who is farther to the side of the next fellow steps nearer."""
 
 _STEP_M: Final = 0.34
-"""A step to the side: more than half a stripe, so that SUMO leads on to the middle of the next one."""
+"""A step to the side: more than half a stripe, so that SUMO leads on to the middle of the next
+one."""
 
-_ROOM_M, _AHEAD_M = 0.9, 6.0
-"""Nobody steps to the side where somebody would be so near, or comes towards it from so far ahead."""
+_ROOM_M = 0.9
+_AHEAD_M = 6.0
+"""Nobody steps to the side where somebody would be so near, or comes towards it from so far
+ahead."""
 
 ROUGHLY: Final = 0.5
 """On corners, where the way turns, what lies between fellows along it counts by this much."""
 
 _APART_M: Final = 3.0
-"""Of fellows farther apart, who may be round a corner, the edges that they walk on say who is ahead."""
+"""Of fellows farther apart, who may be round a corner, the edges that they walk on say who is
+ahead."""
 
 LOOK_AHEAD: Final = 6
 """Nobody walks over so many edges between two looks."""
@@ -92,7 +100,9 @@ class Together:
     """
 
     def __init__(self, engine: Sumo, strips: Mapping[str, Strip], tick_s: float) -> None:
-        self._engine, self._strips, self._tick_s = engine, strips, tick_s
+        self._engine = engine
+        self._strips = strips
+        self._tick_s = tick_s
         self._groups: dict[str, _Group] = {}
         self._chords: dict[str, _Place] = {}
 
@@ -156,15 +166,20 @@ class Together:
                 share = 1.0
             self._walk(group, name, round(_STEPS * share) / _STEPS)
 
-    def _close(self, here: Mapping[str, _Place], group: _Group, way: _Place, seen: Mapping[str, _Standing]) -> None:
-        """Let one who walks too far to the side, and did before, step nearer to its fellows; of two the hindmost."""
+    def _close(
+        self, here: Mapping[str, _Place], group: _Group, way: _Place, seen: Mapping[str, _Standing]
+    ) -> None:
+        """Let one who walks too far to the side, and did before, step nearer to its fellows; of two
+        the hindmost."""
         left = sorted((way[0] * y_m - way[1] * x_m, name) for name, (x_m, y_m) in here.items())
         too_wide = [
             (one, other)
             for (low_m, one), (high_m, other) in itertools.pairwise(left)
-            if _BESIDE_M < high_m - low_m < _APART_M and 0.0 not in (group.share.get(one), group.share.get(other))
+            if _BESIDE_M < high_m - low_m < _APART_M
+            and 0.0 not in (group.share.get(one), group.share.get(other))
         ]
-        before, group.wide = group.wide, bool(too_wide)
+        before = group.wide
+        group.wide = bool(too_wide)
         if not too_wide or not before:
             return
         group.wide = False
@@ -172,7 +187,10 @@ class Together:
         for name in sorted(too_wide[0], key=lambda name: (group.ahead_m[name], name)):
             on_m = self._tick_s * group.mps * group.share.get(name, 1.0)
             left_m = _STEP_M if name == too_wide[0][0] else -_STEP_M
-            to = (here[name][0] + on_m * way[0] - left_m * way[1], here[name][1] + on_m * way[1] + left_m * way[0])
+            to = (
+                here[name][0] + on_m * way[0] - left_m * way[1],
+                here[name][1] + on_m * way[1] + left_m * way[0],
+            )
             if _is_free(to, way, others) and self._step(name, way, to):
                 return
 
@@ -182,10 +200,13 @@ class Together:
         strip = self._strips.get(person.getRoadID(name))
         if strip is None or strip.kind != "sidewalk" or person.getSpeed(name) < _MOVED_M:
             return False
-        length_m, margin_m = self._engine.lane.getLength(f"{strip.id}_0"), strip.width_m + ROUND_THE_CORNER_M
+        length_m = self._engine.lane.getLength(f"{strip.id}_0")
+        margin_m = strip.width_m + ROUND_THE_CORNER_M
         if not margin_m < person.getLanePosition(name) < length_m - margin_m:
             return False
-        person.moveToXY(name, "", *to, heading_to_sumo(math.atan2(way[1], way[0])), KEEP_ROUTE, MATCH_M)
+        person.moveToXY(
+            name, "", *to, heading_to_sumo(math.atan2(way[1], way[0])), KEEP_ROUTE, MATCH_M
+        )
         return True
 
     def _on_crossing(self, name: str) -> bool:
@@ -208,11 +229,14 @@ class Together:
             return
         ahead_m = {n: group.way[0] * p[0] + group.way[1] * p[1] for n, p in here.items()}
         if max(ahead_m.values()) - min(ahead_m.values()) > _SLACK_M:
-            ahead_m = self._along(group.names, group.way) or self._round_a_corner(here, ahead_m, group)
+            ahead_m = self._along(group.names, group.way) or self._round_a_corner(
+                here, ahead_m, group
+            )
         group.ahead_m = ahead_m
 
     def _along(self, names: tuple[str, ...], way: _Place) -> dict[str, float] | None:
-        """How far along its line each is, if all are on one sidewalk or crossing: exact even where somebody evades."""
+        """How far along its line each is, if all are on one sidewalk or crossing: exact even where
+        somebody evades."""
         person = self._engine.person
         edges = {person.getRoadID(name) for name in names}
         if len(edges) > 1 or (edge := edges.pop()) not in self._strips:
@@ -227,7 +251,8 @@ class Together:
     def _round_a_corner(
         self, here: Mapping[str, _Place], ahead_m: Mapping[str, float], group: _Group
     ) -> dict[str, float]:
-        """Who is ahead by how much where the way turns, or on several edges: roughly, but by the walk if APART_M."""
+        """Who is ahead by how much where the way turns, or on several edges: roughly, but by the
+        walk if APART_M."""
         if max(math.dist(p, q) for p, q in itertools.combinations(here.values(), 2)) < _APART_M:
             return {name: ROUGHLY * m for name, m in ahead_m.items()}
         edges = {name: self._edge(name, group) for name in here}
@@ -242,10 +267,13 @@ class Together:
             group.at += ahead.index(edge)
 
     def _edge(self, name: str, group: _Group) -> float:
-        """How many edges of the walk somebody has come, and a half on corners; where it comes twice, near the group."""
-        edge, half = self._engine.person.getRoadID(name), 0.0
+        """How many edges of the walk somebody has come, and a half on corners; where it comes
+        twice, near the group."""
+        edge = self._engine.person.getRoadID(name)
+        half = 0.0
         if edge not in self._strips:
-            edge, half = self._engine.person.getNextEdge(name), 0.5
+            edge = self._engine.person.getNextEdge(name)
+            half = 0.5
         places = [k for k, part in enumerate(group.walk) if part == edge]
         return min(places, key=lambda k: abs(k - group.at), default=group.at) - half
 
@@ -261,6 +289,7 @@ class Together:
 def _is_free(place: _Place, way: _Place, others: list[_Place]) -> bool:
     """Whether nobody is near a place, nor in the way for AHEAD_M from there on."""
     apart = np.array(others).reshape(-1, 2) - place
-    ahead, aside = apart @ way, apart @ (-way[1], way[0])
+    ahead = apart @ way
+    aside = apart @ (-way[1], way[0])
     behind = np.minimum(ahead, 0.0)
     return not bool(((ahead < _AHEAD_M) & (np.hypot(behind, aside) < _ROOM_M)).any())

@@ -27,8 +27,8 @@ _MS: Final = 1000
 
 
 class Showing(NamedTuple):
-    """What a signal shows: whether one may walk, the time at which that changes, None for unknown or never, and the
-    time until which this holds, in seconds of SUMO's time."""
+    """What a signal shows: whether one may walk, the time at which that changes, None for unknown
+    or never, and the time until which this holds, in seconds of SUMO's time."""
 
     walk: bool
     change_s: float | None
@@ -62,21 +62,32 @@ class Signals:
 
     def near(self, x_m: float, y_m: float) -> Mapping[str, Signal]:
         """The signals within NEAR_M (up to RESELECT_M more or less) of a point, now."""
-        if self._centre is None or np.hypot(x_m - self._centre[0], y_m - self._centre[1]) > RESELECT_M:
+        if (
+            self._centre is None
+            or np.hypot(x_m - self._centre[0], y_m - self._centre[1]) > RESELECT_M
+        ):
             self._centre = (x_m, y_m)
             gap = self._xy - (x_m, y_m)
-            self._near = [self._ids[i] for i in np.flatnonzero((gap * gap).sum(axis=1) <= _NEAR_M * _NEAR_M)]
+            self._near = [
+                self._ids[i] for i in np.flatnonzero((gap * gap).sum(axis=1) <= _NEAR_M * _NEAR_M)
+            ]
         now_s = self._lights.now_s()
         signals = {}
         for crossing in self._near:
             walk, change_s, _ = self._state(crossing, now_s)
-            signals[crossing] = Signal(walk, None if change_s is None else round(change_s - now_s, 3))
+            signals[crossing] = Signal(
+                walk, None if change_s is None else round(change_s - now_s, 3)
+            )
         return MappingProxyType(signals)
 
     def red(self, crossings: Sequence[str]) -> list[int]:
         """The places in `crossings` of those that have a signal that forbids walking."""
         now_s = self._lights.now_s()
-        return [i for i, one in enumerate(crossings) if one in self._lit and not self._state(one, now_s).walk]
+        return [
+            i
+            for i, one in enumerate(crossings)
+            if one in self._lit and not self._state(one, now_s).walk
+        ]
 
     def is_red(self, crossing: str) -> bool:
         """Whether a crossing has a signal and it forbids walking."""
@@ -90,20 +101,22 @@ class Signals:
 
 
 class PlannedLights:
-    """The signals of a map whose plans tell all of them: what SUMO would show, without it. begin_s: when SUMO would
-    have been started; `now_ms` is set to its time."""
+    """The signals of a map whose plans tell all of them: what SUMO would show, without it. begin_s:
+    when SUMO would have been started; `now_ms` is set to its time."""
 
     def __init__(self, street_map: StreetMap, begin_s: int) -> None:
         self._strips = street_map.strips
-        self.crossings: Collection[str] = [strip.id for strip in self._strips.values() if strip.plan is not None]
+        self.crossings: Collection[str] = [
+            strip.id for strip in self._strips.values() if strip.plan is not None
+        ]
         self.now_ms = _MS * begin_s
 
     def now_s(self) -> float:
         return self.now_ms / _MS
 
     def showing(self, crossing: str) -> Showing:
-        """SUMO switches within the step that begins with or before the moment of it, so that the moment itself still
-        shows what was before."""
+        """SUMO switches within the step that begins with or before the moment of it, so that the
+        moment itself still shows what was before."""
         plan: SignalPlan | None = self._strips[crossing].plan
         assert plan is not None, crossing
         ends_ms = list(itertools.accumulate(plan.durations_ms))
@@ -139,7 +152,11 @@ class SumoLights:
         traffic_light = self._engine.trafficlight
         next_s = traffic_light.getNextSwitch(light)
         walk = traffic_light.getRedYellowGreenState(light)[index] in _WALK
-        return Showing(walk, self._change(light, index, walk, next_s), next_s if self._program(light) else self.now_s())
+        return Showing(
+            walk,
+            self._change(light, index, walk, next_s),
+            next_s if self._program(light) else self.now_s(),
+        )
 
     def _change(self, light: str, index: int, walk: bool, next_s: float) -> float | None:
         phases = self._program(light)
@@ -161,5 +178,7 @@ class SumoLights:
             name = traffic_light.getProgram(light)
             logic = next(p for p in traffic_light.getAllProgramLogics(light) if p.programID == name)
             static = logic.type == 0
-            self._phases[light] = tuple((p.duration, p.state) for p in logic.phases) if static else None
+            self._phases[light] = (
+                tuple((p.duration, p.state) for p in logic.phases) if static else None
+            )
         return self._phases[light]

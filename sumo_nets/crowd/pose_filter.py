@@ -1,8 +1,8 @@
 """PoseFilter: the poses shown of people whose simulated positions sometimes jump.
 
-SUMO's striping model moves a person by up to metres in one step where strips and corners meet, and flips its angle
-on a sidestep. The shown person walks to where SUMO has it, no faster than a brisk walk, and turns like a body; on
-the way it keeps out of others and of the robot.
+SUMO's striping model moves a person by up to metres in one step where strips and corners meet, and
+flips its angle on a sidestep. The shown person walks to where SUMO has it, no faster than a brisk
+walk, and turns like a body; on the way it keeps out of others and of the robot.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats, wrap_angles
-from cosim.core.rows import RowLookup
+from cosim.core.row_matching import RowLookup
 from cosim.people.standing import Standing
 from cosim.people.yielding import RobotBody, comes_too_near, stepped_round
 from sumo_nets.crowd.separation import NearPairs, kept_apart
@@ -27,7 +27,8 @@ MAX_TURN_RADPS = math.pi
 """The fastest a shown person turns."""
 
 LOOK_AHEAD_S = 0.3
-"""Time constant of the motion that the heading follows: a sidestep is over before the body has turned."""
+"""Time constant of the motion that the heading follows: a sidestep is over before the body has
+turned."""
 
 TURNING_SPEED_MPS = 0.3
 """Below this the motion says nothing about where somebody faces."""
@@ -40,8 +41,8 @@ NOBODY_ELSE: Floats = np.zeros((0, 2))
 
 @dataclass(slots=True)
 class PoseFilter:
-    """Remembers the shown poses of everybody; `update` moves them one period of `period_s` on. standing: what people
-    step round besides the robot."""
+    """Remembers the shown poses of everybody; `update` moves them one period of `period_s` on.
+    standing: what people step round besides the robot."""
 
     period_s: float
     standing: Standing = field(default_factory=Standing)
@@ -60,17 +61,21 @@ class PoseFilter:
         body: RobotBody | None = None,
         others: Floats = NOBODY_ELSE,
     ) -> tuple[Floats, Floats, Floats]:
-        """The shown positions (N, 2) m, headings (N,) rad and speeds (N,) m/s, given the simulated ones.
+        """The shown positions (N, 2) m, headings (N,) rad and speeds (N,) m/s, given the simulated
+        ones.
 
-        Who is new is shown as simulated, facing as `facing_of` says; who is missing is forgotten. body: the robot,
-        round which people step. others (K, 2) m: people who are moved by somebody else.
+        Who is new is shown as simulated, facing as `facing_of` says; who is missing is forgotten.
+        body: the robot, round which people step. others (K, 2) m: people who are moved by somebody
+        else.
         """
         row, new = self._rows.of(ids)
         before, facing, motion = self._xy[row], self._heading[row], self._motion[row]
         if new:
             before[new] = xy[new]
             facing[new] = [facing_of(ids[i]) for i in new]
-            motion[new] = speed[new, None] * np.column_stack([np.cos(facing[new]), np.sin(facing[new])])
+            motion[new] = speed[new, None] * np.column_stack(
+                [np.cos(facing[new]), np.sin(facing[new])]
+            )
         simulated = motion[new]
 
         gap = xy - before
@@ -91,11 +96,16 @@ class PoseFilter:
         facing = wrap_angles(facing + turn)
 
         if ids:
-            self._xy, self._heading, self._motion = shown, facing, motion
+            self._xy = shown
+            self._heading = facing
+            self._motion = motion
         return shown, facing, np.hypot(velocity[:, 0], velocity[:, 1])
 
-    def _round(self, before: Floats, shown: Floats, body: RobotBody | None, stand: NDArray[np.bool_]) -> Floats:
-        """Round the robot and what stands; who would step round that into the robot stays where it is."""
+    def _round(
+        self, before: Floats, shown: Floats, body: RobotBody | None, stand: NDArray[np.bool_]
+    ) -> Floats:
+        """Round the robot and what stands; who would step round that into the robot stays where it
+        is."""
         if body is None:
             return self.standing.stepped_round(before, shown, stand)
         past = stepped_round(before, shown, body, stand)
@@ -103,8 +113,12 @@ class PoseFilter:
         stays = (round_both != past).any(axis=1) & comes_too_near(before, round_both, body)
         return np.where(stays[:, None], before, round_both)
 
-    def _apart(self, before: Floats, shown: Floats, others: Floats, stand: NDArray[np.bool_]) -> Floats:
+    def _apart(
+        self, before: Floats, shown: Floats, others: Floats, stand: NDArray[np.bool_]
+    ) -> Floats:
         firm = np.arange(len(shown) + len(others)) >= len(shown)
         stand = np.concatenate([stand, np.zeros(len(others), dtype=bool)])
         before, wanted = np.concatenate([before, others]), np.concatenate([shown, others])
-        return kept_apart(before, wanted, firm, MAX_SPEED_MPS * self.period_s, stand, self._near)[: len(shown)]
+        return kept_apart(before, wanted, firm, MAX_SPEED_MPS * self.period_s, stand, self._near)[
+            : len(shown)
+        ]

@@ -1,15 +1,10 @@
-"""Proxies: how SUMO's persons and cars see the robot and the event pedestrians.
-
-A proxy is a SUMO person that is put where its original is before every step. SUMO sees it only on the edges of its
-own walk and around the junction where the first of them ends, so the walk is chosen by the place and made anew when
-the place changes. Other ways of moving a person (free mapping, a walk of one walking area) crash SUMO.
-"""
+"""Proxies: how SUMO's persons and vehicles perceive the robot and the event pedestrians."""
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 import shapely
@@ -17,10 +12,47 @@ from shapely.geometry import LineString
 
 from cosim.core.geometry import Circle, Pose, heading_to_sumo
 from cosim.place.street_map import Located, StreetMap
-from sumo_nets.crowd.sidewalk_lead import SidewalkLead
 
-if TYPE_CHECKING:  # a street that goes by itself does without SUMO
+if TYPE_CHECKING:
     from sumo_nets.engine import Sumo
+
+
+class SidewalkLead:
+    """By how much sidewalks are nearer than other lanes. internal: the edges inside each
+    junction."""
+
+    def __init__(self, engine: Sumo, internal: Mapping[str, Iterable[str]]) -> None:
+        self._engine = engine
+        self._internal = internal
+        self._lines: dict[tuple[str, str], tuple[shapely.Geometry, shapely.Geometry]] = {}
+
+    def metres(self, first: str, second: str, x_m: float, y_m: float) -> float:
+        """By how much a point in the sidewalk `first` is nearer to it than to any other lane that
+        SUMO may compare, for a proxy whose walk is `first` and then `second`, or by twice how far
+        it is from its sides if that is less. Negative where another lane is nearer; it changes by 2
+        m at most from a point to the next in 1 m.
+        """
+        if (first, second) not in self._lines:
+            inside = self._internal.get(self._engine.edge.getToJunction(first), ())
+            own, *others = [line for edge in (first, second, *inside) for line in self._of(edge)]
+            self._lines[first, second] = own, shapely.multilinestrings(others)
+        at = shapely.Point(x_m, y_m)
+        sidewalk, rest = self._lines[first, second]
+        own_m = shapely.distance(sidewalk, at)
+        return float(
+            min(
+                shapely.distance(rest, at) - own_m,
+                self._engine.lane.getWidth(f"{first}_0") - 2.0 * own_m,
+            )
+        )
+
+    def _of(self, edge: str) -> list[LineString]:
+        """The lines of an edge's lanes, the sidewalk's first."""
+        lanes = [f"{edge}_{k}" for k in range(self._engine.edge.getLaneNumber(edge))]
+        return [
+            LineString([point[:2] for point in self._engine.lane.getShape(lane)]) for lane in lanes
+        ]
+
 
 KEEP_ROUTE = 3
 """moveToXY: keep the walk, may leave the network. The only mode that neither crashes nor clamps."""
@@ -30,7 +62,8 @@ KEEP_ROUTE_ON_ROAD = 7
 
 MATCH_M = 100.0
 ROUND_THE_CORNER_M = 2.0
-"""Beyond its width, how near to the end of a sidewalk SUMO may take a proxy to be round the corner."""
+"""Beyond its width, how near to the end of a sidewalk SUMO may take a proxy to be round the
+corner."""
 
 NEARER_M = 0.01
 """By how much the lines of its own place must be nearer to a proxy than those of others."""
@@ -39,11 +72,13 @@ _ROUNDING_M: Final = 0.001
 """Distances hold but for this."""
 
 NUDGES = (0.0, 0.1, 0.2, 0.4, 0.7, 0.98)
-"""Shares of the way to its own place's lines by which a proxy is moved to be nearer to them than to others."""
+"""Shares of the way to its own place's lines by which a proxy is moved to be nearer to them than to
+others."""
 
 
 class Walk(NamedTuple):
-    """A walk of a proxy: from sidewalk `first` to sidewalk `second`, over the place `around` where they meet."""
+    """A walk of a proxy: from sidewalk `first` to sidewalk `second`, over the place `around` where
+    they meet."""
 
     around: str
     first: str
@@ -53,8 +88,9 @@ class Walk(NamedTuple):
 class Walks:
     """Chooses a proxy's walk from where it is and where it heads.
 
-    A meeting place is named by the first of the corners that crossings of one junction join, or by the junction
-    where there is no corner. Sidewalks of one junction that do not meet make a walk that crashes SUMO.
+    A meeting place is named by the first of the corners that crossings of one junction join, or by
+    the junction where there is no corner. Sidewalks of one junction that do not meet make a walk
+    that crashes SUMO.
     """
 
     def __init__(self, engine: Sumo, street_map: StreetMap) -> None:
@@ -104,9 +140,11 @@ class Walks:
         return None
 
     def seen_at(self, walk: Walk, x_m: float, y_m: float) -> tuple[float, float] | None:
-        """The place nearest to a point, in metres, at which SUMO can see a proxy with a walk; None without any.
+        """The place nearest to a point, in metres, at which SUMO can see a proxy with a walk; None
+        without any.
 
-        Where the corners of a junction are not joined by crossings, SUMO may take a proxy on one to be on another.
+        Where the corners of a junction are not joined by crossings, SUMO may take a proxy on one to
+        be on another.
         """
         if walk not in self._lines:
             self._lines[walk] = self._own_and_others(walk)
@@ -117,38 +155,60 @@ class Walks:
         to_own = shapely.get_coordinates(shapely.shortest_line(shapely.Point(x_m, y_m), own))
         for share in NUDGES:
             x, y = (to_own[0] + share * (to_own[1] - to_own[0])).tolist()
-            if shapely.distance(own, at := shapely.Point(x, y)) + NEARER_M < shapely.distance(others, at):
+            if shapely.distance(own, at := shapely.Point(x, y)) + NEARER_M < shapely.distance(
+                others, at
+            ):
                 return x, y
         return None
 
     def _own_and_others(self, walk: Walk) -> tuple[shapely.Geometry, shapely.Geometry] | None:
-        """The lines that SUMO compares with a proxy's position: of its walk and place, of the junction's other places.
+        """The lines that SUMO compares with a proxy's position: of its walk and place, of the
+        junction's other places.
 
         None where there are no others.
         """
-        inner = [edge for edge in self._internal.get(self._ends[walk.first][1], []) if _is_walkable(edge)]
+        inner = [
+            edge for edge in self._internal.get(self._ends[walk.first][1], []) if _is_walkable(edge)
+        ]
         others = [piece for piece in inner if self._place.get(piece) != walk.around]
         if not others:
             return None
-        own = [walk.first, walk.second, *(piece for piece in inner if self._place.get(piece) == walk.around)]
-        return shapely.union_all([*map(self._line, own)]), shapely.union_all([*map(self._line, others)])
+        own = [
+            walk.first,
+            walk.second,
+            *(piece for piece in inner if self._place.get(piece) == walk.around),
+        ]
+        return shapely.union_all([*map(self._line, own)]), shapely.union_all(
+            [*map(self._line, others)]
+        )
 
     def _pair(self, around: str, firsts: list[str], edge: str) -> Walk | None:
-        """The walk that touches most corners of `edge`, if possible not from one side of a street to its other."""
-        walks = [Walk(around, first, to) for first in firsts for to in self._at.get(around, []) if to != first]
+        """The walk that touches most corners of `edge`, if possible not from one side of a street
+        to its other."""
+        walks = [
+            Walk(around, first, to)
+            for first in firsts
+            for to in self._at.get(around, [])
+            if to != first
+        ]
         return max(
             walks,
-            key=lambda walk: (self._touched(walk, edge), self._ends[walk.second] != self._ends[walk.first][::-1]),
+            key=lambda walk: (
+                self._touched(walk, edge),
+                self._ends[walk.second] != self._ends[walk.first][::-1],
+            ),
             default=None,
         )
 
     def _touched(self, walk: Walk, edge: str) -> int:
-        """How many corners of a corner or crossing the walk's sidewalks touch: SUMO looks for its path there."""
+        """How many corners of a corner or crossing the walk's sidewalks touch: SUMO looks for its
+        path there."""
         if (walk, edge) not in self._touches:
             strips = self.street_map.strips
             corners = strips[edge].corners if edge in strips else (edge,)
             self._touches[walk, edge] = sum(
-                corner is not None and (corner in strips[walk.first].corners or corner in strips[walk.second].corners)
+                corner is not None
+                and (corner in strips[walk.first].corners or corner in strips[walk.second].corners)
                 for corner in corners
             )
         return self._touches[walk, edge]
@@ -164,12 +224,13 @@ class Walks:
     def _ahead(self, edge: str, pose: Pose) -> str:
         """The meeting place at the end of a sidewalk that a pose heads to.
 
-        Near the end where the edge ends it is always that one: SUMO may map a proxy there to the walking area, and
-        crashes when its walk turns away from it.
+        Near the end where the edge ends it is always that one: SUMO may map a proxy there to the
+        walking area, and crashes when its walk turns away from it.
         """
         if edge not in self._chords:
             strip = self.street_map.strips[edge]
-            (x0, y0), (x1, y1) = strip.line[0].tolist(), strip.line[-1].tolist()
+            (x0, y0) = strip.line[0].tolist()
+            (x1, y1) = strip.line[-1].tolist()
             self._chords[edge] = x1, y1, x1 - x0, y1 - y0, strip.width_m + ROUND_THE_CORNER_M
         x1, y1, along_x, along_y, end_m = self._chords[edge]
         forward = along_x * math.cos(pose.heading_rad) + along_y * math.sin(pose.heading_rad) >= 0.0
@@ -178,12 +239,17 @@ class Walks:
 
 
 class Proxy:
-    """The stand-in of one body. `base` starts the names of the SUMO persons it uses, one after another."""
+    """The stand-in of one body. `base` starts the names of the SUMO persons it uses, one after
+    another."""
 
-    def __init__(self, engine: Sumo, walks: Walks, *, base: str, kind: str, serial: Iterator[int]) -> None:
+    def __init__(
+        self, engine: Sumo, walks: Walks, *, base: str, kind: str, serial: Iterator[int]
+    ) -> None:
         self._engine = engine
         self._walks = walks
-        self._base, self._kind, self._serial = base, kind, serial
+        self._base = base
+        self._kind = kind
+        self._serial = serial
         self._name: str | None = None
         self._walk: Walk | None = None
         self._place = Located("off", "")
@@ -193,7 +259,8 @@ class Proxy:
         self._leads = False
 
     def update(self, pose: Pose) -> None:
-        """Put it at a pose. To be called before every step of the simulation, or it walks on by itself."""
+        """Put it at a pose. To be called before every step of the simulation, or it walks on by
+        itself."""
         x_m, y_m, heading_rad = pose
         place = self._locate(x_m, y_m)
         walk = self._walk
@@ -201,16 +268,24 @@ class Proxy:
             walk = None
         elif walk is None or not self._walks.serves(walk, place.edge, pose):
             walk = self._walks.choose(place.edge, pose)
-        mode, at = KEEP_ROUTE_ON_ROAD, (x_m, y_m)
-        if walk is not None and place.kind != "road" and not self._is_on_sidewalk(walk, place, x_m, y_m):
-            mode, seen_at = KEEP_ROUTE, self._walks.seen_at(walk, x_m, y_m)
+        mode = KEEP_ROUTE_ON_ROAD
+        at = (x_m, y_m)
+        if (
+            walk is not None
+            and place.kind != "road"
+            and not self._is_on_sidewalk(walk, place, x_m, y_m)
+        ):
+            mode = KEEP_ROUTE
+            seen_at = self._walks.seen_at(walk, x_m, y_m)
             walk, at = (None, at) if seen_at is None else (walk, seen_at)
         if walk != self._walk or self._name is None:
             self.remove()
             if walk is not None:
                 self._add(walk)
         if self._name is not None:
-            self._engine.person.moveToXY(self._name, "", *at, heading_to_sumo(heading_rad), mode, MATCH_M)
+            self._engine.person.moveToXY(
+                self._name, "", *at, heading_to_sumo(heading_rad), mode, MATCH_M
+            )
 
     def remove(self) -> None:
         """Take it out of the simulation."""
@@ -220,22 +295,26 @@ class Proxy:
 
     def _add(self, walk: Walk) -> None:
         person = self._engine.person
-        self._name, self._walk = f"{self._base}.{next(self._serial)}", walk
+        self._name = f"{self._base}.{next(self._serial)}"
+        self._walk = walk
         lengths = [self._engine.lane.getLength(f"{edge}_0") for edge in (walk.first, walk.second)]
         person.add(self._name, walk.first, lengths[0] / 2, typeID=self._kind)
         person.appendWalkingStage(self._name, [walk.first, walk.second], lengths[1] / 2)
 
     def _is_on_sidewalk(self, walk: Walk, place: Located, x_m: float, y_m: float) -> bool:
-        """Whether SUMO will take it to be on the sidewalk where its walk begins, whichever lanes it compares."""
+        """Whether SUMO will take it to be on the sidewalk where its walk begins, whichever lanes it
+        compares."""
         if place.edge != walk.first or self._inside.radius_m == 0.0:
             return False
         if walk != self._walk or not self._compared.holds(x_m, y_m):
             lead_m = self._walks.lead.metres(walk.first, walk.second, x_m, y_m) - NEARER_M
-            self._leads, self._compared = lead_m > 0.0, Circle(x_m, y_m, abs(lead_m) / 2.0)
+            self._leads = lead_m > 0.0
+            self._compared = Circle(x_m, y_m, abs(lead_m) / 2.0)
         return self._leads
 
     def _locate(self, x_m: float, y_m: float) -> Located:
-        """The map's `locate`, asked again only when the body has left the walkable piece where it was."""
+        """The map's `locate`, asked again only when the body has left the walkable piece where it
+        was."""
         if self._inside.holds(x_m, y_m):
             return self._place
         if self._piece is None or not shapely.contains_xy(self._piece, x_m, y_m):
@@ -244,11 +323,14 @@ class Proxy:
             self._piece = None
             if place.kind == "walk":
                 piece = street_map.strips.get(place.edge) or street_map.corners[place.edge]
-                self._piece, self._outline = piece.polygon, shapely.boundary(piece.polygon)
+                self._piece = piece.polygon
+                self._outline = shapely.boundary(piece.polygon)
                 shapely.prepare(self._piece)
         room_m = 0.0
         if self._piece is not None and shapely.contains_xy(self._piece, x_m, y_m):
-            room_m = max(float(shapely.distance(self._outline, shapely.Point(x_m, y_m))) - _ROUNDING_M, 0.0)
+            room_m = max(
+                float(shapely.distance(self._outline, shapely.Point(x_m, y_m))) - _ROUNDING_M, 0.0
+            )
         self._inside = Circle(x_m, y_m, room_m)
         return self._place
 
@@ -259,7 +341,8 @@ def junction_of(internal: str) -> str:
 
 
 def _by_junction(edges: Iterable[str]) -> dict[str, list[str]]:
-    """Junction -> the edges inside it, walking areas and crossings included that are too small for the map."""
+    """Junction -> the edges inside it, walking areas and crossings included that are too small for
+    the map."""
     inside: dict[str, list[str]] = {}
     for edge in edges:
         if edge.startswith(":"):
@@ -273,13 +356,19 @@ def _is_walkable(internal: str) -> bool:
 
 
 def _line(engine: Sumo, edge: str) -> shapely.Geometry:
-    """What SUMO measures distances to: the middle line of an edge, the outline, left open, of a walking area."""
+    """What SUMO measures distances to: the middle line of an edge, the outline, left open, of a
+    walking area."""
     return LineString([point[:2] for point in engine.lane.getShape(f"{edge}_0")])
 
 
 def _meeting_places(street_map: StreetMap) -> dict[str, str]:
-    """Corner or crossing id -> id of the first of the corners that it is joined with by crossings."""
-    crossings = [strip for strip in street_map.strips.values() if strip.kind == "crossing" and any(strip.corners)]
+    """Corner or crossing id -> id of the first of the corners that it is joined with by
+    crossings."""
+    crossings = [
+        strip
+        for strip in street_map.strips.values()
+        if strip.kind == "crossing" and any(strip.corners)
+    ]
     joined: dict[str, list[str]] = defaultdict(list)
     for crossing in crossings:
         ends = [corner for corner in crossing.corners if corner is not None]
@@ -292,4 +381,7 @@ def _meeting_places(street_map: StreetMap) -> dict[str, str]:
             if (corner := reached.pop()) not in place:
                 place[corner] = first
                 reached += joined[corner]
-    return place | {one.id: place[next(corner for corner in one.corners if corner is not None)] for one in crossings}
+    return place | {
+        one.id: place[next(corner for corner in one.corners if corner is not None)]
+        for one in crossings
+    }

@@ -1,9 +1,4 @@
-"""Nobody walks through anybody: how shown people keep apart.
-
-SUMO's walkers change stripes through one another, and their paths over corners cross. A step that would bring two
-people nearer than KEEP_M is led aside: each gives way by half, an event pedestrian not at all. Where two meet head-on,
-the step bends to the side on which it would pass; that choice strengthens itself.
-"""
+"""Keep the displayed pedestrians apart."""
 
 from __future__ import annotations
 
@@ -15,16 +10,32 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
 from cosim.people.steering import SHOULDER_TO_SHOULDER_M
-from sumo_nets.crowd.near_pairs import pairs_within
+
+
+def pairs_within(xy: Floats, reach_m: float) -> NDArray[np.intp]:
+    """(P, 2) numbers of those of (N, 2) points that are no farther apart, the lower number
+    first."""
+    order = np.argsort(xy[:, 0], kind="stable")
+    x_m = xy[order, 0]
+    # Along x everybody's neighbours follow it: how many do, and which.
+    ahead = np.searchsorted(x_m, x_m + 1.001 * reach_m, side="right") - np.arange(1, len(xy) + 1)
+    one = np.repeat(np.arange(len(xy)), ahead)
+    other = one + 1 + np.arange(len(one)) - np.repeat(np.cumsum(ahead) - ahead, ahead)
+    pairs = np.sort(np.column_stack([order[one], order[other]]), axis=1)
+    gap = xy[pairs[:, 0]] - xy[pairs[:, 1]]
+    return np.asarray(pairs[(gap * gap).sum(axis=1) <= reach_m * reach_m])
+
 
 SHOULDERS_M: Final = SHOULDER_TO_SHOULDER_M
-"""Least distance of the middles of two people: shoulders touch. SUMO's queues, 0.465 m apart, stay as they are."""
+"""Least distance of the middles of two people: shoulders touch. SUMO's queues, 0.465 m apart, stay
+as they are."""
 
 _NEAR_M: Final = 0.6
 """Pairs nearer than this are looked at: some of them come nearer by giving way to others."""
 
 _MARGIN_M: Final = 1.0
-"""Who may come near is looked for so much farther out, and anew when somebody has moved half of it."""
+"""Who may come near is looked for so much farther out, and anew when somebody has moved half of
+it."""
 
 ROUNDS: Final = 8
 """One gives way to several in turn, at most so often."""
@@ -53,7 +64,8 @@ class NearPairs:
     _other: Rows = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
 
     def of(self, at: Complex, firm: NDArray[np.bool_]) -> tuple[Rows, Rows]:
-        """Numbers of those who are near each other, two arrays (P,), in order; none where nobody is too near.
+        """Numbers of those who are near each other, two arrays (P,), in order; none where nobody is
+        too near.
 
         at, firm: (N,) where they are, and who does not give way.
         """
@@ -86,9 +98,9 @@ def kept_apart(
 ) -> Floats:
     """Where people go who want to go from `before` to `wanted`, (N, 2) metres each.
 
-    firm (N,): who does not give way. reach_m: the farthest that anybody goes in this step. stand (N,): who wants to
-    stand, and stays where it is rather than go somewhere that is no nearer to where it wants to stand. near: what
-    remembers, from step to step, who may come near whom.
+    firm (N,): who does not give way. reach_m: the farthest that anybody goes in this step. stand
+    (N,): who wants to stand, and stays where it is rather than go somewhere that is no nearer to
+    where it wants to stand. near: what remembers, from step to step, who may come near whom.
     """
     goal = _points(wanted)
     one, other = (near or NearPairs()).of(goal, firm)
@@ -109,12 +121,18 @@ def kept_apart(
 
 
 def _pushed(
-    at: Complex, one: Rows, other: Rows, shares: tuple[Floats, Floats], before: Complex, bend: Complex | None
+    at: Complex,
+    one: Rows,
+    other: Rows,
+    shares: tuple[Floats, Floats],
+    before: Complex,
+    bend: Complex | None,
 ) -> Complex:
-    """Where people end up who are at `at` (N,) and give way to each other by `shares` (P,) of what is lacking.
+    """Where people end up who are at `at` (N,) and give way to each other by `shares` (P,) of what
+    is lacking.
 
-    before (P,): from the first of each pair to the second at the beginning of the step. bend: see `_bend`; None where
-    nobody turns aside.
+    before (P,): from the first of each pair to the second at the beginning of the step. bend: see
+    `_bend`; None where nobody turns aside.
     """
     at = at.copy()
     for k in range(ROUNDS):
@@ -140,7 +158,8 @@ def _points(xy: Floats) -> Complex:
 
 
 def _bend(apart: Complex, step: Complex) -> Complex:
-    """(K,) by what a push is turned aside: to the side on which a step passes; not where the step leads away."""
+    """(K,) by what a push is turned aside: to the side on which a step passes; not where the step
+    leads away."""
     turned = apart.conj() * step
     side = np.where(turned.imag >= 0.0, 1.0, -1.0)
     return np.where(turned.real < 0.0, 1.0 + 1j * BEND * side, 1.0 + 0j)

@@ -1,6 +1,8 @@
-"""Foreign maps as SUMO nets that can be walked: OSM converted, car-only nets given walkways, signals mended.
+"""Foreign maps as SUMO nets that can be walked: OSM converted, car-only nets given walkways,
+signals mended.
 
-netconvert's exit code proves nothing, so every net is counted and started in SUMO before it counts as imported.
+netconvert's exit code proves nothing, so every net is counted and started in SUMO before it counts
+as imported.
 """
 
 from __future__ import annotations
@@ -20,12 +22,12 @@ from cosim.core.telling import Tell, untold
 from cosim.place.map_check import NetFacts
 from cosim.place.overlay import where_geos_failed
 from cosim.place.street_map import Feature
-from sumo_nets.maps.cornermend import mend_corners
-from sumo_nets.maps.drivingside import left_hand_country
-from sumo_nets.maps.featurefit import fitted
-from sumo_nets.maps.importrules import NEWEST_RULES, Rules
+from sumo_nets.maps.corner_repair import mend_corners
+from sumo_nets.maps.driving_side import left_hand_country
+from sumo_nets.maps.feature_fit import fitted
+from sumo_nets.maps.import_rules import NEWEST_RULES, Rules
 from sumo_nets.maps.levels import LEVEL_KEYS, edges_of
-from sumo_nets.maps.netsteps import (
+from sumo_nets.maps.net_steps import (
     ImportWork,
     add_walkways,
     crop_net,
@@ -33,9 +35,9 @@ from sumo_nets.maps.netsteps import (
     sumo_home,
     widen_sidewalks,
 )
-from sumo_nets.maps.osmcrop import Box
-from sumo_nets.maps.osmfeatures import osm_features
-from sumo_nets.maps.osmfile import MapFile, OsmFacts, osm_facts, unpacked
+from sumo_nets.maps.osm_crop import Box
+from sumo_nets.maps.osm_features import osm_features
+from sumo_nets.maps.osm_file import MapFile, OsmFacts, osm_facts, unpacked
 from sumo_nets.maps.sidewalks import (
     STREET_WIDTHS_M,
     WIDTH_LIMITS_M,
@@ -43,10 +45,14 @@ from sumo_nets.maps.sidewalks import (
     pavements,
     untagged_share,
 )
-from sumo_nets.net.netfacts import facts_of, net_root, read_facts
-from sumo_nets.net.netfile import read_net
+from sumo_nets.net.net_facts import facts_of, net_root, read_facts
+from sumo_nets.net.net_file import read_net
 
-TYPES = ("osmNetconvert.typ.xml", "osmNetconvertUrbanDe.typ.xml", "osmNetconvertPedestrians.typ.xml")
+TYPES = (
+    "osmNetconvert.typ.xml",
+    "osmNetconvertUrbanDe.typ.xml",
+    "osmNetconvertPedestrians.typ.xml",
+)
 OSM_OPTIONS = (
     "--osm.sidewalks",
     "--sidewalks.guess",
@@ -69,7 +75,8 @@ OSM_OPTIONS = (
 BIG = 10_000
 """With more streets and paths than this an import takes minutes."""
 OSM_LICENCE = (
-    "Map data (c) OpenStreetMap contributors, Open Database License (ODbL) 1.0: credit them on what is shown, "
+    "Map data (c) OpenStreetMap contributors, Open Database License (ODbL) 1.0: credit them "
+    "on what is shown, "
     "and offer the net, a derived database, under the ODbL. https://www.openstreetmap.org/copyright"
 )
 
@@ -95,19 +102,27 @@ class Options:
         if self.bbox is not None:
             west, south, east, north = self.bbox
             if not all(map(math.isfinite, self.bbox)) or west >= east or south >= north:
-                raise UsageError(f"bbox must be west,south,east,north with west < east, south < north: {self.bbox}")
+                raise UsageError(
+                    f"bbox must be west,south,east,north with west < east, south < north: "
+                    f"{self.bbox}"
+                )
         if self.sidewalk_width_m is not None:
             low_m, high_m = WIDTH_LIMITS_M
             if not low_m <= self.sidewalk_width_m <= high_m:
                 raise UsageError(
-                    f"--sidewalk-width must be {low_m:g} to {high_m:g} metres, not {self.sidewalk_width_m:g}"
+                    f"--sidewalk-width must be {low_m:g} to {high_m:g} metres, not "
+                    f"{self.sidewalk_width_m:g}"
                 )
             if self.as_is:
-                raise UsageError("--sidewalk-width changes a net and --as-is leaves it unchanged: give one of them")
+                raise UsageError(
+                    "--sidewalk-width changes a net and --as-is leaves it unchanged: give "
+                    "one of them"
+                )
 
     @property
     def widths_m(self) -> Mapping[str, float]:
-        """Widths of guessed sidewalks by street class; empty to leave them as netconvert chose them."""
+        """Widths of guessed sidewalks by street class; empty to leave them as netconvert chose
+        them."""
         one_m = self.sidewalk_width_m
         return self.rules.widths_m if one_m is None else dict.fromkeys(STREET_WIDTHS_M, one_m)
 
@@ -116,8 +131,8 @@ class Options:
 class Converted:
     """A net ready to be kept, and what the map shows beside its streets.
 
-    changes: what the importer did to it, a sentence each. guessed_share: of the length of the pavements, the part no
-    mapper has seen; None when it cannot be known.
+    changes: what the importer did to it, a sentence each. guessed_share: of the length of the
+    pavements, the part no mapper has seen; None when it cannot be known.
     """
 
     net: Path
@@ -131,7 +146,8 @@ class Converted:
 
 
 def convert(source: Path, folder: Path, options: Options, tell: Tell = untold) -> Converted:
-    """`source` as a net in the scratch `folder`. Raises MapError naming what was found and what to do."""
+    """`source` as a net in the scratch `folder`. Raises MapError naming what was found and what to
+    do."""
     tell(f"reading {source.name}")
     file = unpacked(source, folder, options.bbox)
     work = ImportWork(file, folder, tell, [f"unpacked ({file.packing})"] if file.packing else [])
@@ -143,7 +159,8 @@ def _from_osm(work: ImportWork, options: Options) -> Converted:
     file, changes = work.file, work.changes
     if options.as_is:
         raise UsageError(
-            f"{file.source}: --as-is is for SUMO nets; an OpenStreetMap file is always converted: leave --as-is out"
+            f"{file.source}: --as-is is for SUMO nets; an OpenStreetMap file is always "
+            f"converted: leave --as-is out"
         )
     found = osm_facts(file)
     extra = ["--lefthand"] if _left_hand(found, options, changes) else []
@@ -157,26 +174,37 @@ def _from_osm(work: ImportWork, options: Options) -> Converted:
     net = work.netconvert(stage, "full.net.xml", arguments)
     net = crop_net(work, net, options.bbox)
     changes.append(
-        f"converted {found.roads} roads and {found.ways_on_foot} paths; crossings are guessed wherever pavements "
-        "meet a road; railways and isolated streets left out, junctions and signals close together joined"
+        f"converted {found.roads} roads and {found.ways_on_foot} paths; crossings are guessed "
+        "wherever pavements meet a road; railways and isolated streets left out, junctions and "
+        "signals close together joined"
     )
     net = widen_sidewalks(work, net, options.widths_m, found.widths)
     share = untagged_share(net_root(net), found.tagged)
     if share:
-        changes.append(f"guessed {share:.0%} of the pavement's length: the file does not speak of it")
+        changes.append(
+            f"guessed {share:.0%} of the pavement's length: the file does not speak of it"
+        )
     licences = [OSM_LICENCE, found.licence] if found.licence else [OSM_LICENCE]
     return _finish(work, net, options.rules, share, licences)
 
 
 def _converting(streets: int, options: Options) -> str:
     """The stage of a conversion, with advice where it takes minutes."""
-    advice = " (--bbox west,south,east,north: a part is faster)" if streets > BIG and options.bbox is None else ""
+    advice = (
+        " (--bbox west,south,east,north: a part is faster)"
+        if streets > BIG and options.bbox is None
+        else ""
+    )
     return f"converting {streets} streets and paths{advice}"
 
 
 def _from_net(work: ImportWork, options: Options) -> Converted:
     file, changes = work.file, work.changes
-    facts = read_facts(file.path) if options.lefthand is None else _sided(read_facts(file.path), options, file)
+    facts = (
+        read_facts(file.path)
+        if options.lefthand is None
+        else _sided(read_facts(file.path), options, file)
+    )
     if not facts.edges:
         raise MapError(f"{file.source}: a net of 0 edges: export an area with streets in it")
     if facts.edges > BIG:
@@ -187,7 +215,9 @@ def _from_net(work: ImportWork, options: Options) -> Converted:
         return _unchanged(work, net, facts)
     share: float | None = None
     if options.sidewalk_width_m is not None and not _lacks_walkways(facts):
-        changes.append("--sidewalk-width has no effect: the net has sidewalks of its own, none is guessed")
+        changes.append(
+            "--sidewalk-width has no effect: the net has sidewalks of its own, none is guessed"
+        )
     if _lacks_walkways(facts):
         net = add_walkways(work, net, facts)
         net = widen_sidewalks(work, net, options.widths_m, {}, before)
@@ -203,23 +233,30 @@ def _lacks_walkways(facts: NetFacts) -> bool:
 
 
 def _unchanged(work: ImportWork, net: Path, facts: NetFacts) -> Converted:
-    """The net as it is, with what is not possible on it. Raises MapError when SUMO does not start on it."""
-    file, changes, final = work.file, work.changes, net.with_name("final.net.xml")
+    """The net as it is, with what is not possible on it. Raises MapError when SUMO does not start
+    on it."""
+    file = work.file
+    changes = work.changes
+    final = net.with_name("final.net.xml")
     shutil.copyfile(net, final)
     start_sumo(file, final)
     if _lacks_walkways(facts):
         km = facts.pavement_km + facts.shared_km
         changes.append(
-            f"left as it is (--as-is), with {km:.1f} km of sidewalks and {facts.areas} walking areas: no crowd, no "
-            "route and no scenario is possible on it; import it without --as-is to add sidewalks and crossings"
+            f"left as it is (--as-is), with {km:.1f} km of sidewalks and {facts.areas} walking "
+            "areas: no crowd, no route and no scenario is possible on it; import it without "
+            "--as-is to add sidewalks and crossings"
         )
     else:
         changes.append("left as it is (--as-is): signals and corners are not mended")
     return Converted(final, facts, (), file.format, file.packing, tuple(changes), None, ())
 
 
-def _finish(work: ImportWork, net: Path, rules: Rules, share: float | None, licences: list[str]) -> Converted:
-    """Mend what can be mended, then prove that the net holds walkways and that SUMO starts on it."""
+def _finish(
+    work: ImportWork, net: Path, rules: Rules, share: float | None, licences: list[str]
+) -> Converted:
+    """Mend what can be mended, then prove that the net holds walkways and that SUMO starts on
+    it."""
     file, changes, tell = work.file, work.changes, work.tell
     tell("reading the net")
     root = net_root(net)
@@ -235,22 +272,32 @@ def _finish(work: ImportWork, net: Path, rules: Rules, share: float | None, lice
         street_map = read_net(final)
     if not any(strip.kind == "sidewalk" for strip in street_map.strips.values()):
         raise MapError(
-            f"{file.source}: nothing walkable in it: {facts.edges} edges, none with a sidewalk or path; import an area "
-            "with streets in it"
+            f"{file.source}: nothing walkable in it: {facts.edges} edges, none with a sidewalk or "
+            "path; import an area with streets in it"
         )
     if not street_map.corners:
-        raise MapError(f"{file.source}: its sidewalks are not connected: it has no walking areas; import a larger area")
+        raise MapError(
+            f"{file.source}: its sidewalks are not connected: it has no walking areas; "
+            f"import a larger area"
+        )
     if facts.twisted_areas:
-        changes.append(f"{facts.twisted_areas} of {facts.areas} walking areas cross themselves: repaired when read")
+        changes.append(
+            f"{facts.twisted_areas} of {facts.areas} walking areas cross themselves: "
+            f"repaired when read"
+        )
     tell("starting SUMO on the net")
     start_sumo(file, final)
     features: tuple[Feature, ...] = ()
     if file.format == "osm":
         tell("placing buildings and things")
         location = root.find("location")
-        features, told = fitted(osm_features(file), {} if location is None else location.attrib, street_map)
+        features, told = fitted(
+            osm_features(file), {} if location is None else location.attrib, street_map
+        )
         changes += told
-    return Converted(final, facts, features, file.format, file.packing, tuple(changes), share, tuple(licences))
+    return Converted(
+        final, facts, features, file.format, file.packing, tuple(changes), share, tuple(licences)
+    )
 
 
 def _left_hand(found: OsmFacts, options: Options, changes: list[str]) -> bool:
@@ -260,9 +307,13 @@ def _left_hand(found: OsmFacts, options: Options, changes: list[str]) -> bool:
         changes.append(f"traffic on the {'left' if options.lefthand else 'right'}, as asked")
         return options.lefthand
     if country is None:
-        changes.append(f"traffic on the right: {lat:.2f} N {lon:.2f} E is in no left-hand country of the table")
+        changes.append(
+            f"traffic on the right: {lat:.2f} N {lon:.2f} E is in no left-hand country of the table"
+        )
         return False
-    changes.append(f"traffic on the left: {lat:.2f} N {lon:.2f} E is in {country} (if wrong: --righthand)")
+    changes.append(
+        f"traffic on the left: {lat:.2f} N {lon:.2f} E is in {country} (if wrong: --righthand)"
+    )
     return True
 
 
@@ -270,8 +321,8 @@ def _sided(facts: NetFacts, options: Options, file: MapFile) -> NetFacts:
     if options.lefthand != facts.left_hand:
         side = "left" if facts.left_hand else "right"
         raise MapError(
-            f"{file.source}: a SUMO net says itself on which side people drive: on the {side} in this one; leave "
-            "--lefthand and --righthand out"
+            f"{file.source}: a SUMO net says itself on which side people drive: on the {side} in "
+            "this one; leave --lefthand and --righthand out"
         )
     return facts
 
@@ -282,13 +333,16 @@ def _old(version: str) -> bool:
 
 @contextmanager
 def _told_of(file: MapFile) -> Iterator[None]:
-    """Errors told with the user's file in place of our scratch files, so that their commands can be repeated."""
+    """Errors told with the user's file in place of our scratch files, so that their commands can be
+    repeated."""
     try:
         yield
     except MapError as error:
         raise MapError(_retold(file, str(error))) from error
     except KeyError as error:
-        raise MapError(f"{file.source}: not a street net that can be read: attribute {error} is missing") from error
+        raise MapError(
+            f"{file.source}: not a street net that can be read: attribute {error} is missing"
+        ) from error
     except shapely.errors.GEOSException as error:
         raise MapError(
             f"{file.source}: its ground{where_geos_failed(error)} cannot be put together: {error}"
@@ -299,8 +353,15 @@ def _told_of(file: MapFile) -> Iterator[None]:
 
 def _retold(file: MapFile, words: str) -> str:
     words = re.sub(rf"^{re.escape(str(file.path.parent))}/\S+?: ", "", words)
-    words = words.rstrip(".").replace(str(file.path), str(file.source)).replace(f"{file.path.parent}/", "")
+    words = (
+        words.rstrip(".")
+        .replace(str(file.path), str(file.source))
+        .replace(f"{file.path.parent}/", "")
+    )
     words = words.replace("cut the area of interest out first", "import a part of it with --bbox")
     if "without any edge" in words or "No nodes loaded" in words:
-        words += "; no street of the file survived the conversion: import a larger area, with whole streets in it"
+        words += (
+            "; no street of the file survived the conversion: import a larger area, with whole "
+            "streets in it"
+        )
     return words if words.startswith(f"{file.source}: ") else f"{file.source}: {words}"

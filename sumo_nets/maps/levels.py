@@ -1,6 +1,7 @@
 """Streets above and below the ground: which ones they are, as far as tags and geometry show.
 
-OpenStreetMap's `layer` orders what lies over what and is often set on whole streets. Alone it is no evidence.
+OpenStreetMap's `layer` orders what lies over what and is often set on whole streets. Alone it is no
+evidence.
 """
 
 from __future__ import annotations
@@ -11,8 +12,8 @@ from typing import Final
 
 import shapely
 
-from sumo_nets.net.netfacts import footway
-from sumo_nets.net.netfile import GROUND, LANE_M
+from sumo_nets.net.net_facts import footway
+from sumo_nets.net.net_file import GROUND, LANE_M
 
 LEVEL_KEYS: Final = ("bridge", "tunnel", "layer", "covered", "location", "level")
 """Tags of OSM ways that can say that a way is not on the ground."""
@@ -28,7 +29,8 @@ def is_levelled(tags: Mapping[str, str]) -> bool:
 
 
 def edges_of(ways: Mapping[str, int]) -> Iterator[str]:
-    """Yield the ids that netconvert may give the edges of OSM ways. ways: their numbers of nodes by their ids."""
+    """Yield the ids that netconvert may give the edges of OSM ways. ways: their numbers of nodes by
+    their ids."""
     for way, nodes in ways.items():
         for name in (way, *(f"{way}#{part}" for part in range(nodes - 1))):
             yield name
@@ -36,14 +38,19 @@ def edges_of(ways: Mapping[str, int]) -> Iterator[str]:
 
 
 def settle_levels(root: ET.Element) -> list[str]:
-    """Decide, in place, which edges are not on the ground. Return what was changed, a sentence each.
+    """Decide, in place, which edges are not on the ground. Return what was changed, a sentence
+    each.
 
-    Bridges and tunnels stay as they are. An edge with a level or location off the ground gets a layer. An edge with a
-    layer keeps it if it is covered, or if it lies over or under a street of another layer; else it is on the ground.
+    Bridges and tunnels stay as they are. An edge with a level or location off the ground gets a
+    layer. An edge with a layer keeps it if it is covered, or if it lies over or under a street of
+    another layer; else it is on the ground.
     """
-    normal = [edge for edge in root.iter("edge") if not edge.get("function") and len(edge.findall("lane"))]
+    normal = [
+        edge for edge in root.iter("edge") if not edge.get("function") and len(edge.findall("lane"))
+    ]
     said = {edge.get("id", ""): _params(edge) for edge in normal}
-    moved, doubtful = 0, list[ET.Element]()
+    moved = 0
+    doubtful = list[ET.Element]()
     for edge in normal:
         tags = said[edge.get("id", "")]
         if any(tags.get(key, "no") not in GROUND for key in ("bridge", "tunnel")):
@@ -61,10 +68,14 @@ def settle_levels(root: ET.Element) -> list[str]:
     walked = sum(footway(edge) is not None for edge in settled)
     changes = []
     if moved:
-        changes.append(f"{moved} walkways are above or below the ground by their level or location: routes avoid them")
+        changes.append(
+            f"{moved} walkways are above or below the ground by their level or location: "
+            f"routes avoid them"
+        )
     if walked:
         changes.append(
-            f"{walked} walkways with a layer are on the ground: no bridge, no tunnel, no street over or under them"
+            f"{walked} walkways with a layer are on the ground: no bridge, no tunnel, no "
+            f"street over or under them"
         )
     return changes
 
@@ -92,24 +103,38 @@ def _elsewhere(tags: Mapping[str, str]) -> bool:
     return all(level > 0.0 for level in levels) or all(level < 0.0 for level in levels)
 
 
-def _stacked(doubtful: list[ET.Element], normal: list[ET.Element], said: Mapping[str, Mapping[str, str]]) -> set[str]:
-    """The ids of those edges that cross a street of another layer, or lie mostly over or under such streets."""
-    others = [edge for edge in normal if any(lane.get("allow") != "pedestrian" for lane in edge.findall("lane"))]
+def _stacked(
+    doubtful: list[ET.Element], normal: list[ET.Element], said: Mapping[str, Mapping[str, str]]
+) -> set[str]:
+    """The ids of those edges that cross a street of another layer, or lie mostly over or under such
+    streets."""
+    others = [
+        edge
+        for edge in normal
+        if any(lane.get("allow") != "pedestrian" for lane in edge.findall("lane"))
+    ]
     if not doubtful or not others:
         return set()
     lines = [_line(edge.findall("lane")[-1]) for edge in others]
-    tree, found = shapely.STRtree(lines), set[str]()
+    tree = shapely.STRtree(lines)
+    found = set[str]()
     roads = shapely.STRtree([_ground(edge) for edge in others])
     for edge in doubtful:
-        name, ends = edge.get("id", ""), {edge.get("from"), edge.get("to")}
-        layer, line, ground = said[name]["layer"], _line(edge.findall("lane")[0]), _ground(edge)
+        name = edge.get("id", "")
+        ends = {edge.get("from"), edge.get("to")}
+        layer = said[name]["layer"]
+        line = _line(edge.findall("lane")[0])
+        ground = _ground(edge)
         crossed = [others[k] for k in tree.query(line, predicate="crosses")]
-        touched = [(others[k], roads.geometries[k]) for k in roads.query(ground, predicate="intersects")]
+        touched = [
+            (others[k], roads.geometries[k]) for k in roads.query(ground, predicate="intersects")
+        ]
         # Streets that meet at a junction may overlap there.
         under = [
             area
             for other, area in touched
-            if _layer(said[other.get("id", "")]) != layer and not ends & {other.get("from"), other.get("to")}
+            if _layer(said[other.get("id", "")]) != layer
+            and not ends & {other.get("from"), other.get("to")}
         ]
         hidden_m2 = shapely.area(shapely.intersection(shapely.union_all(under), ground))
         if hidden_m2 > _MOSTLY * shapely.area(ground) or any(
@@ -135,4 +160,6 @@ def _line(lane: ET.Element) -> shapely.LineString:
 def _ground(edge: ET.Element) -> shapely.Geometry:
     """The ground that an edge covers."""
     lanes = [(_line(lane), float(lane.get("width", LANE_M))) for lane in edge.findall("lane")]
-    return shapely.union_all([shapely.buffer(line, width_m / 2.0, cap_style="flat") for line, width_m in lanes])
+    return shapely.union_all(
+        [shapely.buffer(line, width_m / 2.0, cap_style="flat") for line, width_m in lanes]
+    )

@@ -1,7 +1,8 @@
-"""What a user may call a place: a map by its name, a folder of `city make` or `map import`, a street net.
+"""What a user may call a place: a map by its name, a folder of `city make` or `map import`, a
+street net.
 
-Whatever it was, it becomes a place that a scenario can name and that can be found again: a city by its seed, a map by
-its name in the store; both with the hash of their net.
+Whatever it was, it becomes a place that a scenario can name and that can be found again: a city by
+its seed, a map by its name in the store; both with the hash of their net.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ import msgspec
 from cosim.core.errors import MapError, UsageError, unknown, unwritable
 from cosim.spec.scenario import City, CityMap, Place
 from sumo_nets.city.store import ABOUT_NAME, GENERATOR, NET_NAME, city_net
-from sumo_nets.maps.importrules import NEWEST_RULES
-from sumo_nets.maps.mapstore import (
+from sumo_nets.maps.import_rules import NEWEST_RULES
+from sumo_nets.maps.map_store import (
     ABOUT,
     About,
     about_map,
@@ -27,7 +28,7 @@ from sumo_nets.maps.mapstore import (
     map_hash,
     map_name,
     maps_folder,
-)  # fmt: skip
+)
 from sumo_nets.maps.scratch import move_in, scratch_in
 from sumo_nets.net.net_hash import net_content_hash
 
@@ -42,7 +43,8 @@ class _MadeCity(msgspec.Struct):
 
 
 def place_called(words: str, roughness: float = 0.0) -> Place:
-    """The place that a user calls so; nets that are not known yet are imported. roughness: of its ground, 0 to 1.
+    """The place that a user calls so; nets that are not known yet are imported. roughness: of its
+    ground, 0 to 1.
 
     Raises UsageError with what there is, MapError when what is there cannot be used.
     """
@@ -65,7 +67,9 @@ def _file(path: Path) -> Place:
         return _folder(path.parent)
     if path.name.endswith((".net.xml", ".net.xml.gz")) or path.name == "net.xml":
         return CityMap(map=imported_place(path))
-    raise UsageError(f"{path}: cannot be run on as it is: import it first with `cosim map import {path}`")
+    raise UsageError(
+        f"{path}: cannot be run on as it is: import it first with `cosim map import {path}`"
+    )
 
 
 def _folder(folder: Path) -> Place:
@@ -74,20 +78,22 @@ def _folder(folder: Path) -> Place:
     if (folder / ABOUT).is_file():
         return CityMap(map=_adopted(folder))
     raise UsageError(
-        f"{folder}: a folder without {ABOUT_NAME} or {ABOUT}, so neither one of `cosim city make` nor an imported map; "
-        f"give {HINT}, or the name of a map (`cosim map list`)"
+        f"{folder}: a folder without {ABOUT_NAME} or {ABOUT}, so neither one of `cosim city make` "
+        f"nor an imported map; give {HINT}, or the name of a map (`cosim map list`)"
     )
 
 
 def _city(folder: Path) -> Place:
-    """The city in a folder, as its own net says; a net that another version made, or that was changed, is a map."""
+    """The city in a folder, as its own net says; a net that another version made, or that was
+    changed, is a map."""
     net, about = folder / NET_NAME, folder / ABOUT_NAME
     try:
         made = msgspec.json.decode(about.read_bytes(), type=_MadeCity)
     except (OSError, ValueError, msgspec.DecodeError) as error:
         raise MapError(f"{about}: cannot be read: {error}: make the city again") from error
     if made.generator == GENERATOR and net_content_hash(net) == made.city.net_hash:
-        # Built once more where the cache has none: the folder's word alone must not come into the cache.
+        # Built once more where the cache has none: the folder's word alone must not come into the
+        # cache.
         with suppress(MapError):
             city_net(made.city)
             return made.city
@@ -97,25 +103,30 @@ def _city(folder: Path) -> Place:
 def imported_place(net: Path) -> str:
     """The name of a map's file in the store of maps, where it is imported unless it is there."""
     source_hash, wanted = file_hash(net), map_name(net)
-    name = _free_name(wanted, source_hash, lambda about: about.source_hash == source_hash and _as_it_is(about))
+    name = _free_name(
+        wanted, source_hash, lambda about: about.source_hash == source_hash and _as_it_is(about)
+    )
     if not (maps_folder() / name).exists():
         import_map(net, name)
     return name
 
 
 def _adopted(folder: Path) -> str:
-    """The name of an imported map that lies in a folder of its own, in the store, where it is copied to."""
+    """The name of an imported map that lies in a folder of its own, in the store, where it is
+    copied to."""
     try:
         about = msgspec.json.decode((folder / ABOUT).read_bytes(), type=About)
     except (OSError, ValueError, msgspec.DecodeError) as error:
-        raise MapError(f"{folder / ABOUT}: cannot be read: {error}: import the map again") from error
+        raise MapError(
+            f"{folder / ABOUT}: cannot be read: {error}: import the map again"
+        ) from error
     if folder.resolve().parent == maps_folder().resolve():
         return folder.resolve().name
     found = map_hash(folder / "net.xml")
     if found != about.net_hash:
         raise MapError(
-            f"{folder}: its hash is {found}, but {about.net_hash} when it was imported: it was changed since; import "
-            f"the changed net with `cosim map import {folder / 'net.xml'}`"
+            f"{folder}: its hash is {found}, but {about.net_hash} when it was imported: it was "
+            f"changed since; import the changed net with `cosim map import {folder / 'net.xml'}`"
         )
     name = _free_name(map_name(Path(about.name)), found, lambda known: known.net_hash == found)
     if not (maps_folder() / name).exists():
@@ -124,7 +135,9 @@ def _adopted(folder: Path) -> str:
                 ready = scratch / "ready"
                 shutil.copytree(folder, ready)
                 renamed = msgspec.structs.replace(about, name=name)
-                (ready / ABOUT).write_bytes(msgspec.json.format(msgspec.json.encode(renamed), indent=2))
+                (ready / ABOUT).write_bytes(
+                    msgspec.json.format(msgspec.json.encode(renamed), indent=2)
+                )
                 move_in(ready, maps_folder() / name, in_place=False)
         except OSError as error:
             raise unwritable(maps_folder(), error, "set COSIM_CACHE to another folder") from error
@@ -134,16 +147,27 @@ def _adopted(folder: Path) -> str:
 def _free_name(wanted: str, content: str, is_same: Callable[[About], bool]) -> str:
     """The wanted name, or one with a part of the content's hash where another map has it."""
     names = known_maps()
-    for name in (wanted, f"{wanted[:57]}-{content[:6]}", f"{wanted[:54]}-{content[:6]}-v{NEWEST_RULES.version}"):
+    for name in (
+        wanted,
+        f"{wanted[:57]}-{content[:6]}",
+        f"{wanted[:54]}-{content[:6]}-v{NEWEST_RULES.version}",
+    ):
         if name not in names:
             return name
         with suppress(MapError):
             if names[name].origin == "imported" and is_same(about_map(name)):
                 return name
-    raise UsageError(f"two maps in the store are called '{wanted}': import it under another name with --name")
+    raise UsageError(
+        f"two maps in the store are called '{wanted}': import it under another name with --name"
+    )
 
 
 def _as_it_is(about: About) -> bool:
     """Whether a map was imported by this version with no options."""
-    plain = about.bbox is None and about.lefthand is None and not about.as_is and about.sidewalk_width_m is None
+    plain = (
+        about.bbox is None
+        and about.lefthand is None
+        and not about.as_is
+        and about.sidewalk_width_m is None
+    )
     return plain and about.versions.get("importer") == str(NEWEST_RULES.version)

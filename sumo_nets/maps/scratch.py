@@ -21,7 +21,8 @@ YOUNG_S = 3600.0
 
 @contextmanager
 def scratch_in(folder: Path) -> Iterator[Path]:
-    """A scratch folder inside `folder`, gone at the end; those of processes that died go first. OSError passes."""
+    """A scratch folder inside `folder`, gone at the end; those of processes that died go first.
+    OSError passes."""
     folder.mkdir(parents=True, exist_ok=True)
     sweep(folder)
     with tempfile.TemporaryDirectory(prefix=PREFIX, dir=folder) as name:
@@ -48,14 +49,16 @@ def move_in(ready: Path, target: Path, *, in_place: bool = True) -> None:
 
 @contextmanager
 def moving(folder: Path) -> Iterator[None]:
-    """Only one process at a time moves finished folders in `folder`; others wait the moment that it takes."""
+    """Only one process at a time moves finished folders in `folder`; others wait the moment that it
+    takes."""
     with (folder.parent / f".{folder.name}.lock").open("wb") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield
 
 
 def sweep(folder: Path) -> None:
-    """Remove the scratch folders that no process holds any more; what was being replaced when one died is put back."""
+    """Remove the scratch folders that no process holds any more; what was being replaced when one
+    died is put back."""
     for scratch in folder.glob(f"{PREFIX}*"):
         with suppress(OSError):
             if not (scratch / HELD).exists() and time.time() - scratch.stat().st_mtime < YOUNG_S:

@@ -8,8 +8,8 @@ from collections import defaultdict
 from collections.abc import Collection, Mapping
 from typing import Final
 
-from sumo_nets.maps.osmfeatures import metres
-from sumo_nets.net.netfacts import footway
+from sumo_nets.maps.osm_features import metres
+from sumo_nets.net.net_facts import footway
 
 STREET_WIDTHS_M: Final[Mapping[str, float]] = {
     "residential": 2.5,
@@ -19,12 +19,14 @@ STREET_WIDTHS_M: Final[Mapping[str, float]] = {
 }
 """Width of a sidewalk by the class of its street, where the map does not give one.
 
-The German RASt 06 (6.1.6.1) has 2.5 m as the standard: 1.8 m for two persons, 0.5 m to the road, 0.2 m to the houses.
-Their EFA 2002 asks for 3.3 m where homes and shops mix, and NACTO's Urban Street Design Guide for 2.4 to 3.7 m in
-business districts. Tertiary and primary streets are interpolated.
+The German RASt 06 (6.1.6.1) has 2.5 m as the standard: 1.8 m for two persons, 0.5 m to the road,
+0.2 m to the houses. Their EFA 2002 asks for 3.3 m where homes and shops mix, and NACTO's Urban
+Street Design Guide for 2.4 to 3.7 m in business districts. Tertiary and primary streets are
+interpolated.
 """
 WIDTH_LIMITS_M: Final = 1.0, 10.0
-"""Narrowest and widest sidewalk that can be asked for; on less than 1 m a robot and a person cannot pass."""
+"""Narrowest and widest sidewalk that can be asked for; on less than 1 m a robot and a person cannot
+pass."""
 _TAGGED_M: Final = 0.5, 20.0
 """Tagged widths outside of this are ignored."""
 _ON_PATHS: Final = frozenset(("pedestrian", "bicycle"))
@@ -39,8 +41,13 @@ def pavement(edge: ET.Element) -> ET.Element | None:
 
 
 def pavements(root: ET.Element) -> dict[str, ET.Element]:
-    """Return the lanes for walking of a net by the ids of their edges, without those that cars share."""
-    return {edge.get("id", ""): lane for edge in root.iter("edge") if (lane := pavement(edge)) is not None}
+    """Return the lanes for walking of a net by the ids of their edges, without those that cars
+    share."""
+    return {
+        edge.get("id", ""): lane
+        for edge in root.iter("edge")
+        if (lane := pavement(edge)) is not None
+    }
 
 
 def new_share(root: ET.Element, before: Collection[str]) -> float:
@@ -70,7 +77,8 @@ def set_widths(
     tagged: Mapping[str, Mapping[str, str]],
     before: Collection[str] = (),
 ) -> list[str]:
-    """Set the widths of guessed sidewalks in place. Return what was changed, a sentence, or nothing.
+    """Set the widths of guessed sidewalks in place. Return what was changed, a sentence, or
+    nothing.
 
     Walkways beside no lane for vehicles, or one for bicycles alone, keep their widths.
 
@@ -81,12 +89,18 @@ def set_widths(
     if not widths_m:
         return []
     left_hand = root.get("lefthand") in ("true", "1")
-    guessed_m, tagged_m = defaultdict[str, float](float), 0.0
+    guessed_m = defaultdict[str, float](float)
+    tagged_m = 0.0
     for edge in root.iter("edge"):
         lane = pavement(edge)
-        if lane is None or edge.get("id") in before or all(other is lane for other in _driven(edge)):
+        if (
+            lane is None
+            or edge.get("id") in before
+            or all(other is lane for other in _driven(edge))
+        ):
             continue
-        width_m, length_m = _tagged_m(edge, tagged, left_hand), float(lane.get("length", "0"))
+        width_m = _tagged_m(edge, tagged, left_hand)
+        length_m = float(lane.get("length", "0"))
         if width_m is None:
             kind = street_class(edge)
             width_m = widths_m[kind]
@@ -105,22 +119,33 @@ def set_widths(
 
 
 def street_class(edge: ET.Element) -> str:
-    """Return the class of a street, a key of STREET_WIDTHS_M: as its type says, else by its number of lanes."""
+    """Return the class of a street, a key of STREET_WIDTHS_M: as its type says, else by its number
+    of lanes."""
     for found in _CLASS.finditer(edge.get("type", "")):
         if (known := _CLASS_OF.get(found[1], found[1])) in STREET_WIDTHS_M:
             return known
-    return "secondary" if "highway." not in edge.get("type", "") and len(_driven(edge)) > 1 else "residential"
+    return (
+        "secondary"
+        if "highway." not in edge.get("type", "") and len(_driven(edge)) > 1
+        else "residential"
+    )
 
 
 def _driven(edge: ET.Element) -> list[ET.Element]:
     """The lanes of an edge that are not for people and bicycles alone."""
-    return [lane for lane in edge.findall("lane") if set(lane.get("allow", "all").split()) - _ON_PATHS]
+    return [
+        lane for lane in edge.findall("lane") if set(lane.get("allow", "all").split()) - _ON_PATHS
+    ]
 
 
-def _tagged_m(edge: ET.Element, tagged: Mapping[str, Mapping[str, str]], left_hand: bool) -> float | None:
-    """The width that the tags of an edge's ways give its sidewalk, the smallest of several; None without one."""
+def _tagged_m(
+    edge: ET.Element, tagged: Mapping[str, Mapping[str, str]], left_hand: bool
+) -> float | None:
+    """The width that the tags of an edge's ways give its sidewalk, the smallest of several; None
+    without one."""
     name = edge.get("id", "")
-    own, side = name.lstrip("-").split("#")[0], "left" if name.startswith("-") != left_hand else "right"
+    own = name.lstrip("-").split("#")[0]
+    side = "left" if name.startswith("-") != left_hand else "right"
     found = []
     for way in _ways(edge):
         if way in tagged:

@@ -1,6 +1,8 @@
-"""Real places that everybody has: crops of nets that the eclipse-sumo wheel installs, by the names they have here.
+"""Real places that everybody has: crops of nets that the eclipse-sumo wheel installs, by the names
+they have here.
 
-Each is imported when it is first used, as any map is (`mapstore.py`); its net's hash stands in the scenarios on it.
+Each is imported when it is first used, as any map is (`mapstore.py`); its net's hash stands in the
+scenarios on it.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
-from sumo_nets.maps.importrules import SUITE_RULES, Rules
+from sumo_nets.maps.import_rules import SUITE_RULES, Rules
 
 _Box = tuple[float, float, float, float]
 
@@ -37,7 +39,9 @@ class WheelPlace(NamedTuple):
         return Path(sumo.__file__).parent / "tools" / "game" / self.net
 
 
-_BERLIN, _BRAUNSCHWEIG, _WILDAU = "DRT/osm.net.xml", "bs3d/bs.net.xml", "A10KW/osm.net.xml"
+_BERLIN = "DRT/osm.net.xml"
+_BRAUNSCHWEIG = "bs3d/bs.net.xml"
+_WILDAU = "A10KW/osm.net.xml"
 
 WHEEL_PLACES: Final[Mapping[str, WheelPlace]] = MappingProxyType(
     {
@@ -53,4 +57,4 @@ WHEEL_PLACES: Final[Mapping[str, WheelPlace]] = MappingProxyType(
         "braunschweig-2": WheelPlace(_BRAUNSCHWEIG, (10.5256, 52.2699, 10.5350, 52.2762), osm=True),
         "wildau-1": WheelPlace(_WILDAU, (13.5939, 52.3129, 13.6059, 52.3202), osm=True),
     }
-)  # fmt: skip
+)

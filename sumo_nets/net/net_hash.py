@@ -6,18 +6,20 @@ import hashlib
 import re
 from pathlib import Path
 
-from sumo_nets.maps.rawfile import net_bytes
+from sumo_nets.net.raw_file import net_bytes
 
 _SCHEMA = b"xsi:noNamespaceSchemaLocation"
 
 
 def without_comments(net: bytes) -> bytes:
-    """A net's XML without comments: netconvert's hold the time, its version and the folders of the machine."""
+    """A net's XML without comments: netconvert's hold the time, its version and the folders of the
+    machine."""
     return re.sub(rb"<!--.*?-->\s*", b"", net, flags=re.DOTALL) if b"<!--" in net else net
 
 
 def net_content_hash(path: Path) -> str:
-    """SHA-256 (16 hex digits) of what a net says: comments, schema location and line ends do not count."""
+    """SHA-256 (16 hex digits) of what a net says: comments, schema location and line ends do not
+    count."""
     return hash_of(net_bytes(path))
 
 

@@ -31,7 +31,8 @@ _STAGES: Final = (
     (b"Building inner edges", 0.66),
     (b"Writing network", 0.75),
 )
-"""Words of netconvert at the begin of its stages, and the share of its time that is over then, measured on a city."""
+"""Words of netconvert at the begin of its stages, and the share of its time that is over then,
+measured on a city."""
 
 
 def netconvert(
@@ -40,19 +41,31 @@ def netconvert(
     timeout_s: float = 120.0,
     progress: Callable[[float], None] | None = None,
 ) -> Path:
-    """Run netconvert to make `output`. Raises MapError with its complaints, MachineError when it cannot be run.
+    """Run netconvert to make `output`. Raises MapError with its complaints, MachineError when it
+    cannot be run.
 
     progress: called with the share that is done, 0 to 1, whenever netconvert begins a stage.
     """
     import sumo
 
-    command = [str(Path(sumo.__file__).parent / "bin" / "netconvert"), *arguments, "-o", str(output)]
+    command = [
+        str(Path(sumo.__file__).parent / "bin" / "netconvert"),
+        *arguments,
+        "-o",
+        str(output),
+    ]
     try:
-        returncode, said = _run(command if progress is None else [*command, "--verbose"], timeout_s, progress)
+        returncode, said = _run(
+            command if progress is None else [*command, "--verbose"], timeout_s, progress
+        )
     except subprocess.TimeoutExpired as error:
-        raise MapError(f"netconvert did not end within {timeout_s:g} s: cut the area of interest out first") from error
+        raise MapError(
+            f"netconvert did not end within {timeout_s:g} s: cut the area of interest out first"
+        ) from error
     except OSError as error:
-        raise MachineError(f"netconvert cannot be run: {error.strerror}: is eclipse-sumo installed?") from error
+        raise MachineError(
+            f"netconvert cannot be run: {error.strerror}: is eclipse-sumo installed?"
+        ) from error
     if returncode != 0 or not output.exists():
         raise MapError(f"netconvert failed with exit code {returncode}{complaints(said)}")
     # An exit code of 0 is no proof: an empty net ends in "Success" too.
@@ -61,11 +74,15 @@ def netconvert(
     return output
 
 
-def _run(command: Sequence[str], timeout_s: float, progress: Callable[[float], None] | None) -> tuple[int, str]:
+def _run(
+    command: Sequence[str], timeout_s: float, progress: Callable[[float], None] | None
+) -> tuple[int, str]:
     """Run a command to its end. Returns its exit code and what it wrote to standard error."""
     began = time.monotonic()
     with tempfile.TemporaryFile() as errors, selectors.DefaultSelector() as ready:
-        with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors) as process:
+        with subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors
+        ) as process:
             assert process.stdout is not None
             ready.register(process.stdout, selectors.EVENT_READ)
             said = b""
@@ -88,7 +105,8 @@ def _run(command: Sequence[str], timeout_s: float, progress: Callable[[float], N
 
 
 def complaints(said: str) -> str:
-    """What a program of SUMO says of its failure, on one line: its errors, its last words where it names none."""
+    """What a program of SUMO says of its failure, on one line: its errors, its last words where it
+    names none."""
     lines = [" ".join(line.split()) for line in said.splitlines() if line.strip()]
     errors = [line for line in lines if not line.startswith(("Warning", "Quitting"))]
     words = "; ".join(dict.fromkeys(line.removeprefix("Error: ") for line in errors or lines[-1:]))

@@ -1,15 +1,18 @@
-"""Shapes of a street net as arrays and polygons, many at a time."""
+"""Outlines of lanes and junctions as polygons, without gaps between them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NoReturn
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon, Polygon
 
 from cosim.core.geometry import Floats
+from cosim.place import overlay
 
 _SHORTEST_M = 0.1
 FARTHEST_M = 1e8
@@ -17,7 +20,8 @@ FARTHEST_M = 1e8
 
 
 def polylines(shapes: Sequence[str], names: Sequence[str]) -> list[Floats]:
-    """(N, 2) metres of every shape, N >= 2 and never of zero length; elevations are dropped. names: for errors."""
+    """(N, 2) metres of every shape, N >= 2 and never of zero length; elevations are dropped. names:
+    for errors."""
     flat, counts = coordinates(shapes, names)
     lines = np.split(flat, np.cumsum(counts)[:-1])
     for i, line in enumerate(lines):
@@ -53,7 +57,9 @@ def _refuse(points: Sequence[Sequence[str]], names: Sequence[str]) -> NoReturn:
     for name, row in zip(names, points, strict=True):
         wrong = [point for point in row if not _is_point(point)]
         if wrong:
-            raise ValueError(f"'{name}': a shape with points that are not x,y in metres: '{wrong[0][:40]}'")
+            raise ValueError(
+                f"'{name}': a shape with points that are not x,y in metres: '{wrong[0][:40]}'"
+            )
         if not row:
             raise ValueError(f"'{name}': a shape without points")
     raise ValueError("a shape that cannot be read")
@@ -73,8 +79,12 @@ def bands(lines: Sequence[Floats], widths: Floats) -> list[Polygon]:
         return []
     owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
     centres = shapely.linestrings(np.concatenate(lines), indices=owner)
-    around = shapely.buffer(centres, np.maximum(widths, _SHORTEST_M) / 2.0, cap_style="flat", join_style="mitre")
-    polygons = [band if isinstance(band, Polygon) else areas_of(band, largest=True) for band in around]
+    around = shapely.buffer(
+        centres, np.maximum(widths, _SHORTEST_M) / 2.0, cap_style="flat", join_style="mitre"
+    )
+    polygons = [
+        band if isinstance(band, Polygon) else areas_of(band, largest=True) for band in around
+    ]
     if any(polygon is None or polygon.is_empty for polygon in polygons):
         raise ValueError("a shape whose band has no area")
     return polygons
@@ -82,9 +92,88 @@ def bands(lines: Sequence[Floats], widths: Floats) -> list[Polygon]:
 
 def areas_of(shape: shapely.Geometry, *, largest: bool) -> Any:
     """The areas of a repaired shape: the largest as a Polygon, or all of them; None without any."""
-    parts = [p for p in shapely.get_parts(shapely.get_parts(shape)) if isinstance(p, Polygon) and p.area > 0.0]
+    parts = [
+        p
+        for p in shapely.get_parts(shapely.get_parts(shape))
+        if isinstance(p, Polygon) and p.area > 0.0
+    ]
     if not parts:
         return None
     if largest or len(parts) == 1:
         return max(parts, key=lambda part: part.area)
     return MultiPolygon(parts)
+
+
+_REACH_M = 2.5
+"""How far beyond its end a strip may look for its corner."""
+
+WELD_M = 0.005
+"""Wedges are grown by this much, so that they and the strip become one polygon."""
+
+Polygons = NDArray[np.object_]
+
+
+def close_seams(
+    polygons: Sequence[Polygon],
+    lines: Sequence[Floats],
+    widths_m: Floats,
+    corners: Sequence[tuple[shapely.Geometry | None, shapely.Geometry | None]],
+) -> list[Polygon]:
+    """The polygons of N strips, extended at both ends to the edges of their corners (None: no
+    corner there)."""
+    if not len(polygons):
+        return []
+    grown = np.array(polygons, dtype=object)
+    met = [np.array([pair[side] for pair in corners], dtype=object) for side in (0, 1)]
+    at = [np.array([line[i, :2] for line in lines]) for i in (0, 1, -1, -2)]
+
+    def both_ends(rows: slice) -> Polygons:
+        one = joined(grown[rows], at[0][rows], at[1][rows], widths_m[rows], met[0][rows])
+        return joined(one, at[2][rows], at[3][rows], widths_m[rows], met[1][rows])
+
+    # Strips do not depend on each other, and shapely works outside of Python's lock.
+    half = len(grown) // 2
+    with ThreadPoolExecutor(2) as threads:
+        return [
+            p for part in threads.map(both_ends, (slice(0, half), slice(half, None))) for p in part
+        ]
+
+
+def joined(
+    polygons: Polygons, ends: Floats, inner: Floats, widths_m: Floats, corners: Polygons
+) -> Polygons:
+    """Strips extended at one end to the edge of their corner.
+
+    polygons: (N,) of the strips. ends, inner: (N, 2) metres, the last point of each middle line at
+    that end and the one before. widths_m: (N,). corners: (N,) polygons, None where a strip ends
+    nowhere. Returns (N,) polygons.
+    """
+    forth = ends - inner
+    forth /= np.maximum(np.hypot(forth[:, 0], forth[:, 1]), 1e-9)[:, None]
+    aside = np.column_stack([-forth[:, 1], forth[:, 0]]) * (widths_m / 2)[:, None]
+    left = ends + aside
+    right = ends - aside
+    beyond = shapely.polygons(
+        np.stack([right, left, left + _REACH_M * forth, right + _REACH_M * forth], axis=1)
+    )
+    edges = shapely.linestrings(np.stack([right, left], axis=1))
+    met = overlay.intersection(beyond, corners)
+    wanted = ~(shapely.is_missing(met) | shapely.is_empty(met))
+    hulls = overlay.intersection(shapely.convex_hull(overlay.union(edges, met)), beyond)
+    # Slivers without width make GEOS divide by zero; it copes.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        wedges = shapely.buffer(overlay.difference(hulls, corners), WELD_M, join_style="mitre")
+    out: Polygons = polygons.copy()
+    grown = overlay.union(polygons, wedges)
+    out[wanted] = [
+        _holding(shape, strip) for shape, strip in zip(grown[wanted], polygons[wanted], strict=True)
+    ]
+    return out
+
+
+def _holding(shape: Polygon | MultiPolygon, strip: Polygon) -> Polygon:
+    """The part of a shape that holds a strip: slivers of a wedge on the far side of a corner are
+    nothing."""
+    if isinstance(shape, Polygon):
+        return shape
+    return max(shape.geoms, key=lambda part: float(overlay.intersection(part, strip).area))

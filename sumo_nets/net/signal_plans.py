@@ -1,7 +1,8 @@
-"""Signal plans: what the crossings' signals of a net show at any time, where fixed programs decide it alone.
+"""Signal plans: what the crossings' signals of a net show at any time, where fixed programs decide
+it alone.
 
-A plan is made only of a program that SUMO runs by the clock, whose elements are all known here and whose times are
-whole steps, which SUMO rounds to; everything else is left to SUMO.
+A plan is made only of a program that SUMO runs by the clock, whose elements are all known here and
+whose times are whole steps, which SUMO rounds to; everything else is left to SUMO.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ _OFF: Final = "off"
 
 @dataclass(slots=True)
 class SignalPrograms:
-    """What a net says of its traffic lights, element by element. others: whether it also says when programs change."""
+    """What a net says of its traffic lights, element by element. others: whether it also says when
+    programs change."""
 
     logics: list[Mapping[str, str]] = field(default_factory=list)
     phases: list[list[Mapping[str, str]]] = field(default_factory=list)
@@ -44,18 +46,25 @@ class SignalPrograms:
         elif tag.startswith("WAUT"):
             self.others = True
 
-    def plans(self, links: Sequence[Mapping[str, str]], crossings: Iterable[str]) -> dict[str, SignalPlan]:
+    def plans(
+        self, links: Sequence[Mapping[str, str]], crossings: Iterable[str]
+    ) -> dict[str, SignalPlan]:
         """The plans of those crossings that have one. links: the connections to them."""
         names = [logic.get("id", "") for logic in self.logics]
         often = Counter(names)
         fixed = {} if self.others else {name: k for k, name in enumerate(names) if often[name] == 1}
-        wanted, first = frozenset(crossings), dict[str, tuple[str, int]]()
+        wanted = frozenset(crossings)
+        first = dict[str, tuple[str, int]]()
         for link in links:
             if (to := link.get("to", "")) in wanted and "tl" in link:
                 index = link.get("linkIndex", "")
                 controlled = link["tl"], int(index) if index.isdecimal() else -1
                 first[to] = min(first.get(to, controlled), controlled)
-        plans = {to: self._plan(fixed[light], index) for to, (light, index) in first.items() if light in fixed}
+        plans = {
+            to: self._plan(fixed[light], index)
+            for to, (light, index) in first.items()
+            if light in fixed
+        }
         return {to: plan for to, plan in plans.items() if plan is not None}
 
     def _plan(self, k: int, index: int) -> SignalPlan | None:
@@ -63,10 +72,16 @@ class SignalPrograms:
         offset_ms = _ms(logic.get("offset", "0"))
         durations_ms = [ms for phase in phases if (ms := _ms(phase.get("duration", "")))]
         plain = self.plain[k] and logic.get("type") == "static" and logic.get("programID") != _OFF
-        plain = plain and all(phase.keys() <= _PHASE and 0 <= index < len(phase.get("state", "")) for phase in phases)
+        plain = plain and all(
+            phase.keys() <= _PHASE and 0 <= index < len(phase.get("state", "")) for phase in phases
+        )
         if not plain or not phases or offset_ms is None or len(durations_ms) < len(phases):
             return None
-        return SignalPlan(offset_ms, tuple(durations_ms), tuple(phase["state"][index] in _WALK for phase in phases))
+        return SignalPlan(
+            offset_ms,
+            tuple(durations_ms),
+            tuple(phase["state"][index] in _WALK for phase in phases),
+        )
 
 
 def _ms(seconds: str) -> int | None:

@@ -1,7 +1,9 @@
-"""What was read from a net, kept: the second reading of a net takes a fifth of the time of the first.
+"""What was read from a net, kept: the second reading of a net takes a fifth of the time of the
+first.
 
-A snapshot lies in the cache folder under a name that says what it depends on: the net's bytes, the source of the reader
-and the libraries that made its polygons. It holds plain data only, sealed by a hash; a damaged one is read anew.
+A snapshot lies in the cache folder under a name that says what it depends on: the net's bytes, the
+source of the reader and the libraries that made its polygons. It holds plain data only, sealed by a
+hash; a damaged one is read anew.
 """
 
 from __future__ import annotations
@@ -37,8 +39,8 @@ _Maker = Callable[[Any, _Pools], Any]
 
 
 class _Snapshot(msgspec.Struct, array_like=True):
-    """body: the map as msgpack, with numbers in place of arrays and geometries. arrays: their bytes, one after the
-    other, as dtype, shape and offset tell; geometries: WKB."""
+    """body: the map as msgpack, with numbers in place of arrays and geometries. arrays: their
+    bytes, one after the other, as dtype, shape and offset tell; geometries: WKB."""
 
     body: bytes
     arrays: bytes
@@ -70,7 +72,9 @@ def street_map_of(path: Path) -> StreetMap:
 
 
 def _read(path: Path) -> StreetMap:
-    from sumo_nets.net.netfile import read_net  # with all that reading takes: most nets were read before
+    from sumo_nets.net.net_file import (
+        read_net,
+    )  # with all that reading takes: most nets were read before
 
     return read_net(path)
 
@@ -105,7 +109,10 @@ def thawed(data: bytes) -> StreetMap:
         raise ValueError("a damaged snapshot")
     with _without_gc():
         held = msgspec.msgpack.decode(memoryview(data)[_SEAL_BYTES:], type=_Snapshot)
-        arrays = [np.ndarray(shape, dtype, buffer=held.arrays, offset=at) for dtype, shape, at in held.forms]
+        arrays = [
+            np.ndarray(shape, dtype, buffer=held.arrays, offset=at)
+            for dtype, shape, at in held.forms
+        ]
         geometries = shapely.from_wkb(np.array(held.geometries, dtype=object)).tolist()
         made: StreetMap = _maker(StreetMap)(msgspec.msgpack.decode(held.body), (arrays, geometries))
         return made
@@ -136,11 +143,16 @@ def _maker(kind: Any) -> _Maker:
 
 
 def _made_of(kind: Any) -> _Maker:
-    """The maker of a dataclass or a named tuple: the one is kept as a mapping, the other as a list."""
+    """The maker of a dataclass or a named tuple: the one is kept as a mapping, the other as a
+    list."""
     hints = get_type_hints(kind)
     if hasattr(kind, "_fields"):
         return lambda found, _: kind(*found)
-    makers = [(field.name, _maker(hints[field.name])) for field in fields(kind) if field.init and field.name[0] != "_"]
+    makers = [
+        (field.name, _maker(hints[field.name]))
+        for field in fields(kind)
+        if field.init and field.name[0] != "_"
+    ]
     return lambda found, pools: kind(**{name: make(found[name], pools) for name, make in makers})
 
 
@@ -148,14 +160,23 @@ _FIELDS: Final = tuple(name for name in StreetMap.__dataclass_fields__ if not na
 
 
 def _key(name: str, net: bytes) -> str:
-    return hashlib.sha256(_READER + name.encode() + b"\0" + hashlib.sha256(net).digest()).hexdigest()[:32]
+    return hashlib.sha256(
+        _READER + name.encode() + b"\0" + hashlib.sha256(net).digest()
+    ).hexdigest()[:32]
 
 
 def _reader() -> bytes:
-    """What makes a StreetMap of a net: the source of this package and of the words it uses, and the libraries."""
-    rooms = [Path(sumo_nets.__file__).parent, *(Path(cosim.__file__).parent / room for room in ("core", "place"))]
+    """What makes a StreetMap of a net: the source of this package and of the words it uses, and the
+    libraries."""
+    rooms = [
+        Path(sumo_nets.__file__).parent,
+        *(Path(cosim.__file__).parent / room for room in ("core", "place")),
+    ]
     sources = [source for room in rooms for source in sorted(room.rglob("*.py"))]
-    libraries = [*(version(name) for name in ("numpy", "scipy", "shapely")), shapely.geos_version_string]
+    libraries = [
+        *(version(name) for name in ("numpy", "scipy", "shapely")),
+        shapely.geos_version_string,
+    ]
     seen = hashlib.sha256(" ".join(libraries).encode())
     for source in sources:
         seen.update(source.read_bytes())

@@ -14,11 +14,12 @@ from typing import Any
 import msgspec
 import pytest
 
-from cosim.cli.options.endpoint import LONGEST_WAIT_S
+from cosim.cli.options import LONGEST_WAIT_S
 from cosim.episode.control import Command
-from cosim.episode.ports import Manifest, Observation
+from cosim.episode.interfaces import Observation
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.connection import Connection
+from cosim.spec.manifest import Manifest
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from scenarios.events import EVENT_KINDS
 from tests.conftest import PATIENCE_S, Cosim
@@ -30,7 +31,7 @@ WORDS = [sys.executable, "-m", "cosim"]
 KILLER = """
 import os, signal
 from pathlib import Path
-from cosim.episode.ports import Manifest
+from cosim.spec.manifest import Manifest
 from cosim.core.state import Command
 
 class Killer:
@@ -45,7 +46,7 @@ class Killer:
 """
 
 BLIND = """
-from cosim.episode.ports import Manifest
+from cosim.spec.manifest import Manifest
 from cosim.core.state import Command
 
 class Blind:
@@ -63,7 +64,7 @@ from bridge.director import opened_query, signed
 from bridge.session import open_session
 from cosim.spec.connection import Connection
 from scenarios.events import react
-from scenarios.execution.directing import behaviours
+from scenarios.episodes.director import behaviours
 
 last = {}
 def lie(payload):
@@ -100,13 +101,16 @@ class Blind:
 
 
 def frontal(scenario_id: str) -> Scenario:
-    """A reactive scenario of a few seconds: a small city, few people, somebody who walks at the robot."""
-    from scenarios.builders.reactive import build_reactive
-    from scenarios.execution.places import place
+    """A reactive scenario of a few seconds: a small city, few people, somebody who walks at the
+    robot."""
+    from scenarios.places.nets import place
+    from scenarios.suites.reactive import build_reactive
 
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)
-    whole = build_reactive(EVENT_KINDS["frontal"], city, street_map, WalkGraph(street_map), 1, scenario_id)
+    whole = build_reactive(
+        EVENT_KINDS["frontal"], city, street_map, WalkGraph(street_map), 1, scenario_id
+    )
     return msgspec.structs.replace(whole, crowd=CrowdSpec(persons=4, radius_m=40.0, vehicles=0))
 
 
@@ -123,7 +127,8 @@ def recorded(folder: Path, scenario_id: str) -> dict[str, Any]:
 
 @contextmanager
 def directing(folder: Path) -> Iterator[Callable[[], subprocess.Popen[str]]]:
-    """Starts `cosim direct` in a folder, as often as called; the policy Killer knows of the last one."""
+    """Starts `cosim direct` in a folder, as often as called; the policy Killer knows of the last
+    one."""
     started_here: list[subprocess.Popen[str]] = []
 
     def start() -> subprocess.Popen[str]:
@@ -145,15 +150,28 @@ def at_socket(folder: Path) -> str:
 
 def test_a_director_killed_in_mid_episode_leaves_no_trace(tmp_path: Path) -> None:
     """Killed and started again the episode comes to the hash of an undisturbed one."""
-    from scenarios.execution.run import run_episode
+    from scenarios.episodes.run_episode import run_episode
 
-    write_suite(Suite(name="tiny", version="1", scenarios=(frontal("t-0"),)), tmp_path / "tiny.json")
+    write_suite(
+        Suite(name="tiny", version="1", scenarios=(frontal("t-0"),)), tmp_path / "tiny.json"
+    )
     (tmp_path / "killer.py").write_text(KILLER)
-    words = ("run", "tiny.json", "--policy", "killer:Killer", "--out", "run", "--director", at_socket(tmp_path))
+    words = (
+        "run",
+        "tiny.json",
+        "--policy",
+        "killer:Killer",
+        "--out",
+        "run",
+        "--director",
+        at_socket(tmp_path),
+    )
     with directing(tmp_path) as direct:
         first = direct()
         run = subprocess.Popen(
-            [*WORDS, *words, "--director-wait", str(LONGEST_WAIT_S)], cwd=tmp_path, stdout=subprocess.DEVNULL
+            [*WORDS, *words, "--director-wait", str(LONGEST_WAIT_S)],
+            cwd=tmp_path,
+            stdout=subprocess.DEVNULL,
         )
         try:
             undisturbed = run_episode(frontal("t-0"), Blind()).record
@@ -164,15 +182,29 @@ def test_a_director_killed_in_mid_episode_leaves_no_trace(tmp_path: Path) -> Non
             run.kill()
             run.wait()
     kept = recorded(tmp_path, "t-0")
-    assert undisturbed.status == "done" and (undisturbed.events[0].triggered_at_s or PATIENCE_S) < 4.0
+    assert (
+        undisturbed.status == "done" and (undisturbed.events[0].triggered_at_s or PATIENCE_S) < 4.0
+    )
     assert kept["status"] == "done" and kept["state_hash"] == undisturbed.state_hash
 
 
 def test_a_director_that_stays_away_is_told(tmp_path: Path, cosim: Cosim) -> None:
-    """Killed for good while an episode runs: the run says that it waits, and that the simulator owes it."""
-    write_suite(Suite(name="tiny", version="1", scenarios=(frontal("t-1"),)), tmp_path / "tiny.json")
+    """Killed for good while an episode runs: the run says that it waits, and that the simulator
+    owes it."""
+    write_suite(
+        Suite(name="tiny", version="1", scenarios=(frontal("t-1"),)), tmp_path / "tiny.json"
+    )
     (tmp_path / "killer.py").write_text(KILLER)
-    words = ("run", "tiny.json", "--policy", "killer:Killer", "--out", "run", "--director", at_socket(tmp_path))
+    words = (
+        "run",
+        "tiny.json",
+        "--policy",
+        "killer:Killer",
+        "--out",
+        "run",
+        "--director",
+        at_socket(tmp_path),
+    )
     with directing(tmp_path) as direct:
         direct()
         run = cosim(*words, "--director-wait", "5", cwd=tmp_path)
@@ -182,8 +214,11 @@ def test_a_director_that_stays_away_is_told(tmp_path: Path, cosim: Cosim) -> Non
     assert "t-1: waits at tick" in run.stderr and "5 s at most" in run.stderr
 
 
-def test_a_director_that_lies_spoils_its_episodes_and_no_other(tmp_path: Path, cosim: Cosim) -> None:
-    """The last tick's answer, too many states, noise, other code, an exception: each a record with its reason."""
+def test_a_director_that_lies_spoils_its_episodes_and_no_other(
+    tmp_path: Path, cosim: Cosim
+) -> None:
+    """The last tick's answer, too many states, noise, other code, an exception: each a record with
+    its reason."""
     says = {
         "late": "it answered tick 2 of 'late'",
         "many": "it answered with 1000 states for 1 events",
@@ -207,36 +242,56 @@ def test_a_director_that_lies_spoils_its_episodes_and_no_other(tmp_path: Path, c
     assert run.returncode == 1 and recorded(tmp_path, "honest")["status"] == "done", run.stderr
     for name, words in says.items():
         record = recorded(tmp_path, name)
-        assert record["status"] == "invalid" and words in record["reason"] and len(record["reason"]) < 1000
+        assert (
+            record["status"] == "invalid"
+            and words in record["reason"]
+            and len(record["reason"]) < 1000
+        )
         assert f"director, tick 3 of '{name}'" in record["reason"]
 
 
 def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cosim: Cosim) -> None:
-    """Nobody there at first: the run says so, and goes on when somebody is; one that never comes is an error."""
+    """Nobody there at first: the run says so, and goes on when somebody is; one that never comes is
+    an error."""
     from cosim.core.errors import DirectorLost
     from cosim.spec.events import EventQuery
     from cosim.spec.options import Outside
-    from scenarios.execution.directing import directed_by
+    from scenarios.episodes.director import directed_by
 
     at = f"unixsock-stream/{tmp_path}/director.sock"
     there = Connection(role="coordinator", connect=at)
     query = EventQuery(
-        episode="e", tick=0, tick_ms=50, robot_x_m=0.0, robot_y_m=0.0, robot_heading_rad=0.0, robot_v_mps=0.0,
-        robot_w_radps=0.0, route_s_m=0.0, robot_length_m=0.7, robot_width_m=0.55, events=(),
-    )  # fmt: skip
+        episode="e",
+        tick=0,
+        tick_ms=50,
+        robot_x_m=0.0,
+        robot_y_m=0.0,
+        robot_heading_rad=0.0,
+        robot_v_mps=0.0,
+        robot_w_radps=0.0,
+        route_s_m=0.0,
+        robot_length_m=0.7,
+        robot_width_m=0.55,
+        events=(),
+    )
     told: list[str] = []
     with (
         pytest.raises(
-            DirectorLost, match=r"no director at .*director\.sock within 0\.5 s: start one with `cosim direct"
+            DirectorLost,
+            match=r"no director at .*director\.sock within 0\.5 s: start one with `cosim direct",
         ),
         directed_by(Outside(connection=there, run="r", wait_s=0.5), told.append, "e"),
     ):
         pass
     directors: list[subprocess.Popen[str]] = []
-    late = threading.Thread(target=lambda: directors.append(started(tmp_path, *WORDS, "direct", "--listen", at)))
+    late = threading.Thread(
+        target=lambda: directors.append(started(tmp_path, *WORDS, "direct", "--listen", at))
+    )
     late.start()
     try:
-        with directed_by(Outside(connection=there, run="r", wait_s=PATIENCE_S), told.append, "e") as director:
+        with directed_by(
+            Outside(connection=there, run="r", wait_s=PATIENCE_S), told.append, "e"
+        ) as director:
             assert director.react(query).tick == 0
         late.join()
         second = cosim("direct", "--listen", at)
@@ -254,10 +309,14 @@ def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cos
 
 def test_the_version_of_the_behaviours_covers_all_of_ours_that_they_load() -> None:
     """The modules whose source is hashed hold all that a fresh process has loaded with them."""
-    from scenarios.execution.directing import behaviours, sources
+    from scenarios.episodes.director import behaviours, sources
 
     code = "import sys, scenarios.events; print(*sys.modules)"
-    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    loaded = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True
+    ).stdout.split()
     ours = {name for name in loaded if name.startswith(("cosim.", "scenarios."))}
-    assert {"scenarios.events.frontal", "cosim.spec.events"} < ours <= set(sources("scenarios.events"))
+    assert (
+        {"scenarios.events.frontal", "cosim.spec.events"} < ours <= set(sources("scenarios.events"))
+    )
     assert len(behaviours()) == 16 and behaviours() == behaviours()

@@ -14,14 +14,21 @@ import pytest
 
 from bridge import director, keys
 from bridge.codec import decode, encode
-from bridge.director import QueryParts, RemoteDirector, opened_query, serve_director, signed, signed_query
+from bridge.director import (
+    QueryParts,
+    RemoteDirector,
+    opened_query,
+    serve_director,
+    signed,
+    signed_query,
+)
 from bridge.security import settings
 from bridge.session import LoneSession
 from cosim.core.errors import DirectorLost, EngineError, SpecError
 from cosim.core.state import PersonKind
 from cosim.spec.events import Actor, Event, EventQuery, EventReply, EventState, Walker
-from tests.bridge.ends import connected_to, listening_at
 from tests.conftest import PATIENCE_S
+from tests.support.ends import connected_to, listening_at
 
 pytestmark = pytest.mark.engine
 
@@ -30,9 +37,19 @@ KEY = keys.director("test", "env")
 
 def query(tick: int = 0) -> EventQuery:
     return EventQuery(
-        episode="t", tick=tick, tick_ms=50, robot_x_m=0.0, robot_y_m=0.0, robot_heading_rad=0.0, robot_v_mps=0.0,
-        robot_w_radps=0.0, route_s_m=0.0, robot_length_m=0.7, robot_width_m=0.55, events=(),
-    )  # fmt: skip
+        episode="t",
+        tick=tick,
+        tick_ms=50,
+        robot_x_m=0.0,
+        robot_y_m=0.0,
+        robot_heading_rad=0.0,
+        robot_v_mps=0.0,
+        robot_w_radps=0.0,
+        route_s_m=0.0,
+        robot_length_m=0.7,
+        robot_width_m=0.55,
+        events=(),
+    )
 
 
 def echo(asked: EventQuery) -> EventReply:
@@ -61,7 +78,8 @@ def open_sockets() -> set[str]:
 
 
 def test_an_episodes_own_director_answers_in_the_thread_that_asks() -> None:
-    """Over a Zenoh session that has no socket: what it says is what the pure function says, tick by tick."""
+    """Over a Zenoh session that has no socket: what it says is what the pure function says, tick by
+    tick."""
     before, threads = open_sockets(), set()
 
     def seen(asked: EventQuery) -> EventReply:
@@ -71,7 +89,9 @@ def test_an_episodes_own_director_answers_in_the_thread_that_asks() -> None:
     with LoneSession() as session:
         serve_director(session, KEY, seen, by="cafe")
         director = RemoteDirector(session, KEY, by="cafe")
-        assert [director.react(query(tick)) for tick in range(100)] == [echo(query(tick)) for tick in range(100)]
+        assert [director.react(query(tick)) for tick in range(100)] == [
+            echo(query(tick)) for tick in range(100)
+        ]
         assert open_sockets() <= before and threads == {threading.get_ident()}
         with pytest.raises(DirectorLost, match="'feed' met behaviours 'cafe'"):
             RemoteDirector(session, KEY, by="feed").react(query())
@@ -80,7 +100,8 @@ def test_an_episodes_own_director_answers_in_the_thread_that_asks() -> None:
 
 
 def test_ctrl_c_while_the_own_director_answers_is_not_lost() -> None:
-    """It interrupts whoever asked, as anywhere else; an exception is an answer; the next query works."""
+    """It interrupts whoever asked, as anywhere else; an exception is an answer; the next query
+    works."""
     raised: list[BaseException] = [KeyboardInterrupt(), RuntimeError("no idea")]
 
     def broken(asked: EventQuery) -> EventReply:
@@ -132,20 +153,34 @@ def test_a_director_that_restarts_is_found_again(tmp_path: Path) -> None:
 def test_an_answer_to_another_tick_is_refused(tmp_path: Path) -> None:
     """A reply that belongs to another tick or episode is a protocol error."""
     with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
-        serve_director(hub, KEY, lambda asked: EventReply(episode="t", tick=asked.tick + 1, states=(), actors=()))
+        serve_director(
+            hub,
+            KEY,
+            lambda asked: EventReply(episode="t", tick=asked.tick + 1, states=(), actors=()),
+        )
         with pytest.raises(DirectorLost, match="answered tick 1"):
             RemoteDirector(client, KEY).react(query(0))
 
 
 def event(**fields: object) -> Event:
-    known: dict[str, object] = {"id": "e0", "kind": "frontal", "x_m": 0.0, "y_m": 0.0, "heading_rad": 0.0}
+    known: dict[str, object] = {
+        "id": "e0",
+        "kind": "frontal",
+        "x_m": 0.0,
+        "y_m": 0.0,
+        "heading_rad": 0.0,
+    }
     return Event(**known | {"route_s_m": 5.0, "half_width_m": 1.0} | fields)  # type: ignore[arg-type]
 
 
-SANE = EventState(phase="waiting", since_tick=0, walkers=(Walker(x_m=1.0, y_m=0.0, heading_rad=0.0),))
+SANE = EventState(
+    phase="waiting", since_tick=0, walkers=(Walker(x_m=1.0, y_m=0.0, heading_rad=0.0),)
+)
 NOWHERE = msgspec.structs.replace(SANE, walkers=(Walker(x_m=math.nan, y_m=0.0, heading_rad=0.0),))
 CROWDED = msgspec.structs.replace(SANE, walkers=SANE.walkers * 3)
-SHOWN = Actor(id="e0", x_m=1.0, y_m=0.0, heading_rad=0.0, speed_mps=0.0, doing="stand", kind=PersonKind.EVENT)
+SHOWN = Actor(
+    id="e0", x_m=1.0, y_m=0.0, heading_rad=0.0, speed_mps=0.0, doing="stand", kind=PersonKind.EVENT
+)
 FAST = msgspec.structs.replace(SHOWN, speed_mps=math.inf)
 DISGUISED = msgspec.structs.replace(SHOWN, kind=PersonKind.RESIDENT)
 STRANGER = msgspec.structs.replace(SHOWN, id="e7")
@@ -166,12 +201,17 @@ STRANGER = msgspec.structs.replace(SHOWN, id="e7")
         ({"actors": (SHOWN, SHOWN)}, "people of no event, or twice"),
     ],
 )
-def test_a_reply_that_cannot_be_meant_is_refused_in_words(tmp_path: Path, fields: dict[str, Any], words: str) -> None:
-    """The last tick's, another episode's, too many states, people of nobody, places that are none."""
+def test_a_reply_that_cannot_be_meant_is_refused_in_words(
+    tmp_path: Path, fields: dict[str, Any], words: str
+) -> None:
+    """The last tick's, another episode's, too many states, people of nobody, places that are
+    none."""
     asked = msgspec.structs.replace(query(5), events=(event(),))
     sane = EventReply(episode="t", tick=5, states=(SANE,), actors=(SHOWN,))
     with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
-        serve_director(hub, KEY, lambda _: msgspec.structs.replace(sane, **fields if asked.states else {}))
+        serve_director(
+            hub, KEY, lambda _: msgspec.structs.replace(sane, **fields if asked.states else {})
+        )
         director = RemoteDirector(client, KEY)
         assert director.react(asked) == sane
         asked = msgspec.structs.replace(asked, states=sane.states)
@@ -184,7 +224,9 @@ def test_a_director_of_other_behaviours_is_refused(tmp_path: Path, theirs: str) 
     """Whatever it would do: both ends sign with their version, and each refuses the other's."""
     with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
         serve_director(hub, KEY, echo, by=theirs)
-        with pytest.raises(DirectorLost, match=f"'cafe' met behaviours '{theirs}': .* from the same code"):
+        with pytest.raises(
+            DirectorLost, match=f"'cafe' met behaviours '{theirs}': .* from the same code"
+        ):
             RemoteDirector(client, KEY, by="cafe").react(query())
         lax = keys.director("test", "lax")
         hub.serve(lax, lambda payload: signed(echo(opened_query(payload, "cafe")), theirs))
@@ -199,10 +241,16 @@ def test_one_director_answers_every_run_and_episode(tmp_path: Path) -> None:
         for run, env in (("a", "x"), ("b", "y")):
             assert RemoteDirector(client, keys.director(run, env)).react(query(2)).tick == 2
         with pytest.raises(EngineError, match="ask for exactly"):
-            client.ask(keys.director("a", "x").replace("a", "*", 1), signed_query(query(), ""), timeout_s=PATIENCE_S)
+            client.ask(
+                keys.director("a", "x").replace("a", "*", 1),
+                signed_query(query(), ""),
+                timeout_s=PATIENCE_S,
+            )
 
 
-def test_whoever_runs_the_episode_is_told_what_it_waits_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_whoever_runs_the_episode_is_told_what_it_waits_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Once, after a while; the director that comes then is taken."""
     monkeypatch.setattr(director, "NOTICE_S", 0.1)
     told: list[str] = []
@@ -212,7 +260,10 @@ def test_whoever_runs_the_episode_is_told_what_it_waits_for(tmp_path: Path, monk
             told.append(words)
             serve_director(hub, KEY, echo)
 
-        assert RemoteDirector(client, KEY, wait_s=PATIENCE_S, waiting=waiting).react(query(3)).tick == 3
+        assert (
+            RemoteDirector(client, KEY, wait_s=PATIENCE_S, waiting=waiting).react(query(3)).tick
+            == 3
+        )
     assert told == [f"waits at tick 3 for the director, {PATIENCE_S:g} s at most"]
 
 
@@ -222,7 +273,8 @@ def test_whoever_runs_the_episode_is_told_what_it_waits_for(tmp_path: Path, monk
     ids=["empty", "unused byte", "map", "long array", "deep", "pickled"],
 )
 def test_garbage_is_refused_without_harm(tmp_path: Path, payload: bytes) -> None:
-    """Broken, huge-length, deeply nested and pickled payloads get an error reply; the next query works."""
+    """Broken, huge-length, deeply nested and pickled payloads get an error reply; the next query
+    works."""
     with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
         serve_director(hub, KEY, echo)
         with pytest.raises(EngineError, match=r"not a (Signed|QueryParts) message"):
@@ -238,7 +290,9 @@ def test_a_wildcard_query_does_not_reach_a_director(tmp_path: Path) -> None:
             client.ask("cosim/*/env/*/director", encode(query()), timeout_s=PATIENCE_S)
 
 
-def test_nobody_to_connect_to_is_an_error_with_the_endpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nobody_to_connect_to_is_an_error_with_the_endpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A client without a hub fails and names the endpoint."""
     monkeypatch.setattr(settings, "CONNECTS_WITHIN_S", 0.1)
     with pytest.raises(EngineError, match="no hub answers at unixsock-stream"):
@@ -259,8 +313,12 @@ def test_messages_travel_by_field_name() -> None:
 
 
 def test_a_query_holds_its_own_events_however_often_others_are_asked_between() -> None:
-    """Two episodes in turns, and one that changes its events; events that cannot be are refused every time."""
-    queries = [msgspec.structs.replace(query(k), events=(event(route_s_m=5.0 + k % 2),) * (k % 3)) for k in range(12)]
+    """Two episodes in turns, and one that changes its events; events that cannot be are refused
+    every time."""
+    queries = [
+        msgspec.structs.replace(query(k), events=(event(route_s_m=5.0 + k % 2),) * (k % 3))
+        for k in range(12)
+    ]
     assert [opened_query(signed_query(one, "cafe"), "cafe") for one in queries] == queries
     wrong = encode(event()).replace(b"\xa2e0", b"\xa2x0")
     parts = QueryParts(msgspec.Raw(encode(query())), msgspec.Raw(b"\x91" + wrong))

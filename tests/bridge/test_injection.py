@@ -20,17 +20,17 @@ import pytest
 from bridge.live import LARGEST_B, answer_to
 from bridge.security.authority import issue, make_authority
 from cosim.core.geometry import Polyline, Pose
-from cosim.episode.log import Log
-from cosim.episode.ports import Director
+from cosim.episode.interfaces import Director
 from cosim.place.walk_graph import WalkGraph
+from cosim.results.log import Log
 from cosim.spec.events import EventQuery, EventReply
 from cosim.spec.injection import Ack, Injected, Injection, InjectionRequest, RelativePoint
 from cosim.spec.scenario import City, CrowdSpec, Suite, write_suite
-from scenarios.execution import injected
-from scenarios.execution.injected import MOST_INJECTED, InjectedPeople, RobotOnRoute
-from tests.bridge.security.plain import free_port
+from scenarios.episodes import injected
+from scenarios.episodes.injected import MOST_INJECTED, InjectedPeople, RobotOnRoute
 from tests.conftest import PATIENCE_S, Cosim
-from tests.documents import blocks
+from tests.support.documents import blocks
+from tests.support.plain import free_port
 
 TICK_MS = 50
 
@@ -57,18 +57,34 @@ def injected_people(*script: Injected, director: Director | None = None) -> Inje
 
 def query(tick: int, robot_x_m: float = 90.0) -> EventQuery:
     return EventQuery(
-        episode="t", tick=tick, tick_ms=TICK_MS, robot_x_m=robot_x_m, robot_y_m=90.0, robot_heading_rad=0.0,
-        robot_v_mps=0.0, robot_w_radps=0.0, route_s_m=0.0, robot_length_m=0.7, robot_width_m=0.55, events=(),
-    )  # fmt: skip
+        episode="t",
+        tick=tick,
+        tick_ms=TICK_MS,
+        robot_x_m=robot_x_m,
+        robot_y_m=90.0,
+        robot_heading_rad=0.0,
+        robot_v_mps=0.0,
+        robot_w_radps=0.0,
+        route_s_m=0.0,
+        robot_length_m=0.7,
+        robot_width_m=0.55,
+        events=(),
+    )
 
 
 def anna(**fields: object) -> Injection:
-    known: dict[str, object] = {"id": "anna", "path": ((10.0, 10.0), (13.0, 10.0)), "speed_mps": 1.5, "stay_s": 1.0}
+    known: dict[str, object] = {
+        "id": "anna",
+        "path": ((10.0, 10.0), (13.0, 10.0)),
+        "speed_mps": 1.5,
+        "stay_s": 1.0,
+    }
     return Injection(**known | fields)  # type: ignore[arg-type]
 
 
 def test_an_injected_person_enters_at_the_tick_it_was_told_walks_its_path_and_leaves() -> None:
-    """Accepted between ticks 2 and 3 it is there at 3, 3 m at 1.5 m/s later it stands, a second later it is gone."""
+    """Accepted between ticks 2 and 3 it is there at 3, 3 m at 1.5 m/s later it stands, a second
+    later it is gone."""
     one = injected_people()
     for tick in range(3):
         assert not one.react(query(tick)).actors
@@ -84,16 +100,22 @@ def test_an_injected_person_enters_at_the_tick_it_was_told_walks_its_path_and_le
 
 
 def test_nobody_does_on_the_way_what_it_will_do_at_the_end() -> None:
-    """Who is to sit at its end is shown to stand as it appears, and to walk; it sits where its path ends only."""
+    """Who is to sit at its end is shown to stand as it appears, and to walk; it sits where its path
+    ends only."""
     one = injected_people(Injected(tick=0, injection=anna(doing="sit")))
     shown = [actor for tick in range(60) for actor in one.react(query(tick)).actors]
     assert {actor.doing for actor in shown if actor.x_m < 13.0} == {"stand", "walk"}
-    assert {actor.doing for actor in shown if actor.speed_mps == 0.0 and actor.x_m == 13.0} == {"sit"}
+    assert {actor.doing for actor in shown if actor.speed_mps == 0.0 and actor.x_m == 13.0} == {
+        "sit"
+    }
 
 
 @pytest.mark.parametrize("off_m", [(0.0, 0.0), (0.4, 0.3), (-0.7, 0.0), (0.7, 0.0)])
-def test_an_injected_person_whose_end_the_robot_stands_on_stays_beside_it(off_m: tuple[float, float]) -> None:
-    """It comes within a metre, stays for its time, and is gone, instead of walking round the robot for ever."""
+def test_an_injected_person_whose_end_the_robot_stands_on_stays_beside_it(
+    off_m: tuple[float, float],
+) -> None:
+    """It comes within a metre, stays for its time, and is gone, instead of walking round the robot
+    for ever."""
     end = (90.0 + off_m[0], 90.0 + off_m[1])
     one = injected_people(Injected(tick=0, injection=anna(path=((84.0, 90.0), end), stay_s=2.0)))
     shown = [actor for tick in range(300) for actor in one.react(query(tick)).actors]
@@ -103,8 +125,10 @@ def test_an_injected_person_whose_end_the_robot_stands_on_stays_beside_it(off_m:
 
 
 def test_the_log_alone_replays_the_injected_people() -> None:
-    """Two of them, injected at different ticks: a director that only has the log shows the same, tick by tick."""
-    live, shown = injected_people(), []
+    """Two of them, injected at different ticks: a director that only has the log shows the same,
+    tick by tick."""
+    live = injected_people()
+    shown = []
     for tick in range(60):
         if tick in (4, 20):
             live.offer(anna(id=f"p{tick}"))
@@ -115,23 +139,33 @@ def test_the_log_alone_replays_the_injected_people() -> None:
 
 
 def test_points_from_the_robot_are_taken_where_it_is_when_the_pedestrian_enters() -> None:
-    """Ahead and left of its pose at that tick, beside points of the map; the log holds the map's alone, and replays."""
-    one, robot = injected_people(), Pose(50.0, 50.0, math.pi / 2)
+    """Ahead and left of its pose at that tick, beside points of the map; the log holds the map's
+    alone, and replays."""
+    one = injected_people()
+    robot = Pose(50.0, 50.0, math.pi / 2)
     one.react(query(0))
     one.robot_at(RobotOnRoute(1, robot, 40.0))
     ack = answer_to(b'{"id":"a","path":[{"ahead":15,"left":1},[60,60],{"ahead":-2.5}]}', one.offer)
-    assert (ack.status, ack.tick, ack.x_m, ack.y_m) == ("accepted", 1, pytest.approx(49.0), pytest.approx(65.0))
+    assert (ack.status, ack.tick, ack.x_m, ack.y_m) == (
+        "accepted",
+        1,
+        pytest.approx(49.0),
+        pytest.approx(65.0),
+    )
     shown = [one.react(query(tick)).actors for tick in range(1, 100)]
     (entry,) = msgspec.json.decode(msgspec.json.encode(one.log), type=tuple[Injected, ...])
     path = [(49.0, 65.0), (60.0, 60.0), (50.0, 47.5)]
-    assert [number for point in entry.injection.path for number in point] == pytest.approx(sum(path, ()))
+    assert [number for point in entry.injection.path for number in point] == pytest.approx(
+        sum(path, ())
+    )
     again = injected_people(entry)
     again.react(query(0))
     assert [again.react(query(tick)).actors for tick in range(1, 100)] == shown
 
 
 def test_points_from_the_robot_wait_for_the_tick_under_way() -> None:
-    """Offered in the middle of a tick the pedestrian enters at the next one, and ahead of the robot as it is then."""
+    """Offered in the middle of a tick the pedestrian enters at the next one, and ahead of the robot
+    as it is then."""
     acks: list[Ack] = []
     here = InjectionRequest(id="a", path=(RelativePoint(10.0),))
 
@@ -149,8 +183,11 @@ def test_points_from_the_robot_wait_for_the_tick_under_way() -> None:
     assert acks == [Ack(id="a", status="accepted", tick=1, time_s=0.05, x_m=30.0, y_m=30.0)]
 
 
-def test_a_tick_that_does_not_end_refuses_points_from_the_robot(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An engine that hangs holds no client up: points of the map are taken, the others are to be sent again."""
+def test_a_tick_that_does_not_end_refuses_points_from_the_robot(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """An engine that hangs holds no client up: points of the map are taken, the others are to be
+    sent again."""
     monkeypatch.setattr(injected, "SETTLES_S", 0.01)
     one = injected_people()
     one.react(query(0))
@@ -165,22 +202,32 @@ def test_a_tick_that_does_not_end_refuses_points_from_the_robot(monkeypatch: pyt
     ids=["start", "turn", "goal"],
 )
 @pytest.mark.parametrize(
-    "path", ["[[10,10],[170,252]]", '[[10,10],{"ahead":-3,"left":-200}]'], ids=["of the map", "from the robot"]
+    "path",
+    ["[[10,10],[170,252]]", '[[10,10],{"ahead":-3,"left":-200}]'],
+    ids=["of the map", "from the robot"],
 )
 def test_a_refusal_says_where_the_robot_is_and_a_point_that_is_taken(
     robot: tuple[float, float, float, float], path: str
 ) -> None:
-    """At the start, in a turn and near the goal: the message with either form of the point in it is accepted."""
+    """At the start, in a turn and near the goal: the message with either form of the point in it is
+    accepted."""
     one = injected_people()
     one.robot_at(RobotOnRoute(0, Pose(*robot[:3]), robot[3]))
     reason = answer_to(f'{{"id":"a","path":{path}}}'.encode(), one.offer).reason
     assert reason.startswith("path[1] is ") and "not on this map" in reason
     assert f"The robot is at [{robot[0]:.1f}, {robot[1]:.1f}]" in reason
-    found = re.search(r"A valid point on its route is (\[.*?\]), or (\{.*?\}) from the robot", reason)
+    found = re.search(
+        r"A valid point on its route is (\[.*?\]), or (\{.*?\}) from the robot", reason
+    )
     assert found is not None
     acks = [answer_to(f'{{"id":"p{i}","path":[{found[i]}]}}'.encode(), one.offer) for i in (1, 2)]
     assert [ack.status for ack in acks] == ["accepted", "accepted"]
-    assert math.dist((acks[0].x_m or 0.0, acks[0].y_m or 0.0), (acks[1].x_m or 0.0, acks[1].y_m or 0.0)) < 0.2
+    assert (
+        math.dist(
+            (acks[0].x_m or 0.0, acks[0].y_m or 0.0), (acks[1].x_m or 0.0, acks[1].y_m or 0.0)
+        )
+        < 0.2
+    )
 
 
 @pytest.mark.parametrize(
@@ -190,27 +237,70 @@ def test_a_refusal_says_where_the_robot_is_and_a_point_that_is_taken(
         (b'{"id":"a","path":[[10,500]]}', "not on this map"),
         (b'{"id":"a","path":[]}', "path"),
         (b'{"id":"a b","path":[[1,1]]}', "id"),
-        (b'{"id":"a","path":[[1,1]],"sped_mps":1}', "`sped_mps`. Valid choices: id, path, speed_mps, heading_rad"),
+        (
+            b'{"id":"a","path":[[1,1]],"sped_mps":1}',
+            "`sped_mps`. Valid choices: id, path, speed_mps, heading_rad",
+        ),
         (b'{"id":"a","path":[[1,1]],"stay_s":-1}', "stay_s must be 0"),
         (b'{"id":"a","path":[[1,NaN]]}', "malformed"),
         (msgspec.msgpack.encode({"id": "a", "path": [[1.0, float("nan")]]}), "no number"),
         (msgspec.msgpack.encode({"id": "a", "path": [[1.0, float("inf")]]}), "no number"),
-        (b'{"id":"a","path":[{"forward":15}]}', "field `forward` - at `$.path[0]`; a point is [x, y] on the map or {"),
-        (b'{"id":"a","ahead":15}', "`ahead`. Valid choices: id, path, speed_mps, heading_rad, doing, age, stay_s; a"),
-        (b'{"id":"a","path":[{"left":1}]}', "missing required field `ahead` - at `$.path[0]`; a point is"),
-        (b'{"id":"a","path":[{"ahead":1e9}]}', "<= 1000.0 - at `$.path[0].ahead`, found 1000000000.0; a point is"),
-        (b'{"id":"a","path":[[1,2,3]]}', "`array` of length 2 - at `$.path[0]`, found [1, 2, 3]; a point is"),
-        (msgspec.msgpack.encode({"id": "a", "path": [{"ahead": float("nan")}]}), "found nan; a point is"),
-        (b'{"id":"a","path":[[1,1]],"doing":"dance"}', "'dance' - at `$.doing`. Valid choices: walk, stand, look"),
+        (
+            b'{"id":"a","path":[{"forward":15}]}',
+            "field `forward` - at `$.path[0]`; a point is [x, y] on the map or {",
+        ),
+        (
+            b'{"id":"a","ahead":15}',
+            "`ahead`. Valid choices: id, path, speed_mps, heading_rad, doing, age, stay_s; a",
+        ),
+        (
+            b'{"id":"a","path":[{"left":1}]}',
+            "missing required field `ahead` - at `$.path[0]`; a point is",
+        ),
+        (
+            b'{"id":"a","path":[{"ahead":1e9}]}',
+            "<= 1000.0 - at `$.path[0].ahead`, found 1000000000.0; a point is",
+        ),
+        (
+            b'{"id":"a","path":[[1,2,3]]}',
+            "`array` of length 2 - at `$.path[0]`, found [1, 2, 3]; a point is",
+        ),
+        (
+            msgspec.msgpack.encode({"id": "a", "path": [{"ahead": float("nan")}]}),
+            "found nan; a point is",
+        ),
+        (
+            b'{"id":"a","path":[[1,1]],"doing":"dance"}',
+            "'dance' - at `$.doing`. Valid choices: walk, stand, look",
+        ),
         (b"\x93\x01", ""),
         (b"[" * 60_000, ""),
         (b"x" * (LARGEST_B + 1), f"at most {LARGEST_B}"),
         (b"", ""),
     ],
-    ids=["fast", "off the map", "no path", "no name", "misspelt", "negative stay", "nan", "packed nan", "packed inf",
-         "misspelt point", "point without a path", "half a point", "far", "three numbers", "relative nan", "dance",
-         "cut short", "deep", "large", "empty"],
-)  # fmt: skip
+    ids=[
+        "fast",
+        "off the map",
+        "no path",
+        "no name",
+        "misspelt",
+        "negative stay",
+        "nan",
+        "packed nan",
+        "packed inf",
+        "misspelt point",
+        "point without a path",
+        "half a point",
+        "far",
+        "three numbers",
+        "relative nan",
+        "dance",
+        "cut short",
+        "deep",
+        "large",
+        "empty",
+    ],
+)
 def test_a_message_that_makes_no_sense_is_refused_in_words(message: bytes, reason: str) -> None:
     """Nothing of it reaches the simulation."""
     one = injected_people()
@@ -267,7 +357,8 @@ def test_an_injected_person_does_not_walk_through_the_robot() -> None:
 SLOW = """
 import time
 from pathlib import Path
-from cosim.episode.ports import CameraSpec, Manifest
+from cosim.spec.camera import CameraSpec
+from cosim.spec.manifest import Manifest
 from cosim.core.state import Command
 
 class Slow:
@@ -348,7 +439,14 @@ class OnAir(NamedTuple):
 
     def python(self, *arguments: str) -> subprocess.CompletedProcess[str]:
         command = [sys.executable, *arguments]
-        return subprocess.run(command, cwd=self.folder, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+        return subprocess.run(
+            command,
+            cwd=self.folder,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+            check=False,
+        )
 
     def record(self) -> dict[str, Any]:
         """The record, when the episode has been told to end."""
@@ -368,18 +466,32 @@ def once(what: Callable[[], bool]) -> None:
 @contextmanager
 def on_air(folder: Path, at: str, *guard: str) -> Iterator[OnAir]:
     """`cosim run --live` of an episode that lasts until it is told to end."""
-    from scenarios.builders.long_horizon import build_long_horizon
-    from scenarios.execution.places import place
+    from scenarios.places.nets import place
+    from scenarios.suites.long_horizon import build_long_horizon
 
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)
     whole = build_long_horizon(city, street_map, WalkGraph(street_map), 0, "t-0")
     crowd = CrowdSpec(persons=6, radius_m=50.0, vehicles=2)
-    short = msgspec.structs.replace(whole, crowd=crowd, time_limit_s=3600.0, ends_on_failure=True, events=())
+    short = msgspec.structs.replace(
+        whole, crowd=crowd, time_limit_s=3600.0, ends_on_failure=True, events=()
+    )
     write_suite(Suite(name="tiny", version="1", scenarios=(short,)), folder / "tiny.json")
     (folder / "slow.py").write_text(SLOW)
-    words = [sys.executable, "-m", "cosim", "run", "tiny.json", "--policy", "slow:Slow", "--camera", "bullet"]
-    with subprocess.Popen([*words, "--out", "run", "--live", at, *guard], cwd=folder, text=True) as run:
+    words = [
+        sys.executable,
+        "-m",
+        "cosim",
+        "run",
+        "tiny.json",
+        "--policy",
+        "slow:Slow",
+        "--camera",
+        "bullet",
+    ]
+    with subprocess.Popen(
+        [*words, "--out", "run", "--live", at, *guard], cwd=folder, text=True
+    ) as run:
         try:
             yield OnAir(run, folder, at, [(x, y) for x, y in whole.route[20:26]])
         finally:
@@ -387,12 +499,17 @@ def on_air(folder: Path, at: str, *guard: str) -> Iterator[OnAir]:
 
 
 @pytest.mark.engine
-def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays(tmp_path: Path, cosim: Cosim) -> None:
-    """`cosim inject` and `listen` beside `cosim run --live`, each with its own certificate alone; `cosim replay` comes
-    to the same state hash, given the injection."""
-    certs, at = tmp_path / "certs", f"tls/localhost:{free_port()}"
+def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays(
+    tmp_path: Path, cosim: Cosim
+) -> None:
+    """`cosim inject` and `listen` beside `cosim run --live`, each with its own certificate alone;
+    `cosim replay` comes to the same state hash, given the injection."""
+    certs = tmp_path / "certs"
+    at = f"tls/localhost:{free_port()}"
     make_authority(certs, ["localhost"], 1)
-    viewer, injector = (("--tls", str(issue(certs, role, [], 1))) for role in ("viewer", "injector"))  # type: ignore[arg-type]
+    viewer, injector = (
+        ("--tls", str(issue(certs, role, [], 1))) for role in ("viewer", "injector")
+    )  # type: ignore[arg-type]
     with on_air(tmp_path, at, "--tls", "certs/coordinator") as air:
         there = ("--connect", air.at, "--wait", str(PATIENCE_S))
 
@@ -402,15 +519,25 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
             return dict(json.loads(told.stdout.splitlines()[0]))
 
         once(lambda: log_on_air()["tick"] > 0)
-        message = json.dumps({"id": "anna", "path": [air.way[0], {"ahead": 4, "left": 0.5}], "doing": "stop"})
+        message = json.dumps(
+            {"id": "anna", "path": [air.way[0], {"ahead": 4, "left": 0.5}], "doing": "stop"}
+        )
         sent = cosim("inject", message, *there, *injector)
         assert sent.returncode == 0 and "'anna' enters at tick" in sent.stdout, sent.stderr
         again = cosim("inject", message, *there, *injector)
         assert again.returncode == 2 and "of this id" in again.stderr
         swapped = cosim("inject", message, *there, *viewer)
-        assert swapped.returncode == 2 and "is of the role viewer, and this needs injector" in swapped.stderr
+        assert (
+            swapped.returncode == 2
+            and "is of the role viewer, and this needs injector" in swapped.stderr
+        )
         elsewhere = ("inject", message, "--connect", air.at, "--env", "run/t-9", *injector)
-        once(lambda: "Valid choices: run/t-0" in (said := cosim(*elsewhere)).stderr and said.returncode == 2)
+        once(
+            lambda: (
+                "Valid choices: run/t-0" in (said := cosim(*elsewhere)).stderr
+                and said.returncode == 2
+            )
+        )
         once(lambda: [one["injection"]["id"] for one in log_on_air()["injections"]] == ["anna"])
         words = [sys.executable, "-m", "cosim", "listen", "robot", *there, *viewer]
         for ends, code in (("it is told to end", 130), ("nobody reads on", 141)):
@@ -428,7 +555,10 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
     log = Log.load(tmp_path / "run" / "episodes" / "t-0" / "trajectory.npz")
     robot = Pose(*log.pose[entry["tick"] - 1])
     assert entry["tick"] > 0
-    assert entry["injection"]["path"] == [list(air.way[0]), list(RelativePoint(4.0, 0.5).on_map(robot))]
+    assert entry["injection"]["path"] == [
+        list(air.way[0]),
+        list(RelativePoint(4.0, 0.5).on_map(robot)),
+    ]
     replayed = cosim("replay", "run", "t-0", cwd=tmp_path)
     assert replayed.returncode == 0 and record["state_hash"] in replayed.stdout, replayed.stderr
     assert "replaying t-0 ..." in replayed.stderr
@@ -439,28 +569,42 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
 
 
 @pytest.mark.engine
-def test_plain_zenoh_scripts_step_in_listen_and_can_do_no_harm(tmp_path: Path, cosim: Cosim) -> None:
-    """The script of docs/viewing.md injects, a late listener gets all topics and the log, and floods bounce."""
+def test_plain_zenoh_scripts_step_in_listen_and_can_do_no_harm(
+    tmp_path: Path, cosim: Cosim
+) -> None:
+    """The script of docs/viewing.md injects, a late listener gets all topics and the log, and
+    floods bounce."""
     (script,) = blocks("python", "docs/viewing.md")
     with on_air(tmp_path, f"unixsock-stream/{tmp_path}/air.sock") as air:
         text = script.text.replace("tcp/127.0.0.1:7447", air.at)
         (tmp_path / "ten.py").write_text(text)
-        assert cosim("listen", "--connect", air.at, "--wait", str(PATIENCE_S), "--seconds", "0").returncode == 0
+        assert (
+            cosim(
+                "listen", "--connect", air.at, "--wait", str(PATIENCE_S), "--seconds", "0"
+            ).returncode
+            == 0
+        )
         bob = json.loads(air.python("ten.py").stdout)
         words = [sys.executable, "-c", CONNECTED + LISTENER, air.at]
         with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as listener:
             assert listener.stdout is not None and listener.stdout.readline() == "listening\n"
-            vandal = air.python("-c", CONNECTED + VANDAL, air.at, "cosim/run/env/t-0", json.dumps(air.way[2]))
+            vandal = air.python(
+                "-c", CONNECTED + VANDAL, air.at, "cosim/run/env/t-0", json.dumps(air.way[2])
+            )
             assert vandal.returncode == 0, vandal.stderr
             record = air.record()
             heard = json.loads(listener.stdout.read())
     assert bob["status"] == "accepted" and bob["time_s"] == pytest.approx(0.05 * bob["tick"])
     said = json.loads(vandal.stdout)
     for name, words in {
-        "10 MB": f"at most {LARGEST_B}", "10 MB of nothing": f"at most {LARGEST_B}", "NaN": "malformed",
-        "outside": "not on this map", "too fast": "at most 3, not 30", "twice": "of this id",
+        "10 MB": f"at most {LARGEST_B}",
+        "10 MB of nothing": f"at most {LARGEST_B}",
+        "NaN": "malformed",
+        "outside": "not on this map",
+        "too fast": "at most 3, not 30",
+        "twice": "of this id",
         "every run": "ask for exactly 'cosim/run/env/t-0/inject'",
-    }.items():  # fmt: skip
+    }.items():
         assert words in said[name], said[name]
     assert said["wrong run"] == "" and said["camera"] == b"\x89PNG\r\n\x1a\n".hex()
     taken_in = [one["injection"]["id"] for one in record["injections"]]
@@ -473,7 +617,8 @@ def test_plain_zenoh_scripts_step_in_listen_and_can_do_no_harm(tmp_path: Path, c
     injected_people = [sum(one["kind"] == "injected" for one in crowd) for crowd in heard["crowd"]]
     assert MOST_INJECTED // 2 < max(injected_people) <= MOST_INJECTED
     assert (
-        set(heard) == {"clock", "robot", "crowd", "signals", "events"} and heard["events"][-1][-1] == "ended: failure"
+        set(heard) == {"clock", "robot", "crowd", "signals", "events"}
+        and heard["events"][-1][-1] == "ended: failure"
     )
     assert heard["clock"][-1]["tick"] > bob["tick"]
     assert any(one["id"] == "ei-bob" for crowd in heard["crowd"] for one in crowd)

@@ -1,4 +1,5 @@
-"""`cosim listen` and `cosim inject` beside a run whose episode is not on the air yet: real Zenoh, no simulator."""
+"""`cosim listen` and `cosim inject` beside a run whose episode is not on the air yet: real Zenoh,
+no simulator."""
 
 from __future__ import annotations
 
@@ -13,8 +14,8 @@ from bridge.live import serve_injections
 from bridge.security import settings
 from bridge.session import Session
 from cosim.spec.injection import Ack
-from tests.bridge.ends import listening_at
 from tests.conftest import PATIENCE_S, Cosim
+from tests.support.ends import listening_at
 
 pytestmark = pytest.mark.engine
 
@@ -24,7 +25,10 @@ PEDESTRIAN = json.dumps({"id": "anna", "path": [[1, 2], [3, 4]]})
 def started(*words: str) -> subprocess.Popen[str]:
     """A command of `cosim` that has said on standard error that it waits."""
     command = subprocess.Popen(
-        [sys.executable, "-m", "cosim", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, "-m", "cosim", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     assert command.stderr is not None
     assert "waiting" in command.stderr.readline()
@@ -34,14 +38,17 @@ def started(*words: str) -> subprocess.Popen[str]:
 def put_on_the_air(hub: Session, name: str) -> None:
     """Answer as an episode of a run does."""
     serve_injections(
-        hub, f"cosim/r/env/{name}/inject", lambda one: Ack(id=one.id, status="accepted", tick=3, time_s=0.15)
+        hub,
+        f"cosim/r/env/{name}/inject",
+        lambda one: Ack(id=one.id, status="accepted", tick=3, time_s=0.15),
     )
     hub.serve(f"cosim/r/env/{name}/log", lambda _: b'{"tick":7}')
     hub.serve(f"cosim/r/env/{name}/status", lambda _: b"{}", found=True)
 
 
 def test_listen_waits_until_an_episode_is_on_the_air(tmp_path: Path) -> None:
-    """Started before the run it says that it waits, then which episode came, and tells what that one tells."""
+    """Started before the run it says that it waits, then which episode came, and tells what that
+    one tells."""
     at = f"unixsock-stream/{tmp_path}/air.sock"
     words = ("listen", "events", "--connect", at, "--seconds", "0", "--wait", str(PATIENCE_S))
     with started(*words) as listening, listening_at(at) as hub:
@@ -71,19 +78,31 @@ def test_without_a_wait_or_after_it_the_refusal_says_what_to_do(
     monkeypatch.setattr(settings, "CONNECTS_WITHIN_S", 0.1)
     at = f"unixsock-stream/{tmp_path}/air.sock"
     refused = cosim("listen", "--connect", at)
-    assert refused.returncode == 3 and f"no run is on the air at {at}: start one with" in refused.stderr
+    assert (
+        refused.returncode == 3
+        and f"no run is on the air at {at}: start one with" in refused.stderr
+    )
     assert f"--live {at}`" in refused.stderr and "--wait 60 waits" in refused.stderr
     waited = cosim("inject", PEDESTRIAN, "--connect", at, "--wait", "0.1")
     assert (
-        waited.returncode == 3 and f"no run is on the air at {at}" in waited.stderr and "waited 0.1 s" in waited.stderr
+        waited.returncode == 3
+        and f"no run is on the air at {at}" in waited.stderr
+        and "waited 0.1 s" in waited.stderr
     )
     monkeypatch.undo()
     with listening_at(at) as hub:
         early = cosim("listen", "--connect", at)
-        assert early.returncode == 3 and "none of its episodes" in early.stderr and "--wait 60 waits" in early.stderr
+        assert (
+            early.returncode == 3
+            and "none of its episodes" in early.stderr
+            and "--wait 60 waits" in early.stderr
+        )
         put_on_the_air(hub, "t-0")
         (tmp_path / "long.json").write_text(json.dumps({"id": "anna", "path": [[1, 2]] * 20_000}))
         too_long = cosim("inject", f"@{tmp_path}/long.json", "--connect", at)
         assert too_long.returncode == 2 and "an injection has at most 65536" in too_long.stderr
         other = cosim("listen", "--connect", at, "--env", "r/t-9", "--wait", "0.1")
-        assert other.returncode == 2 and "unknown running episode 'r/t-9'. Valid choices: r/t-0." in other.stderr
+        assert (
+            other.returncode == 2
+            and "unknown running episode 'r/t-9'. Valid choices: r/t-0." in other.stderr
+        )

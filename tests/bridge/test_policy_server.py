@@ -1,4 +1,5 @@
-"""Policies behind Zenoh: questions and answers over real sessions, without an engine of the street."""
+"""Policies behind Zenoh: questions and answers over real sessions, without an engine of the
+street."""
 
 from __future__ import annotations
 
@@ -34,16 +35,17 @@ from bridge.policy_server import (
 from bridge.session import QueryHeard, Session, open_session
 from cosim.core.errors import MachineError, PolicyError, PolicyServerLost, UsageError
 from cosim.core.state import Command
-from cosim.episode.given import calibration_of
-from cosim.episode.ports import CameraSpec, Observation
+from cosim.episode.interfaces import Observation
+from cosim.episode.manifest_checks import calibration_of
+from cosim.spec.camera import CameraSpec
 from cosim.spec.connection import Connection
 from cosim.spec.goal import ImageGoal, PointGoal
 from cosim.spec.odometry import Odometry
 from cosim.spec.policy_host import PolicyHost
 from cosim.spec.robot import COURIER
-from scenarios.serving import remote
-from scenarios.serving.drivers import known_driver
-from scenarios.serving.remote import PolicyServers, RemoteDriver, remote_driver
+from scenarios.runs import remote_policy as remote
+from scenarios.runs.policy_host import known_driver
+from scenarios.runs.remote_policy import PolicyServers, RemoteDriver, remote_driver
 from tests.conftest import PATIENCE_S, ROOT, Cosim
 
 SPEC = CameraSpec(64, 40)
@@ -54,11 +56,15 @@ SIZES = {"most": (50_000, 2), "many": (50_001, 2), "far too many": (2_000_000, 2
 
 
 class Counting:
-    """Its speed is the number of the question in its episode, in tenths; in some it does what they are called."""
+    """Its speed is the number of the question in its episode, in tenths; in some it does what they
+    are called."""
 
     manifest: ClassVar = {
-        "name": "counting", "rate_hz": 4.0, "camera": {"width": 64, "height": 40}, "goal": "image",
-    }  # fmt: skip
+        "name": "counting",
+        "rate_hz": 4.0,
+        "camera": {"width": 64, "height": 40},
+        "goal": "image",
+    }
 
     def __init__(self) -> None:
         self.asked: list[str] = []
@@ -106,15 +112,25 @@ class Together(Counting):
 
 def seen_at(tick: int, episode: str = "k1") -> Observation:
     return Observation(
-        tick, tick / 20.0, RGB, 0.5, 0.0, COURIER, episode=episode, goal=ImageGoal(RGB),
-        odometry=Odometry(1.0, 2.0, None), camera=calibration_of(SPEC, COURIER),
-    )  # fmt: skip
+        tick,
+        tick / 20.0,
+        RGB,
+        0.5,
+        0.0,
+        COURIER,
+        episode=episode,
+        goal=ImageGoal(RGB),
+        odometry=Odometry(1.0, 2.0, None),
+        camera=calibration_of(SPEC, COURIER),
+    )
 
 
 @pytest.fixture
 def hub(tmp_path: Path) -> Iterator[Connection]:
     """Where servers and runs meet."""
-    with open_session(Connection(role="policy", listen=f"unixsock-stream/{tmp_path}/hub")) as session:
+    with open_session(
+        Connection(role="policy", listen=f"unixsock-stream/{tmp_path}/hub")
+    ) as session:
         yield session.inside
 
 
@@ -127,7 +143,9 @@ def served(at: Connection, policy: Any, name: str = "counting", **more: Any) -> 
     class Ending:
         """The session, whose end ends the serving thread, too."""
 
-        def declare_queryable(self, key: str, handler: Callable[[Any], None], complete: bool) -> Any:
+        def declare_queryable(
+            self, key: str, handler: Callable[[Any], None], complete: bool
+        ) -> Any:
             heard.append(handler)
             return session.itself.declare_queryable(key, handler, complete=complete)
 
@@ -164,18 +182,26 @@ def driver_at(at: Connection, name: str = "counting", run: str = "run1") -> Iter
 
 @pytest.mark.engine
 def test_a_remote_policy_is_asked_as_one_here(hub: Connection) -> None:
-    """It is given the picture, goal and calibration to the bit; what it raises or answers wrongly is its crash, in the
-    words of one in this process; and how long it took is told."""
+    """It is given the picture, goal and calibration to the bit; what it raises or answers wrongly
+    is its crash, in the words of one in this process; and how long it took is told."""
     policy = Counting()
     with served(hub, policy), driver_at(hub) as driver:
         assert (driver.runs, driver.manifest.camera, driver.at_once) == ("remote", SPEC, 1)
         driver.reset("k1", 7)
-        assert [driver.act(seen_at(tick)) for tick in (0, 5)] == [Command(0.1, 0.0), Command(0.2, 0.0)]
+        assert [driver.act(seen_at(tick)) for tick in (0, 5)] == [
+            Command(0.1, 0.0),
+            Command(0.2, 0.0),
+        ]
         assert (
-            (policy.seen.rgb == RGB).all() and (policy.seen.goal.rgb == RGB).all() and policy.seen.rgb.flags.writeable
+            (policy.seen.rgb == RGB).all()
+            and (policy.seen.goal.rgb == RGB).all()
+            and policy.seen.rgb.flags.writeable
         )
         assert (policy.seen.camera.on_robot == calibration_of(SPEC, COURIER).on_robot).all()
-        assert policy.seen.odometry.heading_rad is None and policy.seen.robot.v_max_mps == COURIER.v_max_mps
+        assert (
+            policy.seen.odometry.heading_rad is None
+            and policy.seen.robot.v_max_mps == COURIER.v_max_mps
+        )
         assert driver.clock.keys() == {"answer_median_ms", "answer_p95_ms"}
         told = {
             "raises": "policy 'counting' raised KeyError: 'no such weight' .act at 0.25 s.",
@@ -199,13 +225,16 @@ def test_a_remote_policy_is_asked_as_one_here(hub: Connection) -> None:
 def test_a_step_that_is_asked_again_is_answered_from_what_was_kept(
     hub: Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An answer that comes after the question was given up is had by asking the same step again: the policy is asked
-    once."""
+    """An answer that comes after the question was given up is had by asking the same step again:
+    the policy is asked once."""
     policy = Counting()
     monkeypatch.setattr(remote, "_TRY_S", 0.2)
     with served(hub, policy), driver_at(hub) as driver:
         driver.reset("slow", 7)
-        assert [driver.act(seen_at(tick, "slow")) for tick in (0, 5)] == [Command(0.1, 0.0), Command(0.2, 0.0)]
+        assert [driver.act(seen_at(tick, "slow")) for tick in (0, 5)] == [
+            Command(0.1, 0.0),
+            Command(0.2, 0.0),
+        ]
     assert policy.asked == ["slow", "slow"]
 
 
@@ -213,9 +242,11 @@ def test_a_step_that_is_asked_again_is_answered_from_what_was_kept(
 def test_a_link_cut_while_a_question_is_under_way_for_long_is_waited_for(
     hub: Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A server is gone when nobody has heard of it for a while after the link was cut, however long it had thought."""
+    """A server is gone when nobody has heard of it for a while after the link was cut, however long
+    it had thought."""
     monkeypatch.setattr(remote, "_LOST_AFTER_S", 0.3)
-    ask_once, cuts = Session.ask_once, ["one"]
+    ask_once = Session.ask_once
+    cuts = ["one"]
 
     def cut_once(session: Session, key: str, payload: bytes, *, timeout_s: float) -> QueryHeard:
         if not cuts:
@@ -232,8 +263,8 @@ def test_a_link_cut_while_a_question_is_under_way_for_long_is_waited_for(
 
 @pytest.mark.engine
 def test_several_episodes_at_once_are_answered_together(hub: Connection) -> None:
-    """Eight environments ask one policy with act_batch: each gets the answers of its own episode, some were asked
-    together, and nothing is remembered of those that have ended."""
+    """Eight environments ask one policy with act_batch: each gets the answers of its own episode,
+    some were asked together, and nothing is remembered of those that have ended."""
     policy = Together()
 
     def drive(name: str, came: list[float]) -> None:
@@ -255,25 +286,34 @@ def test_several_episodes_at_once_are_answered_together(hub: Connection) -> None
 
 @pytest.mark.engine
 def test_servers_of_one_name_share_the_episodes_and_each_keeps_its_own(hub: Connection) -> None:
-    """Of two, the one with less to do takes the next episode; runs of the same seed are kept apart; one that is of
-    another policy is refused."""
+    """Of two, the one with less to do takes the next episode; runs of the same seed are kept apart;
+    one that is of another policy is refused."""
     one, other = Together(), Together()
     with served(hub, one, "together"):
-        with served(hub, other, "together"), driver_at(hub, "together") as a, driver_at(hub, "together", "run2") as b:
+        with (
+            served(hub, other, "together"),
+            driver_at(hub, "together") as a,
+            driver_at(hub, "together", "run2") as b,
+        ):
             for driver in (a, b):
                 driver.reset("k1", 1)
                 driver.act(seen_at(0))
             assert (len(one.batches), len(other.batches)) == (1, 1)
             for driver in (a, b):
                 driver.ended()
-        with served(hub, Counting(), "together"), pytest.raises(UsageError, match="are of two policies"):
+        with (
+            served(hub, Counting(), "together"),
+            pytest.raises(UsageError, match="are of two policies"),
+        ):
             remote_driver("zenoh:together", PolicyHost(servers=(hub,)))
 
 
 @pytest.mark.engine
-def test_a_server_begun_anew_has_lost_the_episode(hub: Connection, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whether it is gone or another has taken its place, nobody answers in the middle of an episode for it: it is lost,
-    and begun again it is whole."""
+def test_a_server_begun_anew_has_lost_the_episode(
+    hub: Connection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether it is gone or another has taken its place, nobody answers in the middle of an episode
+    for it: it is lost, and begun again it is whole."""
     monkeypatch.setattr(remote, "_LOST_AFTER_S", 0.3)
     with driver_after(hub) as driver:
         with served(hub, Counting()):
@@ -320,12 +360,17 @@ def driver_after(hub: Connection) -> Iterator[RemoteDriver]:
 
 @pytest.mark.engine
 def test_a_server_that_answers_wrongly_is_a_policy_that_crashed(hub: Connection) -> None:
-    """Garbage, another step, another attempt, another kind of answer: in words, and never taken for an answer."""
+    """Garbage, another step, another attempt, another kind of answer: in words, and never taken for
+    an answer."""
     wrong: dict[str, Callable[[AskAct], bytes]] = {
         "sent what is no answer": lambda one: b"\xc1 no message",
         "answered step 7 of 'k1' when it was asked step 0": lambda one: answer_to(one, step=7),
-        "answered step 0 of 'k1' when it was asked step 0, in another attempt": lambda one: answer_to(one, attempt="0"),
-        "told who it is when it was asked something else": lambda one: encode_asked(PolicyInfo("s", "wrong", {})),
+        "answered step 0 of 'k1' when it was asked step 0, in another attempt": lambda one: (
+            answer_to(one, attempt="0")
+        ),
+        "told who it is when it was asked something else": lambda one: encode_asked(
+            PolicyInfo("s", "wrong", {})
+        ),
         "answered step -1 of 'k1' when it was asked step 0": begin,
     }
     for words, answer in wrong.items():
@@ -336,7 +381,9 @@ def test_a_server_that_answers_wrongly_is_a_policy_that_crashed(hub: Connection)
 
 
 def answer_to(one: AskAct, **other: Any) -> bytes:
-    return encode_asked(msgspec.structs.replace(Answer(*one.signature, one.step, 1.0, 0.0), **other))
+    return encode_asked(
+        msgspec.structs.replace(Answer(*one.signature, one.step, 1.0, 0.0), **other)
+    )
 
 
 def begin(one: AskAct | AskReset) -> bytes:
@@ -350,27 +397,40 @@ def liar(hub: Connection, answer: Callable[[AskAct], bytes]) -> Iterator[Session
     below = policy_key("default", "wrong", "s")
     with open_session(hub) as session:
         session.serve(f"{below}/info", lambda _: encode_asked(info), found=True)
-        session.serve(f"{below}/reset", lambda asked: begin(msgspec.msgpack.decode(asked, type=AskReset)))
-        session.serve(f"{below}/act", lambda asked: answer(msgspec.msgpack.decode(asked, type=AskAct)))
+        session.serve(
+            f"{below}/reset", lambda asked: begin(msgspec.msgpack.decode(asked, type=AskReset))
+        )
+        session.serve(
+            f"{below}/act", lambda asked: answer(msgspec.msgpack.decode(asked, type=AskAct))
+        )
         yield session
 
 
 @pytest.mark.engine
 def test_what_a_stranger_sends_is_refused_and_changes_nothing(hub: Connection) -> None:
-    """Garbage, depth without end, an episode that did not begin, a question to everybody: refused; a run goes on."""
+    """Garbage, depth without end, an episode that did not begin, a question to everybody: refused;
+    a run goes on."""
     policy = Counting()
     with served(hub, policy), driver_at(hub) as driver, open_session(hub) as stranger:
         driver.reset("k1", 7)
-        (key,) = stranger.answers(f"{policy_key('default', 'counting', '*')}/info", timeout_s=PATIENCE_S)
+        (key,) = stranger.answers(
+            f"{policy_key('default', 'counting', '*')}/info", timeout_s=PATIENCE_S
+        )
         key = key.removesuffix("info") + "act"
         sign = ("other", "k9", "a")
         for payload in (
-            b"", b"\xdf\xff\xff\xff\xff", b"\x91" * 100_000, encode_asked(AskAct(*sign, 0, 0, 0.0, 0.0, 0.0)),
-        ):  # fmt: skip
+            b"",
+            b"\xdf\xff\xff\xff\xff",
+            b"\x91" * 100_000,
+            encode_asked(AskAct(*sign, 0, 0, 0.0, 0.0, 0.0)),
+        ):
             heard = stranger.ask_once(key, payload, timeout_s=PATIENCE_S)
             assert heard.how == "refused" and isinstance(decode_answered(heard.payload), Refusal)
         everybody = key.rpartition("/")[0].rpartition("/")[0] + "/**"
-        assert stranger.ask_once(everybody, b"", timeout_s=PATIENCE_S).how in ("refused", "answered")
+        assert stranger.ask_once(everybody, b"", timeout_s=PATIENCE_S).how in (
+            "refused",
+            "answered",
+        )
         assert driver.act(seen_at(0)) == Command(0.1, 0.0) and policy.asked == ["k1"]
 
 
@@ -383,19 +443,27 @@ def test_pictures_come_as_jpeg_to_who_asks_for_that(hub: Connection) -> None:
         driver.reset("k1", 7)
         driver.act(Observation(0, 0.0, smooth, 0.0, 0.0, COURIER, goal=PointGoal(1.0, 2.0)))
         assert driver.runs == "remote, jpeg" and policy.seen.goal.x_m == 1.0
-        assert np.abs(policy.seen.rgb.astype(int) - smooth).max() < 12 and not (policy.seen.rgb == smooth).all()
+        assert (
+            np.abs(policy.seen.rgb.astype(int) - smooth).max() < 12
+            and not (policy.seen.rgb == smooth).all()
+        )
 
 
 @pytest.mark.engine
-def test_a_policy_that_is_not_served_or_not_enough_is_said(hub: Connection, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nobody there, no endpoint, one that knows everything, too many jobs for an object: before anything is started."""
+def test_a_policy_that_is_not_served_or_not_enough_is_said(
+    hub: Connection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody there, no endpoint, one that knows everything, too many jobs for an object: before
+    anything is started."""
     monkeypatch.setattr(remote, "_FIRST_FOUND_WITHIN_S", 0.2)
     at = PolicyHost(servers=(hub,))
     with pytest.raises(MachineError, match="no server of policy 'counting' at unixsock"):
         known_driver("zenoh:counting", at)
     with pytest.raises(UsageError, match="needs --policy-at ENDPOINT"):
         known_driver("zenoh:counting", PolicyHost())
-    with pytest.raises(UsageError, match="--policy-at goes with --policy zenoh:NAME, not with 'route'"):
+    with pytest.raises(
+        UsageError, match="--policy-at goes with --policy zenoh:NAME, not with 'route'"
+    ):
         known_driver("route", at)
     with (
         served(hub, Counting()),
@@ -403,18 +471,30 @@ def test_a_policy_that_is_not_served_or_not_enough_is_said(hub: Connection, monk
     ):
         known_driver("zenoh:counting", at, 4)
     knows = Counting.manifest | {"privileged": True}
-    with served(hub, Counting(), told=knows), pytest.raises(UsageError, match="a remote one sees only observations"):
+    with (
+        served(hub, Counting(), told=knows),
+        pytest.raises(UsageError, match="a remote one sees only observations"),
+    ):
         known_driver("zenoh:counting", at)
     large = Counting.manifest | {"camera": {"width": 2000, "height": 2000}}
-    with served(hub, Counting(), told=large), pytest.raises(UsageError, match="MiB of pictures a step"):
+    with (
+        served(hub, Counting(), told=large),
+        pytest.raises(UsageError, match="MiB of pictures a step"),
+    ):
         known_driver("zenoh:counting", at)
 
 
 def test_a_server_beyond_this_machine_is_guarded_or_insecure_in_so_many_words() -> None:
     """`serve` refuses it, and no endpoint, and two, and a name that cannot stand in a key."""
-    with pytest.raises(ValueError, match="is beyond this machine and unguarded: whoever can reach it may ask"):
+    with pytest.raises(
+        ValueError, match="is beyond this machine and unguarded: whoever can reach it may ask"
+    ):
         serve(Counting(), listen="tcp/0.0.0.0:7449")
-    for ends in ({}, {"listen": "tcp/127.0.0.1:1", "connect": "tcp/127.0.0.1:1"}, {"listen": "udp/127.0.0.1:1"}):
+    for ends in (
+        {},
+        {"listen": "tcp/127.0.0.1:1", "connect": "tcp/127.0.0.1:1"},
+        {"listen": "udp/127.0.0.1:1"},
+    ):
         with pytest.raises(ValueError, match="listen or connect, one of both"):
             serve(Counting(), **ends)
     with pytest.raises(ValueError, match="cannot stand in a key"):
@@ -422,7 +502,8 @@ def test_a_server_beyond_this_machine_is_guarded_or_insecure_in_so_many_words() 
 
 
 def test_an_object_answers_for_one_episode_at_a_time_and_a_class_for_many() -> None:
-    """The second episode finds an object busy; of a class there is an object for each, and it is used again."""
+    """The second episode finds an object busy; of a class there is an object for each, and it is
+    used again."""
     made: list[Counting] = []
 
     class Made(Counting):
@@ -435,7 +516,8 @@ def test_an_object_answers_for_one_episode_at_a_time_and_a_class_for_many() -> N
         told = decode_answered(reply)
         return told.why if isinstance(told, Refusal) else "begun"
 
-    one, many = PolicyDesk(Counting()), PolicyDesk(Made)
+    one = PolicyDesk(Counting())
+    many = PolicyDesk(Made)
     assert [begun(one, name) for name in ("k1", "k1", "k2")] == ["begun", "begun", "busy"]
     assert [begun(many, name) for name in ("k1", "k2")] == ["begun", "begun"] and len(made) == 2
     act = AskAct("r", "k2", "a", 0, 0, 0.0, 0.0, 0.0, arrays={"rgb": packed(RGB)})
@@ -445,17 +527,32 @@ def test_an_object_answers_for_one_episode_at_a_time_and_a_class_for_many() -> N
 
 @pytest.mark.engine
 def test_cosim_serve_is_asked_beside_others_where_one_listens(tmp_path: Path) -> None:
-    """Two processes, one listening and one connecting to it, answer for one policy with what cosim gives policies; one
-    that is told what the simulator knows is refused."""
+    """Two processes, one listening and one connecting to it, answer for one policy with what cosim
+    gives policies; one that is told what the simulator knows is refused."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    words = [sys.executable, "-m", "cosim", "serve", "tests.scenarios.isolated_policies:Honest", "--name", "both"]
+    words = [
+        sys.executable,
+        "-m",
+        "cosim",
+        "serve",
+        "tests.support.isolated_policies:Honest",
+        "--name",
+        "both",
+    ]
     at = Connection(role="coordinator", connect=endpoint)
     with (
-        subprocess.Popen([*words, "--listen", endpoint], cwd=ROOT, stdout=subprocess.PIPE, text=True) as one,
-        subprocess.Popen([*words, "--connect", endpoint], cwd=ROOT, stdout=subprocess.PIPE, text=True) as other,
+        subprocess.Popen(
+            [*words, "--listen", endpoint], cwd=ROOT, stdout=subprocess.PIPE, text=True
+        ) as one,
+        subprocess.Popen(
+            [*words, "--connect", endpoint], cwd=ROOT, stdout=subprocess.PIPE, text=True
+        ) as other,
     ):
         try:
-            assert one.stdout is not None and "policy 'both' answers at tcp/127.0.0.1:" in one.stdout.readline()
+            assert (
+                one.stdout is not None
+                and "policy 'both' answers at tcp/127.0.0.1:" in one.stdout.readline()
+            )
             assert other.stdout is not None and "stop with Ctrl-C" in other.stdout.readline()
             servers = PolicyServers("both", PolicyHost(servers=(at,)))
             wait_until(lambda: len(servers.know(PATIENCE_S)) == 2)
@@ -476,7 +573,10 @@ def test_a_policy_that_knows_everything_is_not_served(cosim: Cosim) -> None:
     said = cosim("serve", "route")
     assert said.returncode == 2 and "a remote one sees only observations" in said.stderr
     said = cosim("run", "unit", "--policy", "stop", "--policy-at", "tcp/127.0.0.1:7449")
-    assert said.returncode == 2 and "--policy-at goes with --policy zenoh:NAME, not with 'stop'" in said.stderr
+    assert (
+        said.returncode == 2
+        and "--policy-at goes with --policy zenoh:NAME, not with 'stop'" in said.stderr
+    )
     said = cosim("serve", "stop", "--listen", "tcp/0.0.0.0:7449")
     assert said.returncode == 2 and "is beyond this machine and unguarded" in said.stderr
 

@@ -1,4 +1,5 @@
-"""The ways to step into a live run as docs/viewing.md, `--help` and the run itself print them, on one scenario."""
+"""The ways to step into a live run as docs/viewing.md, `--help` and the run itself print them, on
+one scenario."""
 
 from __future__ import annotations
 
@@ -11,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from cosim.cli.options.endpoint import reached_by
+from cosim.cli.options import reached_by
 from cosim.spec.connection import Connection
-from tests.bridge.security.plain import free_port
 from tests.conftest import PATIENCE_S, Cosim
-from tests.documents import text_of
+from tests.support.documents import text_of
+from tests.support.plain import free_port
 
 SECTION = re.search(r"\n## Live injection\n(.*?)\n## ", text_of("docs/viewing.md"), re.DOTALL)
 WRITTEN = "tcp/127.0.0.1:7447"
@@ -23,22 +24,31 @@ WRITTEN = "tcp/127.0.0.1:7447"
 
 
 def examples_in(text: str, name: str, at: str) -> list[list[str]]:
-    """The words of the commands `cosim NAME` of a text, for the address `at`; those over a network are left out."""
+    """The words of the commands `cosim NAME` of a text, for the address `at`; those over a network
+    are left out."""
     lines = re.findall(rf"^ *(?:\.venv/bin/)?cosim ({name} .*)$", text, re.MULTILINE)
-    found = [shlex.split(line.replace(WRITTEN, at), comments=True) for line in lines if "--tls" not in line]
+    found = [
+        shlex.split(line.replace(WRITTEN, at), comments=True)
+        for line in lines
+        if "--tls" not in line
+    ]
     return [words if at in words else [*words, "--connect", at] for words in found]
 
 
 @pytest.mark.engine
-def test_the_examples_of_documents_and_help_step_into_the_first_scenario(tmp_path: Path, cosim: Cosim) -> None:
-    """Run, inject, listen and the Python script of the page, the examples of `cosim inject --help`, and the command
-    that the run prints: each is accepted as written, but for the address."""
+def test_the_examples_of_documents_and_help_step_into_the_first_scenario(
+    tmp_path: Path, cosim: Cosim
+) -> None:
+    """Run, inject, listen and the Python script of the page, the examples of `cosim inject --help`,
+    and the command that the run prints: each is accepted as written, but for the address."""
     assert SECTION is not None
-    at, (script,) = f"tcp/127.0.0.1:{free_port()}", re.findall(r"```python\n(.*?)```", SECTION[1], re.DOTALL)
+    at = f"tcp/127.0.0.1:{free_port()}"
+    (script,) = re.findall(r"```python\n(.*?)```", SECTION[1], re.DOTALL)
     (tmp_path / "bob.py").write_text(script.replace(WRITTEN, at))
     (tmp_path / "pedestrian.json").write_text('{"id": "emil", "path": [{"ahead": 8}]}')
     (run,) = (words for words in examples_in(SECTION[1], "run", at) if "--live" in words)
-    accepted, said = [], ""
+    accepted = []
+    said = ""
     with subprocess.Popen(
         [sys.executable, "-m", "cosim", *run], cwd=tmp_path, stderr=subprocess.PIPE, text=True
     ) as running:
@@ -47,31 +57,44 @@ def test_the_examples_of_documents_and_help_step_into_the_first_scenario(tmp_pat
             while "cosim inject" not in said:
                 said += (line := running.stderr.readline())
                 assert line, said
-            waits = cosim("listen", "events", "--connect", at, "--wait", str(PATIENCE_S), "--seconds", "0")
+            waits = cosim(
+                "listen", "events", "--connect", at, "--wait", str(PATIENCE_S), "--seconds", "0"
+            )
             assert waits.returncode == 0, waits.stderr
             texts = SECTION[1], cosim("inject", "--help").stdout, said
             examples = [words for text in texts for words in examples_in(text, "inject", at)]
             assert len(examples) >= 5
             for example in examples:
                 sent = cosim(*example, cwd=tmp_path)
-                assert sent.returncode == 0 and "enters at tick" in sent.stdout, (example, sent.stderr)
+                assert sent.returncode == 0 and "enters at tick" in sent.stdout, (
+                    example,
+                    sent.stderr,
+                )
                 accepted += re.findall(r"'(\w+)' enters", sent.stdout)
             python = subprocess.run(
-                [sys.executable, "bob.py"], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S
+                [sys.executable, "bob.py"],
+                cwd=tmp_path,
+                capture_output=True,
+                text=True,
+                timeout=PATIENCE_S,
             )
             assert json.loads(python.stdout)["status"] == "accepted", python
             (listen,) = examples_in(SECTION[1], "listen", at)
             with subprocess.Popen(
                 [sys.executable, "-m", "cosim", *listen], stdout=subprocess.PIPE, text=True
             ) as listening:
-                assert listening.stdout is not None and "x_m" in json.loads(listening.stdout.readline())
+                assert listening.stdout is not None and "x_m" in json.loads(
+                    listening.stdout.readline()
+                )
                 listening.kill()
             told = cosim("listen", "events", "--connect", at, "--seconds", "0").stdout
         finally:
             running.kill()
     injected = [one["injection"] for one in json.loads(told.splitlines()[0])["injections"]]
     assert {one["id"] for one in injected} == {*accepted, "bob"}
-    assert all(isinstance(number, float) for one in injected for point in one["path"] for number in point)
+    assert all(
+        isinstance(number, float) for one in injected for point in one["path"] for number in point
+    )
     assert "held to 1 x real time" in said and f"On the air at {at}" in said
 
 
@@ -82,20 +105,30 @@ def test_the_examples_of_documents_and_help_step_into_the_first_scenario(tmp_pat
         ("unixsock-stream//tmp/a b.sock", {}, "--connect 'unixsock-stream//tmp/a b.sock'"),
         ("tcp/0.0.0.0:7447", {"insecure": True}, "--connect tcp/127.0.0.1:7447"),
         ("tcp/10.0.0.5:7447", {"insecure": True}, "--connect tcp/10.0.0.5:7447 --insecure"),
-        ("tls/hub.lan:7447", {"tls": "certs/coordinator"}, "--connect tls/hub.lan:7447 --tls certs/injector"),
+        (
+            "tls/hub.lan:7447",
+            {"tls": "certs/coordinator"},
+            "--connect tls/hub.lan:7447 --tls certs/injector",
+        ),
     ],
     ids=["this machine", "a socket", "all addresses", "another address", "tls"],
 )
-def test_the_printed_command_reaches_the_run(listen: str, how: dict[str, object], words: str) -> None:
-    """An address that stands for all is replaced by one to connect to; certificates are those of the role beside."""
+def test_the_printed_command_reaches_the_run(
+    listen: str, how: dict[str, object], words: str
+) -> None:
+    """An address that stands for all is replaced by one to connect to; certificates are those of
+    the role beside."""
     hub = Connection(role="coordinator", listen=listen, **how)  # type: ignore[arg-type]
     assert reached_by(hub, "injector") == f" {words}"
 
 
 def test_the_printed_command_names_the_host_of_the_certificate(tmp_path: Path) -> None:
-    """A hub that listens at all addresses with TLS is reached by the first name in its certificate."""
+    """A hub that listens at all addresses with TLS is reached by the first name in its
+    certificate."""
     from bridge.security.authority import make_authority
 
     make_authority(tmp_path / "certs", ["hub.lan", "10.0.0.7"], 1)
-    hub = Connection(role="coordinator", listen="tls/0.0.0.0:7447", tls=str(tmp_path / "certs" / "coordinator"))
+    hub = Connection(
+        role="coordinator", listen="tls/0.0.0.0:7447", tls=str(tmp_path / "certs" / "coordinator")
+    )
     assert reached_by(hub, "viewer") == f" --connect tls/hub.lan:7447 --tls {tmp_path}/certs/viewer"

@@ -1,4 +1,5 @@
-"""Names of files and folders that cannot be: one clear line, exit code 2, before any work is done."""
+"""Names of files and folders that cannot be: one clear line, exit code 2, before any work is
+done."""
 
 from __future__ import annotations
 
@@ -34,10 +35,16 @@ READS: tuple[tuple[str, ...], ...] = (
 )
 
 
-@pytest.mark.parametrize("words", [*WRITES, *READS], ids=lambda words: " ".join(words).replace(LONG, "LONG"))
-def test_a_name_that_is_too_long_is_refused_in_one_line(tmp_path: Path, cosim: Cosim, words: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(
+    "words", [*WRITES, *READS], ids=lambda words: " ".join(words).replace(LONG, "LONG")
+)
+def test_a_name_that_is_too_long_is_refused_in_one_line(
+    tmp_path: Path, cosim: Cosim, words: tuple[str, ...]
+) -> None:
     """Whatever it names, to be written or read: exit code 2, no traceback, and nothing is left."""
-    (tmp_path / "mine.toml").write_text('name = "mine"\n[place]\ncity = 1\n[way]\nkind = "straight"\n')
+    (tmp_path / "mine.toml").write_text(
+        'name = "mine"\n[place]\ncity = 1\n[way]\nkind = "straight"\n'
+    )
     said = cosim(*words, cwd=tmp_path)
     assert said.returncode == 2, said
     assert said.stderr.strip().splitlines()[-1].startswith("error: "), said
@@ -63,4 +70,6 @@ def test_a_file_in_the_place_of_a_folder_is_refused_in_one_line(
     said = cosim(*words, cwd=tmp_path)
     assert said.returncode in (2, 3), said
     assert said.stderr.strip().splitlines()[-1].startswith("error: "), said
-    assert {path.name for path in tmp_path.iterdir()} == {"file"} and (tmp_path / "file").read_text() == "mine"
+    assert {path.name for path in tmp_path.iterdir()} == {"file"} and (
+        tmp_path / "file"
+    ).read_text() == "mine"

@@ -20,8 +20,8 @@ import pytest
 from cosim import run
 from cosim.core.whole_file import write_whole
 from cosim.place.walk_graph import WalkGraph
+from cosim.spec.episode_id import pseudonym_of
 from cosim.spec.options import EpisodeOptions
-from cosim.spec.pseudonym import pseudonym_of
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, read_suite, write_suite
 from tests.conftest import PATIENCE_S, WIDE, Cosim, seed_in_order
 
@@ -31,7 +31,7 @@ POLICIES = """
 import json, os, signal, time
 from pathlib import Path
 import numpy as np
-from cosim.episode.ports import Manifest
+from cosim.spec.manifest import Manifest
 from cosim.core.state import Command
 
 class Base:
@@ -54,7 +54,7 @@ class Held(Base):
 class DiesLate(Base):
     # takes its process down right after the record of t-1 is sent, and once in the middle of that of t-2
     def act(self, observation):
-        from cosim.core.wire import Wire
+        from cosim.core.framing import Wire
         send = Wire.send
         def dying(wire, message):
             done = b"Done" in message[:20] and len(message) > 2000
@@ -77,9 +77,10 @@ SEED = "2"
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A user's folder: a suite of three short scenarios, one of four, and a module with policies."""
-    from scenarios.builders.long_horizon import build_long_horizon
-    from scenarios.execution.places import place
+    """A user's folder: a suite of three short scenarios, one of four, and a module with
+    policies."""
+    from scenarios.places.nets import place
+    from scenarios.suites.long_horizon import build_long_horizon
 
     folder = tmp_path_factory.mktemp("desk")
     city = City(seed=1, size_m=500.0)
@@ -92,7 +93,10 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         crowd = CrowdSpec(persons=8, radius_m=50.0, vehicles=2)
         scenarios.append(Scenario(**fields | {"crowd": crowd, "time_limit_s": 1.0}))
     for name, count in (("tiny", 3), ("four", 4)):
-        write_suite(Suite(name=name, version="1", scenarios=tuple(scenarios[:count])), folder / f"{name}.json")
+        write_suite(
+            Suite(name=name, version="1", scenarios=tuple(scenarios[:count])),
+            folder / f"{name}.json",
+        )
     assert seed_in_order(scenarios) == int(SEED)
     names = {pseudonym_of(int(SEED), scenario).episode: scenario.id for scenario in scenarios}
     (folder / "names.json").write_text(json.dumps(names))
@@ -105,7 +109,10 @@ def rows(folder: Path) -> pd.DataFrame:
 
 
 def hashes(folder: Path) -> dict[str, str]:
-    return {p.parent.name: json.loads(p.read_text())["state_hash"] for p in folder.glob("episodes/*/record.json")}
+    return {
+        p.parent.name: json.loads(p.read_text())["state_hash"]
+        for p in folder.glob("episodes/*/record.json")
+    }
 
 
 def wait_for(condition: Callable[[], object]) -> None:
@@ -120,9 +127,14 @@ def running(desk: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
     """A run that is going on, and is killed in the end."""
     command = [sys.executable, "-m", "cosim", "run", *words]
     run = subprocess.Popen(
-        command, cwd=desk, env=os.environ | WIDE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+        command,
+        cwd=desk,
+        env=os.environ | WIDE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
         preexec_fn=hear_interrupts,
-    )  # fmt: skip
+    )
     try:
         yield run
     finally:
@@ -133,7 +145,8 @@ def running(desk: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
 @contextmanager
 def held_before(desk: Path, scenario: str) -> Iterator[Callable[[], bool]]:
     """Policy Held waits before this scenario. Gives whether it does so already."""
-    hold, waits = desk / f"hold-{scenario}", desk / "waits"
+    hold = desk / f"hold-{scenario}"
+    waits = desk / "waits"
     hold.touch()
     try:
         yield waits.exists
@@ -146,7 +159,17 @@ def held_before(desk: Path, scenario: str) -> Iterator[Callable[[], bool]]:
 def whole_run(desk: Path, cosim: Cosim) -> Path:
     """The tiny suite, run without interruption by one process, the camera on."""
     done = cosim(
-        "run", "tiny.json", "--policy", "straight", "--camera", "bullet", "--seed", SEED, "--out", "whole", cwd=desk
+        "run",
+        "tiny.json",
+        "--policy",
+        "straight",
+        "--camera",
+        "bullet",
+        "--seed",
+        SEED,
+        "--out",
+        "whole",
+        cwd=desk,
     )
     assert done.returncode == 0, done.stderr
     return desk / "whole"
@@ -163,8 +186,11 @@ def unbroken(desk: Path, cosim: Cosim) -> bytes:
     return (desk / "unbroken/results.csv").read_bytes()
 
 
-def test_a_run_prints_its_table_and_leaves_its_folder(desk: Path, cosim: Cosim, whole_run: Path) -> None:
-    """Rows, records, trajectories and specs are there; `show` prints the table again, `score` computes it again."""
+def test_a_run_prints_its_table_and_leaves_its_folder(
+    desk: Path, cosim: Cosim, whole_run: Path
+) -> None:
+    """Rows, records, trajectories and specs are there; `show` prints the table again, `score`
+    computes it again."""
     table = rows(whole_run)
     assert list(table.index) == ["t-0", "t-1", "t-2"]
     assert set(table["status"]) == {"done"}
@@ -173,18 +199,40 @@ def test_a_run_prints_its_table_and_leaves_its_folder(desk: Path, cosim: Cosim, 
         assert (whole_run / "episodes" / name / "trajectory.npz").exists()
     shown = cosim("show", "whole", cwd=desk)
     assert (
-        shown.returncode == 0 and "t-2" in shown.stdout and "scheduled 3, scored 3, of these crashed 0" in shown.stdout
+        shown.returncode == 0
+        and "t-2" in shown.stdout
+        and "scheduled 3, scored 3, of these crashed 0" in shown.stdout
     )
-    other = cosim("run", "tiny.json", "--policy", "straight", "--episodes", "2", "--out", "whole", "--resume", cwd=desk)
-    assert other.returncode == 2 and "is 3 of 3 (all), now asked for is 2 of 3 (--episodes 2)." in other.stderr
+    other = cosim(
+        "run",
+        "tiny.json",
+        "--policy",
+        "straight",
+        "--episodes",
+        "2",
+        "--out",
+        "whole",
+        "--resume",
+        cwd=desk,
+    )
+    assert (
+        other.returncode == 2
+        and "is 3 of 3 (all), now asked for is 2 of 3 (--episodes 2)." in other.stderr
+    )
     again = cosim("score", "whole", cwd=desk)
-    assert again.returncode == 0 and "3 episodes" in again.stdout and "equal to the bit" in again.stdout
+    assert (
+        again.returncode == 0
+        and "3 episodes" in again.stdout
+        and "equal to the bit" in again.stdout
+    )
     one = cosim("show", "whole", "--episode", "t-0", "-o", "above.png", cwd=desk)
     assert one.returncode == 0, one.stderr
     assert (desk / "above.png").stat().st_size > 5000
 
 
-def test_the_same_run_gives_the_same_bits_on_any_number_of_processes(desk: Path, cosim: Cosim, whole_run: Path) -> None:
+def test_the_same_run_gives_the_same_bits_on_any_number_of_processes(
+    desk: Path, cosim: Cosim, whole_run: Path
+) -> None:
     """State hashes and rows are identical for one process and for two."""
     words = (
         "run",
@@ -223,11 +271,14 @@ def test_shards_that_are_merged_are_the_run(desk: Path, cosim: Cosim, whole_run:
     assert (desk / "merged/run.json").read_bytes() == (whole_run / "run.json").read_bytes()
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM], ids=lambda how: how.name)
+@pytest.mark.parametrize(
+    "how", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM], ids=lambda how: how.name
+)
 def test_an_interrupted_run_is_finished_by_resume(
     desk: Path, cosim: Cosim, unbroken: bytes, how: signal.Signals
 ) -> None:
-    """Killed or stopped in the middle, then resumed: no episode is run twice or lost, and the table is the same."""
+    """Killed or stopped in the middle, then resumed: no episode is run twice or lost, and the table
+    is the same."""
     out = desk / f"broken-{how.name}"
     with held_before(desk, "t-1") as waits, running(desk, *HELD, out.name) as run:
         wait_for(waits)
@@ -235,7 +286,10 @@ def test_an_interrupted_run_is_finished_by_resume(
         said = run.communicate(timeout=PATIENCE_S)[1]
         if how != signal.SIGKILL:
             assert run.returncode == 130
-            assert f"--out {out.name} --resume" in said and "1 of 2 episodes are finished and kept" in said
+            assert (
+                f"--out {out.name} --resume" in said
+                and "1 of 2 episodes are finished and kept" in said
+            )
         kept = (out / "episodes/t-0/record.json").stat().st_mtime_ns
         wait_for(lambda: not alive(out))
     if how == signal.SIGTERM:
@@ -247,8 +301,11 @@ def test_an_interrupted_run_is_finished_by_resume(
 
 
 @pytest.mark.parametrize("when", ["its process starts", "its first episode starts"])
-def test_a_run_killed_at_its_start_leaves_no_false_crash(desk: Path, cosim: Cosim, unbroken: bytes, when: str) -> None:
-    """A kill while the first environment process comes up loses nothing, and resuming gives the same table."""
+def test_a_run_killed_at_its_start_leaves_no_false_crash(
+    desk: Path, cosim: Cosim, unbroken: bytes, when: str
+) -> None:
+    """A kill while the first environment process comes up loses nothing, and resuming gives the
+    same table."""
     out = desk / when.replace(" ", "-")
     with held_before(desk, "t-0") as waits, running(desk, *HELD, out.name) as run:
         wait_for(lambda: children(run.pid))
@@ -273,22 +330,35 @@ def children(pid: int) -> list[int]:
     task = Path(f"/proc/{pid}/task/{pid}/children")
     pids = [int(word) for word in task.read_text().split()] if task.exists() else []
     lines = {p: Path(f"/proc/{p}/cmdline") for p in pids}
-    return [p for p, line in lines.items() if line.exists() and b"scenarios.execution.shepherd" in line.read_bytes()]
+    return [
+        p
+        for p, line in lines.items()
+        if line.exists() and b"scenarios.ipc.supervisor" in line.read_bytes()
+    ]
 
 
 def test_an_episode_finished_before_its_process_died_is_kept(desk: Path, cosim: Cosim) -> None:
-    """A process that dies after sending its record has finished the episode: it is neither run again nor crashed. One
-    that dies while it sends has not: half a record is none, and the episode is run again."""
+    """A process that dies after sending its record has finished the episode: it is neither run
+    again nor crashed. One that dies while it sends has not: half a record is none, and the episode
+    is run again."""
     out = desk / "late"
-    run = cosim("run", "tiny.json", "--policy", "mine:DiesLate", "--seed", SEED, "--out", out.name, cwd=desk)
+    run = cosim(
+        "run", "tiny.json", "--policy", "mine:DiesLate", "--seed", SEED, "--out", out.name, cwd=desk
+    )
     assert run.returncode == 0, run.stdout
     assert list(rows(out)["status"]) == ["done", "done", "done"] and (desk / "half").exists()
-    assert sorted(p.name for p in out.glob("logs/*")) == ["worker-0.log", "worker-1.log", "worker-2.log"]
+    assert sorted(p.name for p in out.glob("logs/*")) == [
+        "worker-0.log",
+        "worker-1.log",
+        "worker-2.log",
+    ]
 
 
-def test_a_full_disk_ends_the_run_with_the_reason(desk: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_ends_the_run_with_the_reason(
+    desk: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """When a record cannot be written the run stops, says why, and keeps what is finished."""
-    from cosim.records import run_folder
+    from cosim.results import run_folder
 
     def full(path: Path, data: bytes) -> None:
         if path.parent.name == "t-1":
@@ -298,9 +368,21 @@ def test_a_full_disk_ends_the_run_with_the_reason(desk: Path, cosim: Cosim, monk
     out = desk / "full"
     monkeypatch.setattr(run_folder, "write_whole", full)
     run = cosim(
-        "run", "tiny.json", "--policy", "straight", "--camera", "bullet", "--seed", SEED, "--out", out.name, cwd=desk
+        "run",
+        "tiny.json",
+        "--policy",
+        "straight",
+        "--camera",
+        "bullet",
+        "--seed",
+        SEED,
+        "--out",
+        out.name,
+        cwd=desk,
     )
-    assert run.returncode == 3 and "No space left on device" in run.stderr and "--resume" in run.stderr
+    assert (
+        run.returncode == 3 and "No space left on device" in run.stderr and "--resume" in run.stderr
+    )
     assert "Traceback" not in run.stderr
     assert json.loads((out / "episodes/t-0/record.json").read_text())["status"] == "done"
 
@@ -328,14 +410,23 @@ def test_a_second_run_on_the_same_folder_is_refused(desk: Path, cosim: Cosim) ->
         assert third.returncode == 2 and "already holds a run. Add --resume" in third.stderr
 
 
-def test_names_that_do_not_exist_are_answered_with_those_that_do(desk: Path, cosim: Cosim, whole_run: Path) -> None:
-    """Unknown suites, policies, scenarios, runs and episodes: exit 2, the name, and the valid choices."""
+def test_names_that_do_not_exist_are_answered_with_those_that_do(
+    desk: Path, cosim: Cosim, whole_run: Path
+) -> None:
+    """Unknown suites, policies, scenarios, runs and episodes: exit 2, the name, and the valid
+    choices."""
     asked = {
         ("run", "short-horizon"): ("suite 'short-horizon'", "long-horizon"),
         ("run", "tiny.json", "--policy", "rout"): ("policy 'rout'", "social_force, stop, straight"),
         ("run", "tiny.json", "--policy", "mine:Hel"): ("'Hel'", "Held"),
-        ("run", "tiny.json", "--policy", "nowhere:X"): ("module 'nowhere' cannot be imported", "ModuleNotFoundError"),
-        ("run", "tiny.json", "--policy", "mine:Unfinished"): ("'mine:Unfinished' has no attribute 'manifest'", ""),
+        ("run", "tiny.json", "--policy", "nowhere:X"): (
+            "module 'nowhere' cannot be imported",
+            "ModuleNotFoundError",
+        ),
+        ("run", "tiny.json", "--policy", "mine:Unfinished"): (
+            "'mine:Unfinished' has no attribute 'manifest'",
+            "",
+        ),
         ("run", "tiny.json", "--scenario", "t-9"): ("scenario 't-9'", "t-0, t-1, t-2"),
         ("run", "tiny.json", "--goal", "route"): (
             "goal protocol 'route'",
@@ -358,14 +449,20 @@ def test_names_that_do_not_exist_are_answered_with_those_that_do(desk: Path, cos
     [
         ({"route": [[0, 0]]}, "route needs two points"),
         ({"goal": [1.0, 2.0]}, "is not the route's end"),
-        ({"time_limit_s": "long"}, "Expected `float`, got `str` - at `$.scenarios[0].time_limit_s`"),
+        (
+            {"time_limit_s": "long"},
+            "Expected `float`, got `str` - at `$.scenarios[0].time_limit_s`",
+        ),
         ({"crowd": {"persons": -1}}, "crowd persons must be in [0, 1000], not -1"),
         ({"schema": 99}, "has schema 99"),
         (
             {"crowd": {"gruops": 0.4}},
             "unknown field `gruops` - at `$.scenarios[0].crowd`. Valid choices: persons, radius",
         ),
-        ({"ends_at": "noon"}, "Invalid enum value 'noon' - at `$.scenarios[0].ends_at`. Valid choices: goal, stop"),
+        (
+            {"ends_at": "noon"},
+            "Invalid enum value 'noon' - at `$.scenarios[0].ends_at`. Valid choices: goal, stop",
+        ),
         ({"id": "../../elsewhere"}, "scenario id '../../elsewhere' cannot name a folder"),
     ],
 )
@@ -390,12 +487,21 @@ def test_a_suite_without_scenarios_is_refused(desk: Path, cosim: Cosim) -> None:
 
 
 def test_a_run_that_cannot_be_on_the_air_leaves_no_folder(desk: Path, cosim: Cosim) -> None:
-    """A wrong endpoint is told with the remedy, and the same command with a right one is not refused."""
-    said = cosim("run", "tiny.json", "--live", "tcp/192.0.2.1:7447", "--insecure", "--out", "air", cwd=desk)
+    """A wrong endpoint is told with the remedy, and the same command with a right one is not
+    refused."""
+    said = cosim(
+        "run", "tiny.json", "--live", "tcp/192.0.2.1:7447", "--insecure", "--out", "air", cwd=desk
+    )
     assert said.returncode == 3 and not (desk / "air").exists()
-    assert "cannot listen at tcp/192.0.2.1:7447" in said.stderr and "Choose an address of this" in said.stderr
+    assert (
+        "cannot listen at tcp/192.0.2.1:7447" in said.stderr
+        and "Choose an address of this" in said.stderr
+    )
     heard = cosim("listen", "--connect", "7447", cwd=desk)
-    assert heard.returncode == 2 and "--connect '7447': write it as PROTOCOL/ADDRESS:PORT" in heard.stderr
+    assert (
+        heard.returncode == 2
+        and "--connect '7447': write it as PROTOCOL/ADDRESS:PORT" in heard.stderr
+    )
 
 
 def test_ctrl_c_while_the_modules_load_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -412,8 +518,8 @@ def test_ctrl_c_while_the_modules_load_is_no_traceback(monkeypatch: pytest.Monke
 
 
 def test_a_suite_that_does_not_fit_its_place_is_refused(desk: Path, cosim: Cosim) -> None:
-    """A start off the sidewalk, another street net, a robot and a map that nobody knows: told together, before anything
-    runs, and no folder is left."""
+    """A start off the sidewalk, another street net, a robot and a map that nobody knows: told
+    together, before anything runs, and no folder is left."""
     suite = json.loads((desk / "four.json").read_text())
     off, other, robot, unknown = suite["scenarios"]
     off["start"][:2] = off["route"][0] = [-50.0, -50.0]
@@ -426,10 +532,13 @@ def test_a_suite_that_does_not_fit_its_place_is_refused(desk: Path, cosim: Cosim
     head, *faults = said.stderr[said.stderr.index("error: ") :].splitlines()
     assert head == "error: suite 'four': 5 faults:" and len(faults) == 5
     for words in (
-        "scenario 't-0': start is off the walkable area at (-50.00, -50.00)", "scenario 't-0': crossing ",
-        "scenario 't-1': ", "the net's hash is ", "scenario 't-2': unknown robot 'tank'. Valid choices: courier, scout",
+        "scenario 't-0': start is off the walkable area at (-50.00, -50.00)",
+        "scenario 't-0': crossing ",
+        "scenario 't-1': ",
+        "the net's hash is ",
+        "scenario 't-2': unknown robot 'tank'. Valid choices: courier, scout",
         "scenario 't-3': unknown map 'atlantis'",
-    ):  # fmt: skip
+    ):
         assert sum(words in fault for fault in faults) == 1, (words, faults)
 
 
@@ -440,19 +549,35 @@ def test_the_doctor_finds_every_engine_well(desk: Path, fresh_cosim: Cosim) -> N
     assert said.stdout.count("ok") >= 6 and "failed" not in said.stdout
 
 
-def test_a_run_without_a_seed_draws_one_keeps_it_and_goes_on_with_it(desk: Path, cosim: Cosim) -> None:
-    """Another one each time: printed, in run.json, in every row; --resume takes it from there and refuses another."""
+def test_a_run_without_a_seed_draws_one_keeps_it_and_goes_on_with_it(
+    desk: Path, cosim: Cosim
+) -> None:
+    """Another one each time: printed, in run.json, in every row; --resume takes it from there and
+    refuses another."""
     told = []
     for out in ("one", "other"):
         run = cosim(
-            "run", "tiny.json", "--policy", "stop", "--camera", "bullet", "--episodes", "1", "--out", out, cwd=desk
+            "run",
+            "tiny.json",
+            "--policy",
+            "stop",
+            "--camera",
+            "bullet",
+            "--episodes",
+            "1",
+            "--out",
+            out,
+            cwd=desk,
         )
         seed = json.loads((desk / out / "run.json").read_text())["seed"]
         assert run.returncode == 0 and f"Seed {seed}: " in run.stderr
         assert list(rows(desk / out)["run_seed"]) == [seed]
         record = json.loads((desk / out / "episodes/t-0/record.json").read_text())
         (scenario,) = read_suite(desk / out / "scenarios.json").scenarios
-        assert (record["run_seed"], record["episode"]) == (seed, pseudonym_of(seed, scenario).episode)
+        assert (record["run_seed"], record["episode"]) == (
+            seed,
+            pseudonym_of(seed, scenario).episode,
+        )
         told.append(seed)
     assert told[0] != told[1]
     again = (
@@ -470,12 +595,23 @@ def test_a_run_without_a_seed_draws_one_keeps_it_and_goes_on_with_it(desk: Path,
     )
     assert f"Seed {told[0]}: " in cosim(*again, cwd=desk).stderr
     refused = cosim(*again, "--seed", "3", cwd=desk)
-    assert refused.returncode == 2 and f"its seed is {told[0]}, now asked for is 3" in refused.stderr
+    assert (
+        refused.returncode == 2 and f"its seed is {told[0]}, now asked for is 3" in refused.stderr
+    )
 
 
 def test_the_record_says_what_it_was_made_with(whole_run: Path) -> None:
-    """Suite and scenario hash, seed, policy, renderer and the version of every engine are in each record."""
+    """Suite and scenario hash, seed, policy, renderer and the version of every engine are in each
+    record."""
     record = msgspec.json.decode((whole_run / "episodes/t-0/record.json").read_bytes())
     assert {"libsumo", "pybullet", "eclipse-zenoh", "numpy"} <= set(record["versions"])
-    for field in ("suite_hash", "scenario_hash", "seed", "policy", "policy_version", "renderer", "state_hash"):
+    for field in (
+        "suite_hash",
+        "scenario_hash",
+        "seed",
+        "policy",
+        "policy_version",
+        "renderer",
+        "state_hash",
+    ):
         assert record[field] not in ("", None)

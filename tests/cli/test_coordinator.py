@@ -25,7 +25,19 @@ def test_what_is_of_one_machine_is_refused_in_words(cosim: Cosim, tmp_path: Path
 
 def test_a_shard_of_a_coordinator_is_one_of_a_run(cosim: Cosim, tmp_path: Path) -> None:
     """It needs the run's seed, and there are no more shards than scenarios."""
-    words = ("coordinator", "reactive", "--policy", "straight", "--episodes", "2", "--listen", "unixsock-stream/hub")
+    words = (
+        "coordinator",
+        "reactive",
+        "--policy",
+        "straight",
+        "--episodes",
+        "2",
+        "--listen",
+        "unixsock-stream/hub",
+    )
     assert "--shard needs --seed" in cosim(*words, "--shard", "1/2", cwd=tmp_path).stderr
-    assert "the run has 2 scenarios" in cosim(*words, "--shard", "1/3", "--seed", "1", cwd=tmp_path).stderr
+    assert (
+        "the run has 2 scenarios"
+        in cosim(*words, "--shard", "1/3", "--seed", "1", cwd=tmp_path).stderr
+    )
     assert not [*tmp_path.iterdir()]

@@ -13,12 +13,21 @@ from cosim.cli.app import main
 from cosim.core import errors
 from cosim.core.errors import CosimError
 from tests.conftest import Cosim
-from tests.documents import text_of
+from tests.support.documents import text_of
 
 CODES = {
-    "UsageError": 2, "SpecError": 2, "MapError": 2, "RunError": 2, "AccessError": 2, "PolicyError": 1, "EngineError": 3,
-    "RendererLost": 3, "PolicyServerLost": 3, "DirectorLost": 3, "MachineError": 3,
-}  # fmt: skip
+    "UsageError": 2,
+    "SpecError": 2,
+    "MapError": 2,
+    "RunError": 2,
+    "AccessError": 2,
+    "PolicyError": 1,
+    "EngineError": 3,
+    "RendererLost": 3,
+    "PolicyServerLost": 3,
+    "DirectorLost": 3,
+    "MachineError": 3,
+}
 
 
 def ended(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
@@ -30,10 +39,17 @@ def ended(monkeypatch: pytest.MonkeyPatch, *words: str) -> int:
 
 
 def test_every_error_has_its_exit_code() -> None:
-    """Each class of the tree has one code, and the tree in the module's docstring tells the same."""
+    """Each class of the tree has one code, and the tree in the module's docstring tells the
+    same."""
     assert {name: vars(errors)[name].exit_code for name in CODES} == CODES
-    classes = {name for name, value in vars(errors).items() if isinstance(value, type) and value.__base__ is not object}
-    assert classes >= set(CODES) and {n for n in classes if issubclass(vars(errors)[n], CosimError)} == {
+    classes = {
+        name
+        for name, value in vars(errors).items()
+        if isinstance(value, type) and value.__base__ is not object
+    }
+    assert classes >= set(CODES) and {
+        n for n in classes if issubclass(vars(errors)[n], CosimError)
+    } == {
         *CODES,
         "CosimError",
     }
@@ -62,7 +78,8 @@ def test_every_error_has_its_exit_code() -> None:
 def test_wrong_use_is_2_and_the_machine_is_3(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], code: int
 ) -> None:
-    """A name, an option, a suite file, a map, a run folder: 2; a place that cannot be written: 3; else 0."""
+    """A name, an option, a suite file, a map, a run folder: 2; a place that cannot be written: 3;
+    else 0."""
     monkeypatch.chdir(tmp_path)
     Path("file").touch()
     Path("broken.json").write_text(json.dumps({"name": 3}))
@@ -72,18 +89,20 @@ def test_wrong_use_is_2_and_the_machine_is_3(
 
 
 @pytest.mark.parametrize(
-    ("raised", "code"), [(CosimError("x"), 3), (errors.PolicyError("x"), 1), (KeyboardInterrupt(), 130)],
+    ("raised", "code"),
+    [(CosimError("x"), 3), (errors.PolicyError("x"), 1), (KeyboardInterrupt(), 130)],
     ids=["an-engine", "a-policy", "ctrl-c"],
-)  # fmt: skip
+)
 def test_what_a_command_raises_is_its_exit_code(
     monkeypatch: pytest.MonkeyPatch, raised: BaseException, code: int
 ) -> None:
-    """An error that reaches the command line ends it with the code of its class; Ctrl-C with 130."""
+    """An error that reaches the command line ends it with the code of its class; Ctrl-C with
+    130."""
 
     def raises(*_: object) -> None:
         raise raised
 
-    monkeypatch.setattr("scenarios.catalog.load_suite", raises)
+    monkeypatch.setattr("scenarios.suites.catalog.load_suite", raises)
     assert ended(monkeypatch, "list") == code
 
 
@@ -92,10 +111,13 @@ def test_a_run_with_fewer_records_than_scenarios_is_no_success(
 ) -> None:
     """However it came about, the scenarios without a record are named and the exit code is 1."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("scenarios.execution.suite_run.run_all", lambda *_, **__: None)
+    monkeypatch.setattr("scenarios.runs.run.run_all", lambda *_, **__: None)
     words = ("run", "reactive", "--policy", "orca", "--episodes", "2", "--out", "run")
     assert ended(monkeypatch, *words) == 1
-    assert "No record of obstructing-001, conversing-001: run it again with --resume" in capsys.readouterr().err
+    assert (
+        "No record of obstructing-001, conversing-001: run it again with --resume"
+        in capsys.readouterr().err
+    )
 
 
 def test_the_documents_list_the_exit_codes() -> None:

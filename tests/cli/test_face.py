@@ -20,25 +20,36 @@ PRODUCT = ("cosim", "sumo_nets", "physics", "bridge", "scenarios")
 
 
 def test_importing_cosim_imports_nothing_but_the_standard_library() -> None:
-    """A new process that imports cosim has loaded no other package, and one file of ours: so it takes no time."""
+    """A new process that imports cosim has loaded no other package, and one file of ours: so it
+    takes no time."""
     told = subprocess.run(
-        [sys.executable, "-c", "import sys; old = set(sys.modules); import cosim; print(*set(sys.modules) - old)"],
+        [
+            sys.executable,
+            "-c",
+            "import sys; old = set(sys.modules); import cosim; print(*set(sys.modules) - old)",
+        ],
         capture_output=True,
         text=True,
         check=True,
         cwd=ROOT,
     ).stdout.split()
     strangers = {name.split(".")[0] for name in told} - set(sys.stdlib_module_names) - {"cosim"}
-    assert not strangers and {n for n in told if n.startswith("cosim")} == {"cosim", "cosim.rounding"}
+    assert not strangers and {n for n in told if n.startswith("cosim")} == {
+        "cosim",
+        "cosim.rounding",
+    }
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=[pytest.mark.engine] * (name in DRIVES)) for name in cosim.__all__]
+    "name",
+    [pytest.param(name, marks=[pytest.mark.engine] * (name in DRIVES)) for name in cosim.__all__],
 )
 def test_the_example_of_every_public_name_is_true(name: str) -> None:
     """Every name of `__all__` says what it is and shows an example, which gives what it says."""
     value = getattr(cosim, name)
-    (shown,) = doctest.DocTestFinder(recurse=False).find(value, name, globs=vars(sys.modules[value.__module__]).copy())
+    (shown,) = doctest.DocTestFinder(recurse=False).find(
+        value, name, globs=vars(sys.modules[value.__module__]).copy()
+    )
     assert shown.examples
     runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.IGNORE_EXCEPTION_DETAIL)
     told = io.StringIO()
@@ -54,7 +65,12 @@ def test_another_name_is_refused_with_the_valid_ones() -> None:
 
 @pytest.mark.parametrize("engine", ["SumoCrowd(", "BulletWorld("])
 def test_engines_are_made_in_one_file(engine: str) -> None:
-    """One wiring: an engine's class is called in one file of the product, and defined in another."""
+    """One wiring: an engine's class is called in one file of the product, and defined in
+    another."""
     files = [path for top in PRODUCT for path in (ROOT / top).rglob("*.py")]
-    calls = [str(p.relative_to(ROOT)) for p in files if re.search(rf"(?<!class )\b{re.escape(engine)}", p.read_text())]
-    assert calls == ["scenarios/execution/wiring.py"]
+    calls = [
+        str(p.relative_to(ROOT))
+        for p in files
+        if re.search(rf"(?<!class )\b{re.escape(engine)}", p.read_text())
+    ]
+    assert calls == ["scenarios/episodes/wiring.py"]

@@ -1,4 +1,5 @@
-"""What the command line says of itself: help with examples, versions; no engine is started for it."""
+"""What the command line says of itself: help with examples, versions; no engine is started for
+it."""
 
 from __future__ import annotations
 
@@ -35,14 +36,17 @@ COMMANDS = dict(commands(get_command(app)))
 
 def said(*words: str) -> str:
     """What `cosim WORDS` prints in a terminal of 80 columns."""
-    result = CliRunner().invoke(app, list(words), terminal_width=80, color=False, env={"COLUMNS": "80"})
+    result = CliRunner().invoke(
+        app, list(words), terminal_width=80, color=False, env={"COLUMNS": "80"}
+    )
     assert result.exit_code == 0, result.output
     return result.output
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
 def test_every_command_has_an_example_of_itself(words: tuple[str, ...]) -> None:
-    """The help ends with an example that begins with the command, and each example's options exist."""
+    """The help ends with an example that begins with the command, and each example's options
+    exist."""
     epilog = COMMANDS[words].epilog or ""
     examples = re.findall(r"`(cosim [^`]+)`", epilog)
     own = [example for example in examples if example.startswith(" ".join(("cosim", *words)))]
@@ -54,7 +58,8 @@ def test_every_command_has_an_example_of_itself(words: tuple[str, ...]) -> None:
 
 @pytest.mark.parametrize("words", [(), ("city",), ("map",), *COMMANDS], ids=" ".join)
 def test_help_is_read_in_80_columns(words: tuple[str, ...]) -> None:
-    """No line is longer, nothing is cut, and no list of choices is broken in the middle of a word."""
+    """No line is longer, nothing is cut, and no list of choices is broken in the middle of a
+    word."""
     lines = said(*words, "--help").splitlines()
     assert max(map(len, lines)) <= 80
     assert not any("…" in line for line in lines)
@@ -63,13 +68,18 @@ def test_help_is_read_in_80_columns(words: tuple[str, ...]) -> None:
 
 def test_h_is_help() -> None:
     """Whoever types -h is helped, everywhere."""
-    assert said("-h") == said("--help") and said("map", "check", "-h") == said("map", "check", "--help")
+    assert said("-h") == said("--help") and said("map", "check", "-h") == said(
+        "map", "check", "--help"
+    )
 
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
 def test_maps_in_examples_are_there_or_imported_by_them(words: tuple[str, ...]) -> None:
-    """Nobody who types an example is told that its map is unknown: it comes with SUMO, or an example imports it."""
-    named = re.findall(r"(?:--map|map check|map endure) ([a-z][\w-]*)", COMMANDS[words].epilog or "")
+    """Nobody who types an example is told that its map is unknown: it comes with SUMO, or an
+    example imports it."""
+    named = re.findall(
+        r"(?:--map|map check|map endure) ([a-z][\w-]*)", COMMANDS[words].epilog or ""
+    )
     imported = re.findall(r"map import ([\w-]+)[.]", COMMANDS["map", "import"].epilog)
     assert all(name.startswith("sumo-") or name in imported for name in named), named
 
@@ -84,26 +94,35 @@ def test_what_a_newcomer_needs_comes_first() -> None:
 
 
 def test_the_version_is_said_without_an_engine() -> None:
-    """`cosim --version` names the project, Python and the engines; it imports no engine and no pandas."""
+    """`cosim --version` names the project, Python and the engines; it imports no engine and no
+    pandas."""
     code = (
-        "import sys\n"
-        "from typer.testing import CliRunner\n"
-        "from cosim.cli.app import app\n"
-        "print(CliRunner().invoke(app, ['--version']).output)\n"
-        "slow = {'libsumo', 'pybullet', 'zenoh', 'moderngl', 'pandas', 'scipy', 'shapely', 'cv2'}\n"
-        "print(sorted(slow & set(sys.modules)))"
+        "import sys\nfrom typer.testing import CliRunner\nfrom cosim.cli.app import "
+        "app\nprint(CliRunner().invoke(app, ['--version']).output)\nslow = {'libsumo', "
+        "'pybullet', 'zenoh', 'moderngl', 'pandas', 'scipy', 'shapely', 'cv2'}\nprint(sorted(slow "
+        "& set(sys.modules)))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S
+    )
     assert done.returncode == 0, done.stderr
     *lines, imported = done.stdout.strip().splitlines()
     assert imported == "[]"
     text = "\n".join(lines)
-    assert f"cosim {version('sidewalk-cosim')}" in text and f"Python {sys.version.split()[0]}" in text
-    for name, package in (("SUMO", "libsumo"), ("PyBullet", "pybullet"), ("Zenoh", "eclipse-zenoh")):
+    assert (
+        f"cosim {version('sidewalk-cosim')}" in text and f"Python {sys.version.split()[0]}" in text
+    )
+    for name, package in (
+        ("SUMO", "libsumo"),
+        ("PyBullet", "pybullet"),
+        ("Zenoh", "eclipse-zenoh"),
+    ):
         assert f"{name} {version(package)}" in text
 
 
-def test_the_version_of_an_engine_that_is_not_installed_is_said_to_be_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_version_of_an_engine_that_is_not_installed_is_said_to_be_missing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """`cosim --version` is for a broken machine too."""
     from importlib.metadata import PackageNotFoundError
 
@@ -119,7 +138,16 @@ def test_the_version_of_an_engine_that_is_not_installed_is_said_to_be_missing(mo
 
 
 @pytest.mark.parametrize(
-    "endpoint", ["7447", "tcp/", "tcp/127.0.0.1", "tcp/127.0.0.1:99999", "tcp/127.0.0.1:0", "tcp/:x", "ftp/a:1"]
+    "endpoint",
+    [
+        "7447",
+        "tcp/",
+        "tcp/127.0.0.1",
+        "tcp/127.0.0.1:99999",
+        "tcp/127.0.0.1:0",
+        "tcp/:x",
+        "ftp/a:1",
+    ],
 )
 def test_an_endpoint_that_can_be_none_is_refused_with_an_example(endpoint: str) -> None:
     """Before anything is tried: a protocol, an address, a port from 1 to 65535."""
@@ -127,7 +155,9 @@ def test_an_endpoint_that_can_be_none_is_refused_with_an_example(endpoint: str) 
         checked_endpoint(endpoint, "--connect")
 
 
-@pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:7447", "tcp/[::1]:1", "tls/host:65535", "unixsock-stream//tmp/a"])
+@pytest.mark.parametrize(
+    "endpoint", ["tcp/127.0.0.1:7447", "tcp/[::1]:1", "tls/host:65535", "unixsock-stream//tmp/a"]
+)
 def test_an_endpoint_that_may_be_one_is_taken(endpoint: str) -> None:
     """Names, addresses of both kinds, sockets in the file system."""
     assert checked_endpoint(endpoint, "--connect") == endpoint

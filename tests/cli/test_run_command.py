@@ -9,14 +9,14 @@ import msgspec
 import pytest
 
 from cosim.spec.scenario import Suite, write_suite
-from scenarios.checks import small_scenario
+from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import Cosim
 
 POLICY = """
 import numpy as np
 import speeds
 from cosim.core.state import Command
-from cosim.episode.ports import Manifest
+from cosim.spec.manifest import Manifest
 
 class Far:
     manifest = Manifest("far", camera=None, goal="route_point", odometry="wheel")
@@ -29,7 +29,8 @@ class Far:
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a suite of one short scenario, and a policy in a folder of its own, beside what it imports."""
+    """A folder with a suite of one short scenario, and a policy in a folder of its own, beside what
+    it imports."""
     folder = tmp_path_factory.mktemp("desk")
     one = msgspec.structs.replace(small_scenario(), id="n-0", time_limit_s=1.0)
     write_suite(Suite(name="one", version="1", scenarios=(one,)), folder / "one.json")
@@ -41,25 +42,39 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.engine
 def test_a_policy_by_its_file_is_the_one_by_its_module(desk: Path, cosim: Cosim) -> None:
-    """Also in processes that only inherit where it is: isolated ones. The run goes on by any spelling, until edited."""
+    """Also in processes that only inherit where it is: isolated ones. The run goes on by any
+    spelling, until edited."""
     suite, out = str(desk / "one.json"), str(desk / "run")
     by_file = ("run", suite, "--policy", "deeper/far.py:Far", "--isolated", "--out", out)
     said = cosim(*by_file, cwd=desk)
     assert said.returncode == 0, said.stderr
-    assert f"Next:\n  cosim film {out} --failure -o film.mp4\n  cosim report {out} -o report.html\n" in said.stderr
-    assert "policy far; at 4 Hz; goal route_point; odometry wheel; policy isolated; seed" in said.stdout
+    assert (
+        f"Next:\n  cosim film {out} --failure -o film.mp4\n  cosim report {out} -o report.html\n"
+        in said.stderr
+    )
+    assert (
+        "policy far; at 4 Hz; goal route_point; odometry wheel; policy isolated; seed"
+        in said.stdout
+    )
     assert json.loads((desk / "run/run.json").read_text())["policy"] == "far:Far"
     by_module = ("run", suite, "--policy", "far:Far", "--isolated", "--out", out, "--resume")
     again = cosim(*by_module, cwd=desk / "deeper")
-    assert again.returncode == 0 and "1 of 1 episodes are finished already" in again.stderr, again.stderr
+    assert again.returncode == 0 and "1 of 1 episodes are finished already" in again.stderr, (
+        again.stderr
+    )
     (desk / "deeper/far.py").write_text(POLICY + "# edited")
     edited = cosim(*by_file, "--resume", cwd=desk)
-    assert edited.returncode == 2 and "the source of policy 'far:Far' was edited since it began" in edited.stderr
+    assert (
+        edited.returncode == 2
+        and "the source of policy 'far:Far' was edited since it began" in edited.stderr
+    )
 
 
-def test_the_file_of_a_policy_is_sent_to_a_cluster(desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_file_of_a_policy_is_sent_to_a_cluster(
+    desk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Ray is given the file that its name says, as for a module."""
-    from scenarios.many.on_ray import _own_module
+    from scenarios.runs.ray_workers import _own_module
 
     monkeypatch.chdir(desk)
     monkeypatch.syspath_prepend(desk)

@@ -9,17 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from cosim.core.arithmetic import arithmetic
-from cosim.core.versions import versions
+from cosim.core.versions import arithmetic, versions
 
 FLAGS = set(Path("/proc/cpuinfo").read_text().split())
 WITHOUT_FMA = {"GLIBC_TUNABLES": "glibc.cpu.hwcaps=-FMA,-FMA4,-AVX2_Usable,-FMA_Usable,-AVX2"}
-TELLS = "from cosim.core.arithmetic import arithmetic as a; print(a())"
+TELLS = "from cosim.core.versions import arithmetic as a; print(a())"
 
 
 def told(program: str = TELLS, **environment: str) -> str:
     command = [sys.executable, "-W", "ignore", "-c", program]
-    return subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=True).stdout
+    return subprocess.run(
+        command, env=os.environ | environment, capture_output=True, text=True, check=True
+    ).stdout
 
 
 def test_a_machine_always_tells_the_same() -> None:
@@ -28,7 +29,8 @@ def test_a_machine_always_tells_the_same() -> None:
 
 
 def test_a_processor_without_fused_multiply_add_tells_something_else() -> None:
-    """The same packages, a C library that goes without: sines of other bits, and episodes of other bits."""
+    """The same packages, a C library that goes without: sines of other bits, and episodes of other
+    bits."""
     if "fma" not in FLAGS:
         pytest.skip("this processor has no fma that could be left out")
     assert told(**WITHOUT_FMA).strip() != arithmetic()

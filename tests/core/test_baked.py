@@ -41,7 +41,9 @@ def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def same(arrays: Arrays) -> bool:
-    return arrays.keys() == WANTED.keys() and all((arrays[key] == WANTED[key]).all() for key in WANTED)
+    return arrays.keys() == WANTED.keys() and all(
+        (arrays[key] == WANTED[key]).all() for key in WANTED
+    )
 
 
 def test_what_was_made_is_made_once_and_mapped_into_memory(room: Path) -> None:
@@ -49,7 +51,9 @@ def test_what_was_made_is_made_once_and_mapped_into_memory(room: Path) -> None:
     make = Maker()
     first, again = (baked("a", sources_hash(room), make) for _ in range(2))
     assert same(first) and same(again) and make.times == 1
-    assert all(isinstance(array, np.memmap) and not array.flags.writeable for array in again.values())
+    assert all(
+        isinstance(array, np.memmap) and not array.flags.writeable for array in again.values()
+    )
 
 
 def test_other_sources_and_other_names_make_anew(room: Path) -> None:
@@ -63,8 +67,10 @@ def test_other_sources_and_other_names_make_anew(room: Path) -> None:
 
 
 def test_sources_edited_under_a_running_process_do_not_get_what_it_makes(room: Path) -> None:
-    """A process names what it makes by the sources it has imported; who imports the edited ones makes anew."""
-    make, imported = Maker(), sources_hash(room)
+    """A process names what it makes by the sources it has imported; who imports the edited ones
+    makes anew."""
+    make = Maker()
+    imported = sources_hash(room)
     (room / "maker.py").write_text("version = 2\n")
     baked("a", imported, make)
     baked("a", sources_hash(room), make)
@@ -78,8 +84,14 @@ def test_a_name_tells_every_package_that_what_is_kept_stands_on() -> None:
     nodes = [node for tree in trees for node in ast.walk(tree)]
     froms = {node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)}
     plain = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
-    tops = {name.partition(".")[0] for name in froms | plain} - sys.stdlib_module_names - {"cosim", "physics"}
-    assert {package for top in tops for package in packages_distributions()[top]} <= set(module._MADE_WITH)
+    tops = (
+        {name.partition(".")[0] for name in froms | plain}
+        - sys.stdlib_module_names
+        - {"cosim", "physics"}
+    )
+    assert {package for top in tops for package in packages_distributions()[top]} <= set(
+        module._MADE_WITH
+    )
 
 
 @pytest.mark.parametrize("damage", ["a bit", "cut off", "no seal", "no array", "not JSON"])
@@ -101,7 +113,11 @@ def test_damage_is_made_anew(room: Path, tmp_path: Path, damage: str) -> None:
             array.unlink()
         case "not JSON":
             seal.write_bytes(b"{")
-    assert same(baked("a", sources_hash(room), make)) and same(baked("a", sources_hash(room), make)) and make.times == 2
+    assert (
+        same(baked("a", sources_hash(room), make))
+        and same(baked("a", sources_hash(room), make))
+        and make.times == 2
+    )
 
 
 def test_a_cache_that_cannot_be_written_is_done_without_and_said_once(
@@ -110,29 +126,45 @@ def test_a_cache_that_cannot_be_written_is_done_without_and_said_once(
     """The arrays are right all the same; one line tells why the next process makes them anew."""
     (tmp_path / "cache").write_text("a file where a folder should be")
     make = Maker()
-    assert same(baked("a", sources_hash(room), make)) and same(baked("a", sources_hash(room), make)) and make.times == 2
+    assert (
+        same(baked("a", sources_hash(room), make))
+        and same(baked("a", sources_hash(room), make))
+        and make.times == 2
+    )
     told = capsys.readouterr().err
     assert told.startswith("note: ") and "not kept" in told and len(told.splitlines()) == 1
 
 
-def test_a_full_disk_is_done_without_and_nothing_half_written_stays(room: Path, tmp_path: Path) -> None:
-    """Writing that ends in the middle of a file gives the right arrays, one line, and no folder that could be read."""
+def test_a_full_disk_is_done_without_and_nothing_half_written_stays(
+    room: Path, tmp_path: Path
+) -> None:
+    """Writing that ends in the middle of a file gives the right arrays, one line, and no folder
+    that could be read."""
     code = (
-        "import pathlib, resource, sys, numpy as np\nfrom cosim.core.baked import baked, sources_hash\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
-        "made = sources_hash(pathlib.Path(sys.argv[1]))\n"
-        "arrays = [baked(name, made, lambda: {'n': np.arange(200000)}) for name in 'ab']\n"
-        "print([int(kept['n'].sum()) for kept in arrays])"
+        "import pathlib, resource, sys, numpy as np\nfrom cosim.core.baked import baked, "
+        "sources_hash\nresource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\nmade = "
+        "sources_hash(pathlib.Path(sys.argv[1]))\narrays = [baked(name, made, lambda: {'n': "
+        "np.arange(200000)}) for name in 'ab']\nprint([int(kept['n'].sum()) for kept in arrays])"
     )
     done = subprocess.run(
-        [sys.executable, "-B", "-c", code, str(room)], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        [sys.executable, "-B", "-c", code, str(room)],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
     )
     assert done.stdout == f"[{sum(range(200000))}, {sum(range(200000))}]\n", done.stderr
-    assert done.stderr.startswith("note: ") and "not kept" in done.stderr and done.stderr.count("note: ") <= 2
+    assert (
+        done.stderr.startswith("note: ")
+        and "not kept" in done.stderr
+        and done.stderr.count("note: ") <= 2
+    )
     assert list((tmp_path / "cache/baked").iterdir()) == []
 
 
-def test_a_cache_that_may_only_be_read_is_read(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_cache_that_may_only_be_read_is_read(
+    room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """What lies there is mapped, and nothing is said."""
     make = Maker()
     baked("a", sources_hash(room), make)
@@ -148,21 +180,26 @@ def test_a_cache_that_may_only_be_read_is_read(room: Path, tmp_path: Path, capsy
 
 
 def test_who_makes_it_at_once_gets_the_same_and_leaves_nothing(room: Path, tmp_path: Path) -> None:
-    """Processes that make the same at the same time all get it, also beside what a killed one left half made."""
+    """Processes that make the same at the same time all get it, also beside what a killed one left
+    half made."""
     left = tmp_path / "cache/baked/.making-of-a-killed-one"
     left.mkdir(parents=True)
     (left / "ramp.npy").write_bytes(b"half")
     code = (
-        "import sys, pathlib, numpy as np\nfrom cosim.core.baked import baked, sources_hash\nsys.stdin.readline()\n"
-        "print(int(baked('a', sources_hash(pathlib.Path(sys.argv[1])), lambda: {'n': np.arange(200000)})['n'].sum()))"
+        "import sys, pathlib, numpy as np\nfrom cosim.core.baked import baked, "
+        "sources_hash\nsys.stdin.readline()\nprint(int(baked('a', "
+        "sources_hash(pathlib.Path(sys.argv[1])), lambda: {'n': np.arange(200000)})['n'].sum()))"
     )
     makers = [
-        subprocess.Popen([sys.executable, "-c", code, str(room)], stdin=-1, stdout=-1, text=True) for _ in range(4)
+        subprocess.Popen([sys.executable, "-c", code, str(room)], stdin=-1, stdout=-1, text=True)
+        for _ in range(4)
     ]
     for maker in makers:
         assert maker.stdin is not None
         maker.stdin.write("\n")
         maker.stdin.flush()
-    assert {maker.communicate(timeout=PATIENCE_S)[0] for maker in makers} == {f"{sum(range(200000))}\n"}
+    assert {maker.communicate(timeout=PATIENCE_S)[0] for maker in makers} == {
+        f"{sum(range(200000))}\n"
+    }
     (kept,) = (path for path in (tmp_path / "cache/baked").iterdir() if path != left)
     assert kept.name.startswith("a-")

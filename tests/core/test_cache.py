@@ -22,12 +22,14 @@ MB = 10**6
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A cache of its own, with an entry of 1 MB of each kind: the cities oldest, then the others, an hour apart."""
+    """A cache of its own, with an entry of 1 MB of each kind: the cities oldest, then the others,
+    an hour apart."""
     folder = tmp_path / "cache"
     monkeypatch.setenv("COSIM_CACHE", str(folder))
     monkeypatch.delenv("COSIM_CACHE_LIMIT", raising=False)
     for hours, name in enumerate(
-        ("maps/town/net.xml", "baked/sky-1/sky.npy", "tiles/a/0_0", "read/a.map", "city-1.net.xml"), start=2
+        ("maps/town/net.xml", "baked/sky-1/sky.npy", "tiles/a/0_0", "read/a.map", "city-1.net.xml"),
+        start=2,
     ):
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -49,12 +51,16 @@ def user_of(entry: str) -> Iterator[subprocess.Popen[str]]:
         "import sys\nfrom cosim.core.cache import cache_folder, use_entry\n"
         "use_entry(cache_folder() / sys.argv[1])\nprint('uses', flush=True)\nsys.stdin.read()"
     )
-    with subprocess.Popen([sys.executable, "-c", code, entry], stdin=-1, stdout=-1, text=True) as process:
+    with subprocess.Popen(
+        [sys.executable, "-c", code, entry], stdin=-1, stdout=-1, text=True
+    ) as process:
         assert process.stdout is not None and process.stdout.readline() == "uses\n"
         yield process
 
 
-def test_what_was_used_longest_ago_goes_beyond_the_limit(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_used_longest_ago_goes_beyond_the_limit(
+    cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Imported maps count and stay, whatever the limit; nothing goes below it."""
     assert len(left(cache)) == 5 and not forget_entries().entries
     gone = forget_entries(limit_bytes=round(3.5 * MB))
@@ -66,20 +72,23 @@ def test_what_was_used_longest_ago_goes_beyond_the_limit(cache: Path, monkeypatc
 
 
 def test_what_a_living_process_uses_stays(cache: Path) -> None:
-    """Of a process that uses the oldest entry nothing is taken away while it lives, whatever the limit; afterwards,
-    however it ended, it is."""
+    """Of a process that uses the oldest entry nothing is taken away while it lives, whatever the
+    limit; afterwards, however it ended, it is."""
     with user_of("city-1.net.xml") as process:
         gone = forget_entries(limit_bytes=0)
         assert [entry.path.name for entry in gone.in_use] == ["city-1.net.xml"]
         assert left(cache) == {"maps/town", "city-1.net.xml"}
         process.kill()
         process.wait(PATIENCE_S)
-    assert [entry.path.name for entry in forget_entries(limit_bytes=0).entries] == ["city-1.net.xml"]
+    assert [entry.path.name for entry in forget_entries(limit_bytes=0).entries] == [
+        "city-1.net.xml"
+    ]
     assert left(cache) == {"maps/town"} and not list((cache / ".in-use").iterdir())
 
 
 def test_a_long_process_does_not_keep_what_it_used_long_ago(cache: Path) -> None:
-    """What it used within the hour stays, what it used before does not: else nothing would bound what it makes."""
+    """What it used within the hour stays, what it used before does not: else nothing would bound
+    what it makes."""
     with user_of("city-1.net.xml"):
         long_ago_s = time.time() - 7200.0
         os.utime(cache / "city-1.net.xml", (long_ago_s, long_ago_s))
@@ -88,36 +97,49 @@ def test_a_long_process_does_not_keep_what_it_used_long_ago(cache: Path) -> None
 
 
 def test_processes_that_use_and_forget_at_once_do_not_hurt_one_another(cache: Path) -> None:
-    """Four processes keep entries and use them, two forget all that is not in use: no entry that is used is ever gone,
-    and nothing half done is left."""
+    """Four processes keep entries and use them, two forget all that is not in use: no entry that is
+    used is ever gone, and nothing half done is left."""
     keeps = (
-        "import sys\nfrom cosim.core.cache import cache_folder, use_entry\n"
-        "for k in range(150):\n"
-        "    entry = cache_folder() / 'read' / f'{sys.argv[1]}-{k}.map'\n    use_entry(entry)\n"
-        "    part = entry.with_name(f'.writing-{entry.name}')\n    part.write_bytes(b'x' * 100)\n"
-        "    part.replace(entry)\n"
-        "    use_entry(entry)\n"
-        "    gone = [n for n in range(k) if not entry.with_name(f'{sys.argv[1]}-{n}.map').exists()]\n"
-        "    assert not gone, gone\n"
+        "import sys\nfrom cosim.core.cache import cache_folder, use_entry\nfor k in range(150):\n "
+        "   entry = cache_folder() / 'read' / f'{sys.argv[1]}-{k}.map'\n    use_entry(entry)\n    "
+        "part = entry.with_name(f'.writing-{entry.name}')\n    part.write_bytes(b'x' * 100)\n    "
+        "part.replace(entry)\n    use_entry(entry)\n    gone = [n for n in range(k) if not "
+        "entry.with_name(f'{sys.argv[1]}-{n}.map').exists()]\n    assert not gone, gone\n"
     )
-    forgets = "from cosim.core.cache import forget_entries\nfor _ in range(40): forget_entries(limit_bytes=0)"
+    forgets = (
+        "from cosim.core.cache import forget_entries\nfor _ in range(40): "
+        "forget_entries(limit_bytes=0)"
+    )
     words = [(keeps, str(n)) for n in range(4)] + [(forgets, ""), (forgets, "")]
-    processes = [subprocess.Popen([sys.executable, "-c", *word], stderr=subprocess.PIPE, text=True) for word in words]
+    processes = [
+        subprocess.Popen([sys.executable, "-c", *word], stderr=subprocess.PIPE, text=True)
+        for word in words
+    ]
     for process in processes:
         said = process.communicate(timeout=PATIENCE_S)[1]
         assert process.returncode == 0, said
     forget_entries(limit_bytes=0)
     assert left(cache) == {"maps/town"}
-    assert {path.name for path in cache.iterdir()} <= {"maps", "read", "tiles", "baked", ".lock", ".in-use"}
+    assert {path.name for path in cache.iterdir()} <= {
+        "maps",
+        "read",
+        "tiles",
+        "baked",
+        ".lock",
+        ".in-use",
+    }
 
 
 @pytest.mark.parametrize(
-    "keep", [lambda: Pieces("tiles", "b").get("0_0", dict), lambda: baked("sky-2", "b", dict)], ids=["piece", "baked"]
+    "keep",
+    [lambda: Pieces("tiles", "b").get("0_0", dict), lambda: baked("sky-2", "b", dict)],
+    ids=["piece", "baked"],
 )
 def test_who_keeps_something_makes_room_first(
     cache: Path, monkeypatch: pytest.MonkeyPatch, keep: Callable[[], object]
 ) -> None:
-    """Entries that were not used for a month go, but a process looks for them once a minute at most."""
+    """Entries that were not used for a month go, but a process looks for them once a minute at
+    most."""
     os.utime(cache / "tiles/a", (0.0, 0.0))
     keep()
     assert "tiles/a" not in left(cache) and len(left(cache)) == 5
@@ -137,31 +159,51 @@ def test_what_killed_processes_left_half_made_goes(cache: Path) -> None:
         os.utime(cache / name, (0.0, 0.0))
     forget_entries()
     found = {path.name for path in cache.rglob(".*-x*")}
-    assert found == {f"{MAKING}x-young", ".writing-x-young", ".building-x-young", ".forgotten-x-young"}
+    assert found == {
+        f"{MAKING}x-young",
+        ".writing-x-young",
+        ".building-x-young",
+        ".forgotten-x-young",
+    }
 
 
-def test_the_command_says_what_lies_there_and_removes_what_is_not_used(cache: Path, cosim: Cosim) -> None:
-    """A size for each kind, the sum, the limit; --prune what was not used for a month, or for so many days, or all."""
+def test_the_command_says_what_lies_there_and_removes_what_is_not_used(
+    cache: Path, cosim: Cosim
+) -> None:
+    """A size for each kind, the sum, the limit; --prune what was not used for a month, or for so
+    many days, or all."""
     said = cosim("cache")
     assert said.returncode == 0 and said.stdout == cosim("cache", "--size").stdout
     rows = {line.split()[0]: line for line in said.stdout.splitlines() if line.split()}
-    assert "1 MB" in rows["cities"] and "6 h ago" in rows["cities"] and "never removed" in rows["maps"]
+    assert (
+        "1 MB" in rows["cities"] and "6 h ago" in rows["cities"] and "never removed" in rows["maps"]
+    )
     assert f"{cache}: 5" in said.stdout and "of at most 4 GB (COSIM_CACHE_LIMIT)" in said.stdout
     assert "Removed: 0 entries" in cosim("cache", "--prune").stdout
     os.utime(cache / "read/a.map", (0.0, 0.0))
-    assert "Removed: 1 entry, 1 MB" in cosim("cache", "--prune").stdout and "read/a.map" not in left(cache)
+    assert "Removed: 1 entry, 1 MB" in cosim(
+        "cache", "--prune"
+    ).stdout and "read/a.map" not in left(cache)
     assert "Removed: 1 entry" in cosim("cache", "--prune", "--unused-for", "0.22").stdout
     with user_of("tiles/a"):
-        assert "Removed: 1 entry, 1 MB; 1 in use stay" in cosim("cache", "--prune", "--unused-for", "0").stdout
+        assert (
+            "Removed: 1 entry, 1 MB; 1 in use stay"
+            in cosim("cache", "--prune", "--unused-for", "0").stdout
+        )
     assert left(cache) == {"maps/town", "tiles/a"}
 
 
 @pytest.mark.parametrize("limit", ["much", "-1", "nan", "inf"])
-def test_a_limit_that_is_none_is_refused(cosim: Cosim, monkeypatch: pytest.MonkeyPatch, limit: str) -> None:
+def test_a_limit_that_is_none_is_refused(
+    cosim: Cosim, monkeypatch: pytest.MonkeyPatch, limit: str
+) -> None:
     """The variable is named, with what was found and what may stand there."""
     monkeypatch.setenv("COSIM_CACHE_LIMIT", limit)
     said = cosim("list")
-    assert said.returncode == 2 and f"COSIM_CACHE_LIMIT is '{limit}': give a number of GB from 0 on" in said.stderr
+    assert (
+        said.returncode == 2
+        and f"COSIM_CACHE_LIMIT is '{limit}': give a number of GB from 0 on" in said.stderr
+    )
     monkeypatch.setenv("COSIM_CACHE_LIMIT", "0.5")
     assert "of at most 0.5 GB" in cosim("cache").stdout
     assert cosim("cache", "--unused-for", "3").returncode == 2

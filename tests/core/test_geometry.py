@@ -29,7 +29,9 @@ def test_wrapped_angles_lie_in_the_half_open_circle_and_agree(angle: float) -> N
     assert -math.pi < wrapped <= math.pi
     assert math.isclose(math.cos(wrapped), math.cos(angle), abs_tol=1e-9)
     assert math.isclose(math.sin(wrapped), math.sin(angle), abs_tol=1e-9)
-    assert math.isclose(abs(wrap_angle(wrapped - float(wrap_angles([angle])[0]))), 0.0, abs_tol=1e-9)
+    assert math.isclose(
+        abs(wrap_angle(wrapped - float(wrap_angles([angle])[0]))), 0.0, abs_tol=1e-9
+    )
 
 
 def test_sumo_angles_are_clockwise_from_north() -> None:
@@ -76,7 +78,9 @@ def test_boxes_overlap_only_when_they_do() -> None:
     """Parallel, turned and corner-to-corner boxes are told apart by the separating axes."""
     one = np.array([0.0, 0.0, 0.0])
     half = np.array([1.0, 0.5])
-    others = np.array([[1.9, 0.0, 0.0], [2.1, 0.0, 0.0], [1.4, 0.0, math.pi / 2], [1.55, 0.0, math.pi / 2]])
+    others = np.array(
+        [[1.9, 0.0, 0.0], [2.1, 0.0, 0.0], [1.4, 0.0, math.pi / 2], [1.55, 0.0, math.pi / 2]]
+    )
     assert boxes_overlap(one, half, others, half).tolist() == [True, False, True, False]
     diagonal = np.array([1.6, 1.1, math.pi / 4])
     assert not boxes_overlap(one, half, diagonal, np.array([0.5, 0.5]))

@@ -22,16 +22,20 @@ def locked(name: str) -> dict[str, str]:
     return dict(re.findall(r"^([a-z0-9-]+)==(\S+)", (ROOT / name).read_text(), re.MULTILINE))
 
 
-@pytest.mark.parametrize("name", ["requirements.lock", "requirements-dev.lock", "requirements-docs.lock"])
+@pytest.mark.parametrize(
+    "name", ["requirements.lock", "requirements-dev.lock", "requirements-docs.lock"]
+)
 def test_every_locked_package_has_hashes_and_no_home(name: str) -> None:
-    """A lock file names packages, versions and hashes alone: no host, no folder, no version of somebody's own."""
+    """A lock file names packages, versions and hashes alone: no host, no folder, no version of
+    somebody's own."""
     text = re.sub(r"^#.*\n", "", (ROOT / name).read_text(), flags=re.MULTILINE)
     entry = r"[a-z0-9-]+==[0-9][0-9a-z.]* \\\n(    --hash=sha256:[0-9a-f]{64} \\\n)*    --hash=sha256:[0-9a-f]{64}\n"
     assert re.fullmatch(f"({entry})+", text)
 
 
 def test_the_lock_files_hold_what_the_project_asks_for() -> None:
-    """Every requirement is locked within its range, what builds the project too; tests, site and runs agree."""
+    """Every requirement is locked within its range, what builds the project too; tests, site and
+    runs agree."""
     run, dev = locked("requirements.lock"), locked("requirements-dev.lock")
     site = locked("requirements-docs.lock")
     assert run.items() <= dev.items() and run.items() <= site.items()
@@ -58,16 +62,27 @@ def test_what_is_installed_here_is_what_is_locked() -> None:
 
 
 def test_everything_is_installed_from_the_lock_files() -> None:
-    """Each `pip install` of the set-up takes hashes, or nothing but the project itself; CI and container use both."""
+    """Each `pip install` of the set-up takes hashes, or nothing but the project itself; CI and
+    container use both."""
     for name in ("Makefile", "Containerfile", ".ci/run"):
         for line in (ROOT / name).read_text().splitlines():
             if re.search(r"(pip|PIP\)) install", line) and "install --quiet uv" not in line:
-                assert "--require-hashes" in line or "--no-deps --no-build-isolation" in line, f"{name}: {line}"
+                assert "--require-hashes" in line or "--no-deps --no-build-isolation" in line, (
+                    f"{name}: {line}"
+                )
 
 
 def test_whatever_can_change_bits_or_pictures_is_in_the_record() -> None:
-    """Engines, numerics, the libraries inside them and what draws are recorded with their versions."""
+    """Engines, numerics, the libraries inside them and what draws are recorded with their
+    versions."""
     assert set(RECORDED_PACKAGES) - {"sidewalk-cosim"} <= set(locked("requirements.lock"))
-    assert {"libsumo", "pybullet", "osmium", "moderngl", "glcontext", "opencv-python-headless"} < set(versions())
+    assert {
+        "libsumo",
+        "pybullet",
+        "osmium",
+        "moderngl",
+        "glcontext",
+        "opencv-python-headless",
+    } < set(versions())
     assert re.fullmatch(r"3\.\d+\.\d+", versions()["geos"])
     assert re.fullmatch(r"[0-9a-f]{16}", versions()["arithmetic"])

@@ -15,14 +15,29 @@ from pathlib import Path
 
 import pytest
 
-from cosim.machine import EXIT_CODE, FOR_PICTURES, LIBRARIES, Machine, check_machine, missing, refusal
+from cosim.machine import (
+    EXIT_CODE,
+    FOR_PICTURES,
+    LIBRARIES,
+    Machine,
+    check_machine,
+    missing,
+    refusal,
+)
 from tests.conftest import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 GLIBC = {
-    "ld-linux-aarch64.so.1", "ld-linux-x86-64.so.2", "libc.so.6", "libdl.so.2", "libm.so.6", "libmvec.so.1",
-    "libpthread.so.0", "libresolv.so.2", "librt.so.1",
-}  # fmt: skip
+    "ld-linux-aarch64.so.1",
+    "ld-linux-x86-64.so.2",
+    "libc.so.6",
+    "libdl.so.2",
+    "libm.so.6",
+    "libmvec.so.1",
+    "libpthread.so.0",
+    "libresolv.so.2",
+    "librt.so.1",
+}
 ENGINES = ("libsumo", "pybullet", "zenoh", "moderngl", "numpy", "scenarios")
 
 
@@ -30,7 +45,9 @@ class Fake(Machine):
     """A machine without these packages; apt-get has those of `archive`."""
 
     def __init__(self, *without: str, root: bool = False, archive: tuple[str, ...] = ()) -> None:
-        self.without, self.root, self.archive = set(without), root, archive
+        self.without = set(without)
+        self.root = root
+        self.archive = archive
         self.installed: list[str] = []
 
     def loads(self, library: str) -> bool:
@@ -49,24 +66,36 @@ class Fake(Machine):
 
 
 def test_each_missing_library_is_named_with_its_package() -> None:
-    """A refusal names every missing library, its package, and one command that installs them all."""
+    """A refusal names every missing library, its package, and one command that installs them
+    all."""
     said = refusal(Fake("libx11-6", "libatomic1", "libegl1"))
     assert "libX11.so.6 (package libx11-6), libatomic.so.1 (package libatomic1)" in said
-    assert said.endswith("install -y --no-install-recommends libx11-6 libatomic1 libegl1") and "\n" not in said
+    assert (
+        said.endswith("install -y --no-install-recommends libx11-6 libatomic1 libegl1")
+        and "\n" not in said
+    )
     assert refusal(Fake()) == ""
 
 
 def test_whoever_is_not_root_is_told_and_stopped(capsys: pytest.CaptureFixture[str]) -> None:
-    """Without the right to install, the check says what is missing and ends with 3; nothing is installed."""
+    """Without the right to install, the check says what is missing and ends with 3; nothing is
+    installed."""
     machine = Fake("libx11-6", "python3.11")
-    assert check_machine(["--install", "--python", "python3.11"], machine) == EXIT_CODE and machine.installed == []
+    assert (
+        check_machine(["--install", "--python", "python3.11"], machine) == EXIT_CODE
+        and machine.installed == []
+    )
     said = capsys.readouterr().err
-    assert "lacks Python 3.11 with venv (there is no 'python3.11') and libX11.so.6 (package libx11-6)." in said
+    assert (
+        "lacks Python 3.11 with venv (there is no 'python3.11') and libX11.so.6 (package libx11-6)."
+        in said
+    )
     assert "python3.11 python3.11-venv libx11-6\n" in said and "make PYTHON=" in said
 
 
 def test_root_installs_exactly_what_is_missing(capsys: pytest.CaptureFixture[str]) -> None:
-    """As root on Debian, what is missing and nothing else is installed, and said; asked again, nothing happens."""
+    """As root on Debian, what is missing and nothing else is installed, and said; asked again,
+    nothing happens."""
     archive = ("libx11-6", "libegl1", "python3.11", "python3.11-venv")
     machine = Fake("libx11-6", "libegl1", "python3.11", root=True, archive=archive)
     assert check_machine(["--install"], machine) == 0
@@ -77,7 +106,8 @@ def test_root_installs_exactly_what_is_missing(capsys: pytest.CaptureFixture[str
 
 
 def test_what_the_archive_does_not_have_stops_root_too(capsys: pytest.CaptureFixture[str]) -> None:
-    """Where apt-get has no Python 3.11, the libraries are installed all the same, and what is left is said."""
+    """Where apt-get has no Python 3.11, the libraries are installed all the same, and what is left
+    is said."""
     machine = Fake("libx11-6", "python3.11", root=True, archive=("libx11-6",))
     assert check_machine(["--install"], machine) == EXIT_CODE and missing(machine) == []
     assert "error: this machine lacks Python 3.11" in capsys.readouterr().err
@@ -94,11 +124,13 @@ def test_without_egl_a_run_goes_on(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     "script, wrong",
     [
-        ("echo 3.12", "is Python 3.12"), ("echo 3.11; exit 1", "has no venv and ensurepip"),
-        ("exit 127", "does not run"), ("echo 3.11", ""),
+        ("echo 3.12", "is Python 3.12"),
+        ("echo 3.11; exit 1", "has no venv and ensurepip"),
+        ("exit 127", "does not run"),
+        ("echo 3.11", ""),
     ],
     ids=["newer", "no-venv", "broken", "good"],
-)  # fmt: skip
+)
 def test_a_python_is_asked_what_it_is(script: str, wrong: str, tmp_path: Path) -> None:
     """The interpreter that will make the environment is run, and what is wrong with it is said."""
     python = tmp_path / "python3.11"
@@ -110,7 +142,8 @@ def test_a_python_is_asked_what_it_is(script: str, wrong: str, tmp_path: Path) -
 
 @pytest.mark.parametrize("verb", ["run", "test", "check", "docs", "bench"])
 def test_make_looks_before_it_sets_up(verb: str, tmp_path: Path) -> None:
-    """Every verb of make that needs the packages first checks the machine: one error, and nothing is begun."""
+    """Every verb of make that needs the packages first checks the machine: one error, and nothing
+    is begun."""
     make = shutil.which("make")
     assert make is not None
     locks = (path.name for path in ROOT.glob("requirements*.lock"))
@@ -118,12 +151,16 @@ def test_make_looks_before_it_sets_up(verb: str, tmp_path: Path) -> None:
         (tmp_path / name).parent.mkdir(exist_ok=True)
         shutil.copy(ROOT / name, tmp_path / name)
     python = tmp_path / "python3.12"
-    python.write_text(f'#!/bin/sh\ncase "$*" in *-c*) echo 3.12;; *) exec {sys.executable} "$@";; esac\n')
+    python.write_text(
+        f'#!/bin/sh\ncase "$*" in *-c*) echo 3.12;; *) exec {sys.executable} "$@";; esac\n'
+    )
     python.chmod(0o755)
     before = sorted(tmp_path.rglob("*"))
     nothing_to_install_with = {"PATH": str(tmp_path)}
     command = [make, "-j4", verb, f"PYTHON={python}"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=nothing_to_install_with)
+    done = subprocess.run(
+        command, cwd=tmp_path, capture_output=True, text=True, env=nothing_to_install_with
+    )
     assert done.returncode == 2 and done.stdout == "" and done.stderr.count("error: ") == 1
     assert f"lacks Python 3.11 with venv ('{python}' is Python 3.12)" in done.stderr
     assert sorted(tmp_path.rglob("*")) == before
@@ -134,13 +171,19 @@ def test_make_without_any_python_says_which(tmp_path: Path) -> None:
     make = shutil.which("make")
     assert make is not None
     shutil.copy(ROOT / "Makefile", tmp_path)
-    done = subprocess.run([make, "run"], cwd=tmp_path, capture_output=True, text=True, env={"PATH": str(tmp_path)})
-    assert done.returncode == 2 and "there is no python3.11. On Debian, as root: apt-get install" in done.stderr
+    done = subprocess.run(
+        [make, "run"], cwd=tmp_path, capture_output=True, text=True, env={"PATH": str(tmp_path)}
+    )
+    assert (
+        done.returncode == 2
+        and "there is no python3.11. On Debian, as root: apt-get install" in done.stderr
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["Makefile"]
 
 
 def test_a_library_is_looked_for_by_the_loader(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A library that every process has is found, one that cannot exist is not; one that lacks another is not blamed."""
+    """A library that every process has is found, one that cannot exist is not; one that lacks
+    another is not blamed."""
     assert Machine().loads("libc.so.6") and not Machine().loads("libcosim-has-none.so.9")
 
     def load(name: str) -> None:
@@ -151,7 +194,8 @@ def test_a_library_is_looked_for_by_the_loader(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_the_check_runs_before_anything_is_installed() -> None:
-    """The check is read by Python 3.8, imports the standard library alone, and runs without site-packages."""
+    """The check is read by Python 3.8, imports the standard library alone, and runs without
+    site-packages."""
     source = (ROOT / "cosim/machine.py").read_text()
     tree = ast.parse(source, feature_version=(3, 8))
     imported = {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
@@ -160,26 +204,34 @@ def test_the_check_runs_before_anything_is_installed() -> None:
     here = {**os.environ, "PATH": ""}
     command = [sys.executable, "-I", "-S", str(ROOT / "cosim/machine.py"), "--python", "/none"]
     done = subprocess.run(command, capture_output=True, text=True, env=here)
-    assert done.returncode == EXIT_CODE and "there is no '/none'" in done.stderr and "Traceback" not in done.stderr
+    assert (
+        done.returncode == EXIT_CODE
+        and "there is no '/none'" in done.stderr
+        and "Traceback" not in done.stderr
+    )
 
 
-@pytest.mark.parametrize("words", [["doctor"], ["run", "long-horizon", "--out", "out"]], ids=["doctor", "run"])
-def test_the_command_line_says_it_before_it_loads_an_engine(words: list[str], tmp_path: Path) -> None:
-    """With libX11 out of the loader's sight `cosim doctor` and `cosim run` end at once: one line, exit code 3."""
+@pytest.mark.parametrize(
+    "words", [["doctor"], ["run", "long-horizon", "--out", "out"]], ids=["doctor", "run"]
+)
+def test_the_command_line_says_it_before_it_loads_an_engine(
+    words: list[str], tmp_path: Path
+) -> None:
+    """With libX11 out of the loader's sight `cosim doctor` and `cosim run` end at once: one line,
+    exit code 3."""
     code = (
-        "import atexit, ctypes, sys\n"
-        "real = ctypes.CDLL\n"
-        "def load(name, *rest, **more):\n"
-        "    if 'X11' in str(name): raise OSError(f'{name}: cannot open shared object file')\n"
-        "    return real(name, *rest, **more)\n"
-        "ctypes.CDLL = load\n"
-        f"atexit.register(lambda: print(sorted(set({ENGINES!r}) & set(sys.modules))))\n"
-        f"sys.argv = ['cosim', *{words!r}]\n"
-        "from cosim.__main__ import main\n"
-        "main()\n"
+        "import atexit, ctypes, sys\nreal = ctypes.CDLL\ndef load(name, *rest, **more):\n    if "
+        "'X11' in str(name): raise OSError(f'{name}: cannot open shared object file')\n    "
+        "return real(name, *rest, **more)\nctypes.CDLL = load\natexit.register(lambda: "
+        f"print(sorted(set({ENGINES!r}) & set(sys.modules))))\nsys.argv = ['cosim', "
+        f"*{words!r}]\nfrom cosim.__main__ import main\nmain()\n"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, timeout=PATIENCE_S
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        timeout=PATIENCE_S,
     )
     assert done.returncode == 3 and done.stdout.strip() == "[]"
     assert done.stderr.startswith("error: this machine lacks libX11.so.6 (package libx11-6). ")
@@ -188,19 +240,29 @@ def test_the_command_line_says_it_before_it_loads_an_engine(words: list[str], tm
 
 @pytest.mark.parametrize("module", ["typer", "zenoh"], ids=["front", "engine"])
 def test_a_package_that_cannot_be_imported_is_said_in_one_line(module: str) -> None:
-    """Where a package is missing or broken, `cosim doctor` names it and ends with exit code 3, without a traceback."""
+    """Where a package is missing or broken, `cosim doctor` names it and ends with exit code 3,
+    without a traceback."""
     code = f"import sys; sys.modules[{module!r}] = None; sys.argv = ['cosim', 'doctor']\n"
     code += "from cosim.__main__ import main; main()"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S
+    )
     assert done.returncode == 3 and done.stdout == ""
-    assert done.stderr.startswith("error: ") and module in done.stderr and done.stderr.count("\n") == 1
+    assert (
+        done.stderr.startswith("error: ") and module in done.stderr and done.stderr.count("\n") == 1
+    )
 
 
 def test_the_table_holds_every_library_that_the_packages_load() -> None:
-    """What the binaries of the locked packages need is in glibc, in the packages themselves, or in the table."""
+    """What the binaries of the locked packages need is in glibc, in the packages themselves, or in
+    the table."""
     locked = re.findall(r"^([a-z0-9-]+)==", (ROOT / "requirements.lock").read_text(), re.MULTILINE)
     files = [Path(str(f.locate())) for name in locked for f in distribution(name).files or ()]
-    files = [path for path in files if (".so" in path.name or path.parent.name == "bin") and path.is_file()]
+    files = [
+        path
+        for path in files
+        if (".so" in path.name or path.parent.name == "bin") and path.is_file()
+    ]
     brought = {path.name for path in files}
     needed = {library for path in files for library in needed_by(path)}
     assert len(needed) > 50 and needed - brought - GLIBC == set(LIBRARIES)
@@ -213,14 +275,17 @@ def needed_by(path: Path) -> list[str]:
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as raw:
         if raw[:6] != b"\x7fELF\x02\x01":
             return []
-        (start,), (size, count) = struct.unpack_from("<Q", raw, 32), struct.unpack_from("<HH", raw, 54)
+        (start,) = struct.unpack_from("<Q", raw, 32)
+        (size, count) = struct.unpack_from("<HH", raw, 54)
         parts = [struct.unpack_from("<IIQQQQQQ", raw, start + i * size) for i in range(count)]
         dynamic = next((part for part in parts if part[0] == 2), None)
         if dynamic is None:
             return []
         tags = list(struct.iter_unpack("<QQ", raw[dynamic[2] : dynamic[2] + dynamic[5] // 16 * 16]))
         strings = next(value for tag, value in tags if tag == 5)
-        within = next(part for part in parts if part[0] == 1 and part[3] <= strings < part[3] + part[5])
+        within = next(
+            part for part in parts if part[0] == 1 and part[3] <= strings < part[3] + part[5]
+        )
         table = strings - within[3] + within[2]
         names = [table + value for tag, value in tags if tag == 1]
         return [raw[at : raw.find(b"\0", at)].decode() for at in names]

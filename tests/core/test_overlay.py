@@ -1,4 +1,5 @@
-"""Putting ground together where GEOS gives up: tangled corners and slivers, as foreign maps have them."""
+"""Putting ground together where GEOS gives up: tangled corners and slivers, as foreign maps have
+them."""
 
 from __future__ import annotations
 
@@ -11,30 +12,47 @@ from shapely.geometry import LineString, MultiPolygon, Polygon, box
 
 from cosim.core.errors import MapError
 from cosim.place import overlay
-from sumo_nets.net.netfile import read_net
-from sumo_nets.net.seams import close_seams
+from sumo_nets.net.net_file import read_net
+from sumo_nets.net.outlines import close_seams
 
 Point = tuple[float, float]
 
 TANGLED = (
-    [(1747.70, 174.54), (1748.46, 173.49), (1747.08, 170.50), (1750.59, 172.01), (1747.34, 170.75), (1748.30, 171.06),
-     (1745.09, 174.80), (1751.17, 172.61)],
+    [
+        (1747.70, 174.54),
+        (1748.46, 173.49),
+        (1747.08, 170.50),
+        (1750.59, 172.01),
+        (1747.34, 170.75),
+        (1748.30, 171.06),
+        (1745.09, 174.80),
+        (1751.17, 172.61),
+    ],
     [(1750.61, 172.33), (1750.53, 172.35), (1750.38, 172.62)],
     2.0,
-)  # fmt: skip
-"""A walking area that crosses itself, the middle line of a sidewalk that begins in it, and its width; metres."""
+)
+"""A walking area that crosses itself, the middle line of a sidewalk that begins in it, and its
+width; metres."""
 
 CONFLICTING = (
-    [(2025.37, 105.45), (2024.68, 104.96), (2025.67, 105.12), (2025.02, 105.54), (2024.97, 105.59), (2025.40, 105.45),
-     (2025.02, 105.54)],
+    [
+        (2025.37, 105.45),
+        (2024.68, 104.96),
+        (2025.67, 105.12),
+        (2025.02, 105.54),
+        (2024.97, 105.59),
+        (2025.40, 105.45),
+        (2025.02, 105.54),
+    ],
     [(2025.37, 105.45), (2017.41, 104.93), (2017.11, 105.07)],
     3.2,
-)  # fmt: skip
+)
 """Another, on which GEOS finds a "side location conflict"."""
 
 
 def test_a_net_is_read_whose_corner_geos_cannot_join(tmp_path: Path) -> None:
-    """Where the wedge between a sidewalk and its tangled corner cannot be joined as it is, the place is read anyway."""
+    """Where the wedge between a sidewalk and its tangled corner cannot be joined as it is, the
+    place is read anyway."""
     path = tmp_path / "tangled.net.xml"
     area, walk = (" ".join(f"{x},{y}" for x, y in shape) for shape in TANGLED[:2])
     path.write_text(
@@ -49,13 +67,26 @@ def test_a_net_is_read_whose_corner_geos_cannot_join(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("shapes", [TANGLED, CONFLICTING], ids=["tangled", "conflicting"])
-def test_the_seam_to_a_tangled_corner_is_closed(shapes: tuple[list[Point], list[Point], float]) -> None:
-    """The sidewalk grows to its corner, which is many pieces that touch, and keeps its own ground."""
+def test_the_seam_to_a_tangled_corner_is_closed(
+    shapes: tuple[list[Point], list[Point], float],
+) -> None:
+    """The sidewalk grows to its corner, which is many pieces that touch, and keeps its own
+    ground."""
     area, walk, width_m = shapes
-    parts = [p for p in shapely.get_parts(shapely.make_valid(Polygon(area))) if isinstance(p, Polygon) and p.area > 0.0]
+    parts = [
+        p
+        for p in shapely.get_parts(shapely.make_valid(Polygon(area)))
+        if isinstance(p, Polygon) and p.area > 0.0
+    ]
     band = shapely.buffer(LineString(walk), width_m / 2, cap_style="flat", join_style="mitre")
-    (grown,) = close_seams([band], [np.array(walk)], np.array([width_m]), [(MultiPolygon(parts), None)])
-    assert grown.is_valid and grown.buffer(0.01).covers(band) and grown.area < band.area + 2.5 * width_m
+    (grown,) = close_seams(
+        [band], [np.array(walk)], np.array([width_m]), [(MultiPolygon(parts), None)]
+    )
+    assert (
+        grown.is_valid
+        and grown.buffer(0.01).covers(band)
+        and grown.area < band.area + 2.5 * width_m
+    )
 
 
 def crossing_itself() -> Polygon:
@@ -65,9 +96,11 @@ def crossing_itself() -> Polygon:
 
 @pytest.mark.parametrize("name", ["union", "difference", "intersection"])
 def test_what_geos_refuses_is_repaired(name: str) -> None:
-    """A shape that crosses itself is overlaid all the same, alone and among others; those others keep their bits."""
+    """A shape that crosses itself is overlaid all the same, alone and among others; those others
+    keep their bits."""
     operation, plain = getattr(overlay, name), getattr(shapely, name)
-    bow, square = crossing_itself(), box(1.0, 1.0, 3.0, 9.0)
+    bow = crossing_itself()
+    square = box(1.0, 1.0, 3.0, 9.0)
     with pytest.raises(shapely.errors.GEOSException, match=r"side location conflict|non-noded"):
         plain(bow, square)
     repaired = shapely.make_valid(bow, method="structure")
@@ -85,7 +118,9 @@ def test_what_geos_accepts_keeps_its_bits() -> None:
     shapes = shapely.buffer(lines, rng.uniform(0.5, 3.0, 60), cap_style="flat", join_style="mitre")
     assert overlay.union_all(shapes).wkb == shapely.union_all(shapes).wkb
     for name in ("union", "difference", "intersection"):
-        mine, plain = (getattr(module, name)(shapes[:30], shapes[30:]) for module in (overlay, shapely))
+        mine, plain = (
+            getattr(module, name)(shapes[:30], shapes[30:]) for module in (overlay, shapely)
+        )
         assert [s.wkb for s in mine] == [s.wkb for s in plain]
 
 
@@ -93,7 +128,9 @@ def test_what_nothing_helps_is_told_with_its_place(monkeypatch: pytest.MonkeyPat
     """A failure of GEOS that stays is a MapError that says where, in words."""
 
     def broken(*_shapes: object, **_options: object) -> None:
-        raise shapely.errors.GEOSException("TopologyException: side location conflict at 12.345 -6.5.")
+        raise shapely.errors.GEOSException(
+            "TopologyException: side location conflict at 12.345 -6.5."
+        )
 
     monkeypatch.setattr(shapely, "union", broken)
     with pytest.raises(MapError, match=r"the ground near \(12\.3, -6\.5\) is too tangled"):

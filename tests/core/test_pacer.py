@@ -21,7 +21,8 @@ class Wall:
 
 @pytest.mark.parametrize("pace", [0.5, 1.0, 4.0])
 def test_ticks_take_their_time_however_long_each_is_computed(pace: float) -> None:
-    """100 ticks of 0.05 s, every fifth of which takes longer than that: together 5 s at real time."""
+    """100 ticks of 0.05 s, every fifth of which takes longer than that: together 5 s at real
+    time."""
     wall = Wall()
     pacer = Pacer(pace, lambda: wall.now_s, wall.sleep)
     for tick in range(100):
@@ -31,8 +32,8 @@ def test_ticks_take_their_time_however_long_each_is_computed(pace: float) -> Non
 
 
 def test_what_is_slower_is_not_held_back_and_a_long_pause_is_not_made_up_for() -> None:
-    """Ticks slower than real time are never waited after. After a policy that thought for a minute the episode runs
-    faster for a second's worth of ticks, and then at its pace again."""
+    """Ticks slower than real time are never waited after. After a policy that thought for a minute
+    the episode runs faster for a second's worth of ticks, and then at its pace again."""
     wall = Wall()
     pacer = Pacer(1.0, lambda: wall.now_s, wall.sleep)
     pacer.wait(0.05)

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 
 from cosim.core.errors import RunError
-from cosim.core.packed import Packed, read_packed
+from cosim.core.packed_demos import Packed, read_packed
 
 
 def some_rows(lengths: tuple[int, ...] = (3, 2)) -> Packed:
     """Two short episodes whose arrays are all different."""
-    draws, count = np.random.default_rng(4), sum(lengths)
+    draws = np.random.default_rng(4)
+    count = sum(lengths)
     return Packed(
         frames=draws.integers(0, 256, (count, 18, 32, 3), np.uint8),
         state=draws.random((count, 2), np.float32),
@@ -32,8 +33,11 @@ def some_rows(lengths: tuple[int, ...] = (3, 2)) -> Packed:
 
 
 def test_what_is_packed_is_read_again_by_a_python_that_has_numpy_alone(tmp_path: Path) -> None:
-    """The file has the arrays that were saved, twice the same bytes, and is read without any other package."""
-    rows, path, again = some_rows(), tmp_path / "rows.npz", tmp_path / "again.npz"
+    """The file has the arrays that were saved, twice the same bytes, and is read without any other
+    package."""
+    rows = some_rows()
+    path = tmp_path / "rows.npz"
+    again = tmp_path / "again.npz"
     rows.save(path)
     rows.save(again)
     read = read_packed(path)
@@ -41,17 +45,23 @@ def test_what_is_packed_is_read_again_by_a_python_that_has_numpy_alone(tmp_path:
         np.testing.assert_array_equal(getattr(read, one.name), getattr(rows, one.name))
     assert path.read_bytes() == again.read_bytes()
     code = (
-        "import sys; from pathlib import Path; from cosim.core.packed import read_packed; "
-        "print(len(read_packed(Path(sys.argv[1]))), "
-        "sorted({m.partition('.')[0] for m in sys.modules} & {'msgspec', 'pyarrow', 'pandas', 'av', 'scipy'}))"
+        "import sys; from pathlib import Path; from cosim.core.packed_demos import read_packed; "
+        "print(len(read_packed(Path(sys.argv[1]))), sorted({m.partition('.')[0] for m in "
+        "sys.modules} & {'msgspec', 'pyarrow', 'pandas', 'av', 'scipy'}))"
     )
-    said = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
+    said = subprocess.run(
+        [sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True
+    )
     assert said.stdout.strip() == "5 []"
 
 
 def test_a_history_does_not_reach_into_the_episode_before() -> None:
     """Of four pictures, two rows apart, those from before an episode are its first."""
-    assert some_rows((5, 2)).history(4, 2).tolist()[4:] == [[0, 0, 2, 4], [5, 5, 5, 5], [5, 5, 5, 6]]
+    assert some_rows((5, 2)).history(4, 2).tolist()[4:] == [
+        [0, 0, 2, 4],
+        [5, 5, 5, 5],
+        [5, 5, 5, 6],
+    ]
 
 
 @pytest.mark.parametrize("damage", ["no file", "no npz", "cut off"])
@@ -63,5 +73,7 @@ def test_what_is_no_packed_file_is_refused_by_name(tmp_path: Path, damage: str) 
         path.unlink()
     else:
         path.write_bytes(b"frames" if damage == "no npz" else path.read_bytes()[:-400])
-    with pytest.raises(RunError, match=r"rows\.npz: no packed demonstrations: .*cosim dataset pack"):
+    with pytest.raises(
+        RunError, match=r"rows\.npz: no packed demonstrations: .*cosim dataset pack"
+    ):
         read_packed(path)

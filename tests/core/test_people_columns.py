@@ -1,4 +1,5 @@
-"""Kind and age of people are columns: an id is a name, and nothing that reads people looks into it."""
+"""Kind and age of people are columns: an id is a name, and nothing that reads people looks into
+it."""
 
 from __future__ import annotations
 
@@ -8,16 +9,16 @@ import numpy as np
 
 from cosim.core.geometry import Pose
 from cosim.core.state import Age, People, PersonKind, RobotState, Street
-from cosim.judge.delay import Tracks
 from cosim.people.gait import Strides
 from cosim.people.neighbours import nearby_people
 from cosim.place.street_map import StreetMap
 from cosim.report.minimap import EVENT, Minimap
+from cosim.results.delay import Tracks
 from cosim.spec.scenario import City, Scenario
-from physics.people.looks import family_of
+from physics.people.appearance import family_of
 from physics.people.parts import placed_parts
-from scenarios.bench.crowd_tally import Tally
-from tests.tiny_street import tiny_map
+from scenarios.tools.bench.crowd_tally import Tally
+from tests.support.tiny_street import tiny_map
 
 
 class Opaque(str):
@@ -37,20 +38,40 @@ STREET = Street(0, People.of(NAMES, XY, [0.0] * 4, [1.0] * 4, ("walk",) * 4, kin
 
 
 def test_columns_travel_with_their_people() -> None:
-    """Chosen rows and copies keep kind and age, which nobody can write to; one value stands for all."""
+    """Chosen rows and copies keep kind and age, which nobody can write to; one value stands for
+    all."""
     people = STREET.people.only(np.array([1, 3]))
-    assert people.kind.tolist() == [PersonKind.CROWD, PersonKind.RESIDENT] and people.age.tolist() == [1, 0]
+    assert people.kind.tolist() == [
+        PersonKind.CROWD,
+        PersonKind.RESIDENT,
+    ] and people.age.tolist() == [1, 0]
     copy = STREET.people.copied()
     assert copy.age.dtype == copy.kind.dtype == np.int8 and copy.kind.tolist() == list(KINDS)
-    assert not copy.kind.flags.writeable and not people.age.flags.writeable and copy.xy is not STREET.people.xy
-    assert STREET.people.are(PersonKind.CROWD, PersonKind.RESIDENT).tolist() == [False, True, False, True]
-    assert People.of(("a", "b"), XY[:2], [0, 0], [0, 0], ("stand",) * 2, age=Age.CHILD).age.tolist() == [1, 1]
+    assert (
+        not copy.kind.flags.writeable
+        and not people.age.flags.writeable
+        and copy.xy is not STREET.people.xy
+    )
+    assert STREET.people.are(PersonKind.CROWD, PersonKind.RESIDENT).tolist() == [
+        False,
+        True,
+        False,
+        True,
+    ]
+    assert People.of(
+        ("a", "b"), XY[:2], [0, 0], [0, 0], ("stand",) * 2, age=Age.CHILD
+    ).age.tolist() == [1, 1]
 
 
 def test_who_reads_people_reads_the_columns() -> None:
-    """Bystanders, tally, delays, strides, bodies and the minimap, told of people whose names would mislead them."""
+    """Bystanders, tally, delays, strides, bodies and the minimap, told of people whose names would
+    mislead them."""
     people = STREET.people
-    assert [b.kind for b in nearby_people(people)] == [PersonKind.CROWD, PersonKind.INJECTED, PersonKind.RESIDENT]
+    assert [b.kind for b in nearby_people(people)] == [
+        PersonKind.CROWD,
+        PersonKind.INJECTED,
+        PersonKind.RESIDENT,
+    ]
     street_map = tiny_map()
     tally = Tally(street_map, 0.05)
     tally.see(STREET)
@@ -59,10 +80,14 @@ def test_who_reads_people_reads_the_columns() -> None:
     tracks.add(people)
     assert set(tracks.began) == set(NAMES)
     Strides(0.05).update(people.ids, people.xy, people.speed, people.age.tolist())
-    families = [family_of(name, age) for name, age in zip(people.ids, people.age.tolist(), strict=True)]
+    families = [
+        family_of(name, age) for name, age in zip(people.ids, people.age.tolist(), strict=True)
+    ]
     assert families[1:3] == ["child", "elder"] and families[0] in ("man", "woman")
     assert len(placed_parts(people, np.zeros(4), 0.0).at_m) == 4
-    picture = minimap(street_map).picture(RobotState(Pose(8.0, 5.0, 0.0)), STREET, (300, 300), np.array([1.0, 0.0]))
+    picture = minimap(street_map).picture(
+        RobotState(Pose(8.0, 5.0, 0.0)), STREET, (300, 300), np.array([1.0, 0.0])
+    )
     assert (picture == EVENT).all(axis=2).any()
 
 
@@ -70,6 +95,12 @@ def minimap(street_map: StreetMap) -> Minimap:
     """Of a way along the northern sidewalk."""
     route = ((4.0, 5.0), (30.0, 5.0))
     scenario = Scenario(
-        id="t", suite="t", place=City(seed=1), seed=0, start=(4.0, 5.0, 0.0), goal=route[-1], route=route
+        id="t",
+        suite="t",
+        place=City(seed=1),
+        seed=0,
+        start=(4.0, 5.0, 0.0),
+        goal=route[-1],
+        route=route,
     )
     return Minimap(street_map, scenario, (0.7, 0.55))

@@ -12,27 +12,33 @@ from cosim.core.errors import SpecError, UsageError
 from cosim.core.geometry import Pose
 from cosim.core.state import People, RobotState, Street
 from cosim.episode.camera_rules import nonstandard
-from cosim.episode.ports import CameraSpec, Lens, Manifest
-from cosim.records.record import begun
-from cosim.records.results import table_row
-from cosim.records.run_folder import read_records, read_spec
+from cosim.results.record import begun
+from cosim.results.run_folder import read_records, read_spec
+from cosim.results.table import table_row
+from cosim.spec.camera import CameraSpec, Lens
+from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import COURIER, SCOUT, Mount
 from cosim.spec.scenario import City, Scenario, Suite
 from physics.cameras.choice import camera_of
 from physics.cameras.gl import context
-from physics.world.street_surface import StreetSurface
-from physics.world.world import BulletWorld
-from scenarios.checks import small_scenario
-from scenarios.execution.episode import Episode
-from scenarios.execution.suite_run import run
-from tests.cheats import FarEye
-from tests.tiny_street import tiny_map
+from physics.dynamics.world import BulletWorld
+from physics.street.street_surface import StreetSurface
+from scenarios.episodes.episode import Episode
+from scenarios.runs.run import run
+from scenarios.tools.verify.doctor import small_scenario
+from tests.support.cheats import FarEye
+from tests.support.tiny_street import tiny_map
 
 SHORT = Scenario(
-    id="s-0", suite="s", place=City(seed=0), seed=0, start=(0.0, 0.0, 0.0), goal=(9.0, 0.0),
+    id="s-0",
+    suite="s",
+    place=City(seed=0),
+    seed=0,
+    start=(0.0, 0.0, 0.0),
+    goal=(9.0, 0.0),
     route=((0.0, 0.0), (9.0, 0.0)),
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize(
@@ -40,7 +46,11 @@ SHORT = Scenario(
     [
         (None, 20.0, ""),
         (CameraSpec(), 4.0, ""),
-        (CameraSpec(1280, 960, 120.0, "mast", crop=(0, 0, 10, 10)), 20.0, "a camera of 120 deg at 'mast'"),
+        (
+            CameraSpec(1280, 960, 120.0, "mast", crop=(0, 0, 10, 10)),
+            20.0,
+            "a camera of 120 deg at 'mast'",
+        ),
         (CameraSpec(1280, 960, 90.0, "mast"), 20.0, ""),
         (CameraSpec(1281, 960), 4.0, "a camera of 1281 x 960 px at 'front'"),
         (CameraSpec(fov_deg=10.0, mount="left"), 20.0, "a camera of 10 deg, 20 Hz at 'left'"),
@@ -55,20 +65,39 @@ SHORT = Scenario(
             "a camera of its own at (0.3, 0, 0.62) m, 10 deg down, 0 to the left",
         ),
     ],
-    ids=["blind", "standard", "wide-mast", "at-the-limits", "large", "side", "far-eye", "front-by-its-place"],
+    ids=[
+        "blind",
+        "standard",
+        "wide-mast",
+        "at-the-limits",
+        "large",
+        "side",
+        "far-eye",
+        "front-by-its-place",
+    ],
 )
-def test_what_no_mount_of_the_robot_allows_is_told(camera: CameraSpec | None, rate_hz: float, told: str) -> None:
-    """Place, size, field of view and rate are held against the limits of the mount; a crop makes a picture no less."""
+def test_what_no_mount_of_the_robot_allows_is_told(
+    camera: CameraSpec | None, rate_hz: float, told: str
+) -> None:
+    """Place, size, field of view and rate are held against the limits of the mount; a crop makes a
+    picture no less."""
     assert nonstandard(Manifest("mine", rate_hz=rate_hz, camera=camera), COURIER) == told
 
 
-def test_a_camera_that_the_robot_does_not_have_is_refused_with_those_that_it_has(tmp_path: Path) -> None:
+def test_a_camera_that_the_robot_does_not_have_is_refused_with_those_that_it_has(
+    tmp_path: Path,
+) -> None:
     """By an Episode and by a run, before anything starts; the remedy is told."""
     with pytest.raises(UsageError) as caught:
         Episode(SHORT, FarEye.manifest)
-    assert str(caught.value).startswith("policy 'far-eye' sees by a camera of its own at (6, 0, 18) m, 80 deg down")
-    for words in ("'front' at (0.3, 0, 0.62) m, 10 deg down; up to 1280 x 960 px, 20 to 120 deg, 20 Hz",
-                  "'left' at (0.1, 0.25, 0.58) m, 10 deg down, 60 deg to the left; up to", "--own-camera"):  # fmt: skip
+    assert str(caught.value).startswith(
+        "policy 'far-eye' sees by a camera of its own at (6, 0, 18) m, 80 deg down"
+    )
+    for words in (
+        "'front' at (0.3, 0, 0.62) m, 10 deg down; up to 1280 x 960 px, 20 to 120 deg, 20 Hz",
+        "'left' at (0.1, 0.25, 0.58) m, 10 deg down, 60 deg to the left; up to",
+        "--own-camera",
+    ):
         assert words in str(caught.value)
     with pytest.raises(UsageError, match="which marks every row as nonstandard"):
         run("reactive", FarEye(), episodes=1, out=tmp_path / "run")
@@ -77,44 +106,76 @@ def test_a_camera_that_the_robot_does_not_have_is_refused_with_those_that_it_has
 
 
 def test_every_record_and_row_tells_what_the_policy_saw_by() -> None:
-    """Also one of an episode that crashed: the camera itself, the rate, and what is nonstandard of it."""
+    """Also one of an episode that crashed: the camera itself, the rate, and what is nonstandard of
+    it."""
     manifest = Manifest(
-        "mine", rate_hz=5.0, camera=CameraSpec(512, 288, 60.0, crop=(0, 88, 512, 288), lens=Lens(k1=0.1))
+        "mine",
+        rate_hz=5.0,
+        camera=CameraSpec(512, 288, 60.0, crop=(0, 88, 512, 288), lens=Lens(k1=0.1)),
     )
-    record, far = begun(SHORT, manifest, "h"), begun(SHORT, FarEye.manifest, "h")
+    record = begun(SHORT, manifest, "h")
+    far = begun(SHORT, FarEye.manifest, "h")
     assert (record.camera, record.rate_hz, record.nonstandard) == (manifest.camera, 5.0, "")
     row = table_row(record)
     assert row["camera"] == "front, 512 x 288 px, 60 deg, crop 0 88 512 288, lens"
-    assert (row["rate_hz"], row["nonstandard"], table_row(begun(SHORT, Manifest("b", camera=None), "h"))["camera"]) == (
-        5.0, "", "none",
-    )  # fmt: skip
-    assert table_row(far)["nonstandard"] == "a camera of its own at (6, 0, 18) m, 80 deg down, 0 to the left"
-    on_scout = begun(msgspec.structs.replace(SHORT, robot="scout"), Manifest("m", camera=CameraSpec(mount="left")), "h")
-    assert on_scout.nonstandard == nonstandard(Manifest("m", camera=CameraSpec(mount="left")), SCOUT) == ""
+    assert (
+        row["rate_hz"],
+        row["nonstandard"],
+        table_row(begun(SHORT, Manifest("b", camera=None), "h"))["camera"],
+    ) == (
+        5.0,
+        "",
+        "none",
+    )
+    assert (
+        table_row(far)["nonstandard"]
+        == "a camera of its own at (6, 0, 18) m, 80 deg down, 0 to the left"
+    )
+    on_scout = begun(
+        msgspec.structs.replace(SHORT, robot="scout"),
+        Manifest("m", camera=CameraSpec(mount="left")),
+        "h",
+    )
+    assert (
+        on_scout.nonstandard
+        == nonstandard(Manifest("m", camera=CameraSpec(mount="left")), SCOUT)
+        == ""
+    )
 
 
 @pytest.mark.parametrize(
-    "crop", [(0, 0, 97, 96), (5, 0, 5, 96), (-1, 0, 9, 9), (9, 9, 5, 20), (0, 0, 9)], ids=lambda crop: str(crop)
+    "crop",
+    [(0, 0, 97, 96), (5, 0, 5, 96), (-1, 0, 9, 9), (9, 9, 5, 20), (0, 0, 9)],
+    ids=lambda crop: str(crop),
 )
 def test_a_crop_that_is_no_part_of_the_picture_is_refused(crop: tuple[int, int, int, int]) -> None:
     """In words, with the size of the whole picture."""
-    with pytest.raises(SpecError, match=r"camera crop must be \(x0, y0, x1, y1\) within 96 x 96 pixels"):
+    with pytest.raises(
+        SpecError, match=r"camera crop must be \(x0, y0, x1, y1\) within 96 x 96 pixels"
+    ):
         CameraSpec(96, 96, crop=crop)
 
 
 @pytest.mark.engine
-@pytest.mark.parametrize("lens", [Lens(), Lens(k1=0.1, full_well_e=10000.0)], ids=["pinhole", "lens"])
+@pytest.mark.parametrize(
+    "lens", [Lens(), Lens(k1=0.1, full_well_e=10000.0)], ids=["pinhole", "lens"]
+)
 @pytest.mark.parametrize(
     "camera",
     [
-        pytest.param("gl", marks=pytest.mark.skipif(not context.available(), reason="no OpenGL through EGL here")),
+        pytest.param(
+            "gl",
+            marks=pytest.mark.skipif(not context.available(), reason="no OpenGL through EGL here"),
+        ),
         "bullet",
     ],
 )
 def test_a_crop_is_the_slice_of_the_whole_picture(camera: str, lens: Lens) -> None:
-    """To the bit, of colours, labels and depth, whatever the lens does: columns 10 to 50, rows 4 to 30."""
+    """To the bit, of colours, labels and depth, whatever the lens does: columns 10 to 50, rows 4 to
+    30."""
     world = BulletWorld(StreetSurface(tiny_map(), 1), (), COURIER)
-    robot, frames = RobotState(Pose(-40.0, 100.0, 0.2), 1.0), []
+    robot = RobotState(Pose(-40.0, 100.0, 0.2), 1.0)
+    frames = []
     street = Street(3, People.of(("c1",), [[-36.0, 101.0]], [0.0], [1.0], ("walk",)))
     for crop in (None, (10, 4, 50, 30)):
         spec = CameraSpec(64, 48, lens=lens, crop=crop)
@@ -123,18 +184,25 @@ def test_a_crop_is_the_slice_of_the_whole_picture(camera: str, lens: Lens) -> No
     whole, part = frames
     assert spec.size == (40, 26) and part.rgb.shape == (26, 40, 3)
     assert len(np.unique(whole.rgb)) > 10
-    for one, other in ((whole.rgb, part.rgb), (whole.labels, part.labels), (whole.depth, part.depth)):
+    for one, other in (
+        (whole.rgb, part.rgb),
+        (whole.labels, part.labels),
+        (whole.depth, part.depth),
+    ):
         assert one is not None and other is not None and np.array_equal(one[4:30, 10:50], other)
 
 
 @pytest.mark.engine
 def test_a_run_with_a_camera_of_its_own_marks_every_row(tmp_path: Path) -> None:
-    """Its rows, its records and its run.json; what the policy gets is the camera that it asked for."""
+    """Its rows, its records and its run.json; what the policy gets is the camera that it asked
+    for."""
     short = msgspec.structs.replace(small_scenario(), time_limit_s=0.5)
     suite = Suite(name="small", version="1", scenarios=(short,))
     options = EpisodeOptions(own_camera=True, camera="bullet", seed=1)
     table = run(suite, FarEye(), out=tmp_path / "run", options=options)
-    assert list(table["nonstandard"]) == ["a camera of its own at (6, 0, 18) m, 80 deg down, 0 to the left"]
+    assert list(table["nonstandard"]) == [
+        "a camera of its own at (6, 0, 18) m, 80 deg down, 0 to the left"
+    ]
     assert list(table["camera"]) == ["own mount, 64 x 64 px, 75 deg"]
     (record,) = read_records(tmp_path / "run")
     assert record.camera == FarEye.manifest.camera == read_spec(tmp_path / "run").camera

@@ -14,7 +14,7 @@ from cosim.core.clock import Clock
 from cosim.core.errors import PolicyError, SpecError
 from cosim.core.state import Command, Planned
 from cosim.episode.control import command_of
-from cosim.episode.ports import WaypointRule
+from cosim.spec.manifest import WaypointRule
 from cosim.spec.robot import COURIER, Robot
 
 ATAN2 = WaypointRule(rule="atan2")
@@ -22,22 +22,41 @@ QUICK = dataclasses.replace(COURIER, w_max_radps=100.0)
 """Turns as fast as it is told."""
 
 
-def of(answer: object, rule: WaypointRule = WaypointRule(), robot: Robot = COURIER) -> Command:  # noqa: B008  frozen
+def of(answer: object, rule: WaypointRule = WaypointRule(), robot: Robot = COURIER) -> Command:
     command = command_of(answer, rule=rule, robot=robot)
     assert isinstance(command, Planned) == (not isinstance(answer, Command))
     return Command(command.v_mps, command.w_radps)
 
 
-# x, y, heading (None without one), then w by the shipped rule and by atan2, worked out by hand for a step of 0.25 s.
+# x, y, heading (None without one), then w by the shipped rule and by atan2, worked out by hand for
+# a step of 0.25 s.
 BY_HAND = {
     "ahead": (0.5, 0.0, None, 0.0, 0.0),
     "ahead-left": (0.5, 0.5, None, math.pi, math.pi),  # 45 degrees in a quarter of a second
-    "ahead-right": (0.3, -0.3 * math.sqrt(3.0), None, -4.0 * math.pi / 3.0, -4.0 * math.pi / 3.0),  # -60 degrees
-    "behind-left": (-1.0, 0.5, None, -1.8545904360032244, 10.711780178355947),  # arctan(-1/2) = -0.4636; pi - 0.4636
+    "ahead-right": (
+        0.3,
+        -0.3 * math.sqrt(3.0),
+        None,
+        -4.0 * math.pi / 3.0,
+        -4.0 * math.pi / 3.0,
+    ),  # -60 degrees
+    "behind-left": (
+        -1.0,
+        0.5,
+        None,
+        -1.8545904360032244,
+        10.711780178355947,
+    ),  # arctan(-1/2) = -0.4636; pi - 0.4636
     "behind-right": (-1.0, -0.5, None, 1.8545904360032244, -10.711780178355947),
     "straight-behind": (-1.0, 0.0, None, 0.0, 4.0 * math.pi),
     "left": (0.0, 1.0, None, 2.0 * math.pi, 2.0 * math.pi),
-    "right-with-heading": (0.0, -1.0, 1.0, -2.0 * math.pi, -2.0 * math.pi),  # the heading counts at its own place alone
+    "right-with-heading": (
+        0.0,
+        -1.0,
+        1.0,
+        -2.0 * math.pi,
+        -2.0 * math.pi,
+    ),  # the heading counts at its own place alone
     "here": (0.0, 0.0, None, 0.0, 0.0),
     "here-turned-left": (0.0, 0.0, 0.5, 2.0, 2.0),
     "here-turned-right": (1e-9, -1e-9, -2.0, -8.0, -8.0),
@@ -50,41 +69,64 @@ BY_HAND = {
 def test_both_rules_turn_as_worked_out_by_hand(name: str, rule: WaypointRule) -> None:
     """v is x / dt, never backwards; w is that of the rule; only behind the robot the two differ."""
     x_m, y_m, heading_rad, shipped, atan2 = BY_HAND[name]
-    row = [x_m, y_m] if heading_rad is None else [x_m, y_m, math.cos(heading_rad), math.sin(heading_rad)]
+    row = (
+        [x_m, y_m]
+        if heading_rad is None
+        else [x_m, y_m, math.cos(heading_rad), math.sin(heading_rad)]
+    )
     v_mps = 4.0 * x_m if x_m > 1e-8 else 0.0
     expected = (v_mps, shipped if rule is not ATAN2 else atan2)
-    assert dataclasses.astuple(of([[9.0] * len(row), [9.0] * len(row), row], rule, QUICK)) == pytest.approx(expected)
+    assert dataclasses.astuple(
+        of([[9.0] * len(row), [9.0] * len(row), row], rule, QUICK)
+    ) == pytest.approx(expected)
 
 
 def test_a_waypoint_behind_the_robot_turns_it_as_the_models_were_driven() -> None:
-    """(-1, 0.5) at 0.25 s: -1.85 rad/s by the shipped rule, clipped to the courier's -0.65; by atan2 to +0.65."""
+    """(-1, 0.5) at 0.25 s: -1.85 rad/s by the shipped rule, clipped to the courier's -0.65; by
+    atan2 to +0.65."""
     answer = [[-1.0, 0.5]] * 3
     assert of(answer, robot=QUICK).w_radps == pytest.approx(-1.85, abs=0.005)
     assert of(answer) == Command(0.0, -0.65) and of(answer, ATAN2) == Command(0.0, 0.65)
 
 
 def test_the_manifest_says_which_waypoint_is_followed_and_in_which_units() -> None:
-    """The third one unless it says otherwise; x and y times the unit, in the step that is declared."""
+    """The third one unless it says otherwise; x and y times the unit, in the step that is
+    declared."""
     answer = np.array([[0.1, 0.0], [0.2, 0.1], [0.4, 0.0], [0.5, 0.5]])
     assert of(answer) == Command(1.6, 0.0)
     assert of(answer, WaypointRule(index=0)) == Command(0.4, 0.0)
-    assert of(answer, WaypointRule(index=3, unit_m=0.5, dt_s=0.5), QUICK) == Command(0.5, math.pi / 2.0)
+    assert of(answer, WaypointRule(index=3, unit_m=0.5, dt_s=0.5), QUICK) == Command(
+        0.5, math.pi / 2.0
+    )
     scaled = WaypointRule(index=0, unit_m=10.0)
-    assert of([[1e-9, 1e-9, 0.0, 1.0]], scaled, QUICK) == of([[1e-8, 1e-8, 0.0, 1.0]], WaypointRule(index=0), QUICK)
+    assert of([[1e-9, 1e-9, 0.0, 1.0]], scaled, QUICK) == of(
+        [[1e-8, 1e-8, 0.0, 1.0]], WaypointRule(index=0), QUICK
+    )
 
 
 def test_a_command_tells_the_waypoints_that_it_follows_one_of() -> None:
-    """In metres, as they were answered, with the index; asked again it is the same; nobody tells any that are none."""
+    """In metres, as they were answered, with the index; asked again it is the same; nobody tells
+    any that are none."""
     rule = WaypointRule(index=1, unit_m=0.5)
     told = command_of([[1.0, 0.5, 0.6, 0.8], [2.0, -1.0, 1.0, 0.0]], rule=rule, robot=COURIER)
     assert isinstance(told, Planned) and told.index == 1 and told.waypoints.dtype == np.float32
-    assert np.array_equal(told.waypoints, np.float32([[0.5, 0.25, 0.6, 0.8], [1.0, -0.5, 1.0, 0.0]]))
+    assert np.array_equal(
+        told.waypoints, np.float32([[0.5, 0.25, 0.6, 0.8], [1.0, -0.5, 1.0, 0.0]])
+    )
     again = command_of(told, rule=rule, robot=COURIER)
-    assert isinstance(again, Planned) and again == told and np.array_equal(again.waypoints, told.waypoints)
+    assert (
+        isinstance(again, Planned)
+        and again == told
+        and np.array_equal(again.waypoints, told.waypoints)
+    )
     with pytest.raises(PolicyError, match=r"shape \(3,\)"):
         of(dataclasses.replace(told, waypoints=np.zeros(3, np.float32)))
     many = command_of([[1e300, 0.0]] * 1000, rule=WaypointRule(), robot=COURIER)
-    assert isinstance(many, Planned) and many.waypoints.shape == (256, 2) and np.isfinite(many.waypoints).all()
+    assert (
+        isinstance(many, Planned)
+        and many.waypoints.shape == (256, 2)
+        and np.isfinite(many.waypoints).all()
+    )
 
 
 def test_fewer_waypoints_than_the_rule_needs_are_refused_with_the_remedy() -> None:
@@ -92,18 +134,27 @@ def test_fewer_waypoints_than_the_rule_needs_are_refused_with_the_remedy() -> No
     with pytest.raises(PolicyError) as caught:
         of([[0.1, 0.0], [0.2, 0.0]])
     assert str(caught.value) == (
-        "answered waypoints of shape (2, 2), and waypoint 2 (from 0) is followed: answer at least 3, or say which one "
-        "in the manifest, as waypoints=WaypointRule(index=1)"
+        "answered waypoints of shape (2, 2), and waypoint 2 (from 0) is followed: answer at least "
+        "3, or say which one in the manifest, as waypoints=WaypointRule(index=1)"
     )
 
 
 @given(st.floats(-5.0, 5.0), st.floats(-5.0, 5.0), st.floats(-math.pi, math.pi))
-def test_the_rules_agree_before_the_robot_and_never_leave_its_limits(x_m: float, y_m: float, heading: float) -> None:
-    """For any waypoint: within the limits; ahead of the robot the same by both; mirrored, it turns the other way."""
-    row, mirrored = ((x_m, side * y_m, math.cos(heading), side * math.sin(heading)) for side in (1.0, -1.0))
-    one, other = of([row] * 3), of([row] * 3, ATAN2)
+def test_the_rules_agree_before_the_robot_and_never_leave_its_limits(
+    x_m: float, y_m: float, heading: float
+) -> None:
+    """For any waypoint: within the limits; ahead of the robot the same by both; mirrored, it turns
+    the other way."""
+    row, mirrored = (
+        (x_m, side * y_m, math.cos(heading), side * math.sin(heading)) for side in (1.0, -1.0)
+    )
+    one = of([row] * 3)
+    other = of([row] * 3, ATAN2)
     for command in (one, other):
-        assert 0.0 <= command.v_mps <= COURIER.v_max_mps and abs(command.w_radps) <= COURIER.w_max_radps
+        assert (
+            0.0 <= command.v_mps <= COURIER.v_max_mps
+            and abs(command.w_radps) <= COURIER.w_max_radps
+        )
     assert one == other or x_m < 0.0
     turned = of([mirrored] * 3)
     assert turned.v_mps == one.v_mps and turned.w_radps == -one.w_radps
@@ -125,9 +176,15 @@ UNUSABLE: dict[str, tuple[object, str]] = {
     "complex-in-command": (Command(1j, 0.0), "Command(v_mps=1j, w_radps=0.0): both must"),  # type: ignore[arg-type]
     "truth-in-command": (Command(True, 0.0), "Command(v_mps=True, w_radps=0.0): both must"),
     "array-in-command": (Command(np.ones(2), 0.0), "both must be finite"),  # type: ignore[arg-type]
-    "beyond-any-float": (Command(10**400, 0.0), "Command(v_mps=an integer of 1329 bits, w_radps=0.0): both must"),
+    "beyond-any-float": (
+        Command(10**400, 0.0),
+        "Command(v_mps=an integer of 1329 bits, w_radps=0.0): both must",
+    ),
     "nan-waypoint": (np.array([[math.nan, 0.0]]), "waypoints with NaN or infinity: [nan, 0.0]"),
-    "nan-later": (np.array([[1.0, 0.0], [math.inf, 0.0]]), "waypoints with NaN or infinity: [inf, 0.0]"),
+    "nan-later": (
+        np.array([[1.0, 0.0], [math.inf, 0.0]]),
+        "waypoints with NaN or infinity: [inf, 0.0]",
+    ),
     "huge-waypoint": ([[10**400, 0]], "an array of object: waypoints are real numbers"),
     "one-row": (np.zeros((3,)), "an array of shape (3,): waypoints have shape (N, 2) or (N, 4)"),
     "no-row": (np.zeros((0, 2)), "an array of shape (0, 2)"),
@@ -140,17 +197,24 @@ UNUSABLE: dict[str, tuple[object, str]] = {
     "dict": ({"v_mps": 1.0}, "answered {'v_mps': 1.0}: neither a Command nor waypoints"),
     "long": ({"v": "x" * 1000}, "answered a dict: neither a Command nor waypoints"),
     "generator": ((x for x in ()), "neither a Command nor waypoints"),
-    "complex-waypoints": (np.array([[1.0 + 0j, 0.0]]), "an array of complex128: waypoints are real numbers"),
+    "complex-waypoints": (
+        np.array([[1.0 + 0j, 0.0]]),
+        "an array of complex128: waypoints are real numbers",
+    ),
     "text-waypoints": ([["1.0", "0.0"]], "an array of str96: waypoints are real numbers"),
     "truth-waypoints": (np.array([[True, False]]), "an array of bool: waypoints are real numbers"),
     "object-waypoints": (np.array([[1.0, None]]), "an array of object: waypoints are real numbers"),
-    "dates": (np.array([["2020-01-01", "2020-01-02"]], dtype="datetime64[D]"), "waypoints are real numbers"),
+    "dates": (
+        np.array([["2020-01-01", "2020-01-02"]], dtype="datetime64[D]"),
+        "waypoints are real numbers",
+    ),
 }
 
 
 @pytest.mark.parametrize("name", UNUSABLE)
 def test_an_unusable_answer_is_refused_with_what_came(name: str) -> None:
-    """NaN, what is not real numbers, wrong shapes and other things raise PolicyError that says what came."""
+    """NaN, what is not real numbers, wrong shapes and other things raise PolicyError that says what
+    came."""
     answer, message = UNUSABLE[name]
     with pytest.raises(PolicyError) as caught:
         of(answer)
@@ -167,7 +231,8 @@ def test_numbers_of_every_kind_are_commands() -> None:
 
 
 def test_a_clock_counts_in_whole_periods() -> None:
-    """Ticks, substeps and policy periods come from integers, and a rate that does not divide is refused."""
+    """Ticks, substeps and policy periods come from integers, and a rate that does not divide is
+    refused."""
     clock = Clock.for_rate(4)
     assert (clock.substeps, clock.time_s(7), clock.ticks(10.0)) == (10, 0.35, 200)
     assert [tick for tick in range(12) if clock.acts(tick)] == [0, 5, 10]

@@ -16,10 +16,11 @@ from shapely.geometry import box
 from cosim.core.errors import PolicyError
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import STILL, Command, People, Planned, RobotState, Signal, Vehicles
-from cosim.episode.driver import BatchDriver, Driver, PolicyCall
-from cosim.episode.ports import CameraSpec, Manifest, Observation, Privileged, WaypointRule
+from cosim.episode.interfaces import Observation, Privileged
+from cosim.episode.policy_caller import BatchDriver, Driver, PolicyCall
+from cosim.spec.camera import Calibration, CameraPicture, CameraSpec
 from cosim.spec.goal import ImageGoal, RoutePatch
-from cosim.spec.picture import Calibration, CameraPicture
+from cosim.spec.manifest import Manifest, WaypointRule
 from cosim.spec.robot import COURIER
 
 MINE = Manifest("mine", camera=None)
@@ -47,9 +48,17 @@ def seen(tick: int = 0, known: Privileged | None = None) -> Observation:
 def knowledge() -> Privileged:
     people = People.of(("c1",), [[1.0, 2.0]], [0.0], [1.0], ("walk",))
     vehicles = Vehicles.of(("v1",), [[5.0, 5.0]], [0.0], [8.0], [[4.0, 2.0]])
-    robot, route = RobotState(Pose(0.0, 0.0, 0.0), 1.0), Polyline([(0, 0), (9, 0)])
+    robot = RobotState(Pose(0.0, 0.0, 0.0), 1.0)
+    route = Polyline([(0, 0), (9, 0)])
     return Privileged(
-        robot, route, 0.0, people, vehicles, {"x": Signal(False, 3.0)}, (("x", 1.0, 2.0),), box(0, 0, 9, 9)
+        robot,
+        route,
+        0.0,
+        people,
+        vehicles,
+        {"x": Signal(False, 3.0)},
+        (("x", 1.0, 2.0),),
+        box(0, 0, 9, 9),
     )
 
 
@@ -90,7 +99,8 @@ def deaf() -> object:
     ids=["error", "exit", "ctrl-c", "generator", "memory", "mute", "odd-text", "long-text"],
 )
 def test_whatever_a_policy_raises_is_its_crash(deaf: None, error: BaseException, told: str) -> None:
-    """Also what is no Exception, and what cannot be written down: one message with the policy's name and the time."""
+    """Also what is no Exception, and what cannot be written down: one message with the policy's
+    name and the time."""
     with pytest.raises(PolicyError) as caught:
         Driver(Fake(raising(error))).act(seen(tick=2))
     assert str(caught.value).startswith("policy 'mine' raised ") and told in str(caught.value)
@@ -110,7 +120,8 @@ def test_ctrl_c_is_no_crash() -> None:
 
 
 def test_an_answer_is_read_once_and_inside_the_door() -> None:
-    """Numbers that raise when they are read, or change each time, cannot leave the robot's limits."""
+    """Numbers that raise when they are read, or change each time, cannot leave the robot's
+    limits."""
 
     class Pretends(float):
         def __float__(self) -> float:
@@ -137,8 +148,19 @@ def test_what_a_policy_writes_into_nobody_sees() -> None:
         known = observation.privileged
         assert known is not None
         people, vehicles = known.people, known.vehicles
-        for array in (people.xy, people.heading, people.speed, people.strides, people.pace, known.route.points,
-                      known.route.s_m, vehicles.xy, vehicles.heading, vehicles.speed, vehicles.size):  # fmt: skip
+        for array in (
+            people.xy,
+            people.heading,
+            people.speed,
+            people.strides,
+            people.pace,
+            known.route.points,
+            known.route.s_m,
+            vehicles.xy,
+            vehicles.heading,
+            vehicles.speed,
+            vehicles.size,
+        ):
             array.setflags(write=True)
             array[:] = 99.0
         object.__setattr__(known.robot, "v_mps", 99.0)
@@ -168,7 +190,8 @@ def test_a_route_stays_the_same_object_through_an_episode() -> None:
         routes.append(observation.privileged.route)
         return STILL
 
-    driver, known = Driver(Fake(notes, dataclasses.replace(MINE, privileged=True))), knowledge()
+    driver = Driver(Fake(notes, dataclasses.replace(MINE, privileged=True)))
+    known = knowledge()
     for tick in (0, 5):
         driver.act(seen(tick, known))
     driver.reset("next", 0)
@@ -182,7 +205,9 @@ def test_a_manifest_is_read_once() -> None:
 
     def greedy(observation: Observation) -> Command:
         known.append(observation.privileged)
-        policy.manifest = Manifest("mine", camera=None, privileged=True, waypoints=WaypointRule(dt_s=1e-9))
+        policy.manifest = Manifest(
+            "mine", camera=None, privileged=True, waypoints=WaypointRule(dt_s=1e-9)
+        )
         return STILL
 
     policy = Fake(greedy)
@@ -207,7 +232,8 @@ def test_a_child_that_a_policy_forks_does_not_go_on_with_the_episode() -> None:
 
 
 def test_a_policy_at_work_is_timed() -> None:
-    """Every question is told when it begins and ends, also if it ends badly; the first answer is told apart."""
+    """Every question is told when it begins and ends, also if it ends badly; the first answer is
+    told apart."""
     told: list[tuple[str, int] | None] = []
 
     class Notes:
@@ -223,7 +249,16 @@ def test_a_policy_at_work_is_timed() -> None:
     driver.act(seen(5))
     with pytest.raises(PolicyError):
         driver.reset("bad", 0)
-    assert told == [("reset", 0), None, ("first act", 0), None, ("act", 5), None, ("reset", 0), None]
+    assert told == [
+        ("reset", 0),
+        None,
+        ("first act", 0),
+        None,
+        ("act", 5),
+        None,
+        ("reset", 0),
+        None,
+    ]
 
 
 class Pair(Fake):
@@ -259,7 +294,10 @@ def test_a_bad_answer_in_a_batch_is_one_episodes_crash() -> None:
     good, bad = of_two(lambda _: [STILL, Command(float("nan"), 0.0)])
     assert good == STILL and "must be finite numbers (act at 0.20 s)" in str(bad)
     good, bad = of_two(lambda _: [STILL, np.zeros((50_001, 2))])
-    assert good == STILL and "(50001, 2): 100002 numbers; an answer holds at most 100000 (act at 0.20 s)" in str(bad)
+    assert (
+        good == STILL
+        and "(50001, 2): 100002 numbers; an answer holds at most 100000 (act at 0.20 s)" in str(bad)
+    )
 
 
 @pytest.mark.parametrize(
@@ -268,7 +306,10 @@ def test_a_bad_answer_in_a_batch_is_one_episodes_crash() -> None:
         (raising(KeyError("no such weight")), "raised KeyError: 'no such weight'"),
         (raising(SystemExit(3)), "raised SystemExit: 3"),
         (lambda _: [STILL], "gave 1 answers to 2 observations"),
-        (lambda two: (STILL for _ in two), "answered a generator: a batch is answered with a sequence"),
+        (
+            lambda two: (STILL for _ in two),
+            "answered a generator: a batch is answered with a sequence",
+        ),
         (lambda _: None, "answered a NoneType: a batch is answered with a sequence"),
     ],
     ids=["error", "exit", "one-too-few", "generator", "nothing"],
@@ -278,7 +319,8 @@ def test_what_is_no_answer_to_a_batch_is_the_crash_of_all_of_it(
 ) -> None:
     """Each is told at its own time."""
     assert [str(error) for error in of_two(does)] == [
-        f"policy 'mine' {told} (act at {time} s, asked for 2 episodes together)" for time in ("0.10", "0.20")
+        f"policy 'mine' {told} (act at {time} s, asked for 2 episodes together)"
+        for time in ("0.10", "0.20")
     ]
 
 
@@ -304,19 +346,33 @@ def test_the_first_answer_of_any_episode_of_a_batch_may_take_longer() -> None:
 
 
 def test_what_a_policy_writes_into_its_goal_and_further_pictures_nobody_sees() -> None:
-    """Goals that are pictures or patches, depth, labels, pictures of further cameras: copies; and its manifest is what
-    it was, whatever it adds to the one of its class."""
-    ones, grey = np.ones((4, 4), np.uint8), np.full((4, 4, 3), 7, np.uint8)
+    """Goals that are pictures or patches, depth, labels, pictures of further cameras: copies; and
+    its manifest is what it was, whatever it adds to the one of its class."""
+    ones = np.ones((4, 4), np.uint8)
+    grey = np.full((4, 4, 3), 7, np.uint8)
     calibration = Calibration(np.eye(3), np.zeros(5), np.eye(4))
     left = CameraPicture(grey, ones, ones.astype(np.float32), calibration)
-    whole = dataclasses.replace(seen(), depth=ones.astype(np.float32), labels=ones, pictures={"left": left})
+    whole = dataclasses.replace(
+        seen(), depth=ones.astype(np.float32), labels=ones, pictures={"left": left}
+    )
     manifest = dataclasses.replace(MINE, cameras={})
 
     def scribbles(observation: Observation) -> Command:
-        goal, own = observation.goal, observation.pictures["left"]
-        assert isinstance(goal, ImageGoal | RoutePatch) and own.depth is not None and own.labels is not None
-        for array in (goal.rgb if isinstance(goal, ImageGoal) else goal.pixels, observation.depth, observation.labels,
-                      own.rgb, own.depth, own.labels):  # fmt: skip
+        goal = observation.goal
+        own = observation.pictures["left"]
+        assert (
+            isinstance(goal, ImageGoal | RoutePatch)
+            and own.depth is not None
+            and own.labels is not None
+        )
+        for array in (
+            goal.rgb if isinstance(goal, ImageGoal) else goal.pixels,
+            observation.depth,
+            observation.labels,
+            own.rgb,
+            own.depth,
+            own.labels,
+        ):
             assert array is not None
             array[:] = 99
         observation.pictures["right"] = own  # type: ignore[index]
@@ -326,7 +382,12 @@ def test_what_a_policy_writes_into_its_goal_and_further_pictures_nobody_sees() -
     driver = Driver(Fake(scribbles, manifest))
     for goal in (ImageGoal(grey), RoutePatch(ones)):
         driver.act(dataclasses.replace(whole, goal=goal))
-    assert (grey == 7).all() and (ones == 1).all() and (left.depth == 1).all() and (whole.depth == 1).all()
+    assert (
+        (grey == 7).all()
+        and (ones == 1).all()
+        and (left.depth == 1).all()
+        and (whole.depth == 1).all()
+    )
     assert set(whole.pictures) == {"left"} and driver.manifest.cameras == {}
 
 
@@ -367,16 +428,21 @@ class RemembersMany(Remembers):
 
 
 def test_on_reset_comes_before_the_act_that_follows_a_teleport() -> None:
-    """Only then; a policy without it is asked all the same, and what it raises is a crash told as its own."""
+    """Only then; a policy without it is asked all the same, and what it raises is a crash told as
+    its own."""
     policy = Remembers()
     driver = Driver(policy)
     for observation in (seen(0), put_back("", 5), seen(10)):
         driver.act(observation)
     driver.ended()
     assert policy.told == ["act", "on_reset", "act", "act"]
-    assert Driver(Fake(lambda one: Command(float(one.reset), 0.0))).act(put_back("", 5)) == Command(1.0, 0.0)
+    assert Driver(Fake(lambda one: Command(float(one.reset), 0.0))).act(put_back("", 5)) == Command(
+        1.0, 0.0
+    )
     policy.on_reset = lambda: [][0]  # type: ignore[method-assign]
-    with pytest.raises(PolicyError, match=r"raised IndexError: list index out of range \(on_reset at 0\.50 s\)"):
+    with pytest.raises(
+        PolicyError, match=r"raised IndexError: list index out of range \(on_reset at 0\.50 s\)"
+    ):
         driver.act(put_back("", 10))
 
 
@@ -397,13 +463,18 @@ def test_a_policy_for_many_episodes_is_told_which_was_put_back_and_which_has_end
     assert many.told == [("on_reset", "a"), "a", "b", ("ended", "a")]
 
 
-def test_an_on_reset_that_raises_is_the_crash_of_its_episode_alone(capfd: pytest.CaptureFixture[str]) -> None:
-    """The others of the batch are answered, in their order; an `ended` that raises is printed and nobody's crash."""
+def test_an_on_reset_that_raises_is_the_crash_of_its_episode_alone(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """The others of the batch are answered, in their order; an `ended` that raises is printed and
+    nobody's crash."""
     many = RemembersMany()
     batch = BatchDriver(Driver(many))
     first, bad, last = batch.act_batch([put_back("a", 5), put_back("bad", 6), put_back("c", 7)])
     assert (first, last) == (STILL, STILL) and many.told[-2:] == ["a", "c"]
     assert str(bad) == "policy 'mine' raised LookupError: no history (on_reset at 0.30 s)"
-    assert isinstance(batch.act_batch([put_back("bad", 6)])[0], PolicyError) and many.told[-1] == "c"
+    assert (
+        isinstance(batch.act_batch([put_back("bad", 6)])[0], PolicyError) and many.told[-1] == "c"
+    )
     batch.ended("bad")
     assert "policy 'mine' raised LookupError: no such episode (ended)" in capfd.readouterr().err

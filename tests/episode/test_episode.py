@@ -8,17 +8,19 @@ import pytest
 
 from cosim.core.errors import EngineError, PolicyError, UsageError
 from cosim.core.state import Command
-from cosim.episode.ports import CameraSpec, Manifest, Observation
+from cosim.episode.interfaces import Observation
 from cosim.episode.step import Step
-from cosim.judge.referee import Verdict
+from cosim.results.referee import Verdict
+from cosim.spec.camera import CameraSpec
+from cosim.spec.episode_id import pseudonym_of
+from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
-from cosim.spec.pseudonym import pseudonym_of
 from cosim.spec.scenario import Scenario
-from scenarios.checks import small_scenario
-from scenarios.execution.episode import Episode
-from scenarios.execution.replay import Recorded, replayed
-from scenarios.execution.run import run_episode
-from tests.report.blind import BEND, Blind
+from scenarios.episodes.episode import Episode
+from scenarios.episodes.replay import Recorded, replayed
+from scenarios.episodes.run_episode import run_episode
+from scenarios.tools.verify.doctor import small_scenario
+from tests.support.blind_policy import BEND, Blind
 
 pytestmark = pytest.mark.engine
 
@@ -45,7 +47,8 @@ class Ahead:
 
 
 def test_an_episode_is_driven_by_hand_to_the_result_of_a_run(scenario: Scenario) -> None:
-    """reset and advance until it is over: eight observations of four a second, then the record of the same run."""
+    """reset and advance until it is over: eight observations of four a second, then the record of
+    the same run."""
     times = []
     with Episode(scenario, SEEING) as episode:
         observation = episode.reset()
@@ -61,9 +64,11 @@ def test_an_episode_is_driven_by_hand_to_the_result_of_a_run(scenario: Scenario)
     assert run_episode(scenario, Ahead()).record.state_hash == record.state_hash
 
 
-def test_waypoints_are_recorded_as_they_were_answered_and_the_record_replays(scenario: Scenario) -> None:
-    """Blind gives commands for a second, then waypoints, all of which its trajectory has, with the followed one; run
-    again it comes to the same state hash."""
+def test_waypoints_are_recorded_as_they_were_answered_and_the_record_replays(
+    scenario: Scenario,
+) -> None:
+    """Blind gives commands for a second, then waypoints, all of which its trajectory has, with the
+    followed one; run again it comes to the same state hash."""
     came = run_episode(scenario, Blind())
     record, log = came.record, came.log
     assert log is not None and log.answers[:, 0].tolist() == [*range(0, 40, 4)]
@@ -82,8 +87,10 @@ def test_an_episode_stops_within_a_period_for_who_wants_to_look(scenario: Scenar
 
 
 def test_the_observation_after_a_teleport_says_so() -> None:
-    """Put back after leaving its lane: the next observation, and no other, has `reset`; the first one has not."""
-    blind, put_back = Manifest("blind", rate_hz=4.0, camera=None), []
+    """Put back after leaving its lane: the next observation, and no other, has `reset`; the first
+    one has not."""
+    blind = Manifest("blind", rate_hz=4.0, camera=None)
+    put_back = []
 
     def watch(step: Step, verdict: Verdict) -> None:
         if verdict.reset is not None:
@@ -95,11 +102,14 @@ def test_the_observation_after_a_teleport_says_so() -> None:
         while not episode.over:
             seen.append(episode.advance(Command(1.5, 0.65)))
     assert put_back and not seen[0].reset
-    assert [one.tick for one in seen if one.reset] == sorted({5 * (tick // 5 + 1) for tick in put_back})
+    assert [one.tick for one in seen if one.reset] == sorted(
+        {5 * (tick // 5 + 1) for tick in put_back}
+    )
 
 
 def test_an_episode_tells_its_policy_an_opaque_name_and_a_seed(scenario: Scenario) -> None:
-    """Drawn from the run's seed, in every observation and in the record; what happens in the street does not change."""
+    """Drawn from the run's seed, in every observation and in the record; what happens in the street
+    does not change."""
     told: list[tuple[str, int]] = []
 
     class Noting(Ahead):
@@ -117,7 +127,8 @@ def test_an_episode_tells_its_policy_an_opaque_name_and_a_seed(scenario: Scenari
 
 
 def test_an_episode_out_of_turn_says_what_to_do_instead(scenario: Scenario) -> None:
-    """Before entering, before reset, twice begun, an answer that is none, after the end, after close: each in words."""
+    """Before entering, before reset, twice begun, an answer that is none, after the end, after
+    close: each in words."""
     episode = Episode(scenario, SEEING)
     with pytest.raises(UsageError, match="has not been entered: use it in a `with` block"):
         episode.reset()
@@ -131,7 +142,10 @@ def test_an_episode_out_of_turn_says_what_to_do_instead(scenario: Scenario) -> N
             episode.result()
         with pytest.raises(PolicyError, match="policy 'seeing' answered None"):
             episode.advance(None)
-        with pytest.raises(EngineError, match="already running in this process"), Episode(scenario, SEEING):
+        with (
+            pytest.raises(EngineError, match="already running in this process"),
+            Episode(scenario, SEEING),
+        ):
             pass
         while not episode.over:
             episode.advance(np.array([[0.2, 0.0]] * 3))

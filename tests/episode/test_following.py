@@ -12,11 +12,11 @@ import pytest
 from cosim.core.errors import RunError
 from cosim.core.geometry import Pose
 from cosim.core.state import Command, Planned, RobotState
-from cosim.episode.following import Following
-from cosim.episode.in_flight import InFlight
-from cosim.episode.log import Log
+from cosim.episode.command_delay import InFlight
 from cosim.episode.step import Step
-from tests.records.driven_runs import driven, short_way
+from cosim.results.log import Log
+from cosim.results.waypoint_replay import Following
+from tests.support.driven_runs import driven, short_way
 
 AHEAD = np.float32([[1.0, 0.0], [2.0, 0.5]])
 TURNED = np.float32([[1.0, 0.0, 0.6, 0.8]])
@@ -29,7 +29,9 @@ def log_of(*answers: tuple[int, int, Command]) -> Log:
         commands.answered(*answer)
     sizes, points, index = commands.plans
     log = driven(short_way("s-000"), [1.0] * 10)
-    return dataclasses.replace(log, answers=commands.answers, plan_sizes=sizes, plan_points=points, plan_index=index)
+    return dataclasses.replace(
+        log, answers=commands.answers, plan_sizes=sizes, plan_points=points, plan_index=index
+    )
 
 
 def step_at(tick: int, pose: Pose) -> Step:
@@ -38,12 +40,20 @@ def step_at(tick: int, pose: Pose) -> Step:
 
 
 def test_waypoints_of_every_kind_lie_in_the_file_as_they_were_answered(tmp_path: Path) -> None:
-    """Two of them, a command, one with a heading: ragged, the missing headings NaN; a file without any has no word of
-    them."""
-    log = log_of((0, 0, Planned(1.0, 0.0, AHEAD, 1)), (4, 0, Command(1.0, 0.0)), (8, 0, Planned(1.0, 0.0, TURNED, 1)))
+    """Two of them, a command, one with a heading: ragged, the missing headings NaN; a file without
+    any has no word of them."""
+    log = log_of(
+        (0, 0, Planned(1.0, 0.0, AHEAD, 1)),
+        (4, 0, Command(1.0, 0.0)),
+        (8, 0, Planned(1.0, 0.0, TURNED, 1)),
+    )
     (tmp_path / "planned.npz").write_bytes(log.encoded())
     read = Log.load(tmp_path / "planned.npz")
-    assert read.plan_sizes.tolist() == [2, 0, 1] and read.plan_index == 1 and read.plan_points.dtype == np.float32
+    assert (
+        read.plan_sizes.tolist() == [2, 0, 1]
+        and read.plan_index == 1
+        and read.plan_points.dtype == np.float32
+    )
     expected = [
         [1.0, 0.0, math.nan, math.nan],
         [2.0, 0.5, math.nan, math.nan],
@@ -67,15 +77,29 @@ def test_a_trajectory_with_a_part_of_its_waypoints_is_none(tmp_path: Path, name:
         Log.load(tmp_path / "t.npz")
 
 
-def test_waypoints_are_followed_from_when_they_take_effect_until_others_do_or_the_robot_is_put_elsewhere() -> None:
-    """By hand: answered at tick 0 with a delay of 2, at (1, 2) heading north; at 4 a command; at 6 waypoints, which are
-    on their way when the robot is put elsewhere."""
+def test_waypoints_are_followed_from_when_they_take_effect_until_others_do_or_the_robot_is_put_elsewhere() -> (
+    None
+):
+    """By hand: answered at tick 0 with a delay of 2, at (1, 2) heading north; at 4 a command; at 6
+    waypoints, which are on their way when the robot is put elsewhere."""
     planned = Planned(1.0, 0.0, AHEAD, 1)
-    following = Following(log_of((0, 2, planned), (4, 2, Command(1.0, 0.0)), (5, 2, planned), (6, 2, planned)))
+    following = Following(
+        log_of((0, 2, planned), (4, 2, Command(1.0, 0.0)), (5, 2, planned), (6, 2, planned))
+    )
     assert following.follows == 2
     poses = [Pose(1.0, 2.0 + tick, math.pi / 2.0) for tick in range(9)]
     came = [following.take(step_at(tick, pose), reset=tick == 7) for tick, pose in enumerate(poses)]
-    assert [one is None for one in came] == [True, True, False, False, False, False, True, False, True]
+    assert [one is None for one in came] == [
+        True,
+        True,
+        False,
+        False,
+        False,
+        False,
+        True,
+        False,
+        True,
+    ]
     assert all(one is came[2] for one in came[2:6])
     for tick, asked in ((2, 0), (7, 5)):
         assert np.allclose(came[tick], [(1.0, 2.0 + asked), (1.0, 3.0 + asked), (0.5, 4.0 + asked)])

@@ -11,26 +11,35 @@ import pytest
 
 from cosim.core.errors import UsageError
 from cosim.core.geometry import Polyline, Pose
-from cosim.episode.given import calibration_of, with_goal
 from cosim.episode.goals import Goals, goals_for, manoeuvres, patch_around, told_at
-from cosim.episode.ports import CameraSpec, Lens, Manifest
-from cosim.records.record import Record, begun
-from cosim.records.results import table_row
+from cosim.episode.manifest_checks import calibration_of, with_goal
+from cosim.results.record import Record, begun
+from cosim.results.table import table_row
+from cosim.spec.camera import CameraSpec, Lens
 from cosim.spec.goal import GOALS, Goal, GoalProtocol, ImageGoal, Instruction, PointGoal, RoutePatch
+from cosim.spec.manifest import Manifest
 from cosim.spec.robot import COURIER, Mount
 from cosim.spec.scenario import City, RouteCrossing, Scenario
-from scenarios.catalog import load_suite
+from scenarios.suites.catalog import load_suite
 
 CORNER = ((0.0, 0.0), (40.0, 0.0), (40.0, 60.0))
 NORTH = 0.5 * math.pi
 
 
-def scenario(route: tuple[tuple[float, float], ...] = CORNER, crossings: tuple[RouteCrossing, ...] = ()) -> Scenario:
+def scenario(
+    route: tuple[tuple[float, float], ...] = CORNER, crossings: tuple[RouteCrossing, ...] = ()
+) -> Scenario:
     """A route of 100 m that turns left after 40 m."""
     return Scenario(
-        id="a", suite="mine", place=City(seed=1, size_m=500.0), seed=0, start=(*route[0], 0.0), goal=route[-1],
-        route=route, crossings=crossings,
-    )  # fmt: skip
+        id="a",
+        suite="mine",
+        place=City(seed=1, size_m=500.0),
+        seed=0,
+        start=(*route[0], 0.0),
+        goal=route[-1],
+        route=route,
+        crossings=crossings,
+    )
 
 
 def goals(protocol: GoalProtocol, seed: int = 0, **more: object) -> Goals:
@@ -43,22 +52,27 @@ def point(goal: Goal | None) -> tuple[float, float]:
 
 
 def test_the_point_of_the_route_lies_5_to_20_m_along_it() -> None:
-    """Set 20 m along it, kept until 5 m are left to it, then set anew; set anew too when the robot was put back; from
-    20 m before it, the end of the route, however near."""
+    """Set 20 m along it, kept until 5 m are left to it, then set anew; set anew too when the robot
+    was put back; from 20 m before it, the end of the route, however near."""
     told = goals("route_point")
     assert point(told.at(Pose(0.0, 0.0, 0.0), 0.0)) == (20.0, 0.0)
     assert point(told.at(Pose(15.0, 1.0, 0.0), 15.0)) == (5.0, -1.0)
     assert point(told.at(Pose(15.5, 1.0, NORTH), 15.5)) == (-1.0, -20.0)  # 35.5 m along: (35.5, 0)
     assert point(told.at(Pose(31.0, 0.0, 0.0), 31.0)) == (9.0, 11.0)  # 51 m along: (40, 11)
     told.put_back()
-    assert point(told.at(Pose(25.0, 0.0, 0.0), 25.0)) == (15.0, 5.0)  # 26 m were too many: 45 m along, (40, 5)
+    assert point(told.at(Pose(25.0, 0.0, 0.0), 25.0)) == (
+        15.0,
+        5.0,
+    )  # 26 m were too many: 45 m along, (40, 5)
     assert point(told.at(Pose(40.0, 58.0, NORTH), 98.0)) == (2.0, 0.0)
 
 
 @pytest.mark.parametrize("s_m", [0.0, 7.3, 14.999, 15.001, 33.0, 61.2, 79.9])
 def test_no_point_of_the_route_is_nearer_or_farther_along_it(s_m: float) -> None:
-    """By arc length it is in [5, 20] m for every robot that drives along the route, in steps of 0.4 m."""
-    told, line = goals("route_point"), Polyline(CORNER)
+    """By arc length it is in [5, 20] m for every robot that drives along the route, in steps of 0.4
+    m."""
+    told = goals("route_point")
+    line = Polyline(CORNER)
     for here in np.arange(s_m, 80.0, 0.4).tolist():
         goal = told.at(Pose(0.0, 0.0, 0.0), here)
         assert isinstance(goal, PointGoal)
@@ -75,8 +89,9 @@ def test_the_final_point_is_the_goal_in_the_robots_frame() -> None:
 
 
 def test_random_points_are_drawn_ahead_and_stay_where_they_are_until_reached_or_passed() -> None:
-    """Of 300: 5 to 20 m ahead and up to 5 m aside, over all of that; one stays in the street while the robot drives and
-    turns; within 1 m of it, when it is no longer ahead, and after a reset, another is drawn."""
+    """Of 300: 5 to 20 m ahead and up to 5 m aside, over all of that; one stays in the street while
+    the robot drives and turns; within 1 m of it, when it is no longer ahead, and after a reset,
+    another is drawn."""
     pose = Pose(3.0, -2.0, 0.7)
     first = [point(goals("random_point", seed).at(pose, 0.0)) for seed in range(300)]
     ahead, aside = np.array(first).T
@@ -87,8 +102,12 @@ def test_random_points_are_drawn_ahead_and_stay_where_they_are_until_reached_or_
     told = goals("random_point", 4)
     x_m, y_m = point(told.at(Pose(0.0, 0.0, 0.0), 0.0))
     assert point(told.at(Pose(1.0, 0.0, 0.0), 1.0)) == pytest.approx((x_m - 1.0, y_m))
-    assert point(told.at(Pose(x_m - 2.0, y_m, 0.3), 9.0)) == pytest.approx((2 * math.cos(0.3), -2 * math.sin(0.3)))
-    assert told.at(Pose(x_m - 1.1, y_m, 0.0), 9.0) == PointGoal(pytest.approx(1.1), pytest.approx(0.0, abs=1e-9))
+    assert point(told.at(Pose(x_m - 2.0, y_m, 0.3), 9.0)) == pytest.approx(
+        (2 * math.cos(0.3), -2 * math.sin(0.3))
+    )
+    assert told.at(Pose(x_m - 1.1, y_m, 0.0), 9.0) == PointGoal(
+        pytest.approx(1.1), pytest.approx(0.0, abs=1e-9)
+    )
     second = point(told.at(Pose(x_m - 0.9, y_m, 0.0), 9.0))
     assert 5.0 <= second[0] <= 20.0
     assert point(told.at(Pose(x_m - 0.9, y_m, 0.0), 9.0)) == second
@@ -110,8 +129,10 @@ def test_an_image_is_taken_at_the_next_sub_goal_and_only_when_there_is_another()
     seen = [told.at(Pose(s_m, 0.0, 0.0), s_m) for s_m in (0.0, 5.0, 15.0, 16.0, 30.0, 32.0)]
     assert [one.rgb[0, 0, 0] for one in seen if isinstance(one, ImageGoal)] == [1, 1, 1, 2, 2, 3]
     assert [tuple(round(v, 9) for v in pose) for pose in looked] == [
-        (20.0, 0.0, 0.0), (36.0, 0.0, 0.0), (40.0, 12.0, round(NORTH, 9)),
-    ]  # fmt: skip
+        (20.0, 0.0, 0.0),
+        (36.0, 0.0, 0.0),
+        (40.0, 12.0, round(NORTH, 9)),
+    ]
 
 
 def test_a_random_image_is_noise_of_the_cameras_size_and_one_for_an_episode() -> None:
@@ -119,15 +140,19 @@ def test_a_random_image_is_noise_of_the_cameras_size_and_one_for_an_episode() ->
     told = goals("random_image", 1, size=(64, 48))
     first, later = (told.at(Pose(s_m, 0.0, 0.0), s_m) for s_m in (0.0, 50.0))
     other = goals("random_image", 2, size=(64, 48)).at(Pose(0.0, 0.0, 0.0), 0.0)
-    assert isinstance(first, ImageGoal) and isinstance(later, ImageGoal) and isinstance(other, ImageGoal)
+    assert (
+        isinstance(first, ImageGoal)
+        and isinstance(later, ImageGoal)
+        and isinstance(other, ImageGoal)
+    )
     assert first.rgb.shape == (48, 64, 3) and first.rgb.dtype == np.uint8
     assert len(np.unique(first.rgb)) == 256 and abs(float(first.rgb.mean()) - 127.5) < 3.0
     assert (first.rgb == later.rgb).all() and (first.rgb != other.rgb).mean() > 0.9
 
 
 def test_an_instruction_tells_turns_and_crosswalks_before_they_come() -> None:
-    """On a route that turns left at 40 m and crosses from 70 to 80 m, to 5 m; beyond 20 m, and afterwards, it is to
-    follow the sidewalk."""
+    """On a route that turns left at 40 m and crosses from 70 to 80 m, to 5 m; beyond 20 m, and
+    afterwards, it is to follow the sidewalk."""
     crossing = RouteCrossing(id="x", enter_s_m=70.0, leave_s_m=80.0, signalised=True)
     told = goals_for("instruction", scenario(crossings=(crossing,)), np.random.default_rng(0))
     words = {}
@@ -153,10 +178,13 @@ def test_an_instruction_tells_turns_and_crosswalks_before_they_come() -> None:
 
 
 def test_instructions_tell_turns_and_crosswalks_alone() -> None:
-    """On every metre of the long ways of a suite: no number but the metres to the next turn or crosswalk, to 5 m and at
-    most 20; no word of people, events or where the goal is."""
+    """On every metre of the long ways of a suite: no number but the metres to the next turn or
+    crosswalk, to 5 m and at most 20; no word of people, events or where the goal is."""
     what = r"((turn|bear) (left|right)|cross the street at the crosswalk)"
-    told = re.compile(rf"(Follow the sidewalk\.|{what}\.( {what}\.)*)( In (5|10|15|20) m, {what}\.)?", re.IGNORECASE)
+    told = re.compile(
+        rf"(Follow the sidewalk\.|{what}\.( {what}\.)*)( In (5|10|15|20) m, {what}\.)?",
+        re.IGNORECASE,
+    )
     heard = set()
     for one in load_suite("long-horizon").scenarios[:12]:
         ways = manoeuvres(one.route_line, one.crossings)
@@ -183,19 +211,30 @@ def test_what_is_a_turn(route: list[tuple[float, float]], told: list[str]) -> No
 
 
 def test_a_route_patch_has_the_route_around_the_robot() -> None:
-    """Ahead is up, left is left, 0.5 m a pixel: a straight way ahead is the two columns whose middles are within half a
-    metre; turned to the left of a robot it is to its right; the corner 10 m ahead goes off to the left."""
+    """Ahead is up, left is left, 0.5 m a pixel: a straight way ahead is the two columns whose
+    middles are within half a metre; turned to the left of a robot it is to its right; the corner 10
+    m ahead goes off to the left."""
     pixels = patch_around(Pose(20.0, 0.0, 0.0), np.array([(-100.0, 0.0), (100.0, 0.0)]))
-    assert pixels.shape == (80, 80) and pixels.dtype == np.uint8 and set(np.unique(pixels)) == {0, 255}
+    assert (
+        pixels.shape == (80, 80) and pixels.dtype == np.uint8 and set(np.unique(pixels)) == {0, 255}
+    )
     assert set(np.flatnonzero(pixels.any(axis=0))) == {39, 40} and (pixels[:, 39:41] == 255).all()
     aside = patch_around(Pose(20.0, 4.25, 0.0), np.array([(-100.0, 0.0), (100.0, 0.0)]))
-    assert set(np.flatnonzero(aside.any(axis=0))) == {47, 48, 49}  # 4.25 m to the right: column 48 is its middle
+    assert set(np.flatnonzero(aside.any(axis=0))) == {
+        47,
+        48,
+        49,
+    }  # 4.25 m to the right: column 48 is its middle
     ahead = goals("route_patch").at(Pose(30.0, 0.0, 0.0), 30.0)
     assert isinstance(ahead, RoutePatch)
     rows, columns = np.nonzero(ahead.pixels)
-    assert rows.min() == 19 and (ahead.pixels[:19] == 0).all()  # the corner: row 19 is 10.25 m ahead
+    assert (
+        rows.min() == 19 and (ahead.pixels[:19] == 0).all()
+    )  # the corner: row 19 is 10.25 m ahead
     assert (ahead.pixels[19:21, :40] == 255).all() and columns.min() == 0 and columns.max() == 40
-    turned = patch_around(Pose(30.0, 0.0, -NORTH), np.array(CORNER))  # looking right: the corner is to the left
+    turned = patch_around(
+        Pose(30.0, 0.0, -NORTH), np.array(CORNER)
+    )  # looking right: the corner is to the left
     assert (np.rot90(ahead.pixels, 1) == turned).all()
 
 
@@ -204,9 +243,16 @@ def test_goals_are_the_same_for_the_same_seed(protocol: GoalProtocol) -> None:
     """Twice the same along a drive; of those that are drawn, another seed gives another."""
 
     def drive(seed: int) -> list[bytes]:
-        told = goals(protocol, seed, size=(8, 6), look=lambda pose: np.full((6, 8, 3), int(pose.x_m), np.uint8))
+        told = goals(
+            protocol,
+            seed,
+            size=(8, 6),
+            look=lambda pose: np.full((6, 8, 3), int(pose.x_m), np.uint8),
+        )
         along = [told.at(Pose(s_m, 0.5, 0.1), s_m) for s_m in np.arange(0.0, 40.0, 0.5).tolist()]
-        return [msgspec.msgpack.encode(one, enc_hook=lambda array: array.tobytes()) for one in along]
+        return [
+            msgspec.msgpack.encode(one, enc_hook=lambda array: array.tobytes()) for one in along
+        ]
 
     assert drive(5) == drive(5)
     assert (drive(5) != drive(6)) == protocol.startswith("random")
@@ -214,16 +260,26 @@ def test_goals_are_the_same_for_the_same_seed(protocol: GoalProtocol) -> None:
 
 def test_goals_and_odometry_that_there_are_none_of_are_refused_with_the_valid_ones() -> None:
     """By name; a picture as a goal, or a further camera, for a policy without a camera too."""
-    blind, seeing = Manifest("blind", camera=None), Manifest("seeing")
-    with pytest.raises(UsageError, match=r"unknown goal protocol 'route_pont'.*Did you mean route_point\?"):
+    blind = Manifest("blind", camera=None)
+    seeing = Manifest("seeing")
+    with pytest.raises(
+        UsageError, match=r"unknown goal protocol 'route_pont'.*Did you mean route_point\?"
+    ):
         with_goal(seeing, "route_pont")  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match=r"unknown odometry 'imu'. Valid choices: exact, gps, none, wheel"):
+    with pytest.raises(
+        UsageError, match=r"unknown odometry 'imu'. Valid choices: exact, gps, none, wheel"
+    ):
         with_goal(Manifest("odd", odometry="imu"), None)  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match=r"'blind' has no camera, and goal protocol 'image' .*one of none, route"):
+    with pytest.raises(
+        UsageError, match=r"'blind' has no camera, and goal protocol 'image' .*one of none, route"
+    ):
         with_goal(blind, "image")
     with pytest.raises(UsageError, match="'blind' has cameras, but no camera"):
         with_goal(Manifest("blind", camera=None, cameras={"left": CameraSpec()}), None)
-    assert with_goal(seeing, "image").goal == "image" and with_goal(Manifest("b", goal="instruction"), None).goal
+    assert (
+        with_goal(seeing, "image").goal == "image"
+        and with_goal(Manifest("b", goal="instruction"), None).goal
+    )
 
 
 def test_goals_and_odometry_stand_in_every_row() -> None:
@@ -231,11 +287,16 @@ def test_goals_and_odometry_stand_in_every_row() -> None:
     manifest = with_goal(Manifest("mine", goal="image", odometry="wheel"), "route_point")
     record: Record = begun(scenario(), manifest, "")
     row = table_row(record)
-    assert (row["goal_protocol"], row["odometry"], row["privileged"]) == ("route_point", "wheel", False)
+    assert (row["goal_protocol"], row["odometry"], row["privileged"]) == (
+        "route_point",
+        "wheel",
+        False,
+    )
 
 
 def test_a_camera_is_told_as_computer_vision_has_it() -> None:
-    """A point a metre to the left, on the ground, 5 m ahead of the robot, falls where trigonometry puts it."""
+    """A point a metre to the left, on the ground, 5 m ahead of the robot, falls where trigonometry
+    puts it."""
     spec = CameraSpec(64, 48, 60.0, Mount((0.3, 0.0, 0.6), 10.0), Lens(k1=-0.1, k2=0.02))
     camera = calibration_of(spec, COURIER)
     assert np.allclose(camera.on_robot[:3, :3] @ camera.on_robot[:3, :3].T, np.eye(3))
@@ -243,13 +304,24 @@ def test_a_camera_is_told_as_computer_vision_has_it() -> None:
     x, y, z = (np.linalg.inv(camera.on_robot) @ [5.0, 1.0, 0.0, 1.0])[:3]
     down = math.radians(10.0)
     assert (x, y, z) == pytest.approx(
-        (-1.0, 0.6 * math.cos(down) - 4.7 * math.sin(down), 4.7 * math.cos(down) + 0.6 * math.sin(down))
+        (
+            -1.0,
+            0.6 * math.cos(down) - 4.7 * math.sin(down),
+            4.7 * math.cos(down) + 0.6 * math.sin(down),
+        )
     )
     focal = 24.0 / math.tan(math.radians(30.0))
-    assert (camera.matrix @ [x, y, z] / z)[:2] == pytest.approx((31.5 + focal * x / z, 23.5 + focal * y / z))
+    assert (camera.matrix @ [x, y, z] / z)[:2] == pytest.approx(
+        (31.5 + focal * x / z, 23.5 + focal * y / z)
+    )
     assert camera.distortion.tolist() == [-0.1, 0.02, 0.0, 0.0, 0.0]
     aside = Mount((0.1, 0.25, 0.5), 0.0, yaw_left_deg=90.0)
     left = calibration_of(CameraSpec(64, 48, 60.0, aside, crop=(8, 10, 64, 48)), COURIER)
-    seen = np.linalg.inv(left.on_robot) @ [0.1, 3.25, 0.5, 1.0]  # 3 m to the left of it: on its axis
+    seen = np.linalg.inv(left.on_robot) @ [
+        0.1,
+        3.25,
+        0.5,
+        1.0,
+    ]  # 3 m to the left of it: on its axis
     assert seen[:3] == pytest.approx((0.0, 0.0, 3.0), abs=1e-12)
     assert (left.matrix @ seen[:3] / seen[2])[:2] == pytest.approx((31.5 - 8.0, 23.5 - 10.0))

@@ -1,4 +1,5 @@
-"""Latency: commands that take effect later than what they answer, given, and as measured in real time."""
+"""Latency: commands that take effect later than what they answer, given, and as measured in real
+time."""
 
 from __future__ import annotations
 
@@ -11,25 +12,26 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cosim.cli.options.latency import with_latency
-from cosim.cli.terminal.run_table import print_terms
+from cosim.cli.options import with_latency
+from cosim.cli.run_table import print_terms
 from cosim.core.errors import UsageError
 from cosim.core.geometry import Floats
 from cosim.core.state import STILL, Command
-from cosim.episode.in_flight import InFlight
-from cosim.episode.log import Log
-from cosim.episode.ports import Manifest, Observation
-from cosim.records.record import Record, begun
-from cosim.records.results import table_of
-from cosim.records.run_folder import read_records, read_spec
+from cosim.episode.command_delay import InFlight
+from cosim.episode.interfaces import Observation
+from cosim.results.log import Log
+from cosim.results.record import Record, begun
+from cosim.results.run_folder import read_records, read_spec
+from cosim.results.table import table_of
+from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario, Suite, write_suite
-from scenarios.catalog import load_suite
-from scenarios.checks import small_scenario
-from scenarios.execution import suite_run
-from scenarios.execution.replay import Recorded, replayed
-from scenarios.execution.run import run_episode
-from scenarios.execution.suite_run import check_alone
+from scenarios.episodes.replay import Recorded, replayed
+from scenarios.episodes.run_episode import run_episode
+from scenarios.runs import run as suite_run
+from scenarios.runs.run import check_alone
+from scenarios.suites.catalog import load_suite
+from scenarios.tools.verify.doctor import small_scenario
 from tests.cli.terminal.test_run_table import terminal
 from tests.conftest import Cosim
 
@@ -42,9 +44,13 @@ def commands(answers: Floats, ticks: int) -> Floats:
     return held
 
 
-def test_commands_take_effect_in_their_order_and_are_lost_where_the_robot_is_put_elsewhere() -> None:
-    """By hand: asked at 0, 5, 10 with 7 ticks of delay; that of 10 is on its way when the robot is put back."""
-    way, told = InFlight(), [Command(float(v), 0.0) for v in (1, 2, 3)]
+def test_commands_take_effect_in_their_order_and_are_lost_where_the_robot_is_put_elsewhere() -> (
+    None
+):
+    """By hand: asked at 0, 5, 10 with 7 ticks of delay; that of 10 is on its way when the robot is
+    put back."""
+    way = InFlight()
+    told = [Command(float(v), 0.0) for v in (1, 2, 3)]
     way.answered(0, 7, told[0])
     assert [way.at(tick) for tick in (0, 4)] == [STILL, STILL]
     way.answered(5, 7, told[1])
@@ -58,7 +64,9 @@ def test_commands_take_effect_in_their_order_and_are_lost_where_the_robot_is_put
     assert way.at(20) == told[0]
 
 
-@pytest.mark.parametrize("latency_ms", [-1.0, float("nan"), 10_001.0], ids=["negative", "no number", "too much"])
+@pytest.mark.parametrize(
+    "latency_ms", [-1.0, float("nan"), 10_001.0], ids=["negative", "no number", "too much"]
+)
 def test_a_latency_that_there_is_not_is_refused(latency_ms: float) -> None:
     """In words that give the range."""
     with pytest.raises(UsageError, match=r"latency_ms must be from 0 to 10000 ms, not"):
@@ -76,8 +84,9 @@ def test_real_time_goes_with_one_process_and_no_latency() -> None:
 
 
 def test_tables_tell_of_latency_where_there_is_any() -> None:
-    """A given one as a number; of a measured one, of the episodes that ended, what answers took beside the whole ticks
-    after which their commands took effect, and what it is not; of none nothing."""
+    """A given one as a number; of a measured one, of the episodes that ended, what answers took
+    beside the whole ticks after which their commands took effect, and what it is not; of none
+    nothing."""
 
     def told(*records: Record) -> str:
         out, said = terminal()
@@ -94,7 +103,8 @@ def test_tables_tell_of_latency_where_there_is_any() -> None:
     assert "latency" not in told(none)
     assert "latency 200 ms: commands take effect so much later" in told(given)
     assert (
-        "in real time: the median answer took 4 ms (3.12 to 392 ms); commands took effect 50 ms (50 to 400 ms) "
+        "in real time: the median answer took 4 ms (3.12 to 392 ms); commands took effect 50 "
+        "ms (50 to 400 ms) "
         "after what they answer, at whole ticks of 50 ms" in told(*real, crashed, crashed)
     )
     assert "no episode came to its end" in told(crashed)
@@ -115,7 +125,9 @@ def test_a_latency_that_cannot_be_had_is_refused(asked: str, real_time: bool, to
     """By name, with the remedy."""
     whole = load_suite("reactive")
     with pytest.raises(UsageError, match=re.escape(told)):
-        with_latency(EpisodeOptions(), asked, real_time, None, whole, whole.scenarios[0], "stop", 4.0)
+        with_latency(
+            EpisodeOptions(), asked, real_time, None, whole, whole.scenarios[0], "stop", 4.0
+        )
 
 
 def small_in_two_s() -> Scenario:
@@ -141,7 +153,8 @@ class Slow:
 
 
 class Faster:
-    """Blind, 5 Hz; at each observation it wants to be a tenth of a metre a second faster. It is slow to answer."""
+    """Blind, 5 Hz; at each observation it wants to be a tenth of a metre a second faster. It is
+    slow to answer."""
 
     manifest = Manifest("faster", rate_hz=5.0, camera=None)
 
@@ -165,25 +178,37 @@ def scenario() -> Scenario:
 
 
 @pytest.mark.engine
-def test_with_latency_each_command_takes_effect_so_much_later_to_the_tick(scenario: Scenario) -> None:
-    """By hand: 120 ms are three ticks, so that of observations every 4 ticks the commands begin at 3, 7, 11, ..."""
+def test_with_latency_each_command_takes_effect_so_much_later_to_the_tick(
+    scenario: Scenario,
+) -> None:
+    """By hand: 120 ms are three ticks, so that of observations every 4 ticks the commands begin at
+    3, 7, 11, ..."""
     came = run_episode(scenario, Faster(), EpisodeOptions(latency_ms=120.0))
-    assert came.log is not None and (came.record.latency_ms, came.record.real_time) == (120.0, False)
+    assert came.log is not None and (came.record.latency_ms, came.record.real_time) == (
+        120.0,
+        False,
+    )
     by_hand = [0.0] * 3 + [0.1 * k for k in range(1, 10) for _ in range(4)] + [0.1 * 10]
     assert np.allclose(came.log.command[:, 0], by_hand, atol=1e-12)
     assert came.log.answers[:, :2].tolist() == [[4 * k, 3] for k in range(10)]
 
 
 @pytest.mark.engine
-def test_in_real_time_answers_are_as_late_as_they_were_and_the_record_replays(scenario: Scenario) -> None:
-    """A policy that takes 0.2 s: the recorded delays are what was applied, it is not asked before it has answered, and
-    the replay of the record has the same state hash."""
+def test_in_real_time_answers_are_as_late_as_they_were_and_the_record_replays(
+    scenario: Scenario,
+) -> None:
+    """A policy that takes 0.2 s: the recorded delays are what was applied, it is not asked before
+    it has answered, and the replay of the record has the same state hash."""
     slow = Faster(slow_s=0.2)
     came = run_episode(scenario, slow, EpisodeOptions(real_time=True))
     record, log = came.record, came.log
     assert log is not None and record.real_time
     asked, delays = log.answers[:, 0], log.answers[:, 1]
-    assert (delays >= 4).all() and asked.tolist() == slow.asked and (asked[1:] >= (asked + delays)[:-1]).all()
+    assert (
+        (delays >= 4).all()
+        and asked.tolist() == slow.asked
+        and (asked[1:] >= (asked + delays)[:-1]).all()
+    )
     assert np.array_equal(log.command, commands(log.answers, len(log)))
     assert record.latency_ms == 50.0 * np.median(delays) and record.answer_ms is not None
     assert record.latency_ms - 50.0 < record.answer_ms <= record.latency_ms
@@ -194,7 +219,8 @@ def test_in_real_time_answers_are_as_late_as_they_were_and_the_record_replays(sc
 def test_a_measured_latency_is_that_of_every_command_of_the_run(
     scenario: Scenario, tmp_path: Path, cosim: Cosim
 ) -> None:
-    """Not less than what the policy sleeps, and fixed: the row tells it, `--resume` keeps it and refuses another."""
+    """Not less than what the policy sleeps, and fixed: the row tells it, `--resume` keeps it and
+    refuses another."""
     (tmp_path / "slow_one.py").write_text(SLOW_ONE)
     short = msgspec.structs.replace(scenario, time_limit_s=1.0)
     write_suite(Suite(name="brief", version="1", scenarios=(short,)), tmp_path / "brief.json")
@@ -210,16 +236,22 @@ def test_a_measured_latency_is_that_of_every_command_of_the_run(
     assert (log.answers[:, 1] * 50.0 == latency_ms).all()
     assert cosim(*words, "--latency", "measured", "--resume", cwd=tmp_path).returncode == 0
     other = cosim(*words, "--resume", cwd=tmp_path)
-    assert other.returncode == 2 and f"its latency_ms is {latency_ms}, now asked for is 0.0" in other.stderr
+    assert (
+        other.returncode == 2
+        and f"its latency_ms is {latency_ms}, now asked for is 0.0" in other.stderr
+    )
 
 
 @pytest.mark.parametrize(("status", "ended"), [("crashed", None), ("invalid", float("nan"))])
 def test_a_latency_is_not_taken_from_an_episode_that_did_not_end(
     scenario: Scenario, monkeypatch: pytest.MonkeyPatch, status: str, ended: float | None
 ) -> None:
-    """Whether the policy crashed or an engine failed: it is refused with the reason, and not 0 ms."""
+    """Whether the policy crashed or an engine failed: it is refused with the reason, and not 0
+    ms."""
     row = {"status": status, "ended": ended, "reason": "no memory", "latency_ms": 0.0}
     monkeypatch.setattr(suite_run, "run", lambda *_, **__: pd.DataFrame([row]))
     suite = Suite(name="brief", version="1", scenarios=(scenario,))
-    with pytest.raises(UsageError, match=f"cannot be measured: {scenario.id} is {status}: no memory"):
+    with pytest.raises(
+        UsageError, match=f"cannot be measured: {scenario.id} is {status}: no memory"
+    ):
         suite_run.measured_latency(suite, scenario, "mine", EpisodeOptions())

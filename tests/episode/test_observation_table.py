@@ -1,4 +1,5 @@
-"""The table in docs/observations.md of all that an observation holds, against observations of real episodes."""
+"""The table in docs/observations.md of all that an observation holds, against observations of real
+episodes."""
 
 from __future__ import annotations
 
@@ -14,24 +15,28 @@ import pytest
 
 from bridge.policy_server import AskAct, _plain_observation
 from cosim.core.state import Command
-from cosim.episode.given import calibration_of
-from cosim.episode.ports import CameraSpec, Manifest, Observation
+from cosim.episode.interfaces import Observation
+from cosim.episode.manifest_checks import calibration_of
+from cosim.spec.camera import CameraPicture, CameraSpec
 from cosim.spec.goal import GoalProtocol, ImageGoal, Instruction, PointGoal, RoutePatch
+from cosim.spec.manifest import Manifest
 from cosim.spec.odometry import Odometry
 from cosim.spec.options import EpisodeOptions
-from cosim.spec.picture import CameraPicture
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import CrowdSpec
-from scenarios.checks import small_scenario
-from scenarios.execution.episode import Episode
-from scenarios.serving.observed import GOAL, arrays_of, seen_from_afar, told_about, told_goal
-from tests.documents import text_of
+from scenarios.episodes.episode import Episode
+from scenarios.runs.observation_codec import GOAL, arrays_of, seen_from_afar, told_about, told_goal
+from scenarios.tools.verify.doctor import small_scenario
+from tests.support.documents import text_of
 
 SPEC = CameraSpec(32, 24, depth=True, labels=True)
 ALL = Manifest(
-    "all", camera=SPEC, odometry="wheel", privileged=True,
+    "all",
+    camera=SPEC,
+    odometry="wheel",
+    privileged=True,
     cameras={"left": CameraSpec(16, 12, mount="left", depth=True, labels=True)},
-)  # fmt: skip
+)
 CAMERA = calibration_of(SPEC, COURIER)
 WHOLE = ("Skid", "Mount", "Polyline", "Polygon", "MultiPolygon", "Pose", "Signal")
 """Types whose parts the table names in words, if at all."""
@@ -48,7 +53,12 @@ class Row(NamedTuple):
 
 def table() -> list[Row]:
     """The table of the page, a row for each attribute."""
-    lines = text_of("docs/observations.md").partition("| of `observation` |")[2].partition("\n\n")[0].splitlines()[2:]
+    lines = (
+        text_of("docs/observations.md")
+        .partition("| of `observation` |")[2]
+        .partition("\n\n")[0]
+        .splitlines()[2:]
+    )
     found = []
     for line in lines:
         named, asked, types, words = (cell.strip() for cell in line.strip("|").split(" | "))
@@ -66,7 +76,9 @@ def fits(value: Any, stated: str) -> bool:
     if of:
         holds, key, item = of.groups()
         pairs = [*value.items()] if isinstance(value, Mapping) else [(None, None)]
-        return fits(value, f"`{holds}`") and all(fits(k, f"`{key}`") and fits(v, f"`{item}`") for k, v in pairs)
+        return fits(value, f"`{holds}`") and all(
+            fits(k, f"`{key}`") and fits(v, f"`{item}`") for k, v in pairs
+        )
     array = re.fullmatch(r"`\((.*)\) (\w+)`", stated)
     if array is None:
         return stated == f"`{type(value).__name__}`".replace("NoneType", "None")
@@ -75,13 +87,17 @@ def fits(value: Any, stated: str) -> bool:
         isinstance(value, np.ndarray)
         and value.dtype == array[2]
         and value.ndim == len(sides)
-        and all(size == int(side) for size, side in zip(value.shape, sides, strict=True) if side.isdigit())
+        and all(
+            size == int(side)
+            for size, side in zip(value.shape, sides, strict=True)
+            if side.isdigit()
+        )
     )
 
 
 def held(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Every public attribute below an observation, with its path: fields and properties, not methods. Those of a camera
-    stand in the table once."""
+    """Every public attribute below an observation, with its path: fields and properties, not
+    methods. Those of a camera stand in the table once."""
     if isinstance(value, Mapping) and "signals" not in path and "mounts" not in path:
         for name, item in value.items():
             yield from held(item, f'{path}["{name}"]')
@@ -94,19 +110,29 @@ def held(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
         names = list(vars(value))
     else:
         return
-    names += [name for name, part in vars(type(value)).items() if isinstance(part, property) and name[0] != "_"]
+    names += [
+        name
+        for name, part in vars(type(value)).items()
+        if isinstance(part, property) and name[0] != "_"
+    ]
     for name in names:
-        below, part = f"{path}.{name}".removeprefix("."), getattr(value, name)
+        below = f"{path}.{name}".removeprefix(".")
+        part = getattr(value, name)
         yield below, part
         if type(part).__name__ not in WHOLE:
             yield from held(part, "camera" if name == "camera" else below)
 
 
 def untrue(seen: Any, goal: str = "") -> list[str]:
-    """What of an observation is not in the table, or not of a type that it states. goal: by which protocol."""
+    """What of an observation is not in the table, or not of a type that it states. goal: by which
+    protocol."""
     found = []
     for path, value in held(seen):
-        rows = [row for row in TABLE if row.path == path and (path != "goal" or f'goal="{goal}"' in row.asked)]
+        rows = [
+            row
+            for row in TABLE
+            if row.path == path and (path != "goal" or f'goal="{goal}"' in row.asked)
+        ]
         types = [stated for row in rows for stated in row.types]
         if not any(fits(value, stated) for stated in types):
             found.append(f"{path} is {value!r}, not {' or '.join(types)}")
@@ -119,13 +145,18 @@ def paths(seen: Any) -> set[str]:
 
 @pytest.fixture(scope="module")
 def seen() -> dict[str, Observation]:
-    """An observation by each goal protocol of a policy that asks for everything, by one of them among people."""
+    """An observation by each goal protocol of a policy that asks for everything, by one of them
+    among people."""
     found = {}
     for protocol in get_args(GoalProtocol):
         scenario = small_scenario()
         if protocol != "none":
-            scenario = msgspec.structs.replace(scenario, crowd=CrowdSpec(persons=0, vehicles=0), events=())
-        with Episode(scenario, ALL, EpisodeOptions(seed=1, goal=protocol, camera="bullet")) as episode:
+            scenario = msgspec.structs.replace(
+                scenario, crowd=CrowdSpec(persons=0, vehicles=0), events=()
+            )
+        with Episode(
+            scenario, ALL, EpisodeOptions(seed=1, goal=protocol, camera="bullet")
+        ) as episode:
             episode.reset()
             found[protocol] = episode.advance(Command(1.0, 0.0))
     return found
@@ -137,7 +168,9 @@ def test_the_table_has_every_attribute_of_an_observation(seen: dict[str, Observa
     for protocol, one in seen.items():
         assert untrue(one, protocol) == []
     assert {row.path for row in TABLE} == set().union(*map(paths, seen.values()))
-    assert {row.asked for row in TABLE if row.path == "goal"} == {f'`goal="{protocol}"`' for protocol in seen}
+    assert {row.asked for row in TABLE if row.path == "goal"} == {
+        f'`goal="{protocol}"`' for protocol in seen
+    }
     known = seen["none"].privileged
     assert known is not None and len(known.people) > 3 and len(known.signals) > 0
 
@@ -145,23 +178,34 @@ def test_the_table_has_every_attribute_of_an_observation(seen: dict[str, Observa
 def test_who_asks_for_nothing_gets_none() -> None:
     """What the table says is None without being asked for: the defaults of an observation."""
     fields = {field.name: field.default for field in dataclasses.fields(Observation)}
-    absent = {row.path for row in TABLE if "`None`" in row.words and "." not in row.path} | {"depth", "labels"}
+    absent = {row.path for row in TABLE if "`None`" in row.words and "." not in row.path} | {
+        "depth",
+        "labels",
+    }
     assert absent == {"rgb", "camera", "depth", "labels", "odometry", "privileged"}
     assert all(fields[name] is None for name in absent - {"rgb"}) and fields["goal"] is None
 
 
 @pytest.mark.engine
 def test_the_table_holds_where_policies_are_hosted_elsewhere(seen: dict[str, Observation]) -> None:
-    """Isolated and served policies get the same types; one without cosim the same names, but for those that the page
-    lists, and the same arrays of goals and odometry."""
-    listed = text_of("docs/observations.md").partition("It lacks these attributes: ")[2].partition("\n\n")[0]
+    """Isolated and served policies get the same types; one without cosim the same names, but for
+    those that the page lists, and the same arrays of goals and odometry."""
+    listed = (
+        text_of("docs/observations.md")
+        .partition("It lacks these attributes: ")[2]
+        .partition("\n\n")[0]
+    )
     lacking = set(re.findall(r"`([\w.]+)`", listed))
     assert len(lacking) == 6
     for protocol, one in seen.items():
         afar, plain = hosted(one)
         given = dataclasses.replace(one, privileged=None)
         assert paths(afar) == paths(given) and paths(plain) == paths(given) - lacking
-        own = [line for line in untrue(plain, protocol) if "namespace(" not in line and "_Given(" not in line]
+        own = [
+            line
+            for line in untrue(plain, protocol)
+            if "namespace(" not in line and "_Given(" not in line
+        ]
         assert {*untrue(afar, protocol), *own} == {"privileged is None, not `Privileged`"}
         for name in ("odometry", "goal"):
             if name != "goal" or protocol not in ("none", "instruction"):
@@ -173,16 +217,32 @@ def hosted(seen: Observation) -> tuple[Observation, SimpleNamespace]:
     told, array = told_goal(seen.goal)
     arrays = arrays_of(seen) | ({} if array is None else {GOAL: array})
     pose = None if seen.odometry is None else msgspec.structs.astuple(seen.odometry)
-    asked = AskAct("r", seen.episode, "a", 0, seen.tick, seen.time_s, seen.v_mps, seen.w_radps, seen.reset, told, pose)
+    asked = AskAct(
+        "r",
+        seen.episode,
+        "a",
+        0,
+        seen.tick,
+        seen.time_s,
+        seen.v_mps,
+        seen.w_radps,
+        seen.reset,
+        told,
+        pose,
+    )
     asked = msgspec.msgpack.decode(msgspec.msgpack.encode(asked), type=AskAct)
     about = told_about(seen)
-    return seen_from_afar(seen.episode, about, asked, arrays), _plain_observation(seen.episode, about, asked, arrays)
+    return seen_from_afar(seen.episode, about, asked, arrays), _plain_observation(
+        seen.episode, about, asked, arrays
+    )
 
 
 def test_goals_and_odometry_are_arrays_for_numpy() -> None:
-    """A point is x and y, a pose x, y and heading, without one x and y; pictures and patches are their pixels; what is
-    no array says what to read. Equality, hashes and messages are those of the fields."""
-    point, pixels = PointGoal(3.0, -4.0), np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
+    """A point is x and y, a pose x, y and heading, without one x and y; pictures and patches are
+    their pixels; what is no array says what to read. Equality, hashes and messages are those of the
+    fields."""
+    point = PointGoal(3.0, -4.0)
+    pixels = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
     assert np.asarray(point).tolist() == [3.0, -4.0] and np.asarray(point).dtype == float
     assert np.asarray(point, np.float32).dtype == np.float32 and np.linalg.norm(point) == 5.0  # type: ignore[arg-type]
     assert np.stack([point, point]).shape == (2, 2)  # type: ignore[call-overload]
@@ -190,7 +250,10 @@ def test_goals_and_odometry_are_arrays_for_numpy() -> None:
     assert np.asarray(Odometry(1.0, 2.0, None)).tolist() == [1.0, 2.0]
     for one in (ImageGoal(pixels), RoutePatch(pixels), CameraPicture(pixels, None, None, CAMERA)):
         assert np.asarray(one) is pixels and np.asarray(one, np.float32).dtype == np.float32
-    for one, words in ((Instruction("Stop."), "read observation.goal.text"), (CAMERA, r"read .matrix \(3, 3\)")):
+    for one, words in (
+        (Instruction("Stop."), "read observation.goal.text"),
+        (CAMERA, r"read .matrix \(3, 3\)"),
+    ):
         with pytest.raises(TypeError, match=words):
             np.asarray(one)
     assert point == PointGoal(3.0, -4.0) and hash(point) == hash(PointGoal(3.0, -4.0))

@@ -1,4 +1,5 @@
-"""What a policy is given: what its manifest asks for, from a seed, and nothing that only the simulator knows."""
+"""What a policy is given: what its manifest asks for, from a seed, and nothing that only the
+simulator knows."""
 
 from __future__ import annotations
 
@@ -13,30 +14,54 @@ import pytest
 
 from cosim.core.geometry import Pose
 from cosim.core.state import STILL, Frame, Motion, People, RobotState, Street
+from cosim.episode.interfaces import Observation, Privileged
 from cosim.episode.loop import Moment
-from cosim.episode.observing import Observer
-from cosim.episode.ports import CameraSpec, Manifest, Observation, Privileged
+from cosim.episode.observer import Observer
 from cosim.episode.step import Step
+from cosim.spec.camera import CameraSpec
 from cosim.spec.events import Event, EventReply
 from cosim.spec.goal import GoalProtocol, ImageGoal, PointGoal
+from cosim.spec.manifest import Manifest
 from cosim.spec.odometry import Odometry, OdometryKind
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City, Scenario
-from tests.reachable import leaks
+from tests.support.reachable import leaks
 
 SCENARIO = Scenario(
-    id="frontal-017", suite="reactive", place=City(seed=1, size_m=500.0), seed=5, start=(101.3, 57.7, 0.4),
-    goal=(141.8, 90.2), route=((101.3, 57.7), (120.6, 70.9), (141.8, 90.2)),
-    events=(Event(id="e1", kind="frontal", x_m=120.25, y_m=70.65, heading_rad=0.4, route_s_m=22.9, half_width_m=2.1),),
-)  # fmt: skip
-PEOPLE = People.of(("c17", "e1"), [[110.2, 60.1], [121.7, 71.3]], [0.1, 0.2], [1.1, 1.2], ("walk", "walk"))
+    id="frontal-017",
+    suite="reactive",
+    place=City(seed=1, size_m=500.0),
+    seed=5,
+    start=(101.3, 57.7, 0.4),
+    goal=(141.8, 90.2),
+    route=((101.3, 57.7), (120.6, 70.9), (141.8, 90.2)),
+    events=(
+        Event(
+            id="e1",
+            kind="frontal",
+            x_m=120.25,
+            y_m=70.65,
+            heading_rad=0.4,
+            route_s_m=22.9,
+            half_width_m=2.1,
+        ),
+    ),
+)
+PEOPLE = People.of(
+    ("c17", "e1"), [[110.2, 60.1], [121.7, 71.3]], [0.1, 0.2], [1.1, 1.2], ("walk", "walk")
+)
 
 
 HERE = Pose(107.9, 62.3, 0.61)
 
 
 def moment(tick: int = 20, pose: Pose = HERE) -> Moment:
-    return Moment(tick, RobotState(pose, 1.1, 0.05), Street(tick, PEOPLE), SCENARIO.route_line.project(*pose[:2])[0])
+    return Moment(
+        tick,
+        RobotState(pose, 1.1, 0.05),
+        Street(tick, PEOPLE),
+        SCENARIO.route_line.project(*pose[:2])[0],
+    )
 
 
 class Eye:
@@ -55,7 +80,10 @@ def unknown_here(now: Moment) -> Privileged:
 
 
 def observed(
-    manifest: Manifest, now: Moment | None = None, seed: int = 3, known: Callable[[Moment], Privileged] = unknown_here
+    manifest: Manifest,
+    now: Moment | None = None,
+    seed: int = 3,
+    known: Callable[[Moment], Privileged] = unknown_here,
 ) -> Observation:
     """What a policy is given in a street with two people."""
     eye = None if manifest.camera is None else Eye(manifest.camera)
@@ -63,7 +91,9 @@ def observed(
     return observer.observed(now or moment(), 1.0, eye, put_back=False)[0]
 
 
-def observing(manifest: Manifest, seed: int = 3, known: Callable[[Moment], Privileged] = unknown_here) -> Observer:
+def observing(
+    manifest: Manifest, seed: int = 3, known: Callable[[Moment], Privileged] = unknown_here
+) -> Observer:
     eye = None if manifest.camera is None else Eye(manifest.camera)
     further = {name: Eye(spec) for name, spec in manifest.cameras.items()}
 
@@ -75,32 +105,56 @@ def observing(manifest: Manifest, seed: int = 3, known: Callable[[Moment], Privi
 
 
 def test_who_asks_for_nothing_gets_nothing_more() -> None:
-    """Speeds, time and its robot; no picture, goal, odometry, calibration, depth, labels or knowledge."""
+    """Speeds, time and its robot; no picture, goal, odometry, calibration, depth, labels or
+    knowledge."""
     seen = observed(Manifest("blind", camera=None))
-    given = {f.name for f in dataclasses.fields(seen) if getattr(seen, f.name) not in (None, {}, False)}
+    given = {
+        f.name for f in dataclasses.fields(seen) if getattr(seen, f.name) not in (None, {}, False)
+    }
     assert given == {"tick", "time_s", "v_mps", "w_radps", "robot", "episode"}
 
 
 def test_each_thing_that_is_asked_for_is_given() -> None:
-    """Depth and labels of the cameras that ask for them, goals without the people whom the picture shows."""
+    """Depth and labels of the cameras that ask for them, goals without the people whom the picture
+    shows."""
     spec = CameraSpec(8, 6, depth=True)
     manifest = Manifest(
-        "all", camera=spec, goal="image", odometry="exact", cameras={"left": CameraSpec(4, 4, labels=True)}
+        "all",
+        camera=spec,
+        goal="image",
+        odometry="exact",
+        cameras={"left": CameraSpec(4, 4, labels=True)},
     )
     seen = observed(manifest)
-    assert seen.rgb is not None and seen.rgb.max() == 9 and seen.depth is not None and seen.labels is None
-    assert isinstance(seen.goal, ImageGoal) and seen.goal.rgb.max() == 7 and seen.goal.rgb.shape == (6, 8, 3)
+    assert (
+        seen.rgb is not None
+        and seen.rgb.max() == 9
+        and seen.depth is not None
+        and seen.labels is None
+    )
+    assert (
+        isinstance(seen.goal, ImageGoal)
+        and seen.goal.rgb.max() == 7
+        and seen.goal.rgb.shape == (6, 8, 3)
+    )
     left = seen.pictures["left"]
     assert left.rgb.shape == (4, 4, 3) and left.depth is None and left.labels is not None
-    assert left.camera.matrix[0, 2] == 1.5 and seen.camera is not None and seen.camera.matrix[0, 2] == 3.5
+    assert (
+        left.camera.matrix[0, 2] == 1.5
+        and seen.camera is not None
+        and seen.camera.matrix[0, 2] == 3.5
+    )
     assert seen.odometry is not None and seen.odometry.x_m > 5.0
 
 
 @pytest.mark.parametrize("protocol", get_args(GoalProtocol))
 @pytest.mark.parametrize("odometry", get_args(OdometryKind))
-def test_nothing_privileged_is_reached_from_an_observation(protocol: GoalProtocol, odometry: OdometryKind) -> None:
-    """By attributes, containers, closures, weak references and bases of arrays: no value of the simulator's types, no
-    name of the scenario, a person or an event, no number of the map, however the goal is told."""
+def test_nothing_privileged_is_reached_from_an_observation(
+    protocol: GoalProtocol, odometry: OdometryKind
+) -> None:
+    """By attributes, containers, closures, weak references and bases of arrays: no value of the
+    simulator's types, no name of the scenario, a person or an event, no number of the map, however
+    the goal is told."""
     cameras = {"left": CameraSpec(4, 4, mount="left", depth=True, labels=True)}
     spec = CameraSpec(8, 6, depth=True, labels=True)
     seen = observed(Manifest("all", camera=spec, goal=protocol, odometry=odometry, cameras=cameras))
@@ -109,7 +163,8 @@ def test_nothing_privileged_is_reached_from_an_observation(protocol: GoalProtoco
 
 def _planted(seen: Observation, what: str) -> object:
     """An observation that leaks."""
-    now, people = moment(), PEOPLE
+    now = moment()
+    people = PEOPLE
     plants: dict[str, object] = {
         "attribute": people,
         "array": people.xy[1],
@@ -127,7 +182,18 @@ def _planted(seen: Observation, what: str) -> object:
     return dataclasses.replace(seen, goal=cast(PointGoal, plants[what]))
 
 
-PLANTS = ["attribute", "array", "view", "container", "closure", "default", "method", "weak", "objects", "number"]
+PLANTS = [
+    "attribute",
+    "array",
+    "view",
+    "container",
+    "closure",
+    "default",
+    "method",
+    "weak",
+    "objects",
+    "number",
+]
 PLANTS += ["name", "key"]
 
 
@@ -146,7 +212,9 @@ def test_what_the_simulator_knows_goes_to_who_declares_it() -> None:
         told.append(now)
         return nothing
 
-    seen = observed(Manifest("knows", camera=None, privileged=True, goal="final_point"), known=known)
+    seen = observed(
+        Manifest("knows", camera=None, privileged=True, goal="final_point"), known=known
+    )
     assert seen.privileged is nothing and len(told) == 1 and isinstance(seen.goal, PointGoal)
 
 
@@ -154,7 +222,9 @@ def test_goals_and_errors_are_drawn_from_the_runs_seed_each_by_itself() -> None:
     """The same seed gives the same, another another, of both; odometry changes no goal."""
 
     def given(seed: int, odometry: OdometryKind = "gps") -> tuple[object, Odometry | None]:
-        seen = observed(Manifest("mine", camera=None, goal="random_point", odometry=odometry), seed=seed)
+        seen = observed(
+            Manifest("mine", camera=None, goal="random_point", odometry=odometry), seed=seed
+        )
         return seen.goal, seen.odometry
 
     assert given(3) == given(3)
@@ -163,12 +233,14 @@ def test_goals_and_errors_are_drawn_from_the_runs_seed_each_by_itself() -> None:
 
 
 def drove(before: Pose, after: Pose) -> Step:
-    motion, reply = Motion(RobotState(after), np.zeros((10, 3))), EventReply(episode="", tick=0, actors=(), states=())
+    motion = Motion(RobotState(after), np.zeros((10, 3)))
+    reply = EventReply(episode="", tick=0, actors=(), states=())
     return Step(0, RobotState(before), Street(0), 0.0, None, STILL, reply, motion, Street(0), 0.0)
 
 
 def test_a_reset_gives_another_random_point_and_is_not_counted_by_the_wheels() -> None:
-    """Driven 2 m, then put back by 6 m: the wheels have counted 2 m, and the point lies 5 to 20 m ahead of it."""
+    """Driven 2 m, then put back by 6 m: the wheels have counted 2 m, and the point lies 5 to 20 m
+    ahead of it."""
     observer = observing(Manifest("mine", camera=None, goal="random_point", odometry="wheel"))
     start, there, back = (Pose(101.3 + d, 57.7, 0.0) for d in (0.0, 2.0, -4.0))
     first = observer.observed(moment(0, start), 0.0, None, put_back=False)[0].goal
@@ -176,23 +248,39 @@ def test_a_reset_gives_another_random_point_and_is_not_counted_by_the_wheels() -
     kept = observer.observed(moment(5, there), 0.25, None, put_back=False)[0].goal
     observer.moved(drove(there, there), put_back=True)
     seen = observer.observed(moment(6, back), 0.3, None, put_back=True)[0]
-    assert isinstance(first, PointGoal) and isinstance(kept, PointGoal) and isinstance(seen.goal, PointGoal)
+    assert (
+        isinstance(first, PointGoal)
+        and isinstance(kept, PointGoal)
+        and isinstance(seen.goal, PointGoal)
+    )
     assert (kept.x_m, kept.y_m) == pytest.approx((first.x_m - 2.0, first.y_m))
     assert 5.0 <= seen.goal.x_m <= 20.0 and abs(seen.goal.x_m - (first.x_m + 4.0)) > 1e-6
-    assert seen.odometry is not None and seen.odometry.x_m == pytest.approx(2.0, abs=0.5) and seen.reset
+    assert (
+        seen.odometry is not None
+        and seen.odometry.x_m == pytest.approx(2.0, abs=0.5)
+        and seen.reset
+    )
 
 
 def test_goals_travel_to_a_policy_in_another_process() -> None:
     """Each kind of goal arrives as it was sent to the shared renderer, with the odometry."""
-    from scenarios.rendering.exchange import Ask, decode_request, encode_exchange
+    from scenarios.ipc.render_protocol import Ask, decode_request, encode_exchange
 
     for protocol in get_args(GoalProtocol):
         seen = observed(Manifest("mine", camera=CameraSpec(8, 6), goal=protocol, odometry="wheel"))
-        came = decode_request(encode_exchange(Ask(1, 0.5, 0.0, None, False, seen.goal, seen.odometry)))
-        assert isinstance(came, Ask) and came.odometry == seen.odometry and type(came.goal) is type(seen.goal)
+        came = decode_request(
+            encode_exchange(Ask(1, 0.5, 0.0, None, False, seen.goal, seen.odometry))
+        )
+        assert (
+            isinstance(came, Ask)
+            and came.odometry == seen.odometry
+            and type(came.goal) is type(seen.goal)
+        )
         if seen.goal is not None:
             for field in msgspec.structs.fields(seen.goal):
-                assert np.array_equal(getattr(came.goal, field.name), getattr(seen.goal, field.name))
+                assert np.array_equal(
+                    getattr(came.goal, field.name), getattr(seen.goal, field.name)
+                )
 
 
 def test_a_robot_is_told_of_itself_alone() -> None:

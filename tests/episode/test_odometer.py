@@ -23,13 +23,17 @@ def driven(odometer: Odometer, poses: list[Pose]) -> Odometry | None:
 
 
 def straight(far_m: float, steps: int = 100) -> list[Pose]:
-    return [Pose(10.0, 20.0 + d, 0.5 * math.pi) for d in np.linspace(0.0, far_m, steps + 1).tolist()]
+    return [
+        Pose(10.0, 20.0 + d, 0.5 * math.pi) for d in np.linspace(0.0, far_m, steps + 1).tolist()
+    ]
 
 
 def test_exact_odometry_is_where_the_robot_is_from_its_start() -> None:
-    """3 m north and 2 m west of a start that looks north, looking west: 3 m ahead, 2 m left, a quarter turn; carried
-    or driven."""
-    told = odometer_for("exact", START, np.random.default_rng(0)).read(Pose(8.0, 23.0, math.pi), 1.0)
+    """3 m north and 2 m west of a start that looks north, looking west: 3 m ahead, 2 m left, a
+    quarter turn; carried or driven."""
+    told = odometer_for("exact", START, np.random.default_rng(0)).read(
+        Pose(8.0, 23.0, math.pi), 1.0
+    )
     assert told is not None and told.heading_rad == pytest.approx(0.5 * math.pi)
     assert (told.x_m, told.y_m) == pytest.approx((3.0, 2.0))
     assert odometer_for("none", START, np.random.default_rng(0)).read(START, 1.0) is None
@@ -47,22 +51,29 @@ def test_wheels_without_errors_count_the_way_and_not_what_carries_the_robot() ->
 
 
 def test_wheels_are_as_wrong_as_declared() -> None:
-    """Over 400 episodes of 100 m: scale and noise make the length, drift and noise the heading; nothing is wrong of a
-    robot that stands."""
-    noise, far_m = WheelNoise(), 100.0
-    ends = [driven(WheelOdometer(np.random.default_rng(seed)), straight(far_m)) for seed in range(400)]
+    """Over 400 episodes of 100 m: scale and noise make the length, drift and noise the heading;
+    nothing is wrong of a robot that stands."""
+    noise = WheelNoise()
+    far_m = 100.0
+    ends = [
+        driven(WheelOdometer(np.random.default_rng(seed)), straight(far_m)) for seed in range(400)
+    ]
     headings = np.array([one.heading_rad for one in ends if one is not None], dtype=float)
     expected = math.hypot(noise.drift_radpm * far_m, noise.heading_rad * math.sqrt(far_m))
-    assert headings.std() == pytest.approx(expected, rel=0.1) and abs(headings.mean()) < 0.2 * expected
-    short = [driven(WheelOdometer(np.random.default_rng(seed)), straight(1.0)) for seed in range(400)]
+    assert (
+        headings.std() == pytest.approx(expected, rel=0.1) and abs(headings.mean()) < 0.2 * expected
+    )
+    short = [
+        driven(WheelOdometer(np.random.default_rng(seed)), straight(1.0)) for seed in range(400)
+    ]
     lengths = np.array([math.hypot(one.x_m, one.y_m) for one in short if one is not None])
     assert lengths.std() == pytest.approx(math.hypot(noise.scale, noise.along_m), rel=0.1)
     assert driven(WheelOdometer(np.random.default_rng(1)), [START] * 100) == Odometry(0.0, 0.0, 0.0)
 
 
 def test_fixes_are_as_wrong_as_declared() -> None:
-    """Over 400 episodes each fix is off by noise and bias; from one second to the next by the noise alone, nearly; a
-    minute later the bias is another; no heading is told."""
+    """Over 400 episodes each fix is off by noise and bias; from one second to the next by the noise
+    alone, nearly; a minute later the bias is another; no heading is told."""
     noise = GpsNoise()
     errors = []
     for seed in range(400):
@@ -71,7 +82,9 @@ def test_fixes_are_as_wrong_as_declared() -> None:
         assert {one.heading_rad for one in told} == {None}
         errors.append([(one.x_m - 3.0, one.y_m) for one in told])
     off = np.array(errors)
-    assert off.std(axis=0) == pytest.approx(np.full((3, 2), math.hypot(noise.noise_m, noise.bias_m)), rel=0.12)
+    assert off.std(axis=0) == pytest.approx(
+        np.full((3, 2), math.hypot(noise.noise_m, noise.bias_m)), rel=0.12
+    )
     short, long = (off[:, 1] - off[:, 0]).std(), (off[:, 2] - off[:, 1]).std()
     kept = math.exp(-1.0 / 60.0)
     assert short == pytest.approx(

@@ -1,4 +1,5 @@
-"""The small policies that ship, which were trained by `cosim train`; none of them: nothing to test."""
+"""The small policies that ship, which were trained by `cosim train`; none of them: nothing to
+test."""
 
 from __future__ import annotations
 
@@ -8,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from cosim.policies.shipped import shipped_bundles
-from cosim.records.run_folder import read_records
+from cosim.policies.load import shipped_bundles
+from cosim.results.run_folder import read_records
 from tests.conftest import Cosim
 
 SMALL = [name for name in shipped_bundles() if name.startswith("small")]
@@ -17,21 +18,37 @@ SMALL = [name for name in shipped_bundles() if name.startswith("small")]
 
 @pytest.mark.parametrize("name", SMALL)
 def test_a_small_policy_that_ships_is_small_and_answers_without_pytorch(name: str) -> None:
-    """Its folder is no larger than 8 MB; by its name it is loaded and asked without PyTorch in the process."""
+    """Its folder is no larger than 8 MB; by its name it is loaded and asked without PyTorch in the
+    process."""
     assert sum(path.stat().st_size for path in shipped_bundles()[name].iterdir()) < 8_000_000
     code = (
         "import sys, cosim; from cosim.policies.onnx.policy import in_grey; "
         "policy = cosim.load_policy(sys.argv[1]); policy.reset('one', 1); "
         "print(policy.act(in_grey(policy.manifest)).v_mps >= 0.0, 'torch' in sys.modules)"
     )
-    said = subprocess.run([sys.executable, "-c", code, name], capture_output=True, text=True, check=True)
+    said = subprocess.run(
+        [sys.executable, "-c", code, name], capture_output=True, text=True, check=True
+    )
     assert said.stdout.split() == ["True", "False"]
 
 
 @pytest.mark.engine
 @pytest.mark.parametrize("name", SMALL)
-def test_a_small_policy_that_ships_drives_to_a_goal_by_what_it_sees(name: str, tmp_path: Path, cosim: Cosim) -> None:
-    """By its name, as any policy: over a crosswalk of the test part, in a city that it has never seen."""
-    said = cosim("run", "unit", "--policy", name, "--scenario", "crosswalk-7013", "--out", "run", cwd=tmp_path)
+def test_a_small_policy_that_ships_drives_to_a_goal_by_what_it_sees(
+    name: str, tmp_path: Path, cosim: Cosim
+) -> None:
+    """By its name, as any policy: over a crosswalk of the test part, in a city that it has never
+    seen."""
+    said = cosim(
+        "run",
+        "unit",
+        "--policy",
+        name,
+        "--scenario",
+        "crosswalk-7013",
+        "--out",
+        "run",
+        cwd=tmp_path,
+    )
     (record,) = read_records(tmp_path / "run")
     assert said.returncode == 0 and record.ended == "goal" and not record.privileged, said.stderr

@@ -1,4 +1,5 @@
-"""Training a small policy on demonstrations: `cosim train`. Needs PyTorch, which the lock files leave out."""
+"""Training a small policy on demonstrations: `cosim train`. Needs PyTorch, which the lock files
+leave out."""
 
 from __future__ import annotations
 
@@ -16,12 +17,13 @@ import numpy as np
 import pytest
 
 from cosim.core.errors import CosimError
-from cosim.core.packed import Packed
-from cosim.episode.ports import CameraSpec, Observation
+from cosim.core.packed_demos import Packed
+from cosim.episode.interfaces import Observation
 from cosim.policies.load import load_policy
 from cosim.policies.onnx.feeding import Feeder
 from cosim.policies.onnx.graph import TensorPort
 from cosim.policies.onnx.manifest import BundleManifest
+from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import PointGoal
 from cosim.spec.robot import COURIER
 from tests.conftest import Cosim
@@ -41,9 +43,10 @@ BRISK = Training(steps=4, batch=4, device="cpu")
 
 
 def street(episodes: int = 12, length: int = 4, seed: int = 1) -> Packed:
-    """Episodes in which somebody white stands at the left or at the right, which the expert turns away from, or
-    somebody dark right ahead, for whom it stops."""
-    draws, count = np.random.default_rng(seed), episodes * length
+    """Episodes in which somebody white stands at the left or at the right, which the expert turns
+    away from, or somebody dark right ahead, for whom it stops."""
+    draws = np.random.default_rng(seed)
+    count = episodes * length
     scene = np.repeat(np.arange(episodes) % 3, length)
     frames = draws.integers(90, 110, (count, HEIGHT_PX, WIDTH_PX, 3)).astype(np.uint8)
     frames[scene == 0, 20:70, 10:60] = 250
@@ -64,10 +67,15 @@ def street(episodes: int = 12, length: int = 4, seed: int = 1) -> Packed:
         episode=np.repeat(np.arange(episodes, dtype=np.int32), length),
         frame=np.tile(np.arange(length, dtype=np.int32), episodes),
         meta={
-            "rate_hz": 5.0, "waypoint_s": 0.2, "goal": "route_point", "policy": ["orca"], "learner": [""],
-            "robot": "courier", "camera": {"width": WIDTH_PX, "height": HEIGHT_PX, "fov_deg": 60.0, "mount": "front"},
+            "rate_hz": 5.0,
+            "waypoint_s": 0.2,
+            "goal": "route_point",
+            "policy": ["orca"],
+            "learner": [""],
+            "robot": "courier",
+            "camera": {"width": WIDTH_PX, "height": HEIGHT_PX, "fov_deg": 60.0, "mount": "front"},
         },
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +89,9 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def learned(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bundle that has learned from that street."""
     folder = tmp_path_factory.mktemp("learned")
-    assert train([data], folder, Training(steps=60, batch=12, rate=2e-3, device="cpu"), False, heard([])).whole
+    assert train(
+        [data], folder, Training(steps=60, batch=12, rate=2e-3, device="cpu"), False, heard([])
+    ).whole
     return folder
 
 
@@ -99,16 +109,20 @@ def plans(folder: Path, rows: Sequence[int]) -> np.ndarray:
     ort = pytest.importorskip("onnxruntime")
     path = folder / "unseen.npz"
     street(episodes=3, length=1, seed=9).save(path)
-    batch, session = Examples([path], 0, CPU).rows(np.array(rows)), ort.InferenceSession(folder / "model.onnx")
+    batch = Examples([path], 0, CPU).rows(np.array(rows))
+    session = ort.InferenceSession(folder / "model.onnx")
     inputs = [one.name for one in session.get_inputs()]
     return np.concatenate(
-        [session.run(None, {name: getattr(batch, name)[i : i + 1].numpy() for name in inputs})[0] for i in rows]
+        [
+            session.run(None, {name: getattr(batch, name)[i : i + 1].numpy() for name in inputs})[0]
+            for i in rows
+        ]
     )
 
 
 def test_it_learns_to_turn_away_and_to_stop(learned: Path) -> None:
-    """To pictures of a street that it has not seen it answers a turn to the free side, and of somebody ahead that it
-    stops, which is no slow speed but 0."""
+    """To pictures of a street that it has not seen it answers a turn to the free side, and of
+    somebody ahead that it stops, which is no slow speed but 0."""
     left, right, ahead = plans(learned, [0, 1, 2])
     assert left[0, 3] < -0.1 and right[0, 3] > 0.1
     assert min(left[0, 2], right[0, 2]) > 0.5 * CRUISE_MPS
@@ -116,12 +130,18 @@ def test_it_learns_to_turn_away_and_to_stop(learned: Path) -> None:
 
 
 def test_the_bundle_is_one_that_runs_take(learned: Path) -> None:
-    """Its manifest is a bundle's, with the graph's size and hash, no larger than 8 MB; its example answers as said."""
+    """Its manifest is a bundle's, with the graph's size and hash, no larger than 8 MB; its example
+    answers as said."""
     manifest = msgspec.json.decode((learned / "manifest.json").read_bytes(), type=BundleManifest)
     graph = (learned / "model.onnx").read_bytes()
-    told, digest = manifest.files["model.onnx"], hashlib.blake2b(graph, digest_size=32).hexdigest()
+    told = manifest.files["model.onnx"]
+    digest = hashlib.blake2b(graph, digest_size=32).hexdigest()
     assert (told.bytes, told.blake2b) == (len(graph), digest) and len(graph) < 8_000_000
-    assert (manifest.goal, manifest.rate_hz, manifest.camera.spec.size) == ("route_point", 5.0, (160, 90))
+    assert (manifest.goal, manifest.rate_hz, manifest.camera.spec.size) == (
+        "route_point",
+        5.0,
+        (160, 90),
+    )
     example = np.load(learned / "example.npz")
     session = pytest.importorskip("onnxruntime").InferenceSession(graph)
     answer = session.run(["plan"], {name: example[name] for name in manifest.inputs})[0]
@@ -129,41 +149,61 @@ def test_the_bundle_is_one_that_runs_take(learned: Path) -> None:
 
 
 def test_a_camera_of_which_a_part_was_seen_shows_the_same_part_again() -> None:
-    """The bundle's camera has the size, the field of view, the place and the crop of that of the demonstrations."""
-    camera = {"width": 160, "height": 120, "fov_deg": 60.0, "mount": "front", "crop": [0, 30, 160, 120], "depth": False}
-    manifest = msgspec.convert(manifest_of("small", street().meta | {"camera": camera}, "told"), BundleManifest)
+    """The bundle's camera has the size, the field of view, the place and the crop of that of the
+    demonstrations."""
+    camera = {
+        "width": 160,
+        "height": 120,
+        "fov_deg": 60.0,
+        "mount": "front",
+        "crop": [0, 30, 160, 120],
+        "depth": False,
+    }
+    manifest = msgspec.convert(
+        manifest_of("small", street().meta | {"camera": camera}, "told"), BundleManifest
+    )
     assert manifest.camera.spec == CameraSpec(160, 120, 60.0, crop=(0, 30, 160, 120))
 
 
 def test_a_training_that_was_stopped_ends_as_one_in_one_piece(data: Path, tmp_path: Path) -> None:
-    """Stopped after each step and gone on with, it writes the same graph to the byte, and the same curve."""
+    """Stopped after each step and gone on with, it writes the same graph to the byte, and the same
+    curve."""
     assert train([data], tmp_path / "whole", BRISK, False, heard([])).whole
     pieces = 1
-    while not train([data], tmp_path / "pieces", replace(BRISK, minutes=1e-9), True, heard([])).whole:
+    while not train(
+        [data], tmp_path / "pieces", replace(BRISK, minutes=1e-9), True, heard([])
+    ).whole:
         pieces += 1
     assert pieces == BRISK.steps
     for name in ("model.onnx", "curve.csv"):
         assert (tmp_path / "pieces" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
-def test_a_training_whose_time_is_over_leaves_a_bundle_and_its_curve(data: Path, tmp_path: Path, cosim: Cosim) -> None:
-    """`cosim train --minutes`, far too short: exit code 1, a bundle that can be loaded and says at which step it is, a
-    curve with a row of that step, and how to continue; `--resume` alone ends it."""
+def test_a_training_whose_time_is_over_leaves_a_bundle_and_its_curve(
+    data: Path, tmp_path: Path, cosim: Cosim
+) -> None:
+    """`cosim train --minutes`, far too short: exit code 1, a bundle that can be loaded and says at
+    which step it is, a curve with a row of that step, and how to continue; `--resume` alone ends
+    it."""
     words = ("train", str(data), "-o", "small", "--batch", "4", "--device", "cpu", "--seed", "3")
     done = cosim(*words, "--steps", "3", "--minutes", "1e-9", cwd=tmp_path)
-    assert done.returncode == 1 and "stopped at step 1 of 3. Continue with --resume" in done.stderr, done.stderr
+    assert (
+        done.returncode == 1 and "stopped at step 1 of 3. Continue with --resume" in done.stderr
+    ), done.stderr
     assert steps_of(tmp_path / "small") == ["step", "1"]
     manifest = json.loads((tmp_path / "small/manifest.json").read_bytes())
     assert manifest["source"] == "cosim train, seed 3, on what orca drove; step 1 of 3"
     assert load_policy(f"onnx:{tmp_path / 'small'}").manifest.name == "small"
     done = cosim(*words, "--resume", cwd=tmp_path)
     assert done.returncode == 0 and "more steps: --resume --steps 6" in done.stderr, done.stderr
-    assert json.loads((tmp_path / "small/manifest.json").read_bytes())["source"].endswith("on what orca drove")
+    assert json.loads((tmp_path / "small/manifest.json").read_bytes())["source"].endswith(
+        "on what orca drove"
+    )
 
 
 def test_a_finished_training_is_continued_with_more_steps(data: Path, tmp_path: Path) -> None:
-    """Four steps, then six: a curve of both, another graph, the same again to the byte, and the bundle says so. Fewer
-    steps than are done are refused."""
+    """Four steps, then six: a curve of both, another graph, the same again to the byte, and the
+    bundle says so. Fewer steps than are done are refused."""
     for name in ("one", "other"):
         assert train([data], tmp_path / name, BRISK, False, heard([])).whole
         before = (tmp_path / name / "model.onnx").read_bytes()
@@ -175,26 +215,37 @@ def test_a_finished_training_is_continued_with_more_steps(data: Path, tmp_path: 
     assert bundle_facts(tmp_path / "one").name == "small"
     source = json.loads((tmp_path / "one/manifest.json").read_bytes())["source"]
     assert source.endswith("on what orca drove; 4 steps, continued to 6")
-    with pytest.raises(CosimError, match=r"6 steps are done, and --steps asks for 5 in all: give more than 6"):
+    with pytest.raises(
+        CosimError, match=r"6 steps are done, and --steps asks for 5 in all: give more than 6"
+    ):
         train([data], tmp_path / "one", replace(BRISK, steps=5), True, heard([]))
 
 
-def test_it_can_be_trained_on_from_the_shipped_graph_alone(learned: Path, data: Path, tmp_path: Path) -> None:
-    """The graph holds the parameters that training begins with: at a rate of next to nothing it stays as it is."""
+def test_it_can_be_trained_on_from_the_shipped_graph_alone(
+    learned: Path, data: Path, tmp_path: Path
+) -> None:
+    """The graph holds the parameters that training begins with: at a rate of next to nothing it
+    stays as it is."""
     held = parameters_of(learned / "model.onnx")
-    assert train([data], tmp_path / "on", replace(BRISK, begin=learned, rate=1e-12), False, heard([])).whole
+    assert train(
+        [data], tmp_path / "on", replace(BRISK, begin=learned, rate=1e-12), False, heard([])
+    ).whole
     for name, value in parameters_of(tmp_path / "on" / "model.onnx").items():
         torch.testing.assert_close(value, held[name], atol=1e-6, rtol=0)
     drawn = new_parameters(3)
     (tmp_path / "drawn.onnx").write_bytes(graph_of(drawn))
-    assert all(torch.equal(value, drawn[name]) for name, value in parameters_of(tmp_path / "drawn.onnx").items())
+    assert all(
+        torch.equal(value, drawn[name])
+        for name, value in parameters_of(tmp_path / "drawn.onnx").items()
+    )
 
 
 def test_the_mirror_exchanges_left_and_right_everywhere(data: Path) -> None:
-    """Picture, goal, speeds, turn and way are mirrored together: twice is as before, and the street with somebody at
-    the left becomes the one with somebody at the right."""
+    """Picture, goal, speeds, turn and way are mirrored together: twice is as before, and the street
+    with somebody at the left becomes the one with somebody at the right."""
     batch = Examples([data], 0, CPU).rows(np.array([0, 4]))
-    there, back = mirror(batch), mirror(mirror(batch))
+    there = mirror(batch)
+    back = mirror(mirror(batch))
     assert all(torch.equal(value, getattr(back, name)) for name, value in vars(batch).items())
     bright = there.pictures[0] > 0.8
     assert torch.equal(bright, batch.pictures[1] > 0.8)
@@ -203,39 +254,55 @@ def test_the_mirror_exchanges_left_and_right_everywhere(data: Path) -> None:
 
 
 def test_a_run_feeds_the_graph_what_it_was_trained_on(tmp_path: Path) -> None:
-    """By the bundle's manifest an observation becomes the numbers that the row of it was in training, with its history,
-    also at an episode's beginning, and with a goal farther than is told."""
-    draws, packed = np.random.default_rng(5), street(episodes=2, length=6)
+    """By the bundle's manifest an observation becomes the numbers that the row of it was in
+    training, with its history, also at an episode's beginning, and with a goal farther than is
+    told."""
+    draws = np.random.default_rng(5)
+    packed = street(episodes=2, length=6)
     goals = draws.uniform(-30.0, 30.0, (12, 2)).astype(np.float32)
-    packed = replace(packed, frames=draws.integers(0, 256, packed.frames.shape, np.uint8), goal=goals)
+    packed = replace(
+        packed, frames=draws.integers(0, 256, packed.frames.shape, np.uint8), goal=goals
+    )
     packed.save(tmp_path / "street.npz")
     trained_on = Examples([tmp_path / "street.npz"], 0, CPU).rows(np.arange(12))
     manifest = msgspec.convert(manifest_of("small", packed.meta, "told"), BundleManifest)
     ports = {name: TensorPort(name, np.dtype(np.float32), shape) for name, shape in INPUTS.items()}
     feeder = Feeder(manifest.inputs, ports, 0)
-    for row, (rgb, speeds, goal) in enumerate(zip(packed.frames, packed.state, packed.goal, strict=True)):
+    for row, (rgb, speeds, goal) in enumerate(
+        zip(packed.frames, packed.state, packed.goal, strict=True)
+    ):
         if packed.frame[row] == 0:
             feeder.forget()
         v_mps, w_radps, x_m, y_m = map(float, (*speeds, *goal))
-        fed = feeder.feed(Observation(row, 0.0, rgb, v_mps, w_radps, COURIER, goal=PointGoal(x_m, y_m)))
+        fed = feeder.feed(
+            Observation(row, 0.0, rgb, v_mps, w_radps, COURIER, goal=PointGoal(x_m, y_m))
+        )
         for name, tensor in fed.items():
             np.testing.assert_allclose(tensor[0], getattr(trained_on, name)[row], atol=1e-6)
 
 
-def test_a_bundle_says_who_taught_it_and_who_drove(learned: Path, data: Path, tmp_path: Path) -> None:
-    """Of all files that it learned from: the experts, and the learners beside which they answered; and which network it
-    began with."""
+def test_a_bundle_says_who_taught_it_and_who_drove(
+    learned: Path, data: Path, tmp_path: Path
+) -> None:
+    """Of all files that it learned from: the experts, and the learners beside which they answered;
+    and which network it began with."""
     again = street()
-    replace(again, meta=again.meta | {"policy": ["orca-disturbed"], "learner": ["first"]}).save(tmp_path / "again.npz")
+    replace(again, meta=again.meta | {"policy": ["orca-disturbed"], "learner": ["first"]}).save(
+        tmp_path / "again.npz"
+    )
     meta = Examples([data, tmp_path / "again.npz"], 0, CPU).meta
     assert source_of(street().meta, 0) == "cosim train, seed 0, on what orca drove"
-    told = "cosim train, seed 1, on what orca, orca-disturbed drove, and would have done where first drove"
+    told = (
+        "cosim train, seed 1, on what orca, orca-disturbed drove, and would have done where "
+        "first drove"
+    )
     assert source_of(meta, 1) == told
     assert source_of(meta, 1, bundle_facts(learned)) == f"{told}; begun with small"
 
 
 def test_a_batch_hangs_on_seed_and_step_alone(data: Path) -> None:
-    """The same step gives the same batch in any order, another one other pictures, within 0 and 1."""
+    """The same step gives the same batch in any order, another one other pictures, within 0 and
+    1."""
     examples = Examples([data], 0, CPU)
     third = examples.drawn(0, 3, 8)
     other, again = examples.drawn(0, 4, 8), examples.drawn(0, 3, 8)
@@ -245,9 +312,12 @@ def test_a_batch_hangs_on_seed_and_step_alone(data: Path) -> None:
     assert not torch.equal(third.pictures, examples.rows(examples.learned[:8]).pictures)
 
 
-def test_moments_in_which_the_expert_stops_are_drawn_more_often_than_they_come(tmp_path: Path) -> None:
-    """It drives all along, but for one row of each episode in which it stops: these are a sixteenth of all rows, and a
-    third of those that are drawn. Where it never stops nothing is drawn otherwise."""
+def test_moments_in_which_the_expert_stops_are_drawn_more_often_than_they_come(
+    tmp_path: Path,
+) -> None:
+    """It drives all along, but for one row of each episode in which it stops: these are a sixteenth
+    of all rows, and a third of those that are drawn. Where it never stops nothing is drawn
+    otherwise."""
     going = street(length=16)
     going.state[:, 0] = going.command[:, 0] = 1.4
     going.save(tmp_path / "goes.npz")
@@ -260,8 +330,11 @@ def test_moments_in_which_the_expert_stops_are_drawn_more_often_than_they_come(t
 
 def test_what_is_held_out_is_whole_episodes_and_never_learned_from(data: Path) -> None:
     """No episode is on both sides, and none is on neither."""
-    examples, episode = Examples([data, data], 0, CPU), np.repeat(np.arange(24), 4)
-    learned, held_out = ({*episode[rows].tolist()} for rows in (examples.learned, examples.held_out))
+    examples = Examples([data, data], 0, CPU)
+    episode = np.repeat(np.arange(24), 4)
+    learned, held_out = (
+        {*episode[rows].tolist()} for rows in (examples.learned, examples.held_out)
+    )
     assert not learned & held_out and learned | held_out == {*range(24)} and held_out
     assert len(examples.learned) + len(examples.held_out) == 96
 
@@ -269,7 +342,10 @@ def test_what_is_held_out_is_whole_episodes_and_never_learned_from(data: Path) -
 @pytest.mark.parametrize(
     ("wrong", "told"),
     [
-        ("size", r"other\.npz: pictures of 80 x 90 pixels, wanted are 160 x 90: cosim collect --camera 160x90"),
+        (
+            "size",
+            r"other\.npz: pictures of 80 x 90 pixels, wanted are 160 x 90: cosim collect --camera 160x90",
+        ),
         ("goal", r"other\.npz: goals are no points \(none\): cosim collect --goal route_point"),
         ("turn", r"other\.npz: the expert turns at 1\.20 rad/s, and this network at 0\.65 at most"),
         ("rate", r"other\.npz: rate_hz is 10\.0, and 5\.0 in .*street\.npz"),
@@ -284,9 +360,14 @@ def test_what_is_held_out_is_whole_episodes_and_never_learned_from(data: Path) -
         ("steps", r"--steps must be above 0, not 0"),
     ],
 )
-def test_what_cannot_be_trained_on_is_refused(learned: Path, data: Path, tmp_path: Path, wrong: str, told: str) -> None:
-    """Each is one line that names file and field, what was found and what is wanted, and nothing is written."""
-    packed, other, out = street(episodes=2), tmp_path / "other.npz", tmp_path / "out"
+def test_what_cannot_be_trained_on_is_refused(
+    learned: Path, data: Path, tmp_path: Path, wrong: str, told: str
+) -> None:
+    """Each is one line that names file and field, what was found and what is wanted, and nothing is
+    written."""
+    packed = street(episodes=2)
+    other = tmp_path / "other.npz"
+    out = tmp_path / "out"
     if wrong == "size":
         packed = replace(packed, frames=packed.frames[:, :, ::2])
     elif wrong == "goal":
@@ -309,7 +390,11 @@ def test_what_cannot_be_trained_on_is_refused(learned: Path, data: Path, tmp_pat
     with pytest.raises(CosimError, match=told):
         training = replace(
             BRISK,
-            begin=tmp_path if wrong in ("begin", "graph") else learned if wrong == "other begin" else None,
+            begin=tmp_path
+            if wrong in ("begin", "graph")
+            else learned
+            if wrong == "other begin"
+            else None,
             device="abacus" if wrong == "device" else "cpu",
             seed=int(wrong == "another"),
             steps=0 if wrong == "steps" else BRISK.steps,
@@ -325,10 +410,12 @@ def test_what_cannot_be_trained_on_is_refused(learned: Path, data: Path, tmp_pat
 
 
 def test_it_needs_nothing_but_pytorch_numpy_and_onnx() -> None:
-    """What the project has besides is not imported by a training: a GPU host's own Python can do it."""
+    """What the project has besides is not imported by a training: a GPU host's own Python can do
+    it."""
     code = (
-        "import sys, cosim.learning.progress; print(sorted({m.partition('.')[0] for m in sys.modules} & "
-        "{'msgspec', 'shapely', 'pandas', 'scipy', 'cv2', 'av', 'typer', 'rich', 'onnxruntime', 'libsumo'}))"
+        "import sys, cosim.learning.progress; print(sorted({m.partition('.')[0] for m in "
+        "sys.modules} & {'msgspec', 'shapely', 'pandas', 'scipy', 'cv2', 'av', 'typer', 'rich', "
+        "'onnxruntime', 'libsumo'}))"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert said.stdout.strip() == "[]"

@@ -1,4 +1,5 @@
-"""ORCA's half-planes and its linear programme, on cases worked out by hand and against a search of all velocities."""
+"""ORCA's half-planes and its linear programme, on cases worked out by hand and against a search of
+all velocities."""
 
 from __future__ import annotations
 
@@ -14,14 +15,20 @@ from cosim.people.orca import HalfPlane, best_velocity, half_plane
 FASTEST_MPS = 2.0
 
 
-def of(apart: tuple[float, float], mine: tuple[float, float], other: tuple[float, float], **about: float) -> HalfPlane:
+def of(
+    apart: tuple[float, float],
+    mine: tuple[float, float],
+    other: tuple[float, float],
+    **about: float,
+) -> HalfPlane:
     """A half-plane with full responsibility, radius 1 m, a horizon of 2 s."""
     known = {"radius_m": 1.0, "horizon_s": 2.0, "share": 1.0, "step_s": 0.1} | about
     return half_plane(np.array(apart), np.array(mine), np.array(other), **known)
 
 
 def test_standing_still_before_a_standing_disk_is_permitted_and_driving_into_it_is_not() -> None:
-    """A disk of radius 1 at 6 m is reached in 2 s at 2.5 m/s: the edge lies there, square to the way."""
+    """A disk of radius 1 at 6 m is reached in 2 s at 2.5 m/s: the edge lies there, square to the
+    way."""
     plane = of((6.0, 0.0), (0.0, 0.0), (0.0, 0.0))
     assert plane == pytest.approx((-1.0, 0.0, -2.5))
     assert plane.excess(np.array([0.0, 0.0])) == pytest.approx(2.5)
@@ -29,7 +36,8 @@ def test_standing_still_before_a_standing_disk_is_permitted_and_driving_into_it_
 
 
 def test_head_on_the_edge_is_the_leg_of_the_cone() -> None:
-    """Two 5 m apart that close at 4 m/s: the leg is at asin(1/5) to the line between them, and I must cross it."""
+    """Two 5 m apart that close at 4 m/s: the leg is at asin(1/5) to the line between them, and I
+    must cross it."""
     plane = of((5.0, 0.0), (2.0, 0.0), (-2.0, 0.0))
     sin = 0.2
     assert (plane.nx, plane.ny) == pytest.approx((-sin, math.sqrt(1 - sin**2)))
@@ -39,7 +47,8 @@ def test_head_on_the_edge_is_the_leg_of_the_cone() -> None:
 
 
 def test_somebody_who_crosses_before_me_is_passed_behind() -> None:
-    """One who walks left to right ahead of me turns the edge so that going on straight is forbidden, left is not."""
+    """One who walks left to right ahead of me turns the edge so that going on straight is
+    forbidden, left is not."""
     plane = of((2.5, 1.0), (1.0, 0.0), (0.0, -0.5))
     assert plane.excess(np.array([1.0, 0.0])) < 0.0
     v = best_velocity([plane], np.array([1.0, 0.0]), FASTEST_MPS)
@@ -48,7 +57,8 @@ def test_somebody_who_crosses_before_me_is_passed_behind() -> None:
 
 
 def test_disks_that_overlap_are_parted_within_a_step() -> None:
-    """0.9 m apart with radii of 1 m: in 0.1 s the missing 0.1 m is made up by 1 m/s away from it."""
+    """0.9 m apart with radii of 1 m: in 0.1 s the missing 0.1 m is made up by 1 m/s away from
+    it."""
     plane = of((0.9, 0.0), (0.0, 0.0), (0.0, 0.0))
     assert plane == pytest.approx((-1.0, 0.0, 1.0))
 
@@ -60,8 +70,10 @@ def test_what_is_permitted_is_kept_and_what_is_too_fast_is_cut() -> None:
 
 
 def test_where_nothing_is_permitted_the_worst_violation_is_least() -> None:
-    """x >= 1 and x <= -1 meet half way; with y >= 1.5 and y <= -0.5 beside them the midpoint of the worse pair wins."""
-    east, west = HalfPlane(1.0, 0.0, 1.0), HalfPlane(-1.0, 0.0, 1.0)
+    """x >= 1 and x <= -1 meet half way; with y >= 1.5 and y <= -0.5 beside them the midpoint of the
+    worse pair wins."""
+    east = HalfPlane(1.0, 0.0, 1.0)
+    west = HalfPlane(-1.0, 0.0, 1.0)
     v = best_velocity([east, west], np.array([0.3, 0.0]), FASTEST_MPS)
     assert max(-p.excess(v) for p in (east, west)) == pytest.approx(1.0)
     assert v[0] == pytest.approx(0.0, abs=1e-9)
@@ -86,7 +98,8 @@ directions = st.floats(-math.pi, math.pi)
 def test_a_permitted_velocity_keeps_clear_for_the_horizon(
     apart: tuple[float, float], mine: tuple[float, float], other: tuple[float, float]
 ) -> None:
-    """Whoever takes full responsibility and a velocity of the half-plane does not touch the other within tau."""
+    """Whoever takes full responsibility and a velocity of the half-plane does not touch the other
+    within tau."""
     if math.hypot(*apart) <= 1.01:
         return
     plane = of(apart, mine, other)
@@ -100,10 +113,11 @@ def test_a_permitted_velocity_keeps_clear_for_the_horizon(
 def test_the_programme_agrees_with_a_search_of_all_velocities(
     made: list[tuple[float, float]], preferred: tuple[float, float]
 ) -> None:
-    """No solution violates a half-plane where one could keep them all, and none is farther from the wish than needed;
-    where none can, no velocity's worst violation is smaller."""
+    """No solution violates a half-plane where one could keep them all, and none is farther from the
+    wish than needed; where none can, no velocity's worst violation is smaller."""
     planes = [HalfPlane(math.cos(a), math.sin(a), c) for a, c in made]
-    v, wish = best_velocity(planes, np.array(preferred), FASTEST_MPS), np.array(preferred)
+    v = best_velocity(planes, np.array(preferred), FASTEST_MPS)
+    wish = np.array(preferred)
     assert np.hypot(*v) <= FASTEST_MPS + 1e-6
     axis = np.linspace(-FASTEST_MPS, FASTEST_MPS, 81)
     grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)

@@ -24,10 +24,14 @@ def east(name: str) -> float:
 
 
 def shown(track: Floats, facing_rad: float = 0.0) -> tuple[Floats, Floats, Floats]:
-    """What the filter shows of one person on a track (T, 2), facing so at first: (T, 2), (T,), (T,)."""
+    """What the filter shows of one person on a track (T, 2), facing so at first: (T, 2), (T,),
+    (T,)."""
     poses = PoseFilter(DT_S)
     speed = np.hypot(*np.diff(track, axis=0, prepend=track[:1]).T) / DT_S
-    rows = [poses.update(("c1",), track[i : i + 1], speed[i : i + 1], lambda _: facing_rad) for i in range(len(track))]
+    rows = [
+        poses.update(("c1",), track[i : i + 1], speed[i : i + 1], lambda _: facing_rad)
+        for i in range(len(track))
+    ]
     xy, facing, fast = (np.concatenate([row[k] for row in rows]) for k in range(3))
     return xy, facing, fast
 
@@ -81,7 +85,9 @@ def test_people_come_and_go() -> None:
     poses.update(("a", "b"), ab, np.zeros(2), east)
     bc = np.array([[0.0, 0.0], [20.0, 0.0]])
     xy, _, _ = poses.update(("b", "c"), bc, np.zeros(2), east)
-    assert xy[0] == pytest.approx([10.0 - MAX_SPEED_MPS * DT_S, 0.0]) and xy[1] == pytest.approx(bc[1])
+    assert xy[0] == pytest.approx([10.0 - MAX_SPEED_MPS * DT_S, 0.0]) and xy[1] == pytest.approx(
+        bc[1]
+    )
     empty = poses.update((), np.zeros((0, 2)), np.zeros(0), east)
     assert [len(part) for part in empty] == [0, 0, 0]
     xy, _, _ = poses.update(("b",), ab[:1], np.zeros(1), east)
@@ -90,7 +96,8 @@ def test_people_come_and_go() -> None:
 
 @pytest.mark.parametrize("aside_m", [0.3, 0.6, 0.8, 1.0], ids=["close", "near", "middle", "apart"])
 def test_nobody_steps_round_what_stands_into_the_robot(aside_m: float) -> None:
-    """Who hurries past a thing that stands, with the robot driving beside it, comes no nearer to the robot for it."""
+    """Who hurries past a thing that stands, with the robot driving beside it, comes no nearer to
+    the robot for it."""
     half_m = 0.35, 0.275
     standing = Standing([StandingBody(0.0, -aside_m, 0.0, 1.0, 0.6, 0.0, -1.0)])
     poses = PoseFilter(DT_S, standing)
@@ -100,5 +107,8 @@ def test_nobody_steps_round_what_stands_into_the_robot(aside_m: float) -> None:
         robot = Pose(-2.4 + 1.2 * i * DT_S, 0.45, 0.0)
         body = RobotBody(robot, half_m, 1.2)
         xy, _, _ = poses.update(("c1",), track[i : i + 1], np.full(1, MAX_SPEED_MPS), east, body)
-        least_m = min(least_m, float(box_disk_gap(np.array([robot]), *half_m, xy[None])[0, 0]) - PERSON_RADIUS_M)
+        least_m = min(
+            least_m,
+            float(box_disk_gap(np.array([robot]), *half_m, xy[None])[0, 0]) - PERSON_RADIUS_M,
+        )
     assert least_m > 0.05

@@ -11,8 +11,10 @@ REACH_M = 2.2 * 0.05
 
 
 def walked(start: np.ndarray, goal: np.ndarray, firm: np.ndarray) -> list[np.ndarray]:
-    """Where people are who walk from (N, 2) to (N, 2) at 1.4 m/s, tick by tick; who is firm steps as it wants."""
-    at, track = start.astype(float), []
+    """Where people are who walk from (N, 2) to (N, 2) at 1.4 m/s, tick by tick; who is firm steps
+    as it wants."""
+    at = start.astype(float)
+    track = []
     for _ in range(200):
         away = goal - at
         far = np.maximum(np.hypot(*away.T), 1e-9)[:, None]
@@ -24,8 +26,10 @@ def walked(start: np.ndarray, goal: np.ndarray, firm: np.ndarray) -> list[np.nda
 @pytest.mark.parametrize("aside_m", [0.0, 0.1, -0.3])
 @pytest.mark.parametrize("firm", [False, True])
 def test_two_who_walk_at_each_other_pass_without_touching(aside_m: float, firm: bool) -> None:
-    """Head-on or nearly so, both arrive, never nearer than shoulders, and never faster than the reach of a step."""
-    start, goal = np.array([[-4.0, 0.0], [4.0, aside_m]]), np.array([[4.0, 0.0], [-4.0, aside_m]])
+    """Head-on or nearly so, both arrive, never nearer than shoulders, and never faster than the
+    reach of a step."""
+    start = np.array([[-4.0, 0.0], [4.0, aside_m]])
+    goal = np.array([[4.0, 0.0], [-4.0, aside_m]])
     track = walked(start, goal, np.array([firm, False]))
     assert min(float(np.hypot(*(at[0] - at[1]))) for at in track) > 0.9 * SHOULDERS_M
     assert np.hypot(*(track[-1] - goal).T).max() < 0.05
@@ -35,7 +39,8 @@ def test_two_who_walk_at_each_other_pass_without_touching(aside_m: float, firm: 
 
 def test_who_is_firm_does_not_give_way() -> None:
     """An event pedestrian walks its line to the millimetre; the other goes round it."""
-    start, goal = np.array([[-4.0, 0.0], [4.0, 0.0]]), np.array([[4.0, 0.0], [-4.0, 0.0]])
+    start = np.array([[-4.0, 0.0], [4.0, 0.0]])
+    goal = np.array([[4.0, 0.0], [-4.0, 0.0]])
     track = walked(start, goal, np.array([True, False]))
     assert all(at[0, 1] == 0.0 for at in track)
     assert max(abs(float(at[1, 1])) for at in track) > 0.8 * SHOULDERS_M
@@ -57,13 +62,16 @@ def test_who_is_alone_walks_as_it_wants() -> None:
 
 
 def test_who_wants_to_stand_inside_a_group_stands_still_before_it() -> None:
-    """Somebody that SUMO has stopped among three talkers comes as near as shoulders allow, and then does not stir."""
+    """Somebody that SUMO has stopped among three talkers comes as near as shoulders allow, and then
+    does not stir."""
     angles = np.pi / 2 + 2.0 * np.pi * np.arange(3) / 3
     talkers = 0.62 * np.column_stack([np.cos(angles), np.sin(angles)])
     start = np.vstack([talkers, [[0.2, 0.38]]])
     goal = np.vstack([talkers, [[0.33, 0.36]]])
-    firm, stand = np.array([True, True, True, False]), np.array([False, False, False, True])
-    at, steps = start, []
+    firm = np.array([True, True, True, False])
+    stand = np.array([False, False, False, True])
+    at = start
+    steps = []
     for _ in range(100):
         to = kept_apart(at, goal, firm, REACH_M, stand)
         steps.append(float(np.hypot(*(to[3] - at[3]))))
@@ -84,9 +92,12 @@ def test_who_stands_gives_way_to_who_comes_through() -> None:
 
 
 def test_who_may_come_near_is_remembered_without_a_change() -> None:
-    """Among forty who walk, come, go and jump, step by step the same pairs are found as by looking at all of them."""
+    """Among forty who walk, come, go and jump, step by step the same pairs are found as by looking
+    at all of them."""
     rng = np.random.default_rng(3)
-    at, near, found = rng.uniform(0.0, 6.0, (40, 2)), NearPairs(), 0
+    at = rng.uniform(0.0, 6.0, (40, 2))
+    near = NearPairs()
+    found = 0
     for k in range(300):
         at = at + rng.normal(0.0, 0.05, at.shape)
         if k % 40 == 39:
@@ -101,4 +112,6 @@ def test_who_may_come_near_is_remembered_without_a_change() -> None:
         assert np.array_equal(np.column_stack([one, other]), np.argwhere(pairs & too_near))
         found += len(one)
     assert found > 100
-    assert [len(side) for side in NearPairs().of(np.zeros(0, dtype=complex), np.zeros(0, dtype=bool))] == [0, 0]
+    assert [
+        len(side) for side in NearPairs().of(np.zeros(0, dtype=complex), np.zeros(0, dtype=bool))
+    ] == [0, 0]

@@ -1,4 +1,5 @@
-"""Nobody walks through what stands there: the shown crowd, people of events and injected ones step round it."""
+"""Nobody walks through what stands there: the shown crowd, people of events and injected ones step
+round it."""
 
 from __future__ import annotations
 
@@ -28,16 +29,21 @@ def standing(*obstacles: Obstacle, area: Polygon = SIDEWALK) -> Standing:
     return standing_bodies(obstacles, area)
 
 
-def thing(kind: str, x_m: float = 0.0, y_m: float = 0.0, heading_rad: float = 0.3, form: int = 2) -> Obstacle:
+def thing(
+    kind: str, x_m: float = 0.0, y_m: float = 0.0, heading_rad: float = 0.3, form: int = 2
+) -> Obstacle:
     return Obstacle(kind=kind, x_m=x_m, y_m=y_m, heading_rad=heading_rad, form=form)
 
 
 def shown(things: Standing, y_m: float, east: bool, seconds: float = 9.0) -> Floats:
-    """(T, 2) where somebody is shown whom SUMO walks along x at y_m, straight through everything."""
+    """(T, 2) where somebody is shown whom SUMO walks along x at y_m, straight through
+    everything."""
     poses = PoseFilter(DT_S, things)
     x = np.arange(-5.0, -5.0 + 1.3 * seconds, 1.3 * DT_S) * (1 if east else -1)
     rows = [
-        poses.update(("c1",), np.array([[at, y_m]]), np.array([1.3]), lambda _: 0.0 if east else math.pi)[0][0]
+        poses.update(
+            ("c1",), np.array([[at, y_m]]), np.array([1.3]), lambda _: 0.0 if east else math.pi
+        )[0][0]
         for at in x.tolist()
     ]
     return np.array(rows)
@@ -51,7 +57,8 @@ def gap_m(track: Floats, *obstacles: Obstacle) -> float:
 
 @pytest.mark.parametrize("kind", sorted(OBSTACLE_SIZES_M))
 def test_the_crowd_steps_round_what_stands_in_its_way(kind: str) -> None:
-    """From either side, wherever on it they are headed, people go round and come to where they would be."""
+    """From either side, wherever on it they are headed, people go round and come to where they
+    would be."""
     one = thing(kind)
     for y_m in (-0.5, -0.1, 0.0, 0.3):
         for east in (True, False):
@@ -64,7 +71,8 @@ def test_the_crowd_steps_round_what_stands_in_its_way(kind: str) -> None:
 
 
 def test_what_reaches_to_the_edge_is_passed_on_the_other_side() -> None:
-    """Beside a wall people pass a row of bins on the side where there is room, and stay on the sidewalk."""
+    """Beside a wall people pass a row of bins on the side where there is room, and stay on the
+    sidewalk."""
     row = [thing("bin", 0.75 * k, 1.15, 1.57) for k in range(3)]
     things = standing(*row)
     (body,) = things.bodies
@@ -87,18 +95,31 @@ def test_who_fits_between_two_things_goes_between_them() -> None:
 def asked(things: Standing) -> EventQuery:
     """A question with the robot far away."""
     return EventQuery(
-        episode="t", tick=0, tick_ms=50, robot_x_m=-90.0, robot_y_m=0.0, robot_heading_rad=0.0, robot_v_mps=0.0,
-        robot_w_radps=0.0, route_s_m=0.0, robot_length_m=0.7, robot_width_m=0.55, events=(), standing=things.bodies,
-    )  # fmt: skip
+        episode="t",
+        tick=0,
+        tick_ms=50,
+        robot_x_m=-90.0,
+        robot_y_m=0.0,
+        robot_heading_rad=0.0,
+        robot_v_mps=0.0,
+        robot_w_radps=0.0,
+        route_s_m=0.0,
+        robot_length_m=0.7,
+        robot_width_m=0.55,
+        events=(),
+        standing=things.bodies,
+    )
 
 
 @pytest.mark.parametrize("kind", ["bike", "cafe", "fence"])
 @pytest.mark.parametrize("moves", [walked_on, pressed_on], ids=["walks", "presses"])
 def test_directed_people_step_round_it_too(kind: str, moves: object) -> None:
-    """People of events, who know the query alone, go round what it holds and walk on; without it they walk through."""
+    """People of events, who know the query alone, go round what it holds and walk on; without it
+    they walk through."""
     one = thing(kind, 0.0, 0.05, 1.3)
     for things in (standing(one), Standing()):
-        walker, track = Walker(x_m=-3.0, y_m=0.0, heading_rad=0.0), []
+        walker = Walker(x_m=-3.0, y_m=0.0, heading_rad=0.0)
+        track = []
         for _ in range(160):
             walker = moves(walker, 0.0, 1.3, Sight(asked(things)))  # type: ignore[operator]
             track.append((walker.x_m, walker.y_m))

@@ -24,15 +24,23 @@ def walk(
     speed_mps: float = 1.3,
     walls: bool = False,
 ) -> tuple[list[list[Vector]], float]:
-    """(paths, least distance in metres) of people who walk to their goals for 15 s, among others who heed nobody.
+    """(paths, least distance in metres) of people who walk to their goals for 15 s, among others
+    who heed nobody.
 
     walls: the ground ends 2 m left and right of the x axis.
     """
-    at, moving = list(starts), [(0.0, 0.0)] * len(starts)
-    paths, least_m = [[xy] for xy in starts], math.inf
+    at = list(starts)
+    moving = [(0.0, 0.0)] * len(starts)
+    paths = [[xy] for xy in starts]
+    least_m = math.inf
     for tick in range(300):
         here = [
-            Neighbour(o.x_m + o.vx_mps * tick * TICK_S, o.y_m + o.vy_mps * tick * TICK_S, o.vx_mps, o.vy_mps)
+            Neighbour(
+                o.x_m + o.vx_mps * tick * TICK_S,
+                o.y_m + o.vy_mps * tick * TICK_S,
+                o.vx_mps,
+                o.vy_mps,
+            )
             for o in others
         ]
         after = []
@@ -40,45 +48,73 @@ def walk(
             far_m = math.dist(xy, goal)
             pace = min(speed_mps, far_m / TICK_S)
             wanted = (
-                (pace * (goal[0] - xy[0]) / far_m, pace * (goal[1] - xy[1]) / far_m) if far_m > 1e-9 else (0.0, 0.0)
+                (pace * (goal[0] - xy[0]) / far_m, pace * (goal[1] - xy[1]) / far_m)
+                if far_m > 1e-9
+                else (0.0, 0.0)
             )
             fellows = [Neighbour(*at[j], *moving[j], 0.5) for j in range(len(at)) if j != i]
-            edges = [HalfPlane(0.0, -1.0, xy[1] - 2.0), HalfPlane(0.0, 1.0, -2.0 - xy[1])] if walls else []
+            edges = (
+                [HalfPlane(0.0, -1.0, xy[1] - 2.0), HalfPlane(0.0, 1.0, -2.0 - xy[1])]
+                if walls
+                else []
+            )
             until_s = min(2.0, far_m / max(pace, 1e-9))
-            after.append(steered(xy, moving[i], wanted, here + fellows, horizon_s=until_s, walls=edges))
+            after.append(
+                steered(xy, moving[i], wanted, here + fellows, horizon_s=until_s, walls=edges)
+            )
             if far_m > 1e-9:
                 everybody = [*((o.x_m, o.y_m) for o in here), *((f.x_m, f.y_m) for f in fellows)]
                 least_m = min(least_m, *(math.dist(xy, other) for other in everybody))
         moving = after
-        at = [(x + vx * TICK_S, y + vy * TICK_S) for (x, y), (vx, vy) in zip(at, moving, strict=True)]
+        at = [
+            (x + vx * TICK_S, y + vy * TICK_S) for (x, y), (vx, vy) in zip(at, moving, strict=True)
+        ]
         for path, xy in zip(paths, at, strict=True):
             path.append(xy)
     return paths, least_m
 
 
 def test_who_meets_nobody_walks_exactly_as_wanted() -> None:
-    """To the bit: with nobody there, with somebody beside the way, behind, far off, and ahead but going away."""
+    """To the bit: with nobody there, with somebody beside the way, behind, far off, and ahead but
+    going away."""
     wanted = (1.1 / 3.0, -0.7 / 3.0)
     assert steered((3.3, 4.7), (0.0, 0.0), wanted, []) == wanted
-    beside = [Neighbour(3.3 + 1.4, 4.7 + 2.2), Neighbour(3.3 - 0.6, 4.7 + 0.2), Neighbour(12.0, 0.0)]
+    beside = [
+        Neighbour(3.3 + 1.4, 4.7 + 2.2),
+        Neighbour(3.3 - 0.6, 4.7 + 0.2),
+        Neighbour(12.0, 0.0),
+    ]
     leaving = [Neighbour(3.3 + 1.5, 4.7 - 1.0, 1.2, -0.8)]
     assert steered((3.3, 4.7), wanted, wanted, beside + leaving) == wanted
 
 
 def test_who_wants_to_stand_stands() -> None:
     """Whoever comes: standing places are kept."""
-    assert steered((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), [Neighbour(0.4, 0.0, -1.0, 0.0)]) == (0.0, 0.0)
+    assert steered((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), [Neighbour(0.4, 0.0, -1.0, 0.0)]) == (
+        0.0,
+        0.0,
+    )
 
 
-@pytest.mark.parametrize("standing", [[(0.0, 0.0)], TALKERS, QUEUE], ids=["one", "talkers", "queue"])
+@pytest.mark.parametrize(
+    "standing", [[(0.0, 0.0)], TALKERS, QUEUE], ids=["one", "talkers", "queue"]
+)
 @pytest.mark.parametrize("start_m", [-6.0, -1.5])
-def test_who_is_blocked_by_people_who_stand_goes_round_all_of_them(standing: list[Vector], start_m: float) -> None:
-    """From afar and from close by: never between them, and no more than a few seconds later at the goal."""
-    (path,), least_m = walk([(start_m, 0.2)], [(6.0, 0.2)], others=[Neighbour(*xy) for xy in standing])
+def test_who_is_blocked_by_people_who_stand_goes_round_all_of_them(
+    standing: list[Vector], start_m: float
+) -> None:
+    """From afar and from close by: never between them, and no more than a few seconds later at the
+    goal."""
+    (path,), least_m = walk(
+        [(start_m, 0.2)], [(6.0, 0.2)], others=[Neighbour(*xy) for xy in standing]
+    )
     assert least_m > 0.55
     assert path[-1] == pytest.approx((6.0, 0.2))
     abreast = min(path, key=lambda xy: abs(xy[0]))
-    assert abreast[1] > max(y for _, y in standing) + 0.4 or abreast[1] < min(y for _, y in standing) - 0.4
+    assert (
+        abreast[1] > max(y for _, y in standing) + 0.4
+        or abreast[1] < min(y for _, y in standing) - 0.4
+    )
     late_s = TICK_S * sum(math.dist(xy, (6.0, 0.2)) > 1e-3 for xy in path) - (6.0 - start_m) / 1.3
     assert late_s < 2.5
 
@@ -87,9 +123,13 @@ def test_who_is_blocked_by_people_who_stand_goes_round_all_of_them(standing: lis
 def test_two_who_see_each_other_pass_and_arrive(angle_deg: float) -> None:
     """Head-on, crossing at right angles in perfect symmetry, and obliquely."""
     cos, sin = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
-    paths, least_m = walk([(-6.0, 0.0), (-6.0 * cos, -6.0 * sin)], [(6.0, 0.0), (6.0 * cos, 6.0 * sin)])
+    paths, least_m = walk(
+        [(-6.0, 0.0), (-6.0 * cos, -6.0 * sin)], [(6.0, 0.0), (6.0 * cos, 6.0 * sin)]
+    )
     assert least_m > 0.55
-    assert paths[0][-1] == pytest.approx((6.0, 0.0)) and paths[1][-1] == pytest.approx((6.0 * cos, 6.0 * sin))
+    assert paths[0][-1] == pytest.approx((6.0, 0.0)) and paths[1][-1] == pytest.approx(
+        (6.0 * cos, 6.0 * sin)
+    )
 
 
 def test_a_stream_that_heeds_nobody_is_crossed_and_met() -> None:
@@ -103,7 +143,9 @@ def test_a_stream_that_heeds_nobody_is_crossed_and_met() -> None:
 
 def test_nobody_leaves_the_ground_or_is_faster_than_wanted() -> None:
     """Between walls one passes those who stand on the side that is open."""
-    (path,), least_m = walk([(-6.0, 0.2)], [(6.0, 0.2)], others=[Neighbour(*xy) for xy in QUEUE], walls=True)
+    (path,), least_m = walk(
+        [(-6.0, 0.2)], [(6.0, 0.2)], others=[Neighbour(*xy) for xy in QUEUE], walls=True
+    )
     assert max(abs(y) for _, y in path) < 2.0 + 1e-9 and least_m > 0.55
     assert max(math.dist(a, b) for a, b in itertools.pairwise(path)) < 1.3 * TICK_S + 1e-9
     assert path[-1] == pytest.approx((6.0, 0.2))

@@ -20,10 +20,14 @@ def gap(xy: np.ndarray, robot: Pose) -> float:
 
 @pytest.mark.parametrize("aside_m", [0.0, 0.05, -0.3, 0.6])
 @pytest.mark.parametrize("heading", [0.0, 0.7, math.pi / 2])
-def test_someone_who_walks_at_a_standing_robot_passes_it_without_touching(aside_m: float, heading: float) -> None:
-    """From any lateral offset and against any heading the walker gets to the other side and never overlaps."""
+def test_someone_who_walks_at_a_standing_robot_passes_it_without_touching(
+    aside_m: float, heading: float
+) -> None:
+    """From any lateral offset and against any heading the walker gets to the other side and never
+    overlaps."""
     robot = Pose(0.0, 0.0, heading)
-    xy, goal = np.array([[4.0, aside_m]]), np.array([[-4.0, aside_m]])
+    xy = np.array([[4.0, aside_m]])
+    goal = np.array([[-4.0, aside_m]])
     nearest = math.inf
     for _ in range(250):
         away = goal - xy
@@ -35,10 +39,13 @@ def test_someone_who_walks_at_a_standing_robot_passes_it_without_touching(aside_
 
 
 def test_a_robot_that_drives_at_somebody_hits_them() -> None:
-    """Only a person's own steps are changed: who stands still is not moved out of the robot's way."""
+    """Only a person's own steps are changed: who stands still is not moved out of the robot's
+    way."""
     person = np.array([[1.0, 0.0]])
     for x_m in np.arange(0.0, 0.8, 0.1):
-        assert np.array_equal(stepped_round(person, person, RobotBody(Pose(x_m, 0.0, 0.0), HALF, 2.0)), person)
+        assert np.array_equal(
+            stepped_round(person, person, RobotBody(Pose(x_m, 0.0, 0.0), HALF, 2.0)), person
+        )
     assert gap(person, Pose(0.7, 0.0, 0.0)) < 0.0
 
 
@@ -50,7 +57,8 @@ def test_people_who_are_not_near_walk_as_they_want() -> None:
 
 
 def test_who_walks_against_a_moving_robot_steps_aside_in_time() -> None:
-    """A person and a robot at 1.5 m/s meet head-on: the person gets out of its way before they touch."""
+    """A person and a robot at 1.5 m/s meet head-on: the person gets out of its way before they
+    touch."""
     xy = np.array([[6.0, 0.1]])
     nearest = math.inf
     for tick in range(80):
@@ -65,14 +73,18 @@ def test_who_walks_ahead_does_not_see_the_robot_come_from_behind() -> None:
     """A slower person in front keeps walking and is run into: the robot has to watch out."""
     before = np.array([[0.8, 0.0]])
     wanted = before + np.array([[0.03, 0.0]])
-    assert np.allclose(stepped_round(before, wanted, RobotBody(Pose(0.0, 0.0, 0.0), HALF, 2.0)), wanted)
+    assert np.allclose(
+        stepped_round(before, wanted, RobotBody(Pose(0.0, 0.0, 0.0), HALF, 2.0)), wanted
+    )
 
 
 @pytest.mark.parametrize("x_m", [-0.3, 0.0, 0.5])
 def test_who_wants_to_stand_where_the_robot_is_stands_beside_it(x_m: float) -> None:
     """Somebody who waits comes up to the robot, a hand's breadth away, and then stands still."""
-    body, place = RobotBody(Pose(0.0, 0.0, 0.0), HALF), np.array([x_m, 0.45])
-    xy, ways = np.array([[2.0, 1.2]]), []
+    body = RobotBody(Pose(0.0, 0.0, 0.0), HALF)
+    place = np.array([x_m, 0.45])
+    xy = np.array([[2.0, 1.2]])
+    ways = []
     for _ in range(100):
         away = place - xy
         step = away * (0.11 / max(float(np.hypot(*away[0])), 0.11))

@@ -12,8 +12,8 @@ import moderngl
 import pytest
 
 from cosim.core.errors import EngineError, RunError
-from cosim.records.run_folder import RunFolder
-from cosim.records.run_spec import RunSpec
+from cosim.results.run_folder import RunFolder
+from cosim.results.run_spec import RunSpec
 from cosim.spec.scenario import Suite
 from physics.cameras import choice as cameras
 from physics.cameras.gl import context
@@ -41,33 +41,49 @@ def test_auto_falls_to_bullet_without_opengl(without_opengl: None) -> None:
 
 def test_gl_without_opengl_names_the_packages(without_opengl: None) -> None:
     """Asking for gl there fails with the reason, the packages to install, and the way out."""
-    with pytest.raises(EngineError, match=r"libEGL.so not loaded.*apt-get install libegl1 .*--camera bullet"):
+    with pytest.raises(
+        EngineError, match=r"libEGL.so not loaded.*apt-get install libegl1 .*--camera bullet"
+    ):
         cameras.camera_of_choice("gl")
 
 
 def test_a_run_does_not_mix_renderers(tmp_path: Path) -> None:
     """Resuming with another renderer is refused, and the message names both."""
     spec = RunSpec(
-        suite="s", robots={"courier": "h"},
-        suite_version="1", suite_hash="h", policy="p", policy_name="p", policy_version="1", scenarios=(),
-        versions={}, renderer="bullet-tiny",
-    )  # fmt: skip
+        suite="s",
+        robots={"courier": "h"},
+        suite_version="1",
+        suite_hash="h",
+        policy="p",
+        policy_name="p",
+        policy_version="1",
+        scenarios=(),
+        versions={},
+        renderer="bullet-tiny",
+    )
     with RunFolder.create(tmp_path / "run", spec, Suite(name="s", version="1", scenarios=())):
         pass
-    other = RunSpec(**{f: getattr(spec, f) for f in spec.__struct_fields__} | {"renderer": "gl: other"})
+    other = RunSpec(
+        **{f: getattr(spec, f) for f in spec.__struct_fields__} | {"renderer": "gl: other"}
+    )
     with pytest.raises(RunError, match="its renderer is bullet-tiny, now asked for is gl: other"):
         RunFolder.resume(tmp_path / "run", other)
 
 
 def test_naming_cameras_starts_no_engine() -> None:
     """The command line can ask for the renderer without PyBullet's greeting."""
-    code = "import sys, physics.cameras.choice as c; c.camera_of_choice('auto'); print('pybullet' in sys.modules)"
+    code = (
+        "import sys, physics.cameras.choice as c; c.camera_of_choice('auto'); print('pybullet' "
+        "in sys.modules)"
+    )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert said.stdout.strip() == "False"
 
 
 @pytest.mark.engine
-@pytest.mark.skipif(not context.available(), reason="no OpenGL through EGL here (see `cosim doctor`)")
+@pytest.mark.skipif(
+    not context.available(), reason="no OpenGL through EGL here (see `cosim doctor`)"
+)
 def test_the_renderer_has_a_name() -> None:
     """Records tell a GPU from llvmpipe, and one version of it from another."""
     assert len(cameras.renderer_of("gl")) > len("gl: , 4.3")

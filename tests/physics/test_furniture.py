@@ -1,4 +1,5 @@
-"""Street furniture, paving and relief: what stands where, what stays free, what the ground is like."""
+"""Street furniture, paving and relief: what stands where, what stays free, what the ground is
+like."""
 
 from __future__ import annotations
 
@@ -16,28 +17,44 @@ import shapely
 from cosim.core.errors import UsageError
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import LABELS, Command, RobotState, Street
-from cosim.episode.ports import CameraSpec
 from cosim.place.street_map import StreetMap, Strip, street_of
+from cosim.spec.camera import CameraSpec
 from cosim.spec.scenario import City
 from physics.cameras.bullet_camera import BulletCamera
+from physics.dynamics.world import BulletWorld
+from physics.ground.materials import MATERIALS, PAVINGS, Paving, friction
+from physics.ground.tiles import CURB_M, TILE_M, Tile, build_tile, key_at, keys_within, kind_of
 from physics.street.buildings import Frontage
 from physics.street.clearance import clear_width, on_driveways
-from physics.street.furniture import CATALOGUE, KINDS, PROP_VARIANTS, Prop, footprints, parts_of, solids_of
-from physics.street.placement import CLEAR_HALF_M, PROP_END_GAP_M, Placement, clear_half_m, street_style
-from physics.world.materials import MATERIALS, PAVINGS, Paving, friction
-from physics.world.street_surface import StreetSurface
-from physics.world.tiles import CURB_M, TILE_M, Tile, build_tile, key_at, keys_within, kind_of
-from physics.world.world import BulletWorld
+from physics.street.furniture import (
+    CATALOGUE,
+    KINDS,
+    PROP_VARIANTS,
+    Prop,
+    footprints,
+    parts_of,
+    solids_of,
+)
+from physics.street.placement import (
+    CLEAR_HALF_M,
+    PROP_END_GAP_M,
+    Placement,
+    clear_half_m,
+    street_style,
+)
+from physics.street.street_surface import StreetSurface
 from sumo_nets.city.store import city_net
-from sumo_nets.net.netfile import read_net
-from tests.tiny_street import tiny_map
+from sumo_nets.net.net_file import read_net
+from tests.support.tiny_street import tiny_map
 
 BASE = tiny_map()
 CLASSES = {"nw": "commercial", "ne": "residential", "sw": "boulevard", "se": "narrow"}
 MAP: StreetMap = dataclasses.replace(
     BASE,
     strips={
-        name: dataclasses.replace(s, street_class=CLASSES.get(name, ""), verge_m=1.5 if name in ("sw", "se") else 0.0)
+        name: dataclasses.replace(
+            s, street_class=CLASSES.get(name, ""), verge_m=1.5 if name in ("sw", "se") else 0.0
+        )
         for name, s in BASE.strips.items()
     },
 )
@@ -71,18 +88,27 @@ def foreign() -> list[Path]:
 
 @pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: kind.name)
 def test_a_prop_is_small_cheap_and_stands_on_the_ground(kind: object) -> None:
-    """Every size has few triangles, reaches the ground, fills its footprint below the heads and bumps within it."""
+    """Every size has few triangles, reaches the ground, fills its footprint below the heads and
+    bumps within it."""
     entry = KINDS[kind.name]  # type: ignore[attr-defined]
     looks = range(len(entry.paints) if entry.grown else 1)
     for variant, look in itertools.product(range(PROP_VARIANTS), looks):
         length, depth, height = entry.size_m(variant)
         parts = parts_of(entry.name, variant, look)
         vertices = np.concatenate([part.mesh.vertices for part in parts])
-        most = 250 if entry.name.startswith("obstacle:") else {"tree": 300, "car": 170}.get(entry.name, 90)
+        most = (
+            250
+            if entry.name.startswith("obstacle:")
+            else {"tree": 300, "car": 170}.get(entry.name, 90)
+        )
         assert sum(len(part.mesh) for part in parts) <= most
         assert -1e-9 <= vertices[:, 2].min() < 0.051
         assert vertices[:, 2].max() == pytest.approx(height, abs=0.06)
-        low = vertices[vertices[:, 2] < 1.75] if entry.name != "shelter" else vertices[vertices[:, 2] < 2.0]
+        low = (
+            vertices[vertices[:, 2] < 1.75]
+            if entry.name != "shelter"
+            else vertices[vertices[:, 2] < 2.0]
+        )
         assert np.abs(low[:, 0]).max() <= 0.5 * length + 0.02
         assert np.abs(low[:, 1]).max() <= 0.5 * depth + 0.02
         for solid in solids_of(entry.name, variant):
@@ -91,7 +117,8 @@ def test_a_prop_is_small_cheap_and_stands_on_the_ground(kind: object) -> None:
 
 
 def test_crowns_are_closed_and_keep_to_their_room() -> None:
-    """Of every tree: each edge of the crown has two sides, it hangs above the heads, within its spread, all lit."""
+    """Of every tree: each edge of the crown has two sides, it hangs above the heads, within its
+    spread, all lit."""
     kind = KINDS["tree"]
     for variant, look in itertools.product(range(PROP_VARIANTS), range(len(kind.paints))):
         crown = parts_of("tree", variant, look)[1]
@@ -107,7 +134,8 @@ def test_crowns_are_closed_and_keep_to_their_room() -> None:
 
 
 def test_what_is_drawn_may_be_turned_and_bumps_as_before() -> None:
-    """Lamps behind a sidewalk turn their arms to the road, trees each their own way; headings are left alone."""
+    """Lamps behind a sidewalk turn their arms to the road, trees each their own way; headings are
+    left alone."""
     for seed in range(4):
         for prop in all_props(MAP, seed):
             if prop.kind == "lamp":
@@ -115,7 +143,8 @@ def test_what_is_drawn_may_be_turned_and_bumps_as_before() -> None:
                 aside = prop.drawn_rad + 0.5 * math.pi
                 arm = np.array([prop.x_m + math.cos(aside), prop.y_m + math.sin(aside)])
                 road = (
-                    Polyline(strip.line).project(*arm.tolist())[1] - Polyline(strip.line).project(prop.x_m, prop.y_m)[1]
+                    Polyline(strip.line).project(*arm.tolist())[1]
+                    - Polyline(strip.line).project(prop.x_m, prop.y_m)[1]
                 )
                 assert road * strip.road_side > 0.9
             elif prop.kind != "tree":
@@ -123,7 +152,8 @@ def test_what_is_drawn_may_be_turned_and_bumps_as_before() -> None:
 
 
 def test_street_classes_of_any_map_have_a_column() -> None:
-    """Our own classes are themselves; types of imported edges go by their words; the rest are residential."""
+    """Our own classes are themselves; types of imported edges go by their words; the rest are
+    residential."""
     assert street_style("boulevard") == "boulevard"
     assert street_style("highway.primary_link") == "avenue"
     assert street_style("highway.living_street") == "narrow"
@@ -132,8 +162,11 @@ def test_street_classes_of_any_map_have_a_column() -> None:
 
 
 def test_props_keep_off_what_is_not_theirs() -> None:
-    """Over several seeds: no prop on a corner, a road, a crossing, another prop, a house, or near a strip's end."""
-    street = shapely.union_all([p.polygon for p in (*MAP.corners.values(), *MAP.lanes.values()) if "_0" not in p.id])
+    """Over several seeds: no prop on a corner, a road, a crossing, another prop, a house, or near a
+    strip's end."""
+    street = shapely.union_all(
+        [p.polygon for p in (*MAP.corners.values(), *MAP.lanes.values()) if "_0" not in p.id]
+    )
     zebra = MAP.strips[":c0"].polygon
     for seed in range(6):
         placement, frontage = placed(MAP, seed)
@@ -149,11 +182,15 @@ def test_props_keep_off_what_is_not_theirs() -> None:
             strip = MAP.strips[prop.id.split(":")[1]]
             line = Polyline(strip.line)
             along = [line.project(x, y)[0] for x, y in shapely.get_coordinates(footprint)]
-            assert min(along) >= PROP_END_GAP_M - 1e-6 and max(along) <= line.length_m - PROP_END_GAP_M + 1e-6
+            assert (
+                min(along) >= PROP_END_GAP_M - 1e-6
+                and max(along) <= line.length_m - PROP_END_GAP_M + 1e-6
+            )
 
 
 def test_the_middle_of_a_sidewalk_is_free() -> None:
-    """No footprint comes nearer to the middle line than the clear half width, which is at least 0.6 m."""
+    """No footprint comes nearer to the middle line than the clear half width, which is at least 0.6
+    m."""
     for seed in range(6):
         for prop, footprint in zip(props := all_props(MAP, seed), footprints(props), strict=True):
             strip = MAP.strips[prop.id.split(":")[1]]
@@ -163,7 +200,8 @@ def test_the_middle_of_a_sidewalk_is_free() -> None:
 
 
 def test_props_do_not_depend_on_the_order_but_on_the_seed() -> None:
-    """Tiles asked for in any order hold the same props, each in one tile alone; another seed gives others."""
+    """Tiles asked for in any order hold the same props, each in one tile alone; another seed gives
+    others."""
     keys = keys_within(0.0, 0.0, 100.0)
     one, two, other = (placed(MAP, seed)[0] for seed in (4, 4, 5))
     forward = {key: one.in_tile(key) for key in keys}
@@ -172,25 +210,31 @@ def test_props_do_not_depend_on_the_order_but_on_the_seed() -> None:
     assert forward != {key: other.in_tile(key) for key in keys}
     ids = [prop.id for props in forward.values() for prop in props]
     assert len(ids) == len(set(ids)) == len(all_props(MAP, 4))
-    assert all(key_at(prop.x_m, prop.y_m) == key for key, props in forward.items() for prop in props)
+    assert all(
+        key_at(prop.x_m, prop.y_m) == key for key, props in forward.items() for prop in props
+    )
 
 
 def test_streets_differ_by_their_class() -> None:
-    """Trees stand on boulevards and not in narrow streets, cafés rather in commercial ones; all kinds are found."""
+    """Trees stand on boulevards and not in narrow streets, cafés rather in commercial ones; all
+    kinds are found."""
     found: dict[str, list[str]] = {}
     for seed in range(12):
         for prop in all_props(MAP, seed):
             found.setdefault(CLASSES[prop.id.split(":")[1]], []).append(prop.kind)
     assert found["boulevard"].count("tree") > 20 and "tree" not in found["narrow"]
     assert found["commercial"].count("cafe") > found["residential"].count("cafe")
-    assert {kind for kinds in found.values() for kind in kinds} >= {kind.name for kind in CATALOGUE} - {
+    assert {kind for kinds in found.values() for kind in kinds} >= {
+        kind.name for kind in CATALOGUE
+    } - {
         "car",
         "shelter",
     }
 
 
 def test_the_checker_finds_a_prop_in_the_way() -> None:
-    """The least free width over the middle is measured at the prop, and is 0 where it stands on the middle line."""
+    """The least free width over the middle is measured at the prop, and is 0 where it stands on the
+    middle line."""
     strip = MAP.strips["nw"]
     bench = Prop("prop:nw:0", "bench", 0, -40.0, 6.2, 0.0, 0)
     width, bare = clear_width([strip], [bench])["nw"]
@@ -202,9 +246,11 @@ def test_the_checker_finds_a_prop_in_the_way() -> None:
 @pytest.mark.engine
 @pytest.mark.parametrize("seed", [11, 37, 5])
 def test_generated_cities_leave_a_way(seed: int) -> None:
-    """On every sidewalk of a city at least 1.2 m stay free on the final geometry, and there is furniture."""
+    """On every sidewalk of a city at least 1.2 m stay free on the final geometry, and there is
+    furniture."""
     street_map = city(seed)
-    strips, props = sidewalks(street_map), all_props(street_map, seed)
+    strips = sidewalks(street_map)
+    props = all_props(street_map, seed)
     widths = clear_width(strips, props)
     assert min(free for free, _ in widths.values()) >= 1.2 - 1e-6
     assert len(props) > 0.06 * sum(strip.length_m for strip in strips)
@@ -213,9 +259,11 @@ def test_generated_cities_leave_a_way(seed: int) -> None:
 @pytest.mark.engine
 @pytest.mark.parametrize("seed", [11, 37, 5])
 def test_driveways_are_open(seed: int) -> None:
-    """Nothing but parked cars, behind the sidewalk, stands where a driveway or the flares of its ramp are."""
+    """Nothing but parked cars, behind the sidewalk, stands where a driveway or the flares of its
+    ramp are."""
     street_map = city(seed)
-    strips, props = sidewalks(street_map), all_props(street_map, seed)
+    strips = sidewalks(street_map)
+    props = all_props(street_map, seed)
     assert sum(len(strip.driveways) for strip in strips) > 20
     assert on_driveways(strips, props) == []
     cars = [prop for prop in props if prop.kind == "car"]
@@ -224,7 +272,9 @@ def test_driveways_are_open(seed: int) -> None:
         assert shapely.distance(footprint, street_map.strips[car.id.split(":")[1]].polygon) > 0.0
     strip = next(strip for strip in strips if strip.driveways)
     x, y, heading = Polyline(strip.line).at(strip.driveways[0])
-    assert on_driveways(strips, [Prop("prop:here:0", "bin", 0, x, y, heading, 0)]) == ["prop:here:0"]
+    assert on_driveways(strips, [Prop("prop:here:0", "bin", 0, x, y, heading, 0)]) == [
+        "prop:here:0"
+    ]
 
 
 @pytest.mark.engine
@@ -239,7 +289,8 @@ def test_foreign_maps_leave_a_way(path: Path) -> None:
 
 @pytest.mark.engine
 def test_a_prop_stops_the_robot_and_is_named() -> None:
-    """Driven at a prop the robot touches it, whatever its kind: an object, by its id; and it does not pass."""
+    """Driven at a prop the robot touches it, whatever its kind: an object, by its id; and it does
+    not pass."""
     placement, _ = placed(MAP, 1)
     chosen = {prop.kind: prop for strip in sidewalks(MAP) for prop in placement.on_strip(strip)}
     assert len(chosen) > 8
@@ -256,15 +307,25 @@ def test_a_prop_stops_the_robot_and_is_named() -> None:
 
 @pytest.mark.engine
 def test_a_prop_is_seen_where_it_stands() -> None:
-    """A prop ahead is in the middle of the picture with its label, its foot on its zone's ground, at its distance."""
+    """A prop ahead is in the middle of the picture with its label, its foot on its zone's ground,
+    at its distance."""
     placement, _ = placed(MAP, 1)
-    props = [prop for strip in sidewalks(MAP) for prop in placement.on_strip(strip) if prop.kind in ("bin", "planter")]
-    with BulletCamera(BulletWorld(StreetSurface(MAP, seed=1)), CameraSpec(96, 96), depth=True) as camera:
+    props = [
+        prop
+        for strip in sidewalks(MAP)
+        for prop in placement.on_strip(strip)
+        if prop.kind in ("bin", "planter")
+    ]
+    with BulletCamera(
+        BulletWorld(StreetSurface(MAP, seed=1)), CameraSpec(96, 96), depth=True
+    ) as camera:
         for prop in props[:4]:
             y = float(MAP.strips[prop.id.split(":")[1]].line[0, 1])
             toward = math.copysign(math.pi / 2, prop.y_m - y)
             away = 3.0 * math.copysign(1.0, y - prop.y_m)
-            frame = camera.render(RobotState(Pose(prop.x_m, prop.y_m + away, toward), z_m=0.12), EMPTY)
+            frame = camera.render(
+                RobotState(Pose(prop.x_m, prop.y_m + away, toward), z_m=0.12), EMPTY
+            )
             assert frame.labels is not None and frame.depth is not None
             rows = np.flatnonzero(frame.labels[:, 48] == LABELS["prop"])
             assert len(rows) > 5
@@ -281,7 +342,8 @@ def test_names_of_edges_give_their_street() -> None:
 
 
 def test_streets_differ_by_their_paving() -> None:
-    """The paving of a street is the same for both sides and each time, differs by seed, and every class has several."""
+    """The paving of a street is the same for both sides and each time, differs by seed, and every
+    class has several."""
     strips = [
         dataclasses.replace(MAP.strips["nw"], id=f"{sign}s{i}", street_class=name)
         for name in ("residential", "commercial", "narrow")
@@ -300,10 +362,12 @@ def test_streets_differ_by_their_paving() -> None:
 
 
 def test_paved_ground_has_the_shape_of_plain_ground() -> None:
-    """A paved tile covers its square once, at the same heights, kind by kind the same areas; corners stay plain."""
+    """A paved tile covers its square once, at the same heights, kind by kind the same areas;
+    corners stay plain."""
     paving = Paving(MAP, 1)
     for key in keys_within(0.0, 0.0, 40.0):
-        plain, paved = build_tile(MAP, key), build_tile(MAP, key, paving)
+        plain = build_tile(MAP, key)
+        paved = build_tile(MAP, key, paving)
         areas: dict[str, list[float]] = {}
         for side, tile in enumerate((plain, paved)):
             for name, mesh in tile.parts.items():
@@ -321,7 +385,9 @@ def test_paved_ground_has_the_shape_of_plain_ground() -> None:
             strips = [s for s in sidewalks(MAP) if paving.surface(s) == name]
             lanes = [lane for lane in MAP.lanes.values() if paving.surface(lane) == name]
             where = shapely.union_all([p.polygon for p in (*strips, *lanes)])
-            assert shapely.contains_xy(shapely.buffer(where, 0.01), middles[:, 0], middles[:, 1]).all()
+            assert shapely.contains_xy(
+                shapely.buffer(where, 0.01), middles[:, 0], middles[:, 1]
+            ).all()
 
 
 def rough_height(tile: Tile, xy: np.ndarray) -> np.ndarray:
@@ -340,10 +406,15 @@ def rough_height(tile: Tile, xy: np.ndarray) -> np.ndarray:
 
 
 def test_rough_ground_is_a_shape_of_its_own_and_flat_ground_is_untouched() -> None:
-    """At 0 nothing changes; above it the mesh follows `height`, tiles meet, ramps stay, roads get potholes."""
+    """At 0 nothing changes; above it the mesh follows `height`, tiles meet, ramps stay, roads get
+    potholes."""
     key = (0, 0)
-    flat, zero = build_tile(MAP, key), build_tile(MAP, key, roughness=0.0, seed=9, roots=[(10.0, 5.0)])
-    assert all(np.array_equal(mesh.vertices, zero.parts[name].vertices) for name, mesh in flat.parts.items())
+    flat = build_tile(MAP, key)
+    zero = build_tile(MAP, key, roughness=0.0, seed=9, roots=[(10.0, 5.0)])
+    assert all(
+        np.array_equal(mesh.vertices, zero.parts[name].vertices)
+        for name, mesh in flat.parts.items()
+    )
     rough = build_tile(MAP, key, roughness=1.0, seed=9, roots=[(10.0, 5.0)])
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(5.0, 45.0, 400), rng.uniform(3.8, 6.3, 400)])
@@ -352,7 +423,10 @@ def test_rough_ground_is_a_shape_of_its_own_and_flat_ground_is_untouched() -> No
     assert known.mean() > 0.95
     assert np.abs(there - rough.height(points))[known].max() < 0.012
     assert np.ptp(there[known]) > 0.03 and np.abs(there[known] - CURB_M).max() < 0.1
-    assert rough.height([[10.0, 5.0]])[0] > build_tile(MAP, key, roughness=1.0, seed=9).height([[10.0, 5.0]])[0] + 0.02
+    assert (
+        rough.height([[10.0, 5.0]])[0]
+        > build_tile(MAP, key, roughness=1.0, seed=9).height([[10.0, 5.0]])[0] + 0.02
+    )
     other = build_tile(MAP, (-1, 0), roughness=1.0, seed=9)
     border = np.column_stack([np.full(50, 0.4137), np.linspace(1.0, 20.0, 50)])
     assert np.allclose(rough.height(border), other.height(border), atol=1e-9)
@@ -365,7 +439,8 @@ def test_rough_ground_is_a_shape_of_its_own_and_flat_ground_is_untouched() -> No
 
 @pytest.mark.engine
 def test_the_robot_feels_rough_ground() -> None:
-    """On rough pavement it gets along, tilted by a few degrees at most; on flat ground it hardly tilts."""
+    """On rough pavement it gets along, tilted by a few degrees at most; on flat ground it hardly
+    tilts."""
     tilts = {}
     for roughness in (0.0, 1.0):
         with BulletWorld(StreetSurface(MAP, seed=3, roughness=roughness)) as world:
@@ -378,5 +453,7 @@ def test_the_robot_feels_rough_ground() -> None:
 
 def test_roughness_has_a_range() -> None:
     """A roughness beyond 1 is refused with the range."""
-    with pytest.raises(UsageError, match=r"roughness is 1\.5, but it lies between 0 \(flat\) and 1"):
+    with pytest.raises(
+        UsageError, match=r"roughness is 1\.5, but it lies between 0 \(flat\) and 1"
+    ):
         BulletWorld(StreetSurface(MAP, seed=1, roughness=1.5))

@@ -1,4 +1,5 @@
-"""The gl camera: it agrees with the bullet camera, depends on its moment alone, and refuses what nobody can mean."""
+"""The gl camera: it agrees with the bullet camera, depends on its moment alone, and refuses what
+nobody can mean."""
 
 from __future__ import annotations
 
@@ -13,21 +14,23 @@ import pytest
 from cosim.core.errors import EngineError, UsageError
 from cosim.core.geometry import Pose
 from cosim.core.state import LABELS, Frame, People, RobotState, Signal, Street, Vehicles
-from cosim.episode.ports import CameraSpec, Lens
 from cosim.place.street_map import StreetMap, Strip
+from cosim.spec.camera import CameraSpec, Lens
 from cosim.spec.scenario import Barrier, City, Light
 from physics.cameras.bullet_camera import BulletCamera
 from physics.cameras.gl import context
 from physics.cameras.gl.camera import GlCamera
 from physics.cameras.gl.targets import Target
-from physics.world.street_surface import StreetSurface
-from physics.world.world import BulletWorld
-from scenarios.execution.places import place
-from tests.physics.parity import agreement
+from physics.dynamics.world import BulletWorld
+from physics.street.street_surface import StreetSurface
+from scenarios.places.nets import place
+from tests.support.parity import agreement
 
 pytestmark = [
     pytest.mark.engine,
-    pytest.mark.skipif(not context.available(), reason="no OpenGL through EGL here (see `cosim doctor`)"),
+    pytest.mark.skipif(
+        not context.available(), reason="no OpenGL through EGL here (see `cosim doctor`)"
+    ),
 ]
 
 SPEC = CameraSpec(width=128, height=96)
@@ -39,38 +42,55 @@ def street_at(street_map: StreetMap, spot: np.ndarray, rng: np.random.Generator)
     xy = spot + rng.uniform(-25.0, 25.0, (30, 2))
     doing = tuple(str(d) for d in rng.choice(["walk", "stop", "talk", "queue", "look"], 30))
     speed = rng.uniform(0.0, 1.5, 30)
-    people = People.of(tuple(f"c{i:02d}" for i in range(30)), xy, rng.uniform(-3.0, 3.0, 30), speed, doing)  # type: ignore[arg-type]
-    lanes = [lane for lane in street_map.lanes.values() if lane.kind == "road" and math.dist(lane.line[0], spot) < 60.0]
+    people = People.of(
+        tuple(f"c{i:02d}" for i in range(30)), xy, rng.uniform(-3.0, 3.0, 30), speed, doing
+    )  # type: ignore[arg-type]
+    lanes = [
+        lane
+        for lane in street_map.lanes.values()
+        if lane.kind == "road" and math.dist(lane.line[0], spot) < 60.0
+    ]
     middles = np.array([0.5 * (lane.line[0] + lane.line[1]) for lane in lanes]).reshape(-1, 2)
     headings = [math.atan2(*(lane.line[1] - lane.line[0])[::-1]) for lane in lanes]
     sizes = rng.choice([(4.5, 1.8), (12.0, 2.5), (3.6, 1.7)], len(lanes)).reshape(-1, 2)
     names = tuple(f"v{i:03d}" for i in range(len(lanes)))
     vehicles = Vehicles.of(names, middles, headings, np.zeros(len(lanes)), sizes)
     crossings = [s.id for s in street_map.strips.values() if s.signalised]
-    return Street(7, people, vehicles, {name: Signal(i % 2 == 0) for i, name in enumerate(crossings)})
+    return Street(
+        7, people, vehicles, {name: Signal(i % 2 == 0) for i, name in enumerate(crossings)}
+    )
 
 
 def stand_at(world: BulletWorld, strip: Strip, share: float, heading_rad: float) -> RobotState:
     x, y = strip.line[0] + share * (strip.line[1] - strip.line[0])
-    return RobotState(Pose(float(x), float(y), heading_rad), z_m=float(world.surface.heights([[x, y]])[0]))
+    return RobotState(
+        Pose(float(x), float(y), heading_rad), z_m=float(world.surface.heights([[x, y]])[0])
+    )
 
 
 @pytest.mark.parametrize("city", CITIES, ids=lambda city: city.name)
 def test_both_cameras_see_the_same(city: City) -> None:
-    """In 25 views from five places of a city labels agree on 97 % of the pixels off edges, and depth to 2 cm."""
+    """In 25 views from five places of a city labels agree on 97 % of the pixels off edges, and
+    depth to 2 cm."""
     _, street_map = place(city)
     rng = np.random.default_rng(city.seed)
     strips = [s for s in street_map.strips.values() if s.length_m > 5.0]
     crossing = next(s for s in strips if s.kind == "crossing")
     x, y = crossing.line[0]
-    fence = Barrier(x_m=float(x), y_m=float(y), heading_rad=0.3, length_m=2.0, strip=crossing.id, end=0)
+    fence = Barrier(
+        x_m=float(x), y_m=float(y), heading_rad=0.3, length_m=2.0, strip=crossing.id, end=0
+    )
     world = BulletWorld(StreetSurface(street_map, city.seed), [fence])
-    agree, depths, strip = [], [], crossing
+    agree = []
+    depths = []
+    strip = crossing
     with GlCamera(world, SPEC, depth=True) as one, BulletCamera(world, SPEC, depth=True) as other:
         for i in range(25):
             if i and not i % 5:
                 strip = strips[int(rng.integers(len(strips)))]
-            robot = stand_at(world, strip, float(rng.uniform(0.1, 0.9)), float(rng.uniform(-math.pi, math.pi)))
+            robot = stand_at(
+                world, strip, float(rng.uniform(0.1, 0.9)), float(rng.uniform(-math.pi, math.pi))
+            )
             street = street_at(street_map, robot.pose.xy, rng)
             alike, gap_m = agreement(one.render(robot, street), other.render(robot, street))
             agree.append(alike)
@@ -86,7 +106,9 @@ def world() -> BulletWorld:
 
 
 def moment(world: BulletWorld, n: int = 0) -> tuple[RobotState, Street]:
-    strips = [s for s in place(CITIES[0])[1].strips.values() if s.kind == "sidewalk" and s.length_m > 20.0]
+    strips = [
+        s for s in place(CITIES[0])[1].strips.values() if s.kind == "sidewalk" and s.length_m > 20.0
+    ]
     robot = stand_at(world, strips[n % len(strips)], 0.5, 0.4 * n)
     return robot, street_at(place(CITIES[0])[1], robot.pose.xy, np.random.default_rng(n))
 
@@ -99,7 +121,8 @@ def same(one: Frame, other: Frame) -> bool:
 def test_a_camera_frees_what_it_makes_but_for_programs_which_are_made_once(
     world: BulletWorld, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """From the second camera of a process on nothing is left of one in the graphics card's memory."""
+    """From the second camera of a process on nothing is left of one in the graphics card's
+    memory."""
     alive: Counter[str] = Counter()
     touched: Counter[str] = Counter()
 
@@ -122,7 +145,9 @@ def test_a_camera_frees_what_it_makes_but_for_programs_which_are_made_once(
         with GlCamera(world, SPEC) as camera:
             camera.render(*moment(world, n))
         left.append(dict(alive))
-    assert touched["buffer"] > 0 and left[1]["buffer"] >= left[0]["buffer"]  # forms grow with what is seen
+    assert (
+        touched["buffer"] > 0 and left[1]["buffer"] >= left[0]["buffer"]
+    )  # forms grow with what is seen
     assert left[2] == left[1] and left[3] == left[1]
 
 
@@ -134,13 +159,19 @@ def test_cameras_of_two_lights_at_once_draw_each_its_own(world: BulletWorld) -> 
     for light in lights:
         with GlCamera(world, SPEC, light=light) as camera:
             alone.append(camera.render(robot, street))
-    with GlCamera(world, SPEC, light=lights[0]) as noon, GlCamera(world, SPEC, light=lights[1]) as dusk:
+    with (
+        GlCamera(world, SPEC, light=lights[0]) as noon,
+        GlCamera(world, SPEC, light=lights[1]) as dusk,
+    ):
         pictures = [camera.render(robot, street) for camera in (noon, dusk, noon, dusk)]
-    assert all(same(picture, alone[i % 2]) for i, picture in enumerate(pictures)) and not same(*alone)
+    assert all(same(picture, alone[i % 2]) for i, picture in enumerate(pictures)) and not same(
+        *alone
+    )
 
 
 def test_a_picture_depends_on_its_moment_alone(world: BulletWorld) -> None:
-    """The same state is the same picture, whatever was drawn before, far off or a step away, and in whatever camera."""
+    """The same state is the same picture, whatever was drawn before, far off or a step away, and in
+    whatever camera."""
     robot, street = moment(world)
     with GlCamera(world, SPEC) as camera:
         first = camera.render(robot, street)
@@ -162,7 +193,8 @@ def test_two_cameras_take_turns(world: BulletWorld) -> None:
     robot, street = moment(world)
     elsewhere = moment(world, 5)
     with GlCamera(world, SPEC) as one, GlCamera(world, CameraSpec(64, 64)) as other:
-        first, second = one.render(robot, street), other.render(*elsewhere)
+        first = one.render(robot, street)
+        second = other.render(*elsewhere)
         assert same(one.render(robot, street), first)
         assert same(other.render(*elsewhere), second)
 
@@ -170,10 +202,14 @@ def test_two_cameras_take_turns(world: BulletWorld) -> None:
 def test_the_robot_is_seen_from_outside_only(world: BulletWorld) -> None:
     """Its body is in a picture for humans, standing on the ground, and not in its own."""
     robot, street = moment(world)
-    x, y, z = robot.pose.x_m, robot.pose.y_m, robot.z_m
+    x = robot.pose.x_m
+    y = robot.pose.y_m
+    z = robot.z_m
     with GlCamera(world, SPEC, depth=True) as camera:
         own = camera.render(robot, street)
-        outside = camera.picture((x - 2.0, y, z + 1.5), (x, y, z + 0.2), Street(7), robot, size=(160, 120))
+        outside = camera.picture(
+            (x - 2.0, y, z + 1.5), (x, y, z + 0.2), Street(7), robot, size=(160, 120)
+        )
     assert own.labels is not None and outside.labels is not None and outside.depth is not None
     assert not (own.labels == LABELS["robot"]).any()
     seen = outside.labels == LABELS["robot"]
@@ -182,21 +218,33 @@ def test_the_robot_is_seen_from_outside_only(world: BulletWorld) -> None:
 
 
 def test_light_changes_colours_and_nothing_else(world: BulletWorld) -> None:
-    """Noon, noon without shadows, overcast, fog and night show the same labels and depths in other colours."""
+    """Noon, noon without shadows, overcast, fog and night show the same labels and depths in other
+    colours."""
     robot, street = moment(world)
-    lights = [Light(), Light(shadows=False), Light(cloud_cover=1.0), Light(fog_m=40.0), Light(hour=23.0)]
+    lights = [
+        Light(),
+        Light(shadows=False),
+        Light(cloud_cover=1.0),
+        Light(fog_m=40.0),
+        Light(hour=23.0),
+    ]
     frames = []
     for light in lights:
         with GlCamera(world, SPEC, depth=True, light=light) as camera:
             frames.append(camera.render(robot, street))
     for k, frame in enumerate(frames):
-        assert np.array_equal(frame.labels, frames[0].labels) and np.array_equal(frame.depth, frames[0].depth)
+        assert np.array_equal(frame.labels, frames[0].labels) and np.array_equal(
+            frame.depth, frames[0].depth
+        )
         assert all(np.abs(frame.rgb.astype(int) - other.rgb).mean() > 0.5 for other in frames[:k])
 
 
 @pytest.mark.parametrize("make", [GlCamera, BulletCamera])
-def test_a_lens_bends_what_a_camera_draws(make: type[GlCamera | BulletCamera], world: BulletWorld) -> None:
-    """Behind a lens the picture has the camera's size, and what was at its edge has moved inwards."""
+def test_a_lens_bends_what_a_camera_draws(
+    make: type[GlCamera | BulletCamera], world: BulletWorld
+) -> None:
+    """Behind a lens the picture has the camera's size, and what was at its edge has moved
+    inwards."""
     robot, street = moment(world)
     barrel = dataclasses.replace(SPEC, fov_deg=50.0, lens=Lens(k1=-0.1))
     with make(world, dataclasses.replace(SPEC, fov_deg=50.0)) as plain, make(world, barrel) as bent:
@@ -231,18 +279,23 @@ def test_a_camera_outside_its_with_block_says_so(world: BulletWorld) -> None:
 
 @pytest.mark.parametrize("size", [(96, 96), (37, 21)], ids=["even", "odd"])
 def test_a_card_parts_colours_and_labels_as_the_processor_does(size: tuple[int, int]) -> None:
-    """What is parted by drawing it once more, as on a graphics card, is byte for byte what is parted after reading."""
+    """What is parted by drawing it once more, as on a graphics card, is byte for byte what is
+    parted after reading."""
     rng = np.random.default_rng(size[0])
     rgba = rng.integers(0, 256, (size[1], size[0], 4), dtype=np.uint8)
     with context.context() as gl:
         picture = gl.texture(size, 4, rgba.tobytes())
-        source, found = gl.framebuffer([picture]), []
+        source = gl.framebuffer([picture])
+        found = []
         for on_card in (False, True):
             target = Target(gl, size, parts_on_card=on_card)
             gl.copy_framebuffer(target.frame, source)
             buffer = gl.buffer(reserve=rgba.nbytes + 16)
             target.copy(buffer, 16)
-            found += [target.read(), target.parted(np.frombuffer(buffer.read(offset=16), dtype=np.uint8))]
+            found += [
+                target.read(),
+                target.parted(np.frombuffer(buffer.read(offset=16), dtype=np.uint8)),
+            ]
             target.release()
             buffer.release()
         source.release()

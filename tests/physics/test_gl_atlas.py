@@ -8,13 +8,13 @@ import pytest
 from cosim.core.errors import EngineError, UsageError
 from cosim.core.geometry import Pose
 from cosim.core.state import Frame, RobotState, Street
-from cosim.episode.ports import CameraSpec
+from cosim.spec.camera import CameraSpec
 from cosim.spec.robot import ROBOTS
 from cosim.spec.scenario import Light
 from physics.cameras.gl import context
-from physics.world.street_surface import StreetSurface
-from physics.world.world import BulletWorld
-from scenarios.bench.cameras import busy_street, camera_city
+from physics.dynamics.world import BulletWorld
+from physics.street.street_surface import StreetSurface
+from scenarios.tools.bench.cameras import busy_street, camera_city
 
 pytestmark = [
     pytest.mark.engine,
@@ -31,17 +31,22 @@ def worlds() -> list[BulletWorld]:
 
 
 def test_an_atlas_holds_the_pictures_of_its_cameras(worlds: list[BulletWorld]) -> None:
-    """Three environments drawn at once, with a second batch under way before the first is read: bit for bit what
-    three cameras draw one by one."""
+    """Three environments drawn at once, with a second batch under way before the first is read: bit
+    for bit what three cameras draw one by one."""
     from physics.cameras.gl.atlas import Atlas
 
     busy = busy_street(camera_city(300.0), 8, 5)
     ticks = [[busy.streets[i + k] for k in range(3)] for i in range(2)]
-    single = [_alone(world, NOON, [(busy.robot, streets[k]) for streets in ticks]) for k, world in enumerate(worlds)]
+    single = [
+        _alone(world, NOON, [(busy.robot, streets[k]) for streets in ticks])
+        for k, world in enumerate(worlds)
+    ]
     with Atlas(SPEC) as atlas:
         keys = [atlas.join(world) for world in worlds]
         for streets in ticks:
-            atlas.begin([(key, busy.robot, street) for key, street in zip(keys, streets, strict=True)])
+            atlas.begin(
+                [(key, busy.robot, street) for key, street in zip(keys, streets, strict=True)]
+            )
         with pytest.raises(EngineError, match="under way"):
             atlas.begin([(keys[0], busy.robot, busy.streets[0])])
         together = [atlas.end() for _ in ticks]
@@ -51,10 +56,12 @@ def test_an_atlas_holds_the_pictures_of_its_cameras(worlds: list[BulletWorld]) -
     assert not np.array_equal(single[0][0].rgb, single[1][0].rgb)
 
 
-def test_environments_join_and_leave_an_atlas(worlds: list[BulletWorld], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever else is in it, before, beside or after, one that cannot be drawn too: an environment of a place, light
-    and robot of its own has the pictures of a camera of its own, in the order asked for, also one that left before its
-    picture was fetched."""
+def test_environments_join_and_leave_an_atlas(
+    worlds: list[BulletWorld], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever else is in it, before, beside or after, one that cannot be drawn too: an environment
+    of a place, light and robot of its own has the pictures of a camera of its own, in the order
+    asked for, also one that left before its picture was fetched."""
     from physics.cameras.gl.atlas import Atlas
 
     busy = busy_street(camera_city(300.0), 8, 4)
@@ -75,7 +82,10 @@ def test_environments_join_and_leave_an_atlas(worlds: list[BulletWorld], monkeyp
         atlas.begin([(third, *asked[2])])
         for one, expected in zip(atlas.end() + atlas.end(), (a[1], c[1], b[2], c[2]), strict=True):
             assert _same(one, expected)
-        with pytest.raises(UsageError, match=f"environment {first} is not in the atlas; in it are: {second}, {third}"):
+        with pytest.raises(
+            UsageError,
+            match=f"environment {first} is not in the atlas; in it are: {second}, {third}",
+        ):
             atlas.begin([(first, *asked[3])])
         with monkeypatch.context() as broken, pytest.raises(ZeroDivisionError):
             broken.setattr(other.surface, "heights", lambda xy: 1 / 0)
@@ -99,8 +109,9 @@ def _same(one: Frame, other: Frame) -> bool:
 
 
 def test_people_alone_are_the_same_with_the_next_picture_under_way() -> None:
-    """People, fetched while the next are drawn: bit for bit what is drawn one by one, and they move."""
-    from physics.cameras.gl.alone import PeopleAlone
+    """People, fetched while the next are drawn: bit for bit what is drawn one by one, and they
+    move."""
+    from physics.cameras.gl.people_only import PeopleAlone
 
     busy = busy_street(camera_city(300.0), 8, 3)
     with PeopleAlone((96, 54), 60.0) as eyes:

@@ -1,4 +1,5 @@
-"""People as the gl camera draws them: levels of detail keep the silhouettes, poses are those of the joints."""
+"""People as the gl camera draws them: levels of detail keep the silhouettes, poses are those of the
+joints."""
 
 from __future__ import annotations
 
@@ -22,12 +23,12 @@ from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.targets import Target
 from physics.cameras.sky import sky_of
 from physics.cameras.view import Shot, shot
+from physics.people.appearance import ALL, look_of
 from physics.people.body import body
 from physics.people.clips import own_clips
 from physics.people.figure import LEVELS, RIBBONS
-from physics.people.looks import ALL, look_of
 from physics.people.poses import poses
-from tests.physics.blend import skinned
+from tests.support.blend import skinned
 
 pytestmark = [pytest.mark.engine, pytest.mark.skipif(not available(), reason="no OpenGL here")]
 
@@ -43,7 +44,9 @@ def street(seed: int, count: int = 50) -> People:
     pace = np.where([what == "walk" for what in doing], rng.uniform(0.5, 1.8, count), 0.0)
     names = tuple(sorted(f"c{seed * count + i}" for i in range(count)))
     xy = np.column_stack([far * np.cos(way), far * np.sin(way)])
-    return People.of(names, xy, rng.uniform(-3.0, 3.0, count), pace, tuple(doing), rng.uniform(0.0, 9.0, count))
+    return People.of(
+        names, xy, rng.uniform(-3.0, 3.0, count), pace, tuple(doing), rng.uniform(0.0, 9.0, count)
+    )
 
 
 def flat(xy: Floats) -> Floats:
@@ -51,16 +54,23 @@ def flat(xy: Floats) -> Floats:
 
 
 @contextmanager
-def drawing(crowd: CrowdDrawing, people: People, taken: Shot) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
-    gl, anchor = context(), anchor_of(taken.eye_m)
+def drawing(
+    crowd: CrowdDrawing, people: People, taken: Shot
+) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
+    gl = context()
+    anchor = anchor_of(taken.eye_m)
     crowd.set([PeopleSeen(people, 2.0, flat, shadows=True)], Shots([taken]))
-    blocks, target = SceneBlocks(gl), Target(gl, taken.size)
-    blocks.put(0, camera_matrix(taken, anchor), np.eye(4), taken, anchor, lighting_of(sky_of(NOON, 1)))
+    blocks = SceneBlocks(gl)
+    target = Target(gl, taken.size)
+    blocks.put(
+        0, camera_matrix(taken, anchor), np.eye(4), taken, anchor, lighting_of(sky_of(NOON, 1))
+    )
     blocks.upload()
     blocks.bind()
     target.frame.use()
     gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
-    gl.front_face, gl.depth_func = "cw", "<"
+    gl.front_face = "cw"
+    gl.depth_func = "<"
     target.frame.clear(depth=1.0)
     crowd.draw("colour", shadows=False)
     yield target.read()
@@ -81,12 +91,17 @@ def crowd() -> Iterator[CrowdDrawing]:
         crowd.release()
 
 
-def test_levels_of_detail_keep_the_silhouettes(crowd: CrowdDrawing, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In pictures of busy streets levels of detail change less than 3 % of the silhouettes' pixels."""
+def test_levels_of_detail_keep_the_silhouettes(
+    crowd: CrowdDrawing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In pictures of busy streets levels of detail change less than 3 % of the silhouettes'
+    pixels."""
     taken = shot((0.0, 0.0, 0.6), (10.0, 0.0, 0.6), WIDE, 75.0)
     scenes = [street(seed) for seed in range(4)]
     levelled = [mask(crowd, people, taken) for people in scenes]
-    monkeypatch.setattr(crowds, "levels", lambda shots, whose, xy, z_m: np.zeros(len(xy), dtype=np.intp))
+    monkeypatch.setattr(
+        crowds, "levels", lambda shots, whose, xy, z_m: np.zeros(len(xy), dtype=np.intp)
+    )
     full = [mask(crowd, people, taken) for people in scenes]
     changed = sum(int((a ^ b).sum()) for a, b in zip(levelled, full, strict=True))
     total = sum(int(b.sum()) for b in full)
@@ -98,24 +113,40 @@ def test_levels_of_detail_keep_the_silhouettes(crowd: CrowdDrawing, monkeypatch:
 def test_each_level_is_like_full_detail_where_it_begins(
     crowd: CrowdDrawing, monkeypatch: pytest.MonkeyPatch, level: int
 ) -> None:
-    """At the size at which a level begins it changes less than 3 % of silhouette pixels, ribbons less than 4 %."""
+    """At the size at which a level begins it changes less than 3 % of silhouette pixels, ribbons
+    less than 4 %."""
     far = 1.75 / LEVEL_PX[level - 1] * 0.5 * WIDE[1] / np.tan(np.radians(37.5))
     taken = shot((-1.02 * far, 0.0, 0.6), (0.0, 0.0, 0.6), WIDE, 75.0)
     changed = total = 0
     for i in range(24):
         age = (Age.ADULT, Age.ADULT, Age.CHILD, Age.ELDERLY)[i % 4]
-        people = People.of((f"c{i}",), [[0.0, 0.0]], [1.7 * i], [1.3 * (i % 3 > 0)], ("stand",), [0.37 * i], age=age)
+        people = People.of(
+            (f"c{i}",),
+            [[0.0, 0.0]],
+            [1.7 * i],
+            [1.3 * (i % 3 > 0)],
+            ("stand",),
+            [0.37 * i],
+            age=age,
+        )
         shown = []
         for forced in (level, 0):
-            monkeypatch.setattr(crowds, "levels", lambda shots, whose, xy, z_m, k=forced: np.full(len(xy), k))
+            monkeypatch.setattr(
+                crowds, "levels", lambda shots, whose, xy, z_m, k=forced: np.full(len(xy), k)
+            )
             shown.append(mask(crowd, people, taken))
-        changed, total = changed + int((shown[0] ^ shown[1]).sum()), total + int(shown[1].sum())
-    print(f"level {level}, {LEVEL_PX[level - 1]:.0f} pixels tall: {100 * changed / total:.2f} % changed")
+        changed = changed + int((shown[0] ^ shown[1]).sum())
+        total = total + int(shown[1].sum())
+    print(
+        f"level {level}, {LEVEL_PX[level - 1]:.0f} pixels tall: {100 * changed / total:.2f} "
+        f"% changed"
+    )
     assert changed < (0.04 if level == RIBBONS else 0.03) * total
 
 
 def test_the_card_skins_as_the_reference_does(crowd: CrowdDrawing) -> None:
-    """The outline of a walker near by is that of the mesh skinned by numpy: head, hands and feet where they belong."""
+    """The outline of a walker near by is that of the mesh skinned by numpy: head, hands and feet
+    where they belong."""
     people = People.of(("c3",), [[5.0, 0.0]], [0.8], [1.4], ("walk",), [0.3])
     taken = shot((0.0, 0.0, 1.0), (5.0, 0.0, 1.0), (400, 400), 40.0)
     rows, columns = np.nonzero(mask(crowd, people, taken))
@@ -125,9 +156,12 @@ def test_the_card_skins_as_the_reference_does(crowd: CrowdDrawing) -> None:
     grown = made.vertices + made.normals * (made.fat * who.girth_m)[:, None]
     at = skinned(grown, made.joints, made.weights, pose.matrices(own_clips())[0]) * pose.scale[0]
     cos, sin = np.cos(0.8), np.sin(0.8)
-    world = np.column_stack([cos * at[:, 0] - sin * at[:, 1] + 5.0, sin * at[:, 0] + cos * at[:, 1], at[:, 2]])
+    world = np.column_stack(
+        [cos * at[:, 0] - sin * at[:, 1] + 5.0, sin * at[:, 0] + cos * at[:, 1], at[:, 2]]
+    )
     focal = 200.0 / np.tan(np.radians(20.0))
-    u, v = 200.0 - focal * world[:, 1] / world[:, 0], 200.0 - focal * (world[:, 2] - 1.0) / world[:, 0]
+    u = 200.0 - focal * world[:, 1] / world[:, 0]
+    v = 200.0 - focal * (world[:, 2] - 1.0) / world[:, 0]
     assert (columns.min(), columns.max() + 1) == pytest.approx((u.min(), u.max()), abs=2.0)
     assert (rows.min(), rows.max() + 1) == pytest.approx((v.min(), v.max()), abs=2.0)
 

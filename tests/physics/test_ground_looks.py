@@ -1,4 +1,5 @@
-"""Labels against looks: on every map but generated cities open ground is no sidewalk, and no sidewalk is a road."""
+"""Labels against looks: on every map but generated cities open ground is no sidewalk, and no
+sidewalk is a road."""
 
 from __future__ import annotations
 
@@ -14,22 +15,22 @@ import shapely
 from cosim.core.baked import Arrays
 from cosim.core.geometry import Pose
 from cosim.core.state import LABELS, RobotState, Street
-from cosim.episode.ports import CameraSpec
 from cosim.place.open_ground import GROUND_LOOKS, PLAIN_GROUND, open_ground
 from cosim.place.street_map import LANDS, Feature, StreetMap
 from cosim.report.above import Sheet, draw_streets
+from cosim.spec.camera import CameraSpec
 from physics.cameras.bullet_camera import BulletCamera
 from physics.cameras.gl import context
 from physics.cameras.gl.camera import GlCamera
+from physics.dynamics.world import BulletWorld
+from physics.ground.materials import MATERIALS, PAVINGS, SEEN_AS, friction
+from physics.ground.tiles import SURFACES, Key, build_tile, surface
 from physics.street.covers import covers_in
+from physics.street.street_surface import StreetSurface
+from physics.street.surface import Chunk, Finish, Patch
+from physics.street.tile_cache import covers_as_arrays, covers_of_arrays
 from physics.textures.ground import SURFACE_LAYERS, layer_of
-from physics.world.kept_tiles import covers_as_arrays, covers_of_arrays
-from physics.world.materials import MATERIALS, PAVINGS, SEEN_AS, friction
-from physics.world.street_surface import StreetSurface
-from physics.world.surface import Chunk, Finish, Patch
-from physics.world.tiles import SURFACES, Key, build_tile, surface
-from physics.world.world import BulletWorld
-from tests.tiny_street import KEYS, tiny_map, triangles
+from tests.support.tiny_street import KEYS, tiny_map, triangles
 
 LEAST_DISTANCE = 15.0
 """Between two mean colours in CIELAB: 2.3 can just be told apart side by side."""
@@ -39,8 +40,8 @@ PARK = shapely.box(-200.0, -100.0, 200.0, -8.0)
 
 
 def shown_map() -> StreetMap:
-    """The tiny street with a house at the north-western sidewalk, a parking lot in the north-east, a wood with a pond
-    in the south."""
+    """The tiny street with a house at the north-western sidewalk, a parking lot in the north-east,
+    a wood with a pond in the south."""
     features = (
         Feature("building", -32.0, 12.0, 0.0, 6.0, HOUSE),
         Feature("planting", 0.0, -50.0, polygon=PARK),
@@ -76,9 +77,16 @@ def layers_of(name: str) -> set[str]:
 
 
 def test_sidewalks_roads_and_open_ground_share_no_material_and_no_colour() -> None:
-    """Whatever a sidewalk is paved with, its layers are none of a carriageway's, a verge's or open ground's, and its
-    colour is far from theirs; each look of open ground is in the tables of cameras and of maps."""
-    others = ["road", "crossing", "verge", "ground", *(name for name in PAVINGS if name.startswith("verge:"))]
+    """Whatever a sidewalk is paved with, its layers are none of a carriageway's, a verge's or open
+    ground's, and its colour is far from theirs; each look of open ground is in the tables of
+    cameras and of maps."""
+    others = [
+        "road",
+        "crossing",
+        "verge",
+        "ground",
+        *(name for name in PAVINGS if name.startswith("verge:")),
+    ]
     others += [f"ground:{kind}" for kind in LANDS if kind != PLAIN_GROUND]
     layers = {name: layers_of(name) for name in (*walked(), *others)}
     colours = {name: surface(name)[1] for name in (*walked(), *others)}
@@ -89,14 +97,17 @@ def test_sidewalks_roads_and_open_ground_share_no_material_and_no_colour() -> No
     for one in walked():
         for other in others:
             assert not layers[one] & layers[other], (one, other)
-            assert np.linalg.norm(lab(colours[one]) - lab(colours[other])) >= LEAST_DISTANCE, (one, other)
+            assert np.linalg.norm(lab(colours[one]) - lab(colours[other])) >= LEAST_DISTANCE, (
+                one,
+                other,
+            )
     drawn = [look.drawn for look in GROUND_LOOKS.values()]
     assert len(set(drawn)) == len(drawn)
 
 
 def test_no_tile_shows_ground_as_a_sidewalk_or_a_sidewalk_as_anything_else() -> None:
-    """On every tile of a map, with sidewalks of every material, patches of ground have no layer of a sidewalk, and
-    patches of a sidewalk have one; wheels rub on it as on its material."""
+    """On every tile of a map, with sidewalks of every material, patches of ground have no layer of
+    a sidewalk, and patches of a sidewalk have one; wheels rub on it as on its material."""
     seen = Counter[str]()
     for street, key in itertools.product([StreetSurface(MAP, seed) for seed in (3, 4, 10)], KEYS):
         finish = street.finish(key)
@@ -108,29 +119,39 @@ def test_no_tile_shows_ground_as_a_sidewalk_or_a_sidewalk_as_anything_else() -> 
             seen[patch.name] += len(patch.mesh)
     assert {"ground", "ground:planting", "ground:yard", "ground:water"} <= set(seen)
     materials = {name.split(":")[1] for name in seen if name.startswith("sidewalk:")}
-    assert materials == set(MATERIALS) - {"grass"} and friction("sidewalk:asphalt:0") > friction("sidewalk:concrete:0")
+    assert materials == set(MATERIALS) - {"grass"} and friction("sidewalk:asphalt:0") > friction(
+        "sidewalk:concrete:0"
+    )
 
 
 def test_what_covers_open_ground_hangs_on_land_use_then_on_neighbours() -> None:
-    """A parking lot is a yard and a pond in a wood is water; between a sidewalk and the house behind it lies a bed;
-    nothing overlaps, and the rest is lawn. Generated cities have none of it."""
+    """A parking lot is a yard and a pond in a wood is water; between a sidewalk and the house
+    behind it lies a bed; nothing overlaps, and the rest is lawn. Generated cities have none of
+    it."""
     found = dict(open_ground(MAP, shapely.box(-70.0, -40.0, 70.0, 40.0)))
     assert found["yard"].contains(shapely.Point(20.0, 20.0))
-    pond, wood, bed, lawn = (shapely.Point(*at) for at in ((20, -20), (-20, -20), (-30, 7.2), (50, 12)))
+    pond, wood, bed, lawn = (
+        shapely.Point(*at) for at in ((20, -20), (-20, -20), (-30, 7.2), (50, 12))
+    )
     assert found["water"].contains(pond) and not found["planting"].contains(pond)
     assert found["planting"].contains(wood) and found["soil"].contains(bed)
     assert not any(area.contains(lawn) for area in found.values())
     areas = list(found.values())
     assert sum(area.area for area in areas) == pytest.approx(shapely.union_all(areas).area)
-    assert open_ground(dataclasses.replace(MAP, planned=True), shapely.box(-70.0, -40.0, 70.0, 40.0)) == []
+    assert (
+        open_ground(dataclasses.replace(MAP, planned=True), shapely.box(-70.0, -40.0, 70.0, 40.0))
+        == []
+    )
 
 
 def test_maps_from_above_show_the_same_ground_as_cameras() -> None:
-    """Where a camera sees a yard, water or a bed, pictures from above have the colour of that look, not the lawn's."""
+    """Where a camera sees a yard, water or a bed, pictures from above have the colour of that look,
+    not the lawn's."""
     bounds = (-70.0, -40.0, 70.0, 40.0)
     sheet = Sheet(bounds)
     draw_streets(sheet, MAP, shapely.box(*bounds))
-    street, checked = StreetSurface(MAP, 1), Counter[str]()
+    street = StreetSurface(MAP, 1)
+    checked = Counter[str]()
     for key in KEYS:
         for patch in street.covers(key):
             corners = patch.mesh.vertices[patch.mesh.triangles]
@@ -147,20 +168,25 @@ def test_maps_from_above_show_the_same_ground_as_cameras() -> None:
 
 
 def test_covers_lie_on_the_ground_once_and_are_kept_as_they_are_made() -> None:
-    """A tile's covers do not overlap, lie 3 mm above its ground and within it, with rims or without, and what is read
-    of them is what was made, to the bit."""
+    """A tile's covers do not overlap, lie 3 mm above its ground and within it, with rims or
+    without, and what is read of them is what was made, to the bit."""
     for key in KEYS:
         tile = build_tile(MAP, key)
-        ground = shapely.union_all(shapely.polygons(triangles(tile, "ground")[:, :, :2]), grid_size=1e-6)
+        ground = shapely.union_all(
+            shapely.polygons(triangles(tile, "ground")[:, :, :2]), grid_size=1e-6
+        )
         bare, rimmed = (covers_in(MAP, tile, rims) for rims in (False, True))
         again = covers_of_arrays(covers_as_arrays(bare))
         assert [*again] == [*bare] == [*rimmed]
         flat = []
         for kind, mesh in bare.items():
             for field in ("vertices", "normals", "triangles"):
-                made, read = getattr(mesh, field), getattr(again[kind], field)
+                made = getattr(mesh, field)
+                read = getattr(again[kind], field)
                 assert made.dtype == read.dtype and made.tobytes() == read.tobytes()
-            assert mesh.vertices[:, 2] - tile.height(mesh.vertices[:, :2]) == pytest.approx(0.003, abs=1e-6)
+            assert mesh.vertices[:, 2] - tile.height(mesh.vertices[:, :2]) == pytest.approx(
+                0.003, abs=1e-6
+            )
             assert len(rimmed[kind]) > len(mesh)
             flat += [*shapely.polygons(mesh.vertices[mesh.triangles][:, :, :2])]
         if flat:
@@ -170,7 +196,8 @@ def test_covers_lie_on_the_ground_once_and_are_kept_as_they_are_made() -> None:
 
 
 class Looked(StreetSurface):
-    """A street whose labels are what it looks like: "sidewalk" what has a layer of sidewalks, else "road"."""
+    """A street whose labels are what it looks like: "sidewalk" what has a layer of sidewalks, else
+    "road"."""
 
     def kept(self, kind: str, key: Key, make: object) -> Arrays:
         return make() if kind == "gl" else super().kept(kind, key, make)  # type: ignore[operator,no-any-return,arg-type]
@@ -195,7 +222,9 @@ CAMERAS = [
     pytest.param(
         GlCamera,
         id="gl",
-        marks=pytest.mark.skipif(not context.available(), reason="no OpenGL through EGL here (see `cosim doctor`)"),
+        marks=pytest.mark.skipif(
+            not context.available(), reason="no OpenGL through EGL here (see `cosim doctor`)"
+        ),
     ),
     pytest.param(BulletCamera, id="bullet"),
 ]
@@ -203,12 +232,18 @@ CAMERAS = [
 
 @pytest.mark.engine
 @pytest.mark.parametrize("make", CAMERAS)
-def test_a_camera_shows_walkable_ground_apart_from_all_other(make: type[GlCamera | BulletCamera]) -> None:
-    """In pictures from a sidewalk of asphalt no pixel of open ground looks like a sidewalk, every one of the sidewalk
-    does, and their mean colours are far apart."""
+def test_a_camera_shows_walkable_ground_apart_from_all_other(
+    make: type[GlCamera | BulletCamera],
+) -> None:
+    """In pictures from a sidewalk of asphalt no pixel of open ground looks like a sidewalk, every
+    one of the sidewalk does, and their mean colours are far apart."""
     spec = CameraSpec(96, 72)
     labels, looks = BulletWorld(StreetSurface(MAP, 4)), BulletWorld(Looked(MAP, 4))
-    poses = [Pose(x, y, turn) for x, y in ((-40.0, 5.0), (8.0, 5.0), (40.0, -6.5)) for turn in (-0.7, 0.7)]
+    poses = [
+        Pose(x, y, turn)
+        for x, y in ((-40.0, 5.0), (8.0, 5.0), (40.0, -6.5))
+        for turn in (-0.7, 0.7)
+    ]
     seen = Counter[str]()
     with make(labels, spec) as one, make(looks, spec) as other:
         for pose in poses:
@@ -225,5 +260,8 @@ def test_a_camera_shows_walkable_ground_apart_from_all_other(make: type[GlCamera
                 if (here & near).sum() > 60:
                     means[name] = lab(frame.rgb[here & near] / 255.0).mean(axis=0)
             for name in means.keys() - {"sidewalk"}:
-                assert np.linalg.norm(means["sidewalk"] - means[name]) >= LEAST_DISTANCE, (name, pose)
+                assert np.linalg.norm(means["sidewalk"] - means[name]) >= LEAST_DISTANCE, (
+                    name,
+                    pose,
+                )
     assert min(seen.values()) > 500

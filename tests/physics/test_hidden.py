@@ -10,13 +10,13 @@ import pytest
 
 from cosim.core.geometry import Pose
 from cosim.core.state import LABELS, People, PersonKind, Street
-from cosim.judge.event_monitor import STANDARD_CAMERA, body_points, eye_of, in_picture
+from cosim.results.event_monitor import STANDARD_CAMERA, body_points, eye_of, in_picture
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import Barrier
 from physics.cameras.choice import camera_of
-from physics.world.street_surface import StreetSurface
-from physics.world.world import BulletWorld
-from tests.tiny_street import tiny_map
+from physics.dynamics.world import BulletWorld
+from physics.street.street_surface import StreetSurface
+from tests.support.tiny_street import tiny_map
 
 LOW = Barrier(x_m=-16.0, y_m=5.0, heading_rad=0.0, length_m=3.0, strip="nw", end=0, height_m=0.6)
 """Across the northern sidewalk."""
@@ -33,12 +33,20 @@ LOW = Barrier(x_m=-16.0, y_m=5.0, heading_rad=0.0, length_m=3.0, strip="nw", end
         ((-28.0, 5.0), 0.0, (), False),
         ((-20.0, 22.0), 90.0, (), False),
     ],
-    ids=["free", "behind a low fence", "near", "over the road", "behind the robot", "behind a house"],
+    ids=[
+        "free",
+        "behind a low fence",
+        "near",
+        "over the road",
+        "behind the robot",
+        "behind a house",
+    ],
 )
 def test_who_is_seen_has_pixels_and_who_is_hidden_has_none(
     at: tuple[float, float], heading_deg: float, fences: Sequence[Barrier], shown: bool
 ) -> None:
-    """A tenth of the body unhidden by rays where the standard camera shows it; no ray where it shows nothing."""
+    """A tenth of the body unhidden by rays where the standard camera shows it; no ray where it
+    shows nothing."""
     people = People.of(("e0",), np.array([at]), [math.pi], [0.0], ("stand",), kind=PersonKind.EVENT)
     street = Street(0, people)
     with BulletWorld(StreetSurface(tiny_map(), seed=0), fences) as world:

@@ -1,4 +1,5 @@
-"""The robot on hilly streets: a net with elevations, built by netconvert, under its wheels and through an episode."""
+"""The robot on hilly streets: a net with elevations, built by netconvert, under its wheels and
+through an episode."""
 
 from __future__ import annotations
 
@@ -13,18 +14,18 @@ import pytest
 
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import LABELS, NOBODY, STILL, Command, Street, Vehicles
-from cosim.episode.ports import CameraSpec
 from cosim.place.street_map import StreetMap
-from cosim.policies.route import Route
+from cosim.policies.privileged.route import Route
+from cosim.spec.camera import CameraSpec
 from cosim.spec.scenario import CrowdSpec
 from physics.cameras.bullet_camera import BulletCamera
-from physics.world.street_surface import StreetSurface
-from physics.world.world import BulletWorld
-from scenarios.builders.sample import suite_on_map
-from scenarios.execution.run import run_episode
-from sumo_nets.maps.mapstore import checked_map, import_map
+from physics.dynamics.world import BulletWorld
+from physics.street.street_surface import StreetSurface
+from scenarios.episodes.run_episode import run_episode
+from scenarios.suites.sample import suite_on_map
+from sumo_nets.maps.map_store import checked_map, import_map
+from sumo_nets.net.net_file import read_net
 from sumo_nets.net.netconvert import netconvert
-from sumo_nets.net.netfile import read_net
 
 pytestmark = pytest.mark.engine
 
@@ -41,21 +42,30 @@ EMPTY = Street(0)
 
 
 def hill_net(folder: Path) -> Path:
-    """A hill of 10 %: three streets of 200 m up its side, joined by streets along it, from 0 m to 13 m and level on."""
-    nodes, edges = [], []
+    """A hill of 10 %: three streets of 200 m up its side, joined by streets along it, from 0 m to
+    13 m and level on."""
+    nodes = []
+    edges = []
     for i in range(3):
         for j, (y, z) in enumerate(((0, 0), (80, 6.4), (160, 12.8), (240, 12.8))):
             nodes.append(f'<node id="{i}{j}" x="{90 * i}" y="{y}" z="{z}"/>')
             joined = [(i + 1, j)] * (i < 2) + [(i, j + 1)] * (j < 3)
             edges += [
-                f'<edge id="{i}{j}-{k}{m}" from="{i}{j}" to="{k}{m}" numLanes="1" speed="13"/>' for k, m in joined
+                f'<edge id="{i}{j}-{k}{m}" from="{i}{j}" to="{k}{m}" numLanes="1" speed="13"/>'
+                for k, m in joined
             ]
             edges += [
-                f'<edge id="{k}{m}-{i}{j}" from="{k}{m}" to="{i}{j}" numLanes="1" speed="13"/>' for k, m in joined
+                f'<edge id="{k}{m}-{i}{j}" from="{k}{m}" to="{i}{j}" numLanes="1" speed="13"/>'
+                for k, m in joined
             ]
     (folder / "hill.nod.xml").write_text(f"<nodes>{''.join(nodes)}</nodes>")
     (folder / "hill.edg.xml").write_text(f"<edges>{''.join(edges)}</edges>")
-    options = ["--sidewalks.guess", "--default.sidewalk-width=3", "--crossings.guess", "--walkingareas"]
+    options = [
+        "--sidewalks.guess",
+        "--default.sidewalk-width=3",
+        "--crossings.guess",
+        "--walkingareas",
+    ]
     inputs = ["-n", str(folder / "hill.nod.xml"), "-e", str(folder / "hill.edg.xml")]
     return netconvert([*inputs, *options], folder / "hill.net.xml")
 
@@ -77,21 +87,28 @@ def uphill(hill: StreetMap) -> Polyline:
 
 
 def test_the_hill_is_as_steep_as_it_was_drawn(hill: StreetMap) -> None:
-    """The land under a sidewalk rises by a tenth along it and not across it; every strip may be driven."""
+    """The land under a sidewalk rises by a tenth along it and not across it; every strip may be
+    driven."""
     assert hill.terrain is not None and hill.elevation is not None
     line = uphill(hill)
-    rise = hill.terrain.gradient([line.at(float(s)).xy for s in np.arange(20.0, line.length_m - 20.0)])
+    rise = hill.terrain.gradient(
+        [line.at(float(s)).xy for s in np.arange(20.0, line.length_m - 20.0)]
+    )
     assert rise[:, 1] == pytest.approx(GRADE, abs=0.015)
     assert np.abs(rise[:, 0]).max() < 0.01
     assert (hill.elevation.dropped, hill.elevation.steep, hill.elevation.closed) == ("", (), ())
 
 
 @pytest.mark.parametrize("up", [True, False])
-def test_the_robot_holds_its_speed_up_and_down(hill: StreetMap, world: BulletWorld, up: bool) -> None:
-    """At 1.5 m/s on 10 % it is within 5 % of the command, leans as the street does, and its wheels stay on it."""
+def test_the_robot_holds_its_speed_up_and_down(
+    hill: StreetMap, world: BulletWorld, up: bool
+) -> None:
+    """At 1.5 m/s on 10 % it is within 5 % of the command, leans as the street does, and its wheels
+    stay on it."""
     line = uphill(hill) if up else Polyline(uphill(hill).points[::-1])
     state = world.place(Pose(*line.at(12.0)))
-    start_m, states = state.z_m, []
+    start_m = state.z_m
+    states = []
     for _ in range(400):
         state = world.step(Command(1.5, 0.0), EMPTY, EMPTY, 10).robot
         states.append(state)
@@ -106,7 +123,9 @@ def test_the_robot_holds_its_speed_up_and_down(hill: StreetMap, world: BulletWor
 
 
 @pytest.mark.parametrize("turned_rad", [0.0, math.pi / 2, math.pi])
-def test_the_robot_stands_on_a_slope(hill: StreetMap, world: BulletWorld, turned_rad: float) -> None:
+def test_the_robot_stands_on_a_slope(
+    hill: StreetMap, world: BulletWorld, turned_rad: float
+) -> None:
     """Ten seconds at zero command move it less than a centimetre, whichever way it faces."""
     x, y, heading = uphill(hill).at(30.0)
     start = world.place(Pose(x, y, heading + turned_rad)).pose
@@ -117,7 +136,9 @@ def test_the_robot_stands_on_a_slope(hill: StreetMap, world: BulletWorld, turned
 
 def test_vehicles_are_on_the_slope(hill: StreetMap, world: BulletWorld) -> None:
     """A car ahead on the rising road is seen and stops the robot, metres above the lowest point."""
-    lane = next(lane for lane in hill.lanes.values() if lane.edge == "11-12" and lane.kind == "road")
+    lane = next(
+        lane for lane in hill.lanes.values() if lane.edge == "11-12" and lane.kind == "road"
+    )
     line = Polyline(lane.line)
     car = line.at(30.0)
     street = Street(0, NOBODY, Vehicles.of(("car",), [car[:2]], [car[2]], [0.0], [[4.5, 1.8]]))
@@ -134,7 +155,8 @@ def test_vehicles_are_on_the_slope(hill: StreetMap, world: BulletWorld) -> None:
 
 
 def test_an_episode_on_the_hill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The net is imported and told of, and the expert reaches a goal on it, uphill and down, without a failure."""
+    """The net is imported and told of, and the expert reaches a goal on it, uphill and down,
+    without a failure."""
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
     import_map(hill_net(tmp_path), "hill")
     street_map, check, _ = checked_map("hill")
@@ -143,7 +165,12 @@ def test_an_episode_on_the_hill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     (whole,) = suite_on_map("long-horizon", "hill", 3, 1).scenarios
     way = whole.route[:66]
     scenario = msgspec.structs.replace(
-        whole, route=way, goal=way[-1], events=(), obstacles=(), crowd=CrowdSpec(persons=6, vehicles=2)
+        whole,
+        route=way,
+        goal=way[-1],
+        events=(),
+        obstacles=(),
+        crowd=CrowdSpec(persons=6, vehicles=2),
     )
     heights = street_map.terrain.height(np.array(way))
     top = int(heights.argmax())

@@ -18,12 +18,13 @@ from cosim.place.street_map import StreetMap
 from cosim.place.terrain import Terrain
 from cosim.spec.scenario import City
 from physics.cameras.gl.context import available
-from physics.world import kept_tiles, street_surface
-from physics.world.street_surface import StreetSurface
-from physics.world.tiles import key_at, keys_within, square
-from scenarios.execution.places import place, surface_of_place
+from physics.ground.tiles import key_at, keys_within, square
+from physics.street import street_surface
+from physics.street import tile_cache as kept_tiles
+from physics.street.street_surface import StreetSurface
+from scenarios.places.nets import place, surface_of_place
 from tests.conftest import ROOT
-from tests.scenarios import in_turn
+from tests.support import in_turn
 
 CITY = City(seed=1, size_m=500.0)
 
@@ -54,7 +55,9 @@ def no_more(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def hilly(street_map: StreetMap) -> StreetMap:
     heights = np.random.default_rng(1).uniform(0.0, 3.0, (30, 30)).astype(np.float32)
-    return dataclasses.replace(street_map, terrain=Terrain(-50.0, -50.0, 25.0, heights)).read_of("hilly")
+    return dataclasses.replace(street_map, terrain=Terrain(-50.0, -50.0, 25.0, heights)).read_of(
+        "hilly"
+    )
 
 
 def equal(one: object, other: object) -> bool:
@@ -63,7 +66,11 @@ def equal(one: object, other: object) -> bool:
         return False
     if isinstance(one, np.ndarray):
         assert isinstance(other, np.ndarray)
-        alike = (one.dtype, one.shape, one.flags.c_contiguous) == (other.dtype, other.shape, other.flags.c_contiguous)
+        alike = (one.dtype, one.shape, one.flags.c_contiguous) == (
+            other.dtype,
+            other.shape,
+            other.flags.c_contiguous,
+        )
         return alike and one.tobytes() == other.tobytes()
     if isinstance(one, shapely.Geometry):
         return shapely.to_wkb(one) == shapely.to_wkb(other)
@@ -78,8 +85,11 @@ def equal(one: object, other: object) -> bool:
 
 
 @pytest.mark.parametrize("ground", ["flat", "rough", "hilly"])
-def test_a_tile_that_is_read_is_the_one_that_is_made(cache: Path, monkeypatch: pytest.MonkeyPatch, ground: str) -> None:
-    """Meshes, heights, houses, props and covers: equal to the bit to those of a map of which nothing is kept."""
+def test_a_tile_that_is_read_is_the_one_that_is_made(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, ground: str
+) -> None:
+    """Meshes, heights, houses, props and covers: equal to the bit to those of a map of which
+    nothing is kept."""
     street_map = place(CITY)[1]
     street_map = hilly(street_map) if ground == "hilly" else street_map
     roughness = 0.6 if ground == "rough" else 0.0
@@ -90,9 +100,13 @@ def test_a_tile_that_is_read_is_the_one_that_is_made(cache: Path, monkeypatch: p
     tiles = [made._built(key) for key in keys]
     wanted = [(tile.parts, tile.low, tile.crossings, tile.relief) for tile in tiles]
     chunks, finishes = [made.chunk(key) for key in keys], [made.finish(key) for key in keys]
-    points = [np.random.default_rng(0).uniform(square(key)[:2], square(key)[2:], (300, 2)) for key in keys]
+    points = [
+        np.random.default_rng(0).uniform(square(key)[:2], square(key)[2:], (300, 2)) for key in keys
+    ]
     heights = [tile.height(xy) for tile, xy in zip(tiles, points, strict=True)]
-    assert sum(len(chunk.buildings) for chunk in chunks) and sum(len(chunk.props) for chunk in chunks)
+    assert sum(len(chunk.buildings) for chunk in chunks) and sum(
+        len(chunk.props) for chunk in chunks
+    )
 
     first = StreetSurface(street_map, 3, roughness)
     for key in keys:
@@ -111,7 +125,11 @@ def test_what_is_kept_of_a_place_is_of_that_place_alone(cache: Path) -> None:
     """Another seed, another roughness and a map that was changed do not get what is kept."""
     street_map = place(CITY)[1]
     key = key_at(250.0, 250.0)
-    for surface in (StreetSurface(street_map, 3), StreetSurface(street_map, 4), StreetSurface(street_map, 3, 0.5)):
+    for surface in (
+        StreetSurface(street_map, 3),
+        StreetSurface(street_map, 4),
+        StreetSurface(street_map, 3, 0.5),
+    ):
         surface.tile(key)
     StreetSurface(dataclasses.replace(street_map, lanes={}), 3).tile(key)
     assert len([*(cache / "tiles").iterdir()]) == 3
@@ -120,17 +138,39 @@ def test_what_is_kept_of_a_place_is_of_that_place_alone(cache: Path) -> None:
 def test_a_name_tells_all_that_a_tile_stands_on() -> None:
     """What the sources of tiles import is in their rooms, or in the list of packages."""
     files = [path for room in kept_tiles._ROOMS[2:5] for path in room.rglob("*.py")]
-    bodies = {"bodies.py", "bullet.py", "drive.py", "mesh_surface.py", "gltf.py", "movers.py", "world.py"}
+    bodies = {
+        "bodies.py",
+        "bullet.py",
+        "drive.py",
+        "mesh_surface.py",
+        "gltf.py",
+        "movers.py",
+        "world.py",
+    }
     trees = [ast.parse(path.read_text()) for path in files if path.name not in bodies]
-    names = {node.module or "" for tree in trees for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
-    names |= {a.name for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Import) for a in node.names}
+    names = {
+        node.module or ""
+        for tree in trees
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom)
+    }
+    names |= {
+        a.name
+        for tree in trees
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Import)
+        for a in node.names
+    }
     rooms = {".".join(room.relative_to(ROOT).parts) for room in kept_tiles._ROOMS}
     ours = {name for name in names if name.startswith(("cosim.", "physics."))}
     assert {name for name in ours if not {name, name.rpartition(".")[0]} & rooms} <= {
         "cosim.spec.scenario",
         "cosim.spec.obstacle",
     }
-    tops = {name.partition(".")[0] for name in names - ours} & packages_distributions().keys() - {"cosim", "physics"}
+    tops = {name.partition(".")[0] for name in names - ours} & packages_distributions().keys() - {
+        "cosim",
+        "physics",
+    }
     packages = {package for top in tops for package in packages_distributions()[top]}
     assert packages - {"msgspec"} <= set(baked._MADE_WITH)
 
@@ -140,7 +180,8 @@ def test_a_name_tells_all_that_a_tile_stands_on() -> None:
 def test_an_episode_is_the_same_with_tiles_made_and_with_tiles_read(
     cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """State hash and pictures; the second time no tile is made, and the third time some are, as files are missing."""
+    """State hash and pictures; the second time no tile is made, and the third time some are, as
+    files are missing."""
     scenario, manifest = next(iter(in_turn.drawn()))
     assert manifest.camera is not None
 

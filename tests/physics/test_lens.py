@@ -10,7 +10,7 @@ import pytest
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Pose
 from cosim.core.state import Frame, RobotState
-from cosim.episode.ports import CameraSpec, Lens
+from cosim.spec.camera import CameraSpec, Lens
 from cosim.spec.robot import Mount
 from physics.cameras.lens import drawn, exposure_gain, through
 
@@ -37,7 +37,8 @@ def test_a_default_lens_does_nothing() -> None:
 
 @pytest.mark.parametrize("k1", [-0.1, 0.2])
 def test_distortion_moves_a_point_as_brown_says(k1: float) -> None:
-    """A point 0.5 focal lengths off the axis is seen at 0.5 (1 + k1 / 4); labels and depth go with it, unmixed."""
+    """A point 0.5 focal lengths off the axis is seen at 0.5 (1 + k1 / 4); labels and depth go with
+    it, unmixed."""
     camera = spec(Lens(k1=k1))
     source = drawn(camera)
     at = round(0.5 * source.width + 50 - 0.5)
@@ -60,20 +61,26 @@ def test_a_barrel_is_drawn_wider_and_fills_the_picture() -> None:
     camera = spec(Lens(k1=-0.1))
     source = drawn(camera)
     assert source.width > 200 and source.height > 100 and source.lens == Lens()
-    assert 0.5 * source.height / math.tan(math.radians(0.5 * source.fov_deg)) == pytest.approx(100.0)
+    assert 0.5 * source.height / math.tan(math.radians(0.5 * source.fov_deg)) == pytest.approx(
+        100.0
+    )
     assert drawn(spec(Lens(k1=0.1))).width < 200
     with pytest.raises(SpecError, match="needs a frame of"):
         through(camera, flat(camera, 0), STILL, 0, 0)
 
 
 def test_a_lens_that_folds_is_refused() -> None:
-    """k1 = -0.5 at a wide view has no picture; the message names the terms and the field of view."""
-    with pytest.raises(SpecError, match=r"lens k1 -0\.5, k2 0\.0 fold the picture .* field of view of 53"):
+    """k1 = -0.5 at a wide view has no picture; the message names the terms and the field of
+    view."""
+    with pytest.raises(
+        SpecError, match=r"lens k1 -0\.5, k2 0\.0 fold the picture .* field of view of 53"
+    ):
         drawn(spec(Lens(k1=-0.5)))
 
 
 def test_blur_is_as_long_as_the_turn() -> None:
-    """Turning left by 1 rad/s for 0.06 s smears an upright line over 6 pixels around its place; its light stays."""
+    """Turning left by 1 rad/s for 0.06 s smears an upright line over 6 pixels around its place; its
+    light stays."""
     camera = spec(Lens(shutter_s=0.06))
     frame = flat(camera, 0)
     frame.rgb[:, 99:101] = 255
@@ -88,19 +95,23 @@ def test_blur_is_as_long_as_the_turn() -> None:
 
 
 def test_driving_ahead_blurs_the_ground_and_not_the_horizon() -> None:
-    """At 1 m/s from 0.6 m up, ground seen at y below the axis slides down by y^2 / 0.6 focal lengths a second."""
+    """At 1 m/s from 0.6 m up, ground seen at y below the axis slides down by y^2 / 0.6 focal
+    lengths a second."""
     camera = spec(Lens(readout_s=0.1))
     frame = flat(camera, 0)
     frame.rgb[95] = 255
     seen = through(camera, frame, RobotState(Pose(0.0, 0.0, 0.0), v_mps=1.0), 0, 0)
     # Row 95 is y = 0.455, so 0.345 focal lengths a second; it is read 0.0455 s late.
     row = seen.rgb[:, 100, 0].astype(float)
-    assert (row @ np.arange(100)) / row.sum() == pytest.approx(95.0 + 100.0 * 0.345 * 0.0455, abs=0.4)
+    assert (row @ np.arange(100)) / row.sum() == pytest.approx(
+        95.0 + 100.0 * 0.345 * 0.0455, abs=0.4
+    )
     assert not seen.rgb[:60].any()
 
 
 def test_a_rolling_shutter_leans_an_upright_line() -> None:
-    """Turning left at 1 rad/s with a readout of 0.1 s, the line is 10 pixels further right in the last row."""
+    """Turning left at 1 rad/s with a readout of 0.1 s, the line is 10 pixels further right in the
+    last row."""
     camera = spec(Lens(readout_s=0.1))
     frame = flat(camera, 0)
     frame.rgb[:, 99:101] = 255
@@ -111,13 +122,17 @@ def test_a_rolling_shutter_leans_an_upright_line() -> None:
 
 
 def test_noise_is_that_of_electrons() -> None:
-    """A flat grey of 400 of 1000 electrons with 15 of read noise deviates by sqrt(400 + 225) = 25 electrons."""
+    """A flat grey of 400 of 1000 electrons with 15 of read noise deviates by sqrt(400 + 225) = 25
+    electrons."""
     value = 169  # sRGB 169 is 0.397 linear
     camera = spec(Lens(full_well_e=1000.0, read_noise_e=15.0))
     seen = [
-        through(camera, flat(camera, value), STILL, seed, tick).rgb for seed, tick in ((1, 5), (1, 5), (1, 6), (2, 5))
+        through(camera, flat(camera, value), STILL, seed, tick).rgb
+        for seed, tick in ((1, 5), (1, 5), (1, 6), (2, 5))
     ]
-    light = np.where(seen[0] > 10, ((seen[0] / 255.0 + 0.055) / 1.055) ** 2.4, seen[0] / 255.0 / 12.92)
+    light = np.where(
+        seen[0] > 10, ((seen[0] / 255.0 + 0.055) / 1.055) ** 2.4, seen[0] / 255.0 / 12.92
+    )
     assert light.std() * 1000.0 == pytest.approx(math.sqrt(397.0 + 225.0), rel=0.02)
     assert light.mean() == pytest.approx(0.397, abs=0.002)
     assert np.array_equal(seen[0], seen[1])
@@ -125,15 +140,19 @@ def test_noise_is_that_of_electrons() -> None:
 
 
 def test_auto_exposure_reaches_for_grey_within_its_range() -> None:
-    """A picture of 0.09 is doubled to 0.18, one of 0.02 only doubled with a range of one stop, 0.18 is left alone."""
+    """A picture of 0.09 is doubled to 0.18, one of 0.02 only doubled with a range of one stop, 0.18
+    is left alone."""
     for mean, gain in ((0.09, 2.0), (0.02, 2.0), (0.18, 1.0), (0.9, 0.5)):
         assert exposure_gain(np.full((4, 4, 3), mean), 1.0) == pytest.approx(gain)
     camera = spec(Lens(auto_exposure_ev=2.0))
-    assert through(camera, flat(camera, 85), STILL, 0, 0).rgb[0, 0].tolist() == pytest.approx([118] * 3, abs=1)
+    assert through(camera, flat(camera, 85), STILL, 0, 0).rgb[0, 0].tolist() == pytest.approx(
+        [118] * 3, abs=1
+    )
 
 
 def test_a_vignette_falls_with_the_fourth_power() -> None:
-    """One focal length off the axis, cos^4 of 45 degrees leaves a quarter of the light; the middle keeps all."""
+    """One focal length off the axis, cos^4 of 45 degrees leaves a quarter of the light; the middle
+    keeps all."""
     camera = spec(Lens(vignette=1.0))
     seen = through(camera, flat(camera, 255), STILL, 0, 0).rgb
     assert seen[50, 100, 0] == 255

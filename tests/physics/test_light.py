@@ -12,18 +12,28 @@ from cosim.spec.scenario import City, Light, Scenario, Suite, content_hash, read
 
 def scenario(light: Light) -> Scenario:
     return Scenario(
-        id="s", suite="t", place=City(seed=1), seed=1, start=(0.0, 0.0, 0.0), goal=(9.0, 0.0),
-        route=((0.0, 0.0), (9.0, 0.0)), light=light,
-    )  # fmt: skip
+        id="s",
+        suite="t",
+        place=City(seed=1),
+        seed=1,
+        start=(0.0, 0.0, 0.0),
+        goal=(9.0, 0.0),
+        route=((0.0, 0.0), (9.0, 0.0)),
+        light=light,
+    )
 
 
 @pytest.mark.parametrize(
     ("field", "value", "valid"),
     [
-        ("hour", 24.5, "[0, 24]"), ("day_of_year", 0, "[1, 366]"), ("latitude_deg", float("nan"), "[-90, 90]"),
-        ("cloud_cover", 1.1, "[0, 1]"), ("fog_m", 0.0, "[10, 50000]"), ("exposure_ev", -5.0, "[-4, 4]"),
+        ("hour", 24.5, "[0, 24]"),
+        ("day_of_year", 0, "[1, 366]"),
+        ("latitude_deg", float("nan"), "[-90, 90]"),
+        ("cloud_cover", 1.1, "[0, 1]"),
+        ("fog_m", 0.0, "[10, 50000]"),
+        ("exposure_ev", -5.0, "[-4, 4]"),
     ],
-)  # fmt: skip
+)
 def test_a_light_out_of_range_is_refused(field: str, value: float, valid: str) -> None:
     """The message names the field, the valid range and the value."""
     with pytest.raises(SpecError) as told:
@@ -33,23 +43,30 @@ def test_a_light_out_of_range_is_refused(field: str, value: float, valid: str) -
 
 def test_a_light_with_a_foreign_picture_is_refused() -> None:
     """Only Radiance files are skies of the user's."""
-    with pytest.raises(SpecError, match=r"light hdri must be a Radiance \.hdr file, not 'sky\.exr'"):
+    with pytest.raises(
+        SpecError, match=r"light hdri must be a Radiance \.hdr file, not 'sky\.exr'"
+    ):
         Light(hdri="sky.exr")
 
 
 def test_a_light_is_part_of_a_scenarios_hash() -> None:
     """A dusk has another than a noon, and half an hour later another again."""
-    plain, dusk, later = (scenario(light) for light in (Light(), Light(hour=20.0), Light(hour=20.5)))
+    plain, dusk, later = (
+        scenario(light) for light in (Light(), Light(hour=20.0), Light(hour=20.5))
+    )
     assert len({content_hash(one) for one in (plain, dusk, later)}) == 3
 
 
 def test_light_survives_a_suite_file(tmp_path: Path) -> None:
-    """Read again, each scenario has the light it was written with; a bad one is told with the file and the field."""
+    """Read again, each scenario has the light it was written with; a bad one is told with the file
+    and the field."""
     whole = Suite(name="t", version="1", scenarios=(scenario(Light(hour=20.0, fog_m=80.0)),))
     write_suite(whole, tmp_path / "s.json")
     assert read_suite(tmp_path / "s.json") == whole
     text = (tmp_path / "s.json").read_text()
     assert '"hour":20.0' in text
     (tmp_path / "bad.json").write_text(text.replace('"fog_m":80.0', '"fog_m":-80.0'))
-    with pytest.raises(SpecError, match=r"bad\.json: light fog_m must be in \[10, 50000\], not -80\.0"):
+    with pytest.raises(
+        SpecError, match=r"bad\.json: light fog_m must be in \[10, 50000\], not -80\.0"
+    ):
         read_suite(tmp_path / "bad.json")

@@ -9,25 +9,30 @@ import pytest
 
 from cosim.core.geometry import wrap_angles
 from cosim.core.state import People, Vehicles
-from physics.world.movers import movers_near
+from physics.dynamics.movers import movers_near
 
 REACH_M = 6.0
 
 
 def people(rng: np.random.Generator, ids: list[str], xy: np.ndarray) -> People:
-    return People.of(tuple(ids), xy, rng.uniform(-4.0, 4.0, len(ids)), np.zeros(len(ids)), ("walk",) * len(ids))
+    return People.of(
+        tuple(ids), xy, rng.uniform(-4.0, 4.0, len(ids)), np.zeros(len(ids)), ("walk",) * len(ids)
+    )
 
 
 @pytest.mark.parametrize("who_changes", [True, False], ids=["some come and go", "all stay"])
 def test_who_comes_near_is_who_is_near_at_either_end_of_the_tick(who_changes: bool) -> None:
-    """Found as by looking at everybody: who is new, or has jumped, is at the new place all the time."""
+    """Found as by looking at everybody: who is new, or has jumped, is at the new place all the
+    time."""
     rng = np.random.default_rng(3)
     seen = 0
     for _ in range(200):
         names = [f"p{k}" for k in range(40)]
         before = people(rng, names, rng.uniform(-15.0, 15.0, (40, 2)))
         kept = list(rng.permutation(40)[:30]) if who_changes else range(40)
-        moved = before.xy[kept] + rng.normal(0.0, 1.0, (len(kept), 2)) * rng.choice([0.1, 8.0], (len(kept), 1))
+        moved = before.xy[kept] + rng.normal(0.0, 1.0, (len(kept), 2)) * rng.choice(
+            [0.1, 8.0], (len(kept), 1)
+        )
         new = rng.uniform(-15.0, 15.0, (5, 2)) if who_changes else np.zeros((0, 2))
         ids = [names[k] for k in kept] + [f"new{k}" for k in range(len(new))]
         after = people(rng, ids, np.concatenate([moved, new]))
@@ -55,8 +60,12 @@ def test_who_comes_near_is_who_is_near_at_either_end_of_the_tick(who_changes: bo
 
 def test_a_vehicle_has_its_own_size() -> None:
     """Of its row in the later snapshot, whatever the order was before."""
-    before = Vehicles.of(("a", "b"), [[0.0, 0.0], [1.0, 0.0]], [0.0, 0.0], [0.0, 0.0], [[4.0, 1.8], [12.0, 2.5]])
-    after = Vehicles.of(("b", "a"), [[1.0, 0.5], [0.0, 0.0]], [0.0, 0.0], [0.0, 0.0], [[12.0, 2.5], [4.0, 1.8]])
+    before = Vehicles.of(
+        ("a", "b"), [[0.0, 0.0], [1.0, 0.0]], [0.0, 0.0], [0.0, 0.0], [[4.0, 1.8], [12.0, 2.5]]
+    )
+    after = Vehicles.of(
+        ("b", "a"), [[1.0, 0.5], [0.0, 0.0]], [0.0, 0.0], [0.0, 0.0], [[12.0, 2.5], [4.0, 1.8]]
+    )
     bus, car = movers_near(before, after, 0.0, 0.0, 10.0)
     assert (bus.id, bus.size_m, car.size_m) == ("b", (12.0, 2.5), (4.0, 1.8))
     assert bus.way(2) == [(1.0, 0.25, 0.0), (1.0, 0.5, 0.0)]

@@ -1,4 +1,5 @@
-"""Obstacles of a scenario in the world and in pictures: what is bumped into, what is seen, what is exported."""
+"""Obstacles of a scenario in the world and in pictures: what is bumped into, what is seen, what is
+exported."""
 
 from __future__ import annotations
 
@@ -13,16 +14,17 @@ import trimesh
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Pose
 from cosim.core.state import LABELS, Command, Street
-from cosim.episode.ports import Camera, CameraSpec
+from cosim.episode.interfaces import Camera
+from cosim.spec.camera import CameraSpec
 from cosim.spec.obstacle import OBSTACLE_FORMS, OBSTACLE_SIZES_M, Obstacle, footprint
 from physics.cameras.bullet_camera import BulletCamera
 from physics.cameras.gl.camera import GlCamera
+from physics.dynamics.world import BulletWorld
+from physics.ground.tiles import key_at
 from physics.street.furniture import footprints, obstacle_prop
-from physics.world.gltf import as_gltf
-from physics.world.street_surface import StreetSurface
-from physics.world.tiles import key_at
-from physics.world.world import BulletWorld
-from tests.tiny_street import tiny_map
+from physics.street.gltf import as_gltf
+from physics.street.street_surface import StreetSurface
+from tests.support.tiny_street import tiny_map
 
 MAP = tiny_map()
 KINDS = sorted(OBSTACLE_SIZES_M)
@@ -32,17 +34,25 @@ START = Pose(-40.0, 5.0, 0.0)
 def ahead(kind: str, far_m: float = 3.0, form: int = 1) -> Obstacle:
     """In front of a robot at START, its wider side towards it."""
     turned_rad = 0.0 if kind == "sign" else math.pi / 2
-    return Obstacle(kind=kind, x_m=START.x_m + far_m, y_m=START.y_m, heading_rad=turned_rad, form=form)
+    return Obstacle(
+        kind=kind, x_m=START.x_m + far_m, y_m=START.y_m, heading_rad=turned_rad, form=form
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_outline_is_that_of_the_body(kind: str) -> None:
-    """The ground that the spec says an obstacle covers is the ground that physics gives it, turned as it is."""
+    """The ground that the spec says an obstacle covers is the ground that physics gives it, turned
+    as it is."""
     for form in range(OBSTACLE_FORMS):
         one = Obstacle(kind=kind, x_m=3.0, y_m=-2.0, heading_rad=0.7, form=form)
         (ground,) = footprints([obstacle_prop(one, 0)])
-        assert ground.equals_exact(footprint(one), 1e-9) or ground.symmetric_difference(footprint(one)).area < 1e-9
-        assert footprint(one, 0.1).area > footprint(one).area == pytest.approx(np.prod(one.size_m[:2]))
+        assert (
+            ground.equals_exact(footprint(one), 1e-9)
+            or ground.symmetric_difference(footprint(one)).area < 1e-9
+        )
+        assert (
+            footprint(one, 0.1).area > footprint(one).area == pytest.approx(np.prod(one.size_m[:2]))
+        )
 
 
 def test_what_cannot_be_an_obstacle_is_refused() -> None:
@@ -71,8 +81,11 @@ def test_a_robot_that_drives_into_an_obstacle_touches_it(kind: str) -> None:
 @pytest.mark.engine
 @pytest.mark.parametrize("make", [GlCamera, BulletCamera], ids=["gl", "bullet"])
 def test_an_obstacle_is_seen_where_it_stands(make: type[Camera]) -> None:
-    """Each kind covers pixels labelled as a prop in the middle of the picture, and none without it."""
-    surface, spec, street = StreetSurface(MAP, seed=1), CameraSpec(96, 96), Street(0)
+    """Each kind covers pixels labelled as a prop in the middle of the picture, and none without
+    it."""
+    surface = StreetSurface(MAP, seed=1)
+    spec = CameraSpec(96, 96)
+    street = Street(0)
     for kind in (None, *KINDS):
         world = BulletWorld(surface, obstacles=[] if kind is None else [ahead(kind)])
         with world, make(world, spec) as camera:  # type: ignore[call-arg]
@@ -83,12 +96,15 @@ def test_an_obstacle_is_seen_where_it_stands(make: type[Camera]) -> None:
 
 def test_obstacles_are_exported_by_their_names(tmp_path: Path) -> None:
     """A .glb holds each of them where it stands, under a node named by its kind."""
-    surface, path = StreetSurface(MAP, seed=1), tmp_path / "street.glb"
+    surface = StreetSurface(MAP, seed=1)
+    path = tmp_path / "street.glb"
     those = [ahead(kind, 3.0 + 3.0 * k) for k, kind in enumerate(KINDS)]
     path.write_bytes(as_gltf(surface, [key_at(*START.xy)], obstacles=those))
     scene = trimesh.load_scene(path)
     for one in those:
-        parts = [mesh for name, mesh in scene.geometry.items() if name.startswith(f"obstacle:{one.kind}")]
+        parts = [
+            mesh for name, mesh in scene.geometry.items() if name.startswith(f"obstacle:{one.kind}")
+        ]
         corners = np.concatenate([mesh.vertices for mesh in parts])
         ground = shapely.MultiPoint(np.column_stack([corners[:, 0], -corners[:, 2]])).convex_hull
         assert footprint(one, 0.03).covers(ground) and corners[:, 1].max() > 0.4

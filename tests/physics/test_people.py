@@ -14,6 +14,7 @@ from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats
 from cosim.core.state import PERSON_RADIUS_M, Age, People
 from cosim.people.gait import PACES_MPS, STRIDES_M, Strides, first_stride, stature_m, stride_m
+from physics.people.appearance import ALL, family_of, look_of
 from physics.people.body import COATS, SkinnedBody, body, far_body
 from physics.people.captures import capture, read_capture
 from physics.people.clips import own_clips
@@ -21,11 +22,10 @@ from physics.people.families import FAMILIES, skeleton
 from physics.people.figure import LEVELS, MESH_LEVELS
 from physics.people.gaits import CYCLE_FRAMES, gait
 from physics.people.gestures import SEAT_M, SEATED_BACK_M
-from physics.people.looks import ALL, family_of, look_of
 from physics.people.parts import RIGID_PARTS, part_colours, part_meshes, placed_parts
 from physics.people.poses import poses
 from physics.people.skeleton import INDEX, JOINTS, MIRRORED, PARENTS, axis_angle, forward, rodrigues
-from tests.physics.blend import skinned
+from tests.support.blend import skinned
 
 ROOT = Path(__file__).parents[2]
 FORMS = [(outfit, level) for outfit in range(len(ALL)) for level in range(MESH_LEVELS)]
@@ -43,14 +43,23 @@ def posed(made: SkinnedBody, row: int) -> Floats:
 def test_the_joints_are_smpls() -> None:
     """24 joints in SMPL's order, each after its parent, each side the other's mirror."""
     assert len(JOINTS) == len(PARENTS) == 24
-    assert (JOINTS[0], JOINTS[15], JOINTS[20], JOINTS[23]) == ("pelvis", "head", "left_wrist", "right_hand")
+    assert (JOINTS[0], JOINTS[15], JOINTS[20], JOINTS[23]) == (
+        "pelvis",
+        "head",
+        "left_wrist",
+        "right_hand",
+    )
     assert all(parent < k for k, parent in enumerate(PARENTS))
-    assert all(JOINTS[MIRRORED[k]] == name.replace("left", "#").replace("right", "left").replace("#", "right")
-               for k, name in enumerate(JOINTS))  # fmt: skip
+    assert all(
+        JOINTS[MIRRORED[k]]
+        == name.replace("left", "#").replace("right", "left").replace("#", "right")
+        for k, name in enumerate(JOINTS)
+    )
 
 
 def test_forward_kinematics_of_a_bent_elbow() -> None:
-    """A left elbow bent by a right angle from the T puts the wrist straight ahead of it; all else stays."""
+    """A left elbow bent by a right angle from the T puts the wrist straight ahead of it; all else
+    stays."""
     man = skeleton("man")
     turns = np.tile(np.eye(3), (1, 24, 1, 1))
     turns[0, INDEX["left_elbow"]] = rodrigues([0.0, 0.0, -0.5 * np.pi])
@@ -70,7 +79,8 @@ def test_axis_angles_come_back() -> None:
 
 @pytest.mark.parametrize(("outfit", "level"), FORMS)
 def test_bodies_are_closed_and_weighted(outfit: int, level: int) -> None:
-    """Every edge has two triangles in opposite directions; weights fall and sum to 1; normals are unit vectors."""
+    """Every edge has two triangles in opposite directions; weights fall and sum to 1; normals are
+    unit vectors."""
     made = body(ALL[outfit], level)
     assert sewn(made.triangles) == (True, True)
     assert made.weights.sum(axis=1) == pytest.approx(1.0, abs=1e-6)
@@ -80,7 +90,8 @@ def test_bodies_are_closed_and_weighted(outfit: int, level: int) -> None:
 
 
 def test_bodies_stand_on_the_ground_at_their_stature() -> None:
-    """As modelled, soles are at 0 and the top of the head within 6 cm of the family's stature, hair and cap apart."""
+    """As modelled, soles are at 0 and the top of the head within 6 cm of the family's stature, hair
+    and cap apart."""
     for outfit in ALL:
         made = body(outfit, 0)
         skin = made.vertices[made.coat == COATS.index("skin")]
@@ -96,8 +107,8 @@ def sewn(triangles: np.ndarray) -> tuple[bool, bool]:  # type: ignore[type-arg]
 
 
 def test_far_bodies_are_sewn_and_small() -> None:
-    """Each level has at most 0.7 times the triangles of the one before, the coarsest below 400; what is turned to the
-    eye is open behind, what is not is closed."""
+    """Each level has at most 0.7 times the triangles of the one before, the coarsest below 400;
+    what is turned to the eye is open behind, what is not is closed."""
     for outfit in ALL:
         counts = [len(body(outfit, level).triangles) for level in range(MESH_LEVELS)]
         for level in range(MESH_LEVELS, LEVELS):
@@ -113,7 +124,8 @@ def test_far_bodies_are_sewn_and_small() -> None:
 
 
 def test_soles_touch_the_ground_in_stance() -> None:
-    """In every frame of every walk, and of every gesture, the lowest point of the body is within 2 cm of the ground."""
+    """In every frame of every walk, and of every gesture, the lowest point of the body is within 2
+    cm of the ground."""
     clips = own_clips()
     for k, family in enumerate(FAMILIES):
         made = body(next(outfit for outfit in ALL if outfit.family == family), 1)
@@ -122,14 +134,17 @@ def test_soles_touch_the_ground_in_stance() -> None:
             for first, pace in zip(clips.gaits[k], PACES_MPS, strict=True)
             if pace < 2
         ]
-        rows = np.concatenate([*walks, *(first[k : k + 1] + 8 for first in clips.gestures.values())])
+        rows = np.concatenate(
+            [*walks, *(first[k : k + 1] + 8 for first in clips.gestures.values())]
+        )
         for row in rows.tolist():
             assert abs(posed(made, row)[:, 2].min()) < 0.02, (family, row)
 
 
 @pytest.mark.parametrize("pace", [0.4, 0.8, 1.2, 1.4, 1.7, 1.9])
 def test_feet_do_not_slide(pace: float) -> None:
-    """While the ball of a foot is down it drifts by less than 1 cm per step, at baked paces and between."""
+    """While the ball of a foot is down it drifts by less than 1 cm per step, at baked paces and
+    between."""
     people = People.of(("c1",), [[0.0, 0.0]], [0.0], [pace], ("walk",))
     clips = own_clips()
     length = float(stride_m(pace, stature_m("c1", Age.ADULT)))
@@ -137,11 +152,18 @@ def test_feet_do_not_slide(pace: float) -> None:
     ball = skeleton(family_of("c1", Age.ADULT)).rest_m[INDEX["left_foot"]]
     at = []
     for phase in phases:
-        pose = poses(People.of(people.ids, people.xy, people.heading, people.speed, people.doing, [phase]), 0.0, clips)
+        pose = poses(
+            People.of(people.ids, people.xy, people.heading, people.speed, people.doing, [phase]),
+            0.0,
+            clips,
+        )
         matrix = pose.matrices(clips)[0, INDEX["left_foot"]].astype(float) * pose.scale[0]
         at.append(matrix[:, :3] @ ball + matrix[:, 3] + (phase * length, 0.0, 0.0))
     drift = np.ptp(np.array(at), axis=0)
-    print(f"pace {pace}: ball of the foot drifts {1000 * drift[0]:.1f} mm ahead, {1000 * drift[2]:.1f} mm up")
+    print(
+        f"pace {pace}: ball of the foot drifts {1000 * drift[0]:.1f} mm ahead, "
+        f"{1000 * drift[2]:.1f} mm up"
+    )
     assert drift[0] < 0.01 and drift[1] < 0.01 and drift[2] < 0.02
 
 
@@ -155,21 +177,27 @@ def test_gaits_are_loops() -> None:
 
 
 def test_the_stopping_hand_is_held_out() -> None:
-    """The right hand is more than half a metre ahead of the shoulder, at least as high, its palm ahead, fingers up."""
+    """The right hand is more than half a metre ahead of the shoulder, at least as high, its palm
+    ahead, fingers up."""
     clips = own_clips()
     for k, family in enumerate(FAMILIES):
         matrix = clips.matrices[clips.gestures["stop"][k]].astype(float)
-        rest, f = skeleton(family).rest_m, skeleton(family).height_m / 1.75
+        rest = skeleton(family).rest_m
+        f = skeleton(family).height_m / 1.75
         made = body(next(outfit for outfit in ALL if outfit.family == family), 0)
         hand = made.vertices[(made.joints[:, 0] == INDEX["right_hand"]) & (made.coat == 0)]
         shown = hand @ matrix[INDEX["right_hand"], :, :3].T + matrix[INDEX["right_hand"], :, 3]
-        assert shown[:, 0].min() > 0.5 * f and shown[:, 2].min() > rest[INDEX["right_shoulder"], 2] - 0.06
+        assert (
+            shown[:, 0].min() > 0.5 * f
+            and shown[:, 2].min() > rest[INDEX["right_shoulder"], 2] - 0.06
+        )
         assert np.ptp(shown[:, 2]) > 3.0 * np.ptp(shown[:, 0])
         assert shown[:, 1].max() < -0.15 * f
 
 
 def test_who_sits_has_the_hips_on_the_seat_and_the_feet_before_it() -> None:
-    """Of all families but children: hips behind the place on a seat, thighs level, feet at the place and flat."""
+    """Of all families but children: hips behind the place on a seat, thighs level, feet at the
+    place and flat."""
     clips = own_clips()
     for k, family in enumerate(FAMILIES):
         if family == "child":
@@ -179,43 +207,59 @@ def test_who_sits_has_the_hips_on_the_seat_and_the_feet_before_it() -> None:
         at = {n: matrix[INDEX[n], :, :3] @ rest[INDEX[n]] + matrix[INDEX[n], :, 3] for n in JOINTS}
         assert at["left_hip"][0] == pytest.approx(-SEATED_BACK_M, abs=0.03)
         assert 0.0 < at["left_hip"][2] - SEAT_M < 0.12
-        assert at["left_knee"][0] - at["left_hip"][0] > 0.3 and abs(at["left_knee"][2] - at["left_hip"][2]) < 0.12
+        assert (
+            at["left_knee"][0] - at["left_hip"][0] > 0.3
+            and abs(at["left_knee"][2] - at["left_hip"][2]) < 0.12
+        )
         assert -PERSON_RADIUS_M < at["left_ankle"][0] < PERSON_RADIUS_M
         assert at["left_ankle"][2] == pytest.approx(rest[INDEX["left_ankle"], 2], abs=0.02)
 
 
 def test_talkers_speak_and_listen() -> None:
-    """Who talks has the hands up for about half of the time, and never so far ahead that they would touch those of
-    somebody 1 m away."""
+    """Who talks has the hands up for about half of the time, and never so far ahead that they would
+    touch those of somebody 1 m away."""
     clips = own_clips()
     for k, family in enumerate(FAMILIES):
         height_m = skeleton(family).height_m
         made = body(next(outfit for outfit in ALL if outfit.family == family), 1)
         hands = np.isin(made.joints[:, 0], [INDEX["left_hand"], INDEX["right_hand"]])
-        shown = [posed(made, int(clips.gestures["talk"][k]) + frame)[hands] for frame in range(0, clips.loop_frames, 4)]
+        shown = [
+            posed(made, int(clips.gestures["talk"][k]) + frame)[hands]
+            for frame in range(0, clips.loop_frames, 4)
+        ]
         assert max(float(hand[:, 0].max()) for hand in shown) < 0.5
         up = np.array([hand[:, 2].max() > 0.67 * height_m for hand in shown])
         assert 0.35 < up.mean() < 0.65
 
 
 def test_looks_hang_on_name_and_age_alone() -> None:
-    """The same name looks the same in another process, another seed dresses it anew at the same stature."""
+    """The same name looks the same in another process, another seed dresses it anew at the same
+    stature."""
     names = [(f"c{i}", i % 3) for i in range(60)]
     code = (
-        f"from physics.people.looks import look_of\n"
+        f"from physics.people.appearance import look_of\n"
         f"for n in {names!r}: w = look_of(*n); print(w.outfit, w.colours.tolist())"
     )
-    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert said.stdout.splitlines() == [f"{look_of(*n).outfit} {look_of(*n).colours.tolist()}" for n in names]
+    said = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT
+    )
+    assert said.stdout.splitlines() == [
+        f"{look_of(*n).outfit} {look_of(*n).colours.tolist()}" for n in names
+    ]
     assert len({look_of(*n).outfit for n in names}) > 12
     assert len({look_of(*n).colours.tobytes() for n in names}) == 60
-    assert sum(look_of(*n, 7).colours.tobytes() != look_of(*n).colours.tobytes() for n in names) == 60
+    assert (
+        sum(look_of(*n, 7).colours.tobytes() != look_of(*n).colours.tobytes() for n in names) == 60
+    )
 
 
 def test_statures_are_of_all_ages() -> None:
-    """Of a thousand names each is a child, an adult or an elder, as is asked; adults are 1.4 to 2 m tall."""
+    """Of a thousand names each is a child, an adult or an elder, as is asked; adults are 1.4 to 2 m
+    tall."""
     names = [f"c{i}" for i in range(1000)]
-    children, grown, old = ([stature_m(name, age) for name in names] for age in (Age.CHILD, Age.ADULT, Age.ELDERLY))
+    children, grown, old = (
+        [stature_m(name, age) for name in names] for age in (Age.CHILD, Age.ADULT, Age.ELDERLY)
+    )
     assert {family_of(name, Age.CHILD) for name in names} == {"child"}
     assert {family_of(name, Age.ADULT) for name in names} == {"man", "woman"}
     assert {family_of(name, Age.ELDERLY) for name in names} == {"elder"}
@@ -224,31 +268,43 @@ def test_statures_are_of_all_ages() -> None:
 
 
 def test_strides_follow_the_way_walked() -> None:
-    """Ten metres at the reference pace are ten metres over the stride; who stands counts none; who jumps neither."""
+    """Ten metres at the reference pace are ten metres over the stride; who stands counts none; who
+    jumps neither."""
     strides = Strides(0.05)
     start = first_stride("c1")
     for k in range(201):
-        count, pace = strides.update(("c1",), np.array([[0.05 * k, 0.0]]), np.array([1.0]), [Age.ADULT])
-    assert count[0] - start == pytest.approx(10.0 / float(stride_m(1.0, stature_m("c1", Age.ADULT))), rel=1e-6)
+        count, pace = strides.update(
+            ("c1",), np.array([[0.05 * k, 0.0]]), np.array([1.0]), [Age.ADULT]
+        )
+    assert count[0] - start == pytest.approx(
+        10.0 / float(stride_m(1.0, stature_m("c1", Age.ADULT))), rel=1e-6
+    )
     assert pace[0] == 1.0
     still, pace = strides.update(("c1",), np.array([[10.0, 0.0]]), np.array([0.0]), [Age.ADULT])
     assert still[0] == count[0] and 0.0 < pace[0] < 1.0
-    assert strides.update(("c1",), np.array([[50.0, 0.0]]), np.array([0.0]), [Age.ADULT])[0][0] == count[0]
+    assert (
+        strides.update(("c1",), np.array([[50.0, 0.0]]), np.array([0.0]), [Age.ADULT])[0][0]
+        == count[0]
+    )
     assert stride_m(1.4, 1.75) == pytest.approx(STRIDES_M[PACES_MPS.index(1.4)])
 
 
 def test_starting_is_smooth() -> None:
-    """From standing to walking no joint's matrix changes by more than a little from one tick to the next."""
-    clips, strides = own_clips(), Strides(0.05)
-    x, before, largest = 0.0, None, 0.0
+    """From standing to walking no joint's matrix changes by more than a little from one tick to the
+    next."""
+    clips = own_clips()
+    strides = Strides(0.05)
+    x = 0.0
+    before = None
+    largest = 0.0
     for k in range(60):
         speed = 0.0 if k < 10 or k >= 40 else 1.3
         x += 0.05 * speed
         count, pace = strides.update(("c1",), np.array([[x, 0.0]]), np.array([speed]), [Age.ADULT])
         doing = "walk" if speed else "stand"
-        now = poses(People.of(("c1",), [[x, 0.0]], [0.0], [speed], (doing,), count, pace), 0.05 * k, clips).matrices(
-            clips
-        )
+        now = poses(
+            People.of(("c1",), [[x, 0.0]], [0.0], [speed], (doing,), count, pace), 0.05 * k, clips
+        ).matrices(clips)
         if before is not None:
             largest = max(largest, float(np.abs(now[..., :3] - before[..., :3]).max()))
         before = now
@@ -270,13 +326,20 @@ def test_rigid_parts_follow_the_joints() -> None:
     """Thirteen parts per person; the hand of the stopping arm is where the skinned one is."""
     people = People.of(("e1",), [[3.0, 4.0]], [0.0], [0.0], ("stop",))
     parts = placed_parts(people, np.array([0.5]), 0.0)
-    assert parts.at_m.shape == (1, len(RIGID_PARTS), 3) and len(part_colours("e1", Age.ADULT)) == len(RIGID_PARTS) == 13
+    assert (
+        parts.at_m.shape == (1, len(RIGID_PARTS), 3)
+        and len(part_colours("e1", Age.ADULT)) == len(RIGID_PARTS) == 13
+    )
     assert np.linalg.norm(parts.turn, axis=-1) == pytest.approx(1.0)
     family = family_of("e1", Age.ADULT)
     wrist = [joint for joint, _ in RIGID_PARTS].index("right_wrist")
     x, y, z, w = parts.turn[0, wrist]
     mesh = part_meshes(family)[wrist].vertices
-    turned = mesh + 2.0 * np.cross((x, y, z), np.cross((x, y, z), mesh) + w * mesh) + parts.at_m[0, wrist]
+    turned = (
+        mesh
+        + 2.0 * np.cross((x, y, z), np.cross((x, y, z), mesh) + w * mesh)
+        + parts.at_m[0, wrist]
+    )
     assert turned[:, 0].max() > 3.5 and turned[:, 2].max() > 0.5 + 0.75 * stature_m("e1", Age.ADULT)
     assert sum(len(mesh) for mesh in part_meshes(family)) < 320
 

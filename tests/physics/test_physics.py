@@ -11,16 +11,26 @@ import pytest
 
 from cosim.core.errors import EngineError, UsageError
 from cosim.core.geometry import Pose
-from cosim.core.state import LABELS, Command, Frame, Motion, People, RobotState, Signal, Street, Vehicles
-from cosim.episode.ports import CameraSpec
+from cosim.core.state import (
+    LABELS,
+    Command,
+    Frame,
+    Motion,
+    People,
+    RobotState,
+    Signal,
+    Street,
+    Vehicles,
+)
+from cosim.spec.camera import CameraSpec
 from cosim.spec.robot import ROBOTS, robot_called
 from cosim.spec.scenario import Barrier
 from physics.cameras.bullet_camera import BulletCamera
+from physics.dynamics.bullet import p
+from physics.dynamics.world import BulletWorld
 from physics.robots import urdf_of
-from physics.world.bullet import p
-from physics.world.street_surface import StreetSurface
-from physics.world.world import BulletWorld
-from tests.tiny_street import tiny_map
+from physics.street.street_surface import StreetSurface
+from tests.support.tiny_street import tiny_map
 
 MAP = tiny_map()
 
@@ -35,7 +45,9 @@ def world() -> Iterator[BulletWorld]:
         yield world
 
 
-def drive(world: BulletWorld, v_mps: float, w_radps: float, ticks: int, street: Street = EMPTY) -> list[Motion]:
+def drive(
+    world: BulletWorld, v_mps: float, w_radps: float, ticks: int, street: Street = EMPTY
+) -> list[Motion]:
     return [world.step(Command(v_mps, w_radps), street, street, 10) for _ in range(ticks)]
 
 
@@ -45,9 +57,12 @@ def person(x_m: float, y_m: float, heading_rad: float = 0.0, name: str = "c1") -
 
 @pytest.mark.engine
 @pytest.mark.parametrize(
-    ("v_mps", "w_radps"), [(0.5, 0.0), (1.0, 0.3), (2.5, 0.0), (2.5, 0.65), (0.0, 0.65), (0.0, -0.2), (-0.5, 0.0)]
+    ("v_mps", "w_radps"),
+    [(0.5, 0.0), (1.0, 0.3), (2.5, 0.0), (2.5, 0.65), (0.0, 0.65), (0.0, -0.2), (-0.5, 0.0)],
 )
-def test_the_robot_reaches_the_commanded_speeds(world: BulletWorld, v_mps: float, w_radps: float) -> None:
+def test_the_robot_reaches_the_commanded_speeds(
+    world: BulletWorld, v_mps: float, w_radps: float
+) -> None:
     """Mean speed and yaw rate come within 5 % of the command, and the robot stays upright."""
     world.place(OPEN)
     drive(world, v_mps, w_radps, 50)
@@ -88,7 +103,8 @@ def test_the_robot_climbs_the_curb_ramp(world: BulletWorld) -> None:
 
 @pytest.mark.engine
 def test_the_robot_does_not_climb_a_curb(world: BulletWorld) -> None:
-    """Driven at a full curb it stays on the road, and the curb is ground: no contact is reported."""
+    """Driven at a full curb it stays on the road, and the curb is ground: no contact is
+    reported."""
     world.place(Pose(-20.0, 1.0, math.pi / 2))
     motions = drive(world, 1.0, 0.0, 100)
     assert motions[-1].robot.z_m < 0.02
@@ -119,7 +135,8 @@ def test_a_person_blocks_the_robot_and_is_named(world: BulletWorld) -> None:
 
 @pytest.mark.engine
 def test_a_walking_person_is_met_within_the_tick(world: BulletWorld) -> None:
-    """A person who passes over the robot between two snapshots touches it at the substep of the overlap."""
+    """A person who passes over the robot between two snapshots touches it at the substep of the
+    overlap."""
     world.place(Pose(-20.0, 5.0, 0.0))
     motion = world.step(Command(0.0, 0.0), person(-19.0, 5.0), person(-21.0, 5.0), 10)
     substeps = [c.substep for c in motion.contacts if c.other == "c1"]
@@ -129,23 +146,31 @@ def test_a_walking_person_is_met_within_the_tick(world: BulletWorld) -> None:
 
 @pytest.mark.engine
 def test_who_cannot_be_touched_changes_nothing() -> None:
-    """With people and a vehicle some two metres beside its way the robot goes, to the bit, as in an empty street."""
-    crowd = People.of(("c1", "c2"), [[-18.0, 7.2], [-16.0, 2.8]], [0.0, 1.0], [0.0, 0.0], ("stand", "stand"))
+    """With people and a vehicle some two metres beside its way the robot goes, to the bit, as in an
+    empty street."""
+    crowd = People.of(
+        ("c1", "c2"), [[-18.0, 7.2], [-16.0, 2.8]], [0.0, 1.0], [0.0, 0.0], ("stand", "stand")
+    )
     cars = Vehicles.of(("v1",), [[-17.0, -1.0]], [0.0], [0.0], [[4.5, 1.8]])
     ways = []
     for street in (EMPTY, Street(0, people=crowd, vehicles=cars)):
         with BulletWorld(StreetSurface(MAP, seed=1)) as world:
             world.place(Pose(-20.0, 5.0, 0.0))
-            ways.append(b"".join(motion.trace.tobytes() for motion in drive(world, 1.0, 0.1, 60, street)))
+            ways.append(
+                b"".join(motion.trace.tobytes() for motion in drive(world, 1.0, 0.1, 60, street))
+            )
     assert ways[0] == ways[1]
 
 
 @pytest.mark.engine
 def test_a_robot_that_is_thrown_meets_who_stands_there(world: BulletWorld) -> None:
-    """Somebody who was out of its reach when the tick began stops it within the tick, and is named."""
+    """Somebody who was out of its reach when the tick began stops it within the tick, and is
+    named."""
     world.place(Pose(-20.0, 5.0, 0.0))
     drive(world, 0.0, 0.0, 5)
-    p.resetBaseVelocity(world._engine._robot, (40.0, 0.0, 0.0), (0.0, 0.0, 0.0), world._engine._client)
+    p.resetBaseVelocity(
+        world._engine._robot, (40.0, 0.0, 0.0), (0.0, 0.0, 0.0), world._engine._client
+    )
     motion = world.step(Command(0.0, 0.0), person(-18.3, 5.0), person(-18.3, 5.0), 10)
     assert {(c.kind, c.other) for c in motion.contacts} == {("pedestrian", "c1")}
     assert motion.robot.v_mps < 10.0
@@ -195,7 +220,8 @@ def test_the_same_commands_give_the_same_trace() -> None:
 
 @pytest.mark.engine
 def test_a_world_outside_its_with_block_says_so() -> None:
-    """Before and after the block nothing runs, closing twice is fine, and the message names the remedy."""
+    """Before and after the block nothing runs, closing twice is fine, and the message names the
+    remedy."""
     world = BulletWorld(StreetSurface(MAP, seed=1))
     with pytest.raises(EngineError, match="'with' block"):
         world.place(OPEN)
@@ -224,7 +250,8 @@ def seen(frame: Frame, name: str) -> np.ndarray:
 
 @pytest.mark.engine
 def test_the_camera_sees_the_street() -> None:
-    """From the sidewalk: sky above, sidewalk below, and the person ahead in the middle, the feet on the ground."""
+    """From the sidewalk: sky above, sidewalk below, and the person ahead in the middle, the feet on
+    the ground."""
     world = BulletWorld(StreetSurface(MAP, seed=1))
     with BulletCamera(world, SPEC, depth=True) as camera:
         robot = RobotState(Pose(-20.0, 5.0, 0.0), z_m=0.12)
@@ -235,14 +262,19 @@ def test_the_camera_sees_the_street() -> None:
     assert (frame.labels[-3:, 20:76] == LABELS["sidewalk"]).all()
     rows, columns = seen(frame, "person").T
     assert abs(columns.mean() - 47.5) < 2.0
-    assert frame.depth[rows, columns].mean() == pytest.approx(4.7 * math.cos(math.radians(10.0)), abs=0.3)
+    assert frame.depth[rows, columns].mean() == pytest.approx(
+        4.7 * math.cos(math.radians(10.0)), abs=0.3
+    )
     down = math.atan(0.62 / 4.7) - math.radians(10.0)
-    assert rows.max() == pytest.approx(47.5 + 48.0 * math.tan(down) / math.tan(math.radians(37.5)), abs=2.0)
+    assert rows.max() == pytest.approx(
+        47.5 + 48.0 * math.tan(down) / math.tan(math.radians(37.5)), abs=2.0
+    )
 
 
 @pytest.mark.engine
 def test_a_moved_person_is_drawn_where_the_snapshot_says() -> None:
-    """A person to the left is left in the picture, one to the right is right, and one behind is not in it."""
+    """A person to the left is left in the picture, one to the right is right, and one behind is not
+    in it."""
     with BulletCamera(BulletWorld(StreetSurface(MAP, seed=1)), SPEC) as camera:
         robot = RobotState(Pose(-20.0, 5.0, 0.0), z_m=0.12)
         assert seen(camera.render(robot, person(-15.0, 6.0)), "person")[:, 1].mean() < 40.0
@@ -269,8 +301,11 @@ def test_a_picture_depends_on_its_moment_alone() -> None:
 
 @pytest.mark.engine
 def test_everything_has_its_label() -> None:
-    """One view over the street holds every label, and the lamp shows red or green as the signal says."""
-    strips = {k: dataclasses.replace(s, signalised=s.kind == "crossing") for k, s in MAP.strips.items()}
+    """One view over the street holds every label, and the lamp shows red or green as the signal
+    says."""
+    strips = {
+        k: dataclasses.replace(s, signalised=s.kind == "crossing") for k, s in MAP.strips.items()
+    }
     street_map = dataclasses.replace(MAP, strips=strips)
     fence = Barrier(x_m=4.0, y_m=5.0, heading_rad=0.0, length_m=3.0, strip="ne", end=0)
     vehicles = Vehicles.of(("v1",), [[-6.0, 1.75]], [math.pi], [5.0], [[4.5, 1.8]])
@@ -280,9 +315,13 @@ def test_everything_has_its_label() -> None:
     with BulletCamera(BulletWorld(StreetSurface(street_map, seed=1), [fence]), SPEC) as camera:
         for walk in (True, False):
             street = Street(0, people, vehicles, {":c0": Signal(walk)})
-            frame = camera.picture((-16.0, 1.0, 5.0), (0.0, 1.0, 0.0), street, robot, size=(320, 240))
+            frame = camera.picture(
+                (-16.0, 1.0, 5.0), (0.0, 1.0, 0.0), street, robot, size=(320, 240)
+            )
             assert frame.labels is not None
-            assert {LABELS[n] for n in LABELS if n != "prop"} <= set(np.unique(frame.labels).tolist())
+            assert {LABELS[n] for n in LABELS if n != "prop"} <= set(
+                np.unique(frame.labels).tolist()
+            )
             lamp = frame.rgb[frame.labels == LABELS["signal"]].astype(int)
             lit[walk] = (lamp[:, 1] - lamp[:, 0]).max() > 60, (lamp[:, 0] - lamp[:, 1]).max() > 60
     assert lit == {True: (True, False), False: (False, True)}
@@ -296,7 +335,9 @@ def test_the_camera_leans_with_the_ramp() -> None:
         for y, z in ((-1.0, 0.0), (4.22, 0.06)):
             robot = RobotState(Pose(0.0, y, math.pi / 2), z_m=z)
             heads.append(seen(camera.render(robot, person(0.0, y + 6.0)), "person")[:, 0].min())
-    assert heads[1] - heads[0] == pytest.approx(48.0 * math.tan(1.0 / 12.0) / math.tan(math.radians(37.5)), abs=2.0)
+    assert heads[1] - heads[0] == pytest.approx(
+        48.0 * math.tan(1.0 / 12.0) / math.tan(math.radians(37.5)), abs=2.0
+    )
 
 
 @pytest.mark.engine

@@ -15,17 +15,17 @@ from cosim.core.clock import Clock
 from cosim.core.errors import MapError
 from cosim.core.geometry import Polyline, Pose, wrap_angle
 from cosim.core.state import NO_VEHICLES, NOBODY, STILL, Command, Street
-from cosim.episode.driver import Driver
+from cosim.episode.interfaces import Observation, Privileged
 from cosim.episode.loop import place_on_route
-from cosim.episode.ports import Observation, Privileged
+from cosim.episode.policy_caller import Driver
 from cosim.place.route_line import way_line
 from cosim.place.street_map import Port, StreetMap, Strip, WalkableArea
-from cosim.policies.route import Route
+from cosim.policies.privileged.route import Route
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City
-from physics.world.street_surface import StreetSurface
-from physics.world.tiles import CURB_M, RAMP_SLOPE, build_tile, key_at, square
-from physics.world.world import BulletWorld
+from physics.dynamics.world import BulletWorld
+from physics.ground.tiles import CURB_M, RAMP_SLOPE, build_tile, key_at, square
+from physics.street.street_surface import StreetSurface
 from sumo_nets.city.store import city_net
 from sumo_nets.net.snapshot import street_map_of
 
@@ -44,7 +44,9 @@ def place(request: pytest.FixtureRequest) -> StreetMap:
     return street_map_of(city_net(request.param))
 
 
-def climbs(place: StreetMap, count: int, rng: np.random.Generator) -> Iterator[tuple[str, Polyline]]:
+def climbs(
+    place: StreetMap, count: int, rng: np.random.Generator
+) -> Iterator[tuple[str, Polyline]]:
     """Lines from the middle of a crossing over its ramp onto a sidewalk beside its corner."""
     crossings = [strip for strip in place.strips.values() if strip.kind == "crossing"]
     order = rng.permutation(len(crossings)).tolist()
@@ -52,12 +54,18 @@ def climbs(place: StreetMap, count: int, rng: np.random.Generator) -> Iterator[t
     for k in order:
         if found == count:
             return
-        crossing, end = crossings[k], int(rng.integers(2))
+        crossing = crossings[k]
+        end = int(rng.integers(2))
         corner = place.corners[crossing.corners[end] or ""]
         beside = [p for p in corner.ports if place.strips[p.strip].kind == "sidewalk"]
         leave = Port(crossing.id, 1 if end else 0)
         try:
-            line = way_line(place, [leave, beside[int(rng.integers(len(beside)))]], 0.45 * crossing.length_m, 4.0)
+            line = way_line(
+                place,
+                [leave, beside[int(rng.integers(len(beside)))]],
+                0.45 * crossing.length_m,
+                4.0,
+            )
         except MapError:
             continue
         found += 1
@@ -65,7 +73,8 @@ def climbs(place: StreetMap, count: int, rng: np.random.Generator) -> Iterator[t
 
 
 class Climb(NamedTuple):
-    """How a climb went: seconds, slowest metres in any second while driving, metres left, largest tilt."""
+    """How a climb went: seconds, slowest metres in any second while driving, metres left, largest
+    tilt."""
 
     time_s: float
     slowest_m: float
@@ -75,26 +84,39 @@ class Climb(NamedTuple):
 
 def climb(world: BulletWorld, line: Polyline) -> Climb:
     """Drive a line with the `route` policy at its own rate, in an empty street."""
-    state, street, clock = world.place(Pose(*line.at(0.0))), Street(0), Clock.for_rate(Route.manifest.rate_hz)
-    driver, command, tick = Driver(Route()), STILL, 0
+    state = world.place(Pose(*line.at(0.0)))
+    street = Street(0)
+    clock = Clock.for_rate(Route.manifest.rate_hz)
+    driver = Driver(Route())
+    command = STILL
+    tick = 0
     free = shapely.buffer(LineString(line.points), 1.0)
-    track, tilt, reached = [state.pose.xy], 0.0, 0.0
+    track = [state.pose.xy]
+    tilt = 0.0
+    reached = 0.0
     while reached < line.length_m - 0.4 and clock.time_s(tick) < 5.0 + 2.5 * line.length_m / V_MPS:
         if clock.acts(tick):
             known = Privileged(state, line, reached, NOBODY, NO_VEHICLES, {}, (), free)
-            seen = Observation(tick, clock.time_s(tick), None, state.v_mps, state.w_radps, COURIER, known)
+            seen = Observation(
+                tick, clock.time_s(tick), None, state.v_mps, state.w_radps, COURIER, known
+            )
             command = driver.act(seen)
         state = world.step(command, street, street, clock.substeps).robot
         reached = place_on_route(line, state.pose, reached)
-        tilt, tick = max(tilt, state.tilt_rad), tick + 1
+        tilt = max(tilt, state.tilt_rad)
+        tick = tick + 1
         track.append(state.pose.xy)
-    steps, second = np.array(track), round(1.0 / TICK_S)
+    steps = np.array(track)
+    second = round(1.0 / TICK_S)
     moved = np.hypot(*(steps[second:] - steps[:-second]).T)
-    return Climb(clock.time_s(tick), float(moved[second:].min(initial=1.0)), line.length_m - reached, tilt)
+    return Climb(
+        clock.time_s(tick), float(moved[second:].min(initial=1.0)), line.length_m - reached, tilt
+    )
 
 
 def test_route_climbs_every_ramp(place: StreetMap) -> None:
-    """Driven by `route` from crossings onto corners and sidewalks: it arrives, and never stands still for a second."""
+    """Driven by `route` from crossings onto corners and sidewalks: it arrives, and never stands
+    still for a second."""
     done = 0
     with BulletWorld(StreetSurface(place, seed=3)) as world:
         for name, line in climbs(place, CLIMBS_PER_CITY, np.random.default_rng(5)):
@@ -106,10 +128,13 @@ def test_route_climbs_every_ramp(place: StreetMap) -> None:
 
 
 def test_ramps_rise_one_in_twelve_at_most(place: StreetMap) -> None:
-    """The surface asked for is nowhere steeper; of its triangles few are, where flares are rounded by facets."""
+    """The surface asked for is nowhere steeper; of its triangles few are, where flares are rounded
+    by facets."""
     spots = [s.line[0, :2] for s in place.strips.values() if s.kind == "crossing"][:6]
     spots += [Polyline(s.line).at(at).xy for s in place.strips.values() for at in s.driveways][:6]
-    rng, steep_m2, whole_m2 = np.random.default_rng(1), 0.0, 0.0
+    rng = np.random.default_rng(1)
+    steep_m2 = 0.0
+    whole_m2 = 0.0
     for key in dict.fromkeys(key_at(*spot) for spot in spots):
         tile = build_tile(place, key)
         x0, y0, x1, y1 = square(key)
@@ -128,26 +153,40 @@ def test_ramps_rise_one_in_twelve_at_most(place: StreetMap) -> None:
     assert steep_m2 < 0.03 * whole_m2
 
 
-def curbs(place: StreetMap, count: int, rng: np.random.Generator) -> Iterator[tuple[Strip, Pose, Pose]]:
-    """A sidewalk, a pose on it, and one on the road, face to face over a curb far from ramps and driveways."""
-    sidewalks = [s for s in place.strips.values() if s.kind == "sidewalk" and s.length_m > 24.0 and not s.driveways]
+def curbs(
+    place: StreetMap, count: int, rng: np.random.Generator
+) -> Iterator[tuple[Strip, Pose, Pose]]:
+    """A sidewalk, a pose on it, and one on the road, face to face over a curb far from ramps and
+    driveways."""
+    sidewalks = [
+        s
+        for s in place.strips.values()
+        if s.kind == "sidewalk" and s.length_m > 24.0 and not s.driveways
+    ]
     for k in rng.permutation(len(sidewalks))[:count].tolist():
         strip = sidewalks[k]
         x, y, heading = Polyline(strip.line[:, :2]).at(0.5 * strip.length_m)
         to_road = heading + strip.road_side * math.pi / 2.0
         ahead = np.array([math.cos(to_road), math.sin(to_road)])
         road = np.array([x, y]) + (0.5 * strip.width_m + strip.verge_m + 2.2) * ahead
-        yield strip, Pose(x, y, to_road), Pose(float(road[0]), float(road[1]), wrap_angle(to_road + math.pi))
+        yield (
+            strip,
+            Pose(x, y, to_road),
+            Pose(float(road[0]), float(road[1]), wrap_angle(to_road + math.pi)),
+        )
 
 
 def test_the_robot_does_not_climb_curbs_and_never_leaves_unnoticed(place: StreetMap) -> None:
-    """At full speed at a curb it stays below; driven off a curb it is out of the walkable area before it falls."""
+    """At full speed at a curb it stays below; driven off a curb it is out of the walkable area
+    before it falls."""
     street = Street(0)
     with BulletWorld(StreetSurface(place, seed=3)) as world:
         for strip, on_walk, on_road in curbs(place, CURBS_PER_CITY, np.random.default_rng(6)):
             area = WalkableArea(place.walkable_near(strip.polygon.buffer(10.0)))
             world.place(on_road)
-            states = [world.step(Command(FULL_MPS, 0.0), street, street, 10).robot for _ in range(60)]
+            states = [
+                world.step(Command(FULL_MPS, 0.0), street, street, 10).robot for _ in range(60)
+            ]
             assert max(s.z_m for s in states) < 0.5 * CURB_M, strip.id
             assert not area.contains(*states[-1].pose.xy), strip.id
             world.place(on_walk)

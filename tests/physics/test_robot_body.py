@@ -11,8 +11,8 @@ import trimesh
 
 from cosim.core.errors import EngineError, SpecError
 from cosim.spec.robot import COURIER
+from physics.cameras.gl.robot_body import robot_parts
 from physics.robots import urdf_of
-from physics.robots.robot_body import robot_parts
 
 CHASSIS = re.compile(r'<box size="([\d. ]+)"\s*/>')
 
@@ -27,12 +27,15 @@ def with_visual(folder: Path, shape: str) -> Path:
 
 @pytest.mark.parametrize("ending", ["obj", "stl", "glb"])
 def test_a_body_from_a_file_is_drawn_like_one_of_boxes(tmp_path: Path, ending: str) -> None:
-    """A box in a file, scaled by the URDF, has the corners, normals, colour and place of the box it stands for."""
+    """A box in a file, scaled by the URDF, has the corners, normals, colour and place of the box it
+    stands for."""
     box = CHASSIS.search(urdf_of(COURIER).read_text())
     assert box is not None
     size = np.array(box[1].split(), dtype=float)
     trimesh.creation.box(10.0 * size).export(tmp_path / f"chassis.{ending}")
-    made = robot_parts(with_visual(tmp_path, f'<mesh filename="chassis.{ending}" scale="0.1 0.1 0.1"/>'))
+    made = robot_parts(
+        with_visual(tmp_path, f'<mesh filename="chassis.{ending}" scale="0.1 0.1 0.1"/>')
+    )
     plain = robot_parts(urdf_of(COURIER))
     assert [part.colour for part in made] == [part.colour for part in plain]
     for one, other in zip(made, plain, strict=True):
@@ -50,5 +53,8 @@ def test_a_body_that_cannot_be_drawn_is_named(tmp_path: Path) -> None:
     with pytest.raises(SpecError, match=r"gone\.stl: cannot be read as a mesh"):
         robot_parts(with_visual(tmp_path, '<mesh filename="gone.stl"/>'))
     robot_parts.cache_clear()
-    with pytest.raises(EngineError, match=r"a visual shows a capsule; the gl camera draws boxes, cylinders and meshes"):
+    with pytest.raises(
+        EngineError,
+        match=r"a visual shows a capsule; the gl camera draws boxes, cylinders and meshes",
+    ):
         robot_parts(with_visual(tmp_path, '<capsule radius="1" length="2"/>'))

@@ -24,7 +24,8 @@ def luminance(colour: np.ndarray) -> float:
 
 @pytest.mark.parametrize("latitude", [0.0, 30.0, 48.0, -35.0])
 def test_at_the_equinox_noon_stands_as_high_as_the_latitude_leaves(latitude: float) -> None:
-    """On day 81 at noon the sun is at 90 degrees less the latitude, to the south in the north, and rises due east."""
+    """On day 81 at noon the sun is at 90 degrees less the latitude, to the south in the north, and
+    rises due east."""
     noon, morning = sun_direction(12.0, 81, latitude), sun_direction(6.0, 81, latitude)
     assert math.degrees(math.asin(noon[2])) == pytest.approx(90.0 - abs(latitude), abs=1e-6)
     assert noon[0] == pytest.approx(0.0, abs=1e-12)
@@ -33,9 +34,16 @@ def test_at_the_equinox_noon_stands_as_high_as_the_latitude_leaves(latitude: flo
 
 
 def test_midsummer_is_as_the_tilt_says() -> None:
-    """On day 172, 48 N: noon at 90 - 48 + 23.45 degrees, sunrise at cos w = -tan(48) tan(23.45), 4.08 h solar time."""
-    assert math.degrees(math.asin(sun_direction(12.0, 172, 48.0)[2])) == pytest.approx(65.45, abs=0.01)
-    rise_h = 12.0 - math.degrees(math.acos(-math.tan(math.radians(48.0)) * math.tan(math.radians(23.45)))) / 15.0
+    """On day 172, 48 N: noon at 90 - 48 + 23.45 degrees, sunrise at cos w = -tan(48) tan(23.45),
+    4.08 h solar time."""
+    assert math.degrees(math.asin(sun_direction(12.0, 172, 48.0)[2])) == pytest.approx(
+        65.45, abs=0.01
+    )
+    rise_h = (
+        12.0
+        - math.degrees(math.acos(-math.tan(math.radians(48.0)) * math.tan(math.radians(23.45))))
+        / 15.0
+    )
     assert rise_h == pytest.approx(4.08, abs=0.01)
     assert sun_direction(rise_h, 172, 48.0)[2] == pytest.approx(0.0, abs=1e-3)
     assert np.linalg.norm(sun_direction(9.3, 40, 61.0)) == pytest.approx(1.0)
@@ -43,7 +51,9 @@ def test_midsummer_is_as_the_tilt_says() -> None:
 
 def test_a_low_sun_is_dim_and_red() -> None:
     """Air mass is 1 overhead, 2 at 30 degrees and 38 at the horizon; red outlives blue."""
-    assert [air_mass(math.radians(d)) for d in (90, 30, 0)] == pytest.approx([1.0, 1.994, 37.92], rel=2e-3)
+    assert [air_mass(math.radians(d)) for d in (90, 30, 0)] == pytest.approx(
+        [1.0, 1.994, 37.92], rel=2e-3
+    )
     high, low = transmittance(math.radians(60), 3.0), transmittance(math.radians(4), 3.0)
     assert luminance(high) > 5 * luminance(low)
     assert high[0] / high[2] < 1.4 and low[0] / low[2] > 4.0
@@ -74,7 +84,8 @@ def test_the_sun_stands_where_the_picture_shows_it() -> None:
 @pytest.mark.parametrize("cover", [0.0, 0.6, 1.0])
 @pytest.mark.parametrize("hour", [0.0, 4.5, 12.0, 20.0])
 def test_every_sky_is_usable(hour: float, cover: float) -> None:
-    """Finite, never negative, exposed so that a grey card in the open is neither black nor white."""
+    """Finite, never negative, exposed so that a grey card in the open is neither black nor
+    white."""
     sky = sky_of(Light(hour=hour, cloud_cover=cover), seed=3)
     assert np.isfinite(sky.radiance).all() and sky.radiance.min() >= 0.0
     card = 0.4 * (sky.ambient[0] + sky.sun_colour * max(float(sky.sun[2]), 0.0)) * sky.exposure
@@ -83,14 +94,20 @@ def test_every_sky_is_usable(hour: float, cover: float) -> None:
 
 
 def test_daylight_falls_as_it_does() -> None:
-    """An overcast leaves a sixth to a third of noon's light, dusk less than a hundredth, night the lamps'."""
+    """An overcast leaves a sixth to a third of noon's light, dusk less than a hundredth, night the
+    lamps'."""
 
     def open_ground(light: Light) -> float:
         sky = sky_of(light)
         return luminance(sky.ambient[0] + sky.sun_colour * max(float(sky.sun[2]), 0.0))
 
-    noon, late = open_ground(Light(hour=12.0, cloud_cover=0.0)), open_ground(Light(hour=18.0, cloud_cover=0.0))
-    closed, dusk, night = (open_ground(Light(hour=h, cloud_cover=c)) for h, c in ((12.0, 1.0), (20.3, 0.0), (0.0, 0.0)))
+    noon, late = (
+        open_ground(Light(hour=12.0, cloud_cover=0.0)),
+        open_ground(Light(hour=18.0, cloud_cover=0.0)),
+    )
+    closed, dusk, night = (
+        open_ground(Light(hour=h, cloud_cover=c)) for h, c in ((12.0, 1.0), (20.3, 0.0), (0.0, 0.0))
+    )
     assert 0.75 < noon < 1.1 and 0.2 < late / noon < 0.6
     assert 1 / 6 < closed / noon < 1 / 3
     assert 1e-4 < dusk / noon < 1e-2 and 1e-4 < night / noon < 1e-3
@@ -98,7 +115,8 @@ def test_daylight_falls_as_it_does() -> None:
 
 
 def test_shade_in_a_street_is_lit_by_the_houses_too() -> None:
-    """At noon ground in the shade is bluish, not blue, and three to eight times darker than in the sun."""
+    """At noon ground in the shade is bluish, not blue, and three to eight times darker than in the
+    sun."""
     sky = sky_of(Light(hour=12.0))
     shade = sky.ambient[0]
     assert 1.2 < shade[2] / shade[0] < 2.0
@@ -106,11 +124,13 @@ def test_shade_in_a_street_is_lit_by_the_houses_too() -> None:
 
 
 def test_dusk_is_red_where_the_sun_is_and_blue_above() -> None:
-    """Half an hour after sunset the western horizon is redder than the zenith, and the sun gives no light."""
+    """Half an hour after sunset the western horizon is redder than the zenith, and the sun gives no
+    light."""
     sky = sky_of(Light(hour=20.1, cloud_cover=0.0))
     rows = len(sky.radiance)
     column = int((0.5 - math.atan2(sky.sun[1], sky.sun[0]) / (2 * math.pi)) * 2 * rows)
-    west, zenith = sky.radiance[rows // 2 - 3, column], sky.radiance[0, 0]
+    west = sky.radiance[rows // 2 - 3, column]
+    zenith = sky.radiance[0, 0]
     assert west[0] > 1.5 * west[2] and zenith[2] > 1.3 * zenith[0]
     assert not sky.shadows and not sky.sun_colour.any()
 
@@ -127,7 +147,8 @@ def test_an_overcast_is_three_times_brighter_above() -> None:
 
 
 def test_clouds_cover_the_share_asked_for() -> None:
-    """Between a clear and a half-covered sky about half of the upper sky changes; the seed moves the clouds."""
+    """Between a clear and a half-covered sky about half of the upper sky changes; the seed moves
+    the clouds."""
     clear, half = (sky_of(Light(cloud_cover=c), seed=1).radiance[:110] for c in (0.0, 0.5))
     changed = np.abs(half - clear).max(axis=-1) > 0.02
     assert 0.3 < changed.mean() < 0.65
@@ -144,7 +165,8 @@ def test_fog_hides_what_its_visibility_says() -> None:
 
 def test_exposure_follows_the_stops() -> None:
     """One stop more doubles the exposure and changes nothing else."""
-    plain, brighter = sky_of(Light()), sky_of(Light(exposure_ev=1.0))
+    plain = sky_of(Light())
+    brighter = sky_of(Light(exposure_ev=1.0))
     assert brighter.exposure == pytest.approx(2.0 * plain.exposure)
     assert np.array_equal(plain.radiance, brighter.radiance)
 
@@ -158,19 +180,25 @@ def picture(path: Path, rows: int = 128, columns: int = 256) -> np.ndarray:
 
 
 def test_a_picture_of_the_users_brings_its_sun(tmp_path: Path) -> None:
-    """The sun stands at the brightest spot and its light is taken out of the ambient, so that nothing counts twice."""
+    """The sun stands at the brightest spot and its light is taken out of the ambient, so that
+    nothing counts twice."""
     path = tmp_path / "sky.hdr"
     picture(path)
     sky = sky_of(Light(hdri=str(path)))
     assert sky.sun == pytest.approx([0.0, math.cos(math.pi / 6), 0.5], abs=0.06)
     assert luminance(sky.ambient[0] + sky.sun_colour * sky.sun[2]) == pytest.approx(1.0, rel=1e-3)
-    # Nine pixels of 79.5 more than the sky, each (pi / 128)^2 cos 30 deg of a sphere, over pi; the sky gives 0.5.
+    # Nine pixels of 79.5 more than the sky, each (pi / 128)^2 cos 30 deg of a sphere, over pi; the
+    # sky gives 0.5.
     light = 9 * 79.5 * (math.pi / 128) ** 2 * math.cos(math.pi / 6) / math.pi
-    assert luminance(sky.sun_colour) == pytest.approx(light / (0.5 + 0.5 * light), rel=0.02) and sky.shadows
+    assert (
+        luminance(sky.sun_colour) == pytest.approx(light / (0.5 + 0.5 * light), rel=0.02)
+        and sky.shadows
+    )
 
 
 def test_broken_pictures_are_named(tmp_path: Path) -> None:
-    """Missing, foreign, cut, square, black and non-finite pictures are told apart, each with its file."""
+    """Missing, foreign, cut, square, black and non-finite pictures are told apart, each with its
+    file."""
     path = tmp_path / "sky.hdr"
     light = Light(hdri=str(path))
 
@@ -197,4 +225,8 @@ def test_broken_pictures_are_named(tmp_path: Path) -> None:
 def test_photographed_skies_load(name: str) -> None:
     """Real panoramas give a sun above the horizon and finite light."""
     sky = sky_of(Light(hdri=str(ASSETS / f"{name}.hdr")))
-    assert sky.sun[2] > 0.0 and np.isfinite(sky.radiance).all() and sky.radiance.shape == (512, 1024, 3)
+    assert (
+        sky.sun[2] > 0.0
+        and np.isfinite(sky.radiance).all()
+        and sky.radiance.shape == (512, 1024, 3)
+    )

@@ -1,4 +1,5 @@
-"""A surface made from a plain mesh, a slope with a step at its end: driven on, bumped into, drawn by both cameras."""
+"""A surface made from a plain mesh, a slope with a step at its end: driven on, bumped into, drawn
+by both cameras."""
 
 from __future__ import annotations
 
@@ -14,19 +15,21 @@ from trimesh.visual.material import PBRMaterial
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Pose
 from cosim.core.state import LABELS, Command, Frame, RobotState, Street
-from cosim.episode.ports import CameraSpec
+from cosim.spec.camera import CameraSpec
 from cosim.spec.robot import COURIER
 from physics.cameras.bullet_camera import BulletCamera
 from physics.cameras.gl import context
 from physics.cameras.gl.camera import GlCamera
 from physics.cameras.view import shot
-from physics.world.mesh_surface import Z_UP, MeshSurface
-from physics.world.tiles import key_at, keys_within, square
-from physics.world.world import BulletWorld
-from tests.physics.parity import agreement
+from physics.dynamics.world import BulletWorld
+from physics.ground.tiles import key_at, keys_within, square
+from physics.street.mesh_surface import Z_UP, MeshSurface
+from tests.support.parity import agreement
 
 EMPTY = Street(0)
-GRADE, STEP_M, LONG_M = 0.1, 0.25, 6.0
+GRADE = 0.1
+STEP_M = 0.25
+LONG_M = 6.0
 TOP_M = GRADE * LONG_M + STEP_M
 COLOUR = (0.8, 0.3, 0.1)
 PROFILE = {
@@ -35,7 +38,8 @@ PROFILE = {
     "curb": ((LONG_M, GRADE * LONG_M), (LONG_M, TOP_M)),
     "plateau": ((LONG_M, TOP_M), (14.0, TOP_M)),
 }
-"""Seen from the side, in x and z: level, uphill, a step up, level again; 10 m wide. Squares meet at x = 0.41."""
+"""Seen from the side, in x and z: level, uphill, a step up, level again; 10 m wide. Squares meet at
+x = 0.41."""
 
 
 def hill() -> dict[str, trimesh.Trimesh]:
@@ -63,20 +67,26 @@ def surface(tmp_path_factory: pytest.TempPathFactory) -> MeshSurface:
 
 
 def test_a_mesh_has_its_heights_and_lean(surface: MeshSurface) -> None:
-    """Heights are those of its triangles, and a robot leans as the slope does whichever way it faces."""
+    """Heights are those of its triangles, and a robot leans as the slope does whichever way it
+    faces."""
     x = np.array([-4.0, -0.1, 0.41, 2.0, 5.9, 6.1, 13.0])
-    assert surface.heights(np.column_stack([x, 0.3 * x])) == pytest.approx([height(at) for at in x], abs=1e-6)
+    assert surface.heights(np.column_stack([x, 0.3 * x])) == pytest.approx(
+        [height(at) for at in x], abs=1e-6
+    )
     for heading, roll, pitch in ((0.0, 0.0, -1.0), (math.pi, 0.0, 1.0), (math.pi / 2, -1.0, 0.0)):
         z, leant, nodding = surface.lean(Pose(3.0, 1.0, heading), COURIER.drive.span_m)
         assert z == pytest.approx(3.0 * GRADE, abs=1e-6)
-        assert (leant, nodding) == pytest.approx((roll * math.atan(GRADE), pitch * math.atan(GRADE)), abs=1e-6)
+        assert (leant, nodding) == pytest.approx(
+            (roll * math.atan(GRADE), pitch * math.atan(GRADE)), abs=1e-6
+        )
     lying = surface.road([(3.0, 0.0)], [0.0], [(4.5, 1.8)])[0]
     assert lying == pytest.approx((0.3, 0.0, -math.atan(GRADE)), abs=1e-6)
     assert surface.foot(3.0, 0.0, 0.0, (2.0, 0.5)) == pytest.approx(0.2, abs=1e-6)
 
 
 def test_the_squares_of_a_mesh_are_all_of_it(surface: MeshSurface) -> None:
-    """Cut into squares it has the same area, nothing lies outside its square, and names tell what it is made of."""
+    """Cut into squares it has the same area, nothing lies outside its square, and names tell what
+    it is made of."""
     area: dict[str, float] = {}
     for key in keys_within(0.0, 0.0, 30.0):
         x0, y0, x1, y1 = square(key)
@@ -88,13 +98,20 @@ def test_the_squares_of_a_mesh_are_all_of_it(surface: MeshSurface) -> None:
             area[patch.name] = area.get(patch.name, 0.0) + here
     assert area == pytest.approx({name: mesh.area for name, mesh in hill().items()}, rel=1e-6)
     found = {patch.name: patch for patch in surface.chunk(key_at(5.0, 1.0)).ground}
-    assert [found[name].label for name in PROFILE if name in found] == ["sidewalk", "curb", "ground"]
+    assert [found[name].label for name in PROFILE if name in found] == [
+        "sidewalk",
+        "curb",
+        "ground",
+    ]
     assert found["sidewalk:brick:0"].friction == 0.80 and found["curb"].friction == 0.90
-    assert found["plateau"].colour == pytest.approx([1.055 * c ** (1 / 2.4) - 0.055 for c in COLOUR], abs=0.01)
+    assert found["plateau"].colour == pytest.approx(
+        [1.055 * c ** (1 / 2.4) - 0.055 for c in COLOUR], abs=0.01
+    )
 
 
 def test_what_is_no_mesh_is_refused(tmp_path: Path) -> None:
-    """A file that is not there, one that is something else, and one without a triangle are named."""
+    """A file that is not there, one that is something else, and one without a triangle are
+    named."""
     (tmp_path / "words.glb").write_text("hello")
     (tmp_path / "words.obj").write_text("v 0 0 0\n")
     for name in ("nothing.glb", "words.glb", "words.obj"):
@@ -104,16 +121,22 @@ def test_what_is_no_mesh_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.engine
 def test_the_robot_climbs_the_slope_and_is_stopped_by_the_step(surface: MeshSurface) -> None:
-    """Its wheels stay on the slope, it leans as that does, keeps its speed, and does not get over the step."""
+    """Its wheels stay on the slope, it leans as that does, keeps its speed, and does not get over
+    the step."""
     with BulletWorld(surface) as world:
-        state, states = world.place(Pose(-1.5, 1.0, 0.0)), []
+        state = world.place(Pose(-1.5, 1.0, 0.0))
+        states = []
         for _ in range(140):
             state = world.step(Command(1.5, 0.0), EMPTY, EMPTY, 10).robot
             states.append(state)
     on_slope = [s for s in states if 1.0 < s.pose.x_m < LONG_M - 1.0]
     assert len(on_slope) > 20
-    assert [s.tilt_rad for s in on_slope] == pytest.approx([math.atan(GRADE)] * len(on_slope), abs=0.02)
-    assert [s.z_m for s in on_slope] == pytest.approx([GRADE * s.pose.x_m for s in on_slope], abs=0.02)
+    assert [s.tilt_rad for s in on_slope] == pytest.approx(
+        [math.atan(GRADE)] * len(on_slope), abs=0.02
+    )
+    assert [s.z_m for s in on_slope] == pytest.approx(
+        [GRADE * s.pose.x_m for s in on_slope], abs=0.02
+    )
     assert np.mean([s.v_mps for s in on_slope]) == pytest.approx(1.5, rel=0.05)
     nose_m = 0.5 * world.footprint_m[0]
     assert LONG_M - nose_m - 0.15 < states[-1].pose.x_m and max(s.pose.x_m for s in states) < LONG_M
@@ -124,7 +147,8 @@ def test_the_robot_climbs_the_slope_and_is_stopped_by_the_step(surface: MeshSurf
 def test_the_robot_drops_off_the_step(surface: MeshSurface) -> None:
     """From above it falls by the height of the step, and goes on downhill on its wheels."""
     with BulletWorld(surface) as world:
-        state, states = world.place(Pose(8.5, -1.0, math.pi)), []
+        state = world.place(Pose(8.5, -1.0, math.pi))
+        states = []
         for _ in range(110):
             state = world.step(Command(1.5, 0.0), EMPTY, EMPTY, 10).robot
             states.append(state)
@@ -158,8 +182,11 @@ def points_of(frame: Frame, eye: np.ndarray, target: np.ndarray, fov_deg: float)
 
 @pytest.mark.engine
 @pytest.mark.parametrize("make", [GlCamera, BulletCamera], ids=["gl", "bullet"])
-def test_a_camera_draws_a_mesh_where_it_is(make: type[GlCamera | BulletCamera], surface: MeshSurface) -> None:
-    """Of four views each pixel of the mesh lies on it by its depth, on the part that its label names."""
+def test_a_camera_draws_a_mesh_where_it_is(
+    make: type[GlCamera | BulletCamera], surface: MeshSurface
+) -> None:
+    """Of four views each pixel of the mesh lies on it by its depth, on the part that its label
+    names."""
     if make is GlCamera and not context.available():
         pytest.skip("no OpenGL through EGL here (see `cosim doctor`)")
     seen = set()
@@ -168,7 +195,12 @@ def test_a_camera_draws_a_mesh_where_it_is(make: type[GlCamera | BulletCamera], 
             frame = camera.picture(eye, target, EMPTY, size=(160, 120), fov_deg=60.0)
             assert frame.labels is not None and frame.depth is not None
             at = points_of(frame, np.array(eye), np.array(target), 60.0)
-            inside = (at[..., 0] > -4.9) & (at[..., 0] < 13.9) & (np.abs(at[..., 1]) < 4.9) & (frame.depth < 20.0)
+            inside = (
+                (at[..., 0] > -4.9)
+                & (at[..., 0] < 13.9)
+                & (np.abs(at[..., 1]) < 4.9)
+                & (frame.depth < 20.0)
+            )
             wall = inside & (frame.labels == LABELS["curb"])
             if wall.any():
                 assert at[wall][:, 0] == pytest.approx(np.full(wall.sum(), LONG_M), abs=0.03)
@@ -176,20 +208,33 @@ def test_a_camera_draws_a_mesh_where_it_is(make: type[GlCamera | BulletCamera], 
             for label, low, high in (("sidewalk", -5.0, LONG_M), ("ground", LONG_M, 14.0)):
                 part = at[inside & (frame.labels == LABELS[label])]
                 if len(part):
-                    assert part[:, 0].min() > low - 0.05 and part[:, 0].max() < high + 0.05, (label, eye)
+                    assert part[:, 0].min() > low - 0.05 and part[:, 0].max() < high + 0.05, (
+                        label,
+                        eye,
+                    )
                     assert part[:, 2] == pytest.approx([height(x) for x in part[:, 0]], abs=0.03)
                     seen.add(label)
     assert seen == {"sidewalk", "curb", "ground"}
 
 
 @pytest.mark.engine
-@pytest.mark.skipif(not context.available(), reason="no OpenGL through EGL here (see `cosim doctor`)")
+@pytest.mark.skipif(
+    not context.available(), reason="no OpenGL through EGL here (see `cosim doctor`)"
+)
 def test_both_cameras_see_the_same_mesh(surface: MeshSurface) -> None:
-    """From the robot's mount, on the level, on the slope and above the step, labels agree on 97 % of the pixels off
-    edges, and depth to 2 cm."""
-    world, spec = BulletWorld(surface), CameraSpec(128, 96)
+    """From the robot's mount, on the level, on the slope and above the step, labels agree on 97 %
+    of the pixels off edges, and depth to 2 cm."""
+    world = BulletWorld(surface)
+    spec = CameraSpec(128, 96)
     with GlCamera(world, spec, depth=True) as one, BulletCamera(world, spec, depth=True) as other:
-        for x, heading in ((-3.0, 0.0), (2.0, 0.3), (4.5, 0.0), (3.0, 2.8), (9.0, math.pi), (12.0, 2.6)):
+        for x, heading in (
+            (-3.0, 0.0),
+            (2.0, 0.3),
+            (4.5, 0.0),
+            (3.0, 2.8),
+            (9.0, math.pi),
+            (12.0, 2.6),
+        ):
             state = RobotState(Pose(x, 0.5, heading), z_m=height(x))
             alike, gap_m = agreement(one.render(state, EMPTY), other.render(state, EMPTY))
             assert alike >= 0.97 and gap_m <= 0.02, (x, heading)

@@ -1,4 +1,5 @@
-"""Terrain: heights and creases by hand; elevations of nets cleaned, clamped or dropped; tiles on the land."""
+"""Terrain: heights and creases by hand; elevations of nets cleaned, clamped or dropped; tiles on
+the land."""
 
 from __future__ import annotations
 
@@ -15,12 +16,21 @@ from cosim.core.geometry import Pose
 from cosim.place.street_map import Corner, Port
 from cosim.place.terrain import FALSE_GRADE, ROBOT_GRADE_MAX, WALK_GRADE_MAX, Elevation, Terrain
 from cosim.spec.robot import COURIER
-from physics.world.street_surface import StreetSurface
-from physics.world.tiles import CURB_M, RAMP_SLOPE, build_tile, key_at, kind_of, square
-from sumo_nets.net.elevation import steep_ports, steep_strips, surveyed
-from sumo_nets.net.profile import Course, Meeting, On, clamped, course, what_lies_there
+from physics.ground.tiles import CURB_M, RAMP_SLOPE, build_tile, key_at, kind_of, square
+from physics.street.street_surface import StreetSurface
+from sumo_nets.net.elevation import (
+    Course,
+    Meeting,
+    On,
+    clamped,
+    course,
+    steep_ports,
+    steep_strips,
+    surveyed,
+    what_lies_there,
+)
 from sumo_nets.net.snapshot import map_as_bytes, thawed
-from tests.tiny_street import KEYS, no_cracks, plan_areas, tiny_map, triangles
+from tests.support.tiny_street import KEYS, no_cracks, plan_areas, tiny_map, triangles
 
 HAND = Terrain(10.0, 20.0, 2.0, np.array([[0, 1, 2], [0, 1, 6]], dtype=np.float32))
 """One flat rise to the east, and a cell whose north-east corner is pulled up by 4 m."""
@@ -29,15 +39,31 @@ HAND = Terrain(10.0, 20.0, 2.0, np.array([[0, 1, 2], [0, 1, 6]], dtype=np.float3
 def hills(x0: float, y0: float, columns: int, rows: int) -> Terrain:
     """Waves of some 8 %, 2 m apart, with a bend at every node."""
     x, y = np.meshgrid(x0 + 2.0 * np.arange(columns), y0 + 2.0 * np.arange(rows))
-    return Terrain(x0, y0, 2.0, (20.0 + 1.5 * np.sin(x / 20.0) + 1.2 * np.cos(y / 17.0 + x / 40.0)).astype(np.float32))
+    return Terrain(
+        x0,
+        y0,
+        2.0,
+        (20.0 + 1.5 * np.sin(x / 20.0) + 1.2 * np.cos(y / 17.0 + x / 40.0)).astype(np.float32),
+    )
 
 
 HILLY = dataclasses.replace(tiny_map(), terrain=hills(-160.0, -160.0, 161, 161))
 
 
 def test_heights_by_hand() -> None:
-    """Nodes, sides and the two triangles of a cell; beyond the lattice the heights at its edge go on."""
-    points = [(10, 20), (12, 22), (11, 21), (14, 22), (13.5, 20.5), (12.5, 21.5), (100, 20), (12, -50), (14, 90)]
+    """Nodes, sides and the two triangles of a cell; beyond the lattice the heights at its edge go
+    on."""
+    points = [
+        (10, 20),
+        (12, 22),
+        (11, 21),
+        (14, 22),
+        (13.5, 20.5),
+        (12.5, 21.5),
+        (100, 20),
+        (12, -50),
+        (14, 90),
+    ]
     expected = [0, 1, 0.5, 6, 1.75 + 0.25 * 4, 1.25 + 0.25 * 4, 2, 1, 6]
     assert HAND.height(points).tolist() == expected
 
@@ -49,7 +75,8 @@ def test_gradients_by_hand() -> None:
 
 
 def test_creases_are_where_the_land_bends() -> None:
-    """A plane has none inside; the pulled corner bends its cell along the diagonal and at the side it shares."""
+    """A plane has none inside; the pulled corner bends its cell along the diagonal and at the side
+    it shares."""
     x, y = np.meshgrid(np.arange(0.0, 20.0, 2.0), np.arange(0.0, 20.0, 2.0))
     plane = Terrain(0.0, 0.0, 2.0, (0.25 * x - 0.5 * y).astype(np.float32))
     assert len(plane.creases((3.0, 3.0, 15.0, 15.0))) == 0
@@ -63,10 +90,14 @@ def test_a_height_does_not_depend_on_its_company(points: list[tuple[float, float
     """Many points asked at once get the very bits that each gets alone."""
     terrain = HILLY.terrain
     assert terrain is not None
-    assert terrain.height(points).tolist() == [float(terrain.height([point])[0]) for point in points]
+    assert terrain.height(points).tolist() == [
+        float(terrain.height([point])[0]) for point in points
+    ]
 
 
-def straight(z: list[float], length_m: float = 100.0, y_m: float = 0.0, on: On = "street", edge: str = "e") -> Course:
+def straight(
+    z: list[float], length_m: float = 100.0, y_m: float = 0.0, on: On = "street", edge: str = "e"
+) -> Course:
     """A course eastwards with elevations at even distances, zeros left away as netconvert does."""
     at = zip(np.linspace(0.0, length_m, len(z)), z, strict=True)
     points = [f"{x:.2f},{y_m:.2f}" + ("" if h == 0.0 else f",{h:.2f}") for x, h in at]
@@ -107,7 +138,8 @@ def test_the_land_is_level_across_a_street() -> None:
 
 
 def test_steep_streets_are_clamped_and_counted() -> None:
-    """A fault of 6 m in the middle of a street becomes a ramp of the steepest grade allowed; its ends stay."""
+    """A fault of 6 m in the middle of a street becomes a ramp of the steepest grade allowed; its
+    ends stay."""
     terrain, found = surveyed([straight([20.0] * 20 + [26.0] * 20, 400.0)])
     assert terrain is not None and found is not None
     level = along(terrain, 400.0)
@@ -117,14 +149,21 @@ def test_steep_streets_are_clamped_and_counted() -> None:
 
 
 def test_steps_stay_steep_and_leave_the_streets_alone() -> None:
-    """Steps of 50 % between two streets do not move them; the strip of the steps is one that no robot takes."""
+    """Steps of 50 % between two streets do not move them; the strip of the steps is one that no
+    robot takes."""
     up = course("s", "50,0,10 50,20,20", "steps")
     terrain, found = surveyed([straight([10, 10]), up, straight([20, 20], y_m=20.0)])
     assert terrain is not None and found is not None and found.clamped == 0
-    assert along(terrain) == pytest.approx(10.0, abs=0.2) and along(terrain, y_m=20.0) == pytest.approx(20.0, abs=0.2)
+    assert along(terrain) == pytest.approx(10.0, abs=0.2) and along(
+        terrain, y_m=20.0
+    ) == pytest.approx(20.0, abs=0.2)
     strip = next(iter(tiny_map().strips.values()))
-    stairs = dataclasses.replace(strip, id="stairs", line=np.array([[50.0, 1.0], [50.0, 19.0]]), width_m=2.0)
-    street = dataclasses.replace(strip, id="street", line=np.array([[0.0, 0.0], [100.0, 0.0]]), width_m=2.0)
+    stairs = dataclasses.replace(
+        strip, id="stairs", line=np.array([[50.0, 1.0], [50.0, 19.0]]), width_m=2.0
+    )
+    street = dataclasses.replace(
+        strip, id="street", line=np.array([[0.0, 0.0], [100.0, 0.0]]), width_m=2.0
+    )
     assert steep_strips(terrain, (stairs, street)) == ("stairs",)
 
 
@@ -137,9 +176,15 @@ def test_paths_up_hills_count_as_steps_only_when_steep() -> None:
 
 
 def test_streets_that_meet_at_a_corner_meet_in_height() -> None:
-    """Ends that a corner joins are drawn together, though their elevations say otherwise and its own are missing."""
-    one, two = straight([10, 10], 60.0), course("f", "62,0,16 122,0,16")
-    corner = Course("c", np.array([[60, -1, np.nan], [62, -1, np.nan], [62, 1, np.nan], [60, 1, np.nan]]), ring=True)
+    """Ends that a corner joins are drawn together, though their elevations say otherwise and its
+    own are missing."""
+    one = straight([10, 10], 60.0)
+    two = course("f", "62,0,16 122,0,16")
+    corner = Course(
+        "c",
+        np.array([[60, -1, np.nan], [62, -1, np.nan], [62, 1, np.nan], [60, 1, np.nan]]),
+        ring=True,
+    )
     apart, _ = surveyed([one, two, corner])
     joined, _ = surveyed([one, two, corner], [Meeting(2, ((0, 1), (1, 0)))])
     assert apart is not None and joined is not None
@@ -148,10 +193,14 @@ def test_streets_that_meet_at_a_corner_meet_in_height() -> None:
 
 
 def test_false_elevations_are_dropped() -> None:
-    """Spikes, steps of tens of metres, one height everywhere, hardly any height: flat ground, and the reason."""
+    """Spikes, steps of tens of metres, one height everywhere, hardly any height: flat ground, and
+    the reason."""
     rng = np.random.default_rng(1)
     for courses, why in (
-        ([straight(rng.uniform(0, 60, 60).tolist(), 400.0)], "of 60 points have one that can be true"),
+        (
+            [straight(rng.uniform(0, 60, 60).tolist(), 400.0)],
+            "of 60 points have one that can be true",
+        ),
         ([straight(rng.uniform(0, 60, 20).repeat(3).tolist(), 400.0)], "are steeper than 25%"),
         ([straight([7.0] * 9)], "same everywhere"),
         ([straight([30.0, 31.0] + [0.0] * 7, 20.0)], "only 2 of 9 points"),
@@ -171,14 +220,21 @@ def test_bridges_steps_and_paths_are_told_by_type_and_params() -> None:
     """SUMO's type names, and OSM's tags in the params."""
     assert what_lies_there("highway.secondary_tunnel", {}, False) == "raised"
     assert what_lies_there("highway.path", {"bridge": "yes"}, True) == "raised"
-    assert what_lies_there("highway.service", {"tunnel": "building_passage", "layer": "0"}, False) == "street"
+    assert (
+        what_lies_there("highway.service", {"tunnel": "building_passage", "layer": "0"}, False)
+        == "street"
+    )
     assert what_lies_there("highway.steps", {}, True) == "steps"
     assert what_lies_there("highway.footway", {}, True) == "path"
 
 
-HEIGHTS = st.one_of(st.just(math.nan), st.just(0.0), st.floats(-40.0, 90.0), st.floats(allow_nan=True, width=32))
+HEIGHTS = st.one_of(
+    st.just(math.nan), st.just(0.0), st.floats(-40.0, 90.0), st.floats(allow_nan=True, width=32)
+)
 LINES = st.lists(
-    st.lists(st.tuples(st.floats(-90.0, 90.0), st.floats(-90.0, 90.0), HEIGHTS), min_size=1, max_size=8),
+    st.lists(
+        st.tuples(st.floats(-90.0, 90.0), st.floats(-90.0, 90.0), HEIGHTS), min_size=1, max_size=8
+    ),
     max_size=6,
 )
 
@@ -189,8 +245,13 @@ def test_no_elevations_are_too_bad_to_be_read(
     lines: list[list[tuple[float, float, float]]], on: On, ring: bool
 ) -> None:
     """Whatever a net says, there is a finite land or none, and a drop has its reason."""
-    courses = [Course(f"e{i}", np.array(line), "street" if i else on, ring and i == 0) for i, line in enumerate(lines)]
-    meets = [Meeting(0, tuple((i, i % 2) for i in range(1, len(courses))))] if len(courses) > 1 else []
+    courses = [
+        Course(f"e{i}", np.array(line), "street" if i else on, ring and i == 0)
+        for i, line in enumerate(lines)
+    ]
+    meets = (
+        [Meeting(0, tuple((i, i % 2) for i in range(1, len(courses))))] if len(courses) > 1 else []
+    )
     terrain, found = surveyed(courses, meets)
     assert terrain is None or np.isfinite(terrain.heights).all()
     assert found is None or (terrain is None) == bool(found.dropped)
@@ -198,9 +259,12 @@ def test_no_elevations_are_too_bad_to_be_read(
 
 @given(st.data(), st.integers(2, 30))
 def test_clamped_heights_keep_their_bounds(data: st.DataObject, count: int) -> None:
-    """On any graph, from any heights: no joint rises more than it may, and what keeps the bounds is left alone."""
+    """On any graph, from any heights: no joint rises more than it may, and what keeps the bounds is
+    left alone."""
     z = np.array(data.draw(st.lists(st.floats(-400.0, 5000.0), min_size=count, max_size=count)))
-    joints = data.draw(st.lists(st.tuples(*[st.integers(0, count - 1)] * 2, st.floats(0.06, 3.0)), max_size=60))
+    joints = data.draw(
+        st.lists(st.tuples(*[st.integers(0, count - 1)] * 2, st.floats(0.06, 3.0)), max_size=60)
+    )
     tail, head = (np.array([j[k] for j in joints], dtype=np.intp) for k in (0, 1))
     most = np.array([j[2] for j in joints])
     level = clamped(z, tail, head, most)
@@ -209,7 +273,8 @@ def test_clamped_heights_keep_their_bounds(data: st.DataObject, count: int) -> N
 
 
 def test_tiles_on_hills_have_no_cracks_and_lie_on_the_land() -> None:
-    """Edges are shared by two triangles; off the ramps triangles are within a millimetre of the land."""
+    """Edges are shared by two triangles; off the ramps triangles are within a millimetre of the
+    land."""
     terrain = HILLY.terrain
     assert terrain is not None
     for key in [(-1, -1), (0, 0), (0, -1)]:
@@ -221,12 +286,17 @@ def test_tiles_on_hills_have_no_cracks_and_lie_on_the_land() -> None:
             faces = triangles(tile, name)
             inside = faces[np.hypot(*(faces.mean(axis=1)[:, :2]).T) > 12.0].mean(axis=1)
             above = CURB_M if name == "sidewalk" else 0.0
-            assert len(inside) and np.abs(inside[:, 2] - terrain.height(inside[:, :2]) - above).max() < 1e-3
+            assert (
+                len(inside)
+                and np.abs(inside[:, 2] - terrain.height(inside[:, :2]) - above).max() < 1e-3
+            )
 
 
 def test_heights_on_hills_meet_at_tile_borders_and_follow_the_mesh() -> None:
-    """Two tiles agree on their border, and a tile's heights are those of its own vertices, the curb's foot included."""
-    left, right = build_tile(HILLY, (-1, -1)), build_tile(HILLY, (0, -1))
+    """Two tiles agree on their border, and a tile's heights are those of its own vertices, the
+    curb's foot included."""
+    left = build_tile(HILLY, (-1, -1))
+    right = build_tile(HILLY, (0, -1))
     border = np.column_stack([np.full(400, square((0, -1))[0]), np.linspace(-40.0, -1e-3, 400)])
     assert np.allclose(left.height(border), right.height(border), atol=1e-9)
     for name, mesh in right.parts.items():
@@ -237,7 +307,8 @@ def test_heights_on_hills_meet_at_tile_borders_and_follow_the_mesh() -> None:
 
 def test_ramps_rise_one_in_twelve_over_the_land() -> None:
     """Ahead of a crossing the ground is the land and the ramp's own rise, as on flat ground."""
-    flat, hilly = build_tile(tiny_map(), key_at(0.0, 5.0)), build_tile(HILLY, key_at(0.0, 5.0))
+    flat = build_tile(tiny_map(), key_at(0.0, 5.0))
+    hilly = build_tile(HILLY, key_at(0.0, 5.0))
     assert HILLY.terrain is not None
     ahead = np.column_stack([np.zeros(60), np.linspace(3.51, 6.4, 60)])
     ramp = hilly.height(ahead) - HILLY.terrain.height(ahead)
@@ -246,8 +317,10 @@ def test_ramps_rise_one_in_twelve_over_the_land() -> None:
 
 
 def test_nothing_floats_on_a_hill() -> None:
-    """Houses reach down to the lowest land around them, props to the lowest under them; doors are at the street."""
-    ground, terrain = StreetSurface(HILLY, 4), HILLY.terrain
+    """Houses reach down to the lowest land around them, props to the lowest under them; doors are
+    at the street."""
+    ground = StreetSurface(HILLY, 4)
+    terrain = HILLY.terrain
     assert terrain is not None
     houses = [b for key in KEYS for b in ground.buildings(key)]
     assert len(houses) > 5
@@ -272,7 +345,9 @@ def test_a_snapshot_keeps_the_land() -> None:
     assert again.terrain is not None and HILLY.terrain is not None and again.elevation == told
     assert np.array_equal(again.terrain.heights, HILLY.terrain.heights)
     assert again.terrain.heights.dtype == np.float32 and again.terrain.step_m == 2.0
-    assert again.steep == {"a", "b"} and Port("c", 1) in again.too_steep and len(again.too_steep) == 5
+    assert (
+        again.steep == {"a", "b"} and Port("c", 1) in again.too_steep and len(again.too_steep) == 5
+    )
     flat = thawed(map_as_bytes(tiny_map()))
     assert flat.terrain is None and flat.elevation is None
 
@@ -282,16 +357,26 @@ def test_corners_too_steep_to_cross_are_closed() -> None:
     cliff = np.where(np.arange(40)[:, None] >= 22, 10.0, 0.0) * np.ones((1, 40))
     terrain = Terrain(-40.0, -40.0, 2.0, cliff.astype(np.float32))
     strip = next(iter(tiny_map().strips.values()))
-    ends = {"low1": [(-20.0, 0.0), (-5.0, 0.0)], "low2": [(20.0, 0.0), (5.0, 0.0)], "high": [(0.0, 6.0), (0.0, 20.0)]}
-    strips = {n: dataclasses.replace(strip, id=n, line=np.array(line), width_m=2.0) for n, line in ends.items()}
-    corner = Corner("w", shapely.box(-5, -2, 5, 6), (Port("low1", 1), Port("low2", 1), Port("high", 0)))
+    ends = {
+        "low1": [(-20.0, 0.0), (-5.0, 0.0)],
+        "low2": [(20.0, 0.0), (5.0, 0.0)],
+        "high": [(0.0, 6.0), (0.0, 20.0)],
+    }
+    strips = {
+        n: dataclasses.replace(strip, id=n, line=np.array(line), width_m=2.0)
+        for n, line in ends.items()
+    }
+    corner = Corner(
+        "w", shapely.box(-5, -2, 5, 6), (Port("low1", 1), Port("low2", 1), Port("high", 0))
+    )
     assert steep_ports(terrain, strips, [corner], ()) == (("high", 0),)
     level = Terrain(-40.0, -40.0, 2.0, np.zeros((40, 40), dtype=np.float32))
     assert steep_ports(level, strips, [corner], ()) == ()
 
 
 def test_flat_ground_is_what_it_was() -> None:
-    """Without terrain a tile is at height 0; a land of height 0 gives the same heights and leans."""
+    """Without terrain a tile is at height 0; a land of height 0 gives the same heights and
+    leans."""
     flat = StreetSurface(tiny_map(), 4)
     zero = Terrain(-200.0, -200.0, 2.0, np.zeros((200, 200), dtype=np.float32))
     level = StreetSurface(dataclasses.replace(tiny_map(), terrain=zero), 4)

@@ -8,11 +8,21 @@ import numpy as np
 import pytest
 import shapely
 
+from physics.ground.tiles import (
+    CURB_M,
+    TILE_M,
+    Key,
+    Tile,
+    build_tile,
+    distance_to,
+    key_at,
+    keys_within,
+    square,
+)
 from physics.street.buildings import Frontage
 from physics.street.frontage import frontage_in
 from physics.street.paint import paint_in
-from physics.world.tiles import CURB_M, TILE_M, Key, Tile, build_tile, distance_to, key_at, keys_within, square
-from tests.tiny_street import KEYS, no_cracks, plan_areas, tiny_map, triangles
+from tests.support.tiny_street import KEYS, no_cracks, plan_areas, tiny_map, triangles
 
 MAP = tiny_map()
 
@@ -32,30 +42,36 @@ def test_a_tile_is_covered_once(tiles: dict[Key, Tile]) -> None:
 
 
 def test_neighbouring_triangles_share_their_corners(tiles: dict[Key, Tile]) -> None:
-    """Within a tile every edge off the border is shared by two triangles, walls and their feet included."""
+    """Within a tile every edge off the border is shared by two triangles, walls and their feet
+    included."""
     for key, tile in tiles.items():
         no_cracks(key, np.concatenate([triangles(tile, name) for name in tile.parts]))
 
 
 def test_heights_meet_at_tile_borders(tiles: dict[Key, Tile]) -> None:
     """Two tiles agree on the height of points on their common border, on the ramps too."""
-    left, right = tiles[(-1, -1)], tiles[(0, -1)]
+    left = tiles[(-1, -1)]
+    right = tiles[(0, -1)]
     x = square((0, -1))[0]
     border = np.column_stack([np.full(400, x), np.linspace(-20.0, -1e-3, 400)])
     assert np.allclose(left.height(border), right.height(border), atol=1e-9)
 
 
 def test_the_curb_ramp_rises_one_in_twelve() -> None:
-    """From the crossing's end the corner climbs 1:12 to the curb's height; the flares follow the same rule."""
+    """From the crossing's end the corner climbs 1:12 to the curb's height; the flares follow the
+    same rule."""
     tile = build_tile(MAP, key_at(0.0, 5.0))
     ahead = tile.height([[0.0, 3.5 + d] for d in (0.001, 0.36, 0.72, 1.44, 2.0)])
     assert np.allclose(ahead, [0.0, 0.03, 0.06, 0.12, 0.12], atol=2e-4)
     mesh = tile.parts["ramp"]
-    assert np.allclose(mesh.vertices[:, 2], tile.height(mesh.vertices[:, :2] + [0.0, 1e-9]), atol=1e-6)
+    assert np.allclose(
+        mesh.vertices[:, 2], tile.height(mesh.vertices[:, :2] + [0.0, 1e-9]), atol=1e-6
+    )
 
 
 def test_the_kinds_of_ground_lie_where_the_map_says(tiles: dict[Key, Tile]) -> None:
-    """Triangles' middles: sidewalk on strips, stripes on the crossing, road on lanes, verge on the verge."""
+    """Triangles' middles: sidewalk on strips, stripes on the crossing, road on lanes, verge on the
+    verge."""
     where = {
         "road": shapely.box(-80, -3.5, 80, 3.5),
         "stripe": shapely.box(-1.6, -3.5, 1.6, 3.5),
@@ -80,7 +96,8 @@ def test_tiles_do_not_depend_on_the_order(tiles: dict[Key, Tile]) -> None:
 
 
 def test_keys_cover_a_disk() -> None:
-    """The tiles within a radius hold every point of the disk, and each is no farther than the radius."""
+    """The tiles within a radius hold every point of the disk, and each is no farther than the
+    radius."""
     keys = keys_within(13.0, -7.0, 30.0)
     angle = np.linspace(0.0, 6.28, 60)
     assert {key_at(13.0 + 29.9 * np.cos(a), -7.0 + 29.9 * np.sin(a)) for a in angle} <= set(keys)
@@ -88,7 +105,8 @@ def test_keys_cover_a_disk() -> None:
 
 
 def test_buildings_line_the_street_and_keep_off_it() -> None:
-    """Both sides have buildings, none over walkable ground or road, and they begin at the frontage distance."""
+    """Both sides have buildings, none over walkable ground or road, and they begin at the frontage
+    distance."""
     frontage = Frontage(MAP, seed=4)
     built = [b for key in keys_within(0.0, 0.0, 100.0) for b in frontage.in_tile(key)]
     street = shapely.box(-80, -8, 80, 6.5)
@@ -119,9 +137,15 @@ def test_paint_lies_on_its_ground() -> None:
         tile = build_tile(street_map, key)
         for name, mesh in paint_in(street_map, tile).items():
             middles = mesh.vertices[mesh.triangles].mean(axis=1)
-            kinds = ("strip", "corner") if name.startswith("tactile") else ("lane", "junction", "strip")
+            kinds = (
+                ("strip", "corner") if name.startswith("tactile") else ("lane", "junction", "strip")
+            )
             for x, y in middles[:, :2].tolist():
-                assert any(street_map.near(kind, shapely.Point(x, y)) for kind in kinds), (name, x, y)
+                assert any(street_map.near(kind, shapely.Point(x, y)) for kind in kinds), (
+                    name,
+                    x,
+                    y,
+                )
             above = mesh.vertices[:, 2] - tile.height(mesh.vertices[:, :2])
             assert (above.min() > 0.003 and above.max() < 0.005) or name.startswith("tactile")
             found[name] = found.get(name, 0) + len(mesh)
@@ -129,14 +153,18 @@ def test_paint_lies_on_its_ground() -> None:
 
 
 def test_domes_lie_in_the_triangles_of_the_ground() -> None:
-    """Beside a crossing that meets its corner at an angle the ground bends many times: no field of domes is under it or
-    more than 5 mm above it anywhere, and together they cover the fields."""
+    """Beside a crossing that meets its corner at an angle the ground bends many times: no field of
+    domes is under it or more than 5 mm above it anywhere, and together they cover the fields."""
     line = np.array([[-1.4, -4.0], [1.4, 4.0]])
     askew = dataclasses.replace(
-        MAP.strips[":c0"], line=line, polygon=shapely.LineString(line).buffer(1.6, cap_style="flat"), width_m=3.2
+        MAP.strips[":c0"],
+        line=line,
+        polygon=shapely.LineString(line).buffer(1.6, cap_style="flat"),
+        width_m=3.2,
     )
     street_map = dataclasses.replace(MAP, strips={**MAP.strips, ":c0": askew})
-    spread, checked = [], 0
+    spread = []
+    checked = 0
     for key in keys_within(0.0, 0.0, 60.0):
         tile = build_tile(street_map, key)
         domes = paint_in(street_map, tile).get("tactile-domes")
@@ -162,15 +190,17 @@ def test_domes_lie_in_the_triangles_of_the_ground() -> None:
 
 
 def test_the_frontage_is_paved_where_there_are_shops(tiles: dict[Key, Tile]) -> None:
-    """In a generated city it is covered before shops from the sidewalk to the houses, without holes or doubles, a
-    little above the ground, with a rim down to it where it ends; a home's driveway reaches from its sidewalk to the
-    houses; the ground itself stays what it was."""
+    """In a generated city it is covered before shops from the sidewalk to the houses, without holes
+    or doubles, a little above the ground, with a rim down to it where it ends; a home's driveway
+    reaches from its sidewalk to the houses; the ground itself stays what it was."""
     changed = {
         "nw": dataclasses.replace(MAP.strips["nw"], street_class="commercial"),
         "ne": dataclasses.replace(MAP.strips["ne"], street_class="residential", driveways=(30.0,)),
     }
     street_map = dataclasses.replace(MAP, strips={**MAP.strips, **changed}, planned=True)
-    covered, layers, rims = [], set(), []
+    covered = []
+    layers = set()
+    rims = []
     for key in KEYS:
         tile = build_tile(street_map, key)
         assert set(tile.parts) - {"ramp"} == set(tiles[key].parts) - {"ramp"}

@@ -28,8 +28,8 @@ def in_picture(taken: Shot, xy: Floats) -> NDArray[np.bool_]:
 
 @pytest.mark.parametrize("name", SHOTS)
 def test_nothing_that_a_picture_shows_is_left_out(name: str) -> None:
-    """Of ten thousand places around the eye, all that lie in the picture are taken for seen, and most others are not
-    where the picture is level."""
+    """Of ten thousand places around the eye, all that lie in the picture are taken for seen, and
+    most others are not where the picture is level."""
     taken = SHOTS[name]
     xy = taken.eye_m[:2] + np.random.default_rng(3).uniform(-30.0, 30.0, (10_000, 2))
     shown = in_picture(taken, xy)

@@ -16,8 +16,8 @@ from cosim.place.map_check import NetFacts, check_map
 from cosim.place.street_map import Corner, Lane, Port, StreetMap, Strip
 from cosim.place.terrain import Elevation
 from cosim.report.mapsheet import MARKS, SIGNAL, draw_map
-from sumo_nets.net.netfacts import facts_of, walks_of
-from sumo_nets.net.netfile import read_net
+from sumo_nets.net.net_facts import facts_of, walks_of
+from sumo_nets.net.net_file import read_net
 
 
 def strip(name: str, *points: tuple[float, float], width_m: float = 2.0, **more: object) -> Strip:
@@ -30,7 +30,9 @@ def strip(name: str, *points: tuple[float, float], width_m: float = 2.0, **more:
     )
 
 
-def road(name: str, *points: tuple[float, float], width_m: float = 6.0, internal: bool = False) -> Lane:
+def road(
+    name: str, *points: tuple[float, float], width_m: float = 6.0, internal: bool = False
+) -> Lane:
     line = np.array(points)
     polygon = shapely.LineString(line).buffer(width_m / 2.0, cap_style="flat")
     return Lane(f"{name}_0", name, "road", line, width_m, polygon, internal)
@@ -50,7 +52,8 @@ def place(strips: list[Strip], corners: list[Corner], lanes: list[Lane]) -> Stre
 
 
 def town() -> StreetMap:
-    """Two sidewalks of 200 m on both sides of a road, joined by a crossing in the east; and what is wrong with it."""
+    """Two sidewalks of 200 m on both sides of a road, joined by a crossing in the east; and what is
+    wrong with it."""
     strips = [
         strip("south", (0, 0), (200, 0), corners=(None, "cs")),
         strip("north", (0, 12), (200, 12), corners=(None, "cn")),
@@ -64,7 +67,11 @@ def town() -> StreetMap:
         Corner("cs", shapely.box(200, -1, 202, 1), (Port("south", 1), Port(":x", 0))),
         Corner("cn", shapely.box(200, 11, 202, 13), (Port("north", 1), Port(":x", 1))),
     ]
-    return place(strips, corners, [road("street", (0, 6), (200, 6)), road("inner", (200, 6), (208, 6), internal=True)])
+    return place(
+        strips,
+        corners,
+        [road("street", (0, 6), (200, 6)), road("inner", (200, 6), (208, 6), internal=True)],
+    )
 
 
 def test_figures_of_a_made_up_place() -> None:
@@ -90,7 +97,8 @@ def test_figures_of_a_made_up_place() -> None:
 
 
 def test_corners_that_cars_drive_over_are_counted_and_listed() -> None:
-    """A path of cars inside a junction that leads over a corner is one; over a crossing alone, or of bicycles, none."""
+    """A path of cars inside a junction that leads over a corner is one; over a crossing alone, or
+    of bicycles, none."""
     clear = town()
     turn = road("turn", (199, -0.5), (201, 1), (201, 11), internal=True)
     check = check_map(dataclasses.replace(clear, lanes={**clear.lanes, "turn_0": turn}))
@@ -104,16 +112,22 @@ def test_corners_that_cars_drive_over_are_counted_and_listed() -> None:
     bicycles = dataclasses.replace(turn, cars=False)
     over = road("over", (201, 2), (201, 10), internal=True)
     for lane in (bicycles, over):
-        assert check_map(dataclasses.replace(clear, lanes={**clear.lanes, "turn_0": lane})).driven_over == 0
+        assert (
+            check_map(dataclasses.replace(clear, lanes={**clear.lanes, "turn_0": lane})).driven_over
+            == 0
+        )
 
 
 def test_a_place_in_pieces_is_warned_of() -> None:
-    """Where the largest island has less than 60 % of the length the check says what that means and what to do."""
+    """Where the largest island has less than 60 % of the length the check says what that means and
+    what to do."""
     whole = town()
     assert check_map(whole).warnings == ()
     far = strip("far", (0, 90), (400, 90))
     (warning,) = check_map(dataclasses.replace(whole, strips={**whole.strips, "far": far})).warnings
-    assert warning.startswith("the largest of 6 islands of connected walkways has 42% of their length: scenarios are")
+    assert warning.startswith(
+        "the largest of 6 islands of connected walkways has 42% of their length: scenarios are"
+    )
     assert "Import another part (--bbox)" in warning
 
 
@@ -123,7 +137,10 @@ def test_places_without_walks_or_corners_are_not_usable() -> None:
     assert check_map(lonely).reasons[0].startswith("its sidewalks are not connected")
     bare = dataclasses.replace(lonely, strips={})
     check = check_map(bare)
-    assert check.reasons == ("nothing is walkable: no sidewalk, path or crossing",) and check.islands == ()
+    assert (
+        check.reasons == ("nothing is walkable: no sidewalk, path or crossing",)
+        and check.islands == ()
+    )
 
 
 def test_a_check_survives_json() -> None:
@@ -133,13 +150,16 @@ def test_a_check_survives_json() -> None:
 
 
 def test_the_picture_marks_problems() -> None:
-    """Every kind of problem has a colour, and those of the place are in its picture; parts can be drawn alone."""
+    """Every kind of problem has a colour, and those of the place are in its picture; parts can be
+    drawn alone."""
     street_map = town()
     check = check_map(street_map)
     image = draw_map(street_map, check)
     numbers = np.unique(image.reshape(-1, 3).astype(int) @ (1 << 16, 1 << 8, 1))
     colours = {(n >> 16, n >> 8 & 255, n & 255) for n in numbers.tolist()}
-    assert {MARKS[kind][0] for kind in ("narrow", "on_road", "stacked")} <= colours and SIGNAL in colours
+    assert {
+        MARKS[kind][0] for kind in ("narrow", "on_road", "stacked")
+    } <= colours and SIGNAL in colours
     assert {p.kind for p in check.problems} <= set(MARKS)
     part = draw_map(street_map, check, (190.0, -10.0, 210.0, 20.0))
     assert part.shape[1] == 200
@@ -172,7 +192,8 @@ def net() -> ET.Element:
 
 
 def test_facts_of_a_net() -> None:
-    """Kinds of walkways, elevations, levels and signals are told apart; the last program of a signal counts."""
+    """Kinds of walkways, elevations, levels and signals are told apart; the last program of a
+    signal counts."""
     facts: NetFacts = facts_of(net())
     assert (facts.version, facts.left_hand, facts.projected, facts.edges) == ("1.9", True, True, 4)
     assert (facts.pavement_km, facts.shared_km, facts.mixed_km) == (pytest.approx(0.51), 0.3, 0.2)
@@ -186,11 +207,21 @@ def test_facts_of_a_net() -> None:
 
 
 def test_notes_say_what_is_not_used() -> None:
-    """Elevations that are dropped or changed, bridges, level crossings and dead signals are named in words."""
-    land = Elevation(low_m=0.0, high_m=90.0, points=50, missing=7, false_share=0.1, clamped=3, moved_m=1.25)
-    false = dataclasses.replace(town(), elevation=dataclasses.replace(land, dropped="it is the same everywhere"))
-    assert "elevation 0 to 90 m is dropped, the ground is flat: it is the same" in check_map(false).notes[-1]
-    kept = dataclasses.replace(town(), elevation=dataclasses.replace(land, steep=(next(iter(town().strips)),)))
+    """Elevations that are dropped or changed, bridges, level crossings and dead signals are named
+    in words."""
+    land = Elevation(
+        low_m=0.0, high_m=90.0, points=50, missing=7, false_share=0.1, clamped=3, moved_m=1.25
+    )
+    false = dataclasses.replace(
+        town(), elevation=dataclasses.replace(land, dropped="it is the same everywhere")
+    )
+    assert (
+        "elevation 0 to 90 m is dropped, the ground is flat: it is the same"
+        in check_map(false).notes[-1]
+    )
+    kept = dataclasses.replace(
+        town(), elevation=dataclasses.replace(land, steep=(next(iter(town().strips)),))
+    )
     notes = "\n".join(check_map(kept, None, facts_of(net())).notes)
     assert [p.piece for p in check_map(kept).problems if p.kind == "steep"] == list(kept.steep)
     for words in (

@@ -14,14 +14,17 @@ from cosim.place.street_map import Corner, Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
 
 
-def strip(name: str, points: list[tuple[float, float]], corners: tuple[str | None, str | None]) -> Strip:
+def strip(
+    name: str, points: list[tuple[float, float]], corners: tuple[str | None, str | None]
+) -> Strip:
     line = np.array(points, dtype=float)
     kind = "crossing" if "_c" in name else "sidewalk"
     return Strip(name, kind, line, 1.92, LineString(points).buffer(0.96, cap_style="flat"), corners)  # type: ignore[arg-type]
 
 
 def square() -> StreetMap:
-    """A ring south -> east -> north -> west of four strips (north is a crossing), and an island strip.
+    """A ring south -> east -> north -> west of four strips (north is a crossing), and an island
+    strip.
 
     Corners sw, se, ne, nw; each corner is 2 m wide, and south is 40 m long, the others 20 m.
     """
@@ -47,14 +50,16 @@ HOP = math.sqrt(2.0)
 
 
 def test_shortest_takes_the_shorter_way_round() -> None:
-    """The way from the south-west to the north-west corner leads along west, not round by the crossing."""
+    """The way from the south-west to the north-west corner leads along west, not round by the
+    crossing."""
     path, length_m = WalkGraph(square()).shortest(Port("south", 0), Port(":n_c0", 1)) or ([], 0.0)
     assert path == [Port("south", 0), Port("west", 1), Port("west", 0), Port(":n_c0", 1)]
     assert length_m == pytest.approx(HOP + 20 + HOP)
 
 
 def test_a_closed_port_is_not_passed_in_either_direction() -> None:
-    """With one end of the crossing closed, the way to and from it leads along the rest of the ring."""
+    """With one end of the crossing closed, the way to and from it leads along the rest of the
+    ring."""
     graph = WalkGraph(square())
     closed = frozenset({Port(":n_c0", 1)})
     there = graph.shortest(Port("west", 0), Port(":n_c0", 1), closed)
@@ -69,7 +74,12 @@ def test_no_way_is_none() -> None:
     """The island, and a strip closed at both ends, cannot be reached."""
     graph = WalkGraph(square())
     assert graph.shortest(Port("south", 0), Port("island", 0)) is None
-    assert graph.shortest(Port("south", 0), Port("east", 0), frozenset({Port("east", 0), Port("east", 1)})) is None
+    assert (
+        graph.shortest(
+            Port("south", 0), Port("east", 0), frozenset({Port("east", 0), Port("east", 1)})
+        )
+        is None
+    )
 
 
 def test_components_and_the_largest() -> None:
@@ -81,10 +91,12 @@ def test_components_and_the_largest() -> None:
 
 
 def test_reach_is_limited_and_agrees_with_shortest() -> None:
-    """Every port within the limit has the distance and path of `shortest`; those beyond are infinitely far."""
+    """Every port within the limit has the distance and path of `shortest`; those beyond are
+    infinitely far."""
     graph = WalkGraph(square())
     start = Port("south", 0)
-    near, everything = graph.reach(start, limit_m=30.0), graph.reach(start)
+    near = graph.reach(start, limit_m=30.0)
+    everything = graph.reach(start)
     assert near.within(0.0, 30.0) == [start, Port(":n_c0", 1), Port("west", 0), Port("west", 1)]
     assert near.to(Port("spur", 1)) == math.inf and near.path(Port("spur", 1)) is None
     for goal in everything.within(0.0, 1e6):
@@ -103,7 +115,8 @@ def test_others_are_the_ports_across_the_corner() -> None:
 
 
 def test_wander_is_connected_and_keeps_out_of_traps() -> None:
-    """A wanderer goes from strip to neighbouring strip, never into the dead end, and stops on a sidewalk."""
+    """A wanderer goes from strip to neighbouring strip, never into the dead end, and stops on a
+    sidewalk."""
     street_map = square()
     graph = WalkGraph(street_map)
     for seed in range(50):
@@ -115,7 +128,8 @@ def test_wander_is_connected_and_keeps_out_of_traps() -> None:
 
 
 def test_wander_never_passes_a_closed_port() -> None:
-    """With the crossing closed at its far end nobody sets out over it, nor leaves a strip through a closed port."""
+    """With the crossing closed at its far end nobody sets out over it, nor leaves a strip through a
+    closed port."""
     graph = WalkGraph(square())
     rng = np.random.default_rng(1)
     closed = frozenset({Port(":n_c0", 1)})

@@ -1,4 +1,5 @@
-"""`follow`: its graph made of published weights, people and ground in pictures, and the arcs that it takes."""
+"""`follow`: its graph made of published weights, people and ground in pictures, and the arcs that
+it takes."""
 
 from __future__ import annotations
 
@@ -16,20 +17,30 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import UsageError
 from cosim.core.state import STILL, Command
-from cosim.episode.given import calibration_of
-from cosim.episode.ports import CameraSpec
+from cosim.episode.manifest_checks import calibration_of
 from cosim.policies.follow.espnetv2 import street_graph
 from cosim.policies.follow.ground import GROUND_CELL_M, Ground, walkable_pixels
-from cosim.policies.follow.networks import ESPNET_GRAPH, ESPNET_WEIGHTS, YOLOX_NANO, weights_in_words
-from cosim.policies.follow.people import boxes_of
+from cosim.policies.follow.networks import (
+    ESPNET_GRAPH,
+    ESPNET_WEIGHTS,
+    YOLOX_NANO,
+    weights_in_words,
+)
+from cosim.policies.follow.policy import (
+    LOOKS_M,
+    WaitForPeople,
+    best_arc,
+    boxes_of,
+    command_along,
+    turn_aside,
+)
 from cosim.policies.follow.torch_file import read_torch_file
-from cosim.policies.follow.waiting import WaitForPeople
-from cosim.policies.follow.ways import LOOKS_M, best_arc, command_along, turn_aside
 from cosim.policies.load import load_policy
 from cosim.policies.onnx.graph import Graph
 from cosim.policies.onnx.policy import in_grey
+from cosim.spec.camera import CameraSpec
 from cosim.spec.robot import COURIER, ROBOTS, Robot
-from tests.policies.onnx.graphs import tiny_graph
+from tests.support.graphs import tiny_graph
 
 PICTURES = Path(__file__).parent / "pictures"
 WEIGHTS = Path(os.environ.get("COSIM_WEIGHTS") or Path(__file__).parents[3] / "shared" / "weights")
@@ -42,8 +53,12 @@ NOBODY = np.zeros((0, 2))
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with both graphs, one of them made anew."""
-    if missing := [one.name for one in (ESPNET_WEIGHTS, YOLOX_NANO) if not (WEIGHTS / one.name).is_file()]:
-        pytest.skip(f"the published weights {', '.join(missing)} are not in {WEIGHTS} (COSIM_WEIGHTS)")
+    if missing := [
+        one.name for one in (ESPNET_WEIGHTS, YOLOX_NANO) if not (WEIGHTS / one.name).is_file()
+    ]:
+        pytest.skip(
+            f"the published weights {', '.join(missing)} are not in {WEIGHTS} (COSIM_WEIGHTS)"
+        )
     folder = tmp_path_factory.mktemp("weights")
     (folder / YOLOX_NANO.name).symlink_to(WEIGHTS / YOLOX_NANO.name)
     (folder / ESPNET_GRAPH.name).write_bytes(
@@ -67,7 +82,8 @@ def test_every_number_of_the_file_has_its_place_in_the_graph(weights: Path) -> N
 
 
 def test_espnetv2_sees_a_sidewalk_between_two_verges(weights: Path) -> None:
-    """In pictures of our street the pavement is walkable, and grass and houses are not; mirrored it is the mirrored."""
+    """In pictures of our street the pavement is walkable, and grass and houses are not; mirrored it
+    is the mirrored."""
     network = Graph(weights / ESPNET_GRAPH.name)
     street = picture("front_left")
     walkable = walkable_pixels(street, network)
@@ -98,11 +114,17 @@ def test_follow_turns_back_to_the_sidewalk_and_a_mirrored_street_mirrors_its_tur
         assert sign * turn(street) > 0.1 and sign * turn(street[:, ::-1]) < -0.1
 
 
-def test_follow_without_its_weights_says_how_they_are_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The command, the file that it takes, and where that is to be had; another file of the name is refused."""
+def test_follow_without_its_weights_says_how_they_are_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The command, the file that it takes, and where that is to be had; another file of the name is
+    refused."""
     monkeypatch.setenv("COSIM_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
-    with pytest.raises(UsageError, match=r"missing: from `python -m cosim.policies.follow.espnetv2 .*\.pth`.*EdgeNets"):
+    with pytest.raises(
+        UsageError,
+        match=r"missing: from `python -m cosim.policies.follow.espnetv2 .*\.pth`.*EdgeNets",
+    ):
         load_policy("follow")
     assert weights_in_words() == f"weights missing ({ESPNET_GRAPH.name}, {YOLOX_NANO.name})"
     (tmp_path / ESPNET_GRAPH.name).write_bytes(b"\x3a\x00")
@@ -110,14 +132,22 @@ def test_follow_without_its_weights_says_how_they_are_made(tmp_path: Path, monke
     with pytest.raises(UsageError, match=r"policy 'follow': .*city_512x256\.onnx: "):
         load_policy("follow")
     (tmp_path / ESPNET_GRAPH.name).write_bytes(tiny_graph())
-    with pytest.raises(UsageError, match=r"city_512x256\.onnx: cannot be run by onnxruntime: .*picture"):
+    with pytest.raises(
+        UsageError, match=r"city_512x256\.onnx: cannot be run by onnxruntime: .*picture"
+    ):
         load_policy("follow")
 
 
 def test_a_file_that_is_not_the_weights_is_refused_in_one_line(tmp_path: Path) -> None:
     """Its size and hash, and those wanted; nothing is written."""
     (tmp_path / "w.pth").write_bytes(b"not weights")
-    command = [sys.executable, "-m", "cosim.policies.follow.espnetv2", tmp_path / "w.pth", tmp_path / "out.onnx"]
+    command = [
+        sys.executable,
+        "-m",
+        "cosim.policies.follow.espnetv2",
+        tmp_path / "w.pth",
+        tmp_path / "out.onnx",
+    ]
     told = subprocess.run(command, capture_output=True, text=True, check=False)
     assert told.returncode == 1 and told.stderr.count("\n") == 1
     assert "w.pth: 11 bytes, BLAKE2b" in told.stderr and "1107690 bytes" in told.stderr
@@ -135,19 +165,24 @@ def test_a_file_of_weights_cannot_run_code() -> None:
 
 
 def test_boxes_are_where_the_network_says() -> None:
-    """A planted answer in the grid of 16 pixels, and its like beside it, become one box in the picture's pixels."""
+    """A planted answer in the grid of 16 pixels, and its like beside it, become one box in the
+    picture's pixels."""
     told = np.zeros((3549, 85), np.float32)
     row = 52 * 52 + 10 * 26 + 5  # of the second grid, the row 10 and the column 5
     told[row, :6] = 0.5, 0.25, np.log(2.0), np.log(4.0), 0.9, 0.9
     told[row + 1, :6] = -0.5, 0.25, np.log(2.0), np.log(4.0), 0.9, 0.6
     told[7, :6] = 0.0, 0.0, 0.0, 0.0, 0.9, 0.2
     (box,) = boxes_of(told, scale=416 / 512)
-    middle, size = np.array([5.5, 10.25]) * 16, np.array([32.0, 64.0])
-    assert np.allclose(box, np.concatenate([middle - size / 2, middle + size / 2]) * 512 / 416, atol=0.01)
+    middle = np.array([5.5, 10.25]) * 16
+    size = np.array([32.0, 64.0])
+    assert np.allclose(
+        box, np.concatenate([middle - size / 2, middle + size / 2]) * 512 / 416, atol=0.01
+    )
 
 
 def test_feet_are_where_they_stand() -> None:
-    """Who stands 4 m ahead and 1 m to the left is found there by the lower edge of the box; who hovers is left out."""
+    """Who stands 4 m ahead and 1 m to the left is found there by the lower edge of the box; who
+    hovers is left out."""
     x, y, depth = CAMERA.matrix @ (np.linalg.inv(CAMERA.on_robot) @ [4.0, 1.0, 0.0, 1.0])[:3]
     u, v = x / depth, y / depth
     feet = GROUND.feet_of(np.array([[u - 10, v - 60, u + 10, v], [200.0, 10.0, 220.0, 60.0]]))
@@ -155,7 +190,8 @@ def test_feet_are_where_they_stand() -> None:
 
 
 def test_what_is_not_walkable_lies_on_the_ground_where_it_is_seen() -> None:
-    """A picture whose left half cannot be driven on blocks the cells to the left, as far as the camera sees them."""
+    """A picture whose left half cannot be driven on blocks the cells to the left, as far as the
+    camera sees them."""
     walkable = np.ones((128, 256), np.bool_)
     walkable[:, :128] = False
     free = GROUND.free(walkable)
@@ -164,19 +200,29 @@ def test_what_is_not_walkable_lies_on_the_ground_where_it_is_seen() -> None:
 
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
 def test_arcs_keep_to_the_middle_and_lead_to_the_goal(robot: Robot) -> None:
-    """Straight on where all is free; to the goal's side; away from a wall, as far to the left as to the right."""
+    """Straight on where all is free; to the goal's side; away from a wall, as far to the left as to
+    the right."""
     assert best_arc(OPEN, NOBODY, robot, None).curvature == pytest.approx(0.0, abs=1e-9)
-    assert command_along(best_arc(OPEN, NOBODY, robot, None), robot).v_mps == pytest.approx(0.8 * robot.cruise_mps)
-    assert best_arc(OPEN, NOBODY, robot, 0.5).curvature > 0.1 > -0.1 > best_arc(OPEN, NOBODY, robot, -0.5).curvature
+    assert command_along(best_arc(OPEN, NOBODY, robot, None), robot).v_mps == pytest.approx(
+        0.8 * robot.cruise_mps
+    )
+    assert (
+        best_arc(OPEN, NOBODY, robot, 0.5).curvature
+        > 0.1
+        > -0.1
+        > best_arc(OPEN, NOBODY, robot, -0.5).curvature
+    )
     wall = OPEN.copy()
     wall[:, 46:] = False  # from 0.6 m to the left
-    away, back = best_arc(wall, NOBODY, robot, None), best_arc(wall[:, ::-1], NOBODY, robot, None)
+    away = best_arc(wall, NOBODY, robot, None)
+    back = best_arc(wall[:, ::-1], NOBODY, robot, None)
     assert away.curvature < -0.01 and away.free_m == LOOKS_M
     assert back.curvature == pytest.approx(-away.curvature)
 
 
 def test_it_goes_round_a_person_with_room_and_stops_before_one_without() -> None:
-    """On open ground it swerves; in a lane of 1.4 m it stands 0.9 m before what is kept from the person."""
+    """On open ground it swerves; in a lane of 1.4 m it stands 0.9 m before what is kept from the
+    person."""
     person = np.array([[2.5, 0.0]])
     round_him = best_arc(OPEN, person, COURIER, None)
     assert abs(round_him.curvature) > 0.1 and round_him.free_m == LOOKS_M
@@ -195,10 +241,15 @@ def test_it_turns_on_the_spot_to_the_freer_side() -> None:
 
 
 def test_it_stands_four_seconds_for_who_is_near_and_then_goes_round() -> None:
-    """Also where the detector misses them once; who comes when nobody was there for a second is waited for anew."""
-    near, far = np.array([[2.0, 0.3]]), np.array([[4.0, 0.0], [2.0, 1.5]])
+    """Also where the detector misses them once; who comes when nobody was there for a second is
+    waited for anew."""
+    near = np.array([[2.0, 0.3]])
+    far = np.array([[4.0, 0.0], [2.0, 1.5]])
     waiting = WaitForPeople()
     assert not waiting.stands(0.0, far) and not waiting.stands(0.2, NOBODY)
-    seen = [waiting.stands(t, NOBODY if t == 2.8 else near) for t in (1.0, 1.9, 2.6, 2.8, 3.2, 4.1, 4.9, 5.0)]
+    seen = [
+        waiting.stands(t, NOBODY if t == 2.8 else near)
+        for t in (1.0, 1.9, 2.6, 2.8, 3.2, 4.1, 4.9, 5.0)
+    ]
     assert seen == [True, True, True, False, True, True, True, False]
     assert not waiting.stands(5.4, near) and waiting.stands(7.0, near)

@@ -1,4 +1,5 @@
-"""What stands on the way: the room beside it, the line led round it, and the oracle driven past it."""
+"""What stands on the way: the room beside it, the line led round it, and the oracle driven past
+it."""
 
 from __future__ import annotations
 
@@ -14,10 +15,10 @@ from shapely.geometry.base import BaseGeometry
 
 from cosim.core.geometry import Floats, Polyline, Pose
 from cosim.core.state import NO_VEHICLES, NOBODY, Command, People, RobotState
-from cosim.episode.ports import Observation, Privileged
-from cosim.policies.clearance import Clearance
-from cosim.policies.guide import Guide
-from cosim.policies.orca import Orca
+from cosim.episode.interfaces import Observation, Privileged
+from cosim.policies.privileged.distance_field import Clearance
+from cosim.policies.privileged.orca import Orca
+from cosim.policies.privileged.route_planner import Guide
 from cosim.spec.robot import COURIER
 
 GAP_M = COURIER.width_m + 0.5
@@ -40,11 +41,14 @@ class Course:
 def straight(*obstacles: Polygon, width_m: float = 3.0) -> Course:
     """20 m along the x axis."""
     route = Polyline([(0.0, 0.0), (20.0, 0.0)])
-    return Course(box(-1.0, -width_m / 2, 21.0, width_m / 2), route, shapely.union_all(list(obstacles)))
+    return Course(
+        box(-1.0, -width_m / 2, 21.0, width_m / 2), route, shapely.union_all(list(obstacles))
+    )
 
 
 def drawn(seed: int) -> Course:
-    """25 m of a walkway that bends, with something every few metres, half of it on the middle; GAP_M stays free."""
+    """25 m of a walkway that bends, with something every few metres, half of it on the middle;
+    GAP_M stays free."""
     random = np.random.default_rng(seed)
     width_m, radius_m = random.uniform(2.4, 4.0), random.uniform(8.0, 30.0)
     turn = np.linspace(0.0, 25.0 / radius_m, 60)
@@ -52,10 +56,14 @@ def drawn(seed: int) -> Course:
     walk = LineString(route.points).buffer(width_m / 2, cap_style="square")
     solid: list[Polygon] = []
     for s_m in np.arange(4.0, 22.0, 1.5):
-        at, aside_m = route.at(s_m), random.choice([random.normal(0.0, 0.2), random.uniform(-1.0, 1.0) * width_m / 2])
+        at = route.at(s_m)
+        aside_m = random.choice([random.normal(0.0, 0.2), random.uniform(-1.0, 1.0) * width_m / 2])
         length_m, depth_m = random.choice([(0.4, 0.4), (0.6, 1.8), (1.0, 0.5)])
-        thing = affinity.rotate(box(-length_m / 2, -depth_m / 2, length_m / 2, depth_m / 2), random.uniform(0.0, 180.0))
-        x_m, y_m = at.x_m - aside_m * math.sin(at.heading_rad), at.y_m + aside_m * math.cos(at.heading_rad)
+        thing = affinity.rotate(
+            box(-length_m / 2, -depth_m / 2, length_m / 2, depth_m / 2), random.uniform(0.0, 180.0)
+        )
+        x_m = at.x_m - aside_m * math.sin(at.heading_rad)
+        y_m = at.y_m + aside_m * math.cos(at.heading_rad)
         more = [*solid, affinity.translate(thing, x_m, y_m)]
         if passable(walk, shapely.union_all(more), route):
             solid = more
@@ -65,29 +73,47 @@ def drawn(seed: int) -> Course:
 def passable(walk: Polygon, solid: BaseGeometry, route: Polyline) -> bool:
     """Whether a disk as wide as GAP_M gets from the start to within reach of the goal."""
     room = shapely.buffer(shapely.difference(walk, solid), -GAP_M / 2)
-    start, goal = Point(route.points[0]), Point(route.points[-1])
+    start = Point(route.points[0])
+    goal = Point(route.points[-1])
     return any(part.covers(start) and part.distance(goal) < 0.1 for part in shapely.get_parts(room))
 
 
-def driven(course: Course, pose: Pose, jump: tuple[float, Pose] | None = None, people: People = NOBODY) -> Floats:
-    """(N, 3) x, y, heading of the oracle every 0.05 s until the goal, or for 60 s. jump: it is put elsewhere once, when
-    it has come so far on the route."""
-    oracle, free, route = Orca(), course.free, course.route
+def driven(
+    course: Course, pose: Pose, jump: tuple[float, Pose] | None = None, people: People = NOBODY
+) -> Floats:
+    """(N, 3) x, y, heading of the oracle every 0.05 s until the goal, or for 60 s. jump: it is put
+    elsewhere once, when it has come so far on the route."""
+    oracle = Orca()
+    free = course.free
+    route = course.route
     oracle.reset("", 0)
     period = round(20 / oracle.manifest.rate_hz)
-    v, w, s_m, command, track = 0.0, 0.0, 0.0, Command(0.0, 0.0), []
+    v = 0.0
+    w = 0.0
+    s_m = 0.0
+    command = Command(0.0, 0.0)
+    track = []
     for tick in range(1200):
         if jump is not None and s_m > jump[0]:
-            pose, jump, v, w = jump[1], None, 0.0, 0.0
+            pose = jump[1]
+            jump = None
+            v = 0.0
+            w = 0.0
             s_m = route.project(pose.x_m, pose.y_m)[0]
         if tick % period == 0:
             s_m = route.project(pose.x_m, pose.y_m, (s_m - 2.0, s_m + 2.0))[0]
-            known = Privileged(RobotState(pose, v, w), route, s_m, people, NO_VEHICLES, {}, (), free)
+            known = Privileged(
+                RobotState(pose, v, w), route, s_m, people, NO_VEHICLES, {}, (), free
+            )
             command = oracle.act(Observation(tick, 0.05 * tick, None, v, w, COURIER, known))
         v += float(np.clip(command.v_mps - v, -0.1, 0.1))
         w += float(np.clip(np.clip(command.w_radps, -0.65, 0.65) - w, -0.15, 0.15))
         heading = pose.heading_rad + 0.05 * w
-        pose = Pose(pose.x_m + 0.05 * v * math.cos(heading), pose.y_m + 0.05 * v * math.sin(heading), heading)
+        pose = Pose(
+            pose.x_m + 0.05 * v * math.cos(heading),
+            pose.y_m + 0.05 * v * math.sin(heading),
+            heading,
+        )
         track.append(pose)
         if math.dist(pose[:2], route.points[-1]) < 1.0:
             break
@@ -99,13 +125,16 @@ def bodies(track: Floats) -> list[Polygon]:
     length, width = COURIER.footprint_m
     whole = box(-length / 2, -width / 2, length / 2, width / 2)
     return [
-        affinity.translate(affinity.rotate(whole, heading, origin=(0.0, 0.0), use_radians=True), x, y)
+        affinity.translate(
+            affinity.rotate(whole, heading, origin=(0.0, 0.0), use_radians=True), x, y
+        )
         for x, y, heading in track
     ]
 
 
 def test_clearance_is_the_distance_to_the_edge() -> None:
-    """To 3 cm beside what is straight, positive on free ground alone, and never positive far from the route."""
+    """To 3 cm beside what is straight, positive on free ground alone, and never positive far from
+    the route."""
     course = straight(box(8.0, -0.5, 9.0, 0.5))
     clearance = Clearance(course.free, course.route)
     points = np.random.default_rng(0).uniform((0.5, -1.4), (19.5, 1.4), (2000, 2))
@@ -117,9 +146,14 @@ def test_clearance_is_the_distance_to_the_edge() -> None:
 
 
 def test_the_line_keeps_to_the_route_where_nothing_stands_and_goes_round_what_does() -> None:
-    """A box on the middle of 3 m leaves a gap on its left alone, 1.05 m wide: the line is led through its middle."""
-    bare, blocked = straight(), straight(box(9.0, -1.5, 10.0, 0.45))
-    lines = [Guide(Clearance(c.free, c.route), c.route).from_here(c.route.points[0]) for c in (bare, blocked)]
+    """A box on the middle of 3 m leaves a gap on its left alone, 1.05 m wide: the line is led
+    through its middle."""
+    bare = straight()
+    blocked = straight(box(9.0, -1.5, 10.0, 0.45))
+    lines = [
+        Guide(Clearance(c.free, c.route), c.route).from_here(c.route.points[0])
+        for c in (bare, blocked)
+    ]
     assert np.abs(lines[0].points[:, 1]).max() < 0.1
     in_gap = lines[1].points[np.abs(lines[1].points[:, 0] - 9.5) < 0.4]
     assert in_gap[:, 1] == pytest.approx(0.975, abs=0.08)
@@ -129,7 +163,8 @@ def test_the_line_keeps_to_the_route_where_nothing_stands_and_goes_round_what_do
 
 @pytest.mark.parametrize("seed", range(8))
 def test_the_oracle_gets_round_what_stands_on_its_way(seed: int) -> None:
-    """Nothing is touched, the base centre stays on the walkway, the goal is reached at a walking pace or faster."""
+    """Nothing is touched, the base centre stays on the walkway, the goal is reached at a walking
+    pace or faster."""
     course = drawn(seed)
     assert len(shapely.get_parts(course.solid)) >= 3
     track = driven(course, course.route.at(0.0))
@@ -139,7 +174,8 @@ def test_the_oracle_gets_round_what_stands_on_its_way(seed: int) -> None:
 
 
 def test_a_robot_that_was_put_elsewhere_is_led_from_there() -> None:
-    """Put back behind what it had passed, and before the other side of it, it goes round that anew."""
+    """Put back behind what it had passed, and before the other side of it, it goes round that
+    anew."""
     course = straight(box(8.0, -1.5, 9.0, 0.45), box(12.0, -0.45, 13.0, 1.5))
     track = driven(course, Pose(0.0, 0.0, 0.0), jump=(10.5, Pose(6.9, -1.0, 0.0)))
     assert math.dist(track[-1, :2], course.route.points[-1]) < 1.0
@@ -148,7 +184,8 @@ def test_a_robot_that_was_put_elsewhere_is_led_from_there() -> None:
 
 
 def test_another_way_is_found_where_somebody_stands_in_the_first() -> None:
-    """A long box leaves a way on each side; who stands far inside the shorter one is seen too late, and left behind."""
+    """A long box leaves a way on each side; who stands far inside the shorter one is seen too late,
+    and left behind."""
     course = straight(box(5.0, -1.1, 17.0, 0.8), width_m=4.6)
     somebody = People.of(("p0",), [(15.0, 1.55)], [0.0], [0.0], ("stand",))
     track = driven(course, Pose(0.0, 0.0, 0.0), people=somebody)
@@ -158,7 +195,10 @@ def test_another_way_is_found_where_somebody_stands_in_the_first() -> None:
 
 
 def test_a_robot_that_was_kept_off_the_goal_comes_back_to_it() -> None:
-    """Two who talk just before the goal are passed at more than a metre from it; behind them the robot turns round."""
-    talkers = People.of(("p0", "p1"), [(19.6, -0.15), (19.6, 1.3)], [0.0, 0.0], [0.0, 0.0], ("talk", "talk"))
+    """Two who talk just before the goal are passed at more than a metre from it; behind them the
+    robot turns round."""
+    talkers = People.of(
+        ("p0", "p1"), [(19.6, -0.15), (19.6, 1.3)], [0.0, 0.0], [0.0, 0.0], ("talk", "talk")
+    )
     track = driven(straight(width_m=3.6), Pose(5.0, 0.0, 0.0), people=talkers)
     assert math.dist(track[-1, :2], (20.0, 0.0)) < 1.0

@@ -1,4 +1,5 @@
-"""Policies by name: what cannot be loaded is wrong use, told with the policy's name, whatever its code does."""
+"""Policies by name: what cannot be loaded is wrong use, told with the policy's name, whatever its
+code does."""
 
 from __future__ import annotations
 
@@ -10,13 +11,14 @@ from pathlib import Path
 import pytest
 
 from cosim.core.errors import UsageError
-from cosim.episode.driver import PolicyCall
+from cosim.episode.policy_caller import PolicyCall
 from cosim.policies import POLICIES
 from cosim.policies.load import load_policy
-from cosim.policies.own_module import importable
+from cosim.policies.user_module import importable
 
 GOOD = """
-from cosim.episode.ports import CameraSpec, Manifest, WaypointRule
+from cosim.spec.camera import CameraSpec
+from cosim.spec.manifest import Manifest, WaypointRule
 from cosim.core.state import STILL
 from cosim.spec.robot import Mount
 class Mine:
@@ -27,9 +29,15 @@ class Mine:
 BAD = {
     "exits": ("import sys; sys.exit(0)", "cannot be imported: SystemExit: 0"),
     "interrupts": ("raise GeneratorExit", "cannot be imported: GeneratorExit"),
-    "raises": ("import nowhere_to_be_found", "cannot be imported: ModuleNotFoundError: No module named"),
+    "raises": (
+        "import nowhere_to_be_found",
+        "cannot be imported: ModuleNotFoundError: No module named",
+    ),
     "broken": ("def", "cannot be imported: SyntaxError"),
-    "exits-when-made": ("class Mine:\n def __init__(self): raise SystemExit(3)", "cannot be made: SystemExit: 3"),
+    "exits-when-made": (
+        "class Mine:\n def __init__(self): raise SystemExit(3)",
+        "cannot be made: SystemExit: 3",
+    ),
     "needs-more": ("class Mine:\n def __init__(self, x): pass", "cannot be made: TypeError"),
     "no-manifest": ("class Mine: pass", "has no attribute 'manifest'"),
     "odd-manifest": (
@@ -37,12 +45,21 @@ BAD = {
         "its manifest: SystemExit: 1",
     ),
     "no-act": (GOOD.replace("{fields}", "").replace("def act", "def drive"), "has no method 'act'"),
-    "number-as-name": (GOOD.replace('"mine"{fields}', "3"), "its manifest: Expected `str`, got `int`"),
-    "path-as-name": (GOOD.replace('"mine"{fields}', '"../mine"'), "name must be a text of 1 to 100 printable"),
+    "number-as-name": (
+        GOOD.replace('"mine"{fields}', "3"),
+        "its manifest: Expected `str`, got `int`",
+    ),
+    "path-as-name": (
+        GOOD.replace('"mine"{fields}', '"../mine"'),
+        "name must be a text of 1 to 100 printable",
+    ),
     "no-name": (GOOD.replace('"mine"{fields}', '""'), "name must be a text of 1 to 100 printable"),
     "rate-as-text": (GOOD.replace("{fields}", ", rate_hz='4'"), "Expected `float`, got `str`"),
     "rate-zero": (GOOD.replace("{fields}", ", rate_hz=0"), "a policy rate must be positive"),
-    "rate-nan": (GOOD.replace("{fields}", ", rate_hz=float('nan')"), "a policy rate must be positive"),
+    "rate-nan": (
+        GOOD.replace("{fields}", ", rate_hz=float('nan')"),
+        "a policy rate must be positive",
+    ),
     "rate-7": (GOOD.replace("{fields}", ", rate_hz=7"), "usual policy rates are 4, 5, 10, 20 Hz"),
     "waypoints-now": (
         GOOD.replace("{fields}", ", waypoints=WaypointRule(dt_s=0.0)"),
@@ -56,12 +73,22 @@ BAD = {
         GOOD.replace("{fields}", ", waypoints=WaypointRule(rule='magic')"),
         "waypoints rule must be one of shipped, atan2, not 'magic'",
     ),
-    "waypoints-as-number": (GOOD.replace("{fields}", ", waypoints=2"), "its manifest: Expected `object`, got `int`"),
-    "no-pixels": (GOOD.replace("{fields}", ", camera=CameraSpec(0, 96)"), "sides of 1 to 4096 pixels, not 0 x 96"),
-    "fish-eye": (GOOD.replace("{fields}", ", camera=CameraSpec(fov_deg=190)"), "fov_deg must be between 0 and 180"),
+    "waypoints-as-number": (
+        GOOD.replace("{fields}", ", waypoints=2"),
+        "its manifest: Expected `object`, got `int`",
+    ),
+    "no-pixels": (
+        GOOD.replace("{fields}", ", camera=CameraSpec(0, 96)"),
+        "sides of 1 to 4096 pixels, not 0 x 96",
+    ),
+    "fish-eye": (
+        GOOD.replace("{fields}", ", camera=CameraSpec(fov_deg=190)"),
+        "fov_deg must be between 0 and 180",
+    ),
     "crop-beyond": (
         GOOD.replace("{fields}", ", camera=CameraSpec(96, 96, crop=(0, 0, 97, 96))"),
-        "camera crop must be (x0, y0, x1, y1) within 96 x 96 pixels, x0 < x1 and y0 < y1, not (0, 0, 97, 96)",
+        "camera crop must be (x0, y0, x1, y1) within 96 x 96 pixels, x0 < x1 and y0 < y1, "
+        "not (0, 0, 97, 96)",
     ),
     "no-such-goal": (
         GOOD.replace("{fields}", ", goal='route'"),
@@ -133,7 +160,8 @@ def test_loading_is_timed(desk: Path) -> None:
 
 
 def test_an_edited_policy_has_another_hash(desk: Path) -> None:
-    """The hash follows the text of its file, wherever that lies, and that of a base class in another file."""
+    """The hash follows the text of its file, wherever that lies, and that of a base class in
+    another file."""
 
     def hash_of(text: str, base: str = "class Base: pass") -> str:
         (desk / "mine.py").write_text(text)
@@ -154,7 +182,8 @@ def test_an_edited_policy_has_another_hash(desk: Path) -> None:
 
 
 def lay_out(desk: Path) -> None:
-    """A policy in this folder, one in another beside what it imports, one in a package that imports its own parts."""
+    """A policy in this folder, one in another beside what it imports, one in a package that imports
+    its own parts."""
     (desk / "mine.py").write_text(GOOD.format(fields=""))
     (desk / "deeper").mkdir()
     (desk / "deeper/alone.py").write_text("import sibling" + GOOD.format(fields=""))
@@ -162,7 +191,9 @@ def lay_out(desk: Path) -> None:
     (desk / "whole/inner").mkdir(parents=True)
     for part in ("whole/__init__.py", "whole/inner/__init__.py", "whole/part.py"):
         (desk / part).touch()
-    (desk / "whole/inner/driving.py").write_text("from ..part import __name__ as part" + GOOD.format(fields=""))
+    (desk / "whole/inner/driving.py").write_text(
+        "from ..part import __name__ as part" + GOOD.format(fields="")
+    )
 
 
 @pytest.mark.parametrize(
@@ -177,18 +208,31 @@ def lay_out(desk: Path) -> None:
         ("whole/inner/driving.py:Mine", "whole.inner.driving:Mine"),
     ],
 )
-def test_a_policy_is_named_by_its_file_or_its_module(desk: Path, spelled: str, imported: str) -> None:
-    """Both spellings load the same class with the same source hash; siblings and relative imports work."""
+def test_a_policy_is_named_by_its_file_or_its_module(
+    desk: Path, spelled: str, imported: str
+) -> None:
+    """Both spellings load the same class with the same source hash; siblings and relative imports
+    work."""
     lay_out(desk)
     spelled = spelled.format(desk=desk)
     assert importable(spelled) == imported and importable(imported) == imported
     by_file, by_module = load_policy(spelled), load_policy(imported)
-    assert type(by_file.policy) is type(by_module.policy) and by_file.source_hash == by_module.source_hash != ""
+    assert (
+        type(by_file.policy) is type(by_module.policy)
+        and by_file.source_hash == by_module.source_hash != ""
+    )
 
 
 def test_a_name_that_is_no_file_is_left_as_it_is() -> None:
     """Shipped names, networks, served policies and modules."""
-    for name in ("orca", "onnx:my_network", "onnx:a/b.onnx", "zenoh:mine", "my_robot.policy:Mine", ""):
+    for name in (
+        "orca",
+        "onnx:my_network",
+        "onnx:a/b.onnx",
+        "zenoh:mine",
+        "my_robot.policy:Mine",
+        "",
+    ):
         assert importable(name) == name
 
 
@@ -197,13 +241,31 @@ MISNAMED = {
         "min.py:Mine",
         "there is no file {desk}/min.py. Python files in {desk}: mine.py. Did you mean",
     ),
-    "a file elsewhere": ("alone.py:Mine", "Python files in {desk}: mine.py. Did you mean deeper/alone.py?"),
-    "no such folder": ("lost/mine.py:Mine", "there is no file {desk}/lost/mine.py. Python files in {desk}/lost: none."),
+    "a file elsewhere": (
+        "alone.py:Mine",
+        "Python files in {desk}: mine.py. Did you mean deeper/alone.py?",
+    ),
+    "no such folder": (
+        "lost/mine.py:Mine",
+        "there is no file {desk}/lost/mine.py. Python files in {desk}/lost: none.",
+    ),
     "no class": ("mine.py", "names a file and no class: write mine.py:Mine. Classes in it: Mine"),
-    "another class": ("mine.py:Yours", "unknown class in module 'mine' 'Yours'. Valid choices: Mine."),
-    "a module of Python": ("random.py:Mine", "there is another module 'random', which comes with Python: rename"),
-    "a dot in its name": ("mine.v2.py:Mine", "'mine.v2' has a dot, and a module's name has none: rename it"),
-    "two of one name": ("deeper/mine.py:Mine", "there is another module 'mine', loaded from {desk}/mine.py: rename"),
+    "another class": (
+        "mine.py:Yours",
+        "unknown class in module 'mine' 'Yours'. Valid choices: Mine.",
+    ),
+    "a module of Python": (
+        "random.py:Mine",
+        "there is another module 'random', which comes with Python: rename",
+    ),
+    "a dot in its name": (
+        "mine.v2.py:Mine",
+        "'mine.v2' has a dot, and a module's name has none: rename it",
+    ),
+    "two of one name": (
+        "deeper/mine.py:Mine",
+        "there is another module 'mine', loaded from {desk}/mine.py: rename",
+    ),
 }
 
 
@@ -220,26 +282,36 @@ def test_a_file_that_cannot_be_loaded_is_named_with_the_remedy(desk: Path, name:
     assert told.format(desk=desk) in str(caught.value)
 
 
-def test_a_module_that_is_not_found_says_where_it_was_searched(desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All folders of the path but Python's own are listed, with the file of that name farther down."""
+def test_a_module_that_is_not_found_says_where_it_was_searched(
+    desk: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All folders of the path but Python's own are listed, with the file of that name farther
+    down."""
     monkeypatch.syspath_prepend(desk / "libraries")
     lay_out(desk)
     with pytest.raises(UsageError) as caught:
         load_policy("alone:Mine")
     said = str(caught.value)
-    assert f"{desk / 'libraries'}, {desk}" in said.partition("Searched: ")[2] and "lib-dynload" not in said
+    assert (
+        f"{desk / 'libraries'}, {desk}" in said.partition("Searched: ")[2]
+        and "lib-dynload" not in said
+    )
     assert said.endswith(
-        "Run the command in the folder that holds alone.py, add that folder to PYTHONPATH, or name the file: "
-        "deeper/alone.py:Mine"
+        "Run the command in the folder that holds alone.py, add that folder to PYTHONPATH, or "
+        "name the file: deeper/alone.py:Mine"
     )
     (desk / "lost").mkdir()
-    with pytest.raises(UsageError, match=r"'lost' is a folder without code here. Searched: .*path/to/lost.py:Mine$"):
+    with pytest.raises(
+        UsageError, match=r"'lost' is a folder without code here. Searched: .*path/to/lost.py:Mine$"
+    ):
         load_policy("lost:Mine")
     (desk / "mine.py").write_text("import not_installed")
     with pytest.raises(UsageError) as caught:
         load_policy("mine.py:Mine")
     assert f"Searched: {desk}" in str(caught.value)
-    assert f"Install 'not_installed' for {sys.executable}, or add its folder to PYTHONPATH" in str(caught.value)
+    assert f"Install 'not_installed' for {sys.executable}, or add its folder to PYTHONPATH" in str(
+        caught.value
+    )
 
 
 def test_every_policy_of_ours_has_its_own_hash() -> None:

@@ -13,15 +13,23 @@ from shapely.geometry import box
 
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import NO_VEHICLES, Doing, People, PersonKind, RobotState, Signal, Vehicles
-from cosim.episode.driver import Driver
-from cosim.episode.ports import Observation, Privileged
-from cosim.policies.body import BodyDisks
-from cosim.policies.clearance import Clearance
-from cosim.policies.encounters import Yielding, gaps_to_people
-from cosim.policies.foresight import STEP_S, Plans, Way, foresee
-from cosim.policies.groups import distances, groups, lines
-from cosim.policies.orca import STOP_BEFORE_M, Here, Orca, car_nearness, lane_past, pressed_limit, stop_limit
-from cosim.policies.route import crossing_limit
+from cosim.episode.interfaces import Observation, Privileged
+from cosim.episode.policy_caller import Driver
+from cosim.policies.privileged.distance_field import Clearance
+from cosim.policies.privileged.orca import (
+    STOP_BEFORE_M,
+    Here,
+    Orca,
+    car_nearness,
+    lane_past,
+    pressed_limit,
+    stop_limit,
+)
+from cosim.policies.privileged.people_prediction import Yielding, gaps_to_people
+from cosim.policies.privileged.robot_disks import BodyDisks
+from cosim.policies.privileged.rollout import STEP_S, Plans, Way, foresee
+from cosim.policies.privileged.route import crossing_limit
+from cosim.policies.privileged.standing_groups import distances, groups, lines
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City, CrowdSpec
 from scenarios.events import EVENT_KINDS
@@ -35,10 +43,14 @@ def people(*rows: tuple[float, float, float, float, Doing]) -> People:
     xy = [row[:2] for row in rows]
     ids = tuple(f"e{i}" for i in range(len(rows)))
     doing = tuple(r[4] for r in rows)
-    return People.of(ids, xy, [r[2] for r in rows], [r[3] for r in rows], doing, kind=PersonKind.EVENT)
+    return People.of(
+        ids, xy, [r[2] for r in rows], [r[3] for r in rows], doing, kind=PersonKind.EVENT
+    )
 
 
-def known(others: People, x_m: float = 5.0, v_mps: float = 1.2, half_width_m: float = 1.7) -> Privileged:
+def known(
+    others: People, x_m: float = 5.0, v_mps: float = 1.2, half_width_m: float = 1.7
+) -> Privileged:
     """A robot on a straight route along the x axis; the walkway is free 1.7 m to either side."""
     robot = RobotState(Pose(x_m, 0.0, 0.0), v_mps)
     free = box(-2.0, -half_width_m, 40.0, half_width_m)
@@ -46,11 +58,15 @@ def known(others: People, x_m: float = 5.0, v_mps: float = 1.2, half_width_m: fl
 
 
 def test_talkers_are_one_group_and_passers_by_are_none() -> None:
-    """Two who talk 1.9 m apart and a third between whom and them the robot does not fit; one far off; one walking."""
+    """Two who talk 1.9 m apart and a third between whom and them the robot does not fit; one far
+    off; one walking."""
     crowd = people(
-        (10.0, 0.0, 0.0, 0.0, "talk"), (10.0, 1.9, 0.0, 0.0, "talk"), (10.0, 3.2, 0.0, 0.0, "stand"),
-        (10.0, -2.5, 0.0, 0.0, "stand"), (10.0, 0.9, 0.0, 1.2, "walk"),
-    )  # fmt: skip
+        (10.0, 0.0, 0.0, 0.0, "talk"),
+        (10.0, 1.9, 0.0, 0.0, "talk"),
+        (10.0, 3.2, 0.0, 0.0, "stand"),
+        (10.0, -2.5, 0.0, 0.0, "stand"),
+        (10.0, 0.9, 0.0, 1.2, "walk"),
+    )
     assert groups(crowd) == [[0, 1, 2], [3]]
     assert lines(crowd).shape == (4, 2, 2)
     between = distances(np.array([[10.0, 1.0]]), lines(crowd))
@@ -58,7 +74,8 @@ def test_talkers_are_one_group_and_passers_by_are_none() -> None:
 
 
 def test_a_group_is_passed_round_on_the_side_with_room() -> None:
-    """Two talkers stand 1.5 m apart across the way, nearer to its left edge: the lane leads to the right of both."""
+    """Two talkers stand 1.5 m apart across the way, nearer to its left edge: the lane leads to the
+    right of both."""
     crowd = people((11.0, 1.2, 0.0, 0.0, "talk"), (11.0, -0.3, 0.0, 0.0, "talk"))
     scene = known(crowd)
     here = Here(Way(ROUTE), scene.route_s_m, Clearance(scene.free, ROUTE))
@@ -68,14 +85,20 @@ def test_a_group_is_passed_round_on_the_side_with_room() -> None:
 
 def test_it_comes_to_rest_before_a_hand_and_stays() -> None:
     """Braking from afar, zero at 2 m, no limit by somebody who only stands."""
-    hand, nobody = people((12.0, 0.2, math.pi, 0.0, "stop")), people((12.0, 0.2, math.pi, 0.0, "stand"))
+    hand, nobody = (
+        people((12.0, 0.2, math.pi, 0.0, "stop")),
+        people((12.0, 0.2, math.pi, 0.0, "stand")),
+    )
     limits = [stop_limit(known(hand, x_m)) for x_m in (3.0, 6.0, 9.0, 9.9, 10.5)]
     assert limits == sorted(limits, reverse=True) and limits[-1] == 0.0 and limits[0] > 2.0
     assert stop_limit(known(nobody, 9.9)) == math.inf
     driver = Driver(Orca())
-    x_m, v_mps = 3.0, 0.0
+    x_m = 3.0
+    v_mps = 0.0
     for tick in range(300):
-        command = driver.act(Observation(2 * tick, 0.1 * tick, None, v_mps, 0.0, COURIER, known(hand, x_m, v_mps)))
+        command = driver.act(
+            Observation(2 * tick, 0.1 * tick, None, v_mps, 0.0, COURIER, known(hand, x_m, v_mps))
+        )
         v_mps += max(-0.2, min(0.2, command.v_mps - v_mps))
         x_m += 0.1 * v_mps
     assert v_mps == 0.0
@@ -83,11 +106,17 @@ def test_it_comes_to_rest_before_a_hand_and_stays() -> None:
 
 
 def test_it_does_not_stand_long_at_a_green_that_is_too_short() -> None:
-    """14 m of crossing and 13 s of green left: it stands before it for 8 s at most when the signal turns red."""
-    driver, x_m, v_mps, stood_s = Driver(Orca()), 3.0, 1.4, 0.0
+    """14 m of crossing and 13 s of green left: it stands before it for 8 s at most when the signal
+    turns red."""
+    driver = Driver(Orca())
+    x_m = 3.0
+    v_mps = 1.4
+    stood_s = 0.0
     for tick in range(130):
         signals = {":c0": Signal(True, 13.0 - 0.1 * tick)}
-        here = replace(known(people(), x_m, v_mps), crossings=((":c0", 6.0, 20.0),), signals=signals)
+        here = replace(
+            known(people(), x_m, v_mps), crossings=((":c0", 6.0, 20.0),), signals=signals
+        )
         command = driver.act(Observation(2 * tick, 0.1 * tick, None, v_mps, 0.0, COURIER, here))
         v_mps += max(-0.2, min(0.2, command.v_mps - v_mps))
         x_m += 0.1 * v_mps
@@ -97,32 +126,54 @@ def test_it_does_not_stand_long_at_a_green_that_is_too_short() -> None:
 
 
 def test_it_comes_to_rest_before_whoever_of_the_crowd_is_right_ahead() -> None:
-    """The nearer they are the slower, never slower than a creep; not for who is beside, nor for people of events."""
+    """The nearer they are the slower, never slower than a creep; not for who is beside, nor for
+    people of events."""
     here = known(people((6.0, 0.2, 0.0, 0.0, "stand")))
-    crowd = replace(here, people=dataclasses.replace(here.people, kind=np.full(1, PersonKind.CROWD.value)))
+    crowd = replace(
+        here, people=dataclasses.replace(here.people, kind=np.full(1, PersonKind.CROWD.value))
+    )
     limits = [
         pressed_limit(replace(crowd, robot=RobotState(Pose(x_m, 0.0, 0.0), 1.0)), COURIER)
         for x_m in (3.0, 4.5, 5.1, 5.3)
     ]
-    assert limits == sorted(limits, reverse=True) and limits[0] > 1.5 and limits[2] < 0.7 and limits[3] > 0.1
-    assert pressed_limit(replace(crowd, robot=RobotState(Pose(6.0, -0.7, 0.0), 1.0)), COURIER) == math.inf
+    assert (
+        limits == sorted(limits, reverse=True)
+        and limits[0] > 1.5
+        and limits[2] < 0.7
+        and limits[3] > 0.1
+    )
+    assert (
+        pressed_limit(replace(crowd, robot=RobotState(Pose(6.0, -0.7, 0.0), 1.0)), COURIER)
+        == math.inf
+    )
     assert pressed_limit(here, COURIER) == math.inf
 
 
 @pytest.mark.parametrize(
-    ("walk", "v_mps", "limit_mps"), [(False, 0.02, 0.0), (False, 1.2, math.inf), (True, 0.0, math.inf)]
+    ("walk", "v_mps", "limit_mps"),
+    [(False, 0.02, 0.0), (False, 1.2, math.inf), (True, 0.0, math.inf)],
 )
 def test_who_waits_at_red_does_not_start_because_it_has_crept_nearer(
     walk: bool, v_mps: float, limit_mps: float
 ) -> None:
-    """0.2 m before a crossing: at rest it waits for green; at speed it can stop no more, and drives on."""
-    here = replace(known(people(), 5.0, v_mps), crossings=((":c0", 5.2, 12.0),), signals={":c0": Signal(walk, 30.0)})
+    """0.2 m before a crossing: at rest it waits for green; at speed it can stop no more, and drives
+    on."""
+    here = replace(
+        known(people(), 5.0, v_mps),
+        crossings=((":c0", 5.2, 12.0),),
+        signals={":c0": Signal(walk, 30.0)},
+    )
     assert crossing_limit(here, COURIER) == limit_mps
 
 
 def test_foresight_turns_no_faster_than_the_robot() -> None:
     """Every plan keeps to the yaw rate and the speed of the robot, and to its lane in the end."""
-    plans = Plans(np.array([0.0, 1.0, -1.0]), np.array([1.4, 1.4, 0.9]), np.full(3, 0.9), np.array([0.0, 0.0, 0.6]))
+    plans = Plans(
+        np.array([0.0, 1.0, -1.0]),
+        np.array([1.4, 1.4, 0.9]),
+        np.full(3, 0.9),
+        np.array([0.0, 0.0, 0.6]),
+    )
     ahead = foresee(Way(ROUTE), plans, COURIER, Pose(5.0, 0.0, 0.0), 5.0, (1.4, 0.0))
     turns = np.abs(np.diff(ahead.pose[:, 2], axis=0))
     moved = np.hypot(*np.moveaxis(np.diff(ahead.pose[:, :2], axis=0), 1, 0))
@@ -131,7 +182,8 @@ def test_foresight_turns_no_faster_than_the_robot() -> None:
 
 
 def test_a_car_that_brakes_counts_where_it_comes_to_rest_and_never_more_than_half_a_metre() -> None:
-    """At 6 m/s it needs 6 m to stop: one 12 m off does not matter, one 5 m off stands in every plan's way alike."""
+    """At 6 m/s it needs 6 m to stop: one 12 m off does not matter, one 5 m off stands in every
+    plan's way alike."""
     plans = Plans(np.array([0.0, 1.0]), np.array([1.4, 1.4]), np.full(2, 0.9), np.zeros(2))
     ahead = foresee(Way(ROUTE), plans, COURIER, Pose(5.0, 0.0, 0.0), 5.0, (1.4, 0.0))
     for far_m, nearness in ((12.0, 0.0), (5.0, 0.5)):
@@ -141,26 +193,38 @@ def test_a_car_that_brakes_counts_where_it_comes_to_rest_and_never_more_than_hal
 
 
 def test_it_stands_for_who_comes_straight_at_it_until_they_are_past() -> None:
-    """From 4.5 m, while they go round it, at most seven seconds in one place; not for who comes past it or is far."""
+    """From 4.5 m, while they go round it, at most seven seconds in one place; not for who comes
+    past it or is far."""
     at_it, round_it, past_it = (
         people((x_m, y_m, heading, 1.4, "walk"))
         for x_m, y_m, heading in ((9.0, 0.0, math.pi), (6.5, 0.6, 2.4), (3.5, 1.0, 2.9))
     )
     yielding = Yielding()
     assert not yielding.waits(known(round_it), 0.0)
-    assert [yielding.waits(known(one), 1.0) for one in (at_it, round_it, past_it)] == [True, True, False]
+    assert [yielding.waits(known(one), 1.0) for one in (at_it, round_it, past_it)] == [
+        True,
+        True,
+        False,
+    ]
     assert yielding.waits(known(round_it), 6.9) and not yielding.waits(known(at_it), 7.1)
     for x_m, heading in ((9.0, math.pi - 0.3), (9.0, 0.0), (10.0, math.pi)):
         assert not Yielding().waits(known(people((x_m, 0.0, heading, 1.4, "walk"))), 1.0)
 
 
 def test_who_is_near_may_stay_and_who_waits_does_not_turn() -> None:
-    """Somebody 1.1 m ahead who is about to leave sideways counts where it is, too; 4 m off it does not."""
+    """Somebody 1.1 m ahead who is about to leave sideways counts where it is, too; 4 m off it does
+    not."""
     plans = Plans(np.array([0.0, 1.5]), np.array([1.4, 0.0]), np.full(2, 0.9), np.zeros(2))
     ahead = foresee(Way(ROUTE), plans, COURIER, Pose(5.0, 0.0, 0.0), 5.0, (1.4, 0.0))
     assert np.ptp(ahead.pose[:, 2, 1]) == 0.0
     gaps = [
-        gaps_to_people(known(crowd := people((x_m, 0.3, 1.57, 2.0, "walk"))), COURIER, ahead, crowd, lines(people()))[0]
+        gaps_to_people(
+            known(crowd := people((x_m, 0.3, 1.57, 2.0, "walk"))),
+            COURIER,
+            ahead,
+            crowd,
+            lines(people()),
+        )[0]
         for x_m in (6.1, 9.0)
     ]
     assert gaps[0] < 0.0 < 0.3 < gaps[1]
@@ -172,15 +236,18 @@ def test_who_is_near_may_stay_and_who_waits_does_not_turn() -> None:
     [*((kind, 1) for kind in EVENT_KINDS), ("conversing", 2)],
 )
 def test_the_oracle_solves_every_event(kind: str, seed: int) -> None:
-    """One scenario of each event, with real engines: triggered, seen, its rule kept, its end reached."""
+    """One scenario of each event, with real engines: triggered, seen, its rule kept, its end
+    reached."""
     from cosim.place.walk_graph import WalkGraph
-    from scenarios.builders.reactive import build_reactive
-    from scenarios.execution.places import place
-    from scenarios.execution.run import run_episode
+    from scenarios.episodes.run_episode import run_episode
+    from scenarios.places.nets import place
+    from scenarios.suites.reactive import build_reactive
 
     _, street_map = place(CITY)
     whole = build_reactive(EVENT_KINDS[kind], CITY, street_map, WalkGraph(street_map), seed, kind)
-    scenario = msgspec.structs.replace(whole, crowd=CrowdSpec(persons=10, radius_m=40.0, vehicles=4))
+    scenario = msgspec.structs.replace(
+        whole, crowd=CrowdSpec(persons=10, radius_m=40.0, vehicles=4)
+    )
     record = run_episode(scenario, Orca()).record
     assert (record.status, record.failures) == ("done", ())
     assert record.measures["success"] == 1.0
@@ -191,11 +258,11 @@ def test_the_oracle_solves_every_event(kind: str, seed: int) -> None:
 def test_driving_straight_on_fails_before_somebody_who_comes_towards_it() -> None:
     """Who does nothing about `frontal` collides with it."""
     from cosim.core.state import Command
-    from cosim.episode.ports import Manifest
     from cosim.place.walk_graph import WalkGraph
-    from scenarios.builders.reactive import build_reactive
-    from scenarios.execution.places import place
-    from scenarios.execution.run import run_episode
+    from cosim.spec.manifest import Manifest
+    from scenarios.episodes.run_episode import run_episode
+    from scenarios.places.nets import place
+    from scenarios.suites.reactive import build_reactive
 
     class Blind:
         manifest = Manifest("blind", camera=None)
@@ -208,6 +275,9 @@ def test_driving_straight_on_fails_before_somebody_who_comes_towards_it() -> Non
 
     _, street_map = place(CITY)
     record = run_episode(
-        build_reactive(EVENT_KINDS["frontal"], CITY, street_map, WalkGraph(street_map), 1, "frontal"), Blind()
+        build_reactive(
+            EVENT_KINDS["frontal"], CITY, street_map, WalkGraph(street_map), 1, "frontal"
+        ),
+        Blind(),
     ).record
     assert record.ended == "failure" and record.failures[0].other == "e0"

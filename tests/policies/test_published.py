@@ -1,4 +1,5 @@
-"""Published networks: what their manifests say of them, and what they answer in pictures of this street."""
+"""Published networks: what their manifests say of them, and what they answer in pictures of this
+street."""
 
 from __future__ import annotations
 
@@ -13,10 +14,9 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import UsageError
 from cosim.core.state import Command
-from cosim.policies.load import load_policy
+from cosim.policies.load import bundle_in_words, load_policy, shipped_bundles
 from cosim.policies.onnx.manifest import read_bundle_manifest
 from cosim.policies.onnx.policy import OnnxPolicy, in_grey
-from cosim.policies.shipped import bundle_in_words, shipped_bundles
 from cosim.spec.goal import Instruction
 
 PICTURES = Path(__file__).parent / "pictures"
@@ -29,7 +29,9 @@ def weights(monkeypatch: pytest.MonkeyPatch) -> Path:
     """The folder of the networks' files, which are no part of this repository."""
     names = [read_bundle_manifest(shipped_bundles()[name]).model for name in PUBLISHED]
     if missing := [name for name in names if not (WEIGHTS / name).is_file()]:
-        pytest.skip(f"the published weights {', '.join(missing)} are not in {WEIGHTS} (COSIM_WEIGHTS)")
+        pytest.skip(
+            f"the published weights {', '.join(missing)} are not in {WEIGHTS} (COSIM_WEIGHTS)"
+        )
     monkeypatch.setenv("COSIM_WEIGHTS", str(WEIGHTS))
     return WEIGHTS
 
@@ -38,8 +40,8 @@ def weights(monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_network_without_its_weights_says_where_they_are_to_be_had(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The file, its size and hash, its source, the command that makes it, and where it was looked for; the list says
-    that it is missing."""
+    """The file, its size and hash, its source, the command that makes it, and where it was looked
+    for; the list says that it is missing."""
     monkeypatch.setenv("COSIM_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     bundle = read_bundle_manifest(shipped_bundles()[name])
@@ -47,18 +49,26 @@ def test_a_network_without_its_weights_says_where_they_are_to_be_had(
     with pytest.raises(UsageError) as caught:
         load_policy(name)
     said = str(caught.value)
-    assert f"{bundle.model} is missing, {facts.bytes} bytes, BLAKE2b {facts.blake2b}: from {bundle.source}" in said
+    assert (
+        f"{bundle.model} is missing, {facts.bytes} bytes, BLAKE2b {facts.blake2b}: from "
+        f"{bundle.source}" in said
+    )
     assert f"`python -m cosim.policies.published.{name} " in said and "pip install onnx" in said
     assert str(tmp_path) in said and "\n" not in said
     assert f"weights missing ({bundle.model})" in bundle_in_words(shipped_bundles()[name])
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_another_file_of_the_name_is_refused(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_file_of_the_name_is_refused(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A file that only has the name of the weights is none."""
     monkeypatch.setenv("COSIM_WEIGHTS", str(tmp_path))
     (tmp_path / read_bundle_manifest(shipped_bundles()[name]).model).write_bytes(b"\x3a\x00")
-    with pytest.raises(UsageError, match=r"is another file than the manifest of '\w+' says: files\..*\.bytes is \d+"):
+    with pytest.raises(
+        UsageError,
+        match=r"is another file than the manifest of '\w+' says: files\..*\.bytes is \d+",
+    ):
         load_policy(name)
 
 
@@ -79,13 +89,17 @@ def test_dronet_turns_back_to_the_way_and_a_mirrored_street_mirrors_its_turn(wei
 
     for turned, sign in (("left", -1.0), ("right", 1.0)):
         street = _picture(f"mast_{turned}")
-        back, mirrored = sign * command(street).w_radps, sign * command(street[:, ::-1]).w_radps
+        back = sign * command(street).w_radps
+        mirrored = sign * command(street[:, ::-1]).w_radps
         assert back > 0.05 > 0.0 > mirrored
-        assert command(street).v_mps == pytest.approx(1.5 * 0.7, abs=0.05), "paths are free: 7 tenths of its speed"
+        assert command(street).v_mps == pytest.approx(1.5 * 0.7, abs=0.05), (
+            "paths are free: 7 tenths of its speed"
+        )
 
 
 def test_openbot_turns_to_where_the_instruction_says(weights: Path) -> None:
-    """Told to turn left it turns more to the left than told nothing, and to the right the other way round."""
+    """Told to turn left it turns more to the left than told nothing, and to the right the other way
+    round."""
     policy = OnnxPolicy(shipped_bundles()["openbot"])
     seen = in_grey(policy.manifest)
 

@@ -1,4 +1,5 @@
-"""Social forces: against the potential that they are the slope of, and on cases seen at a glance."""
+"""Social forces: against the potential that they are the slope of, and on cases seen at a
+glance."""
 
 from __future__ import annotations
 
@@ -10,8 +11,16 @@ from shapely.geometry import box
 
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import NO_VEHICLES, NOBODY, People, RobotState
-from cosim.episode.ports import Privileged
-from cosim.policies.social_force import DESIRED_MPS, RELAXATION_S, bodies_m, force, from_edge, from_people, seen
+from cosim.episode.interfaces import Privileged
+from cosim.policies.privileged.social_force import (
+    DESIRED_MPS,
+    RELAXATION_S,
+    bodies_m,
+    force,
+    from_edge,
+    from_people,
+    seen,
+)
 from cosim.spec.robot import COURIER
 
 
@@ -20,7 +29,8 @@ def walker(x_m: float, y_m: float, heading_rad: float, speed_mps: float) -> Peop
 
 
 def potential(people: People, d: np.ndarray, velocity: np.ndarray) -> float:
-    """A B exp(-b / B) with the paper's b, d (2,) metres from the person to the robot, between their outlines."""
+    """A B exp(-b / B) with the paper's b, d (2,) metres from the person to the robot, between their
+    outlines."""
     heading = people.heading[0]
     y = 0.5 * (people.speed[0] * np.array([math.cos(heading), math.sin(heading)]) - velocity)
     both = math.hypot(*d) + math.hypot(*(d - y))
@@ -30,32 +40,43 @@ def potential(people: People, d: np.ndarray, velocity: np.ndarray) -> float:
 @pytest.mark.parametrize("d", [(-1.3, 0.0), (-0.8, 0.6), (-1.2, -0.8)])
 def test_a_push_is_minus_the_slope_of_the_potential(d: tuple[float, float]) -> None:
     """Differences of the potential over a thousandth of a metre agree with the push."""
-    person, at, velocity, h = walker(2.0, 0.3, 2.8, 1.3), np.array(d), np.array([1.0, 0.2]), 1e-3
+    person = walker(2.0, 0.3, 2.8, 1.3)
+    at = np.array(d)
+    velocity = np.array([1.0, 0.2])
+    h = 1e-3
     slope = [
-        (potential(person, at + h * axis, velocity) - potential(person, at - h * axis, velocity)) / (2 * h)
+        (potential(person, at + h * axis, velocity) - potential(person, at - h * axis, velocity))
+        / (2 * h)
         for axis in (np.array([1.0, 0.0]), np.array([0.0, 1.0]))
     ]
     here = person.xy[0] + at * (1.0 + bodies_m(COURIER) / math.hypot(*at))
-    assert from_people(person, COURIER, here, velocity)[0] == pytest.approx(-np.array(slope), rel=1e-3, abs=1e-6)
+    assert from_people(person, COURIER, here, velocity)[0] == pytest.approx(
+        -np.array(slope), rel=1e-3, abs=1e-6
+    )
 
 
 def test_what_happens_behind_hardly_counts_and_pushes_lean_to_the_right() -> None:
-    """A push from ahead is felt whole, one from behind by 6 %; somebody straight ahead pushes a little to the right."""
+    """A push from ahead is felt whole, one from behind by 6 %; somebody straight ahead pushes a
+    little to the right."""
     ahead, behind = seen(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([1.0, 0.0]))
     assert np.hypot(*ahead) == pytest.approx(1.0) and np.hypot(*behind) == pytest.approx(0.06)
     assert ahead[0] < -0.9 and -0.3 < ahead[1] < -0.2
 
 
 def scene(y_m: float, others: People = NOBODY) -> Privileged:
-    """A robot at rest beside a route along the x axis, on a walkway free 1.5 m to either side of it."""
+    """A robot at rest beside a route along the x axis, on a walkway free 1.5 m to either side of
+    it."""
     robot = RobotState(Pose(5.0, y_m, 0.0), 0.0)
     route = Polyline([(0.0, 0.0), (30.0, 0.0)])
     return Privileged(robot, route, 5.0, others, NO_VEHICLES, {}, (), box(-5.0, -1.5, 35.0, 1.5))
 
 
 def test_alone_it_is_pulled_along_its_route_and_pushed_off_edges() -> None:
-    """On the middle the goal pulls with v0 / tau; near the left edge the push is to the right, beyond it stronger."""
-    assert force(scene(0.0), COURIER, np.zeros(2))[0] == pytest.approx(DESIRED_MPS / RELAXATION_S, rel=1e-3)
+    """On the middle the goal pulls with v0 / tau; near the left edge the push is to the right,
+    beyond it stronger."""
+    assert force(scene(0.0), COURIER, np.zeros(2))[0] == pytest.approx(
+        DESIRED_MPS / RELAXATION_S, rel=1e-3
+    )
     near, beyond = (
         from_edge(scene(1.3), COURIER, np.array([5.0, 1.3])),
         from_edge(scene(1.6), COURIER, np.array([5.0, 1.6])),
@@ -67,6 +88,7 @@ def test_alone_it_is_pulled_along_its_route_and_pushed_off_edges() -> None:
 def test_somebody_who_comes_from_ahead_on_the_left_pushes_back_and_to_the_right() -> None:
     """A walker 2 m ahead, 0.3 m left, coming closer."""
     alone, met = (
-        force(scene(0.0, people), COURIER, np.zeros(2)) for people in (NOBODY, walker(7.0, 0.3, math.pi, 1.3))
+        force(scene(0.0, people), COURIER, np.zeros(2))
+        for people in (NOBODY, walker(7.0, 0.3, math.pi, 1.3))
     )
     assert met[0] < alone[0] and met[1] < alone[1] - 0.1

@@ -9,19 +9,27 @@ import pytest
 
 from cosim.core.geometry import Pose
 from cosim.core.state import Command
-from cosim.episode.ports import Lens
+from cosim.spec.camera import Lens
 from physics.cameras.view import Shot
-from scenarios.viewing.drawn_way import led_to, way_in_picture
+from scenarios.tools.viewing.drawn_route import led_to, way_in_picture
 
 LEVEL = Shot(np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 1.0]), (200, 100), 90.0)
-"""From 1 m above the origin along x: a focal length is 50 pixels; the ground 45 degrees down is at the lower edge."""
+"""From 1 m above the origin along x: a focal length is 50 pixels; the ground 45 degrees down is at
+the lower edge."""
 
 
 def test_points_of_the_ground_are_where_hand_and_eye_put_them() -> None:
-    """2 m ahead 25 pixels below the middle, 1 m to the left of it as much to the left; at 1 m the lower edge; nearer,
-    behind and aside out of the picture."""
+    """2 m ahead 25 pixels below the middle, 1 m to the left of it as much to the left; at 1 m the
+    lower edge; nearer, behind and aside out of the picture."""
     way = np.array(
-        [[-1.0, 0.0, 0.0], [0.5, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [2.0, 1.0, 0.0], [2.0, -9.0, 0.0]]
+        [
+            [-1.0, 0.0, 0.0],
+            [0.5, 0.0, 0.0],
+            [1.0, 0.0, 0.0],
+            [2.0, 0.0, 0.0],
+            [2.0, 1.0, 0.0],
+            [2.0, -9.0, 0.0],
+        ]
     )
     drawn = way_in_picture(LEVEL, Lens(), way)
     out = [math.nan, math.nan]
@@ -33,16 +41,24 @@ def test_points_of_the_ground_are_where_hand_and_eye_put_them() -> None:
 
 
 def test_a_camera_that_looks_down_has_the_ground_under_its_axis_in_the_middle() -> None:
-    """45 degrees down from 2 m: 2 m ahead is the middle; 1 m aside of it is 50 / sqrt(8) pixels aside."""
+    """45 degrees down from 2 m: 2 m ahead is the middle; 1 m aside of it is 50 / sqrt(8) pixels
+    aside."""
     shot = Shot(np.array([0.0, 0.0, 2.0]), np.array([0.0, 2.0, 0.0]), (200, 100), 90.0)
-    middle, aside = way_in_picture(shot, Lens(), np.array([[0.0, 2.0, 0.0], [1.0, 2.0, 0.0]])).points
-    assert np.allclose(middle, (100.0, 50.0)) and np.allclose(aside, (100.0 + 50.0 / math.sqrt(8.0), 50.0))
+    middle, aside = way_in_picture(
+        shot, Lens(), np.array([[0.0, 2.0, 0.0], [1.0, 2.0, 0.0]])
+    ).points
+    assert np.allclose(middle, (100.0, 50.0)) and np.allclose(
+        aside, (100.0 + 50.0 / math.sqrt(8.0), 50.0)
+    )
 
 
 def test_a_lens_bends_the_way() -> None:
-    """Brown's first term: at r^2 = 1/2 and k1 = 0.1 all is farther out by a twentieth; what folds is left out."""
+    """Brown's first term: at r^2 = 1/2 and k1 = 0.1 all is farther out by a twentieth; what folds
+    is left out."""
     way = np.array([[2.0, 0.0, 0.0], [2.0, 1.0, 0.0]])
-    assert np.allclose(way_in_picture(LEVEL, Lens(k1=0.1), way).points[1], (100.0 - 26.25, 50.0 + 26.25))
+    assert np.allclose(
+        way_in_picture(LEVEL, Lens(k1=0.1), way).points[1], (100.0 - 26.25, 50.0 + 26.25)
+    )
     aside = np.array([[1.0, 1.5, 0.0], [1.0, 1.6, 0.0]])
     assert not way_in_picture(LEVEL, Lens(k1=-0.4), aside).lines and way_in_picture(
         LEVEL, Lens(), aside
@@ -51,9 +67,12 @@ def test_a_lens_bends_the_way() -> None:
 
 @pytest.mark.parametrize("w_radps", [0.0, 0.5], ids=["straight", "turning"])
 def test_a_command_leads_along_its_arc(w_radps: float) -> None:
-    """1 m/s for 1.5 s from a pose that heads north: as long a way, on the circle of its radius to the left."""
+    """1 m/s for 1.5 s from a pose that heads north: as long a way, on the circle of its radius to
+    the left."""
     way = led_to(Command(1.0, w_radps), Pose(3.0, 4.0, math.pi / 2.0))
-    assert np.allclose(way[0], (3.0, 4.0)) and np.hypot(*np.diff(way, axis=0).T).sum() == pytest.approx(1.5, abs=2e-3)
+    assert np.allclose(way[0], (3.0, 4.0)) and np.hypot(
+        *np.diff(way, axis=0).T
+    ).sum() == pytest.approx(1.5, abs=2e-3)
     if w_radps:
         assert np.allclose(np.hypot(*(way - (1.0, 4.0)).T), 2.0)
     else:

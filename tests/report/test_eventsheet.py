@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.episode.log import Log
-from cosim.records.record import Record
+from cosim.results.log import Log
+from cosim.results.record import Record
 from cosim.spec.events import Event
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from scenarios.events import EVENT_KINDS
-from scenarios.viewing.eventsheet import COLUMNS, rows_of, summary
+from scenarios.tools.viewing.event_sheet import COLUMNS, rows_of, summary
 from tests.conftest import Cosim
 
 TICK_S = 0.05
@@ -21,12 +21,25 @@ TICK_S = 0.05
 def scenario_of(kind: str) -> Scenario:
     """20 m along the x axis, the event at 12 m."""
     event = Event(
-        id="e0", kind=kind, x_m=12.0, y_m=0.0, heading_rad=0.0, route_s_m=12.0, half_width_m=1.5, speed_mps=1.2
+        id="e0",
+        kind=kind,
+        x_m=12.0,
+        y_m=0.0,
+        heading_rad=0.0,
+        route_s_m=12.0,
+        half_width_m=1.5,
+        speed_mps=1.2,
     )
     return Scenario(
-        id="t", suite="t", place=City(seed=1), seed=0, start=(0.0, 0.0, 0.0), goal=(20.0, 0.0),
-        route=((0.0, 0.0), (20.0, 0.0)), events=(event,),
-    )  # fmt: skip
+        id="t",
+        suite="t",
+        place=City(seed=1),
+        seed=0,
+        start=(0.0, 0.0, 0.0),
+        goal=(20.0, 0.0),
+        route=((0.0, 0.0), (20.0, 0.0)),
+        events=(event,),
+    )
 
 
 def log_of(x_m: np.ndarray, tracks: np.ndarray) -> Log:
@@ -35,27 +48,49 @@ def log_of(x_m: np.ndarray, tracks: np.ndarray) -> Log:
     pose = np.column_stack([x_m, np.zeros(n), np.zeros(n)])
     travelled = np.diff(x_m, prepend=0.0)
     return Log(
-        tick_s=TICK_S, pose=pose, speed=np.zeros((n, 2)), command=np.zeros((n, 2)), route_s_m=x_m,
-        travelled_m=travelled, person_m=np.ones(n), clearance_m=np.ones(n),
-        collision_in_s=np.ones(n), reset_s_m=np.full(n, np.nan), waits_at_red=np.zeros(n, bool),
-        on_carriageway=np.zeros(n, bool), vehicles_braked=np.zeros(n, int),
-        people_tick=np.zeros(0, int), people_xy=np.zeros((0, 2)), people_kind=np.zeros(0, np.int8),
-        people_age=np.zeros(0, np.int8), event_tracks=tracks,
-    )  # fmt: skip
+        tick_s=TICK_S,
+        pose=pose,
+        speed=np.zeros((n, 2)),
+        command=np.zeros((n, 2)),
+        route_s_m=x_m,
+        travelled_m=travelled,
+        person_m=np.ones(n),
+        clearance_m=np.ones(n),
+        collision_in_s=np.ones(n),
+        reset_s_m=np.full(n, np.nan),
+        waits_at_red=np.zeros(n, bool),
+        on_carriageway=np.zeros(n, bool),
+        vehicles_braked=np.zeros(n, int),
+        people_tick=np.zeros(0, int),
+        people_xy=np.zeros((0, 2)),
+        people_kind=np.zeros(0, np.int8),
+        people_age=np.zeros(0, np.int8),
+        event_tracks=tracks,
+    )
 
 
 def test_a_crossing_walker_is_measured_as_it_walked() -> None:
-    """Drawn by hand: triggered 3.95 m ahead of a robot at 2 m/s, walking to the right at 1.2 m/s from 1 m left."""
+    """Drawn by hand: triggered 3.95 m ahead of a robot at 2 m/s, walking to the right at 1.2 m/s
+    from 1 m left."""
     x_m = 0.1 * np.arange(1, 121) - 0.05
     tick = int(np.flatnonzero(12.0 - x_m <= 4.0)[0]) + 1
     ticks = np.arange(tick, tick + 20)
     y = 1.0 - 1.2 * TICK_S * np.arange(20)
     tracks = np.column_stack([ticks, np.zeros(20), np.zeros(20), np.full(20, 12.0), y])
     record = Record(
-        scenario="t", scenario_hash="", suite="t", suite_hash="", seed=0, robot="courier", policy="p",
+        scenario="t",
+        scenario_hash="",
+        suite="t",
+        suite_hash="",
+        seed=0,
+        robot="courier",
+        policy="p",
         policy_version="1",
-        goal_protocol="", renderer="", versions={}, status="done",
-    )  # fmt: skip
+        goal_protocol="",
+        renderer="",
+        versions={},
+        status="done",
+    )
     (row,) = rows_of(scenario_of("lateral"), record, log_of(x_m, tracks))
     found = dict(zip(COLUMNS, row, strict=True))
     assert found["trigger_m"] == pytest.approx(3.95) and found["error_m"] == pytest.approx(0.05)
@@ -78,11 +113,14 @@ def test_a_late_trigger_is_counted() -> None:
 
 
 @pytest.mark.engine
-def test_a_run_of_one_event_and_its_sheet_as_a_user_asks_for_them(tmp_path: Path, cosim: Cosim) -> None:
-    """--event takes those alone, an unknown one is answered with those there are, --events shows what was measured."""
+def test_a_run_of_one_event_and_its_sheet_as_a_user_asks_for_them(
+    tmp_path: Path, cosim: Cosim
+) -> None:
+    """--event takes those alone, an unknown one is answered with those there are, --events shows
+    what was measured."""
     from cosim.place.walk_graph import WalkGraph
-    from scenarios.builders.reactive import build_reactive
-    from scenarios.execution.places import place
+    from scenarios.places.nets import place
+    from scenarios.suites.reactive import build_reactive
 
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)
@@ -91,7 +129,9 @@ def test_a_run_of_one_event_and_its_sheet_as_a_user_asks_for_them(tmp_path: Path
     made = []
     for kind in ("frontal", "gesturing"):
         whole = build_reactive(EVENT_KINDS[kind], city, street_map, graph, 1, kind)
-        made.append(Scenario(**{name: getattr(whole, name) for name in Scenario.__struct_fields__} | fields))
+        made.append(
+            Scenario(**{name: getattr(whole, name) for name in Scenario.__struct_fields__} | fields)
+        )
     write_suite(Suite(name="tiny", version="1", scenarios=tuple(made)), tmp_path / "tiny.json")
 
     words = ("run", "tiny.json", "--event", "gesturing", "--policy", "orca", "--out", "mine")
@@ -100,6 +140,14 @@ def test_a_run_of_one_event_and_its_sheet_as_a_user_asks_for_them(tmp_path: Path
     assert "scheduled 1, scored 1" in run.stdout
     shown = cosim("show", "mine", "--events", cwd=tmp_path)
     assert shown.returncode == 0, shown.stderr
-    assert "gesturing" in shown.stdout and "frontal" not in shown.stdout and "trigger m" in shown.stdout
+    assert (
+        "gesturing" in shown.stdout
+        and "frontal" not in shown.stdout
+        and "trigger m" in shown.stdout
+    )
     wrong = cosim("run", "tiny.json", "--event", "frontl", cwd=tmp_path)
-    assert wrong.returncode == 2 and "event 'frontl'" in wrong.stderr and "frontal, gesturing" in wrong.stderr
+    assert (
+        wrong.returncode == 2
+        and "event 'frontl'" in wrong.stderr
+        and "frontal, gesturing" in wrong.stderr
+    )

@@ -13,19 +13,19 @@ import numpy as np
 import pytest
 
 from cosim.core.errors import RunError
-from cosim.episode.ports import Observation
+from cosim.episode.interfaces import Observation
 from cosim.place.walk_graph import WalkGraph
-from cosim.policies.replay import Replay
-from cosim.records.record import Recorder
+from cosim.policies.baselines import Replay
+from cosim.report.encoding import Video
 from cosim.report.hud import Layout
 from cosim.report.minimap import PLANNED
-from cosim.report.video import Video
+from cosim.results.record import Recorder
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City, CrowdSpec, Suite, write_suite
-from physics.cameras.eyes import WorldCamera
-from scenarios.viewing.film import Cut, failure_to_film, robot_eye
+from physics.cameras.camera_base import WorldCamera
+from scenarios.tools.viewing.film import Cut, failure_to_film, robot_eye
 from tests.conftest import Cosim
-from tests.records.driven_runs import HIT, run_of, short_way
+from tests.support.driven_runs import HIT, run_of, short_way
 
 pytestmark = pytest.mark.engine
 
@@ -33,28 +33,56 @@ pytestmark = pytest.mark.engine
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
     """A folder with a suite of one short scenario, and a run of it."""
-    from scenarios.builders.long_horizon import build_long_horizon
-    from scenarios.execution.places import place
+    from scenarios.places.nets import place
+    from scenarios.suites.long_horizon import build_long_horizon
 
     folder = tmp_path_factory.mktemp("desk")
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)
     whole = build_long_horizon(city, street_map, WalkGraph(street_map), 0, "t-0")
     short = msgspec.structs.replace(
-        whole, crowd=CrowdSpec(persons=8, radius_m=50.0, vehicles=2), time_limit_s=2.0, robot="courier"
+        whole,
+        crowd=CrowdSpec(persons=8, radius_m=50.0, vehicles=2),
+        time_limit_s=2.0,
+        robot="courier",
     )
     write_suite(Suite(name="tiny", version="1", scenarios=(short,)), folder / "tiny.json")
-    done = cosim("run", "tiny.json", "--policy", "tests.report.blind:Blind", "--out", "run", cwd=folder)
+    done = cosim(
+        "run",
+        "tiny.json",
+        "--policy",
+        "tests.support.blind_policy:Blind",
+        "--out",
+        "run",
+        cwd=folder,
+    )
     assert done.returncode == 0, done.stderr
     return folder
 
 
-def test_a_film_shows_the_seconds_asked_for(desk: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Twenty pictures a second of the cut, in the size asked for, no two neighbours alike, ready to play. The waypoints
-    that are planned from 1 s on are on the map and in the robot's picture."""
-    drawn, add = [], Video.add
-    monkeypatch.setattr(Video, "add", lambda self, image: drawn.append(image.copy()) or add(self, image))
-    words = ("film", "run", "t-0", "--from", "1", "--to", "2", "--size", "320x180", "-o", "film.mp4")
+def test_a_film_shows_the_seconds_asked_for(
+    desk: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Twenty pictures a second of the cut, in the size asked for, no two neighbours alike, ready to
+    play. The waypoints that are planned from 1 s on are on the map and in the robot's picture."""
+    drawn = []
+    add = Video.add
+    monkeypatch.setattr(
+        Video, "add", lambda self, image: drawn.append(image.copy()) or add(self, image)
+    )
+    words = (
+        "film",
+        "run",
+        "t-0",
+        "--from",
+        "1",
+        "--to",
+        "2",
+        "--size",
+        "320x180",
+        "-o",
+        "film.mp4",
+    )
     done = cosim(*words, cwd=desk)
     assert done.returncode == 0, done.stderr
     with av.open(str(desk / "film.mp4")) as film:
@@ -71,7 +99,19 @@ def test_a_film_is_from_above_or_from_the_robot(desk: Path, cosim: Cosim) -> Non
     """--view puts another picture beside the same map, over the same bar."""
     seen = []
     for view in ("above", "robot"):
-        words = ("film", "run", "t-0", "--to", "0.1", "--size", "320x180", "--view", view, "-o", f"{view}.mp4")
+        words = (
+            "film",
+            "run",
+            "t-0",
+            "--to",
+            "0.1",
+            "--size",
+            "320x180",
+            "--view",
+            view,
+            "-o",
+            f"{view}.mp4",
+        )
         done = cosim(*words, cwd=desk)
         assert done.returncode == 0, done.stderr
         with av.open(str(desk / f"{view}.mp4")) as film:
@@ -83,8 +123,21 @@ def test_a_film_is_from_above_or_from_the_robot(desk: Path, cosim: Cosim) -> Non
 
 
 def test_a_film_of_a_failure_ends_with_it(desk: Path, cosim: Cosim) -> None:
-    """Without an episode the first that failed is filmed, from any view; when and why is printed."""
-    words = ("film", "run", "--failure", "--from", "1.8", "--view", "above", "--size", "320x180", "-o", "failure.mp4")
+    """Without an episode the first that failed is filmed, from any view; when and why is
+    printed."""
+    words = (
+        "film",
+        "run",
+        "--failure",
+        "--from",
+        "1.8",
+        "--view",
+        "above",
+        "--size",
+        "320x180",
+        "-o",
+        "failure.mp4",
+    )
     done = cosim(*words, cwd=desk)
     assert done.returncode == 0, done.stderr
     assert "t-0, 2.0 s: ran out of time after 2 s, with " in done.stdout
@@ -105,12 +158,29 @@ def test_the_robots_camera_sees_no_farther_aside_in_a_film(size: tuple[int, int]
 def test_a_film_of_the_beginning_is_not_simulated_to_the_end(
     desk: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After the last picture nothing is simulated, and before the first nothing is drawn; it is said meanwhile."""
-    simulated, drawn = [], []
+    """After the last picture nothing is simulated, and before the first nothing is drawn; it is
+    said meanwhile."""
+    simulated = []
+    drawn = []
     add, render = Recorder.add, WorldCamera.render
     monkeypatch.setattr(Recorder, "add", lambda self, *told: simulated.append(add(self, *told)))
-    monkeypatch.setattr(WorldCamera, "render", lambda self, *told: drawn.append(0) or render(self, *told))
-    done = cosim("film", "run", "t-0", "--from", "0.5", "--to", "0.7", "--size", "320x180", "-o", "cut.mp4", cwd=desk)
+    monkeypatch.setattr(
+        WorldCamera, "render", lambda self, *told: drawn.append(0) or render(self, *told)
+    )
+    done = cosim(
+        "film",
+        "run",
+        "t-0",
+        "--from",
+        "0.5",
+        "--to",
+        "0.7",
+        "--size",
+        "320x180",
+        "-o",
+        "cut.mp4",
+        cwd=desk,
+    )
     assert done.returncode == 0, done.stderr
     assert (len(simulated), len(drawn)) == (14, 4)
     assert done.stderr.splitlines()[-2:] == ["simulating to 0.5 s ...", "filming t-0 ..."]
@@ -119,7 +189,8 @@ def test_a_film_of_the_beginning_is_not_simulated_to_the_end(
 
 @pytest.mark.parametrize("column", ["pose", "person_m", "reset_s_m"])
 def test_a_cut_that_is_not_as_recorded_is_no_film(desk: Path, cosim: Cosim, column: str) -> None:
-    """One bit of one tick of the trajectory: an error that names the moment, and no file; beyond the cut it is none."""
+    """One bit of one tick of the trajectory: an error that names the moment, and no file; beyond
+    the cut it is none."""
     path = desk / "run" / "episodes" / "t-0" / "trajectory.npz"
     kept = path.read_bytes()
     with np.load(path) as arrays:
@@ -136,7 +207,10 @@ def test_a_cut_that_is_not_as_recorded_is_no_film(desk: Path, cosim: Cosim, colu
     finally:
         path.write_bytes(kept)
     assert until.returncode == 0 and (desk / "until.mp4").exists(), until.stderr
-    assert beyond.returncode == 2 and "not the same when it was replayed (from 0.25 s on)" in beyond.stderr
+    assert (
+        beyond.returncode == 2
+        and "not the same when it was replayed (from 0.25 s on)" in beyond.stderr
+    )
     assert not list(desk.glob("beyond*"))
     assert "of the same versions: of other code" in beyond.stderr
 
@@ -148,7 +222,9 @@ def test_a_record_that_does_not_replay_is_told(desk: Path, cosim: Cosim) -> None
     record = json.loads(kept)
     path.write_text(json.dumps(record | {"state_hash": "0" * len(record["state_hash"])}))
     try:
-        done = cosim("film", "run", "t-0", "--from", "1.9", "--size", "320x180", "-o", "wrong.mp4", cwd=desk)
+        done = cosim(
+            "film", "run", "t-0", "--from", "1.9", "--size", "320x180", "-o", "wrong.mp4", cwd=desk
+        )
     finally:
         path.write_bytes(kept)
     assert done.returncode == 2 and "not the same when it was replayed" in done.stderr
@@ -173,34 +249,66 @@ def test_a_record_that_does_not_replay_is_told(desk: Path, cosim: Cosim) -> None
         (("look", "t-0", "--suite", "tiny.json", "--view", "inside"), "unknown view"),
         (("look", "t-9", "--suite", "tiny.json"), "unknown scenario"),
         (("look", "t-9"), "unknown scenario 't-9'. Valid choices: 1335, among them"),
-        (("look", "t-0", "--suite", "tiny.json", "--scenario", "2"), "--scenario chooses from a file"),
+        (
+            ("look", "t-0", "--suite", "tiny.json", "--scenario", "2"),
+            "--scenario chooses from a file",
+        ),
         (("look", "tiny.json", "--suite", "tiny.json"), "tiny.json is a file: leave --suite out"),
         (("look", "tiny.json", "--scenario", "t-9"), "unknown scenario 't-9'. Valid choices: t-0"),
-        (("look", "tiny.json", "--scenario", "2"), "unknown scenario '2'. Valid choices: t-0. Or its number"),
+        (
+            ("look", "tiny.json", "--scenario", "2"),
+            "unknown scenario '2'. Valid choices: t-0. Or its number",
+        ),
         (("look", "nowhere.toml"), "nowhere.toml: cannot be read: No such file"),
-        (("look", "t-0", "--suite", "tiny.json", "-o", "look.gif"), "use a name that ends in .png or .jpg"),
+        (
+            ("look", "t-0", "--suite", "tiny.json", "-o", "look.gif"),
+            "use a name that ends in .png or .jpg",
+        ),
         (("look", "t-0", "--suite", "tiny.json", "-o", "nowhere/look.png"), "written"),
     ],
 )
-def test_what_cannot_be_shown_is_an_error_in_words(desk: Path, cosim: Cosim, words: tuple[str, ...], told: str) -> None:
+def test_what_cannot_be_shown_is_an_error_in_words(
+    desk: Path, cosim: Cosim, words: tuple[str, ...], told: str
+) -> None:
     """Exit code 2, or 3 where the machine does not write; one message, no traceback."""
     done = cosim(*words, cwd=desk)
-    assert done.returncode == (3 if "written" in told else 2) and told in done.stderr and "Traceback" not in done.stderr
+    assert (
+        done.returncode == (3 if "written" in told else 2)
+        and told in done.stderr
+        and "Traceback" not in done.stderr
+    )
     assert "starting" not in done.stderr or words[0] == "film"
 
 
 def test_a_look_is_a_picture_of_its_moment(desk: Path, cosim: Cosim) -> None:
-    """From the robot or from above: a picture of the size asked for, with something in it; what is done meanwhile is
-    said."""
+    """From the robot or from above: a picture of the size asked for, with something in it; what is
+    done meanwhile is said."""
     seen = {}
     for name, words in {
         "start": ("--at", "0"),
         "above": ("--at", "1", "--view", "above"),
     }.items():
-        done = cosim("look", "t-0", "--suite", "tiny.json", *words, "--size", "160x90", "-o", f"{name}.png", cwd=desk)
+        done = cosim(
+            "look",
+            "t-0",
+            "--suite",
+            "tiny.json",
+            *words,
+            "--size",
+            "160x90",
+            "-o",
+            f"{name}.png",
+            cwd=desk,
+        )
         assert done.returncode == 0, done.stderr
         driven = ["simulating to 1 s"] if name == "above" else []
-        stages = ["choosing the camera", "reading the street map", "starting SUMO", *driven, "drawing"]
+        stages = [
+            "choosing the camera",
+            "reading the street map",
+            "starting SUMO",
+            *driven,
+            "drawing",
+        ]
         said = done.stderr.splitlines()
         assert len(said) == len(stages) and all(map(str.startswith, said, stages))
         seen[name] = cv2.imread(str(desk / f"{name}.png"))
@@ -209,8 +317,12 @@ def test_a_look_is_a_picture_of_its_moment(desk: Path, cosim: Cosim) -> None:
 
 
 def test_a_look_at_a_file_of_ones_own_needs_no_suite(desk: Path, cosim: Cosim) -> None:
-    """Of a sweep the first, or the one that is named or numbered; only that one is made, and its faults are listed."""
-    text = 'name = "mine"\nseeds = 2\n[place]\ncity = 1\nsize_m = 500\n[way]\nkind = "straight"\nlength_m = 30\n'
+    """Of a sweep the first, or the one that is named or numbered; only that one is made, and its
+    faults are listed."""
+    text = (
+        'name = "mine"\nseeds = 2\n[place]\ncity = 1\nsize_m = 500\n[way]\nkind = '
+        '"straight"\nlength_m = 30\n'
+    )
     text += '[[events]]\nkind = "frontal"\nat_m = [25, 2]\n'
     (desk / "mine.toml").write_text(text)
     for words, told in {
@@ -224,22 +336,30 @@ def test_a_look_at_a_file_of_ones_own_needs_no_suite(desk: Path, cosim: Cosim) -
     done = cosim("look", "mine.toml", "--scenario", "3", "-o", "none.png", cwd=desk)
     assert done.returncode == 2 and "mine.toml: events[0]: at_m 2 does not do" in done.stderr
     done = cosim("look", "mine.toml", "--scenario", "mine", "-o", "none.png", cwd=desk)
-    assert done.returncode == 2 and "unknown scenario 'mine'. Valid choices: mine-at_m2-s0, mine-" in done.stderr
+    assert (
+        done.returncode == 2
+        and "unknown scenario 'mine'. Valid choices: mine-at_m2-s0, mine-" in done.stderr
+    )
 
 
 def test_the_failure_of_an_episode_is_chosen_and_cut_out(tmp_path: Path) -> None:
-    """The first that failed in the order of the run, or the named one: ten seconds before its first failure, two after.
-    What did not fail is refused with what became of it."""
+    """The first that failed in the order of the run, or the named one: ten seconds before its first
+    failure, two after. What did not fail is refused with what became of it."""
     ways = [short_way(f"s-{k}", ends_on_failure=False) for k in range(3)]
     run = run_of(tmp_path / "run", ["goal", HIT, HIT], scenarios=ways)
-    first, named = failure_to_film(run, None), failure_to_film(run, "s-2")
+    first = failure_to_film(run, None)
+    named = failure_to_film(run, "s-2")
     assert (first.scenario, named.scenario) == ("s-1", "s-2")
     assert first.at_s == 4.0 and (first.from_s, first.to_s) == (0.0, 6.0)
     assert first.reason == "drove into a wall at 1.0 m/s"
-    with pytest.raises(RunError, match=r"'s-0' did not fail: it ended at the goal. Episodes that failed: s-1, s-2$"):
+    with pytest.raises(
+        RunError, match=r"'s-0' did not fail: it ended at the goal. Episodes that failed: s-1, s-2$"
+    ):
         failure_to_film(run, "s-0")
     sound = run_of(tmp_path / "sound", ["goal", "goal", "crashed", "invalid"])
-    with pytest.raises(RunError, match=r"sound: no episode failed: 2 succeeded, 1 crashed, 1 invalid"):
+    with pytest.raises(
+        RunError, match=r"sound: no episode failed: 2 succeeded, 1 crashed, 1 invalid"
+    ):
         failure_to_film(sound, None)
 
 

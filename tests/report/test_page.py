@@ -17,8 +17,7 @@ import numpy as np
 import pytest
 
 from cosim.place.open_ground import GROUND_LOOKS
-from cosim.records.results import summary_of
-from cosim.records.run_folder import RunFolder, read_spec
+from cosim.report.encoding import as_webp
 from cosim.report.page.choice import most_telling, shown_of
 from cosim.report.page.page import Maps, colours_of, counts_of, page_of
 from cosim.report.page.paper import LONG_OF_PAPER, REACTIVE_OF_PAPER, UNIT_OF_PAPER
@@ -26,14 +25,17 @@ from cosim.report.page.plots import exposure_of, near_of, plots_of
 from cosim.report.page.runs import ReportedRun, read_runs
 from cosim.report.page.scene import Entry, PlacePicture, Spot
 from cosim.report.page.three_tables import tables_html, warnings_html
-from cosim.report.webp import as_webp
+from cosim.results.run_folder import RunFolder, read_spec
+from cosim.results.table import summary_of
 from cosim.spec.scenario import read_suite
-from scenarios.viewing.report import _wait
+from scenarios.tools.viewing.report import _wait
 from tests.conftest import ROOT, Cosim
-from tests.records.driven_runs import HIT, episode_of, failure_at, run_of, short_way
+from tests.support.driven_runs import HIT, episode_of, failure_at, run_of, short_way
 
 PAPER = Path(os.environ.get("COSIM_SHARED", ROOT.parent / "shared")) / "paper/sidewalkbench.tex"
-HOSTILE = '</script><script>document.title="taken"</script><img src=x onerror=document.title="taken">'
+HOSTILE = (
+    '</script><script>document.title="taken"</script><img src=x onerror=document.title="taken">'
+)
 
 
 def page(*folders: Path, entries: tuple[Entry, ...] = (), maps: Maps | None = None) -> str:
@@ -64,8 +66,8 @@ class Elements(HTMLParser):
 
 
 def test_a_cell_of_ours_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
-    """Success of straight ways, with its interval, stands in the row of the policy; the paper's rows are marked, and
-    stand only beside those of its suites."""
+    """Success of straight ways, with its interval, stands in the row of the policy; the paper's
+    rows are marked, and stand only beside those of its suites."""
     (own,) = read_runs([run_of(tmp_path / "run", ["goal", HIT, HIT, "goal", "goal"], "mine")])
     spec = msgspec.structs.replace(own.spec, suite="unit")
     told = ReportedRun("mine", own.whole._replace(spec=spec))
@@ -79,15 +81,22 @@ def test_a_cell_of_ours_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
 
 
 def test_the_page_paints_the_ground_as_maps_from_above(tmp_path: Path) -> None:
-    """Each kind of area of a scene has a colour in the page; those of open ground are the table's of all maps."""
-    data = next(one for one in Elements(page(run_of(tmp_path / "run", [HIT], "mine"))).data if "ground" in dict(one))  # type: ignore[call-overload]
+    """Each kind of area of a scene has a colour in the page; those of open ground are the table's
+    of all maps."""
+    data = next(
+        one
+        for one in Elements(page(run_of(tmp_path / "run", [HIT], "mine"))).data
+        if "ground" in dict(one)
+    )  # type: ignore[call-overload]
     assert isinstance(data, dict)
     assert {kind: tuple(bytes.fromhex(hue[1:])) for kind, hue in data["ground"].items()} == {
         kind: look.drawn for kind, look in GROUND_LOOKS.items()
     }
     script = (ROOT / "cosim/report/page/page.js").read_text()
     known = re.search(r"const COLOURS = \{ \.\.\.data\.ground, (.*?)\};", script, re.DOTALL)
-    assert known is not None and {"road", "walk", "crossing", "verge"} <= set(re.findall(r"(\w+):", known[1]))
+    assert known is not None and {"road", "walk", "crossing", "verge"} <= set(
+        re.findall(r"(\w+):", known[1])
+    )
 
 
 @pytest.mark.skipif(not PAPER.exists(), reason="the paper is not here")
@@ -98,14 +107,18 @@ def test_the_papers_figures_are_those_of_its_tables() -> None:
     def row(table: str, name: str, nth: int = 0) -> tuple[float | None, ...]:
         part = text.split(rf"\label{{{table}}}")[0].split(r"\begin{table}")[-1]
         found = re.findall(rf"{name}~\\cite{{[^}}]*}}(.*?)\\\\", part)[nth]
-        cells = [re.sub(r"\\textbf|\\cellcolor{\w+}|[{}\s]", "", cell) for cell in found.split("&")[1:]]
+        cells = [
+            re.sub(r"\\textbf|\\cellcolor{\w+}|[{}\s]", "", cell) for cell in found.split("&")[1:]
+        ]
         return tuple(None if cell == "--" else float(cell) for cell in cells)
 
     for name in UNIT_OF_PAPER:
         assert row("tab:terrain_only", name) == UNIT_OF_PAPER[name]
         assert row("tab:long_horizon", name) == LONG_OF_PAPER[name]
         assert row("tab:hand_crafted", name) == REACTIVE_OF_PAPER["success"][name]
-        assert (None, *row("tab:hand_crafted_full", name, 0)) == REACTIVE_OF_PAPER["pedestrian_collision"][name]
+        assert (None, *row("tab:hand_crafted_full", name, 0)) == REACTIVE_OF_PAPER[
+            "pedestrian_collision"
+        ][name]
         apart = REACTIVE_OF_PAPER["pedestrian_distance_min_success_m"][name]
         assert (None, *row("tab:hand_crafted_full", name, 1)) == apart
 
@@ -118,11 +131,17 @@ def test_the_gallery_shows_every_kind_and_cause_and_no_more_than_asked_for(tmp_p
     candidates = shown_of(runs)
     picked = most_telling(candidates, 3)
     assert len(candidates) == 38 and {kinds[int(one.scenario[2:])] for one in picked} == {*kinds}
-    assert len(most_telling(candidates, 48)) == 36 and len({one.scenario for one in most_telling(candidates, 48)}) == 36
+    assert (
+        len(most_telling(candidates, 48)) == 36
+        and len({one.scenario for one in most_telling(candidates, 48)}) == 36
+    )
 
 
-def test_what_takes_long_to_come_to_is_not_shown_where_something_else_tells_as_much(tmp_path: Path) -> None:
-    """A failure after 100 s yields to one after 4 s of the same facets, and many of them to the time that there is."""
+def test_what_takes_long_to_come_to_is_not_shown_where_something_else_tells_as_much(
+    tmp_path: Path,
+) -> None:
+    """A failure after 100 s yields to one after 4 s of the same facets, and many of them to the
+    time that there is."""
     runs = read_runs([run_of(tmp_path / "run", [HIT], "mine")])
     (soon,) = shown_of(runs)
     late = [
@@ -138,12 +157,14 @@ def test_what_takes_long_to_come_to_is_not_shown_where_something_else_tells_as_m
 
 
 def test_of_an_episode_its_first_failure_is_shown_and_others_that_come_soon(tmp_path: Path) -> None:
-    """Failures after 4 s, 100 s and 200 s, each of another kind: the last is left out, but not where it is the first of
-    its episode, and not where it is asked for."""
+    """Failures after 4 s, 100 s and 200 s, each of another kind: the last is left out, but not
+    where it is the first of its episode, and not where it is asked for."""
     runs = read_runs([run_of(tmp_path / "run", [HIT], "mine")])
     (soon,) = shown_of(runs)
     every = [
-        soon._replace(scenario=name, mishap=soon.mishap._replace(tick=tick), facets=soon.facets | {name, tick})
+        soon._replace(
+            scenario=name, mishap=soon.mishap._replace(tick=tick), facets=soon.facets | {name, tick}
+        )
         for name, tick in (("one", 80), ("one", 2000), ("one", 4000), ("other", 4000))
     ]
     picked = {(one.scenario, one.mishap.tick) for one in most_telling(every)}
@@ -152,8 +173,11 @@ def test_of_an_episode_its_first_failure_is_shown_and_others_that_come_soon(tmp_
 
 
 def test_how_far_the_failures_are_is_told_while_they_are_shown() -> None:
-    """Of two episodes of 100 and 300 ticks, the first done and the second half done: 62 %; of maps alone no share."""
-    first, second, told = Future[None](), Future[None](), list[tuple[str, float | None]]()
+    """Of two episodes of 100 and 300 ticks, the first done and the second half done: 62 %; of maps
+    alone no share."""
+    first = Future[None]()
+    second = Future[None]()
+    told = list[tuple[str, float | None]]()
     first.set_result(None)
 
     def tell(stage: str, share: float | None = None) -> None:
@@ -162,7 +186,10 @@ def test_how_far_the_failures_are_is_told_while_they_are_shown() -> None:
             second.set_result(None)
 
     _wait([first, second], [100, 300], [20.0, 150.0], tell)
-    assert told[0] == ("showing failures again", 0.625) and told[-1] == ("showing failures again", 0.99)
+    assert told[0] == ("showing failures again", 0.625) and told[-1] == (
+        "showing failures again",
+        0.99,
+    )
     _wait([first], [], [], lambda *words: told.append(words))  # type: ignore[arg-type]
     assert told[-1] == ("drawing maps", None)
 
@@ -178,7 +205,8 @@ def test_pictures_of_a_page_are_read_again(size: tuple[int, int]) -> None:
 
 
 def test_a_failure_counts_where_so_many_people_were_near() -> None:
-    """Two people within 10 m in the second of the failure: it and that second's metres are in their bin."""
+    """Two people within 10 m in the second of the failure: it and that second's metres are in their
+    bin."""
     way = short_way("s-000", ends_on_failure=False)
     record, log = episode_of(way, "h", HIT)
     assert log is not None
@@ -186,39 +214,59 @@ def test_a_failure_counts_where_so_many_people_were_near() -> None:
     xy = np.column_stack([log.pose[seen, 0] + [50.0, 50.0, 50.0, 3.0, -3.0], np.zeros(5)])
     near = near_of(log.pose, seen, xy)
     assert near[59] == 0.0 and near[60] == near[79] == 2.0
-    record = msgspec.structs.replace(record, failures=(failure_at(log, 70), failure_at(log, 75, "freezing")))
+    record = msgspec.structs.replace(
+        record, failures=(failure_at(log, 70), failure_at(log, 75, "freezing"))
+    )
     exposure = exposure_of(record, log.travelled_m, near, (1.0, 3.0), moving=False)
     assert exposure.failures.tolist() == [0.0, 2.0, 0.0]
-    assert exposure.metres.sum() == pytest.approx(log.travelled_m.sum()) and exposure.metres[1] == pytest.approx(1.0)
-    assert exposure_of(record, log.travelled_m, near, (1.0, 3.0), moving=True).failures.tolist() == [0.0, 1.0, 0.0]
+    assert exposure.metres.sum() == pytest.approx(log.travelled_m.sum()) and exposure.metres[
+        1
+    ] == pytest.approx(1.0)
+    assert exposure_of(
+        record, log.travelled_m, near, (1.0, 3.0), moving=True
+    ).failures.tolist() == [0.0, 1.0, 0.0]
 
 
 def test_no_rate_is_of_the_metres_of_invalid_episodes(tmp_path: Path) -> None:
     """An invalid episode has a trajectory to its goal, which plots do not read."""
     (run,) = read_runs([run_of(tmp_path / "run", [HIT, "goal", "goal"], "mine")])
     records = {
-        n: msgspec.structs.replace(r, status="invalid") if n == "s-001" else r for n, r in run.whole.records.items()
+        n: msgspec.structs.replace(r, status="invalid") if n == "s-001" else r
+        for n, r in run.whole.records.items()
     }
     told = ReportedRun("mine", run.whole._replace(records=records))
     assert [record.scenario for record, _ in told.tracks()] == ["s-000", "s-002"]
 
 
-def test_a_run_without_a_failure_stands_at_0_beside_one_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """39 ticks of 0.1 m began quick, the last with the failure, 41 slow; both runs have both points; the clean one
-    alone has no plot."""
+def test_a_run_without_a_failure_stands_at_0_beside_one_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """39 ticks of 0.1 m began quick, the last with the failure, 41 slow; both runs have both
+    points; the clean one alone has no plot."""
     runs = read_runs([run_of(tmp_path / how, [how] * 8, how) for how in (HIT, "goal")])
-    speed, nobody = np.repeat([[0.5, 0.0], [1.0, 0.0]], 40, axis=0), np.zeros(0, dtype=int)
-    track = {"pose": np.zeros((80, 3)), "speed": speed, "travelled_m": np.full(80, 0.1), "people_tick": nobody}
+    speed = np.repeat([[0.5, 0.0], [1.0, 0.0]], 40, axis=0)
+    nobody = np.zeros(0, dtype=int)
+    track = {
+        "pose": np.zeros((80, 3)),
+        "speed": speed,
+        "travelled_m": np.full(80, 0.1),
+        "people_tick": nobody,
+    }
     tracks = track | {"people_xy": np.zeros((0, 2))}
-    monkeypatch.setattr(ReportedRun, "tracks", lambda run: [(record, tracks) for record in run.records])
+    monkeypatch.setattr(
+        ReportedRun, "tracks", lambda run: [(record, tracks) for record in run.records]
+    )
     (plot,) = [plot for plot in plots_of(runs, colours_of(runs)) if "speed" in plot.title]
-    assert {trace["name"]: trace["x"] for trace in plot.figure["data"]} == {HIT: [0.0, 25.641], "goal": [0.0, 0.0]}
+    assert {trace["name"]: trace["x"] for trace in plot.figure["data"]} == {
+        HIT: [0.0, 25.641],
+        "goal": [0.0, 0.0],
+    }
     assert not [plot for plot in plots_of(runs[1:], colours_of(runs)) if "speed" in plot.title]
 
 
 def test_long_ways_on_which_a_policy_crashed_are_told_beside_their_rates(tmp_path: Path) -> None:
-    """Two of three crash: their metres are nobody's, the note says how many they are, and who did not crash is not in
-    it."""
+    """Two of three crash: their metres are nobody's, the note says how many they are, and who did
+    not crash is not in it."""
     ways = [short_way(f"s-{k}", ends_on_failure=False, time_limit_s=300.0) for k in range(3)]
     # 4 m to a failure in each: the rates of a run need 20 m
     runs = read_runs(
@@ -232,19 +280,27 @@ def test_long_ways_on_which_a_policy_crashed_are_told_beside_their_rates(tmp_pat
         for n, r in runs[0].whole.records.items()
     }
     shaky = ReportedRun("shaky", runs[0].whole._replace(records=far))
-    (plot,) = [one for one in plots_of([shaky, runs[1]], colours_of(runs)) if one.title.startswith("What goes wrong")]
+    (plot,) = [
+        one
+        for one in plots_of([shaky, runs[1]], colours_of(runs))
+        if one.title.startswith("What goes wrong")
+    ]
     assert plot.note.endswith("the policy crashed: 2 of 3 of shaky.")
     (bar,) = plot.figure["data"]
     assert dict(zip(bar["y"], bar["x"], strict=True)) == {"shaky": 2.0}
 
 
 def test_runs_of_other_scenarios_of_a_suite_are_told_apart(tmp_path: Path) -> None:
-    """One has all three of its scenarios, another two: it is said, with both counts; of two of all nothing."""
+    """One has all three of its scenarios, another two: it is said, with both counts; of two of all
+    nothing."""
     runs = read_runs([run_of(tmp_path / name, ["goal"] * 3, name) for name in ("one", "other")])
     assert not warnings_html(runs)
-    first, whole = runs[0], runs[1].whole
+    first = runs[0]
+    whole = runs[1].whole
     spec = msgspec.structs.replace(whole.spec, scenarios=whole.spec.scenarios[:2])
-    part = ReportedRun("other", whole._replace(spec=spec, records=dict([*whole.records.items()][:2])))
+    part = ReportedRun(
+        "other", whole._replace(spec=spec, records=dict([*whole.records.items()][:2]))
+    )
     assert "not all runs are of the same scenarios (one 3, other 2)" in warnings_html([first, part])
 
 
@@ -264,16 +320,22 @@ def test_the_table_of_places_counts_failures_that_the_map_has_no_room_for(tmp_pa
     """Three failures of which the map shows one are three."""
     text = page(
         run_of(tmp_path / "run", [HIT] * 3 + ["goal"]),
-        maps=Maps([], {"city 0": [Spot(x_m=0.0, y_m=0.0, cause="obstacle", words="")]}, {"city 0": (4, 3)}),
+        maps=Maps(
+            [], {"city 0": [Spot(x_m=0.0, y_m=0.0, cause="obstacle", words="")]}, {"city 0": (4, 3)}
+        ),
     )
     assert '<td>4</td><td>3</td><td class="word">obstacle 3</td>' in text
 
 
 def test_names_and_reasons_cannot_break_out_of_the_page(tmp_path: Path) -> None:
-    """A structure, a policy and a reason that are markup are seen as they are: no element comes of them."""
+    """A structure, a policy and a reason that are markup are seen as they are: no element comes of
+    them."""
     plain, hostile = (
         Elements(page(folder, entries=(entry,), maps=maps))
-        for folder, entry, maps in (_named(tmp_path / "plain", "plain"), _named(tmp_path / "hostile", HOSTILE))
+        for folder, entry, maps in (
+            _named(tmp_path / "plain", "plain"),
+            _named(tmp_path / "hostile", HOSTILE),
+        )
     )
     assert hostile.tags == plain.tags and "script" in plain.tags
     assert HOSTILE in json.dumps(hostile.data[0]).replace('\\"', '"')
@@ -285,24 +347,45 @@ def _named(path: Path, name: str) -> tuple[Path, Entry, Maps]:
     ways = [short_way("s-000", structure=name), short_way("s-001", structure=f"{name} 2")]
     run = run_of(path, [HIT, "goal"], name, ways)
     entry = Entry(
-        label=name, suite="s", scenario="s-000", kind=name, event=name, place=name, light="fog", cause="obstacle",
-        reason=name, at_s=4.0, why=name,
-    )  # fmt: skip
+        label=name,
+        suite="s",
+        scenario="s-000",
+        kind=name,
+        event=name,
+        place=name,
+        light="fog",
+        cause="obstacle",
+        reason=name,
+        at_s=4.0,
+        why=name,
+    )
     picture = PlacePicture(place=name, image="data:image/webp;base64,", bounds=(0.0, 0.0, 1.0, 1.0))
-    return run, entry, Maps([picture], {name: [Spot(x_m=0.0, y_m=0.0, cause="obstacle", words=name)]}, {name: (1, 1)})
+    return (
+        run,
+        entry,
+        Maps(
+            [picture],
+            {name: [Spot(x_m=0.0, y_m=0.0, cause="obstacle", words=name)]},
+            {name: (1, 1)},
+        ),
+    )
 
 
 def test_the_page_is_one_file_that_loads_nothing(tmp_path: Path) -> None:
     """Its policy forbids every address, and no element names one."""
     text = page(run_of(tmp_path / "run", [HIT, "goal"]))
-    assert "content=\"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src" in text
+    assert (
+        "content=\"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src"
+        in text
+    )
     head = re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)
     assert not re.findall(r'(?:src|href)="(?!#|data:)[^"]*"', head) and "<link" not in head
 
 
 def test_two_runs_of_one_policy_and_suite_are_told_apart_by_their_folders(tmp_path: Path) -> None:
     """One run of a policy is called as the policy, two as their folders."""
-    first, second = run_of(tmp_path / "first", ["goal"], "mine"), run_of(tmp_path / "second", [HIT], "mine")
+    first = run_of(tmp_path / "first", ["goal"], "mine")
+    second = run_of(tmp_path / "second", [HIT], "mine")
     assert [run.label for run in read_runs([first])] == ["mine"]
     assert [run.label for run in read_runs([first, second])] == ["first", "second"]
 
@@ -325,7 +408,9 @@ def _edited(run: Path) -> str:
     return "scenarios.json"
 
 
-@pytest.mark.parametrize("damage", [_truncated, _truncated_trajectory, _edited], ids=["record", "trajectory", "suite"])
+@pytest.mark.parametrize(
+    "damage", [_truncated, _truncated_trajectory, _edited], ids=["record", "trajectory", "suite"]
+)
 def test_a_damaged_run_is_refused_by_the_name_of_its_file(
     tmp_path: Path, cosim: Cosim, damage: Callable[[Path], str]
 ) -> None:
@@ -338,11 +423,18 @@ def test_a_damaged_run_is_refused_by_the_name_of_its_file(
     assert not list(tmp_path.glob("*.html*"))
 
 
-def test_no_run_a_run_twice_and_a_run_without_an_episode_are_refused(tmp_path: Path, cosim: Cosim) -> None:
+def test_no_run_a_run_twice_and_a_run_without_an_episode_are_refused(
+    tmp_path: Path, cosim: Cosim
+) -> None:
     """Each in one line that says what to do."""
     run = run_of(tmp_path / "run", [HIT])
-    with RunFolder.create(tmp_path / "empty", read_spec(run), read_suite(run / "scenarios.json")) as held:
-        assert "in use by process" in cosim("report", str(held.path), "-o", "r.html", cwd=tmp_path).stderr
+    with RunFolder.create(
+        tmp_path / "empty", read_spec(run), read_suite(run / "scenarios.json")
+    ) as held:
+        assert (
+            "in use by process"
+            in cosim("report", str(held.path), "-o", "r.html", cwd=tmp_path).stderr
+        )
     words = {
         ("nowhere",): "unknown run",
         ("run", "../" + tmp_path.name + "/run"): "is given twice: name each run once",
@@ -364,11 +456,13 @@ def test_two_suites_of_one_name_do_not_stand_in_one_table(tmp_path: Path, cosim:
     )
 
 
-def test_a_full_disk_leaves_nothing_half_written(tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_leaves_nothing_half_written(
+    tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The page that was there before stays, nothing lies beside it; exit code 3."""
     run_of(tmp_path / "run", ["goal", "goal"])
     (tmp_path / "report.html").write_text("the page before")
-    from scenarios.viewing import report
+    from scenarios.tools.viewing import report
 
     def full(path: Path, data: bytes) -> None:
         path.with_name(path.name + ".part").write_bytes(data[:100])

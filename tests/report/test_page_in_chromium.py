@@ -1,4 +1,5 @@
-"""The page of `cosim report` in a browser: it opens from disk, every failure plays, on a desk, a phone and paper."""
+"""The page of `cosim report` in a browser: it opens from disk, every failure plays, on a desk, a
+phone and paper."""
 
 from __future__ import annotations
 
@@ -11,24 +12,25 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.cli.terminal import progress
+from cosim.cli import progress
 from cosim.report.page.page import Maps, colours_of, counts_of, page_of
 from cosim.report.page.plots import plots_of
 from cosim.report.page.reasons import CAUSES
 from cosim.report.page.runs import read_runs
 from cosim.report.page.scene import PlacePicture, Spot
 from cosim.spec.scenario import City
-from tests.chromium import CHROMIUM, Page, chromium
 from tests.conftest import Cosim
-from tests.records.driven_runs import HIT, run_of, short_way
-from tests.report.blind import BEND
+from tests.support.blind_policy import BEND
+from tests.support.chromium import CHROMIUM, Page, chromium
+from tests.support.driven_runs import HIT, run_of, short_way
 
 pytestmark = [
     pytest.mark.engine,
     pytest.mark.skipif(CHROMIUM is None and "CI" not in os.environ, reason="no Chromium here"),
 ]
 PICTURED = (
-    "document.querySelector('#by-robot').naturalWidth > 0 && document.querySelector('#from-behind').naturalWidth > 0"
+    "document.querySelector('#by-robot').naturalWidth > 0 && "
+    "document.querySelector('#from-behind').naturalWidth > 0"
 )
 DRAWN = "document.querySelector('#above').toDataURL()"
 WIDE = "document.documentElement.scrollWidth"
@@ -50,9 +52,17 @@ CUT_OFF = """[...document.querySelectorAll('.drawing')].flatMap((plot) => {
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
-    """The report of a run of two scenarios that a blind policy fails, in place of a file that was there."""
+    """The report of a run of two scenarios that a blind policy fails, in place of a file that was
+    there."""
     folder = tmp_path_factory.mktemp("report")
-    words = ("--policy", "tests.report.blind:Blind", "--scenario", "lateral-001", "--scenario", "obstructing-001")
+    words = (
+        "--policy",
+        "tests.support.blind_policy:Blind",
+        "--scenario",
+        "lateral-001",
+        "--scenario",
+        "obstructing-001",
+    )
     done = cosim("run", "reactive", *words, "--out", "run", cwd=folder)
     assert done.returncode == 0, done.stderr
     (folder / "report.html").write_text("another page")
@@ -74,7 +84,8 @@ def browser() -> Iterator[Page]:
 
 @pytest.fixture
 def page(report: Path, browser: Page) -> Iterator[Page]:
-    """The report, opened on a desk. Afterwards nothing was wrong with it, and nobody was asked for anything."""
+    """The report, opened on a desk. Afterwards nothing was wrong with it, and nobody was asked for
+    anything."""
     browser.size(1280, 900)
     browser.open(report)
     yield browser
@@ -83,39 +94,59 @@ def page(report: Path, browser: Page) -> Iterator[Page]:
 
 
 def test_what_is_planned_is_drawn_from_above_and_in_the_picture(page: Page) -> None:
-    """Blind answers a command, and from 1 s on waypoints: the page has these, the third is followed; both pictures show
-    them, and the legend says which of both it is."""
-    drawn = "[...document.querySelectorAll('#way circle')].map((c) => [c.cx.baseVal.value, c.cy.baseVal.value])"
-    scenes = [page.js(f"JSON.parse(document.querySelector('#scene-{k}').textContent)") for k in range(2)]
+    """Blind answers a command, and from 1 s on waypoints: the page has these, the third is
+    followed; both pictures show them, and the legend says which of both it is."""
+    drawn = (
+        "[...document.querySelectorAll('#way circle')].map((c) => [c.cx.baseVal.value, "
+        "c.cy.baseVal.value])"
+    )
+    scenes = [
+        page.js(f"JSON.parse(document.querySelector('#scene-{k}').textContent)") for k in range(2)
+    ]
     for number, scene in enumerate(scenes):
         page.js(f"document.querySelector('[data-entry=\"{number}\"]').click()")
         page.until(PICTURED)
-        last, legend = scene["plans"][-1][1], page.js("document.querySelector('#key-way').textContent")
-        asked, points = np.array(last[:2]), np.array(last).reshape(-1, 2)[1:]
+        last = scene["plans"][-1][1]
+        legend = page.js("document.querySelector('#key-way').textContent")
+        asked = np.array(last[:2])
+        points = np.array(last).reshape(-1, 2)[1:]
         begun = scene["plans"][0][0] > 0
         assert legend.startswith("what was commanded" if begun else "planned waypoints")
-        assert np.allclose(np.hypot(*(points - asked).T), 100.0 * np.hypot(*BEND.T), atol=1.0) and scene["follows"] == 3
+        assert (
+            np.allclose(np.hypot(*(points - asked).T), 100.0 * np.hypot(*BEND.T), atol=1.0)
+            and scene["follows"] == 3
+        )
         page.key("End", code=35)
-        assert page.js("document.querySelector('#key-way').textContent").startswith("planned waypoints")
-        circles, way = np.array(page.js(drawn)), scene["pictures"]["ways"][-1]
+        assert page.js("document.querySelector('#key-way').textContent").startswith(
+            "planned waypoints"
+        )
+        circles = np.array(page.js(drawn))
+        way = scene["pictures"]["ways"][-1]
         assert circles.ravel().tolist() == way["points"] and len(circles) >= 6
         assert page.js("document.querySelectorAll('#way circle.followed').length") == 1
-        assert page.js("document.querySelectorAll('#way path').length") == 2 * bool(way["lines"]) == 2
+        assert (
+            page.js("document.querySelectorAll('#way path').length") == 2 * bool(way["lines"]) == 2
+        )
         page.key("Escape", code=27)
     assert any(scene["plans"][0][0] > 0 for scene in scenes)
 
 
 def test_every_failure_plays_to_its_end(page: Page) -> None:
-    """Play runs until the moment of the failure; the picture from above and both cameras change on the way."""
+    """Play runs until the moment of the failure; the picture from above and both cameras change on
+    the way."""
     cards = page.js("document.querySelectorAll('[data-entry]').length")
     assert cards == 2
-    page.js("window.setInterval = ((real) => (what, ms) => real(what, ms / 25))(window.setInterval); 0")
+    page.js(
+        "window.setInterval = ((real) => (what, ms) => real(what, ms / 25))(window.setInterval); 0"
+    )
     for number in range(cards):
         page.js(f"document.querySelector('[data-entry=\"{number}\"]').click()")
         page.until(PICTURED)
         began = [page.js(what) for what in (DRAWN, "document.querySelector('#by-robot').src")]
         page.js("document.querySelector('#play').click()")
-        page.until("document.querySelector('#scrub').value === document.querySelector('#scrub').max")
+        page.until(
+            "document.querySelector('#scrub').value === document.querySelector('#scrub').max"
+        )
         page.until("document.querySelector('#play').textContent === 'Play'")
         page.until(PICTURED)
         ended = [page.js(what) for what in (DRAWN, "document.querySelector('#by-robot').src")]
@@ -123,12 +154,15 @@ def test_every_failure_plays_to_its_end(page: Page) -> None:
         assert page.js("document.querySelector('#clock').textContent") == "the failure"
         page.key("Escape", code=27)
     reasons = page.js("[...document.querySelectorAll('.card b')].map((b) => b.textContent)")
-    assert any("who came from the" in reason and "after the trigger" in reason for reason in reasons)
+    assert any(
+        "who came from the" in reason and "after the trigger" in reason for reason in reasons
+    )
     assert any("who stood ahead" in reason for reason in reasons)
 
 
 def test_the_viewer_is_worked_by_keys_alone(page: Page) -> None:
-    """Enter opens, arrows step, End goes to the failure, Shift and arrow to another, Escape closes."""
+    """Enter opens, arrows step, End goes to the failure, Shift and arrow to another, Escape
+    closes."""
     page.js("document.querySelector('[data-entry=\"0\"]').focus()")
     page.key("Enter", code=13)
     page.until("document.querySelector('#viewer').open")
@@ -149,7 +183,8 @@ def test_the_viewer_is_worked_by_keys_alone(page: Page) -> None:
 
 
 def test_a_phone_and_paper_show_all_of_it(page: Page) -> None:
-    """At 400 px nothing is wider than the screen, but for tables that scroll in themselves; it prints."""
+    """At 400 px nothing is wider than the screen, but for tables that scroll in themselves; it
+    prints."""
     assert page.js(WIDE) <= 1280
     page.size(400, 850, phone=True)
     page.until(f"{WIDE} <= 400 && document.querySelector('.main-svg').clientWidth <= 400")
@@ -163,37 +198,58 @@ def test_a_phone_and_paper_show_all_of_it(page: Page) -> None:
 
 @pytest.fixture(scope="module")
 def crowded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A page of six runs of policies with long names, in scenarios with long names; nothing is shown again."""
-    folder, rng = tmp_path_factory.mktemp("crowded"), np.random.default_rng(1)
+    """A page of six runs of policies with long names, in scenarios with long names; nothing is
+    shown again."""
+    folder = tmp_path_factory.mktemp("crowded")
+    rng = np.random.default_rng(1)
     kinds = ["straight", "curve", "crosswalk"]
     ways = [short_way(f"way-{k}", structure=kinds[k % 3], place=City(seed=k % 2)) for k in range(9)]
-    ways += [short_way(f"long-{k}", ends_on_failure=False, time_limit_s=300.0, structure="route") for k in range(4)]
+    ways += [
+        short_way(f"long-{k}", ends_on_failure=False, time_limit_s=300.0, structure="route")
+        for k in range(4)
+    ]
     names = ["x" * 70, *(f"a-rather-long-policy-name-{k}-2026-11-24" for k in range(5))]
     hows = [[*rng.choice(["goal", HIT, "crashed"], 9).tolist(), *["goal"] * 3, HIT] for _ in names]
-    runs = read_runs([run_of(folder / f"run-{k}", hows[k], name, ways) for k, name in enumerate(names)])
+    runs = read_runs(
+        [run_of(folder / f"run-{k}", hows[k], name, ways) for k, name in enumerate(names)]
+    )
     spots = {
-        place: [Spot(x_m=9.0 * k, y_m=5.0, cause=CAUSES[k % 5], words=f"way-{k} ({name}), 12.3 s: drove into <a wall>")]
+        place: [
+            Spot(
+                x_m=9.0 * k,
+                y_m=5.0,
+                cause=CAUSES[k % 5],
+                words=f"way-{k} ({name}), 12.3 s: drove into <a wall>",
+            )
+        ]
         for place in counts_of(runs)
         for k, name in enumerate(names)
     }
     pictures = [PlacePicture(place=one, image=PIXEL, bounds=(0.0, 0.0, 50.0, 9.0)) for one in spots]
     maps = Maps(pictures, spots, dict(counts_of(runs)))
     path = folder / "crowded.html"
-    path.write_bytes(page_of(runs, plots_of(runs, colours_of(runs)), [], maps, "nothing was shown again"))
+    path.write_bytes(
+        page_of(runs, plots_of(runs, colours_of(runs)), [], maps, "nothing was shown again")
+    )
     return path
 
 
 def test_no_text_is_cut_off_or_covered(crowded: Path, browser: Page) -> None:
-    """At 1280 px, then at 400: every text of every plot lies in its plot, none on another, the figures that show when a
-    point is touched too; of a table the names leave more than half of the width to the figures."""
+    """At 1280 px, then at 400: every text of every plot lies in its plot, none on another, the
+    figures that show when a point is touched too; of a table the names leave more than half of the
+    width to the figures."""
     browser.size(1280, 900)
     browser.open(crowded)
     plots = "[...document.querySelectorAll('.drawing')]"
     for wide in (1280, 400):
         browser.size(wide, 900, phone=wide == 400)
         browser.until(f"innerWidth === {wide}")
-        browser.until(f"{plots}.every((p) => !p.dataset.plot || p.dataset.wide === String(p.clientWidth))")
-        browser.until(f"{plots}.every((p) => p.querySelector('.main-svg')?.clientWidth === p.clientWidth)")
+        browser.until(
+            f"{plots}.every((p) => !p.dataset.plot || p.dataset.wide === String(p.clientWidth))"
+        )
+        browser.until(
+            f"{plots}.every((p) => p.querySelector('.main-svg')?.clientWidth === p.clientWidth)"
+        )
         assert browser.js(CUT_OFF) == [] and browser.js(WIDE) <= wide
         assert browser.js(f"{plots}.length") == 4
         for number in range(4):
@@ -201,20 +257,30 @@ def test_no_text_is_cut_off_or_covered(crowded: Path, browser: Page) -> None:
             browser.until(f"{plots}[{number}].querySelectorAll('.hovertext').length > 0")
             assert browser.js(CUT_OFF) == []
             browser.js(f"Plotly.Fx.unhover({plots}[{number}])")
-        names = "[...document.querySelectorAll('.wide th[scope=row]')].map((head) => head.offsetWidth)"
+        names = (
+            "[...document.querySelectorAll('.wide th[scope=row]')].map((head) => head.offsetWidth)"
+        )
         assert browser.js(f"Math.max(...{names})") < 0.5 * wide
     assert browser.wrong == []
 
 
 def test_plots_and_maps_are_drawn(page: Page) -> None:
-    """Every plot has marks in it, the map of the chosen place its failures; there is a choice for each place."""
+    """Every plot has marks in it, the map of the chosen place its failures; there is a choice for
+    each place."""
     plots = page.js("document.querySelectorAll('[data-plot]').length")
-    marks = "[...document.querySelectorAll('[data-plot]')].filter((p) => p.querySelector('.point, .bars path')).length"
+    marks = (
+        "[...document.querySelectorAll('[data-plot]')].filter((p) => p.querySelector('.point, "
+        ".bars path')).length"
+    )
     assert plots and page.js(marks) == plots
     page.until("document.querySelectorAll('#map .points path').length > 0")
     assert page.js("document.querySelectorAll('#map image').length") == 1
-    buttons = page.js("[...document.querySelectorAll('.modebar-btn')].map((button) => button.dataset.title)")
-    assert buttons == ["Pan", "Zoom", "Zoom in", "Zoom out", "Reset axes"], "nothing that sends a chart anywhere"
+    buttons = page.js(
+        "[...document.querySelectorAll('.modebar-btn')].map((button) => button.dataset.title)"
+    )
+    assert buttons == ["Pan", "Zoom", "Zoom in", "Zoom out", "Reset axes"], (
+        "nothing that sends a chart anywhere"
+    )
     places = page.js("document.querySelectorAll('#place option').length")
     assert places == page.js("document.querySelectorAll('#places tbody tr').length") > 0
 
@@ -223,6 +289,9 @@ def test_filters_show_what_was_asked_for(page: Page) -> None:
     """One kind chosen: its cards alone, and how many of how many."""
     page.js("const kind = document.querySelector('[data-field=kind]'); kind.value = 'lateral'; 0")
     page.js("document.querySelector('[data-field=kind]').dispatchEvent(new Event('change'))")
-    shown = page.js("[...document.querySelectorAll('.cards > li')].filter((c) => !c.hidden).map((c) => c.dataset.kind)")
+    shown = page.js(
+        "[...document.querySelectorAll('.cards > li')].filter((c) => !c.hidden).map((c) => "
+        "c.dataset.kind)"
+    )
     assert shown == ["lateral"]
     assert page.js("document.querySelector('#shown').textContent") == "1 of 2 shown"

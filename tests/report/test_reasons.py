@@ -6,18 +6,22 @@ import msgspec
 import numpy as np
 import pytest
 
-from cosim.judge.referee import Failure
-from cosim.records.record import Record, TriggeredEvent
 from cosim.report.page.reasons import Mishap, Other, cause_of, mishaps_of, reason_of
+from cosim.results.record import Record, TriggeredEvent
+from cosim.results.referee import Failure
 from cosim.spec.events import Event
 from cosim.spec.scenario import Scenario
-from tests.records.driven_runs import HIT, episode_of, failure_at, short_way
+from tests.support.driven_runs import HIT, episode_of, failure_at, short_way
 
-EVENT = Event(id="e0", kind="lateral", x_m=4.0, y_m=0.0, heading_rad=0.0, route_s_m=4.0, half_width_m=1.5)
+EVENT = Event(
+    id="e0", kind="lateral", x_m=4.0, y_m=0.0, heading_rad=0.0, route_s_m=4.0, half_width_m=1.5
+)
 WAY = short_way("s-000", events=(EVENT,), structure="lateral")
 
 
-def told(failure: Failure, other: Other | None = None, scenario: Scenario = WAY, **fields: object) -> str:
+def told(
+    failure: Failure, other: Other | None = None, scenario: Scenario = WAY, **fields: object
+) -> str:
     """The reason of an episode that this failure ended."""
     record, log = episode_of(scenario, "h", HIT)
     record = msgspec.structs.replace(record, failures=(failure,), **fields)
@@ -36,18 +40,58 @@ def car(speed_mps: float = 1.2) -> Failure:
 @pytest.mark.parametrize(
     ("failure", "other", "words"),
     [
-        (person(), Other(0.6, 0.4, 0.0, -1.2), "drove into a person who came from the left at 1.2 m/s"),
-        (person(), Other(0.6, -0.4, 0.0, 0.8), "drove into a person who came from the right at 0.8 m/s"),
-        (person("shared"), Other(0.7, 0.0, -1.4, 0.1), "collided with a person who came from the front at 1.4 m/s"),
-        (person(), Other(0.7, 0.0, 0.6, 0.0), "drove into a person who went ahead of it at 0.6 m/s"),
-        (person(), Other(-0.7, 0.0, 1.6, 0.0), "collided with a person who came from behind at 1.6 m/s"),
+        (
+            person(),
+            Other(0.6, 0.4, 0.0, -1.2),
+            "drove into a person who came from the left at 1.2 m/s",
+        ),
+        (
+            person(),
+            Other(0.6, -0.4, 0.0, 0.8),
+            "drove into a person who came from the right at 0.8 m/s",
+        ),
+        (
+            person("shared"),
+            Other(0.7, 0.0, -1.4, 0.1),
+            "collided with a person who came from the front at 1.4 m/s",
+        ),
+        (
+            person(),
+            Other(0.7, 0.0, 0.6, 0.0),
+            "drove into a person who went ahead of it at 0.6 m/s",
+        ),
+        (
+            person(),
+            Other(-0.7, 0.0, 1.6, 0.0),
+            "collided with a person who came from behind at 1.6 m/s",
+        ),
         (person(), Other(0.6, 0.1, 0.0, 0.0), "drove into a person who stood ahead, at 1.2 m/s"),
-        (person(speed_mps=0.0), Other(0.0, 0.7, 0.0, -1.0), "was hit by a person who came from the left at 1.0 m/s"),
-        (person(speed_mps=0.0), Other(0.0, 0.7, 0.0, 0.1), "touched a person who stood to the left, both at rest"),
-        (person(speed_mps=0.0), Other(0.6, 0.0, 0.5, 0.0), "touched a person who went ahead of it at 0.5 m/s"),
-        (car(), Other(1.5, 0.0, 0.0, 5.0), "collided with a vehicle that came from the right at 5.0 m/s"),
+        (
+            person(speed_mps=0.0),
+            Other(0.0, 0.7, 0.0, -1.0),
+            "was hit by a person who came from the left at 1.0 m/s",
+        ),
+        (
+            person(speed_mps=0.0),
+            Other(0.0, 0.7, 0.0, 0.1),
+            "touched a person who stood to the left, both at rest",
+        ),
+        (
+            person(speed_mps=0.0),
+            Other(0.6, 0.0, 0.5, 0.0),
+            "touched a person who went ahead of it at 0.5 m/s",
+        ),
+        (
+            car(),
+            Other(1.5, 0.0, 0.0, 5.0),
+            "collided with a vehicle that came from the right at 5.0 m/s",
+        ),
         (car(), Other(1.5, 0.0, 0.0, 0.0), "drove into a vehicle that stood ahead, at 1.2 m/s"),
-        (car(0.0), Other(0.0, 2.0, 0.0, -5.0), "was hit by a vehicle that came from the left at 5.0 m/s"),
+        (
+            car(0.0),
+            Other(0.0, 2.0, 0.0, -5.0),
+            "was hit by a vehicle that came from the left at 5.0 m/s",
+        ),
         (car(), None, "ran into a vehicle at 1.2 m/s"),
         (car(0.0), None, "was touched by a vehicle where it stood"),
     ],
@@ -71,24 +115,35 @@ def car(speed_mps: float = 1.2) -> Failure:
 def test_a_collision_tells_from_where_and_how_fast_the_other_came(
     failure: Failure, other: Other | None, words: str
 ) -> None:
-    """Sides are the robot's, its left is y > 0; who does not move stood; who is slower ahead went ahead."""
+    """Sides are the robot's, its left is y > 0; who does not move stood; who is slower ahead went
+    ahead."""
     assert told(failure, other) == words
 
 
 def test_a_collision_with_who_is_of_an_event_tells_when_it_began() -> None:
-    """Ticks are of 0.05 s: the end of tick 79 is 4.00 s, and a trigger at 0.90 s was 3.1 s before."""
-    events = (TriggeredEvent(id="e0", kind="lateral", passed=False, triggered_at_s=0.9, trigger_distance_m=4.0),)
+    """Ticks are of 0.05 s: the end of tick 79 is 4.00 s, and a trigger at 0.90 s was 3.1 s
+    before."""
+    events = (
+        TriggeredEvent(
+            id="e0", kind="lateral", passed=False, triggered_at_s=0.9, trigger_distance_m=4.0
+        ),
+    )
     words = told(person(), Other(0.6, 0.4, 0.0, -1.2), events=events)
     assert words == "drove into a person who came from the left at 1.2 m/s, 3.1 s after the trigger"
     waiting = (TriggeredEvent(id="e0", kind="lateral", passed=False),)
-    assert told(person(), Other(0.6, 0.4, 0.0, -1.2), events=waiting).endswith(", before its event began")
+    assert told(person(), Other(0.6, 0.4, 0.0, -1.2), events=waiting).endswith(
+        ", before its event began"
+    )
 
 
 def test_the_tracks_of_an_event_tell_who_came_from_where() -> None:
-    """Without a replay: the robot heads east on x, the event's person comes from the south at 1 m/s."""
+    """Without a replay: the robot heads east on x, the event's person comes from the south at 1
+    m/s."""
     record, log = episode_of(WAY, "h", HIT)
     ticks = np.arange(60, 80)
-    rows = np.column_stack([ticks, 0 * ticks, 0 * ticks, 4.3 + 0.0 * ticks, 0.05 * (ticks - 79) - 0.5])
+    rows = np.column_stack(
+        [ticks, 0 * ticks, 0 * ticks, 4.3 + 0.0 * ticks, 0.05 * (ticks - 79) - 0.5]
+    )
     walked = msgspec.structs.replace(record, failures=(person(),))
     log = type(log)(**{**vars(log), "event_tracks": rows})  # type: ignore[type-var]
     reason = reason_of(WAY, walked, mishaps_of(walked)[0], log)
@@ -107,20 +162,32 @@ def test_things_lanes_and_standing_still_have_words_too() -> None:
         "building:s380:1": "a wall",
     }
     for name, words in (named | {"obstacle:2:bin": "a bin"}).items():
-        assert told(Failure("collision", 79, 4.0, 0.0, 4.0, 1.0, name, "object")) == f"drove into {words} at 1.0 m/s"
+        assert (
+            told(Failure("collision", 79, 4.0, 0.0, 4.0, 1.0, name, "object"))
+            == f"drove into {words} at 1.0 m/s"
+        )
     off = Failure("out_of_lane", 79, 4.0, 1.5, 4.0, 1.0)
     assert told(off) == "left the sidewalk on its left side at 1.0 m/s, 1.5 m off the route"
-    assert told(failure_at(log, 79, "freezing")) == "stayed within 0.5 m for 10 s, the nearest person 1.5 m away"
+    assert (
+        told(failure_at(log, 79, "freezing"))
+        == "stayed within 0.5 m for 10 s, the nearest person 1.5 m away"
+    )
 
 
 def test_an_episode_without_a_failure_of_the_referees_has_a_reason() -> None:
-    """Time, a stopping hand that was passed, a group that was driven through, a policy that crashed."""
+    """Time, a stopping hand that was passed, a group that was driven through, a policy that
+    crashed."""
     record, log = episode_of(WAY, "h", "goal")
-    lost = msgspec.structs.replace(record, measures=record.measures | {"success": 0.0, "route_completion": 0.4})
+    lost = msgspec.structs.replace(
+        record, measures=record.measures | {"success": 0.0, "route_completion": 0.4}
+    )
     ended = {
         "timeout": ("out of time", "ran out of time after 12 s, with 40 % of the route done"),
         "failure": ("broke the rule", "passed the person who held out a stopping hand"),
-        "goal": ("broke the rule", "came to the goal, but went between people that it should have passed round"),
+        "goal": (
+            "broke the rule",
+            "came to the goal, but went between people that it should have passed round",
+        ),
     }
     for how, (cause, words) in ended.items():
         one = msgspec.structs.replace(lost, ended=how)
@@ -132,7 +199,9 @@ def test_an_episode_without_a_failure_of_the_referees_has_a_reason() -> None:
 
 def test_who_succeeded_or_is_invalid_has_no_mishap() -> None:
     """There is nothing to be explained."""
-    found: list[list[Mishap]] = [mishaps_of(episode_of(WAY, "h", how)[0]) for how in ("goal", "invalid")]
+    found: list[list[Mishap]] = [
+        mishaps_of(episode_of(WAY, "h", how)[0]) for how in ("goal", "invalid")
+    ]
     assert found == [[], []]
 
 

@@ -1,4 +1,5 @@
-"""What is drawn of an episode without an engine: legends, labels, the layout of films, the minimap."""
+"""What is drawn of an episode without an engine: legends, labels, the layout of films, the
+minimap."""
 
 from __future__ import annotations
 
@@ -29,7 +30,8 @@ WORDS = [
 
 @pytest.mark.parametrize("width", [140, 200, 514, 2400])
 def test_a_legend_fits_below_its_picture(width: int) -> None:
-    """However narrow a picture is, no word runs out of it, and every cell is there in its colour."""
+    """However narrow a picture is, no word runs out of it, and every cell is there in its
+    colour."""
     image = np.full((40, width, 3), 90, dtype=np.uint8)
     both = legend(image, WORDS)
     band = both[40:]
@@ -37,11 +39,14 @@ def test_a_legend_fits_below_its_picture(width: int) -> None:
     assert (band[:, -MARGIN_PX:] == 255).all() and (band[-4:] == 255).all()
     for colour in {colour for _, colour in WORDS}:
         assert (band == colour).all(axis=2).any(), colour
-    assert len(legend(np.zeros((40, 140, 3), np.uint8), WORDS)) > len(legend(np.zeros((40, 2400, 3), np.uint8), WORDS))
+    assert len(legend(np.zeros((40, 140, 3), np.uint8), WORDS)) > len(
+        legend(np.zeros((40, 2400, 3), np.uint8), WORDS)
+    )
 
 
 def test_labels_do_not_cover_one_another() -> None:
-    """Three labels of one place: each keeps all the ink that it had alone, and none lies on the ring around it."""
+    """Three labels of one place: each keeps all the ink that it had alone, and none lies on the
+    ring around it."""
     alone = []
     sheet = Sheet((0.0, 0.0, 40.0, 30.0))
     sheet.dot(np.array([[20.0, 15.0]]), EVENT, 0.9, filled=False)
@@ -63,9 +68,12 @@ def test_labels_stay_in_the_picture() -> None:
     assert len(set(counts)) == 1 and counts[0] > 8
 
 
-@pytest.mark.parametrize("size", [(320, 180), (640, 360), (960, 540), (1280, 720), (1920, 1080), (500, 800)])
+@pytest.mark.parametrize(
+    "size", [(320, 180), (640, 360), (960, 540), (1280, 720), (1920, 1080), (500, 800)]
+)
 def test_nothing_covers_anything_in_a_film(size: tuple[int, int]) -> None:
-    """View, second view, map and bar fill the picture and do not overlap; the second view is 4:3."""
+    """View, second view, map and bar fill the picture and do not overlap; the second view is
+    4:3."""
     layout = Layout.of(*size)
     boxes = [shapely.box(a.x, a.y, a.x + a.width, a.y + a.height) for a in layout]
     assert sum(box.area for box in boxes) == size[0] * size[1]
@@ -82,9 +90,14 @@ def minimap() -> Minimap:
     strip = Strip("s", "sidewalk", line, 4.0, polygon, (None, None))
     street_map = StreetMap("made-up", (0.0, -2.0, 60.0, 2.0), {"s": strip}, {}, {}, {})
     scenario = Scenario(
-        id="t", suite="test", place=City(seed=0), seed=0, start=(0.0, 0.0, 0.0), goal=(60.0, 0.0),
+        id="t",
+        suite="test",
+        place=City(seed=0),
+        seed=0,
+        start=(0.0, 0.0, 0.0),
+        goal=(60.0, 0.0),
         route=((0.0, 0.0), (60.0, 0.0)),
-    )  # fmt: skip
+    )
     return Minimap(street_map, scenario, (0.7, 0.55))
 
 
@@ -94,27 +107,35 @@ def where(image: np.ndarray, colour: tuple[int, int, int]) -> np.ndarray:  # typ
 
 
 def test_the_map_shows_who_is_where_and_faces_where() -> None:
-    """East is right and north up; event people are orange, others violet, both with a nose; the hand that stops is red,
-    between its person and the robot."""
+    """East is right and north up; event people are orange, others violet, both with a nose; the
+    hand that stops is red, between its person and the robot."""
     robot = RobotState(Pose(30.0, 0.0, 0.0))
-    xy, doing, kind = [[34.0, 5.0], [36.0, 0.0]], ("walk", "stop"), [PersonKind.CROWD, PersonKind.EVENT]
+    xy = [[34.0, 5.0], [36.0, 0.0]]
+    doing = ("walk", "stop")
+    kind = [PersonKind.CROWD, PersonKind.EVENT]
     people = People.of(("u", "t"), xy, [0.5 * np.pi, np.pi], [1.2, 0.0], doing, kind=kind)  # type: ignore[arg-type]
     image = minimap().picture(robot, Street(0, people), (400, 400), np.array([1.0, 0.0]))
     px = 400 / (2.0 * MINIMAP_REACH_M)
     middle = 200.0 + px * (np.array([30.0, 0.0]) - (34.0, 0.0)) * (1.0, -1.0)
-    event, other, hand, nose = (where(image, colour) for colour in (EVENT, PERSON, RED_SIGNAL, NOSE))
+    event, other, hand, nose = (
+        where(image, colour) for colour in (EVENT, PERSON, RED_SIGNAL, NOSE)
+    )
     assert event.mean(axis=0) == pytest.approx(middle + px * np.array([5.9, 0.0]), abs=3.0)
     assert other.mean(axis=0) == pytest.approx(middle + px * np.array([4.0, -5.1]), abs=3.0)
-    assert np.ptp(other[:, 1]) > 1.2 * np.ptp(other[:, 0]) and np.ptp(event[:, 0]) > 1.2 * np.ptp(event[:, 1])
+    assert np.ptp(other[:, 1]) > 1.2 * np.ptp(other[:, 0]) and np.ptp(event[:, 0]) > 1.2 * np.ptp(
+        event[:, 1]
+    )
     assert nose[:, 0].max() < hand[:, 0].mean() < event[:, 0].min() + 1
     assert nose[:, 0].mean() > middle[0] and len(where(image, ROUTE)) > 400
 
 
 def test_the_map_follows_its_robot() -> None:
-    """The same street ten metres on: what stands on the ground moves by ten metres in the picture, to half a pixel."""
+    """The same street ten metres on: what stands on the ground moves by ten metres in the picture,
+    to half a pixel."""
     one = minimap()
     people = People.of(("e0",), [[36.0, 1.0]], [0.0], [0.0], ("stand",), kind=PersonKind.EVENT)
-    east, shift = np.array([1.0, 0.0]), []
+    east = np.array([1.0, 0.0])
+    shift = []
     for x in (30.0, 32.0):
         image = one.picture(RobotState(Pose(x, 0.0, 0.0)), Street(0, people), (300, 200), east)
         assert image.shape == (200, 300, 3)

@@ -1,4 +1,5 @@
-"""Recordings for the Rerun viewer: what is in the file, read back by its own SDK, and what is refused."""
+"""Recordings for the Rerun viewer: what is in the file, read back by its own SDK, and what is
+refused."""
 
 from __future__ import annotations
 
@@ -12,19 +13,23 @@ import numpy as np
 import pytest
 
 import cosim as product
-from cosim.cli.options.recording import check_rerun
+from cosim.cli.options import check_rerun
 from cosim.core.errors import MachineError, UsageError
 from cosim.core.state import LABELS
-from cosim.episode.log import Log
+from cosim.results.log import Log
 from cosim.spec.scenario import Suite
-from scenarios.checks import small_scenario
+from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import Cosim
-from tests.report.blind import BEND, Blind
+from tests.support.blind_policy import BEND, Blind
 
 
 @pytest.mark.parametrize(
     "name, episodes, told",
-    [("e.mp4", 1, "use a name that ends in .rrd"), ("e.rrd", 0, "and none are asked"), ("e.rrd", 3, "and 3 are asked")],
+    [
+        ("e.mp4", 1, "use a name that ends in .rrd"),
+        ("e.rrd", 0, "and none are asked"),
+        ("e.rrd", 3, "and 3 are asked"),
+    ],
     ids=["another ending", "no episode", "several"],
 )
 def test_a_recording_is_of_one_episode_in_a_file_of_its_kind(
@@ -35,7 +40,9 @@ def test_a_recording_is_of_one_episode_in_a_file_of_its_kind(
         check_rerun(tmp_path / name, episodes)
 
 
-def test_without_the_package_the_remedy_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_package_the_remedy_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The extra that brings it, by name."""
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MachineError, match=r"pip install 'sidewalk-cosim\[rerun\]'"):
@@ -43,7 +50,8 @@ def test_without_the_package_the_remedy_is_told(tmp_path: Path, monkeypatch: pyt
 
 
 class Tape:
-    """A recording read back: for each entity the columns of its rows, in the order in which they were written."""
+    """A recording read back: for each entity the columns of its rows, in the order in which they
+    were written."""
 
     def __init__(self, path: Path) -> None:
         from rerun.chunk import RrdReader
@@ -56,7 +64,9 @@ class Tape:
             self.rows[chunk.entity_path] += chunk.num_rows
             self.timelines.setdefault(chunk.entity_path, set()).update(chunk.timeline_names)
             for name in batch.schema.names:
-                self._columns.setdefault((chunk.entity_path, name), []).extend(batch.column(name).to_pylist())
+                self._columns.setdefault((chunk.entity_path, name), []).extend(
+                    batch.column(name).to_pylist()
+                )
 
     def column(self, entity: str, name: str) -> list[Any]:
         return self._columns[entity, name]
@@ -64,15 +74,17 @@ class Tape:
 
 @pytest.mark.engine
 def test_a_recording_holds_the_episode_on_one_timeline(tmp_path: Path, cosim: Cosim) -> None:
-    """Read back: each tick's pose, people, velocities and plots, each picture with depth and labels; waypoints
-    from where the robot was when it was asked; and the ground. A record that was changed leaves no file."""
+    """Read back: each tick's pose, people, velocities and plots, each picture with depth and
+    labels; waypoints from where the robot was when it was asked; and the ground. A record that was
+    changed leaves no file."""
     pytest.importorskip("rerun")
     scenario = msgspec.structs.replace(small_scenario(), time_limit_s=2.0)
     suite = Suite(name="brief", version="1", scenarios=(scenario,))
     product.run(suite, Blind(), out=tmp_path / "run")
     said = cosim("show", "run", "--episode", scenario.id, "--rerun", "e.rrd", cwd=tmp_path)
     assert said.returncode == 0, said.stderr
-    tape, log = Tape(tmp_path / "e.rrd"), Log.load(tmp_path / "run" / "episodes" / scenario.id / "trajectory.npz")
+    tape = Tape(tmp_path / "e.rrd")
+    log = Log.load(tmp_path / "run" / "episodes" / scenario.id / "trajectory.npz")
     moving = ("robot", "robot/plan", "people", "people/velocity", "vehicles", "signals")
     for entity in (
         *(f"/world/{name}" for name in moving),
@@ -84,8 +96,12 @@ def test_a_recording_holds_the_episode_on_one_timeline(tmp_path: Path, cosim: Co
     at = np.array([place for (place,) in tape.column("/world/robot", "Transform3D:translation")])
     assert np.allclose(at[:, :2], log.pose[:, :2], atol=1e-3)
     assert tape.column("/world/robot", "tick") == [*range(1, len(log) + 1)]
-    dots = [np.array(one)[:, :2] for one in tape.column("/world/waypoints/points", "Points3D:positions")]
-    for dot, (x_m, y_m, heading_rad) in zip(dots, log.pose[19:39:4], strict=True):  # at the end of the tick before
+    dots = [
+        np.array(one)[:, :2] for one in tape.column("/world/waypoints/points", "Points3D:positions")
+    ]
+    for dot, (x_m, y_m, heading_rad) in zip(
+        dots, log.pose[19:39:4], strict=True
+    ):  # at the end of the tick before
         cos, sin = np.cos(heading_rad), np.sin(heading_rad)
         assert np.allclose(dot, BEND @ [[cos, sin], [-sin, cos]] + (x_m, y_m), atol=1e-3)
     assert tape.column("/world/waypoints/points", "tick") == [21, 25, 29, 33, 37]
@@ -93,8 +109,11 @@ def test_a_recording_holds_the_episode_on_one_timeline(tmp_path: Path, cosim: Co
     assert np.array_equal(speeds, log.speed[:, 0])
     people = tape.column("/world/people", "Capsules3D:translations")
     velocities = tape.column("/world/people/velocity", "Arrows3D:vectors")
-    assert [len(one) for one in people] == [len(one) for one in velocities] and any(len(one) for one in people)
-    camera, pictures = "/world/robot/camera", len(log) // 5
+    assert [len(one) for one in people] == [len(one) for one in velocities] and any(
+        len(one) for one in people
+    )
+    camera = "/world/robot/camera"
+    pictures = len(log) // 5
     for name in ("rgb", "depth", "labels"):
         assert tape.rows[f"{camera}/{name}"] == pictures + 1  # and its lens
     (seen,) = tape.column(f"{camera}/labels", "SegmentationImage:buffer")[-1]

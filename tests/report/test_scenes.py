@@ -1,4 +1,5 @@
-"""Failures shown again: one replay for all of an episode, held against its record, each picture drawn once."""
+"""Failures shown again: one replay for all of an episode, held against its record, each picture
+drawn once."""
 
 from __future__ import annotations
 
@@ -9,9 +10,9 @@ import pytest
 
 from cosim.core.errors import RunError, UsageError
 from cosim.report.page.reasons import mishaps_of
-from physics.cameras.eyes import WorldCamera
-from scenarios.execution.replay import recorded, replaying
-from scenarios.viewing.scenes import show_again, ticks_to_show
+from physics.cameras.camera_base import WorldCamera
+from scenarios.episodes.replay import recorded, replaying
+from scenarios.tools.viewing.scenes import show_again, ticks_to_show
 from tests.conftest import Cosim
 
 pytestmark = pytest.mark.engine
@@ -22,16 +23,20 @@ NAME = "obstructing-001"
 def run(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
     """A run of a scenario that a blind policy fails."""
     folder = tmp_path_factory.mktemp("scenes")
-    words = ("--policy", "tests.report.blind:Blind", "--scenario", NAME, "--out", "run")
+    words = ("--policy", "tests.support.blind_policy:Blind", "--scenario", NAME, "--out", "run")
     done = cosim("run", "reactive", *words, cwd=folder)
     assert done.returncode == 0, done.stderr
     return folder / "run"
 
 
-def test_failures_that_follow_one_another_share_their_pictures(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The failure and, as if there were one, a moment a second before it: each has its last 5 s, four a second, and the
-    moment itself; what both show is drawn once, and is the same. What is done rises to what was announced."""
-    drawn, done = [], []
+def test_failures_that_follow_one_another_share_their_pictures(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The failure and, as if there were one, a moment a second before it: each has its last 5 s,
+    four a second, and the moment itself; what both show is drawn once, and is the same. What is
+    done rises to what was announced."""
+    drawn = []
+    done = []
     render = WorldCamera.render
     monkeypatch.setattr(WorldCamera, "render", lambda *told: drawn.append(0) or render(*told))
     (last,) = mishaps_of(recorded(run, NAME).record)
@@ -39,8 +44,15 @@ def test_failures_that_follow_one_another_share_their_pictures(run: Path, monkey
     shown = show_again(run, NAME, [last, before], "auto", done.append)
     late, early = (one.scene.pictures for one in shown)
     seen = {*late.follow, *early.follow}
-    assert len(late.follow) in (20, 21) and len(early.follow) in (20, 21) and len(seen) == len(drawn) <= 27
-    assert len({*late.follow} & {*early.follow}) >= 15 and late.at[-1] == len(shown[0].scene.robot) // 6 - 1
+    assert (
+        len(late.follow) in (20, 21)
+        and len(early.follow) in (20, 21)
+        and len(seen) == len(drawn) <= 27
+    )
+    assert (
+        len({*late.follow} & {*early.follow}) >= 15
+        and late.at[-1] == len(shown[0].scene.robot) // 6 - 1
+    )
     assert done == sorted(done) and done[-1] == ticks_to_show([last, before])
 
 

@@ -1,4 +1,5 @@
-"""People beside people: the measures on tracks made by hand, and our walkers on the streets they are watched on."""
+"""People beside people: the measures on tracks made by hand, and our walkers on the streets they
+are watched on."""
 
 from __future__ import annotations
 
@@ -10,7 +11,7 @@ import pytest
 import shapely
 
 from cosim.core.errors import MachineError
-from scenarios.bench.people.measures import (
+from scenarios.tools.bench.people.measures import (
     encroachments_s,
     free_speeds,
     in_bins,
@@ -20,14 +21,16 @@ from scenarios.bench.people.measures import (
     percentile_distance,
     speeds_by_density,
 )
-from scenarios.bench.people.observed import MeanSd
-from scenarios.bench.people.walking import Flow, walk_round
+from scenarios.tools.bench.people.observed import MeanSd
+from scenarios.tools.bench.people.walking import Flow, walk_round
 
 
 def _walking(rows: list[tuple[float, float, float]], frames: int = 41) -> pd.DataFrame:
     """Tracks of people who walk along x from (x, y) at a speed, ten frames a second."""
     tracks = [
-        (k, frame, x_m + mps * frame / 10, y_m) for k, (x_m, y_m, mps) in enumerate(rows) for frame in range(frames)
+        (k, frame, x_m + mps * frame / 10, y_m)
+        for k, (x_m, y_m, mps) in enumerate(rows)
+        for frame in range(frames)
     ]
     return pd.DataFrame(tracks, columns=["id", "frame", "x", "y"])
 
@@ -47,30 +50,43 @@ def test_everybody_counts_at_the_density_of_its_moment() -> None:
 def test_the_nearest_is_the_nearest_of_the_same_moment() -> None:
     """One passes a place where another was before: only where they are at the same time counts."""
     tracks = _walking([(0.0, 0.0, 1.0), (-3.0, 0.0, 1.0), (0.0, 4.0, 1.0)], frames=11)
-    assert nearest_m(tracks).reshape(3, 11) == pytest.approx(np.repeat([[3.0], [3.0], [4.0]], 11, axis=1))
+    assert nearest_m(tracks).reshape(3, 11) == pytest.approx(
+        np.repeat([[3.0], [3.0], [4.0]], 11, axis=1)
+    )
     assert nearest_m(tracks[tracks["id"] == 0]).tolist() == [np.inf] * 11
     assert free_speeds(tracks, apart_m=3.5, least_s=0.5) == pytest.approx([1.0])
 
 
 def test_gaps_are_from_leaving_to_coming() -> None:
-    """At 1 m/s a lane 1.4 m wide (2 m with the shoulders) is left after 2 s; a vehicle 4 m long at 10 m/s is there
-    0.23 s before its middle is, and gone 0.23 s after."""
+    """At 1 m/s a lane 1.4 m wide (2 m with the shoulders) is left after 2 s; a vehicle 4 m long at
+    10 m/s is there 0.23 s before its middle is, and gone 0.23 s after."""
     times_s = np.arange(0.0, 20.0, 0.01)
     person = np.column_stack([times_s, np.zeros_like(times_s), times_s - 10.0])
 
     def vehicle(at_s: float, y_m: float) -> np.ndarray:
         there = np.ones_like(times_s)
-        return np.column_stack([times_s, 10.0 * (times_s - at_s), y_m * there, 4.0 * there, 1.4 * there])
+        return np.column_stack(
+            [times_s, 10.0 * (times_s - at_s), y_m * there, 4.0 * there, 1.4 * there]
+        )
 
     # It is on the far lane, at y = 2, from 11 s to 13 s.
-    vehicles = [vehicle(5.0, 2.0), vehicle(8.0, 2.0), vehicle(16.0, 2.0), vehicle(18.0, 2.0), vehicle(10.0, -2.0)]
+    vehicles = [
+        vehicle(5.0, 2.0),
+        vehicle(8.0, 2.0),
+        vehicle(16.0, 2.0),
+        vehicle(18.0, 2.0),
+        vehicle(10.0, -2.0),
+    ]
     person_first_s, vehicle_first_s = encroachments_s([person], vehicles, 0.3)
-    assert sorted(person_first_s) == pytest.approx([10.0 - 0.23 - 9.0, 16.0 - 0.23 - 13.0], abs=0.03)
+    assert sorted(person_first_s) == pytest.approx(
+        [10.0 - 0.23 - 9.0, 16.0 - 0.23 - 13.0], abs=0.03
+    )
     assert vehicle_first_s == pytest.approx([11.0 - 8.0 - 0.23], abs=0.03)
 
 
 def test_distances_are_of_what_is_given() -> None:
-    """The same figures are 0 apart; others by mean and deviation, or by the mean difference of percentiles."""
+    """The same figures are 0 apart; others by mean and deviation, or by the mean difference of
+    percentiles."""
     assert normal_distance(MeanSd(1.0, 0.3), MeanSd(1.0, 0.3)) == 0.0
     assert normal_distance(MeanSd(1.0, 0.3), MeanSd(1.3, 0.7)) == pytest.approx(0.5)
     assert percentile_distance(np.arange(101.0), (10, 50), (11, 47)) == pytest.approx(2.0)
@@ -85,10 +101,15 @@ def test_pedpy_is_asked_for_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.engine
 def test_the_ring_holds_as_many_as_are_asked_for() -> None:
-    """On a ring of 0.5 persons/m2 everybody is there to the end, walks on it both ways, and comes forward."""
-    ring, tracks = walk_round(Flow(0.5, both_ways=True, groups=0.5), seconds=2.0, seed=0, settle_s=1.0)
+    """On a ring of 0.5 persons/m2 everybody is there to the end, walks on it both ways, and comes
+    forward."""
+    ring, tracks = walk_round(
+        Flow(0.5, both_ways=True, groups=0.5), seconds=2.0, seed=0, settle_s=1.0
+    )
     counts = tracks.groupby("frame").size()
-    assert len(counts) == 20 and counts.min() == counts.max() == pytest.approx(0.5 * ring.area_m2, abs=3.0)
+    assert len(counts) == 20 and counts.min() == counts.max() == pytest.approx(
+        0.5 * ring.area_m2, abs=3.0
+    )
     pieces = [*ring.street_map.strips.values(), *ring.street_map.corners.values()]
     ground = shapely.union_all([piece.polygon for piece in pieces]).buffer(0.3)
     assert shapely.intersects_xy(ground, tracks["x"], tracks["y"]).all()

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from cosim.core.geometry import Pose, box_disk_gap
-from cosim.judge.event_monitor import went_between
+from cosim.results.event_monitor import went_between
 from cosim.spec.events import Event, EventQuery, EventState
 from cosim.spec.scenario import City, CrowdSpec
 from scenarios.events import EVENT_KINDS, react
-from tests.cheats import BLIND_MPS, Crawl, EdgeDriver, Stander
+from tests.support.cheats import BLIND_MPS, Crawl, EdgeDriver, Stander
 
 TICK_S = 0.05
 HALF_M = (0.35, 0.275)
@@ -26,18 +26,29 @@ NEAR_M = 2.0
 STANDING = ("obstructing", "conversing", "queueing", "gesturing")
 
 
-def event(kind: str, half_width_m: float = 1.9, people: int = 1, side: int = 1, speed_mps: float = 1.2) -> Event:
+def event(
+    kind: str, half_width_m: float = 1.9, people: int = 1, side: int = 1, speed_mps: float = 1.2
+) -> Event:
     """An event 50 m along a route on the x axis."""
     length_m = 4.0 if kind == "ped_crossing" else 0.0
     return Event(
-        id="e0", kind=kind, x_m=50.0, y_m=0.0, heading_rad=0.0, route_s_m=50.0, half_width_m=half_width_m,
-        half_length_m=length_m, people=people, side=side, speed_mps=speed_mps,  # type: ignore[arg-type]
-    )  # fmt: skip
+        id="e0",
+        kind=kind,
+        x_m=50.0,
+        y_m=0.0,
+        heading_rad=0.0,
+        route_s_m=50.0,
+        half_width_m=half_width_m,
+        half_length_m=length_m,
+        people=people,
+        side=side,
+        speed_mps=speed_mps,  # type: ignore[arg-type]
+    )
 
 
 class Driven(NamedTuple):
-    """What came of a drive. gap_m: least gap between the robot and anybody; between: whether it went between two people
-    of a group; state: at the end."""
+    """What came of a drive. gap_m: least gap between the robot and anybody; between: whether it
+    went between two people of a group; state: at the end."""
 
     gap_m: float
     between: bool
@@ -46,22 +57,41 @@ class Driven(NamedTuple):
 
 
 def drive(
-    one: Event, speed_at: Callable[[float], float], start_m: float, seconds: float, left_m: float = 0.0
+    one: Event,
+    speed_at: Callable[[float], float],
+    start_m: float,
+    seconds: float,
+    left_m: float = 0.0,
 ) -> Driven:
-    """A robot on a line beside the x axis whose speed (m/s) is a function of the time (s), until it has touched
-    somebody, or gone between the two of a conversation. Gaps are looked at where it is within 2 m of somebody along its
-    way, between whom it goes where it is beside them: elsewhere neither can be."""
+    """A robot on a line beside the x axis whose speed (m/s) is a function of the time (s), until it
+    has touched somebody, or gone between the two of a conversation. Gaps are looked at where it is
+    within 2 m of somebody along its way, between whom it goes where it is beside them: elsewhere
+    neither can be."""
     states: tuple[EventState, ...] = ()
-    x_m, v_mps, nearest_m, between = start_m, speed_at(0.0), math.inf, False
+    x_m = start_m
+    v_mps = speed_at(0.0)
+    nearest_m = math.inf
+    between = False
     seen = []
     for tick in range(round(seconds / TICK_S)):
         query = EventQuery(
-            episode="t", tick=tick, tick_ms=50, robot_x_m=x_m, robot_y_m=left_m, robot_heading_rad=0.0,
-            robot_v_mps=v_mps, robot_w_radps=0.0, route_s_m=x_m, robot_length_m=0.7, robot_width_m=0.55, events=(one,),
+            episode="t",
+            tick=tick,
+            tick_ms=50,
+            robot_x_m=x_m,
+            robot_y_m=left_m,
+            robot_heading_rad=0.0,
+            robot_v_mps=v_mps,
+            robot_w_radps=0.0,
+            route_s_m=x_m,
+            robot_length_m=0.7,
+            robot_width_m=0.55,
+            events=(one,),
             states=states,
-        )  # fmt: skip
+        )
         states = react(query).states
-        before_m, v_mps = x_m, speed_at(tick * TICK_S)
+        before_m = x_m
+        v_mps = speed_at(tick * TICK_S)
         x_m += v_mps * TICK_S
         seen.append((x_m, states[0]))
         ahead_m = [walker.x_m - x_m for walker in states[0].walkers]
@@ -79,23 +109,31 @@ def drive(
 
 @pytest.mark.parametrize("v_mps", BLIND_MPS)
 @pytest.mark.parametrize("kind", EVENT_KINDS)
-def test_who_drives_straight_on_at_whatever_speed_meets_somebody_of_every_event(kind: str, v_mps: float) -> None:
-    """On sidewalks of three widths, with few people and many, from either side, slow people and fast: the body is
-    touched after the trigger, or goes between two of a group."""
+def test_who_drives_straight_on_at_whatever_speed_meets_somebody_of_every_event(
+    kind: str, v_mps: float
+) -> None:
+    """On sidewalks of three widths, with few people and many, from either side, slow people and
+    fast: the body is touched after the trigger, or goes between two of a group."""
     for people in PEOPLE.get(kind, (1,)):
         for half_m in (1.45, 1.9, 2.9):
             half_width_m = HALF_WIDTHS_M.get(kind, {}).get(people, half_m)
             for side, speed_mps in ((1, 1.1), (-1, 1.65)):
                 one = event(kind, half_width_m, people, side, speed_mps)
-                before_m = 2.0 if kind == "overtaking" else 1.0 + (EVENT_KINDS[kind].trigger_m or one.half_length_m)
-                start_m, way_m = 50.0 - before_m, before_m + (16.0 if kind == "overtaking" else 14.0)
+                before_m = (
+                    2.0
+                    if kind == "overtaking"
+                    else 1.0 + (EVENT_KINDS[kind].trigger_m or one.half_length_m)
+                )
+                start_m = 50.0 - before_m
+                way_m = before_m + (16.0 if kind == "overtaking" else 14.0)
                 driven = drive(one, lambda _: v_mps, start_m, way_m / v_mps)
                 assert driven.gap_m < 0.0 if (kind, people) != ("conversing", 2) else driven.between
                 assert driven.between or driven.state.phase == "acting"
 
 
 def by_fits_and_starts(v_mps: float, late_s: float) -> Callable[[float], float]:
-    """The speed (m/s) of who stands for 0.8 s in every 2.4 s, and takes 0.4 s to start and to stop."""
+    """The speed (m/s) of who stands for 0.8 s in every 2.4 s, and takes 0.4 s to start and to
+    stop."""
 
     def speed_at(t_s: float) -> float:
         since_s = (t_s + late_s) % 2.4
@@ -106,7 +144,9 @@ def by_fits_and_starts(v_mps: float, late_s: float) -> Callable[[float], float]:
 
 @pytest.mark.parametrize("v_mps", [0.8, 1.2, 1.8])
 @pytest.mark.parametrize("kind", ["lateral", "overtaking"])
-def test_who_drives_by_fits_and_starts_meets_those_who_cross_or_cut_in(kind: str, v_mps: float) -> None:
+def test_who_drives_by_fits_and_starts_meets_those_who_cross_or_cut_in(
+    kind: str, v_mps: float
+) -> None:
     """Whenever it happens to stand: they slow down as it does, and stand as it stands."""
     for side, late_s in itertools.product((-1, 1), (0.0, 0.6, 1.2, 1.8)):
         driven = drive(event(kind, side=side), by_fits_and_starts(v_mps, late_s), 44.0, 60.0)
@@ -115,16 +155,21 @@ def test_who_drives_by_fits_and_starts_meets_those_who_cross_or_cut_in(kind: str
 
 @pytest.mark.parametrize("kind", ["lateral", "overtaking"])
 def test_who_stops_before_one_who_crosses_or_cuts_in_has_let_it_go(kind: str) -> None:
-    """However late it stops, if it stands until they have gone on: it is not touched, and the event is over."""
+    """However late it stops, if it stands until they have gone on: it is not touched, and the event
+    is over."""
     meets_s = len(drive(event(kind), lambda _: 1.0, 44.0, 30.0).seen) * TICK_S
     for early_s in (0.6, 1.0, 1.5, 2.5):
-        driven = drive(event(kind), lambda t_s, at_s=meets_s - early_s: float(t_s < at_s), 44.0, 40.0)  # type: ignore[misc]
+        driven = drive(
+            event(kind), lambda t_s, at_s=meets_s - early_s: float(t_s < at_s), 44.0, 40.0
+        )  # type: ignore[misc]
         assert driven.gap_m > 0.0 and driven.state.phase in ("over", "gone"), f"{early_s} s before"
 
 
 @pytest.mark.parametrize("left_m", [-0.9, -0.5, 0.5, 0.9])
 @pytest.mark.parametrize("kind", STANDING)
-def test_who_keeps_to_one_side_of_the_sidewalk_meets_those_who_stand_too(kind: str, left_m: float) -> None:
+def test_who_keeps_to_one_side_of_the_sidewalk_meets_those_who_stand_too(
+    kind: str, left_m: float
+) -> None:
     """They step before the robot; who drives near the middle is met on the middle."""
     for side in (-1, 1):
         one = event(kind, 1.9, PEOPLE.get(kind, (1,))[0], side)
@@ -140,12 +185,18 @@ def test_who_keeps_to_one_side_of_the_sidewalk_meets_those_who_stand_too(kind: s
 def test_who_keeps_to_one_side_of_a_crosswalk_meets_somebody(people: int, left_m: float) -> None:
     """Who comes from the front, or who waits to follow from behind."""
     for side in (-1, 1):
-        assert drive(event("ped_crossing", 1.6, people, side), lambda _: 1.2, 40.0, 20.0, left_m).gap_m < 0.0
+        assert (
+            drive(event("ped_crossing", 1.6, people, side), lambda _: 1.2, 40.0, 20.0, left_m).gap_m
+            < 0.0
+        )
 
 
 @pytest.mark.parametrize("kind", STANDING)
-def test_those_who_stand_stay_until_the_robot_is_three_metres_past_the_last_of_them(kind: str) -> None:
-    """However long it takes: beside them it creeps past at 0.06 m/s, and they do not stir before."""
+def test_those_who_stand_stay_until_the_robot_is_three_metres_past_the_last_of_them(
+    kind: str,
+) -> None:
+    """However long it takes: beside them it creeps past at 0.06 m/s, and they do not stir
+    before."""
     one = event(kind, 2.9, PEOPLE.get(kind, (1,))[0])
     driven = drive(one, lambda t_s: 1.0 if t_s < 9.0 else 0.06, 38.0, 150.0, left_m=-4.0)
     last_m = max(walker.x_m for walker in driven.seen[200][1].walkers)
@@ -161,7 +212,9 @@ def test_a_stopping_hand_is_let_down_when_the_robot_has_stood_before_it_for_two_
         arrives_s = (stops_at_m - 38.0) / 1.0
         driven = drive(
             event("gesturing"),
-            lambda t_s, a=arrives_s, s=stands_s: 0.0 if a < t_s < a + s else 0.1 if t_s > a else 1.0,  # type: ignore[misc]
+            lambda t_s, a=arrives_s, s=stands_s: (
+                0.0 if a < t_s < a + s else 0.1 if t_s > a else 1.0
+            ),  # type: ignore[misc]
             38.0,
             arrives_s + stands_s + 1.0,
         )
@@ -170,9 +223,11 @@ def test_a_stopping_hand_is_let_down_when_the_robot_has_stood_before_it_for_two_
 
 @pytest.mark.parametrize("speed_mps", [1.1, 1.65])
 @pytest.mark.parametrize("left_m", [0.0, 0.4, -0.7])
-def test_who_comes_towards_a_robot_that_stands_walks_round_it(left_m: float, speed_mps: float) -> None:
-    """From wherever it stopped, at least a second before they meet, it is passed at a distance, and the walker goes
-    on."""
+def test_who_comes_towards_a_robot_that_stands_walks_round_it(
+    left_m: float, speed_mps: float
+) -> None:
+    """From wherever it stopped, at least a second before they meet, it is passed at a distance, and
+    the walker goes on."""
     for drives_s in (0.5, 3.0, 5.0):
         one = event("frontal", 1.9, speed_mps=speed_mps)
         driven = drive(one, lambda t_s, d=drives_s: 1.2 if t_s < d else 0.0, 30.0, 40.0, left_m)  # type: ignore[misc]
@@ -205,11 +260,18 @@ def test_who_overtakes_is_not_touched_by_a_robot_that_slows_down_and_walks_on(v_
     """Nor by one that stands the whole time, which it passes."""
     cuts_s = next(
         tick * TICK_S
-        for tick, (_, state) in enumerate(drive(event("overtaking"), lambda _: v_mps, 49.0, 60.0).seen)
+        for tick, (_, state) in enumerate(
+            drive(event("overtaking"), lambda _: v_mps, 49.0, 60.0).seen
+        )
         if state.walkers[0].aim_rad is not None
     )
     for stops_s, slow_mps in ((cuts_s + 0.5, 0.1), (2.2 / v_mps, 0.0)):
-        driven = drive(event("overtaking"), lambda t_s, s=stops_s, v=slow_mps: v_mps if t_s < s else v, 49.0, 30.0)  # type: ignore[misc]
+        driven = drive(
+            event("overtaking"),
+            lambda t_s, s=stops_s, v=slow_mps: v_mps if t_s < s else v,
+            49.0,
+            30.0,
+        )  # type: ignore[misc]
         assert driven.gap_m > 0.05
         assert driven.state.phase in ("over", "gone")
 
@@ -224,22 +286,29 @@ def test_who_overtakes_is_not_touched_by_a_robot_that_slows_down_and_walks_on(v_
         ("frontal", Stander(1.2, 5.0)),
     ],
 )
-def test_blind_policies_do_not_solve_events_and_who_stands_has_not_failed(kind: str, policy: Crawl) -> None:
-    """With real engines and nobody else in the street: the event takes place and is seen; a blind driver collides and
-    is at fault or shares it, and who stands waits for its goal until the time is up."""
+def test_blind_policies_do_not_solve_events_and_who_stands_has_not_failed(
+    kind: str, policy: Crawl
+) -> None:
+    """With real engines and nobody else in the street: the event takes place and is seen; a blind
+    driver collides and is at fault or shares it, and who stands waits for its goal until the time
+    is up."""
     from cosim.place.walk_graph import WalkGraph
-    from scenarios.builders.reactive import build_reactive
-    from scenarios.execution.places import place
-    from scenarios.execution.run import run_episode
+    from scenarios.episodes.run_episode import run_episode
+    from scenarios.places.nets import place
+    from scenarios.suites.reactive import build_reactive
 
     city = City(seed=5, size_m=500.0)
     _, street_map = place(city)
     whole = build_reactive(EVENT_KINDS[kind], city, street_map, WalkGraph(street_map), 1, kind)
     stands = isinstance(policy, Stander)
     scenario = msgspec.structs.replace(
-        whole, crowd=CrowdSpec(persons=0, vehicles=0), time_limit_s=25.0 if stands else whole.time_limit_s
+        whole,
+        crowd=CrowdSpec(persons=0, vehicles=0),
+        time_limit_s=25.0 if stands else whole.time_limit_s,
     )
     record = run_episode(scenario, policy).record
     assert (record.status, record.measures["success"]) == ("done", 0.0)
     assert record.ended == ("timeout" if stands else "failure")
-    assert [failure.fault in ("robot_at_fault", "shared") for failure in record.failures] == [True] * (not stands)
+    assert [failure.fault in ("robot_at_fault", "shared") for failure in record.failures] == [
+        True
+    ] * (not stands)

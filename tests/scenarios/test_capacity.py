@@ -14,19 +14,22 @@ from cosim.core.errors import CosimError
 from cosim.place.street_map import Corner, Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import City, CityMap, Place
-from scenarios.builders.capacity import capacity_of
-from scenarios.builders.reactive import build_reactive
-from scenarios.builders.unit import STRUCTURES, build_unit
 from scenarios.events import EVENT_KINDS
-from scenarios.execution.places import place
+from scenarios.places.nets import place
+from scenarios.suites.capacity import capacity_of
+from scenarios.suites.reactive import build_reactive
+from scenarios.suites.unit import STRUCTURES, build_unit
 from tests.conftest import Cosim
 
 pytestmark = pytest.mark.engine
 
 
-@pytest.mark.parametrize("where", [City(seed=1, size_m=500.0), CityMap(map="sumo-fkk-in")], ids=lambda p: p.name)
+@pytest.mark.parametrize(
+    "where", [City(seed=1, size_m=500.0), CityMap(map="sumo-fkk-in")], ids=lambda p: p.name
+)
 def test_what_is_offered_can_be_drawn_and_nothing_else(where: Place) -> None:
-    """Each kind of event and each structure has a place where a scenario of it is drawn, and none where it is not."""
+    """Each kind of event and each structure has a place where a scenario of it is drawn, and none
+    where it is not."""
     _, street_map = place(where)
     graph = WalkGraph(street_map)
     capacity = capacity_of(street_map, graph)
@@ -40,38 +43,69 @@ def test_what_is_offered_can_be_drawn_and_nothing_else(where: Place) -> None:
         with with_reason:
             build_unit(structure, where, street_map, graph, 0, structure)
             drawn.add(structure)
-    found = {name: count for name, count in {**capacity.events, **capacity.structures}.items() if count.found}
+    found = {
+        name: count
+        for name, count in {**capacity.events, **capacity.structures}.items()
+        if count.found
+    }
     assert set(found) == drawn and capacity.routes.found
-    assert all(count.found <= count.looked_at <= count.places and not count.why_not for count in found.values())
+    assert all(
+        count.found <= count.looked_at <= count.places and not count.why_not
+        for count in found.values()
+    )
 
 
 def street(width_m: float) -> StreetMap:
     """Two sidewalks of 60 m that meet at a corner."""
-    lines = {"west": np.array([[0.0, 0.0], [60.0, 0.0]]), "north": np.array([[62.0, 2.0], [62.0, 62.0]])}
+    lines = {
+        "west": np.array([[0.0, 0.0], [60.0, 0.0]]),
+        "north": np.array([[62.0, 2.0], [62.0, 62.0]]),
+    }
     strips = {
-        name: Strip(name, "sidewalk", line, width_m, LineString(line).buffer(width_m / 2, cap_style="flat"), ends)
+        name: Strip(
+            name,
+            "sidewalk",
+            line,
+            width_m,
+            LineString(line).buffer(width_m / 2, cap_style="flat"),
+            ends,
+        )
         for (name, line), ends in zip(lines.items(), [(None, "c"), ("c", None)], strict=True)
     }
-    corner = Corner("c", box(60, -width_m / 2, 62 + width_m / 2, 2), (Port("west", 1), Port("north", 0)))
+    corner = Corner(
+        "c", box(60, -width_m / 2, 62 + width_m / 2, 2), (Port("west", 1), Port("north", 0))
+    )
     return StreetMap("street", (0, -2, 64, 62), strips, {"c": corner}, {}, {})
 
 
 @pytest.mark.parametrize(("width_m", "fit"), [(1.6, 0), (2.7, 4), (4.0, 7)])
-def test_a_kind_that_needs_a_wider_sidewalk_has_no_place_and_the_reason_is_told(width_m: float, fit: int) -> None:
+def test_a_kind_that_needs_a_wider_sidewalk_has_no_place_and_the_reason_is_told(
+    width_m: float, fit: int
+) -> None:
     """Of two sidewalks, none, or both; without a crosswalk none for those that cross one."""
     capacity = capacity_of(street(width_m), WalkGraph(street(width_m)))
     assert sum(count.found == 2 for count in capacity.events.values()) == fit
     assert str(capacity.events["ped_crossing"]) == "none: there are no crosswalks"
-    narrow = {str(n) for name, n in capacity.events.items() if not n.found and name != "ped_crossing"}
-    assert narrow <= {f"none of 2 sidewalks: the sidewalk is narrower than {w} m" for w in (2.6, 2.8, 3.9)}
-    straight = "2 of 2 sidewalks" if fit else "none: no sidewalk is wide enough, apart from stairs, bridges and tunnels"
+    narrow = {
+        str(n) for name, n in capacity.events.items() if not n.found and name != "ped_crossing"
+    }
+    assert narrow <= {
+        f"none of 2 sidewalks: the sidewalk is narrower than {w} m" for w in (2.6, 2.8, 3.9)
+    }
+    straight = (
+        "2 of 2 sidewalks"
+        if fit
+        else "none: no sidewalk is wide enough, apart from stairs, bridges and tunnels"
+    )
     assert str(capacity.structures["straight"]) == straight
-    assert str(capacity.routes).startswith("none: no way of the drawn length") and capacity.usable == (fit > 0)
+    assert str(capacity.routes).startswith(
+        "none: no way of the drawn length"
+    ) and capacity.usable == (fit > 0)
 
 
 def test_the_check_counts_the_places_of_each_kind(cosim: Cosim, tmp_path: Path) -> None:
-    """A row for each of the eight events, the three structures and long routes; the same in JSON; nothing is called
-    possible."""
+    """A row for each of the eight events, the three structures and long routes; the same in JSON;
+    nothing is called possible."""
     done = cosim("map", "check", "sumo-fkk-in", cwd=tmp_path)
     assert done.returncode == 0 and "possible" not in done.stdout
     as_json = cosim("map", "check", "sumo-fkk-in", "--json", cwd=tmp_path)

@@ -1,4 +1,5 @@
-"""Workers and a coordinator, as a user starts them, that are killed and stopped in the middle of a run."""
+"""Workers and a coordinator, as a user starts them, that are killed and stopped in the middle of a
+run."""
 
 from __future__ import annotations
 
@@ -7,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from cosim.records.run_folder import read_records
-from scenarios.many.chaos import PlannedBlow, chaos, differences, quiet, tiny_suite
+from cosim.results.run_folder import read_records
+from tests.support.chaos import PlannedBlow, chaos, differences, quiet, tiny_suite
 
 PLAN = [
     PlannedBlow(1, "kill worker"),
@@ -22,10 +23,13 @@ SEED = 143
 
 
 @pytest.mark.engine
-def test_what_is_killed_in_a_run_of_many_workers_changes_none_of_its_results(tmp_path: Path) -> None:
-    """Ten real episodes by three workers: one worker is killed, one stopped for a while, one told to end, an
-    environment process is killed, and so is the coordinator; one scenario kills all that run it. The table is that of a
-    quiet run to the byte, and so are the state hashes; the poison is named."""
+def test_what_is_killed_in_a_run_of_many_workers_changes_none_of_its_results(
+    tmp_path: Path,
+) -> None:
+    """Ten real episodes by three workers: one worker is killed, one stopped for a while, one told
+    to end, an environment process is killed, and so is the coordinator; one scenario kills all that
+    run it. The table is that of a quiet run to the byte, and so are the state hashes; the poison is
+    named."""
     tiny_suite(tmp_path, 10)
     with ThreadPoolExecutor(1) as beside:
         calm = beside.submit(quiet, tmp_path, jobs=1)

@@ -8,16 +8,17 @@ import pandas as pd
 import pytest
 
 import cosim
-from scenarios.catalog import load_suite
 from scenarios.events import EVENT_KINDS
-from tests import cheats
+from scenarios.suites.catalog import load_suite
 from tests.conftest import Cosim
+from tests.support import cheats
 
 KINDS = tuple(EVENT_KINDS)
 NAMES = tuple(name for name in cheats.CHEATS if name != "Quitter")
 
 HARDEST = {"StopAndGo": ("lateral", "overtaking")}
-"""Who crosses or cuts in lets the robot go by its speed, so it is there that stops by the clock could pay."""
+"""Who crosses or cuts in lets the robot go by its speed, so it is there that stops by the clock
+could pay."""
 
 
 def scenarios_of(kinds: tuple[str, ...], each: int) -> list[str]:
@@ -29,11 +30,15 @@ def scenarios_of(kinds: tuple[str, ...], each: int) -> list[str]:
 @pytest.mark.engine
 @pytest.mark.parametrize("name", NAMES)
 def test_a_cheat_solves_no_event(name: str, request: pytest.FixtureRequest) -> None:
-    """On one kind of event each, and on each kind one of them; all on all with --whole: no success, and none is left
-    out of the table. Without engines blind drivers are tried on every kind, at every speed."""
-    whole, number = request.config.getoption("--whole"), NAMES.index(name)
+    """On one kind of event each, and on each kind one of them; all on all with --whole: no success,
+    and none is left out of the table. Without engines blind drivers are tried on every kind, at
+    every speed."""
+    whole = request.config.getoption("--whole")
+    number = NAMES.index(name)
     kinds = KINDS if whole else HARDEST.get(name, (KINDS[number % 8],))
-    table = cosim.run("reactive", getattr(cheats, name)(), scenarios=scenarios_of(kinds, 3 if whole else 1))
+    table = cosim.run(
+        "reactive", getattr(cheats, name)(), scenarios=scenarios_of(kinds, 3 if whole else 1)
+    )
     assert set(table["status"]) == {"done"} and table["success"].sum() == 0.0
 
 
@@ -47,12 +52,16 @@ def test_who_ends_its_process_before_it_fails_has_failed(tmp_path: Path, cosim: 
         "--scenario",
         scenario,
         "--policy",
-        "tests.cheats:Quitter",
+        "tests.support.cheats:Quitter",
         "--out",
         str(tmp_path / "r"),
     )
     ran = cosim(*words, cwd=Path(__file__).parents[2])
     table = pd.read_csv(tmp_path / "r" / "results.csv")
     assert ran.returncode == 1 and table["status"].tolist() == ["crashed"], ran.stderr
-    assert table[["success", "pedestrian_collision", "left_lane"]].iloc[0].tolist() == [0.0, 1.0, 1.0]
+    assert table[["success", "pedestrian_collision", "left_lane"]].iloc[0].tolist() == [
+        0.0,
+        1.0,
+        1.0,
+    ]
     assert "none, because 1 crashed" in ran.stdout

@@ -1,4 +1,5 @@
-"""`cosim collect`: what it writes is what was driven, whatever stopped it and however many processes drove."""
+"""`cosim collect`: what it writes is what was driven, whatever stopped it and however many
+processes drove."""
 
 from __future__ import annotations
 
@@ -16,32 +17,45 @@ import numpy as np
 import pytest
 
 from cosim.core.errors import SpecError, UsageError
-from cosim.core.packed import Packed, read_packed
+from cosim.core.packed_demos import Packed, read_packed
 from cosim.core.state import Command
-from cosim.episode.driver import Driver
-from cosim.episode.log import Log
-from cosim.episode.ports import CameraSpec, Manifest, Observation, Policy
+from cosim.episode.interfaces import Observation, Policy
+from cosim.episode.policy_caller import Driver
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies.load import load_policy
-from cosim.records.run_folder import DEMONSTRATION
-from cosim.spec.collecting import Collecting
+from cosim.results.log import Log
+from cosim.results.run_folder import DEMONSTRATION
+from cosim.spec.camera import CameraSpec
+from cosim.spec.demo_options import Collecting
+from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import City, Scenario, Suite, write_suite
-from scenarios.builders.unit import build_unit
-from scenarios.collecting.demonstration import Demonstration
-from scenarios.collecting.demonstrator import Demonstrator
-from scenarios.execution.places import place
-from scenarios.execution.run import run_episode
+from scenarios.episodes.demonstration import Demonstration
+from scenarios.episodes.demonstrator import Demonstrator
+from scenarios.episodes.run_episode import run_episode
+from scenarios.places.nets import place
+from scenarios.suites.unit import build_unit
 from tests.conftest import WIDE, Cosim
 
 pytestmark = pytest.mark.engine
 NOISY = Collecting(camera=CameraSpec(width=64, height=48), noise=0.3)
-ASKED = ("collect", "ways.json", "--episodes", "3", "--camera", "64x48", "--noise", "0.3", "--out", "demos")
+ASKED = (
+    "collect",
+    "ways.json",
+    "--episodes",
+    "3",
+    "--camera",
+    "64x48",
+    "--noise",
+    "0.3",
+    "--out",
+    "demos",
+)
 
 
 class Desk(NamedTuple):
-    """A folder with ways.json, and three demos collected of it. ways: 3 to 4 m straight on; the second of the four has
-    no time for that."""
+    """A folder with ways.json, and three demos collected of it. ways: 3 to 4 m straight on; the
+    second of the four has no time for that."""
 
     folder: Path
     ways: tuple[Scenario, ...]
@@ -58,17 +72,26 @@ class Desk(NamedTuple):
 
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Desk:
-    """Collecting was begun by two processes, killed when one episode was over, and gone on with by one."""
+    """Collecting was begun by two processes, killed when one episode was over, and gone on with by
+    one."""
     folder = tmp_path_factory.mktemp("desk")
     where = City(seed=1, size_m=500.0)
     _, street_map = place(where)
     graph = WalkGraph(street_map)
-    drawn = [build_unit("straight", where, street_map, graph, k, f"way-{k}", way_m=(3.0, 4.0)) for k in range(4)]
+    drawn = [
+        build_unit("straight", where, street_map, graph, k, f"way-{k}", way_m=(3.0, 4.0))
+        for k in range(4)
+    ]
     ways = (drawn[0], msgspec.structs.replace(drawn[1], time_limit_s=0.5), *drawn[2:])
     write_suite(Suite(name="ways", version="1", scenarios=ways), folder / "ways.json")
     command = [sys.executable, "-m", "cosim", *ASKED, "--jobs", "2"]
     with subprocess.Popen(
-        command, cwd=folder, env=os.environ | WIDE, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+        command,
+        cwd=folder,
+        env=os.environ | WIDE,
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        text=True,
     ) as begun:
         assert begun.stderr is not None
         assert any("done, 1 of 3" in line for line in begun.stderr)
@@ -97,27 +120,42 @@ def shown_here(
     return Demonstration.decoded(demonstrator.kept(way, outcome.record, outcome.log), way.id)
 
 
-def test_what_was_killed_and_went_on_is_to_the_byte_what_one_process_drives(desk: Desk, packed: Packed) -> None:
-    """Each demonstration has the bytes of one that is driven here, in one go; the data set has its rows, in the order
-    of the suite; what was not solved is told and left out, and a further scenario is driven in its place."""
+def test_what_was_killed_and_went_on_is_to_the_byte_what_one_process_drives(
+    desk: Desk, packed: Packed
+) -> None:
+    """Each demonstration has the bytes of one that is driven here, in one go; the data set has its
+    rows, in the order of the suite; what was not solved is told and left out, and a further
+    scenario is driven in its place."""
     shown = [shown_here(way, load_policy("orca")) for way in desk.solved]
     kept = [(desk.kept(way) / DEMONSTRATION).read_bytes() for way in desk.solved]
-    assert not [way.id for way, file, one in zip(desk.solved, kept, shown, strict=True) if file != one.encoded()]
+    assert not [
+        way.id
+        for way, file, one in zip(desk.solved, kept, shown, strict=True)
+        if file != one.encoded()
+    ]
     for name in ("state", "goal", "command", "waypoints", "driven", "disturbed"):
-        np.testing.assert_array_equal(getattr(packed, name), np.concatenate([getattr(one, name) for one in shown]))
+        np.testing.assert_array_equal(
+            getattr(packed, name), np.concatenate([getattr(one, name) for one in shown])
+        )
     assert packed.meta["scenarios"] == [way.id for way in desk.solved]
     assert "(3 episodes, " in desk.said
     assert "Dropped 1 that were not solved: ended by timeout: 1" in desk.said
     assert not (desk.kept(desk.ways[1]) / DEMONSTRATION).exists()
 
 
-def test_rows_are_of_the_ticks_at_which_their_pictures_were_taken(desk: Desk, packed: Packed) -> None:
-    """Row k of an episode is of tick 4 k: its speeds are those that the trajectory has there, its command is what was
-    driven then unless it was disturbed, and its next waypoint is where the robot was 4 ticks later."""
+def test_rows_are_of_the_ticks_at_which_their_pictures_were_taken(
+    desk: Desk, packed: Packed
+) -> None:
+    """Row k of an episode is of tick 4 k: its speeds are those that the trajectory has there, its
+    command is what was driven then unless it was disturbed, and its next waypoint is where the
+    robot was 4 ticks later."""
     assert packed.disturbed.any()
     for number, way in enumerate(desk.solved):
-        log, rows = Log.load(desk.kept(way) / "trajectory.npz"), packed.episode == number
-        speed, pose = (np.vstack([first, all_]) for first, all_ in (((0, 0), log.speed), (way.start, log.pose)))
+        log = Log.load(desk.kept(way) / "trajectory.npz")
+        rows = packed.episode == number
+        speed, pose = (
+            np.vstack([first, all_]) for first, all_ in (((0, 0), log.speed), (way.start, log.pose))
+        )
         ticks = 4 * packed.frame[rows]
         np.testing.assert_allclose(packed.state[rows], speed[ticks], atol=1e-6)
         as_driven = np.abs(packed.command[rows] - log.command[ticks]).max(axis=1) < 1e-6
@@ -130,20 +168,42 @@ def test_rows_are_of_the_ticks_at_which_their_pictures_were_taken(desk: Desk, pa
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        (("--resume", "--noise", "0.1"), "is of another data set: its noise is 0.3, now asked for is 0.1."),
-        (("--resume", "--policy", "social_force"), "its policy is orca, now asked for is social_force."),
+        (
+            ("--resume", "--noise", "0.1"),
+            "is of another data set: its noise is 0.3, now asked for is 0.1.",
+        ),
+        (
+            ("--resume", "--policy", "social_force"),
+            "its policy is orca, now asked for is social_force.",
+        ),
         (("--resume", "--seed", "5"), "is of another data set: its seed is 0, now asked for is 5."),
         ((), "demos already holds a data set, or a part of one. Add --resume"),
         (("--out", "."), ". exists and is no data set. Choose another --out."),
         (("--goal", "image"), "give --goal, one of none, route_point, final_point, instruction"),
         (("--camera", "160"), "--camera 160: give width x height in pixels, such as 160x90"),
-        (("--cities", "900:901"), "unknown suite for --cities 'ways.json'. Valid choices: reactive, unit"),
+        (
+            ("--cities", "900:901"),
+            "unknown suite for --cities 'ways.json'. Valid choices: reactive, unit",
+        ),
         (("--cities", "900:901", "--split", "val"), "--cities and --split do not go together"),
     ],
-    ids=["noise", "policy", "seed", "no resume", "used folder", "goal", "camera", "no kind", "split of cities"],
+    ids=[
+        "noise",
+        "policy",
+        "seed",
+        "no resume",
+        "used folder",
+        "goal",
+        "camera",
+        "no kind",
+        "split of cities",
+    ],
 )
-def test_another_data_set_is_refused_in_its_folder(desk: Desk, cosim: Cosim, more: tuple[str, ...], words: str) -> None:
-    """Other settings, a used folder and options that mean nothing are refused in one line, and nothing is touched."""
+def test_another_data_set_is_refused_in_its_folder(
+    desk: Desk, cosim: Cosim, more: tuple[str, ...], words: str
+) -> None:
+    """Other settings, a used folder and options that mean nothing are refused in one line, and
+    nothing is touched."""
     before = sorted((path, path.stat().st_mtime_ns) for path in desk.folder.rglob("*"))
     said = cosim(*ASKED, *more, cwd=desk.folder)
     assert said.returncode == 2
@@ -152,10 +212,17 @@ def test_another_data_set_is_refused_in_its_folder(desk: Desk, cosim: Cosim, mor
     assert before == sorted((path, path.stat().st_mtime_ns) for path in desk.folder.rglob("*"))
 
 
-def test_a_data_set_that_was_stopped_while_it_was_written_is_written_anew(desk: Desk, cosim: Cosim) -> None:
+def test_a_data_set_that_was_stopped_while_it_was_written_is_written_anew(
+    desk: Desk, cosim: Cosim
+) -> None:
     """Without meta/ it is not whole: --resume drives nothing again and writes the same bytes."""
     made = desk.folder / "demos"
-    there = [path for name in ("meta", "data", "videos") for path in (made / name).rglob("*") if path.is_file()]
+    there = [
+        path
+        for name in ("meta", "data", "videos")
+        for path in (made / name).rglob("*")
+        if path.is_file()
+    ]
     files = {path: path.read_bytes() for path in there}
     shutil.rmtree(made / "meta")
     (made / "writing").mkdir()
@@ -168,9 +235,9 @@ def test_a_data_set_that_was_stopped_while_it_was_written_is_written_anew(desk: 
 
 
 def test_fresh_scenarios_are_drawn_the_same_in_pieces() -> None:
-    """Two structures in two small cities: each is drawn under its name and by a light of its own, and who draws them in
-    two pieces gets the same."""
-    from scenarios.collecting.fresh import Fresh
+    """Two structures in two small cities: each is drawn under its name and by a light of its own,
+    and who draws them in two pieces gets the same."""
+    from scenarios.suites.new_scenarios import Fresh
 
     there = Fresh(kind="unit", structures=("straight", "curve"), seeds=(1, 2), size_m=500.0)
     drawn = there.drawn(0, 5)
@@ -224,7 +291,9 @@ class Stands:
 class Learner(Stands):
     """Drives on, and knows nothing that a picture does not show. asked: the ticks of an episode."""
 
-    manifest = Manifest("learner", rate_hz=5.0, camera=CameraSpec(width=64, height=48), goal="route_point")
+    manifest = Manifest(
+        "learner", rate_hz=5.0, camera=CameraSpec(width=64, height=48), goal="route_point"
+    )
 
     def reset(self, episode_id: str, seed: int) -> None:
         self.asked: list[int] = []
@@ -237,24 +306,32 @@ class Learner(Stands):
 
 
 def test_a_learner_drives_and_the_expert_says_what_it_should_have_done(desk: Desk) -> None:
-    """It is asked at every picture, drives its share of the time, seconds at once, while each row has the expert's
-    answer; the same seed gives the same bytes."""
-    kept = Collecting(camera=CameraSpec(width=64, height=48), noise=0.6, learner="learner", unsolved=True)
-    way, learner = msgspec.structs.replace(desk.ways[0], time_limit_s=20.0), Learner()
+    """It is asked at every picture, drives its share of the time, seconds at once, while each row
+    has the expert's answer; the same seed gives the same bytes."""
+    kept = Collecting(
+        camera=CameraSpec(width=64, height=48), noise=0.6, learner="learner", unsolved=True
+    )
+    way = msgspec.structs.replace(desk.ways[0], time_limit_s=20.0)
+    learner = Learner()
     shown = shown_here(way, Driver.of(Stands()), kept, learner)
     assert learner.asked == sorted(set(learner.asked)) and len(learner.asked) == len(shown) > 20
     assert not shown.command.any()
     assert 0.3 < shown.disturbed.mean() < 0.9
     begins = np.flatnonzero(shown.disturbed[1:] & ~shown.disturbed[:-1])
     assert begins.size and shown.disturbed.sum() / (begins.size + 1) >= 5
-    assert shown.state[1:, 0][shown.disturbed[:-1]].mean() > 0.4 > shown.state[1:, 0][~shown.disturbed[:-1]].mean()
+    assert (
+        shown.state[1:, 0][shown.disturbed[:-1]].mean()
+        > 0.4
+        > shown.state[1:, 0][~shown.disturbed[:-1]].mean()
+    )
     assert shown_here(way, Driver.of(Stands()), kept, learner).encoded() == shown.encoded()
 
 
 BESIDE = """
 import os, signal
 from cosim.core.state import Command
-from cosim.episode.ports import CameraSpec, Manifest
+from cosim.spec.camera import CameraSpec
+from cosim.spec.manifest import Manifest
 
 
 class Learner:
@@ -281,25 +358,43 @@ class Dies(Learner):
 def test_a_learner_drives_in_every_process_as_it_does_in_this_one(
     desk: Desk, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two processes with a learner of one's own write the bytes of one; the data set tells which it was, and is not
-    gone on with by another one, or by what the same name means now."""
+    """Two processes with a learner of one's own write the bytes of one; the data set tells which it
+    was, and is not gone on with by another one, or by what the same name means now."""
     (desk.folder / "beside.py").write_text(BESIDE)
     some = ("--scenario", "way-0", "--scenario", "way-2")
-    asked = ("collect", "ways.json", *some, "--camera", "64x48", "--noise", "0.6", "--unsolved", "--out", "taught")
+    asked = (
+        "collect",
+        "ways.json",
+        *some,
+        "--camera",
+        "64x48",
+        "--noise",
+        "0.6",
+        "--unsolved",
+        "--out",
+        "taught",
+    )
     said = cosim(*asked, "--learner", "beside:Learner", "--jobs", "2", cwd=desk.folder)
     assert said.returncode == 0, said.stderr
     monkeypatch.syspath_prepend(desk.folder)
     learner = load_policy("beside:Learner")
-    kept = Collecting(camera=CameraSpec(width=64, height=48), noise=0.6, learner="beside:Learner", unsolved=True)
+    kept = Collecting(
+        camera=CameraSpec(width=64, height=48), noise=0.6, learner="beside:Learner", unsolved=True
+    )
     for way in (desk.ways[0], desk.ways[2]):
         shown = shown_here(way, load_policy("orca"), kept, learner)
         assert shown.disturbed.any()
-        assert (desk.folder / f"taught/runs/00/episodes/{way.id}" / DEMONSTRATION).read_bytes() == shown.encoded()
+        assert (
+            desk.folder / f"taught/runs/00/episodes/{way.id}" / DEMONSTRATION
+        ).read_bytes() == shown.encoded()
     told = json.loads((desk.folder / "taught/meta/cosim.json").read_bytes())
     assert (told["learner"], told["learner_source"]) == ("learner", learner.source_hash)
 
     said = cosim(*asked, "--learner", "beside:Another", "--resume", cwd=desk.folder)
-    assert said.returncode == 2 and "its learner is beside:Learner, now asked for is beside:Another" in said.stderr
+    assert (
+        said.returncode == 2
+        and "its learner is beside:Learner, now asked for is beside:Another" in said.stderr
+    )
     (desk.folder / "beside.py").write_text(BESIDE.replace("0.7", "0.6"))
     said = cosim(*asked, "--learner", "beside:Learner", "--resume", cwd=desk.folder)
     assert said.returncode == 2 and "is of another data set: its learner_source is" in said.stderr
@@ -308,28 +403,56 @@ def test_a_learner_drives_in_every_process_as_it_does_in_this_one(
 def test_a_learner_that_fails_is_told_as_a_policy_is(desk: Desk, cosim: Cosim) -> None:
     """One that is another in each process ends the run; one that dies has crashed its episodes."""
     (desk.folder / "failing.py").write_text(BESIDE)
-    asked = ("collect", "ways.json", "--scenario", "way-0", "--camera", "64x48", "--noise", "0.6", "--learner")
+    asked = (
+        "collect",
+        "ways.json",
+        "--scenario",
+        "way-0",
+        "--camera",
+        "64x48",
+        "--noise",
+        "0.6",
+        "--learner",
+    )
     said = cosim(*asked, "failing:Another", "--out", "other", cwd=desk.folder)
-    assert said.returncode == 2 and "policy 'failing:Another' has another manifest in each process" in said.stderr
+    assert (
+        said.returncode == 2
+        and "policy 'failing:Another' has another manifest in each process" in said.stderr
+    )
     said = cosim(*asked, "failing:Dies", "--out", "dead", cwd=desk.folder)
-    assert said.returncode == 2 and "nothing to keep of 1 episodes: crashed (1)" in said.stderr, said.stderr
+    assert said.returncode == 2 and "nothing to keep of 1 episodes: crashed (1)" in said.stderr, (
+        said.stderr
+    )
     said = cosim(*asked, "zenoh:mine", "--out", "far", cwd=desk.folder)
-    assert said.returncode == 2 and "learner: policy 'zenoh:mine' is served elsewhere" in said.stderr
+    assert (
+        said.returncode == 2 and "learner: policy 'zenoh:mine' is served elsewhere" in said.stderr
+    )
 
 
 def test_a_learner_that_would_see_something_else_is_refused() -> None:
-    """With what to give; so is one beside an expert that sees by a camera of its own, and one that is blind."""
+    """With what to give; so is one beside an expert that sees by a camera of its own, and one that
+    is blind."""
     asked = Collecting(camera=CameraSpec(width=80, height=60), noise=0.6, learner="learner")
     expert, learner = Driver.of(Stands()), Driver.of(Learner())
-    with pytest.raises(UsageError, match=r"front, 80 x 60 px.* give --camera 64x48 --fov 75 --mount front --rate 5$"):
+    with pytest.raises(
+        UsageError,
+        match=r"front, 80 x 60 px.* give --camera 64x48 --fov 75 --mount front --rate 5$",
+    ):
         Demonstrator(expert, asked, None, learner)
     learner.manifest = replace(learner.manifest, camera=CameraSpec(80, 60, crop=(0, 20, 80, 60)))
-    with pytest.raises(UsageError, match=r"crop 0 20 80 60, 5 Hz, collected is .*: such pictures cannot be collected"):
+    with pytest.raises(
+        UsageError,
+        match=r"crop 0 20 80 60, 5 Hz, collected is .*: such pictures cannot be collected",
+    ):
         Demonstrator(expert, asked, None, learner)
     learner.manifest = replace(learner.manifest, camera=asked.camera, goals=("final_point", "none"))
-    with pytest.raises(UsageError, match="cannot do with goal 'route_point': give --goal, one of final_point, none"):
+    with pytest.raises(
+        UsageError, match="cannot do with goal 'route_point': give --goal, one of final_point, none"
+    ):
         Demonstrator(expert, asked, None, learner)
-    with pytest.raises(UsageError, match="'stands' is no policy that drives by one camera, speeds and a goal alone"):
+    with pytest.raises(
+        UsageError, match="'stands' is no policy that drives by one camera, speeds and a goal alone"
+    ):
         Demonstrator(expert, asked, None, Driver.of(Stands()))
     with pytest.raises(UsageError, match="expert 'sees' sees by a camera of its own"):
         Demonstrator(Driver.of(Sees()), msgspec.structs.replace(asked, rate_hz=4.0), None, learner)
@@ -338,8 +461,11 @@ def test_a_learner_that_would_see_something_else_is_refused() -> None:
 
 
 def test_the_lerobot_package_reads_a_data_set(desk: Desk, packed: Packed) -> None:
-    """Its LeRobotDataset has the rows and pictures that are packed. Skipped where lerobot is not installed."""
-    datasets = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="lerobot is not installed")
+    """Its LeRobotDataset has the rows and pictures that are packed. Skipped where lerobot is not
+    installed."""
+    datasets = pytest.importorskip(
+        "lerobot.datasets.lerobot_dataset", reason="lerobot is not installed"
+    )
     read = datasets.LeRobotDataset("cosim/demos", root=desk.folder / "demos")
     assert len(read) == len(packed)
     for row, one in ((row, read[row]) for row in range(len(read))):
@@ -349,14 +475,20 @@ def test_the_lerobot_package_reads_a_data_set(desk: Desk, packed: Packed) -> Non
 
 
 @pytest.mark.parametrize(
-    "words", [("collect", "reactive", "--episodes", "1", "--out", "d"), ("dataset", "pack", "demos", "-o", "d.npz")]
+    "words",
+    [
+        ("collect", "reactive", "--episodes", "1", "--out", "d"),
+        ("dataset", "pack", "demos", "-o", "d.npz"),
+    ],
 )
-def test_a_data_set_without_pyarrow_is_refused_in_one_line(tmp_path: Path, words: tuple[str, ...]) -> None:
+def test_a_data_set_without_pyarrow_is_refused_in_one_line(
+    tmp_path: Path, words: tuple[str, ...]
+) -> None:
     """The error names the package and the command that installs it; exit code 3, no traceback."""
     code = (
-        "import sys, importlib.util\nfound = importlib.util.find_spec\n"
-        "importlib.util.find_spec = lambda name, *rest: None if name == 'pyarrow' else found(name, *rest)\n"
-        "sys.modules['pyarrow'] = None\nfrom cosim.__main__ import main\nsys.exit(main())"
+        "import sys, importlib.util\nfound = importlib.util.find_spec\nimportlib.util.find_spec = "
+        "lambda name, *rest: None if name == 'pyarrow' else found(name, "
+        "*rest)\nsys.modules['pyarrow'] = None\nfrom cosim.__main__ import main\nsys.exit(main())"
     )
     command = [sys.executable, "-c", code, *words]
     done = subprocess.run(
@@ -366,4 +498,8 @@ def test_a_data_set_without_pyarrow_is_refused_in_one_line(tmp_path: Path, words
         capture_output=True,
         text=True,
     )
-    assert done.returncode == 3 and "pip install 'pyarrow<24'" in done.stderr and "Traceback" not in done.stderr, done
+    assert (
+        done.returncode == 3
+        and "pip install 'pyarrow<24'" in done.stderr
+        and "Traceback" not in done.stderr
+    ), done

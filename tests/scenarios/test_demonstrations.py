@@ -16,30 +16,39 @@ import pytest
 
 from cosim.core.errors import CosimError, RunError, SpecError
 from cosim.core.state import Command
-from cosim.episode.ports import CameraSpec, Manifest
-from cosim.records.record import begun
-from cosim.spec.collecting import COLLECTED_GOALS, Collecting, demonstrating
+from cosim.results.record import begun
+from cosim.spec.camera import CameraSpec
+from cosim.spec.demo_options import COLLECTED_GOALS, Collecting, demonstrating
 from cosim.spec.goal import GOALS, goal_called
+from cosim.spec.manifest import Manifest
 from cosim.spec.robot import COURIER
-from scenarios.collecting.clip import _OPTIONS, Clip, _planes_of, _rgb_of, join_clips, pictures_of
-from scenarios.collecting.demonstration import Demonstration, glimpse, waypoints_ahead
-from scenarios.collecting.demonstrator import _Bursts
-from scenarios.collecting.fresh import fresh, fresh_cities
-from scenarios.collecting.lerobot import Collected, Filmed, write_lerobot
-from scenarios.collecting.reading import packed_sets, read_back, read_data_set
-from sumo_nets.city.seeds import SEEDS
-from tests.records.driven_runs import short_way
+from scenarios.episodes.clip import _OPTIONS, Clip, _planes_of, _rgb_of, join_clips, pictures_of
+from scenarios.episodes.demonstration import Demonstration, glimpse, waypoints_ahead
+from scenarios.episodes.demonstrator import _Bursts
+from scenarios.suites.new_scenarios import fresh, fresh_cities
+from scenarios.tools.dataset.lerobot import Collected, Filmed, write_lerobot
+from scenarios.tools.dataset.read import packed_sets, read_back, read_data_set
+from sumo_nets.city.store import SEEDS
+from tests.support.driven_runs import short_way
 
-FPS, TICK_S = 5, 0.05
+FPS = 5
+TICK_S = 0.05
 LENGTHS = (7, 12, 3)
 ABOUT = {
-    "rate_hz": 5.0, "waypoint_s": 0.2, "waypoints": 2, "goal": "route_point", "camera": {"width": 64, "height": 48},
-    "robot": "courier", "policy": "p", "noise": 0.0,
-}  # fmt: skip
+    "rate_hz": 5.0,
+    "waypoint_s": 0.2,
+    "waypoints": 2,
+    "goal": "route_point",
+    "camera": {"width": 64, "height": 48},
+    "robot": "courier",
+    "policy": "p",
+    "noise": 0.0,
+}
 
 
 def known_pictures(episode: int, count: int) -> np.ndarray:
-    """(count, 48, 64, 3): a smooth pattern of the episode's own that moves by 4 pixels from picture to picture."""
+    """(count, 48, 64, 3): a smooth pattern of the episode's own that moves by 4 pixels from picture
+    to picture."""
     small = np.random.default_rng(episode).integers(30, 226, (4, 6, 3), np.uint8)
     wide = cv2.resize(small, (64 + 4 * count, 48), interpolation=cv2.INTER_CUBIC)
     return np.stack([wide[:, 4 * k : 4 * k + 64] for k in range(count)])
@@ -47,17 +56,23 @@ def known_pictures(episode: int, count: int) -> np.ndarray:
 
 def shown(episode: int, count: int) -> Demonstration:
     """An episode of known pictures; its numbers tell which row of which episode they are of."""
-    clip, pictures = Clip((64, 48), FPS), known_pictures(episode, count)
+    clip = Clip((64, 48), FPS)
+    pictures = known_pictures(episode, count)
     for one in pictures:
         clip.add(one)
     rows = np.column_stack([np.full(count, episode), np.arange(count)]).astype(np.float32)
     return Demonstration(
-        state=rows, goal=rows + 0.25, command=rows + 0.5, waypoints=np.stack([rows, rows + 0.75], axis=1),
-        driven=np.full(count, 2, np.int32), disturbed=rows[:, 1] == 1, told=np.array([""] * count),
+        state=rows,
+        goal=rows + 0.25,
+        command=rows + 0.5,
+        waypoints=np.stack([rows, rows + 0.75], axis=1),
+        driven=np.full(count, 2, np.int32),
+        disturbed=rows[:, 1] == 1,
+        told=np.array([""] * count),
         glimpses=np.stack([glimpse(one) for one in pictures]),
         colours=np.stack([np.bincount(pictures[..., c].ravel(), minlength=256) for c in range(3)]),
         clip=np.frombuffer(clip.finished(), np.uint8),
-    )  # fmt: skip
+    )
 
 
 def episodes_of(demonstrations: Sequence[Demonstration]) -> list[Collected]:
@@ -71,7 +86,9 @@ def episodes_of(demonstrations: Sequence[Demonstration]) -> list[Collected]:
 
 def written(folder: Path, demonstrations: Sequence[Demonstration]) -> Path:
     folder.mkdir()
-    write_lerobot(folder, episodes_of(demonstrations), Filmed("front", (64, 48), FPS), "courier", ABOUT)
+    write_lerobot(
+        folder, episodes_of(demonstrations), Filmed("front", (64, 48), FPS), "courier", ABOUT
+    )
     return folder
 
 
@@ -88,10 +105,13 @@ def data_set(tmp_path_factory: pytest.TempPathFactory, demonstrations: list[Demo
 def test_pictures_come_back_from_the_film_at_their_rows_and_times(
     data_set: Path, demonstrations: list[Demonstration]
 ) -> None:
-    """Decoded, picture k of an .mp4 is at k / 5 s the one that was drawn for row k, within what the codec loses, and
-    nearer to it than to those of the rows beside it, across the borders of episodes too."""
+    """Decoded, picture k of an .mp4 is at k / 5 s the one that was drawn for row k, within what the
+    codec loses, and nearer to it than to those of the rows beside it, across the borders of
+    episodes too."""
     (film,) = read_data_set(data_set).films
-    drawn = np.concatenate([known_pictures(k, count) for k, count in enumerate(LENGTHS)]).astype(float)
+    drawn = np.concatenate([known_pictures(k, count) for k, count in enumerate(LENGTHS)]).astype(
+        float
+    )
     times, seen = zip(*pictures_of(film), strict=True)
     assert list(times) == [Fraction(k, FPS) for k in range(sum(LENGTHS))]
     off = np.array([[np.abs(one - other).mean() for other in drawn] for one in seen])
@@ -100,19 +120,29 @@ def test_pictures_come_back_from_the_film_at_their_rows_and_times(
     assert read_back(data_set, episodes_of(demonstrations)).rows == len(drawn)
 
 
-def test_a_data_set_has_the_same_bytes_whenever_it_is_written(data_set: Path, tmp_path: Path) -> None:
+def test_a_data_set_has_the_same_bytes_whenever_it_is_written(
+    data_set: Path, tmp_path: Path
+) -> None:
     """Encoded and written again, every file is the same."""
-    again = written(tmp_path / "again", [shown(episode, count) for episode, count in enumerate(LENGTHS)])
+    again = written(
+        tmp_path / "again", [shown(episode, count) for episode, count in enumerate(LENGTHS)]
+    )
     files = sorted(path.relative_to(data_set) for path in data_set.rglob("*") if path.is_file())
     assert len(files) == 7
     assert files == sorted(path.relative_to(again) for path in again.rglob("*") if path.is_file())
     assert all((data_set / name).read_bytes() == (again / name).read_bytes() for name in files)
 
 
-def test_a_clip_is_the_same_whatever_instructions_the_processor_has(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Restricted to those of older processors, or to none of the fast ones, the encoder writes the same bytes."""
-    rng, known = np.random.default_rng(0), known_pictures(5, 12)
-    pictures = [cv2.add(one, cv2.blur(rng.integers(0, 90, one.shape, np.uint8), (3, 3))) for one in known]
+def test_a_clip_is_the_same_whatever_instructions_the_processor_has(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Restricted to those of older processors, or to none of the fast ones, the encoder writes the
+    same bytes."""
+    rng = np.random.default_rng(0)
+    known = known_pictures(5, 12)
+    pictures = [
+        cv2.add(one, cv2.blur(rng.integers(0, 90, one.shape, np.uint8), (3, 3))) for one in known
+    ]
 
     def clip_of(params: str) -> bytes:
         monkeypatch.setitem(_OPTIONS, "x264-params", params)
@@ -122,18 +152,22 @@ def test_a_clip_is_the_same_whatever_instructions_the_processor_has(monkeypatch:
         return clip.finished()
 
     asked = _OPTIONS["x264-params"]
-    made = {clip_of(asked), *(clip_of(f"{asked}:asm={instructions}") for instructions in ("AVX2", "SSE2", "0"))}
+    made = {
+        clip_of(asked),
+        *(clip_of(f"{asked}:asm={instructions}") for instructions in ("AVX2", "SSE2", "0")),
+    }
     assert len(made) == 1
     assert clip_of("asm=0:subme=0") not in made
 
 
 def test_a_clip_is_the_same_wherever_its_pictures_lie_in_memory() -> None:
-    """Pictures at any address give the bytes of pictures at another; a picture is told apart from one whose red and
-    blue are changed, and a grey one stays grey."""
+    """Pictures at any address give the bytes of pictures at another; a picture is told apart from
+    one whose red and blue are changed, and a grey one stays grey."""
     pictures = known_pictures(5, 6)
 
     def clip_of(shift: int) -> bytes:
-        clip, memory = Clip((64, 48), FPS), np.empty(pictures[0].size + shift, np.uint8)
+        clip = Clip((64, 48), FPS)
+        memory = np.empty(pictures[0].size + shift, np.uint8)
         for one in pictures:
             moved = memory[shift:].reshape(one.shape)
             moved[:] = one
@@ -148,16 +182,20 @@ def test_a_clip_is_the_same_wherever_its_pictures_lie_in_memory() -> None:
 
 
 def test_the_tables_are_what_info_json_tells(data_set: Path) -> None:
-    """Every feature but the film is a column of its type and length; episodes tell from where to where they go."""
+    """Every feature but the film is a column of its type and length; episodes tell from where to
+    where they go."""
     info = json.loads((data_set / "meta/info.json").read_text())
     table = pq.read_table(data_set / info["data_path"].format(chunk_index=0, file_index=0))
     key = "observation.images.front"
     assert set(table.column_names) == set(info["features"]) - {key}
     for name in table.column_names:
-        kind, told = table.schema.field(name).type, info["features"][name]
+        kind = table.schema.field(name).type
+        told = info["features"][name]
         many = told["shape"] != [1]
         assert (kind.list_size if many else 1) == told["shape"][0]
-        assert str(kind.value_type if many else kind) == {"float32": "float"}.get(told["dtype"], told["dtype"])
+        assert str(kind.value_type if many else kind) == {"float32": "float"}.get(
+            told["dtype"], told["dtype"]
+        )
     (path,) = (data_set / "meta/episodes").rglob("*.parquet")
     episodes = pq.read_table(path).to_pylist()
     assert [one["length"] for one in episodes] == list(LENGTHS)
@@ -167,12 +205,16 @@ def test_the_tables_are_what_info_json_tells(data_set: Path) -> None:
     pictures = np.concatenate([known_pictures(k, count) for k, count in enumerate(LENGTHS)]) / 255.0
     np.testing.assert_allclose(np.ravel(stats[key]["mean"]), pictures.mean(axis=(0, 1, 2)))
     np.testing.assert_allclose(np.ravel(stats[key]["std"]), pictures.std(axis=(0, 1, 2)))
-    np.testing.assert_allclose(stats["action"]["mean"], np.stack(table["action"].to_numpy()).mean(axis=0))
+    np.testing.assert_allclose(
+        stats["action"]["mean"], np.stack(table["action"].to_numpy()).mean(axis=0)
+    )
 
 
-def test_packed_rows_are_those_that_were_kept(data_set: Path, demonstrations: list[Demonstration]) -> None:
-    """Two data sets in one file: every array is theirs, one after the other, the episodes counted on, and pictures are
-    made smaller on request."""
+def test_packed_rows_are_those_that_were_kept(
+    data_set: Path, demonstrations: list[Demonstration]
+) -> None:
+    """Two data sets in one file: every array is theirs, one after the other, the episodes counted
+    on, and pictures are made smaller on request."""
     packed = packed_sets([data_set, data_set], (32, 24))
     for name in ("state", "goal", "command", "waypoints", "driven", "disturbed"):
         once = np.concatenate([getattr(one, name) for one in demonstrations])
@@ -183,7 +225,8 @@ def test_packed_rows_are_those_that_were_kept(data_set: Path, demonstrations: li
 
 
 def test_data_sets_that_do_not_fit_are_not_packed_together(data_set: Path, tmp_path: Path) -> None:
-    """Another rate or other waypoints are named, with both values; a folder that holds none is named."""
+    """Another rate or other waypoints are named, with both values; a folder that holds none is
+    named."""
     other = written(tmp_path / "other", [shown(0, 3)])
     (other / "meta/cosim.json").write_text(json.dumps({**ABOUT, "waypoint_s": 0.5}))
     with pytest.raises(SpecError, match=r"waypoint_s is 0\.2 here and 0\.5 there"):
@@ -203,11 +246,17 @@ def _pictures_moved(one: Demonstration) -> Demonstration:
 
 @pytest.mark.parametrize(
     ("moved", "words"),
-    [(_rows_moved, "the rows of episode 1"), (_pictures_moved, "of episode 1, s-001, is not that of its row")],
+    [
+        (_rows_moved, "the rows of episode 1"),
+        (_pictures_moved, "of episode 1, s-001, is not that of its row"),
+    ],
     ids=["rows", "pictures"],
 )
 def test_rows_beside_their_pictures_are_found_when_it_is_read_back(
-    data_set: Path, demonstrations: list[Demonstration], moved: Callable[[Demonstration], Demonstration], words: str
+    data_set: Path,
+    demonstrations: list[Demonstration],
+    moved: Callable[[Demonstration], Demonstration],
+    words: str,
 ) -> None:
     """What is not as it was kept, in one episode, is refused by name."""
     kept = [demonstrations[0], moved(demonstrations[1]), demonstrations[2]]
@@ -215,19 +264,25 @@ def test_rows_beside_their_pictures_are_found_when_it_is_read_back(
         read_back(data_set, episodes_of(kept))
 
 
-def test_a_clip_of_another_length_is_refused(tmp_path: Path, demonstrations: list[Demonstration]) -> None:
+def test_a_clip_of_another_length_is_refused(
+    tmp_path: Path, demonstrations: list[Demonstration]
+) -> None:
     """A film is not made of a clip that has not as many pictures as its episode has rows."""
     with pytest.raises(RunError, match="a clip of 7 pictures, 6 are told"):
         join_clips([demonstrations[0].clip.tobytes()], [6], tmp_path / "film.mp4", FPS)
 
 
 def test_waypoints_are_where_the_robot_is_later_in_its_own_frame() -> None:
-    """Of a robot that drives a circle to the left, its place on the circle, and at the end the same circle goes on by
-    its command."""
-    v_mps, w_radps = 1.0, 0.5
+    """Of a robot that drives a circle to the left, its place on the circle, and at the end the same
+    circle goes on by its command."""
+    v_mps = 1.0
+    w_radps = 0.5
     angle = w_radps * TICK_S * np.arange(41)
-    pose = np.column_stack([v_mps / w_radps * np.sin(angle), v_mps / w_radps * (1.0 - np.cos(angle)), angle])
-    ticks, command = np.arange(0, 40, 4), np.tile([v_mps, w_radps], (10, 1))
+    pose = np.column_stack(
+        [v_mps / w_radps * np.sin(angle), v_mps / w_radps * (1.0 - np.cos(angle)), angle]
+    )
+    ticks = np.arange(0, 40, 4)
+    command = np.tile([v_mps, w_radps], (10, 1))
     ahead, driven = waypoints_ahead(pose, ticks, command, np.zeros(10, bool), 3, 4, TICK_S)
     later = w_radps * 0.2 * np.arange(1, 4)
     circle = np.column_stack([2.0 * np.sin(later), 2.0 * (1.0 - np.cos(later))])
@@ -236,25 +291,34 @@ def test_waypoints_are_where_the_robot_is_later_in_its_own_frame() -> None:
 
 
 def test_waypoints_are_never_those_of_a_disturbed_drive() -> None:
-    """A robot that is turned off its straight way in a burst: waypoints before it and in it go straight on, as the
-    expert would; those after it are driven."""
+    """A robot that is turned off its straight way in a burst: waypoints before it and in it go
+    straight on, as the expert would; those after it are driven."""
     disturbed = np.array([False, False, True, False, False])
     pose = np.zeros((21, 3))
     pose[:, 0] = 0.05 * np.arange(21)
     pose[9:, 1] = 0.3
-    ahead, driven = waypoints_ahead(pose, np.arange(0, 20, 4), np.tile([1.0, 0.0], (5, 1)), disturbed, 2, 4, TICK_S)
+    ahead, driven = waypoints_ahead(
+        pose, np.arange(0, 20, 4), np.tile([1.0, 0.0], (5, 1)), disturbed, 2, 4, TICK_S
+    )
     assert driven.tolist() == [2, 1, 0, 2, 1]
     np.testing.assert_allclose(ahead, np.tile([[0.2, 0.0], [0.4, 0.0]], (5, 1, 1)), atol=1e-6)
 
 
 def test_bursts_have_their_share_of_the_time_and_are_drawn_from_the_seed() -> None:
-    """Over many episodes a fifth of the commands is disturbed for --noise 0.2; one seed gives one drive; a robot that
-    the expert has stand is not driven on."""
-    answer, collecting = Command(1.0, 0.1), Collecting(noise=0.2)
+    """Over many episodes a fifth of the commands is disturbed for --noise 0.2; one seed gives one
+    drive; a robot that the expert has stand is not driven on."""
+    answer = Command(1.0, 0.1)
+    collecting = Collecting(noise=0.2)
     drives = [[bursts.driven(answer, COURIER) for _ in range(60)] for bursts in _each(collecting)]
-    assert drives == [[bursts.driven(answer, COURIER) for _ in range(60)] for bursts in _each(collecting)]
-    assert np.mean([one is not answer for drive in drives for one in drive]) == pytest.approx(0.2, abs=0.02)
-    assert {bursts.driven(Command(0.0, 0.0), COURIER).v_mps for bursts in _each(collecting)} == {0.0}
+    assert drives == [
+        [bursts.driven(answer, COURIER) for _ in range(60)] for bursts in _each(collecting)
+    ]
+    assert np.mean([one is not answer for drive in drives for one in drive]) == pytest.approx(
+        0.2, abs=0.02
+    )
+    assert {bursts.driven(Command(0.0, 0.0), COURIER).v_mps for bursts in _each(collecting)} == {
+        0.0
+    }
     assert all(bursts.driven(answer, COURIER) is answer for bursts in _each(Collecting()))
 
 
@@ -270,34 +334,54 @@ def _each(collecting: Collecting) -> list[_Bursts]:
         ({"noise": float("nan")}, r"noise must be in \[0, 0\.9\]"),
         ({"waypoints": 0}, r"waypoints must be in \[1, 100\], not 0"),
         ({"waypoint_s": 0.12}, r"whole number of ticks of 0\.05 s, up to 10 s, not 0\.12 s"),
-        ({"camera": CameraSpec(width=97, height=96)}, "even sides of 16 pixels or more, not 97 x 96"),
+        (
+            {"camera": CameraSpec(width=97, height=96)},
+            "even sides of 16 pixels or more, not 97 x 96",
+        ),
     ],
-    ids=["rate", "much noise", "no number", "no waypoints", "waypoints between ticks", "odd picture"],
+    ids=[
+        "rate",
+        "much noise",
+        "no number",
+        "no waypoints",
+        "waypoints between ticks",
+        "odd picture",
+    ],
 )
 def test_what_cannot_be_kept_is_refused(asked: dict[str, object], words: str) -> None:
-    """A rate, a share of noise, waypoints or a size that no data set can have is told with what it may be."""
+    """A rate, a share of noise, waypoints or a size that no data set can have is told with what it
+    may be."""
     with pytest.raises(SpecError, match=words):
         Collecting(**asked)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("goal", sorted(set(GOALS) - set(COLLECTED_GOALS)))
 def test_goals_that_rows_cannot_tell_are_refused(goal: str) -> None:
-    """Pictures as goals, and points that the expert does not drive to, are refused with what may be asked for."""
-    with pytest.raises(CosimError, match="give --goal, one of none, route_point, final_point, instruction"):
+    """Pictures as goals, and points that the expert does not drive to, are refused with what may be
+    asked for."""
+    with pytest.raises(
+        CosimError, match="give --goal, one of none, route_point, final_point, instruction"
+    ):
         demonstrating(Manifest("p", goal=goal_called(goal)), Collecting())
 
 
 def test_an_expert_that_sees_is_asked_as_often_as_it_says() -> None:
-    """At another rate the pictures that it remembers would be other times apart; one that sees none is asked at any."""
-    with pytest.raises(CosimError, match="policy 'p' sees, and answers 4 times a second, not 5: give --rate 4"):
+    """At another rate the pictures that it remembers would be other times apart; one that sees none
+    is asked at any."""
+    with pytest.raises(
+        CosimError, match="policy 'p' sees, and answers 4 times a second, not 5: give --rate 4"
+    ):
         demonstrating(Manifest("p", rate_hz=4.0), Collecting())
     assert demonstrating(Manifest("p", rate_hz=4.0), Collecting(rate_hz=4.0)).rate_hz == 4.0
     assert demonstrating(Manifest("p", rate_hz=20.0, camera=None), Collecting()).rate_hz == 5.0
 
 
-@pytest.mark.parametrize("words", ["70:90", "1:2", "7000:7002", "40", "9:9", "a:b", "-4:3", "900:100000"])
+@pytest.mark.parametrize(
+    "words", ["70:90", "1:2", "7000:7002", "40", "9:9", "a:b", "-4:3", "900:100000"]
+)
 def test_cities_of_the_suites_are_refused(words: str) -> None:
-    """Seeds that a suite uses, and what names no seeds, are refused with an example of what may be asked for."""
+    """Seeds that a suite uses, and what names no seeds, are refused with an example of what may be
+    asked for."""
     with pytest.raises(CosimError, match=f"--cities {words}: .*900:940"):
         fresh_cities(words)
 
@@ -307,14 +391,21 @@ def test_fresh_scenarios_are_called_by_structure_and_city_in_turn() -> None:
     there = fresh("reactive", fresh_cities("900:902"), ["gesturing", "static"])
     assert there.structures == ("gesturing", "static")
     assert not {*there.seeds} & {*SEEDS}
-    with pytest.raises(CosimError, match=r"unknown structure of 'unit' 'gesturing'\. Valid choices: crosswalk, curve"):
+    with pytest.raises(
+        CosimError,
+        match=r"unknown structure of 'unit' 'gesturing'\. Valid choices: crosswalk, curve",
+    ):
         fresh("unit", (900,), ["gesturing"])
-    with pytest.raises(CosimError, match=r"unknown suite for --cities 'long-horizon'\. Valid choices: reactive, unit"):
+    with pytest.raises(
+        CosimError,
+        match=r"unknown suite for --cities 'long-horizon'\. Valid choices: reactive, unit",
+    ):
         fresh("long-horizon", (900,))
 
 
 def test_a_damaged_demonstration_is_named(demonstrations: list[Demonstration]) -> None:
-    """One that was cut off is refused by the file's name, and one that was not is what was encoded."""
+    """One that was cut off is refused by the file's name, and one that was not is what was
+    encoded."""
     data = demonstrations[0].encoded()
     assert data == demonstrations[0].encoded()
     assert Demonstration.decoded(data, "here").encoded() == data
@@ -326,5 +417,7 @@ def test_what_is_kept_travels_with_the_options_of_an_episode() -> None:
     """Options that ask for demonstrations are the same behind MessagePack."""
     from cosim.spec.options import EpisodeOptions
 
-    options = EpisodeOptions(collecting=Collecting(noise=0.1, camera=CameraSpec(width=96, height=96)))
+    options = EpisodeOptions(
+        collecting=Collecting(noise=0.1, camera=CameraSpec(width=96, height=96))
+    )
     assert msgspec.msgpack.decode(msgspec.msgpack.encode(options), type=EpisodeOptions) == options

@@ -1,4 +1,5 @@
-"""A kind of event is a row: one that this file alone knows is drawn, read, directed, judged and shown."""
+"""A kind of event is a row: one that this file alone knows is drawn, read, directed, judged and
+shown."""
 
 from __future__ import annotations
 
@@ -13,25 +14,25 @@ import pytest
 
 from cosim.core.errors import SpecError
 from cosim.core.state import Age, Command, PersonKind
-from cosim.episode.ports import Manifest
 from cosim.episode.step import Step
-from cosim.judge.referee import Verdict
 from cosim.place.walk_graph import WalkGraph
+from cosim.results.referee import Verdict
 from cosim.spec.event_kind import EventKind, EventKinds, SidewalkLayout
 from cosim.spec.events import Event, EventQuery, EventState, Walker
+from cosim.spec.manifest import Manifest
 from cosim.spec.robot import COURIER, ROBOTS, Robot
 from cosim.spec.scenario import City, CrowdSpec, Scenario, event_faults, read_suite, write_suite
-from scenarios.builders.fits import check_places
-from scenarios.builders.long_horizon import build_long_horizon
-from scenarios.builders.sample import suite_on_map
-from scenarios.catalog import load_suite
-from scenarios.checks import small_scenario
+from scenarios.episodes.episode import Episode
 from scenarios.events import EVENT_KINDS
 from scenarios.events.sight import sight_of
 from scenarios.events.walking import edge_m, spot, walked_to, walker_at
-from scenarios.execution.episode import Episode
-from scenarios.execution.places import place
-from scenarios.viewing.eventsheet import COLUMNS, rows_of, summary
+from scenarios.places.nets import place
+from scenarios.suites.catalog import load_suite
+from scenarios.suites.fits import check_places
+from scenarios.suites.long_horizon import build_long_horizon
+from scenarios.suites.sample import suite_on_map
+from scenarios.tools.verify.doctor import small_scenario
+from scenarios.tools.viewing.event_sheet import COLUMNS, rows_of, summary
 from sumo_nets.city.store import write_city
 from tests.conftest import ROOT
 
@@ -73,18 +74,27 @@ KINDS: EventKinds = EVENT_KINDS | {SWAPPING.name: SWAPPING}  # type: ignore[oper
 def test_every_row_of_the_table_is_the_papers_and_triggers_on_the_way() -> None:
     """Eight of them; the robot starts farther from an event's place than its trigger reaches."""
     assert [*EVENT_KINDS] == [
-        "obstructing", "conversing", "queueing", "frontal", "lateral", "overtaking", "ped_crossing", "gesturing",
-    ]  # fmt: skip
+        "obstructing",
+        "conversing",
+        "queueing",
+        "frontal",
+        "lateral",
+        "overtaking",
+        "ped_crossing",
+        "gesturing",
+    ]
     for kind in EVENT_KINDS.values():
         if kind.layout is not None:
             assert kind.trigger_m is not None and abs(kind.trigger_m) < kind.layout.event_m[0]
             assert kind.layout.event_m[0] - kind.trigger_m < kind.layout.way_m[0]
-        assert (kind.trigger_m is None) == (kind.layout is None) and 1 <= kind.people[0] <= kind.people[1]
+        assert (kind.trigger_m is None) == (kind.layout is None) and 1 <= kind.people[
+            0
+        ] <= kind.people[1]
 
 
 def test_a_kind_is_named_in_its_own_file_alone() -> None:
-    """Whatever else needs to know something of a kind reads its row: no other module of the product names one, but for
-    the paper's figures, which stand under its names."""
+    """Whatever else needs to know something of a kind reads its row: no other module of the product
+    names one, but for the paper's figures, which stand under its names."""
     named = [
         f"{path.relative_to(ROOT)}: {node.value}"
         for room in ("cosim", "sumo_nets", "physics", "bridge", "scenarios")
@@ -100,12 +110,15 @@ def test_a_kind_is_named_in_its_own_file_alone() -> None:
 
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
 def test_long_ways_have_the_kinds_of_the_table_handed_in(robot: Robot) -> None:
-    """One of several people, where its layout and the robot find room, as many as its row says; none of no kind."""
+    """One of several people, where its layout and the robot find room, as many as its row says;
+    none of no kind."""
     where = small_scenario().place
     _, street_map = place(where)
     loitering = dataclasses.replace(SWAPPING, people=(2, 4), layout=NEEDS_ROOM)
     for kinds, count in (({loitering.name: loitering}, 1), (EVENT_KINDS, 4)):
-        drawn = build_long_horizon(where, street_map, WalkGraph(street_map), 2, "long", robot, kinds)
+        drawn = build_long_horizon(
+            where, street_map, WalkGraph(street_map), 2, "long", robot, kinds
+        )
         assert len(drawn.events) == count and list(event_faults(drawn, kinds)) == []
         for event in drawn.events:
             layout = kinds[event.kind].layout
@@ -115,38 +128,51 @@ def test_long_ways_have_the_kinds_of_the_table_handed_in(robot: Robot) -> None:
 
 
 def test_a_suite_made_in_python_is_refused_as_one_from_a_file() -> None:
-    """Events that are not as the table says are told before anything runs, not one crashed episode each."""
+    """Events that are not as the table says are told before anything runs, not one crashed episode
+    each."""
     whole = load_suite("reactive")
     first, second = whole.scenarios[:2]
     odd = [with_event(first, people=3), with_event(second, kind="swapping")]
     with pytest.raises(SpecError) as refusal:
         check_places(whole, odd)
     told = str(refusal.value)
-    assert f"scenario '{first.id}': event 'e0': people of '{first.events[0].kind}' must be 1, not 3" in told
     assert (
-        f"scenario '{second.id}': Invalid enum value 'swapping' - at `$.events[0].kind`. Valid choices: obstr" in told
+        f"scenario '{first.id}': event 'e0': people of '{first.events[0].kind}' must be 1, not 3"
+        in told
+    )
+    assert (
+        f"scenario '{second.id}': Invalid enum value 'swapping' - at `$.events[0].kind`. "
+        f"Valid choices: obstr" in told
     )
 
 
 def with_event(scenario: Scenario, **changed: object) -> Scenario:
     """The scenario, its event changed."""
-    return msgspec.structs.replace(scenario, events=(msgspec.structs.replace(scenario.events[0], **changed),))
+    return msgspec.structs.replace(
+        scenario, events=(msgspec.structs.replace(scenario.events[0], **changed),)
+    )
 
 
 @pytest.mark.engine
 def test_an_event_that_a_test_alone_knows(tmp_path: Path) -> None:
-    """Its row is all that there is of it: sampled on a city, written, read, directed over Zenoh, triggered, monitored,
-    and in the sheet; without its row it is refused at every door."""
+    """Its row is all that there is of it: sampled on a city, written, read, directed over Zenoh,
+    triggered, monitored, and in the sheet; without its row it is refused at every door."""
     write_city(City(seed=1, size_m=500.0), tmp_path / "city")
     drawn = suite_on_map("reactive", str(tmp_path / "city"), 3, 1, events=["swapping"], kinds=KINDS)
     write_suite(drawn, tmp_path / "s.json")
     (whole,) = read_suite(tmp_path / "s.json", KINDS).scenarios
-    with pytest.raises(SpecError, match=r"'swapping' - at `\$.scenarios\[0\].events\[0\].kind`. Valid choices: obstr"):
+    with pytest.raises(
+        SpecError,
+        match=r"'swapping' - at `\$.scenarios\[0\].events\[0\].kind`. Valid choices: obstr",
+    ):
         read_suite(tmp_path / "s.json", EVENT_KINDS)
     few = CrowdSpec(persons=3, radius_m=40.0, vehicles=0)
     scenario = msgspec.structs.replace(whole, crowd=few, time_limit_s=7.0)
     manifest = Manifest("ahead", camera=None)
-    with pytest.raises(SpecError, match=f"scenario '{scenario.id}': .*'swapping'"), Episode(scenario, manifest):
+    with (
+        pytest.raises(SpecError, match=f"scenario '{scenario.id}': .*'swapping'"),
+        Episode(scenario, manifest),
+    ):
         pass
 
     doing: set[tuple[str, ...]] = set()
@@ -165,9 +191,18 @@ def test_an_event_that_a_test_alone_knows(tmp_path: Path) -> None:
             episode.advance(Command(0.9 if episode.time_s < 3.5 else 0.0, 0.0))
     record, log = episode.result()
     (event,) = record.events
-    assert (record.status, event.kind, event.seen, event.rule_met) == ("done", "swapping", True, True), record.reason
+    assert (record.status, event.kind, event.seen, event.rule_met) == (
+        "done",
+        "swapping",
+        True,
+        True,
+    ), record.reason
     assert event.trigger_distance_m == pytest.approx(TRIGGER_M, abs=0.06)
-    assert ("stand", "stand") in doing and ("walk", "walk") in doing and any("phone" in pair for pair in doing)
+    assert (
+        ("stand", "stand") in doing
+        and ("walk", "walk") in doing
+        and any("phone" in pair for pair in doing)
+    )
     assert phases == {"waiting", "acting", "over"}
     sheet = pd.DataFrame(rows_of(scenario, record, log, KINDS), columns=list(COLUMNS))
     assert sheet["kind"].tolist() == ["swapping"] * 2

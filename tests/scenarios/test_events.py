@@ -21,21 +21,43 @@ PEOPLE = {"conversing": 3, "queueing": 3, "ped_crossing": 4}
 
 def event(kind: str, **fields: object) -> Event:
     """An event 50 m along a route on the x axis, on a sidewalk 4 m wide."""
-    known = {"id": "e0", "kind": kind, "x_m": 50.0, "y_m": 0.0, "heading_rad": 0.0, "route_s_m": 50.0}
+    known = {
+        "id": "e0",
+        "kind": kind,
+        "x_m": 50.0,
+        "y_m": 0.0,
+        "heading_rad": 0.0,
+        "route_s_m": 50.0,
+    }
     known |= {"half_width_m": 2.0, "speed_mps": 1.2, "people": PEOPLE.get(kind, 1)}
     known |= {"half_length_m": 5.0} if kind == "ped_crossing" else {}
     return Event(**known | fields)  # type: ignore[arg-type]
 
 
 def ask(
-    one: Event, tick: int, x_m: float, y_m: float = 0.0, states: tuple[EventState, ...] = (), v_mps: float = 1.0
+    one: Event,
+    tick: int,
+    x_m: float,
+    y_m: float = 0.0,
+    states: tuple[EventState, ...] = (),
+    v_mps: float = 1.0,
 ) -> EventReply:
     """The reply to a robot on the x axis that faces +x."""
     query = EventQuery(
-        episode="t", tick=tick, tick_ms=TICK_MS, robot_x_m=x_m, robot_y_m=y_m, robot_heading_rad=0.0,
-        robot_v_mps=v_mps, robot_w_radps=0.0, route_s_m=x_m, robot_length_m=0.7, robot_width_m=0.55, events=(one,),
+        episode="t",
+        tick=tick,
+        tick_ms=TICK_MS,
+        robot_x_m=x_m,
+        robot_y_m=y_m,
+        robot_heading_rad=0.0,
+        robot_v_mps=v_mps,
+        robot_w_radps=0.0,
+        route_s_m=x_m,
+        robot_length_m=0.7,
+        robot_width_m=0.55,
+        events=(one,),
         states=states,
-    )  # fmt: skip
+    )
     return react(query)
 
 
@@ -56,13 +78,19 @@ def drive(
 @pytest.mark.parametrize(
     ("kind", "trigger_m"),
     [
-        ("obstructing", 10.0), ("conversing", 10.0), ("queueing", 10.0), ("gesturing", 10.0), ("frontal", 20.0),
-        ("lateral", 4.0), ("overtaking", -1.0), ("ped_crossing", 5.0),
+        ("obstructing", 10.0),
+        ("conversing", 10.0),
+        ("queueing", 10.0),
+        ("gesturing", 10.0),
+        ("frontal", 20.0),
+        ("lateral", 4.0),
+        ("overtaking", -1.0),
+        ("ped_crossing", 5.0),
     ],
-)  # fmt: skip
+)
 def test_an_event_triggers_at_its_distance(kind: str, trigger_m: float) -> None:
-    """The trigger fires at the first tick at which the robot is within the distance of the paper's table, overtaking at
-    the last one within it behind, a crossing at the end of its crosswalk."""
+    """The trigger fires at the first tick at which the robot is within the distance of the paper's
+    table, overtaking at the last one within it behind, a crossing at the end of its crosswalk."""
     track = drive(event(kind), 1100, 1.0)
     first = next(i for i, (_, state, _) in enumerate(track) if state.phase != "waiting")
     x_m, state, _ = track[first]
@@ -73,8 +101,8 @@ def test_an_event_triggers_at_its_distance(kind: str, trigger_m: float) -> None:
 
 
 def test_an_obstructing_pedestrian_waits_aside_then_stands_in_the_middle_and_leaves() -> None:
-    """It stands at the edge, walks to the middle when triggered, looks around, and steps back when the robot is 3 m
-    past."""
+    """It stands at the edge, walks to the middle when triggered, looks around, and steps back when
+    the robot is 3 m past."""
     track = drive(event("obstructing"), 1400, 0.4, start_m=35.0)
     waiting = [state for _, state, _ in track if state.phase == "waiting"]
     assert {(s.walkers[0].x_m, round(s.walkers[0].y_m, 9)) for s in waiting} == {(50.0, 1.6)}
@@ -88,12 +116,15 @@ def test_an_obstructing_pedestrian_waits_aside_then_stands_in_the_middle_and_lea
 
 
 def test_a_frontal_pedestrian_walks_at_the_robot_until_it_commits_to_a_line() -> None:
-    """It aims at the robot's current place, keeps its speed, and from the commitment distance on keeps its line."""
+    """It aims at the robot's current place, keeps its speed, and from the commitment distance on
+    keeps its line."""
     one = event("frontal")
     states: tuple[EventState, ...] = ()
-    headings, gaps = [], []
+    headings = []
+    gaps = []
     for tick in range(400):
-        x_m, y_m = 31.0 + 0.02 * tick, 0.004 * tick
+        x_m = 31.0 + 0.02 * tick
+        y_m = 0.004 * tick
         acted = bool(states) and states[0].phase == "acting"
         before = states[0].walkers[0] if states else None
         reply = ask(one, tick, x_m, y_m, states)
@@ -130,7 +161,10 @@ def test_the_director_is_stateless() -> None:
     assert msgspec.json.encode(ask(one, 0, 32.0)) == msgspec.json.encode(first)
     again = ask(one, 1, 32.1, states=first.states)
     restarted = ask(
-        one, 1, 32.1, states=msgspec.json.decode(msgspec.json.encode(first.states), type=tuple[EventState, ...])
+        one,
+        1,
+        32.1,
+        states=msgspec.json.decode(msgspec.json.encode(first.states), type=tuple[EventState, ...]),
     )
     assert restarted == again
 
@@ -144,7 +178,8 @@ def test_an_event_that_makes_no_sense_is_refused() -> None:
 
 
 def test_a_frontal_pedestrian_does_not_push_the_robot() -> None:
-    """It runs into a standing robot, stops there, and after a while goes round it and on, never inside its outline."""
+    """It runs into a standing robot, stops there, and after a while goes round it and on, never
+    inside its outline."""
     one = event("frontal")
     states: tuple[EventState, ...] = ()
     gaps = []
@@ -159,7 +194,8 @@ def test_a_frontal_pedestrian_does_not_push_the_robot() -> None:
 
 
 def test_an_obstructing_pedestrian_does_not_step_into_the_robot() -> None:
-    """When the robot already stands in the middle, the pedestrian comes near but never touches it."""
+    """When the robot already stands in the middle, the pedestrian comes near but never touches
+    it."""
     one = event("obstructing")
     states: tuple[EventState, ...] = ()
     for tick in range(200):
@@ -170,7 +206,8 @@ def test_an_obstructing_pedestrian_does_not_step_into_the_robot() -> None:
 
 
 def test_talkers_stand_in_a_circle_and_face_each_other() -> None:
-    """Once in place they are equally far from the middle of the sidewalk, which all of them face."""
+    """Once in place they are equally far from the middle of the sidewalk, which all of them
+    face."""
     for people in (2, 3, 4):
         track = drive(event("conversing", people=people), 400, 0.3, start_m=39.0)
         walkers = track[-1][1].walkers
@@ -178,7 +215,13 @@ def test_talkers_stand_in_a_circle_and_face_each_other() -> None:
         assert max(radii) - min(radii) < 1e-9 and 0.5 < radii[0] < 0.8
         for w in walkers:
             assert math.cos(w.heading_rad - math.atan2(-w.y_m, 50.0 - w.x_m)) == pytest.approx(1.0)
-        assert min(math.dist((a.x_m, a.y_m), (b.x_m, b.y_m)) for a, b in itertools.combinations(walkers, 2)) > 0.7
+        assert (
+            min(
+                math.dist((a.x_m, a.y_m), (b.x_m, b.y_m))
+                for a, b in itertools.combinations(walkers, 2)
+            )
+            > 0.7
+        )
 
 
 def test_a_queue_is_a_line_from_one_side() -> None:
@@ -193,8 +236,11 @@ def test_a_queue_is_a_line_from_one_side() -> None:
 
 @pytest.mark.parametrize("speed_mps", [0.7, 1.0, 1.5, 2.2])
 @pytest.mark.parametrize("side", [-1, 1])
-def test_a_lateral_pedestrian_meets_a_robot_that_keeps_its_velocity(speed_mps: float, side: int) -> None:
-    """It walks at a right angle to the robot's path, evenly, and without contact would be at its centre with it."""
+def test_a_lateral_pedestrian_meets_a_robot_that_keeps_its_velocity(
+    speed_mps: float, side: int
+) -> None:
+    """It walks at a right angle to the robot's path, evenly, and without contact would be at its
+    centre with it."""
     one = event("lateral", side=side)
     track = drive(one, int(60 / speed_mps * 20), speed_mps)
     acting = [(x, state.walkers[0]) for x, state, _ in track if state.phase == "acting"]
@@ -211,7 +257,8 @@ def test_a_lateral_pedestrian_meets_a_robot_that_keeps_its_velocity(speed_mps: f
 
 
 def test_an_overtaking_pedestrian_passes_beside_the_robot_and_cuts_in() -> None:
-    """It starts from behind, is faster, passes without a touch, and slows down ahead, on the robot's line."""
+    """It starts from behind, is faster, passes without a touch, and slows down ahead, on the
+    robot's line."""
     track = drive(event("overtaking"), 900, 1.2, start_m=40.0)
     acting = [(x, s.walkers[0]) for x, s, _ in track if s.phase == "acting"]
     assert -1.0 <= acting[0][1].x_m - acting[0][0] < -0.85
@@ -224,7 +271,8 @@ def test_an_overtaking_pedestrian_passes_beside_the_robot_and_cuts_in() -> None:
 
 
 def test_people_cross_from_both_ends_of_the_crosswalk() -> None:
-    """They wait off it, set out when the robot enters, one of them on the robot's line, and reach the other side."""
+    """They wait off it, set out when the robot enters, one of them on the robot's line, and reach
+    the other side."""
     track = drive(event("ped_crossing"), 1000, 0.3, start_m=40.0)
     waiting = track[0][1].walkers
     assert [w.x_m > 55.0 for w in waiting] == [True, False, True, False]
@@ -245,4 +293,6 @@ def test_a_gesturing_pedestrian_faces_the_robot_throughout() -> None:
     assert {a.doing for _, _, a in shown if a is not None} == {"stop"}
     for x, w, _ in shown:
         if abs(x - w.x_m) > 1.5:
-            assert math.cos(w.heading_rad - math.atan2(-w.y_m, x - w.x_m)) == pytest.approx(1.0, abs=1e-3)
+            assert math.cos(w.heading_rad - math.atan2(-w.y_m, x - w.x_m)) == pytest.approx(
+                1.0, abs=1e-3
+            )

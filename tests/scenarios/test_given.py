@@ -1,4 +1,5 @@
-"""What a policy is given in an episode, by the engines: goals that are pictures, further cameras, and no secret."""
+"""What a policy is given in an episode, by the engines: goals that are pictures, further cameras,
+and no secret."""
 
 from __future__ import annotations
 
@@ -10,23 +11,31 @@ import pytest
 
 from cosim.core.errors import RunError
 from cosim.core.state import Command, People, RobotState, Street
-from cosim.episode.driver import Driver
-from cosim.episode.ports import CameraSpec, Manifest, Observation
-from cosim.records.run_folder import read_spec
+from cosim.episode.interfaces import Observation
+from cosim.episode.policy_caller import Driver
+from cosim.results.run_folder import read_spec
+from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import ImageGoal, PointGoal
+from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario, Suite
 from physics.cameras.view import robot_shot
-from scenarios.checks import small_scenario
-from scenarios.execution.episode import Episode
-from scenarios.execution.suite_run import run
-from scenarios.viewing.drawn_way import way_in_picture
-from tests.reachable import leaks
+from scenarios.episodes.episode import Episode
+from scenarios.runs.run import run
+from scenarios.tools.verify.doctor import small_scenario
+from scenarios.tools.viewing.drawn_route import way_in_picture
+from tests.support.reachable import leaks
 
 pytestmark = pytest.mark.engine
 
 SPEC = CameraSpec(64, 48, depth=True, labels=True)
-ALL = Manifest("all", camera=SPEC, goal="image", odometry="wheel", cameras={"left": CameraSpec(48, 32, mount="left")})
+ALL = Manifest(
+    "all",
+    camera=SPEC,
+    goal="image",
+    odometry="wheel",
+    cameras={"left": CameraSpec(48, 32, mount="left")},
+)
 SEED = EpisodeOptions(seed=11)
 
 
@@ -51,16 +60,20 @@ class Ahead:
         return Command(1.0, 0.0)
 
 
-def test_what_is_given_in_an_episode_holds_no_secret_and_is_what_it_says(scenario: Scenario) -> None:
-    """Everything that a manifest can ask for but knowledge, after a second among people: nothing that only the
-    simulator knows is reached from it, before its driver copies it and after. The goal is the picture of the place 20 m
-    along the route with nobody there: with somebody in it it is another."""
+def test_what_is_given_in_an_episode_holds_no_secret_and_is_what_it_says(
+    scenario: Scenario,
+) -> None:
+    """Everything that a manifest can ask for but knowledge, after a second among people: nothing
+    that only the simulator knows is reached from it, before its driver copies it and after. The
+    goal is the picture of the place 20 m along the route with nobody there: with somebody in it it
+    is another."""
     policy = Ahead(ALL)
     driver = Driver(policy)
     with Episode(scenario, ALL, SEED) as episode, episode.eyes(SPEC) as camera:
         first = seen = episode.reset()
         while not episode.over:
-            now, seen = episode.moment, episode.advance(driver.act(seen))
+            now = episode.moment
+            seen = episode.advance(driver.act(seen))
         assert len(now.street.people) > 5
         for one in (first, seen, *policy.seen):
             assert leaks(one, scenario, episode.moment) == [] == leaks(one, scenario, now)
@@ -70,7 +83,8 @@ def test_what_is_given_in_an_episode_holds_no_secret_and_is_what_it_says(scenari
         ahead = place.xy + 3.0 * np.array([np.cos(place.heading_rad), np.sin(place.heading_rad)])
         somebody = People.of(("a",), [ahead], [0.0], [0.0], ("stand",))
         empty, met = (
-            camera.render(robot, Street(0, people)).rgb for people in (People.of((), [], [], [], ()), somebody)
+            camera.render(robot, Street(0, people)).rgb
+            for people in (People.of((), [], [], [], ()), somebody)
         )
     assert isinstance(first.goal, ImageGoal) and np.array_equal(first.goal.rgb, empty)
     assert (first.goal.rgb != met).any(axis=-1).mean() > 0.02
@@ -80,19 +94,34 @@ def test_what_is_given_in_an_episode_holds_no_secret_and_is_what_it_says(scenari
     assert seen.odometry is not None and 0.1 < seen.odometry.x_m < 1.0
 
 
-def test_goals_are_drawn_from_the_runs_seed_and_change_nothing_in_the_street(scenario: Scenario) -> None:
-    """The same seed gives the same points, another others; the option goes before the manifest, and stands in the
-    record; hashes, and the robot's pictures where its goal is one, too, are those of an episode without goals."""
-    records, pictures, points = [], [], []
-    for goal, seed in (("none", 1), ("random_point", 1), ("random_point", 1), ("random_point", 2), ("image", 1)):
+def test_goals_are_drawn_from_the_runs_seed_and_change_nothing_in_the_street(
+    scenario: Scenario,
+) -> None:
+    """The same seed gives the same points, another others; the option goes before the manifest, and
+    stands in the record; hashes, and the robot's pictures where its goal is one, too, are those of
+    an episode without goals."""
+    records = []
+    pictures = []
+    points = []
+    for goal, seed in (
+        ("none", 1),
+        ("random_point", 1),
+        ("random_point", 1),
+        ("random_point", 2),
+        ("image", 1),
+    ):
         options = EpisodeOptions(seed=seed, goal=goal)  # type: ignore[arg-type]
-        with Episode(scenario, Manifest("seeing", camera=CameraSpec(48, 32), goal="final_point"), options) as episode:
+        with Episode(
+            scenario, Manifest("seeing", camera=CameraSpec(48, 32), goal="final_point"), options
+        ) as episode:
             seen = [episode.reset()]
             while not episode.over:
                 seen.append(episode.advance(Command(1.0, 0.0)))
             records.append(episode.result()[0])
         pictures.append([one.rgb.tobytes() for one in seen if one.rgb is not None])
-        points.append([(one.goal.x_m, one.goal.y_m) for one in seen if isinstance(one.goal, PointGoal)])
+        points.append(
+            [(one.goal.x_m, one.goal.y_m) for one in seen if isinstance(one.goal, PointGoal)]
+        )
     assert [record.goal_protocol for record in records] == ["none", *["random_point"] * 3, "image"]
     assert len({record.state_hash for record in records}) == 1
     assert pictures[0] == pictures[1] == pictures[4]
@@ -100,35 +129,51 @@ def test_goals_are_drawn_from_the_runs_seed_and_change_nothing_in_the_street(sce
 
 
 def test_a_run_keeps_to_its_goals(scenario: Scenario, tmp_path: Path) -> None:
-    """They stand in its rows and in run.json; who resumes it with others is refused, with both names."""
+    """They stand in its rows and in run.json; who resumes it with others is refused, with both
+    names."""
     suite = Suite(name="one", version="1", scenarios=(scenario,))
-    policy, given = Ahead(Manifest("ahead", camera=None, odometry="gps")), EpisodeOptions(seed=2, goal="route_point")
+    policy = Ahead(Manifest("ahead", camera=None, odometry="gps"))
+    given = EpisodeOptions(seed=2, goal="route_point")
     table = run(suite, policy, out=tmp_path / "run", options=given)
-    assert table[["goal_protocol", "odometry", "privileged"]].to_numpy().tolist() == [["route_point", "gps", False]]
-    assert all(isinstance(one.goal, PointGoal) and one.odometry is not None for one in policy.seen) and policy.seen
+    assert table[["goal_protocol", "odometry", "privileged"]].to_numpy().tolist() == [
+        ["route_point", "gps", False]
+    ]
+    assert (
+        all(isinstance(one.goal, PointGoal) and one.odometry is not None for one in policy.seen)
+        and policy.seen
+    )
     spec = read_spec(tmp_path / "run")
     assert (spec.goal_protocol, spec.odometry) == ("route_point", "gps")
-    for goal, named in (("final_point", "now asked for is final_point"), (None, "now asked for is none")):
+    for goal, named in (
+        ("final_point", "now asked for is final_point"),
+        (None, "now asked for is none"),
+    ):
         other = EpisodeOptions(seed=2, goal=goal)  # type: ignore[arg-type]
-        with pytest.raises(RunError, match=f"is of another run: its goal_protocol is route_point, {named}"):
+        with pytest.raises(
+            RunError, match=f"is of another run: its goal_protocol is route_point, {named}"
+        ):
             run(suite, policy, out=tmp_path / "run", resume=True, options=other)
     assert len(run(suite, policy, out=tmp_path / "run", resume=True, options=given)) == 1
 
 
 def test_the_calibration_is_that_of_the_picture(scenario: Scenario) -> None:
-    """By depth and matrix every pixel of the ground before the robot comes to lie on it, on level ground; and a point
-    of the ground that is seen there is drawn there."""
+    """By depth and matrix every pixel of the ground before the robot comes to lie on it, on level
+    ground; and a point of the ground that is seen there is drawn there."""
     with Episode(scenario, ALL, SEED) as episode:
         seen = episode.reset()
         z_m = episode.moment.robot.z_m
-        surface, robot = episode._open.parts.world.surface, episode.moment.robot  # type: ignore[attr-defined]
+        # type: ignore[attr-defined]
+        surface = episode._open.parts.world.surface
+        robot = episode.moment.robot
         lean = np.array(surface.lean(scenario.start_pose, seen.robot.drive.span_m)[1:])
         shot = robot_shot(surface, seen.robot, SPEC, robot)
     assert seen.camera is not None and seen.depth is not None and seen.labels is not None
     assert np.abs(lean).max() < 0.01, "a start on a slope tells nothing here"
     rows, columns = np.nonzero((seen.labels == 2) & (seen.depth < 8.0))
     rays = np.linalg.inv(seen.camera.matrix) @ np.stack([columns, rows, np.ones_like(rows)])
-    points = seen.camera.on_robot @ np.vstack([rays * seen.depth[rows, columns], np.ones_like(rows)])
+    points = seen.camera.on_robot @ np.vstack(
+        [rays * seen.depth[rows, columns], np.ones_like(rows)]
+    )
     assert len(rows) > 50 and abs(z_m) < 1.0
     assert np.abs(np.median(points[2])) < 0.03 and np.percentile(np.abs(points[2]), 90) < 0.06
     cos, sin = np.cos(robot.pose.heading_rad), np.sin(robot.pose.heading_rad)

@@ -1,4 +1,5 @@
-"""Scenarios as environments of Gymnasium: spaces, rewards, ends, seeds, and the same bits as a run."""
+"""Scenarios as environments of Gymnasium: spaces, rewards, ends, seeds, and the same bits as a
+run."""
 
 from __future__ import annotations
 
@@ -21,32 +22,42 @@ import cosim
 from cosim.core.errors import PolicyError, SpecError, UsageError
 from cosim.core.geometry import Pose
 from cosim.core.state import Command, RobotState
-from cosim.episode.ports import CameraSpec, Manifest, Observation, WaypointRule
+from cosim.episode.interfaces import Observation
 from cosim.gym import ENV_IDS
-from cosim.judge.referee import Failure
+from cosim.results.referee import Failure
+from cosim.spec.camera import CameraPicture, CameraSpec
 from cosim.spec.goal import GOALS, ImageGoal, Instruction, PointGoal, RoutePatch
+from cosim.spec.manifest import Manifest, WaypointRule
 from cosim.spec.odometry import Odometry
 from cosim.spec.options import EpisodeOptions
-from cosim.spec.picture import CameraPicture
 from cosim.spec.robot import COURIER, SCOUT
 from cosim.spec.scenario import CrowdSpec
-from scenarios.catalog import SUITES, load_suite
-from scenarios.execution.run import run_episode
-from scenarios.gym.learned import LearnedPolicy
-from scenarios.gym.reward import Transition, usual_reward
-from scenarios.gym.spaces import action_as_answer, action_space_of, seen_by, seen_space
+from scenarios.episodes.run_episode import run_episode
+from scenarios.suites.catalog import SUITES, load_suite
+from scenarios.tools.gym.learned import LearnedPolicy
+from scenarios.tools.gym.reward import Transition, usual_reward
+from scenarios.tools.gym.spaces import action_as_answer, action_space_of, seen_by, seen_space
 from tests.conftest import PATIENCE_S, still_runs
-from tests.scenarios.gym_suite import BLIND, COUNT, short_ways
+from tests.support.gym_suite import BLIND, COUNT, short_ways
 
-MODULE = (sys.executable, "-m", "tests.scenarios.gym_suite")
+MODULE = (sys.executable, "-m", "tests.support.gym_suite")
 SEES = Manifest("sees", camera=CameraSpec(32, 24, depth=True), goal="image", rate_hz=5.0)
 FAILED = Failure("collision", 3, 0.0, 0.0, 1.0, 1.0)
 QUIET = Transition(
     scenario=None,  # type: ignore[arg-type]  the usual reward does not look at it
-    period_s=0.25, robot=RobotState(Pose(0.0, 0.0, 0.0)), command=Command(0.0, 0.0), route_s_m=3.0, progress_m=0.0,
-    acceleration_mps2=0.0, turn_acceleration_radps2=0.0, nearest_person_m=math.inf, failures=(), walked_into=(),
-    red_light_entries=0, ended=None,
-)  # fmt: skip
+    period_s=0.25,
+    robot=RobotState(Pose(0.0, 0.0, 0.0)),
+    command=Command(0.0, 0.0),
+    route_s_m=3.0,
+    progress_m=0.0,
+    acceleration_mps2=0.0,
+    turn_acceleration_radps2=0.0,
+    nearest_person_m=math.inf,
+    failures=(),
+    walked_into=(),
+    red_light_entries=0,
+    ended=None,
+)
 
 
 @pytest.mark.parametrize(
@@ -77,37 +88,59 @@ def test_the_usual_reward_is_the_sum_that_it_says(happened: dict[str, Any], wort
 
 
 GIVEN = {
-    "none": None, "route_point": PointGoal(3.0, -1.0), "final_point": PointGoal(30_000.0, 1.0),
-    "random_point": PointGoal(5.0, 5.0), "image": ImageGoal(np.ones((24, 32, 3), np.uint8)),
-    "random_image": ImageGoal(np.ones((24, 32, 3), np.uint8)), "instruction": Instruction("In 10 m, turn left."),
+    "none": None,
+    "route_point": PointGoal(3.0, -1.0),
+    "final_point": PointGoal(30_000.0, 1.0),
+    "random_point": PointGoal(5.0, 5.0),
+    "image": ImageGoal(np.ones((24, 32, 3), np.uint8)),
+    "random_image": ImageGoal(np.ones((24, 32, 3), np.uint8)),
+    "instruction": Instruction("In 10 m, turn left."),
     "route_patch": RoutePatch(np.ones((80, 80), np.uint8)),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("goal", sorted(GOALS))
 def test_what_is_seen_lies_in_its_space(goal: str) -> None:
-    """For every goal protocol, with all that a manifest can ask for: the dictionary has the space's names, and all of
-    it is contained; numbers beyond the bounds are put at them."""
+    """For every goal protocol, with all that a manifest can ask for: the dictionary has the space's
+    names, and all of it is contained; numbers beyond the bounds are put at them."""
     wide = CameraSpec(32, 24, labels=True, depth=True)
-    manifest = Manifest("all", camera=wide, cameras={"left": CameraSpec(8, 6)}, goal=goal, odometry="gps")  # type: ignore[arg-type]
+    manifest = Manifest(
+        "all", camera=wide, cameras={"left": CameraSpec(8, 6)}, goal=goal, odometry="gps"
+    )  # type: ignore[arg-type]
     space = seen_space(manifest, [COURIER, SCOUT])
-    pixels, far = np.full((24, 32), 3, np.uint8), np.full((24, 32), np.inf, np.float32)
+    pixels = np.full((24, 32), 3, np.uint8)
+    far = np.full((24, 32), np.inf, np.float32)
     picture = CameraPicture(np.zeros((6, 8, 3), np.uint8), None, None, None)  # type: ignore[arg-type]
     seen = seen_by(
         Observation(
-            5, 0.25, np.zeros((24, 32, 3), np.uint8), 90.0, -0.1, COURIER, goal=GIVEN[goal], depth=far, labels=pixels,
-            pictures={"left": picture}, odometry=Odometry(1.0, 2.0, None),
+            5,
+            0.25,
+            np.zeros((24, 32, 3), np.uint8),
+            90.0,
+            -0.1,
+            COURIER,
+            goal=GIVEN[goal],
+            depth=far,
+            labels=pixels,
+            pictures={"left": picture},
+            odometry=Odometry(1.0, 2.0, None),
         ),
         space,
-    )  # fmt: skip
-    assert space.contains(seen) and seen["speeds"][0] == 5.0 and ("goal" in seen) == (goal != "none")
+    )
+    assert (
+        space.contains(seen) and seen["speeds"][0] == 5.0 and ("goal" in seen) == (goal != "none")
+    )
     assert {"picture", "depth", "labels", "picture_left", "odometry"} <= {*seen}
 
 
 def test_answers_are_commands_or_waypoints_of_the_manifest() -> None:
-    """A command is speed and yaw rate of the fastest robot; waypoints end with the followed one, in its unit."""
+    """A command is speed and yaw rate of the fastest robot; waypoints end with the followed one, in
+    its unit."""
     space = action_space_of("command", BLIND, [COURIER, SCOUT])
-    assert (space.low.tolist(), space.high.tolist()) == ([0.0, np.float32(-1.2)], [2.5, np.float32(1.2)])
+    assert (space.low.tolist(), space.high.tolist()) == (
+        [0.0, np.float32(-1.2)],
+        [2.5, np.float32(1.2)],
+    )
     assert action_as_answer(np.float32([1.5, 0.25]), space) == Command(1.5, 0.25)
     rule = WaypointRule(index=3, unit_m=0.25, dt_s=0.2)
     several = action_space_of("waypoints", replace(BLIND, waypoints=rule), [COURIER])
@@ -119,13 +152,15 @@ def test_answers_are_commands_or_waypoints_of_the_manifest() -> None:
 
 
 def test_every_shipped_suite_has_an_id_of_its_major_version() -> None:
-    """`gymnasium.make` knows a suite for each id, and the id says which version of the suite that is; no engine is
-    started by making it."""
+    """`gymnasium.make` knows a suite for each id, and the id says which version of the suite that
+    is; no engine is started by making it."""
     assert {*ENV_IDS.values()} == {*SUITES}
     for env_id, name in ENV_IDS.items():
         assert env_id.endswith(f"-v{load_suite(name).version.split('.')[0]}")
     with gymnasium.make("cosim/Unit-v1", manifest=BLIND, split="test", actions="waypoints") as env:
-        assert env.action_space.shape == (3, 2) and {one.split for one in env.unwrapped.scenarios} == {"test"}
+        assert env.action_space.shape == (3, 2) and {
+            one.split for one in env.unwrapped.scenarios
+        } == {"test"}
 
 
 @pytest.mark.parametrize(
@@ -138,13 +173,29 @@ def test_every_shipped_suite_has_an_id_of_its_major_version() -> None:
         ({"render_mode": "human"}, "unknown render_mode 'human'.*rgb_array"),
         ({"manifest": replace(BLIND, privileged=True)}, "leave privileged=True out"),
         ({"manifest": replace(BLIND, goal="image")}, "no camera, and goal protocol 'image'"),
-        ({"manifest": replace(SEES, camera=CameraSpec(9000, 9000))}, "which robot 'courier' does not have"),
+        (
+            {"manifest": replace(SEES, camera=CameraSpec(9000, 9000))},
+            "which robot 'courier' does not have",
+        ),
         ({"options": EpisodeOptions(counterfactual=True)}, "leave counterfactual out"),
         ({"options": EpisodeOptions(robot="rover")}, "unknown robot 'rover'"),
     ],
-    ids=["suite", "scenario", "event", "actions", "render mode", "privileged", "goal", "camera", "options", "robot"],
+    ids=[
+        "suite",
+        "scenario",
+        "event",
+        "actions",
+        "render mode",
+        "privileged",
+        "goal",
+        "camera",
+        "options",
+        "robot",
+    ],
 )
-def test_what_cannot_be_is_refused_when_an_environment_is_made(asked: dict[str, Any], told: str) -> None:
+def test_what_cannot_be_is_refused_when_an_environment_is_made(
+    asked: dict[str, Any], told: str
+) -> None:
     """One line says what was found and what may stand there."""
     with pytest.raises((UsageError, SpecError), match=told):
         cosim.make_env(**{"suite": "unit", "manifest": BLIND} | asked)
@@ -152,7 +203,7 @@ def test_what_cannot_be_is_refused_when_an_environment_is_made(asked: dict[str, 
 
 def test_without_gymnasium_one_is_told_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     """The extra is named."""
-    monkeypatch.delitem(sys.modules, "scenarios.gym.environment", raising=False)
+    monkeypatch.delitem(sys.modules, "scenarios.tools.gym.environment", raising=False)
     monkeypatch.setitem(sys.modules, "gymnasium", None)
     with pytest.raises(UsageError, match=r"need Gymnasium.*pip install 'sidewalk-cosim\[gym\]'"):
         cosim.make_env("unit")
@@ -162,27 +213,38 @@ def test_an_environment_without_a_render_mode_says_how_to_get_pictures() -> None
     """`render()` raises; the message names the mode and the call that sets it."""
     with (
         gymnasium.make("cosim/Unit-v1", manifest=BLIND) as env,
-        pytest.raises(UsageError, match=r"no render_mode.*gymnasium\.make\(.*render_mode=\"rgb_array\"\)"),
+        pytest.raises(
+            UsageError, match=r"no render_mode.*gymnasium\.make\(.*render_mode=\"rgb_array\"\)"
+        ),
     ):
         env.unwrapped.render()
 
 
 @pytest.mark.engine
 def test_the_checker_of_gymnasium_is_content() -> None:
-    """`check_env` passes for what is seen by a camera with depth and a picture as a goal, rendering too; it warns of
-    nothing but that speeds are in their units."""
-    asked = {"suite": short_ways(), "manifest": SEES, "scenarios": ["way-1"], "render_mode": "rgb_array"}
+    """`check_env` passes for what is seen by a camera with depth and a picture as a goal, rendering
+    too; it warns of nothing but that speeds are in their units."""
+    asked = {
+        "suite": short_ways(),
+        "manifest": SEES,
+        "scenarios": ["way-1"],
+        "render_mode": "rgb_array",
+    }
     env = gymnasium.make("cosim/Unit-v1", **asked).unwrapped
     with env, warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
         check_env(env)
         assert env.render().shape == (360, 640, 3) and env.render().std() > 10.0
-        with pytest.raises(UsageError, match=r"unknown option of reset 'scene'\. Valid choices: scenario"):
+        with pytest.raises(
+            UsageError, match=r"unknown option of reset 'scene'\. Valid choices: scenario"
+        ):
             env.reset(options={"scene": "way-1"})
         with pytest.raises(UsageError, match=r"unknown scenario 'way-2'\. Valid choices: way-1"):
             env.reset(options={"scenario": "way-2"})
     told = [str(one.message) for one in warned]
-    assert [text for text in told if "we recommend using a symmetric and normalized space" not in text] == []
+    assert [
+        text for text in told if "we recommend using a symmetric and normalized space" not in text
+    ] == []
     with pytest.raises(UsageError, match=r"call reset\(\) first"):
         env.step(env.action_space.sample())
 
@@ -206,13 +268,16 @@ def commands() -> list[np.ndarray]:
 
 @pytest.mark.engine
 def test_the_same_commands_give_the_record_of_a_run_to_the_bit() -> None:
-    """Among walkers and vehicles an environment's last step tells what a run keeps: same state hash, same measures,
-    same everything but wall times; its policy, learned or not, is asked in a run what it was asked here."""
+    """Among walkers and vehicles an environment's last step tells what a run keeps: same state
+    hash, same measures, same everything but wall times; its policy, learned or not, is asked in a
+    run what it was asked here."""
     whole = short_ways(crowd=CrowdSpec(persons=12, vehicles=4, radius_m=60.0))
     options = EpisodeOptions(seed=11, suite_hash=whole.content_hash)
     with cosim.make_env(whole, Replays.manifest, options=EpisodeOptions(seed=11)) as env:
         seen, info = env.reset(options={"scenario": "way-3"})
-        seens, rewards, gained_m = [seen], [], 0.0
+        seens = [seen]
+        rewards = []
+        gained_m = 0.0
         for command in commands():
             seen, reward, terminated, truncated, info = env.step(command)
             seens.append(seen)
@@ -231,7 +296,9 @@ def test_the_same_commands_give_the_record_of_a_run_to_the_bit() -> None:
         record.ended == "failure",
         record.ended == "timeout",
     )
-    assert info["metrics"] == {name: value for name, value in record.measures.items() if value is not None}
+    assert info["metrics"] == {
+        name: value for name, value in record.measures.items() if value is not None
+    }
     for here, there in zip(seens, asked, strict=False):
         assert all((here[name] == there[name]).all() for name in here)
     assert len(asked) == len(seens) - 1 and gained_m > 0.2
@@ -239,10 +306,13 @@ def test_the_same_commands_give_the_record_of_a_run_to_the_bit() -> None:
 
 @pytest.mark.engine
 def test_a_seed_settles_scenarios_and_all_that_is_drawn() -> None:
-    """The same seed gives the same scenarios and observations in the same order, with noise on the wheels; another
-    seed others; a scenario that is named changes nothing of what follows. A user's reward is what a step returns."""
+    """The same seed gives the same scenarios and observations in the same order, with noise on the
+    wheels; another seed others; a scenario that is named changes nothing of what follows. A user's
+    reward is what a step returns."""
 
-    def episodes(env: Any, seed: int, first: dict[str, str] | None = None) -> list[tuple[str, list[float]]]:
+    def episodes(
+        env: Any, seed: int, first: dict[str, str] | None = None
+    ) -> list[tuple[str, list[float]]]:
         found = []
         for seed_now, options in ((seed, first), (None, None), (None, None)):
             _, info = env.reset(seed=seed_now, options=options)
@@ -260,12 +330,13 @@ def test_a_seed_settles_scenarios_and_all_that_is_drawn() -> None:
 
 @pytest.mark.engine
 def test_a_failure_ends_a_short_way_and_is_counted_on_a_long_one() -> None:
-    """Who drives off the sidewalk is terminated where failures end the episode; else it is put back and goes on, for
-    the same penalty, until its time is over, which truncates."""
+    """Who drives off the sidewalk is terminated where failures end the episode; else it is put back
+    and goes on, for the same penalty, until its time is over, which truncates."""
 
     def off_the_walk(ends: bool) -> tuple[list[dict[str, Any]], list[float], bool, bool]:
         way = short_ways(ends_on_failure=ends, time_limit_s=4.0)
-        infos, rewards = [], []
+        infos = []
+        rewards = []
         with cosim.make_env(way, BLIND, scenarios=["way-0"]) as env:
             env.reset(seed=1)
             terminated = truncated = False
@@ -280,25 +351,36 @@ def test_a_failure_ends_a_short_way_and_is_counted_on_a_long_one() -> None:
     assert not infos[-1]["is_success"] and infos[-1]["record"].ended == "failure"
     infos, rewards, *ends = off_the_walk(False)
     back = [k for k, info in enumerate(infos) if info["put_back"]]
-    assert ends == [False, True] and back and all(infos[k]["failures"] == 1 and rewards[k] < -8.0 for k in back)
+    assert (
+        ends == [False, True]
+        and back
+        and all(infos[k]["failures"] == 1 and rewards[k] < -8.0 for k in back)
+    )
     assert sum(info["failures"] for info in infos) == len(infos[-1]["record"].failures)
     assert infos[-1]["time_s"] == 4.0 and infos[-1]["record"].ended == "timeout"
 
 
 @pytest.mark.engine
 def test_eight_at_once_see_what_each_sees_alone(tmp_path: Path) -> None:
-    """`AsyncVectorEnv` of eight, each with engines of its own in a process of its own: observations, rewards and ends
-    are to the bit those of one environment after the other."""
-    done = subprocess.run([*MODULE, "alike"], capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    """`AsyncVectorEnv` of eight, each with engines of its own in a process of its own:
+    observations, rewards and ends are to the bit those of one environment after the other."""
+    done = subprocess.run(
+        [*MODULE, "alike"], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
     assert done.stdout == "[]\n" and COUNT == 8, done.stderr
 
 
 @pytest.mark.engine
 def test_what_goes_wrong_in_one_of_them_is_told_and_nothing_outlives_them() -> None:
-    """An answer that is not a number comes out as the error that it is; when the process that made the environments
-    is killed theirs end too."""
-    told = subprocess.run([*MODULE, "told"], capture_output=True, text=True, timeout=PATIENCE_S, check=False).stdout
-    assert "PolicyError policy 'blind' answered Command(v_mps=nan, w_radps=0.0): both must be finite" in told
+    """An answer that is not a number comes out as the error that it is; when the process that made
+    the environments is killed theirs end too."""
+    told = subprocess.run(
+        [*MODULE, "told"], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    ).stdout
+    assert (
+        "PolicyError policy 'blind' answered Command(v_mps=nan, w_radps=0.0): both must be finite"
+        in told
+    )
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
     with subprocess.Popen([*MODULE, "killed"], text=True, **pipes) as made:
         pids = [int(word) for word in made.stdout.readline().split()]
@@ -312,8 +394,8 @@ def test_what_goes_wrong_in_one_of_them_is_told_and_nothing_outlives_them() -> N
 
 @pytest.mark.engine
 def test_the_learner_of_the_readme_begins(tmp_path: Path) -> None:
-    """The example with PPO learns for one short rollout, writes its curve, and gives a policy that answers in a run; it
-    needs Stable-Baselines3."""
+    """The example with PPO learns for one short rollout, writes its curve, and gives a policy that
+    answers in a run; it needs Stable-Baselines3."""
     pytest.importorskip("stable_baselines3", reason="Stable-Baselines3 is not installed")
     code = (
         "import runpy, pathlib, cosim;"
@@ -321,6 +403,12 @@ def test_the_learner_of_the_readme_begins(tmp_path: Path) -> None:
         f"policy = made['learn'](30.0, 1, pathlib.Path({str(tmp_path)!r}), 1, 64, 64); "
         "print(cosim.run('reactive', policy, scenarios=['static-7001']).scenario[0])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
     assert done.stdout == "static-7001\n", done.stderr
     assert (tmp_path / "curve.csv").read_text().startswith("steps,cpu_s,episodes,return,success")

@@ -11,17 +11,20 @@ from cosim.core.clock import Clock, Pacer
 from cosim.core.errors import UsageError
 from cosim.policies.load import load_policy
 from cosim.spec.options import EpisodeOptions
-from scenarios.checks import small_scenario
-from scenarios.execution import episode
-from scenarios.execution.run import run_episode
+from scenarios.episodes import episode
+from scenarios.episodes.run_episode import run_episode
+from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import Cosim
 
 
 @pytest.mark.engine
 def test_a_pace_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """At half of real time a second of an episode takes two, and comes to the same state hash as without a pace."""
+    """At half of real time a second of an episode takes two, and comes to the same state hash as
+    without a pace."""
     slept_s: list[float] = []
-    monkeypatch.setattr(episode, "Pacer", partial(Pacer, clock=lambda: 100.0 + sum(slept_s), sleep=slept_s.append))
+    monkeypatch.setattr(
+        episode, "Pacer", partial(Pacer, clock=lambda: 100.0 + sum(slept_s), sleep=slept_s.append)
+    )
     short = msgspec.structs.replace(small_scenario(), time_limit_s=1.0)
     free = run_episode(short, load_policy("straight")).record
     assert not slept_s

@@ -1,4 +1,5 @@
-"""Ways on maps whose sidewalks lie over one another: fenced in all along, where fences at the branches do not do."""
+"""Ways on maps whose sidewalks lie over one another: fenced in all along, where fences at the
+branches do not do."""
 
 from __future__ import annotations
 
@@ -11,23 +12,24 @@ from shapely.geometry import LineString
 
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Polyline
-from cosim.place.fences import outline
+from cosim.place.barriers import barrier_at, branches, outline, prove_single_path
 from cosim.place.street_map import Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import City, content_hash
-from scenarios.builders import long_horizon
-from scenarios.builders.barriers import barrier_at, branches, prove_single_path
-from scenarios.builders.hems import MOST, hem
-from scenarios.builders.recipes import RECIPES, candidate
-from scenarios.catalog import load_suite
-from scenarios.execution.places import place
+from scenarios.places.nets import place
+from scenarios.suites import long_horizon
+from scenarios.suites.catalog import load_suite
+from scenarios.suites.edge_fences import MOST, hem
+from scenarios.suites.recipes import RECIPES, candidate
 from tests.scenarios.test_scenarios import cross_map
 
 WAY = [Port("west", 0), Port("east", 0)]
 ROUTE = Polyline([(-30, 0), (30, 0)])
 
 
-def laid_over(street_map: StreetMap, name: str, *points: tuple[float, float], width_m: float = 2.0) -> StreetMap:
+def laid_over(
+    street_map: StreetMap, name: str, *points: tuple[float, float], width_m: float = 2.0
+) -> StreetMap:
     """The map with one more footway, which meets no corner."""
     line = np.array(points)
     polygon = shapely.buffer(LineString(line), width_m / 2, cap_style="flat")
@@ -36,14 +38,17 @@ def laid_over(street_map: StreetMap, name: str, *points: tuple[float, float], wi
 
 
 def test_a_footway_across_a_sidewalk_is_fenced_off() -> None:
-    """Fences at the branches leave it open; a hem closes it on both sides, names it, and keeps off the route."""
+    """Fences at the branches leave it open; a hem closes it on both sides, names it, and keeps off
+    the route."""
     street_map = laid_over(cross_map(), "path", (-15.0, -50.0), (-10.0, 50.0))
     fences = [barrier_at(street_map, port) for port in branches(street_map, WAY)]
     with pytest.raises(SpecError, match="a branch is left open"):
         prove_single_path(street_map, ROUTE, fences, WAY, 0.3)
     hemmed = hem(street_map, WAY)
     part = prove_single_path(street_map, ROUTE, hemmed, WAY, 0.3)
-    assert not part.intersects(street_map.strips["path"].polygon.difference(shapely.box(-50, -2, 50, 2)))
+    assert not part.intersects(
+        street_map.strips["path"].polygon.difference(shapely.box(-50, -2, 50, 2))
+    )
     closed = {(fence.strip, fence.end) for fence in hemmed}
     assert {("north", 0), ("south", 0), ("path", 0), ("path", 1)} <= closed
     for fence in hemmed:
@@ -59,9 +64,12 @@ def test_a_footway_along_a_sidewalk_is_fenced_off() -> None:
 
 
 def test_a_way_on_its_own_needs_no_hem() -> None:
-    """Where nothing borders on the way there are no fences; where far too much does it is refused."""
+    """Where nothing borders on the way there are no fences; where far too much does it is
+    refused."""
     alone = cross_map()
-    alone = dataclasses.replace(alone, strips={name: alone.strips[name] for name in ("west", "east")})
+    alone = dataclasses.replace(
+        alone, strips={name: alone.strips[name] for name in ("west", "east")}
+    )
     ports = tuple(port for port in alone.corners["middle"].ports if port.strip in alone.strips)
     corner = dataclasses.replace(alone.corners["middle"], ports=ports)
     alone = dataclasses.replace(alone, corners={"middle": corner})
@@ -91,14 +99,20 @@ def overlaid() -> StreetMap:
 def test_where_no_draw_fits_a_way_is_searched_for_and_hemmed(
     overlaid: StreetMap, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """On a map of overlaid sidewalks the same seed gives the same proved route; without the search none, and why."""
+    """On a map of overlaid sidewalks the same seed gives the same proved route; without the search
+    none, and why."""
     monkeypatch.setattr(long_horizon, "TRIES", 10)
-    graph, city = WalkGraph(overlaid), City(seed=1, size_m=500.0)
-    found, again = (long_horizon.build_long_horizon(city, overlaid, graph, 4, "hemmed") for _ in range(2))
+    graph = WalkGraph(overlaid)
+    city = City(seed=1, size_m=500.0)
+    found, again = (
+        long_horizon.build_long_horizon(city, overlaid, graph, 4, "hemmed") for _ in range(2)
+    )
     assert found == again and found.crossings and len(found.barriers) > 10
     assert any(barrier.strip.startswith("over:") for barrier in found.barriers)
     monkeypatch.setattr(long_horizon, "SEARCHES", 0)
-    with pytest.raises(SpecError, match=r"^no long-horizon route .* in 10 draws \(.*\), and none was found.*$"):
+    with pytest.raises(
+        SpecError, match=r"^no long-horizon route .* in 10 draws \(.*\), and none was found.*$"
+    ):
         long_horizon.build_long_horizon(city, overlaid, graph, 4, "none")
 
 

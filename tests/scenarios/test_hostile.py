@@ -1,4 +1,5 @@
-"""Policies that do what no policy should, all in one run: every episode gets its row, and nothing else breaks."""
+"""Policies that do what no policy should, all in one run: every episode gets its row, and nothing
+else breaks."""
 
 from __future__ import annotations
 
@@ -18,15 +19,16 @@ import pandas as pd
 import pytest
 
 from cosim.place.walk_graph import WalkGraph
-from cosim.spec.pseudonym import pseudonym_of
+from cosim.spec.episode_id import pseudonym_of
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from scenarios.events import EVENT_KINDS
 from tests.conftest import PATIENCE_S, WIDE, Cosim, Said
-from tests.scenarios.hostile import ACTS, FLOOD_BYTES, RESETS
+from tests.support.hostile import ACTS, FLOOD_BYTES, RESETS
 
 pytestmark = pytest.mark.engine
 
-ANSWER_S, START_S = 3.0, 3.0
+ANSWER_S = 3.0
+START_S = 3.0
 DONE = ""
 """Nothing to say: the episode is done, and simulated as if the policy had done nothing."""
 
@@ -49,7 +51,8 @@ EXPECTED: dict[str, str] = {
     "nothing": "policy 'hostile' answered None: neither a Command nor waypoints (act at 0.50 s)",
     "nan": "answered Command(v_mps=nan, w_radps=0.0): both must be finite",
     "infinity": "answered waypoints with NaN or infinity: [inf, 0.0]",
-    "huge-integer": "answered Command(v_mps=an integer of 1329 bits, w_radps=0.0): both must be finite",
+    "huge-integer": "answered Command(v_mps=an integer of 1329 bits, "
+    "w_radps=0.0): both must be finite",
     "complex": "answered an array of complex128: waypoints are real numbers",
     "texts": "answered an array of str96: waypoints are real numbers",
     "truths": "answered an array of bool: waypoints are real numbers",
@@ -57,8 +60,8 @@ EXPECTED: dict[str, str] = {
     "ragged": "answered [[1.0, 0.0], [1.0]]: neither a Command nor waypoints",
     "wrong-shape": "answered an array of shape (3, 7)",
     "no-waypoint": "answered an array of shape (0, 2)",
-    "too-many-numbers": "policy 'hostile' answered an array of shape (50001, 2): 100002 numbers; an answer holds "
-    "at most 100000 (act at 0.50 s)",
+    "too-many-numbers": "policy 'hostile' answered an array of shape (50001, 2): 100002 numbers; "
+    "an answer holds at most 100000 (act at 0.50 s)",
     "a-coroutine": "answered a coroutine: neither a Command nor waypoints",
     "an-unreal-float": "raised KeyboardInterrupt",
     "without-end": "policy 'hostile' ",
@@ -73,9 +76,12 @@ EXPECTED: dict[str, str] = {
     "forks": DONE,
     "a-busy-thread": DONE,
     "closes-everything": "the environment process",
-    "dies-and-leaves-processes": "the environment process ended with exit code 0 in the policy's act at 0.50 s",
-    "kills-its-parent": "the environment process was killed by SIGKILL in the policy's act at 0.50 s, 2 times",
-    "hangs-with-the-lock": "policy 'hostile' gave no answer for 3 s in act at 0.50 s of hangs-with-the-lock",
+    "dies-and-leaves-processes": "the environment process ended with exit code 0 in the "
+    "policy's act at 0.50 s",
+    "kills-its-parent": "the environment process was killed by SIGKILL in the policy's act at "
+    "0.50 s, 2 times",
+    "hangs-with-the-lock": "policy 'hostile' gave no answer for 3 s in act at 0.50 s "
+    "of hangs-with-the-lock",
     "stops-itself": "gave no answer for 3 s in act at 0.50 s of stops-itself",
     "hangs-in-reset": "gave no answer for 3 s in reset of hangs-in-reset",
 }
@@ -95,22 +101,26 @@ class War(NamedTuple):
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a suite that has one short scenario for each of them, and the policies."""
-    from scenarios.builders.reactive import build_reactive
-    from scenarios.execution.places import place
+    from scenarios.places.nets import place
+    from scenarios.suites.reactive import build_reactive
 
     folder = tmp_path_factory.mktemp("desk")
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)
-    whole = build_reactive(EVENT_KINDS["obstructing"], city, street_map, WalkGraph(street_map), 0, "t")
+    whole = build_reactive(
+        EVENT_KINDS["obstructing"], city, street_map, WalkGraph(street_map), 0, "t"
+    )
     crowd = CrowdSpec(persons=4, radius_m=50.0, vehicles=1)
     one = msgspec.structs.replace(whole, crowd=crowd, time_limit_s=1.0, events=())
     names: dict[str, str] = {}
     for name, scenarios in (("hostile", [*EXPECTED]), ("pictures", ["honest", "blackens"])):
-        suite = Suite(name=name, version="1", scenarios=tuple(named(one, scenario) for scenario in scenarios))
+        suite = Suite(
+            name=name, version="1", scenarios=tuple(named(one, scenario) for scenario in scenarios)
+        )
         write_suite(suite, folder / f"{name}.json")
         names |= {pseudonym_of(int(SEED), each).episode: each.id for each in suite.scenarios}
     (folder / "names.json").write_text(json.dumps(names))
-    shutil.copy(Path(__file__).with_name("hostile.py"), folder)
+    shutil.copy(Path(__file__).parents[1] / "support" / "hostile.py", folder)
     return folder
 
 
@@ -135,7 +145,18 @@ def war(desk: Path, fresh_cosim: Cosim) -> War:
     """One run over all of them, by two processes at a time."""
     mark = f"hostile-{uuid.uuid4()}"
     times = ("--answer-timeout", f"{ANSWER_S:g}", "--start-timeout", f"{START_S:g}")
-    words = ("--policy", "hostile:Hostile", "--jobs", "2", "--seed", SEED, "--out", "war", "--log-json", "log.jsonl")
+    words = (
+        "--policy",
+        "hostile:Hostile",
+        "--jobs",
+        "2",
+        "--seed",
+        SEED,
+        "--out",
+        "war",
+        "--log-json",
+        "log.jsonl",
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HOSTILE_DESK", str(desk))
         patch.setenv("HOSTILE_MARK", mark)
@@ -148,15 +169,17 @@ def record(war: War, name: str) -> dict[str, object]:
 
 
 def test_every_hostile_policy_is_expected() -> None:
-    """The table names each function of tests/scenarios/hostile.py, and they are many."""
+    """The table names each function of tests/support/hostile.py, and they are many."""
     assert set(EXPECTED) == set(ACTS) | set(RESETS)
     assert len(EXPECTED) >= 45
 
 
 @pytest.mark.parametrize("name", EXPECTED)
 def test_a_hostile_policy_is_recorded_for_what_it_did(war: War, name: str) -> None:
-    """A crash with the reason in words, once unless a process died; or an episode that nothing has changed."""
-    told, began = record(war, name), Counter((war.folder.parent / "began.txt").read_text().split())
+    """A crash with the reason in words, once unless a process died; or an episode that nothing has
+    changed."""
+    told = record(war, name)
+    began = Counter((war.folder.parent / "began.txt").read_text().split())
     if EXPECTED[name] == DONE and name not in TWICE:
         assert told["status"] == "done", told["reason"]
         assert told["state_hash"] == record(war, "honest")["state_hash"]
@@ -172,22 +195,27 @@ def test_a_run_of_hostile_policies_ends_in_order(war: War) -> None:
     assert war.said.returncode == 1 and "Traceback" not in war.said.stderr, war.said.stderr
     assert f"scheduled {len(EXPECTED)}, scored {len(EXPECTED)}" in war.said.stdout
     assert "crashed error" in war.said.stdout and EXPECTED["error"] in war.said.stdout
-    table = pd.read_csv(war.folder / "results.csv", index_col="scenario", keep_default_na=False, na_values=[""])
+    table = pd.read_csv(
+        war.folder / "results.csv", index_col="scenario", keep_default_na=False, na_values=[""]
+    )
     assert list(table.index) == sorted(EXPECTED)
     assert set(table["success"][table["status"] == "crashed"]) == {0.0}
 
 
 def test_nobody_pays_for_what_another_did_to_the_process(war: War) -> None:
-    """Processes end by what is expected to end them; else they go on, or leave in order with a closed output."""
-    events = [json.loads(line) for line in (war.folder.parent / "log.jsonl").read_text().splitlines()]
+    """Processes end by what is expected to end them; else they go on, or leave in order with a
+    closed output."""
+    events = [
+        json.loads(line) for line in (war.folder.parent / "log.jsonl").read_text().splitlines()
+    ]
     lost = {one["scenario"]: one["why"] for one in events if one["event"] == "lost"}
     lost = {name: why for name, why in lost.items() if name not in TWICE}
     assert set(lost.values()) <= {"the environment process ended with exit code 0"}, lost
 
 
 def test_pictures_are_kept_as_they_were_drawn(desk: Path, cosim: Cosim) -> None:
-    """A policy that blackens the picture it is given does not blacken the one that is kept; and what a policy has not
-    declared when it was loaded it does not come to know later."""
+    """A policy that blackens the picture it is given does not blacken the one that is kept; and
+    what a policy has not declared when it was loaded it does not come to know later."""
     words = (
         "--policy",
         "hostile:Painter",
@@ -203,7 +231,10 @@ def test_pictures_are_kept_as_they_were_drawn(desk: Path, cosim: Cosim) -> None:
     run = cosim("run", "pictures.json", *words, cwd=desk)
     assert run.returncode == 0, run.stdout
     honest, blackened = (
-        [path.read_bytes() for path in sorted((desk / "pictures/episodes" / name / "frames").glob("*.png"))]
+        [
+            path.read_bytes()
+            for path in sorted((desk / "pictures/episodes" / name / "frames").glob("*.png"))
+        ]
         for name in ("honest", "blackens")
     )
     assert len(honest) == 4 and honest == blackened
@@ -213,7 +244,10 @@ def test_a_flood_of_text_leaves_small_logs(war: War) -> None:
     """Of what a policy prints the beginning and the end are kept."""
     logs = [path.read_bytes() for path in (war.folder / "logs").iterdir()]
     assert max(map(len, logs)) < FLOOD_BYTES / 2
-    assert any(b"the flood begins" in log and b"bytes were printed here and left out" in log for log in logs)
+    assert any(
+        b"the flood begins" in log and b"bytes were printed here and left out" in log
+        for log in logs
+    )
     assert any(b"the flood ends" in log for log in logs)
 
 
@@ -233,7 +267,10 @@ def test_a_run_is_not_finished_with_an_edited_policy(desk: Path, cosim: Cosim, w
     finally:
         source.write_text(kept)
     assert edited.returncode == 2
-    assert "war is of another run: the source of policy 'hostile:Hostile' was edited since it began" in edited.stderr
+    assert (
+        "war is of another run: the source of policy 'hostile:Hostile' was edited since it began"
+        in edited.stderr
+    )
     assert cosim(*words, cwd=desk).returncode == 1  # as it was: every episode is finished
 
 
@@ -263,7 +300,8 @@ def test_nothing_is_left_of_a_run_that_is_killed(desk: Path) -> None:
     while not (desk / "left").exists():
         assert run.poll() is None and time.monotonic() < deadline
         time.sleep(0.02)
-    # The run, the shepherd, the worker, and the two that were left: one that has just been started has no environment.
+    # The run, the shepherd, the worker, and the two that were left: one that has just been started
+    # has no environment.
     while len(with_mark(mark)) < 5:
         assert time.monotonic() < deadline
         time.sleep(0.02)

@@ -1,5 +1,5 @@
-"""Workers of other machines and a run's coordinator, over real Zenoh sessions, without engines: who gets which job,
-what becomes of results, and what is refused."""
+"""Workers of other machines and a run's coordinator, over real Zenoh sessions, without engines: who
+gets which job, what becomes of results, and what is refused."""
 
 from __future__ import annotations
 
@@ -20,20 +20,18 @@ from bridge.session import open_session
 from cosim.core.errors import CosimError, EngineError, MachineError
 from cosim.core.versions import versions
 from cosim.policies.load import load_policy
-from cosim.records.record import METRIC_SCHEMA, NO_RENDERER, Record, begun
-from cosim.records.run_folder import RunFolder, read_records
-from cosim.records.run_spec import RunSpec
+from cosim.results.record import METRIC_SCHEMA, NO_RENDERER, Record, begun
+from cosim.results.run_folder import RunFolder, read_records
+from cosim.results.run_spec import RunSpec
 from cosim.spec.connection import Connection
 from cosim.spec.scenario import City, CityMap, Scenario, Suite
-from scenarios.execution.asked import Patience
-from scenarios.execution.messages import Hello, Progress
-from scenarios.execution.pool import ATTEMPTS, LOSSES, run_all
-from scenarios.execution.transport import HeldRun
-from scenarios.many import roll
-from scenarios.many import workers as remote
-from scenarios.many.nets import Fetched, Nets, lacks
-from scenarios.many.roll import RunStatus
-from scenarios.many.words import (
+from scenarios.ipc.deadlines import Patience
+from scenarios.ipc.messages import Hello, Progress
+from scenarios.runs import status as roll
+from scenarios.runs import zenoh_transport as remote
+from scenarios.runs.net_transfer import Fetched, Nets, lacks
+from scenarios.runs.pool import ATTEMPTS, LOSSES, run_all
+from scenarios.runs.protocol import (
     Asks,
     Briefing,
     Claim,
@@ -52,7 +50,9 @@ from scenarios.many.words import (
     reply_in,
     run_hash,
 )
-from scenarios.many.workers import workers_of_run
+from scenarios.runs.status import RunStatus
+from scenarios.runs.transport import HeldRun
+from scenarios.runs.zenoh_transport import workers_of_run
 from sumo_nets.net.net_hash import hash_of
 from tests.conftest import PATIENCE_S, Cosim
 
@@ -60,23 +60,45 @@ pytestmark = pytest.mark.engine
 
 DRIVER = load_policy("stop")
 SUITE = Suite(
-    name="s", version="1",
+    name="s",
+    version="1",
     scenarios=tuple(
         Scenario(
-            id=f"s-{i}", suite="s", place=City(seed=0, net_hash="h"), seed=i, start=(0.0, 0.0, 0.0), goal=(9.0, 0.0),
+            id=f"s-{i}",
+            suite="s",
+            place=City(seed=0, net_hash="h"),
+            seed=i,
+            start=(0.0, 0.0, 0.0),
+            goal=(9.0, 0.0),
             route=((0.0, 0.0), (9.0, 0.0)),
         )
         for i in range(2)
     ),
-)  # fmt: skip
+)
 SPEC = RunSpec(
-    suite="s", robots={"courier": "h"}, suite_version="1", suite_hash="h", policy="stop", policy_name="stop",
-    policy_version="1", policy_source=DRIVER.source_hash, scenarios=("s-0", "s-1"), versions=versions(), seed=3,
-    renderer=NO_RENDERER, metric_schema=METRIC_SCHEMA,
-)  # fmt: skip
+    suite="s",
+    robots={"courier": "h"},
+    suite_version="1",
+    suite_hash="h",
+    policy="stop",
+    policy_name="stop",
+    policy_version="1",
+    policy_source=DRIVER.source_hash,
+    scenarios=("s-0", "s-1"),
+    versions=versions(),
+    seed=3,
+    renderer=NO_RENDERER,
+    metric_schema=METRIC_SCHEMA,
+)
 
 
-GARBAGE = (b"", b"\xc1" * 100, encode(Asks("act", 1, 1.0)), b"\x91" * 100_000, b"\xdd\xff\xff\xff\xff")
+GARBAGE = (
+    b"",
+    b"\xc1" * 100,
+    encode(Asks("act", 1, 1.0)),
+    b"\x91" * 100_000,
+    b"\xdd\xff\xff\xff\xff",
+)
 
 
 @pytest.fixture(autouse=True)
@@ -86,13 +108,16 @@ def _brief_partings(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 class Run:
-    """A run that is coordinated in a thread of its own, in a folder of its own; killed by closing its session."""
+    """A run that is coordinated in a thread of its own, in a folder of its own; killed by closing
+    its session."""
 
     def __init__(self, folder: Path, *, resumed: bool = False) -> None:
-        self.folder, self._resumed = folder / "run", resumed
+        self.folder = folder / "run"
+        self._resumed = resumed
         self.endpoint = f"unixsock-stream/{folder}/hub.sock"
         self.error: CosimError | None = None
-        self.opened, self._hub = threading.Event(), None
+        self.opened = threading.Event()
+        self._hub = None
         self._thread = threading.Thread(target=self._coordinate, daemon=True)
         self._thread.start()
         assert self.opened.wait(PATIENCE_S)
@@ -109,13 +134,24 @@ class Run:
 
     def _coordinate(self) -> None:
         hello = Hello("stop", DRIVER.manifest, DRIVER.source_hash)
-        held = RunFolder.resume(self.folder, SPEC) if self._resumed else RunFolder.create(self.folder, SPEC, SUITE)
-        with held, open_session(Connection(role="coordinator", listen=self.endpoint)) as hub, suppress(_Killed):
+        held = (
+            RunFolder.resume(self.folder, SPEC)
+            if self._resumed
+            else RunFolder.create(self.folder, SPEC, SUITE)
+        )
+        with (
+            held,
+            open_session(Connection(role="coordinator", listen=self.endpoint)) as hub,
+            suppress(_Killed),
+        ):
             done = held.finished()
             todo = [one for one in SUITE.scenarios if one.id not in done]
             try:
                 run = HeldRun(held, hello, Patience(), SUITE.scenarios, todo)
-                with workers_of_run(hub, run, lambda _: None, resumed=self._resumed) as (transport, tell):
+                with workers_of_run(hub, run, lambda _: None, resumed=self._resumed) as (
+                    transport,
+                    tell,
+                ):
                     self.kill = _killer(transport)
                     self.opened.set()
                     run_all(held, todo, hello, transport, tell=tell)
@@ -129,7 +165,8 @@ class _Killed(BaseException):
 
 def _killer(transport: remote.RemoteWorkers) -> Callable[[], None]:
     """Make a transport raise in its thread when it waits next."""
-    wait, killed = transport.wait, threading.Event()
+    wait = transport.wait
+    killed = threading.Event()
 
     def until_killed(timeout_s: float) -> None:
         wait(min(timeout_s, 0.05))
@@ -145,12 +182,16 @@ class Hand:
 
     def __init__(self, endpoint: str) -> None:
         self.session = open_session(Connection(role="worker", connect=endpoint))
-        self.name, self.run = f"w-{secrets.token_hex(4)}", run_hash(SPEC)
+        self.name = f"w-{secrets.token_hex(4)}"
+        self.run = run_hash(SPEC)
         self.session.stand(keys.worker(self.run, self.name))
-        self.lease, self.scenario = 0, ""
+        self.lease = 0
+        self.scenario = ""
 
     def say(self, act: str, message: msgspec.Struct) -> CoordinatorSays:
-        return reply_in(self.session.ask(keys.job(self.run, act), encode(message), timeout_s=PATIENCE_S))
+        return reply_in(
+            self.session.ask(keys.job(self.run, act), encode(message), timeout_s=PATIENCE_S)
+        )
 
     def claim(self, *, ready: bool = True, **other: object) -> CoordinatorSays:
         installed = msgspec.structs.replace(installed_here(), **other)
@@ -160,30 +201,46 @@ class Hand:
         """Claim until there is a job. Returns its scenario."""
         while not isinstance(reply := self.claim(), Lease):
             assert isinstance(reply, NothingNow)
-        self.lease, self.scenario = reply.number, reply.job.scenario.id
+        self.lease = reply.number
+        self.scenario = reply.job.scenario.id
         return self.scenario
 
     def renew(self, asks: Asks | None = None) -> CoordinatorSays:
         said = (Progress(self.scenario, 1.0, 4.5, 0),)
-        return self.say("renew", Renewal(**self.me(), lease=self.lease, scenario=self.scenario, asks=asks, said=said))
+        return self.say(
+            "renew",
+            Renewal(**self.me(), lease=self.lease, scenario=self.scenario, asks=asks, said=said),
+        )
 
     def result(self, *, of: str = "", ticks: int = 40, record: Record | None = None) -> Result:
         name = of or self.scenario
         scenario = next(one for one in SUITE.scenarios if one.id == name)
         record = record or msgspec.structs.replace(
-            begun(scenario, DRIVER.manifest, "h", DRIVER.source_hash, SPEC.seed), status="done", ended="goal",
-            ticks=ticks, state_hash=f"hash-{ticks}", clock={"wall_s": time.monotonic()},
-        )  # fmt: skip
+            begun(scenario, DRIVER.manifest, "h", DRIVER.source_hash, SPEC.seed),
+            status="done",
+            ended="goal",
+            ticks=ticks,
+            state_hash=f"hash-{ticks}",
+            clock={"wall_s": time.monotonic()},
+        )
         data = record.encoded()
         return Result(
-            **self.me(), lease=self.lease, scenario=name, status="done", record=data, log=b"log", again=False,
+            **self.me(),
+            lease=self.lease,
+            scenario=name,
+            status="done",
+            record=data,
+            log=b"log",
+            again=False,
             digest=digest_of(data, b"log"),
-        )  # fmt: skip
+        )
 
     def deliver(self, **named: object) -> CoordinatorSays:
         return self.say("result", self.result(**named))
 
-    def fail(self, how: str = "ended", why: str = "its process was killed by SIGKILL") -> CoordinatorSays:
+    def fail(
+        self, how: str = "ended", why: str = "its process was killed by SIGKILL"
+    ) -> CoordinatorSays:
         failure = NoResult(**self.me(), lease=self.lease, scenario=self.scenario, how=how, why=why)
         return self.say("failed", failure)
 
@@ -212,8 +269,8 @@ def until(true: Callable[[], bool]) -> None:
 
 
 def test_jobs_are_claimed_renewed_and_delivered_once(tmp_path: Path) -> None:
-    """A newcomer learns the policy; an answer that was lost is given again; a second result changes nothing, one of
-    other content is told loudly; the first one stays."""
+    """A newcomer learns the policy; an answer that was lost is given again; a second result changes
+    nothing, one of other content is told loudly; the first one stays."""
     run = Run(tmp_path)
     with hands(run, 2) as (one, other):
         welcome = one.claim(ready=False)
@@ -228,13 +285,16 @@ def test_jobs_are_claimed_renewed_and_delivered_once(tmp_path: Path) -> None:
         assert len(one.status().conflicts) == 1 and one.status().finished == 1
         assert other.deliver() == Received("kept")
         records = run.over()
-    assert {name: record.state_hash for name, record in records.items()} == {"s-0": "hash-40", "s-1": "hash-40"}
+    assert {name: record.state_hash for name, record in records.items()} == {
+        "s-0": "hash-40",
+        "s-1": "hash-40",
+    }
     assert f"CONFLICT: {first} by {one.name}" in run.log
 
 
 def test_the_job_of_a_lost_worker_is_free_at_once(tmp_path: Path) -> None:
-    """Another one gets it; who was taken for lost is told to let go, and a result that it has all the same is taken,
-    if it is the first."""
+    """Another one gets it; who was taken for lost is told to let go, and a result that it has all
+    the same is taken, if it is the first."""
     run = Run(tmp_path)
     with hands(run, 3) as (lost, other, third):
         first = lost.job()
@@ -268,8 +328,11 @@ def test_who_comes_back_goes_on(tmp_path: Path) -> None:
 def test_a_coordinator_begun_anew_takes_what_its_workers_go_on_with(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither who works nor who is done with its job loses anything when the coordinator is killed."""
-    monkeypatch.setattr(remote, "SETTLING_S", PATIENCE_S)  # nothing can be given before both have told
+    """Neither who works nor who is done with its job loses anything when the coordinator is
+    killed."""
+    monkeypatch.setattr(
+        remote, "SETTLING_S", PATIENCE_S
+    )  # nothing can be given before both have told
     run = Run(tmp_path)
     with hands(run, 2) as (one, other):
         names = {one.job(), other.job()}
@@ -281,9 +344,11 @@ def test_a_coordinator_begun_anew_takes_what_its_workers_go_on_with(
         assert set(run.over()) == names
 
 
-def test_attempts_are_bounded_and_leaving_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A scenario that ends its process is tried twice, one that is lost with its worker eight times, one that is handed
-    back as often as that happens; then they are named."""
+def test_attempts_are_bounded_and_leaving_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A scenario that ends its process is tried twice, one that is lost with its worker eight
+    times, one that is handed back as often as that happens; then they are named."""
     run = Run(tmp_path)
     with hands(run, 1) as (one,):
         poison = one.job()
@@ -301,12 +366,19 @@ def test_attempts_are_bounded_and_leaving_is_none(tmp_path: Path, monkeypatch: p
                 assert another.job() == unlucky
             until(lambda losses=losses: run.log.count("lost, with") > losses)
         records = run.over()
-    assert records[poison].status == "crashed" and "killed by SIGKILL, 2 times" in records[poison].reason
-    assert records[unlucky].status == "crashed" and f"was lost, {LOSSES} times" in records[unlucky].reason
+    assert (
+        records[poison].status == "crashed"
+        and "killed by SIGKILL, 2 times" in records[poison].reason
+    )
+    assert (
+        records[unlucky].status == "crashed"
+        and f"was lost, {LOSSES} times" in records[unlucky].reason
+    )
 
 
 def test_attempts_outlive_the_coordinator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A scenario that has ended its process once before the coordinator was killed is tried once more, and named."""
+    """A scenario that has ended its process once before the coordinator was killed is tried once
+    more, and named."""
     monkeypatch.setattr(remote, "SETTLING_S", 0.0)  # nobody else works for it
     run = Run(tmp_path)
     with hands(run, 1) as (one,):
@@ -320,12 +392,15 @@ def test_attempts_outlive_the_coordinator(tmp_path: Path, monkeypatch: pytest.Mo
         one.fail()
         assert one.job() != poison and one.deliver() == Received("kept")
         records = run.over()
-    assert records[poison].status == "crashed" and "killed by SIGKILL, 2 times" in records[poison].reason
+    assert (
+        records[poison].status == "crashed"
+        and "killed by SIGKILL, 2 times" in records[poison].reason
+    )
 
 
 def test_what_is_none_of_the_run_s_is_refused_in_words(tmp_path: Path) -> None:
-    """Garbage, damaged and oversized messages, other runs, scenarios and installations, keys with wildcards: nothing is
-    changed by any, and the run goes on."""
+    """Garbage, damaged and oversized messages, other runs, scenarios and installations, keys with
+    wildcards: nothing is changed by any, and the run goes on."""
     run = Run(tmp_path)
     with hands(run, 2) as (one, foe):
         name = one.job()
@@ -334,7 +409,9 @@ def test_what_is_none_of_the_run_s_is_refused_in_words(tmp_path: Path) -> None:
                 with pytest.raises(EngineError, match="not a"):
                     foe.session.ask(keys.job(foe.run, act), payload, timeout_s=PATIENCE_S)
         with pytest.raises(EngineError, match="more than a message may have"):
-            foe.session.ask(keys.job(foe.run, "result"), bytes((15 << 20) + 5000), timeout_s=PATIENCE_S)
+            foe.session.ask(
+                keys.job(foe.run, "result"), bytes((15 << 20) + 5000), timeout_s=PATIENCE_S
+            )
         with pytest.raises(EngineError, match="ask for exactly"):
             foe.session.ask("cosim/*/jobs/claim", b"", timeout_s=PATIENCE_S)
         with pytest.raises(TimeoutError):
@@ -342,7 +419,10 @@ def test_what_is_none_of_the_run_s_is_refused_in_words(tmp_path: Path) -> None:
         reply = foe.claim(versions=versions() | {"libsumo": "0.1"})
         assert isinstance(reply, TurnedAway) and "libsumo 0.1 in place of" in reply.why
         reply = foe.claim(metric_schema=METRIC_SCHEMA + 1)
-        assert isinstance(reply, TurnedAway) and f"metric schema {METRIC_SCHEMA + 1} in place of" in reply.why
+        assert (
+            isinstance(reply, TurnedAway)
+            and f"metric schema {METRIC_SCHEMA + 1} in place of" in reply.why
+        )
         with pytest.raises(EngineError, match="damaged on its way"):
             foe.say("result", msgspec.structs.replace(one.result(), log=b"gol"))
         scenario = SUITE.scenarios[0]
@@ -351,7 +431,8 @@ def test_what_is_none_of_the_run_s_is_refused_in_words(tmp_path: Path) -> None:
         assert isinstance(reply, TurnedAway) and "another run" in reply.why
         unknown = msgspec.structs.replace(one.result(), scenario="../../../etc", lease=77)
         assert foe.say("result", unknown) == Received("refused")
-        foe.lease, foe.scenario = 5, name
+        foe.lease = 5
+        foe.scenario = name
         assert foe.renew() == LetGo() and foe.fail() == Received()
         assert one.status().odd > 20 and one.status().finished == 0
         assert one.renew() == GoOn() and one.deliver() == Received("kept")
@@ -360,7 +441,9 @@ def test_what_is_none_of_the_run_s_is_refused_in_words(tmp_path: Path) -> None:
         assert len(run.over()) == 2
 
 
-def test_a_result_that_cannot_be_written_is_not_acknowledged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_result_that_cannot_be_written_is_not_acknowledged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A full disk ends the run with its message; begun anew it takes the same result."""
 
     def full(self: RunFolder, record: Record, *data: bytes) -> None:
@@ -383,7 +466,8 @@ def test_a_result_that_cannot_be_written_is_not_acknowledged(tmp_path: Path, mon
 
 
 def test_a_policy_that_does_not_answer_is_told_by_its_worker(tmp_path: Path) -> None:
-    """What it is asked, and for how long, counts as its worker tells it; between two of its messages nothing ages."""
+    """What it is asked, and for how long, counts as its worker tells it; between two of its
+    messages nothing ages."""
     run = Run(tmp_path)
     with hands(run, 1) as (one,):
         silent = one.job()
@@ -399,23 +483,33 @@ def test_a_policy_that_does_not_answer_is_told_by_its_worker(tmp_path: Path) -> 
     assert "policy 'stop' gave no answer for 60 s in act at 3.20 s" in records[silent].reason
 
 
-def test_a_map_reaches_workers_that_lack_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It comes in parts, under its name, and only if its hash is right; what the run has no map of is refused."""
+def test_a_map_reaches_workers_that_lack_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It comes in parts, under its name, and only if its hash is right; what the run has no map of
+    is refused."""
     there, here = tmp_path / "there", tmp_path / "here"
-    where = CityMap(map="mine", net_hash=hash_of(net := b"<net>" + secrets.token_hex(3 << 20).encode() + b"</net>"))
+    where = CityMap(
+        map="mine",
+        net_hash=hash_of(net := b"<net>" + secrets.token_hex(3 << 20).encode() + b"</net>"),
+    )
     (there / "maps" / "mine").mkdir(parents=True)
     (there / "maps" / "mine" / "net.xml").write_bytes(net)
     (there / "maps" / "mine" / "about.json").write_bytes(b"{}")
 
     def fetched(expected: str) -> None:
         monkeypatch.setenv("COSIM_CACHE", str(there))
-        nets, parts, last = Nets(), 0, False
-        digest, wanted = nets.hash_of(where), Fetched(where, expected)
+        nets = Nets()
+        parts = 0
+        last = False
+        digest = nets.hash_of(where)
+        wanted = Fetched(where, expected)
         while not last:
             monkeypatch.setenv("COSIM_CACHE", str(there))
             part = nets.part(digest, wanted.asks)
             monkeypatch.setenv("COSIM_CACHE", str(here))
-            last, parts = wanted.take(part), parts + 1
+            last = wanted.take(part)
+            parts = parts + 1
         assert parts > 1
         with pytest.raises(EngineError, match="has no map 'another'"):
             nets.part("another", wanted.asks)
@@ -430,8 +524,8 @@ def test_a_map_reaches_workers_that_lack_it(tmp_path: Path, monkeypatch: pytest.
 def test_status_tells_of_a_lost_a_silent_and_a_working_worker(
     cosim: Cosim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By the run folder and by the coordinator's address the same; afterwards what the folder holds; where there is no
-    run, in words."""
+    """By the run folder and by the coordinator's address the same; afterwards what the folder
+    holds; where there is no run, in words."""
     monkeypatch.setattr(roll, "SILENT_S", 0.0)
     monkeypatch.setattr(roll, "_WRITTEN_EVERY_S", 0.0)
     run = Run(tmp_path)
@@ -441,19 +535,34 @@ def test_status_tells_of_a_lost_a_silent_and_a_working_worker(
         lost.session.close()
         until(lambda: f"{lost.name}: lost" in run.log)
         silent.job()
-        until(lambda: (run.folder / "status.json").exists() and silent.name in (run.folder / "status.json").read_text())
+        until(
+            lambda: (
+                (run.folder / "status.json").exists()
+                and silent.name in (run.folder / "status.json").read_text()
+            )
+        )
         told = cosim("status", str(run.folder)).stdout
-        assert told.startswith("s, policy stop: 0 of 2 episodes; 1 lost with their workers and run again")
+        assert told.startswith(
+            "s, policy stop: 0 of 2 episodes; 1 lost with their workers and run again"
+        )
         lines = {line.split()[0]: line.split() for line in told.splitlines() if line.strip()}
         assert lines[lost.name][1] == "lost" and lines[silent.name][1] == "silent"
         monkeypatch.setattr(roll, "SILENT_S", PATIENCE_S)
         assert one.renew() == GoOn()
         told = cosim("status", "--connect", run.endpoint).stdout
         lines = {line.split()[0]: line.split() for line in told.splitlines() if line.strip()}
-        assert lines[one.name][1] == "working" and lines[one.name][4:] == [name, "at", "1", "s,", "50%"]
+        assert lines[one.name][1] == "working" and lines[one.name][4:] == [
+            name,
+            "at",
+            "1",
+            "s,",
+            "50%",
+        ]
         assert one.deliver() == Received("kept") and silent.deliver() == Received("kept")
         run.over()
     monkeypatch.setattr(settings, "CONNECTS_WITHIN_S", 0.1)
     assert cosim("status", str(run.folder)).stdout == "s, policy stop: 2 of 2 episodes\n"
-    assert (said := cosim("status", "--connect", run.endpoint)).returncode == 3 and "no hub answers" in said.stderr
+    assert (
+        said := cosim("status", "--connect", run.endpoint)
+    ).returncode == 3 and "no hub answers" in said.stderr
     assert (said := cosim("status")).returncode == 2 and "name a run folder" in said.stderr

@@ -1,4 +1,5 @@
-"""Obstacles drawn along a way: they stand where such things stand, leave a gap, and take the ways of nobody."""
+"""Obstacles drawn along a way: they stand where such things stand, leave a gap, and take the ways
+of nobody."""
 
 from __future__ import annotations
 
@@ -13,19 +14,20 @@ from shapely.geometry import LineString, Point
 
 from cosim.core.errors import SpecError
 from cosim.core.state import PERSON_RADIUS_M, RobotState
-from cosim.place.fences import fenced, outline
+from cosim.place.barriers import fenced, outline
 from cosim.place.street_map import StreetMap
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.events import EventReply
 from cosim.spec.obstacle import OBSTACLE_SIZES_M, Obstacle, footprint
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City, CrowdSpec, Scenario
+from physics.ground.tiles import keys_in
 from physics.street.furniture import footprints
 from physics.street.placement import driveway_ground
-from physics.world.street_surface import StreetSurface
-from physics.world.tiles import keys_in
-from scenarios.builders.long_horizon import build_long_horizon
-from scenarios.builders.obstacles import (
+from physics.street.street_surface import StreetSurface
+from scenarios.events import EVENT_KINDS
+from scenarios.suites.long_horizon import build_long_horizon
+from scenarios.suites.obstacles import (
     BESIDE_FREE_M,
     ENDS_FREE_M,
     EVENT_FREE_M,
@@ -34,8 +36,7 @@ from scenarios.builders.obstacles import (
     obstacles_along,
     prove_gap,
 )
-from scenarios.builders.reactive import build_reactive
-from scenarios.events import EVENT_KINDS
+from scenarios.suites.reactive import build_reactive
 from tests.scenarios.test_scenarios import cross_map
 
 SMALL = City(seed=1, size_m=500.0)
@@ -43,7 +44,7 @@ SEEDS = range(4)
 
 
 def street() -> StreetMap:
-    from scenarios.execution.places import place
+    from scenarios.places.nets import place
 
     return place(SMALL)[1]
 
@@ -64,30 +65,41 @@ def straight(**changed: object) -> Scenario:
 
 
 def eroded(scenario: Scenario, street_map: StreetMap) -> list[shapely.Geometry]:
-    """What is left of the way, by other means than the builder's: each obstacle and each edge grown instead."""
+    """What is left of the way, by other means than the builder's: each obstacle and each edge grown
+    instead."""
     around = shapely.buffer(LineString(scenario.route), 10.0)
     ground = fenced(street_map.walkable_near(around), scenario.barriers)
     half_m = 0.5 * (COURIER.width_m + TO_SPARE_M) - 1e-3
     edges = shapely.buffer(shapely.boundary(ground), half_m)
     things = [footprint(one).buffer(half_m) for one in scenario.obstacles]
-    return list(shapely.get_parts(ground.difference(shapely.union_all([edges, *things])).intersection(around)))
+    return list(
+        shapely.get_parts(
+            ground.difference(shapely.union_all([edges, *things])).intersection(around)
+        )
+    )
 
 
 @pytest.mark.engine
 def test_a_gap_is_left_on_every_way() -> None:
-    """On random ways start and goal stay connected for a robot 0.5 m wider; a fence more across the gap is refused."""
+    """On random ways start and goal stay connected for a robot 0.5 m wider; a fence more across the
+    gap is refused."""
     for scenario in ways():
         prove_gap(scenario, street())
         ends = Point(scenario.start[:2]), Point(scenario.goal)
-        assert any(all(part.covers(end) for end in ends) for part in eroded(scenario, street())), scenario.id
+        assert any(all(part.covers(end) for end in ends) for part in eroded(scenario, street())), (
+            scenario.id
+        )
         x_m, y_m, heading = scenario.route_line.at(4.0)
         across = [
             Obstacle(
-                kind="fence", form=2, heading_rad=heading - 0.5 * np.pi,
-                x_m=x_m - left_m * np.sin(heading), y_m=y_m + left_m * np.cos(heading),
+                kind="fence",
+                form=2,
+                heading_rad=heading - 0.5 * np.pi,
+                x_m=x_m - left_m * np.sin(heading),
+                y_m=y_m + left_m * np.cos(heading),
             )
             for left_m in (-3.0, -1.5, 0.0, 1.5, 3.0)
-        ]  # fmt: skip
+        ]
         closed = msgspec.structs.replace(scenario, obstacles=(*scenario.obstacles, *across))
         with pytest.raises(SpecError, match=r"leave no gap of 1\.05 m"):
             prove_gap(closed, street())
@@ -95,8 +107,8 @@ def test_a_gap_is_left_on_every_way() -> None:
 
 @pytest.mark.engine
 def test_obstacles_stand_on_sidewalks_and_on_nothing_else() -> None:
-    """None meets another, a prop, a house, a barrier, a driveway, a corner, a crossing, the start, the goal or the
-    place of an event; all of them lie on the walkable ground of a sidewalk."""
+    """None meets another, a prop, a house, a barrier, a driveway, a corner, a crossing, the start,
+    the goal or the place of an event; all of them lie on the walkable ground of a sidewalk."""
     surface = StreetSurface(street(), SMALL.seed)
     for scenario in ways():
         around = shapely.buffer(LineString(scenario.route), 15.0)
@@ -113,21 +125,26 @@ def test_obstacles_stand_on_sidewalks_and_on_nothing_else() -> None:
             Point(scenario.start[:2]).buffer(ENDS_FREE_M),
             Point(scenario.goal).buffer(ENDS_FREE_M - 0.01),
         ]
-        assert grounds and not len(shapely.STRtree(others).query(grounds, predicate="intersects")[0])
+        assert grounds and not len(
+            shapely.STRtree(others).query(grounds, predicate="intersects")[0]
+        )
         assert all(any(strip.polygon.covers(ground) for strip in sidewalks) for ground in grounds)
         assert not any(one.intersects(two) for k, one in enumerate(grounds) for two in grounds[:k])
 
 
 @pytest.mark.engine
 def test_who_follows_the_middle_of_the_way_hits_something() -> None:
-    """On every way something stands where a robot passes that keeps to the route; density is as it is said; all kinds
-    are drawn somewhere; the same seed gives the same."""
-    kinds, found, length_m = set(), 0, 0.0
+    """On every way something stands where a robot passes that keeps to the route; density is as it
+    is said; all kinds are drawn somewhere; the same seed gives the same."""
+    kinds = set()
+    found = 0
+    length_m = 0.0
     for scenario in ways():
         swept = shapely.buffer(LineString(scenario.route), COURIER.width_m / 2)
         assert any(footprint(one).intersects(swept) for one in scenario.obstacles), scenario.id
         kinds |= {one.kind for one in scenario.obstacles}
-        found, length_m = found + len(scenario.obstacles), length_m + scenario.route_line.length_m
+        found = found + len(scenario.obstacles)
+        length_m = length_m + scenario.route_line.length_m
     assert 0.4 * PER_100M[0] < 100.0 * found / length_m < PER_100M[1]
     assert len(kinds) >= 6
     again = build_long_horizon(SMALL, street(), WalkGraph(street()), SEEDS[0], "long-0")
@@ -137,10 +154,13 @@ def test_who_follows_the_middle_of_the_way_hits_something() -> None:
 @pytest.mark.engine
 def test_reactive_scenarios_have_them_beside_the_way() -> None:
     """The band about the middle stays free, and the place of the event."""
-    graph, found = WalkGraph(street()), 0
+    graph = WalkGraph(street())
+    found = 0
     for name in ("frontal", "queueing", "lateral"):
         for seed in SEEDS:
-            scenario = build_reactive(EVENT_KINDS[name], SMALL, street(), graph, seed, f"{name}-{seed}")
+            scenario = build_reactive(
+                EVENT_KINDS[name], SMALL, street(), graph, seed, f"{name}-{seed}"
+            )
             (event,) = scenario.events
             for one in scenario.obstacles:
                 assert footprint(one).distance(LineString(scenario.route)) >= BESIDE_FREE_M - 1e-6
@@ -151,10 +171,14 @@ def test_reactive_scenarios_have_them_beside_the_way() -> None:
 
 
 def test_every_kind_is_drawn_and_narrows_the_way() -> None:
-    """On a sidewalk 3.2 m wide each kind comes up; construction sites are half as wide as it and leave the gap."""
-    kinds, sites = set(), 0
+    """On a sidewalk 3.2 m wide each kind comes up; construction sites are half as wide as it and
+    leave the gap."""
+    kinds = set()
+    sites = 0
     for seed in range(25):
-        obstacles = obstacles_along(straight(), cross_map(), np.random.default_rng(seed), per_100m=15.0)
+        obstacles = obstacles_along(
+            straight(), cross_map(), np.random.default_rng(seed), per_100m=15.0
+        )
         prove_gap(straight(obstacles=obstacles), cross_map())
         kinds |= {one.kind for one in obstacles}
         fences = [footprint(one) for one in obstacles if one.kind == "fence"]
@@ -184,8 +208,9 @@ def _thinner(strip):  # type: ignore[no-untyped-def]
 
 @pytest.mark.engine
 def test_people_go_round_what_is_put_in_their_way() -> None:
-    """Two seconds of a crowd: where somebody walked without obstacles, nobody does once bins stand there."""
-    from scenarios.execution.wiring import crowd_of
+    """Two seconds of a crowd: where somebody walked without obstacles, nobody does once bins stand
+    there."""
+    from scenarios.episodes.wiring import crowd_of
 
     def tracks(one: Scenario) -> dict[str, list[tuple[float, float]]]:
         found: dict[str, list[tuple[float, float]]] = {}
@@ -202,8 +227,13 @@ def test_people_go_round_what_is_put_in_their_way() -> None:
     inside = shapely.buffer(street().walkable, -0.8)
     spots: list[tuple[float, float]] = []
     for track in before.values():
-        walks, at = len(track) == 40 and math.dist(track[0], track[-1]) > 2.0, track[min(24, len(track) - 1)]
-        if walks and shapely.contains_xy(inside, *at) and all(math.dist(at, other) > 4.0 for other in spots):
+        walks = len(track) == 40 and math.dist(track[0], track[-1]) > 2.0
+        at = track[min(24, len(track) - 1)]
+        if (
+            walks
+            and shapely.contains_xy(inside, *at)
+            and all(math.dist(at, other) > 4.0 for other in spots)
+        ):
             spots.append(at)
     bins = tuple(Obstacle(kind="bin", x_m=x, y_m=y, heading_rad=0.0) for x, y in spots)
     after = tracks(msgspec.structs.replace(bare, obstacles=bins))

@@ -16,17 +16,17 @@ import pytest
 from cosim import run
 from cosim.core.errors import UsageError
 from cosim.policies.baselines import Straight
-from cosim.records.run_folder import read_spec
+from cosim.results.run_folder import read_spec
 from cosim.spec.scenario import Suite, write_suite
-from scenarios.checks import small_scenario
-from scenarios.many.on_ray import RayWorkers, ray_cluster
+from scenarios.runs.ray_workers import RayWorkers, ray_cluster
+from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import PATIENCE_S, Cosim, still_runs
 
 POLICY = '''
 import os, time
 from pathlib import Path
 from cosim.core.state import Command
-from cosim.episode.ports import Manifest
+from cosim.spec.manifest import Manifest
 
 
 class Waits:
@@ -45,26 +45,38 @@ class Waits:
 '''
 SCENARIOS = 4
 _WAITS = (
-    "gcs_rpc_server_connect_timeout_s", "gcs_server_request_timeout_seconds", "gcs_server_port_wait_time_s",
-    "raylet_start_wait_time_s", "worker_register_timeout_seconds",
-)  # fmt: skip
+    "gcs_rpc_server_connect_timeout_s",
+    "gcs_server_request_timeout_seconds",
+    "gcs_server_port_wait_time_s",
+    "raylet_start_wait_time_s",
+    "worker_register_timeout_seconds",
+)
 
 
 @pytest.fixture(scope="module")
 def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Any, list[Any], Path]]:
-    """A head without CPUs and two nodes of one CPU, processes of this machine; and the file that is waited for."""
+    """A head without CPUs and two nodes of one CPU, processes of this machine; and the file that is
+    waited for."""
     go = tmp_path_factory.mktemp("ray") / "go"
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COSIM_TEST_GO", str(go))
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         for name in _WAITS:  # of Ray's own some are 5 s, which a busy machine needs
             patch.setenv(f"RAY_{name}", str(int(PATIENCE_S)))
-        cluster_utils = pytest.importorskip("ray.cluster_utils", reason="Ray is not installed: the extra [ray]")
+        cluster_utils = pytest.importorskip(
+            "ray.cluster_utils", reason="Ray is not installed: the extra [ray]"
+        )
         store = {"object_store_memory": 80 << 20, "include_dashboard": False}
-        cluster = cluster_utils.Cluster(initialize_head=True, head_node_args={"num_cpus": 0, **store})
+        cluster = cluster_utils.Cluster(
+            initialize_head=True, head_node_args={"num_cpus": 0, **store}
+        )
         patch.setenv("RAY_ADDRESS", cluster.address)
         try:
-            yield cluster, [cluster.add_node(num_cpus=1, object_store_memory=80 << 20) for _ in range(2)], go
+            yield (
+                cluster,
+                [cluster.add_node(num_cpus=1, object_store_memory=80 << 20) for _ in range(2)],
+                go,
+            )
         finally:
             cluster.shutdown()
 
@@ -73,8 +85,9 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Any, list[
 def test_a_run_by_ray_is_the_run_of_one_process_also_when_a_node_dies(
     tmp_path: Path, nodes: tuple[Any, list[Any], Path], cosim: Cosim
 ) -> None:
-    """A policy that only this machine has is sent there; a node is killed while both run an episode: the episode that
-    was lost is run again, and the tables are equal to the byte. Nodes of other versions are refused."""
+    """A policy that only this machine has is sent there; a node is killed while both run an
+    episode: the episode that was lost is run again, and the tables are equal to the byte. Nodes of
+    other versions are refused."""
     cluster, (first, _), go = nodes
     (tmp_path / "only_here.py").write_text(POLICY)
     one = msgspec.structs.replace(small_scenario(), time_limit_s=2.0)
@@ -87,7 +100,9 @@ def test_a_run_by_ray_is_the_run_of_one_process_also_when_a_node_dies(
         begun = [int(path.name.split("-")[1]) for path in go.parent.glob("begun-*")]
         cluster.remove_node(first, allow_graceful=False)
         until_s = time.monotonic() + PATIENCE_S
-        while all(map(still_runs, begun)) and time.monotonic() < until_s:  # what ran there must not end first
+        while (
+            all(map(still_runs, begun)) and time.monotonic() < until_s
+        ):  # what ran there must not end first
             time.sleep(0.05)
         go.touch()
 
@@ -97,21 +112,33 @@ def test_a_run_by_ray_is_the_run_of_one_process_also_when_a_node_dies(
     said = cosim(*words, "ray", "--on", "ray", "--log-json", "log.jsonl", cwd=tmp_path)
     assert "2 workers on Ray" in said.stderr and said.returncode == 0, said
     killer.join(PATIENCE_S)
-    assert len([*go.parent.glob("begun-*")]) > SCENARIOS, "the episode of the node that died was not run again"
+    assert len([*go.parent.glob("begun-*")]) > SCENARIOS, (
+        "the episode of the node that died was not run again"
+    )
     assert cosim(*words, "here", cwd=tmp_path).returncode == 0
-    assert (tmp_path / "ray/results.csv").read_bytes() == (tmp_path / "here/results.csv").read_bytes()
+    assert (tmp_path / "ray/results.csv").read_bytes() == (
+        tmp_path / "here/results.csv"
+    ).read_bytes()
 
-    events = [json.loads(line)["event"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    events = [
+        json.loads(line)["event"] for line in (tmp_path / "log.jsonl").read_text().splitlines()
+    ]
     assert (events[0], events[-1], events.count("done")) == ("run begun", "run over", SCENARIOS)
     assert events.count("lost") == events.count("retried") == 1
     (figures,) = json.loads((tmp_path / "ray/figures.json").read_text())
-    assert (figures["episodes"], figures["retried"], figures["simulated_s"]) == (SCENARIOS, 1, SCENARIOS * 2.0)
+    assert (figures["episodes"], figures["retried"], figures["simulated_s"]) == (
+        SCENARIOS,
+        1,
+        SCENARIOS * 2.0,
+    )
 
     spec = read_spec(tmp_path / "ray")
     others = msgspec.structs.replace(spec, versions=spec.versions | {"numpy": "0.1"})
     with ray_cluster("auto", "straight", print):
         workers = RayWorkers(others, tmp_path, 1, 1, print)
-        with pytest.raises(UsageError, match=r"node .* has numpy .* in place of 0\.1: install on the nodes"):
+        with pytest.raises(
+            UsageError, match=r"node .* has numpy .* in place of 0\.1: install on the nodes"
+        ):
             while not workers.room(0):
                 workers.wait(1.0)
 
@@ -121,9 +148,14 @@ def test_what_is_no_cluster_is_refused(cosim: Cosim, tmp_path: Path) -> None:
     pytest.importorskip("ray", reason="Ray is not installed: the extra [ray]")
     words = ("run", "reactive", "--policy", "straight", "--episodes", "1")
     said = cosim(*words, "--on", "spark", cwd=tmp_path)
-    assert said.returncode == 2 and "--on spark: give ray, auto, or the address of a cluster" in said.stderr
+    assert (
+        said.returncode == 2
+        and "--on spark: give ray, auto, or the address of a cluster" in said.stderr
+    )
     said = cosim(*words, "--on", "ray", "--shared-renderer", cwd=tmp_path)
-    assert said.returncode == 2 and "--shared-renderer is of processes of this machine" in said.stderr
+    assert (
+        said.returncode == 2 and "--shared-renderer is of processes of this machine" in said.stderr
+    )
     with pytest.raises(UsageError, match="shared_renderer is of processes of this machine"):
         run("reactive", "straight", on="ray", shared_renderer=True, out=tmp_path / "run")
     with pytest.raises(UsageError, match="on='ray' needs a policy by its name"):
@@ -131,8 +163,14 @@ def test_what_is_no_cluster_is_refused(cosim: Cosim, tmp_path: Path) -> None:
     assert not [*tmp_path.iterdir()]
 
 
-def test_without_ray_it_is_said_what_to_install(cosim: Cosim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_ray_it_is_said_what_to_install(
+    cosim: Cosim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """In one line, before anything is loaded."""
     monkeypatch.setitem(sys.modules, "ray", None)
     said = cosim("run", "reactive", "--policy", "straight", "--on", "ray", cwd=tmp_path)
-    assert said.returncode == 2 and "pip install 'sidewalk-cosim[ray]'" in said.stderr and not [*tmp_path.iterdir()]
+    assert (
+        said.returncode == 2
+        and "pip install 'sidewalk-cosim[ray]'" in said.stderr
+        and not [*tmp_path.iterdir()]
+    )

@@ -1,4 +1,5 @@
-"""Nothing that a policy is told, and nothing that its process is called, names the scenario that it drives."""
+"""Nothing that a policy is told, and nothing that its process is called, names the scenario that it
+drives."""
 
 from __future__ import annotations
 
@@ -7,26 +8,27 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from cosim.records.run_folder import read_records
+from cosim.results.run_folder import read_records
+from cosim.spec.episode_id import pseudonym_of
 from cosim.spec.options import EpisodeOptions
-from cosim.spec.pseudonym import pseudonym_of
 from cosim.spec.scenario import Scenario, Suite
-from scenarios.catalog import load_suite
-from scenarios.checks import small_scenario
-from scenarios.execution import suite_run
-from scenarios.execution.episode import Episode
-from tests.cheats import Counter, NameReader
-from tests.scenarios.shared_policies import NOTES
+from scenarios.episodes.episode import Episode
+from scenarios.runs import run as suite_run
+from scenarios.suites.catalog import load_suite
+from scenarios.tools.verify.doctor import small_scenario
+from tests.support.cheats import Counter, NameReader
+from tests.support.shared_policies import NOTES
 
 pytestmark = pytest.mark.engine
 
 BY = "gesturing-001"
-"""A scenario that a blind policy solves if it knows which one it is: it has to stop in the right place."""
+"""A scenario that a blind policy solves if it knows which one it is: it has to stop in the right
+place."""
 
 
 def test_who_knows_the_name_solves_it_blind_and_a_run_does_not_tell_it() -> None:
-    """Told its name, as policies once were, the name reader stops before the hand; in a run, whose seed is drawn, it
-    does not: it drives on."""
+    """Told its name, as policies once were, the name reader stops before the hand; in a run, whose
+    seed is drawn, it does not: it drives on."""
     (scenario,) = (one for one in load_suite("reactive").scenarios if one.id == BY)
     policy = NameReader()
     with Episode(scenario, policy.manifest) as episode:
@@ -40,9 +42,16 @@ def test_who_knows_the_name_solves_it_blind_and_a_run_does_not_tell_it() -> None
 
 
 def test_counting_episodes_tells_a_policy_nothing() -> None:
-    """Of the two first of an event, gone through in the order of a seed, it takes each for the other."""
-    first, second = (one for one in load_suite("reactive").scenarios if one.id in ("gesturing-001", "gesturing-002"))
-    seed = next(seed for seed in range(100) if pseudonym_of(seed, second) < pseudonym_of(seed, first))
+    """Of the two first of an event, gone through in the order of a seed, it takes each for the
+    other."""
+    first, second = (
+        one
+        for one in load_suite("reactive").scenarios
+        if one.id in ("gesturing-001", "gesturing-002")
+    )
+    seed = next(
+        seed for seed in range(100) if pseudonym_of(seed, second) < pseudonym_of(seed, first)
+    )
     taken: list[tuple[str, str]] = []
 
     class Noting(Counter):
@@ -55,24 +64,33 @@ def test_counting_episodes_tells_a_policy_nothing() -> None:
     suite = Suite(name="two", version="1", scenarios=tuple(short))
     suite_run.run(suite, Noting(), options=EpisodeOptions(seed=seed))
     names = {pseudonym_of(seed, one).episode: one.id for one in (first, second)}
-    assert [names[called] for called, _ in taken] == [second.id, first.id] != [guess for _, guess in taken]
+    assert (
+        [names[called] for called, _ in taken]
+        == [second.id, first.id]
+        != [guess for _, guess in taken]
+    )
 
 
 def test_nothing_that_a_policy_can_read_of_its_process_names_the_scenario(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Arguments of its calls and all that can be reached from an observation, privileged knowledge too; arguments,
-    environment, folder, files and threads of its process: no scenario, suite or event in any of them."""
+    """Arguments of its calls and all that can be reached from an observation, privileged knowledge
+    too; arguments, environment, folder, files and threads of its process: no scenario, suite or
+    event in any of them."""
     monkeypatch.setenv(NOTES, str(tmp_path / "notes"))
-    short: Scenario = msgspec.structs.replace(small_scenario(), time_limit_s=0.5, suite="quagga-suite")
+    short: Scenario = msgspec.structs.replace(
+        small_scenario(), time_limit_s=0.5, suite="quagga-suite"
+    )
     suite = Suite(
         name="quagga-run",
         version="1",
         scenarios=tuple(msgspec.structs.replace(short, id=f"quagga-{i}") for i in range(2)),
     )
-    spy = "tests.scenarios.shared_policies:Spy"
+    spy = "tests.support.shared_policies:Spy"
     suite_run.run(suite, spy, out=tmp_path / "run", options=EpisodeOptions(seed=3))
     read = (tmp_path / "notes").read_text()
     assert {one.status for one in read_records(tmp_path / "run")} == {"done"}
-    assert all(pseudonym_of(3, one).episode in read for one in suite.scenarios) and "courier" in read
+    assert (
+        all(pseudonym_of(3, one).episode in read for one in suite.scenarios) and "courier" in read
+    )
     assert "quagga" not in read and not [event.kind for event in short.events if event.kind in read]

@@ -28,10 +28,18 @@ OTHERS: dict[str, bytes] = {
 
 @pytest.mark.parametrize(
     ("name", "ending"),
-    [*((name, "") for name in OTHERS), ("text", ".net.xml"), ("xml", ".net.xml"), ("packed", ".osm")],
+    [
+        *((name, "") for name in OTHERS),
+        ("text", ".net.xml"),
+        ("xml", ".net.xml"),
+        ("packed", ".osm"),
+    ],
 )
-def test_of_a_file_that_is_no_map_nothing_is_printed(tmp_path: Path, cosim: Cosim, name: str, ending: str) -> None:
-    """Text, other XML, packed data: it is said that it is no map, with its path and no byte of it."""
+def test_of_a_file_that_is_no_map_nothing_is_printed(
+    tmp_path: Path, cosim: Cosim, name: str, ending: str
+) -> None:
+    """Text, other XML, packed data: it is said that it is no map, with its path and no byte of
+    it."""
     (tmp_path / f"other{ending}").write_bytes(OTHERS[name])
     own = f'name = "mine"\n[place]\nfile = "other{ending}"\n[way]\nkind = "straight"\n'
     (tmp_path / "mine.toml").write_text(own)

@@ -1,4 +1,5 @@
-"""Scenarios of one's own in TOML files: what may stand in them, what becomes of it, and every refusal."""
+"""Scenarios of one's own in TOML files: what may stand in them, what becomes of it, and every
+refusal."""
 
 from __future__ import annotations
 
@@ -12,13 +13,13 @@ import pytest
 from cosim.core.errors import SpecError
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City, Scenario
-from scenarios.own.along import event_along
-from scenarios.own.format import OwnEvent, OwnScenario, OwnWay
-from scenarios.own.reading import read_own
-from scenarios.own.ways import laid_way
+from scenarios.suites.user_scenarios.along_route import event_along
+from scenarios.suites.user_scenarios.format import OwnEvent, OwnScenario, OwnWay
+from scenarios.suites.user_scenarios.read import read_own
+from scenarios.suites.user_scenarios.routes import laid_way
 from tests.conftest import ROOT, Cosim
-from tests.documents import blocks
-from tests.tiny_street import tiny_map
+from tests.support.documents import blocks
+from tests.support.tiny_street import tiny_map
 
 CITY = "[place]\ncity = 1\nsize_m = 500\n"
 SHORT = f'name = "short"\n{CITY}[way]\nkind = "straight"\nlength_m = 30\n'
@@ -40,7 +41,8 @@ def refusal(folder: Path, text: str) -> str:
 
 
 def test_everything_that_is_wrong_with_a_file_is_told_at_once(tmp_path: Path) -> None:
-    """Types, ranges, names and what contradicts itself: the field, what was found, what may stand there."""
+    """Types, ranges, names and what contradicts itself: the field, what was found, what may stand
+    there."""
     told = refusal(
         tmp_path,
         'name = "a b"\nseed = "x"\nrobot = "tank"\nsizes = 1\n'
@@ -57,8 +59,8 @@ def test_everything_that_is_wrong_with_a_file_is_told_at_once(tmp_path: Path) ->
         "robot: unknown robot 'tank'. Valid choices: courier, scout.",
         "place: give one of city, map, file, not city and map",
         "place.map: unknown map 'berlin-11'. Valid choices: ",
-        "way: unknown field `lenght_m`. Valid choices: kind, length_m, start, goal, route, fences, signals. "
-        "Did you mean length_m?",
+        "way: unknown field `lenght_m`. Valid choices: kind, length_m, start, goal, route, "
+        "fences, signals. Did you mean length_m?",
         "way.kind: Invalid enum value 'strait'. Valid choices: straight, curve, crosswalk, route. "
         "Did you mean straight?",
         "events[0].kind: unknown event 'fronal'. ",
@@ -80,31 +82,86 @@ def test_everything_that_is_wrong_with_a_file_is_told_at_once(tmp_path: Path) ->
         ('name = "a"\nname = "b"', "is no TOML: Cannot overwrite a value (at end"),
         ("", "3 faults:\n  there is no `name`\n  there is no `place`\n  there is no `way`"),
         (f'name = "n"\n{CITY}[way]\n', "way: give one of kind, start and goal, route, not none"),
-        (f'name = "n"\n{CITY}[way]\nstart = [1, 2]\n', "way: start and goal go together; goal is missing"),
-        (f'name = "n"\n{CITY}[way]\nstart = [1, 2, 3]\ngoal = [1, 2]', "way.start: must be a list of 2 values, not [1"),
-        (f'name = "n"\n{CITY}[way]\nkind = "curve"\nlength_m = 20\n', "way length_m is for ways of kind 'straight'"),
-        (SHORT.replace("30", "300"), "way length_m of kind 'straight' must be in [10, 100], not 300"),
-        (SHORT.replace('"short"', '"unit"'), "name 'unit' is that of a suite that ships: choose another"),
-        (SHORT + "[crowd]\npersons = 3\ndensity = 2.0\n", "crowd: give persons (3) or density (2), not both"),
-        (SHORT + "[crowd]\ndensity = [0, 900]\n", "crowd density must be in [0, 150] per 1000 m2, not 900.0"),
-        (SHORT + "[crowd]\ndensity = []\n", "crowd.density is an empty list: give values to sweep over"),
-        (SHORT + "[crowd]\ndensity = [nan]\n", "crowd density must be in [0, 150] per 1000 m2, not nan"),
+        (
+            f'name = "n"\n{CITY}[way]\nstart = [1, 2]\n',
+            "way: start and goal go together; goal is missing",
+        ),
+        (
+            f'name = "n"\n{CITY}[way]\nstart = [1, 2, 3]\ngoal = [1, 2]',
+            "way.start: must be a list of 2 values, not [1",
+        ),
+        (
+            f'name = "n"\n{CITY}[way]\nkind = "curve"\nlength_m = 20\n',
+            "way length_m is for ways of kind 'straight'",
+        ),
+        (
+            SHORT.replace("30", "300"),
+            "way length_m of kind 'straight' must be in [10, 100], not 300",
+        ),
+        (
+            SHORT.replace('"short"', '"unit"'),
+            "name 'unit' is that of a suite that ships: choose another",
+        ),
+        (
+            SHORT + "[crowd]\npersons = 3\ndensity = 2.0\n",
+            "crowd: give persons (3) or density (2), not both",
+        ),
+        (
+            SHORT + "[crowd]\ndensity = [0, 900]\n",
+            "crowd density must be in [0, 150] per 1000 m2, not 900.0",
+        ),
+        (
+            SHORT + "[crowd]\ndensity = []\n",
+            "crowd.density is an empty list: give values to sweep over",
+        ),
+        (
+            SHORT + "[crowd]\ndensity = [nan]\n",
+            "crowd density must be in [0, 150] per 1000 m2, not nan",
+        ),
         (
             "seeds = 1000\n" + SHORT + "[light]\nhour = [8, 9, 10, 11, 12, 13]\n",
             "makes 6000 scenarios, and at most 5000 can be had: give fewer values or seeds",
         ),
-        (f'name = "n"\n{CITY}[way]\nroute = [[1, 2], [1, 2]]\n', "way route needs two different points or more"),
-        (f'name = "n"\n{CITY}[way]\nstart = [nan, 2]\ngoal = [1, 2]', "way start[0] must be in [-10000000, 10000000]"),
-        (f'name = "n"\n{CITY}[way]\nlength_m = 20\n', "way: give one of kind, start and goal, route, not none"),
-        ('name = "n"\n[place]\nfile = "\\u0000"\n[way]\nkind = "curve"\n', "place file must be at most 1000 letters"),
+        (
+            f'name = "n"\n{CITY}[way]\nroute = [[1, 2], [1, 2]]\n',
+            "way route needs two different points or more",
+        ),
+        (
+            f'name = "n"\n{CITY}[way]\nstart = [nan, 2]\ngoal = [1, 2]',
+            "way start[0] must be in [-10000000, 10000000]",
+        ),
+        (
+            f'name = "n"\n{CITY}[way]\nlength_m = 20\n',
+            "way: give one of kind, start and goal, route, not none",
+        ),
+        (
+            'name = "n"\n[place]\nfile = "\\u0000"\n[way]\nkind = "curve"\n',
+            "place file must be at most 1000 letters",
+        ),
         ("seeds = [1, 2]\n" + SHORT, "seeds: must be a whole number, not [1, 2]"),
     ],
     ids=[
-        "syntax", "twice", "empty", "no-way", "no-goal", "three-numbers", "no-length", "too-long", "name-of-a-suite",
-        "both", "one-value", "no-value", "no-number", "too-many", "one-point",
-        "nan", "length-of-none", "control-character", "list-of-seeds",
+        "syntax",
+        "twice",
+        "empty",
+        "no-way",
+        "no-goal",
+        "three-numbers",
+        "no-length",
+        "too-long",
+        "name-of-a-suite",
+        "both",
+        "one-value",
+        "no-value",
+        "no-number",
+        "too-many",
+        "one-point",
+        "nan",
+        "length-of-none",
+        "control-character",
+        "list-of-seeds",
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_is_refused_with_its_remedy(tmp_path: Path, text: str, told: str) -> None:
     """One fault of a file that is else sound."""
     assert refusal(tmp_path, text).startswith(told)
@@ -121,15 +178,20 @@ def test_what_is_no_text_is_refused(tmp_path: Path) -> None:
         path.write_bytes(data)
         with pytest.raises(SpecError, match=told):
             read_own(path)
-    for nowhere, told in ((tmp_path, "is no file"), (tmp_path / "b.toml", "`cosim scenario new .*b.toml` writes one")):
+    for nowhere, told in (
+        (tmp_path, "is no file"),
+        (tmp_path / "b.toml", "`cosim scenario new .*b.toml` writes one"),
+    ):
         with pytest.raises(SpecError, match=told):
             read_own(nowhere)
 
 
 def test_a_list_in_place_of_a_value_is_a_sweep(tmp_path: Path) -> None:
-    """Each value with each of the others, as often as there are seeds; points and fields of single events as well."""
+    """Each value with each of the others, as often as there are seeds; points and fields of single
+    events as well."""
     text = (
-        f'name = "s"\nseed = 7\nseeds = 2\n{CITY}[way]\nstart = [120, 131]\ngoal = [[345, 300], [250, 240]]\n'
+        f'name = "s"\nseed = 7\nseeds = 2\n{CITY}[way]\nstart = [120, 131]\ngoal = [[345, '
+        f"300], [250, 240]]\n"
         '[[events]]\nkind = "frontal"\nspeed_mps = [1.1, 1.5]\n[crowd]\ndensity = [0, 2.5]\n'
     )
     own = read_own(written(tmp_path, text))
@@ -137,9 +199,14 @@ def test_a_list_in_place_of_a_value_is_a_sweep(tmp_path: Path) -> None:
     assert len(own.variants) == 16 == len({variant.id for variant in own.variants})
     first, second, *_, last = own.variants
     assert (first.id, second.id) == (
-        "s-goal345_300-speed_mps1.1-density0-s7", "s-goal345_300-speed_mps1.1-density0-s8",
-    )  # fmt: skip
-    assert first.own.crowd.spec.empty and last.own.crowd.density == 2.5 and last.own.events[0].speed_mps == 1.5
+        "s-goal345_300-speed_mps1.1-density0-s7",
+        "s-goal345_300-speed_mps1.1-density0-s8",
+    )
+    assert (
+        first.own.crowd.spec.empty
+        and last.own.crowd.density == 2.5
+        and last.own.events[0].speed_mps == 1.5
+    )
     assert last.own.way.goal == (250.0, 240.0) and last.own.seed == 8
     assert last.at == {"way.goal": [250, 240], "events[0].speed_mps": 1.5, "crowd.density": 2.5}
 
@@ -153,7 +220,9 @@ def test_the_template_shows_every_field_there_is() -> None:
         found = set()
         for field in msgspec.structs.fields(kind):
             inner = [field.type, *getattr(field.type, "__args__", ())]
-            tables = [one for one in inner if isinstance(one, type) and issubclass(one, msgspec.Struct)]
+            tables = [
+                one for one in inner if isinstance(one, type) and issubclass(one, msgspec.Struct)
+            ]
             found |= {field.name} if not tables else set().union(*map(fields, tables))
         return found
 
@@ -172,7 +241,8 @@ def on_tiny(**way: Any) -> Scenario:
 
 
 def test_the_way_between_two_points_leads_over_the_crossing() -> None:
-    """From the middle of the nearest sidewalk to that of the other, by the crossing that joins them."""
+    """From the middle of the nearest sidewalk to that of the other, by the crossing that joins
+    them."""
     over = on_tiny(start=(-40.0, 6.0), goal=(30.0, -7.0))
     assert over.start[:2] == (-40.0, 5.0) and over.goal == (30.0, -6.5)
     assert [(crossing.id, crossing.signalised) for crossing in over.crossings] == [(":c0", False)]
@@ -186,12 +256,18 @@ def test_the_way_between_two_points_leads_over_the_crossing() -> None:
 @pytest.mark.parametrize(
     ("way", "told"),
     [
-        ({"start": (-40, 30), "goal": (30, 5)}, r"way.start \(-40, 30\) is 24 m from the near.*\(-40.0, 5.0\)"),
+        (
+            {"start": (-40, 30), "goal": (30, 5)},
+            r"way.start \(-40, 30\) is 24 m from the near.*\(-40.0, 5.0\)",
+        ),
         ({"start": (-40, 5), "goal": (-40.2, 5)}, "start and goal are on one spot"),
-        ({"start": (-40, 5), "goal": (30, 5), "signals": "with"}, "way signals 'with': it leads over 0 cross"),
+        (
+            {"start": (-40, 5), "goal": (30, 5), "signals": "with"},
+            "way signals 'with': it leads over 0 cross",
+        ),
     ],
     ids=["far", "one-spot", "no-signals"],
-)  # fmt: skip
+)
 def test_a_way_that_is_not_there_is_refused(way: dict[str, Any], told: str) -> None:
     """With what is there instead."""
     with pytest.raises(SpecError, match=told):
@@ -200,7 +276,8 @@ def test_a_way_that_is_not_there_is_refused(way: dict[str, Any], told: str) -> N
 
 def test_an_event_that_does_not_fit_is_told_where_it_does() -> None:
     """The reason, and the stretches of this way that do."""
-    street, over = tiny_map(), on_tiny(start=(-60.0, 5.0), goal=(60.0, -6.5))
+    street = tiny_map()
+    over = on_tiny(start=(-60.0, 5.0), goal=(60.0, -6.5))
 
     def at(kind: str, at_m: float | None) -> Any:
         return event_along(0, OwnEvent(kind=kind, at_m=at_m), over, street, COURIER)
@@ -213,36 +290,73 @@ def test_an_event_that_does_not_fit_is_told_where_it_does() -> None:
         ),
         ("frontal", 63.0, "no sidewalk is there, but a corner or a crossing"),
         ("frontal", 900.0, "the way ends at "),
-        ("conversing", 30.0, "is 3.0 m wide there, and it needs 3.9 m; it fits nowhere on this way"),
+        (
+            "conversing",
+            30.0,
+            "is 3.0 m wide there, and it needs 3.9 m; it fits nowhere on this way",
+        ),
         ("ped_crossing", 10.0, "at_m 10 is on no crossing for 'ped_crossing': it fits from 6"),
     ):
         with pytest.raises(SpecError) as error:
             at(kind, at_m)
         assert told in str(error.value), error.value
-    crossing, frontal = at("ped_crossing", None), at("frontal", 30.0)
+    crossing = at("ped_crossing", None)
+    frontal = at("frontal", 30.0)
     assert np.hypot(crossing.x_m, crossing.y_m) < 2.0 and crossing.half_length_m > 2.0
-    assert (frontal.x_m, frontal.y_m, frontal.heading_rad, frontal.half_width_m) == (-30.0, 5.0, 0.0, 1.5)
+    assert (frontal.x_m, frontal.y_m, frontal.heading_rad, frontal.half_width_m) == (
+        -30.0,
+        5.0,
+        0.0,
+        1.5,
+    )
     middle = at("obstructing", None)
     assert abs(middle.route_s_m - over.route_line.length_m / 2) < 12.0
 
 
 @pytest.mark.engine
 def test_what_is_written_anew_is_sound_can_be_drawn_and_runs(tmp_path: Path, cosim: Cosim) -> None:
-    """`new`, `check`, `draw`, `run`: from nothing to a picture and a table, with latency; a name that is taken is
-    refused."""
+    """`new`, `check`, `draw`, `run`: from nothing to a picture and a table, with latency; a name
+    that is taken is refused."""
     done = cosim("scenario", "new", "mine.toml", cwd=tmp_path)
     assert done.returncode == 0 and (tmp_path / "mine.toml").read_text().count('name = "mine"') == 1
-    again, done = (cosim("scenario", *words, cwd=tmp_path) for words in (("new", "mine.toml"), ("check", "mine.toml")))
+    again, done = (
+        cosim("scenario", *words, cwd=tmp_path)
+        for words in (("new", "mine.toml"), ("check", "mine.toml"))
+    )
     assert again.returncode == 2 and "is there already" in again.stderr
-    assert done.returncode == 0 and "mine.toml: 1 scenario" in done.stdout and " 40.0 " in done.stdout, done.stderr
-    for words in (("-o", "way.png"), ("--whole", "-o", "town.png"), ("--zoom", "0,0,90,60", "-o", "part.png")):
+    assert (
+        done.returncode == 0 and "mine.toml: 1 scenario" in done.stdout and " 40.0 " in done.stdout
+    ), done.stderr
+    for words in (
+        ("-o", "way.png"),
+        ("--whole", "-o", "town.png"),
+        ("--zoom", "0,0,90,60", "-o", "part.png"),
+    ):
         done = cosim("scenario", "draw", "mine.toml", *words, cwd=tmp_path)
-        assert done.returncode == 0 and (tmp_path / words[-1]).read_bytes().startswith(b"\x89PNG"), done.stderr
-    done = cosim("scenario", "draw", "mine.toml", "--zoom", "900,900,990,990", "-o", "far.png", cwd=tmp_path)
-    assert done.returncode == 2 and "shows nothing of the place" in done.stderr and not (tmp_path / "far.png").exists()
+        assert done.returncode == 0 and (tmp_path / words[-1]).read_bytes().startswith(
+            b"\x89PNG"
+        ), done.stderr
+    done = cosim(
+        "scenario", "draw", "mine.toml", "--zoom", "900,900,990,990", "-o", "far.png", cwd=tmp_path
+    )
+    assert (
+        done.returncode == 2
+        and "shows nothing of the place" in done.stderr
+        and not (tmp_path / "far.png").exists()
+    )
     text = (tmp_path / "mine.toml").read_text()
     (tmp_path / "mine.toml").write_text(text.replace("# time_s = 260", "time_s = 1"))
-    words = ("scenario", "run", "mine.toml", "--policy", "straight", "--latency", "100", "--out", "run")
+    words = (
+        "scenario",
+        "run",
+        "mine.toml",
+        "--policy",
+        "straight",
+        "--latency",
+        "100",
+        "--out",
+        "run",
+    )
     done = cosim(*words, cwd=tmp_path)
     assert done.returncode == 0 and "Run folder: run" in done.stdout, done.stderr
     assert "latency 100 ms: commands take effect so much later" in done.stdout
@@ -250,17 +364,21 @@ def test_what_is_written_anew_is_sound_can_be_drawn_and_runs(tmp_path: Path, cos
 
 @pytest.mark.engine
 def test_what_does_not_fit_its_place_is_told_for_all_files(tmp_path: Path, cosim: Cosim) -> None:
-    """Events, things, their room: each with its place in the file; sound files are told of all the same."""
+    """Events, things, their room: each with its place in the file; sound files are told of all the
+    same."""
     (tmp_path / "sound.toml").write_text(SHORT)
     (tmp_path / "odd.toml").write_text(
         SHORT + '[[events]]\nkind = "frontal"\nat_m = 2\n[[events]]\nkind = "ped_crossing"\n'
         '[[obstacles.placed]]\nkind = "bin"\nat_m = 99\n'
     )
     (tmp_path / "blocked.toml").write_text(
-        SHORT + '[[obstacles.placed]]\nkind = "bin"\nat_m = 0.3\n[[events]]\nkind = "queueing"\npeople = 9\n'
-        '[light]\nhdri = "none.hdr"\n'
-    )  # fmt: skip
-    fences = (f'[[obstacles.placed]]\nkind = "fence"\nat_m = 15\nturned_deg = 90\nleft_m = {m}\n' for m in (-0.9, 0.9))
+        SHORT + '[[obstacles.placed]]\nkind = "bin"\nat_m = 0.3\n[[events]]\nkind = '
+        '"queueing"\npeople = 9\n[light]\nhdri = "none.hdr"\n'
+    )
+    fences = (
+        f'[[obstacles.placed]]\nkind = "fence"\nat_m = 15\nturned_deg = 90\nleft_m = {m}\n'
+        for m in (-0.9, 0.9)
+    )
     (tmp_path / "narrow.toml").write_text(SHORT + "".join(fences))
     files = ("odd.toml", "sound.toml", "blocked.toml", "narrow.toml")
     done = cosim("scenario", "check", *files, cwd=tmp_path)
@@ -276,15 +394,26 @@ def test_what_does_not_fit_its_place_is_told_for_all_files(tmp_path: Path, cosim
     ):
         assert told in done.stderr, done.stderr
     drawn = cosim("scenario", "draw", "odd.toml", "-o", "odd.png", cwd=tmp_path)
-    assert drawn.returncode == 2 and (tmp_path / "odd.png").exists() and "events[0]: at_m 2 does not" in drawn.stderr
+    assert (
+        drawn.returncode == 2
+        and (tmp_path / "odd.png").exists()
+        and "events[0]: at_m 2 does not" in drawn.stderr
+    )
 
 
 @pytest.mark.engine
-def test_whether_a_scenario_can_be_solved_is_driven_by_the_oracle(tmp_path: Path, cosim: Cosim) -> None:
+def test_whether_a_scenario_can_be_solved_is_driven_by_the_oracle(
+    tmp_path: Path, cosim: Cosim
+) -> None:
     """`check --drive` says in what time, or where the oracle fails; then the exit code is 1."""
     near = SHORT.replace("length_m = 30", "length_m = 10")
     (tmp_path / "near.toml").write_text(near)
     (tmp_path / "hasty.toml").write_text(near + "[limits]\ntime_s = 2\n")
-    solved, hasty = (cosim("scenario", "check", name, "--drive", cwd=tmp_path) for name in ("near.toml", "hasty.toml"))
+    solved, hasty = (
+        cosim("scenario", "check", name, "--drive", cwd=tmp_path)
+        for name in ("near.toml", "hasty.toml")
+    )
     assert solved.returncode == 0 and "short: solved by orca in " in solved.stdout, solved.stderr
-    assert hasty.returncode == 1 and "short: orca fails: ended by time" in hasty.stdout, hasty.stderr
+    assert hasty.returncode == 1 and "short: orca fails: ended by time" in hasty.stdout, (
+        hasty.stderr
+    )

@@ -9,13 +9,22 @@ import pytest
 
 from cosim.core.telling import duration
 from cosim.core.versions import versions
-from cosim.records.record import Record
-from cosim.records.run_folder import RunFolder
-from cosim.records.run_spec import RunSpec
+from cosim.results.record import Record
+from cosim.results.run_folder import RunFolder
+from cosim.results.run_spec import RunSpec
 from cosim.spec.scenario import Scenario, Suite
-from scenarios.catalog import load_suite
-from scenarios.execution import pace
-from scenarios.execution.pace import Estimate, Measured, announcement, estimate, makespan, recall, remembered, span
+from scenarios.runs import eta as pace
+from scenarios.runs.eta import (
+    Estimate,
+    Measured,
+    announcement,
+    estimate,
+    makespan,
+    recall,
+    remembered,
+    span,
+)
+from scenarios.suites.catalog import load_suite
 
 LONG = load_suite("long-horizon").scenarios[:12]
 GL = "gl: llvmpipe"
@@ -30,29 +39,46 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def episodes(count: int, **changes: object) -> list[Measured]:
-    """Episodes of `route` over 100 m in 75 s of simulated time, 6 simulated seconds a second, set up in 4 s."""
+    """Episodes of `route` over 100 m in 75 s of simulated time, 6 simulated seconds a second, set
+    up in 4 s."""
     one = Measured(
-        machine=pace.machine(), policy="route", renderer=GL, jobs=1, short=False, compared=False, route_m=100.0,
-        simulated_s=75.0, work_s=12.5, setup_s=4.0,
-    )  # fmt: skip
+        machine=pace.machine(),
+        policy="route",
+        renderer=GL,
+        jobs=1,
+        short=False,
+        compared=False,
+        route_m=100.0,
+        simulated_s=75.0,
+        work_s=12.5,
+        setup_s=4.0,
+    )
     return [msgspec.structs.replace(one, **changes)] * count
 
 
-def of(known: list[Measured], policy: str = "route", jobs: int = 1, compared: bool = False) -> Estimate:
+def of(
+    known: list[Measured], policy: str = "route", jobs: int = 1, compared: bool = False
+) -> Estimate:
     return estimate(LONG, known, policy, GL, jobs, compared, cores=2)
 
 
 def test_an_estimate_holds_what_the_same_policy_took() -> None:
-    """12 episodes of 4.8 km at 0.125 s a metre and 4 s each come to 653 s: that lies inside, and the span is fair."""
+    """12 episodes of 4.8 km at 0.125 s a metre and 4 s each come to 653 s: that lies inside, and
+    the span is fair."""
     true_s = 12 * 4.0 + 0.125 * sum(s.route_line.length_m for s in LONG)
     found = of(episodes(5))
     assert found.low_s < true_s < found.high_s and found.high_s < 3.0 * found.low_s
     assert found.basis == "measured in 5 episodes of 'route' on this machine"
 
 
-def test_without_the_same_policy_the_machines_speed_counts_and_the_policy_is_said_to_be_unknown() -> None:
-    """Wider than of its own episodes, and of nothing measured at all wider still; each says what it rests on."""
-    own, others, nothing = of(episodes(5)), of(episodes(5), policy="mine:Mine"), of([])
+def test_without_the_same_policy_the_machines_speed_counts_and_the_policy_is_said_to_be_unknown() -> (
+    None
+):
+    """Wider than of its own episodes, and of nothing measured at all wider still; each says what it
+    rests on."""
+    own = of(episodes(5))
+    others = of(episodes(5), policy="mine:Mine")
+    nothing = of([])
     assert others.high_s / others.low_s > own.high_s / own.low_s
     assert nothing.high_s / nothing.low_s > others.high_s / others.low_s
     assert "simulates 6.0 s a second" in others.basis and "0.9 to 1.4 m/s" in others.basis
@@ -63,7 +89,8 @@ def test_without_the_same_policy_the_machines_speed_counts_and_the_policy_is_sai
 
 
 def test_what_was_measured_otherwise_does_not_count() -> None:
-    """Another renderer, a comparison, short episodes, fewer than three: none of them is taken for the same."""
+    """Another renderer, a comparison, short episodes, fewer than three: none of them is taken for
+    the same."""
     for other in (
         episodes(9, renderer="bullet-tiny"),
         episodes(9, compared=True),
@@ -74,7 +101,8 @@ def test_what_was_measured_otherwise_does_not_count() -> None:
 
 
 def test_two_processes_take_about_half_and_ten_on_two_cores_no_less() -> None:
-    """The span of two holds half of the time; cores are the limit, and so is the longest episode."""
+    """The span of two holds half of the time; cores are the limit, and so is the longest
+    episode."""
     one, two, ten = (of(episodes(5), jobs=jobs) for jobs in (1, 2, 10))
     assert two.low_s < 0.55 * one.low_s < 0.65 * two.high_s and ten == two
     assert makespan([10.0, 1.0, 1.0], 2) == 10.0 and makespan([1.0, 1.0, 10.0], 2) == 11.0
@@ -84,7 +112,8 @@ def test_two_processes_take_about_half_and_ten_on_two_cores_no_less() -> None:
 @pytest.mark.parametrize("known", [[], episodes(5)], ids=["unknown", "measured"])
 @pytest.mark.parametrize("pace_x", [1.0, 2.0])
 def test_what_is_held_to_real_time_takes_that_time(known: list[Measured], pace_x: float) -> None:
-    """At 0.75 s a metre 12 episodes of 4.8 km take an hour of real time, whatever the machine can do.
+    """At 0.75 s a metre 12 episodes of 4.8 km take an hour of real time, whatever the machine can
+    do.
 
     Two processes take half of that, and four on two cores a quarter, as they wait."""
     for jobs in (1, 2, 4):
@@ -96,9 +125,12 @@ def test_what_is_held_to_real_time_takes_that_time(known: list[Measured], pace_x
 
 
 def test_the_line_says_episodes_way_limit_and_time() -> None:
-    """One line: 12 episodes of 4.8 km, 6 h 40 min simulated at most, with one process and with as many as cores."""
+    """One line: 12 episodes of 4.8 km, 6 h 40 min simulated at most, with one process and with as
+    many as cores."""
     line = announcement(LONG, "route", GL, 1, False)
-    assert line.startswith("12 episodes, 4.8 km of route, at most 6 h 40 min of simulated time. About ")
+    assert line.startswith(
+        "12 episodes, 4.8 km of route, at most 6 h 40 min of simulated time. About "
+    )
     assert " with --jobs 1, " in line and " with --jobs 2: a guess" in line and "\n" not in line
     assert "--jobs 2" not in announcement(LONG[:1], "route", GL, 1, False)
     assert announcement(LONG[:1], "route", GL, 1, False).startswith("1 episode, 482 m")
@@ -106,10 +138,14 @@ def test_the_line_says_episodes_way_limit_and_time() -> None:
 
 @pytest.mark.parametrize(
     ("low_s", "high_s", "words"),
-    [(500.0, 900.0, "8 to 15 min"), (40.0, 170.0, "40 s to 3 min"), (610.0, 620.0, "10 min"),
-     (3000.0, 8000.0, "50 min to 2 h 10 min")],
+    [
+        (500.0, 900.0, "8 to 15 min"),
+        (40.0, 170.0, "40 s to 3 min"),
+        (610.0, 620.0, "10 min"),
+        (3000.0, 8000.0, "50 min to 2 h 10 min"),
+    ],
     ids=["minutes", "mixed", "same", "hours"],
-)  # fmt: skip
+)
 def test_a_span_is_said_with_its_unit_once(low_s: float, high_s: float, words: str) -> None:
     """Both ends in the unit that fits them, said once where it is the same."""
     assert span(Estimate(low_s, high_s, "")) == words
@@ -118,27 +154,50 @@ def test_a_span_is_said_with_its_unit_once(low_s: float, high_s: float, words: s
 def finished(folder: RunFolder, scenario: Scenario, status: str) -> None:
     """The record of an episode that took 20 s, 4 of them to set up."""
     record = Record(
-        scenario=scenario.id, scenario_hash="", suite="s", suite_hash="", seed=0, robot="courier", policy="route",
-        policy_version="1", goal_protocol="route", renderer=GL, versions=versions(), status=status, ticks=1600,
+        scenario=scenario.id,
+        scenario_hash="",
+        suite="s",
+        suite_hash="",
+        seed=0,
+        robot="courier",
+        policy="route",
+        policy_version="1",
+        goal_protocol="route",
+        renderer=GL,
+        versions=versions(),
+        status=status,
+        ticks=1600,
         ended="goal" if status == "done" else None,
         clock={"wall_s": 20.0, "setup_s": 4.0},
-    )  # fmt: skip
+    )
     folder.episode_folder(scenario.id).mkdir()
     record.save(folder.episode_folder(scenario.id) / "record.json")
 
 
 def run_of(path: Path) -> RunFolder:
     spec = RunSpec(
-        suite="s", robots={"courier": "h"},
-        suite_version="1", suite_hash="", policy="route", policy_name="route", policy_version="1",
-        scenarios=tuple(s.id for s in LONG), versions=versions(), renderer=GL,
-    )  # fmt: skip
+        suite="s",
+        robots={"courier": "h"},
+        suite_version="1",
+        suite_hash="",
+        policy="route",
+        policy_name="route",
+        policy_version="1",
+        scenarios=tuple(s.id for s in LONG),
+        versions=versions(),
+        renderer=GL,
+    )
     return RunFolder.create(path, spec, Suite(name="s", version="1", scenarios=LONG))
 
 
 def test_a_run_is_remembered_even_when_it_is_stopped(tmp_path: Path, cache: Path) -> None:
-    """What was finished counts, what crashed or never ran does not; the next estimate rests on it."""
-    with run_of(tmp_path / "run") as held, pytest.raises(KeyboardInterrupt), remembered(held, LONG[:6], 2):
+    """What was finished counts, what crashed or never ran does not; the next estimate rests on
+    it."""
+    with (
+        run_of(tmp_path / "run") as held,
+        pytest.raises(KeyboardInterrupt),
+        remembered(held, LONG[:6], 2),
+    ):
         for scenario in LONG[:4]:
             finished(held, scenario, "crashed" if scenario is LONG[0] else "done")
         raise KeyboardInterrupt
@@ -146,7 +205,9 @@ def test_a_run_is_remembered_even_when_it_is_stopped(tmp_path: Path, cache: Path
     assert [(m.route_m, m.jobs, m.work_s, m.setup_s, m.simulated_s) for m in known] == [
         (s.route_line.length_m, 2, 16.0, 4.0, 80.0) for s in LONG[1:4]
     ]
-    assert "measured in 3 episodes of 'route' on this machine" in announcement(LONG, "route", GL, 1, False)
+    assert "measured in 3 episodes of 'route' on this machine" in announcement(
+        LONG, "route", GL, 1, False
+    )
 
 
 def test_a_run_that_is_held_to_real_time_is_not_remembered(tmp_path: Path, cache: Path) -> None:
@@ -159,7 +220,8 @@ def test_a_run_that_is_held_to_real_time_is_not_remembered(tmp_path: Path, cache
 
 
 def test_what_is_remembered_stays_small_and_survives_damage(tmp_path: Path, cache: Path) -> None:
-    """Lines of other machines and of nonsense are passed over, old ones go; a cache that cannot be written is none."""
+    """Lines of other machines and of nonsense are passed over, old ones go; a cache that cannot be
+    written is none."""
     cache.mkdir()
     path = cache / pace.FILE
     line = msgspec.json.encode(episodes(1, machine="another")[0])

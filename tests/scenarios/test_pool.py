@@ -1,4 +1,5 @@
-"""Environment processes: those that cannot begin, die or say nothing, and what is told of them, once."""
+"""Environment processes: those that cannot begin, die or say nothing, and what is told of them,
+once."""
 
 from __future__ import annotations
 
@@ -14,28 +15,39 @@ import msgspec
 import pytest
 
 from cosim.core.errors import MachineError
-from cosim.core.wire import Wire
-from cosim.episode.driver import PolicyCall
+from cosim.core.framing import Wire
+from cosim.episode.policy_caller import PolicyCall
 from cosim.policies.load import load_policy
-from cosim.records.record import Record, begun
-from cosim.records.run_folder import RunFolder, read_records
-from cosim.records.run_spec import RunSpec
+from cosim.results.record import Record, begun
+from cosim.results.run_folder import RunFolder, read_records
+from cosim.results.run_spec import RunSpec
 from cosim.spec.options import RendererAt
 from cosim.spec.scenario import City, Scenario, Suite, write_suite
-from scenarios.checks import small_scenario
-from scenarios.execution import pool
-from scenarios.execution.asked import Asked, Patience, Question
-from scenarios.execution.messages import Done, FrameDrawn, Hear, Hello, Job, LostRenderer, Message, Progress, Ready
-from scenarios.execution.shepherd import BoundedLog
-from scenarios.rendering.shared import End, SharedRenderer
+from scenarios.ipc.deadlines import Asked, Patience, Question
+from scenarios.ipc.messages import (
+    Done,
+    FrameDrawn,
+    Hear,
+    Hello,
+    Job,
+    LostRenderer,
+    Message,
+    Progress,
+    Ready,
+)
+from scenarios.ipc.supervisor import BoundedLog
+from scenarios.runs import pool
+from scenarios.runs.shared_renderer import End, SharedRenderer
+from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import PATIENCE_S, Cosim, seed_in_order
 
 MODULES = {
-    "libsumo": "raise ImportError('libX11.so.6: cannot open shared object file: No such file or directory')",
+    "libsumo": "raise ImportError('libX11.so.6: cannot open shared object file: No such file or "
+    "directory')",
     "mine": """
 import os, sys, time
 from pathlib import Path
-from cosim.episode.ports import Manifest
+from cosim.spec.manifest import Manifest
 from cosim.core.state import STILL
 IN_A_WORKER = sys.argv[:1] == ["-c"]
 
@@ -61,10 +73,20 @@ class Edits(Mine):
 }
 CANNOT_BEGIN = {
     "Exits": (2, "error: policy 'mine:Exits' cannot be made: SystemExit: no GPU left"),
-    "Dies": (2, "error: policy 'mine:Dies' cannot be loaded: the environment process ended with exit code 7"),
-    "Hangs": (2, "error: policy 'mine' gave no answer for 1 s while it was loaded in an environment process"),
+    "Dies": (
+        2,
+        "error: policy 'mine:Dies' cannot be loaded: the environment process ended with exit "
+        "code 7",
+    ),
+    "Hangs": (
+        2,
+        "error: policy 'mine' gave no answer for 1 s while it was loaded in an environment process",
+    ),
     "Changes": (2, "error: policy 'mine:Changes' has another manifest in each process"),
-    "Edits": (2, "error: policy 'mine:Edits' was edited while the run was going on: begin another run"),
+    "Edits": (
+        2,
+        "error: policy 'mine:Edits' was edited while the run was going on: begin another run",
+    ),
 }
 
 
@@ -77,7 +99,16 @@ def desk(tmp_path: Path) -> Path:
 
 def run(cosim: Cosim, desk: Path, name: str, suite: str = "reactive") -> tuple[int, str]:
     patience_s = "1" if name == "Hangs" else str(PATIENCE_S)
-    words = ("--policy", f"mine:{name}", "--episodes", "3", "--start-timeout", patience_s, "--out", "run")
+    words = (
+        "--policy",
+        f"mine:{name}",
+        "--episodes",
+        "3",
+        "--start-timeout",
+        patience_s,
+        "--out",
+        "run",
+    )
     said = cosim("run", suite, *words, cwd=desk)
     assert "Traceback" not in said.stderr and not list(desk.glob("run/episodes/*/record.json"))
     assert "crashed" not in said.stdout + said.stderr
@@ -86,8 +117,11 @@ def run(cosim: Cosim, desk: Path, name: str, suite: str = "reactive") -> tuple[i
 
 @pytest.mark.engine
 @pytest.mark.parametrize("name", CANNOT_BEGIN)
-def test_a_policy_that_a_process_cannot_load_ends_the_run(cosim: Cosim, desk: Path, name: str) -> None:
-    """It was loaded when the run began, and is not in its processes: wrong use, once, and no episode has crashed."""
+def test_a_policy_that_a_process_cannot_load_ends_the_run(
+    cosim: Cosim, desk: Path, name: str
+) -> None:
+    """It was loaded when the run began, and is not in its processes: wrong use, once, and no
+    episode has crashed."""
     code, said = run(cosim, desk, name)
     assert (code, said.count("error:")) == (2, 1) and CANNOT_BEGIN[name][1] in said
 
@@ -96,8 +130,12 @@ def test_a_policy_that_a_process_cannot_load_ends_the_run(cosim: Cosim, desk: Pa
 def test_an_engine_that_cannot_be_imported_ends_the_run(fresh_cosim: Cosim, desk: Path) -> None:
     """What a process lacks is told once, with the remedy."""
     (desk / "libsumo.py").write_text(MODULES["libsumo"])
-    write_suite(Suite(name="walked", version="1", scenarios=(small_scenario(),)), desk / "walked.json")
-    path = os.pathsep.join([str(desk), os.environ.get("PYTHONPATH", str(Path(__file__).parents[2]))])
+    write_suite(
+        Suite(name="walked", version="1", scenarios=(small_scenario(),)), desk / "walked.json"
+    )
+    path = os.pathsep.join(
+        [str(desk), os.environ.get("PYTHONPATH", str(Path(__file__).parents[2]))]
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", path)
         code, said = run(fresh_cosim, desk, "Mine", "walked.json")
@@ -107,7 +145,8 @@ def test_an_engine_that_cannot_be_imported_ends_the_run(fresh_cosim: Cosim, desk
 
 @pytest.mark.parametrize("printed", [0, 10, 100, 101, 150, 200, 201, 1000])
 def test_a_log_keeps_its_beginning_and_its_end(tmp_path: Path, printed: int) -> None:
-    """Short ones are whole; of longer ones the first and the last 100 bytes or more are kept, in order."""
+    """Short ones are whole; of longer ones the first and the last 100 bytes or more are kept, in
+    order."""
     text = bytes(i % 251 for i in range(printed))
     with (tmp_path / "log").open("wb") as file:
         log = BoundedLog(file.fileno(), first=100, last=100)
@@ -136,7 +175,9 @@ def test_a_log_keeps_its_beginning_and_its_end(tmp_path: Path, printed: int) -> 
         ("loading", 1e9, 0.0, True),
     ],
 )
-def test_a_first_answer_may_take_longer(doing: PolicyCall, answer_s: float, start_s: float, overdue: bool) -> None:
+def test_a_first_answer_may_take_longer(
+    doing: PolicyCall, answer_s: float, start_s: float, overdue: bool
+) -> None:
     """What loads a model has a time of its own; nobody is late before anything is asked."""
     asked = Asked.new()
     assert asked.question is None
@@ -157,17 +198,24 @@ class Fake:
     away = False
 
     def __init__(
-        self, *messages: Message, asks: PolicyCall | None = None, ends: bool = False, in_engine: bool = False
+        self,
+        *messages: Message,
+        asks: PolicyCall | None = None,
+        ends: bool = False,
+        in_engine: bool = False,
     ) -> None:
         self.in_engine = in_engine
         self.question = None if asks is None else Question(time.monotonic(), asks, 64)
-        self.killed, self._messages, self._ends = False, messages, ends
+        self.killed = False
+        self._messages = messages
+        self._ends = ends
 
     def give(self, job: Job) -> None:
         """It does not listen."""
 
     def listen(self, hear: Hear) -> bool:
-        messages, self._messages = self._messages, ()
+        messages = self._messages
+        self._messages = ()
         for message in messages:
             hear(message)
         return not self._ends
@@ -202,12 +250,19 @@ class Prepared:
 
 
 SCENARIO = Scenario(
-    id="s-0", suite="s", place=City(seed=0), seed=0, start=(0.0, 0.0, 0.0), goal=(9.0, 0.0),
+    id="s-0",
+    suite="s",
+    place=City(seed=0),
+    seed=0,
+    start=(0.0, 0.0, 0.0),
+    goal=(9.0, 0.0),
     route=((0.0, 0.0), (9.0, 0.0)),
-)  # fmt: skip
+)
 
 
-def pooled(folder: Path, *fakes: Fake, renderer: SharedRenderer | None = None, **named: float) -> Record:
+def pooled(
+    folder: Path, *fakes: Fake, renderer: SharedRenderer | None = None, **named: float
+) -> Record:
     """The record of one scenario, run by these workers, one after the other."""
     (record,) = all_pooled(folder, (SCENARIO,), *fakes, renderer=renderer, **named)
     return record
@@ -221,16 +276,21 @@ def all_pooled(
     **named: float,
 ) -> list[Record]:
     """The same of several scenarios."""
-    transport, suite, driver = (
-        Prepared(*fakes),
-        Suite(name="s", version="1", scenarios=scenarios),
-        load_policy("stop"),
-    )
+    transport = Prepared(*fakes)
+    suite = Suite(name="s", version="1", scenarios=scenarios)
+    driver = load_policy("stop")
     spec = RunSpec(
-        suite="s", robots={"courier": "h"},
-        suite_version="1", suite_hash="h", policy="stop", policy_name="stop", policy_version="1",
-        scenarios=tuple(one.id for one in scenarios), versions={}, seed=seed_in_order(scenarios),
-    )  # fmt: skip
+        suite="s",
+        robots={"courier": "h"},
+        suite_version="1",
+        suite_hash="h",
+        policy="stop",
+        policy_name="stop",
+        policy_version="1",
+        scenarios=tuple(one.id for one in scenarios),
+        versions={},
+        seed=seed_in_order(scenarios),
+    )
     hello = Hello("stop", driver.manifest, driver.source_hash)
     with RunFolder.create(folder / "run", spec, suite) as held:
         given = {"tell": lambda _: None, "patience": Patience(**named), "renderer": renderer}
@@ -239,12 +299,18 @@ def all_pooled(
     return sorted(read_records(folder / "run"), key=lambda record: record.scenario)
 
 
-def test_an_engine_that_hangs_is_tried_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """A process that says nothing, while its policy has nothing to answer, is killed; the second time it is a crash."""
+def test_an_engine_that_hangs_is_tried_again(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A process that says nothing, while its policy has nothing to answer, is killed; the second
+    time it is a crash."""
     monkeypatch.setattr(pool, "SILENCE_S", 0.0)
     fakes = (Fake(Ready()), Fake(Ready()))
     record = pooled(tmp_path, *fakes)
-    assert record.reason.startswith("the environment process showed no sign of life, 2 times") and record.ticks == 0
+    assert (
+        record.reason.startswith("the environment process showed no sign of life, 2 times")
+        and record.ticks == 0
+    )
     assert all(fake.killed for fake in fakes)
 
 
@@ -255,7 +321,8 @@ def test_a_policy_that_hangs_is_not_tried_again(tmp_path: Path) -> None:
 
 
 def test_a_slow_policy_is_no_silence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """While a policy has time left to answer, its process may say nothing for as long as it likes."""
+    """While a policy has time left to answer, its process may say nothing for as long as it
+    likes."""
     monkeypatch.setattr(pool, "SILENCE_S", 0.0)
     slow = Fake(Ready(), asks="act")
     began = time.monotonic()
@@ -265,7 +332,8 @@ def test_a_slow_policy_is_no_silence(monkeypatch: pytest.MonkeyPatch, tmp_path: 
 
 @pytest.mark.parametrize("came", ["half", "another"])
 def test_a_damaged_record_is_a_crash(tmp_path: Path, came: str) -> None:
-    """A worker that reports an episode as done with half a record, or another one's, has not finished it."""
+    """A worker that reports an episode as done with half a record, or another one's, has not
+    finished it."""
     other = msgspec.structs.replace(SCENARIO, id="s-1")
     whole = begun(other, load_policy("stop").manifest, "h").encoded()
     done = Done("s-0", "done", whole[: len(whole) // 2] if came == "half" else whole)
@@ -277,24 +345,35 @@ def test_a_record_and_its_log_are_written_as_they_came(tmp_path: Path) -> None:
     """A worker needs no folder: the run's own process writes the bytes, and a frame."""
     data = begun(SCENARIO, load_policy("stop").manifest, "h").encoded()
     log = os.urandom(3_000_000)
-    record = pooled(tmp_path, Fake(Ready(), FrameDrawn("s-0", 5, b"png"), Done("s-0", "crashed", data, log)))
+    record = pooled(
+        tmp_path, Fake(Ready(), FrameDrawn("s-0", 5, b"png"), Done("s-0", "crashed", data, log))
+    )
     folder = tmp_path / "run" / "episodes" / "s-0"
-    assert (folder / "trajectory.npz").read_bytes() == log and (folder / "record.json").read_bytes() == data
+    assert (folder / "trajectory.npz").read_bytes() == log and (
+        folder / "record.json"
+    ).read_bytes() == data
     assert (folder / "frames" / "000005.png").read_bytes() == b"png" and record.encoded() == data
     assert not list((tmp_path / "run").rglob("*.part"))
 
 
 @pytest.mark.parametrize(
-    ("in_engine", "status"), [(True, "invalid"), (False, "crashed")], ids=["a fault of an engine", "anything else"]
+    ("in_engine", "status"),
+    [(True, "invalid"), (False, "crashed")],
+    ids=["a fault of an engine", "anything else"],
 )
 def test_who_ends_its_process_gains_nothing_and_who_loses_it_to_an_engine_nothing_either(
     tmp_path: Path, in_engine: bool, status: str
 ) -> None:
-    """Twice lost to a fault of compiled code while nothing was asked of the policy: the simulator owes the episode.
-    However else a process ends, its policy may have ended it: that has failed."""
-    dies = [Fake(Ready(), Progress("s-0", 1.0, 1.0, 0), ends=True, in_engine=in_engine) for _ in range(2)]
+    """Twice lost to a fault of compiled code while nothing was asked of the policy: the simulator
+    owes the episode. However else a process ends, its policy may have ended it: that has failed."""
+    dies = [
+        Fake(Ready(), Progress("s-0", 1.0, 1.0, 0), ends=True, in_engine=in_engine)
+        for _ in range(2)
+    ]
     (record,) = all_pooled(tmp_path, (SCENARIO,), *dies)
-    assert record.status == status and record.reason.startswith("the environment process ended with exit code 7, 2")
+    assert record.status == status and record.reason.startswith(
+        "the environment process ended with exit code 7, 2"
+    )
 
 
 def test_an_engine_that_fails_is_tried_again(tmp_path: Path) -> None:
@@ -307,7 +386,9 @@ def test_an_engine_that_fails_is_tried_again(tmp_path: Path) -> None:
     assert all_pooled(tmp_path / "once", (SCENARIO,), once)[0].status == "done"
     twice = Again(Ready(), *[Done("s-0", "invalid", failed.encoded(), again=True)] * 2)
     (record,) = all_pooled(tmp_path / "twice", (SCENARIO,), twice)
-    assert record.status == "invalid" and record.reason == "gone, 2 times; see logs/ in the run folder"
+    assert (
+        record.status == "invalid" and record.reason == "gone, 2 times; see logs/ in the run folder"
+    )
 
 
 class DiesIdle(Fake):
@@ -320,21 +401,31 @@ class DiesIdle(Fake):
 
 
 def test_a_process_that_died_between_two_episodes_has_not_tried_the_second(tmp_path: Path) -> None:
-    """It was handed one before its end was known, and began nothing: the episode has both of its attempts left."""
-    manifest, second = load_policy("stop").manifest, msgspec.structs.replace(SCENARIO, id="s-1")
+    """It was handed one before its end was known, and began nothing: the episode has both of its
+    attempts left."""
+    manifest = load_policy("stop").manifest
+    second = msgspec.structs.replace(SCENARIO, id="s-1")
     done, again = (
-        Done(one.id, "done", msgspec.structs.replace(begun(one, manifest, "h"), status="invalid").encoded())
+        Done(
+            one.id,
+            "done",
+            msgspec.structs.replace(begun(one, manifest, "h"), status="invalid").encoded(),
+        )
         for one in (SCENARIO, second)
     )
     fakes = (DiesIdle(Ready(), done), Fake(Ready(), ends=True), Fake(Ready(), again))
-    assert [one.status for one in all_pooled(tmp_path, (SCENARIO, second), *fakes)] == ["invalid", "invalid"]
+    assert [one.status for one in all_pooled(tmp_path, (SCENARIO, second), *fakes)] == [
+        "invalid",
+        "invalid",
+    ]
 
 
 class Ended(SharedRenderer):
     """A renderer whose end a test has prepared; None: it goes on."""
 
     def __init__(self, end: End | None) -> None:
-        self.at, self.end = RendererAt(address="nowhere", asks=True), end
+        self.at = RendererAt(address="nowhere", asks=True)
+        self.end = end
 
     def tend(self) -> None:
         """It has ended already."""
@@ -346,7 +437,8 @@ class Ended(SharedRenderer):
         """It does not count."""
 
 
-HUNG, DIED = End("the renderer process was ended", 60.0), End("the renderer process ended with exit code 7")
+HUNG = End("the renderer process was ended", 60.0)
+DIED = End("the renderer process ended with exit code 7")
 
 
 @pytest.mark.parametrize(
@@ -354,24 +446,46 @@ HUNG, DIED = End("the renderer process was ended", 60.0), End("the renderer proc
     [
         (DIED, "", 5, ""),
         (DIED, "act at 3.20 s", 1, ""),
-        (DIED, "act at 3.20 s", 2, "the renderer process ended with exit code 7, 2 times; see logs/ in the run folder"),
+        (
+            DIED,
+            "act at 3.20 s",
+            2,
+            "the renderer process ended with exit code 7, 2 times; see logs/ in the run folder",
+        ),
         (HUNG, "", 5, ""),
         (HUNG, "act at 3.20 s", 1, "policy 'stop' gave no answer for 60 s in act at 3.20 s of s-0"),
-        (None, "", 2, "the environment process lost its connection to the shared renderer, 2 times; see logs/ in the "),
+        (
+            None,
+            "",
+            2,
+            "the environment process lost its connection to the shared renderer, 2 times; "
+            "see logs/ in the ",
+        ),
     ],
-    ids=["died", "died-when-asked", "died-twice-when-asked", "hung", "hung-when-asked", "connection"],
+    ids=[
+        "died",
+        "died-when-asked",
+        "died-twice-when-asked",
+        "hung",
+        "hung-when-asked",
+        "connection",
+    ],
 )
 def test_an_episode_is_no_attempt_the_less_for_a_renderer_that_died_for_others(
     tmp_path: Path, end: End | None, asked: str, lost: int, reason: str
 ) -> None:
-    """It is run again as often as that happens; a policy that takes the renderer down when it is asked for the episode
-    has used up an attempt of it, and one that does not answer all of them."""
-    data = msgspec.structs.replace(begun(SCENARIO, load_policy("stop").manifest, "h"), status="invalid").encoded()
+    """It is run again as often as that happens; a policy that takes the renderer down when it is
+    asked for the episode has used up an attempt of it, and one that does not answer all of them."""
+    data = msgspec.structs.replace(
+        begun(SCENARIO, load_policy("stop").manifest, "h"), status="invalid"
+    ).encoded()
     losses = [LostRenderer("s-0", 1, asked)] * lost
     over = () if reason else (Done("s-0", "done", data),)
     fakes = Again(Ready(), *losses, *over)
     record = pooled(tmp_path, fakes, renderer=Ended(end))
-    assert record.status == ("crashed" if reason else "invalid") and record.reason.startswith(reason)
+    assert record.status == ("crashed" if reason else "invalid") and record.reason.startswith(
+        reason
+    )
 
 
 class Again(Fake):
@@ -386,14 +500,20 @@ class Again(Fake):
 
 def test_processes_that_never_come_up_end_the_run(tmp_path: Path) -> None:
     """Twice in a row: the machine's fault, told with the log."""
-    with pytest.raises(MachineError, match=r"ended with exit code 7 before it was ready, 2 times: see worker-0\.log"):
+    with pytest.raises(
+        MachineError,
+        match=r"ended with exit code 7 before it was ready, 2 times: see worker-0\.log",
+    ):
         pooled(tmp_path, Fake(ends=True), Fake(ends=True))
 
 
 def test_a_job_of_any_length_reaches_a_worker_that_listens_late() -> None:
-    """More than a socket holds is posted without waiting, and arrives whole, in order, as it is taken."""
+    """More than a socket holds is posted without waiting, and arrives whole, in order, as it is
+    taken."""
     ours, theirs = socket.socketpair()
-    run, worker, jobs = Wire(ours), Wire(theirs), [os.urandom(3_000_000), b"the next"]
+    run = Wire(ours)
+    worker = Wire(theirs)
+    jobs = [os.urandom(3_000_000), b"the next"]
     for job in jobs:
         run.post(job)
     heard: list[bytes] = []
@@ -408,10 +528,11 @@ def test_a_job_of_any_length_reaches_a_worker_that_listens_late() -> None:
 
 
 def test_half_a_message_keeps_nobody_waiting() -> None:
-    """Who is stopped in the middle of a message of megabytes is not waited for: what came whole is told, the rest when
-    it comes, and the end after all of it."""
+    """Who is stopped in the middle of a message of megabytes is not waited for: what came whole is
+    told, the rest when it comes, and the end after all of it."""
     ours, theirs = socket.socketpair()
-    wire, message = Wire(ours), os.urandom(3_000_000)
+    wire = Wire(ours)
+    message = os.urandom(3_000_000)
     framed = struct.pack("!I", len(message)) + message
     assert list(wire.received()) == []
     heard: list[bytes] = []
@@ -438,23 +559,36 @@ class Notes(Fake):
 
     def give(self, job: Job) -> None:
         self.given.append(job)
-        done = begun(job.scenario, load_policy("stop").manifest, "h", run_seed=job.options.seed or 0)
+        done = begun(
+            job.scenario, load_policy("stop").manifest, "h", run_seed=job.options.seed or 0
+        )
         self._messages = (*self._messages, Done(job.scenario.id, "crashed", done.encoded()))
 
 
 def test_a_policy_that_counts_its_episodes_does_not_learn_which_they_are(tmp_path: Path) -> None:
-    """A run goes through its scenarios in the order of the names that its policy is told: another one for each seed,
-    always the same for one. Every job carries the run's seed."""
+    """A run goes through its scenarios in the order of the names that its policy is told: another
+    one for each seed, always the same for one. Every job carries the run's seed."""
     suite = Suite(
-        name="s", version="1", scenarios=tuple(msgspec.structs.replace(SCENARIO, id=f"s-{i}") for i in range(8))
+        name="s",
+        version="1",
+        scenarios=tuple(msgspec.structs.replace(SCENARIO, id=f"s-{i}") for i in range(8)),
     )
     orders = {}
     for seed in (1, 2, 1):
-        folder, notes = tmp_path / f"{seed}-{len(orders)}", Notes()
+        folder = tmp_path / f"{seed}-{len(orders)}"
+        notes = Notes()
         spec = RunSpec(
-            suite="s", robots={"courier": "h"}, suite_version="1", suite_hash="h", policy="stop", policy_name="stop",
-            policy_version="1", scenarios=tuple(one.id for one in suite.scenarios), versions={}, seed=seed,
-        )  # fmt: skip
+            suite="s",
+            robots={"courier": "h"},
+            suite_version="1",
+            suite_hash="h",
+            policy="stop",
+            policy_name="stop",
+            policy_version="1",
+            scenarios=tuple(one.id for one in suite.scenarios),
+            versions={},
+            seed=seed,
+        )
         hello = Hello("stop", load_policy("stop").manifest, "")
         with RunFolder.create(folder, spec, suite) as held:
             pool.run_all(held, suite.scenarios, hello, Prepared(notes), tell=lambda _: None)

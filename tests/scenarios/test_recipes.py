@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-RECIPES = Path(__file__).parents[2] / "scenarios/many/recipes"
+RECIPES = Path(__file__).parents[2] / "scenarios/runs/recipes"
 
 
 def test_a_task_of_the_slurm_array_runs_its_shard_and_goes_on_with_it(tmp_path: Path) -> None:
@@ -20,10 +20,16 @@ def test_a_task_of_the_slurm_array_runs_its_shard_and_goes_on_with_it(tmp_path: 
     stub.chmod(0o755)
 
     def task(number: int) -> str:
-        given = {"SLURM_ARRAY_TASK_ID": f"{number}", "SLURM_ARRAY_TASK_COUNT": "3", "SLURM_CPUS_PER_TASK": "4"}
+        given = {
+            "SLURM_ARRAY_TASK_ID": f"{number}",
+            "SLURM_ARRAY_TASK_COUNT": "3",
+            "SLURM_CPUS_PER_TASK": "4",
+        }
         command = [RECIPES / "slurm-array.sh", "reactive", "orca", "7", "out", "--split", "test"]
         environment = os.environ | given | {"PATH": f"{stub.parent}:{os.environ['PATH']}"}
-        return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout
+        return subprocess.run(
+            command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+        ).stdout
 
     said = [task(number).split() for number in (1, 2, 3)]
     assert [words[words.index("--shard") + 1] for words in said] == ["1/3", "2/3", "3/3"]
@@ -40,16 +46,23 @@ def test_the_unit_of_a_worker_is_one_that_systemd_takes(tmp_path: Path) -> None:
     if (verify := shutil.which("systemd-analyze")) is None:
         pytest.skip("there is no systemd-analyze")
     unit = (RECIPES / "cosim-worker.service").read_text()
-    (tmp_path / "cosim-worker.service").write_text(unit.replace("/opt/cosim/.venv/bin/cosim", "/bin/true"))
-    done = subprocess.run([verify, "verify", tmp_path / "cosim-worker.service"], capture_output=True, text=True)
+    (tmp_path / "cosim-worker.service").write_text(
+        unit.replace("/opt/cosim/.venv/bin/cosim", "/bin/true")
+    )
+    done = subprocess.run(
+        [verify, "verify", tmp_path / "cosim-worker.service"], capture_output=True, text=True
+    )
     assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_the_recipe_for_kuberay_is_a_ray_job() -> None:
-    """Its kind, a head that runs no episodes, workers that do, and the command that a driver gives."""
+    """Its kind, a head that runs no episodes, workers that do, and the command that a driver
+    gives."""
     yaml = pytest.importorskip("yaml", reason="comes with Ray")
     job = yaml.safe_load((RECIPES / "kuberay.yaml").read_text())
     cluster = job["spec"]["rayClusterSpec"]
-    assert (job["apiVersion"], job["kind"]) == ("ray.io/v1", "RayJob") and "--on auto" in job["spec"]["entrypoint"]
+    assert (job["apiVersion"], job["kind"]) == ("ray.io/v1", "RayJob") and "--on auto" in job[
+        "spec"
+    ]["entrypoint"]
     assert cluster["headGroupSpec"]["rayStartParams"]["num-cpus"] == "0"
     assert cluster["workerGroupSpecs"][0]["template"]["spec"]["containers"]

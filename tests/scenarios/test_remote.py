@@ -1,4 +1,5 @@
-"""Policies that are served from an environment of their own, with nothing in it but what `policy_server.py` needs."""
+"""Policies that are served from an environment of their own, with nothing in it but what
+`policy_server.py` needs."""
 
 from __future__ import annotations
 
@@ -18,20 +19,20 @@ import pytest
 
 from cosim.core.errors import MachineError, PolicyServerLost
 from cosim.core.state import Command
-from cosim.episode.given import calibration_of
-from cosim.episode.ports import Observation
-from cosim.records.run_folder import read_records, read_spec
+from cosim.episode.interfaces import Observation
+from cosim.episode.manifest_checks import calibration_of
+from cosim.results.run_folder import read_records, read_spec
 from cosim.spec.connection import Connection
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.policy_host import PolicyHost
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import Scenario, Suite, write_suite
-from scenarios.checks import small_scenario
-from scenarios.execution import suite_run
-from scenarios.serving.remote import RemoteDriver, remote_driver
+from scenarios.runs import run as suite_run
+from scenarios.runs.remote_policy import RemoteDriver, remote_driver
+from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import PATIENCE_S, ROOT, Cosim, seed_in_order
-from tests.documents import blocks
-from tests.scenarios.isolated_policies import Honest
+from tests.support.documents import blocks
+from tests.support.isolated_policies import Honest
 
 SERVER = ROOT / "bridge" / "policy_server.py"
 OTHERS = ("python3.9", "python3.10", "python3.12", "python3.13", "python3.14")
@@ -51,15 +52,25 @@ def free_endpoint() -> str:
 
 
 def three_packages(folder: Path) -> list[str]:
-    """A Python that has nothing but the three packages that are needed. Returns how it is called."""
+    """A Python that has nothing but the three packages that are needed. Returns how it is
+    called."""
     beside = folder / "packages"
     beside.mkdir()
     site = Path(np.__file__).parents[1]
     for name in ("zenoh", "msgspec", "numpy", "numpy.libs"):
         if (site / name).exists():
             (beside / name).symlink_to(site / name)
-    start = f"import sys; sys.path[:0] = [{str(folder)!r}, {str(beside)!r}]; import runpy; sys.argv = sys.argv[1:]; "
-    return [sys.executable, "-I", "-S", "-c", start + "runpy.run_path(sys.argv[0], run_name='__main__')"]
+    start = (
+        f"import sys; sys.path[:0] = [{str(folder)!r}, {str(beside)!r}]; import runpy; sys.argv "
+        f"= sys.argv[1:]; "
+    )
+    return [
+        sys.executable,
+        "-I",
+        "-S",
+        "-c",
+        start + "runpy.run_path(sys.argv[0], run_name='__main__')",
+    ]
 
 
 @contextmanager
@@ -90,14 +101,19 @@ def seen_at(tick: int, driver: RemoteDriver) -> Observation:
     spec = driver.manifest.camera
     assert spec is not None
     rgb = np.zeros((spec.height, spec.width, 3), np.uint8)
-    return Observation(tick, tick / 20.0, rgb, 0.5, 0.0, COURIER, camera=calibration_of(spec, COURIER))
+    return Observation(
+        tick, tick / 20.0, rgb, 0.5, 0.0, COURIER, camera=calibration_of(spec, COURIER)
+    )
 
 
 def found(name: str, endpoint: str, printed: Path) -> RemoteDriver:
     """The driver of a policy, as soon as it is served."""
     for _ in range(int(PATIENCE_S / 10)):
         try:
-            return remote_driver(name, PolicyHost(servers=(Connection(role="coordinator", connect=endpoint),), run="r"))
+            return remote_driver(
+                name,
+                PolicyHost(servers=(Connection(role="coordinator", connect=endpoint),), run="r"),
+            )
         except MachineError:
             continue
     raise AssertionError(printed.read_text())
@@ -107,19 +123,25 @@ def pythons(request: pytest.FixtureRequest, folder: Path) -> Iterator[list[str]]
     """Environments to serve from: with --whole one of every other Python that there is."""
     yield three_packages(folder)
     for name in OTHERS if request.config.getoption("--whole") else ():
-        if (python := shutil.which(name)) is not None and not subprocess.run([python, "-V"], check=False).returncode:
+        if (python := shutil.which(name)) is not None and not subprocess.run(
+            [python, "-V"], check=False
+        ).returncode:
             subprocess.run([python, "-m", "venv", folder / name], check=True)
             subprocess.run([folder / name / "bin" / "pip", "install", "-q", *NEEDS], check=True)
-            yield [str(folder / name / "bin" / "python"), "-c", "import runpy, sys; sys.path.insert(0, '.'); "
-                   "runpy.run_path(sys.argv[1], run_name='__main__')"]  # fmt: skip
+            yield [
+                str(folder / name / "bin" / "python"),
+                "-c",
+                "import runpy, sys; sys.path.insert(0, '.'); "
+                "runpy.run_path(sys.argv[1], run_name='__main__')",
+            ]
 
 
 @pytest.mark.engine
 def test_the_example_of_the_documents_serves_from_a_clean_environment(
     tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
-    """At most ten lines, run as they are written but for the port, where there is no cosim: asked as any policy. With
-    --whole in every other Python from 3.9 on."""
+    """At most ten lines, run as they are written but for the port, where there is no cosim: asked
+    as any policy. With --whole in every other Python from 3.9 on."""
     assert len([line for line in example().splitlines() if line.strip()]) <= 10
     shutil.copy(SERVER, tmp_path)
     for python in pythons(request, tmp_path):
@@ -136,9 +158,20 @@ def test_the_example_of_the_documents_serves_from_a_clean_environment(
 def test_the_file_that_is_copied_can_be_read_by_python_3_9() -> None:
     """Its grammar is that of 3.9, and it imports nothing of ours."""
     module = ast.parse(SERVER.read_text(), feature_version=(3, 9))
-    names = {alias.name for node in ast.walk(module) if isinstance(node, ast.Import) for alias in node.names}
+    names = {
+        alias.name
+        for node in ast.walk(module)
+        if isinstance(node, ast.Import)
+        for alias in node.names
+    }
     names |= {node.module or "" for node in ast.walk(module) if isinstance(node, ast.ImportFrom)}
-    assert not {name.partition(".")[0] for name in names} & {"cosim", "scenarios", "bridge", "sumo_nets", "physics"}
+    assert not {name.partition(".")[0] for name in names} & {
+        "cosim",
+        "scenarios",
+        "bridge",
+        "sumo_nets",
+        "physics",
+    }
 
 
 def one_second(name: str) -> Scenario:
@@ -147,7 +180,8 @@ def one_second(name: str) -> Scenario:
 
 @pytest.mark.engine
 def test_nobody_waits_for_a_server_that_hangs_to_hear_of_the_end(tmp_path: Path) -> None:
-    """Its policy never answers: that the episode has ended is told, and what comes next is not held up."""
+    """Its policy never answers: that the episode has ended is told, and what comes next is not held
+    up."""
     shutil.copy(SERVER, tmp_path)
     shutil.copy(ROOT / "tests" / "bridge" / "served_policies.py", tmp_path)
     endpoint = free_endpoint()
@@ -156,7 +190,9 @@ def test_nobody_waits_for_a_server_that_hangs_to_hear_of_the_end(tmp_path: Path)
         with suppress(PolicyServerLost):
             driver.act(seen_at(0, driver))
 
-    with running([*three_packages(tmp_path), "served_policies.py", "Stuck", "stuck", endpoint], tmp_path):
+    with running(
+        [*three_packages(tmp_path), "served_policies.py", "Stuck", "stuck", endpoint], tmp_path
+    ):
         driver = found("zenoh:stuck", endpoint, tmp_path / "printed")
         driver.reset("k1", 1)
         asking = threading.Thread(target=asked, daemon=True)
@@ -172,26 +208,53 @@ def test_nobody_waits_for_a_server_that_hangs_to_hear_of_the_end(tmp_path: Path)
 
 
 @pytest.mark.engine
-def test_a_server_that_is_killed_loses_its_episode_which_is_run_again(tmp_path: Path, cosim: Cosim) -> None:
-    """kill -9 in the third question: another server drives it from its start, to the hash of a policy that drives in
-    the simulator's process; the second time the episode has crashed. Rows and run.json say `remote`, and the record how
-    long answers took. One that never answers has crashed at once."""
+def test_a_server_that_is_killed_loses_its_episode_which_is_run_again(
+    tmp_path: Path, cosim: Cosim
+) -> None:
+    """kill -9 in the third question: another server drives it from its start, to the hash of a
+    policy that drives in the simulator's process; the second time the episode has crashed. Rows and
+    run.json say `remote`, and the record how long answers took. One that never answers has crashed
+    at once."""
     shutil.copy(SERVER, tmp_path)
     shutil.copy(ROOT / "tests" / "bridge" / "served_policies.py", tmp_path)
-    suite = Suite(name="three", version="1", scenarios=(one_second("a"), one_second("b"), one_second("c")))
-    seed, endpoint = seed_in_order(suite.scenarios), free_endpoint()
+    suite = Suite(
+        name="three", version="1", scenarios=(one_second("a"), one_second("b"), one_second("c"))
+    )
+    seed = seed_in_order(suite.scenarios)
+    endpoint = free_endpoint()
     write_suite(suite, tmp_path / "three.json")
-    words = ("--policy", "zenoh:dying", "--policy-at", endpoint, "--seed", str(seed), "--out", "run")
-    with running([*three_packages(tmp_path), "served_policies.py", "Dying", "dying", endpoint], tmp_path):
+    words = (
+        "--policy",
+        "zenoh:dying",
+        "--policy-at",
+        endpoint,
+        "--seed",
+        str(seed),
+        "--out",
+        "run",
+    )
+    with running(
+        [*three_packages(tmp_path), "served_policies.py", "Dying", "dying", endpoint], tmp_path
+    ):
         found("zenoh:dying", endpoint, tmp_path / "printed").close()
         said = cosim("run", "three.json", *words, "--answer-timeout", "5", cwd=tmp_path)
     a, b, c = sorted(read_records(tmp_path / "run"), key=lambda record: record.scenario)
     here = suite_run.run(
-        Suite(name="three", version="1", scenarios=(one_second("a"),)), Honest(), options=EpisodeOptions(seed=seed)
+        Suite(name="three", version="1", scenarios=(one_second("a"),)),
+        Honest(),
+        options=EpisodeOptions(seed=seed),
     )
-    assert (a.status, [a.state_hash]) == ("done", here["state_hash"].tolist()), a.reason + said.stderr
+    assert (a.status, [a.state_hash]) == ("done", here["state_hash"].tolist()), (
+        a.reason + said.stderr
+    )
     assert b.status == "crashed" and "of policy 'dying' is gone, 2 times" in b.reason
-    assert c.status == "crashed" and "policy 'honest' gave no answer for 5 s in act at 0.50 s of c" in c.reason
+    assert (
+        c.status == "crashed"
+        and "policy 'honest' gave no answer for 5 s in act at 0.50 s of c" in c.reason
+    )
     assert a.policy_runs == b.policy_runs == read_spec(tmp_path / "run").policy_runs == "remote"
-    assert a.clock["answer_p95_ms"] >= a.clock["answer_median_ms"] > 0.0 and "policy remote" in said.stdout
+    assert (
+        a.clock["answer_p95_ms"] >= a.clock["answer_median_ms"] > 0.0
+        and "policy remote" in said.stdout
+    )
     assert said.returncode == 1 and (tmp_path / "thirds").stat().st_size == 5

@@ -21,24 +21,24 @@ from cosim.core.errors import SpecError
 from cosim.core.geometry import Floats, Polyline, wrap_angle
 from cosim.core.state import NOBODY, PERSON_RADIUS_M, People, PersonKind
 from cosim.people.gait import Strides
-from cosim.place.fences import outline
+from cosim.place.barriers import outline
 from cosim.place.street_map import Lane, StreetMap, Strip
 from cosim.spec.events import EventQuery, EventReply
 from cosim.spec.scenario import Barrier, City, CrowdSpec, Scenario
+from physics.ground.tiles import key_at
 from physics.people.clips import own_clips
 from physics.people.poses import poses
 from physics.street.furniture import footprints
 from physics.street.interaction_spots import spots
 from physics.street.placement import CLEAR_HALF_M
-from physics.world.street_surface import StreetSurface
-from physics.world.tiles import key_at
-from scenarios.catalog import load_suite, with_crowd
-from scenarios.residents.director import GONE_M, WITHIN_M, Residents
-from scenarios.residents.graph import OFF_WALK_M, BehaviorGraph, behavior_graph
-from scenarios.residents.resident import SPEED_MPS, STAYS_S, Resident
+from physics.street.street_surface import StreetSurface
+from scenarios.events.behaviour_graph import OFF_WALK_M, BehaviorGraph, behavior_graph
+from scenarios.events.resident import SPEED_MPS, STAYS_S, Resident
+from scenarios.events.resident_director import GONE_M, WITHIN_M, Residents
+from scenarios.suites.catalog import load_suite, with_crowd
 from sumo_nets.city.store import city_net
 from sumo_nets.crowd.demand import SIGHT_M
-from sumo_nets.net.netfile import read_net
+from sumo_nets.net.net_file import read_net
 from sumo_nets.net.snapshot import street_map_of
 
 SHARED = Path(os.environ.get("COSIM_SHARED", Path(__file__).parents[3] / "shared")) / "maps"
@@ -59,23 +59,40 @@ class Town(NamedTuple):
 
 @cache
 def town(seed: int, style: str = "mixed") -> Town:
-    """A small city, or the imported map, with a route along its longest sidewalk and a fence in the middle of it."""
+    """A small city, or the imported map, with a route along its longest sidewalk and a fence in the
+    middle of it."""
     if style == "imported":
         street_map = read_net(next(iter(sorted(IMPORTED.glob("*.net.xml.gz")))))
     else:
         street_map = street_map_of(city_net(City(seed=seed, size_m=400.0, style=style)))
-    longest = max((s for s in street_map.strips.values() if s.kind == "sidewalk"), key=lambda s: s.length_m)
+    longest = max(
+        (s for s in street_map.strips.values() if s.kind == "sidewalk"), key=lambda s: s.length_m
+    )
     line = Polyline(longest.line[:, :2])
     x, y, heading = line.at(0.5 * line.length_m)
-    fence = Barrier(x_m=x, y_m=y, heading_rad=heading, length_m=longest.width_m + 0.3, strip=longest.id, end=0)
+    fence = Barrier(
+        x_m=x, y_m=y, heading_rad=heading, length_m=longest.width_m + 0.3, strip=longest.id, end=0
+    )
     ground = StreetSurface(street_map, seed)
     route = tuple((float(px), float(py)) for px, py in line.points)
     graph = behavior_graph(street_map, ground, route, (fence,))
     around = LineString(route).buffer(80.0)
     x0, y0, x1, y1 = around.bounds
-    (i0, j0), (i1, j1) = key_at(x0, y0), key_at(x1, y1)
-    houses = [b.polygon for i in range(i0, i1 + 1) for j in range(j0, j1 + 1) for b in ground.buildings((i, j))]
-    return Town(street_map, route, (fence,), graph, (*footprints(ground.standing(around)), *houses, outline(fence)))
+    (i0, j0) = key_at(x0, y0)
+    (i1, j1) = key_at(x1, y1)
+    houses = [
+        b.polygon
+        for i in range(i0, i1 + 1)
+        for j in range(j0, j1 + 1)
+        for b in ground.buildings((i, j))
+    ]
+    return Town(
+        street_map,
+        route,
+        (fence,),
+        graph,
+        (*footprints(ground.standing(around)), *houses, outline(fence)),
+    )
 
 
 def towns() -> list[Town]:
@@ -96,11 +113,23 @@ class Nobody:
         return EventReply(episode=query.episode, tick=query.tick, states=(), actors=())
 
 
-def query(tick: int, x_m: float, y_m: float, heading_rad: float = 0.0, v_mps: float = 0.0) -> EventQuery:
+def query(
+    tick: int, x_m: float, y_m: float, heading_rad: float = 0.0, v_mps: float = 0.0
+) -> EventQuery:
     return EventQuery(
-        episode="t", tick=tick, tick_ms=TICK_MS, robot_x_m=x_m, robot_y_m=y_m, robot_heading_rad=heading_rad,
-        robot_v_mps=v_mps, robot_w_radps=0.0, route_s_m=0.0, robot_length_m=0.7, robot_width_m=0.55, events=(),
-    )  # fmt: skip
+        episode="t",
+        tick=tick,
+        tick_ms=TICK_MS,
+        robot_x_m=x_m,
+        robot_y_m=y_m,
+        robot_heading_rad=heading_rad,
+        robot_v_mps=v_mps,
+        robot_w_radps=0.0,
+        route_s_m=0.0,
+        robot_length_m=0.7,
+        robot_width_m=0.55,
+        events=(),
+    )
 
 
 class Moment(NamedTuple):
@@ -109,9 +138,13 @@ class Moment(NamedTuple):
     residents: tuple[Resident, ...]
 
 
-def lived(of: Town, seconds: float, seed: int = 7, count: int = 8, v_mps: float = 0.8) -> list[Moment]:
+def lived(
+    of: Town, seconds: float, seed: int = 7, count: int = 8, v_mps: float = 0.8
+) -> list[Moment]:
     """Residents around a robot that drives along the route, and two who stand in their way."""
-    line, shown, moments = Polyline(of.route), NOBODY, []
+    line = Polyline(of.route)
+    shown = NOBODY
+    moments = []
     still = of.graph.xy[[0, of.graph.waypoints // 2]]
     director = Residents(Nobody(), of.graph, count, seed, lambda: shown)
     for tick in range(round(seconds * 1000 / TICK_MS)):
@@ -133,7 +166,8 @@ def lived(of: Town, seconds: float, seed: int = 7, count: int = 8, v_mps: float 
 
 
 def test_waypoints_are_on_walkable_ground_and_clear_of_what_stands_there() -> None:
-    """In three cities and on an imported map, by a person's radius; so is every way between them."""
+    """In three cities and on an imported map, by a person's radius; so is every way between
+    them."""
     for one in towns():
         graph = one.graph
         assert graph.waypoints > 50 and np.isfinite(graph.xy).all()
@@ -143,9 +177,16 @@ def test_waypoints_are_on_walkable_ground_and_clear_of_what_stands_there() -> No
         assert shapely.distance(walk.boundary, points).min() > PERSON_RADIUS_M
         ends = arcs(graph)
         tree = shapely.STRtree(list(one.things))
-        for shape, gap_m in ((points, PERSON_RADIUS_M), (shapely.points(graph.xy), PERSON_RADIUS_M)):
+        for shape, gap_m in (
+            (points, PERSON_RADIUS_M),
+            (shapely.points(graph.xy), PERSON_RADIUS_M),
+        ):
             assert not len(tree.query(shape, predicate="dwithin", distance=gap_m)[0])
-        assert not len(tree.query(shapely.linestrings(ends), predicate="dwithin", distance=PERSON_RADIUS_M - 0.01)[0])
+        assert not len(
+            tree.query(
+                shapely.linestrings(ends), predicate="dwithin", distance=PERSON_RADIUS_M - 0.01
+            )[0]
+        )
 
 
 def test_no_way_leads_over_a_road_or_a_crossing() -> None:
@@ -153,10 +194,18 @@ def test_no_way_leads_over_a_road_or_a_crossing() -> None:
     for one in towns():
         lines = shapely.linestrings(arcs(one.graph))
         area = LineString(one.route).buffer(90.0)
-        roads = [p.polygon for p in one.map.near("lane", area) if isinstance(p, Lane) and p.kind == "road"]
+        roads = [
+            p.polygon
+            for p in one.map.near("lane", area)
+            if isinstance(p, Lane) and p.kind == "road"
+        ]
         assert not len(shapely.STRtree(roads).query(lines, predicate="intersects")[0])
-        crossings = [s for s in one.map.near("strip", area) if isinstance(s, Strip) and s.kind == "crossing"]
-        middles = [Point(Polyline(s.line[:, :2]).at(0.5 * s.length_m).xy).buffer(0.3) for s in crossings]
+        crossings = [
+            s for s in one.map.near("strip", area) if isinstance(s, Strip) and s.kind == "crossing"
+        ]
+        middles = [
+            Point(Polyline(s.line[:, :2]).at(0.5 * s.length_m).xy).buffer(0.3) for s in crossings
+        ]
         assert not len(shapely.STRtree(middles).query(lines, predicate="intersects")[0])
 
 
@@ -165,14 +214,18 @@ def test_nobody_passes_a_fence() -> None:
     one = town(*CITIES[0])
     (fence,) = one.barriers
     assert not shapely.intersects(outline(fence), shapely.linestrings(arcs(one.graph))).any()
-    ahead = (one.graph.xy - (fence.x_m, fence.y_m)) @ (math.cos(fence.heading_rad), math.sin(fence.heading_rad))
+    ahead = (one.graph.xy - (fence.x_m, fence.y_m)) @ (
+        math.cos(fence.heading_rad),
+        math.sin(fence.heading_rad),
+    )
     near = np.hypot(*(one.graph.xy - (fence.x_m, fence.y_m)).T) < 6.0
     assert (ahead[near] > 0.5).any() and (ahead[near] < -0.5).any()
 
 
 def test_who_does_something_faces_it_and_leaves_the_middle_free() -> None:
-    """A bench is behind who sits, a window before who looks into it, a road before who waits; 0.6 m to either side of
-    the middle of the sidewalk stay free, and nobody is farther than 1.2 m beside it."""
+    """A bench is behind who sits, a window before who looks into it, a road before who waits; 0.6 m
+    to either side of the middle of the sidewalk stay free, and nobody is farther than 1.2 m beside
+    it."""
     seen = set()
     for one in towns():
         area = LineString(one.route).buffer(90.0)
@@ -183,7 +236,11 @@ def test_who_does_something_faces_it_and_leaves_the_middle_free() -> None:
             if isinstance(s, Strip) and s.kind == "sidewalk"
         ]
         roads = shapely.union_all(
-            [p.polygon for p in one.map.near("lane", area.buffer(40.0)) if isinstance(p, Lane) and p.kind == "road"]
+            [
+                p.polygon
+                for p in one.map.near("lane", area.buffer(40.0))
+                if isinstance(p, Lane) and p.kind == "road"
+            ]
         )
         for spot in one.graph.spots:
             seen.add(spot.what)
@@ -196,9 +253,13 @@ def test_who_does_something_faces_it_and_leaves_the_middle_free() -> None:
                 assert off_rad < 1e-6 and math.dist(spot.at_m, (spot.x_m, spot.y_m)) < 2.5
             else:
                 cos, sin = math.cos(spot.heading_rad), math.sin(spot.heading_rad)
-                ahead = LineString([(spot.x_m, spot.y_m), (spot.x_m + 35.0 * cos, spot.y_m + 35.0 * sin)])
+                ahead = LineString(
+                    [(spot.x_m, spot.y_m), (spot.x_m + 35.0 * cos, spot.y_m + 35.0 * sin)]
+                )
                 assert ahead.intersects(roads)
-            assert min(at.distance(line) for line in middles) > CLEAR_HALF_M + PERSON_RADIUS_M - 1e-6
+            assert (
+                min(at.distance(line) for line in middles) > CLEAR_HALF_M + PERSON_RADIUS_M - 1e-6
+            )
             assert at.distance(walk) < OFF_WALK_M + 0.01
     assert seen == {"bench", "window", "stop"}
 
@@ -208,7 +269,9 @@ def test_where_no_shelter_stands_nobody_waits_for_a_bus() -> None:
     one = town(*CITIES[0])
     assert list(spots(one.map, (), ())) == []
     ground = StreetSurface(one.map, CITIES[0][0])
-    shelters = {p.id for p in ground.standing(LineString(one.route).buffer(90.0)) if p.kind == "shelter"}
+    shelters = {
+        p.id for p in ground.standing(LineString(one.route).buffer(90.0)) if p.kind == "shelter"
+    }
     assert {s.thing.rpartition("/")[0] for s in one.graph.spots if s.what == "stop"} <= shelters
 
 
@@ -219,15 +282,22 @@ def three_minutes() -> list[Moment]:
 
 
 def test_a_resident_walks_idles_and_does_something(three_minutes: list[Moment]) -> None:
-    """In three minutes all three states are seen; speeds and stays are those of the table, and who sits faces right."""
+    """In three minutes all three states are seen; speeds and stays are those of the table, and who
+    sits faces right."""
     one = town(*CITIES[0])
     moments = three_minutes
     states = {(r.number, r.phase) for m in moments for r in m.residents}
     assert {phase for _, phase in states} == {"walking", "idle", "interacting"}
-    assert sum(len({p for n, p in states if n == number}) >= 2 for number in {n for n, _ in states}) >= 4
+    assert (
+        sum(len({p for n, p in states if n == number}) >= 2 for number in {n for n, _ in states})
+        >= 4
+    )
     for moment in moments:
         for one_of in moment.residents:
-            assert SPEED_MPS[0] <= one_of.speed_mps <= SPEED_MPS[1] and one_of.shown_mps <= one_of.speed_mps + 1e-6
+            assert (
+                SPEED_MPS[0] <= one_of.speed_mps <= SPEED_MPS[1]
+                and one_of.shown_mps <= one_of.speed_mps + 1e-6
+            )
             assert one_of.stay_s <= max(high for _, high in STAYS_S.values())
             if one_of.phase == "interacting" and one_of.since_tick is not None:
                 spot = one.graph.spot(one_of.goal)
@@ -236,7 +306,8 @@ def test_a_resident_walks_idles_and_does_something(three_minutes: list[Moment]) 
 
 
 def test_speeds_are_those_of_the_motion(three_minutes: list[Moment]) -> None:
-    """In three minutes nobody's speed differs from what it moved in the tick, also of who treads to turn or to rise."""
+    """In three minutes nobody's speed differs from what it moved in the tick, also of who treads to
+    turn or to rise."""
     before: dict[str, Floats] = {}
     treads = 0
     for moment in three_minutes:
@@ -244,20 +315,32 @@ def test_speeds_are_those_of_the_motion(three_minutes: list[Moment]) -> None:
         here = dict(zip(people.ids, people.xy, strict=True))
         for name, speed, pace in zip(people.ids, people.speed, people.pace, strict=True):
             if name in before:
-                assert speed == pytest.approx(math.dist(before[name], here[name]) * 1000 / TICK_MS, abs=1e-6)
+                assert speed == pytest.approx(
+                    math.dist(before[name], here[name]) * 1000 / TICK_MS, abs=1e-6
+                )
             treads += speed == 0.0 and pace > 0.0
         before = here
     assert treads > 50
 
 
 def test_who_sits_down_and_gets_up_does_not_jump() -> None:
-    """From walking to sitting and back no joint's matrix changes by 0.55 in a tick: a jump would be 1 or more."""
-    one, clips, strides = town(*CITIES[1]), own_clips(), Strides(TICK_MS / 1000)
+    """From walking to sitting and back no joint's matrix changes by 0.55 in a tick: a jump would be
+    1 or more."""
+    one = town(*CITIES[1])
+    clips = own_clips()
+    strides = Strides(TICK_MS / 1000)
     moments = lived(one, 240.0, v_mps=0.1)
-    sat = {r.number for m in moments for r in m.residents if r.doing == "sit" and r.phase == "interacting"}
+    sat = {
+        r.number
+        for m in moments
+        for r in m.residents
+        if r.doing == "sit" and r.phase == "interacting"
+    }
     walked = {r.number for m in moments for r in m.residents if r.phase == "walking"}
     name = f"n{min(sat & walked)}"
-    before, largest, did = None, 0.0, set()
+    before = None
+    largest = 0.0
+    did = set()
     for moment in moments:
         row = np.array([i for i, who in enumerate(moment.people.ids) if who == name], dtype=np.intp)
         person = moment.people.only(row)
@@ -273,8 +356,8 @@ def test_who_sits_down_and_gets_up_does_not_jump() -> None:
 
 
 def test_residents_keep_out_of_things_people_and_the_robot() -> None:
-    """75 seconds in each of two cities beside a robot that drives: never in a prop or house by a disk's radius, never
-    within 0.45 m of somebody, never within the robot's outline."""
+    """75 seconds in each of two cities beside a robot that drives: never in a prop or house by a
+    disk's radius, never within 0.45 m of somebody, never within the robot's outline."""
     for city in CITIES[:2]:
         one = town(*city)
         tree = shapely.STRtree(list(one.things))
@@ -282,7 +365,11 @@ def test_residents_keep_out_of_things_people_and_the_robot() -> None:
             if not len(moment.people) > 2:
                 continue
             xy = moment.people.xy[2:]
-            assert not len(tree.query(shapely.points(xy), predicate="dwithin", distance=PERSON_RADIUS_M - 0.01)[0])
+            assert not len(
+                tree.query(
+                    shapely.points(xy), predicate="dwithin", distance=PERSON_RADIUS_M - 0.01
+                )[0]
+            )
             gap = np.hypot(*(moment.people.xy[:, None] - xy[None]).transpose(2, 0, 1))
             gap[np.arange(2, len(gap)), np.arange(len(xy))] = np.inf
             assert gap.min() > 0.43
@@ -291,7 +378,8 @@ def test_residents_keep_out_of_things_people_and_the_robot() -> None:
 
 
 def test_they_come_and_go_out_of_sight() -> None:
-    """After the first tick nobody appears within 35 m of the robot, beyond 60 m, or vanishes within 70 m."""
+    """After the first tick nobody appears within 35 m of the robot, beyond 60 m, or vanishes within
+    70 m."""
     moments = lived(town(*CITIES[1]), 150.0, v_mps=1.5)
     before: dict[int, Resident] = {r.number: r for r in moments[0].residents}
     assert before
@@ -306,10 +394,16 @@ def test_they_come_and_go_out_of_sight() -> None:
 
 
 def test_the_same_seed_lives_the_same_life_in_another_process() -> None:
-    """Positions of every tick are the same bits, under another salt of Python's hashes; another seed differs."""
+    """Positions of every tick are the same bits, under another salt of Python's hashes; another
+    seed differs."""
     code = "from tests.scenarios.test_residents import trace; print(trace(7))"
-    environment = os.environ | {"PYTHONHASHSEED": "321", "PYTHONPATH": str(Path(__file__).parents[2])}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    environment = os.environ | {
+        "PYTHONHASHSEED": "321",
+        "PYTHONPATH": str(Path(__file__).parents[2]),
+    }
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment
+    )
     assert done.stdout.split()[-1] == trace(7) != trace(8)
 
 
@@ -322,7 +416,8 @@ def trace(seed: int) -> str:
 
 
 def test_a_crowd_without_residents_is_what_it_was() -> None:
-    """Specs that do not ask for residents keep their hashes; those that do, come back from their file."""
+    """Specs that do not ask for residents keep their hashes; those that do, come back from their
+    file."""
     shipped = load_suite("long-horizon")
     settled = with_crowd(shipped, residents=8)
     assert settled.version != shipped.version and settled.content_hash != shipped.content_hash
@@ -335,15 +430,16 @@ def test_a_crowd_without_residents_is_what_it_was() -> None:
 
 @pytest.mark.engine
 def test_an_episode_with_residents_is_replayed_and_compared() -> None:
-    """They are among the people, the replay has the recorded state hash, and so has the counterfactual's."""
+    """They are among the people, the replay has the recorded state hash, and so has the
+    counterfactual's."""
     from cosim.episode.step import Step
-    from cosim.judge.referee import Verdict
     from cosim.place.walk_graph import WalkGraph
     from cosim.policies.load import load_policy
-    from scenarios.builders.long_horizon import build_long_horizon
-    from scenarios.execution.places import place
-    from scenarios.execution.replay import Recorded, compared
-    from scenarios.execution.run import run_episode
+    from cosim.results.referee import Verdict
+    from scenarios.episodes.replay import Recorded, compared
+    from scenarios.episodes.run_episode import run_episode
+    from scenarios.places.nets import place
+    from scenarios.suites.long_horizon import build_long_horizon
 
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)

@@ -1,4 +1,5 @@
-"""A third robot, larger and slower than the shipped ones, made here of a row and a URDF: everything follows it."""
+"""A third robot, larger and slower than the shipped ones, made here of a row and a URDF: everything
+follows it."""
 
 from __future__ import annotations
 
@@ -18,36 +19,38 @@ from cosim.core.errors import RunError, SpecError, UsageError
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import NO_VEHICLES, NOBODY, Command, People, RobotState, Signal, Street
 from cosim.episode.control import command_of
-from cosim.episode.driver import Driver
-from cosim.episode.ports import CameraSpec, Manifest, Observation, Privileged, WaypointRule
-from cosim.place.fences import fenced
+from cosim.episode.interfaces import Observation, Privileged
+from cosim.episode.policy_caller import Driver
+from cosim.place.barriers import fenced
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies import POLICIES
-from cosim.policies.body import BodyDisks
-from cosim.policies.clearance import Clearance
-from cosim.policies.foresight import STEP_S, Plans, Way, foresee
-from cosim.policies.groups import lines
-from cosim.policies.orca import Here, lane_past
-from cosim.policies.route import best_lane, crossing_limit
-from cosim.policies.social_force import bodies_m
-from cosim.records.run_folder import RunFolder
-from cosim.records.run_spec import RunSpec
+from cosim.policies.privileged.distance_field import Clearance
+from cosim.policies.privileged.orca import Here, lane_past
+from cosim.policies.privileged.robot_disks import BodyDisks
+from cosim.policies.privileged.rollout import STEP_S, Plans, Way, foresee
+from cosim.policies.privileged.route import best_lane, crossing_limit
+from cosim.policies.privileged.social_force import bodies_m
+from cosim.policies.privileged.standing_groups import lines
+from cosim.results.run_folder import RunFolder
+from cosim.results.run_spec import RunSpec
 from cosim.spec import robot as table
+from cosim.spec.camera import CameraSpec
+from cosim.spec.manifest import Manifest, WaypointRule
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import COURIER, ROBOTS, SCOUT, Mount, Robot, Skid
 from cosim.spec.scenario import Suite, content_hash
 from physics.cameras.view import robot_shot
+from physics.dynamics.drive import SkidDrive
 from physics.robots import hash_of_robot, urdf_of
-from physics.world.drive import SkidDrive
-from physics.world.street_surface import StreetSurface
-from scenarios.builders.fits import misfits
-from scenarios.catalog import load_suite, with_robot
-from scenarios.checks import small_scenario
-from scenarios.execution.places import place
-from scenarios.execution.suite_run import run, run_spec
+from physics.street.street_surface import StreetSurface
+from scenarios.places.nets import place
+from scenarios.runs.run import run, run_spec
+from scenarios.suites.catalog import load_suite, with_robot
+from scenarios.suites.fits import misfits
+from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import Cosim
 from tests.spec.test_fits import barrier, crossroads, from_west_to_east
-from tests.tiny_street import tiny_map
+from tests.support.tiny_street import tiny_map
 
 BARROW = Robot(
     name="barrow",
@@ -107,11 +110,15 @@ class Seeing:
 EVERY = pytest.mark.parametrize("robot", [*ROBOTS.values(), BARROW], ids=[*ROBOTS, "barrow"])
 
 
-def seen(robot: Robot, others: People = NOBODY, heading_rad: float = 0.0, v_mps: float = 0.0) -> Observation:
+def seen(
+    robot: Robot, others: People = NOBODY, heading_rad: float = 0.0, v_mps: float = 0.0
+) -> Observation:
     """A robot on a straight route along the x axis; the walkway is free 1.7 m to either side."""
     state = RobotState(Pose(5.0, 0.0, heading_rad), v_mps)
     free = box(-2.0, -1.7, 60.0, 1.7)
-    known = Privileged(state, Polyline([(0.0, 0.0), (50.0, 0.0)]), 5.0, others, NO_VEHICLES, {}, (), free)
+    known = Privileged(
+        state, Polyline([(0.0, 0.0), (50.0, 0.0)]), 5.0, others, NO_VEHICLES, {}, (), free
+    )
     return Observation(0, 0.0, None, v_mps, 0.0, robot, known)
 
 
@@ -121,9 +128,13 @@ def standing(x_m: float, y_m: float) -> People:
 
 @EVERY
 def test_the_disks_that_policies_plan_with_hold_the_robot(robot: Robot) -> None:
-    """Every point of its outline lies in the two disks of its body and in the one around it, and these are tight."""
-    disks, (half_m, aside_m) = BodyDisks.of(robot), (robot.length_m / 2, robot.width_m / 2)
-    edge = np.array(shapely.box(-half_m, -aside_m, half_m, aside_m).segmentize(0.01).exterior.coords)
+    """Every point of its outline lies in the two disks of its body and in the one around it, and
+    these are tight."""
+    disks = BodyDisks.of(robot)
+    (half_m, aside_m) = (robot.length_m / 2, robot.width_m / 2)
+    edge = np.array(
+        shapely.box(-half_m, -aside_m, half_m, aside_m).segmentize(0.01).exterior.coords
+    )
     away = np.abs(np.abs(edge) - (disks.nose_m, 0.0))
     assert np.hypot(*away.T).max() <= disks.radius_m < np.hypot(half_m / 2, aside_m) + 0.02
     assert np.hypot(*edge.T).max() <= disks.around_m < math.hypot(half_m, aside_m) + 0.02
@@ -131,8 +142,14 @@ def test_the_disks_that_policies_plan_with_hold_the_robot(robot: Robot) -> None:
 
 @EVERY
 def test_policies_travel_at_their_robots_pace_and_turn_as_it_can(robot: Robot) -> None:
-    """Alone on a straight way each takes up its share of the pace; off its way it turns as fast as the robot can."""
-    paces = {"route": 1.0, "orca": 28 / 30, "straight": 4 / 5, "social_force": min(1.0, 1.34 / robot.cruise_mps)}
+    """Alone on a straight way each takes up its share of the pace; off its way it turns as fast as
+    the robot can."""
+    paces = {
+        "route": 1.0,
+        "orca": 28 / 30,
+        "straight": 4 / 5,
+        "social_force": min(1.0, 1.34 / robot.cruise_mps),
+    }
     for name, share in paces.items():
         policy = POLICIES[name]()
         policy.reset("t", 0)
@@ -140,7 +157,9 @@ def test_policies_travel_at_their_robots_pace_and_turn_as_it_can(robot: Robot) -
         assert command.v_mps == pytest.approx(share * robot.cruise_mps, rel=1e-3), name
         policy.reset("t", 0)
         turned = policy.act(seen(robot, heading_rad=-1.0))
-        assert isinstance(turned, Command) and (name == "straight" or turned.w_radps == robot.w_max_radps), name
+        assert isinstance(turned, Command) and (
+            name == "straight" or turned.w_radps == robot.w_max_radps
+        ), name
 
 
 @EVERY
@@ -162,12 +181,18 @@ def test_a_wider_robot_keeps_farther_from_who_stands_and_a_longer_one_stops_earl
         known = seen(small, beside).privileged
         assert known is not None
         here = Here(Way(known.route), known.route_s_m, Clearance(known.free, known.route))
-        lanes = [lane_past(known, BodyDisks.of(one), here, lines(beside), 0.0) for one in (small, large)]
+        lanes = [
+            lane_past(known, BodyDisks.of(one), here, lines(beside), 0.0) for one in (small, large)
+        ]
         assert lanes[1] < lanes[0] == 0.0
         offsets = [best_lane(known, one, 0.0, patient=True)[0] for one in (small, large)]
         assert offsets[1] < offsets[0] == 0.0
-        assert bodies_m(large) - bodies_m(small) == pytest.approx((large.length_m - small.length_m) / 2)
-        red = dataclasses.replace(known, crossings=(("c", 7.0, 12.0),), signals={"c": Signal(False, 30.0)})
+        assert bodies_m(large) - bodies_m(small) == pytest.approx(
+            (large.length_m - small.length_m) / 2
+        )
+        red = dataclasses.replace(
+            known, crossings=(("c", 7.0, 12.0),), signals={"c": Signal(False, 30.0)}
+        )
         assert crossing_limit(red, large) < crossing_limit(red, small)
 
 
@@ -181,15 +206,20 @@ def test_answers_are_clipped_to_the_robot_that_drives() -> None:
 @EVERY
 def test_motors_ramp_as_the_row_says(robot: Robot) -> None:
     """Wheels reach a speed after as long as the acceleration takes, and every joint is told one."""
-    drive, dt_s = SkidDrive(robot), 0.005
+    drive = SkidDrive(robot)
+    dt_s = 0.005
     for k in range(1, 40):
         speeds = drive.joint_speeds(Command(robot.v_max_mps, 0.0), 0.0, dt_s)
-        assert speeds == pytest.approx([k * dt_s * robot.acceleration_mps2 / robot.drive.wheel_radius_m] * 4)
+        assert speeds == pytest.approx(
+            [k * dt_s * robot.acceleration_mps2 / robot.drive.wheel_radius_m] * 4
+        )
 
 
 def test_a_camera_sits_where_its_robot_carries_it(barrow: Robot) -> None:
-    """The same policy sees from another height on each robot; a mount may be named, or be a place on any robot."""
-    surface, state = StreetSurface(tiny_map(), 1), RobotState(Pose(-40.0, 100.0, 0.0))
+    """The same policy sees from another height on each robot; a mount may be named, or be a place
+    on any robot."""
+    surface = StreetSurface(tiny_map(), 1)
+    state = RobotState(Pose(-40.0, 100.0, 0.0))
     for robot in (COURIER, SCOUT, barrow):
         eye_m = robot_shot(surface, robot, CameraSpec(), state).eye_m - (-40.0, 100.0, 0.0)
         assert eye_m == pytest.approx(robot.mounts["front"].at_m)
@@ -202,30 +232,44 @@ def test_a_camera_sits_where_its_robot_carries_it(barrow: Robot) -> None:
 
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=lambda robot: robot.name)
 def test_the_mounts_of_a_robot_are_on_it(robot: Robot) -> None:
-    """Every robot has "front"; each mount is over the robot's outline and within reach of a mast, and one on the left
-    looks to the left: its eye and its heading are those of the row."""
-    surface, state = StreetSurface(tiny_map(), 1), RobotState(Pose(-40.0, 100.0, 0.3))
+    """Every robot has "front"; each mount is over the robot's outline and within reach of a mast,
+    and one on the left looks to the left: its eye and its heading are those of the row."""
+    surface = StreetSurface(tiny_map(), 1)
+    state = RobotState(Pose(-40.0, 100.0, 0.3))
     assert "front" in robot.mounts
     for name, mount in robot.mounts.items():
         x_m, y_m, z_m = mount.at_m
-        assert abs(x_m) <= robot.length_m / 2 and abs(y_m) <= robot.width_m / 2 and 0.1 < z_m <= 1.2, name
+        assert (
+            abs(x_m) <= robot.length_m / 2 and abs(y_m) <= robot.width_m / 2 and 0.1 < z_m <= 1.2
+        ), name
         taken = robot_shot(surface, robot, CameraSpec(mount=name), state)
         assert taken.view.heading_rad == pytest.approx(0.3 + math.radians(mount.yaw_left_deg)), name
         assert math.degrees(taken.steep_rad) == pytest.approx(mount.pitch_down_deg), name
         assert (mount.yaw_left_deg > 0) == (y_m > 0) == (name == "left")
 
 
-def test_a_mount_that_the_robot_lacks_is_refused_before_anything_runs(barrow: Robot, tmp_path: Path) -> None:
-    """No episode crashes over it, no folder is made; with the robot that has it the run may begin."""
+def test_a_mount_that_the_robot_lacks_is_refused_before_anything_runs(
+    barrow: Robot, tmp_path: Path
+) -> None:
+    """No episode crashes over it, no folder is made; with the robot that has it the run may
+    begin."""
     policy = Seeing()
     for name in ("courier", "scout"):
         mounts = ", ".join(sorted(ROBOTS[name].mounts))
         said = f"unknown camera mount of robot '{name}' 'rail'. Valid choices: {mounts}."
         with pytest.raises(UsageError, match=re.escape(said)):
-            run("reactive", policy, episodes=1, out=tmp_path / "run", options=EpisodeOptions(robot=name))
+            run(
+                "reactive",
+                policy,
+                episodes=1,
+                out=tmp_path / "run",
+                options=EpisodeOptions(robot=name),
+            )
     assert not (tmp_path / "run").exists()
     whole = with_robot(load_suite("reactive"), barrow.name)
-    spec = run_spec(whole, whole.scenarios[:1], "p", Driver.of(policy), EpisodeOptions(camera="bullet"))
+    spec = run_spec(
+        whole, whole.scenarios[:1], "p", Driver.of(policy), EpisodeOptions(camera="bullet")
+    )
     assert spec.robots == {"barrow": hash_of_robot(barrow)}
 
 
@@ -240,40 +284,64 @@ def test_a_barrier_stands_across_the_route_of_a_wider_robot(barrow: Robot) -> No
 
 
 def test_another_robot_is_another_suite_and_another_run(tmp_path: Path) -> None:
-    """Version and hashes tell; the suite's own robot changes nothing; a run is not resumed with another robot."""
+    """Version and hashes tell; the suite's own robot changes nothing; a run is not resumed with
+    another robot."""
     shipped = load_suite("long-horizon")
     whole = with_robot(shipped, "scout")
-    assert (whole.version, {s.robot for s in whole.scenarios}) == (f"{shipped.version}-scout", {"scout"})
+    assert (whole.version, {s.robot for s in whole.scenarios}) == (
+        f"{shipped.version}-scout",
+        {"scout"},
+    )
     assert whole.content_hash != shipped.content_hash
     assert content_hash(whole.scenarios[0]) != content_hash(shipped.scenarios[0])
     assert with_robot(shipped, "courier") is with_robot(shipped, "") is shipped
     spec = RunSpec(
-        suite="s", robots={"courier": "h"}, suite_version="1", suite_hash="h", policy="p", policy_name="p",
-        policy_version="1", scenarios=(), versions={},
-    )  # fmt: skip
+        suite="s",
+        robots={"courier": "h"},
+        suite_version="1",
+        suite_hash="h",
+        policy="p",
+        policy_name="p",
+        policy_version="1",
+        scenarios=(),
+        versions={},
+    )
     with RunFolder.create(tmp_path / "run", spec, Suite(name="s", version="1", scenarios=())):
         pass
-    with pytest.raises(RunError, match=r"its robots is \{'courier': 'h', 'scout': None\}, now asked"):
-        RunFolder.resume(tmp_path / "run", msgspec.structs.replace(spec, robots={"scout": "h"}, suite_hash="other"))
+    with pytest.raises(
+        RunError, match=r"its robots is \{'courier': 'h', 'scout': None\}, now asked"
+    ):
+        RunFolder.resume(
+            tmp_path / "run",
+            msgspec.structs.replace(spec, robots={"scout": "h"}, suite_hash="other"),
+        )
 
 
 def test_an_edited_robot_is_another_one(barrow: Robot, tmp_path: Path) -> None:
-    """A number of its row and a word of its URDF are in its hash, which a resumed run is held against."""
+    """A number of its row and a word of its URDF are in its hash, which a resumed run is held
+    against."""
     again = dataclasses.replace(barrow, urdf=str(tmp_path / "again.urdf"))
     Path(again.urdf).write_bytes(urdf_of(barrow).read_bytes())
     as_it_was = hash_of_robot(again)
     assert (
-        hash_of_robot(dataclasses.replace(again, v_max_mps=again.v_max_mps + 0.1)) != as_it_was == hash_of_robot(again)
+        hash_of_robot(dataclasses.replace(again, v_max_mps=again.v_max_mps + 0.1))
+        != as_it_was
+        == hash_of_robot(again)
     )
     Path(again.urdf).write_bytes(urdf_of(barrow).read_bytes() + b"<!-- heavier -->")
     assert hash_of_robot(again) != as_it_was
 
 
-def test_a_robot_that_is_not_there_is_refused_with_those_that_are(cosim: Cosim, tmp_path: Path) -> None:
+def test_a_robot_that_is_not_there_is_refused_with_those_that_are(
+    cosim: Cosim, tmp_path: Path
+) -> None:
     """By `run` and `look`, before anything is read or written; `list` names them."""
     for words in (("run", "reactive", "--out", "run"), ("look", "lh-011-00")):
         said = cosim(*words, "--robot", "tank", cwd=tmp_path)
-        assert said.returncode == 2 and "unknown robot 'tank'. Valid choices: courier, scout." in said.stderr
+        assert (
+            said.returncode == 2
+            and "unknown robot 'tank'. Valid choices: courier, scout." in said.stderr
+        )
     assert not list(tmp_path.iterdir())
     assert "robot   scout  0.50 x 0.40 m, travels at 2 m/s" in cosim("list").stdout
 
@@ -281,13 +349,16 @@ def test_a_robot_that_is_not_there_is_refused_with_those_that_are(cosim: Cosim, 
 @pytest.mark.engine
 @pytest.mark.parametrize("name", [*ROBOTS, "barrow"])
 def test_a_urdf_is_as_its_row_says(name: str, barrow: Robot) -> None:
-    """Its collision body fills the outline, its wheels stand where they should, its mass is where it should be."""
-    from physics.world.bullet import p
+    """Its collision body fills the outline, its wheels stand where they should, its mass is where
+    it should be."""
+    from physics.dynamics.bullet import p
 
     robot = table.robot_called(name)
     client = p.connect(p.DIRECT)
     try:
-        body = p.loadURDF(str(urdf_of(robot)), flags=p.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client)
+        body = p.loadURDF(
+            str(urdf_of(robot)), flags=p.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client
+        )
         infos = [p.getJointInfo(body, j, client) for j in range(p.getNumJoints(body, client))]
         (x, y, z), _ = p.getBasePositionAndOrientation(body, client)
         bounds = np.array([p.getAABB(body, link, client) for link in range(-1, len(infos))])
@@ -311,29 +382,40 @@ def test_a_urdf_is_as_its_row_says(name: str, barrow: Robot) -> None:
 @pytest.mark.engine
 @pytest.mark.parametrize("name", [*ROBOTS, "barrow"])
 def test_every_robot_reaches_its_limits_upright(name: str, barrow: Robot) -> None:
-    """At its pace, at its highest speed in a curve, and turning on the spot: within 5 % of the command."""
-    from physics.world.world import BulletWorld
+    """At its pace, at its highest speed in a curve, and turning on the spot: within 5 % of the
+    command."""
+    from physics.dynamics.world import BulletWorld
 
     robot = table.robot_called(name)
     empty = Street(0)
     with BulletWorld(StreetSurface(tiny_map(), 1), robot=robot) as world:
-        for v_mps, w_radps in ((robot.cruise_mps, 0.0), (robot.v_max_mps, robot.w_max_radps), (0.0, robot.w_max_radps)):
+        for v_mps, w_radps in (
+            (robot.cruise_mps, 0.0),
+            (robot.v_max_mps, robot.w_max_radps),
+            (0.0, robot.w_max_radps),
+        ):
             world.place(Pose(-40.0, 100.0, 0.0))
-            states = [world.step(Command(v_mps, w_radps), empty, empty, 10).robot for _ in range(70)][40:]
+            states = [
+                world.step(Command(v_mps, w_radps), empty, empty, 10).robot for _ in range(70)
+            ][40:]
             assert np.mean([s.v_mps for s in states]) == pytest.approx(v_mps, rel=0.05, abs=0.02)
-            assert np.mean([s.w_radps for s in states]) == pytest.approx(w_radps, rel=0.05, abs=0.01)
+            assert np.mean([s.w_radps for s in states]) == pytest.approx(
+                w_radps, rel=0.05, abs=0.01
+            )
             assert max(s.tilt_rad for s in states) < 0.03
 
 
 @pytest.mark.engine
 def test_a_third_robot_runs_an_episode_and_everything_follows_it(barrow: Robot) -> None:
-    """Two seconds in a small city, by an option: what engines, referee and policy know of the robot is the row."""
+    """Two seconds in a small city, by an option: what engines, referee and policy know of the robot
+    is the row."""
     import libsumo
 
-    from scenarios.execution.episode import Episode
+    from scenarios.episodes.episode import Episode
 
     scenario = msgspec.structs.replace(small_scenario(), time_limit_s=2.0)
-    manifest, stages = Manifest("mine", rate_hz=10.0, camera=None, privileged=True), []
+    manifest = Manifest("mine", rate_hz=10.0, camera=None, privileged=True)
+    stages = []
     options = EpisodeOptions(robot="barrow")
     policy = POLICIES["route"]()
     with Episode(scenario, manifest, options, through=stages.append) as episode:
@@ -345,12 +427,18 @@ def test_a_third_robot_runs_an_episode_and_everything_follows_it(barrow: Robot) 
         assert known is not None
         _, street_map = place(scenario.place)
         near = shapely.buffer(LineString(scenario.route), 5.0)
-        walkable, free = street_map.walkable_near(shapely.buffer(near, 5.0)), shapely.intersection(known.free, near)
-        assert walkable.covers(shapely.buffer(free, 0.39)) and not walkable.covers(shapely.buffer(free, 0.45))
+        walkable = street_map.walkable_near(shapely.buffer(near, 5.0))
+        free = shapely.intersection(known.free, near)
+        assert walkable.covers(shapely.buffer(free, 0.39)) and not walkable.covers(
+            shapely.buffer(free, 0.45)
+        )
         while not episode.over:
             observation = episode.advance(policy.act(observation))
         record, log = episode.result()
-    assert (record.robot, record.scenario_hash) == ("barrow", content_hash(scenario.driven_by("barrow")))
+    assert (record.robot, record.scenario_hash) == (
+        "barrow",
+        content_hash(scenario.driven_by("barrow")),
+    )
     v_mps = log.speed[:, 0]
     assert np.diff(v_mps[5:]).max() < 1.1 * barrow.acceleration_mps2 * log.tick_s
     assert 0.7 < v_mps.max() < 1.1 * barrow.cruise_mps
@@ -361,8 +449,9 @@ def test_a_third_robot_runs_an_episode_and_everything_follows_it(barrow: Robot) 
 def test_the_one_way_is_proved_for_the_robot_that_shall_drive_it(
     barrow: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A way built for the third robot is wide enough for it; for one as wide as the sidewalks there is none."""
-    from scenarios.builders import long_horizon
+    """A way built for the third robot is wide enough for it; for one as wide as the sidewalks there
+    is none."""
+    from scenarios.suites import long_horizon
 
     where = small_scenario().place
     _, street_map = place(where)

@@ -16,29 +16,37 @@ from cosim.core.clock import Clock
 from cosim.core.errors import SpecError, UsageError
 from cosim.core.geometry import Polyline
 from cosim.core.state import NO_VEHICLES, NOBODY, RobotState, Street
-from cosim.episode.driver import Driver
+from cosim.episode.interfaces import Privileged
 from cosim.episode.loop import Moment, query
-from cosim.episode.ports import Privileged
-from cosim.place.fences import fenced
+from cosim.episode.policy_caller import Driver
+from cosim.place.barriers import barrier_at, branches, fenced, prove_single_path
 from cosim.place.route_line import way_line
 from cosim.place.street_map import Corner, Lane, Port, StreetMap, Strip, WalkableArea
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies import POLICIES
 from cosim.spec.events import Event, EventQuery
 from cosim.spec.robot import COURIER, ROBOTS, Robot
-from cosim.spec.scenario import Barrier, City, CityMap, RouteCrossing, Scenario, content_hash, read_suite, write_suite
+from cosim.spec.scenario import (
+    Barrier,
+    City,
+    CityMap,
+    RouteCrossing,
+    Scenario,
+    content_hash,
+    read_suite,
+    write_suite,
+)
 from cosim.spec.selection import scenarios_chosen
-from scenarios.builders import long_horizon, unit
-from scenarios.builders.barriers import barrier_at, branches, prove_single_path
-from scenarios.builders.drawing import thinned
-from scenarios.builders.long_horizon import build_long_horizon, on_car_paths_m, on_road_m
-from scenarios.builders.proofs import read_proofs
-from scenarios.builders.sample import suite_on_map
-from scenarios.builders.unit import build_unit
-from scenarios.catalog import SUITES, load_suite
 from scenarios.events import EVENT_KINDS, react
-from scenarios.execution.places import place
-from sumo_nets.maps.mapstore import read_map
+from scenarios.places.nets import place
+from scenarios.suites import long_horizon, unit
+from scenarios.suites.catalog import SUITES, load_suite
+from scenarios.suites.drawing import thinned
+from scenarios.suites.long_horizon import build_long_horizon, on_car_paths_m, on_road_m
+from scenarios.suites.proofs import read_proofs
+from scenarios.suites.sample import suite_on_map
+from scenarios.suites.unit import build_unit
+from sumo_nets.maps.map_store import read_map
 
 LONG = load_suite("long-horizon").scenarios
 
@@ -51,17 +59,22 @@ def test_the_long_horizon_suite_is_what_it_promises() -> None:
     assert abs(sum(s.route_line.length_m for s in whole.scenarios) - 36_500.0) < 365.0
     for scenario in whole.scenarios:
         assert scenario.route_line.length_m > 100.0
-        assert scenario.time_limit_s == pytest.approx(max(300.0, scenario.route_line.length_m / 0.2), abs=0.01)
+        assert scenario.time_limit_s == pytest.approx(
+            max(300.0, scenario.route_line.length_m / 0.2), abs=0.01
+        )
         assert scenario.crossings and scenario.place.net_hash
 
 
 def test_the_reactive_suite_is_what_it_promises() -> None:
-    """Each event in a hundred cities, and nobody in each once; 10 to 20 m; nothing triggers where the robot starts."""
+    """Each event in a hundred cities, and nobody in each once; 10 to 20 m; nothing triggers where
+    the robot starts."""
     whole = load_suite("reactive")
     cities = {scenario.place.name for scenario in whole.scenarios}
     assert len(cities) == 100
     structures = (*EVENT_KINDS, "static")
-    places = {one: [s.place.name for s in whole.scenarios if s.structure == one] for one in structures}
+    places = {
+        one: [s.place.name for s in whole.scenarios if s.structure == one] for one in structures
+    }
     assert all(len(there) == 100 and set(there) == cities for there in places.values())
     assert [s.place.name for s in whole.scenarios] == sorted(
         (s.place.name for s in whole.scenarios), key=lambda name: int(name.rpartition("-")[2])
@@ -71,9 +84,15 @@ def test_the_reactive_suite_is_what_it_promises() -> None:
             assert not scenario.events
             continue
         (event,) = scenario.events
-        assert (event.kind, scenario.crowd.persons, scenario.crowd.vehicles) == (scenario.structure, 0, 0)
+        assert (event.kind, scenario.crowd.persons, scenario.crowd.vehicles) == (
+            scenario.structure,
+            0,
+            0,
+        )
         assert 10.0 <= scenario.route_line.length_m <= 20.5
-        assert scenario.ends_on_failure and (scenario.ends_at == "stop") == (event.kind == "gesturing")
+        assert scenario.ends_on_failure and (scenario.ends_at == "stop") == (
+            event.kind == "gesturing"
+        )
         assert 1.1 <= event.speed_mps <= 1.65
         states = react(first_query(scenario)).states
         assert states[0].phase == "waiting"
@@ -83,7 +102,9 @@ def test_the_reactive_suite_is_what_it_promises() -> None:
 
 def first_query(scenario: Scenario) -> EventQuery:
     """What a director is asked at the first tick."""
-    return query(scenario, Clock(), Moment(0, RobotState(scenario.start_pose), Street(0), 0.0), (0.7, 0.55))
+    return query(
+        scenario, Clock(), Moment(0, RobotState(scenario.start_pose), Street(0), 0.0), (0.7, 0.55)
+    )
 
 
 @pytest.mark.parametrize("name", SUITES)
@@ -95,10 +116,16 @@ def test_every_scenario_comes_with_its_proof(name: str) -> None:
 
 
 def test_scenarios_are_chosen_by_event() -> None:
-    """All with an event of the kinds asked for; a kind that is not there is answered with those that are."""
+    """All with an event of the kinds asked for; a kind that is not there is answered with those
+    that are."""
     whole = load_suite("reactive")
-    assert {s.events[0].kind for s in scenarios_chosen(whole, kinds=["frontal", "lateral"])} == {"frontal", "lateral"}
-    assert [s.events[0].kind for s in scenarios_chosen(whole, kinds=["frontal"], episodes=2)] == ["frontal"] * 2
+    assert {s.events[0].kind for s in scenarios_chosen(whole, kinds=["frontal", "lateral"])} == {
+        "frontal",
+        "lateral",
+    }
+    assert [s.events[0].kind for s in scenarios_chosen(whole, kinds=["frontal"], episodes=2)] == [
+        "frontal"
+    ] * 2
     with pytest.raises(UsageError, match=r"event 'ambush'.*frontal"):
         scenarios_chosen(whole, kinds=["ambush"])
 
@@ -112,19 +139,23 @@ def test_a_suite_survives_its_file(tmp_path: Path) -> None:
 
 
 def test_a_place_says_how_rough_its_ground_is() -> None:
-    """Ground is flat unless a spec says otherwise; roughness survives the file; out of range is refused."""
+    """Ground is flat unless a spec says otherwise; roughness survives the file; out of range is
+    refused."""
     rough = CityMap(map="m", roughness=0.4)
     assert City(seed=1).roughness == 0.0
     assert msgspec.json.decode(msgspec.json.encode(rough), type=CityMap) == rough
     assert content_hash(rough) != content_hash(CityMap(map="m"))
     for bad in (-0.1, 1.5, float("nan")):
-        with pytest.raises(SpecError, match=r"roughness is \S+, but it lies between 0 \(flat\) and 1"):
+        with pytest.raises(
+            SpecError, match=r"roughness is \S+, but it lies between 0 \(flat\) and 1"
+        ):
             City(seed=1, roughness=bad)
 
 
 @pytest.mark.engine
 def test_roughness_can_be_asked_for_on_a_map_alone() -> None:
-    """`--roughness` goes into the scenarios' place; without `--map`, or out of range, it is refused with the reason."""
+    """`--roughness` goes into the scenarios' place; without `--map`, or out of range, it is refused
+    with the reason."""
     from typer.testing import CliRunner
 
     from cosim.cli.app import app
@@ -139,7 +170,8 @@ def test_roughness_can_be_asked_for_on_a_map_alone() -> None:
 
 @pytest.mark.engine
 def test_fewer_people_walk_where_sidewalks_are_few() -> None:
-    """On a small map there are fewer people than in a city, and no more than were asked for where there is room."""
+    """On a small map there are fewer people than in a city, and no more than were asked for where
+    there is room."""
     (scenario,) = suite_on_map("long-horizon", "sumo-fkk-in", 1, 1).scenarios
     assert 20 <= scenario.crowd.persons <= 40
     ten = msgspec.structs.replace(scenario.crowd, persons=10)
@@ -148,9 +180,10 @@ def test_fewer_people_walk_where_sidewalks_are_few() -> None:
 
 
 def test_free_space_ends_at_furniture() -> None:
-    """Where a prop stands on walkable ground it is cut out; where none does the area is the same object."""
+    """Where a prop stands on walkable ground it is cut out; where none does the area is the same
+    object."""
     from physics.street.furniture import Prop, footprints
-    from scenarios.execution.wiring import clear_of
+    from scenarios.episodes.wiring import clear_of
 
     area = cross_map().walkable
     post = Prop("prop:east:0", "lamp", 0, 20.0, 1.2, 0.0, 0)
@@ -171,7 +204,8 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 
 @pytest.mark.engine
 def test_a_scenario_has_exactly_one_walkable_path(shipped: Scenario) -> None:
-    """Start and goal are joined inside the fences, nothing leads round anything, and the route keeps off the edge."""
+    """Start and goal are joined inside the fences, nothing leads round anything, and the route
+    keeps off the edge."""
     scenario = shipped
     _, street_map = place(scenario.place)
     route = scenario.route_line
@@ -181,7 +215,10 @@ def test_a_scenario_has_exactly_one_walkable_path(shipped: Scenario) -> None:
     assert part.covers(Point(route.points[-1]))
     assert not [ring for ring in part.interiors if shapely.Polygon(ring).area > 0.25]
     assert shapely.covers(shapely.buffer(near, -1.0), part)
-    assert WalkableArea(shapely.buffer(part, -0.3)).signed_distance(route.resampled(0.25).points).min() >= 0.0
+    assert (
+        WalkableArea(shapely.buffer(part, -0.3)).signed_distance(route.resampled(0.25).points).min()
+        >= 0.0
+    )
     assert {e.kind for e in scenario.events} <= set(EVENT_KINDS)
     for event in scenario.events:
         at = route.at(event.route_s_m)
@@ -211,7 +248,8 @@ def test_branches_are_the_ports_a_way_does_not_use() -> None:
 
 
 def test_the_proof_refuses_an_open_branch_and_a_closed_way() -> None:
-    """Fences at every branch prove the path; a missing one and one across the way are refused with the reason."""
+    """Fences at every branch prove the path; a missing one and one across the way are refused with
+    the reason."""
     street_map = cross_map()
     way = [Port("west", 0), Port("east", 0)]
     route = Polyline([(-30, 0), (30, 0)])
@@ -229,8 +267,12 @@ def test_the_proof_refuses_a_way_round_an_island() -> None:
     """A hole in the walkable area leaves two ways: refused, and the place is named."""
     street_map = cross_map()
     island = box(-0.4, -0.4, 0.6, 0.6)
-    holed = Corner("middle", box(-2, -2, 2, 2).difference(island), street_map.corners["middle"].ports)
-    street_map = StreetMap("island", street_map.bounds, street_map.strips, {"middle": holed}, {}, {})
+    holed = Corner(
+        "middle", box(-2, -2, 2, 2).difference(island), street_map.corners["middle"].ports
+    )
+    street_map = StreetMap(
+        "island", street_map.bounds, street_map.strips, {"middle": holed}, {}, {}
+    )
     way = [Port("west", 0), Port("east", 0)]
     fences = [barrier_at(street_map, port) for port in branches(street_map, way)]
     with pytest.raises(SpecError, match=r"two ways remain: they lead round \(0\.1, 0\.1\)"):
@@ -238,15 +280,25 @@ def test_the_proof_refuses_a_way_round_an_island() -> None:
 
 
 def test_the_proof_refuses_a_way_that_doubles_back() -> None:
-    """Out on one of two sidewalks that touch and back on the other: whoever walks straight across skips the loop. With
-    a gap between them there is no way across."""
+    """Out on one of two sidewalks that touch and back on the other: whoever walks straight across
+    skips the loop. With a gap between them there is no way across."""
 
     def beside(apart_m: float) -> StreetMap:
         """Two sidewalks of 60 m and 2 m of width, so far apart, joined in the east."""
-        lines = {"out": np.array([[0.0, 0.0], [60.0, 0.0]]), "back": np.array([[0.0, 2.0], [60.0, 2.0]])}
+        lines = {
+            "out": np.array([[0.0, 0.0], [60.0, 0.0]]),
+            "back": np.array([[0.0, 2.0], [60.0, 2.0]]),
+        }
         lines["back"][:, 1] += apart_m
         strips = {
-            name: Strip(name, "sidewalk", line, 2.0, LineString(line).buffer(1.0, cap_style="flat"), (None, "end"))
+            name: Strip(
+                name,
+                "sidewalk",
+                line,
+                2.0,
+                LineString(line).buffer(1.0, cap_style="flat"),
+                (None, "end"),
+            )
             for name, line in lines.items()
         }
         corner = Corner("end", box(60, -1, 63, 3 + apart_m), (Port("out", 1), Port("back", 1)))
@@ -254,7 +306,9 @@ def test_the_proof_refuses_a_way_that_doubles_back() -> None:
 
     way = [Port("out", 1), Port("back", 1)]
     route = way_line(beside(0.0), way, 40.0, 35.0)
-    with pytest.raises(SpecError, match=r"^the way doubles back: its start is \d\d m nearer on foot 7\d m along"):
+    with pytest.raises(
+        SpecError, match=r"^the way doubles back: its start is \d\d m nearer on foot 7\d m along"
+    ):
         prove_single_path(beside(0.0), route, (), way, 0.3)
     assert prove_single_path(beside(0.5), way_line(beside(0.5), way, 40.0, 35.0), (), way, 0.3)
 
@@ -270,9 +324,12 @@ def test_a_fence_closes_its_whole_strip() -> None:
 
 
 def test_a_slanting_fence_closes_a_crossing_that_meets_its_corner_at_an_angle() -> None:
-    """Where a corner reaches round the end of a crossing a square fence leaves a way past it, a slanting one none."""
+    """Where a corner reaches round the end of a crossing a square fence leaves a way past it, a
+    slanting one none."""
     street_map = cross_map()
-    slanting = Corner("middle", Polygon([(-2, -2), (2, -2), (2, 6), (-2, 2)]), street_map.corners["middle"].ports)
+    slanting = Corner(
+        "middle", Polygon([(-2, -2), (2, -2), (2, 6), (-2, 2)]), street_map.corners["middle"].ports
+    )
     north = dataclasses.replace(street_map.strips["north"], kind="crossing")
     strips = {**street_map.strips, "north": north}
     street_map = StreetMap("slant", street_map.bounds, strips, {"middle": slanting}, {}, {})
@@ -280,16 +337,21 @@ def test_a_slanting_fence_closes_a_crossing_that_meets_its_corner_at_an_angle() 
 
     def reached(fence: Barrier) -> bool:
         free = fenced(street_map.walkable, [fence])
-        return any(part.covers(far) and part.covers(Point(0, -1)) for part in shapely.get_parts(free))
+        return any(
+            part.covers(far) and part.covers(Point(0, -1)) for part in shapely.get_parts(free)
+        )
 
     assert reached(barrier_at(street_map, Port("north", 0)))
     assert not reached(barrier_at(street_map, Port("north", 0), slanting=True))
 
 
 def test_a_route_on_a_carriageway_is_measured() -> None:
-    """20 m of a route lie on a lane that is drawn over its sidewalk; those of a crossing do not count."""
+    """20 m of a route lie on a lane that is drawn over its sidewalk; those of a crossing do not
+    count."""
     line = np.array([[10.0, 0.0], [30.0, 0.0]])
-    lane = Lane("car_0", "car", "road", line, 3.0, shapely.buffer(LineString(line), 1.5, cap_style="flat"))
+    lane = Lane(
+        "car_0", "car", "road", line, 3.0, shapely.buffer(LineString(line), 1.5, cap_style="flat")
+    )
     street_map = dataclasses.replace(cross_map(), lanes={"car_0": lane})
     route = Polyline([(-30, 0), (38, 0)])
     assert on_road_m(street_map, route, ()) == pytest.approx(20.0, abs=1.0)
@@ -302,16 +364,21 @@ def turning(street_map: StreetMap, *points: tuple[float, float], cars: bool = Tr
     """The map with a path inside a junction."""
     line = np.array(points)
     inner = LineString(line).buffer(1.6, cap_style="flat")
-    lane = Lane(f":j{len(street_map.lanes)}", ":j", "road", line, 3.2, inner, internal=True, cars=cars)
+    lane = Lane(
+        f":j{len(street_map.lanes)}", ":j", "road", line, 3.2, inner, internal=True, cars=cars
+    )
     return dataclasses.replace(street_map, lanes={**street_map.lanes, lane.id: lane})
 
 
 def test_a_route_where_cars_turn_is_measured() -> None:
-    """A path square to a route hits the robot on as much of it as a car and the robot are wide; a path for bicycles
-    does not, nor one over a crossing."""
-    route, across = Polyline([(-30, 0), (38, 0)]), ((0.0, -9.0), (0.0, 9.0))
+    """A path square to a route hits the robot on as much of it as a car and the robot are wide; a
+    path for bicycles does not, nor one over a crossing."""
+    route = Polyline([(-30, 0), (38, 0)])
+    across = ((0.0, -9.0), (0.0, 9.0))
     wide_m = COURIER.width_m + 2.0
-    assert on_car_paths_m(turning(cross_map(), *across), route, (), COURIER) == pytest.approx(wide_m, abs=0.5)
+    assert on_car_paths_m(turning(cross_map(), *across), route, (), COURIER) == pytest.approx(
+        wide_m, abs=0.5
+    )
     assert on_car_paths_m(turning(cross_map(), *across, cars=False), route, (), COURIER) == 0.0
     crossing = RouteCrossing(id="c", enter_s_m=27.0, leave_s_m=33.0, signalised=False)
     assert on_car_paths_m(turning(cross_map(), *across), route, [crossing], COURIER) == 0.0
@@ -320,7 +387,8 @@ def test_a_route_where_cars_turn_is_measured() -> None:
 
 @pytest.mark.engine
 def test_routes_keep_off_corners_where_cars_turn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A small city with routes has none left when cars turn over all of every corner, and none round a bend."""
+    """A small city with routes has none left when cars turn over all of every corner, and none
+    round a bend."""
     for builder, tries in ((long_horizon, 12), (unit, 4)):
         monkeypatch.setattr(builder, "TRIES", tries)
     monkeypatch.setattr(long_horizon, "SEARCHES", 3)
@@ -329,8 +397,12 @@ def test_routes_keep_off_corners_where_cars_turn(monkeypatch: pytest.MonkeyPatch
     assert build_long_horizon(where, street_map, WalkGraph(street_map), 0, "plain").crossings
     for corner in street_map.corners.values():
         x0, y0, x1, y1 = corner.polygon.bounds
-        street_map = turning(street_map, *((x, y) for y in np.arange(y0, y1 + 2.0, 2.0).tolist() for x in (x0, x1)))
-    with pytest.raises(SpecError, match=r"cars turn over the way \(\d+ times\).*corners reach into junctions"):
+        street_map = turning(
+            street_map, *((x, y) for y in np.arange(y0, y1 + 2.0, 2.0).tolist() for x in (x0, x1))
+        )
+    with pytest.raises(
+        SpecError, match=r"cars turn over the way \(\d+ times\).*corners reach into junctions"
+    ):
         build_long_horizon(where, street_map, WalkGraph(street_map), 0, "turned-over")
     with pytest.raises(SpecError, match="cars turn over the way"):
         build_unit("curve", where, street_map, WalkGraph(street_map), 0, "turned-over")
@@ -342,20 +414,26 @@ def test_routes_keep_off_stairs_and_bridges() -> None:
     where = CityMap(map="sumo-fkk-in")
     street_map = read_map(where)
     assert build_long_horizon(where, street_map, WalkGraph(street_map), 0, "plain").crossings
-    steps = {name: dataclasses.replace(strip, going="steps") for name, strip in street_map.strips.items()}
+    steps = {
+        name: dataclasses.replace(strip, going="steps") for name, strip in street_map.strips.items()
+    }
     street_map = dataclasses.replace(street_map, strips=steps)
     with pytest.raises(SpecError) as caught:
         build_long_horizon(where, street_map, WalkGraph(street_map), 0, "stairs")
     said = str(caught.value)
     assert "the way leads over stairs, a bridge or a tunnel (" in said and "\n" not in said
-    assert "every long sidewalk is a stair, a bridge, a tunnel or on a road (1 times)): import another area" in said
+    assert (
+        "every long sidewalk is a stair, a bridge, a tunnel or on a road (1 times)): import "
+        "another area" in said
+    )
 
 
 @pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
 @pytest.mark.parametrize("name", POLICIES)
 def test_every_policy_answers_within_its_manifest(name: str, robot: Robot) -> None:
-    """Every shipped policy resets, acts and stays within every robot's limits on an empty street."""
-    from cosim.episode.ports import Observation
+    """Every shipped policy resets, acts and stays within every robot's limits on an empty
+    street."""
+    from cosim.episode.interfaces import Observation
 
     driver = Driver(POLICIES[name]())
     Clock.for_rate(driver.manifest.rate_hz)
@@ -363,7 +441,14 @@ def test_every_policy_answers_within_its_manifest(name: str, robot: Robot) -> No
     driver.reset("t", 0)
     for tick in range(0, 200, 2):
         known = Privileged(
-            RobotState(route.at(tick * 0.05), 1.0), route, tick * 0.05, NOBODY, NO_VEHICLES, {}, (), box(-1, -2, 51, 2)
+            RobotState(route.at(tick * 0.05), 1.0),
+            route,
+            tick * 0.05,
+            NOBODY,
+            NO_VEHICLES,
+            {},
+            (),
+            box(-1, -2, 51, 2),
         )
         command = driver.act(Observation(tick, tick * 0.05, None, 1.0, 0.0, robot, known))
         assert 0.0 <= command.v_mps <= robot.v_max_mps and abs(command.w_radps) <= robot.w_max_radps
@@ -383,7 +468,16 @@ def test_two_pedestrians_of_one_name_are_refused() -> None:
     """The second of a group "e0" is "e0-1": no other event may be called so."""
     one = load_suite("reactive").scenarios[0]
     two = [
-        Event(id=name, kind="queueing", x_m=0, y_m=0, heading_rad=0, route_s_m=5, half_width_m=2, people=2)
+        Event(
+            id=name,
+            kind="queueing",
+            x_m=0,
+            y_m=0,
+            heading_rad=0,
+            route_s_m=5,
+            half_width_m=2,
+            people=2,
+        )
         for name in ("e0", "e0-1")
     ]
     assert len(msgspec.structs.replace(one, events=(two[0],)).events[0].names) == 2

@@ -1,4 +1,5 @@
-"""Setting up an episode: what it imports, and that what a process keeps from episode to episode changes nothing."""
+"""Setting up an episode: what it imports, and that what a process keeps from episode to episode
+changes nothing."""
 
 from __future__ import annotations
 
@@ -8,14 +9,14 @@ import sys
 import pytest
 
 from tests.conftest import PATIENCE_S
-from tests.scenarios.in_turn import COUNT, SAMPLE_COUNT
+from tests.support.in_turn import COUNT, SAMPLE_COUNT
 
 NOT_DRIVEN_WITH = (
     "pandas",
     "pyproj",
     "scipy",
     "sumo_nets.maps.importer",
-    "sumo_nets.net.netfile",
+    "sumo_nets.net.net_file",
     "sumolib",
     "traci",
     "trimesh",
@@ -23,29 +24,32 @@ NOT_DRIVEN_WITH = (
 
 
 def test_an_episode_imports_only_what_it_drives_with() -> None:
-    """Neither what reads maps, nor SUMO's tools in Python, nor tables, nor SUMO before somebody is to be simulated; who
-    imports libsumo besides gets all of it."""
+    """Neither what reads maps, nor SUMO's tools in Python, nor tables, nor SUMO before somebody is
+    to be simulated; who imports libsumo besides gets all of it."""
     code = (
-        "import sys, cosim\n"
-        "cosim.Episode\n"
-        f"print(sorted(set({NOT_DRIVEN_WITH}) & set(sys.modules)), 'sumo_nets.engine' in sys.modules)\n"
-        "from sumo_nets.engine import sumo\n"
-        "import libsumo\n"
-        "print(libsumo.person is sumo.person and libsumo.isLibsumo())"
+        f"import sys, cosim\ncosim.Episode\nprint(sorted(set({NOT_DRIVEN_WITH}) & "
+        "set(sys.modules)), 'sumo_nets.engine' in sys.modules)\nfrom sumo_nets.engine import "
+        "sumo\nimport libsumo\nprint(libsumo.person is sumo.person and libsumo.isLibsumo())"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S
+    )
     assert done.returncode == 0, done.stderr
-    first, *_, last = done.stdout.splitlines()  # between them libsumo may say what it makes of other packages
+    first, *_, last = (
+        done.stdout.splitlines()
+    )  # between them libsumo may say what it makes of other packages
     assert (first, last) == ("[] False", "True")
 
 
 @pytest.mark.engine
-def test_the_kth_episode_of_a_process_is_the_first_one_of_another(request: pytest.FixtureRequest) -> None:
-    """Ten episodes, 30 with --whole, two cities, many crowds, grounds, robots and lights in random order: same states,
-    same pictures."""
+def test_the_kth_episode_of_a_process_is_the_first_one_of_another(
+    request: pytest.FixtureRequest,
+) -> None:
+    """Ten episodes, 30 with --whole, two cities, many crowds, grounds, robots and lights in random
+    order: same states, same pictures."""
     whole = request.config.getoption("--whole")
     count, only = (COUNT, []) if whole else (SAMPLE_COUNT, ["--sample"])
-    command = [sys.executable, "-m", "tests.scenarios.in_turn", *only]
+    command = [sys.executable, "-m", "tests.support.in_turn", *only]
     done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split("\n")[-2] == f"[] {count} {count}", done.stderr

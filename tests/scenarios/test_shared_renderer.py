@@ -1,4 +1,5 @@
-"""One renderer for many environments: the same pictures, labels and hashes; and whoever dies, the others go on."""
+"""One renderer for many environments: the same pictures, labels and hashes; and whoever dies, the
+others go on."""
 
 from __future__ import annotations
 
@@ -18,24 +19,24 @@ import pytest
 import shapely
 
 from cosim.core.errors import EngineError, PolicyError, RendererLost, UsageError
+from cosim.core.framing import Wire
 from cosim.core.geometry import Pose
 from cosim.core.state import NO_VEHICLES, Frame, People, RobotState, Signal, Street
-from cosim.core.wire import Wire
-from cosim.episode.driver import Driver
-from cosim.episode.log import Log
-from cosim.episode.ports import CameraSpec, Manifest, Policy
+from cosim.episode.interfaces import Policy
+from cosim.episode.policy_caller import Driver
 from cosim.policies.load import load_policy
-from cosim.records.run_folder import read_records, read_spec
+from cosim.results.log import Log
+from cosim.results.run_folder import read_records, read_spec
+from cosim.spec.camera import CameraSpec
+from cosim.spec.episode_id import pseudonym_of
+from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
-from cosim.spec.pseudonym import pseudonym_of
 from cosim.spec.scenario import CityMap, Light, Scenario, Suite, write_suite
-from scenarios.bench.cameras import busy_street
-from scenarios.checks import small_scenario
-from scenarios.execution import suite_run
-from scenarios.execution.asked import Patience
-from scenarios.execution.messages import Hello, Progress
-from scenarios.execution.places import place
-from scenarios.rendering.exchange import (
+from scenarios.ipc.deadlines import Patience
+from scenarios.ipc.messages import Hello, Progress
+from scenarios.ipc.picture_memory import PictureMemory
+from scenarios.ipc.render_link import RendererLink, link_to
+from scenarios.ipc.render_protocol import (
     Ask,
     Begin,
     Draw,
@@ -50,13 +51,15 @@ from scenarios.rendering.exchange import (
     decode_request,
     encode_exchange,
 )
-from scenarios.rendering.link import RendererLink, link_to
-from scenarios.rendering.memory import PictureMemory
-from scenarios.rendering.shared import End, SharedRenderer, check_shared
+from scenarios.places.nets import place
+from scenarios.runs import run as suite_run
+from scenarios.runs.shared_renderer import End, SharedRenderer, check_shared
+from scenarios.tools.bench.cameras import busy_street
+from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import Cosim
-from tests.scenarios.shared_policies import NOTES, Knowing, Seeing, Together
+from tests.support.shared_policies import NOTES, Knowing, Seeing, Together
 
-OF = "tests.scenarios.shared_policies"
+OF = "tests.support.shared_policies"
 FRAMES = EpisodeOptions(seed=7, frames_every_s=0.5)
 
 
@@ -71,7 +74,9 @@ def suite_of(*names: str) -> Suite:
 
 
 @contextmanager
-def renderer_for(folder: Path, policy: Policy, patience: Patience = Patience()) -> Iterator[SharedRenderer]:  # noqa: B008
+def renderer_for(
+    folder: Path, policy: Policy, patience: Patience = Patience()
+) -> Iterator[SharedRenderer]:
     """A renderer in a process of its own, without a run."""
     name = f"{OF}:{type(policy).__name__}"
     driver = load_policy(name)
@@ -92,8 +97,11 @@ def renderer_pid(renderer: SharedRenderer) -> int:
     return int(child)
 
 
-def asked_together(renderer: SharedRenderer, links: Sequence[RendererLink], *requests: Request) -> list[Reply]:
-    """The replies to requests that the renderer finds waiting all at once: it is stopped while they are sent."""
+def asked_together(
+    renderer: SharedRenderer, links: Sequence[RendererLink], *requests: Request
+) -> list[Reply]:
+    """The replies to requests that the renderer finds waiting all at once: it is stopped while they
+    are sent."""
     pid = renderer_pid(renderer)
     os.kill(pid, signal.SIGSTOP)
     while Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "T":
@@ -110,12 +118,13 @@ def seen_by_themselves(
     """The pictures of a camera of its own for each of some scenarios in one place."""
     from cosim.spec.robot import robot_called
     from physics.cameras.gl.camera import GlCamera
-    from physics.world.street_surface import StreetSurface
-    from physics.world.world import BulletWorld
+    from physics.dynamics.world import BulletWorld
+    from physics.street.street_surface import StreetSurface
 
     spec = Seeing.manifest.camera
     where = scenarios[0].place
-    surface, found = StreetSurface(place(where)[1], where.seed), []
+    surface = StreetSurface(place(where)[1], where.seed)
+    found = []
     for scenario in scenarios:
         world = BulletWorld(surface, scenario.barriers, robot_called(scenario.robot))
         with GlCamera(world, spec, light=scenario.light) as camera:
@@ -125,8 +134,9 @@ def seen_by_themselves(
 
 @pytest.mark.engine
 def test_pictures_and_labels_are_those_of_a_camera_of_ones_own(tmp_path: Path) -> None:
-    """Of environments of other robots and lights, drawn together for as long as they stay: one that ends and one that
-    speaks nonsense leave the others alone. Nothing has a name in /dev/shm, and all know when the renderer is killed."""
+    """Of environments of other robots and lights, drawn together for as long as they stay: one that
+    ends and one that speaks nonsense leave the others alone. Nothing has a name in /dev/shm, and
+    all know when the renderer is killed."""
     before = {*Path("/dev/shm").iterdir()}
     (one,) = scenarios_of("one")
     other = msgspec.structs.replace(one, id="other", robot="scout", light=Light(fog_m=40.0))
@@ -149,7 +159,9 @@ def test_pictures_and_labels_are_those_of_a_camera_of_ones_own(tmp_path: Path) -
             if k == 2:
                 links.pop()._wire.send(b"nonsense")
         assert expected[0][3].rgb.tobytes() != expected[1][3].rgb.tobytes() and len(links) == 1
-        with pytest.raises(EngineError, match="the shared renderer: UsageError: unknown map 'nowhere'"):
+        with pytest.raises(
+            EngineError, match="the shared renderer: UsageError: unknown map 'nowhere'"
+        ):
             linked(renderer).ask(Enter(msgspec.structs.replace(one, place=CityMap(map="nowhere"))))
         pid = renderer_pid(renderer)
         renderer.tend()
@@ -163,10 +175,12 @@ def test_pictures_and_labels_are_those_of_a_camera_of_ones_own(tmp_path: Path) -
 
 
 def test_who_connects_says_that_it_waits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A renderer that is still loading its policy accepts nobody for as long as that takes: an environment that was
-    silent meanwhile would be taken for one that hangs."""
-    monkeypatch.setattr("scenarios.rendering.link._TELLS_EVERY_S", 0.01)
-    address, memory, waited = f"cosim-test-{os.getpid()}", PictureMemory.new((0, 0)), []
+    """A renderer that is still loading its policy accepts nobody for as long as that takes: an
+    environment that was silent meanwhile would be taken for one that hangs."""
+    monkeypatch.setattr("scenarios.ipc.render_link._TELLS_EVERY_S", 0.01)
+    address = f"cosim-test-{os.getpid()}"
+    memory = PictureMemory.new((0, 0))
+    waited = []
     with socket.socket(socket.AF_UNIX) as listening:
         listening.bind(f"\0{address}")
         listening.listen()
@@ -192,10 +206,12 @@ def knows(tick: int, v_mps: float = 0.5) -> Ask:
 
 
 @pytest.mark.engine
-def test_one_bad_answer_is_one_crash_and_what_takes_the_policy_down_names_whom_it_was_asked_for(tmp_path: Path) -> None:
-    """Of episodes asked together: NaN and a reset that raises concern one of them; what act_batch raises, and an answer
-    too few, all; one that hangs, exits or closes what is not its own takes the renderer with it, and who was not asked
-    knows that it was not."""
+def test_one_bad_answer_is_one_crash_and_what_takes_the_policy_down_names_whom_it_was_asked_for(
+    tmp_path: Path,
+) -> None:
+    """Of episodes asked together: NaN and a reset that raises concern one of them; what act_batch
+    raises, and an answer too few, all; one that hangs, exits or closes what is not its own takes
+    the renderer with it, and who was not asked knows that it was not."""
     with renderer_for(tmp_path, Knowing(), Patience(answer_s=1.0)) as renderer:
 
         def begun(*names: str) -> list[RendererLink]:
@@ -219,7 +235,8 @@ def test_one_bad_answer_is_one_crash_and_what_takes_the_policy_down_names_whom_i
         honest, nan = third("honest", "nan")
         assert honest == Told(0.59, 0.0) and isinstance(nan, Refused) and nan.by_policy
         assert nan.reason == (
-            "policy 'knowing' answered Command(v_mps=nan, w_radps=0.0): both must be finite numbers (act at 0.50 s)"
+            "policy 'knowing' answered Command(v_mps=nan, w_radps=0.0): both must be finite "
+            "numbers (act at 0.50 s)"
         )
         for name, words in {
             "raises": "raised KeyError: 'no such weight'",
@@ -229,19 +246,27 @@ def test_one_bad_answer_is_one_crash_and_what_takes_the_policy_down_names_whom_i
             assert third("honest", name) == [Refused(together, by_policy=True)] * 2
         fails = linked(renderer)
         fails.ask(Enter(*scenarios_of("fails-in-reset")))
-        with pytest.raises(PolicyError, match=r"policy 'knowing' raised FileNotFoundError: weights\.pt \(reset\)"):
+        with pytest.raises(
+            PolicyError, match=r"policy 'knowing' raised FileNotFoundError: weights\.pt \(reset\)"
+        ):
             fails.ask(Begin("fails-in-reset", 0))
         fails._wire.close()
         one, other = begun("honest", "fails-when-put-back")
-        told, crashed = asked_together(renderer, [one, other], *[msgspec.structs.replace(knows(10), reset=True)] * 2)
+        told, crashed = asked_together(
+            renderer, [one, other], *[msgspec.structs.replace(knows(10), reset=True)] * 2
+        )
         assert told == Told(0.59, 0.0) and isinstance(crashed, Refused) and crashed.by_policy
-        assert crashed.reason == "policy 'knowing' raised LookupError: no history (on_reset at 0.50 s)"
+        assert (
+            crashed.reason == "policy 'knowing' raised LookupError: no history (on_reset at 0.50 s)"
+        )
         for link in (one, other):
             link._wire.close()
         renderer.tend()
         ends = {
             "hangs": End("the renderer process was ended", 1.0),
-            "exits": End("the renderer process ended with exit code 7 in the policy's act at 0.50 s"),
+            "exits": End(
+                "the renderer process ended with exit code 7 in the policy's act at 0.50 s"
+            ),
             "closes": End("the renderer process ended with exit code 1"),
         }
         for number, (name, end) in enumerate(ends.items(), start=1):
@@ -259,16 +284,35 @@ def test_one_bad_answer_is_one_crash_and_what_takes_the_policy_down_names_whom_i
 
 
 def test_a_policy_may_write_into_what_it_is_told_from_afar() -> None:
-    """What arrives is equal to the bit and its reader's own: write-protected as an episode's is, no more than that."""
-    people = People.of(("c1", "c2"), [[3.0, 0.1], [1 / 3, 0.2]], [0.0, 1.0], [1.0, 0.0], ("walk", "sit"), kind=[1, 2])
-    sent = Draw(RobotState(Pose(0.1, 0.2, 0.3), 0.4), Street(7, people, signals={"x": Signal(True, 2.5)}))
+    """What arrives is equal to the bit and its reader's own: write-protected as an episode's is, no
+    more than that."""
+    people = People.of(
+        ("c1", "c2"),
+        [[3.0, 0.1], [1 / 3, 0.2]],
+        [0.0, 1.0],
+        [1.0, 0.0],
+        ("walk", "sit"),
+        kind=[1, 2],
+    )
+    sent = Draw(
+        RobotState(Pose(0.1, 0.2, 0.3), 0.4), Street(7, people, signals={"x": Signal(True, 2.5)})
+    )
     came = decode_request(encode_exchange(sent))
-    assert isinstance(came, Draw) and came.robot == sent.robot and came.street.signals == sent.street.signals
+    assert (
+        isinstance(came, Draw)
+        and came.robot == sent.robot
+        and came.street.signals == sent.street.signals
+    )
     for column in dataclasses.fields(People):
-        mine, theirs = getattr(people, column.name), getattr(came.street.people, column.name)
+        mine = getattr(people, column.name)
+        theirs = getattr(came.street.people, column.name)
         assert type(mine) is type(theirs)
         if isinstance(mine, np.ndarray):
-            assert mine.dtype == theirs.dtype and mine.tobytes() == theirs.tobytes() and not theirs.flags.writeable
+            assert (
+                mine.dtype == theirs.dtype
+                and mine.tobytes() == theirs.tobytes()
+                and not theirs.flags.writeable
+            )
             theirs.setflags(write=True)
         else:
             assert mine == theirs
@@ -284,8 +328,14 @@ def by_themselves(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def same(one: Path, other: Path) -> bool:
     """Whether two runs have the same tables and hashes, and the same frames to the byte."""
-    hashes = [{record.scenario: record.state_hash for record in read_records(folder)} for folder in (one, other)]
-    frames = [{p.relative_to(f): p.read_bytes() for p in f.glob("episodes/*/frames/*.png")} for f in (one, other)]
+    hashes = [
+        {record.scenario: record.state_hash for record in read_records(folder)}
+        for folder in (one, other)
+    ]
+    frames = [
+        {p.relative_to(f): p.read_bytes() for p in f.glob("episodes/*/frames/*.png")}
+        for f in (one, other)
+    ]
     assert len(set(hashes[0].values())) == 2 and len(frames[0]) == 4
     return hashes[0] == hashes[1] and frames[0] == frames[1]
 
@@ -294,14 +344,17 @@ def same(one: Path, other: Path) -> bool:
 def test_a_run_is_the_same_with_a_shared_renderer_that_asks_the_policy(
     by_themselves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cosim: Cosim
 ) -> None:
-    """Two processes, drawn for and asked by a third: state hashes and pictures are those of episodes that each drew for
-    themselves, in one process; run.json says how it was run, and every question was put by one process."""
+    """Two processes, drawn for and asked by a third: state hashes and pictures are those of
+    episodes that each drew for themselves, in one process; run.json says how it was run, and every
+    question was put by one process."""
     monkeypatch.setenv(NOTES, str(tmp_path / "notes"))
     write_suite(suite_of("a", "b"), tmp_path / "small.json")
     words = ("--policy", f"{OF}:Together", "--frames", "0.5", "--seed", "7", "--out", "shared")
     said = cosim("run", "small.json", *words, "--jobs", "2", "--shared-renderer", cwd=tmp_path)
     assert said.returncode == 0, said.stderr
-    assert same(by_themselves, tmp_path / "shared") and read_spec(tmp_path / "shared").shared_renderer
+    assert (
+        same(by_themselves, tmp_path / "shared") and read_spec(tmp_path / "shared").shared_renderer
+    )
     notes = [line.split() for line in (tmp_path / "notes").read_text().splitlines()]
     ended = [line[1] for line in notes if line[0] == "ended"]
     asked = [line for line in notes if line[0] != "ended"]
@@ -313,24 +366,29 @@ def test_a_run_is_the_same_with_a_shared_renderer_that_asks_the_policy(
 
 @pytest.mark.engine
 def test_a_policy_asked_by_the_shared_renderer_is_given_the_same(tmp_path: Path) -> None:
-    """Goals that are pictures, labels, odometry and calibration: it drives by them to the same state hash as where it
-    has a camera of its own, by the same waypoints."""
-    guided, one = f"{OF}:Guided", EpisodeOptions(seed=7)
+    """Goals that are pictures, labels, odometry and calibration: it drives by them to the same
+    state hash as where it has a camera of its own, by the same waypoints."""
+    guided = f"{OF}:Guided"
+    one = EpisodeOptions(seed=7)
     suite_run.run(suite_of("a"), guided, out=tmp_path / "own", options=one)
     suite_run.run(suite_of("a"), guided, shared_renderer=True, out=tmp_path / "shared", options=one)
-    (own,), (shared,) = read_records(tmp_path / "own"), read_records(tmp_path / "shared")
+    (own,) = read_records(tmp_path / "own")
+    (shared,) = read_records(tmp_path / "shared")
     assert (own.status, own.goal_protocol, own.odometry) == ("done", "image", "wheel")
     assert own.state_hash == shared.state_hash and shared.status == "done"
     mine, theirs = ((tmp_path / how / "episodes/a/trajectory.npz") for how in ("own", "shared"))
-    assert mine.read_bytes() == theirs.read_bytes() and {*Log.load(mine).plan_sizes.tolist()} == {0, 4}
+    assert mine.read_bytes() == theirs.read_bytes() and {*Log.load(mine).plan_sizes.tolist()} == {
+        0,
+        4,
+    }
 
 
 @pytest.mark.engine
 def test_episodes_whose_renderer_is_killed_are_run_again(
     by_themselves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """kill -9 in the middle of two episodes: another renderer draws them from their beginning, none has crashed, and
-    what comes out is the same as ever."""
+    """kill -9 in the middle of two episodes: another renderer draws them from their beginning, none
+    has crashed, and what comes out is the same as ever."""
     started: list[SharedRenderer] = []
     killed: list[int] = []
 
@@ -347,7 +405,13 @@ def test_episodes_whose_renderer_is_killed_are_run_again(
     monkeypatch.setattr(suite_run, "SharedRenderer", Noted)
     folder = tmp_path / "run"
     suite_run.run(
-        suite_of("a", "b"), f"{OF}:Seeing", jobs=2, shared_renderer=True, out=folder, options=FRAMES, tell=kill
+        suite_of("a", "b"),
+        f"{OF}:Seeing",
+        jobs=2,
+        shared_renderer=True,
+        out=folder,
+        options=FRAMES,
+        tell=kill,
     )
     assert killed and same(by_themselves, folder)
     logs = sorted(path.name for path in (folder / "logs").iterdir())
@@ -357,21 +421,35 @@ def test_episodes_whose_renderer_is_killed_are_run_again(
 def test_what_a_shared_renderer_cannot_do_is_wrong_use(cosim: Cosim) -> None:
     """It is told before anything is started."""
     said = cosim("run", "reactive", "--camera", "bullet", "--shared-renderer")
-    assert said.returncode == 2 and "--shared-renderer draws by OpenGL, not by the bullet camera" in said.stderr
+    assert (
+        said.returncode == 2
+        and "--shared-renderer draws by OpenGL, not by the bullet camera" in said.stderr
+    )
 
 
 def test_where_there_is_nothing_to_share_it_is_said() -> None:
-    """A blind policy that is asked for each episode by itself, a camera that is not gl, a policy object: in words."""
+    """A blind policy that is asked for each episode by itself, a camera that is not gl, a policy
+    object: in words."""
     assert check_shared(Driver(Together()), "gl") and not check_shared(Driver(Seeing()), "gl")
     assert check_shared(Driver(Knowing()), "bullet")
-    with pytest.raises(UsageError, match="policy 'orca' has no camera and no method 'act_batch': leave --shared-rend"):
+    with pytest.raises(
+        UsageError,
+        match="policy 'orca' has no camera and no method 'act_batch': leave --shared-rend",
+    ):
         check_shared(load_policy("orca"), "bullet")
-    with pytest.raises(UsageError, match="draws by OpenGL, not by the bullet camera: use --camera gl"):
+    with pytest.raises(
+        UsageError, match="draws by OpenGL, not by the bullet camera: use --camera gl"
+    ):
         check_shared(Driver(Seeing()), "bullet")
     deep = Manifest("deep", camera=CameraSpec(depth=True))
     wide = Manifest("wide", cameras={"left": CameraSpec(mount="left")})
-    for manifest, what in ((deep, "'deep' asks for depth"), (wide, "'wide' asks for further cameras")):
-        with pytest.raises(UsageError, match=f"policy {what}, which a shared renderer does not give"):
+    for manifest, what in (
+        (deep, "'deep' asks for depth"),
+        (wide, "'wide' asks for further cameras"),
+    ):
+        with pytest.raises(
+            UsageError, match=f"policy {what}, which a shared renderer does not give"
+        ):
             check_shared(Driver(Seeing(), manifest), "gl")
     with pytest.raises(UsageError, match="shared_renderer=True needs a policy by its name"):
         suite_run.run(suite_of("a"), Together(), shared_renderer=True)
@@ -382,9 +460,15 @@ def test_no_environment_can_shrink_its_memory_under_the_renderers_hands() -> Non
     memory = PictureMemory.new((4, 2))
     with pytest.raises(PermissionError):
         os.ftruncate(memory.descriptor, 0)
-    rgb, labels = np.arange(24, dtype=np.uint8).reshape(2, 4, 3), np.full((2, 4), 9, np.uint8)
+    rgb = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
+    labels = np.full((2, 4), 9, np.uint8)
     memory.put(Frame(rgb, labels))
     taken = memory.take()
     memory.put(Frame(rgb + 1, labels + 1))
-    assert taken.labels is not None and (taken.rgb == rgb).all() and (taken.labels == 9).all() and not memory.asked
+    assert (
+        taken.labels is not None
+        and (taken.rgb == rgb).all()
+        and (taken.labels == 9).all()
+        and not memory.asked
+    )
     memory.close()

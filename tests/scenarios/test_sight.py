@@ -1,4 +1,5 @@
-"""Event pedestrians and injected people among people: they see the crowd and each other, and go round them."""
+"""Event pedestrians and injected people among people: they see the crowd and each other, and go
+round them."""
 
 from __future__ import annotations
 
@@ -13,7 +14,13 @@ from cosim.people.neighbours import nearby_people
 from cosim.spec.events import Event, EventQuery, EventReply, EventState, NearbyPerson
 from cosim.spec.injection import Injected, Injection
 from scenarios.events import EVENT_KINDS, react
-from scenarios.events.injected_person import InjectedPerson, arriving, injected_actor, injected_moved_on, shown_id
+from scenarios.events.injected_person import (
+    InjectedPerson,
+    arriving,
+    injected_actor,
+    injected_moved_on,
+    shown_id,
+)
 
 TICK_MS = 50
 PEOPLE = {"conversing": 3, "queueing": 3, "ped_crossing": 4}
@@ -22,7 +29,14 @@ BOX_M = (0.35, 0.275)
 
 def event(kind: str, **fields: object) -> Event:
     """An event 50 m along a route on the x axis, on a sidewalk 4 m wide."""
-    known = {"id": "e0", "kind": kind, "x_m": 50.0, "y_m": 0.0, "heading_rad": 0.0, "route_s_m": 50.0}
+    known = {
+        "id": "e0",
+        "kind": kind,
+        "x_m": 50.0,
+        "y_m": 0.0,
+        "heading_rad": 0.0,
+        "route_s_m": 50.0,
+    }
     known |= {"half_width_m": 2.0, "speed_mps": 1.2, "people": PEOPLE.get(kind, 1)}
     known |= {"half_length_m": 5.0} if kind == "ped_crossing" else {}
     return Event(**known | fields)  # type: ignore[arg-type]
@@ -38,22 +52,36 @@ def asked(
 ) -> EventQuery:
     """The question of a robot at `x_m` on the x axis that faces +x."""
     return EventQuery(
-        episode="t", tick=tick, tick_ms=TICK_MS, robot_x_m=x_m, robot_y_m=0.0, robot_heading_rad=0.0, robot_v_mps=v_mps,
-        robot_w_radps=0.0, route_s_m=x_m, robot_length_m=0.7, robot_width_m=0.55, events=events, states=states,
+        episode="t",
+        tick=tick,
+        tick_ms=TICK_MS,
+        robot_x_m=x_m,
+        robot_y_m=0.0,
+        robot_heading_rad=0.0,
+        robot_v_mps=v_mps,
+        robot_w_radps=0.0,
+        route_s_m=x_m,
+        robot_length_m=0.7,
+        robot_width_m=0.55,
+        events=events,
+        states=states,
         nearby=seen,
-    )  # fmt: skip
+    )
 
 
 def drive(
     one: Event, ticks: int, speed_mps: float, start_m: float, *crowd: NearbyPerson
 ) -> list[tuple[float, EventReply]]:
-    """(robot x, reply) at every tick of a robot that drives along the x axis, among people who walk straight on."""
+    """(robot x, reply) at every tick of a robot that drives along the x axis, among people who walk
+    straight on."""
     states: tuple[EventState, ...] = ()
     out = []
     for tick in range(ticks):
         t_s = tick * TICK_MS / 1000
         here = tuple(
-            NearbyPerson(c.id, c.x_m + c.vx_mps * t_s, c.y_m + c.vy_mps * t_s, c.vx_mps, c.vy_mps, c.kind)
+            NearbyPerson(
+                c.id, c.x_m + c.vx_mps * t_s, c.y_m + c.vy_mps * t_s, c.vx_mps, c.vy_mps, c.kind
+            )
             for c in crowd
         )
         reply = react(asked(tick, start_m + speed_mps * t_s, speed_mps, here, (one,), *states))
@@ -65,7 +93,9 @@ def drive(
 def told(person: InjectedPerson) -> NearbyPerson:
     """A person as it sees others of its kind."""
     one = person.walker
-    return NearbyPerson(shown_id(person.injection), one.x_m, one.y_m, one.vx_mps, one.vy_mps, PersonKind.INJECTED)
+    return NearbyPerson(
+        shown_id(person.injection), one.x_m, one.y_m, one.vx_mps, one.vy_mps, PersonKind.INJECTED
+    )
 
 
 def gap_m(robot_x_m: float, x_m: float, y_m: float) -> float:
@@ -84,16 +114,27 @@ def test_people_who_are_in_nobodys_way_change_nothing(kind: str) -> None:
 @pytest.mark.parametrize("side", [-1, 1])
 @pytest.mark.parametrize(
     ("kind", "people"),
-    [("conversing", 2), ("conversing", 3), ("conversing", 4), ("queueing", 3), ("queueing", 5), ("ped_crossing", 4)],
+    [
+        ("conversing", 2),
+        ("conversing", 3),
+        ("conversing", 4),
+        ("queueing", 3),
+        ("queueing", 5),
+        ("ped_crossing", 4),
+    ],
 )
-def test_the_people_of_an_event_do_not_walk_through_each_other(kind: str, people: int, side: int) -> None:
-    """Stepping to their places, back, and over a crosswalk; in the end everybody is where it belongs."""
+def test_the_people_of_an_event_do_not_walk_through_each_other(
+    kind: str, people: int, side: int
+) -> None:
+    """Stepping to their places, back, and over a crosswalk; in the end everybody is where it
+    belongs."""
     track = drive(event(kind, people=people, side=side), 1000, 0.4, 38.0)
     for _, reply in track:
         places = [(w.x_m, w.y_m) for w in reply.states[0].walkers]
         assert min(math.dist(a, b) for a, b in itertools.combinations(places, 2)) > 0.4
     if kind != "ped_crossing":
-        first, last = track[0][1].states[0], track[-1][1].states[0]
+        first = track[0][1].states[0]
+        last = track[-1][1].states[0]
         assert last.phase == "over"
         assert [(w.x_m, w.y_m) for w in last.walkers] == [(w.x_m, w.y_m) for w in first.walkers]
 
@@ -109,12 +150,16 @@ def test_who_stands_in_the_way_is_gone_round_and_who_stands_on_the_place_is_walk
 
 @pytest.mark.parametrize("y_m", [0.0, 0.2, -0.2])
 def test_a_frontal_pedestrian_goes_round_people_and_still_walks_at_the_robot(y_m: float) -> None:
-    """Somebody stands on its line, somebody comes towards it: it passes both, no faster than told, and meets the robot
-    that creeps."""
+    """Somebody stands on its line, somebody comes towards it: it passes both, no faster than told,
+    and meets the robot that creeps."""
     crowd = (NearbyPerson("c1", 44.0, y_m, 0.0, 0.0), NearbyPerson("c2", 34.0, y_m, 1.1, 0.0))
     track = drive(event("frontal"), 500, 0.06, 31.0, *crowd)
     robots = [x_m for x_m, r in track if r.states[0].phase == "acting"]
-    ways = [(r.states[0].walkers[0].x_m, r.states[0].walkers[0].y_m) for _, r in track if r.states[0].phase == "acting"]
+    ways = [
+        (r.states[0].walkers[0].x_m, r.states[0].walkers[0].y_m)
+        for _, r in track
+        if r.states[0].phase == "acting"
+    ]
     assert min(math.dist(xy, (44.0, y_m)) for xy in ways) > 0.55
     assert min(math.dist(xy, (34.0 + 1.1 * 0.05 * k, y_m)) for k, xy in enumerate(ways)) > 0.5
     assert max(math.dist(a, b) for a, b in itertools.pairwise(ways)) < 1.2 * 0.05 + 1e-9
@@ -123,8 +168,11 @@ def test_a_frontal_pedestrian_goes_round_people_and_still_walks_at_the_robot(y_m
 
 @pytest.mark.parametrize("side", [-1, 1])
 def test_a_lateral_pedestrian_goes_round_somebody_and_still_meets_the_robot(side: int) -> None:
-    """Somebody stands on its line: it steps round, and takes aim anew at a robot that keeps its velocity."""
-    track = drive(event("lateral", side=side), 400, 0.8, 40.0, NearbyPerson("c1", 50.1, side * 0.9, 0.0, 0.0))
+    """Somebody stands on its line: it steps round, and takes aim anew at a robot that keeps its
+    velocity."""
+    track = drive(
+        event("lateral", side=side), 400, 0.8, 40.0, NearbyPerson("c1", 50.1, side * 0.9, 0.0, 0.0)
+    )
     acting = [(x, r.states[0].walkers[0]) for x, r in track if r.states[0].phase == "acting"]
     assert min(math.dist((w.x_m, w.y_m), (50.1, side * 0.9)) for _, w in acting) > 0.5
     assert min(gap_m(x, w.x_m, w.y_m) for x, w in acting) < 0.02
@@ -132,7 +180,8 @@ def test_a_lateral_pedestrian_goes_round_somebody_and_still_meets_the_robot(side
 
 
 def test_an_overtaking_pedestrian_overtakes_people_too() -> None:
-    """Behind somebody who walks slowly on its side it swerves, passes and comes in ahead of the robot."""
+    """Behind somebody who walks slowly on its side it swerves, passes and comes in ahead of the
+    robot."""
     slow = NearbyPerson("c1", 52.0, 1.6, 0.6, 0.0)
     track = drive(event("overtaking"), 500, 1.0, 45.0, slow)
     ways = [(r.states[0].walkers[0].x_m, r.states[0].walkers[0].y_m) for _, r in track]
@@ -142,7 +191,11 @@ def test_an_overtaking_pedestrian_overtakes_people_too() -> None:
 
 def test_an_injected_person_goes_round_people_and_ends_beside_who_stands_at_its_end() -> None:
     """On a way of 10 m somebody stands halfway, and somebody else at the end."""
-    person = arriving(Injected(tick=0, injection=Injection(id="anna", path=((0.0, 5.0), (10.0, 5.0)), stay_s=100.0)))
+    person = arriving(
+        Injected(
+            tick=0, injection=Injection(id="anna", path=((0.0, 5.0), (10.0, 5.0)), stay_s=100.0)
+        )
+    )
     standing = (NearbyPerson("c1", 5.0, 5.0, 0.0, 0.0), NearbyPerson("c2", 10.0, 5.0, 0.0, 0.0))
     ways = []
     for tick in range(400):
@@ -158,12 +211,17 @@ def test_an_injected_person_goes_round_people_and_ends_beside_who_stands_at_its_
 
 @pytest.mark.parametrize("names", ["ab", "ba", "abc"])
 def test_guests_who_are_injected_into_one_place_at_once_part(names: str) -> None:
-    """With the same path they are not in each other after a second, nor ever again before they arrive."""
+    """With the same path they are not in each other after a second, nor ever again before they
+    arrive."""
     path = ((0.0, 5.0), (10.0, 5.0))
-    injected_people = [arriving(Injected(tick=0, injection=Injection(id=name, path=path))) for name in names]
+    injected_people = [
+        arriving(Injected(tick=0, injection=Injection(id=name, path=path))) for name in names
+    ]
     for tick in range(120):
         seen = tuple(map(told, injected_people))
-        after = [injected_moved_on(person, asked(tick, 90.0, 0.0, seen)) for person in injected_people]
+        after = [
+            injected_moved_on(person, asked(tick, 90.0, 0.0, seen)) for person in injected_people
+        ]
         injected_people = [person for person in after if person is not None]
         places = [(g.walker.x_m, g.walker.y_m) for g in injected_people]
         gaps = [math.dist(a, b) for a, b in itertools.combinations(places, 2)]
@@ -171,13 +229,23 @@ def test_guests_who_are_injected_into_one_place_at_once_part(names: str) -> None
 
 
 def test_the_director_is_told_of_those_near_the_people_it_moves_and_not_of_these() -> None:
-    """Of a crowd, one 3 m from an event pedestrian and a person beside it; nobody while there is none."""
-    ids, kind = ("u", "s", "t", "a", "r"), [0, 0, PersonKind.EVENT, PersonKind.EVENT, PersonKind.INJECTED]
+    """Of a crowd, one 3 m from an event pedestrian and a person beside it; nobody while there is
+    none."""
+    ids = ("u", "s", "t", "a", "r")
+    kind = [0, 0, PersonKind.EVENT, PersonKind.EVENT, PersonKind.INJECTED]
     xy = [(3.0, 0.0), (9.0, 0.0), (0.0, 0.0), (0.0, 1.0), (-2.0, 0.0)]
-    people = People.of(ids, xy, [math.pi / 2] * 5, [1.0, 1.0, 0.0, 0.0, 0.5], ("walk",) * 5, kind=kind)
+    people = People.of(
+        ids, xy, [math.pi / 2] * 5, [1.0, 1.0, 0.0, 0.0, 0.5], ("walk",) * 5, kind=kind
+    )
     told = nearby_people(people)
-    assert [(b.id, b.x_m, b.y_m, b.kind) for b in told] == [("u", 3.0, 0.0, 0), ("r", -2.0, 0.0, PersonKind.INJECTED)]
-    assert [(b.vx_mps, b.vy_mps) for b in told] == [pytest.approx((0.0, 1.0)), pytest.approx((0.0, 0.5))]
+    assert [(b.id, b.x_m, b.y_m, b.kind) for b in told] == [
+        ("u", 3.0, 0.0, 0),
+        ("r", -2.0, 0.0, PersonKind.INJECTED),
+    ]
+    assert [(b.vx_mps, b.vy_mps) for b in told] == [
+        pytest.approx((0.0, 1.0)),
+        pytest.approx((0.0, 0.5)),
+    ]
     crowd = People.of(ids[:2], xy[:2], [0.0] * 2, [1.0] * 2, ("walk",) * 2)
     assert nearby_people(crowd) == nearby_people(NOBODY) == ()
 
@@ -194,10 +262,12 @@ def test_the_director_is_told_of_those_near_the_people_it_moves_and_not_of_these
 def test_nobody_is_kept_from_a_place_of_the_event_for_ever(
     kind: str, people: int, side: int, standing: list[tuple[float, float]]
 ) -> None:
-    """Where people stand in the way and close to the places, everybody is there within 8 s and stays."""
+    """Where people stand in the way and close to the places, everybody is there within 8 s and
+    stays."""
     crowd = [NearbyPerson(f"c{k}", *xy, 0.0, 0.0) for k, xy in enumerate(standing)]
     track = drive(event(kind, people=people, side=side), 300, 0.1, 40.0, *crowd)
-    late, last = track[160][1].states[0], track[-1][1].states[0]
+    late = track[160][1].states[0]
+    last = track[-1][1].states[0]
     assert (late.phase, last.phase) == ("acting", "acting")
     assert [(w.x_m, w.y_m) for w in late.walkers] == [(w.x_m, w.y_m) for w in last.walkers]
     alone = drive(event(kind, people=people, side=side), 300, 0.1, 40.0)[-1][1].states[0]

@@ -10,8 +10,8 @@ import pytest
 
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import CityMap
-from scenarios.bench.soak import endure, wandering
-from sumo_nets.maps.mapstore import read_map
+from scenarios.tools.bench.soak import endure, wandering
+from sumo_nets.maps.map_store import read_map
 
 pytestmark = pytest.mark.engine
 
@@ -19,8 +19,8 @@ MAP = "sumo-fkk-in"
 
 
 def test_a_map_is_endured() -> None:
-    """A net that comes with SUMO is simulated to the end, with about as many persons and cars as asked for; how far it
-    has come is told meanwhile."""
+    """A net that comes with SUMO is simulated to the end, with about as many persons and cars as
+    asked for; how far it has come is told meanwhile."""
     shares: list[float] = []
     done = endure(CityMap(map=MAP), seed=1, minutes=0.5, tell=shares.append)
     assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) > 1
@@ -35,7 +35,8 @@ def test_what_goes_wrong_is_the_reason() -> None:
 
 
 def test_bodies_go_everywhere() -> None:
-    """In ten minutes a body is on sidewalks, on roads, on neither and at dead ends; it walks, and at times it jumps."""
+    """In ten minutes a body is on sidewalks, on roads, on neither and at dead ends; it walks, and
+    at times it jumps."""
     street_map = read_map(MAP)
     body = wandering(street_map, WalkGraph(street_map), np.random.default_rng(3))
     poses = list(itertools.islice(body, 12000))

@@ -6,13 +6,14 @@ import msgspec
 import pytest
 
 from cosim.core.state import Command
-from cosim.episode.ports import Manifest, Observation
-from cosim.judge.event_monitor import Hidden
-from cosim.records.record import Record
+from cosim.episode.interfaces import Observation
+from cosim.results.event_monitor import Hidden
+from cosim.results.record import Record
+from cosim.spec.manifest import Manifest
 from cosim.spec.scenario import CrowdSpec, Scenario
-from scenarios.catalog import load_suite
-from scenarios.execution.run import run_episode
-from scenarios.execution.scorer import Scorer
+from scenarios.episodes.run_episode import run_episode
+from scenarios.episodes.scorer import Scorer
+from scenarios.suites.catalog import load_suite
 
 
 class Blind:
@@ -33,26 +34,44 @@ class Blind:
 def obstructing(limit_s: float) -> Scenario:
     """Without street life, and shorter."""
     (one,) = (s for s in load_suite("reactive").scenarios if s.id == "obstructing-001")
-    return msgspec.structs.replace(one, crowd=CrowdSpec(persons=0, vehicles=0), time_limit_s=limit_s)
+    return msgspec.structs.replace(
+        one, crowd=CrowdSpec(persons=0, vehicles=0), time_limit_s=limit_s
+    )
 
 
 def outcome(record: Record) -> tuple[str, str | None, float | None, bool]:
-    return record.status, record.ended, record.measures["success"], record.events[0].triggered_at_s is not None
+    return (
+        record.status,
+        record.ended,
+        record.measures["success"],
+        record.events[0].triggered_at_s is not None,
+    )
 
 
 @pytest.mark.engine
 def test_who_fails_before_the_event_has_failed() -> None:
-    """Off the sidewalk at once, and standing until the time is up: both before the trigger, both scored."""
+    """Off the sidewalk at once, and standing until the time is up: both before the trigger, both
+    scored."""
     far = obstructing(20.0)
     (event,) = far.events
-    far = msgspec.structs.replace(far, events=(msgspec.structs.replace(event, route_s_m=event.route_s_m + 5.0),))
+    far = msgspec.structs.replace(
+        far, events=(msgspec.structs.replace(event, route_s_m=event.route_s_m + 5.0),)
+    )
     assert outcome(run_episode(far, Blind(1.5, 0.65)).record) == ("done", "failure", 0.0, False)
-    assert outcome(run_episode(obstructing(2.0), Blind(0.0)).record) == ("done", "timeout", 0.0, False)
+    assert outcome(run_episode(obstructing(2.0), Blind(0.0)).record) == (
+        "done",
+        "timeout",
+        0.0,
+        False,
+    )
 
 
 @pytest.mark.engine
-def test_who_comes_by_an_event_that_nobody_could_see_has_done_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A goal reached without a failure, and something before the camera all the way: the simulator owes the event."""
+def test_who_comes_by_an_event_that_nobody_could_see_has_done_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A goal reached without a failure, and something before the camera all the way: the simulator
+    owes the event."""
     begin = Scorer.__init__
 
     def veiled(*given: object) -> None:

@@ -1,4 +1,5 @@
-"""What `cosim suite check` finds out: a suite that keeps all claims, and for each claim one that breaks it."""
+"""What `cosim suite check` finds out: a suite that keeps all claims, and for each claim one that
+breaks it."""
 
 from __future__ import annotations
 
@@ -25,19 +26,19 @@ from cosim.spec.scenario import (
     read_suite,
 )
 from cosim.spec.selection import scenarios_chosen
-from scenarios.builders.building import build_suite
-from scenarios.builders.claims import CLAIMS, Read
-from scenarios.builders.daylight import drawn_daylight
-from scenarios.builders.long_horizon import build_long_horizon
-from scenarios.builders.place_claims import faults_in_places, narrow_places, sample_of, ways_left
-from scenarios.builders.proofs import Dropped, Proof, Proofs, read_proofs, write_proofs
-from scenarios.builders.recipes import LONG_WAY, RECIPES, Slot
-from scenarios.builders.unit import STRUCTURES, TURN_RAD, build_unit, turn_rad
-from scenarios.catalog import SUITES, load_suite, with_crowd
 from scenarios.events import EVENT_KINDS
-from scenarios.execution.places import place
-from sumo_nets.city.seeds import TEST_SEEDS, VAL_SEEDS
-from sumo_nets.maps.mapstore import about_map, known_maps
+from scenarios.places.nets import place
+from scenarios.suites.catalog import SUITES, load_suite, with_crowd
+from scenarios.suites.daylight import drawn_daylight
+from scenarios.suites.long_horizon import build_long_horizon
+from scenarios.suites.proofs import Dropped, Proof, Proofs, read_proofs, write_proofs
+from scenarios.suites.recipes import LONG_WAY, RECIPES, Slot
+from scenarios.suites.unit import STRUCTURES, TURN_RAD, build_unit, turn_rad
+from scenarios.tools.build.build_suite import build_suite
+from scenarios.tools.build.claims import CLAIMS, Read
+from scenarios.tools.build.place_claims import faults_in_places, narrow_places, sample_of, ways_left
+from sumo_nets.city.store import TEST_SEEDS, VAL_SEEDS
+from sumo_nets.maps.map_store import about_map, known_maps
 from sumo_nets.maps.wheel_places import WHEEL_PLACES
 from tests.conftest import Cosim
 
@@ -46,9 +47,12 @@ replace = msgspec.structs.replace
 
 
 def honest(name: str) -> Read:
-    """A suite of the recipe's slots that keeps every claim of its file, drawn on no map, with proofs."""
+    """A suite of the recipe's slots that keeps every claim of its file, drawn on no map, with
+    proofs."""
     kinds = [*EVENT_KINDS]
-    scenarios = tuple(of_slot(slot, number, kinds) for number, slot in enumerate(RECIPES[name].slots))
+    scenarios = tuple(
+        of_slot(slot, number, kinds) for number, slot in enumerate(RECIPES[name].slots)
+    )
     suite = Suite(name=name, version="1", scenarios=scenarios)
     return Read(suite, proofs_of(suite))
 
@@ -62,10 +66,20 @@ def of_slot(slot: Slot, number: int, kinds: list[str]) -> Scenario:
     route = np.column_stack([x_m + np.linspace(0.0, length_m, 21), np.zeros(21)])
     if slot.structure == "curve":
         side = 1.0 if number % 6 < 3 else -1.0
-        route[11:] = route[10] + np.column_stack([np.zeros(10), side * np.linspace(0.5, 5.0, 10) * length_m / 10.0])
+        route[11:] = route[10] + np.column_stack(
+            [np.zeros(10), side * np.linspace(0.5, 5.0, 10) * length_m / 10.0]
+        )
     line = Polyline(np.round(route, 3))
-    names = kinds[number % 8 : number % 8 + 1] if long else [slot.structure] if slot.structure in kinds else []
-    crossing = RouteCrossing(id="c", enter_s_m=3.0, leave_s_m=8.0, signalised=long and number % 2 == 0)
+    names = (
+        kinds[number % 8 : number % 8 + 1]
+        if long
+        else [slot.structure]
+        if slot.structure in kinds
+        else []
+    )
+    crossing = RouteCrossing(
+        id="c", enter_s_m=3.0, leave_s_m=8.0, signalised=long and number % 2 == 0
+    )
     barrier = Barrier(x_m=x_m, y_m=9.0, heading_rad=0.0, length_m=3.0, strip="s", end=0)
     return Scenario(
         id=slot.name,
@@ -90,19 +104,37 @@ def of_slot(slot: Slot, number: int, kinds: list[str]) -> Scenario:
 def event_of(kind: str, number: int) -> Event:
     side = 1 if number // 9 % 2 else -1
     return Event(
-        id="e0", kind=kind, x_m=0.0, y_m=0.0, heading_rad=0.0, route_s_m=5.0, half_width_m=1.5, side=side, speed_mps=1.3
+        id="e0",
+        kind=kind,
+        x_m=0.0,
+        y_m=0.0,
+        heading_rad=0.0,
+        route_s_m=5.0,
+        half_width_m=1.5,
+        side=side,
+        speed_mps=1.3,
     )
 
 
 def proofs_of(suite: Suite) -> Proofs:
     proofs = tuple(
         Proof(
-            scenario=s.id, scenario_hash=content_hash(s), expert="orca", expert_version="1", state_hash="00", time_s=9.0
+            scenario=s.id,
+            scenario_hash=content_hash(s),
+            expert="orca",
+            expert_version="1",
+            state_hash="00",
+            time_s=9.0,
         )
         for s in suite.scenarios
     )
     return Proofs(
-        suite=suite.name, suite_hash=suite.content_hash, expert="orca 1", first=len(proofs), dropped={}, proofs=proofs
+        suite=suite.name,
+        suite_hash=suite.content_hash,
+        expert="orca 1",
+        first=len(proofs),
+        dropped={},
+        proofs=proofs,
     )
 
 
@@ -149,7 +181,10 @@ def straightened(scenario: Scenario) -> Scenario:
 
 def nearer(scenario: Scenario, share: float) -> Scenario:
     """Its route cut to a share of it."""
-    points = [scenario.route_line.at(float(s)).xy for s in np.linspace(0.0, share * scenario.route_line.length_m, 21)]
+    points = [
+        scenario.route_line.at(float(s)).xy
+        for s in np.linspace(0.0, share * scenario.route_line.length_m, 21)
+    ]
     route = tuple((float(x), float(y)) for x, y in points)
     return replace(scenario, goal=route[-1], route=route, crossings=(), events=())
 
@@ -157,7 +192,10 @@ def nearer(scenario: Scenario, share: float) -> Scenario:
 def spot_of(read: Read, index: int, other: int) -> Read:
     """A scenario moved onto another's spot."""
     there = read.suite.scenarios[other]
-    moved = {name: getattr(there, name) for name in ("place", "start", "goal", "route", "crossings", "events")}
+    moved = {
+        name: getattr(there, name)
+        for name in ("place", "start", "goal", "route", "crossings", "events")
+    }
     return one(read, index, **moved)
 
 
@@ -168,14 +206,30 @@ night = replace(unit.suite.scenarios[0].light, hour=23.0)
 BROKEN: dict[str, tuple[str, Read, str]] = {
     "one-missing": ("counts", of(unit, list(unit.suite.scenarios[1:])), "is missing"),
     "one-of-another-structure": ("counts", one(unit, 0, structure="curve"), "not ('straight'"),
-    "one-elsewhere": ("counts", one(unit, 0, place=City(seed=99, net_hash="net")), "not ('straight', 'val', 1)"),
-    "all-val": ("val and test", all_of(unit, lambda s: replace(s, split="val")), "is test, not a fifth"),
+    "one-elsewhere": (
+        "counts",
+        one(unit, 0, place=City(seed=99, net_hash="net")),
+        "not ('straight', 'val', 1)",
+    ),
+    "all-val": (
+        "val and test",
+        all_of(unit, lambda s: replace(s, split="val")),
+        "is test, not a fifth",
+    ),
     "test-where-val-is": ("val and test", one(unit, 0, split="test"), "where val is, too"),
     "no-net-hash": ("hashes", one(unit, 0, place=City(seed=1)), "has no hash"),
-    "two-nets-of-a-place": ("hashes", one(unit, 0, place=City(seed=1, net_hash="other")), "has 2 nets"),
+    "two-nets-of-a-place": (
+        "hashes",
+        one(unit, 0, place=City(seed=1, net_hash="other")),
+        "has 2 nets",
+    ),
     "another-was-proved": ("hashes", Read(unit.suite, reactive.proofs), "was proved"),
     "no-proofs": ("proofs", Read(unit.suite, None), "has no proofs"),
-    "a-scenario-changed-since": ("proofs", with_proof(unit, scenario_hash="other"), "was changed since"),
+    "a-scenario-changed-since": (
+        "proofs",
+        with_proof(unit, scenario_hash="other"),
+        "was changed since",
+    ),
     "a-proof-missing": ("proofs", with_proof(unit, scenario="nobody"), "has no proof"),
     "a-proof-that-touches": ("proofs", with_proof(unit, obstacles_m=-0.1), "touches"),
     "a-proof-too-slow": ("proofs", with_proof(unit, time_s=61.0), "no time within the limit"),
@@ -183,25 +237,53 @@ BROKEN: dict[str, tuple[str, Read, str]] = {
     "too-short": ("lengths", of(unit, [nearer(unit.suite.scenarios[0], 0.4)]), "m long"),
     "not-so-far-in-all": ("lengths", all_of(long, lambda s: nearer(s, 0.95)), "34.67 km in all"),
     "a-curve-straightened": ("structures", all_of(unit, straightened), "is no 'curve'"),
-    "a-straight-way-bent": ("structures", one(unit, curve, structure="straight"), "is no 'straight'"),
+    "a-straight-way-bent": (
+        "structures",
+        one(unit, curve, structure="straight"),
+        "is no 'straight'",
+    ),
     "a-crosswalk-with-signals": (
         "structures",
-        one(unit, crosswalk, crossings=(RouteCrossing(id="c", enter_s_m=3.0, leave_s_m=8.0, signalised=True),)),
+        one(
+            unit,
+            crosswalk,
+            crossings=(RouteCrossing(id="c", enter_s_m=3.0, leave_s_m=8.0, signalised=True),),
+        ),
         "is no 'crosswalk'",
     ),
-    "another-event": ("structures", one(reactive, 0, events=(event_of("frontal", 1),)), "is no 'obstructing'"),
-    "somebody-in-static": ("structures", one(reactive, 8, events=(event_of("frontal", 1),)), "is no 'static'"),
+    "another-event": (
+        "structures",
+        one(reactive, 0, events=(event_of("frontal", 1),)),
+        "is no 'obstructing'",
+    ),
+    "somebody-in-static": (
+        "structures",
+        one(reactive, 8, events=(event_of("frontal", 1),)),
+        "is no 'static'",
+    ),
     "a-long-way-without-barriers": ("structures", one(long, 0, barriers=()), "is no 'route'"),
     "goes-on-after-a-failure": ("structures", one(unit, 0, ends_on_failure=False), "does not end"),
     "another-time-limit": ("structures", one(unit, 0, time_limit_s=90.0), "not 60"),
-    "walkers-in-a-reactive-one": ("street life", one(reactive, 0, crowd=CrowdSpec(persons=12)), "12 people"),
+    "walkers-in-a-reactive-one": (
+        "street life",
+        one(reactive, 0, crowd=CrowdSpec(persons=12)),
+        "12 people",
+    ),
     "an-empty-street-on-a-long-way": (
         "street life",
         one(long, 0, crowd=CrowdSpec(persons=0, vehicles=0)),
         "0 people and 0 vehicles",
     ),
-    "a-crowd-that-was-asked-for": ("street life", Read(with_crowd(long.suite, persons=9), long.proofs), "9 people"),
-    "no-signals": ("street life", all_of(long, lambda s: replace(s, crossings=())), "0 of 105 ways have signals"),
+    "a-crowd-that-was-asked-for": (
+        "street life",
+        Read(with_crowd(long.suite, persons=9), long.proofs),
+        "9 people",
+    ),
+    "no-signals": (
+        "street life",
+        all_of(long, lambda s: replace(s, crossings=())),
+        "0 of 105 ways have signals",
+    ),
     "a-runner": (
         "events",
         one(reactive, 0, events=(replace(event_of("obstructing", 1), speed_mps=2.0),)),
@@ -209,7 +291,9 @@ BROKEN: dict[str, tuple[str, Read, str]] = {
     ),
     "a-kind-is-missing-on-long-ways": (
         "events",
-        all_of(long, lambda s: replace(s, events=tuple(e for e in s.events if e.kind != "lateral"))),
+        all_of(
+            long, lambda s: replace(s, events=tuple(e for e in s.events if e.kind != "lateral"))
+        ),
         "lateral: 0 times",
     ),
     "all-from-one-side": (
@@ -219,13 +303,21 @@ BROKEN: dict[str, tuple[str, Read, str]] = {
     ),
     "night": ("spread", one(unit, 0, light=night), "too dark"),
     "thick-fog": ("spread", one(unit, 0, light=replace(night, hour=12.0, fog_m=40.0)), "foggy"),
-    "always-noon": ("spread", all_of(unit, lambda s: replace(s, light=replace(night, hour=12.0))), "morning: 0.0%"),
+    "always-noon": (
+        "spread",
+        all_of(unit, lambda s: replace(s, light=replace(night, hour=12.0))),
+        "morning: 0.0%",
+    ),
     "never-fog": (
         "spread",
         all_of(unit, lambda s: replace(s, light=replace(s.light, fog_m=None))),
         "0.0% of the scenarios have fog",
     ),
-    "all-of-one-length": ("spread", all_of(unit, lambda s: nearer(s, 10.5 / s.route_line.length_m)), "long: 0.0%"),
+    "all-of-one-length": (
+        "spread",
+        all_of(unit, lambda s: nearer(s, 10.5 / s.route_line.length_m)),
+        "long: 0.0%",
+    ),
     "the-same-spot-twice": ("duplicates", spot_of(unit, 3, 0), "is on the spot of straight-001"),
 }
 
@@ -251,14 +343,17 @@ def test_a_large_file_is_found_out(tmp_path: Path) -> None:
 
 
 def test_the_recipes_make_what_the_benchmark_says() -> None:
-    """330, 900 and 105 scenarios; a fifth in cities and crops of their own; eleven real places; 36.5 km."""
+    """330, 900 and 105 scenarios; a fifth in cities and crops of their own; eleven real places;
+    36.5 km."""
     counts = {name: len(recipe.slots) for name, recipe in RECIPES.items()}
     assert counts == {"unit": 330, "reactive": 900, "long-horizon": 105}
     for recipe in RECIPES.values():
         assert sum(slot.split == "test" for slot in recipe.slots) * 5 == len(recipe.slots)
         assert len({slot.name for slot in recipe.slots}) == len(recipe.slots)
     assert not set(VAL_SEEDS) & set(TEST_SEEDS) and len(WHEEL_PLACES) == 11
-    assert math.isclose(sum(slot.length_m for slot in RECIPES["long-horizon"].slots), 36_500.0, abs_tol=5.0)
+    assert math.isclose(
+        sum(slot.length_m for slot in RECIPES["long-horizon"].slots), 36_500.0, abs_tol=5.0
+    )
     statics = [slot for slot in RECIPES["reactive"].slots if slot.like]
     assert len(statics) == 100 and {slot.structure for slot in statics} == {"static"}
 
@@ -270,9 +365,12 @@ def test_scenarios_are_chosen_by_split() -> None:
 
 
 def test_added_street_life_is_marked() -> None:
-    """A crowd that was asked for is another suite, by its version and its hash, and each scenario says so."""
+    """A crowd that was asked for is another suite, by its version and its hash, and each scenario
+    says so."""
     busy = with_crowd(reactive.suite, persons=12, vehicles=8)
-    assert busy.version == "1-persons12-vehicles8" and busy.content_hash != reactive.suite.content_hash
+    assert (
+        busy.version == "1-persons12-vehicles8" and busy.content_hash != reactive.suite.content_hash
+    )
     assert all(s.crowd.added and s.crowd.persons == 12 for s in busy.scenarios)
 
 
@@ -287,18 +385,26 @@ def test_proofs_survive_their_file(tmp_path: Path) -> None:
     """Written and read they are the same; what was dropped is counted by reason."""
     assert unit.proofs is not None
     first, *others = unit.proofs.proofs
-    dropped = (Dropped(0, "collision with object", "at 3.0 m"), Dropped(1000, "collision with object", "at 9.1 m"))
-    written = write_proofs(tmp_path / "unit.json", "unit", "00", [replace(first, dropped=dropped), *others])
+    dropped = (
+        Dropped(0, "collision with object", "at 3.0 m"),
+        Dropped(1000, "collision with object", "at 9.1 m"),
+    )
+    written = write_proofs(
+        tmp_path / "unit.json", "unit", "00", [replace(first, dropped=dropped), *others]
+    )
     assert read_proofs(tmp_path / "unit.json") == written
     assert written.dropped == {"collision with object": 2} and written.first == len(others)
 
 
 @pytest.mark.parametrize("structure", STRUCTURES)
 def test_a_unit_scenario_is_what_its_structure_says(structure: str) -> None:
-    """Drawn from a seed: 10 to 20 m, nobody there, a bend of 45 degrees for a curve, one crossing for a crosswalk."""
+    """Drawn from a seed: 10 to 20 m, nobody there, a bend of 45 degrees for a curve, one crossing
+    for a crosswalk."""
     _, street_map = place(SMALL)
     graph = WalkGraph(street_map)
-    drawn = [build_unit(structure, SMALL, street_map, graph, seed, f"u-{seed}") for seed in range(4)]  # type: ignore[arg-type]
+    drawn = [
+        build_unit(structure, SMALL, street_map, graph, seed, f"u-{seed}") for seed in range(4)
+    ]  # type: ignore[arg-type]
     again = build_unit(structure, SMALL, street_map, graph, 0, "u-0")  # type: ignore[arg-type]
     assert again == drawn[0]
     for scenario in drawn:
@@ -313,7 +419,9 @@ def test_a_long_way_has_the_length_that_is_wanted() -> None:
     """Within three metres, whatever corners it cuts."""
     _, street_map = place(SMALL)
     for length_m in (150.0, 260.0):
-        drawn = build_long_horizon(SMALL, street_map, WalkGraph(street_map), 3, "long", length_m=length_m)
+        drawn = build_long_horizon(
+            SMALL, street_map, WalkGraph(street_map), 3, "long", length_m=length_m
+        )
         assert abs(drawn.route_line.length_m - length_m) <= 3.0
 
 
@@ -321,7 +429,9 @@ def test_a_long_way_has_the_length_that_is_wanted() -> None:
 def way() -> Scenario:
     """A long way in a small city."""
     _, street_map = place(SMALL)
-    return build_long_horizon(SMALL, street_map, WalkGraph(street_map), 3, "lh-small", length_m=150.0)
+    return build_long_horizon(
+        SMALL, street_map, WalkGraph(street_map), 3, "lh-small", length_m=150.0
+    )
 
 
 def test_a_second_way_is_found_out(way: Scenario) -> None:
@@ -344,10 +454,12 @@ def test_a_narrow_gap_is_found_out(way: Scenario) -> None:
     assert list(narrow_places(way, street_map)) == []
     x_m, y_m, heading_rad = way.route_line.at(30.0)
     aside = [
-        (x_m - left_m * math.sin(heading_rad), y_m + left_m * math.cos(heading_rad)) for left_m in (-2, -1, 0, 1, 2)
+        (x_m - left_m * math.sin(heading_rad), y_m + left_m * math.cos(heading_rad))
+        for left_m in (-2, -1, 0, 1, 2)
     ]
     wall = tuple(
-        Obstacle(kind="box", x_m=x, y_m=y, heading_rad=heading_rad + math.pi / 2 - math.pi, form=2) for x, y in aside
+        Obstacle(kind="box", x_m=x, y_m=y, heading_rad=heading_rad + math.pi / 2 - math.pi, form=2)
+        for x, y in aside
     )
     (words,) = narrow_places(replace(way, obstacles=wall), street_map)
     assert "no gap" in words
@@ -370,14 +482,17 @@ def test_a_sample_holds_every_structure() -> None:
 
 @pytest.mark.engine
 def test_a_build_goes_on_where_it_was_and_its_proofs_hold(tmp_path: Path, cosim: Cosim) -> None:
-    """A candidate whose process died twice is dropped and told, the next is kept; built again, nothing is done anew;
-    the expert comes to the same state to the bit, and another state in the proof is found out."""
+    """A candidate whose process died twice is dropped and told, the next is kept; built again,
+    nothing is done anew; the expert comes to the same state to the bit, and another state in the
+    proof is found out."""
     out = tmp_path / "unit.json"
     lines: list[str] = []
     parts = out.with_suffix(".parts")
     parts.mkdir()
     (parts / "straight-001.trying").write_text('{"dropped": [], "begun": 2}')
-    suite, proofs = build_suite("unit", out, tell=lambda line, *_: lines.append(line), only=["straight-001"])
+    suite, proofs = build_suite(
+        "unit", out, tell=lambda line, *_: lines.append(line), only=["straight-001"]
+    )
     (proof,) = proofs.proofs
     assert proof.dropped == (Dropped(0, "its process died"),) and suite.scenarios[0].seed == 1000
     assert proofs.dropped == {"its process died": 1} and "its process died" in lines[0]
@@ -400,13 +515,16 @@ def test_the_shipped_suites_keep_their_claims(name: str) -> None:
     """What ships is what the recipe says, as far as its file and its proofs tell."""
     path = SUITES[name]
     read = Read(load_suite(name), read_proofs(path), path)
-    assert {claim: faults for claim, of_claim in CLAIMS.items() if (faults := list(of_claim(read)))} == {}
+    assert {
+        claim: faults for claim, of_claim in CLAIMS.items() if (faults := list(of_claim(read)))
+    } == {}
 
 
 @pytest.mark.engine
 @pytest.mark.parametrize("name", SUITES)
 def test_a_sample_of_the_shipped_suites_holds_in_its_places(name: str) -> None:
-    """One scenario's net, way, gaps, and proof to the bit; `cosim suite check --whole` looks at all."""
+    """One scenario's net, way, gaps, and proof to the bit; `cosim suite check --whole` looks at
+    all."""
     suite = load_suite(name)
     short = [s for s in sample_of(suite, 1) if s.structure != LONG_WAY][:1]
     picked = short or sorted(suite.scenarios, key=lambda s: s.route_line.length_m)[:1]
@@ -417,4 +535,6 @@ def test_a_sample_of_the_shipped_suites_holds_in_its_places(name: str) -> None:
 def test_a_real_place_says_where_it_comes_from() -> None:
     """A crop is imported from the SUMO package's net when it is asked for, with its licences."""
     about = about_map("ingolstadt-1")
-    assert about.source == "ingolstadt.net.xml.gz" and any("OpenStreetMap" in words for words in about.licences)
+    assert about.source == "ingolstadt.net.xml.gz" and any(
+        "OpenStreetMap" in words for words in about.licences
+    )

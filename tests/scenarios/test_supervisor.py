@@ -13,14 +13,14 @@ import pytest
 
 from cosim.core.errors import MachineError
 from cosim.spec.connection import Connection
-from scenarios.many import supervisor
-from scenarios.many.passing_folder import passing_folder
-from scenarios.many.supervisor import work
+from scenarios.runs import zenoh_worker as supervisor
+from scenarios.runs.passing_folder import passing_folder
+from scenarios.runs.zenoh_worker import work
 from tests.scenarios.test_many_workers import Run, until
 
 HOLDS = """
 import sys, time
-from scenarios.many.passing_folder import passing_folder
+from scenarios.runs.passing_folder import passing_folder
 with passing_folder("cosim-test-") as folder:
     (folder / "0.log").write_text("printed")
     print(folder, flush=True)
@@ -29,10 +29,14 @@ with passing_folder("cosim-test-") as folder:
 
 
 @pytest.mark.engine
-def test_a_worker_for_one_run_does_not_wait_for_ever(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It ends, and says why, when it was cut off from a run that is over, and when none was ever there."""
+def test_a_worker_for_one_run_does_not_wait_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ends, and says why, when it was cut off from a run that is over, and when none was ever
+    there."""
     monkeypatch.setattr(supervisor, "_LOOKS_S", 0.0)
-    run, said = Run(tmp_path), list[str]()
+    run = Run(tmp_path)
+    said = list[str]()
 
     def over_unheard() -> None:
         until(lambda: ": is there" in run.log)
@@ -59,7 +63,10 @@ def test_the_folder_of_a_process_that_was_killed_is_removed_by_the_next(
     there = []
     for _ in range(2):
         process = subprocess.Popen(
-            [sys.executable, "-c", HOLDS], env=os.environ | {"TMPDIR": str(tmp_path)}, stdout=subprocess.PIPE, text=True
+            [sys.executable, "-c", HOLDS],
+            env=os.environ | {"TMPDIR": str(tmp_path)},
+            stdout=subprocess.PIPE,
+            text=True,
         )
         assert process.stdout is not None
         there.append((process, Path(process.stdout.readline().strip())))

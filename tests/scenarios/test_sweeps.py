@@ -1,4 +1,5 @@
-"""Own scenarios that are run: the examples that ship, and sweeps, from a list in a file to a table and a picture."""
+"""Own scenarios that are run: the examples that ship, and sweeps, from a list in a file to a table
+and a picture."""
 
 from __future__ import annotations
 
@@ -13,13 +14,13 @@ import pandas as pd
 import pytest
 
 from cosim.core.errors import MachineError
-from cosim.judge.metrics import METRICS
-from cosim.records.results import summary_of
 from cosim.report.curves import draw_curves
-from scenarios.own.reading import OwnFile, read_own
-from scenarios.own.sweep import summary_of_sweep, write_sweep
+from cosim.results.metrics import METRICS
+from cosim.results.table import summary_of
+from scenarios.suites.user_scenarios.read import OwnFile, read_own
+from scenarios.suites.user_scenarios.sweep import summary_of_sweep, write_sweep
 from tests.conftest import ROOT, Cosim
-from tests.drawn_text import clipped_texts
+from tests.support.drawn_text import clipped_texts
 
 EXAMPLES = ROOT / "scenarios" / "examples"
 SHORTER = {
@@ -32,9 +33,12 @@ SHORTER = {
 
 @pytest.fixture
 def swept() -> tuple[OwnFile, pd.DataFrame]:
-    """A sweep over density and goal, and what could have come of it: at a density of 20 every second one fails."""
+    """A sweep over density and goal, and what could have come of it: at a density of 20 every
+    second one fails."""
     own = read_own(EXAMPLES / "density-sweep.toml")
-    table = pd.DataFrame(index=range(len(own.variants)), columns=["scenario", "status", *METRICS], dtype=object)
+    table = pd.DataFrame(
+        index=range(len(own.variants)), columns=["scenario", "status", *METRICS], dtype=object
+    )
     table["scenario"], table["status"] = [variant.id for variant in own.variants], "done"
     dense = np.array([variant.at["crowd.density"] == 20 for variant in own.variants])
     failed = dense & (np.arange(len(dense)) % 2 == 0)
@@ -42,16 +46,24 @@ def swept() -> tuple[OwnFile, pd.DataFrame]:
     return own, table
 
 
-def test_a_sweep_gives_what_the_summary_of_a_run_gives_for_each_value(swept: tuple[OwnFile, pd.DataFrame]) -> None:
-    """Means, pooled rates and intervals of the episodes of one value, as of a run of these alone."""
+def test_a_sweep_gives_what_the_summary_of_a_run_gives_for_each_value(
+    swept: tuple[OwnFile, pd.DataFrame],
+) -> None:
+    """Means, pooled rates and intervals of the episodes of one value, as of a run of these
+    alone."""
     own, table = swept
     summary = summary_of_sweep(own, table).set_index(["crowd.density", "metric"])
     assert list(dict.fromkeys(summary.index.get_level_values(0))) == [0, 5, 10, 20]
     for density in (0, 20):
         ids = [variant.id for variant in own.variants if variant.at["crowd.density"] == density]
         alone = summary_of(table[table["scenario"].isin(ids)])
-        pd.testing.assert_frame_equal(summary.loc[density][["mean", "low", "high", "n"]], alone, check_dtype=False)
-    assert summary.loc[(0, "success"), "mean"] == 1.0 and 0.0 < summary.loc[(20, "success"), "mean"] < 1.0
+        pd.testing.assert_frame_equal(
+            summary.loc[density][["mean", "low", "high", "n"]], alone, check_dtype=False
+        )
+    assert (
+        summary.loc[(0, "success"), "mean"] == 1.0
+        and 0.0 < summary.loc[(20, "success"), "mean"] < 1.0
+    )
     rate = summary.loc[(20, "failures_per_100m")]
     assert rate["mean"] == pytest.approx(100.0 * table["failures"].sum() / 120.0) and rate["n"] == 3
 
@@ -59,12 +71,17 @@ def test_a_sweep_gives_what_the_summary_of_a_run_gives_for_each_value(swept: tup
 def test_a_sweep_is_written_whole_or_not_at_all(
     swept: tuple[OwnFile, pd.DataFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A table of every metric and a picture; without the library that draws only the table; nothing without a place."""
+    """A table of every metric and a picture; without the library that draws only the table; nothing
+    without a place."""
     own, table = swept
     summary = summary_of_sweep(own, table)
     assert [path.name for path in write_sweep(summary, own, tmp_path)] == ["sweep.csv", "sweep.png"]
     read = pd.read_csv(tmp_path / "sweep.csv")
-    assert set(read["metric"]) == set(METRICS) and list(read.columns)[:3] == ["crowd.density", "episodes", "invalid"]
+    assert set(read["metric"]) == set(METRICS) and list(read.columns)[:3] == [
+        "crowd.density",
+        "episodes",
+        "invalid",
+    ]
     assert (tmp_path / "sweep.png").read_bytes().startswith(b"\x89PNG")
     with pytest.raises(MachineError, match=r"nowhere.sweep.csv: cannot be written"):
         write_sweep(summary, own, tmp_path / "nowhere")
@@ -88,15 +105,23 @@ LONG = [f"a-map-with-quite-a-long-name-{k}" for k in range(12)]
     ],
     ids=["numbers", "long names", "many names", "long lines"],
 )
-def test_nothing_of_a_sweeps_picture_is_cut_off(monkeypatch: pytest.MonkeyPatch, fields: dict[str, list[Any]]) -> None:
+def test_nothing_of_a_sweeps_picture_is_cut_off(
+    monkeypatch: pytest.MonkeyPatch, fields: dict[str, list[Any]]
+) -> None:
     """No name of a value, a field, a line or the file is outside of the picture, or on another."""
     metrics = ("success", "failures_per_100m", "time_to_goal_s")
     rows = [
-        dict(zip(fields, at, strict=True)) | {"metric": metric, "mean": 0.5, "low": 0.2, "high": 0.7, "n": 3}
+        dict(zip(fields, at, strict=True))
+        | {"metric": metric, "mean": 0.5, "low": 0.2, "high": 0.7, "n": 3}
         for at in itertools.product(*fields.values())
         for metric in metrics
     ]
-    assert clipped_texts(monkeypatch, lambda: draw_curves(pd.DataFrame(rows), [*fields], metrics * 2, "x" * 150)) == []
+    assert (
+        clipped_texts(
+            monkeypatch, lambda: draw_curves(pd.DataFrame(rows), [*fields], metrics * 2, "x" * 150)
+        )
+        == []
+    )
 
 
 def test_words_and_several_fields_are_drawn(tmp_path: Path) -> None:
@@ -107,7 +132,9 @@ def test_words_and_several_fields_are_drawn(tmp_path: Path) -> None:
     own = read_own(path)
     table = pd.DataFrame({"scenario": [one.id for one in own.variants], "status": "done"})
     summary = summary_of_sweep(own, table.reindex(columns=["scenario", "status", *METRICS]))
-    assert list(summary.columns)[:2] == ["robot", "crowd.density"] and summary["robot"].nunique() == 2
+    assert (
+        list(summary.columns)[:2] == ["robot", "crowd.density"] and summary["robot"].nunique() == 2
+    )
     assert len(write_sweep(summary, own, tmp_path)) == 2
 
 
@@ -127,10 +154,13 @@ def examples(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.engine
 @pytest.mark.parametrize("name", ["morning-crossing", "own-map"])
 def test_an_example_is_sound_and_runs(examples: Path, name: str, cosim: Cosim) -> None:
-    """A crossing with a crowd, an event on a map of one's own; the row holds the hash that `check` tells."""
+    """A crossing with a crowd, an event on a map of one's own; the row holds the hash that `check`
+    tells."""
     done = cosim("scenario", "check", f"{name}.toml", cwd=examples)
     assert done.returncode == 0, done.stderr
-    ran = cosim("scenario", "run", f"{name}.toml", "--policy", "straight", "--out", name, cwd=examples)
+    ran = cosim(
+        "scenario", "run", f"{name}.toml", "--policy", "straight", "--out", name, cwd=examples
+    )
     assert ran.returncode == 0 and f"Run folder: {name}" in ran.stdout, ran.stderr
     row = pd.read_csv(examples / name / "results.csv").iloc[0]
     assert row["suite"] == row["scenario"] == name and row["scenario_hash"] in done.stdout
@@ -140,7 +170,8 @@ def test_an_example_is_sound_and_runs(examples: Path, name: str, cosim: Cosim) -
 
 @pytest.mark.engine
 def test_a_sweep_is_one_command(examples: Path, cosim: Cosim) -> None:
-    """From a file to a table by density, and files beside the run; it is resumed, but not once the file is edited."""
+    """From a file to a table by density, and files beside the run; it is resumed, but not once the
+    file is edited."""
     words = ("scenario", "run", "density-sweep.toml", "--policy", "straight", "--out", "swept")
     ran = cosim(*words, cwd=examples)
     assert ran.returncode == 0, ran.stderr
@@ -149,7 +180,10 @@ def test_a_sweep_is_one_command(examples: Path, cosim: Cosim) -> None:
     assert {"run.json", "results.csv", "sweep.csv", "sweep.png"} <= {
         path.name for path in (examples / "swept").iterdir()
     }
-    assert pd.read_csv(examples / "swept" / "sweep.csv")["crowd.density"].unique().tolist() == [0, 20]
+    assert pd.read_csv(examples / "swept" / "sweep.csv")["crowd.density"].unique().tolist() == [
+        0,
+        20,
+    ]
     scored = cosim("score", "swept", cwd=examples)
     assert scored.returncode == 0 and "equal to the bit" in scored.stdout, scored.stderr
     (examples / "swept" / "sweep.png").unlink()
@@ -163,8 +197,8 @@ def test_a_sweep_is_one_command(examples: Path, cosim: Cosim) -> None:
 
 @pytest.mark.engine
 def test_a_sweep_over_what_the_policy_is_told_is_as_many_runs(tmp_path: Path, cosim: Cosim) -> None:
-    """A run folder for each goal protocol, all of one seed and in real time as asked, and one table of them; a
-    recording of several is refused before anything runs."""
+    """A run folder for each goal protocol, all of one seed and in real time as asked, and one table
+    of them; a recording of several is refused before anything runs."""
     (tmp_path / "told.toml").write_text(
         'name = "told"\ngoal_protocol = ["route_point", "final_point"]\n'
         '[place]\ncity = 1\nsize_m = 500\n[way]\nkind = "straight"\n[limits]\ntime_s = 0.5\n'
@@ -172,11 +206,21 @@ def test_a_sweep_over_what_the_policy_is_told_is_as_many_runs(tmp_path: Path, co
     words = ("scenario", "run", "told.toml", "--policy", "stop", "--out", "runs")
     done = cosim(*words, "--real-time", cwd=tmp_path)
     assert done.returncode == 0 and "goal_protocol" in done.stdout, done.stderr
-    rows = pd.concat(pd.read_csv(tmp_path / "runs" / goal / "results.csv") for goal in ("route_point", "final_point"))
-    assert rows["goal_protocol"].tolist() == ["route_point", "final_point"] and rows["run_seed"].nunique() == 1
+    rows = pd.concat(
+        pd.read_csv(tmp_path / "runs" / goal / "results.csv")
+        for goal in ("route_point", "final_point")
+    )
+    assert (
+        rows["goal_protocol"].tolist() == ["route_point", "final_point"]
+        and rows["run_seed"].nunique() == 1
+    )
     assert rows["real_time"].all() and rows["answer_ms"].notna().all()
     assert len(pd.read_csv(tmp_path / "runs" / "sweep.csv")) == 2 * len(METRICS)
     several = cosim(*words[:-1], "others", "--rerun", "both.rrd", cwd=tmp_path)
-    assert several.returncode == 2 and "and 2 are asked for" in several.stderr and not (tmp_path / "others").exists()
+    assert (
+        several.returncode == 2
+        and "and 2 are asked for" in several.stderr
+        and not (tmp_path / "others").exists()
+    )
     refused = cosim("run", "told.toml", cwd=tmp_path)
     assert refused.returncode == 2 and "goal_protocol 'route_point' is of a run" in refused.stderr

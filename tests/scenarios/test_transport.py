@@ -10,17 +10,19 @@ import pytest
 import cosim
 from cosim.core.errors import MachineError
 from cosim.core.state import Command
-from cosim.episode.driver import Driver
-from cosim.episode.log import Log
-from cosim.episode.ports import CameraSpec, Manifest, Policy
-from cosim.records.run_folder import read_records
+from cosim.episode.interfaces import Policy
+from cosim.episode.policy_caller import Driver
+from cosim.results.log import Log
+from cosim.results.run_folder import read_records
+from cosim.spec.camera import CameraSpec
+from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Suite
-from scenarios.checks import small_scenario
-from scenarios.execution import suite_run
-from scenarios.execution.messages import Done, Hear, Hello, Job, Message
-from scenarios.execution.process import LocalProcesses
-from scenarios.execution.transport import InProcess
+from scenarios.ipc.child_process import LocalProcesses
+from scenarios.ipc.messages import Done, Hear, Hello, Job, Message
+from scenarios.runs import run as suite_run
+from scenarios.runs.transport import InProcess
+from scenarios.tools.verify.doctor import small_scenario
 
 
 class Ahead:
@@ -52,7 +54,8 @@ def done_here(policy: Policy, hear: Hear) -> None:
 
 @pytest.mark.engine
 def test_a_full_disk_is_no_crash_of_an_episode_in_this_process(tmp_path: Path) -> None:
-    """What the run cannot write while the episode goes on ends the run, as it does with processes."""
+    """What the run cannot write while the episode goes on ends the run, as it does with
+    processes."""
     told: list[Message] = []
 
     def hear(message: Message) -> None:
@@ -65,32 +68,57 @@ def test_a_full_disk_is_no_crash_of_an_episode_in_this_process(tmp_path: Path) -
 
 
 @pytest.mark.engine
-def test_the_traceback_of_a_crash_is_printed_in_this_process(capfd: pytest.CaptureFixture[str]) -> None:
-    """A record holds the message alone; the lines that lead to it are printed, as in a worker's log."""
+def test_the_traceback_of_a_crash_is_printed_in_this_process(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """A record holds the message alone; the lines that lead to it are printed, as in a worker's
+    log."""
     told: list[Message] = []
     done_here(Fails(), told.append)
-    assert isinstance(done := told[-1], Done) and done.status == "crashed" and b"no answer" in done.record
+    assert (
+        isinstance(done := told[-1], Done)
+        and done.status == "crashed"
+        and b"no answer" in done.record
+    )
     said = capfd.readouterr().err
     assert said.startswith("--- ") and 'raise LookupError("no answer")' in said
 
 
 @pytest.mark.engine
-def test_a_suite_has_the_same_results_over_every_transport(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In this process and in one of its own: the same state hashes, the same tables to the byte, the same logs and
-    camera frames; a policy object runs in this process, a named one in processes."""
+def test_a_suite_has_the_same_results_over_every_transport(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In this process and in one of its own: the same state hashes, the same tables to the byte,
+    the same logs and camera frames; a policy object runs in this process, a named one in
+    processes."""
     used = []
     for kind in (InProcess, LocalProcesses):
-        monkeypatch.setattr(suite_run, kind.__name__, lambda *of, kind=kind: (used.append(kind), kind(*of))[1])
+        monkeypatch.setattr(
+            suite_run, kind.__name__, lambda *of, kind=kind: (used.append(kind), kind(*of))[1]
+        )
     one = msgspec.structs.replace(small_scenario(), time_limit_s=1.0)
-    suite = Suite(name="two", version="1", scenarios=(one, msgspec.structs.replace(one, id="other", seed=5)))
+    suite = Suite(
+        name="two", version="1", scenarios=(one, msgspec.structs.replace(one, id="other", seed=5))
+    )
     options = EpisodeOptions(seed=7, camera="bullet", frames_every_s=0.5)
     cosim.run(suite, Ahead(), out=tmp_path / "here", options=options)
     cosim.run(suite, f"{__name__}:Ahead", out=tmp_path / "there", options=options)
     assert used == [InProcess, LocalProcesses]
     assert len({(tmp_path / name / "results.csv").read_bytes() for name in ("here", "there")}) == 1
-    hashes = [[record.state_hash for record in read_records(tmp_path / name)] for name in ("here", "there")]
+    hashes = [
+        [record.state_hash for record in read_records(tmp_path / name)]
+        for name in ("here", "there")
+    ]
     assert hashes[0] == hashes[1] and len(set(hashes[0])) == 2
-    files = [sorted(p for p in tmp_path.glob(f"{name}/episodes/*/frames/*.png")) for name in ("here", "there")]
-    assert [p.read_bytes() for p in files[0]] == [p.read_bytes() for p in files[1]] and len(files[0]) == 4
-    logs = [Log.load(tmp_path / name / "episodes" / "other" / "trajectory.npz") for name in ("here", "there")]
+    files = [
+        sorted(p for p in tmp_path.glob(f"{name}/episodes/*/frames/*.png"))
+        for name in ("here", "there")
+    ]
+    assert [p.read_bytes() for p in files[0]] == [p.read_bytes() for p in files[1]] and len(
+        files[0]
+    ) == 4
+    logs = [
+        Log.load(tmp_path / name / "episodes" / "other" / "trajectory.npz")
+        for name in ("here", "there")
+    ]
     assert logs[0].pose.tobytes() == logs[1].pose.tobytes() and len(logs[0]) == 20

@@ -1,4 +1,5 @@
-"""cosim verify: the shipped values are of the shipped suites, and whatever is planted is found and named."""
+"""cosim verify: the shipped values are of the shipped suites, and whatever is planted is found and
+named."""
 
 from __future__ import annotations
 
@@ -13,14 +14,14 @@ import pytest
 
 from cosim.core.errors import RunError
 from cosim.core.state import Frame
-from scenarios.catalog import SUITES, load_suite
-from scenarios.verifying import engines
-from scenarios.verifying import shipped as shipped_values
-from scenarios.verifying.cases import verified_cases
-from scenarios.verifying.engines import DRIVER, ROOMS, room_hashes, textures
-from scenarios.verifying.shipped import SHIPPED, Given, trace_of, writable
-from scenarios.verifying.traces import Trace, kept_picture, traced
-from scenarios.verifying.verdict import blamed, findings, first_difference
+from scenarios.suites.catalog import SUITES, load_suite
+from scenarios.tools.verify import engines
+from scenarios.tools.verify import shipped as shipped_values
+from scenarios.tools.verify.cases import verified_cases
+from scenarios.tools.verify.engines import DRIVER, ROOMS, room_hashes, textures
+from scenarios.tools.verify.shipped import SHIPPED, Given, trace_of, writable
+from scenarios.tools.verify.traces import Trace, kept_picture, traced
+from scenarios.tools.verify.verdict import blamed, findings, first_difference
 from sumo_nets.crowd import pose_filter
 from tests.conftest import ROOT, Cosim
 
@@ -49,8 +50,13 @@ def test_what_is_shipped_is_of_the_shipped_suites(shipped: Given) -> None:
 def test_what_is_shipped_was_made_by_the_sources_as_they_are(shipped: Given) -> None:
     """Else a difference is blamed on a source that is as it was shipped."""
     here = room_hashes()
-    other = [room for room in {*here, *shipped.sources} if here.get(room) != shipped.sources.get(room)]
-    assert not other, "the source has changed: see that `cosim verify` finds the same bits, then `cosim verify --write`"
+    other = [
+        room for room in {*here, *shipped.sources} if here.get(room) != shipped.sources.get(room)
+    ]
+    assert not other, (
+        "the source has changed: see that `cosim verify` finds the same bits, then `cosim "
+        "verify --write`"
+    )
 
 
 def told(shipped: Given, here: Given) -> tuple[list[str], str]:
@@ -93,10 +99,15 @@ PLANTED: dict[str, tuple[Callable[[Given], Given], list[str], tuple[str, ...]]] 
     ),
     "engine": (
         lambda g: replace(
-            with_trace(g, "lh-001-00", lambda t: changed_at(t, "crowd", 7)), alone=g.alone | {"SUMO": "0"}
+            with_trace(g, "lh-001-00", lambda t: changed_at(t, "crowd", 7)),
+            alone=g.alone | {"SUMO": "0"},
         ),
         ["SUMO alone", "lh-001-00"],
-        ("the engine itself", "the crowd first, at 0.35 s", "SUMO alone gives something else, too. Remedy: pip"),
+        (
+            "the engine itself",
+            "the crowd first, at 0.35 s",
+            "SUMO alone gives something else, too. Remedy: pip",
+        ),
     ),
     "crowd": (
         lambda g: replace(
@@ -106,14 +117,18 @@ PLANTED: dict[str, tuple[Callable[[Given], Given], list[str], tuple[str, ...]]] 
         ["lh-001-00"],
         (
             "the crowd first, at 0.35 s; what follows hangs on it",
-            "SUMO alone gives what it should, so it is ours; the source of sumo_nets/crowd is not the shipped one",
+            "SUMO alone gives what it should, so it is ours; the source of sumo_nets/crowd "
+            "is not the shipped one",
             "Remedy: take the source as it was shipped",
         ),
     ),
     "people": (
         lambda g: with_trace(g, "frontal-001", lambda t: changed_at(t, "events", 40)),
         ["frontal-001"],
-        ("our event pedestrians first, at 2.00 s", "something changes scenarios/events, cosim/people"),
+        (
+            "our event pedestrians first, at 2.00 s",
+            "something changes scenarios/events, cosim/people",
+        ),
     ),
     "policy": (
         lambda g: with_trace(g, "lateral-001", lambda t: changed_at(t, "policy", 0)),
@@ -126,7 +141,9 @@ PLANTED: dict[str, tuple[Callable[[Given], Given], list[str], tuple[str, ...]]] 
         ("the robot's physics first, before it begins", "PyBullet alone gives what it should"),
     ),
     "metrics": (
-        lambda g: with_trace(g, "curve-001", lambda t: replace(t, measures=t.measures | {"spl": 0.123})),
+        lambda g: with_trace(
+            g, "curve-001", lambda t: replace(t, measures=t.measures | {"spl": 0.123})
+        ),
         ["curve-001"],
         ("the same to the bit, but not measured so: spl", "the metrics: "),
     ),
@@ -166,8 +183,18 @@ def picture(level: int) -> Frame:
 
 @pytest.mark.parametrize(
     "level, driver, fine",
-    [(100, "shipped", True), (101, "shipped", False), (103, "another", True), (140, "another", False)],
-    ids=["same", "same driver, a level off", "another driver, three levels off", "another driver, forty levels off"],
+    [
+        (100, "shipped", True),
+        (101, "shipped", False),
+        (103, "another", True),
+        (140, "another", False),
+    ],
+    ids=[
+        "same",
+        "same driver, a level off",
+        "another driver, three levels off",
+        "another driver, forty levels off",
+    ],
 )
 def test_pictures_may_differ_a_little_where_another_driver_draws(
     shipped: Given, level: int, driver: str, fine: bool
@@ -176,9 +203,12 @@ def test_pictures_may_differ_a_little_where_another_driver_draws(
 
     def with_picture(given: Given, level: int) -> Given:
         one = kept_picture(picture(level))
-        return with_trace(given, "curve-001", lambda t: replace(t, pictures=t.pictures | {"gl": one}))
+        return with_trace(
+            given, "curve-001", lambda t: replace(t, pictures=t.pictures | {"gl": one})
+        )
 
-    before, after = with_picture(shipped, 100), with_picture(shipped, level)
+    before = with_picture(shipped, 100)
+    after = with_picture(shipped, level)
     if driver == "another":
         after = replace(after, alone=after.alone | {DRIVER: "0"}, renderer="gl: other")
     found, said = told(before, after)
@@ -204,7 +234,9 @@ def test_a_changed_texture_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_an_edited_source_is_told_by_its_room(tmp_path: Path) -> None:
     """In a copy of the tree one constant is another one: the hash of its room is, and no other."""
     for room in ROOMS:
-        shutil.copytree(ROOT / room, tmp_path / room, ignore=shutil.ignore_patterns("__pycache__", "*.json"))
+        shutil.copytree(
+            ROOT / room, tmp_path / room, ignore=shutil.ignore_patterns("__pycache__", "*.json")
+        )
     before = room_hashes(tmp_path)
     edited = tmp_path / "sumo_nets" / "crowd" / "pose_filter.py"
     edited.write_text(edited.read_text().replace("MAX_SPEED_MPS = 2.2", "MAX_SPEED_MPS = 2.1"))
@@ -213,11 +245,15 @@ def test_an_edited_source_is_told_by_its_room(tmp_path: Path) -> None:
     assert {room for room in before if before[room] != after[room]} == {"sumo_nets/crowd"}
 
 
-@pytest.mark.parametrize("content", [b"", b"{}", b'{"schema": 1'], ids=["empty", "of nothing", "cut short"])
+@pytest.mark.parametrize(
+    "content", [b"", b"{}", b'{"schema": 1'], ids=["empty", "of nothing", "cut short"]
+)
 def test_damaged_values_are_named(tmp_path: Path, content: bytes) -> None:
     """In one line, with the remedy."""
     (tmp_path / "verify.json").write_bytes(content)
-    with pytest.raises(RunError, match=r"verify\.json: holds nothing to verify by: .*\. Install anew$"):
+    with pytest.raises(
+        RunError, match=r"verify\.json: holds nothing to verify by: .*\. Install anew$"
+    ):
         Given.load(tmp_path / "verify.json")
 
 
@@ -249,9 +285,12 @@ def test_this_installation_is_verified(cosim: Cosim) -> None:
 
 
 @pytest.mark.engine
-def test_a_changed_constant_of_the_crowd_is_found(monkeypatch: pytest.MonkeyPatch, shipped: Given) -> None:
+def test_a_changed_constant_of_the_crowd_is_found(
+    monkeypatch: pytest.MonkeyPatch, shipped: Given
+) -> None:
     """The crowd differs first, before all that hangs on it."""
     (case,) = [case for case in verified_cases() if case.id == "lh-001-00"]
     monkeypatch.setattr(pose_filter, "MAX_SPEED_MPS", 1.2)
-    trace, told = traced(replace(case, time_limit_s=1.0)), shipped.traces[case.id]
+    trace = traced(replace(case, time_limit_s=1.0))
+    told = shipped.traces[case.id]
     assert isinstance(told, Trace) and first_difference(told, trace)[0] == "crowd"

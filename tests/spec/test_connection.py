@@ -15,7 +15,13 @@ LOOPBACK = (
     "tcp/[::1]:7447",
     "unixsock-stream//tmp/a.sock",
 )
-BEYOND = ("tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/10.0.0.7:7447", "tcp/hub.lan:7447", "tcp/localhost.evil.org:7447")
+BEYOND = (
+    "tcp/0.0.0.0:7447",
+    "tcp/[::]:7447",
+    "tcp/10.0.0.7:7447",
+    "tcp/hub.lan:7447",
+    "tcp/localhost.evil.org:7447",
+)
 
 
 @pytest.mark.parametrize("endpoint", LOOPBACK)
@@ -27,19 +33,28 @@ def test_this_machine_alone_needs_nothing_more(endpoint: str) -> None:
 
 @pytest.mark.parametrize("endpoint", BEYOND)
 def test_beyond_this_machine_needs_tls_or_a_word(endpoint: str) -> None:
-    """Without either it is refused with both remedies; --insecure says in one line what it means."""
+    """Without either it is refused with both remedies; --insecure says in one line what it
+    means."""
     with pytest.raises(UsageError, match="may watch, inject") as refused:
         Connection(role="coordinator", listen=endpoint)
-    assert f"Use tls/{endpoint[4:]} with --tls FOLDER" in str(refused.value) and "--insecure" in str(refused.value)
+    assert f"Use tls/{endpoint[4:]} with --tls FOLDER" in str(
+        refused.value
+    ) and "--insecure" in str(refused.value)
     with pytest.raises(UsageError, match="stands between here and"):
         Connection(role="worker", connect=endpoint)
     warning = Connection(role="coordinator", listen=endpoint, insecure=True).warning
     assert warning.startswith("--insecure: whoever can reach") and "\n" not in warning
-    assert Connection(role="coordinator", listen=endpoint.replace("tcp", "tls"), tls="certs/coordinator").warning == ""
+    assert (
+        Connection(
+            role="coordinator", listen=endpoint.replace("tcp", "tls"), tls="certs/coordinator"
+        ).warning
+        == ""
+    )
 
 
 def test_contradictions_are_refused() -> None:
-    """TLS without files, files without TLS, both and insecure, two endpoints or none, one who never listens, others."""
+    """TLS without files, files without TLS, both and insecure, two endpoints or none, one who never
+    listens, others."""
     cases: list[tuple[str, dict[str, object]]] = [
         ("needs --tls FOLDER, which holds ca.pem", {"listen": "tls/0.0.0.0:7447"}),
         ("--tls goes with tls/ADDRESS:PORT", {"listen": "tcp/127.0.0.1:7447", "tls": "certs"}),
@@ -49,9 +64,12 @@ def test_contradictions_are_refused() -> None:
         ("the role worker listens nowhere", {"listen": "tcp/127.0.0.1:7447", "role": "worker"}),
         ("write it as PROTOCOL/ADDRESS", {"listen": "7447"}),
         ("write it as PROTOCOL/ADDRESS", {"listen": "udp/127.0.0.1:7447"}),
-        ("write it as PROTOCOL/ADDRESS", {"listen": "tls/h:7447#verify_name_on_connect=false", "tls": "certs"}),
+        (
+            "write it as PROTOCOL/ADDRESS",
+            {"listen": "tls/h:7447#verify_name_on_connect=false", "tls": "certs"},
+        ),
         ("write it as PROTOCOL/ADDRESS", {"listen": "tcp/127.0.0.1:70000"}),
-    ]  # fmt: skip
+    ]
     for words, given in cases:
         with pytest.raises(UsageError, match=words):
             Connection(**{"role": "coordinator", **given})  # type: ignore[arg-type]
@@ -63,7 +81,9 @@ def test_it_travels_to_other_processes_as_it_is() -> None:
     one = Connection(role=role, connect="tls/hub.lan:7447", tls="certs/worker")
     assert msgspec.msgpack.decode(msgspec.msgpack.encode(one), type=Connection) == one
     there = Connection(role="coordinator", connect="tls/gpu.lan:7449", tls="certs/coordinator")
-    assert there.seen_by(one) == Connection(role="worker", connect="tls/gpu.lan:7449", tls="certs/worker")
+    assert there.seen_by(one) == Connection(
+        role="worker", connect="tls/gpu.lan:7449", tls="certs/worker"
+    )
     with pytest.raises(UsageError, match="needs --tls FOLDER"):
         there.seen_by(Connection(role="worker", connect="tcp/127.0.0.1:7447"))
     bad = msgspec.msgpack.encode({"role": role, "connect": "tcp/hub.lan:7447"})

@@ -14,20 +14,32 @@ from cosim.core.errors import SpecError
 from cosim.place.street_map import Corner, Port, StreetMap, Strip
 from cosim.spec.events import Event
 from cosim.spec.obstacle import Obstacle
-from cosim.spec.scenario import Barrier, City, CityMap, CrowdSpec, Light, RouteCrossing, Scenario, Suite
-from scenarios.builders import fits
-from scenarios.builders.fits import check_places, misfits
+from cosim.spec.scenario import (
+    Barrier,
+    City,
+    CityMap,
+    CrowdSpec,
+    Light,
+    RouteCrossing,
+    Scenario,
+    Suite,
+)
+from scenarios.suites import fits
+from scenarios.suites.fits import check_places, misfits
 
 
 def crossroads() -> StreetMap:
-    """Sidewalks of 3.2 m x 40 m to the west and the north of a corner of 4 m x 4 m, a crossing to the east."""
+    """Sidewalks of 3.2 m x 40 m to the west and the north of a corner of 4 m x 4 m, a crossing to
+    the east."""
     arms = {"east": (1, 0), "north": (0, 1), "west": (-1, 0)}
     strips = {}
     for name, (dx, dy) in arms.items():
         line = np.array([[2.0 * dx, 2.0 * dy], [42.0 * dx, 42.0 * dy]])
         polygon = shapely.buffer(LineString(line), 1.6, cap_style="flat")
         kind: Any = "crossing" if name == "east" else "sidewalk"
-        strips[name] = Strip(name, kind, line, 3.2, polygon, ("middle", None), signalised=name == "east")
+        strips[name] = Strip(
+            name, kind, line, 3.2, polygon, ("middle", None), signalised=name == "east"
+        )
     corner = Corner("middle", box(-2, -2, 2, 2), tuple(Port(name, 0) for name in arms))
     return StreetMap("cross", (-42, -42, 42, 42), strips, {"middle": corner}, {}, {})
 
@@ -38,7 +50,14 @@ def event(**changes: Any) -> Event:
 
 
 def barrier(**changes: Any) -> Barrier:
-    at: dict[str, Any] = {"x_m": 0.0, "y_m": 3.0, "heading_rad": 1.5708, "length_m": 3.4, "strip": "north", "end": 0}
+    at: dict[str, Any] = {
+        "x_m": 0.0,
+        "y_m": 3.0,
+        "heading_rad": 1.5708,
+        "length_m": 3.4,
+        "strip": "north",
+        "end": 0,
+    }
     return Barrier(**at | changes)
 
 
@@ -47,7 +66,8 @@ def a_bin(**at: float) -> Obstacle:
 
 
 def from_west_to_east(**changes: Any) -> Scenario:
-    """60 m along the sidewalk and over the crossing, the north closed, somebody standing on the way."""
+    """60 m along the sidewalk and over the crossing, the north closed, somebody standing on the
+    way."""
     fields: dict[str, Any] = {
         "route": ((-30.0, 0.0), (0.0, 0.0), (30.0, 0.0)),
         "crossings": (RouteCrossing(id="east", enter_s_m=32.0, leave_s_m=60.0, signalised=True),),
@@ -56,11 +76,20 @@ def from_west_to_east(**changes: Any) -> Scenario:
     }
     fields |= changes
     route = fields["route"]
-    return Scenario(id="s", suite="t", place=City(seed=1), seed=1, start=(*route[0], 0.0), goal=route[-1], **fields)
+    return Scenario(
+        id="s",
+        suite="t",
+        place=City(seed=1),
+        seed=1,
+        start=(*route[0], 0.0),
+        goal=route[-1],
+        **fields,
+    )
 
 
 def test_what_fits_is_not_spoken_of() -> None:
-    """A way on the sidewalk and over the crossing, its barrier where it closes a branch, its event on the way."""
+    """A way on the sidewalk and over the crossing, its barrier where it closes a branch, its event
+    on the way."""
     assert list(misfits([from_west_to_east()], crossroads())) == []
 
 
@@ -76,7 +105,10 @@ def test_what_fits_is_not_spoken_of() -> None:
             "route is off the walkable area at (-22.15, 1.67), 8.0 m along the route",
         ),
         ({"events": (event(y_m=9.0),)}, "event 'e0' is off the walkable area at (-10.00, 9.00)"),
-        ({"barriers": (barrier(strip="south"),)}, "barriers[0].strip 'south' is none of map 'cross'"),
+        (
+            {"barriers": (barrier(strip="south"),)},
+            "barriers[0].strip 'south' is none of map 'cross'",
+        ),
         (
             {"barriers": (barrier(), barrier(x_m=30.0, y_m=0.0, heading_rad=0.0, length_m=0.2))},
             "barriers[1] stands 28 m from strip 'north', which it should close",
@@ -86,52 +118,86 @@ def test_what_fits_is_not_spoken_of() -> None:
             "barriers[0] on strip 'west' stands across the route",
         ),
         (
-            {"crossings": (RouteCrossing(id="west", enter_s_m=1.0, leave_s_m=28.0, signalised=False),)},
+            {
+                "crossings": (
+                    RouteCrossing(id="west", enter_s_m=1.0, leave_s_m=28.0, signalised=False),
+                )
+            },
             "crossing 'west' is none of map 'cross'",
         ),
         (
-            {"crossings": (RouteCrossing(id="east", enter_s_m=32.0, leave_s_m=60.0, signalised=False),)},
+            {
+                "crossings": (
+                    RouteCrossing(id="east", enter_s_m=32.0, leave_s_m=60.0, signalised=False),
+                )
+            },
             "crossing 'east': signalised is True on the map, not False",
         ),
         (
-            {"crossings": (RouteCrossing(id="east", enter_s_m=2.0, leave_s_m=20.0, signalised=True),)},
+            {
+                "crossings": (
+                    RouteCrossing(id="east", enter_s_m=2.0, leave_s_m=20.0, signalised=True),
+                )
+            },
             "crossing 'east' is not where the route is from enter_s_m to leave_s_m",
         ),
         (
             {"obstacles": (a_bin(x_m=-15.0, y_m=1.0), a_bin(x_m=-15.0, y_m=2.5))},
             "obstacles[1] (bin) is off the walkable area at (-15.00, 2.50)",
         ),
-        ({"obstacles": (a_bin(x_m=-29.4, y_m=0.3),)}, "obstacles[0] (bin) stands where the robot starts"),
+        (
+            {"obstacles": (a_bin(x_m=-29.4, y_m=0.3),)},
+            "obstacles[0] (bin) stands where the robot starts",
+        ),
         ({"obstacles": (a_bin(x_m=29.9, y_m=0.0),)}, "obstacles[0] (bin) stands on the goal"),
     ],
     ids=[
-        "start-off", "route-off", "event-off", "unknown-strip", "far-barrier", "barrier-across", "no-crossing",
-        "other-signal", "crossing-elsewhere", "obstacle-off", "obstacle-at-start", "obstacle-on-goal",
+        "start-off",
+        "route-off",
+        "event-off",
+        "unknown-strip",
+        "far-barrier",
+        "barrier-across",
+        "no-crossing",
+        "other-signal",
+        "crossing-elsewhere",
+        "obstacle-off",
+        "obstacle-at-start",
+        "obstacle-on-goal",
     ],
-)  # fmt: skip
+)
 def test_what_does_not_fit_is_named_with_its_place(changes: dict[str, Any], told: str) -> None:
     """Field, number or id, and where it is."""
     assert list(misfits([from_west_to_east(**changes)], crossroads())) == [f"scenario 's': {told}"]
 
 
-def test_a_density_makes_no_more_people_than_may_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_density_makes_no_more_people_than_may_be_asked_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """How many it makes is known where the map is: 400 m2 hold 60 people at 150 per 1000 m2."""
     monkeypatch.setattr(fits, "MOST_PERSONS", 59)
     dense = from_west_to_east(crowd=CrowdSpec(density=150.0))
     assert list(misfits([dense], crossroads())) == [
-        "scenario 's': crowd density 150 within 80 m of the start makes 60 persons, and at most 59 can be had: "
-        "lower density or radius_m"
+        "scenario 's': crowd density 150 within 80 m of the start makes 60 persons, and at most "
+        "59 can be had: lower density or radius_m"
     ]
 
 
 def test_a_scenario_far_from_everything_is_not_on_the_map() -> None:
     """One message, however much of it is off."""
-    far = from_west_to_east(route=((5000.0, 0.0), (5060.0, 0.0)), crossings=(), barriers=(), events=())
-    assert list(misfits([far], crossroads())) == ["scenario 's': start (5000.0, 0.0) is not on map 'cross'"]
+    far = from_west_to_east(
+        route=((5000.0, 0.0), (5060.0, 0.0)), crossings=(), barriers=(), events=()
+    )
+    assert list(misfits([far], crossroads())) == [
+        "scenario 's': start (5000.0, 0.0) is not on map 'cross'"
+    ]
 
 
-def test_every_place_is_looked_at_once_and_all_is_told_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    """However many scenarios a place has, in whatever order; a robot or a sky that is not there is told once."""
+def test_every_place_is_looked_at_once_and_all_is_told_together(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """However many scenarios a place has, in whatever order; a robot or a sky that is not there is
+    told once."""
     made = []
 
     def place(where: City) -> tuple[None, StreetMap]:
@@ -161,11 +227,18 @@ def test_every_place_is_looked_at_once_and_all_is_told_together(monkeypatch: pyt
 def test_many_places_are_looked_at_by_several_processes() -> None:
     """The same is told in the same order as by one."""
     where = [CityMap(map=f"nowhere-{i}") for i in range(16)]
-    lost = tuple(msgspec.structs.replace(from_west_to_east(), id=f"s{i}", place=at) for i, at in enumerate(where))
+    lost = tuple(
+        msgspec.structs.replace(from_west_to_east(), id=f"s{i}", place=at)
+        for i, at in enumerate(where)
+    )
     whole = Suite(name="w", version="1", scenarios=lost)
     told = []
     for jobs in (1, 2):
         with pytest.raises(SpecError) as refusal:
             check_places(whole, lost, jobs=jobs)
         told.append(str(refusal.value))
-    assert told[0] == told[1] and "16 faults" in told[0] and "scenario 's4': unknown map 'nowhere-4'" in told[0]
+    assert (
+        told[0] == told[1]
+        and "16 faults" in told[0]
+        and "scenario 's4': unknown map 'nowhere-4'" in told[0]
+    )

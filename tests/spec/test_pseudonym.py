@@ -1,4 +1,5 @@
-"""What a policy is told in place of a scenario's name: it tells nothing to who does not know the run's seed."""
+"""What a policy is told in place of a scenario's name: it tells nothing to who does not know the
+run's seed."""
 
 from __future__ import annotations
 
@@ -10,24 +11,28 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cosim.core.errors import UsageError
+from cosim.spec.episode_id import drawn_seed, pseudonym_of, seed_for
 from cosim.spec.options import EpisodeOptions
-from cosim.spec.pseudonym import drawn_seed, pseudonym_of, seed_for
-from scenarios.catalog import SUITES, load_suite
+from scenarios.suites.catalog import SUITES, load_suite
 
 SHIPPED = [scenario for name in SUITES for scenario in load_suite(name).scenarios]
 
 
 @given(st.integers(0, 2**63 - 1), st.integers(0, 2**63 - 1))
 def test_no_two_runs_tell_the_same(one: int, other: int) -> None:
-    """Names and seeds of all shipped scenarios are distinct within a run, and between runs of different seeds."""
+    """Names and seeds of all shipped scenarios are distinct within a run, and between runs of
+    different seeds."""
     called = [pseudonym_of(one, scenario) for scenario in SHIPPED]
     assert len({name for name, _ in called}) == len(SHIPPED) == len(set(called))
     if one != other:
-        assert not {name for name, _ in called} & {pseudonym_of(other, scenario).episode for scenario in SHIPPED}
+        assert not {name for name, _ in called} & {
+            pseudonym_of(other, scenario).episode for scenario in SHIPPED
+        }
 
 
 def test_a_name_tells_neither_event_nor_order() -> None:
-    """Twelve characters of a hash; the order of the names is another one for every seed, and none is the suite's."""
+    """Twelve characters of a hash; the order of the names is another one for every seed, and none
+    is the suite's."""
     orders = []
     for seed in range(20):
         names = [pseudonym_of(seed, scenario).episode for scenario in SHIPPED]
@@ -41,19 +46,32 @@ def test_a_name_tells_neither_event_nor_order() -> None:
 def test_it_is_the_same_everywhere_and_hangs_on_the_scenario_alone() -> None:
     """Fixed by hand here, so that a run that is finished by another version keeps its names."""
     scenario = SHIPPED[0]
-    assert pseudonym_of(5, scenario) == pseudonym_of(5, msgspec.structs.replace(scenario, robot="scout"))
-    assert pseudonym_of(5, scenario) != pseudonym_of(5, msgspec.structs.replace(scenario, suite="other"))
-    assert seed_for("policy", 5, scenario) == pseudonym_of(5, scenario).seed != seed_for("goal", 5, scenario)
+    assert pseudonym_of(5, scenario) == pseudonym_of(
+        5, msgspec.structs.replace(scenario, robot="scout")
+    )
+    assert pseudonym_of(5, scenario) != pseudonym_of(
+        5, msgspec.structs.replace(scenario, suite="other")
+    )
+    assert (
+        seed_for("policy", 5, scenario)
+        == pseudonym_of(5, scenario).seed
+        != seed_for("goal", 5, scenario)
+    )
 
 
 def test_a_run_draws_a_seed_that_cannot_be_tried_through() -> None:
     """Each time another one, of 53 bits."""
     drawn = [drawn_seed() for _ in range(200)]
-    assert len(set(drawn)) == 200 and max(drawn) > 2**48 and all(0 <= seed < 2**53 for seed in drawn)
+    assert (
+        len(set(drawn)) == 200 and max(drawn) > 2**48 and all(0 <= seed < 2**53 for seed in drawn)
+    )
 
 
 @pytest.mark.parametrize("seed", [-1, 2**63], ids=["negative", "too-large"])
 def test_what_is_no_seed_is_refused(seed: int) -> None:
     """In words, before anything is run."""
-    with pytest.raises(UsageError, match=f"a seed of {seed}: it must be a whole number from 0 to 9223372036854775807"):
+    with pytest.raises(
+        UsageError,
+        match=f"a seed of {seed}: it must be a whole number from 0 to 9223372036854775807",
+    ):
         EpisodeOptions(seed=seed)

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 
 from cosim.core.errors import RunError, UsageError
-from cosim.records.run_folder import RunFolder
-from cosim.records.run_spec import RunSpec
+from cosim.results.run_folder import RunFolder
+from cosim.results.run_spec import RunSpec
 from cosim.spec.scenario import Suite
 from cosim.spec.selection import scenarios_chosen, selection_in_words
-from scenarios.catalog import load_suite
+from scenarios.suites.catalog import load_suite
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,9 @@ def test_static_is_chosen_like_an_event(reactive: Suite) -> None:
     assert {s.structure for s in scenarios_chosen(reactive, kinds=["static"])} == {"static"}
     assert len(scenarios_chosen(reactive, kinds=["static"])) == 100
     assert len(scenarios_chosen(reactive, kinds=["frontal", "static"])) == 200
-    with pytest.raises(UsageError, match=r"unknown event 'statik'. Valid choices: .*, static. Did you mean static"):
+    with pytest.raises(
+        UsageError, match=r"unknown event 'statik'. Valid choices: .*, static. Did you mean static"
+    ):
         scenarios_chosen(reactive, kinds=["statik"])
     with pytest.raises(UsageError, match=r"unknown event 'static'. Valid choices: none"):
         scenarios_chosen(load_suite("unit"), kinds=["static"])
@@ -35,9 +37,15 @@ CHOICES: dict[str, dict[str, object]] = {
     "30 of 900 (--event frontal --episodes 30)": {"kinds": ["frontal"], "episodes": 30},
     "200 of 900 (--event frontal --event static)": {"kinds": ["static", "frontal"]},
     "180 of 900 (--split test)": {"split": "test"},
-    "7 of 900 (--event static --split test --episodes 7)": {"kinds": ["static"], "split": "test", "episodes": 7},
+    "7 of 900 (--event static --split test --episodes 7)": {
+        "kinds": ["static"],
+        "split": "test",
+        "episodes": 7,
+    },
     "250 of 900 (--episodes 250)": {"episodes": 250},
-    "2 of 900 (--scenario frontal-003 --scenario static-005)": {"ids": ["frontal-003", "static-005"]},
+    "2 of 900 (--scenario frontal-003 --scenario static-005)": {
+        "ids": ["frontal-003", "static-005"]
+    },
 }
 
 
@@ -48,14 +56,24 @@ def test_the_options_that_chose_scenarios_are_found(reactive: Suite, words: str)
     assert selection_in_words(reactive, [scenario.id for scenario in chosen]) == words
 
 
-def test_a_run_resumed_with_another_selection_names_the_options(reactive: Suite, tmp_path: Path) -> None:
-    """How many scenarios the run has and how many are asked for, with the options of both, in place of two lists."""
+def test_a_run_resumed_with_another_selection_names_the_options(
+    reactive: Suite, tmp_path: Path
+) -> None:
+    """How many scenarios the run has and how many are asked for, with the options of both, in place
+    of two lists."""
 
     def spec(ids: list[str]) -> RunSpec:
         return RunSpec(
-            suite="reactive", robots={}, suite_version="1", suite_hash="h", policy="p", policy_name="p",
-            policy_version="1", scenarios=tuple(ids), versions={},
-        )  # fmt: skip
+            suite="reactive",
+            robots={},
+            suite_version="1",
+            suite_hash="h",
+            policy="p",
+            policy_name="p",
+            policy_version="1",
+            scenarios=tuple(ids),
+            versions={},
+        )
 
     every = [scenario.id for scenario in reactive.scenarios]
     some = [scenario.id for scenario in scenarios_chosen(reactive, kinds=["frontal"], episodes=30)]
@@ -64,7 +82,8 @@ def test_a_run_resumed_with_another_selection_names_the_options(reactive: Suite,
     with pytest.raises(RunError) as caught:
         RunFolder.resume(tmp_path / "run", spec(every), reactive)
     assert str(caught.value) == (
-        f"{tmp_path / 'run'} is of another run: its choice of scenarios is 30 of 900 (--event frontal --episodes 30), "
+        f"{tmp_path / 'run'} is of another run: its choice of scenarios is 30 of 900 "
+        f"(--event frontal --episodes 30), "
         "now asked for is 900 of 900 (all). Resume with the same command, or choose another --out."
     )
     apart = spec(some).apart(spec(every))

@@ -1,4 +1,5 @@
-"""What a suite file may hold: everything else is refused in words, every fault at once, before anything runs."""
+"""What a suite file may hold: everything else is refused in words, every fault at once, before
+anything runs."""
 
 from __future__ import annotations
 
@@ -15,19 +16,26 @@ import pytest
 
 from cosim.core.errors import SpecError
 from cosim.spec.scenario import City, Suite, read_suite
-from scenarios.catalog import SUITES, load_suite
 from scenarios.events import EVENT_KINDS
-from tests.mutate_suites import fates, mutated, small_suite
+from scenarios.suites.catalog import SUITES, load_suite
+from tests.support.mutate_suites import fates, mutated, small_suite
 
 PLACE = re.compile(r"`\$[\w.\[\]]*`|line \d+, byte \d+ of it|`scenarios` needs|nested too deep")
 """How a refusal says where in the file something is wrong."""
 
 
 def sound() -> dict[str, Any]:
-    """The file of a suite of three: a long way with barriers, crossings and events, and two short ones with groups."""
+    """The file of a suite of three: a long way with barriers, crossings and events, and two short
+    ones with groups."""
     chosen = [s for s in load_suite("long-horizon").scenarios if s.id == "lh-037-00"]
-    chosen += [s for s in load_suite("reactive").scenarios if s.id in ("ped_crossing-001", "conversing-001")]
-    return json.loads(msgspec.json.encode(Suite(name="sound", version="1", scenarios=tuple(chosen))))  # type: ignore[no-any-return]
+    chosen += [
+        s
+        for s in load_suite("reactive").scenarios
+        if s.id in ("ped_crossing-001", "conversing-001")
+    ]
+    return json.loads(
+        msgspec.json.encode(Suite(name="sound", version="1", scenarios=tuple(chosen)))
+    )  # type: ignore[no-any-return]
 
 
 def refusal(path: Path, data: bytes | str) -> str:
@@ -41,8 +49,10 @@ def refusal(path: Path, data: bytes | str) -> str:
 
 
 def test_a_thousand_mutated_suites_are_read_or_refused_in_words(tmp_path: Path) -> None:
-    """Whatever a file holds: a suite, or a short refusal of printable lines, each of which names its place."""
-    whole, path = sound(), tmp_path / "mutated.json"
+    """Whatever a file holds: a suite, or a short refusal of printable lines, each of which names
+    its place."""
+    whole = sound()
+    path = tmp_path / "mutated.json"
     accepted = 0
     for seed in range(1000):
         path.write_bytes(mutated(whole, seed))
@@ -52,7 +62,9 @@ def test_a_thousand_mutated_suites_are_read_or_refused_in_words(tmp_path: Path) 
         except SpecError as error:
             told = str(error).removeprefix(f"{path}: ")
             lines = told.splitlines()
-            assert len(lines) <= 6 and all(line.isprintable() and len(line) <= 500 for line in lines), (seed, told)
+            assert len(lines) <= 6 and all(
+                line.isprintable() and len(line) <= 500 for line in lines
+            ), (seed, told)
             faults = lines[1:] if len(lines) > 1 else lines
             assert all(PLACE.search(line) for line in faults), (seed, told)
     assert 100 < accepted < 600
@@ -60,12 +72,14 @@ def test_a_thousand_mutated_suites_are_read_or_refused_in_words(tmp_path: Path) 
 
 @pytest.mark.engine
 def test_mutated_suites_that_are_accepted_can_be_driven(tmp_path: Path) -> None:
-    """Of those that the reader and the map let through eight are driven for two seconds: none crashes. (`python -m
-    tests.mutate_suites` drives 200.)"""
+    """Of those that the reader and the map let through eight are driven for two seconds: none
+    crashes. (`python -m tests.support.mutate_suites` drives 200.)"""
     driven = []
     for fate in fates(small_suite(City(seed=1, size_m=500.0)), tmp_path, count(0)):
         if fate.what == "does not fit its place":
-            assert all(line.isprintable() and len(line) <= 500 for line in fate.words.splitlines()), fate
+            assert all(
+                line.isprintable() and len(line) <= 500 for line in fate.words.splitlines()
+            ), fate
         elif fate.what != "refused":
             driven.append(fate)
         if len(driven) == 8:
@@ -74,45 +88,104 @@ def test_mutated_suites_that_are_accepted_can_be_driven(tmp_path: Path) -> None:
 
 
 OUT_OF_RANGE: tuple[tuple[tuple[str | int, ...], object, str], ...] = (
-    (("name",), "../../x", "name '../../x' cannot name a suite, and the folder of a run: use 1 to 100 of A-Z"),
+    (
+        ("name",),
+        "../../x",
+        "name '../../x' cannot name a suite, and the folder of a run: use 1 to 100 of A-Z",
+    ),
     (("first", "id"), "a\nb", r"id 'a\nb' cannot name a folder"),
     (("first", "seed"), -1, "seed must be in [0, 4294967295], not -1 - at `$.scenarios[0]`"),
     (("first", "seed"), 10**30, "seed must be in [0, 4294967295], not 1e+30"),
-    (("first", "place", "size_m"), 1.5, "city size_m must be in [200, 4000], not 1.5 - at `$.scenarios[0].place"),
-    (("first", "place", "size_m"), 300.001, "city size_m must be in whole centimetres, not 300.001"),
+    (
+        ("first", "place", "size_m"),
+        1.5,
+        "city size_m must be in [200, 4000], not 1.5 - at `$.scenarios[0].place",
+    ),
+    (
+        ("first", "place", "size_m"),
+        300.001,
+        "city size_m must be in whole centimetres, not 300.001",
+    ),
     (("first", "place", "style"), "../x", "city style '../x' cannot name a style"),
     (("first", "place", "seed"), -1, "city seed must be in [0, 4294967295], not -1"),
-    (("first", "place", "kind"), "moon", "Invalid value 'moon' - at `$.scenarios[0].place`. Valid choices: city,"),
+    (
+        ("first", "place", "kind"),
+        "moon",
+        "Invalid value 'moon' - at `$.scenarios[0].place`. Valid choices: city,",
+    ),
     (("first", "goal_radius_m"), 1e9, "goal_radius_m must be in [0.1, 20], not 1000000000.0"),
     (("first", "time_limit_s"), 1e-9, "time_limit_s must be in [0.1, 100000], not 1e-09"),
     (("first", "route", 3, 0), math.nan, "route[3][0] must be in [-10000000, 10000000], not nan"),
     (("first", "start", 2), math.inf, "start's heading must be in [-6.28319, 6.28319], not inf"),
-    (("first", "barriers", 1, "length_m"), 9e18, "barrier length_m must be in [0.1, 200], not 9e+18"),
-    (("first", "barriers", 0, "x_m"), -math.inf, "barrier x_m must be in [-10000000, 10000000], not -inf"),
-    (("first", "barriers", 0, "strip"), "s\x1b[2J", r"barrier strip must be at most 200 letters and no control"),
+    (
+        ("first", "barriers", 1, "length_m"),
+        9e18,
+        "barrier length_m must be in [0.1, 200], not 9e+18",
+    ),
+    (
+        ("first", "barriers", 0, "x_m"),
+        -math.inf,
+        "barrier x_m must be in [-10000000, 10000000], not -inf",
+    ),
+    (
+        ("first", "barriers", 0, "strip"),
+        "s\x1b[2J",
+        r"barrier strip must be at most 200 letters and no control",
+    ),
     (("first", "crossings", 0, "leave_s_m"), 0.0, "comes after leave_s_m 0.0"),
-    (("first", "crossings", 0, "leave_s_m"), 9e3, "leave_s_m is 9000, but the route ends at 303.168"),
+    (
+        ("first", "crossings", 0, "leave_s_m"),
+        9e3,
+        "leave_s_m is 9000, but the route ends at 303.168",
+    ),
     (("first", "events", 0, "route_s_m"), 9e3, "route_s_m is 9000, but the route ends at 303.168"),
-    (("first", "events", 0, "half_width_m"), 1e9, "half_width_m must be in (0.3, 50], not 1000000000.0"),
-    (("first", "events", 0, "id"), "e <x>", "event id 'e <x>': ids of event pedestrians start with 'e'"),
-    (("first", "events", 0, "kind"), "ambush", "Invalid enum value 'ambush' - at `$.scenarios[0].events[0].kind`. V"),
-    (("first", "events", 0, "people"), 2, "people of 'obstructing' must be 1, not 2 - at `$.scenarios[0].events[0]`"),
-    (("first", "events", 0, "half_length_m"), 2.0, "half_length_m is the crosswalk's: of 'ped_crossing', and of no"),
+    (
+        ("first", "events", 0, "half_width_m"),
+        1e9,
+        "half_width_m must be in (0.3, 50], not 1000000000.0",
+    ),
+    (
+        ("first", "events", 0, "id"),
+        "e <x>",
+        "event id 'e <x>': ids of event pedestrians start with 'e'",
+    ),
+    (
+        ("first", "events", 0, "kind"),
+        "ambush",
+        "Invalid enum value 'ambush' - at `$.scenarios[0].events[0].kind`. V",
+    ),
+    (
+        ("first", "events", 0, "people"),
+        2,
+        "people of 'obstructing' must be 1, not 2 - at `$.scenarios[0].events[0]`",
+    ),
+    (
+        ("first", "events", 0, "half_length_m"),
+        2.0,
+        "half_length_m is the crosswalk's: of 'ped_crossing', and of no",
+    ),
     (("first", "crowd", "persons"), 10**9, "crowd persons must be in [0, 1000], not 1000000000"),
     (("first", "crowd", "vehicles"), 10**9, "crowd vehicles must be in [0, 200], not 1000000000"),
-    (("first", "light", "hour"), math.nan, "light hour must be in [0, 24], not nan - at `$.scenarios[0].light`"),
+    (
+        ("first", "light", "hour"),
+        math.nan,
+        "light hour must be in [0, 24], not nan - at `$.scenarios[0].light`",
+    ),
     (("first", "ends_at"), "stop", "ends_at 'stop' needs an event 'gesturing'"),
-)  # fmt: skip
+)
 """Where in the file (`first`: in its first scenario), what stands there, and what is said of it."""
 
 
 @pytest.mark.parametrize(
-    ("where", "value", "told"), OUT_OF_RANGE, ids=[".".join(map(str, where)) for where, _, _ in OUT_OF_RANGE]
+    ("where", "value", "told"),
+    OUT_OF_RANGE,
+    ids=[".".join(map(str, where)) for where, _, _ in OUT_OF_RANGE],
 )
 def test_a_value_out_of_its_range_is_named(
     tmp_path: Path, where: tuple[str | int, ...], value: object, told: str
 ) -> None:
-    """The field, its range and what was found; numbers that JSON does not know, such as NaN, are told as any other."""
+    """The field, its range and what was found; numbers that JSON does not know, such as NaN, are
+    told as any other."""
     whole: Any = sound()
     *holders, key = where
     holder = whole
@@ -123,34 +196,43 @@ def test_a_value_out_of_its_range_is_named(
 
 
 def test_several_faults_are_told_at_once(tmp_path: Path) -> None:
-    """One on a line, the first five of many; wrong types, unknown fields and contradictions alike."""
+    """One on a line, the first five of many; wrong types, unknown fields and contradictions
+    alike."""
     whole = sound()
     first, second, third = whole["scenarios"]
     first |= {"seed": "x", "gaol": 1, "crowd": {"persons": -1, "groups": 2.0}, "goal_radius_m": 1e9}
     second["goal"] = [0.0, 0.0]
     assert refusal(tmp_path / "s.json", json.dumps(whole)).splitlines() == [
         "5 faults:",
-        "  Object contains unknown field `gaol` - at `$.scenarios[0]`. Valid choices: " + ", ".join(
-            sorted(first.keys() - {"gaol"}, key=list(msgspec.to_builtins(load_suite("reactive").scenarios[0])).index)
-        ) + ". Did you mean goal?",
+        "  Object contains unknown field `gaol` - at `$.scenarios[0]`. Valid choices: "
+        + ", ".join(
+            sorted(
+                first.keys() - {"gaol"},
+                key=list(msgspec.to_builtins(load_suite("reactive").scenarios[0])).index,
+            )
+        )
+        + ". Did you mean goal?",
         "  Expected `int`, got `str` - at `$.scenarios[0].seed`",
-        "  crowd persons must be in [0, 1000], not -1; crowd groups must be a share in [0, 1], not 2.0"
-        " - at `$.scenarios[0].crowd`",
+        "  crowd persons must be in [0, 1000], not -1; crowd groups must be a share in [0, 1], "
+        "not 2.0 - at `$.scenarios[0].crowd`",
         "  goal_radius_m must be in [0.1, 20], not 1000000000.0 - at `$.scenarios[0]`",
         f"  scenario '{second['id']}': goal (0.0, 0.0) is not the route's end "
         f"{tuple(second['route'][-1])} - at `$.scenarios[1]`",
-    ]  # fmt: skip
+    ]
     third["route"] = [["x", "y"]] * 2000
     lines = refusal(tmp_path / "s.json", json.dumps(whole)).splitlines()
     assert lines[0] == "1000 faults or more; the first 5:" and len(lines) == 6
 
 
 def test_a_file_that_is_no_json_is_refused_with_the_place(tmp_path: Path) -> None:
-    """Cut off, not UTF-8, nested without end: the line and the byte, or what is wrong with the whole."""
+    """Cut off, not UTF-8, nested without end: the line and the byte, or what is wrong with the
+    whole."""
     text = json.dumps(sound(), indent=1).encode()
     told = {
         text[: text.index(b'"version"')]: "JSON ends too early, line 3, byte 1 of it",
-        text.replace(b'"version"', b",", 1): "JSON is malformed: object keys must be strings, line 3, byte 1 of it",
+        text.replace(
+            b'"version"', b",", 1
+        ): "JSON is malformed: object keys must be strings, line 3, byte 1 of it",
         text.replace(b'"version"', b'"ver\xffsion"', 1): "is no UTF-8 text, line 3, byte 5 of it",
         b"[" * 100_000: "is nested too deep",
         b"": "JSON ends too early, line 1, byte 0 of it",
@@ -163,7 +245,8 @@ def test_a_file_that_is_no_json_is_refused_with_the_place(tmp_path: Path) -> Non
 
 
 def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
-    """A folder, a pipe that nobody writes to, and a file that is not there: no waiting, no reading without end."""
+    """A folder, a pipe that nobody writes to, and a file that is not there: no waiting, no reading
+    without end."""
     os.mkfifo(tmp_path / "pipe.json")
     (tmp_path / "folder.json").mkdir()
     for name, words in (
@@ -175,8 +258,11 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
             read_suite(tmp_path / name)
 
 
-def test_a_scenario_that_is_listed_twice_is_found_without_comparing_each_with_each(tmp_path: Path) -> None:
-    """The ids are counted: of 300 hardly any two are compared, and so 48,000 take no longer than their reading."""
+def test_a_scenario_that_is_listed_twice_is_found_without_comparing_each_with_each(
+    tmp_path: Path,
+) -> None:
+    """The ids are counted: of 300 hardly any two are compared, and so 48,000 take no longer than
+    their reading."""
 
     class Counting(str):
         compared = 0
@@ -188,7 +274,9 @@ def test_a_scenario_that_is_listed_twice_is_found_without_comparing_each_with_ea
         __hash__ = str.__hash__
 
     one = load_suite("reactive").scenarios[0]
-    scenarios = tuple(msgspec.structs.replace(one, id=Counting(f"s-{i}")) for i in [*range(300), 41])
+    scenarios = tuple(
+        msgspec.structs.replace(one, id=Counting(f"s-{i}")) for i in [*range(300), 41]
+    )
     with pytest.raises(SpecError, match="suite 'big' lists scenarios twice: s-41"):
         Suite(name="big", version="1", scenarios=scenarios)
     assert Counting.compared < 300

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from sumo_nets.maps.mapstore import maps_folder
+from sumo_nets.maps.map_store import maps_folder
 
 
 @pytest.fixture(scope="module")

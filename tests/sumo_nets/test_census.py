@@ -1,4 +1,5 @@
-"""The census of cities, properties of the generator over seeds and sizes, city folders and their command line."""
+"""The census of cities, properties of the generator over seeds and sizes, city folders and their
+command line."""
 
 from __future__ import annotations
 
@@ -21,11 +22,10 @@ from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import City
 from sumo_nets.city.census import BLOCKS, ZONES, _shape, census, clear_width_m, longest_walk_m
 from sumo_nets.city.city import STYLES
-from sumo_nets.city.seeds import SEEDS, shipped_cities
 from sumo_nets.city.signals import signal_faults
-from sumo_nets.city.store import build_city, city_net, is_whole, write_city
+from sumo_nets.city.store import SEEDS, build_city, city_net, is_whole, shipped_cities, write_city
+from sumo_nets.net.net_file import read_net
 from sumo_nets.net.net_hash import net_content_hash
-from sumo_nets.net.netfile import read_net
 from sumo_nets.net.snapshot import street_map_of
 
 pytestmark = pytest.mark.engine
@@ -38,7 +38,8 @@ def large() -> Path:
 
 
 def test_a_shipped_city_keeps_every_promise(large: Path) -> None:
-    """Seven blocks, five zones on every street, one piece, room to pass, long walks, islands, driveways, no fault."""
+    """Seven blocks, five zones on every street, one piece, room to pass, long walks, islands,
+    driveways, no fault."""
     found = census(large)
     assert found.faults == ()
     assert list(found.blocks) == list(BLOCKS) and min(found.blocks.values()) >= 2
@@ -49,7 +50,8 @@ def test_a_shipped_city_keeps_every_promise(large: Path) -> None:
 
 
 def test_census_notices_what_is_broken(tmp_path: Path) -> None:
-    """Zones that are not there, passages too narrow, signals that never let people go: each is a fault."""
+    """Zones that are not there, passages too narrow, signals that never let people go: each is a
+    fault."""
     broken = tmp_path / "broken.net.xml"
     build_city(City(seed=2, size_m=500.0), broken)
     net = broken.read_bytes()
@@ -58,12 +60,15 @@ def test_census_notices_what_is_broken(tmp_path: Path) -> None:
     faults = census(broken).faults
     assert any("without all of the zones" in fault for fault in faults)
     assert any("never changes between walk and stop" in fault for fault in faults)
-    broken.write_bytes(net.replace(b'width="3.20"', b'width="1.10"').replace(b'width="1.92"', b'width="1.10"'))
+    broken.write_bytes(
+        net.replace(b'width="3.20"', b'width="1.10"').replace(b'width="1.92"', b'width="1.10"')
+    )
     assert any("a passage is only 1." in fault for fault in census(broken).faults)
 
 
 def test_streets_are_told_apart_by_their_turns() -> None:
-    """A line without turns is straight, one that turns one way a curve, one that turns both ways an S-bend."""
+    """A line without turns is straight, one that turns one way a curve, one that turns both ways an
+    S-bend."""
     x = np.linspace(0.0, 100.0, 30)
     assert _shape(np.column_stack([x, 0.02 * x])) == "straight"
     assert _shape(np.column_stack([x, 0.004 * x * x])) == "curve"
@@ -82,8 +87,11 @@ def test_shipped_seeds_are_a_hundred_different_ones() -> None:
     size_m=st.floats(200.0, 800.0).map(lambda size: round(size, 1)),
     style=st.sampled_from(sorted(STYLES)),
 )
-def test_any_city_is_whole(tmp_path_factory: pytest.TempPathFactory, seed: int, size_m: float, style: str) -> None:
-    """Any seed, size and style: one component, every strip reached, clear width, signals without fault, same bytes."""
+def test_any_city_is_whole(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, size_m: float, style: str
+) -> None:
+    """Any seed, size and style: one component, every strip reached, clear width, signals without
+    fault, same bytes."""
     folder = tmp_path_factory.mktemp("any")
     one, two = folder / "one.net.xml", folder / "two.net.xml"
     city = City(seed=seed, size_m=size_m, style=style)
@@ -100,10 +108,13 @@ def test_any_city_is_whole(tmp_path_factory: pytest.TempPathFactory, seed: int, 
 
 
 def test_a_city_folder_is_equal_when_made_again(tmp_path: Path) -> None:
-    """The net and what it was made from, byte by byte; nothing is overwritten or left behind by mistake."""
+    """The net and what it was made from, byte by byte; nothing is overwritten or left behind by
+    mistake."""
     city = City(seed=4, size_m=260.0)
     made = [write_city(city, tmp_path / name) for name in ("a", "b")]
-    assert made[0] == made[1] and made[0].net_hash == net_content_hash(tmp_path / "a" / "city.net.xml")
+    assert made[0] == made[1] and made[0].net_hash == net_content_hash(
+        tmp_path / "a" / "city.net.xml"
+    )
     for name in ("city.net.xml", "city.json"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     assert sorted(p.name for p in (tmp_path / "a").iterdir()) == ["city.json", "city.net.xml"]
@@ -115,7 +126,8 @@ def test_a_city_folder_is_equal_when_made_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "damage", [lambda b: b[:-1], lambda b: b[: len(b) // 2], lambda b: b"", lambda b: b[:9] + b"!" + b[10:]]
+    "damage",
+    [lambda b: b[:-1], lambda b: b[: len(b) // 2], lambda b: b"", lambda b: b[:9] + b"!" + b[10:]],
 )
 def test_a_damaged_net_in_the_cache_is_built_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: Callable[[bytes], bytes]
@@ -153,18 +165,29 @@ def test_city_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert made.exit_code == 0 and (tmp_path / "c" / "city.json").exists()
     shown = runner.invoke(app, ["city", "table", "--count", "2", "--size", "300"])
     assert shown.exit_code == 0 and "2 cities" in shown.output and "frontage" in shown.output
-    drawn = runner.invoke(app, ["city", "draw", "3", "--size", "250", "-o", str(tmp_path / "c.png")])
+    drawn = runner.invoke(
+        app, ["city", "draw", "3", "--size", "250", "-o", str(tmp_path / "c.png")]
+    )
     assert drawn.exit_code == 0 and (tmp_path / "c.png").read_bytes()[1:4] == b"PNG"
     for zoom in ("1,2,3", "5,5,1,9", "900,900,990,990"):
-        bad = runner.invoke(app, ["city", "draw", "3", "--size", "250", "-o", str(tmp_path / "d.png"), "--zoom", zoom])
+        bad = runner.invoke(
+            app,
+            ["city", "draw", "3", "--size", "250", "-o", str(tmp_path / "d.png"), "--zoom", zoom],
+        )
         assert bad.exit_code != 0 and "--zoom" in str(bad.exception)
     bad = runner.invoke(app, ["city", "draw", "3", "--size", "250", "-o", str(tmp_path / "d.gif")])
     assert "use a name that ends in .png" in str(bad.exception) and not list(tmp_path.glob("d.*"))
-    assert runner.invoke(app, ["city", "make", "--seed", "1", "--size", "9", str(tmp_path / "e")]).exit_code != 0
+    assert (
+        runner.invoke(
+            app, ["city", "make", "--seed", "1", "--size", "9", str(tmp_path / "e")]
+        ).exit_code
+        != 0
+    )
 
 
 def test_distance_to_the_edge_is_the_one_of_geometry(large: Path) -> None:
-    """Signed distances equal shapely's distance to the whole boundary, positive inside, holes and parts included."""
+    """Signed distances equal shapely's distance to the whole boundary, positive inside, holes and
+    parts included."""
     place = street_map_of(large)
     area = WalkableArea(place.walkable)
     xy = np.random.default_rng(1).uniform(0.0, 2000.0, (300, 2))

@@ -23,11 +23,17 @@ from sumo_nets.city.plan import CityPlan
 from sumo_nets.city.signals import signal_faults
 from sumo_nets.city.store import city_net
 from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M
+from sumo_nets.net.net_file import read_net
 from sumo_nets.net.net_hash import net_content_hash
 from sumo_nets.net.netconvert import netconvert
-from sumo_nets.net.netfile import read_net
 
-SAMPLE = [(1, 200.0, "mixed"), (2, 450.0, "suburb"), (3, 700.0, "downtown"), (4, 900.0, "mixed"), (5, 2000.0, "mixed")]
+SAMPLE = [
+    (1, 200.0, "mixed"),
+    (2, 450.0, "suburb"),
+    (3, 700.0, "downtown"),
+    (4, 900.0, "mixed"),
+    (5, 2000.0, "mixed"),
+]
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +54,8 @@ def groups(place: StreetMap) -> list[set[str]]:
     for area in place.corners.values():
         for port in area.ports:
             beside[port.strip] |= {other.strip for other in area.ports}
-    left, found = set(place.strips), []
+    left = set(place.strips)
+    found = []
     while left:
         front = [left.pop()]
         group = set(front)
@@ -73,7 +80,8 @@ def arms(plan: CityPlan) -> dict[str, list[float]]:
 def test_blocks_start_and_end_where_they_are_told() -> None:
     """Every primitive line keeps its ends, and curves leave and arrive with the turn asked for."""
     a, b = (0.0, 0.0), (100.0, 0.0)
-    curve, s_bend = bend(a, b, 0.5, -0.5), bend(a, b, 0.5, 0.5)
+    curve = bend(a, b, 0.5, -0.5)
+    s_bend = bend(a, b, 0.5, 0.5)
     for line in (curve, s_bend, corner(a, (100.0, 80.0), b, 30.0)):
         assert (line[0], line[-1]) == (a, b)
         assert length(line) > 100.0
@@ -88,7 +96,12 @@ def test_blocks_start_and_end_where_they_are_told() -> None:
 def test_same_seed_gives_the_same_plan_and_another_seed_another() -> None:
     """A plan is a function of seed, size and style alone."""
     one, same, other = (plan_city(seed, 1000.0, "mixed") for seed in (7, 7, 8))
-    assert (one.nodes, one.edges, one.zebras, one.rings) == (same.nodes, same.edges, same.zebras, same.rings)
+    assert (one.nodes, one.edges, one.zebras, one.rings) == (
+        same.nodes,
+        same.edges,
+        same.zebras,
+        same.rings,
+    )
     assert one.edges != other.edges
     assert one.edges != plan_city(7, 1000.0, "suburb").edges
 
@@ -96,7 +109,8 @@ def test_same_seed_gives_the_same_plan_and_another_seed_another() -> None:
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("style", sorted(STYLES))
 def test_streets_meet_at_wide_angles_and_stay_inside(seed: int, style: str) -> None:
-    """Arms are more than 45 degrees apart, streets longer than 30 m, no node is a dead end, all inside the square."""
+    """Arms are more than 45 degrees apart, streets longer than 30 m, no node is a dead end, all
+    inside the square."""
     plan = plan_city(seed, 1200.0, style)
     for node, headings in arms(plan).items():
         order = sorted(h % (2.0 * math.pi) for h in headings)
@@ -110,7 +124,8 @@ def test_streets_meet_at_wide_angles_and_stay_inside(seed: int, style: str) -> N
 
 
 def test_large_city_shows_every_primitive_block() -> None:
-    """A 2 km city has straights, curves, corners, T, X and Y junctions, roundabouts and mid-block crosswalks."""
+    """A 2 km city has straights, curves, corners, T, X and Y junctions, roundabouts and mid-block
+    crosswalks."""
     plan = plan_city(1, 2000.0, "mixed")
     degrees = Counter(len(headings) for headings in arms(plan).values())
     assert degrees[2] > 50 and degrees[3] > 50 and degrees[4] > 50
@@ -123,11 +138,15 @@ def test_large_city_shows_every_primitive_block() -> None:
 def test_sidewalks_fit_the_stripes_of_the_crowd_model() -> None:
     """Every sidewalk and every crossing is an odd number of 0.64 m stripes wide."""
     for made in CLASSES.values():
-        assert all(round(width / GROUP_STRIPE_M, 6) % 2 == 1 for width in (*made.sidewalks_m, *made.crossings_m))
+        assert all(
+            round(width / GROUP_STRIPE_M, 6) % 2 == 1
+            for width in (*made.sidewalks_m, *made.crossings_m)
+        )
 
 
 def test_widths_differ_within_the_ranges_of_the_class() -> None:
-    """One street has one cross-section; streets of a class differ, each within the ranges; wide ones have islands."""
+    """One street has one cross-section; streets of a class differ, each within the ranges; wide
+    ones have islands."""
     plan = plan_city(3, 2000.0, "mixed")
     sections = defaultdict(set)
     for edge in plan.edges:
@@ -148,14 +167,20 @@ def test_driveways_keep_off_the_ends_of_their_street() -> None:
     edges = [edge for edge in plan_city(3, 2000.0, "mixed").edges if edge.driveways]
     assert len(edges) > 40 and {edge.id[0] for edge in edges} == {"-", "s"}
     for edge in edges:
-        assert all(math.dist(at, end) > 25.0 for at in edge.driveways for end in (edge.line[0], edge.line[-1]))
+        assert all(
+            math.dist(at, end) > 25.0
+            for at in edge.driveways
+            for end in (edge.line[0], edge.line[-1])
+        )
 
 
 def test_cities_out_of_range_are_refused() -> None:
     """Size, style and seed are checked, and the message lists what is valid."""
     with pytest.raises(MapError, match=r"size_m must be in \[200, 4000\], not 50"):
         plan_city(1, 50.0, "mixed")
-    with pytest.raises(UsageError, match=r"unknown city style 'x'. Valid choices: downtown, mixed, suburb."):
+    with pytest.raises(
+        UsageError, match=r"unknown city style 'x'. Valid choices: downtown, mixed, suburb."
+    ):
         plan_city(1, 500.0, "x")
     with pytest.raises(MapError, match="cannot be negative: -1"):
         plan_city(-1, 500.0, "mixed")
@@ -163,7 +188,8 @@ def test_cities_out_of_range_are_refused() -> None:
 
 @pytest.mark.engine
 def test_built_city_is_one_walkable_whole(read: dict[tuple[int, float, str], StreetMap]) -> None:
-    """Every strip has a corner at both ends, is reachable from every other one, and 99 % of the area is one piece."""
+    """Every strip has a corner at both ends, is reachable from every other one, and 99 % of the
+    area is one piece."""
     for place in read.values():
         assert all(None not in strip.corners for strip in place.strips.values())
         assert len(groups(place)) == 1
@@ -172,8 +198,11 @@ def test_built_city_is_one_walkable_whole(read: dict[tuple[int, float, str], Str
 
 
 @pytest.mark.engine
-def test_built_city_keeps_the_zones_of_its_plan(read: dict[tuple[int, float, str], StreetMap]) -> None:
-    """Sidewalks carry the widths of their street class, the road on their left and verges between."""
+def test_built_city_keeps_the_zones_of_its_plan(
+    read: dict[tuple[int, float, str], StreetMap],
+) -> None:
+    """Sidewalks carry the widths of their street class, the road on their left and verges
+    between."""
     sections = {edge.id: edge for edge in plan_city(*SAMPLE[3]).edges}
     place = read[SAMPLE[3]]
     lanes: dict[str, list[tuple[str, float]]] = defaultdict(list)
@@ -208,8 +237,11 @@ def test_every_signalised_crossing_has_time_to_cross(
 
 
 @pytest.mark.engine
-def test_programs_of_netconvert_would_be_found_out(built: dict[tuple[int, float, str], Path]) -> None:
-    """The check of signals notices a crossing that never gets green, and one that is not cleared."""
+def test_programs_of_netconvert_would_be_found_out(
+    built: dict[tuple[int, float, str], Path],
+) -> None:
+    """The check of signals notices a crossing that never gets green, and one that is not
+    cleared."""
     net = built[SAMPLE[2]].read_bytes()
     assert any("never changes" in fault for fault in signal_faults(net.replace(b'G"/>', b'r"/>')))
     hasty = net.replace(b'duration="2"', b'duration="0"').replace(b'duration="3"', b'duration="1"')
@@ -239,15 +271,22 @@ def test_city_is_equal_to_the_byte_in_another_process(
         f"print(city_net(City(seed={seed}, size_m={size_m}, style={style!r})))"
     )
     environment = os.environ | {"COSIM_CACHE": str(tmp_path), "PYTHONHASHSEED": "123"}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
-    digests = [hashlib.sha256(p.read_bytes()).hexdigest() for p in (Path(done.stdout.strip()), built[SAMPLE[3]])]
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment
+    )
+    digests = [
+        hashlib.sha256(p.read_bytes()).hexdigest()
+        for p in (Path(done.stdout.strip()), built[SAMPLE[3]])
+    ]
     assert digests[0] == digests[1]
 
 
 @pytest.mark.engine
-def test_store_builds_once_and_refuses_another_net(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second request is served from the cache, which says that it was used; what was not used for long makes room.
-    A scenario made on another net is refused with a remedy."""
+def test_store_builds_once_and_refuses_another_net(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The second request is served from the cache, which says that it was used; what was not used
+    for long makes room. A scenario made on another net is refused with a remedy."""
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
     (tmp_path / "old.net.xml").write_text("<net/>")
     os.utime(tmp_path / "old.net.xml", (0.0, 0.0))
@@ -259,7 +298,9 @@ def test_store_builds_once_and_refuses_another_net(tmp_path: Path, monkeypatch: 
     assert [p.name for p in tmp_path.iterdir() if not p.name.startswith(".")] == [path.name]
     forget_entries(limit_bytes=0)
     assert path.exists()
-    with pytest.raises(MapError, match=r"made on 0123456789abcdef: delete the file to build it again"):
+    with pytest.raises(
+        MapError, match=r"made on 0123456789abcdef: delete the file to build it again"
+    ):
         city_net(City(seed=9, size_m=200.0, net_hash="0123456789abcdef"))
 
 
@@ -268,5 +309,7 @@ def test_netconvert_failures_are_its_complaint_on_one_line(tmp_path: Path) -> No
     """Bad input ends in a MapError of one line with netconvert's own words."""
     broken = tmp_path / "broken.net.xml"
     broken.write_text("<net")
-    with pytest.raises(MapError, match=r"^netconvert failed with exit code 1: .*broken\.net\.xml[^\n]*$"):
+    with pytest.raises(
+        MapError, match=r"^netconvert failed with exit code 1: .*broken\.net\.xml[^\n]*$"
+    ):
         netconvert(["-s", str(broken)], tmp_path / "out.net.xml")

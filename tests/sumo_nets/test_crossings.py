@@ -13,17 +13,18 @@ import pytest
 from cosim.core.errors import MapError
 from cosim.core.geometry import Polyline, boxes_overlap
 from cosim.core.state import Command, PersonKind, RobotState
-from cosim.episode.ports import Manifest, Observation
+from cosim.episode.interfaces import Observation
 from cosim.episode.step import Step
-from cosim.judge.referee import Verdict
-from cosim.judge.traffic import braking_for
 from cosim.place.walk_graph import WalkGraph
-from cosim.policies.route import bearing_to
+from cosim.policies.privileged.route import bearing_to
+from cosim.results.referee import Verdict
+from cosim.results.traffic import braking_for
 from cosim.spec.events import Actor, EventReply
+from cosim.spec.manifest import Manifest
 from cosim.spec.scenario import City, CrowdSpec
-from scenarios.builders.crossings import AFTER_M, START_BEFORE_CROSSING_M, build_all
-from scenarios.execution.places import place
-from scenarios.execution.run import run_episode
+from scenarios.episodes.run_episode import run_episode
+from scenarios.places.nets import place
+from scenarios.suites.crossings import AFTER_M, START_BEFORE_CROSSING_M, build_all
 from sumo_nets.crowd.crowd import SumoCrowd
 from tests.conftest import Cosim
 
@@ -33,7 +34,8 @@ SMALL = City(seed=5, size_m=500.0)
 
 
 def test_a_crossing_scenario_is_a_short_way_over_one_signalised_crossing() -> None:
-    """Four different crossings, 10 m of sidewalk before and 8 m after each, the same ones whenever they are drawn."""
+    """Four different crossings, 10 m of sidewalk before and 8 m after each, the same ones whenever
+    they are drawn."""
     _, street_map = place(SMALL)
     graph = WalkGraph(street_map)
     drawn = build_all(SMALL, street_map, graph, 3, 4)
@@ -58,7 +60,7 @@ def test_a_city_has_only_so_many_crossings() -> None:
 @pytest.fixture
 def bench(cosim: Cosim, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
     """What `cosim bench crossings` prints, in small cities."""
-    monkeypatch.setattr("scenarios.bench.crossings._SIZE_M", 600.0)
+    monkeypatch.setattr("scenarios.tools.bench.crossings._SIZE_M", 600.0)
 
     def said(*words: str, cwd: Path | None = None) -> str:
         done = cosim("bench", "crossings", *words, cwd=cwd)
@@ -68,8 +70,11 @@ def bench(cosim: Cosim, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
     return said
 
 
-def test_the_bench_drives_over_crossings_and_counts_what_goes_at_red(bench: Callable[..., str]) -> None:
-    """One crossing from the command line: the robot arrives, nothing at red by it; people and vehicles are counted."""
+def test_the_bench_drives_over_crossings_and_counts_what_goes_at_red(
+    bench: Callable[..., str],
+) -> None:
+    """One crossing from the command line: the robot arrives, nothing at red by it; people and
+    vehicles are counted."""
     told = bench("--crossings", "1", "--policy", "orca")
     rows = {name.strip(): count for name, count in re.findall(r"│ ([a-z ,]+?) +│ ([\d.]+)", told)}
     assert (rows["reached the goal"], rows["entered at red"], rows["crashed"]) == ("1", "0", "0")
@@ -79,7 +84,7 @@ def test_the_bench_drives_over_crossings_and_counts_what_goes_at_red(bench: Call
 
 DIES = """
 import os
-from cosim.episode.ports import Manifest
+from cosim.spec.manifest import Manifest
 
 class Dies:
     manifest = Manifest("dies", rate_hz=10.0, camera=None, privileged=True)
@@ -99,8 +104,11 @@ class Dies:
 """
 
 
-def test_the_bench_keeps_what_was_driven_before_its_process_died(tmp_path: Path, bench: Callable[..., str]) -> None:
-    """A policy raises at its first crossing; made anew, it ends the process at the second: both rows say which."""
+def test_the_bench_keeps_what_was_driven_before_its_process_died(
+    tmp_path: Path, bench: Callable[..., str]
+) -> None:
+    """A policy raises at its first crossing; made anew, it ends the process at the second: both
+    rows say which."""
     (tmp_path / "dies.py").write_text(DIES)
     told = bench("--crossings", "2", "--cities", "1", "--policy", "dies:Dies", cwd=tmp_path)
     (crashed,) = re.findall(r"│ crashed +│ 2 +│ (.+?) +│", told)
@@ -117,14 +125,19 @@ class Heedless:
     def act(self, observation: Observation) -> Command:
         assert observation.privileged is not None
         bearing_rad = bearing_to(observation.privileged, 0.0)
-        return Command(0.5 * max(1.0 - abs(bearing_rad), 0.1), max(-0.65, min(0.65, 2.4 * bearing_rad)))
+        return Command(
+            0.5 * max(1.0 - abs(bearing_rad), 0.1), max(-0.65, min(0.65, 2.4 * bearing_rad))
+        )
 
 
 def test_cars_brake_for_a_robot_that_walks_at_red_and_are_counted() -> None:
-    """Over a busy crossing at red, at 0.5 m/s: a car brakes to a stop before the robot, once; none touches it."""
+    """Over a busy crossing at red, at 0.5 m/s: a car brakes to a stop before the robot, once; none
+    touches it."""
     _, street_map = place(SMALL)
     drawn = build_all(SMALL, street_map, WalkGraph(street_map), 0, 1)[0]
-    busy = msgspec.structs.replace(drawn, crowd=CrowdSpec(persons=0, vehicles=40), time_limit_s=45.0)
+    busy = msgspec.structs.replace(
+        drawn, crowd=CrowdSpec(persons=0, vehicles=40), time_limit_s=45.0
+    )
     slowest: dict[str, float] = {}
 
     def watch(step: Step, verdict: Verdict) -> None:
@@ -143,7 +156,8 @@ def test_cars_brake_for_a_robot_that_walks_at_red_and_are_counted() -> None:
 
 @pytest.mark.parametrize("who", ["nobody", "robot", "person"])
 def test_vehicles_yield_on_a_crossing_without_signals(who: str) -> None:
-    """In a minute of traffic cars drive over the middle of a crossing; where a robot or a person stands, none does."""
+    """In a minute of traffic cars drive over the middle of a crossing; where a robot or a person
+    stands, none does."""
     net, street_map = place(SMALL)
     crossing = Polyline(street_map.strips[":n1x2_c1"].line[:, :2])
     assert not street_map.strips[":n1x2_c1"].signalised
@@ -159,10 +173,17 @@ def test_vehicles_yield_on_a_crossing_without_signals(who: str) -> None:
         kind=PersonKind.EVENT,
     )
     over: set[str] = set()
-    with SumoCrowd(net, street_map, CrowdSpec(persons=0, vehicles=40), 7, frozenset(), middle[:2]) as crowd:
+    with SumoCrowd(
+        net, street_map, CrowdSpec(persons=0, vehicles=40), 7, frozenset(), middle[:2]
+    ) as crowd:
         for tick in range(1200):
-            reply = EventReply(episode="t", tick=tick, states=(), actors=(guest,) if who == "person" else ())
+            reply = EventReply(
+                episode="t", tick=tick, states=(), actors=(guest,) if who == "person" else ()
+            )
             cars = crowd.step(RobotState(middle), reply, absent=who != "robot").vehicles
             boxes = np.column_stack([cars.xy, cars.heading])
-            over |= {cars.ids[i] for i in np.flatnonzero(boxes_overlap(np.array(middle), here, boxes, cars.size / 2))}
+            over |= {
+                cars.ids[i]
+                for i in np.flatnonzero(boxes_overlap(np.array(middle), here, boxes, cars.size / 2))
+            }
     assert bool(over) is (who == "nobody")

@@ -21,8 +21,8 @@ from cosim.spec.scenario import City, CrowdSpec
 from sumo_nets.city.store import city_net
 from sumo_nets.crowd.crowd import SumoCrowd
 from sumo_nets.crowd.stoplines import StopLines
+from sumo_nets.net.net_file import read_net
 from sumo_nets.net.netconvert import netconvert
-from sumo_nets.net.netfile import read_net
 from sumo_nets.net.snapshot import street_map_of
 
 pytestmark = pytest.mark.engine
@@ -47,7 +47,13 @@ def place() -> Place:
 def acting(name: str, x_m: float, y_m: float, heading_rad: float, speed_mps: float) -> Actor:
     """Somebody of an event who walks."""
     return Actor(
-        id=name, x_m=x_m, y_m=y_m, heading_rad=heading_rad, speed_mps=speed_mps, doing="walk", kind=PersonKind.EVENT
+        id=name,
+        x_m=x_m,
+        y_m=y_m,
+        heading_rad=heading_rad,
+        speed_mps=speed_mps,
+        doing="walk",
+        kind=PersonKind.EVENT,
     )
 
 
@@ -60,14 +66,17 @@ def at(pose: Pose) -> RobotState:
 
 
 def middle(place: Place, *, signalised: bool = False) -> Pose:
-    """The middle of a long sidewalk near the centre of the map, or the nearest one to a signalised crossing."""
+    """The middle of a long sidewalk near the centre of the map, or the nearest one to a signalised
+    crossing."""
     street_map = place.map
     x0, y0, x1, y1 = street_map.bounds
     centre = np.array([(x0 + x1) / 2, (y0 + y1) / 2])
     if signalised:
         crossing = next(s for s in street_map.strips.values() if s.signalised)
         centre = crossing.line.mean(axis=0)
-    sidewalks = [Polyline(street_map.strips[i].line) for i in sorted(place.graph.main_strips) if i[0] != ":"]
+    sidewalks = [
+        Polyline(street_map.strips[i].line) for i in sorted(place.graph.main_strips) if i[0] != ":"
+    ]
     line = min(
         (line for line in sidewalks if line.length_m > 40.0),
         key=lambda line: float(np.hypot(*(line.at(line.length_m / 2).xy - centre))),
@@ -82,7 +91,8 @@ def gaps(street: Street, pose: Pose) -> Floats:
 
 
 def test_the_first_street_is_populated_and_clear_around_the_robot(place: Place) -> None:
-    """At tick 0 all persons asked for are there, none nearer than 8 m, all on walkable ground, and cars drive."""
+    """At tick 0 all persons asked for are there, none nearer than 8 m, all on walkable ground, and
+    cars drive."""
     start = middle(place)
     spec = CrowdSpec(persons=40, radius_m=80.0, vehicles=12)
     with SumoCrowd(place.net, place.map, spec, 3, OPEN, start[:2]) as crowd:
@@ -98,21 +108,26 @@ def test_the_first_street_is_populated_and_clear_around_the_robot(place: Place) 
 
 
 def test_the_crowd_follows_a_robot_that_travels(place: Place) -> None:
-    """Over 120 m of the robot's way about as many persons as asked for are within the radius, none appears near it."""
+    """Over 120 m of the robot's way about as many persons as asked for are within the radius, none
+    appears near it."""
     start = middle(place)
     reach = place.graph.reach(Port(place.map.locate(*start[:2]).edge, 0))
     path = reach.path(reach.within(140.0, 300.0)[0])
     assert path is not None
     line = Polyline([place.graph.point(port) for port in path])
     spec = CrowdSpec(persons=40, radius_m=80.0, vehicles=12)
-    inside, vehicles, appeared = [], [], []
+    inside = []
+    vehicles = []
+    appeared = []
     with SumoCrowd(place.net, place.map, spec, 5, OPEN, start[:2]) as crowd:
         known: set[str] = set(crowd.street.people.ids)
         for tick in range(1200):
             pose = line.at(0.1 * tick)
             street = crowd.step(at(pose), reply(tick))
             near = gaps(street, pose)
-            appeared += [gap for gap, name in zip(near, street.people.ids, strict=True) if name not in known]
+            appeared += [
+                gap for gap, name in zip(near, street.people.ids, strict=True) if name not in known
+            ]
             known |= set(street.people.ids)
             if tick % 20 == 0:
                 inside.append(int((near < 80.0).sum()))
@@ -124,15 +139,20 @@ def test_the_crowd_follows_a_robot_that_travels(place: Place) -> None:
 
 
 def test_a_density_is_reached_and_kept_on_the_way(place: Place) -> None:
-    """Over 100 m persons per 1000 m2 of walkable ground are as asked for, within 5 % on the mean of every third."""
+    """Over 100 m persons per 1000 m2 of walkable ground are as asked for, within 5 % on the mean of
+    every third."""
     start = middle(place)
     reach = place.graph.reach(Port(place.map.locate(*start[:2]).edge, 0))
     path = reach.path(reach.within(130.0, 300.0)[0])
     assert path is not None
     line = Polyline([place.graph.point(port) for port in path])
-    pieces = np.array([p.polygon for p in (*place.map.strips.values(), *place.map.corners.values())], dtype=object)
+    pieces = np.array(
+        [p.polygon for p in (*place.map.strips.values(), *place.map.corners.values())], dtype=object
+    )
     found = []
-    with SumoCrowd(place.net, place.map, CrowdSpec(density=40.0, vehicles=0), 5, OPEN, start[:2]) as crowd:
+    with SumoCrowd(
+        place.net, place.map, CrowdSpec(density=40.0, vehicles=0), 5, OPEN, start[:2]
+    ) as crowd:
         for tick in range(1200):
             pose = line.at(0.08 * tick)
             street = crowd.step(at(pose), reply(tick))
@@ -140,14 +160,17 @@ def test_a_density_is_reached_and_kept_on_the_way(place: Place) -> None:
                 disk = shapely.Point(pose.xy).buffer(80.0)
                 room_m2 = shapely.area(shapely.intersection(pieces, disk)).sum()
                 found.append(1000.0 * float((gaps(street, pose) < 80.0).sum()) / room_m2)
-    assert [np.mean(third) for third in np.array_split(found, 3)] == pytest.approx([40.0] * 3, rel=0.05)
+    assert [np.mean(third) for third in np.array_split(found, 3)] == pytest.approx(
+        [40.0] * 3, rel=0.05
+    )
 
 
 def test_people_keep_a_distance_from_a_standing_robot(place: Place) -> None:
     """In a minute beside a standing robot people pass on the sidewalk, nobody nearer than 0.5 m."""
     start = middle(place)
     spec = CrowdSpec(persons=60, radius_m=60.0, vehicles=0)
-    nearest, passed = math.inf, set()
+    nearest = math.inf
+    passed = set()
     with SumoCrowd(place.net, place.map, spec, 4, OPEN, start[:2]) as crowd:
         for tick in range(1200):
             street = crowd.step(at(start), reply(tick))
@@ -159,19 +182,25 @@ def test_people_keep_a_distance_from_a_standing_robot(place: Place) -> None:
 
 
 def test_an_absent_robot_is_walked_through(place: Place) -> None:
-    """Where people keep half a metre from a robot, without it somebody walks over the very place."""
+    """Where people keep half a metre from a robot, without it somebody walks over the very
+    place."""
     start = middle(place)
     nearest = math.inf
-    with SumoCrowd(place.net, place.map, CrowdSpec(persons=60, radius_m=60.0, vehicles=0), 4, OPEN, start[:2]) as crowd:
+    with SumoCrowd(
+        place.net, place.map, CrowdSpec(persons=60, radius_m=60.0, vehicles=0), 4, OPEN, start[:2]
+    ) as crowd:
         for tick in range(2400):
-            nearest = min(nearest, float(gaps(crowd.step(at(start), reply(tick), absent=True), start).min()))
+            nearest = min(
+                nearest, float(gaps(crowd.step(at(start), reply(tick), absent=True), start).min())
+            )
             if nearest < 0.4:
                 break
     assert nearest < 0.4
 
 
 def test_nobody_enters_a_signalised_crossing_on_red(place: Place) -> None:
-    """In 80 seconds next to signals people wait and start over crossings, none once it has been red for 2 s.
+    """In 80 seconds next to signals people wait and start over crossings, none once it has been red
+    for 2 s.
 
     Two seconds is what a slow walker needs from the kerb to the inner part, where the test sees it.
     """
@@ -191,9 +220,13 @@ def test_nobody_enters_a_signalised_crossing_on_red(place: Place) -> None:
             now: dict[str, str] = {}
             for crossing, signal in street.signals.items():
                 red_s[crossing] = 0.0 if signal.walk else red_s.get(crossing, -2.0) + 0.05
-                inside = shapely.contains_xy(inner[crossing], street.people.xy[:, 0], street.people.xy[:, 1])
+                inside = shapely.contains_xy(
+                    inner[crossing], street.people.xy[:, 0], street.people.xy[:, 1]
+                )
                 now |= {street.people.ids[i]: crossing for i in np.flatnonzero(inside)}
-            entries += [red_s[crossing] for name, crossing in now.items() if on.get(name) != crossing]
+            entries += [
+                red_s[crossing] for name, crossing in now.items() if on.get(name) != crossing
+            ]
             waiting += sum(doing == "stand" for doing in street.people.doing)
             on = now
     assert len(entries) >= 10 and waiting > 100
@@ -204,19 +237,26 @@ def test_vehicles_stop_at_red(place: Place) -> None:
     """In 80 seconds vehicles pass stop lines, none of them at red."""
     start = middle(place, signalised=True)
     lights = ""
-    with SumoCrowd(place.net, place.map, CrowdSpec(persons=0, vehicles=30), 6, OPEN, start[:2]) as crowd:
+    with SumoCrowd(
+        place.net, place.map, CrowdSpec(persons=0, vehicles=30), 6, OPEN, start[:2]
+    ) as crowd:
         lines = StopLines(0.05)
         for tick in range(1600):
-            lights += "".join(p.light for p in lines.passed(crowd.step(at(start), reply(tick)).vehicles.ids))
+            lights += "".join(
+                p.light for p in lines.passed(crowd.step(at(start), reply(tick)).vehicles.ids)
+            )
     assert len(lights) >= 10 and "r" not in lights
 
 
 def test_signals_change_when_they_say(place: Place) -> None:
-    """Every announced change of a signal comes within a tick of its time, and what is red stays red until then."""
+    """Every announced change of a signal comes within a tick of its time, and what is red stays red
+    until then."""
     start = middle(place, signalised=True)
     announced: dict[str, tuple[bool, float]] = {}
     changes = 0
-    with SumoCrowd(place.net, place.map, CrowdSpec(persons=0, vehicles=0), 6, OPEN, start[:2]) as crowd:
+    with SumoCrowd(
+        place.net, place.map, CrowdSpec(persons=0, vehicles=0), 6, OPEN, start[:2]
+    ) as crowd:
         assert crowd.street.signals and not crowd.street.people.ids
         for tick in range(2400):
             now_s = tick * 0.05
@@ -234,7 +274,8 @@ def test_signals_change_when_they_say(place: Place) -> None:
 
 
 def test_nobody_passes_a_closed_port(place: Place) -> None:
-    """In a minute nobody goes between a closed sidewalk and its corner, where people pass otherwise."""
+    """In a minute nobody goes between a closed sidewalk and its corner, where people pass
+    otherwise."""
     start = middle(place)
     port = Port(place.map.locate(*start[:2]).edge, 1)
     strip = place.map.strips[port.strip]
@@ -262,15 +303,24 @@ def test_nobody_passes_a_closed_port(place: Place) -> None:
 
 
 def test_event_actors_appear_exactly_and_the_crowd_evades_them(place: Place) -> None:
-    """Actors are in the street as given, behind the others in order of ids, gone when not given; people walk round."""
+    """Actors are in the street as given, behind the others in order of ids, gone when not given;
+    people walk round."""
     start = middle(place)
     ahead = Pose(
-        start.x_m + 6.0 * math.cos(start.heading_rad), start.y_m + 6.0 * math.sin(start.heading_rad), start.heading_rad
+        start.x_m + 6.0 * math.cos(start.heading_rad),
+        start.y_m + 6.0 * math.sin(start.heading_rad),
+        start.heading_rad,
     )
     talker = Actor(
-        id="a2", x_m=ahead.x_m, y_m=ahead.y_m, heading_rad=1.0, speed_mps=0.0, doing="talk", kind=PersonKind.INJECTED,
+        id="a2",
+        x_m=ahead.x_m,
+        y_m=ahead.y_m,
+        heading_rad=1.0,
+        speed_mps=0.0,
+        doing="talk",
+        kind=PersonKind.INJECTED,
         age=Age.ELDERLY,
-    )  # fmt: skip
+    )
     spec = CrowdSpec(persons=60, radius_m=60.0, vehicles=0)
     nearest = math.inf
     with SumoCrowd(place.net, place.map, spec, 4, OPEN, start[:2]) as crowd:
@@ -278,11 +328,18 @@ def test_event_actors_appear_exactly_and_the_crowd_evades_them(place: Place) -> 
             walker = acting("a1", start.x_m + 0.01 * tick, start.y_m, 0.0, 0.2)
             street = crowd.step(at(start), reply(tick, talker, walker))
             people = street.people
-            assert people.ids[-2:] == ("a1", "a2") and people.kind[-2:].tolist() == [walker.kind, talker.kind]
+            assert people.ids[-2:] == ("a1", "a2") and people.kind[-2:].tolist() == [
+                walker.kind,
+                talker.kind,
+            ]
             assert people.age[-2:].tolist() == [Age.ADULT, Age.ELDERLY]
             assert not people.kind[:-2].any()
             assert people.xy[-2:].tolist() == [[walker.x_m, walker.y_m], [talker.x_m, talker.y_m]]
-            assert people.heading[-1] == 1.0 and people.speed[-2] == 0.2 and people.doing[-2:] == ("walk", "talk")
+            assert (
+                people.heading[-1] == 1.0
+                and people.speed[-2] == 0.2
+                and people.doing[-2:] == ("walk", "talk")
+            )
             nearest = min(nearest, float(gaps(street, ahead)[:-2].min()))
         street = crowd.step(at(start), reply(800))
         assert street.people.are(PersonKind.CROWD).all()
@@ -299,14 +356,22 @@ def test_the_same_calls_give_the_same_streets_bit_for_bit(place: Place) -> None:
         with SumoCrowd(place.net, place.map, spec, seed, OPEN, start[:2]) as crowd:
             streets.append(crowd.street)
             for tick in range(ticks):
-                pose = Pose(start.x_m + 0.05 * tick * math.cos(start.heading_rad), start.y_m, start.heading_rad)
+                pose = Pose(
+                    start.x_m + 0.05 * tick * math.cos(start.heading_rad),
+                    start.y_m,
+                    start.heading_rad,
+                )
                 actor = acting("e1", pose.x_m + 2.0, pose.y_m, 0.0, 1.0)
                 streets.append(crowd.step(at(pose), reply(tick, actor)))
         return streets
 
     first, second, other = run(1, 250), run(1, 250), run(2, 0)
     for a, b in zip(first, second, strict=True):
-        assert a.people.ids == b.people.ids and a.people.doing == b.people.doing and a.vehicles.ids == b.vehicles.ids
+        assert (
+            a.people.ids == b.people.ids
+            and a.people.doing == b.people.doing
+            and a.vehicles.ids == b.vehicles.ids
+        )
         assert a.signals == b.signals
         for kind in ("xy", "heading", "speed"):
             assert getattr(a.people, kind).tobytes() == getattr(b.people, kind).tobytes()
@@ -315,7 +380,8 @@ def test_the_same_calls_give_the_same_streets_bit_for_bit(place: Place) -> None:
 
 
 def test_it_survives_a_robot_anywhere(place: Place) -> None:
-    """A robot and event pedestrians that wander and jump over sidewalks, corners, roads and fields do no harm."""
+    """A robot and event pedestrians that wander and jump over sidewalks, corners, roads and fields
+    do no harm."""
     rng = np.random.default_rng(9)
     pieces: list[Strip | Corner | Lane] = [
         *place.map.strips.values(),
@@ -325,7 +391,11 @@ def test_it_survives_a_robot_anywhere(place: Place) -> None:
 
     def somewhere() -> list[float]:
         x0, y0, x1, y1 = pieces[int(rng.integers(len(pieces)))].polygon.bounds
-        return [rng.uniform(x0 - 1, x1 + 1), rng.uniform(y0 - 1, y1 + 1), rng.uniform(-math.pi, math.pi)]
+        return [
+            rng.uniform(x0 - 1, x1 + 1),
+            rng.uniform(y0 - 1, y1 + 1),
+            rng.uniform(-math.pi, math.pi),
+        ]
 
     bodies = [somewhere() for _ in range(4)]
     spec = CrowdSpec(persons=20, radius_m=60.0, vehicles=8)
@@ -336,17 +406,22 @@ def test_it_survives_a_robot_anywhere(place: Place) -> None:
                     body[:] = somewhere()
                 body[0] += 0.06 * math.cos(body[2])
                 body[1] += 0.06 * math.sin(body[2])
-            actors = [acting(f"e{i}", x, y, heading, 1.2) for i, (x, y, heading) in enumerate(bodies[1:])]
+            actors = [
+                acting(f"e{i}", x, y, heading, 1.2) for i, (x, y, heading) in enumerate(bodies[1:])
+            ]
             street = crowd.step(at(Pose(*bodies[0])), reply(tick, *actors))
         assert np.isfinite(street.people.xy).all() and np.isfinite(street.vehicles.xy).all()
 
 
 def test_it_survives_corners_that_no_crossing_joins(tmp_path: Path) -> None:
-    """Bodies that jump about where footpaths meet in two corners side by side do no harm: SUMO confuses the two."""
+    """Bodies that jump about where footpaths meet in two corners side by side do no harm: SUMO
+    confuses the two."""
     at_m = {"j": (0, 0), "a": (60, 18), "b": (-6, -3), "c": (-4, 3.5)}
     paths = [f"{a}{b}" for other in "abc" for a, b in ((other, "j"), ("j", other))]
     nodes, edges, net = (tmp_path / name for name in ("n.nod.xml", "e.edg.xml", "paths.net.xml"))
-    nodes.write_text("<n>" + "".join(f'<node id="{k}" x="{x}" y="{y}"/>' for k, (x, y) in at_m.items()) + "</n>")
+    nodes.write_text(
+        "<n>" + "".join(f'<node id="{k}" x="{x}" y="{y}"/>' for k, (x, y) in at_m.items()) + "</n>"
+    )
     edge = '<edge id="{0}{1}" from="{0}" to="{1}" numLanes="1" allow="pedestrian" width="3.2"/>'
     edges.write_text("<e>" + "".join(edge.format(*path) for path in paths) + "</e>")
     netconvert(["-n", str(nodes), "-e", str(edges), "--walkingareas"], net)
@@ -362,17 +437,25 @@ def test_it_survives_corners_that_no_crossing_joins(tmp_path: Path) -> None:
 
 
 def test_people_turn_round_where_the_sidewalks_meet(tmp_path: Path) -> None:
-    """Behind a barrier they go back to the street's other sidewalk over the far end, where the two meet, and arrive."""
+    """Behind a barrier they go back to the street's other sidewalk over the far end, where the two
+    meet, and arrive."""
     at_m = {"a": (0, 0), "b": (60, 0), "c": (66, 2)}
     nodes, edges, net = (tmp_path / name for name in ("n.nod.xml", "e.edg.xml", "street.net.xml"))
-    nodes.write_text("<n>" + "".join(f'<node id="{k}" x="{x}" y="{y}"/>' for k, (x, y) in at_m.items()) + "</n>")
+    nodes.write_text(
+        "<n>" + "".join(f'<node id="{k}" x="{x}" y="{y}"/>' for k, (x, y) in at_m.items()) + "</n>"
+    )
     edge = '<edge id="{0}" from="{0[0]}" to="{0[1]}" numLanes="1" sidewalkWidth="1.92"/>'
     edges.write_text("<e>" + "".join(edge.format(way) for way in ("ab", "ba", "bc", "cb")) + "</e>")
     netconvert(["-n", str(nodes), "-e", str(edges), "--walkingareas"], net)
     street_map = read_net(net)
     barrier = frozenset({Port("bc", 1)})
-    assert WalkGraph(street_map).wander(np.random.default_rng(0), "ab", False, 9, barrier) == ["ab", "ba"]
-    with SumoCrowd(net, street_map, CrowdSpec(persons=12, vehicles=0), 9, barrier, (0.0, 0.0)) as crowd:
+    assert WalkGraph(street_map).wander(np.random.default_rng(0), "ab", False, 9, barrier) == [
+        "ab",
+        "ba",
+    ]
+    with SumoCrowd(
+        net, street_map, CrowdSpec(persons=12, vehicles=0), 9, barrier, (0.0, 0.0)
+    ) as crowd:
         for tick in range(1600):
             crowd.step(at(Pose(0.0, 20.0, 0.0)), reply(tick))
             assert crowd.street.people.xy[:, 0].max(initial=0.0) < 57.0
@@ -380,7 +463,8 @@ def test_people_turn_round_where_the_sidewalks_meet(tmp_path: Path) -> None:
 
 
 def test_misuse_is_named(place: Place, tmp_path: Path) -> None:
-    """A second crowd, a step without a running one, bad actors and a broken net each get their own message."""
+    """A second crowd, a step without a running one, bad actors and a broken net each get their own
+    message."""
     spec = CrowdSpec(persons=2, vehicles=0)
     start = middle(place)
     crowd = SumoCrowd(place.net, place.map, spec, 1, OPEN, start[:2])
@@ -388,13 +472,19 @@ def test_misuse_is_named(place: Place, tmp_path: Path) -> None:
         crowd.step(at(start), reply(0))
     nobody = acting("x1", 0.0, 0.0, 0.0, 0.0)
     with crowd:
-        with pytest.raises(EngineError, match="only once per process"), SumoCrowd(*_arguments(crowd)):
+        with (
+            pytest.raises(EngineError, match="only once per process"),
+            SumoCrowd(*_arguments(crowd)),
+        ):
             pass
         for bad in ((nobody, nobody), (acting(crowd.street.people.ids[0], 0.0, 0.0, 0.0, 0.0),)):
             with pytest.raises(EngineError, match="unique ids, and none of the crowd's"):
                 crowd.step(at(start), reply(0, *bad))
     crowd.close()
-    with pytest.raises(EngineError, match="no street net at"), SumoCrowd(tmp_path / "no.xml", *_arguments(crowd)[1:]):
+    with (
+        pytest.raises(EngineError, match="no street net at"),
+        SumoCrowd(tmp_path / "no.xml", *_arguments(crowd)[1:]),
+    ):
         pass
     broken = tmp_path / "broken.net.xml"
     broken.write_text("<net")
@@ -407,5 +497,7 @@ def test_misuse_is_named(place: Place, tmp_path: Path) -> None:
         assert crowd.street.tick == 0
 
 
-def _arguments(crowd: SumoCrowd) -> tuple[Path, StreetMap, CrowdSpec, int, frozenset[Port], tuple[float, float]]:
+def _arguments(
+    crowd: SumoCrowd,
+) -> tuple[Path, StreetMap, CrowdSpec, int, frozenset[Port], tuple[float, float]]:
     return crowd._net_path, crowd._map, crowd._spec, crowd._seed, crowd._closed, crowd._start_xy

@@ -11,15 +11,19 @@ import shapely
 
 from cosim.core.state import People, Signal, Street, Vehicles
 from cosim.place.street_map import StreetMap, Strip
-from scenarios.bench.crowd_tally import Tally
+from scenarios.tools.bench.crowd_tally import Tally
 
 LINE = np.array([[0.0, 0.0], [8.0, 0.0]])
-CROSSING = Strip(":j_c0", "crossing", LINE, 4.0, shapely.box(0.0, -2.0, 8.0, 2.0), (None, None), signalised=True)
+CROSSING = Strip(
+    ":j_c0", "crossing", LINE, 4.0, shapely.box(0.0, -2.0, 8.0, 2.0), (None, None), signalised=True
+)
 SLANT = shapely.LineString([[4.0, -6.0], [12.0, 6.0]]).buffer(2.0, cap_style="flat")
 MAP = StreetMap("m", (0.0, 0.0, 9.0, 9.0), {":j_c0": CROSSING}, {}, {}, {})
 
 
-def street(tick: int, xy: list[tuple[float, float]], walk: bool = True, vehicles: Vehicles | None = None) -> Street:
+def street(
+    tick: int, xy: list[tuple[float, float]], walk: bool = True, vehicles: Vehicles | None = None
+) -> Street:
     n = len(xy)
     people = People.of(tuple(f"c{i}" for i in range(n)), xy, np.zeros(n), np.ones(n), ("walk",) * n)
     cars = vehicles if vehicles is not None else Vehicles.of((), [], [], [], [])
@@ -27,7 +31,8 @@ def street(tick: int, xy: list[tuple[float, float]], walk: bool = True, vehicles
 
 
 def test_overlaps_are_counted_in_pair_seconds_with_their_place() -> None:
-    """Of three people two are 0.2 m apart on the crossing for two seconds, and all pairs are in contact range."""
+    """Of three people two are 0.2 m apart on the crossing for two seconds, and all pairs are in
+    contact range."""
     tally = Tally(MAP, 0.05, [])
     for tick in range(100):
         tally.see(street(tick, [(4.0, 0.0), (4.0, 0.2 if tick >= 60 else 0.7), (4.0, 1.2)]))
@@ -37,7 +42,8 @@ def test_overlaps_are_counted_in_pair_seconds_with_their_place() -> None:
 
 
 def test_an_entry_at_red_is_told_from_one_at_the_end_of_green() -> None:
-    """Who comes a metre far 0.5 s after the change began at green; who comes 3 s after walked at red."""
+    """Who comes a metre far 0.5 s after the change began at green; who comes 3 s after walked at
+    red."""
     tally = Tally(MAP, 0.05, [])
     for tick in range(100):
         walked_m = -1.0 + 0.07 * tick
@@ -49,8 +55,9 @@ def test_an_entry_at_red_is_told_from_one_at_the_end_of_green() -> None:
 
 
 def test_a_light_that_is_red_when_it_comes_into_view_is_red() -> None:
-    """Entries at red count before any green was seen, and when the light was out of view; a red from before that is
-    forgotten; who stands on a crossing that comes into view does not enter it."""
+    """Entries at red count before any green was seen, and when the light was out of view; a red
+    from before that is forgotten; who stands on a crossing that comes into view does not enter
+    it."""
 
     def counted(xs: list[float], walks: list[bool | None]) -> list[float]:
         """How many entered, entered at red, and entered within a second of red."""
@@ -65,16 +72,29 @@ def test_a_light_that_is_red_when_it_comes_into_view_is_red() -> None:
     waits = [-4.0] * 100
     assert counted(comes, [False] * 60) == [1, 1, 0]
     assert counted(waits + comes, [True] * 50 + [None] * 50 + [False] * 60) == [1, 1, 0]
-    assert counted(waits + comes, [True] * 10 + [False] * 40 + [None] * 90 + [False] * 20) == [1, 0, 1]
+    assert counted(waits + comes, [True] * 10 + [False] * 40 + [None] * 90 + [False] * 20) == [
+        1,
+        0,
+        1,
+    ]
     assert counted([4.0] * 60, [None] * 20 + [False] * 40) == [0, 0, 0]
 
 
 def test_who_walks_on_one_crossing_does_not_enter_another_that_overlaps_it() -> None:
-    """A slanting crossing, red all the time, is walked through by somebody who entered the other one at green."""
+    """A slanting crossing, red all the time, is walked through by somebody who entered the other
+    one at green."""
     slanting = Strip(
-        ":j_c1", "crossing", np.array([[4.0, -6.0], [12.0, 6.0]]), 4.0, SLANT, (None, None), signalised=True
+        ":j_c1",
+        "crossing",
+        np.array([[4.0, -6.0], [12.0, 6.0]]),
+        4.0,
+        SLANT,
+        (None, None),
+        signalised=True,
     )
-    tally = Tally(StreetMap("m", MAP.bounds, {**MAP.strips, ":j_c1": slanting}, {}, {}, {}), 0.05, [])
+    tally = Tally(
+        StreetMap("m", MAP.bounds, {**MAP.strips, ":j_c1": slanting}, {}, {}, {}), 0.05, []
+    )
     for tick in range(150):
         seen = street(tick, [(-1.0 + 0.06 * tick, 0.0)])
         tally.see(replace(seen, signals=MappingProxyType({**seen.signals, ":j_c1": Signal(False)})))

@@ -1,4 +1,5 @@
-"""Maps that are damaged or meant to do harm: refused in one line that says where, or imported whole; nothing stays."""
+"""Maps that are damaged or meant to do harm: refused in one line that says where, or imported
+whole; nothing stays."""
 
 from __future__ import annotations
 
@@ -14,17 +15,18 @@ from typing import IO, Any
 import pytest
 
 from cosim.core.errors import WRONG_USE, MapError
-from sumo_nets.maps import rawfile
 from sumo_nets.maps.importer import Options
-from sumo_nets.maps.mapstore import checked_map, import_map, map_net
-from sumo_nets.net.netfacts import read_facts
-from sumo_nets.net.netfile import read_net
-from tests.mutate_maps import DAMAGES, damaged
+from sumo_nets.maps.map_store import checked_map, import_map, map_net
+from sumo_nets.net import raw_file as rawfile
+from sumo_nets.net.net_facts import read_facts
+from sumo_nets.net.net_file import read_net
 from tests.sumo_nets.conftest import kept
+from tests.support.mutate_maps import DAMAGES, damaged
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 
-SAMPLE, WHOLE = 19, 300
+SAMPLE = 19
+WHOLE = 300
 """So many damaged maps are imported: one of each kind by default, all of them with --whole."""
 
 TOWN = """<?xml version="1.0" encoding="UTF-8"?>
@@ -51,7 +53,10 @@ def tagged(key: str, value: str) -> bytes:
     return TOWN.replace('<tag k="name"', f'<tag k="{key}" v="{value}"/><tag k="name"').encode()
 
 
-BOMB = '<!DOCTYPE osm [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;&a;&a;">]>\n<osm version="0.6">&b;</osm>'
+BOMB = (
+    '<!DOCTYPE osm [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;&a;&a;&a;&a;&a;&a;&a;">]>\n<osm '
+    'version="0.6">&b;</osm>'
+)
 
 
 def zeros(count: int, packed: Callable[[bytes], bytes]) -> bytes:
@@ -62,50 +67,130 @@ def zeros(count: int, packed: Callable[[bytes], bytes]) -> bytes:
 @pytest.mark.parametrize(
     ("name", "content", "reason"),
     [
-        pytest.param("a.osm", nested(100_000), "elements nested more than 40 deep: line 1", id="nested"),
-        pytest.param("a.net.xml", b"<net>" + b"<a>" * 100_000, "nested more than 40 deep: line 1", id="nested-net"),
-        pytest.param("a.osm", tagged("lanes", "1000000000"), "way 100: lanes=1000000000, but no street", id="lanes"),
-        pytest.param("a.osm", tagged("lanes:forward", "99999"), "way 100: lanes:forward=99999, but", id="lanes-forth"),
-        pytest.param("a.osm", tagged("width", "1e9"), "way 100: width=1e9, but no street has more", id="width"),
-        pytest.param("a.osm", tagged("width:lanes", "3|1e9"), "way 100: width:lanes=3|1e9, but no", id="width-of-lane"),
-        pytest.param("a.osm", BOMB.encode(), "it declares an entity: no map has any: line 1", id="entities"),
-        pytest.param("a.osm", TOWN.replace("13.4017000", "nan", 1).encode(), "node 2 lies nowhere: lon=nan", id="nan"),
-        pytest.param("a.osm", TOWN.replace(' lat="52.5011000"', "", 1).encode(), "'lat' is missing: line 5", id="lat"),
-        pytest.param("a.osm", TOWN.encode("latin-1"), "not well-formed (invalid token): line 7", id="no-utf8"),
-        pytest.param("a.osm", TOWN.encode() + b"<osm/>", "junk after document element: line 13", id="two-roots"),
-        pytest.param("a.osm", b"<osm><!--" + b"x" * 20_000_000, "a single tag of more than 16 MiB", id="comment"),
-        pytest.param("a.osm.gz", gzip.compress(b"\0" * 3_000_000, mtime=0), "it holds no XML", id="gzip-of-zeros"),
-        pytest.param("a.osm.gz", zeros(80, lambda d: gzip.compress(d, mtime=0)), "more than 200 times", id="gzip-bomb"),
-        pytest.param("a.osm.bz2", zeros(80, bz2.compress), "more than 200 times its size", id="bzip2-bomb"),
+        pytest.param(
+            "a.osm", nested(100_000), "elements nested more than 40 deep: line 1", id="nested"
+        ),
+        pytest.param(
+            "a.net.xml",
+            b"<net>" + b"<a>" * 100_000,
+            "nested more than 40 deep: line 1",
+            id="nested-net",
+        ),
+        pytest.param(
+            "a.osm",
+            tagged("lanes", "1000000000"),
+            "way 100: lanes=1000000000, but no street",
+            id="lanes",
+        ),
+        pytest.param(
+            "a.osm",
+            tagged("lanes:forward", "99999"),
+            "way 100: lanes:forward=99999, but",
+            id="lanes-forth",
+        ),
+        pytest.param(
+            "a.osm",
+            tagged("width", "1e9"),
+            "way 100: width=1e9, but no street has more",
+            id="width",
+        ),
+        pytest.param(
+            "a.osm",
+            tagged("width:lanes", "3|1e9"),
+            "way 100: width:lanes=3|1e9, but no",
+            id="width-of-lane",
+        ),
+        pytest.param(
+            "a.osm", BOMB.encode(), "it declares an entity: no map has any: line 1", id="entities"
+        ),
+        pytest.param(
+            "a.osm",
+            TOWN.replace("13.4017000", "nan", 1).encode(),
+            "node 2 lies nowhere: lon=nan",
+            id="nan",
+        ),
+        pytest.param(
+            "a.osm",
+            TOWN.replace(' lat="52.5011000"', "", 1).encode(),
+            "'lat' is missing: line 5",
+            id="lat",
+        ),
+        pytest.param(
+            "a.osm", TOWN.encode("latin-1"), "not well-formed (invalid token): line 7", id="no-utf8"
+        ),
+        pytest.param(
+            "a.osm",
+            TOWN.encode() + b"<osm/>",
+            "junk after document element: line 13",
+            id="two-roots",
+        ),
+        pytest.param(
+            "a.osm",
+            b"<osm><!--" + b"x" * 20_000_000,
+            "a single tag of more than 16 MiB",
+            id="comment",
+        ),
+        pytest.param(
+            "a.osm.gz",
+            gzip.compress(b"\0" * 3_000_000, mtime=0),
+            "it holds no XML",
+            id="gzip-of-zeros",
+        ),
+        pytest.param(
+            "a.osm.gz",
+            zeros(80, lambda d: gzip.compress(d, mtime=0)),
+            "more than 200 times",
+            id="gzip-bomb",
+        ),
+        pytest.param(
+            "a.osm.bz2", zeros(80, bz2.compress), "more than 200 times its size", id="bzip2-bomb"
+        ),
     ],
 )
-def test_files_meant_to_do_harm_are_refused(tmp_path: Path, name: str, content: bytes, reason: str) -> None:
-    """What would keep netconvert busy for ever, or fill memory and disk, is refused before anything is converted."""
-    source, before = tmp_path / name, kept()
+def test_files_meant_to_do_harm_are_refused(
+    tmp_path: Path, name: str, content: bytes, reason: str
+) -> None:
+    """What would keep netconvert busy for ever, or fill memory and disk, is refused before anything
+    is converted."""
+    source = tmp_path / name
+    before = kept()
     source.write_bytes(content)
     with pytest.raises(MapError) as caught:
         import_map(source)
     said = str(caught.value)
-    assert said.startswith(f"{source}: ") and reason in said and "\n" not in said and len(said) < 400
+    assert (
+        said.startswith(f"{source}: ") and reason in said and "\n" not in said and len(said) < 400
+    )
     assert kept() == before
 
 
 def test_lanes_and_widths_of_real_streets_are_let_through(tmp_path: Path) -> None:
-    """Words, units and several values in one tag are netconvert's to read; other tags with lanes in them as well."""
-    from sumo_nets.maps.osmfile import osm_facts, unpacked
+    """Words, units and several values in one tag are netconvert's to read; other tags with lanes in
+    them as well."""
+    from sumo_nets.maps.osm_file import osm_facts, unpacked
 
     path = tmp_path / "town.osm"
     for key, value in (
-        ("lanes", "2;3"), ("lanes", "some"), ("width", "12'6\""), ("width", "3.5 m"), ("maxspeed:lanes", "120|100"),
-        ("turn:lanes", "left|through"), ("width", "~4"), ("maxwidth", "999"), ("lanes:psv", "1"),
-    ):  # fmt: skip
+        ("lanes", "2;3"),
+        ("lanes", "some"),
+        ("width", "12'6\""),
+        ("width", "3.5 m"),
+        ("maxspeed:lanes", "120|100"),
+        ("turn:lanes", "left|through"),
+        ("width", "~4"),
+        ("maxwidth", "999"),
+        ("lanes:psv", "1"),
+    ):
         path.write_bytes(tagged(key, value.replace('"', "&quot;")))
         assert osm_facts(unpacked(path, tmp_path)).roads == 4
 
 
-@pytest.mark.parametrize("read", [import_map, read_net, read_facts], ids=["import", "read", "facts"])
+@pytest.mark.parametrize(
+    "read", [import_map, read_net, read_facts], ids=["import", "read", "facts"]
+)
 def test_what_is_no_file_is_refused_at_once(tmp_path: Path, read: Callable[[Path], object]) -> None:
-    """A pipe that nobody writes to, a folder, a device, links to themselves and to nothing are told what they are."""
+    """A pipe that nobody writes to, a folder, a device, links to themselves and to nothing are told
+    what they are."""
     before = kept()
     pipe, loop, nothing = tmp_path / "pipe.osm", tmp_path / "loop.osm", tmp_path / "nothing.osm"
     os.mkfifo(pipe)
@@ -120,11 +205,15 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path, read: Callable[[Path
     ):
         with pytest.raises(MapError) as caught:
             read(path)
-        assert str(caught.value).startswith(f"{path}: cannot be read: ") and words in str(caught.value)
+        assert str(caught.value).startswith(f"{path}: cannot be read: ") and words in str(
+            caught.value
+        )
     assert kept() == before
 
 
-def test_a_file_that_may_not_be_read_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_that_may_not_be_read_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Without the right to read it the error says so."""
     source = tmp_path / "a.osm"
     source.write_text(TOWN)
@@ -145,7 +234,10 @@ def test_memory_stays_bounded_while_a_bomb_is_read(tmp_path: Path) -> None:
     """Of a packed net no more is unpacked than is allowed for its size."""
     path = tmp_path / "bomb.net.xml.gz"
     path.write_bytes(zeros(400, lambda data: gzip.compress(data, mtime=0)))
-    with pytest.raises(MapError, match="more than 200 times its size"), rawfile.file_pieces(path, "gzip") as unpacked:
+    with (
+        pytest.raises(MapError, match="more than 200 times its size"),
+        rawfile.file_pieces(path, "gzip") as unpacked,
+    ):
         most = 0
         for piece in unpacked:
             most += len(piece)
@@ -161,10 +253,14 @@ def test_the_damages_are_drawn_from_their_number() -> None:
 
 
 @pytest.mark.engine
-def test_damaged_maps_end_in_a_map_or_in_one_line(tmp_path: Path, request: pytest.FixtureRequest) -> None:
-    """Whatever happened to a file, it is imported whole, or refused in one line that names it, and nothing else stays.
+def test_damaged_maps_end_in_a_map_or_in_one_line(
+    tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    """Whatever happened to a file, it is imported whole, or refused in one line that names it, and
+    nothing else stays.
 
-    By default one of each kind of damage is tried, on OpenStreetMap and on nets in turn; with --whole 300.
+    By default one of each kind of damage is tried, on OpenStreetMap and on nets in turn; with
+    --whole 300.
     """
     town = tmp_path / "town.osm"
     town.write_text(TOWN)
@@ -175,14 +271,20 @@ def test_damaged_maps_end_in_a_map_or_in_one_line(tmp_path: Path, request: pytes
     for number in range(WHOLE) if request.config.getoption("--whole") else range(0, 2 * SAMPLE, 2):
         kind = ("osm", "net.xml")[number // len(DAMAGES) % 2]
         how, data = damaged(bases[kind], number)
-        source, began = tmp_path / f"damaged.{kind}", time.monotonic()
+        source = tmp_path / f"damaged.{kind}"
+        began = time.monotonic()
         source.write_bytes(data)
         try:
             import_map(source, "damaged", Options(as_is=kind == "net.xml" and number % 3 == 0))
         except MapError as refusal:
-            said, outcome = str(refusal), "refused"
+            said = str(refusal)
+            outcome = "refused"
             assert said.startswith(f"{source}: ") and "\n" not in said, (number, how, said)
-            assert len(said) > len(f"{source}: ") + 15 and "did not end" not in said, (number, how, said)
+            assert len(said) > len(f"{source}: ") + 15 and "did not end" not in said, (
+                number,
+                how,
+                said,
+            )
             assert refusal.exit_code == WRONG_USE
         else:
             outcome = "imported"

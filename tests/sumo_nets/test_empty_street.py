@@ -1,4 +1,5 @@
-"""EmptyStreet: without crowd and vehicles a street needs no SUMO, and is the one that SUMO would have made."""
+"""EmptyStreet: without crowd and vehicles a street needs no SUMO, and is the one that SUMO would
+have made."""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ from sumo_nets.crowd.empty_street import TICK_MS, EmptyStreet, goes_by_itself
 from sumo_nets.crowd.lights import Lights, PlannedLights, SumoLights
 from sumo_nets.crowd.proxy import junction_of
 from sumo_nets.engine import close, start, sumo
-from sumo_nets.net.netfile import read_net
+from sumo_nets.net.net_file import read_net
 
 NOBODY = CrowdSpec(persons=0, vehicles=0)
 BEGIN_S = 1234
@@ -40,7 +41,18 @@ def street_map(net: Path) -> StreetMap:
 
 @contextmanager
 def simulated(net: Path, begin_s: int = BEGIN_S) -> Iterator[None]:
-    start(["--net-file", str(net), "--begin", str(begin_s), "--step-length", "0.05", "--no-warnings", "true"])
+    start(
+        [
+            "--net-file",
+            str(net),
+            "--begin",
+            str(begin_s),
+            "--step-length",
+            "0.05",
+            "--no-warnings",
+            "true",
+        ]
+    )
     try:
         yield
     finally:
@@ -48,7 +60,8 @@ def simulated(net: Path, begin_s: int = BEGIN_S) -> Iterator[None]:
 
 
 def differences(net: Path, street_map: StreetMap, ticks: int) -> int:
-    """How often a crossing's signal is not what SUMO shows, in so many ticks; each is asked in every tick."""
+    """How often a crossing's signal is not what SUMO shows, in so many ticks; each is asked in
+    every tick."""
     differ = 0
     with simulated(net):
         simulating, planned = SumoLights(sumo, street_map), PlannedLights(street_map, BEGIN_S)
@@ -67,28 +80,48 @@ def told(lights: Lights, crossing: str) -> tuple[bool, float | None, float]:
 
 
 def rewritten(net: Path, to: Path, program: Callable[[int, str], str]) -> Path:
-    """A net with other programs. program: of a number and what stands there, what shall stand there."""
+    """A net with other programs. program: of a number and what stands there, what shall stand
+    there."""
     numbers = iter(range(10**6))
     to.write_text(
-        re.sub("<tlLogic.*?</tlLogic>", lambda m: program(next(numbers), m[0]), net.read_text(), flags=re.DOTALL)
+        re.sub(
+            "<tlLogic.*?</tlLogic>",
+            lambda m: program(next(numbers), m[0]),
+            net.read_text(),
+            flags=re.DOTALL,
+        )
     )
     return to
 
 
 @pytest.mark.engine
-def test_signals_go_by_the_clock_as_they_do_in_sumo(net: Path, street_map: StreetMap, tmp_path: Path) -> None:
-    """Every crossing of a city, every tick of the longest cycle: what it shows, until when, and when it changes."""
+def test_signals_go_by_the_clock_as_they_do_in_sumo(
+    net: Path, street_map: StreetMap, tmp_path: Path
+) -> None:
+    """Every crossing of a city, every tick of the longest cycle: what it shows, until when, and
+    when it changes."""
     assert street_map.signals_by_the_clock
-    cycle_ms = max(sum(strip.plan.durations_ms) for strip in street_map.strips.values() if strip.plan)
+    cycle_ms = max(
+        sum(strip.plan.durations_ms) for strip in street_map.strips.values() if strip.plan
+    )
     assert differences(net, street_map, cycle_ms // TICK_MS + 40) == 0
 
-    # Phases that end between two seconds, cycles that begin before SUMO or long after, and one phase that goes on.
+    # Phases that end between two seconds, cycles that begin before SUMO or long after, and one
+    # phase that goes on.
     offsets = ("-7", "3.3", "100000", "-0.05", "0.35", "12.5")
 
     def odd(k: int, was: str) -> str:
         again = re.sub('offset="[^"]*"', f'offset="{offsets[k % len(offsets)]}"', was)
-        again = re.sub(r'duration="(\d+)"', lambda m: f'duration="{int(m[1]) % 7 + 1}.{k % 7}{k % 2 * 5}"', again)
-        return again if k % 6 else re.sub(r"(<phase [^>]*>).*(?=</tlLogic>)", r"\1", again, flags=re.DOTALL)
+        again = re.sub(
+            r'duration="(\d+)"',
+            lambda m: f'duration="{int(m[1]) % 7 + 1}.{k % 7}{k % 2 * 5}"',
+            again,
+        )
+        return (
+            again
+            if k % 6
+            else re.sub(r"(<phase [^>]*>).*(?=</tlLogic>)", r"\1", again, flags=re.DOTALL)
+        )
 
     other = rewritten(net, tmp_path / "odd.net.xml", odd)
     assert differences(other, read_net(other), 600) == 0
@@ -96,19 +129,27 @@ def test_signals_go_by_the_clock_as_they_do_in_sumo(net: Path, street_map: Stree
 
 @pytest.mark.engine
 def test_an_empty_street_is_that_of_sumo(net: Path, street_map: StreetMap) -> None:
-    """The same people, signals and times to the bit, wherever the robot goes and whoever is put there."""
-    crossings = [strip.line.mean(axis=0) for strip in street_map.strips.values() if strip.plan is not None]
+    """The same people, signals and times to the bit, wherever the robot goes and whoever is put
+    there."""
+    crossings = [
+        strip.line.mean(axis=0) for strip in street_map.strips.values() if strip.plan is not None
+    ]
     places = [(x_m + 3.0, y_m) for x_m, y_m in crossings[:6]]
 
     def actors(tick: int) -> tuple[Actor, ...]:
         x_m, y_m = places[tick // 20]
         return tuple(
             Actor(
-                id=f"e{i}", x_m=x_m + 0.06 * (tick % 20) + i, y_m=y_m, heading_rad=0.3 * i, speed_mps=1.2,
-                doing="gesture" if i == 2 else "walk", kind=PersonKind.EVENT,
+                id=f"e{i}",
+                x_m=x_m + 0.06 * (tick % 20) + i,
+                y_m=y_m,
+                heading_rad=0.3 * i,
+                speed_mps=1.2,
+                doing="gesture" if i == 2 else "walk",
+                kind=PersonKind.EVENT,
             )
             for i in range(tick % 50 // 10, -1, -1)
-        )  # fmt: skip
+        )
 
     def streets(crowd: SumoCrowd | EmptyStreet) -> list[tuple[object, ...]]:
         with crowd:
@@ -140,11 +181,17 @@ def values(street: Street) -> tuple[object, ...]:
     )
 
 
-def test_who_comes_and_what_decides_while_it_runs_needs_sumo(net: Path, street_map: StreetMap, tmp_path: Path) -> None:
+def test_who_comes_and_what_decides_while_it_runs_needs_sumo(
+    net: Path, street_map: StreetMap, tmp_path: Path
+) -> None:
     """Anybody in the crowd, anybody to be let in again, or one light whose program is not plain."""
     assert goes_by_itself(street_map, NOBODY)
     assert goes_by_itself(street_map, CrowdSpec(density=0.0, vehicles=0, residents=3))
-    for spec in (CrowdSpec(persons=1, vehicles=0), CrowdSpec(persons=0, vehicles=1), CrowdSpec(density=1, vehicles=0)):
+    for spec in (
+        CrowdSpec(persons=1, vehicles=0),
+        CrowdSpec(persons=0, vehicles=1),
+        CrowdSpec(density=1, vehicles=0),
+    ):
         assert not goes_by_itself(street_map, spec)
     came = Entrances()
     assert goes_by_itself(street_map, NOBODY, came)
@@ -177,6 +224,8 @@ def test_who_comes_and_what_decides_while_it_runs_needs_sumo(net: Path, street_m
     assert not {junction_of(strip.id) for strip in lit if strip.plan is not None} & changed
 
     timed = rewritten(
-        net, tmp_path / "timed.net.xml", lambda k, was: was if k else f'{was}<WAUT id="w" startProg="0"/>'
+        net,
+        tmp_path / "timed.net.xml",
+        lambda k, was: was if k else f'{was}<WAUT id="w" startProg="0"/>',
     )
     assert not any(strip.plan for strip in read_net(timed).strips.values())

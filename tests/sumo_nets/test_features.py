@@ -1,4 +1,5 @@
-"""What a map shows beside its streets: read, projected, brought among the streets, kept, built; and bad input."""
+"""What a map shows beside its streets: read, projected, brought among the streets, kept, built; and
+bad input."""
 
 from __future__ import annotations
 
@@ -21,24 +22,31 @@ from cosim.core.geometry import Pose
 from cosim.core.state import Command, Street
 from cosim.place.street_map import LANDS, Feature, Lane, StreetMap, Strip
 from cosim.spec.scenario import CityMap
+from physics.dynamics.world import BulletWorld
+from physics.ground.tiles import TILE_M, keys_within
 from physics.street.buildings import Frontage, facade_meshes
 from physics.street.clearance import clear_width
 from physics.street.furniture import KINDS, footprints
 from physics.street.mapped import HOUSES_M, MAPPED_NEAR_M, MappedThings
 from physics.street.placement import props_of
-from physics.world.street_surface import StreetSurface
-from physics.world.tiles import TILE_M, keys_within
-from physics.world.world import BulletWorld
-from sumo_nets.maps.featurefile import NAME, read_features, with_features, write_features
-from sumo_nets.maps.featurefit import EXTENT_M, WALL_GAP_M, fitted
-from sumo_nets.maps.mapstore import about_map, import_map, map_hash, map_net, read_map
-from sumo_nets.maps.osmfeatures import HIGHEST_BUILDING_M, LOWEST_M, Found, Mapped, building_height_m, osm_features
-from sumo_nets.maps.osmfile import MapFile
-from sumo_nets.maps.utm import utm_xy, utm_zone
+from physics.street.street_surface import StreetSurface
+from sumo_nets.maps.feature_file import NAME, read_features, with_features, write_features
+from sumo_nets.maps.feature_fit import EXTENT_M, WALL_GAP_M, fitted, utm_xy, utm_zone
+from sumo_nets.maps.map_store import about_map, import_map, map_hash, map_net, read_map
+from sumo_nets.maps.osm_features import (
+    HIGHEST_BUILDING_M,
+    LOWEST_M,
+    Found,
+    Mapped,
+    building_height_m,
+    osm_features,
+)
+from sumo_nets.maps.osm_file import MapFile
 
 SHARED = Path(os.environ.get("COSIM_SHARED", Path(__file__).parents[3] / "shared")) / "maps"
 NEUKOELLN = SHARED / "berlin-neukoelln" / "input.osm.gz"
-LON, LAT = 13.40, 52.50
+LON = 13.40
+LAT = 52.50
 Tags = dict[str, str]
 
 
@@ -59,8 +67,11 @@ class Drawing:
 
     def node(self, x: float, y: float, tags: Tags | None = None) -> int:
         self.count += 1
-        lon, lat = LON + x / (111_195.0 * math.cos(math.radians(LAT))), LAT + y / 111_195.0
-        self.rows.append(f'<node id="{self.count}" lon="{lon:.8f}" lat="{lat:.8f}">{_tags(tags or {})}</node>')
+        lon = LON + x / (111_195.0 * math.cos(math.radians(LAT)))
+        lat = LAT + y / 111_195.0
+        self.rows.append(
+            f'<node id="{self.count}" lon="{lon:.8f}" lat="{lat:.8f}">{_tags(tags or {})}</node>'
+        )
         return self.count
 
     def way(self, refs: list[int], tags: Tags) -> int:
@@ -75,7 +86,9 @@ class Drawing:
 
     def relation(self, members: list[tuple[int, str]], tags: Tags) -> None:
         self.count += 1
-        inner = "".join(f'<member type="way" ref="{ref}" role="{role}"/>' for ref, role in members) + _tags(tags)
+        inner = "".join(
+            f'<member type="way" ref="{ref}" role="{role}"/>' for ref, role in members
+        ) + _tags(tags)
         self.rows.append(f'<relation id="{self.count}">{inner}</relation>')
 
     def streets(self) -> None:
@@ -102,7 +115,8 @@ def _tags(tags: Tags) -> str:
 
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[StreetMap, tuple[str, ...]]:
-    """A small map with things in good places and in bad ones, imported; and what the importer says it did."""
+    """A small map with things in good places and in bad ones, imported; and what the importer says
+    it did."""
     drawing = Drawing()
     drawing.streets()
     for x in (30, 60, 90):
@@ -115,7 +129,10 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[StreetMap, tuple[st
     drawing.outline(20, 20, 80, 45, {"building": "yes", "building:levels": "4"})
     outer = drawing.outline(-80, -45, -20, -3, {})
     inner = drawing.outline(-60, -35, -40, -25, {})
-    drawing.relation([(outer, "outer"), (inner, "inner")], {"type": "multipolygon", "building": "yes", "height": "50'"})
+    drawing.relation(
+        [(outer, "outer"), (inner, "inner")],
+        {"type": "multipolygon", "building": "yes", "height": "50'"},
+    )
     drawing.outline(60, -3, 75, 4, {"building": "yes"})
     drawing.outline(90, -60, 120, -10, {"amenity": "parking"})
     path = drawing.write(tmp_path_factory.mktemp("drawn") / "drawn.osm")
@@ -125,18 +142,26 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[StreetMap, tuple[st
 
 def road_axis(street_map: StreetMap) -> float:
     """y of the middle of the street from west to east, at x of its crossing, from its lanes."""
-    lanes = [lane.polygon for lane in street_map.lanes.values() if lane.kind == "road" and not lane.internal]
+    lanes = [
+        lane.polygon
+        for lane in street_map.lanes.values()
+        if lane.kind == "road" and not lane.internal
+    ]
     east = [lane for lane in lanes if (b := lane.bounds)[2] - b[0] > 50.0]
     return float(shapely.union_all(east).centroid.y)
 
 
 @pytest.mark.engine
 def test_mapped_things_lie_beside_their_street(drawn: tuple[StreetMap, tuple[str, ...]]) -> None:
-    """A lamp 14 m from the street's middle line is there in the net too; its arm points at the road, a bench faces
-    the way the map says."""
+    """A lamp 14 m from the street's middle line is there in the net too; its arm points at the
+    road, a bench faces the way the map says."""
     street_map, _ = drawn
-    lanes = [lane for lane in street_map.lanes.values() if lane.kind == "road" and not lane.internal]
-    east = shapely.union_all([lane.polygon for lane in lanes if abs(np.ptp(lane.line[:, 0])) > 50.0])
+    lanes = [
+        lane for lane in street_map.lanes.values() if lane.kind == "road" and not lane.internal
+    ]
+    east = shapely.union_all(
+        [lane.polygon for lane in lanes if abs(np.ptp(lane.line[:, 0])) > 50.0]
+    )
     x0, _, x1, _ = east.bounds
     (lamp,) = (f for f in street_map.features if f.kind == "lamp")
     across = shapely.intersection(east, shapely.LineString([(lamp.x_m, -1e3), (lamp.x_m, 1e3)]))
@@ -151,14 +176,17 @@ def test_mapped_things_lie_beside_their_street(drawn: tuple[StreetMap, tuple[str
 
 @pytest.mark.engine
 def test_streets_win_against_what_stands_in_them(drawn: tuple[StreetMap, tuple[str, ...]]) -> None:
-    """Buildings keep off everything walked or driven on and keep their courtyards; things off roads and the middle of
-    sidewalks; what was moved, cut back or left out is told."""
+    """Buildings keep off everything walked or driven on and keep their courtyards; things off roads
+    and the middle of sidewalks; what was moved, cut back or left out is told."""
     street_map, changes = drawn
     told = " | ".join(changes)
     assert "taken from the map: 2 x building, 3 x tree" in told
     assert "buildings cut back where they reached into streets (what is walked on wins): 1" in told
     assert "buildings left out that lay mostly on streets or are none: 1" in told
-    assert "mapped things moved aside by up to 3 m, off the road or the middle of a sidewalk: 1" in told
+    assert (
+        "mapped things moved aside by up to 3 m, off the road or the middle of a sidewalk: 1"
+        in told
+    )
     assert "mapped things left out on a road, a crossing or in a narrow passage: 2" in told
     lanes = [p.polygon for p in street_map.lanes.values() if p.kind == "road"]
     walked = [p.polygon for p in (*street_map.strips.values(), *street_map.corners.values())]
@@ -168,34 +196,57 @@ def test_streets_win_against_what_stands_in_them(drawn: tuple[StreetMap, tuple[s
     assert sorted(round(f.height_m, 2) for f in buildings) == [12.8, 15.24]
     assert sum(len(f.polygon.interiors) for f in buildings) == 1
     assert {round(math.sin(f.heading_rad)) for f in buildings} == {0}
-    assert {(f.y_m > road_axis(street_map)) == (math.cos(f.heading_rad) > 0.9) for f in buildings} == {True}
+    assert {
+        (f.y_m > road_axis(street_map)) == (math.cos(f.heading_rad) > 0.9) for f in buildings
+    } == {True}
     props = [p for p in props_of(street_map, 1) if p.id.startswith("prop:map")]
     assert Counter(p.kind for p in props) == {"tree": 3, "lamp": 1, "bench": 1, "bollard": 1}
     roads = shapely.union_all(lanes)
     assert min(shapely.distance(ground, roads) for ground in footprints(props)) > 0.0
     sidewalks = [s for s in street_map.strips.values() if s.kind == "sidewalk"]
-    assert all(free >= min(1.2, bare) - 1e-6 for free, bare in clear_width(sidewalks, props_of(street_map, 1)).values())
+    assert all(
+        free >= min(1.2, bare) - 1e-6
+        for free, bare in clear_width(sidewalks, props_of(street_map, 1)).values()
+    )
 
 
 @pytest.mark.engine
-def test_what_lies_on_the_other_side_of_the_earth_is_left_out(drawn: tuple[StreetMap, tuple[str, ...]]) -> None:
+def test_what_lies_on_the_other_side_of_the_earth_is_left_out(
+    drawn: tuple[StreetMap, tuple[str, ...]],
+) -> None:
     """Points anywhere on earth, where the projection has no value too, come to nothing."""
-    location = {"projParameter": "+proj=utm +zone=33 +datum=WGS84", "netOffset": "-391000.0,-5817000.0"}
-    spots = [(lon, lat) for lon in (-180.0, -165.0, -75.0, 0.0, 105.0, 180.0) for lat in (-85.0, 0.0, 52.5, 85.0)]
+    location = {
+        "projParameter": "+proj=utm +zone=33 +datum=WGS84",
+        "netOffset": "-391000.0,-5817000.0",
+    }
+    spots = [
+        (lon, lat)
+        for lon in (-180.0, -165.0, -75.0, 0.0, 105.0, 180.0)
+        for lat in (-85.0, 0.0, 52.5, 85.0)
+    ]
     things = [Mapped("tree", (np.array([spot]),), 0.0, None) for spot in spots]
     square = np.array([(0.0, 0.0), (1e-3, 0.0), (1e-3, 1e-3), (0.0, 1e-3), (0.0, 0.0)])
-    things += [Mapped(kind, (square + spot,), 9.0, None) for spot in spots for kind in ("building", "lawn")]
+    things += [
+        Mapped(kind, (square + spot,), 9.0, None) for spot in spots for kind in ("building", "lawn")
+    ]
     assert fitted(Found(tuple(things), {}), location, drawn[0]) == ((), [])
 
 
 @pytest.mark.engine
-def test_nothing_is_made_up_where_the_map_shows_it(drawn: tuple[StreetMap, tuple[str, ...]]) -> None:
-    """Near a mapped lamp or house there is no other, farther away there are; without features they are near too."""
+def test_nothing_is_made_up_where_the_map_shows_it(
+    drawn: tuple[StreetMap, tuple[str, ...]],
+) -> None:
+    """Near a mapped lamp or house there is no other, farther away there are; without features they
+    are near too."""
     street_map, _ = drawn
     bare = dataclasses.replace(street_map, features=())
     (lamp,) = (f for f in street_map.features if f.kind == "lamp")
     away = [
-        sorted(math.hypot(p.x_m - lamp.x_m, p.y_m - lamp.y_m) for p in props_of(place, seed) if p.kind == "lamp")
+        sorted(
+            math.hypot(p.x_m - lamp.x_m, p.y_m - lamp.y_m)
+            for p in props_of(place, seed)
+            if p.kind == "lamp"
+        )
         for place in (street_map, bare)
         for seed in range(4)
     ]
@@ -203,28 +254,39 @@ def test_nothing_is_made_up_where_the_map_shows_it(drawn: tuple[StreetMap, tuple
     assert min(map(min, away[4:])) < MAPPED_NEAR_M
     x0, y0, x1, y1 = street_map.bounds
     keys = keys_within(0.5 * (x0 + x1), 0.5 * (y0 + y1), 300.0)
-    rows = [b for key in keys for b in Frontage(street_map, 1, MappedThings(street_map)).in_tile(key)]
+    rows = [
+        b for key in keys for b in Frontage(street_map, 1, MappedThings(street_map)).in_tile(key)
+    ]
     made_up_houses = [b for b in rows if b.outline is None]
     near = shapely.union_all([f.polygon for f in street_map.features if f.kind == "building"])
-    assert made_up_houses and min(shapely.distance(b.polygon, near) for b in made_up_houses) > HOUSES_M
+    assert (
+        made_up_houses and min(shapely.distance(b.polygon, near) for b in made_up_houses) > HOUSES_M
+    )
     assert len([b for key in keys for b in Frontage(bare, 1).in_tile(key)]) > len(made_up_houses)
 
 
 @pytest.mark.engine
-def test_land_is_shown_and_changes_nothing_that_stands_or_rolls(drawn: tuple[StreetMap, tuple[str, ...]]) -> None:
-    """A parking lot of the file is a yard of the map, told and covered by its hash; without it everything that stands,
-    and the ground that wheels feel, is the same to the bit."""
+def test_land_is_shown_and_changes_nothing_that_stands_or_rolls(
+    drawn: tuple[StreetMap, tuple[str, ...]],
+) -> None:
+    """A parking lot of the file is a yard of the map, told and covered by its hash; without it
+    everything that stands, and the ground that wheels feel, is the same to the bit."""
     street_map, changes = drawn
     (lot,) = (f for f in street_map.features if f.kind in LANDS)
     assert lot.kind == "yard" and "1 x yard" in " | ".join(changes)
     assert lot.polygon.area == pytest.approx(30.0 * 50.0, rel=0.01)
-    bare = dataclasses.replace(street_map, features=tuple(f for f in street_map.features if f is not lot))
+    bare = dataclasses.replace(
+        street_map, features=tuple(f for f in street_map.features if f is not lot)
+    )
     assert props_of(street_map, 1) == props_of(bare, 1)
     shown = []
     for key in keys_within(lot.x_m, lot.y_m, 30.0):
         one, other = StreetSurface(street_map, 1), StreetSurface(bare, 1)
         chunks = [surface.chunk(key) for surface in (one, other)]
-        felt = [[(p.name, p.friction, p.mesh.vertices.tobytes()) for p in chunk.ground] for chunk in chunks]
+        felt = [
+            [(p.name, p.friction, p.mesh.vertices.tobytes()) for p in chunk.ground]
+            for chunk in chunks
+        ]
         assert felt[0] == felt[1] and chunks[0].buildings == chunks[1].buildings
         shown += [patch.name for patch in one.covers(key)]
         assert "ground:yard" not in [patch.name for patch in other.covers(key)]
@@ -232,20 +294,29 @@ def test_land_is_shown_and_changes_nothing_that_stands_or_rolls(drawn: tuple[Str
 
 
 def test_land_is_read_as_mappers_write_it(tmp_path: Path) -> None:
-    """Parks, woods with clearings, water, building sites and parking lots are land; what lies above or below the
-    ground, or is open, torn or a way rather than an area is none."""
+    """Parks, woods with clearings, water, building sites and parking lots are land; what lies above
+    or below the ground, or is open, torn or a way rather than an area is none."""
     drawing = Drawing()
     for x, tags in enumerate(
         (
-            {"leisure": "park"}, {"landuse": "construction"}, {"amenity": "parking", "parking": "surface"},
-            {"highway": "pedestrian", "area": "yes"}, {"natural": "water"}, {"landuse": "residential"},
-            {"amenity": "parking", "parking": "underground"}, {"amenity": "parking", "building": "yes"},
-            {"highway": "pedestrian"}, {"leisure": "park", "layer": "1"}, {"natural": "water", "tunnel": "culvert"},
+            {"leisure": "park"},
+            {"landuse": "construction"},
+            {"amenity": "parking", "parking": "surface"},
+            {"highway": "pedestrian", "area": "yes"},
+            {"natural": "water"},
+            {"landuse": "residential"},
+            {"amenity": "parking", "parking": "underground"},
+            {"amenity": "parking", "building": "yes"},
+            {"highway": "pedestrian"},
+            {"leisure": "park", "layer": "1"},
+            {"natural": "water", "tunnel": "culvert"},
         )
-    ):  # fmt: skip
+    ):
         drawing.outline(100.0 * x, 0.0, 100.0 * x + 50.0, 50.0, tags)
     outer, inner = drawing.outline(0, 100, 90, 190, {}), drawing.outline(30, 130, 60, 160, {})
-    drawing.relation([(outer, "outer"), (inner, "inner")], {"type": "multipolygon", "natural": "wood"})
+    drawing.relation(
+        [(outer, "outer"), (inner, "inner")], {"type": "multipolygon", "natural": "wood"}
+    )
     a, b, c, d = (drawing.node(x, y) for x, y in ((0, 0), (9, 9), (9, 0), (0, 9)))
     drawing.way([a, b, c, d, a], {"leisure": "park"})
     drawing.way([a, 99_999, b, a], {"leisure": "park"})
@@ -270,16 +341,23 @@ def house(*corners: tuple[float, float], height_m: float = 9.0) -> Feature:
 def lone_map(*features: Feature) -> StreetMap:
     """A sidewalk along x, 3 m wide, on open ground."""
     line = np.array([[-60.0, 0.0], [60.0, 0.0]])
-    strip = Strip("s", "sidewalk", line, 3.0, shapely.box(-60, -1.5, 60, 1.5), (None, None), road_side=0)
+    strip = Strip(
+        "s", "sidewalk", line, 3.0, shapely.box(-60, -1.5, 60, 1.5), (None, None), road_side=0
+    )
     lane = Lane("r_0", "r", "road", line - (0.0, 5.0), 3.0, shapely.box(-60, -6.5, 60, -3.5))
-    return StreetMap("lone", (-60, -20, 60, 20), {"s": strip}, {}, {"r_0": lane}, {}, features=features)
+    return StreetMap(
+        "lone", (-60, -20, 60, 20), {"s": strip}, {}, {"r_0": lane}, {}, features=features
+    )
 
 
 def test_a_house_is_cut_by_tiles_and_loses_nothing() -> None:
-    """The parts in the tiles cover the house once, their walls are its walls and no cut is one, and the mesh has the
-    walls' and the roof's area."""
-    place = lone_map(house((-40, 4), (40, 4), (40, 60), (10, 60), (10, 20), (-40, 20), height_m=7.5))
-    things, whole = MappedThings(place), place.features[0].polygon
+    """The parts in the tiles cover the house once, their walls are its walls and no cut is one, and
+    the mesh has the walls' and the roof's area."""
+    place = lone_map(
+        house((-40, 4), (40, 4), (40, 60), (10, 60), (10, 20), (-40, 20), height_m=7.5)
+    )
+    things = MappedThings(place)
+    whole = place.features[0].polygon
     parts = [b for key in keys_within(0.0, 0.0, 2.0 * TILE_M) for b in things.buildings(key)]
     assert len(parts) == 3
     assert sum(b.polygon.area for b in parts) == pytest.approx(whole.area)
@@ -304,7 +382,9 @@ def test_the_robot_stops_at_a_mapped_wall() -> None:
     with BulletWorld(StreetSurface(place, seed=1)) as world:
         world.place(Pose(3.0, -0.5, math.pi / 2))
         motions = [world.step(Command(1.0, 0.0), Street(0), Street(0), 10) for _ in range(160)]
-    assert {(c.kind, c.other.split(":")[1]) for m in motions for c in m.contacts} == {("wall", "map")}
+    assert {(c.kind, c.other.split(":")[1]) for m in motions for c in m.contacts} == {
+        ("wall", "map")
+    }
     assert not place.features[0].polygon.contains(shapely.Point(motions[-1].robot.pose.xy))
 
 
@@ -333,7 +413,9 @@ def test_features_survive_their_file_and_change_the_hash(tmp_path: Path) -> None
         "[]",
     ):
         path.write_text(broken)
-        with pytest.raises(MapError, match=r"features\.json: cannot be read: .*: import the map again"):
+        with pytest.raises(
+            MapError, match=r"features\.json: cannot be read: .*: import the map again"
+        ):
             read_features(path)
 
 
@@ -356,13 +438,23 @@ def test_a_scenario_of_other_features_is_refused(drawn: tuple[StreetMap, tuple[s
 @pytest.mark.parametrize(
     ("tags", "height_m", "unread"),
     [
-        ({"height": "12"}, 12.0, 0), ({"height": "12.5 m"}, 12.5, 0), ({"height": "12,5"}, 12.5, 0),
-        ({"height": "40'"}, 12.192, 0), ({"height": "5'6\""}, LOWEST_M, 0), ({"building:levels": "5"}, 16.0, 0),
-        ({"height": "tall"}, 9.6, 1), ({"height": "1e9"}, 9.6, 1), ({"height": "99999"}, 9.6, 1),
-        ({"height": "-4"}, 9.6, 1), ({"height": "nan", "building:levels": "2"}, 6.4, 1), ({"height": "0"}, 9.6, 0),
-        ({"height": "800"}, HIGHEST_BUILDING_M, 0), ({"building": "garage"}, 3.2, 0), ({"building": "house"}, 6.4, 0),
+        ({"height": "12"}, 12.0, 0),
+        ({"height": "12.5 m"}, 12.5, 0),
+        ({"height": "12,5"}, 12.5, 0),
+        ({"height": "40'"}, 12.192, 0),
+        ({"height": "5'6\""}, LOWEST_M, 0),
+        ({"building:levels": "5"}, 16.0, 0),
+        ({"height": "tall"}, 9.6, 1),
+        ({"height": "1e9"}, 9.6, 1),
+        ({"height": "99999"}, 9.6, 1),
+        ({"height": "-4"}, 9.6, 1),
+        ({"height": "nan", "building:levels": "2"}, 6.4, 1),
+        ({"height": "0"}, 9.6, 0),
+        ({"height": "800"}, HIGHEST_BUILDING_M, 0),
+        ({"building": "garage"}, 3.2, 0),
+        ({"building": "house"}, 6.4, 0),
     ],
-)  # fmt: skip
+)
 def test_heights_are_read_as_mappers_write_them(tags: Tags, height_m: float, unread: int) -> None:
     """Metres, feet, storeys; what cannot be read or cannot be is counted and the kind decides."""
     skipped: Counter[str] = Counter()
@@ -371,8 +463,10 @@ def test_heights_are_read_as_mappers_write_them(tags: Tags, height_m: float, unr
 
 
 def test_broken_outlines_are_left_out_and_counted(tmp_path: Path) -> None:
-    """Open, crossed, tiny, torn, hanging and underground buildings are no buildings; the good one stays."""
-    drawing, house_tags = Drawing(), {"building": "yes"}
+    """Open, crossed, tiny, torn, hanging and underground buildings are no buildings; the good one
+    stays."""
+    drawing = Drawing()
+    house_tags = {"building": "yes"}
     drawing.outline(0, 0, 10, 10, house_tags)
     a, b, c, d = (drawing.node(x, y) for x, y in ((0, 0), (9, 9), (9, 0), (0, 9)))
     drawing.way([a, b, c, d, a], house_tags)
@@ -385,7 +479,9 @@ def test_broken_outlines_are_left_out_and_counted(tmp_path: Path) -> None:
     drawing.outline(0, 0, 10, 10, {"building": "yes", "min_height": "6"})
     half = drawing.way([a, c, b], {})
     drawing.relation([(half, "outer")], {"type": "multipolygon", "building": "yes"})
-    drawing.relation([(half, "outer"), (99_999, "outer")], {"type": "multipolygon", "building": "yes"})
+    drawing.relation(
+        [(half, "outer"), (99_999, "outer")], {"type": "multipolygon", "building": "yes"}
+    )
     things, skipped = drawing.found(tmp_path / "broken.osm")
     assert [thing.kind for thing in things] == ["building"]
     assert skipped == {
@@ -403,19 +499,37 @@ WORDS = st.text(max_size=6) | st.sampled_from(
 )
 PAIRS = st.sampled_from(
     [
-        ("building", "yes"), ("natural", "tree"), ("natural", "tree_row"), ("highway", "street_lamp"),
-        ("amenity", "bench"), ("barrier", "bollard"), ("emergency", "fire_hydrant"), ("type", "multipolygon"),
+        ("building", "yes"),
+        ("natural", "tree"),
+        ("natural", "tree_row"),
+        ("highway", "street_lamp"),
+        ("amenity", "bench"),
+        ("barrier", "bollard"),
+        ("emergency", "fire_hydrant"),
+        ("type", "multipolygon"),
     ]
-)  # fmt: skip
+)
 KEYS = st.sampled_from(
-    ["height", "building:levels", "min_height", "building", "direction", "layer", "fire_hydrant:type", "location"]
+    [
+        "height",
+        "building:levels",
+        "min_height",
+        "building",
+        "direction",
+        "layer",
+        "fire_hydrant:type",
+        "location",
+    ]
 )
 
 
 @settings(max_examples=100)
 @given(data=st.data())
-def test_any_tags_are_read_or_counted(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
-    """Any tags, outlines, members and missing nodes: no exception, only finite things of sound height and outline."""
+def test_any_tags_are_read_or_counted(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    """Any tags, outlines, members and missing nodes: no exception, only finite things of sound
+    height and outline."""
     drawing = Drawing()
     spots = st.tuples(st.floats(-200, 200), st.floats(-200, 200))
     tags = st.dictionaries(KEYS, WORDS.filter(lambda w: w.isprintable()), max_size=4)
@@ -428,21 +542,30 @@ def test_any_tags_are_read_or_counted(tmp_path_factory: pytest.TempPathFactory, 
         ways.append(drawing.way(closed, dict([data.draw(PAIRS)]) | data.draw(tags)))
     roles = st.sampled_from(["outer", "inner", "?"])
     members = st.lists(st.tuples(st.sampled_from([*ways, 88_888]), roles), max_size=4)
-    drawing.relation(data.draw(members), {"building": "yes", "type": "multipolygon"} | data.draw(tags))
+    drawing.relation(
+        data.draw(members), {"building": "yes", "type": "multipolygon"} | data.draw(tags)
+    )
     things, skipped = drawing.found(tmp_path_factory.mktemp("any") / "any.osm")
     assert all(count > 0 for count in skipped.values())
     for thing in things:
-        assert all(np.isfinite(ring).all() for ring in thing.rings) and 0.0 <= thing.height_m < 1000.0
+        assert (
+            all(np.isfinite(ring).all() for ring in thing.rings) and 0.0 <= thing.height_m < 1000.0
+        )
         if thing.kind == "building":
             assert LOWEST_M <= thing.height_m <= HIGHEST_BUILDING_M
             assert shapely.Polygon(thing.rings[0], thing.rings[1:]).is_valid
 
 
 def test_the_projection_is_utm_or_none() -> None:
-    """Points worked out by PROJ's own test tables agree to the millimetre; other projections are recognised."""
+    """Points worked out by PROJ's own test tables agree to the millimetre; other projections are
+    recognised."""
     proj = "+proj=utm +zone=32 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"
     assert utm_zone(proj) == (32, False) and utm_zone(proj + " +south") == (32, True)
-    assert utm_zone("!") is None and utm_zone("+proj=tmerc +lat_0=0") is None and utm_zone("+proj=utm +zone=99") is None
+    assert (
+        utm_zone("!") is None
+        and utm_zone("+proj=tmerc +lat_0=0") is None
+        and utm_zone("+proj=utm +zone=99") is None
+    )
     on_axis = utm_xy(np.array([[9.0, 0.0], [9.0, 45.0]]), 32, False)
     assert on_axis[:, 0] == pytest.approx(500_000.0, abs=1e-6)
     assert on_axis[1, 1] == pytest.approx(4_982_950.400, abs=1e-3)
@@ -453,14 +576,24 @@ def test_the_projection_is_utm_or_none() -> None:
 @pytest.mark.engine
 @pytest.mark.skipif(not NEUKOELLN.exists(), reason="the shared maps are not here")
 def test_a_finely_mapped_place_is_built_as_mapped() -> None:
-    """Neukölln: most of its lamps, trees and houses stand; none on a road; every walk as free as without them."""
+    """Neukölln: most of its lamps, trees and houses stand; none on a road; every walk as free as
+    without them."""
     import_map(NEUKOELLN, "neukoelln")
     street_map = read_map("neukoelln")
     counts = Counter(f.kind for f in street_map.features)
-    assert counts["building"] > 110 and counts["tree"] > 120 and counts["lamp"] > 38 and counts["bench"] > 14
+    assert (
+        counts["building"] > 110
+        and counts["tree"] > 120
+        and counts["lamp"] > 38
+        and counts["bench"] > 14
+    )
     props = props_of(street_map, 0)
     mapped = [p for p in props if p.id.startswith("prop:map")]
-    roads = shapely.STRtree([lane.polygon for lane in street_map.lanes.values() if lane.kind == "road"])
+    roads = shapely.STRtree(
+        [lane.polygon for lane in street_map.lanes.values() if lane.kind == "road"]
+    )
     assert not len(roads.query(footprints(mapped), predicate="intersects")[0])
     sidewalks = [s for s in street_map.strips.values() if s.kind == "sidewalk"]
-    assert all(free >= min(1.2, bare) - 1e-6 for free, bare in clear_width(sidewalks, props).values())
+    assert all(
+        free >= min(1.2, bare) - 1e-6 for free, bare in clear_width(sidewalks, props).values()
+    )

@@ -16,13 +16,13 @@ from cosim.core.state import Age, People, RobotState, Street
 from cosim.place.street_map import Strip
 from cosim.spec.events import EventReply
 from cosim.spec.scenario import City, CrowdSpec
-from scenarios.bench.group_tally import widest_gaps
-from scenarios.catalog import load_suite, with_crowd
+from scenarios.suites.catalog import load_suite, with_crowd
+from scenarios.tools.bench.group_tally import widest_gaps
 from sumo_nets.city.store import build_city
 from sumo_nets.crowd.crowd import SumoCrowd
 from sumo_nets.crowd.group_cohesion import Together
 from sumo_nets.crowd.group_sampling import PERSON_MPS, SLOWEST_GROUP_MPS, GroupDraws, PersonGroup
-from sumo_nets.net.netfile import read_net
+from sumo_nets.net.net_file import read_net
 
 LINE = np.array([[0.0, 0.0], [50.0, 0.0]])
 STRIPS = {
@@ -50,7 +50,9 @@ class Walkers:
             setSpeed=self.told.__setitem__,
             moveToXY=lambda name, edge, x, y, *_: self.at.update({name: (self.at[name][0], x, y)}),
         )
-        self.lane = SimpleNamespace(getShape=lambda lane: LINE.tolist(), getLength=lambda lane: 50.0)
+        self.lane = SimpleNamespace(
+            getShape=lambda lane: LINE.tolist(), getLength=lambda lane: 50.0
+        )
 
     def seen(self) -> dict[str, Any]:
         return {name: Spot(x, y) for name, (_, x, y) in self.at.items()}
@@ -70,8 +72,11 @@ def kept(walkers: Walkers, looks: int = 2) -> dict[str, float]:
 
 
 def test_shares_of_groups_elderly_and_children_come_out_as_asked() -> None:
-    """Of many persons 40 % walk in groups, 10 % are elderly, 15 % children; each child has an adult, and is slow."""
-    companies = GroupDraws(CrowdSpec(groups=0.4, elderly=0.1, children=0.15), np.random.default_rng(1))
+    """Of many persons 40 % walk in groups, 10 % are elderly, 15 % children; each child has an
+    adult, and is slow."""
+    companies = GroupDraws(
+        CrowdSpec(groups=0.4, elderly=0.1, children=0.15), np.random.default_rng(1)
+    )
     drawn = []
     for _ in range(8000):
         drawn.append(companies.coming)
@@ -83,12 +88,15 @@ def test_shares_of_groups_elderly_and_children_come_out_as_asked() -> None:
     assert ages[Age.CHILD] / persons == pytest.approx(0.15, abs=0.015)
     assert {group.size for group in drawn} == {1, 2, 3}
     families = [group for group in drawn if Age.CHILD in group.ages]
-    assert all(Age.ADULT in family.ages and family.pace_mps == SLOWEST_GROUP_MPS for family in families)
+    assert all(
+        Age.ADULT in family.ages and family.pace_mps == SLOWEST_GROUP_MPS for family in families
+    )
     assert all(c.pace_mps == PERSON_MPS for c in drawn if set(c.ages) == {Age.ADULT})
 
 
 def test_without_groups_and_ages_nothing_is_drawn_but_looks() -> None:
-    """A plain crowd takes no numbers from the generator; everybody walks alone, and some look young or old."""
+    """A plain crowd takes no numbers from the generator; everybody walks alone, and some look young
+    or old."""
     rng = np.random.default_rng(1)
     companies = GroupDraws(CrowdSpec(), rng)
     ages: Counter[Age] = Counter()
@@ -102,17 +110,24 @@ def test_without_groups_and_ages_nothing_is_drawn_but_looks() -> None:
 
 
 def test_a_group_walks_abreast_where_there_is_room() -> None:
-    """Three stand side by side on 1.92 m, two and one on 1.3 m, in file on 0.64 m; they walk slower than one."""
+    """Three stand side by side on 1.92 m, two and one on 1.3 m, in file on 0.64 m; they walk slower
+    than one."""
     three = PersonGroup((Age.ADULT,) * 3)
-    assert np.array(three.places(1.92)) == pytest.approx(np.array([(-0.64, 0.0), (0.0, 0.0), (0.64, 0.0)]))
-    assert np.array(three.places(1.3)) == pytest.approx(np.array([(-0.32, 0.0), (0.32, 0.0), (0.0, 0.8)]))
-    assert np.array(three.places(0.64)) == pytest.approx(np.array([(0.0, 0.0), (0.0, 0.8), (0.0, 1.6)]))
+    assert np.array(three.places(1.92)) == pytest.approx(
+        np.array([(-0.64, 0.0), (0.0, 0.0), (0.64, 0.0)])
+    )
+    assert np.array(three.places(1.3)) == pytest.approx(
+        np.array([(-0.32, 0.0), (0.32, 0.0), (0.0, 0.8)])
+    )
+    assert np.array(three.places(0.64)) == pytest.approx(
+        np.array([(0.0, 0.0), (0.0, 0.8), (0.0, 1.6)])
+    )
     assert three.walks_at(1.5) == pytest.approx(1.42) and three.walks_at(1.12) == 1.1
 
 
 def test_who_is_ahead_slows_down_and_who_lags_hurries() -> None:
-    """A metre apart on a sidewalk the first is told to walk slower, the second faster, abreast nobody is told anything;
-    but nobody slows down on a crossing."""
+    """A metre apart on a sidewalk the first is told to walk slower, the second faster, abreast
+    nobody is told anything; but nobody slows down on a crossing."""
     told = kept(Walkers(c0=("s", 11.0, 0.0), c1=("s", 10.0, 0.64)))
     assert told["c0"] < 1.2 and 1.3 < told["c1"] < 1.44
     assert kept(Walkers(c0=("s", 10.1, 0.0), c1=("s", 10.0, 0.64))) == {}
@@ -120,7 +135,8 @@ def test_who_is_ahead_slows_down_and_who_lags_hurries() -> None:
 
 
 def test_who_is_far_ahead_waits() -> None:
-    """Three metres ahead one waits, and walks on when the fellow is near; also if a light has parted them."""
+    """Three metres ahead one waits, and walks on when the fellow is near; also if a light has
+    parted them."""
     walkers = Walkers(c0=("s", 13.0, 0.0), c1=("s", 10.0, 0.64))
     together = Together(walkers, STRIPS, 0.05)
     together.join(("c0", "c1"), 1.3, ("s", ":c", "t"))
@@ -142,7 +158,8 @@ def test_who_is_far_ahead_waits() -> None:
 
 
 def test_who_walks_aside_steps_back_unless_somebody_comes() -> None:
-    """1.9 m beside its fellow somebody steps 0.34 m nearer; not where another comes towards that place."""
+    """1.9 m beside its fellow somebody steps 0.34 m nearer; not where another comes towards that
+    place."""
     walkers = Walkers(c0=("s", 20.0, 0.0), c1=("s", 20.0, 1.92))
     kept(walkers, looks=3)
     assert sorted(y for _, _, y in walkers.at.values()) in ([0.0, 1.58], [0.34, 1.92])
@@ -156,7 +173,8 @@ def test_who_walks_aside_steps_back_unless_somebody_comes() -> None:
 
 
 def test_who_has_left_is_forgotten() -> None:
-    """Of three one leaves, and two are a group; the last one walks on at its own speed; two may leave at once."""
+    """Of three one leaves, and two are a group; the last one walks on at its own speed; two may
+    leave at once."""
     walkers = Walkers(c0=("s", 11.0, 0.0), c1=("s", 10.0, 0.64), c2=("s", 10.0, 1.28))
     together = Together(walkers, STRIPS, 0.05)
     together.join(("c0", "c1", "c2"), 1.3, ("s",))
@@ -172,19 +190,28 @@ def test_who_has_left_is_forgotten() -> None:
 
 
 def test_the_gap_of_a_group_is_that_of_its_loneliest_member() -> None:
-    """Of three in a row, 0.5 and 2 m apart, the last is 2 m from its nearest fellow; who is alone has no gap."""
+    """Of three in a row, 0.5 and 2 m apart, the last is 2 m from its nearest fellow; who is alone
+    has no gap."""
     people = People.of(
-        ("a", "b", "c", "d"), [[0.0, 0.0], [0.5, 0.0], [2.5, 0.0], [9.0, 0.0]], np.zeros(4), np.ones(4), ("walk",) * 4
+        ("a", "b", "c", "d"),
+        [[0.0, 0.0], [0.5, 0.0], [2.5, 0.0], [9.0, 0.0]],
+        np.zeros(4),
+        np.ones(4),
+        ("walk",) * 4,
     )
     assert widest_gaps([("a", "b", "c"), ("d", "gone")], people) == [2.0]
 
 
 def test_a_suite_can_be_asked_for_groups() -> None:
-    """`--groups 0.4` makes another suite, whose version says so; nothing asked leaves it; children need groups."""
+    """`--groups 0.4` makes another suite, whose version says so; nothing asked leaves it; children
+    need groups."""
     shipped = load_suite("reactive")
     asked = with_crowd(shipped, groups=0.4, children=None)
     assert {scenario.crowd.groups for scenario in asked.scenarios} == {0.4}
-    assert asked.version == f"{shipped.version}-groups0.4" and asked.content_hash != shipped.content_hash
+    assert (
+        asked.version == f"{shipped.version}-groups0.4"
+        and asked.content_hash != shipped.content_hash
+    )
     assert with_crowd(shipped, groups=None) is shipped
     with pytest.raises(SpecError, match=r"give groups of 0\.2 or more"):
         with_crowd(shipped, children=0.1)
@@ -192,7 +219,8 @@ def test_a_suite_can_be_asked_for_groups() -> None:
 
 @pytest.mark.engine
 def test_groups_stay_together_on_the_street(tmp_path: Path) -> None:
-    """For over a minute groups stay near, are as many as asked, of the right ages and paces; bit for bit again."""
+    """For over a minute groups stay near, are as many as asked, of the right ages and paces; bit
+    for bit again."""
     net = tmp_path / "city.net.xml"
     build_city(City(seed=2, size_m=600.0), net)
     street_map = read_net(net)
@@ -202,7 +230,8 @@ def test_groups_stay_together_on_the_street(tmp_path: Path) -> None:
 
     def run(ticks: int) -> tuple[list[Street], list[tuple[tuple[str, ...], ...]]]:
         with SumoCrowd(net, street_map, spec, 3, frozenset(), start[:2]) as crowd:
-            streets, groups = [crowd.street], [crowd.groups]
+            streets = [crowd.street]
+            groups = [crowd.groups]
             for tick in range(ticks):
                 reply = EventReply(episode="test", tick=tick, states=(), actors=())
                 streets.append(crowd.step(RobotState(start), reply))
@@ -220,7 +249,11 @@ def test_groups_stay_together_on_the_street(tmp_path: Path) -> None:
     assert np.mean([inside(street).sum() for street in streets]) == pytest.approx(50, rel=0.05)
 
     ids = [name for street in streets[::100] for name in street.people.ids]
-    ages = {name: age for street in streets for name, age in zip(street.people.ids, street.people.age, strict=True)}
+    ages = {
+        name: age
+        for street in streets
+        for name, age in zip(street.people.ids, street.people.age, strict=True)
+    }
     together = {name for now in groups for names in now for name in names}
     assert np.mean([name in together for name in ids]) == pytest.approx(0.5, abs=0.15)
     assert {ages[name] for name in ids} == {*Age}
@@ -230,7 +263,9 @@ def test_groups_stay_together_on_the_street(tmp_path: Path) -> None:
     walking = [(street.people.speed, street.people.age) for street in streets[::20]]
     speed, age = (np.concatenate(column) for column in zip(*walking, strict=True))
     pace = {one: np.median(speed[(age == one) & (speed > 0.5)]) for one in Age}
-    assert 0.75 < pace[Age.CHILD] < 1.12 and 0.75 < pace[Age.ELDERLY] < 1.12 and pace[Age.ADULT] > 1.12
+    assert (
+        0.75 < pace[Age.CHILD] < 1.12 and 0.75 < pace[Age.ELDERLY] < 1.12 and pace[Age.ADULT] > 1.12
+    )
 
     again, _ = run(200)
     for a, b in zip(streets, again, strict=False):
@@ -239,7 +274,8 @@ def test_groups_stay_together_on_the_street(tmp_path: Path) -> None:
 
 @pytest.mark.engine
 def test_a_group_is_taken_out_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where everybody who does not wait at red is taken out at the next look, all who walk along leave in that tick."""
+    """Where everybody who does not wait at red is taken out at the next look, all who walk along
+    leave in that tick."""
     monkeypatch.setattr("sumo_nets.crowd.demand.STUCK_S", -1.0)
     net = tmp_path / "city.net.xml"
     build_city(City(seed=2, size_m=600.0), net)
@@ -250,7 +286,8 @@ def test_a_group_is_taken_out_as_a_whole(tmp_path: Path, monkeypatch: pytest.Mon
     left = 0
     with SumoCrowd(net, street_map, spec, 3, frozenset(), start[:2]) as crowd:
         for tick in range(60):
-            groups, before = crowd.groups, set(crowd.street.people.ids)
+            groups = crowd.groups
+            before = set(crowd.street.people.ids)
             reply = EventReply(episode="test", tick=tick, states=(), actors=())
             after = set(crowd.step(RobotState(start), reply).people.ids)
             whole = [set(names) for names in groups if set(names) <= before]

@@ -1,4 +1,5 @@
-"""Importing city maps: OpenStreetMap and SUMO files, whole, packed, broken; the shared maps where they are."""
+"""Importing city maps: OpenStreetMap and SUMO files, whole, packed, broken; the shared maps where
+they are."""
 
 from __future__ import annotations
 
@@ -21,14 +22,16 @@ from cosim.place.route_line import through_corner
 from cosim.place.street_map import Port, StreetMap
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import City, CityMap
-from scenarios.builders.capacity import capacity_of
-from scenarios.catalog import load_suite
+from scenarios.suites.capacity import capacity_of
+from scenarios.suites.catalog import load_suite
 from sumo_nets.city.store import build_city
-from sumo_nets.maps import importer, netsteps, osmcrop
-from sumo_nets.maps.cornermend import mend_corners
-from sumo_nets.maps.drivingside import left_hand_country
+from sumo_nets.maps import importer
+from sumo_nets.maps import net_steps as netsteps
+from sumo_nets.maps import osm_crop as osmcrop
+from sumo_nets.maps.corner_repair import mend_corners
+from sumo_nets.maps.driving_side import left_hand_country
 from sumo_nets.maps.importer import Options
-from sumo_nets.maps.mapstore import (
+from sumo_nets.maps.map_store import (
     ABOUT,
     about_map,
     checked_map,
@@ -39,31 +42,48 @@ from sumo_nets.maps.mapstore import (
     outdated,
     read_map,
 )
-from sumo_nets.maps.signalcheck import lengthen_walks, mend_signals
+from sumo_nets.maps.signal_check import lengthen_walks, mend_signals
+from sumo_nets.net.net_facts import read_facts, walks_of
+from sumo_nets.net.net_file import read_net
 from sumo_nets.net.netconvert import netconvert
-from sumo_nets.net.netfacts import read_facts, walks_of
-from sumo_nets.net.netfile import read_net
 from tests.conftest import Cosim
 from tests.sumo_nets.conftest import kept
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 
 MAPS = Path(__file__).parents[3] / "shared" / "maps"
-NAMES = sorted(p.name for p in MAPS.glob("*") if (p / "stats.json").exists()) if MAPS.is_dir() else []
+NAMES = (
+    sorted(p.name for p in MAPS.glob("*") if (p / "stats.json").exists()) if MAPS.is_dir() else []
+)
 SAMPLE = (
-    "berlin-doerpfeldstr", "berlin-neukoelln", "braunschweig-bs3d", "frederiksted", "london-st-georges", "taipei",
+    "berlin-doerpfeldstr",
+    "berlin-neukoelln",
+    "braunschweig-bs3d",
+    "frederiksted",
+    "london-st-georges",
+    "taipei",
     "west-oakland",
-)  # fmt: skip
-"""Small maps of each packing, for both sides of the road, with sidewalks and without; --whole imports the others."""
-BERLIN, LONDON = (13.40, 52.50), (-0.12, 51.50)
+)
+"""Small maps of each packing, for both sides of the road, with sidewalks and without; --whole
+imports the others."""
+BERLIN = (13.40, 52.50)
+LONDON = (-0.12, 51.50)
 
 
-def osm(at: tuple[float, float] = BERLIN, highway: str = "residential", sidewalk: str = "both", blocks: int = 3) -> str:
+def osm(
+    at: tuple[float, float] = BERLIN,
+    highway: str = "residential",
+    sidewalk: str = "both",
+    blocks: int = 3,
+) -> str:
     """A grid of streets 120 m apart with a footway across one block."""
     lon, lat = at
-    number = {(i, k): 1 + i * (blocks + 1) + k for i in range(blocks + 1) for k in range(blocks + 1)}
+    number = {
+        (i, k): 1 + i * (blocks + 1) + k for i in range(blocks + 1) for k in range(blocks + 1)
+    }
     rows = [
-        f'<node id="{n}" lon="{lon + 0.0017 * i:.7f}" lat="{lat + 0.0011 * k:.7f}"/>' for (i, k), n in number.items()
+        f'<node id="{n}" lon="{lon + 0.0017 * i:.7f}" lat="{lat + 0.0011 * k:.7f}"/>'
+        for (i, k), n in number.items()
     ]
     tags = f'<tag k="highway" v="{highway}"/><tag k="name" v="A &amp; Ö &quot;台北&quot;"/>'
     tags += f'<tag k="sidewalk" v="{sidewalk}"/>' if sidewalk else ""
@@ -72,11 +92,26 @@ def osm(at: tuple[float, float] = BERLIN, highway: str = "residential", sidewalk
             (100 + line, [number[line, k] for k in range(blocks + 1)]),
             (200 + line, [number[i, line] for i in range(blocks + 1)]),
         ):
-            rows.append(f'<way id="{way}">' + "".join(f'<nd ref="{ref}"/>' for ref in refs) + tags + "</way>")
+            rows.append(
+                f'<way id="{way}">'
+                + "".join(f'<nd ref="{ref}"/>' for ref in refs)
+                + tags
+                + "</way>"
+            )
     corner = number[min(1, blocks), min(1, blocks)]
-    rows.append(f'<way id="300"><nd ref="{number[0, 0]}"/><nd ref="{corner}"/><tag k="highway" v="footway"/></way>')
-    rows.append('<way id="301"><nd ref="1"/><nd ref="999"/><tag k="highway" v="footway"/></way><way id="302"/>')
-    return '<?xml version="1.0" encoding="UTF-8"?>\n<osm version="0.6">\n' + "\n".join(rows) + "\n</osm>\n"
+    rows.append(
+        f'<way id="300"><nd ref="{number[0, 0]}"/><nd ref="{corner}"/><tag k="highway" '
+        f'v="footway"/></way>'
+    )
+    rows.append(
+        '<way id="301"><nd ref="1"/><nd ref="999"/><tag k="highway" v="footway"/></way><way '
+        'id="302"/>'
+    )
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n<osm version="0.6">\n'
+        + "\n".join(rows)
+        + "\n</osm>\n"
+    )
 
 
 def written(path: Path, text: str) -> Path:
@@ -94,13 +129,18 @@ def small_city() -> bytes:
 
 @pytest.mark.engine
 def test_osm_becomes_a_place_that_can_be_walked(tmp_path: Path) -> None:
-    """Streets get sidewalks, crossings and corners in one piece; source, changes and licence are kept with the net."""
+    """Streets get sidewalks, crossings and corners in one piece; source, changes and licence are
+    kept with the net."""
     about = import_map(written(tmp_path / "Kleine Stadt.osm", osm()))
     street_map, check, again = checked_map("kleine-stadt")
     assert again == about and about.source == "Kleine Stadt.osm" and about.guessed_share == 0.0
     assert street_map.name == "kleine-stadt" and street_map.net_hash == about.net_hash
     capacity = capacity_of(street_map, WalkGraph(street_map))
-    assert check.usable and capacity.routes.found and all(count.found for count in capacity.structures.values())
+    assert (
+        check.usable
+        and capacity.routes.found
+        and all(count.found for count in capacity.structures.values())
+    )
     assert check.islands[0].share > 0.99 and check.crossings >= 16 and check.corners >= 16
     assert "OpenStreetMap contributors" in about.licences[0]
     assert any("on the right" in change for change in about.changes)
@@ -131,7 +171,10 @@ def test_driving_side_is_looked_up_and_can_be_said(tmp_path: Path) -> None:
     import_map(source, "london", Options(lefthand=False))
     right = read_map("london")
     assert left.left_hand and not right.left_hand
-    sides = [{s.road_side for s in m.strips.values() if s.kind == "sidewalk" and s.road_side} for m in (left, right)]
+    sides = [
+        {s.road_side for s in m.strips.values() if s.kind == "sidewalk" and s.road_side}
+        for m in (left, right)
+    ]
     assert sides == [{-1}, {1}]
 
 
@@ -162,12 +205,28 @@ def test_a_good_net_is_kept_as_it_is(tmp_path: Path) -> None:
     about = import_map(source, options=Options(sidewalk_width_m=3.0))
     after = read_map("good")
     for a, b in zip(after.strips.values(), before.strips.values(), strict=True):
-        assert (a.id, a.kind, a.corners, a.signalised, a.crosses) == (b.id, b.kind, b.corners, b.signalised, b.crosses)
-        assert (a.width_m, a.frontage_m, a.curb_m, a.verge_m) == (b.width_m, b.frontage_m, b.curb_m, b.verge_m)
+        assert (a.id, a.kind, a.corners, a.signalised, a.crosses) == (
+            b.id,
+            b.kind,
+            b.corners,
+            b.signalised,
+            b.crosses,
+        )
+        assert (a.width_m, a.frontage_m, a.curb_m, a.verge_m) == (
+            b.width_m,
+            b.frontage_m,
+            b.curb_m,
+            b.verge_m,
+        )
         assert a.polygon.equals(b.polygon)
-    assert [(c.id, c.ports) for c in after.corners.values()] == [(c.id, c.ports) for c in before.corners.values()]
+    assert [(c.id, c.ports) for c in after.corners.values()] == [
+        (c.id, c.ports) for c in before.corners.values()
+    ]
     assert about.guessed_share is None and about.changes[0] == "unpacked (gzip)"
-    assert "--sidewalk-width has no effect: the net has sidewalks of its own, none is guessed" in about.changes
+    assert (
+        "--sidewalk-width has no effect: the net has sidewalks of its own, none is guessed"
+        in about.changes
+    )
 
 
 @pytest.mark.engine
@@ -183,7 +242,8 @@ def test_nets_for_cars_alone_get_walkways(tmp_path: Path) -> None:
 
 @pytest.mark.engine
 def test_as_is_leaves_a_net_unchanged(tmp_path: Path) -> None:
-    """With --as-is the net stays the same to the byte, and the changes say what is not possible on it."""
+    """With --as-is the net stays the same to the byte, and the changes say what is not possible on
+    it."""
     source = written(tmp_path / "town.osm", osm(sidewalk=""))
     net = netconvert(["--osm-files", str(source)], tmp_path / "cars.net.xml")
     about = import_map(net, options=Options(as_is=True))
@@ -196,12 +256,16 @@ def test_as_is_leaves_a_net_unchanged(tmp_path: Path) -> None:
 
 
 def streets_of_each_class() -> str:
-    """A town of residential streets, of which one is primary and two have sidewalks with tagged widths."""
+    """A town of residential streets, of which one is primary and two have sidewalks with tagged
+    widths."""
     text = osm(sidewalk="")
     for way, tags in (
         ("100", {"highway": "primary"}),
         ("201", {"highway": "tertiary", "sidewalk": "both", "sidewalk:both:width": "2.8 m"}),
-        ("202", {"sidewalk:left:width": "1.6", "sidewalk:right:width": "13'", "sidewalk:both": "yes"}),
+        (
+            "202",
+            {"sidewalk:left:width": "1.6", "sidewalk:right:width": "13'", "sidewalk:both": "yes"},
+        ),
     ):
         head, tail = text.split(f'<way id="{way}">')
         refs, rest = tail.split("</way>", 1)
@@ -213,14 +277,24 @@ def streets_of_each_class() -> str:
 
 @pytest.mark.engine
 def test_guessed_sidewalks_have_the_width_of_their_street(tmp_path: Path, cosim: Cosim) -> None:
-    """Their width follows the street's class, tagged widths win, side by side; --sidewalk-width sets all others."""
+    """Their width follows the street's class, tagged widths win, side by side; --sidewalk-width
+    sets all others."""
     source = written(tmp_path / "town.osm", streets_of_each_class())
     about = import_map(source, "town")
     strips = read_map("town").strips
-    widths = {name: strips[name].width_m for name in ("100#0", "-203#1", "201#1", "-201#1", "202#1", "-202#1", "300")}
+    widths = {
+        name: strips[name].width_m
+        for name in ("100#0", "-203#1", "201#1", "-201#1", "202#1", "-202#1", "300")
+    }
     assert widths == {
-        "100#0": 3.5, "-203#1": 2.5, "201#1": 2.8, "-201#1": 2.8, "202#1": 3.96, "-202#1": 1.6, "300": 2.0,
-    }  # fmt: skip
+        "100#0": 3.5,
+        "-203#1": 2.5,
+        "201#1": 2.8,
+        "-201#1": 2.8,
+        "202#1": 3.96,
+        "-202#1": 1.6,
+        "300": 2.0,
+    }
     (said,) = [change for change in about.changes if change.startswith("sidewalks are")]
     assert "2.5 m beside residential streets (" in said and "as tagged beside others (" in said
     cars = netconvert(["--osm-files", str(source), "--speed.factor=0.5"], tmp_path / "cars.net.xml")
@@ -231,22 +305,28 @@ def test_guessed_sidewalks_have_the_width_of_their_street(tmp_path: Path, cosim:
     assert done.returncode == 0 and "4.2 m beside primary streets" in done.stdout, done.stderr
     assert {s.width_m for s in read_map("cars").strips.values() if s.road_side} == {4.2}
     done = cosim("map", "import", str(cars), "--sidewalk-width", "0.4")
-    assert done.returncode == 2 and "--sidewalk-width must be 1 to 10 metres, not 0.4" in done.stderr
+    assert (
+        done.returncode == 2 and "--sidewalk-width must be 1 to 10 metres, not 0.4" in done.stderr
+    )
 
 
 @pytest.mark.engine
 @pytest.mark.parametrize("name", ["ingolstadt-1", "braunschweig-2"])
 def test_shipped_places_keep_their_import(name: str) -> None:
-    """The shipped places are imported by the version of their suites: their nets have the hashes of the scenarios."""
+    """The shipped places are imported by the version of their suites: their nets have the hashes of
+    the scenarios."""
     about = about_map(name)
-    frozen = {s.place.net_hash for s in load_suite("unit").scenarios if s.place.name == f"map-{name}"}
+    frozen = {
+        s.place.net_hash for s in load_suite("unit").scenarios if s.place.name == f"map-{name}"
+    }
     assert {about.net_hash} == frozen and about.versions["importer"] == "3"
     assert not outdated(about)
 
 
 @pytest.mark.engine
 def test_maps_of_an_older_importer_stay_usable(tmp_path: Path) -> None:
-    """A map that version 3 kept is read as it was, its check advises a new import, and that replaces it."""
+    """A map that version 3 kept is read as it was, its check advises a new import, and that
+    replaces it."""
     source = written(tmp_path / "town.osm", osm())
     import_map(source, "old")
     path = map_net("old").with_name(ABOUT)
@@ -269,10 +349,14 @@ class Stages:
 
 
 @pytest.mark.engine
-def test_a_box_is_cut_out_before_the_conversion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a packed file only the streets in the box and its margin are converted, and the part is that of the whole."""
+def test_a_box_is_cut_out_before_the_conversion(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a packed file only the streets in the box and its margin are converted, and the part is
+    that of the whole."""
     monkeypatch.setattr(osmcrop, "MARGIN_M", 130.0)
-    (lon, lat), told = BERLIN, Stages()
+    (lon, lat) = BERLIN
+    told = Stages()
     plain = written(tmp_path / "town.osm", osm(blocks=5))
     source = tmp_path / "town.osm.gz"
     source.write_bytes(gzip.compress(plain.read_bytes()))
@@ -280,11 +364,18 @@ def test_a_box_is_cut_out_before_the_conversion(tmp_path: Path, monkeypatch: pyt
     about = import_map(source, "part", Options(bbox=box), told)
     stages = list(told.shares)
     assert stages[0] == "reading town.osm.gz" and stages[1] == "converting 8 streets and paths"
-    assert set(stages) >= {"cropping", "widening sidewalks", "mending corners", "starting SUMO on the net"}
+    assert set(stages) >= {
+        "cropping",
+        "widening sidewalks",
+        "mending corners",
+        "starting SUMO on the net",
+    }
     done = told.shares["converting 8 streets and paths"]
     assert done == sorted(done) and done[0] == 0.0 and done[-1] > 0.7
     part = set(read_map("part").strips)
-    assert about.bbox == box and 10 < len(part) < 60 and part == set(cut_afterwards(plain, box).strips)
+    assert (
+        about.bbox == box and 10 < len(part) < 60 and part == set(cut_afterwards(plain, box).strips)
+    )
 
 
 def cut_afterwards(source: Path, box: tuple[float, float, float, float]) -> StreetMap:
@@ -296,21 +387,34 @@ def cut_afterwards(source: Path, box: tuple[float, float, float, float]) -> Stre
 
 
 @pytest.mark.engine
-def test_a_bad_box_is_refused_with_the_bounds(tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A box outside of a file, with its sides swapped, or without a street: the error gives the file's bounds."""
+def test_a_bad_box_is_refused_with_the_bounds(
+    tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A box outside of a file, with its sides swapped, or without a street: the error gives the
+    file's bounds."""
     monkeypatch.setattr(osmcrop, "MARGIN_M", 1.0)
-    source, before = written(tmp_path / "town.osm", osm()), kept()
+    source = written(tmp_path / "town.osm", osm())
+    before = kept()
     done = cosim("map", "import", str(source), "--bbox", "1,1,2,2")
-    assert done.returncode == 2 and "is outside of the map, which covers 13.4,52.5,13.4051,52.5033" in done.stderr
+    assert (
+        done.returncode == 2
+        and "is outside of the map, which covers 13.4,52.5,13.4051,52.5033" in done.stderr
+    )
     with pytest.raises(MapError, match=r"swapped\? --bbox 13.4,52.5,13.401,52.501\)"):
         import_map(source, "swapped", Options(bbox=(52.5, 13.4, 52.501, 13.401)))
-    with pytest.raises(MapError, match=r"no street or path .* lies in --bbox .*; the file covers 13\.4,52\.5,"):
+    with pytest.raises(
+        MapError, match=r"no street or path .* lies in --bbox .*; the file covers 13\.4,52\.5,"
+    ):
         import_map(source, "empty", Options(bbox=(13.4005, 52.5003, 13.4006, 52.5004)))
     broken = written(tmp_path / "broken.osm", osm().replace('lon="13', 'lon="x13', 1))
-    with pytest.raises(MapError, match=r"broken\.osm: cannot be cropped: wrong format for coordinate"):
+    with pytest.raises(
+        MapError, match=r"broken\.osm: cannot be cropped: wrong format for coordinate"
+    ):
         import_map(broken, options=Options(bbox=(13.4, 52.5, 13.41, 52.51)))
     net = netconvert(["--osm-files", str(source)], tmp_path / "projected.net.xml")
-    with pytest.raises(MapError, match=r"outside of the map, which covers 13\.4,52\.5,.* in degrees\)"):
+    with pytest.raises(
+        MapError, match=r"outside of the map, which covers 13\.4,52\.5,.* in degrees\)"
+    ):
         import_map(net, options=Options(bbox=(1.0, 1.0, 2.0, 2.0)))
     flat = tmp_path / "flat.net.xml"
     flat.write_bytes(small_city())
@@ -320,12 +424,17 @@ def test_a_bad_box_is_refused_with_the_bounds(tmp_path: Path, cosim: Cosim, monk
 
 
 @pytest.mark.engine
-def test_large_files_are_told_of_the_box(tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_files_are_told_of_the_box(
+    tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """An import that takes minutes says so when it begins, with the option that makes it faster."""
     monkeypatch.setattr(importer, "BIG", 5)
     source = written(tmp_path / "town.osm", osm(blocks=2))
     done = cosim("map", "import", str(source))
-    assert "converting 8 streets and paths (--bbox west,south,east,north: a part is faster) ...\n" in done.stderr
+    assert (
+        "converting 8 streets and paths (--bbox west,south,east,north: a part is faster) ...\n"
+        in done.stderr
+    )
 
 
 @pytest.mark.engine
@@ -354,27 +463,43 @@ def test_a_net_says_itself_where_it_drives(tmp_path: Path) -> None:
             "nothing walkable",
             id="motorways",
         ),
-        pytest.param("a.osm", osm(blocks=0).encode(), "no street of the file survived", id="one point"),
+        pytest.param(
+            "a.osm", osm(blocks=0).encode(), "no street of the file survived", id="one point"
+        ),
         pytest.param(
             "a.osm.gz",
             gzip.compress(osm().encode(), mtime=0)[:400],
             "broken gzip file, probably cut short",
             id="gzip cut short",
         ),
-        pytest.param("a.osm.bz2", bz2.compress(osm().encode())[:300], "cut short", id="bzip2 cut short"),
         pytest.param(
-            "a.osm.pbf", b"\x00\x00\x00\x0d\x0a\x09OSMHeader" + b"\x00" * 40, "cannot be unpacked (PBF)", id="no PBF"
+            "a.osm.bz2", bz2.compress(osm().encode())[:300], "cut short", id="bzip2 cut short"
+        ),
+        pytest.param(
+            "a.osm.pbf",
+            b"\x00\x00\x00\x0d\x0a\x09OSMHeader" + b"\x00" * 40,
+            "cannot be unpacked (PBF)",
+            id="no PBF",
         ),
         pytest.param("a.net.xml", b'<net version="1.20"/>', "0 edges", id="no edges"),
-        pytest.param("a.net.xml", b'<net version="1.20"><edge id="a">', "broken XML", id="net cut short"),
         pytest.param(
-            "a.net.xml.gz", gzip.compress(b"<net>" * 99, mtime=0)[:20], "broken gzip file", id="gzip net cut short"
+            "a.net.xml", b'<net version="1.20"><edge id="a">', "broken XML", id="net cut short"
+        ),
+        pytest.param(
+            "a.net.xml.gz",
+            gzip.compress(b"<net>" * 99, mtime=0)[:20],
+            "broken gzip file",
+            id="gzip net cut short",
         ),
     ],
 )
-def test_bad_files_are_refused_and_leave_nothing(tmp_path: Path, name: str, content: bytes, reason: str) -> None:
-    """Whatever the file is, one MapError names it and says what was found, and nothing half-imported stays."""
-    before, source = kept(), tmp_path / name
+def test_bad_files_are_refused_and_leave_nothing(
+    tmp_path: Path, name: str, content: bytes, reason: str
+) -> None:
+    """Whatever the file is, one MapError names it and says what was found, and nothing
+    half-imported stays."""
+    before = kept()
+    source = tmp_path / name
     source.write_bytes(content)
     with pytest.raises(MapError) as caught:
         import_map(source)
@@ -383,7 +508,8 @@ def test_bad_files_are_refused_and_leave_nothing(tmp_path: Path, name: str, cont
 
 
 def test_missing_files_and_bad_names_are_refused(tmp_path: Path) -> None:
-    """A file that is not there, a name that is no name, a name that SUMO's nets have, a box that is none."""
+    """A file that is not there, a name that is no name, a name that SUMO's nets have, a box that is
+    none."""
     with pytest.raises(MapError, match="cannot be read: No such file"):
         import_map(tmp_path / "none.osm")
     with pytest.raises(MapError, match="cannot be read: it is a folder, not a file"):
@@ -407,13 +533,18 @@ def test_names_come_from_files() -> None:
 
 
 @pytest.mark.engine
-def test_a_slow_netconvert_is_told_with_the_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_netconvert_is_told_with_the_remedy(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A conversion that does not end is stopped; one line names the user's file and what to do."""
     monkeypatch.setattr(netsteps, "TIMEOUT_S", 0.001)
     source = written(tmp_path / "town.osm", osm())
     with pytest.raises(MapError) as caught:
         import_map(source)
-    assert str(caught.value) == f"{source}: netconvert did not end within 0.001 s: import a part of it with --bbox"
+    assert (
+        str(caught.value)
+        == f"{source}: netconvert did not end within 0.001 s: import a part of it with --bbox"
+    )
 
 
 @pytest.mark.engine
@@ -427,7 +558,8 @@ def test_nets_that_come_with_sumo_are_imported_when_used() -> None:
 
 
 def test_crossings_that_never_have_green_get_a_phase() -> None:
-    """One phase more, in which only they go, with yellow before and time to clear the road after; others stay."""
+    """One phase more, in which only they go, with yellow before and time to clear the road after;
+    others stay."""
     net = """<net version="1.20"><edge id=":J_c0" function="crossing"><lane id=":J_c0_0" length="11"/></edge>
       <edge id=":J_c1" function="crossing"><lane id=":J_c1_0" length="5"/></edge>
       <tlLogic id="J" type="static" programID="0" offset="0"><phase duration="30" state="GrG"/>
@@ -436,7 +568,9 @@ def test_crossings_that_never_have_green_get_a_phase() -> None:
       <connection from=":J_w0" to=":J_c1" tl="J" linkIndex="2"/></net>"""
     root = ET.fromstring(net)
     assert walks_of(root).never == [":J_c0"]
-    assert mend_signals(root) == ["signals that never let people cross got a walk phase at the end of each cycle: J"]
+    assert mend_signals(root) == [
+        "signals that never let people cross got a walk phase at the end of each cycle: J"
+    ]
     added = [(p.get("duration"), p.get("state")) for p in root.iter("phase")][3:]
     assert added == [("3", "yrr"), ("2", "rrr"), ("8", "rGr"), ("10", "rrr")]
     assert walks_of(root).never == [] and mend_signals(root) == []
@@ -445,16 +579,24 @@ def test_crossings_that_never_have_green_get_a_phase() -> None:
 
 
 def with_ways(ways: dict[str, tuple[list[tuple[float, float]], dict[str, str]]]) -> str:
-    """The town of `osm` with further ways: places in blocks east and north of its corner, and tags."""
-    (lon, lat), nodes, rows = BERLIN, list[str](), list[str]()
+    """The town of `osm` with further ways: places in blocks east and north of its corner, and
+    tags."""
+    (lon, lat) = BERLIN
+    nodes = list[str]()
+    rows = list[str]()
     number = {(float(i), float(k)): 1 + 4 * i + k for i in range(4) for k in range(4)}
     for way, (points, tags) in ways.items():
         for x, y in points:
             if (x, y) not in number:
                 number[x, y] = 1000 + len(number)
-                nodes.append(f'<node id="{number[x, y]}" lon="{lon + 0.0017 * x:.7f}" lat="{lat + 0.0011 * y:.7f}"/>')
+                nodes.append(
+                    f'<node id="{number[x, y]}" lon="{lon + 0.0017 * x:.7f}" '
+                    f'lat="{lat + 0.0011 * y:.7f}"/>'
+                )
         refs = "".join(f'<nd ref="{number[point]}"/>' for point in points)
-        rows.append(f'<way id="{way}">{refs}{"".join(f"<tag k={k!r} v={v!r}/>" for k, v in tags.items())}</way>')
+        rows.append(
+            f'<way id="{way}">{refs}{"".join(f"<tag k={k!r} v={v!r}/>" for k, v in tags.items())}</way>'
+        )
     # netconvert reads no nodes after the first way.
     town = osm().replace("<node", "".join(nodes) + "<node", 1)
     return town.replace("</osm>", "\n".join(rows) + "</osm>")
@@ -462,7 +604,8 @@ def with_ways(ways: dict[str, tuple[list[tuple[float, float]], dict[str, str]]])
 
 @pytest.mark.engine
 def test_a_layer_alone_closes_no_sidewalk(tmp_path: Path) -> None:
-    """A layer counts with a bridge, a tunnel, a roof or a street over or under it; level and location count alone.
+    """A layer counts with a bridge, a tunnel, a roof or a street over or under it; level and
+    location count alone.
 
     A bridge closes its own part of a street, not the streets before and after it.
     """
@@ -474,27 +617,49 @@ def test_a_layer_alone_closes_no_sidewalk(tmp_path: Path) -> None:
             "402": ([(4.3, 0.0), (5.0, 0.0)], street),
             "403": ([(0.0, 3.0), (0.0, 4.0), (0.5, 4.5)], {"highway": "footway", "layer": "1"}),
             "404": ([(1.0, 3.0), (1.5, 3.4), (1.5, 2.5)], {"highway": "footway", "layer": "-1"}),
-            "405": ([(2.0, 3.0), (2.0, 4.0)], {"highway": "footway", "layer": "-1", "covered": "yes"}),
+            "405": (
+                [(2.0, 3.0), (2.0, 4.0)],
+                {"highway": "footway", "layer": "-1", "covered": "yes"},
+            ),
             "406": ([(3.0, 3.0), (3.0, 4.0)], {"highway": "footway", "level": "-2"}),
-            "407": ([(3.0, 2.0), (4.0, 2.0)], {"highway": "footway", "covered": "yes", "level": "0;1"}),
+            "407": (
+                [(3.0, 2.0), (4.0, 2.0)],
+                {"highway": "footway", "covered": "yes", "level": "0;1"},
+            ),
         }
     )
     about = import_map(written(tmp_path / "levels.osm", text))
-    going = {name.lstrip("-").split("#")[0]: s.going for name, s in read_map("levels").strips.items() if name[0] != ":"}
+    going = {
+        name.lstrip("-").split("#")[0]: s.going
+        for name, s in read_map("levels").strips.items()
+        if name[0] != ":"
+    }
     assert {way: going[way] for way in map(str, range(400, 408))} == {
-        "400": "plain", "401": "bridge", "402": "plain", "403": "plain",
-        "404": "bridge", "405": "bridge", "406": "bridge", "407": "plain",
-    }  # fmt: skip
+        "400": "plain",
+        "401": "bridge",
+        "402": "plain",
+        "403": "plain",
+        "404": "bridge",
+        "405": "bridge",
+        "406": "bridge",
+        "407": "plain",
+    }
     assert (
-        "3 walkways with a layer are on the ground: no bridge, no tunnel, no street over or under them" in about.changes
+        "3 walkways with a layer are on the ground: no bridge, no tunnel, no street over or "
+        "under them" in about.changes
     )
-    assert any(change.startswith("1 walkways are above or below the ground by their level") for change in about.changes)
+    assert any(
+        change.startswith("1 walkways are above or below the ground by their level")
+        for change in about.changes
+    )
 
 
 def test_greens_too_short_to_walk_are_lengthened() -> None:
-    """Each green lasts as long as the crossing takes; no state changes, so nothing goes together that did not before.
+    """Each green lasts as long as the crossing takes; no state changes, so nothing goes together
+    that did not before.
 
-    The seconds come from the program's long phases; a program that is not fixed is left alone, and named.
+    The seconds come from the program's long phases; a program that is not fixed is left alone, and
+    named.
     """
     net = """<net version="1.20"><edge id=":J_c0" function="crossing"><lane id=":J_c0_0" length="12"/></edge>
       <edge id=":J_c1" function="crossing"><lane id=":J_c1_0" length="6"/></edge>
@@ -519,22 +684,30 @@ def test_greens_too_short_to_walk_are_lengthened() -> None:
 
 @pytest.mark.engine
 def test_greens_of_imported_signals_are_long_enough(tmp_path: Path) -> None:
-    """In a town of one-way streets with signals netconvert's greens of 5 s are too short; after the import none is."""
+    """In a town of one-way streets with signals netconvert's greens of 5 s are too short; after the
+    import none is."""
     signal = '><tag k="highway" v="traffic_signals"/></node>\n<node'
     text = osm(highway="primary", blocks=2).replace("/>\n<node", signal)
-    text = text.replace('v="primary"/>', 'v="primary"/><tag k="lanes" v="4"/><tag k="oneway" v="yes"/>')
+    text = text.replace(
+        'v="primary"/>', 'v="primary"/><tag k="lanes" v="4"/><tag k="oneway" v="yes"/>'
+    )
     about = import_map(written(tmp_path / "wide.osm", text))
     crossings = [s for s in read_map("wide").strips.values() if s.signalised and s.plan is not None]
     assert len(crossings) >= 6 and any("green too short" in change for change in about.changes)
     for strip in crossings:
         assert strip.plan is not None
         phases = zip(strip.plan.walks, strip.plan.durations_ms, strict=True)
-        greens = [sum(ms for _, ms in run) / 1000.0 for go, run in groupby(phases, lambda phase: phase[0]) if go]
+        greens = [
+            sum(ms for _, ms in run) / 1000.0
+            for go, run in groupby(phases, lambda phase: phase[0])
+            if go
+        ]
         assert min(greens) >= strip.length_m / 1.2 + 4.0 - 0.01, strip.id
 
 
 def test_torn_corners_are_widened_and_good_ones_left_alone(tmp_path: Path) -> None:
-    """A walking area that crosses itself between two sidewalks becomes ground a robot can pass; a whole one stays."""
+    """A walking area that crosses itself between two sidewalks becomes ground a robot can pass; a
+    whole one stays."""
     net = """<net version="1.9"><location convBoundary="0,0,30,9"/>
       <edge id=":J_w0" function="walkingarea"><lane id=":J_w0_0" allow="pedestrian" length="4" width="2"
         shape="10,-1 14,1 14,-1 10,1"/></edge>
@@ -547,7 +720,9 @@ def test_torn_corners_are_widened_and_good_ones_left_alone(tmp_path: Path) -> No
       <connection from="b" to=":K_w0" fromLane="0" toLane="0"/><connection from=":K_w0" to="c" fromLane="0" toLane="0"/>
       </net>"""
     path = written(tmp_path / "torn.net.xml", net)
-    root, leave, enter = ET.fromstring(net), Port("a", 1), Port("b", 0)
+    root = ET.fromstring(net)
+    leave = Port("a", 1)
+    enter = Port("b", 0)
     assert read_net(path).corners[":J_w0"].polygon.buffer(-0.1).geom_type == "MultiPolygon"
     assert mend_corners(root, read_net(path)) == [
         "1 of 2 corners were torn or pinched: widened along the ways across them"
@@ -563,7 +738,8 @@ def test_torn_corners_are_widened_and_good_ones_left_alone(tmp_path: Path) -> No
 @pytest.mark.engine
 def test_command_line(tmp_path: Path, cosim: Cosim) -> None:
     """import and check, their output and exit codes."""
-    source, picture = written(tmp_path / "town.osm", osm()), tmp_path / "town.png"
+    source = written(tmp_path / "town.osm", osm())
+    picture = tmp_path / "town.png"
     done = cosim("map", "import", str(source), "--name", "town")
     assert done.returncode == 0 and "long route" in done.stdout, done.stderr
     assert "converting " in done.stderr and "checking town ..." in done.stderr
@@ -598,7 +774,19 @@ def spoiled(draw: st.DrawFn, data: bytes) -> bytes:
     places = list(re.finditer(rb" " + name + rb'="([^"]*)"', data))
     few = draw(st.booleans())
     chosen = [places[draw(st.integers(0, len(places) - 1))]] if few else places
-    values = (b"", b"nan", b"-1", b"1e999", b"x y", b"0,0", b"1,1 1,1", "七".encode(), b"99999999999", b":", b"true")
+    values = (
+        b"",
+        b"nan",
+        b"-1",
+        b"1e999",
+        b"x y",
+        b"0,0",
+        b"1,1 1,1",
+        "七".encode(),
+        b"99999999999",
+        b":",
+        b"true",
+    )
     value = b"" if how == "drop" else b" " + name + b'="' + draw(st.sampled_from(values)) + b'"'
     for place in reversed(chosen):
         data = data[: place.start()] + value + data[place.end() :]
@@ -640,7 +828,8 @@ def test_importing_damaged_files_ends_in_a_map_or_a_map_error(
     tmp_path_factory: pytest.TempPathFactory, data: bytes, as_is: bool
 ) -> None:
     """import_map raises MapError or keeps a whole map, never anything between."""
-    path, before = tmp_path_factory.mktemp("spoiled") / "spoiled.xml", kept()
+    path = tmp_path_factory.mktemp("spoiled") / "spoiled.xml"
+    before = kept()
     path.write_bytes(data)
     try:
         import_map(path, "spoiled", Options(as_is=as_is))
@@ -663,7 +852,9 @@ def test_shared_maps_import(request: pytest.FixtureRequest, name: str) -> None:
     about = import_map(source, name)
     street_map, check, _ = checked_map(name)
     measured_km = stats[stats["meta"]["net"]]["stat"]["walkable_km"]
-    assert check.facts is not None and check.facts.walkable_km == pytest.approx(measured_km, rel=0.05)
+    assert check.facts is not None and check.facts.walkable_km == pytest.approx(
+        measured_km, rel=0.05
+    )
     assert check.walkable_km == pytest.approx(measured_km, rel=0.05)
     assert check.usable and about.licences
     assert not check.facts.never_green

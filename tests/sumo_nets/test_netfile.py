@@ -10,8 +10,8 @@ import pytest
 
 from cosim.core.errors import MapError
 from cosim.place.street_map import Port
+from sumo_nets.net.net_file import read_net
 from sumo_nets.net.net_hash import net_content_hash
-from sumo_nets.net.netfile import read_net
 
 NET = """<?xml version="1.0" encoding="UTF-8"?>
 <!-- generated on 2020-01-01 in /somewhere -->
@@ -53,9 +53,11 @@ def written(folder: Path, text: str, name: str = "small.net.xml") -> Path:
 
 
 def test_trains_and_ships_have_no_road_but_trams_do(tmp_path: Path) -> None:
-    """A railway, a ferry and what OpenStreetMap calls any rail are not read as lanes; a tram's and a bus's are."""
+    """A railway, a ferry and what OpenStreetMap calls any rail are not read as lanes; a tram's and
+    a bus's are."""
     row = (
-        '<edge id="{0}" from="L" to="M"><lane id="{0}_0" index="0" allow="{1}" length="9" shape="900,0 909,0"/></edge>'
+        '<edge id="{0}" from="L" to="M"><lane id="{0}_0" index="0" allow="{1}" length="9" '
+        'shape="900,0 909,0"/></edge>'
     )
     allowed = {
         "railway": "rail rail_electric rail_fast",
@@ -67,11 +69,16 @@ def test_trains_and_ships_have_no_road_but_trams_do(tmp_path: Path) -> None:
     }
     rows = "".join(row.format(*pair) for pair in allowed.items())
     place = read_net(written(tmp_path, NET.replace("<junction", rows + "<junction", 1)))
-    assert {lane.edge for lane in place.lanes.values()} & allowed.keys() == {"light", "tram", "shared"}
+    assert {lane.edge for lane in place.lanes.values()} & allowed.keys() == {
+        "light",
+        "tram",
+        "shared",
+    }
 
 
 def test_stairs_bridges_and_tunnels_are_told_from_plain_ground(tmp_path: Path) -> None:
-    """By the type of the edge or by what it says of bridge, tunnel and layer; a passage through a house is plain."""
+    """By the type of the edge or by what it says of bridge, tunnel and layer; a passage through a
+    house is plain."""
     said = {
         "stairs": ("highway.footway|highway.steps", "", ""),
         "deck": ("highway.footway", "bridge", "viaduct"),
@@ -80,15 +87,26 @@ def test_stairs_bridges_and_tunnels_are_told_from_plain_ground(tmp_path: Path) -
         "passage": ("highway.footway", "tunnel", "building_passage"),
     }
     lane = '<lane id="{0}_0" index="0" allow="pedestrian" length="9" shape="90,20 99,20"/>'
-    row = '<edge id="{0}" from="L" to="M" type="{1}">' + lane + '<param key="{2}" value="{3}"/></edge>'
+    row = (
+        '<edge id="{0}" from="L" to="M" type="{1}">'
+        + lane
+        + '<param key="{2}" value="{3}"/></edge>'
+    )
     rows = "".join(row.format(name, *words) for name, words in said.items())
     strips = read_net(written(tmp_path, NET.replace("<junction", rows + "<junction", 1))).strips
-    going = {"stairs": "steps", "deck": "bridge", "subway": "bridge", "above": "bridge", "passage": "plain"}
+    going = {
+        "stairs": "steps",
+        "deck": "bridge",
+        "subway": "bridge",
+        "above": "bridge",
+        "passage": "plain",
+    }
     assert {name: strips[name].going for name in said} == going and strips["path"].going == "plain"
 
 
 def test_strips_lanes_and_corners_are_told_apart(tmp_path: Path) -> None:
-    """Sidewalks, shared paths and crossings are strips; verges and carriageways lanes; walking areas corners."""
+    """Sidewalks, shared paths and crossings are strips; verges and carriageways lanes; walking
+    areas corners."""
     place = read_net(written(tmp_path, NET))
     assert {strip.id: strip.kind for strip in place.strips.values()} == {
         ":J_c0": "crossing",
@@ -106,7 +124,8 @@ def test_strips_lanes_and_corners_are_told_apart(tmp_path: Path) -> None:
 
 
 def test_strip_knows_its_street(tmp_path: Path) -> None:
-    """Params win over defaults, a missing width is 3.2 m, elevations are dropped, a path has no road."""
+    """Params win over defaults, a missing width is 3.2 m, elevations are dropped, a path has no
+    road."""
     place = read_net(written(tmp_path, NET))
     side, path, crossing = place.strips["in"], place.strips["path"], place.strips[":J_c0"]
     assert (side.frontage_m, side.verge_m, side.curb_m, side.road_side) == (1.5, 1.6, 0.3, 1)
@@ -143,7 +162,9 @@ def test_hash_ignores_comments_and_packing_but_not_content(tmp_path: Path) -> No
     """Time stamps, folders, line ends and gzip do not count; one centimetre does."""
     plain = written(tmp_path, NET)
     packed = tmp_path / "packed.net.xml.gz"
-    packed.write_bytes(gzip.compress(NET.replace("2020-01-01", "2021-02-02").replace("\n", "\r\n").encode()))
+    packed.write_bytes(
+        gzip.compress(NET.replace("2020-01-01", "2021-02-02").replace("\n", "\r\n").encode())
+    )
     moved = written(tmp_path, NET.replace("108,1.6", "108.01,1.6"), "moved.net.xml")
     assert net_content_hash(plain) == net_content_hash(packed) == read_net(packed).net_hash
     assert len(net_content_hash(plain)) == 16
@@ -171,17 +192,28 @@ def test_stubs_of_no_length_become_tiny_strips(tmp_path: Path) -> None:
         ),
         (NET.replace("58,1.6 108,1.6", "58 108,1.6"), "points that are not x,y"),
         (NET.replace("58,1.6 108,1.6", "nan,1.6 108,1.6"), "points that are not x,y"),
-        (NET.replace("58,1.6 108,1.6", "58,1.6 108,1e300"), "'path_0': a shape with points that are not x,y"),
+        (
+            NET.replace("58,1.6 108,1.6", "58,1.6 108,1e300"),
+            "'path_0': a shape with points that are not x,y",
+        ),
         (NET.replace("58,1.6 108,1.6", ""), "a shape without points"),
         (NET.replace('<edge id="in"', '<edge name="in"'), "<edge> '' lacks 'id': line 15"),
         (NET.replace("UTF-8", "klingon"), "broken XML: unknown encoding"),
         (NET.replace('width="3.20"', 'width="wide"'), "lane ':J_c0_0': width 'wide' is no number"),
-        (NET.replace('width="3.20"', 'width="1e9"'), "lane ':J_c0_0': width '1e9' is a width of 1e+09 m"),
-        (NET.replace('fromLane="0"', 'fromLane="x"'), "connection from 'in' to ':J_w0': fromLane 'x' is no number"),
+        (
+            NET.replace('width="3.20"', 'width="1e9"'),
+            "lane ':J_c0_0': width '1e9' is a width of 1e+09 m",
+        ),
+        (
+            NET.replace('fromLane="0"', 'fromLane="x"'),
+            "connection from 'in' to ':J_w0': fromLane 'x' is no number",
+        ),
         (NET.replace("<lane id", "<a>" * 50 + "<lane id", 1), "nested more than 40 deep: line 5"),
     ],
 )
-def test_broken_nets_are_refused_with_file_and_reason(tmp_path: Path, text: str, reason: str) -> None:
+def test_broken_nets_are_refused_with_file_and_reason(
+    tmp_path: Path, text: str, reason: str
+) -> None:
     """Whatever is wrong inside, the error is a MapError that names the file."""
     with pytest.raises(MapError) as caught:
         read_net(written(tmp_path, text))

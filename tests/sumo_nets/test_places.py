@@ -1,5 +1,5 @@
-"""Whatever a user calls a place can be run on: maps by name, folders of cities and maps, nets; and the store of maps
-holds whole ones only, whoever dies or comes at the same moment."""
+"""Whatever a user calls a place can be run on: maps by name, folders of cities and maps, nets; and
+the store of maps holds whole ones only, whoever dies or comes at the same moment."""
 
 from __future__ import annotations
 
@@ -17,11 +17,19 @@ import pytest
 
 from cosim.core.errors import MapError, SpecError, UsageError
 from cosim.spec.scenario import City, CityMap
-from scenarios.builders.sample import suite_on_map
 from scenarios.events import EVENT_KINDS
-from scenarios.execution.places import place
+from scenarios.places.nets import place
+from scenarios.suites.sample import suite_on_map
 from sumo_nets.city.store import NET_NAME, write_city
-from sumo_nets.maps.mapstore import ABOUT, about_map, import_map, known_maps, map_net, maps_folder, read_map
+from sumo_nets.maps.map_store import (
+    ABOUT,
+    about_map,
+    import_map,
+    known_maps,
+    map_net,
+    maps_folder,
+    read_map,
+)
 from sumo_nets.maps.place_names import place_called
 from sumo_nets.maps.scratch import HELD, PREFIX, move_in, scratch_in
 from tests.conftest import PATIENCE_S, Cosim
@@ -46,8 +54,11 @@ def city(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_what_is_no_place_is_told_with_what_there_is(tmp_path: Path) -> None:
-    """An unknown name, a folder of something else and a file that must be imported first: each with the remedy."""
-    with pytest.raises(UsageError, match=r"unknown map 'nowhere'.*sumo-fkk-in.*Or give a path: the folder of"):
+    """An unknown name, a folder of something else and a file that must be imported first: each with
+    the remedy."""
+    with pytest.raises(
+        UsageError, match=r"unknown map 'nowhere'.*sumo-fkk-in.*Or give a path: the folder of"
+    ):
         place_called("nowhere")
     with pytest.raises(UsageError, match=r"a folder without city\.json or about\.json"):
         place_called(str(tmp_path))
@@ -64,8 +75,11 @@ def test_what_is_no_place_is_told_with_what_there_is(tmp_path: Path) -> None:
 
 
 def test_suites_that_cannot_be_drawn_are_refused() -> None:
-    """Another kind of suite, or an event that does not exist, with the valid ones; before any map is looked for."""
-    with pytest.raises(UsageError, match=r"suite for --map 'unit'\. Valid choices: long-horizon, reactive"):
+    """Another kind of suite, or an event that does not exist, with the valid ones; before any map
+    is looked for."""
+    with pytest.raises(
+        UsageError, match=r"suite for --map 'unit'\. Valid choices: long-horizon, reactive"
+    ):
         suite_on_map("unit", "nowhere", 0, 1)
     with pytest.raises(UsageError, match=r"event 'ambush'\. Valid choices: .*frontal"):
         suite_on_map("reactive", "nowhere", 0, 1, events=["ambush"])
@@ -80,19 +94,27 @@ def test_names_that_lead_out_of_the_store_are_unknown() -> None:
 
 @pytest.mark.engine
 def test_the_folder_of_a_city_is_that_city(city: Path) -> None:
-    """It is the same place as by its seed, with the hash of its net, so that a run of it needs no folder."""
+    """It is the same place as by its seed, with the hash of its net, so that a run of it needs no
+    folder."""
     where = place_called(str(city), roughness=0.2)
     assert where == place_called(str(city / NET_NAME), roughness=0.2)
-    assert isinstance(where, City) and (where.seed, where.size_m, where.roughness) == (7, 400.0, 0.2)
+    assert isinstance(where, City) and (where.seed, where.size_m, where.roughness) == (
+        7,
+        400.0,
+        0.2,
+    )
     for kind in ("long-horizon", "reactive"):
         one, again = (suite_on_map(kind, str(city), 3, 2) for _ in range(2))
         assert one == again and len(one.scenarios) == 2
-        assert all(s.place == City(seed=7, size_m=400.0, net_hash=where.net_hash) for s in one.scenarios)
+        assert all(
+            s.place == City(seed=7, size_m=400.0, net_hash=where.net_hash) for s in one.scenarios
+        )
 
 
 @pytest.mark.engine
 def test_a_changed_city_is_a_map(city: Path, tmp_path: Path) -> None:
-    """When its net is not the one of its seed any more, the folder's net is what is run on; it is imported once."""
+    """When its net is not the one of its seed any more, the folder's net is what is run on; it is
+    imported once."""
     mine = tmp_path / "mine"
     shutil.copytree(city, mine)
     net = (mine / NET_NAME).read_text()
@@ -103,20 +125,37 @@ def test_a_changed_city_is_a_map(city: Path, tmp_path: Path) -> None:
     assert place_called(str(mine)) == where
     assert (maps_folder() / where.map / ABOUT).stat().st_mtime_ns == began
     (scenario,) = suite_on_map("long-horizon", str(mine), 0, 1).scenarios
-    assert isinstance(scenario.place, CityMap) and scenario.place.net_hash == read_map(where.map).net_hash
+    assert (
+        isinstance(scenario.place, CityMap)
+        and scenario.place.net_hash == read_map(where.map).net_hash
+    )
 
 
 @pytest.mark.engine
 def test_nets_and_folders_of_maps_are_imported_under_a_name(city: Path, tmp_path: Path) -> None:
-    """A net gets its file's name, another of that name one with its hash; a map's folder brings its buildings along."""
-    net, other = tmp_path / "street.net.xml", tmp_path / "b" / "street.net.xml"
+    """A net gets its file's name, another of that name one with its hash; a map's folder brings its
+    buildings along."""
+    net = tmp_path / "street.net.xml"
+    other = tmp_path / "b" / "street.net.xml"
     shutil.copy(city / NET_NAME, net)
     other.parent.mkdir()
     other.write_bytes(net.read_bytes() + b"<!-- another file -->\n")
-    assert place_called(str(net)) == CityMap(map="street") == place_called(str(net)) == place_called("street")
+    assert (
+        place_called(str(net))
+        == CityMap(map="street")
+        == place_called(str(net))
+        == place_called("street")
+    )
     second = place_called(str(other))
-    assert isinstance(second, CityMap) and second.map.startswith("street-") and second.map in known_maps()
-    house = '<way id="400"><nd ref="5"/><nd ref="6"/><nd ref="7"/><nd ref="5"/><tag k="building" v="yes"/></way>'
+    assert (
+        isinstance(second, CityMap)
+        and second.map.startswith("street-")
+        and second.map in known_maps()
+    )
+    house = (
+        '<way id="400"><nd ref="5"/><nd ref="6"/><nd ref="7"/><nd ref="5"/><tag k="building" '
+        'v="yes"/></way>'
+    )
     spots = [(5, 13.4005, 52.5005), (6, 13.4009, 52.5005), (7, 13.4009, 52.5008)]
     nodes = "".join(f'<node id="{n}" lon="{lon}" lat="{lat}"/>' for n, lon, lat in spots)
     (tmp_path / "town.osm").write_text(
@@ -127,30 +166,39 @@ def test_nets_and_folders_of_maps_are_imported_under_a_name(city: Path, tmp_path
     assert place_called(str(maps_folder() / "town")) == CityMap(map="town")
     elsewhere = tmp_path / "kept"
     shutil.move(maps_folder() / "town", elsewhere)
-    assert place_called(str(elsewhere)) == CityMap(map="town") and read_map("town").net_hash == about.net_hash
+    assert (
+        place_called(str(elsewhere)) == CityMap(map="town")
+        and read_map("town").net_hash == about.net_hash
+    )
     assert {f.kind for f in read_map("town").features} == {"building"}
-    (elsewhere / "net.xml").write_text((elsewhere / "net.xml").read_text().replace("13.89", "13.88"))
+    (elsewhere / "net.xml").write_text(
+        (elsewhere / "net.xml").read_text().replace("13.89", "13.88")
+    )
     with pytest.raises(MapError, match="it was changed since; import the changed net"):
         place_called(str(elsewhere))
 
 
 @pytest.mark.engine
 def test_reactive_scenarios_are_drawn_where_there_is_room() -> None:
-    """Events take turns over the seeds; those without room are left out and named, unless they were asked for."""
+    """Events take turns over the seeds; those without room are left out and named, unless they were
+    asked for."""
     whole = suite_on_map("reactive", "sumo-fkk-in", 0, None)
     kinds = [s.events[0].kind for s in whole.scenarios]
     left_out = [kind for kind in EVENT_KINDS if f"No '{kind}'" in whole.description]
     assert kinds and left_out and sorted([*kinds, *left_out]) == sorted(EVENT_KINDS)
     some = suite_on_map("reactive", "sumo-fkk-in", 5, 3, events=kinds[:2])
     assert [s.events[0].kind for s in some.scenarios] == [kinds[0], kinds[1], kinds[0]]
-    assert len({s.id for s in some.scenarios}) == 3 and all(s.place.net_hash for s in some.scenarios)
+    assert len({s.id for s in some.scenarios}) == 3 and all(
+        s.place.net_hash for s in some.scenarios
+    )
     with pytest.raises(SpecError, match=f"no place for '{left_out[0]}' on 'sumo-fkk-in'"):
         suite_on_map("reactive", "sumo-fkk-in", 0, 1, events=[left_out[0]])
 
 
 @pytest.mark.engine
 def test_a_run_on_a_city_of_ones_own_is_replayed(cosim: Cosim, city: Path) -> None:
-    """`cosim run reactive --map FOLDER` runs, and its replay gives the recorded hash from the run's folder alone."""
+    """`cosim run reactive --map FOLDER` runs, and its replay gives the recorded hash from the run's
+    folder alone."""
     words = ("--map", "seven", "--event", "frontal", "--policy", "straight", "--out", "run")
     said = cosim("run", "reactive", *words, cwd=city.parent)
     assert said.returncode == 0, said.stderr
@@ -197,7 +245,9 @@ def test_a_finished_folder_takes_the_place_of_the_old_one(tmp_path: Path) -> Non
     assert (tmp_path / "maps" / "town" / "net.xml").read_text() == "1"
 
 
-def test_a_reader_waits_while_a_map_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reader_waits_while_a_map_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A map that is gone for the moment of its replacement is not unknown to who asks just then."""
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
     net = maps_folder() / "town" / "net.xml"
@@ -215,7 +265,7 @@ def test_a_reader_waits_while_a_map_is_replaced(tmp_path: Path, monkeypatch: pyt
 IMPORTER = """
 import sys
 from pathlib import Path
-from sumo_nets.maps.mapstore import import_map, read_map
+from sumo_nets.maps.map_store import import_map, read_map
 for _ in range(2):
     import_map(Path(sys.argv[1]), "shared")
     assert read_map("shared").strips
@@ -224,7 +274,8 @@ for _ in range(2):
 
 @pytest.mark.engine
 def test_two_processes_import_one_name_at_once(tmp_path: Path) -> None:
-    """Each ends well and reads a whole map at any moment; one whole map is left, and no scratch folder."""
+    """Each ends well and reads a whole map at any moment; one whole map is left, and no scratch
+    folder."""
     (tmp_path / "town.osm").write_text(TOWN)
     before = sorted(p.name for p in maps_folder().glob("*"))
     command = [sys.executable, "-c", IMPORTER, str(tmp_path / "town.osm")]
@@ -236,12 +287,20 @@ def test_two_processes_import_one_name_at_once(tmp_path: Path) -> None:
     assert about_map("shared").net_hash == read_map("shared").net_hash
 
 
-def test_a_damaged_map_does_not_hide_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The list shows it as damaged; a name that is unknown is still answered with those that are known."""
+def test_a_damaged_map_does_not_hide_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The list shows it as damaged; a name that is unknown is still answered with those that are
+    known."""
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
     (maps_folder() / "broken").mkdir(parents=True)
     (maps_folder() / "broken" / "net.xml").write_text("<net/>")
     (maps_folder() / "broken" / ABOUT).write_bytes(msgspec.json.encode({"name": 1}))
-    assert known_maps()["broken"].source == "damaged: import it again" and "sumo-fkk-in" in known_maps()
-    with pytest.raises(UsageError, match=r"unknown map 'x'\. Valid choices: berlin-1, .* broken, .*sumo-"):
+    assert (
+        known_maps()["broken"].source == "damaged: import it again"
+        and "sumo-fkk-in" in known_maps()
+    )
+    with pytest.raises(
+        UsageError, match=r"unknown map 'x'\. Valid choices: berlin-1, .* broken, .*sumo-"
+    ):
         place_called("x")

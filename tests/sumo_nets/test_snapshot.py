@@ -17,7 +17,7 @@ from cosim.core.errors import MapError
 from cosim.spec.scenario import City
 from sumo_nets.city.store import city_net
 from sumo_nets.net import snapshot
-from sumo_nets.net.netfile import read_net
+from sumo_nets.net.net_file import read_net
 from sumo_nets.net.snapshot import SNAPSHOT_FOLDER, map_as_bytes, street_map_of, thawed
 from tests.conftest import PATIENCE_S
 
@@ -49,22 +49,29 @@ def test_a_snapshot_holds_every_value_of_the_map(net: Path) -> None:
         again = back.strips[name]
         assert np.array_equal(again.line, strip.line)
         assert shapely.equals_exact(again.polygon, strip.polygon, 0.0)
-        assert (again.corners, again.driveways, again.width_m) == (strip.corners, strip.driveways, strip.width_m)
+        assert (again.corners, again.driveways, again.width_m) == (
+            strip.corners,
+            strip.driveways,
+            strip.width_m,
+        )
     for name, corner in read.corners.items():
         assert back.corners[name].ports == corner.ports
         assert type(back.corners[name].polygon) is type(corner.polygon)
 
 
-def test_the_second_reading_comes_from_the_snapshot(net: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_second_reading_comes_from_the_snapshot(
+    net: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Once a snapshot lies there the net itself is not parsed again."""
     first = street_map_of(net)
     assert len(list(cache.iterdir())) == 1
-    monkeypatch.setattr("sumo_nets.net.netfile.read_net", lambda _: pytest.fail("parsed again"))
+    monkeypatch.setattr("sumo_nets.net.net_file.read_net", lambda _: pytest.fail("parsed again"))
     assert map_as_bytes(street_map_of(net)) == map_as_bytes(first)
 
 
 def test_who_keeps_a_snapshot_makes_room_first(net: Path, cache: Path) -> None:
-    """A snapshot that was not used for a month goes; the new one is in use, and stays whatever the limit."""
+    """A snapshot that was not used for a month goes; the new one is in use, and stays whatever the
+    limit."""
     cache.mkdir(parents=True)
     (cache / "old.map").write_bytes(b"old")
     os.utime(cache / "old.map", (0.0, 0.0))
@@ -87,15 +94,19 @@ def test_a_damaged_snapshot_is_made_anew(net: Path, cache: Path) -> None:
 
 
 @pytest.mark.parametrize("package", ["numpy", "scipy", "shapely"])
-def test_another_library_has_another_snapshot(monkeypatch: pytest.MonkeyPatch, package: str) -> None:
-    """Terrain, polygons and lines are made by these packages: what one version made is not given out for another's."""
+def test_another_library_has_another_snapshot(
+    monkeypatch: pytest.MonkeyPatch, package: str
+) -> None:
+    """Terrain, polygons and lines are made by these packages: what one version made is not given
+    out for another's."""
     before = snapshot._reader()
     monkeypatch.setattr(snapshot, "version", lambda name: "0" if name == package else version(name))
     assert snapshot._reader() != before
 
 
 def test_another_net_has_another_snapshot(net: Path, cache: Path, tmp_path: Path) -> None:
-    """The net's bytes are part of a snapshot's name: an edited net is never answered from an old one."""
+    """The net's bytes are part of a snapshot's name: an edited net is never answered from an old
+    one."""
     street_map_of(net)
     edited = tmp_path / net.name
     edited.write_bytes(net.read_bytes().replace(b'"frontage_m" value="', b'"frontage_m" value="1'))
@@ -103,7 +114,9 @@ def test_another_net_has_another_snapshot(net: Path, cache: Path, tmp_path: Path
     assert len(list(cache.iterdir())) == 2
 
 
-def test_a_cache_that_cannot_be_written_is_no_error(net: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cache_that_cannot_be_written_is_no_error(
+    net: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The map is read all the same."""
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "file"))
@@ -111,8 +124,8 @@ def test_a_cache_that_cannot_be_written_is_no_error(net: Path, tmp_path: Path, m
 
 
 def test_a_full_disk_leaves_no_half_snapshot(net: Path, tmp_path: Path) -> None:
-    """The map is read all the same, one line says that it is not kept, and the next process finds nothing that it could
-    take for one."""
+    """The map is read all the same, one line says that it is not kept, and the next process finds
+    nothing that it could take for one."""
     code = (
         "import pathlib, resource, sys\nfrom sumo_nets.net.snapshot import street_map_of\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
@@ -128,7 +141,10 @@ def test_a_full_disk_leaves_no_half_snapshot(net: Path, tmp_path: Path) -> None:
         check=False,
     )
     assert done.stdout == f"{len(read_net(net).strips)}\n", done.stderr
-    assert done.stderr.startswith(f"note: {kept / 'read'}: not kept") and len(done.stderr.splitlines()) == 1
+    assert (
+        done.stderr.startswith(f"note: {kept / 'read'}: not kept")
+        and len(done.stderr.splitlines()) == 1
+    )
     assert list((kept / "read").iterdir()) == []
 
 

@@ -16,8 +16,8 @@ from cosim.spec.events import EventReply
 from cosim.spec.scenario import City, CrowdSpec
 from sumo_nets.city.store import city_net
 from sumo_nets.crowd.crowd import SumoCrowd
+from sumo_nets.crowd.kerb_waiting import Kerbs
 from sumo_nets.crowd.proxy import KEEP_ROUTE, KEEP_ROUTE_ON_ROAD, MATCH_M, NEARER_M, Walks
-from sumo_nets.crowd.waiting_spots import Kerbs
 from sumo_nets.engine import persons_near, sumo, vehicles_near
 from sumo_nets.net.snapshot import street_map_of
 
@@ -37,25 +37,37 @@ def crowd(street_map: StreetMap) -> Iterator[SumoCrowd]:
     spec = CrowdSpec(persons=50, radius_m=80.0, vehicles=12)
     with SumoCrowd(city_net(CITY), street_map, spec, 3, frozenset(), middle[:2]) as running:
         for tick in range(10):
-            running.step(RobotState(middle), EventReply(episode="", tick=tick, states=(), actors=()))
+            running.step(
+                RobotState(middle), EventReply(episode="", tick=tick, states=(), actors=())
+            )
         yield running
 
 
 @pytest.mark.engine
 def test_who_is_near_is_who_is_within_reach(crowd: SumoCrowd) -> None:
-    """Of a crowd all within reach of a point are told, nobody beyond, with places, speeds and edges; vehicles alike."""
+    """Of a crowd all within reach of a point are told, nobody beyond, with places, speeds and
+    edges; vehicles alike."""
     x_m, y_m = crowd.street.people.xy.mean(axis=0).tolist()
     ours = set(sumo.person.getIDList()[::2])
     for reach_m in (60.0, 75.0, 500.0):
         near = persons_near(x_m, y_m, reach_m, ours)
         away_m = {name: math.dist(sumo.person.getPosition(name), (x_m, y_m)) for name in ours}
-        assert list(near.names) == sorted(name for name, far_m in away_m.items() if far_m <= reach_m)
+        assert list(near.names) == sorted(
+            name for name, far_m in away_m.items() if far_m <= reach_m
+        )
         for k, name in enumerate(near.names):
-            assert tuple(near.xy[k]) == sumo.person.getPosition(name) and near.mps[k] == sumo.person.getSpeed(name)
+            assert tuple(near.xy[k]) == sumo.person.getPosition(name) and near.mps[
+                k
+            ] == sumo.person.getSpeed(name)
             assert near.ahead[k] == sumo.person.getNextEdge(name)
     assert 0 < len(persons_near(x_m, y_m, 60.0, ours).names) < len(near.names) == len(ours)
     cars = vehicles_near(x_m, y_m, 100.0)
-    assert 0 < len(cars.names) <= len(vehicles_near(x_m, y_m, 1000.0).names) == len(sumo.vehicle.getIDList())
+    assert (
+        0
+        < len(cars.names)
+        <= len(vehicles_near(x_m, y_m, 1000.0).names)
+        == len(sumo.vehicle.getIDList())
+    )
     assert np.hypot(*(cars.xy - (x_m, y_m)).T).max() <= 100.0
 
 
@@ -63,15 +75,18 @@ def test_who_is_near_is_who_is_within_reach(crowd: SumoCrowd) -> None:
 def test_where_a_sidewalk_leads_it_is_all_the_same_which_lanes_sumo_compares(
     crowd: SumoCrowd, street_map: StreetMap
 ) -> None:
-    """There a body on a sidewalk gets the same lane and place with car lanes compared as without; beside it not so."""
-    walks, rng = Walks(sumo, street_map), np.random.default_rng(4)
+    """There a body on a sidewalk gets the same lane and place with car lanes compared as without;
+    beside it not so."""
+    walks = Walks(sumo, street_map)
+    rng = np.random.default_rng(4)
     sidewalks = [strip for strip in street_map.strips.values() if strip.kind == "sidewalk"]
     same: dict[bool, list[bool]] = {True: [], False: []}
     for k in range(120):
         strip = sidewalks[int(rng.integers(len(sidewalks)))]
         middle = Polyline(strip.line).at(rng.uniform(0.0, strip.length_m))
         left_m, x_m, y_m = rng.uniform(-2.5, 2.5), *middle[:2]
-        x_m, y_m = x_m - left_m * math.sin(middle.heading_rad), y_m + left_m * math.cos(middle.heading_rad)
+        x_m = x_m - left_m * math.sin(middle.heading_rad)
+        y_m = y_m + left_m * math.cos(middle.heading_rad)
         walk = walks.choose(strip.id, Pose(x_m, y_m, middle.heading_rad))
         if walk is None:
             continue
@@ -83,9 +98,14 @@ def test_where_a_sidewalk_leads_it_is_all_the_same_which_lanes_sumo_compares(
             sumo.person.appendWalkingStage(name, [walk.first, walk.second], 1.0)
         for _ in range(2):
             for mode, name in names.items():
-                sumo.person.moveToXY(name, "", x_m, y_m, heading_to_sumo(middle.heading_rad), mode, MATCH_M)
+                sumo.person.moveToXY(
+                    name, "", x_m, y_m, heading_to_sumo(middle.heading_rad), mode, MATCH_M
+                )
             sumo.simulationStep()
-        placed = [(sumo.person.getRoadID(name), sumo.person.getLanePosition(name)) for name in names.values()]
+        placed = [
+            (sumo.person.getRoadID(name), sumo.person.getLanePosition(name))
+            for name in names.values()
+        ]
         same[leads].append(placed[0] == placed[1])
         for name in names.values():
             sumo.person.remove(name)
@@ -95,16 +115,24 @@ def test_where_a_sidewalk_leads_it_is_all_the_same_which_lanes_sumo_compares(
 
 @pytest.mark.engine
 def test_who_waits_before_a_crossing_stands_on_its_nearest_corner(street_map: StreetMap) -> None:
-    """Asked for many at once or one by one, a spot lies on the corner; who is well inside it already stays."""
-    kerbs, rng = Kerbs(street_map), np.random.default_rng(5)
-    crossings = [strip for strip in street_map.strips.values() if strip.kind == "crossing" and all(strip.corners)][:12]
+    """Asked for many at once or one by one, a spot lies on the corner; who is well inside it
+    already stays."""
+    kerbs = Kerbs(street_map)
+    rng = np.random.default_rng(5)
+    crossings = [
+        strip
+        for strip in street_map.strips.values()
+        if strip.kind == "crossing" and all(strip.corners)
+    ][:12]
     ends = np.array([strip.line[k, :2] for strip in crossings for k in (0, -1)])
     asked = [strip.id for strip in crossings for _ in (0, 1)]
     at = ends + rng.uniform(-1.5, 1.5, ends.shape)
     spots = kerbs.behind(asked, at)
     for name, wanted, spot in zip(asked, at, spots, strict=True):
         assert np.array_equal(Kerbs(street_map).behind([name], wanted[None])[0], spot)
-        corners = [street_map.corners[str(corner)].polygon for corner in street_map.strips[name].corners]
+        corners = [
+            street_map.corners[str(corner)].polygon for corner in street_map.strips[name].corners
+        ]
         corner = min(corners, key=lambda corner: shapely.distance(corner, shapely.Point(wanted)))
         assert shapely.dwithin(corner, shapely.Point(spot), 1e-6)
     stays = (spots == at).all(axis=1)

@@ -1,10 +1,11 @@
 """InternVLA-N1 (Wei et al. 2026), to be served from where its code, its checkpoint and a GPU are.
 
-    COSIM_INTERNVLA=~/InternVLA-N1 cosim serve cosim.policies.adapters.internvla_n1:InternVlaN1 --name internvla-n1
-    cosim run unit --policy zenoh:internvla-n1 --goal instruction
+    COSIM_INTERNVLA=~/InternVLA-N1 cosim serve cosim.policies.adapters.internvla_n1:InternVlaN1
+    --name internvla-n1 cosim run unit --policy zenoh:internvla-n1 --goal instruction
 
-Its authors' agent (`internnav.agent.internvla_n1_agent_realworld`) is asked with each picture and the instruction,
-a flat plane for depth, no pose, and the camera's matrix. It answers with a way, or with one of a few actions.
+Its authors' agent (`internnav.agent.internvla_n1_agent_realworld`) is asked with each picture and
+the instruction, a flat plane for depth, no pose, and the camera's matrix. It answers with a way, or
+with one of a few actions.
 """
 
 from __future__ import annotations
@@ -18,8 +19,10 @@ import numpy as np
 
 from cosim.core.errors import UsageError
 from cosim.core.state import STILL, Command
-from cosim.episode.ports import CameraSpec, Manifest, Observation, WaypointRule
+from cosim.episode.interfaces import Observation
+from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import Instruction
+from cosim.spec.manifest import Manifest, WaypointRule
 
 CHECKPOINT_VARIABLE: Final = "COSIM_INTERNVLA"
 _SIZE_PX: Final = 384
@@ -31,15 +34,20 @@ _ACTIONS: Final = {1: Command(0.5, 0.0), 2: Command(0.0, 0.5), 3: Command(0.0, -
 
 
 class InternVlaN1:
-    """The policy. agent: the authors', loaded from the checkpoint of `$COSIM_INTERNVLA` where none is given.
+    """The policy. agent: the authors', loaded from the checkpoint of `$COSIM_INTERNVLA` where none
+    is given.
 
     Raises UsageError where that cannot be loaded, saying where it is to be had.
     """
 
     manifest = Manifest(
-        "internvla-n1", rate_hz=5.0, camera=CameraSpec(_SIZE_PX, _SIZE_PX, 75.0), goal="instruction",
-        goals=("instruction",), waypoints=WaypointRule(index=4, unit_m=1.0, dt_s=1.0, rule="atan2"),
-    )  # fmt: skip
+        "internvla-n1",
+        rate_hz=5.0,
+        camera=CameraSpec(_SIZE_PX, _SIZE_PX, 75.0),
+        goal="instruction",
+        goals=("instruction",),
+        waypoints=WaypointRule(index=4, unit_m=1.0, dt_s=1.0, rule="atan2"),
+    )
 
     def __init__(self, agent: Any = None) -> None:
         self._agent = _loaded() if agent is None else agent
@@ -61,7 +69,9 @@ class InternVlaN1:
             self._matrix[:3, :3] = camera.matrix
         depth = np.full(rgb.shape[:2], _PLANE_M, np.float32)
         for hop in range(_HOPS + 1):
-            told = self._agent.step(rgb, depth, np.eye(4), goal.text, intrinsic=self._matrix, look_down=hop > 0)
+            told = self._agent.step(
+                rgb, depth, np.eye(4), goal.text, intrinsic=self._matrix, look_down=hop > 0
+            )
             actions = [] if told.output_action is None else list(told.output_action)
             if _LOOKS_DOWN not in actions:
                 break
@@ -81,7 +91,8 @@ def _loaded() -> Any:
         ) from error
     if not folder:
         raise UsageError(
-            f"InternVLA-N1: {CHECKPOINT_VARIABLE} must name the folder of InternRobotics/InternVLA-N1-DualVLN's files"
+            f"InternVLA-N1: {CHECKPOINT_VARIABLE} must name the folder of "
+            f"InternRobotics/InternVLA-N1-DualVLN's files"
         )
     size = {"resize_w": _SIZE_PX, "resize_h": _SIZE_PX}
     return agents.InternVLAN1AsyncAgent(

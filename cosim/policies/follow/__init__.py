@@ -1,1 +1,2 @@
-"""`follow`: two networks see the street, a few rules drive: along the middle of the walkable ground, round people."""
+"""`follow`: two networks see the street, a few rules drive: along the middle of the walkable
+ground, round people."""

@@ -2,9 +2,10 @@
 
     python -m cosim.policies.follow.espnetv2 espnetv2_s_1.0_city_512x256.pth [OUT.onnx]
 
-Source: S. Mehta et al., "ESPNetv2: a light-weight, power efficient, and general purpose convolutional neural network",
-arXiv 1811.11431: EESP units, strided ones with the picture fed in again at each size, and a decoder of efficient
-pyramids of pooled sizes, for 20 classes of Cityscapes. It goes without PyTorch, and takes `pip install onnx`.
+Source: S. Mehta et al., "ESPNetv2: a light-weight, power efficient, and general purpose
+convolutional neural network", arXiv 1811.11431: EESP units, strided ones with the picture fed in
+again at each size, and a decoder of efficient pyramids of pooled sizes, for 20 classes of
+Cityscapes. It goes without PyTorch, and takes `pip install onnx`.
 """
 
 from __future__ import annotations
@@ -33,12 +34,14 @@ _SCALES: Final = (2.0, 1.5, 1.0, 0.5, 0.1)
 _PLANES: Final = 10
 """Channels of a pyramid at each size."""
 _DECODER: Final = ((64, 64), (48, 16), (32, 32))
-"""Channels of each step of the decoder, and groups of the convolution that brings the encoder's to them."""
+"""Channels of each step of the decoder, and groups of the convolution that brings the encoder's to
+them."""
 
 
 def street_graph(weights: dict[str, NDArray[Any]]) -> bytes:
-    """The graph as ONNX: `picture` (1, 3, 256, 512), RGB / 255, normalised as for ImageNet, to `scores` (1, 20, 128,
-    256), half the size of the picture. Raises ValueError where the weights are not those of this network."""
+    """The graph as ONNX: `picture` (1, 3, 256, 512), RGB / 255, normalised as for ImageNet, to
+    `scores` (1, 20, 128, 256), half the size of the picture. Raises ValueError where the weights
+    are not those of this network."""
     return _Builder(weights).street()
 
 
@@ -46,12 +49,15 @@ class _Builder:
     """Operators one behind the other; a name of a tensor stands for it."""
 
     def __init__(self, weights: dict[str, NDArray[Any]]) -> None:
-        self._weights, self._writer = weights, GraphWriter("espnetv2")
+        self._weights = weights
+        self._writer = GraphWriter("espnetv2")
         self._left = {name for name in weights if not name.endswith(".num_batches_tracked")}
-        self._tensors, self._constants = count(), count()
+        self._tensors = count()
+        self._constants = count()
 
     def street(self) -> bytes:
-        picture, sizes = "picture", {1: (HEIGHT // 2, WIDTH // 2)}
+        picture = "picture"
+        sizes = {1: (HEIGHT // 2, WIDTH // 2)}
         first = self._conv_act(picture, "base_net.level1", stride=2)
         quarter = self._halved(self._halved(picture))
         second = self._down(first, "base_net.level2_0", quarter)
@@ -64,7 +70,9 @@ class _Builder:
             fourth = self._unit(fourth, f"base_net.level4.{i}", (1, 1, 2, 3))
         sizes = {n: (HEIGHT >> n, WIDTH >> n) for n in (1, 2, 3, 4)}
         out = self._pyramid(fourth, "bu_dec_l1", sizes[4])
-        for step, (encoded, (planes, groups)) in enumerate(zip((third, second, first), _DECODER, strict=True), 2):
+        for step, (encoded, (planes, groups)) in enumerate(
+            zip((third, second, first), _DECODER, strict=True), 2
+        ):
             size = sizes[5 - step]
             merged = self._merged(encoded, f"merge_enc_dec_l{step}", groups)
             out = self._op("Add", merged, self._resized(out, planes, size))
@@ -73,32 +81,51 @@ class _Builder:
         # the file holds a last activation of strided units, which the network leaves out
         self._left -= {f"base_net.level{n}_0.eesp.module_act.weight" for n in (2, 3, 4)}
         if self._left:
-            raise ValueError(f"holds '{min(self._left)}', and {len(self._left) - 1} more, of which there is no place")
+            raise ValueError(
+                f"holds '{min(self._left)}', and {len(self._left) - 1} more, of which there "
+                f"is no place"
+            )
         self._writer.operator("Identity", "scores", out)
         return self._writer.whole(
             {"picture": (1, 3, HEIGHT, WIDTH)}, {"scores": (1, _CLASSES, HEIGHT // 2, WIDTH // 2)}
         )
 
     def _unit(self, x: str, name: str, dilations: tuple[int, ...], stride: int = 1) -> str:
-        """An EESP unit: projected in groups, seen at growing dilations, each added to the one before, joined again."""
+        """An EESP unit: projected in groups, seen at growing dilations, each added to the one
+        before, joined again."""
         groups = len(dilations)
         projected = self._conv_act(x, f"{name}.proj_1x1", groups=groups)
         planes = self._shape(f"{name}.spp_dw.0.conv.weight")[0]
         seen: list[str] = []
         for i, dilation in enumerate(dilations):
-            one = self._conv(projected, f"{name}.spp_dw.{i}.conv", stride=stride, groups=planes, dilation=dilation)
+            one = self._conv(
+                projected,
+                f"{name}.spp_dw.{i}.conv",
+                stride=stride,
+                groups=planes,
+                dilation=dilation,
+            )
             seen.append(self._op("Add", one, seen[-1]) if seen else one)
         joined = self._norm(self._op("Concat", *seen, axis=1), f"{name}.br_after_cat.bn")
-        joined = self._conv(self._act(joined, f"{name}.br_after_cat.act"), f"{name}.conv_1x1_exp.conv", groups=groups)
+        joined = self._conv(
+            self._act(joined, f"{name}.br_after_cat.act"),
+            f"{name}.conv_1x1_exp.conv",
+            groups=groups,
+        )
         joined = self._norm(joined, f"{name}.conv_1x1_exp.bn")
         return joined if stride > 1 else self._act(self._op("Add", joined, x), f"{name}.module_act")
 
     def _down(self, x: str, name: str, picture: str) -> str:
-        """A strided unit beside an average of its input, and the picture in that size added to both."""
+        """A strided unit beside an average of its input, and the picture in that size added to
+        both."""
         strided = self._unit(x, f"{name}.eesp", (1, 2, 3, 4), stride=2)
         both = self._op("Concat", self._halved(x), strided, axis=1)
-        again = self._conv(self._conv_act(picture, f"{name}.inp_reinf.0"), f"{name}.inp_reinf.1.conv")
-        return self._act(self._op("Add", both, self._norm(again, f"{name}.inp_reinf.1.bn")), f"{name}.act")
+        again = self._conv(
+            self._conv_act(picture, f"{name}.inp_reinf.0"), f"{name}.inp_reinf.1.conv"
+        )
+        return self._act(
+            self._op("Add", both, self._norm(again, f"{name}.inp_reinf.1.bn")), f"{name}.act"
+        )
 
     def _pyramid(self, x: str, name: str, size: tuple[int, int]) -> str:
         """An efficient pyramid: few channels, seen at five sizes, shuffled, and merged."""
@@ -118,18 +145,28 @@ class _Builder:
         merge = f"{name}.merge_layer"
         joined = self._norm(self._op("Concat", *seen, axis=1), f"{merge}.0.br.0")
         joined = self._act(joined, f"{merge}.0.br.1")
-        joined = self._op("Reshape", joined, self._constant(np.array([1, len(_SCALES), _PLANES, *size])))
+        joined = self._op(
+            "Reshape", joined, self._constant(np.array([1, len(_SCALES), _PLANES, *size]))
+        )
         joined = self._op("Transpose", joined, perm=[0, 2, 1, 3, 4])
-        joined = self._op("Reshape", joined, self._constant(np.array([1, len(_SCALES) * _PLANES, *size])))
+        joined = self._op(
+            "Reshape", joined, self._constant(np.array([1, len(_SCALES) * _PLANES, *size]))
+        )
         joined = self._conv_act(joined, f"{merge}.2", "cbr.0", "cbr.1", "cbr.2", groups=_PLANES)
         if f"{merge}.3.bias" in self._weights:
             return self._conv(joined, f"{merge}.3", bias=True)
-        return self._act(self._norm(self._conv(joined, f"{merge}.3"), f"{name}.br.br.0"), f"{name}.br.br.1")
+        return self._act(
+            self._norm(self._conv(joined, f"{merge}.3"), f"{name}.br.br.0"), f"{name}.br.br.1"
+        )
 
     def _merged(self, x: str, name: str, groups: int) -> str:
         """What the encoder saw, weighed by channel."""
-        weight = self._op("Sigmoid", self._conv(self._op("GlobalAveragePool", x), f"{name}.wt_layer.1"))
-        wide = self._conv_act(x, f"{name}.expansion_layer", "cbr.0", "cbr.1", "cbr.2", groups=groups)
+        weight = self._op(
+            "Sigmoid", self._conv(self._op("GlobalAveragePool", x), f"{name}.wt_layer.1")
+        )
+        wide = self._conv_act(
+            x, f"{name}.expansion_layer", "cbr.0", "cbr.1", "cbr.2", groups=groups
+        )
         return self._op("Mul", wide, weight)
 
     def _conv_act(
@@ -145,12 +182,27 @@ class _Builder:
         x = self._conv(x, f"{name}.{conv}", stride=stride, groups=groups)
         return self._act(self._norm(x, f"{name}.{norm}"), f"{name}.{act}")
 
-    def _conv(self, x: str, name: str, stride: int = 1, groups: int = 1, dilation: int = 1, bias: bool = False) -> str:
+    def _conv(
+        self,
+        x: str,
+        name: str,
+        stride: int = 1,
+        groups: int = 1,
+        dilation: int = 1,
+        bias: bool = False,
+    ) -> str:
         kernel = self._take(f"{name}.weight")
         beside = (kernel.shape[2] - 1) // 2 * dilation
-        inputs = [x, self._constant(kernel)] + ([self._constant(self._take(f"{name}.bias"))] if bias else [])
+        inputs = [x, self._constant(kernel)] + (
+            [self._constant(self._take(f"{name}.bias"))] if bias else []
+        )
         return self._op(
-            "Conv", *inputs, strides=[stride] * 2, group=groups, dilations=[dilation] * 2, pads=[beside] * 4
+            "Conv",
+            *inputs,
+            strides=[stride] * 2,
+            group=groups,
+            dilations=[dilation] * 2,
+            pads=[beside] * 4,
         )
 
     def _norm(self, x: str, name: str) -> str:
@@ -159,22 +211,34 @@ class _Builder:
         return self._op("BatchNormalization", x, *numbers, epsilon=1e-5)
 
     def _act(self, x: str, name: str) -> str:
-        """PReLU in four operators: the same bits as the one called so, which takes the runtime twice as long."""
+        """PReLU in four operators: the same bits as the one called so, which takes the runtime
+        twice as long."""
         above = self._op("Relu", x)
         slope = self._constant(self._take(f"{name}.weight").reshape(-1, 1, 1))
         return self._op("Add", above, self._op("Mul", self._op("Sub", x, above), slope))
 
     def _halved(self, x: str) -> str:
-        return self._op("AveragePool", x, kernel_shape=[3, 3], strides=[2, 2], pads=[1, 1, 1, 1], count_include_pad=1)
+        return self._op(
+            "AveragePool",
+            x,
+            kernel_shape=[3, 3],
+            strides=[2, 2],
+            pads=[1, 1, 1, 1],
+            count_include_pad=1,
+        )
 
     def _resized(self, x: str, planes: int, size: tuple[int, int]) -> str:
         corners = {"mode": "linear", "coordinate_transformation_mode": "align_corners"}
-        return self._op("Resize", x, "", "", self._constant(np.array([1, planes, *size])), **corners)
+        return self._op(
+            "Resize", x, "", "", self._constant(np.array([1, planes, *size])), **corners
+        )
 
     def _pooled(self, x: str, size: tuple[int, int], to: tuple[int, int]) -> str:
         """Averages over parts of unequal size, as two products with matrices."""
         rows = self._op("MatMul", self._constant(_parts(size[0], to[0])), x)
-        return self._op("MatMul", rows, self._constant(np.ascontiguousarray(_parts(size[1], to[1]).T)))
+        return self._op(
+            "MatMul", rows, self._constant(np.ascontiguousarray(_parts(size[1], to[1]).T))
+        )
 
     def _shape(self, name: str) -> tuple[int, ...]:
         if name not in self._weights:
@@ -194,10 +258,12 @@ class _Builder:
 
 
 def _parts(count: int, parts: int) -> NDArray[np.float32]:
-    """(parts, count): the mean of each of so many parts of a row, which overlap where it does not divide evenly."""
+    """(parts, count): the mean of each of so many parts of a row, which overlap where it does not
+    divide evenly."""
     weights = np.zeros((parts, count), np.float32)
     for i in range(parts):
-        begin, end = i * count // parts, -(-(i + 1) * count // parts)
+        begin = i * count // parts
+        end = -(-(i + 1) * count // parts)
         weights[i, begin:end] = 1.0 / (end - begin)
     return weights
 
@@ -205,9 +271,15 @@ def _parts(count: int, parts: int) -> NDArray[np.float32]:
 def _main(arguments: list[str]) -> None:
     """Write the graph of a file of weights, by default to the user's folder of weights."""
     if len(arguments) not in (1, 2):
-        raise UsageError(f"espnetv2 takes {ESPNET_WEIGHTS.name} and, if wanted, OUT.onnx, not {len(arguments)} names")
-    path, out = Path(arguments[0]), Path(arguments[1]) if arguments[1:] else weight_folders()[-1] / ESPNET_GRAPH.name
-    write_graph(out, make_graph(ESPNET_WEIGHTS, path, lambda data: street_graph(read_torch_file(data))))
+        raise UsageError(
+            f"espnetv2 takes {ESPNET_WEIGHTS.name} and, if wanted, OUT.onnx, not "
+            f"{len(arguments)} names"
+        )
+    path = Path(arguments[0])
+    out = Path(arguments[1]) if arguments[1:] else weight_folders()[-1] / ESPNET_GRAPH.name
+    write_graph(
+        out, make_graph(ESPNET_WEIGHTS, path, lambda data: street_graph(read_torch_file(data)))
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,5 @@
-"""The ground before the robot, as its camera sees it: which of it is walkable, and where on it people stand.
+"""The ground before the robot, as its camera sees it: which of it is walkable, and where on it
+people stand.
 
 The ground is taken for a plane; the robot's lean is not known.
 """
@@ -15,17 +16,22 @@ from cosim.core.geometry import Floats
 from cosim.policies.onnx.graph import Graph
 from cosim.policies.onnx.inputs import PictureInput
 from cosim.policies.onnx.pictures import picture_numbers
-from cosim.spec.picture import Calibration
+from cosim.spec.camera import Calibration
 
 GROUND_CELL_M: Final = 0.1
 GROUND_AHEAD_M: Final = 8.0
 GROUND_ASIDE_M: Final = 4.0
 """What is looked at: from the robot's middle to so far ahead, and so far to either side."""
 _HOW: Final = PictureInput(size=(512, 256), mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225))
-_ROAD, _SIDEWALK, _LIGHT, _SIGN, _SKY = 0, 1, 6, 7, 10
+_ROAD = 0
+_SIDEWALK = 1
+_LIGHT = 6
+_SIGN = 7
+_SKY = 10
 _NO_OBSTACLE: Final = (_ROAD, _SIDEWALK, _LIGHT, _SIGN, _SKY)
-"""Classes of Cityscapes that stop nobody: most of a near sidewalk is road to a network that learned from cars; lights,
-signs and sky do not stand on the ground, but are seen in the joints of a pavement."""
+"""Classes of Cityscapes that stop nobody: most of a near sidewalk is road to a network that learned
+from cars; lights, signs and sky do not stand on the ground, but are seen in the joints of a
+pavement."""
 _SPECKS: Final = 5
 """Specks of up to half so many pixels are wiped out."""
 
@@ -39,18 +45,22 @@ def walkable_pixels(rgb: NDArray[np.uint8], network: Graph) -> NDArray[np.bool_]
 
 
 class Ground:
-    """Cells of `GROUND_CELL_M`: rows ahead from the robot's middle, columns from the right to the left."""
+    """Cells of `GROUND_CELL_M`: rows ahead from the robot's middle, columns from the right to the
+    left."""
 
     def __init__(self, camera: Calibration, size: tuple[int, int]) -> None:
         """size: width and height of the picture."""
-        self._camera, self._size = camera, size
+        self._camera = camera
+        self._size = size
         ahead = np.arange(0.0, GROUND_AHEAD_M, GROUND_CELL_M) + 0.5 * GROUND_CELL_M
         aside = np.arange(-GROUND_ASIDE_M, GROUND_ASIDE_M, GROUND_CELL_M) + 0.5 * GROUND_CELL_M
         x, y = np.meshgrid(ahead, aside, indexing="ij")
         points = np.stack([x, y, np.zeros_like(x), np.ones_like(x)], axis=-1)
         in_camera = points @ np.linalg.inv(camera.on_robot).T
         depth = in_camera[..., 2]
-        pixels = (in_camera[..., :3] @ camera.matrix.T)[..., :2] / np.where(depth > 0.0, depth, 1.0)[..., None]
+        pixels = (in_camera[..., :3] @ camera.matrix.T)[..., :2] / np.where(
+            depth > 0.0, depth, 1.0
+        )[..., None]
         inside = ((pixels >= 0.0) & (pixels <= np.array(size) - 1.0)).all(axis=-1)
         self._seen = inside & (depth > 0.0)
         self._share = np.clip(pixels / np.array(size), 0.0, 0.999)
@@ -58,12 +68,14 @@ class Ground:
     def free(self, walkable: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """(80, 80): which cells are walkable; those that no pixel shows are taken to be."""
         rows, columns = walkable.shape
-        there = walkable[(self._share[..., 1] * rows).astype(int), (self._share[..., 0] * columns).astype(int)]
+        there = walkable[
+            (self._share[..., 1] * rows).astype(int), (self._share[..., 0] * columns).astype(int)
+        ]
         return np.asarray(there | ~self._seen)
 
     def feet_of(self, boxes: Floats) -> Floats:
-        """(N, 2): where on the ground, in the robot's frame, the people in boxes (N, 4) stand; those whose feet are not
-        below the horizon, or farther than is looked at, are left out."""
+        """(N, 2): where on the ground, in the robot's frame, the people in boxes (N, 4) stand;
+        those whose feet are not below the horizon, or farther than is looked at, are left out."""
         if not len(boxes):
             return np.zeros((0, 2))
         bottom = np.minimum(boxes[:, 3], self._size[1] - 1.0)

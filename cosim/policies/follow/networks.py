@@ -15,27 +15,32 @@ from cosim.policies.onnx.weights import NetworkFile, weights_file
 
 ESPNET_WEIGHTS: Final = NetworkFile(
     "espnetv2_s_1.0_city_512x256.pth",
-    "sacmehta/EdgeNets, commit 2b232d3f, model/segmentation/model_zoo/espnetv2 (MIT; learned from Cityscapes, whose "
-    "pictures are not for commerce)",
-    FileFacts(bytes=1107690, blake2b="bd8ae334759f256b767d4f930716722fb2a338606ea3f1a9eb19ce1ad7faadcb"),
+    "sacmehta/EdgeNets, commit 2b232d3f, model/segmentation/model_zoo/espnetv2 (MIT; learned from "
+    "Cityscapes, whose pictures are not for commerce)",
+    FileFacts(
+        bytes=1107690, blake2b="bd8ae334759f256b767d4f930716722fb2a338606ea3f1a9eb19ce1ad7faadcb"
+    ),
 )
 ESPNET_GRAPH: Final = NetworkFile(
     "espnetv2_s_1.0_city_512x256.onnx",
-    f"`python -m cosim.policies.follow.espnetv2 {ESPNET_WEIGHTS.name}`, which makes it of that file of "
-    f"{ESPNET_WEIGHTS.source}",
+    f"`python -m cosim.policies.follow.espnetv2 {ESPNET_WEIGHTS.name}`, which makes it of that "
+    f"file of {ESPNET_WEIGHTS.source}",
     None,
 )
 YOLOX_NANO: Final = NetworkFile(
     "yolox_nano_coco.onnx",
     "hamacom2004jp/iinfer, commit c7f9a3c5, models (YOLOX-nano of Megvii, Apache-2.0)",
-    FileFacts(bytes=3713911, blake2b="60348fab3a68aa73d787b06f49371c1f804c151cae846169a6d5f5f56b2c3f42"),
+    FileFacts(
+        bytes=3713911, blake2b="60348fab3a68aa73d787b06f49371c1f804c151cae846169a6d5f5f56b2c3f42"
+    ),
 )
 
 _BOTH: Final = (ESPNET_GRAPH, YOLOX_NANO)
 
 
 class Networks:
-    """Both graphs, loaded; digest: of their bytes, of how this processor answers by them, and of the rules that drive.
+    """Both graphs, loaded; digest: of their bytes, of how this processor answers by them, and of
+    the rules that drive.
 
     Raises UsageError for a file that is missing, or another.
     """
@@ -58,16 +63,23 @@ class Networks:
         self.digest = digest.hexdigest()
 
 
-def _answer_in_grey(graph: Graph, given: tuple[str, tuple[int, ...]], told: tuple[str, tuple[int, ...]]) -> bytes:
-    """What a graph answers to grey, whose last bits hang on the processor. Raises UsageError for a graph that does not
-    take what is given, or tell what is wanted."""
-    (name, shape), (wanted, sides) = given, told
+def _answer_in_grey(
+    graph: Graph, given: tuple[str, tuple[int, ...]], told: tuple[str, tuple[int, ...]]
+) -> bytes:
+    """What a graph answers to grey, whose last bits hang on the processor. Raises UsageError for a
+    graph that does not take what is given, or tell what is wanted."""
+    (name, shape) = given
+    (wanted, sides) = told
     try:
         answer = graph.ask({name: np.full(shape, 0.5, np.float32)}, [wanted])[wanted]
     except Exception as error:
-        raise UsageError(f"{graph.path}: cannot be run by onnxruntime: {said_by_runtime(error)}") from error
+        raise UsageError(
+            f"{graph.path}: cannot be run by onnxruntime: {said_by_runtime(error)}"
+        ) from error
     if answer.shape != sides or not np.isfinite(answer).all():
-        raise UsageError(f"{graph.path}: tells {wanted} {answer.shape}; wanted are finite numbers, {sides}")
+        raise UsageError(
+            f"{graph.path}: tells {wanted} {answer.shape}; wanted are finite numbers, {sides}"
+        )
     return answer.tobytes()
 
 

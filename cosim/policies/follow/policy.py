@@ -1,29 +1,222 @@
-"""`follow`: what a student would write who has two networks that see.
-
-ESPNetv2 says what is walkable, YOLOX-nano where people are; both are laid on the ground before the robot, and it takes
-the arc that stays clear, has room to both sides, and leads to the goal if it is given one. It stands for people who
-are near in the way, some seconds long, and turns on the spot, to the side where more is free, where no arc is.
-"""
+"""The policy `follow`: finds people and walkable ground with two networks, and drives along the
+middle."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from typing import Final
 
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.geometry import Floats
 from cosim.core.state import STILL, Command
-from cosim.episode.ports import CameraSpec, Manifest, Observation
-from cosim.policies.follow.ground import Ground, walkable_pixels
+from cosim.episode.interfaces import Observation
+from cosim.policies.follow.ground import GROUND_ASIDE_M, GROUND_CELL_M, Ground, walkable_pixels
 from cosim.policies.follow.networks import Networks
-from cosim.policies.follow.people import people_in
-from cosim.policies.follow.waiting import WaitForPeople
-from cosim.policies.follow.ways import best_arc, command_along, turn_aside
+from cosim.policies.onnx.graph import Graph
+from cosim.policies.onnx.inputs import PictureInput
+from cosim.policies.onnx.pictures import picture_numbers
+from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import PointGoal
+from cosim.spec.manifest import Manifest
+from cosim.spec.robot import Robot
+
+_SIDE_PX: Final = 416
+_HOW: Final = PictureInput(
+    size=(_SIDE_PX, _SIDE_PX), fit="corner", resample="linear", colour="bgr", scale=1.0
+)
+_STRIDES_PX: Final = (8, 16, 32)
+_PERSON: Final = 5
+"""The column of class 0, behind middle, size and whether there is anything."""
+_SURE: Final = 0.35
+_OVERLAP: Final = 0.45
+
+
+def people_in(rgb: NDArray[np.uint8], network: Graph) -> Floats:
+    """(N, 4): left, top, right, bottom of each person in a picture (H, W, 3), in its pixels."""
+    tensor = np.ascontiguousarray(picture_numbers(rgb, _HOW).transpose(2, 0, 1)[None], np.float32)
+    told = network.ask({"images": tensor}, ["output"])["output"][0]
+    return boxes_of(told, _SIDE_PX / max(rgb.shape[:2]))
+
+
+def boxes_of(told: NDArray[np.float32], scale: float) -> Floats:
+    """(N, 4): left, top, right, bottom of each person in an answer (3549, 85) on a picture that was
+    scaled so; of those that overlap the surest."""
+    corner, stride = _grid()
+    sure = told[:, 4] * told[:, _PERSON]
+    kept = sure > _SURE
+    middle = (told[kept, :2] + corner[kept]) * stride[kept, None]
+    size = np.exp(told[kept, 2:4]) * stride[kept, None]
+    boxes = np.concatenate([middle - 0.5 * size, size], axis=1).astype(float) / scale
+    if not len(boxes):
+        return np.zeros((0, 4))
+    chosen = np.array(
+        cv2.dnn.NMSBoxes(boxes.tolist(), sure[kept].tolist(), _SURE, _OVERLAP)
+    ).ravel()
+    best: Floats = boxes[chosen]
+    best[:, 2:] += best[:, :2]
+    return best
+
+
+def _grid() -> tuple[Floats, Floats]:
+    """The corner (x, y) of each cell, in cells, and its side in pixels, in the order of an answer's
+    rows."""
+    corners = []
+    strides = []
+    for stride in _STRIDES_PX:
+        side = _SIDE_PX // stride
+        rows, columns = np.mgrid[:side, :side]
+        corners.append(np.stack([columns.ravel(), rows.ravel()], axis=1).astype(float))
+        strides.append(np.full(side * side, float(stride)))
+    return np.concatenate(corners), np.concatenate(strides)
+
+
+_NEAR_M: Final = (2.5, 0.9)
+"""Ahead of the robot's middle, and to either side."""
+_WAITS_S: Final = 4.0
+_LOST_S: Final = 1.0
+"""Who is not seen for so long is gone."""
+
+
+class WaitForPeople:
+    """Since when somebody is near."""
+
+    def __init__(self) -> None:
+        self._first_s = self._last_s = -math.inf
+
+    def stands(self, time_s: float, people: Floats) -> bool:
+        """Whether it stands now, with people (N, 2) seen in the robot's frame.
+
+        >>> WaitForPeople().stands(1.0, np.array([[2.0, 0.0]]))
+        True
+        """
+        near = (people[:, 0] > 0.0) & (people[:, 0] < _NEAR_M[0]) & (abs(people[:, 1]) < _NEAR_M[1])
+        if not near.any():
+            return False
+        if time_s - self._last_s > _LOST_S:
+            self._first_s = time_s
+        self._last_s = time_s
+        return time_s - self._first_s < _WAITS_S
+
+
+LOOKS_M: Final = 5.0
+"""How far an arc is followed."""
+_PERSON_M: Final = 0.45
+"""What is kept from the middle of a person, beside the robot's own clearance."""
+_CLEAR_M: Final = 0.10
+"""Between the robot's side and what is not walkable."""
+_ROOM_M: Final = 1.2
+"""More room to either side than this is worth nothing."""
+_STOPS_M: Final = 0.9
+_SLOWS_M: Final = 1.5
+"""It stands where its arc is free for less than the first, and is at its pace where it is for
+both."""
+_TURNS_RAD: Final = math.radians(70.0)
+"""Arcs end where they have turned so much: beyond that the camera does not see where they lead."""
+_PACE: Final = 0.8
+"""Of the robot's cruise."""
+_ARCS: Final = 41
+_STEPS_M: Final = np.arange(0.3, LOOKS_M, GROUND_CELL_M)
+_ROOM = 0.8
+_GOAL = 0.5
+_STRAIGHT = 0.1
+_STEADY = 0.05
+"""What a metre of room, and a radian aside from the goal, from ahead, and from the arc before are
+worth, against the length that is free, of 1 in all."""
+
+
+@dataclass(frozen=True)
+class Arc:
+    """curvature: 1 / m, to the left; free_m: how far it is free."""
+
+    curvature: float
+    free_m: float
+
+
+def best_arc(
+    free: NDArray[np.bool_],
+    people: Floats,
+    robot: Robot,
+    towards_rad: float | None,
+    last: float = 0.0,
+) -> Arc:
+    """The best arc on cells as `Ground.free` gives them.
+
+    people: (N, 2), where they stand; towards_rad: the bearing of the goal, None without one; last:
+    the curvature of the arc before.
+    """
+    room_m = _room(free, people)
+    curvatures = np.linspace(-1.0, 1.0, _ARCS) * robot.w_max_radps / (_PACE * robot.cruise_mps)
+    x, y = _points(curvatures)
+    rows = np.clip((x / GROUND_CELL_M).astype(int), 0, free.shape[0] - 1)
+    columns = np.clip(((y + GROUND_ASIDE_M) / GROUND_CELL_M).astype(int), 0, free.shape[1] - 1)
+    rooms = room_m[rows, columns]
+    blocked = (rooms < 0.5 * robot.width_m + _CLEAR_M) | (
+        np.abs(curvatures[:, None] * _STEPS_M) > _TURNS_RAD
+    )
+    first = np.where(blocked.any(axis=1), blocked.argmax(axis=1), len(_STEPS_M))
+    free_m = np.where(
+        first < len(_STEPS_M), _STEPS_M[np.minimum(first, len(_STEPS_M) - 1)], LOOKS_M
+    )
+    on_the_way = np.arange(len(_STEPS_M)) < np.maximum(first, 1)[:, None]
+    mean_room = (np.minimum(rooms, _ROOM_M) * on_the_way).sum(axis=1) / on_the_way.sum(axis=1)
+    end = np.arctan2(y[:, -1], x[:, -1])
+    worth = free_m / LOOKS_M + _ROOM * mean_room / _ROOM_M
+    worth -= (
+        _STRAIGHT * np.abs(end)
+        if towards_rad is None
+        else _GOAL * np.abs(end - np.clip(towards_rad, -1.2, 1.2))
+    )
+    worth -= _STEADY * np.abs(curvatures - last)
+    best = int(worth.argmax())
+    return Arc(float(curvatures[best]), float(free_m[best]))
+
+
+def command_along(arc: Arc, robot: Robot) -> Command:
+    """Along an arc as fast as what is free of it allows; STILL where that is too little."""
+    share = min((arc.free_m - _STOPS_M) / _SLOWS_M, 1.0)
+    if share < 0.05:
+        return STILL
+    v_mps = _PACE * robot.cruise_mps * share
+    return Command(v_mps, arc.curvature * v_mps)
+
+
+def turn_aside(free: NDArray[np.bool_], robot: Robot) -> Command:
+    """On the spot, to the side where more is free."""
+    half = free.shape[1] // 2
+    left = free[:, half:].sum()
+    right = free[:, :half].sum()
+    return Command(0.0, math.copysign(0.8 * robot.w_max_radps, float(left) - float(right)))
+
+
+def _room(free: NDArray[np.bool_], people: Floats) -> NDArray[np.float32]:
+    """Metres from each cell to the nearest that is not free, or to what is kept from a person."""
+    cells = free.astype(np.uint8)
+    for x, y in people:
+        middle = int((y + GROUND_ASIDE_M) / GROUND_CELL_M), int(x / GROUND_CELL_M)
+        cv2.circle(cells, middle, round(_PERSON_M / GROUND_CELL_M), 0, thickness=-1)
+    return np.asarray(
+        cv2.distanceTransform(cells, cv2.DIST_L2, 5) * np.float32(GROUND_CELL_M), np.float32
+    )
+
+
+def _points(curvatures: Floats) -> tuple[Floats, Floats]:
+    """(arcs, steps): x and y of points along arcs from the origin, `_STEPS_M` along each."""
+    turned = curvatures[:, None] * _STEPS_M
+    bent = np.where(np.abs(turned) < 1e-6, 1e-6, turned)
+    return _STEPS_M * np.sin(bent) / bent, _STEPS_M * (1.0 - np.cos(bent)) / bent
+
 
 _STUCK_S: Final = 0.6
 """Having stood so long before what is not free it looks for a way on the spot."""
 
 
 class Follow:
-    """Keeps to the middle of the walkable ground that ESPNetv2 sees, and stops for the people that YOLOX-nano sees.
+    """Keeps to the middle of the walkable ground that ESPNetv2 sees, and stops for the people that
+    YOLOX-nano sees.
 
     Raises UsageError where the networks' weights are missing, saying where they are to be had.
     """

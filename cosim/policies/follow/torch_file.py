@@ -1,6 +1,8 @@
-"""NetworkFile out of a PyTorch file of before 2020, without PyTorch: pickles, one behind the other, then raw numbers.
+"""NetworkFile out of a PyTorch file of before 2020, without PyTorch: pickles, one behind the other,
+then raw numbers.
 
-Nothing of such a file is run: of all names that a pickle may ask for, those of tensors are known, and no others.
+Nothing of such a file is run: of all names that a pickle may ask for, those of tensors are known,
+and no others.
 """
 
 from __future__ import annotations
@@ -20,22 +22,35 @@ _Stored = tuple[str, str]
 
 
 def read_torch_file(data: bytes) -> dict[str, NDArray[Any]]:
-    """Arrays by their names. Raises ValueError for what is no such file, or holds anything but arrays."""
+    """Arrays by their names. Raises ValueError for what is no such file, or holds anything but
+    arrays."""
     try:
         return _read(io.BytesIO(data))
-    except (pickle.UnpicklingError, EOFError, AttributeError, IndexError, KeyError, TypeError) as error:
-        raise ValueError(f"no PyTorch file of weights in the form of before 2020: {error}") from None
+    except (
+        pickle.UnpicklingError,
+        EOFError,
+        AttributeError,
+        IndexError,
+        KeyError,
+        TypeError,
+    ) as error:
+        raise ValueError(
+            f"no PyTorch file of weights in the form of before 2020: {error}"
+        ) from None
 
 
 def _read(file: io.BytesIO) -> dict[str, NDArray[Any]]:
     if _Pickle(file).load() != _MAGIC:
-        raise ValueError("no PyTorch file of weights in the form of before 2020: it begins otherwise")
+        raise ValueError(
+            "no PyTorch file of weights in the form of before 2020: it begins otherwise"
+        )
     _version, _system = _Pickle(file).load(), _Pickle(file).load()
     tensors: dict[str, tuple[_Stored, int, tuple[int, ...], tuple[int, ...]]] = _Pickle(file).load()
     kinds = {key: kind for (kind, key), _, _, _ in tensors.values()}
     stored: dict[str, NDArray[Any]] = {}
     for key in _Pickle(file).load():
-        count, dtype = int.from_bytes(file.read(8), "little"), np.dtype(kinds[key])
+        count = int.from_bytes(file.read(8), "little")
+        dtype = np.dtype(kinds[key])
         numbers = file.read(count * dtype.itemsize)
         if len(numbers) != count * dtype.itemsize:
             raise ValueError("ends too early")

@@ -1,4 +1,5 @@
-"""From observations to a graph's inputs: what is remembered of an episode, and the tensors of its next question."""
+"""From observations to a graph's inputs: what is remembered of an episode, and the tensors of its
+next question."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import UsageError
 from cosim.core.geometry import wrap_angle
-from cosim.episode.ports import Observation
+from cosim.episode.interfaces import Observation
 from cosim.policies.onnx.graph import Tensor, TensorPort
 from cosim.policies.onnx.inputs import (
     AnyInput,
@@ -44,12 +45,15 @@ _GOAL_IS_GIVEN: Final = "a run gives the goals that the manifest asks for"
 class Feeder:
     """What is remembered of one episode. `feed` is asked once for every answer of the policy.
 
-    inputs: by the names of `ports`, the graph's. Raises UsageError where a tensor cannot have the shape or type that
-    the graph wants.
+    inputs: by the names of `ports`, the graph's. Raises UsageError where a tensor cannot have the
+    shape or type that the graph wants.
     """
 
-    def __init__(self, inputs: Mapping[str, AnyInput], ports: Mapping[str, TensorPort], seed: int) -> None:
-        self._inputs, self._ports = inputs, ports
+    def __init__(
+        self, inputs: Mapping[str, AnyInput], ports: Mapping[str, TensorPort], seed: int
+    ) -> None:
+        self._inputs = inputs
+        self._ports = ports
         self._draws = np.random.default_rng(seed)
         self._past: dict[int, deque[Any]] = {}
         self._state: dict[str, Tensor] = {}
@@ -63,7 +67,9 @@ class Feeder:
         self._past.clear()
         for name, one in self._inputs.items():
             if isinstance(one, StateInput):
-                self._state[name] = np.full(_whole(name, self._ports[name]), one.begin, self._ports[name].dtype)
+                self._state[name] = np.full(
+                    _whole(name, self._ports[name]), one.begin, self._ports[name].dtype
+                )
 
     def feed(self, seen: Observation) -> dict[str, Tensor]:
         """The tensors of one question, their first axis of length 1 where the graph has any."""
@@ -73,9 +79,12 @@ class Feeder:
         """Keep of an answer what is the graph's state."""
         for name, one in self._inputs.items():
             if isinstance(one, StateInput):
-                held, told = self._state[name], answer[one.output].astype(self._ports[name].dtype)
+                held = self._state[name]
+                told = answer[one.output].astype(self._ports[name].dtype)
                 if one.append:
-                    told = np.concatenate([held, told.reshape(held.shape[0], 1, *held.shape[2:])], axis=1)
+                    told = np.concatenate(
+                        [held, told.reshape(held.shape[0], 1, *held.shape[2:])], axis=1
+                    )
                     told = told[:, told.shape[1] - held.shape[1] :]
                 self._state[name] = told.reshape(held.shape)
 
@@ -98,7 +107,9 @@ class Feeder:
         """The last ones, each as `axes_turned` gives it."""
         now = _frame(one, seen)
         if now is None:
-            assert isinstance(one, GoalPictureInput | RoutePatchInput) and one.missing is not None, _GOAL_IS_GIVEN
+            assert (
+                isinstance(one, GoalPictureInput | RoutePatchInput) and one.missing is not None
+            ), _GOAL_IS_GIVEN
             now = np.full(_sides(one), one.missing, np.float32)
         now = axes_turned(now, one.layout)
         return [np.zeros_like(now) if frame is None else frame for frame in self._past_of(one, now)]
@@ -113,11 +124,19 @@ class Feeder:
             return np.asarray(_turn_told(one, seen.goal), float)
         assert isinstance(one, VectorInput)
         if isinstance(one, PastPositionsInput):
-            rows: list[NDArray[np.float64] | None] = _seen_from_now(self._past_of(one, _place(seen)), one)
+            rows: list[NDArray[np.float64] | None] = _seen_from_now(
+                self._past_of(one, _place(seen)), one
+            )
         else:
-            now = _goal_values(one, seen.goal) if isinstance(one, GoalPointInput) else _speeds(one, seen)
+            now = (
+                _goal_values(one, seen.goal)
+                if isinstance(one, GoalPointInput)
+                else _speeds(one, seen)
+            )
             rows = self._past_of(one, now)
-        numbers = [None if row is None else (row - (one.mean or 0.0)) / (one.std or 1.0) for row in rows]
+        numbers = [
+            None if row is None else (row - (one.mean or 0.0)) / (one.std or 1.0) for row in rows
+        ]
         return np.array([np.zeros(len(one.values)) if row is None else row for row in numbers])
 
     def _past_of(self, one: PastInput, now: Any) -> list[Any]:
@@ -162,7 +181,8 @@ def _takes(one: AnyInput, goal: Goal | None) -> bool:
 
 
 def _goal_values(one: GoalPointInput, goal: Goal | None) -> NDArray[np.float64]:
-    """Those of a point, in its units; what stands for it where there is none, as it would be after normalisation."""
+    """Those of a point, in its units; what stands for it where there is none, as it would be after
+    normalisation."""
     if not isinstance(goal, PointGoal):
         assert one.missing is not None, _GOAL_IS_GIVEN
         return np.asarray(one.missing, float) * (one.std or 1.0) + (one.mean or 0.0)
@@ -193,7 +213,9 @@ def _chosen(names: tuple[str, ...], known: Mapping[str, float]) -> NDArray[np.fl
 def _place(seen: Observation) -> tuple[float, float, float]:
     """Where the robot takes itself to be: x, y in metres, heading in radians."""
     odometry = seen.odometry
-    assert odometry is not None and odometry.heading_rad is not None, "the manifest asks for odometry with a heading"
+    assert odometry is not None and odometry.heading_rad is not None, (
+        "the manifest asks for odometry with a heading"
+    )
     return odometry.x_m, odometry.y_m, odometry.heading_rad
 
 
@@ -206,7 +228,9 @@ def _seen_from_now(past: list[Any], one: PastPositionsInput) -> list[NDArray[np.
         if place is None:
             rows.append(None)
             continue
-        dx, dy, turned = place[0] - x0, place[1] - y0, wrap_angle(place[2] - heading0)
+        dx = place[0] - x0
+        dy = place[1] - y0
+        turned = wrap_angle(place[2] - heading0)
         known = {
             "x": (cos * dx + sin * dy) / one.unit_m,
             "y": (-sin * dx + cos * dy) / one.unit_m,
@@ -237,7 +261,10 @@ def _turn_told(one: TurnInput, goal: Goal | None) -> tuple[float, ...]:
 def _whole(name: str, port: TensorPort) -> tuple[int, ...]:
     """The shape of an input whose first axis alone may be of any length, which is 1 then."""
     if None in port.shape[1:]:
-        raise UsageError(f"inputs.{name}: the graph wants {port.in_words}: export it with fixed sides but the first")
+        raise UsageError(
+            f"inputs.{name}: the graph wants {port.in_words}: export it with fixed sides but "
+            f"the first"
+        )
     return tuple(1 if side is None else side for side in port.shape)
 
 
@@ -248,7 +275,9 @@ def _shaped(name: str, numbers: NDArray[np.float64], port: TensorPort) -> Tensor
     held = math.prod(side for side in shape if side is not None)
     if free > 1 or (numbers.size != held if not free else numbers.size % held):
         made = " x ".join(map(str, numbers.shape))
-        raise UsageError(f"inputs.{name}: the graph wants {port.in_words}, and the manifest gives {made} numbers")
+        raise UsageError(
+            f"inputs.{name}: the graph wants {port.in_words}, and the manifest gives {made} numbers"
+        )
     return numbers.reshape([-1 if side is None else side for side in shape]).astype(port.dtype)
 
 
@@ -259,15 +288,20 @@ def _check_pixels(name: str, one: PixelsInput | RoutePatchInput, port: TensorPor
         side not in (None, there) for side, there in zip(port.shape, shape, strict=True)
     ):
         raise UsageError(
-            f"inputs.{name}: the graph wants {port.in_words}, and layout {one.layout!r} gives {shape}: "
-            "look at frames, size, colour and layout"
+            f"inputs.{name}: the graph wants {port.in_words}, and layout {one.layout!r} gives "
+            f"{shape}: look at frames, size, colour and layout"
         )
     if port.dtype.kind in "iu" and isinstance(one, PixelsInput) and not one.as_they_are:
         raise UsageError(
-            f"inputs.{name}: the graph wants {port.in_words}, whole numbers: say scale 1, without mean and std"
+            f"inputs.{name}: the graph wants {port.in_words}, whole numbers: say scale 1, "
+            f"without mean and std"
         )
 
 
 def _sides(one: PixelsInput | RoutePatchInput) -> tuple[int, int, int]:
     """Rows, columns and channels of a frame."""
-    return (_PATCH_PX, _PATCH_PX, 1) if isinstance(one, RoutePatchInput) else (*one.sides, one.channels)
+    return (
+        (_PATCH_PX, _PATCH_PX, 1)
+        if isinstance(one, RoutePatchInput)
+        else (*one.sides, one.channels)
+    )

@@ -1,4 +1,5 @@
-"""A graph that can be asked: a session of onnxruntime, one thread, and what its inputs and outputs are."""
+"""A graph that can be asked: a session of onnxruntime, one thread, and what its inputs and outputs
+are."""
 
 from __future__ import annotations
 
@@ -29,15 +30,21 @@ NUMBERS: Final = "biuf"
 """The kinds of numpy that the tensors of a graph may be."""
 
 _TYPES: Final[Mapping[str, Any]] = {
-    "tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(double)": np.float64,
-    "tensor(uint8)": np.uint8, "tensor(int8)": np.int8, "tensor(int32)": np.int32, "tensor(int64)": np.int64,
+    "tensor(float)": np.float32,
+    "tensor(float16)": np.float16,
+    "tensor(double)": np.float64,
+    "tensor(uint8)": np.uint8,
+    "tensor(int8)": np.int8,
+    "tensor(int32)": np.int32,
+    "tensor(int64)": np.int64,
     "tensor(bool)": np.bool_,
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
 class TensorPort:
-    """An input or output of a graph. shape: None for an axis of any length, such as that of a batch."""
+    """An input or output of a graph. shape: None for an axis of any length, such as that of a
+    batch."""
 
     name: str
     dtype: np.dtype[Any]
@@ -58,7 +65,8 @@ class TensorPort:
 
 
 class AskedGraph(Protocol):
-    """A graph that can be asked: in this process (`Graph`), or on trial in another (`cosim.policies.onnx.trial`)."""
+    """A graph that can be asked: in this process (`Graph`), or on trial in another
+    (`cosim.policies.onnx.trial`)."""
 
     path: Path
     inputs: Mapping[str, TensorPort]
@@ -69,7 +77,8 @@ class AskedGraph(Protocol):
 
 
 class Graph:
-    """A graph, loaded. Raises UsageError for one that the runtime refuses; MachineError where there is no runtime."""
+    """A graph, loaded. Raises UsageError for one that the runtime refuses; MachineError where there
+    is no runtime."""
 
     def __init__(self, path: Path) -> None:
         onnxruntime = import_runtime()
@@ -83,7 +92,8 @@ class Graph:
                 str(path), options, providers=list(self.providers), enable_fallback=0
             )
             inputs, outputs = (
-                [*map(_told, ports)] for ports in (self._session.get_inputs(), self._session.get_outputs())
+                [*map(_told, ports)]
+                for ports in (self._session.get_inputs(), self._session.get_outputs())
             )
         except Exception as error:
             raise UsageError(f"{path}: {_refusal(error, onnxruntime.__version__)}") from error
@@ -98,7 +108,9 @@ class Graph:
 
     def _port(self, name: str, kind: str, sides: Sequence[Any]) -> TensorPort:
         if kind not in _TYPES:
-            raise UsageError(f"{self.path}: '{name}' is a {kind}: inputs and outputs are tensors of numbers")
+            raise UsageError(
+                f"{self.path}: '{name}' is a {kind}: inputs and outputs are tensors of numbers"
+            )
         shape = tuple(side if isinstance(side, int) and side >= 0 else None for side in sides)
         return TensorPort(name, np.dtype(_TYPES[kind]), shape)
 
@@ -112,7 +124,9 @@ def import_runtime() -> Any:
     try:
         import onnxruntime
     except ImportError as error:
-        raise MachineError(f"onnxruntime cannot be imported: {error}: pip install onnxruntime") from error
+        raise MachineError(
+            f"onnxruntime cannot be imported: {error}: pip install onnxruntime"
+        ) from error
     return onnxruntime
 
 
@@ -122,16 +136,21 @@ def runs_on_cpu() -> bool:
 
 
 def _told(port: Any) -> tuple[str, str, Sequence[Any]]:
-    """Name, type and shape of an input or output, which the runtime cannot tell of every graph that it loads."""
+    """Name, type and shape of an input or output, which the runtime cannot tell of every graph that
+    it loads."""
     return port.name, port.type, port.shape
 
 
 def _providers(available: Sequence[str]) -> tuple[str, ...]:
-    """Those that the environment asks for. Raises UsageError for one that onnxruntime does not have here."""
-    asked = [name.strip() for name in os.environ.get(PROVIDERS_VARIABLE, _CPU).split(",") if name.strip()]
+    """Those that the environment asks for. Raises UsageError for one that onnxruntime does not have
+    here."""
+    asked = [
+        name.strip() for name in os.environ.get(PROVIDERS_VARIABLE, _CPU).split(",") if name.strip()
+    ]
     if lacking := [name for name in asked if name not in available]:
         raise UsageError(
-            f"{PROVIDERS_VARIABLE}: onnxruntime has no {lacking[0]} here. Valid choices: {', '.join(available)}"
+            f"{PROVIDERS_VARIABLE}: onnxruntime has no {lacking[0]} here. Valid choices: "
+            f"{', '.join(available)}"
         )
     return tuple(asked) or (_CPU,)
 
@@ -139,15 +158,21 @@ def _providers(available: Sequence[str]) -> tuple[str, ...]:
 def _refusal(error: Exception, version: str) -> str:
     """Why the runtime does not load a graph, in words."""
     said = said_by_runtime(error)
-    lacks = any(part in said for part in ("is not a registered function", "Could not find an implementation"))
+    lacks = any(
+        part in said
+        for part in ("is not a registered function", "Could not find an implementation")
+    )
     remedy = (
-        "export it with other operators, or a lower opset" if lacks or "opset" in said.lower() else "export it anew"
+        "export it with other operators, or a lower opset"
+        if lacks or "opset" in said.lower()
+        else "export it anew"
     )
     what = "has an operator that onnxruntime lacks" if lacks else "is refused by onnxruntime"
     return f"{what} ({version}): {said}; {remedy}"
 
 
 def said_by_runtime(error: Exception) -> str:
-    """What the runtime has to say, on one line, without its codes, its own source's places, and the file's."""
+    """What the runtime has to say, on one line, without its codes, its own source's places, and the
+    file's."""
     said = _PLACES.sub("", " ".join(str(error).split()))
     return said if len(said) <= _MOST_SAID else f"{said[:_MOST_SAID]}..."

@@ -1,6 +1,7 @@
 """What an ONNX file says without a runtime: its weights and the files that hold more of them.
 
-An ONNX file is a protobuf message; this reads the few fields of it that are named here, by their numbers in onnx.proto.
+An ONNX file is a protobuf message; this reads the few fields of it that are named here, by their
+numbers in onnx.proto.
 """
 
 from __future__ import annotations
@@ -17,14 +18,30 @@ _PARTS: Final[Mapping[str, Mapping[int, str]]] = {
     "function": {7: "node", 11: "attribute"},
     "graph": {1: "node", 5: "tensor", 15: "sparse tensor"},
     "node": {5: "attribute"},
-    "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse tensor", 23: "sparse tensor"},
+    "attribute": {
+        5: "tensor",
+        6: "graph",
+        10: "tensor",
+        11: "graph",
+        22: "sparse tensor",
+        23: "sparse tensor",
+    },
     "sparse tensor": {1: "tensor", 2: "tensor"},
 }
 """By its fields what each message holds that may hold tensors."""
-_TYPE, _FLOATS, _NAME, _RAW, _DOUBLES, _EXTERNAL = 2, 4, 8, 9, 10, 13
+_TYPE = 2
+_FLOATS = 4
+_NAME = 8
+_RAW = 9
+_DOUBLES = 10
+_EXTERNAL = 13
 """Fields of a tensor."""
-_KEY, _VALUE = 1, 2
-_FLOAT, _FLOAT16, _DOUBLE, _BFLOAT16 = 1, 10, 11, 16
+_KEY = 1
+_VALUE = 2
+_FLOAT = 1
+_FLOAT16 = 10
+_DOUBLE = 11
+_BFLOAT16 = 16
 """Types of a tensor's numbers."""
 _DTYPES: Final = {_FLOAT: "<f4", _FLOAT16: "<f2", _DOUBLE: "<f8", _BFLOAT16: "<u2"}
 
@@ -32,19 +49,25 @@ _Field = tuple[int, int | memoryview]
 
 
 def external_files(data: bytes) -> list[str]:
-    """The names of the files beside the graph that hold weights of it. Raises ValueError for what is no ONNX file."""
+    """The names of the files beside the graph that hold weights of it. Raises ValueError for what
+    is no ONNX file."""
     found = set[str]()
     for tensor in _tensors(memoryview(data)):
         for number, entry in _fields(tensor):
             if number == _EXTERNAL and isinstance(entry, memoryview):
-                texts = {key: bytes(text).decode() for key, text in _fields(entry) if isinstance(text, memoryview)}
+                texts = {
+                    key: bytes(text).decode()
+                    for key, text in _fields(entry)
+                    if isinstance(text, memoryview)
+                }
                 if texts.get(_KEY) == "location":
                     found.add(texts.get(_VALUE, ""))
     return sorted(found)
 
 
 def weights_not_finite(data: bytes) -> list[str]:
-    """The names of the weights in the file that hold NaN or infinities. Raises ValueError for what is no ONNX file.
+    """The names of the weights in the file that hold NaN or infinities. Raises ValueError for what
+    is no ONNX file.
 
     Minus infinity is let through: masks of attention are made of it.
     """
@@ -71,7 +94,8 @@ def _name(tensor: memoryview) -> str:
 
 
 def _tensors(model: memoryview) -> Iterator[memoryview]:
-    """All tensors of a model: its weights, and those of constants, functions and graphs within it."""
+    """All tensors of a model: its weights, and those of constants, functions and graphs within
+    it."""
     if not any(_PARTS["model"].get(number) == "graph" for number, _ in _fields(model)):
         raise ValueError("has no graph")
     messages = [("model", model)]
@@ -92,7 +116,8 @@ def _fields(message: memoryview) -> Iterator[_Field]:
     at = 0
     while at < len(message):
         key, at = _varint(message, at)
-        number, wire = key >> 3, key & 7
+        number = key >> 3
+        wire = key & 7
         if wire == 0:
             value, at = _varint(message, at)
             yield number, value

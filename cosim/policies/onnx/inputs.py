@@ -1,7 +1,7 @@
 """What goes into a graph, input by input: the field `inputs` of a bundle's manifest.
 
-{"what": "picture", "frames": 6, "size": [85, 64], "layout": "N(TC)HW", "mean": [0.485, 0.456, 0.406], "std": [0.229,
- 0.224, 0.225]}
+{"what": "picture", "frames": 6, "size": [85, 64], "layout": "N(TC)HW", "mean": [0.485, 0.456,
+ 0.406], "std": [0.229, 0.224, 0.225]}
 {"what": "goal_point", "values": ["distance", "cos", "sin"], "unit_m": 200, "most_m": 200}
 """
 
@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from typing import Annotated, Final, Literal, get_args
 
 from cosim.spec.goal import GoalProtocol
-from cosim.spec.ranges import Counted, Ranged, Within
+from cosim.spec.validation import Counted, Ranged, Within
 
 _NUMBER: Final = Within(-1e9, 1e9)
 _SIDE: Final = Within(1, 4096)
@@ -32,8 +32,9 @@ class AnyInput(Ranged, frozen=True, kw_only=True):
 
 
 class PastInput(AnyInput, frozen=True, kw_only=True):
-    """The last `frames` of something, `every` so many answers of the policy, the newest of now. before: what stands for
-    those from before the episode's beginning, or before the robot was put elsewhere: the first since, or zeros."""
+    """The last `frames` of something, `every` so many answers of the policy, the newest of now.
+    before: what stands for those from before the episode's beginning, or before the robot was put
+    elsewhere: the first since, or zeros."""
 
     frames: Annotated[int, Within(1, 256)] = 1
     every: Annotated[int, Within(1, 256)] = 1
@@ -42,8 +43,8 @@ class PastInput(AnyInput, frozen=True, kw_only=True):
 
 
 class VectorInput(PastInput, frozen=True, kw_only=True):
-    """Numbers: (frames, values), in the shape that the graph has. mean, std: one of each value, which becomes
-    (value - mean) / std; empty for 0 and 1."""
+    """Numbers: (frames, values), in the shape that the graph has. mean, std: one of each value,
+    which becomes (value - mean) / std; empty for 0 and 1."""
 
     values: tuple[str, ...] = ()
     mean: Annotated[tuple[float, ...], Counted(0, 16)] = ()
@@ -54,14 +55,16 @@ class VectorInput(PastInput, frozen=True, kw_only=True):
 
 
 class PixelsInput(PastInput, frozen=True, kw_only=True):
-    """Pictures. crop: of the picture, as shares (x0, y0, x1, y1) of its sides; then fit brings it to size (width,
-    height): stretched, cut to the shape of size around its middle, or whole, in the middle (letterbox) or in the upper
-    left corner, with a border of grey `border` (0 to 255).
-    resample: how; colour: the channels' order; yuv420: six channels of half the size (four of Y, U, V), as openpilot
-    has them. Numbers become (pixel / scale - mean) / std; scale 1 leaves 0 to 255, which a graph of uint8 needs.
+    """Pictures. crop: of the picture, as shares (x0, y0, x1, y1) of its sides; then fit brings it
+    to size (width, height): stretched, cut to the shape of size around its middle, or whole, in the
+    middle (letterbox) or in the upper left corner, with a border of grey `border` (0 to 255).
+    resample: how; colour: the channels' order; yuv420: six channels of half the size (four of Y, U,
+    V), as openpilot has them. Numbers become (pixel / scale - mean) / std; scale 1 leaves 0 to 255,
+    which a graph of uint8 needs.
 
-    layout: the graph's axes, outermost first: N of 1, T frames, C channels, H rows, W columns; those in brackets are
-    one axis, such as "N(TC)HW", frames stacked into channels. N, and T and C where there is one of them, may be absent.
+    layout: the graph's axes, outermost first: N of 1, T frames, C channels, H rows, W columns;
+    those in brackets are one axis, such as "N(TC)HW", frames stacked into channels. N, and T and C
+    where there is one of them, may be absent.
     """
 
     size: tuple[Annotated[int, _SIDE], Annotated[int, _SIDE]]
@@ -101,7 +104,10 @@ class PixelsInput(PastInput, frozen=True, kw_only=True):
         if self.crop is not None and not (
             0.0 <= self.crop[0] < self.crop[2] <= 1.0 and 0.0 <= self.crop[1] < self.crop[3] <= 1.0
         ):
-            yield f"{self.called}crop must be shares [x0, y0, x1, y1] with 0 <= x0 < x1 <= 1, not {list(self.crop)}"
+            yield (
+                f"{self.called}crop must be shares [x0, y0, x1, y1] with 0 <= x0 < x1 <= 1, not "
+                f"{list(self.crop)}"
+            )
 
 
 class PictureInput(PixelsInput, frozen=True, kw_only=True, tag="picture", tag_field="what"):
@@ -114,8 +120,11 @@ class PictureInput(PixelsInput, frozen=True, kw_only=True, tag="picture", tag_fi
     camera: str = ""
 
 
-class GoalPictureInput(PixelsInput, frozen=True, kw_only=True, tag="goal_picture", tag_field="what"):
-    """The picture of where to go. missing: fills the tensor where a run's goals are no pictures; None: refused."""
+class GoalPictureInput(
+    PixelsInput, frozen=True, kw_only=True, tag="goal_picture", tag_field="what"
+):
+    """The picture of where to go. missing: fills the tensor where a run's goals are no pictures;
+    None: refused."""
 
     missing: Annotated[float | None, _NUMBER] = None
 
@@ -125,12 +134,16 @@ class GoalPictureInput(PixelsInput, frozen=True, kw_only=True, tag="goal_picture
 
 
 class GoalPointInput(VectorInput, frozen=True, kw_only=True, tag="goal_point", tag_field="what"):
-    """The point of where to go, in the robot's frame of its frame. x, y, distance in units of `unit_m`; a distance of
-    more than `most_m` becomes that, x and y in proportion; bearing in radians, counter-clockwise from ahead.
-    missing: the values where a run's goals are no points, as the graph gets them; None: refused."""
+    """The point of where to go, in the robot's frame of its frame. x, y, distance in units of
+    `unit_m`; a distance of more than `most_m` becomes that, x and y in proportion; bearing in
+    radians, counter-clockwise from ahead. missing: the values where a run's goals are no points, as
+    the graph gets them; None: refused."""
 
     values: Annotated[
-        tuple[Literal["x", "-x", "y", "-y", "distance", "cos", "sin", "-sin", "bearing", "-bearing"], ...],
+        tuple[
+            Literal["x", "-x", "y", "-y", "distance", "cos", "sin", "-sin", "bearing", "-bearing"],
+            ...,
+        ],
         Counted(1, 8),
     ] = ("x", "y")
     unit_m: Annotated[float, Within(0, 1e6, above=True)] = 1.0
@@ -144,12 +157,16 @@ class GoalPointInput(VectorInput, frozen=True, kw_only=True, tag="goal_point", t
     def contradictions(self) -> Iterator[str]:
         yield from super().contradictions()
         if self.missing is not None and len(self.missing) != len(self.values):
-            yield f"goal_point missing must hold {len(self.values)} numbers, one of each value, not {len(self.missing)}"
+            yield (
+                f"goal_point missing must hold {len(self.values)} numbers, one of each value, "
+                f"not {len(self.missing)}"
+            )
 
 
 class RoutePatchInput(PastInput, frozen=True, kw_only=True, tag="route_patch", tag_field="what"):
-    """The raster of the route around the robot (`cosim.spec.goal.RoutePatch`), with the numbers `on` the route and
-    `off` it. missing: fills the tensor where a run's goals are no route patches; None: refused."""
+    """The raster of the route around the robot (`cosim.spec.goal.RoutePatch`), with the numbers
+    `on` the route and `off` it. missing: fills the tensor where a run's goals are no route patches;
+    None: refused."""
 
     on: Annotated[float, _NUMBER] = 1.0
     off: Annotated[float, _NUMBER] = 0.0
@@ -165,8 +182,9 @@ class RoutePatchInput(PastInput, frozen=True, kw_only=True, tag="route_patch", t
 
 
 class TurnInput(AnyInput, frozen=True, kw_only=True, tag="command", tag_field="what"):
-    """Which way to go: the numbers of left, straight or right. Of an instruction, what is due, or told within
-    `ahead_m`; of a point, where it lies more than `beyond_deg` aside. missing: with other goals; None: refused."""
+    """Which way to go: the numbers of left, straight or right. Of an instruction, what is due, or
+    told within `ahead_m`; of a point, where it lies more than `beyond_deg` aside. missing: with
+    other goals; None: refused."""
 
     left: Annotated[tuple[float, ...], Counted(1, 16)] = (-1.0,)
     straight: Annotated[tuple[float, ...], Counted(1, 16)] = (0.0,)
@@ -180,7 +198,11 @@ class TurnInput(AnyInput, frozen=True, kw_only=True, tag="command", tag_field="w
         return ("instruction", *POINTS) if self.missing is None else ()
 
     def contradictions(self) -> Iterator[str]:
-        counts = {len(one) for one in (self.left, self.straight, self.right, self.missing) if one is not None}
+        counts = {
+            len(one)
+            for one in (self.left, self.straight, self.right, self.missing)
+            if one is not None
+        }
         if len(counts) > 1:
             yield "command left, straight, right and missing must hold as many numbers each"
 
@@ -191,12 +213,15 @@ class SpeedsInput(VectorInput, frozen=True, kw_only=True, tag="speeds", tag_fiel
     values: Annotated[tuple[Literal["v", "w", "-w"], ...], Counted(1, 8)] = ("v", "w")
 
 
-class PastPositionsInput(VectorInput, frozen=True, kw_only=True, tag="past_positions", tag_field="what"):
-    """Where the robot was, by its odometry, in its frame of now; the last one is now, at the origin. heading: in
-    radians, counter-clockwise from that of now."""
+class PastPositionsInput(
+    VectorInput, frozen=True, kw_only=True, tag="past_positions", tag_field="what"
+):
+    """Where the robot was, by its odometry, in its frame of now; the last one is now, at the
+    origin. heading: in radians, counter-clockwise from that of now."""
 
     values: Annotated[
-        tuple[Literal["x", "-x", "y", "-y", "cos", "sin", "-sin", "heading", "-heading"], ...], Counted(1, 8)
+        tuple[Literal["x", "-x", "y", "-y", "cos", "sin", "-sin", "heading", "-heading"], ...],
+        Counted(1, 8),
     ] = ("x", "y")
     unit_m: Annotated[float, Within(0, 1e6, above=True)] = 1.0
 
@@ -219,8 +244,9 @@ class NoiseInput(AnyInput, frozen=True, kw_only=True, tag="noise", tag_field="wh
 
 
 class StateInput(AnyInput, frozen=True, kw_only=True, tag="state", tag_field="what"):
-    """What the graph remembers: the output `output` of the answer before, or with `append` a row of it behind the older
-    rows, of which the first goes. `begin` fills it when an episode begins, or the robot was put elsewhere."""
+    """What the graph remembers: the output `output` of the answer before, or with `append` a row of
+    it behind the older rows, of which the first goes. `begin` fills it when an episode begins, or
+    the robot was put elsewhere."""
 
     output: str
     append: bool = False
@@ -238,7 +264,9 @@ class JoinedInput(AnyInput, frozen=True, kw_only=True, tag="joined", tag_field="
     @property
     def needs(self) -> tuple[GoalProtocol, ...]:
         wanted = [set(part.needs) for part in self.parts if part.needs]
-        return tuple(one for one in get_args(GoalProtocol) if wanted and one in set.intersection(*wanted))
+        return tuple(
+            one for one in get_args(GoalProtocol) if wanted and one in set.intersection(*wanted)
+        )
 
     def contradictions(self) -> Iterator[str]:
         if any(part.needs for part in self.parts) and not self.needs:
@@ -284,19 +312,33 @@ def layout_refusal(called: str, layout: str, **counts: int) -> str:
     """What is wrong with a layout of so many frames T and channels C; "" if nothing is."""
     groups = axes_of(layout)
     letters = "".join(groups)
-    brackets = layout.replace("(", "").replace(")", "") == letters and layout.count("(") == layout.count(")")
+    brackets = layout.replace("(", "").replace(")", "") == letters and layout.count(
+        "("
+    ) == layout.count(")")
     if not brackets or len(set(letters)) != len(letters) or not {"H", "W"} <= set(letters) <= _AXES:
         return (
-            f"{called}layout must be of the letters N T C H W, once each, with H and W, such as N(TC)HW: not {layout!r}"
+            f"{called}layout must be of the letters N T C H W, once each, with H and W, such as "
+            f"N(TC)HW: not {layout!r}"
         )
-    absent = [f"{letter} of {count}" for letter, count in counts.items() if count > 1 and letter not in letters]
+    absent = [
+        f"{letter} of {count}"
+        for letter, count in counts.items()
+        if count > 1 and letter not in letters
+    ]
     return f"{called}layout {layout!r} has no axis for {', '.join(absent)}" if absent else ""
 
 
-def _normalised(called: str, mean: Sequence[float], std: Sequence[float], count: int) -> Iterator[str]:
+def _normalised(
+    called: str, mean: Sequence[float], std: Sequence[float], count: int
+) -> Iterator[str]:
     """What is wrong with the mean and standard deviation of `count` values."""
     for field, numbers in (("mean", mean), ("std", std)):
         if numbers and len(numbers) != count:
             yield f"{called}{field} must hold {count} numbers or none, not {len(numbers)}"
-        elif not all(abs(number) < _NUMBER.high for number in numbers) or (field == "std" and not all(numbers)):
-            yield f"{called}{field} must hold finite numbers{', not 0' if field == 'std' else ''}: {list(numbers)}"
+        elif not all(abs(number) < _NUMBER.high for number in numbers) or (
+            field == "std" and not all(numbers)
+        ):
+            yield (
+                f"{called}{field} must hold finite numbers{', not 0' if field == 'std' else ''}: "
+                f"{list(numbers)}"
+            )

@@ -11,7 +11,10 @@ from cosim.policies.onnx.weights import NetworkFile
 
 
 def make_graph(
-    weights: NetworkFile, path: Path, make: Callable[[bytes], bytes], packages: tuple[str, ...] = ("onnx",)
+    weights: NetworkFile,
+    path: Path,
+    make: Callable[[bytes], bytes],
+    packages: tuple[str, ...] = ("onnx",),
 ) -> bytes:
     """What `make` makes of the file at `path`. packages: those that it imports.
 
@@ -20,13 +23,17 @@ def make_graph(
     try:
         data = path.read_bytes()
     except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror}; it is from {weights.source}") from error
+        raise UsageError(
+            f"{path}: cannot be read: {error.strerror}; it is from {weights.source}"
+        ) from error
     weights.check(path, data)
     try:
         return make(data)
     except ImportError as error:
         wanted = " ".join(packages)
-        raise MachineError(f"{path}: its graph cannot be made: {error}: pip install {wanted}") from error
+        raise MachineError(
+            f"{path}: its graph cannot be made: {error}: pip install {wanted}"
+        ) from error
 
 
 def write_graph(out: Path, graph: bytes) -> None:

@@ -1,8 +1,9 @@
-"""The manifest of an ONNX bundle, `manifest.json`: what its graph wants, what it answers, and where it comes from.
+"""The manifest of an ONNX bundle, `manifest.json`: what its graph wants, what it answers, and where
+it comes from.
 
-{"format": 1, "name": "mine", "rate_hz": 5, "goal": "route_point", "camera": {"width": 160, "height": 90},
- "inputs": {"pictures": {"what": "picture", "frames": 4, "size": [160, 90], "layout": "N(TC)HW"},
-            "goal": {"what": "goal_point", "unit_m": 10}},
+{"format": 1, "name": "mine", "rate_hz": 5, "goal": "route_point", "camera": {"width": 160,
+ "height": 90}, "inputs": {"pictures": {"what": "picture", "frames": 4, "size": [160, 90], "layout":
+ "N(TC)HW"}, "goal": {"what": "goal_point", "unit_m": 10}},
  "output": {"what": "waypoints", "name": "waypoints", "index": 2, "dt_s": 0.6}}
 """
 
@@ -17,17 +18,19 @@ from typing import Annotated, Final, Literal, get_args
 import msgspec
 
 from cosim.core.errors import SpecError
-from cosim.episode.ports import CameraSpec, Manifest, WaypointRule
 from cosim.policies.onnx.inputs import GraphInput, JoinedInput, PastPositionsInput, PictureInput
 from cosim.policies.onnx.outputs import GraphOutput, WaypointsOutput
+from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import GoalProtocol
+from cosim.spec.manifest import Manifest, WaypointRule
 from cosim.spec.odometry import OdometryKind
-from cosim.spec.ranges import Named, Ranged, Text, Within, shown
 from cosim.spec.spec_file import read_spec_file
+from cosim.spec.validation import Named, Ranged, Text, Within, shown
 
 MANIFEST_FILE: Final = "manifest.json"
 EXAMPLE_FILE: Final = "example.npz"
-"""For each input of the graph an array of its name, and for each output one of the name `expected.<name>`."""
+"""For each input of the graph an array of its name, and for each output one of the name
+`expected.<name>`."""
 MOST_EXAMPLE_BYTES: Final = 512 << 20
 """Of an example, packed and unpacked."""
 
@@ -36,7 +39,8 @@ _HASH: Final = re.compile(r"[0-9a-f]{64}")
 
 
 def refusal_of_name(name: str) -> str:
-    """Why a file of a bundle cannot be called so; "" if it can. Files of a bundle lie in its folder, not below it.
+    """Why a file of a bundle cannot be called so; "" if it can. Files of a bundle lie in its
+    folder, not below it.
 
     >>> refusal_of_name("model.onnx.data"), refusal_of_name("../model.onnx")[:17]
     ('', "'../model.onnx' i")
@@ -48,12 +52,15 @@ def refusal_of_name(name: str) -> str:
         and len(name.encode()) <= _MOST_NAME_BYTES
     ):
         return ""
-    return f"{shown(name)} is no name of a file in the bundle's folder: use a name without '/', such as model.onnx.data"
+    return (
+        f"{shown(name)} is no name of a file in the bundle's folder: use a name without '/', "
+        f"such as model.onnx.data"
+    )
 
 
 class FileFacts(Ranged, frozen=True, kw_only=True):
-    """How large a file of a bundle is, and a hash of its bytes, in hexadecimal: the BLAKE2b, 32 bytes long, or the
-    SHA-256 where its authors tell that, or both."""
+    """How large a file of a bundle is, and a hash of its bytes, in hexadecimal: the BLAKE2b, 32
+    bytes long, or the SHA-256 where its authors tell that, or both."""
 
     bytes: Annotated[int, Within(0, 10**12)]
     blake2b: str = ""
@@ -75,7 +82,9 @@ class FileFacts(Ranged, frozen=True, kw_only=True):
     def in_words(self) -> str:
         """As a refusal tells it."""
         told = {"BLAKE2b": self.blake2b, "SHA-256": self.sha256}
-        return ", ".join([f"{self.bytes} bytes", *(f"{name} {one}" for name, one in told.items() if one)])
+        return ", ".join(
+            [f"{self.bytes} bytes", *(f"{name} {one}" for name, one in told.items() if one)]
+        )
 
 
 def file_facts(data: bytes) -> FileFacts:
@@ -89,7 +98,7 @@ def file_facts(data: bytes) -> FileFacts:
 
 
 class BundleCamera(Ranged, frozen=True, kw_only=True):
-    """A camera, as `cosim.episode.ports.CameraSpec` has it; it sits at one of the robot's mounts."""
+    """A camera, as `cosim.spec.camera.CameraSpec` has it; it sits at one of the robot's mounts."""
 
     width: Annotated[int, Within(1, 4096)]
     height: Annotated[int, Within(1, 4096)]
@@ -109,8 +118,9 @@ class BundleCamera(Ranged, frozen=True, kw_only=True):
 
 
 class BundleManifest(Ranged, frozen=True, kw_only=True):
-    """A manifest. inputs: by the names of the graph's inputs; model: the graph's file in the folder, or of the same
-    name in a folder of weights (`cosim.policies.onnx.weights`); files: what is known of it and of others.
+    """A manifest. inputs: by the names of the graph's inputs; model: the graph's file in the
+    folder, or of the same name in a folder of weights (`cosim.policies.onnx.weights`); files: what
+    is known of it and of others.
 
     licence, source: of the weights, in words; a source says where they are to be had.
     """
@@ -138,12 +148,18 @@ class BundleManifest(Ranged, frozen=True, kw_only=True):
     def goals(self) -> tuple[GoalProtocol, ...]:
         """The goals that all of its inputs can be made of; () where they need none."""
         wanted = [set(one.needs) for one in self.inputs.values() if one.needs]
-        return tuple(one for one in get_args(GoalProtocol) if wanted and one in set.intersection(*wanted))
+        return tuple(
+            one for one in get_args(GoalProtocol) if wanted and one in set.intersection(*wanted)
+        )
 
     @property
     def policy(self) -> Manifest:
         """As a run knows it."""
-        waypoints = self.output.waypoint_rule if isinstance(self.output, WaypointsOutput) else WaypointRule()
+        waypoints = (
+            self.output.waypoint_rule
+            if isinstance(self.output, WaypointsOutput)
+            else WaypointRule()
+        )
         return Manifest(
             name=self.name,
             version=self.version,
@@ -160,20 +176,36 @@ class BundleManifest(Ranged, frozen=True, kw_only=True):
         yield from (f"files: {refusal}" for refusal in map(refusal_of_name, self.files) if refusal)
         needs = {name: one.needs for name, one in self.inputs.items() if one.needs}
         if needs and not self.goals:
-            yield f"inputs {', '.join(needs)} need goals that no run can give at once: give one of them `missing`"
+            yield (
+                f"inputs {', '.join(needs)} need goals that no run can give at once: give one of "
+                f"them `missing`"
+            )
         elif self.goals and self.goal not in self.goals:
-            yield f"goal must be one of {', '.join(self.goals)}, of which the inputs are made, not {self.goal!r}"
+            yield (
+                f"goal must be one of {', '.join(self.goals)}, of which the inputs are made, not "
+                f"{self.goal!r}"
+            )
         for name, one in self.inputs.items():
             if isinstance(one, PictureInput):
                 cameras: Mapping[str, BundleCamera | None] = {"": self.camera, **self.cameras}
                 if cameras.get(one.camera) is None:
-                    which = f"cameras has no {one.camera!r}" if one.camera else "camera is null or missing"
+                    which = (
+                        f"cameras has no {one.camera!r}"
+                        if one.camera
+                        else "camera is null or missing"
+                    )
                     yield f"inputs.{name} is a picture, and {which}"
             parts = one.parts if isinstance(one, JoinedInput) else (one,)
-            if self.odometry in ("none", "gps") and any(isinstance(part, PastPositionsInput) for part in parts):
-                yield f"inputs.{name} holds past positions, and odometry is {self.odometry!r}: say exact or wheel"
+            if self.odometry in ("none", "gps") and any(
+                isinstance(part, PastPositionsInput) for part in parts
+            ):
+                yield (
+                    f"inputs.{name} holds past positions, and odometry is {self.odometry!r}: say "
+                    f"exact or wheel"
+                )
 
 
 def read_bundle_manifest(folder: Path) -> BundleManifest:
-    """The manifest of a bundle's folder. Raises SpecError with every fault, its place, and what may stand there."""
+    """The manifest of a bundle's folder. Raises SpecError with every fault, its place, and what may
+    stand there."""
     return read_spec_file(folder / MANIFEST_FILE, BundleManifest)

@@ -1,16 +1,19 @@
-"""What comes out of a graph: the field `output` of a bundle's manifest.
-
-{"what": "waypoints", "name": "action", "unit_m": 0.25, "index": 2, "dt_s": 0.25}
-{"what": "wheels", "left": {"name": "wheels", "index": 0}, "right": {"name": "wheels", "index": 1}, "unit_mps": 1.0}
-"""
+"""Outputs of a graph: the field `output` of a bundle's manifest, and its decoding."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Final, Literal
 
-from cosim.episode.ports import HowFollowed, WaypointRule
-from cosim.spec.ranges import Counted, Ranged, Within
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.errors import PolicyError, UsageError
+from cosim.core.state import STILL, Command, Planned
+from cosim.policies.onnx.graph import Tensor, TensorPort
+from cosim.spec.manifest import HowFollowed, WaypointRule
+from cosim.spec.robot import Robot
+from cosim.spec.validation import Counted, Ranged, Within
 
 _NUMBER: Final = Within(-1e9, 1e9)
 _ABOVE_0: Final = Within(0, 1e9, above=True)
@@ -24,28 +27,46 @@ class Element(Ranged, frozen=True, kw_only=True):
 
 
 class Mixture(Ranged, frozen=True, kw_only=True):
-    """Waypoints in one row of numbers: for each of `modes` the values of all points, as many scales of them, and one
-    score, of which the highest is taken."""
+    """Waypoints in one row of numbers: for each of `modes` the values of all points, as many scales
+    of them, and one score, of which the highest is taken."""
 
     modes: Annotated[int, Within(1, 10_000)]
     points: Annotated[int, Within(1, 10_000)]
 
 
 class WaypointsOutput(Ranged, frozen=True, kw_only=True, tag="waypoints", tag_field="what"):
-    """Waypoints in the robot's frame: the output's last axis holds `columns`, the one before the waypoints.
+    """Waypoints in the robot's frame: the output's last axis holds `columns`, the one before the
+    waypoints.
 
-    columns: what each is: x ahead, y left, -y right, heading in radians; "speed" m/s, "turn" rad/s; "" for what is not
-    used. Numbers become number * scale + offset, one of each column, empty for 1 and 0. steps: each row is the way from
-    the row before, x and y are summed up. unit_m: metres in one unit of x and y; index, dt_s, rule: which is followed
-    and how (`cosim.episode.ports.WaypointRule`). follow: "speeds" takes speed and turn of row `index` for the command.
+    columns: what each is: x ahead, y left, -y right, heading in radians; "speed" m/s, "turn" rad/s;
+    "" for what is not used. Numbers become number * scale + offset, one of each column, empty for 1
+    and 0. steps: each row is the way from the row before, x and y are summed up. unit_m: metres in
+    one unit of x and y; index, dt_s, rule: which is followed and how
+    (`cosim.spec.manifest.WaypointRule`). follow: "speeds" takes speed and turn of row `index` for
+    the command.
 
-    Further axes are modes or samples: the first is taken, or the one with the highest of the output `scores`.
+    Further axes are modes or samples: the first is taken, or the one with the highest of the output
+    `scores`.
     """
 
     name: str
     columns: Annotated[
         tuple[
-            Literal["x", "-x", "y", "-y", "cos", "sin", "-sin", "heading", "-heading", "speed", "turn", "-turn", ""],
+            Literal[
+                "x",
+                "-x",
+                "y",
+                "-y",
+                "cos",
+                "sin",
+                "-sin",
+                "heading",
+                "-heading",
+                "speed",
+                "turn",
+                "-turn",
+                "",
+            ],
             ...,
         ],
         Counted(2, 64),
@@ -82,19 +103,28 @@ class WaypointsOutput(Ranged, frozen=True, kw_only=True, tag="waypoints", tag_fi
         if lacking := sorted(wanted - set(bare)):
             yield f"waypoints columns lack {', '.join(lacking)}: {list(self.columns)}"
         if ("cos" in bare) != ("sin" in bare) or ("cos" in bare and "heading" in bare):
-            yield f"waypoints columns must have cos and sin, or heading, or neither: {list(self.columns)}"
+            yield (
+                f"waypoints columns must have cos and sin, or heading, or neither: "
+                f"{list(self.columns)}"
+            )
         for field in ("scale", "offset"):
             if (numbers := getattr(self, field)) and len(numbers) != len(self.columns):
-                yield f"waypoints {field} must hold {len(self.columns)} numbers or none, not {len(numbers)}"
+                yield (
+                    f"waypoints {field} must hold {len(self.columns)} numbers or none, not "
+                    f"{len(numbers)}"
+                )
         if self.mixture is not None and self.scores is not None:
             yield "waypoints mixture has scores of its own: leave scores out"
         if self.mixture is not None and self.index >= self.mixture.points:
-            yield f"waypoints index must be below mixture.points, {self.mixture.points}, not {self.index}"
+            yield (
+                f"waypoints index must be below mixture.points, {self.mixture.points}, not "
+                f"{self.index}"
+            )
 
 
 class WheelsOutput(Ranged, frozen=True, kw_only=True, tag="wheels", tag_field="what"):
-    """Speeds of the wheels at the left and at the right, in units of `unit_mps`; the robot's track makes them a
-    turn."""
+    """Speeds of the wheels at the left and at the right, in units of `unit_mps`; the robot's track
+    makes them a turn."""
 
     left: Element
     right: Element
@@ -110,9 +140,9 @@ class WheelsOutput(Ranged, frozen=True, kw_only=True, tag="wheels", tag_field="w
 
 
 class SteeringOutput(Ranged, frozen=True, kw_only=True, tag="steering", tag_field="what"):
-    """A turn, in units of `unit_radps`, to the left unless that is negative; and a speed: `speed_mps`, times the number
-    `speed`, times 1 less the number `stop`, where these are named. keep_turn, keep_speed: the share of the last command
-    that stays in the next one."""
+    """A turn, in units of `unit_radps`, to the left unless that is negative; and a speed:
+    `speed_mps`, times the number `speed`, times 1 less the number `stop`, where these are named.
+    keep_turn, keep_speed: the share of the last command that stays in the next one."""
 
     turn: Element
     unit_radps: Annotated[float, _NUMBER] = 1.0
@@ -136,7 +166,8 @@ class SteeringOutput(Ranged, frozen=True, kw_only=True, tag="steering", tag_fiel
 
 
 class CommandOutput(Ranged, frozen=True, kw_only=True, tag="command", tag_field="what"):
-    """A speed in units of `unit_mps`, and a turn to the left in units of `unit_radps` (negative: to the right)."""
+    """A speed in units of `unit_mps`, and a turn to the left in units of `unit_radps` (negative: to
+    the right)."""
 
     v: Element
     w: Element
@@ -157,3 +188,131 @@ class CommandOutput(Ranged, frozen=True, kw_only=True, tag="command", tag_field=
 
 
 GraphOutput = WaypointsOutput | WheelsOutput | SteeringOutput | CommandOutput
+
+
+PolicyAnswer = Command | NDArray[np.float64]
+
+
+def answer_of(
+    output: GraphOutput, told: Mapping[str, Tensor], robot: Robot, last: Command = STILL
+) -> PolicyAnswer:
+    """What the policy answers when the graph tells this; each tensor is of one observation. last:
+    the answer before, STILL at the beginning. Raises PolicyError for what is not finite."""
+    for name in output.outputs:
+        if not np.isfinite(told[name]).all():
+            raise PolicyError(f"output '{name}' of the graph holds NaN or infinity")
+    if isinstance(output, WaypointsOutput):
+        return _waypoints(output, told)
+    if isinstance(output, WheelsOutput):
+        left, right = (_number(told, one) * output.unit_mps for one in (output.left, output.right))
+        return Command((left + right) / 2.0, (right - left) / robot.drive.span_m[1])
+    if isinstance(output, CommandOutput):
+        return Command(
+            _number(told, output.v) * output.unit_mps, _number(told, output.w) * output.unit_radps
+        )
+    return _steered(output, told, last)
+
+
+def check_outputs(output: GraphOutput, ports: Mapping[str, TensorPort]) -> None:
+    """Raises UsageError for an output that the graph does not have."""
+    for name in output.outputs:
+        if name not in ports:
+            raise UsageError(
+                f"output: the graph has no output '{name}'. Valid choices: {', '.join(ports)}"
+            )
+
+
+def _number(told: Mapping[str, Tensor], one: Element) -> float:
+    numbers = told[one.name].ravel()
+    if one.index >= numbers.size:
+        raise UsageError(
+            f"output: '{one.name}' holds {numbers.size} numbers, and number {one.index} "
+            f"(from 0) is asked"
+        )
+    return float(numbers[one.index])
+
+
+def _steered(output: SteeringOutput, told: Mapping[str, Tensor], last: Command) -> Command:
+    v_mps = output.speed_mps
+    if output.speed is not None:
+        v_mps *= _number(told, output.speed)
+    if output.stop is not None:
+        v_mps *= 1.0 - _number(told, output.stop)
+    w_radps = _number(told, output.turn) * output.unit_radps
+    return Command(
+        output.keep_speed * last.v_mps + (1.0 - output.keep_speed) * v_mps,
+        output.keep_turn * last.w_radps + (1.0 - output.keep_turn) * w_radps,
+    )
+
+
+def _waypoints(output: WaypointsOutput, told: Mapping[str, Tensor]) -> PolicyAnswer:
+    """(N, 2), or (N, 4) with cosine and sine of the heading, in the output's units; by the speeds a
+    Planned."""
+    rows = _rows(output, told)
+    if output.scale:
+        rows = rows * output.scale
+    if output.offset:
+        rows = rows + output.offset
+    at = {
+        column.removeprefix("-"): (i, -1.0 if column.startswith("-") else 1.0)
+        for i, column in enumerate(output.columns)
+    }
+
+    def column(name: str) -> NDArray[np.float64]:
+        index, sign = at[name]
+        numbers: NDArray[np.float64] = rows[:, index] * sign
+        return numbers
+
+    x, y = (np.cumsum(column(name)) if output.steps else column(name) for name in "xy")
+    if "heading" in at:
+        turned = np.cumsum(column("heading")) if output.steps else column("heading")
+        answer = np.stack([x, y, np.cos(turned), np.sin(turned)], axis=1)
+    elif "cos" in at:
+        answer = np.stack([x, y, column("cos"), column("sin")], axis=1)
+    else:
+        answer = np.stack([x, y], axis=1)
+    if output.index >= len(answer):
+        raise UsageError(
+            f"output: '{output.name}' holds {len(answer)} waypoints, and waypoint "
+            f"{output.index} (from 0) is followed"
+        )
+    if output.follow == "waypoint":
+        return answer
+    answer[:, :2] *= output.unit_m
+    v_mps, w_radps = (float(column(name)[output.index]) for name in ("speed", "turn"))
+    return Planned(v_mps, w_radps, answer.astype(np.float32), output.index)
+
+
+def _rows(output: WaypointsOutput, told: Mapping[str, Tensor]) -> NDArray[np.float64]:
+    """The rows of the mode that is followed, (N, columns)."""
+    numbers: NDArray[np.float64] = told[output.name].astype(float)
+    width = len(output.columns)
+    if output.mixture is not None:
+        modes, points = output.mixture.modes, output.mixture.points
+        if numbers.size != modes * (2 * points * width + 1):
+            raise UsageError(
+                f"output: '{output.name}' holds {numbers.size} numbers; {modes} modes of "
+                f"{points} points of {width} "
+                f"values, their scales and a score are {modes * (2 * points * width + 1)}"
+            )
+        table = numbers.reshape(modes, -1)
+        best: NDArray[np.float64] = table[int(np.argmax(table[:, -1])), : points * width].reshape(
+            points, width
+        )
+        return best
+    if numbers.shape[-1:] != (width,) or numbers.ndim < 2:
+        if sum(side > 1 for side in numbers.shape) > 1 or numbers.size % width:
+            raise UsageError(
+                f"output: '{output.name}' is {numbers.shape}, and its last axis should hold the "
+                f"{width} columns {list(output.columns)}"
+            )
+        return numbers.reshape(-1, width)
+    points = numbers.shape[-2]
+    modes_of = numbers.reshape(-1, points, width)
+    scores = told[output.scores].ravel() if output.scores else np.zeros(len(modes_of))
+    if len(scores) != len(modes_of):
+        raise UsageError(
+            f"output: '{output.scores}' holds {len(scores)} scores of {len(modes_of)} modes"
+        )
+    rows: NDArray[np.float64] = modes_of[int(np.argmax(scores))]
+    return rows

@@ -22,7 +22,8 @@ _RESAMPLED: Final = {
 
 
 def picture_numbers(rgb: NDArray[np.uint8], how: PixelsInput) -> NDArray[Any]:
-    """One picture (H, W, 3) as a graph sees it: (rows, columns, channels), float32; uint8 where it stays as it is."""
+    """One picture (H, W, 3) as a graph sees it: (rows, columns, channels), float32; uint8 where it
+    stays as it is."""
     pixels = _coloured(_fitted(_cut(rgb, how), how), how.colour)
     if how.as_they_are:
         return pixels
@@ -36,7 +37,9 @@ def picture_numbers(rgb: NDArray[np.uint8], how: PixelsInput) -> NDArray[Any]:
 @cache
 def _numbers_of_bytes(how: PixelsInput) -> NDArray[np.float32]:
     """(256, channels): what each byte of a channel becomes."""
-    numbers = np.arange(256, dtype=np.float32)[:, None] * np.full(how.channels, 1.0 / how.scale, np.float32)
+    numbers = np.arange(256, dtype=np.float32)[:, None] * np.full(
+        how.channels, 1.0 / how.scale, np.float32
+    )
     if how.mean:
         numbers -= np.asarray(how.mean, np.float32)
     if how.std:
@@ -45,13 +48,16 @@ def _numbers_of_bytes(how: PixelsInput) -> NDArray[np.float32]:
 
 
 def axes_turned(frame: NDArray[Any], layout: str) -> NDArray[Any]:
-    """A frame (H, W, C), its axes in the order in which a layout has these letters; C alone may be absent from it.
+    """A frame (H, W, C), its axes in the order in which a layout has these letters; C alone may be
+    absent from it.
 
     >>> axes_turned(np.zeros((64, 85, 3)), "N(TC)HW").shape
     (3, 64, 85)
     """
     order = [letter for letter in "".join(axes_of(layout)) if letter in "HWC"]
-    return np.ascontiguousarray(frame.transpose(["HWC".index(letter) for letter in order + ["C"] * ("C" not in order)]))
+    return np.ascontiguousarray(
+        frame.transpose(["HWC".index(letter) for letter in order + ["C"] * ("C" not in order)])
+    )
 
 
 def laid_out(frames: Sequence[NDArray[Any]], layout: str) -> NDArray[Any]:
@@ -63,7 +69,9 @@ def laid_out(frames: Sequence[NDArray[Any]], layout: str) -> NDArray[Any]:
     letters = "".join(axes_of(layout)).replace("N", "")
     stacked = np.stack(frames, axis=letters.index("T")) if "T" in letters else frames[0]
     sides = dict(zip(letters, stacked.shape, strict=False))
-    return stacked.reshape(shape_of((sides["H"], sides["W"], sides.get("C", 1)), len(frames), layout))
+    return stacked.reshape(
+        shape_of((sides["H"], sides["W"], sides.get("C", 1)), len(frames), layout)
+    )
 
 
 def shape_of(sides: tuple[int, int, int], frames: int, layout: str) -> tuple[int, ...]:
@@ -77,7 +85,8 @@ def shape_of(sides: tuple[int, int, int], frames: int, layout: str) -> tuple[int
 
 
 def _cut(rgb: NDArray[np.uint8], how: PixelsInput) -> NDArray[np.uint8]:
-    """The part of a picture that `crop` names, and of that the part of the shape of `size` where that is asked for."""
+    """The part of a picture that `crop` names, and of that the part of the shape of `size` where
+    that is asked for."""
     rows, columns = rgb.shape[:2]
     if how.crop is not None:
         x0, y0, x1, y1 = how.crop
@@ -113,7 +122,9 @@ def _fitted(rgb: NDArray[np.uint8], how: PixelsInput) -> NDArray[np.uint8]:
     return whole
 
 
-def _resized(rgb: NDArray[np.uint8], width: int, height: int, how: PixelsInput) -> NDArray[np.uint8]:
+def _resized(
+    rgb: NDArray[np.uint8], width: int, height: int, how: PixelsInput
+) -> NDArray[np.uint8]:
     if rgb.shape[:2] == (height, width):
         return rgb
     resized: NDArray[np.uint8] = cv2.resize(
@@ -123,8 +134,8 @@ def _resized(rgb: NDArray[np.uint8], width: int, height: int, how: PixelsInput) 
 
 
 def _coloured(rgb: NDArray[np.uint8], colour: str) -> NDArray[np.uint8]:
-    """(H, W, 3) in other channels; yuv420 as (H / 2, W / 2, 6): Y of even and odd rows at even columns, then at odd
-    ones, U, V."""
+    """(H, W, 3) in other channels; yuv420 as (H / 2, W / 2, 6): Y of even and odd rows at even
+    columns, then at odd ones, U, V."""
     if colour == "bgr":
         return rgb[..., ::-1]
     if colour == "grey":
@@ -133,6 +144,9 @@ def _coloured(rgb: NDArray[np.uint8], colour: str) -> NDArray[np.uint8]:
     if colour == "yuv420":
         height, width = rgb.shape[:2]
         planes = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2YUV_I420)
-        y, uv = planes[:height], planes[height:].reshape(2, height // 2, width // 2)
-        return np.stack([y[::2, ::2], y[1::2, ::2], y[::2, 1::2], y[1::2, 1::2], uv[0], uv[1]], axis=-1)
+        y = planes[:height]
+        uv = planes[height:].reshape(2, height // 2, width // 2)
+        return np.stack(
+            [y[::2, ::2], y[1::2, ::2], y[::2, 1::2], y[1::2, 1::2], uv[0], uv[1]], axis=-1
+        )
     return rgb

@@ -1,7 +1,8 @@
 """A graph on trial: loaded and asked in a child process, with limits of time and memory.
 
-A graph may hold a loop without end, or ask for more memory than there is. Neither can be interrupted, but a process of
-its own can be ended. What the trial answers has the bits of the same graph in this process.
+A graph may hold a loop without end, or ask for more memory than there is. Neither can be
+interrupted, but a process of its own can be ended. What the trial answers has the bits of the same
+graph in this process.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from typing import Final, Self
 import msgspec
 import numpy as np
 
-from cosim.core.child import ForkedChild
+from cosim.core.child_process import ForkedChild
 from cosim.core.errors import UsageError
-from cosim.core.wire import Wire
+from cosim.core.framing import Wire
 from cosim.policies.onnx.graph import Graph, Tensor, TensorPort, import_runtime
 
 ROOM_BYTES: Final = 4 << 30
@@ -57,12 +58,14 @@ class _Raised(msgspec.Struct, tag=True):
 
 
 class TrialGraph:
-    """A graph in a child process. Use as a context manager. Raises UsageError as `Graph` does, and where loading and
-    all answers take more than `within_s` seconds together, or end the child. size: bytes of the graph's files."""
+    """A graph in a child process. Use as a context manager. Raises UsageError as `Graph` does, and
+    where loading and all answers take more than `within_s` seconds together, or end the child.
+    size: bytes of the graph's files."""
 
     def __init__(self, path: Path, size: int, within_s: float) -> None:
         import_runtime()
-        self.path, self._within_s = path, within_s
+        self.path = path
+        self._within_s = within_s
         self._until_s = time.monotonic() + within_s
         self._child = ForkedChild(partial(_serve, path), ROOM_BYTES + _TIMES * size)
         try:
@@ -81,7 +84,8 @@ class TrialGraph:
         self._child.close()
 
     def ask(self, tensors: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
-        """The outputs of these names. What the runtime raises is raised as a RuntimeError with its words."""
+        """The outputs of these names. What the runtime raises is raised as a RuntimeError with its
+        words."""
         packed = {name: _packed(array) for name, array in tensors.items()}
         try:
             self._child.wire.send(msgspec.msgpack.encode(_Ask(packed, list(names))))
@@ -96,7 +100,8 @@ class TrialGraph:
             message = self._child.wire.receive(max(self._until_s - time.monotonic(), 0.0))
         except TimeoutError:
             raise UsageError(
-                f"{self.path}: gives no answer within {self._within_s:g} s, to be loaded and to answer: it may hold a "
+                f"{self.path}: gives no answer within {self._within_s:g} s, to be loaded and "
+                f"to answer: it may hold a "
                 "loop without end. One that is only slow needs more time: --start-timeout"
             ) from None
         except (EOFError, OSError):
@@ -108,7 +113,8 @@ class TrialGraph:
 
     def _dead(self) -> UsageError:
         return UsageError(
-            f"{self.path}: ends onnxruntime: the process that ran it {self._child.ended()}; export it anew"
+            f"{self.path}: ends onnxruntime: the process that ran it {self._child.ended()}; "
+            f"export it anew"
         )
 
 
@@ -119,14 +125,21 @@ def _serve(path: Path, wire: Wire) -> None:
     except UsageError as error:
         wire.send(msgspec.msgpack.encode(_Raised(_with_room(str(error)), refused=True)))
         return
-    ports = ([(one.name, one.dtype.str, one.shape) for one in held.values()] for held in (graph.inputs, graph.outputs))
+    ports = (
+        [(one.name, one.dtype.str, one.shape) for one in held.values()]
+        for held in (graph.inputs, graph.outputs)
+    )
     wire.send(msgspec.msgpack.encode(_Ports(*ports)))
     while True:
         asked = msgspec.msgpack.decode(wire.receive(), type=_Ask)
         try:
-            told = graph.ask({name: _unpacked(one) for name, one in asked.tensors.items()}, asked.names)
+            told = graph.ask(
+                {name: _unpacked(one) for name, one in asked.tensors.items()}, asked.names
+            )
             if (size := sum(array.nbytes for array in told.values())) > _MOST_ANSWER_BYTES:
-                raise ValueError(f"the outputs hold {size} bytes; at most {_MOST_ANSWER_BYTES} are taken")
+                raise ValueError(
+                    f"the outputs hold {size} bytes; at most {_MOST_ANSWER_BYTES} are taken"
+                )
             reply: _Told | _Raised = _Told({name: _packed(array) for name, array in told.items()})
         except Exception as error:  # noqa: BLE001  whatever the runtime raises
             reply = _Raised(_with_room(str(error) or type(error).__name__))
@@ -136,7 +149,11 @@ def _serve(path: Path, wire: Wire) -> None:
 def _with_room(words: str) -> str:
     """The words of an error; where memory was lacking, with how much there was."""
     lacks = any(part in words.lower() for part in ("alloc", "memory"))
-    return f"{words} (a graph may use {ROOM_BYTES >> 30} GiB and {_TIMES} times its size)" if lacks else words
+    return (
+        f"{words} (a graph may use {ROOM_BYTES >> 30} GiB and {_TIMES} times its size)"
+        if lacks
+        else words
+    )
 
 
 def _port(told: _Port) -> TensorPort:

@@ -1,8 +1,9 @@
 """Bundles as visnavkit exports them: `X.onnx`, with `X.metadata.json` and `X.inputs.npz` beside it.
 
-Two graphs of it are known: of a window of frames (`vision`, `route_patch`, `goal`, `ego`, `action_bounds` to `modes`
-and `probs`), and of one frame with a buffer of features (`vision`, `feature_buffer`, `goal`, `ego` to `plan` and
-`feat_out`). What the files do not say is taken as that project has it: 20 Hz for a window, 10 Hz for frames.
+Two graphs of it are known: of a window of frames (`vision`, `route_patch`, `goal`, `ego`,
+`action_bounds` to `modes` and `probs`), and of one frame with a buffer of features (`vision`,
+`feature_buffer`, `goal`, `ego` to `plan` and `feat_out`). What the files do not say is taken as
+that project has it: 20 Hz for a window, 10 Hz for frames.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ from cosim.spec.goal import GoalProtocol
 METADATA: Final = ".metadata.json"
 EXAMPLE: Final = ".inputs.npz"
 _FOV_DEG: Final = 60.0
-_WINDOW_HZ, _FRAME_HZ = 20.0, 10.0
+_WINDOW_HZ = 20.0
+_FRAME_HZ = 10.0
 _MOST_METADATA_BYTES: Final = 16 << 20
 _REACHED_S: Final = 0.5
 """Of waypoints at other times each the first that is to be reached no sooner is followed."""
@@ -58,8 +60,8 @@ class _Metadata(msgspec.Struct):
 
 
 def manifest_of_export(graph: Path) -> BundleManifest:
-    """What visnavkit's files beside a graph say, as a manifest. Raises UsageError where they cannot be read, are of
-    another graph, or of inputs and outputs that are not known."""
+    """What visnavkit's files beside a graph say, as a manifest. Raises UsageError where they cannot
+    be read, are of another graph, or of inputs and outputs that are not known."""
     path = graph.with_suffix(METADATA)
     try:
         told = msgspec.json.decode(read_file(path, _MOST_METADATA_BYTES), type=_Metadata)
@@ -68,19 +70,22 @@ def manifest_of_export(graph: Path) -> BundleManifest:
     found = hashlib.sha256(read_file(graph)).hexdigest()
     if told.onnx_sha256 not in ("", found):
         raise UsageError(
-            f"{graph}: is another file than {path.name} says: onnx_sha256 is {told.onnx_sha256[:16]}... there, "
-            f"{found[:16]}... found"
+            f"{graph}: is another file than {path.name} says: onnx_sha256 is "
+            f"{told.onnx_sha256[:16]}... there, {found[:16]}... found"
         )
     vision = told.input_shapes.get("vision", ())
     if len(vision) not in (4, 5):
         shapes = ", ".join(f"{name} {list(shape)}" for name, shape in told.input_shapes.items())
         raise UsageError(f"{path}: input_shapes has no vision of 4 or 5 axes: {shapes}")
     window = len(vision) == 5
-    inputs = {name: _input(graph, name, shape, told, window) for name, shape in told.input_shapes.items()}
+    inputs = {
+        name: _input(graph, name, shape, told, window) for name, shape in told.input_shapes.items()
+    }
     try:
         return BundleManifest(
             format=1,
-            name=re.sub(r"[^A-Za-z0-9_-]+", "-", told.exp_name or graph.stem).strip("-.") or "visnavkit",
+            name=re.sub(r"[^A-Za-z0-9_-]+", "-", told.exp_name or graph.stem).strip("-.")
+            or "visnavkit",
             source="exported by visnavkit",
             model=graph.name,
             rate_hz=_rate_hz(told, window),
@@ -95,11 +100,16 @@ def manifest_of_export(graph: Path) -> BundleManifest:
 
 def exports_in(folder: Path) -> list[Path]:
     """The graphs in a folder that visnavkit's metadata lie beside."""
-    found = (path.with_name(path.name.removesuffix(METADATA) + ".onnx") for path in sorted(folder.glob(f"*{METADATA}")))
+    found = (
+        path.with_name(path.name.removesuffix(METADATA) + ".onnx")
+        for path in sorted(folder.glob(f"*{METADATA}"))
+    )
     return [graph for graph in found if graph.is_file()]
 
 
-def _input(graph: Path, name: str, shape: tuple[int, ...], told: _Metadata, window: bool) -> GraphInput:
+def _input(
+    graph: Path, name: str, shape: tuple[int, ...], told: _Metadata, window: bool
+) -> GraphInput:
     """What goes into an input."""
     frames = shape[1] if window and len(shape) > 2 else 1
     if name == "vision":
@@ -122,8 +132,8 @@ def _input(graph: Path, name: str, shape: tuple[int, ...], told: _Metadata, wind
     if name == "goal" and len(shape) == 4:
         return GoalPictureInput(size=(shape[-1], shape[-2]), layout="NCHW")
     raise UsageError(
-        f"{graph.with_suffix(METADATA)}: nothing is known of input '{name}' of shape {list(shape)}: "
-        "write a manifest.json"
+        f"{graph.with_suffix(METADATA)}: nothing is known of input '{name}' of shape "
+        f"{list(shape)}: write a manifest.json"
     )
 
 
@@ -134,12 +144,15 @@ def _ego(graph: Path, width: int, told: _Metadata) -> Iterator[Literal["v", "w"]
     for feature in features:
         if feature not in names:
             path = graph.with_suffix(METADATA)
-            raise UsageError(f"{path}: nothing is known of ego feature {feature!r}: write a manifest.json")
+            raise UsageError(
+                f"{path}: nothing is known of ego feature {feature!r}: write a manifest.json"
+            )
         yield names[feature]
 
 
 def _example(graph: Path, name: str) -> tuple[float, ...]:
-    """The numbers of an input that are the same for every question, as they were when the graph was exported."""
+    """The numbers of an input that are the same for every question, as they were when the graph was
+    exported."""
     path = graph.with_suffix(EXAMPLE)
     try:
         array = read_npz(path, [name], MOST_EXAMPLE_BYTES)[name]
@@ -160,14 +173,21 @@ def _protocol(inputs: dict[str, GraphInput]) -> GoalProtocol:
 
 def _rate_hz(told: _Metadata, window: bool) -> float:
     rate = _looked_up(told.config, "dataset", "train_loader", "hz")
-    return float(rate) if isinstance(rate, int | float) and rate > 0 else (_WINDOW_HZ if window else _FRAME_HZ)
+    return (
+        float(rate)
+        if isinstance(rate, int | float) and rate > 0
+        else (_WINDOW_HZ if window else _FRAME_HZ)
+    )
 
 
 def _window_output(path: Path, told: _Metadata) -> WaypointsOutput:
     """The plan with the highest probability, driven by its first speeds."""
     shape = told.output_shapes.get("modes", ())
     if len(shape) != 4 or shape[-1] != 5 or "probs" not in told.output_shapes:
-        raise UsageError(f"{path}: output_shapes has no probs, or no modes of (1, k, steps, 5): {told.output_shapes}")
+        raise UsageError(
+            f"{path}: output_shapes has no probs, or no modes of (1, k, steps, 5): "
+            f"{told.output_shapes}"
+        )
     seconds = _looked_up(told.config, "plan_len_seconds") or 0.05 * shape[2]
     return WaypointsOutput(
         name="modes",
@@ -182,14 +202,15 @@ def _window_output(path: Path, told: _Metadata) -> WaypointsOutput:
 def _frame_output(path: Path, told: _Metadata) -> WaypointsOutput:
     """The mode with the highest score, at the time of one of its points."""
     common = _looked_up(told.config, "common") or {}
-    points, seconds = common.get("plan_len_points", 0), float(common.get("plan_len_seconds", 0.0))
+    points = common.get("plan_len_points", 0)
+    seconds = float(common.get("plan_len_seconds", 0.0))
     width = 3 if common.get("use_full_pose", True) else 2
     shape = told.output_shapes.get("plan", ())
     each = points * 2 * width + 1
     if len(shape) != 2 or points < 1 or seconds <= 0.0 or shape[1] % each:
         raise UsageError(
-            f"{path}: output plan {list(shape)} is no whole number of modes of {points} points of {width} values; "
-            "config.common has plan_len_points, plan_len_seconds, use_full_pose"
+            f"{path}: output plan {list(shape)} is no whole number of modes of {points} points of "
+            f"{width} values; config.common has plan_len_points, plan_len_seconds, use_full_pose"
         )
     times = _times_s(points, seconds, common)
     index = int(np.argmax(times >= min(_REACHED_S, times[-1])))
@@ -203,7 +224,8 @@ def _frame_output(path: Path, told: _Metadata) -> WaypointsOutput:
 
 
 def _times_s(points: int, seconds: float, common: dict[str, Any]) -> NDArray[np.floating]:
-    """When each point is to be reached: evenly spaced, or growing with the square, from 0 unless that is left out."""
+    """When each point is to be reached: evenly spaced, or growing with the square, from 0 unless
+    that is left out."""
     if common.get("uniform_t_anchors", False):
         return np.arange(1, points + 1) * (seconds / points)
     if common.get("offset_t_anchors", False):

@@ -1,4 +1,5 @@
-"""The files of a bundle: where they are, that they are the right ones, and a hash of all that decides its answers."""
+"""The files of a bundle: where they are, that they are the right ones, and a hash of all that
+decides its answers."""
 
 from __future__ import annotations
 
@@ -20,14 +21,15 @@ from cosim.policies.onnx.manifest import BundleManifest, FileFacts, file_facts, 
 WEIGHTS_VARIABLE: Final = "COSIM_WEIGHTS"
 _MOST_BYTES: Final = 8_000_000_000
 _MOST_GRAPH_BYTES: Final = 2 << 30
-"""An ONNX file is a protobuf message, which holds no more; larger weights lie in files beside it."""
+"""An ONNX file is a protobuf message, which holds no more; larger weights lie in files beside
+it."""
 _PIECE_BYTES: Final = 1 << 20
 
 
 @dataclass(frozen=True)
 class BundleFiles:
-    """A graph's file; the BLAKE2b of it, of the files that it names, and of those that the manifest names; and how many
-    bytes all of these hold."""
+    """A graph's file; the BLAKE2b of it, of the files that it names, and of those that the manifest
+    names; and how many bytes all of these hold."""
 
     graph: Path
     digest: str
@@ -49,21 +51,23 @@ class NetworkFile:
         found = file_facts(data)
         if (found.bytes, found.blake2b) != (self.facts.bytes, self.facts.blake2b):
             raise UsageError(
-                f"{path}: {found.bytes} bytes, BLAKE2b {found.blake2b}; wanted is {self.name} of {self.source}: "
-                f"{self.facts.in_words}"
+                f"{path}: {found.bytes} bytes, BLAKE2b {found.blake2b}; wanted is {self.name} of "
+                f"{self.source}: {self.facts.in_words}"
             )
 
 
 def weight_folders() -> list[Path]:
-    """Where weights are looked for that do not lie beside their manifest: $COSIM_WEIGHTS, then a folder of the user's
-    data."""
+    """Where weights are looked for that do not lie beside their manifest: $COSIM_WEIGHTS, then a
+    folder of the user's data."""
     named = os.environ.get(WEIGHTS_VARIABLE, "")
     return [*([Path(named)] if named else []), user_data_path("sidewalk-cosim") / "weights"]
 
 
-def weights_file(policy: str, name: str, facts: FileFacts | None, source: str, beside: Sequence[Path] = ()) -> Path:
-    """Where a policy's file is: in one of the folders `beside`, or of weights. Raises UsageError where it is in none,
-    saying where it is to be had."""
+def weights_file(
+    policy: str, name: str, facts: FileFacts | None, source: str, beside: Sequence[Path] = ()
+) -> Path:
+    """Where a policy's file is: in one of the folders `beside`, or of weights. Raises UsageError
+    where it is in none, saying where it is to be had."""
     places = [*beside, *weight_folders()]
     for place in places:
         if (place / name).is_file():
@@ -72,13 +76,15 @@ def weights_file(policy: str, name: str, facts: FileFacts | None, source: str, b
     wanted = f": from {source}" if source else ""
     looked = ", ".join(map(str, places))
     raise UsageError(
-        f"policy '{policy}': {name} is missing{size}{wanted}. Looked for in {looked} (set {WEIGHTS_VARIABLE})"
+        f"policy '{policy}': {name} is missing{size}{wanted}. Looked for in {looked} (set "
+        f"{WEIGHTS_VARIABLE})"
     )
 
 
 def bundle_files(folder: Path, manifest: BundleManifest) -> BundleFiles:
-    """The files of the bundle in a folder. Raises UsageError for one that is missing, saying where it is to be had, or
-    is another than its manifest says; for a graph that is none, or has weights that are no numbers."""
+    """The files of the bundle in a folder. Raises UsageError for one that is missing, saying where
+    it is to be had, or is another than its manifest says; for a graph that is none, or has weights
+    that are no numbers."""
     graph = _found(folder, manifest, manifest.model)
     data = read_file(graph)
     try:
@@ -90,18 +96,26 @@ def bundle_files(folder: Path, manifest: BundleManifest) -> BundleFiles:
         ) from None
     if bad:
         more = f" and {len(bad) - 3} more" if len(bad) > 3 else ""
-        raise UsageError(f"{graph}: weights are NaN or infinite: {', '.join(bad[:3])}{more}; export it anew")
-    digest, size = hashlib.blake2b(digest_size=32), 0
+        raise UsageError(
+            f"{graph}: weights are NaN or infinite: {', '.join(bad[:3])}{more}; export it anew"
+        )
+    digest = hashlib.blake2b(digest_size=32)
+    size = 0
     for name in dict.fromkeys([manifest.model, *beside, *manifest.files]):
         if name in beside and (refusal := refusal_of_name(name)):
             raise UsageError(f"{graph}: has weights in a file beside it: {refusal}")
-        path = _inside(graph.with_name(name), graph.parent) if name in beside else _found(folder, manifest, name)
+        path = (
+            _inside(graph.with_name(name), graph.parent)
+            if name in beside
+            else _found(folder, manifest, name)
+        )
         size += _digested(path, name, manifest, digest)
     return BundleFiles(graph, digest.hexdigest(), size)
 
 
 def _found(folder: Path, manifest: BundleManifest, name: str) -> Path:
-    """Where a file of a bundle is. Raises UsageError for one in its folder that is a link out of it."""
+    """Where a file of a bundle is. Raises UsageError for one in its folder that is a link out of
+    it."""
     path = weights_file(manifest.name, name, manifest.files.get(name), manifest.source, [folder])
     return _inside(path, folder) if path.parent == folder else path
 
@@ -110,14 +124,15 @@ def _inside(path: Path, folder: Path) -> Path:
     """A file of a bundle's folder. Raises UsageError where it is a link that leads elsewhere."""
     if path.is_symlink() and not path.resolve().is_relative_to(folder.resolve()):
         raise UsageError(
-            f"{path}: is a link that leads out of its bundle: put the file there, or in a folder of weights "
-            f"({WEIGHTS_VARIABLE})"
+            f"{path}: is a link that leads out of its bundle: put the file there, or in a folder "
+            f"of weights ({WEIGHTS_VARIABLE})"
         )
     return path
 
 
 def read_file(path: Path, most_bytes: int = _MOST_GRAPH_BYTES) -> bytes:
-    """All of a file, by default of a graph. Raises UsageError for what is no regular file, and for more bytes."""
+    """All of a file, by default of a graph. Raises UsageError for what is no regular file, and for
+    more bytes."""
     with _read_in_words(path):
         return read_within(path, most_bytes)
 
@@ -133,19 +148,20 @@ def _read_in_words(path: Path) -> Iterator[None]:
 
 
 def _digested(path: Path, name: str, manifest: BundleManifest, digest: hashlib.blake2b) -> int:
-    """Take a file into a digest, piece by piece, and return its size. Raises UsageError for one that is another than
-    its manifest says."""
+    """Take a file into a digest, piece by piece, and return its size. Raises UsageError for one
+    that is another than its manifest says."""
     said = manifest.files.get(path.name)
     told: dict[str, int | str] = {} if said is None else {"bytes": said.bytes, **said.hashes}
 
     def check(what: str, found: int | str) -> None:
         if told.get(what, "") not in ("", found):
             raise UsageError(
-                f"{path}: is another file than the manifest of '{manifest.name}' says: files.{path.name}.{what} is "
-                f"{told[what]} there, {found} found"
+                f"{path}: is another file than the manifest of '{manifest.name}' says: "
+                f"files.{path.name}.{what} is {told[what]} there, {found} found"
             )
 
-    blake2b, sha256 = hashlib.blake2b(digest_size=32), hashlib.sha256()
+    blake2b = hashlib.blake2b(digest_size=32)
+    sha256 = hashlib.sha256()
     with _read_in_words(path):
         size = size_within(path, _MOST_BYTES)
         check("bytes", size)

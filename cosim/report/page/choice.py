@@ -1,4 +1,5 @@
-"""Which failures stand in the gallery: few enough to draw, all runs, structures, events, causes, real places."""
+"""Which failures stand in the gallery: few enough to draw, all runs, structures, events, causes,
+real places."""
 
 from __future__ import annotations
 
@@ -19,7 +20,8 @@ _START_S: Final = 15.0
 _MOST_S: Final = 600.0
 """So many seconds are simulated again in all."""
 WITHIN_S: Final = 150.0
-"""Of an episode failures later than this are not shown where an earlier one is: to come there takes long."""
+"""Of an episode failures later than this are not shown where an earlier one is: to come there takes
+long."""
 _ENOUGH_ALIKE: Final = 30
 """Of failures with the same facets so many are looked at, the earliest."""
 _OF_AN_EPISODE: Final = 40
@@ -27,8 +29,8 @@ _OF_AN_EPISODE: Final = 40
 
 
 class FailureToShow(NamedTuple):
-    """A failure that may be shown. run: its number; event: of its event, "" without; facets: what it is an example of;
-    place: where."""
+    """A failure that may be shown. run: its number; event: of its event, "" without; facets: what
+    it is an example of; place: where."""
 
     run: int
     scenario: str
@@ -49,14 +51,24 @@ def shown_of(runs: Sequence[ReportedRun]) -> list[FailureToShow]:
             family, kind = table_of_paper(scenario), example_of(scenario)
             for mishap in mishaps_of(record)[:_OF_AN_EPISODE]:
                 event = event_of(scenario, mishap)
-                facets: set[Hashable] = {(run.label, family, kind), (run.label, family, mishap.cause)}
+                facets: set[Hashable] = {
+                    (run.label, family, kind),
+                    (run.label, family, mishap.cause),
+                }
                 if event is not None:
                     facets.add((run.label, family, "event", event.kind))
                 if isinstance(scenario.place, CityMap):
                     facets.add(scenario.place.map)
                 words = "" if event is None else event.kind
                 found.append(
-                    FailureToShow(number, record.scenario, mishap, words, frozenset(facets), place_in_words(scenario))
+                    FailureToShow(
+                        number,
+                        record.scenario,
+                        mishap,
+                        words,
+                        frozenset(facets),
+                        place_in_words(scenario),
+                    )
                 )
     return found
 
@@ -64,10 +76,10 @@ def shown_of(runs: Sequence[ReportedRun]) -> list[FailureToShow]:
 def most_telling(
     candidates: Sequence[FailureToShow], most: int = MOST_FAILURES, within_s: float = WITHIN_S
 ) -> list[FailureToShow]:
-    """The most telling ones, the most telling first: each adds as many facets as it can for the time that it takes to
-    come there, then a new episode and a new place. Stops when there is nothing new, but not below LEAST_FAILURES; what
-    would take longer than _MOST_S in all is left out, and so are failures later than within_s of their episode, but
-    for its first."""
+    """The most telling ones, the most telling first: each adds as many facets as it can for the
+    time that it takes to come there, then a new episode and a new place. Stops when there is
+    nothing new, but not below LEAST_FAILURES; what would take longer than _MOST_S in all is left
+    out, and so are failures later than within_s of their episode, but for its first."""
     alike: Counter[frozenset[Hashable]] = Counter()
     left: list[FailureToShow] = []
     begun: set[tuple[int, str]] = set()
@@ -81,7 +93,9 @@ def most_telling(
     while left and len(choice.picked) < most:
         best = max(left, key=choice.worth)
         fresh = best.facets - choice.seen
-        if choice.further_s(best) > choice.room_s or (len(choice.picked) >= LEAST_FAILURES and not fresh):
+        if choice.further_s(best) > choice.room_s or (
+            len(choice.picked) >= LEAST_FAILURES and not fresh
+        ):
             break
         choice.take(best)
         left.remove(best)
@@ -89,7 +103,8 @@ def most_telling(
 
 
 class _Choice:
-    """What is taken so far. reached: of each episode, up to which second it is run again; room_s: what is left."""
+    """What is taken so far. reached: of each episode, up to which second it is run again; room_s:
+    what is left."""
 
     def __init__(self) -> None:
         self.picked: list[FailureToShow] = []
@@ -100,10 +115,13 @@ class _Choice:
 
     def further_s(self, one: FailureToShow) -> float:
         """How long its episode has to be simulated beyond what is taken already."""
-        return max(Clock().time_s(one.mishap.tick) - self._reached.get((one.run, one.scenario), 0.0), 0.0)
+        return max(
+            Clock().time_s(one.mishap.tick) - self._reached.get((one.run, one.scenario), 0.0), 0.0
+        )
 
     def worth(self, one: FailureToShow) -> tuple[bool, float, bool, bool]:
-        """More is better: that there is room for it, new facets for its time, a new episode, a new place."""
+        """More is better: that there is room for it, new facets for its time, a new episode, a new
+        place."""
         further_s = self.further_s(one)
         new_episode = (one.run, one.scenario) not in self._reached
         telling = len(one.facets - self.seen) / (_START_S + further_s)

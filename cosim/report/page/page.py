@@ -1,4 +1,5 @@
-"""The report as one HTML file: text, style, scripts, data and pictures in it; it asks nobody for anything."""
+"""The report as one HTML file: text, style, scripts, data and pictures in it; it asks nobody for
+anything."""
 
 from __future__ import annotations
 
@@ -12,17 +13,19 @@ import msgspec
 import numpy as np
 
 from cosim.core.telling import duration, milliseconds
-from cosim.episode.log import holds_waypoints
 from cosim.place.open_ground import GROUND_LOOKS
-from cosim.records.figures import median_answer_ms
-from cosim.records.results import policy_in_words
 from cosim.report.page.plots import CAUSE_COLOURS, RUN_COLOURS, Plot
 from cosim.report.page.reasons import CAUSES, mishaps_of
 from cosim.report.page.runs import ReportedRun, place_in_words
 from cosim.report.page.scene import Entry, PlacePicture, Spot
 from cosim.report.page.three_tables import summary_html, tables_html, warnings_html, wide_html
+from cosim.results.log import holds_waypoints
+from cosim.results.table import policy_in_words
+from cosim.results.throughput import median_answer_ms
 
-_POLICY: Final = "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+_POLICY: Final = (
+    "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+)
 """What the page may load: nothing from outside."""
 _MOST_LISTED: Final = 4
 """Of more runs than this the heading names fewer."""
@@ -31,8 +34,8 @@ _MOST_TOLD: Final = 12
 
 
 class Maps(msgspec.Struct, frozen=True):
-    """Where things went wrong. pictures: of some places; spots: of all, by place; episodes: of each place, all and
-    failed."""
+    """Where things went wrong. pictures: of some places; spots: of all, by place; episodes: of each
+    place, all and failed."""
 
     pictures: list[PlacePicture]
     spots: dict[str, list[Spot]]
@@ -46,7 +49,11 @@ def colours_of(runs: Sequence[ReportedRun]) -> dict[str, str]:
 
 
 def page_of(
-    runs: Sequence[ReportedRun], plots: Sequence[Plot], entries: Sequence[Entry], maps: Maps, note: str
+    runs: Sequence[ReportedRun],
+    plots: Sequence[Plot],
+    entries: Sequence[Entry],
+    maps: Maps,
+    note: str,
 ) -> bytes:
     """The file. note: what the gallery could not show, "" if nothing."""
     from plotly.offline import get_plotlyjs
@@ -54,8 +61,14 @@ def page_of(
     labels = list(dict.fromkeys(run.label for run in runs))
     title = f"{' · '.join(labels)}: cosim report"
     sections = {
-        "results": ("Results", f"{warnings_html(runs)}{summary_html(runs, colours_of(runs))}{tables_html(runs)}"),
-        "plots": ("Where it goes wrong", f'<div class="plots">{"".join(map(_plot, range(len(plots)), plots))}</div>'),
+        "results": (
+            "Results",
+            f"{warnings_html(runs)}{summary_html(runs, colours_of(runs))}{tables_html(runs)}",
+        ),
+        "plots": (
+            "Where it goes wrong",
+            f'<div class="plots">{"".join(map(_plot, range(len(plots)), plots))}</div>',
+        ),
         "failures": ("Failures", _gallery(entries, note)),
         "places": ("Places", _places(maps, _causes_of(runs))),
         "runs": ("What was run", _what_was_run(runs)),
@@ -68,25 +81,35 @@ def page_of(
         del sections["plots"]
     nav = "".join(f'<a href="#{name}">{words}</a>' for name, (words, _) in sections.items())
     body = "".join(
-        f'<section id="{name}"><h2>{words}</h2>{inner}</section>' for name, (words, inner) in sections.items()
+        f'<section id="{name}"><h2>{words}</h2>{inner}</section>'
+        for name, (words, inner) in sections.items()
     )
     data = {
         "plots": [plot.figure for plot in plots],
         "causes": CAUSE_COLOURS,
         "maps": maps,
-        "ground": {kind: "#{:02x}{:02x}{:02x}".format(*look.drawn) for kind, look in GROUND_LOOKS.items()},
+        "ground": {
+            kind: "#{:02x}{:02x}{:02x}".format(*look.drawn) for kind, look in GROUND_LOOKS.items()
+        },
     }
-    scenes = [_json(f"scene-{k}", entry.scene) for k, entry in enumerate(entries) if entry.scene is not None]
+    scenes = [
+        _json(f"scene-{k}", entry.scene)
+        for k, entry in enumerate(entries)
+        if entry.scene is not None
+    ]
     assets = files("cosim.report.page")
     style, viewer, script = (
-        (assets / name).read_text(encoding="utf-8") for name in ("page.css", "viewer.html", "page.js")
+        (assets / name).read_text(encoding="utf-8")
+        for name in ("page.css", "viewer.html", "page.js")
     )
     text = (
         f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1"><title>{escape(title)}</title>'
+        f'<meta name="viewport" content="width=device-width, '
+        f'initial-scale=1"><title>{escape(title)}</title>'
         f"<style>{style}</style></head><body>"
-        f'<header><p class="mark">cosim report</p><h1>{_lede(runs)}</h1></header><nav aria-label="Parts">{nav}</nav>'
+        f'<header><p class="mark">cosim report</p><h1>{_lede(runs)}</h1></header><nav '
+        f'aria-label="Parts">{nav}</nav>'
         f"<main>{body}</main>{viewer}"
         f"<script>{get_plotlyjs()}</script>{_json('data', data)}{''.join(scenes)}<script>{script}</script>"
         "</body></html>\n"
@@ -116,9 +139,8 @@ def _listed(words: Sequence[str]) -> str:
 
 def _plot(number: int, plot: Plot) -> str:
     return (
-        f'<figure class="plot"><figcaption><h3>{escape(plot.title)}</h3><p>{escape(plot.note)}</p></figcaption>'
-        f'<div class="drawing" data-plot="{number}" style="min-height:{plot.figure["layout"]["height"]}px" '
-        f'role="img" aria-label="{escape(plot.title)}"></div></figure>'
+        "<figure "
+        f'class="plot"><figcaption><h3>{escape(plot.title)}</h3><p>{escape(plot.note)}</p></figcaption><div class="drawing" data-plot="{number}" style="min-height:{plot.figure["layout"]["height"]}px" role="img" aria-label="{escape(plot.title)}"></div></figure>'
     )
 
 
@@ -127,39 +149,57 @@ def _gallery(entries: Sequence[Entry], note: str) -> str:
     choices = []
     for name, field in fields.items():
         counts = Counter(str(getattr(entry, field)) for entry in entries)
-        values = sorted(counts, key=lambda v: CAUSES.index(v) if v in CAUSES else -1) if field == "cause" else [*counts]
-        options = "".join(f'<option value="{escape(v)}">{escape(v)} ({counts[v]})</option>' for v in values)
+        values = (
+            sorted(counts, key=lambda v: CAUSES.index(v) if v in CAUSES else -1)
+            if field == "cause"
+            else [*counts]
+        )
+        options = "".join(
+            f'<option value="{escape(v)}">{escape(v)} ({counts[v]})</option>' for v in values
+        )
         choices.append(
-            f'<label>{name}<select data-field="{field}"><option value="">all</option>{options}</select></label>'
+            f'<label>{name}<select data-field="{field}"><option '
+            f'value="">all</option>{options}</select></label>'
         )
     cards = "".join(_card(number, entry) for number, entry in enumerate(entries))
     intro = (
-        f"{len(entries)} failures, chosen so that every run, structure, event and cause is there, and every real place "
-        "that was driven, as far as there is room; of a long episode its first failure, and others that come soon. "
-        "Open one to see its last seconds again: from above, by the robot's camera, from behind."
+        f"{len(entries)} failures, chosen so that every run, structure, event and cause is there, "
+        "and every real place that was driven, as far as there is room; of a long episode its "
+        "first failure, and others that come soon. Open one to see its last seconds again: from "
+        "above, by the robot's camera, from behind."
     )
     said = f'<p class="warn">{escape(note)}</p>' if note else ""
     return (
-        f'<p class="intro">{intro}</p>{said}<div class="filters">{"".join(choices)}<output id="shown"></output></div>'
-        f'<ol class="cards">{cards}</ol>'
+        f'<p class="intro">{intro}</p>{said}<div class="filters">{"".join(choices)}<output '
+        f'id="shown"></output></div><ol class="cards">{cards}</ol>'
     )
 
 
 def _card(number: int, entry: Entry) -> str:
-    facts = " · ".join(escape(part) for part in dict.fromkeys((entry.label, entry.event or entry.kind, entry.place)))
+    facts = " · ".join(
+        escape(part)
+        for part in dict.fromkeys((entry.label, entry.event or entry.kind, entry.place))
+    )
     about = (
         f'<span class="cause" style="--c:{CAUSE_COLOURS[entry.cause]}">{escape(entry.cause)}</span>'
         f"<b>{escape(entry.reason[:1].upper() + entry.reason[1:])}.</b>"
         f"<small>{facts}<br>{escape(entry.scenario)}, {entry.at_s:.1f} s</small>"
     )
     attributes = "".join(
-        f' data-{name}="{escape(str(getattr(entry, name)))}"' for name in ("label", "cause", "kind", "place")
+        f' data-{name}="{escape(str(getattr(entry, name)))}"'
+        for name in ("label", "cause", "kind", "place")
     )
     if entry.scene is None:
-        return f'<li{attributes}><div class="card bare">{about}<small>{escape(entry.why)}</small></div></li>'
+        return (
+            f'<li{attributes}><div class="card '
+            f'bare">{about}<small>{escape(entry.why)}</small></div></li>'
+        )
     shot = entry.scene.pictures.follow[-1] if entry.scene.pictures.follow else ""
     picture = f'<img src="{shot}" alt="" width="384" height="216" decoding="async">' if shot else ""
-    return f'<li{attributes}><button class="card" type="button" data-entry="{number}">{picture}{about}</button></li>'
+    return (
+        f'<li{attributes}><button class="card" type="button" '
+        f'data-entry="{number}">{picture}{about}</button></li>'
+    )
 
 
 def _places(maps: Maps, causes: Mapping[str, Counter[str]]) -> str:
@@ -177,7 +217,9 @@ def _places(maps: Maps, causes: Mapping[str, Counter[str]]) -> str:
     )
     rows = []
     for place, (episodes, failed) in maps.episodes.items():
-        told = ", ".join(f"{cause} {causes[place][cause]}" for cause in CAUSES if causes[place][cause])
+        told = ", ".join(
+            f"{cause} {causes[place][cause]}" for cause in CAUSES if causes[place][cause]
+        )
         mark = "" if place in drawn else ' class="quiet"'
         rows.append(
             f'<tr{mark}><th scope="row">{escape(place)}</th><td>{episodes}</td><td>{failed}</td>'
@@ -193,9 +235,12 @@ def _places(maps: Maps, causes: Mapping[str, Counter[str]]) -> str:
 
 
 def _what_was_run(runs: Sequence[ReportedRun]) -> str:
-    """What each run was, so that somebody else can do it again: what they share once, the rest side by side."""
+    """What each run was, so that somebody else can do it again: what they share once, the rest side
+    by side."""
     facts = [_facts(run) for run in runs]
-    shared = {name: value for name, value in facts[0].items() if all(one[name] == value for one in facts)}
+    shared = {
+        name: value for name, value in facts[0].items() if all(one[name] == value for one in facts)
+    }
     versions = [run.spec.versions for run in runs]
     packages = sorted({name for one in versions for name in one})
     alike = [name for name in packages if len({one.get(name) for one in versions}) == 1]
@@ -205,7 +250,9 @@ def _what_was_run(runs: Sequence[ReportedRun]) -> str:
         fact |= {name: one.get(name, "not told") for name in packages if name not in alike}
     parts = [_listing(shared)] if shared else []
     if differing := [name for name in facts[0] if name not in shared]:
-        heads = "".join(f'<th scope="col">{escape(run.label)}, {escape(run.spec.suite)}</th>' for run in runs)
+        heads = "".join(
+            f'<th scope="col">{escape(run.label)}, {escape(run.spec.suite)}</th>' for run in runs
+        )
         rows = [
             f'<tr><th scope="row">{name}</th>{"".join(f"<td>{escape(one[name])}</td>" for one in facts)}</tr>'
             for name in differing
@@ -215,14 +262,20 @@ def _what_was_run(runs: Sequence[ReportedRun]) -> str:
 
 
 def _listing(facts: Mapping[str, str]) -> str:
-    items = "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in facts.items())
+    items = "".join(
+        f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in facts.items()
+    )
     return f'<div class="run"><dl>{items}</dl></div>'
 
 
 def _facts(run: ReportedRun) -> dict[str, str]:
     spec = run.spec
     walls = [record.clock["wall_s"] for record in run.records if "wall_s" in record.clock]
-    wall = f"{duration(sum(walls))} in all, {np.median(walls):.1f} s the median episode" if walls else "not told"
+    wall = (
+        f"{duration(sum(walls))} in all, {np.median(walls):.1f} s the median episode"
+        if walls
+        else "not told"
+    )
     took_ms = median_answer_ms(run.records)
     follows = any(map(holds_waypoints, run.path.glob("episodes/*/trajectory.npz")))
     called = policy_in_words(spec.policy_name, run.records[0].privileged)
@@ -251,7 +304,8 @@ def _lost(run: ReportedRun) -> str:
     """The episodes that crashed or are invalid, and why."""
     bad = run.table[run.table["status"] != "done"]
     told = [
-        f"{status} {name}: {why}" for status, name, why in bad[["status", "scenario", "reason"]].itertuples(index=False)
+        f"{status} {name}: {why}"
+        for status, name, why in bad[["status", "scenario", "reason"]].itertuples(index=False)
     ]
     if not told:
         return ""
@@ -262,11 +316,14 @@ def _lost(run: ReportedRun) -> str:
 
 
 def _causes_of(runs: Sequence[ReportedRun]) -> Mapping[str, Counter[str]]:
-    """How often each cause was, by place: of all failures, also of those that no map has room for."""
+    """How often each cause was, by place: of all failures, also of those that no map has room
+    for."""
     found: defaultdict[str, Counter[str]] = defaultdict(Counter)
     for run in runs:
         for name, record in run.whole.records.items():
-            found[place_in_words(run.scenarios[name])].update(mishap.cause for mishap in mishaps_of(record))
+            found[place_in_words(run.scenarios[name])].update(
+                mishap.cause for mishap in mishaps_of(record)
+            )
     return found
 
 
@@ -275,9 +332,12 @@ def counts_of(runs: Sequence[ReportedRun]) -> Mapping[str, tuple[int, int]]:
     total: Counter[str] = Counter()
     failed: Counter[str] = Counter()
     for run in runs:
-        for place, status, success in run.table[["place", "status", "success"]].itertuples(index=False):
+        for place, status, success in run.table[["place", "status", "success"]].itertuples(
+            index=False
+        ):
             total[place] += 1
             failed[place] += status == "crashed" or (status == "done" and not success)
     return {
-        place: (total[place], failed[place]) for place, _ in sorted(total.items(), key=lambda i: (-failed[i[0]], i[0]))
+        place: (total[place], failed[place])
+        for place, _ in sorted(total.items(), key=lambda i: (-failed[i[0]], i[0]))
     }

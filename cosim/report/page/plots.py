@@ -1,4 +1,5 @@
-"""The plots of a report, as figures of Plotly: plain values, drawn in the browser by the library in the page."""
+"""The plots of a report, as figures of Plotly: plain values, drawn in the browser by the library in
+the page."""
 
 from __future__ import annotations
 
@@ -11,18 +12,44 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
 from cosim.core.telling import Tell, untold
-from cosim.records.record import Record, Recorder
-from cosim.records.results import interval_of
 from cosim.report.page.paper import EVENT_COLUMNS
 from cosim.report.page.reasons import CAUSES, mishaps_of
 from cosim.report.page.runs import KINDS_OF_LIGHT, PaperTable, ReportedRun, table_of_paper
-from cosim.report.page.three_tables import UNIT_COLUMNS, MeanOfEpisodes, cell_of, episodes_of, kind_in_words
+from cosim.report.page.three_tables import (
+    UNIT_COLUMNS,
+    MeanOfEpisodes,
+    cell_of,
+    episodes_of,
+    kind_in_words,
+)
+from cosim.results.record import Record, Recorder
+from cosim.results.table import interval_of
 
-RUN_COLOURS: Final = ("#1f5fa8", "#d9722b", "#3b8f5a", "#8a5aa8", "#b03a48", "#5b6770", "#b8912f", "#2a9d9d")
+RUN_COLOURS: Final = (
+    "#1f5fa8",
+    "#d9722b",
+    "#3b8f5a",
+    "#8a5aa8",
+    "#b03a48",
+    "#5b6770",
+    "#b8912f",
+    "#2a9d9d",
+)
 CAUSE_COLOURS: Final = dict(
     zip(
         ("success", *CAUSES, "invalid"),
-        ("#a9cfae", "#c8452f", "#7b2d26", "#d99a3d", "#8a5aa8", "#4f86c6", "#8b97a3", "#c06aa0", "#333333", "#dddddd"),
+        (
+            "#a9cfae",
+            "#c8452f",
+            "#7b2d26",
+            "#d99a3d",
+            "#8a5aa8",
+            "#4f86c6",
+            "#8b97a3",
+            "#c06aa0",
+            "#333333",
+            "#dddddd",
+        ),
         strict=True,
     )
 )
@@ -50,13 +77,16 @@ class Plot(NamedTuple):
 
 
 class Exposure(NamedTuple):
-    """One episode, split by what was around at each moment: failures (B,), metres travelled (B,)."""
+    """One episode, split by what was around at each moment: failures (B,), metres travelled
+    (B,)."""
 
     failures: Floats
     metres: Floats
 
 
-def plots_of(runs: Sequence[ReportedRun], colours: Mapping[str, str], tell: Tell = untold) -> list[Plot]:
+def plots_of(
+    runs: Sequence[ReportedRun], colours: Mapping[str, str], tell: Tell = untold
+) -> list[Plot]:
     """Every plot that the runs have something for. colours: of the labels."""
     rate = "Failures per 100 m"
     found = [
@@ -64,25 +94,61 @@ def plots_of(runs: Sequence[ReportedRun], colours: Mapping[str, str], tell: Tell
         _by(runs, colours, "reactive", "kind", EVENT_COLUMNS, "success", "Success by event"),
         _endings(runs),
         _rates_by_cause(runs),
-        _by(runs, colours, "unit", "light", KINDS_OF_LIGHT, "success", "Success by light, unit tests"),
-        _by(runs, colours, "reactive", "light", KINDS_OF_LIGHT, "success", "Success by light, people in the way"),
-        _by(runs, colours, "long", "light", KINDS_OF_LIGHT, "failures_per_100m", f"{rate} by light, long ways"),
+        _by(
+            runs,
+            colours,
+            "unit",
+            "light",
+            KINDS_OF_LIGHT,
+            "success",
+            "Success by light, unit tests",
+        ),
+        _by(
+            runs,
+            colours,
+            "reactive",
+            "light",
+            KINDS_OF_LIGHT,
+            "success",
+            "Success by light, people in the way",
+        ),
+        _by(
+            runs,
+            colours,
+            "long",
+            "light",
+            KINDS_OF_LIGHT,
+            "failures_per_100m",
+            f"{rate} by light, long ways",
+        ),
     ]
     near, fast = _exposures(runs, tell)
     people = {label: parts for (label, family), parts in near.items() if family == "long"}
     speed: dict[str, dict[str, list[Exposure]]] = {"long ways": {}, "short ways": {}}
     for (label, family), parts in fast.items():
         speed["long ways" if family == "long" else "short ways"].setdefault(label, []).extend(parts)
-    note = "Pooled over episodes that ended: failures that happened so, on metres driven so; bars are 95 % intervals."
+    note = (
+        "Pooled over episodes that ended: failures that happened so, on metres driven so; bars "
+        "are 95 % intervals."
+    )
     moving = f"{note} Without freezings, which happen at no speed."
-    found.append(_exposed(people, colours, _NEAR_WORDS, f"{rate} by people within {NEAR_M:g} m, long ways", note))
+    found.append(
+        _exposed(
+            people, colours, _NEAR_WORDS, f"{rate} by people within {NEAR_M:g} m, long ways", note
+        )
+    )
     for words, of in speed.items():
-        found.append(_exposed(of, colours, _SPEED_WORDS, f"{rate} by the robot's speed, m/s, {words}", moving))
+        found.append(
+            _exposed(
+                of, colours, _SPEED_WORDS, f"{rate} by the robot's speed, m/s, {words}", moving
+            )
+        )
     return [plot for plot in found if plot is not None]
 
 
 def near_of(pose: Floats, people_tick: NDArray[np.int64], people_xy: Floats) -> Floats:
-    """(T,) how many people were within NEAR_M of the robot, as recorded once a second; columns of `Log`."""
+    """(T,) how many people were within NEAR_M of the robot, as recorded once a second; columns of
+    `Log`."""
     away = people_xy - pose[people_tick, :2]
     close = people_tick[np.hypot(away[:, 0], away[:, 1]) < NEAR_M]
     every = Recorder.PEOPLE_EVERY_TICKS
@@ -93,10 +159,14 @@ def near_of(pose: Floats, people_tick: NDArray[np.int64], people_xy: Floats) -> 
 def exposure_of(
     record: Record, travelled_m: Floats, value: Floats, edges: Sequence[float], *, moving: bool
 ) -> Exposure:
-    """Failures and metres of an episode by a value that it has at each tick, (T,). travelled_m: (T,) of each tick.
-    moving: freezings, which have no metres, are left out."""
+    """Failures and metres of an episode by a value that it has at each tick, (T,). travelled_m:
+    (T,) of each tick. moving: freezings, which have no metres, are left out."""
     bins = np.digitize(value, edges)
-    ticks = [f.tick for f in record.failures if f.tick < len(value) and not (moving and f.kind == "freezing")]
+    ticks = [
+        f.tick
+        for f in record.failures
+        if f.tick < len(value) and not (moving and f.kind == "freezing")
+    ]
     count = len(edges) + 1
     failures = np.bincount(bins[np.array(ticks, dtype=int)], minlength=count).astype(float)
     return Exposure(failures, np.bincount(bins, weights=travelled_m, minlength=count).astype(float))
@@ -113,26 +183,40 @@ def _exposures(runs: Sequence[ReportedRun], tell: Tell) -> tuple[_ByRun, _ByRun]
         tell("reading trajectories", number / len(runs))
         for record, track in run.tracks():
             key = run.label, table_of_paper(run.scenarios[record.scenario])
-            travelled_m, speed = track["travelled_m"], np.abs(track["speed"][:, 0])
+            travelled_m = track["travelled_m"]
+            speed = np.abs(track["speed"][:, 0])
             if key[1] == "long":
                 people = near_of(track["pose"], track["people_tick"], track["people_xy"])
-                near.setdefault(key, []).append(exposure_of(record, travelled_m, people, _NEAR_EDGES, moving=False))
+                near.setdefault(key, []).append(
+                    exposure_of(record, travelled_m, people, _NEAR_EDGES, moving=False)
+                )
             began = np.concatenate([speed[:1], speed[:-1]])
-            fast.setdefault(key, []).append(exposure_of(record, travelled_m, began, _SPEED_EDGES, moving=True))
+            fast.setdefault(key, []).append(
+                exposure_of(record, travelled_m, began, _SPEED_EDGES, moving=True)
+            )
     return near, fast
 
 
 def _exposed(
-    of: Mapping[str, list[Exposure]], colours: Mapping[str, str], words: Sequence[str], title: str, note: str
+    of: Mapping[str, list[Exposure]],
+    colours: Mapping[str, str],
+    words: Sequence[str],
+    title: str,
+    note: str,
 ) -> Plot | None:
     """Of all runs, or of none where none has a failure."""
     if not any(part.failures.any() for parts in of.values() for part in parts):
         return None
     cells: dict[str, list[MeanOfEpisodes]] = {}
     for label, parts in of.items():
-        failures, metres = np.array([p.failures for p in parts]), np.array([p.metres for p in parts])
+        failures, metres = (
+            np.array([p.failures for p in parts]),
+            np.array([p.metres for p in parts]),
+        )
         cells[label] = [
-            MeanOfEpisodes(100.0 * f.sum() / m.sum(), *interval_of(100.0 * f, m), int((m > 0).sum()))
+            MeanOfEpisodes(
+                100.0 * f.sum() / m.sum(), *interval_of(100.0 * f, m), int((m > 0).sum())
+            )
             if m.sum() >= _LEAST_M
             else MeanOfEpisodes(np.nan, np.nan, np.nan, 0)
             for f, m in zip(failures.T, metres.T, strict=True)
@@ -141,25 +225,43 @@ def _exposed(
     if len(present) < 2:
         return None
     cells = {label: [row[k] for k in present] for label, row in cells.items()}
-    return Plot(title, note, _points(cells, colours, [words[k] for k in present], "per 100 m", share=False))
+    return Plot(
+        title, note, _points(cells, colours, [words[k] for k in present], "per 100 m", share=False)
+    )
 
 
 def _by(
-    runs: Sequence[ReportedRun], colours: Mapping[str, str], family: PaperTable, column: str, order: Sequence[str],
-    metric: str, title: str,
-) -> Plot | None:  # fmt: skip
+    runs: Sequence[ReportedRun],
+    colours: Mapping[str, str],
+    family: PaperTable,
+    column: str,
+    order: Sequence[str],
+    metric: str,
+    title: str,
+) -> Plot | None:
     """A metric of a family by the values of a column; nothing where there is but one value."""
     tables = episodes_of(runs, family)
-    present = [value for value in order if any((table[column] == value).any() for table in tables.values())]
+    present = [
+        value for value in order if any((table[column] == value).any() for table in tables.values())
+    ]
     if len(present) < 2:
         return None
     cells = {
-        label: [cell_of(table[table[column] == value], metric) for value in present] for label, table in tables.items()
+        label: [cell_of(table[table[column] == value], metric) for value in present]
+        for label, table in tables.items()
     }
     share = metric == "success"
-    note = "Points are means, bars 95 % intervals; hover for figures." if share else "Pooled; bars are 95 % intervals."
+    note = (
+        "Points are means, bars 95 % intervals; hover for figures."
+        if share
+        else "Pooled; bars are 95 % intervals."
+    )
     words = [escape(kind_in_words(value)) for value in present]
-    return Plot(title, note, _points(cells, colours, words, "success" if share else "per 100 m", share=share))
+    return Plot(
+        title,
+        note,
+        _points(cells, colours, words, "success" if share else "per 100 m", share=share),
+    )
 
 
 def _points(
@@ -173,23 +275,37 @@ def _points(
     """A row for each word, in it a point with its interval for each label."""
     data = []
     for label, row in cells.items():
-        shown = [(word, cell) for word, cell in zip(words, row, strict=True) if cell.n and not np.isnan(cell.mean)]
+        shown = [
+            (word, cell)
+            for word, cell in zip(words, row, strict=True)
+            if cell.n and not np.isnan(cell.mean)
+        ]
         data.append(
             {
-                "type": "scatter", "mode": "markers", "orientation": "h", "name": escape(label), "offsetgroup": label,
+                "type": "scatter",
+                "mode": "markers",
+                "orientation": "h",
+                "name": escape(label),
+                "offsetgroup": label,
                 "cliponaxis": False,
-                "x": [round(cell.mean, 4) for _, cell in shown], "y": [word for word, _ in shown],
+                "x": [round(cell.mean, 4) for _, cell in shown],
+                "y": [word for word, _ in shown],
                 "error_x": {
-                    "type": "data", "symmetric": False, "thickness": 1.6, "width": 0,
+                    "type": "data",
+                    "symmetric": False,
+                    "thickness": 1.6,
+                    "width": 0,
                     "array": [round(cell.high - cell.mean, 4) for _, cell in shown],
                     "arrayminus": [round(cell.mean - cell.low, 4) for _, cell in shown],
                 },
                 "marker": {"size": 9, "color": colours[label]},
-                "customdata": [[round(cell.low, 3), round(cell.high, 3), cell.n] for _, cell in shown],
+                "customdata": [
+                    [round(cell.low, 3), round(cell.high, 3), cell.n] for _, cell in shown
+                ],
                 "hovertemplate": "%{y}<br>%{x:.2f} (%{customdata[0]:.2f} to %{customdata[1]:.2f}),"
                 " n = %{customdata[2]}",
             }
-        )  # fmt: skip
+        )
     scale = {"range": [-0.02, 1.02], "tickformat": ".1f"} if share else {"rangemode": "tozero"}
     return {
         "data": data,
@@ -199,7 +315,11 @@ def _points(
             "scattermode": "group",
             "showlegend": len(cells) > 1,
             "xaxis": {"title": {"text": axis}, "zeroline": False, **scale},
-            "yaxis": {"autorange": "reversed", "categoryorder": "array", "categoryarray": list(words)},
+            "yaxis": {
+                "autorange": "reversed",
+                "categoryorder": "array",
+                "categoryarray": list(words),
+            },
         },
     }
 
@@ -209,17 +329,28 @@ def _stacked(rows: Mapping[str, Mapping[str, float]], axis: str, form: str) -> d
     causes = [cause for cause in CAUSE_COLOURS if any(row.get(cause) for row in rows.values())]
     data = [
         {
-            "type": "bar", "orientation": "h", "name": cause, "marker": {"color": CAUSE_COLOURS[cause]},
+            "type": "bar",
+            "orientation": "h",
+            "name": cause,
+            "marker": {"color": CAUSE_COLOURS[cause]},
             "y": [*rows],
             "x": [round(row.get(cause, 0.0), 4) for row in rows.values()],
             "hovertemplate": f"%{{x:{form}}}",
         }
         for cause in causes
-    ]  # fmt: skip
+    ]
     yaxis = {"autorange": "reversed", "type": "category"}
     xaxis = {"title": {"text": axis}, "tickformat": form, "zeroline": False}
-    layout = {"barmode": "stack", "height": 140 + _BAR_PX * len(rows), "bargap": 0.35, "showlegend": True}
-    return {"data": data, "layout": layout | {"meta": {"row": _BAR_PX}, "xaxis": xaxis, "yaxis": yaxis}}
+    layout = {
+        "barmode": "stack",
+        "height": 140 + _BAR_PX * len(rows),
+        "bargap": 0.35,
+        "showlegend": True,
+    }
+    return {
+        "data": data,
+        "layout": layout | {"meta": {"row": _BAR_PX}, "xaxis": xaxis, "yaxis": yaxis},
+    }
 
 
 def _endings(runs: Sequence[ReportedRun]) -> Plot | None:
@@ -231,17 +362,27 @@ def _endings(runs: Sequence[ReportedRun]) -> Plot | None:
             if family != "long":
                 row = rows.setdefault(f"{escape(run.label)}<br>{_FAMILIES[family]}", {})
                 went = mishaps_of(record)
-                what = "invalid" if record.status == "invalid" else went[0].cause if went else "success"
+                what = (
+                    "invalid"
+                    if record.status == "invalid"
+                    else went[0].cause
+                    if went
+                    else "success"
+                )
                 row[what] = row.get(what, 0.0) + 1.0
     if not rows:
         return None
-    shares = {name: {cause: n / sum(row.values()) for cause, n in row.items()} for name, row in rows.items()}
+    shares = {
+        name: {cause: n / sum(row.values()) for cause, n in row.items()}
+        for name, row in rows.items()
+    }
     note = "Share of episodes by how they ended; at the first failure they are over."
     return Plot("How short episodes end", note, _stacked(shares, "share of episodes", ".0%"))
 
 
 def _rates_by_cause(runs: Sequence[ReportedRun]) -> Plot | None:
-    """What goes wrong on long ways. An episode whose policy crashed has no metres: it is told beside."""
+    """What goes wrong on long ways. An episode whose policy crashed has no metres: it is told
+    beside."""
     counts: dict[str, dict[str, float]] = {}
     metres: dict[str, float] = {}
     crashed: dict[str, list[bool]] = {}
@@ -251,7 +392,9 @@ def _rates_by_cause(runs: Sequence[ReportedRun]) -> Plot | None:
                 continue
             crashed.setdefault(run.label, []).append(record.status == "crashed")
             if record.status == "done":
-                metres[run.label] = metres.get(run.label, 0.0) + (record.measures.get("path_length_m") or 0.0)
+                metres[run.label] = metres.get(run.label, 0.0) + (
+                    record.measures.get("path_length_m") or 0.0
+                )
                 row = counts.setdefault(run.label, {})
                 for mishap in mishaps_of(record):
                     if mishap.failure is not None:
@@ -263,7 +406,16 @@ def _rates_by_cause(runs: Sequence[ReportedRun]) -> Plot | None:
     }
     if not any(rows.values()):
         return None
-    note = "Failures per 100 m, all metres of episodes that ended. After a failure the robot is put back and goes on."
-    told = [f"{sum(which)} of {len(which)} of {label}" for label, which in crashed.items() if any(which)]
-    note += f" Not in it are the episodes in which the policy crashed: {', '.join(told)}." if told else ""
+    note = (
+        "Failures per 100 m, all metres of episodes that ended. After a failure the robot is put "
+        "back and goes on."
+    )
+    told = [
+        f"{sum(which)} of {len(which)} of {label}" for label, which in crashed.items() if any(which)
+    ]
+    note += (
+        f" Not in it are the episodes in which the policy crashed: {', '.join(told)}."
+        if told
+        else ""
+    )
     return Plot("What goes wrong on long ways", note, _stacked(rows, "failures per 100 m", ".1f"))

@@ -9,9 +9,9 @@ import numpy as np
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Floats
-from cosim.episode.log import Log
-from cosim.judge.referee import FREEZE_MOVE_M, FREEZE_WINDOW_S, Failure
-from cosim.records.record import Record, TriggeredEvent
+from cosim.results.log import Log
+from cosim.results.record import Record, TriggeredEvent
+from cosim.results.referee import FREEZE_MOVE_M, FREEZE_WINDOW_S, Failure
 from cosim.spec.events import Event
 from cosim.spec.scenario import Scenario
 
@@ -22,18 +22,32 @@ _ASTRAY_M: Final = 5.0
 _OVER_S: Final = 0.4
 """Over so long a time a speed is taken from recorded places."""
 CAUSES: Final = (
-    "person", "vehicle", "obstacle", "off the sidewalk", "froze", "out of time", "broke the rule", "policy crashed",
-)  # fmt: skip
+    "person",
+    "vehicle",
+    "obstacle",
+    "off the sidewalk",
+    "froze",
+    "out of time",
+    "broke the rule",
+    "policy crashed",
+)
 """Kinds of reasons, in the order in which they are shown."""
 _THINGS: Final = {
-    "sign": "sandwich board", "cafe": "cafe table", "bike": "parked bike", "box": "pile of parcels",
-    "fence": "construction fence", "scooter": "parked scooter", "barrier": "barrier", "building": "wall",
+    "sign": "sandwich board",
+    "cafe": "cafe table",
+    "bike": "parked bike",
+    "box": "pile of parcels",
+    "fence": "construction fence",
+    "scooter": "parked scooter",
+    "barrier": "barrier",
+    "building": "wall",
     "prop": "piece of street furniture",
-}  # fmt: skip
+}
 
 
 class Other(NamedTuple):
-    """Whom or what the robot met: place and velocity in the robot's frame, x ahead and y left, metres and m/s."""
+    """Whom or what the robot met: place and velocity in the robot's frame, x ahead and y left,
+    metres and m/s."""
 
     x_m: float
     y_m: float
@@ -49,8 +63,8 @@ class Other(NamedTuple):
 
 
 class Mishap(NamedTuple):
-    """What went wrong in an episode, and when. tick: of the log; failure: None where the referee counted none, as when
-    time ran out. cause: one of CAUSES."""
+    """What went wrong in an episode, and when. tick: of the log; failure: None where the referee
+    counted none, as when time ran out. cause: one of CAUSES."""
 
     tick: int
     cause: str
@@ -58,7 +72,8 @@ class Mishap(NamedTuple):
 
 
 def mishaps_of(record: Record) -> list[Mishap]:
-    """Everything that went wrong in an episode, in order; nothing where it succeeded or is invalid."""
+    """Everything that went wrong in an episode, in order; nothing where it succeeded or is
+    invalid."""
     if record.status == "crashed":
         return [Mishap(record.ticks, "policy crashed")]
     if record.status == "invalid":
@@ -79,8 +94,11 @@ def cause_of(failure: Failure) -> str:
     return {"pedestrian": "person", "vehicle": "vehicle"}.get(failure.other_kind, "obstacle")
 
 
-def reason_of(scenario: Scenario, record: Record, mishap: Mishap, log: Log | None, other: Other | None = None) -> str:
-    """One sentence without its full stop. other: whom the robot met, where that is known better than from the log."""
+def reason_of(
+    scenario: Scenario, record: Record, mishap: Mishap, log: Log | None, other: Other | None = None
+) -> str:
+    """One sentence without its full stop. other: whom the robot met, where that is known better
+    than from the log."""
     if mishap.cause == "policy crashed":
         return f"the policy crashed: {record.reason}"
     failure = mishap.failure
@@ -103,12 +121,16 @@ def thing_in_words(failure: Failure) -> str:
     """What was touched that is neither person nor vehicle: "a parked bike"."""
     of, _, which = failure.other.partition(":")
     kind = which.rpartition(":")[2] if of == "obstacle" else of
-    words = _THINGS.get(kind, kind if of == "obstacle" else failure.other_kind).replace("_", " ") or "something"
+    words = (
+        _THINGS.get(kind, kind if of == "obstacle" else failure.other_kind).replace("_", " ")
+        or "something"
+    )
     return f"{'an' if words[0] in 'aeiou' else 'a'} {words}"
 
 
 def event_of(scenario: Scenario, mishap: Mishap) -> Event | None:
-    """The event that a mishap belongs to: that of the person who was met, or the scenario's only one."""
+    """The event that a mishap belongs to: that of the person who was met, or the scenario's only
+    one."""
     who = mishap.failure.other if mishap.failure else ""
     theirs = [event for event in scenario.events if who in event.names]
     if not theirs and scenario.ends_on_failure and len(scenario.events) == 1:
@@ -117,8 +139,8 @@ def event_of(scenario: Scenario, mishap: Mishap) -> Event | None:
 
 
 def _met(failure: Failure, other: Other | None, whom: str) -> str:
-    """A collision with somebody who moves, or who stood. The speed that is told is the other's, or the robot's where
-    the other stood."""
+    """A collision with somebody who moves, or who stood. The speed that is told is the other's, or
+    the robot's where the other stood."""
     stood = failure.robot_speed_mps < _STANDS_MPS
     at = "where it stood" if stood else f"at {failure.robot_speed_mps:.1f} m/s"
     if other is None:
@@ -127,10 +149,16 @@ def _met(failure: Failure, other: Other | None, whom: str) -> str:
     whom += " who" if whom == "a person" else " that"
     if speed_mps < _STANDS_MPS:
         where = _side(other.x_m, other.y_m, "ahead")
-        return f"touched {whom} stood {where}, both at rest" if stood else f"drove into {whom} stood {where}, {at}"
+        return (
+            f"touched {whom} stood {where}, both at rest"
+            if stood
+            else f"drove into {whom} stood {where}, {at}"
+        )
     side = _side(-other.vx_mps, -other.vy_mps, "from the front", "from the ", "from behind")
     if side == "from behind" and other.x_m > 0.0:
-        return f"{'touched' if stood else 'drove into'} {whom} went ahead of it at {speed_mps:.1f} m/s"
+        return (
+            f"{'touched' if stood else 'drove into'} {whom} went ahead of it at {speed_mps:.1f} m/s"
+        )
     alike = failure.fault == "shared" or failure.other_kind == "vehicle" or side == "from behind"
     verb = "was hit by" if stood else "collided with" if alike else "drove into"
     return f"{verb} {whom} came {side} at {speed_mps:.1f} m/s"
@@ -150,7 +178,9 @@ def _in_tracks(scenario: Scenario, failure: Failure, log: Log | None) -> Other |
         return None
     for number, event in enumerate(scenario.events):
         if failure.other in event.names:
-            of_it = (log.event_tracks[:, 1] == number) & (log.event_tracks[:, 2] == event.names.index(failure.other))
+            of_it = (log.event_tracks[:, 1] == number) & (
+                log.event_tracks[:, 2] == event.names.index(failure.other)
+            )
             track = log.event_tracks[of_it & (log.event_tracks[:, 0] <= failure.tick)]
             if len(track):
                 since = track[track[:, 0] >= track[-1, 0] - round(_OVER_S / log.tick_s)]
@@ -162,7 +192,9 @@ def _in_tracks(scenario: Scenario, failure: Failure, log: Log | None) -> Other |
 
 def _after_trigger(scenario: Scenario, record: Record, failure: Failure) -> str:
     event = event_of(scenario, Mishap(failure.tick, "person", failure))
-    told: TriggeredEvent | None = next((e for e in record.events if event is not None and e.id == event.id), None)
+    told: TriggeredEvent | None = next(
+        (e for e in record.events if event is not None and e.id == event.id), None
+    )
     if told is None:
         return ""
     if told.triggered_at_s is None:
@@ -175,12 +207,16 @@ def _left(scenario: Scenario, failure: Failure) -> str:
     near = (failure.route_s_m - 5.0, failure.route_s_m + 5.0)
     _, left_m = scenario.route_line.project(failure.x_m, failure.y_m, near)
     if abs(left_m) > _ASTRAY_M:
-        return f"left the walkable ground at {failure.robot_speed_mps:.1f} m/s, {abs(left_m):.0f} m off the route"
+        return (
+            f"left the walkable ground at {failure.robot_speed_mps:.1f} m/s, {abs(left_m):.0f} m "
+            f"off the route"
+        )
     crossing = any(c.enter_s_m <= failure.route_s_m <= c.leave_s_m for c in scenario.crossings)
     where = "crosswalk" if crossing else "sidewalk"
     side = "left" if left_m > 0.0 else "right"
     return (
-        f"left the {where} on its {side} side at {failure.robot_speed_mps:.1f} m/s, {abs(left_m):.1f} m off the route"
+        f"left the {where} on its {side} side at {failure.robot_speed_mps:.1f} m/s, "
+        f"{abs(left_m):.1f} m off the route"
     )
 
 
@@ -199,4 +235,6 @@ def _ended(scenario: Scenario, record: Record) -> str:
         return "passed the person who held out a stopping hand"
     if scenario.ends_at == "stop":
         return f"made no stop before the stopping hand within {scenario.time_limit_s:.0f} s"
-    return f"ran out of time after {scenario.time_limit_s:.0f} s, with {done:.0f} % of the route done"
+    return (
+        f"ran out of time after {scenario.time_limit_s:.0f} s, with {done:.0f} % of the route done"
+    )

@@ -1,4 +1,5 @@
-"""The runs that a report is about, read whole, and refused in one line where a table of them would mislead."""
+"""The runs that a report is about, read whole, and refused in one line where a table of them would
+mislead."""
 
 from __future__ import annotations
 
@@ -14,16 +15,17 @@ import pandas as pd
 from cosim.core.errors import RunError, UsageError
 from cosim.core.npz import read_npz
 from cosim.core.telling import Tell, untold
-from cosim.episode.log import Log
-from cosim.records.episode_files import RUN_AGAIN, TRAJECTORY, record_file
-from cosim.records.record import Record
-from cosim.records.results import table_of
-from cosim.records.run_spec import RunSpec
-from cosim.records.whole_run import WholeRun, read_whole_run
+from cosim.results.finished_run import WholeRun, read_whole_run
+from cosim.results.log import Log
+from cosim.results.record import Record
+from cosim.results.run_folder import RUN_AGAIN, TRAJECTORY, record_file
+from cosim.results.run_spec import RunSpec
+from cosim.results.table import table_of
 from cosim.spec.scenario import CityMap, Light, Scenario
 
 PaperTable = Literal["unit", "reactive", "long"]
-"""Short ways past things; short ways with one event, or the same without; long ways, which go on after a failure."""
+"""Short ways past things; short ways with one event, or the same without; long ways, which go on
+after a failure."""
 _COLUMNS: Final = ("pose", "speed", "travelled_m", "people_tick", "people_xy")
 """What plots are made of: to read all that a log holds takes four times as long."""
 OF_THE_PAPER: Final = ("unit", "reactive", "long-horizon")
@@ -35,9 +37,9 @@ _LOW_SUN_DEG: Final = 20.0
 
 @dataclass(frozen=True)
 class ReportedRun:
-    """One run. label: what it is called on the page: its policy; with the suite, for one's own suite beside others; its
-    folder, where two runs of a suite have the same policy. table: a row per episode with the columns of `table_of` and
-    kind, family, place, real, light."""
+    """One run. label: what it is called on the page: its policy; with the suite, for one's own
+    suite beside others; its folder, where two runs of a suite have the same policy. table: a row
+    per episode with the columns of `table_of` and kind, family, place, real, light."""
 
     label: str
     whole: WholeRun
@@ -73,7 +75,8 @@ class ReportedRun:
         )
 
     def log(self, scenario: str) -> Log | None:
-        """The trajectory of an episode; None where the folder has none. Raises RunError for a damaged one."""
+        """The trajectory of an episode; None where the folder has none. Raises RunError for a
+        damaged one."""
         file = record_file(self.path, scenario)
         path = file.with_name(TRAJECTORY)
         if not path.exists():
@@ -84,8 +87,8 @@ class ReportedRun:
             raise RunError(f"{error}: {RUN_AGAIN}") from error
 
     def tracks(self) -> Iterator[tuple[Record, Mapping[str, Any]]]:
-        """_COLUMNS of the log of each episode that counts and has a trajectory; an invalid one does not count. Raises
-        RunError for a damaged one."""
+        """_COLUMNS of the log of each episode that counts and has a trajectory; an invalid one does
+        not count. Raises RunError for a damaged one."""
         for record in self.records:
             file = record_file(self.path, record.scenario)
             path = file.with_name(TRAJECTORY)
@@ -99,8 +102,8 @@ class ReportedRun:
 
 
 def read_runs(paths: Sequence[Path], tell: Tell = untold) -> list[ReportedRun]:
-    """Raises UsageError where a run is given twice, RunError for runs whose figures cannot stand in one table, and what
-    `read_whole_run` raises."""
+    """Raises UsageError where a run is given twice, RunError for runs whose figures cannot stand in
+    one table, and what `read_whole_run` raises."""
     resolved = [path.resolve() for path in paths]
     for path, real in zip(paths, resolved, strict=True):
         if resolved.count(real) > 1:
@@ -111,7 +114,9 @@ def read_runs(paths: Sequence[Path], tell: Tell = untold) -> list[ReportedRun]:
         found.append(read_whole_run(path))
     _refuse_other_suites(found)
     policies = [(whole.spec.suite, whole.spec.policy_name) for whole in found]
-    suites = {policy: {suite for suite, other in policies if other == policy} for _, policy in policies}
+    suites = {
+        policy: {suite for suite, other in policies if other == policy} for _, policy in policies
+    }
     folders = [whole.path.name for whole in found]
     alike = {policy for policy in policies if policies.count(policy) > 1}
     names = [path.name if folders.count(path.name) == 1 else str(path) for path in paths]
@@ -159,18 +164,23 @@ def light_in_words(light: Light) -> str:
 def sun_deg(light: Light) -> float:
     """The sun's height over the horizon, by the usual formula of hour, day and latitude."""
     declination = math.radians(-23.44) * math.cos(2.0 * math.pi * (light.day_of_year + 10) / 365.25)
-    latitude, hour = math.radians(light.latitude_deg), math.radians(15.0 * (light.hour - 12.0))
-    up = math.sin(latitude) * math.sin(declination) + math.cos(latitude) * math.cos(declination) * math.cos(hour)
+    latitude = math.radians(light.latitude_deg)
+    hour = math.radians(15.0 * (light.hour - 12.0))
+    up = math.sin(latitude) * math.sin(declination) + math.cos(latitude) * math.cos(
+        declination
+    ) * math.cos(hour)
     return math.degrees(math.asin(max(-1.0, min(1.0, up))))
 
 
 def _refuse_other_suites(runs: Sequence[WholeRun]) -> None:
-    """Raises RunError for two runs of one suite's name and not of one suite: their rows would be read as alike."""
+    """Raises RunError for two runs of one suite's name and not of one suite: their rows would be
+    read as alike."""
     first: dict[str, WholeRun] = {}
     for run in runs:
         other = first.setdefault(run.spec.suite, run)
         if other.spec.suite_hash != run.spec.suite_hash:
             raise RunError(
-                f"{run.path} and {other.path} are of different suites '{run.spec.suite}' ({run.spec.suite_hash}, "
-                f"{other.spec.suite_hash}): their rows cannot stand in one table. Report them apart, or run one again"
+                f"{run.path} and {other.path} are of different suites '{run.spec.suite}' "
+                f"({run.spec.suite_hash}, {other.spec.suite_hash}): their rows cannot stand in one "
+                "table. Report them apart, or run one again"
             )

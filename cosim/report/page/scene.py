@@ -1,4 +1,5 @@
-"""What the page shows of one failure, and of one place, as it travels there: JSON of short names and whole numbers."""
+"""What the page shows of one failure, and of one place, as it travels there: JSON of short names
+and whole numbers."""
 
 from __future__ import annotations
 
@@ -9,9 +10,9 @@ Outline = list[int]
 
 
 class Track(msgspec.Struct, frozen=True):
-    """Somebody who moves. first: the sample at which it begins; at: x, y in centimetres and heading in milliradians
-    for each sample. kind: "crowd", "event", "resident", "injected" or "vehicle"; size: length and width in centimetres;
-    doing: (sample, word) where what it does changes."""
+    """Somebody who moves. first: the sample at which it begins; at: x, y in centimetres and heading
+    in milliradians for each sample. kind: "crowd", "event", "resident", "injected" or "vehicle";
+    size: length and width in centimetres; doing: (sample, word) where what it does changes."""
 
     kind: str
     first: int
@@ -21,15 +22,17 @@ class Track(msgspec.Struct, frozen=True):
 
 
 class CrossingLight(msgspec.Struct, frozen=True):
-    """The light of one crossing. states: a letter for each sample, g where one may walk, r where not, - unknown."""
+    """The light of one crossing. states: a letter for each sample, g where one may walk, r where
+    not, - unknown."""
 
     line: Outline
     states: str
 
 
 class DrawnWay(msgspec.Struct, frozen=True):
-    """The way ahead in a picture, in tenths of its pixels from its upper left corner: pieces of a line; of waypoints
-    those that are in the picture; the number of the followed one among these, -1 if it is not."""
+    """The way ahead in a picture, in tenths of its pixels from its upper left corner: pieces of a
+    line; of waypoints those that are in the picture; the number of the followed one among these, -1
+    if it is not."""
 
     lines: list[Outline]
     points: Outline = []
@@ -37,8 +40,8 @@ class DrawnWay(msgspec.Struct, frozen=True):
 
 
 class Pictures(msgspec.Struct, frozen=True):
-    """Frames as data URLs, and the samples at which they were taken. ways: that of each of the robot's; size: theirs,
-    width and height in pixels."""
+    """Frames as data URLs, and the samples at which they were taken. ways: that of each of the
+    robot's; size: theirs, width and height in pixels."""
 
     at: list[int]
     robot: list[str]
@@ -48,12 +51,14 @@ class Pictures(msgspec.Struct, frozen=True):
 
 
 class Scene(msgspec.Struct, frozen=True):
-    """The last seconds before a failure. step_s: between samples; end_s: of the last one, in the episode's time.
+    """The last seconds before a failure. step_s: between samples; end_s: of the last one, in the
+    episode's time.
 
-    robot: x, y (cm), heading (mrad), speed (cm/s), command (cm/s, mrad/s) for each sample. ground: pairs of what it is
-    and its rings, drawn in turn. hit: the number of the track that the robot met, -1 for none. size: of the robot, cm.
-    plans: (sample, outline) where the waypoints change that are followed: where the robot was when it was asked, and
-    these; empty where there are none. follows: which point of an outline is followed.
+    robot: x, y (cm), heading (mrad), speed (cm/s), command (cm/s, mrad/s) for each sample. ground:
+    pairs of what it is and its rings, drawn in turn. hit: the number of the track that the robot
+    met, -1 for none. size: of the robot, cm. plans: (sample, outline) where the waypoints change
+    that are followed: where the robot was when it was asked, and these; empty where there are none.
+    follows: which point of an outline is followed.
     """
 
     step_s: float
@@ -72,7 +77,8 @@ class Scene(msgspec.Struct, frozen=True):
 
 
 class Entry(msgspec.Struct, frozen=True, kw_only=True):
-    """One card of the gallery. scene: absent where the episode could not be shown again; why says so then."""
+    """One card of the gallery. scene: absent where the episode could not be shown again; why says
+    so then."""
 
     label: str
     suite: str

@@ -1,4 +1,5 @@
-"""The paper's three tables for the runs of a report, as HTML: our figures with intervals, the paper's own below."""
+"""The paper's three tables for the runs of a report, as HTML: our figures with intervals, the
+paper's own below."""
 
 from __future__ import annotations
 
@@ -10,21 +11,35 @@ from typing import Final, NamedTuple
 import numpy as np
 import pandas as pd
 
-from cosim.records.results import ORACLE, not_to_be_quoted, summary_of
-from cosim.report.page.paper import EVENT_COLUMNS, LONG_OF_PAPER, REACTIVE_OF_PAPER, UNIT_OF_PAPER, Row
+from cosim.report.page.paper import (
+    EVENT_COLUMNS,
+    LONG_OF_PAPER,
+    REACTIVE_OF_PAPER,
+    UNIT_OF_PAPER,
+    Row,
+)
 from cosim.report.page.runs import OF_THE_PAPER, PaperTable, ReportedRun
+from cosim.results.table import ORACLE, not_to_be_quoted, summary_of
 
 UNIT_COLUMNS: Final = ("straight", "curve", "crosswalk")
 _SHARES: Final = {"success": "SR", "spl": "SPL", "route_completion": "RC"}
 RATES: Final = {
-    "failures_per_100m": "FC", "collisions_per_100m": "C", "out_of_lane_per_100m": "OL", "freezings_per_100m": "F",
+    "failures_per_100m": "FC",
+    "collisions_per_100m": "C",
+    "out_of_lane_per_100m": "OL",
+    "freezings_per_100m": "F",
     "velocity_mean_mps": "V",
-}  # fmt: skip
+}
 _FIRST: Final = {
-    "success": "SR", "route_completion": "RC", "failures_per_100m": "FC /100 m", "velocity_mean_mps": "V m/s",
-}  # fmt: skip
+    "success": "SR",
+    "route_completion": "RC",
+    "failures_per_100m": "FC /100 m",
+    "velocity_mean_mps": "V m/s",
+}
 _PLACES: Final = ((False, "Generated places"), (True, "Real places"))
-_BESIDE: Final = "the paper's models, in another engine with other pictures: for the shape, not to be compared"
+_BESIDE: Final = (
+    "the paper's models, in another engine with other pictures: for the shape, not to be compared"
+)
 
 
 class MeanOfEpisodes(NamedTuple):
@@ -40,7 +55,8 @@ _NOTHING: Final = MeanOfEpisodes(np.nan, np.nan, np.nan, 0)
 
 
 class _Column(NamedTuple):
-    """One column: the rows of a table that it is about, and the metric. over, group: what stands over its head."""
+    """One column: the rows of a table that it is about, and the metric. over, group: what stands
+    over its head."""
 
     over: str
     group: str
@@ -66,13 +82,14 @@ def summary_html(runs: Sequence[ReportedRun], colours: Mapping[str, str]) -> str
         cells = "".join(_cell(cell_of(run.table, metric)) for metric in _FIRST)
         dot = f'<i class="dot" style="background:{colours[run.label]}"></i>'
         rows.append(
-            f'<tr><th scope="row">{dot}{escape(run.label)}</th><td class="word">{escape(run.spec.suite)}</td>'
+            f'<tr><th scope="row">{dot}{escape(run.label)}</th><td '
+            f'class="word">{escape(run.spec.suite)}</td>'
             f"<td>{len(run.table) - invalid}</td><td>{invalid}</td>{cells}</tr>"
         )
     title = "All episodes of each run"
     note = (
-        "SR success; RC share of the route done; FC failures per 100 m travelled, pooled; V mean speed. Small figures "
-        "are 95 % bootstrap intervals over episodes."
+        "SR success; RC share of the route done; FC failures per 100 m travelled, pooled; V mean "
+        "speed. Small figures are 95 % bootstrap intervals over episodes."
     )
     return titled_html(title, note, wide_html(title, f"<tr>{heads}</tr>", rows))
 
@@ -127,17 +144,21 @@ def _reactive(runs: Sequence[ReportedRun]) -> Iterable[str]:
         ),
     }
     for metric, (title, note) in titles.items():
-        columns = [_Column("", "", kind_in_words(kind), {"kind": kind}, metric) for kind in EVENT_COLUMNS]
+        columns = [
+            _Column("", "", kind_in_words(kind), {"kind": kind}, metric) for kind in EVENT_COLUMNS
+        ]
         yield _table(title, note, runs, "reactive", columns, REACTIVE_OF_PAPER[metric])
 
 
 def _long(runs: Sequence[ReportedRun]) -> str:
     columns = [
-        _Column("", words, head, {"real": real}, metric) for real, words in _PLACES for metric, head in RATES.items()
+        _Column("", words, head, {"real": real}, metric)
+        for real, words in _PLACES
+        for metric, head in RATES.items()
     ]
     note = (
-        "Failures per 100 m travelled, pooled over all metres: FC all, C collisions, OL off the sidewalk, F freezings; "
-        "V mean speed, m/s."
+        "Failures per 100 m travelled, pooled over all metres: FC all, C collisions, OL off the "
+        "sidewalk, F freezings; V mean speed, m/s."
     )
     return _table("Long ways", note, runs, "long", columns, LONG_OF_PAPER)
 
@@ -153,39 +174,62 @@ def _other(runs: Sequence[ReportedRun]) -> str:
     if not found:
         return ""
     columns = [_Column("", "", head, {}, metric) for metric, head in (_SHARES | RATES).items()]
-    return _framed("Other suites and kinds", "As above, by what the scenarios are examples of.", columns, found, {})
+    return _framed(
+        "Other suites and kinds",
+        "As above, by what the scenarios are examples of.",
+        columns,
+        found,
+        {},
+    )
 
 
 def _table(
-    title: str, note: str, runs: Sequence[ReportedRun], family: PaperTable, columns: Sequence[_Column],
+    title: str,
+    note: str,
+    runs: Sequence[ReportedRun],
+    family: PaperTable,
+    columns: Sequence[_Column],
     paper: Mapping[str, Row],
-) -> str:  # fmt: skip
+) -> str:
     ours = episodes_of([run for run in runs if run.spec.suite in OF_THE_PAPER], family)
     return _framed(title, note, columns, ours, paper) if ours else ""
 
 
 def _framed(
-    title: str, note: str, columns: Sequence[_Column], ours: Mapping[str, pd.DataFrame], paper: Mapping[str, Row]
+    title: str,
+    note: str,
+    columns: Sequence[_Column],
+    ours: Mapping[str, pd.DataFrame],
+    paper: Mapping[str, Row],
 ) -> str:
     edge = [
-        ' class="edge"' if k and (c.over, c.group) != (columns[k - 1].over, columns[k - 1].group) else ""
+        ' class="edge"'
+        if k and (c.over, c.group) != (columns[k - 1].over, columns[k - 1].group)
+        else ""
         for k, c in enumerate(columns)
     ]
     head = _spans([(c.over,) for c in columns]) + _spans([(c.over, c.group) for c in columns])
-    heads = "".join(f'<th scope="col"{edge[k]}>{escape(c.head)}</th>' for k, c in enumerate(columns))
+    heads = "".join(
+        f'<th scope="col"{edge[k]}>{escape(c.head)}</th>' for k, c in enumerate(columns)
+    )
     body = []
     for label, table in ours.items():
-        cells = "".join(_cell(cell_of(_part(table, c), c.metric), edge[k]) for k, c in enumerate(columns))
+        cells = "".join(
+            _cell(cell_of(_part(table, c), c.metric), edge[k]) for k, c in enumerate(columns)
+        )
         body.append(f'<tr><th scope="row">{escape(label)}{_marks(table)}</th>{cells}</tr>')
     if paper:
         body.append(
-            f'<tr class="divide"><th colspan="{len(columns) + 1}" scope="rowgroup"><span>{_BESIDE}</span></th></tr>'
+            f'<tr class="divide"><th colspan="{len(columns) + 1}" '
+            f'scope="rowgroup"><span>{_BESIDE}</span></th></tr>'
         )
     for name, row in paper.items():
         cells = "".join(f"<td{edge[k]}>{_number(value)}</td>" for k, value in enumerate(row))
         body.append(f'<tr class="paper"><th scope="row">{escape(name)}</th>{cells}</tr>')
     heads = f"{head}<tr><td></td>{heads}</tr>"
-    return titled_html(title, note, wide_html(title, heads, body, "tight" if len(columns) > 12 else ""))
+    return titled_html(
+        title, note, wide_html(title, heads, body, "tight" if len(columns) > 12 else "")
+    )
 
 
 def titled_html(title: str, note: str, inner: str) -> str:
@@ -208,7 +252,9 @@ def _spans(names: Sequence[tuple[str, ...]]) -> str:
     if not any(name[-1] for name in names):
         return ""
     spans = [(name[-1], len(list(same))) for name, same in groupby(names)]
-    cells = "".join(f'<th colspan="{count}" scope="colgroup">{escape(words)}</th>' for words, count in spans)
+    cells = "".join(
+        f'<th colspan="{count}" scope="colgroup">{escape(words)}</th>' for words, count in spans
+    )
     return f"<tr><td></td>{cells}</tr>"
 
 
@@ -241,11 +287,12 @@ def _number(value: float | None) -> str:
 
 
 def warnings_html(runs: Sequence[ReportedRun]) -> str:
-    """Why figures of a run are not to be quoted, a line for each such run, and which runs of a suite are of other
-    scenarios of it; nothing where all are sound."""
+    """Why figures of a run are not to be quoted, a line for each such run, and which runs of a
+    suite are of other scenarios of it; nothing where all are sound."""
     told = [(run, not_to_be_quoted(run.table, len(run.spec.scenarios))) for run in runs]
     lines = [
-        f"<li><b>{escape(run.label)}, {escape(run.spec.suite)}</b>: not to be quoted, {escape(why)}.</li>"
+        f"<li><b>{escape(run.label)}, {escape(run.spec.suite)}</b>: not to be quoted, "
+        f"{escape(why)}.</li>"
         for run, why in told
         if why
     ]
@@ -256,7 +303,8 @@ def warnings_html(runs: Sequence[ReportedRun]) -> str:
         if len({frozenset(run.spec.scenarios) for run in of}) > 1:
             counts = ", ".join(f"{escape(run.label)} {len(run.spec.scenarios)}" for run in of)
             lines.append(
-                f"<li><b>{escape(suite)}</b>: not all runs are of the same scenarios ({counts}). Their rows are not to "
-                "be compared one with another; <code>cosim compare</code> takes the scenarios that both have.</li>"
+                f"<li><b>{escape(suite)}</b>: not all runs are of the same scenarios ({counts}). "
+                "Their rows are not to be compared one with another; <code>cosim compare</code> "
+                "takes the scenarios that both have.</li>"
             )
     return f'<ul class="warn">{"".join(lines)}</ul>' if lines else ""

@@ -1,9 +1,10 @@
 """Atlas: the robots of many environments in one process, drawn together and read back at once.
 
-Environments join and leave at any time, each with a place, a light and a robot of its own; a batch holds any of them.
-The pictures are those of a `GlCamera` each, bit for bit: each is drawn by itself and copied behind the last into one
-buffer on the graphics card. Waiting for that buffer is what costs there; one is waited for while the next is under
-way: `begin` the next pictures before you `end` the last ones.
+Environments join and leave at any time, each with a place, a light and a robot of its own; a batch
+holds any of them. The pictures are those of a `GlCamera` each, bit for bit: each is drawn by itself
+and copied behind the last into one buffer on the graphics card. Waiting for that buffer is what
+costs there; one is waited for while the next is under way: `begin` the next pictures before you
+`end` the last ones.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import moderngl
 
 from cosim.core.errors import EngineError, UsageError
 from cosim.core.state import Frame, RobotState, Street
-from cosim.episode.ports import CameraSpec
+from cosim.spec.camera import CameraSpec
 from cosim.spec.scenario import Light
 from physics.cameras.gl.batch import batch_drawing
 from physics.cameras.gl.camera import NOON, GlCamera
@@ -26,7 +27,7 @@ from physics.cameras.gl.context import context
 from physics.cameras.gl.targets import Readback, Target
 from physics.cameras.lens import drawn
 from physics.cameras.view import SIDE_MAX
-from physics.world.world import BulletWorld
+from physics.dynamics.world import BulletWorld
 
 SeatKey = NewType("SeatKey", int)
 """Names an environment of an atlas, from `join` to `leave`; no other one ever gets it."""
@@ -54,7 +55,10 @@ class Atlas:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
     ) -> None:
         while self._cameras:
             self._cameras.popitem()[1].close()
@@ -85,12 +89,14 @@ class Atlas:
     def begin(self, seen: _Seen) -> None:
         """Draw what these robots see; `end` hands the pictures over.
 
-        Raises UsageError for an environment that is not in the atlas, and where there are too many pictures.
+        Raises UsageError for an environment that is not in the atlas, and where there are too many
+        pictures.
         """
         gl = self._running_context
         if len(seen) > self._most:
             raise UsageError(
-                f"an atlas of {len(seen)} pictures of {self._size[1]} rows: 1 to {self._most} fit at a time"
+                f"an atlas of {len(seen)} pictures of {self._size[1]} rows: 1 to "
+                f"{self._most} fit at a time"
             )
         batch = [(self._camera(key), robot, street) for key, robot, street in seen]
         pictures = [camera.mounted_picture(robot, street) for camera, robot, street in batch]
@@ -104,12 +110,15 @@ class Atlas:
         self._begun.append(batch)
 
     def end(self) -> list[Frame]:
-        """The pictures that began first and have not ended, in the order in which they were asked for."""
+        """The pictures that began first and have not ended, in the order in which they were asked
+        for."""
         with self._running_context:
             pictures = self._readback.end()
         return [
             camera.through_lens(Frame(*picture), robot, street)
-            for picture, (camera, robot, street) in zip(pictures, self._begun.popleft(), strict=True)
+            for picture, (camera, robot, street) in zip(
+                pictures, self._begun.popleft(), strict=True
+            )
         ]
 
     def _camera(self, key: SeatKey) -> GlCamera:

@@ -1,4 +1,5 @@
-"""A batch: pictures of any number of environments, what moves in them posed, sorted out and uploaded together.
+"""A batch: pictures of any number of environments, what moves in them posed, sorted out and
+uploaded together.
 
 Each picture is then drawn by itself, so that it has the same bits alone and in company.
 """
@@ -27,7 +28,7 @@ from physics.cameras.gl.surfaces import surfaces
 from physics.cameras.gl.targets import Target
 from physics.cameras.gl.traffic import Driven, TrafficDrawing
 from physics.cameras.view import Shot
-from physics.world.surface import Surface
+from physics.street.surface import Surface
 
 _CLOCK: Final = Clock()
 _PEOPLE_MAX: Final = 4096
@@ -35,7 +36,8 @@ _PEOPLE_MAX: Final = 4096
 
 
 class Stage(NamedTuple):
-    """What a camera draws with: the standing street, its shadow maps if there are any, what lies behind, the light."""
+    """What a camera draws with: the standing street, its shadow maps if there are any, what lies
+    behind, the light."""
 
     surface: Surface
     model: Robot
@@ -46,8 +48,8 @@ class Stage(NamedTuple):
 
 
 class PictureOrder(NamedTuple):
-    """A picture to be drawn. light: as this view sees it. robot: None where there is none; body: it is in the picture
-    itself, not its shadow alone."""
+    """A picture to be drawn. light: as this view sees it. robot: None where there is none; body: it
+    is in the picture itself, not its shadow alone."""
 
     stage: Stage
     taken: Shot
@@ -67,8 +69,11 @@ class BatchDrawing:
         self._crowd, self._traffic = CrowdDrawing(context), TrafficDrawing(context, self.forms)
         self._blocks = SceneBlocks(context)
 
-    def draw(self, pictures: Sequence[PictureOrder], target: Target, drawn: Callable[[int], None]) -> None:
-        """Draw each into the target, and say so by its number before the next. The context must be held."""
+    def draw(
+        self, pictures: Sequence[PictureOrder], target: Target, drawn: Callable[[int], None]
+    ) -> None:
+        """Draw each into the target, and say so by its number before the next. The context must be
+        held."""
         first = 0
         for few in _batches(pictures):
             self._cast(few, self._arrange(few))
@@ -85,27 +90,37 @@ class BatchDrawing:
         shots = Shots([one.taken for one in pictures])
         for one, middle, anchor in zip(pictures, shots.middles, shots.anchors, strict=True):
             one.stage.scene.arrange(one.taken.view, middle, anchor, one.street)
-        watched, driven = [], []
+        watched = []
+        driven = []
         for stage, _, _, street, robot, body in pictures:
-            surface, shadows = stage.surface, stage.shadows is not None
-            watched.append(PeopleSeen(street.people, _CLOCK.time_s(street.tick), surface.heights, shadows))
+            surface = stage.surface
+            shadows = stage.shadows is not None
+            watched.append(
+                PeopleSeen(street.people, _CLOCK.time_s(street.tick), surface.heights, shadows)
+            )
             driven.append(Driven(street.vehicles, surface, stage.model, robot, body, shadows))
         self._crowd.set(watched, shots)
         self._traffic.set(driven, shots)
         self._blocks.room(2 * len(pictures))
-        for i, (one, middle, anchor) in enumerate(zip(pictures, shots.middles, shots.anchors, strict=True)):
+        for i, (one, middle, anchor) in enumerate(
+            zip(pictures, shots.middles, shots.anchors, strict=True)
+        ):
             to_map: Floats = TO_TEXTURE
             if one.stage.shadows is not None:
                 from_sun, to_map = one.stage.shadows.matrices(middle, anchor, one.stage.light)
                 self._blocks.put_sun(2 * i + 1, from_sun, one.stage.light)
-            self._blocks.put(2 * i, camera_matrix(one.taken, anchor), to_map, one.taken, anchor, one.light)
+            self._blocks.put(
+                2 * i, camera_matrix(one.taken, anchor), to_map, one.taken, anchor, one.light
+            )
         self._blocks.upload()
         return shots
 
     def _cast(self, pictures: Sequence[PictureOrder], shots: Shots) -> None:
         """Bring the shadow maps of all pictures up to date."""
         with casting(self._context):
-            for i, (one, middle, anchor) in enumerate(zip(pictures, shots.middles, shots.anchors, strict=True)):
+            for i, (one, middle, anchor) in enumerate(
+                zip(pictures, shots.middles, shots.anchors, strict=True)
+            ):
                 if one.stage.shadows is not None:
                     self._blocks.bind(2 * i + 1)
                     draw = partial(self._draw_pass, i, one.stage)
@@ -142,12 +157,16 @@ def batch_drawing(context: moderngl.Context) -> BatchDrawing:
 
 def _batches(pictures: Sequence[PictureOrder]) -> Iterator[Sequence[PictureOrder]]:
     """The pictures in their order, in batches of at most so many people, no stage twice in one."""
-    begun, people, stages = 0, 0, set[int]()
+    begun = 0
+    people = 0
+    stages = set[int]()
     for i, one in enumerate(pictures):
         people += len(one.street.people)
         if i > begun and (people > _PEOPLE_MAX or id(one.stage) in stages):
             yield pictures[begun:i]
-            begun, people, stages = i, len(one.street.people), set()
+            begun = i
+            people = len(one.street.people)
+            stages = set()
         stages.add(id(one.stage))
     if begun < len(pictures):
         yield pictures[begun:]

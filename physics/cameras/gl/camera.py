@@ -1,7 +1,7 @@
 """GlCamera: pictures by OpenGL, on a GPU or on a processor that plays one.
 
-A picture is a function of the robot's state and the street alone: same values, same pixels on the same renderer,
-whatever was drawn before.
+A picture is a function of the robot's state and the street alone: same values, same pixels on the
+same renderer, whatever was drawn before.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import moderngl
 
 from cosim.core.errors import EngineError
 from cosim.core.state import Frame, RobotState, Street
-from cosim.episode.ports import CameraSpec
+from cosim.spec.camera import CameraSpec
 from cosim.spec.scenario import Light
-from physics.cameras.eyes import WorldCamera
+from physics.cameras.camera_base import WorldCamera
 from physics.cameras.gl.backdrop import Backdrop
 from physics.cameras.gl.batch import PictureOrder, Stage, batch_drawing
 from physics.cameras.gl.context import context
@@ -25,7 +25,7 @@ from physics.cameras.gl.shadows import ShadowMaps
 from physics.cameras.gl.targets import Target
 from physics.cameras.sky import sky_of
 from physics.cameras.view import Shot, View
-from physics.world.world import BulletWorld
+from physics.dynamics.world import BulletWorld
 
 NOON: Final = Light()
 _TARGETS_MAX: Final = 4
@@ -34,7 +34,9 @@ _TARGETS_MAX: Final = 4
 class GlCamera(WorldCamera):
     """The robot's camera in a world. Use it in a `with` block; the world need not be running."""
 
-    def __init__(self, world: BulletWorld, spec: CameraSpec, depth: bool = False, light: Light = NOON) -> None:
+    def __init__(
+        self, world: BulletWorld, spec: CameraSpec, depth: bool = False, light: Light = NOON
+    ) -> None:
         super().__init__(world, spec, depth)
         self._sky = sky_of(light, world.surface.seed)
         self._light = lighting_of(self._sky)
@@ -48,7 +50,9 @@ class GlCamera(WorldCamera):
             with context() as gl:
                 scene = GlScene(gl, batch_drawing(gl).forms, world, light)
                 shadows = ShadowMaps(gl, self._pinhole.height) if light.shadows else None
-                self._stage = Stage(world.surface, world.robot, scene, shadows, Backdrop(gl, self._sky), light)
+                self._stage = Stage(
+                    world.surface, world.robot, scene, shadows, Backdrop(gl, self._sky), light
+                )
             self._context = gl
         return self
 
@@ -69,7 +73,8 @@ class GlCamera(WorldCamera):
         return self._picture(self._mounted(robot), street, robot, body=False)
 
     def _drawn(self, taken: Shot, street: Street, robot: RobotState | None, body: bool) -> Frame:
-        picture, frames = self._picture(taken, street, robot, body), []
+        picture = self._picture(taken, street, robot, body)
+        frames = []
         assert self._context is not None
         with self._context as gl:
             target = self._target(taken.size)
@@ -80,7 +85,9 @@ class GlCamera(WorldCamera):
             batch_drawing(gl).draw([picture], target, read)
         return frames[0]
 
-    def _picture(self, taken: Shot, street: Street, robot: RobotState | None, body: bool) -> PictureOrder:
+    def _picture(
+        self, taken: Shot, street: Street, robot: RobotState | None, body: bool
+    ) -> PictureOrder:
         if self._context is None:
             raise EngineError("the camera is not running: use GlCamera in a 'with' block")
         return PictureOrder(self._stage, taken, self._light_of(taken.view), street, robot, body)

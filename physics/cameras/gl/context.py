@@ -16,7 +16,8 @@ PACKAGES: Final = "libegl1 libgl1 libegl-mesa0 libgl1-mesa-dri"
 
 @lru_cache(maxsize=1)
 def context() -> moderngl.Context:
-    """The one context of this process, made when first asked for. Use it in a `with` block around GL calls.
+    """The one context of this process, made when first asked for. Use it in a `with` block around
+    GL calls.
 
     Raises EngineError with the system packages to install.
     """
@@ -25,11 +26,13 @@ def context() -> moderngl.Context:
         made: Any = moderngl.create_context(**options)
     except Exception as error:
         raise EngineError(
-            f"the gl camera needs OpenGL {VERSION // 100}.{VERSION // 10 % 10} through EGL, and there is none here "
-            f"({error}). Install it (Debian, Ubuntu: apt-get install {PACKAGES}; with a GPU its driver's EGL library), "
-            "or use --camera bullet."
+            f"the gl camera needs OpenGL {VERSION // 100}.{VERSION // 10 % 10} through EGL, and "
+            f"there is none here ({error}). Install it (Debian, Ubuntu: apt-get install "
+            f"{PACKAGES}; with a GPU its driver's EGL library), or use --camera bullet."
         ) from error
-    made.__exit__(None, None, None)  # no thread holds it: whoever draws takes it for the time of a drawing
+    made.__exit__(
+        None, None, None
+    )  # no thread holds it: whoever draws takes it for the time of a drawing
     held: moderngl.Context = made
     return held
 
@@ -47,12 +50,15 @@ def available() -> bool:
 @lru_cache(maxsize=1)
 def is_card(context: moderngl.Context) -> bool:
     """Whether a graphics card draws, not the processor in its place."""
-    return not any(name in context.info["GL_RENDERER"] for name in ("llvmpipe", "softpipe", "swrast", "SWR"))
+    return not any(
+        name in context.info["GL_RENDERER"] for name in ("llvmpipe", "softpipe", "swrast", "SWR")
+    )
 
 
 @lru_cache(maxsize=1)
 def renderer() -> str:
-    """The renderer as it is named in records: pictures are the same bits on the same renderer only."""
+    """The renderer as it is named in records: pictures are the same bits on the same renderer
+    only."""
     with context() as gl:
         info = gl.info
     return f"gl: {info['GL_RENDERER']}, {info['GL_VERSION']}"

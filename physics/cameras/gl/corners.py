@@ -8,10 +8,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from physics.world.mesh import Mesh
+from physics.ground.mesh import Mesh
 
 _CORNER: Final = np.dtype([("at", "f4", 3), ("normal", "u1", 4), ("colour", "u1", 4)])
-"""normal: bytes from -127 to 127, plus 127, for `unpacked` in shading's chunks; the fourths are the drawable's own."""
+"""normal: bytes from -127 to 127, plus 127, for `unpacked` in shading's chunks; the fourths are the
+drawable's own."""
 
 LAYOUT: Final = ("3f 4f1 4f1", "in_at", "in_normal", "in_colour")
 """CORNER as moderngl wants it."""
@@ -27,8 +28,13 @@ def corners(mesh: Mesh, colour: ArrayLike, fourth: int) -> CornerRows:
     return rows
 
 
-def joined_corners(parts: Sequence[tuple[Mesh, CornerRows]]) -> tuple[CornerRows, NDArray[np.uint32]]:
-    """The rows of several meshes, one at least, after each other, and the indices of their triangles, flat."""
+def joined_corners(
+    parts: Sequence[tuple[Mesh, CornerRows]],
+) -> tuple[CornerRows, NDArray[np.uint32]]:
+    """The rows of several meshes, one at least, after each other, and the indices of their
+    triangles, flat."""
     starts = np.cumsum([0, *(len(rows) for _, rows in parts)])
-    indices = [(mesh.triangles + start).ravel() for (mesh, _), start in zip(parts, starts, strict=False)]
+    indices = [
+        (mesh.triangles + start).ravel() for (mesh, _), start in zip(parts, starts, strict=False)
+    ]
     return np.concatenate([rows for _, rows in parts]), np.concatenate(indices).astype(np.uint32)

@@ -1,9 +1,11 @@
-"""People for the gl camera: skinned bodies, posed on the graphics card, of all pictures of a batch at once.
+"""People for the gl camera: skinned bodies, posed on the graphics card, of all pictures of a batch
+at once.
 
-Per batch a few numbers per person go up: four baked frames with weights, place, heading, size. A first small pass
-blends the frames and writes everybody's 24 joint matrices, in metres from the picture's anchor, into a texture; the
-vertex shaders of all passes skin with them. Bodies of all outfits and levels lie in one buffer; a pass of a picture is
-one indirect draw for those near (four joints per vertex) and one for those far away (two).
+Per batch a few numbers per person go up: four baked frames with weights, place, heading, size. A
+first small pass blends the frames and writes everybody's 24 joint matrices, in metres from the
+picture's anchor, into a texture; the vertex shaders of all passes skin with them. Bodies of all
+outfits and levels lie in one buffer; a pass of a picture is one indirect draw for those near (four
+joints per vertex) and one for those far away (two).
 """
 
 from __future__ import annotations
@@ -23,10 +25,10 @@ from physics.cameras.gl.shading import Pass
 from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.skins import mesh_skins, tube_skins
 from physics.cameras.view import PERSON_MARGIN_M
+from physics.people.appearance import ALL, look_of
 from physics.people.body import COATS, body, far_body
 from physics.people.clips import own_clips
 from physics.people.figure import LEVELS, MESH_LEVELS
-from physics.people.looks import ALL, look_of
 from physics.people.poses import bodies_of, loops_of, poses_of
 
 LEVEL_PX: Final = (170.0, 80.0, 44.0, 32.0)
@@ -72,7 +74,8 @@ void main() {
 
 
 class PeopleSeen(NamedTuple):
-    """The people of a picture. heights: of the ground at (N, 2) points; shadows: whether they throw any."""
+    """The people of a picture. heights: of the ground at (N, 2) points; shadows: whether they throw
+    any."""
 
     people: People
     time_s: float
@@ -81,7 +84,8 @@ class PeopleSeen(NamedTuple):
 
 
 class _Worn(NamedTuple):
-    """(N,) outfits and girths of people, (N, coats, 3) colours, (N, 4) bodies as poses take them."""
+    """(N,) outfits and girths of people, (N, coats, 3) colours, (N, 4) bodies as poses take
+    them."""
 
     outfit: NDArray[np.intp]
     girth: NDArray[np.float32]
@@ -110,8 +114,8 @@ class CrowdDrawing:
         self._grow(_CROWD_MIN)
 
     def set(self, watched: Sequence[PeopleSeen], shots: Shots) -> None:
-        """Hold these people as the pictures will show them, each on the ground; binds a framebuffer, and units 0 and 1
-        until all is drawn."""
+        """Hold these people as the pictures will show them, each on the ground; binds a
+        framebuffer, and units 0 and 1 until all is drawn."""
         counts = [len(one.people) for one in watched]
         self._split = [[0, 0, 0, 0]] * len(watched)
         if not sum(counts):
@@ -119,11 +123,15 @@ class CrowdDrawing:
         whose = np.repeat(np.arange(len(watched)), counts)
         xy = np.concatenate([one.people.xy for one in watched])
         casting = np.array([CAST_M if one.shadows else 0.0 for one in watched])
-        seen, casts = shots.sees(whose, xy, PERSON_MARGIN_M), shots.far_m(whose, xy) < casting[whose]
+        seen = shots.sees(whose, xy, PERSON_MARGIN_M)
+        casts = shots.far_m(whose, xy) < casting[whose]
         rows = (seen | casts).nonzero()[0]
         if not len(rows):
             return
-        whose, xy, seen, casts = whose[rows], xy[rows], seen[rows], casts[rows]
+        whose = whose[rows]
+        xy = xy[rows]
+        seen = seen[rows]
+        casts = casts[rows]
         z_m = _heights(watched, whose, xy)
         worn = self._dress([(one.people.ids, one.people.age.tobytes()) for one in watched])
         outfit, girth, bodies = worn.outfit[rows], worn.girth[rows], worn.bodies[rows]
@@ -150,8 +158,8 @@ class CrowdDrawing:
         self._dyed.use(1)
 
     def _dress(self, who: list[tuple[tuple[str, ...], bytes]]) -> _Worn:
-        """What all of them wear, picture after picture, and their colours on the graphics card; mostly it is as it was.
-        who: names and ages."""
+        """What all of them wear, picture after picture, and their colours on the graphics card;
+        mostly it is as it was. who: names and ages."""
         if who != self._dressed:
             each = [_worn(*one) for one in who]
             self._worn = _Worn(*(np.concatenate(column) for column in zip(*each, strict=True)))
@@ -163,8 +171,8 @@ class CrowdDrawing:
         return self._worn
 
     def draw(self, stage: Pass, shadows: bool, picture: int = 0) -> None:
-        """Draw those of a picture; in the shadow maps of what moves everybody has few triangles. shadows: whether they
-        are shaded by shadow maps."""
+        """Draw those of a picture; in the shadow maps of what moves everybody has few triangles.
+        shadows: whether they are shaded by shadow maps."""
         near, far, cast, end = self._split[picture]
         if stage == "still" or near == end:
             return
@@ -192,12 +200,14 @@ class CrowdDrawing:
         girth: NDArray[np.float32],
         dress: NDArray[np.intp],
     ) -> None:
-        """Fill the buffers of instances and of draws: picture after picture, near levels first, then far ones, then
-        shadows, which have a level of their own behind the last."""
+        """Fill the buffers of instances and of draws: picture after picture, near levels first,
+        then far ones, then shadows, which have a level of their own behind the last."""
         in_view, casting = seen.nonzero()[0], casts.nonzero()[0]
         people = np.concatenate([in_view, casting])
         levels_ = np.concatenate([level[in_view], np.full(len(casting), LEVELS)])
-        order, form, commands = runs_of((whose[people] * (LEVELS + 1) + levels_) * len(ALL) + outfit[people])
+        order, form, commands = runs_of(
+            (whose[people] * (LEVELS + 1) + levels_) * len(ALL) + outfit[people]
+        )
         people = people[order]
         start = self._start(form % _KEYS)
         commands[:, 0], commands[:, 2:4] = start[:, 0], start[:, 1:]
@@ -209,14 +219,17 @@ class CrowdDrawing:
         self._commands.write(commands)
 
     def _start(self, form: NDArray[np.intp]) -> NDArray[np.uint32]:
-        """(F, 3) where bodies begin, by level * outfits + outfit; who casts a shadow has the coarsest level."""
+        """(F, 3) where bodies begin, by level * outfits + outfit; who casts a shadow has the
+        coarsest level."""
         if not self._known[form].all():
             for one in dict.fromkeys(form[~self._known[form]].tolist()):
                 level, outfit = divmod(one, len(ALL))
                 if level == LEVELS:
                     self._starts[one] = self._start(np.array([one - len(ALL)]))
                 else:
-                    self._starts[one] = (self._near if level < MESH_LEVELS else self._far).start(outfit, level)
+                    self._starts[one] = (self._near if level < MESH_LEVELS else self._far).start(
+                        outfit, level
+                    )
                 self._known[one] = True
         return self._starts[form]
 
@@ -230,7 +243,14 @@ class CrowdDrawing:
         self._posed = self._context.framebuffer([self._matrices])
         self._instances = self._context.buffer(reserve=2 * room * _INSTANCE.itemsize)
         self._commands = self._context.buffer(reserve=2 * room * 20)
-        self._held = [self._posed, self._told, self._dyed, self._matrices, self._instances, self._commands]
+        self._held = [
+            self._posed,
+            self._told,
+            self._dyed,
+            self._matrices,
+            self._instances,
+            self._commands,
+        ]
 
     def _release_room(self) -> None:
         self._near.release()
@@ -241,7 +261,8 @@ class CrowdDrawing:
 
 
 def _heights(watched: Sequence[PeopleSeen], whose: NDArray[np.intp], xy: Floats) -> Floats:
-    """(N,) height of the ground at (N, 2) points of these pictures, in their order; each ground is asked once."""
+    """(N,) height of the ground at (N, 2) points of these pictures, in their order; each ground is
+    asked once."""
     grounds = list(dict.fromkeys(one.heights for one in watched))
     if len(grounds) == 1:
         return grounds[0](xy)
@@ -265,12 +286,17 @@ def _worn(ids: tuple[str, ...], ages: bytes) -> _Worn:
 
 
 def levels(shots: Shots, whose: NDArray[np.intp], xy: Floats, z_m: Floats) -> NDArray[np.intp]:
-    """(N,) level of detail of people at (N, 2) xy, standing at (N,) heights, by how tall they are in their pictures."""
+    """(N,) level of detail of people at (N, 2) xy, standing at (N,) heights, by how tall they are
+    in their pictures."""
     return np.asarray(np.searchsorted(-np.array(LEVEL_PX), -shots.tall_px(whose, xy, z_m)))
 
 
 def _texture(
-    context: moderngl.Context, size: tuple[int, int], channels: int, dtype: str, data: bytes | None = None
+    context: moderngl.Context,
+    size: tuple[int, int],
+    channels: int,
+    dtype: str,
+    data: bytes | None = None,
 ) -> moderngl.Texture:
     texture = context.texture(size, channels, data, dtype=dtype, alignment=1)
     texture.filter = moderngl.NEAREST, moderngl.NEAREST

@@ -1,7 +1,8 @@
 """Rigid things drawn by the hundred: one call for all, however many forms they have.
 
-A form is a mesh with the colours of its parts; an instance is a form at a place, turned, with a paint of its own. All
-forms lie in one buffer, and the counts of a draw lie in another (multi-draw indirect).
+A form is a mesh with the colours of its parts; an instance is a form at a place, turned, with a
+paint of its own. All forms lie in one buffer, and the counts of a draw lie in another (multi-draw
+indirect).
 """
 
 from __future__ import annotations
@@ -16,18 +17,24 @@ from numpy.typing import ArrayLike, NDArray
 from physics.cameras.gl.corners import LAYOUT, CornerRows, corners, joined_corners
 from physics.cameras.gl.shading import Pass, Programs, programs
 from physics.cameras.gl.surfaces import KNOWN, LOOKED_UP, Surfaces
-from physics.world.mesh import Part
+from physics.ground.mesh import Part
 
 INSTANCE: Final = np.dtype([("at", "f4", 3), ("turn", "f4", 4), ("paint", "u1", 4)])
-"""at: metres from the anchor; turn: quaternion x, y, z, w; paint: colour, and the label as its fourth."""
+"""at: metres from the anchor; turn: quaternion x, y, z, w; paint: colour, and the label as its
+fourth."""
 
-_OWN, _PAINT, _GLOW = 255, 0, 128
-"""Fourth channel of a corner's colour: its own, the instance's, or the instance's and shining. Where it is not its own
-the colour says how much light reaches the corner."""
-_BARE, _LAMP = 255, 254
-"""Fourth channel of a corner's normal, if not a layer of the surfaces: nothing lies on it, or it shines at night."""
+_OWN = 255
+_PAINT = 0
+_GLOW = 128
+"""Fourth channel of a corner's colour: its own, the instance's, or the instance's and shining.
+Where it is not its own the colour says how much light reaches the corner."""
+_BARE = 255
+_LAMP = 254
+"""Fourth channel of a corner's normal, if not a layer of the surfaces: nothing lies on it, or it
+shines at night."""
 _LAMPLIGHT: Final = "6.0e-3, 4.8e-3, 3.0e-3"
-"""Radiance of a street lamp's glass as far as a camera is to see it, in the units of physics.cameras.sky."""
+"""Radiance of a street lamp's glass as far as a camera is to see it, in the units of
+physics.cameras.sky."""
 
 _VERTEX: Final = f"""
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour;
@@ -76,9 +83,13 @@ class Forms:
     """All forms by key, in one vertex and one index buffer; it grows when a key is new."""
 
     def __init__(
-        self, context: moderngl.Context, surfaces: Surfaces, programs_of: dict[bool, Programs] | None = None
+        self,
+        context: moderngl.Context,
+        surfaces: Surfaces,
+        programs_of: dict[bool, Programs] | None = None,
     ) -> None:
-        self._context, self._surfaces = context, surfaces
+        self._context = context
+        self._surfaces = surfaces
         self._programs: dict[bool, Programs] = {} if programs_of is None else programs_of
         self._corners: list[NDArray[np.void]] = []
         self._indices: list[NDArray[np.uint32]] = []
@@ -97,7 +108,9 @@ class Forms:
     def programs(self, shadows: bool) -> Programs:
         """The programs of all forms, shaded by shadow maps or not."""
         if shadows not in self._programs:
-            self._programs[shadows] = made = programs(self._context, KNOWN + _VERTEX, LOOKED_UP + _FRAGMENT, shadows)
+            self._programs[shadows] = made = programs(
+                self._context, KNOWN + _VERTEX, LOOKED_UP + _FRAGMENT, shadows
+            )
             for uniform in made.uniforms("layers"):
                 if uniform is not None:
                     uniform.write(self._surfaces.known)
@@ -125,13 +138,20 @@ class Forms:
     def _rows(self, part: Part) -> CornerRows:
         shade = np.ones(len(part.mesh.vertices)) if part.shade is None else part.shade
         colour = np.tile(part.colour, (len(shade), 1)) if part.colour else np.ones((len(shade), 3))
-        rows = corners(part.mesh, colour * shade[:, None], _GLOW if part.glows else _OWN if part.colour else _PAINT)
+        rows = corners(
+            part.mesh,
+            colour * shade[:, None],
+            _GLOW if part.glows else _OWN if part.colour else _PAINT,
+        )
         named = {"": _BARE, "lamp": _LAMP}
-        rows["normal"][:, 3] = named[part.cover] if part.cover in named else self._surfaces.surfaces.index(part.cover)
+        rows["normal"][:, 3] = (
+            named[part.cover] if part.cover in named else self._surfaces.surfaces.index(part.cover)
+        )
         return rows
 
     def buffers(self) -> tuple[moderngl.Buffer, moderngl.Buffer]:
-        """Corners and triangles of all forms; arrays bound to those of an older `version` are void."""
+        """Corners and triangles of all forms; arrays bound to those of an older `version` are
+        void."""
         if self._buffers is None or self._held != self.version:
             self.release()
             first = self._context.buffer(np.concatenate(self._corners).tobytes())
@@ -146,10 +166,12 @@ class Forms:
 
 
 class Things:
-    """A set of instances in runs of one form each, replaced as a whole; a run of runs is drawn in one call."""
+    """A set of instances in runs of one form each, replaced as a whole; a run of runs is drawn in
+    one call."""
 
     def __init__(self, context: moderngl.Context, forms: Forms) -> None:
-        self._context, self._forms = context, forms
+        self._context = context
+        self._forms = forms
         self._bound = -1
         self._room = 0
         self._instances: moderngl.Buffer | None = None
@@ -158,13 +180,19 @@ class Things:
         self._ends = [0, 0]
 
     def set(
-        self, form: NDArray[np.intp], rows: CornerRows, part: NDArray[np.intp] | None = None, parts: int = 1
+        self,
+        form: NDArray[np.intp],
+        rows: CornerRows,
+        part: NDArray[np.intp] | None = None,
+        parts: int = 1,
     ) -> None:
-        """(N,) numbers of forms and (N,) rows of INSTANCE. part: (N,) which of `parts` each belongs to."""
+        """(N,) numbers of forms and (N,) rows of INSTANCE. part: (N,) which of `parts` each belongs
+        to."""
         if not len(form):
             self._ends = [0] * (parts + 1)
             return
-        rank, kinds = self._forms.rank, len(self._forms.rank)
+        rank = self._forms.rank
+        kinds = len(self._forms.rank)
         order, key, commands = runs_of(rank[form] if part is None else rank[form] + kinds * part)
         draws = self._forms.draws[form[order[commands[:, 4]]]]
         commands[:, 0], commands[:, 2:4] = draws[:, 0], draws[:, 1:]
@@ -177,7 +205,8 @@ class Things:
 
     def draw(self, stage: Pass, shadows: bool, part: int = 0) -> None:
         """Draw one part. shadows: whether it is shaded by shadow maps."""
-        first, count = self._ends[part], self._ends[part + 1] - self._ends[part]
+        first = self._ends[part]
+        count = self._ends[part + 1] - self._ends[part]
         if count:
             if self._bound != self._forms.version or shadows not in self._arrays:
                 self._bind(shadows)
@@ -208,7 +237,8 @@ class Things:
     def _unbind(self) -> None:
         for array in (array for both in self._arrays.values() for array in both):
             array.release()
-        self._arrays, self._bound = {}, -1
+        self._arrays = {}
+        self._bound = -1
 
     def _drop(self) -> None:
         self._unbind()
@@ -219,12 +249,13 @@ class Things:
 
     def release(self) -> None:
         self._drop()
-        self._room, self._ends = 0, [0, 0]
+        self._room = 0
+        self._ends = [0, 0]
 
 
 def runs_of(key: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.uint32]]:
-    """(N,) the order that sorts (N,) keys, the same of equal ones; (F,) the keys that there are; and for each the row
-    of an indirect draw, (F, 5), with its count and its place in that order."""
+    """(N,) the order that sorts (N,) keys, the same of equal ones; (F,) the keys that there are;
+    and for each the row of an indirect draw, (F, 5), with its count and its place in that order."""
     order = key.argsort(kind="stable")
     key = key[order]
     begins = np.empty(len(key), dtype=bool)
@@ -242,12 +273,19 @@ def instances(at: ArrayLike, heading: ArrayLike, paint: ArrayLike, label: int) -
 
 
 def turned_instances(
-    at: ArrayLike, roll: ArrayLike, pitch: ArrayLike, heading: ArrayLike, paint: ArrayLike, label: int
+    at: ArrayLike,
+    roll: ArrayLike,
+    pitch: ArrayLike,
+    heading: ArrayLike,
+    paint: ArrayLike,
+    label: int,
 ) -> CornerRows:
-    """Rows of INSTANCE, turned about x, then y, then z. at: (N, 3) from the anchor; paint: (N, 3) or (3,)."""
+    """Rows of INSTANCE, turned about x, then y, then z. at: (N, 3) from the anchor; paint: (N, 3)
+    or (3,)."""
     at = np.asarray(at, dtype=float).reshape(-1, 3)
     half = [0.5 * np.asarray(angle, dtype=float) for angle in (roll, pitch, heading)]
-    (cx, cy, cz), (sx, sy, sz) = map(np.cos, half), map(np.sin, half)
+    (cx, cy, cz) = map(np.cos, half)
+    (sx, sy, sz) = map(np.sin, half)
     rows = np.zeros(len(at), dtype=INSTANCE)
     rows["at"] = at
     turn = rows["turn"]

@@ -16,15 +16,15 @@ from physics.cameras.sky import Sky
 HAZE_FROM_M: Final = 20.0
 HAZE_PER_M: Final = 1.0 / 110.0
 HAZE_MOST: Final = 0.85
-"""Beside the fog of a scenario distant things fade a little in any weather, so that the end of the drawn world is no
-edge; the bullet camera does the same."""
+"""Beside the fog of a scenario distant things fade a little in any weather, so that the end of the
+drawn world is no edge; the bullet camera does the same."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lighting:
-    """Linear radiances, as in physics.cameras.sky. to_sun: (3,); up, side, down: (3,) ambient of a white surface that
-    looks there; horizon: (N, 3) the sky just over the horizon, columns as in physics.cameras.sky; lamps: 0 by day to 1
-    at night; shadows: whether there are any."""
+    """Linear radiances, as in physics.cameras.sky. to_sun: (3,); up, side, down: (3,) ambient of a
+    white surface that looks there; horizon: (N, 3) the sky just over the horizon, columns as in
+    physics.cameras.sky; lamps: 0 by day to 1 at night; shadows: whether there are any."""
 
     to_sun: Floats
     sun: Floats
@@ -39,7 +39,8 @@ class Lighting:
     shadows: bool
 
     def seen(self, heading_rad: float, half_angle_rad: float) -> Lighting:
-        """The light of a picture: what is far fades into the sky that is behind it, not into the sky all around."""
+        """The light of a picture: what is far fades into the sky that is behind it, not into the
+        sky all around."""
         columns = len(self.horizon)
         turn = math.pi - 2.0 * math.pi * (np.arange(columns) + 0.5) / columns - heading_rad
         aside = np.abs((turn + math.pi) % (2.0 * math.pi) - math.pi)
@@ -63,9 +64,18 @@ def lighting_of(sky: Sky) -> Lighting:
     """What a sky is to the shaders."""
     up, side, down = sky.ambient
     return Lighting(
-        sky.sun, sky.sun_colour, up, side, down, sky.fog_colour, _horizon(sky), sky.fog_per_m, sky.exposure, sky.lamps,
+        sky.sun,
+        sky.sun_colour,
+        up,
+        side,
+        down,
+        sky.fog_colour,
+        _horizon(sky),
+        sky.fog_per_m,
+        sky.exposure,
+        sky.lamps,
         sky.shadows,
-    )  # fmt: skip
+    )
 
 
 def _horizon(sky: Sky) -> Floats:
@@ -80,8 +90,13 @@ def sky_texture(context: moderngl.Context, radiance: NDArray[np.float32]) -> mod
     """An equirectangular picture (H, W, 3) as a texture."""
     rows, columns, _ = radiance.shape
     texture = context.texture(
-        (columns, rows), 3, np.minimum(radiance, 6.0e4).astype(np.float16).tobytes(), dtype="f2", alignment=2
+        (columns, rows),
+        3,
+        np.minimum(radiance, 6.0e4).astype(np.float16).tobytes(),
+        dtype="f2",
+        alignment=2,
     )
     texture.filter = moderngl.LINEAR, moderngl.LINEAR
-    texture.repeat_x, texture.repeat_y = True, False
+    texture.repeat_x = True
+    texture.repeat_y = False
     return texture

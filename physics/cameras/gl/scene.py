@@ -1,8 +1,9 @@
-"""The street that stands around a view for the gl camera: the same things as in physics.cameras.scene, as buffers.
+"""The street that stands around a view for the gl camera: the same things as in
+physics.cameras.scene, as buffers.
 
-What can be in a picture is sorted out for a whole cell of eyes and sector of headings at a time, with a margin, so
-that a robot that drives on mostly finds everything as it lies. Cell and sector hang on the view alone, and so does
-what is drawn.
+What can be in a picture is sorted out for a whole cell of eyes and sector of headings at a time,
+with a margin, so that a robot that drives on mostly finds everything as it lies. Cell and sector
+hang on the view alone, and so does what is drawn.
 """
 
 from __future__ import annotations
@@ -32,12 +33,12 @@ from physics.cameras.gl.surfaces import TileRows, surfaces
 from physics.cameras.gl.tiles import ground_layer, ground_rows, tile_shaders
 from physics.cameras.gl.walls import wall_layer, wall_rows, wall_shaders
 from physics.cameras.view import FORGET_M, PROP_MARGIN_M, VISIBLE_M, View
+from physics.dynamics.world import BulletWorld
+from physics.ground.mesh import Part
+from physics.ground.tiles import Key, distance_to, distances_within, keys_within, square
 from physics.street import props
 from physics.street.furniture import KINDS, parts_of
-from physics.world.mesh import Part
-from physics.world.surface import stood
-from physics.world.tiles import Key, distance_to, distances_within, keys_within, square
-from physics.world.world import BulletWorld
+from physics.street.surface import stood
 
 _CELL_M: Final = 2.0
 _SECTOR_RAD: Final = math.radians(7.5)
@@ -53,8 +54,8 @@ _NOTHING: Final[_Placed] = (np.zeros(0, dtype=np.intp), np.zeros(0, dtype=INSTAN
 
 @dataclass(frozen=True, slots=True)
 class _Tile:
-    """What a tile shows, (2,) middle in world metres, and the things that stand in it, at (N, 2) thing_xy, drawn as
-    far as (N,) seen_m; their rows are relative to the middle."""
+    """What a tile shows, (2,) middle in world metres, and the things that stand in it, at (N, 2)
+    thing_xy, drawn as far as (N,) seen_m; their rows are relative to the middle."""
 
     middle: Floats
     ground: TileRows | None
@@ -77,14 +78,20 @@ class _Words(msgspec.Struct, array_like=True):
 class GlScene:
     """Keeps what stands around a view; what is drawn depends on view and signals alone."""
 
-    def __init__(self, context: moderngl.Context, forms: Forms, world: BulletWorld, light: Lighting) -> None:
-        self._surface, self._forms, self._shadows = world.surface, forms, light.shadows
+    def __init__(
+        self, context: moderngl.Context, forms: Forms, world: BulletWorld, light: Lighting
+    ) -> None:
+        self._surface = world.surface
+        self._forms = forms
+        self._shadows = light.shadows
         self._surfaces = surfaces(context)
         ground = tile_shaders(context, self._surfaces, light.shadows)
         walls = wall_shaders(context, self._surfaces, light.shadows, light.lamps > 0.0)
-        self._ground, self._paint = ground_layer(context, ground), ground_layer(context, ground)
+        self._ground = ground_layer(context, ground)
+        self._paint = ground_layer(context, ground)
         self._walls = wall_layer(context, walls)
-        self._seen, self._standing = Things(context, forms), Things(context, forms)
+        self._seen = Things(context, forms)
+        self._standing = Things(context, forms)
         self._fence_forms = forms.apart()  # there is no end of their sizes
         self._fenced = Things(context, self._fence_forms)
         self._tiles: dict[Key, _Tile] = {}
@@ -102,7 +109,8 @@ class GlScene:
         self._obstacle_xy = np.array([(o.x_m, o.y_m) for o in world.obstacles]).reshape(-1, 2)
 
     def arrange(self, view: View, middle: Floats, anchor: Floats, street: Street) -> None:
-        """Hold everything standing that a picture can show. middle: (3,) of the space with shadows."""
+        """Hold everything standing that a picture can show. middle: (3,) of the space with
+        shadows."""
         cell = round(view.eye_m[0] / _CELL_M), round(view.eye_m[1] / _CELL_M)
         if cell != self._cell:
             self._stream(cell)
@@ -131,7 +139,14 @@ class GlScene:
         self._paint.draw("colour")
 
     def release(self) -> None:
-        for held in (self._ground, self._paint, self._walls, self._seen, self._standing, self._fenced):
+        for held in (
+            self._ground,
+            self._paint,
+            self._walls,
+            self._seen,
+            self._standing,
+            self._fenced,
+        ):
             held.release()
         self._fence_forms.release()
         self._tiles.clear()
@@ -148,7 +163,8 @@ class GlScene:
             if key not in self._tiles:
                 self._tiles[key] = self._built(key)
         tiles = [self._tiles[key] for key in keys]
-        self._keys, self._middles = keys, np.array([tile.middle for tile in tiles])
+        self._keys = keys
+        self._middles = np.array([tile.middle for tile in tiles])
         for layer, rows in (
             (self._ground, [tile.ground for tile in tiles]),
             (self._paint, [tile.paint for tile in tiles]),
@@ -157,14 +173,21 @@ class GlScene:
             layer.hold(rows, self._middles)
         self._stands_xy = np.concatenate([*(tile.thing_xy for tile in tiles), self._obstacle_xy])
         always = np.full(len(self._obstacle_xy), math.inf)
-        self._stands_seen_m = np.minimum(np.concatenate([*(tile.seen_m for tile in tiles), always]), VISIBLE_M)
-        self._posts = [one for tile in tiles for one in zip(tile.posts, tile.post_z.tolist(), strict=True)]
+        self._stands_seen_m = np.minimum(
+            np.concatenate([*(tile.seen_m for tile in tiles), always]), VISIBLE_M
+        )
+        self._posts = [
+            one for tile in tiles for one in zip(tile.posts, tile.post_z.tolist(), strict=True)
+        ]
         self._placed = False
 
     def _place(self, anchor: Floats) -> None:
         """Measure everything from an anchor."""
-        self._anchor, self._placed = anchor, True
-        self._seen_for, self._still_for, self._lit_for = None, None, []
+        self._anchor = anchor
+        self._placed = True
+        self._seen_for = None
+        self._still_for = None
+        self._lit_for = []
         for layer in (self._ground, self._paint, self._walls):
             layer.place(anchor)
         placed = [self._shifted(self._tiles[key]) for key in self._keys]
@@ -191,7 +214,9 @@ class GlScene:
         if still != self._still_for:
             keys = keys_within(float(middle[0]), float(middle[1]), VISIBLE_M - STEP_M)
             obstacles = _at(self._obstacles, self._obstacle_xy, anchor)
-            self._standing.set(*_joined([*(self._shifted(self._tiles[key]) for key in keys), obstacles]))
+            self._standing.set(
+                *_joined([*(self._shifted(self._tiles[key]) for key in keys), obstacles])
+            )
             tiles = np.array([self._keys.index(key) for key in keys], dtype=np.intp)
             for layer in (self._ground, self._walls):
                 layer.show("still", tiles)
@@ -204,16 +229,29 @@ class GlScene:
         form = [self._forms.id(("prop", *form), partial(parts_of, *form)) for form in words.forms]
         things = np.array([*form, *[pole] * len(words.posts)], dtype=np.intp), held["things"]
         ground, paint, walls = (
-            (held[name], held[f"{name}_triangles"]) if name in held else None for name in ("ground", "paint", "walls")
+            (held[name], held[f"{name}_triangles"]) if name in held else None
+            for name in ("ground", "paint", "walls")
         )
         return _Tile(
-            _middle(key), ground, paint, walls, things, held["thing_xy"], held["seen_m"], words.posts, held["post_z"]
+            _middle(key),
+            ground,
+            paint,
+            walls,
+            things,
+            held["thing_xy"],
+            held["seen_m"],
+            words.posts,
+            held["post_z"],
         )
 
     def _made(self, key: Key) -> Arrays:
         """What of a tile hangs on its surface alone."""
         middle = _middle(key)
-        chunk, finish, posts = self._surface.chunk(key), self._surface.finish(key), self._surface.posts(key)
+        chunk, finish, posts = (
+            self._surface.chunk(key),
+            self._surface.finish(key),
+            self._surface.posts(key),
+        )
         layers = {
             "ground": ground_rows(self._surfaces, (*finish.laid, *chunk.ground), middle),
             "paint": ground_rows(self._surfaces, finish.painted, middle),
@@ -222,17 +260,25 @@ class GlScene:
         post_xy = np.array([(post.x_m, post.y_m) for post in posts]).reshape(-1, 2)
         post_z = self._surface.heights(post_xy)
         furniture = chunk.props
-        xyz = np.array([(prop.x_m - middle[0], prop.y_m - middle[1], z) for prop, z in furniture]).reshape(-1, 3)
-        paint = np.array([KINDS[prop.kind].paints[prop.paint] for prop, _ in furniture]).reshape(-1, 3)
+        xyz = np.array(
+            [(prop.x_m - middle[0], prop.y_m - middle[1], z) for prop, z in furniture]
+        ).reshape(-1, 3)
+        paint = np.array([KINDS[prop.kind].paints[prop.paint] for prop, _ in furniture]).reshape(
+            -1, 3
+        )
         rows = instances(xyz, [prop.drawn_rad for prop, _ in furniture], paint, LABELS["prop"])
         headings = [post.heading_rad for post in posts]
-        poles = instances(np.column_stack([post_xy - middle, post_z]), headings, props.POLE, LABELS["signal"])
+        poles = instances(
+            np.column_stack([post_xy - middle, post_z]), headings, props.POLE, LABELS["signal"]
+        )
         words = msgspec.msgpack.encode(_Words([prop.form for prop, _ in furniture], posts))
         found = {
             "words": np.frombuffer(words, dtype=np.uint8),
             "things": np.concatenate([rows, poles]),
             "thing_xy": np.concatenate([xyz[:, :2] + middle, post_xy]),
-            "seen_m": np.array([*(KINDS[prop.kind].seen_m for prop, _ in furniture), *[math.inf] * len(posts)]),
+            "seen_m": np.array(
+                [*(KINDS[prop.kind].seen_m for prop, _ in furniture), *[math.inf] * len(posts)]
+            ),
             "post_z": post_z,
         }
         for name, layer in layers.items():
@@ -247,38 +293,53 @@ class GlScene:
         return form, here
 
     def _fence(self, barrier: Barrier) -> _Placed:
-        z = self._surface.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, (barrier.thickness_m, barrier.length_m))
+        z = self._surface.foot(
+            barrier.x_m, barrier.y_m, barrier.heading_rad, (barrier.thickness_m, barrier.length_m)
+        )
         red, white = props.barrier_meshes(barrier)
         size = (barrier.length_m, barrier.height_m, barrier.thickness_m)
         form = self._fence_forms.id(
             ("barrier", *size), lambda: [Part(red, props.PROP_RED), Part(white, props.PROP_WHITE)]
         )
-        rows = instances((barrier.x_m, barrier.y_m, z), barrier.heading_rad, props.PROP_RED, LABELS["barrier"])
+        rows = instances(
+            (barrier.x_m, barrier.y_m, z), barrier.heading_rad, props.PROP_RED, LABELS["barrier"]
+        )
         return np.array([form]), rows
 
     def _stood(self, obstacles: Sequence[Obstacle]) -> _Placed:
         standing = stood(obstacles, self._surface)
         if not standing:
             return _NOTHING
-        form = [self._forms.id(("prop", *prop.form), partial(parts_of, *prop.form)) for prop, _ in standing]
+        form = [
+            self._forms.id(("prop", *prop.form), partial(parts_of, *prop.form))
+            for prop, _ in standing
+        ]
         paint = np.array([KINDS[prop.kind].paints[prop.paint] for prop, _ in standing])
         xyz = np.array([(0.0, 0.0, z) for _, z in standing])
         rows = instances(xyz, [prop.drawn_rad for prop, _ in standing], paint, LABELS["prop"])
         return np.array(form, dtype=np.intp), rows
 
     def _fences_now(self, anchor: Floats) -> list[_Placed]:
-        return [_at(fence, xy, anchor) for fence, xy in zip(self._fences, self._fence_xy, strict=True)]
+        return [
+            _at(fence, xy, anchor) for fence, xy in zip(self._fences, self._fence_xy, strict=True)
+        ]
 
     def _light(self, street: Street) -> None:
         """Let the lamp of every signal whose state is known be lit."""
         signals = street.signals
-        shown = [signals[post.crossing].walk if post.crossing in signals else None for post, _ in self._posts]
+        shown = [
+            signals[post.crossing].walk if post.crossing in signals else None
+            for post, _ in self._posts
+        ]
         if shown != self._lit_for:
             self._lit_for, self._lit, self._seen_for = shown, self._lamps_showing(shown), None
 
     def _lamps_showing(self, shown: list[bool | None]) -> _Placed:
         lit = {walk: self._forms.id(("signal", walk), partial(_lamp, walk)) for walk in props.LAMPS}
-        forms, at, heading, paint = [], [], [], []
+        forms = []
+        at = []
+        heading = []
+        paint = []
         for (post, z), walk in zip(self._posts, shown, strict=True):
             if walk is not None:
                 forms.append(lit[walk])
@@ -297,7 +358,8 @@ def _middle(key: Key) -> Floats:
 
 
 def _sector(view: View) -> tuple[int, int | None]:
-    """The sector of a heading, and half the width of what its views show, in sectors; None for all around."""
+    """The sector of a heading, and half the width of what its views show, in sectors; None for all
+    around."""
     half = math.ceil(view.half_angle_rad / _SECTOR_RAD + 0.5)
     if view.behind_m > 0.0 or half * _SECTOR_RAD >= 0.5 * math.pi:
         return 0, None
@@ -305,11 +367,12 @@ def _sector(view: View) -> tuple[int, int | None]:
 
 
 def _within(offset: Floats, sector: int, half: int, margin_m: float) -> NDArray[np.bool_]:
-    """Which of (N, 2) points, measured from the middle of a cell, any of its eyes can see that looks into the sector,
-    things of radius `margin_m` standing on them."""
+    """Which of (N, 2) points, measured from the middle of a cell, any of its eyes can see that
+    looks into the sector, things of radius `margin_m` standing on them."""
     heading, aside = sector * _SECTOR_RAD, half * _SECTOR_RAD
     cos, sin = math.cos(heading), math.sin(heading)
-    ahead, across = offset @ np.array([cos, sin]), np.abs(offset @ np.array([-sin, cos]))
+    ahead = offset @ np.array([cos, sin])
+    across = np.abs(offset @ np.array([-sin, cos]))
     return np.asarray(across * math.cos(aside) - ahead * math.sin(aside) < margin_m + _SLACK_M)
 
 
@@ -326,4 +389,6 @@ def _at(placed: _Placed, xy: Floats, anchor: Floats) -> _Placed:
 
 
 def _joined(placed: Sequence[_Placed]) -> _Placed:
-    return np.concatenate([form for form, _ in placed]), np.concatenate([rows for _, rows in placed])
+    return np.concatenate([form for form, _ in placed]), np.concatenate(
+        [rows for _, rows in placed]
+    )

@@ -1,7 +1,7 @@
 """Shadow maps: the street as the sun sees it, once for what stands and once for what moves.
 
-Both maps share one box around a point of a coarse lattice near the eye, set to whole texels, so that shadows do not
-swim; what stands is drawn anew only when that point changes.
+Both maps share one box around a point of a coarse lattice near the eye, set to whole texels, so
+that shadows do not swim; what stands is drawn anew only when that point changes.
 """
 
 from __future__ import annotations
@@ -25,8 +25,11 @@ _DEEP_M: Final = 80.0
 _STILL_PX: Final = 2048
 _MOVING_PX: Final = 512
 _SMALL_PX: Final = (300, 160)
-"""Pictures that are not higher show no difference between the still map, the moving one, and one of half the size."""
-TO_TEXTURE: Final = np.array([[0.5, 0.0, 0.0, 0.5], [0.0, 0.5, 0.0, 0.5], [0.0, 0.0, 0.5, 0.5], [0.0, 0.0, 0.0, 1.0]])
+"""Pictures that are not higher show no difference between the still map, the moving one, and one of
+half the size."""
+TO_TEXTURE: Final = np.array(
+    [[0.5, 0.0, 0.0, 0.5], [0.0, 0.5, 0.0, 0.5], [0.0, 0.0, 0.5, 0.5], [0.0, 0.0, 0.0, 1.0]]
+)
 """From clip space to the space of a texture."""
 
 
@@ -35,11 +38,18 @@ def middle_of(eye_m: Floats) -> Floats:
     return np.asarray(np.round(eye_m / STEP_M) * STEP_M)
 
 
-def shadow_matrix(middle: Floats, anchor: Floats, to_sun: Floats, side_px: int = _STILL_PX) -> Floats:
-    """(4, 4) from metres relative to the anchor to the clip space of the maps. side_px: of the finer one."""
+def shadow_matrix(
+    middle: Floats, anchor: Floats, to_sun: Floats, side_px: int = _STILL_PX
+) -> Floats:
+    """(4, 4) from metres relative to the anchor to the clip space of the maps. side_px: of the
+    finer one."""
     sun = to_sun / np.linalg.norm(to_sun)
     across = np.cross((0.0, 0.0, 1.0), sun)
-    across = across / np.linalg.norm(across) if np.linalg.norm(across) > 1e-6 else np.array([1.0, 0.0, 0.0])
+    across = (
+        across / np.linalg.norm(across)
+        if np.linalg.norm(across) > 1e-6
+        else np.array([1.0, 0.0, 0.0])
+    )
     rows = np.stack([across, np.cross(sun, across), -sun])
     texel = 2.0 * SHADOW_REACH_M / side_px
     centre = rows @ middle
@@ -91,11 +101,15 @@ class ShadowMaps:
         key = (*middle.tolist(), *anchor.tolist())
         if key != self._matrices_for:
             from_at = shadow_matrix(middle, anchor, light.to_sun, self._side_px)
-            self._matrices_for, self._matrices = key, (from_at, TO_TEXTURE @ from_at)
+            self._matrices_for = key
+            self._matrices = (from_at, TO_TEXTURE @ from_at)
         return self._matrices
 
-    def draw(self, middle: Floats, anchor: Floats, light: Lighting, draw: Callable[[Pass], None]) -> None:
-        """Bring the maps up to date, within `casting`; the scene block must hold their matrix as its camera."""
+    def draw(
+        self, middle: Floats, anchor: Floats, light: Lighting, draw: Callable[[Pass], None]
+    ) -> None:
+        """Bring the maps up to date, within `casting`; the scene block must hold their matrix as
+        its camera."""
         key = (*middle.tolist(), *anchor.tolist(), *light.to_sun.tolist())
         if key != self._drawn_for:
             self._draw("still", draw)

@@ -1,4 +1,5 @@
-"""Shots: the views of the pictures of a batch as arrays, so that what moves in all of them is sorted out at once."""
+"""Shots: the views of the pictures of a batch as arrays, so that what moves in all of them is
+sorted out at once."""
 
 from __future__ import annotations
 
@@ -15,8 +16,9 @@ from physics.cameras.view import VISIBLE_M, Shot
 
 
 class Shots:
-    """N views. taken: themselves; anchors, middles: (2,) and (3,) world metres of each, as `anchor_of` and `middle_of`
-    say; anchor, middle: the same as (N, 2) and (N, 3) arrays; eye: (N, 3).
+    """N views. taken: themselves; anchors, middles: (2,) and (3,) world metres of each, as
+    `anchor_of` and `middle_of` say; anchor, middle: the same as (N, 2) and (N, 3) arrays; eye: (N,
+    3).
 
     In all methods whose: (M,) the view that is asked for each of (M, 2) points.
     """
@@ -29,9 +31,16 @@ class Shots:
         self.eye = np.array([one.eye_m for one in taken])
         rows = []
         for one in taken:
-            view, tan = one.view, math.tan(0.5 * math.radians(one.fov_deg))
+            view = one.view
+            tan = math.tan(0.5 * math.radians(one.fov_deg))
             heading, half = view.heading_rad, view.half_angle_rad
-            wedge = math.cos(heading), math.sin(heading), math.cos(half), math.sin(half), view.behind_m
+            wedge = (
+                math.cos(heading),
+                math.sin(heading),
+                math.cos(half),
+                math.sin(half),
+                view.behind_m,
+            )
             rows.append((*one.eye_m[:2].tolist(), *wedge, 1.75 * 0.5 * one.size[1] / tan))
         self._columns = np.array(rows).T
         self._alone = rows[0] if len(rows) == 1 else None
@@ -40,10 +49,13 @@ class Shots:
         """(M,) what `View.sees` says of each point in its view."""
         x, y, cos, sin, cos_half, sin_half, behind, _ = self._of(whose)
         dx, dy = xy[:, 0] - x, xy[:, 1] - y
-        ahead, aside = dx * cos + dy * sin, np.abs(dy * cos - dx * sin)
+        ahead = dx * cos + dy * sin
+        aside = np.abs(dy * cos - dx * sin)
         inner = ahead + behind
         near = dx * dx + dy * dy < VISIBLE_M * VISIBLE_M
-        return np.asarray((aside * cos_half - inner * sin_half < margin_m) & (inner > -margin_m) & near)
+        return np.asarray(
+            (aside * cos_half - inner * sin_half < margin_m) & (inner > -margin_m) & near
+        )
 
     def far_m(self, whose: NDArray[np.intp], xy: Floats) -> Floats:
         """(M,) distances of points from the eyes, over the ground."""
@@ -52,9 +64,11 @@ class Shots:
 
     def tall_px(self, whose: NDArray[np.intp], xy: Floats, z_m: Floats) -> Floats:
         """(M,) how tall people at points and (M,) heights are in the pictures, in pixels."""
-        (*_, px), dz = self._of(whose), z_m + 0.9 - self.eye[whose, 2]
+        (*_, px) = self._of(whose)
+        dz = z_m + 0.9 - self.eye[whose, 2]
         return np.asarray(px / np.maximum(np.hypot(self.far_m(whose, xy), dz), 0.1))
 
     def _of(self, whose: NDArray[np.intp]) -> Iterable[Floats] | Iterable[float]:
-        """What is known of the view of each point, column by column; of a single view one number each."""
+        """What is known of the view of each point, column by column; of a single view one number
+        each."""
         return self._columns[:, whose] if self._alone is None else self._alone

@@ -1,7 +1,8 @@
-"""Bodies on the graphics card: meshes near, tubes far away, and the shaders that move them with their joints.
+"""Bodies on the graphics card: meshes near, tubes far away, and the shaders that move them with
+their joints.
 
-A tube's rings are turned towards the eye in the vertex shader, so that a ring of four or six corners has the outline of
-a round one; in shadow maps they are turned towards the sun.
+A tube's rings are turned towards the eye in the vertex shader, so that a ring of four or six
+corners has the outline of a round one; in shadow maps they are turned towards the sun.
 """
 
 from __future__ import annotations
@@ -19,9 +20,16 @@ from physics.cameras.gl.shading import Pass, Programs, programs
 from physics.people.body import FarBody, SkinnedBody
 
 _CORNER: Final = np.dtype(
-    [("at", "f4", 3), ("normal", "u1", 4), ("joints", "u1", 4), ("weights", "u1", 4), ("coat", "u1", 4)]
+    [
+        ("at", "f4", 3),
+        ("normal", "u1", 4),
+        ("joints", "u1", 4),
+        ("weights", "u1", 4),
+        ("coat", "u1", 4),
+    ]
 )
-"""normal: as in corners._CORNER, fourth: how far fat stands out; weights: of 255; coat: row of COATS."""
+"""normal: as in corners._CORNER, fourth: how far fat stands out; weights: of 255; coat: row of
+COATS."""
 
 FAR_CORNER: Final = np.dtype(
     [
@@ -34,9 +42,17 @@ FAR_CORNER: Final = np.dtype(
         ("coat", "u1", 4),
     ]
 )
-"""A corner of a tube; coat: row of COATS, how far fat stands out, whether it is not turned, whether of a ribbon."""
+"""A corner of a tube; coat: row of COATS, how far fat stands out, whether it is not turned, whether
+of a ribbon."""
 
-_MESH_LAYOUT: Final = ("3f4 4f1 4u1 4f1 4u1", "in_at", "in_normal", "in_joints", "in_weights", "in_coat")
+_MESH_LAYOUT: Final = (
+    "3f4 4f1 4u1 4f1 4u1",
+    "in_at",
+    "in_normal",
+    "in_joints",
+    "in_weights",
+    "in_coat",
+)
 _TUBE_LAYOUT: Final = (
     "3f4 3f4 3f4 4f4 4u1 4f1 4u1",
     *("in_middle", "in_ahead", "in_side", "in_ring", "in_joints", "in_weights", "in_coat"),
@@ -112,8 +128,8 @@ void main() {{ show(albedo, normalize(normal), at, {LABELS["person"]}.0); }}
 
 
 class Skins:
-    """Bodies in one vertex and one index buffer; instances: of person, dress and girth. drawn: the programs, shaded by
-    shadow maps or not."""
+    """Bodies in one vertex and one index buffer; instances: of person, dress and girth. drawn: the
+    programs, shaded by shadow maps or not."""
 
     def __init__(
         self,
@@ -122,7 +138,10 @@ class Skins:
         drawn: Callable[[bool], Programs],
         layout: tuple[str, ...],
     ) -> None:
-        self._context, self._made, self._drawn, self._layout = context, made, drawn, layout
+        self._context = context
+        self._made = made
+        self._drawn = drawn
+        self._layout = layout
         self._rows: list[NDArray[np.void]] = []
         self._indices: list[NDArray[np.uint32]] = []
         self._buffers: list[moderngl.Buffer] = []
@@ -160,16 +179,21 @@ class Skins:
             array.release()
         for buffer in self._buffers:
             buffer.release()
-        self._buffers, self._arrays = [], {}
+        self._buffers = []
+        self._arrays = {}
 
     def _bind(self, shadows: bool, instances: moderngl.Buffer) -> None:
         if not self._buffers:
             rows, indices = np.concatenate(self._rows), np.concatenate(self._indices)
             self._buffers = [self._context.buffer(held.tobytes()) for held in (rows, indices)]
         corner, index = self._buffers
-        content = [(corner, *self._layout), (instances, "1i4 1i4 1f4/i", "person", "dress", "girth")]
+        content = [
+            (corner, *self._layout),
+            (instances, "1i4 1i4 1f4/i", "person", "dress", "girth"),
+        ]
         colour, shadow = (
-            self._context.vertex_array(program, content, index, skip_errors=True) for program in self._drawn(shadows)
+            self._context.vertex_array(program, content, index, skip_errors=True)
+            for program in self._drawn(shadows)
         )
         self._arrays[shadows] = colour, shadow
 
@@ -188,7 +212,12 @@ def tube_skins(context: moderngl.Context, made: Callable[[int, int], FarBody]) -
 
     def drawn(shadows: bool) -> Programs:
         seen, cast = (
-            programs(context, f"#define TOWARDS ({ray})\n#define RAISED {raised}\n" + _SKIN + _TUBE, _FRAGMENT, shadows)
+            programs(
+                context,
+                f"#define TOWARDS ({ray})\n#define RAISED {raised}\n" + _SKIN + _TUBE,
+                _FRAGMENT,
+                shadows,
+            )
             for ray, raised in (("middle - eye.xyz", 1.0), ("sun.xyz", 0.0))
         )
         return Programs(seen.colour, cast.shadow)
@@ -210,7 +239,12 @@ def _corners(made: SkinnedBody) -> NDArray[np.void]:
 def far_corners(made: FarBody) -> NDArray[np.void]:
     """(V,) rows of FAR_CORNER."""
     rows = np.zeros(len(made.middle), dtype=FAR_CORNER)
-    rows["middle"], rows["ahead"], rows["side"], rows["ring"] = made.middle, made.ahead, made.side, made.ring
+    rows["middle"], rows["ahead"], rows["side"], rows["ring"] = (
+        made.middle,
+        made.ahead,
+        made.side,
+        made.ring,
+    )
     rows["joints"], rows["weights"] = made.joints, _bytes(made.weights)
     rows["coat"][:, 0], rows["coat"][:, 1] = made.coat, np.rint(255.0 * made.fat)
     rows["coat"][:, 2], rows["coat"][:, 3] = made.still, made.ribbon

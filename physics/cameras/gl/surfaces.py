@@ -1,4 +1,5 @@
-"""The textures of ground, walls, things and facades on the graphics card, shared by all cameras of a process."""
+"""The textures of ground, walls, things and facades on the graphics card, shared by all cameras of
+a process."""
 
 from __future__ import annotations
 
@@ -37,8 +38,8 @@ vec3 tint_of(vec3 colour, int layer) {{ return decoded(colour) / layers[layer].r
 
 @dataclass(frozen=True, slots=True)
 class Surfaces:
-    """surfaces: layers of ground, walls and things; facades: bays of facades; known: the uniform `layers`,
-    (LAYERS_MAX, 4)."""
+    """surfaces: layers of ground, walls and things; facades: bays of facades; known: the uniform
+    `layers`, (LAYERS_MAX, 4)."""
 
     surfaces: Layers
     facades: Layers
@@ -46,18 +47,27 @@ class Surfaces:
     _arrays: tuple[moderngl.TextureArray, ...]
 
     def bind(self) -> None:
-        for array, unit in zip(self._arrays, (SURFACES_UNIT, FACADES_UNIT, FINISH_UNIT), strict=True):
+        for array, unit in zip(
+            self._arrays, (SURFACES_UNIT, FACADES_UNIT, FINISH_UNIT), strict=True
+        ):
             array.use(unit)
 
 
 class SurfaceShaders:
-    """Programs that look surfaces up, for buffers whose positions are relative to the middle of their tile.
+    """Programs that look surfaces up, for buffers whose positions are relative to the middle of
+    their tile.
 
-    vertex: declares `in vec2 middle` (from the anchor), and `in vec2 middle_in_world` where it needs that.
+    vertex: declares `in vec2 middle` (from the anchor), and `in vec2 middle_in_world` where it
+    needs that.
     """
 
     def __init__(
-        self, context: moderngl.Context, surfaces: Surfaces, vertex: str, fragment: str, shadows: bool
+        self,
+        context: moderngl.Context,
+        surfaces: Surfaces,
+        vertex: str,
+        fragment: str,
+        shadows: bool,
     ) -> None:
         self.surfaces = surfaces
         self.programs = programs(context, KNOWN + vertex, LOOKED_UP + fragment, shadows)
@@ -67,15 +77,20 @@ class SurfaceShaders:
 
 
 TileRows = tuple[CornerRows, NDArray[np.uint32]]
-"""Meshes of one tile joined in their order: rows of vertices, measured from the tile's middle, and triangles, flat."""
+"""Meshes of one tile joined in their order: rows of vertices, measured from the tile's middle, and
+triangles, flat."""
 
 
 class TileLayer:
-    """Meshes of the tiles around, uploaded when the tiles change; those in view are drawn in one call. layout: of a
-    row, as moderngl wants it."""
+    """Meshes of the tiles around, uploaded when the tiles change; those in view are drawn in one
+    call. layout: of a row, as moderngl wants it."""
 
-    def __init__(self, context: moderngl.Context, shaders: SurfaceShaders, layout: tuple[str, ...]) -> None:
-        self._context, self._shaders, self._layout = context, shaders, layout
+    def __init__(
+        self, context: moderngl.Context, shaders: SurfaceShaders, layout: tuple[str, ...]
+    ) -> None:
+        self._context = context
+        self._shaders = shaders
+        self._layout = layout
         self._buffers: list[moderngl.Buffer] = []
         self._arrays: list[moderngl.VertexArray] = []
         self._draws = np.zeros((0, 5), dtype=np.uint32)
@@ -88,17 +103,28 @@ class TileLayer:
         held = [tile for tile in tiles if tile is not None]
         if not held:
             return
-        ends = np.cumsum([(0, 0)] + [(len(t[0]), len(t[1])) if t else (0, 0) for t in tiles], axis=0)
+        ends = np.cumsum(
+            [(0, 0)] + [(len(t[0]), len(t[1])) if t else (0, 0) for t in tiles], axis=0
+        )
         self._draws = np.zeros((len(tiles), 5), dtype=np.uint32)
-        self._draws[:, 0], self._draws[:, 1], self._draws[:, 2:4] = np.diff(ends[:, 1]), 1, ends[:-1, ::-1]
+        self._draws[:, 0], self._draws[:, 1], self._draws[:, 2:4] = (
+            np.diff(ends[:, 1]),
+            1,
+            ends[:-1, ::-1],
+        )
         self._draws[:, 4] = np.arange(len(tiles))
-        rows, triangles = (self._context.buffer(np.concatenate(part).tobytes()) for part in zip(*held, strict=True))
+        rows, triangles = (
+            self._context.buffer(np.concatenate(part).tobytes()) for part in zip(*held, strict=True)
+        )
         self._place = self._context.buffer(reserve=16 * len(tiles))
-        self._commands = {name: self._context.buffer(reserve=20 * len(tiles)) for name in self._counts}
+        self._commands = {
+            name: self._context.buffer(reserve=20 * len(tiles)) for name in self._counts
+        }
         self._buffers = [rows, triangles, self._place, *self._commands.values()]
         content = [(rows, *self._layout), (self._place, "2f 2f /i", "middle", "middle_in_world")]
         self._arrays = [
-            self._context.vertex_array(one, content, triangles, skip_errors=True) for one in self._shaders.programs
+            self._context.vertex_array(one, content, triangles, skip_errors=True)
+            for one in self._shaders.programs
         ]
 
     def place(self, anchor: Floats) -> None:
@@ -117,23 +143,25 @@ class TileLayer:
     def draw(self, stage: Pass) -> None:
         count = self._counts.get(stage, 0)
         if count:
-            self._arrays[stage != "colour"].render_indirect(self._commands[stage], moderngl.TRIANGLES, count=count)
+            self._arrays[stage != "colour"].render_indirect(
+                self._commands[stage], moderngl.TRIANGLES, count=count
+            )
 
     def release(self) -> None:
         for array in self._arrays:
             array.release()
         for buffer in self._buffers:
             buffer.release()
-        self._arrays, self._buffers, self._counts = [], [], {"colour": 0, "still": 0}
+        self._arrays = []
+        self._buffers = []
+        self._counts = {"colour": 0, "still": 0}
 
 
 @lru_cache(maxsize=1)
 def surfaces(context: moderngl.Context) -> Surfaces:
     """Made once in a context; they stay as long as it."""
-    flat, facades = (
-        joined_layers(ground_layers(SIZE_PX), wall_layers(SIZE_PX), prop_layers(SIZE_PX)),
-        facade_layers(SIZE_PX),
-    )
+    flat = joined_layers(ground_layers(SIZE_PX), wall_layers(SIZE_PX), prop_layers(SIZE_PX))
+    facades = facade_layers(SIZE_PX)
     known = np.ones((LAYERS_MAX, 4), dtype=np.float32)
     known[: len(flat), :3], known[: len(flat), 3] = flat.mean, flat.metres[:, 0]
     assert facades.finish is not None

@@ -1,6 +1,7 @@
 """Targets: what a picture is drawn into, and how it is read back.
 
-Colour and label share one texture (the label is its fourth channel), so that a picture is one readback.
+Colour and label share one texture (the label is its fourth channel), so that a picture is one
+readback.
 """
 
 from __future__ import annotations
@@ -23,15 +24,21 @@ _UNIT: Final = 8
 
 
 class Target:
-    """A framebuffer of one size. size: width, height in pixels. parts_on_card: whether colours and labels are parted
-    before they are read, which costs a graphics card nothing; by default where there is one."""
+    """A framebuffer of one size. size: width, height in pixels. parts_on_card: whether colours and
+    labels are parted before they are read, which costs a graphics card nothing; by default where
+    there is one."""
 
-    def __init__(self, context: moderngl.Context, size: tuple[int, int], parts_on_card: bool | None = None) -> None:
+    def __init__(
+        self, context: moderngl.Context, size: tuple[int, int], parts_on_card: bool | None = None
+    ) -> None:
         self.size = size
         self._colour = context.texture(size, 4)
         self._depth = context.depth_renderbuffer(size)
-        self.frame, self._painted = (context.framebuffer([self._colour], self._depth) for _ in range(2))
-        self._painted.color_mask, self._painted.depth_mask = (True, True, True, False), False
+        self.frame, self._painted = (
+            context.framebuffer([self._colour], self._depth) for _ in range(2)
+        )
+        self._painted.color_mask = (True, True, True, False)
+        self._painted.depth_mask = False
         on_card = is_card(context) if parts_on_card is None else parts_on_card
         self._parting = _Parting(context, size) if on_card else None
 
@@ -62,10 +69,12 @@ class Target:
         """Colours (H, W, 3) and labels (H, W) of a picture as it was read."""
         width, height = self.size
         if self._parting is not None:
-            colours, labels = data[: 3 * width * height], data[3 * width * height :]
+            colours = data[: 3 * width * height]
+            labels = data[3 * width * height :]
             return colours.reshape(height, width, 3), labels.reshape(height, width)
         whole = data.reshape(height, width, 4)
-        rgb, label = cv2.cvtColor(whole, cv2.COLOR_RGBA2RGB), cv2.extractChannel(whole, 3)
+        rgb = cv2.cvtColor(whole, cv2.COLOR_RGBA2RGB)
+        label = cv2.extractChannel(whole, 3)
         return np.asarray(rgb, dtype=np.uint8), np.asarray(label, dtype=np.uint8)
 
     def _read(self) -> moderngl.Framebuffer:
@@ -80,7 +89,9 @@ class Target:
         width, height = self.size
         data = self.frame.read(components=1, attachment=-1, dtype="f4")
         depth = np.frombuffer(data, dtype=np.float32).reshape(height, width)
-        return (FAR_PLANE_M * NEAR_PLANE_M / (FAR_PLANE_M - (FAR_PLANE_M - NEAR_PLANE_M) * depth)).astype(np.float32)
+        return (
+            FAR_PLANE_M * NEAR_PLANE_M / (FAR_PLANE_M - (FAR_PLANE_M - NEAR_PLANE_M) * depth)
+        ).astype(np.float32)
 
     def release(self) -> None:
         for thing in (self.frame, self._painted, self._colour, self._depth, self._parting):
@@ -134,14 +145,16 @@ def _parting_program(context: moderngl.Context) -> moderngl.Program:
 
 
 class Readback:
-    """Pictures on their way from the graphics card: copied behind one another into a buffer when the card comes to it,
-    fetched later, so that nobody waits for one while the next can be drawn. target: what they are drawn into."""
+    """Pictures on their way from the graphics card: copied behind one another into a buffer when
+    the card comes to it, fetched later, so that nobody waits for one while the next can be drawn.
+    target: what they are drawn into."""
 
     UNDER_WAY: Final = 2
     """Buffers that may have begun and not ended."""
 
     def __init__(self, context: moderngl.Context, target: Target) -> None:
-        self._context, self._target = context, target
+        self._context = context
+        self._target = target
         self._each = target.size[0] * target.size[1] * 4
         self._free = [context.buffer(reserve=self._each) for _ in range(self.UNDER_WAY)]
         self._begun: deque[tuple[moderngl.Buffer, int]] = deque()

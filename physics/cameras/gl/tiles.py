@@ -11,7 +11,7 @@ from cosim.core.geometry import Floats
 from cosim.core.state import LABELS
 from physics.cameras.gl.corners import LAYOUT, corners, joined_corners
 from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TileLayer, TileRows
-from physics.world.surface import Patch
+from physics.street.surface import Patch
 
 _TINTED: Final = 128
 """Added to the label of a surface whose colour tints its texture."""

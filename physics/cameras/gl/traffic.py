@@ -1,4 +1,5 @@
-"""Vehicles and robots of all pictures of a batch: sorted out together, uploaded together, drawn picture by picture."""
+"""Vehicles and robots of all pictures of a batch: sorted out together, uploaded together, drawn
+picture by picture."""
 
 from __future__ import annotations
 
@@ -15,27 +16,28 @@ from cosim.core.state import LABELS, RobotState, Vehicles
 from cosim.spec.robot import Robot
 from physics.cameras.gl.corners import CornerRows
 from physics.cameras.gl.instances import INSTANCE, Forms, Things, turned_instances
+from physics.cameras.gl.robot_body import robot_parts
 from physics.cameras.gl.shading import Pass
 from physics.cameras.gl.shadows import SHADOW_REACH_M
 from physics.cameras.gl.shots import Shots
 from physics.cameras.view import VEHICLE_MARGIN_M
+from physics.ground.mesh import Part
 from physics.robots import urdf_of
-from physics.robots.robot_body import robot_parts
 from physics.street import vehicles
-from physics.world.mesh import Part
-from physics.world.surface import Surface
+from physics.street.surface import Surface
 
 _PARTS: Final = {"colour": 0, "still": 1, "moving": 1}
 _FLEETS_MAX: Final = 256
 
 
 _Placed = tuple[NDArray[np.intp], CornerRows, NDArray[np.intp]]
-"""Forms, instances, and which part of the draws each belongs to: twice the picture, and one more for shadows."""
+"""Forms, instances, and which part of the draws each belongs to: twice the picture, and one more
+for shadows."""
 
 
 class Driven(NamedTuple):
-    """The vehicles of a picture, and its robot if there is one to show: seen itself, or only its shadow. shadows:
-    whether there are any."""
+    """The vehicles of a picture, and its robot if there is one to show: seen itself, or only its
+    shadow. shadows: whether there are any."""
 
     vehicles: Vehicles
     surface: Surface
@@ -49,7 +51,8 @@ class TrafficDrawing:
     """What drives in the pictures of a batch."""
 
     def __init__(self, context: moderngl.Context, forms: Forms) -> None:
-        self._forms, self._things = forms, Things(context, forms)
+        self._forms = forms
+        self._things = Things(context, forms)
         self._fleets: dict[tuple[tuple[str, ...], bytes], tuple[NDArray[np.intp], Floats]] = {}
 
     def set(self, driven: Sequence[Driven], shots: Shots) -> None:
@@ -68,12 +71,19 @@ class TrafficDrawing:
     def _vehicles(self, driven: Sequence[Driven], shots: Shots) -> _Placed:
         whose = np.repeat(np.arange(len(driven)), [len(one.vehicles) for one in driven])
         xy = np.concatenate([one.vehicles.xy for one in driven])
-        middle, shadows = shots.middle[whose], np.array([one.shadows for one in driven])[whose]
+        middle = shots.middle[whose]
+        shadows = np.array([one.shadows for one in driven])[whose]
         seen = shots.sees(whose, xy, VEHICLE_MARGIN_M)
-        casts = shadows & (np.hypot(xy[:, 0] - middle[:, 0], xy[:, 1] - middle[:, 1]) < SHADOW_REACH_M)
+        casts = shadows & (
+            np.hypot(xy[:, 0] - middle[:, 0], xy[:, 1] - middle[:, 1]) < SHADOW_REACH_M
+        )
         rows = np.concatenate([seen.nonzero()[0], casts.nonzero()[0]])
         if not len(rows):
-            return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=INSTANCE), np.zeros(0, dtype=np.intp)
+            return (
+                np.zeros(0, dtype=np.intp),
+                np.zeros(0, dtype=INSTANCE),
+                np.zeros(0, dtype=np.intp),
+            )
         fleets = [self._fleet(one.vehicles) for one in driven]
         form, paint = (np.concatenate(column) for column in zip(*fleets, strict=True))
         lean = np.concatenate([_leaning(one) for one in driven])
@@ -88,7 +98,10 @@ class TrafficDrawing:
         if key not in self._fleets:
             if len(self._fleets) >= _FLEETS_MAX:
                 self._fleets.clear()
-            forms = [self._form(name, *size) for name, size in zip(which.ids, which.size.tolist(), strict=True)]
+            forms = [
+                self._form(name, *size)
+                for name, size in zip(which.ids, which.size.tolist(), strict=True)
+            ]
             paints = np.array([vehicles.paint(name) for name in which.ids]).reshape(-1, 3)
             self._fleets[key] = np.array(forms, dtype=np.intp), paints
         return self._fleets[key]
@@ -96,17 +109,29 @@ class TrafficDrawing:
     def _form(self, name: str, length_m: float, width_m: float) -> int:
         size = tuple(np.array([length_m, width_m]).round(1).tolist())
         shape = vehicles.shape(name, size[0])
-        return self._forms.id(("vehicle", shape, *size), partial(vehicles.vehicle_parts, shape, *size))
+        return self._forms.id(
+            ("vehicle", shape, *size), partial(vehicles.vehicle_parts, shape, *size)
+        )
 
     def _robots(self, driven: Sequence[Driven], shots: Shots) -> list[_Placed]:
         """The robots, each with its base frame at its pose, leaning with the ground."""
-        forms, rows, parts = [], [], []
+        forms = []
+        rows = []
+        parts = []
         for k, (one, anchor) in enumerate(zip(driven, shots.anchors, strict=True)):
             shown = [2 * k] * one.body + [2 * k + 1] * one.shadows
             if one.robot is None or not shown:
                 continue
-            pose, (_, roll, pitch) = one.robot.pose, one.surface.lean(one.robot.pose, one.model.drive.span_m)
-            row = pose.x_m - anchor[0], pose.y_m - anchor[1], one.robot.z_m, roll, pitch, pose.heading_rad
+            pose = one.robot.pose
+            (_, roll, pitch) = one.surface.lean(one.robot.pose, one.model.drive.span_m)
+            row = (
+                pose.x_m - anchor[0],
+                pose.y_m - anchor[1],
+                one.robot.z_m,
+                roll,
+                pitch,
+                pose.heading_rad,
+            )
             form = self._forms.id(("robot", one.model.name), partial(_robot_parts, one.model))
             forms += len(shown) * [form]
             rows += len(shown) * [row]
@@ -114,7 +139,9 @@ class TrafficDrawing:
         if not rows:
             return []
         at = np.array(rows)
-        placed = turned_instances(at[:, :3], at[:, 3], at[:, 4], at[:, 5], (1.0, 1.0, 1.0), LABELS["robot"])
+        placed = turned_instances(
+            at[:, :3], at[:, 3], at[:, 4], at[:, 5], (1.0, 1.0, 1.0), LABELS["robot"]
+        )
         return [(np.array(forms), placed, np.array(parts))]
 
 

@@ -1,8 +1,9 @@
-"""Buildings of tiles as one static buffer: walls of brick or plaster, laid over them bays of windows and fronts.
+"""Buildings of tiles as one static buffer: walls of brick or plaster, laid over them bays of
+windows and fronts.
 
-What is drawn has the shape that physics.street.buildings gives it; which wall, which windows and which fronts a
-building has hangs on its name. Each bay of the upper storeys draws its own variant; a ground floor has one front all
-along, and doors at even distances."""
+What is drawn has the shape that physics.street.buildings gives it; which wall, which windows and
+which fronts a building has hangs on its name. Each bay of the upper storeys draws its own variant;
+a ground floor has one front all along, and doors at even distances."""
 
 from __future__ import annotations
 
@@ -18,26 +19,40 @@ from cosim.core.state import LABELS
 from physics.cameras.gl.corners import CornerRows, joined_corners
 from physics.cameras.gl.shading import FACADES_UNIT, FINISH_UNIT
 from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TileLayer, TileRows
+from physics.ground.mesh import Mesh
+from physics.ground.tiles import CURB_M
+from physics.street.building_style import NARROWEST_FRONT_M, face_of
 from physics.street.buildings import Building, facade_meshes
-from physics.street.fronts import NARROWEST_FRONT_M, face_of
 from physics.textures.facade_canvas import BAY_M, STOREY_M
 from physics.textures.facades import BAY_VARIANTS, WallStyle
-from physics.world.mesh import Mesh
-from physics.world.tiles import CURB_M
 
 _CORNER: Final = np.dtype(
     [
-        ("at", "f4", 3), ("normal", "u1", 4), ("colour", "u1", 4), ("spot", "f4", 4), ("kind", "u1", 4),
+        ("at", "f4", 3),
+        ("normal", "u1", 4),
+        ("colour", "u1", 4),
+        ("spot", "f4", 4),
+        ("kind", "u1", 4),
         ("fronts", "u1", 4),
     ]
-)  # fmt: skip
-"""normal's fourth: layer of the wall; colour's: 255 where it tints; spot: along and up in metres, in bays and storeys;
-kind: first layer of the upper storeys' windows, storeys, whether it looks to the street, chance;
-fronts: layers of the front and of its bays with doors, 16 times the bays from door to door and the first, chance."""
-_LAYOUT: Final = ("3f 4f1 4f1 4f 4f1 4f1", "in_at", "in_normal", "in_colour", "in_spot", "in_kind", "in_fronts")
+)
+"""normal's fourth: layer of the wall; colour's: 255 where it tints; spot: along and up in metres,
+in bays and storeys; kind: first layer of the upper storeys' windows, storeys, whether it looks to
+the street, chance; fronts: layers of the front and of its bays with doors, 16 times the bays from
+door to door and the first, chance."""
+_LAYOUT: Final = (
+    "3f 4f1 4f1 4f 4f1 4f1",
+    "in_at",
+    "in_normal",
+    "in_colour",
+    "in_spot",
+    "in_kind",
+    "in_fronts",
+)
 _LIT_SHARE: Final = 0.35
 _LAMPLIGHT: Final = "1.6e-3, 1.2e-3, 0.7e-3"
-"""Radiance of a lit window, in the units of physics.cameras.sky: some 60 candela per square metre."""
+"""Radiance of a lit window, in the units of physics.cameras.sky: some 60 candela per square
+metre."""
 
 _VERTEX: Final = """
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour; in vec4 in_spot; in vec4 in_kind; in vec4 in_fronts;
@@ -91,9 +106,13 @@ void main() {{
 """
 
 
-def wall_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: bool, night: bool) -> SurfaceShaders:
+def wall_shaders(
+    context: moderngl.Context, surfaces: Surfaces, shadows: bool, night: bool
+) -> SurfaceShaders:
     """The program of all buildings. night: whether some of their windows are lit."""
-    return SurfaceShaders(context, surfaces, _VERTEX, ("#define NIGHT\n" if night else "") + _FRAGMENT, shadows)
+    return SurfaceShaders(
+        context, surfaces, _VERTEX, ("#define NIGHT\n" if night else "") + _FRAGMENT, shadows
+    )
 
 
 def wall_layer(context: moderngl.Context, shaders: SurfaceShaders) -> TileLayer:
@@ -105,11 +124,17 @@ def wall_rows(
     surfaces: Surfaces, buildings: Sequence[Building], styles: Sequence[WallStyle], middle: Floats
 ) -> TileRows | None:
     """The buildings of one tile, each of a style. middle: (2,) world metres of the tile's."""
-    parts = [part for b, style in zip(buildings, styles, strict=True) for part in _parts(b, style, surfaces, middle)]
+    parts = [
+        part
+        for b, style in zip(buildings, styles, strict=True)
+        for part in _parts(b, style, surfaces, middle)
+    ]
     return joined_corners(parts) if parts else None
 
 
-def _parts(building: Building, style: WallStyle, surfaces: Surfaces, middle: Floats) -> list[tuple[Mesh, CornerRows]]:
+def _parts(
+    building: Building, style: WallStyle, surfaces: Surfaces, middle: Floats
+) -> list[tuple[Mesh, CornerRows]]:
     """A building's walls and roof, with their rows."""
     face = face_of(building, style)
     layers, bays = surfaces.surfaces, surfaces.facades
@@ -134,7 +159,9 @@ def _parts(building: Building, style: WallStyle, surfaces: Surfaces, middle: Flo
         rows["spot"], storeys = _spots(mesh, flat, building.floor_m + CURB_M)
         # A house of the map may stand on a corner, or in a yard: all its walls have doors.
         fronted = (mesh.normals @ street > 0.9) | (building.outline is not None)
-        rows["kind"] = np.stack([np.full(len(rows), upper), storeys, fronted, np.full(len(rows), chance[0])], 1)
+        rows["kind"] = np.stack(
+            [np.full(len(rows), upper), storeys, fronted, np.full(len(rows), chance[0])], 1
+        )
         rows["fronts"] = *fronts, doors, chance[1]
         found.append((mesh, rows))
     return found
@@ -143,10 +170,13 @@ def _parts(building: Building, style: WallStyle, surfaces: Surfaces, middle: Flo
 def _spots(mesh: Mesh, flat: NDArray[np.bool_], floor_m: float) -> tuple[Floats, NDArray[np.int64]]:
     """(V, 4) along and up each wall in metres, in bays and storeys; (V,) storeys with windows, none
     below the floor."""
-    spots, storeys = np.zeros((len(flat), 4)), np.zeros(len(flat), dtype=np.int64)
+    spots = np.zeros((len(flat), 4))
+    storeys = np.zeros(len(flat), dtype=np.int64)
     spots[flat, :2] = mesh.vertices[flat, :2]
     spots[flat, 3] = -1.0
-    walls = np.flatnonzero(~flat).reshape(-1, 4)  # upright faces are quads: four corners after each other
+    walls = np.flatnonzero(~flat).reshape(
+        -1, 4
+    )  # upright faces are quads: four corners after each other
     for quad in walls:
         normal = mesh.normals[quad[0]]
         along = mesh.vertices[quad] @ np.array([-normal[1], normal[0], 0.0])
@@ -155,5 +185,9 @@ def _spots(mesh: Mesh, flat: NDArray[np.bool_], floor_m: float) -> tuple[Floats,
         width = along.max()
         count = max(round(width / BAY_M), 1)
         spots[quad] = np.stack([along, up, along / width * count, up / STOREY_M], axis=1)
-        storeys[quad] = max(int((up.max() + 0.3) / STOREY_M), 1) if width >= NARROWEST_FRONT_M and up.max() > 0.0 else 0
+        storeys[quad] = (
+            max(int((up.max() + 0.3) / STOREY_M), 1)
+            if width >= NARROWEST_FRONT_M and up.max() > 0.0
+            else 0
+        )
     return spots, storeys

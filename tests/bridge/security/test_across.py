@@ -1,4 +1,5 @@
-"""A coordinator, two workers and a viewer on hosts of their own, TLS between them, and a link that goes down."""
+"""A coordinator, two workers and a viewer on hosts of their own, TLS between them, and a link that
+goes down."""
 
 from __future__ import annotations
 
@@ -6,23 +7,30 @@ from pathlib import Path
 
 import pytest
 
-from tests.bridge.security.across import prepare, run_across, watched, wrong_with
-from tests.bridge.security.namespaces import NotPermitted, network
+from tests.support.across import prepare, run_across, watched, wrong_with
+from tests.support.namespaces import NotPermitted, network
 
 pytestmark = pytest.mark.engine
 
 
-def test_a_run_across_hosts_loses_nothing_when_a_link_goes_down(tmp_path: Path, request: pytest.FixtureRequest) -> None:
-    """With --whole, as it waits for links: every episode has one result though a worker's link is down for 6 s in the
-    middle of one; meanwhile a viewer on a host of its own sees that there is a run, and can finish none of its jobs."""
+def test_a_run_across_hosts_loses_nothing_when_a_link_goes_down(
+    tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    """With --whole, as it waits for links: every episode has one result though a worker's link is
+    down for 6 s in the middle of one; meanwhile a viewer on a host of its own sees that there is a
+    run, and can finish none of its jobs."""
     if not request.config.getoption("--whole"):
-        pytest.skip("with --whole, or as a command: python -m tests.bridge.security.across")
+        pytest.skip("with --whole, or as a command: python -m tests.support.across")
     seen: list[str] = []
     try:
         with network("hub", "one", "two", "viewer") as net:
             prepare(tmp_path, net, 4, 1.0)
             code = run_across(
-                tmp_path, net, ["link of worker one down"], 1, lambda _: seen.append(watched(tmp_path, net))
+                tmp_path,
+                net,
+                ["link of worker one down"],
+                1,
+                lambda _: seen.append(watched(tmp_path, net)),
             )
     except NotPermitted as error:
         pytest.skip(str(error))

@@ -1,4 +1,5 @@
-"""Certificates: made once, kept to oneself, shown with their end, and refused in words when they do not fit."""
+"""Certificates: made once, kept to oneself, shown with their end, and refused in words when they do
+not fit."""
 
 from __future__ import annotations
 
@@ -16,8 +17,8 @@ from bridge.security.identity import checked_identity, identity_in
 from bridge.session import open_session
 from cosim.core.errors import AccessError, EngineError, UsageError
 from cosim.spec.connection import Connection, Role
-from tests.bridge.security.plain import free_port, plain_zenoh
 from tests.conftest import Cosim
+from tests.support.plain import free_port, plain_zenoh
 
 NOW = datetime.now(UTC)
 
@@ -38,12 +39,19 @@ def end_of(folder: Path, role: Role) -> Connection:
 
 
 def test_the_command_makes_shows_and_never_overwrites(tmp_path: Path, cosim: Cosim) -> None:
-    """Keys are their owner's alone; what is there stays until --renew, which keeps the hosts; the end is shown."""
+    """Keys are their owner's alone; what is there stays until --renew, which keeps the hosts; the
+    end is shown."""
     folder = tmp_path / "certs"
-    first = cosim("certs", "init", str(folder), "--host", "hub.lan", "--host", "10.0.0.7", "--days", "90")
+    first = cosim(
+        "certs", "init", str(folder), "--host", "hub.lan", "--host", "10.0.0.7", "--days", "90"
+    )
     assert first.returncode == 0 and "reached by hub.lan, 10.0.0.7" in first.stdout, first.stderr
     assert cosim("certs", "role", str(folder), "viewer").returncode == 0
-    for key in (folder / "ca.key", folder / "coordinator" / "key.pem", folder / "viewer" / "key.pem"):
+    for key in (
+        folder / "ca.key",
+        folder / "coordinator" / "key.pem",
+        folder / "viewer" / "key.pem",
+    ):
         assert stat.S_IMODE(key.stat().st_mode) == 0o600
     before = (folder / "coordinator" / "cert.pem").read_bytes()
     for words, said in {
@@ -62,12 +70,22 @@ def test_the_command_makes_shows_and_never_overwrites(tmp_path: Path, cosim: Cos
     assert cosim("certs", "role", str(folder), "coordinator", "--renew").returncode == 0
     assert (folder / "coordinator" / "cert.pem").read_bytes() != before
     shown = cosim("certs", "show", str(folder)).stdout
-    assert "hub.lan, 10.0.0.7" in shown and "watch" in shown and f"{NOW + timedelta(days=365):%Y-%m}" in shown
-    assert sorted(path.name for path in folder.iterdir()) == ["ca.key", "ca.pem", "coordinator", "viewer"]
+    assert (
+        "hub.lan, 10.0.0.7" in shown
+        and "watch" in shown
+        and f"{NOW + timedelta(days=365):%Y-%m}" in shown
+    )
+    assert sorted(path.name for path in folder.iterdir()) == [
+        "ca.key",
+        "ca.pem",
+        "coordinator",
+        "viewer",
+    ]
 
 
 def test_files_that_do_not_fit_are_told_apart(made: Path, tmp_path: Path) -> None:
-    """A missing file, damage, another's key, another authority, everybody's key, another role: each by its name."""
+    """A missing file, damage, another's key, another authority, everybody's key, another role: each
+    by its name."""
     other = tmp_path / "other"
     make_authority(other, ["localhost"], 365)
     copies = iter(range(100))
@@ -106,35 +124,47 @@ def test_files_that_do_not_fit_are_told_apart(made: Path, tmp_path: Path) -> Non
 
 
 def test_the_end_of_a_certificate_is_said_before_it_comes(made: Path) -> None:
-    """Nothing is said long before; within 30 days the day and the remedy; afterwards, and too early, it is refused."""
+    """Nothing is said long before; within 30 days the day and the remedy; afterwards, and too
+    early, it is refused."""
     for role in ("coordinator", "worker"):
         end = end_of(made, role)  # type: ignore[arg-type]
         assert checked_identity(end, NOW) == ""
-        assert "expires on" in (said := checked_identity(end, NOW + timedelta(days=350))) and "--renew" in said
+        assert (
+            "expires on" in (said := checked_identity(end, NOW + timedelta(days=350)))
+            and "--renew" in said
+        )
         with pytest.raises(AccessError, match=r"has expired on .*--renew"):
             checked_identity(end, NOW + timedelta(days=366))
         with pytest.raises(AccessError, match="is this machine's clock right"):
             checked_identity(end, NOW - timedelta(days=3))
-    assert checked_identity(end_of(made, "worker"), NOW - timedelta(hours=20)) == "", "a clock that is behind"
+    assert checked_identity(end_of(made, "worker"), NOW - timedelta(hours=20)) == "", (
+        "a clock that is behind"
+    )
 
 
 @pytest.mark.engine
 def test_a_hub_that_does_not_fit_is_refused_in_words(
     made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Another authority there or here, another name, an expired hub, no TLS, nobody there; and one that fits."""
+    """Another authority there or here, another name, an expired hub, no TLS, nobody there; and one
+    that fits."""
     other = tmp_path / "other"
     make_authority(other, ["localhost"], 365)
     issue(other, "worker", [], 365)
     trusting = tmp_path / "trusting"  # takes the hub for what it is, and is not taken itself
     shutil.copytree(other / "worker", trusting)
-    (trusting / "ca.pem").write_bytes((other / "ca.pem").read_bytes() + (made / "ca.pem").read_bytes())
+    (trusting / "ca.pem").write_bytes(
+        (other / "ca.pem").read_bytes() + (made / "ca.pem").read_bytes()
+    )
     old = tmp_path / "old"
     make_authority(old, ["localhost"], 5, NOW - timedelta(days=10))
     issue(old, "worker", [], 365)
 
     def tried(at: str, folder: Path) -> str:
-        with pytest.raises(AccessError) as error, open_session(Connection(role="worker", connect=at, tls=str(folder))):
+        with (
+            pytest.raises(AccessError) as error,
+            open_session(Connection(role="worker", connect=at, tls=str(folder))),
+        ):
             pass
         return str(error.value)
 
@@ -142,14 +172,21 @@ def test_a_hub_that_does_not_fit_is_refused_in_words(
     listening = Connection(role="coordinator", listen=at, tls=str(made / "coordinator"))
     with open_session(listening) as session:
         session.serve("cosim/r/jobs/claim", bytes.upper)
-        with open_session(Connection(role="worker", connect=at, tls=str(made / "worker"))) as worker:
+        with open_session(
+            Connection(role="worker", connect=at, tls=str(made / "worker"))
+        ) as worker:
             assert worker.ask("cosim/r/jobs/claim", b"mine", timeout_s=60.0) == b"MINE"
-        monkeypatch.setattr(settings, "CONNECTS_WITHIN_S", 0.1)  # what is refused is so however long it is tried
+        monkeypatch.setattr(
+            settings, "CONNECTS_WITHIN_S", 0.1
+        )  # what is refused is so however long it is tried
         assert (
-            "the certificate of tls/localhost" in (said := tried(at, other / "worker")) and "another authority" in said
+            "the certificate of tls/localhost" in (said := tried(at, other / "worker"))
+            and "another authority" in said
         )
         assert "refused us" in (said := tried(at, trusting)) and "than the one there trusts" in said
-        assert "is not for the address 127.0.0.1" in tried(at.replace("localhost", "127.0.0.1"), made / "worker")
+        assert "is not for the address 127.0.0.1" in tried(
+            at.replace("localhost", "127.0.0.1"), made / "worker"
+        )
     plain = f"tls/localhost:{free_port()}".replace("tls", "tcp")
     with (
         open_session(Connection(role="coordinator", listen=plain)),
@@ -157,21 +194,36 @@ def test_a_hub_that_does_not_fit_is_refused_in_words(
         pytest.raises(EngineError, match="by the same protocol"),
     ):
         patch.setattr(refusal, "_PATIENCE_S", 0.2)  # who speaks no TLS never answers
-        open_session(Connection(role="worker", connect=plain.replace("tcp", "tls"), tls=str(made / "worker")))
-    expired = Connection(role="coordinator", listen=f"tls/localhost:{free_port()}", tls=str(old / "coordinator"))
+        open_session(
+            Connection(role="worker", connect=plain.replace("tcp", "tls"), tls=str(made / "worker"))
+        )
+    expired = Connection(
+        role="coordinator", listen=f"tls/localhost:{free_port()}", tls=str(old / "coordinator")
+    )
     with pytest.raises(AccessError, match="has expired on"):
         open_session(expired)
-    monkeypatch.setattr("bridge.session.notices_of", lambda _: [])  # one that listened before its certificate's end
-    (trusting / "ca.pem").write_bytes((other / "ca.pem").read_bytes() + (old / "ca.pem").read_bytes())
+    monkeypatch.setattr(
+        "bridge.session.notices_of", lambda _: []
+    )  # one that listened before its certificate's end
+    (trusting / "ca.pem").write_bytes(
+        (other / "ca.pem").read_bytes() + (old / "ca.pem").read_bytes()
+    )
     with open_session(expired):
         assert "has expired" in tried(expired.listen, trusting)
     with pytest.raises(EngineError, match="no hub answers at"):
-        open_session(Connection(role="worker", connect=f"tls/localhost:{free_port()}", tls=str(made / "worker")))
+        open_session(
+            Connection(
+                role="worker", connect=f"tls/localhost:{free_port()}", tls=str(made / "worker")
+            )
+        )
 
 
 @pytest.mark.engine
-def test_plain_zenoh_without_a_certificate_of_ours_does_not_come_in(made: Path, tmp_path: Path) -> None:
-    """None, one of another authority, one that signed itself a worker: no link; the same client with ours: a link."""
+def test_plain_zenoh_without_a_certificate_of_ours_does_not_come_in(
+    made: Path, tmp_path: Path
+) -> None:
+    """None, one of another authority, one that signed itself a worker: no link; the same client
+    with ours: a link."""
     other = tmp_path / "other"
     make_authority(other, ["localhost"], 365)
     issue(other, "worker", [], 365)
@@ -183,7 +235,10 @@ def test_plain_zenoh_without_a_certificate_of_ours_does_not_come_in(made: Path, 
         for folder in (other, tmp_path / "none"):
             with pytest.raises(zenoh.ZError), plain_zenoh(at, folder, "worker", wait_ms=400):
                 pass
-        with pytest.raises(zenoh.ZError), plain_zenoh(at.replace("tls", "tcp"), None, "", wait_ms=400):
+        with (
+            pytest.raises(zenoh.ZError),
+            plain_zenoh(at.replace("tls", "tcp"), None, "", wait_ms=400),
+        ):
             pass
         with plain_zenoh(at, made, "worker"):
             pass

@@ -1,4 +1,5 @@
-"""Every command that listens or connects: to its own machine alone, and what else it needs is said before it begins."""
+"""Every command that listens or connects: to its own machine alone, and what else it needs is said
+before it begins."""
 
 from __future__ import annotations
 
@@ -8,15 +9,21 @@ import pytest
 
 from bridge.session import open_session
 from cosim.spec.connection import Connection
-from tests.bridge.security.plain import free_port
 from tests.conftest import Cosim
+from tests.support.plain import free_port
 
 DOORS = {
     "run --live": ("run", "no-such-suite", "--live"),
     "run --director": ("run", "no-such-suite", "--director"),
     "coordinator": ("coordinator", "no-such-suite", "--listen"),
     "run --policy-at": ("run", "no-such-suite", "--policy", "zenoh:mine", "--policy-at"),
-    "coordinator --policy-at": ("coordinator", "no-such-suite", "--policy", "zenoh:mine", "--policy-at"),
+    "coordinator --policy-at": (
+        "coordinator",
+        "no-such-suite",
+        "--policy",
+        "zenoh:mine",
+        "--policy-at",
+    ),
     "serve": ("serve", "stop", "--listen"),
     "worker": ("worker", "--connect"),
     "status": ("status", "--connect"),
@@ -28,14 +35,27 @@ DOORS = {
 
 @pytest.mark.parametrize("door", DOORS)
 def test_no_door_is_open_to_others_in_silence(door: str, cosim: Cosim, tmp_path: Path) -> None:
-    """Beyond this machine: without TLS, with TLS and no files, with files and no TLS, with files that are not there."""
-    words, beyond, guarded = DOORS[door], "tcp/10.0.0.7:7447", "tls/10.0.0.7:7447"
+    """Beyond this machine: without TLS, with TLS and no files, with files and no TLS, with files
+    that are not there."""
+    words = DOORS[door]
+    beyond = "tcp/10.0.0.7:7447"
+    guarded = "tls/10.0.0.7:7447"
     files = str(tmp_path / "none")
     for more, said in {
         (beyond,): f"Use {guarded} with --tls FOLDER (`cosim certs` makes it), or say --insecure",
-        (guarded,): f"{guarded} needs --tls FOLDER, which holds ca.pem, cert.pem and key.pem of the role",
-        ("tcp/127.0.0.1:7447", "--tls", files): "--tls goes with tls/ADDRESS:PORT, not with tcp/127.0.0.1:7447",
-        (guarded, "--tls", files): f"{files}/cert.pem: cannot be read: No such file or directory: `cosim certs` makes",
+        (
+            guarded,
+        ): f"{guarded} needs --tls FOLDER, which holds ca.pem, cert.pem and key.pem of the role",
+        (
+            "tcp/127.0.0.1:7447",
+            "--tls",
+            files,
+        ): "--tls goes with tls/ADDRESS:PORT, not with tcp/127.0.0.1:7447",
+        (
+            guarded,
+            "--tls",
+            files,
+        ): f"{files}/cert.pem: cannot be read: No such file or directory: `cosim certs` makes",
         (guarded, "--tls", files, "--insecure"): "--tls guards and --insecure does not",
     }.items():
         refused = cosim(*words, *more)
@@ -45,11 +65,14 @@ def test_no_door_is_open_to_others_in_silence(door: str, cosim: Cosim, tmp_path:
 @pytest.mark.engine
 def test_insecure_says_in_one_line_what_it_means(cosim: Cosim) -> None:
     """On standard error, of who listens and of who connects."""
-    port, said = free_port(), list[str]()
+    port = free_port()
+    said = list[str]()
     open_to_all = Connection(role="coordinator", listen=f"tcp/0.0.0.0:{port}", insecure=True)
     with open_session(open_to_all, said.append):
         (line,) = said
-        assert line.startswith(f"--insecure: whoever can reach tcp/0.0.0.0:{port} may watch, inject pedestrians, take")
+        assert line.startswith(
+            f"--insecure: whoever can reach tcp/0.0.0.0:{port} may watch, inject pedestrians, take"
+        )
         at = f"tcp/127.1:{port}"
         tried = cosim("listen", "--connect", at, "--insecure")
     (line,) = [line for line in tried.stderr.splitlines() if line.startswith("--insecure: ")]
@@ -61,4 +84,7 @@ def test_guards_without_a_door_are_refused(cosim: Cosim, tmp_path: Path) -> None
     """--tls and --insecure of a run that nobody can reach."""
     for more in (("--tls", str(tmp_path)), ("--insecure",)):
         refused = cosim("run", "no-such-suite", *more)
-        assert refused.returncode == 2 and f"{more[0]} goes with --live, --director or --policy-at" in refused.stderr
+        assert (
+            refused.returncode == 2
+            and f"{more[0]} goes with --live, --director or --policy-at" in refused.stderr
+        )

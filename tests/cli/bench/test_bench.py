@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from scenarios.bench.figures import Figure
-from scenarios.bench.measurements import take_rounds
+from scenarios.tools.bench.figures import Figure
+from scenarios.tools.bench.measurements import take_rounds
 from tests.conftest import Cosim
 
 TAKE = """
@@ -33,10 +33,13 @@ def checkout(folder: Path, value: float) -> Path:
 
 
 def test_checkouts_take_turns(tmp_path: Path) -> None:
-    """Each measurement is taken by one checkout and then by the other, and who begins changes from round to round."""
+    """Each measurement is taken by one checkout and then by the other, and who begins changes from
+    round to round."""
     both = [checkout(tmp_path / "one", 3.0), checkout(tmp_path / "two", 6.0)]
     one, two = take_rounds(["driving"], both, 2, lambda _: None)
-    assert (tmp_path / "log").read_text().split("\n")[:-1] == [f"{x} driving" for x in ("one", "two", "two", "one")]
+    assert (tmp_path / "log").read_text().split("\n")[:-1] == [
+        f"{x} driving" for x in ("one", "two", "two", "one")
+    ]
     assert one == {"driving, ms": [Figure("driving, ms", 3.0, 2.0, "an engine")] * 2}
     assert [figure.ratio for figure in two["driving, ms"]] == [3.0, 3.0]
 
@@ -46,8 +49,9 @@ def test_a_figure_stands_beside_that_of_another_checkout(tmp_path: Path, cosim: 
     """--compare shows both medians and their ratio for what both take."""
     other = checkout(tmp_path / "other", 1e6)
     (other / "scenarios" / "bench" / "take.py").write_text(
-        "import json, sys\nfrom pathlib import Path\nfigures = {'shortest walk, ms': 1e9, 'elsewhere': 1.0}\n"
-        "Path(sys.argv[3]).write_text(json.dumps([{'name': k, 'value': v} for k, v in figures.items()]))"
+        "import json, sys\nfrom pathlib import Path\nfigures = {'shortest walk, ms': 1e9, "
+        "'elsewhere': 1.0}\nPath(sys.argv[3]).write_text(json.dumps([{'name': k, 'value': v} for "
+        "k, v in figures.items()]))"
     )
     said = cosim("bench", "--only", "places", "--rounds", "1", "--compare", str(other))
     assert said.returncode == 0, said.stderr
@@ -57,8 +61,17 @@ def test_a_figure_stands_beside_that_of_another_checkout(tmp_path: Path, cosim: 
 
 
 def test_what_cannot_be_measured_is_refused(tmp_path: Path, cosim: Cosim) -> None:
-    """A measurement that is none, and a folder that is no checkout, are named before anything is measured."""
+    """A measurement that is none, and a folder that is no checkout, are named before anything is
+    measured."""
     said = cosim("bench", "--only", "drivin")
-    assert said.returncode == 2 and "Did you mean driving?" in said.stderr and "street 50" in said.stderr
+    assert (
+        said.returncode == 2
+        and "Did you mean driving?" in said.stderr
+        and "street 50" in said.stderr
+    )
     said = cosim("bench", "--compare", str(tmp_path))
-    assert said.returncode == 2 and str(tmp_path) in said.stderr and "scenarios/bench/take.py" in said.stderr
+    assert (
+        said.returncode == 2
+        and str(tmp_path) in said.stderr
+        and "scenarios/tools/bench/take.py" in said.stderr
+    )

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from scenarios.bench import cameras as bench_cameras
-from scenarios.bench.cameras import Drawing, time_cameras, whole_frame
+from scenarios.tools.bench import cameras as bench_cameras
+from scenarios.tools.bench.cameras import Drawing, time_cameras, whole_frame
 from tests.conftest import Cosim
 
 pytestmark = pytest.mark.engine
@@ -19,7 +19,8 @@ pytestmark = pytest.mark.engine
 def test_what_cannot_be_drawn_is_told_with_its_reason(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cosim: Cosim
 ) -> None:
-    """No OpenGL, a package that is missing, a process that dies: each figure has its words; others are taken."""
+    """No OpenGL, a package that is missing, a process that dies: each figure has its words; others
+    are taken."""
     monkeypatch.setenv("__EGL_VENDOR_LIBRARY_DIRS", str(tmp_path))
     figures = (
         Drawing("by gl", partial(whole_frame, "gl", 3, 2), 200.0),
@@ -40,6 +41,11 @@ def test_what_cannot_be_drawn_is_told_with_its_reason(
     said = cosim("bench", "camera", "--rounds", "1")
     assert said.returncode == 0, said.stderr
     told = " ".join(said.stdout.split())
-    assert "by a package cannot be drawn here: ModuleNotFoundError: No module named 'nowhere'" in told
-    assert "by gl; by gl again cannot be drawn here: the gl camera" in told and told.count("apt-get") == 1
+    assert (
+        "by a package cannot be drawn here: ModuleNotFoundError: No module named 'nowhere'" in told
+    )
+    assert (
+        "by gl; by gl again cannot be drawn here: the gl camera" in told
+        and told.count("apt-get") == 1
+    )
     assert "`cosim doctor`" in told and "see below" in told

@@ -11,14 +11,14 @@ import trimesh
 
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import Barrier, City, Scenario, Suite, write_suite
+from physics.ground.materials import PAVINGS, SEEN_AS
+from physics.ground.tiles import SURFACES, keys_in, kind_of, square
+from physics.street.gltf import as_gltf
+from physics.street.mesh_surface import MeshSurface
+from physics.street.street_surface import StreetSurface
 from physics.textures.layers import encoded, linear
-from physics.world.gltf import as_gltf
-from physics.world.materials import PAVINGS, SEEN_AS
-from physics.world.mesh_surface import MeshSurface
-from physics.world.street_surface import StreetSurface
-from physics.world.tiles import SURFACES, keys_in, kind_of, square
 from tests.conftest import Cosim
-from tests.tiny_street import tiny_map
+from tests.support.tiny_street import tiny_map
 
 FENCE = Barrier(x_m=-3.0, y_m=5.0, heading_rad=0.0, length_m=3.0, strip="nw", end=1)
 KEYS = keys_in(shapely.box(-40.0, -6.0, 40.0, 6.0))
@@ -38,23 +38,29 @@ def file(street: StreetSurface, tmp_path_factory: pytest.TempPathFactory) -> Pat
 
 
 def test_a_street_is_read_back_as_it_is(street: StreetSurface, file: Path) -> None:
-    """y is up, every triangle of the ground is there in its place and colour, and nodes are named by what they are."""
+    """y is up, every triangle of the ground is there in its place and colour, and nodes are named
+    by what they are."""
     scene = trimesh.load_scene(file)
     x0, y0, x1, y1 = np.array([square(key) for key in KEYS]).T
     ground = [patch for key in KEYS for patch in street.chunk(key).ground]
     names = {patch.name for patch in ground}
     assert len(KEYS) == 4 and {kind_of(name) for name in names} == set(SURFACES)
     for name in names:
-        mesh, at = scene.geometry[scene.graph[name][1]], scene.graph[name][0]
+        mesh = scene.geometry[scene.graph[name][1]]
+        at = scene.graph[name][0]
         found = trimesh.transform_points(mesh.vertices, at)
         assert (found.min(axis=0) >= (x0.min() - 1e-3, -0.01, -y1.max() - 1e-3)).all()
         assert (found.max(axis=0) <= (x1.max() + 1e-3, 0.13, -y0.min() + 1e-3)).all()
         own = [patch.mesh for patch in ground if patch.name == name]
         assert len(mesh.faces) == sum(map(len, own))
-        assert mesh.area == pytest.approx(sum(trimesh.Trimesh(m.vertices, m.triangles).area for m in own), rel=1e-4)
+        assert mesh.area == pytest.approx(
+            sum(trimesh.Trimesh(m.vertices, m.triangles).area for m in own), rel=1e-4
+        )
         if name in PAVINGS:
             shown = np.array(mesh.visual.material.baseColorFactor[:3]) / 255.0
-            assert shown == pytest.approx(linear(SEEN_AS.get(name, (name, PAVINGS[name]))[1]), abs=0.003)
+            assert shown == pytest.approx(
+                linear(SEEN_AS.get(name, (name, PAVINGS[name]))[1]), abs=0.003
+            )
     fence = scene.geometry["barrier:red"]
     assert fence.bounds[:, 1] == pytest.approx([0.57, 1.12], abs=0.02)
     assert fence.bounds.mean(axis=0)[[0, 2]] == pytest.approx([FENCE.x_m, -FENCE.y_m], abs=0.1)
@@ -63,7 +69,8 @@ def test_a_street_is_read_back_as_it_is(street: StreetSurface, file: Path) -> No
 
 
 def test_nodes_stand_below_the_group_of_their_kind(street: StreetSurface, file: Path) -> None:
-    """Six groups below the root; in them every kind of prop that stands there, walls, windows and fences."""
+    """Six groups below the root; in them every kind of prop that stands there, walls, windows and
+    fences."""
     scene = trimesh.load_scene(file)
     parents = scene.graph.transforms.parents
     of_group: dict[str, set[str]] = {}
@@ -78,12 +85,15 @@ def test_nodes_stand_below_the_group_of_their_kind(street: StreetSurface, file: 
 
 
 def test_a_written_street_is_a_surface_again(street: StreetSurface, file: Path) -> None:
-    """Read back it carries at the same heights, with the same labels and frictions, and its houses are not stood on."""
+    """Read back it carries at the same heights, with the same labels and frictions, and its houses
+    are not stood on."""
     again = MeshSurface.load(file)
     rng = np.random.default_rng(1)
     xy = rng.uniform((-40.0, -9.0), (40.0, 9.0), (400, 2))
     away = np.abs(again.heights(xy) - street.heights(xy))
-    assert np.quantile(away, 0.97) < 0.005  # what lies on the ground is 3 mm thick; on a curb's edge both are right
+    assert (
+        np.quantile(away, 0.97) < 0.005
+    )  # what lies on the ground is 3 mm thick; on a curb's edge both are right
     for key in KEYS:
         told = {patch.name: patch[2:4] for patch in again.chunk(key).ground}
         for patch in street.chunk(key).ground:
@@ -94,9 +104,10 @@ def test_a_written_street_is_a_surface_again(street: StreetSurface, file: Path) 
 
 @pytest.mark.engine
 def test_the_command_writes_the_tiles_along_a_route(tmp_path: Path, cosim: Cosim) -> None:
-    """A scenario of a suite's file is exported: its route lies on the ground from end to end, trees stand there."""
-    from scenarios.builders.long_horizon import build_long_horizon
-    from scenarios.execution.places import place
+    """A scenario of a suite's file is exported: its route lies on the ground from end to end, trees
+    stand there."""
+    from scenarios.places.nets import place
+    from scenarios.suites.long_horizon import build_long_horizon
 
     city = City(seed=1, size_m=500.0)
     street_map = place(city)[1]
@@ -104,18 +115,29 @@ def test_the_command_writes_the_tiles_along_a_route(tmp_path: Path, cosim: Cosim
     write_suite(Suite(name="tiny", version="1", scenarios=(scenario,)), tmp_path / "tiny.json")
     said = cosim("export", "t-0", "street.glb", "--suite", "tiny.json", cwd=tmp_path)
     assert said.returncode == 0, said.stderr
-    assert "building tiles ..." in said.stderr and said.stdout.startswith("Street: street.glb (t-0, ")
-    again, route = MeshSurface.load(tmp_path / "street.glb"), np.array(scenario.route)
+    assert "building tiles ..." in said.stderr and said.stdout.startswith(
+        "Street: street.glb (t-0, "
+    )
+    again = MeshSurface.load(tmp_path / "street.glb")
+    route = np.array(scenario.route)
     assert np.abs(again.heights(route) - StreetSurface(street_map, 1).heights(route)).max() < 0.01
     parents = trimesh.load_scene(tmp_path / "street.glb").graph.transforms.parents
-    assert {parents[name] for name in ("prop:tree", "prop:tree/1")} == {"trees"} and len(scenario.route) > 50
+    assert {parents[name] for name in ("prop:tree", "prop:tree/1")} == {"trees"} and len(
+        scenario.route
+    ) > 50
 
 
-def test_what_cannot_be_exported_is_told_before_anything_is_built(tmp_path: Path, cosim: Cosim) -> None:
-    """An unknown scenario, a wrong ending and a folder that is not there: what was asked for, and what is valid."""
+def test_what_cannot_be_exported_is_told_before_anything_is_built(
+    tmp_path: Path, cosim: Cosim
+) -> None:
+    """An unknown scenario, a wrong ending and a folder that is not there: what was asked for, and
+    what is valid."""
     asked = {
         ("lh-011-0", "a.glb"): (2, "among them lh-011-00, "),
-        ("lh-011-00", "a.obj"): (2, "a.obj: cannot be written as glTF; use a name that ends in .glb"),
+        ("lh-011-00", "a.obj"): (
+            2,
+            "a.obj: cannot be written as glTF; use a name that ends in .glb",
+        ),
         ("lh-011-00", "no/a.glb"): (3, "no/a.glb: cannot be written: no folder no"),
     }
     for words, (code, message) in asked.items():

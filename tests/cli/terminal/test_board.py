@@ -1,4 +1,5 @@
-"""The progress display of a run: what is left is judged by the way, and it fits a terminal of 80 columns."""
+"""The progress display of a run: what is left is judged by the way, and it fits a terminal of 80
+columns."""
 
 from __future__ import annotations
 
@@ -8,10 +9,10 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from cosim.cli.terminal.board import SETUP_M, Board, Left
+from cosim.cli.progress import SETUP_M, Board, Left
 from cosim.core.telling import duration
-from scenarios.catalog import load_suite
-from scenarios.execution.messages import Compares, Done, Progress
+from scenarios.ipc.messages import Compares, Done, Progress
+from scenarios.suites.catalog import load_suite
 
 LONG = load_suite("long-horizon").scenarios
 SHORT = load_suite("reactive").scenarios
@@ -27,7 +28,8 @@ class Clock:
 
 
 def test_what_is_left_is_judged_by_the_way_not_by_the_count() -> None:
-    """After 100 m of 100 + 300 m in 40 s about 100 s are left, not 40; before anything is done nothing is said."""
+    """After 100 m of 100 + 300 m in 40 s about 100 s are left, not 40; before anything is done
+    nothing is said."""
     left = Left({"a": 100.0, "b": 300.0})
     assert left.seconds(3.0) is None
     left.at("a", 1.0)
@@ -48,14 +50,18 @@ def test_nothing_is_left_of_a_run_that_is_done() -> None:
         assert left.share == 1.0 and left.seconds(1e6) == 0.0
 
 
-def board_of(scenarios: tuple, done: tuple[str, ...] = (), **options: object) -> tuple[Board, Clock, io.StringIO]:
-    clock, said = Clock(), io.StringIO()
+def board_of(
+    scenarios: tuple, done: tuple[str, ...] = (), **options: object
+) -> tuple[Board, Clock, io.StringIO]:
+    clock = Clock()
+    said = io.StringIO()
     console = Console(file=said, width=80)
     return Board(scenarios, set(done), console=console, clock=clock, **options), clock, said  # type: ignore[arg-type]
 
 
 def test_a_log_says_how_many_are_done_and_how_long_the_rest_takes() -> None:
-    """A line for each episode that ends: its status, how many of how many, about how long it still takes."""
+    """A line for each episode that ends: its status, how many of how many, about how long it still
+    takes."""
     board, clock, said = board_of(LONG[:3], done=(LONG[0].id,))
     clock.now_s = 40.0
     board.tell(Done(LONG[1].id, "done"))
@@ -68,17 +74,21 @@ def test_a_log_says_how_many_are_done_and_how_long_the_rest_takes() -> None:
 
 
 def test_an_episode_that_stands_still_comes_nearer_to_its_end() -> None:
-    """A robot that gets nowhere uses up its time limit: the share is that of the time, and what is left is known."""
+    """A robot that gets nowhere uses up its time limit: the share is that of the time, and what is
+    left is known."""
     one = msgspec.structs.replace(SHORT[0], id="stuck")
     board, clock, _ = board_of((one,))
     clock.now_s = 30.0
     board.tell(Progress(one.id, one.time_limit_s / 2, 0.0, 0))
     length_m = one.route_line.length_m
-    assert board.left.seconds(30.0) == pytest.approx(30.0 * 0.5 * length_m / (0.5 * length_m + SETUP_M))
+    assert board.left.seconds(30.0) == pytest.approx(
+        30.0 * 0.5 * length_m / (0.5 * length_m + SETUP_M)
+    )
 
 
 def test_a_comparison_is_part_of_its_episode() -> None:
-    """With --counterfactual an episode at its goal is not over yet: the street without the robot is still to come."""
+    """With --counterfactual an episode at its goal is not over yet: the street without the robot is
+    still to come."""
     board, clock, _ = board_of(LONG[:1], compared=True)
     clock.now_s = 70.0
     board.tell(Progress(LONG[0].id, 100.0, LONG[0].route_line.length_m, 0))
@@ -89,12 +99,14 @@ def test_a_comparison_is_part_of_its_episode() -> None:
 
 
 def test_a_run_that_is_held_to_real_time_is_judged_by_that() -> None:
-    """At --pace 1 starting an episode takes little of it: after 2 % of its way, and after 10 %, the rest is known."""
+    """At --pace 1 starting an episode takes little of it: after 2 % of its way, and after 10 %, the
+    rest is known."""
     length_m = LONG[0].route_line.length_m
     board, *_ = board_of(LONG[:1], pace=1.0)
     for share in (0.02, 0.1):
         board.tell(Progress(LONG[0].id, share * length_m, share * length_m, 0))
-        since_s, left_s = 4.0 + share * length_m, (1.0 - share) * length_m
+        since_s = 4.0 + share * length_m
+        left_s = (1.0 - share) * length_m
         assert board.left.seconds(since_s) == pytest.approx(left_s, rel=0.15)
 
 
@@ -105,7 +117,8 @@ def test_a_run_with_nothing_left_to_do_is_all_done() -> None:
 
 
 def test_the_bars_fit_80_columns() -> None:
-    """The longest name, thousands of seconds, dozens of failures: no line is broken and nothing is cut."""
+    """The longest name, thousands of seconds, dozens of failures: no line is broken and nothing is
+    cut."""
     named = msgspec.structs.replace(LONG[7], id="ped_crossing-001")
     board, clock, said = board_of((named, *LONG[:2]))
     clock.now_s = 4000.0
@@ -115,5 +128,7 @@ def test_the_bars_fit_80_columns() -> None:
     lines = said.getvalue().splitlines()
     assert max(map(len, lines)) <= 80 and "…" not in said.getvalue()
     way = f"630/{LONG[7].route_line.length_m:.0f} m"
-    assert any("ped_crossing-001" in line and way in line and "88 failures" in line for line in lines)
+    assert any(
+        "ped_crossing-001" in line and way in line and "88 failures" in line for line in lines
+    )
     assert any("episodes" in line and "0/3" in line and "left" in line for line in lines)

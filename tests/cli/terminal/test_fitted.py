@@ -13,21 +13,20 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from cosim.cli.bench.bench import print_figures
-from cosim.cli.results.compare import print_comparison
-from cosim.cli.results.show import print_sheet
-from cosim.cli.suites.catalog import print_scenarios
-from cosim.cli.suites.scenario import _print_sweep
-from cosim.cli.terminal.fitted import print_fitted
-from cosim.cli.terminal.run_table import COUNTS, SHOWN, WITH_PEOPLE, print_by_kind, print_table
-from cosim.judge.metrics import COUNTERFACTUAL, METRICS
-from cosim.records.comparison import DIFFERENCES, FLIPPED, ComparedRun, RunComparison
-from cosim.records.results import KEYS
+from cosim.cli.bench import print_figures
+from cosim.cli.results import print_comparison, print_sheet
+from cosim.cli.run_table import COUNTS, SHOWN, WITH_PEOPLE, print_by_kind, print_table
+from cosim.cli.scenario import _print_sweep
+from cosim.cli.suites import print_scenarios
+from cosim.cli.tables import print_fitted
+from cosim.results.compare import DIFFERENCES, FLIPPED, ComparedRun, RunComparison
+from cosim.results.metrics import COUNTERFACTUAL, METRICS
+from cosim.results.table import KEYS
 from cosim.spec.scenario import Suite
-from scenarios.bench.figures import Figure
-from scenarios.catalog import load_suite
-from scenarios.own.sweep import SWEPT
-from scenarios.viewing.eventsheet import COLUMNS
+from scenarios.suites.catalog import load_suite
+from scenarios.suites.user_scenarios.sweep import SWEPT
+from scenarios.tools.bench.figures import Figure
+from scenarios.tools.viewing.event_sheet import COLUMNS
 from tests.conftest import ROOT
 
 WIDTHS = (60, 80, 120)
@@ -36,23 +35,44 @@ LONG = "sumo-fokr-bs-demo-ped_crossing-003"
 
 
 def episodes() -> pd.DataFrame:
-    """Two episodes with long names, two digits before every point, dozens of failures, and the robot's cost."""
-    row = dict.fromkeys((*KEYS, *METRICS, *COUNTERFACTUAL), 34.56) | {name: 120.0 for name, _ in COUNTS}
+    """Two episodes with long names, two digits before every point, dozens of failures, and the
+    robot's cost."""
+    row = dict.fromkeys((*KEYS, *METRICS, *COUNTERFACTUAL), 34.56) | {
+        name: 120.0 for name, _ in COUNTS
+    }
     row |= {name: 34.56 for name, _ in (*SHOWN, *WITH_PEOPLE)}
-    words = {"status": "done", "ended": "timeout", "reason": "", "camera": "none", "nonstandard": ""}
-    words |= {"policy": "p", "goal_protocol": "none", "odometry": "none", "waypoints": "w", "policy_runs": "in-process"}
-    return pd.DataFrame([row | words | {"scenario": f"{LONG}{i}", "split": ("val", "test")[i]} for i in range(2)])
+    words = {
+        "status": "done",
+        "ended": "timeout",
+        "reason": "",
+        "camera": "none",
+        "nonstandard": "",
+    }
+    words |= {
+        "policy": "p",
+        "goal_protocol": "none",
+        "odometry": "none",
+        "waypoints": "w",
+        "policy_runs": "in-process",
+    }
+    return pd.DataFrame(
+        [row | words | {"scenario": f"{LONG}{i}", "split": ("val", "test")[i]} for i in range(2)]
+    )
 
 
 def of_run(out: Console) -> None:
     table = episodes()
     print_table(out, table, 2)
-    print_by_kind(out, table, dict(zip(table["scenario"], ("ped_crossing", "conversing"), strict=True)))
+    print_by_kind(
+        out, table, dict(zip(table["scenario"], ("ped_crossing", "conversing"), strict=True))
+    )
 
 
 def of_comparison(out: Console) -> None:
     figures = (200, -34.567, 34.567, 69.134, -12.345, 81.479, 100, "within noise")
-    rows = [("a", "b", by, LONG, name, "", *figures) for by in ("suite", "event") for name in METRICS]
+    rows = [
+        ("a", "b", by, LONG, name, "", *figures) for by in ("suite", "event") for name in METRICS
+    ]
     before, after = (ComparedRun(label, Path(label), episodes()) for label in "ab")
     told = pd.DataFrame(rows, columns=list(DIFFERENCES)), pd.DataFrame([], columns=list(FLIPPED))
     print_comparison(out, RunComparison("reactive", before, (after,), *told, ()))
@@ -65,7 +85,13 @@ def of_sheet(out: Console) -> None:
 
 def of_sweep(out: Console) -> None:
     rows = [
-        {"crowd.density": 12.5, "events.kind": "ped_crossing", "obstacles.per_100m": 3.5, "metric": name, "n": 200}
+        {
+            "crowd.density": 12.5,
+            "events.kind": "ped_crossing",
+            "obstacles.per_100m": 3.5,
+            "metric": name,
+            "n": 200,
+        }
         | {"mean": 34.56, "low": -34.56, "high": 34.56}
         for name in SWEPT
     ]
@@ -74,17 +100,27 @@ def of_sweep(out: Console) -> None:
 
 def of_figures(out: Console) -> None:
     print_figures(
-        {f"a policy's answer to {LONG}, ms": [Figure("f", 1234.56, limit=1034.56, limit_is="SUMO", reach=34.56)] * 3}
+        {
+            f"a policy's answer to {LONG}, ms": [
+                Figure("f", 1234.56, limit=1034.56, limit_is="SUMO", reach=34.56)
+            ]
+            * 3
+        }
     )
 
 
 def of_suite(out: Console) -> None:
-    print_scenarios(out, Suite(name="s", version="1", scenarios=load_suite("long-horizon").scenarios[-3:]))
+    print_scenarios(
+        out, Suite(name="s", version="1", scenarios=load_suite("long-horizon").scenarios[-3:])
+    )
 
 
 TABLES: dict[str, tuple[Callable[[Console], None], Sequence[str]]] = {
     "run": (of_run, ("34.56", "120/120/120", "34.56 to 34.56", "34.56..34.56")),
-    "comparison": (of_comparison, ("-34.57", "34.57", "+69.13", "-12.35 to +81.48", "200", "within noise")),
+    "comparison": (
+        of_comparison,
+        ("-34.57", "34.57", "+69.13", "-12.35 to +81.48", "200", "within noise"),
+    ),
     "events": (of_sheet, ("-19.98", "0.123", "0.060", "-12.34", "-180", "12.34")),
     "sweep": (of_sweep, ("34.56", "-34.56..34.56", "200")),
     "bench": (of_figures, ("1235", "1035", "1235 to 1235", "<= 34.56")),
@@ -95,7 +131,8 @@ TABLES: dict[str, tuple[Callable[[Console], None], Sequence[str]]] = {
 @pytest.mark.parametrize("width", WIDTHS)
 @pytest.mark.parametrize("name", TABLES)
 def test_no_figure_is_cut(name: str, width: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a narrow, a usual and a wide terminal: no line is longer than it, nothing ends in dots, figures are whole."""
+    """In a narrow, a usual and a wide terminal: no line is longer than it, nothing ends in dots,
+    figures are whole."""
     said = io.StringIO()
     out = Console(file=said, width=width)
     for module in ("suites.scenario", "bench.bench"):
@@ -110,7 +147,8 @@ def test_no_figure_is_cut(name: str, width: int, monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_table_that_is_too_wide_is_divided() -> None:
-    """Each part has the names again and as many figures as fit; every figure is there once, in the order of columns."""
+    """Each part has the names again and as many figures as fit; every figure is there once, in the
+    order of columns."""
     heads = [f"figure {k}" for k in range(9)]
     table = Table("what", *heads, box=box.SIMPLE_HEAD)
     table.add_row(LONG, *(f"{k}.000000" for k in range(9)))
@@ -119,7 +157,9 @@ def test_a_table_that_is_too_wide_is_divided() -> None:
     parts = said.getvalue().split("what")[1:]
     assert len(parts) > 1 and max(map(len, said.getvalue().splitlines())) <= 50
     found = [[word for word in part.split() if word.endswith(".000000")] for part in parts]
-    assert [word for words in found for word in words] == [f"{k}.000000" for k in range(9)] and all(found)
+    assert [word for words in found for word in words] == [f"{k}.000000" for k in range(9)] and all(
+        found
+    )
 
 
 def test_a_table_that_fits_is_left_as_it_is() -> None:
@@ -136,4 +176,6 @@ def test_every_command_with_a_table_prints_it_so() -> None:
     """Whichever module of the command line makes a table has it fitted."""
     for path in sorted((ROOT / "cosim/cli").rglob("*.py")):
         if "Table(" in (text := path.read_text()):
-            assert "fitted" in text and not re.search(r"\bout\.print\((table|shown|rows)\)", text), path
+            assert "fitted" in text and not re.search(
+                r"\bout\.print\((table|shown|rows)\)", text
+            ), path

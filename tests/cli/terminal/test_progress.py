@@ -7,13 +7,14 @@ import io
 import pytest
 from rich.console import Console
 
-from cosim.cli.terminal import progress
-from cosim.cli.terminal.progress import doing, stage_in_words
+from cosim.cli import progress
+from cosim.cli.progress import doing, stage_in_words
 from cosim.core.telling import duration
 
 
 def test_a_log_gets_one_line_for_each_stage() -> None:
-    """Where standard error is no terminal nothing moves and nothing is repeated: a line when a stage begins."""
+    """Where standard error is no terminal nothing moves and nothing is repeated: a line when a
+    stage begins."""
     said = io.StringIO()
     with doing("reading [the] city", Console(file=said, width=80)) as tell:
         for share in (0.0, 0.5, 1.0):
@@ -33,9 +34,12 @@ def test_a_log_gets_further_lines_of_a_long_stage(monkeypatch: pytest.MonkeyPatc
 
 
 def test_a_terminal_gets_a_line_that_moves_and_is_gone() -> None:
-    """In a terminal the stage stands with its share and the time; at the end the line is taken away."""
+    """In a terminal the stage stands with its share and the time; at the end the line is taken
+    away."""
     said = io.StringIO()
-    console = Console(file=said, width=80, force_terminal=True, legacy_windows=False, _environ={"TERM": "xterm"})
+    console = Console(
+        file=said, width=80, force_terminal=True, legacy_windows=False, _environ={"TERM": "xterm"}
+    )
     with doing("reading [the] city", console) as tell:
         tell("simulating to 20 s", 0.5)
     assert "simulating to 20 s: 50 %" in said.getvalue() and "0:00:00" in said.getvalue()
@@ -43,7 +47,8 @@ def test_a_terminal_gets_a_line_that_moves_and_is_gone() -> None:
 
 
 def test_what_is_left_is_said_when_it_is_known() -> None:
-    """A tenth took ten seconds: a minute and a half is left; of the first moments nothing is concluded."""
+    """A tenth took ten seconds: a minute and a half is left; of the first moments nothing is
+    concluded."""
     assert stage_in_words("filming", 0.1, 10.0) == "filming: 10 %, about 90 s left"
     assert stage_in_words("filming", 0.5, 10.0) == "filming: 50 %, about 10 s left"
     assert (
@@ -65,7 +70,7 @@ def test_what_is_left_is_said_when_it_is_known() -> None:
         (23400.0, "6 h 30 min"),
     ],
     ids=lambda value: str(value).replace(" ", "-"),
-)  # fmt: skip
+)
 def test_a_time_is_said_no_finer_than_it_is_known(seconds: float, words: str) -> None:
     """Seconds, tens of seconds, minutes, tens of minutes: below one, two, 120 minutes and above."""
     assert duration(seconds) == words

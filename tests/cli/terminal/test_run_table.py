@@ -13,27 +13,27 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from cosim.cli.results.show import print_sheet
-from cosim.cli.suites.catalog import print_names, print_scenarios
-from cosim.cli.terminal.next_commands import print_next_commands
-from cosim.cli.terminal.run_table import (
+from cosim.cli.results import print_sheet
+from cosim.cli.run_table import (
     COUNTS,
     LETTERS,
     SHOWN,
     WITH_PEOPLE,
     print_by_kind,
+    print_next_commands,
     print_table,
     print_terms,
 )
+from cosim.cli.suites import print_names, print_scenarios
 from cosim.core.errors import unknown
-from cosim.judge.metrics import METRICS, SUCCESS_IN_WORDS
-from cosim.records.results import table_of
+from cosim.results.metrics import METRICS, SUCCESS_IN_WORDS
+from cosim.results.table import table_of
 from cosim.spec.scenario import CityMap, Suite
-from scenarios.catalog import SUITES, load_suite
 from scenarios.events.table import EVENT_KINDS
-from scenarios.viewing.eventsheet import COLUMNS
-from tests.documents import text_of
-from tests.records.driven_runs import episode_of, short_way
+from scenarios.suites.catalog import SUITES, load_suite
+from scenarios.tools.viewing.event_sheet import COLUMNS
+from tests.support.documents import text_of
+from tests.support.driven_runs import episode_of, short_way
 
 
 def terminal(width: int = 80) -> tuple[Console, io.StringIO]:
@@ -48,7 +48,9 @@ def test_the_scenarios_of_a_suite_fit_80_columns(name: str) -> None:
     print_scenarios(out, load_suite(name))
     assert "…" not in said.getvalue()
     for scenario in load_suite(name).scenarios:
-        assert f" {scenario.id} " in said.getvalue() and f" {scenario.place.name} " in said.getvalue()
+        assert (
+            f" {scenario.id} " in said.getvalue() and f" {scenario.place.name} " in said.getvalue()
+        )
 
 
 def test_a_name_with_brackets_is_shown_as_it_is() -> None:
@@ -61,8 +63,13 @@ def test_a_name_with_brackets_is_shown_as_it_is() -> None:
 
 
 def test_a_bad_run_fits_80_columns() -> None:
-    """The longest shipped name, two digits before every point, and dozens of failures: nothing is cut."""
-    row = dict.fromkeys(METRICS, 34.56) | {"scenario": "ped_crossing-001", "status": "done", "ended": "timeout"}
+    """The longest shipped name, two digits before every point, and dozens of failures: nothing is
+    cut."""
+    row = dict.fromkeys(METRICS, 34.56) | {
+        "scenario": "ped_crossing-001",
+        "status": "done",
+        "ended": "timeout",
+    }
     row |= {name: 34.56 for name, _ in SHOWN} | {name: 120 for name, _ in COUNTS}  # type: ignore[dict-item]
     out, said = terminal()
     print_table(out, pd.DataFrame([row]), 1)
@@ -76,11 +83,14 @@ def pair_of_kinds() -> tuple[pd.DataFrame, dict[str, str]]:
     row |= {name: 0.25 for name, _ in (*SHOWN, *COUNTS, *WITH_PEOPLE)}  # type: ignore[dict-item]
     row |= {"collisions": 1.0, "collisions_per_100m": 8.48}  # type: ignore[dict-item]
     names = ("ped_crossing-001", "frontal-001")
-    return pd.DataFrame([row | {"scenario": n} for n in names]), {n: n.rsplit("-", 1)[0] for n in names}
+    return pd.DataFrame([row | {"scenario": n} for n in names]), {
+        n: n.rsplit("-", 1)[0] for n in names
+    }
 
 
 def test_a_letter_means_one_thing_in_every_table() -> None:
-    """C, OL and F are per 100 m wherever they stand; what is counted in another way has a name in words."""
+    """C, OL and F are per 100 m wherever they stand; what is counted in another way has a name in
+    words."""
     table, kinds = pair_of_kinds()
     episodes, shares = terminal(), terminal()
     print_table(episodes[0], table, 2)
@@ -91,7 +101,8 @@ def test_a_letter_means_one_thing_in_every_table() -> None:
 
 
 def test_every_letter_and_heading_is_explained_under_its_table() -> None:
-    """Letters have their meaning in the line below, rates their unit in the heading, as the documents do."""
+    """Letters have their meaning in the line below, rates their unit in the heading, as the
+    documents do."""
     table, kinds = pair_of_kinds()
     out, said = terminal()
     print_table(out, table, 2)
@@ -108,7 +119,8 @@ def test_every_letter_and_heading_is_explained_under_its_table() -> None:
 
 
 def test_success_names_the_events_that_end_otherwise() -> None:
-    """Under every table that gives SR stands which events ask for a stop, and which for passing round, by name."""
+    """Under every table that gives SR stands which events ask for a stop, and which for passing
+    round, by name."""
     out, said = terminal()
     print_table(out, pair_of_kinds()[0], 2)
     assert SUCCESS_IN_WORDS in " ".join(said.getvalue().split())
@@ -121,7 +133,8 @@ def test_success_names_the_events_that_end_otherwise() -> None:
 
 
 def test_the_table_by_kind_fits_80_columns() -> None:
-    """The longest event, hundreds of episodes, an interval: no line is longer than the terminal and none is broken."""
+    """The longest event, hundreds of episodes, an interval: no line is longer than the terminal and
+    none is broken."""
     table, kinds = pair_of_kinds()
     out, said = terminal()
     print_by_kind(out, table, kinds)
@@ -141,7 +154,18 @@ def test_a_whole_suite_by_kind_fits_80_columns_with_all_its_headings() -> None:
 
 def test_the_sheet_of_events_fits_80_columns() -> None:
     """A long map's name and two digits before each point: numbers and headings are whole."""
-    row = ("sumo-fokr-bs-demo-003 12", "ped_crossing", -19.98, 0.123, 0.060, 1.65, 1.65, -12.34, -180.0, 12.34)
+    row = (
+        "sumo-fokr-bs-demo-003 12",
+        "ped_crossing",
+        -19.98,
+        0.123,
+        0.060,
+        1.65,
+        1.65,
+        -12.34,
+        -180.0,
+        12.34,
+    )
     out, said = terminal()
     print_sheet(out, pd.DataFrame([row], columns=list(COLUMNS)))
     assert "…" not in said.getvalue() and max(map(len, said.getvalue().splitlines())) <= 80
@@ -150,7 +174,8 @@ def test_the_sheet_of_events_fits_80_columns() -> None:
 
 
 def test_of_many_valid_names_the_likely_ones_are_listed() -> None:
-    """Nine hundred scenarios are no answer to a slip of the pen: five are, and how many there are."""
+    """Nine hundred scenarios are no answer to a slip of the pen: five are, and how many there
+    are."""
     names = [scenario.id for scenario in load_suite("reactive").scenarios]
     assert "frontal-001" in str(unknown("scenario", "frontal-0001", names))
     assert len(str(unknown("scenario", "x", names))) < 160 and "Valid choices: 900" in str(
@@ -162,20 +187,30 @@ def test_val_and_test_stand_apart() -> None:
     """A run with both has a row for each; a run of one has none."""
     rows = [
         dict.fromkeys(METRICS, 1.0)
-        | {"scenario": f"s-{i}", "status": "done", "ended": "goal", "split": split, "success": float(split == "val")}
+        | {
+            "scenario": f"s-{i}",
+            "status": "done",
+            "ended": "goal",
+            "split": split,
+            "success": float(split == "val"),
+        }
         for i, split in enumerate(("val", "val", "test"))
     ]
     out, said = terminal()
     print_table(out, pd.DataFrame(rows), 3)
     assert re.search(r"^ +val +2 +1\.00 ", said.getvalue(), re.MULTILINE)
-    assert re.search(r"^ +test +1 +0\.00 ", said.getvalue(), re.MULTILINE) and "…" not in said.getvalue()
+    assert (
+        re.search(r"^ +test +1 +0\.00 ", said.getvalue(), re.MULTILINE)
+        and "…" not in said.getvalue()
+    )
     out, said = terminal()
     print_table(out, pd.DataFrame(rows[:2]), 2)
     assert "split" not in said.getvalue()
 
 
 def test_a_table_tells_what_the_policy_saw_by_and_marks_what_is_nonstandard() -> None:
-    """Camera, rate, goals, waypoint rule and seed below the rows; who has a camera of its own has a star, and why."""
+    """Camera, rate, goals, waypoint rule and seed below the rows; who has a camera of its own has a
+    star, and why."""
     row = {
         "scenario": "s-1",
         "status": "done",
@@ -197,24 +232,42 @@ def test_a_table_tells_what_the_policy_saw_by_and_marks_what_is_nonstandard() ->
         print_table(out, pd.DataFrame([row | {"nonstandard": odd}]), 1)
         text = " ".join(said.getvalue().split())
         assert (
-            "policy orca (oracle, privileged); camera own mount, 64 x 64 px, 75 deg, at 4 Hz; goal route_point; "
+            "policy orca (oracle, privileged); camera own mount, 64 x 64 px, 75 deg, at 4 "
+            "Hz; goal route_point; "
             "odometry gps; waypoint 2, units of 1 m, in 0.25 s, shipped; seed 7" in text
         )
-        assert ("s-1*" in text) is ("* nonstandard, not to be compared: a camera of its own" in text) is star
+        assert (
+            ("s-1*" in text)
+            is ("* nonstandard, not to be compared: a camera of its own" in text)
+            is star
+        )
 
 
-def test_a_table_leaves_out_the_camera_and_the_waypoints_that_a_policy_does_not_have(tmp_path: Path) -> None:
-    """A blind policy has no camera in its line; waypoints stand there where an answer in the run's folder was some."""
+def test_a_table_leaves_out_the_camera_and_the_waypoints_that_a_policy_does_not_have(
+    tmp_path: Path,
+) -> None:
+    """A blind policy has no camera in its line; waypoints stand there where an answer in the run's
+    folder was some."""
     record, log = episode_of(short_way("s-0"), "h")
     assert log is not None
-    plan = {"plan_sizes": np.ones(1, np.int32), "plan_points": np.ones((1, 2), np.float32), "plan_index": 0}
-    for name, one in (("commands", log), ("waypoints", dataclasses.replace(log, answers=np.ones((1, 4)), **plan))):
+    plan = {
+        "plan_sizes": np.ones(1, np.int32),
+        "plan_points": np.ones((1, 2), np.float32),
+        "plan_index": 0,
+    }
+    for name, one in (
+        ("commands", log),
+        ("waypoints", dataclasses.replace(log, answers=np.ones((1, 4)), **plan)),
+    ):
         (tmp_path / name / "episodes/s-0").mkdir(parents=True)
         (tmp_path / name / "episodes/s-0/trajectory.npz").write_bytes(one.encoded())
         out, said = terminal()
         print_terms(out, table_of([record]), tmp_path / name)
         text = " ".join(said.getvalue().split())
-        assert text.startswith("policy p; at 4 Hz; goal none; odometry none; ") and "camera" not in text
+        assert (
+            text.startswith("policy p; at 4 Hz; goal none; odometry none; ")
+            and "camera" not in text
+        )
         assert ("waypoint 2, units of 1 m" in text) is (name == "waypoints")
 
 
@@ -222,14 +275,17 @@ def test_the_list_says_which_policies_know_more_than_a_robot() -> None:
     """`orca` is the oracle; it and two other baselines are privileged, those that see are not."""
     out, said = terminal()
     print_names(out)
-    named = [line.split("  ")[1] for line in said.getvalue().splitlines() if line.startswith("policy ")]
+    named = [
+        line.split("  ")[1] for line in said.getvalue().splitlines() if line.startswith("policy ")
+    ]
     privileged = ["route (privileged)", "orca (oracle, privileged)", "social_force (privileged)"]
     assert named[:5] == ["stop", "straight", *privileged] and "small" in named
     assert not any("privileged" in name for name in named[5:])
 
 
 def test_the_next_commands_are_printed_with_the_runs_folder() -> None:
-    """A film of the failure, or of an episode where none failed, a report, one episode; without a track a report."""
+    """A film of the failure, or of an episode where none failed, a report, one episode; without a
+    track a report."""
 
     def told(*rows: tuple[str, str | None, float]) -> list[str]:
         said = io.StringIO()
@@ -240,7 +296,10 @@ def test_the_next_commands_are_printed_with_the_runs_folder() -> None:
 
     report = "cosim report 'runs/my run' -o report.html"
     assert told(("a", "goal", 1.0), ("b", "failure", 0.0)) == [
-        "Next:", "cosim film 'runs/my run' --failure -o film.mp4", report, "cosim show 'runs/my run' --episode b"
-    ]  # fmt: skip
+        "Next:",
+        "cosim film 'runs/my run' --failure -o film.mp4",
+        report,
+        "cosim show 'runs/my run' --episode b",
+    ]
     assert told(("a", "goal", 1.0))[1] == "cosim film 'runs/my run' a -o film.mp4"
     assert told(("a", None, 0.0)) == ["Next:", report]

@@ -1,4 +1,5 @@
-"""Manifests of published networks: small graphs with their inputs and outputs pass `cosim policy check`."""
+"""Manifests of published networks: small graphs with their inputs and outputs pass `cosim policy
+check`."""
 
 from __future__ import annotations
 
@@ -9,44 +10,74 @@ import numpy as np
 import pytest
 
 from cosim.core.errors import UsageError
-from cosim.episode.driver import Driver
+from cosim.episode.policy_caller import Driver
 from cosim.policies.load import load_policy
 from cosim.policies.onnx.manifest import BundleManifest, read_bundle_manifest
 from cosim.policies.onnx.policy import OnnxPolicy
 from physics.cameras.choice import camera_of_choice
-from scenarios.policy_check.checks import checked_policy
-from scenarios.policy_check.drives import drives_for
+from scenarios.tools.policy_check.checks import checked_policy
+from scenarios.tools.policy_check.drives import drives_for
 from tests.conftest import Cosim
-from tests.policies.adapters.likenesses import Shapes, likeness
+from tests.support.likenesses import Shapes, likeness
 
 ADAPTERS = Path(__file__).parents[3] / "cosim" / "policies" / "adapters"
-GNM: Shapes = {"obs_img": (1, 18, 64, 85), "goal_img": (1, 3, 64, 85), "dist_pred": (1, 1), "action_pred": (1, 5, 4)}
+GNM: Shapes = {
+    "obs_img": (1, 18, 64, 85),
+    "goal_img": (1, 3, 64, 85),
+    "dist_pred": (1, 1),
+    "action_pred": (1, 5, 4),
+}
 SHAPES: dict[str, Shapes] = {
     "gnm": GNM,
     "vint": GNM,
     "nomad": {
-        "obs_img": (1, 12, 96, 96), "goal_img": (1, 3, 96, 96), "goal_mask": (1,), "noise": (11, 8, 2),
+        "obs_img": (1, 12, 96, 96),
+        "goal_img": (1, 3, 96, 96),
+        "goal_mask": (1,),
+        "noise": (11, 8, 2),
         "actions": (1, 8, 2),
     },
     "mbra": {"obs_img": (1, 18, 96, 96), "goal_pose": (1, 4), "action_pred": (1, 8, 4)},
-    "citywalker": {"obs": (1, 5, 3, 350, 630), "cord": (1, 6, 2), "wp_pred": (1, 5, 2), "arrive_pred": (1, 1)},
-    "s2e": {"obs": (1, 11, 3, 256, 256), "goal": (1, 3), "wp_pred": (1, 64, 10, 2), "wp_pred_score": (1, 64)},
+    "citywalker": {
+        "obs": (1, 5, 3, 350, 630),
+        "cord": (1, 6, 2),
+        "wp_pred": (1, 5, 2),
+        "arrive_pred": (1, 1),
+    },
+    "s2e": {
+        "obs": (1, 11, 3, 256, 256),
+        "goal": (1, 3),
+        "wp_pred": (1, 64, 10, 2),
+        "wp_pred_score": (1, 64),
+    },
     "mimic": {"obs": (1, 16, 3, 288, 512), "output": (1, 15, 2)},
     "flowpilot": {
-        "vision": (1, 20, 3, 216, 384), "route_patch": (1, 20, 80, 80), "goal": (1, 20, 3), "ego": (1, 20, 2),
-        "action_bounds": (1, 2, 5), "modes": (1, 6, 80, 5), "probs": (1, 6), "speed": (1, 1),
+        "vision": (1, 20, 3, 216, 384),
+        "route_patch": (1, 20, 80, 80),
+        "goal": (1, 20, 3),
+        "ego": (1, 20, 2),
+        "action_bounds": (1, 2, 5),
+        "modes": (1, 6, 80, 5),
+        "probs": (1, 6),
+        "speed": (1, 1),
     },
     "openpilot": {
-        "input_imgs": (1, 12, 128, 256), "big_input_imgs": (1, 12, 128, 256), "desire": (1, 100, 8),
-        "traffic_convention": (1, 2), "features_buffer": (1, 99, 512), "plan": (1, 4955), "hidden_state": (1, 512),
+        "input_imgs": (1, 12, 128, 256),
+        "big_input_imgs": (1, 12, 128, 256),
+        "desire": (1, 100, 8),
+        "traffic_convention": (1, 2),
+        "features_buffer": (1, 99, 512),
+        "plan": (1, 4955),
+        "hidden_state": (1, 512),
     },
-}  # fmt: skip
+}
 """As far as they are public; what is not is a guess, told in README.md beside the manifests."""
 SAMPLE = ("nomad", "s2e")
 
 
 def bundle_of(name: str, folder: Path, **changes: object) -> Path:
-    """A folder with an adapter's manifest, but for its files, and a small graph. changes: of the output."""
+    """A folder with an adapter's manifest, but for its files, and a small graph. changes: of the
+    output."""
     told = json.loads((ADAPTERS / name / "manifest.json").read_text())
     bundle: BundleManifest = read_bundle_manifest(ADAPTERS / name)
     (folder / bundle.model).write_bytes(likeness(bundle, SHAPES[name]))
@@ -58,15 +89,19 @@ def bundle_of(name: str, folder: Path, **changes: object) -> Path:
 
 @pytest.mark.parametrize("name", list(SHAPES))
 def test_an_adapter_takes_a_graph_of_the_networks_shapes(name: str, tmp_path: Path) -> None:
-    """Every input is made and every output read: it is asked twice in a grey street when it is loaded."""
+    """Every input is made and every output read: it is asked twice in a grey street when it is
+    loaded."""
     policy = OnnxPolicy(bundle_of(name, tmp_path))
     assert policy.manifest.name == name and set(policy.graph.inputs) == set(policy.bundle.inputs)
 
 
 @pytest.mark.engine
 @pytest.mark.parametrize("name", list(SHAPES))
-def test_an_adapter_passes_the_check(name: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
-    """A graph that follows street and goal, with the inputs and outputs of the network, fails in nothing."""
+def test_an_adapter_passes_the_check(
+    name: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    """A graph that follows street and goal, with the inputs and outputs of the network, fails in
+    nothing."""
     if name not in SAMPLE and not request.config.getoption("--whole"):
         pytest.skip("a sample is tested without --whole")
     policy = OnnxPolicy(bundle_of(name, tmp_path))
@@ -90,7 +125,8 @@ def test_an_adapter_with_the_wrong_side_or_unit_fails_it(tmp_path: Path) -> None
 def test_every_adapter_says_where_its_weights_are(
     cosim: Cosim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each is a policy by its name; without weights a run names file, source, size and hash where these are known."""
+    """Each is a policy by its name; without weights a run names file, source, size and hash where
+    these are known."""
     monkeypatch.setenv("COSIM_WEIGHTS", str(tmp_path))
     monkeypatch.setenv("HOME", str(tmp_path))
     assert sorted(SHAPES) == sorted(path.parent.name for path in ADAPTERS.glob("*/manifest.json"))
@@ -104,7 +140,11 @@ def test_every_adapter_says_where_its_weights_are(
             facts = bundle.files[bundle.model]
             assert f"{facts.bytes} bytes, SHA-256 {facts.sha256}" in said
         else:
-            assert "unknown" in bundle.source or "not published" in bundle.source or "vary" in bundle.source
+            assert (
+                "unknown" in bundle.source
+                or "not published" in bundle.source
+                or "vary" in bundle.source
+            )
 
 
 AGENT = """
@@ -135,7 +175,8 @@ class InternVLAN1AsyncAgent:
 def test_internvla_is_asked_as_its_authors_ask_it(
     cosim: Cosim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An agent of the same face, in its place on the path, passes the check as the served policy's own code."""
+    """An agent of the same face, in its place on the path, passes the check as the served policy's
+    own code."""
     folder = tmp_path / "internnav" / "agent"
     folder.mkdir(parents=True)
     (folder / "internvla_n1_agent_realworld.py").write_text(AGENT)
@@ -148,5 +189,7 @@ def test_internvla_is_asked_as_its_authors_ask_it(
     done = cosim("policy", "check", name, "--frames", "3", "--json", cwd=tmp_path)
     told = json.loads(done.stdout)
     assert done.returncode == 0, told
-    assert told["checks"]["goal_mirrored"]["outcome"] == told["checks"]["side"]["outcome"] == "passed"
+    assert (
+        told["checks"]["goal_mirrored"]["outcome"] == told["checks"]["side"]["outcome"] == "passed"
+    )
     assert np.isfinite(told["answer_ms"])

@@ -11,8 +11,7 @@ import pytest
 
 from cosim.core.errors import PolicyError
 from cosim.core.state import STILL, Command, Planned
-from cosim.policies.onnx.answers import answer_of
-from cosim.policies.onnx.outputs import GraphOutput
+from cosim.policies.onnx.outputs import GraphOutput, answer_of
 from cosim.spec.robot import COURIER, SCOUT
 
 ROWS = np.array([[[1.0, 0.5], [2.0, 1.0], [3.0, 2.0]]])
@@ -32,8 +31,16 @@ PLANS: dict[str, tuple[dict[str, Any], Any, list[list[float]]]] = {
     "scaled": ({"scale": [2, 1], "offset": [0, 1]}, ROWS, [[2, 1.5], [4, 2], [6, 3]]),
     "in-one-row": ({}, ROWS.reshape(1, 6), [[1, 0.5], [2, 1], [3, 2]]),
     "first-sample": ({}, np.stack([ROWS, -ROWS]), [[1, 0.5], [2, 1], [3, 2]]),
-    "heading": ({"columns": ["x", "y", "heading"]}, [[[1, 0, math.pi / 2]] * 2], [[1, 0, 0, 1]] * 2),
-    "cosine": ({"columns": ["x", "y", "cos", "sin"]}, [[[1, 0, 0.6, 0.8]] * 2], [[1, 0, 0.6, 0.8]] * 2),
+    "heading": (
+        {"columns": ["x", "y", "heading"]},
+        [[[1, 0, math.pi / 2]] * 2],
+        [[1, 0, 0, 1]] * 2,
+    ),
+    "cosine": (
+        {"columns": ["x", "y", "cos", "sin"]},
+        [[[1, 0, 0.6, 0.8]] * 2],
+        [[1, 0, 0.6, 0.8]] * 2,
+    ),
 }
 
 
@@ -49,26 +56,43 @@ def test_of_several_modes_the_one_with_the_highest_score_is_followed() -> None:
     modes = np.stack([ROWS[0], -ROWS[0], 2 * ROWS[0]])[None]
     best = answered({**WAYPOINTS, "scores": "probs"}, plan=modes, probs=[[0.1, 0.2, 0.7]])
     np.testing.assert_allclose(best, 2 * ROWS[0])
-    flat = [[*rows.ravel(), *np.ones(6), score] for rows, score in zip(modes[0], (0, 5, 1), strict=True)]
+    flat = [
+        [*rows.ravel(), *np.ones(6), score] for rows, score in zip(modes[0], (0, 5, 1), strict=True)
+    ]
     mixed = answered({**WAYPOINTS, "mixture": {"modes": 3, "points": 3}}, plan=np.ravel(flat)[None])
     np.testing.assert_allclose(mixed, -ROWS[0])
 
 
 def test_speeds_of_a_plan_can_be_followed_in_place_of_its_waypoints() -> None:
     """The command is that of the row, the waypoints are kept in metres."""
-    output = {**WAYPOINTS, "columns": ["x", "y", "speed", "turn"], "follow": "speeds", "index": 0, "unit_m": 2}
+    output = {
+        **WAYPOINTS,
+        "columns": ["x", "y", "speed", "turn"],
+        "follow": "speeds",
+        "index": 0,
+        "unit_m": 2,
+    }
     answer = answered(output, plan=[[[1, 0, 0.7, 0.2], [2, 0, 0.8, 0.3]]])
-    assert isinstance(answer, Planned) and (answer.v_mps, answer.w_radps) == pytest.approx((0.7, 0.2))
+    assert isinstance(answer, Planned) and (answer.v_mps, answer.w_radps) == pytest.approx(
+        (0.7, 0.2)
+    )
     np.testing.assert_allclose(answer.waypoints, [[2, 0], [4, 0]])
 
 
 def test_wheels_turn_a_robot_by_its_track() -> None:
     """The same wheels turn a narrower robot more."""
-    wheels = {"what": "wheels", "left": {"name": "y"}, "right": {"name": "y", "index": 1}, "unit_mps": 2.0}
+    wheels = {
+        "what": "wheels",
+        "left": {"name": "y"},
+        "right": {"name": "y", "index": 1},
+        "unit_mps": 2.0,
+    }
     answer = answered(wheels, y=[[0.4, 0.5]])
     assert (answer.v_mps, answer.w_radps) == pytest.approx((0.9, 0.2 / COURIER.drive.span_m[1]))
     other = answer_of(msgspec.convert(wheels, GraphOutput), {"y": np.array([[0.4, 0.5]])}, SCOUT)
-    assert isinstance(other, Command) and other.w_radps == pytest.approx(0.2 / SCOUT.drive.span_m[1])
+    assert isinstance(other, Command) and other.w_radps == pytest.approx(
+        0.2 / SCOUT.drive.span_m[1]
+    )
 
 
 def test_steering_slows_down_for_what_it_should_stop_for() -> None:
@@ -82,7 +106,13 @@ def test_steering_slows_down_for_what_it_should_stop_for() -> None:
 
 def test_a_command_is_two_numbers_in_their_units() -> None:
     """Wherever they stand in the outputs."""
-    output = {"what": "command", "v": {"name": "u", "index": 1}, "w": {"name": "w"}, "unit_mps": 2, "unit_radps": -1}
+    output = {
+        "what": "command",
+        "v": {"name": "u", "index": 1},
+        "w": {"name": "w"},
+        "unit_mps": 2,
+        "unit_radps": -1,
+    }
     assert answered(output, u=[[9, 0.5]], w=[0.25]) == Command(1.0, -0.25)
 
 

@@ -15,13 +15,22 @@ from onnx import TensorProto, helper
 import cosim
 from cosim.core.errors import UsageError
 from cosim.core.state import Planned
-from cosim.episode.given import with_goal
-from cosim.policies.load import load_policy
+from cosim.episode.manifest_checks import with_goal
+from cosim.policies.load import load_policy, shipped_bundles
 from cosim.policies.onnx.graph import Graph
 from cosim.policies.onnx.manifest import file_facts
 from cosim.policies.onnx.policy import OnnxBatchPolicy, OnnxPolicy, example_differences, in_grey
-from cosim.policies.shipped import shipped_bundles
-from tests.policies.onnx.graphs import MANIFEST, PICTURE, POINT, bundle, echo, external, graph_bytes, port, tiny_graph
+from tests.support.graphs import (
+    MANIFEST,
+    PICTURE,
+    POINT,
+    bundle,
+    echo,
+    external,
+    graph_bytes,
+    port,
+    tiny_graph,
+)
 
 NAN = np.full((6 * 4 * 8, 1), np.nan, np.float32)
 HALF_NAN = np.array([1.0, np.nan], np.float16)
@@ -30,9 +39,17 @@ OVERFLOWS = [helper.make_node("Exp", ["obs"], ["action"])]
 CONDITIONAL = [helper.make_node("Reshape", ["obs", "shape"], ["action"])]
 OBS = port("obs", 1, 5, 2)
 WAYPOINTS = {"what": "waypoints", "name": "action"}
-ONES: dict[str, Any] = {"inputs": {"obs": {"what": "constant", "value": 1000}}, "goal": "none", "camera": None}
+ONES: dict[str, Any] = {
+    "inputs": {"obs": {"what": "constant", "value": 1000}},
+    "goal": "none",
+    "camera": None,
+}
 REFUSED: dict[str, tuple[bytes, dict[str, Any], str]] = {
-    "no-goal-input": (tiny_graph(), {"inputs": {"obs": PICTURE}}, "the graph wants 'goal' float32 (any, 2), of which"),
+    "no-goal-input": (
+        tiny_graph(),
+        {"inputs": {"obs": PICTURE}},
+        "the graph wants 'goal' float32 (any, 2), of which",
+    ),
     "other-input": (
         tiny_graph(),
         {"inputs": {"obs": PICTURE, "goal": POINT, "mask": {"what": "mask"}}},
@@ -41,7 +58,8 @@ REFUSED: dict[str, tuple[bytes, dict[str, Any], str]] = {
     "three-frames": (
         tiny_graph(),
         {"inputs": {"obs": {**PICTURE, "frames": 3}, "goal": POINT}},
-        "inputs.obs: the graph wants float32 (any, 6, 4, 8), and layout 'N(TC)HW' gives (1, 9, 4, 8)",
+        "inputs.obs: the graph wants float32 (any, 6, 4, 8), and layout 'N(TC)HW' gives (1, "
+        "9, 4, 8)",
     ),
     "three-values": (
         tiny_graph(),
@@ -66,27 +84,51 @@ REFUSED: dict[str, tuple[bytes, dict[str, Any], str]] = {
     "bytes": (
         echo(1, 6, 4, 8, kind=TensorProto.UINT8),
         {"inputs": {"obs": PICTURE}, "goal": "none"},
-        "inputs.obs: the graph wants uint8 (1, 6, 4, 8), whole numbers: say scale 1, without mean and std",
+        "inputs.obs: the graph wants uint8 (1, 6, 4, 8), whole numbers: say scale 1, without "
+        "mean and std",
     ),
-    "nan": (tiny_graph(bright=NAN), {}, "model.onnx: weights are NaN or infinite: bright; export it anew"),
+    "nan": (
+        tiny_graph(bright=NAN),
+        {},
+        "model.onnx: weights are NaN or infinite: bright; export it anew",
+    ),
     "half-nan": (tiny_graph(unused=HALF_NAN), {}, "weights are NaN or infinite: unused"),
     "text": (b"once upon a time", {}, "model.onnx: is no ONNX graph: is no protobuf message"),
     "empty": (b"", {}, "model.onnx: is no ONNX graph: has no graph; 0 bytes"),
     "cut": (tiny_graph()[:-40], {}, "ends too early"),
-    "garbled": (tiny_graph().replace(b"goal", b"go\xffl"), {}, "model.onnx: is refused by onnxruntime (1."),
-    "operator": (graph_bytes(FOREIGN, [OBS], [port("action", 1, 5, 2)]), ONES, "com.foo:Bar(-1) is not a registered"),
-    "opset": (graph_bytes(OVERFLOWS, [OBS], [port("action", 1, 5, 2)], opset=99), ONES, "): ONNX Runtime only"),
+    "garbled": (
+        tiny_graph().replace(b"goal", b"go\xffl"),
+        {},
+        "model.onnx: is refused by onnxruntime (1.",
+    ),
+    "operator": (
+        graph_bytes(FOREIGN, [OBS], [port("action", 1, 5, 2)]),
+        ONES,
+        "com.foo:Bar(-1) is not a registered",
+    ),
+    "opset": (
+        graph_bytes(OVERFLOWS, [OBS], [port("action", 1, 5, 2)], opset=99),
+        ONES,
+        "): ONNX Runtime only",
+    ),
     "overflow": (
         graph_bytes(OVERFLOWS, [OBS], [port("action", 1, 5, 2)]),
         ONES,
-        "in a grey street the policy output 'action' of the graph holds NaN or infinity: are its weights whole?",
+        "in a grey street the policy output 'action' of the graph holds NaN or infinity: are "
+        "its weights whole?",
     ),
     "reshape": (
-        graph_bytes(CONDITIONAL, [OBS], [port("action", "n", "m", 2)], {"shape": np.array([1, 7, 2])}),
+        graph_bytes(
+            CONDITIONAL, [OBS], [port("action", "n", "m", 2)], {"shape": np.array([1, 7, 2])}
+        ),
         ONES,
         "cannot be run by onnxruntime",
     ),
-    "text-output": (echo(1, 2, kind=TensorProto.STRING), ONES, "'obs' is a tensor(string): inputs and outputs are"),
+    "text-output": (
+        echo(1, 2, kind=TensorProto.STRING),
+        ONES,
+        "'obs' is a tensor(string): inputs and outputs are",
+    ),
     "size": (
         tiny_graph(),
         {"files": {"model.onnx": {"bytes": 7, "blake2b": "0" * 64}}},
@@ -114,7 +156,8 @@ REFUSED: dict[str, tuple[bytes, dict[str, Any], str]] = {
 def test_a_bundle_that_cannot_be_driven_is_refused_when_it_is_loaded(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], name: str
 ) -> None:
-    """In one message, with the bundle, the place, what was found and what was wanted; the runtime prints nothing."""
+    """In one message, with the bundle, the place, what was found and what was wanted; the runtime
+    prints nothing."""
     graph, fields, told = REFUSED[name]
     place = bundle(tmp_path / "net", graph, **fields)
     with pytest.raises(UsageError) as caught:
@@ -131,7 +174,9 @@ def test_a_folder_without_a_manifest_is_no_bundle(tmp_path: Path) -> None:
 
 def test_a_bundle_is_a_policy_from_python_too(tmp_path: Path) -> None:
     """Its waypoint is the share of the goal that the graph answers, in units of its manifest."""
-    policy = cosim.load_policy(f"onnx:{bundle(tmp_path, tiny_graph(bright=np.zeros((192, 1), np.float32)))}")
+    policy = cosim.load_policy(
+        f"onnx:{bundle(tmp_path, tiny_graph(bright=np.zeros((192, 1), np.float32)))}"
+    )
     policy.reset("a", 0)
     answer = policy.act(in_grey(policy.manifest))
     assert isinstance(answer, Planned)
@@ -147,7 +192,9 @@ def test_the_hash_of_a_bundle_covers_all_that_decides_its_answers(tmp_path: Path
 
     first = hash_of(bundle(tmp_path / "a", tiny_graph()))
     assert first == hash_of(bundle(tmp_path / "b", tiny_graph())) and len(first) == 16
-    assert first != hash_of(bundle(tmp_path / "b", tiny_graph(bright=np.ones((192, 1), np.float32))))
+    assert first != hash_of(
+        bundle(tmp_path / "b", tiny_graph(bright=np.ones((192, 1), np.float32)))
+    )
     assert first != hash_of(bundle(tmp_path / "b", tiny_graph(), version="2"))
     beside = external(tmp_path / "c")
     kept = hash_of(beside)
@@ -157,20 +204,27 @@ def test_the_hash_of_a_bundle_covers_all_that_decides_its_answers(tmp_path: Path
     assert hash_of(beside) != kept
 
 
-def test_weights_are_found_in_a_folder_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """$COSIM_WEIGHTS, where they do not lie beside the manifest; and they are held against its hash."""
+def test_weights_are_found_in_a_folder_of_their_own(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """$COSIM_WEIGHTS, where they do not lie beside the manifest; and they are held against its
+    hash."""
     files = {"tiny.onnx": {"bytes": len(tiny_graph()), "blake2b": file_facts(tiny_graph()).blake2b}}
     place = bundle(tmp_path / "net", tiny_graph(), model="tiny.onnx", files=files)
     (tmp_path / "weights").mkdir()
     shutil.move(place / "model.onnx", tmp_path / "weights" / "tiny.onnx")
     monkeypatch.setenv("COSIM_WEIGHTS", str(tmp_path / "weights"))
     assert load_policy(f"onnx:{place}").manifest.name == "tiny"
-    (tmp_path / "weights" / "tiny.onnx").write_bytes(tiny_graph(bright=np.ones((192, 1), np.float32)))
+    (tmp_path / "weights" / "tiny.onnx").write_bytes(
+        tiny_graph(bright=np.ones((192, 1), np.float32))
+    )
     with pytest.raises(UsageError, match="is another file than the manifest of 'tiny' says"):
         load_policy(f"onnx:{place}")
 
 
-def test_a_bundle_below_the_policies_is_one_by_its_plain_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bundle_below_the_policies_is_one_by_its_plain_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The name of its folder; it is told where a name is unknown."""
     (tmp_path / "bundles").mkdir()
     bundle(tmp_path / "bundles" / "tiny", tiny_graph())
@@ -183,29 +237,39 @@ def test_a_bundle_below_the_policies_is_one_by_its_plain_name(tmp_path: Path, mo
 def test_a_run_with_goals_that_a_bundle_cannot_take_is_refused(tmp_path: Path) -> None:
     """Unless its manifest says what stands for them."""
     driver = load_policy(f"onnx:{bundle(tmp_path / 'a', tiny_graph())}")
-    with pytest.raises(UsageError, match="wants goals route_point or final_point or random_point, and gets 'image'"):
+    with pytest.raises(
+        UsageError, match="wants goals route_point or final_point or random_point, and gets 'image'"
+    ):
         with_goal(driver.manifest, "image")
     inputs = {"obs": PICTURE, "goal": {**POINT, "missing": [1, 0]}}
     other = load_policy(f"onnx:{bundle(tmp_path / 'b', tiny_graph(), inputs=inputs)}")
     assert with_goal(other.manifest, "image").goal == "image"
 
 
-def test_a_provider_that_the_runtime_lacks_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_provider_that_the_runtime_lacks_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """With those that there are."""
     monkeypatch.setenv("COSIM_ONNX_PROVIDERS", "NoSuchExecutionProvider")
     with pytest.raises(
-        UsageError, match=r"has no NoSuchExecutionProvider here\. Valid choices: .*CPUExecutionProvider"
+        UsageError,
+        match=r"has no NoSuchExecutionProvider here\. Valid choices: .*CPUExecutionProvider",
     ):
         load_policy(f"onnx:{bundle(tmp_path, tiny_graph())}")
 
 
-def test_off_the_cpu_a_graph_answers_for_many_episodes_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each as if it were alone, with its own history; where the first axis is fixed, and on the CPU, one by one."""
-    place, fixed = bundle(tmp_path / "a", tiny_graph()), bundle(tmp_path / "b", echo(1, 5, 2), **ONES, output=WAYPOINTS)
+def test_off_the_cpu_a_graph_answers_for_many_episodes_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each as if it were alone, with its own history; where the first axis is fixed, and on the
+    CPU, one by one."""
+    place = bundle(tmp_path / "a", tiny_graph())
+    fixed = bundle(tmp_path / "b", echo(1, 5, 2), **ONES, output=WAYPOINTS)
     assert not load_policy(f"onnx:{place}").batches
     monkeypatch.setenv("COSIM_ONNX_PROVIDERS", "AzureExecutionProvider,CPUExecutionProvider")
     assert not load_policy(f"onnx:{fixed}").batches and load_policy(f"onnx:{place}").batches
-    together, alone = OnnxBatchPolicy(place), {name: OnnxPolicy(place) for name in "abc"}
+    together = OnnxBatchPolicy(place)
+    alone = {name: OnnxPolicy(place) for name in "abc"}
     draws = np.random.default_rng(0)
     for name, policy in alone.items():
         together.reset(name, 0)
@@ -216,7 +280,8 @@ def test_off_the_cpu_a_graph_answers_for_many_episodes_at_once(tmp_path: Path, m
             alone["b"].on_reset()
         grey = in_grey(together.manifest)
         asked = [
-            replace(grey, episode=name, rgb=draws.integers(0, 255, (32, 32, 3)).astype(np.uint8)) for name in "cab"
+            replace(grey, episode=name, rgb=draws.integers(0, 255, (32, 32, 3)).astype(np.uint8))
+            for name in "cab"
         ]
         answers = together.act_batch(asked)
         for one, answer in zip(asked, answers, strict=True):
@@ -236,13 +301,18 @@ def exemplary(tmp_path: Path) -> Callable[..., OnnxPolicy]:
     return made
 
 
-def test_the_example_of_a_bundle_is_held_against_its_graph(exemplary: Callable[..., OnnxPolicy]) -> None:
+def test_the_example_of_a_bundle_is_held_against_its_graph(
+    exemplary: Callable[..., OnnxPolicy],
+) -> None:
     """The largest difference of each output; what does not fit is said."""
-    obs, goal = np.ones((1, 6, 4, 8), np.float32), np.array([[1, 0]], np.float32)
+    obs = np.ones((1, 6, 4, 8), np.float32)
+    goal = np.array([[1, 0]], np.float32)
     right = exemplary(obs=obs, goal=goal)
     told = right.graph.ask({"obs": obs, "goal": goal}, ["action"])["action"]
     expected = {"expected.action": told + np.float32(0.5)}
-    assert example_differences(exemplary(obs=obs, goal=goal, **expected)) == pytest.approx({"action": 0.5})
+    assert example_differences(exemplary(obs=obs, goal=goal, **expected)) == pytest.approx(
+        {"action": 0.5}
+    )
     with pytest.raises(UsageError, match=r"example\.npz: has no array 'goal'"):
         example_differences(exemplary(obs=obs, **expected))
     with pytest.raises(UsageError, match="does not fit the graph"):
@@ -252,7 +322,9 @@ def test_the_example_of_a_bundle_is_held_against_its_graph(exemplary: Callable[.
 def test_every_fault_of_the_manifest_is_told_of_a_policy(tmp_path: Path) -> None:
     """As of a file, with the policy's name before it."""
     place = bundle(tmp_path, tiny_graph(), MANIFEST, goal="none", rate_hz=-1)
-    with pytest.raises(UsageError, match=r"policy 'onnx:.*manifest\.json: rate_hz must be in \(0, 20\]"):
+    with pytest.raises(
+        UsageError, match=r"policy 'onnx:.*manifest\.json: rate_hz must be in \(0, 20\]"
+    ):
         load_policy(f"onnx:{place}")
 
 
@@ -261,10 +333,14 @@ def test_the_hash_of_a_bundle_is_another_where_a_processor_answers_otherwise(
 ) -> None:
     """A runtime that rounds otherwise makes another policy of the same files."""
     folder = bundle(tmp_path / "tiny", tiny_graph())
-    here, ask = OnnxPolicy(folder).digest, Graph.ask
+    here = OnnxPolicy(folder).digest
+    ask = Graph.ask
 
     def next_number(graph: Graph, *words: Any) -> dict[str, Any]:
-        return {name: np.nextafter(told, told.dtype.type(9)) for name, told in ask(graph, *words).items()}
+        return {
+            name: np.nextafter(told, told.dtype.type(9))
+            for name, told in ask(graph, *words).items()
+        }
 
     assert OnnxPolicy(folder).digest == here
     monkeypatch.setattr(Graph, "ask", next_number)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cosim.episode.ports import Observation
+from cosim.episode.interfaces import Observation
 from cosim.policies.onnx.feeding import Feeder
 from cosim.policies.onnx.graph import TensorPort
 from cosim.policies.onnx.inputs import GraphInput
@@ -24,10 +24,14 @@ SEEN = Observation(tick=0, time_s=0.0, rgb=None, v_mps=1.2, w_radps=-0.3, robot=
 SMALL = {"what": "picture", "size": [4, 2], "layout": "TCHW"}
 
 
-def feeder(shape: Sequence[int | None], dtype: Any = np.float32, seed: int = 0, **inputs: dict[str, Any]) -> Feeder:
+def feeder(
+    shape: Sequence[int | None], dtype: Any = np.float32, seed: int = 0, **inputs: dict[str, Any]
+) -> Feeder:
     """Of inputs as a manifest has them, all of one shape."""
     made = msgspec.convert(inputs, dict[str, GraphInput])
-    return Feeder(made, {name: TensorPort(name, np.dtype(dtype), tuple(shape)) for name in made}, seed)
+    return Feeder(
+        made, {name: TensorPort(name, np.dtype(dtype), tuple(shape)) for name in made}, seed
+    )
 
 
 def level(value: int) -> NDArray[np.uint8]:
@@ -43,15 +47,18 @@ def first_pixels(feeding: Feeder, *levels: int) -> list[float]:
 
 
 def test_history_is_the_last_frames_with_the_first_before_the_beginning() -> None:
-    """Oldest or newest first, every so many, zeros where that is asked for; and the same after the robot was put
-    elsewhere."""
+    """Oldest or newest first, every so many, zeros where that is asked for; and the same after the
+    robot was put elsewhere."""
     told = feeder((3, 3, 2, 4), obs={**SMALL, "frames": 3})
     assert first_pixels(told, 1) == [1, 1, 1]
     assert first_pixels(told, 2) == [1, 1, 2]
     assert first_pixels(told, 3, 4, 5) == [3, 4, 5]
     told.forget()
     assert first_pixels(told, 6) == [6, 6, 6]
-    newest = feeder((3, 3, 2, 4), obs={**SMALL, "frames": 3, "every": 2, "order": "newest_first", "before": "zeros"})
+    newest = feeder(
+        (3, 3, 2, 4),
+        obs={**SMALL, "frames": 3, "every": 2, "order": "newest_first", "before": "zeros"},
+    )
     assert first_pixels(newest, 1, 2, 3, 4) == [4, 2, 0]
     assert first_pixels(newest, 5) == [5, 3, 1]
 
@@ -68,18 +75,39 @@ PICTURES: dict[str, tuple[dict[str, Any], tuple[int, ...], tuple[int, ...], floa
     "grey": ({"layout": "NCHW", "colour": "grey"}, (1, 1, 2, 4), (0, 0, 0, 0), 76 / 255),
     "grey-without-an-axis": ({"layout": "NHW", "colour": "grey"}, (1, 2, 4), (0, 1, 0), 76 / 255),
     "as-it-is": ({"layout": "NHWC", "scale": 1}, (1, 2, 4, 3), (0, 0, 3, 2), 51.0),
-    "normal": ({"layout": "NCHW", "mean": [0.5, 0, 0], "std": [0.25, 1, 1]}, (1, 3, 2, 4), (0, 0, 0, 0), 2.0),
+    "normal": (
+        {"layout": "NCHW", "mean": [0.5, 0, 0], "std": [0.25, 1, 1]},
+        (1, 3, 2, 4),
+        (0, 0, 0, 0),
+        2.0,
+    ),
     "right-half": ({"layout": "NCHW", "crop": [0.5, 0, 1, 1]}, (1, 3, 2, 4), (0, 2, 0, 0), 0.2),
     "middle": ({"layout": "NCHW", "size": [2, 2], "fit": "crop"}, (1, 3, 2, 2), (0, 0, 0, 0), 1.0),
-    "border-above": ({"layout": "NCHW", "size": [4, 4], "fit": "letterbox"}, (1, 3, 4, 4), (0, 0, 0, 0), 114 / 255),
-    "border-below": ({"layout": "NCHW", "size": [4, 4], "fit": "corner"}, (1, 3, 4, 4), (0, 0, 3, 0), 114 / 255),
-    "yuv": ({"layout": "NCHW", "colour": "yuv420", "size": [8, 4], "scale": 1}, (1, 6, 2, 4), (0, 5, 0, 0), 240.0),
+    "border-above": (
+        {"layout": "NCHW", "size": [4, 4], "fit": "letterbox"},
+        (1, 3, 4, 4),
+        (0, 0, 0, 0),
+        114 / 255,
+    ),
+    "border-below": (
+        {"layout": "NCHW", "size": [4, 4], "fit": "corner"},
+        (1, 3, 4, 4),
+        (0, 0, 3, 0),
+        114 / 255,
+    ),
+    "yuv": (
+        {"layout": "NCHW", "colour": "yuv420", "size": [8, 4], "scale": 1},
+        (1, 6, 2, 4),
+        (0, 5, 0, 0),
+        240.0,
+    ),
 }
 
 
 @pytest.mark.parametrize("name", PICTURES)
 def test_a_picture_becomes_the_tensor_that_its_input_says(name: str) -> None:
-    """A pixel of a picture that is red at the left and dark blue at the right is where it should be."""
+    """A pixel of a picture that is red at the left and dark blue at the right is where it should
+    be."""
     fields, shape, pixel, value = PICTURES[name]
     told = feeder(shape, obs=SMALL | fields).feed(replace(SEEN, rgb=COLOURED))["obs"]
     assert told.shape == shape and told.dtype == np.float32 and told.flags.c_contiguous
@@ -88,7 +116,9 @@ def test_a_picture_becomes_the_tensor_that_its_input_says(name: str) -> None:
 
 def test_pictures_stay_bytes_for_a_graph_of_bytes() -> None:
     """With scale 1, and as they were."""
-    told = feeder((None, 8, 16, 3), np.uint8, obs={**SMALL, "size": [16, 8], "layout": "NHWC", "scale": 1})
+    told = feeder(
+        (None, 8, 16, 3), np.uint8, obs={**SMALL, "size": [16, 8], "layout": "NHWC", "scale": 1}
+    )
     np.testing.assert_array_equal(told.feed(replace(SEEN, rgb=COLOURED))["obs"], COLOURED[None])
 
 
@@ -96,23 +126,49 @@ AHEAD_LEFT = PointGoal(3.0, 4.0)
 VECTORS: dict[str, tuple[dict[str, Any], Goal | None, list[float]]] = {
     "point": ({"what": "goal_point", "unit_m": 10}, AHEAD_LEFT, [0.3, 0.4]),
     "right-handed": ({"what": "goal_point", "values": ["-y", "x"]}, AHEAD_LEFT, [-4.0, 3.0]),
-    "polar": ({"what": "goal_point", "values": ["distance", "cos", "sin"], "unit_m": 20}, AHEAD_LEFT, [0.25, 0.6, 0.8]),
-    "not-beyond": ({"what": "goal_point", "values": ["x", "distance"], "most_m": 2.5}, AHEAD_LEFT, [1.5, 2.5]),
+    "polar": (
+        {"what": "goal_point", "values": ["distance", "cos", "sin"], "unit_m": 20},
+        AHEAD_LEFT,
+        [0.25, 0.6, 0.8],
+    ),
+    "not-beyond": (
+        {"what": "goal_point", "values": ["x", "distance"], "most_m": 2.5},
+        AHEAD_LEFT,
+        [1.5, 2.5],
+    ),
     "normal-point": ({"what": "goal_point", "mean": [1, 2], "std": [2, 4]}, AHEAD_LEFT, [1.0, 0.5]),
     "no-point": ({"what": "goal_point", "mean": [1, 2], "missing": [7, 8]}, None, [7.0, 8.0]),
-    "bearing": ({"what": "goal_point", "values": ["bearing"]}, PointGoal(0.0, -1.0), [-math.pi / 2]),
+    "bearing": (
+        {"what": "goal_point", "values": ["bearing"]},
+        PointGoal(0.0, -1.0),
+        [-math.pi / 2],
+    ),
     "speeds": ({"what": "speeds", "values": ["v", "w", "-w"]}, None, [1.2, -0.3, 0.3]),
-    "left-told": ({"what": "command"}, Instruction("Follow the sidewalk. In 5 m, turn left."), [-1.0]),
-    "left-not-yet": ({"what": "command"}, Instruction("Follow the sidewalk. In 10 m, turn left."), [0.0]),
+    "left-told": (
+        {"what": "command"},
+        Instruction("Follow the sidewalk. In 5 m, turn left."),
+        [-1.0],
+    ),
+    "left-not-yet": (
+        {"what": "command"},
+        Instruction("Follow the sidewalk. In 10 m, turn left."),
+        [0.0],
+    ),
     "right-due": ({"what": "command"}, Instruction("Bear right."), [1.0]),
     "crosswalk": ({"what": "command"}, Instruction("Cross the street at the crosswalk."), [0.0]),
-    "right-of-point": ({"what": "command", "right": [0, 0, 1], "left": [1, 0, 0], "straight": [0, 1, 0]},
-                       PointGoal(1.0, -1.0), [0.0, 0.0, 1.0]),
+    "right-of-point": (
+        {"what": "command", "right": [0, 0, 1], "left": [1, 0, 0], "straight": [0, 1, 0]},
+        PointGoal(1.0, -1.0),
+        [0.0, 0.0, 1.0],
+    ),
     "mask-without": ({"what": "mask", "given": 0, "missing": 1}, AHEAD_LEFT, [1.0]),
     "constant": ({"what": "constant", "value": [1, 2, 3]}, None, [1.0, 2.0, 3.0]),
-    "joined": ({"what": "joined", "parts": [{"what": "goal_point"}, {"what": "speeds"}]}, AHEAD_LEFT,
-               [3.0, 4.0, 1.2, -0.3]),
-}  # fmt: skip
+    "joined": (
+        {"what": "joined", "parts": [{"what": "goal_point"}, {"what": "speeds"}]},
+        AHEAD_LEFT,
+        [3.0, 4.0, 1.2, -0.3],
+    ),
+}
 
 
 @pytest.mark.parametrize("name", VECTORS)
@@ -130,7 +186,9 @@ def test_a_mask_tells_whether_another_input_has_its_goal() -> None:
         "goal": TensorPort("goal", np.dtype(np.float32), (1, 3, 2, 4)),
         "mask": TensorPort("mask", np.dtype(np.int64), (1,)),
     }
-    told = Feeder(msgspec.convert({"goal": goal, "mask": {"what": "mask"}}, dict[str, GraphInput]), ports, 0)
+    told = Feeder(
+        msgspec.convert({"goal": goal, "mask": {"what": "mask"}}, dict[str, GraphInput]), ports, 0
+    )
     assert told.feed(replace(SEEN, goal=ImageGoal(level(255))))["mask"].tolist() == [0]
     without = told.feed(replace(SEEN, goal=AHEAD_LEFT))
     assert without["mask"].tolist() == [1] and not without["goal"].any()
@@ -142,11 +200,15 @@ def test_a_route_patch_has_the_numbers_that_the_input_says() -> None:
     patch[:40, 40] = 255
     fields = {"what": "route_patch", "frames": 2, "on": 2, "off": -1, "layout": "NTHW"}
     told = feeder((1, 2, 80, 80), one=fields).feed(replace(SEEN, goal=RoutePatch(patch)))["one"]
-    assert told[0, 1, 0, 40] == told[0, 0, 39, 40] == 2 and told[0, 1, 41, 40] == told[0, 1, 0, 0] == -1
+    assert (
+        told[0, 1, 0, 40] == told[0, 0, 39, 40] == 2
+        and told[0, 1, 41, 40] == told[0, 1, 0, 0] == -1
+    )
 
 
 def test_past_positions_are_seen_from_where_the_robot_is_now() -> None:
-    """One that drove 2 m ahead, turned left and drove 1 m has its start 1 m behind and 2 m to the left of it."""
+    """One that drove 2 m ahead, turned left and drove 1 m has its start 1 m behind and 2 m to the
+    left of it."""
     told = feeder((1, 3, 2), one={"what": "past_positions", "frames": 3, "before": "zeros"})
     for place in ((0.0, 0.0, 0.0), (2.0, 0.0, math.pi / 2), (2.0, 1.0, math.pi / 2)):
         seen = told.feed(replace(SEEN, odometry=Odometry(*place)))["one"]
@@ -174,4 +236,8 @@ def test_noise_comes_from_the_seed_of_the_episode() -> None:
     """Anew for every answer, the same for the same seed."""
     first, same, other = (feeder((1, 8), seed=seed, one={"what": "noise"}) for seed in (3, 3, 4))
     drawn = [one.feed(SEEN)["one"] for one in (first, first, same, other)]
-    assert (drawn[0] == drawn[2]).all() and not (drawn[0] == drawn[1]).any() and not (drawn[0] == drawn[3]).any()
+    assert (
+        (drawn[0] == drawn[2]).all()
+        and not (drawn[0] == drawn[1]).any()
+        and not (drawn[0] == drawn[3]).any()
+    )

@@ -1,4 +1,5 @@
-"""Bundles that were made to do harm: refused in words, before they are read, never a traceback or a hang."""
+"""Bundles that were made to do harm: refused in words, before they are read, never a traceback or a
+hang."""
 
 from __future__ import annotations
 
@@ -16,15 +17,19 @@ import pytest
 from cosim.core.errors import UsageError
 from cosim.policies.load import load_policy
 from cosim.policies.onnx.policy import OnnxPolicy, example_differences
-from scenarios.policy_check.of_answers import example
-from tests.policies.onnx.graphs import MANIFEST, bundle, tiny_graph
+from scenarios.tools.policy_check.answer_checks import example
+from tests.support.graphs import MANIFEST, bundle, tiny_graph
 
-OBS, GOAL = np.ones((1, 6, 4, 8), np.float32), np.array([[1, 0]], np.float32)
+OBS = np.ones((1, 6, 4, 8), np.float32)
+GOAL = np.array([[1, 0]], np.float32)
 HUGE = 4 << 30
 
 
 def saved(path: Path, **arrays: np.ndarray[Any, Any]) -> None:
-    np.savez(path, **{"obs": OBS, "goal": GOAL, "expected.action": np.zeros((1, 5, 2), np.float32)} | arrays)
+    np.savez(
+        path,
+        **{"obs": OBS, "goal": GOAL, "expected.action": np.zeros((1, 5, 2), np.float32)} | arrays,
+    )
 
 
 def cut_off(path: Path) -> None:
@@ -54,7 +59,9 @@ def bomb(path: Path) -> None:
 def long_header(path: Path) -> None:
     """An array of a few bytes that says that it has 10**15 numbers."""
     with zipfile.ZipFile(path, "w") as held, held.open("obs.npy", "w") as out:
-        np.lib.format.write_array_header_1_0(out, {"descr": "<f4", "fortran_order": False, "shape": (10**15,)})
+        np.lib.format.write_array_header_1_0(
+            out, {"descr": "<f4", "fortran_order": False, "shape": (10**15,)}
+        )
         out.write(bytes(64))
 
 
@@ -62,29 +69,51 @@ EXAMPLES: dict[str, tuple[Callable[[Path], None], str]] = {
     "cut off": (cut_off, "cannot be read as .npz"),
     "a bit flipped": (flipped, "cannot be read as .npz"),
     "empty": (lambda path: path.write_bytes(b"") and None, "cannot be read as .npz"),
-    "no zip": (lambda path: path.write_text("once upon a time") and None, "cannot be read as .npz: File is not a zip"),
-    "objects": (lambda path: saved(path, obs=np.array([{}], object)), "'obs' holds objects of Python"),
-    "other type": (lambda path: saved(path, obs=OBS.astype(float)), "'obs' is float64 (1, 6, 4, 8), and the graph"),
-    "texts": (lambda path: saved(path, **{"expected.action": np.array(["a"])}), "'expected.action' is str32 (1,), and"),
-    "other shape": (lambda path: saved(path, goal=GOAL[0]), "'goal' is float32 (2,), and the graph takes float32"),
+    "no zip": (
+        lambda path: path.write_text("once upon a time") and None,
+        "cannot be read as .npz: File is not a zip",
+    ),
+    "objects": (
+        lambda path: saved(path, obs=np.array([{}], object)),
+        "'obs' holds objects of Python",
+    ),
+    "other type": (
+        lambda path: saved(path, obs=OBS.astype(float)),
+        "'obs' is float64 (1, 6, 4, 8), and the graph",
+    ),
+    "texts": (
+        lambda path: saved(path, **{"expected.action": np.array(["a"])}),
+        "'expected.action' is str32 (1,), and",
+    ),
+    "other shape": (
+        lambda path: saved(path, goal=GOAL[0]),
+        "'goal' is float32 (2,), and the graph takes float32",
+    ),
     "no arrays": (lambda path: np.savez(path), "has no array 'goal'; it has none"),
     "4 GB": (sparse, "holds 4294967296 bytes; at most 536870912 are read"),
     "a bomb": (bomb, "unpacks to 1 arrays of 4294967296 bytes; at most 536870912 bytes are read"),
-    "a long header": (long_header, "'obs' should hold (1000000000000000,) of float32, and has 64 bytes"),
+    "a long header": (
+        long_header,
+        "'obs' should hold (1000000000000000,) of float32, and has 64 bytes",
+    ),
     "a pipe": (lambda path: os.mkfifo(path), "is no regular file"),
     "a folder": (lambda path: path.mkdir(), "is no regular file"),
 }
 
 
 @pytest.mark.parametrize("name", EXAMPLES)
-def test_an_example_that_cannot_be_used_is_refused_before_it_is_read(tmp_path: Path, name: str) -> None:
+def test_an_example_that_cannot_be_used_is_refused_before_it_is_read(
+    tmp_path: Path, name: str
+) -> None:
     """In one line with its file, what was found and what is wanted."""
     place = bundle(tmp_path / "net", tiny_graph())
     make, told = EXAMPLES[name]
     make(place / "example.npz")
     with pytest.raises(UsageError) as caught:
         example_differences(OnnxPolicy(place))
-    assert str(caught.value).startswith(f"{place}/example.npz: ") and told in str(caught.value), caught.value
+    assert str(caught.value).startswith(f"{place}/example.npz: ") and told in str(caught.value), (
+        caught.value
+    )
     assert "\n" not in str(caught.value)
 
 
@@ -114,25 +143,44 @@ def located(name: str) -> bytes:
 
 def in_a_function(place: Path) -> None:
     """A constant of a function of the graph's own names the file."""
-    far = onnx.TensorProto(name="far", data_type=onnx.TensorProto.FLOAT, dims=[1], raw_data=bytes(4))
+    far = onnx.TensorProto(
+        name="far", data_type=onnx.TensorProto.FLOAT, dims=[1], raw_data=bytes(4)
+    )
     onnx.external_data_helper.set_external_data(far, "../secret")
     far.ClearField("raw_data")
     model = onnx.load_from_string(tiny_graph())
     node = onnx.helper.make_node("Constant", [], ["out"])
     node.attribute.append(onnx.helper.make_attribute("value", far))
-    model.functions.append(onnx.helper.make_function("own", "F", [], ["out"], [node], model.opset_import))
+    model.functions.append(
+        onnx.helper.make_function("own", "F", [], ["out"], [node], model.opset_import)
+    )
     bundle(place, model.SerializeToString())
 
 
 FACTS = {"bytes": 7, "blake2b": "0" * 64}
 PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
-    "NUL": (lambda place: bundle(place, located("a\0b")), "has weights in a file beside it: 'a\\x00b' is no name of"),
-    "weights above": (lambda place: bundle(place, located("../secret")), "'../secret' is no name of a file"),
+    "NUL": (
+        lambda place: bundle(place, located("a\0b")),
+        "has weights in a file beside it: 'a\\x00b' is no name of",
+    ),
+    "weights above": (
+        lambda place: bundle(place, located("../secret")),
+        "'../secret' is no name of a file",
+    ),
     "weights above, in a function": (in_a_function, "'../secret' is no name of a file"),
     "weights without a name": (lambda place: bundle(place, located("")), "'' is no name of a file"),
-    "weights that are a folder": (lambda place: (bundle(place, located("d")), (place / "d").mkdir()), "is no regular"),
-    "a key above": (lambda place: bundle(place, tiny_graph(), files={"../x": FACTS}), "files: '../x' is no name"),
-    "an absolute key": (lambda place: bundle(place, tiny_graph(), files={"/etc/passwd": FACTS}), "'/etc/passwd' is no"),
+    "weights that are a folder": (
+        lambda place: (bundle(place, located("d")), (place / "d").mkdir()),
+        "is no regular",
+    ),
+    "a key above": (
+        lambda place: bundle(place, tiny_graph(), files={"../x": FACTS}),
+        "files: '../x' is no name",
+    ),
+    "an absolute key": (
+        lambda place: bundle(place, tiny_graph(), files={"/etc/passwd": FACTS}),
+        "'/etc/passwd' is no",
+    ),
     "a key with NUL": (
         lambda place: bundle(place, tiny_graph(), files={"a\0": FACTS}),
         "'a\\x00' is no name of a file",
@@ -143,7 +191,8 @@ PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
 
 @pytest.mark.parametrize("name", PLACES)
 def test_a_bundle_reads_no_file_outside_its_folder(tmp_path: Path, name: str) -> None:
-    """Neither by a key of `files`, nor by a name in the graph, nor by a link: it is named and refused."""
+    """Neither by a key of `files`, nor by a name in the graph, nor by a link: it is named and
+    refused."""
     place = bundle(tmp_path / "net", tiny_graph(), MANIFEST)
     make, told = PLACES[name]
     make(place)

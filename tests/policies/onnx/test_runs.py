@@ -1,4 +1,5 @@
-"""Runs with an ONNX bundle: the street is that of the same policy as a class, wherever it is asked."""
+"""Runs with an ONNX bundle: the street is that of the same policy as a class, wherever it is
+asked."""
 
 from __future__ import annotations
 
@@ -11,16 +12,18 @@ import pytest
 from numpy.typing import NDArray
 from onnx import helper
 
-from cosim.episode.ports import CameraSpec, Manifest, Observation, WaypointRule
+from cosim.episode.interfaces import Observation
 from cosim.policies.load import load_policy
-from cosim.records.run_folder import read_records
+from cosim.results.run_folder import read_records
+from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import PointGoal
+from cosim.spec.manifest import Manifest, WaypointRule
 from cosim.spec.scenario import Scenario, Suite, write_suite
-from scenarios.checks import small_scenario
-from scenarios.execution.run import run_episode
+from scenarios.episodes.run_episode import run_episode
+from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import Cosim
-from tests.documents import blocks, shell_lines
-from tests.policies.onnx.graphs import bundle, graph_bytes, port, tiny_graph
+from tests.support.documents import blocks, shell_lines
+from tests.support.graphs import bundle, graph_bytes, port, tiny_graph
 
 BLIND = tiny_graph(bright=np.zeros((6 * 4 * 8, 1), np.float32))
 SEED = ("--seed", "5")
@@ -30,7 +33,10 @@ class Twin:
     """What the graph `BLIND` answers, written out."""
 
     manifest = Manifest(
-        "tiny", camera=CameraSpec(32, 32), goal="route_point", waypoints=WaypointRule(index=2, unit_m=1.0, dt_s=0.25)
+        "tiny",
+        camera=CameraSpec(32, 32),
+        goal="route_point",
+        waypoints=WaypointRule(index=2, unit_m=1.0, dt_s=0.25),
     )
 
     def reset(self, episode_id: str, seed: int) -> None:
@@ -49,34 +55,52 @@ def second(name: str) -> Scenario:
 
 @pytest.mark.engine
 def test_a_bundle_drives_like_the_same_policy_as_a_class(tmp_path: Path) -> None:
-    """Same answers, same state hash; its record tells camera, goal and rule of waypoints by the bundle's manifest."""
+    """Same answers, same state hash; its record tells camera, goal and rule of waypoints by the
+    bundle's manifest."""
     graph = run_episode(second("a"), load_policy(f"onnx:{bundle(tmp_path / 'net', BLIND)}")).record
     twin = run_episode(second("a"), Twin()).record
     assert graph.state_hash == twin.state_hash and graph.status == "done", graph.reason
-    assert (graph.camera, graph.goal_protocol, graph.waypoints) == (twin.camera, "route_point", twin.waypoints)
+    assert (graph.camera, graph.goal_protocol, graph.waypoints) == (
+        twin.camera,
+        "route_point",
+        twin.waypoints,
+    )
 
 
 @pytest.mark.engine
-def test_a_bundle_drives_alike_in_its_own_process_and_in_several(tmp_path: Path, cosim: Cosim) -> None:
+def test_a_bundle_drives_alike_in_its_own_process_and_in_several(
+    tmp_path: Path, cosim: Cosim
+) -> None:
     """A graph that sees the street gives the same bits with --jobs 2, and with --isolated."""
     bundle(tmp_path / "net", tiny_graph())
-    write_suite(Suite(name="two", version="1", scenarios=(second("a"), second("b"))), tmp_path / "two.json")
+    write_suite(
+        Suite(name="two", version="1", scenarios=(second("a"), second("b"))), tmp_path / "two.json"
+    )
     words = ("run", "two.json", "--policy", "onnx:net", *SEED)
     both = cosim(*words, "--jobs", "2", "--out", "both", cwd=tmp_path)
     alone = cosim(*words, "--scenario", "b", "--isolated", "--out", "alone", cwd=tmp_path)
     assert (both.returncode, alone.returncode) == (0, 0), both.stderr + alone.stderr
     hashes = {one.scenario: one.state_hash for one in read_records(tmp_path / "both")}
     (isolated,) = read_records(tmp_path / "alone")
-    assert isolated.policy_runs == "isolated" and isolated.state_hash == hashes["b"] and len(hashes) == 2
+    assert (
+        isolated.policy_runs == "isolated"
+        and isolated.state_hash == hashes["b"]
+        and len(hashes) == 2
+    )
 
 
 @pytest.mark.engine
 def test_the_bundle_of_the_documents_runs_as_it_is_written(tmp_path: Path, cosim: Cosim) -> None:
-    """Its manifest, and its command on a short suite, with a graph of those inputs and that output."""
+    """Its manifest, and its command on a short suite, with a graph of those inputs and that
+    output."""
     ((_, _, _, manifest),) = blocks("json", "docs/onnx.md")
-    (command,) = (words for _, words in shell_lines("docs/onnx.md") if words[-1] == "onnx:my_network")
+    (command,) = (
+        words for _, words in shell_lines("docs/onnx.md") if words[-1] == "onnx:my_network"
+    )
     assert len(manifest.splitlines()) < 10
-    frames, goal, plan = port("frames", 1, 12, 90, 160), port("goal", 1, 3), port("waypoints", 1, 8, 2)
+    frames = port("frames", 1, 12, 90, 160)
+    goal = port("goal", 1, 3)
+    plan = port("waypoints", 1, 8, 2)
     nodes = [
         helper.make_node("ReduceMean", ["frames"], ["light"]),
         helper.make_node("MatMul", ["goal", "way"], ["ahead"]),
@@ -84,22 +108,44 @@ def test_the_bundle_of_the_documents_runs_as_it_is_written(tmp_path: Path, cosim
         helper.make_node("Reshape", ["row", "shape"], ["waypoints"]),
     ]
     weights = {"way": np.ones((3, 16), np.float32), "shape": np.array([1, 8, 2])}
-    bundle(tmp_path / "my_network", graph_bytes(nodes, [frames, goal], [plan], weights), json.loads(manifest))
-    write_suite(Suite(name="reactive", version="1", scenarios=(second("a"),)), tmp_path / "one.json")
-    said = cosim(*["one.json" if word == "reactive" else word for word in command[1:]], "--out", "run", cwd=tmp_path)
+    bundle(
+        tmp_path / "my_network",
+        graph_bytes(nodes, [frames, goal], [plan], weights),
+        json.loads(manifest),
+    )
+    write_suite(
+        Suite(name="reactive", version="1", scenarios=(second("a"),)), tmp_path / "one.json"
+    )
+    said = cosim(
+        *["one.json" if word == "reactive" else word for word in command[1:]],
+        "--out",
+        "run",
+        cwd=tmp_path,
+    )
     (record,) = read_records(tmp_path / "run")
-    assert said.returncode == 0 and (record.policy, record.status) == ("my-network", "done"), said.stderr
+    assert said.returncode == 0 and (record.policy, record.status) == ("my-network", "done"), (
+        said.stderr
+    )
 
 
-def test_a_run_that_a_bundle_cannot_drive_is_refused_before_it_begins(tmp_path: Path, cosim: Cosim) -> None:
-    """Exit code 2, one line, no folder: for goals that the graph cannot take, and for a file that is no graph."""
+def test_a_run_that_a_bundle_cannot_drive_is_refused_before_it_begins(
+    tmp_path: Path, cosim: Cosim
+) -> None:
+    """Exit code 2, one line, no folder: for goals that the graph cannot take, and for a file that
+    is no graph."""
     bundle(tmp_path / "net", tiny_graph())
     write_suite(Suite(name="one", version="1", scenarios=(second("a"),)), tmp_path / "one.json")
     bundle(tmp_path / "text", b"once upon a time")
     for words, told in (
-        (("--policy", "onnx:net", "--goal", "image"), "policy 'tiny' wants goals route_point or final_point or random"),
+        (
+            ("--policy", "onnx:net", "--goal", "image"),
+            "policy 'tiny' wants goals route_point or final_point or random",
+        ),
         (("--policy", "onnx:text"), "policy 'onnx:text': text/model.onnx: is no ONNX graph"),
-        (("--policy", "onnx:nowhere"), "policy 'onnx:nowhere': nowhere: no bundle: has no manifest.json"),
+        (
+            ("--policy", "onnx:nowhere"),
+            "policy 'onnx:nowhere': nowhere: no bundle: has no manifest.json",
+        ),
     ):
         said = cosim("run", "one.json", "--out", "run", *words, cwd=tmp_path)
         assert said.returncode == 2 and f"error: {told}" in said.stderr, said.stderr

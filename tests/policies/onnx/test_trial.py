@@ -1,4 +1,5 @@
-"""Graphs on trial: what never answers, asks for too much memory or ends its process is refused, and leaves nothing."""
+"""Graphs on trial: what never answers, asks for too much memory or ends its process is refused, and
+leaves nothing."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ from cosim.core.errors import UsageError
 from cosim.policies.onnx.graph import Graph
 from cosim.policies.onnx.policy import OnnxPolicy, example_differences
 from tests.conftest import PATIENCE_S, ROOT, WIDE, Cosim, still_runs
-from tests.policies.onnx.graphs import bundle, graph_bytes, port, tiny_graph
+from tests.support.graphs import bundle, graph_bytes, port, tiny_graph
 
 OBS, ACTION = port("obs", 1, 5, 2), port("action", 1, 5, 2)
 
@@ -27,15 +28,20 @@ OBS, ACTION = port("obs", 1, 5, 2), port("action", 1, 5, 2)
 def constant(value: float) -> dict[str, Any]:
     """The fields of a manifest whose graph gets so many times this value."""
     return {
-        "inputs": {"obs": {"what": "constant", "value": value}}, "goal": "none", "camera": None,
+        "inputs": {"obs": {"what": "constant", "value": value}},
+        "goal": "none",
+        "camera": None,
         "output": {"what": "waypoints", "name": "action"},
-    }  # fmt: skip
+    }
 
 
 def endless() -> bytes:
     """A graph that loops as long as the sum of its input is more than 0."""
     body = helper.make_graph(
-        [helper.make_node("Identity", ["on"], ["still_on"]), helper.make_node("Identity", ["x"], ["same_x"])],
+        [
+            helper.make_node("Identity", ["on"], ["still_on"]),
+            helper.make_node("Identity", ["x"], ["same_x"]),
+        ],
         "body",
         [port("i", kind=TensorProto.INT64), port("on", kind=TensorProto.BOOL), port("x", 1, 5, 2)],
         [port("still_on", kind=TensorProto.BOOL), port("same_x", 1, 5, 2)],
@@ -59,21 +65,48 @@ def hungry() -> bytes:
 
 
 def test_a_graph_that_never_answers_is_refused(tmp_path: Path, cosim: Cosim) -> None:
-    """When the start timeout is over, before anything is run: exit code 2, and how to give more time."""
-    place, before = bundle(tmp_path / "net", endless(), **constant(1.0)), {*psutil.Process().children()}
-    said = cosim("run", "unit", "--policy", f"onnx:{place}", "--episodes", "1", "--start-timeout", "0.5", cwd=tmp_path)
+    """When the start timeout is over, before anything is run: exit code 2, and how to give more
+    time."""
+    place = bundle(tmp_path / "net", endless(), **constant(1.0))
+    before = {*psutil.Process().children()}
+    said = cosim(
+        "run",
+        "unit",
+        "--policy",
+        f"onnx:{place}",
+        "--episodes",
+        "1",
+        "--start-timeout",
+        "0.5",
+        cwd=tmp_path,
+    )
     told = (
-        f"{place}/model.onnx: gives no answer within 0.5 s, to be loaded and to answer: it may hold a loop without end"
+        f"{place}/model.onnx: gives no answer within 0.5 s, to be loaded and to answer: it may "
+        f"hold a loop without end"
     )
     assert said.returncode == 2 and told in said.stderr and "--start-timeout" in said.stderr, said
-    assert {path.name for path in tmp_path.iterdir()} == {"net"} and {*psutil.Process().children()} <= before
+    assert {path.name for path in tmp_path.iterdir()} == {"net"} and {
+        *psutil.Process().children()
+    } <= before
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL], ids=lambda how: how.name)
-def test_a_graph_that_never_answers_is_ended_with_its_command(tmp_path: Path, how: signal.Signals) -> None:
+def test_a_graph_that_never_answers_is_ended_with_its_command(
+    tmp_path: Path, how: signal.Signals
+) -> None:
     """By Ctrl-C, by kill -9: at once, and its child with it."""
     place = bundle(tmp_path / "net", endless(), **constant(1.0))
-    words = [sys.executable, "-m", "cosim", "run", "unit", "--policy", f"onnx:{place}", "--episodes", "1"]
+    words = [
+        sys.executable,
+        "-m",
+        "cosim",
+        "run",
+        "unit",
+        "--policy",
+        f"onnx:{place}",
+        "--episodes",
+        "1",
+    ]
     if how == signal.SIGKILL:  # from Python it is the same
         words[1:] = ["-c", f"import cosim; cosim.load_policy('onnx:{place}')"]
     environment = {**os.environ, **WIDE, "PYTHONPATH": str(ROOT)}
@@ -84,7 +117,10 @@ def test_a_graph_that_never_answers_is_ended_with_its_command(tmp_path: Path, ho
             time.sleep(0.01)
         os.kill(command.pid, how)
         code = command.wait(PATIENCE_S)
-        assert code == (-how if how == signal.SIGKILL else 130) and b"Traceback" not in (command.stderr or b"").read()
+        assert (
+            code == (-how if how == signal.SIGKILL else 130)
+            and b"Traceback" not in (command.stderr or b"").read()
+        )
     while any(still_runs(child.pid) for child in children):
         assert time.monotonic() < until_s
         time.sleep(0.01)
@@ -94,16 +130,21 @@ def test_a_graph_that_asks_for_too_much_memory_is_refused(tmp_path: Path) -> Non
     """With the words of the runtime, and how much a graph may use."""
     place = bundle(tmp_path / "net", hungry(), **constant(1.0))
     with pytest.raises(
-        UsageError, match=r"cannot be run by onnxruntime: .*allocate.* \(a graph may use 4 GiB and 8 times"
+        UsageError,
+        match=r"cannot be run by onnxruntime: .*allocate.* \(a graph may use 4 GiB and 8 times",
     ):
         OnnxPolicy(place)
 
 
-def test_a_graph_that_ends_its_process_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_graph_that_ends_its_process_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """As a fault of compiled code would: this process goes on, and the signal is named."""
     place = bundle(tmp_path / "net", tiny_graph())
     monkeypatch.setattr(Graph, "ask", lambda *_: os.kill(os.getpid(), signal.SIGKILL))
-    with pytest.raises(UsageError, match="ends onnxruntime: the process that ran it was killed by SIGKILL"):
+    with pytest.raises(
+        UsageError, match="ends onnxruntime: the process that ran it was killed by SIGKILL"
+    ):
         OnnxPolicy(place)
 
 
@@ -117,6 +158,10 @@ def test_an_example_that_never_ends_is_refused(tmp_path: Path) -> None:
 
 
 def test_a_trial_answers_with_the_bits_of_this_process(tmp_path: Path) -> None:
-    """The hash of a policy is the same with a trial and without, as in a worker, which its run limits."""
-    place = bundle(tmp_path / "net", tiny_graph(bright=np.random.default_rng(0).random((192, 1)).astype(np.float32)))
+    """The hash of a policy is the same with a trial and without, as in a worker, which its run
+    limits."""
+    place = bundle(
+        tmp_path / "net",
+        tiny_graph(bright=np.random.default_rng(0).random((192, 1)).astype(np.float32)),
+    )
     assert OnnxPolicy(place).digest == OnnxPolicy(place, within_s=None).digest

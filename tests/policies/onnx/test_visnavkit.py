@@ -1,4 +1,5 @@
-"""Exports of visnavkit are read as they are: graph, metadata and example inputs beside one another."""
+"""Exports of visnavkit are read as they are: graph, metadata and example inputs beside one
+another."""
 
 from __future__ import annotations
 
@@ -16,31 +17,43 @@ from onnx import ValueInfoProto, helper
 from cosim.core.errors import UsageError
 from cosim.core.state import Planned
 from cosim.policies.load import load_policy
-from cosim.policies.onnx.policy import example_differences, in_grey
-from cosim.policies.onnx.reading import read_bundle
-from tests.policies.onnx.graphs import graph_bytes, port
+from cosim.policies.onnx.policy import example_differences, in_grey, read_bundle
+from tests.support.graphs import graph_bytes, port
 
 BOUNDS = np.array([[[0.0, -0.1, -0.1, 0.0, -0.9], [0.2, 0.1, 0.1, 2.8, 0.9]]], np.float32)
 WINDOW = {
-    "vision": (1, 4, 3, 18, 32), "route_patch": (1, 4, 80, 80), "goal": (1, 4, 3), "ego": (1, 4, 2),
+    "vision": (1, 4, 3, 18, 32),
+    "route_patch": (1, 4, 80, 80),
+    "goal": (1, 4, 3),
+    "ego": (1, 4, 2),
     "action_bounds": (1, 2, 5),
-}  # fmt: skip
+}
 FRAME = {"vision": (1, 3, 24, 32), "feature_buffer": (1, 3, 2), "goal": (1, 3)}
 
 
-def exported(folder: Path, name: str, graph: bytes, shapes: Mapping[str, tuple[int, ...]], **metadata: Any) -> Path:
-    """The three files, as the exporter writes them; the example of an input is 0, of action bounds the bounds."""
+def exported(
+    folder: Path, name: str, graph: bytes, shapes: Mapping[str, tuple[int, ...]], **metadata: Any
+) -> Path:
+    """The three files, as the exporter writes them; the example of an input is 0, of action bounds
+    the bounds."""
     folder.mkdir(exist_ok=True)
     (folder / f"{name}.onnx").write_bytes(graph)
     example = {one: np.zeros(shape, np.float32) for one, shape in shapes.items()}
     np.savez(
-        folder / f"{name}.inputs.npz", **(example | ({"action_bounds": BOUNDS} if "action_bounds" in shapes else {}))
+        folder / f"{name}.inputs.npz",
+        **(example | ({"action_bounds": BOUNDS} if "action_bounds" in shapes else {})),
     )
     told = {
-        "exp_name": "flowpilot dst", "model": "FlowPilotDST", "precision": "fp32", "seed": 0, "opset": 17,
-        "onnx_sha256": hashlib.sha256(graph).hexdigest(), "input_names": list(shapes), "input_shapes": dict(shapes),
+        "exp_name": "flowpilot dst",
+        "model": "FlowPilotDST",
+        "precision": "fp32",
+        "seed": 0,
+        "opset": 17,
+        "onnx_sha256": hashlib.sha256(graph).hexdigest(),
+        "input_names": list(shapes),
+        "input_shapes": dict(shapes),
         "input_dtypes": dict.fromkeys(shapes, "float32"),
-    }  # fmt: skip
+    }
     (folder / f"{name}.metadata.json").write_text(json.dumps(told | metadata))
     return folder
 
@@ -50,8 +63,9 @@ def ports(shapes: Mapping[str, tuple[int, ...]]) -> list[ValueInfoProto]:
 
 
 def window_export(folder: Path, **metadata: Any) -> Path:
-    """A graph of two plans of eight steps: every step of both is [the mean of vision, of the goal's distances, of the
-    route, the largest of the bounds, the newest w]; the second is the more probable."""
+    """A graph of two plans of eight steps: every step of both is [the mean of vision, of the goal's
+    distances, of the route, the largest of the bounds, the newest w]; the second is the more
+    probable."""
     columns = ("light", "far_m", "route", "fast", "turn")
     nodes = [
         helper.make_node("ReduceMean", ["vision"], ["light"], keepdims=0),
@@ -65,22 +79,32 @@ def window_export(folder: Path, **metadata: Any) -> Path:
         helper.make_node("Concat", [f"{one}1" for one in columns], ["row"], axis=0),
         helper.make_node("Mul", ["row", "both"], ["modes"]),
         helper.make_node("Identity", ["scores"], ["probs"]),
-    ]  # fmt: skip
+    ]
     both = np.ones((1, 2, 8, 5), np.float32) * np.array([0.5, 1.0], np.float32)[None, :, None, None]
     weights = {
-        "zero": np.array([0]), "last": np.array([3, 1]), "end": np.array([4, 2]), "axes": np.array([1, 2]),
-        "both": both, "scores": np.array([[0.2, 0.7]], np.float32),
-    }  # fmt: skip
-    graph = graph_bytes(nodes, ports(WINDOW), [port("modes", 1, 2, 8, 5), port("probs", 1, 2)], weights)
+        "zero": np.array([0]),
+        "last": np.array([3, 1]),
+        "end": np.array([4, 2]),
+        "axes": np.array([1, 2]),
+        "both": both,
+        "scores": np.array([[0.2, 0.7]], np.float32),
+    }
+    graph = graph_bytes(
+        nodes, ports(WINDOW), [port("modes", 1, 2, 8, 5), port("probs", 1, 2)], weights
+    )
     shapes = {"modes": (1, 2, 8, 5), "probs": (1, 2)}
     return exported(
-        folder, "dst", graph, WINDOW, **{"output_shapes": shapes, "config": {"plan_len_seconds": 0.4}} | metadata
+        folder,
+        "dst",
+        graph,
+        WINDOW,
+        **{"output_shapes": shapes, "config": {"plan_len_seconds": 0.4}} | metadata,
     )
 
 
 def frame_export(folder: Path) -> Path:
-    """A graph of two modes of five points (x, y, v), whose buffer counts the answers: x of every point of the second,
-    better one is the sum of the buffer's first column, y the goal's sine."""
+    """A graph of two modes of five points (x, y, v), whose buffer counts the answers: x of every
+    point of the second, better one is the sum of the buffer's first column, y the goal's sine."""
     flat = 5 * 2 * 3 + 1
     way = np.zeros((2, 2 * flat), np.float32)
     way[0, flat : flat + 15 : 3], way[1, flat + 1 : flat + 15 : 3] = 1.0, 1.0
@@ -98,10 +122,17 @@ def frame_export(folder: Path) -> Path:
         helper.make_node("Add", ["dark", "token"], ["feat_out"]),
     ]
     weights = {
-        "one": np.array([1]), "zero": np.array([0]), "two": np.array([2]), "way": way, "score": score,
-        "none": np.zeros((1, 2), np.float32), "token": np.array([[1, 5]], np.float32),
-    }  # fmt: skip
-    graph = graph_bytes(nodes, ports(FRAME), [port("plan", 1, 2 * flat), port("feat_out", 1, 2)], weights)
+        "one": np.array([1]),
+        "zero": np.array([0]),
+        "two": np.array([2]),
+        "way": way,
+        "score": score,
+        "none": np.zeros((1, 2), np.float32),
+        "token": np.array([[1, 5]], np.float32),
+    }
+    graph = graph_bytes(
+        nodes, ports(FRAME), [port("plan", 1, 2 * flat), port("feat_out", 1, 2)], weights
+    )
     common = {"plan_len_seconds": 2, "plan_len_points": 5, "use_full_pose": True}
     return exported(
         folder,
@@ -113,12 +144,18 @@ def frame_export(folder: Path) -> Path:
     )
 
 
-def test_the_graph_of_a_window_is_driven_by_the_first_speeds_of_its_best_plan(tmp_path: Path) -> None:
-    """Frames, patches, goals and speeds for every slot of 50 ms; bounds as they were exported; the goal ahead, because
-    the run tells the route."""
+def test_the_graph_of_a_window_is_driven_by_the_first_speeds_of_its_best_plan(
+    tmp_path: Path,
+) -> None:
+    """Frames, patches, goals and speeds for every slot of 50 ms; bounds as they were exported; the
+    goal ahead, because the run tells the route."""
     driver = load_policy(f"onnx:{window_export(tmp_path)}")
     manifest = driver.manifest
-    assert (manifest.name, manifest.rate_hz, manifest.goal) == ("flowpilot-dst", 20.0, "route_patch")
+    assert (manifest.name, manifest.rate_hz, manifest.goal) == (
+        "flowpilot-dst",
+        20.0,
+        "route_patch",
+    )
     assert manifest.camera is not None and manifest.camera.size == (32, 18)
     driver.reset("a", 0)
     answer = driver.act(replace(in_grey(manifest), w_radps=0.25))
@@ -128,7 +165,8 @@ def test_the_graph_of_a_window_is_driven_by_the_first_speeds_of_its_best_plan(tm
 
 
 def test_the_graph_of_a_frame_gets_its_own_features_back(tmp_path: Path) -> None:
-    """The last three answers' rows, zeros before; the plan with the highest score, at the time of the point."""
+    """The last three answers' rows, zeros before; the plan with the highest score, at the time of
+    the point."""
     driver = load_policy(f"onnx:{frame_export(tmp_path)}")
     rule = driver.manifest.waypoints
     assert (rule.index, rule.dt_s, driver.manifest.goal) == (2, 0.5, "route_point")
@@ -144,7 +182,9 @@ def test_the_path_of_a_graph_names_one_of_several_exports(tmp_path: Path) -> Non
     """A folder of several is refused with their names; an engine's metadata are no graph's."""
     frame_export(window_export(tmp_path))
     (tmp_path / "dst.fp16.metadata.json").write_text("{}")
-    with pytest.raises(UsageError, match=r"several bundles: name one of .*dst\.onnx, .*policy\.onnx"):
+    with pytest.raises(
+        UsageError, match=r"several bundles: name one of .*dst\.onnx, .*policy\.onnx"
+    ):
         load_policy(f"onnx:{tmp_path}")
     policy = load_policy(f"onnx:{tmp_path / 'policy.onnx'}")
     assert policy.manifest.waypoints.index == 2
@@ -154,13 +194,22 @@ def test_the_path_of_a_graph_names_one_of_several_exports(tmp_path: Path) -> Non
 
 BROKEN: dict[str, tuple[dict[str, Any], str]] = {
     "another-graph": ({"onnx_sha256": "0" * 64}, "onnx_sha256 is 0000000000000000... there"),
-    "no-shapes": ({"input_shapes": None}, "dst.metadata.json: cannot be read: Expected `object`, got `null`"),
+    "no-shapes": (
+        {"input_shapes": None},
+        "dst.metadata.json: cannot be read: Expected `object`, got `null`",
+    ),
     "camera-matrix": (
         {"input_shapes": {**WINDOW, "intrinsics": (1, 3, 3)}},
         "nothing is known of input 'intrinsics' of shape [1, 3, 3]: write a manifest.json",
     ),
-    "no-vision": ({"input_shapes": {"goal": (1, 3)}}, "input_shapes has no vision of 4 or 5 axes: goal [1, 3]"),
-    "no-modes": ({"output_shapes": {"plan": (1, 10)}}, "output_shapes has no probs, or no modes of (1, k, steps, 5)"),
+    "no-vision": (
+        {"input_shapes": {"goal": (1, 3)}},
+        "input_shapes has no vision of 4 or 5 axes: goal [1, 3]",
+    ),
+    "no-modes": (
+        {"output_shapes": {"plan": (1, 10)}},
+        "output_shapes has no probs, or no modes of (1, k, steps, 5)",
+    ),
 }
 
 

@@ -10,18 +10,18 @@ import cv2
 import numpy as np
 import pytest
 
-from cosim.episode.driver import Driver
-from cosim.episode.ports import Policy
+from cosim.episode.interfaces import Policy
+from cosim.episode.policy_caller import Driver
 from cosim.policies.onnx.policy import OnnxPolicy
-from cosim.policies.route import Route
+from cosim.policies.privileged.route import Route
 from physics.cameras.choice import camera_of_choice
-from scenarios.policy_check.asking import Asker
-from scenarios.policy_check.checks import POLICY_CHECKS, CheckedPolicy, checked_policy
-from scenarios.policy_check.drives import Drive, SceneName, drives_for
-from scenarios.policy_check.of_answers import example
+from scenarios.tools.policy_check.answer_checks import example
+from scenarios.tools.policy_check.checks import POLICY_CHECKS, CheckedPolicy, checked_policy
+from scenarios.tools.policy_check.drives import Drive, SceneName, drives_for
+from scenarios.tools.policy_check.query import Asker
 from tests.conftest import Cosim
-from tests.policies.onnx.graphs import bundle, tiny_graph
-from tests.scenarios.policy_check import planted
+from tests.support import planted
+from tests.support.graphs import bundle, tiny_graph
 
 Drives = Mapping[SceneName, Drive]
 
@@ -38,10 +38,15 @@ def outcomes_of(policy: Policy, drives: Drives) -> CheckedPolicy:
 
 @pytest.mark.engine
 def test_a_right_policy_passes_every_check(drives: Drives) -> None:
-    """A policy that sees, takes goals and remembers pictures passes, and every check applies to it."""
+    """A policy that sees, takes goals and remembers pictures passes, and every check applies to
+    it."""
     found = outcomes_of(planted.Right(), drives)
-    assert {name: one for name, one in found.outcomes.items() if one.outcome != "passed"}.keys() == {"example"}
-    assert {*planted.FAULTS, *planted.DOUBTS, "example"} == set(POLICY_CHECKS) == set(found.outcomes)
+    assert {
+        name: one for name, one in found.outcomes.items() if one.outcome != "passed"
+    }.keys() == {"example"}
+    assert (
+        {*planted.FAULTS, *planted.DOUBTS, "example"} == set(POLICY_CHECKS) == set(found.outcomes)
+    )
 
 
 @pytest.mark.engine
@@ -75,28 +80,46 @@ def test_a_policy_that_is_told_the_street_passes() -> None:
 
 @pytest.mark.engine
 def test_the_command_says_what_it_found(cosim: Cosim, tmp_path: Path) -> None:
-    """A table, or JSON, a picture with the way in it, and exit code 1 where something has failed."""
+    """A table, or JSON, a picture with the way in it, and exit code 1 where something has
+    failed."""
     source = Path(planted.__file__).read_text()
     (tmp_path / "planted.py").write_text(source)
     words = ("--frames", "4", "-o", "check.png")
     right = cosim("policy", "check", "planted:Right", *words, cwd=tmp_path)
-    assert right.returncode == 0 and "0 failed" in right.stdout and "colour_order" in right.stdout, right.stderr
+    assert (
+        right.returncode == 0 and "0 failed" in right.stdout and "colour_order" in right.stdout
+    ), right.stderr
     picture = cv2.imread(str(tmp_path / "check.png"))
     assert picture is not None and picture.shape[:2] == (4 * 320, 2 * 480)
-    assert (np.abs(picture.astype(int) - (60, 70, 255)).max(axis=2) < 8).sum() > 100  # the waypoint that is followed
+    assert (
+        np.abs(picture.astype(int) - (60, 70, 255)).max(axis=2) < 8
+    ).sum() > 100  # the waypoint that is followed
     wrong = cosim("policy", "check", "planted:BlueForRed", "--frames", "4", "--json", cwd=tmp_path)
     told = json.loads(wrong.stdout)
     assert wrong.returncode == 1 and told["checks"]["colour_order"]["outcome"] == "failed"
-    assert told["goal"] == "route_point" and told["answer_ms"] > 0.0 and len(told["checks"]) == len(POLICY_CHECKS)
+    assert (
+        told["goal"] == "route_point"
+        and told["answer_ms"] > 0.0
+        and len(told["checks"]) == len(POLICY_CHECKS)
+    )
 
 
 def test_an_example_is_right_only_where_it_says_what_is_to_come_out(tmp_path: Path) -> None:
-    """The outputs that the graph has pass, others fail, and inputs alone, as some exporters write, prove nothing."""
+    """The outputs that the graph has pass, others fail, and inputs alone, as some exporters write,
+    prove nothing."""
     driver = Driver(OnnxPolicy(bundle(tmp_path, tiny_graph())))
     inputs = {"obs": np.zeros((1, 6, 4, 8), np.float32), "goal": np.ones((1, 2), np.float32)}
     action = np.arange(1, 6)[None, :, None] / 5 * np.ones(2)
-    for expected, outcome in (({}, "warning"), ({"action": action}, "passed"), ({"action": -action}, "failed")):
-        np.savez(tmp_path / "example.npz", **inputs, **{f"expected.{name}": one for name, one in expected.items()})
+    for expected, outcome in (
+        ({}, "warning"),
+        ({"action": action}, "passed"),
+        ({"action": -action}, "failed"),
+    ):
+        np.savez(
+            tmp_path / "example.npz",
+            **inputs,
+            **{f"expected.{name}": one for name, one in expected.items()},
+        )
         assert example(Asker(driver, driver.manifest, {})).outcome == outcome
 
 
@@ -109,7 +132,9 @@ def test_an_example_is_right_only_where_it_says_what_is_to_come_out(tmp_path: Pa
         (("orca", "--only", "mirrors"), "Did you mean mirror?"),
     ],
 )
-def test_wrong_use_is_refused_before_anything_is_drawn(words: tuple[str, ...], said: str, cosim: Cosim) -> None:
+def test_wrong_use_is_refused_before_anything_is_drawn(
+    words: tuple[str, ...], said: str, cosim: Cosim
+) -> None:
     """A policy, a picture or a goal that there is not is one line and exit code 2."""
     done = cosim("policy", "check", *words)
     assert done.returncode == 2 and said in done.stderr and "drawing" not in done.stderr

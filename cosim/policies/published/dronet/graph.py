@@ -1,8 +1,9 @@
 """DroNet's graph, and what it is made of.
 
-Source: A. Loquercio et al., "DroNet: learning to fly by driving", IEEE Robotics and Automation Letters 3 (2018): a
-ResNet of three blocks, each of half the size of its input, then steering and the probability of a collision. Tensors
-are called as the layers in the file of weights, and joined as the `model_struct.json` published beside it tells.
+Source: A. Loquercio et al., "DroNet: learning to fly by driving", IEEE Robotics and Automation
+Letters 3 (2018): a ResNet of three blocks, each of half the size of its input, then steering and
+the probability of a collision. Tensors are called as the layers in the file of weights, and joined
+as the `model_struct.json` published beside it tells.
 """
 
 from __future__ import annotations
@@ -48,8 +49,8 @@ def read_keras_weights(data: bytes) -> KerasWeights:
 
 
 def dronet_graph(weights: KerasWeights) -> bytes:
-    """The graph as ONNX: `image` (N, 1, 200, 200), grey / 255, to `steering` (N, 1) and `collision_prob` (N, 1). Raises
-    ValueError where the weights are not those of this network."""
+    """The graph as ONNX: `image` (N, 1, 200, 200), grey / 255, to `steering` (N, 1) and
+    `collision_prob` (N, 1). Raises ValueError where the weights are not those of this network."""
     return _Layers(weights).dronet()
 
 
@@ -58,7 +59,8 @@ class _Layers:
 
     def __init__(self, weights: KerasWeights) -> None:
         self._writer = GraphWriter("dronet")
-        self._weights, self._left = weights, set(weights)
+        self._weights = weights
+        self._left = set(weights)
 
     def dronet(self) -> bytes:
         write = self._writer.operator
@@ -73,27 +75,39 @@ class _Layers:
         write("Identity", "steering", steering)
         write("Identity", "collision_prob", collision)
         if self._left:
-            raise ValueError(f"holds '{min(self._left)}', and {len(self._left) - 1} more, of which there is no place")
-        return self._writer.whole({"image": ("N", 1, _SIDE, _SIDE)}, {"steering": ("N", 1), "collision_prob": ("N", 1)})
+            raise ValueError(
+                f"holds '{min(self._left)}', and {len(self._left) - 1} more, of which there "
+                f"is no place"
+            )
+        return self._writer.whole(
+            {"image": ("N", 1, _SIDE, _SIDE)}, {"steering": ("N", 1), "collision_prob": ("N", 1)}
+        )
 
     def _block(self, x: str, i: int, planes: int, more: int) -> str:
-        """A residual block: two convolutions, each after its normalisation, beside one of single pixels."""
+        """A residual block: two convolutions, each after its normalisation, beside one of single
+        pixels."""
         norm, conv = 2 * i - 1, 3 * i - 1
         y = self._conv(self._norm_relu(x, norm, planes), conv, 3, (planes, more), 2)
         y = self._norm_relu(y, norm + 1, more)
         beside = self._conv(x, conv + 2, 1, (planes, more), 2)
-        return self._writer.operator("Add", f"add_{i}", beside, self._conv(y, conv + 1, 3, (more, more), 1))
+        return self._writer.operator(
+            "Add", f"add_{i}", beside, self._conv(y, conv + 1, 3, (more, more), 1)
+        )
 
     def _conv(self, x: str, number: int, side: int, planes: tuple[int, int], stride: int) -> str:
         layer = f"conv2d_{number}"
         kernel = self._take(layer, "kernel", (side, side, *planes)).transpose(3, 2, 0, 1)
         numbers = self._numbers(layer, w=kernel, b=self._take(layer, "bias", planes[1:]))
-        return self._writer.operator("Conv", layer, x, *numbers, strides=[stride] * 2, auto_pad="SAME_UPPER")
+        return self._writer.operator(
+            "Conv", layer, x, *numbers, strides=[stride] * 2, auto_pad="SAME_UPPER"
+        )
 
     def _norm_relu(self, x: str, number: int, planes: int) -> str:
         layer = f"batch_normalization_{number}"
         fields = ("gamma", "beta", "moving_mean", "moving_variance")
-        numbers = self._numbers(layer, **{field: self._take(layer, field, (planes,)) for field in fields})
+        numbers = self._numbers(
+            layer, **{field: self._take(layer, field, (planes,)) for field in fields}
+        )
         normed = self._writer.operator("BatchNormalization", layer, x, *numbers, epsilon=_EPSILON)
         return self._writer.operator("Relu", f"activation_{number}", normed)
 
@@ -105,7 +119,9 @@ class _Layers:
         )
 
     def _numbers(self, layer: str, **fields: NDArray[np.float32]) -> list[str]:
-        return [self._writer.constant(f"{layer}_{name}", numbers) for name, numbers in fields.items()]
+        return [
+            self._writer.constant(f"{layer}_{name}", numbers) for name, numbers in fields.items()
+        ]
 
     def _take(self, layer: str, field: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
         path = f"{layer}/{layer}/{field}:0"
@@ -113,7 +129,9 @@ class _Layers:
             raise ValueError(f"has no '{path}'")
         numbers = self._weights[path]
         if numbers.shape != shape or numbers.dtype != np.float32:
-            raise ValueError(f"'{path}' is {numbers.dtype} {numbers.shape}; wanted is float32 {shape}")
+            raise ValueError(
+                f"'{path}' is {numbers.dtype} {numbers.shape}; wanted is float32 {shape}"
+            )
         self._left.discard(path)
         return numbers
 
@@ -123,7 +141,10 @@ DRONET: Final = PublishedNetwork(
     NetworkFile(
         "model_weights.h5",
         "uzh-rpg/rpg_public_dronet, commit ac19c54b, model (MIT)",
-        FileFacts(bytes=1362640, blake2b="e24a45d3441b90191be874643b33422ffc8416ee89d26808d03c2f1c6cf2f196"),
+        FileFacts(
+            bytes=1362640,
+            blake2b="e24a45d3441b90191be874643b33422ffc8416ee89d26808d03c2f1c6cf2f196",
+        ),
     ),
     lambda data: dronet_graph(read_keras_weights(data)),
     ("onnx", "h5py"),

@@ -1,1 +1,2 @@
-"""OpenBot's driving network: its manifest, and its graph made of the file that its authors publish."""
+"""OpenBot's driving network: its manifest, and its graph made of the file that its authors
+publish."""

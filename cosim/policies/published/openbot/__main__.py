@@ -1,4 +1,5 @@
-"""OpenBot's driving network as an ONNX graph, made of the file that is published, with `pip install onnx flatbuffers`.
+"""OpenBot's driving network as an ONNX graph, made of the file that is published, with `pip install
+onnx flatbuffers`.
 
 python -m cosim.policies.published.openbot autopilot_float.tflite [-o FOLDER]
 """

@@ -1,11 +1,13 @@
 """The graph of OpenBot's driving network, and what it is made of.
 
-Source: M. Müller and V. Koltun, "OpenBot: turning smartphones into robots", arXiv 2008.10631: convolutions see the
-picture, and the command goes in at three places. The file is translated operator by operator; number 7 of its tensors
-is called t7, the weights of its operator 7 are w7 and b7, or p7.
+Source: M. Müller and V. Koltun, "OpenBot: turning smartphones into robots", arXiv 2008.10631:
+convolutions see the picture, and the command goes in at three places. The file is translated
+operator by operator; number 7 of its tensors is called t7, the weights of its operator 7 are w7 and
+b7, or p7.
 
-Most weights are int8 with a scale in the file. The graph computes in float32 with what they stand for, where TensorFlow
-Lite rounds to int8 what is multiplied with them, too: its wheels differ from these by up to 0.02.
+Most weights are int8 with a scale in the file. The graph computes in float32 with what they stand
+for, where TensorFlow Lite rounds to int8 what is multiplied with them, too: its wheels differ from
+these by up to 0.02.
 """
 
 from __future__ import annotations
@@ -16,7 +18,12 @@ from cosim.policies.onnx.manifest import FileFacts
 from cosim.policies.onnx.weights import NetworkFile
 from cosim.policies.onnx.writing import GraphWriter, PortShapes
 from cosim.policies.published.making import PublishedNetwork
-from cosim.policies.published.openbot.lite_file import LiteModel, LiteOperator, LiteTensor, read_lite_file
+from cosim.policies.published.openbot.lite_file import (
+    LiteModel,
+    LiteOperator,
+    LiteTensor,
+    read_lite_file,
+)
 
 _INPUTS: Final = {"img_input": ("img", (96, 256, 3)), "cmd_input": ("cmd", (1,))}
 """What the inputs of the file are called here, and their shapes without the first axis."""
@@ -24,16 +31,19 @@ _OUTPUT: Final = ("left_right", (2,))
 
 
 def openbot_graph(model: LiteModel) -> bytes:
-    """The graph as ONNX: `img` (N, 96, 256, 3), RGB / 255, and `cmd` (N, 1), -1 left, 0 straight, 1 right, to
-    `left_right` (N, 2), the wheels. Raises ValueError for a model with other inputs, outputs, or ways to go on."""
+    """The graph as ONNX: `img` (N, 96, 256, 3), RGB / 255, and `cmd` (N, 1), -1 left, 0 straight, 1
+    right, to `left_right` (N, 2), the wheels. Raises ValueError for a model with other inputs,
+    outputs, or ways to go on."""
     return _Translation(model).whole()
 
 
 class _Translation:
-    """The operators of a model as ONNX has them. Pictures have their channels last there and first here."""
+    """The operators of a model as ONNX has them. Pictures have their channels last there and first
+    here."""
 
     def __init__(self, model: LiteModel) -> None:
-        self._model, self._writer = model, GraphWriter("openbot_cil_mobile")
+        self._model = model
+        self._writer = GraphWriter("openbot_cil_mobile")
         self._names: dict[int, str] = {}
 
     def whole(self) -> bytes:
@@ -42,12 +52,16 @@ class _Translation:
         told = [self._tensor(i).shape for i in self._model.outputs]
         name, shape = _OUTPUT
         if shapes != wanted or told != [(1, *shape)]:
-            raise ValueError(f"has inputs {shapes} and outputs {told}; wanted are {wanted} and {[(1, *shape)]}")
+            raise ValueError(
+                f"has inputs {shapes} and outputs {told}; wanted are {wanted} and {[(1, *shape)]}"
+            )
         self._names = {i: _INPUTS[self._tensor(i).name][0] for i in self._model.inputs}
         for i in self._model.inputs:
             if len(self._tensor(i).shape) == 4:
                 called = self._names[i]
-                self._names[i] = self._writer.operator("Transpose", f"{called}_nchw", called, perm=[0, 3, 1, 2])
+                self._names[i] = self._writer.operator(
+                    "Transpose", f"{called}_nchw", called, perm=[0, 3, 1, 2]
+                )
         for number, operator in enumerate(self._model.operators):
             self._names[operator.output] = self._translated(number, operator)
         self._writer.operator("Identity", name, self._name(self._model.outputs[0]))
@@ -65,7 +79,9 @@ class _Translation:
         elif operator.kind == "conv":
             numbers = self._weights(number, operator)
             x = self._name(operator.inputs[0])
-            self._writer.operator("Conv", made, x, *numbers, strides=list(operator.strides), auto_pad="SAME_UPPER")
+            self._writer.operator(
+                "Conv", made, x, *numbers, strides=list(operator.strides), auto_pad="SAME_UPPER"
+            )
         else:
             x = self._flat(operator.inputs[0])
             self._writer.operator("Gemm", made, x, *self._weights(number, operator), transB=1)
@@ -74,9 +90,12 @@ class _Translation:
     def _by_channel(self, made: str, number: int, operator: LiteOperator) -> None:
         """A sum or product with one number for each channel."""
         x, by = operator.inputs
-        numbers, axes = self._tensor(by).numbers, len(self._tensor(x).shape)
+        numbers = self._tensor(by).numbers
+        axes = len(self._tensor(x).shape)
         if numbers is None or numbers.ndim != 1:
-            raise ValueError(f"operator {number}: does not {operator.kind} a number for each channel")
+            raise ValueError(
+                f"operator {number}: does not {operator.kind} a number for each channel"
+            )
         param = self._writer.constant(f"p{number}", numbers.reshape(1, -1, *[1] * (axes - 2)))
         self._writer.operator(operator.kind.capitalize(), made, self._name(x), param)
 
@@ -85,7 +104,9 @@ class _Translation:
         x = self._name(tensor)
         if len(self._tensor(tensor).shape) == 4:
             x = self._writer.operator(
-                "Flatten", f"{x}_f", self._writer.operator("Transpose", f"{x}_nhwc", x, perm=[0, 2, 3, 1])
+                "Flatten",
+                f"{x}_f",
+                self._writer.operator("Transpose", f"{x}_nhwc", x, perm=[0, 2, 3, 1]),
             )
         return x
 
@@ -96,7 +117,10 @@ class _Translation:
             raise ValueError(f"operator {number}: is a {operator.kind} without weights")
         if operator.kind == "conv":
             kernel = kernel.transpose(0, 3, 1, 2)
-        return [self._writer.constant(f"w{number}", kernel), self._writer.constant(f"b{number}", bias)]
+        return [
+            self._writer.constant(f"w{number}", kernel),
+            self._writer.constant(f"b{number}", bias),
+        ]
 
     def _name(self, tensor: int) -> str:
         if tensor not in self._names:
@@ -112,7 +136,10 @@ OPENBOT: Final = PublishedNetwork(
     NetworkFile(
         "autopilot_float.tflite",
         "isl-org/OpenBot, commit 30ab3bd1, android/app/src/main/assets/networks (MIT)",
-        FileFacts(bytes=1304192, blake2b="9d5d9f52e2cc37b820c6774c3a0e5bdb6fd6f8cb69c08650b27e9362967236cb"),
+        FileFacts(
+            bytes=1304192,
+            blake2b="9d5d9f52e2cc37b820c6774c3a0e5bdb6fd6f8cb69c08650b27e9362967236cb",
+        ),
     ),
     lambda data: openbot_graph(read_lite_file(data)),
     ("onnx", "flatbuffers"),

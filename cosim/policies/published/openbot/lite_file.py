@@ -1,6 +1,7 @@
 """What a TensorFlow Lite file holds: tensors, and operators one behind the other.
 
-Such a file is a FlatBuffer; this reads the few fields of it that are named here, by their numbers in schema.fbs.
+Such a file is a FlatBuffer; this reads the few fields of it that are named here, by their numbers
+in schema.fbs.
 """
 
 from __future__ import annotations
@@ -14,35 +15,53 @@ import numpy as np
 from numpy.typing import NDArray
 
 _MARK: Final = b"TFL3"
-_CODES, _GRAPHS, _BUFFERS = 1, 2, 4
+_CODES = 1
+_GRAPHS = 2
+_BUFFERS = 4
 """Fields of a model."""
 _CODE: Final = 0
 """Of a kind of operators."""
-_TENSORS, _INPUTS, _OUTPUTS, _OPERATORS = 0, 1, 2, 3
+_TENSORS = 0
+_INPUTS = 1
+_OUTPUTS = 2
+_OPERATORS = 3
 """Fields of a graph."""
-_SHAPE, _TYPE, _BUFFER, _NAME, _QUANTIZATION = 0, 1, 2, 3, 4
+_SHAPE = 0
+_TYPE = 1
+_BUFFER = 2
+_NAME = 3
+_QUANTIZATION = 4
 """Fields of a tensor."""
-_SCALE, _ZERO = 2, 3
+_SCALE = 2
+_ZERO = 3
 """Fields of a quantization."""
-_OPCODE, _TAKEN, _MADE, _OPTIONS = 0, 1, 2, 4
+_OPCODE = 0
+_TAKEN = 1
+_MADE = 2
+_OPTIONS = 4
 """Fields of an operator."""
-_PADDING, _STRIDE_W, _STRIDE_H = 0, 1, 2
+_PADDING = 0
+_STRIDE_W = 1
+_STRIDE_H = 2
 """Fields of the options of a convolution; padding is 0 for that which keeps the size."""
 _DATA: Final = 0
 """Of a buffer."""
-_FLOAT32, _INT8 = 0, 9
+_FLOAT32 = 0
+_INT8 = 9
 """Types of a tensor's numbers."""
 _DTYPES: Final = {_FLOAT32: "<f4", _INT8: "i1"}
 
 LiteKind = Literal["add", "concat", "conv", "dense", "mul"]
 _KINDS: Final[dict[int, LiteKind]] = {0: "add", 2: "concat", 3: "conv", 9: "dense", 18: "mul"}
 _ACTIVATION: Final[dict[LiteKind, int]] = {"add": 0, "concat": 1, "conv": 3, "dense": 0, "mul": 0}
-"""Where in the options of each kind it stands what the result goes through: 0 for nothing, 1 for a ReLU."""
+"""Where in the options of each kind it stands what the result goes through: 0 for nothing, 1 for a
+ReLU."""
 
 
 @dataclass(frozen=True)
 class LiteTensor:
-    """numbers: float32 of its shape, those that are int8 in the file multiplied out; None for what is computed."""
+    """numbers: float32 of its shape, those that are int8 in the file multiplied out; None for what
+    is computed."""
 
     name: str
     shape: tuple[int, ...]
@@ -51,7 +70,8 @@ class LiteTensor:
 
 @dataclass(frozen=True)
 class LiteOperator:
-    """inputs, output: which tensors; relu: whether its result goes through one; strides: down and right."""
+    """inputs, output: which tensors; relu: whether its result goes through one; strides: down and
+    right."""
 
     kind: LiteKind
     inputs: tuple[int, ...]
@@ -77,7 +97,8 @@ def read_lite_file(data: bytes) -> LiteModel:
     try:
         model = _Row(data, int.from_bytes(data[:4], "little"))
         (graph,) = model.rows(_GRAPHS)
-        buffers, codes = model.rows(_BUFFERS), [code.number(_CODE, "b") for code in model.rows(_CODES)]
+        buffers = model.rows(_BUFFERS)
+        codes = [code.number(_CODE, "b") for code in model.rows(_CODES)]
         return LiteModel(
             tuple(_tensor(row, buffers) for row in graph.rows(_TENSORS)),
             graph.numbers(_INPUTS),
@@ -89,25 +110,34 @@ def read_lite_file(data: bytes) -> LiteModel:
 
 
 def _tensor(row: _Row, buffers: list[_Row]) -> LiteTensor:
-    name, shape, kind = row.text(_NAME), row.numbers(_SHAPE), row.number(_TYPE, "b")
+    name = row.text(_NAME)
+    shape = row.numbers(_SHAPE)
+    kind = row.number(_TYPE, "b")
     raw = buffers[row.number(_BUFFER, "I")].array(_DATA, "u1").tobytes()
     if not raw:
         return LiteTensor(name, shape, None)
     if kind not in _DTYPES or len(raw) != math.prod(shape) * np.dtype(_DTYPES[kind]).itemsize:
-        raise ValueError(f"'{name}' holds {len(raw)} bytes, of type {kind}; wanted are float32 or int8, {shape}")
+        raise ValueError(
+            f"'{name}' holds {len(raw)} bytes, of type {kind}; wanted are float32 or int8, {shape}"
+        )
     numbers = np.frombuffer(raw, _DTYPES[kind]).astype(np.float32).reshape(shape)
     if kind == _INT8:
-        (scale,), (zero,) = (row.row(_QUANTIZATION).array(*how) for how in ((_SCALE, "<f4"), (_ZERO, "<i8")))
+        (scale,), (zero,) = (
+            row.row(_QUANTIZATION).array(*how) for how in ((_SCALE, "<f4"), (_ZERO, "<i8"))
+        )
         numbers = (numbers - np.float32(zero)) * scale
     return LiteTensor(name, shape, numbers)
 
 
 def _operator(row: _Row, codes: list[int]) -> LiteOperator:
-    code, (output,) = codes[row.number(_OPCODE, "I")], row.numbers(_MADE)
+    code = codes[row.number(_OPCODE, "I")]
+    (output,) = row.numbers(_MADE)
     if code not in _KINDS:
         raise ValueError(f"has an operator of kind {code}. Known are {', '.join(map(str, _KINDS))}")
-    kind, options = _KINDS[code], row.row(_OPTIONS)
-    activation, strides = options.number(_ACTIVATION[kind], "b"), (1, 1)
+    kind = _KINDS[code]
+    options = row.row(_OPTIONS)
+    activation = options.number(_ACTIVATION[kind], "b")
+    strides = (1, 1)
     if kind == "conv":
         strides = options.number(_STRIDE_H, "i"), options.number(_STRIDE_W, "i")
         if options.number(_PADDING, "b"):
@@ -118,7 +148,8 @@ def _operator(row: _Row, codes: list[int]) -> LiteOperator:
 
 
 class _Row:
-    """A table of the file at a place of it; its fields by their numbers, 0 or nothing where it has none."""
+    """A table of the file at a place of it; its fields by their numbers, 0 or nothing where it has
+    none."""
 
     def __init__(self, data: bytes, at: int) -> None:
         from flatbuffers.table import Table
@@ -128,7 +159,11 @@ class _Row:
     def number(self, field: int, kind: str) -> int:
         """kind: as `struct` has it."""
         at = self._at(field)
-        return int(struct.unpack_from(f"<{kind}", self._table.Bytes, at + self._table.Pos)[0]) if at else 0
+        return (
+            int(struct.unpack_from(f"<{kind}", self._table.Bytes, at + self._table.Pos)[0])
+            if at
+            else 0
+        )
 
     def text(self, field: int) -> str:
         at = self._at(field)
@@ -143,7 +178,9 @@ class _Row:
     def rows(self, field: int) -> list[_Row]:
         begins = self.array(field, "<u4")
         first = self._table.Vector(self._at(field)) if len(begins) else 0
-        return [_Row(self._table.Bytes, first + 4 * i + int(begin)) for i, begin in enumerate(begins)]
+        return [
+            _Row(self._table.Bytes, first + 4 * i + int(begin)) for i, begin in enumerate(begins)
+        ]
 
     def numbers(self, field: int) -> tuple[int, ...]:
         return tuple(map(int, self.array(field, "<i4")))
@@ -152,7 +189,9 @@ class _Row:
         at = self._at(field)
         if not at:
             return np.zeros(0, dtype)
-        return np.frombuffer(self._table.Bytes, dtype, self._table.VectorLen(at), self._table.Vector(at))
+        return np.frombuffer(
+            self._table.Bytes, dtype, self._table.VectorLen(at), self._table.Vector(at)
+        )
 
     def _at(self, field: int) -> int:
         return int(self._table.Offset(4 + 2 * field))

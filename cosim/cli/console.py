@@ -1,0 +1,196 @@
+"""Consoles, standard streams and logs of the command line."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, TextIO
+
+import typer
+from rich.console import Console
+
+from cosim.core.errors import BROKEN_MACHINE, UNREAD, unknown, unwritable
+from cosim.core.log_event import JOURNAL
+
+out = Console(emoji=False)
+err = Console(stderr=True, emoji=False)
+
+
+_LEVELS = ("debug", "info", "warning", "error")
+LogLevel = Annotated[
+    str,
+    typer.Option(
+        "--log-level", metavar="LEVEL", help="Log on standard error: debug, info, warning or error."
+    ),
+]
+LogJson = Annotated[
+    Path | None,
+    typer.Option(
+        "--log-json", metavar="FILE", help="Append the log to this file, a line of JSON each."
+    ),
+]
+
+
+@contextmanager
+def logged(level: str, json_file: Path | None) -> Iterator[Counter[str]]:
+    """Keep logs as long as the block goes on; what it yields counts events by name. level: "" for
+    none in words, and for "info" in the file. Raises UsageError, MachineError."""
+    if level and level not in _LEVELS:
+        raise unknown("log level", level, _LEVELS)
+    lowest = getattr(logging, (level or "info").upper())
+    counts: Counter[str] = Counter()
+    with ExitStack() as stack:
+        handlers: list[_Quiet] = [_Counts(counts)]
+        if level:
+            handlers.append(_Words(lowest))
+        if json_file is not None:
+            try:
+                handlers.append(
+                    _Lines(lowest, stack.enter_context(json_file.open("a", buffering=1)))
+                )
+            except OSError as error:
+                raise unwritable(json_file, error) from error
+        before = JOURNAL.level
+        JOURNAL.setLevel(min(lowest, logging.INFO))
+        for one in handlers:
+            JOURNAL.addHandler(one)
+        try:
+            yield counts
+        finally:
+            JOURNAL.setLevel(before)
+            for one in handlers:
+                JOURNAL.removeHandler(one)
+
+
+class _Quiet(logging.Handler):
+    """What cannot be written, as on a full disk, is told by the run itself."""
+
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Nothing: an episode is worth more than its line."""
+
+
+class _Counts(_Quiet):
+    def __init__(self, counts: Counter[str]) -> None:
+        super().__init__(logging.DEBUG)
+        self._counts = counts
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._counts[record.msg] += 1
+
+
+class _Words(_Quiet):
+    def emit(self, record: logging.LogRecord) -> None:
+        facts = " ".join(f"{name}={_shown(value)}" for name, value in _facts(record).items())
+        words = f"{_time(record)} {record.levelname.lower():7} {record.msg} {facts}"
+        err.print(words.rstrip(), soft_wrap=True, highlight=False, markup=False)
+
+
+class _Lines(_Quiet):
+    def __init__(self, level: int, file: TextIO) -> None:
+        super().__init__(level)
+        self._file = file
+
+    def emit(self, record: logging.LogRecord) -> None:
+        told = {
+            "time": _time(record),
+            "level": record.levelname.lower(),
+            "event": record.msg,
+            **_facts(record),
+        }
+        try:
+            self._file.write(json.dumps(told, default=str) + "\n")
+        except OSError:
+            self.handleError(record)
+
+
+def _facts(record: logging.LogRecord) -> dict[str, object]:
+    return getattr(record, "facts", {})
+
+
+def _time(record: logging.LogRecord) -> str:
+    return datetime.fromtimestamp(record.created, UTC).strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"
+
+
+def _shown(value: object) -> str:
+    text = str(value)
+    return json.dumps(text) if " " in text or not text else text
+
+
+class Unwritable(Exception):
+    """A stream took no more. No OSError, so that nobody on the way takes it for one of a file."""
+
+    def __init__(self, stream: Stream, reason: OSError) -> None:
+        super().__init__(str(reason))
+        self.stream = stream
+        self.reason = reason
+
+
+class Stream:
+    """A text stream that raises Unwritable, and shows as an escape what its encoding does not
+    have."""
+
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+        if getattr(stream, "errors", "") == "strict":
+            stream.reconfigure(errors="backslashreplace")
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        try:
+            return int(self._stream.write(text))
+        except OSError as error:
+            raise Unwritable(self, error) from None
+
+    def flush(self) -> None:
+        try:
+            self._stream.flush()
+        except OSError as error:
+            raise Unwritable(self, error) from None
+
+    def let_go(self) -> None:
+        """Let what is still to be written go nowhere: the interpreter would complain of it when it
+        ends."""
+        with suppress(OSError):
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, self._stream.fileno())
+            os.close(nowhere)
+
+
+@contextmanager
+def told_streams() -> Iterator[None]:
+    """Run a program whose output may find no room (one line, exit code 3) or no reader (silence,
+    UNREAD)."""
+    before = sys.stdout, sys.stderr
+    out, err = (Stream(stream) if stream is not None else None for stream in before)
+    sys.stdout = out
+    sys.stderr = err
+    try:
+        try:
+            yield
+        finally:
+            if out is not None:
+                out.flush()
+    except Unwritable as lost:
+        lost.stream.let_go()
+        if isinstance(lost.reason, BrokenPipeError):
+            raise SystemExit(UNREAD) from None
+        with suppress(Unwritable):
+            print(
+                f"error: standard output cannot be written: {lost.reason.strerror}",
+                file=err,
+                flush=True,
+            )
+        if err is not None:
+            err.let_go()
+        raise SystemExit(BROKEN_MACHINE) from None
+    finally:
+        sys.stdout, sys.stderr = before

@@ -1,0 +1,205 @@
+"""The commands `cosim doctor`, `cosim verify` and `cosim cache`."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Sequence
+from typing import Annotated
+
+import typer
+from rich import box
+from rich.markup import escape
+from rich.table import Column, Table
+
+from cosim.cli.console import err, out
+from cosim.cli.progress import doing
+from cosim.cli.tables import print_fitted
+from cosim.core.cache import (
+    CACHE_KINDS,
+    GB,
+    LIMIT_VARIABLE,
+    UNUSED_S,
+    CacheEntry,
+    cache_entries,
+    cache_folder,
+    cache_limit_bytes,
+    forget_entries,
+)
+from cosim.core.errors import BROKEN_MACHINE, SOME_CRASHED, EngineError, UsageError, unknown
+from cosim.core.telling import bytes_in_words, duration
+
+cache_app = typer.Typer()
+_DAY_S = 86400.0
+
+
+@cache_app.command(
+    "cache",
+    epilog="Examples:  \n`cosim cache`  \n`cosim cache --prune`  \n`cosim cache --prune "
+    "--unused-for 0`",
+)
+def show_cache(
+    size: Annotated[
+        bool, typer.Option("--size", help="Print the sizes; this is the default.")
+    ] = False,
+    prune: Annotated[
+        bool, typer.Option("--prune", help="Remove what was not used for so long.")
+    ] = False,
+    unused_for: Annotated[
+        float | None,
+        typer.Option(
+            metavar="DAYS",
+            min=0.0,
+            help="With --prune, since when; 0: all.",
+            show_default=f"{UNUSED_S / _DAY_S:g}",
+        ),
+    ] = None,
+) -> None:
+    """Print what lies in the cache folder, or remove what was not used for long.
+
+    Everything that is removed is made again when it is needed. Imported maps stay, and what a
+    running process uses.
+
+    The folder is `$COSIM_CACHE`, by default `~/.cache/sidewalk-cosim`. Where it would be larger
+    than `$COSIM_CACHE_LIMIT` GB (4 by default), what was used longest ago is removed without being
+    asked.
+    """
+    limit_bytes = cache_limit_bytes()
+    if unused_for is not None and not prune:
+        raise UsageError("--unused-for says what --prune removes: give --prune, too")
+    if prune:
+        days = UNUSED_S / _DAY_S if unused_for is None else unused_for
+        gone = forget_entries(days * _DAY_S if days else -math.inf, limit_bytes)
+        in_use = f"; {len(gone.in_use)} in use stay" if gone.in_use else ""
+        out.print(
+            f"Removed: {_counted(len(gone.entries))}, {bytes_in_words(gone.size_bytes)}{in_use}",
+            soft_wrap=True,
+        )
+    if size or not prune:
+        _print_sizes(cache_entries())
+    whole = sum(entry.size_bytes for entry in cache_entries())
+    out.print(
+        f"{cache_folder()}: {bytes_in_words(whole)} of at most {limit_bytes / GB:g} GB "
+        f"({LIMIT_VARIABLE})",
+        soft_wrap=True,
+        highlight=False,
+    )
+
+
+def _print_sizes(entries: Sequence[CacheEntry]) -> None:
+    """Print a row for each kind."""
+    heads = (
+        Column("kind", no_wrap=True),
+        Column("entries", justify="right"),
+        Column("size", justify="right"),
+    )
+    shown = Table(
+        *heads,
+        Column("last used", no_wrap=True),
+        "what it is",
+        box=box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+    )
+    for kind in CACHE_KINDS:
+        of_it = [entry for entry in entries if entry.kind == kind]
+        used = (
+            f"{duration(time.time() - max(e.used_s for e in of_it))} ago"
+            if of_it and not kind.stays
+            else ""
+        )
+        words = f"{kind.words}; never removed" if kind.stays else kind.words
+        shown.add_row(
+            kind.name,
+            str(len(of_it)),
+            bytes_in_words(sum(e.size_bytes for e in of_it)),
+            used,
+            words,
+        )
+    print_fitted(out, shown, words=(4,))
+
+
+def _counted(entries: int) -> str:
+    return f"{entries} entr{'y' if entries == 1 else 'ies'}"
+
+
+installation_app = typer.Typer()
+_LACKING = "an engine cannot be loaded: {}. Mend what it names, or set up anew"
+
+
+@installation_app.command(epilog="Example:  \n`cosim doctor`")
+def doctor() -> None:
+    """Check that every engine works here: versions, a frame, a query, a step."""
+    try:
+        from scenarios.tools.verify.doctor import CHECKS
+    except (ImportError, OSError) as error:
+        raise EngineError(_LACKING.format(error)) from error
+
+    failed = 0
+    for name, check in CHECKS.items():
+        try:
+            out.print(f"[green]ok[/]      {name}: {check()}", soft_wrap=True)
+        except Exception as error:  # noqa: BLE001  a check may fail in any way; it is shown and counted
+            failed += 1
+            out.print(
+                f"[red]failed[/]  {name}: {type(error).__name__}: {escape(str(error))}",
+                soft_wrap=True,
+            )
+    if failed:
+        raise typer.Exit(BROKEN_MACHINE)
+
+
+@installation_app.command(
+    epilog="Examples:  \n`cosim verify`  \n`cosim verify --case lh-001-00 --case frontal-001`"
+)
+def verify(
+    case: Annotated[list[str] | None, typer.Option(help="Only this case; may be repeated.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes; with 1 all runs in this one.")] = 2,
+    write: Annotated[
+        bool,
+        typer.Option(
+            "--write",
+            help="Take what comes out here as what is shipped, after suites were built anew.",
+        ),
+    ] = False,
+) -> None:
+    """Does this installation give the shipped bits and numbers? If not: which engine, version or
+    part, and the remedy.
+
+    Runs the beginnings of 12 scenarios, of each suite the first of each structure or event, with
+    the oracle, and draws a picture of each by both cameras. An OpenGL driver that is not that of
+    the shipped pictures may differ a little.
+    """
+    try:
+        from scenarios.tools.verify.cases import verified_cases
+        from scenarios.tools.verify.shipped import SHIPPED, Given, given_here, writable
+        from scenarios.tools.verify.verdict import blamed, findings
+    except (ImportError, OSError) as error:
+        raise EngineError(_LACKING.format(error)) from error
+
+    cases = {one.id: one for one in verified_cases()}
+    for name in case or ():
+        if name not in cases:
+            raise unknown("case", name, cases)
+    picked = [cases[name] for name in dict.fromkeys(case or cases)]
+    shipped = None if write else Given.load(SHIPPED)
+    with doing(f"running {len(picked)} cases") as tell:
+        here = given_here(picked, jobs, tell)
+    if shipped is None:
+        writable(here, list(cases)).save(SHIPPED)
+        out.print(f"{SHIPPED}: {len(here.traces)} cases", soft_wrap=True, highlight=False)
+        return
+    found = list(findings(shipped, here))
+    for one in found:
+        mark = "[green]ok[/]     " if one.fine else "[red]differs[/]"
+        out.print(
+            f"{mark} {escape(one.name)}: {escape(one.words)}", soft_wrap=True, highlight=False
+        )
+    wrong = [one for one in found if not one.fine]
+    for words in blamed(wrong, shipped, here):
+        err.print(words, soft_wrap=True, highlight=False, markup=False)
+    if wrong:
+        err.print(
+            f"{len(wrong)} of {len(found)} differ: this is not the installation that was shipped."
+        )
+        raise typer.Exit(SOME_CRASHED)
+    out.print("This installation gives the shipped bits and numbers.")

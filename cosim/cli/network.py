@@ -1,0 +1,417 @@
+"""The commands `cosim certs`, `direct`, `inject`, `listen` and `serve`."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable
+from contextlib import nullcontext, suppress
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from typing import TYPE_CHECKING, Annotated, cast, get_args
+
+import typer
+from rich.table import Table
+
+from cosim.cli.console import err, out
+from cosim.cli.options import (
+    DEFAULT,
+    DIRECTOR,
+    MANY,
+    POLICIES_AT,
+    STEP_IN,
+    Insecure,
+    Tls,
+    connecting,
+    listening,
+    warned,
+)
+from cosim.cli.progress import doing
+from cosim.cli.tables import print_fitted
+from cosim.core.errors import (
+    INTERRUPTED,
+    WRONG_USE,
+    AccessError,
+    CosimError,
+    EngineError,
+    UsageError,
+    unknown,
+)
+from cosim.spec.connection import Connection, Role
+
+if TYPE_CHECKING:
+    from bridge.session import Session
+
+
+certs_app = typer.Typer(
+    no_args_is_help=True, help="Make, renew and show the certificates of --tls."
+)
+_Hosts = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--host",
+        metavar="NAME",
+        help="A name or address that others reach it by; may be given again.",
+    ),
+]
+_Days = Annotated[int, typer.Option(min=1, max=3650, help="How long it is valid.")]
+
+
+@certs_app.command(
+    epilog="Example, then copy each role's folder to where it is needed:  \n"
+    "`cosim certs init certs --host hub.lan --host 10.0.0.7`  \n`cosim certs role certs worker`"
+)
+def init(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="A new folder.")],
+    host: _Hosts = None,
+    days: _Days = 365,
+) -> None:
+    """Make a private authority, and the certificate of a coordinator, who is reached by each
+    --host."""
+    from bridge.security.authority import make_authority
+
+    make_authority(folder, host or ["localhost", "127.0.0.1"], days)
+    _print_made(folder / "coordinator")
+    words = f"Keep {folder / 'ca.key'} to yourself: whoever has it can make every role."
+    out.print(words, soft_wrap=True, markup=False, highlight=False)
+
+
+@certs_app.command(
+    epilog="Examples:  \n`cosim certs role certs viewer`  \n`cosim certs role certs policy --host "
+    "gpu.lan`  \n`cosim certs role certs worker --renew`"
+)
+def role(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="What `cosim certs init` made.")],
+    name: Annotated[str, typer.Argument(metavar="ROLE", help=", ".join(get_args(Role)) + ".")],
+    host: _Hosts = None,
+    days: _Days = 365,
+    renew: Annotated[bool, typer.Option("--renew", help="Replace the one that is there.")] = False,
+) -> None:
+    """Issue the certificate of a role. Who listens (a coordinator, a director, some policies) needs
+    --host."""
+    from bridge.security.authority import issue
+
+    if name not in get_args(Role):
+        raise unknown("role", name, get_args(Role))
+    _print_made(issue(folder, cast(Role, name), host or [], days, renew=renew))
+
+
+@certs_app.command(
+    "show", epilog="Examples:  \n`cosim certs show certs`  \n`cosim certs show certs/worker`"
+)
+def show_certificates(
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="An authority's folder, or a role's.")
+    ],
+) -> None:
+    """Show whose the certificates of a folder are, how they are reached, what they may do, and
+    until when."""
+    from bridge.security.identity import identity_in, time_left
+    from bridge.security.rights import RIGHTS
+
+    places = (folder, *(folder / name for name in get_args(Role)))
+    found = [path for path in places if (path / "cert.pem").exists()]
+    if not found:
+        raise AccessError(f"{folder} holds no certificate: `cosim certs init` makes one")
+    table = Table(
+        "folder", "role", "reached by", "may", "valid until", box=None, padding=(0, 2, 0, 0)
+    )
+    for path in found:
+        who = identity_in(path)
+        may = RIGHTS[who.role].words
+        table.add_row(path.name, who.role, ", ".join(who.hosts), may, time_left(who))
+    print_fitted(out, table, words=[2, 3])
+
+
+def _print_made(place: Path) -> None:
+    from bridge.security.identity import identity_in, time_left
+
+    who = identity_in(place)
+    names = f", reached by {', '.join(who.hosts)}" if who.hosts else ""
+    words = f"{place}: role {who.role}{names}, valid until {time_left(who)}"
+    out.print(words, soft_wrap=True, markup=False, highlight=False)
+
+
+direct_app = typer.Typer()
+
+
+@direct_app.command(
+    rich_help_panel=STEP_IN,
+    epilog="Example, in two terminals:  \n`cosim direct --listen tcp/127.0.0.1:7448`  \n"
+    "`cosim run reactive --event frontal --policy orca --director tcp/127.0.0.1:7448`",
+)
+def direct(
+    listen: Annotated[str, typer.Option(help="Where runs find it.")] = DIRECTOR,
+    tls: Tls = "",
+    insecure: Insecure = False,
+) -> None:
+    """Direct the event pedestrians of runs that were started with --director, until stopped.
+
+    It keeps nothing: stop it, kill it and start it again in the middle of an episode, and the
+    episode waits, goes on and comes to the same state hash. A run of other code is refused.
+    """
+    from bridge.session import open_session
+    from scenarios.episodes.director import behaviours, direct_all
+
+    with open_session(listening("director", "--listen", listen, tls, insecure), warned) as session:
+        direct_all(session)
+        print(f"directing at {listen}, behaviours {behaviours()}; stop with Ctrl-C", flush=True)
+        try:
+            while True:
+                time.sleep(3600.0)
+        except KeyboardInterrupt:
+            raise typer.Exit(INTERRUPTED) from None
+
+
+live_app = typer.Typer()
+SEARCH_S = 1.0
+PAUSE_S = 0.5
+
+Connect = Annotated[str, typer.Option(help="The endpoint that the run was given as --live.")]
+Env = Annotated[
+    str | None, typer.Option(help="Which episode, as RUN/EPISODE; needed when several run.")
+]
+Wait = Annotated[
+    float,
+    typer.Option(
+        min=0.0,
+        max=1e6,
+        help="Seconds to wait until it is on the air; by default it must be by now.",
+    ),
+]
+
+
+@live_app.command(
+    rich_help_panel=STEP_IN,
+    epilog="Examples:  \n"
+    '`cosim inject \'{"id": "carl", "path": [{"ahead": 15, "left": 1}]}\'`  \n'
+    '`cosim inject \'{"id": "dora", "path": [{"ahead": 15}, {"ahead": 3}]}\'`  \n'
+    "`cosim inject @pedestrian.json --wait 60`",
+)
+def inject(
+    message: Annotated[
+        str, typer.Argument(help="The pedestrian as JSON, @FILE, or - for standard input.")
+    ],
+    connect: Connect = DEFAULT,
+    env: Env = None,
+    wait: Wait = 0.0,
+    tls: Tls = "",
+    insecure: Insecure = False,
+) -> None:
+    """Inject a pedestrian into a running episode. Prints the tick at which it enters, and where.
+    Exit code 2: refused.
+
+    It appears at the first point of its `path`, walks along it, stays at the end for `stay_s` (30)
+    seconds, and leaves. A point is `[x, y]` on the map, or `{"ahead": 15, "left": 1}` from the
+    robot as it is at that tick, in metres. Negative values mean behind it and to its right. Further
+    fields: `speed_mps`, `heading_rad`, `doing`, `age`.
+    """
+    from bridge.live import send_injection as send
+
+    payload = _payload(message)
+    session, below = _found(connecting("injector", "--connect", connect, tls, insecure), env, wait)
+    with session:
+        ack = send(session, f"{below}/inject", payload)
+    if ack.status == "refused":
+        err.print(f"refused: {ack.reason}", soft_wrap=True, markup=False, highlight=False)
+        raise typer.Exit(WRONG_USE)
+    where = "" if ack.x_m is None else f", at [{ack.x_m:.1f}, {ack.y_m:.1f}]"
+    out.print(
+        f"'{ack.id}' enters at tick {ack.tick}, {ack.time_s:.2f} s{where}",
+        markup=False,
+        highlight=False,
+    )
+
+
+@live_app.command(
+    rich_help_panel=STEP_IN,
+    epilog="Examples:  \n`cosim listen robot --seconds 5`  \n`cosim listen events --wait 60`",
+)
+def listen(
+    topic: Annotated[
+        str, typer.Argument(help="clock, robot, crowd, signals or events.")
+    ] = "events",
+    connect: Connect = DEFAULT,
+    env: Env = None,
+    wait: Wait = 0.0,
+    tls: Tls = "",
+    insecure: Insecure = False,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.0, max=1e6, help="How long; by default until stopped.")
+    ] = None,
+) -> None:
+    """Print what a running episode tells: a line of JSON each time. For `events` what happened
+    before comes first."""
+    topics = ("clock", "robot", "crowd", "signals", "events")
+    if topic not in topics:
+        raise unknown("topic", topic, topics)
+    session, below = _found(connecting("viewer", "--connect", connect, tls, insecure), env, wait)
+    with session:
+        if topic == "events":
+            try:
+                print(session.ask(f"{below}/log", b"", timeout_s=5.0).decode(), flush=True)
+            except TimeoutError as error:
+                raise EngineError(f"{error}: the episode has ended, or is too busy") from error
+        heard: SimpleQueue[bytes] = SimpleQueue()
+        session.listen(f"{below}/{topic}", lambda _, payload: heard.put(payload))
+        ends_at = time.monotonic() + (seconds if seconds is not None else 1e9)
+        try:
+            while (left_s := ends_at - time.monotonic()) > 0.0:
+                with suppress(Empty):
+                    print(heard.get(timeout=left_s).decode(), flush=True)
+        except KeyboardInterrupt:
+            raise typer.Exit(INTERRUPTED) from None
+
+
+def _payload(message: str) -> bytes:
+    if message == "-":
+        return sys.stdin.buffer.read()
+    if message.startswith("@"):
+        try:
+            return Path(message[1:]).read_bytes()
+        except OSError as error:
+            raise UsageError(f"{message[1:]}: cannot be read: {error.strerror}") from error
+    return message.encode()
+
+
+def _found(connection: Connection, env: str | None, wait_s: float) -> tuple[Session, str]:
+    """A session, to be closed, and what the keys of the episode that is meant begin with.
+
+    Looks for it until `wait_s` seconds are over, and says so. Raises EngineError when nothing is on
+    the air then, UsageError when only others are, or when several are and none is named.
+    """
+    meant = _meant(connection, env, warned)
+    connect = connection.connect
+    if isinstance(meant, tuple):
+        return meant
+    began = time.monotonic()
+    with (
+        doing(f"waiting up to {wait_s:g} s for {env or 'an episode'} at {connect}")
+        if wait_s
+        else nullcontext()
+    ):
+        while isinstance(meant, CosimError):
+            left_s = began + wait_s - time.monotonic()
+            if left_s <= 0.0:
+                remedy = f"waited {wait_s:g} s" if wait_s else "--wait 60 waits until it is there"
+                raise type(meant)(f"{meant} ({remedy})")
+            time.sleep(min(PAUSE_S, left_s))
+            meant = _meant(connection, env)
+    err.print(
+        f"{_name(meant[1])} is on the air after {time.monotonic() - began:.0f} s.", highlight=False
+    )
+    return meant
+
+
+def _meant(
+    connection: Connection, env: str | None, say: Callable[[str], None] = lambda _: None
+) -> tuple[Session, str] | CosimError:
+    """An open session and the episode, or why there is none yet. Raises UsageError where waiting
+    changes nothing."""
+    from bridge import keys
+    from bridge.session import open_session
+
+    connect = connection.connect
+    try:
+        session = open_session(connection, say)
+    except EngineError:
+        return EngineError(
+            f"no run is on the air at {connect}: start one with `cosim run ... --live {connect}`"
+        )
+    statuses = session.answers(keys.EVERY_STATUS, timeout_s=SEARCH_S)
+    names = {
+        _name(below): below for below in sorted(key.removesuffix("/status") for key in statuses)
+    }
+    if env in names or (env is None and len(names) == 1):
+        return session, names[env or next(iter(names))]
+    session.close()
+    if env is not None and names:
+        return unknown("running episode", env, names)
+    if names:
+        raise UsageError(f"several episodes are running: choose one with --env: {', '.join(names)}")
+    return EngineError(
+        f"a run is at {connect}, but none of its episodes is on the air: a new one takes "
+        f"some seconds"
+    )
+
+
+def _name(below: str) -> str:
+    """RUN/EPISODE, by what its keys begin with."""
+    return "/".join(below.split("/")[1::2])
+
+
+serve_app = typer.Typer()
+
+
+@serve_app.command(
+    "serve",
+    rich_help_panel=MANY,
+    epilog="Examples, each with a run in another terminal:  \n`cosim serve my.py:Mine --name "
+    "mine`, `cosim run reactive --policy zenoh:mine --policy-at tcp/127.0.0.1:7449`  \n`cosim "
+    "serve my.py:Mine --name mine --listen tls/0.0.0.0:7449 --tls certs/policy`  \n`cosim serve "
+    "my.py:Mine --name mine --connect tcp/127.0.0.1:7449`: a further one, where another listens",
+)
+def serve_command(
+    policy: Annotated[str, typer.Argument(help="Your own, as my.py:Class, or a baseline.")],
+    name: Annotated[
+        str, typer.Option(help="What runs ask for, as --policy zenoh:NAME; else the manifest's.")
+    ] = "",
+    listen: Annotated[
+        str, typer.Option(metavar="ENDPOINT", help="Where runs find it.")
+    ] = POLICIES_AT,
+    connect: Annotated[
+        str,
+        typer.Option(
+            metavar="ENDPOINT",
+            help="Instead: where another one listens, beside which runs find it.",
+        ),
+    ] = "",
+    jpeg: Annotated[
+        bool, typer.Option("--jpeg", help="Have pictures sent as JPEG; every row says so.")
+    ] = False,
+    tls: Tls = "",
+    insecure: Insecure = False,
+) -> None:
+    """Answer for a policy in runs of other processes, until stopped.
+
+    A policy with act_batch is asked for all episodes that wait, together; any other has an object
+    for each episode under way. Several servers of one name share the episodes; one that is killed
+    loses its own, which are run again. Where cosim cannot be installed, copy
+    bridge/policy_server.py and call its `serve`.
+    """
+    from bridge import keys
+    from bridge.policy_server import serve
+    from bridge.session import open_session
+    from cosim.episode.interfaces import Policy
+    from cosim.episode.policy_caller import Untimed
+    from cosim.policies.load import load_policy
+    from scenarios.runs.observation_codec import seen_from_afar
+
+    first = load_policy(policy)
+    if first.manifest.privileged:
+        raise UsageError(
+            f"policy '{policy}' is told what the simulator knows (privileged), and a remote "
+            f"one sees only observations"
+        )
+    spare = [first.policy]
+
+    def another() -> Policy:
+        return spare.pop() if spare else load_policy(policy, Untimed()).policy
+
+    if connect:
+        connection = connecting("policy", "--connect", connect, tls, insecure)
+    else:
+        connection = listening("policy", "--listen", listen, tls, insecure)
+    with open_session(connection, warned) as session:
+        serve(
+            first.policy if first.batches else another,
+            name=keys.name(name) if name else keys.chunk(first.manifest.name),
+            listen=connection.listen,
+            connect=connection.connect,
+            jpeg=jpeg,
+            told=first.manifest,
+            source=first.source_hash,
+            observe=seen_from_afar,
+            session=session.itself,
+        )
+    raise typer.Exit(INTERRUPTED)

@@ -1,0 +1,250 @@
+"""The commands `cosim look`, `cosim film` and `cosim export`."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from cosim.cli.console import out
+from cosim.cli.options import (
+    CAMERA_HELP,
+    CHILDREN_HELP,
+    ELDERLY_HELP,
+    GROUPS_HELP,
+    LOOK,
+    RESIDENTS_HELP,
+    ROBOT_HELP,
+    Choice,
+    camera_here,
+    check_output,
+    replaced,
+)
+from cosim.cli.progress import doing
+from cosim.core.errors import MachineError, UsageError, listed, unknown
+
+if TYPE_CHECKING:
+    from scenarios.tools.viewing.look import Viewpoint
+
+
+export_app = typer.Typer()
+
+
+@export_app.command(rich_help_panel=LOOK, epilog="Example:  \n`cosim export lh-011-00 street.glb`")
+def export(
+    scenario: Annotated[str, typer.Argument(help="A scenario's id (`cosim list long-horizon`).")],
+    output: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Where to write the street, a .glb.")
+    ],
+    suite: Annotated[
+        str | None,
+        typer.Option(
+            help="Where the scenario is: a suite or a suite's .json file; by default looked up."
+        ),
+    ] = None,
+) -> None:
+    """Write the street along a scenario's route as glTF: ground, buildings, trees, furniture,
+    signals, barriers."""
+    check_output(output, "glTF", (".glb",))
+    from cosim.spec.selection import scenarios_chosen
+    from scenarios.suites.catalog import holding, load_suite
+    from scenarios.tools.viewing.export import export_street
+
+    (one,) = scenarios_chosen(holding(scenario) if suite is None else load_suite(suite), [scenario])
+    instead = replaced(output)
+    with doing("reading the scenario") as tell:
+        tiles = export_street(one, output, tell)
+    size = f"{tiles} tiles, {output.stat().st_size / 1e6:.1f} MB"
+    out.print(f"Street: {output} ({one.id}, {size}){instead}", soft_wrap=True, highlight=False)
+
+
+def view_of(name: str) -> Viewpoint:
+    """The view called so. Raises UsageError with the valid names."""
+    from scenarios.tools.viewing.look import VIEWS
+
+    for view in VIEWS:
+        if view == name:
+            return view
+    raise unknown("view", name, VIEWS)
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """Width and height in "1280x720". Raises UsageError."""
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isdecimal() and 16 <= int(part) <= 4096 for part in parts):
+        raise UsageError(
+            f"--size '{text}': give width x height in pixels, each from 16 to 4096, like 1280x720"
+        )
+    return int(parts[0]), int(parts[1])
+
+
+film_app = typer.Typer()
+
+
+@film_app.command(
+    rich_help_panel=LOOK,
+    epilog="Examples:  \n`cosim film runs/mine lh-011-00 --from 30 --to 60 -o film.mp4`  \n"
+    "`cosim film runs/mine --failure --view above`",
+)
+def film(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+    episode: Annotated[
+        str | None,
+        typer.Argument(
+            help="One of its episodes; with --failure by default the first that failed."
+        ),
+    ] = None,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Where to write the film, an .mp4.")
+    ] = Path("film.mp4"),
+    failure: Annotated[
+        bool,
+        typer.Option("--failure", help="Film the first failure: 10 s before it to 2 s after it."),
+    ] = False,
+    start: Annotated[
+        float | None,
+        typer.Option(
+            "--from",
+            min=0.0,
+            help="First second of the episode.",
+            show_default="0, or as --failure says",
+        ),
+    ] = None,
+    end: Annotated[
+        float | None,
+        typer.Option(
+            "--to", help="Last second of the episode.", show_default="the end, or as --failure says"
+        ),
+    ] = None,
+    size: Annotated[str, typer.Option(help="Width x height in pixels, both even.")] = "1280x720",
+    view: Annotated[
+        str, typer.Option(help="follow (from behind), above, or robot: what it sees.")
+    ] = "follow",
+    speed: Annotated[int, typer.Option(min=1, max=32, help="Times real time.")] = 1,
+    camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
+) -> None:
+    """Film an episode of a run: from behind the robot or above it, with what it sees, the map,
+    events and failures."""
+    from scenarios.tools.viewing.film import Cut, failure_to_film, make_film
+
+    picked = view_of(view)
+    from_s = 0.0
+    until_s = math.inf
+    if failure:
+        shown = failure_to_film(folder, episode)
+        episode, from_s, until_s = shown.scenario, shown.from_s, shown.to_s
+        out.print(
+            f"Failure: {episode}, {shown.at_s:.1f} s: {shown.reason}",
+            soft_wrap=True,
+            highlight=False,
+        )
+    if episode is None:
+        raise UsageError(
+            f"{folder}: name one of its episodes, or give --failure: {_episodes(folder)}"
+        )
+    from_s, until_s = from_s if start is None else start, until_s if end is None else end
+    instead = replaced(output)
+    with doing("choosing the camera") as tell:
+        cut = Cut(from_s, until_s, size_of(size), speed, camera_here(camera), picked)
+        to_s = make_film(folder, episode, output, cut, tell)
+    same = (
+        "the state hash is the record's"
+        if to_s == math.inf
+        else f"of its first {to_s:g} s every tick is as recorded"
+    )
+    out.print(f"Film: {output} ({same}){instead}", soft_wrap=True, highlight=False)
+
+
+def _episodes(folder: Path) -> str:
+    """List the finished episodes of a run."""
+    from cosim.results.run_folder import read_records
+
+    return listed("", [record.scenario for record in read_records(folder)])
+
+
+look_app = typer.Typer()
+
+
+@look_app.command(
+    rich_help_panel=LOOK,
+    epilog="Examples:  \n`cosim look lh-011-00 --at 20 -o frame.png`  \n`cosim look lh-011-00 "
+    "--residents 8`  \n`cosim look mine.toml --scenario 2 --view above`",
+)
+def look(
+    scenario: Annotated[
+        str,
+        typer.Argument(
+            help="A scenario's id (`cosim list long-horizon`), or a file: your .toml, a suite's "
+            ".json."
+        ),
+    ],
+    which: Annotated[
+        str | None,
+        typer.Option(
+            "--scenario",
+            help="Of a file, which scenario: its id or its number; by default the first.",
+        ),
+    ] = None,
+    at: Annotated[float, typer.Option(min=0.0, help="Seconds into the episode.")] = 0.0,
+    view: Annotated[str, typer.Option(help="robot, follow (from behind) or above.")] = "robot",
+    size: Annotated[str, typer.Option(help="Width x height in pixels.")] = "1280x720",
+    suite: Annotated[
+        str | None,
+        typer.Option(
+            help="Where the scenario is: a suite or a suite's .json file; by default looked up."
+        ),
+    ] = None,
+    policy: Annotated[str, typer.Option(help="Who drives until then.")] = "route",
+    robot: Annotated[str, typer.Option(help=ROBOT_HELP)] = "",
+    residents: Annotated[int | None, typer.Option(min=0, help=RESIDENTS_HELP)] = None,
+    groups: Annotated[float | None, typer.Option(help=GROUPS_HELP)] = None,
+    elderly: Annotated[float | None, typer.Option(help=ELDERLY_HELP)] = None,
+    children: Annotated[float | None, typer.Option(help=CHILDREN_HELP)] = None,
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Where to write the picture.")
+    ] = Path("look.png"),
+    camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
+) -> None:
+    """Look at a scenario: one picture of what the robot sees, or of the robot in its street."""
+    from scenarios.suites.catalog import one_scenario, with_crowd, with_robot
+    from scenarios.tools.viewing.look import look_at
+
+    picked = view_of(view)
+    pixels = size_of(size)
+    check_output(output)
+    found, of = one_scenario(scenario, suite, which)
+    asked = with_crowd(
+        with_robot(found, robot),
+        residents=residents,
+        groups=groups,
+        elderly=elderly,
+        children=children,
+    )
+    (one,) = asked.scenarios
+    more = "" if which or of == 1 else f"; 1 of {of} scenarios: --scenario chooses another"
+    with doing("choosing the camera") as tell:
+        image, time_s = look_at(one, policy, at, picked, pixels, camera_here(camera), tell)
+    instead = replaced(output)
+    _save(image, output)
+    out.print(
+        f"Picture: {output} ({one.id} at {time_s:.2f} s, {view}{more}){instead}",
+        soft_wrap=True,
+        highlight=False,
+    )
+
+
+def _save(image: object, path: Path) -> None:
+    """Write a picture. Raises MachineError when it cannot be written there."""
+    import cv2
+    import numpy as np
+
+    try:
+        written = cv2.imwrite(str(path), np.asarray(image)[..., ::-1])
+    except cv2.error as error:
+        raise UsageError(
+            f"{path}: cannot be written as a picture; use a name that ends in .png or .jpg"
+        ) from error
+    if not written:
+        raise MachineError(f"{path}: the picture cannot be written there")

@@ -1,0 +1,430 @@
+"""The commands `cosim show`, `score`, `compare`, `merge` and `report`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Column, Table
+from rich.text import Text
+
+from cosim.cli.console import err, out
+from cosim.cli.options import (
+    CAMERA_HELP,
+    LOOK,
+    MANY,
+    RERUN_HELP,
+    TRUST,
+    Choice,
+    camera_here,
+    check_output,
+    replaced,
+    write_rerun,
+)
+from cosim.cli.progress import doing
+from cosim.cli.tables import print_fitted
+from cosim.core.errors import SOME_CRASHED, UsageError, unknown, unwritable
+from cosim.core.telling import milliseconds
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from cosim.results.compare import RunComparison
+    from cosim.results.record import Record
+
+
+compare_app = typer.Typer()
+_OUTPUT_HELP = (
+    "Write it too: .csv (all metrics; flipped scenarios go into NAME.flipped.csv), .md, .tex; "
+    "repeatable."
+)
+
+
+@compare_app.command(
+    rich_help_panel=TRUST,
+    epilog="Examples:  \n`cosim compare runs/before runs/after`  \n"
+    "`cosim compare runs/straight runs/mine runs/other -o all.csv -o table.md -o table.tex`",
+)
+def compare(
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="RUN OTHER...", help="Run folders of one suite.")
+    ],
+    outputs: Annotated[list[Path] | None, typer.Option("-o", "--output", help=_OUTPUT_HELP)] = None,
+) -> None:
+    """Compare runs with the first one, paired by scenario: what differs, what is noise, which
+    scenarios flipped.
+
+    Over the whole suite, and by event, structure and split; intervals of the difference by drawing
+    scenarios again.
+    """
+    from cosim.report.compared import FORMATS
+    from cosim.results.compare import compare_runs
+
+    for path in outputs or ():
+        if path.suffix not in (".csv", *FORMATS):
+            raise UsageError(
+                f"{path}: its name must end in .csv, {', '.join(FORMATS)}: so the format is chosen"
+            )
+    with doing(f"comparing {len(folders)} runs"):
+        told = compare_runs(folders)
+    instead = {path: replaced(path) for path in outputs or ()}
+    for path in outputs or ():
+        if path.suffix == ".csv":
+            _write(path, told.differences.to_csv(index=False))
+            _write(path.with_suffix(".flipped.csv"), told.flipped.to_csv(index=False))
+        else:
+            _write(path, FORMATS[path.suffix](told))
+    print_comparison(out, told)
+    for path, said in instead.items():
+        out.print(f"Written: {path}{said}", soft_wrap=True, markup=False, highlight=False)
+
+
+def print_comparison(out: Console, told: RunComparison) -> None:
+    """What is compared, a table of each run's whole suite and one of its groups, and what flipped:
+    for 80 columns."""
+    from cosim.cli.run_table import print_terms
+    from cosim.report.compared import flips_in_words, how_to_read, tables_of_comparison
+
+    for run in (told.before, *told.others):
+        out.print(f"{run.label}: {run.path}", soft_wrap=True, markup=False, highlight=False)
+        print_terms(out, run.table, run.path)
+    for other in told.others:
+        for table in tables_of_comparison(told, other):
+            out.print(table.title, soft_wrap=True, markup=False, highlight=False)
+            names = [Column(head, overflow="fold") for head in table.heads[: table.names]]
+            figures = [
+                Column(head, no_wrap=True, justify="right")
+                for head in table.heads[table.names : -1]
+            ]
+            shown = Table(
+                *names,
+                *figures,
+                Column(table.heads[-1], no_wrap=True),
+                box=box.SIMPLE_HEAD,
+                padding=0,
+                show_edge=False,
+            )
+            for row in table.rows:
+                shown.add_row(*map(Text, row))
+            print_fitted(out, shown, table.names)
+        for line in flips_in_words(told, other):
+            out.print(line, soft_wrap=not out.is_terminal, markup=False, highlight=False)
+    for note in (*told.notes, how_to_read(told)):
+        out.print(note, soft_wrap=not out.is_terminal, markup=False, highlight=False)
+
+
+def _write(path: Path, text: str) -> None:
+    from cosim.core.whole_file import write_whole
+
+    try:
+        write_whole(path, text.encode())
+    except OSError as error:
+        raise unwritable(path, error) from error
+
+
+report_app = typer.Typer()
+
+
+@report_app.command(
+    rich_help_panel=LOOK,
+    epilog="Examples:  \n`cosim report runs/mine -o report.html`  \n"
+    "`cosim report runs/unit-mine runs/reactive-mine runs/reactive-theirs --failures 24`",
+)
+def report(
+    folders: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="Where to write the page, an .html.")
+    ] = Path("report.html"),
+    failures: Annotated[
+        int, typer.Option(min=0, max=200, help="Show at most so many failures again.")
+    ] = 48,
+    within: Annotated[
+        float,
+        typer.Option(
+            metavar="SECONDS",
+            min=0.0,
+            help="Of an episode show its first failure, and others this soon: to come to later "
+            "ones takes long.",
+        ),
+    ] = 150.0,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes that show them again.")] = 2,
+    camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
+) -> None:
+    """Write one HTML file about runs: tables beside the paper's, plots, maps of failures, failures
+    to play again.
+
+    It opens from disk and asks nobody for anything. Failures are shown by running their episodes
+    again.
+    """
+    check_output(output, "a page", (".html", ".htm"))
+    from scenarios.tools.viewing.report import make_report
+
+    instead = replaced(output)
+    with doing("choosing the camera") as tell:
+        drawn_by = camera_here(camera)
+        made = make_report(
+            folders, output, camera=drawn_by, jobs=jobs, most=failures, within_s=within, tell=tell
+        )
+    size = f"{made.size_bytes / 1e6:.1f} MB, {made.shown} of {made.failures} failures"
+    out.print(f"Report: {output} ({size}){instead}", soft_wrap=True, highlight=False)
+
+
+score_app = typer.Typer()
+
+
+@score_app.command(rich_help_panel=TRUST, epilog="Example:  \n`cosim score runs/mine`")
+def score(folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")]) -> None:
+    """Compute every metric of a run again from its trajectories; is it what the run recorded, to
+    the bit?
+
+    No engine is started. Exit code 1, and the first difference, where it is not.
+    """
+    from cosim.results.metrics import METRICS
+    from cosim.results.record import METRIC_SCHEMA
+    from cosim.results.rescore import score_run
+
+    with doing(f"reading {folder}") as tell:
+        scored = score_run(folder, tell)
+    lines = [
+        f"{scored.episodes} episodes, {len(METRICS)} metrics each, by metric schema {METRIC_SCHEMA}"
+    ]
+    if lacking := scored.scheduled - scored.episodes - scored.without_trajectory:
+        lines.append(
+            f"{lacking} of {scored.scheduled} scheduled episodes have not ended: results.csv "
+            f"is not looked at"
+        )
+    if scored.without_trajectory:
+        lines.append(
+            f"{scored.without_trajectory} have no trajectory: their policy crashed, or an "
+            f"engine failed"
+        )
+    if scored.untested:
+        lines.append(f"no trajectory tells {', '.join(scored.untested)}: see cosim counterfactual")
+    if not scored.differences:
+        files = ("record.json", "results.sqlite", *["results.csv"] * scored.table)
+        lines.append(f"equal to the bit to {', '.join(files)}")
+    for line in lines:
+        out.print(line, soft_wrap=True, highlight=False, markup=False)
+    if scored.differences:
+        first = scored.differences[0]
+        episodes = {one.episode for one in scored.differences}
+        out.print(
+            f"different: episode {first.episode}, {first.metric} in {first.file}: recorded "
+            f"{first.recorded}, computed {first.computed} (differences: {len(scored.differences)}, "
+            f"episodes: {len(episodes)})",
+            soft_wrap=True,
+            highlight=False,
+            markup=False,
+        )
+        raise typer.Exit(SOME_CRASHED)
+
+
+show_app = typer.Typer()
+
+
+@show_app.command(
+    epilog="Examples:  \n`cosim show runs/mine`  \n`cosim show runs/mine --events`  \n"
+    "`cosim show runs/mine --episode lh-011-00 -o episode.png`  \n"
+    "`cosim show runs/mine --episode lh-011-00 --rerun episode.rrd`"
+)
+def show(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+    episode: Annotated[
+        str | None, typer.Option(help="One episode: its failures and events, and a picture.")
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Where to write the episode's picture.")
+    ] = None,
+    events: Annotated[
+        bool, typer.Option("--events", help="What was measured of every event, from its tracks.")
+    ] = False,
+    rerun: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help=RERUN_HELP)] = None,
+) -> None:
+    """Show the table of a run, finished or not, or one episode as a picture from above."""
+    from cosim.cli.run_table import kinds_of, print_by_kind, print_table
+    from cosim.results.finished_run import check_record_file
+    from cosim.results.run_folder import read_records, read_spec
+    from cosim.results.table import table_of
+
+    spec = read_spec(folder)
+    records = {record.scenario: record for record in read_records(folder)}
+    if rerun is not None:
+        write_rerun(folder, [] if episode is None else [episode], rerun)
+        return
+    for record in records.values():
+        check_record_file(folder, record)
+    if events:
+        if episode is not None:
+            raise UsageError("--events is about a whole run: leave --episode out")
+        from scenarios.tools.viewing.event_sheet import sheet_of_run
+
+        print_sheet(out, sheet_of_run(folder))
+        return
+    if episode is None:
+        table = table_of(records.values())
+        print_table(out, table, len(spec.scenarios), folder)
+        print_by_kind(out, table, kinds_of(folder))
+        return
+    if episode not in records:
+        raise unknown(f"finished episode in {folder}", episode, records)
+    from scenarios.tools.viewing.episode_pictures import draw_episode
+
+    record = records[episode]
+    print_episode(out, record)
+    if record.ended is None and picture is not None:
+        raise UsageError(
+            f"episode '{episode}' is {record.status}: it has no track to draw. Leave -o out"
+        )
+    if record.ended is not None:
+        path = picture or folder / "episodes" / episode / "above.png"
+        instead = replaced(picture)
+        with doing(f"drawing {episode}"):
+            draw_episode(folder, episode, path)
+        out.print(f"Picture: {path}{instead}", soft_wrap=True)
+
+
+def print_episode(out: Console, record: Record) -> None:
+    """One episode in words: how it ended, every failure, every event, every metric."""
+    from cosim.cli.run_table import value_in_words
+    from cosim.core.clock import Clock
+    from cosim.results.metrics import COUNTERFACTUAL, METRICS
+
+    out.print(
+        f"{record.scenario}: {record.status} {record.ended or ''} {record.reason}",
+        soft_wrap=True,
+        markup=False,
+    )
+    if record.latency_ms or record.real_time:
+        real = (
+            ", a median in whole ticks of 50 ms: replayed, never made again"
+            if record.real_time
+            else ""
+        )
+        took = (
+            ""
+            if record.answer_ms is None
+            else f"an answer took {milliseconds(record.answer_ms)} (median); "
+        )
+        out.print(
+            f"  {took}commands took effect {record.latency_ms:g} ms after what they answer{real}",
+            soft_wrap=True,
+        )
+    for failure in record.failures:
+        what = f" with {failure.other_kind} {failure.other}" if failure.other else ""
+        fault = f", {failure.fault}" if failure.fault else ""
+        out.print(
+            f"  {Clock().time_s(failure.tick):7.2f} s  {failure.kind}{what} at "
+            f"{failure.route_s_m:.1f} m{fault}"
+        )
+    for contact in record.walked_into:
+        where = f"at {contact.route_s_m:.1f} m, {contact.fault}"
+        out.print(
+            f"  {Clock().time_s(contact.tick):7.2f} s  walked into by {contact.other} {where}"
+        )
+    for event in record.events:
+        at = (
+            "never triggered"
+            if event.triggered_at_s is None
+            else f"triggered at {event.triggered_at_s:.2f} s"
+        )
+        out.print(f"  event {event.id} {event.kind}: {at}")
+    table = Table("metric", "value", "unit")
+    for name, metric in METRICS.items():
+        table.add_row(name, value_in_words(record.measures.get(name)), metric.unit)
+    for name, unit in COUNTERFACTUAL.items():
+        if name in record.measures:
+            table.add_row(name, value_in_words(record.measures[name]), unit)
+    print_fitted(out, table)
+
+
+def print_sheet(out: Console, sheet: pd.DataFrame) -> None:
+    """What was measured of each event of a run (`scenarios.tools.viewing.event_sheet`), and two
+    summaries by kind: for 80 columns."""
+    from scenarios.tools.viewing.event_sheet import summary
+
+    if sheet.empty:
+        out.print("No event of this run's episodes was triggered.")
+        return
+    heads = (
+        "trigger\nm",
+        "error\nm",
+        "tick\nm",
+        "speed\nm/s",
+        "stated\nm/s",
+        "left\nm",
+        "angle\ndeg",
+        "least\nm",
+    )
+    columns = (Column(head, justify="right", no_wrap=True) for head in heads)
+    rows = Table(Column("episode", overflow="fold"), *columns, box=box.SIMPLE_HEAD, padding=0)
+    for row in sheet.itertuples(index=False):
+        name = row[0] if row[0].startswith(row[1]) else f"{row[0]} {row[1]}"
+        numbers = (
+            f"{value:.{digits}f}"
+            for value, digits in zip(row[2:], (2, 3, 3, 2, 2, 2, 0, 2), strict=True)
+        )
+        rows.add_row(name, *("-" if n == "nan" else n for n in numbers))
+    print_fitted(out, rows)
+    for short in summary(sheet):
+        columns = (Column(head, no_wrap=True) for head in short.columns)
+        table = Table(*columns, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        for row in short.itertuples(index=False):
+            table.add_row(*(str(value) for value in row))
+        print_fitted(out, table)
+    out.print(
+        "trigger: from the robot to the event's place, when it began; error: off what is stated; "
+        "tick: what the robot drove in a tick, the most that the error may be; off: triggers "
+        "beyond that; speed: of the person while it walks, stated: of the scenario; left: of the "
+        "middle of the way; angle: of its walk to the robot's heading; least: distance between "
+        "the centres of person and robot"
+    )
+
+
+merge_app = typer.Typer()
+
+
+@merge_app.command(
+    rich_help_panel=MANY,
+    epilog="Examples:  \n`cosim run reactive --policy orca --seed 7 --shard 1/2 --out runs/1`, "
+    "and `2/2` on another machine  \n`cosim merge runs/1 runs/2 --out runs/orca`  \n`cosim run "
+    "reactive --policy orca --seed 7 --out runs/orca --resume`, where episodes are missing",
+)
+def merge(
+    folders: Annotated[
+        list[Path], typer.Argument(metavar="RUN...", help="Run folders: shards of one run.")
+    ],
+    target: Annotated[Path, typer.Option("--out", help="The run folder to make.")],
+) -> None:
+    """Make one run folder of the shards of a run: the table is that of a run in one piece, to the
+    byte.
+
+    Folders of different runs are refused, and so are different episodes of one scenario; equal ones
+    are taken once. Missing scenarios are named, exit code 1: `cosim run --resume` runs them.
+    """
+    from cosim.cli.run_table import kinds_of, print_by_kind, print_table
+    from cosim.results.merge import merge_runs
+
+    with doing("reading the shards") as tell:
+        merged = merge_runs(folders, target, tell)
+    print_table(out, merged.table, len(merged.spec.scenarios), target)
+    print_by_kind(out, merged.table, kinds_of(target))
+    out.print(f"Run folder: {target}", soft_wrap=True)
+    if merged.twice:
+        err.print(
+            f"{len(merged.twice)} scenarios came twice, equal to the bit, and were taken once.",
+            highlight=False,
+        )
+    if merged.missing:
+        err.print(
+            f"{len(merged.missing)} scenarios are missing: {', '.join(merged.missing)}: give "
+            f"the command of the run "
+            f"without --shard, with --seed {merged.spec.seed} --out {target} --resume",
+            soft_wrap=True,
+            markup=False,
+            highlight=False,
+        )
+    if merged.missing or merged.table["ended"].isna().any():
+        raise typer.Exit(SOME_CRASHED)

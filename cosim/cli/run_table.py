@@ -1,0 +1,313 @@
+"""Print the tables of runs and episodes, and the commands to use next."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping
+from pathlib import Path
+
+import pandas as pd
+from rich import box
+from rich.console import Console
+from rich.table import Column, Table
+
+from cosim.cli.tables import print_fitted
+from cosim.core.telling import milliseconds
+from cosim.results.log import holds_waypoints
+from cosim.results.metrics import COUNTERFACTUAL, SUCCESS_IN_WORDS
+from cosim.results.table import not_to_be_quoted, policy_in_words, summary_of
+from cosim.spec.scenario import Scenario, read_suite
+
+
+def print_next_commands(err: Console, folder: Path, table: pd.DataFrame) -> None:
+    """Print the commands that show a run: a film, of a failure where there is one; a page; one
+    episode.
+
+    table: a row per episode. A run of which no episode came to its end has neither film nor
+    picture.
+    """
+    run = shlex.quote(str(folder))
+    ended = table[table["ended"].notna()]
+    lines = [f"cosim report {run} -o report.html"]
+    if len(ended):
+        failed = ended[ended["success"] == 0.0]
+        first = shlex.quote(str((failed if len(failed) else ended)["scenario"].iloc[0]))
+        shown = "--failure" if len(failed) else first
+        lines = [
+            f"cosim film {run} {shown} -o film.mp4",
+            *lines,
+            f"cosim show {run} --episode {first}",
+        ]
+    err.print("\n  ".join(["Next:", *lines]), soft_wrap=True, highlight=False, markup=False)
+
+
+SHOWN = (
+    ("success", "SR"),
+    ("route_completion", "RC"),
+    ("failures_per_100m", "FC"),
+    ("collisions_per_100m", "C"),
+    ("out_of_lane_per_100m", "OL"),
+    ("freezings_per_100m", "F"),
+    ("velocity_mean_mps", "V"),
+)
+LETTERS = {
+    "SR": SUCCESS_IN_WORDS,
+    "RC": "share of the route done",
+    "FC": "failures per 100 m travelled",
+    "C": "collisions per 100 m travelled",
+    "OL": "out of lane per 100 m travelled",
+    "F": "freezings per 100 m travelled",
+    "V": "mean speed",
+}
+"""What a letter means, in every table: what is counted otherwise has no letter."""
+UNITS = {"FC": "/100m", "C": "/100m", "OL": "/100m", "F": "/100m", "V": "m/s"}
+COUNTS = (("collisions", "collisions"), ("out_of_lane", "out of lane"), ("freezings", "freezings"))
+MEANS = (*SHOWN[:3], ("failures_per_100m_route", ""), *SHOWN[3:], ("spl", "SPL"))
+"""Those of a run."""
+WITHOUT_PEOPLE = (
+    ("spl", "SPL"),
+    ("route_completion", "RC"),
+    ("other_collision", "hit\nelse"),
+    ("left_lane", "left\nlane"),
+)
+WITH_PEOPLE = (
+    ("spl", "SPL"),
+    ("pedestrian_collision", "hit a\nperson"),
+    ("other_collision", "hit\nelse"),
+    ("left_lane", "left\nlane"),
+    ("broke_rule", "broke\nrule"),
+    ("pedestrian_distance_min_m", "near-\nest m"),
+    ("pedestrian_distance_min_success_m", "of\nwins"),
+)
+"""Means over the episodes of a kind: shares of them, and metres."""
+
+
+def print_table(
+    out: Console, table: pd.DataFrame, scheduled: int, folder: Path | None = None
+) -> None:
+    """Print the table of a run: a row per episode, then the means with their intervals. folder: of
+    the run."""
+    heads = (*(f"{head}\n{UNITS.get(head, '')}" for _, head in SHOWN), "counts")
+    numbers = (Column(head, no_wrap=True, justify="right") for head in heads)
+    shown = Table(
+        Column("episode", no_wrap=True),
+        Column("ended", no_wrap=True),
+        *numbers,
+        box=box.SIMPLE_HEAD,
+        padding=0,
+    )
+    for _, row in table.iterrows():
+        counts = "/".join("-" if pd.isna(row[name]) else f"{row[name]:.0f}" for name, _ in COUNTS)
+        ended = row["ended"] if row["status"] == "done" else row["status"]
+        shown.add_row(
+            row["scenario"] + "*" * bool(row.get("nonstandard")),
+            ended,
+            *(value_in_words(row[name]) for name, _ in SHOWN),
+            counts,
+        )
+    print_fitted(out, shown)
+    print_terms(out, table, folder)
+    counted = "/".join(name for _, name in COUNTS)
+    out.print(
+        "; ".join(f"{letter} {meaning}" for letter, meaning in LETTERS.items())
+        + f"; counts: {counted}"
+    )
+    print_means(out, table)
+    print_delays(out, table)
+    print_statuses(out, table, scheduled)
+
+
+def print_means(out: Console, table: pd.DataFrame) -> None:
+    """What came out of all episodes of a run together."""
+    if not len(table):
+        return
+    means = Table("over all episodes", "", "95 % interval", "n", box=box.SIMPLE_HEAD)
+    for (name, head), (_, row) in zip(
+        MEANS, summary_of(table, [n for n, _ in MEANS]).iterrows(), strict=True
+    ):
+        means.add_row(f"{name} ({head})" if head else name, *_mean_cells(row))
+    print_fitted(out, means)
+    crashed = int((table["status"] == "crashed").sum())
+    missing = f"; none, because {crashed} crashed" if crashed else ""
+    out.print(
+        f"rates are pooled: all failures on all metres{missing}; what crashed counts as the "
+        f"worst elsewhere"
+    )
+    print_by_split(out, table)
+
+
+def _mean_cells(row: pd.Series[float]) -> tuple[str, str, str]:
+    """Mean, interval and number of episodes, from a row of `summary_of`."""
+    interval = f"{value_in_words(row['low'])} to {value_in_words(row['high'])}" if row["n"] else "-"
+    return value_in_words(row["mean"]), interval, f"{row['n']:.0f}"
+
+
+def print_statuses(out: Console, table: pd.DataFrame, scheduled: int) -> None:
+    """How many episodes there are of each status, why, and whether the run may be quoted."""
+    parts = {status: table[table["status"] == status] for status in ("done", "crashed", "invalid")}
+    scored = len(parts["done"]) + len(parts["crashed"])
+    counts = f"scheduled {scheduled}, scored {scored}, of these crashed {len(parts['crashed'])}"
+    out.print(f"{counts}; invalid {len(parts['invalid'])}")
+    for _, row in pd.concat([parts["crashed"], parts["invalid"]]).iterrows():
+        out.print(
+            f"{row['status']} {row['scenario']}: {row['reason']}",
+            soft_wrap=True,
+            markup=False,
+            highlight=False,
+        )
+    if reason := not_to_be_quoted(table, scheduled):
+        out.print(f"not to be quoted: {reason}", soft_wrap=True, highlight=False)
+
+
+def print_terms(out: Console, table: pd.DataFrame, folder: Path | None = None) -> None:
+    """Print by which terms a run drove: policy, camera, goal, odometry, where the policy ran, how
+    its waypoints were followed, seed; and what is nonstandard. Without a camera, or waypoints in
+    the run's folder, these are left out."""
+    named = [
+        "policy",
+        "camera",
+        "rate_hz",
+        "goal_protocol",
+        "odometry",
+        "privileged",
+        "waypoints",
+        "run_seed",
+        "nonstandard",
+        "policy_runs",
+    ]
+    if not {*named} <= set(table.columns):
+        return
+    follows = folder is None or any(map(holds_waypoints, folder.glob("episodes/*/trajectory.npz")))
+    for policy, camera, rate_hz, goal, odometry, knows, waypoints, seed, odd, runs in (
+        table[named].drop_duplicates().itertuples(index=False)
+    ):
+        told = [
+            f"policy {policy_in_words(policy, knows)}",
+            f"at {rate_hz:g} Hz" if camera == "none" else f"camera {camera}, at {rate_hz:g} Hz",
+            f"goal {goal}",
+            f"odometry {odometry}",
+            *([f"policy {runs}"] if runs != "in-process" else []),
+            *([waypoints] if follows else []),
+            f"seed {seed}",
+        ]
+        out.print("; ".join(told), highlight=False, markup=False)
+        if odd:
+            out.print(f"* nonstandard, not to be compared: {odd}", highlight=False, markup=False)
+    if words := _latency_in_words(table):
+        out.print(words, highlight=False, markup=False)
+
+
+def _latency_in_words(table: pd.DataFrame) -> str:
+    """How late commands took effect, where they did."""
+    if "latency_ms" not in table or not (table["latency_ms"].any() or table["real_time"].any()):
+        return ""
+    measured = table["real_time"].any()
+    late_ms = table.loc[table["ended"].notna(), "latency_ms"] if measured else table["latency_ms"]
+    if not len(late_ms):
+        return "in real time: no episode came to its end, so no latency was measured"
+    if not measured:
+        return (
+            f"latency {late_ms.median():g} ms: commands take effect so much later than what they "
+            f"answer"
+        )
+    told = (
+        f"commands took effect {_median_and_range(late_ms)} after what they answer, at whole "
+        f"ticks of 50 ms"
+    )
+    if len(took_ms := table["answer_ms"].dropna()):
+        told = f"the median answer took {_median_and_range(took_ms)}; {told}"
+    return (
+        f"in real time: {told}; as measured here, not to be had again from the seed, only replayed"
+    )
+
+
+def _median_and_range(of_episodes_ms: pd.Series[float]) -> str:
+    least, middle, most = (milliseconds(float(of_episodes_ms.quantile(q))) for q in (0.0, 0.5, 1.0))
+    return f"{middle} ({least.removesuffix(' ms')} to {most})"
+
+
+def print_delays(out: Console, table: pd.DataFrame) -> None:
+    """What the robot cost others, per episode, in a run that was asked to compare; nothing in any
+    other."""
+    if not set(COUNTERFACTUAL) <= set(table.columns):
+        return
+    shown = Table(
+        "against the same street without the robot",
+        "per episode",
+        "95 % interval",
+        "n",
+        box=box.SIMPLE_HEAD,
+    )
+    for name, row in summary_of(table, tuple(COUNTERFACTUAL)).iterrows():
+        shown.add_row(str(name), *_mean_cells(row))
+    print_fitted(out, shown)
+
+
+def value_in_words(value: float | None) -> str:
+    """A figure as tables show it: with two digits, "-" where there is none."""
+    return "-" if value is None or pd.isna(value) else f"{value:.2f}"
+
+
+def kinds_of(folder: Path) -> Mapping[str, str]:
+    """What each scenario of a run is an example of: its structure, or the kind of its one event; ""
+    for neither."""
+    scenarios = read_suite(folder / "scenarios.json").scenarios
+    return {
+        s.id: s.structure or (s.events[0].kind if about_one_event(s) else "") for s in scenarios
+    }
+
+
+def about_one_event(scenario: Scenario) -> bool:
+    """Whether a scenario is there for its one event."""
+    return scenario.ends_on_failure and len(scenario.events) == 1
+
+
+def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -> None:
+    """A row per kind of scenario: how many episodes, and their means. Nothing for fewer than two
+    kinds."""
+    named = [kind for kind in dict.fromkeys(kinds.values()) if kind]
+    if len(named) < 2:
+        return
+    people = bool(table["pedestrian_distance_min_m"].notna().any())
+    columns = WITH_PEOPLE if people else WITHOUT_PEOPLE
+    heads = ("n", "SR", "95 % of SR", *(head for _, head in columns), "in-\nvalid")
+    numbers = (Column(head, no_wrap=True, justify="right") for head in heads)
+    shown = Table(Column("", no_wrap=True), *numbers, box=box.SIMPLE_HEAD, padding=0)
+    for kind in named:
+        part = table[table["scenario"].map(kinds) == kind]
+        means = summary_of(part, ("success", *(name for name, _ in columns)))
+        low, high, scored = (float(means[column].iloc[0]) for column in ("low", "high", "n"))
+        interval = f"{low:.2f}..{high:.2f}" if scored else "-"
+        success, *rest = (value_in_words(mean) for mean in means["mean"])
+        invalid = str((part["status"] == "invalid").sum())
+        shown.add_row(kind, f"{scored:.0f}", success, interval, *rest, invalid)
+    print_fitted(out, shown)
+    out.print(
+        "n episodes that are scored; hit a person, hit else, left lane, broke rule: share of "
+        "these; nearest: least distance to a person's centre, mean over episodes, of wins: over "
+        "those that succeeded; SPL success by path length"
+        if people
+        else "n episodes that are scored; hit else, left lane: share of these; SPL success "
+        "weighted by path length"
+    )
+
+
+def print_by_split(out: Console, table: pd.DataFrame) -> None:
+    """The episodes of val and of test apart, where a run has both."""
+    if "split" not in table or table["split"].nunique() < 2:
+        return
+    names = ("success", "route_completion", "failures_per_100m")
+    columns = (
+        Column(head, no_wrap=True)
+        for head in ("split", "n", "SR, 95 %", "RC, 95 %", "FC /100m, 95 %")
+    )
+    shown = Table(*columns, box=box.SIMPLE_HEAD)
+    for split, part in table.groupby("split", sort=False):
+        means = summary_of(part, names)
+        cells = (
+            f"{value_in_words(row['mean'])} "
+            f"{value_in_words(row['low'])}..{value_in_words(row['high'])}"
+            for _, row in means.iterrows()
+        )
+        shown.add_row(str(split), f"{means['n'].iloc[0]:.0f}", *cells)
+    print_fitted(out, shown)

@@ -1,0 +1,408 @@
+"""The command line of own scenarios: `cosim scenario new`, `check`, `draw`, `run`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+import typer
+from rich import box
+from rich.table import Column, Table
+
+from cosim.cli.console import err, out
+from cosim.cli.options import (
+    CAMERA_HELP,
+    LATENCY_HELP,
+    REAL_TIME_HELP,
+    RERUN_HELP,
+    Choice,
+    asked_latency_ms,
+    camera_here,
+    check_rerun,
+    replaced,
+    with_latency,
+    write_rerun,
+)
+from cosim.cli.progress import Board, doing
+from cosim.cli.tables import print_fitted
+from cosim.core.bounding_box import box_of, refuse_outside
+from cosim.core.errors import (
+    INTERRUPTED,
+    SOME_CRASHED,
+    WRONG_USE,
+    MachineError,
+    SpecError,
+    UsageError,
+    unknown,
+    unwritable,
+)
+from cosim.core.whole_file import write_whole
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from cosim.spec.goal import GoalProtocol
+    from cosim.spec.scenario import Suite
+    from scenarios.suites.user_scenarios.read import OwnFile
+
+scenario_app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="Scenarios of your own, in TOML files; sweeps over them.",
+)
+_MOVED_M = 0.5
+"""What was moved farther than this is told."""
+_FILE_HELP = "A TOML file: `cosim scenario new` writes one."
+
+
+@scenario_app.command("new", epilog="Example:  \n`cosim scenario new mine.toml`")
+def write_template(
+    file: Annotated[Path, typer.Argument(help="Where to write it, a .toml; it is named after it.")],
+) -> None:
+    """Write a scenario that runs as it is, with a comment on everything that may stand in it."""
+    if file.suffix != ".toml":
+        raise UsageError(f"{file}: a scenario's file ends in .toml")
+    if file.exists():
+        raise UsageError(f"{file} is there already: choose another name, or remove it")
+    name = re.sub(r"[^A-Za-z0-9_.-]+", "-", file.stem).strip("-.") or "mine"
+    template = (
+        Path(__file__).parents[2] / "scenarios" / "suites" / "user_scenarios" / "template.toml"
+    )
+    try:
+        write_whole(file, template.read_bytes().replace(b"NAME", name.encode(), 1))
+    except OSError as error:
+        raise unwritable(file, error) from error
+    out.print(
+        f"{file}: try `cosim scenario draw {file} -o map.png` and `cosim scenario run {file}`",
+        soft_wrap=True,
+    )
+
+
+@scenario_app.command(
+    "check",
+    epilog="Examples:  \n`cosim scenario check mine.toml --drive`  \n`cosim scenario check "
+    "scenarios/examples/*.toml`",
+)
+def check_own(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help=_FILE_HELP)],
+    drive: Annotated[
+        bool, typer.Option("--drive", help="Have the oracle drive each: can it be solved?")
+    ] = False,
+) -> None:
+    """Say what scenarios are, or everything that is wrong with them: fields, place, way, events,
+    obstacles, room.
+
+    Exit code 1: the oracle failed in one.
+    """
+    from scenarios.suites.user_scenarios.build import suite_of_own
+    from scenarios.suites.user_scenarios.check import own_faults
+    from scenarios.suites.user_scenarios.read import read_own
+
+    faulty = failed = 0
+    for path in files:
+        try:
+            with doing(f"checking {path}") as tell:
+                own = read_own(path)
+                faults = own_faults(own, tell)
+        except SpecError as error:
+            faults = [str(error).removeprefix(f"{path}: ")]
+        if faults:
+            faulty += 1
+            for fault in faults:
+                err.print(f"{path}: {fault}", soft_wrap=True, markup=False, highlight=False)
+        else:
+            _say(own)
+            suite = suite_of_own(own)
+            _print_scenarios(suite, own)
+            failed += _driven(suite) if drive else 0
+    if faulty:
+        raise typer.Exit(WRONG_USE)
+    if failed:
+        raise typer.Exit(SOME_CRASHED)
+
+
+def _driven(suite: Suite) -> int:
+    """Say of each scenario whether the oracle comes through without a failure. Returns in how many
+    it does not."""
+    from scenarios.suites.proofs import Dropped
+    from scenarios.tools.build.proving import EXPERT, proved
+
+    failed = 0
+    for one in suite.scenarios:
+        with doing(f"{EXPERT} drives {one.id}"):
+            proof = proved(one)
+        if isinstance(proof, Dropped):
+            failed += 1
+            words = f"{EXPERT} fails: {proof.reason} {proof.details}"
+        else:
+            words = f"solved by {EXPERT} in {proof.time_s:.1f} s"
+        out.print(f"{one.id}: {words}", soft_wrap=True, markup=False, highlight=False)
+    return failed
+
+
+@scenario_app.command(
+    "draw",
+    epilog="Examples:  \n`cosim scenario draw mine.toml -o map.png`  \n"
+    "`cosim scenario draw mine.toml --whole -o town.png`  \n"
+    "`cosim scenario draw mine.toml --zoom 300,1700,500,1900 -o part.png`",
+)
+def draw_own(
+    file: Annotated[Path, typer.Argument(help=_FILE_HELP)],
+    picture: Annotated[Path, typer.Option("-o", "--output", help="The picture, a PNG.")],
+    scenario: Annotated[
+        str | None, typer.Option(help="Of a sweep, which one; by default the first.")
+    ] = None,
+    whole: Annotated[
+        bool, typer.Option("--whole", help="The whole place, also where there is no way yet.")
+    ] = False,
+    zoom: Annotated[
+        str | None, typer.Option(help="Part of the place: x0,y0,x1,y1 in metres.")
+    ] = None,
+) -> None:
+    """Draw the map from above: coordinates, way, metres along it, fences, obstacles, events."""
+    from cosim.report.mapsheet import write_png
+    from cosim.report.plan import draw_plan
+    from scenarios.places.nets import place
+    from scenarios.suites.user_scenarios.build import made_one, place_of_own
+    from scenarios.suites.user_scenarios.read import read_own
+
+    part = None if zoom is None else box_of("--zoom", zoom)
+    own = read_own(file)
+    variants = {variant.id: variant for variant in own.variants}
+    if scenario is not None and scenario not in variants:
+        raise unknown("scenario", scenario, variants)
+    variant = variants[scenario] if scenario else own.variants[0]
+    instead = replaced(picture)
+    with doing(f"drawing {variant.id}"):
+        made = made_one(variant, own.name)
+        if made.scenario is None and not whole and part is None:
+            faults = "\n  ".join(made.faults)
+            raise SpecError(
+                f"{file}: {faults}\n  --whole draws the place alone, to find a way on it"
+            )
+        _, street_map = place(
+            place_of_own(variant.own.place) if made.scenario is None else made.scenario.place
+        )
+        if part is not None:
+            refuse_outside("--zoom", part, street_map.bounds)
+        write_png(draw_plan(street_map, made.scenario, whole=whole, part=part), picture)
+    for fault in made.faults:
+        err.print(f"{file}: {fault}", soft_wrap=True, markup=False, highlight=False)
+    out.print(f"Picture: {picture}{instead}", soft_wrap=True)
+    if made.faults:
+        raise typer.Exit(WRONG_USE)
+
+
+@scenario_app.command(
+    "run",
+    epilog="Examples:  \n`cosim scenario run mine.toml --policy orca`  \n"
+    "`cosim scenario run sweep.toml --policy social_force --jobs 2 --out runs/sweep`  \n"
+    "`cosim scenario run sweep.toml --policy social_force --out runs/sweep --resume`  \n"
+    "`cosim scenario run mine.toml --policy my.py:Mine --real-time --rerun mine.rrd`",
+)
+def run_own(
+    file: Annotated[Path, typer.Argument(help=_FILE_HELP)],
+    policy: Annotated[str, typer.Option(help="A baseline, or your own as my.py:Class.")] = "route",
+    jobs: Annotated[int, typer.Option(min=1, help="Environment processes.")] = 1,
+    folder: Annotated[
+        Path | None, typer.Option("--out", help="Run folder; default runs/NAME-POLICY-TIME.")
+    ] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Finish the run in --out.")] = False,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Of the run: policies' own seeds are drawn from it.")
+    ] = None,
+    frames: Annotated[
+        float, typer.Option(min=0.0, help="Keep a camera frame every so many seconds.")
+    ] = 0.0,
+    camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
+    latency: Annotated[str, typer.Option(metavar="MS", help=LATENCY_HELP)] = "",
+    real_time: Annotated[bool, typer.Option("--real-time", help=REAL_TIME_HELP)] = False,
+    rerun: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help=RERUN_HELP)] = None,
+) -> None:
+    """Run what a file makes, into an ordinary run folder; of a sweep print a table by its values,
+    and draw it.
+
+    All other options of runs go with `cosim run FILE.toml`.
+    """
+    from cosim.policies.load import load_policy
+    from cosim.results.run_folder import read_records, read_spec
+    from cosim.spec.options import EpisodeOptions
+    from scenarios.runs.run import run, seed_of_run
+    from scenarios.suites.user_scenarios.check import checked_own
+    from scenarios.suites.user_scenarios.read import read_own
+
+    if resume and folder is None:
+        raise UsageError("--resume needs --out: the folder of the run to finish")
+    own = read_own(file)
+    check_rerun(rerun, len(own.variants))
+    asked_latency_ms(latency, real_time)
+    with doing(f"checking {file}") as tell:
+        suite = checked_own(own, tell)
+    manifest = load_policy(policy).manifest
+    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+    path = folder or Path("runs") / f"{own.name}-{manifest.name}-{stamp}"
+    by_goal: dict[GoalProtocol | None, list[str]] = {}
+    for variant in own.variants:
+        by_goal.setdefault(variant.own.goal_protocol, []).append(variant.id)
+    # A run tells its policies of the goal in one way: a sweep over these is as many runs, of one
+    # seed.
+    parts = {goal: path if len(by_goal) == 1 else path / str(goal) for goal in by_goal}
+    begun = [part for part in parts.values() if resume and (part / "run.json").exists()]
+    if resume and not begun:
+        read_spec(path)
+    run_seed = seed_of_run(seed, begun[0] if begun else None)
+    drawn_by = camera_here(camera) if manifest.camera is not None else "bullet"
+    first = own.variants[0]
+    options = EpisodeOptions(
+        seed=run_seed, goal=first.own.goal_protocol, frames_every_s=frames, camera=drawn_by
+    )
+    (driven_first,) = (one for one in suite.scenarios if one.id == first.id)
+    went_on = begun[0] if begun else None
+    options = with_latency(
+        options, latency, real_time, went_on, suite, driven_first, policy, manifest.rate_hz
+    )
+    _say(own)
+    tables = []
+    for goal, ids in by_goal.items():
+        part = parts[goal]
+        done = {record.scenario for record in read_records(part)} if part in begun else set()
+        board = Board([one for one in suite.scenarios if one.id in ids], done)
+        options = msgspec.structs.replace(options, goal=goal)
+        try:
+            with board.bars:
+                table = run(
+                    suite,
+                    policy,
+                    scenarios=ids,
+                    jobs=jobs,
+                    out=part,
+                    resume=part in begun,
+                    options=options,
+                    tell=board.tell,
+                )
+        except KeyboardInterrupt:
+            err.print(
+                f"Stopped. What is finished is kept in {part}: go on with --out {path} --resume",
+                soft_wrap=True,
+            )
+            raise typer.Exit(INTERRUPTED) from None
+        tables.append(table)
+    _print_run(own, tables, path)
+    write_rerun(path, [first.id], rerun)
+
+
+def _print_run(own: OwnFile, tables: Sequence[pd.DataFrame], path: Path) -> None:
+    """What came out of a run; of a sweep by its values, which are written beside it."""
+    import pandas as pd
+
+    from cosim.cli.run_table import print_next_commands, print_statuses, print_table
+    from scenarios.suites.user_scenarios.sweep import summary_of_sweep, write_sweep
+
+    table = pd.concat(tables, ignore_index=True)
+    if own.axes:
+        summary = summary_of_sweep(own, table)
+        _print_sweep(summary, [axis.field for axis in own.axes])
+        print_statuses(out, table, len(own.variants))
+        try:
+            files = write_sweep(summary, own, path)
+            out.print(f"Table and picture: {' '.join(map(str, files))}", soft_wrap=True)
+        except MachineError as error:
+            err.print(str(error), soft_wrap=True, markup=False, highlight=False)
+    else:
+        print_table(out, table, len(own.variants), path)
+    out.print(f"Run folder: {path}", soft_wrap=True)
+    if len(tables) == 1:  # else each goal has a run in a folder of its own
+        print_next_commands(err, path, table)
+    if table["ended"].isna().any():
+        raise typer.Exit(SOME_CRASHED)
+
+
+def _print_sweep(summary: pd.DataFrame, fields: list[str]) -> None:
+    """A row for each value: means, with their intervals below."""
+    from cosim.results.metrics import SUCCESS_IN_WORDS
+    from scenarios.suites.user_scenarios.sweep import SWEPT
+
+    columns = [Column(field.replace(".", ".\n"), overflow="fold") for field in fields]
+    columns += [
+        Column("n", justify="right"),
+        *(Column(head, no_wrap=True) for head in ("SR", "SPL", "RC", "FC /100m")),
+    ]
+    shown = Table(*columns, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for values, rows in summary.groupby(fields, sort=False):
+        means = rows.set_index("metric").loc[list(SWEPT)]
+        cells = [
+            "-" if row["n"] == 0 else f"{row['mean']:.2f}\n{row['low']:.2f}..{row['high']:.2f}"
+            for _, row in means.iterrows()
+        ]
+        scored = f"{means['n'].max():.0f}"
+        shown.add_row(*(f"{value}" for value in values), scored, *cells)
+    print_fitted(out, shown, len(fields))
+    out.print(
+        f"n episodes that are scored; SR {SUCCESS_IN_WORDS}; SPL the same by path length; RC share "
+        "of the route done; FC all failures on all metres, per 100 m; below: 95 % intervals"
+    )
+
+
+def _say(own: OwnFile) -> None:
+    """What a file makes, in words."""
+    swept = ", ".join(f"{axis.field} ({len(axis.values)} values)" for axis in own.axes)
+    count = len(own.variants)
+    words = (
+        f"a sweep over {swept}: {count} scenarios"
+        if swept
+        else f"{count} scenario{'s' * (count > 1)}"
+    )
+    out.print(f"{own.path}: {words}", soft_wrap=True, markup=False, highlight=False)
+
+
+def _print_scenarios(suite: Suite, own: OwnFile) -> None:
+    """A row per scenario, with its hash: for 80 columns."""
+    from cosim.spec.scenario import content_hash
+    from scenarios.suites.user_scenarios.along_route import narrow_events
+    from scenarios.suites.user_scenarios.routes import moved_m
+
+    short = f"{own.name}-" if len(own.variants) > 1 else ""
+    heads = (
+        short or "scenario",
+        "hash",
+        "way\nm",
+        "cross-\nings",
+        "events",
+        "obst-\nacles",
+        "people",
+    )
+    first, *others = (Column(head, no_wrap=head != heads[0], overflow="fold") for head in heads)
+    shown = Table(first, *others, box=box.SIMPLE_HEAD, padding=0)
+    for one in suite.scenarios:
+        people = (
+            f"{one.crowd.density:g}/1000m2"
+            if one.crowd.density is not None
+            else str(one.crowd.persons)
+        )
+        counts = (str(len(there)) for there in (one.crossings, one.events, one.obstacles))
+        length = f"{one.route_line.length_m:.1f}"
+        shown.add_row(one.id.removeprefix(short), content_hash(one), length, *counts, people)
+    print_fitted(out, shown)
+    pairs = zip(own.variants, suite.scenarios, strict=True)
+    for name, far_m in dict.fromkeys(
+        end for variant, one in pairs for end in moved_m(variant.own.way, one)
+    ):
+        if far_m > _MOVED_M:
+            out.print(f"way: {name} was moved by {far_m:.1f} m to the middle of its sidewalk")
+    for note in dict.fromkeys(note for one in suite.scenarios for note in narrow_events(one)):
+        out.print(f"note: {note}", soft_wrap=True, markup=False, highlight=False)
+    for variant, one in zip(own.variants, suite.scenarios, strict=True):
+        asked = variant.own.obstacles
+        if asked.per_100m and len(one.obstacles) == len(asked.placed):
+            out.print(
+                f"note: {one.id}: no room for obstacles that leave the robot's width and 0.5 m",
+                soft_wrap=True,
+            )
+    where = ", ".join(sorted({one.place.name for one in suite.scenarios}))
+    least_s, most_s = (end(one.time_limit_s for one in suite.scenarios) for end in (min, max))
+    limits = f"{least_s:g}" if least_s == most_s else f"{least_s:g} to {most_s:g}"
+    out.print(f"on {where}; time limit {limits} s; suite hash {suite.content_hash}", soft_wrap=True)

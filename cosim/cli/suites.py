@@ -1,0 +1,235 @@
+"""The commands `cosim list` and `cosim suite`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Column, Table
+
+from cosim.cli.console import err, out
+from cosim.cli.progress import doing
+from cosim.cli.tables import print_fitted
+from cosim.core.errors import SOME_CRASHED, SpecError, unknown
+
+if TYPE_CHECKING:
+    from cosim.spec.scenario import Suite
+
+
+list_app = typer.Typer()
+
+
+@list_app.command("list", epilog="Examples:  \n`cosim list`  \n`cosim list reactive`")
+def list_all(
+    suite: Annotated[str | None, typer.Argument(help="Show the scenarios of this suite.")] = None,
+) -> None:
+    """List the suites, robots, policies and goals, or the scenarios of a suite."""
+    from scenarios.suites.catalog import load_suite
+
+    if suite is None:
+        print_names(out)
+        return
+    print_scenarios(out, load_suite(suite))
+
+
+def print_names(out: Console) -> None:
+    """Suites, robots and their cameras, policies, goals: a line for each."""
+    from cosim.policies import POLICIES
+    from cosim.policies.follow.networks import weights_in_words
+    from cosim.policies.follow.policy import Follow
+    from cosim.policies.load import bundle_in_words, shipped_bundles
+    from cosim.results.table import policy_in_words
+    from cosim.spec.goal import GOALS
+    from cosim.spec.robot import ROBOTS
+    from scenarios.suites.catalog import SUITES, load_suite
+
+    for name in SUITES:
+        whole = load_suite(name)
+        out.print(
+            f"suite   {name}  {len(whole.scenarios)} scenarios, version {whole.version}, "
+            f"{whole.content_hash}"
+        )
+    for one in ROBOTS.values():
+        size = f"{one.length_m:.2f} x {one.width_m:.2f} m"
+        out.print(
+            f"robot   {one.name}  {size}, travels at {one.cruise_mps:g} m/s, turns at "
+            f"{one.w_max_radps:g} rad/s"
+        )
+        for name, mount in one.mounts.items():
+            out.print(f"camera  {one.name} {name}  {mount.in_words}", soft_wrap=True)
+    for name, make in POLICIES.items():
+        called = policy_in_words(name, make().manifest.privileged)
+        out.print(f"policy  {called}  {(make.__doc__ or '').splitlines()[0]}", soft_wrap=True)
+    for name, folder in shipped_bundles().items():
+        out.print(f"policy  {name}  {bundle_in_words(folder)}", soft_wrap=True)
+    about = (Follow.__doc__ or "").splitlines()[0]
+    out.print(f"policy  {Follow.manifest.name}  {about} {weights_in_words()}", soft_wrap=True)
+    for name, words in GOALS.items():
+        out.print(f"goal    {name}  {words}", soft_wrap=True)
+
+
+def print_scenarios(out: Console, suite: Suite) -> None:
+    """A row per scenario of a suite: made for 80 columns."""
+    heads = ("scenario", "place", "route\nm", "cross-\nings", "events", "bar-\nriers", "limit\ns")
+    shown = Table(*(Column(head, no_wrap=True) for head in heads), box=box.SIMPLE_HEAD, padding=0)
+    for s in suite.scenarios:
+        events = s.events[0].kind if len(s.events) == 1 else str(len(s.events))
+        numbers = (
+            f"{s.route_line.length_m:.0f}",
+            str(len(s.crossings)),
+            events,
+            str(len(s.barriers)),
+        )
+        shown.add_row(s.id, escape(s.place.name), *numbers, f"{s.time_limit_s:.0f}")
+    print_fitted(out, shown)
+
+
+suite_app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode="markdown",
+    help="The suites that ship, and their proofs.",
+)
+
+
+@suite_app.command(
+    "build",
+    epilog="Examples:  \n`cosim suite build unit unit.json --jobs 8`  \n"
+    "`cosim suite build reactive few.json --only frontal-001 --only static-001`",
+)
+def build_one(
+    name: Annotated[str, typer.Argument(help="A suite: see `cosim suite list`.")],
+    path: Annotated[
+        Path,
+        typer.Argument(metavar="OUT", help="The suite's file, a .json; its proofs go beside it."),
+    ],
+    jobs: Annotated[int, typer.Option(min=1, help="Processes, about 0.4 GiB each.")] = 1,
+    tries: Annotated[
+        int, typer.Option(min=1, help="Candidates of each scenario, until the expert solves one.")
+    ] = 6,
+    only: Annotated[
+        list[str] | None, typer.Option(help="Build only this scenario; may be repeated.")
+    ] = None,
+) -> None:
+    """Draw the scenarios of a suite and prove each solvable. Stopped, it goes on where it was when
+    called again."""
+    from scenarios.suites.recipes import RECIPES
+    from scenarios.tools.build.build_suite import build_suite
+
+    if name not in RECIPES:
+        raise unknown("suite", name, RECIPES)
+    names = {slot.name for slot in RECIPES[name].slots}
+    for one in only or ():
+        if one not in names:
+            raise unknown("scenario", one, names)
+
+    def tell(line: str, done: int, count: int) -> None:
+        err.print(f"{done}/{count} {line}", soft_wrap=True, markup=False, highlight=False)
+
+    suite, proofs = build_suite(name, path, jobs, tries, tell, only or ())
+    out.print(
+        f"{path}: {len(suite.scenarios)} scenarios, version {suite.version}, {suite.content_hash}",
+        soft_wrap=True,
+    )
+    out.print(
+        f"{proofs.first} of {len(proofs.proofs)} first candidates solved by {proofs.expert}",
+        highlight=False,
+    )
+    for reason, count in proofs.dropped.items():
+        out.print(f"dropped {count}: {reason}", markup=False, highlight=False)
+
+
+@suite_app.command(
+    "check",
+    epilog="Examples:  \n`cosim suite check unit.json --sample 5`  \n`cosim suite check --whole`",
+)
+def check_suites(
+    suites: Annotated[
+        list[str] | None, typer.Argument(metavar="[SUITE]...", help="By default all that ship.")
+    ] = None,
+    sample: Annotated[
+        int,
+        typer.Option(min=0, help="Scenarios of each structure that are looked at in their places."),
+    ] = 3,
+    drive: Annotated[
+        int, typer.Option(min=0, help="Proofs of each structure that are driven again.")
+    ] = 1,
+    whole: Annotated[
+        bool, typer.Option("--whole", help="Look at all in their places, and drive all proofs.")
+    ] = False,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes, about 0.4 GiB each.")] = 1,
+) -> None:
+    """Prove what suites claim: counts, hashes, single path, gaps, spread, no duplicates, proofs.
+    Exit code 1: one claim is false."""
+    from scenarios.suites.catalog import SUITES
+
+    false = 0
+    for name in suites or SUITES:
+        false += _checked(name, None if whole else sample, None if whole else drive, jobs)
+    if false:
+        raise typer.Exit(SOME_CRASHED)
+
+
+def _checked(name: str, sample: int | None, drive: int | None, jobs: int) -> int:
+    """Print a suite's table, and what is false. Returns how many claims are."""
+    from scenarios.suites.catalog import SUITES, load_suite
+    from scenarios.suites.proofs import read_proofs
+    from scenarios.suites.recipes import RECIPES
+    from scenarios.tools.build.claims import CLAIMS, Read
+    from scenarios.tools.build.place_claims import PLACE_CLAIMS, faults_in_places, sample_of
+
+    suite = load_suite(name)
+    path = SUITES.get(name, Path(name))
+    if suite.name not in RECIPES:
+        raise unknown("suite to check", suite.name, RECIPES)
+    try:
+        proofs = read_proofs(path)
+    except SpecError as error:
+        proofs = None
+        err.print(str(error), soft_wrap=True, markup=False, highlight=False)
+    read = Read(suite, proofs, path)
+    faults = {claim: list(of(read)) for claim, of in CLAIMS.items()}
+    looked = {claim: len(suite.scenarios) for claim in CLAIMS}
+    all_there = list(suite.scenarios)
+    picked = all_there if sample is None else sample_of(suite, sample)
+    driven = [s.id for s in (all_there if drive is None else sample_of(suite, drive))]
+    extra = [s for s in all_there if s.id in set(driven) - {s.id for s in picked}]
+    with doing(f"looking at {len(picked)} scenarios in their places, driving {len(driven)}"):
+        for fault in faults_in_places([*picked, *extra], driven, proofs, jobs):
+            faults.setdefault(fault.claim, []).append(fault.words)
+    looked |= {claim: len(picked) + len(extra) for claim in PLACE_CLAIMS} | {
+        PLACE_CLAIMS[-1]: len(driven)
+    }
+    table = Table(
+        f"{suite.name} {suite.version}, {suite.content_hash}",
+        "looked at",
+        "faults",
+        box=box.SIMPLE_HEAD,
+    )
+    for claim, count in looked.items():
+        found = faults.get(claim, [])
+        table.add_row(claim, str(count), str(len(found)) if found else "-")
+    print_fitted(out, table)
+    for claim, words in ((claim, words) for claim, found in faults.items() for words in found):
+        out.print(f"{suite.name}, {claim}: {words}", soft_wrap=True, markup=False, highlight=False)
+    return sum(bool(found) for found in faults.values())
+
+
+@suite_app.command("list", epilog="Example:  \n`cosim suite list`")
+def list_suites() -> None:
+    """List the suites that ship: how many scenarios, of which version, and what they are for."""
+    from scenarios.suites.catalog import SUITES, load_suite
+    from scenarios.suites.recipes import RECIPES
+
+    table = Table(
+        "suite", "scenarios", "val", "test", "version", "hash", "for", box=box.SIMPLE_HEAD
+    )
+    for name in SUITES:
+        suite = load_suite(name)
+        test = sum(scenario.split == "test" for scenario in suite.scenarios)
+        counts = (str(len(suite.scenarios)), str(len(suite.scenarios) - test), str(test))
+        table.add_row(name, *counts, suite.version, suite.content_hash, RECIPES[name].purpose)
+    print_fitted(out, table, words=[6])

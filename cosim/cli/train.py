@@ -1,0 +1,97 @@
+"""The command line of learning: `cosim train`."""
+
+from __future__ import annotations
+
+import math
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from cosim.cli.console import err
+from cosim.cli.options import LEARN
+from cosim.core.errors import SOME_CRASHED, MachineError
+from cosim.learning.settings import PLANNED_STEPS, TO_INSTALL, Training
+
+train_app = typer.Typer()
+
+
+@train_app.command(
+    "train",
+    rich_help_panel=LEARN,
+    epilog="Examples:  \n`cosim train unit.npz -o small --minutes 9 --resume`  \n"
+    "`cosim train reactive.npz unit.npz -o mine --from small --steps 6000 --rate 3e-4 --seed 1`",
+)
+def train_command(
+    data: Annotated[
+        list[Path],
+        typer.Argument(metavar="DATA...", help="Packed demonstrations: `cosim dataset pack`."),
+    ],
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="FOLDER", help="The folder of the bundle.")
+    ],
+    begin: Annotated[
+        Path | None,
+        typer.Option("--from", metavar="FOLDER", help="Begin with the bundle of another training."),
+    ] = None,
+    steps: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Batches that are learned from, in all.",
+            show_default=f"{PLANNED_STEPS}; with --resume as before",
+        ),
+    ] = None,
+    seed: Annotated[
+        int, typer.Option(min=0, help="Of the first parameters, the batches and what is held out.")
+    ] = 0,
+    batch: Annotated[int, typer.Option(min=1, help="Examples a step.")] = 256,
+    rate: Annotated[
+        float, typer.Option(help="Of learning; it rises to this and falls to 0.")
+    ] = 1e-3,
+    device: Annotated[
+        str, typer.Option(help="cpu, cuda, cuda:1; by default a GPU if there is one.")
+    ] = "",
+    minutes: Annotated[
+        float,
+        typer.Option(
+            help="Stop after so long, with a bundle and exit code 1: --resume continues.",
+            show_default="no limit",
+        ),
+    ] = math.inf,
+    name: Annotated[str, typer.Option(help="The policy's name in records and tables.")] = "small",
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue the training in the folder.")
+    ] = False,
+) -> None:
+    """Train a small policy that sees on demonstrations, and write it as a bundle for --policy
+    onnx:FOLDER.
+
+    Its state is kept every minute. A finished training continues with `--resume` and larger
+    `--steps`.
+
+    Needs PyTorch and onnx, and no engine. Install the CPU build first, unless you have an NVIDIA
+    GPU: `pip install torch --index-url https://download.pytorch.org/whl/cpu`. `python -m
+    cosim.learning` is the same command in a Python that has PyTorch, onnx and NumPy alone.
+    """
+    if lacking := [package for package in ("torch", "onnx") if find_spec(package) is None]:
+        raise MachineError(f"{' and '.join(lacking)} cannot be imported: {TO_INSTALL}")
+    from cosim.learning.progress import trained
+
+    training = Training(
+        steps=steps,
+        seed=seed,
+        batch=batch,
+        rate=rate,
+        device=device,
+        begin=begin,
+        minutes=minutes,
+        name=name,
+    )
+
+    def say(line: str) -> None:
+        err.print(line, soft_wrap=True, markup=False, highlight=False)
+
+    if not trained(data, out, training, resume, say):
+        raise typer.Exit(SOME_CRASHED)

@@ -1,0 +1,117 @@
+"""Packed: demonstrations as plain arrays in one .npz, for training in a Python that has numpy and
+nothing else.
+
+`cosim dataset pack DIR -o FILE.npz` writes it of what `cosim collect` has collected. Its arrays, N
+rows, one for each picture, episode after episode and in order of time:
+
+frames      (N, H, W, 3) uint8     the picture, RGB state       (N, 2) float32         the robot's
+own speeds at the picture: v m/s, w rad/s goal        (N, 2) float32         what the robot is told:
+x ahead, y to the left, metres; NaN where it is told no point command     (N, 2) float32         the
+expert's answer to the picture, clipped to the robot's limits: v m/s, w rad/s waypoints   (N, K, 2)
+float32      where the robot is 1, 2 .. K times `waypoint_s` later, in its frame at the picture: x
+ahead, y to the left, metres
+driven      (N,) int32             how many of the waypoints were driven, by the expert alone,
+                                   before the episode ended or somebody disturbed the drive; the
+                                   others go on by the expert's command there
+disturbed   (N,) bool              another command than the expert's was driven after the picture
+(`--noise`) episode     (N,) int32             from 0 frame       (N,) int32             from 0 in
+each episode; the picture was taken frame / rate_hz seconds after its start meta        () str
+JSON, see `Packed.meta`
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import zipfile
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.errors import RunError, unwritable
+from cosim.core.npz import NO_NPZ
+
+_FORMAT: Final = 1
+
+
+@dataclass(frozen=True)
+class Packed:
+    """Demonstrations in memory; the arrays are those of the file.
+
+    meta: rate_hz, waypoint_s; goal, the name of its protocol, "none" without one; camera, as in
+    `CameraSpec`; robot; policy, noise and learner, lists with those of each data set; structures, a
+    list with what each episode is an example of ("straight", "gesturing"), and scenarios, a list of
+    their ids.
+    """
+
+    frames: NDArray[np.uint8]
+    state: NDArray[np.float32]
+    goal: NDArray[np.float32]
+    command: NDArray[np.float32]
+    waypoints: NDArray[np.float32]
+    driven: NDArray[np.int32]
+    disturbed: NDArray[np.bool_]
+    episode: NDArray[np.int32]
+    frame: NDArray[np.int32]
+    meta: dict[str, Any]
+
+    def __len__(self) -> int:
+        return len(self.episode)
+
+    def history(self, pictures: int, every: int = 1) -> NDArray[np.int64]:
+        """(N, pictures) rows: what had been seen at each, oldest first and itself last, `every`
+        rows apart; before its episode's first row that one, as a policy fills its memory.
+
+        >>> two = np.zeros((3, 2), np.float32)
+        >>> rows = Packed(np.zeros((3, 9, 16, 3), np.uint8), two, two, two, two[:, None], np.zeros(3, np.int32),
+        ...     np.zeros(3, bool), np.array([0, 0, 1], np.int32), np.array([0, 1, 0], np.int32), {})
+        >>> rows.history(2).tolist()
+        [[0, 0], [0, 1], [2, 2]]
+        """
+        rows = np.arange(len(self))
+        back = every * np.arange(pictures - 1, -1, -1)
+        found: NDArray[np.int64] = rows[:, None] - np.minimum(back, self.frame[:, None])
+        return found
+
+    def save(self, path: Path) -> None:
+        """Write the file, whole or not at all. Raises MachineError where that cannot be."""
+        arrays = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "meta"}
+        meta = json.dumps({"format": _FORMAT, **self.meta}, sort_keys=True)
+        part = path.with_name(path.name + ".part")
+        try:
+            with part.open("wb") as file:
+                np.savez(file, allow_pickle=False, meta=np.array(meta), **arrays)
+            part.replace(path)
+        except OSError as error:
+            raise unwritable(path, error) from error
+
+
+def packed_digest(path: Path) -> str:
+    """Of all that a file holds, by the checksums that it holds itself: two packed of the same have
+    the same. Raises RunError naming it where it holds none."""
+    try:
+        with zipfile.ZipFile(path) as held:
+            told = [(one.filename, one.file_size, one.CRC) for one in held.infolist()]
+    except (OSError, *NO_NPZ) as error:
+        raise _none_in(path, error) from error
+    return hashlib.blake2b(repr(told).encode(), digest_size=8).hexdigest()
+
+
+def read_packed(path: Path) -> Packed:
+    """The demonstrations in a file. Raises RunError naming it where it holds none."""
+    try:
+        with np.load(path, allow_pickle=False) as held:
+            meta = json.loads(str(held["meta"]))
+            arrays = {one.name: held[one.name] for one in fields(Packed) if one.name != "meta"}
+        if meta.pop("format") != _FORMAT or len({len(array) for array in arrays.values()}) != 1:
+            raise ValueError("its arrays are of different lengths, or of another format")
+    except (OSError, *NO_NPZ) as error:
+        raise _none_in(path, error) from error
+    return Packed(**arrays, meta=meta)
+
+
+def _none_in(path: Path, error: Exception) -> RunError:
+    return RunError(f"{path}: no packed demonstrations: {error}: make it with `cosim dataset pack`")

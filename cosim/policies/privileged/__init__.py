@@ -1,0 +1,2 @@
+"""Policies that know the simulator's state: `orca` (the oracle), `route`, `social_force`, and their
+parts."""

@@ -1,0 +1,434 @@
+"""`orca`: the oracle. Sees everybody and the map; anticipates, yields, goes round groups and
+things, stops when told.
+
+It knows what no camera shows: where everybody is and how they walk, the free ground, signals and
+when they change; and what people are doing, which tells it who talks, who queues and who holds out
+a stopping hand. How people will go on it does not know: they are taken to walk on as they do
+(`encounters`).
+
+The route is led round what stands on it for good (`guide`). Each time it acts:
+
+1. who stands (groups are one obstacle) decides on a lane beside that line;
+2. what moves bends the velocity towards that lane by ORCA half-planes (`cosim.people.orca`), the
+   robot doing all of the avoiding, because people need not;
+3. many plans are driven ahead in the head (`foresight`), and the one is taken that comes nearest to
+   that velocity while the body stays clear of everybody and on free ground (`clearance`).
+
+Red signals, cars near a crossing, a stopping hand and whoever of the crowd is right before it limit
+the speed so that it comes to rest before them; for who walks straight at it from near, or across
+its way, it stands, since people go round a robot that does. Where a green is too short it comes up
+slowly, so that it stands there at red.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from cosim.core.geometry import Floats, Polyline, wrap_angles
+from cosim.core.state import DIRECTED, PERSON_RADIUS_M, Command, People
+from cosim.episode.interfaces import Observation, Privileged
+from cosim.people.orca import best_velocity, half_plane
+from cosim.policies.privileged.distance_field import Clearance
+from cosim.policies.privileged.people_prediction import Yielding, bodies, gaps_to_people, walks
+from cosim.policies.privileged.robot_disks import BodyDisks
+from cosim.policies.privileged.rollout import (
+    STEP_S,
+    STEP_TIMES_S,
+    STEPS,
+    Ahead,
+    Plans,
+    Way,
+    foresee,
+)
+from cosim.policies.privileged.route import (
+    CAR_BRAKE_MPS2,
+    SEEN_M,
+    STOP_SHORT_M,
+    car_disks,
+    crossing_limit,
+)
+from cosim.policies.privileged.route_planner import Guide
+from cosim.policies.privileged.standing_groups import distances, lines, who_stands
+from cosim.spec.manifest import Manifest
+from cosim.spec.robot import Robot
+
+LANES_M: Final = np.arange(-8, 9) * 0.25
+_SPEED_THIRTIETHS: Final = (28, 18, 9)
+"""Speeds of plans, in thirtieths of the robot's pace: who foresees so much drives a little slower
+than that."""
+MANOEUVRES: Final = ((0.0, 0.35), (0.0, 0.9), (0.6, 0.9), (1.2, 0.9))
+"""Delay in seconds and sideways metres per metre of a change of lanes."""
+OUT_OF_A_NOOK: Final = (0.0, 3.0)
+"""The same of turning nearly on the spot first, at the slowest speed: past somebody whom it stands
+right before."""
+
+_HORIZON_S: Final = 3.0
+"""ORCA's tau."""
+
+_CLEARANCE_M: Final = 0.3
+_TIGHT_M: Final = 0.12
+_NEARNESS_COST: Final = 15.0
+TOUCH_COST: Final = 60.0
+"""m/s given up per metre nearer than the clearance, and nearer than a hand's breadth."""
+CAR_DEEP_M: Final = 0.5
+LANE_COST: Final = 0.25
+_CHANGE_COST: Final = 0.4
+EDGE_COST: Final = 6.0
+"""m/s given up when all of a plan lies outside the walkable area."""
+_EDGE_M: Final = 0.06
+_SOLID_M: Final = 0.05
+"""Nearer to the edge than this a corner of the body may touch what stands there."""
+_SOLID_COST: Final = 60.0
+_DEEP_M: Final = 0.4
+_SOON: Final = 5
+"""So many steps of two STEP_S a plan is kept off what is solid; later ones will be chosen anew."""
+_JUMP_M: Final = 1.0
+_STRAYED_M: Final = 2.6
+_PAST_END_M: Final = 0.05
+"""A robot nearer to the end of its line than this has missed the goal and is led back."""
+_PATIENCE_S: Final = 3.0
+_LED_ANEW_S: Final = 1.6
+"""Who has not come on for so long, and somebody stands near, looks for another way."""
+STUCK_M: Final = 0.5
+"""A robot that has not come this far for PATIENCE_S, and was not held, takes tighter ways."""
+NEAR_S: Final = 1.2
+"""A plan is compared with ORCA's velocity over so long."""
+LANE_AHEAD_M: Final = np.arange(0.5, 9.1, 0.5)
+LANE_SLOPE: Final = 0.4
+
+_STANDS_AT_WALK_S: Final = 6.0
+"""Who comes too late to cross at green rolls up to the crossing, to stand there for so long before
+it is red."""
+
+_REACTS_S: Final = 0.25
+_AHEAD: Final = 0.3
+_CREEPS_MPS: Final = 0.15
+"""In a throng it drives so fast that it comes to rest, after a moment, before whom it drives at;
+never slower than this."""
+
+STOP_BEFORE_M: Final = 2.0
+STOP_BRAKE_MPS2: Final = 0.5
+
+
+class Weights(NamedTuple):
+    """What counts how much: clearance m, m/s of progress, effort of leaving wish and lane, lying
+    off the walkway."""
+
+    clearance_m: float
+    progress: float
+    effort: float
+    edge: float
+
+
+PATIENT: Final = Weights(_CLEARANCE_M, 0.4, 1.0, EDGE_COST)
+STUCK: Final = Weights(_TIGHT_M, 2.5, 0.1, 0.5 * EDGE_COST)
+
+
+class Here(NamedTuple):
+    """The way to the goal, the robot's arc length on it, and the room beside it."""
+
+    way: Way
+    s_m: float
+    clearance: Clearance
+
+
+class Orca:
+    """Anticipates, yields, goes round groups, stops for a hand: the oracle; knows what no camera
+    sees."""
+
+    manifest = Manifest("orca", version="4", rate_hz=5.0, camera=None, privileged=True)
+
+    def __init__(self) -> None:
+        self.reset("", 0)
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        self._lane_m = 0.0
+        self._stuck_s = 0.0
+        self._yielding = Yielding()
+        self._led_anew_s = _LED_ANEW_S
+        self._stuck_at = (math.inf, math.inf)
+        self._last_time_s = 0.0
+        self._here: Here | None = None
+        self._guide: tuple[Polyline, Guide] | None = None
+        self._line = Polyline([(0.0, 0.0), (1.0, 0.0)])
+        self._was = (math.inf, math.inf)
+
+    def act(self, observation: Observation) -> Command:
+        known = observation.privileged
+        if known is None:
+            raise ValueError("the orca policy needs privileged observations")
+        dt_s = max(observation.time_s - self._last_time_s, 1e-3)
+        self._last_time_s = observation.time_s
+        robot = observation.robot
+        crossing_mps = crossing_limit(known, robot)
+        rolls_up_mps = unhurried(known, robot, crossing_mps)
+        limit_mps = min(crossing_mps, rolls_up_mps, stop_limit(known), speeds_of(robot)[0])
+        if self._yielding.waits(known, observation.time_s):
+            limit_mps = 0.0
+        x_m, y_m, _ = known.robot.pose
+        self._stuck_s += dt_s
+        if limit_mps < 0.1 or math.dist((x_m, y_m), self._stuck_at) > STUCK_M:
+            self._stuck_s = 0.0
+            self._stuck_at = (x_m, y_m)
+            self._led_anew_s = _LED_ANEW_S
+
+        limit_mps = min(limit_mps, pressed_limit(known, robot))
+        people = nearby(known)
+        ends = lines(people)
+        here = self._find(known, ends)
+        disks = BodyDisks.of(robot)
+        aim_m = lane_past(known, disks, here, ends, self._lane_m)
+        wished = bent(known, robot, here, people, aim_m, limit_mps)
+        plans = all_plans(lanes_inside(here), [min(speed, limit_mps) for speed in speeds_of(robot)])
+        state = known.robot
+        ahead = foresee(here.way, plans, robot, state.pose, here.s_m, (state.v_mps, state.w_radps))
+        gaps = gaps_to_people(known, robot, ahead, people, ends)
+        weights = PATIENT if self._stuck_s < _PATIENCE_S else STUCK
+        out, deeper = off_ground(known, here, ahead, robot.length_m * 2 / 7)
+        cost = (
+            weights.edge * out
+            + _SOLID_COST * deeper
+            + _NEARNESS_COST * car_nearness(known, disks, ahead)
+        )
+        score = self._scores(known, here, plans, ahead, gaps, wished, aim_m, weights) - cost
+        best = int(np.argmax(score))
+        if plans.speed_mps[best] > 0.0:
+            self._lane_m = float(plans.lane_m[best]) if plans.delay_s[best] == 0.0 else self._lane_m
+        v_mps, w_radps = ahead.command[:, best]
+        return Command(float(v_mps), float(w_radps))
+
+    def _scores(
+        self,
+        known: Privileged,
+        here: Here,
+        plans: Plans,
+        ahead: Ahead,
+        gaps: Floats,
+        wished: Floats,
+        aim_m: float,
+        weights: Weights,
+    ) -> Floats:
+        """How good each plan is among people, (K,) in m/s of speed."""
+        near = max(round(NEAR_S / STEP_S), 1)
+        velocity = (ahead.pose[near - 1, :2].T - known.robot.pose.xy) / (near * STEP_S)
+        off_wish = np.hypot(*(velocity - wished).T)
+        progress = (ahead.s_m[-1] - here.s_m) / (STEPS * STEP_S)
+        lanes = LANE_COST * np.abs(plans.lane_m - aim_m) + _CHANGE_COST * np.abs(
+            plans.lane_m - self._lane_m
+        )
+        nearness = _NEARNESS_COST * np.maximum(weights.clearance_m - gaps, 0.0)
+        touch = TOUCH_COST * np.maximum(0.05 - gaps, 0.0)
+        scores: Floats = (
+            weights.progress * progress - weights.effort * (off_wish + lanes) - nearness - touch
+        )
+        return scores
+
+    def _find(self, known: Privileged, ends: Floats) -> Here:
+        """Where the robot is on its line, which is led anew from where it was put or has strayed
+        to, and round those who stand where it has not come on."""
+        x_m, y_m, _ = known.robot.pose
+        if self._guide is None or self._guide[0] is not known.route:
+            clearance = Clearance(known.free, known.route)
+            self._guide = (known.route, Guide(clearance, known.route))
+            self._here = None
+        here = self._here
+        jumped = math.dist(self._was, (x_m, y_m)) > _JUMP_M
+        self._was = x_m, y_m
+        blocked = self._stuck_s > self._led_anew_s and len(ends) > 0
+        if blocked:
+            self._guide[1].search(ends)
+            self._led_anew_s = self._stuck_s + _PATIENCE_S
+        if not blocked and here is not None and not jumped:
+            s_m, lateral_m = self._line.project(x_m, y_m, (here.s_m - 2.0, here.s_m + 3.0))
+            if abs(lateral_m) < _STRAYED_M and s_m < here.way.length_m - _PAST_END_M:
+                self._here = here._replace(s_m=s_m)
+                return self._here
+        guide = self._guide[1]
+        self._line = guide.from_here(known.robot.pose.xy)
+        self._lane_m = 0.0
+        self._here = Here(Way(self._line), self._line.project(x_m, y_m)[0], guide.clearance)
+        return self._here
+
+
+def nearby(known: Privileged) -> People:
+    """Those who matter: near, and not right behind, from where they step round the robot
+    themselves."""
+    pose = known.robot.pose
+    people = known.people
+    offset = people.xy - pose.xy
+    cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
+    forward = offset @ [cos, sin]
+    left = offset @ [-sin, cos]
+    behind = (forward < -0.3) & ((np.abs(left) < 0.6) | (forward < -2.5))
+    near = (np.hypot(offset[:, 0], offset[:, 1]) < 1.5 * SEEN_M) & ~behind
+    return people.only(np.flatnonzero(near))
+
+
+def unhurried(known: Privileged, robot: Robot, crossing_mps: float) -> float:
+    """Speed in m/s at which the robot comes up to a crossing not long before its signal turns red,
+    if it is near and the green that is left is too short. crossing_mps: its `crossing_limit`."""
+    for crossing_id, enter_s_m, _ in known.crossings:
+        room_m = enter_s_m - known.route_s_m - (robot.length_m / 2 + STOP_SHORT_M)
+        signal = known.signals.get(crossing_id)
+        if (
+            not 0.0 < room_m < 8.0
+            or signal is None
+            or not signal.walk
+            or signal.changes_in_s is None
+        ):
+            continue
+        if math.isfinite(crossing_mps) and signal.changes_in_s > _STANDS_AT_WALK_S:
+            return room_m / (signal.changes_in_s - _STANDS_AT_WALK_S)
+    return math.inf
+
+
+def pressed_limit(known: Privileged, robot: Robot) -> float:
+    """Speed in m/s at which the robot comes to rest before anybody of the crowd ahead, wherever
+    they turn."""
+    pose = known.robot.pose
+    people = known.people
+    offset = (people.xy - pose.xy)[~people.are(*DIRECTED)]
+    cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
+    local = offset @ np.array([[cos, -sin], [sin, cos]])
+    half = np.array(robot.footprint_m) / 2
+    away = local - np.clip(local, -half, half)
+    far = np.hypot(away[:, 0], away[:, 1])
+    ahead = away[:, 0] / np.maximum(far, 1e-9)
+    rows = ahead > _AHEAD
+    if not rows.any():
+        return math.inf
+    room_m = np.maximum(far[rows] - PERSON_RADIUS_M, 0.0)
+    brake_mps2 = 0.8 * robot.acceleration_mps2
+    reacted_mps = _REACTS_S * brake_mps2
+    speed = (np.sqrt(reacted_mps**2 + 2.0 * brake_mps2 * room_m) - reacted_mps) / ahead[rows]
+    return max(float(speed.min()), _CREEPS_MPS)
+
+
+def stop_limit(known: Privileged) -> float:
+    """Speed in m/s at which the robot comes to rest before somebody ahead who holds out a stopping
+    hand."""
+    pose = known.robot.pose
+    people = known.people
+    limit_mps = math.inf
+    for i, doing in enumerate(people.doing):
+        dx, dy = people.xy[i] - pose.xy
+        far_m = math.hypot(dx, dy)
+        off_rad = abs(float(wrap_angles(math.atan2(dy, dx) - pose.heading_rad)))
+        if doing == "stop" and far_m < SEEN_M and off_rad < 1.0:
+            room_m = far_m - STOP_BEFORE_M
+            limit_mps = min(
+                limit_mps, math.sqrt(2.0 * STOP_BRAKE_MPS2 * room_m) if room_m > 0.05 else 0.0
+            )
+    return limit_mps
+
+
+def lane_past(
+    known: Privileged, disks: BodyDisks, here: Here, ends: Floats, current_m: float
+) -> float:
+    """The lane beside the way, m to the left, on which the robot best gets past what stands
+    ahead."""
+    way, s_m, clearance = here
+    beside = way.lateral(known.robot.pose, s_m)
+    shift = LANE_SLOPE * LANE_AHEAD_M
+    lane = beside + np.clip(LANES_M[:, None] - beside, -shift, shift)
+    points = way.place(np.broadcast_to(s_m + LANE_AHEAD_M, lane.shape), lane)
+    gaps = np.full(len(LANES_M), np.inf)
+    if len(ends):
+        gaps = (distances(points, ends) - PERSON_RADIUS_M - disks.radius_m).min(axis=(1, 2))
+    out = (clearance.at(points) < _EDGE_M) & (s_m + LANE_AHEAD_M < way.length_m)
+    cost = LANE_COST * np.abs(LANES_M) + 0.5 * _CHANGE_COST * np.abs(LANES_M - current_m)
+    cost += _NEARNESS_COST * np.maximum(_CLEARANCE_M - gaps, 0.0) + EDGE_COST * out.mean(axis=1)
+    return float(LANES_M[int(np.argmin(cost))])
+
+
+def bent(
+    known: Privileged, robot: Robot, here: Here, people: People, aim_m: float, limit_mps: float
+) -> Floats:
+    """The velocity (2,) towards the lane, bent so that nobody who walks is met within HORIZON_S."""
+    state = known.robot
+    beside = here.way.lateral(state.pose, here.s_m)
+    lane_m = beside + max(-1.0, min(1.0, aim_m - beside))
+    ahead = here.way.place(np.array(here.s_m + 2.0), np.array(lane_m)) - state.pose.xy
+    wish = limit_mps * ahead / max(float(np.hypot(*ahead)), 1e-9)
+    mine = state.v_mps * np.array(
+        [math.cos(state.pose.heading_rad), math.sin(state.pose.heading_rad)]
+    )
+    radius_m = BodyDisks.of(robot).around_m + PERSON_RADIUS_M + _TIGHT_M
+    planes = [
+        half_plane(xy - state.pose.xy, mine, velocity, radius_m, _HORIZON_S, 1.0, 0.5)
+        for xy, velocity, still in zip(people.xy, walks(people), who_stands(people), strict=True)
+        if not still
+    ]
+    return best_velocity(planes, wish, speeds_of(robot)[0])
+
+
+def lanes_inside(here: Here) -> Floats:
+    """The lanes with room somewhere in the next metres, and the way itself."""
+    along, lane = np.meshgrid(here.s_m + np.array([0.5, 1.5, 3.0, 5.0]), LANES_M)
+    inside = (here.clearance.at(here.way.place(along, lane)) > _EDGE_M).any(axis=1)
+    lanes: Floats = LANES_M[inside | (LANES_M == 0.0)]
+    return lanes
+
+
+def speeds_of(robot: Robot) -> list[float]:
+    """The speeds of plans, m/s, the fastest first."""
+    return [robot.cruise_mps * part / 30 for part in _SPEED_THIRTIETHS]
+
+
+def all_plans(lanes: Floats, speeds: Sequence[float]) -> Plans:
+    """Every lane at every speed in every manner, and waiting."""
+    rows = [
+        (lane, speed, slope, delay)
+        for lane in lanes
+        for speed in speeds
+        for delay, slope in MANOEUVRES
+    ]
+    rows += [(lane, speeds[-1], OUT_OF_A_NOOK[1], OUT_OF_A_NOOK[0]) for lane in lanes]
+    rows.append((0.0, 0.0, MANOEUVRES[0][1], 0.0))
+    return Plans(*np.array(rows).T)
+
+
+def car_nearness(known: Privileged, disks: BodyDisks, ahead: Ahead) -> Floats:
+    """(K,) m: how much nearer than the clearance each plan comes to vehicles that brake for it, at
+    most CAR_DEEP_M.
+
+    Who enters a crossing only when every car near can still stop (`crossing_limit`) may count on
+    their stopping; what remains is to keep away from where they do. All plans near a car being bad
+    must not hide how bad each is to people.
+    """
+    xy, velocity, radii = car_disks(known)
+    if not len(xy):
+        return np.zeros(ahead.s_m.shape[1])
+    speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), 1e-9)
+    braked_s = np.minimum(STEP_TIMES_S[:, None], speed / CAR_BRAKE_MPS2)
+    driven_m = speed * braked_s - 0.5 * CAR_BRAKE_MPS2 * braked_s**2
+    cars = xy + driven_m[..., None] * (velocity / speed[:, None])
+    gaps = np.full(ahead.s_m.shape, np.inf)
+    for x, y in bodies(ahead, disks):
+        apart = (
+            np.hypot(cars[:, None, :, 0] - x[..., None], cars[:, None, :, 1] - y[..., None]) - radii
+        )
+        gaps = np.minimum(gaps, apart.min(axis=-1) - disks.radius_m)
+    nearness: Floats = np.clip(_CLEARANCE_M - gaps.min(axis=0), 0.0, CAR_DEEP_M)
+    return nearness
+
+
+def off_ground(known: Privileged, here: Here, ahead: Ahead, nose_m: float) -> tuple[Floats, Floats]:
+    """(K,) the share of each plan in which the base centre, or a point `nose_m` before it, is off
+    free ground, what is near weighing most; and (K,) m: how much deeper in what is solid the body
+    gets soon than it is now."""
+    present = np.array(known.robot.pose)[:, None]
+    pose = np.concatenate([np.broadcast_to(present, (1, *ahead.pose.shape[1:])), ahead.pose[::2]])
+    along = nose_m * np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=-1)
+    middle = np.stack([pose[:, 0], pose[:, 1]], axis=-1)
+    room = here.clearance.at(np.stack([middle - along, middle, middle + along]))
+    room[:, 1:][:, ahead.s_m[::2] >= here.way.length_m] = np.inf
+    off = room[1:, 1:].min(axis=0) < _EDGE_M
+    body = room.min(axis=0)
+    share: Floats = (off * np.linspace(1.5, 0.5, len(body) - 1)[:, None]).mean(axis=0)
+    deeper = np.minimum(body[0], _SOLID_M) - body[1 : 1 + _SOON].min(axis=0)
+    return share, np.clip(deeper, 0.0, _DEEP_M)

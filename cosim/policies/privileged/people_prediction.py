@@ -1,0 +1,153 @@
+"""How near the robot's plans bring it to people, and whom it waits for.
+
+People are taken to walk on as they walk. Besides, who is near may stay where it is, and who walks
+the robot's way may slow down. For who walks straight at the robot from near, or crosses and would
+meet it, it stands until they have passed: people go round what stands, and go first.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.geometry import Floats, wrap_angles
+from cosim.core.state import DIRECTED, PERSON_RADIUS_M, People
+from cosim.episode.interfaces import Privileged
+from cosim.policies.privileged.robot_disks import BodyDisks
+from cosim.policies.privileged.rollout import STEP_TIMES_S, Ahead
+from cosim.policies.privileged.standing_groups import distances, who_stands
+from cosim.spec.robot import Robot
+
+_FOLLOWED: Final = 0.6
+"""Those who walk the robot's way may stop: they are foreseen so much slower than they walk."""
+_LATER_M_PER_S: Final = 0.04
+"""What is foreseen later may come out otherwise: so much nearer a plan may come for each second
+ahead."""
+_REACH_M: Final = 0.3
+_NEAR_M: Final = 1.5
+_SOON: Final = 4
+_DARTS_M: Final = 0.15
+"""Who is so near is foreseen to stay there, too, for so many steps, or to have come so much nearer
+by a step aside."""
+_COMES_M: Final = 4.5
+_COMES_RAD: Final = 0.12
+"""Who ahead walks at the robot so exactly, and is so near, is waited for (not the crowd, which
+would wait too),"""
+_SIDEWAYS: Final = 0.7
+_MET_M: Final = 0.6
+"""and who walks across, by such a share of its pace, and would pass the robot's middle so near,"""
+_LEAVES_RAD: Final = 1.7
+_PAST_M: Final = 1.4
+"""until it walks away, and is so far behind or off: who is still beside the robot may turn to it
+anew,"""
+_WAITS_S: Final = 7.0
+_SAME_PLACE_M: Final = 0.5
+"""or the robot has been in the same place for so long."""
+
+
+def walks(people: People) -> Floats:
+    """(N, 2) m/s: how they walk; those who stand do not."""
+    speed = np.where(who_stands(people), 0.0, people.speed)
+    velocity: Floats = speed[:, None] * np.column_stack(
+        [np.cos(people.heading), np.sin(people.heading)]
+    )
+    return velocity
+
+
+def _followed(known: Privileged, people: People) -> Floats:
+    """`walks`, but slower for those ahead who walk the robot's way."""
+    pose = known.robot.pose
+    velocity = walks(people)
+    forward = np.array([math.cos(pose.heading_rad), math.sin(pose.heading_rad)])
+    same = ((people.xy - pose.xy) @ forward > 0.3) & (velocity @ forward > 0.7 * people.speed)
+    slower: Floats = np.where(same[:, None], _FOLLOWED * velocity, velocity)
+    return slower
+
+
+def gaps_to_people(
+    known: Privileged, robot: Robot, ahead: Ahead, people: People, ends: Floats
+) -> Floats:
+    """(K,) m: the smallest gap of each plan between the body and anybody. ends: the lines of those
+    who stand."""
+    here = known.robot.pose.xy
+    disks = BodyDisks.of(robot)
+    moving = ~who_stands(people)
+    xy = people.xy[moving] + STEP_TIMES_S[:, None, None] * _followed(known, people)[moving]
+    reach_m = disks.around_m + PERSON_RADIUS_M + _REACH_M + robot.cruise_mps * STEP_TIMES_S
+    xy = xy[:, (np.linalg.norm(xy - here, axis=-1) < reach_m[:, None]).any(axis=0)]
+    near = people.xy[moving & (np.hypot(*(people.xy - here).T) < _NEAR_M)]
+    ends = ends[distances(here, ends) < reach_m[-1]]
+    squared = np.full(ahead.s_m.shape, np.inf)
+    for x, y in bodies(ahead, disks):
+        if xy.shape[1]:
+            squared = np.minimum(squared, _squared(xy[:, None], x, y))
+        if len(near):
+            beside = np.maximum(np.sqrt(_squared(near, x[:_SOON], y[:_SOON])) - _DARTS_M, 0.0)
+            squared[:_SOON] = np.minimum(squared[:_SOON], beside**2)
+        if len(ends):
+            squared = np.minimum(
+                squared, distances(np.stack([x, y], axis=-1), ends).min(axis=-1) ** 2
+            )
+    gaps: Floats = np.sqrt(squared) - PERSON_RADIUS_M - disks.radius_m
+    least: Floats = (gaps + _LATER_M_PER_S * STEP_TIMES_S[:, None]).min(axis=0)
+    return least
+
+
+def _squared(people: Floats, x: Floats, y: Floats) -> Floats:
+    """(T, K) m2 from the nearest of people (..., N, 2) to points (T, K)."""
+    dx, dy = people[..., 0] - x[..., None], people[..., 1] - y[..., None]
+    return np.asarray((dx * dx + dy * dy).min(axis=-1))
+
+
+def bodies(ahead: Ahead, disks: BodyDisks) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
+    """x and y, (STEPS, K) m each, of the middles of the two disks of the body."""
+    x, y, heading = ahead.pose[:, 0], ahead.pose[:, 1], ahead.pose[:, 2]
+    nose_x, nose_y = disks.nose_m * np.cos(heading), disks.nose_m * np.sin(heading)
+    return (x + nose_x, y + nose_y), (x - nose_x, y - nose_y)
+
+
+def _crosses(known: Privileged, offset: Floats) -> NDArray[np.bool_]:
+    """(N,): who comes from a side, and would meet the robot if both kept their velocity."""
+    pose = known.robot.pose
+    people = known.people
+    forward = np.array([math.cos(pose.heading_rad), math.sin(pose.heading_rad)])
+    velocity = walks(people)
+    sideways = np.abs(velocity @ [-forward[1], forward[0]]) > _SIDEWAYS * people.speed
+    closing = velocity - known.robot.v_mps * forward
+    speed = np.maximum(np.hypot(closing[:, 0], closing[:, 1]), 1e-6)
+    missed_m = np.abs(offset[:, 0] * closing[:, 1] - offset[:, 1] * closing[:, 0]) / speed
+    met: NDArray[np.bool_] = sideways & ((offset * closing).sum(axis=1) < 0.0) & (missed_m < _MET_M)
+    return met
+
+
+class Yielding:
+    """Whom the robot stands for: who came straight at it, or across, until past it; no longer than
+    _WAITS_S in one place."""
+
+    def __init__(self) -> None:
+        self._for: set[str] = set()
+        self._at = (math.inf, math.inf)
+        self._since_s = 0.0
+
+    def waits(self, known: Privileged, time_s: float) -> bool:
+        """Whether the robot is to stand now."""
+        pose = known.robot.pose
+        people = known.people
+        offset = people.xy - pose.xy
+        far = np.hypot(offset[:, 0], offset[:, 1])
+        cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
+        off = np.abs(wrap_angles(people.heading - np.arctan2(-offset[:, 1], -offset[:, 0])))
+        ahead = offset @ [cos, sin]
+        near = (far < _COMES_M) & (ahead > -_PAST_M)
+        comes = (off < _COMES_RAD) | _crosses(known, offset)
+        comes &= near & people.are(*DIRECTED) & ~who_stands(people) & (ahead > 0.5 * far)
+        passing = near & ((off < _LEAVES_RAD) | (far < _PAST_M))
+        if math.dist(self._at, pose[:2]) > _SAME_PLACE_M:
+            self._at = pose[:2]
+            self._since_s = time_s
+        self._for.update(people.ids[row] for row in np.flatnonzero(comes))
+        waits = any(people.ids[row] in self._for for row in np.flatnonzero(passing))
+        return waits and time_s - self._since_s < _WAITS_S

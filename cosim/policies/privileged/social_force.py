@@ -1,0 +1,150 @@
+"""`social_force`: people and edges push the robot, its goal pulls it.
+
+Sources: goal and edges after D. Helbing, P. Molnar, "Social force model for pedestrian dynamics",
+Physical Review E 51, 4282 (1995), without its attractions by friends and shop windows; people after
+A. Johansson, D. Helbing, P. Shukla, "Specification of the social force pedestrian model by
+evolutionary adjustment to video tracking data", Advances in Complex Systems 10, 271 (2007), its
+second elliptical form, fitted to tracks of real people: the force of 1995 reaches so short that a
+robot that turns slowly drives into whoever stands. Constants are named below.
+
+Their people are points that step sideways at will and waver at random. Distances here are between
+the outlines of robot and person, the robot turns towards the velocity that the forces would give
+it, and where it meets somebody head-on it leans to the right.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+import shapely
+
+from cosim.core.geometry import Floats, wrap_angle
+from cosim.core.state import PERSON_RADIUS_M, Command, People
+from cosim.episode.control import clipped
+from cosim.episode.interfaces import Observation, Privileged
+from cosim.policies.privileged.route import crossing_limit
+from cosim.spec.manifest import Manifest
+from cosim.spec.robot import Robot
+
+DESIRED_MPS: Final = 1.34
+"""The paper's mean desired speed; a slower robot's pace is lower."""
+RELAXATION_S: Final = 0.5
+"""tau: how fast the desired velocity is taken up again."""
+PEOPLE_MPS2: Final = 4.30
+PEOPLE_M: Final = 1.07
+"""A and B of the repulsion by people."""
+STEP_AHEAD_S: Final = 0.5
+"""Delta t: the relative motion over this time stretches the ellipse."""
+BEHIND: Final = 0.06
+"""lambda: what is right behind counts for so much."""
+LEANS_RAD: Final = math.radians(15.0)
+"""A push is turned by so much, so that the robot passes on the right of whoever is straight
+ahead."""
+EDGES_M2PS2: Final = 10.0
+EDGES_M: Final = 0.2
+"""U0 and R of the repulsive potential of edges."""
+ACTS_FOR_S: Final = 0.5
+"""Forces change the velocity over this time to give the one that the robot turns to."""
+TOUCHING_M: Final = 0.05
+"""Outlines are never nearer than this for the force, which would grow beyond all bounds."""
+_LOOK_M: Final = 2.0
+_GAIN_PER_S: Final = 2.0
+_NEAR_M: Final = 8.0
+
+
+class SocialForce:
+    """Pushed by people and edges, pulled along its route (Helbing and Molnar 1995); knows what no
+    camera sees."""
+
+    manifest = Manifest("social_force", version="2", rate_hz=10.0, camera=None, privileged=True)
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: Observation) -> Command:
+        known = observation.privileged
+        if known is None:
+            raise ValueError("the social_force policy needs privileged observations")
+        robot, state = observation.robot, known.robot
+        heading = state.pose.heading_rad
+        velocity = state.v_mps * np.array([math.cos(heading), math.sin(heading)])
+        wanted = velocity + ACTS_FOR_S * force(known, robot, velocity)
+        speed = min(math.hypot(*wanted), 1.3 * desired_mps(robot), crossing_limit(known, robot))
+        off_rad = wrap_angle(math.atan2(wanted[1], wanted[0]) - heading)
+        return clipped(Command(speed * max(math.cos(off_rad), 0.0), _GAIN_PER_S * off_rad), robot)
+
+
+def desired_mps(robot: Robot) -> float:
+    """The speed that its goal pulls a robot to."""
+    return min(DESIRED_MPS, robot.cruise_mps)
+
+
+def force(known: Privileged, robot: Robot, velocity: Floats) -> Floats:
+    """The acceleration (2,) m/s2 of a robot that drives at `velocity` (2,)."""
+    here = known.robot.pose.xy
+    ahead = known.route.at(min(known.route_s_m + _LOOK_M, known.route.length_m)).xy - here
+    direction = ahead / max(math.hypot(*ahead), 1e-9)
+    pull = (desired_mps(robot) * direction - velocity) / RELAXATION_S
+    pushes = seen(from_people(known.people, robot, here, velocity), direction)
+    total: Floats = pull + pushes.sum(axis=0) + from_edge(known, robot, here)
+    return total
+
+
+def bodies_m(robot: Robot) -> float:
+    """Between the middles of a robot and of a person that it touches with its front, a centimetre
+    apart."""
+    return robot.length_m / 2 + 0.01 + PERSON_RADIUS_M
+
+
+def from_people(people: People, robot: Robot, here: Floats, velocity: Floats) -> Floats:
+    """(N, 2) m/s2: the push of each person on a robot at `here` (2,) that drives at `velocity`
+    (2,).
+
+    d: from the person to the robot, between their outlines; y: how the person moves relative to the
+    robot in Delta t; 2 b = sqrt((|d| + |d - y|)^2 - |y|^2): the push is A exp(-b / B) (|d| + |d -
+    y|) / 2 b along the mean of the directions of d and d - y.
+    """
+    away = here - people.xy
+    r = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-9)
+    away = away * (np.maximum(r - bodies_m(robot), TOUCHING_M) / r)[:, None]
+    going = people.speed[:, None] * np.column_stack(
+        [np.cos(people.heading), np.sin(people.heading)]
+    )
+    step = STEP_AHEAD_S * (going - velocity)
+    from_step = away - step
+    near = np.hypot(away[:, 0], away[:, 1])
+    then = np.maximum(np.hypot(from_step[:, 0], from_step[:, 1]), 1e-9)
+    both = near + then
+    b = 0.5 * np.sqrt(np.maximum(both**2 - (step**2).sum(axis=1), (2 * TOUCHING_M) ** 2))
+    along = 0.5 * (away / near[:, None] + from_step / then[:, None])
+    strength = PEOPLE_MPS2 * np.exp(-b / PEOPLE_M) * both / (2.0 * b) * (r < _NEAR_M)
+    pushes: Floats = strength[:, None] * along
+    return pushes
+
+
+def seen(pushes: Floats, direction: Floats) -> Floats:
+    """Pushes (N, 2), turned by LEANS_RAD and weaker for what is not ahead: w = lambda + (1 -
+    lambda) (1 + cos) / 2."""
+    strength = np.maximum(np.hypot(pushes[:, 0], pushes[:, 1]), 1e-9)
+    ahead = -pushes @ direction / strength
+    cos, sin = math.cos(LEANS_RAD), math.sin(LEANS_RAD)
+    weight = BEHIND + (1.0 - BEHIND) * 0.5 * (1.0 + ahead)
+    weighed: Floats = pushes * weight[:, None] @ np.array([[cos, sin], [-sin, cos]])
+    return weighed
+
+
+def from_edge(known: Privileged, robot: Robot, here: Floats) -> Floats:
+    """(2,) m/s2: the push of the nearest edge of the free area; back inside from beyond it."""
+    point = shapely.Point(here)
+    edge = known.free.boundary
+    nearest = np.asarray(edge.interpolate(edge.project(point)).coords[0])
+    away = here - nearest
+    distance_m = max(math.hypot(*away), 1e-6)
+    inward = away / distance_m if shapely.contains_xy(known.free, *here) else -away / distance_m
+    inside_m = distance_m if shapely.contains_xy(known.free, *here) else 0.0
+    push: Floats = (
+        EDGES_M2PS2 / EDGES_M * math.exp(-(inside_m + robot.width_m / 2.2) / EDGES_M) * inward
+    )
+    return push

@@ -1,0 +1,1 @@
+"""Referee, metrics, records and run folders."""

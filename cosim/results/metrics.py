@@ -1,0 +1,351 @@
+"""METRICS: name -> definition. Each is a pure function of one episode; a value that does not exist
+is None.
+
+Names as in the field (Anderson et al. 1807.06757; Francis et al. 2306.16740; the SidewalkBench
+paper).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.core.clock import Clock
+from cosim.core.geometry import Floats
+from cosim.results.log import Log
+from cosim.results.record import Ended, Record
+from cosim.results.referee import Failure
+from cosim.spec.scenario import Scenario
+
+STALLED_MPS = 0.05
+_PERSONAL_SPACE_M = 1.2
+INTIMATE_SPACE_M = 0.45
+PROGRESS_WINDOW_S = 5.0
+PROGRESS_MIN_M = 0.1
+RATE_NEEDS_M = 1.0
+"""A rate per 100 m needs at least this distance."""
+
+
+@dataclass(frozen=True)
+class EpisodeFacts:
+    """What the metrics see of an episode. route_length_m: of the reference route, the geodesic
+    walkable length. rules_broken: of events that were not passed as they should be. walked_into:
+    contacts at a person's fault. period_ticks: of the policy, from one command to the next."""
+
+    log: Log
+    failures: tuple[Failure, ...]
+    red_light_entries: int
+    ended: Ended | None
+    route_length_m: float
+    rules_broken: int = 0
+    walked_into: tuple[Failure, ...] = ()
+    period_ticks: int = 5
+
+    @classmethod
+    def of(cls, record: Record, scenario: Scenario, log: Log) -> EpisodeFacts:
+        """Those of an episode that was recorded: all that a metric sees stands in its files."""
+        clock = Clock.for_rate(record.rate_hz)
+        return cls(
+            log=log,
+            failures=record.failures,
+            red_light_entries=len(record.red_light_entries),
+            ended=record.ended,
+            route_length_m=scenario.route_line.length_m,
+            rules_broken=sum(event.rule_met is False for event in record.events),
+            walked_into=record.walked_into,
+            period_ticks=clock.policy_ms // clock.tick_ms,
+        )
+
+
+class Metric(NamedTuple):
+    """unit; whether higher is better (None: neither); the function."""
+
+    unit: str
+    higher_is_better: bool | None
+    of: Callable[[EpisodeFacts], float | None]
+
+
+def goal_reached(episode: EpisodeFacts) -> float:
+    """1 if the episode ended at the goal within its time limit, however many failures were
+    counted."""
+    return float(episode.ended == "goal")
+
+
+SUCCESS_IN_WORDS = (
+    "success: the goal reached in time (of gesturing: the stop made) without a failure or a "
+    "broken rule (of conversing and queueing: pass round them)"
+)
+
+
+def success(episode: EpisodeFacts) -> float:
+    """1 if the goal was reached, or the stop made that was asked for, in time, without a failure or
+    a broken rule."""
+    return float(
+        episode.ended in ("goal", "stop") and not episode.failures and not episode.rules_broken
+    )
+
+
+def travelled_m(episode: EpisodeFacts) -> float:
+    """Driven length: sum of displacements at the physics rate, reset jumps excluded."""
+    return float(episode.log.travelled_m.sum())
+
+
+def route_length_m(episode: EpisodeFacts) -> float:
+    """Length of the reference route, driven or not."""
+    return episode.route_length_m
+
+
+def progress_m(episode: EpisodeFacts) -> float:
+    """Arc length of the route gained by driving: growth of the furthest arc length, reset jumps
+    excluded."""
+    return progress_of(episode.log.route_s_m, episode.log.reset_s_m)
+
+
+def progress_of(route_s_m: np.ndarray, reset_s_m: np.ndarray) -> float:
+    """`progress_m` from arc lengths (T,) and the arc lengths of resets (T,), NaN where there was
+    none."""
+    furthest = gained = 0.0
+    for s_m, reset_to_m in zip(route_s_m.tolist(), reset_s_m.tolist(), strict=True):
+        gained += max(s_m - furthest, 0.0)
+        furthest = max(furthest, s_m)
+        if not np.isnan(reset_to_m):
+            furthest = max(furthest, reset_to_m)
+    return gained
+
+
+def route_completion(episode: EpisodeFacts) -> float:
+    """Progress / route length, in [0, 1]; 1 needs the goal, or the stop where that is asked for."""
+    if episode.ended in ("goal", "stop") and not np.isfinite(episode.log.reset_s_m).any():
+        return 1.0
+    return min(progress_m(episode) / episode.route_length_m, 1.0)
+
+
+def spl(episode: EpisodeFacts) -> float:
+    """Success weighted by path length, S l / max(p, l) (Anderson et al.), l the geodesic walkable
+    length."""
+    return (
+        success(episode)
+        * episode.route_length_m
+        / max(travelled_m(episode), episode.route_length_m)
+    )
+
+
+def time_s(episode: EpisodeFacts) -> float:
+    return len(episode.log) * episode.log.tick_s
+
+
+def velocity_mean_mps(episode: EpisodeFacts) -> float | None:
+    """Metres travelled / simulated time, frozen time included."""
+    return travelled_m(episode) / time_s(episode) if len(episode.log) else None
+
+
+def pedestrian_distance_min_m(episode: EpisodeFacts) -> float | None:
+    """Least centre distance to a person; absent if there never was one."""
+    nearest = float(episode.log.person_m.min()) if len(episode.log) else np.inf
+    return nearest if np.isfinite(nearest) else None
+
+
+def pedestrian_distance_min_success_m(episode: EpisodeFacts) -> float | None:
+    """Least centre distance to a person in an episode that succeeded, as the paper averages it;
+    absent in others."""
+    return pedestrian_distance_min_m(episode) if success(episode) else None
+
+
+def clearance_min_m(episode: EpisodeFacts) -> float | None:
+    """Least gap between the robot's outline and a person's 0.3 m disk, 0 where they met; absent
+    without people."""
+    least = float(episode.log.clearance_m.min()) if len(episode.log) else np.inf
+    return least if np.isfinite(least) else None
+
+
+def time_to_collision_min_s(episode: EpisodeFacts) -> float | None:
+    """Least time until robot and a person would have met had both kept their velocities (Francis et
+    al., after Biswas et al. 2022), both taken as disks
+    (`cosim.results.record.time_to_collision_s`); absent if they never would have."""
+    least = float(episode.log.collision_in_s.min()) if len(episode.log) else np.inf
+    return least if np.isfinite(least) else None
+
+
+def space_compliance(episode: EpisodeFacts) -> float | None:
+    """Share of ticks with nobody within 0.45 m (centre distance); absent without people."""
+    if pedestrian_distance_min_m(episode) is None:
+        return None
+    return float((episode.log.person_m > INTIMATE_SPACE_M).mean())
+
+
+def personal_space_violation(episode: EpisodeFacts) -> float | None:
+    """Share of ticks with somebody nearer than 1.2 m (centre distance); absent without people."""
+    if pedestrian_distance_min_m(episode) is None:
+        return None
+    return float((episode.log.person_m < _PERSONAL_SPACE_M).mean())
+
+
+def stalled_time_s(episode: EpisodeFacts) -> float:
+    """Time slower than 0.05 m/s."""
+    return float((np.abs(episode.log.speed[:, 0]) < STALLED_MPS).sum() * episode.log.tick_s)
+
+
+def failure_to_progress(episode: EpisodeFacts) -> float:
+    """Number of successive 5 s windows in which driving gained less than 0.1 m of arc length; jumps
+    do not count."""
+    window = round(PROGRESS_WINDOW_S / episode.log.tick_s)
+    s_m, reset_s_m = episode.log.route_s_m, episode.log.reset_s_m
+    begins = np.concatenate([[0.0], np.where(np.isnan(reset_s_m), s_m, reset_s_m)[:-1]])
+    driven = s_m - begins
+    windows = range(0, len(driven) - window + 1, window)
+    return float(sum(driven[i : i + window].sum() < PROGRESS_MIN_M for i in windows))
+
+
+def accelerations_mps2(episode: EpisodeFacts) -> list[Floats]:
+    """Accelerations along the robot's heading, from one command to the next; an array for each
+    stretch without a reset, across which nothing is differenced."""
+    log, period = episode.log, episode.period_ticks
+    ends = [*(np.flatnonzero(np.isfinite(log.reset_s_m)) + 1).tolist(), len(log)]
+    stretches = zip([0, *ends[:-1]], ends, strict=True)
+    speeds = (
+        np.concatenate([[0.0], log.speed[begin:end, 0]])[::period] for begin, end in stretches
+    )
+    return [np.diff(v_mps) / (period * log.tick_s) for v_mps in speeds]
+
+
+def mean_acceleration_mps2(episode: EpisodeFacts) -> float | None:
+    """Mean magnitude of the acceleration, at the policy's rate (Francis et al.)."""
+    return _mean_magnitude(accelerations_mps2(episode))
+
+
+def mean_jerk_mps3(episode: EpisodeFacts) -> float | None:
+    """Mean magnitude of the change of acceleration in a second, at the policy's rate (Francis et
+    al.)."""
+    period_s = episode.period_ticks * episode.log.tick_s
+    return _mean_magnitude([np.diff(one) / period_s for one in accelerations_mps2(episode)])
+
+
+def _mean_magnitude(stretches: list[Floats]) -> float | None:
+    values = np.abs(np.concatenate(stretches))
+    return float(values.mean()) if len(values) else None
+
+
+def carriageway_time_s(episode: EpisodeFacts) -> float:
+    """Time with the base centre on a road outside the crossings, or on a crossing whose signal says
+    stop."""
+    return float(episode.log.on_carriageway.sum() * episode.log.tick_s)
+
+
+def vehicles_braked(episode: EpisodeFacts) -> float:
+    """How often a vehicle had to slow down by more than 2 m/s2 for a robot without green
+    (`cosim.results.traffic`)."""
+    return float(episode.log.vehicles_braked.sum())
+
+
+def count(kind: str) -> Callable[[EpisodeFacts], float]:
+    """Number of failures of a kind; "" counts all."""
+    return lambda episode: float(sum(kind in ("", failure.kind) for failure in episode.failures))
+
+
+def collisions_with(other_kind: str) -> Callable[[EpisodeFacts], float]:
+    """Number of collisions with a kind of thing."""
+    return lambda episode: float(
+        sum(f.kind == "collision" and f.other_kind == other_kind for f in episode.failures)
+    )
+
+
+def had(count_of: Callable[[EpisodeFacts], float]) -> Callable[[EpisodeFacts], float]:
+    """1 if there was one or more of what is counted: its mean over episodes is a rate of
+    episodes."""
+    return lambda episode: float(count_of(episode) > 0.0)
+
+
+def collisions_with_the_rest(episode: EpisodeFacts) -> float:
+    """Number of collisions with anything but a person."""
+    return count("collision")(episode) - collisions_with("pedestrian")(episode)
+
+
+def per_100m(
+    kind: str, distance: Callable[[EpisodeFacts], float]
+) -> Callable[[EpisodeFacts], float | None]:
+    """Failures of a kind per 100 m of a distance; absent below 1 m."""
+
+    def rate(episode: EpisodeFacts) -> float | None:
+        metres = distance(episode)
+        return 100.0 * count(kind)(episode) / metres if metres >= RATE_NEEDS_M else None
+
+    return rate
+
+
+METRICS: Mapping[str, Metric] = MappingProxyType(
+    {
+        "success": Metric("", True, success),
+        "goal_reached": Metric("", True, goal_reached),
+        "route_completion": Metric("", True, route_completion),
+        "spl": Metric("", True, spl),
+        "failures_per_100m": Metric("1/100 m", False, per_100m("", travelled_m)),
+        "collisions_per_100m": Metric("1/100 m", False, per_100m("collision", travelled_m)),
+        "out_of_lane_per_100m": Metric("1/100 m", False, per_100m("out_of_lane", travelled_m)),
+        "freezings_per_100m": Metric("1/100 m", False, per_100m("freezing", travelled_m)),
+        "failures_per_100m_progress": Metric("1/100 m", False, per_100m("", progress_m)),
+        "failures_per_100m_route": Metric("1/100 m", False, per_100m("", route_length_m)),
+        "velocity_mean_mps": Metric("m/s", True, velocity_mean_mps),
+        "failures": Metric("", False, count("")),
+        "rules_broken": Metric("", False, lambda episode: float(episode.rules_broken)),
+        "collisions": Metric("", False, count("collision")),
+        "out_of_lane": Metric("", False, count("out_of_lane")),
+        "freezings": Metric("", False, count("freezing")),
+        "collisions_pedestrian": Metric("", False, collisions_with("pedestrian")),
+        "collisions_vehicle": Metric("", False, collisions_with("vehicle")),
+        "collisions_wall": Metric("", False, collisions_with("wall")),
+        "collisions_object": Metric("", False, collisions_with("object")),
+        "walked_into": Metric("", None, lambda episode: float(len(episode.walked_into))),
+        "pedestrian_collision": Metric("", False, had(collisions_with("pedestrian"))),
+        "other_collision": Metric("", False, had(collisions_with_the_rest)),
+        "left_lane": Metric("", False, had(count("out_of_lane"))),
+        "broke_rule": Metric("", False, had(lambda episode: float(episode.rules_broken))),
+        "red_light_entries": Metric("", False, lambda episode: float(episode.red_light_entries)),
+        "carriageway_time_s": Metric("s", False, carriageway_time_s),
+        "vehicles_braked": Metric("", False, vehicles_braked),
+        "pedestrian_distance_min_m": Metric("m", True, pedestrian_distance_min_m),
+        "pedestrian_distance_min_success_m": Metric("m", True, pedestrian_distance_min_success_m),
+        "clearance_min_m": Metric("m", True, clearance_min_m),
+        "time_to_collision_min_s": Metric("s", True, time_to_collision_min_s),
+        "space_compliance": Metric("", True, space_compliance),
+        "personal_space_violation": Metric("", False, personal_space_violation),
+        "stalled_time_s": Metric("s", False, stalled_time_s),
+        "failure_to_progress": Metric("", False, failure_to_progress),
+        "acceleration_mean_mps2": Metric("m/s2", False, mean_acceleration_mps2),
+        "jerk_mean_mps3": Metric("m/s3", False, mean_jerk_mps3),
+        "path_length_m": Metric("m", None, travelled_m),
+        "route_length_m": Metric("m", None, route_length_m),
+        "progress_m": Metric("m", True, progress_m),
+        "time_s": Metric("s", None, time_s),
+        "time_to_goal_s": Metric("s", False, lambda e: time_s(e) if goal_reached(e) else None),
+    }
+)
+
+POOLED: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {
+        "failures_per_100m": ("failures", "path_length_m"),
+        "collisions_per_100m": ("collisions", "path_length_m"),
+        "out_of_lane_per_100m": ("out_of_lane", "path_length_m"),
+        "freezings_per_100m": ("freezings", "path_length_m"),
+        "failures_per_100m_progress": ("failures", "progress_m"),
+        "failures_per_100m_route": ("failures", "route_length_m"),
+    }
+)
+"""Rates: the metric that is counted, the metres it is counted on. Of several episodes a rate is all
+that was counted on all the metres: a mean of rates would let an episode of 2 m outweigh one of 400
+m, and leave out who never moved."""
+
+COUNTERFACTUAL: Mapping[str, str] = MappingProxyType(
+    {"people_delay_s": "s", "people_compared": "", "vehicles_delay_s": "s", "vehicles_compared": ""}
+)
+"""Name -> unit of what is measured against the same street without the robot
+(`cosim.results.delay`), when that is asked for: delay of those that came near the robot, summed,
+and how many they were. No part of any other episode."""
+
+
+def every_metric(episode: EpisodeFacts) -> dict[str, float | None]:
+    """Every metric of an episode."""
+    return {name: metric.of(episode) for name, metric in METRICS.items()}

@@ -1,0 +1,443 @@
+"""The referee: contacts and poses of a Step -> failures, resets, the end of the episode.
+
+Rules (the paper leaves them open; each is a decision of this benchmark):
+
+- collision: the body touches anything but the ground, or its footprint overlaps a person's 0.3 m
+  disk or a vehicle's box, at any physics substep. One event per thing until they have been apart
+  for 1 s (people and vehicles: more than 0.1 m apart; walls and objects: without contact). Two
+  things touched in one tick are two.
+- A person who walks into a robot of which no point has moved faster than 0.05 m/s for 1 s is at
+  fault: that is counted (`walked_into`), and no failure. A robot that drives on while that person
+  touches it has collided.
+- out_of_lane: the base centre is outside the walkable area (sidewalks, corners, crossings).
+- freezing, where the episode does not end on a failure: for 10 s the robot was never 0.5 m away
+  from where it was at their beginning; time of waiting before a red crossing of the route does not
+  count. In a short episode waiting costs nothing but its time.
+- Signals are judged on the crossings of the reference route, by arc length.
+- Failures of one kind a tick: collisions before out_of_lane before freezing; one reset for all of
+  them.
+- The goal is reached within its radius, at the end of the route; or wherever the arc length is,
+  from where one can walk straight on to the goal: a part of the route was skipped on foot. Where
+  the route itself passes that near before its end, a round, its end alone counts.
+- Where an episode ends at a stop (`gesturing`): stopped within 3 m in front of the pedestrian for 2
+  s ends it well, passing the pedestrian ends it badly.
+- After a failure the robot is put at the nearest free waypoint of the route (every 5 m, never on a
+  crossing, at an obstacle nor at the goal), heading along it; after 3 failures within 10 m of the
+  route, at the first free one at least 1 m beyond them, or between waypoints where none is.
+- The jump counts neither as travel nor as progress.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from cosim.core.clock import Clock
+from cosim.core.geometry import Circle, Floats, Pose, box_disk_gap, boxes_overlap
+from cosim.core.state import PERSON_RADIUS_M, STILL, Contact, Signal
+from cosim.episode.step import Reset, Step
+from cosim.people.yielding import ROBOT_STANDS_MPS, STOOD_S, outline_mps
+from cosim.place.barriers import outline
+from cosim.place.street_map import WalkableArea
+from cosim.spec.events import Event, EventState
+from cosim.spec.obstacle import footprint
+from cosim.spec.scenario import Scenario
+
+FREEZE_WINDOW_S = 10.0
+FREEZE_MOVE_M = 0.5
+_ROUNDING_M = 1e-6
+_APART_M = 0.1
+_APART_S = 1.0
+WAYPOINT_STEP_M = 5.0
+FREE_OF_PEOPLE_M = 1.0
+FREE_OF_VEHICLES_M = 4.0
+FREE_OF_OBSTACLES_M = 0.1
+_SAME_PLACE_M = 10.0
+SAME_PLACE_FAILURES = 3
+_BEYOND_M = 1.0
+_BETWEEN_M = 0.1
+_OFF_GOAL_M = 0.2
+"""Where no waypoint beyond is free, as before the goal, places so far apart are tried, up to so far
+from the goal's circle."""
+RED_WAIT_M = 4.0
+"""A robot this close before a red crossing of its route waits lawfully."""
+STOP_S = 2.0
+STOP_WITHIN_M = 3.0
+"""Before a stopping hand: slower than STANDING_MPS for STOP_S, the base centre at most so far in
+front of it."""
+ROUND_M = 0.5
+"""A route is a round where it passes its goal, before its end, within the goal's radius and
+this."""
+LEFT_M = 0.3
+"""A robot this far before a crossing has left it and may enter it anew."""
+
+FailureKind = Literal["collision", "out_of_lane", "freezing"]
+Fault = Literal["robot_at_fault", "pedestrian_at_fault", "shared"]
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """One counted failure. other: what was touched; fault: who moved into whom, for pedestrians."""
+
+    kind: FailureKind
+    tick: int
+    x_m: float
+    y_m: float
+    route_s_m: float
+    robot_speed_mps: float
+    other: str = ""
+    other_kind: str = ""
+    fault: Fault | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What the referee says of one Step. walked_into: contacts that people are at fault for, which
+    are no failures. red_light_entry: the crossing that was entered at red, if one was."""
+
+    failures: tuple[Failure, ...] = ()
+    walked_into: tuple[Failure, ...] = ()
+    reset: Reset | None = None
+    ended: Literal["goal", "stop", "timeout", "failure"] | None = None
+    red_light_entry: str | None = None
+    waits_at_red: bool = False
+
+
+class Referee:
+    """Judges the Steps of one episode, in order. Memory: contacts under way, the freezing window,
+    past failures."""
+
+    def __init__(
+        self, scenario: Scenario, area: WalkableArea, footprint_m: tuple[float, float], clock: Clock
+    ) -> None:
+        self._scenario = scenario
+        self._area = area
+        self._half_m = (footprint_m[0] / 2, footprint_m[1] / 2)
+        self._clock = clock
+        self._route = scenario.route_line
+        self._obstacles = shapely.union_all(
+            [footprint(obstacle) for obstacle in scenario.obstacles]
+        )
+        self._fences = shapely.union_all([outline(barrier) for barrier in scenario.barriers])
+        self._is_round = is_round(scenario)
+        self._limit_ticks = clock.ticks(scenario.time_limit_s)
+        self._touching: dict[str, int] = {}
+        self._walked_into: set[str] = set()
+        self._still_ticks = 0
+        self._window = FreezeWindow(clock)
+        self._failed_at_s: list[float] = []
+        self._entered: set[str] = set()
+        self._stood_ticks = 0
+        self._inside = Circle()
+
+    def judge(self, step: Step) -> Verdict:
+        """The verdict on one Step; a failure comes with a reset unless it ends the episode."""
+        waits = self._waits_at_red(step)
+        red = self._red_light_entry(step)
+        contacts = self._contacts(step)
+        into = tuple(contact for contact in contacts if contact.fault == "pedestrian_at_fault")
+        failures = tuple(contact for contact in contacts if contact.fault != "pedestrian_at_fault")
+        failures = failures or self._out_of_lane(step) or self._freezing(step, waits)
+        if not failures:
+            return Verdict((), into, None, self._end(step), red, waits)
+        if self._scenario.ends_on_failure:
+            return Verdict(failures, into, None, "failure", red, waits)
+        if step.tick + 1 >= self._limit_ticks:
+            return Verdict(failures, into, None, "timeout", red, waits)
+        reset = self._reset(failures[0], step)
+        self._window.clear()
+        self._entered.clear()
+        return Verdict(failures, into, reset, None, red, waits)
+
+    def _end(self, step: Step) -> Literal["goal", "stop", "timeout", "failure"] | None:
+        if self._scenario.ends_at == "stop":
+            return self._end_by_stop(step)
+        pose = step.motion.robot.pose
+        if at_goal(
+            self._scenario, np.array([pose]), np.array([step.route_s_after_m])
+        ).any() or self._walks_in(pose):
+            return "goal"
+        return "timeout" if step.tick + 1 >= self._limit_ticks else None
+
+    def _walks_in(self, pose: Pose) -> bool:
+        """Whether the goal is near and straight ahead on walkable ground, by whatever way the robot
+        came."""
+        if self._is_round or not near_goal(self._scenario, np.array([pose])).any():
+            return False
+        straight = shapely.LineString([(pose.x_m, pose.y_m), self._scenario.goal])
+        return bool(shapely.covers(self._area.polygon, straight)) and not shapely.intersects(
+            self._fences, straight
+        )
+
+    def _end_by_stop(self, step: Step) -> Literal["stop", "timeout", "failure"] | None:
+        """The episode of a gesturing pedestrian: over when the robot has stopped before it, or has
+        passed it."""
+        robot = step.motion.robot
+        here = any(
+            state.phase == "acting" and stands_before(robot.pose, event, state)
+            for event, state in zip(self._scenario.events, step.events.states, strict=True)
+        )
+        self._stood_ticks = (
+            self._stood_ticks + 1 if here and abs(robot.v_mps) < ROBOT_STANDS_MPS else 0
+        )
+        if self._stood_ticks >= self._clock.ticks(STOP_S):
+            return "stop"
+        if all(step.route_s_after_m > event.route_s_m for event in self._scenario.events):
+            return "failure"
+        return "timeout" if step.tick + 1 >= self._limit_ticks else None
+
+    def _contacts(self, step: Step) -> list[Failure]:
+        """The contacts that begin in a tick, one for each thing."""
+        self._forget_the_parted(step)
+        moves = outline_mps(step.robot.v_mps, step.robot.w_radps, self._half_m) >= ROBOT_STANDS_MPS
+        self._still_ticks = 0 if moves else self._still_ticks + 1
+        stood = self._still_ticks >= self._clock.ticks(STOOD_S)
+        drives_on = self._walked_into if moves and step.command != STILL else set()
+        began: dict[str, Contact] = {}
+        for contact in step.motion.contacts:
+            if contact.other not in self._touching or contact.other in drives_on:
+                began.setdefault(contact.other, contact)
+            self._touching[contact.other] = step.tick
+        found = []
+        for name, contact in began.items():
+            fault = fault_of(name, stood, step) if contact.kind == "pedestrian" else None
+            (
+                self._walked_into.add
+                if fault == "pedestrian_at_fault"
+                else self._walked_into.discard
+            )(name)
+            found.append(self._failure("collision", step, name, contact.kind, fault))
+        return found
+
+    def _forget_the_parted(self, step: Step) -> None:
+        """A thing may collide anew once it has been away for a second."""
+        if not self._touching:
+            return
+        gaps = person_gaps(step, self._half_m)
+        beside = vehicles_within(step, self._half_m, _APART_M)
+        for other, last_tick in list(self._touching.items()):
+            if gaps.get(other, np.inf) <= _APART_M or other in beside:
+                self._touching[other] = step.tick
+            elif (step.tick - last_tick) * self._clock.tick_s > _APART_S:
+                del self._touching[other]
+                self._walked_into.discard(other)
+
+    def _out_of_lane(self, step: Step) -> tuple[Failure, ...]:
+        pose = step.motion.robot.pose
+        if self._inside.holds(pose.x_m, pose.y_m):
+            return ()
+        if not self._area.contains(pose.x_m, pose.y_m):
+            return (self._failure("out_of_lane", step),)
+        room_m = float(self._area.signed_distance(pose.xy)[0]) - _ROUNDING_M
+        self._inside = Circle(pose.x_m, pose.y_m, max(room_m, 0.0))
+        return ()
+
+    def _freezing(self, step: Step, waits_at_red: bool) -> tuple[Failure, ...]:
+        if waits_at_red or self._scenario.ends_on_failure:
+            return ()
+        x_m, y_m, _ = step.motion.robot.pose
+        return (self._failure("freezing", step),) if self._window.frozen((x_m, y_m)) else ()
+
+    def _waits_at_red(self, step: Step) -> bool:
+        return any(
+            signal_is_red(crossing.id, step.street.signals)
+            and -RED_WAIT_M <= step.route_s_after_m - crossing.enter_s_m <= 0.0
+            for crossing in self._scenario.crossings
+        )
+
+    def _red_light_entry(self, step: Step) -> str | None:
+        for crossing in self._scenario.crossings:
+            inside = crossing.enter_s_m < step.route_s_after_m < crossing.leave_s_m
+            if inside and crossing.id not in self._entered:
+                self._entered.add(crossing.id)
+                if signal_is_red(crossing.id, step.street.signals):
+                    return crossing.id
+            elif step.route_s_after_m < crossing.enter_s_m - LEFT_M:
+                self._entered.discard(crossing.id)
+        return None
+
+    def _failure(
+        self,
+        kind: FailureKind,
+        step: Step,
+        other: str = "",
+        other_kind: str = "",
+        fault: Fault | None = None,
+    ) -> Failure:
+        pose = step.motion.robot.pose
+        speed = abs(step.robot.v_mps)
+        return Failure(
+            kind,
+            step.tick,
+            pose.x_m,
+            pose.y_m,
+            step.route_s_after_m,
+            speed,
+            other,
+            other_kind,
+            fault,
+        )
+
+    def _reset(self, failure: Failure, step: Step) -> Reset:
+        self._failed_at_s.append(failure.route_s_m)
+        recent = self._failed_at_s[-SAME_PLACE_FAILURES:]
+        stuck = len(recent) == SAME_PLACE_FAILURES and max(recent) - min(recent) <= _SAME_PLACE_M
+        count = int(self._route.length_m // WAYPOINT_STEP_M) + 1
+        last_m = max(self._route.length_m - 2 * self._scenario.goal_radius_m, 0.0)
+        waypoints = np.arange(count, dtype=np.float64) * WAYPOINT_STEP_M
+        waypoints = waypoints[waypoints <= last_m]
+        clear = self._clear(waypoints)
+        waypoints = clear if len(clear) else waypoints
+        if stuck:
+            self._failed_at_s.clear()
+            begin_m = max(recent) + _BEYOND_M
+            order = waypoints[waypoints > begin_m]
+        else:
+            order = waypoints[np.argsort(np.abs(waypoints - failure.route_s_m), kind="stable")]
+        if (found := self._first_free(order, step)) is not None:
+            return found
+        if stuck:
+            end_m = self._route.length_m - self._scenario.goal_radius_m - _OFF_GOAL_M
+            if (
+                found := self._first_free(self._clear(np.arange(begin_m, end_m, _BETWEEN_M)), step)
+            ) is not None:
+                return found
+        s_m = float(waypoints[np.argmin(np.abs(waypoints - failure.route_s_m))])
+        return Reset(self._route.at(s_m), s_m)
+
+    def _first_free(self, places: Floats, step: Step) -> Reset | None:
+        """At the first of these arc lengths, metres, at which nobody and nothing is in the way."""
+        for s_m in places.tolist():
+            pose = self._route.at(s_m)
+            if self._free(pose, s_m, step):
+                return Reset(pose, s_m)
+        return None
+
+    def _clear(self, waypoints: Floats) -> Floats:
+        """Those at which the robot can turn on the spot between the obstacles."""
+        if not self._scenario.obstacles or not len(waypoints):
+            return waypoints
+        at = shapely.points([self._route.at(s_m).xy for s_m in waypoints.tolist()])
+        return waypoints[
+            shapely.distance(at, self._obstacles) > math.hypot(*self._half_m) + FREE_OF_OBSTACLES_M
+        ]
+
+    def _free(self, pose: Pose, s_m: float, step: Step) -> bool:
+        if any(
+            c.enter_s_m - self._half_m[0] < s_m < c.leave_s_m + self._half_m[0]
+            for c in self._scenario.crossings
+        ):
+            return False
+        people, vehicles = step.street_after.people, step.street_after.vehicles
+        if len(people) and np.hypot(*(people.xy - pose.xy).T).min() < FREE_OF_PEOPLE_M:
+            return False
+        return not (
+            len(vehicles) and np.hypot(*(vehicles.xy - pose.xy).T).min() < FREE_OF_VEHICLES_M
+        )
+
+
+class FreezeWindow:
+    """Where a robot was within the last 10 s, those left out in which it waited lawfully."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._at: deque[tuple[float, float]] = deque(maxlen=clock.ticks(FREEZE_WINDOW_S) + 1)
+
+    def frozen(self, xy: tuple[float, float]) -> bool:
+        """Whether it is frozen now that it is here after a further tick, metres."""
+        self._at.append(xy)
+        if len(self._at) < (self._at.maxlen or 0):
+            return False
+        # Mostly it is far from where it was, whatever lies between.
+        if math.dist(self._at[0], xy) > FREEZE_MOVE_M + _ROUNDING_M:
+            return False
+        track = np.array(self._at)
+        return bool(np.hypot(*(track - track[0]).T).max() < FREEZE_MOVE_M)
+
+    def clear(self) -> None:
+        """It was put elsewhere."""
+        self._at.clear()
+
+
+def at_goal(scenario: Scenario, pose: Floats, route_s_m: Floats) -> NDArray[np.bool_]:
+    """(T,) at which of (T, 3) poses with these arc lengths (T,) the goal is reached at the end of
+    the route."""
+    last_m = scenario.route_line.length_m - 2 * scenario.goal_radius_m
+    reached: NDArray[np.bool_] = near_goal(scenario, pose) & (route_s_m >= last_m)
+    return reached
+
+
+def near_goal(scenario: Scenario, pose: Floats) -> NDArray[np.bool_]:
+    """(T,) which of (T, 3) poses are within the goal's radius."""
+    away_m = np.hypot(pose[:, 0] - scenario.goal[0], pose[:, 1] - scenario.goal[1])
+    near: NDArray[np.bool_] = away_m <= scenario.goal_radius_m
+    return near
+
+
+def is_round(scenario: Scenario) -> bool:
+    """Whether a route passes its own goal before its end, so that being there does not say that it
+    was driven."""
+    route = scenario.route_line
+    last_m = route.length_m - 2 * scenario.goal_radius_m
+    before = shapely.LineString([*route.points[route.s_m < last_m], route.at(last_m).xy])
+    return before.distance(shapely.Point(scenario.goal)) <= scenario.goal_radius_m + ROUND_M
+
+
+def stands_before(robot: Pose, event: Event, state: EventState) -> bool:
+    """Whether the robot is within STOP_WITHIN_M of somebody, on the side from which it came."""
+    for walker in state.walkers:
+        dx, dy = robot.x_m - walker.x_m, robot.y_m - walker.y_m
+        behind = dx * math.cos(event.heading_rad) + dy * math.sin(event.heading_rad) > 0.0
+        if not behind and math.hypot(dx, dy) <= STOP_WITHIN_M:
+            return True
+    return False
+
+
+def signal_is_red(crossing_id: str, signals: Mapping[str, Signal]) -> bool:
+    """Whether a crossing has a signal and it says stop."""
+    signal = signals.get(crossing_id)
+    return signal is not None and not signal.walk
+
+
+def person_gaps(step: Step, half_m: tuple[float, float]) -> dict[str, float]:
+    """Gap in metres from the robot's footprint to each person's disk at the end of a Step."""
+    people = step.street_after.people
+    pose = step.motion.robot.pose
+    if not len(people):
+        return {}
+    gaps: Floats = box_disk_gap(np.array([pose]), *half_m, people.xy[None])[0] - PERSON_RADIUS_M
+    return dict(zip(people.ids, gaps.tolist(), strict=True))
+
+
+def vehicles_within(step: Step, half_m: tuple[float, float], gap_m: float) -> set[str]:
+    """Ids of the vehicles whose box comes within a gap of the robot's outline at the end of a
+    Step."""
+    vehicles = step.street_after.vehicles
+    pose = step.motion.robot.pose
+    if not len(vehicles):
+        return set()
+    boxes = np.column_stack([vehicles.xy, vehicles.heading])
+    near = boxes_overlap(np.array(pose), np.array(half_m) + gap_m, boxes, vehicles.size / 2)
+    return {vehicles.ids[i] for i in np.flatnonzero(near)}
+
+
+def fault_of(person: str, stood: bool, step: Step) -> Fault:
+    """Who moved into whom. stood: the robot has stood long enough to be walked into; a person who
+    does not come nearer is driven into."""
+    if stood:
+        return "pedestrian_at_fault"
+    people = step.street.people
+    if person in people.ids:
+        i = people.ids.index(person)
+        pose = step.robot.pose
+        to_robot = pose.xy - people.xy[i]
+        closing = people.speed[i] * np.cos(people.heading[i] - np.arctan2(to_robot[1], to_robot[0]))
+        if closing > ROBOT_STANDS_MPS:
+            return "shared"
+    return "robot_at_fault"

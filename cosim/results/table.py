@@ -1,0 +1,165 @@
+"""From many records to tables: one row per episode, and summaries with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+import pandas as pd
+
+from cosim.core.geometry import Floats
+from cosim.results.metrics import COUNTERFACTUAL, METRICS, POOLED, RATE_NEEDS_M
+from cosim.results.record import Record
+
+KEYS: tuple[str, ...] = (
+    "scenario",
+    "status",
+    "ended",
+    "reason",
+    "suite",
+    "suite_hash",
+    "scenario_hash",
+    "seed",
+    "split",
+    "structure",
+    "crowd_added",
+    "run_seed",
+    "episode",
+    "robot",
+    "policy",
+    "policy_version",
+    "policy_runs",
+    "camera",
+    "rate_hz",
+    "waypoints",
+    "nonstandard",
+    "goal_protocol",
+    "odometry",
+    "privileged",
+    "latency_ms",
+    "answer_ms",
+    "real_time",
+    "renderer",
+    "ticks",
+    "state_hash",
+)
+ORACLE = "orca"
+"""The policy that suites are proved by: it knows what no robot can, and its results are no
+contestant's."""
+BOOTSTRAP = 2000
+CONFIDENCE = 0.95
+WORST: Mapping[str, float] = {
+    "success": 0.0,
+    "goal_reached": 0.0,
+    "route_completion": 0.0,
+    "spl": 0.0,
+    "velocity_mean_mps": 0.0,
+    "pedestrian_collision": 1.0,
+    "other_collision": 1.0,
+    "left_lane": 1.0,
+    "broke_rule": 1.0,
+    "space_compliance": 0.0,
+    "personal_space_violation": 1.0,
+}
+"""What an episode counts as whose policy crashed: the worst there is, so that nobody gains by
+crashing. Where there is no worst, as of a rate, a run in which a policy crashed has no mean. An
+invalid episode has no measures."""
+MOST_INVALID = 0.02
+"""Of what was scheduled; where more is invalid a table says nothing of its policy."""
+
+
+def table_row(record: Record) -> dict[str, Any]:
+    """One flat row. A function of scenario, policy and versions alone, but in real time: other wall
+    times are left out."""
+    row: dict[str, Any] = {key: getattr(record, key) for key in KEYS}
+    row["waypoints"] = record.waypoints.in_words
+    further = [f"{name}: {spec.in_words}" for name, spec in record.cameras.items()]
+    row["camera"] = (
+        "none" if record.camera is None else "; ".join([record.camera.in_words, *further])
+    )
+    row["metric_schema"] = record.metric_schema
+    row["versions"] = msgspec.json.encode(record.versions, order="deterministic").decode()
+    counted: dict[str, Mapping[str, float | None]] = {
+        "done": record.measures,
+        "crashed": WORST,
+        "invalid": {},
+    }
+    measures = counted[record.status]
+    asked = {name: measures[name] for name in COUNTERFACTUAL if name in measures}
+    return row | {name: measures.get(name) for name in METRICS} | asked
+
+
+def table_of(records: Iterable[Record]) -> pd.DataFrame:
+    """One row per episode, sorted by scenario id, whatever order they ended in."""
+    rows = sorted((table_row(record) for record in records), key=lambda row: str(row["scenario"]))
+    asked = [name for name in COUNTERFACTUAL if any(name in row for row in rows)]
+    columns = [*KEYS, "metric_schema", "versions", *METRICS, *asked]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def policy_in_words(name: str, privileged: bool) -> str:
+    """A policy's name as tables show it, with what sets it apart from one that only sees.
+
+    >>> policy_in_words("orca", privileged=True)
+    'orca (oracle, privileged)'
+    """
+    return f"{name} ({'oracle, ' * (name == ORACLE)}privileged)" if privileged else name
+
+
+def summary_of(table: pd.DataFrame, names: Sequence[str] = tuple(METRICS)) -> pd.DataFrame:
+    """Mean over episodes per metric, its bootstrap interval, and n, the number of episodes that
+    have a value. Rates are pooled (`cosim.results.metrics.POOLED`): all that was counted on all the
+    metres, bootstrapped over episodes.
+
+    Columns: mean, low, high, n; index: metric. A metric that no episode has is absent (NaN, n = 0),
+    and so is a rate where a policy crashed: what it would have done after that cannot be counted.
+    """
+    rows = [_summary(table, name) for name in names]
+    return pd.DataFrame(
+        rows, index=pd.Index(names, name="metric"), columns=["mean", "low", "high", "n"]
+    )
+
+
+def _summary(table: pd.DataFrame, name: str) -> tuple[float, float, float, int]:
+    if name not in POOLED:
+        values = _numbers(table, name)
+        values = values[~np.isnan(values)]
+        return (float(values.mean()) if len(values) else np.nan, *interval_of(values), len(values))
+    counted, metres = (_numbers(table, column) for column in POOLED[name])
+    known = ~(np.isnan(counted) | np.isnan(metres))
+    if (table["status"] == "crashed").any() or metres[known].sum() < RATE_NEEDS_M:
+        return np.nan, np.nan, np.nan, 0
+    counted, metres = counted[known], metres[known]
+    return 100.0 * counted.sum() / metres.sum(), *interval_of(100.0 * counted, metres), len(counted)
+
+
+def _numbers(table: pd.DataFrame, name: str) -> Floats:
+    return np.asarray(pd.to_numeric(table[name], errors="coerce"), dtype=float)
+
+
+def interval_of(values: Floats, weights: Floats | None = None) -> tuple[float, float]:
+    """Percentile bootstrap interval of the mean at CONFIDENCE, or of sum(values) / sum(weights);
+    NaN for no values. Always the same draws."""
+    if not len(values):
+        return float("nan"), float("nan")
+    draws = np.random.default_rng(0).integers(len(values), size=(BOOTSTRAP, len(values)))
+    over = np.full(len(values), 1.0) if weights is None else weights
+    drawn = over[draws].sum(axis=1)
+    means = values[draws].sum(axis=1)[drawn > 0.0] / drawn[drawn > 0.0]
+    tail = (1.0 - CONFIDENCE) / 2
+    low, high = np.quantile(means, [tail, 1.0 - tail])
+    return float(low), float(high)
+
+
+def not_to_be_quoted(table: pd.DataFrame, scheduled: int) -> str:
+    """Why the means of a run say nothing of its policy, in words; "" if they do."""
+    invalid = int((table["status"] == "invalid").sum())
+    if invalid > MOST_INVALID * scheduled:
+        return (
+            f"{invalid} of {scheduled} scheduled episodes are invalid, more than "
+            f"{100 * MOST_INVALID:.0f} %"
+        )
+    missing = scheduled - len(table)
+    return f"{missing} of {scheduled} scheduled episodes have not ended" if missing else ""

@@ -1,0 +1,122 @@
+"""How fast a run was: figures.json of its folder, an entry for each time that it went on."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Collection, Iterable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+
+import msgspec
+
+from cosim.core.clock import Clock
+from cosim.core.errors import unwritable
+from cosim.core.log_event import happened
+from cosim.core.telling import milliseconds
+from cosim.core.whole_file import write_whole
+from cosim.results.record import Record
+from cosim.results.run_folder import read_records
+
+_FILE = "figures.json"
+
+
+class Figures(msgspec.Struct, frozen=True, kw_only=True):
+    """Of one go of a run. began: UTC; simulated_s: of all episodes; setup_s, driving_s: seconds of
+    its processes, until the first observation and from there on; retried: episodes that were begun
+    again; given_up: after the last attempt. answer_ms: how long episodes waited for an answer of
+    the policy, wherever it was asked, the median of their medians; None where that is not known.
+    """
+
+    began: str
+    wall_s: float
+    episodes: int
+    simulated_s: float
+    episodes_per_hour: float
+    times_real: float
+    setup_s: float
+    driving_s: float
+    retried: int
+    given_up: int
+    answer_ms: float | None = None
+
+    @property
+    def in_words(self) -> str:
+        """In a line."""
+        busy_s = self.setup_s + self.driving_s
+        setup = f", {100.0 * self.setup_s / busy_s:.0f} % of it setting up" if busy_s else ""
+        return (
+            f"{self.episodes} episodes in {self.wall_s:.0f} s: {self.episodes_per_hour:,.0f} an "
+            f"hour, {self.times_real:.1f} x real time; processes were busy for {busy_s:.0f} "
+            f"s{setup}; {self.retried} retried, {self.given_up} given up"
+            + (
+                ""
+                if self.answer_ms is None
+                else f"; the median answer took {milliseconds(self.answer_ms)}"
+            )
+        )
+
+
+class Going:
+    """One go of a run, from now on. todo: the scenarios that are to be run; counts: of events, by
+    their names in the log. figures: of it, once it has ended and if an episode has."""
+
+    def __init__(self, folder: Path, todo: Collection[str], counts: Mapping[str, int]) -> None:
+        self._folder = folder
+        self._todo = frozenset(todo)
+        self._counts = counts
+        self._began = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+        self._began_s = time.monotonic()
+        self.figures: Figures | None = None
+
+    def end(self) -> None:
+        """Keep the figures, however it ended. Raises MachineError."""
+        ended = [record for record in read_records(self._folder) if record.scenario in self._todo]
+        happened("run over", episodes=len(ended), of=len(self._todo), folder=str(self._folder))
+        if ended:
+            wall_s = max(time.monotonic() - self._began_s, 1e-3)
+            self.figures = _figures_of(ended, self._began, wall_s, self._counts)
+            keep_figures(self._folder, self.figures)
+
+
+def _figures_of(
+    records: Collection[Record], began: str, wall_s: float, counts: Mapping[str, int]
+) -> Figures:
+    """Of the episodes that ended in one go. counts: of events, by their names in the log."""
+    simulated_s = sum(Clock().time_s(record.ticks) for record in records)
+    setup_s = sum(record.clock.get("setup_s", 0.0) for record in records)
+    return Figures(
+        began=began,
+        wall_s=wall_s,
+        episodes=len(records),
+        simulated_s=simulated_s,
+        episodes_per_hour=3600.0 * len(records) / wall_s,
+        times_real=simulated_s / wall_s,
+        setup_s=setup_s,
+        driving_s=sum(record.clock.get("wall_s", 0.0) for record in records) - setup_s,
+        retried=counts.get("retried", 0),
+        given_up=counts.get("given up", 0),
+        answer_ms=median_answer_ms(records),
+    )
+
+
+def median_answer_ms(records: Iterable[Record]) -> float | None:
+    """How long episodes waited for an answer of the policy, the median of their medians; None where
+    none tells."""
+    told = [record.clock["answer_ms"] for record in records if "answer_ms" in record.clock]
+    return statistics.median(told) if told else None
+
+
+def keep_figures(folder: Path, figures: Figures) -> None:
+    """Add an entry. One that cannot be read is written anew. Raises MachineError."""
+    path = folder / _FILE
+    try:
+        before = msgspec.json.decode(path.read_bytes(), type=list[Figures])
+    except (OSError, msgspec.DecodeError):
+        before = []
+    try:
+        write_whole(
+            path, msgspec.json.format(msgspec.json.encode([*before, figures]), indent=1) + b"\n"
+        )
+    except OSError as error:
+        raise unwritable(path, error) from error

@@ -1,0 +1,151 @@
+"""Collecting: what is kept of an episode as a demonstration, and how its expert is disturbed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Final
+
+import msgspec
+
+from cosim.core.clock import Clock
+from cosim.core.errors import SpecError, UsageError
+from cosim.spec.camera import CameraSpec
+from cosim.spec.goal import GOALS, GoalProtocol
+from cosim.spec.manifest import Manifest
+
+EYE: Final = "collected"
+"""The name of the collecting camera beside that of an expert that sees by one itself."""
+COLLECTED_GOALS: Final = ("none", "route_point", "final_point", "instruction")
+"""Goals of which a row can tell: no pictures, and no points that the expert does not drive to."""
+_MOST_NOISE: Final = 0.9
+_MOST_WAYPOINTS: Final = 100
+_FASTEST_HZ: Final = 20.0
+
+
+class Collecting(msgspec.Struct, frozen=True, kw_only=True):
+    """What is kept. camera: of the pictures; rate_hz: how often the expert is asked and a picture
+    is taken, a whole number of times a second. waypoints, waypoint_s: how many places ahead, and
+    the time from one to the next, whole ticks of 0.05 s. noise: the share of the time in which
+    another command than the expert's is driven, in bursts. learner: the policy whose commands these
+    are, "" for the expert's own, slowed and turned aside by chance. unsolved: episodes that the
+    expert does not solve are kept, too, up to where the robot is put elsewhere. Raises
+    SpecError."""
+
+    camera: CameraSpec = CameraSpec(width=160, height=90)
+    rate_hz: float = 5.0
+    waypoints: int = 8
+    waypoint_s: float = 0.2
+    noise: float = 0.0
+    learner: str = ""
+    unsolved: bool = False
+
+    def __post_init__(self) -> None:
+        if self.rate_hz not in (
+            rates := [n for n in range(1, int(_FASTEST_HZ) + 1) if not 1000 % n and _ticks(1 / n)]
+        ):
+            told = ", ".join(map(str, rates))
+            raise SpecError(
+                f"a data set has {told} pictures a second, not {self.rate_hz:g}: choose one "
+                f"of these rates"
+            )
+        if not 0.0 <= self.noise <= _MOST_NOISE:
+            raise SpecError(
+                f"noise must be in [0, {_MOST_NOISE:g}], a share of the time, not {self.noise:g}"
+            )
+        if self.learner and not self.noise:
+            raise SpecError(
+                f"learner '{self.learner}' drives in the share of the time that is noise: "
+                f"give --noise 0.6"
+            )
+        if not 1 <= self.waypoints <= _MOST_WAYPOINTS:
+            raise SpecError(f"waypoints must be in [1, {_MOST_WAYPOINTS}], not {self.waypoints}")
+        if not (
+            math.isfinite(self.waypoint_s)
+            and 0.0 < self.waypoint_s <= 10.0
+            and _ticks(self.waypoint_s)
+        ):
+            raise SpecError(
+                "from one waypoint to the next it must be a whole number of ticks of 0.05 s, up "
+                f"to 10 s, not {self.waypoint_s:g} s"
+            )
+        if self.camera.size[0] % 2 or self.camera.size[1] % 2 or min(self.camera.size) < 16:
+            wide, high = self.camera.size
+            raise SpecError(
+                f"a film's pictures have even sides of 16 pixels or more, not {wide} x {high}"
+            )
+
+
+def _ticks(time_s: float) -> int:
+    """How many ticks a time is; 0 if it is no whole number of them."""
+    ticks = Clock().ticks(time_s)
+    return ticks if math.isclose(ticks * Clock().tick_s, time_s) else 0
+
+
+def check_learner(
+    learner: Manifest, collecting: Collecting, expert: Manifest, goal: GoalProtocol
+) -> None:
+    """Raises UsageError where a learner would be given something else than what is collected, or
+    cannot do with it. goal: of the rows."""
+    if expert.camera is not None:
+        raise UsageError(
+            f"expert '{expert.name}' sees by a camera of its own, and a learner drives "
+            f"beside one that does not"
+        )
+    camera = learner.camera
+    if camera is None or learner.privileged or learner.cameras or learner.odometry != "none":
+        raise UsageError(
+            f"learner '{learner.name}' is no policy that drives by one camera, speeds and a "
+            f"goal alone"
+        )
+    if (camera, learner.rate_hz) != (collecting.camera, collecting.rate_hz):
+        seen = f"{camera.in_words}, {learner.rate_hz:g} Hz"
+        kept = collecting.camera.in_words
+        raise UsageError(
+            f"learner '{learner.name}' is to see what is collected. It sees by {seen}, collected "
+            f"is {kept}, {collecting.rate_hz:g} Hz: {_asked_for(camera, learner.rate_hz)}"
+        )
+    if learner.goals and goal not in learner.goals:
+        could = ", ".join(learner.goals)
+        raise UsageError(
+            f"learner '{learner.name}' cannot do with goal '{goal}': give --goal, one of {could}"
+        )
+
+
+def _asked_for(camera: CameraSpec, rate_hz: float) -> str:
+    """How these pictures are asked for."""
+    plain = CameraSpec(camera.width, camera.height, camera.fov_deg, camera.mount)
+    if camera != plain or not isinstance(camera.mount, str):
+        return (
+            "such pictures cannot be collected; give a learner with a plain camera at one of the "
+            "robot's mounts"
+        )
+    return (
+        f"give --camera {camera.width}x{camera.height} --fov {camera.fov_deg:g} --mount "
+        f"{camera.mount} --rate {rate_hz:g}"
+    )
+
+
+def demonstrating(
+    expert: Manifest, collecting: Collecting, goal: GoalProtocol | None = None
+) -> Manifest:
+    """The manifest of an expert whose drives are collected: with the camera, at the rate, and named
+    otherwise where it is disturbed. goal: of the run, in place of its own. Raises UsageError for
+    goals that no data set tells, and for another rate than that of an expert that sees: the
+    pictures that it remembers would be other times apart."""
+    goal = goal or expert.goal
+    if goal not in COLLECTED_GOALS:
+        raise UsageError(
+            f"goal protocol '{goal}' ({GOALS.get(goal, 'unknown')}) cannot be told in a data set: "
+            f"give --goal, one of {', '.join(COLLECTED_GOALS)}"
+        )
+    if expert.camera is not None and collecting.rate_hz != expert.rate_hz:
+        raise UsageError(
+            f"policy '{expert.name}' sees, and answers {expert.rate_hz:g} times a second, not "
+            f"{collecting.rate_hz:g}: give --rate {expert.rate_hz:g}"
+        )
+    name = f"{expert.name}-disturbed" if collecting.noise else expert.name
+    settled = replace(expert, name=name, rate_hz=collecting.rate_hz, goal=goal)
+    if expert.camera is None:
+        return replace(settled, camera=collecting.camera)
+    return replace(settled, cameras={**expert.cameras, EYE: collecting.camera})

@@ -1,0 +1,94 @@
+"""People and nothing else: what the paper measures, and what is left of a picture when the street
+is taken away."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Self
+
+import moderngl
+import numpy as np
+
+from cosim.core.clock import Clock
+from cosim.core.geometry import Floats, Pose
+from cosim.core.state import Frame, Street
+from cosim.spec.scenario import Light
+from physics.cameras.gl.context import context
+from physics.cameras.gl.crowd import CrowdDrawing, PeopleSeen
+from physics.cameras.gl.lighting import lighting_of
+from physics.cameras.gl.shading import SceneBlocks, anchor_of, camera_matrix
+from physics.cameras.gl.shots import Shots
+from physics.cameras.gl.targets import Readback, Target
+from physics.cameras.sky import sky_of
+from physics.cameras.view import shot
+
+EYE_M = 0.75
+"""Height of the eye over flat ground."""
+
+
+class PeopleAlone:
+    """Posed, skinned, shaded people before nothing. Use it in a `with` block. size: width, height
+    in pixels."""
+
+    def __init__(self, size: tuple[int, int], fov_deg: float) -> None:
+        self._size = size
+        self._fov_deg = fov_deg
+        self._light = lighting_of(sky_of(Light(shadows=False), 0))
+
+    def __enter__(self) -> Self:
+        with context() as gl:
+            self._crowd, self._blocks, self._target = (
+                CrowdDrawing(gl),
+                SceneBlocks(gl),
+                Target(gl, self._size),
+            )
+            self._readback = Readback(gl, self._target)
+        self._context = gl
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        with self._context:
+            for thing in (self._crowd, self._blocks, self._target, self._readback):
+                thing.release()
+
+    def render(self, pose: Pose, street: Street) -> Frame:
+        """The people of a street as seen from a pose."""
+        self.begin(pose, street)
+        return self.end()
+
+    def begin(self, pose: Pose, street: Street) -> None:
+        """Draw them; `end` hands the picture over, and the next one may begin before that."""
+        ahead = np.array([np.cos(pose.heading_rad), np.sin(pose.heading_rad)])
+        eye = np.append(pose.xy, EYE_M)
+        taken = shot(eye, eye + np.append(ahead, -0.1), self._size, self._fov_deg)
+        shots = Shots([taken])
+        anchor = anchor_of(taken.eye_m)
+        with self._context as gl:
+            self._crowd.set(
+                [PeopleSeen(street.people, Clock().time_s(street.tick), _flat, shadows=False)],
+                shots,
+            )
+            self._blocks.put(0, camera_matrix(taken, anchor), np.eye(4), taken, anchor, self._light)
+            self._blocks.upload()
+            self._blocks.bind()
+            self._target.clear()
+            gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
+            gl.front_face = "cw"
+            gl.depth_func = "<"
+            self._crowd.draw("colour", shadows=False)
+            self._readback.begin()
+            self._readback.copy()
+
+    def end(self) -> Frame:
+        """The picture that began first and has not ended."""
+        with self._context:
+            return Frame(*self._readback.end()[0])
+
+
+def _flat(xy: Floats) -> Floats:
+    return np.zeros(len(xy))

@@ -1,0 +1,93 @@
+"""The robot's body from the shapes of its URDF: boxes, cylinders and files of meshes in their
+colours."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as xml
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from cosim.core.errors import EngineError
+from cosim.core.geometry import Floats
+from physics.dynamics.bullet import p
+from physics.ground.mesh import Mesh, Part, box, frustum, join
+
+_GREY = (0.6, 0.6, 0.6)
+
+
+@lru_cache(maxsize=8)
+def robot_parts(urdf: Path) -> tuple[Part, ...]:
+    """What is drawn of a robot in its base frame, wheels as they stand. Raises EngineError for an
+    unknown shape."""
+    root = xml.parse(urdf).getroot()
+    colours = {m.get("name", ""): _colour(m) for m in root.findall("material")}
+    joints = {j.find("child").get("link", ""): j for j in root.findall("joint")}  # type: ignore[union-attr]
+    parts = []
+    for link in root.findall("link"):
+        turn, shift = _placed(link.get("name", ""), joints)
+        for visual in link.findall("visual"):
+            own_turn, own_shift = _origin(visual)
+            mesh = _shape(visual, urdf)
+            vertices = (mesh.vertices @ own_turn.T + own_shift) @ turn.T + shift
+            material = visual.find("material")
+            name = material.get("name", "") if material is not None else ""
+            turned = Mesh(vertices, mesh.normals @ own_turn.T @ turn.T, mesh.triangles)
+            parts.append(Part(turned, colours.get(name, _GREY)))
+    return tuple(parts)
+
+
+def _placed(link: str, joints: dict[str, xml.Element]) -> tuple[Floats, Floats]:
+    """Rotation and position of a link in the base frame, every joint at zero."""
+    turn, shift = np.eye(3), np.zeros(3)
+    while link in joints:
+        own_turn, own_shift = _origin(joints[link])
+        turn = own_turn @ turn
+        shift = own_turn @ shift + own_shift
+        link = joints[link].find("parent").get("link", "")  # type: ignore[union-attr]
+    return turn, shift
+
+
+def _origin(element: xml.Element) -> tuple[Floats, Floats]:
+    origin = element.find("origin")
+    if origin is None:
+        return np.eye(3), np.zeros(3)
+    angles, shift = (
+        [float(v) for v in origin.get(name, "0 0 0").split()] for name in ("rpy", "xyz")
+    )
+    turn = p.getMatrixFromQuaternion(p.getQuaternionFromEuler(angles))
+    return np.array(turn).reshape(3, 3), np.array(shift)
+
+
+def _shape(visual: xml.Element, urdf: Path) -> Mesh:
+    geometry = visual.find("geometry")
+    shape = next(iter(geometry), None) if geometry is not None else None
+    if shape is not None and shape.tag == "box":
+        return box([float(v) for v in shape.get("size", "").split()])
+    if shape is not None and shape.tag == "cylinder":
+        radius = float(shape.get("radius", ""))
+        half = 0.5 * float(shape.get("length", ""))
+        upper = frustum((radius, radius), (radius, radius), -half, half, sides=16)
+        flip = np.array([1.0, -1.0, -1.0])
+        return join([upper, Mesh(upper.vertices * flip, upper.normals * flip, upper.triangles)])
+    if shape is not None and shape.tag == "mesh":
+        from physics.street.mesh_surface import (
+            as_mesh,
+            read_mesh,
+        )  # trimesh takes 0.2 s, which most robots do not need
+
+        scale = np.array([float(v) for v in shape.get("scale", "1 1 1").split()])
+        return as_mesh(read_mesh(urdf.parent / shape.get("filename", "")).apply_scale(scale))
+    what = "nothing" if shape is None else f"a {shape.tag}"
+    raise EngineError(
+        f"{urdf}: a visual shows {what}; the gl camera draws boxes, cylinders and meshes"
+    )
+
+
+def _colour(material: xml.Element) -> tuple[float, float, float]:
+    colour = material.find("color")
+    if colour is None:
+        return _GREY
+    r, g, b = (float(v) for v in colour.get("rgba", "").split()[:3])
+    return r, g, b

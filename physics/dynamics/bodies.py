@@ -1,0 +1,360 @@
+"""The collision bodies in one PyBullet client: robot, ground, buildings, barriers, and what moves
+near the robot."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.errors import EngineError
+from cosim.core.geometry import Floats, Pose
+from cosim.core.state import PERSON_RADIUS_M, RobotState
+from cosim.spec.robot import Robot
+from cosim.spec.scenario import Barrier
+from physics.dynamics.bullet import p
+from physics.dynamics.movers import Mover, TickPoses
+from physics.ground.mesh import Mesh, as_lists, join
+from physics.ground.tiles import CURB_M
+from physics.robots import urdf_of
+from physics.street.buildings import Building, Wall
+from physics.street.furniture import Prop, solids_of
+from physics.street.surface import Chunk
+
+PERSON_M: Final = 1.7
+VEHICLE_M: Final = 1.5
+WALL_M: Final = 0.2
+"""How thick the walls of mapped buildings are."""
+
+FAR_BELOW_M: Final = -50.0
+_AROUND_M: Final = 0.5
+"""What stands around the robot is looked up anew when it has moved by so much."""
+_NO_CHANGE: Final = (0.0, 0.0, 0.0)
+_NOWHERE: Final = (math.inf, math.inf, math.inf)
+_UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)
+_TYRE: Final = {
+    "lateralFriction": 1.0,
+    "anisotropicFriction": (1.0, 0.3, 1.0),
+    "contactStiffness": 30_000.0,
+    "contactDamping": 1_000.0,
+}
+"""Soft tyres share the load evenly and slide more easily sideways (y is the axle): without both,
+and with the friction cone, skid turns come in jerks."""
+
+BodyKind = Literal["pedestrian", "vehicle", "wall", "object"]
+Moving = Literal["pedestrian", "vehicle"]
+_Placing = tuple[tuple[float, float, float], tuple[float, float, float, float]]
+"""Where the middle of a body comes to be, and its attitude as a quaternion."""
+
+
+class Bodies:
+    """A running engine. Bodies that are not shown wait far below the ground for their next use.
+
+    at_m: where the robot's base frame is; yaw_rate_radps: its rate of turn about the vertical;
+    watched: the bodies that `robot_contacts` asks for.
+    """
+
+    def __init__(self, robot: Robot, substep_s: float) -> None:
+        self._client: int = p.connect(p.DIRECT)
+        if self._client < 0:
+            raise EngineError("PyBullet did not start")
+        self._com_height_m = robot.com_height_m
+        self._what: dict[int, tuple[BodyKind, str]] = {}
+        self._pools: dict[Any, list[int]] = {}
+        self._shown: dict[Moving, dict[str, tuple[int, Any]]] = {"pedestrian": {}, "vehicle": {}}
+        self._led: dict[Moving, list[tuple[int, list[_Placing]]]] = {}
+        self._left_at: dict[int, tuple[float, float, float]] = {}
+        self.at_m = _NOWHERE
+        self.yaw_rate_radps = 0.0
+        self._looked_from = _NOWHERE
+        self._around: dict[int, Any] = {}
+        self.watched: list[int] = []
+        self._asked_radps: list[float] = []
+        self._shapes: dict[Any, int] = {}
+        self._do("setGravity", 0.0, 0.0, -9.81)
+        self._do(
+            "setPhysicsEngineParameter",
+            fixedTimeStep=substep_s,
+            numSubSteps=0,
+            deterministicOverlappingPairs=1,
+            enableConeFriction=0,
+        )
+        self._robot: int = self._do(
+            "loadURDF", str(urdf_of(robot)), flags=p.URDF_USE_INERTIA_FROM_FILE
+        )
+        infos = [
+            self._do("getJointInfo", self._robot, j)
+            for j in range(self._do("getNumJoints", self._robot))
+        ]
+        joints = {info[1].decode(): info[0] for info in infos}
+        self._wheels = [joints[name] for name in robot.drive.joints]
+        self._torques = [robot.drive.torque_nm] * len(self._wheels)
+        self._do(
+            "changeDynamics",
+            self._robot,
+            -1,
+            lateralFriction=0.4,
+            linearDamping=0.0,
+            angularDamping=0.0,
+        )
+        for wheel in self._wheels:
+            self._do(
+                "changeDynamics", self._robot, wheel, linearDamping=0.0, angularDamping=0.0, **_TYRE
+            )
+        self._read()
+
+    def close(self) -> None:
+        p.disconnect(self._client)
+
+    def add_chunk(self, chunk: Chunk) -> list[int]:
+        """What is in a square of a surface; returns what `remove` takes."""
+        self._looked_from = _NOWHERE
+        of_friction: dict[float, list[Mesh]] = {}
+        for patch in chunk.ground:
+            of_friction.setdefault(patch.friction, []).append(patch.mesh)
+        ground = [self._add_ground(join(meshes), value) for value, meshes in of_friction.items()]
+        houses = [body for b in chunk.buildings for body in self._add_building(b)]
+        return [*ground, *houses, *(self.add_prop(prop, z) for prop, z in chunk.props)]
+
+    def _add_ground(self, mesh: Mesh, value: float) -> int:
+        middle = mesh.vertices.mean(axis=0) * (1.0, 1.0, 0.0)
+        flags = p.GEOM_FORCE_CONCAVE_TRIMESH
+        with as_lists(mesh.triangles, mesh.vertices - middle) as (indices, (vertices,)):
+            shape = self._do(
+                "createCollisionShape", p.GEOM_MESH, vertices=vertices, indices=indices, flags=flags
+            )
+        ground = self._body(shape, middle)
+        self._do("changeDynamics", ground, -1, lateralFriction=value)
+        return ground
+
+    def _add_building(self, building: Building) -> list[int]:
+        height = building.size_m[2] + building.floor_m - building.base_m
+        boxes = [
+            ((building.x_m, building.y_m), building.heading_rad, (*building.size_m[:2], height))
+        ]
+        if building.outline is not None:
+            boxes = [_wall_box(wall, height) for wall in building.walls]
+        bodies = []
+        for (x, y), heading, size in boxes:
+            half = [0.5 * s for s in size]
+            shape = self._do("createCollisionShape", p.GEOM_BOX, halfExtents=half)
+            turn = p.getQuaternionFromEuler((0.0, 0.0, heading))
+            bodies.append(self._body(shape, (x, y, building.base_m + CURB_M + half[2]), turn))
+            self._what[bodies[-1]] = ("wall", building.id)
+        return bodies
+
+    def add_prop(self, prop: Prop, z_m: float) -> int:
+        pool = (prop.kind, prop.variant)
+        if pool not in self._shapes:
+            solids = solids_of(*pool)
+            self._shapes[pool] = self._do(
+                "createCollisionShapeArray",
+                shapeTypes=[p.GEOM_BOX if s.shape == "box" else p.GEOM_CYLINDER for s in solids],
+                halfExtents=[[0.5 * c for c in s.size_m] for s in solids],
+                radii=[0.5 * s.size_m[0] for s in solids],
+                lengths=[s.size_m[2] for s in solids],
+                collisionFramePositions=[[*s.at_m, 0.5 * s.size_m[2]] for s in solids],
+            )
+        turn = p.getQuaternionFromEuler((0.0, 0.0, prop.heading_rad))
+        body = self._body(self._shapes[pool], (prop.x_m, prop.y_m, z_m), turn)
+        self._what[body] = ("object", prop.id)
+        return body
+
+    def add_barrier(self, barrier: Barrier, z_m: float) -> int:
+        half = (0.5 * barrier.thickness_m, 0.5 * barrier.length_m, 0.5 * barrier.height_m)
+        shape = self._do("createCollisionShape", p.GEOM_BOX, halfExtents=half)
+        turn = p.getQuaternionFromEuler((0.0, 0.0, barrier.heading_rad))
+        body = self._body(shape, (barrier.x_m, barrier.y_m, z_m + half[2]), turn)
+        self._what[body] = ("object", f"barrier:{barrier.strip}:{barrier.end}")
+        return body
+
+    def remove(self, bodies: Sequence[int]) -> None:
+        self._looked_from = _NOWHERE
+        for body in bodies:
+            self._do("removeBody", body)
+            self._what.pop(body, None)
+
+    def show(self, kind: Moving, movers: Sequence[Mover]) -> None:
+        """Let exactly these people or vehicles have a body, which stays where it is until it is
+        led."""
+        shown = self._shown[kind]
+        ids = [mover.id for mover in movers]
+        if list(shown) == ids:
+            return
+        for name in [name for name in shown if name not in ids]:
+            body, pool = shown.pop(name)
+            self._what.pop(body)
+            self._pools[pool].append(body)
+            self._park(body)
+        for mover in movers:
+            if mover.id not in shown:
+                pool = kind if kind == "pedestrian" else (kind, *mover.size_m)
+                body = self._taken(pool)
+                shown[mover.id] = (body, pool)
+                self._what[body] = (kind, mover.id)
+        self._shown[kind] = {name: shown[name] for name in ids}
+
+    def stands(self, kind: Moving, mover: Mover) -> bool:
+        """Whether a shown body is where it was led to, and stays there."""
+        return (
+            mover.change == _NO_CHANGE
+            and self._left_at.get(self._shown[kind][mover.id][0]) == mover.start
+        )
+
+    def lead(self, kind: Moving, ways: Mapping[Mover, TickPoses], z_m: Sequence[float]) -> None:
+        """Let these of the shown go their ways, substep by substep (`step`); the others stay. z_m:
+        height of the ground under each."""
+        half = 0.5 * (PERSON_M if kind == "pedestrian" else VEHICLE_M)
+        self._led[kind] = []
+        for (mover, way), z in zip(ways.items(), z_m, strict=True):
+            body = self._shown[kind][mover.id][0]
+            self._left_at[body] = way[-1]
+            placings = [
+                ((x, y, z + half), (0.0, 0.0, math.sin(0.5 * heading), math.cos(0.5 * heading)))
+                for x, y, heading in way
+            ]
+            self._led[kind].append((body, placings))
+
+    def _park(self, body: int) -> None:
+        self._left_at.pop(body, None)
+        p.resetBasePositionAndOrientation(body, (0.0, 0.0, FAR_BELOW_M), _UPRIGHT, self._client)
+
+    def _taken(self, pool: Any) -> int:
+        waiting = self._pools.setdefault(pool, [])
+        if waiting:
+            return waiting.pop()
+        if pool not in self._shapes:
+            if pool == "pedestrian":
+                shape = self._do(
+                    "createCollisionShape", p.GEOM_CYLINDER, radius=PERSON_RADIUS_M, height=PERSON_M
+                )
+            else:
+                half = (0.5 * pool[1], 0.5 * pool[2], 0.5 * VEHICLE_M)
+                shape = self._do("createCollisionShape", p.GEOM_BOX, halfExtents=half)
+            self._shapes[pool] = shape
+        return self._body(self._shapes[pool], (0.0, 0.0, FAR_BELOW_M))
+
+    def _body(self, shape: int, at: Any, turn: Any = _UPRIGHT) -> int:
+        body: int = self._do(
+            "createMultiBody",
+            baseMass=0.0,
+            baseCollisionShapeIndex=shape,
+            basePosition=[float(c) for c in at],
+            baseOrientation=turn,
+            useMaximalCoordinates=True,
+        )
+        return body
+
+    def place_robot(
+        self, xyz_m: tuple[float, float, float], roll_pitch_yaw: tuple[float, float, float]
+    ) -> None:
+        """The robot at rest with its base frame there."""
+        turn = p.getQuaternionFromEuler(roll_pitch_yaw)
+        m = p.getMatrixFromQuaternion(turn)
+        h = self._com_height_m
+        middle = [c + h * up for c, up in zip(xyz_m, (m[2], m[5], m[8]), strict=True)]
+        self._do("resetBasePositionAndOrientation", self._robot, middle, turn)
+        self._do("resetBaseVelocity", self._robot, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        for wheel in self._wheels:
+            self._do("resetJointState", self._robot, wheel, 0.0, 0.0)
+        self._read()
+
+    def step(self, substep: int, speeds_radps: list[float]) -> tuple[float, float, float]:
+        """One substep of a tick, from 0; x, y, heading of the robot's base frame after it.
+
+        speeds_radps: at which the motors turn the drive's joints, in the order of `Skid.joints`.
+        """
+        for led in self._led.values():
+            for body, way in led:
+                p.resetBasePositionAndOrientation(body, *way[substep], self._client)
+        if speeds_radps != self._asked_radps:  # the motors keep what they were asked for
+            self._asked_radps = speeds_radps
+            p.setJointMotorControlArray(
+                self._robot,
+                self._wheels,
+                p.VELOCITY_CONTROL,
+                targetVelocities=speeds_radps,
+                forces=self._torques,
+                physicsClientId=self._client,
+            )
+        p.stepSimulation(self._client)
+        return self._read()
+
+    def _read(self) -> tuple[float, float, float]:
+        """Ask the engine where the robot is, and how it moves."""
+        self._velocity = p.getBaseVelocity(self._robot, self._client)
+        (x, y, z), turn = p.getBasePositionAndOrientation(self._robot, self._client)
+        self._turned = m = p.getMatrixFromQuaternion(turn)
+        h = self._com_height_m  # the engine reports the centre of mass
+        self.at_m = x, y, _ = x - h * m[2], y - h * m[5], z - h * m[8]
+        self.yaw_rate_radps = self._velocity[1][2]
+        return x, y, math.atan2(m[3], m[0])
+
+    def robot_state(self) -> RobotState:
+        (x, y, z) = self.at_m
+        m = self._turned
+        (linear, angular) = self._velocity
+        forward = linear[0] * m[0] + linear[1] * m[3] + linear[2] * m[6]
+        turn = angular[0] * m[2] + angular[1] * m[5] + angular[2] * m[8]
+        pose = Pose(x, y, math.atan2(m[3], m[0]))
+        return RobotState(pose, forward, turn, z, math.acos(min(max(m[8], -1.0), 1.0)))
+
+    def watch(self, reach_m: float, movers: Iterable[tuple[Moving, Mover]]) -> None:
+        """Ask for contacts with these of the shown, and with what stands within a reach of the
+        robot."""
+        x, y, z = self.at_m
+        if math.dist(self.at_m, self._looked_from) > _AROUND_M:
+            far_m = reach_m + _AROUND_M
+            found = p.getOverlappingObjects(
+                (x - far_m, y - far_m, z - far_m), (x + far_m, y + far_m, z + far_m), self._client
+            )
+            standing = {
+                body
+                for body, _ in found or ()
+                if body in self._what and self._what[body][0] in ("wall", "object")
+            }
+            self._around = {body: p.getAABB(body, -1, self._client) for body in sorted(standing)}
+            self._looked_from = self.at_m
+        self.watched = [
+            body
+            for body, ((x0, y0, _), (x1, y1, _)) in self._around.items()
+            if x0 - reach_m <= x <= x1 + reach_m and y0 - reach_m <= y <= y1 + reach_m
+        ]
+        self.watched += [self._shown[kind][mover.id][0] for kind, mover in movers]
+
+    def robot_contacts(self) -> list[tuple[BodyKind, str]]:
+        """What of the watched the robot touches now."""
+        return [
+            self._what[body]
+            for body in self.watched
+            if any(
+                c[8] <= 0.0
+                for c in p.getContactPoints(self._robot, body, physicsClientId=self._client)
+            )
+        ]
+
+    def blocked(self, begin_m: Floats, end_m: Floats) -> NDArray[np.bool_]:
+        """On which of (N, 3) -> (N, 3) lines something stands."""
+        hits = self._do("rayTestBatch", begin_m.tolist(), end_m.tolist())
+        return np.array([hit[0] >= 0 for hit in hits], dtype=bool)
+
+    def _do(self, call: str, *args: Any, **options: Any) -> Any:
+        try:
+            return getattr(p, call)(*args, **options, physicsClientId=self._client)
+        except p.error as error:
+            raise EngineError(f"PyBullet: {call}: {error}") from error
+
+
+def _wall_box(
+    wall: Wall, height_m: float
+) -> tuple[tuple[float, float], float, tuple[float, float, float]]:
+    """Middle, heading and size of a wall: WALL_M thick, its outer face on the line, the outside to
+    the line's right."""
+    x0, y0, x1, y1 = wall
+    length, heading = math.hypot(x1 - x0, y1 - y0), math.atan2(y1 - y0, x1 - x0)
+    x = 0.5 * (x0 + x1) - 0.5 * WALL_M * math.sin(heading)
+    y = 0.5 * (y0 + y1) + 0.5 * WALL_M * math.cos(heading)
+    return (x, y), heading, (length, WALL_M, height_m)

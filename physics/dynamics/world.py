@@ -1,0 +1,231 @@
+"""BulletWorld: the robot among streets, buildings, props, barriers, people and vehicles, stepped by
+PyBullet.
+
+Only what the robot can touch is in the engine: ground, buildings and props of the tiles around it,
+and the people and vehicles within reach. Pictures are drawn elsewhere
+(physics.cameras.bullet_camera), from the same values.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from types import TracebackType
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.errors import EngineError
+from cosim.core.geometry import Floats, Pose, box_disk_gap, boxes_overlap
+from cosim.core.state import (
+    PERSON_RADIUS_M,
+    Command,
+    Contact,
+    Motion,
+    RobotState,
+    Street,
+    write_protected,
+)
+from cosim.spec.obstacle import Obstacle
+from cosim.spec.robot import COURIER, Robot
+from cosim.spec.scenario import Barrier
+from physics.dynamics.bodies import Bodies, Moving
+from physics.dynamics.drive import SkidDrive
+from physics.dynamics.movers import Mover, TickPoses, movers_near
+from physics.ground.tiles import Key, distance_to, distances_within, keys_within
+from physics.street.surface import Surface, stood
+
+SUBSTEP_S: Final = 0.005
+PEOPLE_REACH_M: Final = 6.0
+_VEHICLE_REACH_M: Final = 10.0
+_LOAD_M: Final = 20.0
+_UNLOAD_M: Final = 40.0
+_STRAY_M: Final = 0.2
+"""Who can be touched is found anew when the robot comes so far within a tick, as when something
+throws it."""
+_CLEAR_M: Final = 0.5
+"""Who can be touched is who a robot would touch that were larger by this: more than it strays
+before that is seen."""
+_ROUNDING_M: Final = 1e-6
+_OWN_M: Final = 0.45
+"""From a point of a body, at most so far lies its surface."""
+
+
+class BulletWorld:
+    """The physics of one episode. Use it in a `with` block; one PyBullet client each, so several
+    may live at once.
+
+    surface: what it stands on. barriers, obstacles: what stands on it for the whole episode
+    besides.
+    """
+
+    def __init__(
+        self,
+        surface: Surface,
+        barriers: Sequence[Barrier] = (),
+        robot: Robot = COURIER,
+        obstacles: Sequence[Obstacle] = (),
+    ) -> None:
+        self.surface = surface
+        self.robot = robot
+        self.barriers = tuple(barriers)
+        self.obstacles = tuple(obstacles)
+        self._drive = SkidDrive(robot)
+        self._bodies: Bodies | None = None
+        self._tiles: dict[Key, list[int]] = {}
+        self._streamed = (0.0, 0.0)
+        self._settled_m = 0.0
+        self._reach_m = (
+            math.hypot(0.5 * robot.length_m, 0.5 * robot.width_m, robot.height_m) + _CLEAR_M
+        )
+
+    @property
+    def footprint_m(self) -> tuple[float, float]:
+        """Length and width of the robot."""
+        return self.robot.footprint_m
+
+    def __enter__(self) -> Self:
+        if self._bodies is None:
+            self._bodies = Bodies(self.robot, SUBSTEP_S)
+            for barrier in self.barriers:
+                size = (barrier.thickness_m, barrier.length_m)
+                z = self.surface.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, size)
+                self._bodies.add_barrier(barrier, z)
+            for prop, z in stood(self.obstacles, self.surface):
+                self._bodies.add_prop(prop, z)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the engine; a second call does nothing."""
+        if self._bodies is not None:
+            self._bodies.close()
+            self._bodies = None
+            self._tiles.clear()
+            self._settled_m = 0.0
+
+    def place(self, pose: Pose) -> RobotState:
+        """Put the robot at rest at a pose, its wheels on the ground."""
+        bodies = self._engine
+        self._stream(pose.x_m, pose.y_m)
+        self._drive.reset()
+        z, roll, pitch = self.surface.lean(pose, self.robot.drive.span_m)
+        bodies.place_robot((pose.x_m, pose.y_m, z + 0.001), (roll, pitch, pose.heading_rad))
+        return bodies.robot_state()
+
+    def hidden(self, eye_m: Floats, points_m: Floats) -> NDArray[np.bool_]:
+        """Which of (N, 3) points something solid hides from an eye (3,) on the robot. What stands
+        closer than _OWN_M to a point is what is looked at, and what is so near the eye is the
+        robot. What stands farther than _LOAD_M from the robot may not be in the engine."""
+        rays = points_m - eye_m
+        far_m = np.sqrt((rays**2).sum(axis=1))
+        hidden = np.zeros(len(points_m), dtype=bool)
+        long = far_m > 2 * _OWN_M
+        if long.any():
+            inset = _OWN_M * rays[long] / far_m[long, None]
+            hidden[long] = self._engine.blocked(eye_m + inset, points_m[long] - inset)
+        return hidden
+
+    def step(self, command: Command, before: Street, after: Street, substeps: int) -> Motion:
+        """One tick of physics; people and vehicles move evenly from `before` to `after`."""
+        bodies = self._engine
+        x, y, _ = pose = bodies.at_m
+        self._stream(x, y)
+        near: dict[Moving, list[Mover]] = {
+            "pedestrian": movers_near(before.people, after.people, x, y, PEOPLE_REACH_M),
+            "vehicle": movers_near(before.vehicles, after.vehicles, x, y, _VEHICLE_REACH_M),
+        }
+        for kind, movers in near.items():
+            bodies.show(kind, movers)
+            ways = {
+                mover: mover.way(substeps) for mover in movers if not bodies.stands(kind, mover)
+            }
+            bodies.lead(kind, ways, self._feet(kind, ways) if ways else [])
+        close = self._watched(near, x, y)
+        trace: list[float] = []
+        found: set[Contact] = set()
+        for k in range(substeps):
+            if abs(pose[0] - x) > _STRAY_M or abs(pose[1] - y) > _STRAY_M:
+                x, y, _ = pose
+                close |= self._watched(near, x, y)
+            pose = bodies.step(
+                k, self._drive.joint_speeds(command, bodies.yaw_rate_radps, SUBSTEP_S)
+            )
+            trace += pose
+            if bodies.watched:
+                found |= {Contact(what, other, k) for what, other in bodies.robot_contacts()}
+        poses = write_protected(trace, shape=(substeps, 3))
+        for kind, mover in close:
+            found.update(self._overlaps(kind, mover, poses))
+        contacts = tuple(sorted(found, key=lambda c: (c.substep, c.kind, c.other))) if found else ()
+        return Motion(bodies.robot_state(), poses, contacts)
+
+    def _watched(
+        self, near: Mapping[Moving, Sequence[Mover]], x_m: float, y_m: float
+    ) -> set[tuple[Moving, Mover]]:
+        """Whom the robot could touch while it is within _STRAY_M of a point. Contacts are asked for
+        with them and with what stands there, nothing else."""
+        close = {
+            (kind, mover)
+            for kind, movers in near.items()
+            for mover in movers
+            if mover.passes(x_m, y_m, self._reach_m)
+        }
+        self._engine.watch(self._reach_m, close)
+        return close
+
+    def _feet(self, kind: Moving, ways: Mapping[Mover, TickPoses]) -> list[float]:
+        """Height of the ground under each at the end of the tick."""
+        end = np.array([way[-1] for way in ways.values()])
+        if kind == "pedestrian":
+            z_m = self.surface.heights(end[:, :2])
+        else:
+            z_m = self.surface.road(end[:, :2], end[:, 2], [mover.size_m for mover in ways])[:, 0]
+        return list(map(float, z_m))
+
+    def _overlaps(self, kind: Moving, mover: Mover, trace: Floats) -> list[Contact]:
+        """Overlaps of the footprint with a disk or box, whatever the engine made of it."""
+        half = 0.5 * np.array(self.footprint_m)
+        way = np.array(mover.way(len(trace)))[:, None]
+        if kind == "pedestrian":
+            hit = box_disk_gap(trace, half[0], half[1], way[:, :, :2]) < PERSON_RADIUS_M
+        else:
+            hit = boxes_overlap(trace[:, None], half, way, 0.5 * np.array([[mover.size_m]]))
+        return [Contact(kind, mover.id, k) for k in np.flatnonzero(hit).tolist()]
+
+    def _stream(self, x_m: float, y_m: float) -> None:
+        """Load the tiles around a point and drop those left behind; nothing to do before it has
+        moved far enough."""
+        if math.hypot(x_m - self._streamed[0], y_m - self._streamed[1]) < self._settled_m:
+            return
+        bodies = self._engine
+        for key in [k for k in self._tiles if distance_to(k, x_m, y_m) > _UNLOAD_M]:
+            bodies.remove(self._tiles.pop(key))
+        for key in keys_within(x_m, y_m, _LOAD_M):
+            if key not in self._tiles:
+                self._tiles[key] = bodies.add_chunk(self.surface.chunk(key))
+        ahead = [
+            far_m - _LOAD_M
+            for far_m, key in distances_within(x_m, y_m, _UNLOAD_M)
+            if key not in self._tiles
+        ]
+        left = [_UNLOAD_M - distance_to(key, x_m, y_m) for key in self._tiles]
+        self._streamed = (x_m, y_m)
+        self._settled_m = min(ahead + left) - _ROUNDING_M
+
+    @property
+    def _engine(self) -> Bodies:
+        if self._bodies is None:
+            raise EngineError("the physics is not running: use BulletWorld in a 'with' block")
+        return self._bodies
+
+
+__all__ = ["SUBSTEP_S", "BulletWorld"]

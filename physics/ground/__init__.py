@@ -1,0 +1,1 @@
+"""The ground: meshes, materials, relief and tiles."""

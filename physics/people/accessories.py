@@ -1,0 +1,224 @@
+"""What people wear and carry besides clothes: hair, caps, bags, backpacks, phones, as lofts on the
+man of 1.75 m."""
+
+from __future__ import annotations
+
+from typing import Final, Literal
+
+from physics.people.arms import on_arm
+from physics.people.figure import SMALL, upright_loft
+from physics.people.lofted_mesh import Joints, Piece, Ring, ball
+
+Hair = Literal["short", "crop", "bob", "long", "bun", "tail"]
+Carried = Literal["", "bag", "backpack", "phone"]
+
+_HEAD: Final[Joints] = {"head": 1.0}
+_HAIR: Final = (18, 11, 6, 4)
+
+
+def hair(style: Hair) -> list[Piece]:
+    """Hair about the head, in front up to the hairline."""
+    nape = {"short": 1.585, "crop": 1.600, "bob": 1.515, "long": 1.40, "bun": 1.585, "tail": 1.585}[
+        style
+    ]
+    full = {
+        "short": 0.006,
+        "crop": 0.001,
+        "bob": 0.014,
+        "long": 0.012,
+        "bun": 0.003,
+        "tail": 0.003,
+    }[style]
+    low = (
+        # z, x, half depth ahead, behind, half width
+        (nape, -0.066, 0.012, 0.030, 0.050),
+        (nape + 0.012, -0.064, 0.018, 0.040, 0.058),
+    )
+    cap = (
+        (1.630, -0.040, 0.030, 0.064, 0.0745),
+        (1.665, -0.030, 0.045, 0.076, 0.0770),
+        (1.692, -0.022, 0.070, 0.083, 0.0785),
+        (1.706, -0.010, 0.0835, 0.097, 0.0780),
+        (1.726, -0.010, 0.080, 0.094, 0.0720),
+        (1.748, -0.014, 0.062, 0.074, 0.0560),
+        (1.762, -0.017, 0.036, 0.044, 0.0330),
+        (1.766, -0.018, 0.015, 0.018, 0.0140),
+    )
+    rings = []
+    for z, x, front, behind, wide in (*low, *cap):
+        behind = behind + full
+        wide = wide + full * (0.8 if z < 1.74 else 0.3)
+        top = z + full * 0.5 * (z > 1.72)
+        joints = _HEAD
+        if z < 1.56:
+            joints = (
+                {"head": 0.6, "neck": 0.4}
+                if z > 1.46
+                else {"head": 0.2, "neck": 0.3, "spine3": 0.5}
+            )
+        if style in ("bob", "long") and z < 1.6:
+            front, wide = front + 0.030, wide + 0.016
+        if style == "long" and z < 1.5:
+            x = x - 0.022
+            wide = wide + 0.022
+        rings.append(upright_loft((x, 0.0, top), front, behind / front, wide, joints, 2.1))
+    pieces = [Piece("hair", tuple(rings), _HAIR, (15, 9, 7, 5))]
+    if style == "bun":
+        pieces.append(
+            ball("hair", (-0.125, 0.0, 1.700), (0.034, 0.038, 0.036), _HEAD, (10, 7, 6, 4))
+        )
+    if style == "tail":
+        keys = (
+            (1.690, -0.105, 0.018),
+            (1.680, -0.128, 0.028),
+            (1.62, -0.138, 0.032),
+            (1.52, -0.128, 0.028),
+            (1.44, -0.122, 0.010),
+        )
+        tail = [
+            upright_loft((x, 0.0, z), r, 1.0, 1.15 * r, {"head": 0.8, "neck": 0.2})
+            for z, x, r in keys
+        ]
+        pieces.append(Piece("hair", tuple(tail), SMALL, (7, 5, 4, 4)))
+    return pieces
+
+
+def headgear() -> list[Piece]:
+    """A cap with a visor."""
+    dome = (
+        (1.676, -0.006, 0.096, 0.110, 0.083),
+        (1.690, -0.006, 0.101, 0.114, 0.0865),
+        (1.720, -0.008, 0.094, 0.108, 0.0810),
+        (1.748, -0.014, 0.074, 0.086, 0.0660),
+        (1.768, -0.018, 0.042, 0.050, 0.0380),
+        (1.773, -0.019, 0.016, 0.020, 0.0160),
+    )
+    rings = [
+        upright_loft((x, 0.0, z), front, behind / front, wide, _HEAD, 2.1)
+        for z, x, front, behind, wide in dome
+    ]
+    visor = [
+        Ring((x, 0.0, z), (0.0, 0.0, 0.005), (0.0, wide, 0.0), _HEAD, 1.0, 2.4)
+        for x, z, wide in (
+            (0.060, 1.690, 0.066),
+            (0.100, 1.688, 0.068),
+            (0.140, 1.681, 0.056),
+            (0.165, 1.673, 0.026),
+        )
+    ]
+    return [
+        Piece("cap", tuple(rings), _HAIR, (9, 6, 5, 4)),
+        Piece("cap", tuple(visor), (10, 8, 6, 4), (5, 4, 3, 3)),
+    ]
+
+
+def carried(what: Carried, loose: float = 0.0) -> list[Piece]:
+    """A shoulder bag at the left hip, a backpack, a phone in the left hand."""
+    if what == "bag":
+        return [_bag(), _strap(loose)]
+    if what == "backpack":
+        return [_backpack(), *(_shoulder_strap(left, loose) for left in (1.0, -1.0))]
+    if what == "phone":
+        return [_phone()]
+    return []
+
+
+def _bag() -> Piece:
+    joints: Joints = {"pelvis": 0.8, "left_hip": 0.2}
+    keys = (
+        (0.735, 0.115, 0.030),
+        (0.742, 0.145, 0.042),
+        (0.800, 0.152, 0.048),
+        (0.900, 0.148, 0.042),
+        (0.955, 0.135, 0.028),
+        (0.962, 0.10, 0.018),
+    )
+    rings = [
+        upright_loft((-0.01, 0.225, z), deep, 1.0, wide, joints, 3.2) for z, deep, wide in keys
+    ]
+    return Piece("bag", tuple(rings), (14, 12, 6, 4), (6, 6, 5, 4))
+
+
+def _strap(loose: float) -> Piece:
+    """From the right shoulder over chest and back to the bag: a flat loop's front and back, as one
+    thin ring."""
+    rings = []
+    for share in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0):
+        z = 0.95 + 0.53 * share
+        y = 0.195 - 0.285 * share
+        front = (0.115, 0.110, 0.114, 0.134, 0.101, 0.045)[round(5 * share)]
+        joints: Joints = (
+            {"pelvis": 1.0 - share, "spine3": share}
+            if 0.0 < share < 1.0
+            else ({"pelvis": 1.0} if share == 0.0 else {"spine3": 1.0})
+        )
+        rings.append(
+            Ring(
+                (-0.012, y, z),
+                (front + loose + 0.006, 0.0, 0.0),
+                (0.0, 0.016, 0.016),
+                joints,
+                0.78,
+                3.5,
+            )
+        )
+    return Piece("bag", tuple(rings), (16, 10, 0, 0), (10, 6, 0, 0))
+
+
+def _backpack() -> Piece:
+    joints: Joints = {"spine3": 0.7, "spine2": 0.3}
+    keys = (
+        (1.02, 0.05, 0.09),
+        (1.03, 0.08, 0.135),
+        (1.10, 0.095, 0.150),
+        (1.25, 0.090, 0.150),
+        (1.38, 0.072, 0.135),
+        (1.435, 0.040, 0.095),
+        (1.44, 0.02, 0.06),
+    )
+    rings = [
+        upright_loft((-0.175 + 0.012 * (z > 1.3), 0.0, z), deep, 1.0, wide, joints, 2.8)
+        for z, deep, wide in keys
+    ]
+    return Piece("bag", tuple(rings), (16, 12, 6, 4), (9, 7, 6, 5))
+
+
+def _shoulder_strap(left: float, loose: float) -> Piece:
+    keys = (
+        (1.10, 0.10, 0.104),
+        (1.25, 0.085, 0.121),
+        (1.37, 0.085, 0.093),
+        (1.450, 0.085, 0.050),
+        (1.487, 0.085, 0.030),
+        (1.497, 0.085, 0.01),
+    )
+    rings = [
+        Ring(
+            (-0.02, left * y, z),
+            (front + loose + 0.004, 0.0, 0.0),
+            (0.0, 0.021, 0.0),
+            {"spine3": 0.8, "spine2": 0.2},
+            0.9,
+            3.5,
+        )
+        for z, y, front in keys
+    ]
+    return Piece("bag", tuple(rings), (12, 8, 0, 0), (7, 5, 0, 0))
+
+
+def _phone() -> Piece:
+    """Lies in the palm of the left hand, along the fingers."""
+    rings = [
+        on_arm(
+            0.585 + 0.145 * share,
+            0.0,
+            -0.020,
+            0.036 * size,
+            0.006 * size,
+            {"left_hand": 1.0},
+            1.0,
+            3.5,
+        )
+        for share, size in ((0.0, 0.9), (0.03, 1.0), (0.97, 1.0), (1.0, 0.9))
+    ]
+    return Piece("dark", tuple(rings), (10, 8, 6, 0), (4, 4, 3, 0))

@@ -1,0 +1,135 @@
+"""A surface as glTF (y up, metres): what stands in its squares, a node for each kind and colour."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+import trimesh
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
+
+from cosim.core.telling import Tell, untold
+from cosim.spec.obstacle import Obstacle
+from cosim.spec.scenario import Barrier
+from physics.ground.mesh import Mesh, join
+from physics.ground.tiles import Key
+from physics.street import props
+from physics.street.buildings import FACADES, WINDOW_COLOUR, facade_meshes
+from physics.street.furniture import KINDS, Prop, parts_of
+from physics.street.mesh_surface import Z_UP
+from physics.street.surface import Patch, Surface, stood
+from physics.textures.ground import ground_layers
+from physics.textures.layers import Colour, encoded, linear
+
+_GROUPS: Final = ("surfaces", "buildings", "trees", "furniture", "signals", "barriers", "obstacles")
+"""The nodes right below the root; each holds nodes named by what they show, such as
+"sidewalk:brick:2"."""
+_LAYERS_PX: Final = 256
+
+
+def as_gltf(
+    surface: Surface,
+    keys: Sequence[Key],
+    barriers: Sequence[Barrier] = (),
+    tell: Tell = untold,
+    obstacles: Sequence[Obstacle] = (),
+) -> bytes:
+    """A .glb file of the squares of a surface and of the fences and obstacles on it."""
+    parts = _Parts()
+    for n, key in enumerate(keys):
+        tell("building tiles", n / len(keys))
+        parts.add_square(surface, key)
+    for barrier in barriers:
+        size = (barrier.thickness_m, barrier.length_m)
+        at = (
+            barrier.x_m,
+            barrier.y_m,
+            surface.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, size),
+        )
+        red, white = props.barrier_meshes(barrier)
+        parts.add("barriers", "barrier:red", red.moved(at, barrier.heading_rad), props.PROP_RED)
+        parts.add(
+            "barriers", "barrier:white", white.moved(at, barrier.heading_rad), props.PROP_WHITE
+        )
+    for prop, z in stood(obstacles, surface):
+        parts.add_prop("obstacles", prop, z)
+    tell("writing")
+    written: bytes = parts.scene().export(file_type="glb", include_normals=True)
+    return written
+
+
+class _Parts:
+    """Meshes collected by group, name and colour."""
+
+    def __init__(self) -> None:
+        self._meshes: dict[tuple[str, str, Colour], list[Mesh]] = {}
+        layers = ground_layers(_LAYERS_PX)
+        self._means: dict[str, Colour] = dict(
+            zip(layers.names, map(tuple, encoded(layers.mean).tolist()), strict=True)
+        )
+
+    def add(self, group: str, name: str, mesh: Mesh, colour: Colour) -> None:
+        if len(mesh):
+            self._meshes.setdefault((group, name, colour), []).append(mesh)
+
+    def add_square(self, surface: Surface, key: Key) -> None:
+        chunk, finish = surface.chunk(key), surface.finish(key)
+        for patch in (*chunk.ground, *finish.laid, *finish.painted):
+            self.add("surfaces", patch.name, patch.mesh, self._shown(patch))
+        for facade, mesh in facade_meshes(chunk.buildings).items():
+            name, colour = ("windows", WINDOW_COLOUR) if facade < 0 else ("walls", FACADES[facade])
+            self.add("buildings", f"building:{name}", mesh, colour)
+        for prop, z in chunk.props:
+            self.add_prop("trees" if prop.kind == "tree" else "furniture", prop, z)
+        posts = surface.posts(key)
+        for post, z in zip(
+            posts, surface.heights([(post.x_m, post.y_m) for post in posts]).tolist(), strict=True
+        ):
+            self.add(
+                "signals",
+                "signal:post",
+                props.post_mesh().moved((post.x_m, post.y_m, z), post.heading_rad),
+                props.POLE,
+            )
+
+    def add_prop(self, group: str, prop: Prop, z_m: float) -> None:
+        name = prop.kind if group == "obstacles" else f"prop:{prop.kind}"
+        for part in parts_of(*prop.form):
+            mesh = part.mesh.moved((prop.x_m, prop.y_m, z_m), prop.drawn_rad)
+            self.add(group, name, mesh, part.colour or KINDS[prop.kind].paints[prop.paint])
+
+    def _shown(self, patch: Patch) -> Colour:
+        """The mean colour of what cameras with textures show."""
+        return patch.colour if patch.tinted else self._means[patch.layer]
+
+    def scene(self) -> trimesh.Scene:
+        """One node for each kind and colour, below those of _GROUPS."""
+        scene = trimesh.Scene()
+        shades = {(group, name): 0 for group, name, _ in self._meshes}
+        for group in _GROUPS:
+            scene.graph.update(frame_from=scene.graph.base_frame, frame_to=group)
+        for (group, name, colour), meshes in self._meshes.items():
+            number = shades[group, name]
+            shades[group, name] += 1
+            node = f"{name}/{number}" if number else name
+            scene.add_geometry(
+                _shape(join(meshes), node, colour), node, node, parent_node_name=group
+            )
+        return scene
+
+
+def _shape(mesh: Mesh, name: str, colour: Colour) -> trimesh.Trimesh:
+    turn = Z_UP[:3, :3]  # transposed: from our axes to glTF's
+    factor = np.append(linear(colour), 1.0)
+    material = PBRMaterial(
+        name=name, baseColorFactor=factor, metallicFactor=0.0, roughnessFactor=1.0
+    )
+    return trimesh.Trimesh(
+        mesh.vertices @ turn,
+        mesh.triangles,
+        vertex_normals=mesh.normals @ turn,
+        visual=TextureVisuals(material=material),
+        process=False,
+    )

@@ -1,0 +1,205 @@
+"""A street map as a surface: tiles, buildings and props by key, heights by point; made when first
+needed on a machine, and kept for all its processes."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from typing import Final
+
+import numpy as np
+import shapely
+from numpy.typing import ArrayLike
+
+from cosim.core.baked import Arrays
+from cosim.core.errors import UsageError
+from cosim.core.geometry import Floats
+from cosim.place.open_ground import GROUND_LOOKS
+from cosim.place.street_map import LandKind, StreetMap
+from physics.ground.materials import PAVINGS, PLAIN_FRICTION, SEEN_AS, Paving, friction
+from physics.ground.mesh import Mesh
+from physics.ground.tiles import Key, Tile, build_tile, cells_of, keys_in, surface
+from physics.street.building_style import style_of
+from physics.street.buildings import Building, Frontage, on_land
+from physics.street.covers import covers_in
+from physics.street.frontage import frontage_in
+from physics.street.furniture import Prop
+from physics.street.mapped import MappedThings
+from physics.street.paint import paint_in
+from physics.street.placement import Placement
+from physics.street.props import SignalPost, posts_in
+from physics.street.surface import Chunk, Finish, Patch, Surface
+from physics.street.tile_cache import (
+    TileThings,
+    covers_as_arrays,
+    covers_of_arrays,
+    pieces_of,
+    things_as_arrays,
+    things_of_arrays,
+    tile_as_arrays,
+    tile_of_arrays,
+)
+from physics.textures.ground import layer_of
+
+_KEPT: Final = 100
+
+
+class StreetSurface(Surface):
+    """Tiles, buildings and props of a street map under a seed; the least recently used tiles are
+    forgotten.
+
+    roughness: of the ground, from 0 (flat) to 1.
+    """
+
+    def __init__(self, street_map: StreetMap, seed: int, roughness: float = 0.0) -> None:
+        if not 0.0 <= roughness <= 1.0:
+            raise UsageError(f"roughness is {roughness:g}, but it lies between 0 (flat) and 1")
+        self.street_map = street_map
+        self.seed = seed
+        self.roughness = roughness
+        self.level = street_map.terrain is None
+        mapped = MappedThings(street_map)
+        self._frontage = Frontage(street_map, seed, mapped)
+        self._paving = Paving(street_map, seed)
+        self._placement = Placement(street_map, seed, self._frontage, mapped)
+        self._pieces = pieces_of(street_map, seed, roughness)
+        self._tiles: OrderedDict[Key, Tile] = OrderedDict()
+        self._things: dict[Key, TileThings] = {}
+
+    def chunk(self, key: Key) -> Chunk:
+        ground = [self._patch(name, mesh) for name, mesh in self.tile(key).parts.items()]
+        return Chunk(tuple(ground), self.buildings(key), self.props(key))
+
+    def _patch(self, name: str, mesh: Mesh) -> Patch:
+        label, colour = surface(name)
+        shown, colour = (
+            (name, colour) if self.street_map.planned else SEEN_AS.get(name, (name, colour))
+        )
+        return Patch(
+            name, mesh, friction(name), label, colour, layer_of(shown, self.seed), name in PAVINGS
+        )
+
+    def covers(self, key: Key) -> tuple[Patch, ...]:
+        if self.street_map.planned:
+            return ()
+        held = self.kept(
+            "covers",
+            key,
+            lambda: covers_as_arrays(covers_in(self.street_map, self.tile(key), rims=False)),
+        )
+        return self._looking(covers_of_arrays(held))
+
+    def _looking(self, covers: Mapping[LandKind, Mesh]) -> tuple[Patch, ...]:
+        laid = []
+        for kind, mesh in covers.items():
+            name = f"ground:{kind}"
+            colour = GROUND_LOOKS[kind].seen
+            laid.append(
+                Patch(name, mesh, PLAIN_FRICTION, "ground", colour, layer_of(name, self.seed))
+            )
+        return tuple(laid)
+
+    def posts(self, key: Key) -> list[SignalPost]:
+        return posts_in(self.street_map, key)
+
+    def finish(self, key: Key) -> Finish:
+        tile = self.tile(key)
+        painted = []
+        laid = [*self._looking(covers_in(self.street_map, tile, rims=True))]
+        for mesh, (layer, colour) in frontage_in(self.street_map, tile, self.seed):
+            tint = colour or (1.0, 1.0, 1.0)
+            laid.append(
+                Patch(
+                    f"ground:{layer}",
+                    mesh,
+                    PLAIN_FRICTION,
+                    "ground",
+                    tint,
+                    layer,
+                    colour is not None,
+                )
+            )
+        for layer, mesh in paint_in(self.street_map, tile).items():
+            label = "road" if layer == "paint" else "sidewalk"
+            painted.append(
+                Patch(
+                    f"{label}:{layer}", mesh, PLAIN_FRICTION, label, (1.0, 1.0, 1.0), layer, False
+                )
+            )
+        styles = [style_of(building, self.street_map) for building in self.buildings(key)]
+        return Finish(tuple(laid), tuple(painted), tuple(styles))
+
+    def tile(self, key: Key) -> Tile:
+        if key not in self._tiles:
+            held = self.kept("ground", key, lambda: tile_as_arrays(self._built(key)))
+            self._tiles[key] = tile_of_arrays(held, key, self.street_map.terrain)
+            if len(self._tiles) > _KEPT:
+                self._tiles.popitem(last=False)
+        self._tiles.move_to_end(key)
+        return self._tiles[key]
+
+    def kept(self, kind: str, key: Key, make: Callable[[], Arrays]) -> Arrays:
+        return self._pieces.get(f"{kind}_{key[0]}_{key[1]}", make)
+
+    def buildings(self, key: Key) -> tuple[Building, ...]:
+        """Buildings whose centre lies in the tile, on their land."""
+        return self._standing_in(key).buildings
+
+    def props(self, key: Key) -> tuple[tuple[Prop, float], ...]:
+        """Props whose middle lies in the tile, each with the height of its foot in metres."""
+        props = self._standing_in(key).props
+        heights = self.tile(key).height([(prop.x_m, prop.y_m) for prop in props])
+        if props and not self.level:
+            sizes = np.array([prop.size_m[:2] for prop in props])
+            heights = heights - self.fall(
+                [(p.x_m, p.y_m) for p in props], [p.heading_rad for p in props], sizes
+            )
+        return tuple(zip(props, heights.tolist(), strict=True))
+
+    def land(self, xy: ArrayLike) -> Floats:
+        terrain = self.street_map.terrain
+        return (
+            np.zeros(len(np.asarray(xy).reshape(-1, 2))) if terrain is None else terrain.height(xy)
+        )
+
+    def standing(self, area: shapely.Geometry) -> list[Prop]:
+        """Props in the tiles that an area touches."""
+        return [prop for key in keys_in(area) for prop in self._standing_in(key).props]
+
+    def _standing_in(self, key: Key) -> TileThings:
+        if key not in self._things:
+            held = self.kept("things", key, lambda: things_as_arrays(self._placed(key)))
+            self._things[key] = things_of_arrays(held)
+        return self._things[key]
+
+    def _placed(self, key: Key) -> TileThings:
+        buildings = self._frontage.in_tile(key)
+        terrain = self.street_map.terrain
+        on_their_land = (
+            buildings if terrain is None else tuple(on_land(b, terrain) for b in buildings)
+        )
+        return TileThings(on_their_land, self._placement.in_tile(key))
+
+    def _built(self, key: Key) -> Tile:
+        roots = self._trees(key) if self.roughness > 0.0 else []
+        return build_tile(self.street_map, key, self._paving, self.roughness, self.seed, roots)
+
+    def _trees(self, key: Key) -> list[tuple[float, float]]:
+        """Where trees stand in a tile and around it."""
+        around = [(key[0] + i, key[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+        props = [
+            prop for near in around for prop in self._standing_in(near).props if prop.kind == "tree"
+        ]
+        return [(prop.x_m, prop.y_m) for prop in props]
+
+    def heights(self, xy: ArrayLike) -> Floats:
+        """Height of the ground at (N, 2) points, (N,) metres."""
+        xy = np.asarray(xy, dtype=float).reshape(-1, 2)
+        cells = cells_of(xy)
+        if len(xy) and (cells == cells[0]).all():
+            return self.tile((int(cells[0, 0]), int(cells[0, 1]))).height(xy)
+        height = np.zeros(len(xy))
+        for i, j in dict.fromkeys(map(tuple, cells.tolist())):
+            here = (cells[:, 0] == i) & (cells[:, 1] == j)
+            height[here] = self.tile((i, j)).height(xy[here])
+        return height

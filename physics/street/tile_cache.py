@@ -1,0 +1,148 @@
+"""A tile and what stands in it as arrays, to be kept (`cosim.core.pieces`): what is made again of
+them is the same to the bit."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import msgspec
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+import cosim
+import physics
+from cosim.core.baked import Arrays, sources_hash
+from cosim.core.pieces import Pieces
+from cosim.place.street_map import LandKind, StreetMap
+from cosim.place.terrain import Terrain
+from physics.ground.mesh import EMPTY, Mesh
+from physics.ground.relief import Relief
+from physics.ground.tiles import Key, Tile
+from physics.street.buildings import Building
+from physics.street.furniture import Prop
+
+_ROOMS: Final = (
+    *(Path(cosim.__file__).parent / room for room in ("core", "place")),
+    *(
+        Path(physics.__file__).parent / room
+        for room in ("ground", "street", "textures", "cameras/gl")
+    ),
+)
+_MADE_BY: Final = f"{sources_hash(*_ROOMS)} {shapely.geos_version_string}"
+_Name = TypeVar("_Name", bound=str)
+
+
+class TileThings(msgspec.Struct, frozen=True, array_like=True):
+    """What stands in a tile: buildings on their land, and props."""
+
+    buildings: tuple[Building, ...]
+    props: tuple[Prop, ...]
+
+
+class _Ground(msgspec.Struct, array_like=True):
+    """What of a tile is no array. parts: names, vertices and triangles of its meshes; low,
+    crossings: WKB; relief: roughness and seed."""
+
+    parts: list[tuple[str, int, int]]
+    low: bytes
+    crossings: bytes
+    relief: tuple[float, int] | None
+
+
+def pieces_of(street_map: StreetMap, seed: int, roughness: float) -> Pieces:
+    """What is kept of the tiles of a place."""
+    told = f"{street_map.made_of} {seed} {roughness!r} {_MADE_BY}"
+    return Pieces(
+        "tiles", hashlib.sha256(told.encode()).hexdigest()[:32] if street_map.made_of else ""
+    )
+
+
+def tile_as_arrays(tile: Tile) -> Arrays:
+    """For `tile_of_arrays`."""
+    relief = tile.relief
+    words = _Ground(
+        _rows(tile.parts),
+        shapely.to_wkb(tile.low),
+        shapely.to_wkb(tile.crossings),
+        None if relief is None else (relief.roughness, relief.seed),
+    )
+    found = {"words": _as_array(words), **_joined_parts(tile.parts)}
+    return found if relief is None else found | {"roots": relief.roots, "holes": relief.holes}
+
+
+def tile_of_arrays(held: Arrays, key: Key, terrain: Terrain | None) -> Tile:
+    """The tile again."""
+    words = msgspec.msgpack.decode(held["words"].data, type=_Ground)
+    parts = _parts_of(words.parts, held)
+    low, crossings = shapely.from_wkb([words.low, words.crossings])
+    shapely.prepare([low, crossings])
+    relief = None
+    if words.relief is not None:
+        roughness, seed = words.relief
+        relief = Relief(roughness, seed, held["roots"], held["holes"])
+    return Tile(key, parts, low, crossings, relief, terrain)
+
+
+def covers_as_arrays(covers: Mapping[LandKind, Mesh]) -> Arrays:
+    """For `covers_of_arrays`."""
+    words = np.frombuffer(msgspec.msgpack.encode(_rows(covers)), dtype=np.uint8)
+    return {"words": words, **_joined_parts(covers)}
+
+
+def covers_of_arrays(held: Arrays) -> dict[LandKind, Mesh]:
+    """The covers again."""
+    return _parts_of(
+        msgspec.msgpack.decode(held["words"].data, type=list[tuple[LandKind, int, int]]), held
+    )
+
+
+def _rows(parts: Mapping[_Name, Mesh]) -> list[tuple[_Name, int, int]]:
+    """Names of meshes, with how many vertices and triangles they have."""
+    return [(name, len(mesh.vertices), len(mesh)) for name, mesh in parts.items()]
+
+
+def _joined_parts(parts: Mapping[_Name, Mesh]) -> dict[str, NDArray[Any]]:
+    meshes = [*parts.values(), EMPTY]
+    return {
+        "vertices": np.concatenate([mesh.vertices for mesh in meshes]),
+        "normals": np.concatenate([mesh.normals for mesh in meshes]),
+        "triangles": np.concatenate([mesh.triangles for mesh in meshes]),
+    }
+
+
+def _parts_of(rows: Sequence[tuple[_Name, int, int]], held: Arrays) -> dict[_Name, Mesh]:
+    parts = {}
+    corner = 0
+    triangle = 0
+    for name, corners, triangles in rows:
+        here = slice(corner, corner + corners)
+        faces = held["triangles"][triangle : triangle + triangles]
+        parts[name] = Mesh(held["vertices"][here], held["normals"][here], faces)
+        corner, triangle = corner + corners, triangle + triangles
+    return parts
+
+
+def things_as_arrays(things: TileThings) -> Arrays:
+    """For `things_of_arrays`."""
+    return {"words": _as_array(things)}
+
+
+def things_of_arrays(held: Arrays) -> TileThings:
+    """The things again."""
+    return msgspec.msgpack.decode(held["words"].data, type=TileThings, dec_hook=_geometry)
+
+
+def _as_array(words: msgspec.Struct) -> NDArray[np.uint8]:
+    return np.frombuffer(msgspec.msgpack.encode(words, enc_hook=_plain), dtype=np.uint8)
+
+
+def _plain(value: Any) -> Any:
+    return shapely.to_wkb(value) if isinstance(value, shapely.Geometry) else value.item()
+
+
+def _geometry(_: type, wkb: Any) -> Any:
+    return shapely.from_wkb(wkb)

@@ -1,0 +1,275 @@
+"""Ground floors: shops with and without awnings, cafes, doors, lobbies, garages, plain walls."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Final
+
+import numpy as np
+
+from physics.textures.facade_canvas import BAY_M, STOREY_M, FacadeCanvas
+from physics.textures.glazing import WHITE_FRAME, opening, pane, sill, surround
+from physics.textures.layers import Colour, linear
+from physics.textures.noise import step
+
+_FASCIAS: Final[tuple[Colour, ...]] = (
+    (0.20, 0.28, 0.27),
+    (0.34, 0.20, 0.19),
+    (0.22, 0.26, 0.35),
+    (0.30, 0.29, 0.27),
+    (0.72, 0.68, 0.60),
+    (0.42, 0.34, 0.24),
+)
+_CLOTHS: Final[tuple[Colour, ...]] = (
+    (0.47, 0.24, 0.21),
+    (0.26, 0.37, 0.32),
+    (0.28, 0.35, 0.45),
+    (0.58, 0.47, 0.30),
+)
+_DOORS: Final[tuple[Colour, ...]] = (
+    (0.25, 0.32, 0.28),
+    (0.37, 0.24, 0.17),
+    (0.20, 0.23, 0.30),
+    (0.42, 0.19, 0.17),
+    (0.24, 0.24, 0.25),
+    (0.50, 0.40, 0.28),
+)
+_GOODS: Final[tuple[Colour, ...]] = (
+    (0.72, 0.68, 0.60),
+    (0.55, 0.42, 0.32),
+    (0.42, 0.47, 0.50),
+    (0.60, 0.36, 0.30),
+    (0.40, 0.46, 0.38),
+    (0.66, 0.58, 0.42),
+    (0.30, 0.33, 0.40),
+    (0.78, 0.76, 0.72),
+)
+_PLINTH_M: Final = 0.42
+
+
+def _pick(canvas: FacadeCanvas, colours: tuple[Colour, ...]) -> Colour:
+    return colours[int(canvas.rng.integers(len(colours)))]
+
+
+def _scaled(colour: Colour, by: float) -> Colour:
+    return tuple(min(1.0, by * c) for c in colour)  # type: ignore[return-value]
+
+
+def _plinth(canvas: FacadeCanvas) -> None:
+    """The foot of the wall: the wall itself, darker, with a ledge; dirt splashed up from the
+    ground."""
+    canvas.shade(0.0, BAY_M, 0.0, _PLINTH_M, 0.42)
+    canvas.box(0.0, BAY_M, _PLINTH_M - 0.03, _PLINTH_M, (0.60, 0.59, 0.56), 0.5)
+    canvas.shade(0.0, BAY_M, 0.0, 0.12, 0.35)
+
+
+def _display(canvas: FacadeCanvas, x0: float, x1: float, z0: float, z1: float) -> None:
+    """A shop window: a warm room, shelves and goods as soft blocks, the street mirrored on it."""
+    rng = canvas.rng
+    area, cover, across, up = canvas.local(x0, x1, z0, z1)
+    warm = linear((0.68, 0.62, 0.54))
+    depth = 0.35 + 0.65 * np.exp(-(((up - 0.85) / 0.3) ** 2)) * (0.9 + 0.1 * np.cos(9.0 * across))
+    colour = np.broadcast_to(0.55 * warm * depth[..., None], (*cover.shape, 3)).copy()
+    for shelf in (0.08, 0.38):
+        x = rng.uniform(0.02, 0.08)
+        while x < 0.95:
+            wide, high = rng.uniform(0.04, 0.13), rng.uniform(0.07, 0.24)
+            hue = np.asarray(_GOODS[int(rng.integers(len(_GOODS)))]) * rng.uniform(0.7, 1.1)
+            inside = step(x - 0.01, x, across) * (1.0 - step(x + wide, x + wide + 0.01, across))
+            inside = (
+                inside
+                * step(shelf - 0.01, shelf, up)
+                * (1.0 - step(shelf + high, shelf + high + 0.01, up))
+            )
+            colour += (0.8 * linear(hue) - colour) * inside[..., None]
+            x += wide + rng.uniform(0.01, 0.12)
+        board = (
+            step(shelf - 0.03, shelf - 0.025, up)
+            * (1.0 - step(shelf - 0.008, shelf, up))
+            * np.ones_like(across)
+        )
+        colour += (linear((0.34, 0.30, 0.26)) - colour) * board[..., None]
+    mirror = (
+        linear((0.62, 0.68, 0.74))
+        * step(0.35, 0.75, up + 0.12 * np.sin(5.0 * across + rng.uniform(0.0, 6.0)))[..., None]
+    )
+    colour += (mirror - colour) * np.float32(0.16)
+    canvas.fill(area, cover, colour)
+    canvas.gloss[area] = np.maximum(canvas.gloss[area], 0.8 * cover)
+    canvas.glow[area] = np.maximum(canvas.glow[area], cover * (0.6 + 0.4 * up))
+
+
+def _fascia(canvas: FacadeCanvas, colour: Colour, z0: float = 2.55, z1: float = 3.0) -> None:
+    """A sign board over the whole bay with an abstract mark: bars and a disc, no letters."""
+    canvas.box(0.0, BAY_M, z0, z1, colour)
+    canvas.box(0.0, BAY_M, z1 - 0.05, z1, _scaled(colour, 1.3))
+    canvas.shade(0.0, BAY_M, z0 - 0.12, z0, 0.4, 0.12)
+    if canvas.rng.random() < 0.75:
+        mark = (0.82, 0.79, 0.70) if sum(colour) < 1.5 else (0.26, 0.25, 0.24)
+        x, end = canvas.rng.uniform(0.7, 1.0), canvas.rng.uniform(2.0, 2.3)
+        middle = 0.5 * (z0 + z1)
+        while x < end:
+            wide = canvas.rng.uniform(0.05, 0.13)
+            tall = canvas.rng.choice([0.07, 0.07, 0.10])
+            canvas.box(x, x + wide, middle - 0.07, middle - 0.07 + 2 * tall * 0.9, mark, 0.85)
+            x += wide + canvas.rng.choice([0.035, 0.035, 0.12])
+
+
+def _shop(canvas: FacadeCanvas, door: bool = True) -> None:
+    colour = _FASCIAS[2 * canvas.number % len(_FASCIAS)]
+    canvas.box(0.0, BAY_M, 0.0, 3.0, _scaled(colour, 0.9))
+    right = 1.85 if door else BAY_M - 0.1
+    canvas.box(0.1, right, 0.08, 0.45, _scaled(colour, 1.12))
+    canvas.shade(0.1, right, 0.42, 0.45, 0.4)
+    _display(canvas, 0.1, right, 0.5, 2.45)
+    for x in np.linspace(0.1, right, 2 if not door else 1, endpoint=False)[1:]:
+        canvas.box(float(x) - 0.03, float(x) + 0.03, 0.5, 2.45, colour)
+    canvas.frame(0.1, right, 0.46, 2.49, 0.04, _scaled(colour, 1.25))
+    if door:
+        canvas.box(1.95, 2.9, 0.0, 2.45, _scaled(colour, 0.5))
+        canvas.frame(2.0, 2.85, 0.04, 2.4, 0.09, _scaled(colour, 1.2))
+        pane(canvas, 2.09, 2.76, 0.35, 2.31, dress=False)
+        canvas.box(2.12, 2.15, 1.0, 1.25, (0.70, 0.66, 0.52))
+    _fascia(canvas, colour)
+    canvas.shade(0.0, BAY_M, 0.0, 0.08, 0.4)
+
+
+def _awning(canvas: FacadeCanvas, z0: float, z1: float) -> None:
+    """Striped cloth with a straight valance, and its shade on what is below."""
+    cloth = _pick(canvas, _CLOTHS)
+    pale = (0.78, 0.76, 0.70)
+    canvas.shade(0.0, BAY_M, z0 - 0.85, z0, 0.55, 0.8)
+    area, cover, across, up = canvas.local(0.0, BAY_M, z0, z1)
+    stripe = (
+        step(-0.08, 0.08, np.sin(2.0 * np.pi * across * BAY_M / 0.5))
+        if canvas.rng.random() < 0.65
+        else 0.0 * across
+    )
+    tone = (0.72 + 0.30 * up) * np.where(up < 0.22, 0.82, 1.0)
+    colour = linear(cloth) + (linear(pale) - linear(cloth)) * stripe[..., None]
+    canvas.fill(area, cover, np.asarray(colour * tone[..., None], np.float32))
+    canvas.shade(0.0, BAY_M, z0 + 0.21 * (z1 - z0), z0 + 0.24 * (z1 - z0), 0.4)
+
+
+def _shop_window(canvas: FacadeCanvas) -> None:
+    _shop(canvas, door=False)
+
+
+def _shop_awning(canvas: FacadeCanvas) -> None:
+    _shop(canvas, door=False)
+    _awning(canvas, 1.98, 2.56)
+
+
+def _cafe(canvas: FacadeCanvas, door: bool = False) -> None:
+    frame = _FASCIAS[(2 * canvas.number + 1) % len(_FASCIAS)]
+    canvas.box(0.0, BAY_M, 0.0, 2.9, frame)
+    for k in range(3):
+        x0 = 0.08 + 0.96 * k
+        if door and k == 1:
+            canvas.box(x0, x0 + 0.88, 0.0, 2.15, _scaled(frame, 0.6))
+            canvas.frame(x0 + 0.04, x0 + 0.84, 0.02, 2.13, 0.09, _scaled(frame, 1.2))
+            pane(canvas, x0 + 0.13, x0 + 0.75, 0.35, 2.04, dress=False)
+            continue
+        canvas.box(x0, x0 + 0.88, 0.06, 0.55, _scaled(frame, 1.25))
+        canvas.shade(x0 + 0.08, x0 + 0.80, 0.14, 0.47, 0.25)
+        _display(canvas, x0, x0 + 0.88, 0.62, 2.15)
+        pane(canvas, x0, x0 + 0.88, 2.22, 2.6, dress=False)
+    canvas.shade(0.0, BAY_M, 2.45, 2.6, 0.4, 0.15)
+    _fascia(canvas, _scaled(frame, 0.85), 2.62, 3.0)
+
+
+def _cafe_door(canvas: FacadeCanvas) -> None:
+    _cafe(canvas, door=True)
+
+
+def _entrance(canvas: FacadeCanvas) -> None:
+    """The door of a house with flats: leaf, light above it, a step, bells."""
+    _plinth(canvas)
+    leaf = _pick(canvas, _DOORS)
+    x0 = 0.9
+    x1 = 2.1
+    surround(canvas, x0, x1, 0.0, 2.65, (0.70, 0.68, 0.63))
+    canvas.box(x0, x1, 0.0, 2.65, (0.16, 0.15, 0.15))
+    canvas.box(x0 + 0.05, x1 - 0.05, 0.1, 2.15, leaf)
+    for a, b in ((x0 + 0.15, 1.46), (1.54, x1 - 0.15)):
+        for low, high in ((0.25, 0.95), (1.1, 2.02)):
+            canvas.shade(a, b, low, high, 0.30)
+            canvas.box(a + 0.025, b - 0.025, low, high - 0.025, _scaled(leaf, 1.12))
+        if canvas.rng.random() < 0.5:
+            pane(canvas, a + 0.04, b - 0.04, 1.14, 1.98, dress=False)
+    canvas.box(1.49, 1.51, 0.1, 2.15, _scaled(leaf, 0.5))
+    canvas.box(1.55, 1.59, 1.0, 1.12, (0.72, 0.66, 0.46))
+    pane(canvas, x0 + 0.08, x1 - 0.08, 2.22, 2.6, dress=False)
+    canvas.shade(x0, x1, 2.4, 2.65, 0.5, 0.25)
+    canvas.box(x0 - 0.2, x1 + 0.2, 0.0, 0.1, (0.62, 0.61, 0.58))
+    canvas.box(2.36, 2.46, 1.25, 1.55, (0.60, 0.59, 0.56))
+    if canvas.rng.random() < 0.6:
+        opening(canvas, 0.12, 0.6, 1.3, 2.3, WHITE_FRAME)
+
+
+def _home(canvas: FacadeCanvas) -> None:
+    _plinth(canvas)
+    x0 = 0.85
+    x1 = 2.15
+    opening(canvas, x0, x1, 1.0, 2.5, WHITE_FRAME, (2, 1))
+    sill(canvas, x0, x1, 1.0)
+    if canvas.rng.random() < 0.25:
+        for x in np.arange(x0 + 0.1, x1, 0.13):
+            canvas.box(float(x) - 0.01, float(x) + 0.01, 1.02, 2.42, (0.14, 0.14, 0.15))
+        canvas.box(x0, x1, 1.7, 1.72, (0.14, 0.14, 0.15))
+
+
+def _garage(canvas: FacadeCanvas) -> None:
+    _plinth(canvas)
+    colour = _pick(
+        canvas, ((0.62, 0.62, 0.61), (0.40, 0.42, 0.44), (0.46, 0.38, 0.30), (0.70, 0.69, 0.65))
+    )
+    canvas.box(0.22, 2.78, 0.0, 2.5, (0.22, 0.22, 0.22))
+    area, cover, _, up = canvas.local(0.3, 2.7, 0.02, 2.4)
+    ribs = 0.82 + 0.18 * np.clip(8.0 * np.abs((up * 2.38 / 0.2 % 1.0) - 0.5) - 0.4, -1.0, 1.0)
+    canvas.fill(
+        area,
+        cover,
+        linear(colour) * np.broadcast_to(ribs, cover.shape)[..., None].astype(np.float32),
+    )
+    canvas.box(1.42, 1.58, 0.9, 0.95, (0.20, 0.20, 0.21))
+    canvas.shade(0.22, 2.78, 2.1, 2.5, 0.55, 0.4)
+
+
+def _lobby(canvas: FacadeCanvas) -> None:
+    """Glass from the floor up, in steel."""
+    canvas.box(0.0, BAY_M, 0.0, STOREY_M, (0.30, 0.31, 0.32))
+    for k in range(2):
+        pane(canvas, 1.5 * k + 0.04, 1.5 * k + 1.46, 0.12, 2.35, dress=False)
+        pane(canvas, 1.5 * k + 0.04, 1.5 * k + 1.46, 2.42, 3.05, dress=False)
+    if canvas.rng.random() < 0.5:
+        canvas.box(1.47, 1.53, 0.12, 2.35, (0.62, 0.63, 0.64))
+        for x in (1.38, 1.58):
+            canvas.box(x, x + 0.035, 0.8, 1.4, (0.70, 0.71, 0.72))
+    canvas.box(0.0, BAY_M, 3.05, STOREY_M, (0.42, 0.43, 0.44))
+
+
+def _blank(canvas: FacadeCanvas) -> None:
+    _plinth(canvas)
+    if canvas.rng.random() < 0.5:
+        canvas.box(2.2, 2.7, 0.5, 1.1, (0.55, 0.55, 0.54))
+        canvas.frame(2.2, 2.7, 0.5, 1.1, 0.025, (0.44, 0.44, 0.44))
+    if canvas.rng.random() < 0.5:
+        canvas.shade(0.34, 0.47, 0.0, STOREY_M, 0.3)
+        canvas.box(0.30, 0.40, 0.0, STOREY_M, (0.50, 0.51, 0.51))
+        canvas.box(0.32, 0.34, 0.0, STOREY_M, (0.66, 0.67, 0.67))
+
+
+FRONTS: Final[Mapping[str, Callable[[FacadeCanvas], None]]] = {
+    "shop": _shop,
+    "shop-window": _shop_window,
+    "shop-awning": _shop_awning,
+    "cafe": _cafe,
+    "cafe-door": _cafe_door,
+    "entrance": _entrance,
+    "home": _home,
+    "garage": _garage,
+    "lobby": _lobby,
+    "blank": _blank,
+}
+"""Styles of ground floors."""

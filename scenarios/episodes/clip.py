@@ -1,0 +1,134 @@
+"""Clips: the pictures of an episode as H.264, each encoded by itself; joined to one .mp4 without
+encoding them anew.
+
+The same pictures give the same bytes, also back: one thread, no date, no B-frames, so that a clip
+begins and ends with itself; colours are converted here, in whole numbers (BT.601, as players take
+it): the library rounds otherwise from time to time, as its buffers lie in memory; and the encoder
+takes none of the short cuts that some processors offer: it decides otherwise with them, and with
+those of AVX-512 it does so from one call to the next.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Iterator, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Final
+
+import av
+import cv2
+import numpy as np
+from av.container import OutputContainer
+from numpy.typing import NDArray
+
+from cosim.core.errors import RunError
+
+CODEC: Final = "h264"
+PIXELS: Final = "yuv420p"
+_OPTIONS: Final = {
+    "crf": "18",
+    "preset": "veryfast",
+    "bf": "0",
+    "g": "10",
+    "threads": "1",
+    "flags": "+bitexact",
+    "x264-params": "cpu-independent=1",
+}
+_MUXED: Final = {"fflags": "+bitexact"}
+
+
+class Clip:
+    """A clip in the making. fps: pictures a second."""
+
+    def __init__(self, size: tuple[int, int], fps: int) -> None:
+        self._bytes = io.BytesIO()
+        self._file: OutputContainer = av.open(self._bytes, "w", format="mp4", options=_MUXED)
+        self._stream = self._file.add_stream("libx264", rate=fps, options=_OPTIONS)
+        self._stream.width, self._stream.height = size
+        self._stream.pix_fmt = PIXELS
+        self._stream.codec_context.thread_count = 1
+
+    def add(self, rgb: NDArray[np.uint8]) -> None:
+        """The next picture, (H, W, 3)."""
+        frame = av.VideoFrame.from_ndarray(_planes_of(rgb), format=PIXELS)
+        self._file.mux(self._stream.encode(frame))
+
+    def finished(self) -> bytes:
+        """The .mp4 of all of them."""
+        self._file.mux(self._stream.encode(None))
+        self._file.close()
+        return self._bytes.getvalue()
+
+
+def join_clips(clips: Iterable[bytes], lengths: Sequence[int], path: Path, fps: int) -> None:
+    """Write clips one after another into one .mp4. lengths: how many pictures each has; picture k
+    is shown k / fps seconds after the beginning. Raises RunError for a clip that has another number
+    of them."""
+    with av.open(
+        str(path), "w", format="mp4", options={**_MUXED, "movflags": "+faststart"}
+    ) as joined:
+        stream = None
+        before = 0
+        for clip, length in zip(clips, lengths, strict=True):
+            with av.open(io.BytesIO(clip), "r") as one:
+                source = one.streams.video[0]
+                assert source.time_base is not None
+                if stream is None:
+                    stream = joined.add_stream_from_template(source)
+                    stream.time_base = source.time_base
+                step = round(1 / (fps * source.time_base))
+                packets = [packet for packet in one.demux(source) if packet.dts is not None]
+                if [packet.pts for packet in packets] != [k * step for k in range(length)]:
+                    raise RunError(
+                        f"{path}: a clip of {len(packets)} pictures, {length} are told: "
+                        f"collect it anew"
+                    )
+                for number, packet in enumerate(packets, before):
+                    packet.pts = packet.dts = number * step
+                    packet.stream = stream
+                    joined.mux(packet)
+            before += length
+
+
+def pictures_of(path: Path) -> Iterator[tuple[Fraction, NDArray[np.uint8]]]:
+    """The pictures of an .mp4 in their order: the time that each is shown at, seconds, and (H, W,
+    3) RGB."""
+    with av.open(str(path), "r") as film:
+        stream = film.streams.video[0]
+        stream.codec_context.thread_count = 1
+        for frame in film.decode(stream):
+            assert frame.pts is not None
+            assert frame.time_base is not None
+            yield (
+                frame.pts * frame.time_base,
+                _rgb_of(frame.to_ndarray().astype(np.uint8, copy=False)),
+            )
+
+
+_TO_YUV: Final = np.array([[16829, 33039, 6416], [-9714, -19070, 28784], [28784, -24103, -4681]]).T
+_TO_RGB: Final = np.array([[76309, 0, 104597], [76309, -25675, -53279], [76309, 132201, 0]]).T
+"""In units of 1 / 65536: a row for each of what is given."""
+_BLACK: Final = np.array([16, 128, 128])
+_HALF: Final = 1 << 15
+
+
+def _planes_of(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(H, W, 3) as (3 H / 2, W): brightness, and below it both colours, of half the size."""
+    high, wide, _ = rgb.shape
+    small = cv2.resize(rgb, (wide // 2, high // 2), interpolation=cv2.INTER_AREA)
+    bright = ((rgb @ _TO_YUV[:, 0] + _HALF) >> 16) + _BLACK[0]
+    colours = ((small @ _TO_YUV[:, 1:] + _HALF) >> 16) + _BLACK[1:]
+    planes = [bright.ravel(), colours[..., 0].ravel(), colours[..., 1].ravel()]
+    return np.concatenate(planes).astype(np.uint8).reshape(high * 3 // 2, wide)
+
+
+def _rgb_of(planes: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(H, W, 3) of what `_planes_of` gives."""
+    high = planes.shape[0] * 2 // 3
+    wide = planes.shape[1]
+    colours = planes[high:].reshape(2, high // 2, wide // 2)
+    large = [cv2.resize(one, (wide, high), interpolation=cv2.INTER_LINEAR) for one in colours]
+    yuv = np.stack([planes[:high], *large], axis=-1) - _BLACK
+    rgb: NDArray[np.uint8] = np.clip((yuv @ _TO_RGB + _HALF) >> 16, 0, 255).astype(np.uint8)
+    return rgb

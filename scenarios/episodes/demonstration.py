@@ -1,0 +1,136 @@
+"""Demonstration: what is kept of one episode, row by row, and the waypoints that are taken from its
+trajectory."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+from dataclasses import dataclass, fields
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.errors import MachineError, RunError
+from cosim.core.geometry import Floats
+from cosim.core.npz import arrays_in
+
+_GLIMPSE_PX: Final = (8, 6)
+_STRAIGHT_RADPS: Final = 1e-6
+
+
+def check_parquet() -> None:
+    """Check that pyarrow, which writes and reads data sets, is installed. Raises MachineError."""
+    if importlib.util.find_spec("pyarrow") is None:
+        raise MachineError(
+            "a data set needs pyarrow, of the extra [collect]: .venv/bin/pip install 'pyarrow<24'"
+        )
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """One episode, n rows, one for each picture.
+
+    state, goal, command (n, 2), waypoints (n, K, 2), driven (n,), disturbed (n,): as in
+    `cosim.core.packed_demos`; told (n,): the instruction, "" where the goal is none. glimpses (n,
+    6, 8, 3) uint8: the pictures as they were drawn, area by area, to hold those that are read back
+    against. colours (3, 256) int64: how often each value of red, green and blue stands in them.
+    clip: the bytes of an .mp4 with n pictures.
+    """
+
+    state: NDArray[np.float32]
+    goal: NDArray[np.float32]
+    command: NDArray[np.float32]
+    waypoints: NDArray[np.float32]
+    driven: NDArray[np.int32]
+    disturbed: NDArray[np.bool_]
+    told: NDArray[np.str_]
+    glimpses: NDArray[np.uint8]
+    colours: NDArray[np.int64]
+    clip: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.state)
+
+    def encoded(self) -> bytes:
+        """The .npz that is kept; equal demonstrations have equal bytes."""
+        file = io.BytesIO()
+        np.savez(
+            file, allow_pickle=False, **{one.name: getattr(self, one.name) for one in fields(self)}
+        )
+        return file.getvalue()
+
+    @classmethod
+    def decoded(cls, data: bytes, where: object) -> Demonstration:
+        """One that was encoded. where: what an error names. Raises RunError."""
+        try:
+            names = [one.name for one in fields(cls)]
+            held = arrays_in(io.BytesIO(data), names)
+            return cls(**{name: held[name] for name in names})
+        except ValueError as error:
+            raise RunError(
+                f"{where}: no demonstration: {error}: collect it anew, in another --out"
+            ) from error
+
+
+def glimpse(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(6, 8, 3) means of the areas of a picture (H, W, 3)."""
+    small: NDArray[np.uint8] = cv2.resize(rgb, _GLIMPSE_PX, interpolation=cv2.INTER_AREA)
+    return small
+
+
+def waypoints_ahead(
+    pose: Floats,
+    ticks: NDArray[np.int64],
+    command: Floats,
+    disturbed: NDArray[np.bool_],
+    count: int,
+    every: int,
+    tick_s: float,
+) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+    """Where the robot is 1 to `count` times `every` ticks after each of n pictures, (n, count, 2)
+    metres in its frame there, x ahead and y left; and how many of them it was driven to by the
+    expert alone, (n,).
+
+    pose (T + 1, 3): x m, y m, heading at the start of each tick and at the end; ticks (n,) of the
+    pictures, in their order; command (n, 2) the expert's, disturbed (n,): another one was driven
+    after that picture. From the first tick on at which that is so, or at which nothing more is
+    known, the robot is taken to go on by the expert's last command.
+    """
+    until = np.full(len(ticks), len(pose) - 1)
+    last = len(pose) - 1
+    for row in range(len(ticks) - 1, -1, -1):
+        last = int(ticks[row]) if disturbed[row] else last
+        until[row] = last
+    ahead = ticks[:, None] + every * np.arange(1, count + 1)
+    driven = (ahead <= until[:, None]).sum(axis=1)
+    known = pose[np.minimum(ahead, until[:, None])]
+    after_s = np.maximum(ahead - until[:, None], 0) * tick_s
+    v_mps, w_radps = command[np.searchsorted(ticks, until, side="right") - 1].T[:, :, None]
+    onward = arc_ahead(v_mps, w_radps, after_s)
+    world = known[..., :2] + _turned(onward, known[..., 2])
+    here = pose[ticks]
+    local = _turned(world - here[:, None, :2], -here[:, None, 2])
+    return local.astype(np.float32), driven.astype(np.int32)
+
+
+def arc_ahead(v_mps: Floats, w_radps: Floats, time_s: Floats) -> Floats:
+    """(..., 2) metres, x ahead and y left: where one is who has driven by a command for so long.
+
+    >>> arc_ahead(np.array(1.0), np.array(0.0), np.array(2.0)).tolist()
+    [2.0, 0.0]
+    """
+    turn = w_radps * time_s
+    straight = np.abs(w_radps) < _STRAIGHT_RADPS
+    radius_m = v_mps / np.where(straight, 1.0, w_radps)
+    x_m = np.where(straight, v_mps * time_s, radius_m * np.sin(turn))
+    y_m = np.where(straight, 0.0, radius_m * (1.0 - np.cos(turn)))
+    return np.stack([x_m, y_m], axis=-1)
+
+
+def _turned(offset: Floats, angle_rad: Floats) -> Floats:
+    """(..., 2) turned counter-clockwise by angles (...)."""
+    cos, sin = np.cos(angle_rad), np.sin(angle_rad)
+    x, y = offset[..., 0], offset[..., 1]
+    return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)

@@ -1,0 +1,217 @@
+"""Demonstrator: an expert that drives, at times disturbed, while what it sees and answers is
+kept."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.clock import Clock
+from cosim.core.errors import UsageError
+from cosim.core.state import Command
+from cosim.episode.control import clipped
+from cosim.episode.interfaces import Observation
+from cosim.episode.manifest_checks import with_goal
+from cosim.episode.policy_caller import Driver
+from cosim.policies.load import load_policy
+from cosim.results.log import Log
+from cosim.results.record import Record
+from cosim.spec.demo_options import EYE, Collecting, check_learner, demonstrating
+from cosim.spec.goal import GoalProtocol, Instruction, PointGoal
+from cosim.spec.robot import Robot
+from cosim.spec.scenario import Scenario
+from scenarios.episodes.clip import Clip
+from scenarios.episodes.demonstration import Demonstration, glimpse, waypoints_ahead
+
+_BURST_S: Final = (0.4, 1.0)
+"""So long another command is driven, least and most."""
+_LEARNER_S: Final = (1.0, 5.0)
+"""So long a learner drives: until it comes where it errs, and stays there for a while."""
+_SLOWER: Final = (0.5, 1.2)
+"""By this the expert's speed is multiplied, and to its turning is added at most so much of the
+robot's fastest."""
+_TURN: Final = 0.8
+
+
+class Demonstrator(Driver):
+    """The expert as it is asked in an episode. goal: of the run; see `EpisodeOptions`. learner:
+    where one drives at times (`learner_of`); it is asked at every picture, so that it knows those
+    before (Ross et al., DAgger, 2011). Raises UsageError."""
+
+    def __init__(
+        self,
+        expert: Driver,
+        collecting: Collecting,
+        goal: GoalProtocol | None = None,
+        learner: Driver | None = None,
+    ) -> None:
+        manifest = with_goal(demonstrating(expert.manifest, collecting, goal), None)
+        super().__init__(expert, manifest, expert.source_hash)
+        self.runs = expert.runs
+        self.at_once = expert.at_once
+        self._expert = expert
+        self._collecting = collecting
+        self._sees = expert.manifest.camera is not None
+        self._rows = _Rows(manifest.rate_hz)
+        self._bursts = _Bursts(0, collecting)
+        self.learner = learner
+        if learner is not None:
+            check_learner(learner.manifest, collecting, expert.manifest, manifest.goal)
+
+    @property
+    def clock(self) -> dict[str, float]:
+        return self._expert.clock
+
+    def close(self) -> None:
+        self._expert.close()
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        self._rows, self._bursts = _Rows(self.manifest.rate_hz), _Bursts(seed, self._collecting)
+        self._expert.reset(episode_id, seed)
+        if self.learner is not None:
+            self.learner.reset(episode_id, seed)
+
+    def act(self, observation: Observation) -> Command:
+        """What is driven: the expert's command, or in a burst another one, or the learner's."""
+        rgb = observation.pictures[EYE].rgb if self._sees else observation.rgb
+        assert rgb is not None
+        answer = self._expert.act(observation)
+        learned = None if self.learner is None else self.learner.act(observation)
+        driven = self._bursts.driven(answer, observation.robot, learned)
+        self._rows.add(observation, rgb, answer, driven is not answer)
+        return driven
+
+    def ended(self) -> None:
+        self._expert.ended()
+        if self.learner is not None:
+            self.learner.ended()
+
+    def kept(self, scenario: Scenario, record: Record, log: Log | None) -> bytes:
+        """The demonstration, encoded; nothing where there is none: the episode crashed, or was not
+        solved."""
+        if log is None or not (self._collecting.unsolved or solved(record, log)):
+            return b""
+        return self._rows.demonstration(scenario, log, self._collecting).encoded()
+
+
+def solved(record: Record, log: Log) -> bool:
+    """Whether the expert has done what the episode asks for, and was never put elsewhere."""
+    return (
+        record.status == "done"
+        and record.measures["success"] == 1.0
+        and bool(np.isnan(log.reset_s_m).all())
+    )
+
+
+def learner_of(collecting: Collecting) -> Driver | None:
+    """The learner of what is collected as it is now. Raises UsageError."""
+    try:
+        return load_policy(collecting.learner) if collecting.learner else None
+    except UsageError as error:
+        raise UsageError(f"learner: {error}") from error
+
+
+class _Bursts:
+    """When another command is driven, and which: drawn from the episode's seed alone."""
+
+    def __init__(self, seed: int, collecting: Collecting) -> None:
+        self._draws = np.random.default_rng([seed, 0xDA66E5])
+        self._period_s = 1.0 / collecting.rate_hz
+        self._share = collecting.noise
+        self._lasts_s = _LEARNER_S if collecting.learner else _BURST_S
+        self._left = self._calm = 0
+        if float(self._draws.random()) >= self._share:  # else it begins with a burst
+            self._calm = self._steps_of_calm()
+        self._slower = self._turn = 0.0
+
+    def driven(self, answer: Command, robot: Robot, learned: Command | None = None) -> Command:
+        """What is driven where the expert answers this, and the learner, if there is one, that; the
+        answer itself outside of bursts."""
+        if not self._share:
+            return answer
+        if not self._left and self._calm:
+            self._calm -= 1
+            return answer
+        if not self._left:
+            self._left = max(1, round(float(self._draws.uniform(*self._lasts_s)) / self._period_s))
+            self._calm = self._steps_of_calm()
+            self._slower = float(self._draws.uniform(*_SLOWER))
+            self._turn = float(self._draws.uniform(-_TURN, _TURN))
+        self._left -= 1
+        if learned is not None:
+            return learned
+        turned_radps = answer.w_radps + self._turn * robot.w_max_radps
+        return clipped(Command(self._slower * answer.v_mps, turned_radps), robot)
+
+    def _steps_of_calm(self) -> int:
+        """How many answers are driven as they are before the next burst, so that bursts have their
+        share."""
+        if not self._share:
+            return 0
+        mean_s = float(np.mean(self._lasts_s)) * (1.0 - self._share) / self._share
+        return round(float(self._draws.exponential(mean_s)) / self._period_s)
+
+
+class _Rows:
+    """What is seen and answered, from the beginning of an episode until the robot is put
+    elsewhere."""
+
+    def __init__(self, rate_hz: float) -> None:
+        self._fps = round(rate_hz)
+        self._clip: Clip | None = None
+        self._over = False
+        self._ticks: list[int] = []
+        self._numbers: list[tuple[float, ...]] = []
+        self._told: list[str] = []
+        self._glimpses: list[NDArray[np.uint8]] = []
+        self._colours = np.zeros((3, 256), np.int64)
+
+    def add(
+        self, seen: Observation, rgb: NDArray[np.uint8], answer: Command, disturbed: bool
+    ) -> None:
+        self._over |= seen.reset
+        if self._over:
+            return
+        if self._clip is None:
+            self._clip = Clip((rgb.shape[1], rgb.shape[0]), self._fps)
+        self._clip.add(rgb)
+        goal = seen.goal
+        x_m, y_m = (goal.x_m, goal.y_m) if isinstance(goal, PointGoal) else (math.nan, math.nan)
+        self._ticks.append(seen.tick)
+        self._numbers.append(
+            (seen.v_mps, seen.w_radps, x_m, y_m, answer.v_mps, answer.w_radps, float(disturbed))
+        )
+        self._told.append(goal.text if isinstance(goal, Instruction) else "")
+        self._glimpses.append(glimpse(rgb))
+        self._colours += [
+            np.bincount(channel.ravel(), minlength=256) for channel in np.moveaxis(rgb, 2, 0)
+        ]
+
+    def demonstration(self, scenario: Scenario, log: Log, collecting: Collecting) -> Demonstration:
+        """What was added, with the waypoints of the trajectory up to where the robot was put
+        elsewhere."""
+        assert self._clip is not None, "an episode has a picture before its first command"
+        ticks, numbers = np.array(self._ticks), np.array(self._numbers)
+        resets = np.flatnonzero(~np.isnan(log.reset_s_m))
+        end = int(resets[0]) + 1 if len(resets) else len(log)
+        pose = np.vstack([scenario.start, log.pose[:end]])
+        every = Clock().ticks(collecting.waypoint_s)
+        disturbed = numbers[:, 6] > 0.0
+        command = numbers[:, 4:6]
+        ahead = ticks, command, disturbed, collecting.waypoints, every, log.tick_s
+        waypoints, driven = waypoints_ahead(pose, *ahead)
+        return Demonstration(
+            state=numbers[:, 0:2].astype(np.float32),
+            goal=numbers[:, 2:4].astype(np.float32),
+            command=command.astype(np.float32),
+            waypoints=waypoints,
+            driven=driven,
+            disturbed=disturbed,
+            told=np.array(self._told),
+            glimpses=np.stack(self._glimpses),
+            colours=self._colours,
+            clip=np.frombuffer(self._clip.finished(), np.uint8),
+        )

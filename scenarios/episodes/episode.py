@@ -1,0 +1,310 @@
+"""Episode: a scenario that one can hold, and drive period by period of the policy.
+
+    with Episode(scenario, policy.manifest) as episode:
+        policy.reset(episode.id, episode.seed)
+        observation = episode.reset()
+        while not episode.over:
+            observation = episode.advance(policy.act(observation))
+    record, log = episode.result()
+
+It is the only wiring of engines, referee, recorder and event monitor: runs, films, replays,
+measurements and environments drive it. The policy stands outside.
+"""
+
+from __future__ import annotations
+
+import os
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack
+from types import TracebackType
+from typing import Self
+
+import msgspec
+
+from cosim.core.clock import Clock, Pacer
+from cosim.core.errors import EngineError, PolicyError, UsageError
+from cosim.core.state import Frame
+from cosim.episode.camera_rules import check_camera
+from cosim.episode.command_delay import InFlight, whole_ticks
+from cosim.episode.control import command_of
+from cosim.episode.interfaces import Eyes, Observation
+from cosim.episode.loop import Moment, after, begin, tick
+from cosim.episode.manifest_checks import with_goal
+from cosim.episode.step import Step
+from cosim.results.log import Log
+from cosim.results.record import Record, begun
+from cosim.results.referee import Verdict
+from cosim.spec.camera import CameraSpec
+from cosim.spec.episode_id import pseudonym_of
+from cosim.spec.event_kind import EventKinds
+from cosim.spec.manifest import Manifest
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.robot import robot_called
+from cosim.spec.scenario import Scenario
+from scenarios.episodes.live_episode import OnAir
+from scenarios.episodes.wiring import StagedScenario, staged
+from scenarios.events import EVENT_KINDS
+from sumo_nets.crowd.demand_log import Entrances
+
+Watch = Callable[[Step, Verdict], None]
+"""Told each Step of an episode, and what the referee says of it."""
+
+
+_engines_ran_in: set[int] = set()
+"""Ids of this process and of those that it was forked from, if engines ran in them."""
+
+
+def unheard(reason: str) -> None:
+    """Nobody wants to know."""
+
+
+class Episode:
+    """One episode of a scenario, for a policy with this manifest. Use it in a `with` block: its
+    engines start on entering and are closed whatever happens. One at a time in a process, because
+    SUMO runs once in each.
+
+    id, seed: what its policy is told when it begins. watches: told every tick. waiting: told what
+    the episode waits for when it stands still. through: may put stopwatches or stand-ins before the
+    engines, which have started and not begun. kinds: the table of events that there may be.
+
+    Raises UsageError for a camera that the robot does not have, for goals that the policy cannot be
+    given and when it is used out of turn, PolicyError for an answer that is no command, EngineError
+    when an engine fails or runs already, and what its place raises.
+
+    >>> from cosim import load_policy, load_suite
+    >>> policy = load_policy("straight")
+    >>> with Episode(load_suite("reactive").scenarios[0], policy.manifest) as episode:
+    ...     observation = episode.reset()
+    ...     while not episode.over:
+    ...         observation = episode.advance(policy.act(observation))
+    >>> record, log = episode.result()
+    >>> record.ended, len(log) == record.ticks
+    ('failure', True)
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        manifest: Manifest,
+        options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
+        *,
+        watches: Sequence[Watch] = (),
+        waiting: Callable[[str], None] = unheard,
+        through: Callable[[StagedScenario], None] | None = None,
+        kinds: EventKinds = EVENT_KINDS,
+    ) -> None:
+        self.scenario = scenario = scenario.driven_by(options.robot)
+        manifest = with_goal(manifest, options.goal)
+        self.manifest = manifest
+        self.options = options
+        check_camera(manifest, robot_called(scenario.robot), options.own_camera)
+        run_seed = 0 if options.seed is None else options.seed
+        self.id, self.seed = pseudonym_of(run_seed, scenario)
+        self.clock = Clock.for_rate(manifest.rate_hz)
+        how = options.latency_ms, options.real_time, options.policy_runs
+        self.record: Record = begun(
+            scenario, manifest, options.suite_hash, options.policy_source, run_seed, *how
+        )
+        self._watches = list(watches)
+        self._waiting = waiting
+        self._through = through
+        self._kinds = kinds
+        self._began_s = time.perf_counter()
+        self._setup_s = 0.0
+        self._stack = ExitStack()
+        self._stage: StagedScenario | None = None
+        self._now: Moment | None = None
+        self._frame: Frame | None = None
+        self._verdict = Verdict()
+        self._was_reset = False
+        self._commands = InFlight()
+        self._asked_s = 0.0
+        self._took_ms: list[float] = []
+        self._result: tuple[Record, Log] | None = None
+
+    def __enter__(self) -> Self:
+        if self._setup_s:
+            raise UsageError(
+                "this Episode was used before: make a new Episode for every run of a scenario"
+            )
+        if _engines_ran_in - {os.getpid()}:
+            raise EngineError(
+                "engines ran in the process that this one was forked from, whose threads are not "
+                "here: start processes by 'forkserver' or 'spawn' (context= of AsyncVectorEnv, "
+                "start_method= of SubprocVecEnv)"
+            )
+        _engines_ran_in.add(os.getpid())
+        with ExitStack() as stack:
+            stage = stack.enter_context(
+                staged(
+                    self.scenario,
+                    self.manifest,
+                    self.options,
+                    self.clock,
+                    self._waiting,
+                    self._kinds,
+                )
+            )
+            if self._through is not None:
+                self._through(stage)
+            if self.options.live is not None:
+                air = stack.enter_context(OnAir(self.options.live, self.scenario, stage.injected))
+                self._watches.append(air.tell)
+            if self.options.pace:
+                pacer = Pacer(self.options.pace)
+                self._watches.append(lambda step, verdict: pacer.wait(self.clock.tick_s))
+            self._stack = stack.pop_all()
+        self._stage = stage
+        self._scorer = stage.scorer
+        self._injected = stage.injected
+        self.record = msgspec.structs.replace(self.record, renderer=stage.renderer)
+        self._setup_s = time.perf_counter() - self._began_s
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End every engine; a second call does nothing. `result` can still be asked for."""
+        self._stack.close()
+        self._stage = None
+
+    def watch(self, watch: Watch) -> None:
+        """Tell somebody else too of every tick from now on."""
+        self._watches.append(watch)
+
+    @property
+    def over(self) -> bool:
+        """Whether the referee has ended it."""
+        return self._verdict.ended is not None
+
+    @property
+    def time_s(self) -> float:
+        """Simulated seconds since its start."""
+        return 0.0 if self._now is None else self.clock.time_s(self._now.tick)
+
+    @property
+    def moment(self) -> Moment:
+        """Where everything is now."""
+        return self._begun[1]
+
+    @property
+    def footprint_m(self) -> tuple[float, float]:
+        """Length and width of the robot."""
+        return self._open.parts.world.footprint_m
+
+    @property
+    def entrances(self) -> Entrances:
+        """Who has come into the street and left it so far."""
+        return self._open.entrances
+
+    def eyes(self, spec: CameraSpec) -> AbstractContextManager[Eyes]:
+        """A further camera in its street, for humans."""
+        return self._open.eyes(spec)
+
+    def reset(self) -> Observation:
+        """Put the robot at its start; what the policy sees there. Raises UsageError when that was
+        done."""
+        stage = self._open
+        if self._now is not None:
+            raise UsageError(
+                "this Episode has begun: an episode cannot be begun anew, make another "
+                "Episode for that"
+            )
+        self._now = begin(self.scenario, stage.parts)
+        return self._observe(stage, self._now, True)
+
+    def advance(self, answer: object, *, until_tick: int | None = None) -> Observation:
+        """Go on for one period of the policy with its answer; what it sees then, or at the end of
+        the episode. In real time it goes on until the answer has arrived, too, which took as long
+        as the caller took to come here.
+
+        answer: a Command or waypoints; see `cosim.episode.control.command_of`. until_tick: stop
+        there, within the period, for somebody who wants to look.
+        """
+        took_ms = 1000.0 * (time.perf_counter() - self._asked_s)
+        stage, now = self._begun
+        if self.over:
+            raise UsageError(
+                f"this Episode is over ({self._verdict.ended}): ask for its result(), or "
+                f"make another"
+            )
+        try:
+            command = command_of(answer, rule=self.manifest.waypoints, robot=stage.robot)
+        except PolicyError as error:
+            raise PolicyError(f"policy '{self.manifest.name}' {error}") from error
+        options, frame = self.options, self._frame
+        latency_ms = took_ms if options.real_time else options.latency_ms
+        self._took_ms.append(took_ms)
+        self._commands.answered(now.tick, whole_ticks(latency_ms, self.clock.tick_ms), command)
+        free_again = self._commands.arrived_by if options.real_time else 0
+        while True:
+            step = tick(
+                self.scenario, self.clock, stage.parts, now, self._commands.at(now.tick), frame
+            )
+            self._verdict = verdict = stage.scorer.score(step)
+            for watch in self._watches:
+                watch(step, verdict)
+            self._now = now = after(step, verdict.reset, stage.parts)
+            self._was_reset |= verdict.reset is not None
+            stage.observer.moved(step, verdict.reset is not None)
+            if verdict.reset is not None:
+                self._commands.put_back()
+            asks = self.clock.acts(now.tick) and now.tick >= free_again
+            if self.over or asks or now.tick == until_tick:
+                return self._observe(stage, now, asks)
+            frame = None
+
+    def result(self) -> tuple[Record, Log]:
+        """What came out: the record and the log. Raises UsageError while the episode goes on."""
+        if not self.over:
+            raise UsageError(
+                "this Episode is not over: advance() it until `over`, then ask for its result()"
+            )
+        if self._result is None:
+            record, log = self._scorer.result(self.record, self._commands)
+            clock = {"wall_s": time.perf_counter() - self._began_s, "setup_s": self._setup_s}
+            if self._took_ms:
+                clock["answer_ms"] = statistics.median(self._took_ms)
+            self._result = (
+                msgspec.structs.replace(record, injections=self._injected.log, clock=clock),
+                log,
+            )
+        return self._result
+
+    def _observe(self, stage: StagedScenario, now: Moment, asks: bool) -> Observation:
+        """What is seen now; asks: by the policy, whose turn it is."""
+        was_reset = self._was_reset
+        self._was_reset = was_reset and not asks
+        time_s = self.clock.time_s(now.tick)
+        camera = stage.parts.camera
+        seen, self._frame = stage.observer.observed(now, time_s, camera, was_reset)
+        self._asked_s = time.perf_counter()
+        return seen
+
+    @property
+    def _open(self) -> StagedScenario:
+        if self._stage is None:
+            what = (
+                "is closed: make another Episode"
+                if self._setup_s
+                else "has not been entered: use it in a `with` block"
+            )
+            raise UsageError(f"this Episode {what}")
+        return self._stage
+
+    @property
+    def _begun(self) -> tuple[StagedScenario, Moment]:
+        stage = self._open
+        if self._now is None:
+            raise UsageError(
+                "this Episode has not begun: call reset() first, it gives the first observation"
+            )
+        return stage, self._now

@@ -1,0 +1,176 @@
+"""Injected people, beside those of the events. A director around a director.
+
+Injections come from any thread, or from a record that is replayed; they take effect at the boundary
+of a step, in the order in which they came.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from threading import Condition
+from typing import Final, NamedTuple
+
+import msgspec
+
+from cosim.core.geometry import Polyline, Pose
+from cosim.episode.interfaces import Director
+from cosim.spec.events import EventQuery, EventReply
+from cosim.spec.injection import Ack, Injected, Injection, InjectionRequest, RelativePoint
+from scenarios.events.injected_person import (
+    InjectedPerson,
+    arriving,
+    injected_actor,
+    injected_moved_on,
+)
+
+MOST_INJECTED: Final = 100
+"""At once, those under way to their first step included."""
+MOST_EVER: Final = 5000
+"""In one episode: its record holds them all."""
+
+
+SUGGESTED_M: Final = 10.0
+"""A valid point that a refusal names lies so far ahead of the robot on its route."""
+SETTLES_S: Final = 2.0
+"""Seconds to wait for the end of a tick under way, which takes milliseconds: only then is the
+robot's pose known."""
+
+
+class RobotOnRoute(NamedTuple):
+    """The robot at the start of a tick: its pose on the map and its arc length on the route, in
+    metres."""
+
+    tick: int
+    pose: Pose
+    route_s_m: float
+
+
+class InjectedPeople:
+    """Adds injected people to a director's replies.
+
+    on_map(x_m, y_m): whether a point belongs to the place at all. route, start: of the robot.
+    script: injections of a record that is replayed.
+    """
+
+    def __init__(
+        self,
+        director: Director,
+        tick_ms: int,
+        on_map: Callable[[float, float], bool],
+        route: Polyline,
+        start: Pose,
+        script: Sequence[Injected] = (),
+    ) -> None:
+        self._director = director
+        self._tick_ms = tick_ms
+        self._on_map = on_map
+        self._route = route
+        self._robot = RobotOnRoute(0, start, 0.0)
+        self._lock = Condition()
+        self._coming: list[Injected] = list(script)
+        self._log: list[Injected] = []
+        self._here: dict[str, InjectedPerson] = {}
+        self._names = {entry.injection.id for entry in script}
+        self._next_tick = 0
+
+    def robot_at(self, robot: RobotOnRoute) -> None:
+        """Take in where the robot is when a tick begins: points from the robot refer to it."""
+        with self._lock:
+            self._robot = robot
+            self._lock.notify_all()
+
+    def offer(self, asked: InjectionRequest) -> Ack:
+        """Take an injection in for the next step, or say why not. Any thread may call this."""
+        with self._lock:
+            if asked.depends_on_robot and not self._lock.wait_for(self._robot_is_known, SETTLES_S):
+                late = f"the tick under way takes longer than {SETTLES_S:g} s: send it again"
+                return Ack(id=asked.id, status="refused", reason=late)
+            injection = asked.resolved(self._robot.pose)
+            tick = self._next_tick
+            if reason := self._objection(asked, injection):
+                return Ack(id=asked.id, status="refused", reason=reason)
+            self._coming.append(Injected(tick=tick, injection=injection))
+            self._names.add(injection.id)
+        (x_m, y_m), *_ = injection.path
+        return Ack(
+            id=asked.id,
+            status="accepted",
+            tick=tick,
+            time_s=tick * self._tick_ms / 1000,
+            x_m=x_m,
+            y_m=y_m,
+        )
+
+    def _robot_is_known(self) -> bool:
+        """Whether the robot's pose at the start of the next step is known: not while a step is
+        under way."""
+        return self._robot.tick == self._next_tick
+
+    def _objection(self, asked: InjectionRequest, injection: Injection) -> str:
+        """Why an injection is refused; "" where nothing is against it."""
+        for i, (point, (x_m, y_m)) in enumerate(zip(asked.path, injection.path, strict=True)):
+            if not self._on_map(x_m, y_m):
+                found = _in_json((x_m, y_m))
+                if isinstance(point, RelativePoint):
+                    found = f"{_in_json(point)} from the robot, {found} on the map"
+                return f"path[{i}] is {found}: that is not on this map. {self._valid_point()}"
+        if injection.id in self._names:
+            return "there was one of this id in the episode already: choose another"
+        if len(self._here) + len(self._coming) >= MOST_INJECTED:
+            return (
+                f"{MOST_INJECTED} injected pedestrians are here already: wait until some are gone"
+            )
+        if len(self._names) >= MOST_EVER:
+            return f"{MOST_EVER} pedestrians were injected into this episode: no more"
+        return ""
+
+    def _valid_point(self) -> str:
+        """Where the robot is, and a point ahead of it that is valid, in words."""
+        pose, route_s_m = self._robot.pose, self._robot.route_s_m
+        there = self._route.at(route_s_m + SUGGESTED_M)
+        relative = RelativePoint.of(there.x_m, there.y_m, pose)
+        return (
+            f"The robot is at {_in_json(pose[:2])}, heading_rad {pose.heading_rad:.2f}. A "
+            f"valid point on its route is "
+            f"{_in_json((there.x_m, there.y_m))}, or {_in_json(relative)} from the robot"
+        )
+
+    @property
+    def log(self) -> tuple[Injected, ...]:
+        """What took effect so far, in order."""
+        with self._lock:
+            return tuple(self._log)
+
+    def react(self, query: EventQuery) -> EventReply:
+        """The director's reply, with the injected people of this tick among its actors."""
+        with self._lock:
+            due = [entry for entry in self._coming if entry.tick <= query.tick]
+            self._coming = [entry for entry in self._coming if entry.tick > query.tick]
+            self._log += due
+            self._next_tick = query.tick + 1
+            before = self._here
+            new = {entry.injection.id: arriving(entry) for entry in due}
+            self._here = before | new
+        reply = self._director.react(query)
+        here = {}
+        for name, person in before.items():
+            after = injected_moved_on(person, query)
+            if after is not None:
+                here[name] = after
+        here |= new
+        with self._lock:
+            self._here = here
+        if not here:
+            return reply
+        actors = (
+            *reply.actors,
+            *(injected_actor(person, self._tick_ms) for person in here.values()),
+        )
+        return msgspec.structs.replace(reply, actors=actors)
+
+
+def _in_json(point: tuple[float, float] | RelativePoint) -> str:
+    """A point as it stands in a message, in metres to 0.1 m."""
+    if isinstance(point, RelativePoint):
+        return f'{{"ahead": {point.ahead:.10g}, "left": {point.left:.10g}}}'
+    return f"[{point[0]:.1f}, {point[1]:.1f}]"

@@ -1,0 +1,146 @@
+"""An episode on the air: reachable over Zenoh while it runs (`cosim run --live`), for injections
+and telemetry."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Self
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from bridge import keys
+from bridge.live import serve_injections
+from bridge.session import open_session
+from cosim.core.clock import Clock
+from cosim.core.state import Age, PersonKind
+from cosim.episode.step import Step
+from cosim.results.referee import Verdict
+from cosim.spec.injection import Injected, Live
+from cosim.spec.scenario import Scenario
+from scenarios.episodes.injected import InjectedPeople, RobotOnRoute
+
+
+class _Told(msgspec.Struct, frozen=True, kw_only=True):
+    """What `log` answers: the tick, what was injected, and which events and failures there were,
+    with their ticks."""
+
+    tick: int
+    injections: tuple[Injected, ...]
+    happened: tuple[tuple[int, str], ...]
+
+
+class OnAir:
+    """One episode's end of the air. Use in a `with` block."""
+
+    def __init__(self, live: Live, scenario: Scenario, injected: InjectedPeople) -> None:
+        self._live = live
+        self._scenario = scenario
+        self._injected = injected
+        self._below = keys.env(live.run, keys.chunk(scenario.id))
+        self._step: Step | None = None
+        self._happened: list[tuple[int, str]] = []
+        self._acting: set[str] = set()
+        self._rgb: NDArray[np.uint8] | None = None
+
+    def __enter__(self) -> Self:
+        self._session = open_session(self._live.connection)
+        serve_injections(self._session, f"{self._below}/inject", self._injected.offer)
+        self._session.serve(f"{self._below}/status", lambda _: self._status(), found=True)
+        self._session.serve(f"{self._below}/log", lambda _: self._log())
+        self._session.serve(f"{self._below}/camera", lambda _: self._camera())
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._session.close()
+
+    def tell(self, step: Step, verdict: Verdict) -> None:
+        """Tell everybody what this tick did."""
+        self._step = step
+        pose = step.motion.robot.pose
+        route_s_m = step.route_s_after_m
+        if verdict.reset is not None:
+            pose, route_s_m = verdict.reset.pose, verdict.reset.route_s_m
+        self._injected.robot_at(RobotOnRoute(step.tick + 1, pose, route_s_m))
+        if step.frame is not None:
+            self._rgb = step.frame.rgb
+        tick = step.tick
+        street = step.street_after
+        robot = step.motion.robot
+        news = [f"{failure.kind} {failure.other}".strip() for failure in verdict.failures]
+        news += [f"walked into by {contact.other}" for contact in verdict.walked_into]
+        for event, state in zip(self._scenario.events, step.events.states, strict=True):
+            if state.phase == "acting" and event.id not in self._acting:
+                self._acting.add(event.id)
+                news.append(f"event {event.id} {event.kind}")
+        if verdict.ended is not None:
+            news.append(f"ended: {verdict.ended}")
+        self._happened += [(tick, words) for words in news]
+        x_m, y_m, heading_rad = robot.pose
+        crowd = [
+            {
+                "id": name,
+                "x_m": x,
+                "y_m": y,
+                "heading_rad": heading,
+                "speed_mps": speed,
+                "doing": doing,
+                "kind": PersonKind(kind).name.lower(),
+                "age": Age(age).name.lower(),
+            }
+            for name, (x, y), heading, speed, doing, kind, age in zip(
+                street.people.ids,
+                street.people.xy.tolist(),
+                street.people.heading.tolist(),
+                street.people.speed.tolist(),
+                street.people.doing,
+                street.people.kind.tolist(),
+                street.people.age.tolist(),
+                strict=True,
+            )
+        ]
+        topics: dict[str, object] = {
+            "clock": {"tick": tick, "time_s": Clock().time_s(tick)},
+            "robot": {
+                "x_m": x_m,
+                "y_m": y_m,
+                "heading_rad": heading_rad,
+                "v_mps": robot.v_mps,
+                "w_radps": robot.w_radps,
+                "z_m": robot.z_m,
+                "route_s_m": step.route_s_after_m,
+            },
+            "crowd": crowd,
+            "signals": {name: signal.walk for name, signal in street.signals.items()},
+        }
+        if news:
+            topics["events"] = news
+        for topic, what in topics.items():
+            self._session.tell(f"{self._below}/{topic}", msgspec.json.encode(what))
+
+    def _status(self) -> bytes:
+        tick = -1 if self._step is None else self._step.tick
+        return msgspec.json.encode(
+            {"scenario": self._scenario.id, "tick": tick, "time_s": Clock().time_s(max(tick, 0))}
+        )
+
+    def _log(self) -> bytes:
+        tick = -1 if self._step is None else self._step.tick
+        return msgspec.json.encode(
+            _Told(tick=tick, injections=self._injected.log, happened=tuple(self._happened))
+        )
+
+    def _camera(self) -> bytes:
+        """The last picture that the policy got, as PNG. Raises LookupError before there is one."""
+        if self._rgb is None:
+            raise LookupError("the policy has had no picture yet")
+        done, data = cv2.imencode(".png", self._rgb[..., ::-1])
+        assert done
+        return bytes(data)

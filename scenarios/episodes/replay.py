@@ -1,0 +1,148 @@
+"""A recorded episode run again: the same commands, the same injections, the same state hash."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from cosim.core.clock import Clock
+from cosim.core.errors import RunError, unknown
+from cosim.core.telling import Tell, untold
+from cosim.core.versions import versions
+from cosim.episode.step import Step
+from cosim.policies.baselines import Replay
+from cosim.results.log import Log
+from cosim.results.record import Record, log_row
+from cosim.results.referee import Verdict
+from cosim.results.run_folder import read_records
+from cosim.spec.options import CameraChoice, EpisodeOptions
+from cosim.spec.robot import robot_called
+from cosim.spec.scenario import Scenario, read_suite
+from scenarios.episodes.counterfactual import Beside, Compared
+from scenarios.episodes.episode import Episode, Watch
+from scenarios.episodes.run_episode import drive
+from scenarios.episodes.wiring import StagedScenario
+from sumo_nets.crowd.demand_log import Entrances
+
+OF_THE_ROAD: Final = 14
+"""From this value of a row on it is about the roads, which are judged beside the loop."""
+
+
+class Recorded(NamedTuple):
+    """All that a run folder holds of an episode."""
+
+    scenario: Scenario
+    record: Record
+    log: Log
+
+
+def recorded(folder: Path, scenario_id: str) -> Recorded:
+    """A finished episode. Raises UsageError with the valid names, RunError when it crashed."""
+    records = {record.scenario for record in read_records(folder)}
+    if scenario_id not in records:
+        raise unknown(f"finished episode in {folder}", scenario_id, records)
+    scenarios = {s.id: s for s in read_suite(folder / "scenarios.json").scenarios}
+    episode = folder / "episodes" / scenario_id
+    record = Record.load(episode / "record.json")
+    if record.ended is None:
+        raise RunError(
+            f"{folder}: '{scenario_id}' did not come to its end: there is nothing to run again"
+        )
+    return Recorded(scenarios[scenario_id], record, Log.load(episode / "trajectory.npz"))
+
+
+def replaying(
+    told: Recorded, camera: CameraChoice = "auto", *watches: Watch, judged_alone: bool = False
+) -> tuple[Episode, Replay]:
+    """The recorded episode once more, not begun yet, and the policy that does what was done in it.
+
+    judged_alone: leave out what is measured beside what the referee judges, for a replay whose
+    result is not needed.
+    """
+    options = EpisodeOptions(
+        seed=told.record.run_seed,
+        suite_hash=told.record.suite_hash,
+        camera=camera,
+        injections=told.record.injections,
+    )
+    policy = Replay(told.log.command)
+    through = _judge_alone if judged_alone else None
+    return Episode(
+        told.scenario, policy.manifest, options, watches=watches, through=through
+    ), policy
+
+
+def _judge_alone(stage: StagedScenario) -> None:
+    stage.scorer.judge_alone()
+
+
+def replayed(told: Recorded, *watches: Watch, tell: Tell = untold) -> str:
+    """Run it again; the state hash that comes out."""
+    return _again(told, tell, *watches)[0]
+
+
+def compared(told: Recorded, tell: Tell = untold) -> tuple[str, Compared]:
+    """Run it again, then its street without the robot; the state hash, and what the robot cost the
+    others."""
+    beside = Beside()
+    state_hash, entrances = _again(told, tell, beside.watch)
+    return state_hash, beside.compared(
+        told.scenario, entrances, partial(tell, "the street without the robot")
+    )
+
+
+def _again(told: Recorded, tell: Tell, *watches: Watch) -> tuple[str, Entrances]:
+    def watch(step: Step, _: Verdict) -> None:
+        tell(f"replaying {told.scenario.id}", step.tick / len(told.log))
+
+    tell("starting SUMO and PyBullet")
+    episode, policy = replaying(told, "auto", watch, *watches)
+    with episode:
+        drive(episode, policy)
+        return episode.result()[0].state_hash, episode.entrances
+
+
+class Alike:
+    """Watches a replay, and holds every tick against the recorded trajectory, to the bit: the
+    robot's pose, speeds and command, its way, its resets, and how near the nearest person is."""
+
+    def __init__(self, folder: Path, told: Recorded) -> None:
+        self._folder = folder
+        self._told = told
+        self._footprint_m = robot_called(told.scenario.robot).footprint_m
+
+    def watch(self, step: Step, verdict: Verdict) -> None:
+        """The next tick. Raises RunError when it is not the recorded one."""
+        now = np.array(log_row(step, verdict, self._footprint_m))
+        then = self._told.log.row(step.tick)
+        if not np.array_equal(now[:OF_THE_ROAD], then[:OF_THE_ROAD], equal_nan=True):
+            raise otherwise(self._folder, self._told, f"from {Clock().time_s(step.tick):g} s on")
+
+
+def check(folder: Path, told: Recorded, state_hash: str) -> None:
+    """Raises RunError when a replay came out otherwise than recorded."""
+    if state_hash != told.record.state_hash:
+        raise otherwise(folder, told, f"{state_hash[:16]}, recorded {told.record.state_hash[:16]}")
+
+
+def otherwise(folder: Path, told: Recorded, what: str) -> RunError:
+    """The error for a replay that came out otherwise than recorded; what: the difference."""
+    record = told.record
+    here = versions()
+    changed = [
+        f"{name} {record.versions.get(name)}, here {here[name]}"
+        for name in here
+        if here[name] != record.versions.get(name)
+    ]
+    why = (
+        f"made with other versions: {'; '.join(changed)}"
+        if changed
+        else "of the same versions: of other code"
+    )
+    return RunError(
+        f"{folder}: '{record.scenario}' was not the same when it was replayed ({what}). The record "
+        f"is {why}, or it was changed. Replay it with the code that made it, or run it again."
+    )

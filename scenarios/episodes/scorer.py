@@ -1,0 +1,96 @@
+"""Scorer: what is judged, measured and recorded of an episode, Step by Step."""
+
+from __future__ import annotations
+
+import msgspec
+
+from cosim.core.clock import Clock
+from cosim.core.errors import UsageError
+from cosim.episode.command_delay import InFlight, median_ms
+from cosim.episode.step import Step
+from cosim.place.street_map import StreetMap, WalkableArea
+from cosim.results.event_monitor import EventMonitor, Hidden, why_invalid
+from cosim.results.log import Log
+from cosim.results.metrics import EpisodeFacts, every_metric
+from cosim.results.record import Record, Recorder, RedLightEntry, Status
+from cosim.results.referee import Failure, Referee, Verdict
+from cosim.results.traffic import TrafficMonitor
+from cosim.spec.event_kind import EventKinds
+from cosim.spec.robot import Robot
+from cosim.spec.scenario import Scenario
+
+
+class Scorer:
+    """Takes in the Steps of one episode, in order. kinds: the table of its events; area: where the
+    robot may be; hidden: see `EventMonitor`."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        kinds: EventKinds,
+        street_map: StreetMap,
+        area: WalkableArea,
+        robot: Robot,
+        hidden: Hidden,
+        clock: Clock,
+    ) -> None:
+        self._scenario = scenario
+        self._clock = clock
+        footprint_m = robot.footprint_m
+        self._referee = Referee(scenario, area, footprint_m, clock)
+        self._recorder = Recorder(clock.tick_s, footprint_m)
+        self._monitor = EventMonitor(scenario, kinds, robot, hidden, clock.tick_ms)
+        self._traffic = TrafficMonitor(street_map, clock.tick_s)
+        self._failures: list[Failure] = []
+        self._walked_into: list[Failure] = []
+        self._red_lights: list[RedLightEntry] = []
+        self._verdict = Verdict()
+        self._measures = True
+
+    def judge_alone(self) -> None:
+        """From now on ask the referee, and measure and record nothing: there will be no result."""
+        self._measures = False
+
+    def score(self, step: Step) -> Verdict:
+        """The referee's verdict on a Step, which is recorded with it."""
+        verdict = self._verdict = self._referee.judge(step)
+        if not self._measures:
+            return verdict
+        self._recorder.add(step, verdict, self._traffic.see(step))
+        self._monitor.see(step)
+        self._failures += verdict.failures
+        self._walked_into += verdict.walked_into
+        if verdict.red_light_entry is not None:
+            self._red_lights.append(RedLightEntry(step.tick, verdict.red_light_entry))
+        return verdict
+
+    def result(self, begun: Record, commands: InFlight) -> tuple[Record, Log]:
+        """The record that was begun, with all that came out so far, and the log. commands: all that
+        was answered.
+
+        Raises UsageError after `judge_alone`.
+        """
+        if not self._measures:
+            raise UsageError(
+                "this episode was judged alone, nothing of it was recorded: it has no result"
+            )
+        scenario = self._scenario
+        events = self._monitor.outcomes()
+        log = self._recorder.log(self._monitor.tracks, commands)
+        record = msgspec.structs.replace(
+            begun,
+            ended=self._verdict.ended,
+            ticks=len(log),
+            state_hash=self._recorder.hash.hexdigest(),
+            latency_ms=median_ms(log.answers, self._clock.tick_ms)
+            if begun.real_time
+            else begun.latency_ms,
+            failures=tuple(self._failures),
+            walked_into=tuple(self._walked_into),
+            red_light_entries=tuple(self._red_lights),
+            events=events,
+        )
+        measures = every_metric(EpisodeFacts.of(record, scenario, log))
+        reason = why_invalid(record, scenario)
+        status: Status = "invalid" if reason else "done"
+        return msgspec.structs.replace(record, status=status, reason=reason, measures=measures), log

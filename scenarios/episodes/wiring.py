@@ -1,0 +1,272 @@
+"""The only wiring of engines: a scenario becomes running parts, behind their ports."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry import LineString, MultiPolygon, Polygon
+
+from cosim.core.clock import Clock
+from cosim.core.errors import MachineError, SpecError
+from cosim.core.geometry import Pose
+from cosim.core.state import RobotState, Street
+from cosim.episode.interfaces import Camera, Director, Eyes, Privileged
+from cosim.episode.loop import Moment, Parts
+from cosim.episode.observer import Observer
+from cosim.people.standing import Standing, standing_bodies
+from cosim.place import overlay
+from cosim.place.barriers import fenced
+from cosim.place.street_map import Port, StreetMap, WalkableArea
+from cosim.results.record import NO_RENDERER
+from cosim.spec.camera import CameraSpec
+from cosim.spec.event_kind import EventKinds
+from cosim.spec.manifest import Manifest
+from cosim.spec.obstacle import Obstacle, footprint
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.robot import COURIER, Robot, robot_called
+from cosim.spec.scenario import Barrier, CrowdSpec, Scenario, event_faults
+from cosim.spec.spec_file import in_lines
+from physics.cameras.choice import camera_of, camera_of_choice, renderer_of
+from physics.dynamics.world import BulletWorld
+from physics.street.furniture import Prop, footprints
+from physics.street.surface import Surface
+from scenarios.episodes.director import AmongObstacles, director_of
+from scenarios.episodes.injected import InjectedPeople
+from scenarios.episodes.scorer import Scorer
+from scenarios.ipc.render_link import SharedCamera
+from scenarios.places.nets import place, surface_of_place
+from sumo_nets.crowd.demand_log import Entrances
+from sumo_nets.crowd.empty_street import EmptyStreet, goes_by_itself
+
+if TYPE_CHECKING:
+    from sumo_nets.crowd.crowd import SumoCrowd
+
+CORRIDOR_M = 40.0
+"""The walkable area is judged this far around the route; beyond it everything is out of lane."""
+
+_BESIDE_M = 10.0
+"""The walkable ground is looked at so far around obstacles."""
+
+FRONTAGE_M = 2.0
+"""Beside a sidewalk there is room for this much."""
+
+
+@dataclass(slots=True)
+class StagedScenario:
+    """A scenario ready to run. parts: its engines; robot: which one drives. renderer: what draws
+    for the policy. observer: makes what it is given. eyes: makes further cameras. injected: takes
+    pedestrians in. entrances: who comes and goes in the street."""
+
+    parts: Parts
+    robot: Robot
+    renderer: str
+    scorer: Scorer
+    observer: Observer
+    eyes: Callable[[CameraSpec], AbstractContextManager[Eyes]]
+    injected: InjectedPeople
+    entrances: Entrances
+
+
+@contextmanager
+def staged(
+    scenario: Scenario,
+    manifest: Manifest,
+    options: EpisodeOptions,
+    clock: Clock,
+    waiting: Callable[[str], None],
+    kinds: EventKinds,
+) -> Iterator[StagedScenario]:
+    """Start every engine of a scenario; all are closed at the end, whatever happened."""
+    if faults := list(event_faults(scenario, kinds)):
+        raise SpecError(f"scenario '{scenario.id}': {in_lines(faults)}")
+    _, street_map = place(scenario.place)
+    around = shapely.buffer(LineString(scenario.route), CORRIDOR_M)
+    walkable = street_map.walkable_near(around)
+    with ExitStack() as stack:
+        street = surface_of_place(scenario.place)
+        robot = robot_called(scenario.robot)
+        world = stack.enter_context(world_of(street, scenario.barriers, robot, scenario.obstacles))
+        crowd = crowd_of(scenario)
+        stack.enter_context(crowd)
+
+        def eyes(spec: CameraSpec) -> AbstractContextManager[Eyes]:
+            return camera_of(
+                camera_of_choice(options.camera),
+                world,
+                spec,
+                light=scenario.light,
+                depth=spec.depth,
+            )
+
+        camera: Camera | None = None
+        renderer = NO_RENDERER
+        if options.renderer is not None:
+            shared = stack.enter_context(SharedCamera(options.renderer, scenario))
+            if manifest.camera is not None:
+                camera = shared
+                renderer = shared.renderer
+        elif manifest.camera is not None:
+            camera = stack.enter_context(eyes(manifest.camera))
+            renderer = renderer_of(camera_of_choice(options.camera))
+        cameras = {name: stack.enter_context(eyes(spec)) for name, spec in manifest.cameras.items()}
+        look = None if camera is None else partial(empty_street, camera, street, robot)
+        director = stack.enter_context(director_of(scenario.id, options.director, waiting, kinds))
+        if scenario.crowd.residents:
+            from scenarios.events.resident_director import (
+                among_residents,
+            )  # with what draws their graph
+
+            director = among_residents(
+                director, scenario, street_map, street, lambda: crowd.street.people
+            )
+        injected = InjectedPeople(
+            director,
+            clock.tick_ms,
+            partial(on_map, street_map),
+            scenario.route_line,
+            scenario.start_pose,
+            options.injections,
+        )
+        directed: Director = injected
+        if scenario.obstacles:
+            directed = AmongObstacles(
+                injected, standing_in(scenario, street_map), lambda: crowd.street.people
+            )
+
+        @cache
+        def free() -> Polygon | MultiPolygon:
+            """Made for those who are told it: props have to be placed along the whole route."""
+            footing = clear_of(
+                fenced(walkable, scenario.barriers), street.standing(around), scenario.obstacles
+            )
+            room = shapely.buffer(footing, -robot.width_m / 2)
+            shapely.prepare(room)
+            return room
+
+        yield StagedScenario(
+            parts=Parts(world, crowd, directed, camera),
+            robot=robot,
+            renderer=renderer,
+            scorer=Scorer(
+                scenario, kinds, street_map, WalkableArea(walkable), robot, world.hidden, clock
+            ),
+            observer=Observer(
+                scenario,
+                manifest,
+                options.seed or 0,
+                lambda now: known(scenario, free(), now),
+                cameras,
+                look,
+            ),
+            eyes=eyes,
+            injected=injected,
+            entrances=crowd.entrances,
+        )
+
+
+def world_of(
+    surface: Surface,
+    barriers: Sequence[Barrier] = (),
+    robot: Robot = COURIER,
+    obstacles: Sequence[Obstacle] = (),
+) -> BulletWorld:
+    """The physics of a surface, not running yet."""
+    return BulletWorld(surface, barriers, robot, obstacles)
+
+
+def crowd_of(scenario: Scenario, before: Entrances | None = None) -> SumoCrowd | EmptyStreet:
+    """The street life of a scenario, not running yet. before: who comes and goes, in place of who
+    would be drawn."""
+    net_path, street_map = place(scenario.place)
+    robot = robot_called(scenario.robot)
+    start_xy = scenario.start[:2]
+    if goes_by_itself(street_map, scenario.crowd, before):
+        return EmptyStreet(street_map, scenario.seed, start_xy)
+    closed = frozenset(Port(barrier.strip, barrier.end) for barrier in scenario.barriers)
+    return sumo_crowd(
+        net_path,
+        street_map,
+        scenario.crowd,
+        scenario.seed,
+        closed,
+        start_xy,
+        robot.footprint_m,
+        before,
+        standing_in(scenario, street_map),
+    )
+
+
+def sumo_crowd(
+    net_path: Path,
+    street_map: StreetMap,
+    spec: CrowdSpec,
+    seed: int,
+    closed: frozenset[Port],
+    start_xy: tuple[float, float],
+    footprint_m: tuple[float, float] = COURIER.footprint_m,
+    before: Entrances | None = None,
+    standing: Standing | None = None,
+) -> SumoCrowd:
+    """The street life of any net, not running yet, by SUMO. Raises MachineError if it cannot be
+    loaded."""
+    try:
+        from sumo_nets.crowd.crowd import SumoCrowd
+    except (ImportError, OSError) as error:
+        raise MachineError(f"SUMO cannot be loaded: {error}. `cosim doctor` says more") from error
+
+    return SumoCrowd(
+        net_path, street_map, spec, seed, closed, start_xy, footprint_m, before, standing
+    )
+
+
+def standing_in(scenario: Scenario, street_map: StreetMap) -> Standing:
+    """The obstacles of a scenario as people see them."""
+    if not scenario.obstacles:
+        return Standing()
+    around = shapely.union_all([footprint(one, _BESIDE_M) for one in scenario.obstacles])
+    return standing_bodies(scenario.obstacles, street_map.walkable_near(around))
+
+
+def known(scenario: Scenario, free: Polygon | MultiPolygon, now: Moment) -> Privileged:
+    """All that the simulator knows at a moment."""
+    crossings = tuple((c.id, c.enter_s_m, c.leave_s_m) for c in scenario.crossings)
+    street = now.street
+    return Privileged(
+        now.robot,
+        scenario.route_line,
+        now.route_s_m,
+        street.people,
+        street.vehicles,
+        street.signals,
+        crossings,
+        free,
+    )
+
+
+def empty_street(camera: Camera, surface: Surface, robot: Robot, pose: Pose) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8: what a robot would see by a camera at a pose, with nobody in the street."""
+    z_m, _, _ = surface.lean(pose, robot.drive.span_m)
+    return camera.render(RobotState(pose, z_m=z_m), Street(0)).rgb
+
+
+def on_map(street_map: StreetMap, x_m: float, y_m: float) -> bool:
+    """Whether somebody may be there: on a street, or within FRONTAGE_M of one."""
+    return street_map.locate(x_m, y_m, FRONTAGE_M).kind != "off"
+
+
+def clear_of(
+    area: Polygon | MultiPolygon, props: Sequence[Prop], obstacles: Sequence[Obstacle] = ()
+) -> Polygon | MultiPolygon:
+    """An area minus the ground that props and obstacles cover; the area itself where none stands on
+    it."""
+    ground = np.array([*footprints(props), *map(footprint, obstacles)], dtype=object)
+    ground = ground[shapely.intersects(area, ground)]
+    return overlay.difference(area, overlay.union_all(ground)) if len(ground) else area

@@ -1,0 +1,310 @@
+"""One resident: walks to a place, stands about or does what there is to do there, and walks on.
+Pure functions.
+
+States: "walking" along its way; "idle" at a waypoint beside the middle of the sidewalk;
+"interacting" with a bench, a shop window or a bus stop. What is random comes from the generator
+that is handed in when a choice is due.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Sequence
+from typing import Final, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from shapely import covers
+from shapely.geometry import LineString
+
+from cosim.core.geometry import wrap_angle
+from cosim.core.state import Age, Doing, PersonKind
+from cosim.people.steering import SHOULDER_TO_SHOULDER_M, Neighbour, Vector, steered
+from cosim.people.yielding import stepped_round, within_reach_m
+from cosim.spec.events import Actor, EventQuery
+from scenarios.events.behaviour_graph import BehaviorGraph
+from scenarios.events.walking import robot_of, turned
+
+SPEED_MPS: Final = (1.1, 1.65)
+STAYS_S: Final = {
+    "bench": (20.0, 60.0),
+    "window": (5.0, 25.0),
+    "stop": (15.0, 60.0),
+    "idle": (5.0, 20.0),
+}
+_FAR_M: Final = 120.0
+"""Nobody sets out for something that is farther to walk."""
+TO_DO: Final = 0.75
+"""How likely one goes to do something rather than to stand about, where there is something to
+do."""
+_APART_M: Final = 1.2
+"""Nobody chooses to stand nearer to somebody who stands; two sit on a bench."""
+ACCELERATION_MPS2: Final = 3.0
+ARRIVES_M: Final = 0.04
+PASSES_M: Final = 0.3
+"""So near to a waypoint one goes on to the next."""
+LOOKS_AHEAD_TICKS: Final = 8
+_GIVES_UP_S: Final = 3.0
+"""Who makes no way for so long goes elsewhere."""
+TREADS_MPS: Final = 0.25
+"""What a body shows that turns on the spot: `cosim.people.gait` blends from it into what it does
+next."""
+LEAVES_S: Final = 0.55
+"""How long a body takes from what it did, such as sitting, to the pose in which it treads; it stays
+where it is."""
+LEAVES_MPS: Final = 0.3
+_ABOUT: Final[tuple[Doing, ...]] = ("stand", "look", "phone")
+_FACES_RAD: Final = 0.02
+_DETOURS_RAD: Final = (0.0, 0.4, -0.4, 0.8, -0.8, 1.2, -1.2)
+
+
+class Resident(NamedTuple):
+    """Where a resident stands. way: the nodes still to walk to, the last is the goal; goal: where
+    it goes or is.
+
+    doing: what it does there. since_tick: when it faced what it does; None before. choices: how
+    many it made. moving_mps: velocity of its last step; shown_mps: what its body shows, more where
+    it treads on the spot.
+    """
+
+    number: int
+    x_m: float
+    y_m: float
+    heading_rad: float
+    speed_mps: float
+    goal: int
+    phase: Literal["walking", "idle", "interacting"] = "walking"
+    way: tuple[int, ...] = ()
+    doing: Doing = "stand"
+    stay_s: float = 0.0
+    since_tick: int | None = None
+    moving_mps: Vector = (0.0, 0.0)
+    shown_mps: float = 0.0
+    blocked_ticks: int = 0
+    choices: int = 0
+    age: Age = Age.ADULT
+
+    @property
+    def name(self) -> str:
+        return f"n{self.number}"
+
+
+def resident_actor(resident: Resident) -> Actor:
+    """The resident as the world shows it."""
+    here = resident.phase != "walking" and resident.since_tick is not None
+    return Actor(
+        id=resident.name,
+        x_m=resident.x_m,
+        y_m=resident.y_m,
+        heading_rad=resident.heading_rad,
+        speed_mps=math.hypot(*resident.moving_mps),
+        pace_mps=resident.shown_mps,
+        doing=resident.doing if here else "walk" if resident.shown_mps > 0.0 else "stand",
+        kind=PersonKind.RESIDENT,
+        age=resident.age,
+    )
+
+
+def wants_to_choose(resident: Resident, query: EventQuery) -> bool:
+    """Whether it is done here, or makes no way."""
+    if resident.phase == "walking":
+        return resident.blocked_ticks * query.tick_ms / 1000 >= _GIVES_UP_S
+    return _here_s(resident, query) >= resident.stay_s + LEAVES_S
+
+
+def next_errand(
+    resident: Resident, graph: BehaviorGraph, rng: np.random.Generator, taken: Collection[int]
+) -> Resident:
+    """The resident on its way to something new. taken: nodes where others are or go to."""
+    node = graph.nearest(resident.x_m, resident.y_m)
+    resident = resident._replace(
+        blocked_ticks=0, choices=resident.choices + 1, since_tick=None, phase="walking"
+    )
+    if node is None:
+        return resident
+    distance, _ = graph.distances(node)
+    within = (distance > 0.0) & (distance < _FAR_M)
+    within[sorted({*taken, resident.goal})] = False
+    goal = drawn_spot(graph, within, rng) if rng.random() < TO_DO else None
+    if goal is None:
+        goal = drawn_waypoint(graph, within, rng, taken)
+    if goal is None:
+        return resident
+    return bound_for(resident._replace(way=(node, *graph.way(node, goal))), graph, goal, rng)
+
+
+def drawn_spot(
+    graph: BehaviorGraph, open_to: NDArray[np.bool_], rng: np.random.Generator
+) -> int | None:
+    """One of the nodes (N,) bool where there is something to do: first what, then where; None
+    without any."""
+    offered = [
+        nodes for of_what in graph.by_what.values() if len(nodes := of_what[open_to[of_what]])
+    ]
+    if not offered:
+        return None
+    nodes = offered[int(rng.integers(len(offered)))]
+    return int(nodes[int(rng.integers(len(nodes)))])
+
+
+def drawn_waypoint(
+    graph: BehaviorGraph,
+    open_to: NDArray[np.bool_],
+    rng: np.random.Generator,
+    taken: Collection[int],
+) -> int | None:
+    """One of the waypoints (N,) bool where one may stand about, away from others who stand; without
+    any, where one may not; None without either."""
+    open_to = open_to[: graph.waypoints].copy()
+    for x, y in graph.xy[sorted(taken)].tolist():
+        open_to &= np.hypot(*(graph.xy[: graph.waypoints] - (x, y)).T) > _APART_M
+    aside = open_to & graph.idle
+    nodes = np.flatnonzero(aside if aside.any() else open_to)
+    return int(nodes[int(rng.integers(len(nodes)))]) if len(nodes) else None
+
+
+def bound_for(
+    resident: Resident, graph: BehaviorGraph, goal: int, rng: np.random.Generator
+) -> Resident:
+    """The resident with a goal: what it will do there, and for how long."""
+    spot = graph.spot(goal)
+    low, high = STAYS_S["idle" if spot is None else spot.what]
+    stay_s = float(rng.uniform(low, high))
+    doing = _ABOUT[int(rng.integers(len(_ABOUT)))]
+    if spot is None and not graph.idle[goal]:
+        stay_s = 0.0  # who would stand in the way of others walks on at once
+    elif spot is not None and spot.what != "stop":
+        doing = "sit" if spot.what == "bench" else "look"
+    return resident._replace(goal=goal, doing=doing, stay_s=stay_s)
+
+
+def resident_moved_on(
+    resident: Resident, graph: BehaviorGraph, query: EventQuery, neighbours: Sequence[Neighbour]
+) -> Resident:
+    """One tick on."""
+    if resident.phase == "walking":
+        return _walked(resident, graph, query, neighbours)
+    if resident.since_tick is None:
+        return _turned(resident, graph, query)
+    leaves = _here_s(resident, query) >= resident.stay_s
+    return resident._replace(shown_mps=LEAVES_MPS if leaves else 0.0)
+
+
+def arrived(resident: Resident, graph: BehaviorGraph) -> Resident:
+    """The resident at its goal, about to turn to what it does there."""
+    x, y = graph.points[resident.goal]
+    phase: Literal["idle", "interacting"] = (
+        "idle" if graph.spot(resident.goal) is None else "interacting"
+    )
+    return resident._replace(
+        x_m=x, y_m=y, phase=phase, way=(), moving_mps=(0.0, 0.0), since_tick=None
+    )
+
+
+def _turned(resident: Resident, graph: BehaviorGraph, query: EventQuery) -> Resident:
+    spot = graph.spot(resident.goal)
+    wanted = resident.heading_rad if spot is None else spot.heading_rad
+    heading = turned(resident.heading_rad, wanted, query.tick_ms / 1000)
+    if abs(wrap_angle(heading - wanted)) > _FACES_RAD:
+        return resident._replace(heading_rad=heading, moving_mps=(0.0, 0.0), shown_mps=TREADS_MPS)
+    return resident._replace(
+        heading_rad=wanted, moving_mps=(0.0, 0.0), shown_mps=0.0, since_tick=query.tick
+    )
+
+
+def _walked(
+    resident: Resident, graph: BehaviorGraph, query: EventQuery, neighbours: Sequence[Neighbour]
+) -> Resident:
+    if not resident.way:
+        return resident._replace(
+            moving_mps=(0.0, 0.0), shown_mps=0.0, blocked_ticks=resident.blocked_ticks + 1
+        )
+    tick_s = query.tick_ms / 1000
+    at = resident.x_m, resident.y_m
+    way = _ahead(resident, graph, query)
+    x, y = graph.points[way[0]]
+    far_m = math.dist(at, (x, y))
+    if len(way) == 1 and far_m < max(ARRIVES_M, 0.5 * resident.shown_mps * tick_s):
+        return arrived(resident, graph)._replace(
+            moving_mps=((x - at[0]) / tick_s, (y - at[1]) / tick_s)
+        )
+    pace = resident.speed_mps if len(way) > 1 else min(resident.speed_mps, max(0.35, far_m / 0.5))
+    pace = min(pace, far_m / tick_s)
+    wanted = (pace * (x - at[0]) / max(far_m, 1e-9), pace * (y - at[1]) / max(far_m, 1e-9))
+    velocity = _eased(
+        resident.moving_mps, steered(at, resident.moving_mps, wanted, neighbours), tick_s
+    )
+    after = _stepped(at, velocity, graph, query, neighbours, tick_s)
+    moved = (after[0] - at[0]) / tick_s, (after[1] - at[1]) / tick_s
+    shown = math.hypot(*moved)
+    heading = resident.heading_rad
+    if shown > 0.1:
+        heading = turned(heading, math.atan2(moved[1], moved[0]), tick_s)
+    slow = shown < 0.3 * pace
+    return resident._replace(
+        x_m=after[0],
+        y_m=after[1],
+        heading_rad=heading,
+        moving_mps=moved,
+        shown_mps=shown,
+        way=way,
+        blocked_ticks=resident.blocked_ticks + 1 if slow else 0,
+    )
+
+
+def _ahead(resident: Resident, graph: BehaviorGraph, query: EventQuery) -> tuple[int, ...]:
+    """The way without the waypoints that are reached, or that one need not touch any more."""
+    way = resident.way
+    at = (resident.x_m, resident.y_m)
+    while len(way) > 1 and math.dist(at, graph.points[way[0]]) < PASSES_M:
+        way = way[1:]
+    looks = (query.tick + resident.number) % LOOKS_AHEAD_TICKS == 0
+    if len(way) > 1 and looks and covers(graph.ground, LineString([at, graph.points[way[1]]])):
+        way = way[1:]
+    return way
+
+
+def _eased(before: Vector, wanted: Vector, tick_s: float) -> Vector:
+    """The velocity changed no faster than a body can."""
+    dx, dy = wanted[0] - before[0], wanted[1] - before[1]
+    share = min(1.0, ACCELERATION_MPS2 * tick_s / max(math.hypot(dx, dy), 1e-9))
+    return before[0] + share * dx, before[1] + share * dy
+
+
+def _stepped(
+    at: Vector,
+    velocity: Vector,
+    graph: BehaviorGraph,
+    query: EventQuery,
+    neighbours: Sequence[Neighbour],
+    tick_s: float,
+) -> Vector:
+    """Where a step leads: round the robot, never off the graph's ground, nor into somebody; where
+    it is if nowhere."""
+    robot = robot_of(query)
+    for turn_rad in _DETOURS_RAD:
+        cos, sin = math.cos(turn_rad), math.sin(turn_rad)
+        onward = (
+            at[0] + tick_s * (cos * velocity[0] - sin * velocity[1]),
+            at[1] + tick_s * (sin * velocity[0] + cos * velocity[1]),
+        )
+        if math.dist(onward, robot.pose[:2]) < within_reach_m(robot):
+            x, y = stepped_round(np.array([at]), np.array([onward]), robot)[0].tolist()
+            onward = x, y
+        if graph.free(*onward) and not any(_nearer(at, onward, one) for one in neighbours):
+            return onward
+    return at
+
+
+def _nearer(at: Vector, onward: Vector, one: Neighbour) -> bool:
+    """Whether a step leads nearer to somebody who is too near."""
+    far_m = math.hypot(onward[0] - one.x_m, onward[1] - one.y_m)
+    return far_m < SHOULDER_TO_SHOULDER_M and far_m < math.hypot(at[0] - one.x_m, at[1] - one.y_m)
+
+
+def _here_s(resident: Resident, query: EventQuery) -> float:
+    return (
+        -math.inf
+        if resident.since_tick is None
+        else (query.tick - resident.since_tick) * query.tick_ms / 1000
+    )

@@ -1,0 +1,201 @@
+"""Residents beside the pedestrians of the events. A director around a director.
+
+So many are kept around the robot. They come and go out of its sight, and each draws from generators
+of its own, so what one does hangs on nothing but the scenario, its number, and what it meets.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.geometry import Floats
+from cosim.core.state import Age, People, PersonKind
+from cosim.episode.interfaces import Director
+from cosim.people.steering import STEERING_NEAR_M, Neighbour
+from cosim.place.street_map import StreetMap
+from cosim.spec.events import EventQuery, EventReply
+from cosim.spec.scenario import Scenario
+from physics.street.street_surface import StreetSurface
+from scenarios.events.behaviour_graph import BehaviorGraph, behavior_graph
+from scenarios.events.resident import (
+    SPEED_MPS,
+    Resident,
+    arrived,
+    bound_for,
+    drawn_spot,
+    drawn_waypoint,
+    next_errand,
+    resident_actor,
+    resident_moved_on,
+    wants_to_choose,
+)
+from scenarios.events.sight import SHARED, STILL_MPS
+from sumo_nets.crowd.demand import FIRST_FILL_CLEAR_M, SIGHT_M
+from sumo_nets.crowd.group_sampling import ELDERLY_SHARE
+
+WITHIN_M: Final = 60.0
+"""Residents appear no farther from the robot."""
+GONE_M: Final = 70.0
+"""Beyond this they are gone."""
+_ROLL_TICKS: Final = 10
+"""How often they come and go."""
+_ROOM_M: Final = 1.5
+"""Nobody appears nearer to somebody."""
+SETTLED: Final = 0.5
+"""How likely somebody who appears is busy already, where there is something to do."""
+_MOST_NEIGHBOURS: Final = 6
+_KIND: Final = 0x8E51
+"""Tells the generators of residents from others of the same seed."""
+
+
+def among_residents(
+    director: Director,
+    scenario: Scenario,
+    street_map: StreetMap,
+    ground: StreetSurface,
+    people: Callable[[], People],
+) -> Director:
+    """A director with the scenario's residents around it; itself where there are none."""
+    count = scenario.crowd.residents
+    if not count:
+        return director
+    graph = behavior_graph(
+        street_map, ground, scenario.route, scenario.barriers, scenario.obstacles
+    )
+    return Residents(director, graph, count, scenario.seed, people)
+
+
+class Residents:
+    """Adds residents to another director's replies. people: those on the street now, the residents
+    among them."""
+
+    def __init__(
+        self,
+        director: Director,
+        graph: BehaviorGraph,
+        count: int,
+        seed: int,
+        people: Callable[[], People],
+    ) -> None:
+        self._director = director
+        self._graph = graph
+        self._count = count
+        self._seed = seed
+        self._people = people
+        self._here: dict[int, Resident] = {}
+        self._next = 0
+
+    @property
+    def here(self) -> tuple[Resident, ...]:
+        """Those who are there now."""
+        return tuple(self._here.values())
+
+    def react(self, query: EventQuery) -> EventReply:
+        """The director's reply, with the residents of this tick among its actors."""
+        reply = self._director.react(query)
+        people = self._people()
+        self._advance(query, people)
+        if query.tick % _ROLL_TICKS == 0:
+            self._roll(query, people)
+        if not self._here:
+            return reply
+        return msgspec.structs.replace(
+            reply, actors=(*reply.actors, *map(resident_actor, self._here.values()))
+        )
+
+    def _advance(self, query: EventQuery, people: People) -> None:
+        robot = Neighbour(
+            query.robot_x_m, query.robot_y_m, *_velocity(query.robot_v_mps, query.robot_heading_rad)
+        )
+        for number, resident in list(self._here.items()):
+            if wants_to_choose(resident, query):
+                taken = {one.goal for one in self._here.values() if one.number != number}
+                resident = next_errand(
+                    resident, self._graph, self._rng(number, resident.choices), taken
+                )
+            self._here[number] = resident
+        around = _around([one for one in self._here.values() if one.phase == "walking"], people)
+        for number, resident in list(self._here.items()):
+            self._here[number] = resident_moved_on(
+                resident, self._graph, query, (robot, *around.get(number, ()))
+            )
+
+    def _roll(self, query: EventQuery, people: People) -> None:
+        robot = np.array([query.robot_x_m, query.robot_y_m])
+        for number, one in list(self._here.items()):
+            if np.hypot(one.x_m - robot[0], one.y_m - robot[1]) > GONE_M:
+                del self._here[number]
+        if len(self._here) >= self._count or not len(self._graph):
+            return
+        away = np.hypot(*(self._graph.xy - robot).T)
+        nearest = SIGHT_M if query.tick else FIRST_FILL_CLEAR_M
+        ring = (away >= nearest) & (away <= WITHIN_M)
+        ring[[one.goal for one in self._here.values()]] = False
+        for _ in range(self._count - len(self._here)):
+            others = np.array(
+                [*people.xy.tolist(), *((one.x_m, one.y_m) for one in self._here.values())]
+            )
+            resident = self._appearing(ring, others.reshape(-1, 2), query)
+            if resident is None:
+                return
+            ring[resident.goal] = False
+            self._here[resident.number] = resident
+
+    def _appearing(
+        self, ring: NDArray[np.bool_], others: Floats, query: EventQuery
+    ) -> Resident | None:
+        """Somebody new at one of the nodes (N,) bool, busy there or on the way; None where others
+        leave no room."""
+        number, graph = self._next, self._graph
+        rng = self._rng(number, 0)
+        self._next += 1
+        node = drawn_spot(graph, ring, rng) if rng.random() < SETTLED else None
+        settled = node is not None
+        if node is None:
+            node = drawn_waypoint(graph, ring, rng, ())
+        if node is None or (np.hypot(*(others - graph.xy[node]).T) < _ROOM_M).any():
+            return None
+        x, y = graph.xy[node].tolist()
+        spot = graph.spot(node)
+        heading = float(rng.uniform(-np.pi, np.pi)) if spot is None else spot.heading_rad
+        one = Resident(number, x, y, heading, float(rng.uniform(*SPEED_MPS)), node, choices=1)
+        if settled:
+            one = arrived(bound_for(one, graph, node, rng), graph)
+            one = one._replace(since_tick=query.tick, stay_s=one.stay_s * float(rng.random()))
+        else:
+            one = next_errand(one, graph, rng, {other.goal for other in self._here.values()})
+        return one._replace(age=Age.ELDERLY if rng.random() < ELDERLY_SHARE else Age.ADULT)
+
+    def _rng(self, number: int, choice: int) -> np.random.Generator:
+        return np.random.default_rng([self._seed, _KIND, number, choice])
+
+
+def _around(walking: Sequence[Resident], people: People) -> dict[int, list[Neighbour]]:
+    """The nearest people around each resident that walks, by its number."""
+    if not walking or not len(people):
+        return {one.number: [] for one in walking}
+    at = np.array([(one.x_m, one.y_m) for one in walking])
+    apart = people.xy[None] - at[:, None]
+    square = np.einsum("ijk,ijk->ij", apart, apart)
+    found: dict[int, list[tuple[float, Neighbour]]] = {one.number: [] for one in walking}
+    for k, i in np.argwhere(square < STEERING_NEAR_M**2).tolist():
+        if people.ids[i] != walking[k].name:
+            moving = _velocity(float(people.speed[i]), float(people.heading[i]))
+            x, y = people.xy[i].tolist()
+            steers = people.kind[i] != PersonKind.CROWD and people.speed[i] > STILL_MPS
+            one = Neighbour(x, y, *moving, SHARED if steers else 1.0)
+            found[walking[k].number].append((float(square[k, i]), one))
+    return {
+        number: [one for _, one in sorted(near)[:_MOST_NEIGHBOURS]]
+        for number, near in found.items()
+    }
+
+
+def _velocity(speed_mps: float, heading_rad: float) -> tuple[float, float]:
+    return speed_mps * math.cos(heading_rad), speed_mps * math.sin(heading_rad)

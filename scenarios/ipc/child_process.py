@@ -1,0 +1,159 @@
+"""Processes of this machine: each is started, spoken with over a socket, and ended with everything
+that it has started. Those that run episodes are a transport."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from contextlib import nullcontext, suppress
+from multiprocessing.connection import wait
+from pathlib import Path
+from signal import SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV
+from typing import Final
+
+import msgspec
+
+from cosim.core.child_process import ended_in_words
+from cosim.core.errors import unwritable
+from cosim.core.framing import MOST_WIRED_BYTES, Wire
+from scenarios.ipc.deadlines import Asked, Question
+from scenarios.ipc.messages import Hear, Hello, Job, decode_message, encode_message
+
+WORKER: Final = "scenarios.runs.worker:serve_jobs"
+ENDING_S: Final = 10.0
+"""What a process is left to end by itself, and then its shepherd to clear up."""
+_FAULTS: Final = tuple(-fault for fault in (SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV))
+"""Exit codes of a process that compiled code has ended."""
+_CODE: Final = (
+    "import sys; sys.path[:] = {path!r}; from scenarios.ipc.supervisor import keep_worker; "
+    "keep_worker({serves!r}, {given}, {run})"
+)
+
+
+class LocalProcesses:
+    """Workers that are processes of this machine, so many `jobs`. logs: the folder for what they
+    print."""
+
+    def __init__(self, logs: Path, jobs: int = 1) -> None:
+        self._logs = logs
+        self._jobs = jobs
+        self._started = 0
+        self._processes: list[KeptProcess] = []
+
+    def room(self, busy: int) -> int:
+        return self._jobs - busy
+
+    def unasked(self) -> tuple[()]:
+        return ()
+
+    def start(self, hello: Hello) -> KeptProcess:
+        process = KeptProcess(self._logs / f"worker-{self._started}.log", WORKER, "environment")
+        process.send(encode_message(hello))
+        self._started += 1
+        self._processes.append(process)
+        return process
+
+    def wait(self, timeout_s: float) -> None:
+        self._processes = [process for process in self._processes if process.open]
+        wait([process.wire.fileno() for process in self._processes], timeout_s)
+
+
+class KeptProcess:
+    """A shepherd and its worker (`scenarios.ipc.supervisor`). log: where it keeps what is printed,
+    None for this process's standard error; serves: the function that is the worker; called: what
+    kind of process that is; also: descriptors that it is given besides. open: it has not ended, as
+    far as the run knows. most_bytes: of a message from it."""
+
+    def __init__(
+        self,
+        log: Path | None,
+        serves: str,
+        called: str,
+        also: tuple[int, ...] = (),
+        most_bytes: int = MOST_WIRED_BYTES,
+    ) -> None:
+        self.log = str(log)
+        self.open = True
+        self._called = called
+        self._asked = Asked.new()
+        self._last_asked: Question | None = None
+        self.in_engine = self.away = False
+        ours, theirs = socket.socketpair()
+        self.wire = Wire(ours, most_bytes)
+        given = (theirs.fileno(), self._asked.descriptor, *also)
+        path = [str(Path(entry).absolute()) for entry in sys.path]
+        code = _CODE.format(path=path, serves=serves, given=given, run=os.getpid())
+        try:
+            with nullcontext(2) if log is None else log.open("ab") as printed:
+                self._child = subprocess.Popen(
+                    [sys.executable, "-P", "-c", code],
+                    stdin=subprocess.DEVNULL,
+                    stdout=printed,
+                    stderr=printed,
+                    pass_fds=given,
+                    start_new_session=True,
+                )
+        except OSError as error:
+            raise unwritable(Path(self.log), error) from error
+        finally:
+            theirs.close()
+
+    @property
+    def question(self) -> Question | None:
+        return self._asked.question if self.open else self._last_asked
+
+    def give(self, job: Job) -> None:
+        self.send(encode_message(job))
+
+    def send(self, message: bytes) -> None:
+        """Say something. A process that died or was stopped while it was idle does not hear it."""
+        with suppress(OSError):
+            self.wire.post(message)
+
+    def listen(self, hear: Hear) -> bool:
+        with suppress(OSError):
+            self.wire.flush()
+        try:
+            for message in self.wire.received():
+                hear(decode_message(message))
+        except (EOFError, msgspec.DecodeError):  # a policy can write to the socket, too
+            return False
+        return True
+
+    def hang_up(self) -> None:
+        self.wire.close()
+
+    def kill(self, *, wait: bool = True) -> None:
+        self._child.send_signal(signal.SIGTERM)
+        if wait:
+            self.end()
+
+    def end(self) -> str:
+        self.wire.close()
+        code = self._code(ENDING_S)
+        if code is None:
+            self._child.send_signal(signal.SIGTERM)
+            if self._code(2 * ENDING_S) is None:
+                self._child.kill()
+                self._child.wait()
+        if self.open:
+            self._last_asked = self._asked.question
+            self.open = False
+            self._asked.close()
+        during = f" in the policy's {self._last_asked.when}" if self._last_asked is not None else ""
+        self.in_engine = self._last_asked is None and code in _FAULTS
+        return f"the {self._called} process {_in_words(code)}{during}"
+
+    def _code(self, wait_s: float) -> int | None:
+        """Its exit code; None if it has not ended in time."""
+        try:
+            return self._child.wait(wait_s)
+        except subprocess.TimeoutExpired:
+            return None
+
+
+def _in_words(code: int | None) -> str:
+    return "closed its pipe to the run" if code is None else ended_in_words(code)

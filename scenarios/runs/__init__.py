@@ -1,0 +1,1 @@
+"""Runs of many episodes: local processes, Zenoh workers, Ray, policy hosts."""

@@ -1,0 +1,294 @@
+"""How long a run takes on this machine: said before it starts, learned from every run that was
+there.
+
+After a run one line for each of its episodes is added to `pace.jsonl` in the cache folder. It is a
+help, no result: where it cannot be read or written nothing is lost but the estimate.
+"""
+
+from __future__ import annotations
+
+import heapq
+import os
+import platform
+import re
+import statistics
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import msgspec
+import numpy as np
+
+from cosim.core.cache import cache_folder
+from cosim.core.clock import Clock
+from cosim.core.errors import CosimError
+from cosim.core.telling import duration
+from cosim.results.record import Record
+from cosim.results.run_folder import RunFolder
+from cosim.spec.scenario import Scenario
+
+FILE: Final = "pace.jsonl"
+EPISODES_KEPT: Final = 500
+"""So many lines stay when there are twice as many."""
+RECENT: Final = 40
+"""The newest episodes that are looked at: the code and the machine change."""
+ENOUGH: Final = 3
+"""Of fewer episodes nothing is concluded."""
+DRIVES_MPS: Final = (0.9, 1.4)
+"""How fast most policies come along, waiting at red included."""
+SIMULATES: Final = (3.0, 8.0)
+"""Simulated seconds a second of an environment process, on a core of most machines."""
+SETS_UP_S: Final = (2.0, 10.0)
+"""Until an episode's first tick: more where its city is not built yet."""
+COMPARES: Final = 1.4
+"""The time of an episode that is compared with its street without the robot, in episodes that are
+not."""
+AT_LEAST: Final = (0.6, 1.5)
+"""No estimate is narrower than this around its middle: a machine has other work, too, at times."""
+_SHARED: Final = 1.4
+"""More processes than were measured share caches and memory: one of them may take so much
+longer."""
+
+
+class Measured(msgspec.Struct, frozen=True, kw_only=True):
+    """An episode that was run. setup_s: until its first tick; work_s: from then on; short: it ends
+    on a failure."""
+
+    machine: str
+    policy: str
+    renderer: str
+    jobs: int
+    short: bool
+    compared: bool
+    route_m: float
+    simulated_s: float
+    work_s: float
+    setup_s: float
+
+
+class Estimate(NamedTuple):
+    """Seconds that a run takes, and what they were taken from."""
+
+    low_s: float
+    high_s: float
+    basis: str
+
+
+def announcement(
+    scenarios: Sequence[Scenario],
+    policy: str,
+    renderer: str,
+    jobs: int,
+    compared: bool,
+    pace: float = 0.0,
+) -> str:
+    """What a run comes to, in one line: episodes, way, simulated time at most, about how long it
+    takes here. pace: see `cosim.spec.options.EpisodeOptions`."""
+    known = recall()
+    cores = len(os.sched_getaffinity(0))
+
+    def taken(jobs: int) -> Estimate:
+        free = estimate(scenarios, known, policy, renderer, jobs, compared, cores)
+        return paced(free, scenarios, known, policy, jobs, pace) if pace else free
+
+    here = taken(jobs)
+    far_m = sum(s.route_line.length_m for s in scenarios)
+    far = f"{far_m / 1000.0:.1f} km" if far_m >= 1000.0 else f"{far_m:.0f} m"
+    most_s = sum(s.time_limit_s for s in scenarios)
+    words = (
+        f"{_episodes(len(scenarios))}, {far} of route, at most {duration(most_s)} of simulated "
+        f"time. "
+    )
+    words += f"About {span(here)} with --jobs {jobs}"
+    if jobs < (most := min(cores, len(scenarios))):
+        words += f", {span(taken(most))} with --jobs {most}"
+    return f"{words}: {here.basis}."
+
+
+def estimate(
+    scenarios: Sequence[Scenario],
+    known: Sequence[Measured],
+    policy: str,
+    renderer: str,
+    jobs: int,
+    compared: bool,
+    cores: int,
+) -> Estimate:
+    """How long scenarios take with `jobs` processes. known: what was measured on this machine, the
+    newest last."""
+    short = all(s.ends_on_failure for s in scenarios)
+    alike = [m for m in known if m.renderer == renderer and m.compared == compared]
+    same = [m for m in alike if (m.policy, m.short) == (policy, short)][-RECENT:]
+    others = alike[-RECENT:] if len(alike) >= ENOUGH else []
+    found = same if len(same) >= ENOUGH else others
+    slots = min(jobs, cores)
+    slower = _SHARED if slots > max((m.jobs for m in found), default=1) else 1.0
+    setup_s = _around([m.setup_s for m in found]) if found else SETS_UP_S
+
+    def taken_s(low_s: Iterable[float], high_s: Iterable[float]) -> tuple[float, float]:
+        fast, slow = (
+            [setup + work for work in works]
+            for setup, works in zip(setup_s, (low_s, high_s), strict=True)
+        )
+        return makespan(fast, slots), slower * makespan(slow, slots)
+
+    lengths_m = [s.route_line.length_m for s in scenarios]
+    if found is same:
+        rates = _around([m.work_s / m.route_m for m in same])
+        basis = f"measured in {_episodes(len(same))} of '{policy}' on this machine"
+        return Estimate(
+            *taken_s(*([rate * metres for metres in lengths_m] for rate in rates)), basis
+        )
+    if others:
+        slow, fast = _around([m.simulated_s / m.work_s for m in others])
+        middle = statistics.median(m.simulated_s / m.work_s for m in others)
+        driven = f"the policy is taken to drive at {DRIVES_MPS[0]:g} to {DRIVES_MPS[1]:g} m/s"
+        basis = f"this machine simulates {middle:.1f} s a second, {driven}"
+    else:
+        slow = SIMULATES[0] / (COMPARES if compared else 1.0)
+        fast = SIMULATES[1]
+        basis = "a guess, as nothing is measured on this machine yet"
+    spans = (
+        [metres / (v * speed) for metres in lengths_m]
+        for v, speed in zip(DRIVES_MPS, (slow, fast), strict=True)
+    )
+    high_s, low_s = spans
+    stuck_s = taken_s([], [s.time_limit_s / slow for s in scenarios])[1]
+    basis += f"; up to {duration(stuck_s)} if it stands still, longer if it thinks long"
+    return Estimate(*taken_s(low_s, high_s), basis)
+
+
+def paced(
+    free: Estimate,
+    scenarios: Sequence[Scenario],
+    known: Sequence[Measured],
+    policy: str,
+    jobs: int,
+    pace: float,
+) -> Estimate:
+    """How long the same takes where episodes are held to `pace` times real time. free: how long it
+    takes where they are not."""
+    short = all(s.ends_on_failure for s in scenarios)
+    same = [m for m in known if (m.policy, m.short) == (policy, short)][-RECENT:]
+    if len(same) >= ENOUGH:
+        rates = _around([m.simulated_s / m.route_m for m in same])
+        basis = f"as fast as {_episodes(len(same))} of '{policy}' on this machine drove, "
+    else:
+        rates = (1.0 / DRIVES_MPS[1], 1.0 / DRIVES_MPS[0])
+        basis = f"the policy is taken to drive at {DRIVES_MPS[0]:g} to {DRIVES_MPS[1]:g} m/s, "
+    low_s, high_s = (
+        makespan([setup_s + rate * s.route_line.length_m / pace for s in scenarios], jobs)
+        for setup_s, rate in zip(SETS_UP_S, rates, strict=True)
+    )
+    if low_s <= free.low_s and high_s <= free.high_s:
+        return free
+    stuck_s = makespan([s.time_limit_s / pace for s in scenarios], jobs)
+    basis += (
+        f"held to {pace:g} x real time; up to {duration(stuck_s)} if it stands still, longer if "
+        f"it thinks long"
+    )
+    return Estimate(max(low_s, free.low_s), max(high_s, free.high_s), basis)
+
+
+def makespan(taken_s: Sequence[float], slots: int) -> float:
+    """When the last of several tasks ends that are begun in order by `slots` workers."""
+    free_at = [0.0] * slots
+    for one_s in taken_s:
+        heapq.heapreplace(free_at, free_at[0] + one_s)
+    return max(free_at)
+
+
+def span(found: Estimate) -> str:
+    """An estimate in words: 9 to 15 min."""
+    low, high = duration(found.low_s), duration(found.high_s)
+    if low == high:
+        return low
+    return (
+        f"{low.split()[0]} to {high}" if low.split()[1:] == high.split()[1:] else f"{low} to {high}"
+    )
+
+
+@contextmanager
+def remembered(
+    held: RunFolder, todo: Sequence[Scenario], jobs: int, pace: float = 0.0
+) -> Iterator[None]:
+    """What of `todo` is finished in the block is remembered at its end, however it ends. Episodes
+    that are held to a `pace` are not: they do not show how fast this machine is."""
+    try:
+        yield
+    finally:
+        if not pace:
+            with suppress(OSError, CosimError, KeyError):
+                remember(held, todo, jobs)
+
+
+def remember(held: RunFolder, todo: Sequence[Scenario], jobs: int) -> None:
+    """Add the episodes of a run that are finished to what is known of this machine."""
+    lines = []
+    for scenario in todo:
+        path = held.episode_folder(scenario.id) / "record.json"
+        if path.exists() and (record := Record.load(path)).ended is not None:
+            one = measured(record, scenario, held.spec.policy, held.spec.counterfactual, jobs)
+            lines.append(msgspec.json.encode(one))
+    if not lines:
+        return
+    path = cache_folder() / FILE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("ab") as file:
+        file.write(b"".join(line + b"\n" for line in lines))
+    if len(every := path.read_bytes().splitlines(keepends=True)) > 2 * EPISODES_KEPT:
+        short = path.with_name(f"{FILE}.{os.getpid()}.part")
+        short.write_bytes(b"".join(every[-EPISODES_KEPT:]))
+        short.replace(path)
+
+
+def measured(
+    record: Record, scenario: Scenario, policy: str, compared: bool, jobs: int
+) -> Measured:
+    """What an episode took."""
+    setup_s = record.clock["setup_s"]
+    return Measured(
+        machine=machine(),
+        policy=policy,
+        renderer=record.renderer,
+        jobs=jobs,
+        short=scenario.ends_on_failure,
+        compared=compared,
+        route_m=scenario.route_line.length_m,
+        simulated_s=Clock().time_s(record.ticks),
+        work_s=max(record.clock["wall_s"] - setup_s, 1e-3),
+        setup_s=setup_s,
+    )
+
+
+def recall() -> list[Measured]:
+    """What was measured on this machine, the newest last; lines that are no such thing are left
+    out."""
+    found = []
+    with suppress(OSError):
+        for line in (cache_folder() / FILE).read_bytes().splitlines():
+            with suppress(msgspec.DecodeError):
+                found.append(msgspec.json.decode(line, type=Measured))
+    here = machine()
+    return [one for one in found if one.machine == here]
+
+
+def machine() -> str:
+    """Machines of the same processor and as many usable cores take the same time."""
+    with suppress(OSError):
+        if model := re.search(
+            r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE
+        ):
+            return f"{model.group(1)} x{len(os.sched_getaffinity(0))}"
+    return f"{platform.machine()} x{len(os.sched_getaffinity(0))}"
+
+
+def _around(values: Sequence[float]) -> tuple[float, float]:
+    """Between which two most values lie, and never narrower than AT_LEAST."""
+    low, middle, high = np.quantile(values, [0.2, 0.5, 0.8])
+    return float(min(low, AT_LEAST[0] * middle)), float(max(high, AT_LEAST[1] * middle))
+
+
+def _episodes(count: int) -> str:
+    return f"{count} episode" if count == 1 else f"{count} episodes"

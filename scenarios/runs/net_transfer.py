@@ -1,0 +1,128 @@
+"""Street nets that travel from the coordinator to workers, by their hash: maps that a user has
+imported.
+
+What a worker can make by itself does not travel: generated cities and places that come with SUMO.
+All of it is held against the coordinator's hash before an episode is run on it.
+"""
+
+from __future__ import annotations
+
+import zlib
+from typing import Final
+
+import msgspec
+
+from bridge.codec import decode, encode
+from cosim.core.errors import EngineError, unwritable
+from cosim.spec.scenario import CityMap, Place
+from scenarios.places.nets import place
+from scenarios.runs.protocol import NetAsked, NetPart
+from sumo_nets.maps.feature_file import NAME
+from sumo_nets.maps.map_store import ABOUT, NAMES, known_maps, map_hash, map_net, maps_folder
+from sumo_nets.maps.scratch import move_in, scratch_in
+
+_PART_BYTES: Final = 2 << 20
+_MOST_BYTES: Final = 1 << 30
+_NET: Final = "net.xml"
+_FILES: Final = (_NET, ABOUT, NAME)
+
+
+def travels(where: Place) -> bool:
+    """Whether a place is a map that somebody has imported."""
+    if not isinstance(where, CityMap):
+        return False
+    known = known_maps().get(where.map)
+    return known is None or known.origin == "imported"
+
+
+def lacks(where: Place) -> bool:
+    """Whether it is one that is not here."""
+    return isinstance(where, CityMap) and where.map not in known_maps()
+
+
+class Nets:
+    """What a coordinator hands out: the maps of its run."""
+
+    def __init__(self) -> None:
+        self._hashes: dict[Place, str] = {}
+        self._packed: dict[str, bytes] = {}
+        self._maps: dict[str, CityMap] = {}
+
+    def hash_of(self, where: Place) -> str:
+        """By which workers know a place's net."""
+        if where not in self._hashes:
+            self._hashes[where] = where.net_hash or place(where)[1].net_hash
+        if isinstance(where, CityMap):
+            self._maps[self._hashes[where]] = where
+        return self._hashes[where]
+
+    def part(self, digest: str, payload: bytes) -> bytes:
+        """An answer to who asks for a net. Raises EngineError for one that is not of this run."""
+        where = self._maps.get(digest)
+        if where is None or not travels(where):
+            raise EngineError(f"this run has no map '{digest}' to hand out")
+        if digest not in self._packed:
+            folder = map_net(where).parent
+            files = {
+                name: (folder / name).read_bytes() for name in _FILES if (folder / name).exists()
+            }
+            self._packed[digest] = zlib.compress(msgspec.msgpack.encode(files), 1)
+        packed = self._packed[digest]
+        begin = decode(payload, NetAsked).begin
+        return encode(NetPart(begin, len(packed), packed[begin : begin + _PART_BYTES]))
+
+
+class Fetched:
+    """A map on its way to a worker."""
+
+    def __init__(self, where: CityMap, digest: str) -> None:
+        self._where = where
+        self.digest = digest
+        self._packed = bytearray()
+
+    @property
+    def asks(self) -> bytes:
+        """For the next part."""
+        return encode(NetAsked(len(self._packed)))
+
+    def take(self, payload: bytes) -> bool:
+        """Take in a part. Returns whether it was the last one: then the map is kept here, under its
+        name.
+
+        Raises MachineError when it cannot be kept, EngineError when it is not what was asked
+        for."""
+        part = decode(payload, NetPart)
+        if part.whole > _MOST_BYTES:
+            raise EngineError(
+                f"map '{self._where.map}' of {part.whole >> 20} MB is more than is taken"
+            )
+        if part.begin == len(self._packed):
+            self._packed += part.data
+        if len(self._packed) < part.whole:
+            return False
+        self._keep()
+        return True
+
+    def _keep(self) -> None:
+        name = self._where.map
+        folder = maps_folder()
+        try:
+            opened = zlib.decompressobj()
+            files = decode(opened.decompress(bytes(self._packed), _MOST_BYTES), dict[str, bytes])
+        except zlib.error as error:
+            raise EngineError(f"map '{name}' was damaged on its way: {error}") from error
+        if not NAMES.fullmatch(name) or not {_NET, ABOUT} <= files.keys() <= set(_FILES):
+            raise EngineError(f"what came as map '{name}' is none")
+        try:
+            with scratch_in(folder) as scratch:
+                ready = scratch / "ready"
+                ready.mkdir()
+                for file, data in files.items():
+                    (ready / file).write_bytes(data)
+                if (found := map_hash(ready / _NET)) != self.digest:
+                    raise EngineError(
+                        f"map '{name}' came with hash {found} in place of {self.digest}"
+                    )
+                move_in(ready, folder / name, in_place=False)
+        except OSError as error:
+            raise unwritable(folder, error, "set COSIM_CACHE to another folder") from error

@@ -1,0 +1,186 @@
+"""A run's shared renderer: started, replaced when it ends, ended with the run.
+
+The run holds the socket that environments connect to, so that its address lasts while renderers
+come and go: who connects in between waits for the next one.
+"""
+
+from __future__ import annotations
+
+import secrets
+import select
+import socket
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import Final, NamedTuple, Self
+
+import msgspec
+
+from cosim.core.errors import MachineError, UsageError
+from cosim.episode.policy_caller import Driver
+from cosim.spec.manifest import Manifest
+from cosim.spec.options import CameraName, RendererAt
+from scenarios.ipc.child_process import KeptProcess
+from scenarios.ipc.deadlines import Patience
+from scenarios.ipc.messages import Hello, Message, Ready, Unable
+from scenarios.ipc.render_protocol import RendererHello, encode_exchange
+
+RENDERERS: Final = 3
+"""So many may end, one after the other, without an episode that ends in between."""
+_SILENCE_S: Final = 120.0
+"""A renderer that says nothing for so long, while its policy has nothing to answer, hangs."""
+_ENDING_S: Final = 5.0
+"""How long an ended renderer's socket to the run may stay open, after those to its environments."""
+_SERVES: Final = "scenarios.runs.renderer:serve_pictures"
+
+
+class End(NamedTuple):
+    """How a renderer ended. words: in words; unanswered_s: how long its policy gave no answer,
+    where that was why."""
+
+    words: str
+    unanswered_s: float | None = None
+
+
+class SharedRenderer:
+    """Use it in a `with` block. logs: the folder for what renderers print. hello: the policy of the
+    run; asks: whether it is asked there. at: what environments are told of it."""
+
+    def __init__(
+        self, logs: Path, hello: Hello, *, asks: bool, patience: Patience = Patience()
+    ) -> None:
+        self._logs = logs
+        self._patience = patience
+        self.at = RendererAt(address=f"cosim-renderer-{secrets.token_hex(8)}", asks=asks)
+        self._hello = msgspec.structs.replace(hello, renderer=self.at)
+        self._listening = socket.socket(socket.AF_UNIX)
+        self._process: KeptProcess | None = None
+        self._ends: list[End] = []
+        self._in_a_row = 0
+        self._ready = False
+        self._heard_at_s = 0.0
+
+    def __enter__(self) -> Self:
+        self._listening.bind(f"\0{self.at.address}")
+        self._listening.listen(socket.SOMAXCONN)
+        self.tend()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._process is not None:
+            self._process.hang_up()
+            self._process.kill()
+            self._process = None
+        self._listening.close()
+
+    def tend(self) -> None:
+        """Take in what the renderer says; start another if it has ended or hangs. Raises UsageError
+        when it cannot load the policy, MachineError when there can be none."""
+        if self._process is None:
+            self._start()
+        elif not self._process.listen(self._take):
+            words = self._process.end()
+            asked = self._process.question is not None
+            self._replace(End(words), blames_policy=asked)
+        elif (question := self._process.question) is not None:
+            self._heard_at_s = time.monotonic()
+            if question.overdue(self._patience):
+                self._process.kill()
+                allowed_s = self._patience.of(question.doing)
+                if question.doing == "loading":
+                    raise UsageError(
+                        f"policy '{self._hello.manifest.name}' gave no answer for "
+                        f"{allowed_s:g} s while it was loaded "
+                        "in the renderer process: give a longer --start-timeout"
+                    )
+                self._replace(End("the renderer process was ended", allowed_s), blames_policy=True)
+        elif time.monotonic() - self._heard_at_s > _SILENCE_S:
+            self._process.kill()
+            self._replace(End("the renderer process showed no sign of life"), blames_policy=False)
+
+    def end_of(self, number: int) -> End | None:
+        """How the renderer of that number ended; None if it goes on, and an environment alone has
+        lost it. 0: that of one that has not answered at all."""
+        if number == 0:
+            return End("the renderer process could not be reached")
+        deadline_s = time.monotonic() + _ENDING_S
+        while (
+            number > len(self._ends) and self._process is not None and time.monotonic() < deadline_s
+        ):
+            select.select([self._process.wire], [], [], 0.1)
+            self.tend()
+        return self._ends[number - 1] if number <= len(self._ends) else None
+
+    def episode_ended(self) -> None:
+        """The run comes along."""
+        self._in_a_row = 0
+
+    def _start(self) -> None:
+        log = self._logs / f"renderer-{len(self._ends)}.log"
+        self._process = KeptProcess(log, _SERVES, "renderer", (self._listening.fileno(),))
+        self._process.send(encode_exchange(RendererHello(self._hello, len(self._ends) + 1)))
+        self._ready = False
+        self._heard_at_s = time.monotonic()
+
+    def _take(self, message: Message) -> None:
+        self._heard_at_s = time.monotonic()
+        if isinstance(message, Unable):
+            raise (
+                UsageError(message.reason)
+                if message.blames_policy
+                else MachineError(message.reason)
+            )
+        self._ready |= isinstance(message, Ready)
+
+    def _replace(self, end: End, *, blames_policy: bool) -> None:
+        """The renderer has ended. Raises the run's error when it does so again and again."""
+        assert self._process is not None
+        self._ends.append(end)
+        if (
+            self._ready and blames_policy
+        ):  # counted as attempts of the episodes that it was asked for
+            self._start()
+            return
+        self._in_a_row += 1
+        if self._in_a_row >= RENDERERS:
+            told = (
+                f"{end.words}, {RENDERERS} times, and no episode ended in between: see "
+                f"{self._process.log}"
+            )
+            if blames_policy:
+                raise UsageError(f"policy '{self._hello.policy}' cannot be loaded: {told}")
+            raise MachineError(
+                f"{told}, and `cosim doctor`; without --shared-renderer each environment "
+                f"draws for itself"
+            )
+        self._start()
+
+
+def check_shared(driver: Driver, camera: CameraName) -> bool:
+    """Whether the shared renderer of a run asks the policy, too. Raises UsageError where it has
+    nothing to do.
+
+    camera: what draws the pictures of the run."""
+    manifest: Manifest = driver.manifest
+    if manifest.camera is None and not driver.batches:
+        raise UsageError(
+            f"policy '{manifest.name}' has no camera and no method 'act_batch': leave "
+            "--shared-renderer out, there is nothing to share"
+        )
+    if manifest.cameras or (manifest.camera is not None and manifest.camera.depth):
+        raise UsageError(
+            f"policy '{manifest.name}' asks for "
+            f"{'further cameras' if manifest.cameras else 'depth'}, which a shared "
+            "renderer does not give: leave --shared-renderer out"
+        )
+    if manifest.camera is not None and camera != "gl":
+        raise UsageError(
+            f"--shared-renderer draws by OpenGL, not by the {camera} camera: use --camera gl "
+            "(`cosim doctor` says whether it works here), or leave --shared-renderer out"
+        )
+    return driver.batches

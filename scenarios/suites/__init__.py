@@ -1,0 +1,1 @@
+"""Frozen suites, their builders, and scenarios written by users."""

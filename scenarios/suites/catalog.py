@@ -1,0 +1,137 @@
+"""SUITES: what ships with the project, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+
+import msgspec
+
+from cosim.core.errors import UsageError, unknown
+from cosim.spec.scenario import Suite, read_suite
+from cosim.spec.selection import scenarios_chosen
+from scenarios.events import EVENT_KINDS
+
+_HERE = Path(__file__).parent
+
+_NAMES = ("unit", "reactive", "long-horizon")
+_FILES = {name: _HERE / f"{name}.json" for name in _NAMES}
+SUITES: Mapping[str, Path] = MappingProxyType(
+    {name: path for name, path in _FILES.items() if path.exists()}
+)
+
+
+def load_suite(name: str) -> Suite:
+    """A shipped suite by name, or one of the user's by the path of its .json file, or of an own
+    scenario's .toml.
+
+    Raises UsageError with the valid names, SpecError naming the file and the field.
+
+    >>> load_suite("long-horizon").scenarios[0].id
+    'lh-001-00'
+    """
+    if name.endswith(".json"):
+        return read_suite(Path(name), EVENT_KINDS)
+    if name.endswith(".toml"):
+        return _own(Path(name))
+    if name not in SUITES:
+        raise unknown("suite", name, [*SUITES, "path/to/suite.json", "path/to/own.toml"])
+    return read_suite(SUITES[name], EVENT_KINDS)
+
+
+def _own(path: Path) -> Suite:
+    from scenarios.suites.user_scenarios.build import suite_of_own
+    from scenarios.suites.user_scenarios.read import read_own
+
+    own = read_own(path)
+    for goal in filter(None, dict.fromkeys(variant.own.goal_protocol for variant in own.variants)):
+        raise UsageError(
+            f"{path}: goal_protocol '{goal}' is of a run: use `cosim scenario run {path}`, "
+            f"or give --goal in its place"
+        )
+    return suite_of_own(own)
+
+
+def holding(scenario_id: str) -> Suite:
+    """The shipped suite with a scenario of this id. Raises UsageError with the valid names."""
+    ids: list[str] = []
+    for name in SUITES:
+        whole = load_suite(name)
+        if scenario_id in (here := [s.id for s in whole.scenarios]):
+            return whole
+        ids += here
+    raise unknown("scenario", scenario_id, ids)
+
+
+def one_scenario(
+    name: str, suite: str | None = None, which: str | None = None
+) -> tuple[Suite, int]:
+    """Find one scenario by its id, or by the path of its file: the suite with it alone, and of how
+    many it is one.
+
+    suite: where to look for the id; by default in the shipped suites. which: of a file, the id or
+    the number, counted from 1; by default the first. Raises UsageError with the valid choices,
+    SpecError for a file with faults.
+    """
+    if not name.endswith((".json", ".toml")):
+        if which is not None:
+            raise UsageError(
+                f"--scenario chooses from a file, and '{name}' is a scenario's id: leave "
+                f"--scenario out"
+            )
+        whole = holding(name) if suite is None else load_suite(suite)
+        return msgspec.structs.replace(whole, scenarios=scenarios_chosen(whole, [name])), 1
+    if suite is not None:
+        raise UsageError(
+            f"{name} is a file: leave --suite out, and choose one of its scenarios by --scenario"
+        )
+    if name.endswith(".json"):
+        whole = load_suite(name)
+        one = _picked([scenario.id for scenario in whole.scenarios], which)
+        return msgspec.structs.replace(whole, scenarios=(whole.scenarios[one],)), len(
+            whole.scenarios
+        )
+    from scenarios.suites.user_scenarios.build import made_one, suite_of
+    from scenarios.suites.user_scenarios.read import read_own
+
+    own = read_own(Path(name))
+    variant = own.variants[_picked([variant.id for variant in own.variants], which)]
+    return suite_of(own, [made_one(variant, own.name)]), len(own.variants)
+
+
+def _picked(ids: Sequence[str], which: str | None) -> int:
+    """Return the index of the scenario with this id or number; 0 for None."""
+    if which is None:
+        return 0
+    if which in ids:
+        return ids.index(which)
+    if which.isdecimal() and 1 <= int(which) <= len(ids):
+        return int(which) - 1
+    raise UsageError(f"{unknown('scenario', which, ids)} Or its number, 1 to {len(ids)}.")
+
+
+def with_crowd(whole: Suite, **asked: float | None) -> Suite:
+    """The suite with these fields of `CrowdSpec` in each scenario: another suite, whose version and
+    rows say so.
+
+    What is None stays as it is. Raises SpecError where a crowd cannot be so.
+    """
+    changes = {field: value for field, value in asked.items() if value is not None}
+    if not changes:
+        return whole
+    replace = msgspec.structs.replace
+    scenarios = tuple(
+        replace(s, crowd=replace(s.crowd, **changes, added=True)) for s in whole.scenarios
+    )
+    version = "-".join([whole.version, *(f"{field}{value:g}" for field, value in changes.items())])
+    return replace(whole, scenarios=scenarios, version=version)
+
+
+def with_robot(whole: Suite, robot: str) -> Suite:
+    """The suite with this robot in each scenario: another suite, whose version says so. Itself
+    where it is there already, or `robot` is "". Raises UsageError with the valid names."""
+    scenarios = tuple(scenario.driven_by(robot) for scenario in whole.scenarios)
+    if scenarios == whole.scenarios:
+        return whole
+    return msgspec.structs.replace(whole, scenarios=scenarios, version=f"{whole.version}-{robot}")

@@ -1,0 +1,46 @@
+"""Daylight of drawn scenarios: any hour, season, clouds and at times fog, as long as a person can
+read the picture."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import numpy as np
+
+from cosim.spec.scenario import Light
+from physics.cameras.sun import sun_direction
+
+LOWEST_SUN_RAD: Final = math.radians(6.0)
+"""The sun stands higher than this: no dusk, no night."""
+FOG_M: Final = (150.0, 1500.0)
+"""How far one sees in fog, least and most: the other side of a street in any."""
+_FOGGY_EACH: Final = 7
+"""Of so many scenarios one has fog."""
+
+
+def drawn_daylight(rng: np.random.Generator, number: int) -> Light:
+    """A light by day. number: of the scenario in its suite: quarters of the year, parts of the day,
+    skies and fog take turns, so that all come as often; the rest is drawn."""
+    day = 1 + int((number % 4 + rng.random()) * 365 / 4)
+    hours = np.arange(0.0, 24.0, 0.25)
+    bright = np.array(
+        [hour for hour in hours.tolist() if sun_rises_rad(hour, day) >= LOWEST_SUN_RAD]
+    )
+    part = np.array_split(bright, 3)[number // 4 % 3]
+    clouds = (number // 12 % 3 + rng.random()) / 3
+    near, far = np.log(FOG_M)
+    fog_m = float(round(math.exp(rng.uniform(near, far))))
+    return Light(
+        hour=float(part[int(rng.integers(len(part)))]),
+        day_of_year=day,
+        cloud_cover=round(float(clouds), 2),
+        fog_m=fog_m if number % _FOGGY_EACH == 0 else None,
+    )
+
+
+def sun_rises_rad(
+    hour: float, day_of_year: int, latitude_deg: float = Light().latitude_deg
+) -> float:
+    """The sun's elevation above the horizon."""
+    return math.asin(float(sun_direction(hour, day_of_year, latitude_deg)[2]))

@@ -1,0 +1,176 @@
+"""Drawing scenarios from a seed until one fits its place, and what every scenario along a route
+has."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from typing import Final, TypeVar
+
+import msgspec
+import numpy as np
+import shapely
+
+from cosim.core.errors import CosimError, SpecError
+from cosim.core.geometry import Polyline
+from cosim.people.yielding import STEP_ROUND_GAP_M
+from cosim.place.street_map import StreetMap, Strip
+from cosim.spec.event_kind import EventKind
+from cosim.spec.robot import COURIER, Robot
+from cosim.spec.scenario import Place, RouteCrossing, Scenario
+from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M
+
+TRIES: Final = 400
+PERSON_M2: Final = 25.0
+"""Sidewalk that every person has at least, on the mean along a route; in generated cities it is
+about 29 m2."""
+_SAMPLE_M: Final = 20.0
+
+FREE_M2: Final = 20.0
+"""Area of sidewalk for each person, less the lane that a robot needs, on routes drawn by users; in
+cities about 21."""
+LARGEST_GROUP_M: Final = 3 * GROUP_STRIPE_M
+"""Width of the largest group, side by side."""
+NARROW_M: Final = 10.0
+"""Up to this length of a route, sidewalks without room to pass a group do not count."""
+
+_Drawn = TypeVar("_Drawn")
+
+
+class Refusals:
+    """Why draws were refused, and how often."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] = Counter()
+
+    def add(self, refusal: CosimError) -> None:
+        """Count one more. What follows a colon is of this draw alone."""
+        self._counts[str(refusal).split(":")[0]] += 1
+
+    def __str__(self) -> str:
+        return "; ".join(f"{reason} ({n} times)" for reason, n in self._counts.most_common())
+
+    @property
+    def most_frequent(self) -> str:
+        """The reason given most often, "" without any."""
+        return self._counts.most_common(1)[0][0] if self._counts else ""
+
+
+def first_that_fits(draw: Callable[[], Scenario], failure: str) -> Scenario:
+    """The first of TRIES draws that is not refused. Raises SpecError, `failure` and how often each
+    reason was given."""
+    refusals = Refusals()
+    found = first_of((draw for _ in range(TRIES)), refusals)
+    if found is None:
+        raise SpecError(f"{failure} in {TRIES} draws: {refusals}")
+    return found
+
+
+def first_of(draws: Iterable[Callable[[], _Drawn]], refusals: Refusals) -> _Drawn | None:
+    """The first draw that is not refused, None when all are; refusals are counted."""
+    for draw in draws:
+        try:
+            return draw()
+        except CosimError as refusal:
+            refusals.add(refusal)
+        except shapely.errors.GEOSException as error:
+            refusals.add(SpecError(f"the ground is too tangled: {error}"))
+    return None
+
+
+def bare_scenario(
+    route: Polyline,
+    crossings: tuple[RouteCrossing, ...],
+    place: Place,
+    street_map: StreetMap,
+    *,
+    suite: str,
+    seed: int,
+    scenario_id: str,
+    time_limit_s: float,
+    robot: Robot = COURIER,
+) -> Scenario:
+    """A scenario from one end of a route to the other, with nothing else in it yet: its builder
+    adds that."""
+    start = route.at(0.0)
+    goal = route.at(route.length_m)
+    return Scenario(
+        id=scenario_id,
+        suite=suite,
+        place=msgspec.structs.replace(place, net_hash=street_map.net_hash),
+        seed=seed,
+        start=(start.x_m, start.y_m, start.heading_rad),
+        goal=(goal.x_m, goal.y_m),
+        route=tuple((float(x), float(y)) for x, y in route.points),
+        crossings=crossings,
+        time_limit_s=time_limit_s,
+        robot=robot.name,
+    )
+
+
+def people_of(kind: EventKind, half_width_m: float, robot: Robot, rng: np.random.Generator) -> int:
+    """How many people a drawn event has on a sidewalk or crosswalk, so that the robot finds room
+    beside them."""
+    if kind.group is not None:
+        return kind.group(half_width_m - 0.5 * wider_m(robot), rng)
+    fewest, most = kind.people
+    return int(rng.integers(fewest, most + 1))
+
+
+def wider_m(robot: Robot) -> float:
+    """By how much a robot is wider than the one that the layouts of events are written for."""
+    return robot.width_m - COURIER.width_m
+
+
+def thinned(scenario: Scenario, street_map: StreetMap) -> Scenario:
+    """The scenario with no more people than the sidewalks within the crowd's radius of its route
+    have room for."""
+    persons = min(
+        scenario.crowd.persons, round(_area_around_m2(scenario, street_map, 0.0) / PERSON_M2)
+    )
+    return msgspec.structs.replace(
+        scenario, crowd=msgspec.structs.replace(scenario.crowd, persons=persons)
+    )
+
+
+def passable(scenario: Scenario, street_map: StreetMap, robot: Robot = COURIER) -> Scenario:
+    """The scenario with a crowd that leaves a robot room to pass.
+
+    There are as many people as fit beside the robot, and no groups where three abreast fill a
+    sidewalk of the route. The shipped suites use `thinned` alone.
+    """
+    scenario = thinned(scenario, street_map)
+    lane_m = robot.width_m + 2.0 * STEP_ROUND_GAP_M
+    line = shapely.LineString(scenario.route)
+    narrow_m = sum(
+        strip.polygon.intersection(line).length
+        for strip in street_map.near("strip", line)
+        if isinstance(strip, Strip)
+        and strip.kind == "sidewalk"
+        and strip.width_m < LARGEST_GROUP_M + lane_m
+    )
+    crowd = scenario.crowd
+    persons = min(crowd.persons, round(_area_around_m2(scenario, street_map, lane_m) / FREE_M2))
+    groups = crowd.groups if narrow_m <= NARROW_M else 0.0
+    return msgspec.structs.replace(
+        scenario, crowd=msgspec.structs.replace(crowd, persons=persons, groups=groups)
+    )
+
+
+def _area_around_m2(scenario: Scenario, street_map: StreetMap, less_m: float) -> float:
+    """Mean area of sidewalk within the crowd's radius of points on the route. less_m: taken off
+    each width."""
+    route = Polyline(np.array(scenario.route))
+    around = [
+        shapely.Point(route.at(float(s_m)).xy).buffer(scenario.crowd.radius_m)
+        for s_m in np.arange(0.0, route.length_m, _SAMPLE_M)
+    ]
+    area_m2 = [
+        sum(
+            strip.polygon.intersection(disc).area * max(1.0 - less_m / strip.width_m, 0.0)
+            for strip in street_map.near("strip", disc)
+            if isinstance(strip, Strip) and strip.kind == "sidewalk"
+        )
+        for disc in around
+    ]
+    return float(np.mean(area_m2))

@@ -1,0 +1,100 @@
+"""Fences all along a way, for maps whose sidewalks lie over one another.
+
+Where a foreign map draws footways beside or across pavements, ground that is walkable leads off the
+way where no port is; fences at the ports leave it open. A hem closes the way's own ground wherever
+it borders on other walkable ground.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+
+from cosim.core.errors import SpecError
+from cosim.core.geometry import Floats
+from cosim.place import overlay
+from cosim.place.barriers import barrier_along, branches, corner_of
+from cosim.place.street_map import SEAM_M, Port, StreetMap, Strip, union_closed
+from cosim.spec.scenario import Barrier
+
+_NEAR_M = 3.0
+"""Ground farther from the way does not border on it."""
+SMOOTH_M = 0.15
+_SHORTEST_M = 0.02
+_BESIDE_M = 0.5
+STRIP_M = 5.0
+"""A fence stands so far from the strip that it names as the second, and as the first, at most."""
+_FAR_M = 10_000.0
+MOST = 150
+"""A way that needs more fences is no way."""
+
+
+def hem(street_map: StreetMap, way: Sequence[Port]) -> tuple[Barrier, ...]:
+    """Fences wherever the ground of a way borders on walkable ground that is not the way's.
+
+    Each names a port that it closes: those by which one could walk off the way, and both ends of
+    each strip that touches it, so that nobody walks through a fence. Raises SpecError when there
+    would be too many.
+    """
+    strips = {port.strip for port in way}
+    corners = sorted({corner_of(street_map, port) for port in way} - {""})
+    pieces = [street_map.strips[name].polygon for name in sorted(strips)]
+    ground = union_closed([*pieces, *(street_map.corners[name].polygon for name in corners)])
+    walkable = street_map.walkable_near(shapely.buffer(ground, _NEAR_M))
+    # What is within SEAM_M of the edge of all that is walkable borders on nothing.
+    border = overlay.intersection(shapely.boundary(ground), shapely.buffer(walkable, -1.2 * SEAM_M))
+    sides = np.array([side for line in shapely.get_parts(border) for side in _sides(line)]).reshape(
+        -1, 2, 2
+    )
+    if len(sides) > MOST:
+        raise SpecError(f"the way would need more than {MOST} fences: {len(sides)}")
+    touching = [
+        s for s in street_map.near("strip", ground) if isinstance(s, Strip) and s.id not in strips
+    ]
+    ends = [Port(s.id, end) for s in touching for end in (0, 1)]
+    ports = list(dict.fromkeys([*branches(street_map, way), *ends]))
+    if not len(sides) or not ports:
+        return ()
+    middles = sides.mean(axis=1)
+    across = sides[:, 1] - sides[:, 0]
+    return tuple(
+        barrier_along(across[i], middles[i], ports[k]) for i, k in _named(street_map, sides, ports)
+    )
+
+
+def _named(street_map: StreetMap, sides: Floats, ports: Sequence[Port]) -> list[tuple[int, int]]:
+    """Numbers of a side and of the port that its fence closes: of the nearest strip the nearest
+    end.
+
+    A port that is no side's nearest is named by a second fence on the same spot, beside its strip.
+    """
+    lines = shapely.linestrings(sides)
+    beside = np.array(
+        [shapely.distance(street_map.strips[port.strip].polygon, lines) for port in ports]
+    ).T
+    ends = np.array(
+        [street_map.strips[port.strip].line[0 if port.end == 0 else -1, :2] for port in ports]
+    )
+    apart = np.hypot(*(sides.mean(axis=1)[:, None] - ends[None]).transpose(2, 0, 1))
+    # Of strips that are equally near the one whose end is nearer.
+    best = (np.round(beside, 1) * _FAR_M + apart).argmin(axis=1)
+    if beside[np.arange(len(sides)), best].max() > STRIP_M:
+        raise SpecError("the way borders on ground that belongs to no strip")
+    named = [(i, int(k)) for i, k in enumerate(best)]
+    for k in sorted(set(range(len(ports))) - set(best.tolist())):
+        i = int(beside[:, k].argmin())
+        if beside[i, k] <= _BESIDE_M:
+            named.append((i, k))
+    return named
+
+
+def _sides(line: shapely.Geometry) -> Floats:
+    """(N, 2, 2) m: the ends of the straight pieces of a line."""
+    if shapely.get_dimensions(line) != 1:
+        return np.empty((0, 2, 2))
+    points = shapely.get_coordinates(shapely.simplify(line, SMOOTH_M))
+    pairs = np.stack([points[:-1], points[1:]], axis=1)
+    straight: Floats = pairs[np.hypot(*(pairs[:, 1] - pairs[:, 0]).T) >= _SHORTEST_M]
+    return straight

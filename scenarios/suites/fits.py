@@ -1,0 +1,227 @@
+"""Whether scenarios fit their places, found out before anything runs."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack
+from multiprocessing import get_context
+from typing import Final
+
+import numpy as np
+import shapely
+from shapely.geometry import LineString, Point
+
+from cosim.core.errors import MachineError, MapError, SpecError, UsageError
+from cosim.core.telling import Tell, untold
+from cosim.place.barriers import outline
+from cosim.place.street_map import StreetMap, WalkableArea
+from cosim.spec.obstacle import footprint
+from cosim.spec.robot import ROBOTS, robot_called
+from cosim.spec.scenario import MOST_PERSONS, Place, RouteCrossing, Scenario, Suite, event_faults
+from cosim.spec.spec_file import in_lines
+from physics.cameras.hdri import read_hdri
+from scenarios.events import EVENT_KINDS
+from scenarios.places.nets import place
+from sumo_nets.crowd.free_space import Room
+
+LOOKING: Final = "looking where the episodes take place"
+_PLACES_A_PROCESS: Final = 8
+"""Fewer are looked at sooner than another process begins."""
+_AROUND_M: Final = 3.0
+"""So much of a place is looked at around routes and events."""
+_SAMPLE_M: Final = 0.5
+_EDGE_M: Final = 0.02
+"""Nearer than this to the edge of the walkable area is on it."""
+BESIDE_STRIP_M: Final = 8.0
+"""So far from the strip that it closes a barrier may stand: strips end where corners begin, and
+those are wide."""
+
+
+def check_places(
+    whole: Suite, scenarios: Sequence[Scenario], tell: Tell = untold, jobs: int = 1
+) -> None:
+    """Make what is needed of the places of some scenarios of a suite, and look whether each fits
+    its own: place by place, by `jobs` processes where there are many.
+
+    Raises SpecError with everything that does not fit, scenario by scenario; what the machine lacks
+    as MachineError.
+    """
+    there: dict[Place, list[Scenario]] = {}
+    for scenario in scenarios:
+        there.setdefault(scenario.place, []).append(scenario)
+    faults = [*_not_here(scenarios), *_odd_events(scenarios)]
+    jobs = min(jobs, len(there) // _PLACES_A_PROCESS)
+    with ExitStack() as stack:
+        if jobs > 1:
+            made = ProcessPoolExecutor(jobs, get_context("spawn"), initializer=_deaf_to_ctrl_c)
+            stack.callback(made.shutdown, cancel_futures=True)
+            found = made.map(_misfits_at, there, there.values())
+        else:
+            found = map(_misfits_at, there, there.values())
+        for number in range(len(there)):
+            tell(LOOKING, number / len(there))
+            try:
+                faults += next(found)
+            except BrokenProcessPool as error:
+                raise MachineError(
+                    "a process that looked at places was ended: is there enough memory?"
+                ) from error
+    if faults:
+        raise SpecError(f"suite '{whole.name}': {in_lines(faults)}")
+
+
+def _deaf_to_ctrl_c() -> None:
+    """Who started this process ends it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _misfits_at(where: Place, scenarios: Sequence[Scenario]) -> list[str]:
+    """What does not fit of scenarios that take place at one place, which is made where there is
+    none."""
+    try:
+        _, street_map = place(where)
+    except (MapError, UsageError, SpecError) as error:
+        more = f" and {len(scenarios) - 1} more" if len(scenarios) > 1 else ""
+        return [f"scenario '{scenarios[0].id}'{more}: {error}"]
+    return [*misfits(scenarios, street_map)]
+
+
+def misfits(scenarios: Sequence[Scenario], street_map: StreetMap) -> Iterator[str]:
+    """What does not fit of scenarios that take place on one map."""
+    spots = {(event.x_m, event.y_m) for scenario in scenarios for event in scenario.events}
+    ways = {
+        scenario.route for scenario in scenarios
+    }  # the union of many that are the same takes very long
+    near = shapely.union_all([*map(LineString, sorted(ways)), *map(Point, sorted(spots))])
+    try:
+        area = WalkableArea(street_map.walkable_near(shapely.buffer(near, _AROUND_M)))
+    except MapError:
+        yield from (
+            f"scenario '{one.id}': start {one.start[:2]} is not on map '{street_map.name}'"
+            for one in scenarios
+        )
+        return
+    for scenario in scenarios:
+        told = (
+            *_off(scenario, area),
+            *_odd_crossings(scenario, street_map),
+            *_odd_barriers(scenario, street_map),
+            *_odd_obstacles(scenario, area),
+            *_crowded(scenario, street_map),
+        )
+        yield from (f"scenario '{scenario.id}': {fault}" for fault in told)
+
+
+def _off(scenario: Scenario, area: WalkableArea) -> Iterator[str]:
+    """Where the route first leaves the walkable area, and which events are off it."""
+    line = scenario.route_line.resampled(_SAMPLE_M)
+    off = np.flatnonzero(area.signed_distance(line.points) < -_EDGE_M)
+    if len(off):
+        (x_m, y_m) = line.points[off[0]]
+        s_m = line.s_m[off[0]]
+        what = "start" if off[0] == 0 else "route"
+        yield (
+            f"{what} is off the walkable area at ({x_m:.2f}, {y_m:.2f}), {s_m:.1f} m along the "
+            f"route"
+        )
+    for event in scenario.events:
+        if area.signed_distance([event.x_m, event.y_m])[0] < -_EDGE_M:
+            yield (
+                f"event '{event.id}' is off the walkable area at ({event.x_m:.2f}, {event.y_m:.2f})"
+            )
+
+
+def _odd_crossings(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
+    """Crossings that the map does not have, or has elsewhere."""
+    for crossing in scenario.crossings:
+        strip = street_map.strips.get(crossing.id)
+        if strip is None or strip.kind != "crossing":
+            yield f"crossing '{crossing.id}' is none of map '{street_map.name}'"
+        elif strip.signalised != crossing.signalised:
+            yield (
+                f"crossing '{crossing.id}': signalised is {strip.signalised} on the map, not "
+                f"{crossing.signalised}"
+            )
+        elif not strip.polygon.intersects(_on(scenario, crossing)):
+            yield f"crossing '{crossing.id}' is not where the route is from enter_s_m to leave_s_m"
+
+
+def _on(scenario: Scenario, crossing: RouteCrossing) -> Point:
+    """The middle of the route's way over a crossing."""
+    return Point(scenario.route_line.at((crossing.enter_s_m + crossing.leave_s_m) / 2).xy)
+
+
+def _odd_barriers(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
+    """Barriers that close what is not there, stand elsewhere, or stand in the robot's way."""
+    route = LineString(scenario.route)
+    robot = ROBOTS.get(scenario.robot)
+    half_width_m = 0.0 if robot is None else robot.width_m / 2
+    for number, barrier in enumerate(scenario.barriers):
+        strip = street_map.strips.get(barrier.strip)
+        fence = outline(barrier)
+        if strip is None:
+            yield f"barriers[{number}].strip '{barrier.strip}' is none of map '{street_map.name}'"
+        elif (far_m := strip.polygon.distance(fence)) > BESIDE_STRIP_M:
+            yield (
+                f"barriers[{number}] stands {far_m:.0f} m from strip '{barrier.strip}', which it "
+                f"should close"
+            )
+        elif fence.distance(route) < half_width_m:
+            yield f"barriers[{number}] on strip '{barrier.strip}' stands across the route"
+
+
+def _odd_obstacles(scenario: Scenario, area: WalkableArea) -> Iterator[str]:
+    """Obstacles that stand where nobody walks, where the robot starts, or on the goal."""
+    start = Point(scenario.start[:2])
+    goal = Point(scenario.goal)
+    robot = ROBOTS.get(scenario.robot)
+    reach_m = 0.0 if robot is None else float(np.hypot(*robot.footprint_m)) / 2
+    for number, obstacle in enumerate(scenario.obstacles):
+        ground = footprint(obstacle)
+        at = f"obstacles[{number}] ({obstacle.kind})"
+        if area.signed_distance([obstacle.x_m, obstacle.y_m])[0] < -_EDGE_M:
+            yield f"{at} is off the walkable area at ({obstacle.x_m:.2f}, {obstacle.y_m:.2f})"
+        elif ground.distance(start) < reach_m:
+            yield f"{at} stands where the robot starts"
+        elif ground.covers(goal):
+            yield f"{at} stands on the goal"
+
+
+def _odd_events(scenarios: Iterable[Scenario]) -> Iterator[str]:
+    """Events of no kind that there is, or not as the row of their kind says."""
+    for scenario in scenarios:
+        yield from (
+            f"scenario '{scenario.id}': {fault}" for fault in event_faults(scenario, EVENT_KINDS)
+        )
+
+
+def _crowded(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
+    """Crowds that by their density are more people than one may ask for by number."""
+    crowd = scenario.crowd
+    if crowd.density is not None:
+        room_m2 = Room(street_map, crowd.radius_m).area_m2(*scenario.start[:2])
+        if (persons := round(crowd.density * room_m2 / 1000.0)) > MOST_PERSONS:
+            yield (
+                f"crowd density {crowd.density:g} within {crowd.radius_m:g} m of the start "
+                f"makes {persons} persons, "
+                f"and at most {MOST_PERSONS} can be had: lower density or radius_m"
+            )
+
+
+def _not_here(scenarios: Iterable[Scenario]) -> Iterator[str]:
+    """Robots and pictures of skies that there are not, each told once."""
+    robots, skies = ({getattr(s, name): s.id for s in scenarios} for name in ("robot", "light"))
+    for robot, scenario_id in robots.items():
+        try:
+            robot_called(robot)
+        except UsageError as error:
+            yield f"scenario '{scenario_id}': {error}"
+    for light, scenario_id in skies.items():
+        try:
+            if light.hdri:
+                read_hdri(light.hdri)
+        except SpecError as error:
+            yield f"scenario '{scenario_id}': {error}"

@@ -1,0 +1,394 @@
+"""Builder of long-horizon scenarios: start and goal far apart in a city, one walkable path, street
+life, events."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence, Set
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import shapely
+from shapely.geometry import LineString
+
+from cosim.core.errors import MapError, SpecError
+from cosim.core.geometry import Polyline
+from cosim.place.barriers import barrier_at, branches, ground_around, prove_single_path
+from cosim.place.car_paths import CAR_M, from_car_paths_m
+from cosim.place.map_check import on_road_shares
+from cosim.place.route_line import ROUTE_M, START_M, way_line
+from cosim.place.street_map import Lane, Port, StreetMap
+from cosim.place.walk_graph import WalkGraph
+from cosim.spec.event_kind import EventKinds
+from cosim.spec.robot import COURIER, Robot
+from cosim.spec.scenario import Barrier, CrowdSpec, Place, RouteCrossing, Scenario
+from scenarios.events import EVENT_KINDS
+from scenarios.suites.drawing import TRIES, Refusals, bare_scenario, first_of
+from scenarios.suites.edge_fences import hem
+from scenarios.suites.obstacles import with_obstacles
+from scenarios.suites.way_events import draw_events
+
+WAY_SPARE_M = 0.045
+"""The way is wider than the robot by this on either side."""
+IN_GROUPS = 0.3
+"""Share of the walkers that walk in groups of two and three."""
+
+ON_ROAD_M = 2.0
+"""So much of a route may lie on lanes that are driven on, where foreign maps draw sidewalks on the
+carriageway."""
+
+TURNED_OVER_M = 0.5
+"""So much of a route may lie where cars turn, which foreign maps draw over corners."""
+_KERB_M = 0.5
+"""A crossing's own ground ends so far beyond its line."""
+_SAMPLE_M = 0.5
+
+CROSSING_EVERY_M = 160.0
+LENGTH_SLACK_M = 3.0
+"""A way of a wanted length is as long as that, but for this."""
+_END_M = 8.0
+"""A goal keeps this far from the ends of its sidewalk."""
+
+SEARCHES = 150
+"""So many ways are searched for where no draw fits."""
+AVOIDED_SHARE = 0.3
+"""Sidewalks with more of their area on roads are not searched."""
+REMEDIES = {
+    "no way of the drawn length": "the walkable pieces are too small or have too few "
+    "crossings: import a larger area",
+    "every long sidewalk": "import another area, or a net with sidewalks beside its roads",
+    "the way lies on a road": "its sidewalks are drawn on the carriageway: see `cosim map "
+    "check MAP -o map.png`",
+    "cars turn over the way": "its corners reach into junctions: see `cosim map "
+    "check MAP -o map.png`",
+    "the way doubles back": "its sidewalks touch one another: see `cosim map check MAP -o "
+    "map.png`; import a part",
+    "the way would need": "its sidewalks lie over one another: see `cosim map check MAP -o "
+    "map.png`; import a part",
+    "": "see `cosim map check MAP -o map.png` for narrow, torn or stacked sidewalks; another "
+    "--seed or a part may do",
+}
+"""What would help, by how the most frequent reason begins."""
+
+
+class _Draft(NamedTuple):
+    """What every draw of a scenario has in common."""
+
+    place: Place
+    street_map: StreetMap
+    graph: WalkGraph
+    seed: int
+    scenario_id: str
+    robot: Robot
+    kinds: EventKinds
+    length_m: float | None
+
+
+_Fences = Callable[[StreetMap, Polyline, Sequence[Port], float], tuple[Barrier, ...]]
+
+
+def build_long_horizon(
+    place: Place,
+    street_map: StreetMap,
+    graph: WalkGraph,
+    seed: int,
+    scenario_id: str,
+    robot: Robot = COURIER,
+    kinds: EventKinds = EVENT_KINDS,
+    length_m: float | None = None,
+) -> Scenario:
+    """A scenario drawn from `seed`; where no draw has exactly one path to the goal, ways are
+    searched for that can be fenced in all along. length_m: of the way; by default drawn, too.
+
+    Raises SpecError with the reason that stands in the way most often, and what would help."""
+    rng = np.random.default_rng([seed, place.seed, 0x10E6])
+    candidates = starts(street_map, graph)
+    if not candidates:
+        raise MapError(f"map '{street_map.name}' has no sidewalk of {START_M:g} m to start on")
+    draft = _Draft(place, street_map, graph, seed, scenario_id, robot, kinds, length_m)
+    drawn, searched = Refusals(), Refusals()
+    draws = (
+        lambda: _along(
+            draft, rng, draw_way(street_map, graph, rng, candidates, length_m), _barriers
+        )
+        for _ in range(TRIES)
+    )
+    found = first_of(draws, drawn) or first_of(_search(draft, candidates), searched)
+    if found is None:
+        reason = searched.most_frequent
+        remedy = next(
+            (words for start, words in REMEDIES.items() if reason.startswith(start)), REMEDIES[""]
+        )
+        failure = (
+            f"no long-horizon route on '{street_map.name}' with seed {seed} in {TRIES} draws "
+            f"({drawn})"
+        )
+        raise SpecError(f"{failure}, and none was found by searching ({searched}): {remedy}")
+    return found
+
+
+def starts(street_map: StreetMap, graph: WalkGraph) -> list[str]:
+    """The sidewalks on which long ways start and end."""
+    return sorted(
+        strip_id
+        for strip_id in graph.main_strips
+        if street_map.strips[strip_id].kind == "sidewalk"
+        and street_map.strips[strip_id].length_m >= START_M
+        if strip_id not in street_map.steep
+    )
+
+
+def _along(
+    draft: _Draft,
+    rng: np.random.Generator,
+    drawn: tuple[Sequence[Port], float, float],
+    fences: _Fences,
+) -> Scenario:
+    """The scenario along a way, as `draw_way` gives it. Raises SpecError when the way does not
+    do."""
+    way = drawn[0]
+    street_map = draft.street_map
+    route, crossings, barriers = lone_route(street_map, drawn, fences, draft.robot, draft.length_m)
+    bare = bare_scenario(
+        route,
+        crossings,
+        draft.place,
+        street_map,
+        suite="long-horizon",
+        seed=draft.seed,
+        scenario_id=draft.scenario_id,
+        time_limit_s=max(300.0, route.length_m / 0.2),
+        robot=draft.robot,
+    )
+    events = draw_events(street_map, route, way, crossings, rng, draft.robot, draft.kinds)
+    parts = {
+        "barriers": barriers,
+        "events": events,
+        "crowd": CrowdSpec(groups=IN_GROUPS),
+        "structure": "route",
+    }
+    return with_obstacles(msgspec.structs.replace(bare, **parts), street_map)
+
+
+def lone_route(
+    street_map: StreetMap,
+    drawn: tuple[Sequence[Port], float, float],
+    fences: _Fences,
+    robot: Robot,
+    length_m: float | None = None,
+) -> tuple[Polyline, tuple[RouteCrossing, ...], tuple[Barrier, ...]]:
+    """The route along a way, as `draw_way` gives it, its crossings, and fences that leave no other
+    route.
+
+    Raises SpecError when the way does not do."""
+    way, *ends_m = drawn
+    route = _line(street_map, way, *ends_m)
+    if length_m is not None:
+        # Corners are cut: what that saves is walked on the last sidewalk.
+        ends_m[1] += length_m - route.length_m
+        if not _END_M <= ends_m[1] <= street_map.strips[way[-1].strip].length_m - _END_M:
+            raise SpecError("no goal at the wanted distance")
+        route = _line(street_map, way, *ends_m)
+        if abs(route.length_m - length_m) > LENGTH_SLACK_M:
+            raise SpecError("the line is not of the wanted length")
+    if not ROUTE_M[0] <= route.length_m <= 1.2 * ROUTE_M[1]:
+        raise SpecError("length of the line does not fit")
+    crossings = route_crossings(street_map, route, way)
+    if on_road_m(street_map, route, crossings) > ON_ROAD_M:
+        raise SpecError("the way lies on a road: cars drive through who walks there")
+    if on_car_paths_m(street_map, route, crossings, robot) > TURNED_OVER_M:
+        raise SpecError("cars turn over the way")
+    return route, crossings, fences(street_map, route, way, robot.width_m / 2 + WAY_SPARE_M)
+
+
+def _line(street_map: StreetMap, way: Sequence[Port], start_m: float, goal_m: float) -> Polyline:
+    """The route along a way, in whole centimetres."""
+    return Polyline(np.round(way_line(street_map, way, start_m, goal_m).points, 2))
+
+
+def _search(draft: _Draft, candidates: Sequence[str]) -> Iterator[Callable[[], Scenario]]:
+    """More draws: of ways that keep off roads, stairs and bridges, fenced in all along where need
+    be."""
+    street_map = draft.street_map
+    rng = np.random.default_rng([draft.seed, draft.place.seed, 0x10E6, 1])
+    avoided = avoided_strips(street_map)
+    usable = [strip for strip in candidates if strip not in avoided]
+
+    def draw() -> Scenario:
+        if not usable:
+            raise SpecError("every long sidewalk is a stair, a bridge, a tunnel or on a road")
+        found = search_way(street_map, draft.graph, rng, usable, avoided, draft.length_m)
+        return _along(draft, rng, found, fences_along)
+
+    return (draw for _ in range(SEARCHES if usable else 1))
+
+
+def avoided_strips(street_map: StreetMap) -> set[str]:
+    """The strips that no way is searched over: stairs, bridges, tunnels, and sidewalks on roads."""
+    sidewalks = [strip for strip in street_map.strips.values() if strip.kind == "sidewalk"]
+    shares = dict(
+        zip([s.id for s in sidewalks], on_road_shares(street_map, sidewalks), strict=True)
+    )
+    return {
+        s.id
+        for s in street_map.strips.values()
+        if s.going != "plain" or shares.get(s.id, 0.0) > AVOIDED_SHARE
+    }
+
+
+def fences_along(
+    street_map: StreetMap, route: Polyline, way: Sequence[Port], half_width_m: float
+) -> tuple[Barrier, ...]:
+    """Barriers at the branches where they do, else all along the way. Raises SpecError when neither
+    leave one path."""
+    try:
+        return _barriers(street_map, route, way, half_width_m)
+    except SpecError:
+        fences = hem(street_map, way)
+        prove_single_path(street_map, route, fences, way, half_width_m)
+        return fences
+
+
+def _barriers(
+    street_map: StreetMap, route: Polyline, way: Sequence[Port], half_width_m: float
+) -> tuple[Barrier, ...]:
+    """Barriers that leave one path, square to their strips if possible. Raises SpecError when there
+    are none."""
+    ports = branches(street_map, way)
+    ground = ground_around(street_map, route, way)
+    barriers = tuple(barrier_at(street_map, port) for port in ports)
+    try:
+        prove_single_path(street_map, route, barriers, way, half_width_m, ground)
+    except SpecError:
+        barriers = tuple(barrier_at(street_map, port, slanting=True) for port in ports)
+        prove_single_path(street_map, route, barriers, way, half_width_m, ground)
+    return barriers
+
+
+def draw_way(
+    street_map: StreetMap,
+    graph: WalkGraph,
+    rng: np.random.Generator,
+    candidates: Sequence[str],
+    length_m: float | None = None,
+) -> tuple[list[Port], float, float]:
+    """(way, start_m, goal_m): a shortest way of a drawn length that crosses a street, as `way_line`
+    takes it.
+
+    length_m: the wanted length in place of a drawn one."""
+    target_m = rng.uniform(*ROUTE_M) if length_m is None else length_m
+    strip = street_map.strips[candidates[int(rng.integers(len(candidates)))]]
+    leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)
+    start_m = float(rng.uniform(0.4, 0.7)) * strip.length_m
+    closed = street_map.too_steep | {leave.other}
+    reach = graph.reach(leave, closed, limit_m=target_m + 60.0)
+    goals = [
+        port
+        for port in reach.within(target_m - start_m - 60.0, target_m - start_m)
+        if port.strip in candidates
+    ]
+    if not goals:
+        raise SpecError("no goal at the drawn distance")
+    goal = goals[int(rng.integers(len(goals)))]
+    way = reach.path(goal)
+    if way is None or len({port.strip for port in way}) * 2 != len(way) + 2:
+        raise SpecError("the way passes its goal")
+    if any(street_map.strips[port.strip].going != "plain" for port in way):
+        raise SpecError("the way leads over stairs, a bridge or a tunnel")
+    crossed = sum(street_map.strips[port.strip].kind == "crossing" for port in way) // 2
+    if crossed < max(1, round(target_m / CROSSING_EVERY_M)):
+        raise SpecError("the way crosses too few streets")
+    goal_strip = street_map.strips[goal.strip]
+    if length_m is not None:
+        return way, start_m, length_m - start_m - reach.to(goal)
+    return way, start_m, float(rng.uniform(0.4, 0.7)) * goal_strip.length_m
+
+
+def search_way(
+    street_map: StreetMap,
+    graph: WalkGraph,
+    rng: np.random.Generator,
+    candidates: Sequence[str],
+    avoided: Set[str],
+    length_m: float | None = None,
+) -> tuple[list[Port], float, float]:
+    """As `draw_way`, but over none of the `avoided` strips, and to any goal within reach that
+    does."""
+    target_m = rng.uniform(*ROUTE_M) if length_m is None else length_m
+    strip = street_map.strips[candidates[int(rng.integers(len(candidates)))]]
+    leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)
+    start_m = float(rng.uniform(0.4, 0.7)) * strip.length_m
+    closed = (
+        street_map.too_steep
+        | {leave.other}
+        | {port for s in avoided for port in (Port(s, 0), Port(s, 1))}
+    )
+    reach = graph.reach(leave, closed, limit_m=target_m + 60.0)
+    ends = set(candidates)
+    goals = [
+        port
+        for port in reach.within(target_m - start_m - 60.0, target_m - start_m)
+        if port.strip in ends
+    ]
+    for i in rng.permutation(len(goals)):
+        way = reach.path(goals[i])
+        if way is None or len({port.strip for port in way}) * 2 != len(way) + 2:
+            continue
+        crossed = sum(street_map.strips[port.strip].kind == "crossing" for port in way) // 2
+        if crossed >= max(1, round(target_m / CROSSING_EVERY_M)):
+            if length_m is not None:
+                return way, start_m, length_m - start_m - reach.to(goals[i])
+            return (
+                way,
+                start_m,
+                float(rng.uniform(0.4, 0.7)) * street_map.strips[goals[i].strip].length_m,
+            )
+    raise SpecError("no way of the drawn length crosses a street every 160 m")
+
+
+def route_crossings(
+    street_map: StreetMap, route: Polyline, way: Sequence[Port]
+) -> tuple[RouteCrossing, ...]:
+    """The crossings of a way, in order, with the arc lengths between which the route is on them."""
+    found = []
+    for port in way[::2]:
+        strip = street_map.strips[port.strip]
+        if strip.kind != "crossing":
+            continue
+        ends = sorted(route.project(*strip.line[i, :2])[0] for i in (0, -1))
+        found.append(
+            RouteCrossing(
+                id=strip.id, enter_s_m=ends[0], leave_s_m=ends[1], signalised=strip.signalised
+            )
+        )
+    return tuple(sorted(found, key=lambda crossing: crossing.enter_s_m))
+
+
+def on_road_m(street_map: StreetMap, route: Polyline, crossings: Sequence[RouteCrossing]) -> float:
+    """Metres of a route that lie on lanes of roads, crossings and the interior of junctions
+    apart."""
+    s_m = np.arange(0.5, route.length_m, 1.0)
+    for crossing in crossings:
+        s_m = s_m[(s_m < crossing.enter_s_m - 1.0) | (s_m > crossing.leave_s_m + 1.0)]
+    x, y = (np.interp(s_m, route.s_m, route.points[:, k]) for k in (0, 1))
+    lanes = [
+        lane for lane in street_map.near("lane", LineString(route.points)) if isinstance(lane, Lane)
+    ]
+    on_road = np.zeros(len(s_m), dtype=bool)
+    for lane in lanes:
+        if lane.kind == "road" and not lane.internal:
+            on_road |= shapely.contains_xy(lane.polygon, x, y)
+    return float(on_road.sum())
+
+
+def on_car_paths_m(
+    street_map: StreetMap, route: Polyline, crossings: Sequence[RouteCrossing], robot: Robot
+) -> float:
+    """Metres of a route on which a robot is in the way of cars inside a junction, crossings
+    apart."""
+    s_m = np.arange(0.5 * _SAMPLE_M, route.length_m, _SAMPLE_M)
+    for crossing in crossings:
+        s_m = s_m[(s_m < crossing.enter_s_m - _KERB_M) | (s_m > crossing.leave_s_m + _KERB_M)]
+    xy = np.column_stack([np.interp(s_m, route.s_m, route.points[:, k]) for k in (0, 1)])
+    hit = from_car_paths_m(street_map, xy) < 0.5 * (CAR_M + robot.width_m)
+    return _SAMPLE_M * float(hit.sum())

@@ -1,0 +1,234 @@
+"""RECIPES: what each shipped suite is made of: its scenarios by name, where each lies, and how
+candidates are drawn."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from types import MappingProxyType
+from typing import Any, Final, cast
+
+import msgspec
+import numpy as np
+
+from cosim.place.street_map import StreetMap
+from cosim.place.walk_graph import WalkGraph
+from cosim.spec.scenario import City, CityMap, Place, Scenario, Split
+from cosim.spec.selection import STATIC
+from scenarios.events import EVENT_KINDS
+from scenarios.places.nets import place
+from scenarios.suites.daylight import drawn_daylight
+from scenarios.suites.drawing import thinned
+from scenarios.suites.long_horizon import build_long_horizon
+from scenarios.suites.reactive import build_reactive
+from scenarios.suites.unit import STRUCTURES, Structure, build_unit
+from sumo_nets.city.store import SEEDS, TEST_SEEDS
+from sumo_nets.maps.wheel_places import WHEEL_PLACES
+
+LONG_WAY: Final = "route"
+TEST_CROPS: Final = ("braunschweig-2", "wildau-1")
+_SMALL_CROPS: Final = ("ingolstadt-1", "braunschweig-1")
+_REAL_UNIT: Final = tuple(name for name in WHEEL_PLACES if name != "berlin-7")
+"""Ten real places with straight ways and corners."""
+_REAL_CROSSWALKS: Final = (*(name for name in WHEEL_PLACES if name not in _SMALL_CROPS), "berlin-3")
+"""Ten crosswalks: two of them in the largest place, since the small ones have none without
+signals."""
+_REAL_ROUTES: Final = {
+    "berlin-1": 150.0,
+    "berlin-3": 200.0,
+    "berlin-4": 250.0,
+    "berlin-6": 300.0,
+    "braunschweig-2": 350.0,
+}
+ALL_ROUTES_M: Final = 36_500.0
+_SHORTEST_M: Final = 120.0
+_DIGITS: Final = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class Slot:
+    """One scenario to be made. structure: see `Scenario`; number: seed of its first candidate;
+    length_m: of a route.
+
+    like: name of the slot whose scenario it repeats without its events."""
+
+    name: str
+    suite: str
+    structure: str
+    where: Place
+    split: Split
+    number: int
+    length_m: float = 0.0
+    like: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SuiteRecipe:
+    """How a suite is made. purpose: what it is for, in a few words; slots: its scenarios, in
+    order."""
+
+    version: str
+    description: str
+    purpose: str
+    slots: Sequence[Slot] = field(repr=False)
+    draw: Callable[[Slot, StreetMap, WalkGraph, int], Scenario]
+
+
+def candidate(slot: Slot, seed: int) -> Scenario:
+    """A candidate for a slot, drawn from a seed. Raises CosimError when none fits its place."""
+    _, street_map = place(slot.where)
+    drawn = RECIPES[slot.suite].draw(slot, street_map, _graph(slot.where), seed)
+    rng = np.random.default_rng([seed, zlib.crc32(slot.name.encode())])
+    # Another turn for each structure, so that those of one city are not all of one hour.
+    light = drawn_daylight(rng, slot.number + 5 * zlib.crc32(slot.structure.encode()) % 84)
+    whole = msgspec.structs.replace(drawn, light=light, split=slot.split, structure=slot.structure)
+    return msgspec.convert(_in_few_digits(msgspec.to_builtins(whole)), Scenario)
+
+
+def _in_few_digits(value: Any) -> Any:
+    """A spec as plain data, its numbers in as many digits as anybody can measure: a suite's file is
+    half as large."""
+    if isinstance(value, float):
+        return round(value, _DIGITS)
+    if isinstance(value, dict):
+        return {key: _in_few_digits(item) for key, item in value.items()}
+    return [_in_few_digits(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def repeated(slot: Slot, of: Scenario) -> Scenario:
+    """The scenario of a slot that repeats another one: nobody is there."""
+    return msgspec.structs.replace(
+        of, id=slot.name, events=(), structure=slot.structure, ends_at="goal"
+    )
+
+
+@lru_cache(maxsize=1)
+def _graph(where: Place) -> WalkGraph:
+    return WalkGraph(place(where)[1])
+
+
+def _split_of(where: Place) -> Split:
+    name = where.map if isinstance(where, CityMap) else where.seed
+    return "test" if name in TEST_CROPS or name in TEST_SEEDS else "val"
+
+
+def _cities() -> list[tuple[int, City]]:
+    return [(number, City(seed=seed)) for number, seed in enumerate(SEEDS)]
+
+
+def _slot(suite: str, name: str, structure: str, where: Place, number: int, **more: Any) -> Slot:
+    split = _split_of(where)
+    return Slot(
+        name=name, suite=suite, structure=structure, where=where, split=split, number=number, **more
+    )
+
+
+def _unit_slots() -> list[Slot]:
+    """Each structure once in every city, and ten of each on real places."""
+    found = []
+    for number, city in _cities():
+        found += [_slot("unit", f"{one}-{city.seed:03d}", one, city, number) for one in STRUCTURES]
+    for structure in STRUCTURES:
+        named: dict[str, int] = {}
+        for crop in _REAL_CROSSWALKS if structure == "crosswalk" else _REAL_UNIT:
+            named[crop] = named.get(crop, 0) + 1
+            name = f"{structure}-{crop}" + (f"-{named[crop]}" if named[crop] > 1 else "")
+            found.append(_slot("unit", name, structure, CityMap(map=crop), 100 * named[crop]))
+    return found
+
+
+def _reactive_slots() -> list[Slot]:
+    """Each event once in every city, and beside the first kind's the same place with nobody
+    there."""
+    reference = next(iter(EVENT_KINDS))
+    found = []
+    for number, city in _cities():
+        found += [
+            _slot("reactive", f"{kind}-{city.seed:03d}", kind, city, number) for kind in EVENT_KINDS
+        ]
+        like = f"{reference}-{city.seed:03d}"
+        found.append(
+            _slot("reactive", f"{STATIC}-{city.seed:03d}", STATIC, city, number, like=like)
+        )
+    return found
+
+
+def _route_slots() -> list[Slot]:
+    """A way in every city, of lengths that are spread evenly and together make what the suite is to
+    make."""
+    cities = _cities()
+    mean_m = (ALL_ROUTES_M - sum(_REAL_ROUTES.values())) / len(cities)
+    lengths_m = np.linspace(_SHORTEST_M, 2.0 * mean_m - _SHORTEST_M, len(cities))
+    lengths_m = np.random.default_rng(0x105).permutation(np.round(lengths_m, 1))
+    found = [
+        _slot(
+            "long-horizon",
+            f"lh-{city.seed:03d}-00",
+            LONG_WAY,
+            city,
+            number,
+            length_m=float(lengths_m[number]),
+        )
+        for number, city in cities
+    ]
+    for crop, length_m in _REAL_ROUTES.items():
+        found.append(
+            _slot("long-horizon", f"lh-{crop}", LONG_WAY, CityMap(map=crop), 0, length_m=length_m)
+        )
+    return found
+
+
+def _unit(slot: Slot, street_map: StreetMap, graph: WalkGraph, seed: int) -> Scenario:
+    return build_unit(
+        cast(Structure, slot.structure), slot.where, street_map, graph, seed, slot.name
+    )
+
+
+def _reactive(slot: Slot, street_map: StreetMap, graph: WalkGraph, seed: int) -> Scenario:
+    return build_reactive(
+        EVENT_KINDS[slot.structure], slot.where, street_map, graph, seed, slot.name
+    )
+
+
+def _route(slot: Slot, street_map: StreetMap, graph: WalkGraph, seed: int) -> Scenario:
+    drawn = build_long_horizon(
+        slot.where, street_map, graph, seed, slot.name, length_m=slot.length_m
+    )
+    if isinstance(slot.where, City):
+        return drawn
+    return thinned(drawn, street_map)
+
+
+RECIPES: Final[Mapping[str, SuiteRecipe]] = MappingProxyType(
+    {
+        "unit": SuiteRecipe(
+            version="1.0",
+            description="10 to 20 m straight on, round a corner or over a crosswalk, past things "
+            "that stand there; nobody else. 100 of each in generated cities, 10 of each on real "
+            "places. Ends on the first failure.",
+            purpose="lane following and static obstacles",
+            slots=_unit_slots(),
+            draw=_unit,
+        ),
+        "reactive": SuiteRecipe(
+            version="1.0",
+            description="10 to 20 m of way with one event of pedestrians on it and nobody else: "
+            "100 of each event in the same cities, and as reference 100 with nobody there. Ends "
+            "on the first failure.",
+            purpose="eight events of pedestrians",
+            slots=_reactive_slots(),
+            draw=_reactive,
+        ),
+        "long-horizon": SuiteRecipe(
+            version="1.0",
+            description="105 ways of more than 100 m, 36.5 km in all, 5 of them on real places; "
+            "exactly one walkable path; crowd, signals, vehicles, obstacles and events on the "
+            "way. Never ends on a failure.",
+            purpose="long ways through street life",
+            slots=_route_slots(),
+            draw=_route,
+        ),
+    }
+)

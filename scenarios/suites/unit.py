@@ -1,0 +1,229 @@
+"""Builder of unit scenarios: 10 to 20 m straight on, round a corner or over a crosswalk, nobody
+else; ends on the first failure."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Iterator
+from functools import partial
+from typing import Final, Literal, get_args
+
+import msgspec
+import numpy as np
+
+from cosim.core.errors import MapError, SpecError
+from cosim.core.geometry import Polyline, wrap_angle
+from cosim.place.route_line import way_line
+from cosim.place.street_map import Port, StreetMap, Strip
+from cosim.place.walk_graph import WalkGraph
+from cosim.spec.event_kind import SidewalkLayout
+from cosim.spec.robot import COURIER, Robot
+from cosim.spec.scenario import Place, RouteCrossing, Scenario
+from scenarios.suites.drawing import TRIES, Refusals, bare_scenario, first_of
+from scenarios.suites.long_horizon import TURNED_OVER_M, on_car_paths_m, on_road_m
+from scenarios.suites.obstacles import with_obstacles
+from scenarios.suites.reactive import LIMIT_S, NO_CROWD, along_sidewalk, over_crossing
+
+Structure = Literal["straight", "curve", "crosswalk"]
+STRUCTURES: Final[tuple[Structure, ...]] = get_args(Structure)
+WAY_M: Final = (10.0, 20.0)
+TURN_RAD: Final = (math.radians(45.0), math.radians(150.0))
+"""A curve turns by this, at least and at most, from its first metres to its last."""
+_ENDS_M: Final = 2.0
+"""So much of a way, at either end, tells where it comes from and where it goes."""
+_OFF_ROAD_M: Final = 0.5
+_BESIDE_ROBOT_M: Final = 0.7
+"""Sidewalks are wider than the robot by this on either side: there is room for something that
+stands there."""
+
+
+def build_unit(
+    structure: Structure,
+    place: Place,
+    street_map: StreetMap,
+    graph: WalkGraph,
+    seed: int,
+    scenario_id: str,
+    robot: Robot = COURIER,
+    way_m: tuple[float, float] = WAY_M,
+) -> Scenario:
+    """A scenario of one structure drawn from `seed`: its street's class is drawn first, so that
+    rare ones come as often as common ones. way_m: of a straight way, shortest and longest. Raises
+    SpecError when no place for it is found."""
+    named = zlib.crc32(f"{structure} {place.name}".encode())
+    rng = np.random.default_rng([seed, place.seed, 0x0417, named])
+    classes: dict[str, list[Strip]] = {}
+    for strip in strips_for(structure, street_map, graph, robot):
+        classes.setdefault(strip.street_class, []).append(strip)
+    if not classes:
+        raise MapError(f"map '{street_map.name}' has no {lies_on(structure)} for '{structure}'")
+
+    def draw(strips: list[Strip]) -> Scenario:
+        strip = strips[int(rng.integers(len(strips)))]
+        route, crossings = drawn_along(structure, strip, street_map, graph, rng, robot, way_m)
+        bare = bare_scenario(
+            route,
+            crossings,
+            place,
+            street_map,
+            suite="unit",
+            seed=seed,
+            scenario_id=scenario_id,
+            time_limit_s=LIMIT_S,
+            robot=robot,
+        )
+        whole = msgspec.structs.replace(
+            bare, crowd=NO_CROWD, ends_on_failure=True, structure=structure
+        )
+        return with_obstacles(whole, street_map)
+
+    refusals = Refusals()
+    for name in rng.permutation(sorted(classes)).tolist():
+        if found := first_of((partial(draw, classes[name]) for _ in range(TRIES)), refusals):
+            return found
+    raise SpecError(
+        f"no place for '{structure}' on '{street_map.name}' with seed {seed}: {refusals}"
+    )
+
+
+def lies_on(structure: Structure) -> Literal["sidewalk", "crossing"]:
+    """What a structure is drawn on."""
+    return "crossing" if structure == "crosswalk" else "sidewalk"
+
+
+def strips_for(
+    structure: Structure, street_map: StreetMap, graph: WalkGraph, robot: Robot
+) -> list[Strip]:
+    """The strips on which a structure may be, as far as can be told without drawing, by their
+    ids."""
+    strips = [
+        street_map.strips[strip_id] for strip_id in sorted(graph.main_strips - street_map.steep)
+    ]
+    usable = [
+        strip for strip in strips if strip.kind == lies_on(structure) and strip.going == "plain"
+    ]
+    return [strip for strip in usable if _may_be(strip, structure, robot)]
+
+
+def drawn_along(
+    structure: Structure,
+    strip: Strip,
+    street_map: StreetMap,
+    graph: WalkGraph,
+    rng: np.random.Generator,
+    robot: Robot,
+    way_m: tuple[float, float] = WAY_M,
+) -> tuple[Polyline, tuple[RouteCrossing, ...]]:
+    """A route drawn along a strip, and its crossings. Raises CosimError where it does not do."""
+    if structure == "straight":
+        route, crossings = _straight(strip, rng, robot, way_m)
+    elif structure == "curve":
+        route = _round_corner(street_map, graph, strip, rng, robot)
+        crossings = ()
+    else:
+        route, crossings = _crosswalk(street_map, strip, rng, robot)
+    if not way_m[0] <= route.length_m <= way_m[1]:
+        raise SpecError("the way is too short or too long")
+    if on_road_m(street_map, route, crossings) > _OFF_ROAD_M:
+        raise SpecError("the way lies on a road")
+    if on_car_paths_m(street_map, route, crossings, robot) > TURNED_OVER_M:
+        raise SpecError("cars turn over the way")
+    return route, crossings
+
+
+def turn_rad(route: Polyline) -> float:
+    """By how much a route turns from its first metres to its last, left positive."""
+    first = route.at(0.0)
+    last = route.at(_ENDS_M)
+    before = route.at(route.length_m - _ENDS_M)
+    end = route.at(route.length_m)
+    out = math.atan2(last.y_m - first.y_m, last.x_m - first.x_m)
+    return wrap_angle(math.atan2(end.y_m - before.y_m, end.x_m - before.x_m) - out)
+
+
+def _may_be(strip: Strip, structure: Structure, robot: Robot) -> bool:
+    """Whether a strip does, as far as can be told without drawing."""
+    if structure == "crosswalk":
+        return not strip.signalised and None not in strip.corners
+    return strip.width_m >= robot.width_m + 2.0 * _BESIDE_ROBOT_M
+
+
+def _straight(
+    strip: Strip, rng: np.random.Generator, robot: Robot, way_m: tuple[float, float]
+) -> tuple[Polyline, tuple[RouteCrossing, ...]]:
+    layout = SidewalkLayout(way_m, (0.0, 0.0), robot.width_m / 2 + _BESIDE_ROBOT_M)
+    return Polyline(along_sidewalk(layout, strip, rng, robot).route), ()
+
+
+def _crosswalk(
+    street_map: StreetMap, strip: Strip, rng: np.random.Generator, robot: Robot
+) -> tuple[Polyline, tuple[RouteCrossing, ...]]:
+    spot = over_crossing(street_map, strip, rng, robot)
+    return Polyline(spot.route), spot.crossings
+
+
+def _round_corner(
+    street_map: StreetMap, graph: WalkGraph, strip: Strip, rng: np.random.Generator, robot: Robot
+) -> Polyline:
+    """From a sidewalk round one of its corners to another one, which leads elsewhere. Raises
+    SpecError."""
+    leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)
+    onward = [
+        port for port in graph.others(leave) if _leads_round(street_map, strip, leave, port, robot)
+    ]
+    if not onward:
+        raise SpecError("no sidewalk leads round this corner")
+    enter = onward[int(rng.integers(len(onward)))]
+    wanted_m = float(rng.uniform(*WAY_M))
+    before_m, behind_m = (
+        min(0.5 * street_map.strips[port.strip].length_m, WAY_M[1]) for port in (leave, enter)
+    )
+    whole = way_line(street_map, [leave, enter], before_m, behind_m)
+    # The corner stands in the middle of the way, more or less.
+    corner_s_m = whole.project(*graph.point(leave))[0]
+    from_m = corner_s_m - float(rng.uniform(0.3, 0.6)) * wanted_m
+    from_m = max(0.0, min(from_m, whole.length_m - wanted_m))
+    steps = np.linspace(from_m, from_m + wanted_m, round(wanted_m) + 1)
+    if steps[-1] > whole.length_m:
+        raise SpecError("the sidewalks at the corner are too short")
+    route = Polyline(np.round([whole.at(float(s_m)).xy for s_m in steps], 3))
+    if not TURN_RAD[0] <= abs(turn_rad(route)) <= TURN_RAD[1]:
+        raise SpecError("the way turns too little, or back")
+    return route
+
+
+def _leads_round(
+    street_map: StreetMap, strip: Strip, leave: Port, port: Port, robot: Robot
+) -> bool:
+    """Whether a port is of another sidewalk, wide enough, that leads off by as much as a curve
+    turns."""
+    other = street_map.strips[port.strip]
+    if (
+        other.kind != "sidewalk"
+        or other.going != "plain"
+        or other.id in street_map.steep
+        or other.id == strip.id
+    ):
+        return False
+    if not _may_be(other, "curve", robot):
+        return False
+    out, on = (_heading_out(street_map.strips[p.strip], p) for p in (leave, port))
+    return abs(wrap_angle(on + math.pi - out)) >= TURN_RAD[0]
+
+
+def _heading_out(strip: Strip, port: Port) -> float:
+    """The heading of one who leaves a strip by a port."""
+    line = Polyline(strip.line[:, :2] if port.end == 1 else strip.line[::-1, :2])
+    return line.at(line.length_m).heading_rad
+
+
+def classes_of(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
+    """The classes of the streets that a route lies beside, in its order, each once."""
+    seen: set[str] = set()
+    for s_m in np.arange(0.5, scenario.route_line.length_m, 2.0):
+        pose = scenario.route_line.at(float(s_m))
+        strip = street_map.strips.get(street_map.locate(pose.x_m, pose.y_m, 0.05).edge)
+        if strip is not None and strip.kind == "sidewalk" and strip.street_class not in seen:
+            seen.add(strip.street_class)
+            yield strip.street_class

@@ -1,0 +1,1 @@
+"""Scenarios written by users as TOML files."""

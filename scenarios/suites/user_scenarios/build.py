@@ -1,0 +1,161 @@
+"""From files of own scenarios to scenarios: one file, map and versions make the same ones, with the
+same hashes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import msgspec
+
+from cosim.core.errors import CosimError, MachineError, MapError, SpecError
+from cosim.core.telling import Tell, untold
+from cosim.spec.robot import robot_called
+from cosim.spec.scenario import City, CityMap, Light, Place, Scenario, Suite
+from cosim.spec.spec_file import in_lines
+from scenarios.places.nets import place
+from scenarios.suites.obstacles import with_obstacles
+from scenarios.suites.reactive import NO_CROWD
+from scenarios.suites.user_scenarios.along_route import event_along, obstacle_along
+from scenarios.suites.user_scenarios.format import OwnCrowd, OwnLimits, OwnPlace, OwnScenario
+from scenarios.suites.user_scenarios.read import OwnFile, Variant
+from scenarios.suites.user_scenarios.routes import laid_way
+from sumo_nets.maps.place_names import imported_place, place_called
+
+_MAKING: Final = "making the scenarios"
+_VERSION: Final = "own"
+_NOBODYS: Final = "scenario 'own': "
+"""What begins messages about a scenario that has no name yet."""
+_SLOWEST_MPS = 0.2
+_LEAST_S = 60.0
+"""A time limit that is not given is a minute and what the way takes at this speed."""
+
+
+class Made(NamedTuple):
+    """A scenario, and what is against it, as "events[0]: ...", one message each: then it is without
+    what does not fit, and None where there is no way."""
+
+    variant: Variant
+    scenario: Scenario | None
+    faults: tuple[str, ...]
+
+
+class _Street(NamedTuple):
+    """A scenario that has all but its crowd and its light, and what is against it, as `Made` has
+    them."""
+
+    scenario: Scenario | None
+    faults: tuple[str, ...]
+
+
+def made_of(file: OwnFile, tell: Tell = untold) -> Iterator[Made]:
+    """Each scenario of a file, and what is against it. What the machine lacks is raised as
+    MachineError."""
+    for number, variant in enumerate(file.variants):
+        tell(f"{_MAKING} of {file.path.name}", number / len(file.variants))
+        yield made_one(variant, file.name)
+
+
+def made_one(variant: Variant, suite: str) -> Made:
+    """One scenario of a file, and what is against it; suite: the name of the file's scenarios."""
+    own = variant.own
+    alike = {
+        "name": "own",
+        "goal_protocol": None,
+        "crowd": OwnCrowd(),
+        "light": Light(),
+        "limits": OwnLimits(),
+    }
+    street, faults = _street(msgspec.structs.replace(own, **alike))
+    if street is None:
+        return Made(variant, None, faults)
+    limits = own.limits
+    time_s = limits.time_s or round(_LEAST_S + street.route_line.length_m / _SLOWEST_MPS, 1)
+    try:
+        whole = msgspec.structs.replace(
+            street,
+            id=variant.id,
+            suite=suite,
+            crowd=own.crowd.spec,
+            light=own.light,
+            goal_radius_m=limits.goal_radius_m,
+            time_limit_s=time_s,
+            ends_on_failure=limits.ends_on_failure,
+            ends_at=limits.ends_at,
+        )
+    except SpecError as error:
+        return Made(variant, street, (*faults, str(error)))
+    return Made(variant, whole, faults)
+
+
+def suite_of_own(file: OwnFile, tell: Tell = untold) -> Suite:
+    """All scenarios of a file, to be run. Raises SpecError with everything that is against it."""
+    return suite_of(file, list(made_of(file, tell)))
+
+
+def suite_of(file: OwnFile, made: Sequence[Made]) -> Suite:
+    """Join scenarios that were made of a file as a suite. Raises SpecError with everything that is
+    against them."""
+    if faults := dict.fromkeys(fault for one in made for fault in one.faults):
+        raise SpecError(f"{file.path}: {in_lines(list(faults), len(faults))}")
+    scenarios = tuple(one.scenario for one in made if one.scenario is not None)
+    return Suite(
+        name=file.name, version=_VERSION, scenarios=scenarios, description=file.description
+    )
+
+
+def place_of_own(own: OwnPlace) -> Place:
+    """The place that a file means; a map's file is imported when it is first used. Raises
+    UsageError, MapError."""
+    if own.city is not None:
+        return City(seed=own.city, size_m=own.size_m, style=own.style, roughness=own.roughness)
+    if own.map:
+        return CityMap(map=own.map, roughness=own.roughness)
+    path = Path(own.file)
+    if not path.exists():
+        raise SpecError(
+            f"place.file: there is no {path}: give its path from the folder of this file"
+        )
+    try:
+        if path.is_file() and not path.name.endswith((".net.xml", ".net.xml.gz")):
+            return CityMap(map=imported_place(path), roughness=own.roughness)
+        return place_called(own.file, own.roughness)
+    except MapError as error:
+        raise MapError(f"place.file: {error}") from error
+
+
+@lru_cache(maxsize=1024)
+def _street(own: OwnScenario) -> _Street:
+    try:
+        where, robot = _place(own.place), robot_called(own.robot)
+        _, street_map = place(where)
+        bare = laid_way(own.way, where, street_map, own.seed, robot)
+    except MachineError:
+        raise
+    except CosimError as error:
+        return _Street(None, tuple(str(error).replace(_NOBODYS, "").split("\n")))
+    faults: list[str] = []
+    events = []
+    placed = []
+    for number, event in enumerate(own.events):
+        try:
+            events.append(event_along(number, event, bare, street_map, robot))
+        except SpecError as error:
+            faults.append(f"events[{number}]: {error}")
+    for number, thing in enumerate(own.obstacles.placed):
+        try:
+            placed.append(obstacle_along(thing, bare.route_line))
+        except SpecError as error:
+            faults.append(f"obstacles.placed[{number}]: {error}")
+    there = {"events": tuple(events), "obstacles": tuple(placed)}
+    whole = msgspec.structs.replace(bare, **there, crowd=NO_CROWD, light=Light(), ends_at="goal")
+    if own.obstacles.per_100m and not faults:
+        whole = with_obstacles(
+            whole, street_map, per_100m=own.obstacles.per_100m, beside=own.obstacles.beside
+        )
+    return _Street(whole, tuple(faults))
+
+
+_place = lru_cache(maxsize=64)(place_of_own)

@@ -1,0 +1,72 @@
+"""Whether own scenarios can be driven: that places are there, ways exist and are free, events and
+things fit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+
+import msgspec
+
+from cosim.core.errors import CosimError, SpecError
+from cosim.core.telling import Tell, untold
+from cosim.spec.scenario import Light, Scenario, Suite, event_faults
+from cosim.spec.spec_file import in_lines
+from physics.cameras.hdri import read_hdri
+from scenarios.events import EVENT_KINDS
+from scenarios.places.nets import place
+from scenarios.suites.fits import misfits
+from scenarios.suites.long_horizon import WAY_SPARE_M
+from scenarios.suites.obstacles import TO_SPARE_M, prove_gap
+from scenarios.suites.reactive import NO_CROWD
+from scenarios.suites.user_scenarios.build import made_of, suite_of_own
+from scenarios.suites.user_scenarios.read import OwnFile
+
+
+def own_faults(file: OwnFile, tell: Tell = untold) -> list[str]:
+    """Everything that is against driving the scenarios of a file, each fault once, in the order of
+    the scenarios."""
+    found: dict[str, None] = {}
+    for made in made_of(file, tell):
+        told = made.faults
+        if made.scenario is not None and not told:
+            told = tuple(_faults_on_the_street(made.scenario))
+        named = f"scenario '{made.variant.id}': "
+        found |= dict.fromkeys(fault.replace(named, "").removeprefix(named) for fault in told)
+    return list(found)
+
+
+def checked_own(file: OwnFile, tell: Tell = untold) -> Suite:
+    """The scenarios of a file, to be run. Raises SpecError with everything that is against it."""
+    if faults := own_faults(file, tell):
+        raise SpecError(f"{file.path}: {in_lines(faults, len(faults))}")
+    return suite_of_own(file, tell)
+
+
+def _faults_on_the_street(scenario: Scenario) -> Iterator[str]:
+    _, street_map = place(scenario.place)
+    yield from event_faults(scenario, EVENT_KINDS)
+    try:
+        if scenario.light.hdri:
+            read_hdri(scenario.light.hdri)
+    except SpecError as error:
+        yield f"light.hdri: {error}"
+    told = list(misfits([scenario], street_map))
+    yield from told
+    if not told:
+        street = msgspec.structs.replace(
+            scenario, id="own", suite="own", crowd=NO_CROWD, light=Light()
+        )
+        yield from _narrow(street)
+
+
+@lru_cache(maxsize=1024)
+def _narrow(street: Scenario) -> tuple[str, ...]:
+    """Where the robot does not fit: past obstacles it is to have half a metre to spare, else hardly
+    any."""
+    _, street_map = place(street.place)
+    try:
+        prove_gap(street, street_map, TO_SPARE_M if street.obstacles else 2.0 * WAY_SPARE_M)
+    except CosimError as error:
+        return (str(error).replace("scenario 'own': ", ""),)
+    return ()

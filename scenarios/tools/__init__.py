@@ -1,0 +1,2 @@
+"""Tools on top of runs: benchmarks, verification, checks of policies, viewing, data sets,
+Gymnasium."""

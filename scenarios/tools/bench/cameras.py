@@ -1,0 +1,236 @@
+"""What `cosim bench camera` measures: frames a second of the cameras in a busy street, side by side
+in one run.
+
+Every figure is taken in a process of its own, several rounds in turn; medians are shown. People
+walk from frame to frame, so nothing can be kept from the last one.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from cosim.core.errors import CosimError
+from cosim.core.geometry import Floats, Polyline, Pose
+from cosim.core.state import Doing, People, RobotState, Street, Vehicles
+from cosim.place.street_map import StreetMap
+from cosim.spec.camera import CameraSpec
+from cosim.spec.options import CameraName
+from cosim.spec.scenario import City
+
+SIZE: Final = (512, 288)
+PERSONS: Final = 50
+CROWDED: Final = 500
+TOGETHER: Final = 10
+PERIOD_S: Final = 0.05
+"""Time from frame to frame."""
+PAPER_FPS: Final = 226.8
+"""People alone, 50 of them, on an L40S: the paper's figure."""
+_NEAREST_M: Final = 2.5
+_FARTHEST_M: Final = 32.0
+_STANDING: Final[tuple[Doing, ...]] = ("stand", "look", "talk", "stop")
+_STRIDE_M: Final = 1.4
+
+
+class Busy(NamedTuple):
+    """A street to draw: where the robot is, and what moves around it, frame by frame."""
+
+    robot: RobotState
+    streets: tuple[Street, ...]
+
+
+def busy_street(street_map: StreetMap, persons: int, frames: int) -> Busy:
+    """People all over the view of a robot that looks along the longest sidewalk, four of five of
+    them walking."""
+    rng = np.random.default_rng(persons)
+    longest = max(
+        (s for s in street_map.strips.values() if s.kind == "sidewalk"), key=lambda s: s.length_m
+    )
+    x, y, heading = Polyline(longest.line[:, :2]).at(0.3 * longest.length_m)
+    bearing = heading + rng.uniform(-0.6, 0.6, persons)
+    away = np.sqrt(rng.uniform(_NEAREST_M**2, _FARTHEST_M**2, persons))
+    start = np.array([x, y]) + away[:, None] * np.column_stack([np.cos(bearing), np.sin(bearing)])
+    facing = (
+        heading + np.where(rng.random(persons) < 0.5, 0.0, math.pi) + rng.normal(0.0, 0.1, persons)
+    )
+    speed = np.where(rng.random(persons) < 0.8, rng.uniform(0.9, 1.7, persons), 0.0)
+    doing = tuple(
+        "walk" if v else _STANDING[i % len(_STANDING)] for i, v in enumerate(speed.tolist())
+    )
+    ids = tuple(f"c{i:04d}" for i in range(persons))
+    cars = _cars(x, y, heading)
+
+    def street(k: int) -> Street:
+        walked = speed * PERIOD_S * k
+        xy = start + walked[:, None] * np.column_stack([np.cos(facing), np.sin(facing)])
+        who = People.of(ids, xy, facing, speed, doing, walked / _STRIDE_M, speed)
+        return Street(k, who, cars(k * PERIOD_S))
+
+    return Busy(RobotState(Pose(x, y, heading)), tuple(map(street, range(frames))))
+
+
+def _cars(x_m: float, y_m: float, heading_rad: float) -> Callable[[float], Vehicles]:
+    """Eight cars on both sides of a line beside the robot, moving."""
+    count = 8
+    along = np.linspace(5.0, 45.0, count)
+    aside = np.where(np.arange(count) % 2 == 0, 6.0, -6.0)
+    forward = np.array([math.cos(heading_rad), math.sin(heading_rad)])
+    left = np.array([-forward[1], forward[0]])
+    sizes = np.tile([4.6, 1.8], (count, 1))
+
+    def at(time_s: float) -> Vehicles:
+        xy: Floats = (
+            np.array([x_m, y_m]) + (along + 8.0 * time_s)[:, None] * forward + aside[:, None] * left
+        )
+        ids = tuple(f"v{i}" for i in range(count))
+        return Vehicles.of(ids, xy, np.full(count, heading_rad), np.full(count, 8.0), sizes)
+
+    return at
+
+
+def camera_city(size_m: float) -> StreetMap:
+    """The street map of the city of a size that pictures are taken in."""
+    from sumo_nets.city.store import city_net
+    from sumo_nets.net.snapshot import street_map_of
+
+    return street_map_of(city_net(City(seed=5, size_m=size_m)))
+
+
+def whole_frame(camera: CameraName, persons: int, frames: int, size_m: float) -> float:
+    """Median seconds of a whole picture by `gl`, `bullet` or `bullet-egl`: arranged, drawn and read
+    back."""
+    from physics.cameras.choice import camera_of
+    from physics.street.street_surface import StreetSurface
+    from scenarios.episodes.wiring import world_of
+
+    street_map = camera_city(size_m)
+    world = world_of(StreetSurface(street_map, 5))
+    busy = busy_street(street_map, persons, frames)
+    with camera_of(camera, world, CameraSpec(*SIZE, fov_deg=60.0)) as eyes:
+        return _median(lambda street: eyes.render(busy.robot, street), busy.streets)
+
+
+def people_alone(persons: int, frames: int, size_m: float) -> float:
+    """Median seconds of a picture of nothing but people: posed, skinned, drawn, and read back while
+    the next is."""
+    from physics.cameras.gl.people_only import PeopleAlone
+
+    busy = busy_street(camera_city(size_m), persons, frames)
+    with PeopleAlone(SIZE, 60.0) as eyes:
+
+        def draw(street: Street) -> None:
+            eyes.begin(busy.robot.pose, street)
+            if street.tick:
+                eyes.end()
+
+        return _median(draw, busy.streets)
+
+
+def together(environments: int, frames: int, size_m: float) -> float:
+    """Median seconds of one environment's picture where several are drawn into one atlas and read
+    back at once."""
+    from physics.cameras.gl.atlas import Atlas
+    from physics.street.street_surface import StreetSurface
+    from scenarios.episodes.wiring import world_of
+
+    street_map = camera_city(size_m)
+    world = world_of(StreetSurface(street_map, 5))
+    busy = busy_street(street_map, PERSONS, frames)
+    spec = CameraSpec(*SIZE, fov_deg=60.0)
+    with Atlas(spec) as eyes:
+        keys = [eyes.join(world) for _ in range(environments)]
+
+        def draw(street: Street) -> None:
+            eyes.begin([(key, busy.robot, street) for key in keys])
+            if street.tick:
+                eyes.end()
+
+        return _median(draw, busy.streets) / environments
+
+
+def _median(draw: Callable[[Street], object], streets: tuple[Street, ...]) -> float:
+    """Median seconds of a picture, the first tenth left out: tiles and bodies are built in them."""
+    stamps = [time.perf_counter()]
+    for street in streets:
+        draw(street)
+        stamps.append(time.perf_counter())
+    return float(statistics.median(np.diff(stamps)[len(streets) // 10 :].tolist()))
+
+
+class Drawing(NamedTuple):
+    """A row of the table. work(size_m) -> seconds a picture; least_fps: what it should reach, here
+    and on a GPU."""
+
+    name: str
+    work: Callable[[float], float]
+    size_m: float = 2000.0
+    least_fps: tuple[float | None, float | None] = (None, None)
+
+
+WHOLE: Final = "whole frame, gl"
+PEOPLE: Final = "people alone, gl"
+TINY: Final = "whole frame, bullet (TinyRenderer)"
+EGL: Final = "whole frame, bullet (EGL plugin)"
+_SMALL: Final = "whole frame, gl, 0.2 km city"
+
+FIGURES: Final = (
+    Drawing(WHOLE, partial(whole_frame, "gl", PERSONS, 120), least_fps=(100.0, 1000.0)),
+    Drawing(PEOPLE, partial(people_alone, PERSONS, 200), least_fps=(PAPER_FPS, 10.0 * PAPER_FPS)),
+    Drawing(TINY, partial(whole_frame, "bullet", PERSONS, 20)),
+    Drawing(EGL, partial(whole_frame, "bullet-egl", PERSONS, 20)),
+    Drawing(_SMALL, partial(whole_frame, "gl", PERSONS, 120), 200.0),
+    Drawing(
+        f"whole frame, gl, {CROWDED} people",
+        partial(whole_frame, "gl", CROWDED, 60),
+        least_fps=(None, 500.0),
+    ),
+    Drawing(
+        f"{TOGETHER} environments in an atlas, gl",
+        partial(together, TOGETHER, 40),
+        least_fps=(None, 5000.0),
+    ),
+)
+
+
+RATIOS: Final = (
+    ("gl / TinyRenderer", WHOLE, TINY, ">= 5"),
+    ("gl / EGL plugin", WHOLE, EGL, ">= 5"),
+    ("time in a 2 km city / 0.2 km city", _SMALL, WHOLE, "<= 1.1"),
+)
+"""What a ratio says, the figures above and below its line, what it should be."""
+
+
+class _Found(NamedTuple):
+    """What came out of a figure: frames a second, round by round; why: what is wrong where there
+    are none."""
+
+    fps: list[float]
+    why: str = ""
+
+
+def time_cameras(
+    rounds: int, tell: Callable[[str], None], figures: Sequence[Drawing] = FIGURES
+) -> dict[str, _Found]:
+    """Frames a second of every figure, `rounds` times, each in a fresh process. What fails is not
+    tried again."""
+    from scenarios.tools.bench.in_subprocess import alone
+
+    found = {figure.name: _Found([]) for figure in figures}
+    for i in range(rounds):
+        for figure in figures:
+            if found[figure.name].why:
+                continue
+            tell(f"round {i + 1} of {rounds}: {figure.name}")
+            try:
+                found[figure.name].fps.append(1.0 / alone(figure.work, figure.size_m))
+            except CosimError as error:
+                found[figure.name] = _Found([], str(error))
+            except Exception as error:  # noqa: BLE001  a library or a driver may fail in any way; it is told
+                found[figure.name] = _Found([], f"{type(error).__name__}: {error}")
+    return found

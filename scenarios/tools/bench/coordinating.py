@@ -1,0 +1,247 @@
+"""What a run's coordinator takes of an episode, and how many workers it serves: by the real
+coordinator, its transport and run folder, and by workers that make up their results.
+
+    python -m scenarios.tools.bench.coordinating --workers 200 --jobs 100000
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import queue
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import msgspec
+
+from bridge import keys
+from bridge.codec import encode
+from bridge.session import Session, open_session
+from cosim.core.errors import EngineError
+from cosim.core.state import STILL, Command
+from cosim.policies.load import load_policy
+from cosim.results.record import begun
+from cosim.results.run_folder import RunFolder
+from cosim.spec.connection import Connection
+from cosim.spec.manifest import Manifest
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.scenario import City, Scenario, Suite
+from scenarios.ipc.deadlines import Patience
+from scenarios.ipc.messages import Hello, Job
+from scenarios.runs.pool import run_all
+from scenarios.runs.protocol import (
+    Claim,
+    Lease,
+    Over,
+    Result,
+    TurnedAway,
+    digest_of,
+    installed_here,
+    reply_in,
+)
+from scenarios.runs.run import run_spec
+from scenarios.runs.transport import HeldRun
+from scenarios.runs.zenoh_transport import workers_of_run
+from scenarios.tools.bench.figures import MORE, Figure
+
+_MODULE: Final = "scenarios.tools.bench.coordinating"
+_POLICY: Final = f"{_MODULE}:Unseeing"
+_LOG_BYTES: Final = 30_000
+"""Of the log of a short episode."""
+_ONE, _MANY = (1, 300), (200, 3000)
+"""Workers and jobs of the two figures."""
+
+
+class Unseeing:
+    """A policy that is never asked."""
+
+    manifest = Manifest("unseeing", camera=None)
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: object) -> Command:
+        return STILL
+
+
+class Served(NamedTuple):
+    """What a run of made-up results took. wall_s, cpu_s: of the coordinator from the first job on;
+    memory_mb: at most; round_s: median from a result that is ready to the next job, for one of the
+    workers."""
+
+    jobs: int
+    wall_s: float
+    cpu_s: float
+    memory_mb: float
+    round_s: float
+
+
+def coordinating() -> list[Figure]:
+    """What an episode costs, and how many a second the coordinator takes in."""
+    alone, many = serve_made_up(*_ONE), serve_made_up(*_MANY)
+    per_s = many.jobs / many.wall_s
+    return [
+        Figure("coordinator: from a result to the next job, ms", 1000.0 * alone.round_s, reach=5.0),
+        Figure("coordinator: CPU an episode, ms", 1000.0 * many.cpu_s / many.jobs, reach=5.0),
+        Figure(
+            f"coordinator: {_MANY[0]} workers, results a second", per_s, reach=200.0, better=MORE
+        ),
+        Figure(f"coordinator: {_MANY[0]} workers, memory, MB", many.memory_mb, reach=500.0),
+    ]
+
+
+def serve_made_up(workers: int, jobs: int) -> Served:
+    """Coordinate so many jobs of so many workers, which are all in one process beside this one."""
+    one = Scenario(
+        id="j",
+        suite="load",
+        place=City(seed=0, net_hash="h"),
+        seed=0,
+        start=(0.0, 0.0, 0.0),
+        goal=(9.0, 0.0),
+        route=((0.0, 0.0), (9.0, 0.0)),
+    )
+    scenarios = tuple(msgspec.structs.replace(one, id=f"j-{i:06d}", seed=i) for i in range(jobs))
+    suite = Suite(name="load", version="1", scenarios=scenarios)
+    driver = load_policy(_POLICY)
+    options = EpisodeOptions(seed=1, suite_hash=suite.content_hash)
+    spec = run_spec(suite, scenarios, _POLICY, driver, options)
+    hello = Hello(_POLICY, driver.manifest, driver.source_hash)
+    with tempfile.TemporaryDirectory() as folder:
+        endpoint = f"unixsock-stream/{folder}/hub.sock"
+        command = [sys.executable, "-m", _MODULE, "--load", endpoint, "--workers", str(workers)]
+        with (
+            RunFolder.create(Path(folder) / "run", spec, suite) as held,
+            open_session(Connection(role="coordinator", listen=endpoint)) as session,
+            workers_of_run(
+                session,
+                HeldRun(held, hello, Patience(), scenarios, scenarios),
+                lambda _: None,
+                resumed=False,
+            ) as of,
+        ):
+            load = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+            transport, tell = of
+            while not transport.room(0):
+                transport.wait(1.0)
+            began_s, cpu_s = time.monotonic(), time.process_time()
+            run_all(held, scenarios, hello, transport, tell=tell, options=options)
+            took_s, cpu_s = time.monotonic() - began_s, time.process_time() - cpu_s
+        said, _ = load.communicate()
+    if load.returncode:
+        raise EngineError(f"the made-up workers ended with exit code {load.returncode}")
+    memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    return Served(jobs, took_s, cpu_s, memory_mb, float(said))
+
+
+class _MadeUp:
+    """A worker that has every result at once."""
+
+    def __init__(
+        self,
+        session: Session,
+        run: str,
+        number: int,
+        replies: queue.SimpleQueue[tuple[_MadeUp, bytes]],
+    ) -> None:
+        self._session = session
+        self._run = run
+        self._replies = replies
+        self._me = {"worker": f"w-{os.getpid()}-{number}", "slot": 0}
+        session.stand(keys.worker(run, f"w-{os.getpid()}-{number}"))
+        self._claim = encode(Claim(**self._me, host="here", installed=installed_here(), ready=True))  # type: ignore[arg-type]
+        self._manifest = load_policy(_POLICY)
+        self._said: tuple[str, bytes] = ("", b"")
+        self.rounds_s: list[float] = []
+        self._done_s = 0.0
+        self._say("claim", self._claim)
+
+    def take(self, payload: bytes | None) -> bool:
+        """A reply. Returns whether the run is over."""
+        if payload is None:
+            time.sleep(0.001)
+            self._say(*self._said)
+            return False
+        reply = reply_in(payload)
+        if isinstance(reply, Over):
+            return True
+        if isinstance(reply, TurnedAway):
+            raise EngineError(reply.why)
+        if isinstance(reply, Lease):
+            if self._done_s:
+                self.rounds_s.append(time.monotonic() - self._done_s)
+            result = encode(self._result(reply.number, reply.job))
+            self._done_s = time.monotonic()
+            self._say("result", result)
+        else:
+            self._say("claim", self._claim)
+        return False
+
+    def _say(self, act: str, payload: bytes) -> None:
+        self._said = (act, payload)
+        self._session.send(keys.job(self._run, act), payload, self._heard, timeout_s=30.0)
+
+    def _heard(self, payload: bytes | None, error: str) -> None:
+        self._replies.put((self, payload))  # type: ignore[arg-type]
+
+    def _result(self, lease: int, job: Job) -> Result:
+        options, driver = job.options, self._manifest
+        record = begun(
+            job.scenario, driver.manifest, options.suite_hash, driver.source_hash, options.seed or 0
+        )
+        data = msgspec.structs.replace(
+            record, status="done", ended="goal", ticks=40, state_hash="0" * 32
+        ).encoded()
+        log = bytes(_LOG_BYTES)
+        return Result(
+            **self._me,
+            lease=lease,
+            scenario=job.scenario.id,
+            status="done",
+            record=data,
+            log=log,
+            again=False,  # type: ignore[arg-type]
+            digest=digest_of(data, log),
+        )
+
+
+def _load(endpoint: str, workers: int) -> None:
+    """So many made-up workers, until the run is over."""
+    replies: queue.SimpleQueue[tuple[_MadeUp, bytes]] = queue.SimpleQueue()
+    with open_session(Connection(role="worker", connect=endpoint)) as session:
+        while not (runs := session.answers(keys.EVERY_RUN, timeout_s=5.0)):
+            time.sleep(0.05)
+        run = next(iter(runs)).split("/")[1]
+        there = [_MadeUp(session, run, number, replies) for number in range(workers)]
+        over = 0
+        while over < workers:
+            one, payload = replies.get()
+            over += one.take(payload)
+    rounds_s = sorted(took for one in there for took in one.rounds_s)
+    print(rounds_s[len(rounds_s) // 2] if rounds_s else 0.0)
+
+
+def _main() -> None:
+    parser = argparse.ArgumentParser(description="How many workers a coordinator serves.")
+    parser.add_argument("--workers", type=int, default=_MANY[0])
+    parser.add_argument("--jobs", type=int, default=_MANY[1])
+    parser.add_argument("--load", metavar="ENDPOINT", default="", help="be the workers there")
+    given = parser.parse_args()
+    if given.load:
+        _load(given.load, given.workers)
+        return
+    found = serve_made_up(given.workers, given.jobs)
+    print(
+        f"{found.jobs} jobs by {given.workers} workers: {found.jobs / found.wall_s:.0f} a second, "
+        f"{1000.0 * found.cpu_s / found.jobs:.2f} ms CPU each, {found.memory_mb:.0f} MB, "
+        f"{1000.0 * found.round_s:.1f} ms from a result to the next job"
+    )
+
+
+if __name__ == "__main__":
+    _main()

@@ -1,0 +1,175 @@
+"""What `cosim bench crossings` measures: how a policy, the crowd and the vehicles keep to the
+lights of crossings.
+
+Every crossing is an episode of its own with the real engines; each city has a process of its own,
+because SUMO can take one down. What such a process had not finished counts as crashed.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import cache
+
+import msgspec
+import numpy as np
+
+from cosim.core.child_process import end_with
+from cosim.core.clock import Clock
+from cosim.core.errors import SpecError
+from cosim.episode.policy_caller import Driver
+from cosim.episode.step import Step
+from cosim.people.yielding import ROBOT_STANDS_MPS
+from cosim.place.walk_graph import WalkGraph
+from cosim.policies.load import load_policy
+from cosim.results.referee import Verdict
+from cosim.spec.scenario import City, Scenario
+from scenarios.episodes.run_episode import Outcome, run_episode
+from scenarios.places.nets import place
+from scenarios.suites.crossings import build_all
+from scenarios.tools.bench.crowd_tally import Tally
+from sumo_nets.crowd.stoplines import StopLines
+
+_SIZE_M = 2000.0
+"""Of the cities, whose seeds count from 1."""
+
+
+class Crossed(msgspec.Struct, frozen=True, kw_only=True):
+    """One crossing driven over. ended: "crashed" when it was not. waited_s: how long the robot
+    stood before red.
+
+    red_entries, vehicles_braked, carriageway_s: the robot's. failures: what failed, and with whom
+    it collided. counts, at_red: of the street around, see `Tally`; entered: the signalised
+    crossings that somebody entered there.
+    """
+
+    scenario: str
+    city: str
+    crossing: str
+    ended: str
+    reason: str = ""
+    waited_s: float = 0.0
+    red_entries: int = 0
+    vehicles_braked: int = 0
+    carriageway_s: float = 0.0
+    minutes: float = 0.0
+    failures: tuple[str, ...] = ()
+    counts: dict[str, float] = {}
+    entered: tuple[str, ...] = ()
+    at_red: tuple[str, ...] = ()
+
+
+def cross_all(
+    crossings: int, cities: int, policy: str, jobs: int, tell: Callable[[str], None]
+) -> list[Crossed]:
+    """Drive over so many crossings, spread over cities, `jobs` cities at a time."""
+    if cities > crossings:
+        raise SpecError(
+            f"{crossings} crossings cannot lie in {cities} cities: ask for fewer cities"
+        )
+    shares = [crossings // cities + (i < crossings % cities) for i in range(cities)]
+    found: list[Crossed] = []
+
+    def one(seed: int, count: int) -> None:
+        for crossed in cross_city(City(seed=seed, size_m=_SIZE_M), count, policy):
+            found.append(crossed)
+            tell(f"{len(found)} of {crossings} crossings")
+
+    with ThreadPoolExecutor(jobs) as pool:
+        try:
+            for done in [pool.submit(one, 1 + i, count) for i, count in enumerate(shares)]:
+                done.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    return sorted(found, key=lambda crossed: (crossed.city, crossed.scenario))
+
+
+def cross_city(city: City, count: int, policy: str) -> Iterator[Crossed]:
+    """Drive over so many crossings of one city, one after another, in a process of its own."""
+    context = multiprocessing.get_context("spawn")
+    names = [""] * count
+    done = 0
+    try:
+        with ProcessPoolExecutor(
+            1, context, initializer=end_with, initargs=(os.getpid(),)
+        ) as alone:
+            scenarios = alone.submit(_drawn, city, count).result()
+            names = [scenario.id for scenario in scenarios]
+            for scenario in scenarios:
+                yield alone.submit(cross, scenario, policy).result()
+                done += 1
+    except BrokenProcessPool:
+        for name in names[done:]:
+            yield Crossed(
+                scenario=name,
+                city=city.name,
+                crossing="",
+                ended="crashed",
+                reason="the process died",
+            )
+
+
+def _drawn(city: City, count: int) -> list[Scenario]:
+    """So many crossings of a city."""
+    _, street_map = place(city)
+    return build_all(city, street_map, WalkGraph(street_map), 0, count)
+
+
+@cache
+def driver_of(policy: str) -> Driver:
+    """The policy of this process: the same one for all its crossings."""
+    return load_policy(policy)
+
+
+def cross(scenario: Scenario, policy: str) -> Crossed:
+    """Drive over one crossing and count what happens around it. A policy that raised is made anew
+    for the next."""
+    _, street_map = place(scenario.place)
+    tally = Tally(street_map, Clock().tick_s)
+    lines = StopLines(Clock().tick_s)
+
+    def watch(step: Step, verdict: Verdict) -> None:
+        tally.see(step.street_after)
+        tally.drove(lines.passed(step.street_after.vehicles.ids))
+
+    outcome = run_episode(scenario, driver_of(policy), watches=[watch])
+    if outcome.traceback:
+        driver_of.cache_clear()
+    return told(scenario, outcome, tally)
+
+
+def told(scenario: Scenario, outcome: Outcome, tally: Tally) -> Crossed:
+    """An episode and what was counted around it, in a row."""
+    record, log = outcome.record, outcome.log
+    nothing = Crossed(
+        scenario=scenario.id,
+        city=scenario.place.name,
+        crossing=scenario.crossings[0].id,
+        ended="crashed",
+        reason=record.reason,
+    )
+    if log is None:
+        return nothing
+    stood = log.waits_at_red & (np.abs(log.speed[:, 0]) < ROBOT_STANDS_MPS)
+    return msgspec.structs.replace(
+        nothing,
+        ended=str(record.ended),
+        waited_s=float(stood.sum()) * log.tick_s,
+        red_entries=round(record.measures["red_light_entries"] or 0.0),
+        vehicles_braked=round(record.measures["vehicles_braked"] or 0.0),
+        carriageway_s=record.measures["carriageway_time_s"] or 0.0,
+        minutes=len(log) * log.tick_s / 60.0,
+        failures=tuple(f"{f.kind} {f.other_kind}".strip() for f in record.failures),
+        counts=dict(tally.counts),
+        entered=tuple(sorted(f"{scenario.place.name} {crossing}" for crossing in tally.crossings)),
+        at_red=tuple(tally.at_red),
+    )
+
+
+def crossings_entered(rows: Iterable[Crossed]) -> int:
+    """How many different signalised crossings somebody of the crowd entered."""
+    return len({crossing for row in rows for crossing in row.entered})

@@ -1,0 +1,148 @@
+"""What it costs to ask a policy in another process: isolated, and over Zenoh, alone and with many
+episodes at once."""
+
+from __future__ import annotations
+
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from bridge.policy_server import serve
+from cosim.core.state import Command
+from cosim.episode.interfaces import Observation
+from cosim.episode.manifest_checks import calibration_of
+from cosim.episode.policy_caller import Driver
+from cosim.spec.camera import CameraSpec
+from cosim.spec.connection import Connection
+from cosim.spec.manifest import Manifest
+from cosim.spec.policy_host import PolicyHost
+from cosim.spec.robot import COURIER
+from scenarios.runs.isolated_policy import isolated_driver
+from scenarios.runs.observation_codec import seen_from_afar
+from scenarios.runs.remote_policy import remote_driver
+from scenarios.tools.bench.figures import MORE, Figure
+
+_SPEC: Final = CameraSpec(width=512, height=288)
+_ASKED: Final = 500
+_TOGETHER: Final = 8
+_HERE: Final = "the same policy asked in this process"
+_NAME: Final = f"{__name__}:Blind"
+
+
+class Blind:
+    """Answers at once, whatever it is shown."""
+
+    manifest = Manifest("blind", rate_hz=4.0, camera=_SPEC)
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: Observation) -> Command:
+        return Command(1.0, 0.0)
+
+
+class BlindTogether(Blind):
+    """The same for all that ask."""
+
+    def act_batch(self, observations: Sequence[Observation]) -> list[Command]:
+        return [Command(1.0, 0.0) for _ in observations]
+
+
+def asking_elsewhere() -> list[Figure]:
+    """Round trips of a 512x288 picture: in turns with the same policy in this process; then eight
+    ask one server."""
+    here = Driver(Blind())
+    isolated = isolated_driver(_NAME, expected=Blind.manifest)
+    with _served() as host:
+        remote = remote_driver("zenoh:blind", host)
+        here_ms, isolated_ms, remote_ms = _in_turns(here, isolated, remote)
+        remote.close()
+        a_second = _together(host)
+    isolated.close()
+    return [
+        Figure("isolated policy, 512x288, ms a step", isolated_ms, here_ms, _HERE, 1.0),
+        Figure("remote policy on this machine, 512x288, ms a step", remote_ms, here_ms, _HERE, 1.0),
+        Figure(
+            f"remote policy with act_batch, {_TOGETHER} episodes at once, answers per s",
+            a_second,
+            better=MORE,
+        ),
+    ]
+
+
+def _in_turns(*drivers: Driver) -> list[float]:
+    """Milliseconds of an answer, medians."""
+    took: list[list[float]] = [[] for _ in drivers]
+    for driver in drivers:
+        driver.reset("k1", 1)
+    for tick in range(_ASKED):
+        for driver, times in zip(drivers, took, strict=True):
+            began = time.perf_counter()
+            driver.act(_seen(tick))
+            times.append(1000.0 * (time.perf_counter() - began))
+    return [statistics.median(times) for times in took]
+
+
+def _together(host: PolicyHost) -> float:
+    """Answers a second of one server that several processes ask; the slowest one's."""
+    code = f"from {__name__} import ask_alone; ask_alone({host.servers[0].connect!r})"
+    asking = [
+        subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
+        for _ in range(_TOGETHER)
+    ]
+    said = [process.communicate()[0] for process in asking]
+    return _TOGETHER * min(map(float, said))
+
+
+def ask_alone(endpoint: str) -> None:
+    """Ask a served policy for one episode, and print how many answers came in a second."""
+    servers = (Connection(role="coordinator", connect=endpoint),)
+    driver = remote_driver("zenoh:blind", PolicyHost(servers=servers, run=str(os.getpid())))
+    driver.reset("k1", 1)
+    driver.act(_seen(0))
+    began = time.perf_counter()
+    for tick in range(_ASKED):
+        driver.act(_seen(tick))
+    print(_ASKED / (time.perf_counter() - began))
+    driver.ended()
+    driver.close()
+
+
+@contextmanager
+def _served() -> Iterator[PolicyHost]:
+    """The policy in a process of its own, behind a socket."""
+    with tempfile.TemporaryDirectory() as folder:
+        endpoint = f"unixsock-stream/{Path(folder)}/hub"
+        code = f"from {__name__} import serve_blind; serve_blind({endpoint!r})"
+        process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.DEVNULL)
+        try:
+            yield PolicyHost(
+                servers=(Connection(role="coordinator", connect=endpoint),), run="bench"
+            )
+        finally:
+            process.kill()
+            process.wait()
+
+
+def serve_blind(endpoint: str) -> None:
+    """Serve it until killed."""
+    serve(BlindTogether(), listen=endpoint, observe=seen_from_afar)
+
+
+def _seen(tick: int) -> Observation:
+    return Observation(tick, tick / 20.0, _RGB, 0.5, 0.0, COURIER, camera=_CALIBRATION)
+
+
+_RGB: Final[Any] = np.random.default_rng(0).integers(
+    0, 255, (_SPEC.height, _SPEC.width, 3), dtype=np.uint8
+)
+_CALIBRATION: Final = calibration_of(_SPEC, COURIER)

@@ -1,0 +1,214 @@
+"""Ten minutes on a map: does SUMO survive a robot and event pedestrians that go anywhere, with
+crowd and traffic?
+
+The bodies walk from sidewalk to sidewalk, drive along lanes, cut straight across everything, stand
+at the ends of sidewalks and jump, as resets do. Each map has a process of its own: SUMO takes its
+process down when it dies.
+"""
+
+from __future__ import annotations
+
+import math
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from multiprocessing.connection import Connection
+
+import msgspec
+import numpy as np
+
+from cosim.core.child_process import end_with
+from cosim.core.clock import Clock
+from cosim.core.errors import CosimError
+from cosim.core.geometry import Floats, Polyline, Pose
+from cosim.core.state import PersonKind, RobotState
+from cosim.place.street_map import StreetMap
+from cosim.place.walk_graph import WalkGraph
+from cosim.spec.events import Actor, EventReply
+from cosim.spec.scenario import Place, Scenario
+from scenarios.episodes.wiring import crowd_of
+from scenarios.places.nets import place
+
+BODIES = 3
+"""The robot and two event pedestrians."""
+
+_STEP_M = 0.075
+"""How far a body goes in a tick: 1.5 m/s."""
+
+MOVES = {"walk": 0.2, "lane": 0.2, "across": 0.3, "stand": 0.15, "jump": 0.15}
+"""What a body does next, and how often."""
+
+_WALK_EDGES = 6
+ACROSS_M = (10.0, 60.0)
+STAND_TICKS = 160
+NEARBY_M = 100.0
+REPORT_TICKS = 200
+HANG_S = 120.0
+
+
+class Endured(msgspec.Struct, frozen=True, kw_only=True):
+    """How a place was endured. ticks: simulated; persons, vehicles: around the robot, on the mean
+    over the ticks.
+
+    reason: what ended it before its time, "" when nothing did.
+    """
+
+    place: str
+    ticks: int = 0
+    persons: float = 0.0
+    vehicles: float = 0.0
+    wall_s: float = 0.0
+    reason: str = ""
+
+
+def endure(
+    where: Place, seed: int, minutes: float = 10.0, tell: Callable[[float], None] = lambda _: None
+) -> Endured:
+    """Simulate a place in a process of its own. Whatever goes wrong there becomes the reason, not
+    an exception."""
+    context = multiprocessing.get_context("spawn")
+    mine, theirs = context.Pipe(duplex=False)
+    ticks = Clock().ticks(60.0 * minutes)
+    process = context.Process(
+        target=_child, args=(theirs, where, seed, ticks, os.getpid()), daemon=True
+    )
+    began = time.monotonic()
+    process.start()
+    theirs.close()
+    last = Endured(place=where.name)
+    try:
+        while mine.poll(HANG_S):
+            last = msgspec.json.decode(mine.recv_bytes(), type=Endured)
+            tell(last.ticks / ticks)
+        process.kill()
+        reason = f"SUMO showed no sign of life for {HANG_S:g} s"
+    except (EOFError, ConnectionResetError):
+        process.join()
+        code = process.exitcode or 0
+        reason = (
+            f"SUMO was killed by {signal.Signals(-code).name}"
+            if code < 0
+            else f"exit code {code}"
+            if code
+            else ""
+        )
+    process.join()
+    wall_s = round(time.monotonic() - began, 1)
+    return msgspec.structs.replace(last, wall_s=wall_s, reason=last.reason or reason)
+
+
+def _child(pipe: Connection, where: Place, seed: int, ticks: int, parent: int) -> None:
+    end_with(parent)
+    so_far = Endured(place=where.name)
+    try:
+        for so_far in simulated(where, seed, ticks):
+            pipe.send_bytes(msgspec.json.encode(so_far))
+    except CosimError as error:
+        pipe.send_bytes(msgspec.json.encode(msgspec.structs.replace(so_far, reason=str(error))))
+
+
+def simulated(where: Place, seed: int, ticks: int) -> Iterator[Endured]:
+    """Simulate a place in this process, with a word every REPORT_TICKS and at the end."""
+    _, street_map = place(where)
+    graph = WalkGraph(street_map)
+    bodies = [
+        wandering(street_map, graph, rng)
+        for rng in np.random.default_rng([seed, 0xE2D]).spawn(BODIES)
+    ]
+    persons = vehicles = 0
+    start = next(bodies[0])
+    ahead = (start.x_m + 10.0, start.y_m)
+    scenario = Scenario(
+        id="soak",
+        suite="soak",
+        place=where,
+        seed=seed,
+        start=start,
+        goal=ahead,
+        route=((start.x_m, start.y_m), ahead),
+    )
+    with crowd_of(scenario) as crowd:
+        for tick in range(ticks):
+            robot, *others = map(next, bodies)
+            actors = tuple(
+                Actor(
+                    id=f"e{i}",
+                    x_m=x,
+                    y_m=y,
+                    heading_rad=way,
+                    speed_mps=1.5,
+                    doing="walk",
+                    kind=PersonKind.EVENT,
+                )
+                for i, (x, y, way) in enumerate(others)
+            )
+            street = crowd.step(
+                RobotState(robot), EventReply(episode="", tick=tick, states=(), actors=actors)
+            )
+            persons += len(street.people) - len(actors)
+            vehicles += len(street.vehicles)
+            done = tick + 1
+            if done % REPORT_TICKS == 0 or done == ticks:
+                yield Endured(
+                    place=where.name, ticks=done, persons=persons / done, vehicles=vehicles / done
+                )
+
+
+def wandering(street_map: StreetMap, graph: WalkGraph, rng: np.random.Generator) -> Iterator[Pose]:
+    """The poses of a body that goes anywhere, one a tick, for ever."""
+    starts = [s.line[:, :2] for s in street_map.strips.values()]
+    ends = [
+        s.line[:: 1 if end else -1, :2]
+        for s in street_map.strips.values()
+        for end in (0, 1)
+        if not s.corners[end]
+    ]
+    lanes = [lane.line[:, :2] for lane in street_map.lanes.values() if lane.kind == "road"]
+    pose = Polyline(starts[int(rng.integers(len(starts)))]).at(0.0)
+    while True:
+        move = str(rng.choice(list(MOVES), p=list(MOVES.values())))
+        if move == "walk":
+            line = _walk(street_map, graph, rng, pose)
+        elif move == "lane" and lanes:
+            line = _near(lanes, rng, pose)
+        elif move == "across":
+            way_m = rng.uniform(*ACROSS_M)
+            turn_rad = rng.uniform(-math.pi, math.pi)
+            line = np.array(
+                [pose.xy, pose.xy + way_m * np.array([math.cos(turn_rad), math.sin(turn_rad)])]
+            )
+        else:
+            near = _near(ends if ends and rng.random() < 0.5 else starts, rng, pose)
+            line = near if rng.random() < 0.8 else starts[int(rng.integers(len(starts)))]
+            x_m, y_m = line[-1].tolist()
+            pose = Pose(x_m, y_m, float(rng.uniform(-math.pi, math.pi)))
+            for _ in range(STAND_TICKS if move == "stand" else 1):
+                yield pose
+            continue
+        path = Polyline(line)
+        for s_m in np.arange(0.0, path.length_m, _STEP_M):
+            pose = path.at(float(s_m))
+            yield pose
+
+
+def _near(lines: list[Floats], rng: np.random.Generator, pose: Pose) -> Floats:
+    """One of the lines that begin nearby, or any."""
+    near = [line for line in lines if np.hypot(*(line[0] - pose.xy)) < NEARBY_M] or lines
+    return near[int(rng.integers(len(near)))]
+
+
+def _walk(street_map: StreetMap, graph: WalkGraph, rng: np.random.Generator, pose: Pose) -> Floats:
+    """The lines of a random walk that begins on the sidewalk at a pose, or on any."""
+    strips = street_map.strips
+    here = street_map.locate(pose.x_m, pose.y_m).edge
+    names = list(strips)
+    first = here if here in strips else names[int(rng.integers(len(names)))]
+    walk = graph.wander(rng, first, bool(rng.random() < 0.5), _WALK_EDGES)
+    pieces = [strips[first].line[:, :2]]
+    for name in walk[1:]:
+        line = strips[name].line[:, :2]
+        straight = np.hypot(*(line[0] - pieces[-1][-1])) <= np.hypot(*(line[-1] - pieces[-1][-1]))
+        pieces.append(line if straight else line[::-1])
+    return np.vstack(pieces)

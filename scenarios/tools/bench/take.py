@@ -1,0 +1,25 @@
+"""One measurement in a process of its own: `python -m scenarios.tools.bench.take NAME STARTED
+FILE`.
+
+STARTED: when the process was started, seconds of the monotonic clock. FILE: where its figures are
+written, as JSON.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import msgspec
+
+
+def _main() -> None:
+    """Take what the command line names."""
+    name, started_s, path = sys.argv[1:]
+    from scenarios.tools.bench.measurements import figures_of
+
+    Path(path).write_bytes(msgspec.json.encode(figures_of(name, float(started_s))))
+
+
+if __name__ == "__main__":
+    _main()

@@ -1,0 +1,1 @@
+"""Build and prove the frozen suites."""

@@ -1,0 +1,313 @@
+"""Building a suite, a process for each place: what is proved is kept scenario by scenario, so that
+a build that was stopped goes on where it was, and a process that dies or hangs costs one
+candidate."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from multiprocessing import get_context
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+import cosim
+import physics
+import scenarios
+import sumo_nets
+from cosim.core.baked import sources_hash
+from cosim.core.errors import CosimError, RunError, SpecError
+from cosim.core.whole_file import write_whole
+from cosim.spec.scenario import Place, Scenario, Suite, write_suite
+from scenarios.suites.proofs import Dropped, Proof, Proofs, write_proofs
+from scenarios.suites.recipes import RECIPES, Slot, candidate, repeated
+from scenarios.tools.build.proving import proved
+
+CANDIDATES: Final = 6
+"""Candidates of a scenario."""
+_MADE_BY: Final = "made-by.txt"
+_HANGS_S: Final = {"long-horizon": 900.0}
+_HANGS_SHORT_S: Final = 240.0
+"""A candidate that takes longer is given up: many times what it takes."""
+_BEGUN: Final = 2
+"""So often a candidate is begun: once it may have been stopped with the build, twice it ends its
+process."""
+_POLL_S: Final = 0.1
+_THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+class Kept(msgspec.Struct, frozen=True):
+    """A scenario that is kept, with its proof."""
+
+    scenario: Scenario
+    proof: Proof
+
+
+class _Tried(msgspec.Struct, frozen=True):
+    """How far a slot has come. begun: how often the candidate after those that were dropped was
+    begun."""
+
+    dropped: tuple[Dropped, ...] = ()
+    begun: int = 0
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """Scenarios of one suite in one place, in order: a process's work."""
+
+    suite: str
+    where: Place
+    slots: tuple[Slot, ...]
+
+
+TellDone = Callable[[str, int, int], None]
+"""Told of each scenario that is kept or given up: a line, how many are done, of how many."""
+
+
+def build_suite(
+    name: str,
+    out: Path,
+    jobs: int = 1,
+    tries: int = CANDIDATES,
+    tell: TellDone | None = None,
+    only: Sequence[str] = (),
+) -> tuple[Suite, Proofs]:
+    """Build a suite at a path, its proofs beside it; any number of processes makes the same.
+
+    What is proved is kept in the folder OUT.parts until the suite is whole: call it again to go on.
+    tries: candidates of each scenario. only: names of scenarios, a part of the suite for a look at
+    it.
+
+    Raises SpecError with the scenarios for which no candidate did, RunError where OUT.parts is of
+    another version.
+    """
+    recipe = RECIPES[name]
+    folder = out.with_suffix(".parts")
+    slots = [
+        slot
+        for slot in recipe.slots
+        if not only or slot.name in only or _is_like(slot, recipe.slots, only)
+    ]
+    _open(folder, name)
+    for line, done in _run(_pieces(slots), folder, jobs, tries):
+        if tell is not None:
+            tell(line, done, len(slots))
+    kept = [_kept(folder, slot) for slot in slots]
+    if lacking := [slot.name for slot, one in zip(slots, kept, strict=True) if one is None]:
+        reasons = [f"{name}: {_in_words(_tried(folder, name).dropped)}" for name in lacking]
+        raise SpecError(
+            f"no candidate of {len(lacking)} scenarios is solved: {'; '.join(reasons)}. "
+            f"Build again with more --tries"
+        )
+    whole = [one for one in kept if one is not None]
+    suite = Suite(
+        name=name,
+        version=recipe.version,
+        description=recipe.description,
+        scenarios=tuple(one.scenario for one in whole),
+    )
+    write_suite(suite, out)
+    return suite, write_proofs(out, name, suite.content_hash, [one.proof for one in whole])
+
+
+def _is_like(slot: Slot, slots: Sequence[Slot], only: Sequence[str]) -> bool:
+    """Whether a slot is repeated by one of those asked for."""
+    return any(other.like == slot.name and other.name in only for other in slots)
+
+
+def _open(folder: Path, name: str) -> None:
+    """Make the folder of the parts, or go on in it. Raises RunError where another version made what
+    is in it."""
+    rooms = [Path(room.__file__ or "").parent for room in (cosim, physics, scenarios, sumo_nets)]
+    made_by = f"{name} {sources_hash(*rooms)}"
+    folder.mkdir(parents=True, exist_ok=True)
+    note = folder / _MADE_BY
+    if note.exists() and note.read_text() != made_by:
+        raise RunError(f"{folder}: begun by another version of the code: delete it and build anew")
+    write_whole(note, made_by.encode())
+
+
+def _pieces(slots: Sequence[Slot]) -> list[_Piece]:
+    """The longest work first."""
+    by_place: dict[Place, list[Slot]] = {}
+    for slot in slots:
+        by_place.setdefault(slot.where, []).append(slot)
+    pieces = [_Piece(those[0].suite, where, tuple(those)) for where, those in by_place.items()]
+    return sorted(pieces, key=lambda piece: -sum(1.0 + slot.length_m for slot in piece.slots))
+
+
+@dataclass
+class _Worker:
+    piece: _Piece
+    process: BaseProcess
+    heard_s: float
+    restarts: int = 0
+
+
+def _run(
+    pieces: Sequence[_Piece], folder: Path, jobs: int, tries: int
+) -> Iterator[tuple[str, int]]:
+    """Work on all pieces; a line for each scenario that is over, and how many are."""
+    waiting = [(piece, 0) for piece in pieces]
+    working = list[_Worker]()
+    open_slots = {slot.name: slot for piece in pieces for slot in piece.slots}
+    done = 0
+    try:
+        while waiting or working:
+            while waiting and len(working) < jobs:
+                piece, restarts = waiting.pop(0)
+                working.append(
+                    _Worker(piece, _started(piece, folder, tries), time.monotonic(), restarts)
+                )
+            time.sleep(_POLL_S)
+            for worker in list(working):
+                over = [
+                    slot
+                    for slot in worker.piece.slots
+                    if slot.name in open_slots and _over(folder, slot, tries)
+                ]
+                for slot in over:
+                    del open_slots[slot.name]
+                    done += 1
+                    worker.heard_s = time.monotonic()
+                    yield _line(folder, slot), done
+                if worker.process.is_alive():
+                    _look_after(worker, folder)
+                    continue
+                working.remove(worker)
+                worker.process.join()
+                most = _BEGUN * tries * len(worker.piece.slots)
+                if worker.restarts < most and any(
+                    slot.name in open_slots for slot in worker.piece.slots
+                ):
+                    waiting.insert(0, (worker.piece, worker.restarts + 1))
+    finally:
+        # Who stops the build does not use up a candidate.
+        for worker in working:
+            worker.process.kill()
+            worker.process.join()
+            for slot in worker.piece.slots:
+                if (tried := _tried(folder, slot.name)).begun:
+                    _note(folder, slot, _Tried(tried.dropped, tried.begun - 1))
+
+
+def _look_after(worker: _Worker, folder: Path) -> None:
+    """End a process whose candidate takes too long; its place is taken by another, with the next
+    candidate."""
+    marks = [
+        path.stat().st_mtime
+        for slot in worker.piece.slots
+        if (path := _trying(folder, slot.name)).exists()
+    ]
+    since_s = time.time() - max(marks, default=0.0)
+    limit_s = _HANGS_S.get(worker.piece.suite, _HANGS_SHORT_S)
+    if min(since_s, time.monotonic() - worker.heard_s) > limit_s:
+        worker.process.kill()
+        worker.process.join()
+        for slot in worker.piece.slots:
+            if (tried := _tried(folder, slot.name)).begun:
+                hung = Dropped(_seed(slot, len(tried.dropped)), "hung")
+                _note(folder, slot, _Tried((*tried.dropped, hung)))
+
+
+def _started(piece: _Piece, folder: Path, tries: int) -> BaseProcess:
+    for name in _THREADS:
+        os.environ.setdefault(name, "1")
+    process = get_context("spawn").Process(target=_work, args=(piece, folder, tries))
+    process.start()
+    return process
+
+
+def _work(piece: _Piece, folder: Path, tries: int) -> None:
+    """In a process of its own: prove the slots of a piece that are not over."""
+    for slot in piece.slots:
+        if not _over(folder, slot, tries):
+            _fill(slot, folder, tries)
+
+
+def _fill(slot: Slot, folder: Path, tries: int) -> None:
+    """Find the first candidate that the expert solves, and keep it."""
+    tried = _tried(folder, slot.name)
+    dropped = list(tried.dropped)
+    begun = tried.begun
+    if begun >= _BEGUN:
+        dropped.append(Dropped(_seed(slot, len(dropped)), "its process died"))
+        begun = 0
+    for attempt in itertools.count(len(dropped)):
+        if attempt >= tries:
+            _note(folder, slot, _Tried(tuple(dropped)))
+            return
+        seed = _seed(slot, attempt)
+        _note(folder, slot, _Tried(tuple(dropped), begun + 1))
+        begun = 0
+        try:
+            scenario = _drawn(slot, folder, seed)
+        except CosimError as error:
+            dropped.append(Dropped(seed, "none drawn", str(error)[:300]))
+            continue
+        found = proved(scenario)
+        if isinstance(found, Dropped):
+            dropped.append(msgspec.structs.replace(found, seed=seed))
+            continue
+        kept = Kept(scenario, msgspec.structs.replace(found, dropped=tuple(dropped)))
+        write_whole(folder / f"{slot.name}.json", msgspec.json.encode(kept))
+        _trying(folder, slot.name).unlink()
+        return
+
+
+def _drawn(slot: Slot, folder: Path, seed: int) -> Scenario:
+    if not slot.like:
+        return candidate(slot, seed)
+    path = folder / f"{slot.like}.json"
+    if not path.exists():
+        raise SpecError(f"'{slot.like}', which it repeats, was not solved")
+    return repeated(slot, msgspec.json.decode(path.read_bytes(), type=Kept).scenario)
+
+
+def _seed(slot: Slot, attempt: int) -> int:
+    return 1000 * attempt + slot.number
+
+
+def _trying(folder: Path, name: str) -> Path:
+    return folder / f"{name}.trying"
+
+
+def _note(folder: Path, slot: Slot, tried: _Tried) -> None:
+    write_whole(_trying(folder, slot.name), msgspec.json.encode(tried))
+
+
+def _tried(folder: Path, name: str) -> _Tried:
+    path = _trying(folder, name)
+    return msgspec.json.decode(path.read_bytes(), type=_Tried) if path.exists() else _Tried()
+
+
+def _over(folder: Path, slot: Slot, tries: int) -> bool:
+    """Whether a slot is filled, or all its candidates were tried."""
+    if (folder / f"{slot.name}.json").exists():
+        return True
+    tried = _tried(folder, slot.name)
+    return not tried.begun and len(tried.dropped) >= tries
+
+
+def _kept(folder: Path, slot: Slot) -> Kept | None:
+    path = folder / f"{slot.name}.json"
+    return msgspec.json.decode(path.read_bytes(), type=Kept) if path.exists() else None
+
+
+def _line(folder: Path, slot: Slot) -> str:
+    """What became of a slot, in words."""
+    kept = _kept(folder, slot)
+    if kept is None:
+        return f"{slot.name}: NOT SOLVED; {_in_words(_tried(folder, slot.name).dropped)}"
+    length_m = kept.scenario.route_line.length_m
+    told = f"{slot.name}: {length_m:.0f} m, {kept.proof.time_s:.0f} s"
+    return f"{told}; dropped: {_in_words(kept.proof.dropped)}" if kept.proof.dropped else told
+
+
+def _in_words(dropped: Sequence[Dropped]) -> str:
+    return ", ".join(f"{one.seed} {one.reason} {one.details}".strip() for one in dropped)

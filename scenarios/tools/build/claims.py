@@ -1,0 +1,304 @@
+"""What a shipped suite claims, as far as its file and its proofs tell: counts, hashes, ways,
+spread, no duplicates."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+
+from cosim.spec.scenario import City, CityMap, Scenario, Suite, content_hash
+from cosim.spec.selection import STATIC
+from scenarios.events import EVENT_KINDS
+from scenarios.suites.daylight import FOG_M, LOWEST_SUN_RAD, sun_rises_rad
+from scenarios.suites.proofs import Proofs, proofs_path
+from scenarios.suites.recipes import ALL_ROUTES_M, LONG_WAY, RECIPES
+from scenarios.suites.unit import STRUCTURES, TURN_RAD, WAY_M, turn_rad
+from sumo_nets.maps.wheel_places import WHEEL_PLACES
+
+_APART_M: Final = 5.0
+"""Two scenarios of one structure in one place start farther apart than this, or lead elsewhere."""
+_MOST_BYTES: Final = 3_000_000
+"""Of a suite's file and its proofs."""
+_EDGE_M: Final = 0.6
+"""Ways of drawn lengths are as much longer or shorter than wanted, at most."""
+_STRAIGHT_RAD: Final = math.radians(10.0)
+_SPEEDS_MPS: Final = (1.1, 1.65)
+_FEWEST_EVENTS: Final = 5
+"""Of each kind on the long ways."""
+
+
+@dataclass(frozen=True)
+class Read:
+    """A suite as it was read. proofs: None where there are none that can be read; path: None for
+    one made in Python."""
+
+    suite: Suite
+    proofs: Proofs | None
+    path: Path | None = None
+
+
+def _counts(read: Read) -> Iterator[str]:
+    """As many scenarios of each structure as the recipe says, by its names, val and test."""
+    slots = {slot.name: slot for slot in RECIPES[read.suite.name].slots}
+    found = {scenario.id: scenario for scenario in read.suite.scenarios}
+    yield from (f"{name}: is missing" for name in slots if name not in found)
+    yield from (f"{name}: is none of the recipe's" for name in found if name not in slots)
+    for name in slots.keys() & found.keys():
+        slot, one = slots[name], found[name]
+        where = one.place.seed if isinstance(one.place, City) else one.place.map
+        wanted = slot.where.seed if isinstance(slot.where, City) else slot.where.map
+        is_one, should = (one.structure, one.split, where), (slot.structure, slot.split, wanted)
+        if is_one != should:
+            yield f"{name}: is {is_one}, not {should}"
+
+
+def _split(read: Read) -> Iterator[str]:
+    """A fifth is test, of each structure alike, in places that val never comes to."""
+    for structure, those in _by(read.suite.scenarios, lambda s: s.structure).items():
+        share = sum(s.split == "test" for s in those) / len(those)
+        if abs(share - 0.2) > 0.5 / len(those):
+            yield f"{structure}: {share:.1%} is test, not a fifth"
+    val = {s.place.name for s in read.suite.scenarios if s.split == "val"}
+    yield from (
+        f"{s.id}: is test in {s.place.name}, where val is, too"
+        for s in _test(read)
+        if s.place.name in val
+    )
+
+
+def _test(read: Read) -> list[Scenario]:
+    return [scenario for scenario in read.suite.scenarios if scenario.split == "test"]
+
+
+def _hashes(read: Read) -> Iterator[str]:
+    """Each place with its net's hash, one in all scenarios; the suite with the hash that was
+    proved."""
+    nets: dict[str, set[str]] = {}
+    for scenario in read.suite.scenarios:
+        nets.setdefault(scenario.place.name, set()).add(scenario.place.net_hash)
+        if not scenario.place.net_hash:
+            yield f"{scenario.id}: its place has no hash"
+    yield from (
+        f"{name}: has {len(hashes)} nets" for name, hashes in nets.items() if len(hashes) > 1
+    )
+    if read.proofs is not None and read.proofs.suite_hash != read.suite.content_hash:
+        yield (
+            f"{read.suite.name}: is {read.suite.content_hash}, but {read.proofs.suite_hash} was "
+            f"proved"
+        )
+
+
+def _proofs(read: Read) -> Iterator[str]:
+    """Each scenario with a proof of it as it stands, by one version of the expert."""
+    if read.proofs is None:
+        yield f"{read.suite.name}: has no proofs that can be read"
+        return
+    proofs = {proof.scenario: proof for proof in read.proofs.proofs}
+    for scenario in read.suite.scenarios:
+        proof = proofs.pop(scenario.id, None)
+        if proof is None:
+            yield f"{scenario.id}: has no proof"
+        elif proof.scenario_hash != content_hash(scenario):
+            yield f"{scenario.id}: was changed since it was proved"
+        elif not 0.0 < proof.time_s <= scenario.time_limit_s or not proof.state_hash:
+            yield f"{scenario.id}: its proof tells no time within the limit, or no state"
+        elif any(
+            room_m is not None and room_m < 0.0 for room_m in (proof.people_m, proof.obstacles_m)
+        ):
+            yield f"{scenario.id}: its proof touches somebody or something"
+    yield from (f"{name}: a proof of no scenario" for name in proofs)
+    if len({(proof.expert, proof.expert_version) for proof in read.proofs.proofs}) > 1:
+        yield f"{read.suite.name}: is proved by several experts"
+
+
+def _lengths(read: Read) -> Iterator[str]:
+    """10 to 20 m each; long ways more than 100 m, and 36.5 km +- 1 % in all."""
+    for scenario in read.suite.scenarios:
+        length_m = scenario.route_line.length_m
+        low, high = (
+            (100.0, math.inf)
+            if scenario.structure == LONG_WAY
+            else (WAY_M[0] - _EDGE_M, WAY_M[1] + _EDGE_M)
+        )
+        if not low < length_m < high:
+            yield f"{scenario.id}: is {length_m:.1f} m long"
+    routes_m = sum(s.route_line.length_m for s in read.suite.scenarios if s.structure == LONG_WAY)
+    if routes_m and abs(routes_m / ALL_ROUTES_M - 1.0) > 0.01:
+        yield (
+            f"{read.suite.name}: its ways are {routes_m / 1000:.2f} km in all, not "
+            f"{ALL_ROUTES_M / 1000:g} +- 1 %"
+        )
+
+
+def _structures(read: Read) -> Iterator[str]:
+    """Each is what its structure says: straight, round a corner, over a crosswalk without signals,
+    its own event."""
+    for one in read.suite.scenarios:
+        turn = abs(turn_rad(one.route_line))
+        kinds = [event.kind for event in one.events]
+        says = {
+            "straight": turn <= _STRAIGHT_RAD and not one.crossings and not kinds,
+            "curve": TURN_RAD[0] <= turn <= TURN_RAD[1] and not one.crossings and not kinds,
+            "crosswalk": len(one.crossings) == 1 and not one.crossings[0].signalised and not kinds,
+            STATIC: not kinds,
+            LONG_WAY: bool(one.crossings) and bool(one.barriers),
+        }
+        if not says.get(one.structure, kinds == [one.structure]):
+            yield (
+                f"{one.id}: is no '{one.structure}': turns {math.degrees(turn):.0f} degrees, "
+                f"events {kinds}"
+            )
+        if one.ends_on_failure != (one.structure != LONG_WAY):
+            yield f"{one.id}: {'ends' if one.ends_on_failure else 'does not end'} on a failure"
+        if one.structure != LONG_WAY and one.time_limit_s != 60.0:
+            yield f"{one.id}: its time limit is {one.time_limit_s:g} s, not 60"
+
+
+def _street_life(read: Read) -> Iterator[str]:
+    """Nobody and no vehicle but the event's people; on long ways people, vehicles and signals."""
+    for one in read.suite.scenarios:
+        crowd = one.crowd
+        alone = (
+            not crowd.persons and not crowd.vehicles and not crowd.residents and not crowd.density
+        )
+        if crowd.added or alone != (one.structure != LONG_WAY):
+            yield f"{one.id}: {crowd.persons} people and {crowd.vehicles} vehicles around it"
+    if routes := [one for one in read.suite.scenarios if one.structure == LONG_WAY]:
+        with_signals = sum(any(c.signalised for c in one.crossings) for one in routes)
+        if with_signals < 0.25 * len(routes):
+            yield f"{with_signals} of {len(routes)} ways have signals: at least a quarter should"
+
+
+def _events(read: Read) -> Iterator[str]:
+    """Every kind on the long ways, several times; all at the paper's walking speeds, from either
+    side."""
+    events = [(one, event) for one in read.suite.scenarios for event in one.events]
+    for one, event in events:
+        if not _SPEEDS_MPS[0] <= event.speed_mps <= _SPEEDS_MPS[1]:
+            yield f"{one.id}: {event.kind} walks at {event.speed_mps:.2f} m/s"
+    if any(one.structure == LONG_WAY for one in read.suite.scenarios):
+        times = Counter(event.kind for _, event in events)
+        for kind in EVENT_KINDS:
+            if times[kind] < _FEWEST_EVENTS:
+                yield f"{kind}: {times[kind]} times on the long ways, fewer than {_FEWEST_EVENTS}"
+    if events:
+        yield from _shares(
+            "events from",
+            [("left", "right")[e.side < 0] for _, e in events],
+            ("left", "right"),
+            0.35,
+        )
+
+
+def _spread(read: Read) -> Iterator[str]:
+    """Lengths, turns, hours, seasons and clouds spread; fog in some; light enough to see."""
+    whole = read.suite.scenarios
+    for one in whole:
+        rises = sun_rises_rad(one.light.hour, one.light.day_of_year, one.light.latitude_deg)
+        if (
+            rises < LOWEST_SUN_RAD
+            or (one.light.fog_m or math.inf) < FOG_M[0]
+            or one.light.exposure_ev
+        ):
+            yield f"{one.id}: is too dark or foggy to be seen"
+    hours = [
+        ("morning", "noon", "afternoon")[int(np.digitize(one.light.hour, (10.0, 14.0)))]
+        for one in whole
+    ]
+    yield from _shares("hours in the", hours, ("morning", "noon", "afternoon"), 0.15)
+    seasons = [
+        ("winter", "spring", "summer", "autumn")[(one.light.day_of_year + 30) // 92 % 4]
+        for one in whole
+    ]
+    yield from _shares("days in", seasons, ("winter", "spring", "summer", "autumn"), 0.12)
+    skies = [("clear", "broken", "grey")[min(int(3.0 * one.light.cloud_cover), 2)] for one in whole]
+    yield from _shares("skies that are", skies, ("clear", "broken", "grey"), 0.2)
+    foggy = sum(one.light.fog_m is not None for one in whole) / len(whole)
+    if not 0.04 <= foggy <= 0.3:
+        yield f"{foggy:.1%} of the scenarios have fog, not 4 to 30 %"
+    for structure in (*STRUCTURES[:2], LONG_WAY):
+        those = [one for one in whole if one.structure == structure]
+        low, high = (100.0, 600.0) if structure == LONG_WAY else WAY_M
+        thirds = np.linspace(low, high, 4)[1:3]
+        sizes = [
+            ("short", "middle", "long")[int(np.digitize(s.route_line.length_m, thirds))]
+            for s in those
+        ]
+        yield from _shares(f"{structure}: ways that are", sizes, ("short", "middle", "long"), 0.15)
+    turns = [
+        ("left", "right")[turn_rad(one.route_line) < 0.0]
+        for one in whole
+        if one.structure == STRUCTURES[1]
+    ]
+    yield from _shares("curves to the", turns, ("left", "right"), 0.3)
+
+
+def _shares(what: str, found: Sequence[str], wanted: Sequence[str], least: float) -> Iterator[str]:
+    """What of the wanted is rarer than a share."""
+    for name in wanted if found else ():
+        if (share := found.count(name) / len(found)) < least:
+            yield f"{what} {name}: {share:.1%}, less than {least:.0%}"
+
+
+def _duplicates(read: Read) -> Iterator[str]:
+    """No two of a structure on one spot, crops of one net taken together."""
+    groups = _by(read.suite.scenarios, lambda s: f"{s.structure} {_ground(s)}")
+    for those in groups.values():
+        for a, b in itertools.combinations(those, 2):
+            starts, goals = (
+                math.dist(p, q) for p, q in ((a.start[:2], b.start[:2]), (a.goal, b.goal))
+            )
+            if starts < _APART_M and goals < _APART_M:
+                yield f"{b.id}: is on the spot of {a.id}"
+
+
+def _ground(scenario: Scenario) -> str:
+    """What the coordinates of a scenario are of."""
+    if isinstance(scenario.place, CityMap) and scenario.place.map in WHEEL_PLACES:
+        return WHEEL_PLACES[scenario.place.map].net
+    return scenario.place.name
+
+
+def _size(read: Read) -> Iterator[str]:
+    """Suite and proofs are small files."""
+    if read.path is not None:
+        files = [path for path in (read.path, proofs_path(read.path)) if path.exists()]
+        if (size := sum(path.stat().st_size for path in files)) > _MOST_BYTES:
+            yield (
+                f"{read.path.name}: {size / 1e6:.1f} MB with its proofs, more than "
+                f"{_MOST_BYTES / 1e6:g}"
+            )
+
+
+def _by(scenarios: Sequence[Scenario], key: Callable[[Scenario], str]) -> dict[str, list[Scenario]]:
+    groups: dict[str, list[Scenario]] = {}
+    for scenario in scenarios:
+        groups.setdefault(key(scenario), []).append(scenario)
+    return groups
+
+
+CLAIMS: Final[Mapping[str, Callable[[Read], Iterator[str]]]] = MappingProxyType(
+    {
+        "counts": _counts,
+        "val and test": _split,
+        "hashes": _hashes,
+        "proofs": _proofs,
+        "lengths": _lengths,
+        "structures": _structures,
+        "street life": _street_life,
+        "events": _events,
+        "spread": _spread,
+        "duplicates": _duplicates,
+        "size": _size,
+    }
+)
+"""Name -> what is wrong with it, one line each, beginning with the scenario's name where it is
+one's."""

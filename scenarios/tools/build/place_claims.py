@@ -1,0 +1,167 @@
+"""What a shipped suite claims that its places and its expert tell: nets, one walkable path, gaps,
+proofs to the bit."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from cosim.core.errors import CosimError
+from cosim.place.barriers import prove_single_path
+from cosim.place.street_map import Port, StreetMap
+from cosim.spec.robot import robot_called
+from cosim.spec.scenario import Place, Scenario, Suite
+from scenarios.places.nets import place
+from scenarios.suites.fits import misfits
+from scenarios.suites.long_horizon import WAY_SPARE_M
+from scenarios.suites.obstacles import prove_gap
+from scenarios.suites.proofs import Dropped, Proof, Proofs
+from scenarios.suites.recipes import LONG_WAY
+from scenarios.tools.build.proving import proved
+
+PLACE_CLAIMS: Final = ("nets", "fits its place", "single path", "gaps", "proofs to the bit")
+
+
+class FalseClaim(NamedTuple):
+    """What is wrong. words: beginning with the scenario's name."""
+
+    claim: str
+    words: str
+
+
+class _Look(NamedTuple):
+    """What a process looks at. proofs: of those scenarios that are driven again."""
+
+    where: Place
+    scenarios: tuple[Scenario, ...]
+    proofs: tuple[Proof, ...]
+
+
+def sample_of(suite: Suite, count: int) -> list[Scenario]:
+    """So many scenarios of each structure, always the same of one suite."""
+    rng = np.random.default_rng(int(suite.content_hash, 16) % 2**32)
+    by_structure: dict[str, list[Scenario]] = {}
+    for scenario in suite.scenarios:
+        by_structure.setdefault(scenario.structure, []).append(scenario)
+    return [
+        those[int(i)]
+        for those in by_structure.values()
+        for i in rng.permutation(len(those))[:count]
+    ]
+
+
+def faults_in_places(
+    scenarios: Sequence[Scenario], driven: Sequence[str], proofs: Proofs | None, jobs: int = 1
+) -> Iterator[FalseClaim]:
+    """What is wrong with scenarios in their places. driven: names of those that the expert drives
+    again.
+
+    jobs: processes, one for each place; a place whose process dies is a fault.
+    """
+    known = {proof.scenario: proof for proof in proofs.proofs} if proofs is not None else {}
+    there: dict[Place, list[Scenario]] = {}
+    for scenario in scenarios:
+        there.setdefault(scenario.place, []).append(scenario)
+    looks = [
+        _Look(
+            where,
+            tuple(those),
+            tuple(known[s.id] for s in those if s.id in driven and s.id in known),
+        )
+        for where, those in there.items()
+    ]
+    if jobs == 1:
+        for look in looks:
+            yield from _look(look)
+        return
+    with ProcessPoolExecutor(jobs, get_context("spawn"), max_tasks_per_child=1) as pool:
+        for look, future in [(look, pool.submit(_look, look)) for look in looks]:
+            try:
+                yield from future.result()
+            except BrokenProcessPool:
+                yield FalseClaim(
+                    PLACE_CLAIMS[-1],
+                    f"{look.scenarios[0].id}: a process died: check it alone, with --jobs 1",
+                )
+
+
+def _look(look: _Look) -> list[FalseClaim]:
+    """All faults in one place."""
+    try:
+        _, street_map = place(look.where)
+    except CosimError as error:
+        return [FalseClaim("nets", f"{scenario.id}: {error}") for scenario in look.scenarios]
+    faults = [
+        FalseClaim("fits its place", words.removeprefix("scenario "))
+        for words in misfits(look.scenarios, street_map)
+    ]
+    proofs = {proof.scenario: proof for proof in look.proofs}
+    for scenario in look.scenarios:
+        faults += [
+            FalseClaim("single path", f"{scenario.id}: {words}")
+            for words in ways_left(scenario, street_map)
+        ]
+        faults += [
+            FalseClaim("gaps", f"{scenario.id}: {words}")
+            for words in narrow_places(scenario, street_map)
+        ]
+        if scenario.id in proofs:
+            faults += [
+                FalseClaim("proofs to the bit", f"{scenario.id}: {words}")
+                for words in _driven(scenario, proofs)
+            ]
+    return faults
+
+
+def ways_left(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
+    """Why it is not so that exactly one walkable path leads to the goal of a long way."""
+    if scenario.structure != LONG_WAY:
+        return
+    half_width_m = robot_called(scenario.robot).width_m / 2 + WAY_SPARE_M
+    try:
+        prove_single_path(
+            street_map,
+            scenario.route_line,
+            scenario.barriers,
+            _ports(scenario, street_map),
+            half_width_m,
+        )
+    except CosimError as error:
+        yield str(error)
+
+
+def narrow_places(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
+    """Where obstacles leave less than the robot's width and half a metre; where none stand nothing
+    is claimed."""
+    if not scenario.obstacles:
+        return
+    try:
+        prove_gap(scenario, street_map)
+    except CosimError as error:
+        yield str(error)
+
+
+def _driven(scenario: Scenario, proofs: dict[str, Proof]) -> Iterator[str]:
+    """Whether the expert comes to the same state again."""
+    proof = proofs[scenario.id]
+    again = proved(scenario, proof.expert)
+    if isinstance(again, Dropped):
+        yield f"is not solved any more: {again.reason} {again.details}"
+    elif again.state_hash != proof.state_hash:
+        yield (
+            f"its state is {again.state_hash}, but was {proof.state_hash}: other code, or other "
+            f"versions"
+        )
+
+
+def _ports(scenario: Scenario, street_map: StreetMap) -> list[Port]:
+    """The ports of the strips that a route lies on."""
+    line = scenario.route_line
+    poses = [line.at(float(s_m)) for s_m in np.arange(0.0, line.length_m, 0.5)]
+    strips = dict.fromkeys(street_map.locate(pose.x_m, pose.y_m, 0.05).edge for pose in poses)
+    return [Port(strip, end) for strip in strips if strip in street_map.strips for end in (0, 1)]

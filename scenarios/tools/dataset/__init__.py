@@ -1,0 +1,1 @@
+"""Collect demonstrations as data sets, and read them."""

@@ -1,0 +1,390 @@
+"""collect: an expert drives scenarios, and what it does and a camera sees becomes a data set.
+
+OUT/collect.json      what is collected; another command is refused OUT/runs/00, 01 ..    run
+folders, with a demonstration of each episode that is kept; a further one where the expert did not
+solve enough. Once the data set is whole they may be deleted
+OUT/writing           a data set in the making
+OUT/meta, data, videos   the data set; meta comes last: with it, it is whole
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections import Counter
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from cosim.core.errors import RunError, SpecError, unwritable
+from cosim.core.telling import Tell, untold
+from cosim.core.versions import versions
+from cosim.core.whole_file import write_whole
+from cosim.episode.policy_caller import Driver
+from cosim.policies.user_module import importable
+from cosim.results.record import Record
+from cosim.results.run_folder import DEMONSTRATION, RunFolder
+from cosim.spec.demo_options import Collecting
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.scenario import City, Scenario, Suite, read_suite
+from scenarios.episodes.demonstration import Demonstration, check_parquet
+from scenarios.episodes.demonstrator import Demonstrator, learner_of
+from scenarios.ipc.child_process import LocalProcesses
+from scenarios.ipc.messages import Hear, Hello, Learner
+from scenarios.runs.pool import run_all
+from scenarios.runs.run import run_spec
+from scenarios.suites.catalog import with_robot
+from scenarios.suites.fits import check_places
+from scenarios.suites.new_scenarios import Fresh
+from scenarios.tools.dataset.lerobot import Collected, Filmed, write_lerobot
+from scenarios.tools.dataset.read import ReadBack, read_back
+
+_ASKED: Final = "collect.json"
+_RUNS: Final = "runs"
+_WRITING: Final = "writing"
+_PARTS: Final = ("videos", "data", "meta")
+_MOST_ROUNDS: Final = 8
+_STAGE: Final = "writing the data set"
+
+
+class CollectSpec(msgspec.Struct, frozen=True, kw_only=True):
+    """What is collected: two with the same have the same data set. scenarios: of a suite, by id, in
+    order; or fresh ones. episodes: so many are to be kept."""
+
+    suite: str
+    suite_hash: str = ""
+    scenarios: tuple[str, ...] = ()
+    fresh: Fresh | None = None
+    episodes: int
+    policy: str
+    policy_source: str
+    robot: str = ""
+    goal: str
+    seed: int
+    collecting: Collecting
+    learner_source: str = ""
+    renderer: str
+    versions: dict[str, str]
+
+    def refuse_other(self, asked: CollectSpec, path: Path) -> None:
+        """Raises RunError, naming the first difference, where something else is asked for now."""
+        for name in self.__struct_fields__:
+            mine, theirs = getattr(self, name), getattr(asked, name)
+            if isinstance(mine, msgspec.Struct) and isinstance(theirs, msgspec.Struct):
+                for part in mine.__struct_fields__:
+                    _refuse(path, part, getattr(mine, part), getattr(theirs, part, None))
+            _refuse(path, name, mine, theirs)
+
+
+def _refuse(path: Path, name: str, mine: object, theirs: object) -> None:
+    if mine != theirs:
+        raise RunError(
+            f"{path} is of another data set: its {name} is {_brief(mine)}, now asked for is "
+            f"{_brief(theirs)}. Go on with the same command, or choose another --out."
+        )
+
+
+def _brief(value: object) -> str:
+    text = str(getattr(value, "in_words", value))
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """What came out. kept, rows: of the data set; run: episodes that were driven; dropped: why the
+    others are not in it, and how often; spare: so many more were solved than asked for; back: what
+    reading it back showed, None where it was whole before."""
+
+    kept: int
+    rows: int
+    run: int
+    dropped: Counter[str]
+    spare: int
+    back: ReadBack | None
+
+
+_Showing = Callable[[Sequence[Scenario], set[str]], AbstractContextManager[Hear]]
+"""Shows how a run goes: of these scenarios, of which some are done."""
+
+
+def _unshown(scenarios: Sequence[Scenario], done: set[str]) -> AbstractContextManager[Hear]:
+    return nullcontext(lambda message: None)
+
+
+def collect(
+    source: Suite | Fresh,
+    expert: Driver,
+    policy: str,
+    out: Path,
+    *,
+    collecting: Collecting,
+    options: EpisodeOptions,
+    episodes: int | None = None,
+    jobs: int = 1,
+    resume: bool = False,
+    showing: _Showing = _unshown,
+    tell: Tell = untold,
+) -> Gathered:
+    """Collect demonstrations into a folder; the same arguments give the same bytes, whatever
+    `jobs`, and however often it was stopped and went on with `resume`.
+
+    source: scenarios, in order. episodes: so many are kept, all that are solved by default. policy:
+    what the expert is called by. options: seed, robot, goal, own_camera and camera are taken.
+    showing, tell: how it goes.
+
+    Raises RunError for a folder of another data set, UsageError and SpecError for what cannot be
+    asked for, MachineError for what the machine lacks.
+    """
+    check_parquet()
+    policy = importable(policy)
+    collecting = msgspec.structs.replace(collecting, learner=importable(collecting.learner))
+    options = msgspec.structs.replace(options, collecting=collecting, seed=options.seed or 0)
+    learner = learner_of(collecting)
+    demonstrator = Demonstrator(expert, collecting, options.goal, learner)
+    wanted = episodes or (
+        len(source.structures) * len(source.seeds) if isinstance(source, Fresh) else None
+    )
+    rounds = _Rounds(source, out.absolute(), policy, demonstrator, options, jobs, tell)
+    spec = rounds.asked(wanted or len(rounds.all), expert)
+    _open(out, spec, resume)
+    beside = (
+        None
+        if learner is None
+        else Learner(collecting.learner, learner.manifest, learner.source_hash)
+    )
+    hello = Hello(policy, expert.manifest, expert.source_hash, learner=beside)
+    with ExitStack() as stack:
+        found: list[Collected] = []
+        dropped = Counter[str]()
+        run = 0
+        taken = 0
+        number = 0
+        while len(found) < spec.episodes and number < _MOST_ROUNDS:
+            lacking = spec.episodes - len(found)
+            count = lacking + (lacking // 2 + 1 if number else 0)
+            held, scenarios = rounds.opened(stack, number, taken, count)
+            if held is None:
+                break
+            rounds.run(held, scenarios, hello, showing)
+            found += _kept(held, scenarios, dropped)
+            run += len(scenarios)
+            taken = taken + count
+            number = number + 1
+        if not found:
+            told = (
+                "; ".join(f"{words} ({count})" for words, count in dropped.most_common())
+                or "none were drawn"
+            )
+            raise SpecError(f"{out}: nothing to keep of {run} episodes: {told}")
+        kept = found[: spec.episodes]
+        back = None
+        if not (out / "meta").exists():
+            back = _written(out, kept, spec, demonstrator, tell)
+    rows = sum(len(one.load()) for one in kept)
+    return Gathered(len(kept), rows, run, dropped, len(found) - len(kept), back)
+
+
+@dataclass(frozen=True)
+class _Rounds:
+    """The runs that a data set is made of."""
+
+    source: Suite | Fresh
+    out: Path
+    policy: str
+    demonstrator: Demonstrator
+    options: EpisodeOptions
+    jobs: int
+    tell: Tell
+
+    @property
+    def all(self) -> tuple[Scenario, ...]:
+        """The scenarios of a suite."""
+        return () if isinstance(self.source, Fresh) else self.source.scenarios
+
+    def asked(self, episodes: int, expert: Driver) -> CollectSpec:
+        """What is asked for, checked as far as can be without a place. Raises UsageError."""
+        some = self.all or _nowhere(self.source)
+        whole = with_robot(
+            Suite(name="asked", version="1", scenarios=tuple(some)), self.options.robot
+        )
+        told = run_spec(whole, whole.scenarios, self.policy, self.demonstrator, self.options)
+        is_fresh = isinstance(self.source, Fresh)
+        return CollectSpec(
+            suite=self.source.kind if isinstance(self.source, Fresh) else self.source.name,
+            suite_hash="" if isinstance(self.source, Fresh) else self.source.content_hash,
+            scenarios=() if is_fresh else tuple(one.id for one in self.all),
+            fresh=self.source if isinstance(self.source, Fresh) else None,
+            episodes=episodes if is_fresh else min(episodes, len(self.all)),
+            policy=self.policy,
+            policy_source=expert.source_hash,
+            robot=self.options.robot,
+            goal=self.demonstrator.manifest.goal,
+            seed=self.options.seed or 0,
+            collecting=self.options.collecting or Collecting(),
+            learner_source=""
+            if (learner := self.demonstrator.learner) is None
+            else learner.source_hash,
+            renderer=told.renderer,
+            versions=versions(),
+        )
+
+    def opened(
+        self, stack: ExitStack, number: int, taken: int, count: int
+    ) -> tuple[RunFolder | None, Sequence[Scenario]]:
+        """The run folder of a round, and its scenarios; those that it has are not drawn anew."""
+        path = self.out / _RUNS / f"{number:02d}"
+        if begun := (path / "run.json").exists():
+            suite = read_suite(path / "scenarios.json")
+        else:
+            suite = self._suite(taken, count)
+        if not suite.scenarios:
+            return None, ()
+        spec = run_spec(suite, suite.scenarios, self.policy, self.demonstrator, self.options)
+        if not begun and not isinstance(self.source, Fresh):
+            check_places(suite, suite.scenarios, self.tell, self.jobs)
+        held = RunFolder.resume(path, spec) if begun else RunFolder.create(path, spec, suite)
+        return stack.enter_context(held), suite.scenarios
+
+    def _suite(self, taken: int, count: int) -> Suite:
+        if isinstance(self.source, Fresh):
+            drawn = self.source.drawn(taken, count, self.jobs, self.tell)
+            version = f"cities-{self.source.seeds[0]}-{self.source.seeds[-1]}"
+            made = Suite(name=self.source.kind, version=version, scenarios=tuple(drawn))
+            return with_robot(made, self.options.robot)
+        return msgspec.structs.replace(self.source, scenarios=self.all[taken : taken + count])
+
+    def run(
+        self, held: RunFolder, scenarios: Sequence[Scenario], hello: Hello, showing: _Showing
+    ) -> None:
+        """Drive what is not driven yet."""
+        done = held.finished()
+        todo = [one for one in scenarios if one.id not in done]
+        if todo:
+            with showing(scenarios, done) as hear:
+                transport = LocalProcesses(held.path / "logs", self.jobs)
+                options = msgspec.structs.replace(self.options, suite_hash=held.spec.suite_hash)
+                run_all(held, todo, hello, transport, tell=hear, options=options)
+        held.finish()
+
+
+def _nowhere(source: Suite | Fresh) -> list[Scenario]:
+    """A scenario of fresh ones before any is drawn: for what is checked of robot and camera."""
+    name = source.kind if isinstance(source, Fresh) else source.name
+    route = ((0.0, 0.0), (12.0, 0.0))
+    return [
+        Scenario(
+            id="a",
+            suite=name,
+            place=City(seed=0),
+            seed=0,
+            start=(0.0, 0.0, 0.0),
+            goal=route[1],
+            route=route,
+        )
+    ]
+
+
+def _open(out: Path, spec: CollectSpec, resume: bool) -> None:
+    """Begin a folder, or go on in it. Raises RunError for one that is of another data set."""
+    path = out / _ASKED
+    try:
+        if path.exists():
+            try:
+                found = msgspec.json.decode(path.read_bytes(), type=CollectSpec)
+            except msgspec.DecodeError as error:
+                raise RunError(f"{path}: cannot be read: {error}: choose another --out") from error
+            found.refuse_other(spec, out)
+            if not resume:
+                raise RunError(
+                    f"{out} already holds a data set, or a part of one. Add --resume to go "
+                    f"on with it."
+                )
+            return
+        if out.exists() and (
+            not out.is_dir() or any(one.name != f"{_ASKED}.part" for one in out.iterdir())
+        ):
+            raise RunError(f"{out} exists and is no data set. Choose another --out.")
+        (out / _RUNS).mkdir(parents=True, exist_ok=True)
+        write_whole(path, msgspec.json.format(msgspec.json.encode(spec), indent=1) + b"\n")
+    except OSError as error:
+        raise unwritable(out, error) from error
+
+
+def _kept(held: RunFolder, scenarios: Sequence[Scenario], dropped: Counter[str]) -> list[Collected]:
+    """The episodes of a run of which there is a demonstration, in the order of its scenarios."""
+    found = []
+    for scenario in scenarios:
+        folder = held.episode_folder(scenario.id)
+        record = Record.load(folder / "record.json")
+        path = folder / DEMONSTRATION
+        if path.exists():
+            found.append(Collected(scenario, record, partial(_loaded, path)))
+        else:
+            dropped[_why(record)] += 1
+    return found
+
+
+def _loaded(path: Path) -> Demonstration:
+    try:
+        return Demonstration.decoded(path.read_bytes(), path)
+    except OSError as error:
+        raise RunError(
+            f"{path}: cannot be read: {error.strerror}: collect it anew, in another --out"
+        ) from error
+
+
+def _why(record: Record) -> str:
+    """Why an episode is not kept, in a few words."""
+    if record.status != "done":
+        return record.status
+    if record.failures:
+        first = record.failures[0]
+        return " with ".join(filter(None, (first.kind, first.other_kind))).replace("_", " ")
+    return f"ended by {record.ended}"
+
+
+def _written(
+    out: Path, kept: Sequence[Collected], spec: CollectSpec, demonstrator: Demonstrator, tell: Tell
+) -> ReadBack:
+    """Write the data set, read it back, and only then move it to its place."""
+    tell(_STAGE)
+    camera = spec.collecting.camera
+    robot = kept[0].scenario.robot
+    eye = camera.mount if isinstance(camera.mount, str) else "camera"
+    filmed = Filmed(eye, camera.size, round(spec.collecting.rate_hz))
+    about: dict[str, Any] = {
+        "rate_hz": spec.collecting.rate_hz,
+        "waypoint_s": spec.collecting.waypoint_s,
+        "waypoints": spec.collecting.waypoints,
+        "goal": spec.goal,
+        "camera": msgspec.to_builtins(camera),
+        "robot": robot,
+        "policy": demonstrator.manifest.name,
+        "policy_source": spec.policy_source,
+        "noise": spec.collecting.noise,
+        "learner": "" if demonstrator.learner is None else demonstrator.learner.manifest.name,
+        "learner_source": spec.learner_source,
+        "suite": spec.suite,
+        "seed": spec.seed,
+        "renderer": spec.renderer,
+        "versions": spec.versions,
+    }
+    writing = out / _WRITING
+    try:
+        for name in (_WRITING, *_PARTS):
+            shutil.rmtree(out / name, ignore_errors=True)
+        writing.mkdir()
+        write_lerobot(writing, kept, filmed, robot, about)
+        back = read_back(writing, kept, tell)
+        for name in _PARTS:
+            (writing / name).rename(out / name)
+        writing.rmdir()
+    except OSError as error:
+        raise unwritable(
+            out, error, "episodes are kept; make room and go on with --resume"
+        ) from error
+    return back

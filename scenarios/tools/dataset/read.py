@@ -1,0 +1,222 @@
+"""Reading data sets: rows and pictures of one that `cosim collect` has made, held against each
+other, and packed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from cosim.core.errors import RunError, SpecError
+from cosim.core.packed_demos import Packed
+from cosim.core.telling import Tell, untold
+from scenarios.episodes.clip import pictures_of
+from scenarios.episodes.demonstration import glimpse
+from scenarios.tools.dataset.lerobot import CODEBASE_VERSION, Collected
+
+_READING: Final = "reading the pictures"
+_ALIKE: Final = 8.0
+"""Of 255: the means of a picture's areas, read back and as drawn, differ by less on the mean."""
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """A data set on the disk. info: of info.json; about: how it was collected; rows: its columns;
+    films: of its videos the files, in order; episodes: of each its `scenario` and `structure`."""
+
+    folder: Path
+    info: dict[str, Any]
+    about: dict[str, Any]
+    rows: dict[str, NDArray[Any]]
+    films: tuple[Path, ...]
+    episodes: tuple[dict[str, Any], ...]
+
+    def __len__(self) -> int:
+        return len(self.rows["index"])
+
+    def pictures(self) -> Iterator[NDArray[np.uint8]]:
+        """(H, W, 3) for each row. Raises RunError where there are fewer or more, or one is not
+        shown at its time."""
+        fps = int(self.info["fps"])
+        first = 0
+        for film in self.films:
+            shown = 0
+            for time_s, rgb in pictures_of(film):
+                if time_s != Fraction(shown, fps):
+                    raise RunError(
+                        f"{film}: picture {shown} is shown at {float(time_s):g} s, not "
+                        f"{shown / fps:g} s"
+                    )
+                shown += 1
+                yield rgb
+            first += shown
+        if first != len(self):
+            raise RunError(
+                f"{self.folder}: {first} pictures and {len(self)} rows: collect it anew, in "
+                f"another --out"
+            )
+
+
+def read_data_set(folder: Path) -> DataSet:
+    """A data set but for its pictures. Raises RunError naming what is missing."""
+    info_path = folder / "meta/info.json"
+    try:
+        info = json.loads(info_path.read_text(encoding="utf-8"))
+        if info["codebase_version"] != CODEBASE_VERSION:
+            raise RunError(
+                f"{info_path}: codebase_version {info['codebase_version']}, this version "
+                f"reads {CODEBASE_VERSION}"
+            )
+        about = json.loads((folder / "meta/cosim.json").read_text(encoding="utf-8"))
+        table = pq.read_table(folder / info["data_path"].format(chunk_index=0, file_index=0))
+        rows = {name: np.stack(table[name].to_numpy()) for name in table.column_names}
+        (video_key,) = [name for name, one in info["features"].items() if one["dtype"] == "video"]
+        told = [
+            "scenario",
+            "structure",
+            *(f"videos/{video_key}/{at}_index" for at in ("chunk", "file")),
+        ]
+        (path,) = sorted((folder / "meta/episodes").glob("*/*.parquet"))
+        episodes = pq.read_table(path, columns=told).to_pylist()
+        at = dict.fromkeys((one[told[2]], one[told[3]]) for one in episodes)
+        names = [
+            info["video_path"].format(video_key=video_key, chunk_index=c, file_index=f)
+            for c, f in at
+        ]
+    except (OSError, ValueError, KeyError) as error:
+        raise RunError(
+            f"{folder}: no data set of `cosim collect`, or not whole yet: {error}"
+        ) from error
+    return DataSet(
+        folder, info, about, rows, tuple(folder / name for name in names), tuple(episodes)
+    )
+
+
+@dataclass(frozen=True)
+class ReadBack:
+    """What came out of reading a data set back. rows, pictures: of each as many; off, off_next: by
+    how much the pictures differ from those that were drawn for their rows, and for the rows after
+    these, of 255, on the mean."""
+
+    rows: int
+    off: float
+    off_next: float
+
+
+def read_back(folder: Path, episodes: Sequence[Collected], tell: Tell = untold) -> ReadBack:
+    """Hold rows and pictures of a data set against what was kept of its episodes. Raises RunError
+    where a number is another, or a picture is not that of its row."""
+    held = read_data_set(folder)
+    pictures = held.pictures()
+    total = np.zeros(2)
+    counts = np.zeros(2, np.int64)
+    row = 0
+    for index, one in enumerate(episodes):
+        tell(_READING, row / len(held))
+        shown = one.load()
+        here = slice(row, row + len(shown))
+        row += len(shown)
+        same = (
+            np.array_equal(held.rows["episode_index"][here], np.full(len(shown), index))
+            and np.array_equal(held.rows["action"][here], shown.command)
+            and np.array_equal(held.rows["observation.state"][here], shown.state)
+            and np.array_equal(
+                held.rows["waypoints"][here], shown.waypoints.reshape(len(shown), -1)
+            )
+        )
+        if not same:
+            raise RunError(
+                f"{folder}: the rows of episode {index}, {one.scenario.id}, are not those "
+                f"that were kept"
+            )
+        seen = np.stack([glimpse(next(pictures)) for _ in range(len(shown))]).astype(float)
+        off = np.abs(seen - shown.glimpses).mean(axis=(1, 2, 3))
+        if off.max() > _ALIKE:
+            raise RunError(
+                f"{folder}: picture {int(off.argmax())} of episode {index}, {one.scenario.id}, is "
+                f"not that of its row: its areas differ by {off.max():.0f} of 255"
+            )
+        off_next = np.abs(seen[:-1] - shown.glimpses[1:]).mean(axis=(1, 2, 3))
+        total += off.sum(), off_next.sum()
+        counts += len(off), len(off_next)
+    for _ in pictures:
+        raise RunError(f"{folder}: more pictures than rows")
+    means = total / np.maximum(counts, 1)
+    return ReadBack(len(held), float(means[0]), float(means[1]))
+
+
+_SAME: Final = ("rate_hz", "waypoint_s", "waypoints", "goal", "camera", "robot")
+"""What makes data sets fit into one file."""
+
+
+def packed_sets(
+    folders: Sequence[Path], size: tuple[int, int] | None = None, tell: Tell = untold
+) -> Packed:
+    """Data sets, one after another, as arrays. size: width, height of the pictures, in place of
+    their own. Raises RunError for a folder that holds none, SpecError for data sets that do not fit
+    together."""
+    held = [read_data_set(folder) for folder in folders]
+    for one, other in pairwise(held):
+        for name in _SAME:
+            mine, theirs = one.about[name], other.about[name]
+            if mine != theirs:
+                raise SpecError(
+                    f"{one.folder} and {other.folder}: {name} is {mine} here and {theirs} there"
+                )
+    wide, high = size or held[0].info["features"][_eye(held[0])]["shape"][1::-1]
+    count = sum(map(len, held))
+    frames = np.empty((count, high, wide, 3), np.uint8)
+    row = 0
+    for one in held:
+        for rgb in one.pictures():
+            if row % 500 == 0:
+                tell(_READING, row / count)
+            at_size = rgb.shape[:2] == (high, wide)
+            frames[row] = (
+                rgb if at_size else cv2.resize(rgb, (wide, high), interpolation=cv2.INTER_AREA)
+            )
+            row += 1
+
+    def column(name: str) -> NDArray[Any]:
+        return np.concatenate([one.rows[name] for one in held])
+
+    goal = (
+        column("observation.goal")
+        if "observation.goal" in held[0].rows
+        else np.full((count, 2), np.nan, np.float32)
+    )
+    first = np.cumsum([0, *(len(one.episodes) for one in held)])
+    episode = [one.rows["episode_index"] + before for one, before in zip(held, first, strict=False)]
+    listed = [episode for one in held for episode in one.episodes]
+    meta = {name: held[0].about[name] for name in _SAME} | {
+        "policy": [one.about["policy"] for one in held],
+        "noise": [one.about["noise"] for one in held],
+        "learner": [one.about.get("learner", "") for one in held],
+        "scenarios": [one["scenario"] for one in listed],
+        "structures": [one["structure"] for one in listed],
+    }
+    return Packed(
+        frames=frames,
+        state=column("observation.state"),
+        goal=goal,
+        command=column("action"),
+        waypoints=column("waypoints").reshape(count, -1, 2),
+        driven=column("driven").astype(np.int32),
+        disturbed=column("disturbed").astype(bool),
+        episode=np.concatenate(episode).astype(np.int32),
+        frame=column("frame_index").astype(np.int32),
+        meta=meta,
+    )
+
+
+def _eye(held: DataSet) -> str:
+    return next(str(name) for name, one in held.info["features"].items() if one["dtype"] == "video")

@@ -1,0 +1,78 @@
+"""make_env(suite) -> an environment of Gymnasium that drives the scenarios of a suite."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+
+from cosim.core.errors import UsageError
+from cosim.episode.camera_rules import check_camera
+from cosim.episode.manifest_checks import with_goal
+from cosim.spec.manifest import Manifest
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.robot import robot_called
+from cosim.spec.scenario import Split, Suite
+from cosim.spec.selection import scenarios_chosen
+from scenarios.suites.catalog import load_suite, with_robot
+from scenarios.tools.gym.reward import Reward, usual_reward
+
+if TYPE_CHECKING:
+    from scenarios.tools.gym.environment import SidewalkEnv
+    from scenarios.tools.gym.spaces import Actions
+
+LEARNER: Final = Manifest("learner", goal="route_point")
+"""What a learner is given unless it says otherwise: a picture of 96 x 96 four times a second, the
+next sub-goal."""
+
+
+def make_env(
+    suite: Suite | str,
+    manifest: Manifest = LEARNER,
+    *,
+    scenarios: Sequence[str] = (),
+    events: Sequence[str] = (),
+    split: Split | None = "val",
+    actions: Actions = "command",
+    reward: Reward = usual_reward,
+    options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
+    render_mode: str | None = None,
+) -> SidewalkEnv:
+    """An environment of Gymnasium (extra `[gym]`) of the scenarios of a suite, for a learner with
+    this manifest.
+
+    suite: one that was loaded, or a name or path as for `load_suite`. manifest: what is observed
+    and how often, as for any policy, so that what was learned can be run with it; see
+    `scenarios.tools.gym.spaces.seen_space` for the names. scenarios, events: only these ids, only
+    these kinds of events. split: of which scenarios are drawn; None for all, `test` too. actions:
+    "command" or "waypoints"; see `scenarios.tools.gym.spaces.action_space_of`. reward: what a step
+    is worth, a function of a `scenarios.tools.gym.reward.Transition`. options: how episodes are
+    run; without a seed in them each draws its own from that of `reset`. No engine starts before
+    `reset`.
+
+    Raises UsageError for names and options that there are none of, for what the robot or Gymnasium
+    cannot give, and where Gymnasium is not installed.
+
+    >>> with make_env("unit", Manifest("blind", camera=None, goal="route_point"), scenarios=["straight-001"]) as env:
+    ...     seen, info = env.reset(seed=7)
+    >>> sorted(seen), info["scenario"]
+    (['goal', 'speeds'], 'straight-001')
+    """
+    try:
+        from scenarios.tools.gym.environment import SidewalkEnv
+    except ImportError as error:
+        raise UsageError(
+            f"environments need Gymnasium ({error}): pip install 'sidewalk-cosim[gym]'"
+        ) from None
+    if options.counterfactual:
+        raise UsageError(
+            "no episode of an environment is compared with its street: leave counterfactual out"
+        )
+    whole = with_robot(load_suite(suite) if isinstance(suite, str) else suite, options.robot)
+    picked = scenarios_chosen(whole, scenarios, None, events, split)
+    settled = with_goal(manifest, options.goal)
+    for name in sorted({scenario.robot for scenario in picked}):
+        check_camera(settled, robot_called(name), options.own_camera)
+    of_suite = msgspec.structs.replace(options, suite_hash=whole.content_hash)
+    return SidewalkEnv(picked, settled, actions, reward, of_suite, render_mode)

@@ -1,0 +1,171 @@
+"""What a learner sees and does, as Gymnasium's spaces: an Observation as a dictionary of arrays, an
+array as an answer.
+
+What is seen is what the manifest asks for, as a policy of the benchmark gets it: units, frames and
+shapes are those of `cosim.episode.interfaces.Observation`. Numbers beyond the bounds of their space
+are put at the bound.
+"""
+
+from __future__ import annotations
+
+import string
+from collections.abc import Sequence
+from typing import Any, Final, Literal, cast, get_args
+
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from cosim.core.errors import UsageError, unknown
+from cosim.core.state import LABELS, Command
+from cosim.episode.control import check_numbers
+from cosim.episode.goals import PATCH_PX
+from cosim.episode.interfaces import Observation
+from cosim.spec.camera import CameraPicture, CameraSpec
+from cosim.spec.goal import Goal, ImageGoal, Instruction, PointGoal, RoutePatch
+from cosim.spec.manifest import Manifest
+from cosim.spec.robot import Robot
+
+Actions = Literal["command", "waypoints"]
+SeenParts = dict[str, Any]
+"""What a learner sees: arrays, and a text where the goal is an instruction."""
+
+_FARTHEST_M: Final = 10_000.0
+_TOLD: Final = 400
+"""Letters of an instruction, at most."""
+
+
+def seen_space(manifest: Manifest, robots: Sequence[Robot]) -> spaces.Dict:
+    """The space of what is seen: always `speeds` (2,), m/s and rad/s; `picture`, `depth`, `labels`
+    where there is a camera with these, `picture_NAME` and so on for each further one; `goal` as the
+    protocol has it, a point as (2,) metres ahead and to the left; `odometry` (3,), or (2,) without
+    a heading. robots: which may drive.
+
+    Raises UsageError for a manifest that asks for what only the simulator knows.
+    """
+    if manifest.privileged:
+        raise UsageError(
+            "a learner is given what a robot has: leave privileged=True out of the manifest"
+        )
+    fastest = np.array(
+        [max(one.v_max_mps for one in robots), max(one.w_max_radps for one in robots)]
+    )
+    parts: dict[str, spaces.Space[Any]] = {"speeds": _box(2.0 * fastest)}
+    for end, spec in _cameras(manifest):
+        parts |= _picture_spaces(end, spec)
+    parts |= _goal_space(manifest)
+    if manifest.odometry != "none":
+        heading = [] if manifest.odometry == "gps" else [2.0 * np.pi]
+        parts["odometry"] = _box([_FARTHEST_M, _FARTHEST_M, *heading])
+    return spaces.Dict(parts)
+
+
+def seen_by(observation: Observation, space: spaces.Dict) -> SeenParts:
+    """An observation in its space."""
+    parts: SeenParts = {"speeds": (observation.v_mps, observation.w_radps)}
+    pictures: list[tuple[str, Observation | CameraPicture]] = [("", observation)]
+    pictures += [(f"_{name}", one) for name, one in observation.pictures.items()]
+    for end, one in pictures:
+        parts |= {f"picture{end}": one.rgb, f"depth{end}": one.depth, f"labels{end}": one.labels}
+    if observation.goal is not None:
+        parts["goal"] = _goal_seen(observation.goal)
+    if (odometry := observation.odometry) is not None:
+        parts["odometry"] = [
+            v for v in (odometry.x_m, odometry.y_m, odometry.heading_rad) if v is not None
+        ]
+    return {name: _within(parts[name], one) for name, one in space.items()}
+
+
+def action_space_of(actions: Actions, manifest: Manifest, robots: Sequence[Robot]) -> spaces.Box:
+    """The space of answers. `command`: (2,) forward speed in m/s, from 0, and yaw rate in rad/s,
+    left positive. `waypoints`: (N, 2) ahead and to the left, in the unit of the manifest, the last
+    of which is the one followed.
+
+    Raises UsageError."""
+    v_mps, w_radps = max(one.v_max_mps for one in robots), max(one.w_max_radps for one in robots)
+    if actions == "command":
+        return spaces.Box(
+            np.array([0.0, -w_radps], np.float32), np.array([v_mps, w_radps], np.float32)
+        )
+    if actions == "waypoints":
+        rule = manifest.waypoints
+        return _box(np.full((rule.index + 1, 2), v_mps * rule.dt_s / rule.unit_m))
+    raise unknown("kind of actions", str(actions), get_args(Actions))
+
+
+def action_as_answer(
+    action: NDArray[np.floating[Any]], space: spaces.Box
+) -> Command | NDArray[np.floating[Any]]:
+    """What a policy would answer. Raises UsageError for an array of another shape than the space's,
+    PolicyError for one with more numbers than an answer may hold."""
+    array = np.asarray(action)
+    check_numbers(array.shape)
+    if array.shape != space.shape:
+        raise UsageError(
+            f"an action of shape {array.shape}: this environment's are {space.shape}, {space}"
+        )
+    return array if array.ndim == 2 else Command(float(array[0]), float(array[1]))
+
+
+def _box(most: Any) -> spaces.Box:
+    high = np.asarray(most, np.float32)
+    return spaces.Box(-high, high, dtype=np.float32)
+
+
+def _pixels(shape: tuple[int, ...], most: int = 255) -> spaces.Box:
+    return spaces.Box(0, most, shape, np.uint8)
+
+
+def _cameras(manifest: Manifest) -> list[tuple[str, CameraSpec]]:
+    """How the names of each camera's pictures end, and what it is."""
+    own = [] if manifest.camera is None else [("", manifest.camera)]
+    return own + [(f"_{name}", spec) for name, spec in manifest.cameras.items()]
+
+
+def _picture_spaces(end: str, spec: CameraSpec) -> dict[str, spaces.Space[Any]]:
+    width, height = spec.size
+    parts: dict[str, spaces.Space[Any]] = {f"picture{end}": _pixels((height, width, 3))}
+    if spec.depth:
+        parts[f"depth{end}"] = spaces.Box(0.0, _FARTHEST_M, (height, width), np.float32)
+    if spec.labels:
+        parts[f"labels{end}"] = _pixels((height, width), max(LABELS.values()))
+    return parts
+
+
+def _goal_space(manifest: Manifest) -> dict[str, spaces.Space[Any]]:
+    match manifest.goal:
+        case "none":
+            return {}
+        case "image" | "random_image":
+            width, height = (0, 0) if manifest.camera is None else manifest.camera.size
+            return {"goal": _pixels((height, width, 3))}
+        case "instruction":
+            letters = string.ascii_letters + string.digits + " .,"
+            return {"goal": spaces.Text(_TOLD, charset=letters)}
+        case "route_patch":
+            return {"goal": _pixels((PATCH_PX, PATCH_PX))}
+    return {"goal": _box([_FARTHEST_M, _FARTHEST_M])}
+
+
+def _goal_seen(goal: Goal) -> Any:
+    match goal:
+        case PointGoal():
+            return (goal.x_m, goal.y_m)
+        case ImageGoal():
+            return goal.rgb
+        case Instruction():
+            return goal.text
+        case RoutePatch():
+            return goal.pixels
+
+
+def _within(value: Any, space: spaces.Space[Any]) -> Any:
+    """A value of a part of the space: of its type, within its bounds, its own."""
+    if not isinstance(space, spaces.Box):
+        return value
+    array = np.array(value, space.dtype)
+    return (
+        array
+        if array.dtype == np.uint8
+        else np.clip(array, space.low, space.high, out=cast(Any, array))
+    )

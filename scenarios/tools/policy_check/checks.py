@@ -1,0 +1,114 @@
+"""CHECKS: every check of a policy by name, and what all of them come to."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Collection, Mapping
+from types import MappingProxyType
+from typing import Final, NamedTuple
+
+from cosim.core.errors import PolicyError
+from cosim.core.telling import Tell, untold
+from cosim.episode.policy_caller import Driver
+from cosim.spec.manifest import Manifest
+from scenarios.tools.policy_check.answer_checks import (
+    behind,
+    constant,
+    deterministic,
+    example,
+    finite,
+    history_reset,
+    put_back,
+    speed_unit,
+    time_step,
+)
+from scenarios.tools.policy_check.drives import Drive, SceneName
+from scenarios.tools.policy_check.goal_checks import (
+    goal_ignored,
+    goal_mirrored,
+    goal_scaled,
+    goal_zero,
+)
+from scenarios.tools.policy_check.outcome import CheckEnded, CheckOutcome, failed, inapplicable
+from scenarios.tools.policy_check.picture_checks import (
+    colour_order,
+    frame_order,
+    person,
+    picture_ignored,
+    side,
+    street_mirrored,
+)
+from scenarios.tools.policy_check.query import Asker
+
+POLICY_CHECKS: Final[Mapping[str, Callable[[Asker], CheckOutcome]]] = MappingProxyType(
+    {
+        "finite": finite,
+        "example": example,
+        "determinism": deterministic,
+        "history_reset": history_reset,
+        "put_back": put_back,
+        "time_step": time_step,
+        "unit": speed_unit,
+        "behind": behind,
+        "constant": constant,
+        "picture_ignored": picture_ignored,
+        "frame_order": frame_order,
+        "colour_order": colour_order,
+        "mirror": street_mirrored,
+        "side": side,
+        "person": person,
+        "goal_zero": goal_zero,
+        "goal_scaled": goal_scaled,
+        "goal_mirrored": goal_mirrored,
+        "goal_ignored": goal_ignored,
+    }
+)
+"""In the order in which they are asked: what a crash or chance would spoil comes first."""
+
+_BY_CHANCE: Final = ("finite", "example", "determinism", "unit", "behind")
+"""What can be told of a policy that does not answer the same twice."""
+
+
+class CheckedPolicy(NamedTuple):
+    """What came out, by the names of checks. asker: who may ask more. answer_ms: the median of what
+    its answers took, without first ones."""
+
+    asker: Asker
+    outcomes: Mapping[str, CheckOutcome]
+    answer_ms: float
+    answers: int
+
+    def count(self, outcome: CheckEnded) -> int:
+        return sum(one.outcome == outcome for one in self.outcomes.values())
+
+
+def checked_policy(
+    driver: Driver,
+    manifest: Manifest,
+    drives: Mapping[SceneName, Drive],
+    tell: Tell = untold,
+    only: Collection[str] = (),
+) -> CheckedPolicy:
+    """Ask a policy all that is to be known of it, or what these checks ask. manifest: with the
+    goals of the run."""
+    asker = Asker(driver, manifest, drives, tell)
+    outcomes: dict[str, CheckOutcome] = {}
+    for name, check in POLICY_CHECKS.items():
+        if only and name not in only:
+            continue
+        if (
+            name not in _BY_CHANCE
+            and "determinism" in outcomes
+            and outcomes["determinism"].outcome == "failed"
+        ):
+            outcomes[name] = inapplicable("its answers change by chance: see `determinism`")
+            continue
+        try:
+            outcomes[name] = check(asker)
+        except PolicyError as error:
+            crashes = "finite" in outcomes and outcomes["finite"].outcome == "failed"
+            outcomes[name] = (
+                inapplicable("it crashes: see `finite`") if crashes else failed(str(error))
+            )
+    took = asker.took_ms
+    return CheckedPolicy(asker, outcomes, statistics.median(took) if took else 0.0, len(took))

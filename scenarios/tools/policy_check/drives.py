@@ -1,0 +1,151 @@
+"""Drives that a policy is shown: short ways along a real street of a suite, drawn by its own
+cameras, with nothing simulated. What it answers changes nothing of what it sees next."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from types import MappingProxyType
+from typing import Final, Literal
+
+import msgspec
+import shapely
+from shapely.geometry import LineString, MultiPolygon, Polygon
+
+from cosim.core.clock import Clock
+from cosim.core.geometry import Polyline, Pose, wrap_angle
+from cosim.core.state import NOBODY, People, PersonKind, RobotState, Street
+from cosim.core.telling import Tell, untold
+from cosim.episode.camera_rules import check_camera
+from cosim.episode.interfaces import Observation
+from cosim.episode.loop import Moment
+from cosim.episode.observer import Observer
+from cosim.spec.manifest import Manifest
+from cosim.spec.options import CameraName
+from cosim.spec.robot import robot_called
+from cosim.spec.scenario import Scenario
+from physics.cameras.choice import camera_of
+from scenarios.episodes.wiring import CORRIDOR_M, clear_of, empty_street, known, world_of
+from scenarios.places.nets import place, surface_of_place
+from scenarios.suites.catalog import load_suite
+
+SceneName = Literal["straight", "left", "right", "person"]
+SCENES: Final[Mapping[SceneName, str]] = MappingProxyType(
+    {
+        "straight": "along a straight sidewalk, nobody there",
+        "left": "askew on it, to the right: the way leads to the left",
+        "right": "askew on it, to the left: the way leads to the right",
+        "person": "along it, and somebody stands 3 m ahead",
+    }
+)
+_SHOWN: Final = "straight-001"
+"""Of `unit`."""
+_SPEED_MPS: Final = 1.0
+_ASKEW_RAD: Final = math.radians(20.0)
+_ASIDE_M: Final = 0.5
+"""So far beside the middle of the sidewalk who drives askew is when the newest picture is taken."""
+_PERSON_M: Final = 3.0
+_FARTHEST_BACK_M: Final = 4.5
+"""What was seen from before there was seen standing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """What a policy would be given, one observation for each of its answers, oldest first; by the
+    goals of its run."""
+
+    scene: SceneName
+    seen: tuple[Observation, ...]
+
+
+def drives_for(
+    manifest: Manifest,
+    count: int,
+    camera: CameraName,
+    own_camera: bool = False,
+    tell: Tell = untold,
+) -> dict[SceneName, Drive]:
+    """All scenes, `count` observations of each. Raises UsageError for a camera that the robot does
+    not have."""
+    (shown,) = (one for one in load_suite("unit").scenarios if one.id == _SHOWN)
+    shown = msgspec.structs.replace(shown, obstacles=())
+    check_camera(manifest, robot_called(shown.robot), own_camera)
+    drives = {}
+    for done, scene in enumerate(SCENES):
+        tell("drawing streets", done / len(SCENES))
+        drives[scene] = _drive(scene, shown, manifest, count, camera)
+    return drives
+
+
+def _pose(route: Polyline, scene: SceneName, back_m: float) -> Pose:
+    """Where the robot is `back_m` before its newest picture."""
+    middle = route.at(0.5 * route.length_m)
+    side = {"left": -1.0, "right": 1.0}.get(scene, 0.0)
+    heading = wrap_angle(middle.heading_rad + side * _ASKEW_RAD)
+    x_m = middle.x_m - side * _ASIDE_M * math.sin(middle.heading_rad) - back_m * math.cos(heading)
+    y_m = middle.y_m + side * _ASIDE_M * math.cos(middle.heading_rad) - back_m * math.sin(heading)
+    return Pose(x_m, y_m, heading)
+
+
+def _drive(
+    scene: SceneName, scenario: Scenario, manifest: Manifest, count: int, camera: CameraName
+) -> Drive:
+    robot = robot_called(scenario.robot)
+    route = scenario.route_line
+    surface = surface_of_place(scenario.place)
+    clock = Clock.for_rate(manifest.rate_hz)
+    street_map = place(scenario.place)[1]
+    around = shapely.buffer(LineString(scenario.route), CORRIDOR_M)
+
+    @cache
+    def free() -> Polygon | MultiPolygon:
+        ground = clear_of(street_map.walkable_near(around), surface.standing(around))
+        return shapely.buffer(ground, -robot.width_m / 2)
+
+    with ExitStack() as stack:
+        world = stack.enter_context(world_of(surface, robot=robot))
+        cameras = {
+            name: stack.enter_context(
+                camera_of(camera, world, spec, light=scenario.light, depth=spec.depth)
+            )
+            for name, spec in {"": manifest.camera, **manifest.cameras}.items()
+            if spec is not None
+        }
+        eye = cameras.pop("", None)
+        look = None if eye is None else partial(empty_street, eye, surface, robot)
+        told = replace(manifest, odometry="none" if manifest.odometry == "none" else "exact")
+        observer = Observer(
+            scenario, told, 0, lambda now: known(scenario, free(), now), cameras, look
+        )
+        people = _somebody(route, 0.5 * route.length_m + _PERSON_M) if scene == "person" else NOBODY
+        seen = []
+        for number in range(count):
+            time_s = number / manifest.rate_hz
+            back_m = _SPEED_MPS * (count - 1 - number) / manifest.rate_hz
+            pose = _pose(route, scene, min(back_m, _FARTHEST_BACK_M))
+            v_mps = _SPEED_MPS if back_m <= _FARTHEST_BACK_M else 0.0
+            z_m, _, _ = surface.lean(pose, robot.drive.span_m)
+            s_m, _ = route.project(pose.x_m, pose.y_m)
+            tick = clock.ticks(time_s)
+            now = Moment(tick, RobotState(pose, v_mps, z_m=z_m), Street(tick, people), s_m)
+            one, _ = observer.observed(now, time_s, eye, False)
+            if manifest.odometry == "gps" and one.odometry is not None:
+                one = replace(one, odometry=msgspec.structs.replace(one.odometry, heading_rad=None))
+            seen.append(one)
+    return Drive(scene, tuple(seen))
+
+
+def _somebody(route: Polyline, s_m: float) -> People:
+    """One adult who stands on the middle of the way and looks at the robot."""
+    pose = route.at(s_m)
+    return People.of(
+        ("somebody",),
+        [pose.xy],
+        [wrap_angle(pose.heading_rad + math.pi)],
+        [0.0],
+        ("stand",),
+        kind=PersonKind.EVENT,
+    )

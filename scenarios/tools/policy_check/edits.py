@@ -1,0 +1,171 @@
+"""What is changed of a drive before a policy is asked: mirrored, other colours, other goals, other
+pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, Final, NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.clock import Clock
+from cosim.core.geometry import Pose
+from cosim.core.state import frozen
+from cosim.episode.goals import patch_around
+from cosim.episode.interfaces import Observation
+from cosim.spec.camera import Calibration, CameraPicture
+from cosim.spec.goal import Goal, ImageGoal, Instruction, PointGoal, RoutePatch
+
+_MIRROR: Final = np.diag([1.0, -1.0, 1.0, 1.0])
+"""Left becomes right in the robot's frame."""
+_MIRROR_PX: Final = np.diag([-1.0, 1.0, 1.0, 1.0])
+"""The same in a camera's."""
+Observations = Sequence[Observation]
+
+
+class Edit(NamedTuple):
+    """A change of a drive, by a name that no other change has."""
+
+    name: str
+    change: Callable[[Observations], list[Observation]]
+
+
+def of_each(name: str, change: Callable[[Observation], Observation]) -> Edit:
+    """A change of every observation by itself."""
+    return Edit(name, lambda seen: [change(one) for one in seen])
+
+
+def in_mirror(seen: Observation) -> Observation:
+    """What the robot would see, be told and do in a mirror: left is right."""
+    odometry = seen.odometry
+    if odometry is not None:
+        heading = None if odometry.heading_rad is None else -odometry.heading_rad
+        odometry = msgspec.structs.replace(odometry, y_m=-odometry.y_m, heading_rad=heading)
+    return replace(
+        seen,
+        rgb=_flipped(seen.rgb),
+        depth=_flipped(seen.depth),
+        labels=_flipped(seen.labels),
+        w_radps=-seen.w_radps,
+        goal=goal_in_mirror(seen.goal),
+        odometry=odometry,
+        camera=None
+        if seen.camera is None or seen.rgb is None
+        else _camera_in_mirror(seen.camera, seen.rgb.shape[1]),
+        pictures={
+            name: CameraPicture(
+                flipped(one.rgb),
+                _flipped(one.labels),
+                _flipped(one.depth),
+                _camera_in_mirror(one.camera, one.rgb.shape[1]),
+            )
+            for name, one in seen.pictures.items()
+        },
+    )
+
+
+def goal_in_mirror(goal: Goal | None) -> Goal | None:
+    """A goal in a mirror."""
+    if isinstance(goal, PointGoal):
+        return PointGoal(goal.x_m, -goal.y_m)
+    if isinstance(goal, ImageGoal):
+        return ImageGoal(flipped(goal.rgb))
+    if isinstance(goal, RoutePatch):
+        return RoutePatch(flipped(goal.pixels))
+    if isinstance(goal, Instruction):
+        text = goal.text.replace("left", "\0").replace("right", "left")
+        return Instruction(text.replace("\0", "right"))
+    return None
+
+
+def with_goal_told(name: str, goal: Goal | None) -> Edit:
+    """Another goal throughout."""
+    return of_each(f"goal {name}", lambda seen: replace(seen, goal=goal))
+
+
+def with_pictures(name: str, paint: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]) -> Edit:
+    """All pictures, that of the goal as well, painted anew."""
+
+    def painted(seen: Observation) -> Observation:
+        goal = ImageGoal(paint(seen.goal.rgb)) if isinstance(seen.goal, ImageGoal) else seen.goal
+        pictures = {key: replace(one, rgb=paint(one.rgb)) for key, one in seen.pictures.items()}
+        return replace(
+            seen, rgb=None if seen.rgb is None else paint(seen.rgb), goal=goal, pictures=pictures
+        )
+
+    return of_each(name, painted)
+
+
+IN_MIRROR: Final = of_each("mirrored", in_mirror)
+SWAPPED: Final = with_pictures(
+    "red and blue swapped", lambda rgb: np.ascontiguousarray(rgb[..., ::-1])
+)
+ALL_BLACK: Final = with_pictures("black", np.zeros_like)
+ALL_WHITE: Final = with_pictures("white", lambda rgb: np.full_like(rgb, 255))
+AT_REST: Final = of_each("standing", lambda seen: replace(seen, v_mps=0.0, w_radps=0.0))
+LATER_S: Final = 3600.0
+LATER: Final = of_each(
+    "later",
+    lambda seen: replace(
+        seen, tick=seen.tick + Clock().ticks(LATER_S), time_s=seen.time_s + LATER_S
+    ),
+)
+
+
+def showing(name: str, other: Observations, ages: Sequence[int] | None = None) -> Edit:
+    """The pictures of another drive, in all observations or in those of so many answers ago;
+    nothing else of it."""
+
+    def change(seen: Observations) -> list[Observation]:
+        edited = list(seen)
+        for age in range(len(seen)) if ages is None else ages:
+            edited[-1 - age] = _seeing(seen[-1 - age], other[-1 - age])
+        return edited
+
+    return Edit(f"{name} {ages}", change)
+
+
+def _seeing(mine: Observation, theirs: Observation) -> Observation:
+    return replace(
+        mine, rgb=theirs.rgb, depth=theirs.depth, labels=theirs.labels, pictures=theirs.pictures
+    )
+
+
+def then(
+    first: Observations, second: Observations, clock: Clock, rate_hz: float
+) -> list[Observation]:
+    """One drive, and after it, in the same episode, the robot is put at the beginning of
+    another."""
+    period = round(1.0 / (rate_hz * clock.tick_s))
+    moved = []
+    for number, one in enumerate(second):
+        tick = first[-1].tick + (number + 1) * period
+        moved.append(replace(one, tick=tick, time_s=clock.time_s(tick), reset=number == 0))
+    return [*first, *moved]
+
+
+def patch_of_turn(left: float) -> RoutePatch:
+    """A route that turns off 6 m ahead: left 1 for to the left, -1 for to the right, 0 for straight
+    on."""
+    end = (6.0, 20.0 * left) if left else (20.0, 0.0)
+    return RoutePatch(patch_around(Pose(0.0, 0.0, 0.0), np.array([(-20.0, 0.0), (6.0, 0.0), end])))
+
+
+def flipped(picture: NDArray[Any]) -> NDArray[Any]:
+    """(H, W, ...): left is right."""
+    return np.ascontiguousarray(picture[:, ::-1])
+
+
+def _flipped(picture: NDArray[Any] | None) -> NDArray[Any] | None:
+    return None if picture is None else flipped(picture)
+
+
+def _camera_in_mirror(camera: Calibration, width_px: int) -> Calibration:
+    matrix = camera.matrix.copy()
+    matrix[0, 2] = width_px - 1 - matrix[0, 2]
+    return Calibration(
+        frozen(matrix), camera.distortion, frozen(_MIRROR @ camera.on_robot @ _MIRROR_PX)
+    )

@@ -1,0 +1,172 @@
+"""Asking a policy about a drive, as an episode of its own: what it answers, before the robot's
+limits are put on it."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+
+from cosim.core.geometry import Floats
+from cosim.core.state import Command, Planned
+from cosim.core.telling import Tell, untold
+from cosim.episode.interfaces import Observation, Policy
+from cosim.episode.policy_caller import Driver
+from cosim.spec.goal import Goal, ImageGoal, Instruction, PointGoal, RoutePatch
+from cosim.spec.manifest import Manifest, WaypointRule
+from scenarios.tools.policy_check.drives import Drive, SceneName
+from scenarios.tools.policy_check.edits import Edit, flipped, patch_of_turn, with_goal_told
+
+_SEED: Final = 1
+_LEAST: Final = 0.1
+"""Answers of less than this (metres of a waypoint, or metres and radians in a second) are compared
+with it."""
+ROUNDING: Final = 1e-4
+"""Answers that differ by this share at most are the same: one device, another order of sums."""
+
+
+@dataclass(frozen=True, slots=True)
+class Answered:
+    """What a policy answered: how fast it wants to drive, and how far it wants to turn: the bearing
+    of the waypoint that is followed, or what it turns in a second. waypoints: (N, 2) or (N, 4) in
+    metres; None for a command, also for one with a plan beside it, which nobody drives."""
+
+    v_mps: float
+    turn_rad: float
+    waypoints: Floats | None
+
+    @property
+    def degrees(self) -> str:
+        """The turn in words."""
+        turn = round(math.degrees(self.turn_rad))
+        return f"{abs(turn)} deg {'left' if turn > 0 else 'right'}" if turn else "straight on"
+
+
+def answered(said: object, command: Command, rule: WaypointRule) -> Answered:
+    """said: the answer as it is, which became this command."""
+    if isinstance(said, Command) or not isinstance(command, Planned):
+        raw = said if isinstance(said, Command) else command
+        return Answered(float(raw.v_mps), float(raw.w_radps), None)
+    waypoints = command.waypoints.astype(float)
+    x_m, y_m = waypoints[command.index, :2].tolist()
+    if math.hypot(x_m, y_m) > 1e-6:
+        turn = math.atan2(y_m, x_m)
+    else:
+        turn = math.atan2(*waypoints[command.index, [3, 2]]) if waypoints.shape[1] == 4 else 0.0
+    return Answered(x_m / rule.dt_s, turn, waypoints)
+
+
+def apart(one: Answered, other: Answered) -> float:
+    """How much two answers differ, as a share of the larger: 0 for the same, 2 for opposite
+    ones."""
+    first, second = _numbers(one), _numbers(other)
+    if first.shape != second.shape:
+        return 2.0
+    largest = max(float(np.linalg.norm(rows, axis=1).max()) for rows in (first, second))
+    return float(np.linalg.norm(first - second, axis=1).max()) / max(largest, _LEAST)
+
+
+def _numbers(one: Answered) -> Floats:
+    return np.array([[one.v_mps, one.turn_rad]]) if one.waypoints is None else one.waypoints[:, :2]
+
+
+class Asker:
+    """A policy and the drives that it is asked about. What was asked once is not asked again."""
+
+    def __init__(
+        self,
+        driver: Driver,
+        manifest: Manifest,
+        drives: Mapping[SceneName, Drive],
+        tell: Tell = untold,
+    ) -> None:
+        """manifest: with the goals of the run."""
+        self.manifest = manifest
+        self.drives = drives
+        self.took_ms: list[float] = []
+        self._driver = driver
+        self._tell = tell
+        self._said: object = None
+        self._known: dict[tuple[SceneName, tuple[str, ...]], Answered] = {}
+        self._episodes = 0
+        driver.heard_by(self._hear)
+
+    def answer(self, scene: SceneName, *edits: Edit) -> Answered:
+        """The answer to the last observation of a drive, with these changes. Raises PolicyError."""
+        key = scene, tuple(edit.name for edit in edits)
+        if key not in self._known:
+            seen: Sequence[Observation] = self.drives[scene].seen
+            for edit in edits:
+                seen = edit.change(seen)
+            self._known[key] = self.episode(seen)[-1]
+        return self._known[key]
+
+    def episode(self, seen: Sequence[Observation], seed: int = _SEED) -> list[Answered]:
+        """The answers to observations, in an episode of their own. Raises PolicyError."""
+        self._episodes += 1
+        name = f"check-{self._episodes:04d}"
+        self._tell("asking the policy")
+        driver = self._driver
+        rule = self._driver.manifest.waypoints
+        answers: list[Answered] = []
+        driver.reset(name, seed)
+        try:
+            for one in seen:
+                began_s = time.perf_counter()
+                command = driver.act(replace(one, episode=name))
+                if answers:
+                    self.took_ms.append(1000.0 * (time.perf_counter() - began_s))
+                answers.append(answered(self._said, command, rule))
+        finally:
+            driver.ended()
+        return answers
+
+    @property
+    def policy(self) -> Policy:
+        """What is asked."""
+        return self._driver.policy
+
+    @property
+    def plain(self) -> Edit:
+        """A goal that tells nothing of where to turn: straight on."""
+        return self.goals["ahead"]
+
+    @cached_property
+    def goals(self) -> dict[str, Edit]:
+        """By names: ahead, left, right, zero, and for points near, half as far as left. Of pictures
+        left is ahead in a mirror, and there is no right."""
+        own = self.drives["straight"].seen[-1].goal
+        told: dict[str, Goal | None] = {"ahead": own}
+        if isinstance(own, PointGoal):
+            told = {
+                "ahead": PointGoal(10.0, 0.0),
+                "left": PointGoal(10.0, 5.0),
+                "right": PointGoal(10.0, -5.0),
+            }
+            told |= {"zero": PointGoal(0.0, 0.0), "near": PointGoal(5.0, 2.5)}
+        elif isinstance(own, Instruction):
+            words = {
+                "ahead": "Follow the sidewalk.",
+                "left": "Turn left.",
+                "right": "Turn right.",
+                "zero": "",
+            }
+            told = {name: Instruction(text) for name, text in words.items()}
+        elif isinstance(own, RoutePatch):
+            told = {
+                "ahead": patch_of_turn(0.0),
+                "left": patch_of_turn(1.0),
+                "right": patch_of_turn(-1.0),
+            }
+            told["zero"] = RoutePatch(np.zeros_like(own.pixels))
+        elif isinstance(own, ImageGoal):
+            told |= {"left": ImageGoal(flipped(own.rgb)), "zero": ImageGoal(np.zeros_like(own.rgb))}
+        return {name: with_goal_told(name, goal) for name, goal in told.items()}
+
+    def _hear(self, said: object) -> None:
+        self._said = said

@@ -1,0 +1,1 @@
+"""Verify an installation."""

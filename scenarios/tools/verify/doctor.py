@@ -1,0 +1,123 @@
+"""What `cosim doctor` checks: every engine does something real."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping
+from importlib.metadata import packages_distributions
+from pathlib import Path
+from types import MappingProxyType
+
+import msgspec
+import numpy as np
+
+from cosim.core.cache import cache_folder
+from cosim.core.errors import EngineError, MachineError
+from cosim.core.versions import versions
+from cosim.place.walk_graph import WalkGraph
+from cosim.policies.baselines import Straight
+from cosim.spec.events import EventQuery
+from cosim.spec.robot import COURIER
+from cosim.spec.scenario import City, CrowdSpec, Scenario
+from physics.cameras.choice import camera_of_choice, renderer_of
+from scenarios.episodes.director import directed
+from scenarios.episodes.episode import Episode
+from scenarios.places.nets import place
+from scenarios.suites.long_horizon import build_long_horizon
+
+_SMALL = City(seed=1, size_m=500.0)
+OWN = ("cosim", "sumo_nets", "physics", "bridge", "scenarios")
+
+
+def packages() -> str:
+    return ", ".join(f"{name} {version}" for name, version in versions().items())
+
+
+def names() -> str:
+    """The top-level packages are ours and not another distribution's of the same name."""
+    owners = packages_distributions()
+    for name in OWN:
+        if (owner := set(owners.get(name, ["sidewalk-cosim"]))) != {"sidewalk-cosim"}:
+            raise MachineError(
+                f"package '{name}' belongs to {', '.join(sorted(owner))}: use a virtual environment"
+            )
+    return f"{', '.join(OWN)} are this project's"
+
+
+def cache() -> str:
+    folder = cache_folder()
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=folder):
+        return f"{folder} can be written"
+
+
+def city() -> str:
+    net, street_map = place(_SMALL)
+    return (
+        f"netconvert built {Path(net).name}: {len(street_map.strips)} strips, "
+        f"{len(street_map.corners)} corners"
+    )
+
+
+def bridge() -> str:
+    query = EventQuery(
+        episode="doctor",
+        tick=0,
+        tick_ms=50,
+        robot_x_m=0.0,
+        robot_y_m=0.0,
+        robot_heading_rad=0.0,
+        robot_v_mps=0.0,
+        robot_w_radps=0.0,
+        route_s_m=0.0,
+        robot_length_m=COURIER.length_m,
+        robot_width_m=COURIER.width_m,
+        events=(),
+    )
+    with directed("doctor") as director:
+        director.react(query)
+    return "a director answered over a Zenoh session"
+
+
+def cameras() -> str:
+    """Which camera `--camera auto` takes, and why."""
+    try:
+        return f"gl works and is taken ({renderer_of(camera_of_choice('gl'))}); so does bullet"
+    except EngineError as error:
+        return f"bullet works and is taken; gl does not: {error}"
+
+
+def frame() -> str:
+    """One frame and one step of a small city, with crowd and physics."""
+    scenario = small_scenario()
+    with Episode(scenario, Straight.manifest) as episode:
+        picture = episode.reset().rgb
+        if picture is None or len(np.unique(picture.reshape(-1, 3), axis=0)) < 5:
+            raise EngineError("the camera's picture is blank")
+        height, width, _ = picture.shape
+        people = len(episode.moment.street.people)
+        renderer = episode.record.renderer
+        return (
+            f"SUMO walks {people} people, PyBullet holds the robot, {renderer} draws "
+            f"{width}x{height}"
+        )
+
+
+def small_scenario() -> Scenario:
+    """A long-horizon scenario in a small city with a small crowd."""
+    _, street_map = place(_SMALL)
+    scenario = build_long_horizon(_SMALL, street_map, WalkGraph(street_map), 0, "doctor")
+    return msgspec.structs.replace(scenario, crowd=CrowdSpec(persons=10, radius_m=50.0, vehicles=4))
+
+
+CHECKS: Mapping[str, Callable[[], str]] = MappingProxyType(
+    {
+        "packages": packages,
+        "names": names,
+        "cache": cache,
+        "city": city,
+        "bridge": bridge,
+        "cameras": cameras,
+        "frame": frame,
+    }
+)

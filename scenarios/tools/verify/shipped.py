@@ -1,0 +1,127 @@
+"""What an installation must give, as it lies beside the suites: verify.json."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+
+from cosim.core.errors import EngineError, RunError, unwritable
+from cosim.core.versions import versions
+from cosim.core.whole_file import write_whole
+from cosim.spec.scenario import Scenario
+from physics.cameras.choice import camera_of_choice, renderer_of
+from scenarios.episodes.run_episode import in_words
+from scenarios.suites.catalog import SUITES, load_suite
+from scenarios.tools.verify.engines import DRIVER, engines_alone, room_hashes, textures
+from scenarios.tools.verify.traces import Trace, traced
+
+SHIPPED: Final = next(iter(SUITES.values())).parent / "verify.json"
+_SCHEMA: Final = 1
+
+
+class Given(msgspec.Struct, frozen=True, kw_only=True):
+    """What an installation gives. renderer: of the gl camera, "" without one; traces: by case, or
+    why there is none."""
+
+    schema: int = _SCHEMA
+    versions: dict[str, str]
+    renderer: str
+    suites: dict[str, str]
+    sources: dict[str, str]
+    alone: dict[str, str]
+    textures: dict[str, str]
+    traces: dict[str, Trace | str]
+
+    def save(self, path: Path) -> None:
+        """Write as JSON, whole or not at all. Raises MachineError."""
+        data = msgspec.json.format(msgspec.json.encode(self), indent=1) + b"\n"
+        try:
+            write_whole(path, data)
+        except OSError as error:
+            raise unwritable(path, error) from error
+
+    @classmethod
+    def load(cls, path: Path) -> Given:
+        """Raises RunError that names the file and the remedy."""
+        try:
+            given = msgspec.json.decode(path.read_bytes(), type=cls)
+        except (OSError, msgspec.DecodeError) as error:
+            raise RunError(f"{path}: holds nothing to verify by: {error}. Install anew") from error
+        if given.schema != _SCHEMA:
+            raise RunError(
+                f"{path}: schema {given.schema}; this version reads {_SCHEMA}. Install anew"
+            )
+        return given
+
+
+def given_here(cases: Sequence[Scenario], jobs: int, tell: Callable[[str], None]) -> Given:
+    """What this installation gives: `jobs` processes, or this one. tell: is told the name of what
+    is under way. Raises EngineError when a process dies."""
+    work: dict[str, Callable[[], Any]] = {"the engines alone": engines_alone, "textures": textures}
+    work |= {case.id: partial(trace_of, case) for case in cases}
+    alone, layers, *traces = (
+        _done_here(work, tell) if jobs == 1 else _done_in_processes(work, jobs, tell)
+    )
+    return Given(
+        versions=versions(),
+        renderer=renderer_of(camera_of_choice("gl")) if DRIVER in alone else "",
+        suites={name: load_suite(name).content_hash for name in SUITES},
+        sources=room_hashes(),
+        alone=alone,
+        textures=layers,
+        traces={case.id: trace for case, trace in zip(cases, traces, strict=True)},
+    )
+
+
+def _done_here(work: Mapping[str, Callable[[], Any]], tell: Callable[[str], None]) -> list[Any]:
+    done = []
+    for name, do in work.items():
+        tell(name)
+        done.append(do())
+    return done
+
+
+def _done_in_processes(
+    work: Mapping[str, Callable[[], Any]], jobs: int, tell: Callable[[str], None]
+) -> list[Any]:
+    done = []
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        for name, one in {name: pool.submit(do) for name, do in work.items()}.items():
+            tell(name)
+            try:
+                done.append(one.result())
+            except BrokenProcessPool:
+                where = f"a process died in {name}, or in what was under way beside it"
+                raise EngineError(
+                    f"{where}: `cosim verify --jobs 1` shows where, `cosim doctor` what works"
+                ) from None
+    return done
+
+
+def trace_of(case: Scenario) -> Trace | str:
+    """The trace of a case; what went wrong, in words, where there is none."""
+    try:
+        return traced(case)
+    except Exception as error:  # noqa: BLE001  what a wrong version of a package does is told with all the rest
+        return in_words(error)
+
+
+def writable(given: Given, cases: Sequence[str]) -> Given:
+    """What may be shipped: all cases, each run, by both cameras. Raises RunError."""
+    broken = [f"{name} ({trace})" for name, trace in given.traces.items() if isinstance(trace, str)]
+    lacking = [name for name in cases if name not in given.traces]
+    if broken or lacking or not given.renderer:
+        why = (
+            f"cases that did not run: {', '.join(broken + lacking)}"
+            if broken or lacking
+            else "there is no gl camera"
+        )
+        raise RunError(f"what is shipped is made of all cases and both cameras, and here {why}")
+    return given

@@ -1,0 +1,218 @@
+"""Verdict: what differs from what was shipped, what is to blame, and the remedy, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
+from typing import Final, NamedTuple
+
+from cosim.core.clock import Clock
+from scenarios.tools.verify.engines import DRIVER
+from scenarios.tools.verify.shipped import Given
+from scenarios.tools.verify.traces import DIGITS, PARTS, Trace
+
+SAME_LABELS: Final = 0.995
+SAME_LEVELS: Final = 12.0
+"""Another driver of OpenGL may label so many pixels otherwise, and a block of 8 x 8 pixels may be
+so many of 255 levels lighter or darker."""
+_REINSTALL: Final = "pip install --require-hashes -r requirements.lock"
+
+
+class Finding(NamedTuple):
+    """One thing that was looked at. part: of BLAMES, "" where it is as shipped or says itself what
+    is to be done."""
+
+    name: str
+    fine: bool
+    words: str
+    part: str = ""
+
+
+class Blame(NamedTuple):
+    """What a part hangs on: engine, the task that it is asked alone; packages; rooms of ours."""
+
+    called: str
+    engine: str
+    packages: tuple[str, ...]
+    rooms: tuple[str, ...]
+
+
+_DRAWN_BY: Final = ("physics/cameras", "physics/people", "physics/street", "physics/world")
+_OF_PEOPLE: Final = ("scenarios/events", "cosim/people", "scenarios/execution", "bridge")
+_OF_POLICIES: Final = ("cosim/policies", "cosim/people", "cosim/episode")
+_OF_THE_CROWD: Final = ("sumo_nets/crowd", "sumo_nets/net", "cosim/people")
+_OF_THE_WORLD: Final = ("physics/world", "physics/robots", "physics/street")
+BLAMES: Final[Mapping[str, Blame]] = MappingProxyType(
+    {
+        "policy": Blame("the policy", "C library", ("numpy", "scipy", "shapely"), _OF_POLICIES),
+        "events": Blame("our event pedestrians", "numpy", ("numpy", "eclipse-zenoh"), _OF_PEOPLE),
+        "crowd": Blame("the crowd", "SUMO", ("libsumo", "eclipse-sumo", "numpy"), _OF_THE_CROWD),
+        "robot": Blame("the robot's physics", "PyBullet", ("pybullet", "numpy"), _OF_THE_WORLD),
+        "referee": Blame(
+            "the referee", "shapely", ("numpy", "shapely"), ("cosim/judge", "cosim/place")
+        ),
+        "metrics": Blame(
+            "the metrics", "numpy", ("numpy", "scipy"), ("cosim/judge", "cosim/records")
+        ),
+        "bullet": Blame("the bullet camera", "TinyRenderer", ("pybullet",), _DRAWN_BY),
+        "gl": Blame(
+            "the gl camera", DRIVER, ("moderngl", "glcontext"), (*_DRAWN_BY, "physics/textures")
+        ),
+        "textures": Blame(
+            "the textures", "numpy", ("numpy", "opencv-python-headless"), ("physics/textures",)
+        ),
+    }
+)
+
+
+def findings(shipped: Given, here: Given) -> Iterator[Finding]:
+    """What was looked at, in order: packages, suites, engines alone, textures, cases."""
+    yield from _packages(shipped, here)
+    for name, told in shipped.suites.items():
+        mine = here.suites.get(name, "missing")
+        remedy = f"{mine} here, {told} as shipped: it was edited. Take it as it was shipped"
+        yield Finding(f"suite {name}", mine == told, told if mine == told else remedy)
+    for name, told in shipped.alone.items():
+        yield _engine(name, told, here)
+    changed = [name for name, told in shipped.textures.items() if here.textures.get(name) != told]
+    words = f"{len(shipped.textures)} as shipped" if not changed else f"differ: {_few(changed)}"
+    yield Finding("textures", not changed, words, "textures" if changed else "")
+    for case, trace in here.traces.items():
+        yield from _case(case, shipped.traces.get(case), trace, shipped, here)
+
+
+def _packages(shipped: Given, here: Given) -> Iterator[Finding]:
+    others = {
+        n: (here.versions.get(n, "none"), v)
+        for n, v in shipped.versions.items()
+        if here.versions.get(n) != v
+    }
+    others.pop("arithmetic", None)
+    for name, (mine, told) in others.items():
+        yield Finding(f"package {name}", False, f"{mine} here, {told} as shipped: {_REINSTALL}")
+    if not others:
+        yield Finding("packages", True, f"{len(shipped.versions) - 1} of the shipped versions")
+
+
+def _engine(name: str, told: str, here: Given) -> Finding:
+    mine = here.alone.get(name)
+    if mine == told:
+        return Finding(f"{name} alone", True, "as shipped")
+    if name != DRIVER:
+        return Finding(
+            f"{name} alone", False, "gives something else: the engine itself, none of our code"
+        )
+    if mine is None:
+        return Finding(
+            name,
+            True,
+            "none here: the gl camera is not verified (`cosim doctor` says what to install)",
+        )
+    return Finding(
+        name, True, f"another one, so pictures by gl may differ a little: {here.renderer}"
+    )
+
+
+def _case(
+    case: str, told: Trace | str | None, mine: Trace | str, shipped: Given, here: Given
+) -> Iterator[Finding]:
+    if isinstance(mine, str):
+        yield Finding(case, False, f"cannot be run: {mine}")
+        return
+    if not isinstance(told, Trace) or told.scenario_hash != mine.scenario_hash:
+        yield Finding(
+            case, False, "is not the scenario that was shipped: take its suite as it was shipped"
+        )
+        return
+    part, tick = first_difference(told, mine)
+    if part:
+        at = "before it begins" if tick < 0 else f"at {Clock().time_s(tick):.2f} s"
+        yield Finding(
+            case, False, f"{BLAMES[part].called} first, {at}; what follows hangs on it", part
+        )
+        return
+    if others := [
+        name for name, value in told.measures.items() if mine.measures.get(name, "") != value
+    ]:
+        yield Finding(
+            case, False, f"the same to the bit, but not measured so: {_few(others)}", "metrics"
+        )
+        return
+    kinds = [
+        _picture(camera, told, mine, shipped, here)
+        for camera in told.pictures
+        if camera in mine.pictures
+    ]
+    for camera, fine, words in kinds:
+        if not fine:
+            yield Finding(
+                case,
+                False,
+                f"the same to the bit, but its picture by {camera} is not: {words}",
+                camera,
+            )
+            return
+    seen = ", ".join(f"{camera} {words}" for camera, _, words in kinds)
+    ticks = len(mine.ticks["robot"]) // DIGITS - 1
+    numbers = len(told.measures)
+    yield Finding(case, True, f"{ticks} ticks and {numbers} numbers to the bit; pictures: {seen}")
+
+
+def first_difference(told: Trace, mine: Trace) -> tuple[str, int]:
+    """The part that differs first, and in which tick, -1 before the first one; "" where none
+    does."""
+    length = max(len(told.ticks["robot"]), len(mine.ticks["robot"]))
+    for at in range(0, length, DIGITS):
+        for part in PARTS:
+            if told.ticks[part][at : at + DIGITS] != mine.ticks[part][at : at + DIGITS]:
+                return part, at // DIGITS - 1
+    return ("robot", length // DIGITS - 1) if told.state_hash != mine.state_hash else ("", 0)
+
+
+def _picture(
+    camera: str, told: Trace, mine: Trace, shipped: Given, here: Given
+) -> tuple[str, bool, str]:
+    one, other = told.pictures[camera], mine.pictures[camera]
+    if one.hash == other.hash:
+        return camera, True, "to the bit"
+    labels, levels = one.beside(other)
+    words = f"{100.0 * labels:.2f} % of the labels, {levels:.0f} levels of 255"
+    engine = BLAMES[camera].engine
+    drawn_alike = shipped.alone.get(engine) == here.alone.get(engine)
+    return camera, not drawn_alike and labels >= SAME_LABELS and levels <= SAME_LEVELS, words
+
+
+def blamed(found: list[Finding], shipped: Given, here: Given) -> Iterator[str]:
+    """For each part that is to blame what is to blame in it, and what to do."""
+    for part in dict.fromkeys(one.part for one in found if one.part):
+        yield f"{BLAMES[part].called}: {_blame(BLAMES[part], shipped, here)}"
+
+
+def _blame(of: Blame, shipped: Given, here: Given) -> str:
+    others = [
+        f"{name} {here.versions.get(name, 'none')} here, {told} as shipped"
+        for name, told in shipped.versions.items()
+        if name in (*of.packages, "arithmetic", "geos") and here.versions.get(name) != told
+    ]
+    edited = [room for room in of.rooms if here.sources.get(room) != shipped.sources.get(room)]
+    alike = shipped.alone.get(of.engine) == here.alone.get(of.engine)
+    told = [
+        f"{of.engine} alone gives what it should, so it is ours"
+        if alike
+        else f"{of.engine} alone gives something else, too",
+        *others,
+        f"the source of {', '.join(edited)} is not the shipped one" if edited else "",
+    ]
+    if others or not alike:
+        remedy = _REINSTALL
+    elif edited:
+        remedy = "take the source as it was shipped (`git status`, `git diff`; or install anew)"
+    else:
+        remedy = (
+            f"something changes {', '.join(of.rooms)} as they run: report it, with the lines above"
+        )
+    return "; ".join(filter(None, told)) + f". Remedy: {remedy}"
+
+
+def _few(names: list[str]) -> str:
+    return ", ".join(names[:4]) + (f" and {len(names) - 4} more" if len(names) > 4 else "")

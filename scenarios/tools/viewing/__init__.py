@@ -1,0 +1,1 @@
+"""Pictures, films, reports and recordings of episodes."""

@@ -1,0 +1,330 @@
+"""A film of an episode: its record is replayed, tick by tick, and drawn from behind, from above or
+from the robot.
+
+The replay is the same episode: every tick is held against the recorded trajectory, and at the end
+of the episode the state hash against the record's. A film that ends earlier is simulated no further
+than its last picture: it has no state hash to show, but every tick of it is as recorded.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+
+from cosim.core.clock import Clock
+from cosim.core.errors import RunError, listed
+from cosim.core.geometry import Floats
+from cosim.core.state import DIRECTED, RobotState, Street
+from cosim.core.telling import Tell, untold
+from cosim.episode.interfaces import Eyes
+from cosim.episode.step import Step
+from cosim.report import hud
+from cosim.report.encoding import Video
+from cosim.report.legend import Image
+from cosim.report.minimap import PLANNED, Minimap
+from cosim.report.page.reasons import mishaps_of, reason_of
+from cosim.results.record import Record
+from cosim.results.referee import Verdict
+from cosim.results.run_folder import read_records, read_spec
+from cosim.results.waypoint_replay import Following
+from cosim.spec.camera import CameraSpec
+from cosim.spec.options import CameraChoice
+from cosim.spec.robot import robot_called
+from physics.cameras.view import robot_shot
+from scenarios.episodes.replay import Alike, Recorded, check, recorded, replaying
+from scenarios.places.nets import place, surface_of_place
+from scenarios.tools.viewing.drawn_route import way_in_picture
+from scenarios.tools.viewing.look import Viewpoint, eye_behind, over
+
+EASE_S: Final = 0.5
+"""The follower's heading lags the robot's by about this much."""
+SMALLEST_PX: Final = (320, 180)
+ROBOT_FOV_DEG: Final = 75.0
+"""Of the robot's camera, up and down, at 4:3; wider pictures show no more to the sides."""
+ROBOT_ASIDE: Final = math.tan(math.radians(ROBOT_FOV_DEG / 2)) * 4.0 / 3.0
+_FOV_DEG: Final = 62.0
+"""Of the views from behind and from above, up and down."""
+ABOVE_REST: Final = (2.0, 0.0, 10.0)
+"""From above, when nothing happens: metres ahead and to the left of the robot that are looked at,
+height of the eye."""
+ABOVE_HIGH_M: Final = (6.5, 12.0)
+_NEAR_M: Final = 8.0
+"""Event people this near are kept in the picture from above."""
+BEFORE_S = 10.0
+AFTER_S = 2.0
+"""The film of a failure begins and ends so many seconds before and after it."""
+
+
+class Cut(NamedTuple):
+    """What of an episode is filmed. from_s, to_s: simulated time; size: width, height; speed: times
+    real time; camera: what draws it; view: from where."""
+
+    from_s: float = 0.0
+    to_s: float = math.inf
+    size: tuple[int, int] = (1280, 720)
+    speed: int = 1
+    camera: CameraChoice = "auto"
+    view: Viewpoint = "follow"
+
+
+class FilmedFailure(NamedTuple):
+    """The first failure of an episode: when it happened, why, and the seconds that a film of it
+    shows."""
+
+    scenario: str
+    at_s: float
+    reason: str
+    from_s: float
+    to_s: float
+
+
+def failure_to_film(folder: Path, scenario_id: str | None) -> FilmedFailure:
+    """Choose the first failure of an episode; without an id, of the first failed episode in the
+    order of the run.
+
+    Raises UsageError for an unknown episode, and RunError with the outcomes where nothing failed.
+    """
+    records = {record.scenario: record for record in read_records(folder)}
+    failed = [
+        name for name in read_spec(folder).scenarios if name in records and _failed(records[name])
+    ]
+    if scenario_id is not None and scenario_id in records and scenario_id not in failed:
+        others = f". Episodes that failed: {listed(scenario_id, failed)}" if failed else ""
+        raise RunError(
+            f"{folder}: '{scenario_id}' did not fail: {_outcome(records[scenario_id])}{others}"
+        )
+    if scenario_id is None and not failed:
+        outcomes = Counter(
+            "succeeded" if one.status == "done" else one.status for one in records.values()
+        )
+        counts = (
+            ", ".join(f"{count} {outcome}" for outcome, count in outcomes.items())
+            or "no episode has ended"
+        )
+        raise RunError(f"{folder}: no episode failed: {counts}. Name an EPISODE to film it")
+    told = recorded(folder, scenario_id or failed[0])
+    mishap = mishaps_of(told.record)[0]
+    at_s = Clock().time_s(mishap.tick + 1)
+    reason = reason_of(told.scenario, told.record, mishap, told.log)
+    return FilmedFailure(
+        told.record.scenario, at_s, reason, max(0.0, at_s - BEFORE_S), at_s + AFTER_S
+    )
+
+
+def _failed(record: Record) -> bool:
+    """Return whether an episode came to its end and something went wrong in it."""
+    return record.ended is not None and bool(mishaps_of(record))
+
+
+def _outcome(record: Record) -> str:
+    if record.status == "done":
+        return f"it ended {'at the goal' if record.ended == 'goal' else f'by {record.ended}'}"
+    return f"it is {record.status}: {record.reason}"
+
+
+def make_film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell = untold) -> float:
+    """Write the film of a finished episode; the simulated second at which it ends, infinite for the
+    episode's end.
+
+    Raises RunError when there is no such episode, or when the replay differs; then there is no
+    file.
+    """
+    told = recorded(folder, scenario_id)
+    scenario, log = told.scenario, told.log
+    if not cut.from_s < cut.to_s:
+        raise RunError(
+            f"nothing lies between --from {cut.from_s:g} s and --to {cut.to_s:g} s: give a "
+            f"later --to"
+        )
+    last = min(len(log), Clock().ticks(min(cut.to_s, 1e6)))
+    if not 0.0 <= cut.from_s < Clock().time_s(last):
+        raise RunError(
+            f"'{scenario_id}' lasts {Clock().time_s(len(log)):.1f} s: nothing to film from "
+            f"{cut.from_s:g} s on"
+        )
+    if cut.size[0] < SMALLEST_PX[0] or cut.size[1] < SMALLEST_PX[1]:
+        least = "x".join(map(str, SMALLEST_PX))
+        raise RunError(
+            f"a film of {cut.size[0]}x{cut.size[1]} pixels: below {least} nothing can be read"
+        )
+    tell("reading the street map, starting SUMO, PyBullet and the camera")
+    _, street_map = place(scenario.place)
+    fps = round(1.0 / Clock().tick_s)
+    with ExitStack() as stack:
+        video = stack.enter_context(Video(output, cut.size, fps))
+        episode, policy = replaying(told, cut.camera)
+        stack.enter_context(episode)
+        camera = stack.enter_context(episode.eyes(robot_eye(cut)))
+        minimap = Minimap(street_map, scenario, episode.footprint_m)
+        reel = _Reel(told, minimap, camera, video, cut, last, tell)
+        for watch in (Alike(folder, told).watch, reel.take):
+            episode.watch(watch)
+        observation = episode.reset()
+        while not episode.over and episode.moment.tick < last:
+            observation = episode.advance(policy.act(observation))
+        if episode.over:
+            check(folder, told, episode.result()[0].state_hash)
+    return math.inf if last == len(log) else Clock().time_s(last)
+
+
+def robot_eye(cut: Cut) -> CameraSpec:
+    """The robot's camera as large as it is in the film."""
+    layout = hud.Layout.of(*cut.size)
+    area = layout.view if cut.view == "robot" else layout.second
+    up = min(ROBOT_ASIDE * area.height / area.width, math.tan(math.radians(ROBOT_FOV_DEG / 2)))
+    return CameraSpec(area.width, area.height, math.degrees(2.0 * math.atan(up)))
+
+
+class _Reel:
+    """Draws step after step. The follower's eye moves smoothly from picture to picture."""
+
+    def __init__(
+        self,
+        told: Recorded,
+        minimap: Minimap,
+        camera: Eyes,
+        video: Video,
+        cut: Cut,
+        last: int,
+        tell: Tell,
+    ) -> None:
+        self._scenario = told.scenario
+        self._record = told.record
+        self._minimap = minimap
+        self._following = Following(told.log)
+        self._plan: Floats | None = None
+        self._camera = camera
+        self._video = video
+        self._cut = cut
+        self._last = last
+        self._tell = tell
+        self._counts = {"collision": 0, "out_of_lane": 0, "freezing": 0}
+        self._triggered: set[str] = set()
+        self._caption = ("", hud.INK)
+        self._caption_until = -1
+        self._ahead: Floats = np.zeros(2)
+        self._over: Floats = np.array(ABOVE_REST)
+
+    def take(self, step: Step, verdict: Verdict) -> None:
+        """One tick of the episode; drawn if it lies within the cut."""
+        self._note(step, verdict)
+        self._plan = self._following.take(step, verdict.reset is not None)
+        robot = step.motion.robot
+        ahead = np.array([math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)])
+        share = Clock().tick_s / EASE_S
+        self._ahead = (1.0 - share) * self._ahead + share * ahead if self._ahead.any() else ahead
+        self._over = (1.0 - share) * self._over + share * _framed(robot, step.street_after)
+        first = Clock().ticks(self._cut.from_s)
+        if step.tick < first:
+            self._tell(f"simulating to {self._cut.from_s:g} s", step.tick / first)
+        if first <= step.tick < self._last and (step.tick - first) % self._cut.speed == 0:
+            self._video.add(self._picture(step, robot, step.street_after))
+            self._tell(f"filming {self._scenario.id}", (step.tick - first) / (self._last - first))
+
+    def _picture(self, step: Step, robot: RobotState, street: Street) -> Image:
+        width, height = self._cut.size
+        layout = hud.Layout.of(width, height)
+        image: Image = np.zeros((height, width, 3), dtype=np.uint8)
+        seen = self._seen(robot, street)
+        if self._cut.view == "robot":
+            hud.fill(image, layout.view, seen)
+            hud.fill(
+                image,
+                layout.second,
+                self._outside("follow", layout.second, robot, street),
+                "from behind",
+            )
+        else:
+            hud.fill(image, layout.view, self._outside(self._cut.view, layout.view, robot, street))
+            hud.fill(image, layout.second, seen, "robot's camera")
+        area = layout.map
+        hud.fill(
+            image,
+            area,
+            self._minimap.picture(
+                robot, street, (area.width, area.height), self._ahead, self._plan
+            ),
+        )
+        time_s = Clock().time_s(step.tick)
+        counts = "  ".join(f"{name.replace('_', ' ')} {n}" for name, n in self._counts.items())
+        done = step.route_s_after_m / self._scenario.route_line.length_m
+        left = f"{self._scenario.id}  {self._record.policy}  {time_s:5.1f} s  {robot.v_mps:.1f} m/s"
+        hud.bar(image, layout.bar, left, f"route {100.0 * done:.0f} %   {counts}", done)
+        if step.tick < self._caption_until:
+            hud.caption(image, layout.view, *self._caption)
+        return image
+
+    def _seen(self, robot: RobotState, street: Street) -> Image:
+        """What the robot's camera sees, with the waypoints that are followed."""
+        seen = self._camera.render(robot, street).rgb
+        if self._plan is None:
+            return seen
+        surface = surface_of_place(self._scenario.place)
+        spec = robot_eye(self._cut)
+        shot = robot_shot(surface, robot_called(self._scenario.robot), spec, robot)
+        way = way_in_picture(
+            shot, spec.lens, np.column_stack([self._plan, surface.heights(self._plan)])
+        )
+        drawn = seen.copy()
+        wide = max(2, spec.width // 160)
+        cv2.polylines(
+            drawn,
+            [np.int32(np.round(line)) for line in way.lines],
+            False,
+            PLANNED,
+            wide,
+            cv2.LINE_AA,
+        )
+        for x, y in np.round(way.points[1:][np.isfinite(way.points[1:, 0])]).astype(int).tolist():
+            cv2.circle(drawn, (x, y), wide + 1, PLANNED, -1, cv2.LINE_AA)
+        return drawn
+
+    def _outside(self, view: Viewpoint, area: hud.Area, robot: RobotState, street: Street) -> Image:
+        """What somebody sees who follows the robot, behind it or above it."""
+        if view == "follow":
+            eye, target = eye_behind(robot, self._ahead)
+        else:
+            eye, target = over(robot, self._ahead, self._over)
+        return self._camera.picture(
+            eye, target, street, robot, (area.width, area.height), _FOV_DEG
+        ).rgb
+
+    def _note(self, step: Step, verdict: Verdict) -> None:
+        """Count failures, and choose what is captioned."""
+        for event, state in zip(self._scenario.events, step.events.states, strict=True):
+            if state.phase == "acting" and event.id not in self._triggered:
+                self._triggered.add(event.id)
+                self._say(step.tick, event.kind.replace("_", " "), hud.INK)
+        for failure in verdict.failures:
+            self._counts[failure.kind] += 1
+            other = f" with {failure.other_kind}" if failure.other_kind else ""
+            self._say(step.tick, failure.kind.replace("_", " ") + other, hud.BAD)
+        if verdict.walked_into:
+            self._say(step.tick, "walked into by pedestrian", hud.INK)
+        if verdict.ended == "goal":
+            self._say(step.tick, "goal", hud.GOOD)
+
+    def _say(self, tick: int, text: str, colour: tuple[int, int, int]) -> None:
+        self._caption = (text, colour)
+        self._caption_until = tick + Clock().ticks(hud.CAPTION_S)
+
+
+def _framed(robot: RobotState, street: Street) -> Floats:
+    """(3,) metres ahead and left of the robot, and height, from which it and the event people near
+    it can be seen."""
+    cos, sin = math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)
+    event = street.people.are(*DIRECTED)
+    offset = (street.people.xy[event] - robot.pose.xy) @ np.array([[cos, -sin], [sin, cos]])
+    near = offset[np.hypot(*offset.T) < _NEAR_M]
+    if not len(near):
+        return np.array(ABOVE_REST)
+    every = np.vstack([near, (0.0, 0.0)])
+    middle = 0.5 * (every.min(axis=0) + every.max(axis=0))
+    reach_m = float(np.hypot(*(every - middle).T).max())
+    return np.append(middle, np.clip(2.0 * reach_m + 3.0, *ABOVE_HIGH_M))

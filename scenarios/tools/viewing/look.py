@@ -1,0 +1,111 @@
+"""One picture of a scenario: what the robot sees, or somebody behind or above it, at a moment of an
+episode."""
+
+from __future__ import annotations
+
+import math
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cosim.core.clock import Clock
+from cosim.core.geometry import Floats
+from cosim.core.state import RobotState
+from cosim.core.telling import Tell, untold
+from cosim.policies.load import load_policy
+from cosim.report.legend import Image
+from cosim.spec.camera import CameraSpec
+from cosim.spec.options import CameraChoice, EpisodeOptions
+from cosim.spec.scenario import Scenario
+from scenarios.episodes.episode import Episode
+from scenarios.places.nets import place
+
+Viewpoint = Literal["robot", "follow", "above"]
+VIEWS: Final[tuple[Viewpoint, ...]] = ("robot", "follow", "above")
+BEHIND_M: Final = 4.6
+ABOVE_M: Final = 2.5
+_AHEAD_M: Final = 3.0
+HIGH_M: Final = 24.0
+OVER_SLANT: Final = 0.22
+"""From above the eye is behind what it looks at by this share of its height: little, or a house may
+stand between."""
+
+
+def look_at(
+    scenario: Scenario,
+    policy: str,
+    at_s: float,
+    view: Viewpoint,
+    size: tuple[int, int],
+    camera_name: CameraChoice = "auto",
+    tell: Tell = untold,
+) -> tuple[Image, float]:
+    """((H, W, 3) uint8 RGB, seconds): the picture `at_s` seconds into an episode, or at its end if
+    that comes first.
+
+    policy: who drives until then. size: width, height. tell: is told what is being done.
+    """
+    driver = load_policy(policy)
+    last = Clock().ticks(at_s)
+    spec = (
+        CameraSpec(*size)
+        if driver.manifest.camera is None
+        else CameraSpec(*size, driver.manifest.camera.fov_deg)
+    )
+    tell(f"reading the street map of {scenario.place.name}")
+    place(scenario.place)
+    tell("starting SUMO, PyBullet and the camera")
+    with (
+        Episode(scenario, driver.manifest, EpisodeOptions(camera=camera_name)) as episode,
+        episode.eyes(spec) as camera,
+    ):
+        driver.reset(episode.id, episode.seed)
+        observation = episode.reset()
+        while not episode.over and episode.moment.tick < last:
+            tell(f"simulating to {at_s:g} s", episode.moment.tick / last)
+            observation = episode.advance(driver.act(observation), until_tick=last)
+        robot, street = episode.moment.robot, episode.moment.street
+        tell("drawing")
+        if view == "robot":
+            return camera.render(robot, street).rgb, episode.time_s
+        eye, target = eye_behind(robot) if view == "follow" else over(robot)
+        return camera.picture(eye, target, street, robot, size).rgb, episode.time_s
+
+
+def eye_behind(robot: RobotState, ahead: Floats | None = None) -> tuple[Floats, Floats]:
+    """(eye, target), (3,) metres: behind and above the robot, looking ahead. ahead: (2,), by
+    default its heading."""
+    way = _way(robot, ahead)
+    foot = robot.pose.xy
+    return np.append(foot - BEHIND_M * way, robot.z_m + ABOVE_M), np.append(
+        foot + _AHEAD_M * way, robot.z_m + 0.5
+    )
+
+
+def over(
+    robot: RobotState,
+    ahead: Floats | None = None,
+    at_m: ArrayLike = (0.0, 0.0, HIGH_M),
+) -> tuple[Floats, Floats]:
+    """(eye, target), (3,) metres: from high above, a little behind, down on the robot or what is
+    near it.
+
+    at_m: (3,) metres ahead and to the left of the robot that are looked at, and how high the eye
+    is.
+    """
+    way = _way(robot, ahead)
+    forward_m, left_m, high_m = np.asarray(at_m, dtype=float).tolist()
+    foot = robot.pose.xy + forward_m * way + left_m * np.array([-way[1], way[0]])
+    return np.append(foot - OVER_SLANT * high_m * way, robot.z_m + high_m), np.append(
+        foot, robot.z_m
+    )
+
+
+def _way(robot: RobotState, ahead: Floats | None) -> Floats:
+    heading = robot.pose.heading_rad
+    return (
+        np.array([math.cos(heading), math.sin(heading)])
+        if ahead is None
+        else ahead / np.hypot(*ahead)
+    )

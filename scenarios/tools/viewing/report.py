@@ -1,0 +1,327 @@
+"""The report of runs: reads them, shows failures again in processes of their own, and writes one
+HTML file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import MutableSequence, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, Final, NamedTuple, TypeVar
+
+import msgspec
+import numpy as np
+import shapely
+
+from cosim.core.child_process import end_with
+from cosim.core.clock import Clock
+from cosim.core.errors import CosimError, unwritable
+from cosim.core.telling import Tell, untold
+from cosim.core.whole_file import write_whole
+from cosim.report.above import ROUTE, Sheet, draw_streets
+from cosim.report.encoding import image_url
+from cosim.report.page.choice import MOST_FAILURES, WITHIN_S, FailureToShow, most_telling, shown_of
+from cosim.report.page.page import Maps, colours_of, counts_of, page_of
+from cosim.report.page.plots import plots_of
+from cosim.report.page.reasons import Mishap, mishaps_of, reason_of
+from cosim.report.page.runs import (
+    ReportedRun,
+    example_of,
+    light_in_words,
+    place_in_words,
+    read_runs,
+)
+from cosim.report.page.scene import Entry, PlacePicture, Spot
+from cosim.spec.options import CameraChoice
+from cosim.spec.scenario import CityMap, Place, Scenario
+from scenarios.places.nets import place
+from scenarios.tools.viewing.scenes import ShownAgain, show_again, ticks_to_show
+
+_MOST_BYTES: Final = 29_000_000
+"""Of the file; failures beyond it are left out of the gallery, the least telling first."""
+_REST_BYTES: Final = 8_000_000
+"""Of these for all but failures and maps: Plotly, tables, small pictures, every place of
+failure."""
+_MOST_MAPS: Final = 24
+_MAP_PX: Final = 1000
+_MAP_QUALITY: Final = 70
+_MARGIN_M: Final = 25.0
+_MOST_SPOTS: Final = 300
+"""Of a place."""
+_TELL_EVERY_S: Final = 0.2
+_T = TypeVar("_T")
+_Bounds = tuple[float, float, float, float]
+
+
+class ReportFacts(NamedTuple):
+    """What came out: the file's size, and how many failures its gallery shows of how many."""
+
+    size_bytes: int
+    shown: int
+    failures: int
+
+
+def make_report(
+    folders: Sequence[Path],
+    output: Path,
+    *,
+    camera: CameraChoice = "auto",
+    jobs: int = 2,
+    most: int = MOST_FAILURES,
+    within_s: float = WITHIN_S,
+    tell: Tell = untold,
+) -> ReportFacts:
+    """Write the report of these run folders. most: failures in its gallery; within_s: later
+    failures of an episode are left out where an earlier one is shown.
+
+    Raises what `read_runs` raises, and MachineError when it cannot be written; then nothing is.
+    """
+    runs = read_runs(folders, tell)
+    plots = plots_of(runs, colours_of(runs), tell)
+    candidates = shown_of(runs)
+    picks = most_telling(candidates, most, within_s)
+    tell("starting the engines")
+    episodes, lost = _episodes(runs, picks)
+    context = get_context("spawn")
+    done = context.Array("d", max(len(episodes), 1), lock=False)
+    with ProcessPoolExecutor(
+        jobs, context, initializer=_begin, initargs=(os.getpid(), done)
+    ) as pool:
+        try:
+            again = [
+                pool.submit(_shown_again, k, runs[one.run].path, one.scenario, one.mishaps, camera)
+                for k, one in enumerate(episodes)
+            ]
+            drawn = _begun_pictures(pool, runs)
+            _wait([*again, *drawn], [one.ticks for one in episodes], done, tell)
+            pictures = [came for came in map(_outcome, drawn) if not isinstance(came, str)]
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    showings = lost | _showings(episodes, again)
+    entries = [_entry(runs[pick.run], pick, showings[k]) for k, pick in enumerate(picks)]
+    tell("writing the page")
+    fixed = len(msgspec.json.encode(pictures)) + _REST_BYTES
+    sizes = np.array([len(msgspec.json.encode(entry)) for entry in entries], dtype=int)
+    count = int((fixed + np.cumsum(sizes) <= _MOST_BYTES).sum())
+    maps = Maps(pictures, _spots(runs, picks[:count]), dict(counts_of(runs)))
+    data = page_of(runs, plots, entries[:count], maps, _note(entries[:count]))
+    try:
+        write_whole(output, data)
+    except OSError as error:
+        output.with_name(output.name + ".part").unlink(missing_ok=True)
+        raise unwritable(output, error) from error
+    return ReportFacts(len(data), count, len(candidates))
+
+
+class _Episode(NamedTuple):
+    """An episode that is run again. picks: numbers of the failures that it shows; mishaps: these
+    failures."""
+
+    run: int
+    scenario: str
+    picks: list[int]
+    mishaps: list[Mishap]
+
+    @property
+    def ticks(self) -> int:
+        """How long it takes to show them."""
+        return ticks_to_show(self.mishaps)
+
+
+def _episodes(
+    runs: Sequence[ReportedRun], picks: Sequence[FailureToShow]
+) -> tuple[list[_Episode], dict[int, str]]:
+    """The episodes of the picks, those that take longest first; and of the picks that have none:
+    why."""
+    numbers: dict[tuple[int, str], list[int]] = {}
+    lost: dict[int, str] = {}
+    for k, pick in enumerate(picks):
+        numbers.setdefault((pick.run, pick.scenario), []).append(k)
+    found = []
+    for (run, scenario), of_it in numbers.items():
+        if runs[run].log(scenario) is None:
+            lost |= dict.fromkeys(of_it, "its trajectory is no longer in the run folder")
+        else:
+            found.append(_Episode(run, scenario, of_it, [picks[k].mishap for k in of_it]))
+    return sorted(found, key=lambda one: -one.ticks), lost
+
+
+_done: MutableSequence[float] = []
+"""In a process that shows failures again: how much is done of each episode, shared with the one
+that waits."""
+
+
+def _begin(parent: int, done: MutableSequence[float]) -> None:
+    """Begin a process that shows failures again."""
+    global _done
+    end_with(parent)
+    _done = done
+
+
+def _shown_again(
+    number: int, folder: Path, scenario_id: str, mishaps: Sequence[Mishap], camera: CameraChoice
+) -> list[ShownAgain]:
+    """In a process of its own. number: of the episode among those that are shown."""
+
+    def took(ticks: int) -> None:
+        _done[number] = ticks
+
+    return show_again(folder, scenario_id, mishaps, camera, took)
+
+
+def _wait(
+    futures: Sequence[Future[Any]], ticks: Sequence[int], done: Sequence[float], tell: Tell
+) -> None:
+    """Wait for all of them. The first ones are episodes, which take so many ticks, and of which so
+    many are done."""
+    left: set[Future[Any]] = set(futures)
+    while left:
+        left = wait(left, _TELL_EVERY_S, FIRST_COMPLETED).not_done
+        came = [
+            all_of if future.done() else now
+            for future, all_of, now in zip(futures, ticks, done, strict=False)
+        ]
+        share = min(sum(came) / max(sum(ticks), 1), 0.99)
+        tell("showing failures again" if ticks else "drawing maps", share if ticks else None)
+
+
+def _showings(
+    episodes: Sequence[_Episode], again: Sequence[Future[list[ShownAgain]]]
+) -> dict[int, ShownAgain | str]:
+    """What came of every pick, by its number: the failure shown again, or why it could not be."""
+    found: dict[int, ShownAgain | str] = {}
+    for one, future in zip(episodes, again, strict=True):
+        came = _outcome(future)
+        for place_of, k in enumerate(one.picks):
+            found[k] = came if isinstance(came, str) else came[place_of]
+    return found
+
+
+def _outcome(future: Future[_T]) -> _T | str:
+    """What a process made, or in words why it did not."""
+    try:
+        return future.result()
+    except CosimError as error:
+        return str(error)
+    except BrokenProcessPool:
+        return "the process that ran it again died"
+
+
+def _entry(run: ReportedRun, pick: FailureToShow, showing: ShownAgain | str) -> Entry:
+    scenario = run.scenarios[pick.scenario]
+    record = run.whole.records[pick.scenario]
+    other = None if isinstance(showing, str) else showing.other
+    return Entry(
+        label=run.label,
+        suite=run.spec.suite,
+        scenario=pick.scenario,
+        kind=example_of(scenario),
+        event=pick.event,
+        place=pick.place,
+        light=light_in_words(scenario.light),
+        cause=pick.mishap.cause,
+        reason=reason_of(scenario, record, pick.mishap, run.log(pick.scenario), other),
+        at_s=Clock().time_s(pick.mishap.tick + 1),
+        scene=None if isinstance(showing, str) else showing.scene,
+        why=showing if isinstance(showing, str) else "",
+    )
+
+
+def _note(entries: Sequence[Entry]) -> str:
+    """How many failures could not be shown again, and why the first of them could not."""
+    lost = [entry for entry in entries if entry.scene is None]
+    if not lost:
+        return ""
+    return (
+        f"{len(lost)} of {len(entries)} failures could not be shown again. {lost[0].scenario}: "
+        f"{lost[0].why}"
+    )
+
+
+def _begun_pictures(
+    pool: ProcessPoolExecutor, runs: Sequence[ReportedRun]
+) -> list[Future[PlacePicture]]:
+    """From above: every real place with failures, then those with the most."""
+    there: dict[str, list[Scenario]] = {}
+    for run in runs:
+        for record in run.records:
+            scenario = run.scenarios[record.scenario]
+            there.setdefault(place_in_words(scenario), []).append(scenario)
+    failed = [name for name, (_, bad) in counts_of(runs).items() if bad]
+    failed.sort(key=lambda name: not isinstance(there[name][0].place, CityMap))
+    return [
+        pool.submit(
+            _place_picture,
+            name,
+            there[name][0].place,
+            _bounds(there[name]),
+            [s.route for s in there[name]],
+        )
+        for name in failed[:_MOST_MAPS]
+    ]
+
+
+def _bounds(scenarios: Sequence[Scenario]) -> _Bounds:
+    """Around their routes, in metres, no flatter than 2 to 5 either way."""
+    route = np.concatenate([np.array(scenario.route) for scenario in scenarios])
+    low = route.min(axis=0) - _MARGIN_M
+    high = route.max(axis=0) + _MARGIN_M
+    room = np.maximum(0.4 * (high - low).max() - (high - low), 0.0) / 2.0
+    (x0, y0) = (low - room).tolist()
+    (x1, y1) = (high + room).tolist()
+    return x0, y0, x1, y1
+
+
+def _place_picture(
+    name: str, where: Place, bounds: _Bounds, routes: Sequence[tuple[tuple[float, float], ...]]
+) -> PlacePicture:
+    """In a process of its own."""
+    _, street_map = place(where)
+    x0, y0, x1, y1 = bounds
+    sheet = Sheet(bounds, _MAP_PX / max(x1 - x0, y1 - y0))
+    draw_streets(sheet, street_map, shapely.box(*bounds))
+    for route in dict.fromkeys(routes):
+        sheet.line(np.array(route), ROUTE, max(0.4, 2.0 / sheet.px_per_m))
+    return PlacePicture(place=name, image=image_url(sheet.image, _MAP_QUALITY), bounds=bounds)
+
+
+def _spots(runs: Sequence[ReportedRun], picks: Sequence[FailureToShow]) -> dict[str, list[Spot]]:
+    """Where everything went wrong, by place."""
+    numbers = {(pick.run, pick.scenario, pick.mishap): k for k, pick in enumerate(picks)}
+    spots: dict[str, list[Spot]] = {}
+    for number, run in enumerate(runs):
+        for record in run.records:
+            scenario = run.scenarios[record.scenario]
+            for mishap in mishaps_of(record):
+                x_m, y_m = (
+                    (mishap.failure.x_m, mishap.failure.y_m)
+                    if mishap.failure
+                    else scenario.start[:2]
+                )
+                if (
+                    mishap.failure is None
+                    and (log := run.log(record.scenario)) is not None
+                    and len(log)
+                ):
+                    x_m, y_m = log.pose[-1, :2].tolist()
+                reason = reason_of(scenario, record, mishap, None)
+                words = (
+                    f"{record.scenario} ({run.label}), {Clock().time_s(mishap.tick + 1):.1f} s: "
+                    f"{reason}"
+                )
+                entry = numbers.get((number, record.scenario, mishap), -1)
+                spot = Spot(
+                    x_m=round(x_m, 2),
+                    y_m=round(y_m, 2),
+                    cause=mishap.cause,
+                    words=words,
+                    entry=entry,
+                )
+                spots.setdefault(place_in_words(scenario), []).append(spot)
+    return {
+        name: sorted(there, key=lambda spot: spot.entry < 0)[:_MOST_SPOTS]
+        for name, there in spots.items()
+    }

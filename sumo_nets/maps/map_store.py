@@ -1,0 +1,299 @@
+"""The places one can run in besides generated cities: imported maps, kept in the cache folder, and
+SUMO's own nets."""
+
+from __future__ import annotations
+
+import dataclasses
+import gzip
+import hashlib
+import re
+from datetime import UTC, datetime
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+
+import msgspec
+
+from cosim.core.cache import cache_folder
+from cosim.core.errors import MapError, UsageError, unknown, unwritable
+from cosim.core.telling import Tell, untold
+from cosim.place.map_check import MapCheck, check_map
+from cosim.place.street_map import StreetMap
+from cosim.spec.scenario import CityMap
+from sumo_nets.maps.feature_file import NAME, read_features, with_features, write_features
+from sumo_nets.maps.import_rules import NEWEST_RULES, SUITE_RULES
+from sumo_nets.maps.importer import OSM_LICENCE, Options, convert
+from sumo_nets.maps.scratch import move_in, moving, scratch_in
+from sumo_nets.maps.wheel_places import WHEEL_PLACES
+from sumo_nets.net.net_facts import read_facts
+from sumo_nets.net.net_hash import net_content_hash
+from sumo_nets.net.raw_file import head_of
+from sumo_nets.net.snapshot import street_map_of
+
+ABOUT = "about.json"
+GENERIC = ("input", "map", "net", "network", "osm", "converted", "export", "planet", "osm_bbox")
+"""File names that name no place: the folder's name is taken instead."""
+NAMES = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
+GAME_LICENCE = "EPL-2.0 OR GPL-2.0-or-later, with Eclipse SUMO"
+
+
+class About(msgspec.Struct, frozen=True, kw_only=True):
+    """Where an imported map comes from and what was done to it.
+
+    source_hash: SHA-256 of the file, 16 hex digits.
+    versions: of the importer (`importrules.py`) and of SUMO.
+    """
+
+    name: str
+    source: str
+    source_hash: str
+    format: str
+    imported_at: str
+    bbox: tuple[float, float, float, float] | None
+    lefthand: bool | None
+    as_is: bool = False
+    sidewalk_width_m: float | None = None
+    versions: dict[str, str]
+    changes: tuple[str, ...]
+    guessed_share: float | None
+    licences: tuple[str, ...]
+    net_hash: str
+
+
+class Known(msgspec.Struct, frozen=True):
+    """A place of the list. origin: "imported" or "sumo" (inside the SUMO package, imported when
+    first used)."""
+
+    name: str
+    origin: str
+    source: str
+
+
+def maps_folder() -> Path:
+    """Where imported maps are kept, a folder each."""
+    return cache_folder() / "maps"
+
+
+def import_map(
+    source: Path, name: str | None = None, options: Options | None = None, tell: Tell = untold
+) -> About:
+    """Import a map file under a name (by default the file's), in place of an earlier one of that
+    name.
+
+    Raises MapError when the file makes no usable net, UsageError for an unusable name; then nothing
+    is kept.
+    """
+    name = map_name(source) if name is None else name
+    if not NAMES.fullmatch(name):
+        raise UsageError(
+            f"'{name}' cannot name a map: use a-z, 0-9, '.', '_' and '-', at most 64 characters"
+        )
+    options = Options() if options is None else options
+    if name in _supplied():
+        if source != _supplied()[name] or options != Options():
+            raise UsageError(
+                f"'{name}' is the name of a net that comes with SUMO: choose another with --name"
+            )
+        options = _options_of(name)
+    return _keep(source, name, options, tell)
+
+
+def map_name(source: Path) -> str:
+    """The name a file's map gets when the user names none."""
+    stem = re.sub(r"\.(gz|bz2|pbf|xml|osm|net)$", "", source.name)
+    while (shorter := re.sub(r"\.(gz|bz2|pbf|xml|osm|net)$", "", stem)) != stem:
+        stem = shorter
+    if stem.lower() in GENERIC and source.resolve().parent.name:
+        stem = source.resolve().parent.name
+    return re.sub(r"[^a-z0-9._-]+", "-", stem.lower()).strip("-._")[:64] or "map"
+
+
+def map_net(place: CityMap | str) -> Path:
+    """The street net of an imported or SUMO-supplied map.
+
+    Raises UsageError for an unknown name; MapError when `place` names the hash of another net.
+    """
+    name = place if isinstance(place, str) else place.map
+    path = maps_folder() / name / "net.xml"
+    if not NAMES.fullmatch(name) or not _is_there(path):
+        supplied = _supplied()
+        if name not in supplied:
+            raise unknown("map", name, known_maps())
+        _keep(supplied[name], name, _options_of(name), in_place=False)
+    if (
+        not isinstance(place, str)
+        and place.net_hash
+        and (found := map_hash(path)) != place.net_hash
+    ):
+        raise MapError(
+            f"map '{name}': its hash is {found}, but the scenario was made on "
+            f"{place.net_hash}: import the same "
+            "file with the same options and versions again, or make the scenarios anew"
+        )
+    return path
+
+
+def _is_there(net: Path) -> bool:
+    if net.exists():
+        return True
+    try:
+        # It may be replaced at this very moment.
+        with moving(maps_folder()):
+            return net.exists()
+    except OSError:
+        return False
+
+
+def read_map(place: CityMap | str) -> StreetMap:
+    """The StreetMap of a map, under the map's name, with what the map shows beside its streets."""
+    name = place if isinstance(place, str) else place.map
+    path = map_net(place)
+    street_map = street_map_of(path)
+    features = read_features(path.with_name(NAME))
+    known_as = with_features(street_map.net_hash, path.with_name(NAME))
+    whole = dataclasses.replace(street_map, name=name, features=features, net_hash=known_as)
+    return whole.read_of(f"{street_map.made_of}-{known_as}")
+
+
+def map_hash(net: Path) -> str:
+    """Content hash of a map by its net: of the net, and of the features beside it where there are
+    any."""
+    return with_features(net_content_hash(net), net.with_name(NAME))
+
+
+def file_hash(path: Path) -> str:
+    """SHA-256 (16 hex digits) of a file's bytes. Raises MapError when it cannot be read."""
+    head_of(path)
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+
+
+def about_map(name: str) -> About:
+    """Where an imported map comes from. Imports a SUMO-supplied one first."""
+    path = map_net(name).with_name(ABOUT)
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=About)
+    except (OSError, msgspec.DecodeError, msgspec.ValidationError) as error:
+        raise MapError(f"{path}: cannot be read: {error}: import the map '{name}' again") from error
+
+
+def checked_map(name: str) -> tuple[StreetMap, MapCheck, About]:
+    """A map, what it is worth and where it comes from."""
+    about, street_map = about_map(name), read_map(name)
+    return (
+        street_map,
+        check_map(street_map, None, read_facts(map_net(name)), about.guessed_share),
+        about,
+    )
+
+
+def known_maps() -> dict[str, Known]:
+    """Every place by name: imported ones, then nets with sidewalks that come with SUMO, whole and
+    as crops."""
+    folder = maps_folder()
+    found = sorted(p.parent for p in folder.glob(f"*/{ABOUT}")) if folder.is_dir() else []
+    supplied = _supplied()
+    known = {
+        p.name: Known(p.name, "imported", _source_of(p.name))
+        for p in found
+        if p.name not in supplied
+    }
+    return known | {name: Known(name, "sumo", path.name) for name, path in supplied.items()}
+
+
+def outdated(about: About) -> bool:
+    """Return whether importing the map again would apply rules that it was imported without."""
+    return about.name not in _supplied() and about.versions.get("importer") != str(
+        NEWEST_RULES.version
+    )
+
+
+def _source_of(name: str) -> str:
+    try:
+        return about_map(name).source
+    except MapError:
+        return "damaged: import it again"
+
+
+def _keep(
+    source: Path, name: str, options: Options, tell: Tell = untold, *, in_place: bool = True
+) -> About:
+    """Convert in a scratch folder beside the finished maps, then move the whole into place."""
+    folder = maps_folder()
+    try:
+        with scratch_in(folder) as scratch:
+            made = convert(source, scratch, options, tell)
+            ready = scratch / "ready"
+            ready.mkdir()
+            made.net.rename(ready / "net.xml")
+            if made.features:
+                write_features(made.features, ready / NAME)
+            about = About(
+                name=name,
+                source=source.name,
+                source_hash=file_hash(source),
+                format=" ".join(filter(None, (made.format, made.facts.version, made.packing))),
+                imported_at=datetime.now(UTC).isoformat(timespec="seconds"),
+                bbox=options.bbox,
+                lefthand=options.lefthand,
+                as_is=options.as_is,
+                sidewalk_width_m=options.sidewalk_width_m,
+                versions={
+                    "importer": str(options.rules.version),
+                    "eclipse-sumo": version("eclipse-sumo"),
+                },
+                changes=made.changes,
+                guessed_share=made.guessed_share,
+                licences=_licences(name, source, made.licences),
+                net_hash=map_hash(ready / "net.xml"),
+            )
+            (ready / ABOUT).write_bytes(msgspec.json.format(msgspec.json.encode(about), indent=2))
+            move_in(ready, folder / name, in_place=in_place)
+            return about
+    except OSError as error:
+        raise unwritable(folder, error, "set COSIM_CACHE to another folder") from error
+
+
+def _licences(name: str, source: Path, found: tuple[str, ...]) -> tuple[str, ...]:
+    """What the file itself and the texts beside it say about its licence."""
+    said = list(found)
+    if source in _supplied().values():
+        said.append(GAME_LICENCE)
+    if name in WHEEL_PLACES and WHEEL_PLACES[name].osm:
+        said.append(OSM_LICENCE)
+    for name in ("LICENCE.txt", "LICENSE.txt", "LICENSE", "SOURCE.txt"):
+        try:
+            text = (source.resolve().parent / name).read_text(errors="replace")
+        except OSError:
+            continue
+        lines = [line.strip() for line in text.splitlines() if line.strip()]
+        if name == "SOURCE.txt":
+            lines = [line for line in lines if line.startswith("Origin")]
+        said.append(f"{name}: {' '.join(lines)[:1000]}")
+    return tuple(said)
+
+
+def _supplied() -> dict[str, Path]:
+    """The nets that come with the SUMO package, by the names of the places they make."""
+    return _game_nets() | {name: one.path for name, one in WHEEL_PLACES.items()}
+
+
+def _options_of(name: str) -> Options:
+    """How a place that comes with SUMO is imported."""
+    one = WHEEL_PLACES.get(name)
+    return Options(rules=SUITE_RULES) if one is None else Options(bbox=one.box, rules=one.rules)
+
+
+@cache
+def _game_nets() -> dict[str, Path]:
+    """Nets with sidewalks that come with the SUMO package, by the names they have here."""
+    import sumo
+
+    tools = Path(sumo.__file__).parent / "tools"
+    found: dict[str, Path] = {}
+    for path in sorted((tools / "game").glob("*/*.net.xml*")):
+        data = path.read_bytes()
+        if b'function="walkingarea"' in (gzip.decompress(data) if path.suffix == ".gz" else data):
+            name = "sumo-" + path.parent.name.lower().replace("_", "-")
+            found[name if name not in found else f"{name}-{map_name(path)}"] = path
+    return found

@@ -1,0 +1,173 @@
+"""A part of an OpenStreetMap file, cut out before it is converted: a city takes minutes, a part of
+it seconds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from cosim.core.errors import MapError
+
+MARGIN_M: Final = 500.0
+"""Streets are kept this far beyond the box: whole blocks are built, and the net is cropped to the
+box afterwards."""
+MOST_MEMBERS: Final = 50
+"""Areas of more ways than this (rivers, borders) are left out."""
+_DEGREE_M: Final = 111_195.0
+
+Box = tuple[float, float, float, float]
+
+
+def crop_osm(file: Path, target: Path, box: Box, source: Path) -> None:
+    """Write the part of an OSM file (XML or PBF) that lies in a box, as XML, to `target`.
+
+    Open streets end one node outside of the margin; everything else is kept whole or left out.
+    Raises MapError, with the bounds of the file, when it has no street there.
+
+    box: west, south, east, north in degrees.
+    source: the file to name in errors.
+    """
+    import osmium
+
+    try:
+        part = _chosen(file, box, source)
+        _write(file, target, part)
+    except (OSError, RuntimeError, ValueError, osmium.InvalidLocationError) as error:
+        raise MapError(f"{source}: cannot be cropped: {error}: get it again") from error
+
+
+def refuse_box_outside(source: Path, box: Box, bounds: Box, unit: str = "degrees") -> None:
+    """Raise MapError, with the bounds of the map, when a box holds nothing of it."""
+    if _meet(box, bounds):
+        return
+    west, south, east, north = box
+    swapped = (south, west, north, east)
+    hint = (
+        f" (latitude and longitude swapped? --bbox {_words(swapped)})"
+        if _meet(swapped, bounds)
+        else ""
+    )
+    raise MapError(
+        f"{source}: --bbox {_words(box)} is outside of the map, which covers {_words(bounds)} "
+        f"(west,south,east,north in {unit}): give a part of that{hint}"
+    )
+
+
+@dataclass(slots=True)
+class _Part:
+    """Ids of what is kept of a file. cuts: first and last node kept, by their places, of streets
+    that are cut."""
+
+    nodes: set[int] = field(default_factory=set)
+    ways: set[int] = field(default_factory=set)
+    cuts: dict[int, tuple[int, int]] = field(default_factory=dict)
+    relations: set[int] = field(default_factory=set)
+
+
+def _chosen(file: Path, box: Box, source: Path) -> _Part:
+    inside, bounds = _inside(file, box)
+    if not math.isfinite(bounds[0]):
+        raise MapError(f"{source}: an OpenStreetMap file without nodes: export a larger area")
+    refuse_box_outside(source, box, bounds)
+    part = _Part(set(inside))
+    streets = 0
+    for way in _of(file, "WAY"):
+        refs = [node.ref for node in way.nodes]
+        hits = [place for place, ref in enumerate(refs) if ref in inside]
+        if not hits:
+            continue
+        part.ways.add(way.id)
+        if "highway" in way.tags:
+            streets += 1
+            if refs[0] != refs[-1]:
+                first = max(hits[0] - 1, 0)
+                last = min(hits[-1] + 1, len(refs) - 1)
+                part.cuts[way.id] = first, last
+                refs = refs[first : last + 1]
+        part.nodes.update(refs)
+    if not streets:
+        raise MapError(
+            f"{source}: no street or path (highway=*) of the file lies in --bbox {_words(box)}; "
+            f"the file covers {_words(bounds)}: choose a part with streets in it"
+        )
+    further = set[int]()
+    for relation in _of(file, "RELATION"):
+        members = [member.ref for member in relation.members if member.type == "w"]
+        kind = relation.tags.get("type", "")
+        if (
+            kind == "multipolygon"
+            and len(members) <= MOST_MEMBERS
+            and part.ways.intersection(members)
+        ):
+            part.relations.add(relation.id)
+            further.update(members)
+        elif kind == "restriction" and part.ways.issuperset(members):
+            part.relations.add(relation.id)
+    further -= part.ways
+    for way in _of(file, "WAY") if further else ():
+        if way.id in further:
+            part.ways.add(way.id)
+            part.nodes.update(node.ref for node in way.nodes)
+    return part
+
+
+def _inside(file: Path, box: Box) -> tuple[set[int], Box]:
+    """The ids of the nodes in a box and its margin, and the bounds of all nodes."""
+    west, south, east, north = box
+    high = MARGIN_M / _DEGREE_M
+    wide = high / max(math.cos(math.radians(0.5 * (south + north))), 0.01)
+    west = west - wide
+    south = south - high
+    east = east + wide
+    north = north + high
+    low_lon = low_lat = math.inf
+    high_lon = high_lat = -math.inf
+    inside = set[int]()
+    for node in _of(file, "NODE"):
+        if not node.location.valid():
+            continue
+        lon, lat = node.lon, node.lat
+        low_lon, high_lon = min(low_lon, lon), max(high_lon, lon)
+        low_lat, high_lat = min(low_lat, lat), max(high_lat, lat)
+        if west <= lon <= east and south <= lat <= north:
+            inside.add(node.id)
+    return inside, (low_lon, low_lat, high_lon, high_lat)
+
+
+def _write(file: Path, target: Path, part: _Part) -> None:
+    import osmium
+
+    with osmium.SimpleWriter(str(target), overwrite=True) as writer:
+        for node in _of(file, "NODE"):
+            if node.id in part.nodes:
+                writer.add_node(node)
+        for way in _of(file, "WAY"):
+            if way.id in part.cuts:
+                first, last = part.cuts[way.id]
+                writer.add_way(
+                    way.replace(nodes=[node.ref for node in way.nodes][first : last + 1])
+                )
+            elif way.id in part.ways:
+                writer.add_way(way)
+        for relation in _of(file, "RELATION"):
+            if relation.id in part.relations:
+                writer.add_relation(relation)
+
+
+def _of(file: Path, kind: str) -> Iterator[Any]:
+    """The nodes, ways or relations of a file."""
+    import osmium
+
+    things: Iterable[Any] = osmium.FileProcessor(str(file), getattr(osmium.osm, kind))
+    yield from things
+
+
+def _meet(a: Box, b: Box) -> bool:
+    return a[0] < b[2] and a[2] > b[0] and a[1] < b[3] and a[3] > b[1]
+
+
+def _words(box: Box) -> str:
+    return ",".join(f"{side:.6g}" if abs(side) < 1000.0 else f"{side:.0f}" for side in box)

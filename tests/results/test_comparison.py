@@ -1,0 +1,471 @@
+"""Comparisons of runs: what is grouped, what flipped, what is written, and what is refused."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import re
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import msgspec
+import pandas as pd
+import pytest
+from rich.console import Console
+
+from cosim.cli.results import print_comparison
+from cosim.report.compared import as_latex, as_markdown, flips_in_words, tables_of_comparison
+from cosim.results.compare import (
+    ComparedRun,
+    RunComparison,
+    compare_runs,
+    differences_of,
+    flipped_between,
+    groups_of,
+)
+from cosim.results.metrics import METRICS
+from cosim.results.record import Record
+from cosim.results.run_folder import RunFolder, read_records, read_spec
+from cosim.spec.camera import CameraSpec
+from cosim.spec.events import Event
+from cosim.spec.scenario import Scenario, read_suite
+from tests.conftest import Cosim
+from tests.support.driven_runs import HIT, run_of, short_way
+
+GOALS = "goal"
+
+
+def several(count: int) -> tuple[Scenario, ...]:
+    """Half of them straight, half curves; every fifth in test; every fourth with somebody frontal
+    on its way."""
+
+    def one(i: int) -> Scenario:
+        event = Event(
+            id="e0",
+            kind="frontal",
+            x_m=5.0,
+            y_m=0.0,
+            heading_rad=0.0,
+            route_s_m=5.0,
+            half_width_m=1.5,
+        )
+        return short_way(
+            f"s-{i:03d}",
+            structure="straight" if i % 2 else "curve",
+            split="test" if i % 5 == 0 else "val",
+            ends_at="goal",
+            events=(event,) if i % 4 == 0 else (),
+            ends_on_failure=i % 4 != 0,
+        )
+
+    return tuple(one(i) for i in range(count))
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """20 scenarios by three policies: `a` solves every second one; `b` all but one that a solves
+    and one that it does not; `c` crashes once and has one that is invalid, else it is as `a`."""
+    folder = tmp_path_factory.mktemp("runs")
+    a = [GOALS if i % 2 else HIT for i in range(20)]
+    b = [GOALS if i % 2 or i < 18 else HIT for i in range(20)]
+    b[19] = HIT
+    c = [*a[:10], "crashed", "invalid", *a[12:]]
+    for name, hows in (("a", a), ("b", b), ("c", c)):
+        run_of(folder / name, hows, name, several(20))
+    return folder
+
+
+def row(told: RunComparison, metric: str, group: str = "s", after: str = "b") -> pd.Series[float]:
+    table = told.differences
+    (one,) = table.index[
+        (table["metric"] == metric) & (table["group"] == group) & (table["after"] == after)
+    ]
+    found: pd.Series[float] = table.loc[one]
+    return found
+
+
+def test_groups_are_suite_event_structure_and_split() -> None:
+    """Each scenario stands in every group that it belongs to; a group of the same scenarios as
+    another stands once."""
+    groups = groups_of("s", several(20))
+    assert [*groups] == [
+        ("suite", "s"),
+        ("event", "frontal"),
+        ("structure", "curve"),
+        ("structure", "straight"),
+        ("split", "test"),
+        ("split", "val"),
+    ]
+    assert groups["event", "frontal"] == {f"s-{i:03d}" for i in (0, 4, 8, 12, 16)}
+    assert len(groups["split", "test"]) == 4 and len(groups["suite", "s"]) == 20
+    assert [*groups_of("s", several(1))] == [("suite", "s")]
+
+
+def test_a_run_is_compared_scenario_by_scenario(runs: Path) -> None:
+    """Nine won and one lost of twenty: by name, and in every group."""
+    told = compare_runs([runs / "a", runs / "b"])
+    whole = row(told, "success")
+    assert (whole["value_before"], whole["value_after"], whole["n"], whole["changed"]) == (
+        0.5,
+        0.9,
+        20,
+        10,
+    )
+    assert whole["low"] > 0.0 and whole["verdict"] == "better"
+    assert row(told, "failures")["verdict"] == "better" and row(told, "failures")[
+        "difference"
+    ] == pytest.approx(-0.4)
+    assert (
+        row(told, "success", "curve")["difference"] == 0.9
+        and row(told, "success", "straight")["changed"] == 1
+    )
+    rate = row(told, "failures_per_100m")
+    metres = [
+        compare_runs([runs / "a", runs / name]).others[0].table["path_length_m"].sum()
+        for name in ("a", "b")
+    ]
+    assert (rate["value_before"], rate["value_after"]) == pytest.approx(
+        (1000.0 / metres[0], 200.0 / metres[1])
+    )
+    won, lost = flips_in_words(told, told.others[0])
+    assert won == "solved by b alone, 9: " + ", ".join(f"s-{i:03d}" for i in range(0, 18, 2))
+    assert lost == "solved by a alone, 1: s-019"
+    assert told.flipped.loc[
+        told.flipped["flip"] == "lost", ["ended_before", "ended_after"]
+    ].values.tolist() == [["goal", "failure"]]
+
+
+def test_runs_by_other_terms_are_called_neither_better_nor_worse(
+    runs: Path, tmp_path: Path, cosim: Cosim
+) -> None:
+    """Another goal protocol, odometry, knowledge or latency is named, and no verdict given; the
+    differences stay."""
+    run = rewritten(
+        runs / "b",
+        tmp_path / "b",
+        goal_protocol="route_point",
+        odometry="exact",
+        privileged=True,
+        latency_ms=200.0,
+    )
+    told = compare_runs([runs / "a", run])
+    assert {*told.differences["verdict"]} <= {"within noise", "too few", "differs", ""}
+    assert row(told, "success")["verdict"] == "differs" and row(told, "success")["low"] > 0.0
+    (note,) = told.notes
+    assert note == (
+        "No verdict of b against a: they drove by other terms, goal none (a) and route_point (b); "
+        "odometry none (a) and exact (b); knowledge of its own sensors (a) and privileged (b); "
+        "latency 0 ms (a) and 200 ms (b). What differs is called neither better nor worse"
+    )
+    said = cosim("compare", str(runs / "a"), str(run))
+    assert said.returncode == 0 and note in said.stdout
+    assert re.search(r"success +0\.50 +0\.90 +\+0\.400 .* 20 differs", said.stdout)
+
+
+def test_another_camera_is_told_and_the_verdict_stays(runs: Path, tmp_path: Path) -> None:
+    """A camera is the policy's own choice; a run without one is a blind baseline, of which nothing
+    is said."""
+    small, large = (
+        rewritten(runs / name, tmp_path / name, camera=msgspec.to_builtins(CameraSpec(width, 48)))
+        for name, width in (("a", 64), ("b", 96))
+    )
+    told = compare_runs([small, large])
+    assert row(told, "success")["verdict"] == "better"
+    a, b = (f"front, {width} x 48 px, 75 deg, at 4 Hz" for width in (64, 96))
+    assert f"a sees by {a}; b by {b}: a difference may be the camera's" in told.notes
+    assert not any("sees by" in note for note in compare_runs([runs / "a", large]).notes)
+
+
+def rewritten(run: Path, target: Path, **fields: object) -> Path:
+    """A copy of a run whose records have other fields."""
+    with RunFolder.create(target, read_spec(run), read_suite(run / "scenarios.json")) as folder:
+        for record in read_records(run):
+            told = msgspec.json.decode(
+                msgspec.json.encode(msgspec.to_builtins(record) | fields), type=Record
+            )
+            folder.keep(told, (run / f"episodes/{record.scenario}/trajectory.npz").read_bytes())
+        folder.finish()
+    return target
+
+
+def test_intervals_are_counted_where_they_stand(runs: Path) -> None:
+    """Who reads the tables is told how many intervals are in them, and how many more are in the
+    .csv of all metrics."""
+    told = compare_runs([runs / "a", runs / "b", runs / "c"])
+    page = as_markdown(told)
+    shown = len(re.findall(r"\| [+-][\d.]+ to [+-][\d.]+ \|", page))
+    lines = csv.DictReader(io.StringIO(told.differences.to_csv(index=False)))
+    in_all = sum(line["low"] != "" for line in lines)
+    assert 0 < shown < in_all
+    assert f"{shown} stand in these tables, {in_all} in a .csv" in page.replace("\\", "")
+
+
+def test_a_run_is_within_noise_of_itself(runs: Path, cosim: Cosim) -> None:
+    """In every metric and group, and nothing flipped; of a name twice the second has a number."""
+    told = compare_runs([runs / "a", runs / "a"])
+    assert set(told.differences.loc[told.differences["n"] > 0, "verdict"]) == {"within noise"}
+    assert (
+        told.differences.loc[told.differences["n"] > 0, ["difference", "low", "high"]] == 0.0
+    ).all(axis=None)
+    assert not len(told.flipped) and told.notes == () and told.others[0].label == "a (2)"
+    said = cosim("compare", str(runs / "a"), str(runs / "a"))
+    assert said.returncode == 0 and "better" not in said.stdout and "worse" not in said.stdout
+    assert "solved by a (2) alone, 0: none" in said.stdout
+
+
+def test_who_crashes_is_compared_at_its_worst_and_has_no_rates(runs: Path) -> None:
+    """A crash counts as failed, and takes the rates of its groups away; an invalid episode is in no
+    pair; both told."""
+    told = compare_runs([runs / "a", runs / "c"])
+    assert (
+        row(told, "success", after="c")["n"] == 19
+        and row(told, "success", after="c")["value_after"] == 9 / 19
+    )
+    assert (
+        row(told, "failures_per_100m", after="c")["n"] == 0
+        and row(told, "failures_per_100m", "straight", "c")["n"] == 9
+    )
+    assert not len(told.flipped)
+    assert (
+        "c: 1 crashed, counted as the worst there is; groups with them have no rates" in told.notes
+    )
+    assert (
+        "c is not to be quoted: 1 of 20 scheduled episodes are invalid, more than 2 %" in told.notes
+    )
+
+
+def test_a_planted_difference_of_three_in_a_hundred_is_found_on_800_scenarios() -> None:
+    """60 solved no more and 36 more, of 800: 24 fewer, found in the suite, where both kinds of
+    flips are named; in the event that has all of them, too; and nothing anywhere else."""
+    names = [f"s-{i:03d}" for i in range(800)]
+    table = pd.DataFrame({name: [None] * 800 for name in METRICS})
+    base = pd.DataFrame(
+        {"scenario": names, "status": "done", "ended": "goal", "split": "val", "structure": ""}
+    )
+    solved = [1.0 if i % 4 else 0.0 for i in range(800)]
+    planted = list(solved)
+    for i in [i for i in range(400) if solved[i]][:60] + [i for i in range(400) if not solved[i]][
+        :36
+    ]:
+        planted[i] = 1.0 - planted[i]
+    first, second = (
+        ComparedRun(label, Path(label), pd.concat([base, table], axis=1).assign(success=values))
+        for label, values in (("a", solved), ("b", planted))
+    )
+    groups = {("suite", "s"): frozenset(names), ("event", "hard"): frozenset(names[:400])}
+    groups["event", "easy"] = frozenset(names[400:])
+    found = differences_of(first, second, groups, ["success"]).set_index("group")
+    assert found.loc["s", "difference"] == pytest.approx(-0.03)
+    assert found["verdict"].to_dict() == {"s": "worse", "hard": "worse", "easy": "within noise"}
+    assert flipped_between(first, second)["flip"].value_counts().to_dict() == {
+        "lost": 60,
+        "won": 36,
+    }
+
+
+def test_a_comparison_is_printed_and_written(runs: Path, tmp_path: Path, cosim: Cosim) -> None:
+    """CSV holds every metric in full; Markdown and LaTeX the tables that are printed; the same each
+    time."""
+    files = [tmp_path / f"told{end}" for end in (".csv", ".md", ".tex")]
+    words = [
+        "compare",
+        *(str(runs / name) for name in "abc"),
+        *(w for file in files for w in ("-o", str(file))),
+    ]
+    said = cosim(*words)
+    assert said.returncode == 0, said.stderr
+    assert (
+        "b (B) against a (A), suite s" in said.stdout
+        and "c (B) against a (A), suite s, by" in said.stdout
+    )
+    assert re.search(
+        r"success +0\.50 +0\.90 +\+0\.400 +\+\d\.\d{3} to \+\d\.\d{3} +20 +better", said.stdout
+    )
+    read = pd.read_csv(files[0], keep_default_na=False, na_values=[""])
+    told = compare_runs([runs / name for name in "abc"])
+    assert read["low"].dropna().tolist() == told.differences["low"].dropna().tolist() and len(
+        read
+    ) == len(told.differences)
+    assert (
+        pd.read_csv(tmp_path / "told.flipped.csv")["scenario"].tolist()
+        == told.flipped["scenario"].tolist()
+    )
+    assert files[1].read_text() == as_markdown(told) and files[2].read_text() == as_latex(told)
+    assert not [*tmp_path.glob("*.part")]
+
+
+def test_a_comparison_fits_80_columns(runs: Path) -> None:
+    """Long ways, fast robots, many failures: no row of a table is longer, none is broken, nothing
+    is cut."""
+    told = compare_runs([runs / "a", runs / "b"])
+    figures = dict.fromkeys(("value_before", "value_after", "difference", "low", "high"), -123.456)
+    said = io.StringIO()
+    print_comparison(
+        Console(file=said, width=80),
+        told._replace(differences=told.differences.assign(verdict="within noise", **figures)),
+    )
+    lines = said.getvalue().splitlines()
+    assert "…" not in said.getvalue()
+    rows = [line for line in lines if line.rstrip().endswith("within noise")]
+    assert len(rows) > 10 and max(map(len, rows)) <= 80
+    assert [
+        line for line in rows if line.startswith("pedestrian_distance_min_m -123.5 -123.5 -123.5 ")
+    ]
+
+
+def test_names_are_escaped(runs: Path) -> None:
+    """A name of all that means something to LaTeX, Markdown or HTML ends no cell, begins no command
+    and is no tag."""
+    odd = r"<script>_a&b|c$1%#{2}~^\input{x}*`d`[e](f)"
+    told = compare_runs([runs / "a", runs / "b"])
+    other = told.others[0]._replace(label=odd)
+    frames = [
+        frame.replace({"b": odd, "frontal": odd}) for frame in (told.differences, told.flipped)
+    ]
+    told = told._replace(others=(other,), differences=frames[0], flipped=frames[1], notes=(odd,))
+    tables = tables_of_comparison(told, other)
+    latex = as_latex(told)
+    assert r"\input" not in latex.replace(r"\textbackslash{}input", "") and "<" not in latex
+    assert "$+0.400$ & $+" in latex
+    plain = re.sub(r"\\[&%$#_{}]|\\text\w+\{\}|\$[-+][\d.]+\$", "", latex)
+    assert not re.search(r"[%$#_~^]", plain)
+    rows = [line for line in plain.splitlines() if line.endswith(r"\\")]
+    assert len(rows) == sum(len(table.rows) + 1 for table in tables)
+    assert {line.count("&") for line in rows} == {len(table.heads) - 1 for table in tables}
+    assert plain.count("{") == plain.count("}")
+    markdown = as_markdown(told)
+    assert "<script" not in markdown and "&lt;script&gt;" in markdown
+    bars = [
+        len(re.findall(r"(?<!\\)\|", line))
+        for line in markdown.splitlines()
+        if line.startswith("|")
+    ]
+    assert {*bars} == {len(table.heads) + 1 for table in tables}
+
+
+def hold(run: Path) -> RunFolder:
+    return RunFolder.resume(run, read_spec(run))
+
+
+def rewrite_record(run: Path, **fields: object) -> None:
+    with closing(sqlite3.connect(run / "results.sqlite")) as database, database:
+        for name, text in database.execute("select scenario, record from episodes").fetchall():
+            text = json.dumps(json.loads(text) | fields)
+            database.execute("update episodes set record = ? where scenario = ?", (text, name))
+    for file in run.glob("episodes/*/record.json"):
+        file.write_text(json.dumps(json.loads(file.read_text()) | fields))
+
+
+def truncate(file: Path) -> None:
+    file.write_bytes(file.read_bytes()[:300])
+
+
+def empty(run: Path) -> None:
+    with closing(sqlite3.connect(run / "results.sqlite")) as database, database:
+        database.execute("delete from episodes")
+
+
+def edit_suite(run: Path) -> None:
+    file = run / "scenarios.json"
+    file.write_text(file.read_text().replace('"goal_radius_m":1.0', '"goal_radius_m":2.0'))
+
+
+def other_suite(run: Path, name: str, **fields: object) -> None:
+    spec = json.loads((run / "run.json").read_text())
+    (run / "run.json").write_text(json.dumps(spec | {"suite": name, "suite_hash": "beef"} | fields))
+
+
+BAD: dict[str, tuple[Callable[[Path], object], str]] = {
+    "truncated record": (
+        lambda run: truncate(run / "episodes/s-001/record.json"),
+        "{run}/episodes/s-001/record.json: not an episode record: Input data was truncated: "
+        "give the command",
+    ),
+    "another schema": (
+        lambda run: rewrite_record(run, metric_schema=2),
+        "{run}: the measures of 's-000' are of metric schema 2; this version has",
+    ),
+    "no episode": (
+        empty,
+        "{run}: no episode of it has ended: give the command of the run again with --resume",
+    ),
+    "an edited scenario": (
+        edit_suite,
+        "{run}/scenarios.json: scenario 's-000' is not the one that was run, it was edited",
+    ),
+    "another suite": (
+        lambda run: other_suite(run, "t"),
+        "{run} is of suite 't' 1 (beef), {first} of 's' 1 (",
+    ),
+    "an edited suite": (
+        lambda run: other_suite(run, "s"),
+        "run both on the same version of it (edited, robot, --crowd?)",
+    ),
+    "no run": (
+        lambda run: (run / "run.json").unlink(),
+        "{run} is no run folder: it holds no run.json. Runs in it and beside it: {first}",
+    ),
+    "a damaged database": (
+        lambda run: (run / "results.sqlite").write_bytes(b"nothing" * 500),
+        "{run}/results.sqlite is",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_cannot_be_compared_is_refused_in_one_line(
+    tmp_path: Path, cosim: Cosim, name: str
+) -> None:
+    """File or folder and the remedy are named, nothing is printed or written beside that; exit code
+    2."""
+    first, run = (run_of(tmp_path / which, [GOALS, HIT], which) for which in ("first", "second"))
+    spoil, words = BAD[name]
+    spoil(run)
+    said = cosim("compare", str(first), str(run), "-o", str(tmp_path / "out.csv"))
+    assert said.returncode == 2 and not said.stdout and not (tmp_path / "out.csv").exists()
+    comparing, told = said.stderr.splitlines()
+    assert comparing == "comparing 2 runs ..." and told.startswith("error: ")
+    assert words.format(run=run, first=first) in told
+
+
+def test_a_run_that_goes_on_is_not_compared(tmp_path: Path, cosim: Cosim) -> None:
+    """The process is named; one that was stopped and lacks episodes is compared in what it has, and
+    that is told."""
+    first, run = (
+        run_of(tmp_path / which, [GOALS, HIT, GOALS], which) for which in ("first", "second")
+    )
+    with hold(run):
+        said = cosim("compare", str(first), str(run))
+    assert said.returncode == 2 and f"{run} is in use by process {os.getpid()}" in said.stderr
+    with closing(sqlite3.connect(run / "results.sqlite")) as database, database:
+        database.execute("delete from episodes where scenario = 's-002'")
+    said = cosim("compare", str(first), str(run))
+    assert (
+        said.returncode == 0
+        and "second is not to be quoted: 1 of 3 scheduled episodes have not ended" in said.stdout
+    )
+    assert (
+        "scenarios that only one of both runs has are left out: 1 of first, 0 of second"
+        in said.stdout
+    )
+
+
+def test_wrong_words_are_refused(runs: Path, tmp_path: Path, cosim: Cosim) -> None:
+    """One run alone, a format that there is none of, a folder that cannot be written to."""
+    one, other = str(runs / "a"), str(runs / "b")
+    said = cosim("compare", one)
+    assert (
+        said.returncode == 2
+        and "a comparison needs two runs or more: cosim compare RUN OTHER ..." in said.stderr
+    )
+    said = cosim("compare", one, other, "-o", "table.pdf")
+    assert said.returncode == 2 and "table.pdf: its name must end in .csv, .md, .tex" in said.stderr
+    said = cosim("compare", one, other, "-o", str(tmp_path / "gone/table.md"))
+    assert (
+        said.returncode == 3
+        and "gone/table.md: cannot be written: No such file or directory" in said.stderr
+    )

@@ -1,0 +1,278 @@
+"""Shards of a run, and the run that is made of them."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+import sqlite3
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from cosim.core.errors import RunError, UsageError
+from cosim.core.telling import untold
+from cosim.results.merge import merge_runs
+from cosim.results.record import METRIC_SCHEMA
+from cosim.results.run_folder import RunFolder, read_records, read_spec
+from cosim.results.run_spec import RunSpec, Shard
+from cosim.spec.scenario import Scenario, Suite
+from tests.conftest import Cosim
+from tests.support.driven_runs import episode_of, run_of, short_way
+
+WAYS = tuple(short_way(f"s-{i:03d}") for i in range(7))
+SUITE = Suite(name="s", version="1", scenarios=WAYS)
+SPEC = RunSpec(
+    suite="s",
+    robots={"courier": "h"},
+    suite_version="1",
+    suite_hash=SUITE.content_hash,
+    policy="p",
+    policy_name="p",
+    policy_version="1",
+    scenarios=tuple(way.id for way in WAYS),
+    versions={"numpy": "2", "arithmetic": "1f"},
+    metric_schema=METRIC_SCHEMA,
+)
+HOWS = {
+    way.id: how
+    for way, how in zip(
+        WAYS, ("goal", "hit", "goal", "crashed", "goal", "invalid", "hit"), strict=True
+    )
+}
+
+
+def kept(path: Path, spec: RunSpec, ways: Sequence[Scenario], wall_s: float = 1.0) -> Path:
+    """A run folder that has come to the end of these scenarios, after so many seconds each."""
+    with RunFolder.create(path, spec, SUITE) as folder:
+        for way in reversed(ways):
+            record, log = episode_of(way, SUITE.content_hash, HOWS[way.id])
+            record = msgspec.structs.replace(record, clock={"wall_s": wall_s})
+            folder.keep(record, log.encoded() if log is not None else b"")
+    return path
+
+
+def shards(folder: Path, of: int, **fields: object) -> list[Path]:
+    """All shards of the run, each in a folder of its own. fields: what is otherwise in all of
+    them."""
+    cut = [Shard(number, of) for number in range(1, of + 1)]
+    return [
+        kept(
+            folder / f"{one.number}",
+            msgspec.structs.replace(SPEC, shard=one, **fields),
+            one.share(WAYS),
+        )
+        for one in cut
+    ]
+
+
+def bytes_of(*folders: Path) -> dict[Path, bytes]:
+    return {
+        file: file.read_bytes()
+        for folder in folders
+        for file in folder.rglob("*")
+        if file.is_file()
+    }
+
+
+def whole_table(folder: Path) -> bytes:
+    """results.csv of the same run in one piece."""
+    with RunFolder.resume(kept(folder / "whole", SPEC, WAYS), SPEC) as held:
+        held.finish()
+    return (folder / "whole/results.csv").read_bytes()
+
+
+@pytest.mark.parametrize("of", [1, 3, 7])
+def test_shards_are_merged_to_the_run_that_they_are_of(tmp_path: Path, of: int) -> None:
+    """Cut in any way: the same run.json, scenarios.json and results.csv, the same records; the
+    shards are untouched."""
+    parts = shards(tmp_path, of)
+    (parts[0] / "logs/worker-0.log").write_text("what it printed")
+    before = bytes_of(*parts)
+    merged = merge_runs(parts, tmp_path / "deep/merged", untold)
+    assert bytes_of(*parts) == before and (merged.missing, merged.twice) == ((), ())
+    assert (tmp_path / "deep/merged/results.csv").read_bytes() == whole_table(tmp_path)
+    for name in (
+        "run.json",
+        "scenarios.json",
+        "episodes/s-004/trajectory.npz",
+        "episodes/s-003/record.json",
+    ):
+        assert (tmp_path / "deep/merged" / name).read_bytes() == (
+            tmp_path / "whole" / name
+        ).read_bytes()
+    assert {r.scenario for r in read_records(tmp_path / "deep/merged")} == set(SPEC.scenarios)
+    assert (tmp_path / "deep/merged/logs/1-1/worker-0.log").read_text() == "what it printed"
+    assert [path.name for path in (tmp_path / "deep").iterdir()] == ["merged"]
+
+
+def test_a_shard_that_was_killed_is_read_as_it_lies(tmp_path: Path) -> None:
+    """What it wrote last stands beside its database, and its last record has no row yet: all is
+    taken, and not a byte changes."""
+    parts = shards(tmp_path, 2)
+    with closing(sqlite3.connect(parts[0] / "results.sqlite")) as database:
+        with database:
+            database.execute("delete from episodes where scenario = 's-006'")
+        killed = shutil.copytree(parts[0], tmp_path / "killed")
+    before = bytes_of(killed)
+    assert killed / "results.sqlite-wal" in before
+    assert (
+        merge_runs([killed, parts[1]], tmp_path / "merged", untold).missing == ()
+        and bytes_of(killed) == before
+    )
+
+
+def test_what_is_missing_is_named_and_can_be_run(tmp_path: Path, cosim: Cosim) -> None:
+    """A merge without one shard says which scenarios it lacks, writes no results.csv, and is a run
+    to be resumed."""
+    parts = shards(tmp_path, 3)
+    said = cosim("merge", str(parts[0]), str(parts[2]), "--out", str(tmp_path / "merged"))
+    assert said.returncode == 1
+    assert (
+        "2 scenarios are missing: s-001, s-004: give the command of the run without --shard"
+        in said.stderr
+    )
+    assert not (tmp_path / "merged/results.csv").exists()
+    with RunFolder.resume(tmp_path / "merged", SPEC) as folder:
+        assert folder.finished() == set(SPEC.scenarios) - {"s-001", "s-004"}
+
+
+def test_equal_episodes_are_taken_once(tmp_path: Path) -> None:
+    """Wall times and compression may differ; nothing else does."""
+    parts = [*shards(tmp_path, 2), kept(tmp_path / "again", SPEC, WAYS[2:5], wall_s=9.0)]
+    merged = merge_runs(parts, tmp_path / "merged", untold)
+    assert merged.twice == ("s-002", "s-003", "s-004")
+    assert (tmp_path / "merged/results.csv").read_bytes() == whole_table(tmp_path)
+
+
+@pytest.mark.parametrize("what", ["record", "trajectory"])
+def test_different_episodes_of_a_scenario_are_a_conflict(
+    tmp_path: Path, cosim: Cosim, what: str
+) -> None:
+    """Both folders, the scenario and the first difference are named, and nothing is written."""
+    parts = shards(tmp_path, 2)
+    other = tmp_path / "other"
+    with RunFolder.create(other, SPEC, SUITE) as folder:
+        record, log = episode_of(WAYS[2], SUITE.content_hash, "goal")
+        assert log is not None
+        if what == "record":
+            record = msgspec.structs.replace(record, state_hash="f00")
+        else:
+            log.pose[0, 2] += 1e-16
+        folder.keep(record, log.encoded())
+    said = cosim("merge", *map(str, parts), str(other), "--out", str(tmp_path / "merged"))
+    assert said.returncode == 2 and not (tmp_path / "merged").exists()
+    assert f"CONFLICT: {other} and {parts[0]} have different episodes of 's-002'" in said.stderr
+    assert (
+        "state_hash is 'f00'" if what == "record" else "trajectory.npz is another one"
+    ) in said.stderr
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "words"),
+    [
+        ("seed", 8, "its seed is 8, there it is 0"),
+        ("policy", "q", "its policy is q, there it is p"),
+        (
+            "scenarios",
+            SPEC.scenarios[:5],
+            "its choice of scenarios is 5, there it is 7, with s-005",
+        ),
+        (
+            "versions",
+            {"numpy": "3", "arithmetic": "1f"},
+            "{'numpy': '3'}, there it is {'numpy': '2'}",
+        ),
+        (
+            "versions",
+            {"numpy": "2", "arithmetic": "2e"},
+            "the processors or C libraries round differently",
+        ),
+    ],
+    ids=["seed", "policy", "scenarios", "package", "arithmetic"],
+)
+def test_folders_of_different_runs_are_refused(
+    tmp_path: Path, cosim: Cosim, field: str, value: object, words: str
+) -> None:
+    """The field and both values are named, and nothing is written."""
+    mine = kept(tmp_path / "mine", msgspec.structs.replace(SPEC, shard=Shard(1, 2)), WAYS[:1])
+    theirs = kept(
+        tmp_path / "theirs",
+        msgspec.structs.replace(SPEC, shard=Shard(2, 2), **{field: value}),
+        WAYS[1:2],
+    )
+    said = cosim("merge", str(mine), str(theirs), "--out", str(tmp_path / "merged"))
+    assert (
+        said.returncode == 2
+        and f"{theirs} is of another run than {mine}" in said.stderr
+        and words in said.stderr
+    )
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["mine", "theirs"]
+
+
+def test_what_is_damaged_in_use_or_in_the_way_is_refused(tmp_path: Path) -> None:
+    """A folder without a run, one that is written to, a truncated record, a target that is
+    there."""
+    parts = shards(tmp_path, 2)
+    with pytest.raises(UsageError, match="unknown run"):
+        merge_runs([*parts, tmp_path / "nothing"], tmp_path / "merged", untold)
+    with (
+        RunFolder.resume(parts[1], read_spec(parts[1])),
+        pytest.raises(RunError, match=r"in use by process \d+"),
+    ):
+        merge_runs(parts, tmp_path / "merged", untold)
+    with pytest.raises(RunError, match="exists already: choose another --out"):
+        merge_runs(parts, parts[0], untold)
+    record = parts[1] / "episodes/s-001/record.json"
+    record.write_bytes(record.read_bytes()[:200])
+    with pytest.raises(RunError, match=r"1/record\.json: not an episode record.*--resume"):
+        merge_runs(parts, tmp_path / "merged", untold)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1", "2"]
+
+
+def test_a_shard_is_resumed_as_that_shard(tmp_path: Path) -> None:
+    """Another one, or the whole run, is refused: the shards are named as they are asked for."""
+    (first, _) = shards(tmp_path, 2)
+    with pytest.raises(RunError, match="its shard is 1/2, now asked for is 2/2"):
+        RunFolder.resume(first, msgspec.structs.replace(SPEC, shard=Shard(2, 2)))
+    with pytest.raises(RunError, match="its shard is 1/2, now asked for is None"):
+        RunFolder.resume(first, SPEC)
+
+
+@pytest.mark.parametrize(
+    "words", ["0/2", "3/2", "1", "1/0", "-1/2", "a/b", "1/2/3", "²/3"], ids=ascii
+)
+def test_a_shard_that_is_none_is_refused(words: str) -> None:
+    """In one line that says how it is written."""
+    with pytest.raises(UsageError, match="give i/n, with i from 1 to n"):
+        Shard.called(words, 100)
+
+
+def test_shards_share_out_every_scenario_once() -> None:
+    """Whatever they are cut in; of more shards than scenarios some would be empty, which is
+    refused."""
+    for of in range(1, 8):
+        cut = [Shard.called(f"{number}/{of}", 7).share(range(7)) for number in range(1, of + 1)]
+        assert sorted(itertools.chain(*cut)) == list(range(7)) and all(cut)
+    with pytest.raises(UsageError, match="the run has 7 scenarios"):
+        Shard.called("1/8", 7)
+
+
+def test_a_shard_needs_the_seed_of_its_run(cosim: Cosim) -> None:
+    """Drawn anew for each shard it would be another run's."""
+    said = cosim("run", "reactive", "--policy", "straight", "--shard", "1/2")
+    assert said.returncode == 2 and "--shard needs --seed: shards are of one run" in " ".join(
+        said.stderr.split()
+    )
+
+
+def test_a_finished_run_is_a_shard_too(tmp_path: Path) -> None:
+    """The parts of a run that was begun on two machines without shards are merged all the same."""
+    whole = run_of(tmp_path / "a", ["goal", "hit"])
+    merged = merge_runs([whole], tmp_path / "merged", untold)
+    assert (
+        merged.missing == ()
+        and (tmp_path / "merged/results.csv").read_bytes() == (whole / "results.csv").read_bytes()
+    )

@@ -1,0 +1,86 @@
+"""How near people are, on cases worked out by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from cosim.core.geometry import Pose, box_disk_gap
+from cosim.core.state import People, RobotState
+from cosim.results.nearness import Nearness, nearness, time_to_collision_s
+
+FOOTPRINT = (0.7, 0.55)
+
+
+def people(*rows: tuple[float, float, float, float]) -> People:
+    """x, y, heading, speed of each."""
+    x, y, heading, speed = np.array(rows, dtype=float).reshape(-1, 4).T
+    names = tuple(f"p{i}" for i in range(len(rows)))
+    return People.of(names, np.column_stack([x, y]), heading, speed, ("walk",) * len(rows))
+
+
+def test_nobody_is_infinitely_far() -> None:
+    """Without people there is neither distance nor time."""
+    assert nearness(RobotState(Pose(0.0, 0.0, 0.0)), people(), FOOTPRINT) == Nearness(
+        math.inf, math.inf, math.inf
+    )
+
+
+def test_two_who_drive_at_each_other_meet_halfway() -> None:
+    """5 m apart at 1 m/s each, radii 0.35 and 0.3 m: 4.35 m at 2 m/s. The gap before the robot is
+    4.35 m as well."""
+    near = nearness(
+        RobotState(Pose(0.0, 0.0, 0.0), v_mps=1.0), people((5.0, 0.0, math.pi, 1.0)), FOOTPRINT
+    )
+    assert near == pytest.approx((5.0, 4.35, 2.175))
+
+
+def test_who_passes_aside_or_walks_away_is_never_met() -> None:
+    """One on a line 0.7 m beside the robot's, one who keeps ahead at its pace, one who stands
+    behind it."""
+    passing = people((5.0, 0.7, math.pi, 1.0), (3.0, 0.0, 0.0, 1.0), (-2.0, 0.0, 0.0, 0.0))
+    near = nearness(RobotState(Pose(0.0, 0.0, 0.0), v_mps=1.0), passing, FOOTPRINT)
+    assert (
+        near.collision_in_s == math.inf
+        and near.person_m == 2.0
+        and near.clearance_m == pytest.approx(1.35)
+    )
+
+
+def test_the_gap_is_to_the_outline_not_to_the_nearest_centre() -> None:
+    """One 0.75 m ahead is nearer to the bumper than one 0.7 m aside is to the flank."""
+    near = nearness(
+        RobotState(Pose(0.0, 0.0, 0.0)),
+        people((0.75, 0.0, 0.0, 0.0), (0.0, 0.7, 0.0, 0.0)),
+        FOOTPRINT,
+    )
+    assert near.person_m == 0.7 and near.clearance_m == pytest.approx(0.1)
+
+
+def test_the_gap_is_the_least_of_all_gaps() -> None:
+    """On random crowds, against every gap taken by itself; one that overlaps has none."""
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        pose = Pose(*rng.uniform(-1.0, 1.0, 2), rng.uniform(-math.pi, math.pi))
+        crowd = people(*((x, y, 0.0, 0.0) for x, y in rng.uniform(-4.0, 4.0, (6, 2))))
+        gaps = box_disk_gap(np.array([pose]), 0.35, 0.275, crowd.xy[None]) - 0.3
+        assert nearness(RobotState(pose), crowd, FOOTPRINT).clearance_m == pytest.approx(
+            max(float(gaps.min()), 0.0)
+        )
+
+
+def test_at_the_time_that_is_told_they_touch() -> None:
+    """On random ways: at that time the distance is the radius, and before it larger."""
+    rng = np.random.default_rng(1)
+    offset, velocity = rng.uniform(-5.0, 5.0, (500, 2)), rng.uniform(-2.0, 2.0, (500, 2))
+    in_s = time_to_collision_s(offset, velocity, 0.65)
+    meets = np.isfinite(in_s) & (in_s > 0.0)
+    assert 20 < meets.sum() < 400
+    for share, least in ((1.0, 0.65 - 1e-9), (0.5, 0.65)):
+        at = offset[meets] + share * in_s[meets, None] * velocity[meets]
+        assert (np.hypot(at[:, 0], at[:, 1]) >= least).all()
+    never = ~np.isfinite(in_s)
+    for t in np.linspace(0.0, 20.0, 400):
+        assert (np.hypot(*(offset[never] + t * velocity[never]).T) > 0.65).all()

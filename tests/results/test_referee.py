@@ -1,0 +1,505 @@
+"""The referee's rules, on steps made by hand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from shapely.geometry import box
+
+from cosim.core.clock import Clock
+from cosim.core.geometry import Pose
+from cosim.core.state import (
+    NO_VEHICLES,
+    STILL,
+    Command,
+    Contact,
+    Motion,
+    People,
+    RobotState,
+    Signal,
+    Street,
+    Vehicles,
+    write_protected,
+)
+from cosim.episode.step import Step
+from cosim.place.street_map import WalkableArea
+from cosim.results.referee import FREE_OF_OBSTACLES_M, Referee, Verdict
+from cosim.spec.events import Event, EventReply, EventState, Walker
+from cosim.spec.obstacle import Obstacle
+from cosim.spec.scenario import Barrier, City, RouteCrossing, Scenario
+
+CLOCK = Clock()
+AREA = WalkableArea(box(-5, -2, 105, 2))
+NOTHING = EventReply(episode="t", tick=0, states=(), actors=())
+
+
+def scenario(**fields: object) -> Scenario:
+    """A straight route of 100 m along the x axis."""
+    known: dict[str, object] = {
+        "id": "t",
+        "suite": "test",
+        "place": City(seed=0),
+        "seed": 0,
+        "start": (0.0, 0.0, 0.0),
+        "goal": (100.0, 0.0),
+        "route": ((0.0, 0.0), (100.0, 0.0)),
+    }
+    return Scenario(**known | fields)  # type: ignore[arg-type]
+
+
+def referee(**fields: object) -> Referee:
+    return Referee(scenario(**fields), AREA, (0.7, 0.55), CLOCK)
+
+
+def people(*at: tuple[float, float], heading: float = 0.0, speed: float = 0.0) -> People:
+    ids = tuple(f"c{i}" for i in range(len(at)))
+    return People.of(ids, at, [heading] * len(at), [speed] * len(at), ("walk",) * len(at))
+
+
+def step(
+    tick: int,
+    x_m: float,
+    y_m: float = 0.0,
+    *,
+    contacts: Sequence[Contact] = (),
+    who: People | None = None,
+    speed: float = 1.0,
+    red: Sequence[str] = (),
+    cars: Vehicles = NO_VEHICLES,
+    events: EventReply = NOTHING,
+    w_radps: float = 0.0,
+    command: Command = STILL,
+) -> Step:
+    """The robot ends the tick at (x, y), which is also its place on the route."""
+    robot = RobotState(Pose(x_m, y_m, 0.0), speed, w_radps)
+    street = Street(tick, who or people(), cars, {name: Signal(False) for name in red})
+    motion = Motion(robot, write_protected([[x_m, y_m, 0.0]] * CLOCK.substeps), tuple(contacts))
+    return Step(tick, robot, street, x_m, None, command, events, motion, street, x_m)
+
+
+def judge_all(one: Referee, steps: Sequence[Step]) -> list[Verdict]:
+    return [one.judge(s) for s in steps]
+
+
+def touch(other: str, kind: str = "pedestrian") -> Contact:
+    return Contact(kind, other, 0)  # type: ignore[arg-type]
+
+
+def test_a_collision_is_one_event_until_they_have_been_apart() -> None:
+    """A contact that lasts is counted once; after 1 s apart the same person counts again."""
+    one = referee(ends_on_failure=False)
+    far = people((50.0, 0.0))
+    assert one.judge(step(0, 20.0, contacts=[touch("c0")], who=far)).failures
+    held = [
+        one.judge(step(t, 20.0 + t * 0.1, contacts=[touch("c0")], who=far)) for t in range(1, 30)
+    ]
+    assert not any(v.failures for v in held)
+    apart = [one.judge(step(t, 20.0 + t * 0.1, who=far)) for t in range(30, 52)]
+    assert not any(v.failures for v in apart)
+    again = one.judge(step(52, 30.0, contacts=[touch("c0")], who=far)).failures
+    assert [(one.kind, one.other) for one in again] == [("collision", "c0")]
+
+
+def test_someone_still_within_ten_centimetres_has_not_parted() -> None:
+    """A person who stays near after a contact does not collide anew, however long it takes."""
+    one = referee()
+    near = people((20.0 + 0.35 + 0.3 + 0.05, 0.0))
+    assert one.judge(step(0, 20.0, contacts=[touch("c0")], who=near)).failures
+    for tick in range(1, 100):
+        one.judge(step(tick, 20.0, who=near))
+    assert one.judge(step(100, 20.0, contacts=[touch("c0")], who=near)).failures == ()
+
+
+def test_the_fault_of_a_contact_follows_who_moved() -> None:
+    """A standing person was driven into; both moving share it, and so they do where the robot has
+    only just stopped."""
+
+    def fault(robot_mps: float, person_mps: float) -> str | None:
+        who = people((20.5, 0.0), heading=math.pi, speed=person_mps)
+        (failure,) = (
+            referee()
+            .judge(step(0, 20.0, contacts=[touch("c0")], who=who, speed=robot_mps))
+            .failures
+        )
+        return failure.fault
+
+    assert fault(0.0, 1.3) == "shared"
+    assert fault(1.0, 0.0) == "robot_at_fault"
+    assert fault(1.0, 1.3) == "shared"
+
+
+def stood(one: Referee, ticks: int, **speeds: float) -> None:
+    """The robot stands at x = 20, or turns there."""
+    for tick in range(ticks):
+        assert not one.judge(step(tick, 20.0, speed=0.0, **speeds)).failures
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_who_walks_into_a_robot_that_stands_is_at_fault_and_the_robot_has_not_failed(
+    ends: bool,
+) -> None:
+    """After 1 s of standing a contact is counted and nothing ends nor is reset; after less it is a
+    collision, and after 1 s of turning on the spot too."""
+    who = people((20.5, 0.0), heading=math.pi, speed=1.3)
+    hit = {"contacts": [touch("c0")], "who": who, "speed": 0.0}
+    one = referee(ends_on_failure=ends)
+    stood(one, 19)
+    verdict = one.judge(step(19, 20.0, **hit))  # type: ignore[arg-type]
+    assert (verdict.failures, verdict.reset, verdict.ended) == ((), None, None)
+    assert [(into.fault, into.other) for into in verdict.walked_into] == [
+        ("pedestrian_at_fault", "c0")
+    ]
+    assert not one.judge(step(20, 20.0, **hit)).walked_into  # type: ignore[arg-type]
+    for ticks, w_radps in ((18, 0.0), (19, 0.3)):
+        other = referee(ends_on_failure=ends)
+        stood(other, ticks, w_radps=w_radps)
+        verdict = other.judge(step(ticks, 20.0, w_radps=w_radps, **hit))  # type: ignore[arg-type]
+        assert [failure.fault for failure in verdict.failures] == [
+            "shared"
+        ] and not verdict.walked_into
+        assert (verdict.ended == "failure", verdict.reset is None) == (ends, ends)
+
+
+def test_a_robot_that_drives_on_through_who_has_walked_into_it_collides() -> None:
+    """Standing until one is touched buys nothing; a robot that is only pushed has not driven."""
+    who = people((20.5, 0.0))
+    hit = {"contacts": [touch("c0")], "who": who}
+    one = referee(ends_on_failure=True)
+    stood(one, 19)
+    assert one.judge(step(19, 20.0, speed=0.0, **hit)).walked_into  # type: ignore[arg-type]
+    assert not one.judge(step(20, 20.0, speed=0.2, **hit)).failures  # type: ignore[arg-type]
+    (failure,) = one.judge(step(21, 20.0, speed=0.2, command=Command(0.4, 0.0), **hit)).failures  # type: ignore[arg-type]
+    assert failure.fault == "robot_at_fault"
+
+
+def test_things_touched_in_one_tick_are_as_many_collisions_and_one_reset() -> None:
+    """Two people and a bin at once are three failures in the order of their contacts, one of them
+    counted once."""
+    hit = [touch("c0"), touch("bin", "object"), touch("c0"), touch("c1")]
+    verdict = referee().judge(step(0, 23.0, contacts=hit, who=people((23.4, 0.0), (23.4, 0.4))))
+    assert [failure.other for failure in verdict.failures] == ["c0", "bin", "c1"]
+    assert verdict.reset is not None and verdict.ended is None
+    ended = referee(ends_on_failure=True).judge(step(0, 23.0, contacts=hit))
+    assert len(ended.failures) == 3 and ended.ended == "failure"
+
+
+def test_waiting_is_no_failure_where_an_episode_ends_on_one() -> None:
+    """Before its goal a robot may stand until the time is up; on a long way it freezes."""
+    for ends, ended in ((True, "timeout"), (False, "timeout")):
+        one = referee(ends_on_failure=ends, time_limit_s=60.0)
+        verdicts = judge_all(one, [step(t, 20.0, speed=0.0) for t in range(1200)])
+        assert sum(len(v.failures) for v in verdicts) == (0 if ends else 5)
+        assert verdicts[-1].ended == ended
+
+
+def test_out_of_lane_is_the_base_centre_outside_the_walkable_area() -> None:
+    """At 1.99 m beside a 2 m half width nothing happens, at 2.01 m it does, and the robot is put
+    back on the route."""
+    one = referee()
+    assert one.judge(step(0, 23.0, 1.99)).failures == ()
+    verdict = one.judge(step(1, 23.0, 2.01))
+    assert [failure.kind for failure in verdict.failures] == ["out_of_lane"]
+    assert verdict.reset is not None and verdict.reset.pose == (25.0, 0.0, 0.0)
+
+
+def test_out_of_lane_is_told_at_every_step_of_a_walk_to_and_fro_over_the_edge() -> None:
+    """Where the area holds the base centre nothing is told, outside it is, in every one of 800
+    steps of all lengths."""
+    rng = np.random.default_rng(6)
+    one = referee()
+    y_m = 0.0
+    told = []
+    for tick in range(800):
+        y_m = float(np.clip(y_m + rng.normal(0.0, 0.3) * rng.random() ** 3, -2.3, 2.3))
+        told.append(bool(one.judge(step(tick, 20.0 + 0.05 * tick, y_m)).failures))
+        assert told[-1] is not AREA.contains(20.0 + 0.05 * tick, y_m)
+    assert 50 < sum(told) < 750
+
+
+def test_freezing_is_half_a_metre_in_ten_seconds() -> None:
+    """A robot that stands for 10 s freezes at once then; one that creeps 0.06 m/s does not; the
+    count starts anew."""
+    still = judge_all(referee(), [step(t, 20.0) for t in range(402)])
+    frozen_at = [t for t, v in enumerate(still) if v.failures]
+    assert frozen_at == [200, 401]
+    creeping = judge_all(referee(), [step(t, 20.0 + 0.06 * t * 0.05) for t in range(600)])
+    assert not any(v.failures for v in creeping)
+
+
+def test_going_to_and_fro_is_not_freezing() -> None:
+    """A robot that went away and came back to the same spot within the window has moved."""
+    track = [20.0 + 1.0 * math.sin(2 * math.pi * t / 200) for t in range(600)]
+    assert not any(
+        v.failures for v in judge_all(referee(), [step(t, x) for t, x in enumerate(track)])
+    )
+
+
+def test_waiting_before_a_red_crossing_is_not_freezing() -> None:
+    """Within 4 m before a red crossing of the route time does not count; when it turns green, it
+    does."""
+    crossing = RouteCrossing(id=":x_c0", enter_s_m=30.0, leave_s_m=40.0, signalised=True)
+    one = referee(crossings=(crossing,))
+    waiting = judge_all(one, [step(t, 29.0, red=[":x_c0"]) for t in range(500)])
+    assert all(v.waits_at_red and not v.failures for v in waiting)
+    green = judge_all(one, [step(t, 29.0) for t in range(500, 702)])
+    assert [t for t, v in enumerate(green) if v.failures] == [200]
+    elsewhere = judge_all(
+        referee(crossings=(crossing,)), [step(t, 20.0, red=[":x_c0"]) for t in range(202)]
+    )
+    assert elsewhere[200].failures
+
+
+def test_entering_a_crossing_at_red_is_noted_once() -> None:
+    """The tick on which the robot gets onto a red crossing of its route is a red-light entry."""
+    crossing = RouteCrossing(id=":x_c0", enter_s_m=30.0, leave_s_m=40.0, signalised=True)
+    one = referee(crossings=(crossing,))
+    entries = [
+        v.red_light_entry
+        for v in judge_all(one, [step(t, 29.0 + t * 0.1, red=[":x_c0"]) for t in range(60)])
+    ]
+    assert [e for e in entries if e] == [":x_c0"]
+    assert entries.index(":x_c0") == 11
+
+
+def test_a_reset_keeps_off_obstacles() -> None:
+    """Whatever stands where the robot would be put, or too near to turn there, sends it to the next
+    waypoint; where something stands at every one of them it is put at the nearest."""
+
+    def bin_at(x_m: float, y_m: float = 0.0) -> Obstacle:
+        return Obstacle(kind="bin", x_m=x_m, y_m=y_m, heading_rad=0.0)
+
+    def reset_m(*obstacles: Obstacle) -> float:
+        verdict = referee(obstacles=obstacles).judge(step(0, 21.0, 3.0))
+        assert verdict.reset is not None
+        return verdict.reset.route_s_m
+
+    reach_m = math.hypot(0.35, 0.275) + FREE_OF_OBSTACLES_M + 0.5 * 0.55
+    assert reset_m() == reset_m(bin_at(22.5)) == reset_m(bin_at(20.0, reach_m + 0.01)) == 20.0
+    assert reset_m(bin_at(20.0)) == reset_m(bin_at(20.0, reach_m - 0.01)) == 25.0
+    assert reset_m(bin_at(20.0), bin_at(25.0)) == 15.0
+    assert reset_m(*(bin_at(5.0 * k) for k in range(21))) == 20.0
+
+
+def test_who_hits_what_stands_before_the_goal_is_put_between_it_and_the_goal() -> None:
+    """Beyond the last waypoint there is room still: else it would be put before the same bin until
+    the time is up."""
+    for bin_m, beyond_m in ((96.0, 96.8), (97.4, 98.2)):
+        one = referee(obstacles=(Obstacle(kind="bin", x_m=bin_m, y_m=0.0, heading_rad=0.0),))
+        hit = [touch("bin", "object")]
+        at = [one.judge(step(60 * t, bin_m - 0.7, contacts=hit)).reset for t in range(3)]
+        assert [reset.route_s_m for reset in at if reset is not None] == pytest.approx(
+            [95.0, 95.0, beyond_m], abs=0.11
+        )
+
+
+def test_a_reset_goes_to_the_nearest_free_waypoint() -> None:
+    """Waypoints lie every 5 m; one where a person stands is passed over, and so is one on a
+    crossing."""
+    crossing = RouteCrossing(id=":x_c0", enter_s_m=28.0, leave_s_m=36.0, signalised=False)
+    verdict = referee().judge(step(0, 23.0, 3.0, who=people((25.3, 0.0))))
+    assert verdict.reset is not None and verdict.reset.route_s_m == 20.0
+    verdict = referee(crossings=(crossing,)).judge(step(0, 31.0, 3.0))
+    assert verdict.reset is not None and verdict.reset.route_s_m == 25.0
+
+
+def test_three_failures_in_one_place_carry_the_robot_beyond_it() -> None:
+    """The third failure within 10 m of the route puts the robot at the first waypoint at least 1 m
+    behind them all."""
+    one = referee()
+    resets = [one.judge(step(t, x, 3.0)).reset for t, x in enumerate((21.0, 24.0, 22.0, 25.0))]
+    assert [r.route_s_m for r in resets if r is not None] == [20.0, 25.0, 30.0, 25.0]
+    stuck = referee()
+    at = [stuck.judge(step(t, 24.9999, 3.0)).reset for t in range(4)]
+    assert [r.route_s_m for r in at if r is not None] == [25.0, 25.0, 30.0, 25.0]
+    far = [referee().judge(step(t, 20.0 * t, 3.0)).reset for t in range(3)]
+    assert [r.route_s_m for r in far if r is not None] == [0.0, 20.0, 40.0]
+
+
+def test_a_robot_that_never_moves_is_carried_along_the_route_but_never_to_its_goal() -> None:
+    """Frozen at every place, it is put on and on, and the episode ends by time, not at the goal."""
+    one = referee(time_limit_s=1500.0)
+    x_m = 0.0
+    ended = None
+    tick = 0
+    while ended is None:
+        verdict = one.judge(step(tick, x_m, speed=0.0))
+        x_m = verdict.reset.route_s_m if verdict.reset else x_m
+        ended = verdict.ended
+        tick = tick + 1
+    assert ended == "timeout" and 90.0 <= x_m <= 98.0
+
+
+def test_a_vehicle_collides_anew_only_after_it_has_been_away() -> None:
+    """A car that stays within 0.1 m has not parted; one that drove off and comes back has."""
+    one = referee()
+    near = Vehicles.of(("v0",), [[20.0, 1.9]], [0.0], [0.0], [[4.5, 1.8]])
+    hit = [Contact("vehicle", "v0", 0)]
+    assert one.judge(step(0, 20.0, contacts=hit)).failures
+    for tick in range(1, 60):
+        one.judge(step(tick, 20.0 + 0.001 * tick, 0.65, cars=near))
+    assert one.judge(step(60, 20.0, contacts=hit)).failures == ()
+    for tick in range(61, 90):
+        one.judge(step(tick, 20.0 + 0.03 * tick))
+    assert one.judge(step(90, 25.0, contacts=hit)).failures
+
+
+def test_a_crossing_can_be_entered_at_red_after_it_was_left() -> None:
+    """Entered at green, left backwards by half a metre, and entered again at red: that is an entry
+    at red."""
+    crossing = RouteCrossing(id=":x_c0", enter_s_m=30.0, leave_s_m=40.0, signalised=True)
+    one = referee(crossings=(crossing,))
+    at = [(30.2, False), (29.9, False), (29.5, False), (29.6, True), (30.1, True)]
+    verdicts = [
+        one.judge(step(t, x, red=[":x_c0"] if red else [])) for t, (x, red) in enumerate(at)
+    ]
+    assert [v.red_light_entry for v in verdicts] == [None, None, None, None, ":x_c0"]
+
+
+def test_time_before_and_after_a_red_signal_adds_up_to_freezing() -> None:
+    """Waiting at red pauses the count of a freezing, it does not begin it anew."""
+    crossing = RouteCrossing(id=":x_c0", enter_s_m=30.0, leave_s_m=40.0, signalised=True)
+    one = referee(crossings=(crossing,))
+    reds = [120 <= t < 400 for t in range(500)]
+    verdicts = [
+        one.judge(step(t, 29.0, red=[":x_c0"] if red else [])) for t, red in enumerate(reds)
+    ]
+    assert [t for t, v in enumerate(verdicts) if v.failures] == [480]
+
+
+def test_the_episode_ends_at_the_goal_or_at_its_time() -> None:
+    """Within the goal radius is the goal; the limit is a timeout; a unit scenario ends at its first
+    failure."""
+    assert referee().judge(step(0, 98.9)).ended is None
+    assert referee().judge(step(0, 99.1)).ended == "goal"
+    assert referee(time_limit_s=10.0).judge(step(198, 50.0)).ended is None
+    assert referee(time_limit_s=10.0).judge(step(199, 50.0)).ended == "timeout"
+    first = referee(ends_on_failure=True).judge(step(0, 50.0, 3.0))
+    assert (first.ended, first.reset) == ("failure", None)
+
+
+def test_a_goal_near_the_start_of_a_round_route_counts_only_at_its_end() -> None:
+    """A route that ends where it began is not over before it has been driven."""
+    loop = ((0.0, 0.0), (50.0, 0.0), (50.0, 1.0), (0.5, 1.0))
+    one = referee(route=loop, goal=(0.5, 1.0))
+    assert one.judge(step(0, 0.5, 0.4)).ended is None
+
+
+HAIRPIN = {
+    "route": ((0.0, -1.0), (50.0, -1.0), (50.0, 1.0), (0.0, 1.0)),
+    "goal": (0.0, 1.0),
+    "start": (0.0, -1.0, 0.0),
+}
+
+
+@pytest.mark.parametrize(
+    ("y_m", "more", "ended"),
+    [
+        (0.2, {}, "goal"),
+        (-0.2, {}, None),
+        (
+            0.2,
+            {
+                "barriers": (
+                    Barrier(x_m=0.0, y_m=0.5, heading_rad=1.5708, length_m=9.0, strip="s", end=0),
+                )
+            },
+            None,
+        ),
+        (
+            0.2,
+            {
+                "barriers": (
+                    Barrier(x_m=9.0, y_m=0.5, heading_rad=1.5708, length_m=9.0, strip="s", end=0),
+                )
+            },
+            "goal",
+        ),
+    ],
+    ids=["at it", "too far", "behind a fence", "beside a fence"],
+)
+def test_a_robot_at_the_goal_is_there_though_it_skipped_a_part_of_the_route(
+    y_m: float, more: dict[str, object], ended: str | None
+) -> None:
+    """A route leads out and back along two strips that touch: whoever walks across is at the goal,
+    by no arc length."""
+    one = Referee(scenario(**HAIRPIN | more), AREA, (0.7, 0.55), CLOCK)
+    across = step(0, 0.3, y_m)
+    assert one.judge(across).ended == ended
+    apart = WalkableArea(AREA.polygon.difference(box(-5, 0.4, 55, 0.5)))
+    assert (
+        Referee(scenario(**HAIRPIN | more), apart, (0.7, 0.55), CLOCK).judge(across).ended is None
+    )
+
+
+@pytest.mark.parametrize("kind", ["vehicle", "wall", "object"])
+def test_every_kind_of_thing_can_be_collided_with(kind: str) -> None:
+    """Walls, fences and vehicles are collisions too, without a pedestrian's fault class."""
+    (failure,) = referee().judge(step(0, 20.0, contacts=[touch("b", kind)])).failures
+    assert (failure.other_kind, failure.fault) == (kind, None)
+
+
+def test_people_are_seen_from_the_footprint_not_from_the_centre() -> None:
+    """The gap to a person is measured from the robot's outline to the person's disk."""
+    from cosim.results.referee import person_gaps
+
+    gaps = person_gaps(step(0, 0.0, who=people((1.35, 0.0), (0.0, 1.275))), (0.35, 0.275))
+    assert list(gaps) == ["c0", "c1"]
+    assert np.allclose(list(gaps.values()), [0.7, 0.7])
+
+
+def stopping_hand(phase: str = "acting") -> tuple[Event, EventReply]:
+    """Somebody who holds out a hand at x = 12, in the middle of the sidewalk."""
+    event = Event(
+        id="e0",
+        kind="gesturing",
+        x_m=12.0,
+        y_m=0.0,
+        heading_rad=0.0,
+        route_s_m=12.0,
+        half_width_m=1.5,
+    )
+    walker = Walker(x_m=12.0, y_m=0.0, heading_rad=math.pi)
+    state = EventState(phase=phase, since_tick=0, walkers=(walker,))  # type: ignore[arg-type]
+    return event, EventReply(episode="t", tick=0, states=(state,), actors=())
+
+
+@pytest.mark.parametrize(
+    ("x_m", "speed", "ended"), [(9.2, 0.0, "stop"), (8.8, 0.0, None), (9.2, 0.06, None)]
+)
+def test_a_stop_before_the_hand_ends_the_episode_well(
+    x_m: float, speed: float, ended: str | None
+) -> None:
+    """Within 3 m in front, slower than 0.05 m/s, for two seconds and not before; farther away or
+    rolling does not."""
+    event, reply = stopping_hand()
+    one = referee(ends_at="stop", ends_on_failure=True, events=(event,))
+    verdicts = judge_all(one, [step(t, x_m, speed=speed, events=reply) for t in range(45)])
+    first = next((t for t, v in enumerate(verdicts) if v.ended), None)
+    assert (None if first is None else verdicts[first].ended) == ended
+    assert ended is None or first == 39
+
+
+def test_a_stop_interrupted_begins_anew_and_one_before_the_trigger_does_not_count() -> None:
+    """Two seconds in one piece, while the hand is held out."""
+    event, reply = stopping_hand()
+    one = referee(ends_at="stop", ends_on_failure=True, events=(event,))
+    steps = [step(t, 9.2, speed=0.5 if t == 30 else 0.0, events=reply) for t in range(60)]
+    assert all(v.ended is None for v in judge_all(one, steps))
+    _, waiting = stopping_hand("waiting")
+    other = referee(ends_at="stop", ends_on_failure=True, events=(event,))
+    assert all(
+        v.ended is None
+        for v in judge_all(other, [step(t, 9.2, speed=0.0, events=waiting) for t in range(60)])
+    )
+
+
+def test_passing_the_hand_ends_the_episode_badly() -> None:
+    """Beyond the pedestrian there is nothing left to stop for, at the goal neither."""
+    event, reply = stopping_hand()
+    one = referee(ends_at="stop", ends_on_failure=True, events=(event,))
+    assert one.judge(step(0, 11.9, events=reply)).ended is None
+    verdict = one.judge(step(1, 12.1, events=reply))
+    assert verdict.ended == "failure" and not verdict.failures

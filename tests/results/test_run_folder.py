@@ -1,0 +1,501 @@
+"""Run folders: rows, locks, resuming, and damage."""
+
+from __future__ import annotations
+
+import os
+import re
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from cosim.core.errors import MachineError, RunError, UsageError
+from cosim.results.log import Log
+from cosim.results.metrics import METRICS
+from cosim.results.record import Record
+from cosim.results.run_folder import RunFolder, read_records, read_rows, read_spec
+from cosim.results.run_spec import RunSpec
+from cosim.results.table import summary_of, table_of, table_row
+from cosim.spec.camera import CameraSpec
+from cosim.spec.manifest import WaypointRule
+from cosim.spec.scenario import City, Scenario, Suite
+from tests.conftest import Cosim
+from tests.support.driven_runs import driven
+
+
+def scenario(name: str) -> Scenario:
+    return Scenario(
+        id=name,
+        suite="s",
+        place=City(seed=0),
+        seed=0,
+        start=(0.0, 0.0, 0.0),
+        goal=(9.0, 0.0),
+        route=((0.0, 0.0), (9.0, 0.0)),
+    )
+
+
+SUITE = Suite(name="s", version="1", scenarios=tuple(scenario(f"s-{i}") for i in range(3)))
+SPEC = RunSpec(
+    suite="s",
+    robots={"courier": "h"},
+    suite_version="1",
+    suite_hash=SUITE.content_hash,
+    policy="p",
+    policy_name="p",
+    policy_version="1",
+    scenarios=tuple(s.id for s in SUITE.scenarios),
+    versions={"numpy": "2"},
+)
+
+
+def record(name: str, *, success: float = 1.0, status: str = "done", wall_s: float = 1.0) -> Record:
+    measures: dict[str, float | None] = dict.fromkeys(METRICS, None) | {"success": success}
+    return Record(
+        scenario=name,
+        scenario_hash="h",
+        suite="s",
+        suite_hash=SUITE.content_hash,
+        seed=0,
+        robot="courier",
+        policy="p",
+        policy_version="1",
+        goal_protocol="none",
+        renderer="none",
+        versions={"numpy": "2"},
+        status=status,
+        ended="goal" if status == "done" else None,
+        ticks=3,
+        state_hash="abc",
+        measures=measures,
+        clock={"wall_s": wall_s},
+    )  # type: ignore[arg-type]
+
+
+LOG = driven(SUITE.scenarios[0], [1.0] * 3).encoded()
+"""Of three ticks, as `record` has."""
+
+
+def on_disk(folder: RunFolder, kept: Record, under: str = "") -> None:
+    """Write the files of an episode, and no row. under: in the folder of another one."""
+    place = folder.episode_folder(under or kept.scenario)
+    place.mkdir(parents=True, exist_ok=True)
+    (place / "trajectory.npz").write_bytes(LOG)
+    kept.save(place / "record.json")
+
+
+def test_the_table_does_not_depend_on_the_order_in_which_episodes_end(tmp_path: Path) -> None:
+    """Rows are sorted by scenario and hold no wall times, so two runs give the same bytes."""
+    for name, order in (("a", (0, 1, 2)), ("b", (2, 0, 1))):
+        with RunFolder.create(tmp_path / name, SPEC, SUITE) as folder:
+            for i in order:
+                folder.add(record(f"s-{i}", wall_s=float(np.random.default_rng().random())))
+            folder.finish()
+    assert (tmp_path / "a/results.csv").read_bytes() == (tmp_path / "b/results.csv").read_bytes()
+
+
+def test_a_folder_that_holds_a_run_is_not_overwritten(tmp_path: Path) -> None:
+    """A second run into a folder is refused, and so is a folder of other things; a run killed at
+    once begins anew."""
+    with RunFolder.create(tmp_path / "run", SPEC, SUITE):
+        pass
+    with pytest.raises(RunError, match=r"already holds a run\. Add --resume"):
+        RunFolder.create(tmp_path / "run", SPEC, SUITE)
+    (tmp_path / "begun/episodes").mkdir(parents=True)
+    (tmp_path / "begun/lock").touch()
+    with RunFolder.create(tmp_path / "begun", SPEC, SUITE) as folder:
+        assert folder.finished() == set()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/photo.png").touch()
+    with pytest.raises(RunError, match="is no run folder"):
+        RunFolder.create(tmp_path / "other", SPEC, SUITE)
+
+
+def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
+    """While one run holds the folder a second one is told which process does."""
+    with (
+        RunFolder.create(tmp_path / "run", SPEC, SUITE),
+        pytest.raises(RunError, match=r"in use by process \d+"),
+    ):
+        RunFolder.resume(tmp_path / "run", SPEC).__enter__()
+
+
+def test_a_folder_is_locked_before_it_is_written(tmp_path: Path) -> None:
+    """Of two runs that find the same folder empty at the same moment the second one writes
+    nothing."""
+    mine, other = (
+        msgspec.structs.replace(SPEC, policy="p"),
+        msgspec.structs.replace(SPEC, policy="q"),
+    )
+    first, second = (RunFolder.create(tmp_path / "run", spec, SUITE) for spec in (mine, other))
+    with first, pytest.raises(RunError, match=r"in use by process \d+"):
+        second.__enter__()
+    with pytest.raises(RunError, match="already holds a run"):
+        second.__enter__()
+    assert read_spec(tmp_path / "run") == mine
+    with RunFolder.resume(tmp_path / "run", mine):
+        pass
+
+
+def test_a_run_folder_stays_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A relative path means the folder it meant when the run began, wherever the process goes."""
+    monkeypatch.chdir(tmp_path)
+    with RunFolder.create(Path("run"), SPEC, SUITE) as folder:
+        monkeypatch.chdir("/")
+        folder.add(record("s-0"))
+        assert (
+            folder.finished() == {"s-0"}
+            and folder.episode_folder("s-0") == tmp_path / "run/episodes/s-0"
+        )
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("policy", "q"),
+        ("suite_version", "2-groups0.4"),
+        ("suite_hash", "0"),
+        ("renderer", "other"),
+        ("versions", {"numpy": "1"}),
+        ("counterfactual", True),
+        ("waypoints", WaypointRule(rule="atan2")),
+        ("seed", 8),
+        ("camera", CameraSpec(512, 288)),
+        ("rate_hz", 5.0),
+        ("cameras", {"left": CameraSpec(mount="left")}),
+        ("goal_protocol", "route_point"),
+        ("odometry", "gps"),
+    ],
+)
+def test_resuming_with_something_else_is_refused(tmp_path: Path, field: str, value: object) -> None:
+    """Another policy, suite or version would mix two runs: the difference is named."""
+    with RunFolder.create(tmp_path / "run", SPEC, SUITE):
+        pass
+    other = msgspec.structs.replace(SPEC, **{field: value})
+    with pytest.raises(RunError, match=f"is of another run: its {field} is"):
+        RunFolder.resume(tmp_path / "run", other)
+
+
+def test_another_waypoint_rule_is_told_in_words(tmp_path: Path) -> None:
+    """The one of the run, and the one that is asked for now."""
+    with RunFolder.create(tmp_path / "run", SPEC, SUITE):
+        pass
+    other = msgspec.structs.replace(SPEC, waypoints=WaypointRule(index=0, dt_s=0.2, rule="atan2"))
+    with pytest.raises(RunError) as caught:
+        RunFolder.resume(tmp_path / "run", other)
+    assert (
+        "its waypoints is waypoint 2, units of 1 m, in 0.25 s, shipped, now asked for is waypoint "
+        "0, units of 1 m, in 0.2 s, atan2. Resume with the same command"
+    ) in str(caught.value)
+
+
+def test_another_camera_is_told_in_words(tmp_path: Path) -> None:
+    """Mount, size, field of view and crop of both."""
+    spec = msgspec.structs.replace(SPEC, camera=CameraSpec(512, 288, 60.0))
+    with RunFolder.create(tmp_path / "run", spec, SUITE):
+        pass
+    other = msgspec.structs.replace(
+        SPEC, camera=CameraSpec(512, 288, 60.0, "mast", crop=(0, 88, 512, 288))
+    )
+    with pytest.raises(RunError) as caught:
+        RunFolder.resume(tmp_path / "run", other)
+    assert (
+        "its camera is front, 512 x 288 px, 60 deg, now asked for is mast, 512 x 288 px, 60 deg, "
+        "crop 0 88 512 288. Resume with the same command"
+    ) in str(caught.value)
+    with RunFolder.resume(tmp_path / "run", spec) as again:
+        assert again.spec.camera == spec.camera
+
+
+def test_every_row_tells_how_waypoints_were_followed(tmp_path: Path) -> None:
+    """From the record, which holds the rule itself."""
+    scaled = msgspec.structs.replace(record("s-0"), waypoints=WaypointRule(index=4, unit_m=0.25))
+    scaled.save(tmp_path / "record.json")
+    kept = Record.load(tmp_path / "record.json")
+    assert kept.waypoints == WaypointRule(index=4, unit_m=0.25)
+    assert table_row(kept)["waypoints"] == "waypoint 4, units of 0.25 m, in 0.25 s, shipped"
+
+
+def test_resuming_with_an_edited_policy_is_refused(tmp_path: Path) -> None:
+    """Also when its version was left as it was: the policy is named."""
+    spec = msgspec.structs.replace(SPEC, policy_source="1111")
+    with RunFolder.create(tmp_path / "run", spec, SUITE):
+        pass
+    with pytest.raises(
+        RunError, match="is of another run: the source of policy 'p' was edited since it began"
+    ):
+        RunFolder.resume(tmp_path / "run", msgspec.structs.replace(SPEC, policy_source="2222"))
+    with RunFolder.resume(tmp_path / "run", spec):
+        pass
+
+
+def garbage(database: Path) -> None:
+    database.write_bytes(b"nothing that sqlite wrote" * 1000)
+
+
+def cut_off(database: Path) -> None:
+    database.write_bytes(database.read_bytes()[:5000])
+
+
+def overwritten(database: Path) -> None:
+    body = bytearray(database.read_bytes())
+    body[4096:8192] = b"\xff" * 4096
+    database.write_bytes(bytes(body))
+
+
+def another_table(database: Path) -> None:
+    database.unlink()
+    with closing(sqlite3.connect(database)) as connection, connection:
+        connection.execute("create table episodes (name text)")
+
+
+def odd_rows(database: Path) -> None:
+    with closing(sqlite3.connect(database)) as connection, connection:
+        connection.execute("update episodes set record = '{'")
+
+
+def null_rows(database: Path) -> None:
+    with closing(sqlite3.connect(database)) as connection, connection:
+        connection.execute("update episodes set record = null, row = x'00'")
+
+
+DAMAGES = {
+    damage.__name__: damage
+    for damage in (garbage, cut_off, overwritten, another_table, odd_rows, null_rows)
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_damaged_database_is_made_anew_from_the_records(tmp_path: Path, name: str) -> None:
+    """Whatever happened to results.sqlite: showing it says the remedy, and resuming finds every
+    record on disk."""
+    with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
+        for i in (2, 0):
+            folder.keep(record(f"s-{i}"), LOG)
+            os.utime(folder.episode_folder(f"s-{i}") / "record.json", (0, 10 - i))
+    DAMAGES[name](tmp_path / "run/results.sqlite")
+    with pytest.raises(
+        RunError, match=r"results\.sqlite is damaged .*--resume, which makes it anew"
+    ):
+        read_records(tmp_path / "run")
+    if name != "odd_rows":
+        with pytest.raises(RunError, match=r"results\.sqlite is damaged"):
+            read_rows(tmp_path / "run")
+    with RunFolder.resume(tmp_path / "run", SPEC) as again:
+        assert again.finished() == {"s-0", "s-2"}
+        (note,) = again.notes
+        assert "results.sqlite was damaged (" in note and "made anew from 2 records" in note
+    assert [r.scenario for r in read_records(tmp_path / "run")] == ["s-2", "s-0"]
+    assert (tmp_path / "run/results.sqlite.damaged").exists()
+
+
+def test_a_database_without_its_log_is_made_whole(tmp_path: Path) -> None:
+    """A run that was killed leaves a write-ahead log; when it is deleted, or everything is, the
+    records count."""
+    for lost in ("results.sqlite-wal", "results.sqlite"):
+        path = tmp_path / lost
+        code = (
+            "import os, sys; from pathlib import Path; sys.path.insert(0, sys.argv[2]);from "
+            "test_run_folder import *; held = RunFolder.create(Path(sys.argv[1]), SPEC, "
+            "SUITE).__enter__();keep = sqlite3.connect(held.path / 'results.sqlite'); "
+            "keep.execute('select * from episodes').fetchall();held.keep(record('s-1'), LOG); "
+            "os.kill(os.getpid(), 9)"
+        )
+        killed = subprocess.run(
+            [sys.executable, "-c", code, str(path), str(Path(__file__).parent)], check=False
+        )
+        assert killed.returncode == -9 and (path / "results.sqlite-wal").stat().st_size > 0
+        (path / lost).unlink()
+        with RunFolder.resume(path, SPEC) as again:
+            assert again.finished() == {"s-1"}
+        assert [r.scenario for r in read_records(path)] == ["s-1"]
+
+
+def test_a_database_that_goes_during_a_run_is_told_with_the_remedy(tmp_path: Path) -> None:
+    """Deleted or overwritten while it is in use: wrong from then on, and whole again after
+    --resume."""
+    with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
+        (tmp_path / "run/results.sqlite").write_bytes(b"no database" * 1000)
+        with pytest.raises(RunError, match=r"results\.sqlite is damaged .*--resume"):
+            folder.keep(record("s-0"), LOG)
+        for path in (tmp_path / "run").glob("results.sqlite*"):
+            path.unlink()
+        with pytest.raises(RunError, match=r"results\.sqlite is damaged .*--resume"):
+            folder.keep(record("s-0"), LOG)
+    with RunFolder.resume(tmp_path / "run", SPEC) as again:
+        assert again.finished() == {"s-0"}
+
+
+def test_records_without_a_database_are_not_shown_as_nothing(tmp_path: Path) -> None:
+    """`show` says the remedy."""
+    with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
+        folder.episode_folder("s-0").mkdir()
+        record("s-0").save(folder.episode_folder("s-0") / "record.json")
+    (tmp_path / "run/results.sqlite").unlink()
+    with pytest.raises(RunError, match=r"results\.sqlite is gone: .*--resume"):
+        read_records(tmp_path / "run")
+
+
+def test_a_damaged_record_is_run_again(tmp_path: Path) -> None:
+    """Neither a broken record nor one of another scenario counts as finished; which it was is
+    said."""
+    with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
+        for i in range(3):
+            folder.episode_folder(f"s-{i}").mkdir()
+        (folder.episode_folder("s-0") / "record.json").write_text("{")
+        on_disk(folder, record("s-2"), "s-1")
+        on_disk(folder, record("s-2"))
+    with RunFolder.resume(tmp_path / "run", SPEC) as again:
+        assert again.finished() == {"s-2"}
+        assert len(again.notes) == 2 and all(
+            note.endswith("This episode is run again.") for note in again.notes
+        )
+
+
+def test_nothing_of_an_earlier_attempt_stays_beside_a_crash(tmp_path: Path) -> None:
+    """A run killed after it wrote a trajectory and before the record: the next attempt begins with
+    an empty folder."""
+    with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
+        folder.keep_frame("s-0", 4, b"png")
+        for name in ("trajectory.npz", "trajectory.npz.part", "record.json.part"):
+            (folder.episode_folder("s-0") / name).write_bytes(b"of the first attempt")
+    with RunFolder.resume(tmp_path / "run", SPEC) as again:
+        again.forget("s-0")
+        again.keep(record("s-0", status="crashed"))
+        assert [path.name for path in again.episode_folder("s-0").iterdir()] == ["record.json"]
+
+
+def test_an_episode_whose_row_was_lost_to_a_kill_is_taken_in(tmp_path: Path) -> None:
+    """A record on disk without a row counts as finished when the run is resumed; one that is not
+    its row's does not."""
+    folder = RunFolder.create(tmp_path / "run", SPEC, SUITE)
+    with folder:
+        folder.add(record("s-0", success=1.0))
+        for name in ("s-0", "s-1"):
+            on_disk(folder, record(name, success=0.0))
+    with RunFolder.resume(tmp_path / "run", SPEC) as again:
+        assert (
+            again.finished() == {"s-1"}
+            and "not what results.sqlite has of this episode" in again.notes[0]
+        )
+    assert {r.scenario: r.measures["success"] for r in read_records(tmp_path / "run")} == {
+        "s-1": 0.0
+    }
+
+
+def test_a_crashed_episode_counts_as_a_failure(tmp_path: Path) -> None:
+    """Crashed episodes stay in the means as the worst there is, and are absent where there is no
+    worst."""
+    crashed = msgspec.structs.replace(record("s-1", status="crashed"), measures={}, reason="boom")
+    table = table_of([record("s-0"), crashed])
+    summary = summary_of(table)
+    assert summary.loc["success", "mean"] == 0.5
+    assert summary.loc["success", "n"] == 2
+    assert (
+        summary.loc["velocity_mean_mps", "mean"],
+        summary.loc["pedestrian_collision", "mean"],
+    ) == (0.0, 1.0)
+    assert summary.loc["stalled_time_s", "n"] == 0
+
+
+def test_a_folder_without_a_run_is_named(tmp_path: Path) -> None:
+    """What is no run folder is answered with what it lacks and the runs that lie in it and beside
+    it; a file with what a run is."""
+    for name in ("mine", "runs/theirs"):
+        with RunFolder.create(tmp_path / name, SPEC, SUITE):
+            pass
+    (tmp_path / "file").touch()
+    for name, told in (
+        ("other", "unknown run '{run}'. Valid choices: {beside}/mine. Did you mean"),
+        (
+            "runs",
+            "{run} is no run folder: it holds no run.json. Runs in it and beside it: "
+            "{beside}/mine, {run}/theirs",
+        ),
+        ("file", "{run} is no run folder: a file is there, and a run is a folder with run.json"),
+    ):
+        with pytest.raises(
+            UsageError, match=re.escape(told.format(run=tmp_path / name, beside=tmp_path))
+        ):
+            read_records(tmp_path / name)
+
+
+@pytest.mark.parametrize("below", ["run", "runs/run"])
+def test_a_run_below_a_file_is_told_which_file_and_where_else(tmp_path: Path, below: str) -> None:
+    """The path leads through a file: that file is named, and a place beside it."""
+    (tmp_path / "file").touch()
+    path = tmp_path / "file" / below
+    told = (
+        f"{path}: cannot be written: {tmp_path / 'file'} is a file, no folder: choose a place "
+        f"beside it, like "
+    )
+    with pytest.raises(MachineError, match=re.escape(f"{told}{tmp_path / below}")):
+        RunFolder.create(path, SPEC, SUITE).__enter__()
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"{", b'{"scenario": 3}', b"\x80\x04pickle"],
+    ids=["empty", "cut short", "of numbers", "pickled"],
+)
+def test_a_damaged_record_is_named(tmp_path: Path, content: bytes) -> None:
+    """A record that is cut off or of another kind is refused with its path."""
+    path = tmp_path / "record.json"
+    path.write_bytes(content)
+    with pytest.raises(RunError, match=r"record\.json: not an episode record"):
+        Record.load(path)
+
+
+def test_a_log_survives_the_disk(tmp_path: Path) -> None:
+    """A saved trajectory reads back the same; a broken file is named."""
+    arrays = {
+        "pose": np.ones((2, 3)),
+        "speed": np.ones((2, 2)),
+        "command": np.ones((2, 2)),
+        "people_xy": np.ones((1, 2)),
+        "event_tracks": np.ones((1, 5)),
+    }
+    names = (
+        "route_s_m",
+        "travelled_m",
+        "person_m",
+        "clearance_m",
+        "collision_in_s",
+        "reset_s_m",
+        "waits_at_red",
+        "on_carriageway",
+        "vehicles_braked",
+    )
+    vectors = {name: np.ones(2) for name in names}
+    log = Log(
+        tick_s=0.05,
+        people_tick=np.ones(1, int),
+        people_kind=np.ones(1, np.int8),
+        people_age=np.ones(1, np.int8),
+        **arrays,
+        **vectors,
+    )  # type: ignore[arg-type]
+    (tmp_path / "t.npz").write_bytes(log.encoded())
+    again = Log.load(tmp_path / "t.npz")
+    assert again.tick_s == 0.05 and np.array_equal(again.pose, log.pose)
+    (tmp_path / "broken.npz").write_bytes((tmp_path / "t.npz").read_bytes()[:100])
+    with pytest.raises(RunError, match=r"broken\.npz: not a trajectory"):
+        Log.load(tmp_path / "broken.npz")
+
+
+def test_a_crashed_episode_has_no_picture(tmp_path: Path, cosim: Cosim) -> None:
+    """Asked for one, `cosim show` refuses in words; without, it tells what became of the
+    episode."""
+    with RunFolder.create(tmp_path / "run", SPEC, SUITE) as held:
+        held.keep(record("s-0", status="crashed"))
+    said = cosim("show", "run", "--episode", "s-0", "-o", "above.png", cwd=tmp_path)
+    assert (
+        said.returncode == 2 and "episode 's-0' is crashed: it has no track to draw" in said.stderr
+    )
+    assert not (tmp_path / "above.png").exists()
+    assert cosim("show", "run", "--episode", "s-0", cwd=tmp_path).returncode == 0

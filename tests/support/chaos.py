@@ -1,0 +1,325 @@
+"""Chaos: a run of tiny episodes by several workers, while these and the coordinator are killed,
+stopped and replaced.
+
+    python -m tests.support.chaos --episodes 500 --workers 4 --seeds 5
+
+Its results must be those of a quiet `cosim run` to the byte: none missing, none twice, none other.
+One scenario is poison: it kills whatever process runs it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Final, Literal, NamedTuple
+
+import msgspec
+
+from cosim.core.errors import EngineError
+from cosim.core.state import Command
+from cosim.episode.interfaces import Observation
+from cosim.results.run_folder import read_records
+from cosim.spec.episode_id import pseudonym_of
+from cosim.spec.manifest import Manifest
+from cosim.spec.scenario import Suite, write_suite
+from scenarios.runs.status import CONFLICT, LOG_FILE
+from scenarios.tools.verify.doctor import small_scenario
+
+Blow = Literal["kill worker", "kill process", "stop worker", "end worker", "kill coordinator"]
+_BLOWS: Final[Sequence[Blow]] = (
+    "kill worker",
+    "kill worker",
+    "stop worker",
+    "end worker",
+    "kill coordinator",
+)
+_POISON: Final = "COSIM_CHAOS_POISON"
+_SEED: Final = 7
+_LIMIT_S: Final = 2.0
+_STOPPED_S: Final = (0.5, 5.0)
+_AWAY_S: Final = (0.0, 2.0)
+_POLL_S: Final = 0.05
+
+
+class Poisoned:
+    """Drives straight on; of the episode that is named in the environment it kills its own
+    process."""
+
+    manifest = Manifest("poisoned", camera=None)
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        if episode_id == os.environ.get(_POISON):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    def act(self, observation: Observation) -> Command:
+        return Command(0.8, 0.0)
+
+
+class PlannedBlow(NamedTuple):
+    """A fault, and how many episodes are finished when it happens."""
+
+    finished: int
+    fault: Blow
+
+
+class UnderFire(NamedTuple):
+    """What came out: episodes, faults that happened, seconds, and why it did not come to its end,
+    in words."""
+
+    episodes: int
+    faults: Counter[str]
+    wall_s: float
+    wrong: list[str]
+
+
+def planned_blows(episodes: int, seed: int) -> list[PlannedBlow]:
+    """Random faults, one for about ten episodes, and two of environment processes."""
+    draw = random.Random(seed)
+    faults: list[Blow] = [draw.choice(_BLOWS) for _ in range(max(episodes // 10, 4))]
+    planned = [
+        PlannedBlow(draw.randrange(1, max(int(0.95 * episodes), 2)), fault) for fault in faults
+    ]
+    apart = [PlannedBlow(share * episodes // 3, "kill process") for share in (1, 2)]
+    return sorted([*planned, *apart])
+
+
+def tiny_suite(folder: Path, episodes: int) -> None:
+    """Write the suite of all runs in `folder`, and what its poison is called before the policy."""
+    one = small_scenario()
+    suite = Suite(
+        name="chaos",
+        version="1",
+        scenarios=tuple(
+            msgspec.structs.replace(one, id=f"tiny-{i:03d}", seed=i, time_limit_s=_LIMIT_S)
+            for i in range(episodes)
+        ),
+    )
+    write_suite(suite, folder / "suite.json")
+    poison = pseudonym_of(_SEED, suite.scenarios[episodes // 2]).episode
+    (folder / "poison").write_text(poison)
+
+
+def quiet(folder: Path, jobs: int) -> Path:
+    """The run that chaos is held against, of the suite in `folder`. Returns its run folder."""
+    done = subprocess.run(
+        _command(folder, "run", "quiet", "--jobs", str(jobs)),
+        env=_env(folder),
+        check=False,
+        capture_output=True,
+        text=True,
+    )
+    if done.returncode != 1:  # the poison crashes
+        raise EngineError(
+            f"the quiet run ended with exit code {done.returncode}: {done.stderr[-1000:]}"
+        )
+    return folder / "quiet"
+
+
+def chaos(
+    folder: Path,
+    name: str,
+    workers: int,
+    planned: Sequence[PlannedBlow],
+    seed: int,
+    *,
+    replaced: bool = True,
+) -> UnderFire:
+    """Run the suite in `folder` by `workers` workers and with faults, into the run folder `name`
+    there.
+
+    replaced: who is gone is replaced by another worker."""
+    run = folder / name
+    began_s = time.monotonic()
+    happened = Counter[str]()
+    draw = random.Random(seed)
+    left = list(planned)
+    with _crew(folder, name, workers, replaced) as crew:
+        while (code := crew.coordinator.poll()) is None or code not in (0, 1):
+            if code is not None:
+                said = (folder / f"{name}.log").read_text(errors="replace")[-1000:]
+                return UnderFire(
+                    0,
+                    happened,
+                    time.monotonic() - began_s,
+                    [f"coordinator: exit code {code}: {said}"],
+                )
+            crew.tend()
+            finished = len(list(run.glob("episodes/*/record.json")))
+            if left and finished >= left[0].finished:
+                fault = left[0].fault
+                if crew.suffer(fault, draw):
+                    happened[left.pop(0).fault] += 1
+            time.sleep(_POLL_S)
+    return UnderFire(len(read_records(run)), happened, time.monotonic() - began_s, [])
+
+
+class _Crew:
+    """The processes of a run."""
+
+    def __init__(self, folder: Path, name: str, workers: int, replaced: bool) -> None:
+        self._folder = folder
+        self._name = name
+        self._replaced = replaced
+        self._endpoint = f"unixsock-stream/{folder}/{name}.sock"
+        self._stopped: list[tuple[float, subprocess.Popen[bytes]]] = []
+        self.coordinator = self._coordinate()
+        self.workers = [self._work() for _ in range(workers)]
+
+    def tend(self) -> None:
+        """Wake who was stopped for long enough, and replace workers that are gone."""
+        for at, (until_s, one) in reversed(list(enumerate(self._stopped))):
+            if time.monotonic() > until_s:
+                one.send_signal(signal.SIGCONT)
+                del self._stopped[at]
+        there = [one for one in self.workers if one.poll() is None]
+        self.workers = there + [self._work() for _ in self.workers[len(there) :] if self._replaced]
+
+    def suffer(self, fault: Blow, draw: random.Random) -> bool:
+        """Let something happen to somebody. Returns whether it could."""
+        one = draw.choice(self.workers)
+        if fault == "kill worker":
+            one.kill()
+        elif fault == "end worker":
+            one.terminate()
+        elif fault == "stop worker":
+            one.send_signal(signal.SIGSTOP)
+            self._stopped.append((time.monotonic() + draw.uniform(*_STOPPED_S), one))
+        elif fault == "kill process":
+            return any(_kill_below(one.pid) for one in self.workers)
+        else:
+            self.coordinator.kill()
+            self.coordinator.wait()
+            time.sleep(draw.uniform(*_AWAY_S))
+            self.coordinator = self._coordinate()
+        return True
+
+    def end(self) -> None:
+        for one in [self.coordinator, *self.workers]:
+            with suppress(ProcessLookupError):
+                one.send_signal(signal.SIGCONT)
+            one.kill()
+            one.wait()
+
+    def _coordinate(self) -> subprocess.Popen[bytes]:
+        more = ["--resume"] if (self._folder / self._name / "run.json").exists() else []
+        command = _command(
+            self._folder, "coordinator", self._name, "--listen", self._endpoint, *more
+        )
+        return self._started(command, self._name)
+
+    def _work(self) -> subprocess.Popen[bytes]:
+        command = [sys.executable, "-m", "cosim", "worker", "--connect", self._endpoint]
+        return self._started(command, f"{self._name}-workers")
+
+    def _started(self, command: list[str], log: str) -> subprocess.Popen[bytes]:
+        with (self._folder / f"{log}.log").open("ab") as said:
+            return subprocess.Popen(command, env=_env(self._folder), stdout=said, stderr=said)
+
+
+@contextmanager
+def _crew(folder: Path, name: str, workers: int, replaced: bool) -> Iterator[_Crew]:
+    crew = _Crew(folder, name, workers, replaced)
+    try:
+        yield crew
+    finally:
+        crew.end()
+
+
+def _command(folder: Path, verb: str, name: str, *more: str) -> list[str]:
+    policy = f"{__spec__.name if __spec__ else __name__}:{Poisoned.__name__}"
+    words = [
+        verb,
+        str(folder / "suite.json"),
+        "--policy",
+        policy,
+        "--seed",
+        str(_SEED),
+        "--out",
+        str(folder / name),
+    ]
+    return [sys.executable, "-m", "cosim", *words, *more]
+
+
+def _env(folder: Path) -> dict[str, str]:
+    return os.environ | {_POISON: (folder / "poison").read_text()}
+
+
+def _kill_below(pid: int) -> bool:
+    """Kill an environment process of a worker: the child of its shepherd. False where there is none
+    now."""
+    for shepherd in _children(pid):
+        for process in _children(shepherd):
+            with suppress(ProcessLookupError):
+                os.kill(process, signal.SIGKILL)
+                return True
+    return False
+
+
+def _children(pid: int) -> list[int]:
+    found = []
+    for path in Path("/proc", str(pid), "task").glob("*/children"):
+        with suppress(OSError):
+            found += [int(word) for word in path.read_text().split()]
+    return found
+
+
+def differences(reference: Path, run: Path) -> list[str]:
+    """What is wrong with a run, held against a quiet one, in words."""
+    wrong = []
+    quiet_csv, csv = ((one / "results.csv").read_bytes() for one in (reference, run))
+    if quiet_csv != csv:
+        lines = zip(quiet_csv.decode().splitlines(), csv.decode().splitlines(), strict=False)
+        other = next((f"{b} in place of {a}" for a, b in lines if a != b), "of other length")
+        wrong.append(f"results.csv differs: {other[:400]}")
+    hashes = [
+        sorted((r.scenario, r.state_hash) for r in read_records(one)) for one in (reference, run)
+    ]
+    if hashes[0] != hashes[1]:
+        wrong.append("state hashes differ")
+    if CONFLICT in (log := (run / LOG_FILE).read_text(errors="replace")):
+        wrong += [line for line in log.splitlines() if CONFLICT in line]
+    return wrong
+
+
+def _main() -> int:
+    parser = argparse.ArgumentParser(
+        description="Runs under fire: results must be those of a quiet run."
+    )
+    for option, value in (("episodes", 500), ("workers", 4), ("seeds", 5), ("first", 0)):
+        parser.add_argument(f"--{option}", type=int, default=value)
+    parser.add_argument("--folder", type=Path, help="a new one, kept; default: a temporary one")
+    given = parser.parse_args()
+    folder = (given.folder or Path(tempfile.mkdtemp(prefix="cosim-chaos-"))).absolute()
+    folder.mkdir(parents=True, exist_ok=True)
+    began_s = time.monotonic()
+    tiny_suite(folder, given.episodes)
+    reference = quiet(folder, given.workers)
+    print(f"quiet run: {time.monotonic() - began_s:.0f} s", flush=True)
+    wrong = 0
+    for seed in range(given.first, given.first + given.seeds):
+        found = chaos(
+            folder, f"chaos-{seed}", given.workers, planned_blows(given.episodes, seed), seed
+        )
+        faulty = found.wrong or differences(reference, folder / f"chaos-{seed}")
+        wrong += bool(faulty)
+        faults = ", ".join(f"{count} x {fault}" for fault, count in sorted(found.faults.items()))
+        ends = "; ".join(faulty) or "as in the quiet run to the byte"
+        print(
+            f"seed {seed}: {found.episodes} episodes in {found.wall_s:.0f} s, {faults}: {ends}",
+            flush=True,
+        )
+    return int(wrong > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(_main())

@@ -1,0 +1,142 @@
+"""Run folders as runs leave them, of episodes on a straight way that are told here and driven by
+nobody."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from cosim.core.clock import Clock
+from cosim.core.geometry import Pose
+from cosim.episode.loop import place_on_route
+from cosim.results.log import Log
+from cosim.results.metrics import EpisodeFacts, every_metric
+from cosim.results.record import METRIC_SCHEMA, Record, begun
+from cosim.results.referee import Failure
+from cosim.results.run_folder import RunFolder
+from cosim.results.run_spec import RunSpec
+from cosim.spec.manifest import Manifest
+from cosim.spec.scenario import City, Scenario, Suite
+
+SPEED_MPS = 1.0
+HIT = "hit"
+"""Of an episode: it ends half-way, by a collision with a wall."""
+
+
+def short_way(name: str, **fields: object) -> Scenario:
+    """9 m straight on, over at the first failure or after 12 s."""
+    known: dict[str, object] = {
+        "id": name,
+        "suite": "s",
+        "place": City(seed=0),
+        "seed": 0,
+        "start": (0.0, 0.0, 0.0),
+        "goal": (9.0, 0.0),
+        "route": ((0.0, 0.0), (9.0, 0.0)),
+        "ends_on_failure": True,
+        "time_limit_s": 12.0,
+        "structure": "straight",
+    }
+    return Scenario(**known | fields)  # type: ignore[arg-type]
+
+
+def driven(
+    scenario: Scenario, speeds_mps: Sequence[float], resets: dict[int, float] | None = None
+) -> Log:
+    """The log of a robot on the x axis that drives so fast, tick by tick; resets: tick -> arc
+    length it is put at."""
+    tick_s = Clock().tick_s
+    count = len(speeds_mps)
+    x_m = before_m = 0.0
+    pose = np.zeros((count, 3))
+    route_s_m = np.zeros(count)
+    reset_s_m = np.full(count, np.nan)
+    for k, v_mps in enumerate(speeds_mps):
+        x_m += v_mps * tick_s
+        pose[k, 0] = x_m
+        before_m = route_s_m[k] = place_on_route(scenario.route_line, Pose(x_m, 0.0, 0.0), before_m)
+        if resets and k in resets:
+            x_m = before_m = reset_s_m[k] = resets[k]
+    away_m = np.hypot(pose[:, 0] - 4.0, 1.5)
+    nothing = np.zeros(count)
+    nobody = np.zeros(0)
+    return Log(
+        tick_s=tick_s,
+        pose=pose,
+        speed=np.column_stack([speeds_mps, nothing]),
+        command=np.column_stack([speeds_mps, nothing]),
+        route_s_m=route_s_m,
+        travelled_m=np.abs(speeds_mps) * tick_s,
+        person_m=away_m,
+        clearance_m=away_m - 0.6,
+        collision_in_s=np.full(count, np.inf),
+        reset_s_m=reset_s_m,
+        waits_at_red=nothing > 0.0,
+        on_carriageway=nothing > 0.0,
+        vehicles_braked=nothing.astype(np.int64),
+        people_tick=nobody.astype(np.int64),
+        people_xy=np.zeros((0, 2)),
+        people_kind=nobody.astype(np.int8),
+        people_age=nobody.astype(np.int8),
+        event_tracks=np.zeros((0, 5)),
+    )
+
+
+def failure_at(log: Log, tick: int, kind: str = "collision") -> Failure:
+    """What a log says of a failure at a tick."""
+    x_m, y_m, _ = log.pose[tick].tolist()
+    speed_mps = (
+        abs(float(log.speed[tick - 1, 0])) if tick and np.isnan(log.reset_s_m[tick - 1]) else 0.0
+    )
+    other = {"other": "wall", "other_kind": "wall"} if kind == "collision" else {}
+    return Failure(kind, tick, x_m, y_m, float(log.route_s_m[tick]), speed_mps, **other)  # type: ignore[arg-type]
+
+
+def episode_of(
+    scenario: Scenario, suite_hash: str, how: str = "goal", policy: str = "p"
+) -> tuple[Record, Log | None]:
+    """The record and log of a short way. how: "goal"; HIT; "crashed"; "invalid"."""
+    record = begun(scenario, Manifest(policy, camera=None), suite_hash)
+    if how in ("crashed", "invalid"):
+        return msgspec.structs.replace(record, status=how, reason="it said so"), None
+    whole = driven(scenario, [SPEED_MPS] * 161)
+    ticks = int(np.argmax(whole.pose[:, 0] >= 8.0)) + 1 if how == "goal" else 80
+    log = driven(scenario, [SPEED_MPS] * ticks)
+    failures = (failure_at(log, ticks - 1),) if how == HIT else ()
+    ended = "goal" if how == "goal" else "failure"
+    record = msgspec.structs.replace(
+        record, status="done", ended=ended, ticks=ticks, failures=failures
+    )
+    return msgspec.structs.replace(
+        record, measures=every_metric(EpisodeFacts.of(record, scenario, log))
+    ), log
+
+
+def run_of(
+    path: Path, hows: Sequence[str], policy: str = "p", scenarios: Sequence[Scenario] = ()
+) -> Path:
+    """A finished run of one short way after the other, each as `episode_of` says; s-000, s-001 and
+    so on."""
+    ways = tuple(scenarios) or tuple(short_way(f"s-{i:03d}") for i in range(len(hows)))
+    suite = Suite(name="s", version="1", scenarios=ways)
+    spec = RunSpec(
+        suite="s",
+        robots={"courier": "h"},
+        suite_version="1",
+        suite_hash=suite.content_hash,
+        policy=policy,
+        policy_name=policy,
+        policy_version="1",
+        scenarios=tuple(way.id for way in ways),
+        versions={"numpy": "2"},
+        metric_schema=METRIC_SCHEMA,
+    )
+    with RunFolder.create(path, spec, suite) as folder:
+        for way, how in zip(ways, hows, strict=True):
+            record, log = episode_of(way, suite.content_hash, how, policy)
+            folder.keep(record, log.encoded() if log is not None else b"")
+        folder.finish()
+    return path
