@@ -66,8 +66,10 @@ class Packed:
         rows apart; before its episode's first row that one, as a policy fills its memory.
 
         >>> two = np.zeros((3, 2), np.float32)
-        >>> rows = Packed(np.zeros((3, 9, 16, 3), np.uint8), two, two, two, two[:, None], np.zeros(3, np.int32),
-        ...     np.zeros(3, bool), np.array([0, 0, 1], np.int32), np.array([0, 1, 0], np.int32), {})
+        >>> rgb = np.zeros((3, 9, 16, 3), np.uint8)
+        >>> none, driven = np.zeros(3, bool), np.zeros(3, np.int32)
+        >>> episode, frame = np.array([[0, 0, 1], [0, 1, 0]], np.int32)
+        >>> rows = Packed(rgb, two, two, two, two[:, None], driven, none, episode, frame, {})
         >>> rows.history(2).tolist()
         [[0, 0], [0, 1], [2, 2]]
         """

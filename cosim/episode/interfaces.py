@@ -58,7 +58,8 @@ class Observation:
     `Policy.reset` tells.
 
     >>> from cosim.spec.robot import COURIER
-    >>> Observation(tick=5, time_s=0.25, rgb=None, v_mps=0.8, w_radps=0.0, robot=COURIER).privileged is None
+    >>> now = Observation(tick=5, time_s=0.25, rgb=None, v_mps=0.8, w_radps=0.0, robot=COURIER)
+    >>> now.privileged is None
     True
     """
 
@@ -132,7 +133,7 @@ class BatchPolicy(Policy, Protocol):
     ...         return self.act_batch([observation])[0]
     ...
     ...     def act_batch(self, observations):
-    ...         pictures = np.stack([observation.rgb for observation in observations])  # (B, H, W, 3)
+    ...         pictures = np.stack([one.rgb for one in observations])  # (B, H, W, 3)
     ...         return [Command(1.0, 0.0) for _ in pictures]
     """
 

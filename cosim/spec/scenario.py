@@ -218,8 +218,10 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
     All points are in the net's frame: x east, y north; headings in radians, 0 east,
     counter-clockwise. Raises SpecError where fields contradict each other.
 
-    >>> Scenario(id="a", suite="mine", place=City(seed=1, size_m=500.0), seed=0, start=(0.0, 0.0, 0.0),
-    ...          goal=(12.0, 0.0), route=((0.0, 0.0), (12.0, 0.0))).time_limit_s
+    >>> Scenario(
+    ...     id="a", suite="mine", place=City(seed=1, size_m=500.0), seed=0,
+    ...     start=(0.0, 0.0, 0.0), goal=(12.0, 0.0), route=((0.0, 0.0), (12.0, 0.0)),
+    ... ).time_limit_s
     300.0
     """
 

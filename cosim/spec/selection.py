@@ -55,8 +55,13 @@ def selection_in_words(whole: Suite, ids: Sequence[str]) -> str:
     """How many scenarios of a suite these are, and the options of `cosim run` that choose them.
 
     >>> from cosim.spec.scenario import City
-    >>> one, other = (Scenario(id=name, suite="s", place=City(seed=0), seed=0, start=(0.0, 0.0, 0.0), goal=(9.0, 0.0),
-    ...     route=((0.0, 0.0), (9.0, 0.0)), time_limit_s=9.0) for name in "ab")
+    >>> one, other = (
+    ...     Scenario(
+    ...         id=name, suite="s", place=City(seed=0), seed=0, time_limit_s=9.0,
+    ...         start=(0.0, 0.0, 0.0), goal=(9.0, 0.0), route=((0.0, 0.0), (9.0, 0.0)),
+    ...     )
+    ...     for name in "ab"
+    ... )
     >>> selection_in_words(Suite(name="s", version="1", scenarios=(one, other)), ["a"])
     '1 of 2 (--episodes 1)'
     """

@@ -14,7 +14,10 @@ from physics.cameras.gl.context import context
 _SIDE: Final = 128
 _VERTEX: Final = """#version 430
 in vec2 at; out vec2 uv;
-void main() { uv = at; gl_Position = vec4(at * (1.0 + 0.1 * at.y), 0.1 * at.x, 1.0 + 0.3 * at.y); }"""
+void main() {
+    uv = at;
+    gl_Position = vec4(at * (1.0 + 0.1 * at.y), 0.1 * at.x, 1.0 + 0.3 * at.y);
+}"""
 _FRAGMENT: Final = """#version 430
 uniform sampler2D picture; in vec2 uv; out vec4 colour;
 void main() {

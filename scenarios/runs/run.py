@@ -85,7 +85,8 @@ def run(
     fit their places, RunError for a folder that is of another run, MachineError when engines cannot
     start. An episode that fails is a row with status "crashed".
 
-    >>> run("reactive", "straight", scenarios=["obstructing-001"])[["scenario", "success"]].to_dict("records")
+    >>> table = run("reactive", "straight", scenarios=["obstructing-001"])
+    >>> table[["scenario", "success"]].to_dict("records")
     [{'scenario': 'obstructing-001', 'success': 0.0}]
     """
     needs = {f"jobs={jobs}": jobs not in (None, 1), f"on='{on}'": on != "", "host": host.isolated}

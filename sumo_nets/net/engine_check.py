@@ -17,7 +17,8 @@ from sumo_nets.net.netconvert import netconvert
 
 _SECONDS: Final = 60
 _NODES: Final = """<nodes>
-<node id="m" x="0" y="0" type="traffic_light"/><node id="e" x="120" y="7"/><node id="n" x="-11" y="130"/>
+<node id="m" x="0" y="0" type="traffic_light"/>
+<node id="e" x="120" y="7"/><node id="n" x="-11" y="130"/>
 <node id="w" x="-140" y="0"/><node id="s" x="5" y="-125"/>
 </nodes>"""
 _EDGES: Final = "<edges>{}</edges>".format(

@@ -288,9 +288,8 @@ def _id_of(name: str, axes: Sequence[Axis], picked: Sequence[int], seed: int | N
     for axis, k in zip(axes, picked, strict=True):
         words = [re.sub(r"[^A-Za-z0-9._-]+", "_", label(value)).strip("_") for value in axis.values]
         short = len(set(words)) == len(words) and max(map(len, words)) <= 16 and all(words)
-        parts.append(
-            f"{re.sub(r'[^A-Za-z0-9_]+', '', axis.field.split('.')[-1])}{words[k] if short else f'-{k}'}"
-        )
+        field = re.sub(r"[^A-Za-z0-9_]+", "", axis.field.split(".")[-1])
+        parts.append(f"{field}{words[k]}" if short else f"{field}-{k}")
     parts += [] if seed is None else [f"s{seed}"]
     whole = "-".join(parts)
     if len(whole) > _LONGEST_NAME:

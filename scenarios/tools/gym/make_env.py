@@ -54,7 +54,8 @@ def make_env(
     Raises UsageError for names and options that there are none of, for what the robot or Gymnasium
     cannot give, and where Gymnasium is not installed.
 
-    >>> with make_env("unit", Manifest("blind", camera=None, goal="route_point"), scenarios=["straight-001"]) as env:
+    >>> blind = Manifest("blind", camera=None, goal="route_point")
+    >>> with make_env("unit", blind, scenarios=["straight-001"]) as env:
     ...     seen, info = env.reset(seed=7)
     >>> sorted(seen), info["scenario"]
     (['goal', 'speeds'], 'straight-001')

@@ -135,7 +135,7 @@ def test_no_figure_is_cut(name: str, width: int, monkeypatch: pytest.MonkeyPatch
     figures are whole."""
     said = io.StringIO()
     out = Console(file=said, width=width)
-    for module in ("suites.scenario", "bench.bench"):
+    for module in ("scenario", "bench"):
         monkeypatch.setattr(f"cosim.cli.{module}.out", out)
     prints, figures = TABLES[name]
     prints(out)
@@ -176,6 +176,6 @@ def test_every_command_with_a_table_prints_it_so() -> None:
     """Whichever module of the command line makes a table has it fitted."""
     for path in sorted((ROOT / "cosim/cli").rglob("*.py")):
         if "Table(" in (text := path.read_text()):
-            assert "fitted" in text and not re.search(
+            assert "print_fitted" in text and not re.search(
                 r"\bout\.print\((table|shown|rows)\)", text
             ), path
