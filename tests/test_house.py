@@ -79,7 +79,8 @@ def test_the_wheel_holds_what_a_run_needs(tmp_path: Path) -> None:
         "physics/robots/courier.urdf",
         "scenarios/suites/user_scenarios/template.toml",
     }
-    assert {f"cosim/report/page/{name}" for name in ("page.css", "page.js", "viewer.html")} <= names
+    page = ("page.css", "page.html", "page.js", "tables.html", "viewer.html")
+    assert {f"cosim/report/page/{name}" for name in page} <= names
     assert needed <= names
     assert not [n for n in names if n.split("/")[0] not in ROOMS and ".dist-info" not in n]
 

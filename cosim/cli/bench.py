@@ -20,8 +20,7 @@ from cosim.core.errors import UsageError, unknown
 if TYPE_CHECKING:
     from cosim.core.geometry import Floats
     from scenarios.tools.bench.figures import Figure
-    from scenarios.tools.bench.people.comparison import Comparison
-    from scenarios.tools.bench.people.observed import MeanSd
+    from scenarios.tools.bench.people import Comparison, MeanSd
 
 
 LIGHTS = (
@@ -53,8 +52,7 @@ def bench_crowd(
     """Watch the crowd of several cities and print how people keep apart, out of things and to the
     lights."""
     from cosim.spec.scenario import CrowdSpec
-    from scenarios.tools.bench.crowd import summed, watch_all
-    from scenarios.tools.bench.group_tally import APART_M
+    from scenarios.tools.bench.crowd import APART_M, summed, watch_all
 
     spec = CrowdSpec(residents=residents, groups=groups, elderly=elderly, children=children)
     with doing("watching the crowd") as tell:
@@ -173,7 +171,7 @@ _NOTES = (
 def bench_people(jobs: int) -> None:
     """Let the crowd walk on sidewalks and over a crossing and print it beside what was measured of
     people."""
-    from scenarios.tools.bench.people.comparison import watch_people
+    from scenarios.tools.bench.people import watch_people
 
     with doing("watching people") as tell:
         found = watch_people(jobs, lambda words: tell(f"watching people: {words}"))
@@ -184,8 +182,7 @@ def bench_people(jobs: int) -> None:
 
 
 def _by_density(found: Comparison) -> Table:
-    from scenarios.tools.bench.people.measures import normal_distance
-    from scenarios.tools.bench.people.observed import DENSITY_EDGES, SPEED_BY_DENSITY_MPS
+    from scenarios.tools.bench.people import DENSITY_EDGES, SPEED_BY_DENSITY_MPS, normal_distance
 
     table = _table(
         "persons/m2", "HERMES", "one way", "dist.", "off, sd", "both ways", "dist.", "off, sd"
@@ -203,8 +200,7 @@ def _by_density(found: Comparison) -> Table:
 
 
 def _free(found: Comparison) -> Table:
-    from scenarios.tools.bench.people.measures import mean_sd, normal_distance
-    from scenarios.tools.bench.people.observed import FREE_SPEED_MPS
+    from scenarios.tools.bench.people import FREE_SPEED_MPS, mean_sd, normal_distance
 
     ours = mean_sd(found.free_mps)
     table = _table("", "data", "ours", "dist.")
@@ -215,9 +211,13 @@ def _free(found: Comparison) -> Table:
 
 
 def _nearest(found: Comparison) -> Table:
-    from scenarios.tools.bench.people.comparison import GROUPS, alike
-    from scenarios.tools.bench.people.measures import percentile_distance
-    from scenarios.tools.bench.people.observed import NEAREST_M, NEAREST_PERCENT
+    from scenarios.tools.bench.people import (
+        GROUPS,
+        NEAREST_M,
+        NEAREST_PERCENT,
+        alike,
+        percentile_distance,
+    )
 
     table = _table("", _percent(NEAREST_PERCENT), "ours", "dist.", "in groups", "persons/m2")
     table.title = "Nearest neighbour, m"
@@ -235,12 +235,12 @@ def _nearest(found: Comparison) -> Table:
 
 
 def _gaps(found: Comparison) -> Table:
-    from scenarios.tools.bench.people.measures import percentile_distance
-    from scenarios.tools.bench.people.observed import (
+    from scenarios.tools.bench.people import (
         PERSON_FIRST_PERCENT,
         PERSON_FIRST_S,
         VEHICLE_FIRST_PERCENT,
         VEHICLE_FIRST_S,
+        percentile_distance,
     )
 
     table = _table("", "DUT", "ours", "dist.", "gaps")
@@ -369,11 +369,11 @@ def _taken(
     what: str, only: Sequence[str], checkouts: Sequence[Path | None], rounds: int
 ) -> list[dict[str, list[Figure]]]:
     """The figures of checkouts, None for this one, each value of each round."""
+    from scenarios.tools.bench.figures import ROOT
     from scenarios.tools.bench.measurements import (
         CAMERA,
         ENVIRONMENT,
         ON_REQUEST,
-        ROOT,
         chosen,
         take_rounds,
     )

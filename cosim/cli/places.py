@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from cosim.place.street_map import StreetMap
     from cosim.report.legend import Image
     from scenarios.suites.capacity import Capacity, FitCount
-    from scenarios.tools.bench.survey import Survey
+    from scenarios.tools.bench.places import Survey
     from sumo_nets.maps.map_store import About
 
 
@@ -107,7 +107,7 @@ def table(
 ) -> None:
     """Count what the shipped cities are made of, furniture included, and check them. Exit code 1:
     one breaks a promise."""
-    from scenarios.tools.bench.survey import surveys
+    from scenarios.tools.bench.places import surveys
     from sumo_nets.city.store import shipped_cities
 
     cities = shipped_cities(count, size, style)
@@ -354,7 +354,7 @@ def endure_map(
     """Simulate crowd and traffic around a robot that goes anywhere, a process for each map. Exit
     code 1: SUMO died."""
     from cosim.core.clock import Clock
-    from scenarios.tools.bench.soak import endure as endured_on
+    from scenarios.tools.bench.places import endure as endured_on
     from sumo_nets.maps.place_names import place_called
 
     places = [place_called(name) for name in maps]

@@ -56,10 +56,6 @@ class Clock:
     def tick_s(self) -> float:
         return self.tick_ms / 1000
 
-    @property
-    def substep_s(self) -> float:
-        return self.substep_ms / 1000
-
     def time_s(self, tick: int) -> float:
         """Simulated seconds at the start of `tick`."""
         return tick * self.tick_ms / 1000

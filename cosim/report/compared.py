@@ -1,4 +1,4 @@
-"""A comparison as tables to be read: rows of words, and these as Markdown and LaTeX."""
+"""Makes readable tables of a comparison: rows of words, and these as Markdown and LaTeX."""
 
 from __future__ import annotations
 
@@ -12,6 +12,10 @@ from cosim.results.compare import FEWEST_CHANGED, ComparedRun, RunComparison
 from cosim.results.metrics import SUCCESS_IN_WORDS
 from cosim.results.table import BOOTSTRAP
 
+_HLINES: Final[list[Any]] = [
+    {"selector": f"{rule}rule", "props": ":hline"} for rule in ("top", "mid", "bottom")
+]
+"""Rules of a LaTeX table that need no package."""
 _OF_THE_SUITE: Final = (
     "success",
     "goal_reached",
@@ -131,13 +135,10 @@ def as_markdown(told: RunComparison) -> str:
     blocks = []
     for other in told.others:
         for table in tables_of_comparison(told, other):
-            bars = ["---"] * table.names + ["---:"] * (len(table.heads) - table.names)
-            lines = (
-                table.heads,
-                bars,
-                *([_in_markdown(cell) for cell in row] for row in table.rows),
+            align = ["left"] * table.names + ["right"] * (len(table.heads) - table.names)
+            rows = _frame(table, _in_markdown).to_markdown(
+                index=False, colalign=align, disable_numparse=True
             )
-            rows = "\n".join(f"| {' | '.join(line)} |" for line in lines)
             blocks.append(f"**{_in_markdown(table.title)}**\n\n{rows}")
         blocks.append("\n".join(f"- {_in_markdown(line)}" for line in flips_in_words(told, other)))
     return "\n\n".join([*blocks, *map(_in_markdown, (*told.notes, how_to_read(told)))]) + "\n"
@@ -148,26 +149,23 @@ def as_latex(told: RunComparison) -> str:
     blocks = []
     for other in told.others:
         for table in tables_of_comparison(told, other):
+            style = _frame(table, _in_latex).style.hide(axis="index").set_table_styles(_HLINES)
             columns = "l" * table.names + "r" * (len(table.heads) - table.names - 1) + "l"
-            head, *rows = (
-                " & ".join(map(_in_latex, line)) + r" \\" for line in (table.heads, *table.rows)
+            title = _in_latex(table.title)
+            blocks.append(
+                style.to_latex(
+                    column_format=columns, caption=title, position_float="centering"
+                ).strip()
             )
-            lines = (
-                r"\begin{table}",
-                r"\centering",
-                rf"\caption{{{_in_latex(table.title)}}}",
-                rf"\begin{{tabular}}{{{columns}}}",
-                r"\hline",
-                head,
-                r"\hline",
-                *rows,
-                r"\hline",
-                r"\end{tabular}",
-                r"\end{table}",
-            )
-            blocks.append("\n".join(lines))
         blocks.append("\n\n".join(map(_in_latex, flips_in_words(told, other))))
     return "\n\n".join([*blocks, *map(_in_latex, (*told.notes, how_to_read(told)))]) + "\n"
+
+
+def _frame(table: WrittenTable, escaped: Callable[[str], str]) -> pd.DataFrame:
+    """Return a table with its heads and cells escaped."""
+    return pd.DataFrame(
+        [[*map(escaped, row)] for row in table.rows], columns=[*map(escaped, table.heads)]
+    )
 
 
 def _in_latex(text: str) -> str:

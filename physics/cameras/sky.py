@@ -75,10 +75,6 @@ class Sky:
     lamps: float
     shadows: bool
 
-    @property
-    def elevation_rad(self) -> float:
-        return math.asin(float(np.clip(self.sun[2], -1.0, 1.0)))
-
 
 @lru_cache(maxsize=8)
 def sky_of(light: Light, seed: int = 0) -> Sky:

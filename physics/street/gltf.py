@@ -18,7 +18,6 @@ from physics.ground.tiles import Key
 from physics.street import props
 from physics.street.buildings import FACADES, WINDOW_COLOUR, facade_meshes
 from physics.street.furniture import KINDS, Prop, parts_of
-from physics.street.mesh_surface import Z_UP
 from physics.street.surface import Patch, Surface, stood
 from physics.textures.ground import ground_layers
 from physics.textures.layers import Colour, encoded, linear
@@ -121,7 +120,9 @@ class _Parts:
 
 
 def _shape(mesh: Mesh, name: str, colour: Colour) -> trimesh.Trimesh:
-    turn = Z_UP[:3, :3]  # transposed: from our axes to glTF's
+    turn = np.array(
+        [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
+    )  # from z up to glTF's y up
     factor = np.append(linear(colour), 1.0)
     material = PBRMaterial(
         name=name, baseColorFactor=factor, metallicFactor=0.0, roughnessFactor=1.0

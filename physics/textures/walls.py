@@ -24,8 +24,6 @@ from physics.textures.surface import (
     weathered,
 )
 
-_COURSE_M: Final = 0.075
-"""A brick of 65 mm and its joint."""
 _CLAY: Final = ((0.56, 0.34, 0.27), (0.52, 0.31, 0.25), (0.60, 0.38, 0.30), (0.47, 0.29, 0.25))
 _LIME: Final = (0.66, 0.62, 0.56)
 _STRETCHER = 0.225

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterator
 from functools import partial
 from typing import Final, Literal, get_args
 
@@ -216,14 +215,3 @@ def _heading_out(strip: Strip, port: Port) -> float:
     """The heading of one who leaves a strip by a port."""
     line = Polyline(strip.line[:, :2] if port.end == 1 else strip.line[::-1, :2])
     return line.at(line.length_m).heading_rad
-
-
-def classes_of(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
-    """The classes of the streets that a route lies beside, in its order, each once."""
-    seen: set[str] = set()
-    for s_m in np.arange(0.5, scenario.route_line.length_m, 2.0):
-        pose = scenario.route_line.at(float(s_m))
-        strip = street_map.strips.get(street_map.locate(pose.x_m, pose.y_m, 0.05).edge)
-        if strip is not None and strip.kind == "sidewalk" and strip.street_class not in seen:
-            seen.add(strip.street_class)
-            yield strip.street_class

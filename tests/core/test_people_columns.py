@@ -17,7 +17,7 @@ from cosim.results.delay import Tracks
 from cosim.spec.scenario import City, Scenario
 from physics.people.appearance import family_of
 from physics.people.parts import placed_parts
-from scenarios.tools.bench.crowd_tally import Tally
+from scenarios.tools.bench.crowd import Tally
 from tests.support.tiny_street import tiny_map
 
 

@@ -1,19 +1,15 @@
-"""A surface made from a plain mesh, a slope with a step at its end: driven on, bumped into, drawn
-by both cameras."""
+"""A plain surface, a slope with a step at its end: driven on, bumped into, drawn by both
+cameras."""
 
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
-from trimesh.visual import TextureVisuals
-from trimesh.visual.material import PBRMaterial
+from numpy.typing import ArrayLike
 
-from cosim.core.errors import SpecError
-from cosim.core.geometry import Pose
+from cosim.core.geometry import Floats, Pose
 from cosim.core.state import LABELS, Command, Frame, RobotState, Street
 from cosim.spec.camera import CameraSpec
 from cosim.spec.robot import COURIER
@@ -22,8 +18,10 @@ from physics.cameras.gl import context
 from physics.cameras.gl.camera import GlCamera
 from physics.cameras.view import shot
 from physics.dynamics.world import BulletWorld
-from physics.ground.tiles import key_at, keys_within, square
-from physics.street.mesh_surface import Z_UP, MeshSurface
+from physics.ground.mesh import Mesh
+from physics.ground.tiles import Key, square
+from physics.street.surface import Chunk, Patch, Surface
+from physics.textures.ground import layer_of
 from tests.support.parity import agreement
 
 EMPTY = Street(0)
@@ -31,48 +29,65 @@ GRADE = 0.1
 STEP_M = 0.25
 LONG_M = 6.0
 TOP_M = GRADE * LONG_M + STEP_M
-COLOUR = (0.8, 0.3, 0.1)
 PROFILE = {
     "sidewalk": ((-5.0, 0.0), (0.0, 0.0)),
     "sidewalk:brick:0": ((0.0, 0.0), (LONG_M, GRADE * LONG_M)),
     "curb": ((LONG_M, GRADE * LONG_M), (LONG_M, TOP_M)),
     "plateau": ((LONG_M, TOP_M), (14.0, TOP_M)),
 }
-"""Seen from the side, in x and z: level, uphill, a step up, level again; 10 m wide. Squares meet at
-x = 0.41."""
-
-
-def hill() -> dict[str, trimesh.Trimesh]:
-    meshes = {}
-    for name, ((x0, z0), (x1, z1)) in PROFILE.items():
-        corners = [(x0, -5.0, z0), (x1, -5.0, z1), (x1, 5.0, z1), (x0, 5.0, z0)]
-        meshes[name] = trimesh.Trimesh(corners, [(0, 1, 2), (0, 2, 3)], process=False)
-    meshes["plateau"].visual = TextureVisuals(material=PBRMaterial(baseColorFactor=[*COLOUR, 1.0]))
-    return meshes
+"""Seen from the side, in x and z: level, uphill, a step up, level again; 10 m wide. Squares meet
+at x = 0.41."""
+LABEL = {
+    "sidewalk": "sidewalk",
+    "sidewalk:brick:0": "sidewalk",
+    "curb": "curb",
+    "plateau": "ground",
+}
 
 
 def height(x_m: float) -> float:
     return TOP_M if x_m > LONG_M else GRADE * max(x_m, 0.0)
 
 
+class Hill(Surface):
+    """The slope with its step."""
+
+    def heights(self, xy: ArrayLike) -> Floats:
+        return np.array([height(x_m) for x_m in np.asarray(xy, dtype=float).reshape(-1, 2)[:, 0]])
+
+    def chunk(self, key: Key) -> Chunk:
+        x0, y0, x1, y1 = square(key)
+        low = max(y0, -5.0)
+        high = min(y1, 5.0)
+        ground = []
+        for name, ((begin, z0), (end, z1)) in PROFILE.items():
+            left, right = max(begin, x0), min(end, x1)
+            if begin == end:
+                there = x0 <= begin < x1
+                z = np.array([z0, z1])
+            else:
+                there = left < right
+                z = np.interp((left, right), (begin, end), (z0, z1))
+            if low >= high or not there:
+                continue
+            corners = np.array(
+                [(left, low, z[0]), (right, low, z[1]), (right, high, z[1]), (left, high, z[0])]
+            )
+            normal = np.cross(corners[1] - corners[0], corners[3] - corners[0])
+            triangles = np.array([(0, 1, 2), (0, 2, 3)], dtype=np.int32)
+            mesh = Mesh(corners, np.repeat([normal / np.linalg.norm(normal)], 4, axis=0), triangles)
+            layer = "plain" if name == "plateau" else layer_of(name, 0)
+            ground.append(Patch(name, mesh, 0.8, LABEL[name], (0.6, 0.6, 0.6), layer))
+        return Chunk(tuple(ground))
+
+
 @pytest.fixture(scope="module")
-def surface(tmp_path_factory: pytest.TempPathFactory) -> MeshSurface:
-    """The hill from a file, in which y is up."""
-    path = tmp_path_factory.mktemp("mesh") / "hill.glb"
-    scene = trimesh.Scene()
-    for name, mesh in hill().items():
-        scene.add_geometry(mesh, node_name=name)
-    path.write_bytes(scene.apply_transform(Z_UP.T).export(file_type="glb"))
-    return MeshSurface.load(path)
+def surface() -> Hill:
+    return Hill()
 
 
-def test_a_mesh_has_its_heights_and_lean(surface: MeshSurface) -> None:
-    """Heights are those of its triangles, and a robot leans as the slope does whichever way it
-    faces."""
-    x = np.array([-4.0, -0.1, 0.41, 2.0, 5.9, 6.1, 13.0])
-    assert surface.heights(np.column_stack([x, 0.3 * x])) == pytest.approx(
-        [height(at) for at in x], abs=1e-6
-    )
+def test_a_robot_leans_as_the_slope_does(surface: Hill) -> None:
+    """Whichever way it faces; a vehicle lies on its wheels, and no foot floats."""
     for heading, roll, pitch in ((0.0, 0.0, -1.0), (math.pi, 0.0, 1.0), (math.pi / 2, -1.0, 0.0)):
         z, leant, nodding = surface.lean(Pose(3.0, 1.0, heading), COURIER.drive.span_m)
         assert z == pytest.approx(3.0 * GRADE, abs=1e-6)
@@ -84,45 +99,10 @@ def test_a_mesh_has_its_heights_and_lean(surface: MeshSurface) -> None:
     assert surface.foot(3.0, 0.0, 0.0, (2.0, 0.5)) == pytest.approx(0.2, abs=1e-6)
 
 
-def test_the_squares_of_a_mesh_are_all_of_it(surface: MeshSurface) -> None:
-    """Cut into squares it has the same area, nothing lies outside its square, and names tell what
-    it is made of."""
-    area: dict[str, float] = {}
-    for key in keys_within(0.0, 0.0, 30.0):
-        x0, y0, x1, y1 = square(key)
-        for patch in surface.chunk(key).ground:
-            at = patch.mesh.vertices
-            assert (at[:, 0] >= x0 - 1e-9).all() and (at[:, 0] <= x1 + 1e-9).all()
-            assert (at[:, 1] >= y0 - 1e-9).all() and (at[:, 1] <= y1 + 1e-9).all()
-            here = trimesh.Trimesh(at, patch.mesh.triangles, process=False).area
-            area[patch.name] = area.get(patch.name, 0.0) + here
-    assert area == pytest.approx({name: mesh.area for name, mesh in hill().items()}, rel=1e-6)
-    found = {patch.name: patch for patch in surface.chunk(key_at(5.0, 1.0)).ground}
-    assert [found[name].label for name in PROFILE if name in found] == [
-        "sidewalk",
-        "curb",
-        "ground",
-    ]
-    assert found["sidewalk:brick:0"].friction == 0.80 and found["curb"].friction == 0.90
-    assert found["plateau"].colour == pytest.approx(
-        [1.055 * c ** (1 / 2.4) - 0.055 for c in COLOUR], abs=0.01
-    )
-
-
-def test_what_is_no_mesh_is_refused(tmp_path: Path) -> None:
-    """A file that is not there, one that is something else, and one without a triangle are
-    named."""
-    (tmp_path / "words.glb").write_text("hello")
-    (tmp_path / "words.obj").write_text("v 0 0 0\n")
-    for name in ("nothing.glb", "words.glb", "words.obj"):
-        with pytest.raises(SpecError, match=rf"{name}"):
-            MeshSurface.load(tmp_path / name)
-
-
 @pytest.mark.engine
-def test_the_robot_climbs_the_slope_and_is_stopped_by_the_step(surface: MeshSurface) -> None:
-    """Its wheels stay on the slope, it leans as that does, keeps its speed, and does not get over
-    the step."""
+def test_the_robot_climbs_the_slope_and_is_stopped_by_the_step(surface: Hill) -> None:
+    """Its wheels stay on the slope, it leans as that does, keeps its speed, and does not get
+    over the step."""
     with BulletWorld(surface) as world:
         state = world.place(Pose(-1.5, 1.0, 0.0))
         states = []
@@ -144,7 +124,7 @@ def test_the_robot_climbs_the_slope_and_is_stopped_by_the_step(surface: MeshSurf
 
 
 @pytest.mark.engine
-def test_the_robot_drops_off_the_step(surface: MeshSurface) -> None:
+def test_the_robot_drops_off_the_step(surface: Hill) -> None:
     """From above it falls by the height of the step, and goes on downhill on its wheels."""
     with BulletWorld(surface) as world:
         state = world.place(Pose(8.5, -1.0, math.pi))
@@ -183,7 +163,7 @@ def points_of(frame: Frame, eye: np.ndarray, target: np.ndarray, fov_deg: float)
 @pytest.mark.engine
 @pytest.mark.parametrize("make", [GlCamera, BulletCamera], ids=["gl", "bullet"])
 def test_a_camera_draws_a_mesh_where_it_is(
-    make: type[GlCamera | BulletCamera], surface: MeshSurface
+    make: type[GlCamera | BulletCamera], surface: Hill
 ) -> None:
     """Of four views each pixel of the mesh lies on it by its depth, on the part that its label
     names."""
@@ -221,9 +201,9 @@ def test_a_camera_draws_a_mesh_where_it_is(
 @pytest.mark.skipif(
     not context.available(), reason="no OpenGL through EGL here (see `cosim doctor`)"
 )
-def test_both_cameras_see_the_same_mesh(surface: MeshSurface) -> None:
-    """From the robot's mount, on the level, on the slope and above the step, labels agree on 97 %
-    of the pixels off edges, and depth to 2 cm."""
+def test_both_cameras_see_the_same_mesh(surface: Hill) -> None:
+    """From the robot's mount, on the level, on the slope and above the step, labels agree on 97
+    % of the pixels off edges, and depth to 2 cm."""
     world = BulletWorld(surface)
     spec = CameraSpec(128, 96)
     with GlCamera(world, spec, depth=True) as one, BulletCamera(world, spec, depth=True) as other:

@@ -146,12 +146,13 @@ def test_a_file_that_is_not_the_weights_is_refused_in_one_line(tmp_path: Path) -
         "-m",
         "cosim.policies.follow.espnetv2",
         tmp_path / "w.pth",
-        tmp_path / "out.onnx",
+        "-o",
+        tmp_path / "out",
     ]
     told = subprocess.run(command, capture_output=True, text=True, check=False)
     assert told.returncode == 1 and told.stderr.count("\n") == 1
     assert "w.pth: 11 bytes, BLAKE2b" in told.stderr and "1107690 bytes" in told.stderr
-    assert not (tmp_path / "out.onnx").exists()
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_file_of_weights_cannot_run_code() -> None:

@@ -15,6 +15,7 @@ import pytest
 
 from cosim.core.errors import MachineError
 from cosim.policies.load import load_policy, shipped_bundles
+from cosim.policies.onnx.converting import Converter
 from cosim.policies.onnx.manifest import file_facts, read_bundle_manifest
 from cosim.policies.onnx.policy import OnnxPolicy, example_differences
 from cosim.policies.published.dronet.graph import (
@@ -23,7 +24,6 @@ from cosim.policies.published.dronet.graph import (
     dronet_graph,
     read_keras_weights,
 )
-from cosim.policies.published.making import PublishedNetwork
 from cosim.policies.published.openbot.graph import OPENBOT, openbot_graph
 from cosim.policies.published.openbot.lite_file import (
     LiteModel,
@@ -35,55 +35,58 @@ from cosim.policies.published.openbot.lite_file import (
 WEIGHTS = Path(os.environ.get("COSIM_WEIGHTS") or Path(__file__).parents[3] / "shared" / "weights")
 UPSTREAM = {"dronet": "dronet_model_weights.h5", "openbot": "autopilot_float.tflite"}
 """What the files are called in WEIGHTS."""
-NETWORKS = [pytest.param(network, id=network.policy) for network in (DRONET, OPENBOT)]
+PACKAGES = {"dronet": "h5py", "openbot": "flatbuffers"}
+"""What each command imports besides onnx."""
+NETWORKS = [
+    pytest.param(network, id=network.module.rpartition(".")[2]) for network in (DRONET, OPENBOT)
+]
 BLOCKS = ((1, 32, 32), (2, 32, 64), (3, 64, 128))
 """Of DroNet: their numbers, and channels before and after."""
 
 
-def given(network: PublishedNetwork) -> Path:
+def name_of(network: Converter) -> str:
+    """Its policy's name."""
+    return network.module.rpartition(".")[2]
+
+
+def given(network: Converter) -> Path:
     """The file upstream; where it or a package is missing, the test is skipped."""
-    for package in network.packages:
+    policy = name_of(network)
+    for package in ("onnx", PACKAGES[policy]):
         pytest.importorskip(package)
-    path = WEIGHTS / UPSTREAM[network.policy]
+    path = WEIGHTS / UPSTREAM[policy]
     if not path.is_file():
         pytest.skip(f"the published file {path.name} is not in {WEIGHTS} (COSIM_WEIGHTS)")
     return path
 
 
-def taking(network: PublishedNetwork, data: bytes) -> PublishedNetwork:
+def taking(network: Converter, data: bytes) -> Converter:
     """The same, of other weights upstream."""
     return replace(network, weights=replace(network.weights, facts=file_facts(data)))
 
 
 @pytest.mark.parametrize("network", NETWORKS)
 def test_the_command_makes_the_graph_that_runs_take(
-    network: PublishedNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    network: Converter, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Byte for byte the file that the manifest names, with which the policy loads and tells what
     its example expects; so the same every time."""
-    command = [
-        sys.executable,
-        "-m",
-        f"cosim.policies.published.{network.policy}",
-        given(network),
-        "-o",
-        tmp_path,
-    ]
+    command = [sys.executable, "-m", network.module, given(network), "-o", tmp_path]
     told = subprocess.run(command, capture_output=True, text=True, check=True)
-    folder = shipped_bundles()[network.policy]
+    folder = shipped_bundles()[name_of(network)]
     bundle = read_bundle_manifest(folder)
     made = tmp_path / bundle.model
     assert told.stdout == f"{made}: {bundle.files[bundle.model].bytes} bytes\n"
     assert file_facts(made.read_bytes()).blake2b == bundle.files[bundle.model].blake2b
     monkeypatch.setenv("COSIM_WEIGHTS", str(tmp_path))
-    assert load_policy(network.policy).manifest.name == network.policy
+    assert load_policy(name_of(network)).manifest.name == name_of(network)
     off = example_differences(OnnxPolicy(folder))
     assert off.keys() == set(bundle.output.outputs) and max(off.values()) < 1e-4
 
 
 @pytest.mark.parametrize("network", NETWORKS)
 def test_another_file_makes_no_graph(
-    network: PublishedNetwork, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    network: Converter, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """In one line its size and hash, and those wanted, of which file of whom; nothing is
     written."""
@@ -101,13 +104,13 @@ def test_another_file_makes_no_graph(
 
 @pytest.mark.parametrize("network", NETWORKS)
 def test_a_package_that_is_missing_is_named_with_what_installs_it(
-    network: PublishedNetwork, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    network: Converter, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The command needs packages that a run does not."""
     (tmp_path / "file").write_bytes(b"\x20\0\0\0TFL3")
-    monkeypatch.setitem(sys.modules, network.packages[1], None)
+    monkeypatch.setitem(sys.modules, PACKAGES[name_of(network)], None)
     monkeypatch.setitem(sys.modules, "flatbuffers.table", None)
-    with pytest.raises(MachineError, match=f"pip install onnx {network.packages[1]}$"):
+    with pytest.raises(MachineError, match=r"pip install 'sidewalk-cosim\[convert\]'$"):
         taking(network, b"\x20\0\0\0TFL3").write(tmp_path / "file", tmp_path)
 
 

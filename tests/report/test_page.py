@@ -24,7 +24,7 @@ from cosim.report.page.paper import LONG_OF_PAPER, REACTIVE_OF_PAPER, UNIT_OF_PA
 from cosim.report.page.plots import exposure_of, near_of, plots_of
 from cosim.report.page.runs import ReportedRun, read_runs
 from cosim.report.page.scene import Entry, PlacePicture, Spot
-from cosim.report.page.three_tables import tables_html, warnings_html
+from cosim.report.page.three_tables import tables_of, warnings_of
 from cosim.results.run_folder import RunFolder, read_spec
 from cosim.results.table import summary_of
 from cosim.spec.scenario import read_suite
@@ -72,12 +72,16 @@ def test_a_cell_of_ours_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
     spec = msgspec.structs.replace(own.spec, suite="unit")
     told = ReportedRun("mine", own.whole._replace(spec=spec))
     mean, low, high, _ = summary_of(told.table, ["success"]).iloc[0]
-    text = tables_html([told])
-    (row,) = re.findall(r'<tr><th scope="row">mine.*?</tr>', text)
-    assert f">{mean:.2f}<small>{low:.2f}&ndash;{high:.2f}</small>" in row and mean == 0.6
-    assert text.index("the paper's models, in another engine") < text.index("OpenPilot")
+    ours = next(table for table in tables_of([told]) if table.title == "Unit tests")
+    (row,) = ours.rows
+    assert row.name == "mine" and row.cells[0] == (mean, low, high, 5) and mean == 0.6
+    assert ours.paper is UNIT_OF_PAPER
+    text = page_of([told], [], [], Maps([], {}, {}), "").decode()
+    assert f">{mean:.2f}<small>{low:.2f}&ndash;{high:.2f}</small>" in text
+    assert text.index("models, in another engine") < text.index("OpenPilot")
     assert text.count('class="paper"') == len(UNIT_OF_PAPER)
-    assert 'class="paper"' not in tables_html([own]) and "mine: straight" in tables_html([own])
+    (other,) = tables_of([own])
+    assert not other.paper and [row.name for row in other.rows] == ["mine: straight"]
 
 
 def test_the_page_paints_the_ground_as_maps_from_above(tmp_path: Path) -> None:
@@ -294,14 +298,16 @@ def test_runs_of_other_scenarios_of_a_suite_are_told_apart(tmp_path: Path) -> No
     """One has all three of its scenarios, another two: it is said, with both counts; of two of all
     nothing."""
     runs = read_runs([run_of(tmp_path / name, ["goal"] * 3, name) for name in ("one", "other")])
-    assert not warnings_html(runs)
+    assert not any(warnings_of(runs))
     first = runs[0]
     whole = runs[1].whole
     spec = msgspec.structs.replace(whole.spec, scenarios=whole.spec.scenarios[:2])
     part = ReportedRun(
         "other", whole._replace(spec=spec, records=dict([*whole.records.items()][:2]))
     )
-    assert "not all runs are of the same scenarios (one 3, other 2)" in warnings_html([first, part])
+    assert warnings_of([first, part]).mixed == (("s", "one 3, other 2"),)
+    text = page_of([first, part], [], [], Maps([], {}, {}), "").decode()
+    assert "not all runs are of the same scenarios (one 3, other 2)" in text
 
 
 def test_versions_that_differ_stand_side_by_side_and_the_others_once(tmp_path: Path) -> None:

@@ -197,7 +197,7 @@ def test_intervals_are_counted_where_they_stand(runs: Path) -> None:
     .csv of all metrics."""
     told = compare_runs([runs / "a", runs / "b", runs / "c"])
     page = as_markdown(told)
-    shown = len(re.findall(r"\| [+-][\d.]+ to [+-][\d.]+ \|", page))
+    shown = len(re.findall(r"\| +[+-][\d.]+ to [+-][\d.]+ \|", page))
     lines = csv.DictReader(io.StringIO(told.differences.to_csv(index=False)))
     in_all = sum(line["low"] != "" for line in lines)
     assert 0 < shown < in_all

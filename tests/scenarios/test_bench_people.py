@@ -11,7 +11,9 @@ import pytest
 import shapely
 
 from cosim.core.errors import MachineError
-from scenarios.tools.bench.people.measures import (
+from scenarios.tools.bench.people import (
+    Flow,
+    MeanSd,
     encroachments_s,
     free_speeds,
     in_bins,
@@ -20,9 +22,8 @@ from scenarios.tools.bench.people.measures import (
     normal_distance,
     percentile_distance,
     speeds_by_density,
+    walk_round,
 )
-from scenarios.tools.bench.people.observed import MeanSd
-from scenarios.tools.bench.people.walking import Flow, walk_round
 
 
 def _walking(rows: list[tuple[float, float, float]], frames: int = 41) -> pd.DataFrame:

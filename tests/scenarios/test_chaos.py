@@ -10,6 +10,7 @@ import pytest
 
 from cosim.results.run_folder import read_records
 from tests.support.chaos import PlannedBlow, chaos, differences, quiet, tiny_suite
+from tests.support.coordinating import serve_made_up
 
 PLAN = [
     PlannedBlow(1, "kill worker"),
@@ -43,3 +44,11 @@ def test_what_is_killed_in_a_run_of_many_workers_changes_none_of_its_results(
     assert poison.scenario == "tiny-005" and poison.status == "crashed"
     assert "was killed by SIGKILL in the policy's reset, 2 times" in poison.reason
     assert len(read_records(reference)) == 10
+
+
+@pytest.mark.engine
+def test_a_coordinator_takes_in_every_made_up_result() -> None:
+    """Three workers that have each result at once serve thirty jobs; the run ends, and a round
+    takes some time."""
+    served = serve_made_up(workers=3, jobs=30)
+    assert served.jobs == 30 and served.wall_s > served.round_s > 0.0

@@ -10,7 +10,7 @@ import pytest
 
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import CityMap
-from scenarios.tools.bench.soak import endure, wandering
+from scenarios.tools.bench.places import endure, wandering
 from sumo_nets.maps.map_store import read_map
 
 pytestmark = pytest.mark.engine

@@ -11,7 +11,7 @@ import shapely
 
 from cosim.core.state import People, Signal, Street, Vehicles
 from cosim.place.street_map import StreetMap, Strip
-from scenarios.tools.bench.crowd_tally import Tally
+from scenarios.tools.bench.crowd import Tally
 
 LINE = np.array([[0.0, 0.0], [8.0, 0.0]])
 CROSSING = Strip(

@@ -17,7 +17,7 @@ from cosim.place.street_map import Strip
 from cosim.spec.events import EventReply
 from cosim.spec.scenario import City, CrowdSpec
 from scenarios.suites.catalog import load_suite, with_crowd
-from scenarios.tools.bench.group_tally import widest_gaps
+from scenarios.tools.bench.crowd import widest_gaps
 from sumo_nets.city.store import build_city
 from sumo_nets.crowd.crowd import SumoCrowd
 from sumo_nets.crowd.group_cohesion import Together

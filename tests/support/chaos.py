@@ -73,8 +73,8 @@ class PlannedBlow(NamedTuple):
 
 
 class UnderFire(NamedTuple):
-    """What came out: episodes, faults that happened, seconds, and why it did not come to its end,
-    in words."""
+    """What came out: episodes, faults that happened, seconds, and why it did not come to its
+    end, in words."""
 
     episodes: int
     faults: Counter[str]
@@ -255,8 +255,8 @@ def _env(folder: Path) -> dict[str, str]:
 
 
 def _kill_below(pid: int) -> bool:
-    """Kill an environment process of a worker: the child of its shepherd. False where there is none
-    now."""
+    """Kill an environment process of a worker: the child of its shepherd. False where there is
+    none now."""
     for shepherd in _children(pid):
         for process in _children(shepherd):
             with suppress(ProcessLookupError):

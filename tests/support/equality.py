@@ -125,8 +125,8 @@ class _Ways:
 
 
 def _at_each(times: int, done: Callable[[], int], of: int) -> Iterator[int | None]:
-    """Asked again and again, says a number from 0 on, spread over the run, when it has come so far;
-    else None."""
+    """Asked again and again, says a number from 0 on, spread over the run, when it has come so
+    far; else None."""
     number = 0
     while True:
         if number < times and done() > (number + 0.5) * of / times:

@@ -1,11 +1,11 @@
 """ESPNetv2 for streets as an ONNX graph, made of its published weights.
 
-    python -m cosim.policies.follow.espnetv2 espnetv2_s_1.0_city_512x256.pth [OUT.onnx]
+    python -m cosim.policies.follow.espnetv2 espnetv2_s_1.0_city_512x256.pth [-o FOLDER]
 
 Source: S. Mehta et al., "ESPNetv2: a light-weight, power efficient, and general purpose
 convolutional neural network", arXiv 1811.11431: EESP units, strided ones with the picture fed in
 again at each size, and a decoder of efficient pyramids of pooled sizes, for 20 classes of
-Cityscapes. It goes without PyTorch, and takes `pip install onnx`.
+Cityscapes. It needs no PyTorch, and takes `pip install 'sidewalk-cosim[convert]'`.
 """
 
 from __future__ import annotations
@@ -13,18 +13,14 @@ from __future__ import annotations
 import math
 import sys
 from itertools import count
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.core.errors import CosimError, UsageError
 from cosim.policies.follow.networks import ESPNET_GRAPH, ESPNET_WEIGHTS
 from cosim.policies.follow.torch_file import read_torch_file
-from cosim.policies.onnx.making import make_graph, write_graph
-from cosim.policies.onnx.weights import weight_folders
-from cosim.policies.onnx.writing import GraphWriter
+from cosim.policies.onnx.converting import Converter, GraphWriter, PublishedArrays
 
 HEIGHT: Final = 256
 WIDTH: Final = 512
@@ -49,9 +45,8 @@ class _Builder:
     """Operators one behind the other; a name of a tensor stands for it."""
 
     def __init__(self, weights: dict[str, NDArray[Any]]) -> None:
-        self._weights = weights
+        self._weights = PublishedArrays(weights)
         self._writer = GraphWriter("espnetv2")
-        self._left = {name for name in weights if not name.endswith(".num_batches_tracked")}
         self._tensors = count()
         self._constants = count()
 
@@ -78,13 +73,11 @@ class _Builder:
             out = self._op("Add", merged, self._resized(out, planes, size))
             out = self._act(self._norm(out, f"bu_br_l{step}.0"), f"bu_br_l{step}.1")
             out = self._pyramid(out, f"bu_dec_l{step}", size)
-        # the file holds a last activation of strided units, which the network leaves out
-        self._left -= {f"base_net.level{n}_0.eesp.module_act.weight" for n in (2, 3, 4)}
-        if self._left:
-            raise ValueError(
-                f"holds '{min(self._left)}', and {len(self._left) - 1} more, of which there "
-                f"is no place"
-            )
+        # The file holds a last activation of strided units, which the network leaves out.
+        unused = tuple(f"base_net.level{n}_0.eesp.module_act.weight" for n in (2, 3, 4))
+        self._weights.check_all_taken(
+            lambda name: name in unused or name.endswith(".num_batches_tracked")
+        )
         self._writer.operator("Identity", "scores", out)
         return self._writer.whole(
             {"picture": (1, 3, HEIGHT, WIDTH)}, {"scores": (1, _CLASSES, HEIGHT // 2, WIDTH // 2)}
@@ -95,7 +88,7 @@ class _Builder:
         before, joined again."""
         groups = len(dilations)
         projected = self._conv_act(x, f"{name}.proj_1x1", groups=groups)
-        planes = self._shape(f"{name}.spp_dw.0.conv.weight")[0]
+        planes = self._weights.take(f"{name}.spp_dw.0.conv.weight").shape[0]
         seen: list[str] = []
         for i, dilation in enumerate(dilations):
             one = self._conv(
@@ -191,10 +184,10 @@ class _Builder:
         dilation: int = 1,
         bias: bool = False,
     ) -> str:
-        kernel = self._take(f"{name}.weight")
+        kernel = self._weights.take(f"{name}.weight")
         beside = (kernel.shape[2] - 1) // 2 * dilation
         inputs = [x, self._constant(kernel)] + (
-            [self._constant(self._take(f"{name}.bias"))] if bias else []
+            [self._constant(self._weights.take(f"{name}.bias"))] if bias else []
         )
         return self._op(
             "Conv",
@@ -207,14 +200,14 @@ class _Builder:
 
     def _norm(self, x: str, name: str) -> str:
         fields = ("weight", "bias", "running_mean", "running_var")
-        numbers = [self._constant(self._take(f"{name}.{field}")) for field in fields]
+        numbers = [self._constant(self._weights.take(f"{name}.{field}")) for field in fields]
         return self._op("BatchNormalization", x, *numbers, epsilon=1e-5)
 
     def _act(self, x: str, name: str) -> str:
         """PReLU in four operators: the same bits as the one called so, which takes the runtime
         twice as long."""
         above = self._op("Relu", x)
-        slope = self._constant(self._take(f"{name}.weight").reshape(-1, 1, 1))
+        slope = self._constant(self._weights.take(f"{name}.weight").reshape(-1, 1, 1))
         return self._op("Add", above, self._op("Mul", self._op("Sub", x, above), slope))
 
     def _halved(self, x: str) -> str:
@@ -240,16 +233,6 @@ class _Builder:
             "MatMul", rows, self._constant(np.ascontiguousarray(_parts(size[1], to[1]).T))
         )
 
-    def _shape(self, name: str) -> tuple[int, ...]:
-        if name not in self._weights:
-            raise ValueError(f"has no '{name}'")
-        return self._weights[name].shape
-
-    def _take(self, name: str) -> NDArray[Any]:
-        self._shape(name)
-        self._left.discard(name)
-        return self._weights[name]
-
     def _constant(self, numbers: NDArray[Any]) -> str:
         return self._writer.constant(f"c{next(self._constants)}", numbers)
 
@@ -268,22 +251,12 @@ def _parts(count: int, parts: int) -> NDArray[np.float32]:
     return weights
 
 
-def _main(arguments: list[str]) -> None:
-    """Write the graph of a file of weights, by default to the user's folder of weights."""
-    if len(arguments) not in (1, 2):
-        raise UsageError(
-            f"espnetv2 takes {ESPNET_WEIGHTS.name} and, if wanted, OUT.onnx, not "
-            f"{len(arguments)} names"
-        )
-    path = Path(arguments[0])
-    out = Path(arguments[1]) if arguments[1:] else weight_folders()[-1] / ESPNET_GRAPH.name
-    write_graph(
-        out, make_graph(ESPNET_WEIGHTS, path, lambda data: street_graph(read_torch_file(data)))
-    )
-
+ESPNET: Final = Converter(
+    "cosim.policies.follow.espnetv2",
+    ESPNET_WEIGHTS,
+    lambda data: street_graph(read_torch_file(data)),
+    lambda: ESPNET_GRAPH,
+)
 
 if __name__ == "__main__":
-    try:
-        _main(sys.argv[1:])
-    except CosimError as error:
-        sys.exit(f"error: {error}")
+    ESPNET.command(sys.argv[1:])

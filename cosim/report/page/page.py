@@ -1,14 +1,15 @@
-"""The report as one HTML file: text, style, scripts, data and pictures in it; it asks nobody for
-anything."""
+"""Writes the report as one HTML file that holds its text, style, scripts, data and pictures, and
+loads nothing."""
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from html import escape
+from functools import cache
 from importlib.resources import files
-from typing import Final
+from typing import Any, Final
 
+import jinja2
 import msgspec
 import numpy as np
 
@@ -18,7 +19,7 @@ from cosim.report.page.plots import CAUSE_COLOURS, RUN_COLOURS, Plot
 from cosim.report.page.reasons import CAUSES, mishaps_of
 from cosim.report.page.runs import ReportedRun, place_in_words
 from cosim.report.page.scene import Entry, PlacePicture, Spot
-from cosim.report.page.three_tables import summary_html, tables_html, warnings_html, wide_html
+from cosim.report.page.three_tables import summary_table, tables_of, warnings_of
 from cosim.results.log import holds_waypoints
 from cosim.results.table import policy_in_words
 from cosim.results.throughput import median_answer_ms
@@ -31,11 +32,13 @@ _MOST_LISTED: Final = 4
 """Of more runs than this the heading names fewer."""
 _MOST_TOLD: Final = 12
 """Of crashed and invalid episodes of a run so many are told by name."""
+_FILTERS: Final = {"run": "label", "cause": "cause", "kind": "kind", "place": "place"}
+"""The choices above the gallery: by their names the fields of an entry."""
 
 
 class Maps(msgspec.Struct, frozen=True):
-    """Where things went wrong. pictures: of some places; spots: of all, by place; episodes: of each
-    place, all and failed."""
+    """Where things went wrong. pictures: of some places; spots: of all, by place; episodes: of
+    each place, all and failed."""
 
     pictures: list[PlacePicture]
     spots: dict[str, list[Spot]]
@@ -58,32 +61,7 @@ def page_of(
     """The file. note: what the gallery could not show, "" if nothing."""
     from plotly.offline import get_plotlyjs
 
-    labels = list(dict.fromkeys(run.label for run in runs))
-    title = f"{' · '.join(labels)}: cosim report"
-    sections = {
-        "results": (
-            "Results",
-            f"{warnings_html(runs)}{summary_html(runs, colours_of(runs))}{tables_html(runs)}",
-        ),
-        "plots": (
-            "Where it goes wrong",
-            f'<div class="plots">{"".join(map(_plot, range(len(plots)), plots))}</div>',
-        ),
-        "failures": ("Failures", _gallery(entries, note)),
-        "places": ("Places", _places(maps, _causes_of(runs))),
-        "runs": ("What was run", _what_was_run(runs)),
-    }
-    if not entries and not note:
-        del sections["failures"]
-    if not maps.spots:
-        del sections["places"]
-    if not plots:
-        del sections["plots"]
-    nav = "".join(f'<a href="#{name}">{words}</a>' for name, (words, _) in sections.items())
-    body = "".join(
-        f'<section id="{name}"><h2>{words}</h2>{inner}</section>'
-        for name, (words, inner) in sections.items()
-    )
+    causes = _causes_of(runs)
     data = {
         "plots": [plot.figure for plot in plots],
         "causes": CAUSE_COLOURS,
@@ -97,38 +75,62 @@ def page_of(
         for k, entry in enumerate(entries)
         if entry.scene is not None
     ]
-    assets = files("cosim.report.page")
-    style, viewer, script = (
-        (assets / name).read_text(encoding="utf-8")
-        for name in ("page.css", "viewer.html", "page.js")
-    )
-    text = (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
-        f'<meta name="viewport" content="width=device-width, '
-        f'initial-scale=1"><title>{escape(title)}</title>'
-        f"<style>{style}</style></head><body>"
-        f'<header><p class="mark">cosim report</p><h1>{_lede(runs)}</h1></header><nav '
-        f'aria-label="Parts">{nav}</nav>'
-        f"<main>{body}</main>{viewer}"
-        f"<script>{get_plotlyjs()}</script>{_json('data', data)}{''.join(scenes)}<script>{script}</script>"
-        "</body></html>\n"
+    style, viewer, script = map(_asset, ("page.css", "viewer.html", "page.js"))
+    template = _templates().get_template("page.html")
+    text = template.render(
+        policy=_POLICY,
+        labels=list(dict.fromkeys(run.label for run in runs)),
+        suites=list(dict.fromkeys(run.spec.suite for run in runs)),
+        episodes=sum(len(run.records) for run in runs),
+        warnings=warnings_of(runs),
+        overview=summary_table(runs, colours_of(runs)),
+        tables=tables_of(runs),
+        plots=plots,
+        gallery=bool(entries or note),
+        entries=entries,
+        note=note,
+        filters=[(name, field, _counts(entries, field)) for name, field in _FILTERS.items()],
+        colours=CAUSE_COLOURS,
+        maps=maps,
+        drawn={picture.place for picture in maps.pictures},
+        all_causes=CAUSES,
+        causes=causes,
+        runs=runs,
+        **_what_was_run(runs),
+        style=style,
+        viewer=viewer,
+        library=get_plotlyjs(),
+        data=_json("data", data),
+        scenes=scenes,
+        script=script,
     )
     return text.encode()
 
 
+@cache
+def _templates() -> jinja2.Environment:
+    """Return the page's templates, which escape every value that they do not mark as safe."""
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("cosim.report", "page"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["listed"] = _listed
+    return environment
+
+
+def _asset(name: str) -> str:
+    """Return a file of this package that is put into the page as it is."""
+    return files("cosim.report.page").joinpath(name).read_text(encoding="utf-8")
+
+
 def _json(name: str, value: object) -> str:
-    """Data in the page: nothing in it can end the element that it stands in."""
+    """Return data for the page: nothing in it can end its element."""
     text = msgspec.json.encode(value, enc_hook=np.generic.item).decode()
     safe = text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
     return f'<script type="application/json" id="{name}">{safe}</script>\n'
-
-
-def _lede(runs: Sequence[ReportedRun]) -> str:
-    labels = [escape(label) for label in dict.fromkeys(run.label for run in runs)]
-    suites = [escape(name) for name in dict.fromkeys(run.spec.suite for run in runs)]
-    episodes = sum(len(run.records) for run in runs)
-    return f"{_listed(labels)} on {_listed(suites)}: {episodes:,} episode{'s' * (episodes != 1)}"
 
 
 def _listed(words: Sequence[str]) -> str:
@@ -137,106 +139,19 @@ def _listed(words: Sequence[str]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
-def _plot(number: int, plot: Plot) -> str:
-    return (
-        "<figure "
-        f'class="plot"><figcaption><h3>{escape(plot.title)}</h3><p>{escape(plot.note)}</p></figcaption><div class="drawing" data-plot="{number}" style="min-height:{plot.figure["layout"]["height"]}px" role="img" aria-label="{escape(plot.title)}"></div></figure>'
-    )
-
-
-def _gallery(entries: Sequence[Entry], note: str) -> str:
-    fields = {"run": "label", "cause": "cause", "kind": "kind", "place": "place"}
-    choices = []
-    for name, field in fields.items():
-        counts = Counter(str(getattr(entry, field)) for entry in entries)
-        values = (
-            sorted(counts, key=lambda v: CAUSES.index(v) if v in CAUSES else -1)
-            if field == "cause"
-            else [*counts]
+def _counts(entries: Sequence[Entry], field: str) -> list[tuple[str, int]]:
+    """Return how many entries have each value of a field; causes in their order."""
+    counts = Counter(str(getattr(entry, field)) for entry in entries)
+    if field == "cause":
+        return sorted(
+            counts.items(), key=lambda one: CAUSES.index(one[0]) if one[0] in CAUSES else -1
         )
-        options = "".join(
-            f'<option value="{escape(v)}">{escape(v)} ({counts[v]})</option>' for v in values
-        )
-        choices.append(
-            f'<label>{name}<select data-field="{field}"><option '
-            f'value="">all</option>{options}</select></label>'
-        )
-    cards = "".join(_card(number, entry) for number, entry in enumerate(entries))
-    intro = (
-        f"{len(entries)} failures, chosen so that every run, structure, event and cause is there, "
-        "and every real place that was driven, as far as there is room; of a long episode its "
-        "first failure, and others that come soon. Open one to see its last seconds again: from "
-        "above, by the robot's camera, from behind."
-    )
-    said = f'<p class="warn">{escape(note)}</p>' if note else ""
-    return (
-        f'<p class="intro">{intro}</p>{said}<div class="filters">{"".join(choices)}<output '
-        f'id="shown"></output></div><ol class="cards">{cards}</ol>'
-    )
+    return list(counts.items())
 
 
-def _card(number: int, entry: Entry) -> str:
-    facts = " · ".join(
-        escape(part)
-        for part in dict.fromkeys((entry.label, entry.event or entry.kind, entry.place))
-    )
-    about = (
-        f'<span class="cause" style="--c:{CAUSE_COLOURS[entry.cause]}">{escape(entry.cause)}</span>'
-        f"<b>{escape(entry.reason[:1].upper() + entry.reason[1:])}.</b>"
-        f"<small>{facts}<br>{escape(entry.scenario)}, {entry.at_s:.1f} s</small>"
-    )
-    attributes = "".join(
-        f' data-{name}="{escape(str(getattr(entry, name)))}"'
-        for name in ("label", "cause", "kind", "place")
-    )
-    if entry.scene is None:
-        return (
-            f'<li{attributes}><div class="card '
-            f'bare">{about}<small>{escape(entry.why)}</small></div></li>'
-        )
-    shot = entry.scene.pictures.follow[-1] if entry.scene.pictures.follow else ""
-    picture = f'<img src="{shot}" alt="" width="384" height="216" decoding="async">' if shot else ""
-    return (
-        f'<li{attributes}><button class="card" type="button" '
-        f'data-entry="{number}">{picture}{about}</button></li>'
-    )
-
-
-def _places(maps: Maps, causes: Mapping[str, Counter[str]]) -> str:
-    drawn = {picture.place for picture in maps.pictures}
-    options = "".join(
-        f'<option value="{k}">{escape(p.place)}: {causes[p.place].total()} failures</option>'
-        for k, p in enumerate(maps.pictures)
-    )
-    drawing = '<div id="map" class="drawing" role="img" aria-label="Failures on the map"></div>'
-    chooser = (
-        f'<div class="filters"><label>place<select id="place">{options}</select></label></div>'
-        f'<figure class="plot"><h3 id="map-name"></h3>{drawing}</figure>'
-        if options
-        else ""
-    )
-    rows = []
-    for place, (episodes, failed) in maps.episodes.items():
-        told = ", ".join(
-            f"{cause} {causes[place][cause]}" for cause in CAUSES if causes[place][cause]
-        )
-        mark = "" if place in drawn else ' class="quiet"'
-        rows.append(
-            f'<tr{mark}><th scope="row">{escape(place)}</th><td>{episodes}</td><td>{failed}</td>'
-            f'<td class="word">{escape(told)}</td></tr>'
-        )
-    heads = '<th scope="col">place</th><th scope="col">episodes</th><th scope="col">failed</th>'
-    heads += '<th scope="col" class="word">what went wrong</th>'
-    listed = wide_html("Every place", f"<tr>{heads}</tr>", rows)
-    return (
-        f'<p class="intro">Dots are failures; the large ones open.</p>{chooser}'
-        f"<details><summary>Every place ({len(maps.episodes)})</summary>{listed}</details>"
-    )
-
-
-def _what_was_run(runs: Sequence[ReportedRun]) -> str:
-    """What each run was, so that somebody else can do it again: what they share once, the rest side
-    by side."""
+def _what_was_run(runs: Sequence[ReportedRun]) -> dict[str, Any]:
+    """Return what each run was, so that others can repeat it: what they share, what differs,
+    lost episodes."""
     facts = [_facts(run) for run in runs]
     shared = {
         name: value for name, value in facts[0].items() if all(one[name] == value for one in facts)
@@ -248,24 +163,15 @@ def _what_was_run(runs: Sequence[ReportedRun]) -> str:
         shared["versions"] = ", ".join(f"{name} {versions[0][name]}" for name in alike)
     for fact, one in zip(facts, versions, strict=True):
         fact |= {name: one.get(name, "not told") for name in packages if name not in alike}
-    parts = [_listing(shared)] if shared else []
-    if differing := [name for name in facts[0] if name not in shared]:
-        heads = "".join(
-            f'<th scope="col">{escape(run.label)}, {escape(run.spec.suite)}</th>' for run in runs
-        )
-        rows = [
-            f'<tr><th scope="row">{name}</th>{"".join(f"<td>{escape(one[name])}</td>" for one in facts)}</tr>'
-            for name in differing
-        ]
-        parts.append(wide_html("What differs", f"<tr><td></td>{heads}</tr>", rows, "facts"))
-    return "".join([*parts, *(_lost(run) for run in runs)])
-
-
-def _listing(facts: Mapping[str, str]) -> str:
-    items = "".join(
-        f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in facts.items()
-    )
-    return f'<div class="run"><dl>{items}</dl></div>'
+    return {
+        "shared": shared,
+        "differing": {
+            name: [one[name] for one in facts] for name in facts[0] if name not in shared
+        },
+        "without_result": [
+            (f"{run.label}, {run.spec.suite}", lines) for run in runs if (lines := _lost(run))
+        ],
+    }
 
 
 def _facts(run: ReportedRun) -> dict[str, str]:
@@ -300,19 +206,13 @@ def _facts(run: ReportedRun) -> dict[str, str]:
     }
 
 
-def _lost(run: ReportedRun) -> str:
-    """The episodes that crashed or are invalid, and why."""
+def _lost(run: ReportedRun) -> list[str]:
+    """Return a line for each episode that crashed or is invalid."""
     bad = run.table[run.table["status"] != "done"]
-    told = [
-        f"{status} {name}: {why}"
-        for status, name, why in bad[["status", "scenario", "reason"]].itertuples(index=False)
-    ]
-    if not told:
-        return ""
-    more = [f"and {len(told) - _MOST_TOLD} more"] if len(told) > _MOST_TOLD else []
-    lines = "".join(f"<li>{escape(line)}</li>" for line in [*told[:_MOST_TOLD], *more])
-    title = f"{escape(run.label)}, {escape(run.spec.suite)}: without a result"
-    return f'<div class="run"><h3>{title}</h3><ul>{lines}</ul></div>'
+    rows = bad[["status", "scenario", "reason"]].itertuples(index=False)
+    lines = [f"{status} {name}: {why}" for status, name, why in rows]
+    more = [f"and {len(lines) - _MOST_TOLD} more"] if len(lines) > _MOST_TOLD else []
+    return [*lines[:_MOST_TOLD], *more]
 
 
 def _causes_of(runs: Sequence[ReportedRun]) -> Mapping[str, Counter[str]]:

@@ -1,11 +1,10 @@
-"""The paper's three tables for the runs of a report, as HTML: our figures with intervals, the
-paper's own below."""
+"""The paper's three tables for the runs of a report: our figures with intervals, the paper's own
+below."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from html import escape
-from itertools import groupby
+from itertools import groupby, pairwise
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -37,9 +36,6 @@ _FIRST: Final = {
     "velocity_mean_mps": "V m/s",
 }
 _PLACES: Final = ((False, "Generated places"), (True, "Real places"))
-_BESIDE: Final = (
-    "the paper's models, in another engine with other pictures: for the shape, not to be compared"
-)
 
 
 class MeanOfEpisodes(NamedTuple):
@@ -54,9 +50,50 @@ class MeanOfEpisodes(NamedTuple):
 _NOTHING: Final = MeanOfEpisodes(np.nan, np.nan, np.nan, 0)
 
 
+class TableRow(NamedTuple):
+    """A row of figures. notes: what a reader must know of it; suite, colour: in the summary of
+    all runs."""
+
+    name: str
+    cells: tuple[MeanOfEpisodes, ...]
+    notes: str = ""
+    suite: str = ""
+    colour: str = ""
+    scored: int = 0
+    invalid: int = 0
+
+
+class ReportTable(NamedTuple):
+    """A table of the page.
+
+    spans: lines of (words, columns) above the heads.
+    edges: for each column whether a group of columns begins with it.
+    paper: rows of the paper's models.
+    """
+
+    title: str
+    note: str
+    heads: tuple[str, ...]
+    rows: tuple[TableRow, ...]
+    spans: tuple[tuple[tuple[str, int], ...], ...] = ()
+    edges: tuple[bool, ...] = ()
+    paper: Mapping[str, Row] = {}
+
+
+class RunWarnings(NamedTuple):
+    """Reasons against quoting figures.
+
+    unquotable: (run and suite, reason).
+    mixed: (suite, scenarios of each of its runs) where these differ.
+    """
+
+    unquotable: tuple[tuple[str, str], ...]
+    mixed: tuple[tuple[str, str], ...]
+
+
 class _Column(NamedTuple):
-    """One column: the rows of a table that it is about, and the metric. over, group: what stands
-    over its head."""
+    """One column: the rows of a table that it is about, and the metric. over, group: words above
+    its head."""
 
     over: str
     group: str
@@ -65,33 +102,28 @@ class _Column(NamedTuple):
     metric: str
 
 
-def tables_html(runs: Sequence[ReportedRun]) -> str:
-    """All tables that the runs have rows for."""
-    parts = [_unit(runs), *_reactive(runs), _long(runs), _other(runs)]
-    return "\n".join(part for part in parts if part)
+def tables_of(runs: Sequence[ReportedRun]) -> list[ReportTable]:
+    """Return all tables that the runs have rows for."""
+    tables = [_unit(runs), *_reactive(runs), _long(runs), _other(runs)]
+    return [table for table in tables if table is not None]
 
 
-def summary_html(runs: Sequence[ReportedRun], colours: Mapping[str, str]) -> str:
-    """A row for each run: the figures that are asked for first. colours: of the labels."""
-    words = ("scored", "invalid", *_FIRST.values())
-    heads = '<th scope="col">run</th><th scope="col" class="word">suite</th>'
-    heads += "".join(f'<th scope="col">{word}</th>' for word in words)
+def summary_table(runs: Sequence[ReportedRun], colours: Mapping[str, str]) -> ReportTable:
+    """Return a row for each run: the figures that are looked at first. colours: of the labels."""
     rows = []
     for run in runs:
         invalid = int((run.table["status"] == "invalid").sum())
-        cells = "".join(_cell(cell_of(run.table, metric)) for metric in _FIRST)
-        dot = f'<i class="dot" style="background:{colours[run.label]}"></i>'
+        cells = tuple(cell_of(run.table, metric) for metric in _FIRST)
+        about = {"suite": run.spec.suite, "colour": colours[run.label]}
         rows.append(
-            f'<tr><th scope="row">{dot}{escape(run.label)}</th><td '
-            f'class="word">{escape(run.spec.suite)}</td>'
-            f"<td>{len(run.table) - invalid}</td><td>{invalid}</td>{cells}</tr>"
+            TableRow(run.label, cells, scored=len(run.table) - invalid, invalid=invalid, **about)
         )
-    title = "All episodes of each run"
     note = (
         "SR success; RC share of the route done; FC failures per 100 m travelled, pooled; V mean "
         "speed. Small figures are 95 % bootstrap intervals over episodes."
     )
-    return titled_html(title, note, wide_html(title, f"<tr>{heads}</tr>", rows))
+    heads = ("scored", "invalid", *_FIRST.values())
+    return ReportTable("All episodes of each run", note, heads, tuple(rows))
 
 
 def cell_of(table: pd.DataFrame, metric: str) -> MeanOfEpisodes:
@@ -117,7 +149,7 @@ def kind_in_words(kind: str) -> str:
     return kind.replace("ped_", "ped. ")
 
 
-def _unit(runs: Sequence[ReportedRun]) -> str:
+def _unit(runs: Sequence[ReportedRun]) -> ReportTable | None:
     columns = [
         _Column(words, kind, head, {"real": real, "kind": kind}, metric)
         for real, words in _PLACES
@@ -128,7 +160,7 @@ def _unit(runs: Sequence[ReportedRun]) -> str:
     return _table("Unit tests", note, runs, "unit", columns, UNIT_OF_PAPER)
 
 
-def _reactive(runs: Sequence[ReportedRun]) -> Iterable[str]:
+def _reactive(runs: Sequence[ReportedRun]) -> Iterable[ReportTable | None]:
     titles = {
         "success": (
             "People in the way: success",
@@ -150,7 +182,7 @@ def _reactive(runs: Sequence[ReportedRun]) -> Iterable[str]:
         yield _table(title, note, runs, "reactive", columns, REACTIVE_OF_PAPER[metric])
 
 
-def _long(runs: Sequence[ReportedRun]) -> str:
+def _long(runs: Sequence[ReportedRun]) -> ReportTable | None:
     columns = [
         _Column("", words, head, {"real": real}, metric)
         for real, words in _PLACES
@@ -163,8 +195,8 @@ def _long(runs: Sequence[ReportedRun]) -> str:
     return _table("Long ways", note, runs, "long", columns, LONG_OF_PAPER)
 
 
-def _other(runs: Sequence[ReportedRun]) -> str:
-    """What is of no kind that the paper has: a row for each, with success and completion."""
+def _other(runs: Sequence[ReportedRun]) -> ReportTable | None:
+    """A row for each kind of scenario that the paper has not, with success and completion."""
     known = {"unit": UNIT_COLUMNS, "reactive": EVENT_COLUMNS, "long": ("route",)}
     found: dict[str, pd.DataFrame] = {}
     for run in runs:
@@ -172,7 +204,7 @@ def _other(runs: Sequence[ReportedRun]) -> str:
             if run.spec.suite not in OF_THE_PAPER or kind not in known[str(family)]:
                 found[f"{run.label}: {kind}"] = part
     if not found:
-        return ""
+        return None
     columns = [_Column("", "", head, {}, metric) for metric, head in (_SHARES | RATES).items()]
     return _framed(
         "Other suites and kinds",
@@ -190,9 +222,9 @@ def _table(
     family: PaperTable,
     columns: Sequence[_Column],
     paper: Mapping[str, Row],
-) -> str:
+) -> ReportTable | None:
     ours = episodes_of([run for run in runs if run.spec.suite in OF_THE_PAPER], family)
-    return _framed(title, note, columns, ours, paper) if ours else ""
+    return _framed(title, note, columns, ours, paper) if ours else None
 
 
 def _framed(
@@ -201,61 +233,27 @@ def _framed(
     columns: Sequence[_Column],
     ours: Mapping[str, pd.DataFrame],
     paper: Mapping[str, Row],
-) -> str:
-    edge = [
-        ' class="edge"'
-        if k and (c.over, c.group) != (columns[k - 1].over, columns[k - 1].group)
-        else ""
-        for k, c in enumerate(columns)
+) -> ReportTable:
+    groups = [(column.over, column.group) for column in columns]
+    rows = [
+        TableRow(label, tuple(cell_of(_part(table, c), c.metric) for c in columns), _notes(table))
+        for label, table in ours.items()
     ]
-    head = _spans([(c.over,) for c in columns]) + _spans([(c.over, c.group) for c in columns])
-    heads = "".join(
-        f'<th scope="col"{edge[k]}>{escape(c.head)}</th>' for k, c in enumerate(columns)
-    )
-    body = []
-    for label, table in ours.items():
-        cells = "".join(
-            _cell(cell_of(_part(table, c), c.metric), edge[k]) for k, c in enumerate(columns)
-        )
-        body.append(f'<tr><th scope="row">{escape(label)}{_marks(table)}</th>{cells}</tr>')
-    if paper:
-        body.append(
-            f'<tr class="divide"><th colspan="{len(columns) + 1}" '
-            f'scope="rowgroup"><span>{_BESIDE}</span></th></tr>'
-        )
-    for name, row in paper.items():
-        cells = "".join(f"<td{edge[k]}>{_number(value)}</td>" for k, value in enumerate(row))
-        body.append(f'<tr class="paper"><th scope="row">{escape(name)}</th>{cells}</tr>')
-    heads = f"{head}<tr><td></td>{heads}</tr>"
-    return titled_html(
-        title, note, wide_html(title, heads, body, "tight" if len(columns) > 12 else "")
+    lines: tuple[Sequence[tuple[str, ...]], ...] = ([(over,) for over, _ in groups], groups)
+    return ReportTable(
+        title,
+        note,
+        tuple(column.head for column in columns),
+        tuple(rows),
+        tuple(_spans(line) for line in lines if any(name[-1] for name in line)),
+        (False, *(one != before for before, one in pairwise(groups))),
+        paper,
     )
 
 
-def titled_html(title: str, note: str, inner: str) -> str:
-    """A figure with a title and a note above it."""
-    words = f"<h3>{escape(title)}</h3><p>{escape(note)}</p>"
-    return f'<figure class="table"><figcaption>{words}</figcaption>{inner}</figure>'
-
-
-def wide_html(name: str, heads: str, rows: Iterable[str], style: str = "") -> str:
-    """A table that scrolls where it is wider than the page. heads, rows: as HTML."""
-    style = f' class="{style}"' if style else ""
-    return (
-        f'<div class="wide" tabindex="0" role="region" aria-label="{escape(name)}"><table{style}>'
-        f"<thead>{heads}</thead><tbody>{''.join(rows)}</tbody></table></div>"
-    )
-
-
-def _spans(names: Sequence[tuple[str, ...]]) -> str:
-    """A line of heads over neighbouring columns of one name; nothing where they have none."""
-    if not any(name[-1] for name in names):
-        return ""
-    spans = [(name[-1], len(list(same))) for name, same in groupby(names)]
-    cells = "".join(
-        f'<th colspan="{count}" scope="colgroup">{escape(words)}</th>' for words, count in spans
-    )
-    return f"<tr><td></td>{cells}</tr>"
+def _spans(names: Iterable[tuple[str, ...]]) -> tuple[tuple[str, int], ...]:
+    """Return (words, columns) for neighbouring columns of one name."""
+    return tuple((name[-1], len(list(same))) for name, same in groupby(names))
 
 
 def _part(table: pd.DataFrame, column: _Column) -> pd.DataFrame:
@@ -264,47 +262,28 @@ def _part(table: pd.DataFrame, column: _Column) -> pd.DataFrame:
     return table
 
 
-def _marks(table: pd.DataFrame) -> str:
-    """What a reader must know of a row: how many episodes, and who knew more than a robot can."""
+def _notes(table: pd.DataFrame) -> str:
+    """Return what a reader must know of a row: its number of episodes, and what the policy knew."""
     notes = [f"{len(table)} episode{'s' * (len(table) != 1)}"]
     notes += ["crowd added"] * bool(table["crowd_added"].any())
     if table["privileged"].any():
         notes.append("oracle, privileged" if ORACLE in {*table["policy"]} else "privileged")
     notes += ["nonstandard camera"] * bool((table["nonstandard"] != "").any())
-    return f"<small>{', '.join(notes)}</small>"
+    return ", ".join(notes)
 
 
-def _cell(cell: MeanOfEpisodes, edge: str = "") -> str:
-    if not cell.n or np.isnan(cell.mean):
-        return f"<td{edge}>&ndash;</td>"
-    tip = f"{cell.mean:.3f} ({cell.low:.3f} to {cell.high:.3f}), n = {cell.n}"
-    interval = f"{_number(cell.low)}&ndash;{_number(cell.high)}"
-    return f'<td{edge} title="{tip}">{_number(cell.mean)}<small>{interval}</small></td>'
-
-
-def _number(value: float | None) -> str:
-    return "&ndash;" if value is None else f"{value:.2f}"
-
-
-def warnings_html(runs: Sequence[ReportedRun]) -> str:
-    """Why figures of a run are not to be quoted, a line for each such run, and which runs of a
-    suite are of other scenarios of it; nothing where all are sound."""
-    told = [(run, not_to_be_quoted(run.table, len(run.spec.scenarios))) for run in runs]
-    lines = [
-        f"<li><b>{escape(run.label)}, {escape(run.spec.suite)}</b>: not to be quoted, "
-        f"{escape(why)}.</li>"
-        for run, why in told
-        if why
-    ]
+def warnings_of(runs: Sequence[ReportedRun]) -> RunWarnings:
+    """Return why figures of runs should not be quoted, and which suites were run with different
+    scenarios."""
+    reasons = [(run, not_to_be_quoted(run.table, len(run.spec.scenarios))) for run in runs]
     suites: dict[str, list[ReportedRun]] = {}
     for run in runs:
         suites.setdefault(run.spec.suite, []).append(run)
-    for suite, of in suites.items():
-        if len({frozenset(run.spec.scenarios) for run in of}) > 1:
-            counts = ", ".join(f"{escape(run.label)} {len(run.spec.scenarios)}" for run in of)
-            lines.append(
-                f"<li><b>{escape(suite)}</b>: not all runs are of the same scenarios ({counts}). "
-                "Their rows are not to be compared one with another; <code>cosim compare</code> "
-                "takes the scenarios that both have.</li>"
-            )
-    return f'<ul class="warn">{"".join(lines)}</ul>' if lines else ""
+    return RunWarnings(
+        tuple((f"{run.label}, {run.spec.suite}", why) for run, why in reasons if why),
+        tuple(
+            (suite, ", ".join(f"{run.label} {len(run.spec.scenarios)}" for run in of))
+            for suite, of in suites.items()
+            if len({frozenset(run.spec.scenarios) for run in of}) > 1
+        ),
+    )

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cosim.core.errors import EngineError
+from cosim.core.errors import EngineError, SpecError
 from cosim.core.geometry import Floats
 from physics.dynamics.bullet import p
 from physics.ground.mesh import Mesh, Part, box, frustum, join
@@ -72,17 +72,29 @@ def _shape(visual: xml.Element, urdf: Path) -> Mesh:
         flip = np.array([1.0, -1.0, -1.0])
         return join([upper, Mesh(upper.vertices * flip, upper.normals * flip, upper.triangles)])
     if shape is not None and shape.tag == "mesh":
-        from physics.street.mesh_surface import (
-            as_mesh,
-            read_mesh,
-        )  # trimesh takes 0.2 s, which most robots do not need
-
         scale = np.array([float(v) for v in shape.get("scale", "1 1 1").split()])
-        return as_mesh(read_mesh(urdf.parent / shape.get("filename", "")).apply_scale(scale))
+        return _mesh_of_file(urdf.parent / shape.get("filename", ""), scale)
     what = "nothing" if shape is None else f"a {shape.tag}"
     raise EngineError(
         f"{urdf}: a visual shows {what}; the gl camera draws boxes, cylinders and meshes"
     )
+
+
+def _mesh_of_file(path: Path, scale: Floats) -> Mesh:
+    """Return all triangles of a file that trimesh reads, each flat. Raises SpecError that names the
+    file."""
+    import trimesh  # takes 0.2 s, which most robots do not need
+
+    try:
+        scene = trimesh.load_scene(path)
+    except (OSError, ValueError, KeyError, TypeError, IndexError, NotImplementedError) as error:
+        raise SpecError(f"{path}: cannot be read as a mesh: {error}") from error
+    if not any(len(getattr(shape, "faces", ())) for shape in scene.geometry.values()):
+        raise SpecError(f"{path}: there is no triangle in it")
+    mesh = scene.to_mesh().apply_scale(scale)
+    corners = mesh.triangles.reshape(-1, 3)
+    triangles = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
+    return Mesh(corners, np.repeat(mesh.face_normals, 3, axis=0), triangles)
 
 
 def _colour(material: xml.Element) -> tuple[float, float, float]:

@@ -1,5 +1,4 @@
-"""What `cosim bench camera` measures: frames a second of the cameras in a busy street, side by side
-in one run.
+"""Measures frames per second of the cameras in a busy street: `cosim bench camera`.
 
 Every figure is taken in a process of its own, several rounds in turn; medians are shown. People
 walk from frame to frame, so nothing can be kept from the last one.
@@ -23,6 +22,7 @@ from cosim.place.street_map import StreetMap
 from cosim.spec.camera import CameraSpec
 from cosim.spec.options import CameraName
 from cosim.spec.scenario import City
+from scenarios.tools.bench.figures import alone
 
 SIZE: Final = (512, 288)
 PERSONS: Final = 50
@@ -46,8 +46,8 @@ class Busy(NamedTuple):
 
 
 def busy_street(street_map: StreetMap, persons: int, frames: int) -> Busy:
-    """People all over the view of a robot that looks along the longest sidewalk, four of five of
-    them walking."""
+    """Fill the view of a robot that looks along the longest sidewalk with people; four of five
+    walk."""
     rng = np.random.default_rng(persons)
     longest = max(
         (s for s in street_map.strips.values() if s.kind == "sidewalk"), key=lambda s: s.length_m
@@ -76,7 +76,7 @@ def busy_street(street_map: StreetMap, persons: int, frames: int) -> Busy:
 
 
 def _cars(x_m: float, y_m: float, heading_rad: float) -> Callable[[float], Vehicles]:
-    """Eight cars on both sides of a line beside the robot, moving."""
+    """Return a function of time that gives eight moving cars on both sides of the robot."""
     count = 8
     along = np.linspace(5.0, 45.0, count)
     aside = np.where(np.arange(count) % 2 == 0, 6.0, -6.0)
@@ -95,7 +95,7 @@ def _cars(x_m: float, y_m: float, heading_rad: float) -> Callable[[float], Vehic
 
 
 def camera_city(size_m: float) -> StreetMap:
-    """The street map of the city of a size that pictures are taken in."""
+    """Return the street map of the city of a size."""
     from sumo_nets.city.store import city_net
     from sumo_nets.net.snapshot import street_map_of
 
@@ -103,8 +103,8 @@ def camera_city(size_m: float) -> StreetMap:
 
 
 def whole_frame(camera: CameraName, persons: int, frames: int, size_m: float) -> float:
-    """Median seconds of a whole picture by `gl`, `bullet` or `bullet-egl`: arranged, drawn and read
-    back."""
+    """Time a whole picture by `gl`, `bullet` or `bullet-egl`: arranged, drawn and read back;
+    median seconds."""
     from physics.cameras.choice import camera_of
     from physics.street.street_surface import StreetSurface
     from scenarios.episodes.wiring import world_of
@@ -117,8 +117,8 @@ def whole_frame(camera: CameraName, persons: int, frames: int, size_m: float) ->
 
 
 def people_alone(persons: int, frames: int, size_m: float) -> float:
-    """Median seconds of a picture of nothing but people: posed, skinned, drawn, and read back while
-    the next is."""
+    """Time a picture of people alone: posed, skinned, drawn, and read back while the next is
+    drawn; median seconds."""
     from physics.cameras.gl.people_only import PeopleAlone
 
     busy = busy_street(camera_city(size_m), persons, frames)
@@ -133,8 +133,8 @@ def people_alone(persons: int, frames: int, size_m: float) -> float:
 
 
 def together(environments: int, frames: int, size_m: float) -> float:
-    """Median seconds of one environment's picture where several are drawn into one atlas and read
-    back at once."""
+    """Time one environment's picture of several that are drawn into one atlas and read back at
+    once; median seconds."""
     from physics.cameras.gl.atlas import Atlas
     from physics.street.street_surface import StreetSurface
     from scenarios.episodes.wiring import world_of
@@ -155,7 +155,8 @@ def together(environments: int, frames: int, size_m: float) -> float:
 
 
 def _median(draw: Callable[[Street], object], streets: tuple[Street, ...]) -> float:
-    """Median seconds of a picture, the first tenth left out: tiles and bodies are built in them."""
+    """Return the median seconds of a picture without the first tenth, in which tiles and bodies
+    are built."""
     stamps = [time.perf_counter()]
     for street in streets:
         draw(street)
@@ -164,8 +165,8 @@ def _median(draw: Callable[[Street], object], streets: tuple[Street, ...]) -> fl
 
 
 class Drawing(NamedTuple):
-    """A row of the table. work(size_m) -> seconds a picture; least_fps: what it should reach, here
-    and on a GPU."""
+    """A row of the table. work(size_m) -> seconds a picture; least_fps: what it should reach,
+    here and on a GPU."""
 
     name: str
     work: Callable[[float], float]
@@ -203,12 +204,11 @@ RATIOS: Final = (
     ("gl / EGL plugin", WHOLE, EGL, ">= 5"),
     ("time in a 2 km city / 0.2 km city", _SMALL, WHOLE, "<= 1.1"),
 )
-"""What a ratio says, the figures above and below its line, what it should be."""
+"""Ratios: name, figures above and below the line, target."""
 
 
 class _Found(NamedTuple):
-    """What came out of a figure: frames a second, round by round; why: what is wrong where there
-    are none."""
+    """Result of a figure: frames per second of each round; why: the reason where there are none."""
 
     fps: list[float]
     why: str = ""
@@ -217,10 +217,8 @@ class _Found(NamedTuple):
 def time_cameras(
     rounds: int, tell: Callable[[str], None], figures: Sequence[Drawing] = FIGURES
 ) -> dict[str, _Found]:
-    """Frames a second of every figure, `rounds` times, each in a fresh process. What fails is not
-    tried again."""
-    from scenarios.tools.bench.in_subprocess import alone
-
+    """Measure every figure `rounds` times, each in a fresh process. A figure that fails is not
+    repeated."""
     found = {figure.name: _Found([]) for figure in figures}
     for i in range(rounds):
         for figure in figures:

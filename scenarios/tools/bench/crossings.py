@@ -1,5 +1,5 @@
-"""What `cosim bench crossings` measures: how a policy, the crowd and the vehicles keep to the
-lights of crossings.
+"""Measures how a policy, the crowd and vehicles obey the lights of crossings: `cosim bench
+crossings`.
 
 Every crossing is an episode of its own with the real engines; each city has a process of its own,
 because SUMO can take one down. What such a process had not finished counts as crashed.
@@ -30,11 +30,11 @@ from cosim.spec.scenario import City, Scenario
 from scenarios.episodes.run_episode import Outcome, run_episode
 from scenarios.places.nets import place
 from scenarios.suites.crossings import build_all
-from scenarios.tools.bench.crowd_tally import Tally
+from scenarios.tools.bench.crowd import Tally
 from sumo_nets.crowd.stoplines import StopLines
 
 _SIZE_M = 2000.0
-"""Of the cities, whose seeds count from 1."""
+"""Side of the cities, in metres; their seeds count from 1."""
 
 
 class Crossed(msgspec.Struct, frozen=True, kw_only=True):
@@ -114,20 +114,20 @@ def cross_city(city: City, count: int, policy: str) -> Iterator[Crossed]:
 
 
 def _drawn(city: City, count: int) -> list[Scenario]:
-    """So many crossings of a city."""
+    """Build crossings of a city."""
     _, street_map = place(city)
     return build_all(city, street_map, WalkGraph(street_map), 0, count)
 
 
 @cache
 def driver_of(policy: str) -> Driver:
-    """The policy of this process: the same one for all its crossings."""
+    """Load the policy once for all crossings of this process."""
     return load_policy(policy)
 
 
 def cross(scenario: Scenario, policy: str) -> Crossed:
-    """Drive over one crossing and count what happens around it. A policy that raised is made anew
-    for the next."""
+    """Drive over one crossing and count what happens around it. A policy that raised is loaded
+    again for the next."""
     _, street_map = place(scenario.place)
     tally = Tally(street_map, Clock().tick_s)
     lines = StopLines(Clock().tick_s)
@@ -143,7 +143,7 @@ def cross(scenario: Scenario, policy: str) -> Crossed:
 
 
 def told(scenario: Scenario, outcome: Outcome, tally: Tally) -> Crossed:
-    """An episode and what was counted around it, in a row."""
+    """Return an episode and the counts around it as a row."""
     record, log = outcome.record, outcome.log
     nothing = Crossed(
         scenario=scenario.id,
@@ -171,5 +171,5 @@ def told(scenario: Scenario, outcome: Outcome, tally: Tally) -> Crossed:
 
 
 def crossings_entered(rows: Iterable[Crossed]) -> int:
-    """How many different signalised crossings somebody of the crowd entered."""
+    """Return how many different signalised crossings the crowd entered."""
     return len({crossing for row in rows for crossing in row.entered})

@@ -1,65 +1,266 @@
-"""How fast places are made, read and asked."""
+"""Surveys generated cities, and tests whether SUMO endures bodies that go anywhere on a map.
+
+In the test of a map the bodies walk from sidewalk to sidewalk, drive along lanes, cut straight
+across everything, stand at the ends of sidewalks and jump, as resets do. Each map has a process of
+its own: SUMO takes its process down when it dies.
+"""
 
 from __future__ import annotations
 
-import tempfile
+import math
+import multiprocessing
+import os
+import resource
 import time
-from itertools import pairwise
-from pathlib import Path
-from typing import Final
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing.connection import Connection
+from typing import NamedTuple
 
-from cosim.spec.scenario import City
-from scenarios.tools.bench.figures import Figure
+import msgspec
+import numpy as np
 
-_ASKED: Final = 500
-"""Questions about a place whose mean time is taken."""
+from cosim.core.child_process import end_with, ended_in_words
+from cosim.core.clock import Clock
+from cosim.core.errors import CosimError, EngineError
+from cosim.core.geometry import Floats, Polyline, Pose
+from cosim.core.state import PersonKind, RobotState
+from cosim.place.street_map import StreetMap
+from cosim.place.walk_graph import WalkGraph
+from cosim.spec.events import Actor, EventReply
+from cosim.spec.scenario import City, Place, Scenario
+from physics.street.clearance import clear_width, on_driveways
+from physics.street.furniture import footprints
+from physics.street.placement import props_of
+from sumo_nets.city.census import LEAST_CLEAR_M, Census, census
+from sumo_nets.city.store import city_net
+from sumo_nets.net.snapshot import street_map_of
+
+BODIES = 3
+"""The robot and two event pedestrians."""
+_STEP_M = 0.075
+"""Distance that a body moves in a tick, in metres: 1.5 m/s."""
+MOVES = {"walk": 0.2, "lane": 0.2, "across": 0.3, "stand": 0.15, "jump": 0.15}
+"""Probabilities of a body's next move."""
+_WALK_EDGES = 6
+ACROSS_M = (10.0, 60.0)
+STAND_TICKS = 160
+NEARBY_M = 100.0
+REPORT_TICKS = 200
+HANG_S = 120.0
 
 
-def places() -> list[Figure]:
-    """Make a 2 km city from its seed, read it again, ask it: a point against the walkable area, a
-    shortest walk."""
-    import numpy as np
+class Survey(NamedTuple):
+    """A city with its furniture.
 
-    from cosim.place.street_map import WalkableArea
-    from cosim.place.walk_graph import WalkGraph
-    from sumo_nets.city.store import build_city, city_net
-    from sumo_nets.net.net_file import read_net
-    from sumo_nets.net.snapshot import street_map_of
+    side_m: the least free width on any sidewalk, around its middle.
+    props: number of props.
+    faults: violations of what a city promises.
+    memory_mib: the largest memory of its process so far.
+    """
 
-    city = City(seed=5, size_m=2000.0)
-    with tempfile.TemporaryDirectory() as folder:
-        began = time.perf_counter()
-        path = Path(folder) / "city.net.xml"
-        build_city(city, path)
-        read_net(path)
-        made_s = time.perf_counter() - began
-    street_map_of(city_net(city))
-    began = time.perf_counter()
-    street_map = street_map_of(city_net(city))
-    read_s = time.perf_counter() - began
+    seed: int
+    census: Census
+    side_m: float
+    props: int
+    faults: tuple[str, ...]
+    memory_mib: float
+
+
+def survey(city: City) -> Survey:
+    """Count and measure a city on its final geometry."""
+    net = city_net(city)
+    place = street_map_of(net)
+    props = props_of(place, city.seed)
+    found = census(net, place, list(footprints(props)))
+    sidewalks = [strip for strip in place.strips.values() if strip.kind == "sidewalk"]
+    widths = clear_width(sidewalks, props)
+    tightest = min(widths, key=lambda strip: widths[strip][0])
+    faults = list(found.faults)
+    if (side_m := widths[tightest][0]) < LEAST_CLEAR_M:
+        faults.append(f"sidewalk {tightest} is only {side_m:.2f} m wide beside what stands on it")
+    if blocked := on_driveways(sidewalks, props):
+        faults.append(f"{len(blocked)} props stand on driveways: {', '.join(blocked[:3])}")
+    memory_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+    return Survey(city.seed, found, side_m, len(props), tuple(faults), memory_mib)
+
+
+def surveys(cities: Sequence[City], jobs: int) -> Iterator[Survey]:
+    """Yield surveys in the order of the cities, made by `jobs` processes."""
+    if jobs == 1:
+        yield from map(survey, cities)
+        return
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        try:
+            yield from pool.map(survey, cities)
+        except BrokenProcessPool as error:
+            raise EngineError(
+                "a process that surveyed cities has died: with fewer --jobs it may have "
+                "memory enough"
+            ) from error
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+class Endured(msgspec.Struct, frozen=True, kw_only=True):
+    """Result of a place. ticks: simulated; persons, vehicles: around the robot, on the mean over
+    the ticks.
+
+    reason: what ended it before its time, "" when nothing did.
+    """
+
+    place: str
+    ticks: int = 0
+    persons: float = 0.0
+    vehicles: float = 0.0
+    wall_s: float = 0.0
+    reason: str = ""
+
+
+def endure(
+    where: Place, seed: int, minutes: float = 10.0, tell: Callable[[float], None] = lambda _: None
+) -> Endured:
+    """Simulate a place in a process of its own. Whatever goes wrong there becomes the reason,
+    not an exception."""
+    context = multiprocessing.get_context("spawn")
+    mine, theirs = context.Pipe(duplex=False)
+    ticks = Clock().ticks(60.0 * minutes)
+    process = context.Process(
+        target=_child, args=(theirs, where, seed, ticks, os.getpid()), daemon=True
+    )
+    began = time.monotonic()
+    process.start()
+    theirs.close()
+    last = Endured(place=where.name)
+    try:
+        while mine.poll(HANG_S):
+            last = msgspec.json.decode(mine.recv_bytes(), type=Endured)
+            tell(last.ticks / ticks)
+        process.kill()
+        reason = f"SUMO showed no sign of life for {HANG_S:g} s"
+    except (EOFError, ConnectionResetError):
+        process.join()
+        reason = f"SUMO {ended_in_words(process.exitcode)}" if process.exitcode else ""
+    process.join()
+    wall_s = round(time.monotonic() - began, 1)
+    return msgspec.structs.replace(last, wall_s=wall_s, reason=last.reason or reason)
+
+
+def _child(pipe: Connection, where: Place, seed: int, ticks: int, parent: int) -> None:
+    end_with(parent)
+    so_far = Endured(place=where.name)
+    try:
+        for so_far in simulated(where, seed, ticks):
+            pipe.send_bytes(msgspec.json.encode(so_far))
+    except CosimError as error:
+        pipe.send_bytes(msgspec.json.encode(msgspec.structs.replace(so_far, reason=str(error))))
+
+
+def simulated(where: Place, seed: int, ticks: int) -> Iterator[Endured]:
+    """Simulate a place in this process; yields its state every REPORT_TICKS and at the end."""
+    from scenarios.episodes.wiring import crowd_of
+    from scenarios.places.nets import place
+
+    _, street_map = place(where)
     graph = WalkGraph(street_map)
-    area = WalkableArea(street_map.walkable)
-    rng = np.random.default_rng(1)
-    ends = rng.integers(len(graph.ports), size=(_ASKED, 2)).tolist()
-    points = graph.xy[rng.integers(len(graph.xy), size=_ASKED)] + rng.normal(0.0, 2.0, (_ASKED, 2))
-    graph.shortest(graph.ports[0], graph.ports[-1])
-    # The first questions build GEOS's indices; a referee asks on and on about one neighbourhood.
-    for x, y in points.tolist():
-        area.contains(x, y)
-    stamps = [time.perf_counter()]
-    for x, y in points.tolist():
-        area.contains(x, y)
-    stamps.append(time.perf_counter())
-    area.signed_distance(points)
-    stamps.append(time.perf_counter())
-    for a, b in ends:
-        graph.shortest(graph.ports[a], graph.ports[b])
-    stamps.append(time.perf_counter())
-    contains_s, distance_s, walk_s = ((b - a) / _ASKED for a, b in pairwise(stamps))
-    return [
-        Figure("city from its seed to a street map, s", made_s, reach=4.0),
-        Figure("cached city to a street map, s", read_s, reach=0.5),
-        Figure("point in the walkable area, us", 1e6 * contains_s, reach=5.0),
-        Figure("distance to its edge, us", 1e6 * distance_s, reach=20.0),
-        Figure("shortest walk, ms", 1e3 * walk_s, reach=2.0),
+    bodies = [
+        wandering(street_map, graph, rng)
+        for rng in np.random.default_rng([seed, 0xE2D]).spawn(BODIES)
     ]
+    persons = vehicles = 0
+    start = next(bodies[0])
+    ahead = (start.x_m + 10.0, start.y_m)
+    scenario = Scenario(
+        id="soak",
+        suite="soak",
+        place=where,
+        seed=seed,
+        start=start,
+        goal=ahead,
+        route=((start.x_m, start.y_m), ahead),
+    )
+    with crowd_of(scenario) as crowd:
+        for tick in range(ticks):
+            robot, *others = map(next, bodies)
+            actors = tuple(
+                Actor(
+                    id=f"e{i}",
+                    x_m=x,
+                    y_m=y,
+                    heading_rad=way,
+                    speed_mps=1.5,
+                    doing="walk",
+                    kind=PersonKind.EVENT,
+                )
+                for i, (x, y, way) in enumerate(others)
+            )
+            street = crowd.step(
+                RobotState(robot), EventReply(episode="", tick=tick, states=(), actors=actors)
+            )
+            persons += len(street.people) - len(actors)
+            vehicles += len(street.vehicles)
+            done = tick + 1
+            if done % REPORT_TICKS == 0 or done == ticks:
+                yield Endured(
+                    place=where.name, ticks=done, persons=persons / done, vehicles=vehicles / done
+                )
+
+
+def wandering(street_map: StreetMap, graph: WalkGraph, rng: np.random.Generator) -> Iterator[Pose]:
+    """Yield the poses of a body that goes anywhere, one for each tick, without end."""
+    starts = [s.line[:, :2] for s in street_map.strips.values()]
+    ends = [
+        s.line[:: 1 if end else -1, :2]
+        for s in street_map.strips.values()
+        for end in (0, 1)
+        if not s.corners[end]
+    ]
+    lanes = [lane.line[:, :2] for lane in street_map.lanes.values() if lane.kind == "road"]
+    pose = Polyline(starts[int(rng.integers(len(starts)))]).at(0.0)
+    while True:
+        move = str(rng.choice(list(MOVES), p=list(MOVES.values())))
+        if move == "walk":
+            line = _walk(street_map, graph, rng, pose)
+        elif move == "lane" and lanes:
+            line = _near(lanes, rng, pose)
+        elif move == "across":
+            way_m = rng.uniform(*ACROSS_M)
+            turn_rad = rng.uniform(-math.pi, math.pi)
+            line = np.array(
+                [pose.xy, pose.xy + way_m * np.array([math.cos(turn_rad), math.sin(turn_rad)])]
+            )
+        else:
+            near = _near(ends if ends and rng.random() < 0.5 else starts, rng, pose)
+            line = near if rng.random() < 0.8 else starts[int(rng.integers(len(starts)))]
+            x_m, y_m = line[-1].tolist()
+            pose = Pose(x_m, y_m, float(rng.uniform(-math.pi, math.pi)))
+            for _ in range(STAND_TICKS if move == "stand" else 1):
+                yield pose
+            continue
+        path = Polyline(line)
+        for s_m in np.arange(0.0, path.length_m, _STEP_M):
+            pose = path.at(float(s_m))
+            yield pose
+
+
+def _near(lines: list[Floats], rng: np.random.Generator, pose: Pose) -> Floats:
+    """Draw one of the lines that begin nearby, or any."""
+    near = [line for line in lines if np.hypot(*(line[0] - pose.xy)) < NEARBY_M] or lines
+    return near[int(rng.integers(len(near)))]
+
+
+def _walk(street_map: StreetMap, graph: WalkGraph, rng: np.random.Generator, pose: Pose) -> Floats:
+    """Draw the line of a random walk that begins on the sidewalk at a pose, or on any."""
+    strips = street_map.strips
+    here = street_map.locate(pose.x_m, pose.y_m).edge
+    names = list(strips)
+    first = here if here in strips else names[int(rng.integers(len(names)))]
+    walk = graph.wander(rng, first, bool(rng.random() < 0.5), _WALK_EDGES)
+    pieces = [strips[first].line[:, :2]]
+    for name in walk[1:]:
+        line = strips[name].line[:, :2]
+        straight = np.hypot(*(line[0] - pieces[-1][-1])) <= np.hypot(*(line[-1] - pieces[-1][-1]))
+        pieces.append(line if straight else line[::-1])
+    return np.vstack(pieces)

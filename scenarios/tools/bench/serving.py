@@ -1,5 +1,5 @@
-"""What it costs to ask a policy in another process: isolated, and over Zenoh, alone and with many
-episodes at once."""
+"""Measures the cost of a policy in another process: isolated, and over Zenoh for one and for
+many episodes."""
 
 from __future__ import annotations
 
@@ -39,27 +39,26 @@ _NAME: Final = f"{__name__}:Blind"
 
 
 class Blind:
-    """Answers at once, whatever it is shown."""
+    """Answers at once, whatever it sees."""
 
     manifest = Manifest("blind", rate_hz=4.0, camera=_SPEC)
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Nothing to forget."""
+        """Do nothing: it has no state."""
 
     def act(self, observation: Observation) -> Command:
         return Command(1.0, 0.0)
 
 
 class BlindTogether(Blind):
-    """The same for all that ask."""
+    """The same policy, which answers many episodes at once."""
 
     def act_batch(self, observations: Sequence[Observation]) -> list[Command]:
         return [Command(1.0, 0.0) for _ in observations]
 
 
 def asking_elsewhere() -> list[Figure]:
-    """Round trips of a 512x288 picture: in turns with the same policy in this process; then eight
-    ask one server."""
+    """Time round trips of a 512x288 picture, and answers of one server to eight clients."""
     here = Driver(Blind())
     isolated = isolated_driver(_NAME, expected=Blind.manifest)
     with _served() as host:
@@ -80,7 +79,7 @@ def asking_elsewhere() -> list[Figure]:
 
 
 def _in_turns(*drivers: Driver) -> list[float]:
-    """Milliseconds of an answer, medians."""
+    """Return the median milliseconds of an answer of each driver."""
     took: list[list[float]] = [[] for _ in drivers]
     for driver in drivers:
         driver.reset("k1", 1)
@@ -93,7 +92,7 @@ def _in_turns(*drivers: Driver) -> list[float]:
 
 
 def _together(host: PolicyHost) -> float:
-    """Answers a second of one server that several processes ask; the slowest one's."""
+    """Return answers per second of one server with several clients, by the slowest client."""
     code = f"from {__name__} import ask_alone; ask_alone({host.servers[0].connect!r})"
     asking = [
         subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
@@ -104,7 +103,7 @@ def _together(host: PolicyHost) -> float:
 
 
 def ask_alone(endpoint: str) -> None:
-    """Ask a served policy for one episode, and print how many answers came in a second."""
+    """Query a served policy for one episode, and print its answers per second."""
     servers = (Connection(role="coordinator", connect=endpoint),)
     driver = remote_driver("zenoh:blind", PolicyHost(servers=servers, run=str(os.getpid())))
     driver.reset("k1", 1)
@@ -119,7 +118,7 @@ def ask_alone(endpoint: str) -> None:
 
 @contextmanager
 def _served() -> Iterator[PolicyHost]:
-    """The policy in a process of its own, behind a socket."""
+    """Serve the policy in another process, behind a socket."""
     with tempfile.TemporaryDirectory() as folder:
         endpoint = f"unixsock-stream/{Path(folder)}/hub"
         code = f"from {__name__} import serve_blind; serve_blind({endpoint!r})"

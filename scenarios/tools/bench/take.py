@@ -1,4 +1,4 @@
-"""One measurement in a process of its own: `python -m scenarios.tools.bench.take NAME STARTED
+"""Takes one measurement in a process of its own: `python -m scenarios.tools.bench.take NAME STARTED
 FILE`.
 
 STARTED: when the process was started, seconds of the monotonic clock. FILE: where its figures are
@@ -14,7 +14,7 @@ import msgspec
 
 
 def _main() -> None:
-    """Take what the command line names."""
+    """Take the measurement that the command line names."""
     name, started_s, path = sys.argv[1:]
     from scenarios.tools.bench.measurements import figures_of
 

@@ -182,7 +182,7 @@ def test_internvla_is_asked_as_its_authors_ask_it(
     (folder / "internvla_n1_agent_realworld.py").write_text(AGENT)
     for package in (folder, folder.parent):
         (package / "__init__.py").touch()
-    name = "cosim.policies.adapters.internvla_n1:InternVlaN1"
+    name = f"{ADAPTERS.parents[2]}/docs/examples/internvla_n1.py:InternVlaN1"
     without = cosim("policy", "check", name)
     assert without.returncode == 2 and "github.com/InternRobotics/InternNav" in without.stderr
     monkeypatch.setenv("COSIM_INTERNVLA", "checkpoint")

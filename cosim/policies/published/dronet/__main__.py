@@ -1,6 +1,8 @@
-"""DroNet as an ONNX graph, made of its published weights, with `pip install onnx h5py`.
+"""Writes DroNet as an ONNX graph, from its published weights.
 
 python -m cosim.policies.published.dronet model_weights.h5 [-o FOLDER]
+
+It needs `pip install 'sidewalk-cosim[convert]'`.
 """
 
 from __future__ import annotations

@@ -9,15 +9,15 @@ as the `model_struct.json` published beside it tells.
 from __future__ import annotations
 
 import io
+from pathlib import Path
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.policies.onnx.converting import Converter, GraphWriter, PublishedArrays, graph_of_bundle
 from cosim.policies.onnx.manifest import FileFacts
 from cosim.policies.onnx.weights import NetworkFile
-from cosim.policies.onnx.writing import GraphWriter
-from cosim.policies.published.making import PublishedNetwork
 
 _SIDE: Final = 200
 _PLANES: Final = (32, 32, 64, 128)
@@ -59,8 +59,7 @@ class _Layers:
 
     def __init__(self, weights: KerasWeights) -> None:
         self._writer = GraphWriter("dronet")
-        self._weights = weights
-        self._left = set(weights)
+        self._weights = PublishedArrays(weights)
 
     def dronet(self) -> bytes:
         write = self._writer.operator
@@ -74,11 +73,7 @@ class _Layers:
         collision = write("Sigmoid", "activation_8", collision)
         write("Identity", "steering", steering)
         write("Identity", "collision_prob", collision)
-        if self._left:
-            raise ValueError(
-                f"holds '{min(self._left)}', and {len(self._left) - 1} more, of which there "
-                f"is no place"
-            )
+        self._weights.check_all_taken()
         return self._writer.whole(
             {"image": ("N", 1, _SIDE, _SIDE)}, {"steering": ("N", 1), "collision_prob": ("N", 1)}
         )
@@ -124,20 +119,11 @@ class _Layers:
         ]
 
     def _take(self, layer: str, field: str, shape: tuple[int, ...]) -> NDArray[np.float32]:
-        path = f"{layer}/{layer}/{field}:0"
-        if path not in self._weights:
-            raise ValueError(f"has no '{path}'")
-        numbers = self._weights[path]
-        if numbers.shape != shape or numbers.dtype != np.float32:
-            raise ValueError(
-                f"'{path}' is {numbers.dtype} {numbers.shape}; wanted is float32 {shape}"
-            )
-        self._left.discard(path)
-        return numbers
+        return self._weights.take(f"{layer}/{layer}/{field}:0", shape)
 
 
-DRONET: Final = PublishedNetwork(
-    "dronet",
+DRONET: Final = Converter(
+    "cosim.policies.published.dronet",
     NetworkFile(
         "model_weights.h5",
         "uzh-rpg/rpg_public_dronet, commit ac19c54b, model (MIT)",
@@ -147,5 +133,5 @@ DRONET: Final = PublishedNetwork(
         ),
     ),
     lambda data: dronet_graph(read_keras_weights(data)),
-    ("onnx", "h5py"),
+    lambda: graph_of_bundle(Path(__file__).parent),
 )

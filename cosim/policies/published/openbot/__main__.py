@@ -1,7 +1,8 @@
-"""OpenBot's driving network as an ONNX graph, made of the file that is published, with `pip install
-onnx flatbuffers`.
+"""Writes OpenBot's driving network as an ONNX graph, from its published file.
 
 python -m cosim.policies.published.openbot autopilot_float.tflite [-o FOLDER]
+
+It needs `pip install 'sidewalk-cosim[convert]'`.
 """
 
 from __future__ import annotations

@@ -12,12 +12,12 @@ these by up to 0.02.
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Final
 
+from cosim.policies.onnx.converting import Converter, GraphWriter, PortShapes, graph_of_bundle
 from cosim.policies.onnx.manifest import FileFacts
 from cosim.policies.onnx.weights import NetworkFile
-from cosim.policies.onnx.writing import GraphWriter, PortShapes
-from cosim.policies.published.making import PublishedNetwork
 from cosim.policies.published.openbot.lite_file import (
     LiteModel,
     LiteOperator,
@@ -131,8 +131,8 @@ class _Translation:
         return self._model.tensors[i]
 
 
-OPENBOT: Final = PublishedNetwork(
-    "openbot",
+OPENBOT: Final = Converter(
+    "cosim.policies.published.openbot",
     NetworkFile(
         "autopilot_float.tflite",
         "isl-org/OpenBot, commit 30ab3bd1, android/app/src/main/assets/networks (MIT)",
@@ -142,5 +142,5 @@ OPENBOT: Final = PublishedNetwork(
         ),
     ),
     lambda data: openbot_graph(read_lite_file(data)),
-    ("onnx", "flatbuffers"),
+    lambda: graph_of_bundle(Path(__file__).parent),
 )

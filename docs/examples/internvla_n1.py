@@ -1,7 +1,7 @@
-"""InternVLA-N1 (Wei et al. 2026), to be served from where its code, its checkpoint and a GPU are.
+"""Serves InternVLA-N1 (Wei et al. 2026) where its code, its checkpoint and a GPU are.
 
-    COSIM_INTERNVLA=~/InternVLA-N1 cosim serve cosim.policies.adapters.internvla_n1:InternVlaN1
-    --name internvla-n1 cosim run unit --policy zenoh:internvla-n1 --goal instruction
+    COSIM_INTERNVLA=~/InternVLA-N1 cosim serve docs/examples/internvla_n1.py:InternVlaN1 --name
+    internvla-n1 cosim run unit --policy zenoh:internvla-n1 --goal instruction
 
 Its authors' agent (`internnav.agent.internvla_n1_agent_realworld`) is asked with each picture and
 the instruction, a flat plane for depth, no pose, and the camera's matrix. It answers with a way, or

@@ -1,7 +1,8 @@
-"""What a run's coordinator takes of an episode, and how many workers it serves: by the real
-coordinator, its transport and run folder, and by workers that make up their results.
+"""Measures a run's coordinator: its cost per episode, and how many workers it serves.
 
-    python -m scenarios.tools.bench.coordinating --workers 200 --jobs 100000
+Coordinator, transport and run folder are real; the workers make up their results.
+
+    python -m tests.support.coordinating --workers 200 --jobs 100000
 """
 
 from __future__ import annotations
@@ -47,14 +48,13 @@ from scenarios.runs.protocol import (
 from scenarios.runs.run import run_spec
 from scenarios.runs.transport import HeldRun
 from scenarios.runs.zenoh_transport import workers_of_run
-from scenarios.tools.bench.figures import MORE, Figure
 
-_MODULE: Final = "scenarios.tools.bench.coordinating"
+_MODULE: Final = "tests.support.coordinating"
 _POLICY: Final = f"{_MODULE}:Unseeing"
 _LOG_BYTES: Final = 30_000
 """Of the log of a short episode."""
-_ONE, _MANY = (1, 300), (200, 3000)
-"""Workers and jobs of the two figures."""
+_WORKERS: Final = 200
+_JOBS: Final = 3000
 
 
 class Unseeing:
@@ -79,20 +79,6 @@ class Served(NamedTuple):
     cpu_s: float
     memory_mb: float
     round_s: float
-
-
-def coordinating() -> list[Figure]:
-    """What an episode costs, and how many a second the coordinator takes in."""
-    alone, many = serve_made_up(*_ONE), serve_made_up(*_MANY)
-    per_s = many.jobs / many.wall_s
-    return [
-        Figure("coordinator: from a result to the next job, ms", 1000.0 * alone.round_s, reach=5.0),
-        Figure("coordinator: CPU an episode, ms", 1000.0 * many.cpu_s / many.jobs, reach=5.0),
-        Figure(
-            f"coordinator: {_MANY[0]} workers, results a second", per_s, reach=200.0, better=MORE
-        ),
-        Figure(f"coordinator: {_MANY[0]} workers, memory, MB", many.memory_mb, reach=500.0),
-    ]
 
 
 def serve_made_up(workers: int, jobs: int) -> Served:
@@ -228,8 +214,8 @@ def _load(endpoint: str, workers: int) -> None:
 
 def _main() -> None:
     parser = argparse.ArgumentParser(description="How many workers a coordinator serves.")
-    parser.add_argument("--workers", type=int, default=_MANY[0])
-    parser.add_argument("--jobs", type=int, default=_MANY[1])
+    parser.add_argument("--workers", type=int, default=_WORKERS)
+    parser.add_argument("--jobs", type=int, default=_JOBS)
     parser.add_argument("--load", metavar="ENDPOINT", default="", help="be the workers there")
     given = parser.parse_args()
     if given.load:

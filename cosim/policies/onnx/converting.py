@@ -1,0 +1,182 @@
+"""Converts published weights of another format to an ONNX graph, by a command of its own."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.errors import CosimError, MachineError, UsageError, unwritable
+from cosim.core.whole_file import write_whole
+from cosim.policies.onnx.manifest import file_facts, read_bundle_manifest
+from cosim.policies.onnx.weights import NetworkFile, weight_folders
+
+PortShapes = Mapping[str, tuple[int | str, ...]]
+"""Shapes of tensors by their names; a named axis may have any length."""
+
+
+class GraphWriter:
+    """Collects the operators and constants of an ONNX graph with float32 inputs and outputs.
+
+    A tensor is identified by its name. The same calls give the same bytes.
+    """
+
+    def __init__(self, name: str) -> None:
+        import onnx
+
+        self._onnx = onnx
+        self._name = name
+        self._nodes: list[Any] = []
+        self._constants: list[Any] = []
+
+    def constant(self, name: str, numbers: NDArray[Any]) -> str:
+        """Add numbers that the graph holds; returns their name."""
+        self._constants.append(
+            self._onnx.numpy_helper.from_array(np.ascontiguousarray(numbers), name)
+        )
+        return name
+
+    def operator(self, kind: str, out: str, *inputs: str, **attributes: Any) -> str:
+        """Add an operator with one output; returns the output's name."""
+        self._nodes.append(self._onnx.helper.make_node(kind, list(inputs), [out], **attributes))
+        return out
+
+    def whole(self, inputs: PortShapes, outputs: PortShapes) -> bytes:
+        """Return the graph as a file. Raises ValueError where the parts do not fit together."""
+        make = self._onnx.helper
+        graph = make.make_graph(
+            self._nodes, self._name, self._ports(inputs), self._ports(outputs), self._constants
+        )
+        model = make.make_model(graph, opset_imports=[make.make_opsetid("", 13)], ir_version=8)
+        try:
+            self._onnx.checker.check_model(model, full_check=True)
+        except (
+            self._onnx.checker.ValidationError,
+            self._onnx.shape_inference.InferenceError,
+        ) as error:
+            raise ValueError(f"makes no graph: {' '.join(str(error).split())}") from error
+        data: bytes = model.SerializeToString(deterministic=True)
+        return data
+
+    def _ports(self, shapes: PortShapes) -> list[Any]:
+        number = self._onnx.TensorProto.FLOAT
+        return [
+            self._onnx.helper.make_tensor_value_info(name, number, list(shape))
+            for name, shape in shapes.items()
+        ]
+
+
+class PublishedArrays:
+    """Named arrays of a published file, each of which must be used by the graph."""
+
+    def __init__(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        self._arrays = arrays
+        self._unused = set(arrays)
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._arrays
+
+    def take(self, name: str, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
+        """Return an array. Raises ValueError where there is none, or one of another shape or
+        type than given."""
+        if name not in self._arrays:
+            raise ValueError(f"has no '{name}'")
+        numbers = self._arrays[name]
+        if shape is not None and (numbers.shape != shape or numbers.dtype != np.float32):
+            raise ValueError(
+                f"'{name}' is {numbers.dtype} {numbers.shape}; wanted is float32 {shape}"
+            )
+        self._unused.discard(name)
+        return numbers
+
+    def check_all_taken(self, ignored: Callable[[str], bool] = lambda _: False) -> None:
+        """Raises ValueError for arrays that were not taken and are not ignored."""
+        if left := [name for name in self._unused if not ignored(name)]:
+            raise ValueError(
+                f"holds '{min(left)}', and {len(left) - 1} more, of which there is no place"
+            )
+
+
+def graph_of_bundle(folder: Path) -> NetworkFile:
+    """Return the graph that a bundle's manifest names, with the size and hash that a run
+    requires."""
+    manifest = read_bundle_manifest(folder)
+    return NetworkFile(manifest.model, manifest.source, manifest.files[manifest.model])
+
+
+@dataclass(frozen=True)
+class Converter:
+    """The command `python -m MODULE FILE [-o FOLDER]`, which writes the graph of a network.
+
+    weights: the published file.
+    make: returns the graph's bytes for the file's bytes.
+    graph: returns the graph's file, whose facts are None where any version may be written.
+    """
+
+    module: str
+    weights: NetworkFile
+    make: Callable[[bytes], bytes]
+    graph: Callable[[], NetworkFile]
+
+    def write(self, path: Path, folder: Path) -> Path:
+        """Write the graph of the file at `path` into a folder; returns the graph's path.
+
+        Raises UsageError for another file, MachineError where a package is missing, where it would
+        write another graph than runs require, or cannot write.
+        """
+        graph = self.graph()
+        data = self._made(path)
+        found = file_facts(data)
+        if graph.facts is not None and found.blake2b != graph.facts.blake2b:
+            raise MachineError(
+                f"{graph.name}: would be {found.bytes} bytes, BLAKE2b {found.blake2b}, and a run "
+                f"takes {graph.facts.in_words}: this onnx writes it otherwise than versions 1.19 "
+                "to 1.23: pip install 'onnx<1.24'"
+            )
+        out = folder / graph.name
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            write_whole(out, data)
+        except OSError as error:
+            raise unwritable(out, error) from error
+        return out
+
+    def _made(self, path: Path) -> bytes:
+        try:
+            data = path.read_bytes()
+        except OSError as error:
+            raise UsageError(
+                f"{path}: cannot be read: {error.strerror}; it is from {self.weights.source}"
+            ) from error
+        self.weights.check(path, data)
+        try:
+            return self.make(data)
+        except ImportError as error:
+            raise MachineError(
+                f"{path}: its graph cannot be made: {error}: pip install 'sidewalk-cosim[convert]'"
+            ) from error
+
+    def command(self, arguments: Sequence[str]) -> None:
+        """Run the command; errors of this project are one line."""
+        parser = argparse.ArgumentParser(f"python -m {self.module}")
+        parser.add_argument("file", type=Path, help=f"{self.weights.name} of {self.weights.source}")
+        parser.add_argument(
+            "-o",
+            "--output",
+            type=Path,
+            metavar="FOLDER",
+            default=weight_folders()[-1],
+            help="where to write the graph; %(default)s by default",
+        )
+        given = parser.parse_args(arguments)
+        try:
+            out = self.write(given.file, given.output)
+        except CosimError as error:
+            sys.exit(f"error: {error}")
+        print(f"{out}: {out.stat().st_size} bytes")

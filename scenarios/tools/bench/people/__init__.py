@@ -1,1 +1,0 @@
-"""`cosim bench people`: how the crowd walks, beside what was measured of people."""
