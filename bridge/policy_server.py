@@ -29,7 +29,7 @@ from typing import Any, Optional, Union
 import msgspec
 import numpy as np
 
-POLICY_PROTOCOL = 1
+POLICY_PROTOCOL = 2
 """Raised whenever the messages below change their meaning."""
 MOST_WORDS = 500
 MOST_MESSAGE_BYTES = 16 << 20
@@ -433,17 +433,18 @@ def _crash(error: BaseException, among: str = "") -> bytes:
 
 
 class _Given(SimpleNamespace):
-    """A goal, a pose or a picture. For numpy: its pixels, or its numbers without those that are
-    None."""
+    """A goal, a pose or a picture. For numpy: its picture or only array, or its numbers without
+    those that are None."""
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> Any:
-        held = vars(self)
-        pixels = [held[name] for name in ("rgb", "pixels") if name in held]
-        if not pixels and "x_m" not in held:
+        held = {name: value for name, value in vars(self).items() if value is not None}
+        values = list(held.values())
+        if all(isinstance(value, (int, float)) for value in values):
+            return np.array(values, dtype)
+        array = values[0] if len(values) == 1 else held.get("rgb")
+        if not isinstance(array, np.ndarray):
             raise TypeError(f"this is no array: read its {', '.join(held)}")
-        return np.array(
-            pixels[0] if pixels else [value for value in held.values() if value is not None], dtype
-        )
+        return np.array(array, dtype)
 
 
 def _plain_observation(
@@ -457,9 +458,8 @@ def _plain_observation(
         for name, held in about.cameras.items()
     }
     goal = dict(one.goal or {})
-    kind = goal.pop("type", "")
-    if "goal" in arrays:
-        goal["rgb" if kind == "image" else "pixels"] = arrays["goal"]
+    goal.pop("type", None)
+    goal |= {name[5:]: array for name, array in arrays.items() if name.startswith("goal.")}
     pose = (
         None
         if one.odometry is None

@@ -17,6 +17,7 @@ html_theme = "furo"
 html_title = f"cosim {release}"
 html_show_copyright = False
 myst_heading_anchors = 3
+autodoc_inherit_docstrings = False
 autodoc_preserve_defaults = True
 autodoc_typehints = "none"
 default_role = "code"

@@ -102,7 +102,7 @@ def collect_command(
     goal: Annotated[
         str,
         typer.Option(
-            help="What is told of where to go: none, route_point, final_point, instruction."
+            help="The goal protocol of the rows: points of the route, instructions or none."
         ),
     ] = "route_point",
     waypoints: Annotated[

@@ -68,8 +68,8 @@ def print_names(out: Console) -> None:
         out.print(f"policy  {name}  {bundle_in_words(folder)}", soft_wrap=True)
     about = (Follow.__doc__ or "").splitlines()[0]
     out.print(f"policy  {Follow.manifest.name}  {about} {weights_in_words()}", soft_wrap=True)
-    for name, words in GOALS.items():
-        out.print(f"goal    {name}  {words}", soft_wrap=True)
+    for goal in GOALS.values():
+        out.print(f"goal    {goal.name}  {goal.summary}", soft_wrap=True)
 
 
 def print_scenarios(out: Console, suite: Suite) -> None:

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import get_args
 
 import numpy as np
 
 from cosim.core.errors import UsageError, unknown
 from cosim.core.state import frozen
 from cosim.spec.camera import Calibration, CameraSpec
-from cosim.spec.goal import GoalProtocol, goal_called
+from cosim.spec.goal import GOALS, GoalProtocol, goal_called
 from cosim.spec.manifest import Manifest
 from cosim.spec.odometry import ODOMETRY
 from cosim.spec.robot import Robot
-
-_OF_THE_CAMERA = ("image", "random_image")
 
 
 def with_goal(manifest: Manifest, goal: GoalProtocol | None) -> Manifest:
@@ -25,7 +22,7 @@ def with_goal(manifest: Manifest, goal: GoalProtocol | None) -> Manifest:
     do with; for pictures as goals, and further cameras, of a policy without a camera.
     """
     settled = manifest if goal is None else replace(manifest, goal=goal)
-    goal_called(settled.goal)
+    kind = GOALS[goal_called(settled.goal)]
     if settled.odometry not in ODOMETRY:
         raise unknown("odometry", settled.odometry, ODOMETRY)
     if settled.goals and settled.goal not in settled.goals:
@@ -39,8 +36,8 @@ def with_goal(manifest: Manifest, goal: GoalProtocol | None) -> Manifest:
             f"policy '{manifest.name}' has cameras, but no camera: give its manifest one of "
             f"them as that"
         )
-    if settled.goal in _OF_THE_CAMERA and settled.camera is None:
-        others = ", ".join(name for name in get_args(GoalProtocol) if name not in _OF_THE_CAMERA)
+    if kind.of_camera and settled.camera is None:
+        others = ", ".join(one.name for one in GOALS.values() if not one.of_camera)
         raise UsageError(
             f"policy '{manifest.name}' has no camera, and goal protocol '{settled.goal}' gives "
             f"what its camera would show: give its manifest a camera, or choose one of {others}"

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from cosim.core.state import Frame
-from cosim.episode.goals import TakePicture, goals_for
 from cosim.episode.interfaces import Camera, Observation, Privileged
 from cosim.episode.loop import Moment
 from cosim.episode.manifest_checks import calibration_of
@@ -15,6 +14,7 @@ from cosim.episode.odometer import odometer_for
 from cosim.episode.step import Step
 from cosim.spec.camera import CameraPicture, CameraSpec
 from cosim.spec.episode_id import pseudonym_of, seed_for
+from cosim.spec.goal import TakePicture, goals_for
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario
@@ -46,8 +46,7 @@ class Observer:
         self._manifest = manifest
         self._known = known
         self._cameras = cameras
-        size = (0, 0) if spec is None else spec.size
-        self._goals = goals_for(manifest.goal, scenario, draws("goal"), size, look)
+        self._goals = goals_for(manifest.goal, scenario, draws("goal"), manifest.picture_size, look)
         self._odometer = odometer_for(manifest.odometry, scenario.start_pose, draws("odometry"))
         self._calibration = None if spec is None else calibration_of(spec, self._robot)
 

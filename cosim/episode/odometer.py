@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from cosim.core.geometry import Pose, wrap_angle
-from cosim.episode.goals import seen_from
+from cosim.spec.goal import seen_from
 from cosim.spec.odometry import GpsNoise, Odometry, OdometryKind, WheelNoise
 
 

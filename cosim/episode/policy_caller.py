@@ -24,7 +24,6 @@ from cosim.core.geometry import Polyline
 from cosim.core.state import Command, RobotState, Signal, Vehicles
 from cosim.episode.control import command_of
 from cosim.episode.interfaces import BatchPolicy, Observation, Policy, Privileged
-from cosim.spec.goal import own_goal
 from cosim.spec.manifest import Manifest
 from cosim.spec.policy_host import PolicyRuns
 
@@ -201,7 +200,7 @@ class Driver:
                 )
                 for name, one in pictures.items()
             },
-            goal=own_goal(observation.goal),
+            goal=None if observation.goal is None else observation.goal.copied(),
             privileged=self._own_knowledge(known)
             if known is not None and self.manifest.privileged
             else None,

@@ -62,11 +62,21 @@ class EpisodeFacts:
 
 
 class Metric(NamedTuple):
-    """unit; whether higher is better (None: neither); the function."""
+    """A metric of an episode.
+
+    unit: "" for a number without one. higher_is_better: None for neither. of: the definition.
+    worst: the value of an episode whose policy crashed, so that no policy gains by crashing. None
+    where there is no worst value, as of a rate: a run in which a policy crashed has no mean of it.
+    pooled: of a rate, the metric that is counted and the metres that it is counted on. Of several
+        episodes a rate is all that was counted on all the metres. A mean of rates would let an
+        episode of 2 m outweigh one of 400 m, and leave out policies that never moved.
+    """
 
     unit: str
     higher_is_better: bool | None
     of: Callable[[EpisodeFacts], float | None]
+    worst: float | None = None
+    pooled: tuple[str, str] | None = None
 
 
 def goal_reached(episode: EpisodeFacts) -> float:
@@ -278,17 +288,38 @@ def per_100m(
 
 METRICS: Mapping[str, Metric] = MappingProxyType(
     {
-        "success": Metric("", True, success),
-        "goal_reached": Metric("", True, goal_reached),
-        "route_completion": Metric("", True, route_completion),
-        "spl": Metric("", True, spl),
-        "failures_per_100m": Metric("1/100 m", False, per_100m("", travelled_m)),
-        "collisions_per_100m": Metric("1/100 m", False, per_100m("collision", travelled_m)),
-        "out_of_lane_per_100m": Metric("1/100 m", False, per_100m("out_of_lane", travelled_m)),
-        "freezings_per_100m": Metric("1/100 m", False, per_100m("freezing", travelled_m)),
-        "failures_per_100m_progress": Metric("1/100 m", False, per_100m("", progress_m)),
-        "failures_per_100m_route": Metric("1/100 m", False, per_100m("", route_length_m)),
-        "velocity_mean_mps": Metric("m/s", True, velocity_mean_mps),
+        "success": Metric("", True, success, worst=0.0),
+        "goal_reached": Metric("", True, goal_reached, worst=0.0),
+        "route_completion": Metric("", True, route_completion, worst=0.0),
+        "spl": Metric("", True, spl, worst=0.0),
+        "failures_per_100m": Metric(
+            "1/100 m", False, per_100m("", travelled_m), pooled=("failures", "path_length_m")
+        ),
+        "collisions_per_100m": Metric(
+            "1/100 m",
+            False,
+            per_100m("collision", travelled_m),
+            pooled=("collisions", "path_length_m"),
+        ),
+        "out_of_lane_per_100m": Metric(
+            "1/100 m",
+            False,
+            per_100m("out_of_lane", travelled_m),
+            pooled=("out_of_lane", "path_length_m"),
+        ),
+        "freezings_per_100m": Metric(
+            "1/100 m",
+            False,
+            per_100m("freezing", travelled_m),
+            pooled=("freezings", "path_length_m"),
+        ),
+        "failures_per_100m_progress": Metric(
+            "1/100 m", False, per_100m("", progress_m), pooled=("failures", "progress_m")
+        ),
+        "failures_per_100m_route": Metric(
+            "1/100 m", False, per_100m("", route_length_m), pooled=("failures", "route_length_m")
+        ),
+        "velocity_mean_mps": Metric("m/s", True, velocity_mean_mps, worst=0.0),
         "failures": Metric("", False, count("")),
         "rules_broken": Metric("", False, lambda episode: float(episode.rules_broken)),
         "collisions": Metric("", False, count("collision")),
@@ -299,10 +330,12 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
         "collisions_wall": Metric("", False, collisions_with("wall")),
         "collisions_object": Metric("", False, collisions_with("object")),
         "walked_into": Metric("", None, lambda episode: float(len(episode.walked_into))),
-        "pedestrian_collision": Metric("", False, had(collisions_with("pedestrian"))),
-        "other_collision": Metric("", False, had(collisions_with_the_rest)),
-        "left_lane": Metric("", False, had(count("out_of_lane"))),
-        "broke_rule": Metric("", False, had(lambda episode: float(episode.rules_broken))),
+        "pedestrian_collision": Metric("", False, had(collisions_with("pedestrian")), worst=1.0),
+        "other_collision": Metric("", False, had(collisions_with_the_rest), worst=1.0),
+        "left_lane": Metric("", False, had(count("out_of_lane")), worst=1.0),
+        "broke_rule": Metric(
+            "", False, had(lambda episode: float(episode.rules_broken)), worst=1.0
+        ),
         "red_light_entries": Metric("", False, lambda episode: float(episode.red_light_entries)),
         "carriageway_time_s": Metric("s", False, carriageway_time_s),
         "vehicles_braked": Metric("", False, vehicles_braked),
@@ -310,8 +343,8 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
         "pedestrian_distance_min_success_m": Metric("m", True, pedestrian_distance_min_success_m),
         "clearance_min_m": Metric("m", True, clearance_min_m),
         "time_to_collision_min_s": Metric("s", True, time_to_collision_min_s),
-        "space_compliance": Metric("", True, space_compliance),
-        "personal_space_violation": Metric("", False, personal_space_violation),
+        "space_compliance": Metric("", True, space_compliance, worst=0.0),
+        "personal_space_violation": Metric("", False, personal_space_violation, worst=1.0),
         "stalled_time_s": Metric("s", False, stalled_time_s),
         "failure_to_progress": Metric("", False, failure_to_progress),
         "acceleration_mean_mps2": Metric("m/s2", False, mean_acceleration_mps2),
@@ -325,18 +358,13 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
 )
 
 POOLED: Mapping[str, tuple[str, str]] = MappingProxyType(
-    {
-        "failures_per_100m": ("failures", "path_length_m"),
-        "collisions_per_100m": ("collisions", "path_length_m"),
-        "out_of_lane_per_100m": ("out_of_lane", "path_length_m"),
-        "freezings_per_100m": ("freezings", "path_length_m"),
-        "failures_per_100m_progress": ("failures", "progress_m"),
-        "failures_per_100m_route": ("failures", "route_length_m"),
-    }
+    {name: metric.pooled for name, metric in METRICS.items() if metric.pooled}
 )
-"""Rates: the metric that is counted, the metres it is counted on. Of several episodes a rate is all
-that was counted on all the metres: a mean of rates would let an episode of 2 m outweigh one of 400
-m, and leave out who never moved."""
+"""The rates, with what each is counted on."""
+WORST: Mapping[str, float] = MappingProxyType(
+    {name: metric.worst for name, metric in METRICS.items() if metric.worst is not None}
+)
+"""The measures of an episode whose policy crashed. An invalid episode has none."""
 
 COUNTERFACTUAL: Mapping[str, str] = MappingProxyType(
     {"people_delay_s": "s", "people_compared": "", "vehicles_delay_s": "s", "vehicles_compared": ""}

@@ -8,6 +8,7 @@ give the same bytes.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
@@ -21,8 +22,7 @@ from cosim.core.whole_file import read_within, write_whole
 from cosim.episode.camera_rules import nonstandard
 from cosim.episode.command_delay import InFlight
 from cosim.episode.step import Step
-from cosim.results.log import Log
-from cosim.results.nearness import nearness
+from cosim.results.log import COLUMNS, Log, Tick
 from cosim.results.referee import Failure, Verdict
 from cosim.results.traffic import OnRoad
 from cosim.spec.camera import CameraSpec
@@ -247,24 +247,6 @@ class StateHash:
         return self._hash.hexdigest()
 
 
-def log_row(
-    step: Step,
-    verdict: Verdict,
-    footprint_m: tuple[float, float],
-    road: OnRoad = OnRoad(),  # noqa: B008  a frozen value
-) -> tuple[float, ...]:
-    """The 16 values of a tick that a `Log` keeps: its columns from `pose` to `vehicles_braked`."""
-    robot = step.motion.robot
-    track = np.concatenate([[step.robot.pose[:2]], step.motion.trace[:, :2]])
-    way = track[1:] - track[:-1]
-    travelled_m = float(np.hypot(way[:, 0], way[:, 1]).sum())
-    reset_s_m = verdict.reset.route_s_m if verdict.reset else np.nan
-    speeds = (robot.v_mps, robot.w_radps, step.command.v_mps, step.command.w_radps)
-    near = nearness(robot, step.street_after.people, footprint_m)
-    measured = (step.route_s_after_m, travelled_m, *near, reset_s_m, float(verdict.waits_at_red))
-    return (*robot.pose, *speeds, *measured, float(road.carriageway), float(road.braked))
-
-
 class Recorder:
     """Collects the Steps of an episode into a Log."""
 
@@ -274,13 +256,15 @@ class Recorder:
     def __init__(self, tick_s: float, footprint_m: tuple[float, float]) -> None:
         self._tick_s = tick_s
         self._footprint_m = footprint_m
-        self._rows: list[tuple[float, ...]] = []
+        self._values: dict[str, list[float | Sequence[float]]] = {name: [] for name in COLUMNS}
         self._people: list[tuple[float, ...]] = []
         self.hash = StateHash()
 
     def add(self, step: Step, verdict: Verdict, road: OnRoad = OnRoad()) -> None:  # noqa: B008  a frozen value
         self.hash.add(step)
-        self._rows.append(log_row(step, verdict, self._footprint_m, road))
+        tick = Tick(step, verdict, self._footprint_m, road)
+        for name, column in COLUMNS.items():
+            self._values[name].append(column.read(tick))
         if step.tick % self.PEOPLE_EVERY_TICKS == 0:
             people = step.street_after.people
             xy = people.xy - step.motion.robot.pose.xy
@@ -294,23 +278,11 @@ class Recorder:
 
     def log(self, event_tracks: Floats, commands: InFlight) -> Log:
         """The episode so far. event_tracks: see `Log`; commands: all that the policy answered."""
-        rows = np.array(self._rows, dtype=float).reshape(-1, 16)
         people = np.array(self._people, dtype=float).reshape(-1, 5)
         plan_sizes, plan_points, plan_index = commands.plans
         return Log(
             tick_s=self._tick_s,
-            pose=rows[:, 0:3],
-            speed=rows[:, 3:5],
-            command=rows[:, 5:7],
-            route_s_m=rows[:, 7],
-            travelled_m=rows[:, 8],
-            person_m=rows[:, 9],
-            clearance_m=rows[:, 10],
-            collision_in_s=rows[:, 11],
-            reset_s_m=rows[:, 12],
-            waits_at_red=rows[:, 13] > 0,
-            on_carriageway=rows[:, 14] > 0,
-            vehicles_braked=rows[:, 15].astype(np.int64),
+            **{name: column.array(self._values[name]) for name, column in COLUMNS.items()},
             people_tick=people[:, 0].astype(np.int64),
             people_xy=people[:, 1:3],
             people_kind=people[:, 3].astype(np.int8),

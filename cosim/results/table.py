@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from cosim.core.geometry import Floats
-from cosim.results.metrics import COUNTERFACTUAL, METRICS, POOLED, RATE_NEEDS_M
+from cosim.results.metrics import COUNTERFACTUAL, METRICS, POOLED, RATE_NEEDS_M, WORST
 from cosim.results.record import Record
 
 KEYS: tuple[str, ...] = (
@@ -50,22 +50,6 @@ ORACLE = "orca"
 contestant's."""
 BOOTSTRAP = 2000
 CONFIDENCE = 0.95
-WORST: Mapping[str, float] = {
-    "success": 0.0,
-    "goal_reached": 0.0,
-    "route_completion": 0.0,
-    "spl": 0.0,
-    "velocity_mean_mps": 0.0,
-    "pedestrian_collision": 1.0,
-    "other_collision": 1.0,
-    "left_lane": 1.0,
-    "broke_rule": 1.0,
-    "space_compliance": 0.0,
-    "personal_space_violation": 1.0,
-}
-"""What an episode counts as whose policy crashed: the worst there is, so that nobody gains by
-crashing. Where there is no worst, as of a rate, a run in which a policy crashed has no mean. An
-invalid episode has no measures."""
 MOST_INVALID = 0.02
 """Of what was scheduled; where more is invalid a table says nothing of its policy."""
 

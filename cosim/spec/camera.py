@@ -14,6 +14,11 @@ from cosim.core.geometry import Floats
 from cosim.spec.robot import Mount, Robot
 
 
+def flipped(picture: NDArray[Any]) -> NDArray[Any]:
+    """Return a picture (H, W, ...) with left and right exchanged."""
+    return np.ascontiguousarray(picture[:, ::-1])
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
     """A camera as computer vision has it (OpenCV): x to the right, y down, z ahead.

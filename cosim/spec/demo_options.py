@@ -11,13 +11,11 @@ import msgspec
 from cosim.core.clock import Clock
 from cosim.core.errors import SpecError, UsageError
 from cosim.spec.camera import CameraSpec
-from cosim.spec.goal import GOALS, GoalProtocol
+from cosim.spec.goal import GOALS, GoalProtocol, goal_called
 from cosim.spec.manifest import Manifest
 
 EYE: Final = "collected"
 """The name of the collecting camera beside that of an expert that sees by one itself."""
-COLLECTED_GOALS: Final = ("none", "route_point", "final_point", "instruction")
-"""Goals of which a row can tell: no pictures, and no points that the expert does not drive to."""
 _MOST_NOISE: Final = 0.9
 _MOST_WAYPOINTS: Final = 100
 _FASTEST_HZ: Final = 20.0
@@ -134,10 +132,12 @@ def demonstrating(
     goals that no data set tells, and for another rate than that of an expert that sees: the
     pictures that it remembers would be other times apart."""
     goal = goal or expert.goal
-    if goal not in COLLECTED_GOALS:
+    kind = GOALS[goal_called(goal)]
+    if not kind.in_data_sets:
+        others = ", ".join(one.name for one in GOALS.values() if one.in_data_sets)
         raise UsageError(
-            f"goal protocol '{goal}' ({GOALS.get(goal, 'unknown')}) cannot be told in a data set: "
-            f"give --goal, one of {', '.join(COLLECTED_GOALS)}"
+            f"goal protocol '{goal}' ({kind.summary}) cannot be told in a data set: give "
+            f"--goal, one of {others}"
         )
     if expert.camera is not None and collecting.rate_hz != expert.rate_hz:
         raise UsageError(

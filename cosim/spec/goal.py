@@ -1,18 +1,28 @@
-"""Goals: what a policy is told of where to go, by a protocol that its manifest names or the run
-gives (`--goal`)."""
+"""Goals: where a policy is sent, by a protocol that its manifest names or the run gives (`--goal`).
+
+`GOALS` has a row for each protocol. Its goals are values of a class below `AnyGoal`, which says how
+such a goal is mirrored, copied, sent to another process and given to a learner. Goals follow from
+the reference route, the robot's pose and a random generator of their own. Nothing here knows of
+people, events or the street.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import re
+import string
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, Final, Literal, cast
+from typing import Any, Final, Literal, NamedTuple, Protocol, Self, cast
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.errors import unknown
+from cosim.core.geometry import Floats, Polyline, Pose, wrap_angle
+from cosim.spec.camera import flipped
+from cosim.spec.scenario import RouteCrossing, Scenario
 
 GoalProtocol = Literal[
     "none",
@@ -24,27 +34,112 @@ GoalProtocol = Literal[
     "instruction",
     "route_patch",
 ]
+"""The names of the rows of `GOALS`."""
+Turn = Literal["left", "straight", "right"]
+Pixels = NDArray[np.uint8]
+TakePicture = Callable[[Pose], Pixels]
+"""(H, W, 3) uint8: what the policy's camera would see at a pose, without people in the street."""
 
-GOALS: Final[Mapping[str, str]] = MappingProxyType(
-    {
-        "none": "nothing",
-        "route_point": "the next sub-goal: a point of the reference route, 5 to 20 m along it",
-        "final_point": "the goal of the episode, as a point",
-        "random_point": "a point drawn 5 to 20 m ahead and up to 5 m aside, anew when it is "
-        "reached or passed",
-        "image": "what the policy's camera would see at the next sub-goal, with nobody in the "
-        "street",
-        "random_image": "a picture of noise, drawn once for each episode",
-        "instruction": "'Follow the sidewalk.', with each turn and crosswalk of the route before "
-        "it comes",
-        "route_patch": "a raster of the reference route around the robot, 80 x 80 pixels of 0.5 m",
-    }
-)
-"""What a policy gets by each protocol. Points, and what is around the robot, are in the robot's
-frame."""
+PATCH_PX: Final = 80
+"""Rows and columns of a route patch."""
+PATCH_M: Final = 0.5
+"""The side of a pixel of a route patch, in metres. Pixels no farther than this from the route are
+on it."""
+_GREY: Final = 128
+_FARTHEST_M: Final = 10_000.0
+"""Bound of a point's coordinates in the space of a learner."""
+_MOST_LETTERS: Final = 400
+"""Bound of an instruction's length in the space of a learner."""
+_NEAREST_M: Final = 5.0
+_FARTHEST_DRAWN_M: Final = 20.0
+_ASIDE_M: Final = 5.0
+_REACHED_M: Final = 1.0
+_SLACK_M: Final = 1e-6
+_ARM_M: Final = 6.0
+"""A turn is the angle between this much of the route before a place and this much behind it, in
+metres."""
+_BEND_RAD: Final = math.radians(35.0)
+_TURN_RAD: Final = math.radians(60.0)
+_ANNOUNCED_M: Final = 20.0
+"""Distance to a turn from which instructions announce it, in metres."""
+_DUE_M: Final = 2.5
+"""Distance to a turn from which instructions say that it is due, in metres."""
+_ANNOUNCEMENT: Final = re.compile(r"(?:In (\d+) m, )?(?:turn|bear) (left|right)", re.IGNORECASE)
 
 
-class PointGoal(msgspec.Struct, frozen=True, tag="point"):
+class Bounds(NamedTuple):
+    """The arrays that a learner gets of a type of goal."""
+
+    low: float
+    high: float
+    shape: tuple[int, ...]
+    dtype: type[np.uint8] | type[np.float32]
+
+
+class Letters(NamedTuple):
+    """The texts that a learner gets of a type of goal: `most` characters of `charset` at most."""
+
+    most: int
+    charset: str
+
+
+class AnyGoal(msgspec.Struct, frozen=True):
+    """A value that a policy gets as its goal. The fields are numbers, texts and arrays."""
+
+    @classmethod
+    def space(cls, size: tuple[int, int]) -> Bounds | Letters:
+        """Return the values that a learner can get. size: width and height of the policy's
+        pictures."""
+        raise NotImplementedError
+
+    @classmethod
+    def example(cls, size: tuple[int, int]) -> Self:
+        """Return a goal straight ahead, for trying a policy before a run. size: as in `space`."""
+        raise NotImplementedError
+
+    def mirrored(self) -> Self:
+        """Return the goal with left and right exchanged."""
+        raise NotImplementedError
+
+    def probes(self) -> Mapping[str, AnyGoal]:
+        """Return goals of this type that `cosim policy check` asks a policy about, by name.
+
+        "ahead" is needed. "left", "right" and "zero" are compared with it, and "near" with "left".
+        """
+        return {"ahead": self}
+
+    def painted(self, paint: Callable[[Pixels], Pixels]) -> Self:
+        """Return the goal with its picture changed, where it is a picture."""
+        return self
+
+    def copied(self) -> Self:
+        """Return the same goal with arrays of its own."""
+        return type(self)(
+            *(
+                one.copy() if isinstance(one, np.ndarray) else one
+                for one in msgspec.structs.astuple(self)
+            )
+        )
+
+    def plain(self) -> NDArray[Any] | str:
+        """Return the goal as a learner gets it: an array or a text."""
+        return np.asarray(self)
+
+    def encoded(self) -> dict[str, Any]:
+        """Return the type's name as "type", and the fields: plain values and arrays."""
+        return {"type": self.__struct_config__.tag, **msgspec.structs.asdict(self)}
+
+
+class TurningGoal(AnyGoal, frozen=True):
+    """A goal that says which way to turn."""
+
+    def turn(self, ahead_m: float, beyond_deg: float) -> Turn:
+        """Return the side. ahead_m: how near a turn must be; beyond_deg: how far aside the goal
+        must lie."""
+        raise NotImplementedError
+
+
+class PointGoal(TurningGoal, frozen=True, tag="point"):
     """A point in the robot's frame, in metres: x ahead, y to the left.
 
     >>> goal = PointGoal(3.0, 4.0)
@@ -68,22 +163,64 @@ class PointGoal(msgspec.Struct, frozen=True, tag="point"):
         """(2,) float64 metres: x ahead, y to the left."""
         return np.array((self.x_m, self.y_m), dtype)
 
+    @classmethod
+    def space(cls, size: tuple[int, int]) -> Bounds:
+        return Bounds(-_FARTHEST_M, _FARTHEST_M, (2,), np.float32)
 
-class ImageGoal(msgspec.Struct, frozen=True, tag="image"):
+    @classmethod
+    def example(cls, size: tuple[int, int]) -> PointGoal:
+        return PointGoal(10.0, 0.0)
+
+    def mirrored(self) -> PointGoal:
+        return PointGoal(self.x_m, -self.y_m)
+
+    def probes(self) -> Mapping[str, PointGoal]:
+        aside = {
+            "left": PointGoal(10.0, 5.0),
+            "right": PointGoal(10.0, -5.0),
+            "near": PointGoal(5.0, 2.5),
+        }
+        return {"ahead": PointGoal(10.0, 0.0), **aside, "zero": PointGoal(0.0, 0.0)}
+
+    def turn(self, ahead_m: float, beyond_deg: float) -> Turn:
+        if abs(self.bearing_rad) <= math.radians(beyond_deg):
+            return "straight"
+        return "left" if self.bearing_rad > 0.0 else "right"
+
+
+class ImageGoal(AnyGoal, frozen=True, tag="image"):
     """A picture of where to go: (H, W, 3) uint8, as large as the camera's.
 
     >>> ImageGoal(np.zeros((96, 96, 3), np.uint8)).rgb.shape
     (96, 96, 3)
     """
 
-    rgb: NDArray[np.uint8]
+    rgb: Pixels
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """(H, W, 3) uint8."""
         return np.array(self.rgb, dtype, copy=copy)
 
+    @classmethod
+    def space(cls, size: tuple[int, int]) -> Bounds:
+        return Bounds(0, 255, (size[1], size[0], 3), np.uint8)
 
-class Instruction(msgspec.Struct, frozen=True, tag="instruction"):
+    @classmethod
+    def example(cls, size: tuple[int, int]) -> ImageGoal:
+        return ImageGoal(np.full((size[1], size[0], 3), _GREY, np.uint8))
+
+    def mirrored(self) -> ImageGoal:
+        return ImageGoal(flipped(self.rgb))
+
+    def probes(self) -> Mapping[str, ImageGoal]:
+        # Left is ahead in a mirror. There is no right: the side of a picture is not known.
+        return {"ahead": self, "left": self.mirrored(), "zero": ImageGoal(np.zeros_like(self.rgb))}
+
+    def painted(self, paint: Callable[[Pixels], Pixels]) -> ImageGoal:
+        return ImageGoal(paint(self.rgb))
+
+
+class Instruction(TurningGoal, frozen=True, tag="instruction"):
     """What to do, in words.
 
     >>> Instruction("Follow the sidewalk. In 10 m, turn left.").text
@@ -99,9 +236,39 @@ class Instruction(msgspec.Struct, frozen=True, tag="instruction"):
             "another goal"
         )
 
+    @classmethod
+    def space(cls, size: tuple[int, int]) -> Letters:
+        return Letters(_MOST_LETTERS, string.ascii_letters + string.digits + " .,")
 
-class RoutePatch(msgspec.Struct, frozen=True, tag="route_patch"):
-    """The reference route around the robot: (80, 80) uint8, 255 on the route and 0 beside it, 0.5 m
+    @classmethod
+    def example(cls, size: tuple[int, int]) -> Instruction:
+        return Instruction("Follow the sidewalk.")
+
+    def mirrored(self) -> Instruction:
+        text = self.text.replace("left", "\0").replace("right", "left")
+        return Instruction(text.replace("\0", "right"))
+
+    def probes(self) -> Mapping[str, Instruction]:
+        texts = {
+            "ahead": "Follow the sidewalk.",
+            "left": "Turn left.",
+            "right": "Turn right.",
+            "zero": "",
+        }
+        return {name: Instruction(text) for name, text in texts.items()}
+
+    def plain(self) -> str:
+        return self.text
+
+    def turn(self, ahead_m: float, beyond_deg: float) -> Turn:
+        found = _ANNOUNCEMENT.search(self.text)
+        if found is None or (found[1] is not None and float(found[1]) > ahead_m):
+            return "straight"
+        return "left" if found[2].lower() == "left" else "right"
+
+
+class RoutePatch(AnyGoal, frozen=True, tag="route_patch"):
+    """The reference route around the robot: (80, 80) uint8, 255 on the route and 0 elsewhere, 0.5 m
     a pixel.
 
     The robot is in the middle; the first row lies 20 m ahead, the first column 20 m to the left.
@@ -110,25 +277,386 @@ class RoutePatch(msgspec.Struct, frozen=True, tag="route_patch"):
     np.uint8(0)
     """
 
-    pixels: NDArray[np.uint8]
+    pixels: Pixels
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
         """(80, 80) uint8."""
         return np.array(self.pixels, dtype, copy=copy)
 
+    @classmethod
+    def space(cls, size: tuple[int, int]) -> Bounds:
+        return Bounds(0, 255, (PATCH_PX, PATCH_PX), np.uint8)
+
+    @classmethod
+    def example(cls, size: tuple[int, int]) -> RoutePatch:
+        return RoutePatch(np.zeros((PATCH_PX, PATCH_PX), np.uint8))
+
+    def mirrored(self) -> RoutePatch:
+        return RoutePatch(flipped(self.pixels))
+
+    def probes(self) -> Mapping[str, RoutePatch]:
+        # Routes that turn off 6 m ahead.
+        ends = {"ahead": (20.0, 0.0), "left": (6.0, 20.0), "right": (6.0, -20.0)}
+        routes = {name: np.array([(-20.0, 0.0), (6.0, 0.0), end]) for name, end in ends.items()}
+        turns = {
+            name: RoutePatch(patch_around(Pose(0.0, 0.0, 0.0), route))
+            for name, route in routes.items()
+        }
+        return {**turns, "zero": RoutePatch(np.zeros_like(self.pixels))}
+
 
 Goal = PointGoal | ImageGoal | Instruction | RoutePatch
 
 
-def own_goal(goal: Goal | None) -> Goal | None:
-    """The same goal, in an array of its own."""
-    if isinstance(goal, ImageGoal):
-        return ImageGoal(goal.rgb.copy())
-    return RoutePatch(goal.pixels.copy()) if isinstance(goal, RoutePatch) else goal
+class Goals(Protocol):
+    """The goals of an episode."""
+
+    def at(self, pose: Pose, route_s_m: float) -> Goal | None:
+        """Return the goal for a robot at this pose, this far along the route."""
+
+    def put_back(self) -> None:
+        """Forget what no longer holds: the robot was put elsewhere."""
+
+
+class GoalSource(NamedTuple):
+    """What the goals of an episode are made of.
+
+    draws: the generator of all that is random.
+    size: width and height of the policy's pictures, 0 without a camera.
+    look: takes a picture at a pose, for goals that are what the camera would see.
+    """
+
+    scenario: Scenario
+    draws: np.random.Generator
+    size: tuple[int, int] = (0, 0)
+    look: TakePicture | None = None
+
+
+class GoalKind(NamedTuple):
+    """A goal protocol.
+
+    summary: one line for `cosim list` and the documentation.
+    type: the class of its goals; None for no goals.
+    draw: makes the goals of an episode.
+    of_camera: whether the goals are pictures by the policy's camera, so that it needs one.
+    noise: whether the goals say nothing of where to go.
+    in_data_sets: whether a data set has a column for the goals (`cosim collect`).
+    """
+
+    name: GoalProtocol
+    summary: str
+    type: type[Goal] | None
+    draw: Callable[[GoalSource], Goals]
+    of_camera: bool = False
+    noise: bool = False
+    in_data_sets: bool = False
+
+
+def seen_from(pose: Pose, point: Pose) -> PointGoal:
+    """A place in the frame of a robot at a pose."""
+    dx, dy = point.x_m - pose.x_m, point.y_m - pose.y_m
+    cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
+    return PointGoal(cos * dx + sin * dy, -sin * dx + cos * dy)
+
+
+class SubGoals:
+    """Which place of the route is the next sub-goal: one 20 m along it, kept until no more than 5 m
+    are left to it, or the robot was put back too far from it; the end of the route from 20 m before
+    it.
+
+    >>> subgoals = SubGoals(100.0)
+    >>> [subgoals.after(s_m) for s_m in (0.0, 14.0, 16.0, 85.0)]
+    [20.0, 20.0, 36.0, 100.0]
+    """
+
+    def __init__(self, length_m: float) -> None:
+        self._length_m = length_m
+        self._s_m = math.nan
+
+    def after(self, route_s_m: float) -> float:
+        """Its arc length, for a robot this far along the route."""
+        if not _NEAREST_M - _SLACK_M <= self._s_m - route_s_m <= _FARTHEST_DRAWN_M + _SLACK_M:
+            self._s_m = min(route_s_m + _FARTHEST_DRAWN_M, self._length_m)
+        return self._s_m
+
+
+class _Plain:
+    """Goals that are a function of where the robot is."""
+
+    def __init__(self, goal: Callable[[Pose, float], Goal | None]) -> None:
+        self._goal = goal
+
+    def at(self, pose: Pose, route_s_m: float) -> Goal | None:
+        return self._goal(pose, route_s_m)
+
+    def put_back(self) -> None:
+        """Nothing to forget."""
+
+
+class _RandomPoints:
+    """Points of the paper: drawn in the robot's frame, then fixed in the street until reached, or
+    no longer ahead."""
+
+    def __init__(self, draws: np.random.Generator) -> None:
+        self._draws = draws
+        self._point: Pose | None = None
+
+    def at(self, pose: Pose, route_s_m: float) -> PointGoal:
+        goal = None if self._point is None else seen_from(pose, self._point)
+        if goal is None or goal.distance_m <= _REACHED_M or goal.x_m <= 0.0:
+            ahead, aside = self._draws.uniform(
+                (_NEAREST_M, -_ASIDE_M), (_FARTHEST_DRAWN_M, _ASIDE_M)
+            ).tolist()
+            cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
+            self._point = Pose(
+                pose.x_m + cos * ahead - sin * aside, pose.y_m + sin * ahead + cos * aside, 0.0
+            )
+            goal = PointGoal(ahead, aside)
+        return goal
+
+    def put_back(self) -> None:
+        self._point = None
+
+
+class _Images:
+    """Pictures at the sub-goals, taken when they become the next ones, looking along the route."""
+
+    def __init__(self, route: Polyline, look: TakePicture) -> None:
+        self._route = route
+        self._look = look
+        self._subgoals = SubGoals(route.length_m)
+        self._taken_s_m = math.nan
+        self._goal = ImageGoal(np.zeros((0, 0, 3), np.uint8))
+
+    def at(self, pose: Pose, route_s_m: float) -> ImageGoal:
+        s_m = self._subgoals.after(route_s_m)
+        if s_m != self._taken_s_m:
+            self._taken_s_m, self._goal = s_m, ImageGoal(self._look(self._route.at(s_m)))
+        return self._goal
+
+    def put_back(self) -> None:
+        """The next sub-goal is looked for anew in any case."""
+
+
+class Manoeuvre(NamedTuple):
+    """Something to be told: from where to where on the route it is done."""
+
+    s_m: float
+    until_s_m: float
+    words: str
+
+
+def manoeuvres(route: Polyline, crossings: Sequence[RouteCrossing] = ()) -> tuple[Manoeuvre, ...]:
+    """Turns and crosswalks of a route, in their order. A bend of less than 35 degrees within 12 m
+    is none.
+
+    >>> [(one.s_m, one.words) for one in manoeuvres(Polyline([(0, 0), (20, 0), (20, 20)]))]
+    [(20.0, 'turn left')]
+    """
+    found = [
+        Manoeuvre(one.enter_s_m, one.leave_s_m, "cross the street at the crosswalk")
+        for one in crossings
+    ]
+    s_m = np.arange(1.0, route.length_m - 0.5)
+    turns = np.array([_turn_at(route, s) for s in s_m.tolist()])
+    bent = np.where(np.abs(turns) >= _BEND_RAD, np.sign(turns), 0.0)
+    starts = np.flatnonzero(np.diff(bent, prepend=0.0))
+    for first, last in zip(starts, [*starts, len(bent)][1:], strict=True):
+        if bent[first]:
+            peak = first + int(np.argmax(np.abs(turns[first:last])))
+            how = "turn" if abs(turns[peak]) >= _TURN_RAD else "bear"
+            side = "left" if turns[peak] > 0.0 else "right"
+            found.append(Manoeuvre(float(s_m[peak]), float(s_m[peak]) + 1.0, f"{how} {side}"))
+    return tuple(sorted(found))
+
+
+def _turn_at(route: Polyline, s_m: float) -> float:
+    """How far the route turns around a place, to the left, in radians."""
+    before, here, behind = (route.at(s).xy for s in (s_m - _ARM_M, s_m, s_m + _ARM_M))
+    (ax, ay) = (here - before).tolist()
+    (bx, by) = (behind - here).tolist()
+    return wrap_angle(math.atan2(by, bx) - math.atan2(ay, ax))
+
+
+def told_at(route_s_m: float, ways: Sequence[Manoeuvre]) -> str:
+    """The instruction at a place of a route: what is due there, and what comes next within 20 m, to
+    5 m.
+
+    >>> ways = manoeuvres(Polyline([(0, 0), (40, 0), (40, 20)]))
+    >>> told_at(29.0, ways), told_at(39.0, ways)
+    ('Follow the sidewalk. In 10 m, turn left.', 'Turn left.')
+    """
+    due = [one.words for one in ways if one.s_m - _DUE_M <= route_s_m < one.until_s_m]
+    told = [f"{words.capitalize()}." for words in due] or ["Follow the sidewalk."]
+    coming = [one for one in ways if _DUE_M < one.s_m - route_s_m <= _ANNOUNCED_M]
+    if coming:
+        far_m = max(5 * round((coming[0].s_m - route_s_m) / 5.0), 5)
+        told.append(f"In {far_m} m, {coming[0].words}.")
+    return " ".join(told)
+
+
+def patch_around(pose: Pose, route: Floats) -> NDArray[np.uint8]:
+    """(80, 80) uint8, as `RoutePatch` has it. route: (N, 2), its points."""
+    cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
+    offset = route - pose.xy
+    ahead_left = offset @ np.array([[cos, -sin], [sin, cos]])
+    at = (
+        0.5 * (PATCH_PX - 1) - ahead_left / PATCH_M
+    )  # rows and columns, whole numbers in the middle of pixels
+    low = np.maximum(np.ceil(np.minimum(at[:-1], at[1:]) - 1.0), 0.0).astype(int)
+    high = np.minimum(np.floor(np.maximum(at[:-1], at[1:]) + 1.0) + 1.0, PATCH_PX).astype(int)
+    pixels = np.zeros((PATCH_PX, PATCH_PX), np.uint8)
+    for i in np.flatnonzero((low < high).all(axis=1)).tolist():
+        (top, left) = low[i]
+        (bottom, right) = high[i]
+        step = at[i + 1] - at[i]
+        off = np.moveaxis(np.mgrid[top:bottom, left:right], 0, -1) - at[i]
+        along = np.clip(off @ step / max(float(step @ step), 1e-12), 0.0, 1.0)
+        off -= along[..., None] * step
+        pixels[top:bottom, left:right][(off * off).sum(axis=-1) <= 1.0] = 255
+    return pixels
+
+
+def _route_points(source: GoalSource) -> Goals:
+    route = source.scenario.route_line
+    subgoals = SubGoals(route.length_m)
+    return _Plain(lambda pose, s_m: seen_from(pose, route.at(subgoals.after(s_m))))
+
+
+def _final_points(source: GoalSource) -> Goals:
+    end = Pose(*source.scenario.goal, 0.0)
+    return _Plain(lambda pose, s_m: seen_from(pose, end))
+
+
+def _images(source: GoalSource) -> Goals:
+    assert source.look is not None, "image goals need a camera"
+    return _Images(source.scenario.route_line, source.look)
+
+
+def _random_images(source: GoalSource) -> Goals:
+    noise = ImageGoal(source.draws.integers(0, 256, (source.size[1], source.size[0], 3), np.uint8))
+    return _Plain(lambda pose, s_m: noise)
+
+
+def _instructions(source: GoalSource) -> Goals:
+    ways = manoeuvres(source.scenario.route_line, source.scenario.crossings)
+    return _Plain(lambda pose, s_m: Instruction(told_at(s_m, ways)))
+
+
+def _route_patches(source: GoalSource) -> Goals:
+    points = source.scenario.route_line.points
+    return _Plain(lambda pose, s_m: RoutePatch(patch_around(pose, points)))
+
+
+_ROWS: Final = (
+    GoalKind(
+        "none",
+        "no goal",
+        None,
+        lambda source: _Plain(lambda pose, s_m: None),
+        noise=True,
+        in_data_sets=True,
+    ),
+    GoalKind(
+        "route_point",
+        "the next point of the reference route, 5 to 20 m along it",
+        PointGoal,
+        _route_points,
+        in_data_sets=True,
+    ),
+    GoalKind(
+        "final_point",
+        "the goal of the episode, as a point",
+        PointGoal,
+        _final_points,
+        in_data_sets=True,
+    ),
+    GoalKind(
+        "random_point",
+        "a random point, 5 to 20 m ahead and up to 5 m aside",
+        PointGoal,
+        lambda source: _RandomPoints(source.draws),
+    ),
+    GoalKind(
+        "image",
+        "what the policy's camera would see at the next point of the route, without people",
+        ImageGoal,
+        _images,
+        of_camera=True,
+    ),
+    GoalKind(
+        "random_image",
+        "a picture of noise, drawn once per episode",
+        ImageGoal,
+        _random_images,
+        of_camera=True,
+        noise=True,
+    ),
+    GoalKind(
+        "instruction",
+        'a text, such as "Follow the sidewalk. In 10 m, turn left."',
+        Instruction,
+        _instructions,
+        in_data_sets=True,
+    ),
+    GoalKind(
+        "route_patch",
+        "a raster of the reference route around the robot, 80 x 80 pixels of 0.5 m",
+        RoutePatch,
+        _route_patches,
+    ),
+)
+GOALS: Final[Mapping[GoalProtocol, GoalKind]] = MappingProxyType(
+    {kind.name: kind for kind in _ROWS}
+)
+"""The goal protocols by name. Points, and what is around the robot, are in the robot's frame."""
+_TYPES: Final = {
+    kind.type.__struct_config__.tag: kind.type for kind in _ROWS if kind.type is not None
+}
 
 
 def goal_called(name: str) -> GoalProtocol:
-    """The protocol of that name. Raises UsageError, listing them, when there is none."""
+    """Return the protocol of that name. Raises UsageError with the valid names."""
     if name not in GOALS:
         raise unknown("goal protocol", name, GOALS)
     return cast(GoalProtocol, name)
+
+
+def goals_for(
+    protocol: GoalProtocol,
+    scenario: Scenario,
+    draws: np.random.Generator,
+    size: tuple[int, int] = (0, 0),
+    look: TakePicture | None = None,
+) -> Goals:
+    """Return the goals of a scenario by a protocol. The arguments are those of `GoalSource`."""
+    return GOALS[protocol].draw(GoalSource(scenario, draws, size, look))
+
+
+def decoded_goal(fields: Mapping[str, Any]) -> Goal:
+    """Return the goal of what `AnyGoal.encoded` gave. Raises KeyError or TypeError for anything
+    else."""
+    values = dict(fields)
+    return _TYPES[values.pop("type")](**values)
+
+
+def protocols_of(*types: type[AnyGoal]) -> tuple[GoalProtocol, ...]:
+    """Return the protocols whose goals are of one of these types.
+
+    >>> protocols_of(PointGoal)
+    ('route_point', 'final_point', 'random_point')
+    """
+    return tuple(
+        kind.name for kind in _ROWS if kind.type is not None and issubclass(kind.type, types)
+    )
+
+
+def most_goal_bytes(size: tuple[int, int]) -> int:
+    """Return the bytes of the largest array of a goal. size: width and height of the policy's
+    pictures."""
+    spaces = [kind.type.space(size) for kind in _ROWS if kind.type is not None]
+    return max(
+        math.prod(one.shape) * np.dtype(one.dtype).itemsize
+        for one in spaces
+        if isinstance(one, Bounds)
+    )

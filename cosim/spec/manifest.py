@@ -81,3 +81,8 @@ class Manifest:
     odometry: OdometryKind = "none"
     cameras: Mapping[str, CameraSpec] = filled(default_factory=dict)
     goals: tuple[GoalProtocol, ...] = ()
+
+    @property
+    def picture_size(self) -> tuple[int, int]:
+        """Width and height of the camera's pictures in pixels; (0, 0) without a camera."""
+        return (0, 0) if self.camera is None else self.camera.size

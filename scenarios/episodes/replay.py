@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import Final, NamedTuple
-
-import numpy as np
+from typing import NamedTuple
 
 from cosim.core.clock import Clock
 from cosim.core.errors import RunError, unknown
@@ -14,10 +12,11 @@ from cosim.core.telling import Tell, untold
 from cosim.core.versions import versions
 from cosim.episode.step import Step
 from cosim.policies.baselines import Replay
-from cosim.results.log import Log
-from cosim.results.record import Record, log_row
+from cosim.results.log import Log, Tick
+from cosim.results.record import Record
 from cosim.results.referee import Verdict
 from cosim.results.run_folder import read_records
+from cosim.results.traffic import OnRoad
 from cosim.spec.options import CameraChoice, EpisodeOptions
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario, read_suite
@@ -26,9 +25,6 @@ from scenarios.episodes.episode import Episode, Watch
 from scenarios.episodes.run_episode import drive
 from scenarios.episodes.wiring import StagedScenario
 from sumo_nets.crowd.demand_log import Entrances
-
-OF_THE_ROAD: Final = 14
-"""From this value of a row on it is about the roads, which are judged beside the loop."""
 
 
 class Recorded(NamedTuple):
@@ -116,9 +112,7 @@ class Alike:
 
     def watch(self, step: Step, verdict: Verdict) -> None:
         """The next tick. Raises RunError when it is not the recorded one."""
-        now = np.array(log_row(step, verdict, self._footprint_m))
-        then = self._told.log.row(step.tick)
-        if not np.array_equal(now[:OF_THE_ROAD], then[:OF_THE_ROAD], equal_nan=True):
+        if not self._told.log.same(Tick(step, verdict, self._footprint_m, OnRoad())):
             raise otherwise(self._folder, self._told, f"from {Clock().time_s(step.tick):g} s on")
 
 

@@ -15,13 +15,13 @@ import numpy as np
 
 from bridge.policy_server import PackedArray
 from cosim.spec.camera import CameraSpec
+from cosim.spec.goal import most_goal_bytes
 from cosim.spec.manifest import Manifest
 
 _ALIGNED_BYTES: Final = 64
 _SEALS: Final = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 _PER_PIXEL_BYTES: Final = 8
 """Colours, a label and a depth."""
-_PATCH_BYTES: Final = 80 * 80
 
 
 class ObservationMemory:
@@ -64,5 +64,5 @@ def room_for(manifest: Manifest | None) -> int:
     ]
     sizes = [width * height for width, height in (camera.size for camera in cameras)]
     arrays = 3 * len(sizes) + 1
-    goal = max([_PATCH_BYTES, *(3 * pixels for pixels in sizes[:1])])
+    goal = most_goal_bytes(manifest.picture_size)
     return mmap.PAGESIZE + _PER_PIXEL_BYTES * sum(sizes) + goal + _ALIGNED_BYTES * arrays

@@ -23,7 +23,7 @@ from cosim.episode.interfaces import Observation
 from cosim.episode.policy_caller import MOST_SAID, Driver, PolicyCall, Timer
 from cosim.spec.manifest import Manifest
 from cosim.spec.policy_host import PolicyRuns
-from scenarios.runs.observation_codec import GOAL, arrays_of, told_about, told_goal
+from scenarios.runs.observation_codec import arrays_of, told_about, told_goal
 
 PolicyQuestion = AskReset | AskAct | AskEnded
 
@@ -64,8 +64,8 @@ class HostedPolicy:
     def act(self, seen: Observation) -> Command | np.ndarray[Any, Any]:
         began_s = time.perf_counter()
         self._step += 1
-        goal, goal_array = told_goal(seen.goal)
-        arrays = arrays_of(seen) | ({} if goal_array is None else {GOAL: goal_array})
+        goal, goal_arrays = told_goal(seen.goal)
+        arrays = arrays_of(seen) | goal_arrays
         odometry = (
             None if (told := seen.odometry) is None else (told.x_m, told.y_m, told.heading_rad)
         )

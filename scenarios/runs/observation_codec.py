@@ -12,27 +12,25 @@ from bridge.policy_server import AboutEpisode, AskAct
 from cosim.core.state import frozen
 from cosim.episode.interfaces import Observation
 from cosim.spec.camera import Calibration, CameraPicture
-from cosim.spec.goal import Goal, ImageGoal, Instruction, PointGoal, RoutePatch
+from cosim.spec.goal import Goal, decoded_goal
 from cosim.spec.odometry import Odometry
 from cosim.spec.robot import Robot, robot_called
 
-GOAL: Final = "goal"
-"""What the array of a goal is called; those of further cameras begin with the camera's name and a
-slash."""
+GOAL: Final = "goal."
+"""Beginning of the names of a goal's arrays. Names of the arrays of further cameras are
+"camera/array"."""
 
 
-def told_goal(goal: Goal | None) -> tuple[dict[str, Any] | None, np.ndarray[Any, Any] | None]:
-    """A goal as it travels, and its array."""
-    match goal:
-        case PointGoal(x_m, y_m):
-            return {"type": "point", "x_m": x_m, "y_m": y_m}, None
-        case Instruction(text):
-            return {"type": "instruction", "text": text}, None
-        case ImageGoal(rgb):
-            return {"type": "image"}, rgb
-        case RoutePatch(pixels):
-            return {"type": "route_patch"}, pixels
-    return None, None
+def told_goal(goal: Goal | None) -> tuple[dict[str, Any] | None, dict[str, np.ndarray[Any, Any]]]:
+    """Return the plain fields of a goal as it is sent, and its arrays by the names by which they
+    are sent."""
+    if goal is None:
+        return None, {}
+    fields = goal.encoded()
+    arrays = {
+        name: fields.pop(name) for name, one in list(fields.items()) if isinstance(one, np.ndarray)
+    }
+    return fields, {f"{GOAL}{name}": array for name, array in arrays.items()}
 
 
 def told_about(seen: Observation) -> AboutEpisode:
@@ -69,7 +67,7 @@ def seen_from_afar(
         robot=robot,
         episode=episode,
         reset=told.reset,
-        goal=_goal(told.goal, arrays.get(GOAL)),
+        goal=_goal(told.goal, arrays),
         odometry=None if told.odometry is None else Odometry(*told.odometry),
         camera=cameras.get(""),
         depth=arrays.get("depth"),
@@ -86,19 +84,13 @@ def arrays_of(seen: Observation) -> dict[str, np.ndarray[Any, Any]]:
     return {name: array for name, array in found.items() if array is not None}
 
 
-def _goal(told: Mapping[str, Any] | None, array: Any) -> Goal | None:
-    match told:
-        case None:
-            return None
-        case {"type": "point", "x_m": x_m, "y_m": y_m}:
-            return PointGoal(x_m, y_m)
-        case {"type": "instruction", "text": text}:
-            return Instruction(text)
-        case {"type": "image"}:
-            return ImageGoal(array)
-        case {"type": "route_patch"}:
-            return RoutePatch(array)
-    raise ValueError("a goal of no known kind")
+def _goal(told: Mapping[str, Any] | None, arrays: Mapping[str, Any]) -> Goal | None:
+    if told is None:
+        return None
+    own = {
+        name.removeprefix(GOAL): array for name, array in arrays.items() if name.startswith(GOAL)
+    }
+    return decoded_goal({**told, **own})
 
 
 def _told_camera(camera: Calibration) -> tuple[list[list[float]], list[float], list[list[float]]]:

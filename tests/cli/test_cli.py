@@ -22,6 +22,7 @@ from cosim.core.whole_file import write_whole
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.episode_id import pseudonym_of
 from cosim.spec.options import EpisodeOptions
+from cosim.spec.robot import ROBOTS
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, read_suite, write_suite
 from tests.conftest import PATIENCE_S, WIDE, Cosim, seed_in_order
 
@@ -536,7 +537,7 @@ def test_a_suite_that_does_not_fit_its_place_is_refused(desk: Path, cosim: Cosim
         "scenario 't-0': crossing ",
         "scenario 't-1': ",
         "the net's hash is ",
-        "scenario 't-2': unknown robot 'tank'. Valid choices: courier, scout",
+        f"scenario 't-2': unknown robot 'tank'. Valid choices: {', '.join(sorted(ROBOTS))}",
         "scenario 't-3': unknown map 'atlantis'",
     ):
         assert sum(words in fault for fault in faults) == 1, (words, faults)

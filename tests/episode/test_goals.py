@@ -11,12 +11,27 @@ import pytest
 
 from cosim.core.errors import UsageError
 from cosim.core.geometry import Polyline, Pose
-from cosim.episode.goals import Goals, goals_for, manoeuvres, patch_around, told_at
 from cosim.episode.manifest_checks import calibration_of, with_goal
 from cosim.results.record import Record, begun
 from cosim.results.table import table_row
 from cosim.spec.camera import CameraSpec, Lens
-from cosim.spec.goal import GOALS, Goal, GoalProtocol, ImageGoal, Instruction, PointGoal, RoutePatch
+from cosim.spec.goal import (
+    GOALS,
+    Goal,
+    GoalKind,
+    GoalProtocol,
+    Goals,
+    ImageGoal,
+    Instruction,
+    PointGoal,
+    RoutePatch,
+    TurningGoal,
+    decoded_goal,
+    goals_for,
+    manoeuvres,
+    patch_around,
+    told_at,
+)
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import COURIER, Mount
 from cosim.spec.scenario import City, RouteCrossing, Scenario
@@ -256,6 +271,23 @@ def test_goals_are_the_same_for_the_same_seed(protocol: GoalProtocol) -> None:
 
     assert drive(5) == drive(5)
     assert (drive(5) != drive(6)) == protocol.startswith("random")
+
+
+@pytest.mark.parametrize(
+    "kind", [kind for kind in GOALS.values() if kind.type], ids=lambda kind: str(kind.name)
+)
+def test_a_type_of_goal_is_mirrored_copied_and_encoded(kind: GoalKind) -> None:
+    """Twice mirrored, copied, and encoded and decoded it is the same; what a policy is asked about
+    is of its type."""
+    assert kind.type is not None
+    for goal in kind.type.example((8, 6)).probes().values():
+        assert type(goal) is kind.type
+        for same in (goal.mirrored().mirrored(), goal.copied(), decoded_goal(goal.encoded())):
+            for name, value in msgspec.structs.asdict(goal).items():
+                assert np.array_equal(getattr(same, name), value)
+    left = kind.type.example((8, 6)).probes().get("left")
+    if isinstance(left, TurningGoal):
+        assert (left.turn(5.0, 20.0), left.mirrored().turn(5.0, 20.0)) == ("left", "right")
 
 
 def test_goals_and_odometry_that_there_are_none_of_are_refused_with_the_valid_ones() -> None:

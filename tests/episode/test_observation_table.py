@@ -18,14 +18,14 @@ from cosim.core.state import Command
 from cosim.episode.interfaces import Observation
 from cosim.episode.manifest_checks import calibration_of
 from cosim.spec.camera import CameraPicture, CameraSpec
-from cosim.spec.goal import GoalProtocol, ImageGoal, Instruction, PointGoal, RoutePatch
+from cosim.spec.goal import GOALS, GoalProtocol, ImageGoal, Instruction, PointGoal, RoutePatch
 from cosim.spec.manifest import Manifest
 from cosim.spec.odometry import Odometry
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import CrowdSpec
 from scenarios.episodes.episode import Episode
-from scenarios.runs.observation_codec import GOAL, arrays_of, seen_from_afar, told_about, told_goal
+from scenarios.runs.observation_codec import arrays_of, seen_from_afar, told_about, told_goal
 from scenarios.tools.verify.doctor import small_scenario
 from tests.support.documents import text_of
 
@@ -175,6 +175,24 @@ def test_the_table_has_every_attribute_of_an_observation(seen: dict[str, Observa
     assert known is not None and len(known.people) > 3 and len(known.signals) > 0
 
 
+def test_the_table_of_goal_protocols_is_that_of_the_source() -> None:
+    """Name, type and summary of each row of `GOALS`, in their order."""
+    lines = (
+        text_of("docs/observations.md")
+        .partition("| `goal=` |")[2]
+        .partition("\n\n")[0]
+        .splitlines()[2:]
+    )
+    types = {
+        kind.name: "None" if kind.type is None else f"cosim.{kind.type.__name__}"
+        for kind in GOALS.values()
+    }
+    assert lines == [
+        f"| `{kind.name}` | `{types[kind.name]}` | {kind.summary} |" for kind in GOALS.values()
+    ]
+    assert get_args(GoalProtocol) == tuple(GOALS)
+
+
 def test_who_asks_for_nothing_gets_none() -> None:
     """What the table says is None without being asked for: the defaults of an observation."""
     fields = {field.name: field.default for field in dataclasses.fields(Observation)}
@@ -214,8 +232,8 @@ def test_the_table_holds_where_policies_are_hosted_elsewhere(seen: dict[str, Obs
 
 def hosted(seen: Observation) -> tuple[Observation, SimpleNamespace]:
     """What a policy gets in another process with cosim, and in one without."""
-    told, array = told_goal(seen.goal)
-    arrays = arrays_of(seen) | ({} if array is None else {GOAL: array})
+    told, goal_arrays = told_goal(seen.goal)
+    arrays = arrays_of(seen) | goal_arrays
     pose = None if seen.odometry is None else msgspec.structs.astuple(seen.odometry)
     asked = AskAct(
         "r",

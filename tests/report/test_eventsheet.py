@@ -14,6 +14,7 @@ from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from scenarios.events import EVENT_KINDS
 from scenarios.tools.viewing.event_sheet import COLUMNS, rows_of, summary
 from tests.conftest import Cosim
+from tests.logs import log_with
 
 TICK_S = 0.05
 
@@ -47,25 +48,9 @@ def log_of(x_m: np.ndarray, tracks: np.ndarray) -> Log:
     n = len(x_m)
     pose = np.column_stack([x_m, np.zeros(n), np.zeros(n)])
     travelled = np.diff(x_m, prepend=0.0)
-    return Log(
-        tick_s=TICK_S,
-        pose=pose,
-        speed=np.zeros((n, 2)),
-        command=np.zeros((n, 2)),
-        route_s_m=x_m,
-        travelled_m=travelled,
-        person_m=np.ones(n),
-        clearance_m=np.ones(n),
-        collision_in_s=np.ones(n),
-        reset_s_m=np.full(n, np.nan),
-        waits_at_red=np.zeros(n, bool),
-        on_carriageway=np.zeros(n, bool),
-        vehicles_braked=np.zeros(n, int),
-        people_tick=np.zeros(0, int),
-        people_xy=np.zeros((0, 2)),
-        people_kind=np.zeros(0, np.int8),
-        people_age=np.zeros(0, np.int8),
-        event_tracks=tracks,
+    never = np.full(n, np.nan)
+    return log_with(
+        n, pose=pose, route_s_m=x_m, travelled_m=travelled, reset_s_m=never, event_tracks=tracks
     )
 
 

@@ -10,6 +10,7 @@ import pytest
 from cosim.results.log import Log
 from cosim.results.metrics import METRICS, EpisodeFacts, every_metric, progress_of
 from cosim.results.referee import Failure
+from tests.logs import log_with
 
 
 def log(
@@ -24,25 +25,16 @@ def log(
         reset[tick] = to_m
         begins[tick + 1] = to_m
     moved = np.abs(s - begins)
-    return Log(
-        tick_s=0.05,
+    return log_with(
+        n,
         pose=np.column_stack([s, np.zeros(n), np.zeros(n)]),
         speed=np.column_stack([moved / 0.05, np.zeros(n)]),
-        command=np.zeros((n, 2)),
         route_s_m=s,
         travelled_m=moved,
         person_m=np.full(n, person_m),
         clearance_m=np.full(n, person_m - 0.65),
         collision_in_s=np.full(n, np.inf),
         reset_s_m=reset,
-        waits_at_red=np.zeros(n, bool),
-        on_carriageway=np.zeros(n, bool),
-        vehicles_braked=np.zeros(n, int),
-        people_tick=np.zeros(0, np.int64),
-        people_xy=np.zeros((0, 2)),
-        people_kind=np.zeros(0, np.int8),
-        people_age=np.zeros(0, np.int8),
-        event_tracks=np.zeros((0, 5)),
     )
 
 

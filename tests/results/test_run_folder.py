@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from cosim.core.errors import MachineError, RunError, UsageError
-from cosim.results.log import Log
+from cosim.results.log import COLUMNS, Log
 from cosim.results.metrics import METRICS
 from cosim.results.record import Record
 from cosim.results.run_folder import RunFolder, read_records, read_rows, read_spec
@@ -25,6 +25,7 @@ from cosim.spec.camera import CameraSpec
 from cosim.spec.manifest import WaypointRule
 from cosim.spec.scenario import City, Scenario, Suite
 from tests.conftest import Cosim
+from tests.logs import log_with
 from tests.support.driven_runs import driven
 
 
@@ -453,36 +454,12 @@ def test_a_damaged_record_is_named(tmp_path: Path, content: bytes) -> None:
 
 def test_a_log_survives_the_disk(tmp_path: Path) -> None:
     """A saved trajectory reads back the same; a broken file is named."""
-    arrays = {
-        "pose": np.ones((2, 3)),
-        "speed": np.ones((2, 2)),
-        "command": np.ones((2, 2)),
-        "people_xy": np.ones((1, 2)),
-        "event_tracks": np.ones((1, 5)),
-    }
-    names = (
-        "route_s_m",
-        "travelled_m",
-        "person_m",
-        "clearance_m",
-        "collision_in_s",
-        "reset_s_m",
-        "waits_at_red",
-        "on_carriageway",
-        "vehicles_braked",
-    )
-    vectors = {name: np.ones(2) for name in names}
-    log = Log(
-        tick_s=0.05,
-        people_tick=np.ones(1, int),
-        people_kind=np.ones(1, np.int8),
-        people_age=np.ones(1, np.int8),
-        **arrays,
-        **vectors,
-    )  # type: ignore[arg-type]
+    log = log_with(2, pose=np.ones((2, 3)), event_tracks=np.ones((1, 5)))
     (tmp_path / "t.npz").write_bytes(log.encoded())
     again = Log.load(tmp_path / "t.npz")
-    assert again.tick_s == 0.05 and np.array_equal(again.pose, log.pose)
+    assert again.tick_s == 0.05 and all(
+        np.array_equal(getattr(again, name), getattr(log, name)) for name in COLUMNS
+    )
     (tmp_path / "broken.npz").write_bytes((tmp_path / "t.npz").read_bytes()[:100])
     with pytest.raises(RunError, match=r"broken\.npz: not a trajectory"):
         Log.load(tmp_path / "broken.npz")

@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cosim.results.log import Log
+from cosim.results.log import COLUMNS, Log
 from cosim.results.metrics import METRICS
 from cosim.results.record import METRIC_SCHEMA, Record
 from cosim.results.rejudge import contradictions
@@ -74,20 +74,6 @@ def test_a_run_scores_as_it_was_recorded(tmp_path: Path, cosim: Cosim) -> None:
     assert "equal to the bit to record.json, results.sqlite, results.csv" in said.stdout
 
 
-EACH_TICK = (
-    "pose",
-    "speed",
-    "command",
-    "route_s_m",
-    "travelled_m",
-    "person_m",
-    "clearance_m",
-    "collision_in_s",
-    "reset_s_m",
-    "waits_at_red",
-    "on_carriageway",
-    "vehicles_braked",
-)
 LOG_EDITS = {
     "a longer way": ({"travelled_m": put(3, 0.06)}, "failures_per_100m in record.json"),
     "another place": ({"pose": put((3, 0), 0.21)}, "route_s_m at tick 3"),
@@ -98,7 +84,7 @@ LOG_EDITS = {
         "acceleration_mean_mps2",
     ),
     "a tick less": (
-        dict.fromkeys(EACH_TICK, lambda column: column[:-1]),
+        dict.fromkeys(COLUMNS, lambda column: column[:-1]),
         "ticks in record.json: recorded 80, computed 79",
     ),
     "put back": (

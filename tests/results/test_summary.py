@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cosim.results.metrics import METRICS
-from cosim.results.table import WORST, interval_of, not_to_be_quoted, summary_of
+from cosim.results.metrics import METRICS, WORST
+from cosim.results.table import interval_of, not_to_be_quoted, summary_of
 
 
 def table(*rows: tuple[float, float, float], crashed: int = 0, invalid: int = 0) -> pd.DataFrame:

@@ -26,7 +26,7 @@ from cosim.episode.interfaces import Observation
 from cosim.gym import ENV_IDS
 from cosim.results.referee import Failure
 from cosim.spec.camera import CameraPicture, CameraSpec
-from cosim.spec.goal import GOALS, ImageGoal, Instruction, PointGoal, RoutePatch
+from cosim.spec.goal import GOALS, PointGoal
 from cosim.spec.manifest import Manifest, WaypointRule
 from cosim.spec.odometry import Odometry
 from cosim.spec.options import EpisodeOptions
@@ -87,18 +87,6 @@ def test_the_usual_reward_is_the_sum_that_it_says(happened: dict[str, Any], wort
     assert usual_reward(replace(QUIET, **happened)) == pytest.approx(worth)
 
 
-GIVEN = {
-    "none": None,
-    "route_point": PointGoal(3.0, -1.0),
-    "final_point": PointGoal(30_000.0, 1.0),
-    "random_point": PointGoal(5.0, 5.0),
-    "image": ImageGoal(np.ones((24, 32, 3), np.uint8)),
-    "random_image": ImageGoal(np.ones((24, 32, 3), np.uint8)),
-    "instruction": Instruction("In 10 m, turn left."),
-    "route_patch": RoutePatch(np.ones((80, 80), np.uint8)),
-}
-
-
 @pytest.mark.parametrize("goal", sorted(GOALS))
 def test_what_is_seen_lies_in_its_space(goal: str) -> None:
     """For every goal protocol, with all that a manifest can ask for: the dictionary has the space's
@@ -110,6 +98,14 @@ def test_what_is_seen_lies_in_its_space(goal: str) -> None:
     space = seen_space(manifest, [COURIER, SCOUT])
     pixels = np.full((24, 32), 3, np.uint8)
     far = np.full((24, 32), np.inf, np.float32)
+    goals = GOALS[goal].type  # type: ignore[index]
+    given = (
+        None
+        if goals is None
+        else PointGoal(30_000.0, 1.0)
+        if goals is PointGoal
+        else goals.example((32, 24))
+    )
     picture = CameraPicture(np.zeros((6, 8, 3), np.uint8), None, None, None)  # type: ignore[arg-type]
     seen = seen_by(
         Observation(
@@ -119,7 +115,7 @@ def test_what_is_seen_lies_in_its_space(goal: str) -> None:
             90.0,
             -0.1,
             COURIER,
-            goal=GIVEN[goal],
+            goal=given,
             depth=far,
             labels=pixels,
             pictures={"left": picture},

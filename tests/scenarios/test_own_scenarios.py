@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cosim.core.errors import SpecError
-from cosim.spec.robot import COURIER
+from cosim.spec.robot import COURIER, ROBOTS
 from cosim.spec.scenario import City, Scenario
 from scenarios.suites.user_scenarios.along_route import event_along
 from scenarios.suites.user_scenarios.format import OwnEvent, OwnScenario, OwnWay
@@ -56,7 +56,7 @@ def test_everything_that_is_wrong_with_a_file_is_told_at_once(tmp_path: Path) ->
         "unknown field `sizes`. Valid choices: name, description, seed, seeds, robot,",
         "name 'a b' cannot name a scenario: use 1 to 100 of",
         "seed: must be a whole number, not 'x'",
-        "robot: unknown robot 'tank'. Valid choices: courier, scout.",
+        f"robot: unknown robot 'tank'. Valid choices: {', '.join(sorted(ROBOTS))}.",
         "place: give one of city, map, file, not city and map",
         "place.map: unknown map 'berlin-11'. Valid choices: ",
         "way: unknown field `lenght_m`. Valid choices: kind, length_m, start, goal, route, "

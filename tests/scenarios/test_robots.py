@@ -340,7 +340,7 @@ def test_a_robot_that_is_not_there_is_refused_with_those_that_are(
         said = cosim(*words, "--robot", "tank", cwd=tmp_path)
         assert (
             said.returncode == 2
-            and "unknown robot 'tank'. Valid choices: courier, scout." in said.stderr
+            and f"unknown robot 'tank'. Valid choices: {', '.join(sorted(ROBOTS))}." in said.stderr
         )
     assert not list(tmp_path.iterdir())
     assert "robot   scout  0.50 x 0.40 m, travels at 2 m/s" in cosim("list").stdout

@@ -14,6 +14,7 @@ from cosim.core.errors import SpecError
 from cosim.place.street_map import Corner, Port, StreetMap, Strip
 from cosim.spec.events import Event
 from cosim.spec.obstacle import Obstacle
+from cosim.spec.robot import ROBOTS
 from cosim.spec.scenario import (
     Barrier,
     City,
@@ -218,7 +219,7 @@ def test_every_place_is_looked_at_once_and_all_is_told_together(
     assert made == [1, 2]
     head, *faults = str(told.value).splitlines()
     assert head == "suite 'w': 5 faults:"
-    assert "unknown robot 'tank'. Valid choices: courier, scout" in faults[0]
+    assert f"unknown robot 'tank'. Valid choices: {', '.join(sorted(ROBOTS))}" in faults[0]
     assert "hdri 'nowhere.hdr' does not exist" in faults[1]
     assert all(f"scenario 'odd-{i}': event 'e0' is off" in faults[2 + i] for i in range(3))
     check_places(whole, [s for s in scenarios if s.id.startswith("fine")])

@@ -20,6 +20,7 @@ from cosim.results.run_folder import RunFolder
 from cosim.results.run_spec import RunSpec
 from cosim.spec.manifest import Manifest
 from cosim.spec.scenario import City, Scenario, Suite
+from tests.logs import log_with
 
 SPEED_MPS = 1.0
 HIT = "hit"
@@ -61,27 +62,18 @@ def driven(
         if resets and k in resets:
             x_m = before_m = reset_s_m[k] = resets[k]
     away_m = np.hypot(pose[:, 0] - 4.0, 1.5)
-    nothing = np.zeros(count)
-    nobody = np.zeros(0)
-    return Log(
-        tick_s=tick_s,
+    speeds = np.column_stack([speeds_mps, np.zeros(count)])
+    return log_with(
+        count,
         pose=pose,
-        speed=np.column_stack([speeds_mps, nothing]),
-        command=np.column_stack([speeds_mps, nothing]),
+        speed=speeds,
+        command=speeds,
         route_s_m=route_s_m,
         travelled_m=np.abs(speeds_mps) * tick_s,
         person_m=away_m,
         clearance_m=away_m - 0.6,
         collision_in_s=np.full(count, np.inf),
         reset_s_m=reset_s_m,
-        waits_at_red=nothing > 0.0,
-        on_carriageway=nothing > 0.0,
-        vehicles_braked=nothing.astype(np.int64),
-        people_tick=nobody.astype(np.int64),
-        people_xy=np.zeros((0, 2)),
-        people_kind=nobody.astype(np.int8),
-        people_age=nobody.astype(np.int8),
-        event_tracks=np.zeros((0, 5)),
     )
 
 

@@ -4,7 +4,6 @@ next question."""
 from __future__ import annotations
 
 import math
-import re
 from collections import deque
 from collections.abc import Mapping
 from typing import Any, Final
@@ -35,10 +34,8 @@ from cosim.policies.onnx.inputs import (
     VectorInput,
 )
 from cosim.policies.onnx.pictures import axes_turned, laid_out, picture_numbers, shape_of
-from cosim.spec.goal import Goal, ImageGoal, Instruction, PointGoal, RoutePatch
+from cosim.spec.goal import PATCH_PX, Goal, ImageGoal, PointGoal, RoutePatch, TurningGoal
 
-_TURNS: Final = re.compile(r"(?:In (\d+) m, )?(?:turn|bear) (left|right)", re.IGNORECASE)
-_PATCH_PX: Final = 80
 _GOAL_IS_GIVEN: Final = "a run gives the goals that the manifest asks for"
 
 
@@ -95,7 +92,7 @@ class Feeder:
         if isinstance(one, NoiseInput):
             return self._draws.standard_normal(_whole(name, port)).astype(port.dtype)
         if isinstance(one, MaskInput):
-            given = any(_takes(other, seen.goal) for other in self._inputs.values())
+            given = any(other.takes(seen.goal) for other in self._inputs.values())
             return np.full(_whole(name, port), one.given if given else one.missing, port.dtype)
         if isinstance(one, ConstantInput) and not isinstance(one.value, tuple):
             return np.full(_whole(name, port), one.value, port.dtype)
@@ -167,19 +164,6 @@ def _frame(one: PixelsInput | RoutePatchInput, seen: Observation) -> NDArray[Any
     return picture_numbers(goal.rgb, one) if isinstance(goal, ImageGoal) else None
 
 
-def _takes(one: AnyInput, goal: Goal | None) -> bool:
-    """Whether an input is made of such a goal."""
-    if isinstance(one, GoalPictureInput):
-        return isinstance(goal, ImageGoal)
-    if isinstance(one, RoutePatchInput):
-        return isinstance(goal, RoutePatch)
-    if isinstance(one, TurnInput):
-        return isinstance(goal, Instruction | PointGoal)
-    if isinstance(one, JoinedInput):
-        return any(_takes(part, goal) for part in one.parts)
-    return isinstance(one, GoalPointInput) and isinstance(goal, PointGoal)
-
-
 def _goal_values(one: GoalPointInput, goal: Goal | None) -> NDArray[np.float64]:
     """Those of a point, in its units; what stands for it where there is none, as it would be after
     normalisation."""
@@ -244,16 +228,9 @@ def _seen_from_now(past: list[Any], one: PastPositionsInput) -> list[NDArray[np.
 
 def _turn_told(one: TurnInput, goal: Goal | None) -> tuple[float, ...]:
     """The numbers of the way to go."""
-    if isinstance(goal, PointGoal):
-        beyond_rad = math.radians(one.beyond_deg)
-        if abs(goal.bearing_rad) <= beyond_rad:
-            return one.straight
-        return one.left if goal.bearing_rad > 0.0 else one.right
-    if isinstance(goal, Instruction):
-        told = _TURNS.search(goal.text)
-        if told is None or (told[1] is not None and float(told[1]) > one.ahead_m):
-            return one.straight
-        return one.left if told[2].lower() == "left" else one.right
+    if isinstance(goal, TurningGoal):
+        turns = {"left": one.left, "straight": one.straight, "right": one.right}
+        return turns[goal.turn(one.ahead_m, one.beyond_deg)]
     assert one.missing is not None, _GOAL_IS_GIVEN
     return one.missing
 
@@ -301,7 +278,5 @@ def _check_pixels(name: str, one: PixelsInput | RoutePatchInput, port: TensorPor
 def _sides(one: PixelsInput | RoutePatchInput) -> tuple[int, int, int]:
     """Rows, columns and channels of a frame."""
     return (
-        (_PATCH_PX, _PATCH_PX, 1)
-        if isinstance(one, RoutePatchInput)
-        else (*one.sides, one.channels)
+        (PATCH_PX, PATCH_PX, 1) if isinstance(one, RoutePatchInput) else (*one.sides, one.channels)
     )

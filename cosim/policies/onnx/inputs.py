@@ -7,28 +7,48 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Annotated, Final, Literal, get_args
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Annotated, ClassVar, Final, Literal
 
-from cosim.spec.goal import GoalProtocol
+from cosim.spec.goal import (
+    GOALS,
+    AnyGoal,
+    Goal,
+    GoalProtocol,
+    ImageGoal,
+    PointGoal,
+    RoutePatch,
+    TurningGoal,
+    protocols_of,
+)
 from cosim.spec.validation import Counted, Ranged, Within
 
 _NUMBER: Final = Within(-1e9, 1e9)
 _SIDE: Final = Within(1, 4096)
 _AXES: Final = {"N", "T", "C", "H", "W"}
-POINTS: Final[tuple[GoalProtocol, ...]] = ("route_point", "final_point", "random_point")
-_PICTURES: Final[tuple[GoalProtocol, ...]] = ("image", "random_image")
 
 
 class AnyInput(Ranged, frozen=True, kw_only=True):
+    made_of: ClassVar[type[AnyGoal] | None] = None
+    """The type of goal that it is made of, if any. Such an input has a field `missing`."""
+
     @property
     def called(self) -> str:
         return f"{self.__struct_config__.tag} "
 
     @property
     def needs(self) -> tuple[GoalProtocol, ...]:
-        """The goals that it can be made of; () where it is made of none, or can do without."""
-        return ()
+        """The protocols of the goals that it needs; () where it is made of none, or `missing`
+        replaces them."""
+        return (
+            protocols_of(self.made_of)
+            if self.made_of and getattr(self, "missing", None) is None
+            else ()
+        )
+
+    def takes(self, goal: Goal | None) -> bool:
+        """Return whether it is made of this goal."""
+        return self.made_of is not None and isinstance(goal, self.made_of)
 
 
 class PastInput(AnyInput, frozen=True, kw_only=True):
@@ -126,11 +146,8 @@ class GoalPictureInput(
     """The picture of where to go. missing: fills the tensor where a run's goals are no pictures;
     None: refused."""
 
+    made_of = ImageGoal
     missing: Annotated[float | None, _NUMBER] = None
-
-    @property
-    def needs(self) -> tuple[GoalProtocol, ...]:
-        return _PICTURES if self.missing is None else ()
 
 
 class GoalPointInput(VectorInput, frozen=True, kw_only=True, tag="goal_point", tag_field="what"):
@@ -139,6 +156,7 @@ class GoalPointInput(VectorInput, frozen=True, kw_only=True, tag="goal_point", t
     radians, counter-clockwise from ahead. missing: the values where a run's goals are no points, as
     the graph gets them; None: refused."""
 
+    made_of = PointGoal
     values: Annotated[
         tuple[
             Literal["x", "-x", "y", "-y", "distance", "cos", "sin", "-sin", "bearing", "-bearing"],
@@ -149,10 +167,6 @@ class GoalPointInput(VectorInput, frozen=True, kw_only=True, tag="goal_point", t
     unit_m: Annotated[float, Within(0, 1e6, above=True)] = 1.0
     most_m: Annotated[float | None, Within(0, 1e6, above=True)] = None
     missing: tuple[float, ...] | None = None
-
-    @property
-    def needs(self) -> tuple[GoalProtocol, ...]:
-        return POINTS if self.missing is None else ()
 
     def contradictions(self) -> Iterator[str]:
         yield from super().contradictions()
@@ -168,14 +182,11 @@ class RoutePatchInput(PastInput, frozen=True, kw_only=True, tag="route_patch", t
     `on` the route and `off` it. missing: fills the tensor where a run's goals are no route patches;
     None: refused."""
 
+    made_of = RoutePatch
     on: Annotated[float, _NUMBER] = 1.0
     off: Annotated[float, _NUMBER] = 0.0
     layout: str = "NCHW"
     missing: Annotated[float | None, _NUMBER] = None
-
-    @property
-    def needs(self) -> tuple[GoalProtocol, ...]:
-        return ("route_patch",) if self.missing is None else ()
 
     def contradictions(self) -> Iterator[str]:
         yield layout_refusal(self.called, self.layout, T=self.frames, C=1)
@@ -186,16 +197,13 @@ class TurnInput(AnyInput, frozen=True, kw_only=True, tag="command", tag_field="w
     told within `ahead_m`; of a point, where it lies more than `beyond_deg` aside. missing: with
     other goals; None: refused."""
 
+    made_of = TurningGoal
     left: Annotated[tuple[float, ...], Counted(1, 16)] = (-1.0,)
     straight: Annotated[tuple[float, ...], Counted(1, 16)] = (0.0,)
     right: Annotated[tuple[float, ...], Counted(1, 16)] = (1.0,)
     ahead_m: Annotated[float, Within(0, 20)] = 5.0
     beyond_deg: Annotated[float, Within(0, 180)] = 30.0
     missing: Annotated[tuple[float, ...] | None, Counted(1, 16)] = None
-
-    @property
-    def needs(self) -> tuple[GoalProtocol, ...]:
-        return ("instruction", *POINTS) if self.missing is None else ()
 
     def contradictions(self) -> Iterator[str]:
         counts = {
@@ -263,10 +271,10 @@ class JoinedInput(AnyInput, frozen=True, kw_only=True, tag="joined", tag_field="
 
     @property
     def needs(self) -> tuple[GoalProtocol, ...]:
-        wanted = [set(part.needs) for part in self.parts if part.needs]
-        return tuple(
-            one for one in get_args(GoalProtocol) if wanted and one in set.intersection(*wanted)
-        )
+        return common_goals(self.parts)
+
+    def takes(self, goal: Goal | None) -> bool:
+        return any(part.takes(goal) for part in self.parts)
 
     def contradictions(self) -> Iterator[str]:
         if any(part.needs for part in self.parts) and not self.needs:
@@ -287,6 +295,13 @@ GraphInput = (
     | StateInput
     | JoinedInput
 )
+
+
+def common_goals(inputs: Iterable[AnyInput]) -> tuple[GoalProtocol, ...]:
+    """Return the protocols whose goals all of these inputs can be made of; () where they need
+    none."""
+    wanted = [set(one.needs) for one in inputs if one.needs]
+    return tuple(name for name in GOALS if wanted and name in set.intersection(*wanted))
 
 
 def axes_of(layout: str) -> list[str]:

@@ -13,12 +13,18 @@ import hashlib
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Annotated, Final, Literal, get_args
+from typing import Annotated, Final, Literal
 
 import msgspec
 
 from cosim.core.errors import SpecError
-from cosim.policies.onnx.inputs import GraphInput, JoinedInput, PastPositionsInput, PictureInput
+from cosim.policies.onnx.inputs import (
+    GraphInput,
+    JoinedInput,
+    PastPositionsInput,
+    PictureInput,
+    common_goals,
+)
 from cosim.policies.onnx.outputs import GraphOutput, WaypointsOutput
 from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import GoalProtocol
@@ -147,10 +153,7 @@ class BundleManifest(Ranged, frozen=True, kw_only=True):
     @property
     def goals(self) -> tuple[GoalProtocol, ...]:
         """The goals that all of its inputs can be made of; () where they need none."""
-        wanted = [set(one.needs) for one in self.inputs.values() if one.needs]
-        return tuple(
-            one for one in get_args(GoalProtocol) if wanted and one in set.intersection(*wanted)
-        )
+        return common_goals(self.inputs.values())
 
     @property
     def policy(self) -> Manifest:

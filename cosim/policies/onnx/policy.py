@@ -40,7 +40,7 @@ from cosim.policies.onnx.trial import TrialGraph
 from cosim.policies.onnx.visnavkit import EXAMPLE, METADATA, exports_in, manifest_of_export
 from cosim.policies.onnx.weights import bundle_files
 from cosim.spec.camera import CameraPicture
-from cosim.spec.goal import Goal, GoalProtocol, ImageGoal, Instruction, PointGoal, RoutePatch
+from cosim.spec.goal import GOALS
 from cosim.spec.manifest import Manifest
 from cosim.spec.odometry import Odometry
 from cosim.spec.robot import COURIER
@@ -77,7 +77,6 @@ def read_bundle(place: Path) -> FoundBundle:
 
 
 _GREY = 128
-_PATCH_PX = 80
 
 
 def onnx_policy(place: Path, within_s: float | None = LOADED_WITHIN_S) -> OnnxPolicy:
@@ -267,16 +266,15 @@ def in_grey(manifest: Manifest) -> Observation:
     def grey(size: tuple[int, int]) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
         return np.full((size[1], size[0], 3), _GREY, np.uint8)
 
-    camera = manifest.camera
-    rgb = None if camera is None else grey(camera.size)
+    goals = GOALS[manifest.goal].type
     return Observation(
         tick=0,
         time_s=0.0,
-        rgb=rgb,
+        rgb=None if manifest.camera is None else grey(manifest.picture_size),
         v_mps=0.0,
         w_radps=0.0,
         robot=COURIER,
-        goal=_goal_ahead(manifest.goal, rgb),
+        goal=None if goals is None else goals.example(manifest.picture_size),
         odometry=None if manifest.odometry == "none" else Odometry(0.0, 0.0, 0.0),
         pictures={
             name: CameraPicture(grey(one.size), None, None, calibration_of(one, COURIER))
@@ -334,17 +332,6 @@ def example_differences(policy: OnnxPolicy) -> dict[str, float]:
         name: float(np.abs(told[name].astype(float) - array).max(initial=0.0))
         for name, array in wanted.items()
     }
-
-
-def _goal_ahead(protocol: GoalProtocol, rgb: object) -> Goal | None:
-    if protocol in ("image", "random_image"):
-        assert isinstance(rgb, np.ndarray), "pictures as goals need a camera"
-        return ImageGoal(rgb)
-    if protocol == "instruction":
-        return Instruction("Follow the sidewalk.")
-    if protocol == "route_patch":
-        return RoutePatch(np.zeros((_PATCH_PX, _PATCH_PX), np.uint8))
-    return None if protocol == "none" else PointGoal(10.0, 0.0)
 
 
 def _state_outputs(bundle: BundleManifest) -> list[str]:

@@ -8,7 +8,6 @@ are put at the bound.
 
 from __future__ import annotations
 
-import string
 from collections.abc import Sequence
 from typing import Any, Final, Literal, cast, get_args
 
@@ -19,10 +18,9 @@ from numpy.typing import NDArray
 from cosim.core.errors import UsageError, unknown
 from cosim.core.state import LABELS, Command
 from cosim.episode.control import check_numbers
-from cosim.episode.goals import PATCH_PX
 from cosim.episode.interfaces import Observation
 from cosim.spec.camera import CameraPicture, CameraSpec
-from cosim.spec.goal import Goal, ImageGoal, Instruction, PointGoal, RoutePatch
+from cosim.spec.goal import GOALS, Letters
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import Robot
 
@@ -31,8 +29,6 @@ SeenParts = dict[str, Any]
 """What a learner sees: arrays, and a text where the goal is an instruction."""
 
 _FARTHEST_M: Final = 10_000.0
-_TOLD: Final = 400
-"""Letters of an instruction, at most."""
 
 
 def seen_space(manifest: Manifest, robots: Sequence[Robot]) -> spaces.Dict:
@@ -68,7 +64,7 @@ def seen_by(observation: Observation, space: spaces.Dict) -> SeenParts:
     for end, one in pictures:
         parts |= {f"picture{end}": one.rgb, f"depth{end}": one.depth, f"labels{end}": one.labels}
     if observation.goal is not None:
-        parts["goal"] = _goal_seen(observation.goal)
+        parts["goal"] = observation.goal.plain()
     if (odometry := observation.odometry) is not None:
         parts["odometry"] = [
             v for v in (odometry.x_m, odometry.y_m, odometry.heading_rad) if v is not None
@@ -133,30 +129,13 @@ def _picture_spaces(end: str, spec: CameraSpec) -> dict[str, spaces.Space[Any]]:
 
 
 def _goal_space(manifest: Manifest) -> dict[str, spaces.Space[Any]]:
-    match manifest.goal:
-        case "none":
-            return {}
-        case "image" | "random_image":
-            width, height = (0, 0) if manifest.camera is None else manifest.camera.size
-            return {"goal": _pixels((height, width, 3))}
-        case "instruction":
-            letters = string.ascii_letters + string.digits + " .,"
-            return {"goal": spaces.Text(_TOLD, charset=letters)}
-        case "route_patch":
-            return {"goal": _pixels((PATCH_PX, PATCH_PX))}
-    return {"goal": _box([_FARTHEST_M, _FARTHEST_M])}
-
-
-def _goal_seen(goal: Goal) -> Any:
-    match goal:
-        case PointGoal():
-            return (goal.x_m, goal.y_m)
-        case ImageGoal():
-            return goal.rgb
-        case Instruction():
-            return goal.text
-        case RoutePatch():
-            return goal.pixels
+    goals = GOALS[manifest.goal].type
+    if goals is None:
+        return {}
+    values = goals.space(manifest.picture_size)
+    if isinstance(values, Letters):
+        return {"goal": spaces.Text(values.most, charset=values.charset)}
+    return {"goal": spaces.Box(values.low, values.high, values.shape, values.dtype)}
 
 
 def _within(value: Any, space: spaces.Space[Any]) -> Any:

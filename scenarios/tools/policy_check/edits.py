@@ -12,12 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.clock import Clock
-from cosim.core.geometry import Pose
 from cosim.core.state import frozen
-from cosim.episode.goals import patch_around
 from cosim.episode.interfaces import Observation
-from cosim.spec.camera import Calibration, CameraPicture
-from cosim.spec.goal import Goal, ImageGoal, Instruction, PointGoal, RoutePatch
+from cosim.spec.camera import Calibration, CameraPicture, flipped
+from cosim.spec.goal import Goal
 
 _MIRROR: Final = np.diag([1.0, -1.0, 1.0, 1.0])
 """Left becomes right in the robot's frame."""
@@ -50,7 +48,7 @@ def in_mirror(seen: Observation) -> Observation:
         depth=_flipped(seen.depth),
         labels=_flipped(seen.labels),
         w_radps=-seen.w_radps,
-        goal=goal_in_mirror(seen.goal),
+        goal=None if seen.goal is None else seen.goal.mirrored(),
         odometry=odometry,
         camera=None
         if seen.camera is None or seen.rgb is None
@@ -67,20 +65,6 @@ def in_mirror(seen: Observation) -> Observation:
     )
 
 
-def goal_in_mirror(goal: Goal | None) -> Goal | None:
-    """A goal in a mirror."""
-    if isinstance(goal, PointGoal):
-        return PointGoal(goal.x_m, -goal.y_m)
-    if isinstance(goal, ImageGoal):
-        return ImageGoal(flipped(goal.rgb))
-    if isinstance(goal, RoutePatch):
-        return RoutePatch(flipped(goal.pixels))
-    if isinstance(goal, Instruction):
-        text = goal.text.replace("left", "\0").replace("right", "left")
-        return Instruction(text.replace("\0", "right"))
-    return None
-
-
 def with_goal_told(name: str, goal: Goal | None) -> Edit:
     """Another goal throughout."""
     return of_each(f"goal {name}", lambda seen: replace(seen, goal=goal))
@@ -90,7 +74,7 @@ def with_pictures(name: str, paint: Callable[[NDArray[np.uint8]], NDArray[np.uin
     """All pictures, that of the goal as well, painted anew."""
 
     def painted(seen: Observation) -> Observation:
-        goal = ImageGoal(paint(seen.goal.rgb)) if isinstance(seen.goal, ImageGoal) else seen.goal
+        goal = None if seen.goal is None else seen.goal.painted(paint)
         pictures = {key: replace(one, rgb=paint(one.rgb)) for key, one in seen.pictures.items()}
         return replace(
             seen, rgb=None if seen.rgb is None else paint(seen.rgb), goal=goal, pictures=pictures
@@ -145,18 +129,6 @@ def then(
         tick = first[-1].tick + (number + 1) * period
         moved.append(replace(one, tick=tick, time_s=clock.time_s(tick), reset=number == 0))
     return [*first, *moved]
-
-
-def patch_of_turn(left: float) -> RoutePatch:
-    """A route that turns off 6 m ahead: left 1 for to the left, -1 for to the right, 0 for straight
-    on."""
-    end = (6.0, 20.0 * left) if left else (20.0, 0.0)
-    return RoutePatch(patch_around(Pose(0.0, 0.0, 0.0), np.array([(-20.0, 0.0), (6.0, 0.0), end])))
-
-
-def flipped(picture: NDArray[Any]) -> NDArray[Any]:
-    """(H, W, ...): left is right."""
-    return np.ascontiguousarray(picture[:, ::-1])
 
 
 def _flipped(picture: NDArray[Any] | None) -> NDArray[Any] | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
+from cosim.spec.goal import GOALS
 from scenarios.tools.policy_check.outcome import CheckOutcome, doubted, failed, inapplicable, passed
 from scenarios.tools.policy_check.query import ROUNDING, Answered, Asker, apart
 
@@ -106,8 +107,9 @@ def _told(asker: Asker, goal: str) -> Answered:
 
 def _without(asker: Asker) -> CheckOutcome | None:
     """Why a check of goals does not apply, if it does not."""
-    if asker.manifest.goal == "none":
-        return inapplicable("it is told no goal")
-    if asker.manifest.goal == "random_image":
-        return inapplicable("a picture of noise is no goal")
-    return None
+    kind = GOALS[asker.manifest.goal]
+    return (
+        inapplicable(f"its goal says nothing of where to go: {kind.summary}")
+        if kind.noise
+        else None
+    )

@@ -17,10 +17,9 @@ from cosim.core.state import Command, Planned
 from cosim.core.telling import Tell, untold
 from cosim.episode.interfaces import Observation, Policy
 from cosim.episode.policy_caller import Driver
-from cosim.spec.goal import Goal, ImageGoal, Instruction, PointGoal, RoutePatch
 from cosim.spec.manifest import Manifest, WaypointRule
 from scenarios.tools.policy_check.drives import Drive, SceneName
-from scenarios.tools.policy_check.edits import Edit, flipped, patch_of_turn, with_goal_told
+from scenarios.tools.policy_check.edits import Edit, with_goal_told
 
 _SEED: Final = 1
 _LEAST: Final = 0.1
@@ -138,35 +137,10 @@ class Asker:
 
     @cached_property
     def goals(self) -> dict[str, Edit]:
-        """By names: ahead, left, right, zero, and for points near, half as far as left. Of pictures
-        left is ahead in a mirror, and there is no right."""
+        """By name, as the goal's type has them (`AnyGoal.probes`)."""
         own = self.drives["straight"].seen[-1].goal
-        told: dict[str, Goal | None] = {"ahead": own}
-        if isinstance(own, PointGoal):
-            told = {
-                "ahead": PointGoal(10.0, 0.0),
-                "left": PointGoal(10.0, 5.0),
-                "right": PointGoal(10.0, -5.0),
-            }
-            told |= {"zero": PointGoal(0.0, 0.0), "near": PointGoal(5.0, 2.5)}
-        elif isinstance(own, Instruction):
-            words = {
-                "ahead": "Follow the sidewalk.",
-                "left": "Turn left.",
-                "right": "Turn right.",
-                "zero": "",
-            }
-            told = {name: Instruction(text) for name, text in words.items()}
-        elif isinstance(own, RoutePatch):
-            told = {
-                "ahead": patch_of_turn(0.0),
-                "left": patch_of_turn(1.0),
-                "right": patch_of_turn(-1.0),
-            }
-            told["zero"] = RoutePatch(np.zeros_like(own.pixels))
-        elif isinstance(own, ImageGoal):
-            told |= {"left": ImageGoal(flipped(own.rgb)), "zero": ImageGoal(np.zeros_like(own.rgb))}
-        return {name: with_goal_told(name, goal) for name, goal in told.items()}
+        probes = {"ahead": None} if own is None else own.probes()
+        return {name: with_goal_told(name, goal) for name, goal in probes.items()}
 
     def _hear(self, said: object) -> None:
         self._said = said
