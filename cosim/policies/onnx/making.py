@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from cosim.core.errors import MachineError, UsageError, unwritable
-from cosim.core.whole_file import write_whole
+from cosim.core.files import write_atomic
 from cosim.policies.onnx.weights import NetworkFile
 
 
@@ -40,7 +40,7 @@ def write_graph(out: Path, graph: bytes) -> None:
     """Write it, whole or not at all, and say so. Raises MachineError where it cannot be written."""
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(out, graph)
+        write_atomic(out, graph)
     except OSError as error:
         raise unwritable(out, error) from error
     print(f"{out}: {len(graph)} bytes")

@@ -12,7 +12,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from cosim.core.telling import duration, milliseconds
+from cosim.core.units import duration, milliseconds
 from cosim.place.open_ground import GROUND_LOOKS
 from cosim.report.page.plots import CAUSE_COLOURS, RUN_COLOURS, Plot
 from cosim.report.page.reasons import CAUSES, mishaps_of

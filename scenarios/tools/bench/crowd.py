@@ -12,7 +12,7 @@ import math
 import multiprocessing
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any, cast
 
@@ -22,6 +22,7 @@ from shapely.geometry import LineString, Polygon
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Pose, wrap_angle
+from cosim.core.progress import Progress
 from cosim.core.state import Command, Motion, PersonKind, RobotState, Street, write_protected
 from cosim.episode.step import Step
 from cosim.place.street_map import StreetMap
@@ -198,13 +199,11 @@ class Stopwatch:
         return street
 
 
-def watch_all(
-    cities: int, minutes: float, crowd: CrowdSpec, tell: Callable[[str], None]
-) -> list[Watched]:
+def watch_all(cities: int, minutes: float, crowd: CrowdSpec, progress: Progress) -> list[Watched]:
     """Watch the crowd in several cities, a process for each, one after another."""
     found = []
     for seed in range(cities):
-        tell(f"city {seed + 1} of {cities}")
+        progress(f"watching the crowd: city {seed + 1} of {cities}")
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             arguments: tuple[Any, ...] = (City(seed=100 + seed, size_m=CITY_M), minutes, crowd)
             found.append(pool.apply(watch, arguments))

@@ -16,6 +16,7 @@ from typing import Final
 import msgspec
 
 from cosim.core.errors import EngineError, UsageError, unknown
+from cosim.core.progress import Progress
 from scenarios.tools.bench import batched as together
 from scenarios.tools.bench import (
     cameras,
@@ -142,7 +143,7 @@ def chosen(only: Sequence[str], names: Sequence[str]) -> list[str]:
 
 
 def take_rounds(
-    names: Sequence[str], checkouts: Sequence[Path], rounds: int, tell: Callable[[str], None]
+    names: Sequence[str], checkouts: Sequence[Path], rounds: int, progress: Progress
 ) -> list[dict[str, list[Figure]]]:
     """For each checkout its figures by name, a value a round. The checkouts take turns, and who
     begins changes."""
@@ -152,7 +153,7 @@ def take_rounds(
             order = list(enumerate(checkouts))
             for i, checkout in order[:: -1 if k % 2 else 1]:
                 where = "" if len(checkouts) == 1 else f" in {checkout}"
-                tell(f"round {k + 1} of {rounds}: {name}{where}")
+                progress(f"measuring: round {k + 1} of {rounds}: {name}{where}")
                 for figure in taken(name, checkout):
                     found[i].setdefault(figure.name, []).append(figure)
     return found

@@ -13,7 +13,7 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from multiprocessing.connection import Connection
 
 import msgspec
@@ -23,6 +23,7 @@ from cosim.core.child_process import end_with
 from cosim.core.clock import Clock
 from cosim.core.errors import CosimError
 from cosim.core.geometry import Floats, Polyline, Pose
+from cosim.core.progress import Progress, ignore
 from cosim.core.state import PersonKind, RobotState
 from cosim.place.street_map import StreetMap
 from cosim.place.walk_graph import WalkGraph
@@ -63,9 +64,7 @@ class Endured(msgspec.Struct, frozen=True, kw_only=True):
     reason: str = ""
 
 
-def endure(
-    where: Place, seed: int, minutes: float = 10.0, tell: Callable[[float], None] = lambda _: None
-) -> Endured:
+def endure(where: Place, seed: int, minutes: float = 10.0, progress: Progress = ignore) -> Endured:
     """Simulate a place in a process of its own. Whatever goes wrong there becomes the reason, not
     an exception."""
     context = multiprocessing.get_context("spawn")
@@ -81,7 +80,7 @@ def endure(
     try:
         while mine.poll(HANG_S):
             last = msgspec.json.decode(mine.recv_bytes(), type=Endured)
-            tell(last.ticks / ticks)
+            progress(f"{minutes:g} min on {where.name}", last.ticks / ticks)
         process.kill()
         reason = f"SUMO showed no sign of life for {HANG_S:g} s"
     except (EOFError, ConnectionResetError):

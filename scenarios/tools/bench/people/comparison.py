@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from cosim.core.geometry import Floats
+from cosim.core.progress import Progress
 from cosim.core.state import PERSON_RADIUS_M
 from scenarios.tools.bench.people.measures import (
     FRAMES_HZ,
@@ -67,9 +67,9 @@ class Comparison(NamedTuple):
 
 
 def watch_people(
-    jobs: int, tell: Callable[[str], None], walk_s: float = _WALK_S, cross_s: float = _CROSS_S
+    jobs: int, progress: Progress, walk_s: float = _WALK_S, cross_s: float = _CROSS_S
 ) -> Comparison:
-    """Let people walk on every street, in so many processes. tell: is told how far it is."""
+    """Let people walk on every street, in so many processes. progress: receives how far it is."""
     need_pedpy()
     dense = [
         Flow(density, both_ways) for both_ways in (False, True) for density in reversed(DENSITIES)
@@ -82,7 +82,7 @@ def watch_people(
         free = [pool.apply_async(_free_mps, (_FREE, walk_s, seed)) for seed in range(_FREE_SEEDS)]
         found = []
         for k, one in enumerate(tasks := [*walking, *near, *free]):
-            tell(f"street {k + 1} of {len(tasks)}")
+            progress(f"watching people: street {k + 1} of {len(tasks)}")
             found.append(one.get())
         person_first_s, vehicle_first_s, people, vehicles = crossing.get()
     one_way = found[: len(DENSITIES)]
