@@ -21,11 +21,11 @@ import msgspec
 from bridge.codec import decode, encode
 from bridge.session import Session
 from cosim.core.errors import DirectorLost, EngineError
+from cosim.core.progress import Progress
 from cosim.core.state import PersonKind
 from cosim.spec.events import Event, EventQuery, EventReply
 
 React = Callable[[EventQuery], EventReply]
-Waiting = Callable[[str], None]
 
 NOTICE_S = 2.0
 """After so long without an answer whoever runs the episode is told what it waits for."""
@@ -105,7 +105,7 @@ class RemoteDirector:
         *,
         by: str = "",
         wait_s: float = 10.0,
-        waiting: Waiting | None = None,
+        waiting: Progress | None = None,
     ) -> None:
         self._session = session
         self._key = key

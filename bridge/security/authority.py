@@ -10,8 +10,6 @@ from __future__ import annotations
 import os
 import re
 import secrets
-import shutil
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
@@ -36,6 +34,7 @@ from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from bridge.security.identity import CA, CERTIFICATE, KEY, identity_in, said
 from cosim.core.errors import AccessError, UsageError, unwritable
+from cosim.core.files import atomic_folder
 from cosim.spec.connection import HUBS, Role
 
 _CA_KEY: Final = "ca.key"
@@ -191,25 +190,13 @@ def _pem(key: EllipticCurvePrivateKey) -> bytes:
 
 @contextmanager
 def _whole_folder(folder: Path) -> Iterator[Path]:
-    """A folder to fill beside the one that is meant, which takes its place when nothing was
-    raised."""
-    made = None
+    """Yield a folder that takes the place of `folder` at the end of the block."""
     try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        made = Path(tempfile.mkdtemp(prefix=f"{folder.name}.", suffix=".part", dir=folder.parent))
-        yield made
-        if folder.exists():
-            before = made.with_suffix(".before")
-            folder.rename(before)
-            made.rename(folder)
-            shutil.rmtree(before)
-        else:
-            made.rename(folder)
+        with atomic_folder(folder) as made:
+            made.chmod(0o700)
+            yield made
     except OSError as error:
         raise unwritable(folder, error, "choose another place, or make room") from error
-    finally:
-        if made is not None and made.exists():
-            shutil.rmtree(made, ignore_errors=True)
 
 
 def _write(path: Path, data: bytes) -> None:

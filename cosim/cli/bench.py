@@ -7,14 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich import box
-from rich.markup import escape
-from rich.table import Column, Table
 
+from cosim.cli import tables
 from cosim.cli.console import out
 from cosim.cli.options import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, MEASURE
 from cosim.cli.progress import doing
-from cosim.cli.tables import print_fitted
 from cosim.core.errors import UsageError, unknown
 
 if TYPE_CHECKING:
@@ -22,6 +19,9 @@ if TYPE_CHECKING:
     from scenarios.tools.bench.figures import Figure
     from scenarios.tools.bench.people import Comparison, MeanSd
 
+
+_SHARE = [*tables.figures("count"), *tables.labels("of"), *tables.figures("share", "target")]
+"""Columns of a table of shares."""
 
 LIGHTS = (
     ("persons entered at red", "persons entered signalised crossings", "0"),
@@ -55,36 +55,34 @@ def bench_crowd(
     from scenarios.tools.bench.crowd import APART_M, summed, watch_all
 
     spec = CrowdSpec(residents=residents, groups=groups, elderly=elderly, children=children)
-    with doing("watching the crowd") as tell:
-        found = watch_all(cities, minutes, spec, lambda words: tell(f"watching the crowd: {words}"))
+    with doing("watching the crowd") as progress:
+        found = watch_all(cities, minutes, spec, progress)
     counts = summed(one.counts for one in found)
     total_min = sum(one.minutes for one in found)
     places = (
         f"{len(found)} cities, {total_min:.0f} min, {sum(f.crossings for f in found)} signalised "
         f"crossings entered"
     )
-    table = Table(places, "count", "of", "share", "target")
-    _add_shares(table, SHARES, counts)
+    rows = _shares(SHARES, counts)
     told = {name for name, whole, _ in SHARES for name in (name, whole)}
     for name in sorted(counts.keys() - told):
-        table.add_row(name, f"{counts[name]:.2f}", "", "", "")
-    print_fitted(out, table)
+        rows.append((name, f"{counts[name]:.2f}", "", "", ""))
+    tables.show(out, [*tables.names(places), *_SHARE], rows)
     out.print("People and pairs are counted in seconds, entries and vehicles one by one.")
-    each = Table(
-        "city", "min", "persons", "overlaps, share of pair-seconds", "crowd's step, CPU ms"
-    )
+    each = []
     for one in found:
         overlaps = one.counts.get("overlaps", 0.0) / max(
             one.counts.get("pairs in contact range", 0.0), 1e-9
         )
-        each.add_row(
-            one.place,
+        numbers = (
             f"{one.minutes:.0f}",
             f"{one.persons:.0f}",
             f"{100 * overlaps:.4f} %",
             f"{one.crowd_ms:.2f}",
         )
-    print_fitted(out, each)
+        each.append((one.place, *numbers))
+    heads = ("min", "persons", "overlaps, share of pair-seconds", "crowd's step, CPU ms")
+    tables.show(out, [*tables.names("city"), *tables.figures(*heads)], each)
     if gaps_m := sorted(gap for one in found for gap in one.group_gaps_m):
         middle, most = (gaps_m[int(share * len(gaps_m))] for share in (0.5, 0.95))
         apart = sum(gap > APART_M for gap in gaps_m) / len(gaps_m)
@@ -100,13 +98,13 @@ def bench_crossings(crossings: int, cities: int, policy: str, jobs: int) -> None
     from scenarios.tools.bench.crossings import cross_all, crossings_entered
     from scenarios.tools.bench.crowd import summed
 
-    with doing("drawing crossings") as tell:
-        rows = cross_all(crossings, cities, policy, jobs, lambda words: tell(f"driving: {words}"))
+    with doing("drawing crossings") as progress:
+        rows = cross_all(crossings, cities, policy, jobs, progress)
     places = (
         f"cities: {len({row.city for row in rows})}, minutes: "
         f"{sum(row.minutes for row in rows):.0f}"
     )
-    robot = Table(policy, "", f"signalised crossings: {len(rows)}, {places}")
+    robot = []
     waited = [row.waited_s for row in rows if row.waited_s > 0.0]
     for name, rows_with in (
         ("reached the goal", [row for row in rows if row.ended == "goal"]),
@@ -118,39 +116,37 @@ def bench_crossings(crossings: int, cities: int, policy: str, jobs: int) -> None
         named = ", ".join(
             f"{row.scenario or row.city} {row.reason}{', '.join(row.failures)}" for row in rows_with
         )
-        robot.add_row(name, str(len(rows_with)), "" if name == "reached the goal" else named)
+        robot.append((name, str(len(rows_with)), "" if name == "reached the goal" else named))
     mean = f"{sum(waited) / len(waited):.1f} s each on the mean" if waited else ""
-    robot.add_row("waited at red", str(len(waited)), mean)
-    robot.add_row(
-        "on the carriageway, or on a crossing at red",
-        f"{sum(r.carriageway_s for r in rows):.1f} s",
-        "",
-    )
-    print_fitted(out, robot, words=[2])
+    robot.append(("waited at red", str(len(waited)), mean))
+    on_road_s = sum(row.carriageway_s for row in rows)
+    robot.append(("on the carriageway, or on a crossing at red", f"{on_road_s:.1f} s", ""))
+    columns = [
+        *tables.names(policy),
+        *tables.figures(""),
+        *tables.words(f"signalised crossings: {len(rows)}, {places}"),
+    ]
+    tables.show(out, columns, robot)
     counts = summed(row.counts for row in rows)
-    lights = Table(
-        f"crowd and vehicles, {crossings_entered(rows)} crossings entered",
-        "count",
-        "of",
-        "share",
-        "target",
-    )
-    _add_shares(lights, LIGHTS, counts)
+    lights = _shares(LIGHTS, counts)
     for name in ("vehicles drove over a crossing at walk", "vehicles within 1 m of a walker on it"):
-        lights.add_row(name, f"{counts.get(name, 0.0):.2f}", "", "", "")
-    print_fitted(out, lights)
+        lights.append((name, f"{counts.get(name, 0.0):.2f}", "", "", ""))
+    first = tables.names(f"crowd and vehicles, {crossings_entered(rows)} crossings entered")
+    tables.show(out, [*first, *_SHARE], lights)
     for row in rows:
         for who in row.at_red:
             out.print(f"{row.scenario}: {who}", soft_wrap=True, markup=False, highlight=False)
 
 
-def _add_shares(
-    table: Table, shares: tuple[tuple[str, str, str], ...], counts: Mapping[str, float]
-) -> None:
+def _shares(
+    shares: tuple[tuple[str, str, str], ...], counts: Mapping[str, float]
+) -> list[tuple[str, ...]]:
+    rows: list[tuple[str, ...]] = []
     for name, whole, target in shares:
         count, of = counts.get(name, 0.0), counts.get(whole, 0.0)
         share = f"{100.0 * count / of:.4f} %" if of else ""
-        table.add_row(name, f"{count:.2f}", f"{of:.0f} {whole}", share, target)
+        rows.append((name, f"{count:.2f}", f"{of:.0f} {whole}", share, target))
+    return rows
 
 
 _NOTES = (
@@ -173,44 +169,46 @@ def bench_people(jobs: int) -> None:
     people."""
     from scenarios.tools.bench.people import watch_people
 
-    with doing("watching people") as tell:
-        found = watch_people(jobs, lambda words: tell(f"watching people: {words}"))
-    for table in (_by_density(found), _free(found), _nearest(found), _gaps(found)):
-        print_fitted(out, table)
+    with doing("watching people") as progress:
+        found = watch_people(jobs, progress)
+    _show_by_density(found)
+    _show_free(found)
+    _show_nearest(found)
+    _show_gaps(found)
     for note in _NOTES:
         out.print(note, highlight=False)
 
 
-def _by_density(found: Comparison) -> Table:
+def _show_by_density(found: Comparison) -> None:
     from scenarios.tools.bench.people import DENSITY_EDGES, SPEED_BY_DENSITY_MPS, normal_distance
 
-    table = _table(
-        "persons/m2", "HERMES", "one way", "dist.", "off, sd", "both ways", "dist.", "off, sd"
-    )
-    table.title = "Speed by density, m/s"
+    rows = []
     for k, data in enumerate(SPEED_BY_DENSITY_MPS):
         cells = []
         for ours, _ in (way[k] for way in found.by_density):
             off = (ours.mean - data.mean) / data.sd
             cells += [_spread(ours), f"{normal_distance(ours, data):.2f}", f"{off:+.1f}"]
-        table.add_row(f"{DENSITY_EDGES[k]:g} to {DENSITY_EDGES[k + 1]:g}", _spread(data), *cells)
+        rows.append((f"{DENSITY_EDGES[k]:g} to {DENSITY_EDGES[k + 1]:g}", _spread(data), *cells))
     person_s = [" ".join(f"{seconds:.0f}" for _, seconds in way) for way in found.by_density]
-    table.caption = f"person-seconds: one way {person_s[0]}; both ways {person_s[1]}"
-    return table
+    heads = ("HERMES", "one way", "dist.", "off, sd", "both ways", "dist.", "off, sd")
+    note = f"person-seconds: one way {person_s[0]}; both ways {person_s[1]}"
+    columns = [*tables.names("persons/m2"), *tables.figures(*heads)]
+    tables.show(out, columns, rows, title="Speed by density, m/s", note=note)
 
 
-def _free(found: Comparison) -> Table:
+def _show_free(found: Comparison) -> None:
     from scenarios.tools.bench.people import FREE_SPEED_MPS, mean_sd, normal_distance
 
     ours = mean_sd(found.free_mps)
-    table = _table("", "data", "ours", "dist.")
-    table.title = "Free speed, m/s"
-    for name, data in FREE_SPEED_MPS.items():
-        table.add_row(name, _spread(data), _spread(ours), f"{normal_distance(ours, data):.2f}")
-    return table
+    rows = [
+        (name, _spread(data), _spread(ours), f"{normal_distance(ours, data):.2f}")
+        for name, data in FREE_SPEED_MPS.items()
+    ]
+    columns = [*tables.names(""), *tables.figures("data", "ours", "dist.")]
+    tables.show(out, columns, rows, title="Free speed, m/s")
 
 
-def _nearest(found: Comparison) -> Table:
+def _show_nearest(found: Comparison) -> None:
     from scenarios.tools.bench.people import (
         GROUPS,
         NEAREST_M,
@@ -219,8 +217,7 @@ def _nearest(found: Comparison) -> Table:
         percentile_distance,
     )
 
-    table = _table("", _percent(NEAREST_PERCENT), "ours", "dist.", "in groups", "persons/m2")
-    table.title = "Nearest neighbour, m"
+    rows = []
     for share in GROUPS:
         for name, data in NEAREST_M.items():
             flow, apart_m = alike(
@@ -228,13 +225,14 @@ def _nearest(found: Comparison) -> Table:
             )
             far_m = percentile_distance(apart_m, NEAREST_PERCENT, data)
             ours = _percentiles(apart_m, NEAREST_PERCENT)
-            table.add_row(
-                name, _list(data), ours, f"{far_m:.2f}", f"{100 * share:.0f} %", f"{flow.density:g}"
-            )
-    return table
+            numbers = (f"{far_m:.2f}", f"{100 * share:.0f} %", f"{flow.density:g}")
+            rows.append((name, _list(data), ours, *numbers))
+    heads = (_percent(NEAREST_PERCENT), "ours", "dist.", "in groups", "persons/m2")
+    columns = [*tables.names(""), *tables.figures(*heads)]
+    tables.show(out, columns, rows, title="Nearest neighbour, m")
 
 
-def _gaps(found: Comparison) -> Table:
+def _show_gaps(found: Comparison) -> None:
     from scenarios.tools.bench.people import (
         PERSON_FIRST_PERCENT,
         PERSON_FIRST_S,
@@ -243,28 +241,17 @@ def _gaps(found: Comparison) -> Table:
         percentile_distance,
     )
 
-    table = _table("", "DUT", "ours", "dist.", "gaps")
-    table.title = "Gaps at a crossing without signals (post-encroachment times), s"
+    rows = []
     for name, percent, data, ours in (
         ("person first", PERSON_FIRST_PERCENT, PERSON_FIRST_S, found.person_first_s),
         ("vehicle first", VEHICLE_FIRST_PERCENT, VEHICLE_FIRST_S, found.vehicle_first_s),
     ):
         far_s = percentile_distance(ours, percent, data)
         cells = (_list(data), _percentiles(ours, percent), f"{far_s:.2f}", str(len(ours)))
-        table.add_row(f"{name}: {_percent(percent)}", *cells)
-    return table
-
-
-def _table(first: str, *others: str) -> Table:
-    heads = [Column(head, no_wrap=True, justify="right") for head in others]
-    return Table(
-        Column(first, no_wrap=True),
-        *heads,
-        box=box.SIMPLE_HEAD,
-        padding=0,
-        title_justify="left",
-        caption_justify="left",
-    )
+        rows.append((f"{name}: {_percent(percent)}", *cells))
+    title = "Gaps at a crossing without signals (post-encroachment times), s"
+    columns = [*tables.names(""), *tables.figures("DUT", "ours", "dist.", "gaps")]
+    tables.show(out, columns, rows, title=title)
 
 
 def _spread(one: MeanSd) -> str:
@@ -380,13 +367,8 @@ def _taken(
 
     environment = (*ENVIRONMENT, *ON_REQUEST) if only else ENVIRONMENT
     names = chosen(only, tuple(CAMERA) if what == "camera" else environment)
-    with doing("measuring") as tell:
-        return take_rounds(
-            names,
-            [one or ROOT for one in checkouts],
-            rounds,
-            lambda words: tell(f"measuring: {words}"),
-        )
+    with doing("measuring") as progress:
+        return take_rounds(names, [one or ROOT for one in checkouts], rounds, progress)
 
 
 def _compare(other: Path, what: str, only: Sequence[str], rounds: int) -> None:
@@ -400,16 +382,16 @@ def _compare(other: Path, what: str, only: Sequence[str], rounds: int) -> None:
             f"(scenarios/tools/bench/take.py)"
         )
     here, there = _taken(what, only, [None, other.resolve()], rounds)
-    table = Table(
-        *_columns("figure", "here", "there", "here / there", "spread"),
-        box=box.SIMPLE_HEAD,
-        padding=0,
-    )
+    rows = []
     for name in [name for name in here if name in there]:
         mine, theirs = ([one.value for one in found[name]] for found in (here, there))
         ratios = [a / b for a, b in zip(mine, theirs, strict=True)]
-        table.add_row(name, spread(mine)[0], spread(theirs)[0], *spread(ratios))
-    print_fitted(out, table)
+        rows.append((name, spread(mine)[0], spread(theirs)[0], *spread(ratios)))
+    tables.show(
+        out,
+        [*tables.names("figure"), *tables.figures("here", "there", "here / there", "spread")],
+        rows,
+    )
     out.print(f"medians; a ratio a round, {rounds} in all, the checkouts in turns", highlight=False)
 
 
@@ -418,8 +400,7 @@ def print_figures(found: Mapping[str, Sequence[Figure]]) -> None:
     should be reached."""
     from scenarios.tools.bench.figures import spread
 
-    heads = ("figure", "median", "spread", "limit", "ratio", "reach")
-    table = Table(*_columns(*heads), box=box.SIMPLE_HEAD, padding=0)
+    rows = []
     limits: dict[str, None] = {}
     for name, rounds in found.items():
         first = rounds[0]
@@ -435,19 +416,14 @@ def print_figures(found: Mapping[str, Sequence[Figure]]) -> None:
             reach = (
                 f"{'ratio' if first.reach_ratio else ''} {first.better} {first.reach:,.4g}".strip()
             )
-        table.add_row(
-            escape(name + mark), *spread([one.value for one in rounds]), limit, ratio, reach
-        )
-    print_fitted(out, table)
+        rows.append((name + mark, *spread([one.value for one in rounds]), limit, ratio, reach))
+    tables.show(
+        out,
+        [*tables.names("figure"), *tables.figures("median", "spread", "limit", "ratio", "reach")],
+        rows,
+    )
     for i, words in enumerate(limits):
         out.print(f"limit [{i + 1}]: {words}", markup=False, highlight=False)
-
-
-def _columns(first: str, *others: str) -> list[Column]:
-    return [
-        Column(first, overflow="fold"),
-        *(Column(head, no_wrap=True, justify="right") for head in others),
-    ]
 
 
 def bench_cameras(rounds: int) -> None:
@@ -458,24 +434,28 @@ def bench_cameras(rounds: int) -> None:
 
     drawn_by = renderer_of(camera_of_choice("auto"))
     on_gpu = "llvmpipe" not in drawn_by and "bullet" not in drawn_by
-    with doing("measuring") as tell:
-        found = time_cameras(rounds, lambda words: tell(f"measuring: {words}"))
+    with doing("measuring") as progress:
+        found = time_cameras(rounds, progress)
     head = f"busy street, {PERSONS} people in view, {SIZE[0]}x{SIZE[1]}"
-    table = Table(head, "frames/s", "spread", "target")
+    rows = []
     for figure in FIGURES:
         least = figure.least_fps[on_gpu]
         fps = found[figure.name].fps
-        table.add_row(
-            figure.name,
-            *(spread(fps) if fps else NONE),
-            "" if least is None else f">= {least:,.4g}",
+        rows.append(
+            (
+                figure.name,
+                *(spread(fps) if fps else NONE),
+                "" if least is None else f">= {least:,.4g}",
+            )
         )
-    print_fitted(out, table)
-    ratios = Table("ratio", "median", "spread", "target")
+    tables.show(out, [*tables.names(head), *tables.figures("frames/s", "spread", "target")], rows)
+    ratios = []
     for name, above, below, target in RATIOS:
         values = [a / b for a, b in zip(found[above].fps, found[below].fps, strict=False)]
-        ratios.add_row(name, *(spread(values) if values else NONE), target)
-    print_fitted(out, ratios)
+        ratios.append((name, *(spread(values) if values else NONE), target))
+    tables.show(
+        out, [*tables.names("ratio"), *tables.figures("median", "spread", "target")], ratios
+    )
     out.print(
         f"{drawn_by}; {rounds} {'round' if rounds == 1 else 'rounds'}, medians", highlight=False
     )

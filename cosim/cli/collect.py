@@ -23,9 +23,9 @@ from cosim.cli.options import (
     replaced,
     size_called,
 )
-from cosim.cli.progress import Board, doing
+from cosim.cli.progress import doing, stages_in_lines
+from cosim.cli.run_progress import Board
 from cosim.core.errors import INTERRUPTED, UsageError, unknown
-from cosim.core.telling import Tell
 
 if TYPE_CHECKING:
     from cosim.spec.scenario import Scenario, Suite
@@ -190,7 +190,7 @@ def collect_command(
             jobs=jobs,
             resume=resume,
             showing=_shown,
-            tell=_stages(),
+            progress=stages_in_lines(),
         )
     except KeyboardInterrupt:
         again = shlex.join([*(word for word in sys.argv[1:] if word != "--resume"), "--resume"])
@@ -288,19 +288,6 @@ def _shown(scenarios: Sequence[Scenario], done: set[str]) -> Iterator[Callable[[
         yield board.tell
 
 
-def _stages() -> Tell:
-    """Says a stage in a line when it begins; what moves in a terminal is the board alone."""
-    said = ""
-
-    def tell(stage: str, share: float | None = None, /) -> None:
-        nonlocal said
-        if stage != said:
-            said = stage
-            err.print(f"{stage} ...", soft_wrap=True, markup=False, highlight=False)
-
-    return tell
-
-
 def _size_mb(folder: Path) -> float:
     parts = [path for name in ("meta", "data", "videos") for path in (folder / name).rglob("*")]
     return sum(path.stat().st_size for path in parts if path.is_file()) / 1e6
@@ -344,9 +331,9 @@ def pack(
     from scenarios.tools.dataset.read import packed_sets
 
     instead = replaced(output)
-    with doing("reading the rows") as tell:
-        packed = packed_sets(folders, wanted, tell)
-        tell("writing the arrays")
+    with doing("reading the rows") as progress:
+        packed = packed_sets(folders, wanted, progress)
+        progress("writing the arrays")
         packed.save(output)
     shape = " x ".join(map(str, packed.frames.shape))
     out.print(

@@ -8,13 +8,11 @@ from collections.abc import Sequence
 from typing import Annotated
 
 import typer
-from rich import box
 from rich.markup import escape
-from rich.table import Column, Table
 
+from cosim.cli import tables
 from cosim.cli.console import err, out
 from cosim.cli.progress import doing
-from cosim.cli.tables import print_fitted
 from cosim.core.cache import (
     CACHE_KINDS,
     GB,
@@ -27,7 +25,7 @@ from cosim.core.cache import (
     forget_entries,
 )
 from cosim.core.errors import BROKEN_MACHINE, SOME_CRASHED, EngineError, UsageError, unknown
-from cosim.core.telling import bytes_in_words, duration
+from cosim.core.units import bytes_in_words, duration
 
 cache_app = typer.Typer()
 _DAY_S = 86400.0
@@ -88,18 +86,13 @@ def show_cache(
 
 def _print_sizes(entries: Sequence[CacheEntry]) -> None:
     """Print a row for each kind."""
-    heads = (
-        Column("kind", no_wrap=True),
-        Column("entries", justify="right"),
-        Column("size", justify="right"),
-    )
-    shown = Table(
-        *heads,
-        Column("last used", no_wrap=True),
-        "what it is",
-        box=box.SIMPLE_HEAD,
-        padding=(0, 1, 0, 0),
-    )
+    columns = [
+        *tables.names("kind"),
+        *tables.figures("entries", "size"),
+        *tables.labels("last used"),
+    ]
+    columns += tables.words("what it is")
+    rows = []
     for kind in CACHE_KINDS:
         of_it = [entry for entry in entries if entry.kind == kind]
         used = (
@@ -107,15 +100,17 @@ def _print_sizes(entries: Sequence[CacheEntry]) -> None:
             if of_it and not kind.stays
             else ""
         )
-        words = f"{kind.words}; never removed" if kind.stays else kind.words
-        shown.add_row(
-            kind.name,
-            str(len(of_it)),
-            bytes_in_words(sum(e.size_bytes for e in of_it)),
-            used,
-            words,
+        what = f"{kind.words}; never removed" if kind.stays else kind.words
+        rows.append(
+            (
+                kind.name,
+                str(len(of_it)),
+                bytes_in_words(sum(e.size_bytes for e in of_it)),
+                used,
+                what,
+            )
         )
-    print_fitted(out, shown, words=(4,))
+    tables.show(out, columns, rows)
 
 
 def _counted(entries: int) -> str:
@@ -182,8 +177,8 @@ def verify(
             raise unknown("case", name, cases)
     picked = [cases[name] for name in dict.fromkeys(case or cases)]
     shipped = None if write else Given.load(SHIPPED)
-    with doing(f"running {len(picked)} cases") as tell:
-        here = given_here(picked, jobs, tell)
+    with doing(f"running {len(picked)} cases") as progress:
+        here = given_here(picked, jobs, progress)
     if shipped is None:
         writable(here, list(cases)).save(SHIPPED)
         out.print(f"{SHIPPED}: {len(here.traces)} cases", soft_wrap=True, highlight=False)

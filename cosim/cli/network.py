@@ -11,8 +11,8 @@ from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Annotated, cast, get_args
 
 import typer
-from rich.table import Table
 
+from cosim.cli import tables
 from cosim.cli.console import err, out
 from cosim.cli.options import (
     DEFAULT,
@@ -27,7 +27,6 @@ from cosim.cli.options import (
     warned,
 )
 from cosim.cli.progress import doing
-from cosim.cli.tables import print_fitted
 from cosim.core.errors import (
     INTERRUPTED,
     WRONG_USE,
@@ -113,14 +112,14 @@ def show_certificates(
     found = [path for path in places if (path / "cert.pem").exists()]
     if not found:
         raise AccessError(f"{folder} holds no certificate: `cosim certs init` makes one")
-    table = Table(
-        "folder", "role", "reached by", "may", "valid until", box=None, padding=(0, 2, 0, 0)
-    )
+    rows = []
     for path in found:
         who = identity_in(path)
         may = RIGHTS[who.role].words
-        table.add_row(path.name, who.role, ", ".join(who.hosts), may, time_left(who))
-    print_fitted(out, table, words=[2, 3])
+        rows.append((path.name, who.role, ", ".join(who.hosts), may, time_left(who)))
+    columns = [*tables.names("folder"), *tables.labels("role")]
+    columns += [*tables.words("reached by", "may"), *tables.labels("valid until")]
+    tables.show(out, columns, rows)
 
 
 def _print_made(place: Path) -> None:

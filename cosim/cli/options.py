@@ -20,7 +20,7 @@ import typer
 from cosim.cli.console import err, out
 from cosim.cli.progress import doing
 from cosim.core.errors import MachineError, UsageError, too_long, unwritable
-from cosim.core.telling import milliseconds
+from cosim.core.units import milliseconds
 from cosim.spec.connection import Connection, Role, checked_endpoint
 
 if TYPE_CHECKING:
@@ -318,8 +318,8 @@ def write_rerun(folder: Path, episodes: list[str], path: Path | None) -> None:
     from scenarios.tools.viewing.rerun_file import record_for_rerun
 
     instead = replaced(path)
-    with doing(f"recording {episodes[0]}") as tell:
-        record_for_rerun(folder, episodes[0], path, tell=tell)
+    with doing(f"recording {episodes[0]}") as progress:
+        record_for_rerun(folder, episodes[0], path, progress=progress)
     size = f"{path.stat().st_size / 1e6:.1f} MB, the state hash is the record's"
     out.print(
         f"Recording: {path} ({size}){instead}. Open it with: rerun {path}",

@@ -54,8 +54,8 @@ def export(
 
     (one,) = scenarios_chosen(holding(scenario) if suite is None else load_suite(suite), [scenario])
     instead = replaced(output)
-    with doing("reading the scenario") as tell:
-        tiles = export_street(one, output, tell)
+    with doing("reading the scenario") as progress:
+        tiles = export_street(one, output, progress)
     size = f"{tiles} tiles, {output.stat().st_size / 1e6:.1f} MB"
     out.print(f"Street: {output} ({one.id}, {size}){instead}", soft_wrap=True, highlight=False)
 
@@ -146,9 +146,9 @@ def film(
         )
     from_s, until_s = from_s if start is None else start, until_s if end is None else end
     instead = replaced(output)
-    with doing("choosing the camera") as tell:
+    with doing("choosing the camera") as progress:
         cut = Cut(from_s, until_s, size_of(size), speed, camera_here(camera), picked)
-        to_s = make_film(folder, episode, output, cut, tell)
+        to_s = make_film(folder, episode, output, cut, progress)
     same = (
         "the state hash is the record's"
         if to_s == math.inf
@@ -224,8 +224,8 @@ def look(
     )
     (one,) = asked.scenarios
     more = "" if which or of == 1 else f"; 1 of {of} scenarios: --scenario chooses another"
-    with doing("choosing the camera") as tell:
-        image, time_s = look_at(one, policy, at, picked, pixels, camera_here(camera), tell)
+    with doing("choosing the camera") as progress:
+        image, time_s = look_at(one, policy, at, picked, pixels, camera_here(camera), progress)
     instead = replaced(output)
     _save(image, output)
     out.print(

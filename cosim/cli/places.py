@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import typer
-from rich import box
-from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -20,12 +17,11 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Column, Table
 
+from cosim.cli import tables
 from cosim.cli.console import err, out
 from cosim.cli.options import replaced
 from cosim.cli.progress import doing
-from cosim.cli.tables import print_fitted
 from cosim.core.bounding_box import box_of, refuse_outside
 from cosim.core.errors import SOME_CRASHED, WRONG_USE, MapError, UsageError
 
@@ -145,40 +141,39 @@ def draw_city(
     part = (0.0, 0.0, size, size) if zoom is None else box_of("--zoom", zoom, "x0,y0,x1,y1")
     city = City(seed=seed, size_m=size, style=style)
     instead = replaced(picture)
-    with doing(f"building {city.name}") as tell:
+    with doing(f"building {city.name}") as progress:
         street_map = street_map_of(city_net(city))
         refuse_outside("--zoom", part, street_map.bounds)
-        tell("drawing")
+        progress("drawing")
         write_png(_picture(street_map, part), picture)
     out.print(f"Picture: {picture}{instead}", soft_wrap=True)
 
 
 def print_cities(found: Sequence[Survey]) -> None:
     """A row per city, the spans of all, widths of the zones, and whatever is wrong."""
-    heads = [Column(head, justify="right", no_wrap=True) for head, _, _ in _FIGURES]
-    shown = Table(Column("seed", no_wrap=True), *heads, box=box.SIMPLE_HEAD, padding=(0, 0, 0, 1))
-    for one in found:
-        shown.add_row(str(one.seed), *(format(value(one), form) for _, value, form in _FIGURES))
-    shown.add_section()
+    rows: list[tables.Row] = [
+        (str(one.seed), *(format(value(one), form) for _, value, form in _FIGURES)) for one in found
+    ]
+    rows.append(None)
     for name, pick in (("min", min), ("median", statistics.median), ("max", max)):
         cells = [
             format(round(x) if form == "d" else x, form)
             for _, value, form in _FIGURES
             for x in [pick([value(one) for one in found])]
         ]
-        shown.add_row(name, *cells)
-    print_fitted(out, shown)
-    zones = Table("zone", "narrowest m", "median m", "widest m", box=box.SIMPLE_HEAD)
+        rows.append((name, *cells))
+    tables.show(
+        out, [*tables.names("seed"), *tables.figures(*(head for head, _, _ in _FIGURES))], rows
+    )
+    zones = []
     for zone in found[0].census.zones:
         spans = [one.census.zones[zone] for one in found]
         middle = statistics.median(span.middle for span in spans)
-        zones.add_row(
-            zone,
-            f"{min(s.low for s in spans):.2f}",
-            f"{middle:.2f}",
-            f"{max(s.high for s in spans):.2f}",
-        )
-    print_fitted(out, zones)
+        low, high = min(span.low for span in spans), max(span.high for span in spans)
+        zones.append((zone, f"{low:.2f}", f"{middle:.2f}", f"{high:.2f}"))
+    tables.show(
+        out, [*tables.names("zone"), *tables.figures("narrowest m", "median m", "widest m")], zones
+    )
     out.print(MEANING)
     faulty = [(one.seed, fault) for one in found for fault in one.faults]
     for seed, fault in faulty:
@@ -275,9 +270,9 @@ def import_(
 
     box = None if bbox is None else box_of("--bbox", bbox)
     options = Options(bbox=box, lefthand=lefthand, as_is=as_is, sidewalk_width_m=sidewalk_width)
-    with doing(f"reading {file.name}") as tell:
-        about = import_map(file, name, options, tell)
-        tell(f"checking {about.name}")
+    with doing(f"reading {file.name}") as progress:
+        about = import_map(file, name, options, progress)
+        progress(f"checking {about.name}")
         street_map, check, about = checked_map(about.name)
         capacity = _capacity(street_map, check)
     print_check(check, about, capacity)
@@ -313,7 +308,7 @@ def report_map_check(
     if part is not None and picture is None:
         raise UsageError("--zoom is for the picture: say where to write it with -o")
     instead = replaced(picture)
-    with doing(f"checking {place}") as tell:
+    with doing(f"checking {place}") as progress:
         street_map, found, about = _look_up(place)
         capacity = _capacity(street_map, found)
         if picture is not None:
@@ -321,7 +316,7 @@ def report_map_check(
 
             if part is not None:
                 refuse_outside("--zoom", part, street_map.bounds)
-            tell("drawing")
+            progress("drawing")
             write_png(draw_map(street_map, found, part), picture)
     if as_json:
         report = {
@@ -358,13 +353,11 @@ def endure_map(
     from sumo_nets.maps.place_names import place_called
 
     places = [place_called(name) for name in maps]
-    table = Table(
-        "map", "simulated min", "persons", "vehicles", "wall s", "ended by", box=box.SIMPLE_HEAD
-    )
+    rows = []
     failed = False
     for name, where in zip(maps, places, strict=True):
-        with doing(f"{minutes:g} min on {name}") as tell:
-            done = endured_on(where, seed, minutes, partial(tell, f"{minutes:g} min on {name}"))
+        with doing(f"{minutes:g} min on {name}") as progress:
+            done = endured_on(where, seed, minutes, progress)
         failed |= bool(done.reason)
         simulated_min = Clock().time_s(done.ticks) / 60.0
         cells = (
@@ -373,8 +366,13 @@ def endure_map(
             f"{done.vehicles:.0f}",
             f"{done.wall_s:.0f}",
         )
-        table.add_row(name, *cells, escape(done.reason or "its time"))
-    print_fitted(out, table, words=[5])
+        rows.append((name, *cells, done.reason or "its time"))
+    columns = [
+        *tables.names("map"),
+        *tables.figures("simulated min", "persons", "vehicles", "wall s"),
+    ]
+    columns += tables.words("ended by")
+    tables.show(out, columns, rows)
     if failed:
         raise typer.Exit(SOME_CRASHED)
 
@@ -384,10 +382,8 @@ def list_() -> None:
     """List the maps: imported ones, and those that come with SUMO (imported when first used)."""
     from sumo_nets.maps.map_store import known_maps
 
-    table = Table("map", "origin", "file", box=box.SIMPLE_HEAD)
-    for known in known_maps().values():
-        table.add_row(known.name, known.origin, known.source)
-    print_fitted(out, table, words=[1, 2])
+    rows = [(known.name, known.origin, known.source) for known in known_maps().values()]
+    tables.show(out, [*tables.names("map"), *tables.words("origin", "file")], rows)
 
 
 def print_check(check: MapCheck, about: About | None, capacity: Capacity | None) -> None:
@@ -395,24 +391,15 @@ def print_check(check: MapCheck, about: About | None, capacity: Capacity | None)
     from sumo_nets.maps.map_store import outdated
 
     width_m, height_m = check.size_m
-    table = Table(check.name, "", box=box.SIMPLE_HEAD)
-    for what, value in _rows(check):
-        table.add_row(what, value)
-    table.add_row(
-        "size",
-        f"{width_m:.0f} x {height_m:.0f} m, traffic on the "
-        f"{'left' if check.left_hand else 'right'}",
-    )
-    print_fitted(out, table, words=[1])
+    side = "left" if check.left_hand else "right"
+    rows = [*_rows(check), ("size", f"{width_m:.0f} x {height_m:.0f} m, traffic on the {side}")]
+    tables.show(out, [*tables.names(check.name), *tables.words("")], rows)
     if capacity is not None:
-        shown = Table(
-            "scenarios",
-            "places where they fit, of those on the largest island",
-            box=box.SIMPLE_HEAD,
-        )
-        for name, count in _by_name(capacity):
-            shown.add_row(name, str(count))
-        print_fitted(out, shown, words=[1])
+        columns = [
+            *tables.names("scenarios"),
+            *tables.words("places where they fit, of those on the largest island"),
+        ]
+        tables.show(out, columns, [(name, str(count)) for name, count in _by_name(capacity)])
     said = [("warning", warning) for warning in check.warnings] + [
         ("note", note) for note in check.notes
     ]

@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import typer
-from rich import box
-from rich.markup import escape
-from rich.table import Table
+from rich.text import Text
 
+from cosim.cli import tables
 from cosim.cli.console import out
 from cosim.cli.options import (
     CAMERA_HELP,
@@ -23,7 +22,6 @@ from cosim.cli.options import (
     replaced,
 )
 from cosim.cli.progress import doing
-from cosim.cli.tables import print_fitted
 from cosim.core.errors import SOME_CRASHED, unknown
 
 if TYPE_CHECKING:
@@ -98,11 +96,11 @@ def check_policy(
     driver = policy_driver(name, PolicyHost(servers=servers, run=token_hex(8)))
     try:
         manifest = with_goal(driver.manifest, asked_goal)
-        with doing(f"checking {name}") as tell:
-            drives = drives_for(manifest, frames, camera_here(camera), own_camera, tell)
-            found = checked_policy(driver, manifest, drives, tell, only or ())
+        with doing(f"checking {name}") as progress:
+            drives = drives_for(manifest, frames, camera_here(camera), own_camera, progress)
+            found = checked_policy(driver, manifest, drives, progress, only or ())
             if picture is not None:
-                tell("drawing")
+                progress("drawing")
                 write_png(check_sheet(found.asker), picture)
     finally:
         driver.close()
@@ -134,7 +132,10 @@ def check_policy(
 
 
 def _print(found: CheckedPolicy) -> None:
-    table = Table("check", "", "what was seen", box=box.SIMPLE_HEAD)
-    for name, (outcome, words) in found.outcomes.items():
-        table.add_row(name, f"[{_COLOURS[outcome]}]{outcome}[/]", escape(words))
-    print_fitted(out, table, words=[2])
+    rows = [
+        (name, Text(outcome, _COLOURS[outcome]), seen)
+        for name, (outcome, seen) in found.outcomes.items()
+    ]
+    tables.show(
+        out, [*tables.names("check"), *tables.labels(""), *tables.words("what was seen")], rows
+    )

@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
+from cosim.cli import tables
 from cosim.cli.console import out
 from cosim.cli.options import LOOK
 from cosim.cli.progress import doing
-from cosim.cli.tables import print_fitted
 
 counterfactual_app = typer.Typer()
 
@@ -30,25 +29,19 @@ def compare_one(
     from cosim.results.delay import DELAY_NEAR_M
     from scenarios.episodes.replay import check, compared, recorded
 
-    with doing(f"reading {episode}") as tell:
+    with doing(f"reading {episode}") as progress:
         told = recorded(folder, episode)
-        state_hash, found = compared(told, tell)
+        state_hash, found = compared(told, progress)
     check(folder, told, state_hash)
-    table = Table(
-        episode,
-        "delay of\nthose near, s",
-        "those\nnear",
-        "delay of\nall, s",
-        "all",
-        "not\ncomparable",
-    )
+    rows = []
     for name, delay in (("people", found.people), ("vehicles", found.vehicles)):
         near, everybody = (
             (f"{delay.near_s:+.1f}", str(delay.near)),
             (f"{delay.delay_s:+.1f}", str(delay.compared)),
         )
-        table.add_row(name, *near, *everybody, str(delay.unmatched))
-    print_fitted(out, table)
+        rows.append((name, *near, *everybody, str(delay.unmatched)))
+    heads = ("delay of\nthose near, s", "those\nnear", "delay of\nall, s", "all", "not\ncomparable")
+    tables.show(out, [*tables.names(episode), *tables.figures(*heads)], rows)
     out.print(
         f"delay: how much later than without the robot, summed; near: came within "
         f"{DELAY_NEAR_M:g} m of it; far from "
@@ -68,8 +61,8 @@ def replay(
     hash."""
     from scenarios.episodes.replay import check, recorded, replayed
 
-    with doing(f"reading {episode}") as tell:
+    with doing(f"reading {episode}") as progress:
         told = recorded(folder, episode)
-        again = replayed(told, tell=tell)
+        again = replayed(told, progress=progress)
     check(folder, told, again)
     out.print(f"{episode}: state hash {again}, as recorded", highlight=False)

@@ -6,11 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich import box
 from rich.console import Console
-from rich.table import Column, Table
-from rich.text import Text
 
+from cosim.cli import tables
 from cosim.cli.console import err, out
 from cosim.cli.options import (
     CAMERA_HELP,
@@ -25,9 +23,8 @@ from cosim.cli.options import (
     write_rerun,
 )
 from cosim.cli.progress import doing
-from cosim.cli.tables import print_fitted
 from cosim.core.errors import SOME_CRASHED, UsageError, unknown, unwritable
-from cosim.core.telling import milliseconds
+from cosim.core.units import milliseconds
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -94,22 +91,10 @@ def print_comparison(out: Console, told: RunComparison) -> None:
     for other in told.others:
         for table in tables_of_comparison(told, other):
             out.print(table.title, soft_wrap=True, markup=False, highlight=False)
-            names = [Column(head, overflow="fold") for head in table.heads[: table.names]]
-            figures = [
-                Column(head, no_wrap=True, justify="right")
-                for head in table.heads[table.names : -1]
-            ]
-            shown = Table(
-                *names,
-                *figures,
-                Column(table.heads[-1], no_wrap=True),
-                box=box.SIMPLE_HEAD,
-                padding=0,
-                show_edge=False,
-            )
-            for row in table.rows:
-                shown.add_row(*map(Text, row))
-            print_fitted(out, shown, table.names)
+            *heads, last = table.heads
+            columns = [*tables.names(*heads[: table.names]), *tables.figures(*heads[table.names :])]
+            columns += tables.labels(last)
+            tables.show(out, columns, table.rows)
         for line in flips_in_words(told, other):
             out.print(line, soft_wrap=not out.is_terminal, markup=False, highlight=False)
     for note in (*told.notes, how_to_read(told)):
@@ -117,10 +102,10 @@ def print_comparison(out: Console, told: RunComparison) -> None:
 
 
 def _write(path: Path, text: str) -> None:
-    from cosim.core.whole_file import write_whole
+    from cosim.core.files import write_atomic
 
     try:
-        write_whole(path, text.encode())
+        write_atomic(path, text.encode())
     except OSError as error:
         raise unwritable(path, error) from error
 
@@ -163,10 +148,16 @@ def report(
     from scenarios.tools.viewing.report import make_report
 
     instead = replaced(output)
-    with doing("choosing the camera") as tell:
+    with doing("choosing the camera") as progress:
         drawn_by = camera_here(camera)
         made = make_report(
-            folders, output, camera=drawn_by, jobs=jobs, most=failures, within_s=within, tell=tell
+            folders,
+            output,
+            camera=drawn_by,
+            jobs=jobs,
+            most=failures,
+            within_s=within,
+            progress=progress,
         )
     size = f"{made.size_bytes / 1e6:.1f} MB, {made.shown} of {made.failures} failures"
     out.print(f"Report: {output} ({size}){instead}", soft_wrap=True, highlight=False)
@@ -186,8 +177,8 @@ def score(folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run fold
     from cosim.results.record import METRIC_SCHEMA
     from cosim.results.rescore import score_run
 
-    with doing(f"reading {folder}") as tell:
-        scored = score_run(folder, tell)
+    with doing(f"reading {folder}") as progress:
+        scored = score_run(folder, progress)
     lines = [
         f"{scored.episodes} episodes, {len(METRICS)} metrics each, by metric schema {METRIC_SCHEMA}"
     ]
@@ -331,13 +322,12 @@ def print_episode(out: Console, record: Record) -> None:
             else f"triggered at {event.triggered_at_s:.2f} s"
         )
         out.print(f"  event {event.id} {event.kind}: {at}")
-    table = Table("metric", "value", "unit")
-    for name, metric in METRICS.items():
-        table.add_row(name, value_in_words(record.measures.get(name)), metric.unit)
-    for name, unit in COUNTERFACTUAL.items():
-        if name in record.measures:
-            table.add_row(name, value_in_words(record.measures[name]), unit)
-    print_fitted(out, table)
+    units = {name: metric.unit for name, metric in METRICS.items()}
+    units |= {name: unit for name, unit in COUNTERFACTUAL.items() if name in record.measures}
+    rows = [(name, value_in_words(record.measures.get(name)), unit) for name, unit in units.items()]
+    tables.show(
+        out, [*tables.names("metric"), *tables.figures("value"), *tables.labels("unit")], rows
+    )
 
 
 def print_sheet(out: Console, sheet: pd.DataFrame) -> None:
@@ -358,22 +348,19 @@ def print_sheet(out: Console, sheet: pd.DataFrame) -> None:
         "angle\ndeg",
         "least\nm",
     )
-    columns = (Column(head, justify="right", no_wrap=True) for head in heads)
-    rows = Table(Column("episode", overflow="fold"), *columns, box=box.SIMPLE_HEAD, padding=0)
+    rows = []
     for row in sheet.itertuples(index=False):
         name = row[0] if row[0].startswith(row[1]) else f"{row[0]} {row[1]}"
         numbers = (
             f"{value:.{digits}f}"
             for value, digits in zip(row[2:], (2, 3, 3, 2, 2, 2, 0, 2), strict=True)
         )
-        rows.add_row(name, *("-" if n == "nan" else n for n in numbers))
-    print_fitted(out, rows)
+        rows.append((name, *("-" if n == "nan" else n for n in numbers)))
+    tables.show(out, [*tables.names("episode"), *tables.figures(*heads)], rows)
     for short in summary(sheet):
-        columns = (Column(head, no_wrap=True) for head in short.columns)
-        table = Table(*columns, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-        for row in short.itertuples(index=False):
-            table.add_row(*(str(value) for value in row))
-        print_fitted(out, table)
+        kind, *others = short.columns
+        counts = [tuple(str(value) for value in row) for row in short.itertuples(index=False)]
+        tables.show(out, [*tables.names(kind), *tables.figures(*others)], counts)
     out.print(
         "trigger: from the robot to the event's place, when it began; error: off what is stated; "
         "tick: what the robot drove in a tick, the most that the error may be; off: triggers "
@@ -407,8 +394,8 @@ def merge(
     from cosim.cli.run_table import kinds_of, print_by_kind, print_table
     from cosim.results.merge import merge_runs
 
-    with doing("reading the shards") as tell:
-        merged = merge_runs(folders, target, tell)
+    with doing("reading the shards") as progress:
+        merged = merge_runs(folders, target, progress)
     print_table(out, merged.table, len(merged.spec.scenarios), target)
     print_by_kind(out, merged.table, kinds_of(target))
     out.print(f"Run folder: {target}", soft_wrap=True)

@@ -7,12 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pandas as pd
-from rich import box
 from rich.console import Console
-from rich.table import Column, Table
 
-from cosim.cli.tables import print_fitted
-from cosim.core.telling import milliseconds
+from cosim.cli import tables
+from cosim.core.units import milliseconds
 from cosim.results.log import holds_waypoints
 from cosim.results.metrics import COUNTERFACTUAL, SUCCESS_IN_WORDS
 from cosim.results.table import not_to_be_quoted, policy_in_words, summary_of
@@ -80,6 +78,8 @@ WITH_PEOPLE = (
     ("pedestrian_distance_min_success_m", "of\nwins"),
 )
 """Means over the episodes of a kind: shares of them, and metres."""
+_MEAN_HEADS = ("", "95 % interval", "n")
+"""Heads of the cells of a mean."""
 
 
 def print_table(
@@ -88,24 +88,14 @@ def print_table(
     """Print the table of a run: a row per episode, then the means with their intervals. folder: of
     the run."""
     heads = (*(f"{head}\n{UNITS.get(head, '')}" for _, head in SHOWN), "counts")
-    numbers = (Column(head, no_wrap=True, justify="right") for head in heads)
-    shown = Table(
-        Column("episode", no_wrap=True),
-        Column("ended", no_wrap=True),
-        *numbers,
-        box=box.SIMPLE_HEAD,
-        padding=0,
-    )
+    rows = []
     for _, row in table.iterrows():
         counts = "/".join("-" if pd.isna(row[name]) else f"{row[name]:.0f}" for name, _ in COUNTS)
         ended = row["ended"] if row["status"] == "done" else row["status"]
-        shown.add_row(
-            row["scenario"] + "*" * bool(row.get("nonstandard")),
-            ended,
-            *(value_in_words(row[name]) for name, _ in SHOWN),
-            counts,
-        )
-    print_fitted(out, shown)
+        name = row["scenario"] + "*" * bool(row.get("nonstandard"))
+        rows.append((name, ended, *(value_in_words(row[name]) for name, _ in SHOWN), counts))
+    columns = [*tables.names("episode"), *tables.labels("ended"), *tables.figures(*heads)]
+    tables.show(out, columns, rows)
     print_terms(out, table, folder)
     counted = "/".join(name for _, name in COUNTS)
     out.print(
@@ -121,12 +111,12 @@ def print_means(out: Console, table: pd.DataFrame) -> None:
     """What came out of all episodes of a run together."""
     if not len(table):
         return
-    means = Table("over all episodes", "", "95 % interval", "n", box=box.SIMPLE_HEAD)
-    for (name, head), (_, row) in zip(
-        MEANS, summary_of(table, [n for n, _ in MEANS]).iterrows(), strict=True
-    ):
-        means.add_row(f"{name} ({head})" if head else name, *_mean_cells(row))
-    print_fitted(out, means)
+    summary = summary_of(table, [name for name, _ in MEANS]).iterrows()
+    rows = [
+        (f"{name} ({head})" if head else name, *_mean_cells(row))
+        for (name, head), (_, row) in zip(MEANS, summary, strict=True)
+    ]
+    tables.show(out, [*tables.names("over all episodes"), *tables.figures(*_MEAN_HEADS)], rows)
     crashed = int((table["status"] == "crashed").sum())
     missing = f"; none, because {crashed} crashed" if crashed else ""
     out.print(
@@ -231,16 +221,12 @@ def print_delays(out: Console, table: pd.DataFrame) -> None:
     other."""
     if not set(COUNTERFACTUAL) <= set(table.columns):
         return
-    shown = Table(
-        "against the same street without the robot",
-        "per episode",
-        "95 % interval",
-        "n",
-        box=box.SIMPLE_HEAD,
-    )
-    for name, row in summary_of(table, tuple(COUNTERFACTUAL)).iterrows():
-        shown.add_row(str(name), *_mean_cells(row))
-    print_fitted(out, shown)
+    rows = [
+        (str(name), *_mean_cells(row))
+        for name, row in summary_of(table, tuple(COUNTERFACTUAL)).iterrows()
+    ]
+    first = tables.names("against the same street without the robot")
+    tables.show(out, [*first, *tables.figures("per episode", *_MEAN_HEADS[1:])], rows)
 
 
 def value_in_words(value: float | None) -> str:
@@ -271,8 +257,7 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
     people = bool(table["pedestrian_distance_min_m"].notna().any())
     columns = WITH_PEOPLE if people else WITHOUT_PEOPLE
     heads = ("n", "SR", "95 % of SR", *(head for _, head in columns), "in-\nvalid")
-    numbers = (Column(head, no_wrap=True, justify="right") for head in heads)
-    shown = Table(Column("", no_wrap=True), *numbers, box=box.SIMPLE_HEAD, padding=0)
+    rows = []
     for kind in named:
         part = table[table["scenario"].map(kinds) == kind]
         means = summary_of(part, ("success", *(name for name, _ in columns)))
@@ -280,8 +265,8 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
         interval = f"{low:.2f}..{high:.2f}" if scored else "-"
         success, *rest = (value_in_words(mean) for mean in means["mean"])
         invalid = str((part["status"] == "invalid").sum())
-        shown.add_row(kind, f"{scored:.0f}", success, interval, *rest, invalid)
-    print_fitted(out, shown)
+        rows.append((kind, f"{scored:.0f}", success, interval, *rest, invalid))
+    tables.show(out, [*tables.names(""), *tables.figures(*heads)], rows)
     out.print(
         "n episodes that are scored; hit a person, hit else, left lane, broke rule: share of "
         "these; nearest: least distance to a person's centre, mean over episodes, of wins: over "
@@ -297,11 +282,7 @@ def print_by_split(out: Console, table: pd.DataFrame) -> None:
     if "split" not in table or table["split"].nunique() < 2:
         return
     names = ("success", "route_completion", "failures_per_100m")
-    columns = (
-        Column(head, no_wrap=True)
-        for head in ("split", "n", "SR, 95 %", "RC, 95 %", "FC /100m, 95 %")
-    )
-    shown = Table(*columns, box=box.SIMPLE_HEAD)
+    rows = []
     for split, part in table.groupby("split", sort=False):
         means = summary_of(part, names)
         cells = (
@@ -309,5 +290,6 @@ def print_by_split(out: Console, table: pd.DataFrame) -> None:
             f"{value_in_words(row['low'])}..{value_in_words(row['high'])}"
             for _, row in means.iterrows()
         )
-        shown.add_row(str(split), f"{means['n'].iloc[0]:.0f}", *cells)
-    print_fitted(out, shown)
+        rows.append((str(split), f"{means['n'].iloc[0]:.0f}", *cells))
+    heads = ("n", "SR, 95 %", "RC, 95 %", "FC /100m, 95 %")
+    tables.show(out, [*tables.names("split"), *tables.figures(*heads)], rows)

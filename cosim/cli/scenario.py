@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import msgspec
 import typer
-from rich import box
-from rich.table import Column, Table
 
+from cosim.cli import tables
 from cosim.cli.console import err, out
 from cosim.cli.options import (
     CAMERA_HELP,
@@ -27,8 +26,8 @@ from cosim.cli.options import (
     with_latency,
     write_rerun,
 )
-from cosim.cli.progress import Board, doing
-from cosim.cli.tables import print_fitted
+from cosim.cli.progress import doing
+from cosim.cli.run_progress import Board
 from cosim.core.bounding_box import box_of, refuse_outside
 from cosim.core.errors import (
     INTERRUPTED,
@@ -40,7 +39,7 @@ from cosim.core.errors import (
     unknown,
     unwritable,
 )
-from cosim.core.whole_file import write_whole
+from cosim.core.files import write_atomic
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -73,7 +72,7 @@ def write_template(
         Path(__file__).parents[2] / "scenarios" / "suites" / "user_scenarios" / "template.toml"
     )
     try:
-        write_whole(file, template.read_bytes().replace(b"NAME", name.encode(), 1))
+        write_atomic(file, template.read_bytes().replace(b"NAME", name.encode(), 1))
     except OSError as error:
         raise unwritable(file, error) from error
     out.print(
@@ -105,9 +104,9 @@ def check_own(
     faulty = failed = 0
     for path in files:
         try:
-            with doing(f"checking {path}") as tell:
+            with doing(f"checking {path}") as progress:
                 own = read_own(path)
-                faults = own_faults(own, tell)
+                faults = own_faults(own, progress)
         except SpecError as error:
             faults = [str(error).removeprefix(f"{path}: ")]
         if faults:
@@ -240,8 +239,8 @@ def run_own(
     own = read_own(file)
     check_rerun(rerun, len(own.variants))
     asked_latency_ms(latency, real_time)
-    with doing(f"checking {file}") as tell:
-        suite = checked_own(own, tell)
+    with doing(f"checking {file}") as progress:
+        suite = checked_own(own, progress)
     manifest = load_policy(policy).manifest
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     path = folder or Path("runs") / f"{own.name}-{manifest.name}-{stamp}"
@@ -326,12 +325,12 @@ def _print_sweep(summary: pd.DataFrame, fields: list[str]) -> None:
     from cosim.results.metrics import SUCCESS_IN_WORDS
     from scenarios.suites.user_scenarios.sweep import SWEPT
 
-    columns = [Column(field.replace(".", ".\n"), overflow="fold") for field in fields]
-    columns += [
-        Column("n", justify="right"),
-        *(Column(head, no_wrap=True) for head in ("SR", "SPL", "RC", "FC /100m")),
+    columns = [
+        *tables.names(*(field.replace(".", ".\n") for field in fields)),
+        *tables.figures("n"),
     ]
-    shown = Table(*columns, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    columns += tables.labels("SR", "SPL", "RC", "FC /100m")
+    shown = []
     for values, rows in summary.groupby(fields, sort=False):
         means = rows.set_index("metric").loc[list(SWEPT)]
         cells = [
@@ -339,8 +338,8 @@ def _print_sweep(summary: pd.DataFrame, fields: list[str]) -> None:
             for _, row in means.iterrows()
         ]
         scored = f"{means['n'].max():.0f}"
-        shown.add_row(*(f"{value}" for value in values), scored, *cells)
-    print_fitted(out, shown, len(fields))
+        shown.append((*(f"{value}" for value in values), scored, *cells))
+    tables.show(out, columns, shown)
     out.print(
         f"n episodes that are scored; SR {SUCCESS_IN_WORDS}; SPL the same by path length; RC share "
         "of the route done; FC all failures on all metres, per 100 m; below: 95 % intervals"
@@ -366,17 +365,9 @@ def _print_scenarios(suite: Suite, own: OwnFile) -> None:
     from scenarios.suites.user_scenarios.routes import moved_m
 
     short = f"{own.name}-" if len(own.variants) > 1 else ""
-    heads = (
-        short or "scenario",
-        "hash",
-        "way\nm",
-        "cross-\nings",
-        "events",
-        "obst-\nacles",
-        "people",
-    )
-    first, *others = (Column(head, no_wrap=head != heads[0], overflow="fold") for head in heads)
-    shown = Table(first, *others, box=box.SIMPLE_HEAD, padding=0)
+    columns = [*tables.names(short or "scenario"), *tables.labels("hash")]
+    columns += tables.figures("way\nm", "cross-\nings", "events", "obst-\nacles", "people")
+    shown = []
     for one in suite.scenarios:
         people = (
             f"{one.crowd.density:g}/1000m2"
@@ -385,8 +376,8 @@ def _print_scenarios(suite: Suite, own: OwnFile) -> None:
         )
         counts = (str(len(there)) for there in (one.crossings, one.events, one.obstacles))
         length = f"{one.route_line.length_m:.1f}"
-        shown.add_row(one.id.removeprefix(short), content_hash(one), length, *counts, people)
-    print_fitted(out, shown)
+        shown.append((one.id.removeprefix(short), content_hash(one), length, *counts, people))
+    tables.show(out, columns, shown)
     pairs = zip(own.variants, suite.scenarios, strict=True)
     for name, far_m in dict.fromkeys(
         end for variant, one in pairs for end in moved_m(variant.own.way, one)

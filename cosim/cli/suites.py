@@ -6,14 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich import box
 from rich.console import Console
-from rich.markup import escape
-from rich.table import Column, Table
 
+from cosim.cli import tables
 from cosim.cli.console import err, out
 from cosim.cli.progress import doing
-from cosim.cli.tables import print_fitted
 from cosim.core.errors import SOME_CRASHED, SpecError, unknown
 
 if TYPE_CHECKING:
@@ -74,8 +71,13 @@ def print_names(out: Console) -> None:
 
 def print_scenarios(out: Console, suite: Suite) -> None:
     """A row per scenario of a suite: made for 80 columns."""
-    heads = ("scenario", "place", "route\nm", "cross-\nings", "events", "bar-\nriers", "limit\ns")
-    shown = Table(*(Column(head, no_wrap=True) for head in heads), box=box.SIMPLE_HEAD, padding=0)
+    columns = [
+        *tables.names("scenario"),
+        *tables.labels("place"),
+        *tables.figures("route\nm", "cross-\nings"),
+    ]
+    columns += [*tables.labels("events"), *tables.figures("bar-\nriers", "limit\ns")]
+    rows = []
     for s in suite.scenarios:
         events = s.events[0].kind if len(s.events) == 1 else str(len(s.events))
         numbers = (
@@ -84,8 +86,8 @@ def print_scenarios(out: Console, suite: Suite) -> None:
             events,
             str(len(s.barriers)),
         )
-        shown.add_row(s.id, escape(s.place.name), *numbers, f"{s.time_limit_s:.0f}")
-    print_fitted(out, shown)
+        rows.append((s.id, s.place.name, *numbers, f"{s.time_limit_s:.0f}"))
+    tables.show(out, columns, rows)
 
 
 suite_app = typer.Typer(
@@ -126,10 +128,10 @@ def build_one(
         if one not in names:
             raise unknown("scenario", one, names)
 
-    def tell(line: str, done: int, count: int) -> None:
-        err.print(f"{done}/{count} {line}", soft_wrap=True, markup=False, highlight=False)
+    def show(line: str, _share: float | None = None, /) -> None:
+        err.print(line, soft_wrap=True, markup=False, highlight=False)
 
-    suite, proofs = build_suite(name, path, jobs, tries, tell, only or ())
+    suite, proofs = build_suite(name, path, jobs, tries, show, only or ())
     out.print(
         f"{path}: {len(suite.scenarios)} scenarios, version {suite.version}, {suite.content_hash}",
         soft_wrap=True,
@@ -203,18 +205,18 @@ def _checked(name: str, sample: int | None, drive: int | None, jobs: int) -> int
     looked |= {claim: len(picked) + len(extra) for claim in PLACE_CLAIMS} | {
         PLACE_CLAIMS[-1]: len(driven)
     }
-    table = Table(
-        f"{suite.name} {suite.version}, {suite.content_hash}",
-        "looked at",
-        "faults",
-        box=box.SIMPLE_HEAD,
-    )
-    for claim, count in looked.items():
-        found = faults.get(claim, [])
-        table.add_row(claim, str(count), str(len(found)) if found else "-")
-    print_fitted(out, table)
-    for claim, words in ((claim, words) for claim, found in faults.items() for words in found):
-        out.print(f"{suite.name}, {claim}: {words}", soft_wrap=True, markup=False, highlight=False)
+    columns = [*tables.names(f"{suite.name} {suite.version}, {suite.content_hash}")]
+    columns += tables.figures("looked at", "faults")
+    rows = [
+        (claim, str(count), f"{len(faults.get(claim, [])) or '-'}")
+        for claim, count in looked.items()
+    ]
+    tables.show(out, columns, rows)
+    for claim, found in faults.items():
+        for words in found:
+            out.print(
+                f"{suite.name}, {claim}: {words}", soft_wrap=True, markup=False, highlight=False
+            )
     return sum(bool(found) for found in faults.values())
 
 
@@ -224,12 +226,12 @@ def list_suites() -> None:
     from scenarios.suites.catalog import SUITES, load_suite
     from scenarios.suites.recipes import RECIPES
 
-    table = Table(
-        "suite", "scenarios", "val", "test", "version", "hash", "for", box=box.SIMPLE_HEAD
-    )
+    rows = []
     for name in SUITES:
         suite = load_suite(name)
         test = sum(scenario.split == "test" for scenario in suite.scenarios)
         counts = (str(len(suite.scenarios)), str(len(suite.scenarios) - test), str(test))
-        table.add_row(name, *counts, suite.version, suite.content_hash, RECIPES[name].purpose)
-    print_fitted(out, table, words=[6])
+        rows.append((name, *counts, suite.version, suite.content_hash, RECIPES[name].purpose))
+    columns = [*tables.names("suite"), *tables.figures("scenarios", "val", "test")]
+    columns += [*tables.labels("version", "hash"), *tables.words("for")]
+    tables.show(out, columns, rows)

@@ -1,100 +1,150 @@
-"""Print tables in terminals of any width: no cell of a figure is ever cut."""
+"""Print tables in terminals of any width: no figure is ever cut."""
 
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
-from copy import copy
-from dataclasses import replace
-from typing import Final
+from collections.abc import Iterable, Sequence
+from typing import Final, Literal, NamedTuple
 
+from rich import box
 from rich.cells import cell_len
-from rich.console import Console, RenderableType
-from rich.measure import Measurement
-from rich.table import Column, Table
+from rich.console import Console, JustifyMethod
+from rich.table import Table
+from rich.text import Text
 
 _LEAST_NAME: Final = 12
-"""Letters of a line to which a column of names is folded before a table is divided."""
-_UNBOUNDED: Final = 10_000
-"""Columns of a terminal in which everything has its natural width."""
+"""A column of names or words is folded to this many letters before a table is divided."""
+_LAYOUTS: Final = ((True, 1), (True, 0), (False, 0))
+"""Whether a table has an edge, and the padding of its columns: the first layout that fits is
+taken."""
+
+Cell = str | Text
+Row = Sequence[Cell] | None
+"""The cells of a row. None begins a new section of the table."""
 
 
-def print_fitted(out: Console, table: Table, names: int = 1, words: Sequence[int] = ()) -> None:
-    """Print a table; one that is too wide with broken heads, then folded names, then in parts one
-    below the other.
+class Column(NamedTuple):
+    """A column of a table.
 
-    names: the number of leading columns that say what a row is; each part has them. words: the
-    numbers of further columns that may be folded, such as sentences. All others hold figures, which
-    stay in one piece.
+    kind: "name" says what a row is, and may be folded. Names come first, and are repeated where a
+    table is divided. "figure" is flush right and stays in one piece, "label" is flush left and
+    stays in one piece, "words" may be folded.
     """
-    for part in parts_of_table(out, table, names, words):
+
+    head: str
+    kind: Literal["name", "figure", "label", "words"]
+
+    @property
+    def folds(self) -> bool:
+        return self.kind in ("name", "words")
+
+
+def names(*heads: str) -> list[Column]:
+    """Return columns that say what a row is."""
+    return [Column(head, "name") for head in heads]
+
+
+def figures(*heads: str) -> list[Column]:
+    """Return columns of numbers, flush right."""
+    return [Column(head, "figure") for head in heads]
+
+
+def labels(*heads: str) -> list[Column]:
+    """Return columns of short words that stay in one piece."""
+    return [Column(head, "label") for head in heads]
+
+
+def words(*heads: str) -> list[Column]:
+    """Return columns of sentences, which may be folded."""
+    return [Column(head, "words") for head in heads]
+
+
+def show(
+    out: Console, columns: Sequence[Column], rows: Iterable[Row], *, title: str = "", note: str = ""
+) -> None:
+    """Print a table; title: above it; note: below it.
+
+    One that is too wide has less space between its columns, then broken heads, then folded names,
+    then several parts one below the other.
+    """
+    for part in fitted(out, columns, rows, title=title, note=note):
         out.print(part)
 
 
-def parts_of_table(
-    out: Console, table: Table, names: int = 1, words: Sequence[int] = ()
+def fitted(
+    out: Console, columns: Sequence[Column], rows: Iterable[Row], *, title: str = "", note: str = ""
 ) -> list[Table]:
-    """The parts of a table that fit into a terminal; see `print_fitted`."""
-    flexible = {*range(names), *words}
-    for number, column in enumerate(table.columns):
-        column.no_wrap = number not in flexible
-        column.overflow = "fold"
-    heads, cells = zip(*(_widths(out, column) for column in table.columns), strict=True)
-    natural = [*map(max, heads, cells)]
-    if sum(natural) + _frame(out, table, len(natural)) <= out.width:
-        return [table]
-    least = [min(width, _LEAST_NAME) for width in natural]
-    for number in {*range(len(natural))} - flexible:
-        least[number] = _break_head(table.columns[number], cells[number])
-    parts: list[list[int]] = [[*range(names)]]
-    for number in range(names, len(natural)):
-        wanted = [*parts[-1], number]
-        if (
-            len(wanted) > names + 1
-            and sum(least[i] for i in wanted) + _frame(out, table, len(wanted)) > out.width
-        ):
-            wanted = [*range(names), number]
-            parts.append(wanted)
-        parts[-1] = wanted
-    return [_part(table, [table.columns[number] for number in part]) for part in parts]
-
-
-def _part(table: Table, columns: Sequence[Column]) -> Table:
-    """A table with some of its columns."""
-    part = copy(table)
-    part.columns = [replace(column, _index=number) for number, column in enumerate(columns)]
-    return part
-
-
-def _frame(out: Console, table: Table, columns: int) -> int:
-    """How many letters of a line lie between and beside so many columns."""
-    empty = _part(table, [Column("x")] * columns)
-    empty.rows = []
-    empty.title = None
-    empty.caption = None
-    return _longest(out, empty) - columns
-
-
-def _break_head(column: Column, widest: int) -> int:
-    """Break the head of a column that is wider than its cells into lines of whole words. Returns
-    the column's width."""
-    if isinstance(column.header, str):
-        lines = [
-            textwrap.wrap(line, max(1, widest), break_long_words=False)
-            for line in column.header.split("\n")
+    """Return the parts of a table that fit into a terminal; see `show`."""
+    rows = [*rows]
+    cells = [max((_width(row[k]) for row in rows if row), default=0) for k in range(len(columns))]
+    natural = [
+        max(_width(column.head), widest) for column, widest in zip(columns, cells, strict=True)
+    ]
+    edge, pad = next((one for one in _LAYOUTS if _total(natural, *one) <= out.width), _LAYOUTS[-1])
+    parts = [[*range(len(columns))]]
+    if _total(natural, edge, pad) > out.width:
+        columns = [
+            column if column.folds else _broken(column, cells[k])
+            for k, column in enumerate(columns)
         ]
-        column.header = "\n".join(line for wrapped in lines for line in wrapped)
-        return max([widest, *map(cell_len, column.header.split("\n"))])
-    return widest
+        least = [
+            min(natural[k], _LEAST_NAME) if column.folds else max(_width(column.head), cells[k])
+            for k, column in enumerate(columns)
+        ]
+        parts = _divided(columns, least, out.width)
+    tables = []
+    for part in parts:
+        table = Table(
+            box=box.SIMPLE_HEAD, show_edge=edge, padding=(0, pad, 0, 0), title=title or None
+        )
+        table.caption = note or None
+        table.title_justify = table.caption_justify = "left"
+        for column in (columns[k] for k in part):
+            justify: JustifyMethod = "right" if column.kind == "figure" else "left"
+            table.add_column(
+                Text(column.head), justify=justify, no_wrap=not column.folds, overflow="fold"
+            )
+        for row in rows:
+            if row is None:
+                table.add_section()
+            else:
+                table.add_row(*(_text(row[k]) for k in part))
+        tables.append(table)
+    return tables
 
 
-def _widths(out: Console, column: Column) -> tuple[int, int]:
-    """How wide a column's head is, and its widest cell."""
-    return _longest(out, column.header), max(
-        (_longest(out, cell) for cell in column.cells), default=0
-    )
+def _divided(columns: Sequence[Column], least: Sequence[int], width: int) -> list[list[int]]:
+    """Return the numbers of the columns of each part. Each has all names and at least one other
+    column."""
+    leading = [k for k, column in enumerate(columns) if column.kind == "name"]
+    parts = [leading]
+    for k in range(len(leading), len(columns)):
+        part = [*parts[-1], k]
+        if len(part) > len(leading) + 1 and _total([least[i] for i in part], *_LAYOUTS[-1]) > width:
+            part = [*leading, k]
+            parts.append(part)
+        parts[-1] = part
+    return parts
 
 
-def _longest(out: Console, shown: RenderableType) -> int:
-    """Letters of the longest line of something that has all the room it wants."""
-    return Measurement.get(out, out.options.update(max_width=_UNBOUNDED), shown).maximum
+def _total(widths: Sequence[int], edge: bool, pad: int) -> int:
+    """Return the width of a table with columns of these widths."""
+    return sum(widths) + pad * len(widths) + len(widths) - 1 + 2 * edge
+
+
+def _broken(column: Column, widest: int) -> Column:
+    """Break a head that is wider than its cells into lines of whole words."""
+    lines = [
+        textwrap.wrap(line, max(1, widest), break_long_words=False)
+        for line in column.head.split("\n")
+    ]
+    return column._replace(head="\n".join(line for wrapped in lines for line in wrapped))
+
+
+def _text(cell: Cell) -> Text:
+    return Text(cell) if isinstance(cell, str) else cell
+
+
+def _width(cell: Cell) -> int:
+    """Return the letters of the longest line."""
+    return max(map(cell_len, str(cell).split("\n")))

@@ -11,18 +11,17 @@ from signal import SIGINT
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Group
+from rich.console import Group, RenderableType
 from rich.live import Live
-from rich.table import Column, Table
 from rich.text import Text
 
+from cosim.cli import tables
 from cosim.cli.console import LogJson, LogLevel, err, logged, out
 from cosim.cli.options import DEFAULT, MANY, Insecure, Tls, connecting, listening, taking, warned
 from cosim.cli.run import carry_out, told_if_not_begun
-from cosim.cli.tables import parts_of_table
 from cosim.core.errors import INTERRUPTED, EngineError, RunError, UsageError
 from cosim.core.log_event import happened
-from cosim.core.telling import duration
+from cosim.core.units import duration
 
 if TYPE_CHECKING:
     from scenarios.runs.status import RunStatus, Under
@@ -136,7 +135,7 @@ def worker_command(
         raise typer.Exit(INTERRUPTED)
 
 
-def _say(words: str) -> None:
+def _say(words: str, _share: float | None = None, /) -> None:
     happened("said", words=words)
     err.print(words, soft_wrap=True, highlight=False, markup=False)
 
@@ -252,26 +251,31 @@ def _show(look: Callable[[], tuple[RunStatus, str]]) -> None:
 
 
 def _picture(told: RunStatus, remark: str) -> Group:
-    words = f"{told.suite}, policy {told.policy}: {told.finished} of {told.total} episodes"
+    said = f"{told.suite}, policy {told.policy}: {told.finished} of {told.total} episodes"
     if told.per_hour is not None and told.left_s is not None:
-        words += f", {told.per_hour:.0f} an hour, about {duration(told.left_s)} left"
+        said += f", {told.per_hour:.0f} an hour, about {duration(told.left_s)} left"
     if told.lost:
-        words += f"; {told.lost} lost with their workers and run again"
+        said += f"; {told.lost} lost with their workers and run again"
     if told.odd:
-        words += f"; {told.odd} messages refused"
-    parts: list[Text | Table] = [Text(words)]
+        said += f"; {told.odd} messages refused"
+    parts: list[RenderableType] = [Text(said)]
     if told.workers:
-        heads = ("worker", "state", "heard", "done", "episode")
-        table = Table(
-            *(Column(head, no_wrap=head != "episode", justify="left") for head in heads), box=None
-        )
+        columns = [*tables.names("worker"), *tables.labels("state", "heard")]
+        columns += [*tables.figures("done"), *tables.words("episode")]
+        rows = []
         for one in told.workers:
             silent = duration(one.silent_s) if one.silent_s > 0.5 else "now"
             told_of = "\n".join(_under(under) for under in one.under_way) or one.why
-            table.add_row(
-                one.name, Text(one.state, style=_COLOURS[one.state]), silent, str(one.done), told_of
+            rows.append(
+                (
+                    one.name,
+                    Text(one.state, style=_COLOURS[one.state]),
+                    silent,
+                    str(one.done),
+                    told_of,
+                )
             )
-        parts += parts_of_table(out, table, words=[4])
+        parts += tables.fitted(out, columns, rows)
     elif told.finished < told.total and not remark:
         parts.append(Text("No worker is there: start some with `cosim worker`."))
     parts += [Text(line, style="bold red") for line in told.conflicts]

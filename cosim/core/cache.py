@@ -1,38 +1,54 @@
-"""The cache folder: what lies in it, how large it may become, and what is forgotten.
+"""On-disk cache of files, arrays and sets of arrays that can be made again, with a size limit.
 
-An entry is a file or a folder that can be made again: a city's net, a street map that was read, the
-tiles of a place, baked arrays. Entries are forgotten when they were not used for a month, and those
-used longest ago when the folder is larger than its limit. Imported maps count for the limit and are
-never forgotten.
+A cached file begins with a hash of the rest: a damaged one is made again. A cache that cannot be
+written is done without, with a note on standard error.
 
-What a living process uses stays. Each process lists its entries in a file that it holds locked for
-its life; an entry of such a list that was used within the last hour is in use. Entries are listed,
-and taken away, under one lock.
+An entry is a file or a folder: a city's net, a street map that was read, the tiles of a place, an
+array set. Entries are removed when they were not used for a month, and the least recently used ones
+when the folder is larger than its limit. Imported maps count for the limit and are never removed.
+
+Entries in use stay. Each process lists its entries in a file that it holds locked for its life; an
+entry of such a list that was used within the last hour is in use.
 """
 
 from __future__ import annotations
 
 import atexit
-import contextlib
-import fcntl
+import hashlib
 import math
+import mmap
 import os
-import shutil
+import secrets
 import sys
-import tempfile
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from functools import cache
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from functools import cache, lru_cache
+from importlib.metadata import version
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias, TypeVar
 
+import msgspec
 from platformdirs import user_cache_path
 
 from cosim.core.errors import UsageError
+from cosim.core.files import MAKING, atomic_file, is_locked, lock, remove_dead, temp_folder
 
-MAKING: Final = ".making-"
-"""Names of what is half made begin so."""
+if TYPE_CHECKING:  # the command line starts without NumPy
+    import numpy as np
+    from numpy.typing import NDArray
+
+Arrays: TypeAlias = "Mapping[str, NDArray[Any]]"
+_T = TypeVar("_T")
+
+BUILDING: Final = ".building-"
+"""Names of the folders in which nets of cities are built begin like this."""
+_MADE_WITH: Final = ("numpy", "opencv-python-headless", "pybullet", "scipy", "shapely")
+"""Packages that cached arrays depend on."""
+_SEAL_BYTES: Final = 64
+"""A cached file begins with so many hexadecimal digits, the SHA-256 of the rest."""
+_ALIGNED: Final = 64
+"""Arrays begin at multiples of this many bytes in a file."""
 LIMIT_VARIABLE: Final = "COSIM_CACHE_LIMIT"
 """The environment variable with the limit in GB."""
 _DEFAULT_GB: Final = 4.0
@@ -43,8 +59,6 @@ UNUSED_S: Final = 30 * 86400.0
 """Entries that were not used for longer than this are forgotten."""
 _IN_USE_S: Final = 3600.0
 """An entry that a living process has not used for longer than this is not in use."""
-_LEFT_OVER_S: Final = 3600.0
-"""What is half made for longer than this belongs to a process that was killed."""
 _LOOK_EVERY_S: Final = 60.0
 """A process that writes looks for what to forget at first, and then no sooner than after this
 time."""
@@ -126,7 +140,7 @@ def use_entry(entry: Path) -> None:
     Nothing happens where the cache cannot be written.
     """
     with suppress(OSError):
-        _uses(cache_folder()).add(entry)
+        _uses(cache_folder(), os.getpid()).add(entry)
     with suppress(OSError):
         os.utime(entry)
 
@@ -151,7 +165,7 @@ def forget_entries(unused_s: float = UNUSED_S, limit_bytes: int | None = None) -
     folder = cache_folder()
     now_s = time.time()
     room = cache_limit_bytes() if limit_bytes is None else limit_bytes
-    _sweep(folder, now_s)
+    _sweep(folder)
     doomed: list[CacheEntry] = []
     entries = cache_entries()
     room -= sum(entry.size_bytes for entry in entries if entry.kind.stays)
@@ -160,7 +174,7 @@ def forget_entries(unused_s: float = UNUSED_S, limit_bytes: int | None = None) -
             room -= entry.size_bytes
             if room < 0 or now_s - entry.used_s >= unused_s:
                 doomed.append(entry)
-    return _taken_away(folder, doomed) if doomed else Forgotten()
+    return _take_away(folder, doomed) if doomed else Forgotten()
 
 
 def cache_entries() -> list[CacheEntry]:
@@ -190,111 +204,85 @@ class _Uses:
     def __init__(self, folder: Path) -> None:
         lists = folder / _LISTS
         lists.mkdir(parents=True, exist_ok=True)
-        crowded = sum(1 for _ in os.scandir(lists)) > _MOST_DEAD
         self._folder = folder
         self._listed = set[str]()
-        with _locked(folder, fcntl.LOCK_EX if crowded else fcntl.LOCK_SH):
-            if crowded:
-                _remove_dead(lists)
-            handle, name = tempfile.mkstemp(prefix=f"{os.getpid()}-", dir=lists)
-            self._file = os.fdopen(handle, "a")
-            fcntl.flock(self._file, fcntl.LOCK_EX)
-        atexit.register(_remove_own, Path(name), os.getpid())
+        self._file = lists / f"{os.getpid()}-{secrets.token_hex(4)}"
+        with lock(folder / _LOCK):
+            if sum(1 for _ in os.scandir(lists)) > _MOST_DEAD:
+                _remove_dead_lists(lists)
+            self._held = lock(self._file)
+            self._held.acquire()
+        atexit.register(_remove_own, self._file, os.getpid())
 
     def add(self, entry: Path) -> None:
         name = entry.relative_to(self._folder).as_posix()
         if name not in self._listed:
-            with _locked(self._folder, fcntl.LOCK_SH):
-                self._file.write(f"{name}\n")
-                self._file.flush()
+            with lock(self._folder / _LOCK):
+                with self._file.open("a") as file:
+                    file.write(f"{name}\n")
                 with suppress(OSError):
                     os.utime(entry)
             self._listed.add(name)
 
 
 @cache
-def _uses(folder: Path) -> _Uses:
+def _uses(folder: Path, _pid: int) -> _Uses:
+    """Return the list of this process, which does not continue that of the process it was forked
+    from."""
     return _Uses(folder)
 
 
-@contextmanager
-def _locked(folder: Path, how: int) -> Iterator[None]:
-    """Hold the lock of a cache folder: shared to list a use, alone to take entries away."""
-    with (folder / _LOCK).open("ab") as lock:
-        fcntl.flock(lock, how)
-        yield
-
-
-def _taken_away(folder: Path, doomed: list[CacheEntry]) -> Forgotten:
-    """Move entries aside that are still as unused as they were, then remove them. Two processes do
-    it in turn."""
+def _take_away(folder: Path, doomed: list[CacheEntry]) -> Forgotten:
+    """Move entries aside that are still unused, then remove them."""
     gone = []
     kept = []
-    try:
-        with contextlib.ExitStack() as stack:
-            aside = Path(
-                stack.enter_context(tempfile.TemporaryDirectory(prefix=_FORGOTTEN, dir=folder))
-            )
-            with _locked(folder, fcntl.LOCK_EX):
-                listed = _listed_by_the_living(folder / _LISTS)
-                now_s = time.time()
-                for number, entry in enumerate(doomed):
-                    used_s = _used_s(entry.path)
-                    name = entry.path.relative_to(folder).as_posix()
-                    if used_s > entry.used_s or (name in listed and now_s - used_s < _IN_USE_S):
-                        kept.append(entry)
-                        continue
-                    with suppress(OSError):
-                        entry.path.rename(aside / str(number))
-                        gone.append(entry)
-    except OSError:  # a cache that cannot be written is as large as it is
-        pass
+    with suppress(OSError), temp_folder(_FORGOTTEN, folder) as aside, lock(folder / _LOCK):
+        listed = _listed_by_the_living(folder / _LISTS)
+        now_s = time.time()
+        for number, entry in enumerate(doomed):
+            used_s = _used_s(entry.path)
+            name = entry.path.relative_to(folder).as_posix()
+            if used_s > entry.used_s or (name in listed and now_s - used_s < _IN_USE_S):
+                kept.append(entry)
+                continue
+            with suppress(OSError):
+                entry.path.rename(aside / str(number))
+                gone.append(entry)
     return Forgotten(tuple(gone), tuple(kept))
 
 
 def _listed_by_the_living(lists: Path) -> set[str]:
-    _remove_dead(lists)
+    _remove_dead_lists(lists)
     listed: set[str] = set()
-    for path in lists.iterdir() if lists.is_dir() else ():
+    for path in lists.glob("*"):
         with suppress(OSError):
             listed.update(path.read_text().splitlines())
     return listed
 
 
-def _remove_dead(lists: Path) -> None:
-    """Remove the lists that no process holds locked. To be called by who holds the cache's lock
-    alone."""
-    for path in lists.iterdir() if lists.is_dir() else ():
-        with suppress(OSError), path.open("ab") as file:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            path.unlink()
+def _remove_dead_lists(lists: Path) -> None:
+    """Remove the lists that no process holds locked. The caller holds the lock of the cache."""
+    for path in lists.glob("*"):
+        with suppress(OSError):
+            if not is_locked(path):
+                path.unlink()
 
 
 def _remove_own(path: Path, pid: int) -> None:
-    """Remove the list of a process at its end, not at that of one that was forked from it."""
+    """Remove the list of a process at its end, but not at that of one that was forked from it."""
     if os.getpid() == pid:
-        path.unlink(missing_ok=True)
+        with suppress(OSError):
+            path.unlink()
 
 
-def _sweep(folder: Path, now_s: float) -> None:
-    """Remove what killed processes have left half made. That of imports is removed by
-    `sumo_nets.maps.scratch`."""
-    for pattern in (
-        f"{_FORGOTTEN}*",
-        ".building-*",
-        "read/.writing-*",
-        f"tiles/{MAKING}*",
-        f"baked/{MAKING}*",
-    ):
-        for path in folder.glob(pattern):
-            if now_s - _used_s(path) > _LEFT_OVER_S:
-                _remove(path)
-
-
-def _remove(path: Path) -> None:
-    shutil.rmtree(path, ignore_errors=True)
-    with suppress(OSError):
-        path.unlink()
+def _sweep(folder: Path) -> None:
+    """Remove what killed processes have left unfinished. `atomic_folder` does it for imported
+    maps."""
+    remove_dead(folder, _FORGOTTEN)
+    remove_dead(folder, BUILDING)
+    places = {(folder / kind.pattern).parent for kind in CACHE_KINDS if not kind.stays}
+    for place in (*places, *folder.glob("tiles/*")):
+        remove_dead(place, MAKING)
 
 
 def _used_s(path: Path) -> float:
@@ -312,3 +300,155 @@ def _size_bytes(path: Path) -> int:
         return sum(_size_bytes(Path(one.path)) for one in os.scandir(path))
     except OSError:
         return 0
+
+
+def cached(
+    path: Path,
+    make: Callable[[], _T],
+    encode: Callable[[_T], Iterable[bytes | memoryview]],
+    decode: Callable[[memoryview], _T],
+    *,
+    entry: Path | None = None,
+    mapped: bool = False,
+) -> _T:
+    """Return the value of a cached file, or make it and write the file.
+
+    path: named by everything that the value depends on.
+    decode: raises ValueError for bytes that it cannot read.
+    entry: the entry of the cache that the file belongs to, by default the file itself.
+    mapped: the file is mapped into memory, which processes share, instead of read.
+    """
+    entry = entry or path
+    use_entry(entry)
+    with suppress(OSError, ValueError, msgspec.DecodeError):
+        return decode(_read(path, mapped))
+    made = make()
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        make_room()
+        _write(path, [*encode(made)])
+        return decode(_read(path, mapped)) if mapped else made
+    except (OSError, ValueError, msgspec.DecodeError) as error:
+        say_not_kept(entry.parent, error)
+        return made
+
+
+def _read(path: Path, mapped: bool) -> memoryview:
+    """Read or map a cached file. Raises OSError, and ValueError where it is damaged."""
+    if mapped:
+        with path.open("rb") as file:
+            data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
+    else:
+        data = memoryview(path.read_bytes())
+    body = data[_SEAL_BYTES:]
+    if hashlib.sha256(body).hexdigest().encode() != data[:_SEAL_BYTES]:
+        raise ValueError(f"{path}: damaged")
+    return body
+
+
+def _write(path: Path, parts: list[bytes | memoryview]) -> None:
+    """Write a cached file; of processes that write the same file at once the last one wins."""
+    seal = hashlib.sha256()
+    for part in parts:
+        seal.update(part)
+    with atomic_file(path, shared=True) as making, making.open("wb") as file:
+        file.write(seal.hexdigest().encode())
+        file.writelines(parts)
+
+
+def sources_hash(*rooms: Path) -> str:
+    """Return 16 hex digits of the Python files in some folders and of the libraries.
+
+    Call it when a module is imported: later edits do not change what this process makes.
+    """
+    seen = hashlib.sha256(" ".join(version(package) for package in _MADE_WITH).encode())
+    for room in rooms:
+        for source in sorted(room.rglob("*.py")):
+            seen.update(source.relative_to(room).as_posix().encode() + b"\0" + source.read_bytes())
+    return seen.hexdigest()[:16]
+
+
+def mapped_arrays(name: str, made_by: str, make: Callable[[], Arrays]) -> Arrays:
+    """Return arrays that take long to make, write-protected and shared by all processes.
+
+    name: of the file, with every parameter of `make`.
+    made_by: the `sources_hash` of the code that makes them.
+    """
+    path = cache_folder() / "baked" / f"{name}-{made_by}.arrays"
+    return cached(path, lambda: _protected(make()), _encoded, _decoded, mapped=True)
+
+
+class ArrayCache:
+    """Cache of many small array sets that belong together: a file for each, in one folder.
+
+    kind: names the folder of all such folders. key: a hash of everything that the sets depend on;
+    "" if that is unknown, so that none is cached.
+    """
+
+    def __init__(self, kind: str, key: str) -> None:
+        self._folder = cache_folder() / kind / key if key else None
+        if self._folder is not None:
+            use_entry(self._folder)
+
+    def get(self, name: str, make: Callable[[], Arrays]) -> Arrays:
+        """Return a set, write-protected. It is read, not mapped: a process may use thousands."""
+        if self._folder is None:
+            return _protected(make())
+        path = self._folder / name
+        return cached(path, lambda: _protected(make()), _encoded, _decoded, entry=self._folder)
+
+
+_Table = list[tuple[str, bytes, tuple[int, ...], int]]
+"""Name, dtype as JSON, shape and begin of each array of a file."""
+
+
+def _protected(arrays: Arrays) -> Arrays:
+    import numpy as np
+
+    whole = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
+    for array in whole.values():
+        array.flags.writeable = False
+    return whole
+
+
+def _encoded(arrays: Arrays) -> Iterable[bytes | memoryview]:
+    """Encode arrays as the length of the table, the table, and the arrays one after the other."""
+    import numpy as np
+
+    table: _Table = []
+    at = 0
+    for name, array in arrays.items():
+        kind = msgspec.json.encode(array.dtype.descr if array.dtype.names else array.dtype.str)
+        table.append((name, kind, array.shape, at))
+        at = _aligned(at + array.nbytes)
+    head = msgspec.msgpack.encode(table)
+    yield len(head).to_bytes(4, "little") + head
+    yield bytes(_aligned(4 + len(head)) - 4 - len(head))
+    for array in arrays.values():
+        yield array.reshape(-1).view(np.uint8).data
+        yield bytes(_aligned(array.nbytes) - array.nbytes)
+
+
+def _decoded(body: memoryview) -> Arrays:
+    import numpy as np
+
+    size = int.from_bytes(body[:4], "little")
+    table = msgspec.msgpack.decode(body[4 : 4 + size], type=_Table)
+    begin = _aligned(4 + size)
+    return {
+        name: np.ndarray(shape, _dtype(kind), body, begin + at) for name, kind, shape, at in table
+    }
+
+
+def _aligned(count: int) -> int:
+    return -(-count // _ALIGNED) * _ALIGNED
+
+
+@lru_cache(maxsize=64)
+def _dtype(kind: bytes) -> np.dtype[Any]:
+    import numpy as np
+
+    found = msgspec.json.decode(kind)
+    if isinstance(found, str):
+        return np.dtype(found)
+    return np.dtype([(name, one, *map(tuple, shape)) for name, one, *shape in found])

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.core.whole_file import size_within
+from cosim.core.files import size_within
 
 MOST_NPZ_BYTES: Final = 2 << 30
 _MOST_ARRAYS: Final = 4096

@@ -32,6 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.errors import RunError, unwritable
+from cosim.core.files import atomic_file
 from cosim.core.npz import NO_NPZ
 
 _FORMAT: Final = 1
@@ -82,11 +83,9 @@ class Packed:
         """Write the file, whole or not at all. Raises MachineError where that cannot be."""
         arrays = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "meta"}
         meta = json.dumps({"format": _FORMAT, **self.meta}, sort_keys=True)
-        part = path.with_name(path.name + ".part")
         try:
-            with part.open("wb") as file:
+            with atomic_file(path) as part, part.open("wb") as file:
                 np.savez(file, allow_pickle=False, meta=np.array(meta), **arrays)
-            part.replace(path)
         except OSError as error:
             raise unwritable(path, error) from error
 

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from cosim.core.errors import RunError
-from cosim.core.whole_file import write_whole
+from cosim.core.files import write_atomic
 from cosim.learning.examples import Examples
 from cosim.learning.graph import INPUTS, PLAN, graph_of, run_graph
 from cosim.learning.network import (
@@ -75,9 +75,9 @@ def write_bundle(
     example = io.BytesIO()
     np.savez_compressed(example, **{**inputs, f"expected.{PLAN}": wanted})
     manifest = {**manifest_of(name, examples.meta, source), "files": {MODEL: _facts(graph)}}
-    write_whole(folder / MODEL, graph)
-    write_whole(folder / "example.npz", example.getvalue())
-    write_whole(folder / "manifest.json", (json.dumps(manifest, indent=2) + "\n").encode())
+    write_atomic(folder / MODEL, graph)
+    write_atomic(folder / "example.npz", example.getvalue())
+    write_atomic(folder / "manifest.json", (json.dumps(manifest, indent=2) + "\n").encode())
 
 
 def _facts(data: bytes) -> dict[str, Any]:

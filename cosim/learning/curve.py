@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from cosim.core.whole_file import write_whole
+from cosim.core.files import write_atomic
 
 CURVE: Final = "curve.csv"
 PICTURE: Final = "curve.png"
@@ -19,7 +19,7 @@ def write_curve(folder: Path, curve: Sequence[Mapping[str, float]]) -> None:
         ",".join(curve[0]),
         *(",".join(f"{value:.6g}" for value in row.values()) for row in curve),
     ]
-    write_whole(folder / CURVE, ("\n".join(lines) + "\n").encode())
+    write_atomic(folder / CURVE, ("\n".join(lines) + "\n").encode())
 
 
 def draw_curve(folder: Path) -> None:

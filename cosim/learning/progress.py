@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
-from cosim.core.telling import duration
+from cosim.core.units import duration
 from cosim.learning.curve import CURVE, draw_curve
-from cosim.learning.settings import Training, fits_in_words, outcome_in_words
+from cosim.learning.settings import PLANNED_STEPS, Training, fits_in_words, outcome_in_words
 from cosim.learning.training import train
 
 
@@ -23,34 +23,30 @@ def trained(
     """Train a small policy on packed demonstrations. Returns whether it came to its last step. say:
     prints a line."""
     started_s = began_s = time.monotonic()
-    first = 0
-    per_step_s = 0.0
+    steps = training.steps or PLANNED_STEPS
+    first = 0.0
     warned = resume
 
-    def tell(step: int, steps: int, row: Mapping[str, float]) -> None:
-        nonlocal began_s, first, per_step_s, warned
+    def show(stage: str, share: float | None = None, /) -> None:
+        nonlocal began_s, first, warned
+        now_s = time.monotonic()
+        done = share or 0.0
         if not first:
-            first = step
-            began_s = time.monotonic()
-        if step > first:
-            per_step_s = (time.monotonic() - began_s) / (step - first)
-        left = (
-            f", about {duration(per_step_s * (steps - step))} left"
-            if per_step_s and step < steps
-            else ""
+            first, began_s = done, now_s
+        per_share_s = (now_s - began_s) / (done - first) if done > first else 0.0
+        say(
+            f"{stage}, about {duration(per_share_s * (1.0 - done))} left"
+            if per_share_s and done < 1.0
+            else stage
         )
-        held_out = ", ".join(
-            f"{name.replace('_', ' ')} {value:.3f}" for name, value in row.items() if name != "step"
-        )
-        say(f"step {step} of {steps}{left}" + (f": {held_out}" if held_out else ""))
-        if per_step_s and not warned:
+        if per_share_s and not warned:
             warned = True
             if words := fits_in_words(
-                training, step, steps, time.monotonic() - started_s, per_step_s
+                training, round(done * steps), steps, now_s - started_s, per_share_s / steps
             ):
                 say(words)
 
-    reached = train(paths, folder, training, resume, tell)
+    reached = train(paths, folder, training, resume, show)
     if find_spec("matplotlib") and (folder / CURVE).exists():
         draw_curve(folder)
     say(outcome_in_words(folder, reached))

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Final
 
 import numpy as np
@@ -20,7 +21,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from cosim.core.errors import RunError, UsageError, unwritable
+from cosim.core.files import atomic_file
 from cosim.core.packed_demos import packed_digest
+from cosim.core.progress import Progress
 from cosim.learning.bundle import MODEL, bundle_facts, source_of, write_bundle
 from cosim.learning.curve import write_curve
 from cosim.learning.examples import Batch, Examples
@@ -57,10 +60,6 @@ _NARROW_RADPS: Final = 0.04
 _WEIGHTS: Final = {"speed": 4.0, "turn": 1.0, "stop": 1.0, "way": 0.5}
 """Of the parts of the loss."""
 
-TellStep = Callable[[int, int, Mapping[str, float]], None]
-"""Called with the step, with how many there are in all, and with the errors of the held-out
-episodes, if any."""
-
 
 @dataclass
 class _State:
@@ -77,7 +76,7 @@ class _State:
 
 
 def train(
-    paths: Sequence[Path], folder: Path, training: Training, resume: bool, tell: TellStep
+    paths: Sequence[Path], folder: Path, training: Training, resume: bool, progress: Progress
 ) -> Reached:
     """Train on packed demonstrations, and write curve and bundle into a folder, also where time is
     over before the last step. resume: continue what is there, if anything is; a training that came
@@ -88,13 +87,13 @@ def train(
     cannot be written.
     """
     try:
-        return _train(paths, folder, training, resume, tell)
+        return _train(paths, folder, training, resume, progress)
     except OSError as error:
         raise unwritable(folder, error) from error
 
 
 def _train(
-    paths: Sequence[Path], folder: Path, training: Training, resume: bool, tell: TellStep
+    paths: Sequence[Path], folder: Path, training: Training, resume: bool, progress: Progress
 ) -> Reached:
     device = _device(training.device)
     torch.manual_seed(training.seed)
@@ -141,19 +140,27 @@ def _train(
             # piece
             if planned:
                 state.curve.append(row)
-            tell(state.step, steps, row)
+            progress(_step_in_words(state.step, steps, row), state.step / steps)
         if not over and time.monotonic() - saved_s > _KEPT_EVERY_S:
             _write(kept, state, spec)
             saved_s = time.monotonic()
-            tell(state.step, steps, {})
+            progress(_step_in_words(state.step, steps), state.step / steps)
         elif state.step - first in _TIMED_STEPS:
-            tell(state.step, steps, {})
+            progress(_step_in_words(state.step, steps), state.step / steps)
     _write(kept, state, spec)
     source = source_of(examples.meta, training.seed, begun) + state_in_words(
         state.step, state.plans
     )
     write_bundle(folder, state.averaged, examples, training.name, source)
     return Reached(state.step, steps)
+
+
+def _step_in_words(step: int, steps: int, row: Mapping[str, float] = MappingProxyType({})) -> str:
+    """Return a step, with the errors of the held-out episodes if they were measured."""
+    errors = ", ".join(
+        f"{name.replace('_', ' ')} {value:.3f}" for name, value in row.items() if name != "step"
+    )
+    return f"step {step} of {steps}" + (f": {errors}" if errors else "")
 
 
 def _device(name: str) -> torch.device:
@@ -273,7 +280,6 @@ def _errors(parameters: Parameters, examples: Examples) -> dict[str, float]:
 
 
 def _write(path: Path, state: _State, spec: dict[str, Any]) -> None:
-    part = path.with_name(path.name + ".part")
     held = {
         "spec": spec,
         "step": state.step,
@@ -283,8 +289,8 @@ def _write(path: Path, state: _State, spec: dict[str, Any]) -> None:
         "averaged": state.averaged,
         "optimiser": state.optimiser.state_dict(),
     }
-    torch.save(held, part)
-    part.replace(path)
+    with atomic_file(path) as part:
+        torch.save(held, part)
 
 
 def _read(path: Path, training: Training, spec: dict[str, Any], device: torch.device) -> _State:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from contextlib import ExitStack
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.errors import RunError, unwritable
+from cosim.core.files import atomic_file
 from cosim.report.legend import Image
 
 _MOST_PX = 4096
@@ -37,10 +39,13 @@ class Video:
                 f"{_MOST_PX}"
             )
         self._path = path
-        self._part = path.with_name(path.name + ".part")
         try:
-            self._part.touch()
-            self._file = av.open(str(self._part), "w", format="mp4")
+            with ExitStack() as stack:
+                part = stack.enter_context(atomic_file(path))
+                part.touch()
+                self._file = av.open(str(part), "w", format="mp4")
+                stack.callback(self._file.close)
+                self._making = stack.pop_all()
         except OSError as error:
             raise unwritable(path, error) from error
         self._stream = self._file.add_stream(
@@ -65,14 +70,12 @@ class Video:
     ) -> None:
         try:
             if kind is None:
-                self._write(None)
-                self._file.close()
-                self._part.replace(self._path)
+                with self._making:
+                    self._write(None)
+            else:
+                self._making.__exit__(kind, error, trace)
         except OSError as problem:
             raise unwritable(self._path, problem) from problem
-        finally:
-            self._file.close()
-            self._part.unlink(missing_ok=True)
 
     def _write(self, frame: av.VideoFrame | None) -> None:
         try:

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 
 from cosim.core.errors import UsageError, unwritable
-from cosim.core.whole_file import write_whole
+from cosim.core.files import write_atomic
 from cosim.place.map_check import MapCheck
 from cosim.place.street_map import StreetMap, Strip
 from cosim.report.above import TRACK, Sheet, draw_streets
@@ -63,7 +63,9 @@ def write_png(image: Image, path: Path) -> None:
         raise UsageError(f"{path}: cannot be written as a picture; use a name that ends in .png")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(path, cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes())
+        write_atomic(
+            path, cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes()
+        )
     except OSError as error:
         raise unwritable(path, error) from error
 

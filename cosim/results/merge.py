@@ -4,7 +4,6 @@ of them changes."""
 from __future__ import annotations
 
 import shutil
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -13,8 +12,9 @@ import msgspec
 import pandas as pd
 
 from cosim.core.errors import RunError, unwritable
+from cosim.core.files import atomic_folder
 from cosim.core.npz import read_npz
-from cosim.core.telling import Tell
+from cosim.core.progress import Progress
 from cosim.results.finished_run import check_records, read_record
 from cosim.results.record import Record
 from cosim.results.run_folder import (
@@ -50,7 +50,7 @@ class _Part(NamedTuple):
     records: Mapping[str, Record]
 
 
-def merge_runs(folders: Sequence[Path], target: Path, tell: Tell) -> Merged:
+def merge_runs(folders: Sequence[Path], target: Path, progress: Progress) -> Merged:
     """Make the run folder `target`, whole or not at all, of run folders that are the same run but
     for their shard.
 
@@ -62,7 +62,7 @@ def merge_runs(folders: Sequence[Path], target: Path, tell: Tell) -> Merged:
         raise RunError(f"{target} exists already: choose another --out")
     parts: list[_Part] = []
     for folder in folders:
-        tell(f"reading {folder}")
+        progress(f"reading {folder}")
         parts.append(_read(folder, parts[0] if parts else None))
     spec = msgspec.structs.replace(parts[0].spec, shard=None)
     taken: dict[str, _Part] = {}
@@ -75,26 +75,21 @@ def merge_runs(folders: Sequence[Path], target: Path, tell: Tell) -> Merged:
             else:
                 taken[name] = part
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(
-            prefix=f".{target.name}-", suffix=".part", dir=target.parent
-        ) as scratch:
-            made = Path(scratch) / "run"
+        with atomic_folder(target, existing="refuse") as made:
             for name, part in taken.items():
-                tell(f"copying the episodes of {part.path}")
+                progress(f"copying the episodes of {part.path}")
                 shutil.copytree(part.path / "episodes" / name, made / "episodes" / name)
             for number, part in enumerate(parts, 1):
                 if (part.path / "logs").is_dir():
                     shutil.copytree(
                         part.path / "logs", made / "logs" / f"{number}-{part.path.resolve().name}"
                     )
-            tell("making the tables")
+            progress("making the tables")
             missing = tuple(name for name in spec.scenarios if name not in taken)
             with RunFolder.create(made, spec, read_suite(parts[0].path / "scenarios.json")) as held:
                 table = held.finish()
             if missing:
                 (made / "results.csv").unlink()
-            made.replace(target)
     except (OSError, shutil.Error) as error:
         why = error if isinstance(error, OSError) and error.errno else OSError(str(error))
         raise unwritable(target, why) from error

@@ -16,9 +16,9 @@ import msgspec
 import numpy as np
 
 from cosim.core.errors import RunError, SpecError
+from cosim.core.files import read_within, write_atomic
 from cosim.core.geometry import Floats
 from cosim.core.versions import versions
-from cosim.core.whole_file import read_within, write_whole
 from cosim.episode.camera_rules import nonstandard
 from cosim.episode.command_delay import InFlight
 from cosim.episode.step import Step
@@ -146,7 +146,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
     def save(self, path: Path) -> None:
         """Write as JSON, whole or not at all."""
-        write_whole(path, self.encoded())
+        write_atomic(path, self.encoded())
 
     def encoded(self) -> bytes:
         """The JSON that is the file."""

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import msgspec
 
 from cosim.core.errors import RunError
-from cosim.core.telling import Tell, untold
+from cosim.core.progress import Progress, ignore
 from cosim.results.event_monitor import why_invalid
 from cosim.results.finished_run import WholeRun, read_whole_run
 from cosim.results.log import Log
@@ -55,14 +55,14 @@ class Scored(NamedTuple):
     differences: tuple[Difference, ...]
 
 
-def score_run(path: Path, tell: Tell = untold) -> Scored:
+def score_run(path: Path, progress: Progress = ignore) -> Scored:
     """Compute every metric of a run again. Raises what `read_whole_run` raises, and RunError for a
     trajectory that is missing or damaged."""
     run = read_whole_run(path)
     computed: list[Record] = []
     found: list[Difference] = []
     for done, (name, record) in enumerate(run.records.items()):
-        tell("computing", done / len(run.records))
+        progress("computing", done / len(run.records))
         again, differences = _scored(run, run.scenarios[name], record)
         computed.append(again)
         found += differences

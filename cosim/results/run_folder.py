@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 import os
 import shutil
@@ -17,10 +16,11 @@ from typing import Any, NamedTuple, Self
 
 import msgspec
 import pandas as pd
+from filelock import FileLock
 
 from cosim.core.errors import MachineError, RunError, UsageError, listed, unknown, unwritable
+from cosim.core.files import is_locked, lock, read_within, write_atomic
 from cosim.core.npz import read_npz
-from cosim.core.whole_file import read_within, write_whole
 from cosim.results.log import Log
 from cosim.results.record import Record
 from cosim.results.run_spec import RunSpec, decoded_spec
@@ -185,7 +185,7 @@ class RunFolder:
         self.spec = spec
         self.notes: list[str] = []
         self._suite = suite
-        self._lock = -1
+        self._lock = lock(path / "lock", wait=False)
         self._adding: sqlite3.Connection | None = None
 
     @classmethod
@@ -217,7 +217,7 @@ class RunFolder:
     def __enter__(self) -> Self:
         try:
             self.path.mkdir(parents=True, exist_ok=True)
-            self._lock = _locked(self.path)
+            _acquire(self._lock, self.path)
         except OSError as error:
             raise unwritable(self.path, error) from error
         try:
@@ -226,7 +226,7 @@ class RunFolder:
                 self._begin(self._suite)
             self._open_database()
         except BaseException:
-            os.close(self._lock)
+            self._lock.release()
             raise
         return self
 
@@ -239,7 +239,7 @@ class RunFolder:
         if self._adding is not None:
             self._adding.close()
             self._adding = None
-        os.close(self._lock)
+        self._lock.release()
 
     def episode_folder(self, scenario_id: str) -> Path:
         return self.path / "episodes" / scenario_id
@@ -286,7 +286,7 @@ class RunFolder:
             target.mkdir(parents=True, exist_ok=True)
             for name, data in ((TRAJECTORY, log), (DEMONSTRATION, demonstration)):
                 if data:
-                    write_whole(target / name, data)
+                    write_atomic(target / name, data)
             record.save(target / "record.json")
         except OSError as error:
             raise unwritable(target, error, _KEPT) from error
@@ -345,7 +345,7 @@ class RunFolder:
         """Write results.csv and return its table."""
         table = table_of(read_records(self.path))
         try:
-            write_whole(self.path / "results.csv", table.to_csv(index=False).encode())
+            write_atomic(self.path / "results.csv", table.to_csv(index=False).encode())
         except OSError as error:
             remedy = "all episodes are kept; make room and add --resume"
             raise unwritable(self.path / "results.csv", error, remedy) from error
@@ -362,7 +362,7 @@ class RunFolder:
             )
             write_suite(chosen, self.path / "scenarios.json")
             spec = msgspec.json.format(msgspec.json.encode(self.spec), indent=1)
-            write_whole(self.path / "run.json", spec + b"\n")
+            write_atomic(self.path / "run.json", spec + b"\n")
         except OSError as error:
             raise unwritable(self.path, error) from error
 
@@ -469,16 +469,8 @@ def read_rows(path: Path) -> dict[str, dict[str, Any]]:
 
 def refuse_in_use(path: Path) -> None:
     """Raises RunError, naming the process, while a run is writing to its folder."""
-    try:
-        lock = os.open(path / "lock", os.O_RDONLY)
-    except FileNotFoundError:
-        return
-    try:
-        fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise _in_use(path, lock) from None
-    finally:
-        os.close(lock)
+    if is_locked(path / "lock"):
+        raise _in_use(path)
 
 
 def _refuse_used(path: Path) -> None:
@@ -495,25 +487,17 @@ def _refuse_used(path: Path) -> None:
         raise unwritable(path, error) from error
 
 
-def _locked(path: Path) -> int:
-    """The descriptor of the folder's lock. Raises RunError, naming the process that holds it."""
-    lock = os.open(path / "lock", os.O_RDWR | os.O_CREAT, 0o644)
+def _acquire(held: FileLock, path: Path) -> None:
+    """Lock the folder. Raises RunError, naming the process that holds it."""
     try:
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        os.ftruncate(lock, 0)
-        os.pwrite(lock, str(os.getpid()).encode(), 0)
-    except BlockingIOError:
-        refusal = _in_use(path, lock)
-        os.close(lock)
-        raise refusal from None
-    except OSError:
-        os.close(lock)
-        raise
-    return lock
+        held.acquire()
+    except TimeoutError:
+        raise _in_use(path) from None
+    (path / "lock").write_text(str(os.getpid()))
 
 
-def _in_use(path: Path, lock: int) -> RunError:
-    holder = os.pread(lock, 32, 0).decode(errors="replace").strip() or "?"
+def _in_use(path: Path) -> RunError:
+    holder = (path / "lock").read_text(errors="replace").strip() or "?"
     return RunError(
         f"{path} is in use by process {holder}: another cosim run is writing to it. "
         "Wait for it to end, or choose another --out."

@@ -12,9 +12,9 @@ import msgspec
 
 from cosim.core.clock import Clock
 from cosim.core.errors import unwritable
+from cosim.core.files import write_atomic
 from cosim.core.log_event import happened
-from cosim.core.telling import milliseconds
-from cosim.core.whole_file import write_whole
+from cosim.core.units import milliseconds
 from cosim.results.record import Record
 from cosim.results.run_folder import read_records
 
@@ -115,7 +115,7 @@ def keep_figures(folder: Path, figures: Figures) -> None:
     except (OSError, msgspec.DecodeError):
         before = []
     try:
-        write_whole(
+        write_atomic(
             path, msgspec.json.format(msgspec.json.encode([*before, figures]), indent=1) + b"\n"
         )
     except OSError as error:

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.errors import SpecError
+from cosim.core.files import read_within
 from cosim.core.geometry import Floats
-from cosim.core.whole_file import read_within
 from physics.cameras.clearsky import LUMINANCE
 
 _Image = NDArray[np.float32]

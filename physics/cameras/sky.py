@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.core.baked import baked, sources_hash
+from cosim.core.cache import mapped_arrays, sources_hash
 from cosim.core.geometry import Floats
 from cosim.spec.scenario import Light
 from physics.cameras.clearsky import LUMINANCE, clear_sky
@@ -91,7 +91,7 @@ def sky_of(light: Light, seed: int = 0) -> Sky:
             field: np.asarray(value) for field, value in asdict(_procedural(light, seed)).items()
         }
 
-    kept = baked(f"sky-{seed}", _MADE_BY, make)
+    kept = mapped_arrays(f"sky-{seed}", _MADE_BY, make)
     sky: dict[str, Any] = {
         f: np.asarray(value) if value.size > 1 else value.item() for f, value in kept.items()
     }

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.core.baked import Arrays, baked, sources_hash
+from cosim.core.cache import Arrays, mapped_arrays, sources_hash
 from cosim.core.geometry import Floats
 from cosim.people.gait import PACES_MPS
 from physics.people.families import FAMILIES, Family, skeleton
@@ -52,7 +52,7 @@ class Clips:
 @lru_cache(maxsize=1)
 def own_clips() -> Clips:
     """The motions of our own bodies."""
-    arrays = baked("clips", _MADE_BY, _made)
+    arrays = mapped_arrays("clips", _MADE_BY, _made)
     gestures = {name: arrays[name] for name in GESTURES}
     return Clips(arrays["matrices"], arrays["gaits"], gestures, np.stack(list(gestures.values())))
 

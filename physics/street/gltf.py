@@ -10,7 +10,7 @@ import trimesh
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from cosim.core.telling import Tell, untold
+from cosim.core.progress import Progress, ignore
 from cosim.spec.obstacle import Obstacle
 from cosim.spec.scenario import Barrier
 from physics.ground.mesh import Mesh, join
@@ -32,13 +32,13 @@ def as_gltf(
     surface: Surface,
     keys: Sequence[Key],
     barriers: Sequence[Barrier] = (),
-    tell: Tell = untold,
+    progress: Progress = ignore,
     obstacles: Sequence[Obstacle] = (),
 ) -> bytes:
     """A .glb file of the squares of a surface and of the fences and obstacles on it."""
     parts = _Parts()
     for n, key in enumerate(keys):
-        tell("building tiles", n / len(keys))
+        progress("building tiles", n / len(keys))
         parts.add_square(surface, key)
     for barrier in barriers:
         size = (barrier.thickness_m, barrier.length_m)
@@ -54,7 +54,7 @@ def as_gltf(
         )
     for prop, z in stood(obstacles, surface):
         parts.add_prop("obstacles", prop, z)
-    tell("writing")
+    progress("writing")
     written: bytes = parts.scene().export(file_type="glb", include_normals=True)
     return written
 

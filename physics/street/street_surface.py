@@ -11,7 +11,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike
 
-from cosim.core.baked import Arrays
+from cosim.core.cache import Arrays
 from cosim.core.errors import UsageError
 from cosim.core.geometry import Floats
 from cosim.place.open_ground import GROUND_LOOKS
@@ -33,10 +33,10 @@ from physics.street.tile_cache import (
     TileThings,
     covers_as_arrays,
     covers_of_arrays,
-    pieces_of,
     things_as_arrays,
     things_of_arrays,
     tile_as_arrays,
+    tile_cache,
     tile_of_arrays,
 )
 from physics.textures.ground import layer_of
@@ -62,7 +62,7 @@ class StreetSurface(Surface):
         self._frontage = Frontage(street_map, seed, mapped)
         self._paving = Paving(street_map, seed)
         self._placement = Placement(street_map, seed, self._frontage, mapped)
-        self._pieces = pieces_of(street_map, seed, roughness)
+        self._cache = tile_cache(street_map, seed, roughness)
         self._tiles: OrderedDict[Key, Tile] = OrderedDict()
         self._things: dict[Key, TileThings] = {}
 
@@ -139,7 +139,7 @@ class StreetSurface(Surface):
         return self._tiles[key]
 
     def kept(self, kind: str, key: Key, make: Callable[[], Arrays]) -> Arrays:
-        return self._pieces.get(f"{kind}_{key[0]}_{key[1]}", make)
+        return self._cache.get(f"{kind}_{key[0]}_{key[1]}", make)
 
     def buildings(self, key: Key) -> tuple[Building, ...]:
         """Buildings whose centre lies in the tile, on their land."""

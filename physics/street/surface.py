@@ -17,7 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cosim.core.baked import Arrays
+from cosim.core.cache import Arrays
 from cosim.core.geometry import Floats, Pose
 from cosim.spec.obstacle import Obstacle
 from physics.ground.mesh import Mesh

@@ -1,5 +1,4 @@
-"""A tile and what stands in it as arrays, to be kept (`cosim.core.pieces`): what is made again of
-them is the same to the bit."""
+"""Convert a tile and what stands in it to arrays for the cache, and back without a changed bit."""
 
 from __future__ import annotations
 
@@ -15,8 +14,7 @@ from numpy.typing import NDArray
 
 import cosim
 import physics
-from cosim.core.baked import Arrays, sources_hash
-from cosim.core.pieces import Pieces
+from cosim.core.cache import ArrayCache, Arrays, sources_hash
 from cosim.place.street_map import LandKind, StreetMap
 from cosim.place.terrain import Terrain
 from physics.ground.mesh import EMPTY, Mesh
@@ -53,10 +51,10 @@ class _Ground(msgspec.Struct, array_like=True):
     relief: tuple[float, int] | None
 
 
-def pieces_of(street_map: StreetMap, seed: int, roughness: float) -> Pieces:
-    """What is kept of the tiles of a place."""
+def tile_cache(street_map: StreetMap, seed: int, roughness: float) -> ArrayCache:
+    """Return the cache of the tiles of a place."""
     told = f"{street_map.made_of} {seed} {roughness!r} {_MADE_BY}"
-    return Pieces(
+    return ArrayCache(
         "tiles", hashlib.sha256(told.encode()).hexdigest()[:32] if street_map.made_of else ""
     )
 

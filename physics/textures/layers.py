@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.core.baked import Arrays, baked, sources_hash
+from cosim.core.cache import Arrays, mapped_arrays, sources_hash
 from cosim.core.errors import SpecError, UsageError, unknown
 from physics.textures.noise import Field, Noise
 
@@ -85,13 +85,15 @@ def stacked(kind: str, recipes: Mapping[str, Recipe], size_px: int, seed: int) -
     """Every recipe's layer, in the table's order. Each has its own generator, so that a new one
     changes no other.
 
-    kind: what they are, a word in the name under which they are kept (`cosim.core.baked`).
+    kind: what they are, a word in the name under which they are kept (`mapped_arrays`).
     """
     if size_px not in SIZES:
         raise SpecError(
             f"a texture's size_px must be one of {', '.join(map(str, SIZES))}, not {size_px}"
         )
-    arrays = baked(f"{kind}-{size_px}-{seed}", _MADE_BY, lambda: _made(recipes, size_px, seed))
+    arrays = mapped_arrays(
+        f"{kind}-{size_px}-{seed}", _MADE_BY, lambda: _made(recipes, size_px, seed)
+    )
     metres = np.array(
         [np.broadcast_to(recipe.metres, 2) for recipe in recipes.values()], np.float32
     )

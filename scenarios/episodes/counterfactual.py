@@ -7,12 +7,12 @@ but nothing is where the robot was.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from cosim.core.clock import Clock
+from cosim.core.progress import Progress, ignore
 from cosim.core.state import People, PersonKind, RobotState, Street
 from cosim.episode.step import Step
 from cosim.results.delay import Delay, Tracks, delay_of
@@ -23,12 +23,6 @@ from scenarios.episodes.wiring import crowd_of
 from sumo_nets.crowd.demand_log import Entrances
 
 TELL_EVERY_TICKS: Final = 20
-TellShare = Callable[[float], None]
-"""Takes in which share of the street without the robot has been simulated."""
-
-
-def untold_share(share: float) -> None:
-    """Nobody wants to know."""
 
 
 class Compared(NamedTuple):
@@ -62,14 +56,14 @@ class Beside:
         self._present[1].add(step.street_after.vehicles)
 
     def compared(
-        self, scenario: Scenario, entrances: Entrances, tell: TellShare = untold_share
+        self, scenario: Scenario, entrances: Entrances, progress: Progress = ignore
     ) -> Compared:
         """entrances: of the episode. No SUMO may be running in this process."""
         absent = Tracks(), Tracks()
         with crowd_of(scenario, entrances) as crowd:
             for tick, (robot, reply) in enumerate(self._moments):
                 if tick % TELL_EVERY_TICKS == 0:
-                    tell(tick / len(self._moments))
+                    progress("without the robot", tick / len(self._moments))
                 street = crowd.step(robot, reply, absent=True)
                 absent[0].add(_crowd(street))
                 absent[1].add(street.vehicles)

@@ -23,9 +23,10 @@ import msgspec
 
 import scenarios.events
 from bridge import keys
-from bridge.director import RemoteDirector, Waiting, serve_director
+from bridge.director import RemoteDirector, serve_director
 from bridge.session import LoneSession, Session, open_session
 from cosim.core.errors import AccessError, DirectorLost, EngineError
+from cosim.core.progress import Progress
 from cosim.core.state import DIRECTED, People
 from cosim.episode.interfaces import Director
 from cosim.people.standing import Standing
@@ -41,7 +42,7 @@ _OURS: Final = ("cosim.", "scenarios.")
 
 
 def director_of(
-    episode: str, outside: Outside | None, waiting: Waiting, kinds: EventKinds = EVENT_KINDS
+    episode: str, outside: Outside | None, waiting: Progress, kinds: EventKinds = EVENT_KINDS
 ) -> AbstractContextManager[Director]:
     """The director of an episode's event pedestrians: the one outside, or one of its own."""
     return directed(episode, kinds) if outside is None else directed_by(outside, waiting, episode)
@@ -57,7 +58,7 @@ def directed(episode: str, kinds: EventKinds = EVENT_KINDS) -> Iterator[Director
 
 
 @contextmanager
-def directed_by(outside: Outside, waiting: Waiting, episode: str) -> Iterator[Director]:
+def directed_by(outside: Outside, waiting: Progress, episode: str) -> Iterator[Director]:
     """The simulator's end of a director outside, for one episode. Raises DirectorLost when it never
     comes."""
     with _reached(outside, waiting) as session:
@@ -135,7 +136,7 @@ def _gather(name: str, found: dict[str, bytes]) -> None:
                     _gather(".".join(rooms[:depth]), found)
 
 
-def _reached(outside: Outside, waiting: Waiting) -> Session:
+def _reached(outside: Outside, waiting: Progress) -> Session:
     """A session with the director's hub, as soon as there is one."""
     deadline = time.monotonic() + outside.wait_s
     endpoint = outside.connection.endpoint

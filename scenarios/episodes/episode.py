@@ -25,6 +25,7 @@ import msgspec
 
 from cosim.core.clock import Clock, Pacer
 from cosim.core.errors import EngineError, PolicyError, UsageError
+from cosim.core.progress import Progress, ignore
 from cosim.core.state import Frame
 from cosim.episode.camera_rules import check_camera
 from cosim.episode.command_delay import InFlight, whole_ticks
@@ -54,10 +55,6 @@ Watch = Callable[[Step, Verdict], None]
 
 _engines_ran_in: set[int] = set()
 """Ids of this process and of those that it was forked from, if engines ran in them."""
-
-
-def unheard(reason: str) -> None:
-    """Nobody wants to know."""
 
 
 class Episode:
@@ -91,7 +88,7 @@ class Episode:
         options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
         *,
         watches: Sequence[Watch] = (),
-        waiting: Callable[[str], None] = unheard,
+        waiting: Progress = ignore,
         through: Callable[[StagedScenario], None] | None = None,
         kinds: EventKinds = EVENT_KINDS,
     ) -> None:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from cosim.core.clock import Clock
 from cosim.core.errors import RunError, unknown
-from cosim.core.telling import Tell, untold
+from cosim.core.progress import Progress, ignore
 from cosim.core.versions import versions
 from cosim.episode.step import Step
 from cosim.policies.baselines import Replay
@@ -75,26 +75,26 @@ def _judge_alone(stage: StagedScenario) -> None:
     stage.scorer.judge_alone()
 
 
-def replayed(told: Recorded, *watches: Watch, tell: Tell = untold) -> str:
+def replayed(told: Recorded, *watches: Watch, progress: Progress = ignore) -> str:
     """Run it again; the state hash that comes out."""
-    return _again(told, tell, *watches)[0]
+    return _again(told, progress, *watches)[0]
 
 
-def compared(told: Recorded, tell: Tell = untold) -> tuple[str, Compared]:
+def compared(told: Recorded, progress: Progress = ignore) -> tuple[str, Compared]:
     """Run it again, then its street without the robot; the state hash, and what the robot cost the
     others."""
     beside = Beside()
-    state_hash, entrances = _again(told, tell, beside.watch)
+    state_hash, entrances = _again(told, progress, beside.watch)
     return state_hash, beside.compared(
-        told.scenario, entrances, partial(tell, "the street without the robot")
+        told.scenario, entrances, partial(progress, "the street without the robot")
     )
 
 
-def _again(told: Recorded, tell: Tell, *watches: Watch) -> tuple[str, Entrances]:
+def _again(told: Recorded, progress: Progress, *watches: Watch) -> tuple[str, Entrances]:
     def watch(step: Step, _: Verdict) -> None:
-        tell(f"replaying {told.scenario.id}", step.tick / len(told.log))
+        progress(f"replaying {told.scenario.id}", step.tick / len(told.log))
 
-    tell("starting SUMO and PyBullet")
+    progress("starting SUMO and PyBullet")
     episode, policy = replaying(told, "auto", watch, *watches)
     with episode:
         drive(episode, policy)

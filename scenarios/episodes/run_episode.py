@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -17,14 +17,15 @@ from cosim.core.errors import (
     PolicyServerLost,
     RendererLost,
 )
+from cosim.core.progress import Progress, ignore
 from cosim.episode.interfaces import Policy
 from cosim.episode.policy_caller import Driver, said_by
 from cosim.results.log import Log
 from cosim.results.record import Record, Status
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario
-from scenarios.episodes.counterfactual import Beside, TellShare, untold_share
-from scenarios.episodes.episode import Episode, Watch, unheard
+from scenarios.episodes.counterfactual import Beside
+from scenarios.episodes.episode import Episode, Watch
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,8 @@ def run_episode(
     options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
     *,
     watches: Sequence[Watch] = (),
-    waiting: Callable[[str], None] = unheard,
-    comparing: TellShare = untold_share,
+    waiting: Progress = ignore,
+    comparing: Progress = ignore,
 ) -> Outcome:
     """Run one scenario to its end. Whatever goes wrong inside becomes a record, `crashed` where it
     was the policy, `invalid` where it was anything else; but for a shared renderer that has ended:
@@ -53,8 +54,8 @@ def run_episode(
     MachineError, which is no episode's fault. One whose policy server is gone is to be run again,
     and has crashed if it is not.
 
-    watches, waiting: see `Episode`. comparing: told how far the comparison with the street without
-    the robot has come.
+    watches, waiting: see `Episode`.
+    comparing: receives how far the comparison with the street without the robot has come.
     """
     driver = Driver.of(policy)
     beside = Beside()

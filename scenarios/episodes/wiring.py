@@ -17,6 +17,7 @@ from shapely.geometry import LineString, MultiPolygon, Polygon
 from cosim.core.clock import Clock
 from cosim.core.errors import MachineError, SpecError
 from cosim.core.geometry import Pose
+from cosim.core.progress import Progress
 from cosim.core.state import RobotState, Street
 from cosim.episode.interfaces import Camera, Director, Eyes, Privileged
 from cosim.episode.loop import Moment, Parts
@@ -81,7 +82,7 @@ def staged(
     manifest: Manifest,
     options: EpisodeOptions,
     clock: Clock,
-    waiting: Callable[[str], None],
+    waiting: Progress,
     kinds: EventKinds,
 ) -> Iterator[StagedScenario]:
     """Start every engine of a scenario; all are closed at the end, whatever happened."""

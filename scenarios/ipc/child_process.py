@@ -20,7 +20,7 @@ from cosim.core.child_process import ended_in_words
 from cosim.core.errors import unwritable
 from cosim.core.framing import MOST_WIRED_BYTES, Wire
 from scenarios.ipc.deadlines import Asked, Question
-from scenarios.ipc.messages import Hear, Hello, Job, decode_message, encode_message
+from scenarios.ipc.messages import Hello, Job, MessageHandler, decode_message, encode_message
 
 WORKER: Final = "scenarios.runs.worker:serve_jobs"
 ENDING_S: Final = 10.0
@@ -113,7 +113,7 @@ class KeptProcess:
         with suppress(OSError):
             self.wire.post(message)
 
-    def listen(self, hear: Hear) -> bool:
+    def listen(self, hear: MessageHandler) -> bool:
         with suppress(OSError):
             self.wire.flush()
         try:

@@ -109,7 +109,7 @@ class Done(msgspec.Struct, frozen=True, tag=True):
 
 
 Message = Ready | Unable | Progress | Waits | Compares | FrameDrawn | LostRenderer | Done
-Hear = Callable[[Message], None]
+MessageHandler = Callable[[Message], None]
 
 encode_message = msgspec.msgpack.Encoder().encode
 decode_hello = msgspec.msgpack.Decoder(Hello).decode

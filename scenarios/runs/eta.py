@@ -23,7 +23,8 @@ import numpy as np
 from cosim.core.cache import cache_folder
 from cosim.core.clock import Clock
 from cosim.core.errors import CosimError
-from cosim.core.telling import duration
+from cosim.core.files import write_atomic
+from cosim.core.units import duration
 from cosim.results.record import Record
 from cosim.results.run_folder import RunFolder
 from cosim.spec.scenario import Scenario
@@ -238,9 +239,7 @@ def remember(held: RunFolder, todo: Sequence[Scenario], jobs: int) -> None:
     with path.open("ab") as file:
         file.write(b"".join(line + b"\n" for line in lines))
     if len(every := path.read_bytes().splitlines(keepends=True)) > 2 * EPISODES_KEPT:
-        short = path.with_name(f"{FILE}.{os.getpid()}.part")
-        short.write_bytes(b"".join(every[-EPISODES_KEPT:]))
-        short.replace(path)
+        write_atomic(path, b"".join(every[-EPISODES_KEPT:]), shared=True)
 
 
 def measured(

@@ -9,7 +9,7 @@ from typing import Final, Protocol
 
 from bridge.session import Query
 from scenarios.ipc.deadlines import Question
-from scenarios.ipc.messages import Done, FrameDrawn, Hear, Job, Message, Ready
+from scenarios.ipc.messages import Done, FrameDrawn, Job, Message, MessageHandler, Ready
 from scenarios.runs.protocol import (
     CoordinatorSays,
     GoOn,
@@ -119,7 +119,7 @@ class LeasedWorker:
             self.away = True
             self._asks = None
 
-    def listen(self, hear: Hear) -> bool:
+    def listen(self, hear: MessageHandler) -> bool:
         self._held = True
         while self._said:
             message, query, reply = self._said.popleft()

@@ -14,12 +14,12 @@ import msgspec
 
 from bridge.codec import decode, encode
 from cosim.core.errors import EngineError, unwritable
+from cosim.core.files import atomic_folder
 from cosim.spec.scenario import CityMap, Place
 from scenarios.places.nets import place
 from scenarios.runs.protocol import NetAsked, NetPart
 from sumo_nets.maps.feature_file import NAME
 from sumo_nets.maps.map_store import ABOUT, NAMES, known_maps, map_hash, map_net, maps_folder
-from sumo_nets.maps.scratch import move_in, scratch_in
 
 _PART_BYTES: Final = 2 << 20
 _MOST_BYTES: Final = 1 << 30
@@ -114,15 +114,12 @@ class Fetched:
         if not NAMES.fullmatch(name) or not {_NET, ABOUT} <= files.keys() <= set(_FILES):
             raise EngineError(f"what came as map '{name}' is none")
         try:
-            with scratch_in(folder) as scratch:
-                ready = scratch / "ready"
-                ready.mkdir()
+            with atomic_folder(folder / name, existing="keep") as ready:
                 for file, data in files.items():
                     (ready / file).write_bytes(data)
                 if (found := map_hash(ready / _NET)) != self.digest:
                     raise EngineError(
                         f"map '{name}' came with hash {found} in place of {self.digest}"
                     )
-                move_in(ready, folder / name, in_place=False)
         except OSError as error:
             raise unwritable(folder, error, "set COSIM_CACHE to another folder") from error

@@ -34,11 +34,11 @@ from scenarios.ipc.deadlines import Patience, Question
 from scenarios.ipc.messages import (
     Done,
     FrameDrawn,
-    Hear,
     Hello,
     Job,
     LostRenderer,
     Message,
+    MessageHandler,
     Ready,
     Unable,
 )
@@ -61,7 +61,7 @@ def run_all(
     hello: Hello,
     transport: Transport,
     *,
-    tell: Hear,
+    tell: MessageHandler,
     options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
     patience: Patience = Patience(),
     renderer: SharedRenderer | None = None,
@@ -145,7 +145,7 @@ class _Pool:
         hello: Hello,
         transport: Transport,
         options: EpisodeOptions,
-        tell: Hear,
+        tell: MessageHandler,
         patience: Patience,
         renderer: SharedRenderer | None,
     ) -> None:

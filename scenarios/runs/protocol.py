@@ -15,7 +15,7 @@ from typing import Annotated, Final, Literal
 import msgspec
 from msgspec import Meta
 
-from cosim.core.baked import sources_hash
+from cosim.core.cache import sources_hash
 from cosim.core.errors import EngineError
 from cosim.core.versions import versions
 from cosim.episode.policy_caller import PolicyCall

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cosim.core.errors import CosimError
+from cosim.core.files import temp_folder
 from cosim.spec.scenario import CityMap, Place
 from scenarios.ipc.child_process import WORKER, KeptProcess
 from scenarios.ipc.messages import Message, Unable, encode_message
-from scenarios.runs.passing_folder import passing_folder
 from scenarios.runs.protocol import Asks, Installed, installed_here
 
 
@@ -53,7 +53,7 @@ class EnvironmentActor:
 
     def __init__(self) -> None:
         self._folder = ExitStack()
-        logs = self._folder.enter_context(passing_folder("cosim-ray-"))
+        logs = self._folder.enter_context(temp_folder("cosim-ray-"))
         self._process = KeptProcess(logs / "process.log", WORKER, "environment")
         self._turn = threading.Lock()
         self._open = True

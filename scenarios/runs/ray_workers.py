@@ -25,7 +25,7 @@ from cosim.policies.user_module import importable
 from cosim.results.run_spec import RunSpec
 from cosim.spec.scenario import Place
 from scenarios.ipc.deadlines import Question
-from scenarios.ipc.messages import Done, Hear, Hello, Job, decode_message, encode_message
+from scenarios.ipc.messages import Done, Hello, Job, MessageHandler, decode_message, encode_message
 from scenarios.runs.net_transfer import Nets, travels
 from scenarios.runs.protocol import Asks, NetAsked, NetPart, installed_here
 from scenarios.runs.ray_actor import EnvironmentActor, Heard, NodeFound, ProcessEnd
@@ -75,7 +75,7 @@ def by_ray(on: str, jobs: int | None, policy: str, say: _Say) -> Iterator[Reache
     `jobs`, or None for as many as it has CPUs."""
 
     @contextmanager
-    def reached(run: HeldRun, tell: Hear) -> Iterator[tuple[Transport, Hear]]:
+    def reached(run: HeldRun, tell: MessageHandler) -> Iterator[tuple[Transport, MessageHandler]]:
         workers = RayWorkers(run.held.spec, run.held.path / "logs", jobs, len(run.todo), say)
         say(f"{workers.wanted} workers on Ray")
         yield workers, tell
@@ -244,7 +244,7 @@ class _RayWorker:
         message = encode_message(msgspec.structs.replace(job, net_hash=digest))
         self._actor.give.remote(message, where, digest, self._maps.parts_of(where))
 
-    def listen(self, hear: Hear) -> bool:
+    def listen(self, hear: MessageHandler) -> bool:
         while self.open and self._ray.wait([self.hearing], timeout=0)[0]:
             try:
                 heard: Heard = self._ray.get(self.hearing)

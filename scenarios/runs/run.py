@@ -17,6 +17,7 @@ import msgspec
 import pandas as pd
 
 from cosim.core.errors import UsageError
+from cosim.core.progress import ignore
 from cosim.core.versions import versions
 from cosim.episode.camera_rules import check_camera
 from cosim.episode.interfaces import Policy
@@ -37,17 +38,13 @@ from physics.cameras.choice import renderer_of
 from physics.robots import hash_of_robot
 from scenarios.ipc.child_process import LocalProcesses
 from scenarios.ipc.deadlines import Patience
-from scenarios.ipc.messages import Hear, Hello
+from scenarios.ipc.messages import Hello, MessageHandler
 from scenarios.runs.policy_host import known_driver
 from scenarios.runs.pool import run_all
 from scenarios.runs.shared_renderer import SharedRenderer, check_shared
 from scenarios.runs.transport import HeldRun, InProcess, Reaches
 from scenarios.suites.catalog import load_suite, with_robot
 from scenarios.suites.fits import check_places
-
-
-def _untold(message: object) -> None:
-    """Nobody wants to know."""
 
 
 def run(
@@ -65,7 +62,7 @@ def run(
     shared_renderer: bool = False,
     host: PolicyHost = PolicyHost(),  # noqa: B008  a frozen value
     options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
-    tell: Hear = _untold,
+    tell: MessageHandler = ignore,
 ) -> pd.DataFrame:
     """Run a suite with a policy; one row per episode, sorted by scenario, as in `results.csv`.
 
@@ -126,7 +123,7 @@ def run(
     check_places(whole, plan.picked)
     with ExitStack() as stack:
         if on:
-            reaches = stack.enter_context(by_ray(on, jobs, plan.policy, _untold))
+            reaches = stack.enter_context(by_ray(on, jobs, plan.policy, ignore))
         else:
             reaches = (
                 by_processes(jobs or 1) if isinstance(policy, str) else in_this_process(plan.driver)
@@ -235,7 +232,9 @@ def held_run(plan: PlannedRun, folder: Path, *, resume: bool) -> Iterator[HeldRu
         )
 
 
-def run_what_is_left(plan: PlannedRun, run: HeldRun, reaches: Reaches, tell: Hear) -> None:
+def run_what_is_left(
+    plan: PlannedRun, run: HeldRun, reaches: Reaches, tell: MessageHandler
+) -> None:
     """Run what is to be run of it, by workers that are reached so. Raises MachineError,
     UsageError."""
     if not run.todo:

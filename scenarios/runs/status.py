@@ -14,10 +14,11 @@ from typing import Final, Literal
 import msgspec
 
 from cosim.core.errors import EngineError
+from cosim.core.files import write_atomic
 from cosim.core.log_event import happened
 from cosim.results.run_folder import RunFolder
 from cosim.spec.scenario import Scenario
-from scenarios.ipc.messages import Compares, Done, Hear, Message, Progress, Waits
+from scenarios.ipc.messages import Compares, Done, Message, MessageHandler, Progress, Waits
 from scenarios.runs.protocol import Asking, NoResult, Renewal, Result
 
 STATUS_FILE: Final = "status.json"
@@ -116,7 +117,7 @@ class Roll:
     """Of one run, whose folder is held. tell: is told on what the workers say."""
 
     def __init__(
-        self, held: RunFolder, scenarios: Sequence[Scenario], finished: int, tell: Hear
+        self, held: RunFolder, scenarios: Sequence[Scenario], finished: int, tell: MessageHandler
     ) -> None:
         self._held = held
         self._tell_on = tell
@@ -253,9 +254,7 @@ class Roll:
             self._written_s = time.monotonic()
             path = self._held.path / STATUS_FILE
             with suppress(OSError):
-                part = path.with_name(f"{STATUS_FILE}.part")
-                part.write_bytes(msgspec.json.encode(self.status()))
-                part.replace(path)
+                write_atomic(path, msgspec.json.encode(self.status()))
 
     def status(self) -> RunStatus:
         """How the run goes by now."""

@@ -15,7 +15,7 @@ from cosim.episode.policy_caller import Driver
 from cosim.results.run_folder import RunFolder
 from cosim.spec.scenario import Scenario
 from scenarios.ipc.deadlines import Patience, Question
-from scenarios.ipc.messages import Done, Hear, Hello, Job
+from scenarios.ipc.messages import Done, Hello, Job, MessageHandler
 from scenarios.runs.worker import run_job
 
 
@@ -44,7 +44,7 @@ class Worker(Protocol):
     def give(self, job: Job) -> None:
         """Hand it a job. One that has died does not hear it: the next `listen` tells."""
 
-    def listen(self, hear: Hear) -> bool:
+    def listen(self, hear: MessageHandler) -> bool:
         """Tell what it has said since, whole messages in their order, without waiting for more;
         False when it has ended and nothing more will come."""
 
@@ -107,7 +107,9 @@ class HeldRun(NamedTuple):
     todo: Sequence[Scenario]
 
 
-Reaches = Callable[[HeldRun, Hear], AbstractContextManager[tuple[Transport, Hear]]]
+Reaches = Callable[
+    [HeldRun, MessageHandler], AbstractContextManager[tuple[Transport, MessageHandler]]
+]
 """How workers are reached for a run, and what is to be told of their episodes in place of what was
 to be."""
 
@@ -149,7 +151,7 @@ class _Here:
     def give(self, job: Job) -> None:
         self._job = job
 
-    def listen(self, hear: Hear) -> bool:
+    def listen(self, hear: MessageHandler) -> bool:
         job = self._job
         self._job = None
         if job is None:

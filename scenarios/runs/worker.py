@@ -30,12 +30,12 @@ from scenarios.ipc.messages import (
     Compares,
     Done,
     FrameDrawn,
-    Hear,
     Hello,
     Job,
     Learner,
     LostRenderer,
     Message,
+    MessageHandler,
     Progress,
     Ready,
     Unable,
@@ -99,7 +99,7 @@ def _printed_to() -> list[tuple[int, int]]:
     return found
 
 
-def _import_engines(say: Hear) -> None:
+def _import_engines(say: MessageHandler) -> None:
     """An engine that cannot be imported is told, and ends the process."""
     try:
         import scenarios.episodes.run_episode  # noqa: F401  the engines greet on stdout when they are imported
@@ -130,7 +130,9 @@ class DriversHere:
             self.learner.close()
 
 
-def drivers_here(hello: Hello, timer: Asked, say: Hear, *, again: bool = False) -> DriversHere:
+def drivers_here(
+    hello: Hello, timer: Asked, say: MessageHandler, *, again: bool = False
+) -> DriversHere:
     """See `policy_here`; the learner is held against what it was for the run in the same way."""
     if hello.renderer is not None and hello.renderer.asks:
         driver: Driver = AskedElsewhere(hello.manifest, hello.source_hash, hello.renderer)
@@ -142,7 +144,7 @@ def drivers_here(hello: Hello, timer: Asked, say: Hear, *, again: bool = False) 
         return DriversHere(driver, _as_begun(load_policy(learner.policy, timer), learner, again))
 
 
-def policy_here(hello: Hello, timer: Asked, say: Hear, *, again: bool = False) -> Driver:
+def policy_here(hello: Hello, timer: Asked, say: MessageHandler, *, again: bool = False) -> Driver:
     """The policy of the run. One that cannot be loaded here, or is another one here, is told, and
     ends the process.
 
@@ -155,7 +157,7 @@ def policy_here(hello: Hello, timer: Asked, say: Hear, *, again: bool = False) -
 
 
 @contextmanager
-def _unable_told(say: Hear) -> Iterator[None]:
+def _unable_told(say: MessageHandler) -> Iterator[None]:
     try:
         yield
     except (UsageError, MachineError) as error:
@@ -182,7 +184,7 @@ def _as_begun(driver: Driver, begun: Hello | Learner, again: bool) -> Driver:
 
 
 def run_job(
-    job: Job, driver: Driver, say: Hear, learner: Driver | None = None
+    job: Job, driver: Driver, say: MessageHandler, learner: Driver | None = None
 ) -> tuple[Done | LostRenderer, bool]:
     """Run one episode and tell how it goes. Returns what came out, and whether anything went wrong:
     its traceback is printed, because a record holds the message alone. learner: of a job that is
@@ -206,8 +208,8 @@ def run_job(
             expert or driver,
             job.options,
             watches=[_watcher(job, say)],
-            waiting=lambda reason: say(Waits(name, reason)),
-            comparing=lambda share: say(Compares(name, share)),
+            waiting=lambda reason, _=None: say(Waits(name, reason)),
+            comparing=lambda _, share=None: say(Compares(name, share or 0.0)),
         )
     except RendererLost as lost:
         return LostRenderer(name, lost.number, lost.asked), False
@@ -219,7 +221,7 @@ def run_job(
     return done, bool(outcome.traceback)
 
 
-def _watcher(job: Job, say: Hear) -> Watch:
+def _watcher(job: Job, say: MessageHandler) -> Watch:
     """Reports progress, and the camera frames that the job asks for."""
     failures = 0
     next_frame_s = 0.0

@@ -22,7 +22,7 @@ from bridge.session import Query, Session
 from cosim.core.errors import EngineError
 from cosim.results.run_spec import RunSpec
 from scenarios.ipc.deadlines import Patience
-from scenarios.ipc.messages import Done, Hear, Hello, Job
+from scenarios.ipc.messages import Done, Hello, Job, MessageHandler
 from scenarios.runs.lease import LEASE_S, LeasedWorker
 from scenarios.runs.net_transfer import Nets
 from scenarios.runs.protocol import (
@@ -326,8 +326,8 @@ class _Told(msgspec.Struct):
 
 @contextmanager
 def workers_of_run(
-    session: Session, run: HeldRun, tell: Hear, *, resumed: bool
-) -> Iterator[tuple[RemoteWorkers, Hear]]:
+    session: Session, run: HeldRun, tell: MessageHandler, *, resumed: bool
+) -> Iterator[tuple[RemoteWorkers, MessageHandler]]:
     """The workers of a run, and what is to be told of their episodes in place of `tell`. At the end
     of the block, unless it failed, they are told that the run is over."""
     roll = Roll(run.held, run.picked, len(run.picked) - len(run.todo), tell)

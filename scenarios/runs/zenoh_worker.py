@@ -14,7 +14,7 @@ import select
 import signal
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from types import FrameType
@@ -23,9 +23,10 @@ from typing import Final
 from bridge import keys
 from bridge.session import Session, open_session
 from cosim.core.errors import CosimError, EngineError, MachineError
+from cosim.core.files import temp_folder
+from cosim.core.progress import Progress
 from cosim.spec.connection import Connection
 from scenarios.runs.environment_slot import NET, RunEnded, Wish, WorkSlot
-from scenarios.runs.passing_folder import passing_folder
 from scenarios.runs.protocol import installed_here, reply_in
 
 _RETRY_S: Final = 0.5
@@ -38,7 +39,6 @@ _TELLING_S: Final = 2.0
 GIVEN_UP_S: Final = 600.0
 """A worker that is there for one run ends when it has heard of none for so long: that it is over
 may have been told when nobody could hear it."""
-Say = Callable[[str], None]
 
 
 class Leaving:
@@ -81,7 +81,12 @@ def _signals_heard() -> Iterator[Leaving]:
 
 
 def work(
-    connection: Connection, jobs: int, say: Say, *, once: bool = False, logs: Path | None = None
+    connection: Connection,
+    jobs: int,
+    say: Progress,
+    *,
+    once: bool = False,
+    logs: Path | None = None,
 ) -> int:
     """Work for the runs that are to be found at an address, `jobs` episodes at a time, until asked
     to leave, or with `once` until one is over. Returns the number of the signal that asked, 0 if
@@ -93,7 +98,7 @@ def work(
     with ExitStack() as stack:
         leaving = stack.enter_context(_signals_heard())
         if logs is None:
-            logs = stack.enter_context(passing_folder("cosim-worker-"))
+            logs = stack.enter_context(temp_folder("cosim-worker-"))
         logs.mkdir(parents=True, exist_ok=True)
         heard = _Heard(connection.endpoint, once)
         session = _reached(connection, leaving, heard, say)
@@ -142,7 +147,9 @@ class _Heard:
             )
 
 
-def _reached(connection: Connection, leaving: Leaving, heard: _Heard, say: Say) -> Session | None:
+def _reached(
+    connection: Connection, leaving: Leaving, heard: _Heard, say: Progress
+) -> Session | None:
     """A session with the coordinator, waited for; None when asked to leave before that. Raises
     AccessError."""
     told = False
@@ -170,7 +177,7 @@ class _Service:
         logs: Path,
         leaving: Leaving,
         heard: _Heard,
-        say: Say,
+        say: Progress,
     ) -> None:
         self._session = session
         self._run = run

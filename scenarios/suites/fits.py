@@ -15,7 +15,7 @@ import shapely
 from shapely.geometry import LineString, Point
 
 from cosim.core.errors import MachineError, MapError, SpecError, UsageError
-from cosim.core.telling import Tell, untold
+from cosim.core.progress import Progress, ignore
 from cosim.place.barriers import outline
 from cosim.place.street_map import StreetMap, WalkableArea
 from cosim.spec.obstacle import footprint
@@ -41,7 +41,7 @@ those are wide."""
 
 
 def check_places(
-    whole: Suite, scenarios: Sequence[Scenario], tell: Tell = untold, jobs: int = 1
+    whole: Suite, scenarios: Sequence[Scenario], progress: Progress = ignore, jobs: int = 1
 ) -> None:
     """Make what is needed of the places of some scenarios of a suite, and look whether each fits
     its own: place by place, by `jobs` processes where there are many.
@@ -62,7 +62,7 @@ def check_places(
         else:
             found = map(_misfits_at, there, there.values())
         for number in range(len(there)):
-            tell(LOOKING, number / len(there))
+            progress(LOOKING, number / len(there))
             try:
                 faults += next(found)
             except BrokenProcessPool as error:

@@ -15,7 +15,7 @@ from typing import Final
 import msgspec
 
 from cosim.core.errors import CosimError, MachineError, UsageError, unknown
-from cosim.core.telling import Tell, untold
+from cosim.core.progress import Progress, ignore
 from cosim.spec.scenario import City, Scenario
 from cosim.spec.selection import STATIC
 from scenarios.events import EVENT_KINDS
@@ -38,7 +38,9 @@ class Fresh(msgspec.Struct, frozen=True, kw_only=True):
     seeds: tuple[int, ...]
     size_m: float = 2000.0
 
-    def drawn(self, first: int, count: int, jobs: int = 1, tell: Tell = untold) -> list[Scenario]:
+    def drawn(
+        self, first: int, count: int, jobs: int = 1, progress: Progress = ignore
+    ) -> list[Scenario]:
         """So many of them from the `first` on, without those for which there is no place in their
         city; city by city, by `jobs` processes, which makes no difference. Raises MachineError
         where a process is ended."""
@@ -54,7 +56,7 @@ class Fresh(msgspec.Struct, frozen=True, kw_only=True):
             else:
                 drawn = map(self._in_city, by_city.values())
             for done in range(len(by_city)):
-                tell(_DRAWING, done / len(by_city))
+                progress(_DRAWING, done / len(by_city))
                 try:
                     found |= next(drawn)
                 except BrokenProcessPool as error:

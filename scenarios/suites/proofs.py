@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 
 from cosim.core.errors import SpecError
-from cosim.core.whole_file import write_whole
+from cosim.core.files import write_atomic
 
 
 class Dropped(msgspec.Struct, frozen=True):
@@ -86,5 +86,5 @@ def write_proofs(suite: Path, name: str, suite_hash: str, proofs: Sequence[Proof
     head = msgspec.json.encode(msgspec.structs.replace(whole, proofs=()))
     rows = b",\n".join(msgspec.json.encode(proof) for proof in proofs)
     assert head.endswith(b'"proofs":[]}')
-    write_whole(proofs_path(suite), head.removesuffix(b"]}") + b"\n" + rows + b"\n]}\n")
+    write_atomic(proofs_path(suite), head.removesuffix(b"]}") + b"\n" + rows + b"\n]}\n")
     return whole

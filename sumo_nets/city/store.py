@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import tempfile
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
@@ -11,8 +10,9 @@ from xml.sax.saxutils import quoteattr
 
 import msgspec
 
-from cosim.core.cache import cache_folder, make_room, use_entry
+from cosim.core.cache import BUILDING, cache_folder, make_room, use_entry
 from cosim.core.errors import MapError, unwritable
+from cosim.core.files import temp_folder, write_atomic
 from cosim.spec.scenario import City
 from sumo_nets.city.blocks import CLASSES, Point
 from sumo_nets.city.city import plan_city
@@ -171,8 +171,7 @@ def write_city(city: City, folder: Path) -> City:
     try:
         if (
             folder.exists()
-            and not {p.name for p in folder.iterdir() if not p.name.startswith(".building-")}
-            <= known
+            and not {p.name for p in folder.iterdir() if not p.name.startswith(BUILDING)} <= known
         ):
             raise MapError(f"{folder}: is not a city's folder, and not empty: choose a new one")
         net = folder / NET_NAME
@@ -197,9 +196,6 @@ def build_city(city: City, path: Path) -> None:
     """Build a city's net at `path`, in one move: several processes may build the same city at once.
     OSError passes."""
 
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix=".building-", dir=path.parent) as folder:
-        body = city_as_net(city, Path(folder))
-        finished = Path(folder) / path.name
-        finished.write_bytes(body + SEAL + _seal(body))
-        finished.replace(path)
+    with temp_folder(BUILDING, path.parent) as folder:
+        body = city_as_net(city, folder)
+    write_atomic(path, body + SEAL + _seal(body), shared=True)

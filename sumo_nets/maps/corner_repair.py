@@ -17,7 +17,7 @@ import shapely
 from shapely.geometry import MultiPolygon, Polygon
 
 from cosim.core.geometry import Floats
-from cosim.core.telling import Tell, untold
+from cosim.core.progress import Progress, ignore
 from cosim.place import overlay
 from cosim.place.street_map import SEAM_M, Corner, Port, StreetMap, Strip, union_closed
 
@@ -29,7 +29,7 @@ _WIDEST_M = 2.0
 _EDGE_M = 0.05
 
 
-def mend_corners(root: ET.Element, street_map: StreetMap, tell: Tell = untold) -> list[str]:
+def mend_corners(root: ET.Element, street_map: StreetMap, progress: Progress = ignore) -> list[str]:
     """Widen, in place, the walking areas through which a robot could not pass. What was changed, a
     sentence."""
     lanes = {
@@ -40,7 +40,7 @@ def mend_corners(root: ET.Element, street_map: StreetMap, tell: Tell = untold) -
     mended = 0
     for number, corner in enumerate(street_map.corners.values()):
         if number % 100 == 0:
-            tell("mending corners", number / len(street_map.corners))
+            progress("mending corners", number / len(street_map.corners))
         polygon = widened_corner(street_map, corner)
         if polygon is not None and corner.id in lanes:
             ring = shapely.get_coordinates(polygon.exterior)[:-1]

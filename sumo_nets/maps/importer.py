@@ -18,7 +18,7 @@ from pathlib import Path
 import shapely
 
 from cosim.core.errors import MapError, UsageError
-from cosim.core.telling import Tell, untold
+from cosim.core.progress import Progress, ignore
 from cosim.place.map_check import NetFacts
 from cosim.place.overlay import where_geos_failed
 from cosim.place.street_map import Feature
@@ -145,12 +145,14 @@ class Converted:
     licences: tuple[str, ...]
 
 
-def convert(source: Path, folder: Path, options: Options, tell: Tell = untold) -> Converted:
+def convert(source: Path, folder: Path, options: Options, progress: Progress = ignore) -> Converted:
     """`source` as a net in the scratch `folder`. Raises MapError naming what was found and what to
     do."""
-    tell(f"reading {source.name}")
+    progress(f"reading {source.name}")
     file = unpacked(source, folder, options.bbox)
-    work = ImportWork(file, folder, tell, [f"unpacked ({file.packing})"] if file.packing else [])
+    work = ImportWork(
+        file, folder, progress, [f"unpacked ({file.packing})"] if file.packing else []
+    )
     with _told_of(file):
         return _from_osm(work, options) if file.format == "osm" else _from_net(work, options)
 
@@ -208,7 +210,7 @@ def _from_net(work: ImportWork, options: Options) -> Converted:
     if not facts.edges:
         raise MapError(f"{file.source}: a net of 0 edges: export an area with streets in it")
     if facts.edges > BIG:
-        work.tell(_converting(facts.edges, options))
+        work.progress(_converting(facts.edges, options))
     before = frozenset(pavements(net_root(file.path)))
     net = crop_net(work, file.path, options.bbox)
     if options.as_is:
@@ -257,18 +259,20 @@ def _finish(
 ) -> Converted:
     """Mend what can be mended, then prove that the net holds walkways and that SUMO starts on
     it."""
-    file, changes, tell = work.file, work.changes, work.tell
-    tell("reading the net")
+    file = work.file
+    changes = work.changes
+    progress = work.progress
+    progress("reading the net")
     root = net_root(net)
     for mend in rules.mends:
         changes += mend(root)
     final = work.written(root, "final.net.xml")
     facts = facts_of(root)
     street_map = read_net(final)
-    if mended := mend_corners(root, street_map, tell):
+    if mended := mend_corners(root, street_map, progress):
         changes += mended
         work.written(root, "final.net.xml")
-        tell("reading the net")
+        progress("reading the net")
         street_map = read_net(final)
     if not any(strip.kind == "sidewalk" for strip in street_map.strips.values()):
         raise MapError(
@@ -285,11 +289,11 @@ def _finish(
             f"{facts.twisted_areas} of {facts.areas} walking areas cross themselves: "
             f"repaired when read"
         )
-    tell("starting SUMO on the net")
+    progress("starting SUMO on the net")
     start_sumo(file, final)
     features: tuple[Feature, ...] = ()
     if file.format == "osm":
-        tell("placing buildings and things")
+        progress("placing buildings and things")
         location = root.find("location")
         features, told = fitted(
             osm_features(file), {} if location is None else location.attrib, street_map

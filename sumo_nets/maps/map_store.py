@@ -11,19 +11,21 @@ from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Literal
 
 import msgspec
 
 from cosim.core.cache import cache_folder
 from cosim.core.errors import MapError, UsageError, unknown, unwritable
-from cosim.core.telling import Tell, untold
+from cosim.core.files import atomic_folder, folder_holds
+from cosim.core.progress import Progress, ignore
 from cosim.place.map_check import MapCheck, check_map
 from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import CityMap
 from sumo_nets.maps.feature_file import NAME, read_features, with_features, write_features
 from sumo_nets.maps.import_rules import NEWEST_RULES, SUITE_RULES
 from sumo_nets.maps.importer import OSM_LICENCE, Options, convert
-from sumo_nets.maps.scratch import move_in, moving, scratch_in
 from sumo_nets.maps.wheel_places import WHEEL_PLACES
 from sumo_nets.net.net_facts import read_facts
 from sumo_nets.net.net_hash import net_content_hash
@@ -75,7 +77,10 @@ def maps_folder() -> Path:
 
 
 def import_map(
-    source: Path, name: str | None = None, options: Options | None = None, tell: Tell = untold
+    source: Path,
+    name: str | None = None,
+    options: Options | None = None,
+    progress: Progress = ignore,
 ) -> About:
     """Import a map file under a name (by default the file's), in place of an earlier one of that
     name.
@@ -95,7 +100,7 @@ def import_map(
                 f"'{name}' is the name of a net that comes with SUMO: choose another with --name"
             )
         options = _options_of(name)
-    return _keep(source, name, options, tell)
+    return _keep(source, name, options, progress)
 
 
 def map_name(source: Path) -> str:
@@ -115,7 +120,7 @@ def map_net(place: CityMap | str) -> Path:
     """
     name = place if isinstance(place, str) else place.map
     path = maps_folder() / name / "net.xml"
-    if not NAMES.fullmatch(name) or not _is_there(path):
+    if not NAMES.fullmatch(name) or not folder_holds(path.parent, path.name):
         supplied = _supplied()
         if name not in supplied:
             raise unknown("map", name, known_maps())
@@ -131,17 +136,6 @@ def map_net(place: CityMap | str) -> Path:
             "file with the same options and versions again, or make the scenarios anew"
         )
     return path
-
-
-def _is_there(net: Path) -> bool:
-    if net.exists():
-        return True
-    try:
-        # It may be replaced at this very moment.
-        with moving(maps_folder()):
-            return net.exists()
-    except OSError:
-        return False
 
 
 def read_map(place: CityMap | str) -> StreetMap:
@@ -216,16 +210,16 @@ def _source_of(name: str) -> str:
 
 
 def _keep(
-    source: Path, name: str, options: Options, tell: Tell = untold, *, in_place: bool = True
+    source: Path, name: str, options: Options, progress: Progress = ignore, *, in_place: bool = True
 ) -> About:
-    """Convert in a scratch folder beside the finished maps, then move the whole into place."""
+    """Convert a map in a folder of its own, then move the whole into place."""
     folder = maps_folder()
+    existing: Literal["replace", "keep"] = "replace" if in_place else "keep"
     try:
-        with scratch_in(folder) as scratch:
-            made = convert(source, scratch, options, tell)
-            ready = scratch / "ready"
-            ready.mkdir()
-            made.net.rename(ready / "net.xml")
+        with atomic_folder(folder / name, existing=existing) as ready:
+            with TemporaryDirectory(dir=ready) as scratch:
+                made = convert(source, Path(scratch), options, progress)
+                made.net.rename(ready / "net.xml")
             if made.features:
                 write_features(made.features, ready / NAME)
             about = About(
@@ -248,8 +242,7 @@ def _keep(
                 net_hash=map_hash(ready / "net.xml"),
             )
             (ready / ABOUT).write_bytes(msgspec.json.format(msgspec.json.encode(about), indent=2))
-            move_in(ready, folder / name, in_place=in_place)
-            return about
+        return about
     except OSError as error:
         raise unwritable(folder, error, "set COSIM_CACHE to another folder") from error
 

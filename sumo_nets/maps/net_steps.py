@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from cosim.core.errors import MachineError, MapError
-from cosim.core.telling import Tell
+from cosim.core.progress import Progress
 from cosim.place.map_check import NetFacts
 from sumo_nets.maps.osm_crop import Box, refuse_box_outside
 from sumo_nets.maps.osm_file import MapFile
@@ -32,20 +32,20 @@ class ImportWork:
     """An import under way.
 
     folder: for scratch files.
-    tell: takes the stages of the work.
+    progress: receives the stages of the work.
     changes: what was done to the map so far, a sentence each.
     """
 
     file: MapFile
     folder: Path
-    tell: Tell
+    progress: Progress
     changes: list[str] = field(default_factory=list)
 
     def netconvert(self, stage: str, name: str, arguments: Sequence[str]) -> Path:
         """Make the net `name` in the scratch folder."""
-        self.tell(stage, 0.0)
+        self.progress(stage, 0.0)
         return netconvert(
-            arguments, self.folder / name, TIMEOUT_S, lambda share: self.tell(stage, share)
+            arguments, self.folder / name, TIMEOUT_S, lambda share: self.progress(stage, share)
         )
 
     def written(self, root: ET.Element, name: str) -> Path:

@@ -15,6 +15,7 @@ from pathlib import Path
 import msgspec
 
 from cosim.core.errors import MapError, UsageError, unknown, unwritable
+from cosim.core.files import atomic_folder
 from cosim.spec.scenario import City, CityMap, Place
 from sumo_nets.city.store import ABOUT_NAME, GENERATOR, NET_NAME, city_net
 from sumo_nets.maps.import_rules import NEWEST_RULES
@@ -29,7 +30,6 @@ from sumo_nets.maps.map_store import (
     map_name,
     maps_folder,
 )
-from sumo_nets.maps.scratch import move_in, scratch_in
 from sumo_nets.net.net_hash import net_content_hash
 
 HINT = "the folder of `cosim city make` or of an imported map, or a .net.xml file"
@@ -131,14 +131,12 @@ def _adopted(folder: Path) -> str:
     name = _free_name(map_name(Path(about.name)), found, lambda known: known.net_hash == found)
     if not (maps_folder() / name).exists():
         try:
-            with scratch_in(maps_folder()) as scratch:
-                ready = scratch / "ready"
-                shutil.copytree(folder, ready)
+            with atomic_folder(maps_folder() / name, existing="keep") as ready:
+                shutil.copytree(folder, ready, dirs_exist_ok=True)
                 renamed = msgspec.structs.replace(about, name=name)
                 (ready / ABOUT).write_bytes(
                     msgspec.json.format(msgspec.json.encode(renamed), indent=2)
                 )
-                move_in(ready, maps_folder() / name, in_place=False)
         except OSError as error:
             raise unwritable(maps_folder(), error, "set COSIM_CACHE to another folder") from error
     return name

@@ -1,22 +1,17 @@
-"""What was read from a net, kept: the second reading of a net takes a fifth of the time of the
-first.
+"""Cache street maps that were read from nets: reading one again takes a fifth of the time.
 
-A snapshot lies in the cache folder under a name that says what it depends on: the net's bytes, the
-source of the reader and the libraries that made its polygons. It holds plain data only, sealed by a
-hash; a damaged one is read anew.
+The name of a snapshot is a hash of what it depends on: the net's bytes, the source of the reader
+and the libraries that made its polygons. It holds plain data only.
 """
 
 from __future__ import annotations
 
 import gc
 import hashlib
-import os
-import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import fields, is_dataclass
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final, get_args, get_origin, get_type_hints
 
@@ -28,11 +23,10 @@ from shapely.geometry import MultiPolygon, Polygon
 
 import cosim
 import sumo_nets
-from cosim.core.cache import cache_folder, make_room, say_not_kept, use_entry
+from cosim.core.cache import cache_folder, cached, sources_hash
 from cosim.place.street_map import StreetMap
 
 SNAPSHOT_FOLDER: Final = "read"
-_SEAL_BYTES: Final = 32
 
 _Pools = tuple[list[NDArray[Any]], list[shapely.Geometry]]
 _Maker = Callable[[Any, _Pools], Any]
@@ -58,17 +52,9 @@ def street_map_of(path: Path) -> StreetMap:
     except OSError:
         return _read(path)
     made_of = _key(path.name, net)
-    kept = cache_folder() / SNAPSHOT_FOLDER / f"{made_of}.map"
-    use_entry(kept)
-    with suppress(OSError, ValueError, msgspec.DecodeError, shapely.errors.GEOSException):
-        return thawed(kept.read_bytes()).read_of(made_of)
-    street_map = _read(path).read_of(made_of)
-    try:
-        make_room()
-        _write(kept, map_as_bytes(street_map))
-    except OSError as error:
-        say_not_kept(kept.parent, error)
-    return street_map
+    snapshot = cache_folder() / SNAPSHOT_FOLDER / f"{made_of}.map"
+    street_map = cached(snapshot, lambda: _read(path), lambda made: [map_as_bytes(made)], thawed)
+    return street_map.read_of(made_of)
 
 
 def _read(path: Path) -> StreetMap:
@@ -99,16 +85,13 @@ def map_as_bytes(street_map: StreetMap) -> bytes:
     forms = [(a.dtype.str, a.shape, at) for a, at in zip(arrays, ends[:-1], strict=True)]
     wkb = shapely.to_wkb(np.array(geometries, dtype=object)).tolist() if geometries else []
     held = _Snapshot(body, b"".join(np.ascontiguousarray(a).tobytes() for a in arrays), forms, wkb)
-    data = msgspec.msgpack.encode(held)
-    return hashlib.sha256(data).digest() + data
+    return msgspec.msgpack.encode(held)
 
 
-def thawed(data: bytes) -> StreetMap:
-    """The StreetMap in bytes of `map_as_bytes`. Raises ValueError when they are not whole."""
-    if hashlib.sha256(memoryview(data)[_SEAL_BYTES:]).digest() != data[:_SEAL_BYTES]:
-        raise ValueError("a damaged snapshot")
+def thawed(data: bytes | memoryview) -> StreetMap:
+    """Return the StreetMap in bytes of `map_as_bytes`."""
     with _without_gc():
-        held = msgspec.msgpack.decode(memoryview(data)[_SEAL_BYTES:], type=_Snapshot)
+        held = msgspec.msgpack.decode(data, type=_Snapshot)
         arrays = [
             np.ndarray(shape, dtype, buffer=held.arrays, offset=at)
             for dtype, shape, at in held.forms
@@ -161,43 +144,16 @@ _FIELDS: Final = tuple(name for name in StreetMap.__dataclass_fields__ if not na
 
 def _key(name: str, net: bytes) -> str:
     return hashlib.sha256(
-        _READER + name.encode() + b"\0" + hashlib.sha256(net).digest()
+        f"{_READER} {name}\0".encode() + hashlib.sha256(net).digest()
     ).hexdigest()[:32]
 
 
-def _reader() -> bytes:
-    """What makes a StreetMap of a net: the source of this package and of the words it uses, and the
-    libraries."""
-    rooms = [
-        Path(sumo_nets.__file__).parent,
-        *(Path(cosim.__file__).parent / room for room in ("core", "place")),
-    ]
-    sources = [source for room in rooms for source in sorted(room.rglob("*.py"))]
-    libraries = [
-        *(version(name) for name in ("numpy", "scipy", "shapely")),
-        shapely.geos_version_string,
-    ]
-    seen = hashlib.sha256(" ".join(libraries).encode())
-    for source in sources:
-        seen.update(source.read_bytes())
-    return seen.digest()
-
-
-_READER: Final = _reader()
-"""As it was imported: who edits it later does not change what this process reads."""
-
-
-def _write(path: Path, data: bytes) -> None:
-    """In one move: several processes may keep the same map at once."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".writing-")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(data)
-        Path(name).replace(path)
-    except OSError:
-        Path(name).unlink(missing_ok=True)
-        raise
+_ROOMS: Final = (
+    Path(sumo_nets.__file__).parent,
+    *(Path(cosim.__file__).parent / room for room in ("core", "place")),
+)
+_READER: Final = f"{sources_hash(*_ROOMS)} {shapely.geos_version_string}"
+"""A hash of the source and of the libraries that make a StreetMap of a net."""
 
 
 @contextmanager

@@ -256,7 +256,7 @@ def test_whoever_runs_the_episode_is_told_what_it_waits_for(
     told: list[str] = []
     with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
 
-        def waiting(words: str) -> None:
+        def waiting(words: str, _share: float | None = None, /) -> None:
             told.append(words)
             serve_director(hub, KEY, echo)
 

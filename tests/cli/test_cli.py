@@ -18,7 +18,7 @@ import pandas as pd
 import pytest
 
 from cosim import run
-from cosim.core.whole_file import write_whole
+from cosim.core.files import write_atomic
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.episode_id import pseudonym_of
 from cosim.spec.options import EpisodeOptions
@@ -364,10 +364,10 @@ def test_a_full_disk_ends_the_run_with_the_reason(
     def full(path: Path, data: bytes) -> None:
         if path.parent.name == "t-1":
             raise OSError(28, "No space left on device")
-        write_whole(path, data)
+        write_atomic(path, data)
 
     out = desk / "full"
-    monkeypatch.setattr(run_folder, "write_whole", full)
+    monkeypatch.setattr(run_folder, "write_atomic", full)
     run = cosim(
         "run",
         "tiny.json",

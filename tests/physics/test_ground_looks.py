@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import shapely
 
-from cosim.core.baked import Arrays
+from cosim.core.cache import Arrays
 from cosim.core.geometry import Pose
 from cosim.core.state import LABELS, RobotState, Street
 from cosim.place.open_ground import GROUND_LOOKS, PLAIN_GROUND, open_ground

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import shapely
 
-from cosim.core import baked
+from cosim.core import cache as cache_module
 from cosim.core.errors import EngineError
 from cosim.place.street_map import StreetMap
 from cosim.place.terrain import Terrain
@@ -35,8 +35,8 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     place(CITY)
     folder = tmp_path / "cache"
     folder.mkdir()
-    for held in baked.cache_folder().iterdir():
-        if held.name != "tiles":
+    for held in cache_module.cache_folder().iterdir():
+        if held.name != "tiles" and not held.name.startswith("."):
             (folder / held.name).symlink_to(held.resolve())
     monkeypatch.setenv("COSIM_CACHE", str(folder))
     return folder
@@ -164,7 +164,7 @@ def test_a_name_tells_all_that_a_tile_stands_on() -> None:
         "physics",
     }
     packages = {package for top in tops for package in packages_distributions()[top]}
-    assert packages - {"msgspec"} <= set(baked._MADE_WITH)
+    assert packages - {"msgspec"} <= set(cache_module._MADE_WITH)
 
 
 @pytest.mark.engine

@@ -163,7 +163,7 @@ def test_runs_by_other_terms_are_called_neither_better_nor_worse(
     )
     said = cosim("compare", str(runs / "a"), str(run))
     assert said.returncode == 0 and note in said.stdout
-    assert re.search(r"success +0\.50 +0\.90 +\+0\.400 .* 20 differs", said.stdout)
+    assert re.search(r"success +0\.50 +0\.90 +\+0\.400 .* 20  differs", said.stdout)
 
 
 def test_another_camera_is_told_and_the_verdict_stays(runs: Path, tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 from cosim.core.errors import RunError, UsageError
-from cosim.core.telling import untold
+from cosim.core.progress import ignore
 from cosim.results.merge import merge_runs
 from cosim.results.record import METRIC_SCHEMA
 from cosim.results.run_folder import RunFolder, read_records, read_spec
@@ -91,7 +91,7 @@ def test_shards_are_merged_to_the_run_that_they_are_of(tmp_path: Path, of: int) 
     parts = shards(tmp_path, of)
     (parts[0] / "logs/worker-0.log").write_text("what it printed")
     before = bytes_of(*parts)
-    merged = merge_runs(parts, tmp_path / "deep/merged", untold)
+    merged = merge_runs(parts, tmp_path / "deep/merged", ignore)
     assert bytes_of(*parts) == before and (merged.missing, merged.twice) == ((), ())
     assert (tmp_path / "deep/merged/results.csv").read_bytes() == whole_table(tmp_path)
     for name in (
@@ -119,7 +119,7 @@ def test_a_shard_that_was_killed_is_read_as_it_lies(tmp_path: Path) -> None:
     before = bytes_of(killed)
     assert killed / "results.sqlite-wal" in before
     assert (
-        merge_runs([killed, parts[1]], tmp_path / "merged", untold).missing == ()
+        merge_runs([killed, parts[1]], tmp_path / "merged", ignore).missing == ()
         and bytes_of(killed) == before
     )
 
@@ -142,7 +142,7 @@ def test_what_is_missing_is_named_and_can_be_run(tmp_path: Path, cosim: Cosim) -
 def test_equal_episodes_are_taken_once(tmp_path: Path) -> None:
     """Wall times and compression may differ; nothing else does."""
     parts = [*shards(tmp_path, 2), kept(tmp_path / "again", SPEC, WAYS[2:5], wall_s=9.0)]
-    merged = merge_runs(parts, tmp_path / "merged", untold)
+    merged = merge_runs(parts, tmp_path / "merged", ignore)
     assert merged.twice == ("s-002", "s-003", "s-004")
     assert (tmp_path / "merged/results.csv").read_bytes() == whole_table(tmp_path)
 
@@ -217,18 +217,18 @@ def test_what_is_damaged_in_use_or_in_the_way_is_refused(tmp_path: Path) -> None
     there."""
     parts = shards(tmp_path, 2)
     with pytest.raises(UsageError, match="unknown run"):
-        merge_runs([*parts, tmp_path / "nothing"], tmp_path / "merged", untold)
+        merge_runs([*parts, tmp_path / "nothing"], tmp_path / "merged", ignore)
     with (
         RunFolder.resume(parts[1], read_spec(parts[1])),
         pytest.raises(RunError, match=r"in use by process \d+"),
     ):
-        merge_runs(parts, tmp_path / "merged", untold)
+        merge_runs(parts, tmp_path / "merged", ignore)
     with pytest.raises(RunError, match="exists already: choose another --out"):
-        merge_runs(parts, parts[0], untold)
+        merge_runs(parts, parts[0], ignore)
     record = parts[1] / "episodes/s-001/record.json"
     record.write_bytes(record.read_bytes()[:200])
     with pytest.raises(RunError, match=r"1/record\.json: not an episode record.*--resume"):
-        merge_runs(parts, tmp_path / "merged", untold)
+        merge_runs(parts, tmp_path / "merged", ignore)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1", "2"]
 
 
@@ -271,7 +271,7 @@ def test_a_shard_needs_the_seed_of_its_run(cosim: Cosim) -> None:
 def test_a_finished_run_is_a_shard_too(tmp_path: Path) -> None:
     """The parts of a run that was begun on two machines without shards are merged all the same."""
     whole = run_of(tmp_path / "a", ["goal", "hit"])
-    merged = merge_runs([whole], tmp_path / "merged", untold)
+    merged = merge_runs([whole], tmp_path / "merged", ignore)
     assert (
         merged.missing == ()
         and (tmp_path / "merged/results.csv").read_bytes() == (whole / "results.csv").read_bytes()

@@ -7,7 +7,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from cosim.core.telling import duration
+from cosim.core.units import duration
 from cosim.core.versions import versions
 from cosim.results.record import Record
 from cosim.results.run_folder import RunFolder

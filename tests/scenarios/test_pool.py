@@ -27,11 +27,11 @@ from scenarios.ipc.deadlines import Asked, Patience, Question
 from scenarios.ipc.messages import (
     Done,
     FrameDrawn,
-    Hear,
     Hello,
     Job,
     LostRenderer,
     Message,
+    MessageHandler,
     Progress,
     Ready,
 )
@@ -213,7 +213,7 @@ class Fake:
     def give(self, job: Job) -> None:
         """It does not listen."""
 
-    def listen(self, hear: Hear) -> bool:
+    def listen(self, hear: MessageHandler) -> bool:
         messages = self._messages
         self._messages = ()
         for message in messages:
@@ -394,7 +394,7 @@ def test_an_engine_that_fails_is_tried_again(tmp_path: Path) -> None:
 class DiesIdle(Fake):
     """It ends once it has said everything."""
 
-    def listen(self, hear: Hear) -> bool:
+    def listen(self, hear: MessageHandler) -> bool:
         left = bool(self._messages)
         super().listen(hear)
         return left
@@ -491,7 +491,7 @@ def test_an_episode_is_no_attempt_the_less_for_a_renderer_that_died_for_others(
 class Again(Fake):
     """It says one thing after another, one for each time that it is listened to."""
 
-    def listen(self, hear: Hear) -> bool:
+    def listen(self, hear: MessageHandler) -> bool:
         if self._messages:
             hear(self._messages[0])
             self._messages = self._messages[1:]

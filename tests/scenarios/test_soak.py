@@ -20,9 +20,14 @@ MAP = "sumo-fkk-in"
 
 def test_a_map_is_endured() -> None:
     """A net that comes with SUMO is simulated to the end, with about as many persons and cars as
-    asked for; how far it has come is told meanwhile."""
+    asked for; how far it has come is reported meanwhile."""
     shares: list[float] = []
-    done = endure(CityMap(map=MAP), seed=1, minutes=0.5, tell=shares.append)
+    done = endure(
+        CityMap(map=MAP),
+        seed=1,
+        minutes=0.5,
+        progress=lambda _, share=None: shares.append(share or 0.0),
+    )
     assert shares == sorted(shares) and shares[-1] == 1.0 and len(shares) > 1
     assert done.reason == "" and done.ticks == 600
     assert done.persons > 40 and done.vehicles > 10

@@ -491,7 +491,7 @@ def test_a_build_goes_on_where_it_was_and_its_proofs_hold(tmp_path: Path, cosim:
     parts.mkdir()
     (parts / "straight-001.trying").write_text('{"dropped": [], "begun": 2}')
     suite, proofs = build_suite(
-        "unit", out, tell=lambda line, *_: lines.append(line), only=["straight-001"]
+        "unit", out, progress=lambda line, *_: lines.append(line), only=["straight-001"]
     )
     (proof,) = proofs.proofs
     assert proof.dropped == (Dropped(0, "its process died"),) and suite.scenarios[0].seed == 1000

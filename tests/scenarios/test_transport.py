@@ -19,7 +19,7 @@ from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Suite
 from scenarios.ipc.child_process import LocalProcesses
-from scenarios.ipc.messages import Done, Hear, Hello, Job, Message
+from scenarios.ipc.messages import Done, Hello, Job, Message, MessageHandler
 from scenarios.runs import run as suite_run
 from scenarios.runs.transport import InProcess
 from scenarios.tools.verify.doctor import small_scenario
@@ -44,7 +44,7 @@ class Fails(Ahead):
         raise LookupError("no answer")
 
 
-def done_here(policy: Policy, hear: Hear) -> None:
+def done_here(policy: Policy, hear: MessageHandler) -> None:
     """One short scenario in this process."""
     driver = Driver.of(policy)
     worker = InProcess(driver).start(Hello("mine", driver.manifest, driver.source_hash))

@@ -7,13 +7,14 @@ import math
 import os
 import subprocess
 import sys
+import time
 from collections import Counter, defaultdict
 from pathlib import Path
 
 import pytest
 import shapely
 
-from cosim.core.cache import forget_entries
+from cosim.core.cache import BUILDING, forget_entries
 from cosim.core.errors import MapError, UsageError
 from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import City
@@ -26,6 +27,7 @@ from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M
 from sumo_nets.net.net_file import read_net
 from sumo_nets.net.net_hash import net_content_hash
 from sumo_nets.net.netconvert import netconvert
+from tests.conftest import PATIENCE_S
 
 SAMPLE = [
     (1, 200.0, "mixed"),
@@ -302,6 +304,30 @@ def test_store_builds_once_and_refuses_another_net(
         MapError, match=r"made on 0123456789abcdef: delete the file to build it again"
     ):
         city_net(City(seed=9, size_m=200.0, net_hash="0123456789abcdef"))
+
+
+@pytest.mark.engine
+def test_processes_build_one_city_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each gets the whole net, also when one of them is killed while it builds; what that left is
+    removed."""
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
+    code = (
+        "from sumo_nets.city.store import city_net, is_whole; from cosim.spec.scenario import City;"
+        "print(is_whole(city_net(City(seed=9, size_m=200.0))))"
+    )
+    dies, *others = (
+        subprocess.Popen([sys.executable, "-c", code], stdout=-1, text=True) for _ in range(3)
+    )
+    ends_s = time.monotonic() + PATIENCE_S
+    while not list(tmp_path.glob(f"{BUILDING}*/*")) and time.monotonic() < ends_s:
+        time.sleep(0.01)
+    dies.kill()
+    dies.communicate()
+    assert [other.communicate(timeout=PATIENCE_S)[0] for other in others] == ["True\n"] * 2
+    forget_entries()
+    assert [path.name for path in tmp_path.iterdir() if path.name not in (".lock", ".in-use")] == [
+        city_net(City(seed=9, size_m=200.0)).name
+    ]
 
 
 @pytest.mark.engine

@@ -3,7 +3,6 @@ the store of maps holds whole ones only, whoever dies or comes at the same momen
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
 import shutil
@@ -31,7 +30,6 @@ from sumo_nets.maps.map_store import (
     read_map,
 )
 from sumo_nets.maps.place_names import place_called
-from sumo_nets.maps.scratch import HELD, PREFIX, move_in, scratch_in
 from tests.conftest import PATIENCE_S, Cosim
 from tests.sumo_nets.test_damaged_maps import TOWN
 
@@ -212,54 +210,6 @@ def test_a_run_on_a_city_of_ones_own_is_replayed(cosim: Cosim, city: Path) -> No
         shutil.move(city.parent / "gone", city)
     check = cosim("map", "check", "seven", cwd=city.parent)
     assert check.returncode == 0 and "long route" in check.stdout
-
-
-def test_what_a_dead_process_left_is_swept_away(tmp_path: Path) -> None:
-    """A scratch folder that nobody holds is removed by the next one, one that is held stays."""
-    with scratch_in(tmp_path) as held:
-        (tmp_path / f"{PREFIX}dead").mkdir()
-        (tmp_path / f"{PREFIX}dead" / HELD).touch()
-        with scratch_in(tmp_path) as other:
-            assert {p.name for p in tmp_path.glob(f"{PREFIX}*")} == {held.name, other.name}
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_map_that_was_being_replaced_when_its_process_died_is_put_back(tmp_path: Path) -> None:
-    """Between the old map's going and the new one's coming nothing is lost."""
-    dead = tmp_path / "maps" / f"{PREFIX}dead"
-    (dead / "old" / "town").mkdir(parents=True)
-    (dead / "old" / "town" / "net.xml").write_text("<net/>")
-    (dead / HELD).touch()
-    with scratch_in(tmp_path / "maps"):
-        assert (tmp_path / "maps" / "town" / "net.xml").read_text() == "<net/>"
-
-
-def test_a_finished_folder_takes_the_place_of_the_old_one(tmp_path: Path) -> None:
-    """Moved in, the new one is there whole; where it may not take the place, the old one stays."""
-    for number, in_place in enumerate((True, True, False)):
-        with scratch_in(tmp_path / "maps") as scratch:
-            (scratch / "ready").mkdir()
-            (scratch / "ready" / "net.xml").write_text(str(number))
-            move_in(scratch / "ready", tmp_path / "maps" / "town", in_place=in_place)
-    assert [p.name for p in (tmp_path / "maps").iterdir()] == ["town"]
-    assert (tmp_path / "maps" / "town" / "net.xml").read_text() == "1"
-
-
-def test_a_reader_waits_while_a_map_is_replaced(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A map that is gone for the moment of its replacement is not unknown to who asks just then."""
-    monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
-    net = maps_folder() / "town" / "net.xml"
-    waited = []
-
-    def locked(_file: object, how: int) -> None:
-        waited.append(how)
-        net.parent.mkdir(parents=True)
-        net.write_text("<net/>")
-
-    monkeypatch.setattr(fcntl, "flock", locked)
-    assert map_net("town") == net and waited == [fcntl.LOCK_EX]
 
 
 IMPORTER = """

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.errors import CosimError, MachineError, UsageError, unwritable
-from cosim.core.whole_file import write_whole
+from cosim.core.files import write_atomic
 from cosim.policies.onnx.manifest import file_facts, read_bundle_manifest
 from cosim.policies.onnx.weights import NetworkFile, weight_folders
 
@@ -142,7 +142,7 @@ class Converter:
         out = folder / graph.name
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            write_whole(out, data)
+            write_atomic(out, data)
         except OSError as error:
             raise unwritable(out, error) from error
         return out

@@ -14,7 +14,7 @@ from typing import Final
 from platformdirs import user_data_path
 
 from cosim.core.errors import UsageError
-from cosim.core.whole_file import read_within, size_within
+from cosim.core.files import read_within, size_within
 from cosim.policies.onnx.graph_file import external_files, weights_not_finite
 from cosim.policies.onnx.manifest import BundleManifest, FileFacts, file_facts, refusal_of_name
 

@@ -13,7 +13,7 @@ import jinja2
 import msgspec
 import numpy as np
 
-from cosim.core.telling import duration, milliseconds
+from cosim.core.units import duration, milliseconds
 from cosim.place.open_ground import GROUND_LOOKS
 from cosim.report.page.plots import CAUSE_COLOURS, RUN_COLOURS, Plot
 from cosim.report.page.reasons import CAUSES, mishaps_of

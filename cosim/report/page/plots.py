@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
-from cosim.core.telling import Tell, untold
+from cosim.core.progress import Progress, ignore
 from cosim.report.page.paper import EVENT_COLUMNS
 from cosim.report.page.reasons import CAUSES, mishaps_of
 from cosim.report.page.runs import KINDS_OF_LIGHT, PaperTable, ReportedRun, table_of_paper
@@ -85,7 +85,7 @@ class Exposure(NamedTuple):
 
 
 def plots_of(
-    runs: Sequence[ReportedRun], colours: Mapping[str, str], tell: Tell = untold
+    runs: Sequence[ReportedRun], colours: Mapping[str, str], progress: Progress = ignore
 ) -> list[Plot]:
     """Every plot that the runs have something for. colours: of the labels."""
     rate = "Failures per 100 m"
@@ -122,7 +122,7 @@ def plots_of(
             f"{rate} by light, long ways",
         ),
     ]
-    near, fast = _exposures(runs, tell)
+    near, fast = _exposures(runs, progress)
     people = {label: parts for (label, family), parts in near.items() if family == "long"}
     speed: dict[str, dict[str, list[Exposure]]] = {"long ways": {}, "short ways": {}}
     for (label, family), parts in fast.items():
@@ -175,12 +175,12 @@ def exposure_of(
 _ByRun = dict[tuple[str, PaperTable], list[Exposure]]
 
 
-def _exposures(runs: Sequence[ReportedRun], tell: Tell) -> tuple[_ByRun, _ByRun]:
+def _exposures(runs: Sequence[ReportedRun], progress: Progress) -> tuple[_ByRun, _ByRun]:
     """Of every episode with a trajectory: by people near, by speed."""
     near: _ByRun = {}
     fast: _ByRun = {}
     for number, run in enumerate(runs):
-        tell("reading trajectories", number / len(runs))
+        progress("reading trajectories", number / len(runs))
         for record, track in run.tracks():
             key = run.label, table_of_paper(run.scenarios[record.scenario])
             travelled_m = track["travelled_m"]

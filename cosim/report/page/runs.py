@@ -14,7 +14,7 @@ import pandas as pd
 
 from cosim.core.errors import RunError, UsageError
 from cosim.core.npz import read_npz
-from cosim.core.telling import Tell, untold
+from cosim.core.progress import Progress, ignore
 from cosim.results.finished_run import WholeRun, read_whole_run
 from cosim.results.log import Log
 from cosim.results.record import Record
@@ -101,7 +101,7 @@ class ReportedRun:
             yield record, read
 
 
-def read_runs(paths: Sequence[Path], tell: Tell = untold) -> list[ReportedRun]:
+def read_runs(paths: Sequence[Path], progress: Progress = ignore) -> list[ReportedRun]:
     """Raises UsageError where a run is given twice, RunError for runs whose figures cannot stand in
     one table, and what `read_whole_run` raises."""
     resolved = [path.resolve() for path in paths]
@@ -110,7 +110,7 @@ def read_runs(paths: Sequence[Path], tell: Tell = untold) -> list[ReportedRun]:
             raise UsageError(f"{path} is given twice: name each run once")
     found = []
     for path in paths:
-        tell(f"reading {path}")
+        progress(f"reading {path}")
         found.append(read_whole_run(path))
     _refuse_other_suites(found)
     policies = [(whole.spec.suite, whole.spec.policy_name) for whole in found]

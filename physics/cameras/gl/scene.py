@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.core.baked import Arrays
+from cosim.core.cache import Arrays
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS, Street
 from cosim.spec.obstacle import Obstacle

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import msgspec
 
 from cosim.core.errors import CosimError, MachineError, MapError, SpecError
-from cosim.core.telling import Tell, untold
+from cosim.core.progress import Progress, ignore
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import City, CityMap, Light, Place, Scenario, Suite
 from cosim.spec.spec_file import in_lines
@@ -50,11 +50,11 @@ class _Street(NamedTuple):
     faults: tuple[str, ...]
 
 
-def made_of(file: OwnFile, tell: Tell = untold) -> Iterator[Made]:
+def made_of(file: OwnFile, progress: Progress = ignore) -> Iterator[Made]:
     """Each scenario of a file, and what is against it. What the machine lacks is raised as
     MachineError."""
     for number, variant in enumerate(file.variants):
-        tell(f"{_MAKING} of {file.path.name}", number / len(file.variants))
+        progress(f"{_MAKING} of {file.path.name}", number / len(file.variants))
         yield made_one(variant, file.name)
 
 
@@ -90,9 +90,9 @@ def made_one(variant: Variant, suite: str) -> Made:
     return Made(variant, whole, faults)
 
 
-def suite_of_own(file: OwnFile, tell: Tell = untold) -> Suite:
+def suite_of_own(file: OwnFile, progress: Progress = ignore) -> Suite:
     """All scenarios of a file, to be run. Raises SpecError with everything that is against it."""
-    return suite_of(file, list(made_of(file, tell)))
+    return suite_of(file, list(made_of(file, progress)))
 
 
 def suite_of(file: OwnFile, made: Sequence[Made]) -> Suite:

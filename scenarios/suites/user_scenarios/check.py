@@ -9,7 +9,7 @@ from functools import lru_cache
 import msgspec
 
 from cosim.core.errors import CosimError, SpecError
-from cosim.core.telling import Tell, untold
+from cosim.core.progress import Progress, ignore
 from cosim.spec.scenario import Light, Scenario, Suite, event_faults
 from cosim.spec.spec_file import in_lines
 from physics.cameras.hdri import read_hdri
@@ -23,11 +23,11 @@ from scenarios.suites.user_scenarios.build import made_of, suite_of_own
 from scenarios.suites.user_scenarios.read import OwnFile
 
 
-def own_faults(file: OwnFile, tell: Tell = untold) -> list[str]:
+def own_faults(file: OwnFile, progress: Progress = ignore) -> list[str]:
     """Everything that is against driving the scenarios of a file, each fault once, in the order of
     the scenarios."""
     found: dict[str, None] = {}
-    for made in made_of(file, tell):
+    for made in made_of(file, progress):
         told = made.faults
         if made.scenario is not None and not told:
             told = tuple(_faults_on_the_street(made.scenario))
@@ -36,11 +36,11 @@ def own_faults(file: OwnFile, tell: Tell = untold) -> list[str]:
     return list(found)
 
 
-def checked_own(file: OwnFile, tell: Tell = untold) -> Suite:
+def checked_own(file: OwnFile, progress: Progress = ignore) -> Suite:
     """The scenarios of a file, to be run. Raises SpecError with everything that is against it."""
-    if faults := own_faults(file, tell):
+    if faults := own_faults(file, progress):
         raise SpecError(f"{file.path}: {in_lines(faults, len(faults))}")
-    return suite_of_own(file, tell)
+    return suite_of_own(file, progress)
 
 
 def _faults_on_the_street(scenario: Scenario) -> Iterator[str]:

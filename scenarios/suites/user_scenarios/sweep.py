@@ -10,7 +10,7 @@ from typing import Any, Final
 import pandas as pd
 
 from cosim.core.errors import unwritable
-from cosim.core.whole_file import write_whole
+from cosim.core.files import write_atomic
 from cosim.report.curves import draw_curves
 from cosim.results.table import summary_of
 from scenarios.suites.user_scenarios.read import OwnFile, label
@@ -44,10 +44,10 @@ def write_sweep(summary: pd.DataFrame, own: OwnFile, folder: Path) -> list[Path]
     files = []
     try:
         files.append(folder / "sweep.csv")
-        write_whole(files[-1], summary.to_csv(index=False).encode())
+        write_atomic(files[-1], summary.to_csv(index=False).encode())
         picture = draw_curves(summary, fields, _DRAWN, own.name)
         files.append(folder / "sweep.png")
-        write_whole(files[-1], picture)
+        write_atomic(files[-1], picture)
     except OSError as error:
         raise unwritable(files[-1], error) from error
     return files

@@ -17,6 +17,7 @@ import numpy as np
 
 from cosim.core.errors import CosimError
 from cosim.core.geometry import Floats, Polyline, Pose
+from cosim.core.progress import Progress
 from cosim.core.state import Doing, People, RobotState, Street, Vehicles
 from cosim.place.street_map import StreetMap
 from cosim.spec.camera import CameraSpec
@@ -215,7 +216,7 @@ class _Found(NamedTuple):
 
 
 def time_cameras(
-    rounds: int, tell: Callable[[str], None], figures: Sequence[Drawing] = FIGURES
+    rounds: int, progress: Progress, figures: Sequence[Drawing] = FIGURES
 ) -> dict[str, _Found]:
     """Measure every figure `rounds` times, each in a fresh process. A figure that fails is not
     repeated."""
@@ -224,7 +225,7 @@ def time_cameras(
         for figure in figures:
             if found[figure.name].why:
                 continue
-            tell(f"round {i + 1} of {rounds}: {figure.name}")
+            progress(f"measuring: round {i + 1} of {rounds}: {figure.name}")
             try:
                 found[figure.name].fps.append(1.0 / alone(figure.work, figure.size_m))
             except CosimError as error:

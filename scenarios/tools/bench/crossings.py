@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from functools import cache
@@ -20,6 +20,7 @@ import numpy as np
 from cosim.core.child_process import end_with
 from cosim.core.clock import Clock
 from cosim.core.errors import SpecError
+from cosim.core.progress import Progress
 from cosim.episode.policy_caller import Driver
 from cosim.episode.step import Step
 from cosim.people.yielding import ROBOT_STANDS_MPS
@@ -63,7 +64,7 @@ class Crossed(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def cross_all(
-    crossings: int, cities: int, policy: str, jobs: int, tell: Callable[[str], None]
+    crossings: int, cities: int, policy: str, jobs: int, progress: Progress
 ) -> list[Crossed]:
     """Drive over so many crossings, spread over cities, `jobs` cities at a time."""
     if cities > crossings:
@@ -76,7 +77,7 @@ def cross_all(
     def one(seed: int, count: int) -> None:
         for crossed in cross_city(City(seed=seed, size_m=_SIZE_M), count, policy):
             found.append(crossed)
-            tell(f"{len(found)} of {crossings} crossings")
+            progress(f"driving: {len(found)} of {crossings} crossings")
 
     with ThreadPoolExecutor(jobs) as pool:
         try:

@@ -13,7 +13,7 @@ import math
 import multiprocessing
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final, cast
 
@@ -26,6 +26,7 @@ from shapely.geometry import LineString, Polygon
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Floats, Pose, boxes_overlap, wrap_angle
+from cosim.core.progress import Progress
 from cosim.core.state import (
     DIRECTED,
     PERSON_RADIUS_M,
@@ -211,13 +212,11 @@ def things_along(scenario: Scenario, street_map: StreetMap) -> list[tuple[str, P
     ]
 
 
-def watch_all(
-    cities: int, minutes: float, crowd: CrowdSpec, tell: Callable[[str], None]
-) -> list[Watched]:
+def watch_all(cities: int, minutes: float, crowd: CrowdSpec, progress: Progress) -> list[Watched]:
     """Watch the crowd in several cities, a process for each, one after another."""
     found = []
     for seed in range(cities):
-        tell(f"city {seed + 1} of {cities}")
+        progress(f"watching the crowd: city {seed + 1} of {cities}")
         with multiprocessing.get_context("spawn").Pool(1) as pool:
             arguments: tuple[Any, ...] = (City(seed=100 + seed, size_m=CITY_M), minutes, crowd)
             found.append(pool.apply(watch, arguments))

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from cosim.core.errors import unknown
+from cosim.core.progress import Progress
 from scenarios.tools.bench import cameras, environment, serving
 from scenarios.tools.bench.figures import MORE, Figure, taken
 
@@ -82,7 +83,7 @@ def chosen(only: Sequence[str], names: Sequence[str]) -> list[str]:
 
 
 def take_rounds(
-    names: Sequence[str], checkouts: Sequence[Path], rounds: int, tell: Callable[[str], None]
+    names: Sequence[str], checkouts: Sequence[Path], rounds: int, progress: Progress
 ) -> list[dict[str, list[Figure]]]:
     """Return for each checkout its figures by name, one for each round. Checkouts alternate, and
     so does the first."""
@@ -92,7 +93,7 @@ def take_rounds(
             order = list(enumerate(checkouts))
             for i, checkout in order[:: -1 if k % 2 else 1]:
                 where = "" if len(checkouts) == 1 else f" in {checkout}"
-                tell(f"round {k + 1} of {rounds}: {name}{where}")
+                progress(f"measuring: round {k + 1} of {rounds}: {name}{where}")
                 for figure in taken(name, checkout):
                     found[i].setdefault(figure.name, []).append(figure)
     return found

@@ -11,7 +11,7 @@ import math
 import multiprocessing
 import tempfile
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -24,6 +24,7 @@ from shapely.geometry import Polygon
 
 from cosim.core.errors import MachineError
 from cosim.core.geometry import Floats, Pose, heading_to_sumo
+from cosim.core.progress import Progress
 from cosim.core.state import PERSON_RADIUS_M, RobotState, Street
 from cosim.place.street_map import StreetMap
 from cosim.spec.events import EventReply
@@ -579,8 +580,8 @@ class Comparison(NamedTuple):
     vehicles: int
 
 
-def watch_people(jobs: int, tell: Callable[[str], None]) -> Comparison:
-    """Let people walk on every street, in `jobs` processes. tell: called with the progress."""
+def watch_people(jobs: int, progress: Progress) -> Comparison:
+    """Let people walk on every street, in `jobs` processes. progress: receives the stage."""
     need_pedpy()
     dense = [
         Flow(density, both_ways) for both_ways in (False, True) for density in reversed(DENSITIES)
@@ -593,7 +594,7 @@ def watch_people(jobs: int, tell: Callable[[str], None]) -> Comparison:
         free = [pool.apply_async(_free_mps, (_FREE, _WALK_S, seed)) for seed in range(_FREE_SEEDS)]
         found = []
         for k, one in enumerate(tasks := [*walking, *near, *free]):
-            tell(f"street {k + 1} of {len(tasks)}")
+            progress(f"watching people: street {k + 1} of {len(tasks)}")
             found.append(one.get())
         person_first_s, vehicle_first_s, people, vehicles = crossing.get()
     one_way = found[: len(DENSITIES)]

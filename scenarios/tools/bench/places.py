@@ -12,7 +12,7 @@ import multiprocessing
 import os
 import resource
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import Connection
@@ -25,6 +25,7 @@ from cosim.core.child_process import end_with, ended_in_words
 from cosim.core.clock import Clock
 from cosim.core.errors import CosimError, EngineError
 from cosim.core.geometry import Floats, Polyline, Pose
+from cosim.core.progress import Progress, ignore
 from cosim.core.state import PersonKind, RobotState
 from cosim.place.street_map import StreetMap
 from cosim.place.walk_graph import WalkGraph
@@ -119,9 +120,7 @@ class Endured(msgspec.Struct, frozen=True, kw_only=True):
     reason: str = ""
 
 
-def endure(
-    where: Place, seed: int, minutes: float = 10.0, tell: Callable[[float], None] = lambda _: None
-) -> Endured:
+def endure(where: Place, seed: int, minutes: float = 10.0, progress: Progress = ignore) -> Endured:
     """Simulate a place in a process of its own. Whatever goes wrong there becomes the reason,
     not an exception."""
     context = multiprocessing.get_context("spawn")
@@ -137,7 +136,7 @@ def endure(
     try:
         while mine.poll(HANG_S):
             last = msgspec.json.decode(mine.recv_bytes(), type=Endured)
-            tell(last.ticks / ticks)
+            progress(f"{minutes:g} min on {where.name}", last.ticks / ticks)
         process.kill()
         reason = f"SUMO showed no sign of life for {HANG_S:g} s"
     except (EOFError, ConnectionResetError):

@@ -7,7 +7,7 @@ from __future__ import annotations
 import itertools
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.process import BaseProcess
@@ -20,9 +20,10 @@ import cosim
 import physics
 import scenarios
 import sumo_nets
-from cosim.core.baked import sources_hash
+from cosim.core.cache import sources_hash
 from cosim.core.errors import CosimError, RunError, SpecError
-from cosim.core.whole_file import write_whole
+from cosim.core.files import write_atomic
+from cosim.core.progress import Progress, ignore
 from cosim.spec.scenario import Place, Scenario, Suite, write_suite
 from scenarios.suites.proofs import Dropped, Proof, Proofs, write_proofs
 from scenarios.suites.recipes import RECIPES, Slot, candidate, repeated
@@ -65,16 +66,12 @@ class _Piece:
     slots: tuple[Slot, ...]
 
 
-TellDone = Callable[[str, int, int], None]
-"""Told of each scenario that is kept or given up: a line, how many are done, of how many."""
-
-
 def build_suite(
     name: str,
     out: Path,
     jobs: int = 1,
     tries: int = CANDIDATES,
-    tell: TellDone | None = None,
+    progress: Progress = ignore,
     only: Sequence[str] = (),
 ) -> tuple[Suite, Proofs]:
     """Build a suite at a path, its proofs beside it; any number of processes makes the same.
@@ -95,8 +92,7 @@ def build_suite(
     ]
     _open(folder, name)
     for line, done in _run(_pieces(slots), folder, jobs, tries):
-        if tell is not None:
-            tell(line, done, len(slots))
+        progress(f"{done}/{len(slots)} {line}", done / len(slots))
     kept = [_kept(folder, slot) for slot in slots]
     if lacking := [slot.name for slot, one in zip(slots, kept, strict=True) if one is None]:
         reasons = [f"{name}: {_in_words(_tried(folder, name).dropped)}" for name in lacking]
@@ -129,7 +125,7 @@ def _open(folder: Path, name: str) -> None:
     note = folder / _MADE_BY
     if note.exists() and note.read_text() != made_by:
         raise RunError(f"{folder}: begun by another version of the code: delete it and build anew")
-    write_whole(note, made_by.encode())
+    write_atomic(note, made_by.encode())
 
 
 def _pieces(slots: Sequence[Slot]) -> list[_Piece]:
@@ -255,7 +251,7 @@ def _fill(slot: Slot, folder: Path, tries: int) -> None:
             dropped.append(msgspec.structs.replace(found, seed=seed))
             continue
         kept = Kept(scenario, msgspec.structs.replace(found, dropped=tuple(dropped)))
-        write_whole(folder / f"{slot.name}.json", msgspec.json.encode(kept))
+        write_atomic(folder / f"{slot.name}.json", msgspec.json.encode(kept))
         _trying(folder, slot.name).unlink()
         return
 
@@ -278,7 +274,7 @@ def _trying(folder: Path, name: str) -> Path:
 
 
 def _note(folder: Path, slot: Slot, tried: _Tried) -> None:
-    write_whole(_trying(folder, slot.name), msgspec.json.encode(tried))
+    write_atomic(_trying(folder, slot.name), msgspec.json.encode(tried))
 
 
 def _tried(folder: Path, name: str) -> _Tried:

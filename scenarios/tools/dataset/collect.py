@@ -21,9 +21,9 @@ from typing import Any, Final
 import msgspec
 
 from cosim.core.errors import RunError, SpecError, unwritable
-from cosim.core.telling import Tell, untold
+from cosim.core.files import write_atomic
+from cosim.core.progress import Progress, ignore
 from cosim.core.versions import versions
-from cosim.core.whole_file import write_whole
 from cosim.episode.policy_caller import Driver
 from cosim.policies.user_module import importable
 from cosim.results.record import Record
@@ -34,7 +34,7 @@ from cosim.spec.scenario import City, Scenario, Suite, read_suite
 from scenarios.episodes.demonstration import Demonstration, check_parquet
 from scenarios.episodes.demonstrator import Demonstrator, learner_of
 from scenarios.ipc.child_process import LocalProcesses
-from scenarios.ipc.messages import Hear, Hello, Learner
+from scenarios.ipc.messages import Hello, Learner, MessageHandler
 from scenarios.runs.pool import run_all
 from scenarios.runs.run import run_spec
 from scenarios.suites.catalog import with_robot
@@ -107,12 +107,14 @@ class Gathered:
     back: ReadBack | None
 
 
-_Showing = Callable[[Sequence[Scenario], set[str]], AbstractContextManager[Hear]]
+_Showing = Callable[[Sequence[Scenario], set[str]], AbstractContextManager[MessageHandler]]
 """Shows how a run goes: of these scenarios, of which some are done."""
 
 
-def _unshown(scenarios: Sequence[Scenario], done: set[str]) -> AbstractContextManager[Hear]:
-    return nullcontext(lambda message: None)
+def _unshown(
+    scenarios: Sequence[Scenario], done: set[str]
+) -> AbstractContextManager[MessageHandler]:
+    return nullcontext(ignore)
 
 
 def collect(
@@ -127,14 +129,14 @@ def collect(
     jobs: int = 1,
     resume: bool = False,
     showing: _Showing = _unshown,
-    tell: Tell = untold,
+    progress: Progress = ignore,
 ) -> Gathered:
     """Collect demonstrations into a folder; the same arguments give the same bytes, whatever
     `jobs`, and however often it was stopped and went on with `resume`.
 
     source: scenarios, in order. episodes: so many are kept, all that are solved by default. policy:
     what the expert is called by. options: seed, robot, goal, own_camera and camera are taken.
-    showing, tell: how it goes.
+    showing, progress: show how it goes.
 
     Raises RunError for a folder of another data set, UsageError and SpecError for what cannot be
     asked for, MachineError for what the machine lacks.
@@ -148,7 +150,7 @@ def collect(
     wanted = episodes or (
         len(source.structures) * len(source.seeds) if isinstance(source, Fresh) else None
     )
-    rounds = _Rounds(source, out.absolute(), policy, demonstrator, options, jobs, tell)
+    rounds = _Rounds(source, out.absolute(), policy, demonstrator, options, jobs, progress)
     spec = rounds.asked(wanted or len(rounds.all), expert)
     _open(out, spec, resume)
     beside = (
@@ -183,7 +185,7 @@ def collect(
         kept = found[: spec.episodes]
         back = None
         if not (out / "meta").exists():
-            back = _written(out, kept, spec, demonstrator, tell)
+            back = _written(out, kept, spec, demonstrator, progress)
     rows = sum(len(one.load()) for one in kept)
     return Gathered(len(kept), rows, run, dropped, len(found) - len(kept), back)
 
@@ -198,7 +200,7 @@ class _Rounds:
     demonstrator: Demonstrator
     options: EpisodeOptions
     jobs: int
-    tell: Tell
+    progress: Progress
 
     @property
     def all(self) -> tuple[Scenario, ...]:
@@ -245,13 +247,13 @@ class _Rounds:
             return None, ()
         spec = run_spec(suite, suite.scenarios, self.policy, self.demonstrator, self.options)
         if not begun and not isinstance(self.source, Fresh):
-            check_places(suite, suite.scenarios, self.tell, self.jobs)
+            check_places(suite, suite.scenarios, self.progress, self.jobs)
         held = RunFolder.resume(path, spec) if begun else RunFolder.create(path, spec, suite)
         return stack.enter_context(held), suite.scenarios
 
     def _suite(self, taken: int, count: int) -> Suite:
         if isinstance(self.source, Fresh):
-            drawn = self.source.drawn(taken, count, self.jobs, self.tell)
+            drawn = self.source.drawn(taken, count, self.jobs, self.progress)
             version = f"cities-{self.source.seeds[0]}-{self.source.seeds[-1]}"
             made = Suite(name=self.source.kind, version=version, scenarios=tuple(drawn))
             return with_robot(made, self.options.robot)
@@ -309,7 +311,7 @@ def _open(out: Path, spec: CollectSpec, resume: bool) -> None:
         ):
             raise RunError(f"{out} exists and is no data set. Choose another --out.")
         (out / _RUNS).mkdir(parents=True, exist_ok=True)
-        write_whole(path, msgspec.json.format(msgspec.json.encode(spec), indent=1) + b"\n")
+        write_atomic(path, msgspec.json.format(msgspec.json.encode(spec), indent=1) + b"\n")
     except OSError as error:
         raise unwritable(out, error) from error
 
@@ -348,10 +350,14 @@ def _why(record: Record) -> str:
 
 
 def _written(
-    out: Path, kept: Sequence[Collected], spec: CollectSpec, demonstrator: Demonstrator, tell: Tell
+    out: Path,
+    kept: Sequence[Collected],
+    spec: CollectSpec,
+    demonstrator: Demonstrator,
+    progress: Progress,
 ) -> ReadBack:
     """Write the data set, read it back, and only then move it to its place."""
-    tell(_STAGE)
+    progress(_STAGE)
     camera = spec.collecting.camera
     robot = kept[0].scenario.robot
     eye = camera.mount if isinstance(camera.mount, str) else "camera"
@@ -379,7 +385,7 @@ def _written(
             shutil.rmtree(out / name, ignore_errors=True)
         writing.mkdir()
         write_lerobot(writing, kept, filmed, robot, about)
-        back = read_back(writing, kept, tell)
+        back = read_back(writing, kept, progress)
         for name in _PARTS:
             (writing / name).rename(out / name)
         writing.rmdir()

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import RunError, SpecError
 from cosim.core.packed_demos import Packed
-from cosim.core.telling import Tell, untold
+from cosim.core.progress import Progress, ignore
 from scenarios.episodes.clip import pictures_of
 from scenarios.episodes.demonstration import glimpse
 from scenarios.tools.dataset.lerobot import CODEBASE_VERSION, Collected
@@ -112,7 +112,7 @@ class ReadBack:
     off_next: float
 
 
-def read_back(folder: Path, episodes: Sequence[Collected], tell: Tell = untold) -> ReadBack:
+def read_back(folder: Path, episodes: Sequence[Collected], progress: Progress = ignore) -> ReadBack:
     """Hold rows and pictures of a data set against what was kept of its episodes. Raises RunError
     where a number is another, or a picture is not that of its row."""
     held = read_data_set(folder)
@@ -121,7 +121,7 @@ def read_back(folder: Path, episodes: Sequence[Collected], tell: Tell = untold) 
     counts = np.zeros(2, np.int64)
     row = 0
     for index, one in enumerate(episodes):
-        tell(_READING, row / len(held))
+        progress(_READING, row / len(held))
         shown = one.load()
         here = slice(row, row + len(shown))
         row += len(shown)
@@ -159,7 +159,7 @@ _SAME: Final = ("rate_hz", "waypoint_s", "waypoints", "goal", "camera", "robot")
 
 
 def packed_sets(
-    folders: Sequence[Path], size: tuple[int, int] | None = None, tell: Tell = untold
+    folders: Sequence[Path], size: tuple[int, int] | None = None, progress: Progress = ignore
 ) -> Packed:
     """Data sets, one after another, as arrays. size: width, height of the pictures, in place of
     their own. Raises RunError for a folder that holds none, SpecError for data sets that do not fit
@@ -179,7 +179,7 @@ def packed_sets(
     for one in held:
         for rgb in one.pictures():
             if row % 500 == 0:
-                tell(_READING, row / count)
+                progress(_READING, row / count)
             at_size = rgb.shape[:2] == (high, wide)
             frames[row] = (
                 rgb if at_size else cv2.resize(rgb, (wide, high), interpolation=cv2.INTER_AREA)

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from cosim.core.errors import PolicyError
-from cosim.core.telling import Tell, untold
+from cosim.core.progress import Progress, ignore
 from cosim.episode.policy_caller import Driver
 from cosim.spec.manifest import Manifest
 from scenarios.tools.policy_check.answer_checks import (
@@ -86,12 +86,12 @@ def checked_policy(
     driver: Driver,
     manifest: Manifest,
     drives: Mapping[SceneName, Drive],
-    tell: Tell = untold,
+    progress: Progress = ignore,
     only: Collection[str] = (),
 ) -> CheckedPolicy:
     """Ask a policy all that is to be known of it, or what these checks ask. manifest: with the
     goals of the run."""
-    asker = Asker(driver, manifest, drives, tell)
+    asker = Asker(driver, manifest, drives, progress)
     outcomes: dict[str, CheckOutcome] = {}
     for name, check in POLICY_CHECKS.items():
         if only and name not in only:

@@ -17,8 +17,8 @@ from shapely.geometry import LineString, MultiPolygon, Polygon
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Polyline, Pose, wrap_angle
+from cosim.core.progress import Progress, ignore
 from cosim.core.state import NOBODY, People, PersonKind, RobotState, Street
-from cosim.core.telling import Tell, untold
 from cosim.episode.camera_rules import check_camera
 from cosim.episode.interfaces import Observation
 from cosim.episode.loop import Moment
@@ -66,7 +66,7 @@ def drives_for(
     count: int,
     camera: CameraName,
     own_camera: bool = False,
-    tell: Tell = untold,
+    progress: Progress = ignore,
 ) -> dict[SceneName, Drive]:
     """All scenes, `count` observations of each. Raises UsageError for a camera that the robot does
     not have."""
@@ -75,7 +75,7 @@ def drives_for(
     check_camera(manifest, robot_called(shown.robot), own_camera)
     drives = {}
     for done, scene in enumerate(SCENES):
-        tell("drawing streets", done / len(SCENES))
+        progress("drawing streets", done / len(SCENES))
         drives[scene] = _drive(scene, shown, manifest, count, camera)
     return drives
 

@@ -13,8 +13,8 @@ from typing import Final
 import numpy as np
 
 from cosim.core.geometry import Floats
+from cosim.core.progress import Progress, ignore
 from cosim.core.state import Command, Planned
-from cosim.core.telling import Tell, untold
 from cosim.episode.interfaces import Observation, Policy
 from cosim.episode.policy_caller import Driver
 from cosim.spec.manifest import Manifest, WaypointRule
@@ -82,14 +82,14 @@ class Asker:
         driver: Driver,
         manifest: Manifest,
         drives: Mapping[SceneName, Drive],
-        tell: Tell = untold,
+        progress: Progress = ignore,
     ) -> None:
         """manifest: with the goals of the run."""
         self.manifest = manifest
         self.drives = drives
         self.took_ms: list[float] = []
         self._driver = driver
-        self._tell = tell
+        self._progress = progress
         self._said: object = None
         self._known: dict[tuple[SceneName, tuple[str, ...]], Answered] = {}
         self._episodes = 0
@@ -109,7 +109,7 @@ class Asker:
         """The answers to observations, in an episode of their own. Raises PolicyError."""
         self._episodes += 1
         name = f"check-{self._episodes:04d}"
-        self._tell("asking the policy")
+        self._progress("asking the policy")
         driver = self._driver
         rule = self._driver.manifest.waypoints
         answers: list[Answered] = []

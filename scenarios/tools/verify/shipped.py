@@ -13,8 +13,9 @@ from typing import Any, Final
 import msgspec
 
 from cosim.core.errors import EngineError, RunError, unwritable
+from cosim.core.files import write_atomic
+from cosim.core.progress import Progress
 from cosim.core.versions import versions
-from cosim.core.whole_file import write_whole
 from cosim.spec.scenario import Scenario
 from physics.cameras.choice import camera_of_choice, renderer_of
 from scenarios.episodes.run_episode import in_words
@@ -43,7 +44,7 @@ class Given(msgspec.Struct, frozen=True, kw_only=True):
         """Write as JSON, whole or not at all. Raises MachineError."""
         data = msgspec.json.format(msgspec.json.encode(self), indent=1) + b"\n"
         try:
-            write_whole(path, data)
+            write_atomic(path, data)
         except OSError as error:
             raise unwritable(path, error) from error
 
@@ -61,13 +62,13 @@ class Given(msgspec.Struct, frozen=True, kw_only=True):
         return given
 
 
-def given_here(cases: Sequence[Scenario], jobs: int, tell: Callable[[str], None]) -> Given:
-    """What this installation gives: `jobs` processes, or this one. tell: is told the name of what
-    is under way. Raises EngineError when a process dies."""
+def given_here(cases: Sequence[Scenario], jobs: int, progress: Progress) -> Given:
+    """What this installation gives: `jobs` processes, or this one. progress: receives the name of
+    what runs. Raises EngineError when a process dies."""
     work: dict[str, Callable[[], Any]] = {"the engines alone": engines_alone, "textures": textures}
     work |= {case.id: partial(trace_of, case) for case in cases}
     alone, layers, *traces = (
-        _done_here(work, tell) if jobs == 1 else _done_in_processes(work, jobs, tell)
+        _done_here(work, progress) if jobs == 1 else _done_in_processes(work, jobs, progress)
     )
     return Given(
         versions=versions(),
@@ -80,21 +81,21 @@ def given_here(cases: Sequence[Scenario], jobs: int, tell: Callable[[str], None]
     )
 
 
-def _done_here(work: Mapping[str, Callable[[], Any]], tell: Callable[[str], None]) -> list[Any]:
+def _done_here(work: Mapping[str, Callable[[], Any]], progress: Progress) -> list[Any]:
     done = []
     for name, do in work.items():
-        tell(name)
+        progress(name)
         done.append(do())
     return done
 
 
 def _done_in_processes(
-    work: Mapping[str, Callable[[], Any]], jobs: int, tell: Callable[[str], None]
+    work: Mapping[str, Callable[[], Any]], jobs: int, progress: Progress
 ) -> list[Any]:
     done = []
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
         for name, one in {name: pool.submit(do) for name, do in work.items()}.items():
-            tell(name)
+            progress(name)
             try:
                 done.append(one.result())
             except BrokenProcessPool:

@@ -8,7 +8,7 @@ from typing import Final
 import shapely
 
 from cosim.core.errors import unwritable
-from cosim.core.telling import Tell, untold
+from cosim.core.progress import Progress, ignore
 from cosim.spec.scenario import Scenario
 from physics.ground.tiles import keys_in
 from physics.street.gltf import as_gltf
@@ -19,15 +19,15 @@ _AROUND_M: Final = 30.0
 """Tiles nearer to the route than this are written."""
 
 
-def export_street(scenario: Scenario, path: Path, tell: Tell = untold) -> int:
+def export_street(scenario: Scenario, path: Path, progress: Progress = ignore) -> int:
     """Write the tiles along a scenario's route, its fences and its obstacles, as .glb; returns how
     many tiles. y is up, x and -z are the map's x and y, in metres. Raises MachineError when it
     cannot be written."""
-    tell(f"reading the street map of {scenario.place.name}")
+    progress(f"reading the street map of {scenario.place.name}")
     _, street_map = place(scenario.place)
     surface = StreetSurface(street_map, scenario.place.seed, scenario.place.roughness)
     keys = keys_in(shapely.buffer(shapely.LineString(scenario.route), _AROUND_M))
-    written = as_gltf(surface, keys, scenario.barriers, tell, scenario.obstacles)
+    written = as_gltf(surface, keys, scenario.barriers, progress, scenario.obstacles)
     try:
         path.write_bytes(written)
     except OSError as error:

@@ -20,8 +20,8 @@ import numpy as np
 from cosim.core.clock import Clock
 from cosim.core.errors import RunError, listed
 from cosim.core.geometry import Floats
+from cosim.core.progress import Progress, ignore
 from cosim.core.state import DIRECTED, RobotState, Street
-from cosim.core.telling import Tell, untold
 from cosim.episode.interfaces import Eyes
 from cosim.episode.step import Step
 from cosim.report import hud
@@ -128,7 +128,9 @@ def _outcome(record: Record) -> str:
     return f"it is {record.status}: {record.reason}"
 
 
-def make_film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell = untold) -> float:
+def make_film(
+    folder: Path, scenario_id: str, output: Path, cut: Cut, progress: Progress = ignore
+) -> float:
     """Write the film of a finished episode; the simulated second at which it ends, infinite for the
     episode's end.
 
@@ -153,7 +155,7 @@ def make_film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell
         raise RunError(
             f"a film of {cut.size[0]}x{cut.size[1]} pixels: below {least} nothing can be read"
         )
-    tell("reading the street map, starting SUMO, PyBullet and the camera")
+    progress("reading the street map, starting SUMO, PyBullet and the camera")
     _, street_map = place(scenario.place)
     fps = round(1.0 / Clock().tick_s)
     with ExitStack() as stack:
@@ -162,7 +164,7 @@ def make_film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell
         stack.enter_context(episode)
         camera = stack.enter_context(episode.eyes(robot_eye(cut)))
         minimap = Minimap(street_map, scenario, episode.footprint_m)
-        reel = _Reel(told, minimap, camera, video, cut, last, tell)
+        reel = _Reel(told, minimap, camera, video, cut, last, progress)
         for watch in (Alike(folder, told).watch, reel.take):
             episode.watch(watch)
         observation = episode.reset()
@@ -192,7 +194,7 @@ class _Reel:
         video: Video,
         cut: Cut,
         last: int,
-        tell: Tell,
+        progress: Progress,
     ) -> None:
         self._scenario = told.scenario
         self._record = told.record
@@ -203,7 +205,7 @@ class _Reel:
         self._video = video
         self._cut = cut
         self._last = last
-        self._tell = tell
+        self._progress = progress
         self._counts = {"collision": 0, "out_of_lane": 0, "freezing": 0}
         self._triggered: set[str] = set()
         self._caption = ("", hud.INK)
@@ -222,10 +224,12 @@ class _Reel:
         self._over = (1.0 - share) * self._over + share * _framed(robot, step.street_after)
         first = Clock().ticks(self._cut.from_s)
         if step.tick < first:
-            self._tell(f"simulating to {self._cut.from_s:g} s", step.tick / first)
+            self._progress(f"simulating to {self._cut.from_s:g} s", step.tick / first)
         if first <= step.tick < self._last and (step.tick - first) % self._cut.speed == 0:
             self._video.add(self._picture(step, robot, step.street_after))
-            self._tell(f"filming {self._scenario.id}", (step.tick - first) / (self._last - first))
+            self._progress(
+                f"filming {self._scenario.id}", (step.tick - first) / (self._last - first)
+            )
 
     def _picture(self, step: Step, robot: RobotState, street: Street) -> Image:
         width, height = self._cut.size

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Floats
+from cosim.core.progress import Progress, ignore
 from cosim.core.state import RobotState
-from cosim.core.telling import Tell, untold
 from cosim.policies.load import load_policy
 from cosim.report.legend import Image
 from cosim.spec.camera import CameraSpec
@@ -39,12 +39,12 @@ def look_at(
     view: Viewpoint,
     size: tuple[int, int],
     camera_name: CameraChoice = "auto",
-    tell: Tell = untold,
+    progress: Progress = ignore,
 ) -> tuple[Image, float]:
     """((H, W, 3) uint8 RGB, seconds): the picture `at_s` seconds into an episode, or at its end if
     that comes first.
 
-    policy: who drives until then. size: width, height. tell: is told what is being done.
+    policy: who drives until then. size: width, height. progress: receives what is being done.
     """
     driver = load_policy(policy)
     last = Clock().ticks(at_s)
@@ -53,9 +53,9 @@ def look_at(
         if driver.manifest.camera is None
         else CameraSpec(*size, driver.manifest.camera.fov_deg)
     )
-    tell(f"reading the street map of {scenario.place.name}")
+    progress(f"reading the street map of {scenario.place.name}")
     place(scenario.place)
-    tell("starting SUMO, PyBullet and the camera")
+    progress("starting SUMO, PyBullet and the camera")
     with (
         Episode(scenario, driver.manifest, EpisodeOptions(camera=camera_name)) as episode,
         episode.eyes(spec) as camera,
@@ -63,10 +63,10 @@ def look_at(
         driver.reset(episode.id, episode.seed)
         observation = episode.reset()
         while not episode.over and episode.moment.tick < last:
-            tell(f"simulating to {at_s:g} s", episode.moment.tick / last)
+            progress(f"simulating to {at_s:g} s", episode.moment.tick / last)
             observation = episode.advance(driver.act(observation), until_tick=last)
         robot, street = episode.moment.robot, episode.moment.street
-        tell("drawing")
+        progress("drawing")
         if view == "robot":
             return camera.render(robot, street).rgb, episode.time_s
         eye, target = eye_behind(robot) if view == "follow" else over(robot)

@@ -18,8 +18,8 @@ import shapely
 from cosim.core.child_process import end_with
 from cosim.core.clock import Clock
 from cosim.core.errors import CosimError, unwritable
-from cosim.core.telling import Tell, untold
-from cosim.core.whole_file import write_whole
+from cosim.core.files import write_atomic
+from cosim.core.progress import Progress, ignore
 from cosim.report.above import ROUTE, Sheet, draw_streets
 from cosim.report.encoding import image_url
 from cosim.report.page.choice import MOST_FAILURES, WITHIN_S, FailureToShow, most_telling, shown_of
@@ -71,18 +71,18 @@ def make_report(
     jobs: int = 2,
     most: int = MOST_FAILURES,
     within_s: float = WITHIN_S,
-    tell: Tell = untold,
+    progress: Progress = ignore,
 ) -> ReportFacts:
     """Write the report of these run folders. most: failures in its gallery; within_s: later
     failures of an episode are left out where an earlier one is shown.
 
     Raises what `read_runs` raises, and MachineError when it cannot be written; then nothing is.
     """
-    runs = read_runs(folders, tell)
-    plots = plots_of(runs, colours_of(runs), tell)
+    runs = read_runs(folders, progress)
+    plots = plots_of(runs, colours_of(runs), progress)
     candidates = shown_of(runs)
     picks = most_telling(candidates, most, within_s)
-    tell("starting the engines")
+    progress("starting the engines")
     episodes, lost = _episodes(runs, picks)
     context = get_context("spawn")
     done = context.Array("d", max(len(episodes), 1), lock=False)
@@ -95,23 +95,22 @@ def make_report(
                 for k, one in enumerate(episodes)
             ]
             drawn = _begun_pictures(pool, runs)
-            _wait([*again, *drawn], [one.ticks for one in episodes], done, tell)
+            _wait([*again, *drawn], [one.ticks for one in episodes], done, progress)
             pictures = [came for came in map(_outcome, drawn) if not isinstance(came, str)]
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     showings = lost | _showings(episodes, again)
     entries = [_entry(runs[pick.run], pick, showings[k]) for k, pick in enumerate(picks)]
-    tell("writing the page")
+    progress("writing the page")
     fixed = len(msgspec.json.encode(pictures)) + _REST_BYTES
     sizes = np.array([len(msgspec.json.encode(entry)) for entry in entries], dtype=int)
     count = int((fixed + np.cumsum(sizes) <= _MOST_BYTES).sum())
     maps = Maps(pictures, _spots(runs, picks[:count]), dict(counts_of(runs)))
     data = page_of(runs, plots, entries[:count], maps, _note(entries[:count]))
     try:
-        write_whole(output, data)
+        write_atomic(output, data)
     except OSError as error:
-        output.with_name(output.name + ".part").unlink(missing_ok=True)
         raise unwritable(output, error) from error
     return ReportFacts(len(data), count, len(candidates))
 
@@ -173,7 +172,7 @@ def _shown_again(
 
 
 def _wait(
-    futures: Sequence[Future[Any]], ticks: Sequence[int], done: Sequence[float], tell: Tell
+    futures: Sequence[Future[Any]], ticks: Sequence[int], done: Sequence[float], progress: Progress
 ) -> None:
     """Wait for all of them. The first ones are episodes, which take so many ticks, and of which so
     many are done."""
@@ -185,7 +184,7 @@ def _wait(
             for future, all_of, now in zip(futures, ticks, done, strict=False)
         ]
         share = min(sum(came) / max(sum(ticks), 1), 0.99)
-        tell("showing failures again" if ticks else "drawing maps", share if ticks else None)
+        progress("showing failures again" if ticks else "drawing maps", share if ticks else None)
 
 
 def _showings(

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -29,9 +28,10 @@ from shapely.geometry import MultiPolygon, Polygon
 
 from cosim.core.clock import Clock
 from cosim.core.errors import unwritable
+from cosim.core.files import atomic_file
 from cosim.core.geometry import Floats, Pose
+from cosim.core.progress import Progress, ignore
 from cosim.core.state import LABELS, PERSON_RADIUS_M, Street
-from cosim.core.telling import Tell, untold
 from cosim.episode.interfaces import Eyes
 from cosim.episode.manifest_checks import calibration_of
 from cosim.episode.step import Step
@@ -79,7 +79,11 @@ _LABEL_COLOURS: Final = (
 
 
 def record_for_rerun(
-    folder: Path, scenario_id: str, output: Path, camera: CameraChoice = "auto", tell: Tell = untold
+    folder: Path,
+    scenario_id: str,
+    output: Path,
+    camera: CameraChoice = "auto",
+    progress: Progress = ignore,
 ) -> None:
     """Write the recording of a finished episode of a run. Pictures are those of its policy's
     camera, or of one of 192 x 144 pixels where it has none, four a second.
@@ -91,27 +95,23 @@ def record_for_rerun(
     import rerun.blueprint as rrb
 
     told = recorded(folder, scenario_id)
-    tell("reading the street map, starting SUMO, PyBullet and the camera")
-    part = output.with_name(output.name + ".part")
+    progress("reading the street map, starting SUMO, PyBullet and the camera")
     recording = rr.RecordingStream(
         "cosim", recording_id=f"{told.record.scenario}-{told.record.state_hash}"
     )
     try:
-        with part.open("wb"):
-            pass
-        recording.save(str(part), default_blueprint=_blueprint(rrb))
-        recording.set_log_time_enabled(False)
-        recording.set_log_tick_enabled(False)
-        _replay_into(_Tape(rr, recording, told), folder, told, camera, tell)
-        recording.flush()
-        recording.disconnect()
-        part.replace(output)
+        with atomic_file(output) as part:
+            part.touch()
+            try:
+                recording.save(str(part), default_blueprint=_blueprint(rrb))
+                recording.set_log_time_enabled(False)
+                recording.set_log_tick_enabled(False)
+                _replay_into(_Tape(rr, recording, told), folder, told, camera, progress)
+                recording.flush()
+            finally:
+                recording.disconnect()
     except OSError as error:
         raise unwritable(output, error) from error
-    finally:
-        recording.disconnect()
-        with suppress(OSError):
-            part.unlink(missing_ok=True)
 
 
 def _blueprint(rrb: Any) -> Any:
@@ -140,7 +140,7 @@ def _blueprint(rrb: Any) -> Any:
 
 
 def _replay_into(
-    tape: _Tape, folder: Path, told: Recorded, camera: CameraChoice, tell: Tell
+    tape: _Tape, folder: Path, told: Recorded, camera: CameraChoice, progress: Progress
 ) -> None:
     spec = replace(told.record.camera or _SPEC, depth=True, labels=True)
     episode, policy = replaying(told, camera)
@@ -155,7 +155,7 @@ def _replay_into(
         observation = episode.reset()
         while not episode.over:
             observation = episode.advance(policy.act(observation))
-            tell(f"recording {told.scenario.id}", episode.moment.tick / len(told.log))
+            progress(f"recording {told.scenario.id}", episode.moment.tick / len(told.log))
         check(folder, told, episode.result()[0].state_hash)
     tape.plots()
 

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from cosim.cli import progress
 from cosim.cli.progress import doing, stage_in_words
-from cosim.core.telling import duration
+from cosim.core.units import duration
 
 
 def test_a_log_gets_one_line_for_each_stage() -> None:

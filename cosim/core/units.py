@@ -1,18 +1,10 @@
-"""What a long task says of itself while it runs."""
+"""Write times and sizes with their units."""
 
 from __future__ import annotations
 
-from typing import Protocol
-
-
-class Tell(Protocol):
-    """Takes in what is being done now, and which share of it, 0 to 1, where that is known."""
-
-    def __call__(self, stage: str, share: float | None = None, /) -> None: ...
-
 
 def duration(seconds: float) -> str:
-    """A time in words, no finer than is known: 45 s, 90 s, 12 min, 2 h 10 min."""
+    """Return a time, no finer than it is known: 45 s, 90 s, 12 min, 2 h 10 min."""
     if seconds < 115.0:
         return f"{round(seconds, -1) if seconds >= 60.0 else seconds:.0f} s"
     minutes = round(seconds / 60.0)
@@ -23,7 +15,7 @@ def duration(seconds: float) -> str:
 
 
 def milliseconds(ms: float) -> str:
-    """A short time in words, to three figures: 0.43 ms, 70.3 ms, 1,235 ms.
+    """Return a short time to three figures: 0.43 ms, 70.3 ms, 1,235 ms.
 
     >>> milliseconds(70.345), milliseconds(1234.6)
     ('70.3 ms', '1,235 ms')
@@ -32,8 +24,7 @@ def milliseconds(ms: float) -> str:
 
 
 def bytes_in_words(count: float) -> str:
-    """A size in words, to three figures, in decimal units as disks have them: 812 B, 4.2 MB, 1.62
-    GB.
+    """Return a size to three figures in decimal units, as disks have them: 812 B, 4.2 MB, 1.62 GB.
 
     >>> bytes_in_words(812), bytes_in_words(4_200_000), bytes_in_words(1_618_000_000)
     ('812 B', '4.2 MB', '1.62 GB')
@@ -43,7 +34,3 @@ def bytes_in_words(count: float) -> str:
             return f"{count:.3g} {unit}"
         count /= 1000.0
     return f"{count:.3g} GB" if count < 999.5 else f"{count:,.0f} GB"
-
-
-def untold(stage: str, share: float | None = None, /) -> None:
-    """Nobody wants to know."""

@@ -9,16 +9,14 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from rich import box
 from rich.console import Console
-from rich.table import Table
 
+from cosim.cli import tables
 from cosim.cli.bench import print_figures
 from cosim.cli.results import print_comparison, print_sheet
 from cosim.cli.run_table import COUNTS, SHOWN, WITH_PEOPLE, print_by_kind, print_table
 from cosim.cli.scenario import _print_sweep
 from cosim.cli.suites import print_scenarios
-from cosim.cli.tables import print_fitted
 from cosim.results.compare import DIFFERENCES, FLIPPED, ComparedRun, RunComparison
 from cosim.results.metrics import COUNTERFACTUAL, METRICS
 from cosim.results.table import KEYS
@@ -150,10 +148,11 @@ def test_a_table_that_is_too_wide_is_divided() -> None:
     """Each part has the names again and as many figures as fit; every figure is there once, in the
     order of columns."""
     heads = [f"figure {k}" for k in range(9)]
-    table = Table("what", *heads, box=box.SIMPLE_HEAD)
-    table.add_row(LONG, *(f"{k}.000000" for k in range(9)))
     said = io.StringIO()
-    print_fitted(Console(file=said, width=50), table)
+    row = (LONG, *(f"{k}.000000" for k in range(9)))
+    tables.show(
+        Console(file=said, width=50), [*tables.names("what"), *tables.figures(*heads)], [row]
+    )
     parts = said.getvalue().split("what")[1:]
     assert len(parts) > 1 and max(map(len, said.getvalue().splitlines())) <= 50
     found = [[word for word in part.split() if word.endswith(".000000")] for part in parts]
@@ -164,18 +163,26 @@ def test_a_table_that_is_too_wide_is_divided() -> None:
 
 def test_a_table_that_fits_is_left_as_it_is() -> None:
     """Heads are broken only where there is no room for them."""
-    table = Table("what", "a head of several words", box=box.SIMPLE_HEAD)
-    table.add_row("a", "1.00")
+    columns = [*tables.names("what"), *tables.figures("a head of several words")]
     wide, narrow = io.StringIO(), io.StringIO()
-    print_fitted(Console(file=wide, width=40), table)
-    print_fitted(Console(file=narrow, width=20), table)
+    for file, width in ((wide, 40), (narrow, 20)):
+        tables.show(Console(file=file, width=width), columns, [("a", "1.00")])
     assert "a head of several words" in wide.getvalue() and "several" in narrow.getvalue().split()
 
 
-def test_every_command_with_a_table_prints_it_so() -> None:
-    """Whichever module of the command line makes a table has it fitted."""
+def test_cells_are_plain_text() -> None:
+    """Brackets in a name are no markup; a section is set apart; title and note are around the
+    table."""
+    said = io.StringIO()
+    columns = [*tables.names("what"), *tables.labels("how"), *tables.words("why")]
+    rows = [("a [1]", "b", "c"), None, ("d", "e", "f")]
+    tables.show(Console(file=said, width=40), columns, rows, title="above", note="below")
+    lines = [line.split() for line in said.getvalue().splitlines()]
+    assert lines[0] == ["above"] and lines[-1] == ["below"]
+    assert ["a", "[1]", "b", "c"] in lines and ["d", "e", "f"] in lines
+
+
+def test_every_command_prints_its_tables_so() -> None:
+    """No other module of the command line makes a table of its own."""
     for path in sorted((ROOT / "cosim/cli").rglob("*.py")):
-        if "Table(" in (text := path.read_text()):
-            assert "print_fitted" in text and not re.search(
-                r"\bout\.print\((table|shown|rows)\)", text
-            ), path
+        assert path.name == "tables.py" or "rich.table" not in path.read_text(), path

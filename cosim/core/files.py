@@ -1,0 +1,188 @@
+"""Write files and folders whole or not at all, lock them, and read files within bounds."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import secrets
+import shutil
+import stat
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Literal
+
+if TYPE_CHECKING:
+    from filelock import FileLock
+
+MAKING: Final = ".making-"
+"""Names of unfinished folders, and of unfinished files that processes share, begin like this."""
+_HELD: Final = ".held"
+"""The file in a temporary folder that its process keeps locked."""
+_OLD: Final = ".old"
+"""The folder in a temporary folder that holds the one that is being replaced."""
+_YOUNG_S: Final = 3600.0
+"""An unfinished file, or a folder without a lock file, may be in use until it is this old."""
+
+
+def lock(path: Path, *, wait: bool = True) -> FileLock:
+    """Return a lock on a file that is created for it; it is released when its process ends.
+
+    wait: block until it is free. Otherwise acquiring it raises TimeoutError.
+    """
+    from filelock import FileLock
+
+    timeout_s = -1.0 if wait else 0.0
+    return FileLock(path, timeout=timeout_s, thread_local=False, poll_interval=0.01)
+
+
+def is_locked(path: Path) -> bool:
+    """Return whether a process holds the lock of a file. The file only has to be readable."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY)
+    except FileNotFoundError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
+@contextmanager
+def atomic_file(path: Path, *, shared: bool = False) -> Iterator[Path]:
+    """Yield a path to write to; at the end of the block it becomes `path`, after an error it is
+    removed.
+
+    shared: several processes may write the file at once. It is not flushed to the disk, as for
+    a file that can be made again.
+    """
+    part = path.with_name(MAKING + secrets.token_hex(8) if shared else f"{path.name}.part")
+    try:
+        yield part
+        if not shared:
+            with part.open("rb") as file:
+                os.fsync(file.fileno())
+        part.replace(path)
+    finally:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def write_atomic(path: Path, data: bytes, *, shared: bool = False) -> None:
+    """Write a file whole or not at all. `shared` is that of `atomic_file`. OSError passes."""
+    with atomic_file(path, shared=shared) as part:
+        part.write_bytes(data)
+
+
+@contextmanager
+def temp_folder(prefix: str, parent: Path | None = None) -> Iterator[Path]:
+    """Yield a temporary folder, removed at the end of the block or by the next process that makes
+    one.
+
+    prefix: begins the names of such folders, and of no others in `parent`.
+    parent: the system's temporary folder by default.
+    """
+    parent = parent or Path(tempfile.gettempdir())
+    parent.mkdir(parents=True, exist_ok=True)
+    remove_dead(parent, prefix)
+    with tempfile.TemporaryDirectory(prefix=prefix, dir=parent, ignore_cleanup_errors=True) as name:
+        folder = Path(name)
+        new = folder / f"{_HELD}.new"
+        with lock(new):
+            new.rename(folder / _HELD)  # locked before another process looks for it
+            try:
+                yield folder
+            finally:
+                _restore(folder)
+
+
+@contextmanager
+def atomic_folder(
+    target: Path, *, existing: Literal["replace", "keep", "refuse"] = "replace"
+) -> Iterator[Path]:
+    """Yield an empty folder that becomes `target` at the end of the block, or is removed after an
+    error.
+
+    existing: whether a folder that exists by then is replaced, is kept in place of the new one,
+    or raises OSError. An empty one is always replaced.
+    """
+    with temp_folder(MAKING, target.parent) as scratch:
+        made = scratch / target.name
+        made.mkdir()
+        yield made
+        old = scratch / _OLD / target.name
+        while True:  # another process may put its own there at any moment
+            try:
+                made.rename(target)
+                return
+            except OSError:
+                if existing == "refuse" or not target.exists():
+                    raise
+            if existing == "keep":
+                return
+            shutil.rmtree(old, ignore_errors=True)
+            old.parent.mkdir(exist_ok=True)
+            with suppress(FileNotFoundError):
+                target.rename(old)
+
+
+def folder_holds(target: Path, name: str) -> bool:
+    """Return whether a folder of `atomic_folder` holds a file, after waiting while it is
+    replaced."""
+    for _ in range(100):
+        if (target / name).exists():
+            return True
+        if not any((one / _OLD / target.name).exists() for one in target.parent.glob(f"{MAKING}*")):
+            break
+        remove_dead(target.parent, MAKING)
+        time.sleep(0.01)
+    return (target / name).exists()
+
+
+def remove_dead(parent: Path, prefix: str) -> None:
+    """Remove unfinished files and temporary folders whose processes have ended.
+
+    A folder that one of them was replacing is put back.
+    """
+    for left in parent.glob(f"{prefix}*"):
+        with suppress(OSError):
+            young = time.time() - left.stat().st_mtime < _YOUNG_S
+            if not left.is_dir():
+                if not young:
+                    left.unlink()
+            elif not (is_locked(left / _HELD) if (left / _HELD).exists() else young):
+                _restore(left)
+                shutil.rmtree(left)
+
+
+def _restore(scratch: Path) -> None:
+    """Put a folder back that was moved away and has no successor."""
+    for old in (scratch / _OLD).glob("*"):
+        target = scratch.parent / old.name
+        if not target.exists():
+            with suppress(OSError):
+                old.rename(target)
+
+
+def size_within(path: Path, most_bytes: int) -> int:
+    """Return the size of a file in bytes. OSError passes.
+
+    Raises ValueError for a larger file, and for a folder, a pipe or a device.
+    """
+    about = path.stat()
+    if not stat.S_ISREG(about.st_mode):
+        raise ValueError("is no regular file")
+    if about.st_size > most_bytes:
+        raise ValueError(f"holds {about.st_size} bytes; at most {most_bytes} are read")
+    return about.st_size
+
+
+def read_within(path: Path, most_bytes: int) -> bytes:
+    """Read a whole file, unless it is too large. Raises as `size_within` does."""
+    size_within(path, most_bytes)
+    return path.read_bytes()
