@@ -52,8 +52,8 @@ def driving_together(environments: int = ENVIRONMENTS, *, shared: bool = True) -
     from cosim.results.run_folder import RunFolder
     from cosim.spec.options import EpisodeOptions
     from cosim.spec.scenario import Suite
-    from scenarios.ipc.child_process import LocalProcesses
     from scenarios.ipc.messages import Hello
+    from scenarios.runs.local import LocalProcesses
     from scenarios.runs.pool import run_all
     from scenarios.runs.run import run_spec
     from scenarios.runs.shared_renderer import SharedRenderer
