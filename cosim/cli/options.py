@@ -62,7 +62,7 @@ EVERY_ADDRESS = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
 """What stands for all addresses of a machine, and by what it reaches itself."""
 LONGEST_WAIT_S = 240.0
 """For a director: an environment process that says nothing for much longer is taken to hang
-(`scenarios.runs.pool`)."""
+(`scenarios.runs.environment_slot`)."""
 
 Tls = Annotated[
     str,

@@ -205,8 +205,8 @@ def carry_out(
     log_json: LogJson = None,
     carrier: AbstractContextManager[Any] | None = None,
 ) -> None:
-    """Do what is asked by the options of `cosim run`. carrier: gives the `Reaches` of workers, in
-    place of processes of this machine; opened before anything is written."""
+    """Do what is asked by the options of `cosim run`. carrier: gives the `TransportFactory` of
+    workers, in place of processes of this machine; opened before anything is written."""
     from bridge import keys
     from bridge.session import notices_of, open_session
     from cosim.results.throughput import Going

@@ -94,10 +94,18 @@ class Board:
 
     def tell(self, message: object) -> None:
         """Take in what a worker says."""
-        from scenarios.ipc.messages import Compares, Done, Waits
+        from scenarios.ipc.messages import Done, Waits
         from scenarios.ipc.messages import Progress as Report
 
-        if isinstance(message, Report):
+        if isinstance(message, Report) and message.compared is not None:
+            self.left.at(message.scenario, self._alone + (1.0 - self._alone) * message.compared)
+            self._bar(
+                message.scenario,
+                message.compared,
+                f"{100.0 * message.compared:.0f} %",
+                "without the robot",
+            )
+        elif isinstance(message, Report):
             one = self._scenarios[message.scenario]
             length_m = one.route_line.length_m
             share = max(message.route_s_m / length_m, message.time_s / one.time_limit_s)
@@ -105,14 +113,6 @@ class Board:
             count = f"{message.route_s_m:.0f}/{length_m:.0f} m"
             note = f"simulated {message.time_s:.0f} s, {message.failures} failures"
             self._bar(one.id, message.route_s_m / length_m, count, note)
-        elif isinstance(message, Compares):
-            self.left.at(message.scenario, self._alone + (1.0 - self._alone) * message.share)
-            self._bar(
-                message.scenario,
-                message.share,
-                f"{100.0 * message.share:.0f} %",
-                "without the robot",
-            )
         elif isinstance(message, Waits):
             words = f"{message.scenario}: {message.reason}"
             self._console.print(words, soft_wrap=True, highlight=False, markup=False)

@@ -24,7 +24,7 @@ from cosim.core.log_event import happened
 from cosim.core.units import duration
 
 if TYPE_CHECKING:
-    from scenarios.runs.status import RunStatus, Under
+    from scenarios.runs.status import RunningEpisode, RunStatus
 
 
 coordinator_app = typer.Typer()
@@ -188,21 +188,21 @@ def status_command(
 
 def _asked(answers: dict[str, bytes], where: str) -> tuple[RunStatus, str]:
     """Raises EngineError when no run is coordinated there."""
-    from scenarios.runs.status import status_in
+    from scenarios.runs.status import decode_status
 
     if not answers:
         raise EngineError(
             f"no run is coordinated at {where}: is `cosim coordinator` started, and the "
             f"address right?"
         )
-    return status_in(next(iter(answers.values()))), ""
+    return decode_status(next(iter(answers.values()))), ""
 
 
 def _of_folder(folder: Path) -> tuple[RunStatus, str]:
     """The status of a run, and a remark on whoever runs it. Raises UsageError when the folder holds
     no run."""
     from cosim.results.run_folder import read_rows, read_spec, refuse_in_use
-    from scenarios.runs.status import STATUS_FILE, RunStatus, status_in
+    from scenarios.runs.status import STATUS_FILE, RunStatus, decode_status
 
     spec = read_spec(folder)
     try:
@@ -214,7 +214,7 @@ def _of_folder(folder: Path) -> tuple[RunStatus, str]:
     total = len(spec.scenarios)
     path = folder / STATUS_FILE
     if runs and path.exists():
-        told = status_in(path.read_bytes())
+        told = decode_status(path.read_bytes())
         late_s = time.time() - told.at_s
         if told.finished <= finished or late_s < _STALE_S:
             return (
@@ -256,23 +256,25 @@ def _picture(told: RunStatus, remark: str) -> Group:
         said += f", {told.per_hour:.0f} an hour, about {duration(told.left_s)} left"
     if told.lost:
         said += f"; {told.lost} lost with their workers and run again"
-    if told.odd:
-        said += f"; {told.odd} messages refused"
+    if told.refused:
+        said += f"; {told.refused} messages refused"
     parts: list[RenderableType] = [Text(said)]
     if told.workers:
         columns = [*tables.names("worker"), *tables.labels("state", "heard")]
         columns += [*tables.figures("done"), *tables.words("episode")]
         rows = []
         for one in told.workers:
-            silent = duration(one.silent_s) if one.silent_s > 0.5 else "now"
-            told_of = "\n".join(_under(under) for under in one.under_way) or one.why
+            state = one.state_at(told.at_s)
+            silent_s = told.at_s - one.heard_at_s
+            silent = duration(silent_s) if silent_s > 0.5 else "now"
+            under_way = "\n".join(_episode(each, told.at_s) for each in one.episodes.values())
             rows.append(
                 (
                     one.name,
-                    Text(one.state, style=_COLOURS[one.state]),
+                    Text(state, style=_COLOURS[state]),
                     silent,
                     str(one.done),
-                    told_of,
+                    under_way or one.why,
                 )
             )
         parts += tables.fitted(out, columns, rows)
@@ -284,10 +286,9 @@ def _picture(told: RunStatus, remark: str) -> Group:
     return Group(*parts)
 
 
-def _under(under: Under) -> str:
-    words = f"{under.scenario} at {under.time_s:.0f} s, {under.share:.0%}"
-    if under.waits:
-        return f"{words}, {under.waits}"
-    return (
-        words if under.still_s < _STILL_S else f"{words}, no progress for {duration(under.still_s)}"
-    )
+def _episode(episode: RunningEpisode, at_s: float) -> str:
+    words = f"{episode.scenario} at {episode.time_s:.0f} s, {episode.share:.0%}"
+    if episode.waits:
+        return f"{words}, {episode.waits}"
+    still_s = at_s - episode.moved_at_s
+    return words if still_s < _STILL_S else f"{words}, no progress for {duration(still_s)}"

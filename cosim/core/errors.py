@@ -52,7 +52,7 @@ class CosimError(Exception):
     ...     raise unknown("suite", "long-horizont", ["long-horizon", "reactive"])
     ... except CosimError as error:
     ...     print(error.exit_code, str(error)[:29])
-    2 unknown suite 'long-horizont
+    2 unknown suite 'long-horizont'
     """
 
     exit_code: ClassVar[int] = BROKEN_MACHINE

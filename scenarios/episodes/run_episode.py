@@ -8,24 +8,17 @@ from dataclasses import dataclass
 
 import msgspec
 
-from cosim.core.errors import (
-    CosimError,
-    DirectorLost,
-    EngineError,
-    MachineError,
-    PolicyError,
-    PolicyServerLost,
-    RendererLost,
-)
+from cosim.core.errors import CosimError, MachineError, RendererLost
 from cosim.core.progress import Progress, ignore
 from cosim.episode.interfaces import Policy
 from cosim.episode.policy_caller import Driver, said_by
 from cosim.results.log import Log
-from cosim.results.record import Record, Status
+from cosim.results.record import Record
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario
 from scenarios.episodes.counterfactual import Beside
 from scenarios.episodes.episode import Episode, Watch
+from scenarios.ipc.faults import verdict_on
 
 
 @dataclass(frozen=True)
@@ -74,11 +67,8 @@ def run_episode(
     except (RendererLost, MachineError):
         raise
     except Exception as error:  # noqa: BLE001  here a failing episode is turned into its record
-        by_policy = isinstance(error, PolicyError | PolicyServerLost)
-        status: Status = "crashed" if by_policy else "invalid"
+        status, again = verdict_on(error)
         record = msgspec.structs.replace(episode.record, status=status, reason=in_words(error))
-        another_time = isinstance(error, EngineError) or not isinstance(error, CosimError)
-        again = another_time and not isinstance(error, DirectorLost)
         return Outcome(record, None, traceback.format_exc(), again)
     finally:
         driver.ended()

@@ -36,13 +36,13 @@ from cosim.spec.selection import scenarios_chosen
 from physics.cameras.choice import camera_of_choice as chosen_camera
 from physics.cameras.choice import renderer_of
 from physics.robots import hash_of_robot
-from scenarios.ipc.child_process import LocalProcesses
 from scenarios.ipc.deadlines import Patience
 from scenarios.ipc.messages import Hello, MessageHandler
+from scenarios.runs.local import LocalProcesses
 from scenarios.runs.policy_host import known_driver
 from scenarios.runs.pool import run_all
 from scenarios.runs.shared_renderer import SharedRenderer, check_shared
-from scenarios.runs.transport import HeldRun, InProcess, Reaches
+from scenarios.runs.transport import HeldRun, InProcess, TransportFactory
 from scenarios.suites.catalog import load_suite, with_robot
 from scenarios.suites.fits import check_places
 
@@ -220,20 +220,20 @@ def held_run(plan: PlannedRun, folder: Path, *, resume: bool) -> Iterator[HeldRu
         if resume
         else RunFolder.create(folder, plan.spec, plan.whole)
     )
-    hello = Hello(plan.policy, plan.driver.manifest, plan.driver.source_hash, host=plan.host)
+    hello = Hello(
+        plan.policy,
+        plan.driver.manifest,
+        plan.driver.source_hash,
+        host=plan.host,
+        patience=plan.patience,
+    )
     with held:
         done = held.finished()
-        yield HeldRun(
-            held,
-            hello,
-            plan.patience,
-            plan.picked,
-            [one for one in plan.picked if one.id not in done],
-        )
+        yield HeldRun(held, hello, plan.picked, [one for one in plan.picked if one.id not in done])
 
 
 def run_what_is_left(
-    plan: PlannedRun, run: HeldRun, reaches: Reaches, tell: MessageHandler
+    plan: PlannedRun, run: HeldRun, reaches: TransportFactory, tell: MessageHandler
 ) -> None:
     """Run what is to be run of it, by workers that are reached so. Raises MachineError,
     UsageError."""
@@ -244,7 +244,7 @@ def run_what_is_left(
         if plan.shared_renderer:
             asks = check_shared(plan.driver, chosen_camera(plan.options.camera))
             drawing = SharedRenderer(
-                run.held.path / "logs", run.hello, asks=asks, patience=run.patience
+                run.held.path / "logs", run.hello, asks=asks, patience=plan.patience
             )
             renderer = stack.enter_context(drawing)
         transport, tell = stack.enter_context(reaches(run, tell))
@@ -255,17 +255,16 @@ def run_what_is_left(
             transport,
             tell=tell,
             options=plan.options,
-            patience=run.patience,
             renderer=renderer,
         )
 
 
-def by_processes(jobs: int) -> Reaches:
+def by_processes(jobs: int) -> TransportFactory:
     """Workers that are so many processes of this machine."""
     return lambda run, tell: nullcontext((LocalProcesses(run.held.path / "logs", jobs), tell))
 
 
-def in_this_process(driver: Driver) -> Reaches:
+def in_this_process(driver: Driver) -> TransportFactory:
     """This process is the worker."""
     return lambda run, tell: nullcontext((InProcess(driver), tell))
 

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from socket import socket
-from typing import TYPE_CHECKING
+
+import msgspec
 
 from cosim.core.clock import Clock
 from cosim.core.errors import MachineError, RendererLost, UsageError
@@ -27,12 +28,10 @@ from cosim.policies.load import load_policy
 from cosim.results.referee import Verdict
 from scenarios.ipc.deadlines import Asked
 from scenarios.ipc.messages import (
-    Compares,
     Done,
     FrameDrawn,
     Hello,
     Job,
-    Learner,
     LostRenderer,
     Message,
     MessageHandler,
@@ -46,9 +45,6 @@ from scenarios.ipc.messages import (
 )
 from scenarios.ipc.render_link import AskedElsewhere, link_to
 from scenarios.runs.policy_host import policy_driver
-
-if TYPE_CHECKING:
-    from scenarios.episodes.episode import Watch
 
 REPORT_EVERY_TICKS = 20
 CANNOT_START = "an environment process cannot start:"
@@ -165,7 +161,7 @@ def _unable_told(say: MessageHandler) -> Iterator[None]:
         raise
 
 
-def _as_begun(driver: Driver, begun: Hello | Learner, again: bool) -> Driver:
+def _as_begun(driver: Driver, begun: Hello, again: bool) -> Driver:
     """A driver that was loaded here, if it is what it was for the run. Raises UsageError."""
     if driver.source_hash != begun.source_hash:
         raise UsageError(
@@ -200,6 +196,7 @@ def run_job(
         from scenarios.episodes.demonstrator import Demonstrator
 
         expert = Demonstrator(driver, collecting, job.options.goal, learner)
+    watcher = _Watcher(job, say)
     try:
         if (shared := job.options.renderer) is not None:
             link_to(shared.address, lambda: say(Waits(name, "waits for the shared renderer")))
@@ -207,9 +204,9 @@ def run_job(
             job.scenario,
             expert or driver,
             job.options,
-            watches=[_watcher(job, say)],
+            watches=[watcher.watch],
             waiting=lambda reason, _=None: say(Waits(name, reason)),
-            comparing=lambda _, share=None: say(Compares(name, share or 0.0)),
+            comparing=watcher.compared,
         )
     except RendererLost as lost:
         return LostRenderer(name, lost.number, lost.asked), False
@@ -221,25 +218,31 @@ def run_job(
     return done, bool(outcome.traceback)
 
 
-def _watcher(job: Job, say: MessageHandler) -> Watch:
-    """Reports progress, and the camera frames that the job asks for."""
-    failures = 0
-    next_frame_s = 0.0
+class _Watcher:
+    """Reports the progress of an episode, and the camera frames that its job asks for."""
 
-    def watch(step: Step, verdict: Verdict) -> None:
-        nonlocal failures, next_frame_s
-        failures += len(verdict.failures)
+    def __init__(self, job: Job, say: MessageHandler) -> None:
+        self._every_s = job.options.frames_every_s
+        self._say = say
+        self._next_frame_s = 0.0
+        self._progress = Progress(job.scenario.id, 0.0, 0.0, 0)
+
+    def watch(self, step: Step, verdict: Verdict) -> None:
         time_s = Clock().time_s(step.tick)
-        if step.frame is not None and job.options.frames_every_s and time_s >= next_frame_s:
+        name = self._progress.scenario
+        failures = self._progress.failures + len(verdict.failures)
+        self._progress = Progress(name, time_s, step.route_s_after_m, failures)
+        if step.frame is not None and self._every_s and time_s >= self._next_frame_s:
             import cv2
 
-            next_frame_s += job.options.frames_every_s
+            self._next_frame_s += self._every_s
             _, png = cv2.imencode(".png", step.frame.rgb[..., ::-1])
-            say(FrameDrawn(job.scenario.id, step.tick, png.tobytes()))
+            self._say(FrameDrawn(name, step.tick, png.tobytes()))
         if step.tick % REPORT_EVERY_TICKS == 0:
-            say(Progress(job.scenario.id, time_s, step.route_s_after_m, failures))
+            self._say(self._progress)
 
-    return watch
+    def compared(self, _stage: str, share: float | None = None) -> None:
+        self._say(msgspec.structs.replace(self._progress, compared=share or 0.0))
 
 
 def said_to_run(wire: Wire, worker: int, message: Message) -> None:

@@ -23,9 +23,9 @@ from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from scenarios.episodes.run_episode import run_episode
 from scenarios.episodes.wiring import crowd_of
-from scenarios.ipc.child_process import LocalProcesses
-from scenarios.ipc.messages import Compares, Done, Hello, Message, Progress
+from scenarios.ipc.messages import Done, Hello, Message, Progress
 from scenarios.places.nets import place
+from scenarios.runs.local import LocalProcesses
 from scenarios.runs.pool import run_all
 from scenarios.suites.crossings import build_all
 from sumo_nets.crowd.demand_log import Entrances
@@ -160,8 +160,8 @@ def test_a_run_gives_signs_of_life_while_it_compares(scenario: Scenario, tmp_pat
         hello = Hello("orca", manifest, driver.source_hash)
         transport = LocalProcesses(folder.path / "logs")
         run_all(folder, short.scenarios, hello, transport, tell=told.append, options=options)
-    assert [type(message) for message in told] == [Progress] * 5 + [Compares] * 5 + [Done]
-    assert [message.share for message in told if isinstance(message, Compares)] == [
+    assert [type(message) for message in told] == [Progress] * 10 + [Done]
+    assert [getattr(message, "compared", None) for message in told[5:-1]] == [
         0.0,
         0.2,
         0.4,

@@ -36,7 +36,8 @@ from scenarios.ipc.messages import (
     Ready,
 )
 from scenarios.ipc.supervisor import BoundedLog
-from scenarios.runs import pool
+from scenarios.runs import environment_slot, pool
+from scenarios.runs.environment_slot import EnvironmentSlot
 from scenarios.runs.shared_renderer import End, SharedRenderer
 from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import PATIENCE_S, Cosim, seed_in_order
@@ -192,10 +193,11 @@ def test_a_first_answer_may_take_longer(
 
 
 class Fake:
-    """A worker that says what a test has prepared, and then nothing; or it ends."""
+    """A process that says what a test has prepared, and then nothing; or it ends."""
 
     log = "worker-0.log"
-    away = False
+    called = "environment"
+    descriptor = None
 
     def __init__(
         self,
@@ -231,7 +233,7 @@ class Fake:
 
 
 class Prepared:
-    """A transport to workers that a test has made."""
+    """A transport to one slot, for processes that a test has made."""
 
     def __init__(self, *fakes: Fake) -> None:
         self.waiting = iter(fakes)
@@ -239,11 +241,11 @@ class Prepared:
     def room(self, busy: int) -> int:
         return 1 - busy
 
-    def unasked(self) -> tuple[()]:
+    def unsolicited(self) -> tuple[()]:
         return ()
 
-    def start(self, hello: Hello) -> Fake:
-        return next(self.waiting)
+    def start(self, hello: Hello) -> EnvironmentSlot:
+        return EnvironmentSlot(lambda: next(self.waiting), hello)
 
     def wait(self, timeout_s: float) -> None:
         """They have said everything."""
@@ -291,10 +293,11 @@ def all_pooled(
         versions={},
         seed=seed_in_order(scenarios),
     )
-    hello = Hello("stop", driver.manifest, driver.source_hash)
+    hello = Hello("stop", driver.manifest, driver.source_hash, patience=Patience(**named))
     with RunFolder.create(folder / "run", spec, suite) as held:
-        given = {"tell": lambda _: None, "patience": Patience(**named), "renderer": renderer}
-        pool.run_all(held, suite.scenarios, hello, transport, **given)
+        pool.run_all(
+            held, suite.scenarios, hello, transport, tell=lambda _: None, renderer=renderer
+        )
         assert next(transport.waiting, None) is None and held.finished() == set(spec.scenarios)
     return sorted(read_records(folder / "run"), key=lambda record: record.scenario)
 
@@ -304,7 +307,7 @@ def test_an_engine_that_hangs_is_tried_again(
 ) -> None:
     """A process that says nothing, while its policy has nothing to answer, is killed; the second
     time it is a crash."""
-    monkeypatch.setattr(pool, "SILENCE_S", 0.0)
+    monkeypatch.setattr(environment_slot, "SILENCE_S", 0.0)
     fakes = (Fake(Ready()), Fake(Ready()))
     record = pooled(tmp_path, *fakes)
     assert (
@@ -323,7 +326,7 @@ def test_a_policy_that_hangs_is_not_tried_again(tmp_path: Path) -> None:
 def test_a_slow_policy_is_no_silence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """While a policy has time left to answer, its process may say nothing for as long as it
     likes."""
-    monkeypatch.setattr(pool, "SILENCE_S", 0.0)
+    monkeypatch.setattr(environment_slot, "SILENCE_S", 0.0)
     slow = Fake(Ready(), asks="act")
     began = time.monotonic()
     record = pooled(tmp_path, slow, answer_s=0.2)
@@ -418,6 +421,28 @@ def test_a_process_that_died_between_two_episodes_has_not_tried_the_second(tmp_p
         "invalid",
         "invalid",
     ]
+
+
+def test_an_episode_finished_before_its_process_died_is_kept(tmp_path: Path) -> None:
+    """A process that dies after sending its record has finished the episode; one that dies before
+    has not, and the episode is run again."""
+    second = msgspec.structs.replace(SCENARIO, id="s-1")
+    first_done, second_done = (
+        Done(
+            one.id,
+            "done",
+            msgspec.structs.replace(
+                begun(one, load_policy("stop").manifest, "h"), ticks=9
+            ).encoded(),
+        )
+        for one in (SCENARIO, second)
+    )
+    fakes = (
+        Fake(Ready(), first_done, ends=True),
+        Fake(Ready(), ends=True),
+        Fake(Ready(), second_done),
+    )
+    assert [record.ticks for record in all_pooled(tmp_path, (SCENARIO, second), *fakes)] == [9, 9]
 
 
 class Ended(SharedRenderer):

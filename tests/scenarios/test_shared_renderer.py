@@ -91,8 +91,8 @@ def linked(renderer: SharedRenderer) -> RendererLink:
 
 def renderer_pid(renderer: SharedRenderer) -> int:
     """The process that draws: the only child of its shepherd."""
-    assert renderer._process is not None
-    shepherd = renderer._process._child.pid
+    assert renderer._watchdog is not None
+    shepherd = renderer._watchdog.process._child.pid
     (child,) = Path(f"/proc/{shepherd}/task/{shepherd}/children").read_text().split()
     return int(child)
 

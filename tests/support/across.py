@@ -55,7 +55,7 @@ from tests.support.plain import plain_zenoh
 
 with plain_zenoh(sys.argv[1], Path(sys.argv[2]), "viewer") as session:
     (status,) = [str(one.ok.key_expr) for one in session.get("cosim/*/status", timeout=600.0)]
-    acts = ("claim", "renew", "result", "failed")
+    acts = ("claim", "report")
     asked = [list(session.get(status.replace("status", f"jobs/{act}"), payload=b"mine", timeout=600.0)) for act in acts]
     print(status.split("/")[2], sum(map(len, asked)), "answers about its jobs")
 """

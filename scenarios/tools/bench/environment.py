@@ -486,8 +486,8 @@ def driving_together() -> list[Figure]:
     in all."""
     from cosim.policies.load import load_policy
     from cosim.results.run_folder import RunFolder
-    from scenarios.ipc.child_process import LocalProcesses
     from scenarios.ipc.messages import Hello
+    from scenarios.runs.local import LocalProcesses
     from scenarios.runs.pool import run_all
     from scenarios.runs.run import run_spec
     from scenarios.runs.shared_renderer import SharedRenderer

@@ -33,8 +33,8 @@ from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import City, Scenario, Suite, read_suite
 from scenarios.episodes.demonstration import Demonstration, check_parquet
 from scenarios.episodes.demonstrator import Demonstrator, learner_of
-from scenarios.ipc.child_process import LocalProcesses
-from scenarios.ipc.messages import Hello, Learner, MessageHandler
+from scenarios.ipc.messages import Hello, MessageHandler
+from scenarios.runs.local import LocalProcesses
 from scenarios.runs.pool import run_all
 from scenarios.runs.run import run_spec
 from scenarios.suites.catalog import with_robot
@@ -156,7 +156,7 @@ def collect(
     beside = (
         None
         if learner is None
-        else Learner(collecting.learner, learner.manifest, learner.source_hash)
+        else Hello(collecting.learner, learner.manifest, learner.source_hash)
     )
     hello = Hello(policy, expert.manifest, expert.source_hash, learner=beside)
     with ExitStack() as stack:
