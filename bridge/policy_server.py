@@ -45,6 +45,7 @@ _MOST_ANSWER_BYTES = (
 )  # of a larger array only the shape is sent, and the simulator refuses it
 _ARRAYS = {"|u1", "<f4"}
 _QUESTIONS = ("reset", "act", "ended")
+_OWN_PACKAGES = {"cosim", "scenarios", "sumo_nets", "physics", "bridge"}
 
 
 class PackedArray(msgspec.Struct, frozen=True):
@@ -427,9 +428,27 @@ def _crash(error: BaseException, among: str = "") -> bytes:
         c if c.isprintable() or c == "\n" else "?" for c in said.encode("utf-8", "replace").decode()
     )
     said = said if len(said) <= MOST_WORDS else f"{said[:MOST_WORDS]} ... ({len(said)} characters)"
-    return encode_asked(
-        Refusal("policy", f"raised {type(error).__name__}{': ' * bool(said)}{said}{among}")
-    )
+    told = f"raised {type(error).__name__}{': ' * bool(said)}{said}{_line_of(error)}{among}"
+    return encode_asked(Refusal("policy", told))
+
+
+def _line_of(error: BaseException) -> str:
+    """Name the file and line of the user's code that an error came from, as " in mine.py:12"; else
+    ""."""
+    found = ""
+    stdlib = Path(traceback.__file__).parent
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        file = Path(frame.f_code.co_filename)
+        installed = (
+            "site-packages" in file.parts or file.name.startswith("<") or stdlib in file.parents
+        )
+        ours = (
+            frame.f_globals.get("__name__", "").partition(".")[0] in _OWN_PACKAGES
+            or str(file) == __file__
+        )
+        if not installed and not ours:
+            found = f" in {file.name}:{line}"
+    return found
 
 
 class _Given(SimpleNamespace):

@@ -14,18 +14,7 @@ import typer
 from rich.table import Table
 
 from cosim.cli.console import err, out
-from cosim.cli.options import (
-    DEFAULT,
-    DIRECTOR,
-    MANY,
-    POLICIES_AT,
-    STEP_IN,
-    Insecure,
-    Tls,
-    connecting,
-    listening,
-    warned,
-)
+from cosim.cli.options import DEFAULT, DIRECTOR, MANY, POLICIES_AT, STEP_IN, Insecure, Tls, warned
 from cosim.cli.progress import doing
 from cosim.cli.tables import print_fitted
 from cosim.core.errors import (
@@ -37,7 +26,7 @@ from cosim.core.errors import (
     UsageError,
     unknown,
 )
-from cosim.spec.connection import Connection, Role
+from cosim.spec.connection import Connection, Role, connecting, listening
 
 if TYPE_CHECKING:
     from bridge.session import Session

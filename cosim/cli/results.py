@@ -13,12 +13,11 @@ from rich.text import Text
 
 from cosim.cli.console import err, out
 from cosim.cli.options import (
-    CAMERA_HELP,
     LOOK,
     MANY,
     RERUN_HELP,
     TRUST,
-    Choice,
+    Camera,
     camera_here,
     check_output,
     replaced,
@@ -151,7 +150,7 @@ def report(
         ),
     ] = 150.0,
     jobs: Annotated[int, typer.Option(min=1, help="Processes that show them again.")] = 2,
-    camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
+    camera: Camera = "auto",
 ) -> None:
     """Write one HTML file about runs: tables beside the paper's, plots, maps of failures, failures
     to play again.
@@ -168,7 +167,8 @@ def report(
         made = make_report(
             folders, output, camera=drawn_by, jobs=jobs, most=failures, within_s=within, tell=tell
         )
-    size = f"{made.size_bytes / 1e6:.1f} MB, {made.shown} of {made.failures} failures"
+    limit = f": {made.limit}" if made.limit else ""
+    size = f"{made.size_bytes / 1e6:.1f} MB, {made.shown} of {made.failures} failures{limit}"
     out.print(f"Report: {output} ({size}){instead}", soft_wrap=True, highlight=False)
 
 

@@ -14,6 +14,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Literal, Protocol, cast
 
 from numpy.typing import NDArray
@@ -31,6 +32,8 @@ from cosim.spec.policy_host import PolicyRuns
 PolicyCall = Literal["loading", "reset", "first act", "act", "on_reset", "ended"]
 """What a policy is busy with. The first answer of an episode may take longer than the others."""
 
+_OWN_PACKAGES = frozenset({"cosim", "scenarios", "sumo_nets", "physics", "bridge"})
+_STDLIB = Path(traceback.__file__).parent
 LOADED_WITHIN_S = 300.0
 """A policy may take so long to be loaded, for a reset and for the first answer, unless a run says
 otherwise."""
@@ -331,7 +334,30 @@ def told_of(error: BaseException) -> str:
     said = said_by(error)
     if isinstance(error, PolicyError):  # of this project: about its answer
         return said
-    return f"raised {type(error).__name__}" + (f": {said}" if said else "")
+    where = line_of(error)
+    return f"raised {type(error).__name__}{f': {said}' if said else ''}{f' in {where}' if where else ''}"
+
+
+def line_of(error: BaseException) -> str:
+    """Name the file and line of the user's code that an error came from, as "mine.py:12"; "" if
+    there is none.
+
+    Code of this project, of Python and of installed packages is not the user's.
+    """
+    found = ""
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        file = Path(frame.f_code.co_filename)
+        installed = (
+            "site-packages" in file.parts
+            or file.is_relative_to(_STDLIB)
+            or file.name.startswith("<")
+        )
+        if (
+            not installed
+            and frame.f_globals.get("__name__", "").partition(".")[0] not in _OWN_PACKAGES
+        ):
+            found = f"{file.name}:{line}"
+    return found
 
 
 def said_by(error: BaseException) -> str:

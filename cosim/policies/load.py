@@ -215,6 +215,7 @@ def checked_manifest(name: str, told: object) -> Manifest:
     wrong with it."""
     try:
         manifest = msgspec.convert(told, Manifest)
+        _refuse_unknown_fields(told, msgspec.to_builtins(manifest))
         with_goal(manifest, None)
         Clock.for_rate(manifest.rate_hz)
         wrong = _wrong(manifest)
@@ -230,6 +231,16 @@ def checked_manifest(name: str, told: object) -> Manifest:
     if wrong:
         raise UsageError(f"policy '{name}': its manifest's {wrong}")
     return manifest
+
+
+def _refuse_unknown_fields(told: object, known: object, place: str = "") -> None:
+    """Raise UsageError for a field of a manifest, or of its cameras, that does not exist."""
+    if not (isinstance(told, dict) and isinstance(known, dict)):
+        return
+    for name in told:
+        if name not in known:
+            raise unknown(f"field{f' of {place}' if place else ''}", str(name), known)
+        _refuse_unknown_fields(told[name], known[name], f"{place}.{name}" if place else str(name))
 
 
 def _wrong(manifest: Manifest) -> str:

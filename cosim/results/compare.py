@@ -17,7 +17,13 @@ from cosim.core.errors import RunError, UsageError
 from cosim.core.geometry import Floats
 from cosim.results.finished_run import WholeRun, read_whole_run
 from cosim.results.metrics import COUNTERFACTUAL, METRICS, POOLED, RATE_NEEDS_M
-from cosim.results.table import BOOTSTRAP, CONFIDENCE, not_to_be_quoted, table_of
+from cosim.results.table import (
+    BOOTSTRAP,
+    CONFIDENCE,
+    injections_in_words,
+    not_to_be_quoted,
+    table_of,
+)
 from cosim.spec.scenario import Scenario
 
 FEWEST_CHANGED: Final = 6
@@ -319,6 +325,8 @@ def _notes(runs: Sequence[WholeRun], told: Sequence[ComparedRun]) -> Iterator[st
             (record.nonstandard for record in run.records.values() if record.nonstandard), ""
         ):
             yield f"{one.label} is nonstandard: {odd}"
+        if words := injections_in_words(one.table):
+            yield f"{one.label}: {words}"
         crashed = sum(record.status == "crashed" for record in run.records.values())
         if crashed:
             yield (

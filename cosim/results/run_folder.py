@@ -192,7 +192,7 @@ class RunFolder:
     def create(cls, path: Path, spec: RunSpec, suite: Suite) -> RunFolder:
         """A new run folder. Raises RunError when one is there already, MachineError where nothing
         can be written."""
-        _refuse_used(path)
+        refuse_used(path)
         return cls(path, spec, suite)
 
     @classmethod
@@ -222,7 +222,7 @@ class RunFolder:
             raise unwritable(self.path, error) from error
         try:
             if self._suite is not None:
-                _refuse_used(self.path)
+                refuse_used(self.path)
                 self._begin(self._suite)
             self._open_database()
         except BaseException:
@@ -481,7 +481,7 @@ def refuse_in_use(path: Path) -> None:
         os.close(lock)
 
 
-def _refuse_used(path: Path) -> None:
+def refuse_used(path: Path) -> None:
     """Raises RunError when a folder holds a run, or something else that is not a run's
     beginning."""
     try:

@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import pandas as pd
 
+from cosim.core.errors import listed
 from cosim.core.geometry import Floats
 from cosim.results.metrics import COUNTERFACTUAL, METRICS, POOLED, RATE_NEEDS_M
 from cosim.results.record import Record
@@ -68,6 +69,9 @@ crashing. Where there is no worst, as of a rate, a run in which a policy crashed
 invalid episode has no measures."""
 MOST_INVALID = 0.02
 """Of what was scheduled; where more is invalid a table says nothing of its policy."""
+INJECTED = "injected"
+"""The column that counts the pedestrians injected into each episode; only runs with injections have
+it."""
 
 
 def table_row(record: Record) -> dict[str, Any]:
@@ -92,10 +96,18 @@ def table_row(record: Record) -> dict[str, Any]:
 
 
 def table_of(records: Iterable[Record]) -> pd.DataFrame:
-    """One row per episode, sorted by scenario id, whatever order they ended in."""
-    rows = sorted((table_row(record) for record in records), key=lambda row: str(row["scenario"]))
+    """One row per episode, sorted by scenario id, whatever order they ended in.
+
+    A run into which pedestrians were injected has the column `INJECTED`, how many in each episode.
+    """
+    records = sorted(records, key=lambda record: record.scenario)
+    rows = [table_row(record) for record in records]
     asked = [name for name in COUNTERFACTUAL if any(name in row for row in rows)]
     columns = [*KEYS, "metric_schema", "versions", *METRICS, *asked]
+    if any(record.injections for record in records):
+        columns.append(INJECTED)
+        for row, record in zip(rows, records, strict=True):
+            row[INJECTED] = len(record.injections)
     return pd.DataFrame(rows, columns=columns)
 
 
@@ -151,6 +163,23 @@ def interval_of(values: Floats, weights: Floats | None = None) -> tuple[float, f
     tail = (1.0 - CONFIDENCE) / 2
     low, high = np.quantile(means, [tail, 1.0 - tail])
     return float(low), float(high)
+
+
+def injections_in_words(table: pd.DataFrame) -> str:
+    """Describe which episodes had injected pedestrians; "" if none had.
+
+    >>> injections_in_words(pd.DataFrame({"scenario": ["a", "b"], "injected": [2, 0]}))
+    'pedestrians were injected into 1 episode (a): its street is not the one of the suite'
+    """
+    if INJECTED not in table:
+        return ""
+    names = [str(name) for name in table.loc[table[INJECTED] > 0, "scenario"]]
+    one = len(names) == 1
+    return (
+        f"pedestrians were injected into {len(names)} episode{'' if one else 's'} "
+        f"({listed('', names)}): {'its street is' if one else 'their streets are'} not the "
+        f"one of the suite"
+    )
 
 
 def not_to_be_quoted(table: pd.DataFrame, scheduled: int) -> str:

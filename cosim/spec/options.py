@@ -12,13 +12,12 @@ from cosim.core.errors import UsageError
 from cosim.spec.connection import Connection
 from cosim.spec.demo_options import Collecting
 from cosim.spec.episode_id import check_seed
-from cosim.spec.goal import GoalProtocol
+from cosim.spec.goal import GoalProtocol, goal_called
 from cosim.spec.injection import Injected, Live
 from cosim.spec.policy_host import PolicyRuns
+from cosim.spec.run_config import MOST_LATENCY_MS, CameraChoice, RunConfig
 
 CameraName = Literal["gl", "bullet", "bullet-egl"]
-CameraChoice = Literal["auto", "gl", "bullet", "bullet-egl"]
-MOST_LATENCY_MS = 10_000.0
 
 
 class Outside(msgspec.Struct, frozen=True, kw_only=True):
@@ -89,6 +88,21 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     latency_ms: float = 0.0
     real_time: bool = False
     collecting: Collecting | None = None
+
+    @classmethod
+    def asked(cls, config: RunConfig) -> EpisodeOptions:
+        """The options that the config of a run asks for. Raises UsageError."""
+        return cls(
+            seed=config.seed,
+            robot=config.robot,
+            own_camera=config.own_camera,
+            goal=goal_called(config.goal) if config.goal else None,
+            camera=config.camera,
+            frames_every_s=config.frames,
+            counterfactual=config.counterfactual,
+            real_time=config.real_time,
+            pace=config.pace,
+        )
 
     def __post_init__(self) -> None:
         check_seed(self.seed)

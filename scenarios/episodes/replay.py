@@ -18,8 +18,9 @@ from cosim.results.log import Log
 from cosim.results.record import Record, log_row
 from cosim.results.referee import Verdict
 from cosim.results.run_folder import read_records
-from cosim.spec.options import CameraChoice, EpisodeOptions
+from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import robot_called
+from cosim.spec.run_config import CameraChoice
 from cosim.spec.scenario import Scenario, read_suite
 from scenarios.episodes.counterfactual import Beside, Compared
 from scenarios.episodes.episode import Episode, Watch

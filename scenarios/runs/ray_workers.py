@@ -52,9 +52,8 @@ def check_ray(on: str) -> Any:
     try:
         import ray
     except ImportError:
-        raise UsageError(
-            f"--on {on} needs Ray, here and on each node: pip install 'sidewalk-cosim[ray]'"
-        ) from None
+        remedy = "pip install -e '.[ray]' in the checkout"
+        raise UsageError(f"--on {on} needs Ray, here and on each node: {remedy}") from None
     return ray
 
 

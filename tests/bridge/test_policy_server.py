@@ -204,7 +204,7 @@ def test_a_remote_policy_is_asked_as_one_here(hub: Connection) -> None:
         )
         assert driver.clock.keys() == {"answer_median_ms", "answer_p95_ms"}
         told = {
-            "raises": "policy 'counting' raised KeyError: 'no such weight' .act at 0.25 s.",
+            "raises": r"'counting' raised KeyError: 'no such weight' in test_policy_server\.py:\d+ \(act at 0\.25 s\)",
             "nan": "answered Command.v_mps=nan, w_radps=0.0.: both must be finite",
             "words": "answered 'left': neither a Command nor waypoints",
             "many": r"answered an array of shape \(50001, 2\): 100002 numbers; an answer holds at most 100000 \(act at",
@@ -474,6 +474,15 @@ def test_a_policy_that_is_not_served_or_not_enough_is_said(
     with (
         served(hub, Counting(), told=knows),
         pytest.raises(UsageError, match="a remote one sees only observations"),
+    ):
+        known_driver("zenoh:counting", at)
+    wrong = Counting.manifest | {"camera": {"width": 64, "hight": 64}}
+    with (
+        served(hub, Counting(), told=wrong),
+        pytest.raises(
+            UsageError,
+            match=r"unknown field of camera 'hight'\. Valid choices: .*Did you mean height",
+        ),
     ):
         known_driver("zenoh:counting", at)
     large = Counting.manifest | {"camera": {"width": 2000, "height": 2000}}

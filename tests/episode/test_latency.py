@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cosim.cli.options import with_latency
 from cosim.cli.run_table import print_terms
 from cosim.core.errors import UsageError
 from cosim.core.geometry import Floats
@@ -25,11 +24,12 @@ from cosim.results.run_folder import read_records, read_spec
 from cosim.results.table import table_of
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
+from cosim.spec.run_config import RunConfig
 from cosim.spec.scenario import Scenario, Suite, write_suite
 from scenarios.episodes.replay import Recorded, replayed
 from scenarios.episodes.run_episode import run_episode
 from scenarios.runs import run as suite_run
-from scenarios.runs.run import check_alone
+from scenarios.runs.planning import check_alone
 from scenarios.suites.catalog import load_suite
 from scenarios.tools.verify.doctor import small_scenario
 from tests.cli.terminal.test_run_table import terminal
@@ -123,11 +123,8 @@ def test_tables_tell_of_latency_where_there_is_any() -> None:
 )
 def test_a_latency_that_cannot_be_had_is_refused(asked: str, real_time: bool, told: str) -> None:
     """By name, with the remedy."""
-    whole = load_suite("reactive")
     with pytest.raises(UsageError, match=re.escape(told)):
-        with_latency(
-            EpisodeOptions(), asked, real_time, None, whole, whole.scenarios[0], "stop", 4.0
-        )
+        RunConfig(suite="reactive", latency=asked, real_time=real_time)
 
 
 def small_in_two_s() -> Scenario:

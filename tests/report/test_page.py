@@ -129,11 +129,13 @@ def test_the_gallery_shows_every_kind_and_cause_and_no_more_than_asked_for(tmp_p
     ways = [short_way(f"s-{i:03d}", structure=kind) for i, kind in enumerate(kinds)]
     runs = read_runs([run_of(tmp_path / "run", [HIT] * 38, "mine", ways)])
     candidates = shown_of(runs)
-    picked = most_telling(candidates, 3)
+    picked = most_telling(candidates, 3).picks
     assert len(candidates) == 38 and {kinds[int(one.scenario[2:])] for one in picked} == {*kinds}
+    picked, limit = most_telling(candidates, 48)
     assert (
-        len(most_telling(candidates, 48)) == 36
-        and len({one.scenario for one in most_telling(candidates, 48)}) == 36
+        len(picked) == 36
+        and len({one.scenario for one in picked}) == 36
+        and limit.startswith("the others show no")
     )
 
 
@@ -152,8 +154,8 @@ def test_what_takes_long_to_come_to_is_not_shown_where_something_else_tells_as_m
         )
         for k in range(12)
     ]
-    assert most_telling([late[0], soon], 1) == [soon]
-    assert len(most_telling([*late, soon])) == 6
+    assert most_telling([late[0], soon], 1) == ([soon], "--failures 1")
+    assert len(most_telling([*late, soon]).picks) == 6
 
 
 def test_of_an_episode_its_first_failure_is_shown_and_others_that_come_soon(tmp_path: Path) -> None:
@@ -167,9 +169,9 @@ def test_of_an_episode_its_first_failure_is_shown_and_others_that_come_soon(tmp_
         )
         for name, tick in (("one", 80), ("one", 2000), ("one", 4000), ("other", 4000))
     ]
-    picked = {(one.scenario, one.mishap.tick) for one in most_telling(every)}
+    picked = {(one.scenario, one.mishap.tick) for one in most_telling(every).picks}
     assert picked == {("one", 80), ("one", 2000), ("other", 4000)}
-    assert len(most_telling(every, within_s=200.0)) == 4
+    assert len(most_telling(every, within_s=200.0).picks) == 4
 
 
 def test_how_far_the_failures_are_is_told_while_they_are_shown() -> None:

@@ -180,12 +180,37 @@ def test_another_camera_is_told_and_the_verdict_stays(runs: Path, tmp_path: Path
     assert not any("sees by" in note for note in compare_runs([runs / "a", large]).notes)
 
 
-def rewritten(run: Path, target: Path, **fields: object) -> Path:
-    """A copy of a run whose records have other fields."""
+def test_a_run_with_injected_pedestrians_is_marked(
+    runs: Path, tmp_path: Path, cosim: Cosim
+) -> None:
+    """In results.csv, below the table and in a comparison; a run without them has no such
+    column."""
+    injected = rewritten(
+        runs / "a", tmp_path / "a", "s-001", injections=[{"tick": 3, "injection": EVE}]
+    )
+    table = pd.read_csv(injected / "results.csv")
+    assert dict(zip(table["scenario"], table["injected"], strict=True)) == {
+        f"s-{i:03d}": int(i == 1) for i in range(20)
+    }
+    assert "injected" not in pd.read_csv(runs / "a" / "results.csv")
+    words = "pedestrians were injected into 1 episode (s-001)"
+    shown = cosim("show", str(injected)).stdout
+    assert "s-001+" in shown and words in " ".join(shown.split())
+    assert any(words in note for note in compare_runs([runs / "b", injected]).notes)
+    assert not any("injected" in note for note in compare_runs([runs / "a", runs / "b"]).notes)
+
+
+EVE = {"id": "eve", "path": [[4.0, 1.0], [4.0, -1.0]]}
+
+
+def rewritten(run: Path, target: Path, of: str = "", **fields: object) -> Path:
+    """A copy of a run whose records have other fields. of: the scenario of the record, "" for all
+    of them."""
     with RunFolder.create(target, read_spec(run), read_suite(run / "scenarios.json")) as folder:
         for record in read_records(run):
+            other = fields if of in ("", record.scenario) else {}
             told = msgspec.json.decode(
-                msgspec.json.encode(msgspec.to_builtins(record) | fields), type=Record
+                msgspec.json.encode(msgspec.to_builtins(record) | other), type=Record
             )
             folder.keep(told, (run / f"episodes/{record.scenario}/trajectory.npz").read_bytes())
         folder.finish()

@@ -205,7 +205,9 @@ def test_without_gymnasium_one_is_told_what_to_install(monkeypatch: pytest.Monke
     """The extra is named."""
     monkeypatch.delitem(sys.modules, "scenarios.tools.gym.environment", raising=False)
     monkeypatch.setitem(sys.modules, "gymnasium", None)
-    with pytest.raises(UsageError, match=r"need Gymnasium.*pip install 'sidewalk-cosim\[gym\]'"):
+    with pytest.raises(
+        UsageError, match=r"need Gymnasium.*pip install -e '\.\[gym\]' in the checkout"
+    ):
         cosim.make_env("unit")
 
 

@@ -171,6 +171,6 @@ def test_without_ray_it_is_said_what_to_install(
     said = cosim("run", "reactive", "--policy", "straight", "--on", "ray", cwd=tmp_path)
     assert (
         said.returncode == 2
-        and "pip install 'sidewalk-cosim[ray]'" in said.stderr
+        and "pip install -e '.[ray]' in the checkout" in said.stderr
         and not [*tmp_path.iterdir()]
     )

@@ -44,7 +44,8 @@ from physics.dynamics.drive import SkidDrive
 from physics.robots import hash_of_robot, urdf_of
 from physics.street.street_surface import StreetSurface
 from scenarios.places.nets import place
-from scenarios.runs.run import run, run_spec
+from scenarios.runs.planning import run_spec
+from scenarios.runs.run import run
 from scenarios.suites.catalog import load_suite, with_robot
 from scenarios.suites.fits import misfits
 from scenarios.tools.verify.doctor import small_scenario

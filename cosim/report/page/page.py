@@ -20,7 +20,7 @@ from cosim.report.page.runs import ReportedRun, place_in_words
 from cosim.report.page.scene import Entry, PlacePicture, Spot
 from cosim.report.page.three_tables import summary_html, tables_html, warnings_html, wide_html
 from cosim.results.log import holds_waypoints
-from cosim.results.table import policy_in_words
+from cosim.results.table import injections_in_words, policy_in_words
 from cosim.results.throughput import median_answer_ms
 
 _POLICY: Final = (
@@ -229,8 +229,20 @@ def _places(maps: Maps, causes: Mapping[str, Counter[str]]) -> str:
     heads += '<th scope="col" class="word">what went wrong</th>'
     listed = wide_html("Every place", f"<tr>{heads}</tr>", rows)
     return (
-        f'<p class="intro">Dots are failures; the large ones open.</p>{chooser}'
+        f'<p class="intro">Dots are failures; the large ones open.</p>{chooser}{_credits(maps)}'
         f"<details><summary>Every place ({len(maps.episodes)})</summary>{listed}</details>"
+    )
+
+
+def _credits(maps: Maps) -> str:
+    """Credit the data of places that were made from maps."""
+    of: dict[str, list[str]] = {}
+    for picture in maps.pictures:
+        if picture.credit:
+            of.setdefault(picture.credit.replace("(c)", "©"), []).append(picture.place)
+    return "".join(
+        f'<p class="intro">Map data of {escape(", ".join(names))}: {escape(credit)}.</p>'
+        for credit, names in of.items()
     )
 
 
@@ -295,6 +307,7 @@ def _facts(run: ReportedRun) -> dict[str, str]:
         "waypoints": spec.waypoints.in_words if follows else "none: it answers with commands",
         "robot": ", ".join(f"{name} ({digest})" for name, digest in spec.robots.items()),
         "seed of the run": str(spec.seed),
+        "injected": injections_in_words(run.table) or "nobody",
         "wall time": wall,
         "folder": str(run.path),
     }

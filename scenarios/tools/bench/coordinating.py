@@ -33,6 +33,7 @@ from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import City, Scenario, Suite
 from scenarios.ipc.deadlines import Patience
 from scenarios.ipc.messages import Hello, Job
+from scenarios.runs.planning import run_spec
 from scenarios.runs.pool import run_all
 from scenarios.runs.protocol import (
     Claim,
@@ -44,7 +45,6 @@ from scenarios.runs.protocol import (
     installed_here,
     reply_in,
 )
-from scenarios.runs.run import run_spec
 from scenarios.runs.transport import HeldRun
 from scenarios.runs.zenoh_transport import workers_of_run
 from scenarios.tools.bench.figures import MORE, Figure

@@ -35,8 +35,8 @@ from scenarios.episodes.demonstration import Demonstration, check_parquet
 from scenarios.episodes.demonstrator import Demonstrator, learner_of
 from scenarios.ipc.child_process import LocalProcesses
 from scenarios.ipc.messages import Hear, Hello, Learner
+from scenarios.runs.planning import run_spec
 from scenarios.runs.pool import run_all
-from scenarios.runs.run import run_spec
 from scenarios.suites.catalog import with_robot
 from scenarios.suites.fits import check_places
 from scenarios.suites.new_scenarios import Fresh

@@ -62,9 +62,8 @@ def make_env(
     try:
         from scenarios.tools.gym.environment import SidewalkEnv
     except ImportError as error:
-        raise UsageError(
-            f"environments need Gymnasium ({error}): pip install 'sidewalk-cosim[gym]'"
-        ) from None
+        remedy = "pip install -e '.[gym]' in the checkout"
+        raise UsageError(f"environments need Gymnasium ({error}): {remedy}") from None
     if options.counterfactual:
         raise UsageError(
             "no episode of an environment is compared with its street: leave counterfactual out"

@@ -42,8 +42,8 @@ from cosim.report.minimap import COLOURS, PLANNED, RED_SIGNAL, VEHICLE
 from cosim.results.referee import Verdict
 from cosim.results.waypoint_replay import Following
 from cosim.spec.camera import CameraSpec
-from cosim.spec.options import CameraChoice
 from cosim.spec.robot import robot_called
+from cosim.spec.run_config import CameraChoice
 from cosim.spec.scenario import Scenario
 from physics.street.surface import Surface
 from scenarios.episodes.replay import Alike, Recorded, check, recorded, replaying

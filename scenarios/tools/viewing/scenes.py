@@ -26,8 +26,8 @@ from cosim.results.referee import Verdict
 from cosim.results.waypoint_replay import Following
 from cosim.spec.camera import CameraSpec
 from cosim.spec.obstacle import footprint
-from cosim.spec.options import CameraChoice
 from cosim.spec.robot import robot_called
+from cosim.spec.run_config import CameraChoice
 from physics.cameras.view import robot_shot
 from scenarios.episodes.replay import Alike, Recorded, recorded, replaying
 from scenarios.places.nets import place, surface_of_place
