@@ -23,7 +23,8 @@ from cosim.cli.options import (
     replaced,
     size_called,
 )
-from cosim.cli.progress import Board, doing
+from cosim.cli.progress import doing
+from cosim.cli.run_progress import Board
 from cosim.core.errors import INTERRUPTED, UsageError, unknown
 from cosim.core.telling import Tell
 

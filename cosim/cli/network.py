@@ -385,7 +385,7 @@ def serve_command(
     from cosim.episode.interfaces import Policy
     from cosim.episode.policy_caller import Untimed
     from cosim.policies.load import load_policy
-    from scenarios.runs.observation_codec import seen_from_afar
+    from scenarios.runs.observation_codec import ObservationDecoder
 
     first = load_policy(policy)
     if first.manifest.privileged:
@@ -411,7 +411,7 @@ def serve_command(
             jpeg=jpeg,
             told=first.manifest,
             source=first.source_hash,
-            observe=seen_from_afar,
+            decoder=ObservationDecoder,
             session=session.itself,
         )
     raise typer.Exit(INTERRUPTED)

@@ -42,7 +42,8 @@ from cosim.cli.options import (
     with_latency,
     write_rerun,
 )
-from cosim.cli.progress import Board, doing
+from cosim.cli.progress import doing
+from cosim.cli.run_progress import Board
 from cosim.core.errors import INTERRUPTED, SOME_CRASHED, UsageError, unknown
 
 if TYPE_CHECKING:

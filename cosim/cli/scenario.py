@@ -27,7 +27,8 @@ from cosim.cli.options import (
     with_latency,
     write_rerun,
 )
-from cosim.cli.progress import Board, doing
+from cosim.cli.progress import doing
+from cosim.cli.run_progress import Board
 from cosim.cli.tables import print_fitted
 from cosim.core.bounding_box import box_of, refuse_outside
 from cosim.core.errors import (

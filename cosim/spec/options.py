@@ -32,10 +32,12 @@ class Outside(msgspec.Struct, frozen=True, kw_only=True):
 
 class RendererAt(msgspec.Struct, frozen=True, kw_only=True):
     """The shared renderer of a run. address: where it listens; asks: whether the policy is there
-    and asked there, for all episodes together (`act_batch`)."""
+    and asked there, for all episodes together (`act_batch`). number: for the renderer, which of the
+    run it is, from 1."""
 
     address: str
     asks: bool
+    number: int = 0
 
 
 LEAST_PACE = 0.1

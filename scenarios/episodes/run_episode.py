@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import msgspec
 
+from bridge.policy_server import said_by
 from cosim.core.errors import (
     CosimError,
     DirectorLost,
@@ -18,7 +19,7 @@ from cosim.core.errors import (
     RendererLost,
 )
 from cosim.episode.interfaces import Policy
-from cosim.episode.policy_caller import Driver, said_by
+from cosim.episode.policy_caller import Driver
 from cosim.results.log import Log
 from cosim.results.record import Record, Status
 from cosim.spec.options import EpisodeOptions

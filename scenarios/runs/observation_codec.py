@@ -1,110 +1,131 @@
-"""An observation as it arrives at a policy that is asked from another process, made what `act` is
-given in one."""
+"""The codec of observations for policies in other processes: an Observation as a message, and
+back."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final
+from types import MappingProxyType
+from typing import Any, ClassVar, Final, get_args
 
+import msgspec
 import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry import MultiPolygon, Polygon
 
-from bridge.policy_server import AboutEpisode, AskAct
-from cosim.core.state import frozen
-from cosim.episode.interfaces import Observation
+from bridge.policy_server import AboutEpisode, EpisodeDecoder
+from cosim.core.geometry import Polyline
+from cosim.core.state import People, RobotState, Signal, Vehicles, frozen, write_protected
+from cosim.episode.interfaces import Observation, Privileged
 from cosim.spec.camera import Calibration, CameraPicture
-from cosim.spec.goal import Goal, ImageGoal, Instruction, PointGoal, RoutePatch
+from cosim.spec.goal import Goal
 from cosim.spec.odometry import Odometry
 from cosim.spec.robot import Robot, robot_called
 
-GOAL: Final = "goal"
-"""What the array of a goal is called; those of further cameras begin with the camera's name and a
-slash."""
-
-
-def told_goal(goal: Goal | None) -> tuple[dict[str, Any] | None, np.ndarray[Any, Any] | None]:
-    """A goal as it travels, and its array."""
-    match goal:
-        case PointGoal(x_m, y_m):
-            return {"type": "point", "x_m": x_m, "y_m": y_m}, None
-        case Instruction(text):
-            return {"type": "instruction", "text": text}, None
-        case ImageGoal(rgb):
-            return {"type": "image"}, rgb
-        case RoutePatch(pixels):
-            return {"type": "route_patch"}, pixels
-    return None, None
-
-
-def told_about(seen: Observation) -> AboutEpisode:
-    """What stays as it is while an episode lasts."""
-    robot = {name: getattr(seen.robot, name) for name in _OF_A_ROBOT}
-    cameras = {name: _told_camera(one.camera) for name, one in seen.pictures.items()}
-    if seen.camera is not None:
-        cameras[""] = _told_camera(seen.camera)
-    return AboutEpisode(robot, cameras)
-
-
-def seen_from_afar(
-    episode: str, about: AboutEpisode, told: AskAct, arrays: Mapping[str, Any]
-) -> Observation:
-    """What the policy is given. Raises ValueError, KeyError and TypeError for what is no
-    observation."""
-    cameras = {
-        name: Calibration(*map(frozen, map(np.array, one))) for name, one in about.cameras.items()
-    }
-    robot = robot_called(str(about.robot["name"]))
-    pictures = {
-        name: CameraPicture(
-            arrays[f"{name}/rgb"], arrays.get(f"{name}/labels"), arrays.get(f"{name}/depth"), camera
-        )
-        for name, camera in cameras.items()
-        if name
-    }
-    return Observation(
-        tick=told.tick,
-        time_s=told.time_s,
-        rgb=arrays.get("rgb"),
-        v_mps=told.v_mps,
-        w_radps=told.w_radps,
-        robot=robot,
-        episode=episode,
-        reset=told.reset,
-        goal=_goal(told.goal, arrays.get(GOAL)),
-        odometry=None if told.odometry is None else Odometry(*told.odometry),
-        camera=cameras.get(""),
-        depth=arrays.get("depth"),
-        labels=arrays.get("labels"),
-        pictures=pictures,
-    )
-
-
-def arrays_of(seen: Observation) -> dict[str, np.ndarray[Any, Any]]:
-    """All arrays of an observation but its goal's, by the names by which they travel."""
-    found = {"rgb": seen.rgb, "depth": seen.depth, "labels": seen.labels}
-    for name, one in seen.pictures.items():
-        found |= {f"{name}/rgb": one.rgb, f"{name}/depth": one.depth, f"{name}/labels": one.labels}
-    return {name: array for name, array in found.items() if array is not None}
-
-
-def _goal(told: Mapping[str, Any] | None, array: Any) -> Goal | None:
-    match told:
-        case None:
-            return None
-        case {"type": "point", "x_m": x_m, "y_m": y_m}:
-            return PointGoal(x_m, y_m)
-        case {"type": "instruction", "text": text}:
-            return Instruction(text)
-        case {"type": "image"}:
-            return ImageGoal(array)
-        case {"type": "route_patch"}:
-            return RoutePatch(array)
-    raise ValueError("a goal of no known kind")
-
-
-def _told_camera(camera: Calibration) -> tuple[list[list[float]], list[float], list[list[float]]]:
-    return camera.matrix.tolist(), camera.distortion.tolist(), camera.on_robot.tolist()
-
-
-_OF_A_ROBOT: Final = tuple(
+Arrays = dict[str, NDArray[Any]]
+_ROBOT_FIELDS: Final = tuple(
     name for name in Robot.__dataclass_fields__ if name not in ("urdf", "drive", "mounts")
 )
+"""Fields of a robot that are sent: its size and limits."""
+_GOALS: Final = {str(kind.__struct_config__.tag): kind for kind in get_args(Goal)}
+
+
+def encode_extra(value: object) -> object:
+    """Encode arrays and read-only mappings, which MessagePack does not know (an `enc_hook`)."""
+    if isinstance(value, np.ndarray):
+        return value.dtype.str, value.shape, value.tobytes()
+    if isinstance(value, MappingProxyType):
+        return dict(value)
+    raise NotImplementedError(f"a {type(value).__name__} cannot be sent")
+
+
+def decode_extra(kind: type, packed: Any) -> Any:
+    """Decode a write-protected array (a `dec_hook`)."""
+    dtype, shape, data = packed
+    return write_protected(np.frombuffer(data, dtype).reshape(shape), dtype)
+
+
+_Moment = tuple[
+    RobotState, float, People, Vehicles, Mapping[str, Signal], tuple[tuple[str, float, float], ...]
+]
+"""The fields of `Privileged` that change, in their order, without route and free ground."""
+_encode = msgspec.msgpack.Encoder(enc_hook=encode_extra).encode
+_decode_moment = msgspec.msgpack.Decoder(_Moment, dec_hook=decode_extra).decode
+_decode_ground = msgspec.msgpack.Decoder(
+    tuple[NDArray[np.float64], bytes], dec_hook=decode_extra
+).decode
+
+
+def encoded_about(seen: Observation) -> AboutEpisode:
+    """Encode the constants of an episode."""
+    robot = {name: getattr(seen.robot, name) for name in _ROBOT_FIELDS}
+    cameras = {name: one.camera for name, one in seen.pictures.items()}
+    if seen.camera is not None:
+        cameras[""] = seen.camera
+    told = {
+        name: (one.matrix.tolist(), one.distortion.tolist(), one.on_robot.tolist())
+        for name, one in cameras.items()
+    }
+    known = seen.privileged
+    ground = b"" if known is None else _encode((known.route.points, shapely.to_wkb(known.free)))
+    return AboutEpisode(robot, told, ground)
+
+
+def encoded_fields(seen: Observation) -> tuple[dict[str, Any], Arrays]:
+    """Encode an observation: the fields of an `AskAct`, and the arrays that belong to it."""
+    arrays = {"rgb": seen.rgb, "depth": seen.depth, "labels": seen.labels}
+    for name, one in seen.pictures.items():
+        arrays |= {f"{name}/rgb": one.rgb, f"{name}/depth": one.depth, f"{name}/labels": one.labels}
+    goal: dict[str, Any] | None = None
+    if seen.goal is not None:
+        goal = {"type": seen.goal.__struct_config__.tag, **msgspec.structs.asdict(seen.goal)}
+        for name, value in [*goal.items()]:
+            if isinstance(value, np.ndarray):
+                arrays[f"goal.{name}"] = goal.pop(name)
+    fields = {name: getattr(seen, name) for name in ("tick", "time_s", "v_mps", "w_radps", "reset")}
+    fields["goal"] = goal
+    if seen.odometry is not None:
+        fields["odometry"] = msgspec.structs.astuple(seen.odometry)
+    if (known := seen.privileged) is not None:
+        fields["knowledge"] = _encode(
+            (
+                known.robot,
+                known.route_s_m,
+                known.people,
+                known.vehicles,
+                known.signals,
+                known.crossings,
+            )
+        )
+    return fields, {name: array for name, array in arrays.items() if array is not None}
+
+
+class ObservationDecoder(EpisodeDecoder):
+    """Decodes the observations of one episode to what a policy in this process would get.
+
+    Raises an error for what is no observation.
+    """
+
+    makes: ClassVar[dict[str, Any]] = {
+        "robot": lambda **fields: robot_called(fields["name"]),
+        "camera": lambda **arrays: Calibration(
+            **{name: frozen(one) for name, one in arrays.items()}
+        ),
+        "picture": CameraPicture,
+        "goal": lambda type, **fields: _GOALS[type](**fields),
+        "odometry": Odometry,
+        "observation": Observation,
+    }
+    _ground: tuple[Polyline, Polygon | MultiPolygon] | None = None
+
+    def privileged(self, knowledge: bytes) -> Privileged:
+        if self._ground is None:
+            points, wkb = _decode_ground(self.about.knowledge)
+            free = shapely.from_wkb(wkb)
+            if not isinstance(free, Polygon | MultiPolygon):
+                raise ValueError(f"a {type(free).__name__} is no ground")
+            shapely.prepare(free)
+            self._ground = Polyline(points), free
+        route, free = self._ground
+        robot, route_s_m, people, vehicles, signals, crossings = _decode_moment(knowledge)
+        return Privileged(robot, route, route_s_m, people, vehicles, signals, crossings, free)

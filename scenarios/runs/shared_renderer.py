@@ -22,8 +22,7 @@ from cosim.spec.manifest import Manifest
 from cosim.spec.options import CameraName, RendererAt
 from scenarios.ipc.child_process import KeptProcess
 from scenarios.ipc.deadlines import Patience
-from scenarios.ipc.messages import Hello, Message, Ready, Unable
-from scenarios.ipc.render_protocol import RendererHello, encode_exchange
+from scenarios.ipc.messages import Hello, Message, Ready, Unable, encode_message
 
 RENDERERS: Final = 3
 """So many may end, one after the other, without an episode that ends in between."""
@@ -123,7 +122,8 @@ class SharedRenderer:
     def _start(self) -> None:
         log = self._logs / f"renderer-{len(self._ends)}.log"
         self._process = KeptProcess(log, _SERVES, "renderer", (self._listening.fileno(),))
-        self._process.send(encode_exchange(RendererHello(self._hello, len(self._ends) + 1)))
+        at = msgspec.structs.replace(self.at, number=len(self._ends) + 1)
+        self._process.send(encode_message(msgspec.structs.replace(self._hello, renderer=at)))
         self._ready = False
         self._heard_at_s = time.monotonic()
 

@@ -18,10 +18,11 @@ from pathlib import Path
 from socket import socket
 from typing import TYPE_CHECKING
 
+from bridge.policy_server import said_by
 from cosim.core.clock import Clock
 from cosim.core.errors import MachineError, RendererLost, UsageError
 from cosim.core.framing import Wire
-from cosim.episode.policy_caller import Driver, said_by
+from cosim.episode.policy_caller import Driver
 from cosim.episode.step import Step
 from cosim.policies.load import load_policy
 from cosim.results.referee import Verdict
@@ -44,8 +45,9 @@ from scenarios.ipc.messages import (
     decode_job,
     encode_message,
 )
-from scenarios.ipc.render_link import AskedElsewhere, link_to
+from scenarios.ipc.render_link import link_to
 from scenarios.runs.policy_host import policy_driver
+from scenarios.runs.shared import shared_driver
 
 if TYPE_CHECKING:
     from scenarios.episodes.episode import Watch
@@ -133,7 +135,9 @@ class DriversHere:
 def drivers_here(hello: Hello, timer: Asked, say: Hear, *, again: bool = False) -> DriversHere:
     """See `policy_here`; the learner is held against what it was for the run in the same way."""
     if hello.renderer is not None and hello.renderer.asks:
-        driver: Driver = AskedElsewhere(hello.manifest, hello.source_hash, hello.renderer)
+        driver: Driver = shared_driver(
+            hello.manifest, hello.source_hash, hello.renderer, hello.host.run
+        )
     else:
         driver = policy_here(hello, timer, say, again=again)
     if (learner := hello.learner) is None:

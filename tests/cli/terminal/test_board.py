@@ -9,7 +9,7 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from cosim.cli.progress import SETUP_M, Board, Left
+from cosim.cli.run_progress import SETUP_M, Board, Left
 from cosim.core.telling import duration
 from scenarios.ipc.messages import Compares, Done, Progress
 from scenarios.suites.catalog import load_suite
