@@ -34,7 +34,7 @@ def director(run: str, env: str) -> str:
 
 
 def job(run: str, act: str) -> str:
-    """Where workers of a run do this with its jobs: claim, renew, result, failed."""
+    """Where workers of a run do this with its jobs: claim, report."""
     return f"cosim/{name(run)}/jobs/{name(act)}"
 
 

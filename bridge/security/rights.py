@@ -60,7 +60,7 @@ _ADMITTED: Final[dict[Role, tuple[Role, ...]]] = {
 """Whom a hub has business with."""
 _LARGEST_B: Final = {
     64 << 10: (f"{_ENV}/inject", "cosim/*/jobs/claim"),
-    1 << 20: (f"{_ENV}/director", "cosim/*/jobs/failed"),
+    1 << 20: (f"{_ENV}/director",),
     1 << 10: (
         "cosim/*/status",
         "cosim/*/nets/*",

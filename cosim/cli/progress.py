@@ -1,162 +1,20 @@
-"""Progress on standard error: stages, shares done and remaining time."""
+"""How the command line says what takes its time: a moving line in a terminal, a plain line for each
+stage elsewhere."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator
 from contextlib import contextmanager
-from math import fsum
-from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
 from cosim.cli.console import err
 from cosim.core.telling import Tell, duration
 
-if TYPE_CHECKING:
-    from cosim.spec.scenario import Scenario
-
-
-SETUP_M = 30.0
-"""Starting an episode takes about as long as so many metres of its route."""
-PACED_SETUP_M = 3.0
-"""The same for each time real time that episodes are held to, as they take longer then and starting
-them does not."""
-ALONE = 0.74
-"""Of an episode that is compared with its street without the robot, the share of the episode
-itself."""
-_SURE = 0.02
-_SURE_S = 5.0
-"""Of a smaller share of a run, or after less time, nothing is concluded."""
-BAR = 12
-"""Columns of a bar: the display fits a terminal of 80."""
-
-
-class Left:
-    """How much of a run is left: its episodes weigh what their routes are long, and their
-    starts."""
-
-    def __init__(self, lengths_m: Mapping[str, float], setup_m: float = SETUP_M) -> None:
-        self._lengths_m = lengths_m
-        self._setup_m = setup_m
-        self._shares: dict[str, float] = {}
-
-    def at(self, scenario: str, share: float) -> None:
-        """An episode has started, and is done to that share."""
-        self._shares[scenario] = min(share, 1.0)
-
-    @property
-    def share(self) -> float:
-        """What of the run is done, 0 to 1."""
-        if not self._lengths_m:
-            return 1.0
-        done_m = fsum(
-            self._setup_m + self._lengths_m[name] * share for name, share in self._shares.items()
-        )
-        return done_m / fsum(self._setup_m + length_m for length_m in self._lengths_m.values())
-
-    def seconds(self, since_s: float) -> float | None:
-        """How long the rest takes, judged by the `since_s` seconds that the run took so far; None:
-        too early to say."""
-        if self.share < _SURE or since_s < _SURE_S:
-            return None
-        return since_s * (1.0 - self.share) / self.share
-
-
-class Board:
-    """The progress display of a run: one bar for all of it, one for each episode under way.
-
-    done: ids of the scenarios that were finished before. compared: each episode is compared with
-    its street without the robot. pace: episodes are held to so many times real time, 0 for none.
-    """
-
-    def __init__(
-        self,
-        scenarios: Sequence[Scenario],
-        done: Set[str],
-        *,
-        compared: bool = False,
-        pace: float = 0.0,
-        console: Console = err,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        text = ("{task.description}", "{task.fields[count]}", "{task.fields[note]}")
-        name, count, note = (TextColumn(words, markup=False) for words in text)
-        self.bars = Progress(
-            name, BarColumn(BAR), count, note, TimeElapsedColumn(), console=console
-        )
-        lengths_m = {s.id: s.route_line.length_m for s in scenarios if s.id not in done}
-        self.left = Left(lengths_m, min(SETUP_M, PACED_SETUP_M * pace) if pace else SETUP_M)
-        self._scenarios = {s.id: s for s in scenarios}
-        self._finished = len(done)
-        self._alone = ALONE if compared else 1.0
-        self._console = console
-        self._clock = clock
-        self._began_s = clock()
-        self._all = self.bars.add_task("episodes", total=1.0, count="", note="")
-        self._tasks: dict[str, TaskID] = {}
-        self._show()
-
-    def tell(self, message: object) -> None:
-        """Take in what a worker says."""
-        from scenarios.ipc.messages import Compares, Done, Waits
-        from scenarios.ipc.messages import Progress as Report
-
-        if isinstance(message, Report):
-            one = self._scenarios[message.scenario]
-            length_m = one.route_line.length_m
-            share = max(message.route_s_m / length_m, message.time_s / one.time_limit_s)
-            self.left.at(one.id, self._alone * share)
-            count = f"{message.route_s_m:.0f}/{length_m:.0f} m"
-            note = f"simulated {message.time_s:.0f} s, {message.failures} failures"
-            self._bar(one.id, message.route_s_m / length_m, count, note)
-        elif isinstance(message, Compares):
-            self.left.at(message.scenario, self._alone + (1.0 - self._alone) * message.share)
-            self._bar(
-                message.scenario,
-                message.share,
-                f"{100.0 * message.share:.0f} %",
-                "without the robot",
-            )
-        elif isinstance(message, Waits):
-            words = f"{message.scenario}: {message.reason}"
-            self._console.print(words, soft_wrap=True, highlight=False, markup=False)
-        elif isinstance(message, Done):
-            task = self._tasks.pop(message.scenario, None)
-            if task is not None:
-                self.bars.remove_task(task)
-            self.left.at(message.scenario, 1.0)
-            self._finished += 1
-            rest = self._rest()
-            words = (
-                f"{message.scenario}: {message.status}, {self._finished} of {len(self._scenarios)}"
-            )
-            self._console.print(
-                f"{words}; {rest}" if rest else words, highlight=False, markup=False
-            )
-        self._show()
-
-    def _bar(self, scenario: str, share: float, count: str, note: str) -> None:
-        if scenario not in self._tasks:
-            self._tasks[scenario] = self.bars.add_task(
-                f"  {scenario}", total=1.0, count="", note=""
-            )
-        self.bars.update(self._tasks[scenario], completed=share, count=count, note=note)
-
-    def _show(self) -> None:
-        count = f"{self._finished}/{len(self._scenarios)}"
-        self.bars.update(self._all, completed=self.left.share, count=count, note=self._rest())
-
-    def _rest(self) -> str:
-        """How long the rest takes, in words; nothing while that is not known, and nothing at the
-        end."""
-        rest_s = self.left.seconds(self._clock() - self._began_s)
-        return "" if rest_s is None or rest_s < 0.5 else f"about {duration(rest_s)} left"
-
-
-_SURE_PROGRESS = 0.03
-_SURE_S_PROGRESS = 3.0
+_SURE = 0.03
+_SURE_S = 3.0
 """Of less of a stage than this share, or after less time, nothing is concluded."""
 AGAIN_S = 30.0
 """Without a terminal a stage whose share is known gets a further line after this time, and so
@@ -220,6 +78,6 @@ def stage_in_words(stage: str, share: float | None, since_s: float) -> str:
     if share is None:
         return stage
     words = f"{stage}: {100.0 * share:.0f} %"
-    if share < _SURE_PROGRESS or since_s < _SURE_S_PROGRESS:
+    if share < _SURE or since_s < _SURE_S:
         return words
     return f"{words}, about {duration(since_s * (1.0 - share) / share)} left"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from signal import SIGINT
@@ -17,15 +18,17 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from cosim.cli.console import LogJson, LogLevel, err, logged, out
-from cosim.cli.options import DEFAULT, MANY, Insecure, Tls, connecting, listening, taking, warned
-from cosim.cli.run import carry_out, told_if_not_begun
+from cosim.cli.generated_options import Fields, configured
+from cosim.cli.options import DEFAULT, MANY, Insecure, Tls, warned
 from cosim.cli.tables import parts_of_table
 from cosim.core.errors import INTERRUPTED, EngineError, RunError, UsageError
 from cosim.core.log_event import happened
 from cosim.core.telling import duration
+from cosim.spec.connection import connecting, listening
+from cosim.spec.run_config import RunConfig
 
 if TYPE_CHECKING:
-    from scenarios.runs.status import RunStatus, Under
+    from scenarios.runs.status import RunningEpisode, RunStatus
 
 
 coordinator_app = typer.Typer()
@@ -49,18 +52,21 @@ _OF_ONE_MACHINE = {
     "orca --seed 7 --shard 1/2 --out runs/1`: see `cosim merge`  \n`cosim coordinator reactive "
     "--policy my.py:Mine --listen tls/0.0.0.0:7447 --tls certs/coordinator`",
 )
-@taking(
-    carry_out,
-    without=("carrier", "jobs", "director_wait", "tls", "insecure"),
-    hidden=_OF_ONE_MACHINE,
-)
+@configured
 def coordinator_command(
+    config: Annotated[
+        RunConfig,
+        Fields(
+            without=("jobs", "on", "director_wait", "tls", "insecure"),
+            hidden=_OF_ONE_MACHINE,
+            panels=True,
+        ),
+    ],
     listen: Annotated[
         str, typer.Option(metavar="ENDPOINT", help="Where workers find it.")
     ] = DEFAULT,
     tls: Tls = "",
     insecure: Insecure = False,
-    **asked: Any,
 ) -> None:
     """Run a suite by workers that come and go (`cosim worker`): with the options of `cosim run`,
     and the same results.
@@ -69,16 +75,16 @@ def coordinator_command(
     with --resume, it goes on where it was, and so do they. `cosim status` tells how it goes.
     """
     from bridge.session import notices_of, open_session
+    from cosim.cli.run_display import run_in_terminal
     from scenarios.runs.zenoh_transport import workers_of_run
 
     for name, why in _OF_ONE_MACHINE.items():
-        if asked[name]:
+        if getattr(config, name):
             raise UsageError(
                 f"--{name.replace('_', '-')} is of one machine ({why}): leave it out, or use "
                 f"`cosim run`"
             )
-    at = asked["policy_at"] or ()
-    files = tls if any(one.startswith("tls/") for one in at) else ""
+    files = tls if any(one.startswith("tls/") for one in config.policy_at) else ""
     ours = tls if listen.startswith("tls/") or not files else ""
     connection = listening("coordinator", "--listen", listen, ours, insecure)
     notices_of(connection)
@@ -90,10 +96,11 @@ def coordinator_command(
                 f"Workers find it by: cosim worker --connect "
                 f"{listen.replace('0.0.0.0', 'THIS-MACHINE')}"
             )
-            yield partial(workers_of_run, session, resumed=bool(asked["resume"]))
+            yield partial(workers_of_run, session, resumed=config.resume)
 
-    with told_if_not_begun(asked["folder"]):
-        carry_out(**asked, tls=files, insecure=insecure and bool(at), carrier=carrier())
+    run_in_terminal(
+        replace(config, tls=files, insecure=insecure and bool(config.policy_at)), carrier()
+    )
 
 
 @coordinator_app.command(
@@ -189,21 +196,21 @@ def status_command(
 
 def _asked(answers: dict[str, bytes], where: str) -> tuple[RunStatus, str]:
     """Raises EngineError when no run is coordinated there."""
-    from scenarios.runs.status import status_in
+    from scenarios.runs.status import decode_status
 
     if not answers:
         raise EngineError(
             f"no run is coordinated at {where}: is `cosim coordinator` started, and the "
             f"address right?"
         )
-    return status_in(next(iter(answers.values()))), ""
+    return decode_status(next(iter(answers.values()))), ""
 
 
 def _of_folder(folder: Path) -> tuple[RunStatus, str]:
     """The status of a run, and a remark on whoever runs it. Raises UsageError when the folder holds
     no run."""
-    from cosim.results.run_folder import read_rows, read_spec, refuse_in_use
-    from scenarios.runs.status import STATUS_FILE, RunStatus, status_in
+    from cosim.results.run_folder import read_records, read_spec, refuse_in_use
+    from scenarios.runs.status import STATUS_FILE, RunStatus, decode_status
 
     spec = read_spec(folder)
     try:
@@ -211,11 +218,11 @@ def _of_folder(folder: Path) -> tuple[RunStatus, str]:
         runs = False
     except RunError:
         runs = True
-    finished = len(read_rows(folder))
+    finished = len(read_records(folder))
     total = len(spec.scenarios)
     path = folder / STATUS_FILE
     if runs and path.exists():
-        told = status_in(path.read_bytes())
+        told = decode_status(path.read_bytes())
         late_s = time.time() - told.at_s
         if told.finished <= finished or late_s < _STALE_S:
             return (
@@ -257,8 +264,8 @@ def _picture(told: RunStatus, remark: str) -> Group:
         words += f", {told.per_hour:.0f} an hour, about {duration(told.left_s)} left"
     if told.lost:
         words += f"; {told.lost} lost with their workers and run again"
-    if told.odd:
-        words += f"; {told.odd} messages refused"
+    if told.refused:
+        words += f"; {told.refused} messages refused"
     parts: list[Text | Table] = [Text(words)]
     if told.workers:
         heads = ("worker", "state", "heard", "done", "episode")
@@ -266,10 +273,15 @@ def _picture(told: RunStatus, remark: str) -> Group:
             *(Column(head, no_wrap=head != "episode", justify="left") for head in heads), box=None
         )
         for one in told.workers:
-            silent = duration(one.silent_s) if one.silent_s > 0.5 else "now"
-            told_of = "\n".join(_under(under) for under in one.under_way) or one.why
+            state = one.state_at(told.at_s)
+            silent_s = told.at_s - one.heard_at_s
+            silent = duration(silent_s) if silent_s > 0.5 else "now"
+            told_of = (
+                "\n".join(_episode(episode, told.at_s) for episode in one.episodes.values())
+                or one.why
+            )
             table.add_row(
-                one.name, Text(one.state, style=_COLOURS[one.state]), silent, str(one.done), told_of
+                one.name, Text(state, style=_COLOURS[state]), silent, str(one.done), told_of
             )
         parts += parts_of_table(out, table, words=[4])
     elif told.finished < told.total and not remark:
@@ -280,10 +292,9 @@ def _picture(told: RunStatus, remark: str) -> Group:
     return Group(*parts)
 
 
-def _under(under: Under) -> str:
-    words = f"{under.scenario} at {under.time_s:.0f} s, {under.share:.0%}"
-    if under.waits:
-        return f"{words}, {under.waits}"
-    return (
-        words if under.still_s < _STILL_S else f"{words}, no progress for {duration(under.still_s)}"
-    )
+def _episode(episode: RunningEpisode, at_s: float) -> str:
+    words = f"{episode.scenario} at {episode.time_s:.0f} s, {episode.share:.0%}"
+    if episode.waits:
+        return f"{words}, {episode.waits}"
+    still_s = at_s - episode.moved_at_s
+    return words if still_s < _STILL_S else f"{words}, no progress for {duration(still_s)}"

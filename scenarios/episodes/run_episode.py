@@ -8,23 +8,18 @@ from dataclasses import dataclass
 
 import msgspec
 
-from cosim.core.errors import (
-    CosimError,
-    DirectorLost,
-    EngineError,
-    MachineError,
-    PolicyError,
-    PolicyServerLost,
-    RendererLost,
-)
+from bridge.policy_server import said_by
+from cosim.core.errors import CosimError, MachineError, RendererLost
 from cosim.episode.interfaces import Policy
-from cosim.episode.policy_caller import Driver, said_by
+from cosim.episode.policy_caller import Driver
 from cosim.results.log import Log
-from cosim.results.record import Record, Status
-from cosim.spec.options import EpisodeOptions
+from cosim.results.record import Record
+from cosim.results.run_setup import RunSetup
+from cosim.spec.options import EpisodeOptions, RendererAt
 from cosim.spec.scenario import Scenario
 from scenarios.episodes.counterfactual import Beside, TellShare, untold_share
 from scenarios.episodes.episode import Episode, Watch, unheard
+from scenarios.ipc.faults import verdict_on
 
 
 @dataclass(frozen=True)
@@ -43,6 +38,8 @@ def run_episode(
     policy: Policy,
     options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
     *,
+    setup: RunSetup | None = None,
+    renderer: RendererAt | None = None,
     watches: Sequence[Watch] = (),
     waiting: Callable[[str], None] = unheard,
     comparing: TellShare = untold_share,
@@ -53,17 +50,24 @@ def run_episode(
     MachineError, which is no episode's fault. One whose policy server is gone is to be run again,
     and has crashed if it is not.
 
-    watches, waiting: see `Episode`. comparing: told how far the comparison with the street without
-    the robot has come.
+    setup, renderer, watches, waiting: see `Episode`. comparing: told how far the comparison with
+    the street without the robot has come.
     """
     driver = Driver.of(policy)
     beside = Beside()
     trouble = ""
     listening = [*watches, beside.watch] if options.counterfactual else watches
-    options = msgspec.structs.replace(
-        options, policy_source=driver.source_hash, policy_runs=driver.runs
+    if setup is None:
+        setup = RunSetup.of(options, policy_source=driver.source_hash, policy_runs=driver.runs)
+    episode = Episode(
+        scenario,
+        driver.manifest,
+        options,
+        watches=listening,
+        waiting=waiting,
+        setup=setup,
+        renderer=renderer,
     )
-    episode = Episode(scenario, driver.manifest, options, watches=listening, waiting=waiting)
     try:
         with episode:
             drive(episode, driver)
@@ -73,11 +77,8 @@ def run_episode(
     except (RendererLost, MachineError):
         raise
     except Exception as error:  # noqa: BLE001  here a failing episode is turned into its record
-        by_policy = isinstance(error, PolicyError | PolicyServerLost)
-        status: Status = "crashed" if by_policy else "invalid"
+        status, again = verdict_on(error)
         record = msgspec.structs.replace(episode.record, status=status, reason=in_words(error))
-        another_time = isinstance(error, EngineError) or not isinstance(error, CosimError)
-        again = another_time and not isinstance(error, DirectorLost)
         return Outcome(record, None, traceback.format_exc(), again)
     finally:
         driver.ended()

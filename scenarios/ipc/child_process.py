@@ -1,5 +1,5 @@
-"""Processes of this machine: each is started, spoken with over a socket, and ended with everything
-that it has started. Those that run episodes are a transport."""
+"""Starts processes of this machine, talks to them over a socket, and ends them with everything they
+have started."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import socket
 import subprocess
 import sys
 from contextlib import nullcontext, suppress
-from multiprocessing.connection import wait
 from pathlib import Path
 from signal import SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV
 from typing import Final
@@ -20,45 +19,17 @@ from cosim.core.child_process import ended_in_words
 from cosim.core.errors import unwritable
 from cosim.core.framing import MOST_WIRED_BYTES, Wire
 from scenarios.ipc.deadlines import Asked, Question
-from scenarios.ipc.messages import Hear, Hello, Job, decode_message, encode_message
+from scenarios.ipc.messages import Hear, Job, decode_message, encode_message
 
 WORKER: Final = "scenarios.runs.worker:serve_jobs"
 ENDING_S: Final = 10.0
-"""What a process is left to end by itself, and then its shepherd to clear up."""
+"""Seconds that a process has to end by itself, and then its supervisor to clear up."""
 _FAULTS: Final = tuple(-fault for fault in (SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV))
 """Exit codes of a process that compiled code has ended."""
 _CODE: Final = (
     "import sys; sys.path[:] = {path!r}; from scenarios.ipc.supervisor import keep_worker; "
     "keep_worker({serves!r}, {given}, {run})"
 )
-
-
-class LocalProcesses:
-    """Workers that are processes of this machine, so many `jobs`. logs: the folder for what they
-    print."""
-
-    def __init__(self, logs: Path, jobs: int = 1) -> None:
-        self._logs = logs
-        self._jobs = jobs
-        self._started = 0
-        self._processes: list[KeptProcess] = []
-
-    def room(self, busy: int) -> int:
-        return self._jobs - busy
-
-    def unasked(self) -> tuple[()]:
-        return ()
-
-    def start(self, hello: Hello) -> KeptProcess:
-        process = KeptProcess(self._logs / f"worker-{self._started}.log", WORKER, "environment")
-        process.send(encode_message(hello))
-        self._started += 1
-        self._processes.append(process)
-        return process
-
-    def wait(self, timeout_s: float) -> None:
-        self._processes = [process for process in self._processes if process.open]
-        wait([process.wire.fileno() for process in self._processes], timeout_s)
 
 
 class KeptProcess:
@@ -77,10 +48,10 @@ class KeptProcess:
     ) -> None:
         self.log = str(log)
         self.open = True
-        self._called = called
+        self.called = called
         self._asked = Asked.new()
         self._last_asked: Question | None = None
-        self.in_engine = self.away = False
+        self.in_engine = False
         ours, theirs = socket.socketpair()
         self.wire = Wire(ours, most_bytes)
         given = (theirs.fileno(), self._asked.descriptor, *also)
@@ -105,11 +76,16 @@ class KeptProcess:
     def question(self) -> Question | None:
         return self._asked.question if self.open else self._last_asked
 
+    @property
+    def descriptor(self) -> int | None:
+        """File descriptor that is readable when it has a message; None if it has ended."""
+        return self.wire.fileno() if self.open else None
+
     def give(self, job: Job) -> None:
         self.send(encode_message(job))
 
     def send(self, message: bytes) -> None:
-        """Say something. A process that died or was stopped while it was idle does not hear it."""
+        """Send it a message. A process that has died, or was stopped, ignores it."""
         with suppress(OSError):
             self.wire.post(message)
 
@@ -145,7 +121,7 @@ class KeptProcess:
             self._asked.close()
         during = f" in the policy's {self._last_asked.when}" if self._last_asked is not None else ""
         self.in_engine = self._last_asked is None and code in _FAULTS
-        return f"the {self._called} process {_in_words(code)}{during}"
+        return f"the {self.called} process {_in_words(code)}{during}"
 
     def _code(self, wait_s: float) -> int | None:
         """Its exit code; None if it has not ended in time."""

@@ -1,4 +1,5 @@
-"""What a run and its workers say to each other; between processes and machines as MessagePack."""
+"""Defines the messages between a run and its workers; between processes and machines they are
+MessagePack."""
 
 from __future__ import annotations
 
@@ -7,79 +8,83 @@ from collections.abc import Callable
 import msgspec
 
 from cosim.results.record import Status
+from cosim.results.run_setup import RunSetup
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions, RendererAt
 from cosim.spec.policy_host import PolicyHost
 from cosim.spec.scenario import Scenario
-
-
-class Learner(msgspec.Struct, frozen=True):
-    """Who drives at times in place of an expert whose drives are collected, and what that was for
-    the run."""
-
-    policy: str
-    manifest: Manifest
-    source_hash: str
+from scenarios.ipc.deadlines import Patience
 
 
 class Hello(msgspec.Struct, frozen=True, tag=True):
-    """The first message to a worker: which policy it drives with, and what that was for the run.
-    renderer: the run's shared one, where there is one. host: where the policy is."""
+    """Introduces the policy of a run to a worker: its name, and the manifest and the source that it
+    must have there.
+
+    renderer: address of the run's shared renderer, if it has one.
+    host: where the policy runs.
+    learner: a second policy, which drives at times while demonstrations are collected.
+    patience: how long the policy may take for an answer.
+    """
 
     policy: str
     manifest: Manifest
     source_hash: str
     renderer: RendererAt | None = None
     host: PolicyHost = PolicyHost()
-    learner: Learner | None = None
+    learner: Hello | None = None
+    patience: Patience = Patience()
 
 
 class Job(msgspec.Struct, frozen=True, tag=True):
-    """Run this. net_hash: that of its place for a run on another machine; "" where it need not be
-    compared."""
+    """Requests an episode.
+
+    setup: of the run; without one it follows from options and policy.
+    renderer: address of the run's shared renderer, if it has one.
+    net_hash: that of its street net, if the worker is on another machine; else "".
+    """
 
     scenario: Scenario
     options: EpisodeOptions = EpisodeOptions()
+    setup: RunSetup | None = None
+    renderer: RendererAt | None = None
     net_hash: str = ""
 
 
 class Ready(msgspec.Struct, frozen=True, tag=True):
-    """The engines are imported and the policy is loaded."""
+    """Reports that the engines are imported and the policy is loaded."""
 
 
 class Unable(msgspec.Struct, frozen=True, tag=True):
-    """No episode can be run here: the policy cannot be loaded (`blames_policy`), or the machine
-    lacks something."""
+    """Reports that the policy cannot be loaded (`blames_policy`), or that the machine lacks
+    something."""
 
     reason: str
     blames_policy: bool
 
 
 class Progress(msgspec.Struct, frozen=True, tag=True):
-    """A sign of life: how far the episode is."""
+    """Reports how far an episode is.
+
+    compared: share of the street that is simulated without the robot, 0 to 1; None before the
+    episode is over.
+    """
 
     scenario: str
     time_s: float
     route_s_m: float
     failures: int
+    compared: float | None = None
 
 
 class Waits(msgspec.Struct, frozen=True, tag=True):
-    """The episode stands still: what it waits for."""
+    """Reports what an episode waits for."""
 
     scenario: str
     reason: str
 
 
-class Compares(msgspec.Struct, frozen=True, tag=True):
-    """The episode is over and its street is simulated without the robot: which share of it."""
-
-    scenario: str
-    share: float
-
-
 class FrameDrawn(msgspec.Struct, frozen=True, tag=True):
-    """A camera frame that is to be kept, as PNG."""
+    """Carries a camera frame for the run folder, as PNG."""
 
     scenario: str
     tick: int
@@ -87,7 +92,7 @@ class FrameDrawn(msgspec.Struct, frozen=True, tag=True):
 
 
 class LostRenderer(msgspec.Struct, frozen=True, tag=True):
-    """The shared renderer has ended in the middle of the episode. number, asked: see
+    """Reports that the shared renderer has ended in the middle of an episode; fields as in
     `RendererLost`."""
 
     scenario: str
@@ -96,9 +101,12 @@ class LostRenderer(msgspec.Struct, frozen=True, tag=True):
 
 
 class Done(msgspec.Struct, frozen=True, tag=True):
-    """The episode is over. record, log: the bytes of its files, as `encoded` by Record and Log; a
-    crash has no log. again: see `Outcome`. demonstration: what is kept of it where demonstrations
-    are collected, if anything."""
+    """Carries the result of an episode.
+
+    record, log: the bytes of its files, as `encoded` by Record and Log; a crash has no log.
+    again: whether an engine failed, which may not happen another time.
+    demonstration: the bytes of its demonstration, while these are collected.
+    """
 
     scenario: str
     status: Status
@@ -108,7 +116,7 @@ class Done(msgspec.Struct, frozen=True, tag=True):
     demonstration: bytes = b""
 
 
-Message = Ready | Unable | Progress | Waits | Compares | FrameDrawn | LostRenderer | Done
+Message = Ready | Unable | Progress | Waits | FrameDrawn | LostRenderer | Done
 Hear = Callable[[Message], None]
 
 encode_message = msgspec.msgpack.Encoder().encode

@@ -1,152 +1,97 @@
-"""A worker on another machine as long as it has one lease: what it has said, and what has to be
-answered."""
+"""Holds the lease of a job that a worker on another machine runs, over Zenoh or Ray."""
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from typing import Final, Protocol
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
-from bridge.session import Query
-from scenarios.ipc.deadlines import Question
-from scenarios.ipc.messages import Done, FrameDrawn, Hear, Job, Message, Ready
-from scenarios.runs.protocol import (
-    CoordinatorSays,
-    GoOn,
-    Lease,
-    LetGo,
-    NoResult,
-    Received,
-    Renewal,
-    reply_in_bytes,
-)
+from scenarios.ipc.faults import Failure
+from scenarios.ipc.messages import Done, Hear, Message
+from scenarios.runs.protocol import Reply
 
-LEASE_S: Final = 15.0
-"""A worker that does not renew its lease for so long has lost it, whatever Zenoh says of it."""
+Answer = Callable[[Reply], None]
 
 
-class Keeper(Protocol):
-    """Who keeps the leases."""
-
-    def forget(self, one: LeasedWorker) -> None:
-        """Its lease has ended."""
-
-    def with_net(self, job: Job) -> Job:
-        """A job, with the hash of its place."""
-
-    def given(self, one: LeasedWorker) -> None:
-        """It has been given its job."""
-
-    def ended_late(self, one: LeasedWorker) -> None:
-        """It did not renew its lease."""
+def ignore(reply: Reply) -> None:
+    """Default callback: ignores the reply."""
 
 
-class LeasedWorker:
-    """A worker as long as it has one lease (`scenarios.runs.transport.Worker`)."""
+class _Reported(NamedTuple):
+    """A report that the run has not processed."""
 
-    away = in_engine = False
+    messages: Sequence[Message]
+    failure: Failure | None
+    answer: Answer
 
-    def __init__(
-        self,
-        keeper: Keeper,
-        at: tuple[str, int],
-        number: int,
-        claim: Query | None,
-        scenario: str = "",
-    ) -> None:
-        self.at = at
+    @property
+    def ends(self) -> bool:
+        """Whether it ends the lease."""
+        return self.failure is not None or any(
+            isinstance(message, Done) for message in self.messages
+        )
+
+
+class Lease:
+    """A job that a worker holds as long as it reports at least every `lasts_s` seconds.
+
+    holder: name of the worker.
+    number: identifies this lease among those of the same worker.
+    ended: the job is done, has failed, or is taken away.
+    expired: no report came in time.
+    """
+
+    def __init__(self, holder: str, number: int, lasts_s: float, scenario: str = "") -> None:
         self.number = number
         self.scenario = scenario
-        self.name = f"{at[0]}/{at[1]}"
-        self.log = f"logs/{at[0]}-{at[1]}.log"
-        self.job: Job | None = None
-        self._keeper = keeper
-        self._claim = claim
-        self._said: deque[tuple[Message | None, Query | None, CoordinatorSays]] = deque(
-            [(Ready(), None, GoOn())]
-        )
-        self._heard_s = time.monotonic()
-        self._held = False
-        self._asks: Renewal | NoResult | None = None
-        self._why: str | None = None
+        self.ended = False
+        self.expired = False
+        self._holder = holder
+        self._lasts_s = lasts_s
+        self._reported_s = time.monotonic()
+        self._reports: deque[_Reported] = deque()
+        self._lost = ""
 
-    @property
-    def question(self) -> Question | None:
-        """As old as it was when the worker last told of it: what came after that is not known
-        here."""
-        if self._asks is None or self._asks.asks is None:
-            return None
-        return self._asks.asks.question(time.monotonic())
-
-    @property
-    def ended(self) -> bool:
-        """Whether there is nothing to be expected of this lease any more."""
-        return self._why is not None
-
-    def give(self, job: Job) -> None:
-        self.job = self._keeper.with_net(job)
-        self.scenario = job.scenario.id
-        if self._claim is not None:
-            self._claim.answer(reply_in_bytes(Lease(self.number, self.job)))
-            self._keeper.given(self)
-
-    def renew(self, renewal: Renewal, query: Query) -> None:
-        """It is alive. It is told so once its frames are written, and once the run knows of it."""
-        self._heard_s = time.monotonic()
-        self._asks = renewal
-        self._said.extend(
-            (message, None, GoOn()) for message in renewal.said if message.scenario == self.scenario
-        )
-        if self._held and not any(isinstance(message, FrameDrawn) for message in renewal.said):
-            query.answer(reply_in_bytes(GoOn()))
-        else:
-            self._said.append((None, query, GoOn()))
-
-    def deliver(self, done: Done, query: Query) -> None:
-        self._heard_s = time.monotonic()
-        self._said.append((done, query, Received()))
-
-    def fail(self, failure: NoResult) -> None:
-        """Its process has ended, or it leaves."""
-        self._asks = failure
-        self.in_engine = failure.in_engine
-        self.away = failure.how != "ended"
-        self._why = "" if self.away else failure.why
+    def take(
+        self, messages: Sequence[Message], failure: Failure | None, answer: Answer = ignore
+    ) -> None:
+        """Take in a report. It is answered once the run has processed it, so that nothing unwritten
+        is acknowledged."""
+        self._reported_s = time.monotonic()
+        self._reports.append(_Reported(messages, failure, answer))
 
     def lose(self, why: str) -> None:
-        if self._why is None:
-            self._why = why
-            self.away = True
-            self._asks = None
+        """Note that the worker is lost, with all that runs on its machine."""
+        self._lost = self._lost or why
 
-    def listen(self, hear: Hear) -> bool:
-        self._held = True
-        while self._said:
-            message, query, reply = self._said.popleft()
-            if message is not None:
-                hear(message)
-            if query is not None:
-                query.answer(reply_in_bytes(reply))
-            if isinstance(message, Done):
-                self._why = ""
-        if self._why is None and time.monotonic() - self._heard_s > LEASE_S:
-            self._keeper.ended_late(self)
-            self.lose(f"worker {self.at[0]} fell silent")
-        return self._why is None
+    def poll(self, hear: Hear) -> Failure | None:
+        """Pass on what was reported. Returns the failure of the job if it has failed or its worker
+        is lost."""
+        while self._reports and not self.ended:
+            report = self._reports.popleft()
+            for message in report.messages:
+                if isinstance(message, Done) or getattr(message, "scenario", "") == self.scenario:
+                    hear(message)
+            self.ended = report.ends
+            report.answer(Reply("kept" if self.ended else "renewed"))
+            if report.failure is not None:
+                return report.failure
+        if self.ended:
+            return None
+        self.expired = not self._lost and time.monotonic() - self._reported_s > self._lasts_s
+        if self.expired:
+            self._lost = f"worker {self._holder} fell silent"
+        if not self._lost:
+            return None
+        self.ended = True
+        return Failure("machine_lost", self._lost)
 
-    def hang_up(self) -> None:
-        """It has one job, and ends with it."""
-
-    def kill(self, *, wait: bool = True) -> None:
-        """Its lease is over: when it renews it next it is told so."""
-        self._keeper.forget(self)
-        for message, query, _ in self._said:
-            if (
-                query is not None and wait and not isinstance(message, Done)
-            ):  # a result is sent again
-                query.answer(reply_in_bytes(LetGo()))
-        self._said.clear()
-
-    def end(self) -> str:
-        self._keeper.forget(self)
-        return self._why or ""
+    def revoke(self, *, silently: bool = False) -> None:
+        """Take the job away. A result that was not processed is not answered: the worker sends it
+        again."""
+        self.ended = True
+        for report in self._reports:
+            if not silently and not report.ends:
+                report.answer(Reply("revoked"))
+        self._reports.clear()

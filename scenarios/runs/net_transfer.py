@@ -1,8 +1,7 @@
-"""Street nets that travel from the coordinator to workers, by their hash: maps that a user has
-imported.
+"""Sends imported maps from the coordinator to workers, by the hash of their street net.
 
-What a worker can make by itself does not travel: generated cities and places that come with SUMO.
-All of it is held against the coordinator's hash before an episode is run on it.
+Generated cities and places that come with SUMO are made by each worker. Every net is compared with
+the coordinator's hash before an episode is run on it.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from bridge.codec import decode, encode
 from cosim.core.errors import EngineError, unwritable
 from cosim.spec.scenario import CityMap, Place
 from scenarios.places.nets import place
-from scenarios.runs.protocol import NetAsked, NetPart
+from scenarios.runs.protocol import NetPart
 from sumo_nets.maps.feature_file import NAME
 from sumo_nets.maps.map_store import ABOUT, NAMES, known_maps, map_hash, map_net, maps_folder
 from sumo_nets.maps.scratch import move_in, scratch_in
@@ -28,7 +27,7 @@ _FILES: Final = (_NET, ABOUT, NAME)
 
 
 def travels(where: Place) -> bool:
-    """Whether a place is a map that somebody has imported."""
+    """Return whether a place is an imported map."""
     if not isinstance(where, CityMap):
         return False
     known = known_maps().get(where.map)
@@ -36,12 +35,12 @@ def travels(where: Place) -> bool:
 
 
 def lacks(where: Place) -> bool:
-    """Whether it is one that is not here."""
+    """Return whether a place is a map that this machine lacks."""
     return isinstance(where, CityMap) and where.map not in known_maps()
 
 
 class Nets:
-    """What a coordinator hands out: the maps of its run."""
+    """The maps of a run, as the coordinator sends them."""
 
     def __init__(self) -> None:
         self._hashes: dict[Place, str] = {}
@@ -49,15 +48,15 @@ class Nets:
         self._maps: dict[str, CityMap] = {}
 
     def hash_of(self, where: Place) -> str:
-        """By which workers know a place's net."""
+        """Return the hash of a place's street net."""
         if where not in self._hashes:
             self._hashes[where] = where.net_hash or place(where)[1].net_hash
         if isinstance(where, CityMap):
             self._maps[self._hashes[where]] = where
         return self._hashes[where]
 
-    def part(self, digest: str, payload: bytes) -> bytes:
-        """An answer to who asks for a net. Raises EngineError for one that is not of this run."""
+    def packed(self, digest: str) -> bytes:
+        """Return a map as it is sent. Raises EngineError for one that is not of this run."""
         where = self._maps.get(digest)
         if where is None or not travels(where):
             raise EngineError(f"this run has no map '{digest}' to hand out")
@@ -67,8 +66,13 @@ class Nets:
                 name: (folder / name).read_bytes() for name in _FILES if (folder / name).exists()
             }
             self._packed[digest] = zlib.compress(msgspec.msgpack.encode(files), 1)
-        packed = self._packed[digest]
-        begin = decode(payload, NetAsked).begin
+        return self._packed[digest]
+
+    def part(self, digest: str, payload: bytes) -> bytes:
+        """Reply to the request for a part of a map. Raises EngineError for one that is not of this
+        run."""
+        packed = self.packed(digest)
+        begin = decode(payload, NetPart).begin
         return encode(NetPart(begin, len(packed), packed[begin : begin + _PART_BYTES]))
 
 
@@ -81,16 +85,16 @@ class Fetched:
         self._packed = bytearray()
 
     @property
-    def asks(self) -> bytes:
-        """For the next part."""
-        return encode(NetAsked(len(self._packed)))
+    def request(self) -> bytes:
+        """Return the request for the next part."""
+        return encode(NetPart(len(self._packed)))
 
     def take(self, payload: bytes) -> bool:
-        """Take in a part. Returns whether it was the last one: then the map is kept here, under its
-        name.
+        """Take in a part. Returns whether it was the last one: then the map is stored here, under
+        its name.
 
-        Raises MachineError when it cannot be kept, EngineError when it is not what was asked
-        for."""
+        Raises MachineError when it cannot be stored, EngineError when it is not the requested one.
+        """
         part = decode(payload, NetPart)
         if part.whole > _MOST_BYTES:
             raise EngineError(
@@ -100,15 +104,16 @@ class Fetched:
             self._packed += part.data
         if len(self._packed) < part.whole:
             return False
-        self._keep()
+        self.keep(bytes(self._packed))
         return True
 
-    def _keep(self) -> None:
+    def keep(self, packed: bytes) -> None:
+        """Store the map, sent as a whole, under its name. Raises as `take` does."""
         name = self._where.map
         folder = maps_folder()
         try:
             opened = zlib.decompressobj()
-            files = decode(opened.decompress(bytes(self._packed), _MOST_BYTES), dict[str, bytes])
+            files = decode(opened.decompress(packed, _MOST_BYTES), dict[str, bytes])
         except zlib.error as error:
             raise EngineError(f"map '{name}' was damaged on its way: {error}") from error
         if not NAMES.fullmatch(name) or not {_NET, ABOUT} <= files.keys() <= set(_FILES):

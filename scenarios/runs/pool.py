@@ -1,56 +1,34 @@
 """Runs scenarios by the workers that a transport reaches.
 
-A worker that dies (SUMO and PyBullet can take its process down) is replaced and its scenario tried
-once more; an engine that shows no sign of life is killed. After the last attempt the episode is
-recorded, so that none is ever lost: as invalid if it was an engine that failed, as crashed if that
-may have been the policy, which gets nothing out of ending its process. A worker that is lost
-together with its machine is no attempt: its scenario goes to another one, and what the first one
-still delivers is taken if it comes first. When a shared renderer dies, the episodes that it drew
-for are run again. A policy that gives no answer in time is not asked again: its episode has
-crashed. What comes out of an episode is written here, by the run's own process.
+A worker reports the failure of its job (`scenarios.ipc.faults`). The scenario is run again,
+or recorded after its last attempt, so that none is ever lost. An episode that loses the shared
+renderer is run again. A worker that is lost with its machine may still deliver its result, which is
+kept if it comes first. Only this process writes to the run folder.
 """
 
 from __future__ import annotations
 
-import time
-from collections import deque
 from collections.abc import Sequence
 from functools import partial
 from logging import ERROR, WARNING
 from pathlib import Path
-from typing import NamedTuple
 
 import msgspec
 
-from cosim.core.errors import MachineError, RunError, UsageError
+from cosim.core.errors import RunError
 from cosim.core.log_event import happened
 from cosim.episode.manifest_checks import with_goal
-from cosim.results.record import Record, Status, begun
-from cosim.results.run_folder import FailedAttempt, RunFolder
-from cosim.spec.episode_id import pseudonym_of
+from cosim.results.record import Record, Status
+from cosim.results.run_folder import RunFolder
+from cosim.results.run_setup import NO_RENDERER
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario
-from scenarios.ipc.deadlines import Patience, Question
-from scenarios.ipc.messages import (
-    Done,
-    FrameDrawn,
-    Hear,
-    Hello,
-    Job,
-    LostRenderer,
-    Message,
-    Ready,
-    Unable,
-)
+from scenarios.ipc.faults import Failure, failure_of_result
+from scenarios.ipc.messages import Done, FrameDrawn, Hear, Hello, Job, LostRenderer, Message
+from scenarios.runs.attempts import AttemptQueue
+from scenarios.runs.environment_slot import no_answer
 from scenarios.runs.shared_renderer import SharedRenderer
-from scenarios.runs.transport import Late, Reception, Transport, Worker
-
-ATTEMPTS = 2
-LOSSES = 8
-"""So many workers may be lost, each with all that is beside it, while they run one scenario."""
-SILENCE_S = 300.0
-"""A worker that says nothing for so long, while its policy has nothing to answer, hangs in an
-engine."""
+from scenarios.runs.transport import LateResult, Reception, Transport, Worker
 
 POLL_S = 1.0
 
@@ -63,77 +41,30 @@ def run_all(
     *,
     tell: Hear,
     options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
-    patience: Patience = Patience(),
     renderer: SharedRenderer | None = None,
 ) -> None:
-    """Run scenarios, as many at a time as the transport has room for, adding each record to the
-    folder as it ends: in the order of what they are called before the policy, so that one that
-    counts its episodes does not learn which they are.
+    """Run scenarios, as many at a time as the transport has room for, and add each record to the
+    folder.
 
-    hello: the policy as it was loaded here. renderer: what draws for all of them; the caller ends
-    it. Raises UsageError when a worker cannot load the policy, MachineError when none can be
-    started or a record cannot be written."""
+    hello: introduces the policy as it was loaded here.
+    tell: called with the messages about the episodes.
+    renderer: draws for all episodes; the caller ends it.
+
+    Raises UsageError when a worker cannot load the policy, MachineError when none can be started or
+    a record cannot be written."""
     if renderer is not None:
         hello = msgspec.structs.replace(hello, renderer=renderer.at)
-        options = msgspec.structs.replace(options, renderer=renderer.at)
-    options = msgspec.structs.replace(options, seed=folder.spec.seed)
-    pool = _Pool(folder, hello, transport, options, tell, patience, renderer)
-    waiting = deque(sorted(scenarios, key=partial(pseudonym_of, folder.spec.seed)))
-    attempts = folder.failed_attempts()
+    queue = AttemptQueue(folder, scenarios)
+    pool = _Pool(folder, queue, hello, transport, options, tell, renderer)
     happened("run begun", episodes=len(scenarios), policy=hello.policy, folder=str(folder.path))
     try:
-        while waiting or pool.busy:
-            while waiting and transport.room(len(pool.busy)) > 0:
-                pool.give(waiting.popleft())
-            for lost in pool.listen():
-                attempt = FailedAttempt(lost.scenario.id, lost.away)
-                most = LOSSES if lost.away else ATTEMPTS
-                if lost.why:
-                    attempts[attempt] += 1
-                    folder.keep_failed_attempt(attempt)
-                if not lost.why or attempts[attempt] < most:
-                    tried = attempts[attempt]
-                    happened(
-                        "retried",
-                        WARNING,
-                        scenario=lost.scenario.id,
-                        why=lost.why,
-                        attempts=tried,
-                        of=most,
-                    )
-                    waiting.appendleft(lost.scenario)
-                else:
-                    why = f"{lost.why}, {most} times; see logs/ in the run folder"
-                    pool.give_up(lost.scenario, why, "invalid" if lost.in_engine else "crashed")
-            pool.take_unasked(waiting)
+        while queue or pool.busy:
+            while queue and transport.room(pool.busy) > 0:
+                pool.give(queue.next())
+            pool.poll()
+            pool.take_unsolicited()
     finally:
         pool.close()
-
-
-def _called(name: str, waiting: deque[Scenario]) -> Scenario | None:
-    """The scenario of that name, if it waits."""
-    return next((scenario for scenario in waiting if scenario.id == name), None)
-
-
-class _Lost(NamedTuple):
-    """A scenario that is not done, whose worker or whose engine failed. why: "" if it never began;
-    in_engine: whether it was an engine for sure; away: see `Worker`."""
-
-    scenario: Scenario
-    why: str
-    in_engine: bool = False
-    away: bool = False
-
-
-class _Slot:
-    """A worker, and what it is busy with. ran: it has run an episode before; silent: it has said
-    nothing since it was given the next."""
-
-    def __init__(self, worker: Worker) -> None:
-        self.worker = worker
-        self.ready = self.ran = self.silent = False
-        self.job: Scenario | None = None
-        self.heard_at = time.monotonic()
 
 
 class _Pool:
@@ -142,70 +73,166 @@ class _Pool:
     def __init__(
         self,
         folder: RunFolder,
+        queue: AttemptQueue,
         hello: Hello,
         transport: Transport,
         options: EpisodeOptions,
         tell: Hear,
-        patience: Patience,
         renderer: SharedRenderer | None,
     ) -> None:
         self._folder = folder
+        self._queue = queue
         self._hello = hello
         self._transport = transport
         self._options = options
         self._tell = tell
-        self._patience = patience
         self._renderer = renderer
-        self._bereft: list[tuple[Scenario, LostRenderer]] = []
-        self._again: list[_Lost] = []
-        self._workers: list[_Slot] = []
-        self._failed_starts = 0
+        self._setup = msgspec.structs.replace(folder.spec.setup, renderer=NO_RENDERER)
+        self._workers: dict[Worker, Scenario | None] = {}
+        self._without_renderer: list[tuple[Scenario, LostRenderer]] = []
 
     @property
-    def busy(self) -> list[_Slot]:
-        return [w for w in self._workers if w.job is not None]
+    def busy(self) -> int:
+        """Number of workers that have a job."""
+        return sum(scenario is not None for scenario in self._workers.values())
 
-    def take_unasked(self, waiting: deque[Scenario]) -> None:
-        """Take in workers that go on with what waits, and results that come late; what they are of
-        waits no more."""
-        for one in self._transport.unasked():
-            if isinstance(one, Late):
-                one.answer(self._late(one.done, waiting))
-            elif (scenario := _called(one.scenario, waiting)) is None:
-                one.worker.kill()
+    def give(self, scenario: Scenario) -> None:
+        """Hand a scenario to an idle worker, or to a new one."""
+        idle = (worker for worker, job in self._workers.items() if job is None)
+        worker = next(idle, None) or self._transport.start(self._hello)
+        self._workers[worker] = scenario
+        self._folder.forget(scenario.id)
+        worker.give(Job(scenario, self._options, self._setup, self._hello.renderer))
+        happened("claimed", scenario=scenario.id, worker=Path(worker.log).stem)
+
+    def poll(self) -> None:
+        """Take in what the workers report; queue or record the scenarios that failed."""
+        self._transport.wait(POLL_S)
+        if self._renderer is not None:
+            self._renderer.tend()
+        for worker in list(self._workers):
+            failure = worker.poll(partial(self._take, worker))
+            scenario = self._workers[worker]
+            if failure is not None and scenario is not None:
+                self._workers[worker] = None
+                if failure.fault != "policy_timeout":
+                    happened(
+                        "lost",
+                        WARNING,
+                        worker=Path(worker.log).stem,
+                        scenario=scenario.id,
+                        why=failure.why,
+                    )
+                self._failed(scenario, failure)
+            if worker.ended:
+                del self._workers[worker]
+        while self._without_renderer:
+            scenario, lost = self._without_renderer.pop()
+            self._failed(scenario, self._failure_of(scenario, lost))
+
+    def take_unsolicited(self) -> None:
+        """Adopt workers that run a scenario which waits, and keep late results."""
+        for one in self._transport.unsolicited():
+            if isinstance(one, LateResult):
+                one.answer(self._late(one.done))
+            elif (scenario := self._queue.named(one.scenario)) is None:
+                one.worker.cancel()
             else:
-                waiting.remove(scenario)
-                slot = _Slot(one.worker)
-                slot.job = scenario
-                self._workers.append(slot)
+                self._queue.remove(scenario)
+                self._workers[one.worker] = scenario
 
-    def _late(self, done: Done, waiting: deque[Scenario]) -> Reception:
-        """A result from a worker that its job had been taken from is kept if there is none. Who has
-        that job now is freed."""
-        busy = next(
-            (slot for slot in self.busy if slot.job is not None and slot.job.id == done.scenario),
-            None,
+    def close(self) -> None:
+        """End all workers: idle ones by closing their connection, busy ones by force."""
+        for worker in self._workers:
+            worker.stop()
+        for worker in self._workers:
+            worker.end()
+        self._workers.clear()
+
+    def _take(self, worker: Worker, message: Message) -> None:
+        if isinstance(message, FrameDrawn):
+            self._folder.keep_frame(message.scenario, message.tick, message.png)
+        elif not isinstance(message, Done | LostRenderer):
+            self._tell(message)
+        elif (scenario := self._workers[worker]) is not None:
+            self._workers[worker] = None
+            if isinstance(message, Done):
+                self._keep(scenario, message)
+            else:
+                self._without_renderer.append((scenario, message))
+
+    def _keep(self, scenario: Scenario, done: Done) -> None:
+        """Write the record and the log of a scenario that is over."""
+        record = self._record_of(scenario, done)
+        if record is None:
+            self._failed(
+                scenario, Failure("damaged_result", "its record was damaged when it arrived")
+            )
+        elif done.again:
+            self._failed(scenario, failure_of_result(record.status, record.reason))
+        else:
+            self._folder.keep(record, done.log, done.demonstration)
+            self._over(scenario, record.status)
+
+    def _record_of(self, scenario: Scenario, done: Done) -> Record | None:
+        """Return the record in a result; None if it is damaged, or of another scenario."""
+        try:
+            record = Record.decoded(done.record, self._folder.episode_folder(scenario.id))
+        except RunError:
+            return None
+        return record if record.scenario.id == scenario.id else None
+
+    def _failed(self, scenario: Scenario, failure: Failure) -> None:
+        given_up = self._queue.failed(scenario, failure)
+        if given_up is not None:
+            self._give_up(scenario, given_up.reason, given_up.status)
+
+    def _failure_of(self, scenario: Scenario, lost: LostRenderer) -> Failure:
+        """Return the failure of an episode whose shared renderer has ended: its policy's if that
+        was being queried."""
+        assert self._renderer is not None
+        end = self._renderer.end_of(lost.number)
+        if end is None:
+            return Failure(
+                "process_ended",
+                "the environment process lost its connection to the shared renderer",
+            )
+        if not lost.asked:
+            return Failure("handed_back")
+        if end.unanswered_s is None:
+            return Failure("process_ended", end.words)
+        words = no_answer(self._hello, end.unanswered_s)
+        return Failure("policy_timeout", f"{words} in {lost.asked} of {scenario.id}")
+
+    def _late(self, done: Done) -> Reception:
+        """Keep a late result if there is none; its scenario is taken from the worker that has it
+        now."""
+        busy = (
+            worker
+            for worker, job in self._workers.items()
+            if job is not None and job.id == done.scenario
         )
-        scenario = _called(done.scenario, waiting) if busy is None else busy.job
+        worker = next(busy, None)
+        scenario = self._queue.named(done.scenario) if worker is None else self._workers[worker]
         if scenario is None:
             return self._second(done)
         record = self._record_of(scenario, done)
         if (
             record is None or done.again or self._options.frames_every_s
-        ):  # of its frames some may have come nowhere
+        ):  # some of its frames may be lost
             return "refused"
-        if busy is None:
-            waiting.remove(scenario)
+        if worker is None:
+            self._queue.remove(scenario)
         else:
-            busy.worker.kill()
-            self._workers.remove(busy)
+            worker.cancel()
+            del self._workers[worker]
         self._folder.keep(record, done.log)
         self._over(scenario, record.status)
         return "kept"
 
     def _second(self, done: Done) -> Reception:
-        """A result of a scenario that has one. Two episodes that came to their end must be
-        alike."""
+        """Compare a result with the one in the run folder: two episodes that ended must be
+        equal."""
         if done.scenario not in self._folder.spec.scenarios:
             return "refused"
         try:
@@ -214,178 +241,14 @@ class _Pool:
         except RunError:
             return "refused"
         alike = msgspec.structs.replace(kept, clock={}) == msgspec.structs.replace(came, clock={})
-        comparable = None not in (kept.ended, came.ended) and not kept.real_time
+        comparable = None not in (kept.ended, came.ended) and not kept.setup.real_time
         return "conflict" if comparable and not alike else "duplicate"
 
-    def give(self, scenario: Scenario) -> None:
-        """Hand a scenario to an idle worker, or to a new one."""
-        idle = next((w for w in self._workers if w.job is None), None) or self._start()
-        idle.job = scenario
-        idle.heard_at = time.monotonic()
-        idle.silent = True
-        self._folder.forget(scenario.id)
-        happened("claimed", scenario=scenario.id, worker=Path(idle.worker.log).stem)
-        idle.worker.give(Job(scenario, self._options))
-
-    def listen(self) -> list[_Lost]:
-        """Take in what the workers say. Returns the scenarios that are to be run again."""
-        lost: list[_Lost] = []
-        self._transport.wait(POLL_S)
-        if self._renderer is not None:
-            self._renderer.tend()
-        for one in list(self._workers):
-            if not one.worker.listen(partial(self._take, one)):
-                why = one.worker.end()
-                began = not (one.ran and one.silent) or one.worker.question is not None
-                lost += self._lost(
-                    one, why, began=began, in_engine=one.worker.in_engine, away=one.worker.away
-                )
-            elif one.job is None:
-                continue
-            elif (question := one.worker.question) is not None:
-                one.heard_at = time.monotonic()
-                if question.overdue(self._patience):
-                    self._leave_unanswered(one, one.job, question)
-            elif time.monotonic() - one.heard_at > SILENCE_S:
-                one.worker.kill()
-                lost += self._lost(
-                    one, "the environment process showed no sign of life", in_engine=True
-                )
-        while self._bereft:
-            lost += self._without_renderer(*self._bereft.pop())
-        lost += self._again
-        self._again.clear()
-        return lost
-
-    def _without_renderer(self, scenario: Scenario, lost: LostRenderer) -> list[_Lost]:
-        """The shared renderer has ended in the middle of an episode, which is to be run again. It
-        was an attempt if its policy was being asked; if that gave no answer in time it was the last
-        one."""
-        assert self._renderer is not None
-        end = self._renderer.end_of(lost.number)
-        if end is None:
-            return [
-                _Lost(
-                    scenario, "the environment process lost its connection to the shared renderer"
-                )
-            ]
-        if lost.asked and end.unanswered_s is not None:
-            self.give_up(
-                scenario, f"{self._silent(end.unanswered_s)} in {lost.asked} of {scenario.id}"
-            )
-            return []
-        return [_Lost(scenario, end.words if lost.asked else "")]
-
-    def _silent(self, allowed_s: float) -> str:
-        return f"policy '{self._hello.manifest.name}' gave no answer for {allowed_s:g} s"
-
-    def _take(self, one: _Slot, message: Message) -> None:
-        """Something that a worker has said."""
-        one.heard_at = time.monotonic()
-        one.silent = False
-        if isinstance(message, Unable):
-            raise (
-                UsageError(message.reason)
-                if message.blames_policy
-                else MachineError(message.reason)
-            )
-        if isinstance(message, Ready):
-            one.ready = True
-            self._failed_starts = 0
-        elif isinstance(message, FrameDrawn):
-            self._folder.keep_frame(message.scenario, message.tick, message.png)
-        elif not isinstance(message, Done | LostRenderer):
-            self._tell(message)
-        elif one.job is not None:
-            scenario = one.job
-            one.job = None
-            one.ran = True
-            if isinstance(message, Done):
-                self._keep(scenario, message)
-            else:
-                self._bereft.append((scenario, message))
-
-    def _keep(self, scenario: Scenario, done: Done) -> None:
-        """The record of a scenario that is over, and its log, are written and told."""
-        record = self._record_of(scenario, done)
-        if record is None:
-            self.give_up(scenario, "its record was damaged when it arrived")
-        elif done.again:
-            self._again.append(_Lost(scenario, record.reason, in_engine=record.status == "invalid"))
-        else:
-            self._folder.keep(record, done.log, done.demonstration)
-            self._over(scenario, record.status)
-
-    def _record_of(self, scenario: Scenario, done: Done) -> Record | None:
-        """The record in a result; None if it is damaged, or of another scenario."""
-        try:
-            record = Record.decoded(done.record, self._folder.episode_folder(scenario.id))
-        except RunError:
-            return None
-        return record if record.scenario == scenario.id else None
-
-    def _lost(
-        self,
-        one: _Slot,
-        why: str,
-        *,
-        began: bool = True,
-        in_engine: bool = False,
-        away: bool = False,
-    ) -> list[_Lost]:
-        """A worker has ended. Returns its scenario if that is not done, and why, if it was
-        begun."""
-        if one.job is not None:
-            happened(
-                "lost", WARNING, worker=Path(one.worker.log).stem, scenario=one.job.id, why=why
-            )
-        self._workers.remove(one)
-        if one.job is None:
-            return []
-        if one.ready:
-            return [_Lost(one.job, why if began else "", in_engine, away)]
-        self._not_started(one, why)
-        return [_Lost(one.job, "")]
-
-    def _leave_unanswered(self, one: _Slot, scenario: Scenario, question: Question) -> None:
-        """The policy takes too long: its process is killed, and its episode has crashed, once."""
-        one.worker.kill()
-        self._workers.remove(one)
-        silent = self._silent(self._patience.of(question.doing))
-        if question.doing == "loading":
-            raise UsageError(
-                f"{silent} while it was loaded in an environment process: give a longer "
-                f"--start-timeout"
-            )
-        self.give_up(scenario, f"{silent} in {question.when} of {scenario.id}")
-
-    def _not_started(self, one: _Slot, why: str) -> None:
-        """A worker that ended before it was ready. Raises the run's error when the next one has
-        done so too."""
-        self._failed_starts += 1
-        if self._failed_starts < ATTEMPTS:
-            return
-        told = f"{why} before it was ready, {ATTEMPTS} times: see {one.worker.log}"
-        if one.worker.question is not None:
-            raise UsageError(f"policy '{self._hello.policy}' cannot be loaded: {told}")
-        raise MachineError(f"{told}, and `cosim doctor`")
-
-    def give_up(self, scenario: Scenario, reason: str, status: Status = "crashed") -> None:
-        """Record a scenario that does not come to its end: no worker survives it, or the policy
-        does not answer."""
+    def _give_up(self, scenario: Scenario, reason: str, status: Status) -> None:
+        """Record a scenario after its last failed attempt."""
         happened("given up", ERROR, scenario=scenario.id, why=reason, status=status)
-        spec = self._folder.spec
         manifest = with_goal(self._hello.manifest, self._options.goal)
-        record = begun(
-            scenario,
-            manifest,
-            spec.suite_hash,
-            self._hello.source_hash,
-            spec.seed,
-            spec.latency_ms,
-            spec.real_time,
-            spec.policy_runs,
-        )
+        record = Record.begun(scenario, manifest, self._setup)
         self._folder.keep(msgspec.structs.replace(record, status=status, reason=reason))
         self._over(scenario, status)
 
@@ -394,18 +257,3 @@ class _Pool:
         if self._renderer is not None:
             self._renderer.episode_ended()
         self._tell(Done(scenario.id, status))
-
-    def close(self) -> None:
-        """End every worker: idle ones by closing their pipe, busy ones by force."""
-        for one in self._workers:
-            if one.job is not None:
-                one.worker.kill(wait=False)
-            one.worker.hang_up()
-        for one in self._workers:
-            one.worker.end()
-        self._workers.clear()
-
-    def _start(self) -> _Slot:
-        one = _Slot(self._transport.start(self._hello))
-        self._workers.append(one)
-        return one

@@ -1,13 +1,14 @@
-"""What workers on other machines and a run's coordinator say to each other: MessagePack, typed,
-bounded.
+"""Defines the messages between a run's coordinator and its workers on other machines: MessagePack,
+typed and bounded.
 
-A worker asks, the coordinator answers. Whatever is asked may be asked again: the answer is the
+A worker sends a request, the coordinator replies. Every request may be repeated: the reply is the
 same.
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Final, Literal
@@ -18,209 +19,179 @@ from msgspec import Meta
 from cosim.core.baked import sources_hash
 from cosim.core.errors import EngineError
 from cosim.core.versions import versions
-from cosim.episode.policy_caller import PolicyCall
-from cosim.results.record import METRIC_SCHEMA, Status
-from cosim.results.run_spec import RunSpec
-from scenarios.ipc.deadlines import Patience, Question
-from scenarios.ipc.messages import Compares, FrameDrawn, Hello, Job, Progress, Waits
+from cosim.results.run_setup import METRIC_SCHEMA
+from cosim.results.run_spec import RUN_FILE, RunSpec
+from scenarios.ipc.faults import Fault
+from scenarios.ipc.messages import Done, FrameDrawn, Hello, Job, Progress, Waits
 
-PROTOCOL: Final = 1
-"""Another one for every change of what is said here."""
+PROTOCOL: Final = 2
+"""Version of these messages: it changes with each of them."""
 MOST_SENT_BYTES: Final = 15 << 20
-"""Of a message: Zenoh drops what is longer than 16 MiB."""
-
-How = Literal["ended", "released", "unable"]
+"""Size limit of a message in bytes: Zenoh drops messages of more than 16 MiB."""
+MOST_WORDS: Final = 2000
+"""Length limit of a reason in characters."""
 _Name = Annotated[str, Meta(pattern="^[A-Za-z0-9_-]{1,64}$")]
-_Words = Annotated[str, Meta(max_length=2000)]
+_Words = Annotated[str, Meta(max_length=MOST_WORDS)]
 _Count = Annotated[int, Meta(ge=0, lt=1 << 62)]
-_Seconds = Annotated[float, Meta(ge=0.0, le=1e9)]
+_Slot = Annotated[int, Meta(ge=0, lt=4096)]
 _Printed = Annotated[bytes, Meta(max_length=1 << 16)]
 
-
-class Installed(msgspec.Struct, frozen=True, kw_only=True):
-    """What makes results: where all of it is the same they are the same to the bit. source: hash of
-    this project's."""
-
-    versions: dict[str, str]
-    metric_schema: int
-    source: str
-    protocol: int = PROTOCOL
-
-    def differs_from(self, run: Installed) -> str:
-        """In words, where this is another one than the run's; "" where it is not."""
-        here, there = (
-            {
-                **one.versions,
-                "metric schema": str(one.metric_schema),
-                "source": one.source,
-                "protocol": str(one.protocol),
-            }
-            for one in (self, run)
-        )
-        names = sorted(
-            name for name in here.keys() | there.keys() if here.get(name) != there.get(name)
-        )
-        return ", ".join(
-            f"{n} {here.get(n, 'missing')} in place of {there.get(n, 'none')}" for n in names
-        )
+Installed = Mapping[str, str]
+"""What decides results: where all of it is equal they are equal to the bit."""
 
 
 @lru_cache(maxsize=1)
 def installed_here() -> Installed:
-    """What is installed here."""
+    """Return the versions and the hash of the source that are installed here."""
     rooms = Path(__file__).parents[2]
     source = sources_hash(
         *(rooms / name for name in ("cosim", "sumo_nets", "physics", "bridge", "scenarios"))
     )
-    return Installed(versions=versions(), metric_schema=METRIC_SCHEMA, source=source)
+    return {
+        **versions(),
+        "metric schema": str(METRIC_SCHEMA),
+        "source": source,
+        "protocol": str(PROTOCOL),
+    }
 
 
-class Asks(msgspec.Struct, frozen=True):
-    """What a policy is asked (`Question`), and for how long by now."""
-
-    doing: PolicyCall
-    tick: int
-    for_s: _Seconds
-
-    def question(self, now_s: float) -> Question:
-        """As of now, by the clock of whoever hears it."""
-        return Question(now_s - self.for_s, self.doing, self.tick)
+def difference(here: Installed, run: Installed) -> str:
+    """Return in words where an installation differs from that of the run; "" if it does not."""
+    names = sorted(name for name in here.keys() | run.keys() if here.get(name) != run.get(name))
+    return ", ".join(
+        f"{n} {here.get(n, 'missing')} in place of {run.get(n, 'none')}" for n in names
+    )
 
 
-class Asking(msgspec.Struct, frozen=True, kw_only=True):
-    """Who asks: the worker, by a name that no other has, and which of its environment processes."""
+def installed_for(spec: RunSpec) -> Installed:
+    """Return the installation that the workers of a run need."""
+    own = {name: version for name, version in installed_here().items() if name not in versions()}
+    return {**spec.setup.versions, **own}
+
+
+class Claim(msgspec.Struct, frozen=True, kw_only=True):
+    """Requests a job for a slot; one that is not `ready` requests the introduction of the policy
+    first."""
 
     worker: _Name
-    slot: Annotated[int, Meta(ge=0, lt=4096)]
-
-
-class Claim(Asking, frozen=True, kw_only=True):
-    """It has nothing to do. ready: engines and policy are loaded; else it is to be told what is
-    needed for that."""
-
+    slot: _Slot
     host: Annotated[str, Meta(max_length=255)]
-    installed: Installed
+    installed: dict[str, str]
     ready: bool
 
 
-class Renewal(Asking, frozen=True, kw_only=True):
-    """It goes on with the job of a lease. said: by its process since the last renewal."""
+class Report(msgspec.Struct, frozen=True, kw_only=True):
+    """Renews the lease of a job, and ends it if there is a result or a fault.
 
+    worker, slot: the sender; the name of a worker is unique.
+    said: messages of the environment process since the last report.
+    done: the result, with the `digest` of its record and log.
+    fault: the kind of failure, with its reason `why`.
+    printed: the end of the output of the environment process.
+    """
+
+    worker: _Name
+    slot: _Slot
     lease: _Count
     scenario: _Words
-    asks: Asks | None = None
-    said: tuple[Progress | Waits | Compares | FrameDrawn, ...] = ()
-
-
-class Result(Asking, frozen=True, kw_only=True):
-    """Its episode is over: as `Done`. digest: of record and log; printed: by the process, its
-    end."""
-
-    lease: _Count
-    scenario: _Words
-    status: Status
-    record: bytes
-    log: bytes
-    again: bool
-    digest: str
+    said: tuple[Progress | Waits | FrameDrawn, ...] = ()
+    done: Done | None = None
+    digest: str = ""
+    fault: Fault | None = None
+    why: _Words = ""
     printed: _Printed = b""
 
 
-class NoResult(Asking, frozen=True, kw_only=True):
-    """It has no result. how: its process ended; it leaves and hands the job back; or it can run
-    nothing at all. why: in words, "" for a process that ended before the episode began."""
+class Assignment(msgspec.Struct, frozen=True, tag=True):
+    """Grants the lease of a job."""
 
-    lease: _Count
-    scenario: _Words
-    how: How
-    why: _Words
-    in_engine: bool = False
-    asks: Asks | None = None
-    printed: _Printed = b""
-
-
-class Briefing(msgspec.Struct, frozen=True, tag=True):
-    """What a worker needs before it can be given jobs."""
-
-    hello: Hello
-    installed: Installed
-    patience: Patience
-
-
-class Lease(msgspec.Struct, frozen=True, tag=True):
-    """A job, its worker's as long as it renews the lease."""
-
-    number: int
+    lease: int
     job: Job
 
 
-class NothingNow(msgspec.Struct, frozen=True, tag=True):
-    """Nothing to do now: ask again."""
+class Reply(msgspec.Struct, frozen=True, tag=True):
+    """Replies to a claim or a report.
 
+    idle: there is no job now.
+    over: the run is over.
+    renewed: the lease is renewed.
+    revoked: the job is done, or another worker's.
+    kept, duplicate, conflict, refused: what became of a result; a failure is "kept".
+    turned_away: this worker can do nothing for this run, for the reason `why`.
+    """
 
-class GoOn(msgspec.Struct, frozen=True, tag=True):
-    """The lease is renewed."""
-
-
-class LetGo(msgspec.Struct, frozen=True, tag=True):
-    """The job is another's by now, or done: end it, and claim."""
-
-
-class Over(msgspec.Struct, frozen=True, tag=True):
-    """The run is over."""
-
-
-class Received(msgspec.Struct, frozen=True, tag=True):
-    """A result or a failure has been taken in. how: what became of a result."""
-
-    how: Literal["kept", "duplicate", "conflict", "refused"] = "kept"
-
-
-class TurnedAway(msgspec.Struct, frozen=True, tag=True):
-    """This worker can do nothing for this run."""
-
-    why: str
+    kind: Literal[
+        "idle",
+        "over",
+        "renewed",
+        "revoked",
+        "kept",
+        "duplicate",
+        "conflict",
+        "refused",
+        "turned_away",
+    ]
+    why: str = ""
 
 
 class NetPart(msgspec.Struct, frozen=True):
-    """A part of what is handed out by its hash: from which byte, of how many."""
+    """A part of a street net, from byte `begin` on, of `whole` bytes; without data it requests the
+    part."""
 
     begin: _Count
-    whole: _Count
-    data: bytes
+    whole: _Count = 0
+    data: bytes = b""
 
 
-class NetAsked(msgspec.Struct, frozen=True):
-    """Give me this from that byte on."""
-
-    begin: _Count = 0
+CoordinatorReply = Hello | Assignment | Reply
 
 
-CoordinatorSays = Briefing | Lease | NothingNow | GoOn | LetGo | Over | Received | TurnedAway
-
-
-def digest_of(record: bytes, log: bytes) -> str:
-    """By which a damaged result is told from a sound one."""
+def digest_of(done: Done) -> str:
+    """Return a hash of the record and the log of a result, by which damage is noticed."""
     return hashlib.blake2b(
-        len(record).to_bytes(8, "big") + record + log, digest_size=16
+        len(done.record).to_bytes(8, "big") + done.record + done.log, digest_size=16
     ).hexdigest()
 
 
+class Origin(msgspec.Struct):
+    """The fields of a record that say where it comes from."""
+
+    suite_hash: str
+    run_seed: int
+    policy_source: str
+    versions: dict[str, str]
+    renderer: str
+    ended: str | None = None
+
+
+def origin_of(done: Done) -> Origin | None:
+    """Return where a result comes from; None if it is damaged."""
+    try:
+        return msgspec.json.decode(done.record, type=Origin)
+    except msgspec.DecodeError:
+        return None
+
+
+def other_renderer(done: Done, renderer: str) -> str:
+    """Return in words that the pictures of a result were not drawn by the renderer of the run; ""
+    if they were."""
+    origin = origin_of(done)
+    if origin is None or origin.ended is None or origin.renderer == renderer:
+        return ""
+    return f"its pictures are drawn by {origin.renderer}, those of the run by {renderer}"
+
+
 def run_hash(spec: RunSpec) -> str:
-    """The name of a run in keys: that of the same run begun anew, too."""
-    return hashlib.blake2b(msgspec.json.encode(spec, order="sorted"), digest_size=8).hexdigest()
+    """Return the name of a run in keys: a resumed run has the same."""
+    return hashlib.blake2b(RUN_FILE.encode(spec), digest_size=8).hexdigest()
 
 
-_encode_reply = msgspec.msgpack.Encoder().encode
-_replies: msgspec.msgpack.Decoder[CoordinatorSays] = msgspec.msgpack.Decoder(CoordinatorSays)
+encode_reply: Final = msgspec.msgpack.Encoder().encode
+_replies: msgspec.msgpack.Decoder[CoordinatorReply] = msgspec.msgpack.Decoder(CoordinatorReply)
 
 
-def reply_in_bytes(reply: CoordinatorSays) -> bytes:
-    return _encode_reply(reply)
-
-
-def reply_in(payload: bytes) -> CoordinatorSays:
-    """Raises EngineError for what is no reply."""
+def decode_reply(payload: bytes) -> CoordinatorReply:
+    """Decode a reply of the coordinator. Raises EngineError."""
     try:
         return _replies.decode(payload)
     except (msgspec.DecodeError, RecursionError, ValueError) as error:

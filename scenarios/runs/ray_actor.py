@@ -1,115 +1,112 @@
-"""On a node of a Ray cluster: an environment process, kept by a Ray actor.
+"""Runs an environment slot on a node of a Ray cluster, as a Ray actor.
 
-What Ray gives to each node is this actor. It loads no engine: the process beside it does, which is
-the same as in a run on one machine, and what takes that down or hangs in it is told by the actor as
-it is found by a run on one machine.
+The actor loads no engine: the environment process of its slot does, as in a run on one machine.
 """
 
 from __future__ import annotations
 
 import socket
 import threading
-import time
-from collections.abc import Sequence
 from contextlib import ExitStack
+from functools import partial
 from multiprocessing.connection import wait
-from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
-from cosim.core.errors import CosimError
+from cosim.core.errors import CosimError, UsageError
 from cosim.spec.scenario import CityMap, Place
-from scenarios.ipc.child_process import WORKER, KeptProcess
-from scenarios.ipc.messages import Message, Unable, encode_message
+from scenarios.ipc.faults import Failure
+from scenarios.ipc.messages import Message, Unable, decode_hello, decode_job, encode_message
+from scenarios.runs.environment_slot import EnvironmentSlot, new_output, start_environment
 from scenarios.runs.passing_folder import passing_folder
-from scenarios.runs.protocol import Asks, Installed, installed_here
+from scenarios.runs.protocol import Installed, installed_here
+
+_LAST_PRINTED: Final = 1 << 20
+"""Number of bytes that are sent of the output of a process."""
 
 
 class NodeFound(NamedTuple):
-    """Where an actor is, and what is installed there."""
+    """The host name of a node, and what is installed there."""
 
     host: str
     installed: Installed
 
 
-class Heard(NamedTuple):
-    """What a process has said since, whether it has ended, and what its policy is asked."""
+class SlotReport(NamedTuple):
+    """The messages of an environment process since the last report, the failure of its job, and its
+    output."""
 
     said: tuple[bytes, ...]
-    ended: bool
-    asks: Asks | None
-
-
-class ProcessEnd(NamedTuple):
-    """How a process ended, in words, and what it printed."""
-
-    words: str
-    in_engine: bool
-    asks: Asks | None
+    failure: Failure | None
     printed: bytes
 
 
 class EnvironmentActor:
-    """One environment process. Its methods are called by the run, `hear` beside the others."""
+    """Runs jobs in one environment slot. `report` may be called at the same time as another
+    method."""
 
     def __init__(self) -> None:
         self._folder = ExitStack()
-        logs = self._folder.enter_context(passing_folder("cosim-ray-"))
-        self._process = KeptProcess(logs / "process.log", WORKER, "environment")
+        self._log = self._folder.enter_context(passing_folder("cosim-ray-")) / "process.log"
+        self._log_sent = 0
         self._turn = threading.Lock()
-        self._open = True
-        self._trouble: list[Message] = []
+        self._slot: EnvironmentSlot | None = None
+        self._unable: Unable | None = None
 
     def found(self) -> NodeFound:
-        """What is here."""
+        """Return where the actor runs."""
         return NodeFound(socket.gethostname(), installed_here())
 
-    def send(self, message: bytes) -> None:
-        """Hand the process a message as the run made it: its Hello."""
+    def begin(self, hello: bytes) -> None:
+        """Introduce the policy of the run."""
         with self._turn:
-            self._process.send(message)
+            introduced = decode_hello(hello)
+            self._slot = EnvironmentSlot(
+                partial(start_environment, self._log, introduced), introduced
+            )
 
-    def give(self, message: bytes, where: Place, digest: str, parts: Sequence[bytes]) -> None:
-        """Hand the process a job. parts: of the map that it takes place on, where that is not made
-        anew here."""
+    def give(self, job: bytes, where: Place, digest: str, packed: bytes | None) -> None:
+        """Run a job. `packed` is its map, which is kept here if it is missing."""
         try:
-            if parts:
+            if packed is not None:
                 from scenarios.runs.net_transfer import Fetched, lacks  # with the importer of maps
 
                 if isinstance(where, CityMap) and lacks(where):
-                    fetched = Fetched(where, digest)
-                    for part in parts:
-                        fetched.take(part)
+                    Fetched(where, digest).keep(packed)
+            with self._turn:
+                assert self._slot is not None
+                self._slot.give(decode_job(job))
         except CosimError as error:
-            self._trouble.append(Unable(str(error), blames_policy=False))
-        self.send(message)
+            self._unable = Unable(str(error), blames_policy=False)
 
-    def hear(self, timeout_s: float) -> Heard:
-        """What it has said since the last time; waits for something."""
-        if self._open:
-            wait([self._process.wire.fileno()], timeout_s)
+    def report(self, timeout_s: float) -> SlotReport:
+        """Wait for messages of the environment process, and return them."""
+        slot = self._slot
+        descriptor = None if slot is None else slot.descriptor
+        wait([] if descriptor is None else [descriptor], timeout_s)
+        said: list[Message] = []
+        failure = None
         with self._turn:
-            said = self._trouble
-            self._trouble = []
-            goes_on = self._open and self._process.listen(said.append)
-            return Heard(tuple(encode_message(one) for one in said), not goes_on, self._asks())
+            if self._unable is not None:
+                said.append(self._unable)
+            elif slot is not None:
+                try:
+                    failure = slot.poll(said.append)
+                except CosimError as error:
+                    self._unable = Unable(str(error), blames_policy=isinstance(error, UsageError))
+                    said.append(self._unable)
+        return SlotReport(tuple(encode_message(one) for one in said), failure, self._printed())
 
-    def hang_up(self) -> None:
-        """It gets no more jobs."""
+    def close(self) -> bytes:
+        """End the process; return the rest of its output."""
         with self._turn:
-            if self._open:
-                self._process.hang_up()
-
-    def end(self) -> ProcessEnd:
-        """Wait until it has ended, by force if need be."""
-        with self._turn:
-            self._open = False
-            words = self._process.end()
-            printed = Path(self._process.log).read_bytes()
+            if self._slot is not None:
+                self._slot.stop()
+                self._slot.end()
+            printed = self._printed()
             self._folder.close()
-            return ProcessEnd(words, self._process.in_engine, self._asks(), printed)
+            return printed
 
-    def _asks(self) -> Asks | None:
-        question = self._process.question
-        if question is None:
-            return None
-        return Asks(question.doing, question.tick, max(time.monotonic() - question.since_s, 0.0))
+    def _printed(self) -> bytes:
+        """Return what the process has printed since the last report."""
+        printed, self._log_sent = new_output(self._log, self._log_sent, _LAST_PRINTED)
+        return printed

@@ -1,8 +1,8 @@
-"""Workers on a Ray cluster, as a transport.
+"""Reaches workers on a Ray cluster: a transport.
 
-Ray decides where they are and waits for nodes that are yet to come; what becomes of an episode
-whose worker was lost is decided by `scenarios.runs.pool`, as ever. Ray sends Python objects: a
-cluster is as trusted as whoever reaches it.
+Ray places the workers and waits for nodes to come; `scenarios.runs.pool` decides about an
+episode whose worker is lost. Ray sends Python objects: a cluster must be trusted as much as
+everyone that can reach it.
 """
 
 from __future__ import annotations
@@ -14,37 +14,41 @@ import sysconfig
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
 import msgspec
 
-from bridge.codec import decode, encode
 from cosim.core.errors import MachineError, UsageError
 from cosim.policies.user_module import importable
 from cosim.results.run_spec import RunSpec
 from cosim.spec.scenario import Place
-from scenarios.ipc.deadlines import Question
-from scenarios.ipc.messages import Done, Hear, Hello, Job, decode_message, encode_message
+from scenarios.ipc.faults import Failure
+from scenarios.ipc.messages import Done, Hear, Hello, Job, Unable, decode_message, encode_message
+from scenarios.ipc.watchdog import raise_unable
+from scenarios.runs.lease import Lease
 from scenarios.runs.net_transfer import Nets, travels
-from scenarios.runs.protocol import Asks, NetAsked, NetPart, installed_here
-from scenarios.runs.ray_actor import EnvironmentActor, Heard, NodeFound, ProcessEnd
-from scenarios.runs.transport import HeldRun, Reaches, Transport
+from scenarios.runs.protocol import difference, installed_for, other_renderer
+from scenarios.runs.ray_actor import EnvironmentActor, NodeFound, SlotReport
+from scenarios.runs.transport import HeldRun, Transport, TransportFactory
 
 _POLL_S: Final = 1.0
-_ANSWERS_S: Final = 10.0
-"""A worker of which nothing was heard for so long may have stopped: what its policy is asked is not
-known then."""
+LEASE_S: Final = 60.0
+"""Seconds without a report after which an actor has lost its lease, whether or not Ray still lists
+its node."""
 _ENDING_S: Final = 60.0
+"""Seconds that an idle actor may take to end."""
 _TELLS_S: Final = 30.0
+"""Seconds between two notes that Ray places no worker."""
 _STARTS: Final = 3
-"""So many actors in a row may fail to start."""
+"""Number of actors in a row that may fail to start."""
 _Say = Callable[[str], None]
+_Packed = Callable[[Job], tuple[bytes, Place, str, Any]]
 
 
 def check_ray(on: str) -> Any:
-    """The package. Raises UsageError where it is not installed, or where a cluster cannot be called
-    so."""
+    """Return the package. Raises UsageError if it is not installed, or if this names no cluster."""
     if on not in ("ray", "auto") and not on.startswith("ray://"):
         raise UsageError(
             f"--on {on}: give ray, auto, or the address of a cluster, like ray://head.lan:10001"
@@ -52,17 +56,18 @@ def check_ray(on: str) -> Any:
     try:
         import ray
     except ImportError:
-        raise UsageError(
-            f"--on {on} needs Ray, here and on each node: pip install 'sidewalk-cosim[ray]'"
-        ) from None
+        remedy = "pip install -e '.[ray]' in the checkout"
+        raise UsageError(f"--on {on} needs Ray, here and on each node: {remedy}") from None
     return ray
 
 
 def check_on_ray(on: str, of_here: Mapping[str, object]) -> None:
-    """Raises UsageError without Ray, for what is no cluster's name, and where something is asked
-    for that is of processes of this machine. of_here: what is, by its name."""
+    """Check the options of a run on Ray. of_here: those that need processes of this machine, by
+    name.
+
+    Raises UsageError if one of them is set, without Ray, and if this names no cluster."""
     check_ray(on)
-    for name in (name for name, asked in of_here.items() if asked):
+    for name in (name for name, is_set in of_here.items() if is_set):
         raise UsageError(
             f"{name} is of processes of this machine, and these are of a cluster: leave it, "
             f"or that, out"
@@ -70,9 +75,10 @@ def check_on_ray(on: str, of_here: Mapping[str, object]) -> None:
 
 
 @contextmanager
-def by_ray(on: str, jobs: int | None, policy: str, say: _Say) -> Iterator[Reaches]:
-    """A connection to a cluster, as for `ray_cluster`, and how its workers are reached: so many
-    `jobs`, or None for as many as it has CPUs."""
+def by_ray(on: str, jobs: int | None, policy: str, say: _Say) -> Iterator[TransportFactory]:
+    """Connect to a cluster, and create the factory of its transport.
+
+    jobs: number of workers, by default one for each CPU."""
 
     @contextmanager
     def reached(run: HeldRun, tell: Hear) -> Iterator[tuple[Transport, Hear]]:
@@ -86,10 +92,12 @@ def by_ray(on: str, jobs: int | None, policy: str, say: _Say) -> Iterator[Reache
 
 @contextmanager
 def ray_cluster(on: str, policy: str, say: _Say) -> Iterator[None]:
-    """A connection to a cluster: on is "ray", the cluster of this machine or RAY_ADDRESS, else one
-    that is started here and ends with the block; "auto", the same but never started; or
-    "ray://HOST:PORT". The policy's own package goes there, unless it is installed. Raises
-    UsageError where there is none, or one of another Ray or Python."""
+    """Connect to a cluster, and send the policy's package there unless it is installed.
+
+    on: "ray" for the cluster of RAY_ADDRESS or of this machine, which is started, for the block, if
+    there is none; "auto" for the same without starting one; or "ray://HOST:PORT".
+
+    Raises UsageError if there is no cluster, or one of another Ray or Python."""
     ray = check_ray(on)
     address = {"ray": os.environ.get("RAY_ADDRESS", "auto"), "auto": "auto"}.get(on, on)
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
@@ -118,11 +126,13 @@ def ray_cluster(on: str, policy: str, say: _Say) -> Iterator[None]:
 
 
 class RayWorkers:
-    """Workers that are Ray actors of one CPU each: so many `jobs`, or None for as many as the
-    cluster has CPUs now; no more than there are episodes, and fewer while Ray finds no place for
-    more.
+    """Runs workers that are Ray actors of one CPU each.
 
-    logs: the folder for what they print. wanted: how many there are to be."""
+    jobs: their number, by default one for each CPU of the cluster; never more than there are
+    episodes.
+    logs: folder for their output.
+    wanted: the number of actors; there are fewer while Ray finds no place for more.
+    """
 
     def __init__(
         self, spec: RunSpec, logs: Path, jobs: int | None, episodes: int, say: _Say
@@ -131,7 +141,7 @@ class RayWorkers:
         self._spec = spec
         self._logs = logs
         self._say = say
-        self._here = msgspec.structs.replace(installed_here(), versions=spec.versions)
+        self._here = installed_for(spec)
         self.wanted = min(
             jobs or max(1, int(self._ray.cluster_resources().get("CPU", 1))), episodes
         )
@@ -143,25 +153,36 @@ class RayWorkers:
         self._workers: list[_RayWorker] = []
         self._count = self._failed = 0
         self._told_s = time.monotonic()
-        self._maps = _Maps(self._ray)
+        self._nets = Nets()
+        self._sent = cache(lambda digest: self._ray.put(self._nets.packed(digest)))
 
     def room(self, busy: int) -> int:
         self._tend()
         return len(self._placed) + len(self._workers) - busy
 
-    def unasked(self) -> tuple[()]:
+    def unsolicited(self) -> tuple[()]:
         return ()
 
     def start(self, hello: Hello) -> _RayWorker:
         actor, found = self._placed.pop(0)
         log = self._logs / f"ray-{self._count}-{found.host}.log"
         self._count += 1
-        worker = _RayWorker(self._ray, actor, log, hello, self._spec.renderer, self._maps)
+        worker = _RayWorker(
+            self._ray, actor, log, hello, self._spec.setup.renderer, self._packed_job
+        )
         self._workers.append(worker)
         return worker
 
+    def _packed_job(self, job: Job) -> tuple[bytes, Place, str, Any]:
+        """Return what an actor is given: a job, its place, the hash of its net, and a reference to
+        an imported map."""
+        where = job.scenario.place
+        digest = self._nets.hash_of(where)
+        message = encode_message(msgspec.structs.replace(job, net_hash=digest))
+        return message, where, digest, self._sent(digest) if travels(where) else None
+
     def wait(self, timeout_s: float) -> None:
-        refs = [*self._coming, *(one.hearing for one in self._workers if one.open)]
+        refs = [*self._coming, *(one.pending for one in self._workers if not one.ended)]
         if not refs:
             time.sleep(min(timeout_s, 0.1))
             return
@@ -174,8 +195,8 @@ class RayWorkers:
             ) from None
 
     def _tend(self) -> None:
-        """Ask Ray for what is wanted, and see what it has placed."""
-        self._workers = [one for one in self._workers if one.open]
+        """Request the missing actors from Ray, and take in those that it has placed."""
+        self._workers = [one for one in self._workers if not one.ended]
         for _ in range(self.wanted - len(self._coming) - len(self._placed) - len(self._workers)):
             actor = self._actor.remote()
             self._coming[actor.found.remote()] = actor
@@ -204,7 +225,7 @@ class RayWorkers:
                 ) from None
             return
         self._failed = 0
-        if other := found.installed.differs_from(self._here):
+        if other := difference(found.installed, self._here):
             raise UsageError(
                 f"node {found.host} has {other}: install on the nodes what is installed here"
             )
@@ -212,130 +233,87 @@ class RayWorkers:
 
 
 class _RayWorker:
-    """What the run knows of an actor and its process. hearing: the answer that is awaited."""
-
-    in_engine = away = False
+    """An actor that runs jobs (`scenarios.runs.transport.Worker`). `pending` is its next
+    report."""
 
     def __init__(
-        self, ray: Any, actor: Any, log: Path, hello: Hello, renderer: str, maps: _Maps
+        self, ray: Any, actor: Any, log: Path, hello: Hello, renderer: str, packed: _Packed
     ) -> None:
-        self._maps = maps
-        self._renderer = renderer
+        self.log = str(log)
+        self.ended = False
         self._ray = ray
         self._actor = actor
-        self.log = str(log)
-        self.open = True
-        self._asks: Asks | None = None
-        self._heard_s = time.monotonic()
-        self._lost = ""
-        self._actor.send.remote(encode_message(hello))
-        self.hearing = self._actor.hear.remote(_POLL_S)
-
-    @property
-    def question(self) -> Question | None:
-        quiet_s = time.monotonic() - self._heard_s
-        if self._asks is None or (self.open and quiet_s > _ANSWERS_S):
-            return None
-        return self._asks.question(self._heard_s + 2.0 * _POLL_S)
+        self._renderer = renderer
+        self._packed = packed
+        self._lease: Lease | None = None
+        self._leases = 0
+        self._closing: Any = None
+        self._actor.begin.remote(encode_message(hello))
+        self.pending = self._actor.report.remote(_POLL_S)
 
     def give(self, job: Job) -> None:
-        where = job.scenario.place
-        digest = self._maps.hash_of(where)
-        message = encode_message(msgspec.structs.replace(job, net_hash=digest))
-        self._actor.give.remote(message, where, digest, self._maps.parts_of(where))
+        self._leases += 1
+        self._lease = Lease(Path(self.log).stem, self._leases, LEASE_S, job.scenario.id)
+        self._actor.give.remote(*self._packed(job))
 
-    def listen(self, hear: Hear) -> bool:
-        while self.open and self._ray.wait([self.hearing], timeout=0)[0]:
+    def poll(self, hear: Hear) -> Failure | None:
+        while not self.ended and self._ray.wait([self.pending], timeout=0)[0]:
             try:
-                heard: Heard = self._ray.get(self.hearing)
+                report: SlotReport = self._ray.get(self.pending)
             except self._ray.exceptions.RayError as error:
-                self._lost = f"its Ray worker was lost ({type(error).__name__})"
-                self.away = True
-                return False
-            self._heard_s = time.monotonic()
-            self._asks = heard.asks
-            if not heard.ended:
-                self.hearing = self._actor.hear.remote(_POLL_S)
-            for message in map(decode_message, heard.said):
-                if isinstance(message, Done):
-                    self._check_renderer(message.record)
-                hear(message)
-            if heard.ended:
-                return False
-        return True
+                self.ended = True
+                if self._lease is not None:
+                    self._lease.lose(f"its Ray worker was lost ({type(error).__name__})")
+                break
+            self.pending = self._actor.report.remote(_POLL_S)
+            self._take(report)
+        if self._lease is None:
+            return None
+        failure = self._lease.poll(hear)
+        if self._lease.ended:
+            self._lease = None
+        if failure is not None and failure.fault == "machine_lost":
+            self.cancel()
+        return failure
 
-    def _check_renderer(self, record: bytes) -> None:
-        told = msgspec.json.decode(record, type=_Told)
-        if told.ended is not None and told.renderer != self._renderer:
-            raise UsageError(
-                f"pictures are drawn by {told.renderer} on the cluster, and by {self._renderer} "
-                "here, where the run began: take nodes alike, or --camera bullet"
-            )
+    def _take(self, report: SlotReport) -> None:
+        self._keep_output(report.printed)
+        messages = [decode_message(one) for one in report.said]
+        for message in messages:
+            if isinstance(message, Unable):
+                raise_unable(message)
+            if isinstance(message, Done) and (other := other_renderer(message, self._renderer)):
+                raise UsageError(f"{other}: take nodes alike, or --camera bullet")
+        if self._lease is not None:
+            self._lease.take(messages, report.failure)
 
-    def hang_up(self) -> None:
-        self._actor.hang_up.remote()
+    def _keep_output(self, printed: bytes) -> None:
+        if printed:
+            with suppress(OSError), Path(self.log).open("ab") as log:
+                log.write(printed)
 
-    def kill(self, *, wait: bool = True) -> None:
+    def cancel(self) -> None:
         self._ray.kill(self._actor)
-        self._lost = self._lost or "its Ray worker was killed"
-        self.open = False
+        self._lease = None
+        self.ended = True
 
-    def end(self) -> str:
-        if not self._lost:
-            try:
-                ended: ProcessEnd = self._ray.get(self._actor.end.remote(), timeout=_ENDING_S)
-                self._asks = ended.asks
-                self.in_engine = ended.in_engine
-                words = ended.words
-                Path(self.log).write_bytes(ended.printed)
-            except self._ray.exceptions.RayError as error:
-                self.away = True
-                words = f"its Ray worker was lost ({type(error).__name__})"
-            self._lost = words
-        if self.open:
-            self.kill()
-        return self._lost
+    def stop(self) -> None:
+        if self._lease is not None:
+            self.cancel()
+        elif not self.ended:
+            self._closing = self._actor.close.remote()
 
-
-class _Maps:
-    """The imported maps of a run, in the cluster's memory once they are needed."""
-
-    def __init__(self, ray: Any) -> None:
-        self._ray = ray
-        self._nets = Nets()
-        self._there: dict[str, Any] = {}
-
-    def hash_of(self, where: Place) -> str:
-        return self._nets.hash_of(where)
-
-    def parts_of(self, where: Place) -> Any:
-        """A reference to what is sent of a place; nothing for one that every node makes by
-        itself."""
-        if not travels(where):
-            return ()
-        digest = self.hash_of(where)
-        if digest not in self._there:
-            parts: list[bytes] = []
-            begin = 0
-            whole = 1
-            while begin < whole:
-                parts.append(self._nets.part(digest, encode(NetAsked(begin))))
-                one = decode(parts[-1], NetPart)
-                begin = begin + len(one.data)
-                whole = one.whole
-            self._there[digest] = self._ray.put(parts)
-        return self._there[digest]
-
-
-class _Told(msgspec.Struct):
-    """What a record says of its pictures."""
-
-    renderer: str
-    ended: str | None = None
+    def end(self) -> None:
+        if self._closing is not None:
+            with suppress(self._ray.exceptions.RayError):
+                self._keep_output(self._ray.get(self._closing, timeout=_ENDING_S))
+        if not self.ended:
+            self.cancel()
 
 
 def _own_module(policy: str) -> str:
-    """The package, or the file, of a policy that is not installed; "" for all others."""
+    """Return the path of the package or file of a policy that is not installed; "" for all
+    others."""
     policy = importable(policy)
     name = policy.partition(":")[0].partition(".")[0] if ":" in policy else ""
     spec = importlib.util.find_spec(name) if name else None

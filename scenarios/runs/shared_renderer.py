@@ -22,8 +22,8 @@ from cosim.spec.manifest import Manifest
 from cosim.spec.options import CameraName, RendererAt
 from scenarios.ipc.child_process import KeptProcess
 from scenarios.ipc.deadlines import Patience
-from scenarios.ipc.messages import Hello, Message, Ready, Unable
-from scenarios.ipc.render_protocol import RendererHello, encode_exchange
+from scenarios.ipc.messages import Hello, encode_message
+from scenarios.ipc.watchdog import Watchdog
 
 RENDERERS: Final = 3
 """So many may end, one after the other, without an episode that ends in between."""
@@ -54,11 +54,9 @@ class SharedRenderer:
         self.at = RendererAt(address=f"cosim-renderer-{secrets.token_hex(8)}", asks=asks)
         self._hello = msgspec.structs.replace(hello, renderer=self.at)
         self._listening = socket.socket(socket.AF_UNIX)
-        self._process: KeptProcess | None = None
+        self._watchdog: Watchdog | None = None
         self._ends: list[End] = []
         self._in_a_row = 0
-        self._ready = False
-        self._heard_at_s = 0.0
 
     def __enter__(self) -> Self:
         self._listening.bind(f"\0{self.at.address}")
@@ -72,36 +70,33 @@ class SharedRenderer:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if self._process is not None:
-            self._process.hang_up()
-            self._process.kill()
-            self._process = None
+        if self._watchdog is not None:
+            self._watchdog.process.hang_up()
+            self._watchdog.process.kill()
+            self._watchdog = None
         self._listening.close()
 
     def tend(self) -> None:
         """Take in what the renderer says; start another if it has ended or hangs. Raises UsageError
         when it cannot load the policy, MachineError when there can be none."""
-        if self._process is None:
+        if self._watchdog is None:
             self._start()
-        elif not self._process.listen(self._take):
-            words = self._process.end()
-            asked = self._process.question is not None
-            self._replace(End(words), blames_policy=asked)
-        elif (question := self._process.question) is not None:
-            self._heard_at_s = time.monotonic()
-            if question.overdue(self._patience):
-                self._process.kill()
-                allowed_s = self._patience.of(question.doing)
-                if question.doing == "loading":
-                    raise UsageError(
-                        f"policy '{self._hello.manifest.name}' gave no answer for "
-                        f"{allowed_s:g} s while it was loaded "
-                        "in the renderer process: give a longer --start-timeout"
-                    )
-                self._replace(End("the renderer process was ended", allowed_s), blames_policy=True)
-        elif time.monotonic() - self._heard_at_s > _SILENCE_S:
-            self._process.kill()
-            self._replace(End("the renderer process showed no sign of life"), blames_policy=False)
+            return
+        end = self._watchdog.poll(lambda message: None)
+        if end is None:
+            return
+        if (
+            end.allowed_s is not None
+            and end.question is not None
+            and end.question.doing == "loading"
+        ):
+            raise UsageError(
+                f"policy '{self._hello.manifest.name}' gave no answer for {end.allowed_s:g} s "
+                "while it was loaded in the renderer process: give a longer --start-timeout"
+            )
+        self._replace(
+            self._watchdog, End(end.words, end.allowed_s), blames_policy=end.question is not None
+        )
 
     def end_of(self, number: int) -> End | None:
         """How the renderer of that number ended; None if it goes on, and an environment alone has
@@ -110,9 +105,11 @@ class SharedRenderer:
             return End("the renderer process could not be reached")
         deadline_s = time.monotonic() + _ENDING_S
         while (
-            number > len(self._ends) and self._process is not None and time.monotonic() < deadline_s
+            number > len(self._ends)
+            and self._watchdog is not None
+            and time.monotonic() < deadline_s
         ):
-            select.select([self._process.wire], [], [], 0.1)
+            select.select([self._watchdog.process.wire], [], [], 0.1)
             self.tend()
         return self._ends[number - 1] if number <= len(self._ends) else None
 
@@ -122,27 +119,16 @@ class SharedRenderer:
 
     def _start(self) -> None:
         log = self._logs / f"renderer-{len(self._ends)}.log"
-        self._process = KeptProcess(log, _SERVES, "renderer", (self._listening.fileno(),))
-        self._process.send(encode_exchange(RendererHello(self._hello, len(self._ends) + 1)))
-        self._ready = False
-        self._heard_at_s = time.monotonic()
+        process = KeptProcess(log, _SERVES, "renderer", (self._listening.fileno(),))
+        at = msgspec.structs.replace(self.at, number=len(self._ends) + 1)
+        process.send(encode_message(msgspec.structs.replace(self._hello, renderer=at)))
+        self._watchdog = Watchdog(process, self._patience, _SILENCE_S)
 
-    def _take(self, message: Message) -> None:
-        self._heard_at_s = time.monotonic()
-        if isinstance(message, Unable):
-            raise (
-                UsageError(message.reason)
-                if message.blames_policy
-                else MachineError(message.reason)
-            )
-        self._ready |= isinstance(message, Ready)
-
-    def _replace(self, end: End, *, blames_policy: bool) -> None:
+    def _replace(self, watchdog: Watchdog, end: End, *, blames_policy: bool) -> None:
         """The renderer has ended. Raises the run's error when it does so again and again."""
-        assert self._process is not None
         self._ends.append(end)
         if (
-            self._ready and blames_policy
+            watchdog.ready and blames_policy
         ):  # counted as attempts of the episodes that it was asked for
             self._start()
             return
@@ -150,7 +136,7 @@ class SharedRenderer:
         if self._in_a_row >= RENDERERS:
             told = (
                 f"{end.words}, {RENDERERS} times, and no episode ended in between: see "
-                f"{self._process.log}"
+                f"{watchdog.process.log}"
             )
             if blames_policy:
                 raise UsageError(f"policy '{self._hello.policy}' cannot be loaded: {told}")

@@ -1,5 +1,5 @@
-"""The roll of a run's workers: who is there, how far each is, and whatever is odd; for `cosim
-status`, and kept in the run folder."""
+"""Registry of connected workers, their progress and protocol errors, for `cosim status` and the run
+folder."""
 
 from __future__ import annotations
 
@@ -17,51 +17,85 @@ from cosim.core.errors import EngineError
 from cosim.core.log_event import happened
 from cosim.results.run_folder import RunFolder
 from cosim.spec.scenario import Scenario
-from scenarios.ipc.messages import Compares, Done, Hear, Message, Progress, Waits
-from scenarios.runs.protocol import Asking, NoResult, Renewal, Result
+from scenarios.ipc.messages import Done, Hear, Message, Progress, Waits
+from scenarios.runs.protocol import Report
 
 STATUS_FILE: Final = "status.json"
 LOG_FILE: Final = "logs/coordinator.log"
 CONFLICT: Final = "CONFLICT"
 SILENT_S: Final = 4.0
-"""A worker renews every second."""
+"""Seconds without a report after which a worker is shown as silent: it reports every second."""
 _WRITTEN_EVERY_S: Final = 2.0
-_MOST_ODD: Final = 1000
+_MOST_REFUSED: Final = 1000
+"""Number of refused messages that are logged."""
 _MOST_GONE: Final = 1000
+"""Number of workers that have left or were lost and are still listed."""
 _MOST_PRINTED: Final = 4 << 20
+"""Size limit in bytes of the output that is kept of each environment process."""
 
 State = Literal["working", "idle", "silent", "lost", "left", "turned away"]
 
 
-class Under(msgspec.Struct, frozen=True, kw_only=True):
-    """An episode under way. time_s: simulated; share: of its route, 0 to 1; for_s: how long it has
-    been run; still_s: since it came on; waits: what for, "" if for nothing."""
+class RunningEpisode(msgspec.Struct, kw_only=True):
+    """An episode that a worker runs.
+
+    time_s: simulated seconds.
+    share: driven part of its route, 0 to 1.
+    moved_at_s: wall clock of its last progress.
+    waits: what it waits for, "" if for nothing.
+    """
 
     scenario: str
     time_s: float = 0.0
     share: float = 0.0
-    for_s: float = 0.0
-    still_s: float = 0.0
+    moved_at_s: float = msgspec.field(default_factory=time.time)
     waits: str = ""
 
+    def take(self, message: Message, length_m: float) -> None:
+        """Note a message about the episode, whose route has this length."""
+        self.moved_at_s = time.time()
+        self.waits = message.reason if isinstance(message, Waits) else ""
+        if isinstance(message, Progress) and message.compared is not None:
+            self.share = 1.0
+            self.waits = f"is compared, {message.compared:.0%}"
+        elif isinstance(message, Progress):
+            self.time_s = message.time_s
+            self.share = min(max(message.route_s_m / length_m, 0.0), 1.0)
 
-class WorkerHealth(msgspec.Struct, frozen=True, kw_only=True):
-    """How a worker is. silent_s: since it was heard last; done: how many results it has brought;
-    why: of its state."""
+
+class WorkerStatus(msgspec.Struct, kw_only=True):
+    """The state of a worker, and the reason for it.
+
+    heard_at_s: wall clock of its last message.
+    done: number of its results.
+    episodes: what it runs, by the number of the slot.
+    """
 
     name: str
     host: str
-    state: State
-    silent_s: float
-    done: int
-    why: str
-    under_way: tuple[Under, ...]
+    state: State = "idle"
+    why: str = ""
+    connected: bool = True
+    heard_at_s: float = msgspec.field(default_factory=time.time)
+    done: int = 0
+    episodes: dict[int, RunningEpisode] = msgspec.field(default_factory=dict)
+
+    def state_at(self, at_s: float) -> State:
+        """Return its state as of a moment: "silent" after a few seconds without a message."""
+        silent = self.state in ("working", "idle") and at_s - self.heard_at_s > SILENT_S
+        return "silent" if silent else self.state
 
 
 class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """How a run goes. since_s: since it was begun, or begun anew; at_s: of the wall clock;
-    per_hour: episodes; left_s: None while it cannot be told; lost: how many episodes were lost with
-    their workers; odd: messages refused."""
+    """The progress of a run.
+
+    since_s: seconds since it began, or was resumed.
+    at_s: wall clock when the status was taken.
+    per_hour: episodes an hour; None before the first is done.
+    left_s: estimated seconds to its end; None before the first is done.
+    lost: number of episodes that were lost with their workers.
+    refused: number of messages that were refused.
+    """
 
     suite: str
     policy: str
@@ -73,145 +107,96 @@ class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
     per_hour: float | None = None
     left_s: float | None = None
     lost: int = 0
-    odd: int = 0
-    workers: tuple[WorkerHealth, ...] = ()
+    refused: int = 0
+    workers: tuple[WorkerStatus, ...] = ()
     conflicts: tuple[str, ...] = ()
 
 
-class _Underway:
-    """An episode that a worker runs."""
-
-    def __init__(self, scenario: str) -> None:
-        self.scenario = scenario
-        self.time_s = 0.0
-        self.share = 0.0
-        self.waits = ""
-        self.begun_s = self.moved_s = time.monotonic()
-
-    def told(self, now_s: float) -> Under:
-        return Under(
-            scenario=self.scenario,
-            time_s=self.time_s,
-            share=self.share,
-            for_s=now_s - self.begun_s,
-            still_s=now_s - self.moved_s,
-            waits=self.waits,
-        )
-
-
-class _Known:
-    """What is known of a worker."""
-
-    def __init__(self, host: str) -> None:
-        self.host = host
-        self.state = "idle"
-        self.why = ""
-        self.done = 0
-        self.there = True
-        self.heard_s = time.monotonic()
-        self.under_way: dict[int, _Underway] = {}
-
-
-class Roll:
-    """Of one run, whose folder is held. tell: is told on what the workers say."""
+class WorkerRegistry:
+    """Lists the workers of one run, whose folder is locked by this process. `tell` is the run's
+    progress callback."""
 
     def __init__(
         self, held: RunFolder, scenarios: Sequence[Scenario], finished: int, tell: Hear
     ) -> None:
         self._held = held
-        self._tell_on = tell
+        self._tell = tell
         self._lengths_m = {one.id: max(one.route_line.length_m, 1.0) for one in scenarios}
         self._before = finished
         self._finished = finished
         self._began_s = time.monotonic()
         self._written_s = 0.0
-        self._known: dict[str, _Known] = {}
-        self._lost = self._odd = 0
+        self._workers: dict[str, WorkerStatus] = {}
+        self._lost = 0
+        self._refused = 0
         self._conflicts = [line for line in _lines(held.path / LOG_FILE) if CONFLICT in line]
 
     @property
-    def anybody(self) -> bool:
-        """Whether a worker is there."""
-        return any(one.there for one in self._known.values())
+    def any_connected(self) -> bool:
+        """Whether a worker is connected."""
+        return any(one.connected for one in self._workers.values())
 
     def tell(self, message: Message) -> None:
-        """Something that a worker has said of its episode."""
+        """Pass on a message about an episode."""
         self._finished += isinstance(message, Done)
-        self._tell_on(message)
+        self._tell(message)
 
-    def heard(self, worker: str, host: str, slot: int) -> None:
-        """A worker has asked for a job."""
+    def claimed(self, worker: str, host: str, slot: int) -> None:
+        """Note that a slot of a worker has no job."""
         one = self._of(worker, host)
-        one.under_way.pop(slot, None)
-        one.state = "working" if one.under_way else "idle"
+        one.episodes.pop(slot, None)
+        one.state = "working" if one.episodes else "idle"
         one.why = ""
 
-    def leased(self, worker: str, slot: int, scenario: str) -> None:
-        """A worker has been given a job."""
+    def assigned(self, worker: str, slot: int, scenario: str) -> None:
+        """Note the job that a slot of a worker has been given."""
         one = self._of(worker, "")
         one.state = "working"
-        one.under_way[slot] = _Underway(scenario)
+        one.episodes[slot] = RunningEpisode(scenario=scenario)
 
-    def renewed(self, renewal: Renewal) -> None:
-        one = self._of(renewal.worker, "")
-        one.state = "working"
-        one.why = ""
-        under = one.under_way.get(renewal.slot)
-        if under is None or under.scenario != renewal.scenario:
-            under = one.under_way[renewal.slot] = _Underway(renewal.scenario)
-        for message in renewal.said:
-            under.moved_s = time.monotonic()
-            under.waits = ""
-            if isinstance(message, Progress):
-                far = message.route_s_m / self._lengths_m.get(message.scenario, 1.0)
-                under.time_s = message.time_s
-                under.share = min(max(far, 0.0), 1.0)
-            elif isinstance(message, Compares):
-                under.share = 1.0
-                under.waits = f"is compared, {message.share:.0%}"
-            elif isinstance(message, Waits):
-                under.waits = message.reason
+    def reported(self, report: Report) -> None:
+        """Note the progress or the end of a job."""
+        one = self._of(report.worker, "")
+        if report.done is not None:
+            one.episodes.pop(report.slot, None)
+            one.done += 1
+        elif report.fault is not None:
+            one.episodes.pop(report.slot, None)
+            where = f"{report.worker}/{report.slot}: {report.scenario or 'no episode'}"
+            self.note(f"{where}: {report.fault.replace('_', ' ')}: {report.why}".rstrip(": "))
+            if report.fault == "worker_unable":
+                one.state = "turned away"
+                one.why = report.why
+            elif report.fault == "handed_back":
+                one.state = "left"
+        else:
+            one.state = "working"
+            one.why = ""
+            episode = one.episodes.get(report.slot)
+            if episode is None or episode.scenario != report.scenario:
+                episode = one.episodes[report.slot] = RunningEpisode(scenario=report.scenario)
+            for message in report.said:
+                episode.take(message, self._lengths_m.get(message.scenario, 1.0))
 
-    def delivered(self, result: Result) -> None:
-        one = self._of(result.worker, "")
-        one.under_way.pop(result.slot, None)
-        one.done += 1
-
-    def failed(self, failure: NoResult) -> None:
-        one = self._of(failure.worker, "")
-        one.under_way.pop(failure.slot, None)
-        words = (
-            f"{failure.worker}/{failure.slot}: {failure.scenario or 'no episode'}: "
-            f"{failure.how}: {failure.why}"
-        )
-        self.note(words.rstrip(": "))
-        if failure.how == "unable":
-            one.state = "turned away"
-            one.why = failure.why
-        elif failure.how == "released":
-            one.state = "left"
-
-    def gone(self, worker: str) -> None:
-        """A worker is not seen any more."""
-        one = self._known.get(worker)
+    def disconnected(self, worker: str) -> None:
+        """Note that a worker is lost, or has left."""
+        one = self._workers.get(worker)
         if one is not None:
-            one.there = False
+            one.connected = False
         if one is None or one.state in ("left", "turned away"):
             return
-        self._lost += len(one.under_way)
-        one.state, one.why = (
-            "lost" if one.under_way else "left",
-            ", ".join(u.scenario for u in one.under_way.values()),
-        )
-        self.note(f"{worker}: {'lost, with ' + one.why if one.under_way else 'has left'}")
+        self._lost += len(one.episodes)
+        one.state = "lost" if one.episodes else "left"
+        one.why = ", ".join(episode.scenario for episode in one.episodes.values())
+        self.note(f"{worker}: {'lost, with ' + one.why if one.episodes else 'has left'}")
 
     def left(self, worker: str) -> None:
-        """It knows that the run is over."""
-        if worker in self._known:
-            self._known[worker].state = "left"
+        """Note that a worker knows that the run is over."""
+        if worker in self._workers:
+            self._workers[worker].state = "left"
 
-    def refused(self, worker: str, host: str, why: str) -> None:
-        """A worker can do nothing for this run."""
+    def turned_away(self, worker: str, host: str, why: str) -> None:
+        """Note that a worker can do nothing for this run."""
         one = self._of(worker, host)
         if (one.state, one.why) != ("turned away", why):
             self.note(f"{worker}: turned away: {why}")
@@ -220,35 +205,37 @@ class Roll:
         one.why = why
 
     def conflict(self, words: str) -> None:
-        self._conflicts.append(self.note(words))
+        """Note that two results of a scenario contradict each other."""
+        self._conflicts.append(self.note(f"{CONFLICT}: {words}"))
 
-    def odd(self, words: str) -> None:
-        """Something that cannot be read, or is none of this run's."""
-        self._odd += 1
-        if self._odd <= _MOST_ODD:
+    def refused(self, words: str) -> None:
+        """Note a message that cannot be read, or is of another run."""
+        self._refused += 1
+        if self._refused <= _MOST_REFUSED:
             self.note(words)
 
     def note(self, words: str) -> str:
-        """Keep a line in the run's log. Returns it."""
+        """Add a line to the run's log, and return it."""
         happened("noted", DEBUG, words=words)
         line = f"{datetime.now(UTC).strftime('%Y-%m-%d %H:%M:%S')} {' '.join(words.split())}"
         with (
             suppress(OSError),
             (self._held.path / LOG_FILE).open("a") as log,
-        ):  # a full disk is told elsewhere
+        ):  # a full disk is reported elsewhere
             log.write(line + "\n")
         return line
 
-    def printed(self, who: Asking, text: bytes) -> None:
-        """Keep what an environment process has printed."""
-        path = self._held.path / "logs" / f"{who.worker}-{who.slot}.log"
+    def printed(self, report: Report) -> None:
+        """Keep the output of an environment process."""
+        path = self._held.path / "logs" / f"{report.worker}-{report.slot}.log"
+        text = report.printed
         with suppress(OSError):
             if text and (not path.exists() or path.stat().st_size < _MOST_PRINTED):
                 with path.open("ab") as log:
                     log.write(text)
 
-    def tend(self) -> None:
-        """Write the status to the run folder, every now and then."""
+    def write(self) -> None:
+        """Write the status to the run folder, unless that was done just before."""
         if time.monotonic() - self._written_s > _WRITTEN_EVERY_S:
             self._written_s = time.monotonic()
             path = self._held.path / STATUS_FILE
@@ -258,16 +245,16 @@ class Roll:
                 part.replace(path)
 
     def status(self) -> RunStatus:
-        """How the run goes by now."""
+        """Return the progress of the run."""
         now_s = time.monotonic()
         spec = self._held.spec
         since_s = now_s - self._began_s
         here = self._finished - self._before
         total = len(spec.scenarios)
-        halves = sum(
-            under.share for one in self._known.values() for under in one.under_way.values()
+        parts = sum(
+            episode.share for one in self._workers.values() for episode in one.episodes.values()
         )
-        per_s = (here + halves) / since_s if here else None
+        per_s = (here + parts) / since_s if here else None
         return RunStatus(
             suite=spec.suite,
             policy=spec.policy,
@@ -277,50 +264,34 @@ class Roll:
             since_s=since_s,
             at_s=time.time(),
             per_hour=None if per_s is None else here / since_s * 3600.0,
-            left_s=None if per_s is None else max(total - self._finished - halves, 0.0) / per_s,
+            left_s=None if per_s is None else max(total - self._finished - parts, 0.0) / per_s,
             lost=self._lost,
-            odd=self._odd,
-            workers=tuple(_health(name, one, now_s) for name, one in sorted(self._known.items())),
+            refused=self._refused,
+            workers=tuple(one for _, one in sorted(self._workers.items())),
             conflicts=tuple(self._conflicts),
         )
 
-    def _of(self, worker: str, host: str) -> _Known:
-        one = self._known.get(worker)
+    def _of(self, worker: str, host: str) -> WorkerStatus:
+        one = self._workers.get(worker)
         if one is None:
             absent = [
-                name for name, one in self._known.items() if one.state not in ("working", "idle")
+                name for name, one in self._workers.items() if one.state not in ("working", "idle")
             ]
             for name in absent[: max(len(absent) - _MOST_GONE, 0)]:
-                del self._known[name]
-            one = self._known[worker] = _Known(host or worker)
-            self.note(f"{worker}: is there")
-        one.heard_s = time.monotonic()
-        one.there = True
+                del self._workers[name]
+            one = self._workers[worker] = WorkerStatus(name=worker, host=host or worker)
+            self.note(f"{worker}: is connected")
+        one.heard_at_s = time.time()
+        one.connected = True
         return one
 
 
-def status_in(payload: bytes) -> RunStatus:
-    """A status as it was told or kept. Raises EngineError for what is none."""
+def decode_status(payload: bytes) -> RunStatus:
+    """Decode a status. Raises EngineError."""
     try:
         return msgspec.json.decode(payload, type=RunStatus)
     except (msgspec.DecodeError, RecursionError) as error:
         raise EngineError(f"the status of the run cannot be read: {error}") from error
-
-
-def _health(name: str, one: _Known, now_s: float) -> WorkerHealth:
-    silent_s = now_s - one.heard_s
-    state: State = one.state  # type: ignore[assignment]
-    if state in ("working", "idle") and silent_s > SILENT_S:
-        state = "silent"
-    return WorkerHealth(
-        name=name,
-        host=one.host,
-        state=state,
-        silent_s=silent_s,
-        done=one.done,
-        why=one.why,
-        under_way=tuple(under.told(now_s) for under in one.under_way.values()),
-    )
 
 
 def _lines(path: Path) -> list[str]:

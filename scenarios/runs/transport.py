@@ -1,8 +1,9 @@
-"""Transport: how jobs reach the workers that run episodes, and how what those say comes back.
+"""Defines how jobs reach the workers that run episodes, and how their messages and results come
+back.
 
-A transport carries, and nothing else: what a run does when a worker dies, falls silent or reports a
-damaged record stands above it, in `scenarios.runs.pool`, and is the same for all of them. A record
-and its log travel as bytes, so that a worker needs no folder of the run's.
+A transport starts workers; what a run does about a failed episode is decided in
+`scenarios.runs.pool`, and is the same for all transports. A record and its log travel as
+bytes, so that a worker needs no access to the run folder.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Literal, NamedTuple, Protocol
 from cosim.episode.policy_caller import Driver
 from cosim.results.run_folder import RunFolder
 from cosim.spec.scenario import Scenario
-from scenarios.ipc.deadlines import Patience, Question
+from scenarios.ipc.faults import Failure
 from scenarios.ipc.messages import Done, Hear, Hello, Job
 from scenarios.runs.worker import run_job
 
@@ -24,55 +25,44 @@ class Worker(Protocol):
 
     @property
     def log(self) -> str:
-        """Where one can read what it has printed."""
+        """Path of the file with its output."""
 
     @property
-    def question(self) -> Question | None:
-        """What its policy is asked right now, or was asked when it ended; None where nothing can be
-        known."""
-
-    @property
-    def in_engine(self) -> bool:
-        """Whether it was a fault of compiled code that ended it, while its policy was asked
-        nothing."""
-
-    @property
-    def away(self) -> bool:
-        """Whether it has left, or was lost with all that is beside it: its end tells nothing of its
-        episode."""
+    def ended(self) -> bool:
+        """Whether it takes no more jobs."""
 
     def give(self, job: Job) -> None:
-        """Hand it a job. One that has died does not hear it: the next `listen` tells."""
+        """Send it a job."""
 
-    def listen(self, hear: Hear) -> bool:
-        """Tell what it has said since, whole messages in their order, without waiting for more;
-        False when it has ended and nothing more will come."""
+    def poll(self, hear: Hear) -> Failure | None:
+        """Pass on the messages that have arrived, without waiting; return the failure of its job if
+        it has failed."""
 
-    def hang_up(self) -> None:
-        """It gets no more jobs, and ends when it has none."""
+    def cancel(self) -> None:
+        """Take its job away."""
 
-    def kill(self, *, wait: bool = True) -> None:
-        """End it by force, with everything that it has started."""
+    def stop(self) -> None:
+        """Tell it to end, by force if it is busy, without waiting for that."""
 
-    def end(self) -> str:
-        """Wait until it has ended, by force if need be. Returns how it ended, in words."""
+    def end(self) -> None:
+        """Wait until it has ended."""
 
 
 Reception = Literal["kept", "duplicate", "conflict", "refused"]
-"""What became of a result: kept; there already, alike; there already, with other content; of no
+"""What became of a result: it is kept, equals or contradicts the one in the run folder, or is of no
 use."""
 
 
-class GoesOn(NamedTuple):
-    """A worker that runs a scenario of this run though nobody here has given it that: the run was
-    begun anew, or had given it up for lost."""
+class AdoptedJob(NamedTuple):
+    """A scenario that a worker runs already: the run was resumed, or had given the worker up for
+    lost."""
 
     scenario: str
     worker: Worker
 
 
-class Late(NamedTuple):
-    """A result from a worker that the job had been taken from. answer: to be told what became of
+class LateResult(NamedTuple):
+    """A result that arrives after the job was reassigned. `answer` is called with what became of
     it."""
 
     done: Done
@@ -80,43 +70,44 @@ class Late(NamedTuple):
 
 
 class Transport(Protocol):
-    """Starts workers. A worker tells that it is `Ready` or `Unable` before it says anything
-    else."""
+    """Starts workers."""
 
     def room(self, busy: int) -> int:
-        """How many more jobs can be given now, while so many are."""
+        """Return how many more jobs can be given now, while `busy` workers have one."""
 
-    def unasked(self) -> Iterable[GoesOn | Late]:
-        """What has come without having been asked for since the last time."""
+    def unsolicited(self) -> Iterable[AdoptedJob | LateResult]:
+        """Return the jobs and results that have arrived since the last call without being
+        requested."""
 
     def start(self, hello: Hello) -> Worker:
-        """One more worker. Raises MachineError when there can be none."""
+        """Start one more worker. Raises MachineError when that is impossible."""
 
     def wait(self, timeout_s: float) -> None:
-        """Until a worker that has not ended may have something to tell, or the time is over."""
+        """Wait until a worker may have something to report, or the time is over."""
 
 
 class HeldRun(NamedTuple):
-    """A run whose folder is held. hello: its policy; patience: with that; picked: its scenarios, of
-    a shard those of that; todo: what of these is to be run."""
+    """A run whose folder is locked by this process.
+
+    hello: introduces its policy.
+    picked: its scenarios, of a shard those of the shard.
+    todo: those of them that are to be run.
+    """
 
     held: RunFolder
     hello: Hello
-    patience: Patience
     picked: Sequence[Scenario]
     todo: Sequence[Scenario]
 
 
-Reaches = Callable[[HeldRun, Hear], AbstractContextManager[tuple[Transport, Hear]]]
-"""How workers are reached for a run, and what is to be told of their episodes in place of what was
-to be."""
+TransportFactory = Callable[[HeldRun, Hear], AbstractContextManager[tuple[Transport, Hear]]]
+"""Creates the transport for a run and wraps its progress callback."""
 
 
 class InProcess:
-    """Episodes run in this process, one after another, while they are listened to, by a policy that
-    was loaded here.
+    """Runs episodes in this process, one after another, with a policy that is loaded here.
 
-    One that hangs or dies takes the run with it: no time limit of an answer can be kept.
+    An episode that hangs or dies takes the run with it, and no time limit of an answer is enforced.
     """
 
     def __init__(self, driver: Driver) -> None:
@@ -125,22 +116,21 @@ class InProcess:
     def room(self, busy: int) -> int:
         return 1 - busy
 
-    def unasked(self) -> tuple[()]:
+    def unsolicited(self) -> tuple[()]:
         return ()
 
-    def start(self, hello: Hello) -> _Here:
-        return _Here(self._driver)
+    def start(self, hello: Hello) -> _ThisProcess:
+        return _ThisProcess(self._driver)
 
     def wait(self, timeout_s: float) -> None:
-        """Nothing: who listens has the next job done."""
+        """Do nothing: the next poll runs the next job."""
 
 
-class _Here:
-    """A worker that works when it is listened to."""
+class _ThisProcess:
+    """Runs its job when it is polled."""
 
     log = "this process's own output"
-    question: Question | None = None
-    in_engine = away = False
+    ended = False
 
     def __init__(self, driver: Driver) -> None:
         self._driver = driver
@@ -149,20 +139,18 @@ class _Here:
     def give(self, job: Job) -> None:
         self._job = job
 
-    def listen(self, hear: Hear) -> bool:
+    def poll(self, hear: Hear) -> None:
         job = self._job
         self._job = None
-        if job is None:
-            return True
-        done, _ = run_job(job, self._driver, hear)
-        hear(done)
-        return True
+        if job is not None:
+            done, _ = run_job(job, self._driver, hear)
+            hear(done)
 
-    def hang_up(self) -> None:
-        """It has nothing that would have to end."""
+    def cancel(self) -> None:
+        """Do nothing: nothing else runs while it works."""
 
-    def kill(self, *, wait: bool = True) -> None:
-        """Nobody who could is left while it works."""
+    def stop(self) -> None:
+        """Do nothing: this process continues."""
 
-    def end(self) -> str:
-        return "this process goes on"
+    def end(self) -> None:
+        """Do nothing: this process continues."""

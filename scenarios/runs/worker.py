@@ -16,24 +16,25 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from socket import socket
-from typing import TYPE_CHECKING
 
+import msgspec
+
+from bridge.policy_server import said_by
 from cosim.core.clock import Clock
 from cosim.core.errors import MachineError, RendererLost, UsageError
 from cosim.core.framing import Wire
-from cosim.episode.policy_caller import Driver, said_by
+from cosim.core.versions import versions
+from cosim.episode.policy_caller import Driver
 from cosim.episode.step import Step
 from cosim.policies.load import load_policy
 from cosim.results.referee import Verdict
 from scenarios.ipc.deadlines import Asked
 from scenarios.ipc.messages import (
-    Compares,
     Done,
     FrameDrawn,
     Hear,
     Hello,
     Job,
-    Learner,
     LostRenderer,
     Message,
     Progress,
@@ -44,11 +45,9 @@ from scenarios.ipc.messages import (
     decode_job,
     encode_message,
 )
-from scenarios.ipc.render_link import AskedElsewhere, link_to
+from scenarios.ipc.render_link import link_to
 from scenarios.runs.policy_host import policy_driver
-
-if TYPE_CHECKING:
-    from scenarios.episodes.episode import Watch
+from scenarios.runs.shared_policy import shared_driver
 
 REPORT_EVERY_TICKS = 20
 CANNOT_START = "an environment process cannot start:"
@@ -133,7 +132,9 @@ class DriversHere:
 def drivers_here(hello: Hello, timer: Asked, say: Hear, *, again: bool = False) -> DriversHere:
     """See `policy_here`; the learner is held against what it was for the run in the same way."""
     if hello.renderer is not None and hello.renderer.asks:
-        driver: Driver = AskedElsewhere(hello.manifest, hello.source_hash, hello.renderer)
+        driver: Driver = shared_driver(
+            hello.manifest, hello.source_hash, hello.renderer, hello.host.run
+        )
     else:
         driver = policy_here(hello, timer, say, again=again)
     if (learner := hello.learner) is None:
@@ -163,7 +164,7 @@ def _unable_told(say: Hear) -> Iterator[None]:
         raise
 
 
-def _as_begun(driver: Driver, begun: Hello | Learner, again: bool) -> Driver:
+def _as_begun(driver: Driver, begun: Hello, again: bool) -> Driver:
     """A driver that was loaded here, if it is what it was for the run. Raises UsageError."""
     if driver.source_hash != begun.source_hash:
         raise UsageError(
@@ -198,16 +199,19 @@ def run_job(
         from scenarios.episodes.demonstrator import Demonstrator
 
         expert = Demonstrator(driver, collecting, job.options.goal, learner)
+    watcher = _Watcher(job, say)
     try:
-        if (shared := job.options.renderer) is not None:
-            link_to(shared.address, lambda: say(Waits(name, "waits for the shared renderer")))
+        if job.renderer is not None:
+            link_to(job.renderer.address, lambda: say(Waits(name, "waits for the shared renderer")))
         outcome = run_episode(
             job.scenario,
             expert or driver,
             job.options,
-            watches=[_watcher(job, say)],
+            setup=job.setup and msgspec.structs.replace(job.setup, versions=versions()),
+            renderer=job.renderer,
+            watches=[watcher.watch],
             waiting=lambda reason: say(Waits(name, reason)),
-            comparing=lambda share: say(Compares(name, share)),
+            comparing=watcher.compared,
         )
     except RendererLost as lost:
         return LostRenderer(name, lost.number, lost.asked), False
@@ -219,25 +223,31 @@ def run_job(
     return done, bool(outcome.traceback)
 
 
-def _watcher(job: Job, say: Hear) -> Watch:
-    """Reports progress, and the camera frames that the job asks for."""
-    failures = 0
-    next_frame_s = 0.0
+class _Watcher:
+    """Reports the progress of an episode, and the camera frames that its job asks for."""
 
-    def watch(step: Step, verdict: Verdict) -> None:
-        nonlocal failures, next_frame_s
-        failures += len(verdict.failures)
+    def __init__(self, job: Job, say: Hear) -> None:
+        self._every_s = job.options.frames_every_s
+        self._say = say
+        self._next_frame_s = 0.0
+        self._progress = Progress(job.scenario.id, 0.0, 0.0, 0)
+
+    def watch(self, step: Step, verdict: Verdict) -> None:
         time_s = Clock().time_s(step.tick)
-        if step.frame is not None and job.options.frames_every_s and time_s >= next_frame_s:
+        name = self._progress.scenario
+        failures = self._progress.failures + len(verdict.failures)
+        self._progress = Progress(name, time_s, step.route_s_after_m, failures)
+        if step.frame is not None and self._every_s and time_s >= self._next_frame_s:
             import cv2
 
-            next_frame_s += job.options.frames_every_s
+            self._next_frame_s += self._every_s
             _, png = cv2.imencode(".png", step.frame.rgb[..., ::-1])
-            say(FrameDrawn(job.scenario.id, step.tick, png.tobytes()))
+            self._say(FrameDrawn(name, step.tick, png.tobytes()))
         if step.tick % REPORT_EVERY_TICKS == 0:
-            say(Progress(job.scenario.id, time_s, step.route_s_after_m, failures))
+            self._say(self._progress)
 
-    return watch
+    def compared(self, share: float) -> None:
+        self._say(msgspec.structs.replace(self._progress, compared=share))
 
 
 def said_to_run(wire: Wire, worker: int, message: Message) -> None:

@@ -1,8 +1,8 @@
-"""Workers on other machines, as a transport: whenever they are free they ask the run's coordinator
-for jobs.
+"""Reaches workers on other machines over Zenoh: a transport. Free workers claim jobs from the run's
+coordinator.
 
-Threads of Zenoh's only put what they hear into a queue; all else is done by the thread of the run,
-when it waits.
+Zenoh's threads only put what arrives into a queue; all else is done by the run's thread, when it
+waits.
 """
 
 from __future__ import annotations
@@ -21,50 +21,108 @@ from bridge.codec import decode
 from bridge.session import Query, Session
 from cosim.core.errors import EngineError
 from cosim.results.run_spec import RunSpec
-from scenarios.ipc.deadlines import Patience
+from scenarios.ipc.faults import Failure
 from scenarios.ipc.messages import Done, Hear, Hello, Job
-from scenarios.runs.lease import LEASE_S, LeasedWorker
+from scenarios.runs.lease import Lease
 from scenarios.runs.net_transfer import Nets
 from scenarios.runs.protocol import (
     MOST_SENT_BYTES,
-    Briefing,
+    Assignment,
     Claim,
-    Lease,
-    LetGo,
-    NoResult,
-    NothingNow,
-    Over,
-    Received,
-    Renewal,
-    Result,
-    TurnedAway,
+    CoordinatorReply,
+    Reply,
+    Report,
+    difference,
     digest_of,
-    installed_here,
-    reply_in_bytes,
+    encode_reply,
+    installed_for,
+    origin_of,
+    other_renderer,
     run_hash,
 )
-from scenarios.runs.status import Roll
-from scenarios.runs.transport import GoesOn, HeldRun, Late, Reception
+from scenarios.runs.status import WorkerRegistry
+from scenarios.runs.transport import AdoptedJob, HeldRun, LateResult, Reception
 
+LEASE_S: Final = 15.0
+"""Seconds without a report after which a worker has lost its lease, whether or not Zenoh still
+lists it."""
 HELD_S: Final = 2.0
-"""A claim is answered after so long even when there is nothing to do."""
+"""Seconds after which a claim is answered even if there is no job."""
 SETTLING_S: Final = 3.0
-"""A run that is begun anew gives no jobs for so long: who works on one tells so first."""
+"""Seconds for which a resumed run gives no jobs: workers that already run one report it first."""
 PARTING_S: Final = 3.0
-"""How long those who ask are told that the run is over."""
+"""Seconds for which claims are answered after the run is over."""
+_OVERHEAD_BYTES: Final = 4096
+"""Bytes that a message may have beyond `MOST_SENT_BYTES`."""
+
+_Seat = tuple[str, int]
+"""The name of a worker and the number of its slot."""
 
 
-class _Departed(NamedTuple):
-    """A worker is not seen any more."""
+class _Disconnected(NamedTuple):
+    """A worker that Zenoh no longer lists."""
 
     worker: str
 
 
-class RemoteWorkers:
-    """A transport (`scenarios.runs.transport`) to all workers that come to a session.
+class _LeasedWorker(Lease):
+    """A slot of a worker as long as it has one lease (`scenarios.runs.transport.Worker`)."""
 
-    hello, patience: of the run. resumed: whether others may work for it already. roll: who is there
-    and what is odd.
+    def __init__(
+        self,
+        server: ZenohWorkers,
+        seat: _Seat,
+        number: int,
+        claim: Query | None,
+        scenario: str = "",
+    ) -> None:
+        super().__init__(seat[0], number, LEASE_S, scenario)
+        self.seat = seat
+        self.log = f"logs/{seat[0]}-{seat[1]}.log"
+        self.job: Job | None = None
+        self._server = server
+        self._claim = claim
+
+    def give(self, job: Job) -> None:
+        self.scenario = job.scenario.id
+        self.job = self._server.with_net(job)
+        if self._claim is not None:
+            _answer(self._claim, Assignment(self.number, self.job))
+            self._server.registry.assigned(*self.seat, self.scenario)
+
+    def take_report(self, report: Report, query: Query) -> None:
+        """Take in a report, which is answered once it is processed."""
+        done = () if report.done is None else (report.done,)
+        failure = None if report.fault is None else Failure(report.fault, report.why)
+        self.take((*report.said, *done), failure, lambda reply: _answer(query, reply))
+
+    def poll(self, hear: Hear) -> Failure | None:
+        failure = super().poll(hear)
+        if self.expired:
+            words = f"has not renewed its lease of {self.scenario} for {LEASE_S:g} s"
+            self._server.registry.note(f"{self.seat[0]}/{self.seat[1]} {words}")
+        if self.ended:
+            self._server.forget(self)
+        return failure
+
+    def cancel(self) -> None:
+        self.revoke()
+        self._server.forget(self)
+
+    def stop(self) -> None:
+        self.revoke(silently=True)
+        self._server.forget(self)
+
+    def end(self) -> None:
+        """Do nothing: the reply to its next report informs the worker."""
+
+
+class ZenohWorkers:
+    """A transport (`scenarios.runs.transport`) to all workers that connect to a session.
+
+    hello: introduces the policy of the run.
+    registry: lists the workers.
+    resumed: whether workers may run jobs of this run already.
     """
 
     def __init__(
@@ -72,61 +130,57 @@ class RemoteWorkers:
         session: Session,
         spec: RunSpec,
         hello: Hello,
-        patience: Patience,
-        roll: Roll,
+        registry: WorkerRegistry,
         *,
         resumed: bool = False,
     ) -> None:
         self.run = run_hash(spec)
+        self.registry = registry
         self._session = session
         self._spec = spec
         self._hello = hello
-        self._patience = patience
-        self._roll = roll
-        self._installed = msgspec.structs.replace(installed_here(), versions=spec.versions)
-        self._inbox: queue.SimpleQueue[tuple[str, Query] | _Departed] = queue.SimpleQueue()
-        self._claims: dict[tuple[str, int], tuple[Query, float]] = {}
-        self._leased: dict[tuple[str, int], LeasedWorker] = {}
-        self._unasked: list[GoesOn | Late] = []
+        self._installed = installed_for(spec)
+        self._inbox: queue.SimpleQueue[tuple[str, Query] | _Disconnected] = queue.SimpleQueue()
+        self._claims: dict[_Seat, tuple[Query, float]] = {}
+        self._leases: dict[_Seat, _LeasedWorker] = {}
+        self._unsolicited: list[AdoptedJob | LateResult] = []
         self._nets = Nets()
         self._number = secrets.randbits(48)
         self._opens_at = time.monotonic() + (SETTLING_S if resumed else 0.0)
         self._over = False
-        self._taken: dict[str, Callable[[Query], None]] = {
+        self._handlers: dict[str, Callable[[Query], None]] = {
             "claim": self._claimed,
-            "renew": self._renewed,
-            "result": self._delivered,
-            "failed": self._failed,
-            "status": self._told,
-            "net": self._handed_out,
+            "report": self._reported,
+            "status": self._status,
+            "net": self._net,
         }
 
     def open(self) -> None:
-        """From now on workers are heard."""
-        for act in ("claim", "renew", "result", "failed"):
-            self._session.collect(keys.job(self.run, act), self._taken_in(act))
-        self._session.collect(keys.status(self.run), self._taken_in("status"), found=True)
-        self._session.collect(keys.net(self.run, "*"), self._taken_in("net"))
+        """Start to answer workers."""
+        for act in ("claim", "report"):
+            self._session.collect(keys.job(self.run, act), self._queued(act))
+        self._session.collect(keys.status(self.run), self._queued("status"), found=True)
+        self._session.collect(keys.net(self.run, "*"), self._queued("net"))
         self._session.watch(keys.worker(self.run, "*"), self._seen)
 
     def room(self, busy: int) -> int:
         return len(self._claims) if time.monotonic() >= self._opens_at else 0
 
-    def start(self, hello: Hello) -> LeasedWorker:
-        """The worker that has waited longest. Its first job must be given at once."""
-        at, (query, _) = next(iter(self._claims.items()))
-        del self._claims[at]
+    def start(self, hello: Hello) -> _LeasedWorker:
+        """Return the worker that has waited longest. Its first job must be given at once."""
+        seat, (query, _) = next(iter(self._claims.items()))
+        del self._claims[seat]
         self._number += 1
-        one = self._leased[at] = LeasedWorker(self, at, self._number, query)
-        return one
+        lease = self._leases[seat] = _LeasedWorker(self, seat, self._number, query)
+        return lease
 
-    def unasked(self) -> Iterable[GoesOn | Late]:
-        found = self._unasked
-        self._unasked = []
+    def unsolicited(self) -> Iterable[AdoptedJob | LateResult]:
+        found = self._unsolicited
+        self._unsolicited = []
         return found
 
     def wait(self, timeout_s: float) -> None:
-        """Take in all that has come; if nothing has, wait for something."""
+        """Take in all messages that have arrived; if there is none, wait for one."""
         try:
             one = self._inbox.get(timeout=timeout_s)
             while True:
@@ -135,205 +189,194 @@ class RemoteWorkers:
         except queue.Empty:
             pass
         now_s = time.monotonic()
-        for at, (query, since_s) in list(self._claims.items()):
-            if now_s - since_s > HELD_S:
-                del self._claims[at]
-                query.answer(reply_in_bytes(NothingNow()))
-        self._roll.tend()
+        for seat in [
+            seat for seat, (_, since_s) in self._claims.items() if now_s - since_s > HELD_S
+        ]:
+            self._drop_claim(seat)
+        self.registry.write()
 
-    def part(self) -> None:
-        """The run is over: tell it to those who ask, until they have left; what is told just before
-        a session closes may be lost."""
+    def close(self) -> None:
+        """Tell workers that the run is over, until all have left: a reply just before a session
+        closes may be lost."""
         self._over = True
         until_s = time.monotonic() + PARTING_S
         for query, _ in self._claims.values():
-            query.answer(reply_in_bytes(Over()))
+            _answer(query, Reply("over"))
         self._claims.clear()
-        while self._roll.anybody and (left_s := until_s - time.monotonic()) > 0.0:
+        while self.registry.any_connected and (left_s := until_s - time.monotonic()) > 0.0:
             self.wait(left_s)
 
-    def _taken_in(self, act: str) -> Callable[[Query], None]:
-        return lambda query: self._inbox.put((act, query))
-
-    def forget(self, one: LeasedWorker) -> None:
-        """The lease of a worker has ended."""
-        if self._leased.get(one.at) is one:
-            del self._leased[one.at]
+    def forget(self, lease: _LeasedWorker) -> None:
+        """Forget a lease that has ended."""
+        if self._leases.get(lease.seat) is lease:
+            del self._leases[lease.seat]
 
     def with_net(self, job: Job) -> Job:
+        """Return a job with the hash of its street net."""
         return msgspec.structs.replace(job, net_hash=self._nets.hash_of(job.scenario.place))
 
-    def given(self, one: LeasedWorker) -> None:
-        """A worker has been given a job."""
-        self._roll.leased(*one.at, one.scenario)
+    def _queued(self, act: str) -> Callable[[Query], None]:
+        return lambda query: self._inbox.put((act, query))
 
-    def ended_late(self, one: LeasedWorker) -> None:
-        """A worker did not renew its lease."""
-        self._roll.note(f"{one.name} has not renewed its lease of {one.scenario} for {LEASE_S:g} s")
+    def _seen(self, key: str, connected: bool) -> None:
+        if not connected:
+            self._inbox.put(_Disconnected(key.rpartition("/")[2]))
 
-    def _seen(self, key: str, there: bool) -> None:
-        if not there:
-            self._inbox.put(_Departed(key.rpartition("/")[2]))
-
-    def _take(self, one: tuple[str, Query] | _Departed) -> None:
-        if isinstance(one, _Departed):
-            self._lose(one.worker)
+    def _take(self, one: tuple[str, Query] | _Disconnected) -> None:
+        if isinstance(one, _Disconnected):
+            self._disconnected(one.worker)
             return
         act, query = one
         try:
-            if len(query.payload) > MOST_SENT_BYTES + 4096:
+            if len(query.payload) > MOST_SENT_BYTES + _OVERHEAD_BYTES:
                 raise EngineError(f"{len(query.payload)} bytes are more than a message may have")
-            self._taken[act](query)
+            self._handlers[act](query)
         except EngineError as error:
-            self._roll.odd(f"what came to '{act}' was refused: {error}")
+            self.registry.refused(f"a message to '{act}' was refused: {error}")
             query.refuse(str(error)[:500])
 
-    def _lose(self, worker: str) -> None:
-        """A worker is gone, or cut off: all its jobs are free. What it says again later is
-        heard."""
-        self._roll.gone(worker)
-        for at in [at for at in self._claims if at[0] == worker]:
-            self._claims.pop(at)[0].answer(reply_in_bytes(NothingNow()))
-        for one in [one for at, one in self._leased.items() if at[0] == worker]:
-            one.lose(f"worker {worker} was lost")
+    def _disconnected(self, worker: str) -> None:
+        """Free the jobs of a worker that is lost or cut off. Its later reports are still
+        accepted."""
+        self.registry.disconnected(worker)
+        for seat in [seat for seat in self._claims if seat[0] == worker]:
+            self._drop_claim(seat)
+        for lease in [lease for seat, lease in self._leases.items() if seat[0] == worker]:
+            lease.lose(f"worker {worker} was lost")
+
+    def _drop_claim(self, seat: _Seat) -> None:
+        if seat in self._claims:
+            _answer(self._claims.pop(seat)[0], Reply("idle"))
 
     def _claimed(self, query: Query) -> None:
         claim = decode(query.payload, Claim)
-        at = (claim.worker, claim.slot)
+        seat = (claim.worker, claim.slot)
         if self._over:
-            self._roll.left(claim.worker)
-            query.answer(reply_in_bytes(Over()))
+            self.registry.left(claim.worker)
+            _answer(query, Reply("over"))
             return
-        if other := claim.installed.differs_from(self._installed):
-            self._roll.refused(claim.worker, claim.host, other)
+        if other := difference(claim.installed, self._installed):
+            self.registry.turned_away(claim.worker, claim.host, other)
             why = (
                 f"this run needs another installation than that of {claim.host}, which has "
                 f"{other}: install the same"
             )
-            query.answer(reply_in_bytes(TurnedAway(why)))
+            _answer(query, Reply("turned_away", why))
             return
-        self._roll.heard(claim.worker, claim.host, claim.slot)
+        self.registry.claimed(claim.worker, claim.host, claim.slot)
         if not claim.ready:
-            query.answer(reply_in_bytes(Briefing(self._hello, self._installed, self._patience)))
+            _answer(query, self._hello)
             return
-        one = self._leased.get(at)
+        lease = self._leases.get(seat)
         if (
-            one is not None and one.job is not None and not one.ended
+            lease is not None and lease.job is not None and not lease.ended
         ):  # the answer to its last claim was lost
-            query.answer(reply_in_bytes(Lease(one.number, one.job)))
+            _answer(query, Assignment(lease.number, lease.job))
             return
-        if one is not None:
-            one.lose(f"worker {claim.worker} does not go on with it")
-        if at in self._claims:
-            self._claims.pop(at)[0].answer(reply_in_bytes(NothingNow()))
-        self._claims[at] = (query, time.monotonic())
+        if lease is not None:
+            lease.lose(f"worker {claim.worker} does not continue with it")
+        self._drop_claim(seat)
+        self._claims[seat] = (query, time.monotonic())
 
-    def _renewed(self, query: Query) -> None:
-        renewal = decode(query.payload, Renewal)
-        self._roll.renewed(renewal)
-        at = (renewal.worker, renewal.slot)
-        one = self._leased.get(at)
-        if one is None or one.number != renewal.lease:
-            if self._over or one is not None:
-                query.answer(reply_in_bytes(LetGo()))
-                return
-            one = self._leased[at] = LeasedWorker(self, at, renewal.lease, None, renewal.scenario)
-            self._unasked.append(GoesOn(renewal.scenario, one))
-        one.renew(renewal, query)
+    def _reported(self, query: Query) -> None:
+        report = decode(query.payload, Report)
+        if report.done is not None and (refusal := self._refusal(report)):
+            self._turn_away(report, query, refusal)
+            return
+        self.registry.printed(report)
+        self.registry.reported(report)
+        lease = self._lease_of(report)
+        if lease is not None:
+            lease.take_report(report, query)
+        elif report.done is not None:
+            self._late(report, report.done, query)
+        elif report.fault is not None:
+            _answer(query, Reply("kept"))
+        elif self._over or (report.worker, report.slot) in self._leases:
+            _answer(query, Reply("revoked"))
+        else:
+            self._adopt(report, query)
 
-    def _delivered(self, query: Query) -> None:
-        result = decode(query.payload, Result)
-        if digest_of(result.record, result.log) != result.digest:
+    def _lease_of(self, report: Report) -> _LeasedWorker | None:
+        lease = self._leases.get((report.worker, report.slot))
+        return lease if lease is not None and lease.number == report.lease else None
+
+    def _adopt(self, report: Report, query: Query) -> None:
+        """Renew a lease that is not known here, if the run can use its job."""
+        seat = (report.worker, report.slot)
+        lease = self._leases[seat] = _LeasedWorker(self, seat, report.lease, None, report.scenario)
+        lease.take_report(report, query)
+        self._unsolicited.append(AdoptedJob(report.scenario, lease))
+
+    def _late(self, report: Report, done: Done, query: Query) -> None:
+        """Offer the run the result of a lease that has ended."""
+
+        def answer(how: Reception) -> None:
+            if how == "conflict":
+                self.registry.conflict(
+                    f"{report.scenario} by {report.worker} came out otherwise than what is "
+                    f"kept: the same scenario "
+                    "must give the same result on every machine; the first one stays"
+                )
+            else:
+                self.registry.note(f"late result of {report.scenario} by {report.worker}: {how}")
+            _answer(query, Reply(how))
+
+        if self._over:
+            answer("duplicate")
+        else:
+            self._unsolicited.append(LateResult(done, answer))
+
+    def _turn_away(self, report: Report, query: Query, why: str) -> None:
+        self.registry.turned_away(report.worker, "", why)
+        if (lease := self._lease_of(report)) is not None:
+            lease.lose(f"its worker was turned away: {why}")
+        _answer(query, Reply("turned_away", why))
+
+    def _refusal(self, report: Report) -> str:
+        """Return why a result cannot be of this run; "" if it can, or if it is damaged inside.
+
+        Raises EngineError if it was damaged on its way."""
+        assert report.done is not None
+        if digest_of(report.done) != report.digest or report.done.scenario != report.scenario:
             raise EngineError("the result was damaged on its way")
-        one = self._leased.get((result.worker, result.slot))
-        one = one if one is not None and one.number == result.lease else None
-        if other := self._of_another(result):
-            self._roll.refused(result.worker, "", other)
-            if one is not None:
-                one.lose(f"its worker was turned away: {other}")
-            query.answer(reply_in_bytes(TurnedAway(other)))
-            return
-        self._roll.printed(result, result.printed)
-        done = Done(result.scenario, result.status, result.record, result.log, result.again)
-        if one is not None:
-            one.deliver(done, query)
-        elif self._over:
-            self._answer_late(result, query, "duplicate")
-        else:
-            self._unasked.append(Late(done, lambda how: self._answer_late(result, query, how)))
-        self._roll.delivered(result)
-
-    def _answer_late(self, result: Result, query: Query, how: Reception) -> None:
-        name = result.worker
-        if how == "conflict":
-            self._roll.conflict(
-                f"CONFLICT: {result.scenario} by {name} came out otherwise than what is kept: the "
-                "same scenario must give the same result on every machine; the first one stays"
-            )
-        else:
-            self._roll.note(f"late result of {result.scenario} by {name}: {how}")
-        query.answer(reply_in_bytes(Received(how)))
-
-    def _of_another(self, result: Result) -> str:
-        """Why a result cannot be of this run; "" where it can, or where it is too damaged to
-        tell."""
-        try:
-            told = msgspec.json.decode(result.record, type=_Told)
-        except msgspec.DecodeError:
+        run = self._spec.setup
+        origin = origin_of(report.done)
+        if origin is None:
             return ""
-        run = self._spec
-        if (told.suite_hash, told.run_seed, told.policy_source) != (
+        if (origin.suite_hash, origin.run_seed, origin.policy_source) != (
             run.suite_hash,
             run.seed,
             run.policy_source,
         ):
             return "its result is of another run"
-        if told.versions != run.versions:
+        if origin.versions != run.versions:
             return "its result is of another installation"
-        if told.ended is not None and told.renderer != run.renderer:
-            return (
-                f"its pictures are drawn by {told.renderer}, those of the run by {run.renderer}: "
-                "begin the run with --camera bullet"
-            )
-        return ""
+        other = other_renderer(report.done, run.renderer)
+        return f"{other}: begin the run with --camera bullet" if other else ""
 
-    def _failed(self, query: Query) -> None:
-        failure = decode(query.payload, NoResult)
-        one = self._leased.get((failure.worker, failure.slot))
-        self._roll.printed(failure, failure.printed)
-        if one is not None and one.number == failure.lease:
-            one.fail(failure)
-        self._roll.failed(failure)
-        query.answer(reply_in_bytes(Received()))
-
-    def _handed_out(self, query: Query) -> None:
+    def _net(self, query: Query) -> None:
         query.answer(self._nets.part(query.key.rpartition("/")[2], query.payload))
 
-    def _told(self, query: Query) -> None:
-        query.answer(msgspec.json.encode(self._roll.status()))
+    def _status(self, query: Query) -> None:
+        query.answer(msgspec.json.encode(self.registry.status()))
 
 
-class _Told(msgspec.Struct):
-    """What a record says of where it comes from."""
-
-    suite_hash: str
-    run_seed: int
-    policy_source: str
-    versions: dict[str, str]
-    renderer: str
-    ended: str | None = None
+def _answer(query: Query, reply: CoordinatorReply) -> None:
+    query.answer(encode_reply(reply))
 
 
 @contextmanager
 def workers_of_run(
     session: Session, run: HeldRun, tell: Hear, *, resumed: bool
-) -> Iterator[tuple[RemoteWorkers, Hear]]:
-    """The workers of a run, and what is to be told of their episodes in place of `tell`. At the end
-    of the block, unless it failed, they are told that the run is over."""
-    roll = Roll(run.held, run.picked, len(run.picked) - len(run.todo), tell)
-    workers = RemoteWorkers(session, run.held.spec, run.hello, run.patience, roll, resumed=resumed)
+) -> Iterator[tuple[ZenohWorkers, Hear]]:
+    """Create the transport of a run and wrap its progress callback.
+
+    At the end of the block, unless it failed, workers are told that the run is over."""
+    registry = WorkerRegistry(run.held, run.picked, len(run.picked) - len(run.todo), tell)
+    workers = ZenohWorkers(session, run.held.spec, run.hello, registry, resumed=resumed)
     workers.open()
-    roll.note(f"run {workers.run}: {len(run.todo)} of {len(run.picked)} episodes to be run")
-    yield workers, roll.tell
-    roll.note("the run is over")
-    workers.part()
+    registry.note(f"run {workers.run}: {len(run.todo)} of {len(run.picked)} episodes to be run")
+    yield workers, registry.tell
+    registry.note("the run is over")
+    workers.close()

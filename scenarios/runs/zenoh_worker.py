@@ -1,8 +1,9 @@
-"""A worker: holds the session with the coordinator, and starts the processes that run episodes.
+"""Works for runs on other machines: holds the Zenoh session with the coordinator, and environment
+slots for its jobs.
 
-No engine is loaded in this process: what takes an environment process down, or hangs in it, does
-not touch the session. It needs nothing of the run but the address: policy, options and scenarios
-come with the jobs.
+No engine is loaded in this process, so that a failure of an environment process does not touch the
+session. It needs nothing of the run but the address: policy, options and scenarios come with the
+jobs.
 """
 
 from __future__ import annotations
@@ -24,25 +25,26 @@ from bridge import keys
 from bridge.session import Session, open_session
 from cosim.core.errors import CosimError, EngineError, MachineError
 from cosim.spec.connection import Connection
-from scenarios.runs.environment_slot import NET, RunEnded, Wish, WorkSlot
+from scenarios.runs.job_client import Installation, JobClient, Request, RunEnded
 from scenarios.runs.passing_folder import passing_folder
-from scenarios.runs.protocol import installed_here, reply_in
+from scenarios.runs.protocol import installed_here
 
 _RETRY_S: Final = 0.5
 _WAIT_S: Final = 0.25
 _LOOKS_S: Final = 5.0
-"""So long nothing is heard of the run before it is looked for another one at the same place."""
+"""Seconds without a reply after which a worker looks for another run at the same address."""
 _PARTING_S: Final = 10.0
-"""How long a worker that leaves goes on trying to hand over what it has."""
-_TELLING_S: Final = 2.0
+"""Seconds for which a worker that leaves tries to deliver its results."""
+_LAST_REPORT_S: Final = 2.0
+"""Seconds that the report of a worker that can run nothing may take."""
 GIVEN_UP_S: Final = 600.0
-"""A worker that is there for one run ends when it has heard of none for so long: that it is over
-may have been told when nobody could hear it."""
+"""Seconds without a reply after which a worker for one run ends: it may have missed that the run is
+over."""
 Say = Callable[[str], None]
 
 
 class Leaving:
-    """Whether the process was asked to leave, and by which signal; and a bell that ends a wait."""
+    """The signal that requests this process to leave, 0 for none, and a bell that ends a wait."""
 
     def __init__(self) -> None:
         self.signal = 0
@@ -52,7 +54,7 @@ class Leaving:
         os.eventfd_write(self.bell, 1)
 
     def wait(self, descriptors: list[int], timeout_s: float) -> None:
-        """Until the bell rings, something can be read, or the time is over."""
+        """Wait until the bell rings, a descriptor is readable, or the time is over."""
         poll = select.poll()
         for descriptor in (self.bell, *descriptors):
             poll.register(descriptor, select.POLLIN)
@@ -66,8 +68,8 @@ class Leaving:
 
 
 @contextmanager
-def _signals_heard() -> Iterator[Leaving]:
-    """SIGTERM and Ctrl-C are requests to leave, meanwhile."""
+def _signals_caught() -> Iterator[Leaving]:
+    """Take SIGTERM and Ctrl-C as requests to leave, inside the block."""
     leaving = Leaving()
     before = {
         number: signal.signal(number, leaving.leave) for number in (signal.SIGTERM, signal.SIGINT)
@@ -83,37 +85,35 @@ def _signals_heard() -> Iterator[Leaving]:
 def work(
     connection: Connection, jobs: int, say: Say, *, once: bool = False, logs: Path | None = None
 ) -> int:
-    """Work for the runs that are to be found at an address, `jobs` episodes at a time, until asked
-    to leave, or with `once` until one is over. Returns the number of the signal that asked, 0 if
-    none did.
+    """Work for the runs at an address until a signal requests to leave, or with `once` until a run
+    is over.
 
-    logs: the folder for what processes print, by default one that is gone afterwards. say: what to
-    tell the user, a line each. Raises UsageError when the run refuses this worker, MachineError
-    when no episode can be run here, or with `once` when no run is heard of any more."""
+    jobs: number of episodes at a time.
+    say: called with each line for the user.
+    logs: folder for the output of the processes; by default a temporary one.
+
+    Returns the number of the signal, or 0. Raises UsageError when the run refuses this worker,
+    MachineError when no episode can be run here, or with `once` when there has been no run for too
+    long."""
     with ExitStack() as stack:
-        leaving = stack.enter_context(_signals_heard())
+        leaving = stack.enter_context(_signals_caught())
         if logs is None:
             logs = stack.enter_context(passing_folder("cosim-worker-"))
         logs.mkdir(parents=True, exist_ok=True)
-        heard = _Heard(connection.endpoint, once)
-        session = _reached(connection, leaving, heard, say)
+        contact = _Contact(connection.endpoint, once, say)
+        session = _reached(connection, leaving, contact, say)
         if session is None:
             return leaving.signal
         stack.enter_context(session)
-        told = False
         over = ""
         over_s = 0.0
         while not leaving.signal:
             runs = [key.split("/")[1] for key in session.answers(keys.EVERY_RUN, timeout_s=5.0)]
             if not runs or (runs[0] == over and time.monotonic() - over_s < _PARTING_S):
-                if not told:
-                    say(f"waits for a run at {connection.endpoint}")
-                told = True
-                heard.look()
+                contact.missing(f"waits for a run at {connection.endpoint}")
                 leaving.wait([], _RETRY_S)
                 continue
-            told = False
-            if _Service(session, connection, runs[0], jobs, logs, leaving, heard, say).serve():
+            if _Service(session, connection, runs[0], jobs, logs, leaving, contact, say).serve():
                 if once:
                     return 0
                 over = runs[0]
@@ -121,77 +121,82 @@ def work(
         return leaving.signal
 
 
-class _Heard:
-    """When something was heard of a run. once: whether it is waited for no longer than
+class _Contact:
+    """The time of the last contact with a run. With `once` a run is waited for no longer than
     GIVEN_UP_S."""
 
-    def __init__(self, endpoint: str, once: bool) -> None:
+    def __init__(self, endpoint: str, once: bool, say: Say) -> None:
         self._endpoint = endpoint
         self._once = once
-        self.now()
+        self._say = say
+        self._quiet = False
+        self.made()
 
-    def now(self) -> None:
+    def made(self, words: str = "") -> None:
+        """Note a contact, and say so if there was none for a while."""
+        if words and self._quiet:
+            self._say(words)
+        self._quiet = False
         self._at_s = time.monotonic()
 
-    def look(self) -> None:
-        """Raises MachineError when nothing was for too long."""
+    def missing(self, words: str) -> None:
+        """Say, once, that there is no contact. Raises MachineError if the last one is too long
+        ago."""
         if self._once and time.monotonic() - self._at_s > GIVEN_UP_S:
             raise MachineError(
                 f"no run was heard of at {self._endpoint} for {GIVEN_UP_S:g} s: is it over? "
                 "Without --once a worker waits for the next one"
             )
+        if not self._quiet:
+            self._say(words)
+        self._quiet = True
 
 
-def _reached(connection: Connection, leaving: Leaving, heard: _Heard, say: Say) -> Session | None:
-    """A session with the coordinator, waited for; None when asked to leave before that. Raises
+def _reached(
+    connection: Connection, leaving: Leaving, contact: _Contact, say: Say
+) -> Session | None:
+    """Wait for a session with the coordinator, and return it; None after a request to leave. Raises
     AccessError."""
-    told = False
     while not leaving.signal:
-        heard.look()
         try:
             return open_session(connection, say)
         except EngineError:
-            if not told:
-                say(f"waits for a coordinator at {connection.endpoint}")
-                told = True
+            contact.missing(f"waits for a coordinator at {connection.endpoint}")
         leaving.wait([], _RETRY_S)
     return None
 
 
 class _Service:
-    """For one run."""
+    """Works for one run, with `jobs` environment slots."""
 
     def __init__(
         self,
         session: Session,
-        reach: Connection,
+        connection: Connection,
         run: str,
         jobs: int,
         logs: Path,
         leaving: Leaving,
-        heard: _Heard,
+        contact: _Contact,
         say: Say,
     ) -> None:
         self._session = session
         self._run = run
         self._leaving = leaving
-        self._heard = heard
+        self._contact = contact
         self._say = say
         host = socket.gethostname()
         self._name = keys.chunk(f"{host[:40]}-{os.getpid()}-{secrets.token_hex(3)}")
-        installed = installed_here()
-        self._slots = [
-            WorkSlot(self._name, number, host, installed, logs, reach) for number in range(jobs)
-        ]
-        self._replies: queue.SimpleQueue[tuple[WorkSlot | None, str, bytes | None, str]] = (
+        here = Installation(self._name, host, installed_here(), connection)
+        self._clients = [JobClient(run, number, here, logs) for number in range(jobs)]
+        self._replies: queue.SimpleQueue[tuple[JobClient | None, Request, bytes | None, str]] = (
             queue.SimpleQueue()
         )
         self._looks_s = time.monotonic() + _LOOKS_S
-        self._quiet = False
-        self._told = ""
+        self._refusal = ""
 
     def serve(self) -> bool:
-        """Until the run is over (True), another one is at its place, or this process is asked to
+        """Work until the run is over (True), another one takes its place, or this process is to
         leave."""
         leave = self._session.stand(keys.worker(self._run, self._name))
         self._say(f"works for run {self._run} as {self._name}")
@@ -206,71 +211,63 @@ class _Service:
             self._say(f"run {self._run} is over")
             return True
         except CosimError as error:
-            self._send(None, self._slots[0].unable(str(error)))
-            self._leaving.wait([], _TELLING_S)
+            self._send(None, self._clients[0].unable(str(error)))
+            self._leaving.wait([], _LAST_REPORT_S)
             raise
         finally:
             leave()
-            for slot in self._slots:
-                slot.end()
+            for client in self._clients:
+                client.close()
         return False
 
     def _turn(self, *, listen: bool) -> None:
-        """Say what is to be said, wait until something happens, take it in."""
+        """Send the requests that are due, wait until something happens, and take it in."""
         now_s = time.monotonic()
-        for slot in self._slots:
-            for wish in slot.wishes(now_s):
-                self._send(slot, wish)
-        found = [slot.descriptor for slot in self._slots]
+        for client in self._clients:
+            for request in client.requests(now_s):
+                self._send(client, request)
+        found = [client.descriptor for client in self._clients]
         self._leaving.wait([one for one in found if one is not None and listen], _WAIT_S)
         while not self._replies.empty():
             self._take(*self._replies.get_nowait())
         if listen:
-            for slot in self._slots:
-                slot.listen()
+            for client in self._clients:
+                client.poll()
 
-    def _send(self, slot: WorkSlot | None, wish: Wish) -> None:
+    def _send(self, client: JobClient | None, request: Request) -> None:
         def replied(payload: bytes | None, error: str) -> None:
-            self._replies.put((slot, wish.act, payload, error))
+            self._replies.put((client, request, payload, error))
             self._leaving.ring()
 
-        is_net, digest = wish.act.startswith(NET), wish.act.removeprefix(NET)
-        key = keys.net(self._run, digest) if is_net else keys.job(self._run, wish.act)
-        self._session.send(key, wish.payload, replied, timeout_s=wish.timeout_s)
+        self._session.send(request.key, request.payload, replied, timeout_s=request.timeout_s)
 
-    def _take(self, slot: WorkSlot | None, act: str, payload: bytes | None, error: str) -> None:
+    def _take(
+        self, client: JobClient | None, request: Request, payload: bytes | None, error: str
+    ) -> None:
         if payload is not None:
-            self._heard.now()
+            self._contact.made("the coordinator answers again")
             self._looks_s = time.monotonic() + _LOOKS_S
-            if self._quiet:
-                self._say("the coordinator is there again")
-            self._quiet = False
-        if error and error != self._told:
-            self._told = error
-            self._say(f"the coordinator refused a '{act}': {error}")
-        if slot is not None and act.startswith(NET):
-            slot.part_came(payload, error)
-        elif slot is not None:
-            slot.replied(act, None if payload is None else reply_in(payload))
+        if error and error != self._refusal:
+            self._refusal = error
+            self._say(f"the coordinator refused a '{request.act}': {error}")
+        if client is not None:
+            client.answered(request, payload, error)
 
     def _other_run(self) -> bool:
-        """Whether another run is to be found where this one was; looked for when nothing is heard
-        of it."""
+        """Return whether another run has taken the place of this one; checked while it does not
+        answer."""
         if time.monotonic() < self._looks_s:
             return False
-        self._heard.look()
-        if not self._quiet:
-            self._say("the coordinator does not answer: waits for it")
-        self._quiet = True
+        self._contact.missing("the coordinator does not answer: waits for it")
         self._looks_s = time.monotonic() + 1.0
         runs = [key.split("/")[1] for key in self._session.answers(keys.EVERY_RUN, timeout_s=2.0)]
         return bool(runs) and self._run not in runs
 
     def _part(self) -> None:
-        """Hand the jobs back, and over what is done."""
-        for slot in self._slots:
-            slot.release()
+        """Hand the jobs back, and deliver the results that are ready."""
+        for client in self._clients:
+            client.release()
         until_s = time.monotonic() + _PARTING_S
-        while any(slot.holds_result for slot in self._slots) and time.monotonic() < until_s:
+        while any(client.has_unsent for client in self._clients) and time.monotonic() < until_s:
             self._turn(listen=False)
         self._say("has left")

@@ -52,22 +52,6 @@ class Held(Base):
             hold.with_name("waits").touch()
         while hold.exists():
             time.sleep(0.02)
-class DiesLate(Base):
-    # takes its process down right after the record of t-1 is sent, and once in the middle of that of t-2
-    def act(self, observation):
-        from cosim.core.framing import Wire
-        send = Wire.send
-        def dying(wire, message):
-            done = b"Done" in message[:20] and len(message) > 2000
-            if done and b"t-2" in message[:50] and not Path("half").exists():
-                Path("half").touch()
-                wire._end.sendall(len(message).to_bytes(4, "big") + message[: len(message) // 2])
-                os.kill(os.getpid(), signal.SIGKILL)
-            send(wire, message)
-            if done and b"t-1" in message[:50]: os.kill(os.getpid(), signal.SIGKILL)
-        if send.__name__ == "send": Wire.send = dying
-        self.count += 1
-        return Command(1.0, 0.0)
 class Unfinished: pass
 """
 
@@ -335,23 +319,6 @@ def children(pid: int) -> list[int]:
         p
         for p, line in lines.items()
         if line.exists() and b"scenarios.ipc.supervisor" in line.read_bytes()
-    ]
-
-
-def test_an_episode_finished_before_its_process_died_is_kept(desk: Path, cosim: Cosim) -> None:
-    """A process that dies after sending its record has finished the episode: it is neither run
-    again nor crashed. One that dies while it sends has not: half a record is none, and the episode
-    is run again."""
-    out = desk / "late"
-    run = cosim(
-        "run", "tiny.json", "--policy", "mine:DiesLate", "--seed", SEED, "--out", out.name, cwd=desk
-    )
-    assert run.returncode == 0, run.stdout
-    assert list(rows(out)["status"]) == ["done", "done", "done"] and (desk / "half").exists()
-    assert sorted(p.name for p in out.glob("logs/*")) == [
-        "worker-0.log",
-        "worker-1.log",
-        "worker-2.log",
     ]
 
 

@@ -20,34 +20,25 @@ from bridge.session import open_session
 from cosim.core.errors import CosimError, EngineError, MachineError
 from cosim.core.versions import versions
 from cosim.policies.load import load_policy
-from cosim.results.record import METRIC_SCHEMA, NO_RENDERER, Record, begun
+from cosim.results.record import Record
 from cosim.results.run_folder import RunFolder, read_records
-from cosim.results.run_spec import RunSpec
 from cosim.spec.connection import Connection
 from cosim.spec.scenario import City, CityMap, Scenario, Suite
-from scenarios.ipc.deadlines import Patience
-from scenarios.ipc.messages import Hello, Progress
-from scenarios.runs import status as roll
+from scenarios.ipc.faults import RULES, Failure
+from scenarios.ipc.messages import Done, Hello, Progress
+from scenarios.runs import status
 from scenarios.runs import zenoh_transport as remote
 from scenarios.runs.net_transfer import Fetched, Nets, lacks
-from scenarios.runs.pool import ATTEMPTS, LOSSES, run_all
+from scenarios.runs.pool import run_all
 from scenarios.runs.protocol import (
-    Asks,
-    Briefing,
+    Assignment,
     Claim,
-    CoordinatorSays,
-    GoOn,
-    Lease,
-    LetGo,
-    NoResult,
-    NothingNow,
-    Received,
-    Renewal,
-    Result,
-    TurnedAway,
+    CoordinatorReply,
+    Reply,
+    Report,
+    decode_reply,
     digest_of,
     installed_here,
-    reply_in,
     run_hash,
 )
 from scenarios.runs.status import RunStatus
@@ -55,6 +46,7 @@ from scenarios.runs.transport import HeldRun
 from scenarios.runs.zenoh_transport import workers_of_run
 from sumo_nets.net.net_hash import hash_of
 from tests.conftest import PATIENCE_S, Cosim
+from tests.run_specs import changed, spec_of
 
 pytestmark = pytest.mark.engine
 
@@ -75,27 +67,20 @@ SUITE = Suite(
         for i in range(2)
     ),
 )
-SPEC = RunSpec(
-    suite="s",
-    robots={"courier": "h"},
-    suite_version="1",
-    suite_hash="h",
-    policy="stop",
-    policy_name="stop",
-    policy_version="1",
-    policy_source=DRIVER.source_hash,
-    scenarios=("s-0", "s-1"),
-    versions=versions(),
-    seed=3,
-    renderer=NO_RENDERER,
-    metric_schema=METRIC_SCHEMA,
-)
+SPEC = spec_of(SUITE, "stop", policy_source=DRIVER.source_hash, versions=versions(), seed=3)
 
 
+IDLE, RENEWED, REVOKED = Reply("idle"), Reply("renewed"), Reply("revoked")
+KEPT = Reply("kept")
+DUPLICATE = Reply("duplicate")
+CONFLICT = Reply("conflict")
+REFUSED = Reply("refused")
+KILLED = Failure("process_ended", "its process was killed by SIGKILL")
+ATTEMPTS, LOSSES = (RULES[fault].attempts for fault in ("process_ended", "machine_lost"))
 GARBAGE = (
     b"",
     b"\xc1" * 100,
-    encode(Asks("act", 1, 1.0)),
+    encode(Progress("s-0", 1.0, 1.0, 0)),
     b"\x91" * 100_000,
     b"\xdd\xff\xff\xff\xff",
 )
@@ -126,7 +111,7 @@ class Run:
         """Wait until it is; its records."""
         self._thread.join(PATIENCE_S)
         assert not self._thread.is_alive()
-        return {record.scenario: record for record in read_records(self.folder)}
+        return {record.scenario.id: record for record in read_records(self.folder)}
 
     @property
     def log(self) -> str:
@@ -147,7 +132,7 @@ class Run:
             done = held.finished()
             todo = [one for one in SUITE.scenarios if one.id not in done]
             try:
-                run = HeldRun(held, hello, Patience(), SUITE.scenarios, todo)
+                run = HeldRun(held, hello, SUITE.scenarios, todo)
                 with workers_of_run(hub, run, lambda _: None, resumed=self._resumed) as (
                     transport,
                     tell,
@@ -163,7 +148,7 @@ class _Killed(BaseException):
     """The coordinator was killed."""
 
 
-def _killer(transport: remote.RemoteWorkers) -> Callable[[], None]:
+def _killer(transport: remote.ZenohWorkers) -> Callable[[], None]:
     """Make a transport raise in its thread when it waits next."""
     wait = transport.wait
     killed = threading.Event()
@@ -188,61 +173,56 @@ class Hand:
         self.lease = 0
         self.scenario = ""
 
-    def say(self, act: str, message: msgspec.Struct) -> CoordinatorSays:
-        return reply_in(
-            self.session.ask(keys.job(self.run, act), encode(message), timeout_s=PATIENCE_S)
+    def claim(self, *, ready: bool = True, **other: str) -> CoordinatorReply:
+        installed = {**installed_here(), **other}
+        payload = encode(Claim(**self.me(), host="here", installed=installed, ready=ready))
+        return decode_reply(
+            self.session.ask(keys.job(self.run, "claim"), payload, timeout_s=PATIENCE_S)
         )
-
-    def claim(self, *, ready: bool = True, **other: object) -> CoordinatorSays:
-        installed = msgspec.structs.replace(installed_here(), **other)
-        return self.say("claim", Claim(**self.me(), host="here", installed=installed, ready=ready))
 
     def job(self) -> str:
         """Claim until there is a job. Returns its scenario."""
-        while not isinstance(reply := self.claim(), Lease):
-            assert isinstance(reply, NothingNow)
-        self.lease = reply.number
+        while not isinstance(reply := self.claim(), Assignment):
+            assert reply == IDLE
+        self.lease = reply.lease
         self.scenario = reply.job.scenario.id
         return self.scenario
 
-    def renew(self, asks: Asks | None = None) -> CoordinatorSays:
-        said = (Progress(self.scenario, 1.0, 4.5, 0),)
-        return self.say(
-            "renew",
-            Renewal(**self.me(), lease=self.lease, scenario=self.scenario, asks=asks, said=said),
+    def report(self, **fields: object) -> CoordinatorReply:
+        payload = self.payload(**fields)
+        return decode_reply(
+            self.session.ask(keys.job(self.run, "report"), payload, timeout_s=PATIENCE_S)
         )
 
-    def result(self, *, of: str = "", ticks: int = 40, record: Record | None = None) -> Result:
+    def payload(self, **fields: object) -> bytes:
+        return encode(
+            Report(**self.me(), **{"lease": self.lease, "scenario": self.scenario} | fields)
+        )
+
+    def renew(self) -> CoordinatorReply:
+        return self.report(said=(Progress(self.scenario, 1.0, 4.5, 0),))
+
+    def result(
+        self, *, of: str = "", ticks: int = 40, record: Record | None = None
+    ) -> dict[str, object]:
         name = of or self.scenario
         scenario = next(one for one in SUITE.scenarios if one.id == name)
         record = record or msgspec.structs.replace(
-            begun(scenario, DRIVER.manifest, "h", DRIVER.source_hash, SPEC.seed),
+            Record.begun(scenario, DRIVER.manifest, SPEC.setup),
             status="done",
             ended="goal",
             ticks=ticks,
             state_hash=f"hash-{ticks}",
             clock={"wall_s": time.monotonic()},
         )
-        data = record.encoded()
-        return Result(
-            **self.me(),
-            lease=self.lease,
-            scenario=name,
-            status="done",
-            record=data,
-            log=b"log",
-            again=False,
-            digest=digest_of(data, b"log"),
-        )
+        done = Done(name, "done", record.encoded(), b"log")
+        return {"scenario": name, "done": done, "digest": digest_of(done)}
 
-    def deliver(self, **named: object) -> CoordinatorSays:
-        return self.say("result", self.result(**named))
+    def deliver(self, **named: object) -> CoordinatorReply:
+        return self.report(**self.result(**named))
 
-    def fail(
-        self, how: str = "ended", why: str = "its process was killed by SIGKILL"
-    ) -> CoordinatorSays:
-        failure = NoResult(**self.me(), lease=self.lease, scenario=self.scenario, how=how, why=why)
-        return self.say("failed", failure)
+    def fail(self, failure: Failure = KILLED) -> CoordinatorReply:
+        return self.report(fault=failure.fault, why=failure.why)
 
     def me(self) -> dict[str, object]:
         return {"worker": self.name, "slot": 0}
@@ -274,16 +254,19 @@ def test_jobs_are_claimed_renewed_and_delivered_once(tmp_path: Path) -> None:
     run = Run(tmp_path)
     with hands(run, 2) as (one, other):
         welcome = one.claim(ready=False)
-        assert isinstance(welcome, Briefing) and welcome.hello.policy == "stop"
+        assert isinstance(welcome, Hello) and welcome.policy == "stop"
         first = one.job()
-        assert one.job() == first and one.renew() == GoOn()
+        assert one.job() == first and one.renew() == RENEWED
         assert other.job() != first
-        working = {w.name: [u.scenario for u in w.under_way] for w in one.status().workers}
+        working = {
+            w.name: [episode.scenario for episode in w.episodes.values()]
+            for w in one.status().workers
+        }
         assert working[one.name] == [first]
-        assert one.deliver() == Received("kept") and one.deliver() == Received("duplicate")
-        assert one.deliver(ticks=41) == Received("conflict")
+        assert one.deliver() == KEPT and one.deliver() == DUPLICATE
+        assert one.deliver(ticks=41) == CONFLICT
         assert len(one.status().conflicts) == 1 and one.status().finished == 1
-        assert other.deliver() == Received("kept")
+        assert other.deliver() == KEPT
         records = run.over()
     assert {name: record.state_hash for name, record in records.items()} == {
         "s-0": "hash-40",
@@ -302,10 +285,10 @@ def test_the_job_of_a_lost_worker_is_free_at_once(tmp_path: Path) -> None:
         assert other.job() == first
         lost.session = open_session(Connection(role="worker", connect=run.endpoint))
         with lost.session:
-            assert lost.renew() == LetGo()
-            assert lost.deliver() == Received("kept")
-            assert other.renew() == LetGo() and other.deliver() == Received("duplicate")
-        assert third.job() != first and third.deliver() == Received("kept")
+            assert lost.renew() == REVOKED
+            assert lost.deliver() == KEPT
+            assert other.renew() == REVOKED and other.deliver() == DUPLICATE
+        assert third.job() != first and third.deliver() == KEPT
         assert len(run.over()) == 2
     assert f"{lost.name}: lost" in run.log
 
@@ -319,9 +302,9 @@ def test_who_comes_back_goes_on(tmp_path: Path) -> None:
         until(lambda: f"{one.name}: lost" in run.log)
         one.session = open_session(Connection(role="worker", connect=run.endpoint))
         with one.session:
-            assert one.renew() == GoOn() and one.deliver() == Received("kept")
+            assert one.renew() == RENEWED and one.deliver() == KEPT
             one.job()
-            assert one.deliver() == Received("kept")
+            assert one.deliver() == KEPT
         assert len(run.over()) == 2
 
 
@@ -339,8 +322,8 @@ def test_a_coordinator_begun_anew_takes_what_its_workers_go_on_with(
         run.kill()
         assert run.over() == {}
         run = Run(tmp_path, resumed=True)
-        assert one.renew() == GoOn()
-        assert one.deliver() == Received("kept") and other.deliver() == Received("kept")
+        assert one.renew() == RENEWED
+        assert one.deliver() == KEPT and other.deliver() == KEPT
         assert set(run.over()) == names
 
 
@@ -353,7 +336,7 @@ def test_attempts_are_bounded_and_leaving_is_none(
     with hands(run, 1) as (one,):
         poison = one.job()
         for _ in range(ATTEMPTS + 1):
-            assert one.fail("released", "") == Received()
+            assert one.fail(Failure("handed_back")) == KEPT
             assert one.job() == poison
         for _ in range(ATTEMPTS):
             assert one.job() == poison
@@ -390,7 +373,7 @@ def test_attempts_outlive_the_coordinator(tmp_path: Path, monkeypatch: pytest.Mo
         run = Run(tmp_path, resumed=True)
         assert one.job() == poison
         one.fail()
-        assert one.job() != poison and one.deliver() == Received("kept")
+        assert one.job() != poison and one.deliver() == KEPT
         records = run.over()
     assert (
         records[poison].status == "crashed"
@@ -404,40 +387,48 @@ def test_what_is_none_of_the_run_s_is_refused_in_words(tmp_path: Path) -> None:
     run = Run(tmp_path)
     with hands(run, 2) as (one, foe):
         name = one.job()
-        for act in ("claim", "renew", "result", "failed"):
+        for act in ("claim", "report"):
             for payload in GARBAGE:
                 with pytest.raises(EngineError, match="not a"):
                     foe.session.ask(keys.job(foe.run, act), payload, timeout_s=PATIENCE_S)
         with pytest.raises(EngineError, match="more than a message may have"):
             foe.session.ask(
-                keys.job(foe.run, "result"), bytes((15 << 20) + 5000), timeout_s=PATIENCE_S
+                keys.job(foe.run, "report"), bytes((15 << 20) + 5000), timeout_s=PATIENCE_S
             )
         with pytest.raises(EngineError, match="ask for exactly"):
             foe.session.ask("cosim/*/jobs/claim", b"", timeout_s=PATIENCE_S)
         with pytest.raises(TimeoutError):
             foe.session.ask(keys.job("another-run", "claim"), b"", timeout_s=0.2)
-        reply = foe.claim(versions=versions() | {"libsumo": "0.1"})
-        assert isinstance(reply, TurnedAway) and "libsumo 0.1 in place of" in reply.why
-        reply = foe.claim(metric_schema=METRIC_SCHEMA + 1)
-        assert (
-            isinstance(reply, TurnedAway)
-            and f"metric schema {METRIC_SCHEMA + 1} in place of" in reply.why
-        )
+        for other in ({"libsumo": "0.1"}, {"metric schema": "0"}):
+            reply = foe.claim(**other)
+            words = " ".join(*other.items())
+            assert (
+                isinstance(reply, Reply)
+                and reply.kind == "turned_away"
+                and f"{words} in place of" in reply.why
+            )
         with pytest.raises(EngineError, match="damaged on its way"):
-            foe.say("result", msgspec.structs.replace(one.result(), log=b"gol"))
+            foe.report(**one.result() | {"digest": "0"})
         scenario = SUITE.scenarios[0]
-        strange = begun(scenario, DRIVER.manifest, "another suite", DRIVER.source_hash, SPEC.seed)
+        strange = changed(
+            Record.begun(scenario, DRIVER.manifest, SPEC.setup), suite_hash="another suite"
+        )
         reply = foe.deliver(of=name, record=strange)
-        assert isinstance(reply, TurnedAway) and "another run" in reply.why
-        unknown = msgspec.structs.replace(one.result(), scenario="../../../etc", lease=77)
-        assert foe.say("result", unknown) == Received("refused")
+        assert (
+            isinstance(reply, Reply) and reply.kind == "turned_away" and "another run" in reply.why
+        )
+        unknown = msgspec.structs.replace(one.result()["done"], scenario="../../../etc")
+        assert (
+            foe.report(scenario="../../../etc", lease=77, done=unknown, digest=digest_of(unknown))
+            == REFUSED
+        )
         foe.lease = 5
         foe.scenario = name
-        assert foe.renew() == LetGo() and foe.fail() == Received()
-        assert one.status().odd > 20 and one.status().finished == 0
-        assert one.renew() == GoOn() and one.deliver() == Received("kept")
+        assert foe.renew() == REVOKED and foe.fail() == KEPT
+        assert one.status().refused > 10 and one.status().finished == 0
+        assert one.renew() == RENEWED and one.deliver() == KEPT
         one.job()
-        assert one.deliver() == Received("kept")
+        assert one.deliver() == KEPT
         assert len(run.over()) == 2
 
 
@@ -456,31 +447,34 @@ def test_a_result_that_cannot_be_written_is_not_acknowledged(
         with monkeypatch.context() as patch:
             patch.setattr(RunFolder, "keep", full)
             with pytest.raises(TimeoutError):
-                one.session.ask(keys.job(one.run, "result"), encode(one.result()), timeout_s=0.5)
+                one.session.ask(
+                    keys.job(one.run, "report"), one.payload(**one.result()), timeout_s=0.5
+                )
             assert run.over() == {} and "no space left" in str(run.error)
         run = Run(tmp_path, resumed=True)
-        assert one.deliver() == Received("kept")
+        assert one.deliver() == KEPT
         one.job()
-        assert one.deliver() == Received("kept")
+        assert one.deliver() == KEPT
         assert len(run.over()) == 2
 
 
-def test_a_policy_that_does_not_answer_is_told_by_its_worker(tmp_path: Path) -> None:
-    """What it is asked, and for how long, counts as its worker tells it; between two of its
-    messages nothing ages."""
+def test_a_policy_timeout_that_a_worker_reports_is_the_last_attempt(tmp_path: Path) -> None:
+    """The worker enforces the time limit of an answer; its episode has crashed, once, for the
+    reason that it gives."""
     run = Run(tmp_path)
     with hands(run, 1) as (one,):
         silent = one.job()
-        assert one.renew(Asks("act", 64, 59.99)) == GoOn()
-        time.sleep(0.05)
-        assert one.renew() == GoOn()
-        one.renew(Asks("act", 64, 60.5))
-        until(lambda: one.status().finished == 1)
+        assert (
+            one.fail(
+                Failure("policy_timeout", "policy 'stop' gave no answer for 60 s in act at 3.20 s")
+            )
+            == KEPT
+        )
         one.job()
-        assert one.deliver() == Received("kept")
+        assert one.deliver() == KEPT
         records = run.over()
     assert records[silent].status == "crashed"
-    assert "policy 'stop' gave no answer for 60 s in act at 3.20 s" in records[silent].reason
+    assert records[silent].reason == "policy 'stop' gave no answer for 60 s in act at 3.20 s"
 
 
 def test_a_map_reaches_workers_that_lack_it(
@@ -506,13 +500,13 @@ def test_a_map_reaches_workers_that_lack_it(
         wanted = Fetched(where, expected)
         while not last:
             monkeypatch.setenv("COSIM_CACHE", str(there))
-            part = nets.part(digest, wanted.asks)
+            part = nets.part(digest, wanted.request)
             monkeypatch.setenv("COSIM_CACHE", str(here))
             last = wanted.take(part)
             parts = parts + 1
         assert parts > 1
         with pytest.raises(EngineError, match="has no map 'another'"):
-            nets.part("another", wanted.asks)
+            nets.part("another", wanted.request)
 
     with pytest.raises(EngineError, match=f"came with hash {where.net_hash} in place of wrong"):
         fetched("wrong")
@@ -526,8 +520,8 @@ def test_status_tells_of_a_lost_a_silent_and_a_working_worker(
 ) -> None:
     """By the run folder and by the coordinator's address the same; afterwards what the folder
     holds; where there is no run, in words."""
-    monkeypatch.setattr(roll, "SILENT_S", 0.0)
-    monkeypatch.setattr(roll, "_WRITTEN_EVERY_S", 0.0)
+    monkeypatch.setattr(status, "SILENT_S", 0.0)
+    monkeypatch.setattr(status, "_WRITTEN_EVERY_S", 0.0)
     run = Run(tmp_path)
     with hands(run, 3) as (lost, one, silent):
         lost.job()
@@ -547,18 +541,18 @@ def test_status_tells_of_a_lost_a_silent_and_a_working_worker(
         )
         lines = {line.split()[0]: line.split() for line in told.splitlines() if line.strip()}
         assert lines[lost.name][1] == "lost" and lines[silent.name][1] == "silent"
-        monkeypatch.setattr(roll, "SILENT_S", PATIENCE_S)
-        assert one.renew() == GoOn()
+        monkeypatch.setattr(status, "SILENT_S", PATIENCE_S)
+        assert one.renew() == RENEWED
         told = cosim("status", "--connect", run.endpoint).stdout
         lines = {line.split()[0]: line.split() for line in told.splitlines() if line.strip()}
-        assert lines[one.name][1] == "working" and lines[one.name][4:] == [
+        assert lines[one.name][1] == "working" and lines[one.name][-5:] == [
             name,
             "at",
             "1",
             "s,",
             "50%",
         ]
-        assert one.deliver() == Received("kept") and silent.deliver() == Received("kept")
+        assert one.deliver() == KEPT and silent.deliver() == KEPT
         run.over()
     monkeypatch.setattr(settings, "CONNECTS_WITHIN_S", 0.1)
     assert cosim("status", str(run.folder)).stdout == "s, policy stop: 2 of 2 episodes\n"

@@ -18,9 +18,8 @@ from cosim.core.errors import MachineError
 from cosim.core.framing import Wire
 from cosim.episode.policy_caller import PolicyCall
 from cosim.policies.load import load_policy
-from cosim.results.record import Record, begun
+from cosim.results.record import Record
 from cosim.results.run_folder import RunFolder, read_records
-from cosim.results.run_spec import RunSpec
 from cosim.spec.options import RendererAt
 from cosim.spec.scenario import City, Scenario, Suite, write_suite
 from scenarios.ipc.deadlines import Asked, Patience, Question
@@ -36,10 +35,12 @@ from scenarios.ipc.messages import (
     Ready,
 )
 from scenarios.ipc.supervisor import BoundedLog
-from scenarios.runs import pool
+from scenarios.runs import environment_slot, pool
+from scenarios.runs.environment_slot import EnvironmentSlot
 from scenarios.runs.shared_renderer import End, SharedRenderer
 from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import PATIENCE_S, Cosim, seed_in_order
+from tests.run_specs import record_of, spec_of
 
 MODULES = {
     "libsumo": "raise ImportError('libX11.so.6: cannot open shared object file: No such file or "
@@ -192,10 +193,11 @@ def test_a_first_answer_may_take_longer(
 
 
 class Fake:
-    """A worker that says what a test has prepared, and then nothing; or it ends."""
+    """A process that says what a test has prepared, and then nothing; or it ends."""
 
     log = "worker-0.log"
-    away = False
+    called = "environment"
+    descriptor = None
 
     def __init__(
         self,
@@ -231,7 +233,7 @@ class Fake:
 
 
 class Prepared:
-    """A transport to workers that a test has made."""
+    """A transport to one slot, for processes that a test has made."""
 
     def __init__(self, *fakes: Fake) -> None:
         self.waiting = iter(fakes)
@@ -239,11 +241,11 @@ class Prepared:
     def room(self, busy: int) -> int:
         return 1 - busy
 
-    def unasked(self) -> tuple[()]:
+    def unsolicited(self) -> tuple[()]:
         return ()
 
-    def start(self, hello: Hello) -> Fake:
-        return next(self.waiting)
+    def start(self, hello: Hello) -> EnvironmentSlot:
+        return EnvironmentSlot(lambda: next(self.waiting), hello)
 
     def wait(self, timeout_s: float) -> None:
         """They have said everything."""
@@ -279,24 +281,14 @@ def all_pooled(
     transport = Prepared(*fakes)
     suite = Suite(name="s", version="1", scenarios=scenarios)
     driver = load_policy("stop")
-    spec = RunSpec(
-        suite="s",
-        robots={"courier": "h"},
-        suite_version="1",
-        suite_hash="h",
-        policy="stop",
-        policy_name="stop",
-        policy_version="1",
-        scenarios=tuple(one.id for one in scenarios),
-        versions={},
-        seed=seed_in_order(scenarios),
-    )
-    hello = Hello("stop", driver.manifest, driver.source_hash)
+    spec = spec_of(suite, "stop", seed=seed_in_order(scenarios))
+    hello = Hello("stop", driver.manifest, driver.source_hash, patience=Patience(**named))
     with RunFolder.create(folder / "run", spec, suite) as held:
-        given = {"tell": lambda _: None, "patience": Patience(**named), "renderer": renderer}
-        pool.run_all(held, suite.scenarios, hello, transport, **given)
+        pool.run_all(
+            held, suite.scenarios, hello, transport, tell=lambda _: None, renderer=renderer
+        )
         assert next(transport.waiting, None) is None and held.finished() == set(spec.scenarios)
-    return sorted(read_records(folder / "run"), key=lambda record: record.scenario)
+    return sorted(read_records(folder / "run"), key=lambda record: record.scenario.id)
 
 
 def test_an_engine_that_hangs_is_tried_again(
@@ -304,7 +296,7 @@ def test_an_engine_that_hangs_is_tried_again(
 ) -> None:
     """A process that says nothing, while its policy has nothing to answer, is killed; the second
     time it is a crash."""
-    monkeypatch.setattr(pool, "SILENCE_S", 0.0)
+    monkeypatch.setattr(environment_slot, "SILENCE_S", 0.0)
     fakes = (Fake(Ready()), Fake(Ready()))
     record = pooled(tmp_path, *fakes)
     assert (
@@ -323,7 +315,7 @@ def test_a_policy_that_hangs_is_not_tried_again(tmp_path: Path) -> None:
 def test_a_slow_policy_is_no_silence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """While a policy has time left to answer, its process may say nothing for as long as it
     likes."""
-    monkeypatch.setattr(pool, "SILENCE_S", 0.0)
+    monkeypatch.setattr(environment_slot, "SILENCE_S", 0.0)
     slow = Fake(Ready(), asks="act")
     began = time.monotonic()
     record = pooled(tmp_path, slow, answer_s=0.2)
@@ -335,7 +327,7 @@ def test_a_damaged_record_is_a_crash(tmp_path: Path, came: str) -> None:
     """A worker that reports an episode as done with half a record, or another one's, has not
     finished it."""
     other = msgspec.structs.replace(SCENARIO, id="s-1")
-    whole = begun(other, load_policy("stop").manifest, "h").encoded()
+    whole = record_of(other, load_policy("stop").manifest).encoded()
     done = Done("s-0", "done", whole[: len(whole) // 2] if came == "half" else whole)
     record = pooled(tmp_path, Fake(Ready(), done))
     assert record.status == "crashed" and record.reason == "its record was damaged when it arrived"
@@ -343,7 +335,7 @@ def test_a_damaged_record_is_a_crash(tmp_path: Path, came: str) -> None:
 
 def test_a_record_and_its_log_are_written_as_they_came(tmp_path: Path) -> None:
     """A worker needs no folder: the run's own process writes the bytes, and a frame."""
-    data = begun(SCENARIO, load_policy("stop").manifest, "h").encoded()
+    data = record_of(SCENARIO, load_policy("stop").manifest).encoded()
     log = os.urandom(3_000_000)
     record = pooled(
         tmp_path, Fake(Ready(), FrameDrawn("s-0", 5, b"png"), Done("s-0", "crashed", data, log))
@@ -379,7 +371,7 @@ def test_who_ends_its_process_gains_nothing_and_who_loses_it_to_an_engine_nothin
 def test_an_engine_that_fails_is_tried_again(tmp_path: Path) -> None:
     """One error is forgotten; after the second the episode is invalid, with its reason."""
     failed = msgspec.structs.replace(
-        begun(SCENARIO, load_policy("stop").manifest, "h"), status="invalid", reason="gone"
+        record_of(SCENARIO, load_policy("stop").manifest), status="invalid", reason="gone"
     )
     fine = Done("s-0", "done", msgspec.structs.replace(failed, status="done", reason="").encoded())
     once = Again(Ready(), Done("s-0", "invalid", failed.encoded(), again=True), fine)
@@ -409,7 +401,7 @@ def test_a_process_that_died_between_two_episodes_has_not_tried_the_second(tmp_p
         Done(
             one.id,
             "done",
-            msgspec.structs.replace(begun(one, manifest, "h"), status="invalid").encoded(),
+            msgspec.structs.replace(record_of(one, manifest), status="invalid").encoded(),
         )
         for one in (SCENARIO, second)
     )
@@ -418,6 +410,28 @@ def test_a_process_that_died_between_two_episodes_has_not_tried_the_second(tmp_p
         "invalid",
         "invalid",
     ]
+
+
+def test_an_episode_finished_before_its_process_died_is_kept(tmp_path: Path) -> None:
+    """A process that dies after sending its record has finished the episode; one that dies before
+    has not, and the episode is run again."""
+    second = msgspec.structs.replace(SCENARIO, id="s-1")
+    first_done, second_done = (
+        Done(
+            one.id,
+            "done",
+            msgspec.structs.replace(
+                record_of(one, load_policy("stop").manifest), ticks=9
+            ).encoded(),
+        )
+        for one in (SCENARIO, second)
+    )
+    fakes = (
+        Fake(Ready(), first_done, ends=True),
+        Fake(Ready(), ends=True),
+        Fake(Ready(), second_done),
+    )
+    assert [record.ticks for record in all_pooled(tmp_path, (SCENARIO, second), *fakes)] == [9, 9]
 
 
 class Ended(SharedRenderer):
@@ -477,7 +491,7 @@ def test_an_episode_is_no_attempt_the_less_for_a_renderer_that_died_for_others(
     """It is run again as often as that happens; a policy that takes the renderer down when it is
     asked for the episode has used up an attempt of it, and one that does not answer all of them."""
     data = msgspec.structs.replace(
-        begun(SCENARIO, load_policy("stop").manifest, "h"), status="invalid"
+        record_of(SCENARIO, load_policy("stop").manifest), status="invalid"
     ).encoded()
     losses = [LostRenderer("s-0", 1, asked)] * lost
     over = () if reason else (Done("s-0", "done", data),)
@@ -559,9 +573,7 @@ class Notes(Fake):
 
     def give(self, job: Job) -> None:
         self.given.append(job)
-        done = begun(
-            job.scenario, load_policy("stop").manifest, "h", run_seed=job.options.seed or 0
-        )
+        done = Record.begun(job.scenario, load_policy("stop").manifest, job.setup)
         self._messages = (*self._messages, Done(job.scenario.id, "crashed", done.encoded()))
 
 
@@ -577,22 +589,11 @@ def test_a_policy_that_counts_its_episodes_does_not_learn_which_they_are(tmp_pat
     for seed in (1, 2, 1):
         folder = tmp_path / f"{seed}-{len(orders)}"
         notes = Notes()
-        spec = RunSpec(
-            suite="s",
-            robots={"courier": "h"},
-            suite_version="1",
-            suite_hash="h",
-            policy="stop",
-            policy_name="stop",
-            policy_version="1",
-            scenarios=tuple(one.id for one in suite.scenarios),
-            versions={},
-            seed=seed,
-        )
+        spec = spec_of(suite, "stop", seed=seed)
         hello = Hello("stop", load_policy("stop").manifest, "")
         with RunFolder.create(folder, spec, suite) as held:
             pool.run_all(held, suite.scenarios, hello, Prepared(notes), tell=lambda _: None)
-        assert {job.options.seed for job in notes.given} == {seed}
+        assert {job.setup.seed for job in notes.given} == {seed}
         order = [job.scenario.id for job in notes.given]
         assert orders.setdefault(seed, order) == order
     assert sorted(orders[1]) == sorted(orders[2]) == list(spec.scenarios)

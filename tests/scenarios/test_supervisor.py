@@ -13,7 +13,7 @@ import pytest
 
 from cosim.core.errors import MachineError
 from cosim.spec.connection import Connection
-from scenarios.runs import zenoh_worker as supervisor
+from scenarios.runs import zenoh_worker
 from scenarios.runs.passing_folder import passing_folder
 from scenarios.runs.zenoh_worker import work
 from tests.scenarios.test_many_workers import Run, until
@@ -34,13 +34,13 @@ def test_a_worker_for_one_run_does_not_wait_for_ever(
 ) -> None:
     """It ends, and says why, when it was cut off from a run that is over, and when none was ever
     there."""
-    monkeypatch.setattr(supervisor, "_LOOKS_S", 0.0)
+    monkeypatch.setattr(zenoh_worker, "_LOOKS_S", 0.0)
     run = Run(tmp_path)
     said = list[str]()
 
     def over_unheard() -> None:
-        until(lambda: ": is there" in run.log)
-        monkeypatch.setattr(supervisor, "GIVEN_UP_S", 0.5)
+        until(lambda: ": is connected" in run.log)
+        monkeypatch.setattr(zenoh_worker, "GIVEN_UP_S", 0.5)
         run.kill()
 
     other = threading.Thread(target=over_unheard)

@@ -18,9 +18,9 @@ from cosim.spec.camera import CameraSpec
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Suite
-from scenarios.ipc.child_process import LocalProcesses
 from scenarios.ipc.messages import Done, Hear, Hello, Job, Message
 from scenarios.runs import run as suite_run
+from scenarios.runs.local import LocalProcesses
 from scenarios.runs.transport import InProcess
 from scenarios.tools.verify.doctor import small_scenario
 
@@ -49,7 +49,7 @@ def done_here(policy: Policy, hear: Hear) -> None:
     driver = Driver.of(policy)
     worker = InProcess(driver).start(Hello("mine", driver.manifest, driver.source_hash))
     worker.give(Job(msgspec.structs.replace(small_scenario(), time_limit_s=1.0)))
-    assert worker.listen(hear)
+    assert worker.poll(hear) is None
 
 
 @pytest.mark.engine

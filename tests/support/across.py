@@ -55,7 +55,7 @@ from tests.support.plain import plain_zenoh
 
 with plain_zenoh(sys.argv[1], Path(sys.argv[2]), "viewer") as session:
     (status,) = [str(one.ok.key_expr) for one in session.get("cosim/*/status", timeout=600.0)]
-    acts = ("claim", "renew", "result", "failed")
+    acts = ("claim", "report")
     asked = [list(session.get(status.replace("status", f"jobs/{act}"), payload=b"mine", timeout=600.0)) for act in acts]
     print(status.split("/")[2], sum(map(len, asked)), "answers about its jobs")
 """
@@ -126,14 +126,14 @@ def _hub(net: Network) -> str:
 
 def wrong_with(folder: Path, scenarios: int) -> list[str]:
     """What is wrong with the run, in words."""
-    records = [record.scenario for record in read_records(folder / "run")]
+    records = [record.scenario.id for record in read_records(folder / "run")]
     wrong = (
         []
         if len(set(records)) == len(records) == scenarios
         else [f"{len(records)} records of {scenarios}"]
     )
     if lost := [
-        record.scenario for record in read_records(folder / "run") if record.status != "done"
+        record.scenario.id for record in read_records(folder / "run") if record.status != "done"
     ]:
         wrong.append(f"without a result: {', '.join(lost)}")
     log = (folder / "run" / LOG_FILE).read_text()

@@ -20,7 +20,7 @@ from cosim.report.page.runs import ReportedRun, place_in_words
 from cosim.report.page.scene import Entry, PlacePicture, Spot
 from cosim.report.page.three_tables import summary_html, tables_html, warnings_html, wide_html
 from cosim.results.log import holds_waypoints
-from cosim.results.table import policy_in_words
+from cosim.results.table import injections_in_words, policy_in_words
 from cosim.results.throughput import median_answer_ms
 
 _POLICY: Final = (
@@ -229,8 +229,20 @@ def _places(maps: Maps, causes: Mapping[str, Counter[str]]) -> str:
     heads += '<th scope="col" class="word">what went wrong</th>'
     listed = wide_html("Every place", f"<tr>{heads}</tr>", rows)
     return (
-        f'<p class="intro">Dots are failures; the large ones open.</p>{chooser}'
+        f'<p class="intro">Dots are failures; the large ones open.</p>{chooser}{_credits(maps)}'
         f"<details><summary>Every place ({len(maps.episodes)})</summary>{listed}</details>"
+    )
+
+
+def _credits(maps: Maps) -> str:
+    """Credit the data of places that were made from maps."""
+    of: dict[str, list[str]] = {}
+    for picture in maps.pictures:
+        if picture.credit:
+            of.setdefault(picture.credit.replace("(c)", "©"), []).append(picture.place)
+    return "".join(
+        f'<p class="intro">Map data of {escape(", ".join(names))}: {escape(credit)}.</p>'
+        for credit, names in of.items()
     )
 
 
@@ -241,7 +253,7 @@ def _what_was_run(runs: Sequence[ReportedRun]) -> str:
     shared = {
         name: value for name, value in facts[0].items() if all(one[name] == value for one in facts)
     }
-    versions = [run.spec.versions for run in runs]
+    versions = [run.spec.setup.versions for run in runs]
     packages = sorted({name for one in versions for name in one})
     alike = [name for name in packages if len({one.get(name) for one in versions}) == 1]
     if alike:
@@ -278,23 +290,30 @@ def _facts(run: ReportedRun) -> dict[str, str]:
     )
     took_ms = median_answer_ms(run.records)
     follows = any(map(holds_waypoints, run.path.glob("episodes/*/trajectory.npz")))
-    called = policy_in_words(spec.policy_name, run.records[0].privileged)
+    called = policy_in_words(spec.manifest.name, run.records[0].manifest.privileged)
     return {
-        "policy": f"{called} {spec.policy_version} ({spec.policy})",
-        "its source": spec.policy_source or "not told",
-        "suite": f"{spec.suite} {spec.suite_version}, {spec.suite_hash}",
+        "policy": f"{called} {spec.manifest.version} ({spec.policy})",
+        "its source": spec.setup.policy_source or "not told",
+        "suite": f"{spec.suite} {spec.suite_version}, {spec.setup.suite_hash}",
         "scenarios": f"{len(spec.scenarios)} scheduled, {len(run.records)} ended",
         "metric schema": str(run.table["metric_schema"].iloc[0]),
-        "camera": f"{run.table['camera'].iloc[0]}, at {spec.rate_hz:g} Hz",
-        "drawn by": spec.renderer,
-        "goal": spec.goal_protocol,
-        "odometry": spec.odometry,
+        "camera": f"{run.table['camera'].iloc[0]}, at {spec.manifest.rate_hz:g} Hz",
+        "drawn by": spec.setup.renderer,
+        "goal": spec.manifest.goal,
+        "odometry": spec.manifest.odometry,
         "an answer took": "not told" if took_ms is None else f"{milliseconds(took_ms)}, the median",
-        "latency": "of each answer, measured" if spec.real_time else f"{spec.latency_ms:g} ms",
-        "privileged": "yes: knows what no robot can" if run.records[0].privileged else "no",
-        "waypoints": spec.waypoints.in_words if follows else "none: it answers with commands",
+        "latency": "of each answer, measured"
+        if spec.setup.real_time
+        else f"{spec.setup.latency_ms:g} ms",
+        "privileged": "yes: knows what no robot can"
+        if run.records[0].manifest.privileged
+        else "no",
+        "waypoints": spec.manifest.waypoints.in_words
+        if follows
+        else "none: it answers with commands",
         "robot": ", ".join(f"{name} ({digest})" for name, digest in spec.robots.items()),
-        "seed of the run": str(spec.seed),
+        "seed of the run": str(spec.setup.seed),
+        "injected": injections_in_words(run.table) or "nobody",
         "wall time": wall,
         "folder": str(run.path),
     }

@@ -3,11 +3,9 @@ of them."""
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack, suppress
-from pathlib import Path
+from contextlib import suppress
 from typing import Final
 
 import msgspec
@@ -48,15 +46,9 @@ def driving_together(environments: int = ENVIRONMENTS, *, shared: bool = True) -
 
     shared: by one renderer and one policy for all of them; else each environment has its own of
     both."""
-    from cosim.policies.load import load_policy
-    from cosim.results.run_folder import RunFolder
     from cosim.spec.options import EpisodeOptions
     from cosim.spec.scenario import Suite
-    from scenarios.ipc.child_process import LocalProcesses
-    from scenarios.ipc.messages import Hello
-    from scenarios.runs.pool import run_all
-    from scenarios.runs.run import run_spec
-    from scenarios.runs.shared_renderer import SharedRenderer
+    from scenarios.runs.run import run
     from scenarios.suites.catalog import load_suite
 
     shipped = load_suite("long-horizon").scenarios
@@ -66,21 +58,12 @@ def driving_together(environments: int = ENVIRONMENTS, *, shared: bool = True) -
     ]
     suite = Suite(name="together", version="1", scenarios=tuple(picked))
     name = f"{__name__}:{StraightTogether.__name__}"
-    driver = load_policy(name)
-    options = EpisodeOptions(camera="gl")
-    hello = Hello(name, driver.manifest, driver.source_hash)
     watch = _Watch(environments)
-    with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run"
-        spec = run_spec(suite, picked, name, driver, options, shared)
-        held = stack.enter_context(RunFolder.create(folder, spec, suite))
-        logs = held.path / "logs"
-        renderer = stack.enter_context(SharedRenderer(logs, hello, asks=True)) if shared else None
-        with suppress(_Enough):
-            processes = LocalProcesses(logs, environments)
-            run_all(
-                held, picked, hello, processes, tell=watch.hear, options=options, renderer=renderer
-            )
+    options = EpisodeOptions(seed=0, camera="gl")
+    with suppress(_Enough):
+        run(
+            suite, name, jobs=environments, shared_renderer=shared, options=options, tell=watch.hear
+        )
     how = (
         "shared renderer and batched policy" if shared else "each with its own renderer and policy"
     )

@@ -25,26 +25,24 @@ from bridge.session import Session, open_session
 from cosim.core.errors import EngineError
 from cosim.core.state import STILL, Command
 from cosim.policies.load import load_policy
-from cosim.results.record import begun
+from cosim.results.record import Record
 from cosim.results.run_folder import RunFolder
 from cosim.spec.connection import Connection
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import City, Scenario, Suite
-from scenarios.ipc.deadlines import Patience
-from scenarios.ipc.messages import Hello, Job
+from scenarios.ipc.messages import Done, Hello, Job
+from scenarios.runs.planning import run_spec
 from scenarios.runs.pool import run_all
 from scenarios.runs.protocol import (
+    Assignment,
     Claim,
-    Lease,
-    Over,
-    Result,
-    TurnedAway,
+    Reply,
+    Report,
+    decode_reply,
     digest_of,
     installed_here,
-    reply_in,
 )
-from scenarios.runs.run import run_spec
 from scenarios.runs.transport import HeldRun
 from scenarios.runs.zenoh_transport import workers_of_run
 from scenarios.tools.bench.figures import MORE, Figure
@@ -109,7 +107,7 @@ def serve_made_up(workers: int, jobs: int) -> Served:
     scenarios = tuple(msgspec.structs.replace(one, id=f"j-{i:06d}", seed=i) for i in range(jobs))
     suite = Suite(name="load", version="1", scenarios=scenarios)
     driver = load_policy(_POLICY)
-    options = EpisodeOptions(seed=1, suite_hash=suite.content_hash)
+    options = EpisodeOptions(seed=1)
     spec = run_spec(suite, scenarios, _POLICY, driver, options)
     hello = Hello(_POLICY, driver.manifest, driver.source_hash)
     with tempfile.TemporaryDirectory() as folder:
@@ -119,10 +117,7 @@ def serve_made_up(workers: int, jobs: int) -> Served:
             RunFolder.create(Path(folder) / "run", spec, suite) as held,
             open_session(Connection(role="coordinator", listen=endpoint)) as session,
             workers_of_run(
-                session,
-                HeldRun(held, hello, Patience(), scenarios, scenarios),
-                lambda _: None,
-                resumed=False,
+                session, HeldRun(held, hello, scenarios, scenarios), lambda _: None, resumed=False
             ) as of,
         ):
             load = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
@@ -154,8 +149,10 @@ class _MadeUp:
         self._replies = replies
         self._me = {"worker": f"w-{os.getpid()}-{number}", "slot": 0}
         session.stand(keys.worker(run, f"w-{os.getpid()}-{number}"))
-        self._claim = encode(Claim(**self._me, host="here", installed=installed_here(), ready=True))  # type: ignore[arg-type]
-        self._manifest = load_policy(_POLICY)
+        self._claim = encode(
+            Claim(**self._me, host="here", installed=dict(installed_here()), ready=True)
+        )  # type: ignore[arg-type]
+        self._manifest = load_policy(_POLICY).manifest
         self._said: tuple[str, bytes] = ("", b"")
         self.rounds_s: list[float] = []
         self._done_s = 0.0
@@ -167,17 +164,17 @@ class _MadeUp:
             time.sleep(0.001)
             self._say(*self._said)
             return False
-        reply = reply_in(payload)
-        if isinstance(reply, Over):
+        reply = decode_reply(payload)
+        if reply == Reply("over"):
             return True
-        if isinstance(reply, TurnedAway):
+        if isinstance(reply, Reply) and reply.kind == "turned_away":
             raise EngineError(reply.why)
-        if isinstance(reply, Lease):
+        if isinstance(reply, Assignment):
             if self._done_s:
                 self.rounds_s.append(time.monotonic() - self._done_s)
-            result = encode(self._result(reply.number, reply.job))
+            result = encode(self._result(reply.lease, reply.job))
             self._done_s = time.monotonic()
-            self._say("result", result)
+            self._say("report", result)
         else:
             self._say("claim", self._claim)
         return False
@@ -189,25 +186,16 @@ class _MadeUp:
     def _heard(self, payload: bytes | None, error: str) -> None:
         self._replies.put((self, payload))  # type: ignore[arg-type]
 
-    def _result(self, lease: int, job: Job) -> Result:
-        options, driver = job.options, self._manifest
-        record = begun(
-            job.scenario, driver.manifest, options.suite_hash, driver.source_hash, options.seed or 0
-        )
+    def _result(self, lease: int, job: Job) -> Report:
+        assert job.setup is not None
+        record = Record.begun(job.scenario, self._manifest, job.setup)
         data = msgspec.structs.replace(
             record, status="done", ended="goal", ticks=40, state_hash="0" * 32
         ).encoded()
-        log = bytes(_LOG_BYTES)
-        return Result(
-            **self._me,
-            lease=lease,
-            scenario=job.scenario.id,
-            status="done",
-            record=data,
-            log=log,
-            again=False,  # type: ignore[arg-type]
-            digest=digest_of(data, log),
-        )
+        done = Done(job.scenario.id, "done", data, bytes(_LOG_BYTES))
+        return Report(
+            **self._me, lease=lease, scenario=done.scenario, done=done, digest=digest_of(done)
+        )  # type: ignore[arg-type]
 
 
 def _load(endpoint: str, workers: int) -> None:

@@ -9,9 +9,9 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from cosim.cli.progress import SETUP_M, Board, Left
+from cosim.cli.run_progress import SETUP_M, Board, Left
 from cosim.core.telling import duration
-from scenarios.ipc.messages import Compares, Done, Progress
+from scenarios.ipc.messages import Done, Progress
 from scenarios.suites.catalog import load_suite
 
 LONG = load_suite("long-horizon").scenarios
@@ -93,7 +93,7 @@ def test_a_comparison_is_part_of_its_episode() -> None:
     clock.now_s = 70.0
     board.tell(Progress(LONG[0].id, 100.0, LONG[0].route_line.length_m, 0))
     at_goal_s = board.left.seconds(70.0)
-    board.tell(Compares(LONG[0].id, 0.5))
+    board.tell(Progress(LONG[0].id, 1.0, 1.0, 0, compared=0.5))
     assert at_goal_s is not None and at_goal_s > 15.0
     assert (half_s := board.left.seconds(70.0)) is not None and half_s < at_goal_s / 1.5
 

@@ -21,7 +21,7 @@ from cosim.cli.suites import print_scenarios
 from cosim.cli.tables import print_fitted
 from cosim.results.compare import DIFFERENCES, FLIPPED, ComparedRun, RunComparison
 from cosim.results.metrics import COUNTERFACTUAL, METRICS
-from cosim.results.table import KEYS
+from cosim.results.table import COLUMNS as KEYS
 from cosim.spec.scenario import Suite
 from scenarios.suites.catalog import load_suite
 from scenarios.suites.user_scenarios.sweep import SWEPT

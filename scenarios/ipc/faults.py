@@ -1,0 +1,65 @@
+"""Decides what a failed attempt at an episode means: run it again, or record it as crashed or
+invalid.
+
+An episode whose engine fails is invalid, because the simulator owes it. It is crashed if the policy
+may be the cause, so that a policy gains nothing by ending its own process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final, Literal, NamedTuple
+
+from cosim.core.errors import CosimError, DirectorLost, EngineError, PolicyError, PolicyServerLost
+from cosim.results.record import Status
+
+Fault = Literal[
+    "policy_timeout",
+    "process_ended",
+    "engine_failed",
+    "damaged_result",
+    "machine_lost",
+    "handed_back",
+    "worker_unable",
+]
+
+
+class Rule(NamedTuple):
+    """The consequence of a fault. The episode is recorded with `status` after `attempts`, never if
+    that is None."""
+
+    attempts: int | None
+    status: Status
+
+
+RULES: Final[Mapping[Fault, Rule]] = {
+    "policy_timeout": Rule(1, "crashed"),
+    "damaged_result": Rule(1, "crashed"),
+    "process_ended": Rule(2, "crashed"),
+    "engine_failed": Rule(2, "invalid"),
+    "machine_lost": Rule(8, "crashed"),
+    "handed_back": Rule(None, "invalid"),
+    "worker_unable": Rule(None, "invalid"),
+}
+"""The rule of each fault. A machine loses all its episodes at once, so that its losses say little
+about each."""
+
+
+class Failure(NamedTuple):
+    """A failed attempt at an episode, with its reason in words."""
+
+    fault: Fault
+    why: str = ""
+
+
+def verdict_on(error: Exception) -> tuple[Status, bool]:
+    """Return the status of an episode that ended with an error, and whether it is worth another
+    attempt."""
+    status: Status = "crashed" if isinstance(error, PolicyError | PolicyServerLost) else "invalid"
+    may_pass = isinstance(error, EngineError) or not isinstance(error, CosimError)
+    return status, may_pass and not isinstance(error, DirectorLost)
+
+
+def failure_of_result(status: Status, why: str) -> Failure:
+    """Return the failure of an episode that its process reports as worth another attempt."""
+    return Failure("engine_failed" if status == "invalid" else "process_ended", why)
