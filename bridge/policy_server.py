@@ -1,9 +1,9 @@
-"""Serve a policy to `cosim run --policy zenoh:NAME --policy-at ENDPOINT`, from any Python >= 3.9,
-here or elsewhere.
+"""Serve a policy to `cosim run --policy zenoh:NAME --policy-at ENDPOINT`, from any Python >= 3.9.
 
-One file to copy beside a policy; it needs eclipse-zenoh, msgspec and numpy. `serve` asks the policy
-in the thread that calls it. A question is signed with run, episode, attempt and step: one that
-comes again gets the cached answer.
+Copy this file next to a policy; it needs eclipse-zenoh, msgspec and numpy. `serve` queries the
+policy in the thread that calls it. cosim itself imports this file: the messages, `PolicyDesk` and
+the faults of policies are the same for isolated policies, served ones and the shared renderer.
+A request is signed with run, episode, attempt and step: a repeated one gets the cached reply.
 """
 
 from __future__ import annotations
@@ -19,12 +19,13 @@ import secrets
 import signal
 import time
 import traceback
-from collections.abc import Sequence
-from contextlib import nullcontext, suppress
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from ipaddress import ip_address
+from itertools import repeat
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, Optional, Union
+from typing import Any, ClassVar, Optional, Union
 
 import msgspec
 import numpy as np
@@ -32,19 +33,24 @@ import numpy as np
 POLICY_PROTOCOL = 2
 """Raised whenever the messages below change their meaning."""
 MOST_WORDS = 500
+"""Characters of an error's message that are quoted."""
 MOST_MESSAGE_BYTES = 16 << 20
+"""Bytes of one message over Zenoh."""
 _WINDOW_S = 0.002
-"""So long a policy with act_batch is not asked for those who wait, while others are about to."""
+"""Seconds that a policy with act_batch waits for further requests before it answers a batch."""
 _MOST_SEATS = 4096
-_FORGOTTEN_AFTER_S = 300.0
+"""Episodes under way in one server; beyond that the longest idle one is dropped."""
+FORGET_AFTER_S = 300.0
+"""Seconds without a request after which a server drops an episode."""
 _TAKEN_OVER_AFTER_S = 30.0
-"""A policy object that answers for one episode at a time is free again when it was asked nothing
-for so long."""
-_MOST_ANSWER_BYTES = (
-    2 << 20
-)  # of a larger array only the shape is sent, and the simulator refuses it
+"""Seconds without a request after which a policy object for one episode at a time is free again."""
+_MOST_ANSWER_BYTES = 2 << 20
+"""Bytes of an answer; of a larger array only the shape is sent, and the simulator refuses it."""
 _ARRAYS = {"|u1", "<f4"}
 _QUESTIONS = ("reset", "act", "ended")
+_OWN_PACKAGES = {"cosim", "scenarios", "sumo_nets", "physics", "bridge"}
+_PICTURE = ("rgb", "depth", "labels")
+_NUMBERS = ("tick", "time_s", "v_mps", "w_radps", "reset")
 
 
 class PackedArray(msgspec.Struct, frozen=True):
@@ -59,11 +65,14 @@ class PackedArray(msgspec.Struct, frozen=True):
 
 
 class AboutEpisode(msgspec.Struct, frozen=True):
-    """What stays as it is for an episode. robot: its size and limits. cameras: K (3 x 3),
-    distortion (5) and pose on the robot (4 x 4) of each; "" is the policy's first one."""
+    """The constants of an episode. robot: its size and limits. knowledge: as in `AskAct`.
+
+    cameras: K (3 x 3), distortion (5) and pose on the robot (4 x 4); "" is the policy's first one.
+    """
 
     robot: dict[str, Union[str, float]] = {}
     cameras: dict[str, tuple[list[list[float]], list[float], list[list[float]]]] = {}
+    knowledge: bytes = b""
 
 
 class _Signed(msgspec.Struct, frozen=True):
@@ -86,8 +95,11 @@ class AskReset(_Signed, frozen=True, tag="reset"):
 
 
 class AskAct(_Signed, frozen=True, tag="act"):
-    """An observation. step: the number of this question in the episode, from 0. about: with the
-    first one."""
+    """An observation; with the first one about. step: the number of this request, from 0.
+
+    arrays: by names like "rgb", those of a goal "goal.rgb", of a further camera "left/rgb".
+    knowledge: for a privileged policy in the shared renderer, encoded by cosim.
+    """
 
     step: int
     tick: int
@@ -99,6 +111,7 @@ class AskAct(_Signed, frozen=True, tag="act"):
     odometry: Optional[tuple[float, float, Optional[float]]] = None
     arrays: dict[str, PackedArray] = {}
     about: Optional[AboutEpisode] = None
+    knowledge: bytes = b""
 
 
 class AskEnded(_Signed, frozen=True, tag="ended"):
@@ -127,144 +140,291 @@ class Begun(_Signed, frozen=True, tag="begun"):
 
 
 class Answer(_Signed, frozen=True, tag="answer"):
-    """What the policy answers at a step: two speeds, or waypoints."""
+    """The policy's answer at a step: two speeds, or waypoints; planned: both, a plan with its
+    command."""
 
     step: int
     v_mps: float = 0.0
     w_radps: float = 0.0
     waypoints: Optional[PackedArray] = None
+    planned: bool = False
 
 
 class Refusal(msgspec.Struct, frozen=True, tag="refusal"):
-    """There is no answer. why: "policy", it raised or answered what is none; "unknown", an episode
-    that did not begin here; "busy", with another episode; "message", which cannot be understood."""
+    """There is no answer. during, together: see `PolicyFault`.
+
+    why: "policy", its fault; "unknown", the episode did not begin here; "busy", with another
+    episode; "message", it cannot be decoded; "renderer", the shared renderer itself failed.
+    """
 
     why: str
     words: str
+    during: str = ""
+    together: int = 1
 
 
 PolicyRequest = Union[AskReset, AskAct, AskEnded]
-encode_asked = msgspec.msgpack.Encoder().encode
-decode_asked = msgspec.msgpack.Decoder(PolicyRequest).decode
-decode_answered = msgspec.msgpack.Decoder(Union[PolicyInfo, Begun, Answer, Refusal]).decode
+PolicyReply = Union[Begun, Answer, Refusal]
+encode_message = msgspec.msgpack.Encoder().encode
+decode_request = msgspec.msgpack.Decoder(PolicyRequest).decode
+decode_reply = msgspec.msgpack.Decoder(PolicyReply).decode
+decode_info = msgspec.msgpack.Decoder(Union[PolicyInfo, Refusal]).decode
 UNREADABLE = (msgspec.DecodeError, RecursionError, ValueError, TypeError, OverflowError)
-"""What reading bytes of anybody may raise."""
+"""What decoding bytes of unknown origin may raise."""
 
 
 def packed(array: Any) -> PackedArray:
-    """An array in a message."""
+    """Pack an array into a message."""
     array = np.ascontiguousarray(array)
     return PackedArray(array.dtype.str, tuple(array.shape), array.reshape(-1).view(np.uint8).data)
 
 
-class _Seat:
-    """An episode under way. told: what the policy is told that it is called; step: the last one
-    answered, by reply."""
+class PolicyFault(Exception):
+    """Something that a policy did wrong, in printable words.
 
-    def __init__(self, told: str, attempt: str) -> None:
+    during: in which call, "" for the requested one. together: for so many episodes at once.
+    """
+
+    def __init__(self, words: str, during: str = "", together: int = 1) -> None:
+        words = words.encode("utf-8", "replace").decode()
+        words = "".join(c if c.isprintable() or c == "\n" else "?" for c in words)
+        super().__init__(words)
+        self.words = words[: 2 * MOST_WORDS]
+        self.during = during
+        self.together = together
+
+
+def said_by(error: BaseException) -> str:
+    """Return the message of an error as printable text of bounded length."""
+    try:
+        text = PolicyFault(str(error)).args[0]
+    except BaseException:  # noqa: BLE001  even the message of an error can raise
+        return "(its message cannot be read)"
+    if len(text) <= MOST_WORDS:
+        return str(text)
+    return f"{text[:MOST_WORDS]} ... ({len(text)} characters)"
+
+
+@contextmanager
+def policy_call(
+    doing: str, tick: int = 0, timer: Any = None, passes: tuple[type[BaseException], ...] = ()
+) -> Iterator[None]:
+    """Guard a call of a policy: whatever it raises becomes a PolicyFault, but for Ctrl-C.
+
+    timer: its `starts(doing, tick)` and `stops()` are called. passes: errors that are not the
+    policy's, or that have their words already. A copy of the process that the policy forked ends.
+    """
+    process = os.getpid()
+    if timer is not None:
+        timer.starts(doing, tick)
+    try:
+        yield
+    except BaseException as error:
+        # Where Ctrl-C is ignored only the policy can have raised KeyboardInterrupt.
+        ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+        if isinstance(error, (PolicyFault, *passes, *([] if ignored else [KeyboardInterrupt]))):
+            raise
+        said = said_by(error)
+        words = f"raised {type(error).__name__}{': ' * bool(said)}{said}{_line_of(error)}"
+        raise PolicyFault(words) from error
+    finally:
+        if os.getpid() != process:
+            os._exit(1)
+        if timer is not None:
+            timer.stops()
+
+
+def _line_of(error: BaseException) -> str:
+    """Return the file and line of the user's code that an error came from, as " in mine.py:12";
+    else ""."""
+    found = ""
+    stdlib = Path(traceback.__file__).parent
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        file = Path(frame.f_code.co_filename)
+        installed = (
+            "site-packages" in file.parts or file.name.startswith("<") or stdlib in file.parents
+        )
+        ours = (
+            frame.f_globals.get("__name__", "").partition(".")[0] in _OWN_PACKAGES
+            or str(file) == __file__
+        )
+        if not installed and not ours:
+            found = f" in {file.name}:{line}"
+    return found
+
+
+class _Given(SimpleNamespace):
+    """A goal, a pose or a picture. For numpy: its picture or only array, else its numbers."""
+
+    def __array__(self, dtype: Any = None, copy: Any = None) -> Any:
+        held = {name: value for name, value in vars(self).items() if value is not None}
+        values = list(held.values())
+        if all(isinstance(value, (int, float)) for value in values):
+            return np.array(values, dtype)
+        array = values[0] if len(values) == 1 else held.get("rgb")
+        if not isinstance(array, np.ndarray):
+            raise TypeError(f"this is no array: read its {', '.join(held)}")
+        return np.array(array, dtype)
+
+
+class EpisodeDecoder:
+    """Decodes the observations of one episode to plain objects with the names of
+    `cosim.Observation`.
+
+    A subclass that decodes to other objects overrides `makes`, the maker of each part, and
+    `privileged`. They raise an error for wrong values.
+    """
+
+    makes: ClassVar[dict[str, Any]] = {
+        **dict.fromkeys(("camera", "picture", "odometry"), _Given),
+        **dict.fromkeys(("robot", "observation"), SimpleNamespace),
+        "goal": lambda type, **fields: _Given(**fields),
+    }
+
+    def __init__(self, episode: str, about: AboutEpisode) -> None:
+        self.episode = episode
+        self.about = about
+        self.robot = self.makes["robot"](**about.robot)
+        self.cameras = {}
+        for name, camera in about.cameras.items():
+            parts = zip(("matrix", "distortion", "on_robot"), map(np.array, camera))
+            self.cameras[name] = self.makes["camera"](**dict(parts))
+
+    def decoded(self, one: AskAct, arrays: dict[str, Any]) -> Any:
+        """Return the observation in a request with these arrays."""
+        makes = self.makes
+        pictures = {}
+        for name in [name for name in self.cameras if name]:
+            parts = {kind: arrays.get(f"{name}/{kind}") for kind in _PICTURE}
+            pictures[name] = makes["picture"](camera=self.cameras[name], **parts)
+        goal = {name[5:]: one for name, one in arrays.items() if name.startswith("goal.")}
+        pose = dict(zip(("x_m", "y_m", "heading_rad"), one.odometry or ()))
+        return makes["observation"](
+            **{kind: arrays.get(kind) for kind in _PICTURE},
+            **{name: getattr(one, name) for name in _NUMBERS},
+            robot=self.robot,
+            privileged=self.privileged(one.knowledge) if one.knowledge else None,
+            episode=self.episode,
+            goal=makes["goal"](**one.goal, **goal) if one.goal else None,
+            odometry=makes["odometry"](**pose) if pose else None,
+            camera=self.cameras.get(""),
+            pictures=pictures,
+        )
+
+    def privileged(self, knowledge: bytes) -> Any:
+        """Decode what a privileged policy gets: nothing here."""
+        return None
+
+
+class _Seat:
+    """An episode under way. called: its name before the policy. step: the last one, with its
+    reply."""
+
+    def __init__(self, called: str, attempt: str) -> None:
         self.policy: Any = None
-        self.told = told
+        self.called = called
         self.attempt = attempt
-        self.about = AboutEpisode()
+        self.decoder: Any = None
         self.step = -1
-        self.reply = b""
-        self.heard_s = time.monotonic()
+        self.reply: PolicyReply = Refusal("message", "the episode did not begin")
+        self.answered = False
+        self.used_at_s = time.monotonic()
 
 
 class PolicyDesk:
-    """Answers the questions about a policy, whatever carries them.
+    """Queries a policy for any number of episodes, whatever carries requests and replies.
 
-    policy: an object; or a class, or a function without arguments, that makes one for each episode
-    under way. An object with `act_batch` answers for any number of episodes at once, unless batch
-    is False; any other for one at a time. observe: makes what the policy is given. memory: where
-    arrays lie that are not in messages.
+    policy: an object; or a class or function that makes one for each episode under way. An object
+    with `act_batch` answers for any number at once, unless batch is False; any other for one.
+    decoder: an `EpisodeDecoder`. timer: see `policy_call`. forget_after_s: when idle ones end.
     """
 
     def __init__(
-        self, policy: Any, *, observe: Any = None, memory: Any = None, batch: bool = True
+        self,
+        policy: Any,
+        *,
+        decoder: Any = EpisodeDecoder,
+        timer: Any = None,
+        batch: bool = True,
+        forget_after_s: float = FORGET_AFTER_S,
     ) -> None:
         self._make: Any = policy if isinstance(policy, type) or not hasattr(policy, "act") else None
         self.policy: Any = policy if self._make is None else self._make()
-        self._told_which = callable(getattr(self.policy, "act_batch", None))
-        self.batches = batch and self._told_which
+        self._for_many = callable(getattr(self.policy, "act_batch", None))
+        self.batches = batch and self._for_many
         self.at_once = int(not self.batches and self._make is None)
         self._idle = [] if self.batches else [self.policy]
         self._seats: dict[tuple[str, str], _Seat] = {}
-        self._observe = observe or _plain_observation
-        self._memory = memory
+        self._decoder = decoder
+        self._timer = timer
+        most_s = _TAKEN_OVER_AFTER_S if self.at_once else forget_after_s
+        self._forget_after_s = min(forget_after_s, most_s)
 
     @property
     def under_way(self) -> int:
         """How many episodes have begun and not ended."""
         return len(self._seats)
 
-    def answers(self, payloads: Sequence[bytes]) -> list[bytes]:
-        """The reply to each message; those that ask a policy with act_batch are answered
-        together."""
-        process = os.getpid()
-        try:
-            asked = [_read(payload) for payload in payloads]
-            told = {i: self._begin(one) for i, one in enumerate(asked) if isinstance(one, AskReset)}
-            acts = [(self._seat(one), one) for one in asked if isinstance(one, AskAct)]
-            fresh = {
-                id(seat): (seat, one)
-                for seat, one in acts
-                if seat is not None and one.step == seat.step + 1
-            }
-            self._act(list(fresh.values()))
-            return [told[i] if i in told else self._reply(one) for i, one in enumerate(asked)]
-        finally:
-            if os.getpid() != process:
-                os._exit(
-                    1
-                )  # a child that the policy has forked: the episode goes on in its parent alone
+    def wait_s(self, waiting: int, expected: int, since_s: float) -> float:
+        """Return how long a batch of requests, the first of since_s, waits for those expected."""
+        if not self.batches or waiting >= expected:
+            return 0.0
+        return max(since_s + _WINDOW_S - time.monotonic(), 0.0)
+
+    def replies(
+        self, requests: Sequence[Union[PolicyRequest, Refusal]], memories: Sequence[Any] = ()
+    ) -> list[PolicyReply]:
+        """Return the reply to each request. A Refusal is a request that could not be decoded.
+
+        memories: for each request the buffer of its arrays that are not in the message.
+        """
+        began = {i: self._begin(one) for i, one in enumerate(requests) if isinstance(one, AskReset)}
+        fresh = {}
+        for one, memory in zip(requests, memories or repeat(None)):
+            seat = self._seat(one) if isinstance(one, AskAct) else None
+            if seat is not None and isinstance(one, AskAct) and one.step == seat.step + 1:
+                fresh[id(seat)] = seat, one, memory
+        self._act(list(fresh.values()))
+        return [began[i] if i in began else self._reply(one) for i, one in enumerate(requests)]
 
     def _seat(self, one: Any) -> _Seat | None:
         seat = self._seats.get((one.run, one.episode))
         return seat if seat is not None and seat.attempt == one.attempt else None
 
-    def _reply(self, one: Any) -> bytes:
+    def _reply(self, one: Any) -> PolicyReply:
         if isinstance(one, Refusal):
-            return encode_asked(one)
+            return one
         seat = self._seat(one)
         if isinstance(one, AskEnded):
             self._end((one.run, one.episode), seat)
-            return encode_asked(Begun(*one.signature))
+            return Begun(*one.signature)
         if seat is None:
-            return encode_asked(
-                Refusal("unknown", "this episode did not begin here, or was forgotten")
-            )
-        seat.heard_s = time.monotonic()
+            return Refusal("unknown", "this episode did not begin here, or was dropped")
+        seat.used_at_s = time.monotonic()
         if one.step != seat.step:
-            return encode_asked(
-                Refusal("message", f"asked for step {one.step} after step {seat.step}")
-            )
+            return Refusal("message", f"step {one.step} was requested after step {seat.step}")
         return seat.reply
 
-    def _begin(self, one: AskReset) -> bytes:
-        key = (one.run, one.episode)
+    def _begin(self, one: AskReset) -> PolicyReply:
+        key = one.run, one.episode
         seat = self._seat(one)
-        if seat is not None and seat.step < 0:  # asked again: the answer was lost
+        if seat is not None and seat.step < 0:  # a repeated request: the reply was lost
             return seat.reply
         self._end(key, self._seats.get(key))
-        self._forget(_TAKEN_OVER_AFTER_S if self.at_once else _FORGOTTEN_AFTER_S)
+        self._forget()
         if self.at_once and not self._idle:
-            return encode_asked(
-                Refusal("busy", "this policy answers for one episode at a time: serve its class")
-            )
-        # Two runs of one seed may ask at once: what their episodes are called must differ.
-        taken = any(other.told == one.episode for other in self._seats.values())
-        self._seats[key] = seat = _Seat(
-            f"{one.episode}-{one.run[:4]}" if taken else one.episode, one.attempt
-        )
+            return Refusal("busy", "this policy answers for one episode at a time: serve its class")
+        # Two runs of one seed may begin at once: the names of their episodes must differ.
+        taken = any(other.called == one.episode for other in self._seats.values())
+        called = f"{one.episode}-{one.run[:4]}" if taken else one.episode
+        self._seats[key] = seat = _Seat(called, one.attempt)
         try:
-            seat.policy = (
-                self.policy if self.batches else self._idle.pop() if self._idle else self._make()
-            )
-            seat.policy.reset(seat.told, one.seed)
-            seat.reply = encode_asked(Begun(*one.signature))
-        except BaseException as error:  # noqa: BLE001  the policy's crash, not the server's
-            seat.reply = _crash(error)
+            with policy_call("reset", timer=self._timer):
+                seat.policy = self.policy if self.batches else (self._idle or [self._make()]).pop()
+                seat.policy.reset(seat.called, one.seed)
+            seat.reply = Begun(*one.signature)
+        except PolicyFault as fault:
+            seat.reply = _refused(fault)
         return seat.reply
 
     def _end(self, key: tuple[str, str], seat: _Seat | None) -> None:
@@ -273,66 +433,91 @@ class PolicyDesk:
         if not self.batches:
             self._idle.append(seat.policy)
         try:
-            if self._told_which and callable(told := getattr(seat.policy, "ended", None)):
-                told(seat.told)
-        except BaseException as error:  # noqa: BLE001  changes nothing any more
-            _crash(error)
+            if self._for_many and callable(ended := getattr(seat.policy, "ended", None)):
+                with policy_call("ended", timer=self._timer):
+                    ended(seat.called)
+        except PolicyFault as fault:
+            _refused(fault)  # printed; the episode is over
 
-    def _forget(self, after_s: float) -> None:
-        """Leave episodes that nobody has asked about for long, and the oldest where there are too
-        many."""
-        now, seats = time.monotonic(), sorted(self._seats.items(), key=lambda item: item[1].heard_s)
+    def _forget(self) -> None:
+        """Drop idle episodes, and the longest idle one where there are too many."""
+        now = time.monotonic()
+        seats = sorted(self._seats.items(), key=lambda item: item[1].used_at_s)
         for number, (key, seat) in enumerate(seats):
-            if now - seat.heard_s > after_s or len(seats) - number >= _MOST_SEATS:
+            if now - seat.used_at_s > self._forget_after_s or len(seats) - number >= _MOST_SEATS:
                 self._end(key, seat)
 
-    def _act(self, asked: list[tuple[_Seat, AskAct]]) -> None:
-        """Ask the policy. Each seat gets its reply, or its crash."""
-        ready = [
-            (seat, one, seen) for seat, one in asked if (seen := self._seen(seat, one)) is not None
-        ]
-        for group in ([ready] if ready else []) if self.batches else [[one] for one in ready]:
-            try:
-                seen = tuple(one[2] for one in group)
-                found = (
-                    self.policy.act_batch(seen)
-                    if self.batches
-                    else [group[0][0].policy.act(seen[0])]
-                )
-                if len(found) != len(group):
-                    raise ValueError(f"{len(found)} answers to {len(group)} observations")
-                answers = [found[i] for i in range(len(group))]
-            except BaseException as error:  # noqa: BLE001  the policy's crash, not the server's
-                crash = _crash(
-                    error, f", asked for {len(group)} episodes together" if len(group) > 1 else ""
-                )
-                for seat, _, _ in group:
-                    seat.reply = crash
-                continue
-            for (seat, one, _), answer in zip(group, answers):
-                seat.reply = _answered(one, answer)
+    def _act(self, asked: list[tuple[_Seat, AskAct, Any]]) -> None:
+        """Query the policy. Each seat gets its reply."""
+        seen = [(seat, one, self._observation(seat, one, memory)) for seat, one, memory in asked]
+        ready = [one for one in seen if one[2] is not None]
+        for group in [ready] * bool(ready) if self.batches else [[one] for one in ready]:
+            self._answer(group)
 
-    def _seen(self, seat: _Seat, one: AskAct) -> Any:
-        """What the policy is given, once it knows of a reset; None where that cannot be, which is
-        the reply."""
+    def _observation(self, seat: _Seat, one: AskAct, memory: Any) -> Any:
+        """Decode an observation, and report a reset to the policy; None if refused."""
         seat.step = one.step
-        seat.heard_s = time.monotonic()
-        seat.about = one.about or seat.about
+        seat.used_at_s = time.monotonic()
         try:
-            arrays = {name: _unpacked(array, self._memory) for name, array in one.arrays.items()}
-            seen = self._observe(seat.told, seat.about, one, arrays)
-        except UNREADABLE as error:
-            seat.reply = encode_asked(
-                Refusal("message", f"not an observation: {error}"[:MOST_WORDS])
-            )
+            if seat.decoder is None or one.about is not None:
+                seat.decoder = self._decoder(seat.called, one.about or AboutEpisode())
+            arrays = {name: unpacked(array, memory) for name, array in one.arrays.items()}
+            observation = seat.decoder.decoded(one, arrays)
+        except Exception as error:  # noqa: BLE001  whatever is wrong with the message
+            seat.reply = Refusal("message", f"not an observation: {error}"[:MOST_WORDS])
             return None
         try:
-            if one.reset and callable(told := getattr(seat.policy, "on_reset", None)):
-                told(*([seat.told] if self._told_which else []))
-        except BaseException as error:  # noqa: BLE001  the policy's crash, not the server's
-            seat.reply = _crash(error)
+            if one.reset and callable(on_reset := getattr(seat.policy, "on_reset", None)):
+                with policy_call("on_reset", one.tick, self._timer):
+                    on_reset(*([seat.called] if self._for_many else []))
+        except PolicyFault as fault:
+            fault.during = "on_reset"
+            seat.reply = _refused(fault)
             return None
-        return seen
+        return observation
+
+    def _answer(self, group: list[tuple[_Seat, AskAct, Any]]) -> None:
+        """Query the policy for observations together. A bad answer concerns its own episode."""
+        doing = "act" if all(seat.answered for seat, _, _ in group) else "first act"
+        observations = tuple(observation for _, _, observation in group)
+        try:
+            with policy_call(doing, max(one.tick for _, one, _ in group), self._timer):
+                if self.batches:
+                    answers = _as_many(self.policy.act_batch(observations), len(group))
+                else:
+                    answers = [group[0][0].policy.act(observations[0])]
+        except PolicyFault as fault:
+            fault.together = len(group)
+            refusal = _refused(fault)
+            for seat, _, _ in group:
+                seat.reply = refusal
+            return
+        for (seat, one, _), answer in zip(group, answers):
+            seat.answered = True
+            try:
+                with policy_call(doing, one.tick, self._timer):
+                    seat.reply = _packed_answer(one, answer)
+            except PolicyFault as fault:
+                seat.reply = _refused(fault)
+
+
+def _as_many(answers: Any, count: int) -> list[Any]:
+    """Return the answers of a batch. Raises PolicyFault unless there is one for each
+    observation."""
+    if not hasattr(answers, "__len__") or not hasattr(answers, "__getitem__"):
+        kind = type(answers).__name__
+        raise PolicyFault(f"answered a {kind}: a batch is answered with a sequence")
+    if len(answers) != count:
+        raise PolicyFault(f"gave {len(answers)} answers to {count} observations")
+    return [answers[i] for i in range(count)]
+
+
+def _refused(fault: PolicyFault) -> Refusal:
+    """Print the traceback of a fault, and return it as a message."""
+    cause = fault.__cause__
+    if cause is not None:
+        traceback.print_exception(type(cause), cause, cause.__traceback__)
+    return Refusal("policy", fault.words, fault.during, fault.together)
 
 
 def _from_jpeg(data: memoryview) -> Any:
@@ -350,143 +535,63 @@ def _from_jpeg(data: memoryview) -> Any:
         return np.array(Image.open(BytesIO(data)).convert("RGB"))
 
 
-def _read(payload: bytes) -> Any:
+def read_request(payload: bytes) -> Union[PolicyRequest, Refusal]:
+    """Decode a request; a Refusal where it is none."""
     try:
-        return decode_asked(payload)
+        request: PolicyRequest = decode_request(payload)
+        return request
     except UNREADABLE as error:
         return Refusal("message", f"not a question: {error}"[:MOST_WORDS])
 
 
-def _unpacked(told: PackedArray, memory: memoryview | None) -> Any:
-    if told.jpeg:
-        return _from_jpeg(told.data).reshape(told.shape)
-    if told.dtype not in _ARRAYS or any(side < 0 for side in told.shape):
-        raise ValueError(f"an array of {told.dtype} {told.shape}")
-    count = int(np.prod(told.shape, dtype=np.int64))
-    if told.at < 0:
-        return np.frombuffer(told.data, told.dtype).reshape(told.shape).copy()
+def unpacked(array: PackedArray, memory: Any = None) -> Any:
+    """Return a copy of an array of an observation. Raises ValueError for what is none."""
+    if array.jpeg:
+        return _from_jpeg(array.data).reshape(array.shape)
+    if array.dtype not in _ARRAYS or any(side < 0 for side in array.shape):
+        raise ValueError(f"an array of {array.dtype} {array.shape}")
+    count = int(np.prod(array.shape, dtype=np.int64))
+    if array.at < 0:
+        return np.frombuffer(array.data, array.dtype).reshape(array.shape).copy()
     if memory is None:
         raise ValueError("no memory is shared")
-    return np.frombuffer(memory, told.dtype, count, told.at).reshape(told.shape).copy()
+    return np.frombuffer(memory, array.dtype, count, array.at).reshape(array.shape).copy()
 
 
-def _answered(one: AskAct, answer: Any) -> bytes:
-    try:
-        return encode_asked(_answer(one, answer))
-    except BaseException as error:  # noqa: BLE001  whatever was answered
-        return _crash(error)
-
-
-def _answer(one: AskAct, answer: Any) -> Union[Answer, Refusal]:
-    """What a policy has answered, as it travels."""
+def _packed_answer(one: AskAct, answer: Any) -> Answer:
+    """Pack a policy's answer. Raises PolicyFault for what is none, and whatever reading it
+    raises."""
     if isinstance(answer, dict) and set(answer) == {"v_mps", "w_radps"}:
         answer = SimpleNamespace(**answer)
-    if hasattr(answer, "v_mps") and hasattr(answer, "w_radps"):
-        speeds = [answer.v_mps, answer.w_radps]
-        if all(
-            isinstance(v, (int, float, np.integer, np.floating)) and not isinstance(v, bool)
-            for v in speeds
-        ):
-            v_mps, w_radps = (
-                np.inf if isinstance(v, int) and v.bit_length() > 1000 else float(v) for v in speeds
-            )
-            return Answer(*one.signature, one.step, v_mps, w_radps)
-        return Refusal(
-            "policy",
-            f"answered Command{tuple(speeds)!r}"[:MOST_WORDS] + ": both must be finite numbers",
-        )
+    if not (hasattr(answer, "v_mps") and hasattr(answer, "w_radps")):
+        return Answer(*one.signature, one.step, waypoints=_packed_waypoints(answer))
+    speeds = answer.v_mps, answer.w_radps
+    numbers = (int, float, np.integer, np.floating)
+    if not all(isinstance(v, numbers) and not isinstance(v, bool) for v in speeds):
+        shown = "Command(v_mps={!r}, w_radps={!r})".format(*speeds)[:MOST_WORDS]
+        raise PolicyFault(f"answered {shown}: both must be finite numbers")
+    v_mps, w_radps = map(_float, speeds)
+    plan = getattr(answer, "waypoints", None)
+    if plan is None:
+        return Answer(*one.signature, one.step, v_mps, w_radps)
+    return Answer(*one.signature, one.step, v_mps, w_radps, _packed_waypoints(plan), planned=True)
+
+
+def _float(value: Any) -> float:
+    return np.inf if isinstance(value, int) and value.bit_length() > 1000 else float(value)
+
+
+def _packed_waypoints(answer: Any) -> PackedArray:
     array = np.asarray(None)
     with suppress(TypeError, ValueError):  # rows of different lengths
         array = np.asarray(answer)
     if array.ndim == 0 or array.dtype.kind not in "biufc":
         shown = repr(answer)
         shown = shown if len(shown) <= 80 and shown.isprintable() else f"a {type(answer).__name__}"
-        return Refusal("policy", f"answered {shown}: neither a Command nor waypoints")
-    told = (
-        packed(array)
-        if array.nbytes <= _MOST_ANSWER_BYTES
-        else PackedArray(array.dtype.str, array.shape)
-    )
-    return Answer(*one.signature, one.step, waypoints=told)
-
-
-def _crash(error: BaseException, among: str = "") -> bytes:
-    """What is said of whatever came out of a policy; the rest is printed. Ctrl-C stays what it
-    is."""
-    if (
-        isinstance(error, KeyboardInterrupt)
-        and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
-    ):
-        raise error
-    traceback.print_exception(type(error), error, error.__traceback__)
-    try:
-        said = str(error)
-    except BaseException:  # noqa: BLE001  even the message of an error can raise
-        said = "(its message cannot be read)"
-    said = "".join(
-        c if c.isprintable() or c == "\n" else "?" for c in said.encode("utf-8", "replace").decode()
-    )
-    said = said if len(said) <= MOST_WORDS else f"{said[:MOST_WORDS]} ... ({len(said)} characters)"
-    return encode_asked(
-        Refusal("policy", f"raised {type(error).__name__}{': ' * bool(said)}{said}{among}")
-    )
-
-
-class _Given(SimpleNamespace):
-    """A goal, a pose or a picture. For numpy: its picture or only array, or its numbers without
-    those that are None."""
-
-    def __array__(self, dtype: Any = None, copy: Any = None) -> Any:
-        held = {name: value for name, value in vars(self).items() if value is not None}
-        values = list(held.values())
-        if all(isinstance(value, (int, float)) for value in values):
-            return np.array(values, dtype)
-        array = values[0] if len(values) == 1 else held.get("rgb")
-        if not isinstance(array, np.ndarray):
-            raise TypeError(f"this is no array: read its {', '.join(held)}")
-        return np.array(array, dtype)
-
-
-def _plain_observation(
-    told: str, about: AboutEpisode, one: AskAct, arrays: dict[str, Any]
-) -> SimpleNamespace:
-    """What a policy is given where cosim is not installed: by the names that `cosim.Observation`
-    has."""
-    names = ("matrix", "distortion", "on_robot")
-    cameras = {
-        name: _Given(**dict(zip(names, map(np.array, held))))
-        for name, held in about.cameras.items()
-    }
-    goal = dict(one.goal or {})
-    goal.pop("type", None)
-    goal |= {name[5:]: array for name, array in arrays.items() if name.startswith("goal.")}
-    pose = (
-        None
-        if one.odometry is None
-        else _Given(**dict(zip(("x_m", "y_m", "heading_rad"), one.odometry)))
-    )
-    further = sorted({name.partition("/")[0] for name in arrays if "/" in name})
-    picture = {
-        name: {kind: arrays.get(f"{name}/{kind}") for kind in ("rgb", "depth", "labels")}
-        for name in further
-    }
-    return SimpleNamespace(
-        tick=one.tick,
-        time_s=one.time_s,
-        v_mps=one.v_mps,
-        w_radps=one.w_radps,
-        reset=one.reset,
-        episode=told,
-        robot=SimpleNamespace(**about.robot),
-        goal=_Given(**goal) if goal else None,
-        odometry=pose,
-        privileged=None,
-        camera=cameras.get(""),
-        rgb=arrays.get("rgb"),
-        depth=arrays.get("depth"),
-        labels=arrays.get("labels"),
-        pictures={name: _Given(**held, camera=cameras.get(name)) for name, held in picture.items()},
-    )
+        raise PolicyFault(f"answered {shown}: neither a Command nor waypoints")
+    if array.nbytes > _MOST_ANSWER_BYTES:
+        return PackedArray(array.dtype.str, array.shape)
+    return packed(array)
 
 
 def serve(
@@ -501,7 +606,7 @@ def serve(
     insecure: bool = False,
     told: Any = None,
     source: str = "",
-    observe: Any = None,
+    decoder: Any = EpisodeDecoder,
     session: Any = None,
 ) -> None:
     """Answer for a policy until Ctrl-C.
@@ -513,13 +618,13 @@ def serve(
     (`cosim certs`). insecure: it may reach beyond this machine without. jpeg: pictures are to come
     as JPEG. session: an open Zenoh session, in place of all that. Raises ValueError.
     """
-    desk = PolicyDesk(policy, observe=observe)
+    desk = PolicyDesk(policy, decoder=decoder)
     manifest = msgspec.to_builtins(desk.policy.manifest if told is None else told)
     name = name or manifest["name"]
     server = secrets.token_hex(4)
     if not all(re.fullmatch(r"[A-Za-z0-9_-]{1,64}", part) for part in (name, domain)):
         raise ValueError(
-            f"'{name}' or '{domain}' cannot stand in a key: use 1 to 64 of A-Z a-z 0-9 _ -"
+            f"'{name}' or '{domain}' cannot stand in a key: use 1 to 64 of A-Za-z0-9_-"
         )
     below = policy_key(domain, name, server)
     source = source or _source_of(desk.policy)
@@ -527,45 +632,40 @@ def serve(
 
     def tell(query: Any) -> None:
         with query:
-            info = PolicyInfo(
-                server, name, manifest, source, desk.at_once, desk.under_way, jpeg, bool(listen)
-            )
-            query.reply(f"{below}/info", encode_asked(info))
+            busy = desk.at_once, desk.under_way
+            info = PolicyInfo(server, name, manifest, source, *busy, jpeg, bool(listen))
+            query.reply(f"{below}/info", encode_message(info))
 
     opens = nullcontext(session) if session else _opened(listen, connect, tls, insecure)
     with opens as opened, suppress(KeyboardInterrupt):
-        declared = [opened.declare_queryable(f"{below}/info", tell, complete=True)]
-        declared += [
-            opened.declare_queryable(f"{below}/{kind}", asked.put, complete=True)
-            for kind in _QUESTIONS
+        answers = {"info": tell, **dict.fromkeys(_QUESTIONS, asked.put)}
+        _declared = [
+            opened.declare_queryable(f"{below}/{kind}", answer, complete=True)
+            for kind, answer in answers.items()
         ]
-        print(
-            f"policy '{name}' answers at {listen or connect} as server {server}; stop with Ctrl-C",
-            flush=True,
-        )
+        where = f"at {listen or connect} as server {server}"
+        print(f"policy '{name}' answers {where}; stop with Ctrl-C", flush=True)
         while True:
             _answer_waiting(desk, asked)
 
 
 def _answer_waiting(desk: PolicyDesk, asked: Any) -> None:
-    """Answer what is waiting, at least one question."""
+    """Answer the waiting requests, at least one."""
     queries = [asked.get()]
-    until_s = time.monotonic() + _WINDOW_S
+    since_s = time.monotonic()
     with suppress(queue.Empty):
         while True:
-            waits = desk.batches and len(queries) < desk.under_way
-            queries.append(
-                asked.get(timeout=max(until_s - time.monotonic(), 0.0) if waits else 0.0)
-            )
-    # What asks several servers at once is no question to any: an answer would be lost.
+            wait_s = desk.wait_s(len(queries), desk.under_way, since_s)
+            queries.append(asked.get(timeout=wait_s))
+    # A request to several servers at once is refused: an answer would be lost.
     read = [query.payload is not None and "*" not in str(query.key_expr) for query in queries]
     payloads = [query.payload.to_bytes() if reads else b"" for query, reads in zip(queries, read)]
-    for query, reply in zip(queries, desk.answers(payloads)):
+    for query, reply in zip(queries, desk.replies(list(map(read_request, payloads)))):
         with query:
-            if isinstance(decode_answered(reply), Refusal):
-                query.reply_err(reply)
+            if isinstance(reply, Refusal):
+                query.reply_err(encode_message(reply))
             else:
-                query.reply(query.key_expr, reply)
+                query.reply(query.key_expr, encode_message(reply))
 
 
 def policy_key(domain: str, name: str, server: str) -> str:
@@ -575,9 +675,8 @@ def policy_key(domain: str, name: str, server: str) -> str:
 
 def _source_of(policy: Any) -> str:
     with suppress(OSError, TypeError):
-        source = (
-            Path(inspect.getfile(type(policy))).read_bytes() + type(policy).__qualname__.encode()
-        )
+        kind = type(policy)
+        source = Path(inspect.getfile(kind)).read_bytes() + kind.__qualname__.encode()
         return hashlib.blake2b(source, digest_size=8).hexdigest()
     return ""
 
@@ -588,10 +687,8 @@ def _opened(listen: str, connect: str, tls: str, insecure: bool) -> Any:
 
     found = re.fullmatch(r"(tcp|tls)/(.+):\d{1,5}|unixsock-stream/.+", listen or connect)
     if not found or (listen and connect):
-        raise ValueError(
-            f"listen or connect, one of both, like tcp/127.0.0.1:7449, not '{listen}' and "
-            f"'{connect}'"
-        )
+        got = f"not '{listen}' and '{connect}'"
+        raise ValueError(f"listen or connect, one of both, like tcp/127.0.0.1:7449, {got}")
     host = (found[2] or "localhost").strip("[]")
     with suppress(ValueError):
         host = "localhost" if ip_address(host).is_loopback else host
@@ -614,25 +711,18 @@ def _opened(listen: str, connect: str, tls: str, insecure: bool) -> Any:
     }
     if tls:
         ours = {"certificate": str(Path(tls, "cert.pem")), "private_key": str(Path(tls, "key.pem"))}
-        guard = {
-            f"{end}_{what}": path for end in ("listen", "connect") for what, path in ours.items()
-        }
-        guard |= {"root_ca_certificate": str(Path(tls, "ca.pem"))}
-        settings["transport/link/tls"] = {
-            **guard,
-            "enable_mtls": True,
-            "verify_name_on_connect": True,
-        }
+        guard: dict[str, Any] = {"enable_mtls": True, "verify_name_on_connect": True}
+        for end in ("listen", "connect"):
+            guard.update({f"{end}_{what}": path for what, path in ours.items()})
+        guard["root_ca_certificate"] = str(Path(tls, "ca.pem"))
+        settings["transport/link/tls"] = guard
     if listen and found[1]:  # runs may ask; nobody else may, and nobody may answer in its place
         may = {"permission": "allow", "key_exprs": ["cosim/*/policy/**"]}
         flows = {"ingress": ["query"], "egress": ["declare_queryable", "reply"]}
-        rules = [
-            {"id": flow, "flows": [flow], "messages": messages, **may}
-            for flow, messages in flows.items()
-        ]
-        who = (
-            {"cert_common_names": ["worker", "coordinator"]} if tls else {"link_protocols": ["tcp"]}
-        )
+        rules = [{"id": flow, "flows": [flow], "messages": flows[flow], **may} for flow in flows]
+        who = {"link_protocols": ["tcp"]}
+        if tls:
+            who = {"cert_common_names": ["worker", "coordinator"]}
         settings["access_control"] = {
             "enabled": True,
             "default_permission": "deny",

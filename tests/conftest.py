@@ -8,6 +8,7 @@ import importlib
 import io
 import itertools
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -164,3 +165,8 @@ def _as_a_program(words: tuple[str, ...], folder: Path) -> Iterator[None]:
             if source and Path(source).is_relative_to(folder):
                 del sys.modules[name]
         signal.signal(signal.SIGTERM, before[4])
+
+
+def without_lines(text: str) -> str:
+    """Remove the file and line that a policy's crash names."""
+    return re.sub(r" in \w+\.py:\d+", "", text)

@@ -10,9 +10,10 @@ import typer
 
 from cosim.cli import tables
 from cosim.cli.console import out
-from cosim.cli.options import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, MEASURE
+from cosim.cli.options import MEASURE
 from cosim.cli.progress import doing
 from cosim.core.errors import UsageError, unknown
+from cosim.spec.run_config import help_of
 
 if TYPE_CHECKING:
     from cosim.core.geometry import Floats
@@ -325,9 +326,9 @@ def bench(
     crossings: Annotated[int, typer.Option(min=1, help="For `crossings`: how many in all.")] = 200,
     policy: Annotated[str, typer.Option(help="For `crossings`: who drives over them.")] = "orca",
     jobs: Annotated[int, typer.Option(min=1, help="For `crossings` and `people`: processes.")] = 1,
-    groups: Annotated[float, typer.Option(help=f"For `crowd`: {GROUPS_HELP}")] = 0.0,
-    elderly: Annotated[float, typer.Option(help=f"For `crowd`: {ELDERLY_HELP}")] = 0.0,
-    children: Annotated[float, typer.Option(help=f"For `crowd`: {CHILDREN_HELP}")] = 0.0,
+    groups: Annotated[float, typer.Option(help=f"For `crowd`: {help_of('groups')}")] = 0.0,
+    elderly: Annotated[float, typer.Option(help=f"For `crowd`: {help_of('elderly')}")] = 0.0,
+    children: Annotated[float, typer.Option(help=f"For `crowd`: {help_of('children')}")] = 0.0,
 ) -> None:
     """Measure one environment process, part by part, the cameras, or what robot, people and
     vehicles do in traffic."""

@@ -7,56 +7,141 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, get_args
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from cosim.cli.console import err, out
-from cosim.cli.options import (
-    CAMERA_HELP,
-    LEARN,
-    ROBOT_HELP,
-    Choice,
-    camera_here,
-    check_output,
-    replaced,
-    size_called,
-)
+from cosim.cli.generated_options import Fields, configured
+from cosim.cli.options import LEARN, camera_here, check_output, replaced, size_called
 from cosim.cli.progress import doing, stages_in_lines
 from cosim.cli.run_progress import Board
-from cosim.core.errors import INTERRUPTED, UsageError, unknown
+from cosim.core.errors import INTERRUPTED, UsageError
+from cosim.spec.run_config import Option, RunConfig
 
 if TYPE_CHECKING:
+    from cosim.spec.demo_options import Collecting
     from cosim.spec.scenario import Scenario, Suite
     from scenarios.suites.new_scenarios import Fresh
+    from scenarios.tools.dataset.collect import Gathered
 
 
 collect_app = typer.Typer()
 
-_CITIES_HELP = (
-    "Draw scenarios like the suite's (unit, reactive) in the generated cities of these seeds, "
-    "which no suite uses."
+_EPISODES_HELP = (
+    "So many demonstrations are kept; of a suite all that are solved by default, else one of each."
 )
 _EVENT_HELP = (
     "Only scenarios of this event, with --cities also of this structure (straight, static); may "
     "be repeated."
 )
-_EPISODES_HELP = (
-    "So many demonstrations are kept; of a suite all that are solved by default, else one of each."
+_OF_COLLECT = Fields(
+    only=(
+        "suite",
+        "out",
+        "episodes",
+        "event",
+        "scenario",
+        "split",
+        "map",
+        "policy",
+        "robot",
+        "goal",
+        "seed",
+        "camera",
+        "own_camera",
+        "jobs",
+        "resume",
+    ),
+    help={
+        "out": "Folder of the data set.",
+        "episodes": _EPISODES_HELP,
+        "event": _EVENT_HELP,
+        "scenario": "Only this scenario; may be repeated.",
+        "split": "Only scenarios of val, or of test.",
+        "map": "Draw on this place: a map, a folder, a net.",
+        "policy": "The expert: a baseline, or your own as my.py:Class.",
+        "goal": "What is told of where to go: none, route_point, final_point, instruction.",
+        "seed": "Of the policy, of noise, and with --map of the scenarios.",
+        "own_camera": "A camera that the robot does not have.",
+        "jobs": "Environment processes.",
+        "resume": "Go on with the data set in --out.",
+    },
+    default={"policy": "orca", "goal": "route_point", "seed": 0, "jobs": 1},
+    flag={"camera": "--renderer"},
+    required=("out",),
 )
-_NOISE_HELP = (
-    "Share of the time in which another command is driven, in bursts; the expert's answer is "
-    "kept all the same."
-)
-_LEARNER_HELP = (
-    "DAgger: this policy drives in --noise's share of the time, 1 to 5 s at once, and the "
-    "expert's answer is kept. It sees the pictures that are collected."
-)
-_RATE_HELP = (
-    "Pictures and answers a second: 1, 2, 4, 5, 10 or 20; of an expert that sees its own rate."
-)
-_UNSOLVED_HELP = "Keep also what the expert does not solve, up to where the robot is put back."
+"""The options of `cosim collect` that it has in common with `cosim run`."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DemoConfig:
+    """What `cosim collect` keeps of an episode, and where it draws scenarios."""
+
+    cities: Annotated[
+        str,
+        Option(
+            "Draw scenarios like the suite's (unit, reactive) in the generated cities of these "
+            "seeds, which no suite uses.",
+            metavar="FIRST:END",
+        ),
+    ] = ""
+    city_size: Annotated[
+        float, Option("Metres; of the cities of --cities.", least=300.0, most=5000.0)
+    ] = 2000.0
+    size: Annotated[str, Option("Pixels of the pictures.", flag="--camera", metavar="WxH")] = (
+        "160x90"
+    )
+    fov: Annotated[
+        float, Option("Degrees from its lower to its upper edge.", least=1.0, most=170.0)
+    ] = 75.0
+    mount: Annotated[str, Option("Where the camera sits on the robot.")] = "front"
+    rate: Annotated[
+        float,
+        Option(
+            "Pictures and answers a second: 1, 2, 4, 5, 10 or 20; of an expert that sees its "
+            "own rate."
+        ),
+    ] = 5.0
+    waypoints: Annotated[int, Option("So many places ahead are taken from the trajectory.")] = 8
+    waypoint_s: Annotated[float, Option("Seconds from one of them to the next.")] = 0.2
+    noise: Annotated[
+        float,
+        Option(
+            "Share of the time in which another command is driven, in bursts; the expert's "
+            "answer is kept all the same."
+        ),
+    ] = 0.0
+    learner: Annotated[
+        str,
+        Option(
+            "DAgger: this policy drives in --noise's share of the time, 1 to 5 s at once, and the "
+            "expert's answer is kept. It sees the pictures that are collected.",
+            metavar="POLICY",
+        ),
+    ] = ""
+    unsolved: Annotated[
+        bool, Option("Keep also what the expert does not solve, up to where the robot is put back.")
+    ] = False
+
+    @property
+    def collecting(self) -> Collecting:
+        """What is kept. Raises UsageError, SpecError."""
+        from cosim.spec.camera import CameraSpec
+        from cosim.spec.demo_options import Collecting
+
+        wide, high = size_called("--camera", self.size)
+        return Collecting(
+            camera=CameraSpec(width=wide, height=high, fov_deg=self.fov, mount=self.mount),
+            rate_hz=self.rate,
+            waypoints=self.waypoints,
+            waypoint_s=self.waypoint_s,
+            noise=self.noise,
+            learner=self.learner,
+            unsolved=self.unsolved,
+        )
 
 
 @collect_app.command(
@@ -69,64 +154,10 @@ _UNSOLVED_HELP = "Keep also what the expert does not solve, up to where the robo
     "60 --noise 0.7 --learner small --unsolved --out demos/again`  \n`cosim collect ... --out "
     "demos/unit --resume`, where it was stopped; then `cosim dataset pack`",
 )
+@configured
 def collect_command(
-    suite: Annotated[
-        str, typer.Argument(help="A suite (see `cosim list`) or the path of a suite's .json file.")
-    ],
-    folder: Annotated[Path, typer.Option("--out", help="Folder of the data set.")],
-    episodes: Annotated[int | None, typer.Option(min=1, help=_EPISODES_HELP)] = None,
-    event: Annotated[list[str] | None, typer.Option(help=_EVENT_HELP)] = None,
-    scenario: Annotated[
-        list[str] | None, typer.Option(help="Only this scenario; may be repeated.")
-    ] = None,
-    split: Annotated[str | None, typer.Option(help="Only scenarios of val, or of test.")] = None,
-    cities: Annotated[str, typer.Option(metavar="FIRST:END", help=_CITIES_HELP)] = "",
-    city_size: Annotated[
-        float, typer.Option(min=300.0, max=5000.0, help="Metres; of the cities of --cities.")
-    ] = 2000.0,
-    map_name: Annotated[
-        str | None, typer.Option("--map", help="Draw on this place: a map, a folder, a net.")
-    ] = None,
-    policy: Annotated[
-        str, typer.Option(help="The expert: a baseline, or your own as my.py:Class.")
-    ] = "orca",
-    robot: Annotated[str, typer.Option(help=ROBOT_HELP)] = "",
-    size: Annotated[
-        str, typer.Option("--camera", metavar="WxH", help="Pixels of the pictures.")
-    ] = "160x90",
-    fov: Annotated[
-        float, typer.Option(min=1.0, max=170.0, help="Degrees from its lower to its upper edge.")
-    ] = 75.0,
-    mount: Annotated[str, typer.Option(help="Where the camera sits on the robot.")] = "front",
-    rate: Annotated[float, typer.Option(help=_RATE_HELP)] = 5.0,
-    goal: Annotated[
-        str,
-        typer.Option(
-            help="The goal protocol of the rows: points of the route, instructions or none."
-        ),
-    ] = "route_point",
-    waypoints: Annotated[
-        int, typer.Option(help="So many places ahead are taken from the trajectory.")
-    ] = 8,
-    waypoint_s: Annotated[
-        float, typer.Option("--waypoint-s", help="Seconds from one of them to the next.")
-    ] = 0.2,
-    noise: Annotated[float, typer.Option(help=_NOISE_HELP)] = 0.0,
-    learner: Annotated[str, typer.Option(metavar="POLICY", help=_LEARNER_HELP)] = "",
-    unsolved: Annotated[bool, typer.Option("--unsolved", help=_UNSOLVED_HELP)] = False,
-    seed: Annotated[
-        int, typer.Option(min=0, help="Of the policy, of noise, and with --map of the scenarios.")
-    ] = 0,
-    renderer: Annotated[
-        Choice, typer.Option("--renderer", metavar="CAMERA", help=CAMERA_HELP)
-    ] = "auto",
-    own_camera: Annotated[
-        bool, typer.Option("--own-camera", help="A camera that the robot does not have.")
-    ] = False,
-    jobs: Annotated[int, typer.Option(min=1, help="Environment processes.")] = 1,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the data set in --out.")
-    ] = False,
+    config: Annotated[RunConfig, _OF_COLLECT],
+    demo: Annotated[DemoConfig, Fields()],
 ) -> None:
     """Drive scenarios with an expert and write what it does and a camera sees as a LeRobot data set
     (v3.0).
@@ -135,60 +166,33 @@ def collect_command(
     Only solved episodes are kept. The same command writes the same bytes, whatever --jobs; stopped
     at any moment it goes on with --resume.
     """
-    from cosim.spec.camera import CameraSpec
-    from cosim.spec.demo_options import Collecting
-    from cosim.spec.goal import goal_called
-    from cosim.spec.options import EpisodeOptions
     from cosim.spec.policy_host import PolicyHost
     from scenarios.episodes.demonstration import check_parquet
 
     check_parquet()  # before the modules that import pyarrow
+    from cosim.spec.options import EpisodeOptions
     from scenarios.runs.policy_host import known_driver
     from scenarios.tools.dataset.collect import collect
 
-    wide, high = size_called("--camera", size)
-    spec = CameraSpec(width=wide, height=high, fov_deg=fov, mount=mount)
-    collecting = Collecting(
-        camera=spec,
-        rate_hz=rate,
-        waypoints=waypoints,
-        waypoint_s=waypoint_s,
-        noise=noise,
-        learner=learner,
-        unsolved=unsolved,
-    )
-    expert = known_driver(policy, PolicyHost(), jobs)
-    options = EpisodeOptions(
-        seed=seed,
-        robot=robot,
-        goal=goal_called(goal),
-        own_camera=own_camera,
-        camera=camera_here(renderer),
-    )
-    source = _source(
-        suite,
-        cities,
-        city_size,
-        map_name,
-        event or (),
-        scenario or (),
-        split,
-        episodes,
-        seed,
-        robot,
-    )
+    folder = config.out
+    jobs = config.jobs or 1
+    assert folder is not None
+    collecting = demo.collecting
+    expert = known_driver(config.policy, PolicyHost(), jobs)
+    options = EpisodeOptions.asked(replace(config, camera=camera_here(config.camera)))
+    source = _source(config, demo)
     began_s = time.monotonic()
     try:
         found = collect(
             source,
             expert,
-            policy,
+            config.policy,
             folder,
             collecting=collecting,
             options=options,
-            episodes=episodes,
+            episodes=config.episodes,
             jobs=jobs,
-            resume=resume,
+            resume=config.resume,
             showing=_shown,
             progress=stages_in_lines(),
         )
@@ -199,13 +203,16 @@ def collect_command(
             soft_wrap=True,
         )
         raise typer.Exit(INTERRUPTED) from None
-    out.print(
-        f"Data set: {folder} ({found.kept} episodes, {found.rows} pictures, {_size_mb(folder):.1f} "
-        f"MB), of {found.run} driven in {time.monotonic() - began_s:.0f} s",
-        soft_wrap=True,
-        highlight=False,
-        markup=False,
-    )
+    _tell_of_end(found, folder, time.monotonic() - began_s)
+    if config.episodes is not None and found.kept < config.episodes:
+        err.print(f"There are no more: {config.episodes} were asked for.", highlight=False)
+
+
+def _tell_of_end(found: Gathered, folder: Path, took_s: float) -> None:
+    """Print what was collected, what was dropped, and what reading it back showed."""
+    kept = f"{found.kept} episodes, {found.rows} pictures, {_size_mb(folder):.1f} MB"
+    words = f"Data set: {folder} ({kept}), of {found.run} driven in {took_s:.0f} s"
+    out.print(words, soft_wrap=True, highlight=False, markup=False)
     if found.dropped:
         reasons = "; ".join(f"{words}: {count}" for words, count in found.dropped.most_common())
         out.print(
@@ -215,70 +222,53 @@ def collect_command(
         )
     if found.spare:
         out.print(f"{found.spare} more were solved than asked for, and left out", highlight=False)
-    if found.back is None:
+    if (back := found.back) is None:
         err.print("The data set was whole already: nothing is written.")
-    else:
-        back = found.back
-        out.print(
-            f"Read back: {back.rows} rows and pictures; a picture differs from what was "
-            f"drawn for its row by "
-            f"{back.off:.1f} of 255, from what was drawn for the next row by {back.off_next:.1f}",
-            soft_wrap=True,
-            highlight=False,
-        )
-    if episodes is not None and found.kept < episodes:
-        err.print(f"There are no more: {episodes} were asked for.", highlight=False)
+        return
+    words = (
+        f"Read back: {back.rows} rows and pictures; a picture differs from what was drawn for its "
+        f"row by {back.off:.1f} of 255, from what was drawn for the next row by {back.off_next:.1f}"
+    )
+    out.print(words, soft_wrap=True, highlight=False)
 
 
-def _source(
-    suite: str,
-    cities: str,
-    city_size: float,
-    map_name: str | None,
-    event: Sequence[str],
-    scenario: Sequence[str],
-    split: str | None,
-    episodes: int | None,
-    seed: int,
-    robot: str,
-) -> Suite | Fresh:
+def _source(config: RunConfig, demo: DemoConfig) -> Suite | Fresh:
     """What is driven. Raises UsageError."""
     import msgspec
 
     from cosim.spec.robot import COURIER, robot_called
-    from cosim.spec.scenario import Split
+    from cosim.spec.scenario import split_called
     from cosim.spec.selection import scenarios_chosen
     from scenarios.suites.catalog import load_suite, with_robot
     from scenarios.suites.new_scenarios import fresh, fresh_cities
 
-    options = {"--cities": cities, "--map": map_name, "--scenario": scenario, "--split": split}
+    options = {
+        "--cities": demo.cities,
+        "--map": config.map,
+        "--scenario": config.scenario,
+        "--split": config.split,
+    }
     told = [name for name, asked in options.items() if asked]
-    if len(told) > 1 and (cities or map_name):
+    if len(told) > 1 and (demo.cities or config.map):
         raise UsageError(
             f"{' and '.join(told)} do not go together: scenarios are drawn in places, or are "
             f"a suite's"
         )
-    if cities:
-        return fresh(suite, fresh_cities(cities), event, city_size)
-    if map_name is not None:
+    if demo.cities:
+        return fresh(config.suite, fresh_cities(demo.cities), config.event, demo.city_size)
+    if config.map is not None:
         from scenarios.suites.sample import suite_on_map
 
-        with doing(f"drawing routes on {map_name}"):
+        robot = robot_called(config.robot or COURIER.name)
+        with doing(f"drawing routes on {config.map}"):
+            seed = config.seed or 0
             return suite_on_map(
-                suite,
-                map_name,
-                seed,
-                episodes,
-                0.0,
-                event,
-                robot=robot_called(robot or COURIER.name),
+                config.suite, config.map, seed, config.episodes, 0.0, config.event, robot=robot
             )
-    if split not in (None, *get_args(Split)):
-        raise unknown("split", str(split), get_args(Split))
-    whole = with_robot(load_suite(suite), robot)
-    return msgspec.structs.replace(
-        whole, scenarios=scenarios_chosen(whole, scenario, None, event, split)
-    )
+    split = split_called(config.split)
+    whole = with_robot(load_suite(config.suite), config.robot)
+    chosen = scenarios_chosen(whole, config.scenario, None, config.event, split)
+    return msgspec.structs.replace(whole, scenarios=chosen)
 
 
 @contextmanager

@@ -18,23 +18,16 @@ from rich.console import Console
 
 from cosim.core.errors import BROKEN_MACHINE, UNREAD, unknown, unwritable
 from cosim.core.log_event import JOURNAL
+from cosim.spec.run_config import help_of
 
 out = Console(emoji=False)
 err = Console(stderr=True, emoji=False)
 
 
 _LEVELS = ("debug", "info", "warning", "error")
-LogLevel = Annotated[
-    str,
-    typer.Option(
-        "--log-level", metavar="LEVEL", help="Log on standard error: debug, info, warning or error."
-    ),
-]
+LogLevel = Annotated[str, typer.Option("--log-level", metavar="LEVEL", help=help_of("log_level"))]
 LogJson = Annotated[
-    Path | None,
-    typer.Option(
-        "--log-json", metavar="FILE", help="Append the log to this file, a line of JSON each."
-    ),
+    Path | None, typer.Option("--log-json", metavar="FILE", help=help_of("log_json"))
 ]
 
 

@@ -14,18 +14,7 @@ import typer
 
 from cosim.cli import tables
 from cosim.cli.console import err, out
-from cosim.cli.options import (
-    DEFAULT,
-    DIRECTOR,
-    MANY,
-    POLICIES_AT,
-    STEP_IN,
-    Insecure,
-    Tls,
-    connecting,
-    listening,
-    warned,
-)
+from cosim.cli.options import DEFAULT, DIRECTOR, MANY, POLICIES_AT, STEP_IN, Insecure, Tls, warned
 from cosim.cli.progress import doing
 from cosim.core.errors import (
     INTERRUPTED,
@@ -36,7 +25,7 @@ from cosim.core.errors import (
     UsageError,
     unknown,
 )
-from cosim.spec.connection import Connection, Role
+from cosim.spec.connection import Connection, Role, connecting, listening
 
 if TYPE_CHECKING:
     from bridge.session import Session
@@ -384,7 +373,7 @@ def serve_command(
     from cosim.episode.interfaces import Policy
     from cosim.episode.policy_caller import Untimed
     from cosim.policies.load import load_policy
-    from scenarios.runs.observation_codec import seen_from_afar
+    from scenarios.ipc.observation_codec import ObservationDecoder
 
     first = load_policy(policy)
     if first.manifest.privileged:
@@ -410,7 +399,7 @@ def serve_command(
             jpeg=jpeg,
             told=first.manifest,
             source=first.source_hash,
-            observe=seen_from_afar,
+            decoder=ObservationDecoder,
             session=session.itself,
         )
     raise typer.Exit(INTERRUPTED)

@@ -9,21 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cosim.cli.console import out
-from cosim.cli.options import (
-    CAMERA_HELP,
-    CHILDREN_HELP,
-    ELDERLY_HELP,
-    GROUPS_HELP,
-    LOOK,
-    RESIDENTS_HELP,
-    ROBOT_HELP,
-    Choice,
-    camera_here,
-    check_output,
-    replaced,
-)
+from cosim.cli.options import LOOK, Camera, camera_here, check_output, replaced
 from cosim.cli.progress import doing
 from cosim.core.errors import MachineError, UsageError, listed, unknown
+from cosim.spec.run_config import help_of
 
 if TYPE_CHECKING:
     from scenarios.tools.viewing.look import Viewpoint
@@ -123,7 +112,7 @@ def film(
         str, typer.Option(help="follow (from behind), above, or robot: what it sees.")
     ] = "follow",
     speed: Annotated[int, typer.Option(min=1, max=32, help="Times real time.")] = 1,
-    camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
+    camera: Camera = "auto",
 ) -> None:
     """Film an episode of a run: from behind the robot or above it, with what it sees, the map,
     events and failures."""
@@ -161,7 +150,7 @@ def _episodes(folder: Path) -> str:
     """List the finished episodes of a run."""
     from cosim.results.run_folder import read_records
 
-    return listed("", [record.scenario for record in read_records(folder)])
+    return listed("", [record.scenario.id for record in read_records(folder)])
 
 
 look_app = typer.Typer()
@@ -197,15 +186,15 @@ def look(
         ),
     ] = None,
     policy: Annotated[str, typer.Option(help="Who drives until then.")] = "route",
-    robot: Annotated[str, typer.Option(help=ROBOT_HELP)] = "",
-    residents: Annotated[int | None, typer.Option(min=0, help=RESIDENTS_HELP)] = None,
-    groups: Annotated[float | None, typer.Option(help=GROUPS_HELP)] = None,
-    elderly: Annotated[float | None, typer.Option(help=ELDERLY_HELP)] = None,
-    children: Annotated[float | None, typer.Option(help=CHILDREN_HELP)] = None,
+    robot: Annotated[str, typer.Option(help=help_of("robot"))] = "",
+    residents: Annotated[int | None, typer.Option(min=0, help=help_of("residents"))] = None,
+    groups: Annotated[float | None, typer.Option(help=help_of("groups"))] = None,
+    elderly: Annotated[float | None, typer.Option(help=help_of("elderly"))] = None,
+    children: Annotated[float | None, typer.Option(help=help_of("children"))] = None,
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Where to write the picture.")
     ] = Path("look.png"),
-    camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
+    camera: Camera = "auto",
 ) -> None:
     """Look at a scenario: one picture of what the robot sees, or of the robot in its street."""
     from scenarios.suites.catalog import one_scenario, with_crowd, with_robot

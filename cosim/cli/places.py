@@ -313,11 +313,14 @@ def report_map_check(
         capacity = _capacity(street_map, found)
         if picture is not None:
             from cosim.report.mapsheet import draw_map, write_png
+            from cosim.spec.scenario import CityMap
+            from sumo_nets.maps.map_store import credit_of
 
             if part is not None:
                 refuse_outside("--zoom", part, street_map.bounds)
             progress("drawing")
-            write_png(draw_map(street_map, found, part), picture)
+            credit = "" if about is None else credit_of(CityMap(map=about.name))
+            write_png(draw_map(street_map, found, part, credit), picture)
     if as_json:
         report = {
             "usable": not _refusals(found, capacity),

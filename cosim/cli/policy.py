@@ -11,18 +11,10 @@ from rich.text import Text
 
 from cosim.cli import tables
 from cosim.cli.console import out
-from cosim.cli.options import (
-    CAMERA_HELP,
-    Choice,
-    Insecure,
-    Tls,
-    camera_here,
-    check_output,
-    ends_of_run,
-    replaced,
-)
+from cosim.cli.options import Camera, Insecure, Tls, camera_here, check_output, replaced
 from cosim.cli.progress import doing
 from cosim.core.errors import SOME_CRASHED, unknown
+from cosim.spec.run_config import ends_of_run
 
 if TYPE_CHECKING:
     from scenarios.tools.policy_check.checks import CheckedPolicy
@@ -60,7 +52,7 @@ def check_policy(
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="What came out, as JSON.")] = False,
-    camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
+    camera: Camera = "auto",
     own_camera: Annotated[bool, typer.Option("--own-camera", help=_OWN_CAMERA_HELP)] = False,
     policy_at: Annotated[
         list[str] | None, typer.Option(metavar="ENDPOINT", help=_POLICY_AT_HELP)
@@ -92,7 +84,7 @@ def check_policy(
         if check not in POLICY_CHECKS:
             raise unknown("check", check, POLICY_CHECKS)
     asked_goal = goal_called(goal) if goal else None
-    _, _, servers = ends_of_run(None, None, policy_at or (), tls, insecure)
+    servers = ends_of_run(None, None, policy_at or (), tls, insecure).servers
     driver = policy_driver(name, PolicyHost(servers=servers, run=token_hex(8)))
     try:
         manifest = with_goal(driver.manifest, asked_goal)

@@ -11,12 +11,11 @@ from rich.console import Console
 from cosim.cli import tables
 from cosim.cli.console import err, out
 from cosim.cli.options import (
-    CAMERA_HELP,
     LOOK,
     MANY,
     RERUN_HELP,
     TRUST,
-    Choice,
+    Camera,
     camera_here,
     check_output,
     replaced,
@@ -136,7 +135,7 @@ def report(
         ),
     ] = 150.0,
     jobs: Annotated[int, typer.Option(min=1, help="Processes that show them again.")] = 2,
-    camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
+    camera: Camera = "auto",
 ) -> None:
     """Write one HTML file about runs: tables beside the paper's, plots, maps of failures, failures
     to play again.
@@ -159,7 +158,8 @@ def report(
             within_s=within,
             progress=progress,
         )
-    size = f"{made.size_bytes / 1e6:.1f} MB, {made.shown} of {made.failures} failures"
+    limit = f": {made.limit}" if made.limit else ""
+    size = f"{made.size_bytes / 1e6:.1f} MB, {made.shown} of {made.failures} failures{limit}"
     out.print(f"Report: {output} ({size}){instead}", soft_wrap=True, highlight=False)
 
 
@@ -174,8 +174,8 @@ def score(folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run fold
     No engine is started. Exit code 1, and the first difference, where it is not.
     """
     from cosim.results.metrics import METRICS
-    from cosim.results.record import METRIC_SCHEMA
     from cosim.results.rescore import score_run
+    from cosim.results.run_setup import METRIC_SCHEMA
 
     with doing(f"reading {folder}") as progress:
         scored = score_run(folder, progress)
@@ -241,7 +241,7 @@ def show(
     from cosim.results.table import table_of
 
     spec = read_spec(folder)
-    records = {record.scenario: record for record in read_records(folder)}
+    records = {record.scenario.id: record for record in read_records(folder)}
     if rerun is not None:
         write_rerun(folder, [] if episode is None else [episode], rerun)
         return
@@ -284,14 +284,14 @@ def print_episode(out: Console, record: Record) -> None:
     from cosim.results.metrics import COUNTERFACTUAL, METRICS
 
     out.print(
-        f"{record.scenario}: {record.status} {record.ended or ''} {record.reason}",
+        f"{record.scenario.id}: {record.status} {record.ended or ''} {record.reason}",
         soft_wrap=True,
         markup=False,
     )
-    if record.latency_ms or record.real_time:
+    if record.setup.latency_ms or record.setup.real_time:
         real = (
             ", a median in whole ticks of 50 ms: replayed, never made again"
-            if record.real_time
+            if record.setup.real_time
             else ""
         )
         took = (
@@ -300,7 +300,8 @@ def print_episode(out: Console, record: Record) -> None:
             else f"an answer took {milliseconds(record.answer_ms)} (median); "
         )
         out.print(
-            f"  {took}commands took effect {record.latency_ms:g} ms after what they answer{real}",
+            f"  {took}commands took effect {record.setup.latency_ms:g} ms after what they "
+            f"answer{real}",
             soft_wrap=True,
         )
     for failure in record.failures:
@@ -408,7 +409,7 @@ def merge(
         err.print(
             f"{len(merged.missing)} scenarios are missing: {', '.join(merged.missing)}: give "
             f"the command of the run "
-            f"without --shard, with --seed {merged.spec.seed} --out {target} --resume",
+            f"without --shard, with --seed {merged.spec.setup.seed} --out {target} --resume",
             soft_wrap=True,
             markup=False,
             highlight=False,

@@ -1,21 +1,29 @@
-"""The progress display of a run: how far it is, and about how long the rest takes."""
+"""A run whose notices, stages and episodes are shown on standard error."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from math import fsum
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
 from cosim.cli.console import err
+from cosim.cli.progress import doing
+from cosim.core.progress import Progress as Stages
 from cosim.core.progress import time_left_s
 from cosim.core.units import duration
 
 if TYPE_CHECKING:
     from cosim.spec.scenario import Scenario
+    from scenarios.ipc.messages import MessageHandler
+    from scenarios.runs.planning import PlannedRun
+    from scenarios.runs.transport import HeldRun
+
 
 SETUP_M = 30.0
 """Starting an episode takes about as long as so many metres of its route."""
@@ -147,3 +155,34 @@ class Board:
         end."""
         rest_s = self.left.seconds(self._clock() - self._began_s)
         return "" if rest_s is None or rest_s < 0.5 else f"about {duration(rest_s)} left"
+
+
+def notice(words: str) -> None:
+    """Print a notice in a line on standard error."""
+    err.print(words, soft_wrap=True, markup=False, highlight=False)
+
+
+class EpisodeBars:
+    """Shows notices, stages and the progress of episodes (`scenarios.runs.run.Reporter`)."""
+
+    def say(self, words: str) -> None:
+        """Print a notice."""
+        notice(words)
+
+    def stage(self, words: str) -> AbstractContextManager[Stages]:
+        """Show a stage that takes its time."""
+        return doing(words)
+
+    def planned(self, plan: PlannedRun) -> None:
+        """Check nothing more."""
+
+    def opening(self, plan: PlannedRun, folder: Path) -> AbstractContextManager[None]:
+        """Keep no log."""
+        return nullcontext()
+
+    @contextmanager
+    def running(self, plan: PlannedRun, run: HeldRun) -> Iterator[MessageHandler]:
+        """Show how far each episode is."""
+        board = Board(plan.picked, {one.id for one in plan.picked} - {one.id for one in run.todo})
+        with board.bars:
+            yield board.tell

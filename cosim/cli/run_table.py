@@ -13,7 +13,13 @@ from cosim.cli import tables
 from cosim.core.units import milliseconds
 from cosim.results.log import holds_waypoints
 from cosim.results.metrics import COUNTERFACTUAL, SUCCESS_IN_WORDS
-from cosim.results.table import not_to_be_quoted, policy_in_words, summary_of
+from cosim.results.table import (
+    INJECTED,
+    injections_in_words,
+    not_to_be_quoted,
+    policy_in_words,
+    summary_of,
+)
 from cosim.spec.scenario import Scenario, read_suite
 
 
@@ -92,7 +98,7 @@ def print_table(
     for _, row in table.iterrows():
         counts = "/".join("-" if pd.isna(row[name]) else f"{row[name]:.0f}" for name, _ in COUNTS)
         ended = row["ended"] if row["status"] == "done" else row["status"]
-        name = row["scenario"] + "*" * bool(row.get("nonstandard"))
+        name = row["scenario"] + "*" * bool(row.get("nonstandard")) + "+" * bool(row.get(INJECTED))
         rows.append((name, ended, *(value_in_words(row[name]) for name, _ in SHOWN), counts))
     columns = [*tables.names("episode"), *tables.labels("ended"), *tables.figures(*heads)]
     tables.show(out, columns, rows)
@@ -183,6 +189,8 @@ def print_terms(out: Console, table: pd.DataFrame, folder: Path | None = None) -
         out.print("; ".join(told), highlight=False, markup=False)
         if odd:
             out.print(f"* nonstandard, not to be compared: {odd}", highlight=False, markup=False)
+    if words := injections_in_words(table):
+        out.print(f"+ {words}", soft_wrap=True, highlight=False, markup=False)
     if words := _latency_in_words(table):
         out.print(words, highlight=False, markup=False)
 

@@ -4,30 +4,18 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import msgspec
 import typer
 
 from cosim.cli import tables
 from cosim.cli.console import err, out
-from cosim.cli.options import (
-    CAMERA_HELP,
-    LATENCY_HELP,
-    REAL_TIME_HELP,
-    RERUN_HELP,
-    Choice,
-    asked_latency_ms,
-    camera_here,
-    check_rerun,
-    replaced,
-    with_latency,
-    write_rerun,
-)
+from cosim.cli.generated_options import Fields, configured
+from cosim.cli.options import camera_here, check_rerun, replaced, write_rerun
 from cosim.cli.progress import doing
-from cosim.cli.run_progress import Board
 from cosim.core.bounding_box import box_of, refuse_outside
 from cosim.core.errors import (
     INTERRUPTED,
@@ -40,6 +28,7 @@ from cosim.core.errors import (
     unwritable,
 )
 from cosim.core.files import write_atomic
+from cosim.spec.run_config import MEASURED, RunConfig
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -56,6 +45,27 @@ scenario_app = typer.Typer(
 _MOVED_M = 0.5
 """What was moved farther than this is told."""
 _FILE_HELP = "A TOML file: `cosim scenario new` writes one."
+_OF_OWN_RUN = Fields(
+    only=(
+        "policy",
+        "jobs",
+        "out",
+        "resume",
+        "seed",
+        "frames",
+        "camera",
+        "latency",
+        "real_time",
+        "rerun",
+    ),
+    help={
+        "policy": "A baseline, or your own as my.py:Class.",
+        "jobs": "Environment processes.",
+        "out": "Run folder; default runs/NAME-POLICY-TIME.",
+        "seed": "Of the run: policies' own seeds are drawn from it.",
+    },
+)
+"""The options of `cosim scenario run`."""
 
 
 @scenario_app.command("new", epilog="Example:  \n`cosim scenario new mine.toml`")
@@ -168,6 +178,7 @@ def draw_own(
     from scenarios.places.nets import place
     from scenarios.suites.user_scenarios.build import made_one, place_of_own
     from scenarios.suites.user_scenarios.read import read_own
+    from sumo_nets.maps.map_store import credit_of
 
     part = None if zoom is None else box_of("--zoom", zoom)
     own = read_own(file)
@@ -183,12 +194,12 @@ def draw_own(
             raise SpecError(
                 f"{file}: {faults}\n  --whole draws the place alone, to find a way on it"
             )
-        _, street_map = place(
-            place_of_own(variant.own.place) if made.scenario is None else made.scenario.place
-        )
+        where = place_of_own(variant.own.place) if made.scenario is None else made.scenario.place
+        _, street_map = place(where)
         if part is not None:
             refuse_outside("--zoom", part, street_map.bounds)
-        write_png(draw_plan(street_map, made.scenario, whole=whole, part=part), picture)
+        plan = draw_plan(street_map, made.scenario, whole=whole, part=part, credit=credit_of(where))
+        write_png(plan, picture)
     for fault in made.faults:
         err.print(f"{file}: {fault}", soft_wrap=True, markup=False, highlight=False)
     out.print(f"Picture: {picture}{instead}", soft_wrap=True)
@@ -203,24 +214,10 @@ def draw_own(
     "`cosim scenario run sweep.toml --policy social_force --out runs/sweep --resume`  \n"
     "`cosim scenario run mine.toml --policy my.py:Mine --real-time --rerun mine.rrd`",
 )
+@configured
 def run_own(
     file: Annotated[Path, typer.Argument(help=_FILE_HELP)],
-    policy: Annotated[str, typer.Option(help="A baseline, or your own as my.py:Class.")] = "route",
-    jobs: Annotated[int, typer.Option(min=1, help="Environment processes.")] = 1,
-    folder: Annotated[
-        Path | None, typer.Option("--out", help="Run folder; default runs/NAME-POLICY-TIME.")
-    ] = None,
-    resume: Annotated[bool, typer.Option("--resume", help="Finish the run in --out.")] = False,
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Of the run: policies' own seeds are drawn from it.")
-    ] = None,
-    frames: Annotated[
-        float, typer.Option(min=0.0, help="Keep a camera frame every so many seconds.")
-    ] = 0.0,
-    camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
-    latency: Annotated[str, typer.Option(metavar="MS", help=LATENCY_HELP)] = "",
-    real_time: Annotated[bool, typer.Option("--real-time", help=REAL_TIME_HELP)] = False,
-    rerun: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help=RERUN_HELP)] = None,
+    config: Annotated[RunConfig, _OF_OWN_RUN],
 ) -> None:
     """Run what a file makes, into an ordinary run folder; of a sweep print a table by its values,
     and draw it.
@@ -228,70 +225,63 @@ def run_own(
     All other options of runs go with `cosim run FILE.toml`.
     """
     from cosim.policies.load import load_policy
-    from cosim.results.run_folder import read_records, read_spec
-    from cosim.spec.options import EpisodeOptions
-    from scenarios.runs.run import run, seed_of_run
+    from cosim.results.run_folder import refuse_used
     from scenarios.suites.user_scenarios.check import checked_own
     from scenarios.suites.user_scenarios.read import read_own
 
-    if resume and folder is None:
-        raise UsageError("--resume needs --out: the folder of the run to finish")
     own = read_own(file)
-    check_rerun(rerun, len(own.variants))
-    asked_latency_ms(latency, real_time)
+    check_rerun(config.rerun, len(own.variants))
+    if config.out is not None and not config.resume:
+        for part in _parts(own, config.out).values():
+            refuse_used(part)
     with doing(f"checking {file}") as progress:
         suite = checked_own(own, progress)
-    manifest = load_policy(policy).manifest
+    manifest = load_policy(config.policy).manifest
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-    path = folder or Path("runs") / f"{own.name}-{manifest.name}-{stamp}"
-    by_goal: dict[GoalProtocol | None, list[str]] = {}
-    for variant in own.variants:
-        by_goal.setdefault(variant.own.goal_protocol, []).append(variant.id)
-    # A run tells its policies of the goal in one way: a sweep over these is as many runs, of one
-    # seed.
-    parts = {goal: path if len(by_goal) == 1 else path / str(goal) for goal in by_goal}
-    begun = [part for part in parts.values() if resume and (part / "run.json").exists()]
-    if resume and not begun:
-        read_spec(path)
-    run_seed = seed_of_run(seed, begun[0] if begun else None)
-    drawn_by = camera_here(camera) if manifest.camera is not None else "bullet"
-    first = own.variants[0]
-    options = EpisodeOptions(
-        seed=run_seed, goal=first.own.goal_protocol, frames_every_s=frames, camera=drawn_by
-    )
-    (driven_first,) = (one for one in suite.scenarios if one.id == first.id)
-    went_on = begun[0] if begun else None
-    options = with_latency(
-        options, latency, real_time, went_on, suite, driven_first, policy, manifest.rate_hz
-    )
+    path = config.out or Path("runs") / f"{own.name}-{manifest.name}-{stamp}"
+    if manifest.camera is not None:
+        config = replace(config, camera=camera_here(config.camera))
     _say(own)
-    tables = []
-    for goal, ids in by_goal.items():
-        part = parts[goal]
-        done = {record.scenario for record in read_records(part)} if part in begun else set()
-        board = Board([one for one in suite.scenarios if one.id in ids], done)
-        options = msgspec.structs.replace(options, goal=goal)
+    tables = _run_parts(own, suite, config, path)
+    _print_run(own, tables, path)
+    write_rerun(path, [own.variants[0].id], config.rerun)
+
+
+def _parts(own: OwnFile, path: Path) -> dict[GoalProtocol | None, Path]:
+    """The run folders of a file: one for each goal protocol, because a run has one."""
+    goals = dict.fromkeys(variant.own.goal_protocol for variant in own.variants)
+    return {goal: path if len(goals) == 1 else path / str(goal) for goal in goals}
+
+
+def _run_parts(own: OwnFile, suite: Suite, config: RunConfig, path: Path) -> list[pd.DataFrame]:
+    """Run the scenarios of a file. Its runs have one seed and one latency."""
+    from cosim.cli.run_progress import EpisodeBars
+    from cosim.results.run_folder import read_spec
+    from scenarios.runs.planning import seed_of_run
+    from scenarios.runs.run import Given, carry_out
+
+    parts = _parts(own, path)
+    begun = [part for part in parts.values() if config.resume and (part / "run.json").exists()]
+    if config.resume and not begun:
+        read_spec(path)
+    config = replace(config, seed=seed_of_run(config.seed, begun[0] if begun else None))
+    tables: list[pd.DataFrame] = []
+    for goal, part in parts.items():
+        if config.latency == MEASURED and (known := [*begun, *list(parts.values())[: len(tables)]]):
+            config = replace(config, latency=repr(read_spec(known[0]).setup.latency_ms))
+        ids = tuple(variant.id for variant in own.variants if variant.own.goal_protocol == goal)
+        of_part = replace(
+            config, suite=own.name, scenario=ids, goal=goal or "", out=part, resume=part in begun
+        )
         try:
-            with board.bars:
-                table = run(
-                    suite,
-                    policy,
-                    scenarios=ids,
-                    jobs=jobs,
-                    out=part,
-                    resume=part in begun,
-                    options=options,
-                    tell=board.tell,
-                )
+            tables.append(carry_out(of_part, given=Given(suite=suite), reporter=EpisodeBars()))
         except KeyboardInterrupt:
             err.print(
                 f"Stopped. What is finished is kept in {part}: go on with --out {path} --resume",
                 soft_wrap=True,
             )
             raise typer.Exit(INTERRUPTED) from None
-        tables.append(table)
-    _print_run(own, tables, path)
-    write_rerun(path, [first.id], rerun)
+    return tables
 
 
 def _print_run(own: OwnFile, tables: Sequence[pd.DataFrame], path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from signal import SIGINT
@@ -17,11 +18,13 @@ from rich.text import Text
 
 from cosim.cli import tables
 from cosim.cli.console import LogJson, LogLevel, err, logged, out
-from cosim.cli.options import DEFAULT, MANY, Insecure, Tls, connecting, listening, taking, warned
-from cosim.cli.run import carry_out, told_if_not_begun
+from cosim.cli.generated_options import Fields, configured
+from cosim.cli.options import DEFAULT, MANY, Insecure, Tls, warned
 from cosim.core.errors import INTERRUPTED, EngineError, RunError, UsageError
 from cosim.core.log_event import happened
 from cosim.core.units import duration
+from cosim.spec.connection import connecting, listening
+from cosim.spec.run_config import RunConfig
 
 if TYPE_CHECKING:
     from scenarios.runs.status import RunningEpisode, RunStatus
@@ -48,18 +51,21 @@ _OF_ONE_MACHINE = {
     "orca --seed 7 --shard 1/2 --out runs/1`: see `cosim merge`  \n`cosim coordinator reactive "
     "--policy my.py:Mine --listen tls/0.0.0.0:7447 --tls certs/coordinator`",
 )
-@taking(
-    carry_out,
-    without=("carrier", "jobs", "director_wait", "tls", "insecure"),
-    hidden=_OF_ONE_MACHINE,
-)
+@configured
 def coordinator_command(
+    config: Annotated[
+        RunConfig,
+        Fields(
+            without=("jobs", "on", "director_wait", "tls", "insecure"),
+            hidden=_OF_ONE_MACHINE,
+            panels=True,
+        ),
+    ],
     listen: Annotated[
         str, typer.Option(metavar="ENDPOINT", help="Where workers find it.")
     ] = DEFAULT,
     tls: Tls = "",
     insecure: Insecure = False,
-    **asked: Any,
 ) -> None:
     """Run a suite by workers that come and go (`cosim worker`): with the options of `cosim run`,
     and the same results.
@@ -68,16 +74,16 @@ def coordinator_command(
     with --resume, it goes on where it was, and so do they. `cosim status` tells how it goes.
     """
     from bridge.session import notices_of, open_session
+    from cosim.cli.run_display import run_in_terminal
     from scenarios.runs.zenoh_transport import workers_of_run
 
     for name, why in _OF_ONE_MACHINE.items():
-        if asked[name]:
+        if getattr(config, name):
             raise UsageError(
                 f"--{name.replace('_', '-')} is of one machine ({why}): leave it out, or use "
                 f"`cosim run`"
             )
-    at = asked["policy_at"] or ()
-    files = tls if any(one.startswith("tls/") for one in at) else ""
+    files = tls if any(one.startswith("tls/") for one in config.policy_at) else ""
     ours = tls if listen.startswith("tls/") or not files else ""
     connection = listening("coordinator", "--listen", listen, ours, insecure)
     notices_of(connection)
@@ -89,10 +95,11 @@ def coordinator_command(
                 f"Workers find it by: cosim worker --connect "
                 f"{listen.replace('0.0.0.0', 'THIS-MACHINE')}"
             )
-            yield partial(workers_of_run, session, resumed=bool(asked["resume"]))
+            yield partial(workers_of_run, session, resumed=config.resume)
 
-    with told_if_not_begun(asked["folder"]):
-        carry_out(**asked, tls=files, insecure=insecure and bool(at), carrier=carrier())
+    run_in_terminal(
+        replace(config, tls=files, insecure=insecure and bool(config.policy_at)), carrier()
+    )
 
 
 @coordinator_app.command(
@@ -201,7 +208,7 @@ def _asked(answers: dict[str, bytes], where: str) -> tuple[RunStatus, str]:
 def _of_folder(folder: Path) -> tuple[RunStatus, str]:
     """The status of a run, and a remark on whoever runs it. Raises UsageError when the folder holds
     no run."""
-    from cosim.results.run_folder import read_rows, read_spec, refuse_in_use
+    from cosim.results.run_folder import read_records, read_spec, refuse_in_use
     from scenarios.runs.status import STATUS_FILE, RunStatus, decode_status
 
     spec = read_spec(folder)
@@ -210,7 +217,7 @@ def _of_folder(folder: Path) -> tuple[RunStatus, str]:
         runs = False
     except RunError:
         runs = True
-    finished = len(read_rows(folder))
+    finished = len(read_records(folder))
     total = len(spec.scenarios)
     path = folder / STATUS_FILE
     if runs and path.exists():

@@ -8,22 +8,21 @@ its crash, SystemExit and KeyboardInterrupt included, and never the end of the p
 
 from __future__ import annotations
 
-import os
-import signal
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, Literal, Protocol, cast
+from typing import Any, ClassVar, Literal, Protocol
 
 from numpy.typing import NDArray
 
+from bridge.policy_server import PolicyFault, policy_call, said_by
 from cosim.core.clock import Clock
 from cosim.core.errors import PolicyError
 from cosim.core.geometry import Polyline
 from cosim.core.state import Command, RobotState, Signal, Vehicles
 from cosim.episode.control import command_of
-from cosim.episode.interfaces import BatchPolicy, Observation, Policy, Privileged
+from cosim.episode.interfaces import Observation, Policy, Privileged
 from cosim.spec.manifest import Manifest
 from cosim.spec.policy_host import PolicyRuns
 
@@ -33,8 +32,6 @@ PolicyCall = Literal["loading", "reset", "first act", "act", "on_reset", "ended"
 LOADED_WITHIN_S = 300.0
 """A policy may take so long to be loaded, for a reset and for the first answer, unless a run says
 otherwise."""
-MOST_SAID = 500
-"""Of what a policy says when it raises, so many characters are kept."""
 
 
 class Timer(Protocol):
@@ -66,6 +63,8 @@ class Driver:
 
     runs: PolicyRuns = "in-process"
     at_once = 0
+    _passes: ClassVar[tuple[type[Exception], ...]] = (PolicyError,)
+    """Errors of a call that are not wrapped as raised by the policy."""
 
     def __init__(
         self,
@@ -78,7 +77,7 @@ class Driver:
         self.manifest = replace(manifest, cameras=dict(manifest.cameras))
         self.source_hash = source_hash
         self._policy = policy
-        self._timer: Timer = Untimed() if timer is None else timer
+        self._timer = timer
         self._begun = ""
         self._answered = False
         self._route: tuple[Polyline, Polyline] | None = None
@@ -164,27 +163,18 @@ class Driver:
 
     @contextmanager
     def _asked(self, doing: PolicyCall, tick: int) -> Iterator[None]:
-        """The policy at work: timed, and whatever it raises is a PolicyError."""
-        process = os.getpid()
-        self._timer.starts(doing, tick)
+        """Time a call of the policy. Raises PolicyError for whatever it raises."""
         try:
-            yield
-        except BaseException as error:
-            if (
-                isinstance(error, KeyboardInterrupt)
-                and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
-            ):
-                # somebody pressed Ctrl-C; where that is ignored only a policy can have raised it
-                raise
-            raise PolicyError(
-                f"policy '{self.manifest.name}' {told_of(error)} ({when(doing, tick)})"
-            ) from error
-        finally:
-            if os.getpid() != process:
-                os._exit(
-                    1
-                )  # a child that the policy has forked: the episode goes on in its parent alone
-            self._timer.stops()
+            with policy_call(doing, tick, self._timer, self._passes):
+                yield
+        except (PolicyFault, PolicyError) as error:
+            fault = error if isinstance(error, PolicyFault) else PolicyFault(said_by(error))
+            during = when(doing if fault.during != "on_reset" else "on_reset", tick)
+            together = (
+                f", asked for {fault.together} episodes together" if fault.together > 1 else ""
+            )
+            words = f"policy '{self.manifest.name}' {fault.words} ({during}{together})"
+            raise PolicyError(words) from fault.__cause__ or error
 
     def _own(self, observation: Observation) -> Observation:
         """What the policy may know, as copies of its own."""
@@ -230,92 +220,8 @@ class Driver:
         )
 
 
-class BatchDriver:
-    """A `BatchPolicy` that can be asked for several episodes at once. What goes wrong with one
-    answer is that episode's crash; whatever the policy raises is the crash of all that it was asked
-    for."""
-
-    def __init__(self, driver: Driver) -> None:
-        self._driver = driver
-        self.manifest = driver.manifest
-        self._policy = cast(BatchPolicy, driver._policy)
-        self._answered: set[str] = set()
-
-    def reset(self, episode_id: str, seed: int) -> None:
-        """Tell the policy that another episode begins. Raises PolicyError for whatever it
-        raises."""
-        self._answered.discard(episode_id)
-        with self._driver._asked("reset", 0):
-            self._policy.reset(episode_id, seed)
-
-    def ended(self, episode_id: str) -> None:
-        """Tell the policy that nothing more is asked about an episode. What it raises is
-        printed."""
-        self._answered.discard(episode_id)
-        self._driver._tell_ended(episode_id)
-
-    def act_batch(self, observations: Sequence[Observation]) -> list[Command | PolicyError]:
-        """The policy's command for each observation, or what is wrong with it. The observations
-        become the policy's own."""
-        crashes = [self._told_reset(one) for one in observations]
-        asked = [one for one, crash in zip(observations, crashes, strict=True) if crash is None]
-        answers = iter(self._answers(asked) if asked else ())
-        return [next(answers) if crash is None else crash for crash in crashes]
-
-    def _told_reset(self, seen: Observation) -> PolicyError | None:
-        """Tell the policy of a reset, where there was one; its crash if it raises."""
-        try:
-            if seen.reset:
-                self._driver._tell_reset(seen.episode, seen.tick)
-        except PolicyError as error:
-            return error
-        return None
-
-    def _answers(self, observations: Sequence[Observation]) -> list[Command | PolicyError]:
-        began = all(observation.episode in self._answered for observation in observations)
-        doing: PolicyCall = "act" if began else "first act"
-        last = max(observation.tick for observation in observations)
-        try:
-            with self._driver._asked(doing, last):
-                answers = _as_many(self._policy.act_batch(tuple(observations)), len(observations))
-        except PolicyError as error:
-            told = told_of(error.__cause__ or error)
-            return [self._crash(told, doing, one, len(observations)) for one in observations]
-        self._answered |= {observation.episode for observation in observations}
-        return [
-            self._command(answer, doing, one)
-            for answer, one in zip(answers, observations, strict=True)
-        ]
-
-    def _command(
-        self, answer: object, doing: PolicyCall, seen: Observation
-    ) -> Command | PolicyError:
-        try:
-            with self._driver._asked(doing, seen.tick):
-                return command_of(answer, rule=self._driver.manifest.waypoints, robot=seen.robot)
-        except PolicyError as error:
-            return error
-
-    def _crash(self, told: str, doing: PolicyCall, seen: Observation, among: int) -> PolicyError:
-        together = f", asked for {among} episodes together" if among > 1 else ""
-        return PolicyError(
-            f"policy '{self._driver.manifest.name}' {told} ({when(doing, seen.tick)}{together})"
-        )
-
-
 def _copied(picture: NDArray[Any] | None) -> NDArray[Any] | None:
     return None if picture is None else picture.copy()
-
-
-def _as_many(answers: Sequence[object], count: int) -> list[object]:
-    """The answers of a batch. Raises PolicyError unless there is one for each observation."""
-    if not hasattr(answers, "__len__") or not hasattr(answers, "__getitem__"):
-        raise PolicyError(
-            f"answered a {type(answers).__name__}: a batch is answered with a sequence"
-        )
-    if len(answers) != count:
-        raise PolicyError(f"gave {len(answers)} answers to {count} observations")
-    return [answers[i] for i in range(count)]
 
 
 def when(doing: PolicyCall, tick: int) -> str:
@@ -323,23 +229,3 @@ def when(doing: PolicyCall, tick: int) -> str:
     if doing == "on_reset" or doing.endswith("act"):
         return f"{doing.removeprefix('first ')} at {Clock().time_s(tick):.2f} s"
     return doing
-
-
-def told_of(error: BaseException) -> str:
-    """What is said of an error that came out of a policy."""
-    said = said_by(error)
-    if isinstance(error, PolicyError):  # of this project: about its answer
-        return said
-    return f"raised {type(error).__name__}" + (f": {said}" if said else "")
-
-
-def said_by(error: BaseException) -> str:
-    """The message of an error, as text that can be stored and shown in a line or a few, however odd
-    it is."""
-    try:
-        text = str(error)
-    except BaseException:  # noqa: BLE001  even the message of an error can raise
-        return "(its message cannot be read)"
-    text = text.encode("utf-8", "replace").decode()
-    text = "".join(c if c.isprintable() or c == "\n" else "?" for c in text)
-    return text if len(text) <= MOST_SAID else f"{text[:MOST_SAID]} ... ({len(text)} characters)"

@@ -22,7 +22,7 @@ CPU_WHEEL: Final = "pip install torch --index-url https://download.pytorch.org/w
 """How PyTorch's own documentation installs the build without CUDA."""
 TO_INSTALL: Final = (
     f"{CPU_WHEEL} (0.8 GB on disk; without --index-url pip installs the build for NVIDIA GPUs, 7 "
-    "GB), then pip install 'sidewalk-cosim[train]'"
+    "GB), then pip install -e '.[train]' in the checkout"
 )
 
 

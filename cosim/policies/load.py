@@ -7,7 +7,6 @@ import hashlib
 import inspect
 import math
 import os
-import signal
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,11 +14,12 @@ from typing import Protocol, cast
 
 import msgspec
 
+from bridge.policy_server import PolicyFault, policy_call
 from cosim.core.clock import Clock
 from cosim.core.errors import SpecError, UsageError, unknown
 from cosim.episode.interfaces import Policy
 from cosim.episode.manifest_checks import with_goal
-from cosim.episode.policy_caller import LOADED_WITHIN_S, Driver, Timer, told_of
+from cosim.episode.policy_caller import LOADED_WITHIN_S, Driver, Timer
 from cosim.policies import POLICIES
 from cosim.policies.onnx.manifest import MANIFEST_FILE, read_bundle_manifest
 from cosim.policies.onnx.weights import weights_file
@@ -94,19 +94,14 @@ def load_policy(name: str, timer: Timer | None = None, start_s: float = LOADED_W
         if name == FOLLOW:
             return _by_networks(name, _follow, timer)
         raise unknown("policy", name, [*POLICIES, *bundles, FOLLOW, *OTHER_NAMES])
-    process, home = os.getpid(), Path.cwd()
-    if timer is not None:
-        timer.starts("loading", 0)
-    try:
-        policy = _made(name)
-        manifest = _checked(name, policy)
-        return Driver(policy, manifest, source_hash(policy), timer)
-    finally:
-        if os.getpid() != process:
-            os._exit(1)  # a child that the user's code has forked
-        os.chdir(home)  # the user's code may have gone elsewhere
-        if timer is not None:
-            timer.stops()
+    home = Path.cwd()
+    with policy_call("loading", timer=timer, passes=(BaseException,)):
+        try:
+            policy = _made(name)
+            manifest = _checked(name, policy)
+        finally:
+            os.chdir(home)  # the user's code may have gone elsewhere
+    return Driver(policy, manifest, source_hash(policy), timer)
 
 
 class _Networked(Policy, Protocol):
@@ -134,19 +129,15 @@ def _follow() -> _Networked:
 
 def _by_networks(name: str, make: Callable[[], _Networked], timer: Timer | None) -> Driver:
     """The policy that `make` makes. Raises UsageError for whatever is wrong with its networks."""
-    if timer is not None:
-        timer.starts("loading", 0)
     try:
-        policy = make()
-        manifest = checked_manifest(name, msgspec.to_builtins(policy.manifest))
-        digest = hashlib.blake2b(f"{source_hash(policy)}{policy.digest}".encode(), digest_size=8)
-        return Driver(policy, manifest, digest.hexdigest(), timer)
+        with policy_call("loading", timer=timer, passes=(BaseException,)):
+            policy = make()
+            manifest = checked_manifest(name, msgspec.to_builtins(policy.manifest))
     except (UsageError, SpecError) as error:
         said = str(error).removeprefix(f"policy '{name}': ")
         raise UsageError(f"policy '{name}': {said}") from error
-    finally:
-        if timer is not None:
-            timer.stops()
+    digest = hashlib.blake2b(f"{source_hash(policy)}{policy.digest}".encode(), digest_size=8)
+    return Driver(policy, manifest, digest.hexdigest(), timer)
 
 
 def source_hash(policy: Policy) -> str:
@@ -215,6 +206,7 @@ def checked_manifest(name: str, told: object) -> Manifest:
     wrong with it."""
     try:
         manifest = msgspec.convert(told, Manifest)
+        _refuse_unknown_fields(told, msgspec.to_builtins(manifest))
         with_goal(manifest, None)
         Clock.for_rate(manifest.rate_hz)
         wrong = _wrong(manifest)
@@ -230,6 +222,16 @@ def checked_manifest(name: str, told: object) -> Manifest:
     if wrong:
         raise UsageError(f"policy '{name}': its manifest's {wrong}")
     return manifest
+
+
+def _refuse_unknown_fields(told: object, known: object, place: str = "") -> None:
+    """Raise UsageError for a field of a manifest, or of its cameras, that does not exist."""
+    if not (isinstance(told, dict) and isinstance(known, dict)):
+        return
+    for name in told:
+        if name not in known:
+            raise unknown(f"field{f' of {place}' if place else ''}", str(name), known)
+        _refuse_unknown_fields(told[name], known[name], f"{place}.{name}" if place else str(name))
 
 
 def _wrong(manifest: Manifest) -> str:
@@ -274,11 +276,7 @@ def _in_words(what: str) -> Iterator[None]:
     """Whatever the user's code raises, SystemExit included, as a UsageError; Ctrl-C stays what it
     is."""
     try:
-        yield
-    except BaseException as error:
-        if (
-            isinstance(error, KeyboardInterrupt)
-            and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
-        ):
-            raise
-        raise UsageError(f"{what} {told_of(error).removeprefix('raised ')}") from error
+        with policy_call("loading"):
+            yield
+    except PolicyFault as fault:
+        raise UsageError(f"{what} {fault.words.removeprefix('raised ')}") from fault.__cause__

@@ -259,8 +259,8 @@ def _facts(scenario: Scenario, record: Record, time_s: float) -> list[tuple[str,
     """What stands below the picture: how the episode went, and what each colour means."""
     measures = record.measures
     return [
-        (record.scenario, TRACK),
-        (f"policy {record.policy}", TRACK),
+        (record.scenario.id, TRACK),
+        (f"policy {record.manifest.name}", TRACK),
         (f"{record.ended} after {time_s:.0f} s", TRACK),
         (f"RC {measures.get('route_completion') or 0.0:.2f}", TRACK),
         (f"failures {measures.get('failures') or 0.0:.0f}", TRACK),

@@ -34,9 +34,13 @@ MARKS: Final[dict[str, tuple[Rgb255, str]]] = {
 
 
 def draw_map(
-    street_map: StreetMap, check: MapCheck, part: tuple[float, float, float, float] | None = None
+    street_map: StreetMap,
+    check: MapCheck,
+    part: tuple[float, float, float, float] | None = None,
+    credit: str = "",
 ) -> Image:
-    """The picture of a map, or of the `part` x0, y0, x1, y1 (metres) of it, (H, W, 3) uint8 RGB."""
+    """Draw a map, or the `part` x0, y0, x1, y1 (metres) of it: (H, W, 3) uint8 RGB. credit: of the
+    map's data."""
     x0, y0, x1, y1 = street_map.bounds if part is None else part
     margin_m = _MARGIN_M if part is None else 0.0
     bounds = (x0 - margin_m, y0 - margin_m, x1 + margin_m, y1 + margin_m)
@@ -53,7 +57,7 @@ def draw_map(
             sheet.line(street_map.strips[problem.piece].line[:, :2], colour, 1.0)
         sheet.dot(np.array([[problem.x_m, problem.y_m]]), colour, 4.0, filled=False)
     _scale_bar(sheet, bounds)
-    return legend(sheet.image, _facts(check))
+    return legend(sheet.image, [*_facts(check), *([(credit, TRACK)] if credit else [])])
 
 
 def write_png(image: Image, path: Path) -> None:

@@ -47,9 +47,10 @@ def draw_plan(
     *,
     whole: bool = False,
     part: _Bounds | None = None,
+    credit: str = "",
 ) -> Image:
-    """The picture of a scenario, (H, W, 3) uint8 RGB; None: of the place alone. whole: of its whole
-    place; part: what lies within x0, y0, x1, y1 (metres) of it."""
+    """Draw a scenario, (H, W, 3) uint8 RGB; None: the place alone. whole: its whole place; part:
+    what lies within x0, y0, x1, y1 (metres) of it; credit: of the map's data."""
     bounds = part or _around(street_map.bounds if whole or scenario is None else _ends(scenario))
     lines = _LINES_OF_ALL if part or whole or scenario is None else _LINES
     longest_m = max(bounds[2] - bounds[0], bounds[3] - bounds[1])
@@ -61,6 +62,7 @@ def draw_plan(
             sheet.line(strip.line[:, :2], SIGNAL, 0.5)
     _grid(sheet, bounds, step_m)
     cells = [(f"{street_map.name}: x east, y north, a line every {step_m:g} m", _INK)]
+    cells += [(credit, _INK)] if credit else []
     if scenario is None:
         return legend(sheet.image, cells)
     draw_way_and_things(sheet, scenario)

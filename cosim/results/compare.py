@@ -17,7 +17,14 @@ from cosim.core.errors import RunError, UsageError
 from cosim.core.geometry import Floats
 from cosim.results.finished_run import WholeRun, read_whole_run
 from cosim.results.metrics import COUNTERFACTUAL, METRICS, POOLED, RATE_NEEDS_M
-from cosim.results.table import BOOTSTRAP, CONFIDENCE, not_to_be_quoted, table_of
+from cosim.results.table import (
+    BOOTSTRAP,
+    CONFIDENCE,
+    injections_in_words,
+    not_to_be_quoted,
+    numbers,
+    table_of,
+)
 from cosim.spec.scenario import Scenario
 
 FEWEST_CHANGED: Final = 6
@@ -242,11 +249,11 @@ def _difference(name: str, before: pd.DataFrame, after: pd.DataFrame) -> PairedD
     """Of a metric, over rows of the same scenarios. A rate has none where a policy crashed: what it
     would have done after that cannot be counted."""
     if name not in POOLED:
-        return difference_of_means(_column(before, name), _column(after, name))
+        return difference_of_means(numbers(before, name), numbers(after, name))
     if "crashed" in {*before["status"], *after["status"]}:
         return PairedDifference(math.nan, math.nan, math.nan, math.nan, 0, 0)
     counted, metres = POOLED[name]
-    one, other = ((_column(table, counted), _column(table, metres)) for table in (before, after))
+    one, other = ((numbers(table, counted), numbers(table, metres)) for table in (before, after))
     return difference_of_rates(one, other)
 
 
@@ -273,23 +280,19 @@ def flipped_between(before: ComparedRun, after: ComparedRun) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=list(FLIPPED))
 
 
-def _column(table: pd.DataFrame, name: str) -> Floats:
-    return np.asarray(pd.to_numeric(table[name], errors="coerce"), dtype=float)
-
-
 def _check_suites(one: WholeRun, other: WholeRun) -> None:
     """Raises RunError where two runs are not of the same suite, or share no scenario."""
     mine, theirs = one.spec, other.spec
-    if mine.suite_hash != theirs.suite_hash:
+    my_hash, their_hash = mine.setup.suite_hash, theirs.setup.suite_hash
+    if my_hash != their_hash:
         what = (
             "the same suite"
             if mine.suite != theirs.suite
             else "the same version of it (edited, robot, --crowd?)"
         )
         raise RunError(
-            f"{other.path} is of suite '{theirs.suite}' {theirs.suite_version} "
-            f"({theirs.suite_hash}), {one.path} of "
-            f"'{mine.suite}' {mine.suite_version} ({mine.suite_hash}): run both on {what}"
+            f"{other.path} is of suite '{theirs.suite}' {theirs.suite_version} ({their_hash}), "
+            f"{one.path} of '{mine.suite}' {mine.suite_version} ({my_hash}): run both on {what}"
         )
     if not one.records.keys() & other.records.keys():
         raise RunError(
@@ -301,7 +304,7 @@ def _check_suites(one: WholeRun, other: WholeRun) -> None:
 def _labels(runs: Sequence[WholeRun]) -> list[str]:
     """What runs are called: by their policies where these are apart, else by their folders, and
     numbers."""
-    names = [run.spec.policy_name for run in runs]
+    names = [run.spec.manifest.name for run in runs]
     if len({*names}) < len(names):
         names = [run.path.absolute().name for run in runs]
     return [
@@ -319,13 +322,15 @@ def _notes(runs: Sequence[WholeRun], told: Sequence[ComparedRun]) -> Iterator[st
             (record.nonstandard for record in run.records.values() if record.nonstandard), ""
         ):
             yield f"{one.label} is nonstandard: {odd}"
+        if words := injections_in_words(one.table):
+            yield f"{one.label}: {words}"
         crashed = sum(record.status == "crashed" for record in run.records.values())
         if crashed:
             yield (
                 f"{one.label}: {crashed} crashed, counted as the worst there is; groups with "
                 f"them have no rates"
             )
-        first = runs[0].spec
+        first = runs[0].spec.setup
         if terms := _terms_apart(told[0], one):
             yield (
                 f"No verdict of {one.label} against {told[0].label}: they drove by other terms, "
@@ -338,9 +343,9 @@ def _notes(runs: Sequence[WholeRun], told: Sequence[ComparedRun]) -> Iterator[st
                 f"{told[0].label} sees by {saw}; {one.label} by {sees}: a difference may be the "
                 f"camera's"
             )
-        if changed := [n for n, v in first.versions.items() if run.spec.versions.get(n) != v]:
+        if changed := [n for n, v in first.versions.items() if run.spec.setup.versions.get(n) != v]:
             apart = ", ".join(
-                f"{n} {first.versions[n]} and {run.spec.versions.get(n)}" for n in changed
+                f"{n} {first.versions[n]} and {run.spec.setup.versions.get(n)}" for n in changed
             )
             yield (
                 f"{told[0].label} and {one.label} ran with other versions, a difference may be "

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from cosim.core.errors import RunError
-from cosim.results.record import METRIC_SCHEMA, Record
+from cosim.results.record import Record
 from cosim.results.run_folder import (
     DATABASE,
     RUN_AGAIN,
@@ -18,6 +18,7 @@ from cosim.results.run_folder import (
     refuse_in_use,
     told_apart,
 )
+from cosim.results.run_setup import METRIC_SCHEMA
 from cosim.results.run_spec import RunSpec
 from cosim.spec.scenario import Scenario, content_hash, read_suite
 
@@ -44,7 +45,8 @@ def read_whole_run(path: Path) -> WholeRun:
     spec = read_spec(path)
     refuse_in_use(path)
     records = {
-        record.scenario: record for record in sorted(read_records(path), key=lambda r: r.scenario)
+        record.scenario.id: record
+        for record in sorted(read_records(path), key=lambda r: r.scenario.id)
     }
     if not records:
         raise RunError(
@@ -64,7 +66,7 @@ def check_records(
     `read_whole_run` does."""
     for name, record in records.items():
         _check_schema(path, record)
-        if name not in scenarios or content_hash(scenarios[name]) != record.scenario_hash:
+        if name not in scenarios or content_hash(scenarios[name]) != record.scenario.hash:
             raise RunError(
                 f"{path / 'scenarios.json'}: scenario '{name}' is not the one that was run, it was "
                 "edited since: put the file back as it was, or run it again into another --out"
@@ -75,7 +77,7 @@ def check_records(
 def check_record_file(path: Path, record: Record) -> None:
     """Raises RunError, naming file and remedy, where the record of an episode that `results.sqlite`
     has is not the one in its file, or that is gone or damaged."""
-    file = record_file(path, record.scenario)
+    file = record_file(path, record.scenario.id)
     if not file.exists():
         if record.ended is not None:
             raise RunError(f"{file}: not there: {RUN_AGAIN}")
@@ -93,10 +95,10 @@ def read_record(file: Path) -> Record:
 
 def _check_schema(path: Path, record: Record) -> None:
     """Raises RunError where measures are not by the definitions of this version."""
-    if record.metric_schema != METRIC_SCHEMA:
-        made = f"metric schema {record.metric_schema}" if record.metric_schema else _UNTOLD
+    if (schema := record.setup.metric_schema) != METRIC_SCHEMA:
+        made = f"metric schema {schema}" if schema else _UNTOLD
         raise RunError(
-            f"{path}: the measures of '{record.scenario}' are of {made}; this version has "
-            f"{METRIC_SCHEMA}, and other "
-            "definitions are not compared: run it again with this version"
+            f"{path}: the measures of '{record.scenario.id}' are of {made}; this version has "
+            f"{METRIC_SCHEMA}, and "
+            "other definitions are not compared: run it again with this version"
         )

@@ -113,7 +113,7 @@ def _read(path: Path, first: _Part | None) -> _Part:
     scenarios = {
         scenario.id: scenario for scenario in read_suite(path / "scenarios.json").scenarios
     }
-    in_table = {record.scenario: record for record in read_records(path, untouched=True)}
+    in_table = {record.scenario.id: record for record in read_records(path, untouched=True)}
     check_records(path, in_table, scenarios)
     records: dict[str, Record] = {}
     for name in spec.scenarios:
@@ -130,9 +130,9 @@ def _read(path: Path, first: _Part | None) -> _Part:
 def _not_in_table(path: Path, file: Path, scenarios: Mapping[str, Scenario]) -> Record:
     """A record that was written a moment before its run was killed."""
     record = read_record(file)
-    if record.scenario != file.parent.name:
-        raise RunError(f"{file} is of scenario '{record.scenario}': {RUN_AGAIN}")
-    check_records(path, {record.scenario: record}, scenarios)
+    if record.scenario.id != file.parent.name:
+        raise RunError(f"{file} is of scenario '{record.scenario.id}': {RUN_AGAIN}")
+    check_records(path, {record.scenario.id: record}, scenarios)
     return record
 
 

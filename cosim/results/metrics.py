@@ -48,7 +48,7 @@ class EpisodeFacts:
     @classmethod
     def of(cls, record: Record, scenario: Scenario, log: Log) -> EpisodeFacts:
         """Those of an episode that was recorded: all that a metric sees stands in its files."""
-        clock = Clock.for_rate(record.rate_hz)
+        clock = Clock.for_rate(record.manifest.rate_hz)
         return cls(
             log=log,
             failures=record.failures,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -18,29 +19,22 @@ import numpy as np
 from cosim.core.errors import RunError, SpecError
 from cosim.core.files import read_within, write_atomic
 from cosim.core.geometry import Floats
-from cosim.core.versions import versions
 from cosim.episode.camera_rules import nonstandard
 from cosim.episode.command_delay import InFlight
 from cosim.episode.step import Step
+from cosim.results.flat_file import FlatFile
 from cosim.results.log import COLUMNS, Log, Tick
 from cosim.results.referee import Failure, Verdict
+from cosim.results.run_setup import RunSetup
 from cosim.results.traffic import OnRoad
-from cosim.spec.camera import CameraSpec
 from cosim.spec.episode_id import pseudonym_of
 from cosim.spec.injection import Injected
-from cosim.spec.manifest import Manifest, WaypointRule
-from cosim.spec.odometry import OdometryKind
-from cosim.spec.policy_host import PolicyRuns
+from cosim.spec.manifest import Manifest
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario, Split, content_hash
 
 _SCHEMA = 1
 _MOST_BYTES = 256 << 20
-METRIC_SCHEMA = 3
-"""Raised whenever a definition of `cosim.results.metrics` comes or changes; other schemas are not
-compared with it."""
-NO_RENDERER = "none"
-"""The renderer of an episode whose policy has no camera."""
 
 Status = Literal["done", "crashed", "invalid"]
 Ended = Literal["goal", "stop", "timeout", "failure"]
@@ -69,24 +63,48 @@ class RedLightEntry(msgspec.Struct, frozen=True):
     crossing: str
 
 
-class Record(msgspec.Struct, frozen=True, kw_only=True):
-    """What came out of one episode. reason: why it crashed or is invalid. clock: wall times, not
-    reproducible.
+class ScenarioFacts(msgspec.Struct, frozen=True, kw_only=True):
+    """Which scenario an episode is of. hash: of all of its spec; crowd_added: its crowd is not the
+    suite's own (`CrowdSpec.added`)."""
 
-    seed: of the scenario; run_seed: of the run, from which is drawn what the policy was told that
-    it is called: episode. split, structure: of the scenario; crowd_added: its crowd is not the
-    suite's own (`CrowdSpec.added`). policy_source: hash of the file that the policy is written in
-    (`cosim.policies.load.source_hash`). policy_runs: where it ran. clock: also how long the answers
-    of one that ran elsewhere took. walked_into: contacts with people who walked into the robot
-    where it stood; no failures. waypoints: how those that it answers were followed. latency_ms: of
-    its commands, as asked for; in real_time the median of those that were measured, and another one
-    the next time: such a record is replayed, not made again. latency_ms is counted in whole ticks;
-    what the policy took for an answer is `answer_ms`. metric_schema: METRIC_SCHEMA of the version
-    that made the measures, 0 where that did not say. injections: pedestrians that came in from
-    outside; with them the episode can be replayed. crashed: its policy crashed, which counts as a
-    failure. invalid: what the simulator owes, counted apart: it came to its end without a failure,
-    and its event had not happened or could not be seen; or an engine failed, twice. ended: absent
-    if it did not come to its end: then there is no trajectory.
+    id: str
+    hash: str
+    suite: str
+    seed: int
+    split: Split = "val"
+    structure: str = ""
+    crowd_added: bool = False
+    robot: str
+
+    @classmethod
+    def of(cls, scenario: Scenario) -> ScenarioFacts:
+        return cls(
+            id=scenario.id,
+            hash=content_hash(scenario),
+            suite=scenario.suite,
+            seed=scenario.seed,
+            split=scenario.split,
+            structure=scenario.structure,
+            crowd_added=scenario.crowd.added,
+            robot=scenario.robot,
+        )
+
+
+class Record(msgspec.Struct, frozen=True, kw_only=True):
+    """What came out of one episode: of which scenario, how the run was set up, what its policy says
+    of itself, and the outcome. In record.json and results.csv all of it is flat; a field that is
+    added is written to both.
+
+    episode: what the policy was told that the episode is called, drawn from the seed of the run.
+    manifest: with the goals of the run; without `goals`, which are not recorded. nonstandard: what
+    of its cameras no mount of the robot allows, in words. reason: why it crashed or is invalid.
+    clock: wall times, not reproducible; also how long the answers took of a policy that ran
+    elsewhere. walked_into: contacts with people who walked into the robot where it stood; no
+    failures. injections: pedestrians that came in from outside; with them the episode can be
+    replayed. status: crashed: its policy crashed, which counts as a failure. invalid: what the
+    simulator owes, counted apart: it came to its end without a failure, and its event had not
+    happened or could not be seen; or an engine failed, twice. ended: absent if it did not come to
+    its end: then there is no trajectory.
 
     `Record.load` reads the record.json of a run folder and raises RunError naming the file and the
     field.
@@ -96,33 +114,11 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     cosim.core.errors.RunError: runs/mine/episodes/lh-011-00/record.json: ...
     """
 
-    scenario: str
-    scenario_hash: str
-    suite: str
-    suite_hash: str
-    seed: int
-    split: Split = "val"
-    structure: str = ""
-    crowd_added: bool = False
-    run_seed: int = 0
+    scenario: ScenarioFacts
+    setup: RunSetup
+    manifest: Manifest
     episode: str = ""
-    robot: str
-    policy: str
-    policy_version: str
-    policy_source: str = ""
-    policy_runs: PolicyRuns = "in-process"
-    waypoints: WaypointRule = WaypointRule()
-    camera: CameraSpec | None = None
-    cameras: dict[str, CameraSpec] = {}
-    rate_hz: float = 4.0
     nonstandard: str = ""
-    goal_protocol: str
-    odometry: OdometryKind = "none"
-    privileged: bool = False
-    latency_ms: float = 0.0
-    real_time: bool = False
-    renderer: str
-    versions: dict[str, str]
     status: Status
     reason: str = ""
     ended: Ended | None = None
@@ -134,15 +130,27 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     red_light_entries: tuple[RedLightEntry, ...] = ()
     events: tuple[TriggeredEvent, ...] = ()
     injections: tuple[Injected, ...] = ()
-    metric_schema: int = 0
     schema: int = _SCHEMA
     clock: dict[str, float] = {}
+
+    @classmethod
+    def begun(cls, scenario: Scenario, manifest: Manifest, setup: RunSetup) -> Record:
+        """The record of an episode of which nothing is known yet but what is run: crashed, until it
+        is done."""
+        return cls(
+            scenario=ScenarioFacts.of(scenario),
+            setup=setup,
+            manifest=replace(manifest, cameras=dict(manifest.cameras), goals=()),
+            episode=pseudonym_of(setup.seed, scenario).episode,
+            nonstandard=nonstandard(manifest, robot_called(scenario.robot)),
+            status="crashed",
+        )
 
     @property
     def answer_ms(self) -> float | None:
         """In real time the median of what the policy took for an answer, as it was measured; else
         None."""
-        return self.clock.get("answer_ms") if self.real_time else None
+        return self.clock.get("answer_ms") if self.setup.real_time else None
 
     def save(self, path: Path) -> None:
         """Write as JSON, whole or not at all."""
@@ -150,7 +158,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
     def encoded(self) -> bytes:
         """The JSON that is the file."""
-        return msgspec.json.format(msgspec.json.encode(self), indent=1) + b"\n"
+        return RECORD_FILE.in_lines(self)
 
     @classmethod
     def load(cls, path: Path) -> Record:
@@ -167,7 +175,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     def decoded(cls, data: bytes, where: Path) -> Record:
         """The record in a file's bytes. where: what an error names. Raises RunError."""
         try:
-            record = msgspec.json.decode(data, type=cls)
+            record = RECORD_FILE.decode(data)
         except (msgspec.DecodeError, RecursionError, SpecError) as error:
             raise RunError(f"{where}: not an episode record: {error}") from error
         if record.schema != _SCHEMA:
@@ -175,49 +183,21 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
         return record
 
 
-def begun(
-    scenario: Scenario,
-    manifest: Manifest,
-    suite_hash: str,
-    policy_source: str = "",
-    run_seed: int = 0,
-    latency_ms: float = 0.0,
-    real_time: bool = False,
-    policy_runs: PolicyRuns = "in-process",
-) -> Record:
-    """The record of an episode about which nothing is known yet but what is run: crashed, until it
-    is done."""
-    return Record(
-        scenario=scenario.id,
-        scenario_hash=content_hash(scenario),
-        suite=scenario.suite,
-        suite_hash=suite_hash,
-        seed=scenario.seed,
-        split=scenario.split,
-        structure=scenario.structure,
-        crowd_added=scenario.crowd.added,
-        run_seed=run_seed,
-        episode=pseudonym_of(run_seed, scenario).episode,
-        robot=scenario.robot,
-        policy=manifest.name,
-        policy_version=manifest.version,
-        policy_source=policy_source,
-        policy_runs=policy_runs,
-        waypoints=manifest.waypoints,
-        camera=manifest.camera,
-        cameras=dict(manifest.cameras),
-        rate_hz=manifest.rate_hz,
-        nonstandard=nonstandard(manifest, robot_called(scenario.robot)),
-        goal_protocol=manifest.goal,
-        odometry=manifest.odometry,
-        privileged=manifest.privileged,
-        latency_ms=latency_ms,
-        real_time=real_time,
-        renderer=NO_RENDERER,
-        versions=versions(),
-        status="crashed",
-        metric_schema=METRIC_SCHEMA,
-    )
+RECORD_FILE = FlatFile(
+    Record,
+    {"scenario": ScenarioFacts, "setup": RunSetup, "manifest": Manifest},
+    """
+    scenario=scenario.id scenario_hash=scenario.hash suite suite_hash seed=scenario.seed
+    split structure crowd_added run_seed=setup.seed episode robot policy=manifest.name
+    policy_version=manifest.version policy_source policy_runs waypoints camera cameras rate_hz
+    nonstandard goal_protocol=manifest.goal odometry privileged latency_ms real_time renderer
+    versions status reason ended ticks state_hash measures failures walked_into
+    red_light_entries events injections metric_schema schema clock
+    """,
+    without="manifest.goals",
+    defaults={"camera": None},
+)
+"""The layout of record.json, which is older than the parts of a `Record`."""
 
 
 class StateHash:

@@ -42,10 +42,10 @@ def contradictions(record: Record, scenario: Scenario, log: Log) -> Iterator[Con
     if record.ticks != len(log):
         yield Contradiction("ticks", record.ticks, len(log))
         return
-    if record.real_time and record.latency_ms != (
+    if record.setup.real_time and record.setup.latency_ms != (
         latency_ms := median_ms(log.answers, Clock().tick_ms)
     ):
-        yield Contradiction("latency_ms", record.latency_ms, latency_ms)
+        yield Contradiction("latency_ms", record.setup.latency_ms, latency_ms)
     yield from _failures_as_driven(record, log)
     yield from _resets(record, scenario, log)
     yield from _red_entries(record, scenario, log)

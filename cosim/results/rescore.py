@@ -2,16 +2,15 @@
 the run recorded.
 
 No engine is started. Of an episode its record, its scenario and its trajectory are read; where what
-follows from these is not, to the last bit, what stands in record.json, results.sqlite and
-results.csv, it is told.
+follows from these is not, to the last bit, what record.json, results.sqlite and results.csv hold,
+it is told.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-import json
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -25,8 +24,8 @@ from cosim.results.log import Log
 from cosim.results.metrics import COUNTERFACTUAL, METRICS, EpisodeFacts, every_metric
 from cosim.results.record import Record
 from cosim.results.rejudge import contradictions
-from cosim.results.run_folder import DATABASE, RUN_AGAIN, TRAJECTORY, read_rows, record_file
-from cosim.results.table import table_of, table_row
+from cosim.results.run_folder import RUN_AGAIN, TRAJECTORY, record_file
+from cosim.results.table import table_of
 from cosim.spec.scenario import Scenario
 
 _TABLE = "results.csv"
@@ -66,7 +65,6 @@ def score_run(path: Path, progress: Progress = ignore) -> Scored:
         again, differences = _scored(run, run.scenarios[name], record)
         computed.append(again)
         found += differences
-    found += _rows_that_differ(path, computed)
     has_table = len(computed) == len(run.spec.scenarios) and (path / _TABLE).exists()
     if has_table:
         found += _cells_that_differ(path / _TABLE, computed)
@@ -80,18 +78,16 @@ def score_run(path: Path, progress: Progress = ignore) -> Scored:
 def _scored(run: WholeRun, scenario: Scenario, record: Record) -> tuple[Record, list[Difference]]:
     """The record of an episode as it follows from its trajectory, and where it is another."""
     measures: dict[str, float | None] = {}
-    reason = record.reason
     found = []
     if record.ended is not None:
-        log = _trajectory(run.path, record.scenario)
+        log = _trajectory(run.path, record.scenario.id)
         found = [(what, told, shown) for what, told, shown in contradictions(record, scenario, log)]
         if not found:
             measures = every_metric(EpisodeFacts.of(record, scenario, log))
             measures |= {
                 name: value for name, value in record.measures.items() if name in COUNTERFACTUAL
             }
-            reason = why_invalid(record, scenario)
-            status = "invalid" if reason else "done"
+            status = "invalid" if why_invalid(record, scenario) else "done"
             found = [("status", record.status, status)] if record.status != status else []
     found = found or [
         (name, record.measures.get(name), measures.get(name))
@@ -99,7 +95,8 @@ def _scored(run: WholeRun, scenario: Scenario, record: Record) -> tuple[Record, 
         if repr(record.measures.get(name)) != repr(measures.get(name))
     ]
     differences = [
-        Difference("record.json", record.scenario, what, repr(a), repr(b)) for what, a, b in found
+        Difference("record.json", record.scenario.id, what, repr(a), repr(b))
+        for what, a, b in found
     ]
     return msgspec.structs.replace(record, measures=measures), differences
 
@@ -110,19 +107,6 @@ def _trajectory(path: Path, scenario_id: str) -> Log:
         return Log.load(file)
     except RunError as error:
         raise RunError(f"{error}: {RUN_AGAIN}") from error
-
-
-def _rows_that_differ(path: Path, computed: list[Record]) -> Iterator[Difference]:
-    """Where the rows of results.sqlite are others."""
-    rows = read_rows(path)
-    for record in computed:
-        told = rows[record.scenario]
-        follows = json.loads(json.dumps(table_row(record)))
-        for name in _looked_at(follows, told):
-            if repr(told.get(name)) != repr(follows.get(name)):
-                yield Difference(
-                    DATABASE, record.scenario, name, repr(told.get(name)), repr(follows.get(name))
-                )
 
 
 def _cells_that_differ(file: Path, computed: list[Record]) -> Iterator[Difference]:
@@ -145,9 +129,11 @@ def _cells_that_differ(file: Path, computed: list[Record]) -> Iterator[Differenc
     columns = next(iter(theirs.values()))
     for name, row in mine.items():
         other = theirs.get(name, {})
-        for column in _looked_at(row, columns):
-            value = row[column]
-            if other.get(column) != value:
+        for (
+            column,
+            value,
+        ) in row.items():  # all metrics, and of the others those that the run's version had
+            if (column in METRICS or column in columns) and other.get(column) != value:
                 yield Difference(
                     file.name, name, column, other.get(column) or "nothing", value or "nothing"
                 )
@@ -156,8 +142,3 @@ def _cells_that_differ(file: Path, computed: list[Record]) -> Iterator[Differenc
 def _rows_of(table: str) -> dict[str, dict[str, str]]:
     """The rows of a table, by scenario."""
     return {row["scenario"]: row for row in csv.DictReader(io.StringIO(table)) if "scenario" in row}
-
-
-def _looked_at(follows: Mapping[str, object], told: Container[str]) -> list[str]:
-    """All metrics, and of the other columns those that the run's version had."""
-    return [name for name in follows if name in METRICS or name in told]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 import sqlite3
@@ -12,7 +11,7 @@ from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import msgspec
 import pandas as pd
@@ -22,9 +21,9 @@ from cosim.core.errors import MachineError, RunError, UsageError, listed, unknow
 from cosim.core.files import is_locked, lock, read_within, write_atomic
 from cosim.core.npz import read_npz
 from cosim.results.log import Log
-from cosim.results.record import Record
-from cosim.results.run_spec import RunSpec, decoded_spec
-from cosim.results.table import table_of, table_row
+from cosim.results.record import RECORD_FILE, Record
+from cosim.results.run_spec import RUN_FILE, RunSpec, decoded_spec
+from cosim.results.table import table_of
 from cosim.spec.scenario import Suite, write_suite
 from cosim.spec.validation import shown
 
@@ -58,7 +57,7 @@ def check_database(path: Path) -> None:
     is damaged."""
     with closing(connected(path)) as database, database:
         database.execute(
-            "create table if not exists episodes (scenario text primary key, row text, record text)"
+            "create table if not exists episodes (scenario text primary key, record text)"
         )
         faults = [fault for (fault,) in database.execute("pragma quick_check")]
         if faults != ["ok"]:
@@ -72,7 +71,7 @@ def records_in(database: sqlite3.Connection) -> list[Record]:
     rows: Sequence[tuple[object]] = database.execute(
         "select record from episodes order by rowid"
     ).fetchall()
-    return [msgspec.json.decode(_text(value), type=Record) for (value,) in rows]
+    return [RECORD_FILE.decode(_text(value)) for (value,) in rows]
 
 
 def _text(value: object) -> str:
@@ -123,8 +122,8 @@ def damage_of_episode(path: Path, scenario_id: str, row: Record | None = None) -
         return ""  # it was given up, and left no file
     try:
         record = Record.load(file)
-        if record.scenario != scenario_id:
-            return f"{file} is of scenario {shown(record.scenario)}"
+        if record.scenario.id != scenario_id:
+            return f"{file} is of scenario {shown(record.scenario.id)}"
         if row is not None and (apart := told_apart(record, row)):
             return f"{file}: not what results.sqlite has of this episode: {apart}"
         trajectory = file.with_name(TRAJECTORY)
@@ -146,7 +145,7 @@ def _damage_of_demonstration(file: Path) -> str:
 
 def told_apart(mine: Record, theirs: Record) -> str:
     """Where two records of an episode are first apart, in words; "" where they are not."""
-    told, other = (msgspec.to_builtins(record) for record in (mine, theirs))
+    told, other = (msgspec.to_builtins(RECORD_FILE.flat(record)) for record in (mine, theirs))
     for field, value in told.items():
         if isinstance(value, dict):
             for name in dict.fromkeys([*value, *other[field]]):
@@ -192,7 +191,7 @@ class RunFolder:
     def create(cls, path: Path, spec: RunSpec, suite: Suite) -> RunFolder:
         """A new run folder. Raises RunError when one is there already, MachineError where nothing
         can be written."""
-        _refuse_used(path)
+        refuse_used(path)
         return cls(path, spec, suite)
 
     @classmethod
@@ -201,7 +200,7 @@ class RunFolder:
         is of another run. whole: the suite that its scenarios are of."""
         refuse_unbegun(path)
         found = read_spec(path)
-        if found.policy == spec.policy and found.policy_source != spec.policy_source:
+        if found.policy == spec.policy and found.setup.policy_source != spec.setup.policy_source:
             raise RunError(
                 f"{path} is of another run: the source of policy '{spec.policy}' was edited since "
                 "it began. Resume with the source as it was, or choose another --out."
@@ -222,7 +221,7 @@ class RunFolder:
             raise unwritable(self.path, error) from error
         try:
             if self._suite is not None:
-                _refuse_used(self.path)
+                refuse_used(self.path)
                 self._begin(self._suite)
             self._open_database()
         except BaseException:
@@ -256,14 +255,13 @@ class RunFolder:
 
     def add(self, record: Record) -> None:
         """Append a finished episode. A second one of the same scenario is not taken."""
-        row = json.dumps(table_row(record), sort_keys=True)
-        text = msgspec.json.encode(record).decode()
+        values = record.scenario.id, RECORD_FILE.encode(record).decode()
         try:
             if self._adding is None:  # kept open: opening and closing takes longer than adding
                 self._adding = connected(self.path)
             with self._adding as database:
                 database.execute(
-                    "insert or ignore into episodes values (?, ?, ?)", (record.scenario, row, text)
+                    "insert or ignore into episodes (scenario, record) values (?, ?)", values
                 )
         except sqlite3.Error as error:
             raise trouble_with(self.path, error) from error
@@ -281,7 +279,7 @@ class RunFolder:
     def keep(self, record: Record, log: bytes = b"", demonstration: bytes = b"") -> None:
         """Write what came out of an episode, the record last, and add its row. log: the bytes of
         its `Log`."""
-        target = self.episode_folder(record.scenario)
+        target = self.episode_folder(record.scenario.id)
         try:
             target.mkdir(parents=True, exist_ok=True)
             for name, data in ((TRAJECTORY, log), (DEMONSTRATION, demonstration)):
@@ -361,8 +359,7 @@ class RunFolder:
                 suite, scenarios=tuple(s for s in suite.scenarios if s.id in wanted)
             )
             write_suite(chosen, self.path / "scenarios.json")
-            spec = msgspec.json.format(msgspec.json.encode(self.spec), indent=1)
-            write_atomic(self.path / "run.json", spec + b"\n")
+            write_atomic(self.path / "run.json", RUN_FILE.in_lines(self.spec))
         except OSError as error:
             raise unwritable(self.path, error) from error
 
@@ -382,7 +379,7 @@ class RunFolder:
             database.replace(database.with_name(DATABASE + ".damaged"))
             check_database(self.path)
         rows = [] if self._suite is not None else read_records(self.path)
-        if gone := [row.scenario for row in rows if not self._is_whole(row.scenario, row)]:
+        if gone := [row.scenario.id for row in rows if not self._is_whole(row.scenario.id, row)]:
             self._remove(gone)
         on_disk = {
             p.parent.name: p.stat().st_mtime_ns for p in self.path.glob("episodes/*/record.json")
@@ -455,25 +452,13 @@ def read_records(path: Path, *, untouched: bool = False) -> list[Record]:
         raise RunError(f"{path / DATABASE}: cannot be read: {error.strerror or error}") from error
 
 
-def read_rows(path: Path) -> dict[str, dict[str, Any]]:
-    """The row of each scenario as `results.sqlite` has it. Raises RunError."""
-    try:
-        with closing(connected(path)) as database:
-            rows = database.execute("select scenario, row from episodes").fetchall()
-        return {scenario: dict(json.loads(row)) for scenario, row in rows}
-    except (TypeError, ValueError) as error:
-        raise damaged(path, error) from error
-    except sqlite3.Error as error:
-        raise trouble_with(path, error) from error
-
-
 def refuse_in_use(path: Path) -> None:
     """Raises RunError, naming the process, while a run is writing to its folder."""
     if is_locked(path / "lock"):
         raise _in_use(path)
 
 
-def _refuse_used(path: Path) -> None:
+def refuse_used(path: Path) -> None:
     """Raises RunError when a folder holds a run, or something else that is not a run's
     beginning."""
     try:

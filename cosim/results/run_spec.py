@@ -10,43 +10,17 @@ from typing import NamedTuple, TypeVar
 import msgspec
 
 from cosim.core.errors import RunError, UsageError
-from cosim.spec.camera import CameraSpec
-from cosim.spec.goal import GoalProtocol
-from cosim.spec.manifest import WaypointRule
-from cosim.spec.odometry import OdometryKind
-from cosim.spec.policy_host import PolicyRuns
+from cosim.results.flat_file import FlatFile
+from cosim.results.run_setup import RunSetup
+from cosim.spec.manifest import Manifest
 from cosim.spec.scenario import Suite
 from cosim.spec.selection import selection_in_words
 
 _T = TypeVar("_T")
 SCHEMA = 1
 """Raised whenever run.json changes its meaning; other schemas are refused."""
-SAME = (
-    "suite",
-    "robots",
-    "suite_version",
-    "suite_hash",
-    "policy",
-    "policy_version",
-    "policy_source",
-    "policy_runs",
-    "scenarios",
-    "versions",
-    "renderer",
-    "counterfactual",
-    "waypoints",
-    "seed",
-    "camera",
-    "cameras",
-    "rate_hz",
-    "goal_protocol",
-    "odometry",
-    "latency_ms",
-    "real_time",
-    "metric_schema",
-    "shard",
-)
-"""What makes two runs the same."""
+_MAY_DIFFER = {"policy_name", "shared_renderer", "schema"}
+"""Keys of run.json in which runs may differ and be the same run."""
 _ARITHMETIC = (
     " Of two machines whose arithmetic is apart the processors or C libraries round differently: "
     "episodes of one are not those of the other to the bit."
@@ -107,47 +81,35 @@ class _Schema(msgspec.Struct):
 
 
 class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
-    """What a run is. Two runs with the same RunSpec have the same results. renderer: what draws the
-    pictures. counterfactual: whether each episode is compared with its street without the robot.
-    policy_source: hash of the file that the policy is written in
-    (`cosim.policies.load.source_hash`); waypoints: how those it answers are followed. seed: see
-    `cosim.spec.options.EpisodeOptions`. robots: which drive, and the hash of each. shared_renderer:
-    whether one process drew for all others when it began; what comes out is the same. scenarios: of
-    the whole run; shard: which part of them the folder holds, where it is not all."""
+    """What a run is. Two runs with the same RunSpec have the same results.
+
+    robots: which drive, and the hash of each. policy: the name that loads it. manifest: of the
+    policy, with the goals of the run; run.json does not hold its `privileged` and `goals`, so a
+    spec that was read has their defaults. scenarios: of the whole run; shard: which part of them
+    the folder holds, where it is not all. counterfactual: whether each episode is compared with its
+    street without the robot. shared_renderer: whether one process drew for all others when it
+    began; what comes out is the same.
+    """
 
     suite: str
     robots: dict[str, str]
     suite_version: str
-    suite_hash: str
     policy: str
-    policy_name: str
-    policy_version: str
-    policy_source: str = ""
-    policy_runs: PolicyRuns = "in-process"
-    waypoints: WaypointRule = WaypointRule()
-    camera: CameraSpec | None = None
-    cameras: dict[str, CameraSpec] = {}
-    rate_hz: float = 4.0
-    goal_protocol: GoalProtocol = "none"
-    odometry: OdometryKind = "none"
-    latency_ms: float = 0.0
-    real_time: bool = False
-    seed: int = 0
+    manifest: Manifest
+    setup: RunSetup
     scenarios: tuple[str, ...]
-    versions: dict[str, str]
-    renderer: str = "unknown"
     counterfactual: bool = False
     shared_renderer: bool = False
-    metric_schema: int = 0
     shard: Shard | None = None
     schema: int = SCHEMA
 
     def apart(self, other: RunSpec, but: str = "", whole: Suite | None = None) -> Apart | None:
         """The first field in which another run is not the same; None where it is. but: a field that
         may differ. whole: the suite of both, for words about which of its scenarios they have."""
-        for field in SAME:
-            mine, theirs = getattr(self, field), getattr(other, field)
-            if mine == theirs or field == but:
+        others = RUN_FILE.flat(other)
+        for field, mine in RUN_FILE.flat(self).items():
+            theirs = others[field]
+            if mine == theirs or field == but or field in _MAY_DIFFER:
                 continue
             if field == "scenarios":
                 return _chosen_apart(self.scenarios, other.scenarios, whole)
@@ -166,8 +128,23 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
                 if field in _OF_SUITE
                 else ""
             )
-            return Apart(field, _brief(mine), _brief(theirs), hint)
+            return Apart(field, brief(mine), brief(theirs), hint)
         return None
+
+
+RUN_FILE = FlatFile(
+    RunSpec,
+    {"setup": RunSetup, "manifest": Manifest},
+    """
+    suite robots suite_version suite_hash policy policy_name=manifest.name
+    policy_version=manifest.version policy_source policy_runs waypoints camera cameras rate_hz
+    goal_protocol=manifest.goal odometry latency_ms real_time seed scenarios versions renderer
+    counterfactual shared_renderer metric_schema shard schema
+    """,
+    without="manifest.privileged manifest.goals",
+    defaults={"camera": None, "renderer": "unknown"},
+)
+"""The layout of run.json, which is older than the parts of a `RunSpec`."""
 
 
 def _chosen_apart(mine: Sequence[str], theirs: Sequence[str], whole: Suite | None) -> Apart:
@@ -198,11 +175,12 @@ def decoded_spec(data: bytes, where: Path) -> RunSpec:
                 f"{where}: run schema {schema}, and this version reads {SCHEMA}: use the version "
                 "of cosim that made the run, which is in its `versions`"
             )
-        return msgspec.json.decode(data, type=RunSpec)
+        return RUN_FILE.decode(data)
     except RecursionError as error:
         raise ValueError("brackets within brackets within brackets") from error
 
 
-def _brief(value: object) -> str:
+def brief(value: object) -> str:
+    """A value in words, in at most 80 letters."""
     text = str(getattr(value, "in_words", value))
     return text if len(text) <= 80 else text[:77] + "..."

@@ -9,11 +9,12 @@ import msgspec
 import numpy as np
 import pandas as pd
 
+from cosim.core.errors import listed
 from cosim.core.geometry import Floats
 from cosim.results.metrics import COUNTERFACTUAL, METRICS, POOLED, RATE_NEEDS_M, WORST
-from cosim.results.record import Record
+from cosim.results.record import RECORD_FILE, Record
 
-KEYS: tuple[str, ...] = (
+_ORDER = (
     "scenario",
     "status",
     "ended",
@@ -44,7 +45,25 @@ KEYS: tuple[str, ...] = (
     "renderer",
     "ticks",
     "state_hash",
+    "metric_schema",
+    "versions",
 )
+_RECORD_ONLY = {
+    "policy_source",
+    "cameras",
+    "measures",
+    "failures",
+    "walked_into",
+    "red_light_entries",
+    "events",
+    "injections",
+    "schema",
+    "clock",
+}
+"""Keys of record.json that are no column of results.csv."""
+COLUMNS = (*_ORDER, *(key for key in RECORD_FILE.keys if key not in {*_ORDER, *_RECORD_ONLY}))
+"""The columns of results.csv before the metrics: `answer_ms`, and all keys of record.json but
+`_RECORD_ONLY`."""
 ORACLE = "orca"
 """The policy that suites are proved by: it knows what no robot can, and its results are no
 contestant's."""
@@ -52,19 +71,25 @@ BOOTSTRAP = 2000
 CONFIDENCE = 0.95
 MOST_INVALID = 0.02
 """Of what was scheduled; where more is invalid a table says nothing of its policy."""
+INJECTED = "injected"
+"""The column that counts the pedestrians injected into each episode; only runs with injections have
+it."""
 
 
 def table_row(record: Record) -> dict[str, Any]:
     """One flat row. A function of scenario, policy and versions alone, but in real time: other wall
     times are left out."""
-    row: dict[str, Any] = {key: getattr(record, key) for key in KEYS}
-    row["waypoints"] = record.waypoints.in_words
-    further = [f"{name}: {spec.in_words}" for name, spec in record.cameras.items()]
-    row["camera"] = (
-        "none" if record.camera is None else "; ".join([record.camera.in_words, *further])
-    )
-    row["metric_schema"] = record.metric_schema
-    row["versions"] = msgspec.json.encode(record.versions, order="deterministic").decode()
+    flat = RECORD_FILE.flat(record) | {"answer_ms": record.answer_ms}
+    row: dict[str, Any] = {key: flat[key] for key in COLUMNS}
+    row["waypoints"] = record.manifest.waypoints.in_words
+    cameras = {"": record.manifest.camera, **record.manifest.cameras}
+    words = [
+        f"{name}: {spec.in_words}" if name else spec.in_words
+        for name, spec in cameras.items()
+        if spec
+    ]
+    row["camera"] = "; ".join(words) or "none"
+    row["versions"] = msgspec.json.encode(record.setup.versions, order="deterministic").decode()
     counted: dict[str, Mapping[str, float | None]] = {
         "done": record.measures,
         "crashed": WORST,
@@ -76,10 +101,18 @@ def table_row(record: Record) -> dict[str, Any]:
 
 
 def table_of(records: Iterable[Record]) -> pd.DataFrame:
-    """One row per episode, sorted by scenario id, whatever order they ended in."""
-    rows = sorted((table_row(record) for record in records), key=lambda row: str(row["scenario"]))
+    """One row per episode, sorted by scenario id, whatever order they ended in.
+
+    A run into which pedestrians were injected has the column `INJECTED`, how many in each episode.
+    """
+    records = sorted(records, key=lambda record: record.scenario.id)
+    rows = [table_row(record) for record in records]
     asked = [name for name in COUNTERFACTUAL if any(name in row for row in rows)]
-    columns = [*KEYS, "metric_schema", "versions", *METRICS, *asked]
+    columns = [*COLUMNS, *METRICS, *asked]
+    if any(record.injections for record in records):
+        columns.append(INJECTED)
+        for row, record in zip(rows, records, strict=True):
+            row[INJECTED] = len(record.injections)
     return pd.DataFrame(rows, columns=columns)
 
 
@@ -108,10 +141,10 @@ def summary_of(table: pd.DataFrame, names: Sequence[str] = tuple(METRICS)) -> pd
 
 def _summary(table: pd.DataFrame, name: str) -> tuple[float, float, float, int]:
     if name not in POOLED:
-        values = _numbers(table, name)
+        values = numbers(table, name)
         values = values[~np.isnan(values)]
         return (float(values.mean()) if len(values) else np.nan, *interval_of(values), len(values))
-    counted, metres = (_numbers(table, column) for column in POOLED[name])
+    counted, metres = (numbers(table, column) for column in POOLED[name])
     known = ~(np.isnan(counted) | np.isnan(metres))
     if (table["status"] == "crashed").any() or metres[known].sum() < RATE_NEEDS_M:
         return np.nan, np.nan, np.nan, 0
@@ -119,7 +152,8 @@ def _summary(table: pd.DataFrame, name: str) -> tuple[float, float, float, int]:
     return 100.0 * counted.sum() / metres.sum(), *interval_of(100.0 * counted, metres), len(counted)
 
 
-def _numbers(table: pd.DataFrame, name: str) -> Floats:
+def numbers(table: pd.DataFrame, name: str) -> Floats:
+    """A column of a table; NaN where it is empty."""
     return np.asarray(pd.to_numeric(table[name], errors="coerce"), dtype=float)
 
 
@@ -135,6 +169,23 @@ def interval_of(values: Floats, weights: Floats | None = None) -> tuple[float, f
     tail = (1.0 - CONFIDENCE) / 2
     low, high = np.quantile(means, [tail, 1.0 - tail])
     return float(low), float(high)
+
+
+def injections_in_words(table: pd.DataFrame) -> str:
+    """Describe which episodes had injected pedestrians; "" if none had.
+
+    >>> injections_in_words(pd.DataFrame({"scenario": ["a", "b"], "injected": [2, 0]}))
+    'pedestrians were injected into 1 episode (a): its street is not the one of the suite'
+    """
+    if INJECTED not in table:
+        return ""
+    names = [str(name) for name in table.loc[table[INJECTED] > 0, "scenario"]]
+    one = len(names) == 1
+    return (
+        f"pedestrians were injected into {len(names)} episode{'' if one else 's'} "
+        f"({listed('', names)}): {'its street is' if one else 'their streets are'} not the "
+        f"one of the suite"
+    )
 
 
 def not_to_be_quoted(table: pd.DataFrame, scheduled: int) -> str:

@@ -71,7 +71,9 @@ class Going:
 
     def end(self) -> None:
         """Keep the figures, however it ended. Raises MachineError."""
-        ended = [record for record in read_records(self._folder) if record.scenario in self._todo]
+        ended = [
+            record for record in read_records(self._folder) if record.scenario.id in self._todo
+        ]
         happened("run over", episodes=len(ended), of=len(self._todo), folder=str(self._folder))
         if ended:
             wall_s = max(time.monotonic() - self._began_s, 1e-3)

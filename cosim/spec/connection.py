@@ -101,6 +101,20 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
         return f"whoever can reach {self.listen} may {may[self.role]}, and read all that is sent"
 
 
+def listening(role: Role, option: str, endpoint: str, tls: str, insecure: bool) -> Connection:
+    """The end that listens at the endpoint of an option. Raises UsageError."""
+    return Connection(
+        role=role, listen=checked_endpoint(endpoint, option), tls=tls, insecure=insecure
+    )
+
+
+def connecting(role: Role, option: str, endpoint: str, tls: str, insecure: bool) -> Connection:
+    """The end that connects to the endpoint of an option. Raises UsageError."""
+    return Connection(
+        role=role, connect=checked_endpoint(endpoint, option), tls=tls, insecure=insecure
+    )
+
+
 def checked_endpoint(endpoint: str, option: str) -> str:
     """The endpoint that an option was given. Raises UsageError where it can be none."""
     found = _OVER_IP.fullmatch(endpoint)

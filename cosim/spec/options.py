@@ -12,13 +12,11 @@ from cosim.core.errors import UsageError
 from cosim.spec.connection import Connection
 from cosim.spec.demo_options import Collecting
 from cosim.spec.episode_id import check_seed
-from cosim.spec.goal import GoalProtocol
+from cosim.spec.goal import GoalProtocol, goal_called
 from cosim.spec.injection import Injected, Live
-from cosim.spec.policy_host import PolicyRuns
+from cosim.spec.run_config import MOST_LATENCY_MS, CameraChoice, RunConfig
 
 CameraName = Literal["gl", "bullet", "bullet-egl"]
-CameraChoice = Literal["auto", "gl", "bullet", "bullet-egl"]
-MOST_LATENCY_MS = 10_000.0
 
 
 class Outside(msgspec.Struct, frozen=True, kw_only=True):
@@ -32,10 +30,12 @@ class Outside(msgspec.Struct, frozen=True, kw_only=True):
 
 class RendererAt(msgspec.Struct, frozen=True, kw_only=True):
     """The shared renderer of a run. address: where it listens; asks: whether the policy is there
-    and asked there, for all episodes together (`act_batch`)."""
+    and asked there, for all episodes together (`act_batch`). number: for the renderer, which of the
+    run it is, from 1."""
 
     address: str
     asks: bool
+    number: int = 0
 
 
 LEAST_PACE = 0.1
@@ -48,24 +48,21 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     what is seen and kept, never what happens in the street.
 
     seed: of the run: what a policy is told in place of the scenario's name and seed is drawn from
-    it (`cosim.spec.episode_id`), and the order of a run's episodes. None: a run draws one anew, an
-    Episode by itself takes
-    0. robot: which drives (`cosim.spec.robot`), in place of the scenario's own. goal: what the
-    policy is told of where to go (`cosim.spec.goal`), in place of what its manifest says.
-    suite_hash, policy_source, policy_runs: of the suite that the scenario is of, of the file of the
-    policy, and where that runs, for the record. own_camera: the policy may see by a camera that the
-    robot does not have (`cosim.episode.camera_rules`), which marks the record as nonstandard.
-    camera: what draws pictures. frames_every_s: keep a camera frame every so many seconds, 0 for
-    none. live: where it is on the air meanwhile. pace: the simulation waits for the wall clock, to
-    run at most so many times faster than real time; 0: it never waits. director: where its event
-    pedestrians are decided, when not beside it. counterfactual: compare it with its street without
-    the robot. injections: pedestrians that were injected into the episode that this one replays.
-    renderer: what draws for the policy in place of a camera of its own. latency_ms: each command
-    takes effect so much later than the observation that it answers, rounded up to ticks of 50 ms
-    (`cosim.episode.command_delay`). real_time: in place of that, the time that the policy takes for
-    an answer on this machine is that answer's latency, and it is not asked again before: what comes
-    out is replayed from its record, and not made again from its seed. collecting: the policy is an
-    expert, of whose drive a demonstration is kept. Raises UsageError.
+    it (`cosim.spec.episode_id`), and the order of a run's episodes. None: a run draws one, an
+    Episode by itself takes 0. robot: which drives (`cosim.spec.robot`), in place of the scenario's
+    own. goal: what the policy is told of where to go (`cosim.spec.goal`), in place of what its
+    manifest says. own_camera: the policy may see by a camera that the robot does not have
+    (`cosim.episode.camera_rules`), which marks the record as nonstandard. camera: what draws
+    pictures. frames_every_s: keep a camera frame every so many seconds, 0 for none. live: where it
+    is on the air meanwhile. pace: the simulation waits for the wall clock, to run at most so many
+    times faster than real time; 0: it never waits. director: where its event pedestrians are
+    decided, if in another process. counterfactual: compare it with its street without the robot.
+    injections: pedestrians that were injected into the episode that this one replays. latency_ms:
+    each command takes effect so much later than the observation that it answers, rounded up to
+    ticks of 50 ms (`cosim.episode.command_delay`). real_time: in place of that, the time that the
+    policy takes for an answer on this machine is that answer's latency, and it is not asked again
+    before: what comes out is replayed from its record, and not made again from its seed.
+    collecting: the policy is an expert, of whose drive a demonstration is kept. Raises UsageError.
 
     >>> EpisodeOptions(camera="bullet", frames_every_s=1.0).camera
     'bullet'
@@ -74,9 +71,6 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     seed: int | None = None
     robot: str = ""
     goal: GoalProtocol | None = None
-    suite_hash: str = ""
-    policy_source: str = ""
-    policy_runs: PolicyRuns = "in-process"
     own_camera: bool = False
     camera: CameraChoice = "auto"
     frames_every_s: float = 0.0
@@ -85,10 +79,24 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     director: Outside | None = None
     counterfactual: bool = False
     injections: tuple[Injected, ...] = ()
-    renderer: RendererAt | None = None
     latency_ms: float = 0.0
     real_time: bool = False
     collecting: Collecting | None = None
+
+    @classmethod
+    def asked(cls, config: RunConfig) -> EpisodeOptions:
+        """The options that the config of a run asks for. Raises UsageError."""
+        return cls(
+            seed=config.seed,
+            robot=config.robot,
+            own_camera=config.own_camera,
+            goal=goal_called(config.goal) if config.goal else None,
+            camera=config.camera,
+            frames_every_s=config.frames,
+            counterfactual=config.counterfactual,
+            real_time=config.real_time,
+            pace=config.pace,
+        )
 
     def __post_init__(self) -> None:
         check_seed(self.seed)

@@ -11,12 +11,12 @@ from collections.abc import Iterator
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, cast, get_args
 
 import msgspec
 import numpy as np
 
-from cosim.core.errors import SpecError
+from cosim.core.errors import SpecError, unknown
 from cosim.core.geometry import Polyline, Pose
 from cosim.spec.event_kind import EventKinds
 from cosim.spec.events import Event
@@ -329,6 +329,13 @@ class Suite(Ranged, frozen=True, kw_only=True):
     def content_hash(self) -> str:
         """SHA-256 of the suite's canonical JSON, 16 hex digits."""
         return content_hash(self)
+
+
+def split_called(name: str | None) -> Split | None:
+    """The split of that name. Raises UsageError, listing them, when there is none."""
+    if name not in (None, *get_args(Split)):
+        raise unknown("split", str(name), get_args(Split))
+    return cast(Split | None, name)
 
 
 def content_hash(spec: msgspec.Struct) -> str:

@@ -38,6 +38,11 @@ def scenarios_chosen(
     picked = [by_id[i] for i in dict.fromkeys(ids)] or list(whole.scenarios)
     there = {kind: None for scenario in picked for kind in _kinds_of(scenario)}
     for kind in kinds:
+        if kind not in there and not there:
+            raise UsageError(
+                f"--event {kind}: suite '{whole.name}' has no events among these scenarios: "
+                f"leave it out"
+            )
         if kind not in there:
             raise unknown("event", kind, there)
     if kinds:

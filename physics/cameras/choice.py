@@ -9,7 +9,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from cosim.spec.camera import CameraSpec
-from cosim.spec.options import CameraChoice, CameraName
+from cosim.spec.options import CameraName
+from cosim.spec.run_config import CameraChoice
 from cosim.spec.scenario import Light
 from physics.cameras.gl import context
 

@@ -35,13 +35,14 @@ from cosim.episode.loop import Moment, after, begin, tick
 from cosim.episode.manifest_checks import with_goal
 from cosim.episode.step import Step
 from cosim.results.log import Log
-from cosim.results.record import Record, begun
+from cosim.results.record import Record
 from cosim.results.referee import Verdict
+from cosim.results.run_setup import RunSetup
 from cosim.spec.camera import CameraSpec
 from cosim.spec.episode_id import pseudonym_of
 from cosim.spec.event_kind import EventKinds
 from cosim.spec.manifest import Manifest
-from cosim.spec.options import EpisodeOptions
+from cosim.spec.options import EpisodeOptions, RendererAt
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario
 from scenarios.episodes.live_episode import OnAir
@@ -64,7 +65,9 @@ class Episode:
 
     id, seed: what its policy is told when it begins. watches: told every tick. waiting: told what
     the episode waits for when it stands still. through: may put stopwatches or stand-ins before the
-    engines, which have started and not begun. kinds: the table of events that there may be.
+    engines, which have started and not begun. kinds: the table of events that there may be. setup:
+    of its run, which decides seed and latency; by default what the options request. renderer: the
+    shared one of its run, which draws in place of a camera of its own.
 
     Raises UsageError for a camera that the robot does not have, for goals that the policy cannot be
     given and when it is used out of turn, PolicyError for an answer that is no command, EngineError
@@ -91,19 +94,19 @@ class Episode:
         waiting: Progress = ignore,
         through: Callable[[StagedScenario], None] | None = None,
         kinds: EventKinds = EVENT_KINDS,
+        setup: RunSetup | None = None,
+        renderer: RendererAt | None = None,
     ) -> None:
         self.scenario = scenario = scenario.driven_by(options.robot)
         manifest = with_goal(manifest, options.goal)
         self.manifest = manifest
         self.options = options
         check_camera(manifest, robot_called(scenario.robot), options.own_camera)
-        run_seed = 0 if options.seed is None else options.seed
-        self.id, self.seed = pseudonym_of(run_seed, scenario)
+        self.setup = setup or RunSetup.of(options)
+        self.id, self.seed = pseudonym_of(self.setup.seed, scenario)
         self.clock = Clock.for_rate(manifest.rate_hz)
-        how = options.latency_ms, options.real_time, options.policy_runs
-        self.record: Record = begun(
-            scenario, manifest, options.suite_hash, options.policy_source, run_seed, *how
-        )
+        self.record = Record.begun(scenario, manifest, self.setup)
+        self._renderer = renderer
         self._watches = list(watches)
         self._waiting = waiting
         self._through = through
@@ -139,9 +142,11 @@ class Episode:
                     self.scenario,
                     self.manifest,
                     self.options,
+                    self.setup.seed,
                     self.clock,
                     self._waiting,
                     self._kinds,
+                    self._renderer,
                 )
             )
             if self._through is not None:
@@ -156,7 +161,8 @@ class Episode:
         self._stage = stage
         self._scorer = stage.scorer
         self._injected = stage.injected
-        self.record = msgspec.structs.replace(self.record, renderer=stage.renderer)
+        drawn = msgspec.structs.replace(self.setup, renderer=stage.renderer)
+        self.record = msgspec.structs.replace(self.record, setup=drawn)
         self._setup_s = time.perf_counter() - self._began_s
         return self
 
@@ -237,11 +243,11 @@ class Episode:
             command = command_of(answer, rule=self.manifest.waypoints, robot=stage.robot)
         except PolicyError as error:
             raise PolicyError(f"policy '{self.manifest.name}' {error}") from error
-        options, frame = self.options, self._frame
-        latency_ms = took_ms if options.real_time else options.latency_ms
+        setup, frame = self.setup, self._frame
+        latency_ms = took_ms if setup.real_time else setup.latency_ms
         self._took_ms.append(took_ms)
         self._commands.answered(now.tick, whole_ticks(latency_ms, self.clock.tick_ms), command)
-        free_again = self._commands.arrived_by if options.real_time else 0
+        free_again = self._commands.arrived_by if setup.real_time else 0
         while True:
             step = tick(
                 self.scenario, self.clock, stage.parts, now, self._commands.at(now.tick), frame

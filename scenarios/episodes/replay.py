@@ -17,8 +17,9 @@ from cosim.results.record import Record
 from cosim.results.referee import Verdict
 from cosim.results.run_folder import read_records
 from cosim.results.traffic import OnRoad
-from cosim.spec.options import CameraChoice, EpisodeOptions
+from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import robot_called
+from cosim.spec.run_config import CameraChoice
 from cosim.spec.scenario import Scenario, read_suite
 from scenarios.episodes.counterfactual import Beside, Compared
 from scenarios.episodes.episode import Episode, Watch
@@ -37,7 +38,7 @@ class Recorded(NamedTuple):
 
 def recorded(folder: Path, scenario_id: str) -> Recorded:
     """A finished episode. Raises UsageError with the valid names, RunError when it crashed."""
-    records = {record.scenario for record in read_records(folder)}
+    records = {record.scenario.id for record in read_records(folder)}
     if scenario_id not in records:
         raise unknown(f"finished episode in {folder}", scenario_id, records)
     scenarios = {s.id: s for s in read_suite(folder / "scenarios.json").scenarios}
@@ -59,10 +60,7 @@ def replaying(
     result is not needed.
     """
     options = EpisodeOptions(
-        seed=told.record.run_seed,
-        suite_hash=told.record.suite_hash,
-        camera=camera,
-        injections=told.record.injections,
+        seed=told.record.setup.seed, camera=camera, injections=told.record.injections
     )
     policy = Replay(told.log.command)
     through = _judge_alone if judged_alone else None
@@ -127,9 +125,9 @@ def otherwise(folder: Path, told: Recorded, what: str) -> RunError:
     record = told.record
     here = versions()
     changed = [
-        f"{name} {record.versions.get(name)}, here {here[name]}"
+        f"{name} {record.setup.versions.get(name)}, here {here[name]}"
         for name in here
-        if here[name] != record.versions.get(name)
+        if here[name] != record.setup.versions.get(name)
     ]
     why = (
         f"made with other versions: {'; '.join(changed)}"
@@ -137,6 +135,7 @@ def otherwise(folder: Path, told: Recorded, what: str) -> RunError:
         else "of the same versions: of other code"
     )
     return RunError(
-        f"{folder}: '{record.scenario}' was not the same when it was replayed ({what}). The record "
-        f"is {why}, or it was changed. Replay it with the code that made it, or run it again."
+        f"{folder}: '{record.scenario.id}' was not the same when it was replayed ({what}). "
+        f"The record is {why}, or "
+        "it was changed. Replay it with the code that made it, or run it again."
     )

@@ -8,13 +8,15 @@ from dataclasses import dataclass
 
 import msgspec
 
+from bridge.policy_server import said_by
 from cosim.core.errors import CosimError, MachineError, RendererLost
 from cosim.core.progress import Progress, ignore
 from cosim.episode.interfaces import Policy
-from cosim.episode.policy_caller import Driver, said_by
+from cosim.episode.policy_caller import Driver
 from cosim.results.log import Log
 from cosim.results.record import Record
-from cosim.spec.options import EpisodeOptions
+from cosim.results.run_setup import RunSetup
+from cosim.spec.options import EpisodeOptions, RendererAt
 from cosim.spec.scenario import Scenario
 from scenarios.episodes.counterfactual import Beside
 from scenarios.episodes.episode import Episode, Watch
@@ -37,6 +39,8 @@ def run_episode(
     policy: Policy,
     options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
     *,
+    setup: RunSetup | None = None,
+    renderer: RendererAt | None = None,
     watches: Sequence[Watch] = (),
     waiting: Progress = ignore,
     comparing: Progress = ignore,
@@ -47,17 +51,24 @@ def run_episode(
     MachineError, which is no episode's fault. One whose policy server is gone is to be run again,
     and has crashed if it is not.
 
-    watches, waiting: see `Episode`.
+    setup, renderer, watches, waiting: see `Episode`.
     comparing: receives how far the comparison with the street without the robot has come.
     """
     driver = Driver.of(policy)
     beside = Beside()
     trouble = ""
     listening = [*watches, beside.watch] if options.counterfactual else watches
-    options = msgspec.structs.replace(
-        options, policy_source=driver.source_hash, policy_runs=driver.runs
+    if setup is None:
+        setup = RunSetup.of(options, policy_source=driver.source_hash, policy_runs=driver.runs)
+    episode = Episode(
+        scenario,
+        driver.manifest,
+        options,
+        watches=listening,
+        waiting=waiting,
+        setup=setup,
+        renderer=renderer,
     )
-    episode = Episode(scenario, driver.manifest, options, watches=listening, waiting=waiting)
     try:
         with episode:
             drive(episode, driver)

@@ -77,14 +77,17 @@ class Scorer:
         scenario = self._scenario
         events = self._monitor.outcomes()
         log = self._recorder.log(self._monitor.tracks, commands)
+        setup = begun.setup
+        if setup.real_time:
+            setup = msgspec.structs.replace(
+                setup, latency_ms=median_ms(log.answers, self._clock.tick_ms)
+            )
         record = msgspec.structs.replace(
             begun,
             ended=self._verdict.ended,
             ticks=len(log),
             state_hash=self._recorder.hash.hexdigest(),
-            latency_ms=median_ms(log.answers, self._clock.tick_ms)
-            if begun.real_time
-            else begun.latency_ms,
+            setup=setup,
             failures=tuple(self._failures),
             walked_into=tuple(self._walked_into),
             red_light_entries=tuple(self._red_lights),

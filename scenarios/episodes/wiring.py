@@ -26,12 +26,12 @@ from cosim.people.standing import Standing, standing_bodies
 from cosim.place import overlay
 from cosim.place.barriers import fenced
 from cosim.place.street_map import Port, StreetMap, WalkableArea
-from cosim.results.record import NO_RENDERER
+from cosim.results.run_setup import NO_RENDERER
 from cosim.spec.camera import CameraSpec
 from cosim.spec.event_kind import EventKinds
 from cosim.spec.manifest import Manifest
 from cosim.spec.obstacle import Obstacle, footprint
-from cosim.spec.options import EpisodeOptions
+from cosim.spec.options import EpisodeOptions, RendererAt
 from cosim.spec.robot import COURIER, Robot, robot_called
 from cosim.spec.scenario import Barrier, CrowdSpec, Scenario, event_faults
 from cosim.spec.spec_file import in_lines
@@ -81,11 +81,14 @@ def staged(
     scenario: Scenario,
     manifest: Manifest,
     options: EpisodeOptions,
+    seed: int,
     clock: Clock,
     waiting: Progress,
     kinds: EventKinds,
+    shared: RendererAt | None = None,
 ) -> Iterator[StagedScenario]:
-    """Start every engine of a scenario; all are closed at the end, whatever happened."""
+    """Start every engine of a scenario; all are closed at the end, whatever happened. seed: of the
+    run; shared: draws in place of a camera of its own."""
     if faults := list(event_faults(scenario, kinds)):
         raise SpecError(f"scenario '{scenario.id}': {in_lines(faults)}")
     _, street_map = place(scenario.place)
@@ -109,11 +112,11 @@ def staged(
 
         camera: Camera | None = None
         renderer = NO_RENDERER
-        if options.renderer is not None:
-            shared = stack.enter_context(SharedCamera(options.renderer, scenario))
+        if shared is not None:
+            elsewhere = stack.enter_context(SharedCamera(shared, scenario))
             if manifest.camera is not None:
-                camera = shared
-                renderer = shared.renderer
+                camera = elsewhere
+                renderer = elsewhere.renderer
         elif manifest.camera is not None:
             camera = stack.enter_context(eyes(manifest.camera))
             renderer = renderer_of(camera_of_choice(options.camera))
@@ -160,12 +163,7 @@ def staged(
                 scenario, kinds, street_map, WalkableArea(walkable), robot, world.hidden, clock
             ),
             observer=Observer(
-                scenario,
-                manifest,
-                options.seed or 0,
-                lambda now: known(scenario, free(), now),
-                cameras,
-                look,
+                scenario, manifest, seed, lambda now: known(scenario, free(), now), cameras, look
             ),
             eyes=eyes,
             injected=injected,

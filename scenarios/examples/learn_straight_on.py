@@ -1,5 +1,4 @@
-"""PPO of Stable-Baselines3 learns to go straight on: pip install 'sidewalk-cosim[gym]'
-stable-baselines3
+"""PPO of Stable-Baselines3 learns to go straight on: pip install -e '.[gym]' stable-baselines3
 
     python scenarios/examples/learn_straight_on.py --minutes 30 --processes 2 --out learned
 

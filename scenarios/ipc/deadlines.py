@@ -1,19 +1,17 @@
-"""What the policy of an environment process is asked right now, and since when: told to the run in
-shared memory.
+"""Deadlines of policies: the pending call of a policy, in shared memory, and how long it may take.
 
 A policy that hangs may hold the interpreter's lock or be stopped by a signal, so that its process
-says nothing more. The run reads here whom it waits for.
+sends nothing more. The run reads the pending call here, and enforces the deadline.
 """
 
 from __future__ import annotations
 
-import mmap
-import os
 import struct
 import time
 from typing import Final, NamedTuple, get_args
 
 from cosim.episode.policy_caller import LOADED_WITHIN_S, PolicyCall, when
+from scenarios.ipc.shared_memory import SharedMemory
 
 _DOINGS: Final[tuple[PolicyCall, ...]] = get_args(PolicyCall)
 _LAYOUT: Final = struct.Struct(
@@ -30,6 +28,23 @@ class Patience(NamedTuple):
 
     def of(self, doing: PolicyCall) -> float:
         return self.start_s if doing in ("loading", "reset", "first act") else self.answer_s
+
+
+class ServerTimes(NamedTuple):
+    """Seconds by which a policy behind Zenoh is queried.
+
+    found_s: to find a server for the next episode, before the run ends. first_found_s: the same
+    before a run begins. lost_after_s: a server that is not reached for so long is gone; a link that
+    was cut is up again sooner. try_s: for one attempt of a request, which is then repeated. end_s:
+    for the reply to the end of an episode. pause_s: between two attempts.
+    """
+
+    found_s: float = 60.0
+    first_found_s: float = 10.0
+    lost_after_s: float = 3.0
+    try_s: float = 5.0
+    end_s: float = 1.0
+    pause_s: float = 0.05
 
 
 class Question(NamedTuple):
@@ -50,33 +65,17 @@ class Question(NamedTuple):
         return when(self.doing, self.tick)
 
 
-class Asked:
-    """The shared memory: made by the run, `opened` by the process, which is the policy's
-    `Timer`."""
-
-    def __init__(self, descriptor: int) -> None:
-        self.descriptor = descriptor
-        self._memory = mmap.mmap(descriptor, _LAYOUT.size)
-
-    @classmethod
-    def new(cls) -> Asked:
-        """Memory that nobody else has yet; its descriptor can be handed to a child."""
-        descriptor = os.memfd_create("cosim-asked")
-        os.ftruncate(descriptor, _LAYOUT.size)
-        return cls(descriptor)
+class Asked(SharedMemory):
+    """The pending call: made by the run, opened by the policy's process, whose `Timer` it is."""
 
     def starts(self, doing: PolicyCall, tick: int) -> None:
-        _LAYOUT.pack_into(self._memory, 0, time.monotonic(), _DOINGS.index(doing), tick)
+        _LAYOUT.pack_into(self.map, 0, time.monotonic(), _DOINGS.index(doing), tick)
 
     def stops(self) -> None:
-        _LAYOUT.pack_into(self._memory, 0, 0.0, 0, 0)
+        _LAYOUT.pack_into(self.map, 0, 0.0, 0, 0)
 
     @property
     def question(self) -> Question | None:
-        """What is being asked; None while the policy has nothing to do."""
-        since_s, doing, tick = _LAYOUT.unpack_from(self._memory, 0)
+        """The pending call; None while the policy has nothing to do."""
+        since_s, doing, tick = _LAYOUT.unpack_from(self.map, 0)
         return Question(since_s, _DOINGS[doing], tick) if since_s else None
-
-    def close(self) -> None:
-        self._memory.close()
-        os.close(self.descriptor)

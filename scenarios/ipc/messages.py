@@ -8,6 +8,7 @@ from collections.abc import Callable
 import msgspec
 
 from cosim.results.record import Status
+from cosim.results.run_setup import RunSetup
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions, RendererAt
 from cosim.spec.policy_host import PolicyHost
@@ -35,11 +36,17 @@ class Hello(msgspec.Struct, frozen=True, tag=True):
 
 
 class Job(msgspec.Struct, frozen=True, tag=True):
-    """Requests an episode. net_hash: that of its street net, if the worker is on another machine;
-    else ""."""
+    """Requests an episode.
+
+    setup: of the run; without one it follows from options and policy.
+    renderer: address of the run's shared renderer, if it has one.
+    net_hash: that of its street net, if the worker is on another machine; else "".
+    """
 
     scenario: Scenario
     options: EpisodeOptions = EpisodeOptions()
+    setup: RunSetup | None = None
+    renderer: RendererAt | None = None
     net_hash: str = ""
 
 

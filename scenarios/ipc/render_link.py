@@ -1,8 +1,6 @@
-"""An environment's end of the shared renderer: what draws for it, and, for a policy that answers
-for many episodes at once, what asks it.
+"""An environment's connection to the shared renderer, and the camera that draws over it.
 
-One connection lasts as long as the process; when it ends the renderer knows that the environment
-has.
+One connection lasts as long as the process; its end shows the renderer that the environment ended.
 """
 
 from __future__ import annotations
@@ -15,114 +13,142 @@ from types import TracebackType
 from typing import Final, Self
 
 import msgspec
-import shapely
 
-from cosim.core.errors import EngineError, PolicyError, RendererLost
+from bridge.policy_server import PackedArray, Refusal
+from cosim.core.errors import EngineError, RendererLost
 from cosim.core.framing import Wire
-from cosim.core.state import Command, Frame, Planned, RobotState, Street
-from cosim.episode.interfaces import Observation, Privileged
-from cosim.episode.policy_caller import Driver, when
-from cosim.spec.manifest import Manifest
+from cosim.core.state import Frame, RobotState, Street
 from cosim.spec.options import RendererAt
 from cosim.spec.scenario import Scenario
-from scenarios.ipc.picture_memory import PictureMemory
+from scenarios.ipc.observation_codec import Arrays
 from scenarios.ipc.render_protocol import (
-    Ask,
-    Begin,
     Draw,
     Enter,
-    Knowledge,
-    Leave,
-    Refused,
-    Reply,
+    Rendered,
     Request,
-    Told,
-    Welcome,
-    decode_reply,
+    decode_rendered,
     encode_exchange,
 )
+from scenarios.ipc.shared_memory import SharedMemory
 
-_TELLS_EVERY_S: Final = 60.0
-"""Who waits for the renderer says so that often: it is no silence."""
+WAITING_EVERY_S: Final = 60.0
+"""Seconds between two reports of an environment that waits for the renderer."""
 
 
 class RendererLink:
-    """The connection. renderer: what draws, as records name it. waiting: called now and then while
-    a reply is waited for. Raises RendererLost, here and whenever it is used, when the renderer is
-    gone."""
+    """The connection. Its methods raise RendererLost when the renderer is gone.
 
-    def __init__(self, address: str, waiting: Callable[[], None] | None = None) -> None:
+    waiting: called every waiting_every_s seconds while a reply is waited for. number, renderer: of
+    `Rendered`, once there was one.
+    """
+
+    def __init__(
+        self,
+        address: str,
+        waiting: Callable[[], None] | None = None,
+        waiting_every_s: float = WAITING_EVERY_S,
+    ) -> None:
         self.waiting = waiting
-        self._number = 0
-        self._memory: PictureMemory | None = None
+        self._address = address
+        self.number = 0
+        self.renderer = ""
+        self._waiting_every_s = waiting_every_s
+        self._memory: SharedMemory | None = None
+        self._drawn: tuple[Arrays, dict[str, PackedArray]] = {}, {}
         self._end = socket.socket(socket.AF_UNIX)
         self._wire = Wire(self._end)
         try:
             self._end.connect(f"\0{address}")
             self._wait()
             _, (descriptor,), *_ = socket.recv_fds(self._end, 1, 1)
-            welcome = self._received()
-        except (OSError, ValueError, EOFError, msgspec.DecodeError) as error:
+        except (OSError, ValueError) as error:
             raise self.lost() from error
-        assert isinstance(welcome, Welcome)
-        self._number = welcome.number
-        self.renderer = welcome.renderer
-        self._memory = PictureMemory(descriptor, welcome.size)
+        self._memory = SharedMemory(descriptor)
 
     def tell(self, request: Request) -> None:
-        """Say something that is not replied to."""
+        """Send a request that is not replied to."""
         try:
             self._wire.send(encode_exchange(request))
         except OSError as error:
             raise self.lost() from error
 
-    def ask(self, request: Request, asked: str = "") -> Reply:
-        """The reply to a request. asked: what the policy is asked by it. Raises PolicyError and
-        EngineError with what the renderer says."""
+    def exchange(self, request: Request, call: str = "") -> bytes:
+        """Return the reply to a request. call: which call of the policy that is, in words."""
         self.tell(request)
-        return self.reply(asked)
+        return self.received(call)
 
-    def reply(self, asked: str = "") -> Reply:
-        """The reply to what was told."""
+    def received(self, call: str = "") -> bytes:
+        """Wait for the reply to a request that was sent."""
         try:
-            reply = self._received()
-        except (OSError, EOFError, msgspec.DecodeError) as error:
-            raise self.lost(asked) from error
-        if isinstance(reply, Refused):
-            raise PolicyError(reply.reason) if reply.by_policy else EngineError(reply.reason)
-        return reply
+            self._wait()
+            return self._wire.receive()
+        except (OSError, EOFError) as error:
+            raise self.lost(call) from error
 
-    def picture(self) -> Frame:
-        """The last one that was drawn."""
+    def enter(self, scenario: Scenario) -> None:
+        """Report the scenario that this environment runs from now on. Raises EngineError."""
+        self._rendered(self.exchange(Enter(scenario)))
+
+    def draw(self, robot: RobotState, street: Street) -> Frame:
+        """Return what the robot sees. Raises EngineError."""
+        return self.drawn(self.exchange(Draw(robot, street)))
+
+    def drawn(self, payload: bytes) -> Frame:
+        """Return a copy of the picture that a reply describes. Raises EngineError."""
+        laid = self._rendered(payload).arrays
         if self._memory is None:
             raise self.lost()
-        return self._memory.take()
+        arrays = self._memory.take(laid)
+        self._drawn = arrays, laid
+        return Frame(arrays["rgb"], arrays["labels"])
 
-    def lost(self, asked: str = "") -> RendererLost:
-        """The error for a connection that is of no use any more; the next one is made anew."""
-        _links.clear()
+    def laid(self, name: str, array: object) -> PackedArray | None:
+        """Return where an array of the last picture is; None for any other array."""
+        arrays, laid = self._drawn
+        return laid[name] if arrays.get(name) is array else None
+
+    def leave(self) -> None:
+        """Report that this environment runs no scenario."""
+        self.tell(Enter(None))
+
+    def close(self) -> None:
+        """Close the connection; the next use of `link_to` makes another one."""
+        if _links.get(self._address) is self:
+            del _links[self._address]
         self._wire.close()
         if self._memory is not None:
-            asked = asked if self._memory.asked else ""
             self._memory.close()
             self._memory = None
-        return RendererLost(self._number, asked)
 
-    def _received(self) -> Reply:
-        self._wait()
-        reply: Reply = decode_reply(self._wire.receive())
+    def lost(self, call: str = "") -> RendererLost:
+        """Close the connection, and return the error to raise."""
+        busy = self._memory is not None and self._memory.busy
+        self.close()
+        return RendererLost(self.number, call if busy else "")
+
+    def _rendered(self, payload: bytes) -> Rendered:
+        try:
+            reply: Rendered | Refusal = decode_rendered(payload)
+        except msgspec.DecodeError as error:
+            raise self.lost() from error
+        if isinstance(reply, Refusal):
+            raise EngineError(reply.words)
+        self.number = reply.number
+        self.renderer = reply.renderer
         return reply
 
     def _wait(self) -> None:
-        while not select.select([self._end], [], [], _TELLS_EVERY_S)[0]:
+        while not select.select([self._end], [], [], self._waiting_every_s)[0]:
             if self.waiting is not None:
                 self.waiting()
 
 
 def link_to(address: str, waiting: Callable[[], None] | None = None) -> RendererLink:
-    """This process's connection to the renderer at an address, made when it is first needed.
-    waiting: called from now on while a reply is waited for, that to the connection too: a renderer
-    that loads a large policy lets it wait."""
+    """Return this process's connection to the renderer at an address, made when first needed.
+
+    waiting: called from now on while a reply is waited for, and while the renderer accepts no
+    connection because it loads a large policy.
+    """
     if address not in _links:
         _links[address] = RendererLink(address, waiting)
     elif waiting is not None:
@@ -134,18 +160,20 @@ _links: Final[dict[str, RendererLink]] = {}
 
 
 class SharedCamera:
-    """This environment's place in the shared renderer while it runs a scenario. Use it in a `with`
-    block.
-
-    renderer: what draws, as records name it."""
+    """This environment's camera in the shared renderer, for one scenario. Use it in a `with`
+    block."""
 
     def __init__(self, renderer: RendererAt, scenario: Scenario) -> None:
         self._link = link_to(renderer.address)
         self._scenario = scenario
-        self.renderer = self._link.renderer
+
+    @property
+    def renderer(self) -> str:
+        """What draws, as records name it."""
+        return self._link.renderer
 
     def __enter__(self) -> Self:
-        self._link.ask(Enter(self._scenario))
+        self._link.enter(self._scenario)
         return self
 
     def __exit__(
@@ -155,44 +183,7 @@ class SharedCamera:
         trace: TracebackType | None,
     ) -> None:
         with suppress(RendererLost):
-            self._link.tell(Leave())
+            self._link.leave()
 
     def render(self, robot: RobotState, street: Street) -> Frame:
-        self._link.ask(Draw(robot, street))
-        return self._link.picture()
-
-
-class AskedElsewhere(Driver):
-    """The driver of a policy that the shared renderer asks, for all episodes together."""
-
-    def __init__(self, manifest: Manifest, source_hash: str, renderer: RendererAt) -> None:
-        super().__init__(self, manifest, source_hash)
-        self._address = renderer.address
-        self._free: object = None
-
-    def reset(self, episode_id: str, seed: int) -> None:
-        self._free = None
-        link_to(self._address).ask(Begin(episode_id, seed), when("reset", 0))
-
-    def act(self, observation: Observation) -> Command:
-        known = observation.privileged if self.manifest.privileged else None
-        told = None if known is None else self._told(known)
-        seen = observation
-        request = Ask(
-            seen.tick, seen.v_mps, seen.w_radps, told, seen.reset, seen.goal, seen.odometry
-        )
-        reply = link_to(self._address).ask(request, when("act", observation.tick))
-        assert isinstance(reply, Told)
-        if reply.waypoints is None:
-            return Command(reply.v_mps, reply.w_radps)
-        return Planned(reply.v_mps, reply.w_radps, reply.waypoints, reply.index)
-
-    def _told(self, known: Privileged) -> Knowledge:
-        """What the renderer is told of it: the ground where the robot may be once for each
-        episode."""
-        free = b"" if known.free is self._free else shapely.to_wkb(known.free)
-        self._free = known.free
-        people, vehicles, signals = known.people, known.vehicles, known.signals
-        return Knowledge(
-            known.robot, known.route_s_m, people, vehicles, signals, known.crossings, free
-        )
+        return self._link.draw(robot, street)

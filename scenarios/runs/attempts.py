@@ -32,7 +32,7 @@ class AttemptQueue:
 
     def __init__(self, folder: RunFolder, scenarios: Sequence[Scenario]) -> None:
         self._folder = folder
-        self._waiting = deque(sorted(scenarios, key=partial(pseudonym_of, folder.spec.seed)))
+        self._waiting = deque(sorted(scenarios, key=partial(pseudonym_of, folder.spec.setup.seed)))
         self._failed = folder.failed_attempts()
 
     def __len__(self) -> int:

@@ -27,7 +27,7 @@ from scenarios.ipc.messages import (
     MessageHandler,
     encode_message,
 )
-from scenarios.runs.watchdog import ProcessEnd, Watchdog
+from scenarios.ipc.watchdog import ProcessEnd, Watchdog
 
 SILENCE_S = 300.0
 """Seconds after which a process that reports nothing, while its policy has nothing to answer, hangs

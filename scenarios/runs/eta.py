@@ -250,7 +250,7 @@ def measured(
     return Measured(
         machine=machine(),
         policy=policy,
-        renderer=record.renderer,
+        renderer=record.setup.renderer,
         jobs=jobs,
         short=scenario.ends_on_failure,
         compared=compared,

@@ -1,50 +1,75 @@
-"""Asking a policy that is not in this process: the same questions and answers, whatever carries
-them.
+"""Querying a policy in another process: the same requests and replies, whatever carries them.
 
-Nothing that comes back is believed: an answer must be signed with the question's run, episode,
-attempt and step, and becomes a command by the same checks as that of a policy in this process.
+No reply is trusted: an answer must be signed with the run, episode, attempt and step of the
+request. It becomes a command by the same checks as that of a policy in this process.
 """
 
 from __future__ import annotations
 
 import secrets
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
-from typing import Any, Protocol
+from contextlib import nullcontext
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
-from bridge.policy_server import Answer, AskAct, AskEnded, AskReset, Begun, PackedArray, Refusal
-from cosim.core.errors import MachineError, PolicyError, PolicyServerLost
-from cosim.core.state import Command
+from bridge.policy_server import (
+    MOST_WORDS,
+    UNREADABLE,
+    Answer,
+    AskAct,
+    AskEnded,
+    AskReset,
+    Begun,
+    PackedArray,
+    PolicyFault,
+    PolicyReply,
+    Refusal,
+    decode_reply,
+)
+from cosim.core.errors import EngineError, MachineError, PolicyError, PolicyServerLost
+from cosim.core.state import Command, Planned
 from cosim.episode.control import check_numbers
 from cosim.episode.interfaces import Observation
-from cosim.episode.policy_caller import MOST_SAID, Driver, PolicyCall, Timer
+from cosim.episode.policy_caller import Driver, Timer
 from cosim.spec.manifest import Manifest
 from cosim.spec.policy_host import PolicyRuns
-from scenarios.runs.observation_codec import arrays_of, told_about, told_goal
+from scenarios.ipc.observation_codec import Arrays, encoded_about, encoded_fields
 
-PolicyQuestion = AskReset | AskAct | AskEnded
+
+class PolicyServerBusy(PolicyServerLost):
+    """Another episode has taken the server."""
 
 
 class QuestionCarrier(Protocol):
-    """Brings questions to where a policy is."""
+    """Carries requests to where a policy is. loses: whether an episode can be lost there."""
 
-    def lay(self, arrays: dict[str, np.ndarray[Any, Any]]) -> dict[str, PackedArray]:
-        """Arrays of the next question, as they are told of in it."""
+    @property
+    def loses(self) -> bool: ...
 
-    def ask(self, question: PolicyQuestion) -> Begun | Answer | Refusal:
-        """The reply to a question. Raises PolicyError where none will come, PolicyServerLost where
-        that is no fault of the answer."""
+    def lay(self, arrays: Arrays) -> dict[str, PackedArray]:
+        """Lay the arrays of the next request, and return them as the request has them."""
+
+    def ask(self, question: AskReset | AskAct) -> bytes:
+        """Return the reply to a request.
+
+        Raises PolicyFault where none will come, an EngineError where that is not the policy's
+        fault.
+        """
+
+    def tell_ended(self, question: AskEnded) -> None:
+        """Report the end of an episode. Raises the same errors."""
 
     def close(self) -> None:
-        """Nothing more is asked."""
+        """Release everything."""
 
 
 class HostedPolicy:
-    """A policy elsewhere, as one that can be asked here. run: signs what is asked. took_ms: each
-    answer of the episode. lost: whether nobody was there any more when an episode had ended."""
+    """A policy elsewhere, which is queried like one in this process.
+
+    run: signs the requests. took_ms: the time of each answer of the episode. lost: whether the
+    policy was gone when an episode had ended.
+    """
 
     def __init__(self, manifest: Manifest, carrier: QuestionCarrier, run: str) -> None:
         self.manifest = manifest
@@ -64,60 +89,58 @@ class HostedPolicy:
     def act(self, seen: Observation) -> Command | np.ndarray[Any, Any]:
         began_s = time.perf_counter()
         self._step += 1
-        goal, goal_arrays = told_goal(seen.goal)
-        arrays = arrays_of(seen) | goal_arrays
-        odometry = (
-            None if (told := seen.odometry) is None else (told.x_m, told.y_m, told.heading_rad)
-        )
-        answer = self._reply(
-            AskAct(
-                *self._sign,
-                self._step,
-                seen.tick,
-                seen.time_s,
-                seen.v_mps,
-                seen.w_radps,
-                seen.reset,
-                goal,
-                odometry,
-                self._carrier.lay(arrays),
-                told_about(seen) if self._step == 0 else None,
-            )
-        )
+        fields, arrays = encoded_fields(seen)
+        about = encoded_about(seen) if self._step == 0 else None
+        laid = self._carrier.lay(arrays)
+        answer = self._reply(AskAct(*self._sign, self._step, **fields, arrays=laid, about=about))
         assert isinstance(answer, Answer)
         self.took_ms.append(1000.0 * (time.perf_counter() - began_s))
-        return (
-            Command(answer.v_mps, answer.w_radps)
-            if answer.waypoints is None
-            else _array(answer.waypoints)
-        )
+        if answer.waypoints is None:
+            return Command(answer.v_mps, answer.w_radps)
+        waypoints = _array(answer.waypoints)
+        if not answer.planned:
+            return waypoints
+        return Planned(answer.v_mps, answer.w_radps, waypoints, self.manifest.waypoints.index)
 
     def tell_ended(self) -> None:
-        """Nothing more is asked about the episode. Whatever goes wrong with that changes
-        nothing."""
+        """Report the end of the episode. Failures of that change nothing."""
         try:
-            self._carrier.ask(AskEnded(*self._sign))
-        except (PolicyError, PolicyServerLost):
+            self._carrier.tell_ended(AskEnded(*self._sign))
+        except (PolicyFault, EngineError):
             self.lost = True
 
     def close(self) -> None:
         self._carrier.close()
 
     def _reply(self, question: AskReset | AskAct) -> Begun | Answer:
-        reply = self._carrier.ask(question)
+        """Return the reply to a request. This decides what is the policy's fault, and what is
+        not."""
+        payload = self._carrier.ask(question)
+        try:
+            reply: PolicyReply = decode_reply(payload)
+        except UNREADABLE as error:
+            raise PolicyFault(f"sent what is no answer: {error}"[:MOST_WORDS]) from None
         if isinstance(reply, Refusal):
-            raise PolicyError(reply.words[: 2 * MOST_SAID])
+            fault = PolicyFault(reply.words, reply.during, reply.together)
+            if not self._carrier.loses or reply.why not in ("unknown", "busy"):
+                raise fault
+            lost = PolicyServerBusy if reply.why == "busy" else PolicyServerLost
+            raise lost(f"the server of policy '{self.manifest.name}': {fault.words}")
         wanted = Begun if isinstance(question, AskReset) else Answer
         step = reply.step if isinstance(reply, Answer) else -1
         if not isinstance(reply, wanted) or reply.signature != self._sign or step != self._step:
-            told = f"answered step {step} of '{reply.episode}' when it was asked step {self._step}"
-            raise PolicyError(told + ", in another attempt" * (step == self._step))
+            said = f"answered step {step} of '{reply.episode}' when it was asked step {self._step}"
+            raise PolicyFault(said + ", in another attempt" * (step == self._step))
         return reply
 
 
 class HostedDriver(Driver):
-    """The driver of a policy elsewhere. What comes of it is checked as ever; that its server is
-    lost, or the machine lacks something, is not its crash."""
+    """The driver of a policy elsewhere: its answers are checked as those of one in this process.
+
+    A lost server or renderer, and what the machine lacks, is not the policy's fault.
+    """
+
+    _passes: ClassVar[tuple[type[Exception], ...]] = (PolicyError, EngineError, MachineError)
 
     def __init__(
         self, policy: HostedPolicy, runs: PolicyRuns, source_hash: str, timer: Timer | None = None
@@ -128,14 +151,14 @@ class HostedDriver(Driver):
 
     @property
     def clock(self) -> dict[str, float]:
-        if not self._hosted.took_ms:
+        if not self._hosted.took_ms or self.runs == "in-process":
             return {}
         median, most = np.quantile(self._hosted.took_ms, [0.5, 0.95])
         return {"answer_median_ms": float(median), "answer_p95_ms": float(most)}
 
     def ended(self) -> None:
         if self._begun:
-            # What is elsewhere is waited for a moment only, by itself.
+            # A server has a second to reply; an isolated policy is timed like any call.
             with self._asked("ended", 0) if self.runs == "isolated" else nullcontext():
                 self._hosted.tell_ended()
         self._begun = ""
@@ -150,21 +173,9 @@ class HostedDriver(Driver):
     def _own(self, observation: Observation) -> Observation:
         return observation  # what is sent is a copy
 
-    @contextmanager
-    def _asked(self, doing: PolicyCall, tick: int) -> Iterator[None]:
-        try:
-            with super()._asked(doing, tick):
-                yield
-        except PolicyError as error:
-            if isinstance(
-                error.__cause__, MachineError | PolicyServerLost
-            ):  # no words of the policy's become these
-                raise error.__cause__ from None
-            raise
-
 
 def _array(told: PackedArray) -> np.ndarray[Any, Any]:
-    """Waypoints. Raises PolicyError where they are none."""
+    """Return the waypoints of an answer. Raises PolicyFault or PolicyError where they are none."""
     try:
         kind = np.dtype(told.dtype)
         if kind.kind not in "biufc" or any(side < 0 for side in told.shape) or told.at >= 0:
@@ -172,4 +183,4 @@ def _array(told: PackedArray) -> np.ndarray[Any, Any]:
         check_numbers(told.shape)
         return np.frombuffer(told.data, kind).reshape(told.shape)
     except (TypeError, ValueError, OverflowError) as error:
-        raise PolicyError(f"answered waypoints that cannot be read: {error}"[:MOST_SAID]) from None
+        raise PolicyFault(f"answered waypoints that cannot be read: {error}"[:MOST_WORDS]) from None

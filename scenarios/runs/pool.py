@@ -18,8 +18,9 @@ import msgspec
 from cosim.core.errors import RunError
 from cosim.core.log_event import happened
 from cosim.episode.manifest_checks import with_goal
-from cosim.results.record import Record, Status, begun
+from cosim.results.record import Record, Status
 from cosim.results.run_folder import RunFolder
+from cosim.results.run_setup import NO_RENDERER
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario
 from scenarios.ipc.faults import Failure, failure_of_result
@@ -61,8 +62,6 @@ def run_all(
     a record cannot be written."""
     if renderer is not None:
         hello = msgspec.structs.replace(hello, renderer=renderer.at)
-        options = msgspec.structs.replace(options, renderer=renderer.at)
-    options = msgspec.structs.replace(options, seed=folder.spec.seed)
     queue = AttemptQueue(folder, scenarios)
     pool = _Pool(folder, queue, hello, transport, options, tell, renderer)
     happened("run begun", episodes=len(scenarios), policy=hello.policy, folder=str(folder.path))
@@ -96,6 +95,7 @@ class _Pool:
         self._options = options
         self._tell = tell
         self._renderer = renderer
+        self._setup = msgspec.structs.replace(folder.spec.setup, renderer=NO_RENDERER)
         self._workers: dict[Worker, Scenario | None] = {}
         self._without_renderer: list[tuple[Scenario, LostRenderer]] = []
 
@@ -110,7 +110,7 @@ class _Pool:
         worker = next(idle, None) or self._transport.start(self._hello)
         self._workers[worker] = scenario
         self._folder.forget(scenario.id)
-        worker.give(Job(scenario, self._options))
+        worker.give(Job(scenario, self._options, self._setup, self._hello.renderer))
         happened("claimed", scenario=scenario.id, worker=Path(worker.log).stem)
 
     def poll(self) -> None:
@@ -188,7 +188,7 @@ class _Pool:
             record = Record.decoded(done.record, self._folder.episode_folder(scenario.id))
         except RunError:
             return None
-        return record if record.scenario == scenario.id else None
+        return record if record.scenario.id == scenario.id else None
 
     def _failed(self, scenario: Scenario, failure: Failure) -> None:
         given_up = self._queue.failed(scenario, failure)
@@ -249,24 +249,14 @@ class _Pool:
         except RunError:
             return "refused"
         alike = msgspec.structs.replace(kept, clock={}) == msgspec.structs.replace(came, clock={})
-        comparable = None not in (kept.ended, came.ended) and not kept.real_time
+        comparable = None not in (kept.ended, came.ended) and not kept.setup.real_time
         return "conflict" if comparable and not alike else "duplicate"
 
     def _give_up(self, scenario: Scenario, reason: str, status: Status) -> None:
         """Record a scenario after its last failed attempt."""
         happened("given up", ERROR, scenario=scenario.id, why=reason, status=status)
-        spec = self._folder.spec
         manifest = with_goal(self._hello.manifest, self._options.goal)
-        record = begun(
-            scenario,
-            manifest,
-            spec.suite_hash,
-            self._hello.source_hash,
-            spec.seed,
-            spec.latency_ms,
-            spec.real_time,
-            spec.policy_runs,
-        )
+        record = Record.begun(scenario, manifest, self._setup)
         self._folder.keep(msgspec.structs.replace(record, status=status, reason=reason))
         self._over(scenario, status)
 

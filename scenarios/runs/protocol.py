@@ -19,8 +19,8 @@ from msgspec import Meta
 from cosim.core.cache import sources_hash
 from cosim.core.errors import EngineError
 from cosim.core.versions import versions
-from cosim.results.record import METRIC_SCHEMA
-from cosim.results.run_spec import RunSpec
+from cosim.results.run_setup import METRIC_SCHEMA
+from cosim.results.run_spec import RUN_FILE, RunSpec
 from scenarios.ipc.faults import Fault
 from scenarios.ipc.messages import Done, FrameDrawn, Hello, Job, Progress, Waits
 
@@ -66,7 +66,7 @@ def difference(here: Installed, run: Installed) -> str:
 def installed_for(spec: RunSpec) -> Installed:
     """Return the installation that the workers of a run need."""
     own = {name: version for name, version in installed_here().items() if name not in versions()}
-    return {**spec.versions, **own}
+    return {**spec.setup.versions, **own}
 
 
 class Claim(msgspec.Struct, frozen=True, kw_only=True):
@@ -183,7 +183,7 @@ def other_renderer(done: Done, renderer: str) -> str:
 
 def run_hash(spec: RunSpec) -> str:
     """Return the name of a run in keys: a resumed run has the same."""
-    return hashlib.blake2b(msgspec.json.encode(spec, order="sorted"), digest_size=8).hexdigest()
+    return hashlib.blake2b(RUN_FILE.encode(spec), digest_size=8).hexdigest()
 
 
 encode_reply: Final = msgspec.msgpack.Encoder().encode

@@ -34,12 +34,12 @@ from scenarios.ipc.messages import (
     decode_message,
     encode_message,
 )
+from scenarios.ipc.watchdog import raise_unable
 from scenarios.runs.lease import Lease
 from scenarios.runs.net_transfer import Nets, travels
 from scenarios.runs.protocol import difference, installed_for, other_renderer
 from scenarios.runs.ray_actor import EnvironmentActor, NodeFound, SlotReport
 from scenarios.runs.transport import HeldRun, Transport, TransportFactory
-from scenarios.runs.watchdog import raise_unable
 
 _POLL_S: Final = 1.0
 LEASE_S: Final = 60.0
@@ -64,9 +64,8 @@ def check_ray(on: str) -> Any:
     try:
         import ray
     except ImportError:
-        raise UsageError(
-            f"--on {on} needs Ray, here and on each node: pip install 'sidewalk-cosim[ray]'"
-        ) from None
+        remedy = "pip install -e '.[ray]' in the checkout"
+        raise UsageError(f"--on {on} needs Ray, here and on each node: {remedy}") from None
     return ray
 
 
@@ -176,7 +175,9 @@ class RayWorkers:
         actor, found = self._placed.pop(0)
         log = self._logs / f"ray-{self._count}-{found.host}.log"
         self._count += 1
-        worker = _RayWorker(self._ray, actor, log, hello, self._spec.renderer, self._packed_job)
+        worker = _RayWorker(
+            self._ray, actor, log, hello, self._spec.setup.renderer, self._packed_job
+        )
         self._workers.append(worker)
         return worker
 

@@ -1,11 +1,9 @@
-"""A policy behind Zenoh: found by its name at one or several endpoints, asked in lockstep, one
-server for an episode.
+"""A policy behind Zenoh: found by its name at one or several endpoints, queried in lockstep.
 
-What is answered late is waited for, and asked again by the same step, for as long as the run has
-patience with a policy: the server answers a step that it has answered before from what it kept. A
-server that is gone, frozen or begun anew has lost the episode, which is run again from its start.
-Sessions are asked in the environment's process: they hold nothing that others watch, and no handler
-runs in it.
+Each episode stays with one server. A late answer is waited for, and the request of its step is
+repeated, until the deadline of the run: the server answers a repeated step from its cache. A server
+that is gone, frozen or restarted has lost the episode, which is run again from its start. Sessions
+are used in the environment's process: nothing in them is watched by others, and no handler runs.
 """
 
 from __future__ import annotations
@@ -24,41 +22,30 @@ from bridge.policy_server import (
     MOST_MESSAGE_BYTES,
     POLICY_PROTOCOL,
     UNREADABLE,
-    Answer,
+    AskAct,
+    AskEnded,
     AskReset,
-    Begun,
     PackedArray,
     PolicyInfo,
-    Refusal,
-    decode_answered,
-    encode_asked,
+    encode_message,
     packed,
     policy_key,
 )
 from bridge.session import Session, open_session
-from cosim.core.errors import EngineError, MachineError, PolicyError, PolicyServerLost, UsageError
+from cosim.core.errors import EngineError, MachineError, PolicyServerLost, UsageError
 from cosim.episode.manifest_checks import with_goal
 from cosim.episode.policy_caller import Timer
 from cosim.policies.load import checked_manifest
 from cosim.spec.manifest import Manifest
 from cosim.spec.policy_host import PolicyHost, PolicyRuns
-from scenarios.ipc.shared_arrays import room_for
-from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy, PolicyQuestion
+from scenarios.ipc.deadlines import ServerTimes
+from scenarios.ipc.observation_codec import Arrays
+from scenarios.ipc.shared_memory import room_for
+from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy, PolicyServerBusy
 
 DOMAIN: Final = "default"
-_FOUND_WITHIN_S: Final = 60.0
-"""So long a server is waited for that has gone, before the run ends; it can be resumed."""
-_FIRST_FOUND_WITHIN_S: Final = 10.0
-_LOST_AFTER_S: Final = 3.0
-"""A server that nobody has heard of for so long is gone: a link that was cut is taken up again
-sooner."""
-_TRY_S: Final = 5.0
-_TOLD_WITHIN_S: Final = 1.0
-"""So long it is waited for the word that the end of an episode was heard: it may be busy, or
-hang."""
-_PAUSE_S: Final = 0.05
 _QUALITY: Final = 90
-"""Of JPEG."""
+"""Quality of JPEG pictures, of 100."""
 
 
 class _Server(NamedTuple):
@@ -77,10 +64,13 @@ class _Server(NamedTuple):
 
 
 class PolicyServers:
-    """The servers of a policy. source: as the run knows it, None where it does not know it yet."""
+    """The servers of a policy: carries the requests of one episode to one of them."""
 
-    def __init__(self, name: str, host: PolicyHost) -> None:
+    loses = True
+
+    def __init__(self, name: str, host: PolicyHost, times: ServerTimes = ServerTimes()) -> None:  # noqa: B008
         self.name = name
+        self.times = times
         self._host = host
         self._wanted: tuple[dict[str, Any], str] | None = None
         self._sessions: dict[str, Session] = {}
@@ -105,7 +95,7 @@ class PolicyServers:
     def choose(self) -> None:
         """Take the server with the least to do for the next episode. Raises MachineError when there
         is none."""
-        found = self._found(_FOUND_WITHIN_S)
+        found = self._found(self.times.found_s)
         same = [one for one in found if (one.info.manifest, one.info.source) == self._wanted]
         if not same:
             raise MachineError(
@@ -115,7 +105,7 @@ class PolicyServers:
         random.shuffle(same)
         self._server = min(same, key=lambda one: one.info.under_way)
 
-    def lay(self, arrays: dict[str, np.ndarray[Any, Any]]) -> dict[str, PackedArray]:
+    def lay(self, arrays: Arrays) -> dict[str, PackedArray]:
         return {
             name: _as_jpeg(array)
             if self._jpeg and name.rpartition("/")[2] == "rgb"
@@ -123,48 +113,46 @@ class PolicyServers:
             for name, array in arrays.items()
         }
 
-    def ask(self, question: PolicyQuestion) -> Begun | Answer | Refusal:
-        assert self._server is not None
-        session, info, _ = self._server
-        kind = str(question.__struct_config__.tag)
-        key = f"{policy_key(DOMAIN, self.name, info.server)}/{kind}"
-        payload = encode_asked(question)
-        unheard_since_s = (
-            None  # a question that was under way for long says nothing against the server
+    def ask(self, question: AskReset | AskAct) -> bytes:
+        unreached_since_s = (
+            None  # a request that was under way for long is no sign of a lost server
         )
-        to_end = kind == "ended"
         while True:
-            heard = session.ask_once(key, payload, timeout_s=_TOLD_WITHIN_S if to_end else _TRY_S)
-            if heard.how in ("answered", "refused"):
-                return self._read(heard.payload, question)
-            if heard.how == "late" and not to_end:
-                unheard_since_s = None
-                continue
+            how, payload = self._sent(question, self.times.try_s)
+            if how in ("answered", "refused"):
+                return payload
             now_s = time.monotonic()
-            unheard_since_s = now_s if unheard_since_s is None else unheard_since_s
-            if to_end or self._server.replaced or now_s - unheard_since_s > _LOST_AFTER_S:
-                raise PolicyServerLost(f"the server {info.server} of policy '{self.name}' is gone")
-            time.sleep(_PAUSE_S)
+            if how == "late":
+                unreached_since_s = None
+                continue
+            unreached_since_s = now_s if unreached_since_s is None else unreached_since_s
+            assert self._server is not None
+            if self._server.replaced or now_s - unreached_since_s > self.times.lost_after_s:
+                raise self._gone()
+            time.sleep(self.times.pause_s)
+
+    def tell_ended(self, question: AskEnded) -> None:
+        if self._sent(question, self.times.end_s)[0] not in ("answered", "refused"):
+            raise self._gone()
+
+    def _sent(self, question: AskReset | AskAct | AskEnded, timeout_s: float) -> tuple[str, bytes]:
+        """Send a request once. Returns how it went, and the reply."""
+        assert self._server is not None
+        kind = str(question.__struct_config__.tag)
+        key = f"{policy_key(DOMAIN, self.name, self._server.info.server)}/{kind}"
+        heard = self._server.session.ask_once(key, encode_message(question), timeout_s=timeout_s)
+        return heard.how, heard.payload
+
+    def _gone(self) -> PolicyServerLost:
+        assert self._server is not None
+        return PolicyServerLost(
+            f"the server {self._server.info.server} of policy '{self.name}' is gone"
+        )
 
     def close(self) -> None:
         for session in self._sessions.values():
             session.close()
         self._sessions.clear()
-
-    def _read(self, payload: bytes, question: PolicyQuestion) -> Begun | Answer | Refusal:
-        try:
-            reply = decode_answered(payload)
-        except UNREADABLE as error:
-            raise PolicyError(f"sent what is no answer: {error}") from None
-        if isinstance(reply, PolicyInfo):
-            raise PolicyError("told who it is when it was asked something else")
-        if isinstance(reply, Refusal) and reply.why == "unknown":
-            raise PolicyServerLost(f"the server of policy '{self.name}' has lost the episode")
-        if isinstance(reply, Refusal) and reply.why == "busy":
-            raise _ServerBusy(f"the server of policy '{self.name}' is busy: {reply.words}")
-        if isinstance(question, AskReset) and isinstance(reply, Answer):
-            raise PolicyError("answered a step when it was told of a beginning")
-        return reply  # type: ignore[no-any-return]
 
     def _found(self, within_s: float) -> list[_Server]:
         """All that answer, as soon as there is one. Raises MachineError."""
@@ -194,11 +182,7 @@ class PolicyServers:
                     f"start one with `cosim serve package:Policy --name {self.name} --listen "
                     "ENDPOINT`, and add --resume to a run that had begun"
                 )
-            time.sleep(_PAUSE_S)
-
-
-class _ServerBusy(PolicyServerLost):
-    """Another episode was faster."""
+            time.sleep(self.times.pause_s)
 
 
 class RemoteDriver(HostedDriver):
@@ -217,26 +201,31 @@ class RemoteDriver(HostedDriver):
 
     def reset(self, episode_id: str, seed: int) -> None:
         """A server that is free is looked for first, which takes no time of the policy's."""
-        until_s = time.monotonic() + _FOUND_WITHIN_S
+        until_s = time.monotonic() + self._servers.times.found_s
         while True:
             self._servers.choose()
             try:
                 return super().reset(episode_id, seed)
-            except _ServerBusy:
+            except PolicyServerBusy:
                 if time.monotonic() > until_s:
                     raise
-            time.sleep(_PAUSE_S)
+            time.sleep(self._servers.times.pause_s)
 
 
-def remote_driver(name: str, host: PolicyHost, timer: Timer | None = None) -> RemoteDriver:
+def remote_driver(
+    name: str,
+    host: PolicyHost,
+    timer: Timer | None = None,
+    times: ServerTimes = ServerTimes(),  # noqa: B008  a frozen value
+) -> RemoteDriver:
     """A policy as `zenoh:NAME`. Raises UsageError for one that cannot be asked so, MachineError
     when nobody answers."""
     called = name.partition(":")[2]
     if not host.servers:
         raise UsageError(f"policy '{name}' needs --policy-at ENDPOINT: where `cosim serve` listens")
-    servers = PolicyServers(called, host)
+    servers = PolicyServers(called, host, times)
     try:
-        infos = servers.know(_FIRST_FOUND_WITHIN_S)
+        infos = servers.know(times.first_found_s)
         info = infos[0]
         if info.protocol != POLICY_PROTOCOL:
             raise UsageError(

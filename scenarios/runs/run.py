@@ -1,50 +1,106 @@
-"""run(suite, policy) -> table: a suite run from Python, in this process or in several, into a run
-folder or none.
-
-What the command line does with options goes the same way: a run is planned, its folder held, what
-is left of it run.
-"""
+"""Run a suite: load, choose, plan, check, open, run, finish; for the command line and `cosim.run`
+alike."""
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from datetime import datetime
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from secrets import token_hex
+from typing import Any, NamedTuple, Protocol
 
 import msgspec
 import pandas as pd
 
+from bridge import keys
+from bridge.session import notices_of, open_session
 from cosim.core.errors import UsageError
-from cosim.core.progress import ignore
-from cosim.core.versions import versions
-from cosim.episode.camera_rules import check_camera
+from cosim.core.progress import Progress
+from cosim.core.progress import ignore as ignore_progress
+from cosim.core.units import milliseconds
 from cosim.episode.interfaces import Policy
-from cosim.episode.manifest_checks import with_goal
 from cosim.episode.policy_caller import Driver
-from cosim.policies.user_module import importable
-from cosim.results.record import METRIC_SCHEMA, NO_RENDERER
-from cosim.results.run_folder import RunFolder, read_spec, refuse_unbegun
-from cosim.results.run_spec import RunSpec, Shard
-from cosim.spec.episode_id import drawn_seed
-from cosim.spec.options import EpisodeOptions
+from cosim.results.run_folder import read_spec, refuse_unbegun, refuse_used
+from cosim.spec.connection import Connection
+from cosim.spec.injection import Live
+from cosim.spec.options import EpisodeOptions, Outside
 from cosim.spec.policy_host import PolicyHost
-from cosim.spec.robot import robot_called
-from cosim.spec.scenario import Scenario, Suite
+from cosim.spec.robot import COURIER, robot_called
+from cosim.spec.run_config import RunConfig, RunEnds
+from cosim.spec.scenario import Scenario, Suite, split_called
 from cosim.spec.selection import scenarios_chosen
-from physics.cameras.choice import camera_of_choice as chosen_camera
-from physics.cameras.choice import renderer_of
-from physics.robots import hash_of_robot
-from scenarios.ipc.deadlines import Patience
-from scenarios.ipc.messages import Hello, MessageHandler
+from physics.cameras.choice import camera_of_choice
+from scenarios.ipc.messages import MessageHandler
 from scenarios.runs.local import LocalProcesses
-from scenarios.runs.policy_host import known_driver
+from scenarios.runs.planning import PlannedRun, check_folder, held_run, planned_run
 from scenarios.runs.pool import run_all
 from scenarios.runs.shared_renderer import SharedRenderer, check_shared
 from scenarios.runs.transport import HeldRun, InProcess, TransportFactory
-from scenarios.suites.catalog import load_suite, with_robot
-from scenarios.suites.fits import check_places
+from scenarios.suites.catalog import load_suite, with_crowd, with_robot
+from scenarios.suites.fits import LOOKING, check_places
+from scenarios.suites.sample import suite_on_map
+
+Carrier = AbstractContextManager[TransportFactory]
+"""Connects to machines whose workers run the episodes, in place of processes of this machine."""
+_VEHICLES_SHARE = 2 / 3
+"""Vehicles that a crowd of so many people adds, for each person."""
+
+
+def ignore(message: object) -> None:
+    """Default callback: ignores the message."""
+
+
+class Given(NamedTuple):
+    """Objects of a Python caller, in place of what a config names. Without a folder such a run uses
+    a temporary one."""
+
+    suite: Suite | None = None
+    policy: Policy | None = None
+    options: EpisodeOptions | None = None
+    host: PolicyHost = PolicyHost()
+
+
+class Reporter(Protocol):
+    """Shows how a run goes. The command line has its own (`cosim.cli.run_display`)."""
+
+    def say(self, words: str) -> None:
+        """Show a notice in a line."""
+
+    def stage(self, words: str) -> AbstractContextManager[Progress]:
+        """Show what takes its time until the block ends."""
+
+    def planned(self, plan: PlannedRun) -> None:
+        """Called when the policy is loaded, before places are built."""
+
+    def opening(self, plan: PlannedRun, folder: Path) -> AbstractContextManager[None]:
+        """Entered before workers are connected and anything is written, for as long as the run
+        takes."""
+
+    def running(self, plan: PlannedRun, run: HeldRun) -> AbstractContextManager[MessageHandler]:
+        """Entered while episodes run; receives the messages of workers."""
+
+
+class Silent(NamedTuple):
+    """Shows nothing of a run. tell: receives the messages of workers."""
+
+    tell: MessageHandler = ignore
+
+    def say(self, words: str) -> None: ...
+
+    def stage(self, words: str) -> AbstractContextManager[Progress]:
+        return nullcontext(ignore_progress)
+
+    def planned(self, plan: PlannedRun) -> None: ...
+
+    def opening(self, plan: PlannedRun, folder: Path) -> AbstractContextManager[None]:
+        return nullcontext()
+
+    def running(self, plan: PlannedRun, run: HeldRun) -> AbstractContextManager[MessageHandler]:
+        return nullcontext(self.tell)
 
 
 def run(
@@ -66,271 +122,217 @@ def run(
 ) -> pd.DataFrame:
     """Run a suite with a policy; one row per episode, sorted by scenario, as in `results.csv`.
 
-    suite: one that was loaded, or a name or path as for `load_suite`. policy: an object, which
-    drives in this process, one episode after another; or a name, as "orca" or "my.py:Class", which
-    drives in `jobs` processes (one) that survive whatever it does; or, with `on` ("ray", "auto",
-    "ray://HOST:10001"), in those of a Ray cluster, as many as it has CPUs. episodes, scenarios,
-    events: run only the first so many, these ids, these kinds of events. shard: only a part of
-    that, as "1/4", of a run with a seed: `cosim merge` makes one of all. out: the run folder, to be
-    kept and resumed; without one only the table is. shared_renderer: one process draws for all the
-    others and, if the policy has `act_batch`, asks it (`BatchPolicy`). host: where a named policy
-    is asked: `PolicyHost(isolated=True)` gives it a process of its own. options: without a seed one
-    is drawn anew, or taken from the run that is resumed; it stands in every row (`run_seed`). tell:
-    takes in what workers say of their episodes.
+    suite: a loaded one, or a name or path as for `load_suite`. policy: an object drives in this
+    process; a name, as "my.py:Class", in `jobs` processes that survive its faults. episodes,
+    scenarios, events: run only the first so many, these ids, these kinds of events. shard: only a
+    part of that, as "1/4", of a run with a seed: `cosim merge` makes one of all. on: a Ray cluster
+    ("ray", "auto", "ray://HOST:10001") whose workers drive, by default as many as it has CPUs. out:
+    the run folder, kept and resumed; without one only the table is. shared_renderer: one process
+    draws for all others and asks a policy with `act_batch` (`BatchPolicy`). host: where a named
+    policy is asked: `PolicyHost(isolated=True)` gives it a process of its own. options: without a
+    seed one is drawn, or taken from the run that is resumed; each row has it (`run_seed`). tell:
+    receives the messages of workers.
 
-    Raises UsageError for names and options that do not exist, SpecError for scenarios that do not
-    fit their places, RunError for a folder that is of another run, MachineError when engines cannot
-    start. An episode that fails is a row with status "crashed".
+    An episode that fails is a row with status "crashed". Raises UsageError, SpecError, RunError,
+    MachineError.
 
     >>> table = run("reactive", "straight", scenarios=["obstructing-001"])
     >>> table[["scenario", "success"]].to_dict("records")
     [{'scenario': 'obstructing-001', 'success': 0.0}]
     """
+    _refuse_for_object(policy, jobs, on, host, shared_renderer)
+    config = RunConfig(
+        suite=suite if isinstance(suite, str) else suite.name,
+        policy=policy if isinstance(policy, str) else "",
+        episodes=episodes,
+        scenario=tuple(scenarios),
+        event=tuple(events),
+        shard=shard,
+        jobs=jobs,
+        on=on,
+        out=None if out is None else Path(out),
+        resume=resume,
+        shared_renderer=shared_renderer,
+        robot=options.robot,
+        real_time=options.real_time,
+        pace=options.pace,
+        latency=repr(options.latency_ms) if options.latency_ms else "",
+    )
+    given = Given(
+        suite=None if isinstance(suite, str) else suite,
+        policy=None if isinstance(policy, str) else policy,
+        options=options,
+        host=host,
+    )
+    return carry_out(config, given=given, reporter=Silent(tell))
+
+
+def _refuse_for_object(
+    policy: Policy | str, jobs: int | None, on: str, host: PolicyHost, shared: bool
+) -> None:
+    """Refuse other processes for a policy that is an object. Raises UsageError."""
     needs = {f"jobs={jobs}": jobs not in (None, 1), f"on='{on}'": on != "", "host": host.isolated}
     asked = next(
-        (words for words, is_asked in needs.items() if is_asked),
-        "shared_renderer=True" * shared_renderer,
+        (words for words, is_asked in needs.items() if is_asked), "shared_renderer=True" * shared
     )
     if asked and not isinstance(policy, str):
         raise UsageError(
             f"{asked} needs a policy by its name, such as 'my.py:Class': "
             "every process makes one of its own; an object drives in this process alone"
         )
-    if on:
-        from scenarios.runs.ray_workers import by_ray, check_on_ray
 
-        of_here = {
-            "shared_renderer": shared_renderer,
-            "real_time": options.real_time,
-            "live": options.live,
-            "pace": options.pace,
-        }
-        check_on_ray(on, of_here)
-    whole = with_robot(load_suite(suite) if isinstance(suite, str) else suite, options.robot)
-    of_run = scenarios_chosen(whole, scenarios, episodes, events)
-    folder = None if out is None else Path(out)
-    plan = planned_run(
-        whole,
-        of_run,
-        policy,
-        options,
-        shard=shard,
-        jobs=1 if on else jobs or 1,
-        shared_renderer=shared_renderer,
-        host=host,
-        resumed=folder if resume else None,
+
+def carry_out(
+    config: RunConfig,
+    *,
+    given: Given | None = None,
+    reporter: Reporter = Silent(),  # noqa: B008  a frozen value
+    carrier: Carrier | None = None,
+) -> pd.DataFrame:
+    """Run what a config asks for, and return the table of its results.
+
+    given: objects in place of what the config names. reporter: shows how it goes. carrier: connects
+    to workers elsewhere. Raises what `run` raises.
+    """
+    ends = config.ends
+    for line in (line for end in ends.all for line in notices_of(end)):
+        reporter.say(line)
+    _check_cluster(config, given)
+    if config.out is not None:
+        (refuse_unbegun if config.resume else refuse_used)(config.out)
+    whole = _loaded(config, given, reporter)
+    of_run = scenarios_chosen(
+        whole, config.scenario, config.episodes, config.event, split_called(config.split)
     )
-    check_places(whole, plan.picked)
+    plan = _planned(config, given, whole, of_run, ends)
+    reporter.planned(plan)
     with ExitStack() as stack:
-        if on:
-            reaches = stack.enter_context(by_ray(on, jobs, plan.policy, ignore))
-        else:
-            reaches = (
-                by_processes(jobs or 1) if isinstance(policy, str) else in_this_process(plan.driver)
-            )
-        folder = folder or Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run"
-        held = stack.enter_context(held_run(plan, folder, resume=resume))
-        run_what_is_left(plan, held, reaches, tell)
+        folder = config.out or _default_folder(plan, stack, temporary=given is not None)
+        plan = _checked(plan, folder, reporter, 1 if given else _lookers(config, carrier))
+        stack.enter_context(reporter.opening(plan, folder))
+        reaches = stack.enter_context(carrier or _workers(plan, given, reporter))
+        plan = stack.enter_context(_connected(plan, folder, ends))
+        held = stack.enter_context(held_run(plan, folder))
+        with reporter.running(plan, held) as hear:
+            _run_what_is_left(plan, held, reaches, hear)
         return held.held.finish()
 
 
-class PlannedRun(NamedTuple):
-    """What is to be run. of_run: of the suite `whole`; shard: which part of that, where not all;
-    policy: its name; driver: it, as it was loaded here; options: with the run's seed and camera;
-    shared_renderer: whether one process draws for all the others."""
-
-    whole: Suite
-    of_run: Sequence[Scenario]
-    shard: Shard | None
-    policy: str
-    driver: Driver
-    options: EpisodeOptions
-    host: PolicyHost
-    patience: Patience
-    shared_renderer: bool
-
-    @property
-    def picked(self) -> Sequence[Scenario]:
-        """What is run of it here."""
-        return self.of_run if self.shard is None else self.shard.share(self.of_run)
-
-    @property
-    def spec(self) -> RunSpec:
-        """What it is, for its folder. Raises UsageError."""
-        return run_spec(
-            self.whole,
-            self.of_run,
-            self.policy,
-            self.driver,
-            self.options,
-            self.shared_renderer,
-            self.shard,
-        )
-
-
-def planned_run(
-    whole: Suite,
-    of_run: Sequence[Scenario],
-    policy: Policy | str,
-    options: EpisodeOptions,
-    *,
-    shard: str = "",
-    jobs: int = 1,
-    shared_renderer: bool = False,
-    host: PolicyHost = PolicyHost(),  # noqa: B008  a frozen value
-    patience: Patience = Patience(),
-    resumed: Path | None = None,
-) -> PlannedRun:
-    """A run, once its policy is loaded and its seed drawn; its places have not been looked at.
-    shard: "1/4"; resumed: the folder of the run that it goes on with. Raises UsageError,
-    MachineError."""
-    policy = importable(policy) if isinstance(policy, str) else policy
-    part = Shard.called(shard, len(of_run)) if shard else None
-    if part is not None and options.seed is None and resumed is None:
-        raise UsageError(
-            "--shard needs --seed: shards are of one run, which has one seed: give the same to each"
-        )
-    driver = (
-        known_driver(policy, host, jobs, patience.start_s)
-        if isinstance(policy, str)
-        else Driver.of(policy)
-    )
-    name = (
-        policy
-        if isinstance(policy, str)
-        else f"{type(policy).__module__}:{type(policy).__qualname__}"
-    )
-    camera = chosen_camera(options.camera) if driver.manifest.camera is not None else "bullet"
-    seed = seed_of_run(options.seed, resumed)
-    options = msgspec.structs.replace(
-        options, seed=seed, suite_hash=whole.content_hash, camera=camera
-    )
-    check_alone(options, jobs, shared_renderer)
-    if shared_renderer:
-        check_shared(driver, camera)
-    return PlannedRun(whole, of_run, part, name, driver, options, host, patience, shared_renderer)
-
-
-@contextmanager
-def held_run(plan: PlannedRun, folder: Path, *, resume: bool) -> Iterator[HeldRun]:
-    """The run in its folder, begun there, or to be gone on with. Raises RunError for a folder of
-    another run."""
-    held = (
-        RunFolder.resume(folder, plan.spec, plan.whole)
-        if resume
-        else RunFolder.create(folder, plan.spec, plan.whole)
-    )
-    hello = Hello(
-        plan.policy,
-        plan.driver.manifest,
-        plan.driver.source_hash,
-        host=plan.host,
-        patience=plan.patience,
-    )
-    with held:
-        done = held.finished()
-        yield HeldRun(held, hello, plan.picked, [one for one in plan.picked if one.id not in done])
-
-
-def run_what_is_left(
-    plan: PlannedRun, run: HeldRun, reaches: TransportFactory, tell: MessageHandler
-) -> None:
-    """Run what is to be run of it, by workers that are reached so. Raises MachineError,
-    UsageError."""
-    if not run.todo:
+def _check_cluster(config: RunConfig, given: Given | None) -> None:
+    """Refuse what a cluster cannot do. Raises UsageError."""
+    if not config.on:
         return
-    with ExitStack() as stack:
-        renderer = None
-        if plan.shared_renderer:
-            asks = check_shared(plan.driver, chosen_camera(plan.options.camera))
-            drawing = SharedRenderer(
-                run.held.path / "logs", run.hello, asks=asks, patience=plan.patience
+    from scenarios.runs.ray_workers import check_on_ray
+
+    of_here: dict[str, Any] = {
+        "shared_renderer": config.shared_renderer,
+        "real_time": config.real_time,
+        "live": config.live if given is None or given.options is None else given.options.live,
+        "pace": config.pace,
+        "rerun": config.rerun,
+    }
+    words = {name: name if given else f"--{name.replace('_', '-')}" for name in of_here}
+    check_on_ray(config.on, {words[name]: asked for name, asked in of_here.items()})
+
+
+def _loaded(config: RunConfig, given: Given | None, reporter: Reporter) -> Suite:
+    """The suite of a run, with its robot and crowd. Raises UsageError, SpecError, MapError."""
+    if given is not None and given.suite is not None:
+        whole = given.suite
+    elif config.map is not None:
+        with reporter.stage(f"drawing routes on {config.map}"):
+            whole = suite_on_map(
+                config.suite,
+                config.map,
+                config.seed or 0,
+                config.episodes,
+                config.roughness or 0.0,
+                config.event,
+                robot=robot_called(config.robot or COURIER.name),
             )
-            renderer = stack.enter_context(drawing)
-        transport, tell = stack.enter_context(reaches(run, tell))
-        run_all(
-            run.held,
-            run.todo,
-            run.hello,
-            transport,
-            tell=tell,
-            options=plan.options,
-            renderer=renderer,
-        )
-
-
-def by_processes(jobs: int) -> TransportFactory:
-    """Workers that are so many processes of this machine."""
-    return lambda run, tell: nullcontext((LocalProcesses(run.held.path / "logs", jobs), tell))
-
-
-def in_this_process(driver: Driver) -> TransportFactory:
-    """This process is the worker."""
-    return lambda run, tell: nullcontext((InProcess(driver), tell))
-
-
-def run_spec(
-    whole: Suite,
-    picked: Sequence[Scenario],
-    policy: str,
-    driver: Driver,
-    options: EpisodeOptions,
-    shared: bool = False,
-    shard: Shard | None = None,
-) -> RunSpec:
-    """What a run is, for its folder. policy: its name; shared: one renderer draws for all of it;
-    shard: what of it the folder holds, if not all. Raises UsageError when a robot has no such
-    camera, unless one of its own was asked for, or the policy cannot be given what it asks for."""
-    manifest = with_goal(driver.manifest, options.goal)
-    robots = [robot_called(name) for name in sorted({one.robot for one in picked})]
-    if manifest.camera is not None:
-        for robot in robots:
-            check_camera(manifest, robot, options.own_camera)
-    return RunSpec(
-        suite=whole.name,
-        robots={robot.name: hash_of_robot(robot) for robot in robots},
-        suite_version=whole.version,
-        metric_schema=METRIC_SCHEMA,
-        suite_hash=whole.content_hash,
-        policy=policy,
-        policy_name=manifest.name,
-        policy_version=manifest.version,
-        policy_source=driver.source_hash,
-        policy_runs=driver.runs,
-        waypoints=manifest.waypoints,
-        camera=manifest.camera,
-        cameras=dict(manifest.cameras),
-        rate_hz=manifest.rate_hz,
-        goal_protocol=manifest.goal,
-        odometry=manifest.odometry,
-        latency_ms=options.latency_ms,
-        real_time=options.real_time,
-        seed=0 if options.seed is None else options.seed,
-        scenarios=tuple(s.id for s in picked),
-        versions=versions(),
-        renderer=renderer_of(chosen_camera(options.camera))
-        if manifest.camera is not None
-        else NO_RENDERER,
-        counterfactual=options.counterfactual,
-        shared_renderer=shared,
-        shard=shard,
+        reporter.say(whole.description)
+    else:
+        whole = load_suite(config.suite)
+    return with_crowd(
+        with_robot(whole, config.robot),
+        persons=config.crowd,
+        vehicles=None if config.crowd is None else round(_VEHICLES_SHARE * config.crowd),
+        residents=config.residents,
+        groups=config.groups,
+        elderly=config.elderly,
+        children=config.children,
     )
 
 
-def check_alone(options: EpisodeOptions, jobs: int, shared: bool) -> None:
-    """Raises UsageError where the answers of a run in real time would wait for those of other
-    episodes."""
-    if options.real_time and (jobs != 1 or shared):
-        much = "a shared renderer" if shared else f"{jobs} jobs"
-        raise UsageError(
-            f"in real time every answer is timed, and {much} would be timed too: take one "
-            f"job, without it"
+def _planned(
+    config: RunConfig, given: Given | None, whole: Suite, of_run: Sequence[Scenario], ends: RunEnds
+) -> PlannedRun:
+    if given is not None:
+        return planned_run(
+            config, whole, of_run, policy=given.policy, options=given.options, host=given.host
         )
+    host = PolicyHost(isolated=config.isolated, servers=ends.servers, run=token_hex(8))
+    return planned_run(config, whole, of_run, host=host)
+
+
+def _default_folder(plan: PlannedRun, stack: ExitStack, *, temporary: bool) -> Path:
+    """The folder of a run that names none."""
+    if temporary:
+        return Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run"
+    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+    shard = "" if plan.shard is None else f"-{plan.shard.number}-of-{plan.shard.of}"
+    return Path("runs") / f"{plan.whole.name}-{plan.driver.manifest.name}-{stamp}{shard}"
+
+
+def _lookers(config: RunConfig, carrier: Carrier | None) -> int:
+    """Processes that look at places."""
+    return (config.jobs or 1) if carrier is None and not config.on else len(os.sched_getaffinity(0))
+
+
+def _checked(plan: PlannedRun, folder: Path, reporter: Reporter, jobs: int) -> PlannedRun:
+    """Check folder and places of a run, and measure its latency where that is asked for."""
+    latency_ms = plan.config.latency_ms
+    if latency_ms is None and plan.config.resume:
+        latency_ms = read_spec(folder).setup.latency_ms
+    if latency_ms is not None:
+        plan = _late(plan, latency_ms)
+    if plan.config.resume:
+        check_folder(plan, folder)
+    with reporter.stage(LOOKING) as looking:
+        check_places(plan.whole, plan.picked, looking, jobs)
+    return _late(plan, _measured(plan, reporter)) if latency_ms is None else plan
+
+
+def _late(plan: PlannedRun, latency_ms: float) -> PlannedRun:
+    return plan._replace(options=msgspec.structs.replace(plan.options, latency_ms=latency_ms))
+
+
+def _measured(plan: PlannedRun, reporter: Reporter) -> float:
+    """The latency that the policy shows in the first episode, in milliseconds."""
+    first = plan.picked[0]
+    with reporter.stage(f"measuring the latency of {plan.policy} in {first.id}"):
+        answer_ms, latency_ms = measured_latency(
+            plan.whole, first, plan.policy, plan.options, plan.host
+        )
+    reporter.say(
+        f"Latency {latency_ms:g} ms, that of every command of this run: in {first.id} an "
+        f"answer took "
+        f"{milliseconds(answer_ms)} (median), and commands take effect at whole ticks of 50 ms."
+    )
+    if latency_ms > (period_ms := 1000.0 / plan.driver.manifest.rate_hz):
+        reporter.say(
+            f"That is longer than its period of {period_ms:g} ms, at which it is asked all the "
+            "same. With --real-time it is not asked again before it has answered."
+        )
+    return latency_ms
 
 
 class MeasuredLatency(NamedTuple):
-    """Medians over an episode. answer_ms: what the policy took for an answer. latency_ms: after
-    what they answer the commands took effect, at whole ticks."""
+    """Medians over an episode, in milliseconds.
+
+    answer_ms: what the policy took for an answer.
+    latency_ms: after what they answer the commands took effect, at whole ticks.
+    """
 
     answer_ms: float
     latency_ms: float
@@ -343,8 +345,8 @@ def measured_latency(
     options: EpisodeOptions,
     host: PolicyHost = PolicyHost(),  # noqa: B008  a frozen value
 ) -> MeasuredLatency:
-    """The latency that a policy shows on this machine in an episode in real time, in a process of
-    its own. Raises UsageError when that does not come to its end."""
+    """Measure the latency of a policy in an episode in real time, in a process of its own. Raises
+    UsageError where the episode does not come to its end."""
     alone = EpisodeOptions(
         seed=options.seed,
         robot=options.robot,
@@ -362,12 +364,74 @@ def measured_latency(
     return MeasuredLatency(float(row["answer_ms"]), float(row["latency_ms"]))
 
 
-def seed_of_run(asked: int | None, resumed: Path | None) -> int:
-    """The seed that was asked for; else that of the run that is resumed; else one that is drawn
-    anew."""
-    if asked is not None:
-        return asked
-    if resumed is None:
-        return drawn_seed()
-    refuse_unbegun(resumed)
-    return read_spec(resumed).seed
+def _workers(plan: PlannedRun, given: Given | None, reporter: Reporter) -> Carrier:
+    """How the workers of a run are reached: in a cluster, in this process, or as processes of this
+    machine."""
+    if plan.config.on:
+        from scenarios.runs.ray_workers import by_ray
+
+        return by_ray(plan.config.on, plan.config.jobs, plan.policy, reporter.say)
+    if given is not None and given.policy is not None:
+        return nullcontext(partial(_in_this_process, plan.driver))
+    return nullcontext(partial(_by_processes, plan.config.jobs or 1))
+
+
+def _by_processes(
+    jobs: int, run: HeldRun, tell: MessageHandler
+) -> AbstractContextManager[tuple[LocalProcesses, MessageHandler]]:
+    return nullcontext((LocalProcesses(run.held.path / "logs", jobs), tell))
+
+
+def _in_this_process(
+    driver: Driver, run: HeldRun, tell: MessageHandler
+) -> AbstractContextManager[tuple[InProcess, MessageHandler]]:
+    return nullcontext((InProcess(driver), tell))
+
+
+@contextmanager
+def _connected(plan: PlannedRun, folder: Path, ends: RunEnds) -> Iterator[PlannedRun]:
+    """Connect a run to its director, and put it on the air, where the config says so."""
+    options = plan.options
+    named = keys.chunk(folder.name)
+    if ends.director is not None:
+        outside = Outside(connection=ends.director, run=named, wait_s=plan.config.director_wait)
+        options = msgspec.structs.replace(options, director=outside)
+    with _on_the_air(ends.live, named) as live:
+        if live is not None:
+            options = msgspec.structs.replace(options, live=live)
+        yield plan._replace(options=options)
+
+
+@contextmanager
+def _on_the_air(air: Connection | None, named: str) -> Iterator[Live | None]:
+    if air is None:
+        yield None
+        return
+    with open_session(air) as hub:
+        yield Live(connection=hub.inside, run=named)
+
+
+def _run_what_is_left(
+    plan: PlannedRun, run: HeldRun, reaches: TransportFactory, tell: MessageHandler
+) -> None:
+    """Run the episodes that have no result yet. Raises MachineError, UsageError."""
+    if not run.todo:
+        return
+    with ExitStack() as stack:
+        renderer = None
+        if plan.config.shared_renderer:
+            asks = check_shared(plan.driver, camera_of_choice(plan.options.camera))
+            drawing = SharedRenderer(
+                run.held.path / "logs", run.hello, asks=asks, patience=plan.patience
+            )
+            renderer = stack.enter_context(drawing)
+        transport, tell = stack.enter_context(reaches(run, tell))
+        run_all(
+            run.held,
+            run.todo,
+            run.hello,
+            transport,
+            tell=tell,
+            options=plan.options,
+            renderer=renderer,
+        )

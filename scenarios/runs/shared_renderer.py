@@ -22,9 +22,8 @@ from cosim.spec.manifest import Manifest
 from cosim.spec.options import CameraName, RendererAt
 from scenarios.ipc.child_process import KeptProcess
 from scenarios.ipc.deadlines import Patience
-from scenarios.ipc.messages import Hello
-from scenarios.ipc.render_protocol import RendererHello, encode_exchange
-from scenarios.runs.watchdog import Watchdog
+from scenarios.ipc.messages import Hello, encode_message
+from scenarios.ipc.watchdog import Watchdog
 
 RENDERERS: Final = 3
 """So many may end, one after the other, without an episode that ends in between."""
@@ -121,7 +120,8 @@ class SharedRenderer:
     def _start(self) -> None:
         log = self._logs / f"renderer-{len(self._ends)}.log"
         process = KeptProcess(log, _SERVES, "renderer", (self._listening.fileno(),))
-        process.send(encode_exchange(RendererHello(self._hello, len(self._ends) + 1)))
+        at = msgspec.structs.replace(self.at, number=len(self._ends) + 1)
+        process.send(encode_message(msgspec.structs.replace(self._hello, renderer=at)))
         self._watchdog = Watchdog(process, self._patience, _SILENCE_S)
 
     def _replace(self, watchdog: Watchdog, end: End, *, blames_policy: bool) -> None:

@@ -19,10 +19,12 @@ from socket import socket
 
 import msgspec
 
+from bridge.policy_server import said_by
 from cosim.core.clock import Clock
 from cosim.core.errors import MachineError, RendererLost, UsageError
 from cosim.core.framing import Wire
-from cosim.episode.policy_caller import Driver, said_by
+from cosim.core.versions import versions
+from cosim.episode.policy_caller import Driver
 from cosim.episode.step import Step
 from cosim.policies.load import load_policy
 from cosim.results.referee import Verdict
@@ -43,8 +45,9 @@ from scenarios.ipc.messages import (
     decode_job,
     encode_message,
 )
-from scenarios.ipc.render_link import AskedElsewhere, link_to
+from scenarios.ipc.render_link import link_to
 from scenarios.runs.policy_host import policy_driver
+from scenarios.runs.shared_policy import shared_driver
 
 REPORT_EVERY_TICKS = 20
 CANNOT_START = "an environment process cannot start:"
@@ -131,7 +134,9 @@ def drivers_here(
 ) -> DriversHere:
     """See `policy_here`; the learner is held against what it was for the run in the same way."""
     if hello.renderer is not None and hello.renderer.asks:
-        driver: Driver = AskedElsewhere(hello.manifest, hello.source_hash, hello.renderer)
+        driver: Driver = shared_driver(
+            hello.manifest, hello.source_hash, hello.renderer, hello.host.run
+        )
     else:
         driver = policy_here(hello, timer, say, again=again)
     if (learner := hello.learner) is None:
@@ -198,12 +203,14 @@ def run_job(
         expert = Demonstrator(driver, collecting, job.options.goal, learner)
     watcher = _Watcher(job, say)
     try:
-        if (shared := job.options.renderer) is not None:
-            link_to(shared.address, lambda: say(Waits(name, "waits for the shared renderer")))
+        if job.renderer is not None:
+            link_to(job.renderer.address, lambda: say(Waits(name, "waits for the shared renderer")))
         outcome = run_episode(
             job.scenario,
             expert or driver,
             job.options,
+            setup=job.setup and msgspec.structs.replace(job.setup, versions=versions()),
+            renderer=job.renderer,
             watches=[watcher.watch],
             waiting=lambda reason, _=None: say(Waits(name, reason)),
             comparing=watcher.compared,

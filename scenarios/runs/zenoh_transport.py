@@ -340,7 +340,7 @@ class ZenohWorkers:
         assert report.done is not None
         if digest_of(report.done) != report.digest or report.done.scenario != report.scenario:
             raise EngineError("the result was damaged on its way")
-        run = self._spec
+        run = self._spec.setup
         origin = origin_of(report.done)
         if origin is None:
             return ""

@@ -22,7 +22,7 @@ from cosim.core.files import atomic_folder, folder_holds
 from cosim.core.progress import Progress, ignore
 from cosim.place.map_check import MapCheck, check_map
 from cosim.place.street_map import StreetMap
-from cosim.spec.scenario import CityMap
+from cosim.spec.scenario import CityMap, Place
 from sumo_nets.maps.feature_file import NAME, read_features, with_features, write_features
 from sumo_nets.maps.import_rules import NEWEST_RULES, SUITE_RULES
 from sumo_nets.maps.importer import OSM_LICENCE, Options, convert
@@ -33,6 +33,9 @@ from sumo_nets.net.raw_file import head_of
 from sumo_nets.net.snapshot import street_map_of
 
 ABOUT = "about.json"
+OSM_CREDIT = "(c) OpenStreetMap contributors, ODbL"
+"""The credit on pictures of places made from OpenStreetMap data; picture fonts have no copyright
+sign."""
 GENERIC = ("input", "map", "net", "network", "osm", "converted", "export", "planet", "osm_bbox")
 """File names that name no place: the folder's name is taken instead."""
 NAMES = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
@@ -169,6 +172,18 @@ def about_map(name: str) -> About:
         return msgspec.json.decode(path.read_bytes(), type=About)
     except (OSError, msgspec.DecodeError, msgspec.ValidationError) as error:
         raise MapError(f"{path}: cannot be read: {error}: import the map '{name}' again") from error
+
+
+def credit_of(place: Place) -> str:
+    """Return the credit that pictures of a place need; "" where its map is not known to be from
+    OpenStreetMap."""
+    if not isinstance(place, CityMap):
+        return ""
+    try:
+        licences = about_map(place.map).licences
+    except (MapError, UsageError):
+        return ""
+    return OSM_CREDIT if OSM_LICENCE in licences else ""
 
 
 def checked_map(name: str) -> tuple[StreetMap, MapCheck, About]:

@@ -14,12 +14,12 @@ from typing import Any
 import msgspec
 import pytest
 
-from cosim.cli.options import LONGEST_WAIT_S
 from cosim.episode.control import Command
 from cosim.episode.interfaces import Observation
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.connection import Connection
 from cosim.spec.manifest import Manifest
+from cosim.spec.run_config import LONGEST_WAIT_S
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from scenarios.events import EVENT_KINDS
 from tests.conftest import PATIENCE_S, Cosim

@@ -12,7 +12,6 @@ from cosim.core.errors import SpecError, UsageError
 from cosim.core.geometry import Pose
 from cosim.core.state import People, RobotState, Street
 from cosim.episode.camera_rules import nonstandard
-from cosim.results.record import begun
 from cosim.results.run_folder import read_records, read_spec
 from cosim.results.table import table_row
 from cosim.spec.camera import CameraSpec, Lens
@@ -27,6 +26,7 @@ from physics.street.street_surface import StreetSurface
 from scenarios.episodes.episode import Episode
 from scenarios.runs.run import run
 from scenarios.tools.verify.doctor import small_scenario
+from tests.run_specs import record_of
 from tests.support.cheats import FarEye
 from tests.support.tiny_street import tiny_map
 
@@ -113,15 +113,19 @@ def test_every_record_and_row_tells_what_the_policy_saw_by() -> None:
         rate_hz=5.0,
         camera=CameraSpec(512, 288, 60.0, crop=(0, 88, 512, 288), lens=Lens(k1=0.1)),
     )
-    record = begun(SHORT, manifest, "h")
-    far = begun(SHORT, FarEye.manifest, "h")
-    assert (record.camera, record.rate_hz, record.nonstandard) == (manifest.camera, 5.0, "")
+    record = record_of(SHORT, manifest)
+    far = record_of(SHORT, FarEye.manifest)
+    assert (record.manifest.camera, record.manifest.rate_hz, record.nonstandard) == (
+        manifest.camera,
+        5.0,
+        "",
+    )
     row = table_row(record)
     assert row["camera"] == "front, 512 x 288 px, 60 deg, crop 0 88 512 288, lens"
     assert (
         row["rate_hz"],
         row["nonstandard"],
-        table_row(begun(SHORT, Manifest("b", camera=None), "h"))["camera"],
+        table_row(record_of(SHORT, Manifest("b", camera=None)))["camera"],
     ) == (
         5.0,
         "",
@@ -131,10 +135,9 @@ def test_every_record_and_row_tells_what_the_policy_saw_by() -> None:
         table_row(far)["nonstandard"]
         == "a camera of its own at (6, 0, 18) m, 80 deg down, 0 to the left"
     )
-    on_scout = begun(
+    on_scout = record_of(
         msgspec.structs.replace(SHORT, robot="scout"),
         Manifest("m", camera=CameraSpec(mount="left")),
-        "h",
     )
     assert (
         on_scout.nonstandard
@@ -205,4 +208,8 @@ def test_a_run_with_a_camera_of_its_own_marks_every_row(tmp_path: Path) -> None:
     ]
     assert list(table["camera"]) == ["own mount, 64 x 64 px, 75 deg"]
     (record,) = read_records(tmp_path / "run")
-    assert record.camera == FarEye.manifest.camera == read_spec(tmp_path / "run").camera
+    assert (
+        record.manifest.camera
+        == FarEye.manifest.camera
+        == read_spec(tmp_path / "run").manifest.camera
+    )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import os
 import signal
 from collections.abc import Callable, Sequence
@@ -15,13 +14,14 @@ from shapely.geometry import box
 
 from cosim.core.errors import PolicyError
 from cosim.core.geometry import Polyline, Pose
-from cosim.core.state import STILL, Command, People, Planned, RobotState, Signal, Vehicles
+from cosim.core.state import STILL, Command, People, RobotState, Signal, Vehicles
 from cosim.episode.interfaces import Observation, Privileged
-from cosim.episode.policy_caller import BatchDriver, Driver, PolicyCall
+from cosim.episode.policy_caller import Driver, PolicyCall
 from cosim.spec.camera import Calibration, CameraPicture, CameraSpec
 from cosim.spec.goal import ImageGoal, RoutePatch
 from cosim.spec.manifest import Manifest, WaypointRule
 from cosim.spec.robot import COURIER
+from tests.conftest import without_lines
 
 MINE = Manifest("mine", camera=None)
 
@@ -103,13 +103,30 @@ def test_whatever_a_policy_raises_is_its_crash(deaf: None, error: BaseException,
     name and the time."""
     with pytest.raises(PolicyError) as caught:
         Driver(Fake(raising(error))).act(seen(tick=2))
-    assert str(caught.value).startswith("policy 'mine' raised ") and told in str(caught.value)
+    assert str(caught.value).startswith("policy 'mine' raised ") and told in without_lines(
+        str(caught.value)
+    )
     str(caught.value).encode()
+
+
+def test_a_crash_names_the_last_line_of_the_users_code() -> None:
+    """File and line of the policy, also where numpy or a class of this project raised."""
+
+    def by_numpy(_: Observation) -> Command:
+        return Command(float(np.zeros(3).reshape(2)[0]), 0.0)
+
+    line = by_numpy.__code__.co_firstlineno + 1
+    with pytest.raises(
+        PolicyError, match=rf"size 3 into shape \(2,\) in test_driver\.py:{line} \(act at 0\.00 s\)"
+    ):
+        Driver(Fake(by_numpy)).act(seen(tick=0))
 
 
 def test_a_reset_that_raises_is_a_crash_too() -> None:
     """It is told as what happened in reset."""
-    with pytest.raises(PolicyError, match=r"policy 'mine' raised SystemExit: 3 \(reset\)"):
+    with pytest.raises(
+        PolicyError, match=r"policy 'mine' raised SystemExit: 3 in test_driver\.py:\d+ \(reset\)"
+    ):
         Driver(Fake(lambda _: STILL)).reset("bad", 0)
 
 
@@ -261,90 +278,6 @@ def test_a_policy_at_work_is_timed() -> None:
     ]
 
 
-class Pair(Fake):
-    """Acts for many episodes as it is told."""
-
-    def act_batch(self, observations: Sequence[Observation]) -> Sequence[Command]:
-        return self.does(observations)  # type: ignore[arg-type, return-value]
-
-
-def of_two(does: Callable[[Sequence[Observation]], object]) -> list[Command | PolicyError]:
-    """What comes of an answer for two episodes, "a" at tick 2 and "b" at tick 4."""
-    driver = Driver(Pair(does))  # type: ignore[arg-type]
-    assert driver.batches and not Driver(Fake(lambda _: STILL)).batches
-    two = [dataclasses.replace(seen(tick), episode=name) for tick, name in ((2, "a"), (4, "b"))]
-    return BatchDriver(driver).act_batch(two)
-
-
-def test_a_batch_is_answered_in_its_order() -> None:
-    """With commands within the robot's limits, or with waypoints of each."""
-    assert of_two(lambda two: [Command(0.1 * one.tick, 9.0) for one in two]) == [
-        Command(0.2, COURIER.w_max_radps),
-        Command(0.4, COURIER.w_max_radps),
-    ]
-    planned = of_two(lambda two: np.array([[[0.1, 0.0]] * 3, [[0.2, 0.0]] * 3]))
-    assert [(one.v_mps, one.waypoints[0, 0]) for one in planned if isinstance(one, Planned)] == [
-        (0.4, np.float32(0.1)),
-        (0.8, np.float32(0.2)),
-    ]
-
-
-def test_a_bad_answer_in_a_batch_is_one_episodes_crash() -> None:
-    """The other one has its command."""
-    good, bad = of_two(lambda _: [STILL, Command(float("nan"), 0.0)])
-    assert good == STILL and "must be finite numbers (act at 0.20 s)" in str(bad)
-    good, bad = of_two(lambda _: [STILL, np.zeros((50_001, 2))])
-    assert (
-        good == STILL
-        and "(50001, 2): 100002 numbers; an answer holds at most 100000 (act at 0.20 s)" in str(bad)
-    )
-
-
-@pytest.mark.parametrize(
-    ("does", "told"),
-    [
-        (raising(KeyError("no such weight")), "raised KeyError: 'no such weight'"),
-        (raising(SystemExit(3)), "raised SystemExit: 3"),
-        (lambda _: [STILL], "gave 1 answers to 2 observations"),
-        (
-            lambda two: (STILL for _ in two),
-            "answered a generator: a batch is answered with a sequence",
-        ),
-        (lambda _: None, "answered a NoneType: a batch is answered with a sequence"),
-    ],
-    ids=["error", "exit", "one-too-few", "generator", "nothing"],
-)
-def test_what_is_no_answer_to_a_batch_is_the_crash_of_all_of_it(
-    does: Callable[[Sequence[Observation]], object], told: str
-) -> None:
-    """Each is told at its own time."""
-    assert [str(error) for error in of_two(does)] == [
-        f"policy 'mine' {told} (act at {time} s, asked for 2 episodes together)"
-        for time in ("0.10", "0.20")
-    ]
-
-
-def test_the_first_answer_of_any_episode_of_a_batch_may_take_longer() -> None:
-    """A question is a first one while one of its episodes has not been answered since its reset."""
-    asked: list[PolicyCall] = []
-
-    class Notes:
-        def starts(self, doing: PolicyCall, tick: int) -> None:
-            asked.append(doing)
-
-        def stops(self) -> None:
-            """Nothing to note."""
-
-    batch = BatchDriver(Driver(Pair(lambda two: [STILL for _ in two]), timer=Notes()))  # type: ignore[arg-type,misc]
-    one, two = (dataclasses.replace(seen(), episode=name) for name in ("a", "b"))
-    for observations in ([one], [one], [one, two], [one, two]):
-        batch.act_batch(observations)
-    batch.reset("b", 0)
-    batch.act_batch([one, two])
-    puts = [doing for doing, _ in itertools.groupby(asked)]
-    assert puts == ["first act", "act", "first act", "act", "reset", "first act"]
-
-
 def test_what_a_policy_writes_into_its_goal_and_further_pictures_nobody_sees() -> None:
     """Goals that are pictures or patches, depth, labels, pictures of further cameras: copies; and
     its manifest is what it was, whatever it adds to the one of its class."""
@@ -414,14 +347,10 @@ class RemembersMany(Remembers):
     """The same for many episodes."""
 
     def on_reset(self, episode_id: str) -> None:  # type: ignore[override]
-        if episode_id == "bad":
-            raise LookupError("no history")
         self.noted(("on_reset", episode_id))
 
     def ended(self, episode_id: str) -> None:
         self.noted(("ended", episode_id))
-        if episode_id == "bad":
-            raise LookupError("no such episode")
 
     def act_batch(self, observations: Sequence[Observation]) -> list[Command]:
         return [self.noted(one.episode) for one in observations]
@@ -440,9 +369,8 @@ def test_on_reset_comes_before_the_act_that_follows_a_teleport() -> None:
         1.0, 0.0
     )
     policy.on_reset = lambda: [][0]  # type: ignore[method-assign]
-    with pytest.raises(
-        PolicyError, match=r"raised IndexError: list index out of range \(on_reset at 0\.50 s\)"
-    ):
+    where = r"in test_driver\.py:\d+ \(on_reset at 0\.50 s\)"
+    with pytest.raises(PolicyError, match=rf"raised IndexError: list index out of range {where}"):
         driver.act(put_back("", 10))
 
 
@@ -456,25 +384,17 @@ def test_a_policy_for_many_episodes_is_told_which_was_put_back_and_which_has_end
     driver.ended()
     driver.ended()
     assert policy.told == [("on_reset", "a"), "act", ("ended", "a")]
-    many = RemembersMany()
-    batch = BatchDriver(Driver(many))
-    batch.act_batch([put_back("a", 5), dataclasses.replace(seen(10), episode="b")])
-    batch.ended("a")
-    assert many.told == [("on_reset", "a"), "a", "b", ("ended", "a")]
+    assert driver.batches and not Driver(Remembers()).batches
 
 
-def test_an_on_reset_that_raises_is_the_crash_of_its_episode_alone(
-    capfd: pytest.CaptureFixture[str],
-) -> None:
-    """The others of the batch are answered, in their order; an `ended` that raises is printed and
-    nobody's crash."""
-    many = RemembersMany()
-    batch = BatchDriver(Driver(many))
-    first, bad, last = batch.act_batch([put_back("a", 5), put_back("bad", 6), put_back("c", 7)])
-    assert (first, last) == (STILL, STILL) and many.told[-2:] == ["a", "c"]
-    assert str(bad) == "policy 'mine' raised LookupError: no history (on_reset at 0.30 s)"
-    assert (
-        isinstance(batch.act_batch([put_back("bad", 6)])[0], PolicyError) and many.told[-1] == "c"
-    )
-    batch.ended("bad")
+def test_an_ended_that_raises_is_printed_and_no_crash(capfd: pytest.CaptureFixture[str]) -> None:
+    """The episode is over."""
+
+    class Fails(RemembersMany):
+        def ended(self, episode_id: str) -> None:
+            raise LookupError("no such episode")
+
+    driver = Driver(Fails())
+    driver.reset("a", 0)
+    driver.ended()
     assert "policy 'mine' raised LookupError: no such episode (ended)" in capfd.readouterr().err

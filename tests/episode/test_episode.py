@@ -122,7 +122,7 @@ def test_an_episode_tells_its_policy_an_opaque_name_and_a_seed(scenario: Scenari
 
     records = [run_episode(scenario, Noting(), EpisodeOptions(seed=seed)).record for seed in (1, 2)]
     assert told == [pseudonym_of(seed, scenario) for seed in (1, 2)] and told[0] != told[1]
-    assert [(one.run_seed, one.episode) for one in records] == [(1, told[0][0]), (2, told[1][0])]
+    assert [(one.setup.seed, one.episode) for one in records] == [(1, told[0][0]), (2, told[1][0])]
     assert records[0].state_hash == records[1].state_hash
 
 

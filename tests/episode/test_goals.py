@@ -12,7 +12,6 @@ import pytest
 from cosim.core.errors import UsageError
 from cosim.core.geometry import Polyline, Pose
 from cosim.episode.manifest_checks import calibration_of, with_goal
-from cosim.results.record import Record, begun
 from cosim.results.table import table_row
 from cosim.spec.camera import CameraSpec, Lens
 from cosim.spec.goal import (
@@ -36,6 +35,7 @@ from cosim.spec.manifest import Manifest
 from cosim.spec.robot import COURIER, Mount
 from cosim.spec.scenario import City, RouteCrossing, Scenario
 from scenarios.suites.catalog import load_suite
+from tests.run_specs import record_of
 
 CORNER = ((0.0, 0.0), (40.0, 0.0), (40.0, 60.0))
 NORTH = 0.5 * math.pi
@@ -317,8 +317,7 @@ def test_goals_and_odometry_that_there_are_none_of_are_refused_with_the_valid_on
 def test_goals_and_odometry_stand_in_every_row() -> None:
     """Those that the policy was given, and whether it was privileged."""
     manifest = with_goal(Manifest("mine", goal="image", odometry="wheel"), "route_point")
-    record: Record = begun(scenario(), manifest, "")
-    row = table_row(record)
+    row = table_row(record_of(scenario(), manifest))
     assert (row["goal_protocol"], row["odometry"], row["privileged"]) == (
         "route_point",
         "wheel",

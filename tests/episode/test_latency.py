@@ -12,7 +12,6 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cosim.cli.options import with_latency
 from cosim.cli.run_table import print_terms
 from cosim.core.errors import UsageError
 from cosim.core.geometry import Floats
@@ -20,20 +19,22 @@ from cosim.core.state import STILL, Command
 from cosim.episode.command_delay import InFlight
 from cosim.episode.interfaces import Observation
 from cosim.results.log import Log
-from cosim.results.record import Record, begun
+from cosim.results.record import Record
 from cosim.results.run_folder import read_records, read_spec
 from cosim.results.table import table_of
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
+from cosim.spec.run_config import RunConfig
 from cosim.spec.scenario import Scenario, Suite, write_suite
 from scenarios.episodes.replay import Recorded, replayed
 from scenarios.episodes.run_episode import run_episode
 from scenarios.runs import run as suite_run
-from scenarios.runs.run import check_alone
+from scenarios.runs.planning import check_alone
 from scenarios.suites.catalog import load_suite
 from scenarios.tools.verify.doctor import small_scenario
 from tests.cli.terminal.test_run_table import terminal
 from tests.conftest import Cosim
+from tests.run_specs import changed, record_of
 
 
 def commands(answers: Floats, ticks: int) -> Floats:
@@ -93,11 +94,11 @@ def test_tables_tell_of_latency_where_there_is_any() -> None:
         print_terms(out, table_of(records))
         return " ".join(said.getvalue().split())
 
-    none = begun(load_suite("reactive").scenarios[0], Manifest("m", camera=None), "h")
-    given = msgspec.structs.replace(none, latency_ms=200.0)
-    crashed = msgspec.structs.replace(none, real_time=True)
+    none = record_of(load_suite("reactive").scenarios[0], Manifest("m", camera=None))
+    given = changed(none, latency_ms=200.0)
+    crashed = changed(none, real_time=True)
     real = [
-        msgspec.structs.replace(crashed, latency_ms=ms, ended="goal", clock={"answer_ms": took_ms})
+        changed(crashed, latency_ms=ms, ended="goal", clock={"answer_ms": took_ms})
         for ms, took_ms in ((50.0, 3.124), (50.0, 4.0), (400.0, 391.6))
     ]
     assert "latency" not in told(none)
@@ -123,11 +124,8 @@ def test_tables_tell_of_latency_where_there_is_any() -> None:
 )
 def test_a_latency_that_cannot_be_had_is_refused(asked: str, real_time: bool, told: str) -> None:
     """By name, with the remedy."""
-    whole = load_suite("reactive")
     with pytest.raises(UsageError, match=re.escape(told)):
-        with_latency(
-            EpisodeOptions(), asked, real_time, None, whole, whole.scenarios[0], "stop", 4.0
-        )
+        RunConfig(suite="reactive", latency=asked, real_time=real_time)
 
 
 def small_in_two_s() -> Scenario:
@@ -184,7 +182,7 @@ def test_with_latency_each_command_takes_effect_so_much_later_to_the_tick(
     """By hand: 120 ms are three ticks, so that of observations every 4 ticks the commands begin at
     3, 7, 11, ..."""
     came = run_episode(scenario, Faster(), EpisodeOptions(latency_ms=120.0))
-    assert came.log is not None and (came.record.latency_ms, came.record.real_time) == (
+    assert came.log is not None and (came.record.setup.latency_ms, came.record.setup.real_time) == (
         120.0,
         False,
     )
@@ -202,7 +200,7 @@ def test_in_real_time_answers_are_as_late_as_they_were_and_the_record_replays(
     slow = Faster(slow_s=0.2)
     came = run_episode(scenario, slow, EpisodeOptions(real_time=True))
     record, log = came.record, came.log
-    assert log is not None and record.real_time
+    assert log is not None and record.setup.real_time
     asked, delays = log.answers[:, 0], log.answers[:, 1]
     assert (
         (delays >= 4).all()
@@ -210,8 +208,8 @@ def test_in_real_time_answers_are_as_late_as_they_were_and_the_record_replays(
         and (asked[1:] >= (asked + delays)[:-1]).all()
     )
     assert np.array_equal(log.command, commands(log.answers, len(log)))
-    assert record.latency_ms == 50.0 * np.median(delays) and record.answer_ms is not None
-    assert record.latency_ms - 50.0 < record.answer_ms <= record.latency_ms
+    assert record.setup.latency_ms == 50.0 * np.median(delays) and record.answer_ms is not None
+    assert record.setup.latency_ms - 50.0 < record.answer_ms <= record.setup.latency_ms
     assert replayed(Recorded(scenario, record, log)) == record.state_hash
 
 
@@ -227,9 +225,9 @@ def test_a_measured_latency_is_that_of_every_command_of_the_run(
     words = ("run", "brief.json", "--policy", "slow_one:Slow", "--out", "mine")
     said = cosim(*words, "--latency", "measured", cwd=tmp_path)
     assert said.returncode == 0, said.stderr
-    latency_ms = read_spec(tmp_path / "mine").latency_ms
+    latency_ms = read_spec(tmp_path / "mine").setup.latency_ms
     (record,) = read_records(tmp_path / "mine")
-    assert latency_ms == record.latency_ms >= 300.0 and not record.real_time
+    assert latency_ms == record.setup.latency_ms >= 300.0 and not record.setup.real_time
     assert f"latency {latency_ms:g} ms: commands take effect" in said.stdout
     assert "longer than its period of 250 ms" in said.stderr
     log = Log.load(tmp_path / "mine" / "episodes" / short.id / "trajectory.npz")

@@ -12,8 +12,10 @@ from typing import Any, NamedTuple, get_args
 import msgspec
 import numpy as np
 import pytest
+from shapely.geometry.base import BaseGeometry
 
-from bridge.policy_server import AskAct, _plain_observation
+from bridge.policy_server import AskAct, EpisodeDecoder, packed, unpacked
+from cosim.core.geometry import Polyline
 from cosim.core.state import Command
 from cosim.episode.interfaces import Observation
 from cosim.episode.manifest_checks import calibration_of
@@ -25,7 +27,12 @@ from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import CrowdSpec
 from scenarios.episodes.episode import Episode
-from scenarios.runs.observation_codec import arrays_of, seen_from_afar, told_about, told_goal
+from scenarios.ipc.observation_codec import (
+    ObservationDecoder,
+    encode_extra,
+    encoded_about,
+    encoded_fields,
+)
 from scenarios.tools.verify.doctor import small_scenario
 from tests.support.documents import text_of
 
@@ -232,27 +239,38 @@ def test_the_table_holds_where_policies_are_hosted_elsewhere(seen: dict[str, Obs
 
 def hosted(seen: Observation) -> tuple[Observation, SimpleNamespace]:
     """What a policy gets in another process with cosim, and in one without."""
-    told, goal_arrays = told_goal(seen.goal)
-    arrays = arrays_of(seen) | goal_arrays
-    pose = None if seen.odometry is None else msgspec.structs.astuple(seen.odometry)
-    asked = AskAct(
-        "r",
-        seen.episode,
-        "a",
-        0,
-        seen.tick,
-        seen.time_s,
-        seen.v_mps,
-        seen.w_radps,
-        seen.reset,
-        told,
-        pose,
+    fields, arrays = encoded_fields(dataclasses.replace(seen, privileged=None))
+    laid = {name: packed(array) for name, array in arrays.items()}
+    about = encoded_about(seen)
+    asked = AskAct("r", seen.episode, "a", 0, **fields, arrays=laid, about=about)
+    came = msgspec.msgpack.decode(msgspec.msgpack.encode(asked), type=AskAct)
+    copies = {name: unpacked(array) for name, array in came.arrays.items()}
+    afar, plain = (
+        kind(seen.episode, came.about).decoded(came, copies)
+        for kind in (ObservationDecoder, EpisodeDecoder)
     )
-    asked = msgspec.msgpack.decode(msgspec.msgpack.encode(asked), type=AskAct)
-    about = told_about(seen)
-    return seen_from_afar(seen.episode, about, asked, arrays), _plain_observation(
-        seen.episode, about, asked, arrays
-    )
+    return afar, plain
+
+
+@pytest.mark.engine
+def test_an_observation_that_is_sent_arrives_equal_to_the_bit(seen: dict[str, Observation]) -> None:
+    """By every goal protocol: each array and number, what the simulator knows included."""
+    for one in seen.values():
+        fields, arrays = encoded_fields(one)
+        asked = AskAct("r", one.episode, "a", 0, **fields)
+        came = ObservationDecoder(one.episode, encoded_about(one)).decoded(asked, arrays)
+        assert bytes_of(one) == bytes_of(came)
+
+
+def bytes_of(seen: Observation) -> bytes:
+    """Everything in an observation."""
+
+    def extra(value: object) -> object:
+        if isinstance(value, Polyline):
+            return value.points
+        return value.wkb if isinstance(value, BaseGeometry) else encode_extra(value)
+
+    return msgspec.msgpack.encode(seen, enc_hook=extra)
 
 
 def test_goals_and_odometry_are_arrays_for_numpy() -> None:

@@ -8,7 +8,6 @@ import weakref
 from collections.abc import Callable
 from typing import cast, get_args
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -260,27 +259,6 @@ def test_a_reset_gives_another_random_point_and_is_not_counted_by_the_wheels() -
         and seen.odometry.x_m == pytest.approx(2.0, abs=0.5)
         and seen.reset
     )
-
-
-def test_goals_travel_to_a_policy_in_another_process() -> None:
-    """Each kind of goal arrives as it was sent to the shared renderer, with the odometry."""
-    from scenarios.ipc.render_protocol import Ask, decode_request, encode_exchange
-
-    for protocol in get_args(GoalProtocol):
-        seen = observed(Manifest("mine", camera=CameraSpec(8, 6), goal=protocol, odometry="wheel"))
-        came = decode_request(
-            encode_exchange(Ask(1, 0.5, 0.0, None, False, seen.goal, seen.odometry))
-        )
-        assert (
-            isinstance(came, Ask)
-            and came.odometry == seen.odometry
-            and type(came.goal) is type(seen.goal)
-        )
-        if seen.goal is not None:
-            for field in msgspec.structs.fields(seen.goal):
-                assert np.array_equal(
-                    getattr(came.goal, field.name), getattr(seen.goal, field.name)
-                )
 
 
 def test_a_robot_is_told_of_itself_alone() -> None:

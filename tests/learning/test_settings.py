@@ -38,7 +38,7 @@ def test_without_pytorch_the_cpu_build_is_recommended_first(
     done = cosim("train", "no.npz", "-o", "small", cwd=tmp_path)
     assert done.returncode == 3 and not list(tmp_path.iterdir())
     first = "pip install torch --index-url https://download.pytorch.org/whl/cpu"
-    second = "'sidewalk-cosim[train]'"
+    second = "-e '.[train]' in the checkout"
     assert (
         0
         < done.stderr.index("torch cannot be imported: ")

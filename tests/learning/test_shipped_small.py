@@ -51,4 +51,6 @@ def test_a_small_policy_that_ships_drives_to_a_goal_by_what_it_sees(
         cwd=tmp_path,
     )
     (record,) = read_records(tmp_path / "run")
-    assert said.returncode == 0 and record.ended == "goal" and not record.privileged, said.stderr
+    assert said.returncode == 0 and record.ended == "goal" and not record.manifest.privileged, (
+        said.stderr
+    )

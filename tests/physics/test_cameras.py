@@ -13,10 +13,10 @@ import pytest
 
 from cosim.core.errors import EngineError, RunError
 from cosim.results.run_folder import RunFolder
-from cosim.results.run_spec import RunSpec
 from cosim.spec.scenario import Suite
 from physics.cameras import choice as cameras
 from physics.cameras.gl import context
+from tests.run_specs import spec_of
 
 
 @pytest.fixture
@@ -49,23 +49,11 @@ def test_gl_without_opengl_names_the_packages(without_opengl: None) -> None:
 
 def test_a_run_does_not_mix_renderers(tmp_path: Path) -> None:
     """Resuming with another renderer is refused, and the message names both."""
-    spec = RunSpec(
-        suite="s",
-        robots={"courier": "h"},
-        suite_version="1",
-        suite_hash="h",
-        policy="p",
-        policy_name="p",
-        policy_version="1",
-        scenarios=(),
-        versions={},
-        renderer="bullet-tiny",
-    )
-    with RunFolder.create(tmp_path / "run", spec, Suite(name="s", version="1", scenarios=())):
+    suite = Suite(name="s", version="1", scenarios=())
+    spec = spec_of(suite, renderer="bullet-tiny")
+    with RunFolder.create(tmp_path / "run", spec, suite):
         pass
-    other = RunSpec(
-        **{f: getattr(spec, f) for f in spec.__struct_fields__} | {"renderer": "gl: other"}
-    )
+    other = spec_of(suite, renderer="gl: other")
     with pytest.raises(RunError, match="its renderer is bullet-tiny, now asked for is gl: other"):
         RunFolder.resume(tmp_path / "run", other)
 

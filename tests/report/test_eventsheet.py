@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
 from cosim.results.log import Log
-from cosim.results.record import Record
 from cosim.spec.events import Event
+from cosim.spec.manifest import Manifest
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from scenarios.events import EVENT_KINDS
 from scenarios.tools.viewing.event_sheet import COLUMNS, rows_of, summary
 from tests.conftest import Cosim
 from tests.logs import log_with
+from tests.run_specs import record_of
 
 TICK_S = 0.05
 
@@ -62,21 +64,9 @@ def test_a_crossing_walker_is_measured_as_it_walked() -> None:
     ticks = np.arange(tick, tick + 20)
     y = 1.0 - 1.2 * TICK_S * np.arange(20)
     tracks = np.column_stack([ticks, np.zeros(20), np.zeros(20), np.full(20, 12.0), y])
-    record = Record(
-        scenario="t",
-        scenario_hash="",
-        suite="t",
-        suite_hash="",
-        seed=0,
-        robot="courier",
-        policy="p",
-        policy_version="1",
-        goal_protocol="",
-        renderer="",
-        versions={},
-        status="done",
-    )
-    (row,) = rows_of(scenario_of("lateral"), record, log_of(x_m, tracks))
+    scenario = scenario_of("lateral")
+    record = msgspec.structs.replace(record_of(scenario, Manifest("p", camera=None)), status="done")
+    (row,) = rows_of(scenario, record, log_of(x_m, tracks))
     found = dict(zip(COLUMNS, row, strict=True))
     assert found["trigger_m"] == pytest.approx(3.95) and found["error_m"] == pytest.approx(0.05)
     assert found["period_m"] == pytest.approx(0.1)

@@ -30,6 +30,7 @@ from cosim.results.table import summary_of
 from cosim.spec.scenario import read_suite
 from scenarios.tools.viewing.report import _wait
 from tests.conftest import ROOT, Cosim
+from tests.run_specs import changed
 from tests.support.driven_runs import HIT, episode_of, failure_at, run_of, short_way
 
 PAPER = Path(os.environ.get("COSIM_SHARED", ROOT.parent / "shared")) / "paper/sidewalkbench.tex"
@@ -133,11 +134,13 @@ def test_the_gallery_shows_every_kind_and_cause_and_no_more_than_asked_for(tmp_p
     ways = [short_way(f"s-{i:03d}", structure=kind) for i, kind in enumerate(kinds)]
     runs = read_runs([run_of(tmp_path / "run", [HIT] * 38, "mine", ways)])
     candidates = shown_of(runs)
-    picked = most_telling(candidates, 3)
+    picked = most_telling(candidates, 3).picks
     assert len(candidates) == 38 and {kinds[int(one.scenario[2:])] for one in picked} == {*kinds}
+    picked, limit = most_telling(candidates, 48)
     assert (
-        len(most_telling(candidates, 48)) == 36
-        and len({one.scenario for one in most_telling(candidates, 48)}) == 36
+        len(picked) == 36
+        and len({one.scenario for one in picked}) == 36
+        and limit.startswith("the others show no")
     )
 
 
@@ -156,8 +159,8 @@ def test_what_takes_long_to_come_to_is_not_shown_where_something_else_tells_as_m
         )
         for k in range(12)
     ]
-    assert most_telling([late[0], soon], 1) == [soon]
-    assert len(most_telling([*late, soon])) == 6
+    assert most_telling([late[0], soon], 1) == ([soon], "--failures 1")
+    assert len(most_telling([*late, soon]).picks) == 6
 
 
 def test_of_an_episode_its_first_failure_is_shown_and_others_that_come_soon(tmp_path: Path) -> None:
@@ -171,9 +174,9 @@ def test_of_an_episode_its_first_failure_is_shown_and_others_that_come_soon(tmp_
         )
         for name, tick in (("one", 80), ("one", 2000), ("one", 4000), ("other", 4000))
     ]
-    picked = {(one.scenario, one.mishap.tick) for one in most_telling(every)}
+    picked = {(one.scenario, one.mishap.tick) for one in most_telling(every).picks}
     assert picked == {("one", 80), ("one", 2000), ("other", 4000)}
-    assert len(most_telling(every, within_s=200.0)) == 4
+    assert len(most_telling(every, within_s=200.0).picks) == 4
 
 
 def test_how_far_the_failures_are_is_told_while_they_are_shown() -> None:
@@ -239,7 +242,7 @@ def test_no_rate_is_of_the_metres_of_invalid_episodes(tmp_path: Path) -> None:
         for n, r in run.whole.records.items()
     }
     told = ReportedRun("mine", run.whole._replace(records=records))
-    assert [record.scenario for record, _ in told.tracks()] == ["s-000", "s-002"]
+    assert [record.scenario.id for record, _ in told.tracks()] == ["s-000", "s-002"]
 
 
 def test_a_run_without_a_failure_stands_at_0_beside_one_with(
@@ -315,7 +318,7 @@ def test_versions_that_differ_stand_side_by_side_and_the_others_once(tmp_path: P
     runs = read_runs([run_of(tmp_path / name, ["goal"], name) for name in ("one", "other")])
     told = []
     for run, glibc in zip(runs, ("2.36", "2.39"), strict=True):
-        spec = msgspec.structs.replace(run.spec, versions={"numpy": "2", "glibc": glibc})
+        spec = changed(run.spec, versions={"numpy": "2", "glibc": glibc})
         told.append(ReportedRun(run.label, run.whole._replace(spec=spec)))
     text = page_of(told, [], [], Maps([], {}, dict(counts_of(told))), "").decode()
     assert "<dt>versions</dt><dd>numpy 2</dd>" in text

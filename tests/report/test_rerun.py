@@ -45,7 +45,7 @@ def test_without_the_package_the_remedy_is_told(
 ) -> None:
     """The extra that brings it, by name."""
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(MachineError, match=r"pip install 'sidewalk-cosim\[rerun\]'"):
+    with pytest.raises(MachineError, match=r"pip install -e '\.\[rerun\]' in the checkout"):
         check_rerun(tmp_path / "e.rrd", 1)
 
 

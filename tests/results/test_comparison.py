@@ -12,7 +12,6 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
-import msgspec
 import pandas as pd
 import pytest
 from rich.console import Console
@@ -28,12 +27,12 @@ from cosim.results.compare import (
     groups_of,
 )
 from cosim.results.metrics import METRICS
-from cosim.results.record import Record
 from cosim.results.run_folder import RunFolder, read_records, read_spec
 from cosim.spec.camera import CameraSpec
 from cosim.spec.events import Event
 from cosim.spec.scenario import Scenario, read_suite
 from tests.conftest import Cosim
+from tests.run_specs import changed
 from tests.support.driven_runs import HIT, run_of, short_way
 
 GOALS = "goal"
@@ -170,7 +169,7 @@ def test_another_camera_is_told_and_the_verdict_stays(runs: Path, tmp_path: Path
     """A camera is the policy's own choice; a run without one is a blind baseline, of which nothing
     is said."""
     small, large = (
-        rewritten(runs / name, tmp_path / name, camera=msgspec.to_builtins(CameraSpec(width, 48)))
+        rewritten(runs / name, tmp_path / name, camera=CameraSpec(width, 48))
         for name, width in (("a", 64), ("b", 96))
     )
     told = compare_runs([small, large])
@@ -180,14 +179,39 @@ def test_another_camera_is_told_and_the_verdict_stays(runs: Path, tmp_path: Path
     assert not any("sees by" in note for note in compare_runs([runs / "a", large]).notes)
 
 
-def rewritten(run: Path, target: Path, **fields: object) -> Path:
-    """A copy of a run whose records have other fields."""
+def test_a_run_with_injected_pedestrians_is_marked(
+    runs: Path, tmp_path: Path, cosim: Cosim
+) -> None:
+    """In results.csv, below the table and in a comparison; a run without them has no such
+    column."""
+    injected = rewritten(
+        runs / "a", tmp_path / "a", "s-001", injections=[{"tick": 3, "injection": EVE}]
+    )
+    table = pd.read_csv(injected / "results.csv")
+    assert dict(zip(table["scenario"], table["injected"], strict=True)) == {
+        f"s-{i:03d}": int(i == 1) for i in range(20)
+    }
+    assert "injected" not in pd.read_csv(runs / "a" / "results.csv")
+    words = "pedestrians were injected into 1 episode (s-001)"
+    shown = cosim("show", str(injected)).stdout
+    assert "s-001+" in shown and words in " ".join(shown.split())
+    assert any(words in note for note in compare_runs([runs / "b", injected]).notes)
+    assert not any("injected" in note for note in compare_runs([runs / "a", runs / "b"]).notes)
+
+
+EVE = {"id": "eve", "path": [[4.0, 1.0], [4.0, -1.0]]}
+
+
+def rewritten(run: Path, target: Path, of: str = "", **fields: object) -> Path:
+    """A copy of a run whose records have other fields. of: the scenario of the record, "" for all
+    of them."""
     with RunFolder.create(target, read_spec(run), read_suite(run / "scenarios.json")) as folder:
         for record in read_records(run):
-            told = msgspec.json.decode(
-                msgspec.json.encode(msgspec.to_builtins(record) | fields), type=Record
+            other = fields if of in ("", record.scenario.id) else {}
+            folder.keep(
+                changed(record, **other),
+                (run / f"episodes/{record.scenario.id}/trajectory.npz").read_bytes(),
             )
-            folder.keep(told, (run / f"episodes/{record.scenario}/trajectory.npz").read_bytes())
         folder.finish()
     return target
 

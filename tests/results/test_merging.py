@@ -15,27 +15,16 @@ import pytest
 from cosim.core.errors import RunError, UsageError
 from cosim.core.progress import ignore
 from cosim.results.merge import merge_runs
-from cosim.results.record import METRIC_SCHEMA
 from cosim.results.run_folder import RunFolder, read_records, read_spec
 from cosim.results.run_spec import RunSpec, Shard
 from cosim.spec.scenario import Scenario, Suite
 from tests.conftest import Cosim
+from tests.run_specs import changed, spec_of
 from tests.support.driven_runs import episode_of, run_of, short_way
 
 WAYS = tuple(short_way(f"s-{i:03d}") for i in range(7))
 SUITE = Suite(name="s", version="1", scenarios=WAYS)
-SPEC = RunSpec(
-    suite="s",
-    robots={"courier": "h"},
-    suite_version="1",
-    suite_hash=SUITE.content_hash,
-    policy="p",
-    policy_name="p",
-    policy_version="1",
-    scenarios=tuple(way.id for way in WAYS),
-    versions={"numpy": "2", "arithmetic": "1f"},
-    metric_schema=METRIC_SCHEMA,
-)
+SPEC = spec_of(SUITE, versions={"numpy": "2", "arithmetic": "1f"})
 HOWS = {
     way.id: how
     for way, how in zip(
@@ -59,11 +48,7 @@ def shards(folder: Path, of: int, **fields: object) -> list[Path]:
     them."""
     cut = [Shard(number, of) for number in range(1, of + 1)]
     return [
-        kept(
-            folder / f"{one.number}",
-            msgspec.structs.replace(SPEC, shard=one, **fields),
-            one.share(WAYS),
-        )
+        kept(folder / f"{one.number}", changed(SPEC, shard=one, **fields), one.share(WAYS))
         for one in cut
     ]
 
@@ -103,7 +88,7 @@ def test_shards_are_merged_to_the_run_that_they_are_of(tmp_path: Path, of: int) 
         assert (tmp_path / "deep/merged" / name).read_bytes() == (
             tmp_path / "whole" / name
         ).read_bytes()
-    assert {r.scenario for r in read_records(tmp_path / "deep/merged")} == set(SPEC.scenarios)
+    assert {r.scenario.id for r in read_records(tmp_path / "deep/merged")} == set(SPEC.scenarios)
     assert (tmp_path / "deep/merged/logs/1-1/worker-0.log").read_text() == "what it printed"
     assert [path.name for path in (tmp_path / "deep").iterdir()] == ["merged"]
 
@@ -199,9 +184,7 @@ def test_folders_of_different_runs_are_refused(
     """The field and both values are named, and nothing is written."""
     mine = kept(tmp_path / "mine", msgspec.structs.replace(SPEC, shard=Shard(1, 2)), WAYS[:1])
     theirs = kept(
-        tmp_path / "theirs",
-        msgspec.structs.replace(SPEC, shard=Shard(2, 2), **{field: value}),
-        WAYS[1:2],
+        tmp_path / "theirs", changed(SPEC, shard=Shard(2, 2), **{field: value}), WAYS[1:2]
     )
     said = cosim("merge", str(mine), str(theirs), "--out", str(tmp_path / "merged"))
     assert (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import sqlite3
@@ -18,14 +19,16 @@ from cosim.core.errors import MachineError, RunError, UsageError
 from cosim.results.log import COLUMNS, Log
 from cosim.results.metrics import METRICS
 from cosim.results.record import Record
-from cosim.results.run_folder import RunFolder, read_records, read_rows, read_spec
-from cosim.results.run_spec import RunSpec
+from cosim.results.run_folder import RunFolder, read_records, read_spec
+from cosim.results.run_setup import RunSetup
+from cosim.results.run_spec import Shard
 from cosim.results.table import summary_of, table_of, table_row
 from cosim.spec.camera import CameraSpec
 from cosim.spec.manifest import WaypointRule
 from cosim.spec.scenario import City, Scenario, Suite
 from tests.conftest import Cosim
 from tests.logs import log_with
+from tests.run_specs import changed, spec_of
 from tests.support.driven_runs import driven
 
 
@@ -42,33 +45,13 @@ def scenario(name: str) -> Scenario:
 
 
 SUITE = Suite(name="s", version="1", scenarios=tuple(scenario(f"s-{i}") for i in range(3)))
-SPEC = RunSpec(
-    suite="s",
-    robots={"courier": "h"},
-    suite_version="1",
-    suite_hash=SUITE.content_hash,
-    policy="p",
-    policy_name="p",
-    policy_version="1",
-    scenarios=tuple(s.id for s in SUITE.scenarios),
-    versions={"numpy": "2"},
-)
+SPEC = spec_of(SUITE)
 
 
 def record(name: str, *, success: float = 1.0, status: str = "done", wall_s: float = 1.0) -> Record:
     measures: dict[str, float | None] = dict.fromkeys(METRICS, None) | {"success": success}
-    return Record(
-        scenario=name,
-        scenario_hash="h",
-        suite="s",
-        suite_hash=SUITE.content_hash,
-        seed=0,
-        robot="courier",
-        policy="p",
-        policy_version="1",
-        goal_protocol="none",
-        renderer="none",
-        versions={"numpy": "2"},
+    return msgspec.structs.replace(
+        Record.begun(scenario(name), SPEC.manifest, SPEC.setup),
         status=status,
         ended="goal" if status == "done" else None,
         ticks=3,
@@ -84,7 +67,7 @@ LOG = driven(SUITE.scenarios[0], [1.0] * 3).encoded()
 
 def on_disk(folder: RunFolder, kept: Record, under: str = "") -> None:
     """Write the files of an episode, and no row. under: in the folder of another one."""
-    place = folder.episode_folder(under or kept.scenario)
+    place = folder.episode_folder(under or kept.scenario.id)
     place.mkdir(parents=True, exist_ok=True)
     (place / "trajectory.npz").write_bytes(LOG)
     kept.save(place / "record.json")
@@ -177,7 +160,7 @@ def test_resuming_with_something_else_is_refused(tmp_path: Path, field: str, val
     """Another policy, suite or version would mix two runs: the difference is named."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE):
         pass
-    other = msgspec.structs.replace(SPEC, **{field: value})
+    other = changed(SPEC, **{field: value})
     with pytest.raises(RunError, match=f"is of another run: its {field} is"):
         RunFolder.resume(tmp_path / "run", other)
 
@@ -186,7 +169,7 @@ def test_another_waypoint_rule_is_told_in_words(tmp_path: Path) -> None:
     """The one of the run, and the one that is asked for now."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE):
         pass
-    other = msgspec.structs.replace(SPEC, waypoints=WaypointRule(index=0, dt_s=0.2, rule="atan2"))
+    other = changed(SPEC, waypoints=WaypointRule(index=0, dt_s=0.2, rule="atan2"))
     with pytest.raises(RunError) as caught:
         RunFolder.resume(tmp_path / "run", other)
     assert (
@@ -197,12 +180,10 @@ def test_another_waypoint_rule_is_told_in_words(tmp_path: Path) -> None:
 
 def test_another_camera_is_told_in_words(tmp_path: Path) -> None:
     """Mount, size, field of view and crop of both."""
-    spec = msgspec.structs.replace(SPEC, camera=CameraSpec(512, 288, 60.0))
+    spec = changed(SPEC, camera=CameraSpec(512, 288, 60.0))
     with RunFolder.create(tmp_path / "run", spec, SUITE):
         pass
-    other = msgspec.structs.replace(
-        SPEC, camera=CameraSpec(512, 288, 60.0, "mast", crop=(0, 88, 512, 288))
-    )
+    other = changed(SPEC, camera=CameraSpec(512, 288, 60.0, "mast", crop=(0, 88, 512, 288)))
     with pytest.raises(RunError) as caught:
         RunFolder.resume(tmp_path / "run", other)
     assert (
@@ -210,27 +191,27 @@ def test_another_camera_is_told_in_words(tmp_path: Path) -> None:
         "crop 0 88 512 288. Resume with the same command"
     ) in str(caught.value)
     with RunFolder.resume(tmp_path / "run", spec) as again:
-        assert again.spec.camera == spec.camera
+        assert again.spec.manifest.camera == spec.manifest.camera
 
 
 def test_every_row_tells_how_waypoints_were_followed(tmp_path: Path) -> None:
     """From the record, which holds the rule itself."""
-    scaled = msgspec.structs.replace(record("s-0"), waypoints=WaypointRule(index=4, unit_m=0.25))
+    scaled = changed(record("s-0"), waypoints=WaypointRule(index=4, unit_m=0.25))
     scaled.save(tmp_path / "record.json")
     kept = Record.load(tmp_path / "record.json")
-    assert kept.waypoints == WaypointRule(index=4, unit_m=0.25)
+    assert kept.manifest.waypoints == WaypointRule(index=4, unit_m=0.25)
     assert table_row(kept)["waypoints"] == "waypoint 4, units of 0.25 m, in 0.25 s, shipped"
 
 
 def test_resuming_with_an_edited_policy_is_refused(tmp_path: Path) -> None:
     """Also when its version was left as it was: the policy is named."""
-    spec = msgspec.structs.replace(SPEC, policy_source="1111")
+    spec = changed(SPEC, policy_source="1111")
     with RunFolder.create(tmp_path / "run", spec, SUITE):
         pass
     with pytest.raises(
         RunError, match="is of another run: the source of policy 'p' was edited since it began"
     ):
-        RunFolder.resume(tmp_path / "run", msgspec.structs.replace(SPEC, policy_source="2222"))
+        RunFolder.resume(tmp_path / "run", changed(SPEC, policy_source="2222"))
     with RunFolder.resume(tmp_path / "run", spec):
         pass
 
@@ -262,7 +243,7 @@ def odd_rows(database: Path) -> None:
 
 def null_rows(database: Path) -> None:
     with closing(sqlite3.connect(database)) as connection, connection:
-        connection.execute("update episodes set record = null, row = x'00'")
+        connection.execute("update episodes set record = null")
 
 
 DAMAGES = {
@@ -284,15 +265,87 @@ def test_a_damaged_database_is_made_anew_from_the_records(tmp_path: Path, name: 
         RunError, match=r"results\.sqlite is damaged .*--resume, which makes it anew"
     ):
         read_records(tmp_path / "run")
-    if name != "odd_rows":
-        with pytest.raises(RunError, match=r"results\.sqlite is damaged"):
-            read_rows(tmp_path / "run")
     with RunFolder.resume(tmp_path / "run", SPEC) as again:
         assert again.finished() == {"s-0", "s-2"}
         (note,) = again.notes
         assert "results.sqlite was damaged (" in note and "made anew from 2 records" in note
-    assert [r.scenario for r in read_records(tmp_path / "run")] == ["s-2", "s-0"]
+    assert [r.scenario.id for r in read_records(tmp_path / "run")] == ["s-2", "s-0"]
     assert (tmp_path / "run/results.sqlite.damaged").exists()
+
+
+def test_a_database_of_an_earlier_version_is_read_and_added_to(tmp_path: Path) -> None:
+    """It has a column `row` with the table's row of each record, which is not read any more."""
+    with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
+        folder.keep(record("s-0"), LOG)
+    with closing(sqlite3.connect(tmp_path / "run/results.sqlite")) as database, database:
+        database.execute("alter table episodes rename to new")
+        database.execute("create table episodes (scenario text primary key, row text, record text)")
+        database.execute("insert into episodes select scenario, '{}', record from new")
+        database.execute("drop table new")
+    with RunFolder.resume(tmp_path / "run", SPEC) as again:
+        again.keep(record("s-1"), LOG)
+        assert again.notes == [] and [*again.finish()["scenario"]] == ["s-0", "s-1"]
+
+
+def test_run_json_and_record_json_are_flat_and_keep_what_a_version_did_not_write(
+    tmp_path: Path,
+) -> None:
+    """Every fact of scenario, set-up and manifest is a key of the file; both are read back as they
+    were, and from a file of an earlier version without the later keys."""
+    spec = changed(
+        SPEC,
+        camera=CameraSpec(64, 48),
+        goal_protocol="route_point",
+        latency_ms=50.0,
+        shard=Shard(1, 2),
+    )
+    with RunFolder.create(tmp_path / "run", spec, SUITE) as folder:
+        folder.keep(
+            msgspec.structs.replace(record("s-0"), setup=spec.setup, manifest=spec.manifest), LOG
+        )
+    path = tmp_path / "run/episodes/s-0/record.json"
+    told = [json.loads((tmp_path / "run/run.json").read_text()), json.loads(path.read_text())]
+    assert read_spec(tmp_path / "run") == spec and Record.load(path).setup == spec.setup
+    for file in told:
+        assert (
+            not file.keys() & {"setup", "manifest"}
+            and file["camera"]["width"] == 64
+            and file["latency_ms"] == 50.0
+        )
+    assert set(RunSetup.__struct_fields__) <= told[0].keys()
+    assert (told[0]["seed"], told[0]["policy"], told[0]["policy_name"], told[1]["policy"]) == (
+        0,
+        "p",
+        "p",
+        "p",
+    )
+    later = {
+        "camera",
+        "cameras",
+        "latency_ms",
+        "real_time",
+        "policy_runs",
+        "odometry",
+        "waypoints",
+        "metric_schema",
+    }
+    (tmp_path / "run/run.json").write_text(
+        json.dumps({key: told[0][key] for key in told[0].keys() - later})
+    )
+    path.write_text(json.dumps({key: told[1][key] for key in told[1].keys() - later}))
+    old = Record.load(path)
+    assert read_spec(tmp_path / "run").manifest.camera is old.manifest.camera is None
+    assert (old.setup.latency_ms, old.setup.metric_schema, old.scenario) == (
+        0.0,
+        0,
+        record("s-0").scenario,
+    )
+    path.write_text(json.dumps(told[1] | {"suite_hash": 5}))
+    with pytest.raises(
+        RunError,
+        match=r"record\.json: not an episode record: Expected `str`, got `int` - at `\$\.suite_h",
+    ):
+        Record.load(path)
 
 
 def test_a_database_without_its_log_is_made_whole(tmp_path: Path) -> None:
@@ -314,7 +367,7 @@ def test_a_database_without_its_log_is_made_whole(tmp_path: Path) -> None:
         (path / lost).unlink()
         with RunFolder.resume(path, SPEC) as again:
             assert again.finished() == {"s-1"}
-        assert [r.scenario for r in read_records(path)] == ["s-1"]
+        assert [r.scenario.id for r in read_records(path)] == ["s-1"]
 
 
 def test_a_database_that_goes_during_a_run_is_told_with_the_remedy(tmp_path: Path) -> None:
@@ -384,7 +437,7 @@ def test_an_episode_whose_row_was_lost_to_a_kill_is_taken_in(tmp_path: Path) -> 
             again.finished() == {"s-1"}
             and "not what results.sqlite has of this episode" in again.notes[0]
         )
-    assert {r.scenario: r.measures["success"] for r in read_records(tmp_path / "run")} == {
+    assert {r.scenario.id: r.measures["success"] for r in read_records(tmp_path / "run")} == {
         "s-1": 0.0
     }
 

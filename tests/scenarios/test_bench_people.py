@@ -96,7 +96,7 @@ def test_distances_are_of_what_is_given() -> None:
 def test_pedpy_is_asked_for_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without pedpy one line says how to get it."""
     monkeypatch.setitem(sys.modules, "pedpy", None)
-    with pytest.raises(MachineError, match=r"pip install 'sidewalk-cosim\[people\]'"):
+    with pytest.raises(MachineError, match=r"pip install -e '\.\[people\]' in the checkout"):
         need_pedpy()
 
 

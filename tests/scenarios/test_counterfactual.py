@@ -17,7 +17,6 @@ from cosim.policies.load import load_policy
 from cosim.results.delay import Tracks, delay_of
 from cosim.results.record import Record
 from cosim.results.run_folder import RunFolder
-from cosim.results.run_spec import RunSpec
 from cosim.spec.events import EventReply
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
@@ -30,6 +29,7 @@ from scenarios.runs.pool import run_all
 from scenarios.suites.crossings import build_all
 from sumo_nets.crowd.demand_log import Entrances
 from tests.conftest import Cosim
+from tests.run_specs import spec_of
 
 pytestmark = pytest.mark.engine
 
@@ -121,9 +121,7 @@ def test_a_run_says_whom_its_robot_delayed_only_when_asked(
         and "no trajectory tells people_delay_s, people_compared," in scored.stdout
     )
     row = pd.read_csv(tmp_path / "asked" / "results.csv").iloc[0]
-    plain = run_episode(
-        short, load_policy("orca"), EpisodeOptions(suite_hash=str(row["suite_hash"]))
-    ).record
+    plain = run_episode(short, load_policy("orca"), EpisodeOptions()).record
     asked = Record.load(tmp_path / "asked" / "episodes" / scenario.id / "record.json")
     names = ["people_delay_s", "people_compared", "vehicles_delay_s", "vehicles_compared"]
     assert asked.state_hash == plain.state_hash
@@ -142,18 +140,7 @@ def test_a_run_gives_signs_of_life_while_it_compares(scenario: Scenario, tmp_pat
     )
     driver = load_policy("orca")
     manifest = driver.manifest
-    spec = RunSpec(
-        suite="s",
-        robots={"courier": "h"},
-        suite_version="1",
-        suite_hash=short.content_hash,
-        policy="orca",
-        policy_name=manifest.name,
-        policy_version=manifest.version,
-        scenarios=(scenario.id,),
-        versions={},
-        counterfactual=True,
-    )
+    spec = msgspec.structs.replace(spec_of(short, "orca"), counterfactual=True)
     told: list[Message] = []
     with RunFolder.create(tmp_path / "run", spec, short) as folder:
         options = EpisodeOptions(camera="bullet", counterfactual=True)

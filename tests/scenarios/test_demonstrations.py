@@ -16,7 +16,6 @@ import pytest
 
 from cosim.core.errors import CosimError, RunError, SpecError
 from cosim.core.state import Command
-from cosim.results.record import begun
 from cosim.spec.camera import CameraSpec
 from cosim.spec.demo_options import Collecting, demonstrating
 from cosim.spec.goal import GOALS, goal_called
@@ -29,6 +28,7 @@ from scenarios.suites.new_scenarios import fresh, fresh_cities
 from scenarios.tools.dataset.lerobot import Collected, Filmed, write_lerobot
 from scenarios.tools.dataset.read import packed_sets, read_back, read_data_set
 from sumo_nets.city.store import SEEDS
+from tests.run_specs import record_of
 from tests.support.driven_runs import short_way
 
 FPS = 5
@@ -79,7 +79,7 @@ def episodes_of(demonstrations: Sequence[Demonstration]) -> list[Collected]:
     found = []
     for k, one in enumerate(demonstrations):
         scenario = short_way(f"s-{k:03d}")
-        record = begun(scenario, Manifest("p"), "")
+        record = record_of(scenario, Manifest("p"))
         found.append(Collected(scenario, record, lambda one=one: one))  # type: ignore[misc]
     return found
 

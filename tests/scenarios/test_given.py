@@ -122,7 +122,7 @@ def test_goals_are_drawn_from_the_runs_seed_and_change_nothing_in_the_street(
         points.append(
             [(one.goal.x_m, one.goal.y_m) for one in seen if isinstance(one.goal, PointGoal)]
         )
-    assert [record.goal_protocol for record in records] == ["none", *["random_point"] * 3, "image"]
+    assert [record.manifest.goal for record in records] == ["none", *["random_point"] * 3, "image"]
     assert len({record.state_hash for record in records}) == 1
     assert pictures[0] == pictures[1] == pictures[4]
     assert points[0] == points[4] == [] and points[1] == points[2] and points[1][0] != points[3][0]
@@ -143,7 +143,7 @@ def test_a_run_keeps_to_its_goals(scenario: Scenario, tmp_path: Path) -> None:
         and policy.seen
     )
     spec = read_spec(tmp_path / "run")
-    assert (spec.goal_protocol, spec.odometry) == ("route_point", "gps")
+    assert (spec.manifest.goal, spec.manifest.odometry) == ("route_point", "gps")
     for goal, named in (
         ("final_point", "now asked for is final_point"),
         (None, "now asked for is none"),

@@ -20,9 +20,8 @@ from bridge.session import open_session
 from cosim.core.errors import CosimError, EngineError, MachineError
 from cosim.core.versions import versions
 from cosim.policies.load import load_policy
-from cosim.results.record import METRIC_SCHEMA, NO_RENDERER, Record, begun
+from cosim.results.record import Record
 from cosim.results.run_folder import RunFolder, read_records
-from cosim.results.run_spec import RunSpec
 from cosim.spec.connection import Connection
 from cosim.spec.scenario import City, CityMap, Scenario, Suite
 from scenarios.ipc.faults import RULES, Failure
@@ -47,6 +46,7 @@ from scenarios.runs.transport import HeldRun
 from scenarios.runs.zenoh_transport import workers_of_run
 from sumo_nets.net.net_hash import hash_of
 from tests.conftest import PATIENCE_S, Cosim
+from tests.run_specs import changed, spec_of
 
 pytestmark = pytest.mark.engine
 
@@ -67,21 +67,7 @@ SUITE = Suite(
         for i in range(2)
     ),
 )
-SPEC = RunSpec(
-    suite="s",
-    robots={"courier": "h"},
-    suite_version="1",
-    suite_hash="h",
-    policy="stop",
-    policy_name="stop",
-    policy_version="1",
-    policy_source=DRIVER.source_hash,
-    scenarios=("s-0", "s-1"),
-    versions=versions(),
-    seed=3,
-    renderer=NO_RENDERER,
-    metric_schema=METRIC_SCHEMA,
-)
+SPEC = spec_of(SUITE, "stop", policy_source=DRIVER.source_hash, versions=versions(), seed=3)
 
 
 IDLE, RENEWED, REVOKED = Reply("idle"), Reply("renewed"), Reply("revoked")
@@ -125,7 +111,7 @@ class Run:
         """Wait until it is; its records."""
         self._thread.join(PATIENCE_S)
         assert not self._thread.is_alive()
-        return {record.scenario: record for record in read_records(self.folder)}
+        return {record.scenario.id: record for record in read_records(self.folder)}
 
     @property
     def log(self) -> str:
@@ -222,7 +208,7 @@ class Hand:
         name = of or self.scenario
         scenario = next(one for one in SUITE.scenarios if one.id == name)
         record = record or msgspec.structs.replace(
-            begun(scenario, DRIVER.manifest, "h", DRIVER.source_hash, SPEC.seed),
+            Record.begun(scenario, DRIVER.manifest, SPEC.setup),
             status="done",
             ended="goal",
             ticks=ticks,
@@ -424,7 +410,9 @@ def test_what_is_none_of_the_run_s_is_refused_in_words(tmp_path: Path) -> None:
         with pytest.raises(EngineError, match="damaged on its way"):
             foe.report(**one.result() | {"digest": "0"})
         scenario = SUITE.scenarios[0]
-        strange = begun(scenario, DRIVER.manifest, "another suite", DRIVER.source_hash, SPEC.seed)
+        strange = changed(
+            Record.begun(scenario, DRIVER.manifest, SPEC.setup), suite_hash="another suite"
+        )
         reply = foe.deliver(of=name, record=strange)
         assert (
             isinstance(reply, Reply) and reply.kind == "turned_away" and "another run" in reply.why

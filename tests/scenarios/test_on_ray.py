@@ -21,6 +21,7 @@ from cosim.spec.scenario import Suite, write_suite
 from scenarios.runs.ray_workers import RayWorkers, ray_cluster
 from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import PATIENCE_S, Cosim, still_runs
+from tests.run_specs import changed
 
 POLICY = '''
 import os, time
@@ -133,7 +134,7 @@ def test_a_run_by_ray_is_the_run_of_one_process_also_when_a_node_dies(
     )
 
     spec = read_spec(tmp_path / "ray")
-    others = msgspec.structs.replace(spec, versions=spec.versions | {"numpy": "0.1"})
+    others = changed(spec, versions=spec.setup.versions | {"numpy": "0.1"})
     with ray_cluster("auto", "straight", print):
         workers = RayWorkers(others, tmp_path, 1, 1, print)
         with pytest.raises(
@@ -171,6 +172,6 @@ def test_without_ray_it_is_said_what_to_install(
     said = cosim("run", "reactive", "--policy", "straight", "--on", "ray", cwd=tmp_path)
     assert (
         said.returncode == 2
-        and "pip install 'sidewalk-cosim[ray]'" in said.stderr
+        and "pip install -e '.[ray]' in the checkout" in said.stderr
         and not [*tmp_path.iterdir()]
     )

@@ -9,9 +9,8 @@ import pytest
 
 from cosim.core.units import duration
 from cosim.core.versions import versions
-from cosim.results.record import Record
 from cosim.results.run_folder import RunFolder
-from cosim.results.run_spec import RunSpec
+from cosim.spec.manifest import Manifest
 from cosim.spec.scenario import Scenario, Suite
 from scenarios.runs import eta as pace
 from scenarios.runs.eta import (
@@ -25,6 +24,7 @@ from scenarios.runs.eta import (
     span,
 )
 from scenarios.suites.catalog import load_suite
+from tests.run_specs import record_of, spec_of
 
 LONG = load_suite("long-horizon").scenarios[:12]
 GL = "gl: llvmpipe"
@@ -153,18 +153,8 @@ def test_a_span_is_said_with_its_unit_once(low_s: float, high_s: float, words: s
 
 def finished(folder: RunFolder, scenario: Scenario, status: str) -> None:
     """The record of an episode that took 20 s, 4 of them to set up."""
-    record = Record(
-        scenario=scenario.id,
-        scenario_hash="",
-        suite="s",
-        suite_hash="",
-        seed=0,
-        robot="courier",
-        policy="route",
-        policy_version="1",
-        goal_protocol="route",
-        renderer=GL,
-        versions=versions(),
+    record = msgspec.structs.replace(
+        record_of(scenario, Manifest("route"), renderer=GL),
         status=status,
         ticks=1600,
         ended="goal" if status == "done" else None,
@@ -175,19 +165,8 @@ def finished(folder: RunFolder, scenario: Scenario, status: str) -> None:
 
 
 def run_of(path: Path) -> RunFolder:
-    spec = RunSpec(
-        suite="s",
-        robots={"courier": "h"},
-        suite_version="1",
-        suite_hash="",
-        policy="route",
-        policy_name="route",
-        policy_version="1",
-        scenarios=tuple(s.id for s in LONG),
-        versions=versions(),
-        renderer=GL,
-    )
-    return RunFolder.create(path, spec, Suite(name="s", version="1", scenarios=LONG))
+    suite = Suite(name="s", version="1", scenarios=LONG)
+    return RunFolder.create(path, spec_of(suite, "route", versions=versions(), renderer=GL), suite)
 
 
 def test_a_run_is_remembered_even_when_it_is_stopped(tmp_path: Path, cache: Path) -> None:

@@ -18,9 +18,8 @@ from cosim.core.errors import MachineError
 from cosim.core.framing import Wire
 from cosim.episode.policy_caller import PolicyCall
 from cosim.policies.load import load_policy
-from cosim.results.record import Record, begun
+from cosim.results.record import Record
 from cosim.results.run_folder import RunFolder, read_records
-from cosim.results.run_spec import RunSpec
 from cosim.spec.options import RendererAt
 from cosim.spec.scenario import City, Scenario, Suite, write_suite
 from scenarios.ipc.deadlines import Asked, Patience, Question
@@ -41,6 +40,7 @@ from scenarios.runs.environment_slot import EnvironmentSlot
 from scenarios.runs.shared_renderer import End, SharedRenderer
 from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import PATIENCE_S, Cosim, seed_in_order
+from tests.run_specs import record_of, spec_of
 
 MODULES = {
     "libsumo": "raise ImportError('libX11.so.6: cannot open shared object file: No such file or "
@@ -281,25 +281,14 @@ def all_pooled(
     transport = Prepared(*fakes)
     suite = Suite(name="s", version="1", scenarios=scenarios)
     driver = load_policy("stop")
-    spec = RunSpec(
-        suite="s",
-        robots={"courier": "h"},
-        suite_version="1",
-        suite_hash="h",
-        policy="stop",
-        policy_name="stop",
-        policy_version="1",
-        scenarios=tuple(one.id for one in scenarios),
-        versions={},
-        seed=seed_in_order(scenarios),
-    )
+    spec = spec_of(suite, "stop", seed=seed_in_order(scenarios))
     hello = Hello("stop", driver.manifest, driver.source_hash, patience=Patience(**named))
     with RunFolder.create(folder / "run", spec, suite) as held:
         pool.run_all(
             held, suite.scenarios, hello, transport, tell=lambda _: None, renderer=renderer
         )
         assert next(transport.waiting, None) is None and held.finished() == set(spec.scenarios)
-    return sorted(read_records(folder / "run"), key=lambda record: record.scenario)
+    return sorted(read_records(folder / "run"), key=lambda record: record.scenario.id)
 
 
 def test_an_engine_that_hangs_is_tried_again(
@@ -338,7 +327,7 @@ def test_a_damaged_record_is_a_crash(tmp_path: Path, came: str) -> None:
     """A worker that reports an episode as done with half a record, or another one's, has not
     finished it."""
     other = msgspec.structs.replace(SCENARIO, id="s-1")
-    whole = begun(other, load_policy("stop").manifest, "h").encoded()
+    whole = record_of(other, load_policy("stop").manifest).encoded()
     done = Done("s-0", "done", whole[: len(whole) // 2] if came == "half" else whole)
     record = pooled(tmp_path, Fake(Ready(), done))
     assert record.status == "crashed" and record.reason == "its record was damaged when it arrived"
@@ -346,7 +335,7 @@ def test_a_damaged_record_is_a_crash(tmp_path: Path, came: str) -> None:
 
 def test_a_record_and_its_log_are_written_as_they_came(tmp_path: Path) -> None:
     """A worker needs no folder: the run's own process writes the bytes, and a frame."""
-    data = begun(SCENARIO, load_policy("stop").manifest, "h").encoded()
+    data = record_of(SCENARIO, load_policy("stop").manifest).encoded()
     log = os.urandom(3_000_000)
     record = pooled(
         tmp_path, Fake(Ready(), FrameDrawn("s-0", 5, b"png"), Done("s-0", "crashed", data, log))
@@ -382,7 +371,7 @@ def test_who_ends_its_process_gains_nothing_and_who_loses_it_to_an_engine_nothin
 def test_an_engine_that_fails_is_tried_again(tmp_path: Path) -> None:
     """One error is forgotten; after the second the episode is invalid, with its reason."""
     failed = msgspec.structs.replace(
-        begun(SCENARIO, load_policy("stop").manifest, "h"), status="invalid", reason="gone"
+        record_of(SCENARIO, load_policy("stop").manifest), status="invalid", reason="gone"
     )
     fine = Done("s-0", "done", msgspec.structs.replace(failed, status="done", reason="").encoded())
     once = Again(Ready(), Done("s-0", "invalid", failed.encoded(), again=True), fine)
@@ -412,7 +401,7 @@ def test_a_process_that_died_between_two_episodes_has_not_tried_the_second(tmp_p
         Done(
             one.id,
             "done",
-            msgspec.structs.replace(begun(one, manifest, "h"), status="invalid").encoded(),
+            msgspec.structs.replace(record_of(one, manifest), status="invalid").encoded(),
         )
         for one in (SCENARIO, second)
     )
@@ -432,7 +421,7 @@ def test_an_episode_finished_before_its_process_died_is_kept(tmp_path: Path) -> 
             one.id,
             "done",
             msgspec.structs.replace(
-                begun(one, load_policy("stop").manifest, "h"), ticks=9
+                record_of(one, load_policy("stop").manifest), ticks=9
             ).encoded(),
         )
         for one in (SCENARIO, second)
@@ -502,7 +491,7 @@ def test_an_episode_is_no_attempt_the_less_for_a_renderer_that_died_for_others(
     """It is run again as often as that happens; a policy that takes the renderer down when it is
     asked for the episode has used up an attempt of it, and one that does not answer all of them."""
     data = msgspec.structs.replace(
-        begun(SCENARIO, load_policy("stop").manifest, "h"), status="invalid"
+        record_of(SCENARIO, load_policy("stop").manifest), status="invalid"
     ).encoded()
     losses = [LostRenderer("s-0", 1, asked)] * lost
     over = () if reason else (Done("s-0", "done", data),)
@@ -584,9 +573,7 @@ class Notes(Fake):
 
     def give(self, job: Job) -> None:
         self.given.append(job)
-        done = begun(
-            job.scenario, load_policy("stop").manifest, "h", run_seed=job.options.seed or 0
-        )
+        done = Record.begun(job.scenario, load_policy("stop").manifest, job.setup)
         self._messages = (*self._messages, Done(job.scenario.id, "crashed", done.encoded()))
 
 
@@ -602,22 +589,11 @@ def test_a_policy_that_counts_its_episodes_does_not_learn_which_they_are(tmp_pat
     for seed in (1, 2, 1):
         folder = tmp_path / f"{seed}-{len(orders)}"
         notes = Notes()
-        spec = RunSpec(
-            suite="s",
-            robots={"courier": "h"},
-            suite_version="1",
-            suite_hash="h",
-            policy="stop",
-            policy_name="stop",
-            policy_version="1",
-            scenarios=tuple(one.id for one in suite.scenarios),
-            versions={},
-            seed=seed,
-        )
+        spec = spec_of(suite, "stop", seed=seed)
         hello = Hello("stop", load_policy("stop").manifest, "")
         with RunFolder.create(folder, spec, suite) as held:
             pool.run_all(held, suite.scenarios, hello, Prepared(notes), tell=lambda _: None)
-        assert {job.options.seed for job in notes.given} == {seed}
+        assert {job.setup.seed for job in notes.given} == {seed}
         order = [job.scenario.id for job in notes.given]
         assert orders.setdefault(seed, order) == order
     assert sorted(orders[1]) == sorted(orders[2]) == list(spec.scenarios)

@@ -238,7 +238,7 @@ def test_a_server_that_is_killed_loses_its_episode_which_is_run_again(
     ):
         found("zenoh:dying", endpoint, tmp_path / "printed").close()
         said = cosim("run", "three.json", *words, "--answer-timeout", "5", cwd=tmp_path)
-    a, b, c = sorted(read_records(tmp_path / "run"), key=lambda record: record.scenario)
+    a, b, c = sorted(read_records(tmp_path / "run"), key=lambda record: record.scenario.id)
     here = suite_run.run(
         Suite(name="three", version="1", scenarios=(one_second("a"),)),
         Honest(),
@@ -252,7 +252,12 @@ def test_a_server_that_is_killed_loses_its_episode_which_is_run_again(
         c.status == "crashed"
         and "policy 'honest' gave no answer for 5 s in act at 0.50 s of c" in c.reason
     )
-    assert a.policy_runs == b.policy_runs == read_spec(tmp_path / "run").policy_runs == "remote"
+    assert (
+        a.setup.policy_runs
+        == b.setup.policy_runs
+        == read_spec(tmp_path / "run").setup.policy_runs
+        == "remote"
+    )
     assert (
         a.clock["answer_p95_ms"] >= a.clock["answer_median_ms"] > 0.0
         and "policy remote" in said.stdout

@@ -32,7 +32,6 @@ from cosim.policies.privileged.route import best_lane, crossing_limit
 from cosim.policies.privileged.social_force import bodies_m
 from cosim.policies.privileged.standing_groups import lines
 from cosim.results.run_folder import RunFolder
-from cosim.results.run_spec import RunSpec
 from cosim.spec import robot as table
 from cosim.spec.camera import CameraSpec
 from cosim.spec.manifest import Manifest, WaypointRule
@@ -44,11 +43,13 @@ from physics.dynamics.drive import SkidDrive
 from physics.robots import hash_of_robot, urdf_of
 from physics.street.street_surface import StreetSurface
 from scenarios.places.nets import place
-from scenarios.runs.run import run, run_spec
+from scenarios.runs.planning import run_spec
+from scenarios.runs.run import run
 from scenarios.suites.catalog import load_suite, with_robot
 from scenarios.suites.fits import misfits
 from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import Cosim
+from tests.run_specs import changed, spec_of
 from tests.spec.test_fits import barrier, crossroads, from_west_to_east
 from tests.support.tiny_street import tiny_map
 
@@ -295,26 +296,14 @@ def test_another_robot_is_another_suite_and_another_run(tmp_path: Path) -> None:
     assert whole.content_hash != shipped.content_hash
     assert content_hash(whole.scenarios[0]) != content_hash(shipped.scenarios[0])
     assert with_robot(shipped, "courier") is with_robot(shipped, "") is shipped
-    spec = RunSpec(
-        suite="s",
-        robots={"courier": "h"},
-        suite_version="1",
-        suite_hash="h",
-        policy="p",
-        policy_name="p",
-        policy_version="1",
-        scenarios=(),
-        versions={},
-    )
-    with RunFolder.create(tmp_path / "run", spec, Suite(name="s", version="1", scenarios=())):
+    none = Suite(name="s", version="1", scenarios=())
+    spec = spec_of(none)
+    with RunFolder.create(tmp_path / "run", spec, none):
         pass
     with pytest.raises(
         RunError, match=r"its robots is \{'courier': 'h', 'scout': None\}, now asked"
     ):
-        RunFolder.resume(
-            tmp_path / "run",
-            msgspec.structs.replace(spec, robots={"scout": "h"}, suite_hash="other"),
-        )
+        RunFolder.resume(tmp_path / "run", changed(spec, robots={"scout": "h"}, suite_hash="other"))
 
 
 def test_an_edited_robot_is_another_one(barrow: Robot, tmp_path: Path) -> None:
@@ -435,7 +424,7 @@ def test_a_third_robot_runs_an_episode_and_everything_follows_it(barrow: Robot) 
         while not episode.over:
             observation = episode.advance(policy.act(observation))
         record, log = episode.result()
-    assert (record.robot, record.scenario_hash) == (
+    assert (record.scenario.robot, record.scenario.hash) == (
         "barrow",
         content_hash(scenario.driven_by("barrow")),
     )

@@ -11,18 +11,18 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Self
 
 import msgspec
 import numpy as np
 import pytest
 import shapely
 
+from bridge.policy_server import Answer, AskAct, AskReset, Begun, PolicyReply, Refusal, decode_reply
 from cosim.core.errors import EngineError, PolicyError, RendererLost, UsageError
 from cosim.core.framing import Wire
-from cosim.core.geometry import Pose
+from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import NO_VEHICLES, Frame, People, RobotState, Signal, Street
-from cosim.episode.interfaces import Policy
+from cosim.episode.interfaces import Observation, Policy, Privileged
 from cosim.episode.policy_caller import Driver
 from cosim.policies.load import load_policy
 from cosim.results.log import Log
@@ -31,28 +31,17 @@ from cosim.spec.camera import CameraSpec
 from cosim.spec.episode_id import pseudonym_of
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
+from cosim.spec.robot import COURIER
 from cosim.spec.scenario import CityMap, Light, Scenario, Suite, write_suite
 from scenarios.ipc.deadlines import Patience
 from scenarios.ipc.messages import Hello, Progress
-from scenarios.ipc.picture_memory import PictureMemory
-from scenarios.ipc.render_link import RendererLink, link_to
-from scenarios.ipc.render_protocol import (
-    Ask,
-    Begin,
-    Draw,
-    Enter,
-    Fine,
-    Knowledge,
-    Refused,
-    Reply,
-    Request,
-    Told,
-    Welcome,
-    decode_request,
-    encode_exchange,
-)
+from scenarios.ipc.observation_codec import encoded_about, encoded_fields
+from scenarios.ipc.render_link import RendererLink
+from scenarios.ipc.render_protocol import Draw, Rendered, Request, decode_request, encode_exchange
+from scenarios.ipc.shared_memory import SharedMemory
 from scenarios.places.nets import place
 from scenarios.runs import run as suite_run
+from scenarios.runs.shared_policy import shared_driver
 from scenarios.runs.shared_renderer import End, SharedRenderer, check_shared
 from scenarios.tools.bench.cameras import busy_street
 from scenarios.tools.verify.doctor import small_scenario
@@ -89,27 +78,35 @@ def linked(renderer: SharedRenderer) -> RendererLink:
     return RendererLink(renderer.at.address)
 
 
-def renderer_pid(renderer: SharedRenderer) -> int:
-    """The process that draws: the only child of its shepherd."""
-    assert renderer._watchdog is not None
-    shepherd = renderer._watchdog.process._child.pid
-    (child,) = Path(f"/proc/{shepherd}/task/{shepherd}/children").read_text().split()
-    return int(child)
+def renderer_pid() -> int:
+    """The process that draws: below a shepherd of this process, the one that has the listening
+    socket's address."""
+    found = [
+        int(child)
+        for shepherd in children(os.getpid())
+        for child in children(shepherd)
+        if b"serve_pictures" in Path(f"/proc/{shepherd}/cmdline").read_bytes()
+    ]
+    return found[-1]
 
 
-def asked_together(
-    renderer: SharedRenderer, links: Sequence[RendererLink], *requests: Request
-) -> list[Reply]:
+def children(pid: int) -> list[int]:
+    """The processes that the threads of a process have started."""
+    tasks = Path(f"/proc/{pid}/task").iterdir()
+    return sorted(int(child) for task in tasks for child in (task / "children").read_text().split())
+
+
+def asked_together(links: Sequence[RendererLink], *requests: Request) -> list[bytes]:
     """The replies to requests that the renderer finds waiting all at once: it is stopped while they
     are sent."""
-    pid = renderer_pid(renderer)
+    pid = renderer_pid()
     os.kill(pid, signal.SIGSTOP)
     while Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "T":
         time.sleep(0.001)
     for link, request in zip(links, requests, strict=True):
         link.tell(request)
     os.kill(pid, signal.SIGCONT)
-    return [link._received() for link in links]
+    return [link.received() for link in links]
 
 
 def seen_by_themselves(
@@ -145,41 +142,39 @@ def test_pictures_and_labels_are_those_of_a_camera_of_ones_own(tmp_path: Path) -
     with renderer_for(tmp_path, Seeing()) as renderer:
         links = [linked(renderer) for _ in range(3)]
         for link, each in zip(links, (one, other, other), strict=True):
-            link.ask(Enter(each))
+            link.enter(each)
         for k, street in enumerate(busy.streets):
-            replies = asked_together(renderer, links, *[Draw(busy.robot, street)] * len(links))
-            assert replies == [Fine()] * len(links)
-            for link, frames in zip(links, expected, strict=False):
-                picture = link.picture()
+            replies = asked_together(links, *[Draw(busy.robot, street)] * len(links))
+            for link, reply, frames in zip(links, replies, expected, strict=False):
+                picture = link.drawn(reply)
                 assert picture.rgb.tobytes() == frames[k].rgb.tobytes()
                 assert frames[k].labels is not None and picture.labels is not None
                 assert picture.labels.tobytes() == frames[k].labels.tobytes()
             if k == 1:
-                links.pop()._wire.close()
+                links.pop().close()
             if k == 2:
-                links.pop()._wire.send(b"nonsense")
+                links.pop().tell(AskReset("", "no policy is here", "", 0))
         assert expected[0][3].rgb.tobytes() != expected[1][3].rgb.tobytes() and len(links) == 1
         with pytest.raises(
             EngineError, match="the shared renderer: UsageError: unknown map 'nowhere'"
         ):
-            linked(renderer).ask(Enter(msgspec.structs.replace(one, place=CityMap(map="nowhere"))))
-        pid = renderer_pid(renderer)
+            linked(renderer).enter(msgspec.structs.replace(one, place=CityMap(map="nowhere")))
+        pid = renderer_pid()
         renderer.tend()
         os.kill(pid, signal.SIGKILL)
         with pytest.raises(RendererLost) as lost:
-            links[0].ask(Draw(busy.robot, busy.streets[0]))
+            links[0].draw(busy.robot, busy.streets[0])
         assert (lost.value.number, lost.value.asked) == (1, "")
         end = renderer.end_of(1)
         assert end is not None and end.words == "the renderer process was killed by SIGKILL"
     assert {*Path("/dev/shm").iterdir()} == before
 
 
-def test_who_connects_says_that_it_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_connects_says_that_it_waits() -> None:
     """A renderer that is still loading its policy accepts nobody for as long as that takes: an
     environment that was silent meanwhile would be taken for one that hangs."""
-    monkeypatch.setattr("scenarios.ipc.render_link._TELLS_EVERY_S", 0.01)
     address = f"cosim-test-{os.getpid()}"
-    memory = PictureMemory.new((0, 0))
+    memory = SharedMemory.new()
     waited = []
     with socket.socket(socket.AF_UNIX) as listening:
         listening.bind(f"\0{address}")
@@ -189,78 +184,60 @@ def test_who_connects_says_that_it_waits(monkeypatch: pytest.MonkeyPatch) -> Non
             end, _ = listening.accept()
             waited.append(end)
             socket.send_fds(end, [b"\0"], [memory.descriptor])
-            Wire(end).send(encode_exchange(Welcome(1, "late", (0, 0))))
+            Wire(end).send(encode_exchange(Rendered(1, "late")))
 
-        made = link_to(address, accept)
-        assert made.renderer == "late" and len(waited) == 1 and link_to(address) is made
-        made.lost()
+        made = RendererLink(address, accept, waiting_every_s=0.01)
+        made.enter(small_scenario())
+        assert (made.number, made.renderer, len(waited)) == (1, "late", 1)
+        made.close()
     memory.close()
 
 
-def knows(tick: int, v_mps: float = 0.5) -> Ask:
-    """What the environment of a blind policy asks for at a tick."""
+def knows(name: str, step: int) -> AskAct:
+    """The request of the environment of a blind policy at a step."""
     people = People.of(("c1",), [[3.0, 0.0]], [0.0], [1.0], ("walk",))
-    area = shapely.to_wkb(shapely.box(0.0, -1.0, 30.0, 1.0))
-    robot = RobotState(Pose(0.0, 0.0, 0.0), v_mps)
-    return Ask(tick, v_mps, 0.0, Knowledge(robot, 0.0, people, NO_VEHICLES, {}, (), area))
+    robot = RobotState(Pose(0.0, 0.0, 0.0), 0.5)
+    route = Polyline([(0.0, 0.0), (30.0, 0.0)])
+    known = Privileged(
+        robot, route, 0.0, people, NO_VEHICLES, {}, (), shapely.box(0.0, -1.0, 30.0, 1.0)
+    )
+    seen = Observation(5 * step, 0.25 * step, None, 0.5, 0.0, COURIER, known)
+    fields, _ = encoded_fields(seen)
+    return AskAct("r", name, "a", step, **fields, about=None if step else encoded_about(seen))
 
 
 @pytest.mark.engine
-def test_one_bad_answer_is_one_crash_and_what_takes_the_policy_down_names_whom_it_was_asked_for(
-    tmp_path: Path,
-) -> None:
-    """Of episodes asked together: NaN and a reset that raises concern one of them; what act_batch
-    raises, and an answer too few, all; one that hangs, exits or closes what is not its own takes
-    the renderer with it, and who was not asked knows that it was not."""
+def test_what_takes_the_policy_down_names_whom_it_was_asked_for(tmp_path: Path) -> None:
+    """What act_batch raises concerns all that it was queried for. A policy that hangs, exits or
+    closes what is not its own takes the renderer with it, and who was not asked knows that it was
+    not."""
     with renderer_for(tmp_path, Knowing(), Patience(answer_s=1.0)) as renderer:
 
         def begun(*names: str) -> list[RendererLink]:
-            links = []
-            for scenario in scenarios_of(*names):
-                links.append(linked(renderer))
-                links[-1].ask(Enter(scenario))
-                links[-1].ask(Begin(scenario.id, scenario.seed))
-            for tick in (0, 5):
-                told = asked_together(renderer, links, *[knows(tick)] * len(links))
-                assert told == [Told(0.59, 0.0)] * len(links)
+            links = [linked(renderer) for _ in names]
+            for link, name in zip(links, names, strict=True):
+                assert decode_reply(link.exchange(AskReset("r", name, "a", 0))) == Begun(
+                    "r", name, "a"
+                )
+            for step in (0, 1):
+                replies = together(links, names, step)
+                assert replies == [Answer("r", name, "a", step, 0.59, 0.0) for name in names]
             return links
 
-        def third(*names: str) -> list[Reply]:
-            links = begun(*names)
-            replies = asked_together(renderer, links, *[knows(10)] * len(links))
-            for link in links:
-                link._wire.close()
-            return replies
+        def together(
+            links: Sequence[RendererLink], names: Sequence[str], step: int
+        ) -> list[PolicyReply]:
+            requests = [knows(name, step) for name in names]
+            return [decode_reply(reply) for reply in asked_together(links, *requests)]
 
-        honest, nan = third("honest", "nan")
-        assert honest == Told(0.59, 0.0) and isinstance(nan, Refused) and nan.by_policy
-        assert nan.reason == (
-            "policy 'knowing' answered Command(v_mps=nan, w_radps=0.0): both must be finite "
-            "numbers (act at 0.50 s)"
-        )
-        for name, words in {
-            "raises": "raised KeyError: 'no such weight'",
-            "forgets-one": "gave 1 answers to 2 observations",
-        }.items():
-            together = f"policy 'knowing' {words} (act at 0.50 s, asked for 2 episodes together)"
-            assert third("honest", name) == [Refused(together, by_policy=True)] * 2
-        fails = linked(renderer)
-        fails.ask(Enter(*scenarios_of("fails-in-reset")))
+        names = "honest", "raises"
+        refused = Refusal("policy", "raised KeyError: 'no such weight'", together=2)
+        assert together(begun(*names), names, 2) == [refused] * 2
+        driver = shared_driver(Knowing.manifest, "", renderer.at, "r")
         with pytest.raises(
             PolicyError, match=r"policy 'knowing' raised FileNotFoundError: weights\.pt \(reset\)"
         ):
-            fails.ask(Begin("fails-in-reset", 0))
-        fails._wire.close()
-        one, other = begun("honest", "fails-when-put-back")
-        told, crashed = asked_together(
-            renderer, [one, other], *[msgspec.structs.replace(knows(10), reset=True)] * 2
-        )
-        assert told == Told(0.59, 0.0) and isinstance(crashed, Refused) and crashed.by_policy
-        assert (
-            crashed.reason == "policy 'knowing' raised LookupError: no history (on_reset at 0.50 s)"
-        )
-        for link in (one, other):
-            link._wire.close()
+            driver.reset("fails-in-reset", 0)
         renderer.tend()
         ends = {
             "hangs": End("the renderer process was ended", 1.0),
@@ -271,15 +248,15 @@ def test_one_bad_answer_is_one_crash_and_what_takes_the_policy_down_names_whom_i
         }
         for number, (name, end) in enumerate(ends.items(), start=1):
             honest_one, other = begun("honest", name)
-            other.tell(knows(10))
+            other.tell(knows(name, 2))
             while name == "hangs" and renderer.end_of(1) is None:
                 renderer.tend()
             with pytest.raises(RendererLost) as lost:
-                other.reply("act at 0.50 s")
-            assert (lost.value.number, lost.value.asked) == (number, "act at 0.50 s")
+                other.received("act at 0.50 s")
+            assert lost.value.asked == "act at 0.50 s"
             with pytest.raises(RendererLost) as lost:
-                honest_one.reply("act at 0.50 s")
-            assert (lost.value.number, lost.value.asked) == (number, "")
+                honest_one.received("act at 0.50 s")
+            assert lost.value.asked == ""
             assert renderer.end_of(number) == end
 
 
@@ -329,7 +306,7 @@ def by_themselves(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def same(one: Path, other: Path) -> bool:
     """Whether two runs have the same tables and hashes, and the same frames to the byte."""
     hashes = [
-        {record.scenario: record.state_hash for record in read_records(folder)}
+        {record.scenario.id: record.state_hash for record in read_records(folder)}
         for folder in (one, other)
     ]
     frames = [
@@ -374,7 +351,7 @@ def test_a_policy_asked_by_the_shared_renderer_is_given_the_same(tmp_path: Path)
     suite_run.run(suite_of("a"), guided, shared_renderer=True, out=tmp_path / "shared", options=one)
     (own,) = read_records(tmp_path / "own")
     (shared,) = read_records(tmp_path / "shared")
-    assert (own.status, own.goal_protocol, own.odometry) == ("done", "image", "wheel")
+    assert (own.status, own.manifest.goal, own.manifest.odometry) == ("done", "image", "wheel")
     assert own.state_hash == shared.state_hash and shared.status == "done"
     mine, theirs = ((tmp_path / how / "episodes/a/trajectory.npz") for how in ("own", "shared"))
     assert mine.read_bytes() == theirs.read_bytes() and {*Log.load(mine).plan_sizes.tolist()} == {
@@ -385,24 +362,17 @@ def test_a_policy_asked_by_the_shared_renderer_is_given_the_same(tmp_path: Path)
 
 @pytest.mark.engine
 def test_episodes_whose_renderer_is_killed_are_run_again(
-    by_themselves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    by_themselves: Path, tmp_path: Path
 ) -> None:
     """kill -9 in the middle of two episodes: another renderer draws them from their beginning, none
     has crashed, and what comes out is the same as ever."""
-    started: list[SharedRenderer] = []
     killed: list[int] = []
-
-    class Noted(SharedRenderer):
-        def __enter__(self) -> Self:
-            started.append(self)
-            return super().__enter__()
 
     def kill(message: object) -> None:
         if isinstance(message, Progress) and not killed:
-            killed.append(renderer_pid(started[0]))
+            killed.append(renderer_pid())
             os.kill(killed[0], signal.SIGKILL)
 
-    monkeypatch.setattr(suite_run, "SharedRenderer", Noted)
     folder = tmp_path / "run"
     suite_run.run(
         suite_of("a", "b"),
@@ -457,18 +427,13 @@ def test_where_there_is_nothing_to_share_it_is_said() -> None:
 
 def test_no_environment_can_shrink_its_memory_under_the_renderers_hands() -> None:
     """The size is sealed; a picture that was taken stays when the next one comes."""
-    memory = PictureMemory.new((4, 2))
+    memory = SharedMemory.new(64)
     with pytest.raises(PermissionError):
         os.ftruncate(memory.descriptor, 0)
-    rgb = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
-    labels = np.full((2, 4), 9, np.uint8)
-    memory.put(Frame(rgb, labels))
-    taken = memory.take()
-    memory.put(Frame(rgb + 1, labels + 1))
-    assert (
-        taken.labels is not None
-        and (taken.rgb == rgb).all()
-        and (taken.labels == 9).all()
-        and not memory.asked
-    )
+    with pytest.raises(ValueError, match="no room for rgb"):
+        memory.lay({"rgb": np.zeros((9, 9), np.uint8)})
+    picture = {"rgb": np.arange(24, dtype=np.uint8).reshape(2, 4, 3)}
+    taken = memory.take(memory.lay(picture))
+    memory.lay({"rgb": picture["rgb"] + 1})
+    assert (taken["rgb"] == picture["rgb"]).all() and not memory.busy
     memory.close()

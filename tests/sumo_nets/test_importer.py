@@ -35,6 +35,7 @@ from sumo_nets.maps.map_store import (
     ABOUT,
     about_map,
     checked_map,
+    credit_of,
     import_map,
     known_maps,
     map_name,
@@ -143,6 +144,8 @@ def test_osm_becomes_a_place_that_can_be_walked(tmp_path: Path) -> None:
     )
     assert check.islands[0].share > 0.99 and check.crossings >= 16 and check.corners >= 16
     assert "OpenStreetMap contributors" in about.licences[0]
+    assert credit_of(CityMap(map="kleine-stadt")) == "(c) OpenStreetMap contributors, ODbL"
+    assert credit_of(CityMap(map="sumo-a10kw")) == credit_of(City(seed=1)) == ""
     assert any("on the right" in change for change in about.changes)
     assert known_maps()["kleine-stadt"].origin == "imported"
 

@@ -126,14 +126,14 @@ def _hub(net: Network) -> str:
 
 def wrong_with(folder: Path, scenarios: int) -> list[str]:
     """What is wrong with the run, in words."""
-    records = [record.scenario for record in read_records(folder / "run")]
+    records = [record.scenario.id for record in read_records(folder / "run")]
     wrong = (
         []
         if len(set(records)) == len(records) == scenarios
         else [f"{len(records)} records of {scenarios}"]
     )
     if lost := [
-        record.scenario for record in read_records(folder / "run") if record.status != "done"
+        record.scenario.id for record in read_records(folder / "run") if record.status != "done"
     ]:
         wrong.append(f"without a result: {', '.join(lost)}")
     log = (folder / "run" / LOG_FILE).read_text()

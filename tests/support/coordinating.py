@@ -26,13 +26,14 @@ from bridge.session import Session, open_session
 from cosim.core.errors import EngineError
 from cosim.core.state import STILL, Command
 from cosim.policies.load import load_policy
-from cosim.results.record import begun
+from cosim.results.record import Record
 from cosim.results.run_folder import RunFolder
 from cosim.spec.connection import Connection
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import City, Scenario, Suite
 from scenarios.ipc.messages import Done, Hello, Job
+from scenarios.runs.planning import run_spec
 from scenarios.runs.pool import run_all
 from scenarios.runs.protocol import (
     Assignment,
@@ -43,7 +44,6 @@ from scenarios.runs.protocol import (
     digest_of,
     installed_here,
 )
-from scenarios.runs.run import run_spec
 from scenarios.runs.transport import HeldRun
 from scenarios.runs.zenoh_transport import workers_of_run
 
@@ -93,7 +93,7 @@ def serve_made_up(workers: int, jobs: int) -> Served:
     scenarios = tuple(msgspec.structs.replace(one, id=f"j-{i:06d}", seed=i) for i in range(jobs))
     suite = Suite(name="load", version="1", scenarios=scenarios)
     driver = load_policy(_POLICY)
-    options = EpisodeOptions(seed=1, suite_hash=suite.content_hash)
+    options = EpisodeOptions(seed=1)
     spec = run_spec(suite, scenarios, _POLICY, driver, options)
     hello = Hello(_POLICY, driver.manifest, driver.source_hash)
     with tempfile.TemporaryDirectory() as folder:
@@ -138,7 +138,7 @@ class _MadeUp:
         self._claim = encode(
             Claim(**self._me, host="here", installed=dict(installed_here()), ready=True)
         )  # type: ignore[arg-type]
-        self._manifest = load_policy(_POLICY)
+        self._manifest = load_policy(_POLICY).manifest
         self._said: tuple[str, bytes] = ("", b"")
         self.rounds_s: list[float] = []
         self._done_s = 0.0
@@ -173,10 +173,8 @@ class _MadeUp:
         self._replies.put((self, payload))  # type: ignore[arg-type]
 
     def _result(self, lease: int, job: Job) -> Report:
-        options, driver = job.options, self._manifest
-        record = begun(
-            job.scenario, driver.manifest, options.suite_hash, driver.source_hash, options.seed or 0
-        )
+        assert job.setup is not None
+        record = Record.begun(job.scenario, self._manifest, job.setup)
         data = msgspec.structs.replace(
             record, status="done", ended="goal", ticks=40, state_hash="0" * 32
         ).encoded()

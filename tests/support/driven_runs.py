@@ -14,13 +14,13 @@ from cosim.core.geometry import Pose
 from cosim.episode.loop import place_on_route
 from cosim.results.log import Log
 from cosim.results.metrics import EpisodeFacts, every_metric
-from cosim.results.record import METRIC_SCHEMA, Record, begun
+from cosim.results.record import Record
 from cosim.results.referee import Failure
 from cosim.results.run_folder import RunFolder
-from cosim.results.run_spec import RunSpec
 from cosim.spec.manifest import Manifest
 from cosim.spec.scenario import City, Scenario, Suite
 from tests.logs import log_with
+from tests.run_specs import record_of, spec_of
 
 SPEED_MPS = 1.0
 HIT = "hit"
@@ -91,7 +91,7 @@ def episode_of(
     scenario: Scenario, suite_hash: str, how: str = "goal", policy: str = "p"
 ) -> tuple[Record, Log | None]:
     """The record and log of a short way. how: "goal"; HIT; "crashed"; "invalid"."""
-    record = begun(scenario, Manifest(policy, camera=None), suite_hash)
+    record = record_of(scenario, Manifest(policy, camera=None), suite_hash=suite_hash)
     if how in ("crashed", "invalid"):
         return msgspec.structs.replace(record, status=how, reason="it said so"), None
     whole = driven(scenario, [SPEED_MPS] * 161)
@@ -114,19 +114,7 @@ def run_of(
     so on."""
     ways = tuple(scenarios) or tuple(short_way(f"s-{i:03d}") for i in range(len(hows)))
     suite = Suite(name="s", version="1", scenarios=ways)
-    spec = RunSpec(
-        suite="s",
-        robots={"courier": "h"},
-        suite_version="1",
-        suite_hash=suite.content_hash,
-        policy=policy,
-        policy_name=policy,
-        policy_version="1",
-        scenarios=tuple(way.id for way in ways),
-        versions={"numpy": "2"},
-        metric_schema=METRIC_SCHEMA,
-    )
-    with RunFolder.create(path, spec, suite) as folder:
+    with RunFolder.create(path, spec_of(suite, policy), suite) as folder:
         for way, how in zip(ways, hows, strict=True):
             record, log = episode_of(way, suite.content_hash, how, policy)
             folder.keep(record, log.encoded() if log is not None else b"")

@@ -12,7 +12,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -58,7 +58,16 @@ class Cheat(Honest):
     def reset(self, episode_id: str, seed: int) -> None:
         names = json.loads((Path(os.environ[DESK]) / "names.json").read_text())
         self.deed = DEEDS[names[episode_id]]
+        self.at_end = AFTERWARDS.get(names[episode_id], lambda: None)
         self.count = 0
+
+    def act_batch(
+        self, observations: Sequence[Observation]
+    ) -> list[Command | np.ndarray[Any, Any]]:
+        return [self.act(seen) for seen in observations]
+
+    def ended(self, episode_id: str) -> None:
+        self.at_end()
 
     def act(self, seen: Observation) -> Command | np.ndarray[Any, Any]:
         self.count += 1
@@ -122,17 +131,6 @@ def _raises(seen: Observation) -> None:
     raise PolicyServerLost("the server is gone")
 
 
-def _at_the_end(does: Callable[[], object]) -> Callable[[Observation], None]:
-    """Once the episode is over, and its process is told so."""
-
-    def plan(seen: Observation) -> None:
-        from bridge.policy_server import PolicyDesk
-
-        PolicyDesk._end = lambda *_: does()  # type: ignore[method-assign]
-
-    return plan
-
-
 DEEDS: dict[str, Callable[[Observation], object]] = {
     "honest": lambda seen: None,
     "patches-the-referee": _patches,
@@ -148,6 +146,11 @@ DEEDS: dict[str, Callable[[Observation], object]] = {
     "stops-itself": lambda seen: os.kill(os.getpid(), signal.SIGSTOP),
     "too-many-numbers": lambda seen: np.zeros((50_001, 2)),
     "far-too-many-numbers": lambda seen: np.zeros((1_000_000, 4)),
-    "ends-afterwards": _at_the_end(lambda: os._exit(0)),
-    "hangs-afterwards": _at_the_end(lambda: time.sleep(3600)),
+    "ends-afterwards": lambda seen: None,
+    "hangs-afterwards": lambda seen: None,
 }
+AFTERWARDS: dict[str, Callable[[], object]] = {
+    "ends-afterwards": lambda: os._exit(0),
+    "hangs-afterwards": lambda: time.sleep(3600),
+}
+"""What is done when the episode has ended, and the policy knows that."""

@@ -47,7 +47,7 @@ def shown_of(runs: Sequence[ReportedRun]) -> list[FailureToShow]:
         for record in run.records:
             if record.status != "done" or record.ended is None:
                 continue
-            scenario = run.scenarios[record.scenario]
+            scenario = run.scenarios[record.scenario.id]
             family, kind = table_of_paper(scenario), example_of(scenario)
             for mishap in mishaps_of(record)[:_OF_AN_EPISODE]:
                 event = event_of(scenario, mishap)
@@ -60,22 +60,26 @@ def shown_of(runs: Sequence[ReportedRun]) -> list[FailureToShow]:
                 if isinstance(scenario.place, CityMap):
                     facets.add(scenario.place.map)
                 words = "" if event is None else event.kind
+                where = place_in_words(scenario)
                 found.append(
                     FailureToShow(
-                        number,
-                        record.scenario,
-                        mishap,
-                        words,
-                        frozenset(facets),
-                        place_in_words(scenario),
+                        number, record.scenario.id, mishap, words, frozenset(facets), where
                     )
                 )
     return found
 
 
+class Chosen(NamedTuple):
+    """The failures to show, and the limit that left others out, in words; "" where all are
+    shown."""
+
+    picks: list[FailureToShow]
+    limit: str
+
+
 def most_telling(
     candidates: Sequence[FailureToShow], most: int = MOST_FAILURES, within_s: float = WITHIN_S
-) -> list[FailureToShow]:
+) -> Chosen:
     """The most telling ones, the most telling first: each adds as many facets as it can for the
     time that it takes to come there, then a new episode and a new place. Stops when there is
     nothing new, but not below LEAST_FAILURES; what would take longer than _MOST_S in all is left
@@ -90,16 +94,21 @@ def most_telling(
         if soon and alike[one.facets] <= _ENOUGH_ALIKE:
             left.append(one)
     choice = _Choice()
-    while left and len(choice.picked) < most:
+    limit = ""
+    while left and not limit:
         best = max(left, key=choice.worth)
-        fresh = best.facets - choice.seen
-        if choice.further_s(best) > choice.room_s or (
-            len(choice.picked) >= LEAST_FAILURES and not fresh
-        ):
-            break
-        choice.take(best)
-        left.remove(best)
-    return choice.picked
+        if len(choice.picked) >= most:
+            limit = f"--failures {most}"
+        elif choice.further_s(best) > choice.room_s:
+            limit = f"more than {_MOST_S:g} s would be simulated again"
+        elif len(choice.picked) >= LEAST_FAILURES and not best.facets - choice.seen:
+            limit = "the others show no other run, event, cause or place"
+        else:
+            choice.take(best)
+            left.remove(best)
+    if not limit and len(choice.picked) < len(candidates):
+        limit = f"the others are alike, or later than --within {within_s:g} s"
+    return Chosen(choice.picked, limit)
 
 
 class _Choice:

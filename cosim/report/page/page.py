@@ -21,7 +21,7 @@ from cosim.report.page.runs import ReportedRun, place_in_words
 from cosim.report.page.scene import Entry, PlacePicture, Spot
 from cosim.report.page.three_tables import summary_table, tables_of, warnings_of
 from cosim.results.log import holds_waypoints
-from cosim.results.table import policy_in_words
+from cosim.results.table import injections_in_words, policy_in_words
 from cosim.results.throughput import median_answer_ms
 
 _POLICY: Final = (
@@ -92,6 +92,7 @@ def page_of(
         filters=[(name, field, _counts(entries, field)) for name, field in _FILTERS.items()],
         colours=CAUSE_COLOURS,
         maps=maps,
+        credits=_credits(maps),
         drawn={picture.place for picture in maps.pictures},
         all_causes=CAUSES,
         causes=causes,
@@ -149,6 +150,15 @@ def _counts(entries: Sequence[Entry], field: str) -> list[tuple[str, int]]:
     return list(counts.items())
 
 
+def _credits(maps: Maps) -> dict[str, list[str]]:
+    """Return the places that were made from map data, by the credit that its licence asks for."""
+    places: dict[str, list[str]] = {}
+    for picture in maps.pictures:
+        if picture.credit:
+            places.setdefault(picture.credit.replace("(c)", "©"), []).append(picture.place)
+    return places
+
+
 def _what_was_run(runs: Sequence[ReportedRun]) -> dict[str, Any]:
     """Return what each run was, so that others can repeat it: what they share, what differs,
     lost episodes."""
@@ -156,7 +166,7 @@ def _what_was_run(runs: Sequence[ReportedRun]) -> dict[str, Any]:
     shared = {
         name: value for name, value in facts[0].items() if all(one[name] == value for one in facts)
     }
-    versions = [run.spec.versions for run in runs]
+    versions = [run.spec.setup.versions for run in runs]
     packages = sorted({name for one in versions for name in one})
     alike = [name for name in packages if len({one.get(name) for one in versions}) == 1]
     if alike:
@@ -184,23 +194,30 @@ def _facts(run: ReportedRun) -> dict[str, str]:
     )
     took_ms = median_answer_ms(run.records)
     follows = any(map(holds_waypoints, run.path.glob("episodes/*/trajectory.npz")))
-    called = policy_in_words(spec.policy_name, run.records[0].privileged)
+    called = policy_in_words(spec.manifest.name, run.records[0].manifest.privileged)
     return {
-        "policy": f"{called} {spec.policy_version} ({spec.policy})",
-        "its source": spec.policy_source or "not told",
-        "suite": f"{spec.suite} {spec.suite_version}, {spec.suite_hash}",
+        "policy": f"{called} {spec.manifest.version} ({spec.policy})",
+        "its source": spec.setup.policy_source or "not told",
+        "suite": f"{spec.suite} {spec.suite_version}, {spec.setup.suite_hash}",
         "scenarios": f"{len(spec.scenarios)} scheduled, {len(run.records)} ended",
         "metric schema": str(run.table["metric_schema"].iloc[0]),
-        "camera": f"{run.table['camera'].iloc[0]}, at {spec.rate_hz:g} Hz",
-        "drawn by": spec.renderer,
-        "goal": spec.goal_protocol,
-        "odometry": spec.odometry,
+        "camera": f"{run.table['camera'].iloc[0]}, at {spec.manifest.rate_hz:g} Hz",
+        "drawn by": spec.setup.renderer,
+        "goal": spec.manifest.goal,
+        "odometry": spec.manifest.odometry,
         "an answer took": "not told" if took_ms is None else f"{milliseconds(took_ms)}, the median",
-        "latency": "of each answer, measured" if spec.real_time else f"{spec.latency_ms:g} ms",
-        "privileged": "yes: knows what no robot can" if run.records[0].privileged else "no",
-        "waypoints": spec.waypoints.in_words if follows else "none: it answers with commands",
+        "latency": "of each answer, measured"
+        if spec.setup.real_time
+        else f"{spec.setup.latency_ms:g} ms",
+        "privileged": "yes: knows what no robot can"
+        if run.records[0].manifest.privileged
+        else "no",
+        "waypoints": spec.manifest.waypoints.in_words
+        if follows
+        else "none: it answers with commands",
         "robot": ", ".join(f"{name} ({digest})" for name, digest in spec.robots.items()),
-        "seed of the run": str(spec.seed),
+        "seed of the run": str(spec.setup.seed),
+        "injected": injections_in_words(run.table) or "nobody",
         "wall time": wall,
         "folder": str(run.path),
     }

@@ -182,7 +182,7 @@ def _exposures(runs: Sequence[ReportedRun], progress: Progress) -> tuple[_ByRun,
     for number, run in enumerate(runs):
         progress("reading trajectories", number / len(runs))
         for record, track in run.tracks():
-            key = run.label, table_of_paper(run.scenarios[record.scenario])
+            key = run.label, table_of_paper(run.scenarios[record.scenario.id])
             travelled_m = track["travelled_m"]
             speed = np.abs(track["speed"][:, 0])
             if key[1] == "long":
@@ -358,7 +358,7 @@ def _endings(runs: Sequence[ReportedRun]) -> Plot | None:
     rows: dict[str, dict[str, float]] = {}
     for run in runs:
         for record in run.records:
-            family = table_of_paper(run.scenarios[record.scenario])
+            family = table_of_paper(run.scenarios[record.scenario.id])
             if family != "long":
                 row = rows.setdefault(f"{escape(run.label)}<br>{_FAMILIES[family]}", {})
                 went = mishaps_of(record)
@@ -388,7 +388,7 @@ def _rates_by_cause(runs: Sequence[ReportedRun]) -> Plot | None:
     crashed: dict[str, list[bool]] = {}
     for run in runs:
         for record in run.records:
-            if table_of_paper(run.scenarios[record.scenario]) != "long":
+            if table_of_paper(run.scenarios[record.scenario.id]) != "long":
                 continue
             crashed.setdefault(run.label, []).append(record.status == "crashed")
             if record.status == "done":

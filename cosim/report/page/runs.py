@@ -90,7 +90,7 @@ class ReportedRun:
         """_COLUMNS of the log of each episode that counts and has a trajectory; an invalid one does
         not count. Raises RunError for a damaged one."""
         for record in self.records:
-            file = record_file(self.path, record.scenario)
+            file = record_file(self.path, record.scenario.id)
             path = file.with_name(TRAJECTORY)
             if record.status != "done" or not path.exists():
                 continue
@@ -113,7 +113,7 @@ def read_runs(paths: Sequence[Path], progress: Progress = ignore) -> list[Report
         progress(f"reading {path}")
         found.append(read_whole_run(path))
     _refuse_other_suites(found)
-    policies = [(whole.spec.suite, whole.spec.policy_name) for whole in found]
+    policies = [(whole.spec.suite, whole.spec.manifest.name) for whole in found]
     suites = {
         policy: {suite for suite, other in policies if other == policy} for _, policy in policies
     }
@@ -178,9 +178,9 @@ def _refuse_other_suites(runs: Sequence[WholeRun]) -> None:
     first: dict[str, WholeRun] = {}
     for run in runs:
         other = first.setdefault(run.spec.suite, run)
-        if other.spec.suite_hash != run.spec.suite_hash:
+        if other.spec.setup.suite_hash != run.spec.setup.suite_hash:
             raise RunError(
                 f"{run.path} and {other.path} are of different suites '{run.spec.suite}' "
-                f"({run.spec.suite_hash}, {other.spec.suite_hash}): their rows cannot stand in one "
-                "table. Report them apart, or run one again"
+                f"({run.spec.setup.suite_hash}, {other.spec.setup.suite_hash}): their rows cannot "
+                "stand in one table. Report them apart, or run one again"
             )

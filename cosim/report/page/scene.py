@@ -95,11 +95,13 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlacePicture(msgspec.Struct, frozen=True, kw_only=True):
-    """A place from above. image: data URL; bounds: x0, y0, x1, y1 in metres."""
+    """A place from above. image: data URL; bounds: x0, y0, x1, y1 in metres; credit: of the map's
+    data."""
 
     place: str
     image: str
     bounds: tuple[float, float, float, float]
+    credit: str = ""
 
 
 class Spot(msgspec.Struct, frozen=True, kw_only=True):

@@ -488,8 +488,8 @@ def driving_together() -> list[Figure]:
     from cosim.results.run_folder import RunFolder
     from scenarios.ipc.messages import Hello
     from scenarios.runs.local import LocalProcesses
+    from scenarios.runs.planning import run_spec
     from scenarios.runs.pool import run_all
-    from scenarios.runs.run import run_spec
     from scenarios.runs.shared_renderer import SharedRenderer
     from scenarios.suites.catalog import load_suite
 

@@ -26,8 +26,8 @@ from cosim.spec.connection import Connection
 from cosim.spec.manifest import Manifest
 from cosim.spec.policy_host import PolicyHost
 from cosim.spec.robot import COURIER
+from scenarios.ipc.observation_codec import ObservationDecoder
 from scenarios.runs.isolated_policy import isolated_driver
-from scenarios.runs.observation_codec import seen_from_afar
 from scenarios.runs.remote_policy import remote_driver
 from scenarios.tools.bench.figures import MORE, Figure
 
@@ -134,7 +134,7 @@ def _served() -> Iterator[PolicyHost]:
 
 def serve_blind(endpoint: str) -> None:
     """Serve it until killed."""
-    serve(BlindTogether(), listen=endpoint, observe=seen_from_afar)
+    serve(BlindTogether(), listen=endpoint, decoder=ObservationDecoder)
 
 
 def _seen(tick: int) -> Observation:

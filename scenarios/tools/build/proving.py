@@ -90,7 +90,7 @@ def proof_of(
         scenario=scenario.id,
         scenario_hash=content_hash(scenario),
         expert=expert,
-        expert_version=record.policy_version,
+        expert_version=record.manifest.version,
         state_hash=record.state_hash,
         time_s=record.measures["time_s"] or 0.0,
         people_m=round(people_m, _ROUNDED) if math.isfinite(people_m) else None,

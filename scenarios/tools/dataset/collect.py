@@ -28,6 +28,7 @@ from cosim.episode.policy_caller import Driver
 from cosim.policies.user_module import importable
 from cosim.results.record import Record
 from cosim.results.run_folder import DEMONSTRATION, RunFolder
+from cosim.results.run_spec import brief
 from cosim.spec.demo_options import Collecting
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import City, Scenario, Suite, read_suite
@@ -35,8 +36,8 @@ from scenarios.episodes.demonstration import Demonstration, check_parquet
 from scenarios.episodes.demonstrator import Demonstrator, learner_of
 from scenarios.ipc.messages import Hello, MessageHandler
 from scenarios.runs.local import LocalProcesses
+from scenarios.runs.planning import run_spec
 from scenarios.runs.pool import run_all
-from scenarios.runs.run import run_spec
 from scenarios.suites.catalog import with_robot
 from scenarios.suites.fits import check_places
 from scenarios.suites.new_scenarios import Fresh
@@ -83,14 +84,9 @@ class CollectSpec(msgspec.Struct, frozen=True, kw_only=True):
 def _refuse(path: Path, name: str, mine: object, theirs: object) -> None:
     if mine != theirs:
         raise RunError(
-            f"{path} is of another data set: its {name} is {_brief(mine)}, now asked for is "
-            f"{_brief(theirs)}. Go on with the same command, or choose another --out."
+            f"{path} is of another data set: its {name} is {brief(mine)}, now asked for is "
+            f"{brief(theirs)}. Go on with the same command, or choose another --out."
         )
-
-
-def _brief(value: object) -> str:
-    text = str(getattr(value, "in_words", value))
-    return text if len(text) <= 80 else text[:77] + "..."
 
 
 @dataclass(frozen=True)
@@ -230,7 +226,7 @@ class _Rounds:
             learner_source=""
             if (learner := self.demonstrator.learner) is None
             else learner.source_hash,
-            renderer=told.renderer,
+            renderer=told.setup.renderer,
             versions=versions(),
         )
 
@@ -268,8 +264,7 @@ class _Rounds:
         if todo:
             with showing(scenarios, done) as hear:
                 transport = LocalProcesses(held.path / "logs", self.jobs)
-                options = msgspec.structs.replace(self.options, suite_hash=held.spec.suite_hash)
-                run_all(held, todo, hello, transport, tell=hear, options=options)
+                run_all(held, todo, hello, transport, tell=hear, options=self.options)
         held.finish()
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from cosim.core.errors import UsageError, unknown
 from cosim.episode.interfaces import Eyes
 from cosim.results.record import Record
+from cosim.results.run_setup import RunSetup
 from cosim.spec.camera import CameraSpec
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
@@ -63,6 +64,7 @@ class SidewalkEnv(gymnasium.Env[SeenParts, NDArray[Any]]):
         reward: Reward,
         options: EpisodeOptions,
         render_mode: str | None = None,
+        suite_hash: str = "",
     ) -> None:
         if render_mode not in (None, *_RENDER_MODES):
             raise unknown("render_mode", str(render_mode), _RENDER_MODES)
@@ -76,6 +78,7 @@ class SidewalkEnv(gymnasium.Env[SeenParts, NDArray[Any]]):
         self.transition: Transition | None = None
         self._reward = reward
         self._options = options
+        self._suite_hash = suite_hash
         self._stack = ExitStack()
         self._episode: Episode | None = None
         self._period: Period | None = None
@@ -88,11 +91,10 @@ class SidewalkEnv(gymnasium.Env[SeenParts, NDArray[Any]]):
         drawn, run_seed = self.np_random.integers((len(self.scenarios), 2**53)).tolist()
         scenario = self._named(options) or self.scenarios[drawn]
         self.close()
-        if self._options.seed is not None:
-            run_seed = self._options.seed
-        episode = Episode(
-            scenario, self.manifest, msgspec.structs.replace(self._options, seed=run_seed)
-        )
+        setup = RunSetup.of(self._options, suite_hash=self._suite_hash)
+        if self._options.seed is None:
+            setup = msgspec.structs.replace(setup, seed=run_seed)
+        episode = Episode(scenario, self.manifest, self._options, setup=setup)
         self._episode = self._stack.enter_context(episode)
         self._period = Period(scenario, episode.clock.tick_s)
         episode.watch(self._period.watch)

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
-import msgspec
-
 from cosim.core.errors import UsageError
 from cosim.episode.camera_rules import check_camera
 from cosim.episode.manifest_checks import with_goal
@@ -63,9 +61,8 @@ def make_env(
     try:
         from scenarios.tools.gym.environment import SidewalkEnv
     except ImportError as error:
-        raise UsageError(
-            f"environments need Gymnasium ({error}): pip install 'sidewalk-cosim[gym]'"
-        ) from None
+        remedy = "pip install -e '.[gym]' in the checkout"
+        raise UsageError(f"environments need Gymnasium ({error}): {remedy}") from None
     if options.counterfactual:
         raise UsageError(
             "no episode of an environment is compared with its street: leave counterfactual out"
@@ -75,5 +72,4 @@ def make_env(
     settled = with_goal(manifest, options.goal)
     for name in sorted({scenario.robot for scenario in picked}):
         check_camera(settled, robot_called(name), options.own_camera)
-    of_suite = msgspec.structs.replace(options, suite_hash=whole.content_hash)
-    return SidewalkEnv(picked, settled, actions, reward, of_suite, render_mode)
+    return SidewalkEnv(picked, settled, actions, reward, options, render_mode, whole.content_hash)

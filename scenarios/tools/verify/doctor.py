@@ -96,7 +96,7 @@ def frame() -> str:
             raise EngineError("the camera's picture is blank")
         height, width, _ = picture.shape
         people = len(episode.moment.street.people)
-        renderer = episode.record.renderer
+        renderer = episode.record.setup.renderer
         return (
             f"SUMO walks {people} people, PyBullet holds the robot, {renderer} draws "
             f"{width}x{height}"

@@ -46,10 +46,10 @@ def sheet_of_run(folder: Path, kinds: EventKinds = EVENT_KINDS) -> pd.DataFrame:
     raises."""
     scenarios = {s.id: s for s in read_suite(folder / "scenarios.json", kinds).scenarios}
     rows = []
-    for record in sorted(read_records(folder), key=lambda r: r.scenario):
-        path = folder / "episodes" / record.scenario / "trajectory.npz"
+    for record in sorted(read_records(folder), key=lambda r: r.scenario.id):
+        path = folder / "episodes" / record.scenario.id / "trajectory.npz"
         if record.ended is not None and path.exists():
-            rows += rows_of(scenarios[record.scenario], record, Log.load(path), kinds)
+            rows += rows_of(scenarios[record.scenario.id], record, Log.load(path), kinds)
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 

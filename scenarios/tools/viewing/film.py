@@ -34,13 +34,14 @@ from cosim.results.referee import Verdict
 from cosim.results.run_folder import read_records, read_spec
 from cosim.results.waypoint_replay import Following
 from cosim.spec.camera import CameraSpec
-from cosim.spec.options import CameraChoice
 from cosim.spec.robot import robot_called
+from cosim.spec.run_config import CameraChoice
 from physics.cameras.view import robot_shot
 from scenarios.episodes.replay import Alike, Recorded, check, recorded, replaying
 from scenarios.places.nets import place, surface_of_place
 from scenarios.tools.viewing.drawn_route import way_in_picture
 from scenarios.tools.viewing.look import Viewpoint, eye_behind, over
+from sumo_nets.maps.map_store import credit_of
 
 EASE_S: Final = 0.5
 """The follower's heading lags the robot's by about this much."""
@@ -90,7 +91,7 @@ def failure_to_film(folder: Path, scenario_id: str | None) -> FilmedFailure:
 
     Raises UsageError for an unknown episode, and RunError with the outcomes where nothing failed.
     """
-    records = {record.scenario: record for record in read_records(folder)}
+    records = {record.scenario.id: record for record in read_records(folder)}
     failed = [
         name for name in read_spec(folder).scenarios if name in records and _failed(records[name])
     ]
@@ -113,7 +114,7 @@ def failure_to_film(folder: Path, scenario_id: str | None) -> FilmedFailure:
     at_s = Clock().time_s(mishap.tick + 1)
     reason = reason_of(told.scenario, told.record, mishap, told.log)
     return FilmedFailure(
-        told.record.scenario, at_s, reason, max(0.0, at_s - BEFORE_S), at_s + AFTER_S
+        told.record.scenario.id, at_s, reason, max(0.0, at_s - BEFORE_S), at_s + AFTER_S
     )
 
 
@@ -200,6 +201,7 @@ class _Reel:
         self._record = told.record
         self._minimap = minimap
         self._following = Following(told.log)
+        self._credit = credit_of(told.scenario.place)
         self._plan: Floats | None = None
         self._camera = camera
         self._video = video
@@ -248,17 +250,17 @@ class _Reel:
             hud.fill(image, layout.view, self._outside(self._cut.view, layout.view, robot, street))
             hud.fill(image, layout.second, seen, "robot's camera")
         area = layout.map
-        hud.fill(
-            image,
-            area,
-            self._minimap.picture(
-                robot, street, (area.width, area.height), self._ahead, self._plan
-            ),
+        drawn = self._minimap.picture(
+            robot, street, (area.width, area.height), self._ahead, self._plan
         )
+        hud.fill(image, area, drawn, self._credit)
         time_s = Clock().time_s(step.tick)
         counts = "  ".join(f"{name.replace('_', ' ')} {n}" for name, n in self._counts.items())
         done = step.route_s_after_m / self._scenario.route_line.length_m
-        left = f"{self._scenario.id}  {self._record.policy}  {time_s:5.1f} s  {robot.v_mps:.1f} m/s"
+        left = (
+            f"{self._scenario.id}  {self._record.manifest.name}  {time_s:5.1f} s  "
+            f"{robot.v_mps:.1f} m/s"
+        )
         hud.bar(image, layout.bar, left, f"route {100.0 * done:.0f} %   {counts}", done)
         if step.tick < self._caption_until:
             hud.caption(image, layout.view, *self._caption)

@@ -16,7 +16,8 @@ from cosim.core.state import RobotState
 from cosim.policies.load import load_policy
 from cosim.report.legend import Image
 from cosim.spec.camera import CameraSpec
-from cosim.spec.options import CameraChoice, EpisodeOptions
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.run_config import CameraChoice
 from cosim.spec.scenario import Scenario
 from scenarios.episodes.episode import Episode
 from scenarios.places.nets import place

@@ -34,10 +34,11 @@ from cosim.report.page.runs import (
     read_runs,
 )
 from cosim.report.page.scene import Entry, PlacePicture, Spot
-from cosim.spec.options import CameraChoice
+from cosim.spec.run_config import CameraChoice
 from cosim.spec.scenario import CityMap, Place, Scenario
 from scenarios.places.nets import place
 from scenarios.tools.viewing.scenes import ShownAgain, show_again, ticks_to_show
+from sumo_nets.maps.map_store import credit_of
 
 _MOST_BYTES: Final = 29_000_000
 """Of the file; failures beyond it are left out of the gallery, the least telling first."""
@@ -56,11 +57,13 @@ _Bounds = tuple[float, float, float, float]
 
 
 class ReportFacts(NamedTuple):
-    """What came out: the file's size, and how many failures its gallery shows of how many."""
+    """What came out: the file's size, how many failures its gallery shows of how many, and which
+    limit left out the others, "" where all are shown."""
 
     size_bytes: int
     shown: int
     failures: int
+    limit: str
 
 
 def make_report(
@@ -81,7 +84,7 @@ def make_report(
     runs = read_runs(folders, progress)
     plots = plots_of(runs, colours_of(runs), progress)
     candidates = shown_of(runs)
-    picks = most_telling(candidates, most, within_s)
+    picks, limit = most_telling(candidates, most, within_s)
     progress("starting the engines")
     episodes, lost = _episodes(runs, picks)
     context = get_context("spawn")
@@ -112,7 +115,9 @@ def make_report(
         write_atomic(output, data)
     except OSError as error:
         raise unwritable(output, error) from error
-    return ReportFacts(len(data), count, len(candidates))
+    if count < len(picks):
+        limit = f"the file would be larger than {_MOST_BYTES / 1e6:g} MB"
+    return ReportFacts(len(data), count, len(candidates), limit)
 
 
 class _Episode(NamedTuple):
@@ -247,7 +252,7 @@ def _begun_pictures(
     there: dict[str, list[Scenario]] = {}
     for run in runs:
         for record in run.records:
-            scenario = run.scenarios[record.scenario]
+            scenario = run.scenarios[record.scenario.id]
             there.setdefault(place_in_words(scenario), []).append(scenario)
     failed = [name for name, (_, bad) in counts_of(runs).items() if bad]
     failed.sort(key=lambda name: not isinstance(there[name][0].place, CityMap))
@@ -284,7 +289,12 @@ def _place_picture(
     draw_streets(sheet, street_map, shapely.box(*bounds))
     for route in dict.fromkeys(routes):
         sheet.line(np.array(route), ROUTE, max(0.4, 2.0 / sheet.px_per_m))
-    return PlacePicture(place=name, image=image_url(sheet.image, _MAP_QUALITY), bounds=bounds)
+    return PlacePicture(
+        place=name,
+        image=image_url(sheet.image, _MAP_QUALITY),
+        bounds=bounds,
+        credit=credit_of(where),
+    )
 
 
 def _spots(runs: Sequence[ReportedRun], picks: Sequence[FailureToShow]) -> dict[str, list[Spot]]:
@@ -293,7 +303,7 @@ def _spots(runs: Sequence[ReportedRun], picks: Sequence[FailureToShow]) -> dict[
     spots: dict[str, list[Spot]] = {}
     for number, run in enumerate(runs):
         for record in run.records:
-            scenario = run.scenarios[record.scenario]
+            scenario = run.scenarios[record.scenario.id]
             for mishap in mishaps_of(record):
                 x_m, y_m = (
                     (mishap.failure.x_m, mishap.failure.y_m)
@@ -302,16 +312,16 @@ def _spots(runs: Sequence[ReportedRun], picks: Sequence[FailureToShow]) -> dict[
                 )
                 if (
                     mishap.failure is None
-                    and (log := run.log(record.scenario)) is not None
+                    and (log := run.log(record.scenario.id)) is not None
                     and len(log)
                 ):
                     x_m, y_m = log.pose[-1, :2].tolist()
                 reason = reason_of(scenario, record, mishap, None)
                 words = (
-                    f"{record.scenario} ({run.label}), {Clock().time_s(mishap.tick + 1):.1f} s: "
-                    f"{reason}"
+                    f"{record.scenario.id} ({run.label}), {Clock().time_s(mishap.tick + 1):.1f} "
+                    f"s: {reason}"
                 )
-                entry = numbers.get((number, record.scenario, mishap), -1)
+                entry = numbers.get((number, record.scenario.id, mishap), -1)
                 spot = Spot(
                     x_m=round(x_m, 2),
                     y_m=round(y_m, 2),

@@ -42,8 +42,8 @@ from cosim.report.minimap import COLOURS, PLANNED, RED_SIGNAL, VEHICLE
 from cosim.results.referee import Verdict
 from cosim.results.waypoint_replay import Following
 from cosim.spec.camera import CameraSpec
-from cosim.spec.options import CameraChoice
 from cosim.spec.robot import robot_called
+from cosim.spec.run_config import CameraChoice
 from cosim.spec.scenario import Scenario
 from physics.street.surface import Surface
 from scenarios.episodes.replay import Alike, Recorded, check, recorded, replaying
@@ -97,7 +97,7 @@ def record_for_rerun(
     told = recorded(folder, scenario_id)
     progress("reading the street map, starting SUMO, PyBullet and the camera")
     recording = rr.RecordingStream(
-        "cosim", recording_id=f"{told.record.scenario}-{told.record.state_hash}"
+        "cosim", recording_id=f"{told.record.scenario.id}-{told.record.state_hash}"
     )
     try:
         with atomic_file(output) as part:
@@ -142,7 +142,7 @@ def _blueprint(rrb: Any) -> Any:
 def _replay_into(
     tape: _Tape, folder: Path, told: Recorded, camera: CameraChoice, progress: Progress
 ) -> None:
-    spec = replace(told.record.camera or _SPEC, depth=True, labels=True)
+    spec = replace(told.record.manifest.camera or _SPEC, depth=True, labels=True)
     episode, policy = replaying(told, camera)
     with episode, episode.eyes(spec) as eyes:
         surface = surface_of_place(told.scenario.place)

@@ -26,8 +26,8 @@ from cosim.results.referee import Verdict
 from cosim.results.waypoint_replay import Following
 from cosim.spec.camera import CameraSpec
 from cosim.spec.obstacle import footprint
-from cosim.spec.options import CameraChoice
 from cosim.spec.robot import robot_called
+from cosim.spec.run_config import CameraChoice
 from physics.cameras.view import robot_shot
 from scenarios.episodes.replay import Alike, Recorded, recorded, replaying
 from scenarios.places.nets import place, surface_of_place
@@ -113,7 +113,7 @@ def show_again(
     with ExitStack() as stack:
         episode, policy = replaying(told, camera, judged_alone=True)
         stack.enter_context(episode)
-        spec = robots_camera(told.record.camera)
+        spec = robots_camera(told.record.manifest.camera)
         # Each camera keeps what stands around its own place: one for both would sort that out again
         # for each picture.
         seen, outside = (stack.enter_context(episode.eyes(spec)) for _ in range(2))

@@ -61,7 +61,7 @@ def test_figures_of_a_run_are_kept_for_each_time_that_it_went_on(tmp_path: Path)
     logged."""
     run = run_of(tmp_path / "run", ["goal", "hit", "goal"])
     simulated_s = 0.05 * sum(
-        record.ticks for record in read_records(run) if record.scenario != "s-000"
+        record.ticks for record in read_records(run) if record.scenario.id != "s-000"
     )
     with logged("", None) as counts:
         go = Going(run, ["s-001", "s-002"], counts)

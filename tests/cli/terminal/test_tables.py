@@ -19,7 +19,7 @@ from cosim.cli.scenario import _print_sweep
 from cosim.cli.suites import print_scenarios
 from cosim.results.compare import DIFFERENCES, FLIPPED, ComparedRun, RunComparison
 from cosim.results.metrics import COUNTERFACTUAL, METRICS
-from cosim.results.table import KEYS
+from cosim.results.table import COLUMNS as KEYS
 from cosim.spec.scenario import Suite
 from scenarios.suites.catalog import load_suite
 from scenarios.suites.user_scenarios.sweep import SWEPT

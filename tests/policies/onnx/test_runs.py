@@ -60,10 +60,10 @@ def test_a_bundle_drives_like_the_same_policy_as_a_class(tmp_path: Path) -> None
     graph = run_episode(second("a"), load_policy(f"onnx:{bundle(tmp_path / 'net', BLIND)}")).record
     twin = run_episode(second("a"), Twin()).record
     assert graph.state_hash == twin.state_hash and graph.status == "done", graph.reason
-    assert (graph.camera, graph.goal_protocol, graph.waypoints) == (
-        twin.camera,
+    assert (graph.manifest.camera, graph.manifest.goal, graph.manifest.waypoints) == (
+        twin.manifest.camera,
         "route_point",
-        twin.waypoints,
+        twin.manifest.waypoints,
     )
 
 
@@ -80,10 +80,10 @@ def test_a_bundle_drives_alike_in_its_own_process_and_in_several(
     both = cosim(*words, "--jobs", "2", "--out", "both", cwd=tmp_path)
     alone = cosim(*words, "--scenario", "b", "--isolated", "--out", "alone", cwd=tmp_path)
     assert (both.returncode, alone.returncode) == (0, 0), both.stderr + alone.stderr
-    hashes = {one.scenario: one.state_hash for one in read_records(tmp_path / "both")}
+    hashes = {one.scenario.id: one.state_hash for one in read_records(tmp_path / "both")}
     (isolated,) = read_records(tmp_path / "alone")
     assert (
-        isolated.policy_runs == "isolated"
+        isolated.setup.policy_runs == "isolated"
         and isolated.state_hash == hashes["b"]
         and len(hashes) == 2
     )
@@ -123,9 +123,10 @@ def test_the_bundle_of_the_documents_runs_as_it_is_written(tmp_path: Path, cosim
         cwd=tmp_path,
     )
     (record,) = read_records(tmp_path / "run")
-    assert said.returncode == 0 and (record.policy, record.status) == ("my-network", "done"), (
-        said.stderr
-    )
+    assert said.returncode == 0 and (record.manifest.name, record.status) == (
+        "my-network",
+        "done",
+    ), said.stderr
 
 
 def test_a_run_that_a_bundle_cannot_drive_is_refused_before_it_begins(

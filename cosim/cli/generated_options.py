@@ -1,0 +1,128 @@
+"""Make the options of a command from the fields of a config (`cosim.spec.run_config`)."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Callable, Collection, Iterator, Mapping
+from functools import wraps
+from types import MappingProxyType
+from typing import Annotated, Any, NamedTuple, get_type_hints
+
+import typer
+
+from cosim.spec.run_config import Option
+
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
+class Fields(NamedTuple):
+    """Which fields of a config a command has as options, and what it says of them.
+
+    only: these alone; () for all.
+    without: those that the command leaves at their defaults.
+    hidden: those that its help does not show.
+    help, default, flag: in place of the field's own, by field.
+    required: those without a default here.
+    panels: whether the help groups the options.
+    """
+
+    only: Collection[str] = ()
+    without: Collection[str] = ()
+    hidden: Collection[str] = ()
+    help: Mapping[str, str] = _NOTHING
+    default: Mapping[str, Any] = _NOTHING
+    flag: Mapping[str, str] = _NOTHING
+    required: Collection[str] = ()
+    panels: bool = False
+
+
+def configured(command: Callable[..., None]) -> Callable[..., None]:
+    """Decorate a command: a parameter `Annotated[Config, Fields(...)]` becomes the options of that
+    config."""
+    hints = get_type_hints(command, include_extras=True)
+    configs = {
+        name: (hint.__origin__, fields)
+        for name, hint in hints.items()
+        for fields in getattr(hint, "__metadata__", ())
+        if isinstance(fields, Fields)
+    }
+
+    @wraps(command)
+    def expanded(**given: Any) -> None:
+        for name, (config, fields) in configs.items():
+            taken = {field.name: given.pop(field.name) for field in _taken(config, fields)}
+            given[name] = config(
+                **{field: _told(value, config, field) for field, value in taken.items()}
+            )
+        command(**given)
+
+    parameters: list[inspect.Parameter] = []
+    for name, one in inspect.signature(command).parameters.items():
+        if name in configs:
+            parameters += _parameters(*configs[name])
+        else:
+            parameters.append(
+                one.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=hints[name])
+            )
+    expanded.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    expanded.__annotations__ = {one.name: one.annotation for one in parameters} | {"return": None}
+    return expanded
+
+
+def _taken(config: Any, fields: Fields) -> Iterator[dataclasses.Field[Any]]:
+    """The fields of a config that a command has."""
+    for field in dataclasses.fields(config):
+        if field.name not in fields.without and (not fields.only or field.name in fields.only):
+            yield field
+
+
+def _told(value: Any, config: Any, field: str) -> Any:
+    """The value of an option as the field has it: what may be repeated is a tuple."""
+    several = get_type_hints(config)[field] == tuple[str, ...]
+    return tuple(value or ()) if several else value
+
+
+def _parameters(config: Any, fields: Fields) -> Iterator[inspect.Parameter]:
+    hints = get_type_hints(config, include_extras=True)
+    for field in _taken(config, fields):
+        kind = hints[field.name].__origin__
+        option = hints[field.name].__metadata__[0]
+        several = kind == tuple[str, ...]
+        default = fields.default.get(field.name, None if several else field.default)
+        if option.argument or field.name in fields.required:
+            default = inspect.Parameter.empty
+            kind = _without_none(kind)
+        yield inspect.Parameter(
+            field.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=default,
+            annotation=Annotated[
+                list[str] | None if several else kind, _declared(field.name, kind, option, fields)
+            ],
+        )
+
+
+def _without_none(kind: Any) -> Any:
+    """The type of an option that must be given."""
+    parts = [part for part in getattr(kind, "__args__", ()) if part is not type(None)]
+    return parts[0] if len(parts) == 1 else kind
+
+
+def _declared(name: str, kind: Any, option: Option, fields: Fields) -> Any:
+    """An option or argument of typer's."""
+    words = fields.help.get(name, option.help)
+    if option.argument:
+        return typer.Argument(help=words, metavar=option.metavar)
+    flag = fields.flag.get(name) or option.flag or f"--{name.replace('_', '-')}"
+    own_default = name in fields.default or name in fields.required
+    return typer.Option(
+        flag,
+        help=words,
+        metavar=option.metavar,
+        min=option.least,
+        max=option.most,
+        show_default=True if own_default or not option.default else option.default,
+        hidden=name in fields.hidden,
+        rich_help_panel=option.panel or None if fields.panels else None,
+    )

@@ -1,0 +1,193 @@
+"""A run shown in a terminal: what is planned, how far it is, what came out."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from cosim.cli.console import err, logged, out
+from cosim.cli.options import NO_OPENGL, check_rerun, reached_by, write_rerun
+from cosim.cli.run_progress import Board, EpisodeBars, notice
+from cosim.cli.run_table import kinds_of, print_by_kind, print_next_commands, print_table
+from cosim.core.errors import INTERRUPTED, SOME_CRASHED
+from cosim.results.throughput import Figures, Going
+from cosim.spec.connection import Connection
+from cosim.spec.episode_id import pseudonym_of
+from cosim.spec.run_config import RunConfig
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+    from scenarios.ipc.messages import MessageHandler
+    from scenarios.runs.planning import PlannedRun
+    from scenarios.runs.run import Carrier
+    from scenarios.runs.transport import HeldRun
+
+_STEPS_IN = '{"id": "eve", "path": [{"ahead": 15, "left": 1}]}'
+
+
+def run_in_terminal(config: RunConfig, carrier: Carrier | None = None) -> None:
+    """Run what a config asks for, shown in this terminal, and exit with the code of what came out.
+
+    carrier: connects to workers elsewhere.
+    """
+    terminal = Terminal(config, of_here=carrier is None and not config.on)
+    with _told_if_not_begun(config.out):
+        from scenarios.runs.run import carry_out
+
+        table = carry_out(config, reporter=terminal, carrier=carrier)
+    _tell_of_end(terminal, table)
+
+
+class Terminal(EpisodeBars):
+    """Shows in this terminal how a run goes.
+
+    of_here: its episodes run in processes of this machine. Once it runs: plan, folder, figures.
+    """
+
+    plan: PlannedRun
+    folder: Path
+    figures: Figures | None = None
+
+    def __init__(self, config: RunConfig, *, of_here: bool) -> None:
+        self._config = config
+        self._of_here = of_here
+        self._counts: dict[str, int] = {}
+
+    def planned(self, plan: PlannedRun) -> None:
+        """Check what the end of the run needs, and name the camera where it is not the usual
+        one."""
+        sees = plan.driver.manifest.camera is not None
+        if sees and self._config.camera == "auto" and plan.options.camera == "bullet":
+            err.print(NO_OPENGL)
+        check_rerun(self._config.rerun, len(plan.picked))
+
+    @contextmanager
+    def opening(self, plan: PlannedRun, folder: Path) -> Iterator[None]:
+        """Keep the log of the run."""
+        self.plan = plan
+        self.folder = folder
+        with logged(self._config.log_level, self._config.log_json) as counts:
+            self._counts = counts
+            yield
+
+    @contextmanager
+    def running(self, plan: PlannedRun, run: HeldRun) -> Iterator[MessageHandler]:
+        """Show the progress of episodes; where Ctrl-C ends it, how to continue."""
+        from scenarios.runs.eta import remembered
+
+        config = self._config
+        self._tell_of_beginning(plan, run)
+        done = {one.id for one in plan.picked} - {one.id for one in run.todo}
+        board = Board(plan.picked, done, compared=config.counterfactual, pace=config.pace)
+        going = Going(run.held.path, [one.id for one in run.todo], self._counts)
+        try:
+            with ExitStack() as stack:
+                stack.callback(going.end)
+                if self._of_here:
+                    stack.enter_context(
+                        remembered(run.held, run.todo, config.jobs or 1, config.pace)
+                    )
+                stack.enter_context(board.bars)
+                yield board.tell
+        except KeyboardInterrupt:
+            self._tell_how_to_continue(plan, len(run.held.finished()))
+            raise typer.Exit(INTERRUPTED) from None
+        self.figures = going.figures
+
+    def _tell_of_beginning(self, plan: PlannedRun, run: HeldRun) -> None:
+        from scenarios.runs.eta import announcement
+
+        config = self._config
+        seed = plan.options.seed
+        err.print(
+            f"Seed {seed}: what the policy is told that episodes are called is drawn from it.",
+            highlight=False,
+        )
+        for note in run.held.notes:
+            notice(note)
+        if done := len(run.picked) - len(run.todo):
+            err.print(f"{done} of {len(run.picked)} episodes are finished already.")
+        if run.todo and self._of_here:
+            jobs = config.jobs or 1
+            words = announcement(
+                run.todo,
+                plan.policy,
+                plan.spec.setup.renderer,
+                jobs,
+                config.counterfactual,
+                config.pace,
+            )
+            err.print(words, soft_wrap=not err.is_terminal, highlight=False, markup=False)
+        if config.ends.live is not None and run.todo:
+            _tell_how_to_step_in(
+                config.ends.live, run, several=(config.jobs or 1) > 1, paced=config.pace > 0.0
+            )
+
+    def _tell_how_to_continue(self, plan: PlannedRun, finished: int) -> None:
+        again = shlex.join(word for word in sys.argv[1:] if word != "--resume")
+        again += "" if self._config.out else f" --out {shlex.quote(str(self.folder))}"
+        err.print(
+            f"Stopped. {finished} of {len(plan.picked)} episodes are finished and kept in "
+            f"{self.folder}."
+        )
+        err.print(f"Go on with: cosim {again} --resume", soft_wrap=True)
+
+
+def _tell_how_to_step_in(air: Connection, run: HeldRun, *, several: bool, paced: bool) -> None:
+    """Print the commands that listen and inject here. several: episodes at a time; then the first
+    one is named."""
+    from bridge import keys
+
+    first = min(run.todo, key=partial(pseudonym_of, run.held.spec.setup.seed))
+    env = f" --env {keys.chunk(run.held.path.name)}/{keys.chunk(first.id)}" if several else ""
+    notice(f"On the air at {air.listen}. From another terminal:")
+    notice(f"  cosim listen events{reached_by(air, 'viewer')}{env} --wait 60")
+    notice(f"  cosim inject '{_STEPS_IN}'{reached_by(air, 'injector')}{env} --wait 60")
+    if not paced:
+        notice(
+            "It runs as fast as it can. --pace 1 holds it to real time, so that there is "
+            "time to step in."
+        )
+
+
+def _tell_of_end(terminal: Terminal, table: DataFrame) -> None:
+    """Print what came out. Raises Exit where not all of it is scored."""
+    plan = terminal.plan
+    folder = terminal.folder
+    print_table(out, table, len(plan.of_run), folder)
+    print_by_kind(out, table, kinds_of(folder))
+    if terminal.figures is not None:
+        err.print(terminal.figures.in_words, soft_wrap=True, highlight=False)
+    out.print(f"Run folder: {folder}", soft_wrap=True)
+    print_next_commands(err, folder, table)
+    if plan.shard is not None:
+        err.print(
+            f"Shard {plan.shard.in_words} of the run: `cosim merge` makes one of all.",
+            highlight=False,
+        )
+    if lacking := [one.id for one in plan.picked if one.id not in set(table["scenario"])]:
+        notice(f"No record of {', '.join(lacking)}: run it again with --resume.")
+    if lacking or table["ended"].isna().any():
+        raise typer.Exit(SOME_CRASHED)
+    write_rerun(folder, [one.id for one in plan.picked], plan.config.rerun)
+
+
+@contextmanager
+def _told_if_not_begun(folder: Path | None) -> Iterator[None]:
+    """Where Ctrl-C ends a run before its folder was written, print that there is nothing to
+    resume."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if folder is not None and not (folder / "run.json").exists():
+            remedy = "Give the same command again, without --resume."
+            notice(f"Stopped before the run began: {folder} holds nothing. {remedy}")
+        raise

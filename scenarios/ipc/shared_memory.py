@@ -1,0 +1,92 @@
+"""Memory that two processes of a machine share: sealed, without a name, freed when both have closed
+it.
+
+64 bytes   the head: a few numbers, for whoever maps it
+the rest   arrays of one message, each from a multiple of 64 bytes
+"""
+
+from __future__ import annotations
+
+import fcntl
+import math
+import mmap
+import os
+from contextlib import suppress
+from typing import Any, Final, Self
+
+import numpy as np
+
+from bridge.policy_server import PackedArray, unpacked
+from cosim.spec.goal import most_goal_bytes
+from cosim.spec.manifest import Manifest
+
+HEAD_BYTES: Final = 64
+_ALIGNED_BYTES: Final = 64
+_SEALS: Final = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
+_PER_PIXEL_BYTES: Final = 8
+"""Bytes of a pixel's color, label and depth."""
+
+
+class SharedMemory:
+    """One end. descriptor: for the other end, which cannot change the size. map: the bytes."""
+
+    def __init__(self, descriptor: int, *, writes: bool = True) -> None:
+        self.descriptor = descriptor
+        protection = mmap.PROT_READ | (mmap.PROT_WRITE if writes else 0)
+        self.map = mmap.mmap(descriptor, os.fstat(descriptor).st_size, prot=protection)
+
+    @classmethod
+    def new(cls, size: int = 0) -> Self:
+        """Create memory with a head and room for size bytes of arrays."""
+        descriptor = os.memfd_create("cosim", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        os.ftruncate(descriptor, HEAD_BYTES + size)
+        fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, _SEALS)
+        return cls(descriptor)
+
+    def lay(self, arrays: dict[str, np.ndarray[Any, Any]]) -> dict[str, PackedArray]:
+        """Write arrays in place of the last ones. Raises ValueError where there is no room."""
+        laid = {}
+        at = HEAD_BYTES
+        for name, array in arrays.items():
+            flat = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+            if at + len(flat) > len(self.map):
+                raise ValueError(
+                    f"no room for {name} of shape {array.shape} in {len(self.map)} bytes"
+                )
+            self.map[at : at + len(flat)] = flat.data
+            laid[name] = PackedArray(array.dtype.str, array.shape, at=at)
+            at += -(-len(flat) // _ALIGNED_BYTES) * _ALIGNED_BYTES
+        return laid
+
+    def take(self, laid: dict[str, PackedArray]) -> dict[str, Any]:
+        """Return copies of arrays. Raises ValueError for what is none."""
+        return {name: unpacked(array, self.map) for name, array in laid.items()}
+
+    @property
+    def busy(self) -> bool:
+        """Whether the policy is being queried for this memory's environment, or was at the end."""
+        return bool(self.map[0])
+
+    @busy.setter
+    def busy(self, now: bool) -> None:
+        self.map[0] = now
+
+    def close(self) -> None:
+        """Unmap it and close the descriptor."""
+        with suppress(OSError):  # a policy may have closed it already
+            os.close(self.descriptor)
+        self.map.close()
+
+
+def room_for(manifest: Manifest | None) -> int:
+    """Return the bytes of the largest observation by a manifest; few without one.
+
+    >>> room_for(None)
+    0
+    """
+    if manifest is None:
+        return 0
+    first = [] if manifest.camera is None else [manifest.camera]
+    sizes = [math.prod(camera.size) for camera in (*first, *manifest.cameras.values())]
+    goal = most_goal_bytes(manifest.picture_size)
+    return _PER_PIXEL_BYTES * sum(sizes) + goal + _ALIGNED_BYTES * (3 * len(sizes) + 1)

@@ -1,0 +1,196 @@
+"""Plan a run: load its policy, draw its seed, and say what it is (`RunSpec`)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from cosim.core.errors import UsageError
+from cosim.episode.camera_rules import check_camera
+from cosim.episode.interfaces import Policy
+from cosim.episode.manifest_checks import with_goal
+from cosim.episode.policy_caller import Driver
+from cosim.policies.user_module import importable
+from cosim.results.run_folder import RunFolder, read_spec, refuse_unbegun
+from cosim.results.run_setup import RunSetup
+from cosim.results.run_spec import RunSpec, Shard
+from cosim.spec.episode_id import drawn_seed
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.policy_host import PolicyHost
+from cosim.spec.robot import robot_called
+from cosim.spec.run_config import RunConfig
+from cosim.spec.scenario import Scenario, Suite
+from physics.cameras.choice import camera_of_choice as chosen_camera
+from physics.cameras.choice import renderer_of
+from physics.robots import hash_of_robot
+from scenarios.ipc.deadlines import Patience
+from scenarios.ipc.messages import Hello
+from scenarios.runs.policy_host import known_driver
+from scenarios.runs.shared_renderer import check_shared
+from scenarios.runs.transport import HeldRun
+
+
+class PlannedRun(NamedTuple):
+    """A run whose policy is loaded and whose seed is drawn.
+
+    config: what was asked for. whole: its suite; of_run: the scenarios chosen from that; shard:
+    which part of them, where not all. policy: its name; driver: it, as it was loaded here; host:
+    where episodes ask it; patience: with it. options: of each episode, with the seed of the run and
+    the camera of this machine.
+    """
+
+    config: RunConfig
+    whole: Suite
+    of_run: Sequence[Scenario]
+    shard: Shard | None
+    policy: str
+    driver: Driver
+    options: EpisodeOptions
+    host: PolicyHost
+    patience: Patience
+
+    @property
+    def picked(self) -> Sequence[Scenario]:
+        """The scenarios that are run here."""
+        return self.of_run if self.shard is None else self.shard.share(self.of_run)
+
+    @property
+    def spec(self) -> RunSpec:
+        """What the run is, for its folder. Raises UsageError."""
+        shared = self.config.shared_renderer
+        return run_spec(
+            self.whole, self.of_run, self.policy, self.driver, self.options, shared, self.shard
+        )
+
+
+def planned_run(
+    config: RunConfig,
+    whole: Suite,
+    of_run: Sequence[Scenario],
+    *,
+    policy: Policy | None = None,
+    options: EpisodeOptions | None = None,
+    host: PolicyHost = PolicyHost(),  # noqa: B008  a frozen value
+) -> PlannedRun:
+    """Load the policy of a run and draw its seed; its places are not looked at.
+
+    policy: an object that drives in this process, in place of the config's name.
+    options: in place of those that the config gives.
+    Raises UsageError, MachineError.
+    """
+    options = EpisodeOptions.asked(config) if options is None else options
+    resumed = config.out if config.resume else None
+    name = (
+        importable(config.policy)
+        if policy is None
+        else f"{type(policy).__module__}:{type(policy).__qualname__}"
+    )
+    part = Shard.called(config.shard, len(of_run)) if config.shard else None
+    if part is not None and options.seed is None and resumed is None:
+        raise UsageError(
+            "--shard needs --seed: shards are of one run, which has one seed: give the same to each"
+        )
+    patience = Patience(config.answer_timeout, config.start_timeout)
+    jobs = 1 if config.on else config.jobs or 1
+    driver = (
+        known_driver(name, host, jobs, patience.start_s) if policy is None else Driver.of(policy)
+    )
+    camera = chosen_camera(options.camera) if driver.manifest.camera is not None else "bullet"
+    seed = seed_of_run(options.seed, resumed)
+    options = msgspec.structs.replace(options, seed=seed, camera=camera)
+    check_alone(options, jobs, config.shared_renderer)
+    if config.shared_renderer:
+        check_shared(driver, camera)
+    return PlannedRun(config, whole, of_run, part, name, driver, options, host, patience)
+
+
+def check_folder(plan: PlannedRun, folder: Path) -> None:
+    """Refuse a folder in which the run cannot continue. Raises RunError, UsageError."""
+    _folder(plan, folder)
+
+
+@contextmanager
+def held_run(plan: PlannedRun, folder: Path) -> Iterator[HeldRun]:
+    """Hold a run in its folder, begun there or continued. Raises RunError for a folder of another
+    run."""
+    held = _folder(plan, folder)
+    hello = Hello(
+        plan.policy,
+        plan.driver.manifest,
+        plan.driver.source_hash,
+        host=plan.host,
+        patience=plan.patience,
+    )
+    with held:
+        done = held.finished()
+        yield HeldRun(held, hello, plan.picked, [one for one in plan.picked if one.id not in done])
+
+
+def _folder(plan: PlannedRun, folder: Path) -> RunFolder:
+    open_folder = RunFolder.resume if plan.config.resume else RunFolder.create
+    return open_folder(folder, plan.spec, plan.whole)
+
+
+def run_spec(
+    whole: Suite,
+    picked: Sequence[Scenario],
+    policy: str,
+    driver: Driver,
+    options: EpisodeOptions,
+    shared: bool = False,
+    shard: Shard | None = None,
+) -> RunSpec:
+    """What a run is, for its folder. policy: its name; shared: one renderer draws for all of it;
+    shard: what of it the folder holds, if not all. Raises UsageError when a robot has no such
+    camera, unless one of its own was asked for, or the policy cannot be given what it asks for."""
+    manifest = with_goal(driver.manifest, options.goal)
+    robots = [robot_called(name) for name in sorted({one.robot for one in picked})]
+    if manifest.camera is not None:
+        for robot in robots:
+            check_camera(manifest, robot, options.own_camera)
+    setup = RunSetup.of(
+        options,
+        suite_hash=whole.content_hash,
+        policy_source=driver.source_hash,
+        policy_runs=driver.runs,
+    )
+    if manifest.camera is not None:
+        setup = msgspec.structs.replace(setup, renderer=renderer_of(chosen_camera(options.camera)))
+    return RunSpec(
+        suite=whole.name,
+        robots={robot.name: hash_of_robot(robot) for robot in robots},
+        suite_version=whole.version,
+        policy=policy,
+        manifest=manifest,
+        setup=setup,
+        scenarios=tuple(s.id for s in picked),
+        counterfactual=options.counterfactual,
+        shared_renderer=shared,
+        shard=shard,
+    )
+
+
+def check_alone(options: EpisodeOptions, jobs: int, shared: bool) -> None:
+    """Raises UsageError where the answers of a run in real time would wait for those of other
+    episodes."""
+    if options.real_time and (jobs != 1 or shared):
+        much = "a shared renderer" if shared else f"{jobs} jobs"
+        raise UsageError(
+            f"in real time every answer is timed, and {much} would be timed too: take one "
+            f"job, without it"
+        )
+
+
+def seed_of_run(asked: int | None, resumed: Path | None) -> int:
+    """The seed that was asked for; else that of the run that is resumed; else one that is drawn
+    anew."""
+    if asked is not None:
+        return asked
+    if resumed is None:
+        return drawn_seed()
+    refuse_unbegun(resumed)
+    return read_spec(resumed).setup.seed

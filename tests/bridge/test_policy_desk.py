@@ -1,0 +1,298 @@
+"""PolicyDesk: one place that queries a policy for any number of episodes, whatever carries
+requests."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Any, NoReturn
+
+import numpy as np
+import pytest
+
+from bridge.policy_server import (
+    Answer,
+    AskAct,
+    AskEnded,
+    AskReset,
+    Begun,
+    PackedArray,
+    PolicyDesk,
+    PolicyReply,
+    Refusal,
+    decode_reply,
+    encode_message,
+    packed,
+    read_request,
+)
+from cosim.core.errors import PolicyError
+from cosim.core.state import STILL, Command, Planned
+from cosim.episode.interfaces import Observation
+from cosim.episode.policy_caller import PolicyCall
+from cosim.spec.manifest import Manifest, WaypointRule
+from cosim.spec.robot import COURIER
+from scenarios.ipc.observation_codec import ObservationDecoder
+from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy
+
+MANIFEST = Manifest("mine", camera=None, waypoints=WaypointRule(index=1))
+
+
+class Notes:
+    """A policy for one episode that notes what it is called for."""
+
+    manifest = MANIFEST
+
+    def __init__(self, does: Callable[[Any], Any] = lambda _: STILL) -> None:
+        self.does = does
+        self.calls: list[object] = []
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        self.calls.append(("reset", episode_id, seed))
+
+    def act(self, observation: Any) -> Any:
+        self.calls.append(observation.episode)
+        return self.does(observation)
+
+
+class NotesMany(Notes):
+    """The same for many episodes at once."""
+
+    def on_reset(self, episode_id: str) -> None:
+        self.calls.append(("on_reset", episode_id))
+        if episode_id == "bad":
+            raise LookupError("no history")
+
+    def ended(self, episode_id: str) -> None:
+        self.calls.append(("ended", episode_id))
+        if episode_id == "bad":
+            raise LookupError("no such episode")
+
+    def act_batch(self, observations: Sequence[Any]) -> Any:
+        self.calls += [one.episode for one in observations]
+        return self.does(observations)
+
+
+def act(episode: str, tick: int = 0, step: int = 0, *, reset: bool = False) -> AskAct:
+    return AskAct("r", episode, "a", step, tick, tick / 20.0, 0.0, 0.0, reset)
+
+
+def began(policy: Any, *episodes: str, timer: Any = None) -> PolicyDesk:
+    """A desk at which these episodes are under way."""
+    desk = PolicyDesk(policy, timer=timer)
+    for episode in episodes:
+        assert desk.replies([AskReset("r", episode, "a", 7)]) == [Begun("r", episode, "a")]
+    return desk
+
+
+def of_two(does: Callable[[Sequence[Any]], Any]) -> list[PolicyReply]:
+    """The replies to "a" and "b", which are queried together."""
+    return began(NotesMany(does), "a", "b").replies([act("a", 2), act("b", 4)])
+
+
+def test_a_batch_is_answered_in_its_order() -> None:
+    """With the command of each, or its waypoints."""
+    assert of_two(lambda two: [Command(0.1 * one.tick, 9.0) for one in two]) == [
+        Answer("r", "a", "a", 0, 0.2, 9.0),
+        Answer("r", "b", "a", 0, 0.4, 9.0),
+    ]
+    rows = np.array([[[0.1, 0.0]] * 3, [[0.2, 0.0]] * 3])
+    for row, reply in zip(rows, of_two(lambda _: rows), strict=True):
+        assert isinstance(reply, Answer) and reply.waypoints is not None and not reply.planned
+        assert bytes(reply.waypoints.data) == row.tobytes()
+
+
+def test_a_bad_answer_in_a_batch_is_one_episodes_crash() -> None:
+    """The other one has its answer; numbers that raise when they are read count as bad answers."""
+
+    class Pretends(float):
+        def __float__(self) -> float:
+            raise SystemExit(9)
+
+    good, bad = of_two(lambda _: [STILL, Command(Pretends(1.0), 0.0)])
+    assert isinstance(good, Answer) and bad == Refusal("policy", "raised SystemExit: 9")
+    good, bad = of_two(lambda _: [STILL, "left"])
+    assert isinstance(good, Answer)
+    assert bad == Refusal("policy", "answered 'left': neither a Command nor waypoints")
+
+
+def raising(error: BaseException) -> Callable[[Any], NoReturn]:
+    def does(_: Any) -> NoReturn:
+        raise error
+
+    return does
+
+
+@pytest.mark.parametrize(
+    ("does", "words"),
+    [
+        (raising(KeyError("no such weight")), "raised KeyError: 'no such weight'"),
+        (raising(SystemExit(3)), "raised SystemExit: 3"),
+        (lambda _: [STILL], "gave 1 answers to 2 observations"),
+        (
+            lambda two: (STILL for _ in two),
+            "answered a generator: a batch is answered with a sequence",
+        ),
+        (lambda _: None, "answered a NoneType: a batch is answered with a sequence"),
+    ],
+    ids=["error", "exit", "one-too-few", "generator", "nothing"],
+)
+def test_what_is_no_answer_to_a_batch_is_the_crash_of_all_of_it(
+    does: Callable[[Any], Any], words: str
+) -> None:
+    """Each of them says for how many episodes the policy was queried."""
+    assert of_two(does) == [Refusal("policy", words, together=2)] * 2
+
+
+def test_the_first_answer_of_any_episode_of_a_batch_may_take_longer() -> None:
+    """A call is a first one while one of its episodes has not been answered since its reset."""
+    timed: list[PolicyCall] = []
+
+    class Timer:
+        def starts(self, doing: PolicyCall, tick: int) -> None:
+            timed.append(doing)
+
+        def stops(self) -> None:
+            """Nothing to note."""
+
+    desk = began(NotesMany(lambda some: [STILL for _ in some]), "a", "b", timer=Timer())
+    timed.clear()
+    for step, names in enumerate(("a", "a")):
+        desk.replies([act(name, step=step) for name in names])
+    desk.replies([act("a", step=2), act("b", step=0)])
+    desk.replies([act("a", step=3), act("b", step=1)])
+    desk.replies([AskReset("r", "b", "again", 7)])
+    assert [doing for doing, _ in itertools.groupby(timed)] == [
+        "first act",
+        "act",
+        "first act",
+        "act",
+        "ended",
+        "reset",
+    ]
+
+
+def test_a_policy_for_many_episodes_gets_resets_and_ends_of_each() -> None:
+    """`on_reset` comes before the act that follows, `ended` once."""
+    policy = NotesMany(lambda some: [STILL for _ in some])
+    desk = began(policy, "a", "b")
+    policy.calls.clear()
+    desk.replies([act("a", 5, reset=True), act("b", 10)])
+    desk.replies([AskEnded("r", "a", "a"), AskEnded("r", "a", "a")])
+    assert policy.calls == [("on_reset", "a"), "a", "b", ("ended", "a")]
+    assert desk.under_way == 1
+
+
+def test_an_on_reset_that_raises_is_the_crash_of_its_episode_alone(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """The others of the batch are answered; an `ended` that raises is printed and no crash."""
+    policy = NotesMany(lambda some: [STILL for _ in some])
+    desk = began(policy, "a", "bad", "c")
+    first, bad, last = desk.replies([act(name, 5, reset=True) for name in ("a", "bad", "c")])
+    assert (
+        isinstance(first, Answer) and isinstance(last, Answer) and policy.calls[-2:] == ["a", "c"]
+    )
+    assert bad == Refusal("policy", "raised LookupError: no history", during="on_reset")
+    assert desk.replies([AskEnded("r", "bad", "a")]) == [Begun("r", "bad", "a")]
+    assert "LookupError: no such episode" in capfd.readouterr().err
+
+
+def test_an_object_answers_for_one_episode_at_a_time_and_a_class_for_many() -> None:
+    """The second episode finds an object busy; of a class there is one for each, which is
+    reused."""
+    made: list[Notes] = []
+
+    class Made(Notes):
+        def __init__(self) -> None:
+            super().__init__()
+            made.append(self)
+
+    one = began(Notes(), "a")
+    again, other = one.replies([AskReset("r", name, "a", 7) for name in ("a", "b")])
+    assert isinstance(again, Begun) and isinstance(other, Refusal) and other.why == "busy"
+    many = began(Made, "a", "b")
+    assert len(made) == 2
+    many.replies([AskEnded("r", "a", "a")])
+    many.replies([AskReset("r", "c", "a", 7)])
+    assert len(made) == 2 and made[0].calls[-1] == ("reset", "c", 7)
+    rgb = {"rgb": packed(np.zeros((2, 2, 3), np.uint8))}
+    asked = AskAct("r", "b", "a", 0, 0, 0.0, 0.0, 0.0, arrays=rgb)
+    first, repeated, later = many.replies([asked] * 3)
+    assert first == repeated == later and made[1].calls.count("b") == 1
+
+
+def test_a_request_that_cannot_be_decoded_is_refused() -> None:
+    """Garbage, arrays of no memory or of wrong sizes: the policy is not queried, others are."""
+    policy = Notes()
+    desk = began(policy, "a")
+    garbage = read_request(b"\x91" * 100_000)
+    assert isinstance(garbage, Refusal) and desk.replies([garbage]) == [garbage]
+    for array in (
+        PackedArray("|u1", (4, 4), at=0),
+        PackedArray("|u1", (9, 9)),
+        PackedArray("<f8", (1,)),
+    ):
+        desk = began(policy, "a")
+        (refused,) = desk.replies(
+            [AskAct("r", "a", "a", 0, 0, 0.0, 0.0, 0.0, arrays={"rgb": array})]
+        )
+        assert isinstance(refused, Refusal) and refused.why == "message"
+    assert policy.calls == [("reset", "a", 7)] * 4
+
+
+class ToDesk:
+    """Carries requests to a desk of this process."""
+
+    loses = True
+
+    def __init__(self, policy: Any) -> None:
+        self.desk = PolicyDesk(policy, decoder=ObservationDecoder)
+
+    def lay(self, arrays: dict[str, Any]) -> dict[str, PackedArray]:
+        return {name: packed(array) for name, array in arrays.items()}
+
+    def ask(self, question: AskReset | AskAct) -> bytes:
+        (reply,) = self.desk.replies([read_request(encode_message(question))])
+        payload = encode_message(reply)
+        assert decode_reply(payload) == reply
+        return payload
+
+    def tell_ended(self, question: AskEnded) -> None:
+        self.desk.replies([question])
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+def hosted(policy: Any) -> HostedDriver:
+    return HostedDriver(HostedPolicy(MANIFEST, ToDesk(policy), "r"), "remote", "")
+
+
+def seen(tick: int, *, reset: bool = False) -> Observation:
+    return Observation(tick, tick / 20.0, None, 0.5, 0.0, COURIER, episode="bad", reset=reset)
+
+
+def test_a_plan_with_its_command_stays_one() -> None:
+    """An answer that is a command with the waypoints it follows keeps both, as in this process."""
+    plan = np.array([[1.0, 0.0], [2.0, 0.5]], np.float32)
+    driver = hosted(Notes(lambda _: Planned(0.5, 0.1, plan, 1)))
+    driver.reset("a", 0)
+    command = driver.act(seen(0))
+    assert isinstance(command, Planned) and (command.v_mps, command.w_radps) == (0.5, 0.1)
+    assert command.waypoints.tobytes() == plan.tobytes() and command.index == 1
+
+
+def test_a_fault_elsewhere_has_the_words_of_one_in_this_process() -> None:
+    """Which call it was, and when; an error's long message is cut once."""
+    driver = hosted(NotesMany())
+    driver.reset("bad", 0)
+    with pytest.raises(
+        PolicyError, match=r"^policy 'mine' raised LookupError: no history \(on_reset at 0.25 s\)$"
+    ):
+        driver.act(seen(5, reset=True))
+    driver = hosted(Notes(raising(ValueError("x" * 10_000))))
+    driver.reset("a", 0)
+    with pytest.raises(
+        PolicyError, match=r"raised ValueError: x{500} \.\.\. \(10000 characters\) \(act at"
+    ):
+        driver.act(seen(5))
