@@ -1,16 +1,17 @@
 """The errors of the project, in one tree, and the exit codes of the command line, one meaning each.
 
-CosimError                what a user can mend: shown as one message ├── UsageError         2  a
-name or an option that does not exist, a policy that cannot be loaded ├── SpecError          2  a
-scenario, suite or place that contradicts itself (also a ValueError) ├── MapError           2  a
-street net that cannot be read or built ├── RunError           2  a run folder that is locked,
-broken or of another run ├── AccessError        2  certificates that do not fit, or a right that is
-lacking ├── PolicyError        1  a policy that raised, or answered with something unusable ├──
-EngineError        3  SUMO, PyBullet or Zenoh failed or was misused │   ├── DirectorLost   3  the
-director of the event pedestrians did not answer │   ├── RendererLost   3  the shared renderer has
-ended │   └── PolicyServerLost 3  the server of a remote policy has ended, or does not know an
-episode any more └── MachineError       3  a full disk, a folder that cannot be written, a library
-or program that is missing
+CosimError                what a user can mend: shown as one message
+├── UsageError         2  a name or option that does not exist, or a policy that cannot be loaded
+├── SpecError          2  a scenario, suite or place that contradicts itself (also a ValueError)
+├── MapError           2  a street net that cannot be read or built
+├── RunError           2  a run folder that is locked, broken or of another run
+├── AccessError        2  certificates that do not fit, or a right that is lacking
+├── PolicyError        1  a policy that raised, or answered with something unusable
+├── EngineError        3  SUMO, PyBullet or Zenoh failed or was misused
+│   ├── DirectorLost   3  the director of the event pedestrians did not answer
+│   ├── RendererLost   3  the shared renderer has ended
+│   └── PolicyServerLost 3  the server of a remote policy has ended, or lost the episode
+└── MachineError       3  a full disk, a folder that cannot be written, a missing library or program
 """
 
 from __future__ import annotations

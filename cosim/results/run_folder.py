@@ -1,4 +1,19 @@
-"""Run folders: files of an episode, the database `results.sqlite`, and what resuming needs."""
+"""A run folder: what was asked for, and what came out, episode by episode; survives a kill at any
+moment.
+
+run.json                         what is run: suite, policy, scenarios, versions, renderer
+scenarios.json                   the resolved specs
+episodes/<scenario>/record.json  and trajectory.npz, written by the run's process, whole or not at
+                                 all; frames/;
+                                 demonstration.npz where these are collected
+results.sqlite                   one row per finished episode, in the order in which they ended
+results.csv                      the same, sorted by scenario, written at the end
+attempts.jsonl                   scenarios that were begun in vain, a line each time: whoever goes
+                                 on counts on
+figures.json                     how fast it was, each time that it went on
+logs/                            what the engines of each worker printed
+lock                             held while a run is going on
+"""
 
 from __future__ import annotations
 

@@ -25,7 +25,8 @@ ODOMETRY: Final[Mapping[str, str]] = MappingProxyType(
 
 class Odometry(msgspec.Struct, frozen=True):
     """Where the robot takes itself to be: metres ahead and to the left of its start, heading
-    counter-clockwise from the start's, None for gps. Nothing in it tells where on the map that is.
+    counter-clockwise from the
+    start's, None for gps. Nothing in it tells where on the map that is.
 
     >>> pose = Odometry(12.0, 0.5, heading_rad=0.1)
     >>> pose.x_m, np.asarray(pose)

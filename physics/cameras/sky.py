@@ -4,7 +4,8 @@ Radiance is linear sRGB; 1 is a white matt surface that faces the sun outside th
 draws
 
     L = albedo * (ambient(n) + sun_colour * max(0, n . sun) * lit),   L = mix(fog_colour, L,
-    exp(-fog_per_m * distance)) pixel = sRGB(filmic(L * exposure))
+    exp(-fog_per_m * distance))
+    pixel = sRGB(filmic(L * exposure))
 """
 
 from __future__ import annotations

@@ -4,11 +4,12 @@ A texel's albedo, everything linear (decoded from sRGB; filtering and mip-maps t
 GL_SRGB8_ALPHA8):
 
     surface (ground, wall, prop):  mix(rgb, rgb / mean * tint, alpha)      without a tint of its
-    own: rgb facade over a wall:            rgb + alpha * wall                       rgb is
-    premultiplied
+                                   own: rgb
+    facade over a wall:            rgb + alpha * wall                       rgb is premultiplied
 
 so that alpha is the share of the tint in a surface (mortar keeps its own colour), and the share of
-the wall behind in a facade.
+the wall behind in
+a facade.
 """
 
 from __future__ import annotations

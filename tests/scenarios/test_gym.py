@@ -165,7 +165,7 @@ def test_every_shipped_suite_has_an_id_of_its_major_version() -> None:
     [
         ({"suite": "unlt"}, "unknown suite 'unlt'.*Did you mean unit"),
         ({"scenarios": ["straight-999999"]}, "unknown scenario 'straight-999999'"),
-        ({"events": ["frontal"]}, "unknown event 'frontal'"),
+        ({"events": ["frontal"]}, "suite 'unit' has no events"),
         ({"actions": "wheels"}, "unknown kind of actions 'wheels'.*command, waypoints"),
         ({"render_mode": "human"}, "unknown render_mode 'human'.*rgb_array"),
         ({"manifest": replace(BLIND, privileged=True)}, "leave privileged=True out"),

@@ -23,7 +23,7 @@ from tests.support.tiny_street import tiny_map
 
 CITY = "[place]\ncity = 1\nsize_m = 500\n"
 SHORT = f'name = "short"\n{CITY}[way]\nkind = "straight"\nlength_m = 30\n'
-TEMPLATE = ROOT / "scenarios" / "own" / "template.toml"
+TEMPLATE = ROOT / "scenarios" / "suites" / "user_scenarios" / "template.toml"
 
 
 def written(folder: Path, text: str) -> Path:

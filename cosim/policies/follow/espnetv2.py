@@ -5,7 +5,7 @@
 Source: S. Mehta et al., "ESPNetv2: a light-weight, power efficient, and general purpose
 convolutional neural network", arXiv 1811.11431: EESP units, strided ones with the picture fed in
 again at each size, and a decoder of efficient pyramids of pooled sizes, for 20 classes of
-Cityscapes. It needs no PyTorch, and takes `pip install 'sidewalk-cosim[convert]'`.
+Cityscapes. It needs no PyTorch, and takes `pip install -e '.[convert]'`.
 """
 
 from __future__ import annotations

@@ -159,7 +159,8 @@ class Converter:
             return self.make(data)
         except ImportError as error:
             raise MachineError(
-                f"{path}: its graph cannot be made: {error}: pip install 'sidewalk-cosim[convert]'"
+                f"{path}: its graph cannot be made: {error}: pip install -e '.[convert]' in "
+                "the checkout"
             ) from error
 
     def command(self, arguments: Sequence[str]) -> None:

@@ -5,42 +5,55 @@ A drawable's program is written once and works in every pass. `programs` puts th
 before its code:
 
 vertex shader     reads its own attributes and ends with `gl_Position = project(at);`, where `at` is
-                  a position in metres relative to the anchor of the picture (below). Normals are in
-                  world axes.
+                  a position in
+                  metres relative to the anchor of the picture (below). Normals are in world axes.
 fragment shader   calls `show(albedo, normal, at, label)` once, or `glow(colour, label)` for what
-                  shines by itself. albedo, colour: vec3 sRGB, 0 to 1; normal: vec3, unit length or
-                  nearly; at: as in the vertex shader; label: float, an id of
-                  cosim.core.state.LABELS. `show_linear` takes a linear albedo (sRGB textures are
-                  decoded when they are read) and a radiance of the surface's own. In the shadow
-                  pass it is not run: leave the depth alone and do not discard.
+                  shines by itself.
+                  albedo, colour: vec3 sRGB, 0 to 1; normal: vec3, unit length or nearly; at: as in
+                  the vertex
+                  shader; label: float, an id of cosim.core.state.LABELS. `show_linear` takes a
+                  linear albedo (sRGB
+                  textures are decoded when they are read) and a radiance of the surface's own.
+                  In the shadow pass it is not run: leave the depth alone and do not discard.
 
 Positions are relative to the anchor, a point of the ground near the eye on a lattice of ANCHOR_M,
-so that float32 holds them to a hundredth of a millimetre anywhere in a city. `anchor_of(eye)` is
-it, in world metres: subtract it in float64 before an upload.
+so that float32 holds
+them to a hundredth of a millimetre anywhere in a city. `anchor_of(eye)` is it, in world metres:
+subtract
+it in float64 before an upload.
 
 The uniform block `Scene` (binding SCENE_BINDING, one for each pass of each picture, of
 `SceneBlocks`):
 
     mat4 clip_from_at      the camera's, or the sun's in the shadow pass; `project` is all that
-    needs it mat4 shadow_from_at    to the shadow map's texture space vec4 eye               xyz
-    from the anchor vec4 sun               xyz towards the sun; w 1 where it throws shadows vec4
-    sun_light         rgb linear; w exposure vec4 side_light        rgb linear, ambient of an
-    upright surface; w lamps: 0 by day to 1 at night vec4 tilt_light        rgb linear, what is
-    added times the z of the normal vec4 flat_light        rgb linear, what is added times the size
-    of the z of the normal vec4 fog               rgb linear; w extinction per metre vec4 haze
-    where it begins in metres, share per metre, largest share vec4 anchor            xy in world
-    metres (float32: for patterns, not for geometry) vec4 right, up, ahead  axes of the picture; w
-    of right and up: tangents of half its width and height
+                           needs it
+    mat4 shadow_from_at    to the shadow map's texture space
+    vec4 eye               xyz from the anchor
+    vec4 sun               xyz towards the sun; w 1 where it throws shadows
+    vec4 sun_light         rgb linear; w exposure
+    vec4 side_light        rgb linear, ambient of an upright surface; w lamps: 0 by day to 1 at
+                           night
+    vec4 tilt_light        rgb linear, what is added times the z of the normal
+    vec4 flat_light        rgb linear, what is added times the size of the z of the normal
+    vec4 fog               rgb linear; w extinction per metre
+    vec4 haze              where it begins in metres, share per metre, largest share
+    vec4 anchor            xy in world metres (float32: for patterns, not for geometry)
+    vec4 right, up, ahead  axes of the picture; w of right and up: tangents of half its width and
+                           height
 
 Textures: the shadow maps are bound to units STILL_UNIT (what stands) and MOVING_UNIT (what walks
-and drives), SKY_UNIT holds the sky, SURFACES_UNIT, FACADES_UNIT and FINISH_UNIT the textures of
-ground and walls; free for drawables are units 0 and 1, which people take for the time of a batch.
+and drives), SKY_UNIT
+holds the sky, SURFACES_UNIT, FACADES_UNIT and FINISH_UNIT the textures of ground and walls; free
+for drawables are
+units 0 and 1, which people take for the time of a batch.
 
 A drawable takes part in a pass by a method `draw(stage)`, drawing itself with its program of that
-stage: "colour"; "still", the shadows of what stands, drawn anew only when the eye has moved on;
-"moving", the shadows of what moves, drawn for every picture. A drawable that casts no shadow of a
-kind returns at once. Back faces are culled in the picture; front faces are counter-clockwise as in
-physics.ground.mesh."""
+stage: "colour";
+"still", the shadows of what stands, drawn anew only when the eye has moved on; "moving", the
+shadows of what moves,
+drawn for every picture. A drawable that casts no shadow of a kind returns at once. Back faces are
+culled in the
+picture; front faces are counter-clockwise as in physics.world.mesh."""
 
 from __future__ import annotations
 

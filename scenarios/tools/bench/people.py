@@ -126,7 +126,7 @@ def need_pedpy() -> None:
     except ImportError as error:
         raise MachineError(
             "`cosim bench people` measures density and speed with pedpy, which is not installed: "
-            "pip install 'sidewalk-cosim[people]'"
+            "pip install -e '.[people]' in the checkout"
         ) from error
 
 

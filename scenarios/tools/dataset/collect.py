@@ -1,8 +1,9 @@
 """collect: an expert drives scenarios, and what it does and a camera sees becomes a data set.
 
-OUT/collect.json      what is collected; another command is refused OUT/runs/00, 01 ..    run
-folders, with a demonstration of each episode that is kept; a further one where the expert did not
-solve enough. Once the data set is whole they may be deleted
+OUT/collect.json      what is collected; another command is refused
+OUT/runs/00, 01 ..    run folders, with a demonstration of each episode that is kept; a further one
+                      where the expert did
+                      not solve enough. Once the data set is whole they may be deleted
 OUT/writing           a data set in the making
 OUT/meta, data, videos   the data set; meta comes last: with it, it is whole
 """

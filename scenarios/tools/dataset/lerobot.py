@@ -1,12 +1,15 @@
 """A data set as the lerobot package reads it (`codebase_version` v3.0): what stands in which file.
 
-meta/info.json                       features by name and shape, rate, paths meta/stats.json
-of each feature: min, max, mean, std, count and quantiles meta/tasks.parquet                   the
-instructions meta/episodes/chunk-000/file-000.parquet   of each episode: length, where its rows and
-pictures are, statistics; also scenario, structure, place, seed and state hash
-meta/cosim.json                      how it was collected data/chunk-000/file-000.parquet      the
-rows videos/<key>/chunk-000/file-000.mp4  the pictures, one for each row, in its order, at index /
-rate seconds
+meta/info.json                       features by name and shape, rate, paths
+meta/stats.json                      of each feature: min, max, mean, std, count and quantiles
+meta/tasks.parquet                   the instructions
+meta/episodes/chunk-000/file-000.parquet   of each episode: length, where its rows and pictures are,
+                                           statistics; also
+                                     scenario, structure, place, seed and state hash
+meta/cosim.json                      how it was collected
+data/chunk-000/file-000.parquet      the rows
+videos/<key>/chunk-000/file-000.mp4  the pictures, one for each row, in its order, at index / rate
+                                     seconds
 """
 
 from __future__ import annotations

@@ -3,14 +3,18 @@ one timeline.
 
     world/map/...           ground by kind, fences, obstacles, the route, the goal; static
     world/robot             where the robot is; plan: where its command leads; camera: rgb, depth,
-    labels world/waypoints         those that its policy planned, the followed one large; only where
-    it answered any world/people, vehicles  bodies by kind; people/velocity: arrows of a second
-    world/signals           red and green, over the crossings near the robot plots/...
-    speed, turn, command, gap to the nearest person, way, delay of the answers told
-    events, failures, the end, in words
+                            labels
+    world/waypoints         those that its policy planned, the followed one large; only where it
+                            answered any
+    world/people, vehicles  bodies by kind; people/velocity: arrows of a second
+    world/signals           red and green, over the crossings near the robot
+    plots/...               speed, turn, command, gap to the nearest person, way, delay of the
+                            answers
+    told                    events, failures, the end, in words
 
 Timelines: `time`, simulated seconds, and `tick`. The file is there whole or not at all, and only if
-the replay came to the recorded state hash.
+the replay came to
+the recorded state hash.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 python -m cosim.policies.published.openbot autopilot_float.tflite [-o FOLDER]
 
-It needs `pip install 'sidewalk-cosim[convert]'`.
+It needs `pip install -e '.[convert]'`.
 """
 
 from __future__ import annotations
