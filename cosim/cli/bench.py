@@ -12,7 +12,7 @@ from cosim.cli import tables
 from cosim.cli.console import out
 from cosim.cli.options import MEASURE
 from cosim.cli.progress import doing
-from cosim.core.errors import UsageError, unknown
+from cosim.core.errors import unknown
 from cosim.spec.run_config import help_of
 
 if TYPE_CHECKING:
@@ -375,13 +375,9 @@ def _taken(
 def _compare(other: Path, what: str, only: Sequence[str], rounds: int) -> None:
     """A row per figure that both checkouts take: medians here and there, and the ratio round by
     round."""
-    from scenarios.tools.bench.figures import spread
+    from scenarios.tools.bench.figures import measuring_module, spread
 
-    if not (other / "scenarios" / "bench" / "take.py").is_file():
-        raise UsageError(
-            f"--compare {other}: no checkout of cosim that can be measured "
-            f"(scenarios/tools/bench/take.py)"
-        )
+    measuring_module(other)
     here, there = _taken(what, only, [None, other.resolve()], rounds)
     rows = []
     for name in [name for name in here if name in there]:

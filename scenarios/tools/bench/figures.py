@@ -22,7 +22,7 @@ from cosim.core.errors import EngineError, UsageError
 
 LESS: Final = "<="
 MORE: Final = ">="
-ROOT: Final = Path(__file__).resolve().parents[2]
+ROOT: Final = Path(__file__).resolve().parents[3]
 """This checkout."""
 
 
@@ -79,6 +79,19 @@ class TimedEngine:
         return self._methods.get(name) or getattr(self._engine, name)
 
 
+def measuring_module(checkout: Path) -> str:
+    """Return the module of a checkout that takes measurements; older ones have it elsewhere.
+
+    Raises UsageError for a folder without one.
+    """
+    for package in ("scenarios.tools.bench", "scenarios.bench"):
+        if (checkout / package.replace(".", "/") / "take.py").is_file():
+            return f"{package}.take"
+    raise UsageError(
+        f"{checkout} cannot be compared: it holds no cosim with scenarios/tools/bench/take.py"
+    )
+
+
 def taken(name: str, checkout: Path = ROOT) -> list[Figure]:
     """Take a measurement of a checkout of cosim, in a fresh process of its own environment, if it
     has one.
@@ -92,7 +105,7 @@ def taken(name: str, checkout: Path = ROOT) -> list[Figure]:
         command = [
             str(python) if python.exists() else sys.executable,
             "-m",
-            "scenarios.tools.bench.take",
+            measuring_module(checkout),
             name,
         ]
         done = subprocess.run(
@@ -106,10 +119,6 @@ def taken(name: str, checkout: Path = ROOT) -> list[Figure]:
         if found.exists():
             return msgspec.json.decode(found.read_bytes(), type=list[Figure])
     last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
-    if checkout != ROOT and not (checkout / "scenarios" / "bench" / "take.py").is_file():
-        raise UsageError(
-            f"{checkout} cannot be compared: it holds no cosim with scenarios/tools/bench/take.py"
-        )
     raise EngineError(f"measurement '{name}' failed in {checkout}: {last}")
 
 
