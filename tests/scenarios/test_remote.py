@@ -183,7 +183,7 @@ def test_nobody_waits_for_a_server_that_hangs_to_hear_of_the_end(tmp_path: Path)
     """Its policy never answers: that the episode has ended is told, and what comes next is not held
     up."""
     shutil.copy(SERVER, tmp_path)
-    shutil.copy(ROOT / "tests" / "bridge" / "served_policies.py", tmp_path)
+    shutil.copy(ROOT / "tests" / "support" / "served_policies.py", tmp_path)
     endpoint = free_endpoint()
 
     def asked() -> None:
@@ -216,7 +216,7 @@ def test_a_server_that_is_killed_loses_its_episode_which_is_run_again(
     run.json say `remote`, and the record how long answers took. One that never answers has crashed
     at once."""
     shutil.copy(SERVER, tmp_path)
-    shutil.copy(ROOT / "tests" / "bridge" / "served_policies.py", tmp_path)
+    shutil.copy(ROOT / "tests" / "support" / "served_policies.py", tmp_path)
     suite = Suite(
         name="three", version="1", scenarios=(one_second("a"), one_second("b"), one_second("c"))
     )

@@ -282,7 +282,7 @@ def differences(reference: Path, run: Path) -> list[str]:
         other = next((f"{b} in place of {a}" for a, b in lines if a != b), "of other length")
         wrong.append(f"results.csv differs: {other[:400]}")
     hashes = [
-        sorted((r.scenario, r.state_hash) for r in read_records(one)) for one in (reference, run)
+        sorted((r.scenario.id, r.state_hash) for r in read_records(one)) for one in (reference, run)
     ]
     if hashes[0] != hashes[1]:
         wrong.append("state hashes differ")
