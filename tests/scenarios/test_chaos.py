@@ -41,7 +41,7 @@ def test_what_is_killed_in_a_run_of_many_workers_changes_none_of_its_results(
     assert differences(reference, tmp_path / "chaos") == [], said
     assert found.episodes == 10 and "Traceback" not in said
     (poison,) = [record for record in read_records(tmp_path / "chaos") if record.status != "done"]
-    assert poison.scenario == "tiny-005" and poison.status == "crashed"
+    assert poison.scenario.id == "tiny-005" and poison.status == "crashed"
     assert "was killed by SIGKILL in the policy's reset, 2 times" in poison.reason
     assert len(read_records(reference)) == 10
 
