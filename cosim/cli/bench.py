@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cosim.cli import tables
-from cosim.cli.console import out
+from cosim.cli.console import out, say
 from cosim.cli.options import MEASURE
 from cosim.cli.progress import doing
 from cosim.core.errors import UsageError, unknown
@@ -136,7 +136,7 @@ def bench_crossings(crossings: int, cities: int, policy: str, jobs: int) -> None
     tables.show(out, [*first, *_SHARE], lights)
     for row in rows:
         for who in row.at_red:
-            out.print(f"{row.scenario}: {who}", soft_wrap=True, markup=False, highlight=False)
+            say(f"{row.scenario}: {who}")
 
 
 def _shares(
@@ -465,11 +465,6 @@ def bench_cameras(rounds: int) -> None:
         if one.why:
             wrong.setdefault(one.why, []).append(name)
     for why, names in wrong.items():
-        out.print(
-            f"{'; '.join(names)} cannot be drawn here: {why}",
-            soft_wrap=True,
-            markup=False,
-            highlight=False,
-        )
+        say(f"{'; '.join(names)} cannot be drawn here: {why}")
     if wrong:
         out.print("What the machine lacks, and how to get it: `cosim doctor`.", highlight=False)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cosim.cli.console import err, out
+from cosim.cli.console import err, out, say
 from cosim.cli.generated_options import Fields, configured
 from cosim.cli.options import LEARN, camera_here, check_output, replaced, size_called
 from cosim.cli.progress import doing, stages_in_lines
@@ -212,7 +212,7 @@ def _tell_of_end(found: Gathered, folder: Path, took_s: float) -> None:
     """Print what was collected, what was dropped, and what reading it back showed."""
     kept = f"{found.kept} episodes, {found.rows} pictures, {_size_mb(folder):.1f} MB"
     words = f"Data set: {folder} ({kept}), of {found.run} driven in {took_s:.0f} s"
-    out.print(words, soft_wrap=True, highlight=False, markup=False)
+    say(words)
     if found.dropped:
         reasons = "; ".join(f"{words}: {count}" for words, count in found.dropped.most_common())
         out.print(

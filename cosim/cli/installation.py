@@ -11,7 +11,7 @@ import typer
 from rich.markup import escape
 
 from cosim.cli import tables
-from cosim.cli.console import err, out
+from cosim.cli.console import err, notice, out
 from cosim.cli.progress import doing
 from cosim.core.cache import (
     CACHE_KINDS,
@@ -191,7 +191,7 @@ def verify(
         )
     wrong = [one for one in found if not one.fine]
     for words in blamed(wrong, shipped, here):
-        err.print(words, soft_wrap=True, highlight=False, markup=False)
+        notice(words)
     if wrong:
         err.print(
             f"{len(wrong)} of {len(found)} differ: this is not the installation that was shipped."

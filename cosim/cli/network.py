@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, cast, get_args
 import typer
 
 from cosim.cli import tables
-from cosim.cli.console import err, out
-from cosim.cli.options import DEFAULT, DIRECTOR, MANY, POLICIES_AT, STEP_IN, Insecure, Tls, warned
+from cosim.cli.console import err, notice, out, say
+from cosim.cli.options import DEFAULT, DIRECTOR, MANY, POLICIES_AT, STEP_IN, Insecure, Tls
 from cosim.cli.progress import doing
 from cosim.core.errors import (
     INTERRUPTED,
@@ -61,7 +61,7 @@ def init(
     make_authority(folder, host or ["localhost", "127.0.0.1"], days)
     _print_made(folder / "coordinator")
     words = f"Keep {folder / 'ca.key'} to yourself: whoever has it can make every role."
-    out.print(words, soft_wrap=True, markup=False, highlight=False)
+    say(words)
 
 
 @certs_app.command(
@@ -117,7 +117,7 @@ def _print_made(place: Path) -> None:
     who = identity_in(place)
     names = f", reached by {', '.join(who.hosts)}" if who.hosts else ""
     words = f"{place}: role {who.role}{names}, valid until {time_left(who)}"
-    out.print(words, soft_wrap=True, markup=False, highlight=False)
+    say(words)
 
 
 direct_app = typer.Typer()
@@ -141,7 +141,7 @@ def direct(
     from bridge.session import open_session
     from scenarios.episodes.director import behaviours, direct_all
 
-    with open_session(listening("director", "--listen", listen, tls, insecure), warned) as session:
+    with open_session(listening("director", "--listen", listen, tls, insecure), notice) as session:
         direct_all(session)
         print(f"directing at {listen}, behaviours {behaviours()}; stop with Ctrl-C", flush=True)
         try:
@@ -201,7 +201,7 @@ def inject(
     with session:
         ack = send(session, f"{below}/inject", payload)
     if ack.status == "refused":
-        err.print(f"refused: {ack.reason}", soft_wrap=True, markup=False, highlight=False)
+        notice(f"refused: {ack.reason}")
         raise typer.Exit(WRONG_USE)
     where = "" if ack.x_m is None else f", at [{ack.x_m:.1f}, {ack.y_m:.1f}]"
     out.print(
@@ -268,7 +268,7 @@ def _found(connection: Connection, env: str | None, wait_s: float) -> tuple[Sess
     Looks for it until `wait_s` seconds are over, and says so. Raises EngineError when nothing is on
     the air then, UsageError when only others are, or when several are and none is named.
     """
-    meant = _meant(connection, env, warned)
+    meant = _meant(connection, env, notice)
     connect = connection.connect
     if isinstance(meant, tuple):
         return meant
@@ -390,7 +390,7 @@ def serve_command(
         connection = connecting("policy", "--connect", connect, tls, insecure)
     else:
         connection = listening("policy", "--listen", listen, tls, insecure)
-    with open_session(connection, warned) as session:
+    with open_session(connection, notice) as session:
         serve(
             first.policy if first.batches else another,
             name=keys.name(name) if name else keys.chunk(first.manifest.name),

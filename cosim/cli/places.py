@@ -19,7 +19,7 @@ from rich.progress import (
 )
 
 from cosim.cli import tables
-from cosim.cli.console import err, out
+from cosim.cli.console import err, out, say
 from cosim.cli.options import replaced
 from cosim.cli.progress import doing
 from cosim.core.bounding_box import box_of, refuse_outside
@@ -177,7 +177,7 @@ def print_cities(found: Sequence[Survey]) -> None:
     out.print(MEANING)
     faulty = [(one.seed, fault) for one in found for fault in one.faults]
     for seed, fault in faulty:
-        out.print(f"city {seed}: {fault}", soft_wrap=True, markup=False, highlight=False)
+        say(f"city {seed}: {fault}")
     signals = sum(one.census.signals for one in found)
     out.print(
         f"{len(found)} cities, {signals} traffic lights checked, {len(faulty)} faults",
@@ -415,7 +415,7 @@ def print_check(check: MapCheck, about: About | None, capacity: Capacity | None)
         ]
     said += [("NOT USABLE", reason) for reason in _refusals(check, capacity)]
     for head, words in said:
-        out.print(f"{head}: {words}", soft_wrap=True, markup=False, highlight=False)
+        say(f"{head}: {words}")
 
 
 def _rows(check: MapCheck) -> list[tuple[str, str]]:

@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from cosim.cli import tables
-from cosim.cli.console import err, out
+from cosim.cli.console import err, notice, out, say
 from cosim.cli.options import (
     LOOK,
     MANY,
@@ -75,7 +75,7 @@ def compare(
             _write(path, FORMATS[path.suffix](told))
     print_comparison(out, told)
     for path, said in instead.items():
-        out.print(f"Written: {path}{said}", soft_wrap=True, markup=False, highlight=False)
+        say(f"Written: {path}{said}")
 
 
 def print_comparison(out: Console, told: RunComparison) -> None:
@@ -198,17 +198,14 @@ def score(folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run fold
         files = ("record.json", "results.sqlite", *["results.csv"] * scored.table)
         lines.append(f"equal to the bit to {', '.join(files)}")
     for line in lines:
-        out.print(line, soft_wrap=True, highlight=False, markup=False)
+        say(line)
     if scored.differences:
         first = scored.differences[0]
         episodes = {one.episode for one in scored.differences}
-        out.print(
+        say(
             f"different: episode {first.episode}, {first.metric} in {first.file}: recorded "
             f"{first.recorded}, computed {first.computed} (differences: {len(scored.differences)}, "
-            f"episodes: {len(episodes)})",
-            soft_wrap=True,
-            highlight=False,
-            markup=False,
+            f"episodes: {len(episodes)})"
         )
         raise typer.Exit(SOME_CRASHED)
 
@@ -406,13 +403,10 @@ def merge(
             highlight=False,
         )
     if merged.missing:
-        err.print(
+        notice(
             f"{len(merged.missing)} scenarios are missing: {', '.join(merged.missing)}: give "
             f"the command of the run "
-            f"without --shard, with --seed {merged.spec.setup.seed} --out {target} --resume",
-            soft_wrap=True,
-            markup=False,
-            highlight=False,
+            f"without --shard, with --seed {merged.spec.setup.seed} --out {target} --resume"
         )
     if merged.missing or merged.table["ended"].isna().any():
         raise typer.Exit(SOME_CRASHED)

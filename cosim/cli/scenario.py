@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cosim.cli import tables
-from cosim.cli.console import err, out
+from cosim.cli.console import err, notice, out, say
 from cosim.cli.generated_options import Fields, configured
 from cosim.cli.options import camera_here, check_rerun, replaced, write_rerun
 from cosim.cli.progress import doing
@@ -122,7 +122,7 @@ def check_own(
         if faults:
             faulty += 1
             for fault in faults:
-                err.print(f"{path}: {fault}", soft_wrap=True, markup=False, highlight=False)
+                notice(f"{path}: {fault}")
         else:
             _say(own)
             suite = suite_of_own(own)
@@ -149,7 +149,7 @@ def _driven(suite: Suite) -> int:
             words = f"{EXPERT} fails: {proof.reason} {proof.details}"
         else:
             words = f"solved by {EXPERT} in {proof.time_s:.1f} s"
-        out.print(f"{one.id}: {words}", soft_wrap=True, markup=False, highlight=False)
+        say(f"{one.id}: {words}")
     return failed
 
 
@@ -201,7 +201,7 @@ def draw_own(
         plan = draw_plan(street_map, made.scenario, whole=whole, part=part, credit=credit_of(where))
         write_png(plan, picture)
     for fault in made.faults:
-        err.print(f"{file}: {fault}", soft_wrap=True, markup=False, highlight=False)
+        notice(f"{file}: {fault}")
     out.print(f"Picture: {picture}{instead}", soft_wrap=True)
     if made.faults:
         raise typer.Exit(WRONG_USE)
@@ -300,7 +300,7 @@ def _print_run(own: OwnFile, tables: Sequence[pd.DataFrame], path: Path) -> None
             files = write_sweep(summary, own, path)
             out.print(f"Table and picture: {' '.join(map(str, files))}", soft_wrap=True)
         except MachineError as error:
-            err.print(str(error), soft_wrap=True, markup=False, highlight=False)
+            notice(str(error))
     else:
         print_table(out, table, len(own.variants), path)
     out.print(f"Run folder: {path}", soft_wrap=True)
@@ -345,7 +345,7 @@ def _say(own: OwnFile) -> None:
         if swept
         else f"{count} scenario{'s' * (count > 1)}"
     )
-    out.print(f"{own.path}: {words}", soft_wrap=True, markup=False, highlight=False)
+    say(f"{own.path}: {words}")
 
 
 def _print_scenarios(suite: Suite, own: OwnFile) -> None:
@@ -375,7 +375,7 @@ def _print_scenarios(suite: Suite, own: OwnFile) -> None:
         if far_m > _MOVED_M:
             out.print(f"way: {name} was moved by {far_m:.1f} m to the middle of its sidewalk")
     for note in dict.fromkeys(note for one in suite.scenarios for note in narrow_events(one)):
-        out.print(f"note: {note}", soft_wrap=True, markup=False, highlight=False)
+        say(f"note: {note}")
     for variant, one in zip(own.variants, suite.scenarios, strict=True):
         asked = variant.own.obstacles
         if asked.per_100m and len(one.obstacles) == len(asked.placed):

@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from cosim.cli import tables
-from cosim.cli.console import err, out
+from cosim.cli.console import notice, out, say
 from cosim.cli.progress import doing
 from cosim.core.errors import SOME_CRASHED, SpecError, unknown
 
@@ -129,7 +129,7 @@ def build_one(
             raise unknown("scenario", one, names)
 
     def show(line: str, _share: float | None = None, /) -> None:
-        err.print(line, soft_wrap=True, markup=False, highlight=False)
+        notice(line)
 
     suite, proofs = build_suite(name, path, jobs, tries, show, only or ())
     out.print(
@@ -191,7 +191,7 @@ def _checked(name: str, sample: int | None, drive: int | None, jobs: int) -> int
         proofs = read_proofs(path)
     except SpecError as error:
         proofs = None
-        err.print(str(error), soft_wrap=True, markup=False, highlight=False)
+        notice(str(error))
     read = Read(suite, proofs, path)
     faults = {claim: list(of(read)) for claim, of in CLAIMS.items()}
     looked = {claim: len(suite.scenarios) for claim in CLAIMS}
@@ -214,9 +214,7 @@ def _checked(name: str, sample: int | None, drive: int | None, jobs: int) -> int
     tables.show(out, columns, rows)
     for claim, found in faults.items():
         for words in found:
-            out.print(
-                f"{suite.name}, {claim}: {words}", soft_wrap=True, markup=False, highlight=False
-            )
+            say(f"{suite.name}, {claim}: {words}")
     return sum(bool(found) for found in faults.values())
 
 

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli.console import err
+from cosim.cli.console import notice
 from cosim.cli.options import LEARN
 from cosim.core.errors import SOME_CRASHED, MachineError
 from cosim.learning.settings import PLANNED_STEPS, TO_INSTALL, Training
@@ -91,7 +91,7 @@ def train_command(
     )
 
     def say(line: str) -> None:
-        err.print(line, soft_wrap=True, markup=False, highlight=False)
+        notice(line)
 
     if not trained(data, out, training, resume, say):
         raise typer.Exit(SOME_CRASHED)

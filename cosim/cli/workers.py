@@ -17,9 +17,9 @@ from rich.live import Live
 from rich.text import Text
 
 from cosim.cli import tables
-from cosim.cli.console import LogJson, LogLevel, err, logged, out
+from cosim.cli.console import LogJson, LogLevel, logged, notice, out
 from cosim.cli.generated_options import Fields, configured
-from cosim.cli.options import DEFAULT, MANY, Insecure, Tls, warned
+from cosim.cli.options import DEFAULT, MANY, Insecure, Tls
 from cosim.core.errors import INTERRUPTED, EngineError, RunError, UsageError
 from cosim.core.log_event import happened
 from cosim.core.units import duration
@@ -90,7 +90,7 @@ def coordinator_command(
 
     @contextmanager
     def carrier() -> Iterator[Any]:
-        with open_session(connection, warned) as session:
+        with open_session(connection, notice) as session:
             _say(
                 f"Workers find it by: cosim worker --connect "
                 f"{listen.replace('0.0.0.0', 'THIS-MACHINE')}"
@@ -144,7 +144,7 @@ def worker_command(
 
 def _say(words: str, _share: float | None = None, /) -> None:
     happened("said", words=words)
-    err.print(words, soft_wrap=True, highlight=False, markup=False)
+    notice(words)
 
 
 status_app = typer.Typer()
@@ -189,7 +189,7 @@ def status_command(
     from bridge.session import open_session
 
     connection = connecting("viewer", "--connect", str(connect), tls, insecure)
-    with open_session(connection, warned) as session:
+    with open_session(connection, notice) as session:
         _show(lambda: _asked(session.answers(keys.EVERY_RUN, timeout_s=5.0), str(connect)))
 
 
