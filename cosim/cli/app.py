@@ -14,10 +14,15 @@ from cosim.cli.console import err, told_streams
 from cosim.cli.installation import cache_app, installation_app
 from cosim.cli.network import certs_app, direct_app, live_app, serve_app
 from cosim.cli.options import LEARN, MEASURE, PLACES, STEP_IN, with_paths_checked
-from cosim.cli.pictures import export_app, film_app, look_app
+from cosim.cli.pictures import (
+    counterfactual_app,
+    export_app,
+    film_app,
+    look_app,
+    replay_app,
+)
 from cosim.cli.places import city_app, map_app
 from cosim.cli.policy import policy_app
-from cosim.cli.replay import counterfactual_app, replay_app
 from cosim.cli.results import compare_app, merge_app, report_app, score_app, show_app
 from cosim.cli.run import run_app
 from cosim.cli.scenario import scenario_app

@@ -44,14 +44,13 @@ SHARES = (
     ("off the walkable area", "persons", ""),
     *LIGHTS,
 )
-"""What is counted, of what, and the target."""
+"""Rows of the crowd's table: counted event, its total, target."""
 
 
 def bench_crowd(
     cities: int, minutes: float, residents: int, groups: float, elderly: float, children: float
 ) -> None:
-    """Watch the crowd of several cities and print how people keep apart, out of things and to the
-    lights."""
+    """Simulate the crowd of several cities, and print overlaps and violations of signals."""
     from cosim.spec.scenario import CrowdSpec
     from scenarios.tools.bench.crowd import APART_M, summed, watch_all
 
@@ -65,8 +64,8 @@ def bench_crowd(
         f"crossings entered"
     )
     rows = _shares(SHARES, counts)
-    told = {name for name, whole, _ in SHARES for name in (name, whole)}
-    for name in sorted(counts.keys() - told):
+    shown = {name for name, whole, _ in SHARES for name in (name, whole)}
+    for name in sorted(counts.keys() - shown):
         rows.append((name, f"{counts[name]:.2f}", "", "", ""))
     tables.show(out, [*tables.names(places), *_SHARE], rows)
     out.print("People and pairs are counted in seconds, entries and vehicles one by one.")
@@ -94,8 +93,7 @@ def bench_crowd(
 
 
 def bench_crossings(crossings: int, cities: int, policy: str, jobs: int) -> None:
-    """Drive a policy over signalised crossings and print how it, the crowd and the vehicles keep to
-    the lights."""
+    """Drive a policy over signalised crossings, and print violations of signals by all."""
     from scenarios.tools.bench.crossings import cross_all, crossings_entered
     from scenarios.tools.bench.crowd import summed
 
@@ -166,8 +164,7 @@ _NOTES = (
 
 
 def bench_people(jobs: int) -> None:
-    """Let the crowd walk on sidewalks and over a crossing and print it beside what was measured of
-    people."""
+    """Measure the walking of the crowd, and print it next to measurements of people."""
     from scenarios.tools.bench.people import watch_people
 
     with doing("watching people") as progress:
@@ -350,13 +347,13 @@ def bench(
     elif what == "camera" and not only:
         bench_cameras(rounds)
     else:
-        print_figures(_taken(what, only, [None], rounds)[0])
+        print_figures(_figures_of(what, only, [None], rounds)[0])
 
 
-def _taken(
+def _figures_of(
     what: str, only: Sequence[str], checkouts: Sequence[Path | None], rounds: int
 ) -> list[dict[str, list[Figure]]]:
-    """The figures of checkouts, None for this one, each value of each round."""
+    """Return the figures of checkouts (None: this one), with a value per round."""
     from scenarios.tools.bench.figures import ROOT
     from scenarios.tools.bench.measurements import (
         CAMERA,
@@ -373,16 +370,15 @@ def _taken(
 
 
 def _compare(other: Path, what: str, only: Sequence[str], rounds: int) -> None:
-    """A row per figure that both checkouts take: medians here and there, and the ratio round by
-    round."""
+    """Print medians and ratios of the figures that both checkouts have."""
     from scenarios.tools.bench.figures import spread
 
-    if not (other / "scenarios" / "bench" / "take.py").is_file():
+    if not (other / "scenarios" / "tools" / "bench" / "take.py").is_file():
         raise UsageError(
             f"--compare {other}: no checkout of cosim that can be measured "
             f"(scenarios/tools/bench/take.py)"
         )
-    here, there = _taken(what, only, [None, other.resolve()], rounds)
+    here, there = _figures_of(what, only, [None, other.resolve()], rounds)
     rows = []
     for name in [name for name in here if name in there]:
         mine, theirs = ([one.value for one in found[name]] for found in (here, there))
@@ -397,8 +393,7 @@ def _compare(other: Path, what: str, only: Sequence[str], rounds: int) -> None:
 
 
 def print_figures(found: Mapping[str, Sequence[Figure]]) -> None:
-    """A row per figure: the median of its rounds, the engine's own time, their ratio, and what
-    should be reached."""
+    """Print a row per figure: median, spread, the engine's own time, ratio and target."""
     from scenarios.tools.bench.figures import spread
 
     rows = []
@@ -428,7 +423,7 @@ def print_figures(found: Mapping[str, Sequence[Figure]]) -> None:
 
 
 def bench_cameras(rounds: int) -> None:
-    """Measure the cameras in one busy street and print frames a second, targets and ratios."""
+    """Measure the cameras in one busy street, and print frames per second, targets and ratios."""
     from physics.cameras.choice import camera_of_choice, renderer_of
     from scenarios.tools.bench.cameras import FIGURES, PERSONS, RATIOS, SIZE, time_cameras
     from scenarios.tools.bench.figures import spread

@@ -54,12 +54,11 @@ def init(
     host: _Hosts = None,
     days: _Days = 365,
 ) -> None:
-    """Make a private authority, and the certificate of a coordinator, who is reached by each
-    --host."""
+    """Make a private authority, and the certificate of a coordinator for each --host."""
     from bridge.security.authority import make_authority
 
     make_authority(folder, host or ["localhost", "127.0.0.1"], days)
-    _print_made(folder / "coordinator")
+    _print_certificate(folder / "coordinator")
     words = f"Keep {folder / 'ca.key'} to yourself: whoever has it can make every role."
     say(words)
 
@@ -75,13 +74,12 @@ def role(
     days: _Days = 365,
     renew: Annotated[bool, typer.Option("--renew", help="Replace the one that is there.")] = False,
 ) -> None:
-    """Issue the certificate of a role. Who listens (a coordinator, a director, some policies) needs
-    --host."""
+    """Issue the certificate of a role. A role that listens (director, policy) needs --host."""
     from bridge.security.authority import issue
 
     if name not in get_args(Role):
         raise unknown("role", name, get_args(Role))
-    _print_made(issue(folder, cast(Role, name), host or [], days, renew=renew))
+    _print_certificate(issue(folder, cast(Role, name), host or [], days, renew=renew))
 
 
 @certs_app.command(
@@ -92,8 +90,7 @@ def show_certificates(
         Path, typer.Argument(metavar="FOLDER", help="An authority's folder, or a role's.")
     ],
 ) -> None:
-    """Show whose the certificates of a folder are, how they are reached, what they may do, and
-    until when."""
+    """Show role, host names, rights and end of validity of the certificates in a folder."""
     from bridge.security.identity import identity_in, time_left
     from bridge.security.rights import RIGHTS
 
@@ -111,7 +108,7 @@ def show_certificates(
     tables.show(out, columns, rows)
 
 
-def _print_made(place: Path) -> None:
+def _print_certificate(place: Path) -> None:
     from bridge.security.identity import identity_in, time_left
 
     who = identity_in(place)
@@ -135,8 +132,8 @@ def direct(
 ) -> None:
     """Direct the event pedestrians of runs that were started with --director, until stopped.
 
-    It keeps nothing: stop it, kill it and start it again in the middle of an episode, and the
-    episode waits, goes on and comes to the same state hash. A run of other code is refused.
+    It is stateless. If it is killed and started again during an episode, the episode waits and
+    reaches the same state hash. A run with other source code is refused.
     """
     from bridge.session import open_session
     from scenarios.episodes.director import behaviours, direct_all
@@ -197,7 +194,9 @@ def inject(
     from bridge.live import send_injection as send
 
     payload = _payload(message)
-    session, below = _found(connecting("injector", "--connect", connect, tls, insecure), env, wait)
+    session, below = _live_episode(
+        connecting("injector", "--connect", connect, tls, insecure), env, wait
+    )
     with session:
         ack = send(session, f"{below}/inject", payload)
     if ack.status == "refused":
@@ -228,12 +227,13 @@ def listen(
         float | None, typer.Option(min=0.0, max=1e6, help="How long; by default until stopped.")
     ] = None,
 ) -> None:
-    """Print what a running episode tells: a line of JSON each time. For `events` what happened
-    before comes first."""
+    """Print messages of a running episode, a line of JSON each. `events` begins with past ones."""
     topics = ("clock", "robot", "crowd", "signals", "events")
     if topic not in topics:
         raise unknown("topic", topic, topics)
-    session, below = _found(connecting("viewer", "--connect", connect, tls, insecure), env, wait)
+    session, below = _live_episode(
+        connecting("viewer", "--connect", connect, tls, insecure), env, wait
+    )
     with session:
         if topic == "events":
             try:
@@ -262,53 +262,57 @@ def _payload(message: str) -> bytes:
     return message.encode()
 
 
-def _found(connection: Connection, env: str | None, wait_s: float) -> tuple[Session, str]:
-    """A session, to be closed, and what the keys of the episode that is meant begin with.
+def _live_episode(connection: Connection, env: str | None, wait_s: float) -> tuple[Session, str]:
+    """Return an open session, and the key prefix of the requested episode.
 
-    Looks for it until `wait_s` seconds are over, and says so. Raises EngineError when nothing is on
-    the air then, UsageError when only others are, or when several are and none is named.
+    Searches for `wait_s` seconds. Raises EngineError if no episode is live then, UsageError if only
+    others are, or if several are and `env` is None.
     """
-    meant = _meant(connection, env, notice)
+    found = _live_episode_now(connection, env, notice)
     connect = connection.connect
-    if isinstance(meant, tuple):
-        return meant
+    if isinstance(found, tuple):
+        return found
     began = time.monotonic()
     with (
         doing(f"waiting up to {wait_s:g} s for {env or 'an episode'} at {connect}")
         if wait_s
         else nullcontext()
     ):
-        while isinstance(meant, CosimError):
+        while isinstance(found, CosimError):
             left_s = began + wait_s - time.monotonic()
             if left_s <= 0.0:
                 remedy = f"waited {wait_s:g} s" if wait_s else "--wait 60 waits until it is there"
-                raise type(meant)(f"{meant} ({remedy})")
+                raise type(found)(f"{found} ({remedy})")
             time.sleep(min(PAUSE_S, left_s))
-            meant = _meant(connection, env)
+            found = _live_episode_now(connection, env)
     err.print(
-        f"{_name(meant[1])} is on the air after {time.monotonic() - began:.0f} s.", highlight=False
+        f"{_episode_name(found[1])} is on the air after {time.monotonic() - began:.0f} s.",
+        highlight=False,
     )
-    return meant
+    return found
 
 
-def _meant(
-    connection: Connection, env: str | None, say: Callable[[str], None] = lambda _: None
+def _live_episode_now(
+    connection: Connection, env: str | None, warn: Callable[[str], None] = lambda _: None
 ) -> tuple[Session, str] | CosimError:
-    """An open session and the episode, or why there is none yet. Raises UsageError where waiting
-    changes nothing."""
+    """Return a session and the key prefix of the episode, or the error while there is none.
+
+    Raises UsageError if waiting cannot help.
+    """
     from bridge import keys
     from bridge.session import open_session
 
     connect = connection.connect
     try:
-        session = open_session(connection, say)
+        session = open_session(connection, warn)
     except EngineError:
         return EngineError(
             f"no run is on the air at {connect}: start one with `cosim run ... --live {connect}`"
         )
     statuses = session.answers(keys.EVERY_STATUS, timeout_s=SEARCH_S)
     names = {
-        _name(below): below for below in sorted(key.removesuffix("/status") for key in statuses)
+        _episode_name(below): below
+        for below in sorted(key.removesuffix("/status") for key in statuses)
     }
     if env in names or (env is None and len(names) == 1):
         return session, names[env or next(iter(names))]
@@ -323,8 +327,8 @@ def _meant(
     )
 
 
-def _name(below: str) -> str:
-    """RUN/EPISODE, by what its keys begin with."""
+def _episode_name(below: str) -> str:
+    """Return RUN/EPISODE of a key prefix."""
     return "/".join(below.split("/")[1::2])
 
 
@@ -351,7 +355,7 @@ def serve_command(
         str,
         typer.Option(
             metavar="ENDPOINT",
-            help="Instead: where another one listens, beside which runs find it.",
+            help="Instead: the endpoint of another server, next to which runs find it.",
         ),
     ] = "",
     jpeg: Annotated[
@@ -360,12 +364,11 @@ def serve_command(
     tls: Tls = "",
     insecure: Insecure = False,
 ) -> None:
-    """Answer for a policy in runs of other processes, until stopped.
+    """Serve a policy to runs in other processes, until stopped.
 
-    A policy with act_batch is asked for all episodes that wait, together; any other has an object
-    for each episode under way. Several servers of one name share the episodes; one that is killed
-    loses its own, which are run again. Where cosim cannot be installed, copy
-    bridge/policy_server.py and call its `serve`.
+    A policy with act_batch is queried for all waiting episodes together; any other gets an object
+    per episode. Several servers of one name share the episodes; those of a killed server are run
+    again. Where cosim cannot be installed, copy bridge/policy_server.py and call its `serve`.
     """
     from bridge import keys
     from bridge.policy_server import serve

@@ -63,7 +63,7 @@ _FIGURES: tuple[tuple[str, Callable[[Survey], float], str], ...] = (
     ("far km", lambda s: s.census.longest_m / 1000.0, ".2f"),
     ("one %", lambda s: 100.0 * s.census.one_piece, ".1f"),
 )
-"""Columns of the table: head, value, format."""
+"""Columns of the table of cities: head, value, format."""
 
 MEANING = (
     "straight, curve, S: streets; T, X, Y, round: junctions; walk km, walk %: sidewalks, share of "
@@ -81,8 +81,7 @@ def make(
     size: _Size = 2000.0,
     style: _Style = "mixed",
 ) -> None:
-    """Make a city: a folder with its street net, and what it was made from. Equal to the byte when
-    made again."""
+    """Generate a city in a folder: street net, seed and versions, the same bytes each time."""
     from cosim.spec.scenario import City
     from sumo_nets.city.store import write_city
 
@@ -101,8 +100,7 @@ def table(
     style: _Style = "mixed",
     jobs: Annotated[int, typer.Option(min=1, help="Processes, about 0.3 GiB each.")] = 1,
 ) -> None:
-    """Count what the shipped cities are made of, furniture included, and check them. Exit code 1:
-    one breaks a promise."""
+    """Print and check the parts of the shipped cities. Exit code 1: a city has a fault."""
     from scenarios.tools.bench.places import surveys
     from sumo_nets.city.store import shipped_cities
 
@@ -150,7 +148,7 @@ def draw_city(
 
 
 def print_cities(found: Sequence[Survey]) -> None:
-    """A row per city, the spans of all, widths of the zones, and whatever is wrong."""
+    """Print a row per city, ranges over all cities, widths of zones, and faults."""
     rows: list[tables.Row] = [
         (str(one.seed), *(format(value(one), form) for _, value, form in _FIGURES)) for one in found
     ]
@@ -205,7 +203,7 @@ def _bar() -> Progress:
 
 
 def _picture(street_map: StreetMap, part: tuple[float, float, float, float]) -> Image:
-    """A part of a map from above, (H, W, 3) uint8 RGB."""
+    """Return a part of a map from above, (H, W, 3) uint8 RGB."""
     import shapely
 
     from cosim.report.above import Sheet, draw_streets
@@ -253,7 +251,7 @@ def import_(
         bool,
         typer.Option(
             "--as-is",
-            help="Leave a SUMO net unchanged: add no sidewalks and crossings, mend nothing.",
+            help="Leave a SUMO net unchanged: add no sidewalks and crossings, repair nothing.",
         ),
     ] = False,
     sidewalk_width: Annotated[
@@ -264,7 +262,7 @@ def import_(
         ),
     ] = None,
 ) -> None:
-    """Import a map: convert it, mend what can be mended, check it, keep it under a name."""
+    """Import a map: convert, repair and check it, and store it under a name."""
     from sumo_nets.maps.importer import Options
     from sumo_nets.maps.map_store import checked_map, import_map
 
@@ -300,10 +298,9 @@ def report_map_check(
     zoom: Annotated[
         str | None, typer.Option(help="Part of it for the picture: x0,y0,x1,y1 in metres.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Everything found, as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the check as JSON.")] = False,
 ) -> None:
-    """Say what a map is, what is wrong with it and what it can be used for. Exit code 1: it is not
-    usable."""
+    """Print a map's description, defects and uses. Exit code 2: it is not usable."""
     part = None if zoom is None else box_of("--zoom", zoom)
     if part is not None and picture is None:
         raise UsageError("--zoom is for the picture: say where to write it with -o")
@@ -349,8 +346,7 @@ def endure_map(
     minutes: Annotated[float, typer.Option(min=0.1, help="Simulated minutes on each.")] = 10.0,
     seed: Annotated[int, typer.Option(min=0, help="Of crowd, traffic and wanderings.")] = 0,
 ) -> None:
-    """Simulate crowd and traffic around a robot that goes anywhere, a process for each map. Exit
-    code 1: SUMO died."""
+    """Simulate crowd and traffic around a robot that drives anywhere. Exit code 1: SUMO died."""
     from cosim.core.clock import Clock
     from scenarios.tools.bench.places import endure as endured_on
     from sumo_nets.maps.place_names import place_called
@@ -390,7 +386,7 @@ def list_() -> None:
 
 
 def print_check(check: MapCheck, about: About | None, capacity: Capacity | None) -> None:
-    """Print a check in words, and how many places each kind of scenario has."""
+    """Print the check of a map, and the number of places for each kind of scenario."""
     from sumo_nets.maps.map_store import outdated
 
     width_m, height_m = check.size_m
@@ -457,8 +453,7 @@ def _rows(check: MapCheck) -> list[tuple[str, str]]:
 
 
 def _look_up(called: str) -> tuple[StreetMap, MapCheck, About | None]:
-    """What is known of a place by whatever it is called; a net that was not imported is checked as
-    it is."""
+    """Return map, check and source of a place by its name, folder or net file."""
     from cosim.place.map_check import check_map
     from cosim.spec.scenario import CityMap
     from sumo_nets.city.store import city_net
@@ -483,7 +478,7 @@ def _look_up(called: str) -> tuple[StreetMap, MapCheck, About | None]:
 
 
 def _capacity(street_map: StreetMap, check: MapCheck) -> Capacity | None:
-    """What fits on a map; None where nothing can."""
+    """Return the scenarios that fit on a map; None for an unusable map."""
     from cosim.place.walk_graph import walk_graph_of
     from scenarios.suites.capacity import capacity_of
 
@@ -499,7 +494,7 @@ def _by_name(capacity: Capacity) -> list[tuple[str, FitCount]]:
 
 
 def _refusals(check: MapCheck, capacity: Capacity | None) -> list[str]:
-    """Why a map cannot be used; nothing where it can."""
+    """Return the reasons why a map cannot be used; none for a usable map."""
     if capacity is None or capacity.usable:
         return list(check.reasons)
     return [

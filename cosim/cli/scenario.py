@@ -1,4 +1,4 @@
-"""The command line of own scenarios: `cosim scenario new`, `check`, `draw`, `run`."""
+"""The commands `cosim scenario new`, `check`, `draw` and `run`."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ scenario_app = typer.Typer(
     help="Scenarios of your own, in TOML files; sweeps over them.",
 )
 _MOVED_M = 0.5
-"""What was moved farther than this is told."""
+"""Metres beyond which a moved end of a route is reported."""
 _FILE_HELP = "A TOML file: `cosim scenario new` writes one."
 _OF_OWN_RUN = Fields(
     only=(
@@ -65,14 +65,14 @@ _OF_OWN_RUN = Fields(
         "seed": "Of the run: policies' own seeds are drawn from it.",
     },
 )
-"""The options of `cosim scenario run`."""
+"""Options of `cosim scenario run`."""
 
 
 @scenario_app.command("new", epilog="Example:  \n`cosim scenario new mine.toml`")
 def write_template(
     file: Annotated[Path, typer.Argument(help="Where to write it, a .toml; it is named after it.")],
 ) -> None:
-    """Write a scenario that runs as it is, with a comment on everything that may stand in it."""
+    """Write a scenario file that runs as it is, with a comment on every possible field."""
     if file.suffix != ".toml":
         raise UsageError(f"{file}: a scenario's file ends in .toml")
     if file.exists():
@@ -102,10 +102,9 @@ def check_own(
         bool, typer.Option("--drive", help="Have the oracle drive each: can it be solved?")
     ] = False,
 ) -> None:
-    """Say what scenarios are, or everything that is wrong with them: fields, place, way, events,
-    obstacles, room.
+    """Print the scenarios of files, or all their errors at once.
 
-    Exit code 1: the oracle failed in one.
+    Checks fields, place, route, events, obstacles and free width. Exit code 1: the oracle failed.
     """
     from scenarios.suites.user_scenarios.build import suite_of_own
     from scenarios.suites.user_scenarios.check import own_faults
@@ -124,7 +123,7 @@ def check_own(
             for fault in faults:
                 notice(f"{path}: {fault}")
         else:
-            _say(own)
+            _print_count(own)
             suite = suite_of_own(own)
             _print_scenarios(suite, own)
             failed += _driven(suite) if drive else 0
@@ -135,8 +134,7 @@ def check_own(
 
 
 def _driven(suite: Suite) -> int:
-    """Say of each scenario whether the oracle comes through without a failure. Returns in how many
-    it does not."""
+    """Print whether the oracle solves each scenario, and return the number of failures."""
     from scenarios.suites.proofs import Dropped
     from scenarios.tools.build.proving import EXPERT, proved
 
@@ -172,7 +170,7 @@ def draw_own(
         str | None, typer.Option(help="Part of the place: x0,y0,x1,y1 in metres.")
     ] = None,
 ) -> None:
-    """Draw the map from above: coordinates, way, metres along it, fences, obstacles, events."""
+    """Draw the map from above, with coordinates, route, fences, obstacles and events."""
     from cosim.report.mapsheet import write_png
     from cosim.report.plan import draw_plan
     from scenarios.places.nets import place
@@ -219,10 +217,9 @@ def run_own(
     file: Annotated[Path, typer.Argument(help=_FILE_HELP)],
     config: Annotated[RunConfig, _OF_OWN_RUN],
 ) -> None:
-    """Run what a file makes, into an ordinary run folder; of a sweep print a table by its values,
-    and draw it.
+    """Run the scenarios of a file. A sweep gets a table by its values, and a plot.
 
-    All other options of runs go with `cosim run FILE.toml`.
+    `cosim run FILE.toml` has all other options of runs.
     """
     from cosim.policies.load import load_policy
     from cosim.results.run_folder import refuse_used
@@ -241,20 +238,20 @@ def run_own(
     path = config.out or Path("runs") / f"{own.name}-{manifest.name}-{stamp}"
     if manifest.camera is not None:
         config = replace(config, camera=camera_here(config.camera))
-    _say(own)
+    _print_count(own)
     tables = _run_parts(own, suite, config, path)
     _print_run(own, tables, path)
     write_rerun(path, [own.variants[0].id], config.rerun)
 
 
 def _parts(own: OwnFile, path: Path) -> dict[GoalProtocol | None, Path]:
-    """The run folders of a file: one for each goal protocol, because a run has one."""
+    """Return the run folder of each goal protocol in a file, because a run has only one."""
     goals = dict.fromkeys(variant.own.goal_protocol for variant in own.variants)
     return {goal: path if len(goals) == 1 else path / str(goal) for goal in goals}
 
 
 def _run_parts(own: OwnFile, suite: Suite, config: RunConfig, path: Path) -> list[pd.DataFrame]:
-    """Run the scenarios of a file. Its runs have one seed and one latency."""
+    """Run the scenarios of a file, with one seed and one latency, and return a table per run."""
     from cosim.cli.run_progress import EpisodeBars
     from cosim.results.run_folder import read_spec
     from scenarios.runs.planning import seed_of_run
@@ -285,7 +282,7 @@ def _run_parts(own: OwnFile, suite: Suite, config: RunConfig, path: Path) -> lis
 
 
 def _print_run(own: OwnFile, tables: Sequence[pd.DataFrame], path: Path) -> None:
-    """What came out of a run; of a sweep by its values, which are written beside it."""
+    """Print the results of a run; a sweep by its values, which are also written to files."""
     import pandas as pd
 
     from cosim.cli.run_table import print_next_commands, print_statuses, print_table
@@ -304,14 +301,14 @@ def _print_run(own: OwnFile, tables: Sequence[pd.DataFrame], path: Path) -> None
     else:
         print_table(out, table, len(own.variants), path)
     out.print(f"Run folder: {path}", soft_wrap=True)
-    if len(tables) == 1:  # else each goal has a run in a folder of its own
+    if len(tables) == 1:
         print_next_commands(err, path, table)
     if table["ended"].isna().any():
         raise typer.Exit(SOME_CRASHED)
 
 
 def _print_sweep(summary: pd.DataFrame, fields: list[str]) -> None:
-    """A row for each value: means, with their intervals below."""
+    """Print the means of a sweep, a row per value, with intervals below."""
     from cosim.results.metrics import SUCCESS_IN_WORDS
     from scenarios.suites.user_scenarios.sweep import SWEPT
 
@@ -336,8 +333,8 @@ def _print_sweep(summary: pd.DataFrame, fields: list[str]) -> None:
     )
 
 
-def _say(own: OwnFile) -> None:
-    """What a file makes, in words."""
+def _print_count(own: OwnFile) -> None:
+    """Print the number of scenarios in a file."""
     swept = ", ".join(f"{axis.field} ({len(axis.values)} values)" for axis in own.axes)
     count = len(own.variants)
     words = (
@@ -349,7 +346,7 @@ def _say(own: OwnFile) -> None:
 
 
 def _print_scenarios(suite: Suite, own: OwnFile) -> None:
-    """A row per scenario, with its hash: for 80 columns."""
+    """Print a row per scenario with its hash, and notes."""
     from cosim.spec.scenario import content_hash
     from scenarios.suites.user_scenarios.along_route import narrow_events
     from scenarios.suites.user_scenarios.routes import moved_m

@@ -106,7 +106,7 @@ def taken(name: str, checkout: Path = ROOT) -> list[Figure]:
         if found.exists():
             return msgspec.json.decode(found.read_bytes(), type=list[Figure])
     last = (done.stderr.strip().splitlines() or [f"exit code {done.returncode}"])[-1]
-    if checkout != ROOT and not (checkout / "scenarios" / "bench" / "take.py").is_file():
+    if checkout != ROOT and not (checkout / "scenarios" / "tools" / "bench" / "take.py").is_file():
         raise UsageError(
             f"{checkout} cannot be compared: it holds no cosim with scenarios/tools/bench/take.py"
         )
