@@ -198,13 +198,13 @@ def collect_command(
     except KeyboardInterrupt:
         again = shlex.join([*(word for word in sys.argv[1:] if word != "--resume"), "--resume"])
         err.print(
-            f"Stopped. What is collected is kept in {folder}. Go on with: cosim {again}",
+            f"Stopped. Collected episodes are stored in {folder}. Continue with: cosim {again}",
             soft_wrap=True,
         )
         raise typer.Exit(INTERRUPTED) from None
     _print_end(found, folder, time.monotonic() - began_s)
     if config.episodes is not None and found.kept < config.episodes:
-        err.print(f"There are no more: {config.episodes} were asked for.", highlight=False)
+        err.print(f"There are no more: {config.episodes} were requested.", highlight=False)
 
 
 def _print_end(found: Gathered, folder: Path, took_s: float) -> None:
@@ -220,7 +220,7 @@ def _print_end(found: Gathered, folder: Path, took_s: float) -> None:
             highlight=False,
         )
     if found.spare:
-        out.print(f"{found.spare} more were solved than asked for, and left out", highlight=False)
+        out.print(f"{found.spare} more were solved than requested, and left out", highlight=False)
     if (back := found.back) is None:
         err.print("The data set was whole already: nothing is written.")
         return

@@ -100,9 +100,10 @@ def show_certificates(
         raise AccessError(f"{folder} holds no certificate: `cosim certs init` makes one")
     rows = []
     for path in found:
-        who = identity_in(path)
-        may = RIGHTS[who.role].words
-        rows.append((path.name, who.role, ", ".join(who.hosts), may, time_left(who)))
+        identity = identity_in(path)
+        may = RIGHTS[identity.role].words
+        hosts = ", ".join(identity.hosts)
+        rows.append((path.name, identity.role, hosts, may, time_left(identity)))
     columns = [*tables.names("folder"), *tables.labels("role")]
     columns += [*tables.words("reached by", "may"), *tables.labels("valid until")]
     tables.show(out, columns, rows)
@@ -111,9 +112,9 @@ def show_certificates(
 def _print_certificate(place: Path) -> None:
     from bridge.security.identity import identity_in, time_left
 
-    who = identity_in(place)
-    names = f", reached by {', '.join(who.hosts)}" if who.hosts else ""
-    words = f"{place}: role {who.role}{names}, valid until {time_left(who)}"
+    identity = identity_in(place)
+    names = f", reached by {', '.join(identity.hosts)}" if identity.hosts else ""
+    words = f"{place}: role {identity.role}{names}, valid until {time_left(identity)}"
     say(words)
 
 
@@ -240,13 +241,13 @@ def listen(
                 print(session.ask(f"{below}/log", b"", timeout_s=5.0).decode(), flush=True)
             except TimeoutError as error:
                 raise EngineError(f"{error}: the episode has ended, or is too busy") from error
-        heard: SimpleQueue[bytes] = SimpleQueue()
-        session.listen(f"{below}/{topic}", lambda _, payload: heard.put(payload))
+        received: SimpleQueue[bytes] = SimpleQueue()
+        session.listen(f"{below}/{topic}", lambda _, payload: received.put(payload))
         ends_at = time.monotonic() + (seconds if seconds is not None else 1e9)
         try:
             while (left_s := ends_at - time.monotonic()) > 0.0:
                 with suppress(Empty):
-                    print(heard.get(timeout=left_s).decode(), flush=True)
+                    print(received.get(timeout=left_s).decode(), flush=True)
         except KeyboardInterrupt:
             raise typer.Exit(INTERRUPTED) from None
 

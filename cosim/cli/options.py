@@ -37,12 +37,22 @@ def camera_here(choice: CameraChoice) -> Literal["gl", "bullet", "bullet-egl"]:
     return name
 
 
-def size_called(option: str, words: str) -> tuple[int, int]:
-    """Return (width, height) of a text such as "160x90", pixels. Raises UsageError."""
+def size_called(option: str, words: str, span: tuple[int, int] = (1, 9999)) -> tuple[int, int]:
+    """Return (width, height) of a text such as "160x90".
+
+    option: its name, for the error message.
+    span: least and largest width and height, pixels.
+    Raises UsageError.
+    """
     found = re.fullmatch(r"([1-9][0-9]{0,3})x([1-9][0-9]{0,3})", words, re.ASCII)
-    if found is None:
-        raise UsageError(f"{option} {words}: give width x height in pixels, such as 160x90")
-    return int(found[1]), int(found[2])
+    size = (int(found[1]), int(found[2])) if found else (0, 0)
+    least, most = span
+    if not all(least <= side <= most for side in size):
+        raise UsageError(
+            f"{option} {words}: give width x height in pixels, such as 160x90, each from {least} "
+            f"to {most}"
+        )
+    return size
 
 
 DEFAULT = "tcp/127.0.0.1:7447"

@@ -10,7 +10,7 @@ import typer
 
 from cosim.cli import tables
 from cosim.cli.console import out
-from cosim.cli.options import LOOK, Camera, camera_here, check_output, replaced
+from cosim.cli.options import LOOK, Camera, camera_here, check_output, replaced, size_called
 from cosim.cli.progress import doing
 from cosim.core.errors import MachineError, UsageError, listed, unknown
 from cosim.spec.run_config import help_of
@@ -57,16 +57,6 @@ def view_of(name: str) -> Viewpoint:
         if view == name:
             return view
     raise unknown("view", name, VIEWS)
-
-
-def size_of(text: str) -> tuple[int, int]:
-    """Return (width, height) of a text such as "1280x720", pixels. Raises UsageError."""
-    parts = text.lower().split("x")
-    if len(parts) != 2 or not all(part.isdecimal() and 16 <= int(part) <= 4096 for part in parts):
-        raise UsageError(
-            f"--size '{text}': give width x height in pixels, each from 16 to 4096, like 1280x720"
-        )
-    return int(parts[0]), int(parts[1])
 
 
 film_app = typer.Typer()
@@ -135,7 +125,14 @@ def film(
     from_s, until_s = from_s if start is None else start, until_s if end is None else end
     instead = replaced(output)
     with doing("choosing the camera") as progress:
-        cut = Cut(from_s, until_s, size_of(size), speed, camera_here(camera), picked)
+        cut = Cut(
+            from_s,
+            until_s,
+            size_called("--size", size, (16, 4096)),
+            speed,
+            camera_here(camera),
+            picked,
+        )
         to_s = make_film(folder, episode, output, cut, progress)
     same = (
         "the state hash is the record's"
@@ -200,17 +197,17 @@ def look(
     from scenarios.tools.viewing.look import look_at
 
     picked = view_of(view)
-    pixels = size_of(size)
+    pixels = size_called("--size", size, (16, 4096))
     check_output(output)
     found, of = one_scenario(scenario, suite, which)
-    asked = with_crowd(
+    changed = with_crowd(
         with_robot(found, robot),
         residents=residents,
         groups=groups,
         elderly=elderly,
         children=children,
     )
-    (one,) = asked.scenarios
+    (one,) = changed.scenarios
     more = "" if which or of == 1 else f"; 1 of {of} scenarios: --scenario chooses another"
     with doing("choosing the camera") as progress:
         image, time_s = look_at(one, policy, at, picked, pixels, camera_here(camera), progress)

@@ -399,18 +399,18 @@ def print_check(check: MapCheck, about: About | None, capacity: Capacity | None)
             *tables.words("places where they fit, of those on the largest island"),
         ]
         tables.show(out, columns, [(name, str(count)) for name, count in _by_name(capacity)])
-    said = [("warning", warning) for warning in check.warnings] + [
+    remarks = [("warning", warning) for warning in check.warnings] + [
         ("note", note) for note in check.notes
     ]
     if about is not None:
-        said += [("note", _OUTDATED)] if outdated(about) else []
-        said += [("changed", change) for change in about.changes]
-        said += [
+        remarks += [("note", _OUTDATED)] if outdated(about) else []
+        remarks += [("changed", change) for change in about.changes]
+        remarks += [
             ("licence", licence)
             for licence in about.licences or ("none found: ask where the file comes from",)
         ]
-    said += [("NOT USABLE", reason) for reason in _refusals(check, capacity)]
-    for head, words in said:
+    remarks += [("NOT USABLE", reason) for reason in _refusals(check, capacity)]
+    for head, words in remarks:
         say(f"{head}: {words}")
 
 

@@ -109,7 +109,7 @@ class Terminal(EpisodeBars):
         config = self._config
         seed = plan.options.seed
         err.print(
-            f"Seed {seed}: what the policy is told that episodes are called is drawn from it.",
+            f"Seed {seed}: the episode ids and seeds that the policy gets are drawn from it.",
             highlight=False,
         )
         for note in run.held.notes:
@@ -136,10 +136,10 @@ class Terminal(EpisodeBars):
         again = shlex.join(word for word in sys.argv[1:] if word != "--resume")
         again += "" if self._config.out else f" --out {shlex.quote(str(self.folder))}"
         err.print(
-            f"Stopped. {finished} of {len(plan.picked)} episodes are finished and kept in "
+            f"Stopped. {finished} of {len(plan.picked)} episodes are finished and stored in "
             f"{self.folder}."
         )
-        err.print(f"Go on with: cosim {again} --resume", soft_wrap=True)
+        err.print(f"Continue with: cosim {again} --resume", soft_wrap=True)
 
 
 def _print_live_commands(hub: Connection, run: HeldRun, *, several: bool, paced: bool) -> None:

@@ -213,14 +213,14 @@ def _latency_in_words(table: pd.DataFrame) -> str:
             f"latency {late_ms.median():g} ms: commands take effect so much later than what they "
             f"answer"
         )
-    told = (
+    words = (
         f"commands took effect {_median_and_range(late_ms)} after what they answer, at whole "
         f"ticks of 50 ms"
     )
     if len(took_ms := table["answer_ms"].dropna()):
-        told = f"the median answer took {_median_and_range(took_ms)}; {told}"
+        words = f"the median answer took {_median_and_range(took_ms)}; {words}"
     return (
-        f"in real time: {told}; as measured here, not to be had again from the seed, only replayed"
+        f"in real time: {words}; as measured here, not to be had again from the seed, only replayed"
     )
 
 

@@ -273,9 +273,9 @@ def _run_parts(own: OwnFile, suite: Suite, config: RunConfig, path: Path) -> lis
         try:
             tables.append(carry_out(of_part, given=Given(suite=suite), reporter=EpisodeBars()))
         except KeyboardInterrupt:
-            err.print(
-                f"Stopped. What is finished is kept in {part}: go on with --out {path} --resume",
-                soft_wrap=True,
+            notice(
+                f"Stopped. Finished episodes are stored in {part}: continue with --out {path} "
+                f"--resume"
             )
             raise typer.Exit(INTERRUPTED) from None
     return tables
@@ -374,8 +374,8 @@ def _print_scenarios(suite: Suite, own: OwnFile) -> None:
     for note in dict.fromkeys(note for one in suite.scenarios for note in narrow_events(one)):
         say(f"note: {note}")
     for variant, one in zip(own.variants, suite.scenarios, strict=True):
-        asked = variant.own.obstacles
-        if asked.per_100m and len(one.obstacles) == len(asked.placed):
+        wanted = variant.own.obstacles
+        if wanted.per_100m and len(one.obstacles) == len(wanted.placed):
             out.print(
                 f"note: {one.id}: no room for obstacles that leave the robot's width and 0.5 m",
                 soft_wrap=True,

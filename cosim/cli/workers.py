@@ -105,9 +105,9 @@ def coordinator_command(
     "worker",
     rich_help_panel=MANY,
     epilog="Examples:  \n`cosim worker --jobs 2`  \n`cosim worker --connect tls/hub.lan:7447 "
-    "--tls certs/worker --jobs 16 --once`  \nExit codes: 0 told to end by SIGTERM, its episodes "
+    "--tls certs/worker --jobs 16 --once`  \nExit codes: 0 ended by SIGTERM, its episodes "
     "handed back, or the run is over (--once); 2 the run needs another installation, or its "
-    "policy cannot be loaded here; 3 this machine lacks something, or no run was heard of for 10 "
+    "policy cannot be loaded here; 3 this machine lacks something, or no run was found for 10 "
     "minutes (--once); 130 Ctrl-C",
 )
 def worker_command(
@@ -231,7 +231,7 @@ def _status_of_folder(folder: Path) -> tuple[RunStatus, str]:
         if status.finished <= finished or late_s < _STALE_S:
             return (
                 status,
-                f"Its coordinator has said nothing for {duration(late_s)}."
+                f"Its coordinator has sent nothing for {duration(late_s)}."
                 if late_s > _STALE_S
                 else "",
             )
@@ -240,7 +240,7 @@ def _status_of_folder(folder: Path) -> tuple[RunStatus, str]:
     )
     if runs:
         return bare, "Run by processes of this machine, or just begun."
-    return bare, "" if finished == total else "Nobody runs it: go on with its command and --resume."
+    return bare, "" if finished == total else "Not running: continue with its command and --resume."
 
 
 def _show_status(look: Callable[[], tuple[RunStatus, str]]) -> None:
@@ -251,7 +251,7 @@ def _show_status(look: Callable[[], tuple[RunStatus, str]]) -> None:
         return
     try:
         with Live(_picture(status, remark), console=out, auto_refresh=False) as live:
-            while status.finished < status.total and not remark.startswith("Nobody"):
+            while status.finished < status.total and not remark.startswith("Not running"):
                 time.sleep(_EVERY_S)
                 try:
                     status, remark = look()
@@ -263,14 +263,16 @@ def _show_status(look: Callable[[], tuple[RunStatus, str]]) -> None:
 
 
 def _picture(status: RunStatus, remark: str) -> Group:
-    said = f"{status.suite}, policy {status.policy}: {status.finished} of {status.total} episodes"
+    summary = (
+        f"{status.suite}, policy {status.policy}: {status.finished} of {status.total} episodes"
+    )
     if status.per_hour is not None and status.left_s is not None:
-        said += f", {status.per_hour:.0f} an hour, about {duration(status.left_s)} left"
+        summary += f", {status.per_hour:.0f} an hour, about {duration(status.left_s)} left"
     if status.lost:
-        said += f"; {status.lost} lost with their workers and run again"
+        summary += f"; {status.lost} lost with their workers and run again"
     if status.refused:
-        said += f"; {status.refused} messages refused"
-    parts: list[RenderableType] = [Text(said)]
+        summary += f"; {status.refused} messages refused"
+    parts: list[RenderableType] = [Text(summary)]
     if status.workers:
         columns = [*tables.names("worker"), *tables.labels("state", "heard")]
         columns += [*tables.figures("done"), *tables.words("episode")]
@@ -291,7 +293,7 @@ def _picture(status: RunStatus, remark: str) -> Group:
             )
         parts += tables.fitted(out, columns, rows)
     elif status.finished < status.total and not remark:
-        parts.append(Text("No worker is there: start some with `cosim worker`."))
+        parts.append(Text("No worker is connected: start some with `cosim worker`."))
     parts += [Text(line, style="bold red") for line in status.conflicts]
     if remark:
         parts.append(Text(remark))
