@@ -149,17 +149,15 @@ def _shares(
 
 
 _NOTES = (
-    "Density and speed by pedpy. Speed by density: everybody in a window of 2 x 3.2 m in the "
-    "middle of a straight sidewalk that leads round a block, frame by frame; off: how many of the "
-    "data's standard deviations ours lies beside its mean. Free speed: of each person while "
-    "nobody is within 3 m, of those who walk so for 3 s. Nearest: that of our streets whose "
-    "median is nearest, for how dense the films were is not known. Gaps: a marked crossing "
-    "without signals, where vehicles yield; people and vehicles of each direction come every 10 s "
-    "on the mean. How often they came in DUT, where nothing is marked, is not known: the low "
-    "percentiles say most.",
-    "Distances: of means and deviations the 2-Wasserstein distance between normal "
-    "distributions that have them, "
-    "of percentiles the 1-Wasserstein distance over those given, their mean difference.",
+    "Density and speed by pedpy, frame by frame, in a window of 2 x 3.2 m in the middle of a "
+    "straight sidewalk that leads round a block; off: difference of the means in standard "
+    "deviations of the data. Free speed: of people who walk for 3 s with nobody within 3 m. "
+    "Nearest: the simulated street with the nearest median, because the density in the films is "
+    "not known. Gaps: a marked crossing without signals, where vehicles yield; people and "
+    "vehicles of each direction arrive every 10 s on average. Their rates in DUT, which has no "
+    "markings, are not known: the low percentiles say most.",
+    "Distances: for means and deviations the 2-Wasserstein distance between normal "
+    "distributions, for percentiles the 1-Wasserstein distance, their mean difference.",
 )
 
 
@@ -285,9 +283,9 @@ def bench(
         str,
         typer.Argument(
             metavar="WHAT",
-            help="environment (one process, part by part), camera (all of them side by side), "
-            "crowd (how people and vehicles behave), people (how the crowd walks, beside what was "
-            "measured of people) or crossings (how a policy, they and the lights get on).",
+            help="environment (one process, part by part), camera (all of them), "
+            "crowd (behaviour of people and vehicles), people (the crowd compared with measured "
+            "people) or crossings (a policy, people and vehicles at signals).",
         ),
     ] = "environment",
     only: Annotated[
@@ -301,34 +299,29 @@ def bench(
         Path | None,
         typer.Option(
             metavar="CHECKOUT",
-            help="For `environment` and `camera`: take each figure there too, in turns, and show "
+            help="For `environment` and `camera`: measure this checkout in turns, too, and show "
             "the ratios.",
         ),
     ] = None,
     rounds: Annotated[
-        int, typer.Option(min=1, help="How often each figure is taken; medians are shown.")
+        int, typer.Option(min=1, help="Number of measurements of each figure; medians are shown.")
     ] = 3,
     cities: Annotated[
         int | None,
-        typer.Option(
-            min=1, help="How many cities: 3 for `crowd`, 20 for `crossings` unless you say."
-        ),
+        typer.Option(min=1, help="Number of cities; default: 3 for `crowd`, 20 for `crossings`."),
     ] = None,
     minutes: Annotated[
         float, typer.Option(min=0.1, help="For `crowd`: simulated minutes in each.")
     ] = 10.0,
-    residents: Annotated[
-        int, typer.Option(min=0, help="For `crowd`: residents beside the crowd.")
-    ] = 0,
-    crossings: Annotated[int, typer.Option(min=1, help="For `crossings`: how many in all.")] = 200,
-    policy: Annotated[str, typer.Option(help="For `crossings`: who drives over them.")] = "orca",
+    residents: Annotated[int, typer.Option(min=0, help="For `crowd`: number of residents.")] = 0,
+    crossings: Annotated[int, typer.Option(min=1, help="For `crossings`: their number.")] = 200,
+    policy: Annotated[str, typer.Option(help="For `crossings`: the policy.")] = "orca",
     jobs: Annotated[int, typer.Option(min=1, help="For `crossings` and `people`: processes.")] = 1,
     groups: Annotated[float, typer.Option(help=f"For `crowd`: {help_of('groups')}")] = 0.0,
     elderly: Annotated[float, typer.Option(help=f"For `crowd`: {help_of('elderly')}")] = 0.0,
     children: Annotated[float, typer.Option(help=f"For `crowd`: {help_of('children')}")] = 0.0,
 ) -> None:
-    """Measure one environment process, part by part, the cameras, or what robot, people and
-    vehicles do in traffic."""
+    """Measure the speed of an environment process or of cameras, or behaviour in traffic."""
     choices = ("environment", "camera", "crowd", "people", "crossings")
     if what not in choices:
         raise unknown("bench", what, choices)

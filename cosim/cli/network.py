@@ -39,7 +39,7 @@ _Hosts = Annotated[
     typer.Option(
         "--host",
         metavar="NAME",
-        help="A name or address that others reach it by; may be given again.",
+        help="A host name or address of this endpoint; repeatable.",
     ),
 ]
 _Days = Annotated[int, typer.Option(min=1, max=3650, help="How long it is valid.")]
@@ -127,7 +127,7 @@ direct_app = typer.Typer()
     "`cosim run reactive --event frontal --policy orca --director tcp/127.0.0.1:7448`",
 )
 def direct(
-    listen: Annotated[str, typer.Option(help="Where runs find it.")] = DIRECTOR,
+    listen: Annotated[str, typer.Option(help="The endpoint for runs.")] = DIRECTOR,
     tls: Tls = "",
     insecure: Insecure = False,
 ) -> None:
@@ -155,14 +155,14 @@ PAUSE_S = 0.5
 
 Connect = Annotated[str, typer.Option(help="The endpoint that the run was given as --live.")]
 Env = Annotated[
-    str | None, typer.Option(help="Which episode, as RUN/EPISODE; needed when several run.")
+    str | None, typer.Option(help="The episode as RUN/EPISODE; required if several run.")
 ]
 Wait = Annotated[
     float,
     typer.Option(
         min=0.0,
         max=1e6,
-        help="Seconds to wait until it is on the air; by default it must be by now.",
+        help="Seconds to wait until the episode is live; default: no wait.",
     ),
 ]
 
@@ -347,10 +347,10 @@ serve_app = typer.Typer()
 def serve_command(
     policy: Annotated[str, typer.Argument(help="Your own, as my.py:Class, or a baseline.")],
     name: Annotated[
-        str, typer.Option(help="What runs ask for, as --policy zenoh:NAME; else the manifest's.")
+        str, typer.Option(help="Its name in --policy zenoh:NAME; default: the manifest's.")
     ] = "",
     listen: Annotated[
-        str, typer.Option(metavar="ENDPOINT", help="Where runs find it.")
+        str, typer.Option(metavar="ENDPOINT", help="The endpoint for runs.")
     ] = POLICIES_AT,
     connect: Annotated[
         str,
@@ -360,7 +360,7 @@ def serve_command(
         ),
     ] = "",
     jpeg: Annotated[
-        bool, typer.Option("--jpeg", help="Have pictures sent as JPEG; every row says so.")
+        bool, typer.Option("--jpeg", help="Get pictures as JPEG, which is recorded in every row.")
     ] = False,
     tls: Tls = "",
     insecure: Insecure = False,

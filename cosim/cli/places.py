@@ -68,7 +68,7 @@ _FIGURES: tuple[tuple[str, Callable[[Survey], float], str], ...] = (
 MEANING = (
     "straight, curve, S: streets; T, X, Y, round: junctions; walk km, walk %: sidewalks, share of "
     "the city's area; cross, lit, mid, refuge: crossings, with signals, in mid-street, with an "
-    "island; drive: driveways; props: street furniture; side m: least width beside it on any "
+    "island; drive: driveways; props: street furniture; side m: least width next to it on any "
     "sidewalk; clear m: width that passes everywhere, furniture included (2 at most); far km: "
     "longest shortest walk; one %: of the walkable area in one piece"
 )
@@ -93,9 +93,7 @@ def make(
 
 @city_app.command(epilog="Example:  \n`cosim city table --count 10 --jobs 2`")
 def table(
-    count: Annotated[
-        int, typer.Option(min=1, max=100, help="How many of the shipped cities.")
-    ] = 100,
+    count: Annotated[int, typer.Option(min=1, max=100, help="Number of shipped cities.")] = 100,
     size: _Size = 2000.0,
     style: _Style = "mixed",
     jobs: Annotated[int, typer.Option(min=1, help="Processes, about 0.3 GiB each.")] = 1,
@@ -184,7 +182,7 @@ def print_cities(found: Sequence[Survey]) -> None:
     narrowest = min(one.side_m for one in found)
     tightest = min(one.census.clear_m for one in found)
     out.print(
-        f"least width beside furniture on any sidewalk {narrowest:.2f} m, passing everywhere "
+        f"least width next to furniture on any sidewalk {narrowest:.2f} m, passing everywhere "
         f"{tightest:.2f} m; "
         f"memory of a process {max(one.memory_mib for one in found):.0f} MiB at most",
         soft_wrap=True,

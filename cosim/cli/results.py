@@ -354,11 +354,11 @@ def print_sheet(out: Console, sheet: pd.DataFrame) -> None:
         counts = [tuple(str(value) for value in row) for row in short.itertuples(index=False)]
         tables.show(out, [*tables.names(kind), *tables.figures(*others)], counts)
     out.print(
-        "trigger: from the robot to the event's place, when it began; error: off what is stated; "
-        "tick: what the robot drove in a tick, the most that the error may be; off: triggers "
-        "beyond that; speed: of the person while it walks, stated: of the scenario; left: of the "
-        "middle of the way; angle: of its walk to the robot's heading; least: distance between "
-        "the centres of person and robot"
+        "trigger: distance from the robot to the event's place when it began; error: difference "
+        "to the stated distance; tick: metres that the robot drove in a tick, the largest "
+        "expected error; off: triggers beyond it; speed: of the walking person; stated: by the "
+        "scenario; left: of the middle of the route; angle: between its walk and the robot's "
+        "heading; least: distance between the centres of person and robot"
     )
 
 

@@ -34,10 +34,10 @@ coordinator_app = typer.Typer()
 
 _LOCAL_ONLY = {
     "shared_renderer": "workers draw for themselves",
-    "live": "episodes run elsewhere",
-    "pace": "it is there to step in, and episodes run elsewhere",
-    "director": "workers ask their own",
-    "real_time": "answers are timed where nothing else runs",
+    "live": "episodes run on other machines",
+    "pace": "it is for live injection, and episodes run on other machines",
+    "director": "workers use their own",
+    "real_time": "answers are timed on an idle machine",
 }
 """Options of `cosim run` that a coordinator refuses, with the reason."""
 
@@ -122,7 +122,7 @@ def worker_command(
     insecure: Insecure = False,
     logs: Annotated[
         Path | None,
-        typer.Option(help="Keep here what its processes print; else the run alone keeps it."),
+        typer.Option(help="Folder for the output of its processes; default: none."),
     ] = None,
     log_level: LogLevel = "",
     log_json: LogJson = None,
