@@ -1,5 +1,4 @@
-"""The command line, put together: each command stands in a file of its own, in the room of its
-subject."""
+"""The `cosim` command line, assembled from the commands of the other modules."""
 
 from __future__ import annotations
 
@@ -15,10 +14,15 @@ from cosim.cli.console import err, told_streams
 from cosim.cli.installation import cache_app, installation_app
 from cosim.cli.network import certs_app, direct_app, live_app, serve_app
 from cosim.cli.options import LEARN, MEASURE, PLACES, STEP_IN, with_paths_checked
-from cosim.cli.pictures import export_app, film_app, look_app
+from cosim.cli.pictures import (
+    counterfactual_app,
+    export_app,
+    film_app,
+    look_app,
+    replay_app,
+)
 from cosim.cli.places import city_app, map_app
 from cosim.cli.policy import policy_app
-from cosim.cli.replay import counterfactual_app, replay_app
 from cosim.cli.results import compare_app, merge_app, report_app, score_app, show_app
 from cosim.cli.run import run_app
 from cosim.cli.scenario import scenario_app
@@ -38,7 +42,7 @@ app = typer.Typer(
     epilog="Examples:  \n`cosim run long-horizon --policy route --episodes 2`  \n`cosim COMMAND "
     "--help`\n\nExit codes: 0 done, of a run: all is scored; 1 ended, but not all is scored, or a "
     "check has failed; 2 wrong use or bad input; 3 the machine or an engine; 130 interrupted, by "
-    "Ctrl-C or SIGTERM: what is finished is kept; 141 nobody read what it printed.",
+    "Ctrl-C or SIGTERM: finished episodes are stored; 141 the output was closed early.",
 )
 for commands in (
     *(run_app, list_app, show_app, installation_app, cache_app),
@@ -56,9 +60,9 @@ app.add_typer(city_app, name="city", rich_help_panel=PLACES)
 app.add_typer(map_app, name="map", rich_help_panel=PLACES)
 
 
-def _say_versions(asked: bool) -> None:
-    """Print the versions and end, if asked for."""
-    if asked:
+def _print_versions(requested: bool) -> None:
+    """Print the versions and exit if `--version` is given."""
+    if requested:
         from cosim.core.versions import versions_in_words
 
         typer.echo(versions_in_words())
@@ -70,18 +74,19 @@ def common(
     version: Annotated[
         bool,
         typer.Option(
-            "--version", callback=_say_versions, is_eager=True, help="Say the versions and end."
+            "--version",
+            callback=_print_versions,
+            is_eager=True,
+            help="Print the versions and exit.",
         ),
     ] = False,
 ) -> None:
-    """Options of `cosim` itself. A limit of the cache that is none is refused before anything is
-    made."""
+    """Define the options of `cosim` itself, and refuse an invalid cache limit first."""
     cache_limit_bytes()
 
 
 def main() -> None:
-    """Run the command line. SIGTERM ends it as Ctrl-C does: exit code 130, nothing half-written is
-    left."""
+    """Run the command line. SIGTERM ends it like Ctrl-C: exit code 130, no half-written files."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with told_streams():
         try:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cosim.cli import tables
-from cosim.cli.console import out
+from cosim.cli.console import out, say
 from cosim.cli.options import MEASURE
 from cosim.cli.progress import doing
 from cosim.core.errors import unknown
@@ -44,14 +44,13 @@ SHARES = (
     ("off the walkable area", "persons", ""),
     *LIGHTS,
 )
-"""What is counted, of what, and the target."""
+"""Rows of the crowd's table: counted event, its total, target."""
 
 
 def bench_crowd(
     cities: int, minutes: float, residents: int, groups: float, elderly: float, children: float
 ) -> None:
-    """Watch the crowd of several cities and print how people keep apart, out of things and to the
-    lights."""
+    """Simulate the crowd of several cities, and print overlaps and violations of signals."""
     from cosim.spec.scenario import CrowdSpec
     from scenarios.tools.bench.crowd import APART_M, summed, watch_all
 
@@ -65,8 +64,8 @@ def bench_crowd(
         f"crossings entered"
     )
     rows = _shares(SHARES, counts)
-    told = {name for name, whole, _ in SHARES for name in (name, whole)}
-    for name in sorted(counts.keys() - told):
+    shown = {name for name, whole, _ in SHARES for name in (name, whole)}
+    for name in sorted(counts.keys() - shown):
         rows.append((name, f"{counts[name]:.2f}", "", "", ""))
     tables.show(out, [*tables.names(places), *_SHARE], rows)
     out.print("People and pairs are counted in seconds, entries and vehicles one by one.")
@@ -94,8 +93,7 @@ def bench_crowd(
 
 
 def bench_crossings(crossings: int, cities: int, policy: str, jobs: int) -> None:
-    """Drive a policy over signalised crossings and print how it, the crowd and the vehicles keep to
-    the lights."""
+    """Drive a policy over signalised crossings, and print violations of signals by all."""
     from scenarios.tools.bench.crossings import cross_all, crossings_entered
     from scenarios.tools.bench.crowd import summed
 
@@ -136,7 +134,7 @@ def bench_crossings(crossings: int, cities: int, policy: str, jobs: int) -> None
     tables.show(out, [*first, *_SHARE], lights)
     for row in rows:
         for who in row.at_red:
-            out.print(f"{row.scenario}: {who}", soft_wrap=True, markup=False, highlight=False)
+            say(f"{row.scenario}: {who}")
 
 
 def _shares(
@@ -151,23 +149,20 @@ def _shares(
 
 
 _NOTES = (
-    "Density and speed by pedpy. Speed by density: everybody in a window of 2 x 3.2 m in the "
-    "middle of a straight sidewalk that leads round a block, frame by frame; off: how many of the "
-    "data's standard deviations ours lies beside its mean. Free speed: of each person while "
-    "nobody is within 3 m, of those who walk so for 3 s. Nearest: that of our streets whose "
-    "median is nearest, for how dense the films were is not known. Gaps: a marked crossing "
-    "without signals, where vehicles yield; people and vehicles of each direction come every 10 s "
-    "on the mean. How often they came in DUT, where nothing is marked, is not known: the low "
-    "percentiles say most.",
-    "Distances: of means and deviations the 2-Wasserstein distance between normal "
-    "distributions that have them, "
-    "of percentiles the 1-Wasserstein distance over those given, their mean difference.",
+    "Density and speed by pedpy, frame by frame, in a window of 2 x 3.2 m in the middle of a "
+    "straight sidewalk that leads round a block; off: difference of the means in standard "
+    "deviations of the data. Free speed: of people who walk for 3 s with nobody within 3 m. "
+    "Nearest: the simulated street with the nearest median, because the density in the films is "
+    "not known. Gaps: a marked crossing without signals, where vehicles yield; people and "
+    "vehicles of each direction arrive every 10 s on average. Their rates in DUT, which has no "
+    "markings, are not known: the low percentiles say most.",
+    "Distances: for means and deviations the 2-Wasserstein distance between normal "
+    "distributions, for percentiles the 1-Wasserstein distance, their mean difference.",
 )
 
 
 def bench_people(jobs: int) -> None:
-    """Let the crowd walk on sidewalks and over a crossing and print it beside what was measured of
-    people."""
+    """Measure the walking of the crowd, and print it next to measurements of people."""
     from scenarios.tools.bench.people import watch_people
 
     with doing("watching people") as progress:
@@ -288,9 +283,9 @@ def bench(
         str,
         typer.Argument(
             metavar="WHAT",
-            help="environment (one process, part by part), camera (all of them side by side), "
-            "crowd (how people and vehicles behave), people (how the crowd walks, beside what was "
-            "measured of people) or crossings (how a policy, they and the lights get on).",
+            help="environment (one process, part by part), camera (all of them), "
+            "crowd (behaviour of people and vehicles), people (the crowd compared with measured "
+            "people) or crossings (a policy, people and vehicles at signals).",
         ),
     ] = "environment",
     only: Annotated[
@@ -304,34 +299,29 @@ def bench(
         Path | None,
         typer.Option(
             metavar="CHECKOUT",
-            help="For `environment` and `camera`: take each figure there too, in turns, and show "
+            help="For `environment` and `camera`: measure this checkout in turns, too, and show "
             "the ratios.",
         ),
     ] = None,
     rounds: Annotated[
-        int, typer.Option(min=1, help="How often each figure is taken; medians are shown.")
+        int, typer.Option(min=1, help="Number of measurements of each figure; medians are shown.")
     ] = 3,
     cities: Annotated[
         int | None,
-        typer.Option(
-            min=1, help="How many cities: 3 for `crowd`, 20 for `crossings` unless you say."
-        ),
+        typer.Option(min=1, help="Number of cities; default: 3 for `crowd`, 20 for `crossings`."),
     ] = None,
     minutes: Annotated[
         float, typer.Option(min=0.1, help="For `crowd`: simulated minutes in each.")
     ] = 10.0,
-    residents: Annotated[
-        int, typer.Option(min=0, help="For `crowd`: residents beside the crowd.")
-    ] = 0,
-    crossings: Annotated[int, typer.Option(min=1, help="For `crossings`: how many in all.")] = 200,
-    policy: Annotated[str, typer.Option(help="For `crossings`: who drives over them.")] = "orca",
+    residents: Annotated[int, typer.Option(min=0, help="For `crowd`: number of residents.")] = 0,
+    crossings: Annotated[int, typer.Option(min=1, help="For `crossings`: their number.")] = 200,
+    policy: Annotated[str, typer.Option(help="For `crossings`: the policy.")] = "orca",
     jobs: Annotated[int, typer.Option(min=1, help="For `crossings` and `people`: processes.")] = 1,
     groups: Annotated[float, typer.Option(help=f"For `crowd`: {help_of('groups')}")] = 0.0,
     elderly: Annotated[float, typer.Option(help=f"For `crowd`: {help_of('elderly')}")] = 0.0,
     children: Annotated[float, typer.Option(help=f"For `crowd`: {help_of('children')}")] = 0.0,
 ) -> None:
-    """Measure one environment process, part by part, the cameras, or what robot, people and
-    vehicles do in traffic."""
+    """Measure the speed of an environment process or of cameras, or behaviour in traffic."""
     choices = ("environment", "camera", "crowd", "people", "crossings")
     if what not in choices:
         raise unknown("bench", what, choices)
@@ -350,13 +340,13 @@ def bench(
     elif what == "camera" and not only:
         bench_cameras(rounds)
     else:
-        print_figures(_taken(what, only, [None], rounds)[0])
+        print_figures(_figures_of(what, only, [None], rounds)[0])
 
 
-def _taken(
+def _figures_of(
     what: str, only: Sequence[str], checkouts: Sequence[Path | None], rounds: int
 ) -> list[dict[str, list[Figure]]]:
-    """The figures of checkouts, None for this one, each value of each round."""
+    """Return the figures of checkouts (None: this one), with a value per round."""
     from scenarios.tools.bench.figures import ROOT
     from scenarios.tools.bench.measurements import (
         CAMERA,
@@ -373,12 +363,11 @@ def _taken(
 
 
 def _compare(other: Path, what: str, only: Sequence[str], rounds: int) -> None:
-    """A row per figure that both checkouts take: medians here and there, and the ratio round by
-    round."""
+    """Print medians and ratios of the figures that both checkouts have."""
     from scenarios.tools.bench.figures import measuring_module, spread
 
     measuring_module(other)
-    here, there = _taken(what, only, [None, other.resolve()], rounds)
+    here, there = _figures_of(what, only, [None, other.resolve()], rounds)
     rows = []
     for name in [name for name in here if name in there]:
         mine, theirs = ([one.value for one in found[name]] for found in (here, there))
@@ -393,8 +382,7 @@ def _compare(other: Path, what: str, only: Sequence[str], rounds: int) -> None:
 
 
 def print_figures(found: Mapping[str, Sequence[Figure]]) -> None:
-    """A row per figure: the median of its rounds, the engine's own time, their ratio, and what
-    should be reached."""
+    """Print a row per figure: median, spread, the engine's own time, ratio and target."""
     from scenarios.tools.bench.figures import spread
 
     rows = []
@@ -424,7 +412,7 @@ def print_figures(found: Mapping[str, Sequence[Figure]]) -> None:
 
 
 def bench_cameras(rounds: int) -> None:
-    """Measure the cameras in one busy street and print frames a second, targets and ratios."""
+    """Measure the cameras in one busy street, and print frames per second, targets and ratios."""
     from physics.cameras.choice import camera_of_choice, renderer_of
     from scenarios.tools.bench.cameras import FIGURES, PERSONS, RATIOS, SIZE, time_cameras
     from scenarios.tools.bench.figures import spread
@@ -461,11 +449,6 @@ def bench_cameras(rounds: int) -> None:
         if one.why:
             wrong.setdefault(one.why, []).append(name)
     for why, names in wrong.items():
-        out.print(
-            f"{'; '.join(names)} cannot be drawn here: {why}",
-            soft_wrap=True,
-            markup=False,
-            highlight=False,
-        )
+        say(f"{'; '.join(names)} cannot be drawn here: {why}")
     if wrong:
         out.print("What the machine lacks, and how to get it: `cosim doctor`.", highlight=False)

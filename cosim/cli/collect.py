@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cosim.cli.console import err, out
+from cosim.cli.console import err, out, say
 from cosim.cli.generated_options import Fields, configured
 from cosim.cli.options import LEARN, camera_here, check_output, replaced, size_called
 from cosim.cli.progress import doing, stages_in_lines
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 collect_app = typer.Typer()
 
 _EPISODES_HELP = (
-    "So many demonstrations are kept; of a suite all that are solved by default, else one of each."
+    "Number of demonstrations; default: of a suite all that are solved, else one of each."
 )
 _EVENT_HELP = (
     "Only scenarios of this event, with --cities also of this structure (straight, static); may "
@@ -63,22 +63,22 @@ _OF_COLLECT = Fields(
         "split": "Only scenarios of val, or of test.",
         "map": "Draw on this place: a map, a folder, a net.",
         "policy": "The expert: a baseline, or your own as my.py:Class.",
-        "goal": "What is told of where to go: none, route_point, final_point, instruction.",
+        "goal": "Goal protocol: none, route_point, final_point, instruction.",
         "seed": "Of the policy, of noise, and with --map of the scenarios.",
         "own_camera": "A camera that the robot does not have.",
         "jobs": "Environment processes.",
-        "resume": "Go on with the data set in --out.",
+        "resume": "Continue the data set in --out.",
     },
     default={"policy": "orca", "goal": "route_point", "seed": 0, "jobs": 1},
     flag={"camera": "--renderer"},
     required=("out",),
 )
-"""The options of `cosim collect` that it has in common with `cosim run`."""
+"""Options that `cosim collect` shares with `cosim run`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DemoConfig:
-    """What `cosim collect` keeps of an episode, and where it draws scenarios."""
+    """Options of `cosim collect` for recorded data and for the places of scenarios."""
 
     cities: Annotated[
         str,
@@ -105,30 +105,30 @@ class DemoConfig:
             "own rate."
         ),
     ] = 5.0
-    waypoints: Annotated[int, Option("So many places ahead are taken from the trajectory.")] = 8
-    waypoint_s: Annotated[float, Option("Seconds from one of them to the next.")] = 0.2
+    waypoints: Annotated[int, Option("Number of waypoints from the trajectory.")] = 8
+    waypoint_s: Annotated[float, Option("Seconds between waypoints.")] = 0.2
     noise: Annotated[
         float,
         Option(
             "Share of the time in which another command is driven, in bursts; the expert's "
-            "answer is kept all the same."
+            "answer is stored."
         ),
     ] = 0.0
     learner: Annotated[
         str,
         Option(
             "DAgger: this policy drives in --noise's share of the time, 1 to 5 s at once, and the "
-            "expert's answer is kept. It sees the pictures that are collected.",
+            "expert's answer is stored. It sees the pictures that are collected.",
             metavar="POLICY",
         ),
     ] = ""
     unsolved: Annotated[
-        bool, Option("Keep also what the expert does not solve, up to where the robot is put back.")
+        bool, Option("Store unsolved episodes, too, up to where the robot is put back.")
     ] = False
 
     @property
     def collecting(self) -> Collecting:
-        """What is kept. Raises UsageError, SpecError."""
+        """Return the settings of the recorded data. Raises UsageError, SpecError."""
         from cosim.spec.camera import CameraSpec
         from cosim.spec.demo_options import Collecting
 
@@ -159,17 +159,16 @@ def collect_command(
     config: Annotated[RunConfig, _OF_COLLECT],
     demo: Annotated[DemoConfig, Fields()],
 ) -> None:
-    """Drive scenarios with an expert and write what it does and a camera sees as a LeRobot data set
-    (v3.0).
+    """Drive scenarios with an expert, and write a LeRobot data set (v3.0).
 
     A row is a picture with speeds, goal, the expert's command, and waypoints from its trajectory.
-    Only solved episodes are kept. The same command writes the same bytes, whatever --jobs; stopped
-    at any moment it goes on with --resume.
+    Only solved episodes are stored. The bytes are the same for any --jobs. A stopped collection
+    continues with --resume.
     """
     from cosim.spec.policy_host import PolicyHost
     from scenarios.episodes.demonstration import check_parquet
 
-    check_parquet()  # before the modules that import pyarrow
+    check_parquet()
     from cosim.spec.options import EpisodeOptions
     from scenarios.runs.policy_host import known_driver
     from scenarios.tools.dataset.collect import collect
@@ -193,26 +192,26 @@ def collect_command(
             episodes=config.episodes,
             jobs=jobs,
             resume=config.resume,
-            showing=_shown,
+            showing=_show_board,
             progress=stages_in_lines(),
         )
     except KeyboardInterrupt:
         again = shlex.join([*(word for word in sys.argv[1:] if word != "--resume"), "--resume"])
         err.print(
-            f"Stopped. What is collected is kept in {folder}. Go on with: cosim {again}",
+            f"Stopped. Collected episodes are stored in {folder}. Continue with: cosim {again}",
             soft_wrap=True,
         )
         raise typer.Exit(INTERRUPTED) from None
-    _tell_of_end(found, folder, time.monotonic() - began_s)
+    _print_end(found, folder, time.monotonic() - began_s)
     if config.episodes is not None and found.kept < config.episodes:
-        err.print(f"There are no more: {config.episodes} were asked for.", highlight=False)
+        err.print(f"There are no more: {config.episodes} were requested.", highlight=False)
 
 
-def _tell_of_end(found: Gathered, folder: Path, took_s: float) -> None:
-    """Print what was collected, what was dropped, and what reading it back showed."""
+def _print_end(found: Gathered, folder: Path, took_s: float) -> None:
+    """Print the numbers of collected and dropped episodes, and the result of reading them back."""
     kept = f"{found.kept} episodes, {found.rows} pictures, {_size_mb(folder):.1f} MB"
     words = f"Data set: {folder} ({kept}), of {found.run} driven in {took_s:.0f} s"
-    out.print(words, soft_wrap=True, highlight=False, markup=False)
+    say(words)
     if found.dropped:
         reasons = "; ".join(f"{words}: {count}" for words, count in found.dropped.most_common())
         out.print(
@@ -221,7 +220,7 @@ def _tell_of_end(found: Gathered, folder: Path, took_s: float) -> None:
             highlight=False,
         )
     if found.spare:
-        out.print(f"{found.spare} more were solved than asked for, and left out", highlight=False)
+        out.print(f"{found.spare} more were solved than requested, and left out", highlight=False)
     if (back := found.back) is None:
         err.print("The data set was whole already: nothing is written.")
         return
@@ -233,7 +232,7 @@ def _tell_of_end(found: Gathered, folder: Path, took_s: float) -> None:
 
 
 def _source(config: RunConfig, demo: DemoConfig) -> Suite | Fresh:
-    """What is driven. Raises UsageError."""
+    """Return the suite or the source of new scenarios to drive. Raises UsageError."""
     import msgspec
 
     from cosim.spec.robot import COURIER, robot_called
@@ -248,10 +247,10 @@ def _source(config: RunConfig, demo: DemoConfig) -> Suite | Fresh:
         "--scenario": config.scenario,
         "--split": config.split,
     }
-    told = [name for name, asked in options.items() if asked]
-    if len(told) > 1 and (demo.cities or config.map):
+    given = [name for name, value in options.items() if value]
+    if len(given) > 1 and (demo.cities or config.map):
         raise UsageError(
-            f"{' and '.join(told)} do not go together: scenarios are drawn in places, or are "
+            f"{' and '.join(given)} do not go together: scenarios are drawn in places, or are "
             f"a suite's"
         )
     if demo.cities:
@@ -272,7 +271,9 @@ def _source(config: RunConfig, demo: DemoConfig) -> Suite | Fresh:
 
 
 @contextmanager
-def _shown(scenarios: Sequence[Scenario], done: set[str]) -> Iterator[Callable[[object], None]]:
+def _show_board(
+    scenarios: Sequence[Scenario], done: set[str]
+) -> Iterator[Callable[[object], None]]:
     board = Board(scenarios, done)
     with board.bars:
         yield board.tell
@@ -286,7 +287,7 @@ def _size_mb(folder: Path) -> float:
 dataset_app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="markdown",
-    help="What `cosim collect` has made, for training.",
+    help="Data sets of `cosim collect`, for training.",
 )
 
 
@@ -307,11 +308,9 @@ def pack(
         str, typer.Option(metavar="WxH", help="Pixels of the pictures, in place of their own.")
     ] = "",
 ) -> None:
-    """Write data sets as plain arrays: pictures, speeds, goals, commands, waypoints, for who has
-    numpy alone.
+    """Write data sets as plain arrays, which need numpy only.
 
-    The arrays are told in `cosim/core/packed_demos.py`; `cosim.core.packed_demos.read_packed` reads
-    them.
+    `cosim/core/packed_demos.py` describes the arrays, and its `read_packed` reads them.
     """
     from scenarios.episodes.demonstration import check_parquet
 

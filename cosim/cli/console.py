@@ -24,6 +24,16 @@ out = Console(emoji=False)
 err = Console(stderr=True, emoji=False)
 
 
+def say(words: str) -> None:
+    """Print a line on standard output, unwrapped and without markup."""
+    out.print(words, soft_wrap=True, markup=False, highlight=False)
+
+
+def notice(words: str, _share: float | None = None, /) -> None:
+    """Print a line on standard error, unwrapped and without markup. Can serve as a `Progress`."""
+    err.print(words, soft_wrap=True, markup=False, highlight=False)
+
+
 _LEVELS = ("debug", "info", "warning", "error")
 LogLevel = Annotated[str, typer.Option("--log-level", metavar="LEVEL", help=help_of("log_level"))]
 LogJson = Annotated[
@@ -33,20 +43,24 @@ LogJson = Annotated[
 
 @contextmanager
 def logged(level: str, json_file: Path | None) -> Iterator[Counter[str]]:
-    """Keep logs as long as the block goes on; what it yields counts events by name. level: "" for
-    none in words, and for "info" in the file. Raises UsageError, MachineError."""
+    """Log events during the block, and yield the count of events by name.
+
+    level: lowest level on standard error; "" for none there, and "info" in the file.
+    json_file: file to append to, one JSON object per line.
+    Raises UsageError, MachineError.
+    """
     if level and level not in _LEVELS:
         raise unknown("log level", level, _LEVELS)
     lowest = getattr(logging, (level or "info").upper())
     counts: Counter[str] = Counter()
     with ExitStack() as stack:
-        handlers: list[_Quiet] = [_Counts(counts)]
+        handlers: list[_Handler] = [_CountingHandler(counts)]
         if level:
-            handlers.append(_Words(lowest))
+            handlers.append(_TextHandler(lowest))
         if json_file is not None:
             try:
                 handlers.append(
-                    _Lines(lowest, stack.enter_context(json_file.open("a", buffering=1)))
+                    _JsonHandler(lowest, stack.enter_context(json_file.open("a", buffering=1)))
                 )
             except OSError as error:
                 raise unwritable(json_file, error) from error
@@ -62,14 +76,14 @@ def logged(level: str, json_file: Path | None) -> Iterator[Counter[str]]:
                 JOURNAL.removeHandler(one)
 
 
-class _Quiet(logging.Handler):
-    """What cannot be written, as on a full disk, is told by the run itself."""
+class _Handler(logging.Handler):
+    """Log handler that ignores write errors, because a full disk must not end an episode."""
 
     def handleError(self, record: logging.LogRecord) -> None:
-        """Nothing: an episode is worth more than its line."""
+        """Ignore the error: the run itself reports a full disk."""
 
 
-class _Counts(_Quiet):
+class _CountingHandler(_Handler):
     def __init__(self, counts: Counter[str]) -> None:
         super().__init__(logging.DEBUG)
         self._counts = counts
@@ -78,27 +92,27 @@ class _Counts(_Quiet):
         self._counts[record.msg] += 1
 
 
-class _Words(_Quiet):
+class _TextHandler(_Handler):
     def emit(self, record: logging.LogRecord) -> None:
-        facts = " ".join(f"{name}={_shown(value)}" for name, value in _facts(record).items())
+        facts = " ".join(f"{name}={_quoted(value)}" for name, value in _facts(record).items())
         words = f"{_time(record)} {record.levelname.lower():7} {record.msg} {facts}"
         err.print(words.rstrip(), soft_wrap=True, highlight=False, markup=False)
 
 
-class _Lines(_Quiet):
+class _JsonHandler(_Handler):
     def __init__(self, level: int, file: TextIO) -> None:
         super().__init__(level)
         self._file = file
 
     def emit(self, record: logging.LogRecord) -> None:
-        told = {
+        entry = {
             "time": _time(record),
             "level": record.levelname.lower(),
             "event": record.msg,
             **_facts(record),
         }
         try:
-            self._file.write(json.dumps(told, default=str) + "\n")
+            self._file.write(json.dumps(entry, default=str) + "\n")
         except OSError:
             self.handleError(record)
 
@@ -111,13 +125,13 @@ def _time(record: logging.LogRecord) -> str:
     return datetime.fromtimestamp(record.created, UTC).strftime("%Y-%m-%dT%H:%M:%S.%f")[:-3] + "Z"
 
 
-def _shown(value: object) -> str:
+def _quoted(value: object) -> str:
     text = str(value)
     return json.dumps(text) if " " in text or not text else text
 
 
 class Unwritable(Exception):
-    """A stream took no more. No OSError, so that nobody on the way takes it for one of a file."""
+    """A standard stream cannot be written. Not an OSError, which would be reported as a file's."""
 
     def __init__(self, stream: Stream, reason: OSError) -> None:
         super().__init__(str(reason))
@@ -126,8 +140,7 @@ class Unwritable(Exception):
 
 
 class Stream:
-    """A text stream that raises Unwritable, and shows as an escape what its encoding does not
-    have."""
+    """Text stream that raises Unwritable, and escapes characters that its encoding lacks."""
 
     def __init__(self, stream: Any) -> None:
         self._stream = stream
@@ -150,8 +163,7 @@ class Stream:
             raise Unwritable(self, error) from None
 
     def let_go(self) -> None:
-        """Let what is still to be written go nowhere: the interpreter would complain of it when it
-        ends."""
+        """Discard buffered output, which the interpreter would fail to write at its end."""
         with suppress(OSError):
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, self._stream.fileno())
@@ -160,8 +172,11 @@ class Stream:
 
 @contextmanager
 def told_streams() -> Iterator[None]:
-    """Run a program whose output may find no room (one line, exit code 3) or no reader (silence,
-    UNREAD)."""
+    """Run a block with guarded standard streams.
+
+    Output that finds a full disk ends the program with one line and exit code 3. Output without a
+    reader ends it silently with UNREAD.
+    """
     before = sys.stdout, sys.stderr
     out, err = (Stream(stream) if stream is not None else None for stream in before)
     sys.stdout = out

@@ -1,4 +1,4 @@
-"""Make the options of a command from the fields of a config (`cosim.spec.run_config`)."""
+"""Generate the options of a command from the fields of a config (`cosim.spec.run_config`)."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 class Fields(NamedTuple):
-    """Which fields of a config a command has as options, and what it says of them.
+    """Selection of config fields that become options of a command, with overrides.
 
-    only: these alone; () for all.
-    without: those that the command leaves at their defaults.
-    hidden: those that its help does not show.
-    help, default, flag: in place of the field's own, by field.
-    required: those without a default here.
+    only: names of the fields; () for all.
+    without: names of fields that keep their defaults and are no options.
+    hidden: names of options that the help does not show.
+    help, default, flag: replacements of the field's own values, by field name.
+    required: names of fields that have no default here.
     panels: whether the help groups the options.
     """
 
@@ -38,8 +38,7 @@ class Fields(NamedTuple):
 
 
 def configured(command: Callable[..., None]) -> Callable[..., None]:
-    """Decorate a command: a parameter `Annotated[Config, Fields(...)]` becomes the options of that
-    config."""
+    """Replace a command's parameter `Annotated[Config, Fields(...)]` by options of that config."""
     hints = get_type_hints(command, include_extras=True)
     configs = {
         name: (hint.__origin__, fields)
@@ -51,9 +50,9 @@ def configured(command: Callable[..., None]) -> Callable[..., None]:
     @wraps(command)
     def expanded(**given: Any) -> None:
         for name, (config, fields) in configs.items():
-            taken = {field.name: given.pop(field.name) for field in _taken(config, fields)}
+            taken = {field.name: given.pop(field.name) for field in _option_fields(config, fields)}
             given[name] = config(
-                **{field: _told(value, config, field) for field, value in taken.items()}
+                **{field: _as_field_value(value, config, field) for field, value in taken.items()}
             )
         command(**given)
 
@@ -70,22 +69,22 @@ def configured(command: Callable[..., None]) -> Callable[..., None]:
     return expanded
 
 
-def _taken(config: Any, fields: Fields) -> Iterator[dataclasses.Field[Any]]:
-    """The fields of a config that a command has."""
+def _option_fields(config: Any, fields: Fields) -> Iterator[dataclasses.Field[Any]]:
+    """Yield the fields of a config that are options of the command."""
     for field in dataclasses.fields(config):
         if field.name not in fields.without and (not fields.only or field.name in fields.only):
             yield field
 
 
-def _told(value: Any, config: Any, field: str) -> Any:
-    """The value of an option as the field has it: what may be repeated is a tuple."""
+def _as_field_value(value: Any, config: Any, field: str) -> Any:
+    """Return the value of an option as its field stores it: repeatable options as a tuple."""
     several = get_type_hints(config)[field] == tuple[str, ...]
     return tuple(value or ()) if several else value
 
 
 def _parameters(config: Any, fields: Fields) -> Iterator[inspect.Parameter]:
     hints = get_type_hints(config, include_extras=True)
-    for field in _taken(config, fields):
+    for field in _option_fields(config, fields):
         kind = hints[field.name].__origin__
         option = hints[field.name].__metadata__[0]
         several = kind == tuple[str, ...]
@@ -98,19 +97,20 @@ def _parameters(config: Any, fields: Fields) -> Iterator[inspect.Parameter]:
             inspect.Parameter.KEYWORD_ONLY,
             default=default,
             annotation=Annotated[
-                list[str] | None if several else kind, _declared(field.name, kind, option, fields)
+                list[str] | None if several else kind,
+                _typer_parameter(field.name, kind, option, fields),
             ],
         )
 
 
 def _without_none(kind: Any) -> Any:
-    """The type of an option that must be given."""
+    """Return the type of a required option: `T` for `T | None`."""
     parts = [part for part in getattr(kind, "__args__", ()) if part is not type(None)]
     return parts[0] if len(parts) == 1 else kind
 
 
-def _declared(name: str, kind: Any, option: Option, fields: Fields) -> Any:
-    """An option or argument of typer's."""
+def _typer_parameter(name: str, kind: Any, option: Option, fields: Fields) -> Any:
+    """Return typer's option or argument of a field."""
     words = fields.help.get(name, option.help)
     if option.argument:
         return typer.Argument(help=words, metavar=option.metavar)

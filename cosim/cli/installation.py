@@ -11,7 +11,7 @@ import typer
 from rich.markup import escape
 
 from cosim.cli import tables
-from cosim.cli.console import err, out
+from cosim.cli.console import err, notice, out
 from cosim.cli.progress import doing
 from cosim.core.cache import (
     CACHE_KINDS,
@@ -41,26 +41,26 @@ def show_cache(
         bool, typer.Option("--size", help="Print the sizes; this is the default.")
     ] = False,
     prune: Annotated[
-        bool, typer.Option("--prune", help="Remove what was not used for so long.")
+        bool, typer.Option("--prune", help="Remove entries unused for --unused-for days.")
     ] = False,
     unused_for: Annotated[
         float | None,
         typer.Option(
             metavar="DAYS",
             min=0.0,
-            help="With --prune, since when; 0: all.",
+            help="With --prune: unused for so many days; 0: all.",
             show_default=f"{UNUSED_S / _DAY_S:g}",
         ),
     ] = None,
 ) -> None:
-    """Print what lies in the cache folder, or remove what was not used for long.
+    """Print the contents of the cache folder, or remove unused entries.
 
-    Everything that is removed is made again when it is needed. Imported maps stay, and what a
-    running process uses.
+    Removed entries are rebuilt when they are needed. Imported maps and entries that a running
+    process uses stay.
 
-    The folder is `$COSIM_CACHE`, by default `~/.cache/sidewalk-cosim`. Where it would be larger
-    than `$COSIM_CACHE_LIMIT` GB (4 by default), what was used longest ago is removed without being
-    asked.
+    The folder is `$COSIM_CACHE`, by default `~/.cache/sidewalk-cosim`. Beyond
+    `$COSIM_CACHE_LIMIT` GB (4 by default), the least recently used entries are removed
+    automatically.
     """
     limit_bytes = cache_limit_bytes()
     if unused_for is not None and not prune:
@@ -85,7 +85,7 @@ def show_cache(
 
 
 def _print_sizes(entries: Sequence[CacheEntry]) -> None:
-    """Print a row for each kind."""
+    """Print number, size and last use of the entries of each kind."""
     columns = [
         *tables.names("kind"),
         *tables.figures("entries", "size"),
@@ -118,7 +118,7 @@ def _counted(entries: int) -> str:
 
 
 installation_app = typer.Typer()
-_LACKING = "an engine cannot be loaded: {}. Mend what it names, or set up anew"
+_LACKING = "an engine cannot be loaded: {}. Repair it, or install cosim again"
 
 
 @installation_app.command(epilog="Example:  \n`cosim doctor`")
@@ -153,16 +153,14 @@ def verify(
         bool,
         typer.Option(
             "--write",
-            help="Take what comes out here as what is shipped, after suites were built anew.",
+            help="Replace the reference results by those of this installation.",
         ),
     ] = False,
 ) -> None:
-    """Does this installation give the shipped bits and numbers? If not: which engine, version or
-    part, and the remedy.
+    """Compare this installation with the reference results, and name the cause of a difference.
 
-    Runs the beginnings of 12 scenarios, of each suite the first of each structure or event, with
-    the oracle, and draws a picture of each by both cameras. An OpenGL driver that is not that of
-    the shipped pictures may differ a little.
+    Runs the beginnings of 12 scenarios with the oracle: of each suite, the first of each structure
+    or event. Draws a picture of each by both cameras, which may differ slightly by OpenGL driver.
     """
     try:
         from scenarios.tools.verify.cases import verified_cases
@@ -191,7 +189,7 @@ def verify(
         )
     wrong = [one for one in found if not one.fine]
     for words in blamed(wrong, shipped, here):
-        err.print(words, soft_wrap=True, highlight=False, markup=False)
+        notice(words)
     if wrong:
         err.print(
             f"{len(wrong)} of {len(found)} differ: this is not the installation that was shipped."

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, cast, get_args
 import typer
 
 from cosim.cli import tables
-from cosim.cli.console import err, out
-from cosim.cli.options import DEFAULT, DIRECTOR, MANY, POLICIES_AT, STEP_IN, Insecure, Tls, warned
+from cosim.cli.console import err, notice, out, say
+from cosim.cli.options import DEFAULT, DIRECTOR, MANY, POLICIES_AT, STEP_IN, Insecure, Tls
 from cosim.cli.progress import doing
 from cosim.core.errors import (
     INTERRUPTED,
@@ -39,7 +39,7 @@ _Hosts = Annotated[
     typer.Option(
         "--host",
         metavar="NAME",
-        help="A name or address that others reach it by; may be given again.",
+        help="A host name or address of this endpoint; repeatable.",
     ),
 ]
 _Days = Annotated[int, typer.Option(min=1, max=3650, help="How long it is valid.")]
@@ -54,14 +54,13 @@ def init(
     host: _Hosts = None,
     days: _Days = 365,
 ) -> None:
-    """Make a private authority, and the certificate of a coordinator, who is reached by each
-    --host."""
+    """Make a private authority, and the certificate of a coordinator for each --host."""
     from bridge.security.authority import make_authority
 
     make_authority(folder, host or ["localhost", "127.0.0.1"], days)
-    _print_made(folder / "coordinator")
+    _print_certificate(folder / "coordinator")
     words = f"Keep {folder / 'ca.key'} to yourself: whoever has it can make every role."
-    out.print(words, soft_wrap=True, markup=False, highlight=False)
+    say(words)
 
 
 @certs_app.command(
@@ -75,13 +74,12 @@ def role(
     days: _Days = 365,
     renew: Annotated[bool, typer.Option("--renew", help="Replace the one that is there.")] = False,
 ) -> None:
-    """Issue the certificate of a role. Who listens (a coordinator, a director, some policies) needs
-    --host."""
+    """Issue the certificate of a role. A role that listens (director, policy) needs --host."""
     from bridge.security.authority import issue
 
     if name not in get_args(Role):
         raise unknown("role", name, get_args(Role))
-    _print_made(issue(folder, cast(Role, name), host or [], days, renew=renew))
+    _print_certificate(issue(folder, cast(Role, name), host or [], days, renew=renew))
 
 
 @certs_app.command(
@@ -92,8 +90,7 @@ def show_certificates(
         Path, typer.Argument(metavar="FOLDER", help="An authority's folder, or a role's.")
     ],
 ) -> None:
-    """Show whose the certificates of a folder are, how they are reached, what they may do, and
-    until when."""
+    """Show role, host names, rights and end of validity of the certificates in a folder."""
     from bridge.security.identity import identity_in, time_left
     from bridge.security.rights import RIGHTS
 
@@ -103,21 +100,22 @@ def show_certificates(
         raise AccessError(f"{folder} holds no certificate: `cosim certs init` makes one")
     rows = []
     for path in found:
-        who = identity_in(path)
-        may = RIGHTS[who.role].words
-        rows.append((path.name, who.role, ", ".join(who.hosts), may, time_left(who)))
+        identity = identity_in(path)
+        may = RIGHTS[identity.role].words
+        hosts = ", ".join(identity.hosts)
+        rows.append((path.name, identity.role, hosts, may, time_left(identity)))
     columns = [*tables.names("folder"), *tables.labels("role")]
     columns += [*tables.words("reached by", "may"), *tables.labels("valid until")]
     tables.show(out, columns, rows)
 
 
-def _print_made(place: Path) -> None:
+def _print_certificate(place: Path) -> None:
     from bridge.security.identity import identity_in, time_left
 
-    who = identity_in(place)
-    names = f", reached by {', '.join(who.hosts)}" if who.hosts else ""
-    words = f"{place}: role {who.role}{names}, valid until {time_left(who)}"
-    out.print(words, soft_wrap=True, markup=False, highlight=False)
+    identity = identity_in(place)
+    names = f", reached by {', '.join(identity.hosts)}" if identity.hosts else ""
+    words = f"{place}: role {identity.role}{names}, valid until {time_left(identity)}"
+    say(words)
 
 
 direct_app = typer.Typer()
@@ -129,19 +127,19 @@ direct_app = typer.Typer()
     "`cosim run reactive --event frontal --policy orca --director tcp/127.0.0.1:7448`",
 )
 def direct(
-    listen: Annotated[str, typer.Option(help="Where runs find it.")] = DIRECTOR,
+    listen: Annotated[str, typer.Option(help="The endpoint for runs.")] = DIRECTOR,
     tls: Tls = "",
     insecure: Insecure = False,
 ) -> None:
     """Direct the event pedestrians of runs that were started with --director, until stopped.
 
-    It keeps nothing: stop it, kill it and start it again in the middle of an episode, and the
-    episode waits, goes on and comes to the same state hash. A run of other code is refused.
+    It is stateless. If it is killed and started again during an episode, the episode waits and
+    reaches the same state hash. A run with other source code is refused.
     """
     from bridge.session import open_session
     from scenarios.episodes.director import behaviours, direct_all
 
-    with open_session(listening("director", "--listen", listen, tls, insecure), warned) as session:
+    with open_session(listening("director", "--listen", listen, tls, insecure), notice) as session:
         direct_all(session)
         print(f"directing at {listen}, behaviours {behaviours()}; stop with Ctrl-C", flush=True)
         try:
@@ -157,14 +155,14 @@ PAUSE_S = 0.5
 
 Connect = Annotated[str, typer.Option(help="The endpoint that the run was given as --live.")]
 Env = Annotated[
-    str | None, typer.Option(help="Which episode, as RUN/EPISODE; needed when several run.")
+    str | None, typer.Option(help="The episode as RUN/EPISODE; required if several run.")
 ]
 Wait = Annotated[
     float,
     typer.Option(
         min=0.0,
         max=1e6,
-        help="Seconds to wait until it is on the air; by default it must be by now.",
+        help="Seconds to wait until the episode is live; default: no wait.",
     ),
 ]
 
@@ -197,11 +195,13 @@ def inject(
     from bridge.live import send_injection as send
 
     payload = _payload(message)
-    session, below = _found(connecting("injector", "--connect", connect, tls, insecure), env, wait)
+    session, below = _live_episode(
+        connecting("injector", "--connect", connect, tls, insecure), env, wait
+    )
     with session:
         ack = send(session, f"{below}/inject", payload)
     if ack.status == "refused":
-        err.print(f"refused: {ack.reason}", soft_wrap=True, markup=False, highlight=False)
+        notice(f"refused: {ack.reason}")
         raise typer.Exit(WRONG_USE)
     where = "" if ack.x_m is None else f", at [{ack.x_m:.1f}, {ack.y_m:.1f}]"
     out.print(
@@ -228,25 +228,26 @@ def listen(
         float | None, typer.Option(min=0.0, max=1e6, help="How long; by default until stopped.")
     ] = None,
 ) -> None:
-    """Print what a running episode tells: a line of JSON each time. For `events` what happened
-    before comes first."""
+    """Print messages of a running episode, a line of JSON each. `events` begins with past ones."""
     topics = ("clock", "robot", "crowd", "signals", "events")
     if topic not in topics:
         raise unknown("topic", topic, topics)
-    session, below = _found(connecting("viewer", "--connect", connect, tls, insecure), env, wait)
+    session, below = _live_episode(
+        connecting("viewer", "--connect", connect, tls, insecure), env, wait
+    )
     with session:
         if topic == "events":
             try:
                 print(session.ask(f"{below}/log", b"", timeout_s=5.0).decode(), flush=True)
             except TimeoutError as error:
                 raise EngineError(f"{error}: the episode has ended, or is too busy") from error
-        heard: SimpleQueue[bytes] = SimpleQueue()
-        session.listen(f"{below}/{topic}", lambda _, payload: heard.put(payload))
+        received: SimpleQueue[bytes] = SimpleQueue()
+        session.listen(f"{below}/{topic}", lambda _, payload: received.put(payload))
         ends_at = time.monotonic() + (seconds if seconds is not None else 1e9)
         try:
             while (left_s := ends_at - time.monotonic()) > 0.0:
                 with suppress(Empty):
-                    print(heard.get(timeout=left_s).decode(), flush=True)
+                    print(received.get(timeout=left_s).decode(), flush=True)
         except KeyboardInterrupt:
             raise typer.Exit(INTERRUPTED) from None
 
@@ -262,53 +263,57 @@ def _payload(message: str) -> bytes:
     return message.encode()
 
 
-def _found(connection: Connection, env: str | None, wait_s: float) -> tuple[Session, str]:
-    """A session, to be closed, and what the keys of the episode that is meant begin with.
+def _live_episode(connection: Connection, env: str | None, wait_s: float) -> tuple[Session, str]:
+    """Return an open session, and the key prefix of the requested episode.
 
-    Looks for it until `wait_s` seconds are over, and says so. Raises EngineError when nothing is on
-    the air then, UsageError when only others are, or when several are and none is named.
+    Searches for `wait_s` seconds. Raises EngineError if no episode is live then, UsageError if only
+    others are, or if several are and `env` is None.
     """
-    meant = _meant(connection, env, warned)
+    found = _live_episode_now(connection, env, notice)
     connect = connection.connect
-    if isinstance(meant, tuple):
-        return meant
+    if isinstance(found, tuple):
+        return found
     began = time.monotonic()
     with (
         doing(f"waiting up to {wait_s:g} s for {env or 'an episode'} at {connect}")
         if wait_s
         else nullcontext()
     ):
-        while isinstance(meant, CosimError):
+        while isinstance(found, CosimError):
             left_s = began + wait_s - time.monotonic()
             if left_s <= 0.0:
                 remedy = f"waited {wait_s:g} s" if wait_s else "--wait 60 waits until it is there"
-                raise type(meant)(f"{meant} ({remedy})")
+                raise type(found)(f"{found} ({remedy})")
             time.sleep(min(PAUSE_S, left_s))
-            meant = _meant(connection, env)
+            found = _live_episode_now(connection, env)
     err.print(
-        f"{_name(meant[1])} is on the air after {time.monotonic() - began:.0f} s.", highlight=False
+        f"{_episode_name(found[1])} is on the air after {time.monotonic() - began:.0f} s.",
+        highlight=False,
     )
-    return meant
+    return found
 
 
-def _meant(
-    connection: Connection, env: str | None, say: Callable[[str], None] = lambda _: None
+def _live_episode_now(
+    connection: Connection, env: str | None, warn: Callable[[str], None] = lambda _: None
 ) -> tuple[Session, str] | CosimError:
-    """An open session and the episode, or why there is none yet. Raises UsageError where waiting
-    changes nothing."""
+    """Return a session and the key prefix of the episode, or the error while there is none.
+
+    Raises UsageError if waiting cannot help.
+    """
     from bridge import keys
     from bridge.session import open_session
 
     connect = connection.connect
     try:
-        session = open_session(connection, say)
+        session = open_session(connection, warn)
     except EngineError:
         return EngineError(
             f"no run is on the air at {connect}: start one with `cosim run ... --live {connect}`"
         )
     statuses = session.answers(keys.EVERY_STATUS, timeout_s=SEARCH_S)
     names = {
-        _name(below): below for below in sorted(key.removesuffix("/status") for key in statuses)
+        _episode_name(below): below
+        for below in sorted(key.removesuffix("/status") for key in statuses)
     }
     if env in names or (env is None and len(names) == 1):
         return session, names[env or next(iter(names))]
@@ -323,8 +328,8 @@ def _meant(
     )
 
 
-def _name(below: str) -> str:
-    """RUN/EPISODE, by what its keys begin with."""
+def _episode_name(below: str) -> str:
+    """Return RUN/EPISODE of a key prefix."""
     return "/".join(below.split("/")[1::2])
 
 
@@ -342,30 +347,29 @@ serve_app = typer.Typer()
 def serve_command(
     policy: Annotated[str, typer.Argument(help="Your own, as my.py:Class, or a baseline.")],
     name: Annotated[
-        str, typer.Option(help="What runs ask for, as --policy zenoh:NAME; else the manifest's.")
+        str, typer.Option(help="Its name in --policy zenoh:NAME; default: the manifest's.")
     ] = "",
     listen: Annotated[
-        str, typer.Option(metavar="ENDPOINT", help="Where runs find it.")
+        str, typer.Option(metavar="ENDPOINT", help="The endpoint for runs.")
     ] = POLICIES_AT,
     connect: Annotated[
         str,
         typer.Option(
             metavar="ENDPOINT",
-            help="Instead: where another one listens, beside which runs find it.",
+            help="Instead: the endpoint of another server, next to which runs find it.",
         ),
     ] = "",
     jpeg: Annotated[
-        bool, typer.Option("--jpeg", help="Have pictures sent as JPEG; every row says so.")
+        bool, typer.Option("--jpeg", help="Get pictures as JPEG, which is recorded in every row.")
     ] = False,
     tls: Tls = "",
     insecure: Insecure = False,
 ) -> None:
-    """Answer for a policy in runs of other processes, until stopped.
+    """Serve a policy to runs in other processes, until stopped.
 
-    A policy with act_batch is asked for all episodes that wait, together; any other has an object
-    for each episode under way. Several servers of one name share the episodes; one that is killed
-    loses its own, which are run again. Where cosim cannot be installed, copy
-    bridge/policy_server.py and call its `serve`.
+    A policy with act_batch is queried for all waiting episodes together; any other gets an object
+    per episode. Several servers of one name share the episodes; those of a killed server are run
+    again. Where cosim cannot be installed, copy bridge/policy_server.py and call its `serve`.
     """
     from bridge import keys
     from bridge.policy_server import serve
@@ -390,7 +394,7 @@ def serve_command(
         connection = connecting("policy", "--connect", connect, tls, insecure)
     else:
         connection = listening("policy", "--listen", listen, tls, insecure)
-    with open_session(connection, warned) as session:
+    with open_session(connection, notice) as session:
         serve(
             first.policy if first.batches else another,
             name=keys.name(name) if name else keys.chunk(first.manifest.name),

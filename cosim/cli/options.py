@@ -25,8 +25,10 @@ NO_OPENGL = "No OpenGL here: the bullet camera draws the pictures (`cosim doctor
 
 
 def camera_here(choice: CameraChoice) -> Literal["gl", "bullet", "bullet-egl"]:
-    """The camera that a choice comes to on this machine; says so where auto is not gl. Raises
-    EngineError."""
+    """Return the camera of a choice on this machine, with a notice where `auto` is not `gl`.
+
+    Raises EngineError.
+    """
     from physics.cameras.choice import camera_of_choice
 
     name = camera_of_choice(choice)
@@ -35,31 +37,43 @@ def camera_here(choice: CameraChoice) -> Literal["gl", "bullet", "bullet-egl"]:
     return name
 
 
-def size_called(option: str, words: str) -> tuple[int, int]:
-    """Width and height of "160x90". Raises UsageError."""
+def size_called(option: str, words: str, span: tuple[int, int] = (1, 9999)) -> tuple[int, int]:
+    """Return (width, height) of a text such as "160x90".
+
+    option: its name, for the error message.
+    span: least and largest width and height, pixels.
+    Raises UsageError.
+    """
     found = re.fullmatch(r"([1-9][0-9]{0,3})x([1-9][0-9]{0,3})", words, re.ASCII)
-    if found is None:
-        raise UsageError(f"{option} {words}: give width x height in pixels, such as 160x90")
-    return int(found[1]), int(found[2])
+    size = (int(found[1]), int(found[2])) if found else (0, 0)
+    least, most = span
+    if not all(least <= side <= most for side in size):
+        raise UsageError(
+            f"{option} {words}: give width x height in pixels, such as 160x90, each from {least} "
+            f"to {most}"
+        )
+    return size
 
 
 DEFAULT = "tcp/127.0.0.1:7447"
 DIRECTOR = "tcp/127.0.0.1:7448"
 POLICIES_AT = "tcp/127.0.0.1:7449"
 EVERY_ADDRESS = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
-"""What stands for all addresses of a machine, and by what it reaches itself."""
+"""Wildcard addresses, and the loopback address by which a machine reaches itself."""
 
 Tls = Annotated[str, typer.Option("--tls", metavar="FOLDER", help=help_of("tls"))]
 Insecure = Annotated[bool, typer.Option("--insecure", help=help_of("insecure"))]
 
 
 def reached_by(hub: Connection, role: Role) -> str:
-    """The options by which a command in this role reaches a hub from this machine, each after a
-    space."""
+    """Return the options with which a command in a role connects to a hub from this machine.
+
+    Returns: the options with a leading space.
+    """
     protocol, _, address = hub.listen.partition("/")
     host, _, port = address.rpartition(":")
     if host in EVERY_ADDRESS:
-        address = f"{_certified(hub.tls) if hub.tls else EVERY_ADDRESS[host]}:{port}"
+        address = f"{_certified_host(hub.tls) if hub.tls else EVERY_ADDRESS[host]}:{port}"
     options = ["--connect", f"{protocol}/{address}"]
     if hub.tls:
         options += ["--tls", str(Path(hub.tls).parent / role)]
@@ -68,21 +82,15 @@ def reached_by(hub: Connection, role: Role) -> str:
     return " " + shlex.join(options)
 
 
-def _certified(folder: str) -> str:
-    """The first name in the certificate of a hub, by which others must reach it."""
+def _certified_host(folder: str) -> str:
+    """Return the first host name in a hub's certificate, which clients must connect to."""
     from bridge.security.identity import identity_in
 
     return identity_in(Path(folder)).hosts[0]
 
 
-def warned(line: str) -> None:
-    """Print what is insecure, or ends soon, on standard error."""
-    err.print(line, soft_wrap=True, markup=False, highlight=False)
-
-
 def with_paths_checked(command: Any) -> Any:
-    """The same command of Typer's, and those below it; each raises UsageError first where a path it
-    is given is too long."""
+    """Make a Typer command and its subcommands raise UsageError for a path that is too long."""
     if command.callback is not None:
         command.callback = _checked(command.callback)
     for below in getattr(command, "commands", {}).values():
@@ -92,18 +100,18 @@ def with_paths_checked(command: Any) -> Any:
 
 def _checked(does: Callable[..., Any]) -> Callable[..., Any]:
     @wraps(does)
-    def checks_first(**given: Any) -> Any:
+    def checked(**given: Any) -> Any:
         for value in given.values():
             for one in value if isinstance(value, list | tuple) else (value,):
                 if isinstance(one, Path):
                     _check(one)
         return does(**given)
 
-    return checks_first
+    return checked
 
 
 def _check(path: Path) -> None:
-    """Raises UsageError where a name in a path, or all of it, is too long."""
+    """Raise UsageError if a path, or a name in it, is too long."""
     try:
         os.lstat(path)
     except OSError as error:
@@ -115,14 +123,15 @@ PICTURES = (".png", ".jpg", ".jpeg")
 
 
 def replaced(path: Path | None) -> str:
-    """Asked before a file is written, what is said of it afterwards: that it took another's place,
-    or nothing."""
+    """Return the remark for a file that is about to be replaced, or "". Call before writing."""
     return ", in place of the one that was there" if path is not None and path.exists() else ""
 
 
 def check_output(path: Path, what: str = "a picture", endings: tuple[str, ...] = PICTURES) -> None:
-    """Before it is made: raises UsageError when no such file can have this name, MachineError
-    without its folder."""
+    """Check the name and folder of an output file before it is computed.
+
+    Raises UsageError for a wrong ending, MachineError for a missing folder.
+    """
     if path.suffix.lower() not in endings:
         raise UsageError(
             f"{path}: cannot be written as {what}; use a name that ends in "
@@ -145,8 +154,10 @@ RERUN_HELP = help_of("rerun")
 
 
 def check_rerun(path: Path | None, episodes: int) -> None:
-    """Before anything runs, where a recording is asked for: raises UsageError for a name that is
-    none, or several episodes, MachineError without the package."""
+    """Check before a run that a requested recording can be written.
+
+    Raises UsageError for a wrong name or several episodes, MachineError without rerun-sdk.
+    """
     if path is None:
         return
     check_output(path, "a Rerun recording", (".rrd",))
@@ -163,7 +174,7 @@ def check_rerun(path: Path | None, episodes: int) -> None:
 
 
 def write_rerun(folder: Path, episodes: list[str], path: Path | None) -> None:
-    """Write the recording of the one episode of a run, where it is asked for, and say so."""
+    """Write the recording of the only episode of a run to `path`, if given, and print its path."""
     check_rerun(path, len(episodes))
     if path is None:
         return

@@ -1,4 +1,4 @@
-"""The commands `cosim look`, `cosim film` and `cosim export`."""
+"""The commands `cosim look`, `film`, `export`, `replay` and `counterfactual`."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from cosim.cli import tables
 from cosim.cli.console import out
-from cosim.cli.options import LOOK, Camera, camera_here, check_output, replaced
+from cosim.cli.options import LOOK, Camera, camera_here, check_output, replaced, size_called
 from cosim.cli.progress import doing
 from cosim.core.errors import MachineError, UsageError, listed, unknown
 from cosim.spec.run_config import help_of
@@ -34,8 +35,7 @@ def export(
         ),
     ] = None,
 ) -> None:
-    """Write the street along a scenario's route as glTF: ground, buildings, trees, furniture,
-    signals, barriers."""
+    """Export the street along a scenario's route as glTF, with buildings, trees and furniture."""
     check_output(output, "glTF", (".glb",))
     from cosim.spec.selection import scenarios_chosen
     from scenarios.suites.catalog import holding, load_suite
@@ -50,23 +50,13 @@ def export(
 
 
 def view_of(name: str) -> Viewpoint:
-    """The view called so. Raises UsageError with the valid names."""
+    """Return the view with a name. Raises UsageError with the valid names."""
     from scenarios.tools.viewing.look import VIEWS
 
     for view in VIEWS:
         if view == name:
             return view
     raise unknown("view", name, VIEWS)
-
-
-def size_of(text: str) -> tuple[int, int]:
-    """Width and height in "1280x720". Raises UsageError."""
-    parts = text.lower().split("x")
-    if len(parts) != 2 or not all(part.isdecimal() and 16 <= int(part) <= 4096 for part in parts):
-        raise UsageError(
-            f"--size '{text}': give width x height in pixels, each from 16 to 4096, like 1280x720"
-        )
-    return int(parts[0]), int(parts[1])
 
 
 film_app = typer.Typer()
@@ -114,8 +104,7 @@ def film(
     speed: Annotated[int, typer.Option(min=1, max=32, help="Times real time.")] = 1,
     camera: Camera = "auto",
 ) -> None:
-    """Film an episode of a run: from behind the robot or above it, with what it sees, the map,
-    events and failures."""
+    """Film an episode of a run from behind or above, with camera picture, map and failures."""
     from scenarios.tools.viewing.film import Cut, failure_to_film, make_film
 
     picked = view_of(view)
@@ -136,7 +125,14 @@ def film(
     from_s, until_s = from_s if start is None else start, until_s if end is None else end
     instead = replaced(output)
     with doing("choosing the camera") as progress:
-        cut = Cut(from_s, until_s, size_of(size), speed, camera_here(camera), picked)
+        cut = Cut(
+            from_s,
+            until_s,
+            size_called("--size", size, (16, 4096)),
+            speed,
+            camera_here(camera),
+            picked,
+        )
         to_s = make_film(folder, episode, output, cut, progress)
     same = (
         "the state hash is the record's"
@@ -185,7 +181,7 @@ def look(
             help="Where the scenario is: a suite or a suite's .json file; by default looked up."
         ),
     ] = None,
-    policy: Annotated[str, typer.Option(help="Who drives until then.")] = "route",
+    policy: Annotated[str, typer.Option(help="The policy that drives until then.")] = "route",
     robot: Annotated[str, typer.Option(help=help_of("robot"))] = "",
     residents: Annotated[int | None, typer.Option(min=0, help=help_of("residents"))] = None,
     groups: Annotated[float | None, typer.Option(help=help_of("groups"))] = None,
@@ -196,22 +192,22 @@ def look(
     ] = Path("look.png"),
     camera: Camera = "auto",
 ) -> None:
-    """Look at a scenario: one picture of what the robot sees, or of the robot in its street."""
+    """Draw one picture of a scenario: by the robot's camera, from behind or from above."""
     from scenarios.suites.catalog import one_scenario, with_crowd, with_robot
     from scenarios.tools.viewing.look import look_at
 
     picked = view_of(view)
-    pixels = size_of(size)
+    pixels = size_called("--size", size, (16, 4096))
     check_output(output)
     found, of = one_scenario(scenario, suite, which)
-    asked = with_crowd(
+    changed = with_crowd(
         with_robot(found, robot),
         residents=residents,
         groups=groups,
         elderly=elderly,
         children=children,
     )
-    (one,) = asked.scenarios
+    (one,) = changed.scenarios
     more = "" if which or of == 1 else f"; 1 of {of} scenarios: --scenario chooses another"
     with doing("choosing the camera") as progress:
         image, time_s = look_at(one, policy, at, picked, pixels, camera_here(camera), progress)
@@ -225,7 +221,7 @@ def look(
 
 
 def _save(image: object, path: Path) -> None:
-    """Write a picture. Raises MachineError when it cannot be written there."""
+    """Write a picture. Raises UsageError for its format, MachineError if it cannot be written."""
     import cv2
     import numpy as np
 
@@ -237,3 +233,55 @@ def _save(image: object, path: Path) -> None:
         ) from error
     if not written:
         raise MachineError(f"{path}: the picture cannot be written there")
+
+
+counterfactual_app = typer.Typer()
+
+
+@counterfactual_app.command(
+    "counterfactual",
+    rich_help_panel=LOOK,
+    epilog="Example:  \n`cosim counterfactual runs/mine lh-011-00`",
+)
+def compare_one(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+    episode: Annotated[str, typer.Argument(help="One of its episodes.")],
+) -> None:
+    """Simulate an episode's street again without the robot, and print the delays it caused."""
+    from cosim.results.delay import DELAY_NEAR_M
+    from scenarios.episodes.replay import check, compared, recorded
+
+    with doing(f"reading {episode}") as progress:
+        record = recorded(folder, episode)
+        state_hash, found = compared(record, progress)
+    check(folder, record, state_hash)
+    rows = []
+    for name, delay in (("people", found.people), ("vehicles", found.vehicles)):
+        near = (f"{delay.near_s:+.1f}", str(delay.near))
+        everyone = (f"{delay.delay_s:+.1f}", str(delay.compared))
+        rows.append((name, *near, *everyone, str(delay.unmatched)))
+    heads = ("delay of\nthose near, s", "those\nnear", "delay of\nall, s", "all", "not\ncomparable")
+    tables.show(out, [*tables.names(episode), *tables.figures(*heads)], rows)
+    out.print(
+        f"delay: how much later than without the robot, summed; near: came within "
+        f"{DELAY_NEAR_M:g} m of it; far from "
+        "it the two streets differ by chance; not comparable: not the same in both"
+    )
+
+
+replay_app = typer.Typer()
+
+
+@replay_app.command(rich_help_panel=LOOK, epilog="Example:  \n`cosim replay runs/mine lh-011-00`")
+def replay(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+    episode: Annotated[str, typer.Argument(help="One of its episodes.")],
+) -> None:
+    """Run a finished episode again from its record, and compare the state hash."""
+    from scenarios.episodes.replay import check, recorded, replayed
+
+    with doing(f"reading {episode}") as progress:
+        record = recorded(folder, episode)
+        again = replayed(record, progress=progress)
+    check(folder, record, again)
+    out.print(f"{episode}: state hash {again}, as recorded", highlight=False)

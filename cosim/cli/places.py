@@ -19,7 +19,7 @@ from rich.progress import (
 )
 
 from cosim.cli import tables
-from cosim.cli.console import err, out
+from cosim.cli.console import err, out, say
 from cosim.cli.options import replaced
 from cosim.cli.progress import doing
 from cosim.core.bounding_box import box_of, refuse_outside
@@ -63,12 +63,12 @@ _FIGURES: tuple[tuple[str, Callable[[Survey], float], str], ...] = (
     ("far km", lambda s: s.census.longest_m / 1000.0, ".2f"),
     ("one %", lambda s: 100.0 * s.census.one_piece, ".1f"),
 )
-"""Columns of the table: head, value, format."""
+"""Columns of the table of cities: head, value, format."""
 
 MEANING = (
     "straight, curve, S: streets; T, X, Y, round: junctions; walk km, walk %: sidewalks, share of "
     "the city's area; cross, lit, mid, refuge: crossings, with signals, in mid-street, with an "
-    "island; drive: driveways; props: street furniture; side m: least width beside it on any "
+    "island; drive: driveways; props: street furniture; side m: least width next to it on any "
     "sidewalk; clear m: width that passes everywhere, furniture included (2 at most); far km: "
     "longest shortest walk; one %: of the walkable area in one piece"
 )
@@ -81,8 +81,7 @@ def make(
     size: _Size = 2000.0,
     style: _Style = "mixed",
 ) -> None:
-    """Make a city: a folder with its street net, and what it was made from. Equal to the byte when
-    made again."""
+    """Generate a city in a folder: street net, seed and versions, the same bytes each time."""
     from cosim.spec.scenario import City
     from sumo_nets.city.store import write_city
 
@@ -94,15 +93,12 @@ def make(
 
 @city_app.command(epilog="Example:  \n`cosim city table --count 10 --jobs 2`")
 def table(
-    count: Annotated[
-        int, typer.Option(min=1, max=100, help="How many of the shipped cities.")
-    ] = 100,
+    count: Annotated[int, typer.Option(min=1, max=100, help="Number of shipped cities.")] = 100,
     size: _Size = 2000.0,
     style: _Style = "mixed",
     jobs: Annotated[int, typer.Option(min=1, help="Processes, about 0.3 GiB each.")] = 1,
 ) -> None:
-    """Count what the shipped cities are made of, furniture included, and check them. Exit code 1:
-    one breaks a promise."""
+    """Print and check the parts of the shipped cities. Exit code 1: a city has a fault."""
     from scenarios.tools.bench.places import surveys
     from sumo_nets.city.store import shipped_cities
 
@@ -150,7 +146,7 @@ def draw_city(
 
 
 def print_cities(found: Sequence[Survey]) -> None:
-    """A row per city, the spans of all, widths of the zones, and whatever is wrong."""
+    """Print a row per city, ranges over all cities, widths of zones, and faults."""
     rows: list[tables.Row] = [
         (str(one.seed), *(format(value(one), form) for _, value, form in _FIGURES)) for one in found
     ]
@@ -177,7 +173,7 @@ def print_cities(found: Sequence[Survey]) -> None:
     out.print(MEANING)
     faulty = [(one.seed, fault) for one in found for fault in one.faults]
     for seed, fault in faulty:
-        out.print(f"city {seed}: {fault}", soft_wrap=True, markup=False, highlight=False)
+        say(f"city {seed}: {fault}")
     signals = sum(one.census.signals for one in found)
     out.print(
         f"{len(found)} cities, {signals} traffic lights checked, {len(faulty)} faults",
@@ -186,7 +182,7 @@ def print_cities(found: Sequence[Survey]) -> None:
     narrowest = min(one.side_m for one in found)
     tightest = min(one.census.clear_m for one in found)
     out.print(
-        f"least width beside furniture on any sidewalk {narrowest:.2f} m, passing everywhere "
+        f"least width next to furniture on any sidewalk {narrowest:.2f} m, passing everywhere "
         f"{tightest:.2f} m; "
         f"memory of a process {max(one.memory_mib for one in found):.0f} MiB at most",
         soft_wrap=True,
@@ -205,7 +201,7 @@ def _bar() -> Progress:
 
 
 def _picture(street_map: StreetMap, part: tuple[float, float, float, float]) -> Image:
-    """A part of a map from above, (H, W, 3) uint8 RGB."""
+    """Return a part of a map from above, (H, W, 3) uint8 RGB."""
     import shapely
 
     from cosim.report.above import Sheet, draw_streets
@@ -253,7 +249,7 @@ def import_(
         bool,
         typer.Option(
             "--as-is",
-            help="Leave a SUMO net unchanged: add no sidewalks and crossings, mend nothing.",
+            help="Leave a SUMO net unchanged: add no sidewalks and crossings, repair nothing.",
         ),
     ] = False,
     sidewalk_width: Annotated[
@@ -264,7 +260,7 @@ def import_(
         ),
     ] = None,
 ) -> None:
-    """Import a map: convert it, mend what can be mended, check it, keep it under a name."""
+    """Import a map: convert, repair and check it, and store it under a name."""
     from sumo_nets.maps.importer import Options
     from sumo_nets.maps.map_store import checked_map, import_map
 
@@ -300,10 +296,9 @@ def report_map_check(
     zoom: Annotated[
         str | None, typer.Option(help="Part of it for the picture: x0,y0,x1,y1 in metres.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Everything found, as JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the check as JSON.")] = False,
 ) -> None:
-    """Say what a map is, what is wrong with it and what it can be used for. Exit code 1: it is not
-    usable."""
+    """Print a map's description, defects and uses. Exit code 2: it is not usable."""
     part = None if zoom is None else box_of("--zoom", zoom)
     if part is not None and picture is None:
         raise UsageError("--zoom is for the picture: say where to write it with -o")
@@ -349,8 +344,7 @@ def endure_map(
     minutes: Annotated[float, typer.Option(min=0.1, help="Simulated minutes on each.")] = 10.0,
     seed: Annotated[int, typer.Option(min=0, help="Of crowd, traffic and wanderings.")] = 0,
 ) -> None:
-    """Simulate crowd and traffic around a robot that goes anywhere, a process for each map. Exit
-    code 1: SUMO died."""
+    """Simulate crowd and traffic around a robot that drives anywhere. Exit code 1: SUMO died."""
     from cosim.core.clock import Clock
     from scenarios.tools.bench.places import endure as endured_on
     from sumo_nets.maps.place_names import place_called
@@ -390,7 +384,7 @@ def list_() -> None:
 
 
 def print_check(check: MapCheck, about: About | None, capacity: Capacity | None) -> None:
-    """Print a check in words, and how many places each kind of scenario has."""
+    """Print the check of a map, and the number of places for each kind of scenario."""
     from sumo_nets.maps.map_store import outdated
 
     width_m, height_m = check.size_m
@@ -403,19 +397,19 @@ def print_check(check: MapCheck, about: About | None, capacity: Capacity | None)
             *tables.words("places where they fit, of those on the largest island"),
         ]
         tables.show(out, columns, [(name, str(count)) for name, count in _by_name(capacity)])
-    said = [("warning", warning) for warning in check.warnings] + [
+    remarks = [("warning", warning) for warning in check.warnings] + [
         ("note", note) for note in check.notes
     ]
     if about is not None:
-        said += [("note", _OUTDATED)] if outdated(about) else []
-        said += [("changed", change) for change in about.changes]
-        said += [
+        remarks += [("note", _OUTDATED)] if outdated(about) else []
+        remarks += [("changed", change) for change in about.changes]
+        remarks += [
             ("licence", licence)
             for licence in about.licences or ("none found: ask where the file comes from",)
         ]
-    said += [("NOT USABLE", reason) for reason in _refusals(check, capacity)]
-    for head, words in said:
-        out.print(f"{head}: {words}", soft_wrap=True, markup=False, highlight=False)
+    remarks += [("NOT USABLE", reason) for reason in _refusals(check, capacity)]
+    for head, words in remarks:
+        say(f"{head}: {words}")
 
 
 def _rows(check: MapCheck) -> list[tuple[str, str]]:
@@ -457,8 +451,7 @@ def _rows(check: MapCheck) -> list[tuple[str, str]]:
 
 
 def _look_up(called: str) -> tuple[StreetMap, MapCheck, About | None]:
-    """What is known of a place by whatever it is called; a net that was not imported is checked as
-    it is."""
+    """Return map, check and source of a place by its name, folder or net file."""
     from cosim.place.map_check import check_map
     from cosim.spec.scenario import CityMap
     from sumo_nets.city.store import city_net
@@ -483,7 +476,7 @@ def _look_up(called: str) -> tuple[StreetMap, MapCheck, About | None]:
 
 
 def _capacity(street_map: StreetMap, check: MapCheck) -> Capacity | None:
-    """What fits on a map; None where nothing can."""
+    """Return the scenarios that fit on a map; None for an unusable map."""
     from cosim.place.walk_graph import walk_graph_of
     from scenarios.suites.capacity import capacity_of
 
@@ -499,7 +492,7 @@ def _by_name(capacity: Capacity) -> list[tuple[str, FitCount]]:
 
 
 def _refusals(check: MapCheck, capacity: Capacity | None) -> list[str]:
-    """Why a map cannot be used; nothing where it can."""
+    """Return the reasons why a map cannot be used; none for a usable map."""
     if capacity is None or capacity.usable:
         return list(check.reasons)
     return [

@@ -1,4 +1,4 @@
-"""`cosim policy check`: what users of a policy get wrong and never notice."""
+"""The command `cosim policy check`, which finds mistakes in adapted policies."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from cosim.spec.run_config import ends_of_run
 if TYPE_CHECKING:
     from scenarios.tools.policy_check.checks import CheckedPolicy
 
-policy_app = typer.Typer(no_args_is_help=True, help="Policies: are they what they are taken for?")
+policy_app = typer.Typer(no_args_is_help=True, help="Checks of policies.")
 _NAME_HELP = "As --policy of `cosim run` has it: a name, my.py:Class, onnx:FOLDER, zenoh:NAME."
-_GOAL_HELP = "What it is told of where to go (`cosim list`), in place of what its manifest says."
-_FRAMES_HELP = "Observations of each drive: more than the history of the policy is long."
-_OWN_CAMERA_HELP = "It may see by a camera that the robot does not have."
+_GOAL_HELP = "Goal protocol (`cosim list`), in place of its manifest's."
+_FRAMES_HELP = "Observations of each drive; more than the policy's history has."
+_OWN_CAMERA_HELP = "Allow a camera that the robot does not have."
 _POLICY_AT_HELP = "Where `cosim serve` listens, for zenoh:NAME; may be repeated."
 _COLOURS = {"passed": "green", "warning": "yellow", "failed": "red", "does not apply": "dim"}
 
 
 @policy_app.callback()
 def policies() -> None:
-    """A group of commands, also while there is one of them."""
+    """Make typer treat `policy` as a group although it has only one command."""
 
 
 @policy_app.command(
@@ -47,9 +47,7 @@ def check_policy(
     frames: Annotated[int, typer.Option(min=2, max=256, help=_FRAMES_HELP)] = 16,
     picture: Annotated[
         Path | None,
-        typer.Option(
-            "-o", "--output", help="Write what it answers, drawn into what it sees: a PNG."
-        ),
+        typer.Option("-o", "--output", help="Write its answers, drawn into its pictures: a PNG."),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="What came out, as JSON.")] = False,
     camera: Camera = "auto",
@@ -60,11 +58,10 @@ def check_policy(
     tls: Tls = "",
     insecure: Insecure = False,
 ) -> None:
-    """Ask a policy about streets, mirrored streets, wrong colours, old pictures, other goals: does
-    it answer as it should?
+    """Check a policy's answers to streets, mirrored streets, wrong colours and other goals.
 
-    Nothing is simulated. A check can fail, doubt (what may be right, with the reason) or not apply;
-    passing proves no more than what it asks. Exit code 1: one has failed.
+    Nothing is simulated. A check can pass, fail, doubt (the answer may be right, with the reason)
+    or not apply. Exit code 1: a check has failed.
     """
     from secrets import token_hex
 
@@ -97,7 +94,7 @@ def check_policy(
     finally:
         driver.close()
     if as_json:
-        told = {
+        report = {
             "policy": manifest.name,
             "version": manifest.version,
             "source": driver.source_hash,
@@ -106,7 +103,7 @@ def check_policy(
             "answer_ms": found.answer_ms,
             "checks": {check: one._asdict() for check, one in found.outcomes.items()},
         }
-        typer.echo(msgspec.json.format(msgspec.json.encode(told), indent=2).decode())
+        typer.echo(msgspec.json.format(msgspec.json.encode(report), indent=2).decode())
     else:
         _print(found)
         out.print(

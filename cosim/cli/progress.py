@@ -1,5 +1,4 @@
-"""Show the progress of a task: a moving line in a terminal, a plain line for each stage
-elsewhere."""
+"""Show the progress of a task: a live line in a terminal, else a plain line per stage."""
 
 from __future__ import annotations
 
@@ -16,12 +15,12 @@ from cosim.core.progress import Progress, time_left_s
 from cosim.core.units import duration
 
 AGAIN_S = 30.0
-"""Without a terminal a stage whose share is known gets a further line each time this is over."""
+"""Seconds between the lines of a long stage whose share is known, without a terminal."""
 
 
 @contextmanager
 def doing(first: str, console: Console = err) -> Iterator[Progress]:
-    """Show on standard error what is being done until the block ends. It reports its next stages.
+    """Show a stage on standard error until the block ends, and yield a callback for later stages.
 
     >>> with doing("reading the city") as progress:
     ...     progress("simulating to 20 s", 0.5)
@@ -52,8 +51,7 @@ def doing(first: str, console: Console = err) -> Iterator[Progress]:
 
 
 def stages_in_lines(console: Console = err, first: str = "") -> Progress:
-    """Return a callback that prints a line when a stage begins, and further ones if it takes
-    long."""
+    """Return a callback that prints a line when a stage begins, and more if it takes long."""
     shown = ""
     began = 0.0
     last = 0.0
@@ -77,8 +75,11 @@ def stages_in_lines(console: Console = err, first: str = "") -> Progress:
 
 
 def stage_in_words(stage: str, share: float | None, since_s: float) -> str:
-    """Return a stage with the share that is done and the time that is left, judged by its first
-    `since_s` seconds."""
+    """Return the text of a stage with its share done and time left.
+
+    share: of the stage that is done, 0 to 1; None if unknown.
+    since_s: seconds since the stage began, from which the time left is estimated.
+    """
     if share is None:
         return stage
     words = f"{stage}: {100.0 * share:.0f} %"

@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from cosim.cli import tables
-from cosim.cli.console import err, out
+from cosim.cli.console import err, notice, out, say
 from cosim.cli.options import (
     LOOK,
     MANY,
@@ -50,11 +50,10 @@ def compare(
     ],
     outputs: Annotated[list[Path] | None, typer.Option("-o", "--output", help=_OUTPUT_HELP)] = None,
 ) -> None:
-    """Compare runs with the first one, paired by scenario: what differs, what is noise, which
-    scenarios flipped.
+    """Compare runs with the first one, paired by scenario.
 
-    Over the whole suite, and by event, structure and split; intervals of the difference by drawing
-    scenarios again.
+    Prints differences with bootstrap intervals over the suite, and by event, structure and split.
+    Lists the scenarios whose result flipped.
     """
     from cosim.report.compared import FORMATS
     from cosim.results.compare import compare_runs
@@ -65,38 +64,37 @@ def compare(
                 f"{path}: its name must end in .csv, {', '.join(FORMATS)}: so the format is chosen"
             )
     with doing(f"comparing {len(folders)} runs"):
-        told = compare_runs(folders)
+        comparison = compare_runs(folders)
     instead = {path: replaced(path) for path in outputs or ()}
     for path in outputs or ():
         if path.suffix == ".csv":
-            _write(path, told.differences.to_csv(index=False))
-            _write(path.with_suffix(".flipped.csv"), told.flipped.to_csv(index=False))
+            _write(path, comparison.differences.to_csv(index=False))
+            _write(path.with_suffix(".flipped.csv"), comparison.flipped.to_csv(index=False))
         else:
-            _write(path, FORMATS[path.suffix](told))
-    print_comparison(out, told)
-    for path, said in instead.items():
-        out.print(f"Written: {path}{said}", soft_wrap=True, markup=False, highlight=False)
+            _write(path, FORMATS[path.suffix](comparison))
+    print_comparison(out, comparison)
+    for path, remark in instead.items():
+        say(f"Written: {path}{remark}")
 
 
-def print_comparison(out: Console, told: RunComparison) -> None:
-    """What is compared, a table of each run's whole suite and one of its groups, and what flipped:
-    for 80 columns."""
+def print_comparison(out: Console, comparison: RunComparison) -> None:
+    """Print a comparison of runs: terms, tables by suite and group, and flipped scenarios."""
     from cosim.cli.run_table import print_terms
     from cosim.report.compared import flips_in_words, how_to_read, tables_of_comparison
 
-    for run in (told.before, *told.others):
+    for run in (comparison.before, *comparison.others):
         out.print(f"{run.label}: {run.path}", soft_wrap=True, markup=False, highlight=False)
         print_terms(out, run.table, run.path)
-    for other in told.others:
-        for table in tables_of_comparison(told, other):
+    for other in comparison.others:
+        for table in tables_of_comparison(comparison, other):
             out.print(table.title, soft_wrap=True, markup=False, highlight=False)
             *heads, last = table.heads
             columns = [*tables.names(*heads[: table.names]), *tables.figures(*heads[table.names :])]
             columns += tables.labels(last)
             tables.show(out, columns, table.rows)
-        for line in flips_in_words(told, other):
+        for line in flips_in_words(comparison, other):
             out.print(line, soft_wrap=not out.is_terminal, markup=False, highlight=False)
-    for note in (*told.notes, how_to_read(told)):
+    for note in (*comparison.notes, how_to_read(comparison)):
         out.print(note, soft_wrap=not out.is_terminal, markup=False, highlight=False)
 
 
@@ -123,25 +121,23 @@ def report(
         Path, typer.Option("-o", "--output", help="Where to write the page, an .html.")
     ] = Path("report.html"),
     failures: Annotated[
-        int, typer.Option(min=0, max=200, help="Show at most so many failures again.")
+        int, typer.Option(min=0, max=200, help="Replay at most so many failures.")
     ] = 48,
     within: Annotated[
         float,
         typer.Option(
             metavar="SECONDS",
             min=0.0,
-            help="Of an episode show its first failure, and others this soon: to come to later "
-            "ones takes long.",
+            help="Replay the first failure of an episode, and others within so many seconds.",
         ),
     ] = 150.0,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes that show them again.")] = 2,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes for the replays.")] = 2,
     camera: Camera = "auto",
 ) -> None:
-    """Write one HTML file about runs: tables beside the paper's, plots, maps of failures, failures
-    to play again.
+    """Write a report of runs as one HTML file: tables, plots, maps and replays of failures.
 
-    It opens from disk and asks nobody for anything. Failures are shown by running their episodes
-    again.
+    The file opens from disk and loads nothing from the network. The tables include the paper's.
+    Failures are drawn by running their episodes again.
     """
     check_output(output, "a page", (".html", ".htm"))
     from scenarios.tools.viewing.report import make_report
@@ -168,10 +164,9 @@ score_app = typer.Typer()
 
 @score_app.command(rich_help_panel=TRUST, epilog="Example:  \n`cosim score runs/mine`")
 def score(folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")]) -> None:
-    """Compute every metric of a run again from its trajectories; is it what the run recorded, to
-    the bit?
+    """Compute every metric of a run again from its trajectories, and compare it to the bit.
 
-    No engine is started. Exit code 1, and the first difference, where it is not.
+    No engine is started. A difference is printed, with exit code 1.
     """
     from cosim.results.metrics import METRICS
     from cosim.results.rescore import score_run
@@ -198,17 +193,14 @@ def score(folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run fold
         files = ("record.json", "results.sqlite", *["results.csv"] * scored.table)
         lines.append(f"equal to the bit to {', '.join(files)}")
     for line in lines:
-        out.print(line, soft_wrap=True, highlight=False, markup=False)
+        say(line)
     if scored.differences:
         first = scored.differences[0]
         episodes = {one.episode for one in scored.differences}
-        out.print(
+        say(
             f"different: episode {first.episode}, {first.metric} in {first.file}: recorded "
             f"{first.recorded}, computed {first.computed} (differences: {len(scored.differences)}, "
-            f"episodes: {len(episodes)})",
-            soft_wrap=True,
-            highlight=False,
-            markup=False,
+            f"episodes: {len(episodes)})"
         )
         raise typer.Exit(SOME_CRASHED)
 
@@ -230,7 +222,7 @@ def show(
         Path | None, typer.Option("-o", "--output", help="Where to write the episode's picture.")
     ] = None,
     events: Annotated[
-        bool, typer.Option("--events", help="What was measured of every event, from its tracks.")
+        bool, typer.Option("--events", help="Measured values of every event, from its tracks.")
     ] = False,
     rerun: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help=RERUN_HELP)] = None,
 ) -> None:
@@ -278,7 +270,7 @@ def show(
 
 
 def print_episode(out: Console, record: Record) -> None:
-    """One episode in words: how it ended, every failure, every event, every metric."""
+    """Print the result, failures, events and metrics of an episode."""
     from cosim.cli.run_table import value_in_words
     from cosim.core.clock import Clock
     from cosim.results.metrics import COUNTERFACTUAL, METRICS
@@ -332,8 +324,7 @@ def print_episode(out: Console, record: Record) -> None:
 
 
 def print_sheet(out: Console, sheet: pd.DataFrame) -> None:
-    """What was measured of each event of a run (`scenarios.tools.viewing.event_sheet`), and two
-    summaries by kind: for 80 columns."""
+    """Print the measured events of a run (`scenarios.tools.viewing.event_sheet`), and summaries."""
     from scenarios.tools.viewing.event_sheet import summary
 
     if sheet.empty:
@@ -363,11 +354,11 @@ def print_sheet(out: Console, sheet: pd.DataFrame) -> None:
         counts = [tuple(str(value) for value in row) for row in short.itertuples(index=False)]
         tables.show(out, [*tables.names(kind), *tables.figures(*others)], counts)
     out.print(
-        "trigger: from the robot to the event's place, when it began; error: off what is stated; "
-        "tick: what the robot drove in a tick, the most that the error may be; off: triggers "
-        "beyond that; speed: of the person while it walks, stated: of the scenario; left: of the "
-        "middle of the way; angle: of its walk to the robot's heading; least: distance between "
-        "the centres of person and robot"
+        "trigger: distance from the robot to the event's place when it began; error: difference "
+        "to the stated distance; tick: metres that the robot drove in a tick, the largest "
+        "expected error; off: triggers beyond it; speed: of the walking person; stated: by the "
+        "scenario; left: of the middle of the route; angle: between its walk and the robot's "
+        "heading; least: distance between the centres of person and robot"
     )
 
 
@@ -386,11 +377,10 @@ def merge(
     ],
     target: Annotated[Path, typer.Option("--out", help="The run folder to make.")],
 ) -> None:
-    """Make one run folder of the shards of a run: the table is that of a run in one piece, to the
-    byte.
+    """Merge the shards of a run into one run folder, with the same table to the byte.
 
-    Folders of different runs are refused, and so are different episodes of one scenario; equal ones
-    are taken once. Missing scenarios are named, exit code 1: `cosim run --resume` runs them.
+    Folders of different runs, and different results of one scenario, are refused. Missing
+    scenarios are named, with exit code 1; `cosim run --resume` runs them.
     """
     from cosim.cli.run_table import kinds_of, print_by_kind, print_table
     from cosim.results.merge import merge_runs
@@ -406,13 +396,10 @@ def merge(
             highlight=False,
         )
     if merged.missing:
-        err.print(
+        notice(
             f"{len(merged.missing)} scenarios are missing: {', '.join(merged.missing)}: give "
             f"the command of the run "
-            f"without --shard, with --seed {merged.spec.setup.seed} --out {target} --resume",
-            soft_wrap=True,
-            markup=False,
-            highlight=False,
+            f"without --shard, with --seed {merged.spec.setup.seed} --out {target} --resume"
         )
     if merged.missing or merged.table["ended"].isna().any():
         raise typer.Exit(SOME_CRASHED)

@@ -1,4 +1,4 @@
-"""`cosim run`: a suite with a policy."""
+"""The command `cosim run`."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ run_app = typer.Typer()
     "onnx:my_network --goal route_point`  \n`cosim run long-horizon --policy my.py:Mine --goal "
     "route_point`  \n`cosim run reactive --policy my.py:Mine --latency 200`, or `--latency "
     "measured`, or `--real-time`  \n`cosim run long-horizon --map sumo-fkk-in --seed 3 --episodes "
-    "5`  \n`cosim run reactive --director tcp/127.0.0.1:7448`, with `cosim direct` beside it  "
-    "\n`cosim run long-horizon --policy route --episodes 2 --counterfactual`  \n`cosim run "
-    "reactive --policy orca --scenario frontal-001 --rerun frontal.rrd`",
+    "5`  \n`cosim run reactive --director tcp/127.0.0.1:7448`, with `cosim direct` in another "
+    "terminal  \n`cosim run long-horizon --policy route --episodes 2 --counterfactual`  \n`cosim "
+    "run reactive --policy orca --scenario frontal-001 --rerun frontal.rrd`",
 )
 @configured
 def run_command(config: Annotated[RunConfig, Fields(panels=True)]) -> None:

@@ -1,4 +1,4 @@
-"""A run shown in a terminal: what is planned, how far it is, what came out."""
+"""Show a run in a terminal: its plan, progress and results."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from cosim.cli.console import err, logged, out
+from cosim.cli.console import err, logged, notice, out
 from cosim.cli.options import NO_OPENGL, check_rerun, reached_by, write_rerun
-from cosim.cli.run_progress import Board, EpisodeBars, notice
+from cosim.cli.run_progress import Board, EpisodeBars
 from cosim.cli.run_table import kinds_of, print_by_kind, print_next_commands, print_table
 from cosim.core.errors import INTERRUPTED, SOME_CRASHED
 from cosim.results.throughput import Figures, Going
@@ -30,26 +30,28 @@ if TYPE_CHECKING:
     from scenarios.runs.run import Carrier
     from scenarios.runs.transport import HeldRun
 
-_STEPS_IN = '{"id": "eve", "path": [{"ahead": 15, "left": 1}]}'
+_EXAMPLE_PEDESTRIAN = '{"id": "eve", "path": [{"ahead": 15, "left": 1}]}'
 
 
 def run_in_terminal(config: RunConfig, carrier: Carrier | None = None) -> None:
-    """Run what a config asks for, shown in this terminal, and exit with the code of what came out.
+    """Run a config in this terminal, and exit with the code of its results.
 
-    carrier: connects to workers elsewhere.
+    carrier: connection to workers on other machines; None for this machine.
     """
     terminal = Terminal(config, of_here=carrier is None and not config.on)
-    with _told_if_not_begun(config.out):
+    with _noticed_if_not_begun(config.out):
         from scenarios.runs.run import carry_out
 
         table = carry_out(config, reporter=terminal, carrier=carrier)
-    _tell_of_end(terminal, table)
+    _print_end(terminal, table)
 
 
 class Terminal(EpisodeBars):
-    """Shows in this terminal how a run goes.
+    """Reporter that shows a run in this terminal.
 
-    of_here: its episodes run in processes of this machine. Once it runs: plan, folder, figures.
+    of_here: whether its episodes run in processes of this machine.
+    plan, folder: set when the run opens.
+    figures: throughput, set when it ends.
     """
 
     plan: PlannedRun
@@ -62,8 +64,7 @@ class Terminal(EpisodeBars):
         self._counts: dict[str, int] = {}
 
     def planned(self, plan: PlannedRun) -> None:
-        """Check what the end of the run needs, and name the camera where it is not the usual
-        one."""
+        """Check that a requested recording is possible, and print if OpenGL is missing."""
         sees = plan.driver.manifest.camera is not None
         if sees and self._config.camera == "auto" and plan.options.camera == "bullet":
             err.print(NO_OPENGL)
@@ -71,7 +72,7 @@ class Terminal(EpisodeBars):
 
     @contextmanager
     def opening(self, plan: PlannedRun, folder: Path) -> Iterator[None]:
-        """Keep the log of the run."""
+        """Log the run."""
         self.plan = plan
         self.folder = folder
         with logged(self._config.log_level, self._config.log_json) as counts:
@@ -80,11 +81,11 @@ class Terminal(EpisodeBars):
 
     @contextmanager
     def running(self, plan: PlannedRun, run: HeldRun) -> Iterator[MessageHandler]:
-        """Show the progress of episodes; where Ctrl-C ends it, how to continue."""
+        """Show the progress of episodes and, after Ctrl-C, the command that continues."""
         from scenarios.runs.eta import remembered
 
         config = self._config
-        self._tell_of_beginning(plan, run)
+        self._print_beginning(plan, run)
         done = {one.id for one in plan.picked} - {one.id for one in run.todo}
         board = Board(plan.picked, done, compared=config.counterfactual, pace=config.pace)
         going = Going(run.held.path, [one.id for one in run.todo], self._counts)
@@ -98,17 +99,17 @@ class Terminal(EpisodeBars):
                 stack.enter_context(board.bars)
                 yield board.tell
         except KeyboardInterrupt:
-            self._tell_how_to_continue(plan, len(run.held.finished()))
+            self._print_how_to_continue(plan, len(run.held.finished()))
             raise typer.Exit(INTERRUPTED) from None
         self.figures = going.figures
 
-    def _tell_of_beginning(self, plan: PlannedRun, run: HeldRun) -> None:
+    def _print_beginning(self, plan: PlannedRun, run: HeldRun) -> None:
         from scenarios.runs.eta import announcement
 
         config = self._config
         seed = plan.options.seed
         err.print(
-            f"Seed {seed}: what the policy is told that episodes are called is drawn from it.",
+            f"Seed {seed}: the episode ids and seeds that the policy gets are drawn from it.",
             highlight=False,
         )
         for note in run.held.notes:
@@ -127,30 +128,33 @@ class Terminal(EpisodeBars):
             )
             err.print(words, soft_wrap=not err.is_terminal, highlight=False, markup=False)
         if config.ends.live is not None and run.todo:
-            _tell_how_to_step_in(
+            _print_live_commands(
                 config.ends.live, run, several=(config.jobs or 1) > 1, paced=config.pace > 0.0
             )
 
-    def _tell_how_to_continue(self, plan: PlannedRun, finished: int) -> None:
+    def _print_how_to_continue(self, plan: PlannedRun, finished: int) -> None:
         again = shlex.join(word for word in sys.argv[1:] if word != "--resume")
         again += "" if self._config.out else f" --out {shlex.quote(str(self.folder))}"
         err.print(
-            f"Stopped. {finished} of {len(plan.picked)} episodes are finished and kept in "
+            f"Stopped. {finished} of {len(plan.picked)} episodes are finished and stored in "
             f"{self.folder}."
         )
-        err.print(f"Go on with: cosim {again} --resume", soft_wrap=True)
+        err.print(f"Continue with: cosim {again} --resume", soft_wrap=True)
 
 
-def _tell_how_to_step_in(air: Connection, run: HeldRun, *, several: bool, paced: bool) -> None:
-    """Print the commands that listen and inject here. several: episodes at a time; then the first
-    one is named."""
+def _print_live_commands(hub: Connection, run: HeldRun, *, several: bool, paced: bool) -> None:
+    """Print the commands that listen to a live run and inject pedestrians.
+
+    several: whether episodes run in parallel; then the commands name the first one.
+    paced: whether the run is limited to real time.
+    """
     from bridge import keys
 
     first = min(run.todo, key=partial(pseudonym_of, run.held.spec.setup.seed))
     env = f" --env {keys.chunk(run.held.path.name)}/{keys.chunk(first.id)}" if several else ""
-    notice(f"On the air at {air.listen}. From another terminal:")
-    notice(f"  cosim listen events{reached_by(air, 'viewer')}{env} --wait 60")
-    notice(f"  cosim inject '{_STEPS_IN}'{reached_by(air, 'injector')}{env} --wait 60")
+    notice(f"On the air at {hub.listen}. From another terminal:")
+    notice(f"  cosim listen events{reached_by(hub, 'viewer')}{env} --wait 60")
+    notice(f"  cosim inject '{_EXAMPLE_PEDESTRIAN}'{reached_by(hub, 'injector')}{env} --wait 60")
     if not paced:
         notice(
             "It runs as fast as it can. --pace 1 holds it to real time, so that there is "
@@ -158,8 +162,8 @@ def _tell_how_to_step_in(air: Connection, run: HeldRun, *, several: bool, paced:
         )
 
 
-def _tell_of_end(terminal: Terminal, table: DataFrame) -> None:
-    """Print what came out. Raises Exit where not all of it is scored."""
+def _print_end(terminal: Terminal, table: DataFrame) -> None:
+    """Print the results of a run. Raises Exit if an episode is not scored."""
     plan = terminal.plan
     folder = terminal.folder
     print_table(out, table, len(plan.of_run), folder)
@@ -181,9 +185,8 @@ def _tell_of_end(terminal: Terminal, table: DataFrame) -> None:
 
 
 @contextmanager
-def _told_if_not_begun(folder: Path | None) -> Iterator[None]:
-    """Where Ctrl-C ends a run before its folder was written, print that there is nothing to
-    resume."""
+def _noticed_if_not_begun(folder: Path | None) -> Iterator[None]:
+    """Print that there is nothing to resume if Ctrl-C ends a run before its folder is written."""
     try:
         yield
     except KeyboardInterrupt:

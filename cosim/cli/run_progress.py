@@ -1,4 +1,4 @@
-"""A run whose notices, stages and episodes are shown on standard error."""
+"""Progress of a run on standard error: notices, stages and episodes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
-from cosim.cli.console import err
+from cosim.cli.console import err, notice
 from cosim.cli.progress import doing
 from cosim.core.progress import Progress as Stages
 from cosim.core.progress import time_left_s
@@ -26,20 +26,21 @@ if TYPE_CHECKING:
 
 
 SETUP_M = 30.0
-"""Starting an episode takes about as long as so many metres of its route."""
+"""Metres of route that take as long to simulate as the start of an episode."""
 PACED_SETUP_M = 3.0
-"""The same for each time real time that episodes are held to, as they take longer then and starting
-them does not."""
+"""The same per unit of pace in a paced run, whose episodes take longer while starts do not."""
 ALONE = 0.74
-"""Of an episode that is compared with its street without the robot, the share of the episode
-itself."""
+"""Share of the episode itself in the work of an episode with a counterfactual."""
 BAR = 12
-"""Columns of a bar: the display fits a terminal of 80."""
+"""Width of a bar in characters, so that the display fits 80 columns."""
 
 
 class Left:
-    """How much of a run is left: its episodes weigh what their routes are long, and their
-    starts."""
+    """Remaining work of a run. An episode weighs its route length plus its start, in metres.
+
+    lengths_m: route length by scenario id.
+    setup_m: weight of an episode's start.
+    """
 
     def __init__(self, lengths_m: Mapping[str, float], setup_m: float = SETUP_M) -> None:
         self._lengths_m = lengths_m
@@ -47,12 +48,12 @@ class Left:
         self._shares: dict[str, float] = {}
 
     def at(self, scenario: str, share: float) -> None:
-        """An episode has started, and is done to that share."""
+        """Record the share of an episode that is done, 0 to 1."""
         self._shares[scenario] = min(share, 1.0)
 
     @property
     def share(self) -> float:
-        """What of the run is done, 0 to 1."""
+        """Return the share of the run that is done, 0 to 1."""
         if not self._lengths_m:
             return 1.0
         done_m = fsum(
@@ -61,16 +62,16 @@ class Left:
         return done_m / fsum(self._setup_m + length_m for length_m in self._lengths_m.values())
 
     def seconds(self, since_s: float) -> float | None:
-        """Return how long the rest takes, judged by the first `since_s` seconds of the run; None:
-        too early to say."""
+        """Return the estimated seconds left after `since_s` seconds; None if it is too early."""
         return time_left_s(self.share, since_s)
 
 
 class Board:
-    """The progress display of a run: one bar for all of it, one for each episode under way.
+    """Progress display of a run: a bar for the run and one for each running episode.
 
-    done: ids of the scenarios that were finished before. compared: each episode is compared with
-    its street without the robot. pace: episodes are held to so many times real time, 0 for none.
+    done: ids of the scenarios that were finished before.
+    compared: whether each episode has a counterfactual.
+    pace: limit of the speed in times real time; 0 for none.
     """
 
     def __init__(
@@ -96,12 +97,12 @@ class Board:
         self._console = console
         self._clock = clock
         self._began_s = clock()
-        self._all = self.bars.add_task("episodes", total=1.0, count="", note="")
+        self._run_task = self.bars.add_task("episodes", total=1.0, count="", note="")
         self._tasks: dict[str, TaskID] = {}
         self._show()
 
     def tell(self, message: object) -> None:
-        """Take in what a worker says."""
+        """Update the display by a message of a worker."""
         from scenarios.ipc.messages import Done, Waits
         from scenarios.ipc.messages import Progress as Report
 
@@ -122,15 +123,19 @@ class Board:
             note = f"simulated {message.time_s:.0f} s, {message.failures} failures"
             self._bar(one.id, message.route_s_m / length_m, count, note)
         elif isinstance(message, Waits):
-            words = f"{message.scenario}: {message.reason}"
-            self._console.print(words, soft_wrap=True, highlight=False, markup=False)
+            self._console.print(
+                f"{message.scenario}: {message.reason}",
+                soft_wrap=True,
+                highlight=False,
+                markup=False,
+            )
         elif isinstance(message, Done):
             task = self._tasks.pop(message.scenario, None)
             if task is not None:
                 self.bars.remove_task(task)
             self.left.at(message.scenario, 1.0)
             self._finished += 1
-            rest = self._rest()
+            rest = self._time_left()
             words = (
                 f"{message.scenario}: {message.status}, {self._finished} of {len(self._scenarios)}"
             )
@@ -148,41 +153,37 @@ class Board:
 
     def _show(self) -> None:
         count = f"{self._finished}/{len(self._scenarios)}"
-        self.bars.update(self._all, completed=self.left.share, count=count, note=self._rest())
+        self.bars.update(
+            self._run_task, completed=self.left.share, count=count, note=self._time_left()
+        )
 
-    def _rest(self) -> str:
-        """How long the rest takes, in words; nothing while that is not known, and nothing at the
-        end."""
-        rest_s = self.left.seconds(self._clock() - self._began_s)
-        return "" if rest_s is None or rest_s < 0.5 else f"about {duration(rest_s)} left"
-
-
-def notice(words: str) -> None:
-    """Print a notice in a line on standard error."""
-    err.print(words, soft_wrap=True, markup=False, highlight=False)
+    def _time_left(self) -> str:
+        """Return the time left in words; "" while it is unknown, and at the end."""
+        left_s = self.left.seconds(self._clock() - self._began_s)
+        return "" if left_s is None or left_s < 0.5 else f"about {duration(left_s)} left"
 
 
 class EpisodeBars:
-    """Shows notices, stages and the progress of episodes (`scenarios.runs.run.Reporter`)."""
+    """Reporter (`scenarios.runs.run.Reporter`) that shows notices, stages and episodes."""
 
     def say(self, words: str) -> None:
         """Print a notice."""
         notice(words)
 
     def stage(self, words: str) -> AbstractContextManager[Stages]:
-        """Show a stage that takes its time."""
+        """Show a stage."""
         return doing(words)
 
     def planned(self, plan: PlannedRun) -> None:
-        """Check nothing more."""
+        """Accept the plan."""
 
     def opening(self, plan: PlannedRun, folder: Path) -> AbstractContextManager[None]:
-        """Keep no log."""
+        """Write no log."""
         return nullcontext()
 
     @contextmanager
     def running(self, plan: PlannedRun, run: HeldRun) -> Iterator[MessageHandler]:
-        """Show how far each episode is."""
+        """Show the progress of the episodes."""
         board = Board(plan.picked, {one.id for one in plan.picked} - {one.id for one in run.todo})
         with board.bars:
             yield board.tell

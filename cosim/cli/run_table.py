@@ -1,4 +1,4 @@
-"""Print the tables of runs and episodes, and the commands to use next."""
+"""Print the tables of runs and episodes, and the next commands to use."""
 
 from __future__ import annotations
 
@@ -24,11 +24,10 @@ from cosim.spec.scenario import Scenario, read_suite
 
 
 def print_next_commands(err: Console, folder: Path, table: pd.DataFrame) -> None:
-    """Print the commands that show a run: a film, of a failure where there is one; a page; one
-    episode.
+    """Print the commands for a film, a report and a picture of one episode.
 
-    table: a row per episode. A run of which no episode came to its end has neither film nor
-    picture.
+    table: a row per episode. The film shows a failure if there is one. Without an ended episode
+    only the report is offered.
     """
     run = shlex.quote(str(folder))
     ended = table[table["ended"].notna()]
@@ -63,11 +62,11 @@ LETTERS = {
     "F": "freezings per 100 m travelled",
     "V": "mean speed",
 }
-"""What a letter means, in every table: what is counted otherwise has no letter."""
+"""Meaning of each letter, the same in every table."""
 UNITS = {"FC": "/100m", "C": "/100m", "OL": "/100m", "F": "/100m", "V": "m/s"}
 COUNTS = (("collisions", "collisions"), ("out_of_lane", "out of lane"), ("freezings", "freezings"))
 MEANS = (*SHOWN[:3], ("failures_per_100m_route", ""), *SHOWN[3:], ("spl", "SPL"))
-"""Those of a run."""
+"""Metrics in the table of means of a run, with their letters."""
 WITHOUT_PEOPLE = (
     ("spl", "SPL"),
     ("route_completion", "RC"),
@@ -83,16 +82,20 @@ WITH_PEOPLE = (
     ("pedestrian_distance_min_m", "near-\nest m"),
     ("pedestrian_distance_min_success_m", "of\nwins"),
 )
-"""Means over the episodes of a kind: shares of them, and metres."""
+"""Metrics in the table by kind of scenario, with their heads."""
 _MEAN_HEADS = ("", "95 % interval", "n")
-"""Heads of the cells of a mean."""
+"""Heads of the columns of a mean."""
 
 
 def print_table(
     out: Console, table: pd.DataFrame, scheduled: int, folder: Path | None = None
 ) -> None:
-    """Print the table of a run: a row per episode, then the means with their intervals. folder: of
-    the run."""
+    """Print the table of a run: a row per episode, then means with their intervals.
+
+    table: a row per episode.
+    scheduled: number of episodes of the run.
+    folder: of the run, to look for waypoints in its trajectories.
+    """
     heads = (*(f"{head}\n{UNITS.get(head, '')}" for _, head in SHOWN), "counts")
     rows = []
     for _, row in table.iterrows():
@@ -114,7 +117,7 @@ def print_table(
 
 
 def print_means(out: Console, table: pd.DataFrame) -> None:
-    """What came out of all episodes of a run together."""
+    """Print the means over all episodes of a run."""
     if not len(table):
         return
     summary = summary_of(table, [name for name, _ in MEANS]).iterrows()
@@ -133,13 +136,13 @@ def print_means(out: Console, table: pd.DataFrame) -> None:
 
 
 def _mean_cells(row: pd.Series[float]) -> tuple[str, str, str]:
-    """Mean, interval and number of episodes, from a row of `summary_of`."""
+    """Return mean, interval and number of episodes from a row of `summary_of`, as text."""
     interval = f"{value_in_words(row['low'])} to {value_in_words(row['high'])}" if row["n"] else "-"
     return value_in_words(row["mean"]), interval, f"{row['n']:.0f}"
 
 
 def print_statuses(out: Console, table: pd.DataFrame, scheduled: int) -> None:
-    """How many episodes there are of each status, why, and whether the run may be quoted."""
+    """Print the number of episodes of each status, the reasons, and whether to quote the run."""
     parts = {status: table[table["status"] == status] for status in ("done", "crashed", "invalid")}
     scored = len(parts["done"]) + len(parts["crashed"])
     counts = f"scheduled {scheduled}, scored {scored}, of these crashed {len(parts['crashed'])}"
@@ -156,9 +159,11 @@ def print_statuses(out: Console, table: pd.DataFrame, scheduled: int) -> None:
 
 
 def print_terms(out: Console, table: pd.DataFrame, folder: Path | None = None) -> None:
-    """Print by which terms a run drove: policy, camera, goal, odometry, where the policy ran, how
-    its waypoints were followed, seed; and what is nonstandard. Without a camera, or waypoints in
-    the run's folder, these are left out."""
+    """Print the terms of a run: policy, camera, goal, odometry, host, waypoint rule and seed.
+
+    Nonstandard terms, injections and latency follow. A policy without a camera, or a folder
+    without waypoints, has no such term.
+    """
     named = [
         "policy",
         "camera",
@@ -177,7 +182,7 @@ def print_terms(out: Console, table: pd.DataFrame, folder: Path | None = None) -
     for policy, camera, rate_hz, goal, odometry, knows, waypoints, seed, odd, runs in (
         table[named].drop_duplicates().itertuples(index=False)
     ):
-        told = [
+        terms = [
             f"policy {policy_in_words(policy, knows)}",
             f"at {rate_hz:g} Hz" if camera == "none" else f"camera {camera}, at {rate_hz:g} Hz",
             f"goal {goal}",
@@ -186,7 +191,7 @@ def print_terms(out: Console, table: pd.DataFrame, folder: Path | None = None) -
             *([waypoints] if follows else []),
             f"seed {seed}",
         ]
-        out.print("; ".join(told), highlight=False, markup=False)
+        out.print("; ".join(terms), highlight=False, markup=False)
         if odd:
             out.print(f"* nonstandard, not to be compared: {odd}", highlight=False, markup=False)
     if words := injections_in_words(table):
@@ -196,7 +201,7 @@ def print_terms(out: Console, table: pd.DataFrame, folder: Path | None = None) -
 
 
 def _latency_in_words(table: pd.DataFrame) -> str:
-    """How late commands took effect, where they did."""
+    """Return the latency of commands in words; "" without latency."""
     if "latency_ms" not in table or not (table["latency_ms"].any() or table["real_time"].any()):
         return ""
     measured = table["real_time"].any()
@@ -208,14 +213,14 @@ def _latency_in_words(table: pd.DataFrame) -> str:
             f"latency {late_ms.median():g} ms: commands take effect so much later than what they "
             f"answer"
         )
-    told = (
+    words = (
         f"commands took effect {_median_and_range(late_ms)} after what they answer, at whole "
         f"ticks of 50 ms"
     )
     if len(took_ms := table["answer_ms"].dropna()):
-        told = f"the median answer took {_median_and_range(took_ms)}; {told}"
+        words = f"the median answer took {_median_and_range(took_ms)}; {words}"
     return (
-        f"in real time: {told}; as measured here, not to be had again from the seed, only replayed"
+        f"in real time: {words}; as measured here, not to be had again from the seed, only replayed"
     )
 
 
@@ -225,8 +230,7 @@ def _median_and_range(of_episodes_ms: pd.Series[float]) -> str:
 
 
 def print_delays(out: Console, table: pd.DataFrame) -> None:
-    """What the robot cost others, per episode, in a run that was asked to compare; nothing in any
-    other."""
+    """Print the delays caused by the robot, per episode; nothing without `--counterfactual`."""
     if not set(COUNTERFACTUAL) <= set(table.columns):
         return
     rows = [
@@ -238,13 +242,12 @@ def print_delays(out: Console, table: pd.DataFrame) -> None:
 
 
 def value_in_words(value: float | None) -> str:
-    """A figure as tables show it: with two digits, "-" where there is none."""
+    """Return a number with two decimals, or "-" for None and NaN."""
     return "-" if value is None or pd.isna(value) else f"{value:.2f}"
 
 
 def kinds_of(folder: Path) -> Mapping[str, str]:
-    """What each scenario of a run is an example of: its structure, or the kind of its one event; ""
-    for neither."""
+    """Return each scenario's structure, or the kind of its single event, or ""."""
     scenarios = read_suite(folder / "scenarios.json").scenarios
     return {
         s.id: s.structure or (s.events[0].kind if about_one_event(s) else "") for s in scenarios
@@ -252,13 +255,12 @@ def kinds_of(folder: Path) -> Mapping[str, str]:
 
 
 def about_one_event(scenario: Scenario) -> bool:
-    """Whether a scenario is there for its one event."""
+    """Return whether a scenario tests its single event."""
     return scenario.ends_on_failure and len(scenario.events) == 1
 
 
 def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -> None:
-    """A row per kind of scenario: how many episodes, and their means. Nothing for fewer than two
-    kinds."""
+    """Print a row of means per kind of scenario; nothing for fewer than two kinds."""
     named = [kind for kind in dict.fromkeys(kinds.values()) if kind]
     if len(named) < 2:
         return
@@ -286,7 +288,7 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
 
 
 def print_by_split(out: Console, table: pd.DataFrame) -> None:
-    """The episodes of val and of test apart, where a run has both."""
+    """Print means of `val` and `test` separately if a run has both."""
     if "split" not in table or table["split"].nunique() < 2:
         return
     names = ("success", "route_completion", "failures_per_100m")

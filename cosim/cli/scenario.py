@@ -1,4 +1,4 @@
-"""The command line of own scenarios: `cosim scenario new`, `check`, `draw`, `run`."""
+"""The commands `cosim scenario new`, `check`, `draw` and `run`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from cosim.cli import tables
-from cosim.cli.console import err, out
+from cosim.cli.console import err, notice, out, say
 from cosim.cli.generated_options import Fields, configured
 from cosim.cli.options import camera_here, check_rerun, replaced, write_rerun
 from cosim.cli.progress import doing
@@ -43,7 +43,7 @@ scenario_app = typer.Typer(
     help="Scenarios of your own, in TOML files; sweeps over them.",
 )
 _MOVED_M = 0.5
-"""What was moved farther than this is told."""
+"""Metres beyond which a moved end of a route is reported."""
 _FILE_HELP = "A TOML file: `cosim scenario new` writes one."
 _OF_OWN_RUN = Fields(
     only=(
@@ -65,14 +65,14 @@ _OF_OWN_RUN = Fields(
         "seed": "Of the run: policies' own seeds are drawn from it.",
     },
 )
-"""The options of `cosim scenario run`."""
+"""Options of `cosim scenario run`."""
 
 
 @scenario_app.command("new", epilog="Example:  \n`cosim scenario new mine.toml`")
 def write_template(
     file: Annotated[Path, typer.Argument(help="Where to write it, a .toml; it is named after it.")],
 ) -> None:
-    """Write a scenario that runs as it is, with a comment on everything that may stand in it."""
+    """Write a scenario file that runs as it is, with a comment on every possible field."""
     if file.suffix != ".toml":
         raise UsageError(f"{file}: a scenario's file ends in .toml")
     if file.exists():
@@ -102,10 +102,9 @@ def check_own(
         bool, typer.Option("--drive", help="Have the oracle drive each: can it be solved?")
     ] = False,
 ) -> None:
-    """Say what scenarios are, or everything that is wrong with them: fields, place, way, events,
-    obstacles, room.
+    """Print the scenarios of files, or all their errors at once.
 
-    Exit code 1: the oracle failed in one.
+    Checks fields, place, route, events, obstacles and free width. Exit code 1: the oracle failed.
     """
     from scenarios.suites.user_scenarios.build import suite_of_own
     from scenarios.suites.user_scenarios.check import own_faults
@@ -122,9 +121,9 @@ def check_own(
         if faults:
             faulty += 1
             for fault in faults:
-                err.print(f"{path}: {fault}", soft_wrap=True, markup=False, highlight=False)
+                notice(f"{path}: {fault}")
         else:
-            _say(own)
+            _print_count(own)
             suite = suite_of_own(own)
             _print_scenarios(suite, own)
             failed += _driven(suite) if drive else 0
@@ -135,8 +134,7 @@ def check_own(
 
 
 def _driven(suite: Suite) -> int:
-    """Say of each scenario whether the oracle comes through without a failure. Returns in how many
-    it does not."""
+    """Print whether the oracle solves each scenario, and return the number of failures."""
     from scenarios.suites.proofs import Dropped
     from scenarios.tools.build.proving import EXPERT, proved
 
@@ -149,7 +147,7 @@ def _driven(suite: Suite) -> int:
             words = f"{EXPERT} fails: {proof.reason} {proof.details}"
         else:
             words = f"solved by {EXPERT} in {proof.time_s:.1f} s"
-        out.print(f"{one.id}: {words}", soft_wrap=True, markup=False, highlight=False)
+        say(f"{one.id}: {words}")
     return failed
 
 
@@ -172,7 +170,7 @@ def draw_own(
         str | None, typer.Option(help="Part of the place: x0,y0,x1,y1 in metres.")
     ] = None,
 ) -> None:
-    """Draw the map from above: coordinates, way, metres along it, fences, obstacles, events."""
+    """Draw the map from above, with coordinates, route, fences, obstacles and events."""
     from cosim.report.mapsheet import write_png
     from cosim.report.plan import draw_plan
     from scenarios.places.nets import place
@@ -201,7 +199,7 @@ def draw_own(
         plan = draw_plan(street_map, made.scenario, whole=whole, part=part, credit=credit_of(where))
         write_png(plan, picture)
     for fault in made.faults:
-        err.print(f"{file}: {fault}", soft_wrap=True, markup=False, highlight=False)
+        notice(f"{file}: {fault}")
     out.print(f"Picture: {picture}{instead}", soft_wrap=True)
     if made.faults:
         raise typer.Exit(WRONG_USE)
@@ -219,10 +217,9 @@ def run_own(
     file: Annotated[Path, typer.Argument(help=_FILE_HELP)],
     config: Annotated[RunConfig, _OF_OWN_RUN],
 ) -> None:
-    """Run what a file makes, into an ordinary run folder; of a sweep print a table by its values,
-    and draw it.
+    """Run the scenarios of a file. A sweep gets a table by its values, and a plot.
 
-    All other options of runs go with `cosim run FILE.toml`.
+    `cosim run FILE.toml` has all other options of runs.
     """
     from cosim.policies.load import load_policy
     from cosim.results.run_folder import refuse_used
@@ -241,20 +238,20 @@ def run_own(
     path = config.out or Path("runs") / f"{own.name}-{manifest.name}-{stamp}"
     if manifest.camera is not None:
         config = replace(config, camera=camera_here(config.camera))
-    _say(own)
+    _print_count(own)
     tables = _run_parts(own, suite, config, path)
     _print_run(own, tables, path)
     write_rerun(path, [own.variants[0].id], config.rerun)
 
 
 def _parts(own: OwnFile, path: Path) -> dict[GoalProtocol | None, Path]:
-    """The run folders of a file: one for each goal protocol, because a run has one."""
+    """Return the run folder of each goal protocol in a file, because a run has only one."""
     goals = dict.fromkeys(variant.own.goal_protocol for variant in own.variants)
     return {goal: path if len(goals) == 1 else path / str(goal) for goal in goals}
 
 
 def _run_parts(own: OwnFile, suite: Suite, config: RunConfig, path: Path) -> list[pd.DataFrame]:
-    """Run the scenarios of a file. Its runs have one seed and one latency."""
+    """Run the scenarios of a file, with one seed and one latency, and return a table per run."""
     from cosim.cli.run_progress import EpisodeBars
     from cosim.results.run_folder import read_spec
     from scenarios.runs.planning import seed_of_run
@@ -276,16 +273,16 @@ def _run_parts(own: OwnFile, suite: Suite, config: RunConfig, path: Path) -> lis
         try:
             tables.append(carry_out(of_part, given=Given(suite=suite), reporter=EpisodeBars()))
         except KeyboardInterrupt:
-            err.print(
-                f"Stopped. What is finished is kept in {part}: go on with --out {path} --resume",
-                soft_wrap=True,
+            notice(
+                f"Stopped. Finished episodes are stored in {part}: continue with --out {path} "
+                f"--resume"
             )
             raise typer.Exit(INTERRUPTED) from None
     return tables
 
 
 def _print_run(own: OwnFile, tables: Sequence[pd.DataFrame], path: Path) -> None:
-    """What came out of a run; of a sweep by its values, which are written beside it."""
+    """Print the results of a run; a sweep by its values, which are also written to files."""
     import pandas as pd
 
     from cosim.cli.run_table import print_next_commands, print_statuses, print_table
@@ -300,18 +297,18 @@ def _print_run(own: OwnFile, tables: Sequence[pd.DataFrame], path: Path) -> None
             files = write_sweep(summary, own, path)
             out.print(f"Table and picture: {' '.join(map(str, files))}", soft_wrap=True)
         except MachineError as error:
-            err.print(str(error), soft_wrap=True, markup=False, highlight=False)
+            notice(str(error))
     else:
         print_table(out, table, len(own.variants), path)
     out.print(f"Run folder: {path}", soft_wrap=True)
-    if len(tables) == 1:  # else each goal has a run in a folder of its own
+    if len(tables) == 1:
         print_next_commands(err, path, table)
     if table["ended"].isna().any():
         raise typer.Exit(SOME_CRASHED)
 
 
 def _print_sweep(summary: pd.DataFrame, fields: list[str]) -> None:
-    """A row for each value: means, with their intervals below."""
+    """Print the means of a sweep, a row per value, with intervals below."""
     from cosim.results.metrics import SUCCESS_IN_WORDS
     from scenarios.suites.user_scenarios.sweep import SWEPT
 
@@ -336,8 +333,8 @@ def _print_sweep(summary: pd.DataFrame, fields: list[str]) -> None:
     )
 
 
-def _say(own: OwnFile) -> None:
-    """What a file makes, in words."""
+def _print_count(own: OwnFile) -> None:
+    """Print the number of scenarios in a file."""
     swept = ", ".join(f"{axis.field} ({len(axis.values)} values)" for axis in own.axes)
     count = len(own.variants)
     words = (
@@ -345,11 +342,11 @@ def _say(own: OwnFile) -> None:
         if swept
         else f"{count} scenario{'s' * (count > 1)}"
     )
-    out.print(f"{own.path}: {words}", soft_wrap=True, markup=False, highlight=False)
+    say(f"{own.path}: {words}")
 
 
 def _print_scenarios(suite: Suite, own: OwnFile) -> None:
-    """A row per scenario, with its hash: for 80 columns."""
+    """Print a row per scenario with its hash, and notes."""
     from cosim.spec.scenario import content_hash
     from scenarios.suites.user_scenarios.along_route import narrow_events
     from scenarios.suites.user_scenarios.routes import moved_m
@@ -375,10 +372,10 @@ def _print_scenarios(suite: Suite, own: OwnFile) -> None:
         if far_m > _MOVED_M:
             out.print(f"way: {name} was moved by {far_m:.1f} m to the middle of its sidewalk")
     for note in dict.fromkeys(note for one in suite.scenarios for note in narrow_events(one)):
-        out.print(f"note: {note}", soft_wrap=True, markup=False, highlight=False)
+        say(f"note: {note}")
     for variant, one in zip(own.variants, suite.scenarios, strict=True):
-        asked = variant.own.obstacles
-        if asked.per_100m and len(one.obstacles) == len(asked.placed):
+        wanted = variant.own.obstacles
+        if wanted.per_100m and len(one.obstacles) == len(wanted.placed):
             out.print(
                 f"note: {one.id}: no room for obstacles that leave the robot's width and 0.5 m",
                 soft_wrap=True,

@@ -9,7 +9,7 @@ import typer
 from rich.console import Console
 
 from cosim.cli import tables
-from cosim.cli.console import err, out
+from cosim.cli.console import notice, out, say
 from cosim.cli.progress import doing
 from cosim.core.errors import SOME_CRASHED, SpecError, unknown
 
@@ -34,7 +34,7 @@ def list_all(
 
 
 def print_names(out: Console) -> None:
-    """Suites, robots and their cameras, policies, goals: a line for each."""
+    """Print a line for each suite, robot, camera, policy and goal."""
     from cosim.policies import POLICIES
     from cosim.policies.follow.networks import weights_in_words
     from cosim.policies.follow.policy import Follow
@@ -70,7 +70,7 @@ def print_names(out: Console) -> None:
 
 
 def print_scenarios(out: Console, suite: Suite) -> None:
-    """A row per scenario of a suite: made for 80 columns."""
+    """Print a row per scenario of a suite."""
     columns = [
         *tables.names("scenario"),
         *tables.labels("place"),
@@ -106,7 +106,7 @@ def build_one(
     name: Annotated[str, typer.Argument(help="A suite: see `cosim suite list`.")],
     path: Annotated[
         Path,
-        typer.Argument(metavar="OUT", help="The suite's file, a .json; its proofs go beside it."),
+        typer.Argument(metavar="OUT", help="The suite's file, a .json; its proofs go next to it."),
     ],
     jobs: Annotated[int, typer.Option(min=1, help="Processes, about 0.4 GiB each.")] = 1,
     tries: Annotated[
@@ -116,8 +116,7 @@ def build_one(
         list[str] | None, typer.Option(help="Build only this scenario; may be repeated.")
     ] = None,
 ) -> None:
-    """Draw the scenarios of a suite and prove each solvable. Stopped, it goes on where it was when
-    called again."""
+    """Draw the scenarios of a suite and prove each solvable. A stopped build continues."""
     from scenarios.suites.recipes import RECIPES
     from scenarios.tools.build.build_suite import build_suite
 
@@ -128,10 +127,7 @@ def build_one(
         if one not in names:
             raise unknown("scenario", one, names)
 
-    def show(line: str, _share: float | None = None, /) -> None:
-        err.print(line, soft_wrap=True, markup=False, highlight=False)
-
-    suite, proofs = build_suite(name, path, jobs, tries, show, only or ())
+    suite, proofs = build_suite(name, path, jobs, tries, notice, only or ())
     out.print(
         f"{path}: {len(suite.scenarios)} scenarios, version {suite.version}, {suite.content_hash}",
         soft_wrap=True,
@@ -164,19 +160,21 @@ def check_suites(
     ] = False,
     jobs: Annotated[int, typer.Option(min=1, help="Processes, about 0.4 GiB each.")] = 1,
 ) -> None:
-    """Prove what suites claim: counts, hashes, single path, gaps, spread, no duplicates, proofs.
-    Exit code 1: one claim is false."""
+    """Prove the claims of suites, such as hashes, single path, gaps and proofs.
+
+    Exit code 1: a claim is false.
+    """
     from scenarios.suites.catalog import SUITES
 
     false = 0
     for name in suites or SUITES:
-        false += _checked(name, None if whole else sample, None if whole else drive, jobs)
+        false += _false_claims(name, None if whole else sample, None if whole else drive, jobs)
     if false:
         raise typer.Exit(SOME_CRASHED)
 
 
-def _checked(name: str, sample: int | None, drive: int | None, jobs: int) -> int:
-    """Print a suite's table, and what is false. Returns how many claims are."""
+def _false_claims(name: str, sample: int | None, drive: int | None, jobs: int) -> int:
+    """Print a suite's table and false claims, and return the number of false claims."""
     from scenarios.suites.catalog import SUITES, load_suite
     from scenarios.suites.proofs import read_proofs
     from scenarios.suites.recipes import RECIPES
@@ -191,38 +189,36 @@ def _checked(name: str, sample: int | None, drive: int | None, jobs: int) -> int
         proofs = read_proofs(path)
     except SpecError as error:
         proofs = None
-        err.print(str(error), soft_wrap=True, markup=False, highlight=False)
+        notice(str(error))
     read = Read(suite, proofs, path)
     faults = {claim: list(of(read)) for claim, of in CLAIMS.items()}
-    looked = {claim: len(suite.scenarios) for claim in CLAIMS}
-    all_there = list(suite.scenarios)
-    picked = all_there if sample is None else sample_of(suite, sample)
-    driven = [s.id for s in (all_there if drive is None else sample_of(suite, drive))]
-    extra = [s for s in all_there if s.id in set(driven) - {s.id for s in picked}]
+    checked = {claim: len(suite.scenarios) for claim in CLAIMS}
+    every = list(suite.scenarios)
+    picked = every if sample is None else sample_of(suite, sample)
+    driven = [s.id for s in (every if drive is None else sample_of(suite, drive))]
+    extra = [s for s in every if s.id in set(driven) - {s.id for s in picked}]
     with doing(f"looking at {len(picked)} scenarios in their places, driving {len(driven)}"):
         for fault in faults_in_places([*picked, *extra], driven, proofs, jobs):
             faults.setdefault(fault.claim, []).append(fault.words)
-    looked |= {claim: len(picked) + len(extra) for claim in PLACE_CLAIMS} | {
+    checked |= {claim: len(picked) + len(extra) for claim in PLACE_CLAIMS} | {
         PLACE_CLAIMS[-1]: len(driven)
     }
     columns = [*tables.names(f"{suite.name} {suite.version}, {suite.content_hash}")]
     columns += tables.figures("looked at", "faults")
     rows = [
         (claim, str(count), f"{len(faults.get(claim, [])) or '-'}")
-        for claim, count in looked.items()
+        for claim, count in checked.items()
     ]
     tables.show(out, columns, rows)
     for claim, found in faults.items():
         for words in found:
-            out.print(
-                f"{suite.name}, {claim}: {words}", soft_wrap=True, markup=False, highlight=False
-            )
+            say(f"{suite.name}, {claim}: {words}")
     return sum(bool(found) for found in faults.values())
 
 
 @suite_app.command("list", epilog="Example:  \n`cosim suite list`")
 def list_suites() -> None:
-    """List the suites that ship: how many scenarios, of which version, and what they are for."""
+    """List the shipped suites with number of scenarios, version and purpose."""
     from scenarios.suites.catalog import SUITES, load_suite
     from scenarios.suites.recipes import RECIPES
 

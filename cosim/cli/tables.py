@@ -1,4 +1,4 @@
-"""Print tables in terminals of any width: no figure is ever cut."""
+"""Print tables in terminals of any width without cutting numbers."""
 
 from __future__ import annotations
 
@@ -13,10 +13,9 @@ from rich.table import Table
 from rich.text import Text
 
 _LEAST_NAME: Final = 12
-"""A column of names or words is folded to this many letters before a table is divided."""
+"""Characters to which a column of names or words may be folded before a table is divided."""
 _LAYOUTS: Final = ((True, 1), (True, 0), (False, 0))
-"""Whether a table has an edge, and the padding of its columns: the first layout that fits is
-taken."""
+"""Layouts (edge, padding in characters). The first one that fits is used."""
 
 Cell = str | Text
 Row = Sequence[Cell] | None
@@ -26,9 +25,11 @@ Row = Sequence[Cell] | None
 class Column(NamedTuple):
     """A column of a table.
 
-    kind: "name" says what a row is, and may be folded. Names come first, and are repeated where a
-    table is divided. "figure" is flush right and stays in one piece, "label" is flush left and
-    stays in one piece, "words" may be folded.
+    kind:
+    - "name" identifies a row. It may be folded, comes first, and is repeated in divided tables.
+    - "figure" is right-aligned and never folded.
+    - "label" is left-aligned and never folded.
+    - "words" may be folded.
     """
 
     head: str
@@ -40,17 +41,17 @@ class Column(NamedTuple):
 
 
 def names(*heads: str) -> list[Column]:
-    """Return columns that say what a row is."""
+    """Return columns that identify a row."""
     return [Column(head, "name") for head in heads]
 
 
 def figures(*heads: str) -> list[Column]:
-    """Return columns of numbers, flush right."""
+    """Return columns of numbers, right-aligned."""
     return [Column(head, "figure") for head in heads]
 
 
 def labels(*heads: str) -> list[Column]:
-    """Return columns of short words that stay in one piece."""
+    """Return columns of short words that are never folded."""
     return [Column(head, "label") for head in heads]
 
 
@@ -62,10 +63,12 @@ def words(*heads: str) -> list[Column]:
 def show(
     out: Console, columns: Sequence[Column], rows: Iterable[Row], *, title: str = "", note: str = ""
 ) -> None:
-    """Print a table; title: above it; note: below it.
+    """Print a table.
 
-    One that is too wide has less space between its columns, then broken heads, then folded names,
-    then several parts one below the other.
+    A table that is too wide gets less padding, then broken heads, then folded names. If that is
+    not enough, it is divided into parts below each other.
+
+    title, note: lines above and below the table.
     """
     for part in fitted(out, columns, rows, title=title, note=note):
         out.print(part)
@@ -114,8 +117,7 @@ def fitted(
 
 
 def _divided(columns: Sequence[Column], least: Sequence[int], width: int) -> list[list[int]]:
-    """Return the numbers of the columns of each part. Each has all names and at least one other
-    column."""
+    """Return the column indices of each part, with all names and at least one other column."""
     leading = [k for k, column in enumerate(columns) if column.kind == "name"]
     parts = [leading]
     for k in range(len(leading), len(columns)):
@@ -146,5 +148,5 @@ def _text(cell: Cell) -> Text:
 
 
 def _width(cell: Cell) -> int:
-    """Return the letters of the longest line."""
+    """Return the width of the longest line, in terminal cells."""
     return max(map(cell_len, str(cell).split("\n")))

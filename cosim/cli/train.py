@@ -1,4 +1,4 @@
-"""The command line of learning: `cosim train`."""
+"""The command `cosim train`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli.console import err
+from cosim.cli.console import notice
 from cosim.cli.options import LEARN
 from cosim.core.errors import SOME_CRASHED, MachineError
 from cosim.learning.settings import PLANNED_STEPS, TO_INSTALL, Training
@@ -39,17 +39,15 @@ def train_command(
         int | None,
         typer.Option(
             min=1,
-            help="Batches that are learned from, in all.",
+            help="Number of batches in all.",
             show_default=f"{PLANNED_STEPS}; with --resume as before",
         ),
     ] = None,
     seed: Annotated[
-        int, typer.Option(min=0, help="Of the first parameters, the batches and what is held out.")
+        int, typer.Option(min=0, help="Seed of initial parameters, batches and held-out episodes.")
     ] = 0,
-    batch: Annotated[int, typer.Option(min=1, help="Examples a step.")] = 256,
-    rate: Annotated[
-        float, typer.Option(help="Of learning; it rises to this and falls to 0.")
-    ] = 1e-3,
+    batch: Annotated[int, typer.Option(min=1, help="Examples per step.")] = 256,
+    rate: Annotated[float, typer.Option(help="Peak learning rate; it then falls to 0.")] = 1e-3,
     device: Annotated[
         str, typer.Option(help="cpu, cuda, cuda:1; by default a GPU if there is one.")
     ] = "",
@@ -65,10 +63,9 @@ def train_command(
         bool, typer.Option("--resume", help="Continue the training in the folder.")
     ] = False,
 ) -> None:
-    """Train a small policy that sees on demonstrations, and write it as a bundle for --policy
-    onnx:FOLDER.
+    """Train a small camera policy on demonstrations, as a bundle for --policy onnx:FOLDER.
 
-    Its state is kept every minute. A finished training continues with `--resume` and larger
+    A checkpoint is saved every minute. A finished training continues with `--resume` and larger
     `--steps`.
 
     Needs PyTorch and onnx, and no engine. Install the CPU build first, unless you have an NVIDIA
@@ -89,9 +86,5 @@ def train_command(
         minutes=minutes,
         name=name,
     )
-
-    def say(line: str) -> None:
-        err.print(line, soft_wrap=True, markup=False, highlight=False)
-
-    if not trained(data, out, training, resume, say):
+    if not trained(data, out, training, resume, notice):
         raise typer.Exit(SOME_CRASHED)

@@ -17,9 +17,9 @@ from rich.live import Live
 from rich.text import Text
 
 from cosim.cli import tables
-from cosim.cli.console import LogJson, LogLevel, err, logged, out
+from cosim.cli.console import LogJson, LogLevel, logged, notice, out
 from cosim.cli.generated_options import Fields, configured
-from cosim.cli.options import DEFAULT, MANY, Insecure, Tls, warned
+from cosim.cli.options import DEFAULT, MANY, Insecure, Tls
 from cosim.core.errors import INTERRUPTED, EngineError, RunError, UsageError
 from cosim.core.log_event import happened
 from cosim.core.units import duration
@@ -32,14 +32,14 @@ if TYPE_CHECKING:
 
 coordinator_app = typer.Typer()
 
-_OF_ONE_MACHINE = {
+_LOCAL_ONLY = {
     "shared_renderer": "workers draw for themselves",
-    "live": "episodes run elsewhere",
-    "pace": "it is there to step in, and episodes run elsewhere",
-    "director": "workers ask their own",
-    "real_time": "answers are timed where nothing else runs",
+    "live": "episodes run on other machines",
+    "pace": "it is for live injection, and episodes run on other machines",
+    "director": "workers use their own",
+    "real_time": "answers are timed on an idle machine",
 }
-"""Options of `cosim run` that are refused here, and why."""
+"""Options of `cosim run` that a coordinator refuses, with the reason."""
 
 
 @coordinator_app.command(
@@ -57,7 +57,7 @@ def coordinator_command(
         RunConfig,
         Fields(
             without=("jobs", "on", "director_wait", "tls", "insecure"),
-            hidden=_OF_ONE_MACHINE,
+            hidden=_LOCAL_ONLY,
             panels=True,
         ),
     ],
@@ -67,17 +67,16 @@ def coordinator_command(
     tls: Tls = "",
     insecure: Insecure = False,
 ) -> None:
-    """Run a suite by workers that come and go (`cosim worker`): with the options of `cosim run`,
-    and the same results.
+    """Run a suite on workers (`cosim worker`), with the options and results of `cosim run`.
 
-    It waits for workers as long as there is something to do. Killed at any moment, and begun again
-    with --resume, it goes on where it was, and so do they. `cosim status` tells how it goes.
+    Workers may connect and disconnect at any time. A coordinator that was killed continues with
+    --resume, and so do its workers. `cosim status` shows the progress.
     """
     from bridge.session import notices_of, open_session
     from cosim.cli.run_display import run_in_terminal
     from scenarios.runs.zenoh_transport import workers_of_run
 
-    for name, why in _OF_ONE_MACHINE.items():
+    for name, why in _LOCAL_ONLY.items():
         if getattr(config, name):
             raise UsageError(
                 f"--{name.replace('_', '-')} is of one machine ({why}): leave it out, or use "
@@ -90,8 +89,8 @@ def coordinator_command(
 
     @contextmanager
     def carrier() -> Iterator[Any]:
-        with open_session(connection, warned) as session:
-            _say(
+        with open_session(connection, notice) as session:
+            _log_and_print(
                 f"Workers find it by: cosim worker --connect "
                 f"{listen.replace('0.0.0.0', 'THIS-MACHINE')}"
             )
@@ -106,9 +105,9 @@ def coordinator_command(
     "worker",
     rich_help_panel=MANY,
     epilog="Examples:  \n`cosim worker --jobs 2`  \n`cosim worker --connect tls/hub.lan:7447 "
-    "--tls certs/worker --jobs 16 --once`  \nExit codes: 0 told to end by SIGTERM, its episodes "
+    "--tls certs/worker --jobs 16 --once`  \nExit codes: 0 ended by SIGTERM, its episodes "
     "handed back, or the run is over (--once); 2 the run needs another installation, or its "
-    "policy cannot be loaded here; 3 this machine lacks something, or no run was heard of for 10 "
+    "policy cannot be loaded here; 3 this machine lacks something, or no run was found for 10 "
     "minutes (--once); 130 Ctrl-C",
 )
 def worker_command(
@@ -123,37 +122,37 @@ def worker_command(
     insecure: Insecure = False,
     logs: Annotated[
         Path | None,
-        typer.Option(help="Keep here what its processes print; else the run alone keeps it."),
+        typer.Option(help="Folder for the output of its processes; default: none."),
     ] = None,
     log_level: LogLevel = "",
     log_json: LogJson = None,
 ) -> None:
     """Run episodes for a coordinator (`cosim coordinator`), on this machine or another one.
 
-    It needs no folder of the run's: scenarios, options and the policy's name come from there. The
-    policy itself must be importable here, and be the same. It may come and go at any time.
+    The coordinator sends scenarios, options and the policy's name. The same policy must be
+    importable here. A worker may connect and disconnect at any time.
     """
     from scenarios.runs.zenoh_worker import work
 
     connection = connecting("worker", "--connect", connect, tls, insecure)
     with logged(log_level, log_json):
-        ended_by = work(connection, jobs, _say, once=once, logs=logs)
+        ended_by = work(connection, jobs, _log_and_print, once=once, logs=logs)
     if ended_by == SIGINT:
         raise typer.Exit(INTERRUPTED)
 
 
-def _say(words: str, _share: float | None = None, /) -> None:
+def _log_and_print(words: str, _share: float | None = None, /) -> None:
     happened("said", words=words)
-    err.print(words, soft_wrap=True, highlight=False, markup=False)
+    notice(words)
 
 
 status_app = typer.Typer()
 
 _EVERY_S = 1.0
 _STALE_S = 10.0
-"""A coordinator writes its status every two seconds."""
+"""Seconds after which a status file is outdated; coordinators write it every 2 s."""
 _STILL_S = 30.0
-"""An episode that has not come on for so long is told of."""
+"""Seconds without progress after which an episode is reported."""
 _COLOURS = {
     "working": "green",
     "idle": "",
@@ -178,23 +177,27 @@ def status_command(
     tls: Tls = "",
     insecure: Insecure = False,
 ) -> None:
-    """Show how a run goes: progress, rate, time left, and each worker's health; live in a terminal,
-    until Ctrl-C or the end of the run, once elsewhere."""
+    """Show progress, rate, time left and each worker's health, live in a terminal.
+
+    A terminal shows it until Ctrl-C or the end of the run. Elsewhere it is printed once.
+    """
     if (folder is None) == (connect is None):
         raise UsageError("name a run folder, or the coordinator's address with --connect")
     if folder is not None:
-        _show(lambda: _of_folder(folder))
+        _show_status(lambda: _status_of_folder(folder))
         return
     from bridge import keys
     from bridge.session import open_session
 
     connection = connecting("viewer", "--connect", str(connect), tls, insecure)
-    with open_session(connection, warned) as session:
-        _show(lambda: _asked(session.answers(keys.EVERY_RUN, timeout_s=5.0), str(connect)))
+    with open_session(connection, notice) as session:
+        _show_status(
+            lambda: _status_of_answers(session.answers(keys.EVERY_RUN, timeout_s=5.0), str(connect))
+        )
 
 
-def _asked(answers: dict[str, bytes], where: str) -> tuple[RunStatus, str]:
-    """Raises EngineError when no run is coordinated there."""
+def _status_of_answers(answers: dict[str, bytes], where: str) -> tuple[RunStatus, str]:
+    """Return the status of a coordinated run. Raises EngineError if there is none."""
     from scenarios.runs.status import decode_status
 
     if not answers:
@@ -205,9 +208,11 @@ def _asked(answers: dict[str, bytes], where: str) -> tuple[RunStatus, str]:
     return decode_status(next(iter(answers.values()))), ""
 
 
-def _of_folder(folder: Path) -> tuple[RunStatus, str]:
-    """The status of a run, and a remark on whoever runs it. Raises UsageError when the folder holds
-    no run."""
+def _status_of_folder(folder: Path) -> tuple[RunStatus, str]:
+    """Return the status of a run folder, and a remark on its coordinator.
+
+    Raises UsageError if the folder has no run.
+    """
     from cosim.results.run_folder import read_records, read_spec, refuse_in_use
     from scenarios.runs.status import STATUS_FILE, RunStatus, decode_status
 
@@ -221,12 +226,12 @@ def _of_folder(folder: Path) -> tuple[RunStatus, str]:
     total = len(spec.scenarios)
     path = folder / STATUS_FILE
     if runs and path.exists():
-        told = decode_status(path.read_bytes())
-        late_s = time.time() - told.at_s
-        if told.finished <= finished or late_s < _STALE_S:
+        status = decode_status(path.read_bytes())
+        late_s = time.time() - status.at_s
+        if status.finished <= finished or late_s < _STALE_S:
             return (
-                told,
-                f"Its coordinator has said nothing for {duration(late_s)}."
+                status,
+                f"Its coordinator has sent nothing for {duration(late_s)}."
                 if late_s > _STALE_S
                 else "",
             )
@@ -235,46 +240,48 @@ def _of_folder(folder: Path) -> tuple[RunStatus, str]:
     )
     if runs:
         return bare, "Run by processes of this machine, or just begun."
-    return bare, "" if finished == total else "Nobody runs it: go on with its command and --resume."
+    return bare, "" if finished == total else "Not running: continue with its command and --resume."
 
 
-def _show(look: Callable[[], tuple[RunStatus, str]]) -> None:
-    """Once, or again and again where that can be seen."""
-    told, remark = look()
+def _show_status(look: Callable[[], tuple[RunStatus, str]]) -> None:
+    """Show a status, once or live in a terminal."""
+    status, remark = look()
     if not out.is_terminal:
-        out.print(_picture(told, remark), soft_wrap=True)
+        out.print(_picture(status, remark), soft_wrap=True)
         return
     try:
-        with Live(_picture(told, remark), console=out, auto_refresh=False) as live:
-            while told.finished < told.total and not remark.startswith("Nobody"):
+        with Live(_picture(status, remark), console=out, auto_refresh=False) as live:
+            while status.finished < status.total and not remark.startswith("Not running"):
                 time.sleep(_EVERY_S)
                 try:
-                    told, remark = look()
+                    status, remark = look()
                 except EngineError:
                     remark = "Its coordinator does not answer."
-                live.update(_picture(told, remark), refresh=True)
+                live.update(_picture(status, remark), refresh=True)
     except KeyboardInterrupt:
         raise typer.Exit(INTERRUPTED) from None
 
 
-def _picture(told: RunStatus, remark: str) -> Group:
-    said = f"{told.suite}, policy {told.policy}: {told.finished} of {told.total} episodes"
-    if told.per_hour is not None and told.left_s is not None:
-        said += f", {told.per_hour:.0f} an hour, about {duration(told.left_s)} left"
-    if told.lost:
-        said += f"; {told.lost} lost with their workers and run again"
-    if told.refused:
-        said += f"; {told.refused} messages refused"
-    parts: list[RenderableType] = [Text(said)]
-    if told.workers:
+def _picture(status: RunStatus, remark: str) -> Group:
+    summary = (
+        f"{status.suite}, policy {status.policy}: {status.finished} of {status.total} episodes"
+    )
+    if status.per_hour is not None and status.left_s is not None:
+        summary += f", {status.per_hour:.0f} an hour, about {duration(status.left_s)} left"
+    if status.lost:
+        summary += f"; {status.lost} lost with their workers and run again"
+    if status.refused:
+        summary += f"; {status.refused} messages refused"
+    parts: list[RenderableType] = [Text(summary)]
+    if status.workers:
         columns = [*tables.names("worker"), *tables.labels("state", "heard")]
         columns += [*tables.figures("done"), *tables.words("episode")]
         rows = []
-        for one in told.workers:
-            state = one.state_at(told.at_s)
-            silent_s = told.at_s - one.heard_at_s
+        for one in status.workers:
+            state = one.state_at(status.at_s)
+            silent_s = status.at_s - one.heard_at_s
             silent = duration(silent_s) if silent_s > 0.5 else "now"
-            under_way = "\n".join(_episode(each, told.at_s) for each in one.episodes.values())
+            under_way = "\n".join(_episode(each, status.at_s) for each in one.episodes.values())
             rows.append(
                 (
                     one.name,
@@ -285,9 +292,9 @@ def _picture(told: RunStatus, remark: str) -> Group:
                 )
             )
         parts += tables.fitted(out, columns, rows)
-    elif told.finished < told.total and not remark:
-        parts.append(Text("No worker is there: start some with `cosim worker`."))
-    parts += [Text(line, style="bold red") for line in told.conflicts]
+    elif status.finished < status.total and not remark:
+        parts.append(Text("No worker is connected: start some with `cosim worker`."))
+    parts += [Text(line, style="bold red") for line in status.conflicts]
     if remark:
         parts.append(Text(remark))
     return Group(*parts)

@@ -273,7 +273,7 @@ def test_an_interrupted_run_is_finished_by_resume(
             assert run.returncode == 130
             assert (
                 f"--out {out.name} --resume" in said
-                and "1 of 2 episodes are finished and kept" in said
+                and "1 of 2 episodes are finished and stored" in said
             )
         kept = (out / "episodes/t-0/record.json").stat().st_mtime_ns
         wait_for(lambda: not alive(out))

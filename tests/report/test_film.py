@@ -240,7 +240,7 @@ def test_a_record_that_does_not_replay_is_told(desk: Path, cosim: Cosim) -> None
         (("film", "run", "t-9", "--failure"), "unknown finished episode"),
         (("film", "run", "t-0", "--from", "99"), "nothing to film"),
         (("film", "run", "t-0", "--from", "1", "--to", "nan"), "give a later --to"),
-        (("film", "run", "t-0", "--size", "wide"), "--size 'wide'"),
+        (("film", "run", "t-0", "--size", "wide"), "--size wide"),
         (("film", "run", "t-0", "--size", "321x181"), "both sides must be even"),
         (("film", "run", "t-0", "--size", "64x64"), "nothing can be read"),
         (("film", "run", "t-0", "-o", "film.gif"), "ends in .mp4"),

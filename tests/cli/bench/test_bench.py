@@ -23,9 +23,9 @@ Path(path).write_text(json.dumps([figure]))
 
 def checkout(folder: Path, value: float) -> Path:
     """A folder whose every measurement comes to a value, and is noted in a file beside it."""
-    bench = folder / "scenarios" / "bench"
+    bench = folder / "scenarios" / "tools" / "bench"
     bench.mkdir(parents=True)
-    for package in (bench, bench.parent):
+    for package in (bench, bench.parent, bench.parents[1]):
         (package / "__init__.py").touch()
     take = TAKE.format(log=folder.parent / "log", here=folder.name, value=value)
     (bench / "take.py").write_text(take, encoding="utf-8")
@@ -48,7 +48,7 @@ def test_checkouts_take_turns(tmp_path: Path) -> None:
 def test_a_figure_stands_beside_that_of_another_checkout(tmp_path: Path, cosim: Cosim) -> None:
     """--compare shows both medians and their ratio for what both take."""
     other = checkout(tmp_path / "other", 1e6)
-    (other / "scenarios" / "bench" / "take.py").write_text(
+    (other / "scenarios" / "tools" / "bench" / "take.py").write_text(
         "import json, sys\nfrom pathlib import Path\nfigures = {'shortest walk, ms': 1e9, "
         "'elsewhere': 1.0}\nPath(sys.argv[3]).write_text(json.dumps([{'name': k, 'value': v} for "
         "k, v in figures.items()]))"
