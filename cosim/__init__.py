@@ -34,8 +34,7 @@ if TYPE_CHECKING:
     from cosim.spec.goal import ImageGoal, Instruction, PointGoal, RoutePatch
     from cosim.spec.manifest import Manifest, WaypointRule
     from cosim.spec.odometry import Odometry
-    from cosim.spec.options import EpisodeOptions
-    from cosim.spec.policy_host import PolicyHost
+    from cosim.spec.options import EpisodeOptions, PolicyHost
     from cosim.spec.robot import Mount, Robot
     from cosim.spec.scenario import Scenario, Suite
     from scenarios.episodes.episode import Episode
@@ -94,7 +93,7 @@ _HOMES = {
     "Odometry": "cosim.spec.odometry",
     "PointGoal": "cosim.spec.goal",
     "Policy": "cosim.episode.interfaces",
-    "PolicyHost": "cosim.spec.policy_host",
+    "PolicyHost": "cosim.spec.options",
     "Record": "cosim.results.record",
     "Robot": "cosim.spec.robot",
     "RoutePatch": "cosim.spec.goal",

@@ -166,7 +166,7 @@ def collect_command(
     Only solved episodes are kept. The same command writes the same bytes, whatever --jobs; stopped
     at any moment it goes on with --resume.
     """
-    from cosim.spec.policy_host import PolicyHost
+    from cosim.spec.options import PolicyHost
     from scenarios.episodes.demonstration import check_parquet
 
     check_parquet()  # before the modules that import pyarrow

@@ -17,12 +17,41 @@ from dataclasses import dataclass
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Polyline, Pose
-from cosim.core.state import Command, Frame, RobotState, Street
+from cosim.core.state import Command, Frame, Motion, RobotState, Street
 from cosim.episode.interfaces import Camera, Crowd, Director, World
-from cosim.episode.step import Reset, Step
-from cosim.people.neighbours import nearby_people
-from cosim.spec.events import EventQuery, EventState
+from cosim.people.steering import nearby_people
+from cosim.spec.events import EventQuery, EventReply, EventState
 from cosim.spec.scenario import Scenario
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """One tick. robot, street, route_s_m: at its start; motion, street_after, route_s_after_m: at
+    its end.
+
+    frame: what the camera saw, on ticks on which the policy was asked. route_s_m: arc length on the
+    route.
+    """
+
+    tick: int
+    robot: RobotState
+    street: Street
+    route_s_m: float
+    frame: Frame | None
+    command: Command
+    events: EventReply
+    motion: Motion
+    street_after: Street
+    route_s_after_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Reset:
+    """Put the robot at rest at a pose, which lies at this arc length of the route."""
+
+    pose: Pose
+    route_s_m: float
+
 
 ROUTE_WINDOW_M = 10.0
 """The robot's place on the route is looked for this far before and behind the last one."""

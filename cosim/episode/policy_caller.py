@@ -24,7 +24,7 @@ from cosim.core.state import Command, RobotState, Signal, Vehicles
 from cosim.episode.control import command_of
 from cosim.episode.interfaces import Observation, Policy, Privileged
 from cosim.spec.manifest import Manifest
-from cosim.spec.policy_host import PolicyRuns
+from cosim.spec.options import PolicyRuns
 
 PolicyCall = Literal["loading", "reset", "first act", "act", "on_reset", "ended"]
 """What a policy is busy with. The first answer of an episode may take longer than the others."""

@@ -18,8 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cosim.core.geometry import Floats
-from cosim.core.row_matching import RowLookup
-from cosim.core.state import Age
+from cosim.core.state import Age, RowLookup
 
 REFERENCE_M: Final = 1.75
 """Stature of the person whose strides are listed."""

@@ -14,8 +14,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from cosim.core.state import PERSON_RADIUS_M
+from cosim.core.state import DIRECTED, PERSON_RADIUS_M, People, PersonKind
 from cosim.people.orca import HalfPlane, best_velocity, half_plane
+from cosim.spec.events import NearbyPerson
 
 STEERING_NEAR_M: Final = 4.0
 """Who is farther away is not looked at."""
@@ -214,3 +215,31 @@ def _meets_in_s(
 
 def _permits(plane: HalfPlane, x_mps: float, y_mps: float) -> bool:
     return plane.nx * x_mps + plane.ny * y_mps - plane.offset >= -_EPS
+
+
+def nearby_people(people: People) -> tuple[NearbyPerson, ...]:
+    """Those within STEERING_NEAR_M of somebody the director moves, in the order of the street; not
+    the events' own people.
+
+    The events' people are in the states of a query. Injected people are moved by the director and
+    see each other here.
+    """
+    if not people.kind.any():  # all are of the crowd
+        return ()
+    moved = people.xy[people.are(*DIRECTED)]
+    if not len(moved):
+        return ()
+    gap = people.xy[:, None] - moved[None]
+    near = ((gap * gap).sum(axis=2) < STEERING_NEAR_M * STEERING_NEAR_M).any(axis=1)
+    rows = np.flatnonzero(near & (people.kind != PersonKind.EVENT)).tolist()
+    if not rows:
+        return ()
+    heading, speed = people.heading, people.speed
+    vx, vy = (
+        (speed[rows] * np.cos(heading[rows])).tolist(),
+        (speed[rows] * np.sin(heading[rows])).tolist(),
+    )
+    told = zip(rows, people.xy[rows].tolist(), vx, vy, people.kind[rows].tolist(), strict=True)
+    return tuple(
+        NearbyPerson(people.ids[i], x, y, u, v, PersonKind(kind)) for i, (x, y), u, v, kind in told
+    )

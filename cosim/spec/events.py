@@ -7,10 +7,12 @@ killed and started again in the middle of an episode without a trace in the resu
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from typing import Annotated, Final, Literal
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Final, Literal, NamedTuple
 
 import msgspec
+import numpy as np
 
 from cosim.core.state import PERSON_RADIUS_M, Age, Doing, PersonKind
 from cosim.spec.validation import ALONG_M, HEADING_RAD, WHERE_M, Ranged, Within, shown
@@ -148,7 +150,7 @@ class EventQuery(msgspec.Struct, frozen=True, kw_only=True):
     """What the simulator sends at each tick. states: one per event, empty at the first tick.
 
     route_s_m: the robot's arc length on the reference route. robot_length_m, robot_width_m: its
-    outline. nearby: who is near the people that the director moves, see `cosim.people.neighbours`.
+    outline. nearby: who is near the people that the director moves, see `cosim.people.steering`.
     standing: what stands there.
     """
 
@@ -176,3 +178,50 @@ class EventReply(msgspec.Struct, frozen=True, kw_only=True):
     tick: int
     states: tuple[EventState, ...]
     actors: tuple[Actor, ...]
+
+
+class SidewalkLayout(NamedTuple):
+    """Where a drawn event is along a sidewalk. way_m: length of the way, shortest and longest;
+    event_m: from the start to the event's place, nearest and farthest, farther than its trigger
+    reaches; half_width_m: least half of the sidewalk's width."""
+
+    way_m: tuple[float, float]
+    event_m: tuple[float, float]
+    half_width_m: float = 1.3
+
+
+@dataclass(frozen=True, kw_only=True)
+class EventKind:
+    """One kind of event.
+
+    name: in scenarios, on the command line, in tables. people: fewest and most. layout: where a
+    reactive scenario has it, and the room that it needs on a long way; None over a crosswalk.
+    group(half_width_m, rng) -> how many people a drawn one has; None: any number.
+
+    trigger_m: it begins when the robot is so far before its place along the route; below 0, when
+    the robot has just come so far past it; None, when the robot is on the crosswalk. begin(event,
+    number) -> person `number` before that. step(event, state, number, query) -> the same person a
+    tick on, from the trigger on. ends(event, state, query) -> whether what began is over: its
+    people go their ways, and once they are out of sight they are gone. pose, age: what its people
+    show who stand while it goes on, and how old they look.
+
+    passed_round: the robot is to pass round all of its people, never between two. ends_at: a
+    reactive scenario of it ends at the goal, or when the robot has stopped before its people.
+    """
+
+    name: str
+    people: tuple[int, int] = (1, 1)
+    layout: SidewalkLayout | None
+    group: Callable[[float, np.random.Generator], int] | None = None
+    trigger_m: float | None
+    begin: Callable[[Event, int], Walker]
+    step: Callable[[Event, EventState, int, EventQuery], Walker]
+    ends: Callable[[Event, EventState, EventQuery], bool]
+    pose: Doing = "stand"
+    age: Age = Age.ADULT
+    passed_round: bool = False
+    ends_at: Literal["goal", "stop"] = "goal"
+
+
+EventKinds = Mapping[str, EventKind]
+"""The table: kinds of events by their names."""

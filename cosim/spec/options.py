@@ -16,6 +16,30 @@ from cosim.spec.goal import GoalProtocol, goal_called
 from cosim.spec.injection import Injected, Live
 from cosim.spec.run_config import MOST_LATENCY_MS, CameraChoice, RunConfig
 
+PolicyRuns = Literal["in-process", "isolated", "remote", "remote, jpeg"]
+"""Where a policy ran: in the simulator's process, which it can reach into; in one of its own on the
+same machine; or behind Zenoh, where its pictures may have been sent as JPEG."""
+
+
+class PolicyHost(msgspec.Struct, frozen=True, kw_only=True):
+    """Where the policy of a run is. isolated: in a process of its own. servers: where those of a
+    remote one are found; run: signs what they are asked, so that none mistakes one run for another.
+
+    >>> PolicyHost(isolated=True).servers
+    ()
+    """
+
+    isolated: bool = False
+    servers: tuple[Connection, ...] = ()
+    run: str = ""
+
+    def seen_by(self, worker: Connection) -> PolicyHost:
+        """As a worker on another machine reaches it, who has this connection to the run."""
+        return msgspec.structs.replace(
+            self, servers=tuple(one.seen_by(worker) for one in self.servers)
+        )
+
+
 CameraName = Literal["gl", "bullet", "bullet-egl"]
 
 
@@ -52,7 +76,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     Episode by itself takes 0. robot: which drives (`cosim.spec.robot`), in place of the scenario's
     own. goal: what the policy is told of where to go (`cosim.spec.goal`), in place of what its
     manifest says. own_camera: the policy may see by a camera that the robot does not have
-    (`cosim.episode.camera_rules`), which marks the record as nonstandard. camera: what draws
+    (`cosim.episode.manifest_checks`), which marks the record as nonstandard. camera: what draws
     pictures. frames_every_s: keep a camera frame every so many seconds, 0 for none. live: where it
     is on the air meanwhile. pace: the simulation waits for the wall clock, to run at most so many
     times faster than real time; 0: it never waits. director: where its event pedestrians are

@@ -18,8 +18,7 @@ import numpy as np
 
 from cosim.core.errors import SpecError, unknown
 from cosim.core.geometry import Polyline, Pose
-from cosim.spec.event_kind import EventKinds
-from cosim.spec.events import Event
+from cosim.spec.events import Event, EventKinds
 from cosim.spec.obstacle import Obstacle
 from cosim.spec.robot import COURIER, robot_called
 from cosim.spec.spec_file import in_lines, read_spec_file
