@@ -1,22 +1,24 @@
-"""Packed: demonstrations as plain arrays in one .npz, for training in a Python that has numpy and
-nothing else.
+"""Packed demonstrations: plain arrays in one .npz, for training with numpy alone.
 
-`cosim dataset pack DIR -o FILE.npz` writes it of what `cosim collect` has collected. Its arrays, N
-rows, one for each picture, episode after episode and in order of time:
+`cosim dataset pack DIR -o FILE.npz` writes it from the output of `cosim collect`. It has N rows,
+one for each picture, ordered by episode and time:
 
-frames      (N, H, W, 3) uint8     the picture, RGB state       (N, 2) float32         the robot's
-own speeds at the picture: v m/s, w rad/s goal        (N, 2) float32         what the robot is told:
-x ahead, y to the left, metres; NaN where it is told no point command     (N, 2) float32         the
-expert's answer to the picture, clipped to the robot's limits: v m/s, w rad/s waypoints   (N, K, 2)
-float32      where the robot is 1, 2 .. K times `waypoint_s` later, in its frame at the picture: x
-ahead, y to the left, metres
-driven      (N,) int32             how many of the waypoints were driven, by the expert alone,
-                                   before the episode ended or somebody disturbed the drive; the
-                                   others go on by the expert's command there
-disturbed   (N,) bool              another command than the expert's was driven after the picture
-(`--noise`) episode     (N,) int32             from 0 frame       (N,) int32             from 0 in
-each episode; the picture was taken frame / rate_hz seconds after its start meta        () str
-JSON, see `Packed.meta`
+| array     | type                     | meaning                                                   |
+|-----------|--------------------------|-----------------------------------------------------------|
+| frames    | (N, H, W, 3) uint8       | RGB picture                                               |
+| state     | (N, 2) float32           | speeds of the robot at the picture: v m/s, w rad/s        |
+| goal      | (N, 2) float32           | point goal: x ahead, y left, metres; NaN without one      |
+| command   | (N, 2) float32           | expert's answer within the robot's limits: v m/s, w rad/s |
+| waypoints | (N, K, 2) float32        | robot after 1 .. K times `waypoint_s`: x ahead, y left    |
+| driven    | (N,) int32               | number of waypoints driven by the expert alone            |
+| disturbed | (N,) bool                | whether another command was driven (`--noise`)            |
+| episode   | (N,) int32               | number of the episode, from 0                             |
+| frame     | (N,) int32               | number of the picture in its episode, from 0              |
+| meta      | () str                   | JSON, see `Packed.meta`                                   |
+
+Waypoints are metres in the robot's frame at the picture. Those after `driven` extrapolate the
+expert's command, because the episode ended or the drive was disturbed. A picture is taken frame /
+rate_hz seconds after the episode's start.
 """
 
 from __future__ import annotations
@@ -36,16 +38,16 @@ from cosim.core.files import atomic_file
 from cosim.core.npz import NO_NPZ
 
 _FORMAT: Final = 1
+"""Version of the file format."""
 
 
 @dataclass(frozen=True)
 class Packed:
-    """Demonstrations in memory; the arrays are those of the file.
+    """Demonstrations in memory, with the arrays of the file.
 
-    meta: rate_hz, waypoint_s; goal, the name of its protocol, "none" without one; camera, as in
-    `CameraSpec`; robot; policy, noise and learner, lists with those of each data set; structures, a
-    list with what each episode is an example of ("straight", "gesturing"), and scenarios, a list of
-    their ids.
+    meta: rate_hz and waypoint_s; goal, the name of its protocol or "none"; camera, as in
+        `CameraSpec`; robot. policy, noise and learner are lists with one value for each data set.
+        structures and scenarios are lists with the structure and the id of each episode's scenario.
     """
 
     frames: NDArray[np.uint8]
@@ -63,8 +65,11 @@ class Packed:
         return len(self.episode)
 
     def history(self, pictures: int, every: int = 1) -> NDArray[np.int64]:
-        """(N, pictures) rows: what had been seen at each, oldest first and itself last, `every`
-        rows apart; before its episode's first row that one, as a policy fills its memory.
+        """Return the rows of the last pictures at each row, oldest first, as (N, pictures).
+
+        Rows before the start of an episode are replaced by its first row, as a policy fills its
+        memory.
+        every: distance between the pictures in rows.
 
         >>> two = np.zeros((3, 2), np.float32)
         >>> rgb = np.zeros((3, 9, 16, 3), np.uint8)
@@ -80,7 +85,7 @@ class Packed:
         return found
 
     def save(self, path: Path) -> None:
-        """Write the file, whole or not at all. Raises MachineError where that cannot be."""
+        """Write the file atomically. Raises MachineError."""
         arrays = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "meta"}
         meta = json.dumps({"format": _FORMAT, **self.meta}, sort_keys=True)
         try:
@@ -91,8 +96,10 @@ class Packed:
 
 
 def packed_digest(path: Path) -> str:
-    """Of all that a file holds, by the checksums that it holds itself: two packed of the same have
-    the same. Raises RunError naming it where it holds none."""
+    """Return a hash of a file's content, from the checksums in the file. Raises RunError.
+
+    Files packed from the same data have the same hash.
+    """
     try:
         with zipfile.ZipFile(path) as held:
             told = [(one.filename, one.file_size, one.CRC) for one in held.infolist()]
@@ -102,7 +109,7 @@ def packed_digest(path: Path) -> str:
 
 
 def read_packed(path: Path) -> Packed:
-    """The demonstrations in a file. Raises RunError naming it where it holds none."""
+    """Load the demonstrations of a file. Raises RunError."""
     try:
         with np.load(path, allow_pickle=False) as held:
             meta = json.loads(str(held["meta"]))

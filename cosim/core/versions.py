@@ -1,4 +1,4 @@
-"""Versions and floating-point behaviour of everything that can change the bits of an episode."""
+"""Versions and floating-point behaviour of everything that affects an episode's bits."""
 
 from __future__ import annotations
 
@@ -11,14 +11,16 @@ from importlib.metadata import PackageNotFoundError, version
 import numpy as np
 
 _ASKED = 4096
-"""Arguments of each function. Where two ways of rounding differ at all they do so for one in some
-hundred."""
+"""Number of arguments for each function. Implementations that differ at all do so for about one in
+some hundred."""
 
 
 @lru_cache(maxsize=1)
 def arithmetic() -> str:
-    """Hash of the bits of what the simulation computes with, over fixed arguments; 6 ms, once in a
-    process."""
+    """Return a hash of the results of elementary functions for fixed arguments.
+
+    It takes 6 ms, once in a process.
+    """
     share = (
         np.arange(1, _ASKED + 1, dtype=np.uint64)
         * np.uint64(2654435761)
@@ -67,6 +69,7 @@ RECORDED_PACKAGES = (
     "glcontext",
     "opencv-python-headless",
 )
+"""Distributions whose versions are recorded with every episode."""
 
 ENGINES = {
     "SUMO": "libsumo",
@@ -74,14 +77,15 @@ ENGINES = {
     "Zenoh": "eclipse-zenoh",
     "moderngl": "moderngl",
 }
-"""Name for humans -> distribution."""
+"""Distribution of each engine, by the engine's name."""
 
 
 @lru_cache(maxsize=1)
 def versions() -> dict[str, str]:
-    """Version of each package by distribution name, of `geos` as shapely loaded it, and the
-    `arithmetic` of this machine (`cosim.core.versions`). Machines of which all of it is the same
-    simulate the same to the bit."""
+    """Return the version of each package, of `geos`, and the `arithmetic` hash of this machine.
+
+    Machines with equal values simulate the same bits.
+    """
     import shapely
 
     found = {package: version(package) for package in RECORDED_PACKAGES}
@@ -89,8 +93,7 @@ def versions() -> dict[str, str]:
 
 
 def versions_in_words() -> str:
-    """Versions of the project, Python and the engines, for humans; nothing is imported to find
-    them."""
+    """Return the versions of project, Python and engines as text, without importing the engines."""
     engines = ", ".join(f"{name} {_installed(package)}" for name, package in ENGINES.items())
     return f"cosim {_installed('sidewalk-cosim')}, Python {platform.python_version()}\n{engines}"
 

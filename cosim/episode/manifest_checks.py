@@ -1,4 +1,4 @@
-"""What a manifest asks for beside a picture: whether it can be had, and how a camera is told."""
+"""Check a manifest's goals, odometry and cameras against a robot; build camera calibrations."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from cosim.spec.robot import Mount, Robot
 
 
 def with_goal(manifest: Manifest, goal: GoalProtocol | None) -> Manifest:
-    """A policy's manifest, with the goals of the run if that names some. Raises UsageError, with
-    the valid names, for goals or odometry that there are none of; for goals that the policy cannot
-    do with; for pictures as goals, and further cameras, of a policy without a camera.
+    """Return a manifest with the goal protocol of the run, if there is one.
+
+    Raises UsageError for an unknown goal protocol or odometry, and for goals that the policy does
+    not support. It also refuses picture goals and further cameras without a main camera.
     """
     settled = manifest if goal is None else replace(manifest, goal=goal)
     kind = GOALS[goal_called(settled.goal)]
@@ -46,7 +47,7 @@ def with_goal(manifest: Manifest, goal: GoalProtocol | None) -> Manifest:
 
 
 def calibration_of(spec: CameraSpec, robot: Robot) -> Calibration:
-    """A camera on a robot as computer vision has it.
+    """Return the calibration of a camera on a robot, in OpenCV's convention.
 
     >>> from cosim.spec.robot import COURIER
     >>> calibration_of(CameraSpec(width=96, height=96, fov_deg=90.0), COURIER).matrix[0].tolist()
@@ -80,8 +81,10 @@ def calibration_of(spec: CameraSpec, robot: Robot) -> Calibration:
 
 
 def nonstandard(manifest: Manifest, robot: Robot) -> str:
-    """What of a policy's cameras no mount of the robot allows, in words; "" if nothing. Raises
-    UsageError, listing the robot's mounts, if it has none of that name."""
+    """Return the cameras of a policy that exceed the robot's mounts, as text; "" if none do.
+
+    Raises UsageError for an unknown mount.
+    """
     cameras = [*([] if manifest.camera is None else [manifest.camera]), *manifest.cameras.values()]
     return " and ".join(
         filter(None, [_beyond(camera, manifest.rate_hz, robot) for camera in cameras])
@@ -89,8 +92,10 @@ def nonstandard(manifest: Manifest, robot: Robot) -> str:
 
 
 def check_camera(manifest: Manifest, robot: Robot, own_camera: bool) -> None:
-    """Raises UsageError, with the robot's mounts and their limits, for a camera that is none of the
-    robot's, unless that was asked for."""
+    """Raise UsageError for a camera that the robot does not have, unless `own_camera` allows it.
+
+    The message lists the robot's mounts and their limits.
+    """
     odd = nonstandard(manifest, robot)
     if odd and not own_camera:
         mounts = "; ".join(f"'{name}' {mount.in_words}" for name, mount in robot.mounts.items())
@@ -102,7 +107,7 @@ def check_camera(manifest: Manifest, robot: Robot, own_camera: bool) -> None:
 
 
 def _beyond(camera: CameraSpec, rate_hz: float, robot: Robot) -> str:
-    """The same of one camera."""
+    """Return how one camera exceeds its mount, as text; "" if it does not."""
     mount = camera.on(robot)
     if isinstance(camera.mount, Mount):
         at = ", ".join(f"{m:g}" for m in mount.at_m)

@@ -1,4 +1,4 @@
-"""What a policy is given at a moment: what its manifest asks for, and nothing more."""
+"""Builds a policy's observations from what its manifest requests; simulates odometry."""
 
 from __future__ import annotations
 
@@ -23,17 +23,20 @@ from cosim.spec.scenario import Scenario
 
 
 class Odometer(Protocol):
-    """One kind of odometry through an episode."""
+    """Odometry of an episode."""
 
     def moved(self, before: Pose, after: Pose) -> None:
-        """The robot has driven from one pose to another, in one tick."""
+        """Record the motion of one tick, from one pose to another."""
 
     def read(self, pose: Pose, time_s: float) -> Odometry | None:
-        """What it says of a robot that is truly at a pose."""
+        """Return the odometry of a robot whose true pose is `pose`."""
 
 
 def odometer_for(kind: OdometryKind, start: Pose, draws: np.random.Generator) -> Odometer:
-    """The odometer of an episode that begins at a pose. draws: where its errors come from."""
+    """Return the odometry of an episode that starts at a pose.
+
+    draws: generator of its errors.
+    """
     if kind == "wheel":
         return WheelOdometer(draws)
     return Gps(start, draws) if kind == "gps" else _Errorless(start, told=kind == "exact")
@@ -45,7 +48,7 @@ class _Errorless:
         self._told = told
 
     def moved(self, before: Pose, after: Pose) -> None:
-        """Nothing is counted."""
+        """Nothing to count."""
 
     def read(self, pose: Pose, time_s: float) -> Odometry | None:
         place = seen_from(self._start, pose)
@@ -54,7 +57,7 @@ class _Errorless:
 
 
 class WheelOdometer:
-    """Counts what the wheels have turned: being carried is not counted."""
+    """Wheel odometry: it counts wheel turns, so it misses resets of the robot."""
 
     def __init__(self, draws: np.random.Generator, noise: WheelNoise = WheelNoise()) -> None:  # noqa: B008
         self._draws = draws
@@ -86,7 +89,7 @@ class WheelOdometer:
 
 
 class Gps:
-    """Fixes of where the robot is; being carried is seen."""
+    """GPS fixes of the robot; they include resets."""
 
     def __init__(
         self, start: Pose, draws: np.random.Generator, noise: GpsNoise = GpsNoise()
@@ -98,7 +101,7 @@ class Gps:
         self._time_s = 0.0
 
     def moved(self, before: Pose, after: Pose) -> None:
-        """Nothing is counted."""
+        """Nothing to count."""
 
     def read(self, pose: Pose, time_s: float) -> Odometry:
         kept = math.exp(-(time_s - self._time_s) / self._noise.bias_s)
@@ -111,11 +114,13 @@ class Gps:
 
 
 class Observer:
-    """Makes the observations of one episode.
+    """Builds the observations of one episode.
 
-    manifest: with the goals of the run. run_seed: what goals and errors of odometry are drawn from,
-    each from a generator of its own. known: all that the simulator knows at a moment. cameras: the
-    further ones; look: for goals that are pictures.
+    manifest: manifest with the goal protocol of the run.
+    run_seed: seed of goals and odometry errors, each with its own generator.
+    known: returns the simulator state at a moment.
+    cameras: further cameras by name.
+    look: takes pictures for picture goals.
     """
 
     def __init__(
@@ -141,7 +146,7 @@ class Observer:
         self._calibration = None if spec is None else calibration_of(spec, self._robot)
 
     def moved(self, step: Step, put_back: bool) -> None:
-        """A tick has passed. put_back: the robot is put elsewhere now."""
+        """Record a tick. `put_back` says that the robot is reset to another pose now."""
         self._odometer.moved(step.robot.pose, step.motion.robot.pose)
         if put_back:
             self._goals.put_back()
@@ -149,13 +154,15 @@ class Observer:
     def observed(
         self, now: Moment, time_s: float, camera: Camera | None, put_back: bool
     ) -> tuple[Observation, Frame | None]:
-        """What the policy is given now, and its picture. camera: the policy's. put_back: since the
-        last observation the robot was put elsewhere."""
+        """Return the observation of a moment, and its camera frame.
+
+        camera: camera of the policy.
+        put_back: whether the robot was reset since the last observation.
+        """
         robot = now.robot
         spec = self._manifest.camera
-        goal = self._goals.at(
-            robot.pose, now.route_s_m
-        )  # a goal's picture is drawn first: the last one is the robot's
+        # Before the robot's own picture: the camera's last frame must be that one.
+        goal = self._goals.at(robot.pose, now.route_s_m)
         frame = None if camera is None else camera.render(robot, now.street)
         seen = Observation(
             tick=now.tick,
@@ -180,7 +187,7 @@ class Observer:
         return seen, frame
 
     def _picture(self, camera: Camera, spec: CameraSpec, now: Moment) -> CameraPicture:
-        """What a further camera shows."""
+        """Return the picture of a further camera."""
         frame = camera.render(now.robot, now.street)
         labels, depth = frame.labels if spec.labels else None, frame.depth if spec.depth else None
         return CameraPicture(frame.rgb, labels, depth, calibration_of(spec, self._robot))

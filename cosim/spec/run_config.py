@@ -1,4 +1,4 @@
-"""RunConfig: what a run does. `cosim run` and its relatives make their options from its fields."""
+"""RunConfig: the settings of a run, from which the options of `cosim run` are made."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from cosim.spec.connection import Connection, connecting, listening
 
 CameraChoice = Literal["auto", "gl", "bullet", "bullet-egl"]
 MEASURED = "measured"
-"""The value of `--latency` that has it measured before the run."""
+"""Value of `--latency` that measures the latency before the run."""
 MOST_LATENCY_MS = 10_000.0
-"""The longest latency of a command, in milliseconds."""
+"""Maximum latency of a command in milliseconds."""
 LONGEST_WAIT_S = 240.0
-"""The longest wait for a director, in seconds; a process that is silent for much longer counts as
+"""Maximum timeout of a director in seconds; processes that are silent for much longer count as
 hanging."""
 
 
 class Option(NamedTuple):
-    """How a field of a config appears on the command line.
+    """Command-line option of a config's field.
 
-    flag: "" for the field's name.
-    least, most: the range of a number.
-    default: the default in words, where the value does not say it.
-    argument: it is an argument, not an option.
-    panel: the heading of its group in the help.
+    flag: name of the option, "" for the field's name.
+    least, most: range of a number.
+    default: description of the default, if the value is not enough.
+    argument: whether it is a positional argument.
+    panel: heading of its group in the help.
     """
 
     help: str
@@ -52,9 +52,9 @@ _LOG = "Log"
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig:
-    """What a run does: which scenarios, driven by which policy, how, where, and what is kept.
+    """Settings of a run: scenarios, policy, conditions, processes and outputs.
 
-    Raises UsageError for values that contradict each other.
+    Raises UsageError for contradictory values.
 
     >>> RunConfig(suite="reactive", policy="orca", event=("frontal",), latency="200").latency_ms
     200.0
@@ -355,7 +355,7 @@ class RunConfig:
 
     @property
     def latency_ms(self) -> float | None:
-        """The latency of commands; None where it is measured before the run. Raises UsageError."""
+        """Latency of commands; None if it is measured before the run. Raises UsageError."""
         if self.real_time and self.latency:
             raise UsageError(
                 "--real-time measures the latency of every answer: leave --latency out"
@@ -376,12 +376,12 @@ class RunConfig:
 
     @property
     def ends(self) -> RunEnds:
-        """The ends of its network connections. Raises UsageError."""
+        """Network connections of the run. Raises UsageError."""
         return ends_of_run(self.live, self.director, self.policy_at, self.tls, self.insecure)
 
 
 def help_of(field: str) -> str:
-    """The help text of a field of `RunConfig`, for other commands with the same option.
+    """Return the help text of a field of `RunConfig`, for other commands with the same option.
 
     >>> help_of("elderly")
     'Share of the walkers who are elderly: they walk slower.'
@@ -390,14 +390,18 @@ def help_of(field: str) -> str:
 
 
 def option_of(config: type, field: str) -> Option:
-    """How a field of a config appears on the command line."""
+    """Return the command-line option of a config's field."""
     found: Option = get_type_hints(config, include_extras=True)[field].__metadata__[0]
     return found
 
 
 class RunEnds(NamedTuple):
-    """The ends of a run's connections: where it listens, where its director is, where servers of
-    its policy are."""
+    """Network connections of a run.
+
+    live: endpoint on which it listens.
+    director: connection to its director.
+    servers: connections to the servers of its policy.
+    """
 
     live: Connection | None
     director: Connection | None
@@ -405,15 +409,14 @@ class RunEnds(NamedTuple):
 
     @property
     def all(self) -> tuple[Connection, ...]:
-        """Those that there are."""
+        """All connections that are configured."""
         return tuple(end for end in (self.live, self.director, *self.servers) if end is not None)
 
 
 def ends_of_run(
     live: str | None, director: str | None, policies: Sequence[str], tls: str, insecure: bool
 ) -> RunEnds:
-    """The ends of a run by their endpoints: --tls goes to those that are tls/... Raises
-    UsageError."""
+    """Return the connections of a run. `--tls` applies to tls/... endpoints. Raises UsageError."""
     at = {f"--policy-at {end}": end for end in policies}
     given = {
         name: end for name, end in (("--live", live), ("--director", director)) if end is not None
