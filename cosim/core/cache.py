@@ -41,15 +41,15 @@ _T = TypeVar("_T")
 
 BUILDING: Final = ".building-"
 """Prefix of the folders in which city nets are built."""
-_MADE_WITH: Final = ("numpy", "opencv-python-headless", "pybullet", "scipy", "shapely")
+_ARRAY_PACKAGES: Final = ("numpy", "opencv-python-headless", "pybullet", "scipy", "shapely")
 """Packages that cached arrays depend on."""
-_SEAL_BYTES: Final = 64
+_HASH_BYTES: Final = 64
 """Length of the hexadecimal SHA-256 hash at the start of a cached file."""
-_ALIGNED: Final = 64
+_ALIGNMENT_BYTES: Final = 64
 """Alignment of arrays in a file, in bytes."""
 LIMIT_VARIABLE: Final = "COSIM_CACHE_LIMIT"
 """Environment variable with the size limit in GB."""
-_DEFAULT_GB: Final = 4.0
+_DEFAULT_LIMIT_GB: Final = 4.0
 """Default size limit in GB. Nets and street maps of the suites' hundred cities take 1 GB of it."""
 GB: Final = 10**9
 """Bytes in one GB."""
@@ -57,14 +57,14 @@ UNUSED_S: Final = 30 * 86400.0
 """Entries unused for this long, in seconds, are removed."""
 _IN_USE_S: Final = 3600.0
 """Time since its last use, in seconds, after which a listed entry no longer counts as in use."""
-_LOOK_EVERY_S: Final = 60.0
+_CLEANUP_INTERVAL_S: Final = 60.0
 """Minimum time between two clean-ups by a process that writes, in seconds."""
-_FORGOTTEN: Final = ".forgotten-"
+_REMOVED: Final = ".forgotten-"
 """Prefix of the temporary folders into which entries are moved before deletion."""
-_LISTS: Final = ".in-use"
+_IN_USE_FOLDER: Final = ".in-use"
 """Folder with the lists of entries in use."""
 _LOCK: Final = ".lock"
-_MOST_DEAD: Final = 32
+_MOST_LISTS: Final = 32
 """Number of lists above which a new process removes those of ended processes."""
 
 
@@ -126,7 +126,7 @@ def cache_folder() -> Path:
 
 def cache_limit_bytes() -> int:
     """Return the size limit: $COSIM_CACHE_LIMIT in GB, else 4 GB. Raises UsageError."""
-    text = os.environ.get(LIMIT_VARIABLE) or f"{_DEFAULT_GB:g}"
+    text = os.environ.get(LIMIT_VARIABLE) or f"{_DEFAULT_LIMIT_GB:g}"
     try:
         limit_gb = float(text)
     except ValueError:
@@ -134,7 +134,7 @@ def cache_limit_bytes() -> int:
     if not 0.0 <= limit_gb < math.inf:
         raise UsageError(
             f"{LIMIT_VARIABLE} is '{text}': give a number of GB from 0 on, like "
-            f"{_DEFAULT_GB:g} or 0.5"
+            f"{_DEFAULT_LIMIT_GB:g} or 0.5"
         )
     return round(limit_gb * GB)
 
@@ -145,7 +145,7 @@ def use_entry(entry: Path) -> None:
     It does nothing if the cache cannot be written.
     """
     with suppress(OSError):
-        _uses(cache_folder(), os.getpid()).add(entry)
+        _in_use_list(cache_folder(), os.getpid()).add(entry)
     with suppress(OSError):
         os.utime(entry)
 
@@ -155,12 +155,12 @@ def make_room() -> None:
     entry."""
     folder = cache_folder()
     now_s = time.monotonic()
-    if now_s - _looked_s.get(folder, -math.inf) >= _LOOK_EVERY_S:
-        _looked_s[folder] = now_s
+    if now_s - _last_cleanup_s.get(folder, -math.inf) >= _CLEANUP_INTERVAL_S:
+        _last_cleanup_s[folder] = now_s
         forget_entries()
 
 
-_looked_s: Final[dict[Path, float]] = {}
+_last_cleanup_s: Final[dict[Path, float]] = {}
 """Monotonic time of this process's last clean-up, by cache folder."""
 
 
@@ -173,16 +173,16 @@ def forget_entries(unused_s: float = UNUSED_S, limit_bytes: int | None = None) -
     folder = cache_folder()
     now_s = time.time()
     room = cache_limit_bytes() if limit_bytes is None else limit_bytes
-    _sweep(folder)
-    doomed: list[CacheEntry] = []
+    _remove_unfinished(folder)
+    expired: list[CacheEntry] = []
     entries = cache_entries()
     room -= sum(entry.size_bytes for entry in entries if entry.kind.stays)
     for entry in sorted(entries, key=lambda one: one.used_s, reverse=True):
         if not entry.kind.stays:
             room -= entry.size_bytes
             if room < 0 or now_s - entry.used_s >= unused_s:
-                doomed.append(entry)
-    return _take_away(folder, doomed) if doomed else Forgotten()
+                expired.append(entry)
+    return _delete_entries(folder, expired) if expired else Forgotten()
 
 
 def cache_entries() -> list[CacheEntry]:
@@ -198,29 +198,29 @@ def cache_entries() -> list[CacheEntry]:
 
 def say_not_kept(folder: Path, error: Exception) -> None:
     """Print that something could not be cached, once in a process for each message."""
-    _say_once(f"note: {folder}: not kept for the next process, which makes it anew: {error}")
+    _print_once(f"note: {folder}: not kept for the next process, which makes it anew: {error}")
 
 
 @cache
-def _say_once(words: str) -> None:
+def _print_once(words: str) -> None:
     print(words, file=sys.stderr, flush=True)
 
 
-class _Uses:
+class _InUseList:
     """List file of the entries that this process uses."""
 
     def __init__(self, folder: Path) -> None:
-        lists = folder / _LISTS
+        lists = folder / _IN_USE_FOLDER
         lists.mkdir(parents=True, exist_ok=True)
         self._folder = folder
         self._listed = set[str]()
         self._file = lists / f"{os.getpid()}-{secrets.token_hex(4)}"
         with lock(folder / _LOCK):
-            if sum(1 for _ in os.scandir(lists)) > _MOST_DEAD:
+            if sum(1 for _ in os.scandir(lists)) > _MOST_LISTS:
                 _remove_dead_lists(lists)
             self._held = lock(self._file)
             self._held.acquire()
-        atexit.register(_remove_own, self._file, os.getpid())
+        atexit.register(_remove_list_of, self._file, os.getpid())
 
     def add(self, entry: Path) -> None:
         name = entry.relative_to(self._folder).as_posix()
@@ -234,31 +234,31 @@ class _Uses:
 
 
 @cache
-def _uses(folder: Path, _pid: int) -> _Uses:
+def _in_use_list(folder: Path, _pid: int) -> _InUseList:
     """Return this process's list. A forked child starts a list of its own."""
-    return _Uses(folder)
+    return _InUseList(folder)
 
 
-def _take_away(folder: Path, doomed: list[CacheEntry]) -> Forgotten:
+def _delete_entries(folder: Path, expired: list[CacheEntry]) -> Forgotten:
     """Move entries aside that are still unused, then delete them."""
-    gone = []
-    kept = []
-    with suppress(OSError), temp_folder(_FORGOTTEN, folder) as aside, lock(folder / _LOCK):
-        listed = _listed_by_the_living(folder / _LISTS)
+    removed = []
+    in_use = []
+    with suppress(OSError), temp_folder(_REMOVED, folder) as trash, lock(folder / _LOCK):
+        listed = _entries_in_use(folder / _IN_USE_FOLDER)
         now_s = time.time()
-        for number, entry in enumerate(doomed):
+        for number, entry in enumerate(expired):
             used_s = _used_s(entry.path)
             name = entry.path.relative_to(folder).as_posix()
             if used_s > entry.used_s or (name in listed and now_s - used_s < _IN_USE_S):
-                kept.append(entry)
+                in_use.append(entry)
                 continue
             with suppress(OSError):
-                entry.path.rename(aside / str(number))
-                gone.append(entry)
-    return Forgotten(tuple(gone), tuple(kept))
+                entry.path.rename(trash / str(number))
+                removed.append(entry)
+    return Forgotten(tuple(removed), tuple(in_use))
 
 
-def _listed_by_the_living(lists: Path) -> set[str]:
+def _entries_in_use(lists: Path) -> set[str]:
     _remove_dead_lists(lists)
     listed: set[str] = set()
     for path in lists.glob("*"):
@@ -275,16 +275,16 @@ def _remove_dead_lists(lists: Path) -> None:
                 path.unlink()
 
 
-def _remove_own(path: Path, pid: int) -> None:
+def _remove_list_of(path: Path, pid: int) -> None:
     """Remove the list of a process when it exits, but not when a forked child exits."""
     if os.getpid() == pid:
         with suppress(OSError):
             path.unlink()
 
 
-def _sweep(folder: Path) -> None:
+def _remove_unfinished(folder: Path) -> None:
     """Remove unfinished files of killed processes. `atomic_folder` does this for imported maps."""
-    remove_dead(folder, _FORGOTTEN)
+    remove_dead(folder, _REMOVED)
     remove_dead(folder, BUILDING)
     places = {(folder / kind.pattern).parent for kind in CACHE_KINDS if not kind.stays}
     for place in (*places, *folder.glob("tiles/*")):
@@ -346,19 +346,19 @@ def _read(path: Path, mapped: bool) -> memoryview:
             data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
     else:
         data = memoryview(path.read_bytes())
-    body = data[_SEAL_BYTES:]
-    if hashlib.sha256(body).hexdigest().encode() != data[:_SEAL_BYTES]:
+    body = data[_HASH_BYTES:]
+    if hashlib.sha256(body).hexdigest().encode() != data[:_HASH_BYTES]:
         raise ValueError(f"{path}: damaged")
     return body
 
 
 def _write(path: Path, parts: list[bytes | memoryview]) -> None:
     """Write a cached file. If several processes write it at once, the last one wins."""
-    seal = hashlib.sha256()
+    digest = hashlib.sha256()
     for part in parts:
-        seal.update(part)
+        digest.update(part)
     with atomic_file(path, shared=True) as making, making.open("wb") as file:
-        file.write(seal.hexdigest().encode())
+        file.write(digest.hexdigest().encode())
         file.writelines(parts)
 
 
@@ -367,7 +367,7 @@ def sources_hash(*rooms: Path) -> str:
 
     Call it when a module is imported: later edits do not change what this process makes.
     """
-    seen = hashlib.sha256(" ".join(version(package) for package in _MADE_WITH).encode())
+    seen = hashlib.sha256(" ".join(version(package) for package in _ARRAY_PACKAGES).encode())
     for room in rooms:
         for source in sorted(room.rglob("*.py")):
             seen.update(source.relative_to(room).as_posix().encode() + b"\0" + source.read_bytes())
@@ -448,7 +448,7 @@ def _decoded(body: memoryview) -> Arrays:
 
 
 def _aligned(count: int) -> int:
-    return -(-count // _ALIGNED) * _ALIGNED
+    return -(-count // _ALIGNMENT_BYTES) * _ALIGNMENT_BYTES
 
 
 @lru_cache(maxsize=64)

@@ -15,9 +15,9 @@ from cosim.core.framing import Wire
 
 _PR_SET_PDEATHSIG = 1
 """Number of Linux's prctl operation that sends a signal when the parent dies."""
-_ENDING_S = 5.0
+_EXIT_TIMEOUT_S = 5.0
 """Time that a child has to exit after closing its socket, in seconds; then it is killed."""
-_LOOK_S = 0.001
+_POLL_INTERVAL_S = 0.001
 """Interval at which an exiting child is polled, in seconds."""
 
 
@@ -56,7 +56,7 @@ class ForkedChild:
         self._pid = os.fork()
         if self._pid == 0:
             ours.close()
-            _be_child(serves, theirs, parent, room_bytes)
+            _run_child(serves, theirs, parent, room_bytes)
         theirs.close()
         self.wire = Wire(ours)
 
@@ -72,7 +72,7 @@ class ForkedChild:
         killed."""
         pid = self._pid
         self._pid = 0
-        until_s = time.monotonic() + _ENDING_S
+        until_s = time.monotonic() + _EXIT_TIMEOUT_S
         try:
             while True:
                 ended, status = os.waitpid(pid, os.WNOHANG)
@@ -80,12 +80,12 @@ class ForkedChild:
                     return ended_in_words(os.waitstatus_to_exitcode(status))
                 if time.monotonic() > until_s:
                     os.kill(pid, signal.SIGKILL)
-                time.sleep(_LOOK_S)
+                time.sleep(_POLL_INTERVAL_S)
         except ChildProcessError:  # other code in this process reaped the child
             return "has ended"
 
 
-def _be_child(
+def _run_child(
     serves: Callable[[Wire], None], end: socket.socket, parent: int, room_bytes: int
 ) -> None:
     """Run the child's function with its limits, then exit."""
@@ -94,9 +94,9 @@ def _be_child(
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
         end_with(parent)
-        nowhere = os.open(os.devnull, os.O_RDWR)
+        null_device = os.open(os.devnull, os.O_RDWR)
         for descriptor in range(3):
-            os.dup2(nowhere, descriptor)
+            os.dup2(null_device, descriptor)
         pages = int(Path("/proc/self/statm").read_text().split()[0])
         most = pages * resource.getpagesize() + room_bytes
         _limit(resource.RLIMIT_AS, most)

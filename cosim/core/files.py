@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 MAKING: Final = ".making-"
 """Prefix of unfinished folders, and of unfinished files that several processes write."""
-_HELD: Final = ".held"
+_LOCK_FILE: Final = ".held"
 """File in a temporary folder that its process locks."""
 _OLD: Final = ".old"
 """Folder in a temporary folder that holds the replaced folder."""
-_YOUNG_S: Final = 3600.0
+_IN_USE_S: Final = 3600.0
 """Age in seconds below which an unfinished file or unlocked folder counts as in use."""
 
 
@@ -91,9 +91,9 @@ def temp_folder(prefix: str, parent: Path | None = None) -> Iterator[Path]:
     remove_dead(parent, prefix)
     with tempfile.TemporaryDirectory(prefix=prefix, dir=parent, ignore_cleanup_errors=True) as name:
         folder = Path(name)
-        new = folder / f"{_HELD}.new"
+        new = folder / f"{_LOCK_FILE}.new"
         with lock(new):
-            new.rename(folder / _HELD)  # locked before other processes can see it
+            new.rename(folder / _LOCK_FILE)  # locked before other processes can see it
             try:
                 yield folder
             finally:
@@ -146,15 +146,17 @@ def remove_dead(parent: Path, prefix: str) -> None:
 
     A folder that such a process was replacing is restored.
     """
-    for left in parent.glob(f"{prefix}*"):
+    for leftover in parent.glob(f"{prefix}*"):
         with suppress(OSError):
-            young = time.time() - left.stat().st_mtime < _YOUNG_S
-            if not left.is_dir():
-                if not young:
-                    left.unlink()
-            elif not (is_locked(left / _HELD) if (left / _HELD).exists() else young):
-                _restore(left)
-                shutil.rmtree(left)
+            recent = time.time() - leftover.stat().st_mtime < _IN_USE_S
+            if not leftover.is_dir():
+                if not recent:
+                    leftover.unlink()
+            elif not (
+                is_locked(leftover / _LOCK_FILE) if (leftover / _LOCK_FILE).exists() else recent
+            ):
+                _restore(leftover)
+                shutil.rmtree(leftover)
 
 
 def _restore(scratch: Path) -> None:

@@ -26,8 +26,8 @@ class Wire:
 
     def __init__(self, end: socket.socket, most_bytes: int = MOST_WIRED_BYTES) -> None:
         self._end = end
-        self._held = bytearray()
-        self._unsent = bytearray()
+        self._incoming = bytearray()
+        self._outgoing = bytearray()
         self._most_bytes = most_bytes
 
     def fileno(self) -> int:
@@ -41,15 +41,15 @@ class Wire:
 
     def post(self, message: bytes) -> None:
         """Send a message without waiting; `flush` sends the rest. Raises OSError as `send` does."""
-        self._unsent += _LENGTH.pack(len(message)) + message
+        self._outgoing += _LENGTH.pack(len(message)) + message
         self.flush()
 
     def flush(self) -> None:
         """Send as much of the posted messages as the buffer takes."""
         self._end.setblocking(False)
         with suppress(BlockingIOError):
-            while self._unsent:
-                del self._unsent[: self._end.send(self._unsent)]
+            while self._outgoing:
+                del self._outgoing[: self._end.send(self._outgoing)]
 
     def receive(self, within_s: float | None = None) -> bytes:
         """Wait for the next message and return it.
@@ -57,9 +57,9 @@ class Wire:
         Raises EOFError when the other end is closed, TimeoutError after `within_s` seconds.
         """
         until_s = None if within_s is None else time.monotonic() + within_s
-        while (message := self._next()) is None:
+        while (message := self._next_message()) is None:
             self._end.settimeout(None if until_s is None else max(until_s - time.monotonic(), 1e-3))
-            self._take()
+            self._read_chunk()
         return message
 
     def received(self) -> Iterator[bytes]:
@@ -68,32 +68,32 @@ class Wire:
         self._end.setblocking(False)
         try:
             while True:
-                while (message := self._next()) is not None:
+                while (message := self._next_message()) is not None:
                     yield message
-                self._take()
+                self._read_chunk()
         except BlockingIOError:
             return
 
     def close(self) -> None:
         self._end.close()
 
-    def _take(self) -> None:
+    def _read_chunk(self) -> None:
         try:
             chunk = self._end.recv(_CHUNK_BYTES)
         except ConnectionResetError:
             chunk = b""
         if not chunk:
             raise EOFError
-        self._held += chunk
+        self._incoming += chunk
 
-    def _next(self) -> bytes | None:
-        if len(self._held) < _LENGTH.size:
+    def _next_message(self) -> bytes | None:
+        if len(self._incoming) < _LENGTH.size:
             return None
-        end = _LENGTH.size + int(_LENGTH.unpack_from(self._held)[0])
+        end = _LENGTH.size + int(_LENGTH.unpack_from(self._incoming)[0])
         if end > self._most_bytes:
             raise EOFError
-        if len(self._held) < end:
+        if len(self._incoming) < end:
             return None
-        message = bytes(self._held[_LENGTH.size : end])
-        del self._held[:end]
+        message = bytes(self._incoming[_LENGTH.size : end])
+        del self._incoming[:end]
         return message

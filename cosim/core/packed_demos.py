@@ -102,10 +102,10 @@ def packed_digest(path: Path) -> str:
     """
     try:
         with zipfile.ZipFile(path) as held:
-            told = [(one.filename, one.file_size, one.CRC) for one in held.infolist()]
+            checksums = [(one.filename, one.file_size, one.CRC) for one in held.infolist()]
     except (OSError, *NO_NPZ) as error:
-        raise _none_in(path, error) from error
-    return hashlib.blake2b(repr(told).encode(), digest_size=8).hexdigest()
+        raise _unreadable(path, error) from error
+    return hashlib.blake2b(repr(checksums).encode(), digest_size=8).hexdigest()
 
 
 def read_packed(path: Path) -> Packed:
@@ -117,9 +117,9 @@ def read_packed(path: Path) -> Packed:
         if meta.pop("format") != _FORMAT or len({len(array) for array in arrays.values()}) != 1:
             raise ValueError("its arrays are of different lengths, or of another format")
     except (OSError, *NO_NPZ) as error:
-        raise _none_in(path, error) from error
+        raise _unreadable(path, error) from error
     return Packed(**arrays, meta=meta)
 
 
-def _none_in(path: Path, error: Exception) -> RunError:
+def _unreadable(path: Path, error: Exception) -> RunError:
     return RunError(f"{path}: no packed demonstrations: {error}: make it with `cosim dataset pack`")

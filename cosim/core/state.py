@@ -312,7 +312,7 @@ LABELS: Mapping[str, int] = MappingProxyType(
 """Semantic ids of a label picture."""
 
 
-_SAME = slice(None)
+_ALL_ROWS = slice(None)
 
 
 @dataclass(slots=True)
@@ -331,7 +331,7 @@ class RowLookup:
         a slice, so that indexing makes no copy.
         """
         if ids and ids == self._ids:
-            return _SAME, []
+            return _ALL_ROWS, []
         index = {name: i for i, name in enumerate(self._ids)}
         row = [index.get(name, -1) for name in ids]
         self._ids = ids

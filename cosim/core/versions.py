@@ -10,7 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
 
-_ASKED = 4096
+_ARGUMENT_COUNT = 4096
 """Number of arguments for each function. Implementations that differ at all do so for about one in
 some hundred."""
 
@@ -22,7 +22,7 @@ def arithmetic() -> str:
     It takes 6 ms, once in a process.
     """
     share = (
-        np.arange(1, _ASKED + 1, dtype=np.uint64)
+        np.arange(1, _ARGUMENT_COUNT + 1, dtype=np.uint64)
         * np.uint64(2654435761)
         % np.uint64(1 << 32)
         / 2.0**32
@@ -31,8 +31,8 @@ def arithmetic() -> str:
     angle = (share - 0.5) * 40.0
     ratio = 2.0 * share - 1.0
     power = (share - 0.5) * 20.0
-    much = share * 100.0
-    of_one = (
+    large = share * 100.0
+    unary = (
         (math.sin, np.sin, angle),
         (math.cos, np.cos, angle),
         (math.tan, None, angle),
@@ -40,18 +40,18 @@ def arithmetic() -> str:
         (math.asin, np.arcsin, ratio),
         (math.acos, np.arccos, ratio),
         (math.exp, np.exp, power),
-        (math.log, np.log, much),
+        (math.log, np.log, large),
     )
-    of_two = ((math.atan2, np.arctan2), (math.hypot, np.hypot), (math.pow, np.power))
+    binary = ((math.atan2, np.arctan2), (math.hypot, np.hypot), (math.pow, np.power))
     bits = hashlib.blake2b(digest_size=8)
-    for plain, array, asked in of_one:
-        bits.update(np.array([plain(value) for value in asked.tolist()]).tobytes())
+    for scalar, array, arguments in unary:
+        bits.update(np.array([scalar(value) for value in arguments.tolist()]).tobytes())
         if array is not None:
-            bits.update(array(asked).tobytes())
-    for plain_2, array_2 in of_two:
-        pairs = zip(much.tolist(), other.tolist(), strict=True)
-        bits.update(np.array([plain_2(one, two) for one, two in pairs]).tobytes())
-        bits.update(array_2(much, other).tobytes())
+            bits.update(array(arguments).tobytes())
+    for scalar_2, array_2 in binary:
+        pairs = zip(large.tolist(), other.tolist(), strict=True)
+        bits.update(np.array([scalar_2(one, two) for one, two in pairs]).tobytes())
+        bits.update(array_2(large, other).tobytes())
     return bits.hexdigest()
 
 

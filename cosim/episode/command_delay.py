@@ -25,8 +25,8 @@ class InFlight:
     """Pending commands of an episode, in the order of their ticks."""
 
     def __init__(self) -> None:
-        self._way: deque[tuple[int, Command]] = deque()
-        self._holds = STILL
+        self._pending: deque[tuple[int, Command]] = deque()
+        self._current = STILL
         self._answers: list[tuple[float, float, float, float]] = []
         self._plans: list[NDArray[np.float32]] = []
         self._index = 0
@@ -36,7 +36,7 @@ class InFlight:
     def answered(self, tick: int, delay: int, command: Command) -> None:
         """Add a command for the observation of `tick`, which takes effect `delay` ticks later."""
         self.arrived_by = tick + delay
-        self._way.append((self.arrived_by, command))
+        self._pending.append((self.arrived_by, command))
         self._answers.append((tick, delay, command.v_mps, command.w_radps))
         if isinstance(command, Planned):
             self._plans.append(command.waypoints)
@@ -46,14 +46,14 @@ class InFlight:
 
     def at(self, tick: int) -> Command:
         """Return the command that holds during a tick."""
-        while self._way and self._way[0][0] <= tick:
-            _, self._holds = self._way.popleft()
-        return self._holds
+        while self._pending and self._pending[0][0] <= tick:
+            _, self._current = self._pending.popleft()
+        return self._current
 
     def put_back(self) -> None:
         """Discard pending commands: the robot was reset and is at rest."""
-        self._way.clear()
-        self._holds = STILL
+        self._pending.clear()
+        self._current = STILL
 
     @property
     def answers(self) -> Floats:

@@ -27,13 +27,13 @@ _MOST_SHOWN = 80
 """Maximum length of an answer in a message, in characters."""
 _COLUMNS = (2, 4)
 """Valid numbers of columns of waypoints."""
-_MOST_KEPT = 256
+_MOST_RECORDED = 256
 """Maximum number of recorded waypoints of an answer; all up to the followed one are recorded."""
 _LARGEST = float(np.finfo(np.float32).max)
 """Largest float32."""
 
 
-def _followed(x_m: float, y_m: float, heading_rad: float | None, rule: WaypointRule) -> Command:
+def _command_for(x_m: float, y_m: float, heading_rad: float | None, rule: WaypointRule) -> Command:
     """Return the unclipped command for one waypoint (x forward, y left).
 
     heading_rad: heading of the waypoint, None without one.
@@ -78,15 +78,17 @@ def command_of(answer: object, *, rule: WaypointRule, robot: Robot) -> Command:
     waypoints = _waypoints(answer, rule.index)
     x, y, *turn = waypoints[rule.index].tolist()
     heading_rad = math.atan2(turn[1], turn[0]) if turn else None
-    command = clipped(_followed(x * rule.unit_m, y * rule.unit_m, heading_rad, rule), robot)
+    command = clipped(_command_for(x * rule.unit_m, y * rule.unit_m, heading_rad, rule), robot)
     waypoints[:, :2] *= rule.unit_m
     return _planned(command, waypoints, rule.index)
 
 
 def _planned(command: Command, waypoints: Floats, index: int) -> Planned:
     """Return a command together with its waypoints in metres."""
-    kept = np.clip(waypoints[: max(_MOST_KEPT, index + 1)], -_LARGEST, _LARGEST).astype(np.float32)
-    return Planned(command.v_mps, command.w_radps, kept, index)
+    recorded = np.clip(waypoints[: max(_MOST_RECORDED, index + 1)], -_LARGEST, _LARGEST).astype(
+        np.float32
+    )
+    return Planned(command.v_mps, command.w_radps, recorded, index)
 
 
 def _waypoints(answer: object, index: int) -> Floats:

@@ -50,7 +50,8 @@ def calibration_of(spec: CameraSpec, robot: Robot) -> Calibration:
     """Return the calibration of a camera on a robot, in OpenCV's convention.
 
     >>> from cosim.spec.robot import COURIER
-    >>> calibration_of(CameraSpec(width=96, height=96, fov_deg=90.0), COURIER).matrix[0].tolist()
+    >>> spec = CameraSpec(width=96, height=96, fov_deg=90.0)
+    >>> calibration_of(spec, COURIER).matrix[0].round(3).tolist()
     [48.0, 0.0, 47.5]
     """
     mount = spec.on(robot)

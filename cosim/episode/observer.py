@@ -39,13 +39,13 @@ def odometer_for(kind: OdometryKind, start: Pose, draws: np.random.Generator) ->
     """
     if kind == "wheel":
         return WheelOdometer(draws)
-    return Gps(start, draws) if kind == "gps" else _Errorless(start, told=kind == "exact")
+    return Gps(start, draws) if kind == "gps" else _ExactOdometer(start, reported=kind == "exact")
 
 
-class _Errorless:
-    def __init__(self, start: Pose, told: bool) -> None:
+class _ExactOdometer:
+    def __init__(self, start: Pose, reported: bool) -> None:
         self._start = start
-        self._told = told
+        self._reported = reported
 
     def moved(self, before: Pose, after: Pose) -> None:
         """Nothing to count."""
@@ -53,7 +53,7 @@ class _Errorless:
     def read(self, pose: Pose, time_s: float) -> Odometry | None:
         place = seen_from(self._start, pose)
         turned = wrap_angle(pose.heading_rad - self._start.heading_rad)
-        return Odometry(place.x_m, place.y_m, turned) if self._told else None
+        return Odometry(place.x_m, place.y_m, turned) if self._reported else None
 
 
 class WheelOdometer:
@@ -104,9 +104,9 @@ class Gps:
         """Nothing to count."""
 
     def read(self, pose: Pose, time_s: float) -> Odometry:
-        kept = math.exp(-(time_s - self._time_s) / self._noise.bias_s)
-        fresh = math.sqrt(1.0 - kept * kept) * self._noise.bias_m
-        self._bias_m = kept * self._bias_m + fresh * self._draws.standard_normal(2)
+        decay = math.exp(-(time_s - self._time_s) / self._noise.bias_s)
+        fresh = math.sqrt(1.0 - decay * decay) * self._noise.bias_m
+        self._bias_m = decay * self._bias_m + fresh * self._draws.standard_normal(2)
         self._time_s = time_s
         place = seen_from(self._start, pose)
         x_m, y_m = (self._bias_m + self._noise.noise_m * self._draws.standard_normal(2)).tolist()
@@ -136,7 +136,7 @@ class Observer:
             return np.random.default_rng(seed_for(purpose, run_seed, scenario))
 
         spec = manifest.camera
-        self._called = pseudonym_of(run_seed, scenario).episode
+        self._episode_id = pseudonym_of(run_seed, scenario).episode
         self._robot = robot_called(scenario.robot)
         self._manifest = manifest
         self._known = known
@@ -164,7 +164,7 @@ class Observer:
         # Before the robot's own picture: the camera's last frame must be that one.
         goal = self._goals.at(robot.pose, now.route_s_m)
         frame = None if camera is None else camera.render(robot, now.street)
-        seen = Observation(
+        observation = Observation(
             tick=now.tick,
             time_s=time_s,
             rgb=None if frame is None else frame.rgb,
@@ -172,7 +172,7 @@ class Observer:
             w_radps=robot.w_radps,
             robot=self._robot,
             privileged=self._known(now) if self._manifest.privileged else None,
-            episode=self._called,
+            episode=self._episode_id,
             reset=put_back,
             goal=goal,
             odometry=self._odometer.read(robot.pose, time_s),
@@ -180,11 +180,11 @@ class Observer:
             depth=frame.depth if frame is not None and spec is not None and spec.depth else None,
             labels=frame.labels if frame is not None and spec is not None and spec.labels else None,
             pictures={
-                name: self._picture(further, self._manifest.cameras[name], now)
-                for name, further in self._cameras.items()
+                name: self._picture(extra, self._manifest.cameras[name], now)
+                for name, extra in self._cameras.items()
             },
         )
-        return seen, frame
+        return observation, frame
 
     def _picture(self, camera: Camera, spec: CameraSpec, now: Moment) -> CameraPicture:
         """Return the picture of a further camera."""

@@ -77,9 +77,9 @@ class Driver:
         self._policy = policy
         self._timer = timer
         self._begun = ""
-        self._answered = False
+        self._has_answered = False
         self._route: tuple[Polyline, Polyline] | None = None
-        self._hears: Callable[[object], None] | None = None
+        self._on_answer: Callable[[object], None] | None = None
 
     @property
     def policy(self) -> Policy:
@@ -112,7 +112,7 @@ class Driver:
     def reset(self, episode_id: str, seed: int) -> None:
         """Start an episode. Raises PolicyError."""
         self._begun = episode_id
-        self._answered = False
+        self._has_answered = False
         self._route = None
         with self._asked("reset", 0):
             self._policy.reset(episode_id, seed)
@@ -121,38 +121,38 @@ class Driver:
         """Return the policy's command. Raises PolicyError for an exception or an invalid answer."""
         own = self._own(observation)
         if own.reset:
-            self._tell_reset(own.episode, own.tick)
-        with self._asked("act" if self._answered else "first act", observation.tick):
+            self._call_on_reset(own.episode, own.tick)
+        with self._asked("act" if self._has_answered else "first act", observation.tick):
             answer = self._policy.act(own)
-            if self._hears is not None:
-                self._hears(answer)
+            if self._on_answer is not None:
+                self._on_answer(answer)
             command = command_of(answer, rule=self.manifest.waypoints, robot=own.robot)
-        self._answered = True
+        self._has_answered = True
         return command
 
     def heard_by(self, hears: Callable[[object], None]) -> None:
         """Set a callback for raw answers, before checks and limits."""
-        self._hears = hears
+        self._on_answer = hears
 
     def ended(self) -> None:
         """End an episode, if one has started, for a policy that serves many. Exceptions are
         printed."""
         if self._begun and self.batches:
-            self._tell_ended(self._begun)
+            self._call_ended(self._begun)
         self._begun = ""
 
-    def _tell_reset(self, episode_id: str, tick: int) -> None:
+    def _call_on_reset(self, episode_id: str, tick: int) -> None:
         """Call the policy's `on_reset`, if it has one. Raises PolicyError."""
-        if callable(told := getattr(self._policy, "on_reset", None)):
+        if callable(callback := getattr(self._policy, "on_reset", None)):
             with self._asked("on_reset", tick):
-                told(*([episode_id] if self.batches else []))
+                callback(*([episode_id] if self.batches else []))
 
-    def _tell_ended(self, episode_id: str) -> None:
+    def _call_ended(self, episode_id: str) -> None:
         """Call the policy's `ended`, if it has one; print its exception."""
         try:
-            if callable(told := getattr(self._policy, "ended", None)):
+            if callable(callback := getattr(self._policy, "ended", None)):
                 with self._asked("ended", 0):
-                    told(episode_id)
+                    callback(episode_id)
         except PolicyError as error:
             traceback.print_exception(error)
 
@@ -186,12 +186,12 @@ class Driver:
                 for name, one in pictures.items()
             },
             goal=None if observation.goal is None else observation.goal.copied(),
-            privileged=self._own_knowledge(known)
+            privileged=self._copied_privileged(known)
             if known is not None and self.manifest.privileged
             else None,
         )
 
-    def _own_knowledge(self, known: Privileged) -> Privileged:
+    def _copied_privileged(self, known: Privileged) -> Privileged:
         """Return a copy of the simulator state; the route is copied once in an episode, `free` is
         immutable."""
         if self._route is None or self._route[0] is not known.route:

@@ -102,18 +102,18 @@ def steered(
     speed_mps = math.hypot(*wanted_mps)
     if speed_mps < _EPS:
         return wanted_mps
-    disks = _seen(at_m, wanted_mps, neighbours, room_m)
+    disks = _relevant_disks(at_m, wanted_mps, neighbours, room_m)
     if not disks and all(_permits(wall, *wanted_mps) for wall in walls):
         return wanted_mps
     if (
         math.dist(moving_mps, wanted_mps) < _EPS
-        and _meets_in_s(*wanted_mps, disks, walls, horizon_s) >= horizon_s
+        and _time_to_encounter_s(*wanted_mps, disks, walls, horizon_s) >= horizon_s
     ):
         return wanted_mps
-    heading_mps, is_open = _most_open(wanted_mps, moving_mps, disks, walls, horizon_s)
+    heading_mps, is_open = _freest_heading(wanted_mps, moving_mps, disks, walls, horizon_s)
     if not is_open:
-        disks = _seen(at_m, wanted_mps, neighbours, SHOULDER_TO_SHOULDER_M)
-        heading_mps, _ = _most_open(wanted_mps, moving_mps, disks, walls, horizon_s)
+        disks = _relevant_disks(at_m, wanted_mps, neighbours, SHOULDER_TO_SHOULDER_M)
+        heading_mps, _ = _freest_heading(wanted_mps, moving_mps, disks, walls, horizon_s)
     planes = [
         half_plane(d.apart_m, moving_mps, d.moving_mps, d.keep_m, horizon_s, d.share, PARTED_S)
         for d in disks
@@ -125,7 +125,7 @@ def steered(
     return x_mps, y_mps
 
 
-def _seen(
+def _relevant_disks(
     at_m: Vector, wanted_mps: Vector, neighbours: Sequence[Neighbour], room_m: float
 ) -> list[_Disk]:
     """Return the relevant neighbours and the distance to keep: `room_m`, or the current distance if
@@ -142,7 +142,7 @@ def _seen(
     return disks
 
 
-def _lets_pass(disk: _Disk, wanted_mps: Vector) -> bool:
+def _yields_to(disk: _Disk, wanted_mps: Vector) -> bool:
     """Return whether a neighbour that steers comes from the left: the person from the right goes
     first."""
     (dx, dy) = disk.apart_m
@@ -152,7 +152,7 @@ def _lets_pass(disk: _Disk, wanted_mps: Vector) -> bool:
     return disk.share < 1.0 and across and x * dy - y * dx > 0.0
 
 
-def _most_open(
+def _freest_heading(
     wanted_mps: Vector,
     moving_mps: Vector,
     disks: Sequence[_Disk],
@@ -165,16 +165,16 @@ def _most_open(
     sides, the side of the current motion wins; for straight motion the right.
     """
     x, y = wanted_mps
-    disks = [disk for disk in disks if not _lets_pass(disk, wanted_mps)]
+    disks = [disk for disk in disks if not _yields_to(disk, wanted_mps)]
     best = wanted_mps
-    latest_s = _meets_in_s(x, y, disks, walls, horizon_s)
+    latest_s = _time_to_encounter_s(x, y, disks, walls, horizon_s)
     if latest_s >= horizon_s:
         return best, True
     side = 1.0 if x * moving_mps[1] - y * moving_mps[0] > _EPS else -1.0
     for cos, sin in TURNS:
         for aside in (side * sin, -side * sin):
             turned = (cos * x - aside * y, aside * x + cos * y)
-            in_s = _meets_in_s(*turned, disks, walls, horizon_s, latest_s)
+            in_s = _time_to_encounter_s(*turned, disks, walls, horizon_s, latest_s)
             if in_s >= horizon_s:
                 return turned, True
             if in_s > latest_s:
@@ -182,7 +182,7 @@ def _most_open(
     return best, False
 
 
-def _meets_in_s(
+def _time_to_encounter_s(
     x_mps: float,
     y_mps: float,
     disks: Sequence[_Disk],
@@ -239,7 +239,8 @@ def nearby_people(people: People) -> tuple[NearbyPerson, ...]:
         (speed[rows] * np.cos(heading[rows])).tolist(),
         (speed[rows] * np.sin(heading[rows])).tolist(),
     )
-    told = zip(rows, people.xy[rows].tolist(), vx, vy, people.kind[rows].tolist(), strict=True)
+    columns = zip(rows, people.xy[rows].tolist(), vx, vy, people.kind[rows].tolist(), strict=True)
     return tuple(
-        NearbyPerson(people.ids[i], x, y, u, v, PersonKind(kind)) for i, (x, y), u, v, kind in told
+        NearbyPerson(people.ids[i], x, y, u, v, PersonKind(kind))
+        for i, (x, y), u, v, kind in columns
     )

@@ -96,19 +96,19 @@ def stepped_round(
     ):
         return wanted
     turn = _axes(body)
-    everybody = offset @ turn
-    rows = np.flatnonzero(_gap(everybody, low, high + reach) < STEP_ROUND_GAP_M)
+    offsets = offset @ turn
+    rows = np.flatnonzero(_disk_gap(offsets, low, high + reach) < STEP_ROUND_GAP_M)
     if not len(rows):
         return wanted
     local = ((before - body.pose.xy) @ turn)[rows]
-    near = everybody[rows]
+    near = offsets[rows]
     step = near - local
     pace = np.hypot(step[:, 0], step[:, 1])
     side = np.where(local[:, 0] * step[:, 1] - local[:, 1] * step[:, 0] >= 0.0, 1.0, -1.0)
 
     if body.closed != (0.0, 0.0):
-        shut = np.array(body.closed) @ turn
-        to_left = step[:, 0] * shut[1] - step[:, 1] * shut[0]
+        closed_side = np.array(body.closed) @ turn
+        to_left = step[:, 0] * closed_side[1] - step[:, 1] * closed_side[0]
         side = np.where(to_left == 0.0, side, np.where(to_left > 0.0, 1.0, -1.0))
 
     out = local - np.clip(local, low, high)
@@ -116,7 +116,7 @@ def stepped_round(
     normal = out / np.maximum(far, 1e-9)[:, None]
     inward = -(step * normal).sum(axis=1)
     tangent = np.column_stack([-normal[:, 1], normal[:, 0]])
-    slides = (_gap(near, low, high) < STEP_ROUND_GAP_M) & (inward > 0.0) & (far > 1e-6)
+    slides = (_disk_gap(near, low, high) < STEP_ROUND_GAP_M) & (inward > 0.0) & (far > 1e-6)
     moved = np.where(slides[:, None], local + tangent * (side * pace)[:, None], near)
     if stand is not None:
         back = np.clip(STEP_ROUND_GAP_M + PERSON_RADIUS_M - far, 0.0, DRAWS_BACK_M)
@@ -126,8 +126,8 @@ def stepped_round(
     meets = ~slides & (step[:, 0] < 0.0) & (local[:, 0] > length)
     aside = np.where(local[:, 1] >= 0.0, pace, -pace)
     moved[meets] = local[meets] + np.column_stack([np.zeros_like(aside), aside])[meets]
-    everybody[rows] = moved
-    rounded: Floats = everybody @ turn.T + body.pose.xy
+    offsets[rows] = moved
+    rounded: Floats = offsets @ turn.T + body.pose.xy
     return rounded
 
 
@@ -135,9 +135,9 @@ def comes_too_near(before: Floats, after: Floats, body: RobotBody) -> NDArray[np
     """Return whether each step approaches the robot's outline below the gap, (N,) booleans."""
     turn = _axes(body)
     half = np.array(body.half_m)
-    gap = _gap((after - body.pose.xy) @ turn, -half, half)
+    gap = _disk_gap((after - body.pose.xy) @ turn, -half, half)
     near: NDArray[np.bool_] = (gap < STEP_ROUND_GAP_M) & (
-        gap < _gap((before - body.pose.xy) @ turn, -half, half)
+        gap < _disk_gap((before - body.pose.xy) @ turn, -half, half)
     )
     return near
 
@@ -146,7 +146,7 @@ def touches(xy: Floats, body: RobotBody, within_m: float = TOUCH_M) -> bool:
     """Return whether a person's disk at (2,) metres is within `within_m` of the robot's outline."""
     local = (np.asarray(xy) - body.pose.xy)[None] @ _axes(body)
     half = np.array(body.half_m)
-    return bool(_gap(local, -half, half)[0] <= within_m)
+    return bool(_disk_gap(local, -half, half)[0] <= within_m)
 
 
 def _axes(body: RobotBody) -> Floats:
@@ -155,7 +155,7 @@ def _axes(body: RobotBody) -> Floats:
     return np.array([[cos, -sin], [sin, cos]])
 
 
-def _gap(points: Floats, low: Floats, high: Floats) -> Floats:
+def _disk_gap(points: Floats, low: Floats, high: Floats) -> Floats:
     """Return the distance from people's disks to an axis-aligned box, (N,) metres."""
     away = points - np.clip(points, low, high)
     gap: Floats = np.hypot(away[:, 0], away[:, 1]) - PERSON_RADIUS_M
@@ -174,9 +174,9 @@ class Standing:
 
     def __init__(self, bodies: Sequence[StandingBody] = ()) -> None:
         self.bodies = tuple(bodies)
-        self._seen = [as_met(body) for body in self.bodies]
+        self._footprints = [as_met(body) for body in self.bodies]
         self._xy = np.array([(body.x_m, body.y_m) for body in self.bodies]).reshape(-1, 2)
-        self._reach_m = np.array([within_reach_m(body) for body in self._seen])
+        self._reach_m = np.array([within_reach_m(body) for body in self._footprints])
 
     def near(self, xy: Floats, margin_m: float = 0.0) -> tuple[StandingBody, ...]:
         """Return the obstacles near people at (N, 2) metres, within stepping distance plus a
@@ -189,7 +189,7 @@ class Standing:
         """Return new positions of people, as `stepped_round` does, for all near obstacles."""
         if len(self.bodies) and len(wanted):
             for i in self._rows(wanted, 0.0):
-                wanted = stepped_round(before, wanted, self._seen[i], stand)
+                wanted = stepped_round(before, wanted, self._footprints[i], stand)
         return wanted
 
     def _rows(self, xy: Floats, margin_m: float) -> list[int]:

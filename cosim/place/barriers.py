@@ -63,9 +63,9 @@ BACK_M: Final = 5.0
 Measured: at most 0.4 m on the 105 shipped routes. Of 562 routes sampled on 15 maps, 555 have at
     most 2.5 m; the other seven double back by 11 to 69 m.
 """
-_SPOT_M: Final = 2.0
+_SAMPLE_M: Final = 2.0
 """Distance between the points of a route in the search for shorter walks, in metres."""
-_SIGHT_M: Final = 30.0
+_SEGMENT_M: Final = 30.0
 """Maximum length of a straight segment in that search, in metres."""
 
 
@@ -182,7 +182,7 @@ def prove_single_path(
     free = fenced(walkable, barriers)
     start = Point(route.points[0])
     goal = Point(route.points[-1])
-    part = _part_with(free, start)
+    part = _part_containing(free, start)
     if part is None or not part.covers(goal):
         raise SpecError("start and goal are not connected")
     if not shapely.buffer(surroundings, -0.5).covers(part):
@@ -191,25 +191,25 @@ def prove_single_path(
     if holes:
         x, y = Polygon(holes[0]).centroid.coords[0]
         raise SpecError(f"two ways remain: they lead round ({x:.1f}, {y:.1f})")
-    passable = _part_with(shapely.buffer(part, -half_width_m), start)
+    passable = _part_containing(shapely.buffer(part, -half_width_m), start)
     if passable is None or not passable.covers(goal):
         raise SpecError(f"somewhere the way is narrower than {2 * half_width_m:.2f} m")
     if not passable.covers(LineString(route.points)):
         raise SpecError(
             f"the route comes nearer than {half_width_m:.2f} m to the edge of the walkable area"
         )
-    _refuse_doubling_back(part, route)
+    _check_doubling_back(part, route)
     return part
 
 
-def _refuse_doubling_back(part: Polygon, route: Polyline) -> None:
+def _check_doubling_back(part: Polygon, route: Polyline) -> None:
     """Raise SpecError if the walk from the start to a place is shorter than to an earlier place.
 
     A difference of BACK_M is allowed. This finds routes that go out along one strip and back along
     another that touches it.
     """
-    spots = route.resampled(_SPOT_M)
-    walk_m = _walks_m(part, spots.points)
+    spots = route.resampled(_SAMPLE_M)
+    walk_m = _walking_distances_m(part, spots.points)
     back_m = np.maximum.accumulate(walk_m) - walk_m
     if back_m.max() > BACK_M:
         worst = int(back_m.argmax())
@@ -220,7 +220,7 @@ def _refuse_doubling_back(part: Polygon, route: Polyline) -> None:
         )
 
 
-def _walks_m(area: Polygon, spots: Floats) -> Floats:
+def _walking_distances_m(area: Polygon, spots: Floats) -> Floats:
     """Return walking distances from the first of (N, 2) points to each, (N,) metres.
 
     Walks are straight segments between the points, inside the area.
@@ -230,7 +230,7 @@ def _walks_m(area: Polygon, spots: Floats) -> Floats:
 
     i, j = np.triu_indices(len(spots), 1)
     apart_m = np.hypot(*(spots[i] - spots[j]).T)
-    i, j, apart_m = (values[apart_m <= _SIGHT_M] for values in (i, j, apart_m))
+    i, j, apart_m = (values[apart_m <= _SEGMENT_M] for values in (i, j, apart_m))
     grown = shapely.buffer(area, SEAM_M)
     shapely.prepare(grown)
     seen = (j == i + 1) | shapely.covers(
@@ -250,5 +250,5 @@ def ground_around(
     return surroundings, street_map.walkable_near(surroundings)
 
 
-def _part_with(area: Polygon | MultiPolygon, point: Point) -> Polygon | None:
+def _part_containing(area: Polygon | MultiPolygon, point: Point) -> Polygon | None:
     return next((part for part in shapely.get_parts(area) if part.covers(point)), None)

@@ -167,18 +167,18 @@ def check_map(
     narrow = [s for s in sidewalks if s.width_m < _NARROW_M]
     driven_over = corners_driven_over(street_map)
     islands = _islands(graph, lengths)
-    marked = [
-        *_marks("island", [s for s in strips if s.id not in graph.main_strips]),
-        *_marks("narrow", narrow),
-        *_marks("on_road", on_road),
-        *_marks("stacked", stacked),
-        *_marks_of_corners("driven_over", driven_over),
-        *_marks("steep", [s for s in strips if s.id in street_map.steep]),
+    problems = [
+        *_problems("island", [s for s in strips if s.id not in graph.main_strips]),
+        *_problems("narrow", narrow),
+        *_problems("on_road", on_road),
+        *_problems("stacked", stacked),
+        *_corner_problems("driven_over", driven_over),
+        *_problems("steep", [s for s in strips if s.id in street_map.steep]),
     ]
     if facts is not None:
         for kind in ("never_green", "always_green", "levels", "misfits"):
             known = [street_map.strips[i] for i in getattr(facts, kind) if i in street_map.strips]
-            marked += _marks(kind.removesuffix("s"), known)
+            problems += _problems(kind.removesuffix("s"), known)
     x0, y0, x1, y1 = street_map.bounds
     return MapCheck(
         name=street_map.name,
@@ -205,15 +205,15 @@ def check_map(
         guessed_share=guessed_share,
         elevation=street_map.elevation,
         facts=facts,
-        reasons=tuple(_unusable(street_map)),
-        warnings=tuple(_torn(islands)),
+        reasons=tuple(_unusable_reasons(street_map)),
+        warnings=tuple(_island_warnings(islands)),
         notes=(
-            *_land_notes(street_map),
-            *_stairs(sidewalks),
+            *_elevation_notes(street_map),
+            *_stairs_notes(sidewalks),
             *_driven_over_notes(driven_over),
-            *_notes(facts),
+            *_net_notes(facts),
         ),
-        problems=tuple(marked),
+        problems=tuple(problems),
         features=dict(sorted(Counter(feature.kind for feature in street_map.features).items())),
     )
 
@@ -251,14 +251,14 @@ def _length_m(lane: Lane) -> float:
     return float(np.hypot(*np.diff(lane.line[:, :2], axis=0).T).sum())
 
 
-def _marks(kind: str, strips: Sequence[Strip]) -> list[Problem]:
+def _problems(kind: str, strips: Sequence[Strip]) -> list[Problem]:
     middles = [
         (s, Polyline(s.line[:, :2]).at(s.length_m / 2.0)) for s in strips if s.length_m > 0.0
     ]
     return [Problem(kind, s.id, round(at.x_m, 2), round(at.y_m, 2)) for s, at in middles]
 
 
-def _marks_of_corners(kind: str, grounds: Mapping[str, shapely.Geometry]) -> list[Problem]:
+def _corner_problems(kind: str, grounds: Mapping[str, shapely.Geometry]) -> list[Problem]:
     spots = shapely.get_coordinates(
         [shapely.point_on_surface(ground) for ground in grounds.values()]
     ).tolist()
@@ -282,7 +282,7 @@ def _islands(graph: WalkGraph, lengths: dict[str, float]) -> tuple[Island, ...]:
     )
 
 
-def _unusable(street_map: StreetMap) -> list[str]:
+def _unusable_reasons(street_map: StreetMap) -> list[str]:
     if not street_map.strips:
         return ["nothing is walkable: no sidewalk, path or crossing"]
     if not street_map.corners:
@@ -293,7 +293,7 @@ def _unusable(street_map: StreetMap) -> list[str]:
     return []
 
 
-def _torn(islands: Sequence[Island]) -> list[str]:
+def _island_warnings(islands: Sequence[Island]) -> list[str]:
     if not islands or islands[0].share >= LARGEST:
         return []
     return [
@@ -304,7 +304,7 @@ def _torn(islands: Sequence[Island]) -> list[str]:
     ]
 
 
-def _stairs(sidewalks: Sequence[Strip]) -> list[str]:
+def _stairs_notes(sidewalks: Sequence[Strip]) -> list[str]:
     steps = [s.id for s in sidewalks if s.going == "steps"]
     return (
         [f"{len(steps)} walkable edges are stairs, flat here: routes keep off them"]
@@ -318,11 +318,11 @@ def _driven_over_notes(corners: Mapping[str, object]) -> list[str]:
         return []
     return [
         f"cars turn over {len(corners)} corners, crossings apart: routes keep off there: "
-        f"{_some([*corners])}"
+        f"{_first_few([*corners])}"
     ]
 
 
-def _notes(facts: NetFacts | None) -> list[str]:
+def _net_notes(facts: NetFacts | None) -> list[str]:
     if facts is None:
         return []
     notes = []
@@ -341,21 +341,21 @@ def _notes(facts: NetFacts | None) -> list[str]:
     if facts.no_program:
         notes.append(
             f"{len(facts.no_program)} level crossings are run by SUMO itself: "
-            f"{_some(facts.no_program)}"
+            f"{_first_few(facts.no_program)}"
         )
     for which, words in (("never_green", "never green"), ("always_green", "always green")):
         found: tuple[str, ...] = getattr(facts, which)
         if found:
-            notes.append(f"{len(found)} signalised crossings are {words}: {_some(found)}")
+            notes.append(f"{len(found)} signalised crossings are {words}: {_first_few(found)}")
     if facts.misfits:
         notes.append(
             f"{len(facts.misfits)} crossings are beyond their signal's program: "
-            f"{_some(facts.misfits)}"
+            f"{_first_few(facts.misfits)}"
         )
     return notes
 
 
-def _land_notes(street_map: StreetMap) -> list[str]:
+def _elevation_notes(street_map: StreetMap) -> list[str]:
     elevation = street_map.elevation
     if elevation is None:
         return []
@@ -378,5 +378,5 @@ def _land_notes(street_map: StreetMap) -> list[str]:
     return notes
 
 
-def _some(names: Sequence[str]) -> str:
+def _first_few(names: Sequence[str]) -> str:
     return ", ".join(names[:4]) + (" ..." if len(names) > 4 else "")

@@ -19,12 +19,12 @@ from cosim.place.street_map import LandKind, StreetMap, Strip, street_of
 
 _NEAR_M: Final = 4.0
 """Distance to a house and a sidewalk within which the ground is a bed, in metres."""
-_UNDER_M: Final = 0.6
+_UNDER_HOUSE_M: Final = 0.6
 """Length by which beds reach under the houses of unmapped buildings, in metres. Their fronts are
 straight where a street bends."""
 _REACH_M: Final = 12.0
 """Margin around the area in which sidewalks and houses are considered, in metres."""
-_SPLINTER_M2: Final = 1e-3
+_MIN_PIECE_M2: Final = 1e-3
 """Area in m2 below which a piece is dropped."""
 
 
@@ -71,7 +71,7 @@ def open_ground(
         part = overlay.intersection(whole, area)
         rest = shapely.get_parts(overlay.difference(part, taken))
         found[kind] += [
-            piece for piece in rest if isinstance(piece, Polygon) and piece.area > _SPLINTER_M2
+            piece for piece in rest if isinstance(piece, Polygon) and piece.area > _MIN_PIECE_M2
         ]
         taken = overlay.union(taken, part)
     return [
@@ -110,5 +110,5 @@ def _beds(street_map: StreetMap, area: shapely.Polygon) -> list[tuple[LandKind, 
             around = shapely.buffer(line, edge + _NEAR_M, cap_style="flat", join_style="mitre")
             found[bed].append(overlay.intersection(around, houses))
         elif strip.road_side != 0 and strip.frontage_m > 0.0:
-            found[bed].append(beside(strip, edge, edge + strip.frontage_m + _UNDER_M))
+            found[bed].append(beside(strip, edge, edge + strip.frontage_m + _UNDER_HOUSE_M))
     return [(kind, overlay.union_all(parts)) for kind, parts in found.items() if parts]

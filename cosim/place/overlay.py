@@ -28,17 +28,17 @@ Shapes = NDArray[np.object_]
 
 def union(a: Any, b: Any) -> Any:
     """Return the union of two shapes, or of (N,) pairs. Raises MapError with the place."""
-    return _pairs(shapely.union, a, b)
+    return _elementwise(shapely.union, a, b)
 
 
 def difference(a: Any, b: Any) -> Any:
     """Return the first shapes without the second ones, as in `union`."""
-    return _pairs(shapely.difference, a, b)
+    return _elementwise(shapely.difference, a, b)
 
 
 def intersection(a: Any, b: Any) -> Any:
     """Return the intersection of shapes, as in `union`."""
-    return _pairs(shapely.intersection, a, b)
+    return _elementwise(shapely.intersection, a, b)
 
 
 def union_all(shapes: Sequence[shapely.Geometry] | Shapes) -> Polygon | MultiPolygon:
@@ -48,7 +48,7 @@ def union_all(shapes: Sequence[shapely.Geometry] | Shapes) -> Polygon | MultiPol
     def whole(pieces: Shapes, grid_size: float | None = None) -> Any:
         return shapely.union_all(pieces, grid_size=grid_size)
 
-    united: Polygon | MultiPolygon = _tried(whole, every)
+    united: Polygon | MultiPolygon = _robust(whole, every)
     return united
 
 
@@ -58,32 +58,32 @@ def where_geos_failed(error: Exception) -> str:
     return f" near ({float(found[1]):.1f}, {float(found[2]):.1f})" if found else ""
 
 
-def _pairs(operation: Callable[..., Any], a: Any, b: Any) -> Any:
+def _elementwise(operation: Callable[..., Any], a: Any, b: Any) -> Any:
     try:
         return operation(a, b)
     except shapely.errors.GEOSException:
         if isinstance(a, shapely.Geometry) and isinstance(b, shapely.Geometry):
-            return _tried(operation, a, b)
+            return _robust(operation, a, b)
     one, other = np.broadcast_arrays(np.asarray(a, dtype=object), np.asarray(b, dtype=object))
     out = np.empty(one.shape, dtype=object)
     for at in np.ndindex(one.shape):
-        out[at] = _tried(operation, one[at], other[at])
+        out[at] = _robust(operation, one[at], other[at])
     return out
 
 
-def _tried(operation: Callable[..., Any], *shapes: Any) -> Any:
+def _robust(operation: Callable[..., Any], *shapes: Any) -> Any:
     """Apply an operation to the shapes; on failure to repaired ones, then to ones snapped to a
     grid."""
     try:
         return operation(*shapes)
     except shapely.errors.GEOSException as error:
         refusal = error
-    mended = [
+    repaired = [
         shapely.make_valid(shape, method="structure", keep_collapsed=False) for shape in shapes
     ]
     for grid_m in (None, *GRIDS_M):
         try:
-            return operation(*mended, grid_size=grid_m)
+            return operation(*repaired, grid_size=grid_m)
         except shapely.errors.GEOSException as error:
             refusal = error
     raise MapError(

@@ -246,11 +246,11 @@ class StreetMap:
 
     @cached_property
     def _lands(self) -> tuple[shapely.STRtree, tuple[Feature, ...]]:
-        return _by_place(feature for feature in self.features if feature.kind in LANDS)
+        return _indexed(feature for feature in self.features if feature.kind in LANDS)
 
     @cached_property
     def _houses(self) -> tuple[shapely.STRtree, tuple[Feature, ...]]:
-        return _by_place(feature for feature in self.features if feature.kind == "building")
+        return _indexed(feature for feature in self.features if feature.kind == "building")
 
     def walkable_near(self, area: shapely.Geometry) -> Polygon | MultiPolygon:
         """Return the union of the walkable pieces that intersect `area`, with seams closed.
@@ -307,7 +307,7 @@ class StreetMap:
         return self._trees[kind]
 
 
-def _by_place(features: Iterable[Feature]) -> tuple[shapely.STRtree, tuple[Feature, ...]]:
+def _indexed(features: Iterable[Feature]) -> tuple[shapely.STRtree, tuple[Feature, ...]]:
     held = tuple(features)
     return shapely.STRtree([feature.polygon for feature in held]), held
 

@@ -53,11 +53,11 @@ class Reach:
 
     def to(self, goal: Port) -> float:
         """Return the walking distance to `goal` in metres, inf if it is unreachable."""
-        return float(self.distance_m[_number(self._index, goal)])
+        return float(self.distance_m[_node(self._index, goal)])
 
     def path(self, goal: Port) -> list[Port] | None:
         """Return the shortest path to `goal` with both ends, or None if it is unreachable."""
-        node = _number(self._index, goal)
+        node = _node(self._index, goal)
         if not np.isfinite(self.distance_m[node]):
             return None
         nodes = [node]
@@ -90,8 +90,8 @@ class WalkGraph:
             for corner in street_map.corners.values()
             for port in corner.ports
         }
-        self._arcs = lru_cache(maxsize=8)(self._arcs_without)
-        self._onward = lru_cache(maxsize=4096)(self._choices)
+        self._arcs = lru_cache(maxsize=8)(self._build_arcs)
+        self._next_ports = lru_cache(maxsize=4096)(self._find_next_ports)
 
     @cached_property
     def component(self) -> NDArray[np.int32]:
@@ -105,7 +105,7 @@ class WalkGraph:
         if not self.street_map.strips:
             return frozenset()
         labels = self.component[::2]
-        (_, _, lengths_m) = self._along
+        (_, _, lengths_m) = self._strip_arcs
         main = np.argmax(np.bincount(labels, weights=lengths_m[: len(labels)]))
         return frozenset(
             strip for strip, c in zip(self.street_map.strips, labels, strict=True) if c == main
@@ -113,7 +113,7 @@ class WalkGraph:
 
     def point(self, port: Port) -> tuple[float, float]:
         """Return the position of a port in metres."""
-        x, y = self.xy[_number(self._index, port)]
+        x, y = self.xy[_node(self._index, port)]
         return float(x), float(y)
 
     def others(self, port: Port, closed: frozenset[Port] = OPEN) -> tuple[Port, ...]:
@@ -141,7 +141,7 @@ class WalkGraph:
 
         distance, before = dijkstra(  # type: ignore[call-overload]
             self._arcs(closed),
-            indices=_number(self._index, start),
+            indices=_node(self._index, start),
             return_predecessors=True,
             limit=limit_m,
         )
@@ -166,7 +166,7 @@ class WalkGraph:
         walk = [strip]
         port = Port(strip, 1 if forward else 0)
         while len(walk) < n_edges:
-            choices, weights = self._onward(port, closed)
+            choices, weights = self._next_ports(port, closed)
             if not choices:
                 break
             pick = rng.random() * sum(weights)
@@ -182,7 +182,7 @@ class WalkGraph:
             walk.pop()
         return walk
 
-    def _choices(
+    def _find_next_ports(
         self, port: Port, closed: frozenset[Port]
     ) -> tuple[tuple[Port, ...], tuple[float, ...]]:
         """Return the next ports of a random walk that are not dead ends, and their weights."""
@@ -191,7 +191,7 @@ class WalkGraph:
         return choices, tuple([CROSSING_WEIGHT if kind == "crossing" else 1.0 for kind in kinds])
 
     @cached_property
-    def _along(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats]:
+    def _strip_arcs(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats]:
         lengths = np.array(
             [max(strip.length_m, SHORTEST_HOP_M) for strip in self.street_map.strips.values()]
         )
@@ -203,9 +203,9 @@ class WalkGraph:
         )
 
     @cached_property
-    def _hops(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats]:
+    def _corner_arcs(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats]:
         pairs = [
-            (_number(self._index, a), _number(self._index, b))
+            (_node(self._index, a), _node(self._index, b))
             for corner in self.street_map.corners.values()
             for a in corner.ports
             for b in corner.ports
@@ -215,21 +215,21 @@ class WalkGraph:
         gap = self.xy[nodes[:, 0]] - self.xy[nodes[:, 1]]
         return nodes[:, 0], nodes[:, 1], np.maximum(np.hypot(gap[:, 0], gap[:, 1]), SHORTEST_HOP_M)
 
-    def _arcs_without(self, closed: frozenset[Port]) -> csr_array:
+    def _build_arcs(self, closed: frozenset[Port]) -> csr_array:
         from scipy.sparse import csr_array
 
-        tails, heads, metres = self._hops
+        tails, heads, metres = self._corner_arcs
         if closed:
-            shut = self._numbers(closed)
-            keep = ~(np.isin(tails, shut) | np.isin(heads, shut))
+            closed_nodes = self._nodes(closed)
+            keep = ~(np.isin(tails, closed_nodes) | np.isin(heads, closed_nodes))
             tails, heads, metres = tails[keep], heads[keep], metres[keep]
-        along_tails, along_heads, along_m = self._along
+        along_tails, along_heads, along_m = self._strip_arcs
         nodes = (np.concatenate([along_tails, tails]), np.concatenate([along_heads, heads]))
         count = len(self.ports)
         return csr_array((np.concatenate([along_m, metres]), nodes), shape=(count, count))
 
-    def _numbers(self, ports: Iterable[Port]) -> NDArray[np.int32]:
-        return np.array([_number(self._index, port) for port in ports], dtype=np.int32)
+    def _nodes(self, ports: Iterable[Port]) -> NDArray[np.int32]:
+        return np.array([_node(self._index, port) for port in ports], dtype=np.int32)
 
 
 @lru_cache(maxsize=1)
@@ -238,7 +238,7 @@ def walk_graph_of(street_map: StreetMap) -> WalkGraph:
     return WalkGraph(street_map)
 
 
-def _number(index: dict[str, int], port: Port) -> int:
+def _node(index: dict[str, int], port: Port) -> int:
     try:
         return index[port.strip] + port.end
     except KeyError:

@@ -18,8 +18,8 @@ Role = Literal["coordinator", "director", "policy", "worker", "viewer", "injecto
 HUBS: Final[tuple[Role, ...]] = ("coordinator", "director", "policy")
 """Roles that listen; the others connect."""
 
-_OVER_IP: Final = re.compile(r"(tcp|tls)/([^/?#]+):(\d{1,5})")
-_OVER_A_FILE: Final = re.compile(r"(unixsock-stream)/([^?#]+)")
+_IP_ENDPOINT: Final = re.compile(r"(tcp|tls)/([^/?#]+):(\d{1,5})")
+_SOCKET_ENDPOINT: Final = re.compile(r"(unixsock-stream)/([^?#]+)")
 
 
 class Connection(msgspec.Struct, frozen=True, kw_only=True):
@@ -61,7 +61,7 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
             )
         if not (self.tls or self.insecure or self.of_this_machine):
             raise UsageError(
-                f"{self.endpoint} is beyond this machine and unguarded: {self._danger}. Use "
+                f"{self.endpoint} is beyond this machine and unguarded: {self._risk}. Use "
                 f"tls/{address} with --tls FOLDER (`cosim certs` makes it), or say --insecure"
             )
 
@@ -84,10 +84,10 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def warning(self) -> str:
         """Consequence of --insecure in one line; "" if nothing is insecure."""
-        return "" if not self.insecure or self.of_this_machine else f"--insecure: {self._danger}."
+        return "" if not self.insecure or self.of_this_machine else f"--insecure: {self._risk}."
 
     @property
-    def _danger(self) -> str:
+    def _risk(self) -> str:
         if self.connect:
             return (
                 f"whoever stands between here and {self.connect} may read and change all that is "
@@ -118,8 +118,8 @@ def connecting(role: Role, option: str, endpoint: str, tls: str, insecure: bool)
 
 def checked_endpoint(endpoint: str, option: str) -> str:
     """Return the endpoint of an option. Raises UsageError if it is malformed."""
-    found = _OVER_IP.fullmatch(endpoint)
-    if not (found and 1 <= int(found[3]) <= 65535) and not _OVER_A_FILE.fullmatch(endpoint):
+    found = _IP_ENDPOINT.fullmatch(endpoint)
+    if not (found and 1 <= int(found[3]) <= 65535) and not _SOCKET_ENDPOINT.fullmatch(endpoint):
         like = "tcp/127.0.0.1:7447, tls/HOST:7447 or unixsock-stream/PATH"
         raise UsageError(f"{option} '{endpoint}': write it as PROTOCOL/ADDRESS:PORT, like {like}")
     return endpoint

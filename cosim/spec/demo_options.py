@@ -50,9 +50,9 @@ class Collecting(msgspec.Struct, frozen=True, kw_only=True):
         if self.rate_hz not in (
             rates := [n for n in range(1, int(_FASTEST_HZ) + 1) if not 1000 % n and _ticks(1 / n)]
         ):
-            told = ", ".join(map(str, rates))
+            valid = ", ".join(map(str, rates))
             raise SpecError(
-                f"a data set has {told} pictures a second, not {self.rate_hz:g}: choose one "
+                f"a data set has {valid} pictures a second, not {self.rate_hz:g}: choose one "
                 f"of these rates"
             )
         if not 0.0 <= self.noise <= _MOST_NOISE:
@@ -111,7 +111,7 @@ def check_learner(
         kept = collecting.camera.in_words
         raise UsageError(
             f"learner '{learner.name}' is to see what is collected. It sees by {seen}, collected "
-            f"is {kept}, {collecting.rate_hz:g} Hz: {_asked_for(camera, learner.rate_hz)}"
+            f"is {kept}, {collecting.rate_hz:g} Hz: {_matching_options(camera, learner.rate_hz)}"
         )
     if learner.goals and goal not in learner.goals:
         could = ", ".join(learner.goals)
@@ -120,7 +120,7 @@ def check_learner(
         )
 
 
-def _asked_for(camera: CameraSpec, rate_hz: float) -> str:
+def _matching_options(camera: CameraSpec, rate_hz: float) -> str:
     """Return the options that record these pictures, as advice."""
     plain = CameraSpec(camera.width, camera.height, camera.fov_deg, camera.mount)
     if camera != plain or not isinstance(camera.mount, str):

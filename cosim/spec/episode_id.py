@@ -12,9 +12,9 @@ from typing import Final, NamedTuple
 from cosim.core.errors import UsageError
 from cosim.spec.scenario import Scenario
 
-_DRAWN_BITS: Final = 53
+_RANDOM_BITS: Final = 53
 """Bits of a random run seed: too many to guess, few enough for every JSON reader."""
-_MOST: Final = 2**63 - 1
+_LARGEST_SEED: Final = 2**63 - 1
 """Largest seed of a run."""
 _SEED_BYTES: Final = 4
 """Size of a derived seed in bytes."""
@@ -50,13 +50,13 @@ def seed_for(purpose: str, run_seed: int, scenario: Scenario) -> int:
 
 def drawn_seed() -> int:
     """Return a random seed for a run."""
-    return secrets.randbits(_DRAWN_BITS)
+    return secrets.randbits(_RANDOM_BITS)
 
 
 def check_seed(seed: int | None) -> None:
     """Raise UsageError for an invalid run seed."""
-    if seed is not None and not 0 <= seed <= _MOST:
-        raise UsageError(f"a seed of {seed}: it must be a whole number from 0 to {_MOST}")
+    if seed is not None and not 0 <= seed <= _LARGEST_SEED:
+        raise UsageError(f"a seed of {seed}: it must be a whole number from 0 to {_LARGEST_SEED}")
 
 
 def _digest(run_seed: int, scenario: Scenario, purpose: str) -> bytes:

@@ -224,7 +224,7 @@ class ImageGoal(AnyGoal, frozen=True, tag="image"):
         return ImageGoal(flipped(self.rgb))
 
     def probes(self) -> Mapping[str, ImageGoal]:
-        # The mirrored picture serves as left; the side of a picture is unknown, so there is no right.
+        # The mirrored picture serves as "left"; its true side is unknown.
         return {"ahead": self, "left": self.mirrored(), "zero": ImageGoal(np.zeros_like(self.rgb))}
 
     def painted(self, paint: Callable[[Pixels], Pixels]) -> ImageGoal:
@@ -393,7 +393,7 @@ class SubGoals:
         return self._s_m
 
 
-class _Plain:
+class _PositionGoals:
     """Goals that depend only on the robot's position."""
 
     def __init__(self, goal: Callable[[Pose, float], Goal | None]) -> None:
@@ -430,7 +430,7 @@ class _RandomPoints:
         self._point = None
 
 
-class _Images:
+class _ImageGoals:
     """Pictures at the sub-goals along the route, taken when a sub-goal is selected."""
 
     def __init__(self, route: Polyline, look: TakePicture) -> None:
@@ -491,7 +491,7 @@ def _turn_at(route: Polyline, s_m: float) -> float:
     return wrap_angle(math.atan2(by, bx) - math.atan2(ay, ax))
 
 
-def told_at(route_s_m: float, ways: Sequence[Manoeuvre]) -> str:
+def told_at(route_s_m: float, steps: Sequence[Manoeuvre]) -> str:
     """Return the instruction at an arc length: due manoeuvres, then the next one within 20 m.
 
     Distances are rounded to 5 m.
@@ -500,13 +500,13 @@ def told_at(route_s_m: float, ways: Sequence[Manoeuvre]) -> str:
     >>> told_at(29.0, ways), told_at(39.0, ways)
     ('Follow the sidewalk. In 10 m, turn left.', 'Turn left.')
     """
-    due = [one.words for one in ways if one.s_m - _DUE_M <= route_s_m < one.until_s_m]
-    told = [f"{words.capitalize()}." for words in due] or ["Follow the sidewalk."]
-    coming = [one for one in ways if _DUE_M < one.s_m - route_s_m <= _ANNOUNCED_M]
+    due = [one.words for one in steps if one.s_m - _DUE_M <= route_s_m < one.until_s_m]
+    sentences = [f"{words.capitalize()}." for words in due] or ["Follow the sidewalk."]
+    coming = [one for one in steps if _DUE_M < one.s_m - route_s_m <= _ANNOUNCED_M]
     if coming:
         far_m = max(5 * round((coming[0].s_m - route_s_m) / 5.0), 5)
-        told.append(f"In {far_m} m, {coming[0].words}.")
-    return " ".join(told)
+        sentences.append(f"In {far_m} m, {coming[0].words}.")
+    return " ".join(sentences)
 
 
 def patch_around(pose: Pose, route: Floats) -> NDArray[np.uint8]:
@@ -535,32 +535,32 @@ def patch_around(pose: Pose, route: Floats) -> NDArray[np.uint8]:
 def _route_points(source: GoalSource) -> Goals:
     route = source.scenario.route_line
     subgoals = SubGoals(route.length_m)
-    return _Plain(lambda pose, s_m: seen_from(pose, route.at(subgoals.after(s_m))))
+    return _PositionGoals(lambda pose, s_m: seen_from(pose, route.at(subgoals.after(s_m))))
 
 
 def _final_points(source: GoalSource) -> Goals:
     end = Pose(*source.scenario.goal, 0.0)
-    return _Plain(lambda pose, s_m: seen_from(pose, end))
+    return _PositionGoals(lambda pose, s_m: seen_from(pose, end))
 
 
 def _images(source: GoalSource) -> Goals:
     assert source.look is not None, "image goals need a camera"
-    return _Images(source.scenario.route_line, source.look)
+    return _ImageGoals(source.scenario.route_line, source.look)
 
 
 def _random_images(source: GoalSource) -> Goals:
     noise = ImageGoal(source.draws.integers(0, 256, (source.size[1], source.size[0], 3), np.uint8))
-    return _Plain(lambda pose, s_m: noise)
+    return _PositionGoals(lambda pose, s_m: noise)
 
 
 def _instructions(source: GoalSource) -> Goals:
-    ways = manoeuvres(source.scenario.route_line, source.scenario.crossings)
-    return _Plain(lambda pose, s_m: Instruction(told_at(s_m, ways)))
+    steps = manoeuvres(source.scenario.route_line, source.scenario.crossings)
+    return _PositionGoals(lambda pose, s_m: Instruction(told_at(s_m, steps)))
 
 
 def _route_patches(source: GoalSource) -> Goals:
     points = source.scenario.route_line.points
-    return _Plain(lambda pose, s_m: RoutePatch(patch_around(pose, points)))
+    return _PositionGoals(lambda pose, s_m: RoutePatch(patch_around(pose, points)))
 
 
 _ROWS: Final = (
@@ -568,7 +568,7 @@ _ROWS: Final = (
         "none",
         "no goal",
         None,
-        lambda source: _Plain(lambda pose, s_m: None),
+        lambda source: _PositionGoals(lambda pose, s_m: None),
         noise=True,
         in_data_sets=True,
     ),

@@ -407,10 +407,10 @@ def read_suite(path: Path, kinds: EventKinds | None = None) -> Suite:
             f"{path}: suite '{suite.name}' has no scenarios: `scenarios` needs one or more"
         )
     if kinds is not None:
-        told = (
+        faults_by_scenario = (
             event_faults(one, kinds, f"$.scenarios[{i}]") for i, one in enumerate(suite.scenarios)
         )
-        if faults := list(chain.from_iterable(told)):
+        if faults := list(chain.from_iterable(faults_by_scenario)):
             raise SpecError(f"{path}: {in_lines(faults)}")
     return suite
 

@@ -34,15 +34,15 @@ def scenarios_chosen(
         if scenario_id not in by_id:
             raise unknown("scenario", scenario_id, by_id)
     picked = [by_id[i] for i in dict.fromkeys(ids)] or list(whole.scenarios)
-    there = {kind: None for scenario in picked for kind in _kinds_of(scenario)}
+    available = {kind: None for scenario in picked for kind in _kinds_of(scenario)}
     for kind in kinds:
-        if kind not in there and not there:
+        if kind not in available and not available:
             raise UsageError(
                 f"--event {kind}: suite '{whole.name}' has no events among these scenarios: "
                 f"leave it out"
             )
-        if kind not in there:
-            raise unknown("event", kind, there)
+        if kind not in available:
+            raise unknown("event", kind, available)
     if kinds:
         picked = [s for s in picked if not _kinds_of(s).isdisjoint(kinds)]
     if split is not None:

@@ -69,35 +69,35 @@ def in_lines(faults: Sequence[str], most: int = MOST_TOLD) -> str:
 
 def _faults(data: bytes, kind: Any, error: Exception) -> Iterator[str]:
     """Yield every error of a file that was refused with `error`."""
-    if _of_the_whole(error):
+    if _is_contradiction(error):
         yield f"{error} - at `$`"
         return
     try:
         # json accepts NaN and huge numbers, which msgspec refuses without naming the field.
         tree = json.loads(data)
     except (ValueError, RecursionError):
-        yield _malformed(data, error)
+        yield _syntax_fault(data, error)
         return
     found = False
     for fault in faults_in(tree, kind, "$"):
         found = True
         yield fault
     if not found:
-        yield _malformed(data, error)
+        yield _syntax_fault(data, error)
 
 
-def _malformed(data: bytes, refused: Exception) -> str:
+def _syntax_fault(data: bytes, refused: Exception) -> str:
     """Return why a file is not JSON, and where."""
     error = _syntax_error(data) or refused
     message = str(error)
     if isinstance(error, RecursionError):
         return "is nested too deep: brackets within brackets within brackets"
     if isinstance(error, UnicodeDecodeError):
-        return f"is no UTF-8 text, {_where(data, _readable(data))}"
+        return f"is no UTF-8 text, {_position(data, _valid_utf8_bytes(data))}"
     if message == "Input data was truncated":
-        return f"JSON ends too early, {_where(data, len(data))}"
+        return f"JSON ends too early, {_position(data, len(data))}"
     if byte := _BYTE.search(message):
-        return f"{message[: byte.start()]}, {_where(data, int(byte[1]))}"
+        return f"{message[: byte.start()]}, {_position(data, int(byte[1]))}"
     return message if _PLACE.search(message) else f"{message} - at `$`"
 
 
@@ -110,7 +110,7 @@ def _syntax_error(data: bytes) -> Exception | None:
     return None
 
 
-def _readable(data: bytes) -> int:
+def _valid_utf8_bytes(data: bytes) -> int:
     """Return the number of leading bytes that are valid UTF-8."""
     try:
         return len(data.decode())
@@ -118,7 +118,7 @@ def _readable(data: bytes) -> int:
         return error.start
 
 
-def _where(data: bytes, byte: int) -> str:
+def _position(data: bytes, byte: int) -> str:
     """Return line and byte of an offset as text."""
     lines = data[:byte].split(b"\n")
     return f"line {len(lines)}, byte {len(lines[-1])} of it"
@@ -130,7 +130,7 @@ def faults_in(tree: Any, kind: Any, place: str) -> Iterator[str]:
         msgspec.convert(tree, kind)
         return
     except _REFUSED as error:
-        message, whole = str(error), _of_the_whole(error)
+        message, whole = str(error), _is_contradiction(error)
     found = False
     for fault in () if whole else _faults_below(tree, bare_type(kind, tree), place):
         found = True
@@ -146,7 +146,7 @@ def faults_in(tree: Any, kind: Any, place: str) -> Iterator[str]:
         )
 
 
-def _of_the_whole(error: Exception) -> bool:
+def _is_contradiction(error: Exception) -> bool:
     """Return whether an error is a contradiction between valid parts."""
     return isinstance(error.__cause__, SpecError) and not _PLACE.search(str(error))
 

@@ -61,12 +61,12 @@ class Points(NamedTuple):
         if all(self.low <= number <= self.high for number in chain.from_iterable(value)):
             return ""
         number = Within(*self)
-        told = (
+        refusals = (
             number.refusal(f"{field}[{i}][{k}]", x)
             for i, point in enumerate(value)
             for k, x in enumerate(point)
         )
-        return next(filter(None, told))
+        return next(filter(None, refusals))
 
 
 class Counted(NamedTuple):
@@ -134,10 +134,10 @@ class Ranged(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             raise SpecError("; ".join(faults))
 
     def _out_of_range(self) -> list[str]:
-        told = (
+        refusals = (
             refusal_of(field, rule, getattr(self, field)) for field, rule in rules_of(type(self))
         )
-        return [self.called + refusal for refusal in told if refusal]
+        return [self.called + refusal for refusal in refusals if refusal]
 
     @property
     def called(self) -> str:
