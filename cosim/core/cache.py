@@ -2,9 +2,11 @@
 
 Cached files start with a hash of their content; damaged files are made again. If the cache cannot
 be written, a note is printed on standard error and work continues without it.
+
 An entry is a file or a folder: a city's net, a parsed street map, the tiles of a place, an array
 set. Entries unused for a month are removed. If the folder exceeds its limit, the least recently
 used entries are removed. Imported maps count towards the limit but are never removed.
+
 Entries in use are not removed. Each process lists its entries in a file that it locks while it
 lives. A listed entry counts as in use for an hour after its last use.
 """

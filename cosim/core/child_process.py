@@ -45,6 +45,7 @@ class ForkedChild:
     """Forked child process that answers messages over a socket, without output of its own.
 
     It ends with its parent, or when it is closed.
+
     serves: function that the child runs with its end of the socket. It shares what this process has
         loaded, but no threads.
     room_bytes: memory that the child may allocate in addition to this process's.

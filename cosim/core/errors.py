@@ -168,6 +168,7 @@ def unwritable(path: Path, error: OSError, remedy: str = "") -> MachineError | U
 
     If a part of its path is a file, the message says so. A name that is too long has an error of
     its own.
+
     remedy: advice that replaces the default one.
     """
     if error.errno == errno.ENAMETOOLONG:

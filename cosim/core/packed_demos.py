@@ -69,6 +69,7 @@ class Packed:
 
         Rows before the start of an episode are replaced by its first row, as a policy fills its
         memory.
+
         every: distance between the pictures in rows.
 
         >>> two = np.zeros((3, 2), np.float32)

@@ -37,6 +37,7 @@ def _command_for(x_m: float, y_m: float, heading_rad: float | None, rule: Waypoi
     """Return the unclipped command for one waypoint (x forward, y left).
 
     heading_rad: heading of the waypoint, None without one.
+
     At the robot's own position the command turns to the heading, or stands without one. Exactly at
     the side it turns by a quarter turn. Otherwise v = x / dt, and w = arctan(y / x) / dt
     (`shipped`) or atan2(y, x) / dt (`atan2`).

@@ -122,10 +122,12 @@ class BatchPolicy(Policy, Protocol):
 
     One object in the renderer's process serves all episodes of the run, several at a time. `reset`
     starts one of them. State of an episode belongs to its id, which every observation contains.
+
     An optional `ended(episode_id)` is called after the last query of an episode; its exceptions are
     printed and ignored. An optional `on_reset(episode_id)` gets the id. The composition of batches
     is random, so an answer must depend only on its own episode. Without a shared renderer, `act` is
     called.
+
     A bad answer is the crash of its episode. An exception in `act_batch`, or a wrong number of
     answers, is the crash of all episodes in the batch.
 

@@ -96,6 +96,7 @@ class Strides:
         """Return the strides taken so far (N,) and the shown paces (N,) m/s.
 
         A new person starts at a phase drawn from the name, with the current speed as pace.
+
         ids: ids of the people.
         xy: (N, 2) positions in metres.
         speed: (N,) m/s; for a person who turns on the spot, the shown pace.

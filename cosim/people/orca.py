@@ -54,6 +54,7 @@ def half_plane(
     horizon_s: tau.
     share: own share of the avoidance: 1/2 if both avoid, 1 if the other does not.
     step_s: time in which overlapping disks are separated.
+
     The velocity obstacle VO^tau is the set of relative velocities that lead into the disk of radius
     `radius_m` at `apart_m` within tau. It is a cone with a round tip: a disk at apart/tau of radius
     r/tau, and its tangents. u is the smallest change of the relative velocity to the obstacle's

@@ -90,6 +90,7 @@ def steered(
     """Return the velocity (m/s) of a person, no faster than preferred.
 
     It is exactly the preferred velocity if nobody is in the way. A person who wants to stand does.
+
     at_m: position.
     moving_mps: current velocity.
     wanted_mps: preferred velocity.
@@ -142,9 +143,8 @@ def _relevant_disks(
     return disks
 
 
-def _yields_to(disk: _Disk, wanted_mps: Vector) -> bool:
-    """Return whether a neighbour that steers comes from the left: the person from the right goes
-    first."""
+def _neighbour_yields(disk: _Disk, wanted_mps: Vector) -> bool:
+    """Return whether a steering neighbour yields because it crosses from the left."""
     (dx, dy) = disk.apart_m
     (vx, vy) = disk.moving_mps
     (x, y) = wanted_mps
@@ -165,7 +165,7 @@ def _freest_heading(
     sides, the side of the current motion wins; for straight motion the right.
     """
     x, y = wanted_mps
-    disks = [disk for disk in disks if not _yields_to(disk, wanted_mps)]
+    disks = [disk for disk in disks if not _neighbour_yields(disk, wanted_mps)]
     best = wanted_mps
     latest_s = _time_to_encounter_s(x, y, disks, walls, horizon_s)
     if latest_s >= horizon_s:

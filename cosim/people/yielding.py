@@ -4,6 +4,7 @@ SUMO's walkers sometimes walk through the robot at the edge of a crossing or cor
 avoid other people by `cosim.people.steering`, but the robot only here. A person slides round the
 robot's outline instead of entering it. Only the person's own motion changes: the robot can hit
 people.
+
 Obstacles are merged to few rectangles: those without a gap for a person count as one. If one
 reaches the edge of the walkable ground, people pass on its other side.
 """
@@ -79,6 +80,7 @@ def stepped_round(
     before, wanted: (N, 2) current and preferred positions.
     stand: (N,) whether a person wants to stand there. Such a person approaches, and backs away
         slowly from a robot that is too close, instead of circling it.
+
     People avoid the ground that a moving robot will cover: those ahead of it step aside. Otherwise,
     a step towards the robot within STEP_ROUND_GAP_M loses its inward part. Its length goes into the
     tangent, on the side on which the step passes the centre. The choice reinforces itself, so that

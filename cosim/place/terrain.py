@@ -37,6 +37,7 @@ class Terrain:
     heights: (R, C) metres above `datum_m`, rows northwards from y0_m, columns eastwards from x0_m.
         R and C are at least 2.
     datum_m: height of 0 above the map's own zero.
+
     The diagonal of each cell runs from south-west to north-east. Beyond the lattice, the heights of
     its edge continue.
     """

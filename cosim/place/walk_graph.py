@@ -159,6 +159,7 @@ class WalkGraph:
 
         strip: first strip.
         forward: whether it is walked along its line.
+
         The walk avoids dead ends and does not end on a crossing, so it can be shorter, down to one
         strip.
         """

@@ -141,6 +141,7 @@ def demonstrating(
 
     A disturbed expert gets another name. Raises UsageError for goals that a data set cannot hold.
     An expert with a camera must keep its rate, because it remembers pictures at that interval.
+
     goal: goal protocol of the run, in place of the expert's.
     """
     goal = goal or expert.goal

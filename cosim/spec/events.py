@@ -2,6 +2,7 @@
 
 The director is stateless: each query contains the states of the previous reply. So a director can
 be restarted during an episode without changing the result.
+
 `scenarios.events.EVENT_KINDS` is the shipped table of kinds. Code that samples, directs, judges or
 shows events takes a table, so a kind is added by its row: `EVENT_KINDS | {MINE.name: MINE}`.
 """

@@ -27,6 +27,7 @@ class WaypointRule:
     dt_s: time to reach the waypoint.
     rule: "shipped" (v = x / dt, w = arctan(y / x) / dt) or "atan2" (w = atan2(y, x) / dt). They
         differ for waypoints behind the robot: "shipped" turns by less than a quarter turn.
+
     Both rules use the heading of a waypoint at the robot's own position, if it has one
     (`cosim.episode.control`). Raises SpecError.
 
@@ -70,6 +71,7 @@ class Manifest:
     odometry: kind of odometry (`cosim.spec.odometry.ODOMETRY`).
     cameras: further cameras by name.
     goals: supported goal protocols, () for any; a run with another one is refused.
+
     The manifest itself raises nothing. An episode refuses invalid values, such as a period that is
     not a whole number of ticks.
 

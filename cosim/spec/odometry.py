@@ -29,6 +29,7 @@ class Odometry(msgspec.Struct, frozen=True):
     counter-clockwise.
 
     heading_rad: None for gps.
+
     It does not reveal the position on the map.
 
     >>> pose = Odometry(12.0, 0.5, heading_rad=0.1)

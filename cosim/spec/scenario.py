@@ -226,6 +226,7 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
 
     Points are metres in the net's frame: x east, y north. Headings are radians counter-clockwise
     from east.
+
     start: x, y, heading.
     route: reference route from start to goal.
     structure: what the scenario is an example of: straight, curve, crosswalk, an event kind,
