@@ -183,7 +183,7 @@ def unwritable(path: Path, error: OSError, remedy: str = "") -> MachineError | U
                     if file != path
                     else "with another name"
                 )
-                remedy = remedy or f"choose a place beside it, {beside}"
+                remedy = remedy or f"choose a path next to it, {beside}"
                 break
     return MachineError(
         f"{path}: cannot be written: {reason}: {remedy or 'choose another place, or make room'}"
