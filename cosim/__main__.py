@@ -18,6 +18,7 @@ NEED_NO_ENGINE = (
     "dataset",
     "train",
 )
+"""Commands that start without the check of the machine."""
 
 
 def main() -> None:

@@ -66,6 +66,7 @@ _REMOVED: Final = ".forgotten-"
 _IN_USE_FOLDER: Final = ".in-use"
 """Folder with the lists of entries in use."""
 _LOCK: Final = ".lock"
+"""File that serializes changes of the lists."""
 _MOST_LISTS: Final = 32
 """Number of lists above which a new process removes those of ended processes."""
 
@@ -94,6 +95,7 @@ CACHE_KINDS: Final = (
     CacheKind("maps", "maps/*", "imported maps, and places that come with SUMO", stays=True),
     CacheKind("times", "pace.jsonl", "how long episodes took here", stays=True),
 )
+"""All kinds of cache entries."""
 
 
 class CacheEntry(NamedTuple):

@@ -47,7 +47,9 @@ _MOST_LETTERS = 100
 _SHOWN_LETTERS = 60
 """Maximum length of a too long path in a message, in characters."""
 _LONGEST_NAME_BYTES = 255
+"""Maximum length of a file name on Linux, in bytes."""
 _LONGEST_PATH_BYTES = 4095
+"""Maximum length of a path on Linux, in bytes."""
 
 
 class CosimError(Exception):

@@ -23,11 +23,13 @@ from cosim.core.files import size_within
 MOST_NPZ_BYTES: Final = 2 << 30
 """Maximum size of a file, packed or unpacked, in bytes."""
 _MOST_ARRAYS: Final = 4096
+"""Maximum number of arrays in a file."""
 _ENDING: Final = ".npy"
 _HEADERS: Final = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
+"""Reader of the array header by version of the .npy format."""
 NO_NPZ: Final = (
     EOFError,
     KeyError,

@@ -249,6 +249,7 @@ class Planned(Command):
 
 
 STILL = Command(0.0, 0.0)
+"""Command that stops the robot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,9 +313,6 @@ LABELS: Mapping[str, int] = MappingProxyType(
 """Semantic ids of a label picture."""
 
 
-_ALL_ROWS = slice(None)
-
-
 @dataclass(slots=True)
 class RowLookup:
     """Finds the rows of people in the previous tick's table by their ids.
@@ -331,7 +329,7 @@ class RowLookup:
         a slice, so that indexing makes no copy.
         """
         if ids and ids == self._ids:
-            return _ALL_ROWS, []
+            return slice(None), []
         index = {name: i for i, name in enumerate(self._ids)}
         row = [index.get(name, -1) for name in ids]
         self._ids = ids

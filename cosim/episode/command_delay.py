@@ -19,6 +19,7 @@ from cosim.core.geometry import Floats
 from cosim.core.state import STILL, Command, Planned
 
 _NO_PLAN = np.empty((0, 2), dtype=np.float32)
+"""Waypoints of a command without any."""
 
 
 class InFlight:

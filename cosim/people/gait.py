@@ -32,7 +32,8 @@ between length of stride, step frequency, time of swing and speed of walking, Er
 """
 
 Ages = Sequence[int] | NDArray[np.int8]
-_PACES_MPS, _STRIDES_M = np.array(PACES_MPS), np.array(STRIDES_M)
+_PACES_MPS = np.array(PACES_MPS)
+_STRIDES_M = np.array(STRIDES_M)
 
 SETTLE_S: Final = 0.25
 """Time constant in seconds with which the shown pace follows the speed."""

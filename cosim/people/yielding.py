@@ -43,6 +43,8 @@ _ROUNDING_M: Final = 1e-6
 """Tolerance for rounding in metres."""
 FORESEEN_S = 0.6
 """Time ahead in which people avoid the ground that the robot will cover, in seconds."""
+_ROOM_M: Final = 2.0 * (PERSON_RADIUS_M + STEP_ROUND_GAP_M)
+"""Width in metres below which a gap is too narrow for a person."""
 
 
 def outline_mps(v_mps: float, w_radps: float, half_m: tuple[float, float]) -> float:
@@ -98,12 +100,12 @@ def stepped_round(
     ):
         return wanted
     turn = _axes(body)
-    offsets = offset @ turn
-    rows = np.flatnonzero(_disk_gap(offsets, low, high + reach) < STEP_ROUND_GAP_M)
+    targets = offset @ turn
+    rows = np.flatnonzero(_disk_gap(targets, low, high + reach) < STEP_ROUND_GAP_M)
     if not len(rows):
         return wanted
     local = ((before - body.pose.xy) @ turn)[rows]
-    near = offsets[rows]
+    near = targets[rows]
     step = near - local
     pace = np.hypot(step[:, 0], step[:, 1])
     side = np.where(local[:, 0] * step[:, 1] - local[:, 1] * step[:, 0] >= 0.0, 1.0, -1.0)
@@ -128,8 +130,8 @@ def stepped_round(
     meets = ~slides & (step[:, 0] < 0.0) & (local[:, 0] > length)
     aside = np.where(local[:, 1] >= 0.0, pace, -pace)
     moved[meets] = local[meets] + np.column_stack([np.zeros_like(aside), aside])[meets]
-    offsets[rows] = moved
-    rounded: Floats = offsets @ turn.T + body.pose.xy
+    targets[rows] = moved
+    rounded: Floats = targets @ turn.T + body.pose.xy
     return rounded
 
 
@@ -162,10 +164,6 @@ def _disk_gap(points: Floats, low: Floats, high: Floats) -> Floats:
     away = points - np.clip(points, low, high)
     gap: Floats = np.hypot(away[:, 0], away[:, 1]) - PERSON_RADIUS_M
     return gap
-
-
-_ROOM_M: Final = 2.0 * (PERSON_RADIUS_M + STEP_ROUND_GAP_M)
-"""Width in metres below which a gap is too narrow for a person."""
 
 
 class Standing:

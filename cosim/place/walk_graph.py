@@ -8,7 +8,6 @@ strip behind it can be entered from its other end.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
@@ -221,16 +220,13 @@ class WalkGraph:
 
         tails, heads, metres = self._corner_arcs
         if closed:
-            closed_nodes = self._nodes(closed)
+            closed_nodes = [_node(self._index, port) for port in closed]
             keep = ~(np.isin(tails, closed_nodes) | np.isin(heads, closed_nodes))
             tails, heads, metres = tails[keep], heads[keep], metres[keep]
         along_tails, along_heads, along_m = self._strip_arcs
         nodes = (np.concatenate([along_tails, tails]), np.concatenate([along_heads, heads]))
         count = len(self.ports)
         return csr_array((np.concatenate([along_m, metres]), nodes), shape=(count, count))
-
-    def _nodes(self, ports: Iterable[Port]) -> NDArray[np.int32]:
-        return np.array([_node(self._index, port) for port in ports], dtype=np.int32)
 
 
 @lru_cache(maxsize=1)

@@ -70,6 +70,7 @@ _ANNOUNCED_M: Final = 20.0
 _DUE_M: Final = 2.5
 """Distance from which instructions say that a turn is due, in metres."""
 _ANNOUNCEMENT: Final = re.compile(r"(?:In (\d+) m, )?(?:turn|bear) (left|right)", re.IGNORECASE)
+"""Pattern of a turn in an instruction, with its distance if it is not due."""
 
 
 class Bounds(NamedTuple):
@@ -318,6 +319,7 @@ class RoutePatch(AnyGoal, frozen=True, tag="route_patch"):
 
 
 Goal = PointGoal | ImageGoal | Instruction | RoutePatch
+"""Any goal of a policy."""
 
 
 class Goals(Protocol):
@@ -621,6 +623,7 @@ _ROWS: Final = (
         _route_patches,
     ),
 )
+"""Rows of `GOALS`."""
 GOALS: Final[Mapping[GoalProtocol, GoalKind]] = MappingProxyType(
     {kind.name: kind for kind in _ROWS}
 )

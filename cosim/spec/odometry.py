@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 OdometryKind = Literal["none", "exact", "wheel", "gps"]
+"""Names of the rows of `ODOMETRY`."""
 
 ODOMETRY: Final[Mapping[str, str]] = MappingProxyType(
     {

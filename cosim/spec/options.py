@@ -43,6 +43,7 @@ class PolicyHost(msgspec.Struct, frozen=True, kw_only=True):
 
 
 CameraName = Literal["gl", "bullet", "bullet-egl"]
+"""Renderers of a policy's pictures."""
 
 
 class Outside(msgspec.Struct, frozen=True, kw_only=True):

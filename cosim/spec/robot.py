@@ -134,6 +134,7 @@ COURIER = Robot(
     acceleration_mps2=2.5,
     acceleration_radps2=3.0,
 )
+"""Default robot: a four-wheeled delivery robot of 0.70 m x 0.55 m."""
 
 SCOUT = Robot(
     name="scout",
@@ -155,6 +156,7 @@ SCOUT = Robot(
     acceleration_mps2=3.0,
     acceleration_radps2=4.0,
 )
+"""Smaller and more agile robot of 0.50 m x 0.40 m."""
 
 ROBOTS: Mapping[str, Robot] = {one.name: one for one in (COURIER, SCOUT)}
 """Robots by name."""
