@@ -1,12 +1,12 @@
 """cosim: a benchmark for robots that deliver on sidewalks.
 
-This is its public face; what is not listed here is private. Names are loaded when they are first
-used: importing cosim starts no engine and imports none.
+This module is the public API; everything that is not listed here is private. Names are imported on
+first use, so importing cosim loads no engine.
 
     suite = cosim.load_suite("reactive")
     table = cosim.run(suite, "orca", episodes=2)
 
-or, holding an episode oneself:
+Or step through one episode:
 
     with cosim.Episode(suite.scenarios[0], policy.manifest) as episode:
         policy.reset(episode.id, episode.seed)
@@ -34,8 +34,7 @@ if TYPE_CHECKING:
     from cosim.spec.goal import ImageGoal, Instruction, PointGoal, RoutePatch
     from cosim.spec.manifest import Manifest, WaypointRule
     from cosim.spec.odometry import Odometry
-    from cosim.spec.options import EpisodeOptions
-    from cosim.spec.policy_host import PolicyHost
+    from cosim.spec.options import EpisodeOptions, PolicyHost
     from cosim.spec.robot import Mount, Robot
     from cosim.spec.scenario import Scenario, Suite
     from scenarios.episodes.episode import Episode
@@ -94,7 +93,7 @@ _HOMES = {
     "Odometry": "cosim.spec.odometry",
     "PointGoal": "cosim.spec.goal",
     "Policy": "cosim.episode.interfaces",
-    "PolicyHost": "cosim.spec.policy_host",
+    "PolicyHost": "cosim.spec.options",
     "Record": "cosim.results.record",
     "Robot": "cosim.spec.robot",
     "RoutePatch": "cosim.spec.goal",
@@ -106,7 +105,7 @@ _HOMES = {
     "make_env": "scenarios.tools.gym.make_env",
     "run": "scenarios.runs.run",
 }
-"""The module of each public name (PEP 562: loaded on demand)."""
+"""Module of each public name, for loading on demand (PEP 562)."""
 
 
 def __getattr__(name: str) -> Any:

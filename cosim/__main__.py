@@ -1,5 +1,4 @@
-"""`python -m cosim` is `cosim`; Ctrl-C ends it at any moment with exit code 130, also while it
-loads."""
+"""Entry point of `cosim` and `python -m cosim`. Ctrl-C exits with code 130, also during loading."""
 
 from __future__ import annotations
 
@@ -19,11 +18,11 @@ NEED_NO_ENGINE = (
     "dataset",
     "train",
 )
+"""Commands that start without the check of the machine."""
 
 
 def main() -> None:
-    """Entry point of the console script. What the machine lacks is said before anything is imported
-    that needs it."""
+    """Run the command line, after checking the machine for commands that start an engine."""
     try:
         if _starts_an_engine(sys.argv[1:]) and (refusal := machine.refusal()):
             print(f"error: {refusal}", file=sys.stderr)

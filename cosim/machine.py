@@ -1,9 +1,7 @@
-"""What this machine lacks: Python 3.11 with venv, and the shared libraries that the packages do not
-bring themselves.
+"""Check this machine for Python 3.11 with venv and the shared libraries that wheels do not bring.
 
-Runs by itself before anything is installed, with any Python 3 (`python3 -I cosim/machine.py
---install`), so it imports nothing of this project and nothing that is not in the standard library.
-`make` calls it first, `cosim` when it starts.
+It runs before anything is installed, with any Python 3: `python3 -I cosim/machine.py --install`. So
+it imports only the standard library. `make` runs it first, `cosim` at each start.
 """
 
 from __future__ import annotations
@@ -16,7 +14,7 @@ import subprocess
 import sys
 
 EXIT_CODE = 3
-"""What the machine lacks ends everything with this one."""
+"""Exit code when the machine lacks something."""
 LIBRARIES = {
     "libX11.so.6": "libx11-6",
     "libXext.so.6": "libxext6",
@@ -28,19 +26,22 @@ LIBRARIES = {
     "libstdc++.so.6": "libstdc++6",
     "libgcc_s.so.1": "libgcc-s1",
 }
-"""What the wheels of SUMO (the first five), osmium and the others load, and the package of Debian
-and Ubuntu."""
+"""Shared libraries that the wheels load, and their Debian packages. SUMO needs the first five."""
 FOR_PICTURES = {"libEGL.so.1": "libegl1"}
-"""What the gl camera needs on top; its package brings Mesa's driver."""
+"""Further library of the gl camera, and its Debian package, which includes Mesa's driver."""
 PYTHON = ("python3.11", "python3.11-venv")
+"""Debian packages of the Python that the project needs."""
 
 
 class Machine:
-    """This machine, as far as the check asks it."""
+    """Access to this machine for the check; tests replace it."""
 
     def loads(self, library: str) -> bool:
-        """Can the dynamic loader open it? One that only lacks another of the tables, told by
-        itself, is no fault."""
+        """Return whether the dynamic loader can open a library.
+
+        A library that fails only because of another one in the tables counts as loadable: that
+        other one is reported.
+        """
         try:
             ctypes.CDLL(library)
         except OSError as error:
@@ -49,7 +50,7 @@ class Machine:
         return True
 
     def runs(self, python: str) -> str:
-        """What is wrong with this Python interpreter, or an empty string."""
+        """Return the problem with a Python interpreter, or ""."""
         ask = "import sys; print(*sys.version_info[:2], sep='.'); import venv, ensurepip"
         try:
             said = subprocess.run([python, "-I", "-c", ask], capture_output=True)
@@ -65,11 +66,11 @@ class Machine:
         return ""
 
     def can_install(self) -> bool:
-        """Is this root on Debian, Ubuntu or what descends from them?"""
+        """Return whether this process is root on a system with apt-get."""
         return os.geteuid() == 0 and shutil.which("apt-get") is not None
 
     def install(self, packages: list[str]) -> None:
-        """Let apt-get install them, in view. Whether it did is seen by looking again."""
+        """Install packages with apt-get and show its output. The caller checks the result."""
         environment = dict(os.environ, DEBIAN_FRONTEND="noninteractive")
         for command in (["update"], ["install", "-y", "--no-install-recommends", *packages]):
             subprocess.run(
@@ -81,8 +82,10 @@ class Machine:
 
 
 def missing(machine: Machine, wanted: dict[str, str] | None = None) -> list[str]:
-    """Those of the `wanted` libraries (by default all that are needed to run) that the machine
-    lacks."""
+    """Return the libraries that the machine lacks.
+
+    wanted: the libraries to check, by default those that every run needs.
+    """
     return [
         library
         for library in (LIBRARIES if wanted is None else wanted)
@@ -91,8 +94,8 @@ def missing(machine: Machine, wanted: dict[str, str] | None = None) -> list[str]
 
 
 def refusal(machine: Machine | None = None) -> str:
-    """One message with every missing library, its package and the command that installs them; empty
-    if none is."""
+    """Return one message with all missing libraries, their packages and the install command; "" if
+    none."""
     machine = machine or Machine()
     lacking = missing(machine)
     if not lacking:
@@ -103,8 +106,10 @@ def refusal(machine: Machine | None = None) -> str:
 
 
 def check_machine(words: list[str] | None = None, machine: Machine | None = None) -> int:
-    """Check the machine before anything is set up; 0 if all is there, else 3, with the one command
-    that mends it."""
+    """Check the machine before the setup.
+
+    Returns 0 if nothing is missing, else `EXIT_CODE` after printing the install command.
+    """
     options = argparse.ArgumentParser(description="Check what this machine lacks.")
     options.add_argument(
         "--python", default=sys.executable, help="The Python 3.11 that will be used."
@@ -147,7 +152,7 @@ def check_machine(words: list[str] | None = None, machine: Machine | None = None
 
 
 def _install(machine: Machine, python: str) -> None:
-    """Two calls, because a system may have the libraries and not this Python."""
+    """Install missing packages in two calls: a system may lack only the Python package."""
     here = {**LIBRARIES, **FOR_PICTURES}
     libraries = [here[library] for library in missing(machine, here)]
     for packages in ([*PYTHON] if machine.runs(python) else [], libraries):

@@ -1,9 +1,9 @@
-"""numpy is told to compute without AVX-512, so that machines with and without it round alike.
+"""Make numpy compute without AVX-512, so that all machines round alike.
 
-Where a processor has AVX-512 numpy takes other sines, exponentials and sums for arrays, which
-differ in the last bit. numpy reads what it shall leave out when it is loaded, from the environment:
-so this comes first of all that `cosim` and its rooms import, imports nothing that loads numpy, and
-what it sets goes on to every process that is started from here.
+With AVX-512, numpy uses other implementations of sine, exponential and sum, which differ in the
+last bit. numpy reads the excluded features from the environment when it is loaded. So every package
+of the project imports this module first; it must not import numpy. Child processes inherit the
+setting.
 """
 
 from __future__ import annotations
@@ -13,25 +13,24 @@ import sys
 import warnings
 
 _VARIABLE = "NPY_DISABLE_CPU_FEATURES"
-_LEFT_OUT = ("X86_V4", "AVX512_ICL", "AVX512_SPR")
-"""All that numpy has of AVX-512, by its own names. One that it or the processor lacks it passes
-over."""
+_DISABLED_FEATURES = ("X86_V4", "AVX512_ICL", "AVX512_SPR")
+"""numpy's names for its AVX-512 features. numpy ignores names that it or the processor lacks."""
 
 
 def settle_rounding() -> None:
-    """Set the environment; warn where numpy is in this process already, and with AVX-512."""
+    """Set the environment variable; warn if numpy is already loaded and uses AVX-512."""
     given = os.environ.get(_VARIABLE, "").replace(",", " ").split()
-    os.environ[_VARIABLE] = " ".join(dict.fromkeys((*given, *_LEFT_OUT)))
+    os.environ[_VARIABLE] = " ".join(dict.fromkeys((*given, *_DISABLED_FEATURES)))
     numpy = sys.modules.get("numpy")
     features = getattr(
         getattr(getattr(numpy, "_core", None), "_multiarray_umath", None), "__cpu_features__", {}
     )
-    if any(features.get(name) for name in _LEFT_OUT):
+    if any(features.get(name) for name in _DISABLED_FEATURES):
         warnings.warn(
             "numpy was loaded before cosim, and computes with AVX-512: what this process "
             "simulates has other bits "
             "than on other machines and than what is shipped. Import cosim first, or set "
-            f'{_VARIABLE}="{" ".join(_LEFT_OUT)}"',
+            f'{_VARIABLE}="{" ".join(_DISABLED_FEATURES)}"',
             RuntimeWarning,
             stacklevel=3,
         )

@@ -165,7 +165,7 @@ def collect_command(
     Only solved episodes are stored. The bytes are the same for any --jobs. A stopped collection
     continues with --resume.
     """
-    from cosim.spec.policy_host import PolicyHost
+    from cosim.spec.options import PolicyHost
     from scenarios.episodes.demonstration import check_parquet
 
     check_parquet()

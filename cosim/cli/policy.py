@@ -68,7 +68,7 @@ def check_policy(
     from cosim.episode.manifest_checks import with_goal
     from cosim.report.mapsheet import write_png
     from cosim.spec.goal import goal_called
-    from cosim.spec.policy_host import PolicyHost
+    from cosim.spec.options import PolicyHost
     from scenarios.runs.policy_host import policy_driver
     from scenarios.tools.policy_check.checks import POLICY_CHECKS, checked_policy
     from scenarios.tools.policy_check.drives import drives_for

@@ -1,4 +1,4 @@
-"""A box on a map, as the command line takes it."""
+"""Bounding boxes as command-line options."""
 
 from __future__ import annotations
 
@@ -8,8 +8,12 @@ _Box = tuple[float, float, float, float]
 
 
 def box_of(option: str, words: str, sides: str = "west,south,east,north") -> _Box:
-    """The four numbers in the words of an option. Raises UsageError naming the option and its
-    `sides`."""
+    """Parse the four numbers of a bounding-box option.
+
+    option: the option's name, for the error.
+    words: the option's value.
+    sides: the order of the numbers, for the error. Raises UsageError.
+    """
     try:
         x0, y0, x1, y1 = (float(word) for word in words.split(","))
     except ValueError:
@@ -22,7 +26,7 @@ def box_of(option: str, words: str, sides: str = "west,south,east,north") -> _Bo
 
 
 def refuse_outside(option: str, part: _Box, bounds: _Box) -> None:
-    """Raises UsageError, with the bounds of the place, when a part of it holds nothing of it."""
+    """Raise UsageError with the bounds of the place when a box does not overlap them."""
     (x0, y0, x1, y1) = part
     (west, south, east, north) = bounds
     if x1 <= west or x0 >= east or y1 <= south or y0 >= north:

@@ -1,14 +1,14 @@
-"""On-disk cache of files, arrays and sets of arrays that can be made again, with a size limit.
+"""On-disk cache of files, arrays and array sets that can be made again, with a size limit.
 
-A cached file begins with a hash of the rest: a damaged one is made again. A cache that cannot be
-written is done without, with a note on standard error.
+Cached files start with a hash of their content; damaged files are made again. If the cache cannot
+be written, a note is printed on standard error and work continues without it.
 
-An entry is a file or a folder: a city's net, a street map that was read, the tiles of a place, an
-array set. Entries are removed when they were not used for a month, and the least recently used ones
-when the folder is larger than its limit. Imported maps count for the limit and are never removed.
+An entry is a file or a folder: a city's net, a parsed street map, the tiles of a place, an array
+set. Entries unused for a month are removed. If the folder exceeds its limit, the least recently
+used entries are removed. Imported maps count towards the limit but are never removed.
 
-Entries in use stay. Each process lists its entries in a file that it holds locked for its life; an
-entry of such a list that was used within the last hour is in use.
+Entries in use are not removed. Each process lists its entries in a file that it locks while it
+lives. A listed entry counts as in use for an hour after its last use.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from platformdirs import user_cache_path
 from cosim.core.errors import UsageError
 from cosim.core.files import MAKING, atomic_file, is_locked, lock, remove_dead, temp_folder
 
-if TYPE_CHECKING:  # the command line starts without NumPy
+if TYPE_CHECKING:  # the command line starts without numpy
     import numpy as np
     from numpy.typing import NDArray
 
@@ -42,36 +42,42 @@ Arrays: TypeAlias = "Mapping[str, NDArray[Any]]"
 _T = TypeVar("_T")
 
 BUILDING: Final = ".building-"
-"""Names of the folders in which nets of cities are built begin like this."""
-_MADE_WITH: Final = ("numpy", "opencv-python-headless", "pybullet", "scipy", "shapely")
+"""Prefix of the folders in which city nets are built."""
+_ARRAY_PACKAGES: Final = ("numpy", "opencv-python-headless", "pybullet", "scipy", "shapely")
 """Packages that cached arrays depend on."""
-_SEAL_BYTES: Final = 64
-"""A cached file begins with so many hexadecimal digits, the SHA-256 of the rest."""
-_ALIGNED: Final = 64
-"""Arrays begin at multiples of this many bytes in a file."""
+_HASH_BYTES: Final = 64
+"""Length of the hexadecimal SHA-256 hash at the start of a cached file."""
+_ALIGNMENT_BYTES: Final = 64
+"""Alignment of arrays in a file, in bytes."""
 LIMIT_VARIABLE: Final = "COSIM_CACHE_LIMIT"
-"""The environment variable with the limit in GB."""
-_DEFAULT_GB: Final = 4.0
-"""Nets and street maps of the hundred cities of the suites take 1 GB of it; the rest is for tiles
-and maps."""
+"""Environment variable with the size limit in GB."""
+_DEFAULT_LIMIT_GB: Final = 4.0
+"""Default size limit in GB. Nets and street maps of the suites' hundred cities take 1 GB of it."""
 GB: Final = 10**9
+"""Bytes in one GB."""
 UNUSED_S: Final = 30 * 86400.0
-"""Entries that were not used for longer than this are forgotten."""
+"""Entries unused for this long, in seconds, are removed."""
 _IN_USE_S: Final = 3600.0
-"""An entry that a living process has not used for longer than this is not in use."""
-_LOOK_EVERY_S: Final = 60.0
-"""A process that writes looks for what to forget at first, and then no sooner than after this
-time."""
-_FORGOTTEN: Final = ".forgotten-"
-_LISTS: Final = ".in-use"
+"""Time since its last use, in seconds, after which a listed entry no longer counts as in use."""
+_CLEANUP_INTERVAL_S: Final = 60.0
+"""Minimum time between two clean-ups by a process that writes, in seconds."""
+_REMOVED: Final = ".forgotten-"
+"""Prefix of the temporary folders into which entries are moved before deletion."""
+_IN_USE_FOLDER: Final = ".in-use"
+"""Folder with the lists of entries in use."""
 _LOCK: Final = ".lock"
-_MOST_DEAD: Final = 32
-"""Of more lists than this those of dead processes are removed when a further process begins one."""
+"""File that serializes changes of the lists."""
+_MOST_LISTS: Final = 32
+"""Number of lists above which a new process removes those of ended processes."""
 
 
 class CacheKind(NamedTuple):
-    """A kind of things in the cache. pattern: of their paths; words: what they are; stays: they are
-    never forgotten."""
+    """A kind of cache entry.
+
+    pattern: glob pattern of the entries' paths.
+    words: description for `cosim cache`.
+    stays: True if entries are never removed.
+    """
 
     name: str
     pattern: str
@@ -89,11 +95,15 @@ CACHE_KINDS: Final = (
     CacheKind("maps", "maps/*", "imported maps, and places that come with SUMO", stays=True),
     CacheKind("times", "pace.jsonl", "how long episodes took here", stays=True),
 )
+"""All kinds of cache entries."""
 
 
 class CacheEntry(NamedTuple):
-    """An entry of the cache: the bytes of the disk that it takes, and when it was last used,
-    seconds of the epoch."""
+    """An entry of the cache.
+
+    size_bytes: space on the disk.
+    used_s: time of last use, in seconds since the epoch.
+    """
 
     path: Path
     kind: CacheKind
@@ -102,7 +112,7 @@ class CacheEntry(NamedTuple):
 
 
 class Forgotten(NamedTuple):
-    """What was taken away, and what was to be and is in use."""
+    """Result of a clean-up: the removed entries, and those not removed because they are in use."""
 
     entries: tuple[CacheEntry, ...] = ()
     in_use: tuple[CacheEntry, ...] = ()
@@ -113,15 +123,14 @@ class Forgotten(NamedTuple):
 
 
 def cache_folder() -> Path:
-    """Return where what was made is kept: $COSIM_CACHE, else the user's cache folder
+    """Return the cache folder: $COSIM_CACHE, else the user's cache folder
     (~/.cache/sidewalk-cosim)."""
     return Path(os.environ.get("COSIM_CACHE") or user_cache_path("sidewalk-cosim"))
 
 
 def cache_limit_bytes() -> int:
-    """Return the limit of the cache folder: $COSIM_CACHE_LIMIT in GB, else 4 GB. Raises
-    UsageError."""
-    text = os.environ.get(LIMIT_VARIABLE) or f"{_DEFAULT_GB:g}"
+    """Return the size limit: $COSIM_CACHE_LIMIT in GB, else 4 GB. Raises UsageError."""
+    text = os.environ.get(LIMIT_VARIABLE) or f"{_DEFAULT_LIMIT_GB:g}"
     try:
         limit_gb = float(text)
     except ValueError:
@@ -129,52 +138,55 @@ def cache_limit_bytes() -> int:
     if not 0.0 <= limit_gb < math.inf:
         raise UsageError(
             f"{LIMIT_VARIABLE} is '{text}': give a number of GB from 0 on, like "
-            f"{_DEFAULT_GB:g} or 0.5"
+            f"{_DEFAULT_LIMIT_GB:g} or 0.5"
         )
     return round(limit_gb * GB)
 
 
 def use_entry(entry: Path) -> None:
-    """Say that this process uses an entry now, whether it is there or not: call it before you look.
+    """Mark an entry as in use by this process. Call it before checking whether the entry exists.
 
-    Nothing happens where the cache cannot be written.
+    It does nothing if the cache cannot be written.
     """
     with suppress(OSError):
-        _uses(cache_folder(), os.getpid()).add(entry)
+        _in_use_list(cache_folder(), os.getpid()).add(entry)
     with suppress(OSError):
         os.utime(entry)
 
 
 def make_room() -> None:
-    """Forget entries, to be called before one is kept: now and then, because it takes as long as to
-    make a few."""
+    """Remove entries if the last clean-up of this process is long ago. Call it before writing an
+    entry."""
     folder = cache_folder()
     now_s = time.monotonic()
-    if now_s - _looked_s.get(folder, -math.inf) >= _LOOK_EVERY_S:
-        _looked_s[folder] = now_s
+    if now_s - _last_cleanup_s.get(folder, -math.inf) >= _CLEANUP_INTERVAL_S:
+        _last_cleanup_s[folder] = now_s
         forget_entries()
 
 
-_looked_s: Final[dict[Path, float]] = {}
-"""When this process last looked for what to forget."""
+_last_cleanup_s: Final[dict[Path, float]] = {}
+"""Monotonic time of this process's last clean-up, by cache folder."""
 
 
 def forget_entries(unused_s: float = UNUSED_S, limit_bytes: int | None = None) -> Forgotten:
-    """Take away entries that were not used for so long, those used longest ago beyond the limit,
-    and what killed processes have left half made. limit_bytes: by default `cache_limit_bytes`."""
+    """Remove unused entries, the least recently used ones beyond the limit, and unfinished files.
+
+    unused_s: remove entries unused for this long.
+    limit_bytes: size limit, by default `cache_limit_bytes`.
+    """
     folder = cache_folder()
     now_s = time.time()
     room = cache_limit_bytes() if limit_bytes is None else limit_bytes
-    _sweep(folder)
-    doomed: list[CacheEntry] = []
+    _remove_unfinished(folder)
+    expired: list[CacheEntry] = []
     entries = cache_entries()
     room -= sum(entry.size_bytes for entry in entries if entry.kind.stays)
     for entry in sorted(entries, key=lambda one: one.used_s, reverse=True):
         if not entry.kind.stays:
             room -= entry.size_bytes
             if room < 0 or now_s - entry.used_s >= unused_s:
-                doomed.append(entry)
-    return _take_away(folder, doomed) if doomed else Forgotten()
+                expired.append(entry)
+    return _delete_entries(folder, expired) if expired else Forgotten()
 
 
 def cache_entries() -> list[CacheEntry]:
@@ -189,30 +201,30 @@ def cache_entries() -> list[CacheEntry]:
 
 
 def say_not_kept(folder: Path, error: Exception) -> None:
-    """Print, once in a process, that something could not be kept in the cache."""
-    _say_once(f"note: {folder}: not kept for the next process, which makes it anew: {error}")
+    """Print that something could not be cached, once in a process for each message."""
+    _print_once(f"note: {folder}: not kept for the next process, which makes it anew: {error}")
 
 
 @cache
-def _say_once(words: str) -> None:
+def _print_once(words: str) -> None:
     print(words, file=sys.stderr, flush=True)
 
 
-class _Uses:
-    """The list of the entries that this process uses."""
+class _InUseList:
+    """List file of the entries that this process uses."""
 
     def __init__(self, folder: Path) -> None:
-        lists = folder / _LISTS
+        lists = folder / _IN_USE_FOLDER
         lists.mkdir(parents=True, exist_ok=True)
         self._folder = folder
         self._listed = set[str]()
         self._file = lists / f"{os.getpid()}-{secrets.token_hex(4)}"
         with lock(folder / _LOCK):
-            if sum(1 for _ in os.scandir(lists)) > _MOST_DEAD:
+            if sum(1 for _ in os.scandir(lists)) > _MOST_LISTS:
                 _remove_dead_lists(lists)
             self._held = lock(self._file)
             self._held.acquire()
-        atexit.register(_remove_own, self._file, os.getpid())
+        atexit.register(_remove_list_of, self._file, os.getpid())
 
     def add(self, entry: Path) -> None:
         name = entry.relative_to(self._folder).as_posix()
@@ -226,32 +238,31 @@ class _Uses:
 
 
 @cache
-def _uses(folder: Path, _pid: int) -> _Uses:
-    """Return the list of this process, which does not continue that of the process it was forked
-    from."""
-    return _Uses(folder)
+def _in_use_list(folder: Path, _pid: int) -> _InUseList:
+    """Return this process's list. A forked child starts a list of its own."""
+    return _InUseList(folder)
 
 
-def _take_away(folder: Path, doomed: list[CacheEntry]) -> Forgotten:
-    """Move entries aside that are still unused, then remove them."""
-    gone = []
-    kept = []
-    with suppress(OSError), temp_folder(_FORGOTTEN, folder) as aside, lock(folder / _LOCK):
-        listed = _listed_by_the_living(folder / _LISTS)
+def _delete_entries(folder: Path, expired: list[CacheEntry]) -> Forgotten:
+    """Move entries aside that are still unused, then delete them."""
+    removed = []
+    in_use = []
+    with suppress(OSError), temp_folder(_REMOVED, folder) as trash, lock(folder / _LOCK):
+        listed = _entries_in_use(folder / _IN_USE_FOLDER)
         now_s = time.time()
-        for number, entry in enumerate(doomed):
+        for number, entry in enumerate(expired):
             used_s = _used_s(entry.path)
             name = entry.path.relative_to(folder).as_posix()
             if used_s > entry.used_s or (name in listed and now_s - used_s < _IN_USE_S):
-                kept.append(entry)
+                in_use.append(entry)
                 continue
             with suppress(OSError):
-                entry.path.rename(aside / str(number))
-                gone.append(entry)
-    return Forgotten(tuple(gone), tuple(kept))
+                entry.path.rename(trash / str(number))
+                removed.append(entry)
+    return Forgotten(tuple(removed), tuple(in_use))
 
 
-def _listed_by_the_living(lists: Path) -> set[str]:
+def _entries_in_use(lists: Path) -> set[str]:
     _remove_dead_lists(lists)
     listed: set[str] = set()
     for path in lists.glob("*"):
@@ -261,24 +272,23 @@ def _listed_by_the_living(lists: Path) -> set[str]:
 
 
 def _remove_dead_lists(lists: Path) -> None:
-    """Remove the lists that no process holds locked. The caller holds the lock of the cache."""
+    """Remove the lists of ended processes. The caller holds the lock of the cache."""
     for path in lists.glob("*"):
         with suppress(OSError):
             if not is_locked(path):
                 path.unlink()
 
 
-def _remove_own(path: Path, pid: int) -> None:
-    """Remove the list of a process at its end, but not at that of one that was forked from it."""
+def _remove_list_of(path: Path, pid: int) -> None:
+    """Remove the list of a process when it exits, but not when a forked child exits."""
     if os.getpid() == pid:
         with suppress(OSError):
             path.unlink()
 
 
-def _sweep(folder: Path) -> None:
-    """Remove what killed processes have left unfinished. `atomic_folder` does it for imported
-    maps."""
-    remove_dead(folder, _FORGOTTEN)
+def _remove_unfinished(folder: Path) -> None:
+    """Remove unfinished files of killed processes. `atomic_folder` does this for imported maps."""
+    remove_dead(folder, _REMOVED)
     remove_dead(folder, BUILDING)
     places = {(folder / kind.pattern).parent for kind in CACHE_KINDS if not kind.stays}
     for place in (*places, *folder.glob("tiles/*")):
@@ -288,12 +298,12 @@ def _sweep(folder: Path) -> None:
 def _used_s(path: Path) -> float:
     try:
         return path.stat().st_mtime
-    except OSError:  # another process has just taken it away
+    except OSError:  # removed by another process
         return 0.0
 
 
 def _size_bytes(path: Path) -> int:
-    """Return the bytes that a file takes on the disk, or all files of a folder."""
+    """Return the disk space of a file, or of all files in a folder."""
     try:
         if not path.is_dir():
             return path.stat().st_blocks * 512
@@ -311,12 +321,12 @@ def cached(
     entry: Path | None = None,
     mapped: bool = False,
 ) -> _T:
-    """Return the value of a cached file, or make it and write the file.
+    """Return the value of a cached file; if the file is missing or damaged, make and write it.
 
-    path: named by everything that the value depends on.
+    path: file name that contains everything the value depends on.
     decode: raises ValueError for bytes that it cannot read.
-    entry: the entry of the cache that the file belongs to, by default the file itself.
-    mapped: the file is mapped into memory, which processes share, instead of read.
+    entry: cache entry that the file belongs to, by default the file itself.
+    mapped: map the file into memory, shared between processes, instead of reading it.
     """
     entry = entry or path
     use_entry(entry)
@@ -334,34 +344,34 @@ def cached(
 
 
 def _read(path: Path, mapped: bool) -> memoryview:
-    """Read or map a cached file. Raises OSError, and ValueError where it is damaged."""
+    """Read or map a cached file. Raises OSError, or ValueError for a damaged file."""
     if mapped:
         with path.open("rb") as file:
             data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
     else:
         data = memoryview(path.read_bytes())
-    body = data[_SEAL_BYTES:]
-    if hashlib.sha256(body).hexdigest().encode() != data[:_SEAL_BYTES]:
+    body = data[_HASH_BYTES:]
+    if hashlib.sha256(body).hexdigest().encode() != data[:_HASH_BYTES]:
         raise ValueError(f"{path}: damaged")
     return body
 
 
 def _write(path: Path, parts: list[bytes | memoryview]) -> None:
-    """Write a cached file; of processes that write the same file at once the last one wins."""
-    seal = hashlib.sha256()
+    """Write a cached file. If several processes write it at once, the last one wins."""
+    digest = hashlib.sha256()
     for part in parts:
-        seal.update(part)
+        digest.update(part)
     with atomic_file(path, shared=True) as making, making.open("wb") as file:
-        file.write(seal.hexdigest().encode())
+        file.write(digest.hexdigest().encode())
         file.writelines(parts)
 
 
 def sources_hash(*rooms: Path) -> str:
-    """Return 16 hex digits of the Python files in some folders and of the libraries.
+    """Return 16 hex digits of a hash of Python sources in some folders and of library versions.
 
     Call it when a module is imported: later edits do not change what this process makes.
     """
-    seen = hashlib.sha256(" ".join(version(package) for package in _MADE_WITH).encode())
+    seen = hashlib.sha256(" ".join(version(package) for package in _ARRAY_PACKAGES).encode())
     for room in rooms:
         for source in sorted(room.rglob("*.py")):
             seen.update(source.relative_to(room).as_posix().encode() + b"\0" + source.read_bytes())
@@ -369,20 +379,20 @@ def sources_hash(*rooms: Path) -> str:
 
 
 def mapped_arrays(name: str, made_by: str, make: Callable[[], Arrays]) -> Arrays:
-    """Return arrays that take long to make, write-protected and shared by all processes.
+    """Return expensive arrays, write-protected and shared by all processes.
 
-    name: of the file, with every parameter of `make`.
-    made_by: the `sources_hash` of the code that makes them.
+    name: file name, with every parameter of `make`.
+    made_by: `sources_hash` of the code that makes the arrays.
     """
     path = cache_folder() / "baked" / f"{name}-{made_by}.arrays"
     return cached(path, lambda: _protected(make()), _encoded, _decoded, mapped=True)
 
 
 class ArrayCache:
-    """Cache of many small array sets that belong together: a file for each, in one folder.
+    """On-disk cache of many small array sets; each set is a file in one folder.
 
-    kind: names the folder of all such folders. key: a hash of everything that the sets depend on;
-    "" if that is unknown, so that none is cached.
+    kind: folder of all caches of this kind.
+    key: hash of everything that the sets depend on; "" disables caching.
     """
 
     def __init__(self, kind: str, key: str) -> None:
@@ -391,7 +401,8 @@ class ArrayCache:
             use_entry(self._folder)
 
     def get(self, name: str, make: Callable[[], Arrays]) -> Arrays:
-        """Return a set, write-protected. It is read, not mapped: a process may use thousands."""
+        """Return a set of arrays, write-protected. The file is read, not mapped, because a process
+        may use thousands."""
         if self._folder is None:
             return _protected(make())
         path = self._folder / name
@@ -399,7 +410,7 @@ class ArrayCache:
 
 
 _Table = list[tuple[str, bytes, tuple[int, ...], int]]
-"""Name, dtype as JSON, shape and begin of each array of a file."""
+"""Name, dtype as JSON, shape and offset of each array in a file."""
 
 
 def _protected(arrays: Arrays) -> Arrays:
@@ -412,7 +423,7 @@ def _protected(arrays: Arrays) -> Arrays:
 
 
 def _encoded(arrays: Arrays) -> Iterable[bytes | memoryview]:
-    """Encode arrays as the length of the table, the table, and the arrays one after the other."""
+    """Encode arrays as the table's length, the table, and the arrays one after the other."""
     import numpy as np
 
     table: _Table = []
@@ -441,7 +452,7 @@ def _decoded(body: memoryview) -> Arrays:
 
 
 def _aligned(count: int) -> int:
-    return -(-count // _ALIGNED) * _ALIGNED
+    return -(-count // _ALIGNMENT_BYTES) * _ALIGNMENT_BYTES
 
 
 @lru_cache(maxsize=64)

@@ -1,7 +1,6 @@
-"""Integer time. A tick is one step of the crowd; the policy acts every few ticks; physics runs
-substeps.
+"""Integer time: ticks of the crowd, periods of the policy, substeps of the physics.
 
-The simulation never reads a wall clock; a `Pacer` can hold it back to one.
+The simulation never reads a wall clock. A `Pacer` can slow it down to real time.
 """
 
 from __future__ import annotations
@@ -16,10 +15,11 @@ from cosim.core.errors import SpecError
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """The three periods of an episode, in whole milliseconds, checked once to divide each other.
+    """Periods of an episode in whole milliseconds; each divides the next larger one.
 
-    tick_ms: one step of crowd, director and referee. substep_ms: one step of the physics.
-    policy_ms: the policy's own period; its command is held in between.
+    tick_ms: period of crowd, director and referee.
+    substep_ms: period of the physics.
+    policy_ms: period of the policy; its command holds in between. Raises SpecError.
     """
 
     tick_ms: int = 50
@@ -42,14 +42,14 @@ class Clock:
 
     @classmethod
     def for_rate(cls, policy_hz: float) -> Clock:
-        """The clock of a policy that acts `policy_hz` times a simulated second."""
+        """Return the clock of a policy that acts `policy_hz` times per simulated second."""
         if not policy_hz > 0:
             raise SpecError(f"a policy rate must be positive, not {policy_hz} Hz")
         return cls(policy_ms=round(1000 / policy_hz))
 
     @property
     def substeps(self) -> int:
-        """Physics substeps per tick."""
+        """Number of physics substeps per tick."""
         return self.tick_ms // self.substep_ms
 
     @property
@@ -57,28 +57,28 @@ class Clock:
         return self.tick_ms / 1000
 
     def time_s(self, tick: int) -> float:
-        """Simulated seconds at the start of `tick`."""
+        """Return the simulated time at the start of a tick, in seconds."""
         return tick * self.tick_ms / 1000
 
     def ticks(self, seconds: float) -> int:
-        """Ticks in `seconds`, to the nearest."""
+        """Return the number of ticks in `seconds`, rounded to the nearest."""
         return round(seconds * 1000 / self.tick_ms)
 
     def acts(self, tick: int) -> bool:
-        """Whether the policy is asked at `tick`."""
+        """Return whether the policy acts at a tick."""
         return tick % (self.policy_ms // self.tick_ms) == 0
 
 
 class Pacer:
-    """Holds a simulation back to a multiple of real time.
+    """Slows a simulation down to a multiple of real time.
 
-    pace: simulated seconds for each second of the wall clock. clock, sleep: that wall clock, and
-    how to wait, in seconds.
+    pace: simulated seconds per second of wall-clock time.
+    clock: function that returns the wall-clock time in seconds.
+    sleep: function that waits for a time in seconds.
     """
 
     CATCH_UP_S: Final = 1.0
-    """A simulation that fell behind, because a policy thought or the machine was busy, makes up for
-    so much at most."""
+    """Maximum delay that the simulation catches up after it was slow, in seconds."""
 
     def __init__(
         self,
@@ -92,7 +92,7 @@ class Pacer:
         self._due_s: float | None = None
 
     def wait(self, simulated_s: float) -> None:
-        """Wait until so many more simulated seconds may be over."""
+        """Wait until `simulated_s` more simulated seconds may have passed."""
         now_s = self._clock()
         due_s = now_s if self._due_s is None else self._due_s
         self._due_s = max(due_s + simulated_s / self._pace, now_s - self.CATCH_UP_S)

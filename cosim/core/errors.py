@@ -1,4 +1,4 @@
-"""The errors of the project, in one tree, and the exit codes of the command line, one meaning each.
+"""Exception classes of the project and exit codes of the command line.
 
 CosimError                what a user can mend: shown as one message
 ├── UsageError         2  a name or option that does not exist, or a policy that cannot be loaded
@@ -24,30 +24,34 @@ from pathlib import Path
 from typing import ClassVar
 
 ALL_SCORED = 0
+"""Exit code of a run whose episodes are all scored."""
 SOME_CRASHED = 1
-"""The run ended, but not all of it is scored."""
+"""Exit code of a finished run in which some episodes are not scored."""
 WRONG_USE = 2
+"""Exit code for wrong input."""
 BROKEN_MACHINE = 3
+"""Exit code for a failed engine or machine."""
 INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells use it."""
 UNREAD = 141
-"""Nobody reads standard output any more; shells give this code to a program that a closed pipe has
-ended."""
+"""Exit code when the reader of standard output has closed the pipe, as shells use it."""
 
 MOST_LISTED = 30
-"""Of more valid choices than these, five are listed: those most like what was asked for, else the
-first."""
+"""Maximum number of valid choices that a message lists in full; of more, it lists five."""
 
 
 _MOST_LETTERS = 100
-"""Of a name that is compared with valid ones."""
+"""Maximum length of a name that is compared with valid ones, in characters."""
 _SHOWN_LETTERS = 60
-"""Of a path that is too long."""
+"""Maximum length of a too long path in a message, in characters."""
 _LONGEST_NAME_BYTES = 255
+"""Maximum length of a file name on Linux, in bytes."""
 _LONGEST_PATH_BYTES = 4095
+"""Maximum length of a path on Linux, in bytes."""
 
 
 class CosimError(Exception):
-    """Root of every error this project raises on purpose. The message says what to do.
+    """Base class of all errors that the project raises on purpose. The message says what to do.
 
     >>> try:
     ...     raise unknown("suite", "long-horizont", ["long-horizon", "reactive"])
@@ -60,13 +64,13 @@ class CosimError(Exception):
 
 
 class UsageError(CosimError):
-    """A name or option that does not exist; the message lists the valid choices."""
+    """A name or option that does not exist. The message lists the valid choices."""
 
     exit_code = WRONG_USE
 
 
 class SpecError(CosimError, ValueError):
-    """A spec that contradicts itself or the place it stands in."""
+    """A spec that contradicts itself or its place."""
 
     exit_code = WRONG_USE
 
@@ -84,8 +88,7 @@ class RunError(CosimError):
 
 
 class AccessError(CosimError):
-    """Certificates that do not fit, or a right that this end of a session lacks: trying again
-    changes nothing."""
+    """Certificates that do not match, or a missing right. A retry does not help."""
 
     exit_code = WRONG_USE
 
@@ -107,9 +110,11 @@ class DirectorLost(EngineError):
 
 
 class RendererLost(EngineError):
-    """The shared renderer has ended, or left this environment. number: which renderer of the run it
-    was, 0 where that is unknown; asked: what its policy was being asked for this environment, as
-    "act at 3.20 s", "" if nothing."""
+    """The shared renderer has exited or closed the connection to this environment.
+
+    number: number of the renderer in its run, 0 if unknown.
+    asked: pending policy call of this environment, such as "act at 3.20 s"; "" if none.
+    """
 
     def __init__(self, number: int, asked: str = "") -> None:
         super().__init__(
@@ -120,19 +125,17 @@ class RendererLost(EngineError):
 
 
 class PolicyServerLost(EngineError):
-    """The server of a remote policy is gone, or was begun anew: what it knew of the episode is
-    lost."""
+    """The server of a remote policy has exited or restarted, and lost the state of the episode."""
 
 
 class MachineError(CosimError):
-    """The machine lacks something: room on the disk, a folder that can be written, a library, a
-    program."""
+    """The machine lacks something: disk space, a writable folder, a library, a program."""
 
     exit_code = BROKEN_MACHINE
 
 
 def too_long(path: str | Path) -> UsageError:
-    """The error for the path of a file or folder that no file system takes."""
+    """Return the error for a path that is too long for any file system."""
     size = max(len(os.fsencode(part)) for part in Path(path).parts)
     shown = str(path) if len(str(path)) <= _SHOWN_LETTERS else f"{str(path)[:_SHOWN_LETTERS]}..."
     what = (
@@ -147,8 +150,7 @@ def too_long(path: str | Path) -> UsageError:
 
 
 def of_file(error: OSError) -> CosimError:
-    """The error for a file that the system refuses, where nothing more is known of it than its
-    path."""
+    """Return the error for a file that the system refuses, when only its path is known."""
     name = (
         os.fsdecode(error.filename)
         if isinstance(error.filename, str | bytes)
@@ -162,9 +164,13 @@ def of_file(error: OSError) -> CosimError:
 
 
 def unwritable(path: Path, error: OSError, remedy: str = "") -> MachineError | UsageError:
-    """The error for a file or folder that cannot be written. Where its path leads through a file,
-    or is one and should be a folder, that is the reason; and unless there is a remedy, another path
-    is. Its name may be too long."""
+    """Return the error for a file or folder that cannot be written.
+
+    If a part of its path is a file, the message says so. A name that is too long has an error of
+    its own.
+
+    remedy: advice that replaces the default one.
+    """
     if error.errno == errno.ENAMETOOLONG:
         return too_long(path)
     reason = error.strerror or str(error)
@@ -177,7 +183,7 @@ def unwritable(path: Path, error: OSError, remedy: str = "") -> MachineError | U
                     if file != path
                     else "with another name"
                 )
-                remedy = remedy or f"choose a place beside it, {beside}"
+                remedy = remedy or f"choose a path next to it, {beside}"
                 break
     return MachineError(
         f"{path}: cannot be written: {reason}: {remedy or 'choose another place, or make room'}"
@@ -185,8 +191,11 @@ def unwritable(path: Path, error: OSError, remedy: str = "") -> MachineError | U
 
 
 def unknown(what: str, name: str, choices: Iterable[str]) -> UsageError:
-    """The error for a `name` that is none of the `choices`, which it lists: unknown("suite", "x",
-    ["unit"])."""
+    """Return the error for a name that is none of the choices.
+
+    what: kind of name, such as "suite".
+    choices: the valid names, which the message lists.
+    """
     valid = sorted(choices)
     return UsageError(
         f"unknown {what} '{name}'. Valid choices: {listed(name, valid)}.{nearest(name, valid)}"
@@ -194,8 +203,7 @@ def unknown(what: str, name: str, choices: Iterable[str]) -> UsageError:
 
 
 def listed(name: str, choices: Iterable[str]) -> str:
-    """All choices, or of many how many there are, and those most like the name: "a, b", "312, among
-    them a, b"."""
+    """Return all choices in one line; of many, their number and the most similar ones."""
     valid = sorted(choices)
     if len(valid) <= MOST_LISTED:
         return ", ".join(valid) or "none"
@@ -204,7 +212,6 @@ def listed(name: str, choices: Iterable[str]) -> str:
 
 
 def nearest(name: str, valid: Iterable[str]) -> str:
-    """The question whether the valid name most like this one was meant; "" where none is like
-    it."""
+    """Return a question that suggests the most similar valid name; "" if none is similar."""
     near = get_close_matches(name[:_MOST_LETTERS], sorted(valid), n=1, cutoff=0.5)
     return f" Did you mean {near[0]}?" if near else ""

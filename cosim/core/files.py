@@ -1,4 +1,4 @@
-"""Write files and folders whole or not at all, lock them, and read files within bounds."""
+"""Write files and folders atomically, lock them, and read files with a size limit."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ if TYPE_CHECKING:
     from filelock import FileLock
 
 MAKING: Final = ".making-"
-"""Names of unfinished folders, and of unfinished files that processes share, begin like this."""
-_HELD: Final = ".held"
-"""The file in a temporary folder that its process keeps locked."""
+"""Prefix of unfinished folders, and of unfinished files that several processes write."""
+_LOCK_FILE: Final = ".held"
+"""File in a temporary folder that its process locks."""
 _OLD: Final = ".old"
-"""The folder in a temporary folder that holds the one that is being replaced."""
-_YOUNG_S: Final = 3600.0
-"""An unfinished file, or a folder without a lock file, may be in use until it is this old."""
+"""Folder in a temporary folder that holds the replaced folder."""
+_IN_USE_S: Final = 3600.0
+"""Age in seconds below which an unfinished file or unlocked folder counts as in use."""
 
 
 def lock(path: Path, *, wait: bool = True) -> FileLock:
-    """Return a lock on a file that is created for it; it is released when its process ends.
+    """Return a file lock; the file is created. The lock is released when its process ends.
 
-    wait: block until it is free. Otherwise acquiring it raises TimeoutError.
+    wait: block until the lock is free. Otherwise acquiring it raises TimeoutError.
     """
     from filelock import FileLock
 
@@ -55,11 +55,10 @@ def is_locked(path: Path) -> bool:
 
 @contextmanager
 def atomic_file(path: Path, *, shared: bool = False) -> Iterator[Path]:
-    """Yield a path to write to; at the end of the block it becomes `path`, after an error it is
-    removed.
+    """Yield a path to write to; it replaces `path` at the end of the block, or is removed on error.
 
-    shared: several processes may write the file at once. It is not flushed to the disk, as for
-    a file that can be made again.
+    shared: several processes may write the file at once. It is not flushed to disk, as for a file
+        that can be made again.
     """
     part = path.with_name(MAKING + secrets.token_hex(8) if shared else f"{path.name}.part")
     try:
@@ -74,7 +73,7 @@ def atomic_file(path: Path, *, shared: bool = False) -> Iterator[Path]:
 
 
 def write_atomic(path: Path, data: bytes, *, shared: bool = False) -> None:
-    """Write a file whole or not at all. `shared` is that of `atomic_file`. OSError passes."""
+    """Write a file atomically. `shared` is as in `atomic_file`. Raises OSError."""
     with atomic_file(path, shared=shared) as part:
         part.write_bytes(data)
 
@@ -84,17 +83,17 @@ def temp_folder(prefix: str, parent: Path | None = None) -> Iterator[Path]:
     """Yield a temporary folder, removed at the end of the block or by the next process that makes
     one.
 
-    prefix: begins the names of such folders, and of no others in `parent`.
-    parent: the system's temporary folder by default.
+    prefix: start of the names of such folders, and of no others in `parent`.
+    parent: by default the system's temporary folder.
     """
     parent = parent or Path(tempfile.gettempdir())
     parent.mkdir(parents=True, exist_ok=True)
     remove_dead(parent, prefix)
     with tempfile.TemporaryDirectory(prefix=prefix, dir=parent, ignore_cleanup_errors=True) as name:
         folder = Path(name)
-        new = folder / f"{_HELD}.new"
+        new = folder / f"{_LOCK_FILE}.new"
         with lock(new):
-            new.rename(folder / _HELD)  # locked before another process looks for it
+            new.rename(folder / _LOCK_FILE)  # locked before other processes can see it
             try:
                 yield folder
             finally:
@@ -105,18 +104,17 @@ def temp_folder(prefix: str, parent: Path | None = None) -> Iterator[Path]:
 def atomic_folder(
     target: Path, *, existing: Literal["replace", "keep", "refuse"] = "replace"
 ) -> Iterator[Path]:
-    """Yield an empty folder that becomes `target` at the end of the block, or is removed after an
-    error.
+    """Yield an empty folder that becomes `target` at the end of the block, or is removed on error.
 
-    existing: whether a folder that exists by then is replaced, is kept in place of the new one,
-    or raises OSError. An empty one is always replaced.
+    existing: policy for a folder that exists by then: replace it, keep it, or raise OSError. An
+        empty one is always replaced.
     """
     with temp_folder(MAKING, target.parent) as scratch:
         made = scratch / target.name
         made.mkdir()
         yield made
         old = scratch / _OLD / target.name
-        while True:  # another process may put its own there at any moment
+        while True:  # other processes may create it at any moment
             try:
                 made.rename(target)
                 return
@@ -132,8 +130,7 @@ def atomic_folder(
 
 
 def folder_holds(target: Path, name: str) -> bool:
-    """Return whether a folder of `atomic_folder` holds a file, after waiting while it is
-    replaced."""
+    """Return whether a folder of `atomic_folder` holds a file, after waiting for a replacement."""
     for _ in range(100):
         if (target / name).exists():
             return True
@@ -147,21 +144,23 @@ def folder_holds(target: Path, name: str) -> bool:
 def remove_dead(parent: Path, prefix: str) -> None:
     """Remove unfinished files and temporary folders whose processes have ended.
 
-    A folder that one of them was replacing is put back.
+    A folder that such a process was replacing is restored.
     """
-    for left in parent.glob(f"{prefix}*"):
+    for leftover in parent.glob(f"{prefix}*"):
         with suppress(OSError):
-            young = time.time() - left.stat().st_mtime < _YOUNG_S
-            if not left.is_dir():
-                if not young:
-                    left.unlink()
-            elif not (is_locked(left / _HELD) if (left / _HELD).exists() else young):
-                _restore(left)
-                shutil.rmtree(left)
+            recent = time.time() - leftover.stat().st_mtime < _IN_USE_S
+            if not leftover.is_dir():
+                if not recent:
+                    leftover.unlink()
+            elif not (
+                is_locked(leftover / _LOCK_FILE) if (leftover / _LOCK_FILE).exists() else recent
+            ):
+                _restore(leftover)
+                shutil.rmtree(leftover)
 
 
 def _restore(scratch: Path) -> None:
-    """Put a folder back that was moved away and has no successor."""
+    """Restore a folder that was moved away and has no successor."""
     for old in (scratch / _OLD).glob("*"):
         target = scratch.parent / old.name
         if not target.exists():
@@ -170,7 +169,7 @@ def _restore(scratch: Path) -> None:
 
 
 def size_within(path: Path, most_bytes: int) -> int:
-    """Return the size of a file in bytes. OSError passes.
+    """Return the size of a file in bytes. Raises OSError.
 
     Raises ValueError for a larger file, and for a folder, a pipe or a device.
     """

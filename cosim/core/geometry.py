@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 
 
 class Pose(NamedTuple):
-    """A pose in the world frame."""
+    """Pose in the world frame."""
 
     x_m: float
     y_m: float
@@ -24,48 +24,51 @@ class Pose(NamedTuple):
 
     @property
     def xy(self) -> Floats:
-        """(2,) position in metres."""
+        """Position in metres, shape (2,)."""
         return np.array([self.x_m, self.y_m])
 
 
 class Circle(NamedTuple):
-    """Where something that was found at its middle is known to hold; by default nowhere."""
+    """A disk in the plane; the default one contains nothing.
+
+    It bounds where a result that was found at its centre stays valid.
+    """
 
     x_m: float = math.nan
     y_m: float = math.nan
     radius_m: float = 0.0
 
     def holds(self, x_m: float, y_m: float) -> bool:
-        """Whether a point lies in it; its middle always does."""
+        """Return whether a point lies in the disk. The centre always does."""
         return math.hypot(x_m - self.x_m, y_m - self.y_m) <= self.radius_m
 
 
 def wrap_angle(angle_rad: float) -> float:
-    """`angle_rad` wrapped into (-pi, pi]."""
+    """Return an angle wrapped into (-pi, pi]."""
     wrapped = math.fmod(angle_rad + math.pi, 2.0 * math.pi)
     return wrapped + math.pi if wrapped <= 0.0 else wrapped - math.pi
 
 
 def wrap_angles(angles_rad: ArrayLike) -> Floats:
-    """Every angle of an array wrapped into (-pi, pi]."""
+    """Return every angle of an array wrapped into (-pi, pi]."""
     return np.pi - (np.pi - np.asarray(angles_rad, dtype=float)) % (2.0 * np.pi)
 
 
 def headings_from_sumo(angles_deg: ArrayLike) -> Floats:
-    """SUMO's navigational degrees (0 north, clockwise) as headings in radians."""
+    """Convert SUMO's navigational degrees (0 north, clockwise) to headings in radians."""
     return wrap_angles(np.radians(90.0 - np.asarray(angles_deg, dtype=float)))
 
 
 def heading_to_sumo(heading_rad: float) -> float:
-    """A heading in radians as SUMO's navigational degrees in [0, 360)."""
+    """Convert a heading in radians to SUMO's navigational degrees in [0, 360)."""
     return (90.0 - math.degrees(heading_rad)) % 360.0
 
 
 class Polyline:
-    """An open polyline measured by arc length.
+    """Open polyline with points addressed by arc length.
 
-    points: (N, 2) metres, N >= 2; consecutive equal points are dropped. Raises ValueError when
-    fewer than two distinct points remain.
+    points: (N, 2) metres, N >= 2; consecutive equal points are dropped. Raises ValueError if fewer
+        than two distinct points remain.
     """
 
     def __init__(self, points: ArrayLike) -> None:
@@ -88,7 +91,7 @@ class Polyline:
         return float(self.s_m[-1])
 
     def at(self, s_m: float) -> Pose:
-        """The pose at arc length `s_m` (clamped to the ends), heading along the polyline."""
+        """Return the pose at arc length `s_m`, clamped to the ends, heading along the polyline."""
         i = min(
             max(int(np.searchsorted(self.s_m, s_m, side="right")) - 1, 0), len(self._lengths) - 1
         )
@@ -100,10 +103,10 @@ class Polyline:
     def project(
         self, x_m: float, y_m: float, near_s_m: tuple[float, float] | None = None
     ) -> tuple[float, float]:
-        """Nearest point of the polyline: (arc length, signed offset, left positive), in metres.
+        """Return arc length and signed offset (left positive) of the nearest point, in metres.
 
-        near_s_m: search only the segments that touch this interval of arc length. A route that
-        passes near itself is projected unambiguously only with it.
+        near_s_m: interval of arc length to search. A route that passes near itself needs it for an
+            unambiguous result.
         """
         first = 0
         last = len(self._lengths)
@@ -122,7 +125,7 @@ class Polyline:
         return float(self.s_m[first + i] + along[i]), math.copysign(math.hypot(ox[i], oy[i]), side)
 
     def resampled(self, step_m: float) -> Polyline:
-        """The same line with a point about every `step_m` metres; the ends stay."""
+        """Return the line with a point about every `step_m` metres and the same ends."""
         count = max(round(self.length_m / step_m), 1)
         s = np.linspace(0.0, self.length_m, count + 1)
         xy = np.column_stack(
@@ -134,9 +137,10 @@ class Polyline:
 def box_disk_gap(
     poses: Floats, half_length_m: float, half_width_m: float, centres: Floats
 ) -> Floats:
-    """Distance from oriented boxes to points; 0 inside.
+    """Return the distance from oriented boxes to points; 0 inside.
 
-    poses: (T, 3) x, y, heading of the box's centre. centres: (T, N, 2) or (1, N, 2) metres.
+    poses: (T, 3) x, y, heading of the box's centre.
+    centres: (T, N, 2) or (1, N, 2) points in metres.
     Returns (T, N) metres. Subtract a disk's radius to get the gap to the disk.
     """
     offset = centres - poses[:, None, :2]
@@ -149,10 +153,11 @@ def box_disk_gap(
 def boxes_overlap(
     pose_a: Floats, half_a: ArrayLike, pose_b: Floats, half_b: ArrayLike
 ) -> NDArray[np.bool_]:
-    """Whether oriented boxes overlap, by the separating-axis theorem.
+    """Return whether oriented boxes overlap, by the separating-axis theorem.
 
-    pose_a, pose_b: (..., 3) x, y, heading. half_a, half_b: (..., 2) half length, half width,
-    metres. Returns the broadcast shape of booleans.
+    pose_a, pose_b: (..., 3) x, y, heading.
+    half_a, half_b: (..., 2) half length, half width, in metres.
+    Returns booleans in the broadcast shape.
     """
     pose_a, pose_b = np.asarray(pose_a, float), np.asarray(pose_b, float)
     half_a, half_b = np.asarray(half_a, float), np.asarray(half_b, float)

@@ -1,5 +1,4 @@
-"""What happens in a run, a coordinator or a worker, for logs: an event by its name, and facts by
-theirs."""
+"""Structured logging of events in a run, a coordinator or a worker."""
 
 from __future__ import annotations
 
@@ -12,7 +11,7 @@ JOURNAL.propagate = False
 
 
 def happened(event: str, level: int = logging.INFO, /, **facts: object) -> None:
-    """Tell whoever keeps a log. Nothing is kept, and next to nothing done, where nobody does.
+    """Log an event with its facts. Without a log handler this costs next to nothing.
 
     >>> happened("retried", logging.WARNING, scenario="frontal-001", why="its worker was lost")
     """

@@ -1,7 +1,7 @@
-"""Arrays from an .npz file that others made: read within bounds, or refused in words.
+"""Read untrusted .npz files within size limits.
 
-Sizes are looked at before anything is read: neither a sparse file nor a few bytes that unpack to
-gigabytes fill the memory. Objects (pickle) are never unpacked.
+Sizes are checked before anything is read, so that neither sparse files nor zip bombs fill the
+memory. Pickled objects are never loaded.
 """
 
 from __future__ import annotations
@@ -21,12 +21,15 @@ from numpy.typing import NDArray
 from cosim.core.files import size_within
 
 MOST_NPZ_BYTES: Final = 2 << 30
+"""Maximum size of a file, packed or unpacked, in bytes."""
 _MOST_ARRAYS: Final = 4096
+"""Maximum number of arrays in a file."""
 _ENDING: Final = ".npy"
 _HEADERS: Final = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
 }
+"""Reader of the array header by version of the .npy format."""
 NO_NPZ: Final = (
     EOFError,
     KeyError,
@@ -42,17 +45,17 @@ NO_NPZ: Final = (
     zipfile.LargeZipFile,
     zlib.error,
 )
-"""What zipfile and numpy raise where a file is damaged, encrypted, packed otherwise, or not one of
-theirs."""
+"""Exceptions that zipfile and numpy raise for damaged, encrypted or foreign files."""
 
 
 def read_npz(
     path: Path, only: Collection[str] | None = None, most_bytes: int = MOST_NPZ_BYTES
 ) -> dict[str, NDArray[Any]]:
-    """The arrays of a file, by name. only: of these names, each of which must be there.
+    """Return the arrays of a file by name.
 
-    Raises ValueError, which says what is wrong: no regular file, no .npz, cut off, damaged, objects
-    in it, or more than `most_bytes`, packed or unpacked. OSError passes.
+    only: names of the arrays to read; each of them must exist.
+    Raises ValueError with the reason: not a regular file, not an .npz, truncated, damaged, pickled
+    objects, or larger than `most_bytes`. Raises OSError.
     """
     size_within(path, most_bytes)
     with path.open("rb") as file:
@@ -60,8 +63,7 @@ def read_npz(
 
 
 def names_in_npz(path: Path) -> list[str]:
-    """The names of the arrays of a file, which are not read. Raises ValueError for what is no .npz;
-    OSError passes."""
+    """Return the names of the arrays in a file without reading them. Raises ValueError, OSError."""
     try:
         with zipfile.ZipFile(path) as held:
             return [name.removesuffix(_ENDING) for name in held.namelist()]
@@ -72,7 +74,7 @@ def names_in_npz(path: Path) -> list[str]:
 def arrays_in(
     file: BinaryIO, only: Collection[str] | None = None, most_bytes: int = MOST_NPZ_BYTES
 ) -> dict[str, NDArray[Any]]:
-    """The same of an open file."""
+    """Return the arrays of an open file by name, as `read_npz` does."""
     try:
         with zipfile.ZipFile(file) as held:
             entries = {one.filename.removesuffix(_ENDING): one for one in held.infolist()}
@@ -93,7 +95,7 @@ def arrays_in(
 
 
 def _array(name: str, data: bytes) -> NDArray[Any]:
-    """The array in the bytes of an .npy file."""
+    """Decode the array in the bytes of an .npy file."""
     file = io.BytesIO(data)
     version = np.lib.format.read_magic(file)
     if version not in _HEADERS:

@@ -1,5 +1,4 @@
-"""Packed: demonstrations as plain arrays in one .npz, for training in a Python that has numpy and
-nothing else.
+"""Packed demonstrations: plain arrays in one .npz, for training with numpy alone.
 
 `cosim dataset pack DIR -o FILE.npz` writes it of what `cosim collect` has collected. Its arrays, N
 rows, one for each
@@ -43,16 +42,16 @@ from cosim.core.files import atomic_file
 from cosim.core.npz import NO_NPZ
 
 _FORMAT: Final = 1
+"""Version of the file format."""
 
 
 @dataclass(frozen=True)
 class Packed:
-    """Demonstrations in memory; the arrays are those of the file.
+    """Demonstrations in memory, with the arrays of the file.
 
-    meta: rate_hz, waypoint_s; goal, the name of its protocol, "none" without one; camera, as in
-    `CameraSpec`; robot; policy, noise and learner, lists with those of each data set; structures, a
-    list with what each episode is an example of ("straight", "gesturing"), and scenarios, a list of
-    their ids.
+    meta: rate_hz and waypoint_s; goal, the name of its protocol or "none"; camera, as in
+        `CameraSpec`; robot. policy, noise and learner are lists with one value for each data set.
+        structures and scenarios are lists with the structure and the id of each episode's scenario.
     """
 
     frames: NDArray[np.uint8]
@@ -70,8 +69,12 @@ class Packed:
         return len(self.episode)
 
     def history(self, pictures: int, every: int = 1) -> NDArray[np.int64]:
-        """(N, pictures) rows: what had been seen at each, oldest first and itself last, `every`
-        rows apart; before its episode's first row that one, as a policy fills its memory.
+        """Return the rows of the last pictures at each row, oldest first, as (N, pictures).
+
+        Rows before the start of an episode are replaced by its first row, as a policy fills its
+        memory.
+
+        every: distance between the pictures in rows.
 
         >>> two = np.zeros((3, 2), np.float32)
         >>> rgb = np.zeros((3, 9, 16, 3), np.uint8)
@@ -87,7 +90,7 @@ class Packed:
         return found
 
     def save(self, path: Path) -> None:
-        """Write the file, whole or not at all. Raises MachineError where that cannot be."""
+        """Write the file atomically. Raises MachineError."""
         arrays = {one.name: getattr(self, one.name) for one in fields(self) if one.name != "meta"}
         meta = json.dumps({"format": _FORMAT, **self.meta}, sort_keys=True)
         try:
@@ -98,18 +101,20 @@ class Packed:
 
 
 def packed_digest(path: Path) -> str:
-    """Of all that a file holds, by the checksums that it holds itself: two packed of the same have
-    the same. Raises RunError naming it where it holds none."""
+    """Return a hash of a file's content, from the checksums in the file. Raises RunError.
+
+    Files packed from the same data have the same hash.
+    """
     try:
         with zipfile.ZipFile(path) as held:
-            told = [(one.filename, one.file_size, one.CRC) for one in held.infolist()]
+            checksums = [(one.filename, one.file_size, one.CRC) for one in held.infolist()]
     except (OSError, *NO_NPZ) as error:
-        raise _none_in(path, error) from error
-    return hashlib.blake2b(repr(told).encode(), digest_size=8).hexdigest()
+        raise _unreadable(path, error) from error
+    return hashlib.blake2b(repr(checksums).encode(), digest_size=8).hexdigest()
 
 
 def read_packed(path: Path) -> Packed:
-    """The demonstrations in a file. Raises RunError naming it where it holds none."""
+    """Load the demonstrations of a file. Raises RunError."""
     try:
         with np.load(path, allow_pickle=False) as held:
             meta = json.loads(str(held["meta"]))
@@ -117,9 +122,9 @@ def read_packed(path: Path) -> Packed:
         if meta.pop("format") != _FORMAT or len({len(array) for array in arrays.values()}) != 1:
             raise ValueError("its arrays are of different lengths, or of another format")
     except (OSError, *NO_NPZ) as error:
-        raise _none_in(path, error) from error
+        raise _unreadable(path, error) from error
     return Packed(**arrays, meta=meta)
 
 
-def _none_in(path: Path, error: Exception) -> RunError:
+def _unreadable(path: Path, error: Exception) -> RunError:
     return RunError(f"{path}: no packed demonstrations: {error}: make it with `cosim dataset pack`")

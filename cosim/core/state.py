@@ -1,7 +1,7 @@
-"""Snapshots of a moment: frozen values that travel between the engines.
+"""Frozen snapshots of the simulation that engines exchange.
 
-Arrays are write-protected; positions are world metres, headings radians counter-clockwise from +x,
-speeds m/s.
+Arrays are write-protected. Positions are metres in the world frame, headings radians
+counter-clockwise from +x, speeds m/s.
 """
 
 from __future__ import annotations
@@ -18,16 +18,15 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Floats, Pose
 
 PERSON_RADIUS_M = 0.3
-"""Radius of every pedestrian's collision cylinder."""
+"""Radius of every pedestrian's collision cylinder, in metres."""
 
 Doing = Literal["walk", "stand", "look", "talk", "queue", "stop", "phone", "sit"]
-"""What a pedestrian's body shows: walking, standing, looking around, talking, queueing, the
-stopping hand, reading a phone, sitting on a seat behind the place where it is."""
+"""Activity that a pedestrian's body shows. "stop" raises a hand; "sit" uses a seat behind the
+person's position."""
 
 
 class PersonKind(IntEnum):
-    """Whose a person is: of the background crowd, of an event, a resident (`CrowdSpec.residents`),
-    or injected."""
+    """Origin of a person: background crowd, event, resident (`CrowdSpec.residents`) or injected."""
 
     CROWD = 0
     EVENT = 1
@@ -36,11 +35,11 @@ class PersonKind(IntEnum):
 
 
 DIRECTED: Final = (PersonKind.EVENT, PersonKind.INJECTED)
-"""Whom the director of events moves."""
+"""Kinds of people that the event director moves."""
 
 
 class Age(IntEnum):
-    """How old a person looks, and in the crowd how fast it walks."""
+    """Age group of a person, for the looks and, in the crowd, the walking speed."""
 
     ADULT = 0
     CHILD = 1
@@ -50,7 +49,7 @@ class Age(IntEnum):
 def write_protected(
     array: Any, dtype: Any = np.float64, shape: tuple[int, ...] | None = None
 ) -> NDArray[Any]:
-    """A write-protected copy of `array`."""
+    """Return a write-protected copy of an array."""
     copy = np.array(array, dtype=dtype)
     if shape is not None:
         copy = copy.reshape(shape)
@@ -58,18 +57,19 @@ def write_protected(
 
 
 def frozen(array: NDArray[Any]) -> NDArray[Any]:
-    """The array itself, write-protected from now on."""
+    """Write-protect an array in place and return it."""
     array.flags.writeable = False
     return array
 
 
 @dataclass(frozen=True, slots=True)
 class RobotState:
-    """The robot: pose of the base centre on the ground plane, body speeds, height and tilt of the
-    base.
+    """State of the robot: pose of the base centre on the ground plane and motion of the base.
 
-    v_mps along the heading, w_radps counter-clockwise; z_m height of the base frame; tilt_rad angle
-    between the base's up axis and the vertical.
+    v_mps: speed along the heading.
+    w_radps: yaw rate, counter-clockwise.
+    z_m: height of the base frame.
+    tilt_rad: angle between the base's up axis and the vertical.
     """
 
     pose: Pose
@@ -81,12 +81,17 @@ class RobotState:
 
 @dataclass(frozen=True, slots=True)
 class People:
-    """Pedestrians of a moment. ids: N unique names; xy (N, 2) m; heading (N,) rad; speed (N,) m/s.
-    A name says nothing of who has it: kind (N,) int8 of `PersonKind`, age (N,) int8 of `Age`.
+    """Pedestrians at one moment.
 
-    strides (N,): strides taken so far, whose fraction is the phase of the gait; pace (N,) m/s: the
-    speed that the body shows, which follows the speed as one starts and stops
-    (`cosim.people.gait`). Both are for pictures: nothing else reads them."""
+    ids: N unique names, independent of kind and age.
+    xy: (N, 2) positions in metres.
+    heading: (N,) radians.
+    speed: (N,) m/s.
+    strides: (N,) strides taken so far; the fraction is the phase of the gait. For pictures only.
+    pace: (N,) m/s, speed that the body shows (`cosim.people.gait`). For pictures only.
+    kind: (N,) int8 of `PersonKind`.
+    age: (N,) int8 of `Age`.
+    """
 
     ids: tuple[str, ...]
     xy: Floats
@@ -111,8 +116,12 @@ class People:
         kind: Any = PersonKind.CROWD,
         age: Any = Age.ADULT,
     ) -> People:
-        """Without strides and pace: people at the beginning of a stride, at the pace of their
-        speed. kind, age: of all of them, or of each."""
+        """Return people from arrays, which are copied.
+
+        strides: by default 0, the beginning of a stride.
+        pace: by default the speed.
+        kind, age: one value for all, or (N,).
+        """
         n = len(ids)
         return cls(
             ids,
@@ -127,18 +136,18 @@ class People:
         )
 
     def copied(self) -> People:
-        """The same people in arrays of their own."""
+        """Return the same people with arrays of their own."""
         return People.of(*(getattr(self, column.name) for column in fields(self)))
 
     def are(self, kind: PersonKind, *more: PersonKind) -> NDArray[np.bool_]:
-        """(N,) who is of one of these kinds."""
+        """Return whether each person is of one of these kinds, as (N,) booleans."""
         found: NDArray[np.bool_] = self.kind == kind.value
         for other in more:
             found |= self.kind == other.value
         return found
 
     def only(self, rows: NDArray[np.intp]) -> People:
-        """Those in these rows."""
+        """Return the people in these rows."""
         if len(rows) == len(self.ids) and (rows == np.arange(len(rows))).all():
             return self
         columns = (self.xy, self.heading, self.speed, self.strides, self.pace, self.kind, self.age)
@@ -156,8 +165,11 @@ class People:
 
 @dataclass(frozen=True, slots=True)
 class Vehicles:
-    """Vehicles of a moment. xy (N, 2) m is the centre of the box; size (N, 2) m is length,
-    width."""
+    """Vehicles at one moment.
+
+    xy: (N, 2) centres of the boxes in metres.
+    size: (N, 2) length and width in metres.
+    """
 
     ids: tuple[str, ...]
     xy: Floats
@@ -167,6 +179,7 @@ class Vehicles:
 
     @classmethod
     def of(cls, ids: tuple[str, ...], xy: Any, heading: Any, speed: Any, size: Any) -> Vehicles:
+        """Return vehicles from arrays, which are copied."""
         n = len(ids)
         return cls(
             ids,
@@ -186,8 +199,11 @@ NO_VEHICLES = Vehicles.of((), [], [], [], [])
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """A crosswalk signal: may one walk, and in how many seconds does that change (None: unknown or
-    never)."""
+    """Crosswalk signal.
+
+    walk: whether pedestrians may walk.
+    changes_in_s: time to the next change in seconds; None if unknown or never.
+    """
 
     walk: bool
     changes_in_s: float | None = None
@@ -195,10 +211,10 @@ class Signal:
 
 @dataclass(frozen=True, slots=True)
 class Street:
-    """Everything that moves or changes but the robot, at one tick.
+    """Everything at one tick that moves or changes, except the robot.
 
-    signals: crossing id -> Signal, for the signalised crossings near the robot; a crossing that is
-    absent has no signal.
+    signals: signal by crossing id, for signalised crossings near the robot. Other crossings have no
+        signal.
     """
 
     tick: int
@@ -209,7 +225,7 @@ class Street:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What the robot is told: forward speed in m/s and yaw rate in rad/s, left positive.
+    """Command to the robot: forward speed in m/s and yaw rate in rad/s, left positive.
 
     >>> Command(v_mps=1.0, w_radps=-0.2)
     Command(v_mps=1.0, w_radps=-0.2)
@@ -221,10 +237,11 @@ class Command:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Planned(Command):
-    """The command that follows one of waypoints, with these.
+    """Command that follows one of a policy's waypoints.
 
-    waypoints: (N, 2) float32, x ahead and y left of the robot at its observation, metres; (N, 4)
-    with the cosine and the sine of the heading there. index: which one is followed.
+    waypoints: (N, 2) float32, metres ahead and to the left of the robot at its observation; (N, 4)
+        with cosine and sine of the heading there.
+    index: number of the waypoint that is followed.
     """
 
     waypoints: NDArray[np.float32]
@@ -232,11 +249,16 @@ class Planned(Command):
 
 
 STILL = Command(0.0, 0.0)
+"""Command that stops the robot."""
 
 
 @dataclass(frozen=True, slots=True)
 class Contact:
-    """The robot's body touched something. other: the thing's id; substep: of the tick, from 0."""
+    """Contact of the robot's body with another object.
+
+    other: id of the object.
+    substep: number of the substep in its tick, from 0.
+    """
 
     kind: Literal["pedestrian", "vehicle", "wall", "object"]
     other: str
@@ -245,10 +267,10 @@ class Contact:
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """What one tick of physics did.
+    """Result of one tick of physics.
 
-    trace: (substeps, 3) x, y, heading of the robot after each substep. contacts: in order of
-    substeps, at most one for each (substep, other).
+    trace: (substeps, 3) x, y, heading of the robot after each substep.
+    contacts: in order of substeps, at most one for each (substep, other).
     """
 
     robot: RobotState
@@ -258,8 +280,12 @@ class Motion:
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """What a camera saw. rgb (H, W, 3) uint8; labels (H, W) uint8 semantic ids; depth (H, W)
-    float32 metres."""
+    """Picture of a camera.
+
+    rgb: (H, W, 3) uint8.
+    labels: (H, W) uint8 semantic ids, see `LABELS`.
+    depth: (H, W) float32 metres.
+    """
 
     rgb: NDArray[np.uint8]
     labels: NDArray[np.uint8] | None = None
@@ -284,4 +310,27 @@ LABELS: Mapping[str, int] = MappingProxyType(
         "robot": 13,
     }
 )
-"""Semantic ids of a camera's label picture."""
+"""Semantic ids of a label picture."""
+
+
+@dataclass(slots=True)
+class RowLookup:
+    """Finds the rows of people in the previous tick's table by their ids.
+
+    Mostly the ids are unchanged; then no search is needed.
+    """
+
+    _ids: tuple[str, ...] = ()
+
+    def of(self, ids: tuple[str, ...]) -> tuple[NDArray[np.intp] | slice, list[int]]:
+        """Return each person's row in the previous table, and the positions in `ids` of new people.
+
+        The row of a new person is the last one of the table. If the ids are unchanged the rows are
+        a slice, so that indexing makes no copy.
+        """
+        if ids and ids == self._ids:
+            return slice(None), []
+        index = {name: i for i, name in enumerate(self._ids)}
+        row = [index.get(name, -1) for name in ids]
+        self._ids = ids
+        return np.array(row, dtype=np.intp), [i for i, k in enumerate(row) if k < 0]

@@ -1,10 +1,10 @@
-"""Write times and sizes with their units."""
+"""Format times and sizes with units."""
 
 from __future__ import annotations
 
 
 def duration(seconds: float) -> str:
-    """Return a time, no finer than it is known: 45 s, 90 s, 12 min, 2 h 10 min."""
+    """Return a time in rounded units: 45 s, 90 s, 12 min, 2 h 10 min."""
     if seconds < 115.0:
         return f"{round(seconds, -1) if seconds >= 60.0 else seconds:.0f} s"
     minutes = round(seconds / 60.0)
@@ -15,7 +15,7 @@ def duration(seconds: float) -> str:
 
 
 def milliseconds(ms: float) -> str:
-    """Return a short time to three figures: 0.43 ms, 70.3 ms, 1,235 ms.
+    """Return a short time with three digits: 0.43 ms, 70.3 ms, 1,235 ms.
 
     >>> milliseconds(70.345), milliseconds(1234.6)
     ('70.3 ms', '1,235 ms')
@@ -24,7 +24,7 @@ def milliseconds(ms: float) -> str:
 
 
 def bytes_in_words(count: float) -> str:
-    """Return a size to three figures in decimal units, as disks have them: 812 B, 4.2 MB, 1.62 GB.
+    """Return a size with three digits in decimal units: 812 B, 4.2 MB, 1.62 GB.
 
     >>> bytes_in_words(812), bytes_in_words(4_200_000), bytes_in_words(1_618_000_000)
     ('812 B', '4.2 MB', '1.62 GB')

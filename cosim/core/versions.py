@@ -1,4 +1,4 @@
-"""Versions and floating-point behaviour of everything that can change the bits of an episode."""
+"""Versions and floating-point behaviour of everything that affects an episode's bits."""
 
 from __future__ import annotations
 
@@ -10,17 +10,19 @@ from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
 
-_ASKED = 4096
-"""Arguments of each function. Where two ways of rounding differ at all they do so for one in some
-hundred."""
+_ARGUMENT_COUNT = 4096
+"""Number of arguments for each function. Implementations that differ at all do so for about one in
+some hundred."""
 
 
 @lru_cache(maxsize=1)
 def arithmetic() -> str:
-    """Hash of the bits of what the simulation computes with, over fixed arguments; 6 ms, once in a
-    process."""
+    """Return a hash of the results of elementary functions for fixed arguments.
+
+    It takes 6 ms, once in a process.
+    """
     share = (
-        np.arange(1, _ASKED + 1, dtype=np.uint64)
+        np.arange(1, _ARGUMENT_COUNT + 1, dtype=np.uint64)
         * np.uint64(2654435761)
         % np.uint64(1 << 32)
         / 2.0**32
@@ -29,8 +31,8 @@ def arithmetic() -> str:
     angle = (share - 0.5) * 40.0
     ratio = 2.0 * share - 1.0
     power = (share - 0.5) * 20.0
-    much = share * 100.0
-    of_one = (
+    large = share * 100.0
+    unary = (
         (math.sin, np.sin, angle),
         (math.cos, np.cos, angle),
         (math.tan, None, angle),
@@ -38,18 +40,18 @@ def arithmetic() -> str:
         (math.asin, np.arcsin, ratio),
         (math.acos, np.arccos, ratio),
         (math.exp, np.exp, power),
-        (math.log, np.log, much),
+        (math.log, np.log, large),
     )
-    of_two = ((math.atan2, np.arctan2), (math.hypot, np.hypot), (math.pow, np.power))
+    binary = ((math.atan2, np.arctan2), (math.hypot, np.hypot), (math.pow, np.power))
     bits = hashlib.blake2b(digest_size=8)
-    for plain, array, asked in of_one:
-        bits.update(np.array([plain(value) for value in asked.tolist()]).tobytes())
+    for scalar, array, arguments in unary:
+        bits.update(np.array([scalar(value) for value in arguments.tolist()]).tobytes())
         if array is not None:
-            bits.update(array(asked).tobytes())
-    for plain_2, array_2 in of_two:
-        pairs = zip(much.tolist(), other.tolist(), strict=True)
-        bits.update(np.array([plain_2(one, two) for one, two in pairs]).tobytes())
-        bits.update(array_2(much, other).tobytes())
+            bits.update(array(arguments).tobytes())
+    for scalar_2, array_2 in binary:
+        pairs = zip(large.tolist(), other.tolist(), strict=True)
+        bits.update(np.array([scalar_2(one, two) for one, two in pairs]).tobytes())
+        bits.update(array_2(large, other).tobytes())
     return bits.hexdigest()
 
 
@@ -67,6 +69,7 @@ RECORDED_PACKAGES = (
     "glcontext",
     "opencv-python-headless",
 )
+"""Distributions whose versions are recorded with every episode."""
 
 ENGINES = {
     "SUMO": "libsumo",
@@ -74,14 +77,15 @@ ENGINES = {
     "Zenoh": "eclipse-zenoh",
     "moderngl": "moderngl",
 }
-"""Name for humans -> distribution."""
+"""Distribution of each engine, by the engine's name."""
 
 
 @lru_cache(maxsize=1)
 def versions() -> dict[str, str]:
-    """Version of each package by distribution name, of `geos` as shapely loaded it, and the
-    `arithmetic` of this machine (`cosim.core.versions`). Machines of which all of it is the same
-    simulate the same to the bit."""
+    """Return the version of each package, of `geos`, and the `arithmetic` hash of this machine.
+
+    Machines with equal values simulate the same bits.
+    """
     import shapely
 
     found = {package: version(package) for package in RECORDED_PACKAGES}
@@ -89,8 +93,7 @@ def versions() -> dict[str, str]:
 
 
 def versions_in_words() -> str:
-    """Versions of the project, Python and the engines, for humans; nothing is imported to find
-    them."""
+    """Return the versions of project, Python and engines as text, without importing the engines."""
     engines = ", ".join(f"{name} {_installed(package)}" for name, package in ENGINES.items())
     return f"cosim {_installed('sidewalk-cosim')}, Python {platform.python_version()}\n{engines}"
 

@@ -1,7 +1,7 @@
-"""From a policy's answer to a command: checks, and the rules by which waypoints are followed.
+"""Convert a policy's answer to a command: checks and waypoint rules.
 
-The rules follow D. Shah et al., GNM (ICRA 2023), ViNT (CoRL 2023), and A. Sridhar et al., NoMaD
-(ICRA 2024), as their robots are driven: one waypoint of the answer, to be reached in one time step.
+The rules follow the robots of GNM (D. Shah et al., ICRA 2023), ViNT (D. Shah et al., CoRL 2023) and
+NoMaD (A. Sridhar et al., ICRA 2024). One waypoint of the answer is reached in one time step.
 """
 
 from __future__ import annotations
@@ -18,24 +18,29 @@ from cosim.spec.manifest import WaypointRule
 from cosim.spec.robot import Robot
 
 EPS_M = 1e-8
+"""Coordinate in metres below which a waypoint counts as at the robot."""
 MOST_NUMBERS = 100_000
-"""Of a policy's answer, wherever the policy runs."""
+"""Maximum number of numbers in a policy's answer."""
 REAL_KINDS = "iuf"
-"""The kinds of numpy that are real numbers: integers, unsigned, floating."""
+"""numpy's kinds of real numbers: integers, unsigned integers, floats."""
 _MOST_SHOWN = 80
+"""Maximum length of an answer in a message, in characters."""
 _COLUMNS = (2, 4)
-_MOST_KEPT = 256
-"""Of the waypoints of one answer so many are told of it, and all up to the one that is followed."""
+"""Valid numbers of columns of waypoints."""
+_MOST_RECORDED = 256
+"""Maximum number of recorded waypoints of an answer; all up to the followed one are recorded."""
 _LARGEST = float(np.finfo(np.float32).max)
+"""Largest float32."""
 
 
-def _followed(x_m: float, y_m: float, heading_rad: float | None, rule: WaypointRule) -> Command:
-    """The command for one waypoint (x forward, y left), not yet clipped. heading_rad: the one it
-    has, None for none.
+def _command_for(x_m: float, y_m: float, heading_rad: float | None, rule: WaypointRule) -> Command:
+    """Return the unclipped command for one waypoint (x forward, y left).
 
-    At the robot's own place the heading is turned to, without one nothing is done. One exactly at
-    its side is turned to by a quarter. Else v = x / dt, and w = arctan(y / x) / dt (`shipped`) or
-    atan2(y, x) / dt (`atan2`): these differ behind the robot alone.
+    heading_rad: heading of the waypoint, None without one.
+
+    At the robot's own position the command turns to the heading, or stands without one. Exactly at
+    the side it turns by a quarter turn. Otherwise v = x / dt, and w = arctan(y / x) / dt
+    (`shipped`) or atan2(y, x) / dt (`atan2`).
     """
     if abs(x_m) < EPS_M and abs(y_m) < EPS_M:
         return STILL if heading_rad is None else Command(0.0, heading_rad / rule.dt_s)
@@ -46,18 +51,18 @@ def _followed(x_m: float, y_m: float, heading_rad: float | None, rule: WaypointR
 
 
 def clipped(command: Command, robot: Robot) -> Command:
-    """`command` within a robot's limits. Policies drive forward: a negative speed becomes 0."""
+    """Return a command within a robot's limits. A negative speed becomes 0."""
     w_radps = min(max(command.w_radps, -robot.w_max_radps), robot.w_max_radps)
     return Command(min(max(command.v_mps, 0.0), robot.v_max_mps), w_radps)
 
 
 def command_of(answer: object, *, rule: WaypointRule, robot: Robot) -> Command:
-    """The clipped command in a policy's answer: a Command, or waypoints (N, 2) or (N, 4) of which
-    one is followed, as a Planned.
+    """Return the clipped command of a policy's answer.
 
-    Raises PolicyError, saying what was answered, for NaN, infinities, fewer waypoints than the rule
-    needs, more than MOST_NUMBERS numbers, and anything that is not real numbers of that shape:
-    truth values, texts and complex numbers are none.
+    answer: a Command, or waypoints (N, 2) or (N, 4), of which one is followed (the result is a
+        Planned).
+    Raises PolicyError with the answer for NaN, infinities, too few waypoints, more than
+    MOST_NUMBERS numbers, and anything else than real numbers.
     """
     if isinstance(answer, Command):
         speeds = (answer.v_mps, answer.w_radps)
@@ -74,20 +79,21 @@ def command_of(answer: object, *, rule: WaypointRule, robot: Robot) -> Command:
     waypoints = _waypoints(answer, rule.index)
     x, y, *turn = waypoints[rule.index].tolist()
     heading_rad = math.atan2(turn[1], turn[0]) if turn else None
-    command = clipped(_followed(x * rule.unit_m, y * rule.unit_m, heading_rad, rule), robot)
+    command = clipped(_command_for(x * rule.unit_m, y * rule.unit_m, heading_rad, rule), robot)
     waypoints[:, :2] *= rule.unit_m
     return _planned(command, waypoints, rule.index)
 
 
 def _planned(command: Command, waypoints: Floats, index: int) -> Planned:
-    """A command with the waypoints in metres that it follows one of."""
-    kept = np.clip(waypoints[: max(_MOST_KEPT, index + 1)], -_LARGEST, _LARGEST).astype(np.float32)
-    return Planned(command.v_mps, command.w_radps, kept, index)
+    """Return a command together with its waypoints in metres."""
+    recorded = np.clip(waypoints[: max(_MOST_RECORDED, index + 1)], -_LARGEST, _LARGEST).astype(
+        np.float32
+    )
+    return Planned(command.v_mps, command.w_radps, recorded, index)
 
 
 def _waypoints(answer: object, index: int) -> Floats:
-    """Waypoints (N, 2) or (N, 4), a copy, all of which must be finite; more of them than
-    `index`."""
+    """Return a copy of an answer's waypoints, (N, 2) or (N, 4), finite and more than `index`."""
     try:
         array = np.asarray(answer)
     except (TypeError, ValueError) as error:  # rows of different lengths
@@ -117,8 +123,7 @@ def _waypoints(answer: object, index: int) -> Floats:
 
 
 def check_numbers(shape: Sequence[int]) -> None:
-    """Raises PolicyError for an answer whose array of this shape holds more numbers than any
-    may."""
+    """Raise PolicyError for an array shape with too many numbers."""
     if (count := math.prod(shape)) > MOST_NUMBERS:
         shown = ", ".join(map(str, shape[:4])) + (
             ", ..." if len(shape) > 4 else "," * (len(shape) == 1)
@@ -130,8 +135,7 @@ def check_numbers(shape: Sequence[int]) -> None:
 
 
 def _number(value: object) -> float:
-    """A real number as float, read once; NaN for anything else, and for what is beyond any
-    float."""
+    """Return a real number as float; NaN for other types, inf for a too large integer."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.floating | np.integer):
         return math.nan
     try:
@@ -141,14 +145,13 @@ def _number(value: object) -> float:
 
 
 def _shown(value: object) -> str:
-    """An answer as it is told: its repr if that is short and can be had, else its kind."""
+    """Return an answer for a message: its repr if it is short and stable, else its type."""
     if isinstance(value, int) and value.bit_length() > _MOST_SHOWN:
         return f"an integer of {value.bit_length()} bits"
     try:
         text = repr(value)
     except Exception:  # noqa: BLE001  a repr may do anything
         return f"a {type(value).__name__}"
-    tells = (
-        len(text) <= _MOST_SHOWN and text.isprintable() and " at 0x" not in text
-    )  # an address is another every time
-    return text if tells else f"a {type(value).__name__}"
+    stable = " at 0x" not in text
+    short = len(text) <= _MOST_SHOWN and text.isprintable()
+    return text if stable and short else f"a {type(value).__name__}"

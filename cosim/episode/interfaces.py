@@ -1,4 +1,4 @@
-"""What the loop needs of the engines and of a policy: protocols of a few methods each."""
+"""Interfaces of policies, engines and cameras to the episode loop."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ from cosim.spec.robot import Robot
 
 @dataclass(frozen=True, slots=True)
 class Privileged:
-    """What the simulator knows and a camera does not; given only to policies that declare it.
+    """Simulator state that cameras do not show, for policies that declare `privileged`.
 
-    route_s_m: the robot's arc length on the route. crossings: for each crossing of the route its id
-    and the arc lengths at which the route enters and leaves it. free: where the base centre may be
-    with half the robot's width to spare: the walkable area minus barriers, eroded.
+    route_s_m: robot's arc length on the route.
+    crossings: id, first and last arc length of each crossing on the route.
+    free: positions of the base centre with half the robot's width of clearance, within the walkable
+        area and outside barriers.
     """
 
     robot: RobotState
@@ -42,20 +43,22 @@ class Privileged:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What a policy gets. rgb: (H, W, 3) uint8 or None without a camera; v_mps, w_radps: its own
-    speeds, without error.
+    """Input of a policy at one moment. Optional fields are set if the manifest requests them.
 
-    Where the manifest asks for them: depth (H, W) float32, metres along the camera's axis; labels
-    (H, W) uint8 of `cosim.core.state.LABELS`; camera: how `rgb` was taken; pictures: of the further
-    cameras, by name; odometry: where the robot takes itself to be; goal: by the protocol of the
-    manifest or of the run (`cosim.spec.goal`).
-
-    tick, time_s: since the start of the episode; robot: which one it drives, the same from reset to
-    the end: its size, its pace, its limits; privileged: only for a manifest that declares it;
-    episode: of which one it is, as `reset` was told: a name that tells nothing. reset: since the
-    last observation the robot was put back on its way after a failure, elsewhere and at rest, so
-    that what was seen before is no history of this; not at the start of an episode, which
-    `Policy.reset` tells.
+    tick, time_s: time since the start of the episode.
+    rgb: (H, W, 3) uint8, None without a camera.
+    v_mps, w_radps: the robot's own speeds, without errors.
+    robot: the robot, with its size and limits, constant in an episode.
+    privileged: simulator state.
+    episode: id of the episode, as in `reset`.
+    reset: whether the robot was put elsewhere, at rest, since the last observation, after a
+        failure. Older observations are then no history. It is False at the start of an episode.
+    goal: goal by the protocol of the manifest or of the run (`cosim.spec.goal`).
+    odometry: the robot's estimate of its pose.
+    camera: calibration of `rgb`.
+    depth: (H, W) float32 metres along the camera's axis.
+    labels: (H, W) uint8 ids of `cosim.core.state.LABELS`.
+    pictures: pictures of the further cameras by name.
 
     >>> from cosim.spec.robot import COURIER
     >>> now = Observation(tick=5, time_s=0.25, rgb=None, v_mps=0.8, w_radps=0.0, robot=COURIER)
@@ -81,11 +84,11 @@ class Observation:
 
 
 class Policy(Protocol):
-    """A navigation policy. One object lives through many episodes; `reset` comes before each.
+    """Navigation policy. One object is used for many episodes; `reset` starts each.
 
-    `on_reset()`, if it has one, is called before the `act` whose observation says `reset`: the
-    robot was put elsewhere. Whatever it raises is its own crash, recorded with the episode; it
-    never ends the run.
+    An optional `on_reset()` is called before an `act` whose observation has `reset`: the robot was
+    put elsewhere. An exception is recorded as the policy's crash in this episode; it never ends the
+    run.
 
     >>> class Ahead:
     ...     manifest = Manifest("ahead", camera=None)
@@ -100,28 +103,33 @@ class Policy(Protocol):
     def manifest(self) -> Manifest: ...
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """A new episode begins. Anything random must come from `seed`. Both are drawn from the seed
-        of the run and the scenario, and tell neither its name nor its place in the suite."""
+        """Start an episode. All random draws must use `seed`.
+
+        Id and seed are derived from the run's seed and the scenario. They reveal neither the
+        scenario's name nor its position in the suite.
+        """
 
     def act(self, observation: Observation) -> Command | NDArray[np.floating]:
-        """A command, or waypoints in the robot's frame: (N, 2), x forward and y left, or (N, 4)
-        with the cosine and the sine of the heading there; the manifest's `WaypointRule` says which
-        is followed, and how."""
+        """Return a command, or waypoints in the robot's frame.
+
+        Waypoints are (N, 2), x forward and y left in metres, or (N, 4) with cosine and sine of the
+        heading there. The manifest's `WaypointRule` selects the followed one.
+        """
 
 
 class BatchPolicy(Policy, Protocol):
-    """A policy that can answer for many episodes at once; `cosim run --shared-renderer` asks it so.
+    """Policy that can answer for many episodes at once, as in `cosim run --shared-renderer`.
 
-    One object, in the renderer's process, lives through all episodes of the run, of which several
-    are under way at any time. `reset` begins one of them; what the policy remembers of an episode
-    it keeps under its id, which every observation carries. `ended(episode_id)`, if it has one, is
-    called when nothing more will be asked about an episode, however that ended; what it raises is
-    printed and changes nothing. Its `on_reset(episode_id)` is told of which. Who is asked together
-    is a matter of time and chance: an answer must depend on nothing but its own episode. Without a
-    shared renderer it is a policy like any other, asked by `act`.
+    One object in the renderer's process serves all episodes of the run, several at a time. `reset`
+    starts one of them. State of an episode belongs to its id, which every observation contains.
 
-    A bad answer is the crash of its episode; whatever `act_batch` raises, also a number of answers
-    that is not that of the observations, is the crash of all that it was asked for.
+    An optional `ended(episode_id)` is called after the last query of an episode; its exceptions are
+    printed and ignored. An optional `on_reset(episode_id)` gets the id. The composition of batches
+    is random, so an answer must depend only on its own episode. Without a shared renderer, `act` is
+    called.
+
+    A bad answer is the crash of its episode. An exception in `act_batch`, or a wrong number of
+    answers, is the crash of all episodes in the batch.
 
     >>> from cosim.spec.camera import CameraSpec
     >>> class Steady:
@@ -140,42 +148,42 @@ class BatchPolicy(Policy, Protocol):
     def act_batch(
         self, observations: Sequence[Observation]
     ) -> Sequence[Command | NDArray[np.floating]]:
-        """For each observation, in their order, what `act` would answer."""
+        """Return the answer of `act` for each observation, in their order."""
 
 
 class Crowd(Protocol):
-    """Everything that moves but the robot."""
+    """Everything that moves except the robot."""
 
     @property
     def street(self) -> Street:
-        """The street now."""
+        """Current street."""
 
     def step(self, robot: RobotState, reply: EventReply) -> Street:
-        """One tick on, with the robot and the event pedestrians where they are now."""
+        """Advance one tick, with the robot and the event pedestrians at their current positions."""
 
 
 class World(Protocol):
-    """The physics of the robot."""
+    """Physics of the robot."""
 
     @property
     def footprint_m(self) -> tuple[float, float]:
-        """Length and width of the robot."""
+        """Length and width of the robot in metres."""
 
     def place(self, pose: Pose) -> RobotState:
         """Put the robot at rest at a pose."""
 
     def step(self, command: Command, before: Street, after: Street, substeps: int) -> Motion:
-        """One tick of physics; people and vehicles move evenly from `before` to `after`."""
+        """Advance one tick; people and vehicles move linearly from `before` to `after`."""
 
 
 class Camera(Protocol):
-    """Draws what the robot sees."""
+    """Renders the robot's view."""
 
     def render(self, robot: RobotState, street: Street) -> Frame: ...
 
 
 class Eyes(Camera, Protocol):
-    """A camera that also draws for humans."""
+    """Camera that also renders views for humans."""
 
     def picture(
         self,
@@ -186,8 +194,10 @@ class Eyes(Camera, Protocol):
         size: tuple[int, int] = (640, 480),
         fov_deg: float = 60.0,
     ) -> Frame:
-        """A view from (3,) `eye_m` towards (3,) `target_m`, with the robot in it; size: width,
-        height."""
+        """Return a view from (3,) `eye_m` towards (3,) `target_m`, with the robot in it.
+
+        size: width and height in pixels.
+        """
 
 
 class Director(Protocol):

@@ -1,14 +1,12 @@
-"""The one tick that every episode is made of. No policy, no scoring, no recording, no drawing in
-it.
+"""The tick of an episode, without policy, scoring, recording or drawing.
 
-A tick (0.05 s), robot and street as they are at its start:
+A tick (0.05 s) uses robot and street at its start:
 
-    1 direct    the director answers with the event pedestrians of this tick
-    2 crowd     one step on, with the robot and the event pedestrians where they are now
-    3 physics   ten substeps with the command; people and vehicles move evenly to their new places
+    1 direct    the director replies with the event pedestrians of this tick
+    2 crowd     one step, with the robot and the event pedestrians at their current positions
+    3 physics   ten substeps with the command; people and vehicles move linearly
 
-The crowd of a step has seen the robot one tick late, always; the robot's camera shows the street of
-its own tick.
+The crowd always sees the robot one tick late. The robot's camera shows the street of its own tick.
 """
 
 from __future__ import annotations
@@ -17,20 +15,49 @@ from dataclasses import dataclass
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Polyline, Pose
-from cosim.core.state import Command, Frame, RobotState, Street
+from cosim.core.state import Command, Frame, Motion, RobotState, Street
 from cosim.episode.interfaces import Camera, Crowd, Director, World
-from cosim.episode.step import Reset, Step
-from cosim.people.neighbours import nearby_people
-from cosim.spec.events import EventQuery, EventState
+from cosim.people.steering import nearby_people
+from cosim.spec.events import EventQuery, EventReply, EventState
 from cosim.spec.scenario import Scenario
 
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """Result of one tick, yielded by the loop.
+
+    robot, street, route_s_m: state at its start; route_s_m is the arc length on the route.
+    frame: camera frame, on ticks with a policy query.
+    motion, street_after, route_s_after_m: state at its end.
+    """
+
+    tick: int
+    robot: RobotState
+    street: Street
+    route_s_m: float
+    frame: Frame | None
+    command: Command
+    events: EventReply
+    motion: Motion
+    street_after: Street
+    route_s_after_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Reset:
+    """Reset of the robot to a pose, at rest, at this arc length of the route."""
+
+    pose: Pose
+    route_s_m: float
+
+
 ROUTE_WINDOW_M = 10.0
-"""The robot's place on the route is looked for this far before and behind the last one."""
+"""Range of arc length around the last position in which the robot is searched, in metres."""
 
 
 @dataclass(frozen=True, slots=True)
 class Parts:
-    """The engines of an episode, behind their ports."""
+    """Engines of an episode."""
 
     world: World
     crowd: Crowd
@@ -40,8 +67,11 @@ class Parts:
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """An episode between two ticks. route_s_m: the robot's arc length on the route; states: of the
-    events."""
+    """State of an episode between two ticks.
+
+    route_s_m: robot's arc length on the route.
+    states: states of the events.
+    """
 
     tick: int
     robot: RobotState
@@ -51,7 +81,7 @@ class Moment:
 
 
 def begin(scenario: Scenario, parts: Parts) -> Moment:
-    """The robot at rest at its start, in the street as it is."""
+    """Return the first moment, with the robot at rest at its start."""
     return Moment(0, parts.world.place(scenario.start_pose), parts.crowd.street, 0.0)
 
 
@@ -63,8 +93,10 @@ def tick(
     command: Command,
     frame: Frame | None = None,
 ) -> Step:
-    """All that happens in a tick. frame: what the policy saw before it gave the command, where it
-    was asked now."""
+    """Run one tick and return its step.
+
+    frame: camera frame of the observation, if the policy was queried at this tick.
+    """
     reply = parts.director.react(query(scenario, clock, now, parts.world.footprint_m))
     street_after = parts.crowd.step(now.robot, reply)
     motion = parts.world.step(command, now.street, street_after, clock.substeps)
@@ -84,7 +116,7 @@ def tick(
 
 
 def after(step: Step, reset: Reset | None, parts: Parts) -> Moment:
-    """The moment that a step leads to; a reset puts the robot elsewhere, at rest."""
+    """Return the moment after a step; a reset puts the robot elsewhere, at rest."""
     robot = step.motion.robot
     route_s_m = step.route_s_after_m
     if reset is not None:
@@ -96,7 +128,7 @@ def after(step: Step, reset: Reset | None, parts: Parts) -> Moment:
 def query(
     scenario: Scenario, clock: Clock, now: Moment, footprint_m: tuple[float, float]
 ) -> EventQuery:
-    """The question to the director at a tick."""
+    """Return the message to the director at a tick."""
     return EventQuery(
         episode=scenario.id,
         tick=now.tick,
@@ -116,7 +148,7 @@ def query(
 
 
 def place_on_route(route: Polyline, pose: Pose, last_s_m: float) -> float:
-    """Arc length of the robot on the route, searched near the last one."""
+    """Return the robot's arc length on the route, searched near the last one."""
     s_m, _ = route.project(
         pose.x_m, pose.y_m, (last_s_m - ROUTE_WINDOW_M, last_s_m + ROUTE_WINDOW_M)
     )

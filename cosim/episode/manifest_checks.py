@@ -1,4 +1,4 @@
-"""What a manifest asks for beside a picture: whether it can be had, and how a camera is told."""
+"""Check a manifest's goals, odometry and cameras against a robot; build camera calibrations."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from cosim.spec.camera import Calibration, CameraSpec
 from cosim.spec.goal import GOALS, GoalProtocol, goal_called
 from cosim.spec.manifest import Manifest
 from cosim.spec.odometry import ODOMETRY
-from cosim.spec.robot import Robot
+from cosim.spec.robot import Mount, Robot
 
 
 def with_goal(manifest: Manifest, goal: GoalProtocol | None) -> Manifest:
-    """A policy's manifest, with the goals of the run if that names some. Raises UsageError, with
-    the valid names, for goals or odometry that there are none of; for goals that the policy cannot
-    do with; for pictures as goals, and further cameras, of a policy without a camera.
+    """Return a manifest with the goal protocol of the run, if there is one.
+
+    Raises UsageError for an unknown goal protocol or odometry, and for goals that the policy does
+    not support. It also refuses picture goals and further cameras without a main camera.
     """
     settled = manifest if goal is None else replace(manifest, goal=goal)
     kind = GOALS[goal_called(settled.goal)]
@@ -46,10 +47,11 @@ def with_goal(manifest: Manifest, goal: GoalProtocol | None) -> Manifest:
 
 
 def calibration_of(spec: CameraSpec, robot: Robot) -> Calibration:
-    """A camera on a robot as computer vision has it.
+    """Return the calibration of a camera on a robot, in OpenCV's convention.
 
     >>> from cosim.spec.robot import COURIER
-    >>> calibration_of(CameraSpec(width=96, height=96, fov_deg=90.0), COURIER).matrix[0].tolist()
+    >>> spec = CameraSpec(width=96, height=96, fov_deg=90.0)
+    >>> calibration_of(spec, COURIER).matrix[0].round(3).tolist()
     [48.0, 0.0, 47.5]
     """
     mount = spec.on(robot)
@@ -77,3 +79,48 @@ def calibration_of(spec: CameraSpec, robot: Robot) -> Calibration:
         frozen(np.array([spec.lens.k1, spec.lens.k2, 0.0, 0.0, 0.0])),
         frozen(on_robot),
     )
+
+
+def nonstandard(manifest: Manifest, robot: Robot) -> str:
+    """Return the cameras of a policy that exceed the robot's mounts, as text; "" if none do.
+
+    Raises UsageError for an unknown mount.
+    """
+    cameras = [*([] if manifest.camera is None else [manifest.camera]), *manifest.cameras.values()]
+    return " and ".join(
+        filter(None, [_beyond(camera, manifest.rate_hz, robot) for camera in cameras])
+    )
+
+
+def check_camera(manifest: Manifest, robot: Robot, own_camera: bool) -> None:
+    """Raise UsageError for a camera that the robot does not have, unless `own_camera` allows it.
+
+    The message lists the robot's mounts and their limits.
+    """
+    odd = nonstandard(manifest, robot)
+    if odd and not own_camera:
+        mounts = "; ".join(f"'{name}' {mount.in_words}" for name, mount in robot.mounts.items())
+        raise UsageError(
+            f"policy '{manifest.name}' sees by {odd}, which robot '{robot.name}' does not have. It "
+            f"has: {mounts}. Choose one of these, or give --own-camera "
+            "(EpisodeOptions.own_camera), which marks every row as nonstandard"
+        )
+
+
+def _beyond(camera: CameraSpec, rate_hz: float, robot: Robot) -> str:
+    """Return how one camera exceeds its mount, as text; "" if it does not."""
+    mount = camera.on(robot)
+    if isinstance(camera.mount, Mount):
+        at = ", ".join(f"{m:g}" for m in mount.at_m)
+        return (
+            f"a camera of its own at ({at}) m, {mount.pitch_down_deg:g} deg down, "
+            f"{mount.yaw_left_deg:g} to the left"
+        )
+    beyond = []
+    if camera.width > mount.most_px[0] or camera.height > mount.most_px[1]:
+        beyond.append(f"{camera.width} x {camera.height} px")
+    if not mount.fov_deg[0] <= camera.fov_deg <= mount.fov_deg[1]:
+        beyond.append(f"{camera.fov_deg:g} deg")
+    if rate_hz > mount.most_hz:
+        beyond.append(f"{rate_hz:g} Hz")
+    return f"a camera of {', '.join(beyond)} at '{camera.mount}'" if beyond else ""

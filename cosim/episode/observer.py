@@ -1,31 +1,126 @@
-"""What a policy is given at a moment: what its manifest asks for, and nothing more."""
+"""Builds a policy's observations from what its manifest requests; simulates odometry."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
+from typing import Protocol
 
 import numpy as np
 
+from cosim.core.geometry import Pose, wrap_angle
 from cosim.core.state import Frame
 from cosim.episode.interfaces import Camera, Observation, Privileged
-from cosim.episode.loop import Moment
+from cosim.episode.loop import Moment, Step
 from cosim.episode.manifest_checks import calibration_of
-from cosim.episode.odometer import odometer_for
-from cosim.episode.step import Step
 from cosim.spec.camera import CameraPicture, CameraSpec
 from cosim.spec.episode_id import pseudonym_of, seed_for
-from cosim.spec.goal import TakePicture, goals_for
+from cosim.spec.goal import TakePicture, goals_for, seen_from
 from cosim.spec.manifest import Manifest
+from cosim.spec.odometry import GpsNoise, Odometry, OdometryKind, WheelNoise
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario
 
 
-class Observer:
-    """Makes the observations of one episode.
+class Odometer(Protocol):
+    """Odometry of an episode."""
 
-    manifest: with the goals of the run. run_seed: what goals and errors of odometry are drawn from,
-    each from a generator of its own. known: all that the simulator knows at a moment. cameras: the
-    further ones; look: for goals that are pictures.
+    def moved(self, before: Pose, after: Pose) -> None:
+        """Record the motion of one tick, from one pose to another."""
+
+    def read(self, pose: Pose, time_s: float) -> Odometry | None:
+        """Return the odometry of a robot whose true pose is `pose`."""
+
+
+def odometer_for(kind: OdometryKind, start: Pose, draws: np.random.Generator) -> Odometer:
+    """Return the odometry of an episode that starts at a pose.
+
+    draws: generator of its errors.
+    """
+    if kind == "wheel":
+        return WheelOdometer(draws)
+    return Gps(start, draws) if kind == "gps" else _ExactOdometer(start, reported=kind == "exact")
+
+
+class _ExactOdometer:
+    def __init__(self, start: Pose, reported: bool) -> None:
+        self._start = start
+        self._reported = reported
+
+    def moved(self, before: Pose, after: Pose) -> None:
+        """Nothing to count."""
+
+    def read(self, pose: Pose, time_s: float) -> Odometry | None:
+        place = seen_from(self._start, pose)
+        turned = wrap_angle(pose.heading_rad - self._start.heading_rad)
+        return Odometry(place.x_m, place.y_m, turned) if self._reported else None
+
+
+class WheelOdometer:
+    """Wheel odometry: it counts wheel turns, so it misses resets of the robot."""
+
+    def __init__(self, draws: np.random.Generator, noise: WheelNoise = WheelNoise()) -> None:  # noqa: B008
+        self._draws = draws
+        self._noise = noise
+        errors = draws.standard_normal(3).tolist()
+        self._scale = 1.0 + noise.scale * errors[0]
+        self._turn_scale = 1.0 + noise.turn_scale * errors[1]
+        self._drift_radpm = noise.drift_radpm * errors[2]
+        self._x_m = self._y_m = self._heading_rad = 0.0
+
+    def moved(self, before: Pose, after: Pose) -> None:
+        along_m = seen_from(before, after).x_m
+        turned = wrap_angle(after.heading_rad - before.heading_rad)
+        far_m = abs(along_m)
+        (one, two) = self._draws.standard_normal(2).tolist()
+        counted_m = self._scale * along_m + self._noise.along_m * math.sqrt(far_m) * one
+        turn = (
+            self._turn_scale * turned
+            + self._drift_radpm * far_m
+            + self._noise.heading_rad * math.sqrt(far_m) * two
+        )
+        middle = self._heading_rad + 0.5 * turn
+        self._x_m += counted_m * math.cos(middle)
+        self._y_m += counted_m * math.sin(middle)
+        self._heading_rad = wrap_angle(self._heading_rad + turn)
+
+    def read(self, pose: Pose, time_s: float) -> Odometry:
+        return Odometry(self._x_m, self._y_m, self._heading_rad)
+
+
+class Gps:
+    """GPS fixes of the robot; they include resets."""
+
+    def __init__(
+        self, start: Pose, draws: np.random.Generator, noise: GpsNoise = GpsNoise()
+    ) -> None:
+        self._start = start
+        self._draws = draws
+        self._noise = noise
+        self._bias_m = noise.bias_m * draws.standard_normal(2)
+        self._time_s = 0.0
+
+    def moved(self, before: Pose, after: Pose) -> None:
+        """Nothing to count."""
+
+    def read(self, pose: Pose, time_s: float) -> Odometry:
+        decay = math.exp(-(time_s - self._time_s) / self._noise.bias_s)
+        fresh = math.sqrt(1.0 - decay * decay) * self._noise.bias_m
+        self._bias_m = decay * self._bias_m + fresh * self._draws.standard_normal(2)
+        self._time_s = time_s
+        place = seen_from(self._start, pose)
+        x_m, y_m = (self._bias_m + self._noise.noise_m * self._draws.standard_normal(2)).tolist()
+        return Odometry(place.x_m + x_m, place.y_m + y_m, None)
+
+
+class Observer:
+    """Builds the observations of one episode.
+
+    manifest: manifest with the goal protocol of the run.
+    run_seed: seed of goals and odometry errors, each with its own generator.
+    known: returns the simulator state at a moment.
+    cameras: further cameras by name.
+    look: takes pictures for picture goals.
     """
 
     def __init__(
@@ -41,7 +136,7 @@ class Observer:
             return np.random.default_rng(seed_for(purpose, run_seed, scenario))
 
         spec = manifest.camera
-        self._called = pseudonym_of(run_seed, scenario).episode
+        self._episode_id = pseudonym_of(run_seed, scenario).episode
         self._robot = robot_called(scenario.robot)
         self._manifest = manifest
         self._known = known
@@ -51,7 +146,7 @@ class Observer:
         self._calibration = None if spec is None else calibration_of(spec, self._robot)
 
     def moved(self, step: Step, put_back: bool) -> None:
-        """A tick has passed. put_back: the robot is put elsewhere now."""
+        """Record a tick. `put_back` says that the robot is reset to another pose now."""
         self._odometer.moved(step.robot.pose, step.motion.robot.pose)
         if put_back:
             self._goals.put_back()
@@ -59,15 +154,17 @@ class Observer:
     def observed(
         self, now: Moment, time_s: float, camera: Camera | None, put_back: bool
     ) -> tuple[Observation, Frame | None]:
-        """What the policy is given now, and its picture. camera: the policy's. put_back: since the
-        last observation the robot was put elsewhere."""
+        """Return the observation of a moment, and its camera frame.
+
+        camera: camera of the policy.
+        put_back: whether the robot was reset since the last observation.
+        """
         robot = now.robot
         spec = self._manifest.camera
-        goal = self._goals.at(
-            robot.pose, now.route_s_m
-        )  # a goal's picture is drawn first: the last one is the robot's
+        # Before the robot's own picture: the camera's last frame must be that one.
+        goal = self._goals.at(robot.pose, now.route_s_m)
         frame = None if camera is None else camera.render(robot, now.street)
-        seen = Observation(
+        observation = Observation(
             tick=now.tick,
             time_s=time_s,
             rgb=None if frame is None else frame.rgb,
@@ -75,7 +172,7 @@ class Observer:
             w_radps=robot.w_radps,
             robot=self._robot,
             privileged=self._known(now) if self._manifest.privileged else None,
-            episode=self._called,
+            episode=self._episode_id,
             reset=put_back,
             goal=goal,
             odometry=self._odometer.read(robot.pose, time_s),
@@ -83,14 +180,14 @@ class Observer:
             depth=frame.depth if frame is not None and spec is not None and spec.depth else None,
             labels=frame.labels if frame is not None and spec is not None and spec.labels else None,
             pictures={
-                name: self._picture(further, self._manifest.cameras[name], now)
-                for name, further in self._cameras.items()
+                name: self._picture(extra, self._manifest.cameras[name], now)
+                for name, extra in self._cameras.items()
             },
         )
-        return seen, frame
+        return observation, frame
 
     def _picture(self, camera: Camera, spec: CameraSpec, now: Moment) -> CameraPicture:
-        """What a further camera shows."""
+        """Return the picture of a further camera."""
         frame = camera.render(now.robot, now.street)
         labels, depth = frame.labels if spec.labels else None, frame.depth if spec.depth else None
         return CameraPicture(frame.rgb, labels, depth, calibration_of(spec, self._robot))

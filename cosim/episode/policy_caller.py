@@ -1,9 +1,8 @@
-"""A policy at arm's length: asked through one door, which lets nothing out but a command or a
-PolicyError.
+"""Calls a policy safely: returns a command or raises PolicyError, nothing else.
 
-What a policy is given are copies of its own: whatever it writes into them, the simulation, the
-record and the referee do not see it. What it is, its manifest, is read once. Whatever it raises is
-its crash, SystemExit and KeyboardInterrupt included, and never the end of the process.
+The policy gets copies, so it cannot change simulation, record or referee. Its manifest is read
+once. Any exception, SystemExit and KeyboardInterrupt included, is a crash of the policy and never
+ends the process.
 """
 
 from __future__ import annotations
@@ -24,18 +23,17 @@ from cosim.core.state import Command, RobotState, Signal, Vehicles
 from cosim.episode.control import command_of
 from cosim.episode.interfaces import Observation, Policy, Privileged
 from cosim.spec.manifest import Manifest
-from cosim.spec.policy_host import PolicyRuns
+from cosim.spec.options import PolicyRuns
 
 PolicyCall = Literal["loading", "reset", "first act", "act", "on_reset", "ended"]
-"""What a policy is busy with. The first answer of an episode may take longer than the others."""
+"""Kinds of calls of a policy. The first act of an episode has a longer timeout than the others."""
 
 LOADED_WITHIN_S = 300.0
-"""A policy may take so long to be loaded, for a reset and for the first answer, unless a run says
-otherwise."""
+"""Default timeout in seconds for loading a policy, for a reset and for the first act."""
 
 
 class Timer(Protocol):
-    """Is told when a policy is asked and when it has answered."""
+    """Observes the start and end of each call of a policy."""
 
     def starts(self, doing: PolicyCall, tick: int) -> None: ...
 
@@ -43,28 +41,28 @@ class Timer(Protocol):
 
 
 class Untimed:
-    """A timer that does not care."""
+    """Timer that does nothing."""
 
     def starts(self, doing: PolicyCall, tick: int) -> None:
-        """Nothing to start."""
+        """Do nothing."""
 
     def stops(self) -> None:
-        """Nothing to stop."""
+        """Do nothing."""
 
 
 class Driver:
-    """A policy that can be asked. It is a Policy itself, and its answers are commands within the
-    robot's limits.
+    """Wraps a policy; its answers are commands within the robot's limits. It is a Policy itself.
 
-    manifest: what the policy is, read once; later changes of `policy.manifest` mean nothing.
-    source_hash: of the file it is written in, "" where that is unknown (`cosim.policies.load`).
-    runs: where it is asked; at_once: for so many episodes at a time, 0 for any number.
+    manifest: manifest of the policy, read once.
+    source_hash: hash of the policy's source file, "" if unknown (`cosim.policies.load`).
+    runs: process that runs the policy.
+    at_once: maximum number of episodes at a time, 0 for any number.
     """
 
     runs: PolicyRuns = "in-process"
     at_once = 0
     _passes: ClassVar[tuple[type[Exception], ...]] = (PolicyError,)
-    """Errors of a call that are not wrapped as raised by the policy."""
+    """Exceptions of a call that are raised unchanged."""
 
     def __init__(
         self,
@@ -79,28 +77,27 @@ class Driver:
         self._policy = policy
         self._timer = timer
         self._begun = ""
-        self._answered = False
+        self._has_answered = False
         self._route: tuple[Polyline, Polyline] | None = None
-        self._hears: Callable[[object], None] | None = None
+        self._on_answer: Callable[[object], None] | None = None
 
     @property
     def policy(self) -> Policy:
-        """What is asked."""
+        """The wrapped policy."""
         return self._policy
 
     @property
     def clock(self) -> dict[str, float]:
-        """How long the answers of the last episode took, where that is known: for a record's
-        `clock`."""
+        """Response times of the last episode for a record's `clock`, if known."""
         return {}
 
     @property
     def spent(self) -> bool:
-        """Whether what answers has come to its end: the next episode needs a driver of its own."""
+        """Whether the policy's process has ended, so that the next episode needs a new driver."""
         return False
 
     def close(self) -> None:
-        """Nothing more is asked of the policy."""
+        """Release the policy."""
 
     @property
     def batches(self) -> bool:
@@ -109,61 +106,59 @@ class Driver:
 
     @classmethod
     def of(cls, policy: Policy) -> Driver:
-        """The driver of a policy: itself if it is one."""
+        """Return the driver of a policy: the policy itself if it is one."""
         return policy if isinstance(policy, Driver) else cls(policy)
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Tell the policy that an episode begins. Raises PolicyError for whatever it raises."""
+        """Start an episode. Raises PolicyError."""
         self._begun = episode_id
-        self._answered = False
+        self._has_answered = False
         self._route = None
         with self._asked("reset", 0):
             self._policy.reset(episode_id, seed)
 
     def act(self, observation: Observation) -> Command:
-        """The policy's command. Raises PolicyError for whatever it raises, and for an answer that
-        is no command."""
+        """Return the policy's command. Raises PolicyError for an exception or an invalid answer."""
         own = self._own(observation)
         if own.reset:
-            self._tell_reset(own.episode, own.tick)
-        with self._asked("act" if self._answered else "first act", observation.tick):
+            self._call_on_reset(own.episode, own.tick)
+        with self._asked("act" if self._has_answered else "first act", observation.tick):
             answer = self._policy.act(own)
-            if self._hears is not None:
-                self._hears(answer)
+            if self._on_answer is not None:
+                self._on_answer(answer)
             command = command_of(answer, rule=self.manifest.waypoints, robot=own.robot)
-        self._answered = True
+        self._has_answered = True
         return command
 
     def heard_by(self, hears: Callable[[object], None]) -> None:
-        """Tell somebody every answer as it is, before it is looked at and made a command within the
-        robot's limits."""
-        self._hears = hears
+        """Set a callback for raw answers, before checks and limits."""
+        self._on_answer = hears
 
     def ended(self) -> None:
-        """Tell a policy for many episodes that nothing more is asked about this one, if it has
-        begun. What it raises is printed."""
+        """End an episode, if one has started, for a policy that serves many. Exceptions are
+        printed."""
         if self._begun and self.batches:
-            self._tell_ended(self._begun)
+            self._call_ended(self._begun)
         self._begun = ""
 
-    def _tell_reset(self, episode_id: str, tick: int) -> None:
-        """Call `on_reset` of a policy that has one. Raises PolicyError for whatever it raises."""
-        if callable(told := getattr(self._policy, "on_reset", None)):
+    def _call_on_reset(self, episode_id: str, tick: int) -> None:
+        """Call the policy's `on_reset`, if it has one. Raises PolicyError."""
+        if callable(callback := getattr(self._policy, "on_reset", None)):
             with self._asked("on_reset", tick):
-                told(*([episode_id] if self.batches else []))
+                callback(*([episode_id] if self.batches else []))
 
-    def _tell_ended(self, episode_id: str) -> None:
-        """Call `ended` of a policy that has one."""
+    def _call_ended(self, episode_id: str) -> None:
+        """Call the policy's `ended`, if it has one; print its exception."""
         try:
-            if callable(told := getattr(self._policy, "ended", None)):
+            if callable(callback := getattr(self._policy, "ended", None)):
                 with self._asked("ended", 0):
-                    told(episode_id)
+                    callback(episode_id)
         except PolicyError as error:
             traceback.print_exception(error)
 
     @contextmanager
     def _asked(self, doing: PolicyCall, tick: int) -> Iterator[None]:
-        """Time a call of the policy. Raises PolicyError for whatever it raises."""
+        """Time a call of the policy. Raises PolicyError for any exception."""
         try:
             with policy_call(doing, tick, self._timer, self._passes):
                 yield
@@ -177,7 +172,7 @@ class Driver:
             raise PolicyError(words) from fault.__cause__ or error
 
     def _own(self, observation: Observation) -> Observation:
-        """What the policy may know, as copies of its own."""
+        """Return the observation as copies, without what the manifest does not request."""
         known, pictures = observation.privileged, observation.pictures
         return replace(
             observation,
@@ -191,14 +186,14 @@ class Driver:
                 for name, one in pictures.items()
             },
             goal=None if observation.goal is None else observation.goal.copied(),
-            privileged=self._own_knowledge(known)
+            privileged=self._copied_privileged(known)
             if known is not None and self.manifest.privileged
             else None,
         )
 
-    def _own_knowledge(self, known: Privileged) -> Privileged:
-        """Copies of all but `free`, which cannot be written to; of the route one for the whole
-        episode."""
+    def _copied_privileged(self, known: Privileged) -> Privileged:
+        """Return a copy of the simulator state; the route is copied once in an episode, `free` is
+        immutable."""
         if self._route is None or self._route[0] is not known.route:
             self._route = (known.route, Polyline(known.route.points.copy()))
         robot = known.robot
@@ -225,7 +220,7 @@ def _copied(picture: NDArray[Any] | None) -> NDArray[Any] | None:
 
 
 def when(doing: PolicyCall, tick: int) -> str:
-    """What a policy was doing, in words: "reset", or "act at 3.2 s"."""
+    """Return the kind and time of a call as text: "reset", or "act at 3.20 s"."""
     if doing == "on_reset" or doing.endswith("act"):
         return f"{doing.removeprefix('first ')} at {Clock().time_s(tick):.2f} s"
     return doing

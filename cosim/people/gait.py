@@ -1,9 +1,7 @@
-"""How people walk, as far as a snapshot must know it: their statures, their strides, how far in its
-stride each is.
+"""Walking gait of people: stature, stride length and stride count.
 
-A body is drawn at a phase of its stride. The phase follows the way walked, so that feet do not
-slide, and strides grow with the pace; so what is counted are strides, each metre in strides of the
-length of its moment.
+A body is drawn at a phase of its stride. The phase follows the walked distance, so that feet do not
+slide. Strides grow with the pace, so each metre counts in strides of the current length.
 """
 
 from __future__ import annotations
@@ -18,37 +16,38 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cosim.core.geometry import Floats
-from cosim.core.row_matching import RowLookup
-from cosim.core.state import Age
+from cosim.core.state import Age, RowLookup
 
 REFERENCE_M: Final = 1.75
-"""Stature of the person whose strides are listed."""
+"""Stature of the reference person in metres."""
 
 PACES_MPS: Final = (0.25, 0.6, 1.0, 1.4, 1.9, 2.2, 2.8)
+"""Paces at which the reference person's stride is given, in m/s."""
 STRIDES_M: Final = (0.45, 0.86, 1.20, 1.48, 1.78, 1.75, 2.15)
-"""Stride (two steps) of the reference person at each pace, straight lines between; from 2.2 m/s on
-they run.
+"""Stride (two steps) of the reference person at each pace in metres, interpolated linearly; running
+starts at 2.2 m/s.
 
 Walking strides grow with the power 0.5 to 0.6 of the pace, as in Grieve and Gear, The relationships
 between length of stride, step frequency, time of swing and speed of walking, Ergonomics 9(5), 1966.
 """
 
 Ages = Sequence[int] | NDArray[np.int8]
-_PACES_MPS, _STRIDES_M = np.array(PACES_MPS), np.array(STRIDES_M)
+_PACES_MPS = np.array(PACES_MPS)
+_STRIDES_M = np.array(STRIDES_M)
 
 SETTLE_S: Final = 0.25
-"""Time constant with which the shown pace follows the speed: how long a start or a stop takes."""
+"""Time constant in seconds with which the shown pace follows the speed."""
 
 _JUMP_M: Final = 1.0
-"""Who moves further in a tick was set there."""
+"""Distance in metres above which a move in one tick is a teleport."""
 
 
 @lru_cache(maxsize=65536)
 def stature_m(name: str, age: int) -> float:
-    """Height of the person of this `Age` called `name` without shoes: always the same; 1.15 to 1.95
-    m.
+    """Return a person's height without shoes in metres, 1.15 to 1.95, determined by name and `Age`.
 
-    Adults are drawn from normal distributions of 1.64 m and 1.77 m +- 0.065 m (women, men).
+    Adults follow normal distributions of 1.64 m (women) and 1.77 m (men), with 0.065 m standard
+    deviation.
     """
     draw = zlib.crc32(b"stature " + name.encode())
     if age == Age.CHILD:
@@ -61,25 +60,29 @@ def stature_m(name: str, age: int) -> float:
 
 
 def is_woman(name: str) -> bool:
+    """Return whether the person with this name is drawn as a woman."""
     return bool(zlib.crc32(b"sex " + name.encode()) & 1)
 
 
 def relative_pace(pace_mps: ArrayLike, stature: ArrayLike) -> Floats:
-    """(N,) pace in m/s at which the reference person would walk alike: equal Froude numbers."""
+    """Return the reference person's pace with an equal Froude number, (N,) m/s."""
     return np.asarray(pace_mps, dtype=float) * np.sqrt(
         REFERENCE_M / np.asarray(stature, dtype=float)
     )
 
 
 def stride_m(pace_mps: ArrayLike, stature: ArrayLike) -> Floats:
-    """(N,) stride in metres of people of (N,) statures at (N,) paces."""
+    """Return the stride of people of (N,) statures at (N,) paces, (N,) metres."""
     scale = np.asarray(stature, dtype=float) / REFERENCE_M
     return np.asarray(scale * np.interp(relative_pace(pace_mps, stature), _PACES_MPS, _STRIDES_M))
 
 
 @dataclass(slots=True)
 class Strides:
-    """Counts everybody's strides. period_s: time between two updates."""
+    """Counts the strides of all people.
+
+    period_s: time between two updates in seconds.
+    """
 
     period_s: float
     _rows: RowLookup = field(default_factory=RowLookup)
@@ -91,10 +94,14 @@ class Strides:
     def update(
         self, ids: tuple[str, ...], xy: Floats, speed: Floats, age: Ages
     ) -> tuple[Floats, Floats]:
-        """Strides taken so far (N,) and paces (N,) m/s, given where people (N, 2) are now and their
-        speeds (N,), or the paces that those show who tread on the spot. age: of each, an `Age`.
+        """Return the strides taken so far (N,) and the shown paces (N,) m/s.
 
-        Who is new begins somewhere in a stride, drawn from the name, at the pace of the moment.
+        A new person starts at a phase drawn from the name, with the current speed as pace.
+
+        ids: ids of the people.
+        xy: (N, 2) positions in metres.
+        speed: (N,) m/s; for a person who turns on the spot, the shown pace.
+        age: `Age` of each.
         """
         row, new = self._rows.of(ids)
         at = self._xy[row]
@@ -117,5 +124,5 @@ class Strides:
 
 
 def first_stride(name: str) -> float:
-    """Where in the stride, from 0 to 1, the person called `name` begins."""
+    """Return the initial phase of a person's stride, 0 to 1."""
     return zlib.crc32(b"stride " + name.encode()) / 2**32

@@ -1,8 +1,8 @@
-"""Optimal reciprocal collision avoidance: velocities that keep a disk clear of others for a time.
+"""Optimal reciprocal collision avoidance (ORCA) of disks.
 
 Source: J. van den Berg, S. J. Guy, M. Lin, D. Manocha, "Reciprocal n-body collision avoidance",
-Robotics Research (ISRR 2009), Springer 2011; the names are its own. The linear programme is theirs
-too, after de Berg et al., "Computational Geometry", chapter 4 (linear programming).
+    Robotics Research (ISRR 2009), Springer 2011, whose names are used. The linear programme follows
+    de Berg et al., "Computational Geometry", chapter 4.
 """
 
 from __future__ import annotations
@@ -16,21 +16,24 @@ import numpy as np
 from cosim.core.geometry import Floats
 
 _EPS = 1e-9
+"""Tolerance for rounding, in the units of its use."""
 
 _Vector = Floats | tuple[float, float]
-"""Two numbers: metres, or metres per second."""
+"""Vector of two numbers, in metres or metres per second."""
 
 
 class HalfPlane(NamedTuple):
-    """Velocities v (m/s) with normal . v >= offset. normal: of length 1, into the permitted
-    side."""
+    """Permitted velocities v (m/s): normal . v >= offset.
+
+    nx, ny: unit normal into the permitted side.
+    """
 
     nx: float
     ny: float
     offset: float
 
     def excess(self, v: Floats) -> float:
-        """How far inside (positive) or outside a velocity (2,) lies, in m/s."""
+        """Return the distance of a velocity (2,) from the edge in m/s, positive inside."""
         return self.nx * float(v[0]) + self.ny * float(v[1]) - self.offset
 
 
@@ -43,17 +46,19 @@ def half_plane(
     share: float,
     step_s: float,
 ) -> HalfPlane:
-    """The velocities with which a disk does its share to keep clear of another one, ORCA^tau of the
-    paper.
+    """Return the velocities with which a disk does its share to avoid another one, ORCA^tau.
 
-    apart_m (2,): from me to the other; mine_mps, other_mps (2,): velocities; radius_m: sum of both
-    radii; horizon_s: tau; share: of the avoidance that is mine, 1/2 where both avoid, 1 where the
-    other does not; step_s: time in which disks that overlap already are to be parted.
+    apart_m: (2,) vector to the other disk.
+    mine_mps, other_mps: (2,) velocities.
+    radius_m: sum of both radii.
+    horizon_s: tau.
+    share: own share of the avoidance: 1/2 if both avoid, 1 if the other does not.
+    step_s: time in which overlapping disks are separated.
 
-    The velocity obstacle VO^tau is the cone of relative velocities that lead into the disk of
-    radius `radius_m` at `apart_m` within tau: a disk at apart/tau of radius r/tau, and the legs
-    that touch it. u is the smallest change of the relative velocity that reaches the obstacle's
-    boundary, n its outward normal there.
+    The velocity obstacle VO^tau is the set of relative velocities that lead into the disk of radius
+    `radius_m` at `apart_m` within tau. It is a cone with a round tip: a disk at apart/tau of radius
+    r/tau, and its tangents. u is the smallest change of the relative velocity to the obstacle's
+    boundary; n is the outward normal there.
     """
     ax, ay = float(apart_m[0]), float(apart_m[1])
     mx, my = float(mine_mps[0]), float(mine_mps[1])
@@ -80,10 +85,9 @@ def half_plane(
 
 
 def best_velocity(planes: Sequence[HalfPlane], preferred_mps: Floats, fastest_mps: float) -> Floats:
-    """The permitted velocity (2,) nearest to the preferred one, no faster than `fastest_mps`.
+    """Return the permitted velocity (2,) nearest to the preferred one, at most `fastest_mps`.
 
-    Where the half-planes leave none ("densely packed conditions"), the one that violates the worst
-    of them least.
+    If no velocity is permitted, return the one with the least maximum violation.
     """
     speed = math.hypot(*preferred_mps)
     v = preferred_mps * min(1.0, fastest_mps / max(speed, _EPS))
@@ -99,10 +103,9 @@ def best_velocity(planes: Sequence[HalfPlane], preferred_mps: Floats, fastest_mp
 def _on_edge(
     plane: HalfPlane, others: Sequence[HalfPlane], fastest_mps: float, goal: Floats, *, toward: bool
 ) -> Floats | None:
-    """The best velocity on the edge of a half-plane that all others permit; None where they permit
-    none.
+    """Return the best velocity on the edge of a half-plane that all others permit, or None.
 
-    goal: the velocity to be near to; or, with `toward`, the direction to go far in.
+    goal: preferred velocity; with `toward`, a direction to maximize.
     """
     if abs(plane.offset) > fastest_mps:
         return None
@@ -135,13 +138,11 @@ def _on_edge(
 def _least_violating(
     planes: Sequence[HalfPlane], first: int, v: Floats, fastest_mps: float
 ) -> Floats:
-    """The velocity whose worst violation is least: half-planes move outward together until one
-    velocity is permitted.
+    """Return the velocity with the least maximum violation of the half-planes.
 
-    v permits the half-planes before `first`. Each half-plane that is violated more than all before
-    it becomes the worst; then its violation is made as small as it can be without any earlier one's
-    becoming larger than it. "Not larger than it" is a half-plane again: (n_j - n_i) . v >= c_j -
-    c_i.
+    v permits the half-planes before `first`. A half-plane that is violated more than all earlier
+    ones becomes the worst. Its violation is minimized while no earlier one exceeds it. This
+    constraint is again a half-plane: (n_j - n_i) . v >= c_j - c_i.
     """
     worst = 0.0
     for i in range(first, len(planes)):
@@ -161,8 +162,7 @@ def _least_violating(
 
 
 def _no_worse(other: HalfPlane, plane: HalfPlane) -> HalfPlane | None:
-    """Where `other` is violated no more than `plane`; None for parallel ones, where one bounds the
-    other everywhere."""
+    """Return where `other` is violated no more than `plane`; None for parallel ones."""
     nx, ny = other.nx - plane.nx, other.ny - plane.ny
     size = math.hypot(nx, ny)
     return (

@@ -1,10 +1,11 @@
-"""How one who walks steers round others: a way that is open, then ORCA's half-planes.
+"""Steering of directed people around other people: an open heading, then ORCA half-planes.
 
-ORCA alone stops before somebody who stands in the way and stays there. So the wanted velocity is
-turned first to the nearest heading that is open for a while (RVO's choice among velocities: J. van
-den Berg, M. Lin, D. Manocha, "Reciprocal velocity obstacles for real-time multi-agent navigation",
-ICRA 2008); the half-planes of `cosim.people.orca` then share the avoidance between those who see
-each other, and slow down who finds nothing open."""
+ORCA alone stops before a standing person. So the preferred velocity is first turned to the nearest
+heading that is free for a while. This follows RVO's choice among velocities: J. van den Berg, M.
+Lin, D. Manocha, "Reciprocal velocity obstacles for real-time multi-agent navigation", ICRA 2008.
+Then the half-planes of `cosim.people.orca` share the avoidance between people who see each other.
+They slow down those without a free heading.
+"""
 
 from __future__ import annotations
 
@@ -14,47 +15,48 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from cosim.core.state import PERSON_RADIUS_M
+from cosim.core.state import DIRECTED, PERSON_RADIUS_M, People, PersonKind
 from cosim.people.orca import HalfPlane, best_velocity, half_plane
+from cosim.spec.events import NearbyPerson
 
 STEERING_NEAR_M: Final = 4.0
-"""Who is farther away is not looked at."""
+"""Distance in metres within which people are considered."""
 
 HORIZON_S: Final = 2.0
-"""How far ahead one looks; half-planes too."""
+"""Time horizon of the steering and of the half-planes in seconds."""
 
 ROOM_M: Final = 2 * PERSON_RADIUS_M
-"""Middles of two people who pass keep so far apart, as long as that leaves a way."""
+"""Preferred distance between the centres of people who pass each other, in metres."""
 
 SHOULDER_TO_SHOULDER_M: Final = 0.45
-"""Middles of two people who touch shoulders: one squeezes through where nothing else is open.
-Nearer ones part."""
+"""Distance between centres at which shoulders touch, in metres: used if no heading is free. People
+who are closer separate."""
 
 PARTED_S: Final = 0.5
-"""In this time those who are too near are parted."""
+"""Time in which people who are too close separate, in seconds."""
 
 TURNS: Final = tuple(
     (math.cos(math.radians(turn)), math.sin(math.radians(turn))) for turn in range(10, 120, 10)
 )
-"""Cosine and sine of the turns that are tried to either side: in steps of 10 degrees, beyond a
-right angle."""
+"""Cosine and sine of the turns that are tried to either side, 10 to 110 degrees."""
 
 GIVES: Final = 0.98
-"""Those who stand nearer than two radii come no nearer than this share of their distance."""
+"""Share of their distance that people closer than two radii keep at least."""
 
 _CROSSING: Final = 0.35
-"""Sine of the angle between two ways from which on they cross."""
+"""Sine of the angle from which two ways cross."""
 
 _EPS: Final = 1e-9
+"""Tolerance for rounding, in the units of its use."""
 
 Vector = tuple[float, float]
 
 
 class Neighbour(NamedTuple):
-    """Somebody else: where (m), how it moves (m/s), and how much of the avoidance it leaves to the
-    one who steers.
+    """Another person: position (m), velocity (m/s) and behaviour.
 
-    share: 1 for who pays no heed, 1/2 for who steers the same way.
+    share: share of the avoidance for the steering person: 1 if the neighbour does not react, 1/2 if
+        it steers in the same way.
     """
 
     x_m: float
@@ -65,15 +67,14 @@ class Neighbour(NamedTuple):
 
 
 class _Disk(NamedTuple):
-    """A neighbour as the one who steers sees it: from here to it in metres, its velocity, the
-    distance to keep."""
+    """Neighbour relative to the steering person: offset, velocity and distance to keep."""
 
     apart_m: Vector
     moving_mps: Vector
     keep_m: float
     share: float
     room_m2: float
-    """The square of the distance minus that of the distance to keep."""
+    """Squared distance minus the squared distance to keep."""
 
 
 def steered(
@@ -86,30 +87,34 @@ def steered(
     room_m: float = ROOM_M,
     walls: Sequence[HalfPlane] = (),
 ) -> Vector:
-    """The velocity (m/s) of one person who is at `at_m`, moves with `moving_mps` and wants
-    `wanted_mps`.
+    """Return the velocity (m/s) of a person, no faster than preferred.
 
-    No faster than wanted; exactly as wanted, to the bit, where nobody is in the way. One who wants
-    to stand stands. horizon_s: how far ahead to look; less for one who arrives before. room_m:
-    between middles, where that is to be had; less for one in a hurry. walls: half-planes of
-    velocities that stay on the ground one may walk on. Only who is nearer than NEAR_M counts, and
-    of those behind only who is too near.
+    It is exactly the preferred velocity if nobody is in the way. A person who wants to stand does.
+
+    at_m: position.
+    moving_mps: current velocity.
+    wanted_mps: preferred velocity.
+    neighbours: other people; those beyond STEERING_NEAR_M, or behind and not too close, are
+        ignored.
+    horizon_s: time horizon; shorter for a person who arrives earlier.
+    room_m: preferred distance between centres; less for a person in a hurry.
+    walls: half-planes of velocities that stay on the permitted ground.
     """
     speed_mps = math.hypot(*wanted_mps)
     if speed_mps < _EPS:
         return wanted_mps
-    disks = _seen(at_m, wanted_mps, neighbours, room_m)
+    disks = _relevant_disks(at_m, wanted_mps, neighbours, room_m)
     if not disks and all(_permits(wall, *wanted_mps) for wall in walls):
         return wanted_mps
     if (
         math.dist(moving_mps, wanted_mps) < _EPS
-        and _meets_in_s(*wanted_mps, disks, walls, horizon_s) >= horizon_s
+        and _time_to_encounter_s(*wanted_mps, disks, walls, horizon_s) >= horizon_s
     ):
         return wanted_mps
-    heading_mps, is_open = _most_open(wanted_mps, moving_mps, disks, walls, horizon_s)
+    heading_mps, is_open = _freest_heading(wanted_mps, moving_mps, disks, walls, horizon_s)
     if not is_open:
-        disks = _seen(at_m, wanted_mps, neighbours, SHOULDER_TO_SHOULDER_M)
-        heading_mps, _ = _most_open(wanted_mps, moving_mps, disks, walls, horizon_s)
+        disks = _relevant_disks(at_m, wanted_mps, neighbours, SHOULDER_TO_SHOULDER_M)
+        heading_mps, _ = _freest_heading(wanted_mps, moving_mps, disks, walls, horizon_s)
     planes = [
         half_plane(d.apart_m, moving_mps, d.moving_mps, d.keep_m, horizon_s, d.share, PARTED_S)
         for d in disks
@@ -121,11 +126,11 @@ def steered(
     return x_mps, y_mps
 
 
-def _seen(
+def _relevant_disks(
     at_m: Vector, wanted_mps: Vector, neighbours: Sequence[Neighbour], room_m: float
 ) -> list[_Disk]:
-    """Those who count, with the distance to keep from each: `room_m`, or what there is between them
-    now."""
+    """Return the relevant neighbours and the distance to keep: `room_m`, or the current distance if
+    less."""
     disks = []
     for one in neighbours:
         dx, dy = one.x_m - at_m[0], one.y_m - at_m[1]
@@ -138,9 +143,8 @@ def _seen(
     return disks
 
 
-def _lets_pass(disk: _Disk, wanted_mps: Vector) -> bool:
-    """Whether somebody who steers the same way crosses from the left: of two, the one from the
-    right goes first."""
+def _neighbour_yields(disk: _Disk, wanted_mps: Vector) -> bool:
+    """Return whether a steering neighbour yields because it crosses from the left."""
     (dx, dy) = disk.apart_m
     (vx, vy) = disk.moving_mps
     (x, y) = wanted_mps
@@ -148,30 +152,29 @@ def _lets_pass(disk: _Disk, wanted_mps: Vector) -> bool:
     return disk.share < 1.0 and across and x * dy - y * dx > 0.0
 
 
-def _most_open(
+def _freest_heading(
     wanted_mps: Vector,
     moving_mps: Vector,
     disks: Sequence[_Disk],
     walls: Sequence[HalfPlane],
     horizon_s: float,
 ) -> tuple[Vector, bool]:
-    """The wanted velocity, turned no more than needed to meet nobody within the horizon, and True;
-    else to meet the latest, and False.
+    """Return the preferred velocity with the least turn that is free within the horizon, and True.
 
-    Of two that are turned alike, that on the side to which one moves already; to the right for who
-    moves straight.
+    If none is free, return the one with the latest encounter, and False. Of equal turns to both
+    sides, the side of the current motion wins; for straight motion the right.
     """
     x, y = wanted_mps
-    disks = [disk for disk in disks if not _lets_pass(disk, wanted_mps)]
+    disks = [disk for disk in disks if not _neighbour_yields(disk, wanted_mps)]
     best = wanted_mps
-    latest_s = _meets_in_s(x, y, disks, walls, horizon_s)
+    latest_s = _time_to_encounter_s(x, y, disks, walls, horizon_s)
     if latest_s >= horizon_s:
         return best, True
     side = 1.0 if x * moving_mps[1] - y * moving_mps[0] > _EPS else -1.0
     for cos, sin in TURNS:
         for aside in (side * sin, -side * sin):
             turned = (cos * x - aside * y, aside * x + cos * y)
-            in_s = _meets_in_s(*turned, disks, walls, horizon_s, latest_s)
+            in_s = _time_to_encounter_s(*turned, disks, walls, horizon_s, latest_s)
             if in_s >= horizon_s:
                 return turned, True
             if in_s > latest_s:
@@ -179,7 +182,7 @@ def _most_open(
     return best, False
 
 
-def _meets_in_s(
+def _time_to_encounter_s(
     x_mps: float,
     y_mps: float,
     disks: Sequence[_Disk],
@@ -187,10 +190,9 @@ def _meets_in_s(
     horizon_s: float,
     enough_s: float = -1.0,
 ) -> float:
-    """When who goes on so comes too near to somebody, at most `horizon_s`; 0 where a wall is in the
-    way.
+    """Return the time to the first encounter at a velocity, at most `horizon_s`; 0 at a wall.
 
-    enough_s: once it is known to be no later than this, how much earlier does not matter.
+    enough_s: the search stops when an encounter before this time is found.
     """
     for wall in walls:
         if not _permits(wall, x_mps, y_mps):
@@ -214,3 +216,31 @@ def _meets_in_s(
 
 def _permits(plane: HalfPlane, x_mps: float, y_mps: float) -> bool:
     return plane.nx * x_mps + plane.ny * y_mps - plane.offset >= -_EPS
+
+
+def nearby_people(people: People) -> tuple[NearbyPerson, ...]:
+    """Return the people within STEERING_NEAR_M of directed ones, in the order of the street.
+
+    People of events are omitted, because their states are in the query. Injected people are
+    included, so that they see each other.
+    """
+    if not people.kind.any():  # only crowd
+        return ()
+    moved = people.xy[people.are(*DIRECTED)]
+    if not len(moved):
+        return ()
+    gap = people.xy[:, None] - moved[None]
+    near = ((gap * gap).sum(axis=2) < STEERING_NEAR_M * STEERING_NEAR_M).any(axis=1)
+    rows = np.flatnonzero(near & (people.kind != PersonKind.EVENT)).tolist()
+    if not rows:
+        return ()
+    heading, speed = people.heading, people.speed
+    vx, vy = (
+        (speed[rows] * np.cos(heading[rows])).tolist(),
+        (speed[rows] * np.sin(heading[rows])).tolist(),
+    )
+    columns = zip(rows, people.xy[rows].tolist(), vx, vy, people.kind[rows].tolist(), strict=True)
+    return tuple(
+        NearbyPerson(people.ids[i], x, y, u, v, PersonKind(kind))
+        for i, (x, y), u, v, kind in columns
+    )

@@ -1,48 +1,61 @@
-"""Nobody walks into the robot: how a person steps round it.
+"""Motion of people around the robot and the obstacles of a scenario.
 
-SUMO's walkers see the robot as stripes, and at the edge of a crossing or corner they sometimes walk
-through it; our own people see other people (`cosim.people.steering`), the robot they see here. A
-person goes where it wants to go, but slides round the robot's outline instead of entering it. Only
-the person's own motion is changed: a robot that drives at somebody still hits them."""
+SUMO's walkers sometimes walk through the robot at the edge of a crossing or corner. Directed people
+avoid other people by `cosim.people.steering`, but the robot only here. A person slides round the
+robot's outline instead of entering it. Only the person's own motion changes: the robot can hit
+people.
+
+Obstacles are merged to few rectangles: those without a gap for a person count as one. If one
+reaches the edge of the walkable ground, people pass on its other side.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
+from shapely.geometry import MultiPolygon, Point, Polygon
 
 from cosim.core.geometry import Floats, Pose
 from cosim.core.state import PERSON_RADIUS_M
+from cosim.spec.events import StandingBody
+from cosim.spec.obstacle import Obstacle, footprint
 
 STEP_ROUND_GAP_M = 0.12
-"""Gap between a person's disk and the robot's outline at which the person begins to step round."""
+"""Gap between a person's disk and the robot's outline below which the person steps round, in
+metres."""
 
 DRAWS_BACK_M = 0.015
-"""Who stands nearer to the robot than KEEP_M goes back by this in a step of 0.05 s."""
+"""Distance per tick of 0.05 s by which a standing person backs away from the robot, in metres."""
 
 TOUCH_M = 0.01
+"""Gap in metres below which a person touches the robot."""
 ROBOT_STANDS_MPS: Final = 0.05
+"""Speed of the robot's fastest point below which it stands, in m/s."""
 STOOD_S: Final = 1.0
-"""A robot of which no point has moved faster than ROBOT_STANDS_MPS for so long stands, for people
-and for the referee: they walk round it, and who walks into it is at fault."""
+"""Time below ROBOT_STANDS_MPS after which the robot counts as standing, in seconds. Then people
+walk round it, and the referee blames those who walk into it."""
 _ROUNDING_M: Final = 1e-6
+"""Tolerance for rounding in metres."""
 FORESEEN_S = 0.6
-"""How far ahead people see the robot come: nobody walks into the ground it will cover in this
-time."""
+"""Time ahead in which people avoid the ground that the robot will cover, in seconds."""
+_ROOM_M: Final = 2.0 * (PERSON_RADIUS_M + STEP_ROUND_GAP_M)
+"""Width in metres below which a gap is too narrow for a person."""
 
 
 def outline_mps(v_mps: float, w_radps: float, half_m: tuple[float, float]) -> float:
-    """How fast the fastest point of a robot's outline moves, at most."""
+    """Return an upper bound of the speed of the robot's outline in m/s."""
     return abs(v_mps) + abs(w_radps) * math.hypot(*half_m)
 
 
 class RobotBody(NamedTuple):
-    """The robot as people see it, or what stands: its pose, half its length and width in metres,
-    its speed.
+    """Footprint of the robot or an obstacle: pose, half length and half width in metres, speed.
 
-    closed: unit vector to the side on which nobody can pass it; (0, 0) where one can on either.
+    closed: unit vector to the side without a passage; (0, 0) if both sides are free.
     """
 
     pose: Pose
@@ -52,7 +65,7 @@ class RobotBody(NamedTuple):
 
 
 def within_reach_m(body: RobotBody) -> float:
-    """How near to the robot's middle somebody must be for a step to be led round it."""
+    """Return the distance to the body's centre within which people step round it, in metres."""
     return (
         math.hypot(*body.half_m)
         + FORESEEN_S * max(body.v_mps, 0.0)
@@ -64,14 +77,16 @@ def within_reach_m(body: RobotBody) -> float:
 def stepped_round(
     before: Floats, wanted: Floats, body: RobotBody, stand: NDArray[np.bool_] | None = None
 ) -> Floats:
-    """Where people go who want to go from `before` to `wanted`, (N, 2) metres each, near a robot.
+    """Return new positions of people near a body, (N, 2) metres.
 
-    People keep out of the ground that a moving robot is about to cover, too: who walks against it
-    there steps aside. Apart from that a step towards the robot from nearer than KEEP_M loses its
-    inward part; its length goes into the way round: to the side on which the step would pass the
-    robot's centre. That choice strengthens itself, so nobody dithers. stand (N,): who only wants to
-    stand there comes up as near as it can and draws back slowly from a robot that is nearer than
-    KEEP_M: it would go round it and back for ever.
+    before, wanted: (N, 2) current and preferred positions.
+    stand: (N,) whether a person wants to stand there. Such a person approaches, and backs away
+        slowly from a robot that is too close, instead of circling it.
+
+    People avoid the ground that a moving robot will cover: those ahead of it step aside. Otherwise,
+    a step towards the robot within STEP_ROUND_GAP_M loses its inward part. Its length goes into the
+    tangent, on the side on which the step passes the centre. The choice reinforces itself, so that
+    people do not oscillate.
     """
     length, width = body.half_m
     ahead = FORESEEN_S * max(body.v_mps, 0.0)
@@ -85,19 +100,19 @@ def stepped_round(
     ):
         return wanted
     turn = _axes(body)
-    everybody = offset @ turn
-    rows = np.flatnonzero(_gap(everybody, low, high + reach) < STEP_ROUND_GAP_M)
+    targets = offset @ turn
+    rows = np.flatnonzero(_disk_gap(targets, low, high + reach) < STEP_ROUND_GAP_M)
     if not len(rows):
         return wanted
     local = ((before - body.pose.xy) @ turn)[rows]
-    near = everybody[rows]
+    near = targets[rows]
     step = near - local
     pace = np.hypot(step[:, 0], step[:, 1])
     side = np.where(local[:, 0] * step[:, 1] - local[:, 1] * step[:, 0] >= 0.0, 1.0, -1.0)
 
     if body.closed != (0.0, 0.0):
-        shut = np.array(body.closed) @ turn
-        to_left = step[:, 0] * shut[1] - step[:, 1] * shut[0]
+        closed_side = np.array(body.closed) @ turn
+        to_left = step[:, 0] * closed_side[1] - step[:, 1] * closed_side[0]
         side = np.where(to_left == 0.0, side, np.where(to_left > 0.0, 1.0, -1.0))
 
     out = local - np.clip(local, low, high)
@@ -105,7 +120,7 @@ def stepped_round(
     normal = out / np.maximum(far, 1e-9)[:, None]
     inward = -(step * normal).sum(axis=1)
     tangent = np.column_stack([-normal[:, 1], normal[:, 0]])
-    slides = (_gap(near, low, high) < STEP_ROUND_GAP_M) & (inward > 0.0) & (far > 1e-6)
+    slides = (_disk_gap(near, low, high) < STEP_ROUND_GAP_M) & (inward > 0.0) & (far > 1e-6)
     moved = np.where(slides[:, None], local + tangent * (side * pace)[:, None], near)
     if stand is not None:
         back = np.clip(STEP_ROUND_GAP_M + PERSON_RADIUS_M - far, 0.0, DRAWS_BACK_M)
@@ -115,40 +130,104 @@ def stepped_round(
     meets = ~slides & (step[:, 0] < 0.0) & (local[:, 0] > length)
     aside = np.where(local[:, 1] >= 0.0, pace, -pace)
     moved[meets] = local[meets] + np.column_stack([np.zeros_like(aside), aside])[meets]
-    everybody[rows] = moved
-    rounded: Floats = everybody @ turn.T + body.pose.xy
+    targets[rows] = moved
+    rounded: Floats = targets @ turn.T + body.pose.xy
     return rounded
 
 
 def comes_too_near(before: Floats, after: Floats, body: RobotBody) -> NDArray[np.bool_]:
-    """(N,) who goes from `before` to `after`, (N, 2) metres each, nearer to the robot's outline
-    than one steps round it."""
+    """Return whether each step approaches the robot's outline below the gap, (N,) booleans."""
     turn = _axes(body)
     half = np.array(body.half_m)
-    gap = _gap((after - body.pose.xy) @ turn, -half, half)
+    gap = _disk_gap((after - body.pose.xy) @ turn, -half, half)
     near: NDArray[np.bool_] = (gap < STEP_ROUND_GAP_M) & (
-        gap < _gap((before - body.pose.xy) @ turn, -half, half)
+        gap < _disk_gap((before - body.pose.xy) @ turn, -half, half)
     )
     return near
 
 
 def touches(xy: Floats, body: RobotBody, within_m: float = TOUCH_M) -> bool:
-    """Whether the disk of a person at (2,) metres meets the robot's outline, or comes so near to
-    it."""
+    """Return whether a person's disk at (2,) metres is within `within_m` of the robot's outline."""
     local = (np.asarray(xy) - body.pose.xy)[None] @ _axes(body)
     half = np.array(body.half_m)
-    return bool(_gap(local, -half, half)[0] <= within_m)
+    return bool(_disk_gap(local, -half, half)[0] <= within_m)
 
 
 def _axes(body: RobotBody) -> Floats:
-    """(2, 2) ahead and left of the robot, as columns: what an offset from its middle is multiplied
-    by to be told in its frame."""
+    """Return the robot's axes ahead and left as columns, (2, 2), to rotate world offsets."""
     cos, sin = np.cos(body.pose.heading_rad), np.sin(body.pose.heading_rad)
     return np.array([[cos, -sin], [sin, cos]])
 
 
-def _gap(points: Floats, low: Floats, high: Floats) -> Floats:
-    """Distance from people's disks to a box that is square to the axes, (N,) metres."""
+def _disk_gap(points: Floats, low: Floats, high: Floats) -> Floats:
+    """Return the distance from people's disks to an axis-aligned box, (N,) metres."""
     away = points - np.clip(points, low, high)
     gap: Floats = np.hypot(away[:, 0], away[:, 1]) - PERSON_RADIUS_M
     return gap
+
+
+class Standing:
+    """Obstacles of a scenario as people avoid them.
+
+    bodies: obstacles as the director gets them.
+    """
+
+    def __init__(self, bodies: Sequence[StandingBody] = ()) -> None:
+        self.bodies = tuple(bodies)
+        self._footprints = [as_met(body) for body in self.bodies]
+        self._xy = np.array([(body.x_m, body.y_m) for body in self.bodies]).reshape(-1, 2)
+        self._reach_m = np.array([within_reach_m(body) for body in self._footprints])
+
+    def near(self, xy: Floats, margin_m: float = 0.0) -> tuple[StandingBody, ...]:
+        """Return the obstacles near people at (N, 2) metres, within stepping distance plus a
+        margin."""
+        return tuple(self.bodies[i] for i in self._rows(xy, margin_m))
+
+    def stepped_round(
+        self, before: Floats, wanted: Floats, stand: NDArray[np.bool_] | None = None
+    ) -> Floats:
+        """Return new positions of people, as `stepped_round` does, for all near obstacles."""
+        if len(self.bodies) and len(wanted):
+            for i in self._rows(wanted, 0.0):
+                wanted = stepped_round(before, wanted, self._footprints[i], stand)
+        return wanted
+
+    def _rows(self, xy: Floats, margin_m: float) -> list[int]:
+        gap = xy[:, None] - self._xy[None]
+        near = (gap * gap).sum(axis=2) < (self._reach_m + margin_m) ** 2
+        rows: list[int] = np.flatnonzero(near.any(axis=0)).tolist()
+        return rows
+
+
+def standing_bodies(obstacles: Sequence[Obstacle], walkable: Polygon | MultiPolygon) -> Standing:
+    """Return the obstacles on walkable ground as people avoid them."""
+    grounds = np.array([footprint(one) for one in obstacles], dtype=object)
+    if not len(grounds):
+        return Standing()
+    together = shapely.get_parts(shapely.union_all(shapely.buffer(grounds, 0.5 * _ROOM_M)))
+    edge = shapely.boundary(walkable)
+    bodies = []
+    for whole in together:
+        box = shapely.oriented_envelope(
+            shapely.union_all(grounds[shapely.intersects(whole, grounds)])
+        )
+        corners = shapely.get_coordinates(box)
+        ahead, aside = corners[1] - corners[0], corners[2] - corners[1]
+        x_m, y_m = corners[:4].mean(axis=0).tolist()
+        closed = (0.0, 0.0)
+        if shapely.distance(box, edge) < _ROOM_M:
+            nearest = shapely.get_coordinates(shapely.shortest_line(Point(x_m, y_m), edge))[1]
+            out = nearest - (x_m, y_m)
+            closed = tuple((out / max(float(np.hypot(*out)), 1e-9)).tolist())
+        heading = float(np.arctan2(ahead[1], ahead[0]))
+        long, wide = float(np.hypot(*ahead)), float(np.hypot(*aside))
+        bodies.append(StandingBody(x_m, y_m, heading, long, wide, *closed))
+    return Standing(bodies)
+
+
+def as_met(body: StandingBody) -> RobotBody:
+    """Return an obstacle as a footprint to step round."""
+    pose = Pose(body.x_m, body.y_m, body.heading_rad)
+    return RobotBody(
+        pose, (0.5 * body.length_m, 0.5 * body.width_m), 0.0, (body.closed_x, body.closed_y)
+    )

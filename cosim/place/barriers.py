@@ -1,4 +1,4 @@
-"""Barriers that close the branches of a route, and the ground that they leave."""
+"""Barriers that close the branches of a route, and the proof that one path remains."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cosim.spec.scenario import Barrier
 
 
 def outline(barrier: Barrier, margin_m: float = 0.0) -> Polygon:
-    """The ground that a barrier covers, grown by a margin."""
+    """Return the footprint of a barrier, grown by a margin."""
     cos, sin = math.cos(barrier.heading_rad), math.sin(barrier.heading_rad)
     half = barrier.length_m / 2
     line = LineString(
@@ -31,7 +31,7 @@ def outline(barrier: Barrier, margin_m: float = 0.0) -> Polygon:
 
 
 def fenced(area: Polygon | MultiPolygon, barriers: Iterable[Barrier]) -> Polygon | MultiPolygon:
-    """The walkable area minus the ground of the barriers."""
+    """Return the walkable area without the footprints of the barriers."""
     fences = [outline(barrier) for barrier in barriers]
     if not fences:
         return area
@@ -40,34 +40,38 @@ def fenced(area: Polygon | MultiPolygon, barriers: Iterable[Barrier]) -> Polygon
 
 
 INTO_STRIP_M = 0.5
-"""A sidewalk is closed this far from its corner; a crossing at its edge, so that the road stays
-free."""
+"""Distance of a barrier from the corner into a sidewalk, in metres. Barriers of crossings are at
+the edge of the road, which stays free."""
 
 OVERHANG_M = 0.12
+"""Length by which a barrier exceeds the strip on either side, in metres."""
 THICKNESS_M = 0.16
+"""Thickness of a barrier in metres."""
 SEAM_HOLE_M2 = 0.25
-"""Smaller holes in the walkable area are seams of the net, not ways round something."""
+"""Area in m2 below which a hole in the walkable area is a seam of the net, not an obstacle."""
 
 MOUTH_M = 4.0
-"""How far before and behind a strip's end the edge of a slanting corner is looked for."""
+"""Range before and behind a strip's end in which a slanting corner's edge is searched, in metres.
+"""
 
 _REACH_M = 30.0
-"""The walkable area is examined this far around the way; what can be reached must end before."""
+"""Distance around the way within which the reachable area must end, in metres."""
 
 BACK_M: Final = 5.0
-"""Nowhere does a route lead back towards its start by more than this.
+"""Maximum length by which a route may lead back towards its start, in metres.
 
-Measured: at most 0.4 m on the 105 shipped routes; of 562 drawn on 15 maps at most 2.5 m on 555, and
-11 to 69 m on the seven that double back."""
-_SPOT_M: Final = 2.0
-_SIGHT_M: Final = 30.0
-"""Walks are put together from straight lines between spots of the route so far from each other, at
-most."""
+Measured: at most 0.4 m on the 105 shipped routes. Of 562 routes sampled on 15 maps, 555 have at
+    most 2.5 m; the other seven double back by 11 to 69 m.
+"""
+_SAMPLE_M: Final = 2.0
+"""Distance between the points of a route in the search for shorter walks, in metres."""
+_SEGMENT_M: Final = 30.0
+"""Maximum length of a straight segment in that search, in metres."""
 
 
 def branches(street_map: StreetMap, way: Sequence[Port]) -> list[Port]:
-    """The ports to close: all others at the corners of a way, and the far ends of its first and
-    last strip."""
+    """Return the ports to close: the others at the corners of a way, and the far ends of its first
+    and last strip."""
     corners = sorted({corner_of(street_map, port) for port in way} - {""})
     inner = {port for corner in corners for port in street_map.corners[corner].ports} - set(way)
     ends = {port for port in (way[0].other, way[-1].other) if corner_of(street_map, port)}
@@ -75,13 +79,15 @@ def branches(street_map: StreetMap, way: Sequence[Port]) -> list[Port]:
 
 
 def corner_of(street_map: StreetMap, port: Port) -> str:
-    """Id of the corner at a port, "" at a dead end."""
+    """Return the id of the corner at a port, "" at a dead end."""
     return street_map.strips[port.strip].corners[port.end] or ""
 
 
 def barrier_at(street_map: StreetMap, port: Port, *, slanting: bool = False) -> Barrier:
-    """The barrier that closes a port: square to its strip, or slanting where the strip's mouth
-    does."""
+    """Return the barrier that closes a port.
+
+    slanting: follow the slant of the strip's mouth instead of a right angle to the strip.
+    """
     if slanting:
         return _slanting_barrier(street_map, port)
     strip = street_map.strips[port.strip]
@@ -122,8 +128,11 @@ def _slanting_barrier(street_map: StreetMap, port: Port) -> Barrier:
 
 
 def barrier_along(across: Floats, middle: Floats, port: Port) -> Barrier:
-    """The barrier that closes a port along the vector (2,) `across`, about (2,) `middle`,
-    metres."""
+    """Return the barrier that closes a port along a vector.
+
+    across: (2,) vector along the barrier, metres.
+    middle: (2,) centre of the barrier, metres.
+    """
     x_m, y_m = middle.tolist()
     return Barrier(
         x_m=round(x_m, 3),
@@ -137,10 +146,11 @@ def barrier_along(across: Floats, middle: Floats, port: Port) -> Barrier:
 
 
 def mouth(end: Floats, along: Floats, reach_m: float, corner: Polygon | MultiPolygon) -> Floats:
-    """Where an edge of a strip meets a corner, (2,) metres; the edge's own end where it does not.
+    """Return where an edge of a strip meets a corner, (2,) metres; `end` if it does not.
 
-    end: (2,) of the edge at the port. along: (2,) unit vector from there into the strip. reach_m:
-    how far to look.
+    end: (2,) end of the edge at the port.
+    along: (2,) unit vector from there into the strip.
+    reach_m: range of the search in metres.
     """
     inside = end + reach_m * along
     met = LineString([inside, end - MOUTH_M * along]).intersection(corner)
@@ -155,21 +165,24 @@ def prove_single_path(
     half_width_m: float,
     ground: tuple[shapely.Geometry, Polygon | MultiPolygon] | None = None,
 ) -> Polygon:
-    """The area that can be reached from the start, once exactly one path leads to the goal.
-    SpecError otherwise.
+    """Return the area reachable from the start, after proving that exactly one path leads to the
+    goal.
 
-    What is shown, on the walkable polygon itself: (1) the part of walkable-minus-barriers that
-    holds the start holds the goal; (2) it ends within REACH_M of the way, so nothing leads
-    elsewhere; (3) it has no hole, and in an area without holes all paths between two points are the
-    same but for bending; (4) start and goal stay connected when the area is eroded by half the
-    robot's width, so the robot fits through; (5) no shorter walk skips a part of the route. ground:
-    what `ground_around` gives, where it is known.
+    The proof uses the walkable polygon without the barriers:
+      1. The part that contains the start contains the goal.
+      2. It ends within _REACH_M of the way, so that nothing leads elsewhere.
+      3. It has no hole, so that all paths between two points are homotopic.
+      4. Start and goal stay connected after erosion by half the robot's width.
+      5. No shorter walk skips a part of the route.
+    half_width_m: half width of the robot in metres.
+    ground: result of `ground_around`, if known.
+    Raises SpecError with the first condition that fails.
     """
     surroundings, walkable = ground_around(street_map, route, way) if ground is None else ground
     free = fenced(walkable, barriers)
     start = Point(route.points[0])
     goal = Point(route.points[-1])
-    part = _part_with(free, start)
+    part = _part_containing(free, start)
     if part is None or not part.covers(goal):
         raise SpecError("start and goal are not connected")
     if not shapely.buffer(surroundings, -0.5).covers(part):
@@ -178,23 +191,25 @@ def prove_single_path(
     if holes:
         x, y = Polygon(holes[0]).centroid.coords[0]
         raise SpecError(f"two ways remain: they lead round ({x:.1f}, {y:.1f})")
-    passable = _part_with(shapely.buffer(part, -half_width_m), start)
+    passable = _part_containing(shapely.buffer(part, -half_width_m), start)
     if passable is None or not passable.covers(goal):
         raise SpecError(f"somewhere the way is narrower than {2 * half_width_m:.2f} m")
     if not passable.covers(LineString(route.points)):
         raise SpecError(
             f"the route comes nearer than {half_width_m:.2f} m to the edge of the walkable area"
         )
-    _refuse_doubling_back(part, route)
+    _check_doubling_back(part, route)
     return part
 
 
-def _refuse_doubling_back(part: Polygon, route: Polyline) -> None:
-    """Raises SpecError where the walk from the start of a route to a place on it is shorter, by
-    more than BACK_M, than the walk to an earlier place: out along one strip and back along another
-    one that touches it."""
-    spots = route.resampled(_SPOT_M)
-    walk_m = _walks_m(part, spots.points)
+def _check_doubling_back(part: Polygon, route: Polyline) -> None:
+    """Raise SpecError if the walk from the start to a place is shorter than to an earlier place.
+
+    A difference of BACK_M is allowed. This finds routes that go out along one strip and back along
+    another that touches it.
+    """
+    spots = route.resampled(_SAMPLE_M)
+    walk_m = _walking_distances_m(part, spots.points)
     back_m = np.maximum.accumulate(walk_m) - walk_m
     if back_m.max() > BACK_M:
         worst = int(back_m.argmax())
@@ -205,15 +220,17 @@ def _refuse_doubling_back(part: Polygon, route: Polyline) -> None:
         )
 
 
-def _walks_m(area: Polygon, spots: Floats) -> Floats:
-    """(N,) m: from the first of (N, 2) spots of a line to each, by straight lines between spots
-    inside an area."""
-    from scipy.sparse import csr_array  # 0.2 s, and episodes have their routes
+def _walking_distances_m(area: Polygon, spots: Floats) -> Floats:
+    """Return walking distances from the first of (N, 2) points to each, (N,) metres.
+
+    Walks are straight segments between the points, inside the area.
+    """
+    from scipy.sparse import csr_array  # takes 0.2 s; episodes do not need it
     from scipy.sparse.csgraph import dijkstra
 
     i, j = np.triu_indices(len(spots), 1)
     apart_m = np.hypot(*(spots[i] - spots[j]).T)
-    i, j, apart_m = (values[apart_m <= _SIGHT_M] for values in (i, j, apart_m))
+    i, j, apart_m = (values[apart_m <= _SEGMENT_M] for values in (i, j, apart_m))
     grown = shapely.buffer(area, SEAM_M)
     shapely.prepare(grown)
     seen = (j == i + 1) | shapely.covers(
@@ -227,11 +244,11 @@ def _walks_m(area: Polygon, spots: Floats) -> Floats:
 def ground_around(
     street_map: StreetMap, route: Polyline, way: Sequence[Port]
 ) -> tuple[shapely.Geometry, Polygon | MultiPolygon]:
-    """The area within REACH_M of a way, and the walkable ground there."""
+    """Return the area within _REACH_M of a way, and the walkable ground there."""
     strips = union_closed([street_map.strips[port.strip].polygon for port in way])
     surroundings = shapely.buffer(overlay.union(strips, LineString(route.points)), _REACH_M)
     return surroundings, street_map.walkable_near(surroundings)
 
 
-def _part_with(area: Polygon | MultiPolygon, point: Point) -> Polygon | None:
+def _part_containing(area: Polygon | MultiPolygon, point: Point) -> Polygon | None:
     return next((part for part in shapely.get_parts(area) if part.covers(point)), None)

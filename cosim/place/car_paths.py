@@ -1,5 +1,4 @@
-"""Where cars turn: the paths inside junctions, and the walkable ground beside crossings that they
-lead over."""
+"""Paths of cars inside junctions, and the corners that they cross."""
 
 from __future__ import annotations
 
@@ -11,23 +10,25 @@ from cosim.place import overlay
 from cosim.place.street_map import Lane, StreetMap, Strip
 
 CAR_M = 2.0
-"""Width of the widest vehicle."""
+"""Width of the widest vehicle in metres."""
 _NEAR_M = 4.0
-"""Cars farther from a point do not matter to it."""
+"""Distance in metres beyond which a car path is ignored."""
 _SLIVER_M = 0.5
-"""Ground narrower than this is the rim of a corner, which a car brushes at most."""
+"""Width in metres below which crossed ground is ignored: the rim of a corner."""
 
 
 def paths_near(street_map: StreetMap, area: shapely.Geometry) -> list[shapely.LineString]:
-    """The middle lines of the paths that cars take inside junctions near an area."""
+    """Return the centre lines of car paths inside junctions near an area."""
     lanes = [lane for lane in street_map.near("lane", area) if isinstance(lane, Lane)]
     inner = [lane for lane in lanes if lane.internal and lane.cars and lane.kind == "road"]
     return [shapely.LineString(lane.line[:, :2]) for lane in inner]
 
 
 def from_car_paths_m(street_map: StreetMap, xy: Floats) -> Floats:
-    """(N,) m: from (N, 2) points, one after the other along a way, to the nearest middle line on
-    which cars drive inside a junction; inf beyond 4 m."""
+    """Return the distance of (N, 2) points along a way to the nearest car path, (N,) metres.
+
+    It is inf beyond 4 m.
+    """
     far_m = np.full(len(xy), np.inf)
     if len(xy) < 2:
         return far_m
@@ -42,7 +43,7 @@ def from_car_paths_m(street_map: StreetMap, xy: Floats) -> Floats:
 
 
 def corners_driven_over(street_map: StreetMap) -> dict[str, shapely.Geometry]:
-    """For each corner that cars drive over: where, crossings apart. In the map's order."""
+    """Return the ground that cars drive over at each corner, without crossings."""
     found = {}
     for name, corner in street_map.corners.items():
         lines = paths_near(street_map, corner.polygon)

@@ -1,5 +1,7 @@
-"""What a place is: its size, what can be walked, what is wrong with it.
-`scenarios/suites/capacity.py` says which scenarios it can hold."""
+"""Checks of a place: its size, its walkable network, and its errors.
+
+`scenarios/suites/capacity.py` computes which scenarios it can hold.
+"""
 
 from __future__ import annotations
 
@@ -18,23 +20,24 @@ from cosim.place.terrain import ROBOT_GRADE_MAX, WALK_GRADE_MAX, Elevation
 from cosim.place.walk_graph import WalkGraph
 
 _NARROW_M = 1.0
-"""On a strip less wide than this a robot and a person cannot pass."""
+"""Width of a strip in metres below which a robot and a person cannot pass each other."""
 STUB_M = 1.0
+"""Length in metres below which a strip counts as a stub."""
 STEEP = 0.08
 """Grade from which a walkable lane counts as steep."""
 MOSTLY = 0.5
+"""Share of a sidewalk's area on roads above which it counts as lying on the road."""
 LARGEST = 0.6
-"""Scenarios are drawn on the largest island alone: one with less of the length than this is warned
-of."""
+"""Share of the largest island below which the check warns; scenarios use only the largest one."""
 
 
 class NetFacts(msgspec.Struct, frozen=True, kw_only=True):
-    """What a SUMO net says beyond its StreetMap. Ids are SUMO edge ids, signals' ids of traffic
-    lights.
+    """Facts about a SUMO net beyond its StreetMap. Ids are those of SUMO edges and traffic lights.
 
-    mixed_km: lanes that people share with cars, which are not walkable here. elevation_m: lowest
-    and highest point, None for a flat net. steep, false_grades: counts of walkable lanes.
-    no_program: signals named by crossings that have no program (SUMO runs level crossings itself).
+    mixed_km: lanes that people share with cars, which are not walkable here.
+    elevation_m: lowest and highest point, None for a flat net.
+    steep, false_grades: numbers of walkable lanes.
+    no_program: signals of crossings without a program; SUMO controls level crossings itself.
     levels: walkable edges on bridges or in tunnels.
     """
 
@@ -62,13 +65,15 @@ class NetFacts(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def walkable_km(self) -> float:
-        """Every lane on which SUMO lets people walk beside or off the carriageway, and those shared
-        with cars."""
+        """Length of all lanes on which SUMO allows pedestrians, including shared ones."""
         return self.pavement_km + self.shared_km + self.mixed_km
 
 
 class Island(msgspec.Struct, frozen=True):
-    """A connected part of the walkable strips; share: of the length of all of them."""
+    """Connected part of the walkable strips.
+
+    share: share of the total length.
+    """
 
     strips: int
     km: float
@@ -76,10 +81,11 @@ class Island(msgspec.Struct, frozen=True):
 
 
 class Problem(msgspec.Struct, frozen=True):
-    """Something wrong at one strip or corner.
+    """Problem at one strip or corner.
 
     kind: island, narrow, on_road, stacked, driven_over, steep, never_green, always_green, level or
-    misfit.
+        misfit.
+    piece: id of the strip or corner.
     """
 
     kind: str
@@ -89,14 +95,18 @@ class Problem(msgspec.Struct, frozen=True):
 
 
 class MapCheck(msgspec.Struct, frozen=True, kw_only=True):
-    """What was found. reasons: why nothing can be drawn on the map, none where something may be;
-    warnings: what to change; notes: what a user should know.
+    """Result of `check_map`.
 
-    walkable_km: length of sidewalks and shared paths, crossings apart. overlap_share: part of the
-    sidewalks' area that lies on lanes of roads; on_road: sidewalks that do so mostly; stacked:
-    those that cross a road where there is no crossing; driven_over: corners over which cars turn.
-    guessed_share: part of the sidewalks' length that the importer made up; None if unknown.
-    features: how many buildings and things of each kind the map itself shows.
+    reasons: why the map is unusable; empty if it is usable.
+    warnings: what to change.
+    notes: what to know.
+    walkable_km: length of sidewalks and shared paths, without crossings.
+    overlap_share: share of the sidewalks' area on lanes of roads.
+    on_road: number of sidewalks that lie mostly on roads.
+    stacked: number of sidewalks that cross a road without a crossing.
+    driven_over: number of corners that cars drive over.
+    guessed_share: share of the sidewalks' length that the importer made up; None if unknown.
+    features: number of mapped buildings and objects by kind.
     """
 
     name: str
@@ -139,8 +149,12 @@ def check_map(
     facts: NetFacts | None = None,
     guessed_share: float | None = None,
 ) -> MapCheck:
-    """Everything that can be said of a place without simulating it. graph: the place's own, made
-    here when None."""
+    """Check a place without simulating it.
+
+    graph: walking graph of the place; built if None.
+    facts: facts about its net, if known.
+    guessed_share: as in `MapCheck`.
+    """
     graph = WalkGraph(street_map) if graph is None else graph
     strips = list(street_map.strips.values())
     sidewalks = [s for s in strips if s.kind == "sidewalk"]
@@ -153,18 +167,18 @@ def check_map(
     narrow = [s for s in sidewalks if s.width_m < _NARROW_M]
     driven_over = corners_driven_over(street_map)
     islands = _islands(graph, lengths)
-    marked = [
-        *_marks("island", [s for s in strips if s.id not in graph.main_strips]),
-        *_marks("narrow", narrow),
-        *_marks("on_road", on_road),
-        *_marks("stacked", stacked),
-        *_marks_of_corners("driven_over", driven_over),
-        *_marks("steep", [s for s in strips if s.id in street_map.steep]),
+    problems = [
+        *_problems("island", [s for s in strips if s.id not in graph.main_strips]),
+        *_problems("narrow", narrow),
+        *_problems("on_road", on_road),
+        *_problems("stacked", stacked),
+        *_corner_problems("driven_over", driven_over),
+        *_problems("steep", [s for s in strips if s.id in street_map.steep]),
     ]
     if facts is not None:
         for kind in ("never_green", "always_green", "levels", "misfits"):
             known = [street_map.strips[i] for i in getattr(facts, kind) if i in street_map.strips]
-            marked += _marks(kind.removesuffix("s"), known)
+            problems += _problems(kind.removesuffix("s"), known)
     x0, y0, x1, y1 = street_map.bounds
     return MapCheck(
         name=street_map.name,
@@ -191,22 +205,21 @@ def check_map(
         guessed_share=guessed_share,
         elevation=street_map.elevation,
         facts=facts,
-        reasons=tuple(_unusable(street_map)),
-        warnings=tuple(_torn(islands)),
+        reasons=tuple(_unusable_reasons(street_map)),
+        warnings=tuple(_island_warnings(islands)),
         notes=(
-            *_land_notes(street_map),
-            *_stairs(sidewalks),
+            *_elevation_notes(street_map),
+            *_stairs_notes(sidewalks),
             *_driven_over_notes(driven_over),
-            *_notes(facts),
+            *_net_notes(facts),
         ),
-        problems=tuple(marked),
+        problems=tuple(problems),
         features=dict(sorted(Counter(feature.kind for feature in street_map.features).items())),
     )
 
 
 def on_road_shares(street_map: StreetMap, sidewalks: Sequence[Strip]) -> Floats:
-    """(N,) how much of each sidewalk's area lies on lanes that are driven on, junctions' interiors
-    apart; 0 to 1."""
+    """Return the share of each sidewalk's area on lanes, without junctions, (N,) from 0 to 1."""
     roads = [lane.polygon for lane in street_map.lanes.values() if _is_road(lane)]
     if not roads or not sidewalks:
         return np.zeros(len(sidewalks))
@@ -219,8 +232,7 @@ def on_road_shares(street_map: StreetMap, sidewalks: Sequence[Strip]) -> Floats:
 
 
 def stacked_on_roads(street_map: StreetMap, sidewalks: Sequence[Strip]) -> list[Strip]:
-    """Sidewalks whose middle line crosses that of a lane of another edge: bridges, tunnels, or maps
-    gone wrong."""
+    """Return sidewalks that cross a lane of another edge: bridges, tunnels or map errors."""
     roads = [lane for lane in street_map.lanes.values() if _is_road(lane)]
     if not roads or not sidewalks:
         return []
@@ -239,14 +251,14 @@ def _length_m(lane: Lane) -> float:
     return float(np.hypot(*np.diff(lane.line[:, :2], axis=0).T).sum())
 
 
-def _marks(kind: str, strips: Sequence[Strip]) -> list[Problem]:
+def _problems(kind: str, strips: Sequence[Strip]) -> list[Problem]:
     middles = [
         (s, Polyline(s.line[:, :2]).at(s.length_m / 2.0)) for s in strips if s.length_m > 0.0
     ]
     return [Problem(kind, s.id, round(at.x_m, 2), round(at.y_m, 2)) for s, at in middles]
 
 
-def _marks_of_corners(kind: str, grounds: Mapping[str, shapely.Geometry]) -> list[Problem]:
+def _corner_problems(kind: str, grounds: Mapping[str, shapely.Geometry]) -> list[Problem]:
     spots = shapely.get_coordinates(
         [shapely.point_on_surface(ground) for ground in grounds.values()]
     ).tolist()
@@ -257,7 +269,7 @@ def _marks_of_corners(kind: str, grounds: Mapping[str, shapely.Geometry]) -> lis
 
 
 def _islands(graph: WalkGraph, lengths: dict[str, float]) -> tuple[Island, ...]:
-    """The connected parts, longest first."""
+    """Return the connected parts, longest first."""
     labels = graph.component[::2]
     if not len(labels):
         return ()
@@ -270,7 +282,7 @@ def _islands(graph: WalkGraph, lengths: dict[str, float]) -> tuple[Island, ...]:
     )
 
 
-def _unusable(street_map: StreetMap) -> list[str]:
+def _unusable_reasons(street_map: StreetMap) -> list[str]:
     if not street_map.strips:
         return ["nothing is walkable: no sidewalk, path or crossing"]
     if not street_map.corners:
@@ -281,7 +293,7 @@ def _unusable(street_map: StreetMap) -> list[str]:
     return []
 
 
-def _torn(islands: Sequence[Island]) -> list[str]:
+def _island_warnings(islands: Sequence[Island]) -> list[str]:
     if not islands or islands[0].share >= LARGEST:
         return []
     return [
@@ -292,7 +304,7 @@ def _torn(islands: Sequence[Island]) -> list[str]:
     ]
 
 
-def _stairs(sidewalks: Sequence[Strip]) -> list[str]:
+def _stairs_notes(sidewalks: Sequence[Strip]) -> list[str]:
     steps = [s.id for s in sidewalks if s.going == "steps"]
     return (
         [f"{len(steps)} walkable edges are stairs, flat here: routes keep off them"]
@@ -306,11 +318,11 @@ def _driven_over_notes(corners: Mapping[str, object]) -> list[str]:
         return []
     return [
         f"cars turn over {len(corners)} corners, crossings apart: routes keep off there: "
-        f"{_some([*corners])}"
+        f"{_first_few([*corners])}"
     ]
 
 
-def _notes(facts: NetFacts | None) -> list[str]:
+def _net_notes(facts: NetFacts | None) -> list[str]:
     if facts is None:
         return []
     notes = []
@@ -329,21 +341,21 @@ def _notes(facts: NetFacts | None) -> list[str]:
     if facts.no_program:
         notes.append(
             f"{len(facts.no_program)} level crossings are run by SUMO itself: "
-            f"{_some(facts.no_program)}"
+            f"{_first_few(facts.no_program)}"
         )
     for which, words in (("never_green", "never green"), ("always_green", "always green")):
         found: tuple[str, ...] = getattr(facts, which)
         if found:
-            notes.append(f"{len(found)} signalised crossings are {words}: {_some(found)}")
+            notes.append(f"{len(found)} signalised crossings are {words}: {_first_few(found)}")
     if facts.misfits:
         notes.append(
             f"{len(facts.misfits)} crossings are beyond their signal's program: "
-            f"{_some(facts.misfits)}"
+            f"{_first_few(facts.misfits)}"
         )
     return notes
 
 
-def _land_notes(street_map: StreetMap) -> list[str]:
+def _elevation_notes(street_map: StreetMap) -> list[str]:
     elevation = street_map.elevation
     if elevation is None:
         return []
@@ -366,5 +378,5 @@ def _land_notes(street_map: StreetMap) -> list[str]:
     return notes
 
 
-def _some(names: Sequence[str]) -> str:
+def _first_few(names: Sequence[str]) -> str:
     return ", ".join(names[:4]) + (" ..." if len(names) > 4 else "")

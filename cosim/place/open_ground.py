@@ -1,7 +1,6 @@
-"""What lies off the streets, where nobody walks: chosen by the map's land use, else by what it lies
-between.
+"""Ground cover off the streets, from the map's land use or from the neighbouring objects.
 
-Cameras and maps from above draw it from this one table. No look resembles a sidewalk.
+Cameras and top-down maps use this table. No cover resembles a sidewalk.
 """
 
 from __future__ import annotations
@@ -19,17 +18,22 @@ from cosim.place import overlay
 from cosim.place.street_map import LandKind, StreetMap, Strip, street_of
 
 _NEAR_M: Final = 4.0
-"""Ground this near to a house and to the sidewalk before it is a bed."""
-_UNDER_M: Final = 0.6
-"""So far beds reach under houses that the map does not show, whose fronts are straight where a
-street bends."""
+"""Distance to a house and a sidewalk within which the ground is a bed, in metres."""
+_UNDER_HOUSE_M: Final = 0.6
+"""Length by which beds reach under the houses of unmapped buildings, in metres. Their fronts are
+straight where a street bends."""
 _REACH_M: Final = 12.0
-_SPLINTER_M2: Final = 1e-3
+"""Margin around the area in which sidewalks and houses are considered, in metres."""
+_MIN_PIECE_M2: Final = 1e-3
+"""Area in m2 below which a piece is dropped."""
 
 
 class GroundLook(NamedTuple):
-    """seen: mean colour in pictures, sRGB from 0 to 1; drawn: colour on maps from above, 0 to
-    255."""
+    """Colours of a ground cover.
+
+    seen: mean sRGB colour in pictures, 0 to 1.
+    drawn: colour on top-down maps, 0 to 255.
+    """
 
     seen: tuple[float, float, float]
     drawn: tuple[int, int, int]
@@ -42,21 +46,22 @@ GROUND_LOOKS: Final[Mapping[LandKind, GroundLook]] = {
     "yard": GroundLook((0.33, 0.33, 0.34), (172, 174, 178)),
     "water": GroundLook((0.16, 0.28, 0.36), (170, 198, 222)),
 }
+"""Colours by ground cover."""
 PLAIN_GROUND: Final[LandKind] = "lawn"
-"""What lies where neither the map nor the neighbours say anything."""
+"""Cover where neither the map nor the neighbours determine one."""
 
 _BEDS: Final[tuple[LandKind, ...]] = ("planting", "lawn", "soil")
-"""What may lie between the sidewalks of a street and its houses, drawn by the name of the
-street."""
+"""Covers between sidewalks and houses; the street's name selects one."""
 
 
 def open_ground(
     street_map: StreetMap, area: shapely.Polygon
 ) -> list[tuple[LandKind, Polygon | MultiPolygon]]:
-    """What covers the plain ground within `area`: areas that do not overlap, and reach under
-    streets and houses.
+    """Return the covers within `area`, as areas that do not overlap and reach under streets and
+    houses.
 
-    Nothing for a generated city: `physics/street/frontage.py` covers its ground."""
+    It is empty for a generated city, whose ground comes from `physics/street/frontage.py`.
+    """
     if street_map.planned:
         return []
     lands = [(cast(LandKind, land.kind), land.polygon) for land in street_map.lands_near(area)]
@@ -66,7 +71,7 @@ def open_ground(
         part = overlay.intersection(whole, area)
         rest = shapely.get_parts(overlay.difference(part, taken))
         found[kind] += [
-            piece for piece in rest if isinstance(piece, Polygon) and piece.area > _SPLINTER_M2
+            piece for piece in rest if isinstance(piece, Polygon) and piece.area > _MIN_PIECE_M2
         ]
         taken = overlay.union(taken, part)
     return [
@@ -77,7 +82,7 @@ def open_ground(
 
 
 def beside(strip: Strip, near_m: float, far_m: float) -> shapely.Geometry:
-    """What lies between two distances from the middle of a sidewalk, on the side away from its
+    """Return the area between two distances from a sidewalk's middle, on the side away from the
     road."""
     line = shapely.LineString((strip.line if strip.road_side < 0 else strip.line[::-1])[:, :2])
     one, two = (
@@ -88,7 +93,7 @@ def beside(strip: Strip, near_m: float, far_m: float) -> shapely.Geometry:
 
 
 def _beds(street_map: StreetMap, area: shapely.Polygon) -> list[tuple[LandKind, shapely.Geometry]]:
-    """What lies between sidewalks and houses."""
+    """Return the covers between sidewalks and houses."""
     x0, y0, x1, y1 = shapely.bounds(area).tolist()
     reach = shapely.box(x0 - _REACH_M, y0 - _REACH_M, x1 + _REACH_M, y1 + _REACH_M)
     outlines = np.array([house.polygon for house in street_map.houses_near(reach)], dtype=object)
@@ -105,5 +110,5 @@ def _beds(street_map: StreetMap, area: shapely.Polygon) -> list[tuple[LandKind, 
             around = shapely.buffer(line, edge + _NEAR_M, cap_style="flat", join_style="mitre")
             found[bed].append(overlay.intersection(around, houses))
         elif strip.road_side != 0 and strip.frontage_m > 0.0:
-            found[bed].append(beside(strip, edge, edge + strip.frontage_m + _UNDER_M))
+            found[bed].append(beside(strip, edge, edge + strip.frontage_m + _UNDER_HOUSE_M))
     return [(kind, overlay.union_all(parts)) for kind, parts in found.items() if parts]

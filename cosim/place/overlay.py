@@ -1,8 +1,7 @@
-"""Union, difference and intersection of ground, also of shapes that GEOS gives up on.
+"""Robust union, difference and intersection of areas.
 
-Foreign maps hold slivers, and the mitred outline of a sliver can cross itself; GEOS refuses to
-overlay such shapes. What it refuses is repaired and, if need be, snapped to a grid. What it accepts
-keeps its bits.
+Imported maps contain slivers whose outlines GEOS refuses. Such shapes are repaired and, if needed,
+snapped to a grid. Results for valid shapes are those of GEOS, bit for bit.
 """
 
 from __future__ import annotations
@@ -19,73 +18,72 @@ from shapely.geometry import MultiPolygon, Polygon
 from cosim.core.errors import MapError
 
 GRIDS_M = (1e-6, 1e-3, 1e-2)
-"""Grids that repaired shapes are snapped to, one after another."""
+"""Grids that repaired shapes are snapped to, in metres, tried in this order."""
 
 _NUMBER = r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
+"""Regular expression of a number in a GEOS message."""
 
 Shapes = NDArray[np.object_]
 
 
 def union(a: Any, b: Any) -> Any:
-    """The union of two shapes, or of (N,) pairs of them. Raises MapError with the place where
-    nothing helps."""
-    return _pairs(shapely.union, a, b)
+    """Return the union of two shapes, or of (N,) pairs. Raises MapError with the place."""
+    return _elementwise(shapely.union, a, b)
 
 
 def difference(a: Any, b: Any) -> Any:
-    """Shapes without other shapes, as in `union`."""
-    return _pairs(shapely.difference, a, b)
+    """Return the first shapes without the second ones, as in `union`."""
+    return _elementwise(shapely.difference, a, b)
 
 
 def intersection(a: Any, b: Any) -> Any:
-    """What shapes have in common, as in `union`."""
-    return _pairs(shapely.intersection, a, b)
+    """Return the intersection of shapes, as in `union`."""
+    return _elementwise(shapely.intersection, a, b)
 
 
 def union_all(shapes: Sequence[shapely.Geometry] | Shapes) -> Polygon | MultiPolygon:
-    """The union of all shapes, areas as a rule. Raises MapError with the place where nothing
-    helps."""
+    """Return the union of many areas. Raises MapError with the place."""
     every = np.asarray(shapes, dtype=object)
 
     def whole(pieces: Shapes, grid_size: float | None = None) -> Any:
         return shapely.union_all(pieces, grid_size=grid_size)
 
-    united: Polygon | MultiPolygon = _tried(whole, every)
+    united: Polygon | MultiPolygon = _robust(whole, every)
     return united
 
 
 def where_geos_failed(error: Exception) -> str:
-    """Where GEOS failed, in words: " near (12.3, 45.6)", or nothing when it does not say."""
+    """Return the place in a GEOS error as text, such as " near (12.3, 45.6)", or ""."""
     found = re.search(rf"at ({_NUMBER}) ({_NUMBER})", str(error))
     return f" near ({float(found[1]):.1f}, {float(found[2]):.1f})" if found else ""
 
 
-def _pairs(operation: Callable[..., Any], a: Any, b: Any) -> Any:
+def _elementwise(operation: Callable[..., Any], a: Any, b: Any) -> Any:
     try:
         return operation(a, b)
     except shapely.errors.GEOSException:
         if isinstance(a, shapely.Geometry) and isinstance(b, shapely.Geometry):
-            return _tried(operation, a, b)
+            return _robust(operation, a, b)
     one, other = np.broadcast_arrays(np.asarray(a, dtype=object), np.asarray(b, dtype=object))
     out = np.empty(one.shape, dtype=object)
     for at in np.ndindex(one.shape):
-        out[at] = _tried(operation, one[at], other[at])
+        out[at] = _robust(operation, one[at], other[at])
     return out
 
 
-def _tried(operation: Callable[..., Any], *shapes: Any) -> Any:
-    """The operation on the shapes as they are, else repaired, else snapped to coarser and coarser
-    grids as well."""
+def _robust(operation: Callable[..., Any], *shapes: Any) -> Any:
+    """Apply an operation to the shapes; on failure to repaired ones, then to ones snapped to a
+    grid."""
     try:
         return operation(*shapes)
     except shapely.errors.GEOSException as error:
         refusal = error
-    mended = [
+    repaired = [
         shapely.make_valid(shape, method="structure", keep_collapsed=False) for shape in shapes
     ]
     for grid_m in (None, *GRIDS_M):
         try:
-            return operation(*mended, grid_size=grid_m)
+            return operation(*repaired, grid_size=grid_m)
         except shapely.errors.GEOSException as error:
             refusal = error
     raise MapError(

@@ -1,5 +1,7 @@
-"""From a way over ports to the line a robot can follow: along the middle of strips, round the
-inside of corners."""
+"""Compute the line that a robot follows along a way of ports.
+
+It runs along the middle of strips and through the inside of corners.
+"""
 
 from __future__ import annotations
 
@@ -15,22 +17,23 @@ from cosim.core.geometry import Floats, Polyline
 from cosim.place.street_map import Port, StreetMap, Strip, union_closed
 
 START_M = 30.0
-"""Long routes start and end on sidewalks at least this long."""
+"""Minimum length of the first and last sidewalk of a long route, in metres."""
 ROUTE_M = (120.0, 560.0)
-"""Shortest and longest way of a long-horizon route."""
+"""Minimum and maximum length of a long-horizon route, in metres."""
 MARGINS_M = (0.6, 0.45, 0.3, 0.15, 0.02)
-"""Distances from the edge of a corner that are tried for the line through it, widest first."""
+"""Distances from a corner's edge tried for the line through it, in metres, widest first."""
 
 _STEP_M = 1.0
+"""Distance between the points of a smoothed line, in metres."""
 SMOOTHING_ROUNDS = 2
+"""Number of rounds of corner cutting."""
 
 
 def way_line(street_map: StreetMap, way: Sequence[Port], start_m: float, goal_m: float) -> Polyline:
-    """The line along a way.
+    """Return the line along a way. Raises MapError if a corner cannot be passed.
 
-    way: ports in order, beginning with the port by which the first strip is left and ending with
-    the port by which the last is entered. start_m, goal_m: how far from those ports the line begins
-    on the first strip and ends on the last. Raises MapError when a corner cannot be passed.
+    way: ports in order, from the exit of the first strip to the entrance of the last.
+    start_m, goal_m: distance from those ports to the ends of the line, on the first and last strip.
     """
     first = street_map.strips[way[0].strip]
     last = street_map.strips[way[-1].strip]
@@ -46,15 +49,17 @@ def way_line(street_map: StreetMap, way: Sequence[Port], start_m: float, goal_m:
 
 
 def tail(strip: Strip, port: Port, length_m: float) -> Floats:
-    """The part of a strip's middle line from a port on, `length_m` long."""
+    """Return the first `length_m` metres of a strip's middle line from a port."""
     line = Polyline(strip.line[:, :2] if port.end == 0 else strip.line[::-1, :2])
     inner = line.points[(line.s_m > 0) & (line.s_m < length_m)]
     return np.vstack([line.points[:1], inner, line.at(length_m).xy[None]])
 
 
 def through_corner(street_map: StreetMap, leave: Port, enter: Port) -> Floats:
-    """The shortest line across a corner between two ports that keeps off its edges, ends
-    included."""
+    """Return the shortest line across a corner between two ports, at a distance from its edges.
+
+    Raises MapError if there is none.
+    """
     strips = [street_map.strips[port.strip] for port in (leave, enter)]
     corner_id = strips[0].corners[leave.end]
     if corner_id is None or corner_id != strips[1].corners[enter.end]:
@@ -73,9 +78,11 @@ def through_corner(street_map: StreetMap, leave: Port, enter: Port) -> Floats:
 
 
 def shortest_inside(area: Polygon | MultiPolygon, a: Floats, b: Floats) -> Floats | None:
-    """The shortest line from a to b inside an area, (N, 2) metres, or None. By its visibility
-    graph."""
-    from scipy.sparse import csr_array  # 0.2 s, and episodes have their lines
+    """Return the shortest line from a to b inside an area, (N, 2) metres, or None.
+
+    It uses the area's visibility graph.
+    """
+    from scipy.sparse import csr_array  # takes 0.2 s; episodes do not need it
     from scipy.sparse.csgraph import dijkstra
 
     grown = shapely.buffer(area, 0.01)
@@ -103,7 +110,7 @@ def shortest_inside(area: Polygon | MultiPolygon, a: Floats, b: Floats) -> Float
 
 
 def smoothed(line: Polyline) -> Polyline:
-    """The line with its bends rounded by corner cutting and a point about every metre; the ends
+    """Return a line with bends rounded by corner cutting and a point about every metre; the ends
     stay."""
     points = line.resampled(_STEP_M).points
     for _ in range(SMOOTHING_ROUNDS):

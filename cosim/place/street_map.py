@@ -1,7 +1,6 @@
-"""StreetMap: what a place is. Walkable strips and corners, crossings and their signals, roads,
-zones.
+"""StreetMap: a place with walkable strips and corners, crossings, signals, roads and zones.
 
-Every place, generated or imported, is read from a SUMO net into this one value; ground, buildings,
+Every place, generated or imported, is read from a SUMO net into a StreetMap. Ground, buildings,
 routes, crowd and the referee's walkable area derive from it.
 """
 
@@ -24,28 +23,29 @@ from cosim.place import overlay
 from cosim.place.terrain import Elevation, Terrain
 
 SEAM_M = 0.05
-"""Gaps up to twice this between neighbouring walkable pieces count as closed."""
+"""Margin in metres by which walkable pieces are grown to close gaps; gaps up to twice this close.
+"""
 
 
 class Port(NamedTuple):
-    """One end of a walkable strip: 0 where its line starts, 1 where it ends."""
+    """One end of a walkable strip: 0 at the start of its line, 1 at the end."""
 
     strip: str
     end: Literal[0, 1]
 
     @property
     def other(self) -> Port:
-        """The other end of the same strip."""
+        """Other end of the same strip."""
         return Port(self.strip, 1 if self.end == 0 else 0)
 
 
 @dataclass(frozen=True, slots=True)
 class SignalPlan:
-    """A crossing's signal that goes by the clock alone: phase after phase, and again from the
-    first.
+    """Fixed-time program of a crossing's signal, repeated after the last phase.
 
-    The first one begins at offset_ms, in milliseconds of SUMO's time. durations_ms: of the phases;
-    walks: whether one may walk in each.
+    offset_ms: start of the first phase in SUMO's time.
+    durations_ms: durations of the phases.
+    walks: whether pedestrians may walk in each phase.
     """
 
     offset_ms: int
@@ -55,15 +55,18 @@ class SignalPlan:
 
 @dataclass(frozen=True, slots=True)
 class Strip:
-    """A sidewalk or a crossing: a band of `width_m` around `line`, (N, 2) metres.
+    """Sidewalk or crossing: a band of `width_m` around `line`, (N, 2) metres.
 
-    id: SUMO edge id. corners: ids of the corners at either end, None at a dead end. signalised and
-    crosses (ids of the road edges crossed) are for crossings; frontage_m, curb_m (width of curb and
-    gutter), verge_m and street_class for sidewalks. road_side: +1 when the road lies left of
-    `line`, -1 right, 0 when there is none. driveways: arc lengths of `line`, in metres, where a
-    driveway's middle crosses the sidewalk. going: plain ground, steps, or a bridge or tunnel, which
-    share their place on the map with what lies below or above. plan: of a crossing's signal; None
-    where there is no signal, or where SUMO alone can tell what it shows.
+    id: SUMO edge id.
+    corners: ids of the corners at both ends, None at a dead end.
+    signalised: whether a crossing has a signal.
+    crosses: ids of the road edges that a crossing crosses.
+    frontage_m, curb_m, verge_m, street_class: properties of sidewalks; curb_m is the width of curb
+        and gutter.
+    road_side: +1 if the road is left of `line`, -1 right, 0 without a road.
+    driveways: arc lengths of `line` at which driveways cross the sidewalk, in metres.
+    going: surface. Bridges and tunnels share their place on the map with another level.
+    plan: program of a crossing's signal; None without a signal, or if only SUMO knows its state.
     """
 
     id: str
@@ -90,7 +93,7 @@ class Strip:
 
 @dataclass(frozen=True, slots=True)
 class Corner:
-    """A walking area: the polygon where strips meet, and their ports."""
+    """Walking area where strips meet, with their ports."""
 
     id: str
     polygon: Polygon | MultiPolygon
@@ -99,10 +102,11 @@ class Corner:
 
 @dataclass(frozen=True, slots=True)
 class Lane:
-    """A lane that is not for walking. kind "road": driven on; "verge": between road and sidewalk.
+    """Lane that is not for walking.
 
-    internal: part of a junction's interior. cars: whether cars may drive on it, and not only
-    bicycles or trams.
+    kind: "road" for traffic; "verge" between road and sidewalk.
+    internal: whether it is inside a junction.
+    cars: whether cars may use it, and not only bicycles or trams.
     """
 
     id: str
@@ -117,7 +121,7 @@ class Lane:
 
 @dataclass(frozen=True, slots=True)
 class Junction:
-    """The outline of a junction, its corners included."""
+    """Outline of a junction, with its corners."""
 
     id: str
     polygon: Polygon
@@ -125,20 +129,24 @@ class Junction:
 
 
 LandKind = Literal["lawn", "planting", "soil", "yard", "water"]
-"""What open land is covered with. yard: land to park, drive or work on, such as a parking lot."""
+"""Covers of open land. A yard is land to park, drive or work on, such as a parking lot."""
 LANDS: Final[tuple[LandKind, ...]] = get_args(LandKind)
+"""All covers of open land."""
 FeatureKind = (
     Literal["building", "tree", "lamp", "bench", "bollard", "bin", "hydrant", "rack"] | LandKind
 )
+"""Kinds of mapped features."""
 
 
 @dataclass(frozen=True, slots=True)
 class Feature:
-    """A building, a thing on the street or a piece of land that the map itself shows.
+    """Building, street object or piece of land of the map.
 
-    x_m, y_m: its middle. heading_rad: along it, what it serves or faces to its left (the arm of a
-    lamp) or right (who sits on a bench, the front of a building). height_m: 0 where the map does
-    not say. polygon: the ground of a building or a piece of land; empty for the others.
+    x_m, y_m: its middle.
+    heading_rad: direction along it. The street is to the left of a lamp, and to the right of a
+        bench or a building.
+    height_m: 0 if unknown.
+    polygon: footprint of a building or a piece of land; empty for the others.
     """
 
     kind: FeatureKind
@@ -150,25 +158,27 @@ class Feature:
 
 
 class Located(NamedTuple):
-    """Where a point is: on a walkable piece, on a lane, or off both; edge: the SUMO edge there."""
+    """Result of `StreetMap.locate`: kind of piece, and the SUMO edge there."""
 
     kind: Literal["walk", "road", "off"]
     edge: str
 
 
 PieceKind = Literal["strip", "corner", "lane", "junction"]
+"""Kinds of pieces with a spatial index."""
 _Piece = Strip | Corner | Lane | Junction
 
 
 @dataclass(frozen=True, eq=False)
 class StreetMap:
-    """A place. All ids are SUMO edge, lane or junction ids; the mappings are in the net's order.
+    """A place. Ids are SUMO edge, lane or junction ids; mappings are in the net's order.
 
-    bounds: x0, y0, x1, y1 in metres. net_hash: content hash of the net it was read from, and of the
-    features where there are any. features: what the map shows beside its streets; none of it stands
-    in the way. terrain: None where the place is flat; elevation: what became of the net's
-    elevations, None when it has none. planned: a generated city: its net names the class of each of
-    its streets.
+    bounds: x0, y0, x1, y1 in metres.
+    net_hash: content hash of the net and of its features, if any.
+    features: mapped objects beside the streets; none of them is in the way.
+    terrain: None if the place is flat.
+    elevation: how the net's elevations were processed, None without any.
+    planned: whether it is a generated city, whose net names the class of each street.
     """
 
     name: str
@@ -186,44 +196,43 @@ class StreetMap:
     _trees: dict[str, tuple[shapely.STRtree, tuple[_Piece, ...]]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
-    """Made when they are first asked for; a map that is changed makes its own."""
+    """Spatial indexes, built on first use. A modified copy builds its own."""
     _made_of: str = field(default="", init=False, repr=False, compare=False)
 
     @property
     def made_of(self) -> str:
-        """A hash of all that it was read from, and of what read it; "" where it is made by hand or
-        of another one."""
+        """Hash of the map's inputs and of the code that read it; "" if built otherwise."""
         return self._made_of
 
     def read_of(self, made_of: str) -> Self:
-        """This map, told its `made_of` by who read it."""
+        """Set `made_of` and return the map, for its reader."""
         object.__setattr__(self, "_made_of", made_of)
         return self
 
     @cached_property
     def signals_by_the_clock(self) -> bool:
-        """Whether all signals of crossings have a plan."""
+        """Whether all signals of crossings have a fixed-time program."""
         return all(strip.plan is not None for strip in self.strips.values() if strip.signalised)
 
     @cached_property
     def too_steep(self) -> frozenset[Port]:
-        """Ports that no robot is sent past because the land is too steep there; people pass."""
+        """Ports that robots must not pass because of the slope; people do."""
         whole = {port for strip in self.steep for port in (Port(strip, 0), Port(strip, 1))}
         closed = self.elevation.closed if self.elevation is not None else ()
         return frozenset(whole | {Port(strip, 1 if end else 0) for strip, end in closed})
 
     @cached_property
     def steep(self) -> frozenset[str]:
-        """Strips that no robot is sent over because the land is too steep there."""
+        """Strips that robots must not use because of the slope."""
         return frozenset(self.elevation.steep if self.elevation is not None else ())
 
     def near(self, kind: PieceKind, area: shapely.Geometry) -> list[_Piece]:
-        """Pieces of `kind` whose polygon touches `area`, in the net's order."""
+        """Return the pieces of a kind whose polygon intersects `area`, in the net's order."""
         tree, pieces = self._tree(kind)
         return [pieces[i] for i in np.sort(tree.query(area, predicate="intersects"))]
 
     def lands_near(self, area: shapely.Geometry) -> list[Feature]:
-        """Pieces of land that the map shows and that touch `area`, the smallest first."""
+        """Return the mapped land that intersects `area`, the smallest piece first."""
         tree, lands = self._lands
         return sorted(
             (lands[i] for i in np.sort(tree.query(area, "intersects"))),
@@ -231,21 +240,23 @@ class StreetMap:
         )
 
     def houses_near(self, area: shapely.Geometry) -> list[Feature]:
-        """Buildings that the map shows and that touch `area`, in its order."""
+        """Return the mapped buildings that intersect `area`, in the map's order."""
         tree, houses = self._houses
         return [houses[i] for i in np.sort(tree.query(area, "intersects"))]
 
     @cached_property
     def _lands(self) -> tuple[shapely.STRtree, tuple[Feature, ...]]:
-        return _by_place(feature for feature in self.features if feature.kind in LANDS)
+        return _indexed(feature for feature in self.features if feature.kind in LANDS)
 
     @cached_property
     def _houses(self) -> tuple[shapely.STRtree, tuple[Feature, ...]]:
-        return _by_place(feature for feature in self.features if feature.kind == "building")
+        return _indexed(feature for feature in self.features if feature.kind == "building")
 
     def walkable_near(self, area: shapely.Geometry) -> Polygon | MultiPolygon:
-        """Union of the walkable pieces that touch `area`; seams closed. Raises MapError when there
-        are none."""
+        """Return the union of the walkable pieces that intersect `area`, with seams closed.
+
+        Raises MapError if there are none.
+        """
         polygons = [piece.polygon for piece in self.near("strip", area) + self.near("corner", area)]
         if not polygons:
             raise MapError(
@@ -255,13 +266,15 @@ class StreetMap:
 
     @cached_property
     def walkable(self) -> Polygon | MultiPolygon:
-        """Union of every walkable piece. Seconds on a large map: prefer `walkable_near`."""
+        """Union of all walkable pieces. It takes seconds on a large map; prefer `walkable_near`."""
         strips, corners = self.strips.values(), self.corners.values()
         return union_closed([s.polygon for s in strips] + [c.polygon for c in corners])
 
     def locate(self, x_m: float, y_m: float, slack_m: float = 0.8) -> Located:
-        """The walkable piece at a point (up to `slack_m` beside it), else the lane there, else
-        "off"."""
+        """Return the walkable piece at a point, else the lane, else "off".
+
+        slack_m: distance up to which a walkable piece counts, in metres.
+        """
         point = shapely.Point(x_m, y_m)
         best = ""
         best_gap = slack_m
@@ -294,29 +307,27 @@ class StreetMap:
         return self._trees[kind]
 
 
-def _by_place(features: Iterable[Feature]) -> tuple[shapely.STRtree, tuple[Feature, ...]]:
+def _indexed(features: Iterable[Feature]) -> tuple[shapely.STRtree, tuple[Feature, ...]]:
     held = tuple(features)
     return shapely.STRtree([feature.polygon for feature in held]), held
 
 
 def street_of(edge: str) -> str:
-    """What the two directions and the pieces of a street have in common: `-s12b` and `s12a` are
-    s12, `-7#2` is 7."""
+    """Return the street of an edge: `-s12b` and `s12a` give s12, `-7#2` gives 7."""
     return re.sub(r"(#-?\d+|(?<=\d)[a-d])$", "", edge.removeprefix("-"))
 
 
 def union_closed(polygons: Sequence[shapely.Geometry]) -> Polygon | MultiPolygon:
-    """Union of polygons, with gaps up to 2 x SEAM_M between them closed."""
+    """Return the union of polygons; gaps up to 2 x SEAM_M are closed."""
     grown = shapely.buffer(np.asarray(polygons, dtype=object), SEAM_M, join_style="mitre")
     closed = shapely.buffer(overlay.union_all(grown), -SEAM_M, join_style="mitre")
-    # Slivers of foreign nets can make the mitred outline cross itself.
-    if closed.is_valid:
+    if closed.is_valid:  # slivers of imported nets can make the mitred outline cross itself
         return closed
     return shapely.make_valid(closed, method="structure", keep_collapsed=False)  # type: ignore[return-value]
 
 
 class WalkableArea:
-    """Fast tests of points against a walkable polygon."""
+    """Spatial index for point tests against a walkable polygon."""
 
     def __init__(self, polygon: Polygon | MultiPolygon) -> None:
         self.polygon = polygon
@@ -335,7 +346,7 @@ class WalkableArea:
         return bool(shapely.contains_xy(self.polygon, x_m, y_m))
 
     def signed_distance(self, xy: ArrayLike) -> Floats:
-        """Distance of (N, 2) points to the edge of the area in metres, positive inside."""
+        """Return the distance of (N, 2) points to the area's edge in metres, positive inside."""
         xy = np.asarray(xy, dtype=float).reshape(-1, 2)
         inside: NDArray[np.bool_] = shapely.contains_xy(self.polygon, xy[:, 0], xy[:, 1])
         if not len(self._sides):

@@ -1,8 +1,6 @@
-"""Terrain: how high the land lies under a place, curbs, ramps and unevenness apart; and where those
-heights come from.
+"""Terrain: heights of the land under a place, and the processing of its elevations.
 
-A place without terrain (None in its StreetMap) is flat at height 0: nothing is added to anything
-there.
+Curbs, ramps and roughness are not part of it. A place without terrain is flat at height 0.
 """
 
 from __future__ import annotations
@@ -15,30 +13,33 @@ from numpy.typing import ArrayLike, NDArray
 from cosim.core.geometry import Floats
 
 WALK_GRADE_MAX = 0.12
-"""Steepest grade left in streets and walkways, steps apart. Local streets are built with up to 8 %
-in towns and 15 % in hills (AASHTO, A Policy on Geometric Design of Highways and Streets); beyond
-that maps hold mostly noise."""
+"""Maximum grade of streets and walkways, except steps.
+
+Local streets have up to 8 % in towns and 15 % in hills (AASHTO, A Policy on Geometric Design of
+Highways and Streets). Steeper values in maps are mostly noise.
+"""
 
 ROBOT_GRADE_MAX = 0.20
-"""No route leads over strips where the land, curb ramps apart, is anywhere steeper than this, along
-or across."""
+"""Maximum grade of the land on a route, along or across a strip; curb ramps are excluded."""
 
 
 FALSE_GRADE = 0.25
-"""Hardly a street on Earth is steeper: a map that says so is wrong there."""
+"""Grade above which a map's elevation counts as wrong; hardly any street is steeper."""
 
 CLAMPED_M = 0.25
-"""A street that is moved by more than this counts as clamped."""
+"""Correction of a street's height in metres above which the point counts as clamped."""
 
 
 @dataclass(frozen=True, slots=True)
 class Terrain:
-    """Heights of the land on a square lattice, and flat triangles between.
+    """Heights on a square lattice, interpolated linearly on triangles.
 
-    heights: (R, C) metres above `datum_m`, rows northwards from y0_m, columns eastwards from x0_m,
-    R and C at least 2. Every cell is divided by the diagonal from its south-west to its north-east
-    corner. Beyond the lattice the heights at its edge go on. datum_m: height of 0 above the map's
-    own zero.
+    heights: (R, C) metres above `datum_m`, rows northwards from y0_m, columns eastwards from x0_m.
+        R and C are at least 2.
+    datum_m: height of 0 above the map's own zero.
+
+    The diagonal of each cell runs from south-west to north-east. Beyond the lattice, the heights of
+    its edge continue.
     """
 
     x0_m: float
@@ -48,8 +49,8 @@ class Terrain:
     datum_m: float = 0.0
 
     def height(self, xy: ArrayLike) -> Floats:
-        """Height of the land at (N, 2) points, (N,) metres: each value depends on its own point
-        alone, to the bit."""
+        """Return the height at (N, 2) points, (N,) metres. Each value depends only on its own
+        point."""
         i, j, a, b = self._cells(xy)
         h = self.heights
         south_west = h[j, i].astype(float)
@@ -59,8 +60,10 @@ class Terrain:
         return np.asarray(south_west + more * (corner - south_west) + less * (north_east - corner))
 
     def gradient(self, xy: ArrayLike) -> Floats:
-        """(N, 2) rise to the east and to the north, metres for each metre; 0 across the edge beyond
-        the lattice."""
+        """Return the slope to the east and to the north at (N, 2) points, (N, 2).
+
+        Beyond the lattice the slope across its edge is 0.
+        """
         i, j, a, b = self._cells(xy)
         h = self.heights
         below = a >= b
@@ -75,7 +78,8 @@ class Terrain:
         return np.where((at < (self.x0_m, self.y0_m)) | (at > last), 0.0, rise)
 
     def creases(self, bounds: tuple[float, float, float, float]) -> Floats:
-        """(L, 2, 2) sides of the triangles within x0, y0, x1, y1 along which the land bends."""
+        """Return the triangle sides within x0, y0, x1, y1 at which the land bends, (L, 2, 2)
+        metres."""
         x0, y0, x1, y1 = bounds
         i0, j0 = (
             int(np.floor((c - o) / self.step_m)) for c, o in ((x0, self.x0_m), (y0, self.y0_m))
@@ -83,7 +87,7 @@ class Terrain:
         i1, j1 = (
             int(np.ceil((c - o) / self.step_m)) for c, o in ((x1, self.x0_m), (y1, self.y0_m))
         )
-        # One ring of cells more than the bounds hold, so that the bend at their border can be seen.
+        # One more ring of cells, to find the bends at the border.
         columns = np.clip(np.arange(i0 - 1, i1 + 2), 0, self.heights.shape[1] - 1)
         rows = np.clip(np.arange(j0 - 1, j1 + 2), 0, self.heights.shape[0] - 1)
         h = self.heights[np.ix_(rows, columns)].astype(float)
@@ -103,8 +107,8 @@ class Terrain:
         return ends
 
     def _cells(self, xy: ArrayLike) -> tuple[NDArray[np.intp], NDArray[np.intp], Floats, Floats]:
-        """Column and row of the cell of each point, and its place in there, 0 to 1 eastwards and
-        northwards."""
+        """Return column and row of each point's cell, and its position there, 0 to 1 east and
+        north."""
         at = np.asarray(xy, dtype=float).reshape(-1, 2)
         rows, columns = self.heights.shape
         u = np.clip((at[:, 0] - self.x0_m) / self.step_m, 0.0, columns - 1.0)
@@ -115,14 +119,17 @@ class Terrain:
 
 @dataclass(frozen=True, slots=True)
 class Elevation:
-    """What became of the elevations in a map. dropped: why the place is flat all the same, "" when
-    they are kept.
+    """Statistics of the processing of a map's elevations.
 
-    low_m, high_m: of the points on streets, as the map has them, the missing ones apart. points: of
-    all shapes; missing: those without an elevation or with a 0 or a spike that cannot be;
-    false_share: part of the streets' length that is steeper than any street; clamped: points moved
-    by more than CLAMPED_M to keep WALK_GRADE_MAX, by at most moved_m. steep: strips that no robot
-    is sent over; closed: ends of others, strip and 0 or 1, that none passes.
+    low_m, high_m: range of the valid points on streets.
+    points: number of points of all shapes.
+    missing: number of points without an elevation, or with an impossible 0 or spike.
+    false_share: share of the streets' length that is steeper than any real street.
+    clamped: number of points moved by more than CLAMPED_M to satisfy WALK_GRADE_MAX.
+    moved_m: largest correction.
+    steep: strips that robots must not use.
+    closed: ends of other strips that robots must not pass, as strip and 0 or 1.
+    dropped: why the place is flat in spite of elevations; "" if they are used.
     """
 
     low_m: float

@@ -1,15 +1,13 @@
-"""WalkGraph: where one can walk on, from strip to strip, and how far it is.
+"""WalkGraph: reachability and walking distances between strips.
 
-Nodes are ports, the two ends of every strip. Arcs lead along each strip (its length) and, at each
-corner, between every two of its ports (the straight line). A closed port is one that a barrier
-stops: nobody passes between it and its corner, but the strip behind it stays walkable from its
-other end.
+Nodes are ports, the two ends of every strip. Arcs run along each strip and, at each corner,
+straight between its ports. A barrier closes a port: its arcs across the corner are removed. The
+strip behind it can be entered from its other end.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
@@ -21,25 +19,24 @@ from cosim.core.errors import MapError
 from cosim.core.geometry import Floats
 from cosim.place.street_map import Port, StreetMap
 
-if TYPE_CHECKING:  # imported where it is used: a crowd that only wanders does without
+if TYPE_CHECKING:  # imported on use: a wandering crowd does not need it
     from scipy.sparse import csr_array
 
 OPEN: frozenset[Port] = frozenset()
-"""No port is closed."""
+"""Empty set of closed ports."""
 
 SHORTEST_HOP_M = 0.1
-"""Length of a step across a corner between ports that touch."""
+"""Minimum length of an arc in metres, for ports that touch."""
 
 CROSSING_WEIGHT = 0.5
-"""How likely a wanderer takes a crossing, relative to a sidewalk."""
+"""Probability that a random walk takes a crossing, relative to a sidewalk."""
 
 
 @dataclass(frozen=True, slots=True)
 class Reach:
-    """Everything that can be walked to from `start`.
+    """Ports reachable from `start`.
 
-    distance_m: (P,) metres to each port of the graph, inf where it is out of reach or beyond the
-    limit.
+    distance_m: (P,) metres to each port; inf if it is unreachable or beyond the limit.
     """
 
     start: Port
@@ -49,17 +46,17 @@ class Reach:
     _before: NDArray[np.int32]
 
     def within(self, low_m: float, high_m: float) -> list[Port]:
-        """The ports at a walking distance in [low_m, high_m], in the graph's order."""
+        """Return the ports at a walking distance in [low_m, high_m], in the graph's order."""
         hits = np.flatnonzero((self.distance_m >= low_m) & (self.distance_m <= high_m))
         return [self.ports[i] for i in hits]
 
     def to(self, goal: Port) -> float:
-        """Walking distance to `goal` in metres, inf when out of reach."""
-        return float(self.distance_m[_number(self._index, goal)])
+        """Return the walking distance to `goal` in metres, inf if it is unreachable."""
+        return float(self.distance_m[_node(self._index, goal)])
 
     def path(self, goal: Port) -> list[Port] | None:
-        """The shortest way to `goal`, both ends included, or None when out of reach."""
-        node = _number(self._index, goal)
+        """Return the shortest path to `goal` with both ends, or None if it is unreachable."""
+        node = _node(self._index, goal)
         if not np.isfinite(self.distance_m[node]):
             return None
         nodes = [node]
@@ -69,11 +66,12 @@ class Reach:
 
 
 class WalkGraph:
-    """The walking graph of a place.
+    """Walking graph of a place.
 
-    ports: all P of them, both ends of each strip in the map's order. xy: (P, 2) metres. component:
-    (P,) label of the connected part each port lies in, when nothing is closed. main_strips: the
-    strips of the longest such part.
+    ports: all P ports, both ends of each strip in the map's order.
+    xy: (P, 2) metres.
+    component: (P,) label of each port's connected part, without closed ports.
+    main_strips: strips of the longest connected part.
     """
 
     def __init__(self, street_map: StreetMap) -> None:
@@ -91,8 +89,8 @@ class WalkGraph:
             for corner in street_map.corners.values()
             for port in corner.ports
         }
-        self._arcs = lru_cache(maxsize=8)(self._arcs_without)
-        self._onward = lru_cache(maxsize=4096)(self._choices)
+        self._arcs = lru_cache(maxsize=8)(self._build_arcs)
+        self._next_ports = lru_cache(maxsize=4096)(self._find_next_ports)
 
     @cached_property
     def component(self) -> NDArray[np.int32]:
@@ -106,19 +104,19 @@ class WalkGraph:
         if not self.street_map.strips:
             return frozenset()
         labels = self.component[::2]
-        (_, _, lengths_m) = self._along
+        (_, _, lengths_m) = self._strip_arcs
         main = np.argmax(np.bincount(labels, weights=lengths_m[: len(labels)]))
         return frozenset(
             strip for strip, c in zip(self.street_map.strips, labels, strict=True) if c == main
         )
 
     def point(self, port: Port) -> tuple[float, float]:
-        """Where a port is, in metres."""
-        x, y = self.xy[_number(self._index, port)]
+        """Return the position of a port in metres."""
+        x, y = self.xy[_node(self._index, port)]
         return float(x), float(y)
 
     def others(self, port: Port, closed: frozenset[Port] = OPEN) -> tuple[Port, ...]:
-        """The ports that can be reached across the corner at `port`; none at a dead end or a closed
+        """Return the ports reachable across the corner at `port`; none at a dead end or a closed
         port."""
         if port in closed:
             return ()
@@ -128,8 +126,8 @@ class WalkGraph:
     def shortest(
         self, start: Port, goal: Port, closed: frozenset[Port] = OPEN
     ) -> tuple[list[Port], float] | None:
-        """The shortest way from port to port, both included, and its length in metres; None if
-        there is none."""
+        """Return the shortest path between ports with both ends, and its length in metres; None
+        without one."""
         reach = self.reach(start, closed)
         path = reach.path(goal)
         return None if path is None else (path, reach.to(goal))
@@ -137,12 +135,12 @@ class WalkGraph:
     def reach(
         self, start: Port, closed: frozenset[Port] = OPEN, limit_m: float = math.inf
     ) -> Reach:
-        """Distances from `start` to every port within `limit_m`."""
+        """Return the ports reachable from `start` within `limit_m`, with their distances."""
         from scipy.sparse.csgraph import dijkstra
 
         distance, before = dijkstra(  # type: ignore[call-overload]
             self._arcs(closed),
-            indices=_number(self._index, start),
+            indices=_node(self._index, start),
             return_predecessors=True,
             limit=limit_m,
         )
@@ -156,17 +154,19 @@ class WalkGraph:
         n_edges: int,
         closed: frozenset[Port] = OPEN,
     ) -> list[str]:
-        """A random walk: up to `n_edges` strip ids from `strip` on, crossings named, never past a
-        closed port.
+        """Return a random walk of up to `n_edges` strip ids, crossings included, within open ports.
 
-        forward: whether `strip` is walked along its line. It keeps out of strips without a way out
-        and does not end on a crossing, so it can be shorter, down to `strip` alone.
+        strip: first strip.
+        forward: whether it is walked along its line.
+
+        The walk avoids dead ends and does not end on a crossing, so it can be shorter, down to one
+        strip.
         """
         strips = self.street_map.strips
         walk = [strip]
         port = Port(strip, 1 if forward else 0)
         while len(walk) < n_edges:
-            choices, weights = self._onward(port, closed)
+            choices, weights = self._next_ports(port, closed)
             if not choices:
                 break
             pick = rng.random() * sum(weights)
@@ -182,16 +182,16 @@ class WalkGraph:
             walk.pop()
         return walk
 
-    def _choices(
+    def _find_next_ports(
         self, port: Port, closed: frozenset[Port]
     ) -> tuple[tuple[Port, ...], tuple[float, ...]]:
-        """Where a wanderer at a port may go on that is no dead end, and how likely."""
+        """Return the next ports of a random walk that are not dead ends, and their weights."""
         choices = tuple([p for p in self.others(port, closed) if self.others(p.other, closed)])
         kinds = [self.street_map.strips[p.strip].kind for p in choices]
         return choices, tuple([CROSSING_WEIGHT if kind == "crossing" else 1.0 for kind in kinds])
 
     @cached_property
-    def _along(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats]:
+    def _strip_arcs(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats]:
         lengths = np.array(
             [max(strip.length_m, SHORTEST_HOP_M) for strip in self.street_map.strips.values()]
         )
@@ -203,9 +203,9 @@ class WalkGraph:
         )
 
     @cached_property
-    def _hops(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats]:
+    def _corner_arcs(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats]:
         pairs = [
-            (_number(self._index, a), _number(self._index, b))
+            (_node(self._index, a), _node(self._index, b))
             for corner in self.street_map.corners.values()
             for a in corner.ports
             for b in corner.ports
@@ -215,30 +215,27 @@ class WalkGraph:
         gap = self.xy[nodes[:, 0]] - self.xy[nodes[:, 1]]
         return nodes[:, 0], nodes[:, 1], np.maximum(np.hypot(gap[:, 0], gap[:, 1]), SHORTEST_HOP_M)
 
-    def _arcs_without(self, closed: frozenset[Port]) -> csr_array:
+    def _build_arcs(self, closed: frozenset[Port]) -> csr_array:
         from scipy.sparse import csr_array
 
-        tails, heads, metres = self._hops
+        tails, heads, metres = self._corner_arcs
         if closed:
-            shut = self._numbers(closed)
-            keep = ~(np.isin(tails, shut) | np.isin(heads, shut))
+            closed_nodes = [_node(self._index, port) for port in closed]
+            keep = ~(np.isin(tails, closed_nodes) | np.isin(heads, closed_nodes))
             tails, heads, metres = tails[keep], heads[keep], metres[keep]
-        along_tails, along_heads, along_m = self._along
+        along_tails, along_heads, along_m = self._strip_arcs
         nodes = (np.concatenate([along_tails, tails]), np.concatenate([along_heads, heads]))
         count = len(self.ports)
         return csr_array((np.concatenate([along_m, metres]), nodes), shape=(count, count))
 
-    def _numbers(self, ports: Iterable[Port]) -> NDArray[np.int32]:
-        return np.array([_number(self._index, port) for port in ports], dtype=np.int32)
-
 
 @lru_cache(maxsize=1)
 def walk_graph_of(street_map: StreetMap) -> WalkGraph:
-    """The graph of a place; the last one is kept."""
+    """Return the graph of a place; the last one is cached."""
     return WalkGraph(street_map)
 
 
-def _number(index: dict[str, int], port: Port) -> int:
+def _node(index: dict[str, int], port: Port) -> int:
     try:
         return index[port.strip] + port.end
     except KeyError:

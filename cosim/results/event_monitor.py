@@ -24,11 +24,10 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats, Pose
 from cosim.core.state import PersonKind, RobotState
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
 from cosim.results.record import Record, TriggeredEvent
 from cosim.spec.camera import CameraSpec
-from cosim.spec.event_kind import EventKinds
-from cosim.spec.events import Event, EventState
+from cosim.spec.events import Event, EventKinds, EventState
 from cosim.spec.robot import Mount, Robot
 from cosim.spec.scenario import Scenario
 

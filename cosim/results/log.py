@@ -17,7 +17,7 @@ from cosim.core.errors import RunError
 from cosim.core.geometry import Floats
 from cosim.core.npz import names_in_npz, read_npz
 from cosim.core.state import RobotState
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
 from cosim.results.nearness import Nearness, nearness
 from cosim.results.referee import Verdict
 from cosim.results.traffic import OnRoad

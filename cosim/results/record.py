@@ -19,9 +19,9 @@ import numpy as np
 from cosim.core.errors import RunError, SpecError
 from cosim.core.files import read_within, write_atomic
 from cosim.core.geometry import Floats
-from cosim.episode.camera_rules import nonstandard
 from cosim.episode.command_delay import InFlight
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
+from cosim.episode.manifest_checks import nonstandard
 from cosim.results.flat_file import FlatFile
 from cosim.results.log import COLUMNS, Log, Tick
 from cosim.results.referee import Failure, Verdict

@@ -42,7 +42,7 @@ from numpy.typing import NDArray
 from cosim.core.clock import Clock
 from cosim.core.geometry import Circle, Floats, Pose, box_disk_gap, boxes_overlap
 from cosim.core.state import PERSON_RADIUS_M, STILL, Contact, Signal
-from cosim.episode.step import Reset, Step
+from cosim.episode.loop import Reset, Step
 from cosim.people.yielding import ROBOT_STANDS_MPS, STOOD_S, outline_mps
 from cosim.place.barriers import outline
 from cosim.place.street_map import WalkableArea

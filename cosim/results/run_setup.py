@@ -5,8 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from cosim.core.versions import versions
-from cosim.spec.options import EpisodeOptions
-from cosim.spec.policy_host import PolicyRuns
+from cosim.spec.options import EpisodeOptions, PolicyRuns
 
 METRIC_SCHEMA = 3
 """Raised whenever a definition of `cosim.results.metrics` comes or changes; other schemas are not

@@ -20,7 +20,7 @@ import shapely
 
 from cosim.core.geometry import Circle, Floats, Pose
 from cosim.core.state import PERSON_RADIUS_M, Street
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
 from cosim.place import overlay
 from cosim.place.street_map import StreetMap, Strip
 

@@ -8,7 +8,7 @@ from collections import deque
 import numpy as np
 
 from cosim.core.geometry import Floats
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
 from cosim.results.log import Log
 
 _FARTHEST_M = 200.0

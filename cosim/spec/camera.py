@@ -1,4 +1,4 @@
-"""Cameras: what a policy asks for (`CameraSpec`, `Lens`), and what it gets (`CameraPicture`,
+"""Camera specs of policies (`CameraSpec`, `Lens`), and their pictures (`CameraPicture`,
 `Calibration`)."""
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ def flipped(picture: NDArray[Any]) -> NDArray[Any]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Calibration:
-    """A camera as computer vision has it (OpenCV): x to the right, y down, z ahead.
+    """Camera calibration in OpenCV's convention: x right, y down, z ahead.
 
-    matrix: (3, 3) K, in pixels, the middle of the upper left pixel at (0, 0). distortion: (5,) k1,
-    k2, p1, p2, k3 of Brown's model. on_robot: (4, 4), from the camera's frame to the robot's (x
-    ahead, y left, z up, the origin on the ground below its middle); the ground may lean the robot.
+    matrix: (3, 3) K in pixels; (0, 0) is the middle of the upper left pixel.
+    distortion: (5,) k1, k2, p1, p2, k3 of Brown's model.
+    on_robot: (4, 4) transform from the camera's frame to the robot's: x ahead, y left, z up, origin
+        on the ground below its middle. It ignores the tilt of the robot on uneven ground.
 
     >>> ahead = Calibration(np.eye(3), np.zeros(5), np.eye(4)).on_robot @ [0.0, 0.0, 1.0, 1.0]
     """
@@ -35,7 +36,7 @@ class Calibration:
     on_robot: Floats
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        """Raises TypeError: it is three arrays."""
+        """Raise TypeError: a calibration is three arrays."""
         raise TypeError(
             "a camera is no array: read .matrix (3, 3), .distortion (5,) or .on_robot (4, 4)"
         )
@@ -43,9 +44,12 @@ class Calibration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPicture:
-    """What one camera gives: rgb (H, W, 3) uint8; labels (H, W) uint8 of `cosim.core.state.LABELS`
-    and depth (H, W) float32, metres along the camera's axis, where its spec asks for them; and the
-    camera.
+    """Picture of one camera.
+
+    rgb: (H, W, 3) uint8.
+    labels: (H, W) uint8 ids of `cosim.core.state.LABELS`, if the spec requests them.
+    depth: (H, W) float32 metres along the camera's axis, if the spec requests it.
+    camera: its calibration.
 
     >>> camera = Calibration(np.eye(3), np.zeros(5), np.eye(4))
     >>> CameraPicture(np.zeros((48, 64, 3), np.uint8), None, None, camera).rgb.shape
@@ -58,20 +62,21 @@ class CameraPicture:
     camera: Calibration
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        """(H, W, 3) uint8: `rgb`."""
+        """Return `rgb`, (H, W, 3) uint8."""
         return np.array(self.rgb, dtype, copy=copy)
 
 
 @dataclass(frozen=True, slots=True)
 class Lens:
-    """What a camera's optics and sensor do to a picture; the default does nothing.
+    """Effects of a camera's optics and sensor on a picture; the default has none.
 
     k1, k2: radial terms of Brown's distortion, in units of the focal length; k1 < 0 is a barrel.
-    shutter_s: time the shutter is open, the source of motion blur; readout_s: from the first row to
-    the last, the source of a rolling shutter's skew. full_well_e: electrons of a white pixel, 0 for
-    a sensor without noise; read_noise_e: electrons of noise in the dark. auto_exposure_ev: stops by
-    which metering on the picture itself may brighten or darken it. vignette: 0 (none) to 1 (the
-    natural fall of light, cos^4 of the angle off the axis).
+    shutter_s: exposure time, the cause of motion blur.
+    readout_s: time from the first row to the last, the cause of rolling-shutter skew.
+    full_well_e: electrons of a white pixel; 0 for a sensor without noise.
+    read_noise_e: electrons of noise in the dark.
+    auto_exposure_ev: maximum correction in stops by metering on the picture itself.
+    vignette: 0 (none) to 1 (natural falloff, cos^4 of the angle off the axis).
     """
 
     k1: float = 0.0
@@ -108,14 +113,14 @@ class Lens:
 
 @dataclass(frozen=True, slots=True)
 class CameraSpec:
-    """A policy's camera: size in pixels, vertical field of view in degrees, and where it sits.
+    """Camera of a policy: size in pixels, vertical field of view in degrees, and mount.
 
-    mount: the name of one of the robot's mounts, which every robot has elsewhere and whose limits
-    hold for size, field of view and rate. A place of one's own, or what is beyond the limits, needs
-    `EpisodeOptions.own_camera`. crop: (x0, y0, x1, y1) in pixels of the whole picture: the policy
-    gets its columns x0 to x1 and rows y0 to y1 alone, from the upper left corner, without x1 and
-    y1. depth, labels: whether the policy gets these of each picture, too. Raises SpecError where
-    the crop is no part of the picture.
+    mount: name of one of the robot's mounts, whose limits hold for size, field of view and rate. A
+        `Mount` of its own, or values beyond the limits, need `EpisodeOptions.own_camera`.
+    crop: (x0, y0, x1, y1) in pixels, without x1 and y1: the part of the picture that the policy
+        gets.
+    depth, labels: whether the policy gets these with each picture. Raises SpecError if the crop is
+        not within the picture.
 
     >>> CameraSpec(width=512, height=288, fov_deg=60.0, crop=(0, 88, 512, 288)).size
     (512, 200)
@@ -143,19 +148,18 @@ class CameraSpec:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Width and height of what the policy gets."""
+        """Width and height of the policy's picture in pixels, after the crop."""
         x0, y0, x1, y1 = self.crop or (0, 0, self.width, self.height)
         return x1 - x0, y1 - y0
 
     @property
     def in_words(self) -> str:
-        """As tables tell it."""
+        """Description for tables."""
         own = "own mount" if isinstance(self.mount, Mount) else self.mount
         crop = "" if self.crop is None else ", crop " + " ".join(map(str, self.crop))
         more = ", lens" * (self.lens != Lens()) + ", depth" * self.depth + ", labels" * self.labels
         return f"{own}, {self.width} x {self.height} px, {self.fov_deg:g} deg{crop}{more}"
 
     def on(self, robot: Robot) -> Mount:
-        """Where it sits on a robot. Raises UsageError, listing the robot's mounts, if it has none
-        of that name."""
+        """Return the camera's mount on a robot. Raises UsageError with the robot's mounts."""
         return robot.mount(self.mount) if isinstance(self.mount, str) else self.mount

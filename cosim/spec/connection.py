@@ -1,7 +1,7 @@
-"""One end of a session over a network: what it does there, where it stands, and what guards it.
+"""Endpoint of a network session: role, address and security.
 
-An end is open to its own machine alone, or guarded by TLS, or insecure in so many words. This is
-decided here, before anything is opened.
+An endpoint is limited to its own machine, protected by TLS, or explicitly insecure. This is checked
+here, before anything is opened.
 """
 
 from __future__ import annotations
@@ -15,20 +15,22 @@ import msgspec
 from cosim.core.errors import UsageError
 
 Role = Literal["coordinator", "director", "policy", "worker", "viewer", "injector"]
+"""Role of an end of a session, for its rights (`bridge.security.rights`)."""
 HUBS: Final[tuple[Role, ...]] = ("coordinator", "director", "policy")
-"""Roles that others connect to."""
+"""Roles that listen; the others connect."""
 
-_OVER_IP: Final = re.compile(r"(tcp|tls)/([^/?#]+):(\d{1,5})")
-_OVER_A_FILE: Final = re.compile(r"(unixsock-stream)/([^?#]+)")
+_IP_ENDPOINT: Final = re.compile(r"(tcp|tls)/([^/?#]+):(\d{1,5})")
+_SOCKET_ENDPOINT: Final = re.compile(r"(unixsock-stream)/([^?#]+)")
 
 
 class Connection(msgspec.Struct, frozen=True, kw_only=True):
-    """An end that listens, or one that connects.
+    """Endpoint that listens or connects.
 
-    role: what it does, and whose its certificate must be. listen, connect: one of both,
-    PROTOCOL/ADDRESS:PORT (tcp or tls) or unixsock-stream/PATH. tls: a folder with `ca.pem`,
-    `cert.pem`, `key.pem` (`cosim certs`). insecure: it may reach beyond this machine without TLS.
-    Raises UsageError.
+    role: role of this end, and the role in its certificate.
+    listen, connect: exactly one of both, as PROTOCOL/ADDRESS:PORT (tcp or tls) or
+        unixsock-stream/PATH.
+    tls: folder with `ca.pem`, `cert.pem` and `key.pem` (`cosim certs`).
+    insecure: allow other machines without TLS. Raises UsageError.
 
     >>> Connection(role="worker", connect="tls/hub.lan:7447", tls="certs/worker").endpoint
     'tls/hub.lan:7447'
@@ -60,33 +62,33 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
             )
         if not (self.tls or self.insecure or self.of_this_machine):
             raise UsageError(
-                f"{self.endpoint} is beyond this machine and unguarded: {self._danger}. Use "
+                f"{self.endpoint} is beyond this machine and unguarded: {self._risk}. Use "
                 f"tls/{address} with --tls FOLDER (`cosim certs` makes it), or say --insecure"
             )
 
     @property
     def endpoint(self) -> str:
-        """Where it listens or connects to."""
+        """Address that it listens on or connects to."""
         return self.listen or self.connect
 
     def seen_by(self, other: Connection) -> Connection:
-        """The same endpoint as the end that `other` is of reaches it: in its role, with its
+        """Return the connection that `other` needs to the same address, with its own role and
         certificates."""
         return msgspec.structs.replace(self, role=other.role, tls=other.tls if self.tls else "")
 
     @property
     def of_this_machine(self) -> bool:
-        """Whether nobody on another machine can reach it, or be reached by it."""
+        """Whether the endpoint is reachable only on this machine."""
         protocol, address = _parts(self.endpoint)
         return protocol == "unixsock-stream" or _is_loopback(address.rpartition(":")[0].strip("[]"))
 
     @property
     def warning(self) -> str:
-        """What --insecure means here, in one line; "" where nothing is insecure."""
-        return "" if not self.insecure or self.of_this_machine else f"--insecure: {self._danger}."
+        """Consequence of --insecure in one line; "" if nothing is insecure."""
+        return "" if not self.insecure or self.of_this_machine else f"--insecure: {self._risk}."
 
     @property
-    def _danger(self) -> str:
+    def _risk(self) -> str:
         if self.connect:
             return (
                 f"whoever stands between here and {self.connect} may read and change all that is "
@@ -102,30 +104,30 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def listening(role: Role, option: str, endpoint: str, tls: str, insecure: bool) -> Connection:
-    """The end that listens at the endpoint of an option. Raises UsageError."""
+    """Return the connection that listens on an option's endpoint. Raises UsageError."""
     return Connection(
         role=role, listen=checked_endpoint(endpoint, option), tls=tls, insecure=insecure
     )
 
 
 def connecting(role: Role, option: str, endpoint: str, tls: str, insecure: bool) -> Connection:
-    """The end that connects to the endpoint of an option. Raises UsageError."""
+    """Return the connection to an option's endpoint. Raises UsageError."""
     return Connection(
         role=role, connect=checked_endpoint(endpoint, option), tls=tls, insecure=insecure
     )
 
 
 def checked_endpoint(endpoint: str, option: str) -> str:
-    """The endpoint that an option was given. Raises UsageError where it can be none."""
-    found = _OVER_IP.fullmatch(endpoint)
-    if not (found and 1 <= int(found[3]) <= 65535) and not _OVER_A_FILE.fullmatch(endpoint):
+    """Return the endpoint of an option. Raises UsageError if it is malformed."""
+    found = _IP_ENDPOINT.fullmatch(endpoint)
+    if not (found and 1 <= int(found[3]) <= 65535) and not _SOCKET_ENDPOINT.fullmatch(endpoint):
         like = "tcp/127.0.0.1:7447, tls/HOST:7447 or unixsock-stream/PATH"
         raise UsageError(f"{option} '{endpoint}': write it as PROTOCOL/ADDRESS:PORT, like {like}")
     return endpoint
 
 
 def _parts(endpoint: str) -> tuple[str, str]:
-    """Protocol and the rest."""
+    """Split an endpoint into protocol and address."""
     protocol, _, rest = endpoint.partition("/")
     return protocol, rest
 

@@ -1,4 +1,4 @@
-"""Collecting: what is kept of an episode as a demonstration, and how its expert is disturbed."""
+"""Options of recorded demonstrations, and of the disturbances of their expert."""
 
 from __future__ import annotations
 
@@ -15,20 +15,28 @@ from cosim.spec.goal import GOALS, GoalProtocol, goal_called
 from cosim.spec.manifest import Manifest
 
 EYE: Final = "collected"
-"""The name of the collecting camera beside that of an expert that sees by one itself."""
+"""Name of the recording camera when the expert has a camera of its own."""
 _MOST_NOISE: Final = 0.9
+"""Maximum share of the time with disturbed commands."""
 _MOST_WAYPOINTS: Final = 100
+"""Maximum number of waypoints in a row."""
 _FASTEST_HZ: Final = 20.0
+"""Maximum rate of pictures; a tick takes 0.05 s."""
 
 
 class Collecting(msgspec.Struct, frozen=True, kw_only=True):
-    """What is kept. camera: of the pictures; rate_hz: how often the expert is asked and a picture
-    is taken, a whole number of times a second. waypoints, waypoint_s: how many places ahead, and
-    the time from one to the next, whole ticks of 0.05 s. noise: the share of the time in which
-    another command than the expert's is driven, in bursts. learner: the policy whose commands these
-    are, "" for the expert's own, slowed and turned aside by chance. unsolved: episodes that the
-    expert does not solve are kept, too, up to where the robot is put elsewhere. Raises
-    SpecError."""
+    """Options of recorded demonstrations.
+
+    camera: camera of the pictures.
+    rate_hz: rate of the expert's queries and of the pictures.
+    waypoints: number of future positions in a row.
+    waypoint_s: time between them in seconds, whole ticks of 0.05 s.
+    noise: share of the time in which another command than the expert's is driven, in bursts.
+    learner: policy that drives in this time; "" for the expert's command, slowed and turned at
+        random.
+    unsolved: also record episodes that the expert fails, up to the first reset of the robot. Raises
+        SpecError.
+    """
 
     camera: CameraSpec = CameraSpec(width=160, height=90)
     rate_hz: float = 5.0
@@ -42,9 +50,9 @@ class Collecting(msgspec.Struct, frozen=True, kw_only=True):
         if self.rate_hz not in (
             rates := [n for n in range(1, int(_FASTEST_HZ) + 1) if not 1000 % n and _ticks(1 / n)]
         ):
-            told = ", ".join(map(str, rates))
+            valid = ", ".join(map(str, rates))
             raise SpecError(
-                f"a data set has {told} pictures a second, not {self.rate_hz:g}: choose one "
+                f"a data set has {valid} pictures a second, not {self.rate_hz:g}: choose one "
                 f"of these rates"
             )
         if not 0.0 <= self.noise <= _MOST_NOISE:
@@ -75,7 +83,7 @@ class Collecting(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def _ticks(time_s: float) -> int:
-    """How many ticks a time is; 0 if it is no whole number of them."""
+    """Return the number of ticks in a time; 0 if it is not a whole number."""
     ticks = Clock().ticks(time_s)
     return ticks if math.isclose(ticks * Clock().tick_s, time_s) else 0
 
@@ -83,8 +91,10 @@ def _ticks(time_s: float) -> int:
 def check_learner(
     learner: Manifest, collecting: Collecting, expert: Manifest, goal: GoalProtocol
 ) -> None:
-    """Raises UsageError where a learner would be given something else than what is collected, or
-    cannot do with it. goal: of the rows."""
+    """Raise UsageError if a learner's inputs differ from the recorded ones.
+
+    goal: goal protocol of the rows.
+    """
     if expert.camera is not None:
         raise UsageError(
             f"expert '{expert.name}' sees by a camera of its own, and a learner drives "
@@ -101,7 +111,7 @@ def check_learner(
         kept = collecting.camera.in_words
         raise UsageError(
             f"learner '{learner.name}' is to see what is collected. It sees by {seen}, collected "
-            f"is {kept}, {collecting.rate_hz:g} Hz: {_asked_for(camera, learner.rate_hz)}"
+            f"is {kept}, {collecting.rate_hz:g} Hz: {_matching_options(camera, learner.rate_hz)}"
         )
     if learner.goals and goal not in learner.goals:
         could = ", ".join(learner.goals)
@@ -110,8 +120,8 @@ def check_learner(
         )
 
 
-def _asked_for(camera: CameraSpec, rate_hz: float) -> str:
-    """How these pictures are asked for."""
+def _matching_options(camera: CameraSpec, rate_hz: float) -> str:
+    """Return the options that record these pictures, as advice."""
     plain = CameraSpec(camera.width, camera.height, camera.fov_deg, camera.mount)
     if camera != plain or not isinstance(camera.mount, str):
         return (
@@ -127,10 +137,13 @@ def _asked_for(camera: CameraSpec, rate_hz: float) -> str:
 def demonstrating(
     expert: Manifest, collecting: Collecting, goal: GoalProtocol | None = None
 ) -> Manifest:
-    """The manifest of an expert whose drives are collected: with the camera, at the rate, and named
-    otherwise where it is disturbed. goal: of the run, in place of its own. Raises UsageError for
-    goals that no data set tells, and for another rate than that of an expert that sees: the
-    pictures that it remembers would be other times apart."""
+    """Return the manifest of an expert for recording, with the recording camera and rate.
+
+    A disturbed expert gets another name. Raises UsageError for goals that a data set cannot hold.
+    An expert with a camera must keep its rate, because it remembers pictures at that interval.
+
+    goal: goal protocol of the run, in place of the expert's.
+    """
     goal = goal or expert.goal
     kind = GOALS[goal_called(goal)]
     if not kind.in_data_sets:

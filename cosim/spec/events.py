@@ -1,33 +1,41 @@
-"""Event pedestrians: what is asked of a director at each tick, and what it answers.
+"""Events with pedestrians: their kinds, and the messages between simulator and event director.
 
-The director keeps no memory: the simulator sends the states it got last time, so a director can be
-killed and started again in the middle of an episode without a trace in the result.
+The director is stateless: each query contains the states of the previous reply. So a director can
+be restarted during an episode without changing the result.
+
+`scenarios.events.EVENT_KINDS` is the shipped table of kinds. Code that samples, directs, judges or
+shows events takes a table, so a kind is added by its row: `EVENT_KINDS | {MINE.name: MINE}`.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
-from typing import Annotated, Final, Literal
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Annotated, Final, Literal, NamedTuple
 
 import msgspec
+import numpy as np
 
 from cosim.core.state import PERSON_RADIUS_M, Age, Doing, PersonKind
 from cosim.spec.validation import ALONG_M, HEADING_RAD, WHERE_M, Ranged, Within, shown
 
 INJECTED_ID: Final = "ei-"
-"""What the ids of injected pedestrians begin with."""
+"""Prefix of the ids of injected pedestrians."""
 
 
 class Event(Ranged, frozen=True, kw_only=True):
-    """One event: a pedestrian or a group on the way. kind: a row of a table of `EventKinds`, by its
-    name.
+    """One event: a pedestrian or a group on the way.
 
-    x_m, y_m, heading_rad: the place on the middle of the sidewalk (of the crosswalk) where it
-    happens, heading along the robot's direction of travel. half_width_m: from there to either edge.
-    half_length_m: of a crosswalk, from there to either end along the heading. route_s_m: the same
-    place as arc length of the reference route. people: how many. speed_mps: walking speed. side: of
-    the sidewalk, left (1) or right (-1).
+    kind: name of a row in a table of `EventKinds`.
+    x_m, y_m: place on the middle of the sidewalk or crosswalk.
+    heading_rad: direction of the robot's travel there.
+    half_width_m: distance from there to either edge.
+    half_length_m: for a crosswalk, distance to either end along the heading.
+    route_s_m: arc length of the place on the reference route.
+    people: number of people.
+    speed_mps: walking speed.
+    side: side of the sidewalk, left (1) or right (-1).
     """
 
     id: str
@@ -57,17 +65,18 @@ class Event(Ranged, frozen=True, kw_only=True):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The ids of its people: its own, and with "-1", "-2" for the further ones."""
+        """Ids of its people: its own id, then with "-1", "-2" and so on."""
         return (self.id, *(f"{self.id}-{k}" for k in range(1, self.people)))
 
 
 class Walker(msgspec.Struct, frozen=True, kw_only=True):
-    """One person of an event. aim_rad, pace_mps: the heading and the speed it has committed to, if
-    it has.
+    """State of one person in an event.
 
-    blocked_ticks: how long it has stood against the robot. counted_ticks: how long that lasts which
-    ends its event. nearest_m: how near the robot has come to it from behind since it slowed down
-    before it. vx_mps, vy_mps: of its last step.
+    aim_rad, pace_mps: heading and speed that the person has committed to, if any.
+    blocked_ticks: time that the person has been blocked by the robot.
+    counted_ticks: duration so far of the condition that ends the event.
+    nearest_m: least distance of the robot behind the person, since it slowed down.
+    vx_mps, vy_mps: velocity of the last step.
     """
 
     x_m: float
@@ -83,12 +92,14 @@ class Walker(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class EventState(msgspec.Struct, frozen=True, kw_only=True):
-    """Where an event stands. phase: waiting for its trigger, acting, over, or gone for good.
-    since_tick: in this phase.
+    """State of an event.
 
-    trigger_distance_m: along the route from the robot to the event's place when it triggered,
-    negative behind it. lane_m: how far left of the middle of the way the robot was then.
-    robot_stood_ticks: how long the robot has stood.
+    phase: waiting for the trigger, acting, over, or gone for good.
+    since_tick: start of the phase.
+    trigger_distance_m: distance along the route from the robot to the event when it triggered,
+        negative behind it.
+    lane_m: offset of the robot from the middle of the way at that moment, left positive.
+    robot_stood_ticks: time that the robot has stood still.
     """
 
     phase: Literal["waiting", "acting", "over", "gone"]
@@ -101,11 +112,12 @@ class EventState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Actor(msgspec.Struct, frozen=True, kw_only=True):
-    """A pedestrian of ours as the world shows it at one tick. id: unlike all others; see
-    `Event.names`.
+    """A directed pedestrian at one tick.
 
-    speed_mps: of its last step. pace_mps: the speed that its body shows where that is another: who
-    turns or rises on the spot treads.
+    id: unique id, see `Event.names`.
+    speed_mps: speed of its last step.
+    pace_mps: speed that its body shows, if different: a person who turns on the spot moves the
+        feet.
     """
 
     id: str
@@ -120,7 +132,7 @@ class Actor(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class NearbyPerson(msgspec.Struct, frozen=True, array_like=True):
-    """Somebody who is not of an event: place, velocity and kind."""
+    """Position, velocity and kind of a person who belongs to no event."""
 
     id: str
     x_m: float
@@ -131,9 +143,10 @@ class NearbyPerson(msgspec.Struct, frozen=True, array_like=True):
 
 
 class StandingBody(msgspec.Struct, frozen=True, array_like=True):
-    """What stands in the way of people: a rectangle, length_m along its heading. closed_x,
-    closed_y: unit vector to the side on which nobody can pass it, (0, 0) where one can on
-    either."""
+    """Static obstacle for people: a rectangle with length_m along its heading.
+
+    closed_x, closed_y: unit vector to the side without a passage; (0, 0) if both sides are free.
+    """
 
     x_m: float
     y_m: float
@@ -145,11 +158,13 @@ class StandingBody(msgspec.Struct, frozen=True, array_like=True):
 
 
 class EventQuery(msgspec.Struct, frozen=True, kw_only=True):
-    """What the simulator sends at each tick. states: one per event, empty at the first tick.
+    """Message to the director at each tick.
 
-    route_s_m: the robot's arc length on the reference route. robot_length_m, robot_width_m: its
-    outline. nearby: who is near the people that the director moves, see `cosim.people.neighbours`.
-    standing: what stands there.
+    route_s_m: robot's arc length on the reference route.
+    robot_length_m, robot_width_m: its footprint.
+    states: one for each event, empty at the first tick.
+    nearby: people near the directed ones, see `cosim.people.steering`.
+    standing: obstacles near them.
     """
 
     episode: str
@@ -170,9 +185,59 @@ class EventQuery(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class EventReply(msgspec.Struct, frozen=True, kw_only=True):
-    """What the director answers: the new states, one per event, and the pedestrians to show."""
+    """Reply of the director: the new state of each event, and the pedestrians to show."""
 
     episode: str
     tick: int
     states: tuple[EventState, ...]
     actors: tuple[Actor, ...]
+
+
+class SidewalkLayout(NamedTuple):
+    """Space that a sampled event needs along a sidewalk.
+
+    way_m: shortest and longest way.
+    event_m: least and largest distance from the start to the event, beyond the range of its
+        trigger.
+    half_width_m: least half width of the sidewalk.
+    """
+
+    way_m: tuple[float, float]
+    event_m: tuple[float, float]
+    half_width_m: float = 1.3
+
+
+@dataclass(frozen=True, kw_only=True)
+class EventKind:
+    """One kind of event, with its behaviour as pure functions.
+
+    name: name in scenarios, on the command line and in tables.
+    people: fewest and most people.
+    layout: placement in a reactive scenario, and space on a long way; None for a crosswalk.
+    group: samples the number of people from (half_width_m, rng); None for any number.
+    trigger_m: distance before the event along the route at which it begins. A negative one is
+        behind it; None means that the robot is on the crosswalk.
+    begin: returns person `number` of an event before the trigger.
+    step: returns person `number` one tick later, from the trigger on.
+    ends: returns whether the event is over. Then its people walk away and are removed out of sight.
+    pose, age: activity of people who stand during the event, and their age.
+    passed_round: whether the robot must pass round the whole group.
+    ends_at: end of a reactive scenario: the goal, or a stop before the people.
+    """
+
+    name: str
+    people: tuple[int, int] = (1, 1)
+    layout: SidewalkLayout | None
+    group: Callable[[float, np.random.Generator], int] | None = None
+    trigger_m: float | None
+    begin: Callable[[Event, int], Walker]
+    step: Callable[[Event, EventState, int, EventQuery], Walker]
+    ends: Callable[[Event, EventState, EventQuery], bool]
+    pose: Doing = "stand"
+    age: Age = Age.ADULT
+    passed_round: bool = False
+    ends_at: Literal["goal", "stop"] = "goal"
+
+
+EventKinds = Mapping[str, EventKind]
+"""Table of event kinds by name."""

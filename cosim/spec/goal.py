@@ -1,9 +1,8 @@
-"""Goals: where a policy is sent, by a protocol that its manifest names or the run gives (`--goal`).
+"""Goal protocols: the forms in which a policy gets its destination.
 
-`GOALS` has a row for each protocol. Its goals are values of a class below `AnyGoal`, which says how
-such a goal is mirrored, copied, sent to another process and given to a learner. Goals follow from
-the reference route, the robot's pose and a random generator of their own. Nothing here knows of
-people, events or the street.
+The manifest or the run (`--goal`) selects a protocol, a row of `GOALS`. Its goals are instances of
+a subclass of `AnyGoal`, which mirrors, copies and serializes them. Goals depend on the reference
+route, the robot's pose and a random generator, but not on people, events or the street.
 """
 
 from __future__ import annotations
@@ -34,41 +33,48 @@ GoalProtocol = Literal[
     "instruction",
     "route_patch",
 ]
-"""The names of the rows of `GOALS`."""
+"""Names of the rows of `GOALS`."""
 Turn = Literal["left", "straight", "right"]
 Pixels = NDArray[np.uint8]
 TakePicture = Callable[[Pose], Pixels]
-"""(H, W, 3) uint8: what the policy's camera would see at a pose, without people in the street."""
+"""Function that returns the camera's picture at a pose, (H, W, 3) uint8, without people."""
 
 PATCH_PX: Final = 80
 """Rows and columns of a route patch."""
 PATCH_M: Final = 0.5
-"""The side of a pixel of a route patch, in metres. Pixels no farther than this from the route are
-on it."""
+"""Size of a route patch's pixel in metres. Pixels closer than this to the route are on it."""
 _GREY: Final = 128
+"""Grey value of an example picture."""
 _FARTHEST_M: Final = 10_000.0
-"""Bound of a point's coordinates in the space of a learner."""
+"""Largest coordinate of a point in a learner's space, in metres."""
 _MOST_LETTERS: Final = 400
-"""Bound of an instruction's length in the space of a learner."""
+"""Largest length of an instruction in a learner's space, in characters."""
 _NEAREST_M: Final = 5.0
+"""Least distance of a sub-goal or random point, in metres."""
 _FARTHEST_DRAWN_M: Final = 20.0
+"""Largest distance of a sub-goal or random point, in metres."""
 _ASIDE_M: Final = 5.0
+"""Largest lateral offset of a random point, in metres."""
 _REACHED_M: Final = 1.0
+"""Distance at which a random point counts as reached, in metres."""
 _SLACK_M: Final = 1e-6
+"""Tolerance for rounding in metres."""
 _ARM_M: Final = 6.0
-"""A turn is the angle between this much of the route before a place and this much behind it, in
-metres."""
+"""Length of the route before and after a place whose angle is its turn, in metres."""
 _BEND_RAD: Final = math.radians(35.0)
+"""Angle from which a bend is an instruction."""
 _TURN_RAD: Final = math.radians(60.0)
+"""Angle from which an instruction says "turn" instead of "bear"."""
 _ANNOUNCED_M: Final = 20.0
-"""Distance to a turn from which instructions announce it, in metres."""
+"""Distance from which instructions announce a turn, in metres."""
 _DUE_M: Final = 2.5
-"""Distance to a turn from which instructions say that it is due, in metres."""
+"""Distance from which instructions say that a turn is due, in metres."""
 _ANNOUNCEMENT: Final = re.compile(r"(?:In (\d+) m, )?(?:turn|bear) (left|right)", re.IGNORECASE)
+"""Pattern of a turn in an instruction, with its distance if it is not due."""
 
 
 class Bounds(NamedTuple):
-    """The arrays that a learner gets of a type of goal."""
+    """Array space of a type of goal for learners."""
 
     low: float
     high: float
@@ -77,24 +83,26 @@ class Bounds(NamedTuple):
 
 
 class Letters(NamedTuple):
-    """The texts that a learner gets of a type of goal: `most` characters of `charset` at most."""
+    """Text space of a type of goal for learners: at most `most` characters of `charset`."""
 
     most: int
     charset: str
 
 
 class AnyGoal(msgspec.Struct, frozen=True):
-    """A value that a policy gets as its goal. The fields are numbers, texts and arrays."""
+    """Base class of goals. Fields are numbers, texts and arrays."""
 
     @classmethod
     def space(cls, size: tuple[int, int]) -> Bounds | Letters:
-        """Return the values that a learner can get. size: width and height of the policy's
-        pictures."""
+        """Return the space of the goal's plain values.
+
+        size: width and height of the policy's pictures.
+        """
         raise NotImplementedError
 
     @classmethod
     def example(cls, size: tuple[int, int]) -> Self:
-        """Return a goal straight ahead, for trying a policy before a run. size: as in `space`."""
+        """Return a goal straight ahead, for testing a policy. `size` is as in `space`."""
         raise NotImplementedError
 
     def mirrored(self) -> Self:
@@ -102,18 +110,19 @@ class AnyGoal(msgspec.Struct, frozen=True):
         raise NotImplementedError
 
     def probes(self) -> Mapping[str, AnyGoal]:
-        """Return goals of this type that `cosim policy check` asks a policy about, by name.
+        """Return goals of this type for the checks of `cosim policy check`, by name.
 
-        "ahead" is needed. "left", "right" and "zero" are compared with it, and "near" with "left".
+        "ahead" is required. The checks compare it with "left", "right" and "zero", and "left" with
+        "near".
         """
         return {"ahead": self}
 
     def painted(self, paint: Callable[[Pixels], Pixels]) -> Self:
-        """Return the goal with its picture changed, where it is a picture."""
+        """Return the goal with its picture edited, if it is a picture."""
         return self
 
     def copied(self) -> Self:
-        """Return the same goal with arrays of its own."""
+        """Return the goal with arrays of its own."""
         return type(self)(
             *(
                 one.copy() if isinstance(one, np.ndarray) else one
@@ -122,25 +131,28 @@ class AnyGoal(msgspec.Struct, frozen=True):
         )
 
     def plain(self) -> NDArray[Any] | str:
-        """Return the goal as a learner gets it: an array or a text."""
+        """Return the goal as an array or a text for learners."""
         return np.asarray(self)
 
     def encoded(self) -> dict[str, Any]:
-        """Return the type's name as "type", and the fields: plain values and arrays."""
+        """Serialize the goal: its type as "type", and its fields as values and arrays."""
         return {"type": self.__struct_config__.tag, **msgspec.structs.asdict(self)}
 
 
 class TurningGoal(AnyGoal, frozen=True):
-    """A goal that says which way to turn."""
+    """Goal that implies a turn."""
 
     def turn(self, ahead_m: float, beyond_deg: float) -> Turn:
-        """Return the side. ahead_m: how near a turn must be; beyond_deg: how far aside the goal
-        must lie."""
+        """Return the side to turn to.
+
+        ahead_m: maximum distance of a turn in metres.
+        beyond_deg: minimum bearing of the goal in degrees.
+        """
         raise NotImplementedError
 
 
 class PointGoal(TurningGoal, frozen=True, tag="point"):
-    """A point in the robot's frame, in metres: x ahead, y to the left.
+    """Point in the robot's frame in metres: x ahead, y to the left.
 
     >>> goal = PointGoal(3.0, 4.0)
     >>> goal.distance_m, np.asarray(goal)
@@ -156,11 +168,11 @@ class PointGoal(TurningGoal, frozen=True, tag="point"):
 
     @property
     def bearing_rad(self) -> float:
-        """Where it lies, counter-clockwise from ahead, in (-pi, pi]."""
+        """Bearing, counter-clockwise from ahead, in (-pi, pi]."""
         return math.atan2(self.y_m, self.x_m)
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        """(2,) float64 metres: x ahead, y to the left."""
+        """Return (2,) float64 metres: x ahead, y to the left."""
         return np.array((self.x_m, self.y_m), dtype)
 
     @classmethod
@@ -189,7 +201,7 @@ class PointGoal(TurningGoal, frozen=True, tag="point"):
 
 
 class ImageGoal(AnyGoal, frozen=True, tag="image"):
-    """A picture of where to go: (H, W, 3) uint8, as large as the camera's.
+    """Picture at the destination: (H, W, 3) uint8, of the camera's size.
 
     >>> ImageGoal(np.zeros((96, 96, 3), np.uint8)).rgb.shape
     (96, 96, 3)
@@ -198,7 +210,7 @@ class ImageGoal(AnyGoal, frozen=True, tag="image"):
     rgb: Pixels
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        """(H, W, 3) uint8."""
+        """Return the picture, (H, W, 3) uint8."""
         return np.array(self.rgb, dtype, copy=copy)
 
     @classmethod
@@ -213,7 +225,7 @@ class ImageGoal(AnyGoal, frozen=True, tag="image"):
         return ImageGoal(flipped(self.rgb))
 
     def probes(self) -> Mapping[str, ImageGoal]:
-        # Left is ahead in a mirror. There is no right: the side of a picture is not known.
+        # The mirrored picture serves as "left"; its true side is unknown.
         return {"ahead": self, "left": self.mirrored(), "zero": ImageGoal(np.zeros_like(self.rgb))}
 
     def painted(self, paint: Callable[[Pixels], Pixels]) -> ImageGoal:
@@ -221,7 +233,7 @@ class ImageGoal(AnyGoal, frozen=True, tag="image"):
 
 
 class Instruction(TurningGoal, frozen=True, tag="instruction"):
-    """What to do, in words.
+    """Instruction as a text.
 
     >>> Instruction("Follow the sidewalk. In 10 m, turn left.").text
     'Follow the sidewalk. In 10 m, turn left.'
@@ -230,7 +242,7 @@ class Instruction(TurningGoal, frozen=True, tag="instruction"):
     text: str
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        """Raises TypeError: it is a text."""
+        """Raise TypeError: an instruction is a text."""
         raise TypeError(
             "an instruction is a text and no array: read observation.goal.text, or ask for "
             "another goal"
@@ -268,10 +280,11 @@ class Instruction(TurningGoal, frozen=True, tag="instruction"):
 
 
 class RoutePatch(AnyGoal, frozen=True, tag="route_patch"):
-    """The reference route around the robot: (80, 80) uint8, 255 on the route and 0 elsewhere, 0.5 m
-    a pixel.
+    """Raster of the reference route around the robot: (80, 80) uint8, 255 on the route, 0
+    elsewhere.
 
-    The robot is in the middle; the first row lies 20 m ahead, the first column 20 m to the left.
+    A pixel is 0.5 m wide. The robot is in the middle; the first row is 20 m ahead, the first column
+    20 m to the left.
 
     >>> RoutePatch(np.zeros((80, 80), np.uint8)).pixels.max()
     np.uint8(0)
@@ -280,7 +293,7 @@ class RoutePatch(AnyGoal, frozen=True, tag="route_patch"):
     pixels: Pixels
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        """(80, 80) uint8."""
+        """Return the raster, (80, 80) uint8."""
         return np.array(self.pixels, dtype, copy=copy)
 
     @classmethod
@@ -295,7 +308,7 @@ class RoutePatch(AnyGoal, frozen=True, tag="route_patch"):
         return RoutePatch(flipped(self.pixels))
 
     def probes(self) -> Mapping[str, RoutePatch]:
-        # Routes that turn off 6 m ahead.
+        # Routes that turn 6 m ahead.
         ends = {"ahead": (20.0, 0.0), "left": (6.0, 20.0), "right": (6.0, -20.0)}
         routes = {name: np.array([(-20.0, 0.0), (6.0, 0.0), end]) for name, end in ends.items()}
         turns = {
@@ -306,24 +319,25 @@ class RoutePatch(AnyGoal, frozen=True, tag="route_patch"):
 
 
 Goal = PointGoal | ImageGoal | Instruction | RoutePatch
+"""Any goal of a policy."""
 
 
 class Goals(Protocol):
-    """The goals of an episode."""
+    """Goals of an episode."""
 
     def at(self, pose: Pose, route_s_m: float) -> Goal | None:
-        """Return the goal for a robot at this pose, this far along the route."""
+        """Return the goal of a robot at this pose and arc length of the route."""
 
     def put_back(self) -> None:
-        """Forget what no longer holds: the robot was put elsewhere."""
+        """Discard state that is invalid after the robot was reset to another pose."""
 
 
 class GoalSource(NamedTuple):
-    """What the goals of an episode are made of.
+    """Inputs for the goals of an episode.
 
-    draws: the generator of all that is random.
+    draws: generator of all random draws.
     size: width and height of the policy's pictures, 0 without a camera.
-    look: takes a picture at a pose, for goals that are what the camera would see.
+    look: takes the camera's picture at a pose, for goals that are pictures.
     """
 
     scenario: Scenario
@@ -336,10 +350,10 @@ class GoalKind(NamedTuple):
     """A goal protocol.
 
     summary: one line for `cosim list` and the documentation.
-    type: the class of its goals; None for no goals.
-    draw: makes the goals of an episode.
-    of_camera: whether the goals are pictures by the policy's camera, so that it needs one.
-    noise: whether the goals say nothing of where to go.
+    type: class of its goals; None for no goals.
+    draw: returns the goals of an episode.
+    of_camera: whether the goals are camera pictures, so that the policy needs a camera.
+    noise: whether the goals carry no information.
     in_data_sets: whether a data set has a column for the goals (`cosim collect`).
     """
 
@@ -353,16 +367,17 @@ class GoalKind(NamedTuple):
 
 
 def seen_from(pose: Pose, point: Pose) -> PointGoal:
-    """A place in the frame of a robot at a pose."""
+    """Return a point in the frame of a robot at a pose."""
     dx, dy = point.x_m - pose.x_m, point.y_m - pose.y_m
     cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
     return PointGoal(cos * dx + sin * dy, -sin * dx + cos * dy)
 
 
 class SubGoals:
-    """Which place of the route is the next sub-goal: one 20 m along it, kept until no more than 5 m
-    are left to it, or the robot was put back too far from it; the end of the route from 20 m before
-    it.
+    """Selects the next sub-goal on the route, by arc length.
+
+    It is 20 m ahead and stays until 5 m are left, or until a reset puts the robot too far from it.
+    In the last 20 m it is the end of the route.
 
     >>> subgoals = SubGoals(100.0)
     >>> [subgoals.after(s_m) for s_m in (0.0, 14.0, 16.0, 85.0)]
@@ -374,14 +389,14 @@ class SubGoals:
         self._s_m = math.nan
 
     def after(self, route_s_m: float) -> float:
-        """Its arc length, for a robot this far along the route."""
+        """Return the sub-goal's arc length for a robot at this arc length."""
         if not _NEAREST_M - _SLACK_M <= self._s_m - route_s_m <= _FARTHEST_DRAWN_M + _SLACK_M:
             self._s_m = min(route_s_m + _FARTHEST_DRAWN_M, self._length_m)
         return self._s_m
 
 
-class _Plain:
-    """Goals that are a function of where the robot is."""
+class _PositionGoals:
+    """Goals that depend only on the robot's position."""
 
     def __init__(self, goal: Callable[[Pose, float], Goal | None]) -> None:
         self._goal = goal
@@ -394,8 +409,7 @@ class _Plain:
 
 
 class _RandomPoints:
-    """Points of the paper: drawn in the robot's frame, then fixed in the street until reached, or
-    no longer ahead."""
+    """Random points in the robot's frame, fixed in the street until reached or no longer ahead."""
 
     def __init__(self, draws: np.random.Generator) -> None:
         self._draws = draws
@@ -418,8 +432,8 @@ class _RandomPoints:
         self._point = None
 
 
-class _Images:
-    """Pictures at the sub-goals, taken when they become the next ones, looking along the route."""
+class _ImageGoals:
+    """Pictures at the sub-goals along the route, taken when a sub-goal is selected."""
 
     def __init__(self, route: Polyline, look: TakePicture) -> None:
         self._route = route
@@ -435,11 +449,11 @@ class _Images:
         return self._goal
 
     def put_back(self) -> None:
-        """The next sub-goal is looked for anew in any case."""
+        """Nothing to discard: the sub-goals detect a reset themselves."""
 
 
 class Manoeuvre(NamedTuple):
-    """Something to be told: from where to where on the route it is done."""
+    """Part of the route with an instruction, as an interval of arc length."""
 
     s_m: float
     until_s_m: float
@@ -447,8 +461,9 @@ class Manoeuvre(NamedTuple):
 
 
 def manoeuvres(route: Polyline, crossings: Sequence[RouteCrossing] = ()) -> tuple[Manoeuvre, ...]:
-    """Turns and crosswalks of a route, in their order. A bend of less than 35 degrees within 12 m
-    is none.
+    """Return the turns and crosswalks of a route in order.
+
+    Bends of less than 35 degrees within 12 m are ignored.
 
     >>> [(one.s_m, one.words) for one in manoeuvres(Polyline([(0, 0), (20, 0), (20, 20)]))]
     [(20.0, 'turn left')]
@@ -471,38 +486,40 @@ def manoeuvres(route: Polyline, crossings: Sequence[RouteCrossing] = ()) -> tupl
 
 
 def _turn_at(route: Polyline, s_m: float) -> float:
-    """How far the route turns around a place, to the left, in radians."""
+    """Return the angle of the route around a place, left positive, in radians."""
     before, here, behind = (route.at(s).xy for s in (s_m - _ARM_M, s_m, s_m + _ARM_M))
     (ax, ay) = (here - before).tolist()
     (bx, by) = (behind - here).tolist()
     return wrap_angle(math.atan2(by, bx) - math.atan2(ay, ax))
 
 
-def told_at(route_s_m: float, ways: Sequence[Manoeuvre]) -> str:
-    """The instruction at a place of a route: what is due there, and what comes next within 20 m, to
-    5 m.
+def told_at(route_s_m: float, steps: Sequence[Manoeuvre]) -> str:
+    """Return the instruction at an arc length: due manoeuvres, then the next one within 20 m.
+
+    Distances are rounded to 5 m.
 
     >>> ways = manoeuvres(Polyline([(0, 0), (40, 0), (40, 20)]))
     >>> told_at(29.0, ways), told_at(39.0, ways)
     ('Follow the sidewalk. In 10 m, turn left.', 'Turn left.')
     """
-    due = [one.words for one in ways if one.s_m - _DUE_M <= route_s_m < one.until_s_m]
-    told = [f"{words.capitalize()}." for words in due] or ["Follow the sidewalk."]
-    coming = [one for one in ways if _DUE_M < one.s_m - route_s_m <= _ANNOUNCED_M]
+    due = [one.words for one in steps if one.s_m - _DUE_M <= route_s_m < one.until_s_m]
+    sentences = [f"{words.capitalize()}." for words in due] or ["Follow the sidewalk."]
+    coming = [one for one in steps if _DUE_M < one.s_m - route_s_m <= _ANNOUNCED_M]
     if coming:
         far_m = max(5 * round((coming[0].s_m - route_s_m) / 5.0), 5)
-        told.append(f"In {far_m} m, {coming[0].words}.")
-    return " ".join(told)
+        sentences.append(f"In {far_m} m, {coming[0].words}.")
+    return " ".join(sentences)
 
 
 def patch_around(pose: Pose, route: Floats) -> NDArray[np.uint8]:
-    """(80, 80) uint8, as `RoutePatch` has it. route: (N, 2), its points."""
+    """Return a raster as in `RoutePatch`, (80, 80) uint8.
+
+    route: (N, 2) points in metres.
+    """
     cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
     offset = route - pose.xy
     ahead_left = offset @ np.array([[cos, -sin], [sin, cos]])
-    at = (
-        0.5 * (PATCH_PX - 1) - ahead_left / PATCH_M
-    )  # rows and columns, whole numbers in the middle of pixels
+    at = 0.5 * (PATCH_PX - 1) - ahead_left / PATCH_M  # row and column, integers at pixel centres
     low = np.maximum(np.ceil(np.minimum(at[:-1], at[1:]) - 1.0), 0.0).astype(int)
     high = np.minimum(np.floor(np.maximum(at[:-1], at[1:]) + 1.0) + 1.0, PATCH_PX).astype(int)
     pixels = np.zeros((PATCH_PX, PATCH_PX), np.uint8)
@@ -520,32 +537,32 @@ def patch_around(pose: Pose, route: Floats) -> NDArray[np.uint8]:
 def _route_points(source: GoalSource) -> Goals:
     route = source.scenario.route_line
     subgoals = SubGoals(route.length_m)
-    return _Plain(lambda pose, s_m: seen_from(pose, route.at(subgoals.after(s_m))))
+    return _PositionGoals(lambda pose, s_m: seen_from(pose, route.at(subgoals.after(s_m))))
 
 
 def _final_points(source: GoalSource) -> Goals:
     end = Pose(*source.scenario.goal, 0.0)
-    return _Plain(lambda pose, s_m: seen_from(pose, end))
+    return _PositionGoals(lambda pose, s_m: seen_from(pose, end))
 
 
 def _images(source: GoalSource) -> Goals:
     assert source.look is not None, "image goals need a camera"
-    return _Images(source.scenario.route_line, source.look)
+    return _ImageGoals(source.scenario.route_line, source.look)
 
 
 def _random_images(source: GoalSource) -> Goals:
     noise = ImageGoal(source.draws.integers(0, 256, (source.size[1], source.size[0], 3), np.uint8))
-    return _Plain(lambda pose, s_m: noise)
+    return _PositionGoals(lambda pose, s_m: noise)
 
 
 def _instructions(source: GoalSource) -> Goals:
-    ways = manoeuvres(source.scenario.route_line, source.scenario.crossings)
-    return _Plain(lambda pose, s_m: Instruction(told_at(s_m, ways)))
+    steps = manoeuvres(source.scenario.route_line, source.scenario.crossings)
+    return _PositionGoals(lambda pose, s_m: Instruction(told_at(s_m, steps)))
 
 
 def _route_patches(source: GoalSource) -> Goals:
     points = source.scenario.route_line.points
-    return _Plain(lambda pose, s_m: RoutePatch(patch_around(pose, points)))
+    return _PositionGoals(lambda pose, s_m: RoutePatch(patch_around(pose, points)))
 
 
 _ROWS: Final = (
@@ -553,7 +570,7 @@ _ROWS: Final = (
         "none",
         "no goal",
         None,
-        lambda source: _Plain(lambda pose, s_m: None),
+        lambda source: _PositionGoals(lambda pose, s_m: None),
         noise=True,
         in_data_sets=True,
     ),
@@ -606,17 +623,19 @@ _ROWS: Final = (
         _route_patches,
     ),
 )
+"""Rows of `GOALS`."""
 GOALS: Final[Mapping[GoalProtocol, GoalKind]] = MappingProxyType(
     {kind.name: kind for kind in _ROWS}
 )
-"""The goal protocols by name. Points, and what is around the robot, are in the robot's frame."""
+"""Goal protocols by name. Points and rasters are in the robot's frame."""
 _TYPES: Final = {
     kind.type.__struct_config__.tag: kind.type for kind in _ROWS if kind.type is not None
 }
+"""Class of goals by its name in messages."""
 
 
 def goal_called(name: str) -> GoalProtocol:
-    """Return the protocol of that name. Raises UsageError with the valid names."""
+    """Return the protocol with a name. Raises UsageError with the valid names."""
     if name not in GOALS:
         raise unknown("goal protocol", name, GOALS)
     return cast(GoalProtocol, name)
@@ -629,19 +648,18 @@ def goals_for(
     size: tuple[int, int] = (0, 0),
     look: TakePicture | None = None,
 ) -> Goals:
-    """Return the goals of a scenario by a protocol. The arguments are those of `GoalSource`."""
+    """Return the goals of a scenario. The arguments are those of `GoalSource`."""
     return GOALS[protocol].draw(GoalSource(scenario, draws, size, look))
 
 
 def decoded_goal(fields: Mapping[str, Any]) -> Goal:
-    """Return the goal of what `AnyGoal.encoded` gave. Raises KeyError or TypeError for anything
-    else."""
+    """Deserialize a goal from the output of `AnyGoal.encoded`. Raises KeyError or TypeError."""
     values = dict(fields)
     return _TYPES[values.pop("type")](**values)
 
 
 def protocols_of(*types: type[AnyGoal]) -> tuple[GoalProtocol, ...]:
-    """Return the protocols whose goals are of one of these types.
+    """Return the protocols whose goals have one of these types.
 
     >>> protocols_of(PointGoal)
     ('route_point', 'final_point', 'random_point')
@@ -652,8 +670,10 @@ def protocols_of(*types: type[AnyGoal]) -> tuple[GoalProtocol, ...]:
 
 
 def most_goal_bytes(size: tuple[int, int]) -> int:
-    """Return the bytes of the largest array of a goal. size: width and height of the policy's
-    pictures."""
+    """Return the size of the largest goal array in bytes.
+
+    size: width and height of the policy's pictures.
+    """
     spaces = [kind.type.space(size) for kind in _ROWS if kind.type is not None]
     return max(
         math.prod(one.shape) * np.dtype(one.dtype).itemsize

@@ -1,8 +1,7 @@
-"""Injected pedestrians: what an outside client may send into a running episode, and the answer.
+"""Injected pedestrians: requests of an outside client into a running episode, and acknowledgements.
 
-An injection is applied at the boundary of a step, in the order of arrival. Tick and place are in
-the acknowledgement and in the episode's record, points from the robot as points on the map, so that
-the record alone replays the episode.
+An injection is applied between two steps, in the order of arrival. Acknowledgement and record
+contain its tick and its path on the map, so the record alone replays the episode.
 """
 
 from __future__ import annotations
@@ -18,25 +17,28 @@ from cosim.core.state import Doing
 from cosim.spec.connection import Connection
 
 _FASTEST_MPS = 3.0
+"""Maximum speed of an injected pedestrian in m/s."""
 LONGEST_S = 3600.0
+"""Maximum stay at the end of the path in seconds."""
 _FARTHEST_M: Final = 1000.0
+"""Maximum coordinate of a point relative to the robot, in metres."""
 
 POINT_FORMS: Final = (
     'a point is [x, y] on the map or {"ahead": 15, "left": 1} from the robot, in metres'
 )
-"""The valid forms of a point of a path, in words."""
+"""Valid forms of a point of a path, for messages."""
 
 Name = Annotated[str, msgspec.Meta(pattern="^[A-Za-z0-9_-]{1,32}$")]
+"""Name of an injected pedestrian."""
 
 
 _FromRobot = Annotated[float, msgspec.Meta(ge=-_FARTHEST_M, le=_FARTHEST_M)]
 
 
 class RelativePoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A point from the robot, in metres: straight ahead of its middle and to its left; behind and
-    right are negative.
+    """Point relative to the robot in metres: ahead of its middle and to the left.
 
-    The robot's pose is that at the start of the tick at which the pedestrian enters.
+    The robot's pose is the one at the start of the tick at which the pedestrian appears.
     """
 
     ahead: _FromRobot
@@ -44,7 +46,7 @@ class RelativePoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @classmethod
     def of(cls, x_m: float, y_m: float, robot: Pose) -> RelativePoint:
-        """The point of the map at (x_m, y_m), from a robot at this pose, to 0.1 m."""
+        """Return the point (x_m, y_m) of the map relative to a robot, rounded to 0.1 m."""
         dx_m, dy_m = x_m - robot.x_m, y_m - robot.y_m
         cos, sin = math.cos(robot.heading_rad), math.sin(robot.heading_rad)
         ahead, left = (
@@ -53,7 +55,7 @@ class RelativePoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return cls(ahead, left)
 
     def on_map(self, robot: Pose) -> tuple[float, float]:
-        """The same point as x and y on the map, in metres, for a robot at this pose."""
+        """Return the point's x and y on the map in metres, for a robot at this pose."""
         cos, sin = math.cos(robot.heading_rad), math.sin(robot.heading_rad)
         return (
             robot.x_m + self.ahead * cos - self.left * sin,
@@ -62,12 +64,12 @@ class RelativePoint(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class InjectionRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A pedestrian as a client asks for it. It appears at the first point of `path`, walks along
-    it, stays, and leaves.
+    """Request for a pedestrian that walks along a path, stays at its end, and leaves.
 
-    path: points on the map (x, y in metres) or from the robot. heading_rad: which way it faces at
-    the end, on the map; by default the way it came. doing: what it shows while it stands there.
-    stay_s: how long it stays at the end.
+    path: points on the map (x, y in metres) or relative to the robot; it appears at the first one.
+    heading_rad: heading at the end, on the map; by default that of the path.
+    doing: activity at the end.
+    stay_s: duration of the stay in seconds. Raises SpecError.
     """
 
     id: Name
@@ -98,11 +100,11 @@ class InjectionRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
     @property
     def depends_on_robot(self) -> bool:
-        """Whether a point of the path is given from the robot."""
+        """Whether the path has a point relative to the robot."""
         return any(isinstance(point, RelativePoint) for point in self.path)
 
     def resolved(self, robot: Pose) -> Injection:
-        """The injection on the map, for a robot at this pose."""
+        """Return the injection with points on the map, for a robot at this pose."""
         points = tuple(
             point.on_map(robot) if isinstance(point, RelativePoint) else point
             for point in self.path
@@ -111,21 +113,28 @@ class InjectionRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
 
 
 class Injection(InjectionRequest, frozen=True, kw_only=True):
-    """A pedestrian whose path is on the map: x and y of each point in metres."""
+    """Pedestrian with a path on the map: x and y of each point in metres."""
 
     path: Annotated[tuple[tuple[float, float], ...], msgspec.Meta(min_length=1, max_length=200)]
 
 
 class Injected(msgspec.Struct, frozen=True, kw_only=True):
-    """An injection and the tick from which it takes effect: an entry of the episode's log."""
+    """Injection in the episode's log.
+
+    tick: tick at which it takes effect.
+    """
 
     tick: int
     injection: Injection
 
 
 class Ack(msgspec.Struct, frozen=True, kw_only=True):
-    """The answer to an injection. tick, time_s: when it takes effect; x_m, y_m: where; reason: why
-    it was refused."""
+    """Reply to an injection.
+
+    tick, time_s: when it takes effect.
+    x_m, y_m: where the pedestrian appears.
+    reason: why it was refused.
+    """
 
     id: str
     status: Literal["accepted", "refused"]
@@ -137,7 +146,11 @@ class Ack(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Live(msgspec.Struct, frozen=True, kw_only=True):
-    """Where a run is on the air. connection: to its hub; run: its name in the keys."""
+    """Address of a live run.
+
+    connection: connection to its hub.
+    run: name of the run in keys.
+    """
 
     connection: Connection
     run: str

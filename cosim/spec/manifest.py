@@ -1,4 +1,4 @@
-"""Manifest: what a policy declares about itself."""
+"""Manifest: a policy's declaration of its inputs and outputs."""
 
 from __future__ import annotations
 
@@ -14,18 +14,22 @@ from cosim.spec.goal import GoalProtocol
 from cosim.spec.odometry import OdometryKind
 
 HowFollowed = Literal["shipped", "atan2"]
+"""Names of the rules that turn a waypoint into a command."""
 
 
 @dataclass(frozen=True, slots=True)
 class WaypointRule:
-    """How a policy's waypoints become a command. The defaults are how GNM, ViNT and NoMaD drive
-    their robots.
+    """Rule that turns a policy's waypoints into a command. The defaults are those of GNM, ViNT and
+    NoMaD.
 
-    index: which waypoint is followed, from 0: the third of an answer. unit_m: metres in one unit of
-    x and y. dt_s: the time in which it is to be reached. rule: "shipped", v = x / dt and w =
-    arctan(y / x) / dt, so that a waypoint behind the robot turns it by less than a quarter; or
-    "atan2", w = atan2(y, x) / dt, which turns it round. Both take a waypoint at the robot's own
-    place by its heading, if it has one (`cosim.episode.control`). Raises SpecError.
+    index: number of the waypoint to follow, from 0.
+    unit_m: metres per unit of x and y.
+    dt_s: time to reach the waypoint.
+    rule: "shipped" (v = x / dt, w = arctan(y / x) / dt) or "atan2" (w = atan2(y, x) / dt). They
+        differ for waypoints behind the robot: "shipped" turns by less than a quarter turn.
+
+    Both rules use the heading of a waypoint at the robot's own position, if it has one
+    (`cosim.episode.control`). Raises SpecError.
 
     >>> WaypointRule(index=0, dt_s=0.2).in_words
     'waypoint 0, units of 1 m, in 0.2 s, shipped'
@@ -51,21 +55,25 @@ class WaypointRule:
 
     @property
     def in_words(self) -> str:
-        """As tables tell it."""
+        """Description for tables."""
         return f"waypoint {self.index}, units of {self.unit_m:g} m, in {self.dt_s:g} s, {self.rule}"
 
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """What a policy says of itself. rate_hz: how often it acts; waypoints: how those that it
-    answers are followed.
+    """Declaration of a policy.
 
-    camera: what it sees by, None for a blind one; cameras: further ones, by names of its own; goal:
-    what it is told of where to go (`cosim.spec.goal.GOALS`), unless the run says otherwise;
-    odometry: what its sensors tell of where it is (`cosim.spec.odometry.ODOMETRY`); privileged:
-    whether it is told what a camera does not show; goals: those that it can do with, () for any: a
-    run that gives others is refused. Raises nothing itself: an episode refuses what cannot be, such
-    as a rate of which a period is no whole number of ticks.
+    rate_hz: rate at which it acts.
+    camera: its camera, None for a policy without one.
+    privileged: whether it gets simulator state (`cosim.episode.interfaces.Privileged`).
+    waypoints: rule for its waypoints.
+    goal: default goal protocol (`cosim.spec.goal.GOALS`); a run may override it.
+    odometry: kind of odometry (`cosim.spec.odometry.ODOMETRY`).
+    cameras: further cameras by name.
+    goals: supported goal protocols, () for any; a run with another one is refused.
+
+    The manifest itself raises nothing. An episode refuses invalid values, such as a period that is
+    not a whole number of ticks.
 
     >>> Manifest("mine", rate_hz=5.0, camera=CameraSpec(width=512, height=288)).camera.height
     288

@@ -1,5 +1,4 @@
-"""Obstacle: a thing that stands on the walkable ground of one scenario, and the ground that it
-covers."""
+"""Obstacles on the walkable ground of a scenario, and their footprints."""
 
 from __future__ import annotations
 
@@ -13,11 +12,11 @@ from shapely.geometry import Polygon
 from cosim.spec.validation import HEADING_RAD, WHERE_M, Ranged, Within, shown
 
 ObstacleKind = Literal["bin", "bike", "sign", "planter", "box", "fence", "scooter", "cafe"]
-"""Bin on wheels, parked bike, sandwich board, planter, parcels, construction fence, parked scooter,
-cafe table with its chairs."""
+"""Kinds of obstacles. "sign" is a sandwich board, "box" a stack of parcels, "fence" a construction
+fence, "cafe" a table with chairs."""
 
 _Size = tuple[float, float, float]
-"""Length along the heading, depth across it, height, in metres."""
+"""Length along the heading, depth across it, and height, in metres."""
 
 OBSTACLE_SIZES_M: Final[Mapping[ObstacleKind, tuple[_Size, _Size]]] = {
     "bin": ((0.48, 0.55, 0.95), (0.60, 0.74, 1.10)),
@@ -29,17 +28,19 @@ OBSTACLE_SIZES_M: Final[Mapping[ObstacleKind, tuple[_Size, _Size]]] = {
     "scooter": ((1.10, 0.45, 1.15), (1.20, 0.50, 1.20)),
     "cafe": ((1.75, 0.60, 0.85), (1.95, 0.75, 0.85)),
 }
-"""The smallest and the largest of each kind."""
+"""Smallest and largest size of each kind."""
 
 OBSTACLE_VARIANTS: Final = 3
-"""Sizes of each kind, evenly from the smallest to the largest."""
+"""Number of sizes of each kind, evenly from the smallest to the largest."""
 OBSTACLE_FORMS: Final = 4 * OBSTACLE_VARIANTS
-"""Sizes times paints."""
+"""Number of combinations of size and paint."""
 
 
 class Obstacle(Ranged, frozen=True, kw_only=True):
-    """A thing on the way. heading_rad: of its length. form: its size, and its paint for each of
-    them.
+    """Obstacle on the way.
+
+    heading_rad: direction of its length.
+    form: number of its size and paint, below `OBSTACLE_FORMS`.
 
     >>> Obstacle(kind="bin", x_m=3.0, y_m=4.0, heading_rad=0.0, form=2).size_m
     (0.6, 0.74, 1.1)
@@ -57,7 +58,7 @@ class Obstacle(Ranged, frozen=True, kw_only=True):
 
     @property
     def variant(self) -> int:
-        """Which of its kind's sizes it has, the smallest first."""
+        """Number of its size, from the smallest."""
         return self.form % OBSTACLE_VARIANTS
 
     @property
@@ -70,7 +71,7 @@ class Obstacle(Ranged, frozen=True, kw_only=True):
 
 
 def obstacle_size_m(kind: ObstacleKind, variant: int) -> _Size:
-    """The size of an obstacle of a kind."""
+    """Return the size of a variant of a kind."""
     low, high = OBSTACLE_SIZES_M[kind]
     share = variant / (OBSTACLE_VARIANTS - 1)
     length, depth, height = (round(a + (b - a) * share, 6) for a, b in zip(low, high, strict=True))
@@ -78,7 +79,7 @@ def obstacle_size_m(kind: ObstacleKind, variant: int) -> _Size:
 
 
 def footprint(obstacle: Obstacle, margin_m: float = 0.0) -> Polygon:
-    """The rectangle of ground that an obstacle covers, grown by a margin."""
+    """Return the rectangle of ground that an obstacle covers, grown by a margin."""
     length, depth, _ = obstacle.size_m
     cos, sin = math.cos(obstacle.heading_rad), math.sin(obstacle.heading_rad)
     ahead, aside = 0.5 * length + margin_m, 0.5 * depth + margin_m

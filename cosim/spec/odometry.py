@@ -1,4 +1,4 @@
-"""Odometry: what a robot's sensors say of where it has gone, and how wrong they are."""
+"""Odometry: the robot's own estimate of its pose, and its errors."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 OdometryKind = Literal["none", "exact", "wheel", "gps"]
+"""Names of the rows of `ODOMETRY`."""
 
 ODOMETRY: Final[Mapping[str, str]] = MappingProxyType(
     {
@@ -20,7 +21,8 @@ ODOMETRY: Final[Mapping[str, str]] = MappingProxyType(
         "gps": "a position with noise and a slow bias, without a heading",
     }
 )
-"""What a policy gets by each kind, all in the frame of the start of the episode."""
+"""Kinds of odometry and their descriptions. All estimates are in the frame of the episode's start.
+"""
 
 
 class Odometry(msgspec.Struct, frozen=True):
@@ -38,15 +40,20 @@ class Odometry(msgspec.Struct, frozen=True):
     heading_rad: float | None
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
-        """(3,) float64: x, y in metres, heading in radians; (2,) without a heading."""
+        """Return (3,) float64: x, y in metres, heading in radians; (2,) without a heading."""
         known = (self.x_m, self.y_m, self.heading_rad)[: 2 if self.heading_rad is None else 3]
         return np.array(known, dtype)
 
 
 class WheelNoise(NamedTuple):
-    """Standard deviations. For a whole episode: scale, of the distance; turn_scale, of turns;
-    drift_radpm, of a turn with every metre. For each metre, growing with its square root: along_m,
-    heading_rad."""
+    """Standard deviations of wheel odometry.
+
+    scale: relative error of the distance, constant in an episode.
+    turn_scale: relative error of turns, constant in an episode.
+    drift_radpm: turn per metre, constant in an episode.
+    along_m: error of the distance after one metre, growing with the square root.
+    heading_rad: error of the heading after one metre, growing with the square root.
+    """
 
     scale: float = 0.02
     turn_scale: float = 0.03
@@ -56,8 +63,12 @@ class WheelNoise(NamedTuple):
 
 
 class GpsNoise(NamedTuple):
-    """Standard deviations in metres, of x and of y: noise_m of each fix; bias_m of what lasts for
-    about bias_s seconds (a Gauss-Markov process)."""
+    """Standard deviations of GPS positions in x and in y.
+
+    noise_m: independent error of each fix.
+    bias_m: slow error, a Gauss-Markov process.
+    bias_s: its time constant in seconds.
+    """
 
     noise_m: float = 0.5
     bias_m: float = 1.5

@@ -1,5 +1,4 @@
-"""How an episode is run, beyond what its scenario says: one value from the command line to the
-worker."""
+"""Options of an episode that are not part of its scenario, from the command line to the worker."""
 
 from __future__ import annotations
 
@@ -16,12 +15,44 @@ from cosim.spec.goal import GoalProtocol, goal_called
 from cosim.spec.injection import Injected, Live
 from cosim.spec.run_config import MOST_LATENCY_MS, CameraChoice, RunConfig
 
+PolicyRuns = Literal["in-process", "isolated", "remote", "remote, jpeg"]
+"""Process that runs a policy: the simulator's, an isolated one on the same machine, or a server
+over Zenoh. "remote, jpeg" means that its pictures may have been sent as JPEG."""
+
+
+class PolicyHost(msgspec.Struct, frozen=True, kw_only=True):
+    """Location of a run's policy.
+
+    isolated: run it in a process of its own.
+    servers: connections to the servers of a remote policy.
+    run: name of the run, part of each query's key so that runs are not confused.
+
+    >>> PolicyHost(isolated=True).servers
+    ()
+    """
+
+    isolated: bool = False
+    servers: tuple[Connection, ...] = ()
+    run: str = ""
+
+    def seen_by(self, worker: Connection) -> PolicyHost:
+        """Return the host as a worker with this connection to the run reaches it."""
+        return msgspec.structs.replace(
+            self, servers=tuple(one.seen_by(worker) for one in self.servers)
+        )
+
+
 CameraName = Literal["gl", "bullet", "bullet-egl"]
+"""Renderers of a policy's pictures."""
 
 
 class Outside(msgspec.Struct, frozen=True, kw_only=True):
-    """A director in a process of its own. connection: to it; run: the run's name in the keys;
-    wait_s: how long an episode waits for it before it is recorded as crashed."""
+    """Address of a director in another process.
+
+    connection: connection to it.
+    run: name of the run in keys.
+    wait_s: timeout of its replies; then the episode is recorded as crashed.
+    """
 
     connection: Connection
     run: str
@@ -29,9 +60,12 @@ class Outside(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RendererAt(msgspec.Struct, frozen=True, kw_only=True):
-    """The shared renderer of a run. address: where it listens; asks: whether the policy is there
-    and asked there, for all episodes together (`act_batch`). number: for the renderer, which of the
-    run it is, from 1."""
+    """Address of a run's shared renderer.
+
+    address: socket on which it listens.
+    asks: whether it hosts the policy and queries it in batches (`act_batch`).
+    number: number of the renderer in the run, from 1; only the renderer uses it.
+    """
 
     address: str
     asks: bool
@@ -39,30 +73,33 @@ class RendererAt(msgspec.Struct, frozen=True, kw_only=True):
 
 
 LEAST_PACE = 0.1
+"""Minimum pace in multiples of real time. A slower one would look like a hanging engine."""
 MOST_PACE = 100.0
-"""Times real time: the range of a pace. Slower ones would look like an engine that hangs."""
+"""Maximum pace in multiples of real time."""
 
 
 class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """How an episode is run. But for robot, latency and the noise of collecting, options change
-    what is seen and kept, never what happens in the street.
+    """Options of an episode. Only robot, latency and collecting noise affect what happens in the
+    street.
 
-    seed: of the run: what a policy is told in place of the scenario's name and seed is drawn from
-    it (`cosim.spec.episode_id`), and the order of a run's episodes. None: a run draws one, an
-    Episode by itself takes 0. robot: which drives (`cosim.spec.robot`), in place of the scenario's
-    own. goal: what the policy is told of where to go (`cosim.spec.goal`), in place of what its
-    manifest says. own_camera: the policy may see by a camera that the robot does not have
-    (`cosim.episode.camera_rules`), which marks the record as nonstandard. camera: what draws
-    pictures. frames_every_s: keep a camera frame every so many seconds, 0 for none. live: where it
-    is on the air meanwhile. pace: the simulation waits for the wall clock, to run at most so many
-    times faster than real time; 0: it never waits. director: where its event pedestrians are
-    decided, if in another process. counterfactual: compare it with its street without the robot.
-    injections: pedestrians that were injected into the episode that this one replays. latency_ms:
-    each command takes effect so much later than the observation that it answers, rounded up to
-    ticks of 50 ms (`cosim.episode.command_delay`). real_time: in place of that, the time that the
-    policy takes for an answer on this machine is that answer's latency, and it is not asked again
-    before: what comes out is replayed from its record, and not made again from its seed.
-    collecting: the policy is an expert, of whose drive a demonstration is kept. Raises UsageError.
+    seed: seed of the run, for policy ids and seeds (`cosim.spec.episode_id`) and the order of
+        episodes. If it is None, a run draws one, and a single Episode uses 0.
+    robot: robot in place of the scenario's (`cosim.spec.robot`).
+    goal: goal protocol in place of the manifest's (`cosim.spec.goal`).
+    own_camera: allow a camera that the robot does not have (`cosim.episode.manifest_checks`). It
+        marks the record as nonstandard.
+    camera: renderer of the pictures.
+    frames_every_s: interval of saved camera frames in seconds, 0 for none.
+    live: address at which the episode is live.
+    pace: maximum speed in multiples of real time; 0 for no limit.
+    director: address of an event director in another process.
+    counterfactual: compare with the same street without the robot.
+    injections: injected pedestrians of the episode that this one replays.
+    latency_ms: delay from an observation to its command's effect, rounded up to ticks of 50 ms
+        (`cosim.episode.command_delay`).
+    real_time: use the policy's measured response time as the latency, without queries in the
+        meantime. Such an episode can be replayed from its record, but not repeated from its seed.
+    collecting: record a demonstration of the policy as an expert. Raises UsageError.
 
     >>> EpisodeOptions(camera="bullet", frames_every_s=1.0).camera
     'bullet'
@@ -85,7 +122,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def asked(cls, config: RunConfig) -> EpisodeOptions:
-        """The options that the config of a run asks for. Raises UsageError."""
+        """Return the options that a run's config requests. Raises UsageError."""
         return cls(
             seed=config.seed,
             robot=config.robot,

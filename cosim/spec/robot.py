@@ -1,9 +1,8 @@
-"""Robots: one frozen value each, in one literal table. Whatever depends on which robot drives takes
-it from here.
+"""Table of robots; everything that depends on the robot is derived from it.
 
-A new robot is a row of `ROBOTS` and a URDF. Convention of the URDFs: the base frame lies on the
-ground in the middle of the robot, x ahead, y left, z up; the base link's centre of mass is
-`com_height_m` above it; wheels turn forward for positive joint speeds.
+A new robot is a row of `ROBOTS` and a URDF. In the URDF, the base frame is on the ground in the
+middle of the robot, x ahead, y left, z up. The base link's centre of mass is `com_height_m` above
+it. Wheels turn forward for positive joint speeds.
 """
 
 from __future__ import annotations
@@ -16,11 +15,11 @@ from cosim.core.errors import unknown
 
 @dataclass(frozen=True, slots=True)
 class Skid:
-    """Wheels that do not steer: it turns by their speeds. left, right: names of their joints, fore
-    before aft.
+    """Skid-steering drive: fixed wheels that turn the robot by their speeds.
 
-    torque_nm: limit of one wheel's motor. span_m: (length, width) of the rectangle of the wheels'
-    contacts.
+    span_m: length and width of the rectangle of the wheels' contacts.
+    torque_nm: limit of one wheel's motor.
+    left, right: names of the wheels' joints, front first.
     """
 
     wheel_radius_m: float
@@ -31,17 +30,20 @@ class Skid:
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """All that its motors turn, in the order of `physics.dynamics.drive`."""
+        """Names of all motor joints, in the order of `physics.dynamics.drive`."""
         return self.left + self.right
 
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Where a camera sits, and what it can be there.
+    """Place of a camera on a robot, with the limits of the camera.
 
-    at_m: (x, y, z) in the base frame, metres. pitch_down_deg, yaw_left_deg: how far it looks down,
-    and to the left of ahead. fov_deg: the least and the largest vertical field of view; most_px:
-    the largest (width, height) in pixels; most_hz: the most pictures a second.
+    at_m: (x, y, z) in the base frame, metres.
+    pitch_down_deg: downward tilt.
+    yaw_left_deg: angle to the left of ahead.
+    fov_deg: smallest and largest vertical field of view.
+    most_px: largest (width, height) in pixels.
+    most_hz: largest rate of pictures.
 
     >>> Mount((0.3, 0.0, 0.62), pitch_down_deg=10.0).at_m[2]
     0.62
@@ -56,7 +58,7 @@ class Mount:
 
     @property
     def in_words(self) -> str:
-        """Where it is, and its limits."""
+        """Description of place and limits."""
         at = ", ".join(f"{m:g}" for m in self.at_m)
         side = (
             f", {abs(self.yaw_left_deg):g} deg to the "
@@ -71,15 +73,15 @@ class Mount:
 
 @dataclass(frozen=True, slots=True)
 class Robot:
-    """A robot. length_m, width_m, height_m: of the box around its collision body, in whose middle
-    the base frame lies.
+    """Robot with its size, drive, camera mounts and limits.
 
-    urdf: a file in `physics/robots`, or an absolute path. mounts: its cameras' places by name; a
-    policy's camera sits at "front", where every robot has one, unless it says otherwise.
-    cruise_mps: the pace at which it travels; v_max_mps, w_max_radps: the most that a command can
-    ask of it, as magnitudes; acceleration_mps2, acceleration_radps2: of its motors' ramps. drive:
-    how it moves; one that does not skid needs a class beside `Skid`, and one beside
-    `physics.dynamics.drive.SkidDrive`.
+    urdf: file in `physics/robots`, or an absolute path.
+    length_m, width_m, height_m: box around the collision body, centred on the base frame.
+    drive: how it moves. Another type than `Skid` needs its counterpart in `physics.dynamics.drive`.
+    mounts: camera mounts by name. Every robot has "front", the default of policies.
+    cruise_mps: travelling speed.
+    v_max_mps, w_max_radps: largest commands, as magnitudes.
+    acceleration_mps2, acceleration_radps2: ramps of the motors.
 
     >>> robot_called("scout").footprint_m
     (0.5, 0.4)
@@ -101,11 +103,11 @@ class Robot:
 
     @property
     def footprint_m(self) -> tuple[float, float]:
-        """Length and width."""
+        """Length and width in metres."""
         return self.length_m, self.width_m
 
     def mount(self, name: str) -> Mount:
-        """The mount called `name`. Raises UsageError listing the names."""
+        """Return the mount with a name. Raises UsageError with the valid names."""
         if name not in self.mounts:
             raise unknown(f"camera mount of robot '{self.name}'", name, self.mounts)
         return self.mounts[name]
@@ -132,6 +134,7 @@ COURIER = Robot(
     acceleration_mps2=2.5,
     acceleration_radps2=3.0,
 )
+"""Default robot: a four-wheeled delivery robot of 0.70 m x 0.55 m."""
 
 SCOUT = Robot(
     name="scout",
@@ -153,12 +156,14 @@ SCOUT = Robot(
     acceleration_mps2=3.0,
     acceleration_radps2=4.0,
 )
+"""Smaller and more agile robot of 0.50 m x 0.40 m."""
 
 ROBOTS: Mapping[str, Robot] = {one.name: one for one in (COURIER, SCOUT)}
+"""Robots by name."""
 
 
 def robot_called(name: str) -> Robot:
-    """The robot called `name`. Raises UsageError listing the names."""
+    """Return the robot with a name. Raises UsageError with the valid names."""
     if name not in ROBOTS:
         raise unknown("robot", name, ROBOTS)
     return ROBOTS[name]

@@ -1,4 +1,4 @@
-"""RunConfig: what a run does. `cosim run` and its relatives make their options from its fields."""
+"""RunConfig: the settings of a run, from which the options of `cosim run` are made."""
 
 from __future__ import annotations
 
@@ -11,23 +11,24 @@ from cosim.core.errors import UsageError
 from cosim.spec.connection import Connection, connecting, listening
 
 CameraChoice = Literal["auto", "gl", "bullet", "bullet-egl"]
+"""Renderers of `--camera`; auto selects gl where it works."""
 MEASURED = "measured"
-"""The value of `--latency` that has it measured before the run."""
+"""Value of `--latency` that measures the latency before the run."""
 MOST_LATENCY_MS = 10_000.0
-"""The longest latency of a command, in milliseconds."""
+"""Maximum latency of a command in milliseconds."""
 LONGEST_WAIT_S = 240.0
-"""The longest wait for a director, in seconds; a process that is silent for much longer counts as
+"""Maximum timeout of a director in seconds; processes that are silent for much longer count as
 hanging."""
 
 
 class Option(NamedTuple):
-    """How a field of a config appears on the command line.
+    """Command-line option of a config's field.
 
-    flag: "" for the field's name.
-    least, most: the range of a number.
-    default: the default in words, where the value does not say it.
-    argument: it is an argument, not an option.
-    panel: the heading of its group in the help.
+    flag: name of the option, "" for the field's name.
+    least, most: range of a number.
+    default: description of the default, if the value is not enough.
+    argument: whether it is a positional argument.
+    panel: heading of its group in the help.
     """
 
     help: str
@@ -52,9 +53,9 @@ _LOG = "Log"
 
 @dataclass(frozen=True, kw_only=True)
 class RunConfig:
-    """What a run does: which scenarios, driven by which policy, how, where, and what is kept.
+    """Settings of a run: scenarios, policy, conditions, processes and outputs.
 
-    Raises UsageError for values that contradict each other.
+    Raises UsageError for contradictory values.
 
     >>> RunConfig(suite="reactive", policy="orca", event=("frontal",), latency="200").latency_ms
     200.0
@@ -65,7 +66,7 @@ class RunConfig:
         Option("A suite (see `cosim list`) or the path of a suite's .json file.", argument=True),
     ] = ""
     episodes: Annotated[
-        int | None, Option("Run only the first so many scenarios.", least=1, panel=_CHOICE)
+        int | None, Option("Run only the first N scenarios.", least=1, panel=_CHOICE)
     ] = None
     scenario: Annotated[
         tuple[str, ...], Option("Run only this scenario; may be repeated.", panel=_CHOICE)
@@ -73,7 +74,8 @@ class RunConfig:
     event: Annotated[
         tuple[str, ...],
         Option(
-            "Run only scenarios of this event, or static: of none; may be repeated.", panel=_CHOICE
+            "Run only scenarios with this event, or static for none; may be repeated.",
+            panel=_CHOICE,
         ),
     ] = ()
     split: Annotated[
@@ -90,7 +92,7 @@ class RunConfig:
     robot: Annotated[
         str,
         Option(
-            "In place of the scenario's: which robot drives, by its name (`cosim list`).",
+            "Robot in place of the scenario's, by name (`cosim list`).",
             panel=_STREET,
         ),
     ] = ""
@@ -115,24 +117,24 @@ class RunConfig:
     isolated: Annotated[
         bool,
         Option(
-            "The policy gets a process of its own and sees observations alone: it cannot "
-            "reach into the simulator.",
+            "Run the policy in a process of its own, which gets only observations and cannot "
+            "access the simulator.",
             panel=_POLICY,
         ),
     ] = False
     shared_renderer: Annotated[
         bool,
         Option(
-            "One process draws for all environments and, if the policy has act_batch, asks "
-            "it for all of them at once.",
+            "One process renders for all environments. If the policy has act_batch, it also "
+            "queries the policy for all of them at once.",
             panel=_WHERE,
         ),
     ] = False
     shard: Annotated[
         str,
         Option(
-            "Run only every N-th scenario, from the I-th on; needs --seed. `cosim merge` "
-            "makes one run of all N.",
+            "Run only every N-th scenario, from the I-th; needs --seed. `cosim merge` joins all N"
+            " runs.",
             metavar="I/N",
             panel=_WHERE,
         ),
@@ -144,14 +146,15 @@ class RunConfig:
     map: Annotated[
         str | None,
         Option(
-            "Draw on this place in place of the suite's: a map, a folder, a net.", panel=_STREET
+            "Draw scenarios on this place instead of the suite's: a map, a folder, a net.",
+            panel=_STREET,
         ),
     ] = None
     seed: Annotated[
         int | None,
         Option(
-            "Of the run: policies' seeds and the names they are told are drawn from it; and the "
-            "routes with --map (else 0).",
+            "Seed of the run, for policy seeds and episode ids, and for the routes with --map "
+            "(else 0).",
             least=0,
             default="another one each time",
             panel=_FOLDER,
@@ -160,15 +163,15 @@ class RunConfig:
     roughness: Annotated[
         float | None,
         Option(
-            "Of the ground of --map: from 0, flat, to 1 (raised slabs, roots, potholes).",
+            "Roughness of the ground of --map: from 0, flat, to 1 (raised slabs, roots, potholes).",
             panel=_STREET,
         ),
     ] = None
     crowd: Annotated[
         int | None,
         Option(
-            "Street life in place of the suite's own: so many people, and vehicles; marked "
-            "in every row.",
+            "Number of people in place of the suite's own crowd, with vehicles; marked in every "
+            "row.",
             least=0,
             panel=_STREET,
         ),
@@ -176,7 +179,7 @@ class RunConfig:
     residents: Annotated[
         int | None,
         Option(
-            "In place of the scenario's: so many people who sit on benches, look into shop "
+            "Number of residents in place of the scenario's: they sit on benches, look into shop "
             "windows, wait at stops.",
             least=0,
             panel=_STREET,
@@ -201,17 +204,16 @@ class RunConfig:
     goal: Annotated[
         str,
         Option(
-            "What the policy is told of where to go, by its name (`cosim list`), in place of "
-            "what its manifest says.",
+            "Goal protocol in place of the manifest's, by name (`cosim list`).",
             panel=_POLICY,
         ),
     ] = ""
     latency: Annotated[
         str,
         Option(
-            "Milliseconds from an observation until the command that answers it takes effect, "
-            "rounded up to ticks of 50 ms; or 'measured': the median that the policy shows here "
-            "in the first episode, driven once before the run.",
+            "Milliseconds from an observation until its command takes effect, rounded up to ticks"
+            " of 50 ms; or 'measured': the policy's median here in the first episode, driven once"
+            " before the run.",
             metavar="MS",
             panel=_POLICY,
         ),
@@ -219,19 +221,19 @@ class RunConfig:
     real_time: Annotated[
         bool,
         Option(
-            "Each answer takes effect as late as it came on this machine. One process; does not "
-            "come again from its seed.",
+            "Each command takes effect after the policy's response time on this machine. One "
+            "process; not repeatable from its seed.",
             panel=_POLICY,
         ),
     ] = False
     frames: Annotated[
-        float, Option("Keep a camera frame every so many seconds.", least=0.0, panel=_PICTURES)
+        float, Option("Save a camera frame every X seconds.", least=0.0, panel=_PICTURES)
     ] = 0.0
     camera: Annotated[
         CameraChoice,
         Option(
-            "What draws the pictures: gl (OpenGL), bullet (slow, bare, anywhere), bullet-egl "
-            "(bare, by OpenGL), or auto: gl where it works, else bullet.",
+            "Renderer: gl (OpenGL), bullet (slow and plain, works anywhere), bullet-egl (plain, "
+            "by OpenGL), or auto: gl where it works, else bullet.",
             metavar="CAMERA",
             panel=_PICTURES,
         ),
@@ -239,23 +241,23 @@ class RunConfig:
     own_camera: Annotated[
         bool,
         Option(
-            "The policy may see by a camera that the robot does not have; every row is "
-            "marked nonstandard.",
+            "Allow a policy's camera that the robot does not have; every row is marked "
+            "nonstandard.",
             panel=_PICTURES,
         ),
     ] = False
     live: Annotated[
         str | None,
         Option(
-            "Be on the air at this endpoint, like tcp/127.0.0.1:7447: see `cosim inject`.",
+            "Publish the run at this endpoint, like tcp/127.0.0.1:7447: see `cosim inject`.",
             panel=_NETWORK,
         ),
     ] = None
     pace: Annotated[
         float,
         Option(
-            "Hold it to so many times real time, from 0.1 to 100: with 1 there is time to step in "
-            "by hand. The same results.",
+            "Limit the speed to this multiple of real time, from 0.1 to 100, for interaction by "
+            "hand. The results are the same.",
             metavar="X",
             default="as fast as possible",
             panel=_NETWORK,
@@ -264,27 +266,30 @@ class RunConfig:
     director: Annotated[
         str | None,
         Option(
-            "Ask the director at this endpoint, a process of its own: see `cosim direct`.",
+            "Use the director at this endpoint, a process of its own: see `cosim direct`.",
             panel=_NETWORK,
         ),
     ] = None
     tls: Annotated[
         str,
         Option(
-            "Guard tls/... endpoints: see `cosim certs --help`.", metavar="FOLDER", panel=_NETWORK
+            "Folder of certificates for tls/... endpoints: see `cosim certs --help`.",
+            metavar="FOLDER",
+            panel=_NETWORK,
         ),
     ] = ""
     insecure: Annotated[
         bool,
         Option(
-            "Beyond this machine without TLS: open to all who can reach it, unencrypted.",
+            "Allow other machines without TLS: open to all who can reach the endpoint, "
+            "unencrypted.",
             panel=_NETWORK,
         ),
     ] = False
     director_wait: Annotated[
         float,
         Option(
-            "Seconds to wait for it; then the episode has crashed.",
+            "Timeout of the director in seconds; then the episode has crashed.",
             least=0.1,
             most=LONGEST_WAIT_S,
             panel=_NETWORK,
@@ -293,7 +298,7 @@ class RunConfig:
     answer_timeout: Annotated[
         float,
         Option(
-            "Seconds a policy may take to answer; then its episode has crashed.",
+            "Timeout of a policy's answer in seconds; then its episode has crashed.",
             least=0.1,
             panel=_POLICY,
         ),
@@ -301,7 +306,8 @@ class RunConfig:
     start_timeout: Annotated[
         float,
         Option(
-            "The same for loading it, for its reset, and for the first answer after it.",
+            "Timeout in seconds for loading a policy, for its reset, and for the first answer "
+            "after it.",
             least=0.1,
             panel=_POLICY,
         ),
@@ -309,21 +315,24 @@ class RunConfig:
     rerun: Annotated[
         Path | None,
         Option(
-            "Write one episode as a recording for the Rerun viewer (package extra [rerun]): "
-            "it is replayed for that.",
+            "Write one episode as a recording for the Rerun viewer (package extra [rerun]), from "
+            "a replay.",
             metavar="FILE.rrd",
             panel=_PICTURES,
         ),
     ] = None
     counterfactual: Annotated[
         bool,
-        Option("Simulate every street again without the robot: whom it delayed.", panel=_FOLDER),
+        Option(
+            "Simulate every street again without the robot, to measure whom it delayed.",
+            panel=_FOLDER,
+        ),
     ] = False
     on: Annotated[
         str,
         Option(
-            "Run by a Ray cluster: ray (of this machine), auto, or ray://HOST:10001. A "
-            "policy of yours is sent there.",
+            "Run on a Ray cluster: ray (on this machine), auto, or ray://HOST:10001. Your own "
+            "policy is sent there.",
             metavar="CLUSTER",
             panel=_WHERE,
         ),
@@ -355,7 +364,7 @@ class RunConfig:
 
     @property
     def latency_ms(self) -> float | None:
-        """The latency of commands; None where it is measured before the run. Raises UsageError."""
+        """Latency of commands; None if it is measured before the run. Raises UsageError."""
         if self.real_time and self.latency:
             raise UsageError(
                 "--real-time measures the latency of every answer: leave --latency out"
@@ -376,12 +385,12 @@ class RunConfig:
 
     @property
     def ends(self) -> RunEnds:
-        """The ends of its network connections. Raises UsageError."""
+        """Network connections of the run. Raises UsageError."""
         return ends_of_run(self.live, self.director, self.policy_at, self.tls, self.insecure)
 
 
 def help_of(field: str) -> str:
-    """The help text of a field of `RunConfig`, for other commands with the same option.
+    """Return the help text of a field of `RunConfig`, for other commands with the same option.
 
     >>> help_of("elderly")
     'Share of the walkers who are elderly: they walk slower.'
@@ -390,14 +399,18 @@ def help_of(field: str) -> str:
 
 
 def option_of(config: type, field: str) -> Option:
-    """How a field of a config appears on the command line."""
+    """Return the command-line option of a config's field."""
     found: Option = get_type_hints(config, include_extras=True)[field].__metadata__[0]
     return found
 
 
 class RunEnds(NamedTuple):
-    """The ends of a run's connections: where it listens, where its director is, where servers of
-    its policy are."""
+    """Network connections of a run.
+
+    live: endpoint on which it listens.
+    director: connection to its director.
+    servers: connections to the servers of its policy.
+    """
 
     live: Connection | None
     director: Connection | None
@@ -405,15 +418,14 @@ class RunEnds(NamedTuple):
 
     @property
     def all(self) -> tuple[Connection, ...]:
-        """Those that there are."""
+        """All connections that are configured."""
         return tuple(end for end in (self.live, self.director, *self.servers) if end is not None)
 
 
 def ends_of_run(
     live: str | None, director: str | None, policies: Sequence[str], tls: str, insecure: bool
 ) -> RunEnds:
-    """The ends of a run by their endpoints: --tls goes to those that are tls/... Raises
-    UsageError."""
+    """Return the connections of a run. `--tls` applies to tls/... endpoints. Raises UsageError."""
     at = {f"--policy-at {end}": end for end in policies}
     given = {
         name: end for name, end in (("--live", live), ("--director", director)) if end is not None

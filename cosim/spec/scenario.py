@@ -1,6 +1,6 @@
-"""Scenario and Suite: frozen specs of what is measured, and their files.
+"""Scenario and Suite: frozen specs of the benchmark, and their files.
 
-A spec is complete: the same spec gives the same episode, bit for bit, in any process.
+A spec is complete: it determines its episode bit for bit, in any process.
 """
 
 from __future__ import annotations
@@ -18,8 +18,7 @@ import numpy as np
 
 from cosim.core.errors import SpecError, unknown
 from cosim.core.geometry import Polyline, Pose
-from cosim.spec.event_kind import EventKinds
-from cosim.spec.events import Event
+from cosim.spec.events import Event, EventKinds
 from cosim.spec.obstacle import Obstacle
 from cosim.spec.robot import COURIER, robot_called
 from cosim.spec.spec_file import in_lines, read_spec_file
@@ -38,26 +37,33 @@ from cosim.spec.validation import (
 )
 
 _SCHEMA = 1
-"""Version of the scenario files; a reader refuses others."""
+"""Version of the scenario files; other versions are refused."""
 _SHORTEST_M = 1.0
+"""Minimum length of a reference route in metres."""
 _LONGEST_M = 20_000.0
-"""Of a reference route."""
+"""Maximum length of a reference route in metres."""
 _SLACK_M = 0.01
+"""Tolerance of arc lengths at the end of the route, in metres."""
 EVENT_BEYOND_M = 60.0
-"""Who comes towards the robot may start from beyond the goal, so far."""
+"""Maximum distance of an event beyond the goal in metres; oncoming people may start there."""
 SHARE = Within(0, 1, words="must be a share in {range}, not {value}")
+"""Range of a share."""
 _NAME = Text(200)
 FOLDER = Named("a folder")
 
 
 _ROUGHNESS = Within(0, 1, words="is {value:g}, but it lies between 0 (flat) and 1")
 CITY_SIZE_M = Within(200, 4000)
-"""In a smaller square there is no room for two blocks."""
+"""Range of a city's size in metres. A smaller square has no space for two blocks."""
 
 
 class City(Ranged, frozen=True, kw_only=True, tag="city", tag_field="kind"):
-    """A procedural city. size_m: in whole centimetres. net_hash: content hash of the street net the
-    scenario was made on. roughness: of the ground, from 0 (flat) to 1."""
+    """Procedural city.
+
+    size_m: side of the square, in whole centimetres.
+    net_hash: content hash of the street net of the scenario.
+    roughness: roughness of the ground, from 0 (flat) to 1.
+    """
 
     seed: Annotated[int, SEED]
     size_m: Annotated[float, CITY_SIZE_M] = 2000.0
@@ -75,8 +81,11 @@ class City(Ranged, frozen=True, kw_only=True, tag="city", tag_field="kind"):
 
 
 class CityMap(Ranged, frozen=True, kw_only=True, tag="map", tag_field="kind"):
-    """An imported map, by its name in the store of maps. seed: of what the map does not say
-    (buildings, props). roughness: of the ground, from 0 (flat) to 1."""
+    """Imported map, by its name in the map store.
+
+    seed: seed of what the map does not contain (buildings, props).
+    roughness: roughness of the ground, from 0 (flat) to 1.
+    """
 
     map: Annotated[str, _NAME]
     seed: Annotated[int, SEED] = 0
@@ -92,9 +101,11 @@ Place = City | CityMap
 
 
 class Barrier(Ranged, frozen=True, kw_only=True):
-    """A fence across a way. heading_rad: along the way it closes; length_m: across it.
+    """Fence across a way.
 
-    strip, end: the port of the walking graph that it closes.
+    heading_rad: direction of the way that it closes.
+    length_m: length across the way.
+    strip, end: port of the walking graph that it closes.
     """
 
     x_m: Annotated[float, WHERE_M]
@@ -108,7 +119,7 @@ class Barrier(Ranged, frozen=True, kw_only=True):
 
 
 class RouteCrossing(Ranged, frozen=True, kw_only=True):
-    """A crossing of the reference route, from arc length enter_s_m to leave_s_m."""
+    """Crossing on the reference route, from arc length enter_s_m to leave_s_m."""
 
     id: Annotated[str, _NAME]
     enter_s_m: Annotated[float, ALONG_M]
@@ -125,21 +136,22 @@ class RouteCrossing(Ranged, frozen=True, kw_only=True):
 
 
 DEFAULT_PERSONS = 50
+"""Default number of persons around the robot."""
 MOST_PERSONS = 1000
-"""More take SUMO longer than a run waits for an episode."""
+"""Maximum number of persons; SUMO would be too slow for more."""
 MOST_PER_1000_M2 = 150.0
-"""Denser crowds have no room to enter 1.5 m apart."""
+"""Maximum density in persons per 1000 m2. Denser crowds have no space to enter 1.5 m apart."""
 
 
 class CrowdSpec(Ranged, frozen=True, kw_only=True):
-    """The street life around the robot: persons and vehicles kept within radius_m of it.
+    """Background crowd: persons and vehicles within radius_m of the robot.
 
-    density: persons per 1000 m2 of walkable ground there, in place of a number of persons.
-    residents: people besides who know the street, sit on its benches, look into its shop windows,
-    wait at its stops (`scenarios.residents`); so many are kept within 60 m of the robot. Shares of
-    the persons: groups, of those who walk in groups of two and three; elderly and children, of
-    those who walk slower than others. A child walks in a group with an adult, at the child's pace.
-    added: it is another crowd than the suite's own, asked for by who runs it.
+    density: persons per 1000 m2 of walkable ground, in place of a number of persons.
+    residents: number of residents within 60 m of the robot, in addition to the persons. They sit on
+        benches, look into shop windows and wait at stops.
+    groups: share of the persons who walk in groups of two and three.
+    elderly, children: shares of slower walkers. A child walks with an adult, at the child's pace.
+    added: whether the crowd was requested in place of the suite's own.
     """
 
     persons: Annotated[int, Within(0, MOST_PERSONS)] = DEFAULT_PERSONS
@@ -161,7 +173,7 @@ class CrowdSpec(Ranged, frozen=True, kw_only=True):
 
     @property
     def empty(self) -> bool:
-        """Whether there are neither persons nor vehicles to come and go; residents do not count."""
+        """Whether the crowd has neither persons nor vehicles; residents do not count."""
         return not self.vehicles and not (self.persons if self.density is None else self.density)
 
     def contradictions(self) -> Iterator[str]:
@@ -182,12 +194,13 @@ class CrowdSpec(Ranged, frozen=True, kw_only=True):
 
 
 class Light(Ranged, frozen=True, kw_only=True):
-    """Time of day and weather of a scenario: what they do to pictures, and to nothing else.
+    """Time of day and weather; they affect only pictures.
 
-    hour: solar time, the sun highest at 12. cloud_cover: 0 (clear) to 1 (overcast). fog_m: the
-    distance at which fog leaves 5 % of a contrast (the meteorologists' visibility), None without
-    fog. exposure_ev: stops brighter (+) or darker (-) than the camera would choose. hdri: path of
-    an equirectangular Radiance .hdr that replaces sky and sun.
+    hour: solar time; the sun is highest at 12.
+    cloud_cover: 0 (clear) to 1 (overcast).
+    fog_m: meteorological visibility, where 5 % of a contrast is left; None without fog.
+    exposure_ev: stops brighter (+) or darker (-) than the camera's automatic exposure.
+    hdri: path of an equirectangular Radiance .hdr in place of sky and sun.
     """
 
     hour: Annotated[float, Within(0, 24)] = 13.0
@@ -205,18 +218,19 @@ class Light(Ranged, frozen=True, kw_only=True):
 
 
 Split = Literal["val", "test"]
-"""val: for choosing and tuning; test: in places that no tuning has seen."""
+"""Splits: val for development and tuning, test for places that no tuning has used."""
 
 
 class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
-    """One episode to run. start: x, y, heading. route: the reference route from start to goal, in
-    metres.
+    """One episode to run. Raises SpecError for contradictory fields.
 
-    structure: what it is an example of: straight, curve, crosswalk, a kind of event, static, route;
-    "" if of nothing.
+    Points are metres in the net's frame: x east, y north. Headings are radians counter-clockwise
+    from east.
 
-    All points are in the net's frame: x east, y north; headings in radians, 0 east,
-    counter-clockwise. Raises SpecError where fields contradict each other.
+    start: x, y, heading.
+    route: reference route from start to goal.
+    structure: what the scenario is an example of: straight, curve, crosswalk, an event kind,
+        static, route, or "".
 
     >>> Scenario(
     ...     id="a", suite="mine", place=City(seed=1, size_m=500.0), seed=0,
@@ -297,18 +311,17 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
         return Pose(*self.start)
 
     def driven_by(self, robot: str) -> Scenario:
-        """The same with another robot; itself where `robot` is "". Raises UsageError with the valid
-        names."""
+        """Return the scenario with another robot; unchanged if `robot` is "". Raises UsageError."""
         return msgspec.structs.replace(self, robot=robot_called(robot).name) if robot else self
 
     @cached_property
     def route_line(self) -> Polyline:
-        """The reference route by arc length; made once."""
+        """Reference route by arc length, made once."""
         return Polyline(self.route)
 
 
 class Suite(Ranged, frozen=True, kw_only=True):
-    """A named, versioned list of scenarios. Raises SpecError for two of one id.
+    """Named, versioned list of scenarios. Raises SpecError for duplicate ids.
 
     >>> len(Suite(name="mine", version="1", scenarios=()).content_hash)
     16
@@ -332,14 +345,14 @@ class Suite(Ranged, frozen=True, kw_only=True):
 
 
 def split_called(name: str | None) -> Split | None:
-    """The split of that name. Raises UsageError, listing them, when there is none."""
+    """Return the split with a name. Raises UsageError with the valid names."""
     if name not in (None, *get_args(Split)):
         raise unknown("split", str(name), get_args(Split))
     return cast(Split | None, name)
 
 
 def content_hash(spec: msgspec.Struct) -> str:
-    """SHA-256 of a spec's canonical JSON, 16 hex digits."""
+    """Return the SHA-256 of a spec's canonical JSON, 16 hex digits."""
     return hashlib.sha256(_canonical(spec)).hexdigest()[:16]
 
 
@@ -348,8 +361,10 @@ def _canonical(spec: msgspec.Struct) -> bytes:
 
 
 def event_faults(scenario: Scenario, kinds: EventKinds, place: str = "$") -> Iterator[str]:
-    """What of the events of a scenario, at `place` of its file, is not of the table or not as its
-    rows say."""
+    """Yield the errors of a scenario's events with respect to a table of kinds.
+
+    place: path of the scenario in its file.
+    """
     for number, event in enumerate(scenario.events):
         at = f"{place}.events[{number}]"
         if event.kind not in kinds:
@@ -383,26 +398,26 @@ def event_faults(scenario: Scenario, kinds: EventKinds, place: str = "$") -> Ite
 
 
 def read_suite(path: Path, kinds: EventKinds | None = None) -> Suite:
-    """The suite in a JSON file. kinds: of events that there may be; None for a file that was read
-    before.
+    """Load the suite of a JSON file. Raises SpecError with file, field and valid choices.
 
-    Raises SpecError naming the file and the field, and what may stand there."""
+    kinds: table of event kinds to check against; None for a file that was checked before.
+    """
     suite = read_spec_file(path, Suite)
     if not suite.scenarios:
         raise SpecError(
             f"{path}: suite '{suite.name}' has no scenarios: `scenarios` needs one or more"
         )
     if kinds is not None:
-        told = (
+        faults_by_scenario = (
             event_faults(one, kinds, f"$.scenarios[{i}]") for i, one in enumerate(suite.scenarios)
         )
-        if faults := list(chain.from_iterable(told)):
+        if faults := list(chain.from_iterable(faults_by_scenario)):
             raise SpecError(f"{path}: {in_lines(faults)}")
     return suite
 
 
 def write_suite(suite: Suite, path: Path) -> None:
-    """Write a suite as readable JSON: one scenario a line."""
+    """Write a suite as readable JSON, one scenario a line."""
     head = msgspec.json.encode(
         {"name": suite.name, "version": suite.version, "description": suite.description}
     )

@@ -1,5 +1,4 @@
-"""Choose scenarios of a suite by id, event, split and number; and find the options that chose given
-ones."""
+"""Select scenarios of a suite by id, event, split and number; find options for a selection."""
 
 from __future__ import annotations
 
@@ -11,10 +10,9 @@ from cosim.core.errors import UsageError, unknown
 from cosim.spec.scenario import Scenario, Split, Suite
 
 STATIC: Final = "static"
-"""The structure of `reactive` scenarios of the same places and ways without an event; chosen like
-an event."""
+"""Structure of `reactive` scenarios without an event, selectable like an event kind."""
 _MOST_NAMED: Final = 3
-"""Scenarios listed by name where no other options choose them."""
+"""Maximum number of scenarios that are listed by name, if no other options select them."""
 
 
 def scenarios_chosen(
@@ -24,27 +22,27 @@ def scenarios_chosen(
     kinds: Sequence[str] = (),
     split: str | None = None,
 ) -> tuple[Scenario, ...]:
-    """The named scenarios of a suite (all when none is named) with events of the named kinds, the
-    first `episodes`.
+    """Return the selected scenarios of a suite. Raises UsageError with the valid names.
 
-    kinds: of events, or `static`. split: those of val or of test alone.
-
-    Raises UsageError with the valid names.
+    ids: ids of scenarios; none for all.
+    episodes: number of scenarios, from the first.
+    kinds: event kinds, or `static`.
+    split: val or test; None for both.
     """
     by_id = {scenario.id: scenario for scenario in whole.scenarios}
     for scenario_id in ids:
         if scenario_id not in by_id:
             raise unknown("scenario", scenario_id, by_id)
     picked = [by_id[i] for i in dict.fromkeys(ids)] or list(whole.scenarios)
-    there = {kind: None for scenario in picked for kind in _kinds_of(scenario)}
+    available = {kind: None for scenario in picked for kind in _kinds_of(scenario)}
     for kind in kinds:
-        if kind not in there and not there:
+        if kind not in available and not available:
             raise UsageError(
                 f"--event {kind}: suite '{whole.name}' has no events among these scenarios: "
                 f"leave it out"
             )
-        if kind not in there:
-            raise unknown("event", kind, there)
+        if kind not in available:
+            raise unknown("event", kind, available)
     if kinds:
         picked = [s for s in picked if not _kinds_of(s).isdisjoint(kinds)]
     if split is not None:
@@ -57,7 +55,7 @@ def scenarios_chosen(
 
 
 def selection_in_words(whole: Suite, ids: Sequence[str]) -> str:
-    """How many scenarios of a suite these are, and the options of `cosim run` that choose them.
+    """Return how many scenarios of a suite are selected, and the options of `cosim run` for them.
 
     >>> from cosim.spec.scenario import City
     >>> one, other = (
@@ -77,7 +75,7 @@ def selection_in_words(whole: Suite, ids: Sequence[str]) -> str:
 
 
 def _options_for(whole: Suite, ids: Sequence[str]) -> list[str]:
-    """The fewest options that choose exactly these scenarios; none for all of them, or where none
+    """Return the fewest options that select exactly these scenarios; none if all are, or no options
     do."""
     picked = [scenario for scenario in whole.scenarios if scenario.id in {*ids}]
     each = [_kinds_of(scenario) for scenario in picked]
@@ -104,7 +102,7 @@ def _as_options(kinds: Iterable[str], split: str | None, episodes: int | None) -
 
 
 def _kinds_of(scenario: Scenario) -> set[str]:
-    """What `--event` finds a scenario by."""
+    """Return the names by which `--event` selects a scenario."""
     return {event.kind for event in scenario.events} or (
         {STATIC} if scenario.structure == STATIC else set()
     )

@@ -1,5 +1,4 @@
-"""Specs in JSON files: read whole, or refused with every fault at once, each with its place in the
-file."""
+"""Load specs from JSON files, or report all their errors with their places in the file."""
 
 from __future__ import annotations
 
@@ -18,21 +17,29 @@ from cosim.core.errors import SpecError, nearest
 from cosim.spec.validation import MOST_SHOWN, Ranged, printable, refusal_of, rules_of, shown
 
 MOST_BYTES: Final = 1_000_000_000
+"""Maximum size of a file in bytes."""
 MOST_TOLD: Final = 5
+"""Maximum number of errors that a message lists."""
 MOST_COUNTED: Final = 1000
-"""Of more faults than this it is only said that there are more."""
+"""Maximum number of errors that are counted."""
 MOST_LETTERS: Final = 400
-"""Of one fault."""
+"""Maximum length of one error in characters."""
 _PLACE: Final = re.compile(r" - at `(key in )?\$[^`]*`$")
+"""Place that msgspec appends to an error."""
 _BYTE: Final = re.compile(r" \(byte (\d+)\)$")
+"""Offset that msgspec appends to a syntax error."""
 _REFUSED: Final = (msgspec.DecodeError, ValueError, RecursionError)
+"""Exceptions of a decoder that refuses a file."""
 
 Spec = TypeVar("Spec", bound=msgspec.Struct)
 
 
 def read_spec_file(path: Path, kind: type[Spec]) -> Spec:
-    """The spec in a JSON file. Raises SpecError naming the file, and of each fault the place and
-    what may stand there: one on a line, the first MOST_TOLD of them."""
+    """Load the spec of a JSON file.
+
+    Raises SpecError with the file, and the place and valid values of each error, one a line. At
+    most MOST_TOLD errors are listed.
+    """
     try:
         if path.exists() and not path.is_file():
             raise SpecError(f"{path}: is no file")
@@ -49,7 +56,8 @@ def read_spec_file(path: Path, kind: type[Spec]) -> Spec:
 
 
 def in_lines(faults: Sequence[str], most: int = MOST_TOLD) -> str:
-    """A fault as it is; of several, their number and the first `most` of them, a line each."""
+    """Join errors to a message: one as it is; of several, their number and the first `most`, one a
+    line."""
     if len(faults) == 1:
         return faults[0]
     count = (
@@ -60,42 +68,41 @@ def in_lines(faults: Sequence[str], most: int = MOST_TOLD) -> str:
 
 
 def _faults(data: bytes, kind: Any, error: Exception) -> Iterator[str]:
-    """Every fault of a file that was refused with `error`."""
-    if _of_the_whole(error):
+    """Yield every error of a file that was refused with `error`."""
+    if _is_contradiction(error):
         yield f"{error} - at `$`"
         return
     try:
-        # It takes NaN and numbers without end, which the other reader refuses without naming their
-        # field.
+        # json accepts NaN and huge numbers, which msgspec refuses without naming the field.
         tree = json.loads(data)
     except (ValueError, RecursionError):
-        yield _malformed(data, error)
+        yield _syntax_fault(data, error)
         return
     found = False
     for fault in faults_in(tree, kind, "$"):
         found = True
         yield fault
     if not found:
-        yield _malformed(data, error)
+        yield _syntax_fault(data, error)
 
 
-def _malformed(data: bytes, refused: Exception) -> str:
-    """Why a file is no JSON, and where."""
+def _syntax_fault(data: bytes, refused: Exception) -> str:
+    """Return why a file is not JSON, and where."""
     error = _syntax_error(data) or refused
     message = str(error)
     if isinstance(error, RecursionError):
         return "is nested too deep: brackets within brackets within brackets"
     if isinstance(error, UnicodeDecodeError):
-        return f"is no UTF-8 text, {_where(data, _readable(data))}"
+        return f"is no UTF-8 text, {_position(data, _valid_utf8_bytes(data))}"
     if message == "Input data was truncated":
-        return f"JSON ends too early, {_where(data, len(data))}"
+        return f"JSON ends too early, {_position(data, len(data))}"
     if byte := _BYTE.search(message):
-        return f"{message[: byte.start()]}, {_where(data, int(byte[1]))}"
+        return f"{message[: byte.start()]}, {_position(data, int(byte[1]))}"
     return message if _PLACE.search(message) else f"{message} - at `$`"
 
 
 def _syntax_error(data: bytes) -> Exception | None:
-    """What is wrong with a file as JSON, whatever it should hold; None if nothing is."""
+    """Return the JSON syntax error of a file, or None."""
     try:
         msgspec.json.decode(data)
     except _REFUSED as error:
@@ -103,27 +110,27 @@ def _syntax_error(data: bytes) -> Exception | None:
     return None
 
 
-def _readable(data: bytes) -> int:
-    """How many bytes from the beginning are UTF-8."""
+def _valid_utf8_bytes(data: bytes) -> int:
+    """Return the number of leading bytes that are valid UTF-8."""
     try:
         return len(data.decode())
     except UnicodeDecodeError as error:
         return error.start
 
 
-def _where(data: bytes, byte: int) -> str:
+def _position(data: bytes, byte: int) -> str:
+    """Return line and byte of an offset as text."""
     lines = data[:byte].split(b"\n")
     return f"line {len(lines)}, byte {len(lines[-1])} of it"
 
 
 def faults_in(tree: Any, kind: Any, place: str) -> Iterator[str]:
-    """Every fault of a value that should be of a type: those of its parts, where they have none its
-    own."""
+    """Yield every error of a value for a type: those of its parts, else its own."""
     try:
         msgspec.convert(tree, kind)
         return
     except _REFUSED as error:
-        message, whole = str(error), _of_the_whole(error)
+        message, whole = str(error), _is_contradiction(error)
     found = False
     for fault in () if whole else _faults_below(tree, bare_type(kind, tree), place):
         found = True
@@ -139,13 +146,13 @@ def faults_in(tree: Any, kind: Any, place: str) -> Iterator[str]:
         )
 
 
-def _of_the_whole(error: Exception) -> bool:
-    """Whether a value was refused for a contradiction of its own: then its parts are sound."""
+def _is_contradiction(error: Exception) -> bool:
+    """Return whether an error is a contradiction between valid parts."""
     return isinstance(error.__cause__, SpecError) and not _PLACE.search(str(error))
 
 
 def _faults_below(tree: Any, kind: Any, place: str) -> Iterator[str]:
-    """The faults of the parts of a value; none where it is of another shape altogether."""
+    """Yield the errors of a value's parts; none if its shape is wrong altogether."""
     if isinstance(tree, dict) and isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}
         for name in sorted(tree.keys() - fields.keys() - {kind.__struct_config__.tag_field}):
@@ -171,8 +178,8 @@ def _faults_below(tree: Any, kind: Any, place: str) -> Iterator[str]:
 
 
 def _out_of_range(tree: Any, kind: Any, place: str) -> Iterator[str]:
-    """The fields of a value that are out of their range; those of another type are told of
-    already."""
+    """Yield the fields of a value that are out of range. Those of a wrong type are reported
+    elsewhere."""
     if not (isinstance(tree, dict) and isinstance(kind, type) and issubclass(kind, Ranged)):
         return
     types = {field.name: field.type for field in msgspec.structs.fields(kind)}
@@ -185,8 +192,8 @@ def _out_of_range(tree: Any, kind: Any, place: str) -> Iterator[str]:
 
 
 def bare_type(kind: Any, tree: Any) -> Any:
-    """A type without its range, and without None; of several kinds of objects the one that the
-    value says it is."""
+    """Return a type without its range and without None. A union of objects is resolved by the
+    value's tag."""
     if get_origin(kind) is Annotated:
         return bare_type(get_args(kind)[0], tree)
     if get_origin(kind) in (Union, UnionType):
@@ -202,7 +209,7 @@ def bare_type(kind: Any, tree: Any) -> Any:
 
 
 def _choices(kind: Any, tree: Any) -> str:
-    """The values that may stand where another does."""
+    """Return the valid values of a type as text, if they can be listed."""
     bare = bare_type(kind, tree)
     if get_origin(bare) is Literal:
         return _listed(get_args(bare), tree)

@@ -1,5 +1,4 @@
-"""Ranges of the fields of a spec, declared where the field is, and the check of all of them at
-once.
+"""Declarative ranges of the fields of a spec, checked together.
 
 class Fence(Ranged, frozen=True, kw_only=True):
     length_m: Annotated[float, Within(0.1, 100)]
@@ -21,21 +20,21 @@ import msgspec
 from cosim.core.errors import SpecError
 
 _NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,99}")
+"""Names that are valid in paths and keys."""
 MOST_SHOWN: Final = 60
-"""Letters of a value that a message repeats."""
+"""Maximum length of a value in a message, in characters."""
 
 
 class Rule(Protocol):
-    """What the value of a field must be."""
+    """Rule for the value of a field."""
 
     def refusal(self, field: str, value: Any) -> str:
-        """What is wrong with a value, a sentence that begins with the field's name; "" if nothing
-        is."""
+        """Return the error of a value as a sentence that starts with the field's name; "" if it is
+        valid."""
 
 
 class Within(NamedTuple):
-    """A finite number from low to high, both included unless `above`: then low itself is out of
-    range."""
+    """Finite number from low to high, both included. `above` excludes low."""
 
     low: float
     high: float
@@ -53,7 +52,7 @@ class Within(NamedTuple):
 
 
 class Points(NamedTuple):
-    """Points whose coordinates are finite numbers from low to high."""
+    """Points with finite coordinates from low to high."""
 
     low: float
     high: float
@@ -62,16 +61,16 @@ class Points(NamedTuple):
         if all(self.low <= number <= self.high for number in chain.from_iterable(value)):
             return ""
         number = Within(*self)
-        told = (
+        refusals = (
             number.refusal(f"{field}[{i}][{k}]", x)
             for i, point in enumerate(value)
             for k, x in enumerate(point)
         )
-        return next(filter(None, told))
+        return next(filter(None, refusals))
 
 
 class Counted(NamedTuple):
-    """How many items there may be."""
+    """Range of the number of items."""
 
     fewest: int
     most: int
@@ -83,7 +82,7 @@ class Counted(NamedTuple):
 
 
 class Text(NamedTuple):
-    """Words on one line, of so many letters at most."""
+    """One line of text with a maximum length in characters."""
 
     most: int
 
@@ -97,7 +96,10 @@ class Text(NamedTuple):
 
 
 class Named(NamedTuple):
-    """A name that can stand in paths and keys. what: it names."""
+    """Name that is valid in paths and keys.
+
+    what: thing that it names, for the message.
+    """
 
     what: str
 
@@ -111,18 +113,19 @@ class Named(NamedTuple):
 
 
 WHERE_M: Final = Within(-10_000_000, 10_000_000)
-"""A coordinate; on maps that keep those of their UTM zone they are millions."""
+"""Range of a coordinate in metres. On maps in UTM coordinates they are millions."""
 HEADING_RAD: Final = Within(-2 * math.pi, 2 * math.pi)
+"""Range of a heading in radians."""
 ALONG_M: Final = Within(0, 20_000)
-"""An arc length of a route."""
+"""Range of an arc length of a route in metres."""
 SEED: Final = Within(0, 2**32 - 1)
+"""Range of a scenario's seed."""
 
 
 class Ranged(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A spec whose fields keep their ranges and do not contradict each other.
+    """Base class of specs with ranges and consistency checks.
 
-    Raises SpecError with every field that is out of its range; where none is, with every
-    contradiction.
+    Raises SpecError with every field out of range or, if there are none, with every contradiction.
     """
 
     def __post_init__(self) -> None:
@@ -131,24 +134,24 @@ class Ranged(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             raise SpecError("; ".join(faults))
 
     def _out_of_range(self) -> list[str]:
-        told = (
+        refusals = (
             refusal_of(field, rule, getattr(self, field)) for field, rule in rules_of(type(self))
         )
-        return [self.called + refusal for refusal in told if refusal]
+        return [self.called + refusal for refusal in refusals if refusal]
 
     @property
     def called(self) -> str:
-        """What comes before a field's name in a message."""
+        """Prefix of field names in messages."""
         return f"{type(self).__name__.lower()} "
 
     def contradictions(self) -> Iterator[str]:
-        """What fields in their ranges may not be together, one message each; "" is none."""
+        """Yield an error for each contradiction between valid fields; "" is ignored."""
         return iter(())
 
 
 @cache
 def rules_of(kind: type[Ranged]) -> tuple[tuple[str, Rule], ...]:
-    """The rules of a spec, field by field, in the order of the fields."""
+    """Return the rules of a spec's fields, in the order of the fields."""
     hints = get_type_hints(kind, include_extras=True)
     return tuple(
         (name, rule)
@@ -158,12 +161,12 @@ def rules_of(kind: type[Ranged]) -> tuple[tuple[str, Rule], ...]:
 
 
 def refusal_of(field: str, rule: Rule, value: Any) -> str:
-    """What a rule says of the value of a field; nothing where none is given."""
+    """Return the error of a field's value; "" if it is valid or None."""
     return "" if value is None else rule.refusal(field, value)
 
 
 def shown(value: object) -> str:
-    """A value as messages repeat it: on one line, quoted if it is text, cut if it is long."""
+    """Return a value for a message: on one line, quoted if it is text, cut if it is long."""
     return (
         f"'{printable(value, MOST_SHOWN)}'"
         if isinstance(value, str)
@@ -172,8 +175,7 @@ def shown(value: object) -> str:
 
 
 def printable(text: str, most: int) -> str:
-    """Text on one line, cut to so many letters: what would end a line, steer a terminal or cannot
-    be encoded is written as an escape."""
+    """Return text on one line, cut to `most` characters, with unprintable ones escaped."""
     line = (
         text
         if text.isprintable()
@@ -183,8 +185,7 @@ def printable(text: str, most: int) -> str:
 
 
 def _in_few_digits(value: float) -> float:
-    """A number that can be written in a few digits: a whole one that is huge as a power of ten, or
-    as infinite."""
+    """Convert a huge integer to a float, so that few digits are printed."""
     try:
         return value if abs(value) < 10**18 else float(value)
     except OverflowError:

@@ -14,7 +14,7 @@ import numpy as np
 from cosim.core.clock import Clock
 from cosim.core.progress import Progress, ignore
 from cosim.core.state import People, PersonKind, RobotState, Street
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
 from cosim.results.delay import Delay, Tracks, delay_of
 from cosim.results.referee import Verdict
 from cosim.spec.events import EventReply

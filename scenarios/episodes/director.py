@@ -29,9 +29,8 @@ from cosim.core.errors import AccessError, DirectorLost, EngineError
 from cosim.core.progress import Progress
 from cosim.core.state import DIRECTED, People
 from cosim.episode.interfaces import Director
-from cosim.people.standing import Standing
-from cosim.spec.event_kind import EventKinds
-from cosim.spec.events import EventQuery, EventReply
+from cosim.people.yielding import Standing
+from cosim.spec.events import EventKinds, EventQuery, EventReply
 from cosim.spec.options import Outside
 from scenarios.events import EVENT_KINDS, react
 

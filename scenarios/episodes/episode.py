@@ -27,20 +27,18 @@ from cosim.core.clock import Clock, Pacer
 from cosim.core.errors import EngineError, PolicyError, UsageError
 from cosim.core.progress import Progress, ignore
 from cosim.core.state import Frame
-from cosim.episode.camera_rules import check_camera
 from cosim.episode.command_delay import InFlight, whole_ticks
 from cosim.episode.control import command_of
 from cosim.episode.interfaces import Eyes, Observation
-from cosim.episode.loop import Moment, after, begin, tick
-from cosim.episode.manifest_checks import with_goal
-from cosim.episode.step import Step
+from cosim.episode.loop import Moment, Step, after, begin, tick
+from cosim.episode.manifest_checks import check_camera, with_goal
 from cosim.results.log import Log
 from cosim.results.record import Record
 from cosim.results.referee import Verdict
 from cosim.results.run_setup import RunSetup
 from cosim.spec.camera import CameraSpec
 from cosim.spec.episode_id import pseudonym_of
-from cosim.spec.event_kind import EventKinds
+from cosim.spec.events import EventKinds
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions, RendererAt
 from cosim.spec.robot import robot_called

@@ -16,7 +16,7 @@ from bridge.live import serve_injections
 from bridge.session import open_session
 from cosim.core.clock import Clock
 from cosim.core.state import Age, PersonKind
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
 from cosim.results.referee import Verdict
 from cosim.spec.injection import Injected, Live
 from cosim.spec.scenario import Scenario

@@ -10,7 +10,7 @@ from cosim.core.clock import Clock
 from cosim.core.errors import RunError, unknown
 from cosim.core.progress import Progress, ignore
 from cosim.core.versions import versions
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
 from cosim.policies.baselines import Replay
 from cosim.results.log import Log, Tick
 from cosim.results.record import Record

@@ -7,7 +7,7 @@ import msgspec
 from cosim.core.clock import Clock
 from cosim.core.errors import UsageError
 from cosim.episode.command_delay import InFlight, median_ms
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
 from cosim.place.street_map import StreetMap, WalkableArea
 from cosim.results.event_monitor import EventMonitor, Hidden, why_invalid
 from cosim.results.log import Log
@@ -15,7 +15,7 @@ from cosim.results.metrics import EpisodeFacts, every_metric
 from cosim.results.record import Record, Recorder, RedLightEntry, Status
 from cosim.results.referee import Failure, Referee, Verdict
 from cosim.results.traffic import TrafficMonitor
-from cosim.spec.event_kind import EventKinds
+from cosim.spec.events import EventKinds
 from cosim.spec.robot import Robot
 from cosim.spec.scenario import Scenario
 

@@ -22,13 +22,13 @@ from cosim.core.state import RobotState, Street
 from cosim.episode.interfaces import Camera, Director, Eyes, Privileged
 from cosim.episode.loop import Moment, Parts
 from cosim.episode.observer import Observer
-from cosim.people.standing import Standing, standing_bodies
+from cosim.people.yielding import Standing, standing_bodies
 from cosim.place import overlay
 from cosim.place.barriers import fenced
 from cosim.place.street_map import Port, StreetMap, WalkableArea
 from cosim.results.run_setup import NO_RENDERER
 from cosim.spec.camera import CameraSpec
-from cosim.spec.event_kind import EventKinds
+from cosim.spec.events import EventKinds
 from cosim.spec.manifest import Manifest
 from cosim.spec.obstacle import Obstacle, footprint
 from cosim.spec.options import EpisodeOptions, RendererAt

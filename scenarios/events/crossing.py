@@ -12,8 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from cosim.spec.event_kind import EventKind
-from cosim.spec.events import Event, EventQuery, EventState, Walker
+from cosim.spec.events import Event, EventKind, EventQuery, EventState, Walker
 from scenarios.events.sight import sight_of
 from scenarios.events.walking import (
     along_m,

@@ -12,8 +12,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from cosim.spec.event_kind import EventKind, SidewalkLayout
-from cosim.spec.events import Event, EventQuery, EventState, Walker
+from cosim.spec.events import Event, EventKind, EventQuery, EventState, SidewalkLayout, Walker
 from scenarios.events.sight import sight_of
 from scenarios.events.walking import aimed, gave_up, pressed_on, walked_on, walker_at
 

@@ -16,8 +16,7 @@ import msgspec
 
 from cosim.core.state import PERSON_RADIUS_M
 from cosim.people.yielding import ROBOT_STANDS_MPS
-from cosim.spec.event_kind import EventKind, SidewalkLayout
-from cosim.spec.events import Event, EventQuery, EventState, Walker
+from cosim.spec.events import Event, EventKind, EventQuery, EventState, SidewalkLayout, Walker
 from scenarios.events.sight import sight_of
 from scenarios.events.walking import edge_m, gave_up, pressed_on, walked_on, walker_at
 

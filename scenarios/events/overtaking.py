@@ -13,8 +13,7 @@ from typing import Final
 import msgspec
 
 from cosim.core.state import PERSON_RADIUS_M
-from cosim.spec.event_kind import EventKind, SidewalkLayout
-from cosim.spec.events import Event, EventQuery, EventState, Walker
+from cosim.spec.events import Event, EventKind, EventQuery, EventState, SidewalkLayout, Walker
 from scenarios.events.sight import sight_of
 from scenarios.events.walking import (
     along_m,

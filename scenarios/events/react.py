@@ -9,8 +9,16 @@ import msgspec
 from cosim.core.errors import SpecError
 from cosim.core.state import PersonKind
 from cosim.people.yielding import ROBOT_STANDS_MPS, outline_mps
-from cosim.spec.event_kind import EventKind, EventKinds
-from cosim.spec.events import Actor, Event, EventQuery, EventReply, EventState, Walker
+from cosim.spec.events import (
+    Actor,
+    Event,
+    EventKind,
+    EventKinds,
+    EventQuery,
+    EventReply,
+    EventState,
+    Walker,
+)
 from scenarios.events.table import EVENT_KINDS
 from scenarios.events.walking import left_m
 

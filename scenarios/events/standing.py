@@ -19,8 +19,7 @@ from cosim.core.geometry import Pose, wrap_angle
 from cosim.core.state import PERSON_RADIUS_M
 from cosim.people.yielding import ROBOT_STANDS_MPS
 from cosim.results.referee import STOP_S, stands_before
-from cosim.spec.event_kind import EventKind, SidewalkLayout
-from cosim.spec.events import Event, EventQuery, EventState, Walker
+from cosim.spec.events import Event, EventKind, EventQuery, EventState, SidewalkLayout, Walker
 from scenarios.events.sight import sight_of
 from scenarios.events.walking import (
     ON_THE_MIDDLE_M,

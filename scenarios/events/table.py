@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import Final
 
-from cosim.spec.event_kind import EventKinds
+from cosim.spec.events import EventKinds
 from scenarios.events.crossing import PED_CROSSING
 from scenarios.events.frontal import FRONTAL
 from scenarios.events.lateral import LATERAL

@@ -10,9 +10,8 @@ import numpy as np
 
 from cosim.core.geometry import Pose, wrap_angle
 from cosim.core.state import PERSON_RADIUS_M
-from cosim.people.standing import as_met
 from cosim.people.steering import Vector
-from cosim.people.yielding import RobotBody, stepped_round, touches, within_reach_m
+from cosim.people.yielding import RobotBody, as_met, stepped_round, touches, within_reach_m
 from cosim.spec.events import Event, EventQuery, Walker
 from scenarios.events.sight import Sight, led_round, place_taken
 

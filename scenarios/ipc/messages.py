@@ -10,8 +10,7 @@ import msgspec
 from cosim.results.record import Status
 from cosim.results.run_setup import RunSetup
 from cosim.spec.manifest import Manifest
-from cosim.spec.options import EpisodeOptions, RendererAt
-from cosim.spec.policy_host import PolicyHost
+from cosim.spec.options import EpisodeOptions, PolicyHost, RendererAt
 from cosim.spec.scenario import Scenario
 from scenarios.ipc.deadlines import Patience
 

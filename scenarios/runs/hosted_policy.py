@@ -33,7 +33,7 @@ from cosim.episode.control import check_numbers
 from cosim.episode.interfaces import Observation
 from cosim.episode.policy_caller import Driver, Timer
 from cosim.spec.manifest import Manifest
-from cosim.spec.policy_host import PolicyRuns
+from cosim.spec.options import PolicyRuns
 from scenarios.ipc.observation_codec import Arrays, encoded_about, encoded_fields
 
 

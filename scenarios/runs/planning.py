@@ -10,17 +10,15 @@ from typing import NamedTuple
 import msgspec
 
 from cosim.core.errors import UsageError
-from cosim.episode.camera_rules import check_camera
 from cosim.episode.interfaces import Policy
-from cosim.episode.manifest_checks import with_goal
+from cosim.episode.manifest_checks import check_camera, with_goal
 from cosim.episode.policy_caller import Driver
 from cosim.policies.user_module import importable
 from cosim.results.run_folder import RunFolder, read_spec, refuse_unbegun
 from cosim.results.run_setup import RunSetup
 from cosim.results.run_spec import RunSpec, Shard
 from cosim.spec.episode_id import drawn_seed
-from cosim.spec.options import EpisodeOptions
-from cosim.spec.policy_host import PolicyHost
+from cosim.spec.options import EpisodeOptions, PolicyHost
 from cosim.spec.robot import robot_called
 from cosim.spec.run_config import RunConfig
 from cosim.spec.scenario import Scenario, Suite

@@ -8,7 +8,7 @@ from cosim.episode.policy_caller import LOADED_WITHIN_S, Driver, Timer
 from cosim.policies.load import REMOTE_SCHEME, load_policy
 from cosim.policies.user_module import importable
 from cosim.spec.manifest import Manifest
-from cosim.spec.policy_host import PolicyHost
+from cosim.spec.options import PolicyHost
 from scenarios.runs.isolated_policy import isolated_driver
 
 

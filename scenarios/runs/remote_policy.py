@@ -37,7 +37,7 @@ from cosim.episode.manifest_checks import with_goal
 from cosim.episode.policy_caller import Timer
 from cosim.policies.load import checked_manifest
 from cosim.spec.manifest import Manifest
-from cosim.spec.policy_host import PolicyHost, PolicyRuns
+from cosim.spec.options import PolicyHost, PolicyRuns
 from scenarios.ipc.deadlines import ServerTimes
 from scenarios.ipc.observation_codec import Arrays
 from scenarios.ipc.shared_memory import room_for

@@ -27,8 +27,7 @@ from cosim.episode.policy_caller import Driver
 from cosim.results.run_folder import read_spec, refuse_unbegun, refuse_used
 from cosim.spec.connection import Connection
 from cosim.spec.injection import Live
-from cosim.spec.options import EpisodeOptions, Outside
-from cosim.spec.policy_host import PolicyHost
+from cosim.spec.options import EpisodeOptions, Outside, PolicyHost
 from cosim.spec.robot import COURIER, robot_called
 from cosim.spec.run_config import RunConfig, RunEnds
 from cosim.spec.scenario import Scenario, Suite, split_called

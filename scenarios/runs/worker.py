@@ -24,8 +24,8 @@ from cosim.core.clock import Clock
 from cosim.core.errors import MachineError, RendererLost, UsageError
 from cosim.core.framing import Wire
 from cosim.core.versions import versions
+from cosim.episode.loop import Step
 from cosim.episode.policy_caller import Driver
-from cosim.episode.step import Step
 from cosim.policies.load import load_policy
 from cosim.results.referee import Verdict
 from scenarios.ipc.deadlines import Asked

@@ -18,7 +18,7 @@ from cosim.core.errors import CosimError
 from cosim.place.route_line import START_M
 from cosim.place.street_map import Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
-from cosim.spec.event_kind import EventKinds
+from cosim.spec.events import EventKinds
 from cosim.spec.robot import COURIER, Robot
 from scenarios.events import EVENT_KINDS
 from scenarios.suites.drawing import Refusals, first_of

@@ -15,7 +15,7 @@ from cosim.core.errors import CosimError, SpecError
 from cosim.core.geometry import Polyline
 from cosim.people.yielding import STEP_ROUND_GAP_M
 from cosim.place.street_map import StreetMap, Strip
-from cosim.spec.event_kind import EventKind
+from cosim.spec.events import EventKind
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import Place, RouteCrossing, Scenario
 from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M

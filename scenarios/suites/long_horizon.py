@@ -19,7 +19,7 @@ from cosim.place.map_check import on_road_shares
 from cosim.place.route_line import ROUTE_M, START_M, way_line
 from cosim.place.street_map import Lane, Port, StreetMap
 from cosim.place.walk_graph import WalkGraph
-from cosim.spec.event_kind import EventKinds
+from cosim.spec.events import EventKinds
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import Barrier, CrowdSpec, Place, RouteCrossing, Scenario
 from scenarios.events import EVENT_KINDS

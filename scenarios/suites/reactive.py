@@ -16,8 +16,7 @@ from cosim.core.errors import MapError, SpecError
 from cosim.core.geometry import Floats, Polyline, Pose
 from cosim.place.street_map import Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
-from cosim.spec.event_kind import EventKind, SidewalkLayout
-from cosim.spec.events import Event
+from cosim.spec.events import Event, EventKind, SidewalkLayout
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import CrowdSpec, Place, RouteCrossing, Scenario
 from scenarios.suites.drawing import bare_scenario, first_that_fits, people_of, wider_m

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from cosim.core.errors import MapError, SpecError, unknown
 from cosim.place.street_map import StreetMap
 from cosim.place.walk_graph import WalkGraph
-from cosim.spec.event_kind import EventKind, EventKinds
+from cosim.spec.events import EventKind, EventKinds
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import CityMap, Place, Scenario, Suite
 from scenarios.events import EVENT_KINDS

@@ -16,7 +16,7 @@ from cosim.core.geometry import Polyline, wrap_angle
 from cosim.place.route_line import way_line
 from cosim.place.street_map import Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
-from cosim.spec.event_kind import SidewalkLayout
+from cosim.spec.events import SidewalkLayout
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import Place, RouteCrossing, Scenario
 from scenarios.suites.drawing import TRIES, Refusals, bare_scenario, first_of

@@ -11,8 +11,7 @@ import numpy as np
 
 from cosim.core.geometry import Polyline
 from cosim.place.street_map import Port, StreetMap, Strip
-from cosim.spec.event_kind import EventKind, EventKinds
-from cosim.spec.events import Event
+from cosim.spec.events import Event, EventKind, EventKinds
 from cosim.spec.robot import Robot
 from cosim.spec.scenario import RouteCrossing
 from scenarios.suites.drawing import people_of, wider_m

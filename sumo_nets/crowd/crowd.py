@@ -27,8 +27,7 @@ from cosim.core.state import (
     write_protected,
 )
 from cosim.episode.interfaces import Crowd
-from cosim.people.standing import Standing
-from cosim.people.yielding import RobotBody
+from cosim.people.yielding import RobotBody, Standing
 from cosim.place.street_map import Port, StreetMap
 from cosim.spec.events import Actor, EventReply
 from cosim.spec.robot import COURIER

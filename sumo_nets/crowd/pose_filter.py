@@ -15,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats, wrap_angles
-from cosim.core.row_matching import RowLookup
-from cosim.people.standing import Standing
-from cosim.people.yielding import RobotBody, comes_too_near, stepped_round
+from cosim.core.state import RowLookup
+from cosim.people.yielding import RobotBody, Standing, comes_too_near, stepped_round
 from sumo_nets.crowd.separation import NearPairs, kept_apart
 
 MAX_SPEED_MPS = 2.2

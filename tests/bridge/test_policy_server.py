@@ -39,7 +39,7 @@ from cosim.spec.camera import CameraSpec
 from cosim.spec.connection import Connection
 from cosim.spec.goal import ImageGoal, PointGoal
 from cosim.spec.odometry import Odometry
-from cosim.spec.policy_host import PolicyHost
+from cosim.spec.options import PolicyHost
 from cosim.spec.robot import COURIER
 from scenarios.ipc.deadlines import ServerTimes
 from scenarios.runs.policy_host import known_driver

@@ -151,7 +151,7 @@ def test_who_keeps_something_makes_room_first(
     os.utime(cache / "read/a.map", (0.0, 0.0))
     make_room()
     assert "read/a.map" in left(cache)
-    monkeypatch.setattr("cosim.core.cache._LOOK_EVERY_S", 0.0)
+    monkeypatch.setattr("cosim.core.cache._CLEANUP_INTERVAL_S", 0.0)
     make_room()
     assert "read/a.map" not in left(cache)
 

@@ -62,7 +62,7 @@ class Maker:
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A cache of its own."""
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
-    module._say_once.cache_clear()
+    module._print_once.cache_clear()
     return tmp_path / "cache"
 
 
@@ -146,7 +146,7 @@ def test_a_hash_of_sources_covers_the_packages_that_they_import() -> None:
         - {"cosim", "physics"}
     )
     assert {package for top in tops for package in packages_distributions()[top]} <= set(
-        module._MADE_WITH
+        module._ARRAY_PACKAGES
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from cosim.core.geometry import Pose
 from cosim.core.state import Age, People, PersonKind, RobotState, Street
 from cosim.people.gait import Strides
-from cosim.people.neighbours import nearby_people
+from cosim.people.steering import nearby_people
 from cosim.place.street_map import StreetMap
 from cosim.report.minimap import EVENT, Minimap
 from cosim.results.delay import Tracks

@@ -11,7 +11,7 @@ import pytest
 from cosim.core.errors import SpecError, UsageError
 from cosim.core.geometry import Pose
 from cosim.core.state import People, RobotState, Street
-from cosim.episode.camera_rules import nonstandard
+from cosim.episode.manifest_checks import nonstandard
 from cosim.results.run_folder import read_records, read_spec
 from cosim.results.table import table_row
 from cosim.spec.camera import CameraSpec, Lens

@@ -9,7 +9,7 @@ import pytest
 from cosim.core.errors import EngineError, PolicyError, UsageError
 from cosim.core.state import Command
 from cosim.episode.interfaces import Observation
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
 from cosim.results.referee import Verdict
 from cosim.spec.camera import CameraSpec
 from cosim.spec.episode_id import pseudonym_of

@@ -13,7 +13,7 @@ from cosim.core.errors import RunError
 from cosim.core.geometry import Pose
 from cosim.core.state import Command, Planned, RobotState
 from cosim.episode.command_delay import InFlight
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
 from cosim.results.log import Log
 from cosim.results.waypoint_replay import Following
 from tests.support.driven_runs import driven, short_way

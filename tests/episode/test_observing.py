@@ -14,9 +14,8 @@ import pytest
 from cosim.core.geometry import Pose
 from cosim.core.state import STILL, Frame, Motion, People, RobotState, Street
 from cosim.episode.interfaces import Observation, Privileged
-from cosim.episode.loop import Moment
+from cosim.episode.loop import Moment, Step
 from cosim.episode.observer import Observer
-from cosim.episode.step import Step
 from cosim.spec.camera import CameraSpec
 from cosim.spec.events import Event, EventReply
 from cosim.spec.goal import GoalProtocol, ImageGoal, PointGoal

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cosim.core.geometry import Pose
-from cosim.episode.odometer import Gps, Odometer, WheelOdometer, odometer_for
+from cosim.episode.observer import Gps, Odometer, WheelOdometer, odometer_for
 from cosim.spec.odometry import GpsNoise, Odometry, WheelNoise
 
 START = Pose(10.0, 20.0, 0.5 * math.pi)

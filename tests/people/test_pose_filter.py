@@ -10,8 +10,7 @@ import pytest
 
 from cosim.core.geometry import Floats, Pose, box_disk_gap, wrap_angle
 from cosim.core.state import PERSON_RADIUS_M
-from cosim.people.standing import Standing
-from cosim.people.yielding import RobotBody
+from cosim.people.yielding import RobotBody, Standing
 from cosim.spec.events import StandingBody
 from sumo_nets.crowd.pose_filter import MAX_SPEED_MPS, MAX_TURN_RADPS, PoseFilter
 

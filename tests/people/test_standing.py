@@ -13,7 +13,7 @@ from shapely.geometry import Polygon, box
 
 from cosim.core.geometry import Floats
 from cosim.core.state import PERSON_RADIUS_M
-from cosim.people.standing import Standing, standing_bodies
+from cosim.people.yielding import Standing, standing_bodies
 from cosim.spec.events import EventQuery, Walker
 from cosim.spec.obstacle import OBSTACLE_SIZES_M, Obstacle, footprint
 from scenarios.events.sight import Sight

@@ -164,7 +164,7 @@ def test_a_name_tells_all_that_a_tile_stands_on() -> None:
         "physics",
     }
     packages = {package for top in tops for package in packages_distributions()[top]}
-    assert packages - {"msgspec"} <= set(cache_module._MADE_WITH)
+    assert packages - {"msgspec"} <= set(cache_module._ARRAY_PACKAGES)
 
 
 @pytest.mark.engine

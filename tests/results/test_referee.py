@@ -24,7 +24,7 @@ from cosim.core.state import (
     Vehicles,
     write_protected,
 )
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
 from cosim.place.street_map import WalkableArea
 from cosim.results.referee import FREE_OF_OBSTACLES_M, Referee, Verdict
 from cosim.spec.events import Event, EventReply, EventState, Walker

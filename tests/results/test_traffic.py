@@ -11,7 +11,7 @@ import shapely
 
 from cosim.core.geometry import Pose
 from cosim.core.state import STILL, Motion, People, RobotState, Signal, Street, Vehicles
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
 from cosim.place.street_map import Corner, Lane, Located, StreetMap, Strip
 from cosim.results.traffic import OnRoad, TrafficMonitor, braking_for
 from cosim.spec.events import EventReply

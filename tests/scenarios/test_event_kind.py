@@ -14,11 +14,18 @@ import pytest
 
 from cosim.core.errors import SpecError
 from cosim.core.state import Age, Command, PersonKind
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
 from cosim.place.walk_graph import WalkGraph
 from cosim.results.referee import Verdict
-from cosim.spec.event_kind import EventKind, EventKinds, SidewalkLayout
-from cosim.spec.events import Event, EventQuery, EventState, Walker
+from cosim.spec.events import (
+    Event,
+    EventKind,
+    EventKinds,
+    EventQuery,
+    EventState,
+    SidewalkLayout,
+    Walker,
+)
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import COURIER, ROBOTS, Robot
 from cosim.spec.scenario import City, CrowdSpec, Scenario, event_faults, read_suite, write_suite

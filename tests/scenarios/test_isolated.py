@@ -16,8 +16,7 @@ from cosim.core.errors import UsageError
 from cosim.results.record import Record
 from cosim.results.run_folder import read_records, read_spec
 from cosim.spec.episode_id import pseudonym_of
-from cosim.spec.options import EpisodeOptions
-from cosim.spec.policy_host import PolicyHost
+from cosim.spec.options import EpisodeOptions, PolicyHost
 from cosim.spec.scenario import Scenario, Suite, write_suite
 from scenarios.runs import run as suite_run
 from scenarios.runs.isolated_policy import isolated_driver

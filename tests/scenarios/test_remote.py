@@ -23,8 +23,7 @@ from cosim.episode.interfaces import Observation
 from cosim.episode.manifest_checks import calibration_of
 from cosim.results.run_folder import read_records, read_spec
 from cosim.spec.connection import Connection
-from cosim.spec.options import EpisodeOptions
-from cosim.spec.policy_host import PolicyHost
+from cosim.spec.options import EpisodeOptions, PolicyHost
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import Scenario, Suite, write_suite
 from scenarios.runs import run as suite_run

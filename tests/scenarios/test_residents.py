@@ -432,7 +432,7 @@ def test_a_crowd_without_residents_is_what_it_was() -> None:
 def test_an_episode_with_residents_is_replayed_and_compared() -> None:
     """They are among the people, the replay has the recorded state hash, and so has the
     counterfactual's."""
-    from cosim.episode.step import Step
+    from cosim.episode.loop import Step
     from cosim.place.walk_graph import WalkGraph
     from cosim.policies.load import load_policy
     from cosim.results.referee import Verdict

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cosim.core.state import NOBODY, People, PersonKind
-from cosim.people.neighbours import nearby_people
+from cosim.people.steering import nearby_people
 from cosim.spec.events import Event, EventQuery, EventReply, EventState, NearbyPerson
 from cosim.spec.injection import Injected, Injection
 from scenarios.events import EVENT_KINDS, react

@@ -14,7 +14,7 @@ from cosim.core.errors import MapError
 from cosim.core.geometry import Polyline, boxes_overlap
 from cosim.core.state import Command, PersonKind, RobotState
 from cosim.episode.interfaces import Observation
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies.privileged.route import bearing_to
 from cosim.results.referee import Verdict

@@ -13,8 +13,7 @@ from cosim.core.errors import SpecError
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import PERSON_RADIUS_M
 from cosim.place.street_map import StreetMap
-from cosim.spec.event_kind import EventKind
-from cosim.spec.events import Event
+from cosim.spec.events import Event, EventKind
 from cosim.spec.obstacle import Obstacle
 from cosim.spec.robot import Robot, robot_called
 from cosim.spec.scenario import Scenario

@@ -21,8 +21,8 @@ from cosim.core.child_process import end_with
 from cosim.core.clock import Clock
 from cosim.core.errors import SpecError
 from cosim.core.progress import Progress
+from cosim.episode.loop import Step
 from cosim.episode.policy_caller import Driver
-from cosim.episode.step import Step
 from cosim.people.yielding import ROBOT_STANDS_MPS
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies.load import load_policy

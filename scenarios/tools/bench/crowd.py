@@ -40,7 +40,7 @@ from cosim.core.state import (
     write_protected,
 )
 from cosim.episode.interfaces import Crowd
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
 from cosim.place.street_map import StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies.privileged.route import Route

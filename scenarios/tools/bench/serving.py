@@ -24,7 +24,7 @@ from cosim.episode.policy_caller import Driver
 from cosim.spec.camera import CameraSpec
 from cosim.spec.connection import Connection
 from cosim.spec.manifest import Manifest
-from cosim.spec.policy_host import PolicyHost
+from cosim.spec.options import PolicyHost
 from cosim.spec.robot import COURIER
 from scenarios.ipc.observation_codec import ObservationDecoder
 from scenarios.runs.isolated_policy import isolated_driver

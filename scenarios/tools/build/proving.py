@@ -11,7 +11,7 @@ import shapely
 from cosim.core.errors import CosimError
 from cosim.core.geometry import box_disk_gap
 from cosim.core.state import PERSON_RADIUS_M
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
 from cosim.policies.load import load_policy
 from cosim.results.record import Record
 from cosim.results.referee import Verdict

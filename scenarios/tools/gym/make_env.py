@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from cosim.core.errors import UsageError
-from cosim.episode.camera_rules import check_camera
-from cosim.episode.manifest_checks import with_goal
+from cosim.episode.manifest_checks import check_camera, with_goal
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import robot_called

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from cosim.core.state import Command, RobotState
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
 from cosim.results.record import Ended
 from cosim.results.referee import Failure, Verdict
 from cosim.spec.scenario import Scenario

@@ -19,9 +19,9 @@ from cosim.core.clock import Clock
 from cosim.core.geometry import Polyline, Pose, wrap_angle
 from cosim.core.progress import Progress, ignore
 from cosim.core.state import NOBODY, People, PersonKind, RobotState, Street
-from cosim.episode.camera_rules import check_camera
 from cosim.episode.interfaces import Observation
 from cosim.episode.loop import Moment
+from cosim.episode.manifest_checks import check_camera
 from cosim.episode.observer import Observer
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import CameraName

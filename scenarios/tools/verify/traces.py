@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import EngineError
 from cosim.core.state import Frame, RobotState, Street
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
 from cosim.policies.load import load_policy
 from cosim.results.referee import Verdict
 from cosim.spec.camera import CameraSpec

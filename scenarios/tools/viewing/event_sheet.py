@@ -19,8 +19,7 @@ from cosim.core.geometry import Floats, wrap_angles
 from cosim.results.log import Log
 from cosim.results.record import Record
 from cosim.results.run_folder import read_records
-from cosim.spec.event_kind import EventKinds
-from cosim.spec.events import Event
+from cosim.spec.events import Event, EventKinds
 from cosim.spec.scenario import Scenario, read_suite
 from scenarios.events import EVENT_KINDS
 

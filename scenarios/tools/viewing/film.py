@@ -23,7 +23,7 @@ from cosim.core.geometry import Floats
 from cosim.core.progress import Progress, ignore
 from cosim.core.state import DIRECTED, RobotState, Street
 from cosim.episode.interfaces import Eyes
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
 from cosim.report import hud
 from cosim.report.encoding import Video
 from cosim.report.legend import Image

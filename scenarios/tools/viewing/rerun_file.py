@@ -37,8 +37,8 @@ from cosim.core.geometry import Floats, Pose
 from cosim.core.progress import Progress, ignore
 from cosim.core.state import LABELS, PERSON_RADIUS_M, Street
 from cosim.episode.interfaces import Eyes
+from cosim.episode.loop import Step
 from cosim.episode.manifest_checks import calibration_of
-from cosim.episode.step import Step
 from cosim.place.street_map import Lane
 from cosim.report.above import BARRIER, OBSTACLE, ROAD, ROUTE, VERGE
 from cosim.report.legend import Rgb255

@@ -16,7 +16,7 @@ from cosim.core.clock import Clock
 from cosim.core.geometry import Floats
 from cosim.core.state import PersonKind, Street
 from cosim.episode.interfaces import Eyes
-from cosim.episode.step import Step
+from cosim.episode.loop import Step
 from cosim.place.street_map import StreetMap
 from cosim.report.above import street_areas
 from cosim.report.encoding import image_url
