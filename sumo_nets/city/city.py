@@ -17,8 +17,7 @@ import numpy as np
 from cosim.core.errors import MapError, unknown
 from cosim.spec.scenario import CITY_SIZE_M
 from sumo_nets.city.blocks import CLASSES
-from sumo_nets.city.draft import Cell, Draft, Link
-from sumo_nets.city.plan import CityPlan, plan_of
+from sumo_nets.city.plan import Cell, CityPlan, Draft, Link, plan_of
 
 _SIZE_M = (CITY_SIZE_M.low, CITY_SIZE_M.high)
 """Smallest and largest city."""

@@ -18,8 +18,8 @@ from sumo_nets.city.blocks import CLASSES, Point
 from sumo_nets.city.city import plan_city
 from sumo_nets.city.plan import CityPlan, Edge
 from sumo_nets.city.signals import with_programs
-from sumo_nets.net.net_hash import net_content_hash, without_comments
 from sumo_nets.net.netconvert import netconvert
+from sumo_nets.net.raw_file import net_content_hash, without_comments
 
 _CROSSING_M = 3.2
 _NETCONVERT = (

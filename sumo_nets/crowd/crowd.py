@@ -34,16 +34,20 @@ from cosim.spec.events import Actor, EventReply
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import CrowdSpec
 from sumo_nets import engine
-from sumo_nets.crowd.demand import LINGER_M, VEHICLE_REACH_M, Drivers, Pedestrians, Seen
+from sumo_nets.crowd.demand import (
+    LINGER_M,
+    VEHICLE_REACH_M,
+    Drivers,
+    Pedestrians,
+    Seen,
+    replayed_demand,
+)
 from sumo_nets.crowd.demand_log import Entrances
-from sumo_nets.crowd.demand_replay import replayed_demand
 from sumo_nets.crowd.empty_street import TICK_MS, start_of
 from sumo_nets.crowd.group_cohesion import Together
-from sumo_nets.crowd.kerb_waiting import Kerbs
-from sumo_nets.crowd.lights import Signals, SumoLights
-from sumo_nets.crowd.pose_filter import PoseFilter
+from sumo_nets.crowd.lights import Kerbs, Signals, SumoLights
 from sumo_nets.crowd.proxy import Proxy, Walks
-from sumo_nets.crowd.shown_people import ShownPeople, cast_in_order, places_of
+from sumo_nets.crowd.shown_people import PoseFilter, ShownPeople, cast_in_order, places_of
 from sumo_nets.engine import NearPersons, NearVehicles, sumo, translated
 
 _ROLL_TICKS = 10

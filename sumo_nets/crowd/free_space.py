@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Final
+from collections.abc import Iterable
+from typing import Final, NamedTuple
 
 import numpy as np
 import shapely
 
+from cosim.core.geometry import Floats, Polyline, Pose
 from cosim.place.street_map import StreetMap
 
 AGAIN_M: Final = 5.0
@@ -35,3 +37,70 @@ class Room:
             near = self._polygons[self._tree.query(disk, predicate="intersects")]
             self._area_m2 = float(shapely.area(shapely.intersection(near, disk)).sum())
         return self._area_m2
+
+
+class EntrySpot(NamedTuple):
+    """A place on the middle line of an edge, heading along it; share: of the edge's length that
+    lies before it."""
+
+    edge: str
+    share: float
+    pose: Pose
+
+    def beside(self, left_m: float, ahead_m: float) -> tuple[float, float]:
+        """A point so far to the left of it and ahead of it, in metres."""
+        cos, sin = math.cos(self.pose.heading_rad), math.sin(self.pose.heading_rad)
+        return (
+            self.pose.x_m - left_m * sin + ahead_m * cos,
+            self.pose.y_m + left_m * cos + ahead_m * sin,
+        )
+
+
+class Spots:
+    """Where somebody may enter: points every `step_m` along lines, made for the lines that are
+    asked about."""
+
+    def __init__(self, lines: Iterable[tuple[str, Floats, float, float]], step_m: float) -> None:
+        """lines: edge id, (N, 2) metres, and how much to leave free at its start and end in
+        metres."""
+        self._lines = list(lines)
+        self._step_m = step_m
+        self._made: dict[int, tuple[Floats, Floats]] = {}
+        points = [line for _, line, _, _ in self._lines]
+        starts = np.cumsum([0, *map(len, points)])[:-1]
+        if points:
+            whole = np.concatenate(points)
+            self._low = np.minimum.reduceat(whole, starts)
+            self._high = np.maximum.reduceat(whole, starts)
+
+    def ring(self, x_m: float, y_m: float, low_m: float, high_m: float) -> list[tuple[int, int]]:
+        """The spots at a distance in [low_m, high_m), each by the number of its line and its own on
+        it."""
+        if not self._lines:
+            return []
+        beside = np.maximum(np.maximum(self._low - (x_m, y_m), (x_m, y_m) - self._high), 0.0)
+        lines = np.flatnonzero((beside * beside).sum(axis=1) <= high_m * high_m + 1.0)
+        poses = [self._on(number)[1] for number in lines.tolist()]
+        numbers = np.repeat(lines, [len(on) for on in poses])
+        places = np.concatenate([np.arange(len(on)) for on in poses] or [numbers])
+        gap = np.concatenate([on[:, :2] for on in poses] or [np.zeros((0, 2))]) - (x_m, y_m)
+        here = ((gap * gap).sum(axis=1) <= high_m * high_m) & (
+            np.hypot(gap[:, 0], gap[:, 1]) >= low_m
+        )
+        return list(zip(numbers[here].tolist(), places[here].tolist(), strict=True))
+
+    def __getitem__(self, spot: tuple[int, int]) -> EntrySpot:
+        number, k = spot
+        shares, poses = self._on(number)
+        return EntrySpot(self._lines[number][0], float(shares[k]), Pose(*poses[k].tolist()))
+
+    def _on(self, number: int) -> tuple[Floats, Floats]:
+        """(N,) shares and (N, 3) poses of the spots of a line."""
+        if number not in self._made:
+            _, xy, start_m, end_m = self._lines[number]
+            line = Polyline(xy)
+            s = np.arange(start_m, line.length_m - end_m, self._step_m)
+            x, y = (np.interp([s - 0.1, s, s + 0.1], line.s_m, line.points[:, k]) for k in (0, 1))
+            poses = np.column_stack([x[1], y[1], np.arctan2(y[2] - y[0], x[2] - x[0])])
+            self._made[number] = s / line.length_m, poses
+        return self._made[number]

@@ -5,7 +5,9 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Final
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final, NamedTuple
 
 from sumo_nets.maps.levels import settle_levels
 from sumo_nets.maps.sidewalks import STREET_WIDTHS_M
@@ -32,3 +34,49 @@ SUITE_RULES: Final = Rules(3, {}, (mend_signals,))
 nets."""
 NEWEST_RULES: Final = Rules(4, STREET_WIDTHS_M, (settle_levels, mend_signals, lengthen_walks))
 """The version that imports everything else."""
+
+
+_Box = tuple[float, float, float, float]
+
+
+class WheelPlace(NamedTuple):
+    """A crop of a net.
+
+    net: path below the wheel's tools/game.
+    box: west, south, east, north in degrees, None for all of it.
+    osm: drawn from OpenStreetMap data.
+    rules: the version of the importer, which decides the hash of the net.
+    """
+
+    net: str
+    box: _Box | None = None
+    osm: bool = False
+    rules: Rules = SUITE_RULES
+
+    @property
+    def path(self) -> Path:
+        """Where the net lies on this machine."""
+        import sumo
+
+        return Path(sumo.__file__).parent / "tools" / "game" / self.net
+
+
+_BERLIN = "DRT/osm.net.xml"
+_BRAUNSCHWEIG = "bs3d/bs.net.xml"
+_WILDAU = "A10KW/osm.net.xml"
+
+WHEEL_PLACES: Final[Mapping[str, WheelPlace]] = MappingProxyType(
+    {
+        "berlin-1": WheelPlace(_BERLIN, (13.5212, 52.4242, 13.5307, 52.4303), osm=True),
+        "berlin-2": WheelPlace(_BERLIN, (13.5210, 52.4302, 13.5305, 52.4363), osm=True),
+        "berlin-3": WheelPlace(_BERLIN, (13.5309, 52.4243, 13.5404, 52.4304), osm=True),
+        "berlin-4": WheelPlace(_BERLIN, (13.5307, 52.4303, 13.5354, 52.4364), osm=True),
+        "berlin-5": WheelPlace(_BERLIN, (13.5354, 52.4303, 13.5402, 52.4364), osm=True),
+        "berlin-6": WheelPlace(_BERLIN, (13.5406, 52.4244, 13.5500, 52.4305), osm=True),
+        "berlin-7": WheelPlace(_BERLIN, (13.5404, 52.4304, 13.5498, 52.4365), osm=True),
+        "ingolstadt-1": WheelPlace("fkk_in/ingolstadt.net.xml.gz", osm=True),
+        "braunschweig-1": WheelPlace("fokr_bs_demo/fokr_bs.net.xml.gz"),
+        "braunschweig-2": WheelPlace(_BRAUNSCHWEIG, (10.5256, 52.2699, 10.5350, 52.2762), osm=True),
+        "wildau-1": WheelPlace(_WILDAU, (13.5939, 52.3129, 13.6059, 52.3202), osm=True),
+    }
+)

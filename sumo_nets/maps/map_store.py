@@ -24,12 +24,10 @@ from cosim.place.map_check import MapCheck, check_map
 from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import CityMap, Place
 from sumo_nets.maps.feature_file import NAME, read_features, with_features, write_features
-from sumo_nets.maps.import_rules import NEWEST_RULES, SUITE_RULES
+from sumo_nets.maps.import_rules import NEWEST_RULES, SUITE_RULES, WHEEL_PLACES
 from sumo_nets.maps.importer import OSM_LICENCE, Options, convert
-from sumo_nets.maps.wheel_places import WHEEL_PLACES
 from sumo_nets.net.net_facts import read_facts
-from sumo_nets.net.net_hash import net_content_hash
-from sumo_nets.net.raw_file import head_of
+from sumo_nets.net.raw_file import head_of, net_content_hash
 from sumo_nets.net.snapshot import street_map_of
 
 ABOUT = "about.json"

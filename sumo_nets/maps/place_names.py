@@ -30,7 +30,7 @@ from sumo_nets.maps.map_store import (
     map_name,
     maps_folder,
 )
-from sumo_nets.net.net_hash import net_content_hash
+from sumo_nets.net.raw_file import net_content_hash
 
 HINT = "the folder of `cosim city make` or of an imported map, or a .net.xml file"
 

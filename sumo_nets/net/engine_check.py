@@ -12,8 +12,8 @@ import numpy as np
 
 from sumo_nets import engine
 from sumo_nets.engine import sumo
-from sumo_nets.net.net_hash import net_content_hash
 from sumo_nets.net.netconvert import netconvert
+from sumo_nets.net.raw_file import net_content_hash
 
 _SECONDS: Final = 60
 _NODES: Final = """<nodes>

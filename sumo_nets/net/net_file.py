@@ -23,9 +23,8 @@ from cosim.core.geometry import Floats
 from cosim.place.overlay import where_geos_failed
 from cosim.place.street_map import Corner, Junction, Lane, Port, StreetMap, Strip
 from sumo_nets.net.elevation import land_of, steep_ports, steep_strips
-from sumo_nets.net.net_hash import hash_of
 from sumo_nets.net.outlines import areas_of, bands, close_seams, coordinates, polylines
-from sumo_nets.net.raw_file import DEEPEST, net_bytes
+from sumo_nets.net.raw_file import DEEPEST, hash_of, net_bytes
 from sumo_nets.net.signal_plans import SignalPrograms
 
 LANE_M = 3.2

@@ -13,7 +13,7 @@ from cosim.core.state import PERSON_RADIUS_M
 from cosim.people.standing import Standing
 from cosim.people.yielding import RobotBody
 from cosim.spec.events import StandingBody
-from sumo_nets.crowd.pose_filter import MAX_SPEED_MPS, MAX_TURN_RADPS, PoseFilter
+from sumo_nets.crowd.shown_people import MAX_SPEED_MPS, MAX_TURN_RADPS, PoseFilter
 
 DT_S = 0.05
 

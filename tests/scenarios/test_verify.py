@@ -238,7 +238,7 @@ def test_an_edited_source_is_told_by_its_room(tmp_path: Path) -> None:
             ROOT / room, tmp_path / room, ignore=shutil.ignore_patterns("__pycache__", "*.json")
         )
     before = room_hashes(tmp_path)
-    edited = tmp_path / "sumo_nets" / "crowd" / "pose_filter.py"
+    edited = tmp_path / "sumo_nets" / "crowd" / "shown_people.py"
     edited.write_text(edited.read_text().replace("MAX_SPEED_MPS = 2.2", "MAX_SPEED_MPS = 2.1"))
     after = room_hashes(tmp_path)
     assert before == room_hashes(ROOT)
