@@ -12,6 +12,7 @@ from typing import Final, NamedTuple
 from sumo_nets.maps.levels import settle_levels
 from sumo_nets.maps.sidewalks import STREET_WIDTHS_M
 from sumo_nets.maps.signal_check import lengthen_walks, mend_signals
+from sumo_nets.net.netconvert import sumo_home
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,9 +57,7 @@ class WheelPlace(NamedTuple):
     @property
     def path(self) -> Path:
         """Where the net lies on this machine."""
-        import sumo
-
-        return Path(sumo.__file__).parent / "tools" / "game" / self.net
+        return sumo_home() / "tools" / "game" / self.net
 
 
 _BERLIN = "DRT/osm.net.xml"

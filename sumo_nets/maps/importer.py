@@ -32,7 +32,6 @@ from sumo_nets.maps.net_steps import (
     add_walkways,
     crop_net,
     start_sumo,
-    sumo_home,
     widen_sidewalks,
 )
 from sumo_nets.maps.osm_crop import Box
@@ -47,6 +46,7 @@ from sumo_nets.maps.sidewalks import (
 )
 from sumo_nets.net.net_facts import facts_of, net_root, read_facts
 from sumo_nets.net.net_file import read_net
+from sumo_nets.net.netconvert import sumo_home
 
 TYPES = (
     "osmNetconvert.typ.xml",

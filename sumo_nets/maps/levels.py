@@ -12,8 +12,9 @@ from typing import Final
 
 import shapely
 
-from sumo_nets.net.net_facts import footway
-from sumo_nets.net.net_file import GROUND, LANE_M
+from sumo_nets.net.elevation import GROUND
+from sumo_nets.net.net_facts import footway, params_of
+from sumo_nets.net.net_file import LANE_M
 
 LEVEL_KEYS: Final = ("bridge", "tunnel", "layer", "covered", "location", "level")
 """Tags of OSM ways that can say that a way is not on the ground."""
@@ -48,7 +49,7 @@ def settle_levels(root: ET.Element) -> list[str]:
     normal = [
         edge for edge in root.iter("edge") if not edge.get("function") and len(edge.findall("lane"))
     ]
-    said = {edge.get("id", ""): _params(edge) for edge in normal}
+    said = {edge.get("id", ""): params_of(edge) for edge in normal}
     moved = 0
     doubtful = list[ET.Element]()
     for edge in normal:
@@ -78,10 +79,6 @@ def settle_levels(root: ET.Element) -> list[str]:
             f"street over or under them"
         )
     return changes
-
-
-def _params(edge: ET.Element) -> dict[str, str]:
-    return {param.get("key", ""): param.get("value", "") for param in edge.findall("param")}
 
 
 def _set_layer(edge: ET.Element, layer: str | None) -> None:

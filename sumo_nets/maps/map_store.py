@@ -27,6 +27,7 @@ from sumo_nets.maps.feature_file import NAME, read_features, with_features, writ
 from sumo_nets.maps.import_rules import NEWEST_RULES, SUITE_RULES, WHEEL_PLACES
 from sumo_nets.maps.importer import OSM_LICENCE, Options, convert
 from sumo_nets.net.net_facts import read_facts
+from sumo_nets.net.netconvert import sumo_home
 from sumo_nets.net.raw_file import head_of, net_content_hash
 from sumo_nets.net.snapshot import street_map_of
 
@@ -293,11 +294,8 @@ def _options_of(name: str) -> Options:
 @cache
 def _game_nets() -> dict[str, Path]:
     """Nets with sidewalks that come with the SUMO package, by the names they have here."""
-    import sumo
-
-    tools = Path(sumo.__file__).parent / "tools"
     found: dict[str, Path] = {}
-    for path in sorted((tools / "game").glob("*/*.net.xml*")):
+    for path in sorted((sumo_home() / "tools" / "game").glob("*/*.net.xml*")):
         data = path.read_bytes()
         if b'function="walkingarea"' in (gzip.decompress(data) if path.suffix == ".gz" else data):
             name = "sumo-" + path.parent.name.lower().replace("_", "-")

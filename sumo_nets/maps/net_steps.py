@@ -16,8 +16,9 @@ from cosim.place.map_check import NetFacts
 from sumo_nets.maps.osm_crop import Box, refuse_box_outside
 from sumo_nets.maps.osm_file import MapFile
 from sumo_nets.maps.sidewalks import set_widths
-from sumo_nets.net.net_facts import allows, net_root, read_facts
-from sumo_nets.net.netconvert import complaints, netconvert
+from sumo_nets.net.net_facts import net_root, read_facts
+from sumo_nets.net.net_file import allows
+from sumo_nets.net.netconvert import complaints, netconvert, sumo_home
 
 TIMEOUT_S = 300.0
 START_TIMEOUT_S = 60.0
@@ -118,10 +119,10 @@ def add_walkways(work: ImportWork, net: Path, facts: NetFacts) -> Path:
         if (
             len(lanes) == 1
             and not edge.get("function")
-            and allows(lanes[0], "pedestrian")
+            and allows(lanes[0].attrib, "pedestrian")
             and _is_footway(edge)
         ):
-            freed += allows(lanes[0], "passenger")
+            freed += allows(lanes[0].attrib, "passenger")
             lanes[0].attrib.pop("disallow", None)
             lanes[0].set("allow", "pedestrian")
     ready = work.written(root, "ready.net.xml")
@@ -197,10 +198,3 @@ def start_sumo(file: MapFile, net: Path) -> None:
     if done.returncode != 0:
         ended = f"(sumo -n NET -e 1 ends with {done.returncode})"
         raise MapError(f"{file.source}: SUMO refuses the net {ended}{complaints(done.stderr)}")
-
-
-def sumo_home() -> Path:
-    """Return the folder of the SUMO package."""
-    import sumo
-
-    return Path(sumo.__file__).parent

@@ -28,6 +28,9 @@ from cosim.place.terrain import (
 SAME_LEVEL_M: Final = 1.5
 """Places side by side that differ by more are on different terraces."""
 
+GROUND: Final = ("no", "", "building_passage")
+"""Values of the params `bridge` and `tunnel` for ways on the ground."""
+
 _SPACING_M = 4.0
 _BESIDE_M = 5.0
 _ROUNDS = 300
@@ -65,12 +68,19 @@ def course(edge: str, shape: str, on: On = "street", ring: bool = False) -> Cour
     return Course(edge, points, on, ring)
 
 
+def off_ground(params: Mapping[str, str], kind: str) -> bool:
+    """Return whether the params or the type of an edge say that it is a bridge or a tunnel."""
+    if any(params.get(key, "no") not in GROUND for key in ("bridge", "tunnel")):
+        return True
+    return params.get("layer", "0") not in ("0", "") or kind.endswith(("_bridge", "_tunnel"))
+
+
 def what_lies_there(kind: str, params: Mapping[str, str], apart: bool) -> On:
-    """What an edge leads over, as far as its type and params say. apart: nothing drives there."""
-    raised = any(
-        params.get(key, "no") not in ("no", "", "building_passage") for key in ("bridge", "tunnel")
-    )
-    if raised or params.get("layer", "0") not in ("0", "") or kind.endswith(("_bridge", "_tunnel")):
+    """Return the kind of ground under an edge, from its type and params.
+
+    apart: whether no vehicles drive on it.
+    """
+    if off_ground(params, kind):
         return "raised"
     if "steps" in kind:
         return "steps"

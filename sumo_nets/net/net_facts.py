@@ -17,7 +17,8 @@ import shapely
 from cosim.core.errors import MapError
 from cosim.place.map_check import STEEP, NetFacts
 from cosim.place.terrain import FALSE_GRADE
-from sumo_nets.net.net_file import going_on
+from sumo_nets.net.elevation import off_ground
+from sumo_nets.net.net_file import allows
 from sumo_nets.net.raw_file import net_bytes, other_root
 
 GO = frozenset("Gg")
@@ -48,20 +49,11 @@ def net_root(path: Path) -> ET.Element:
     return root
 
 
-def allows(lane: ET.Element, vehicle: str) -> bool:
-    """Whether a lane lets a class of road users in."""
-    allow = lane.get("allow")
-    disallow = lane.get("disallow", "")
-    if allow is not None:
-        return allow == "all" or vehicle in allow.split()
-    return disallow != "all" and vehicle not in disallow.split()
-
-
 def footway(edge: ET.Element) -> tuple[ET.Element, str] | None:
     """The lane of an edge that people walk on, and its kind: pavement, shared with bicycles, mixed
     with cars."""
-    walked = [lane for lane in edge.iter("lane") if allows(lane, "pedestrian")]
-    apart = next((lane for lane in walked if not allows(lane, "passenger")), None)
+    walked = [lane for lane in edge.iter("lane") if allows(lane.attrib, "pedestrian")]
+    apart = next((lane for lane in walked if not allows(lane.attrib, "passenger")), None)
     if apart is not None:
         return apart, "pavement" if apart.get("allow") == "pedestrian" else "shared"
     return (walked[0], "mixed") if walked else None
@@ -141,7 +133,7 @@ def facts_of(root: ET.Element) -> NetFacts:
             grade = _steepest(lane.attrib["shape"])
             steep += grade > STEEP
             false_grades += grade > FALSE_GRADE
-            if _off_ground(edge):
+            if off_ground(params_of(edge), edge.get("type", "")):
                 levels[edge.attrib["id"]] = length_m / 1000.0
     walks = walks_of(root)
     location = root.find("location")
@@ -201,7 +193,6 @@ def _steepest(shape: str) -> float:
     return max(grades)
 
 
-def _off_ground(edge: ET.Element) -> bool:
-    """Whether an edge is on a bridge or in a tunnel, as far as the net says so."""
-    said = {param.get("key", ""): param.get("value", "") for param in edge.findall("param")}
-    return going_on(said, edge.get("type", "")) == "bridge"
+def params_of(edge: ET.Element) -> dict[str, str]:
+    """Return the params of an edge by their keys."""
+    return {param.get("key", ""): param.get("value", "") for param in edge.findall("param")}

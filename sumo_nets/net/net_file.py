@@ -22,7 +22,7 @@ from cosim.core.errors import MapError
 from cosim.core.geometry import Floats
 from cosim.place.overlay import where_geos_failed
 from cosim.place.street_map import Corner, Junction, Lane, Port, StreetMap, Strip
-from sumo_nets.net.elevation import land_of, steep_ports, steep_strips
+from sumo_nets.net.elevation import land_of, off_ground, steep_ports, steep_strips
 from sumo_nets.net.outlines import areas_of, bands, close_seams, coordinates, polylines
 from sumo_nets.net.raw_file import DEEPEST, hash_of, net_bytes
 from sumo_nets.net.signal_plans import SignalPrograms
@@ -30,8 +30,6 @@ from sumo_nets.net.signal_plans import SignalPrograms
 LANE_M = 3.2
 """SUMO's width of a lane, sidewalks included, that names none."""
 SPECK_M2 = 0.5
-GROUND = ("no", "", "building_passage")
-"""What the params `bridge` and `tunnel` say of ways on the ground."""
 HEAVY = frozenset(("rail", "rail_electric", "rail_fast", "subway", "ship", "cable_car", "aircraft"))
 TRAMS = frozenset(("tram", "rail_urban"))
 NEEDED = {
@@ -198,7 +196,7 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
             width_m=float(widths[k]),
             polygon=polygons[k],
             internal=edge.attributes.get("function", "") == "internal",
-            cars=_allows(lane, "passenger"),
+            cars=allows(lane, "passenger"),
         )
         for k, (edge, lane, kind) in enumerate(driven, len(walk))
     }
@@ -257,14 +255,15 @@ def _lane_of(link: Attributes, end: str) -> int:
         ) from error
 
 
-def _allows(lane: Attributes, vehicle: str) -> bool:
+def allows(lane: Attributes, vehicle: str) -> bool:
+    """Return whether a lane permits a SUMO vehicle class, for example "pedestrian"."""
     if "allow" in lane:
         return lane["allow"] == "all" or vehicle in lane["allow"].split()
     return lane.get("disallow", "") != "all" and vehicle not in lane.get("disallow", "").split()
 
 
 def _only_walked(lane: Attributes) -> bool:
-    return _allows(lane, "pedestrian") and not _allows(lane, "passenger")
+    return allows(lane, "pedestrian") and not allows(lane, "passenger")
 
 
 def _footway(edge: _Edge) -> int:
@@ -394,15 +393,13 @@ def _strip(
         verge_m=number("verge_m", sum(verges)),
         road_side=side,
         driveways=_driveways(edge.params.get("driveways", ""), line),
-        going=going_on(edge.params, edge.attributes.get("type", "")),
+        going=_going(edge.params, edge.attributes.get("type", "")),
     )
 
 
-def going_on(said: Mapping[str, str], kind: str) -> Literal["plain", "steps", "bridge"]:
-    """What an edge leads over, as far as its params and its type say so; tunnels count as
-    bridges."""
-    raised = any(said.get(key, "no") not in GROUND for key in ("bridge", "tunnel"))
-    if raised or said.get("layer", "0") not in ("0", "") or kind.endswith(("_bridge", "_tunnel")):
+def _going(params: Mapping[str, str], kind: str) -> Literal["plain", "steps", "bridge"]:
+    """Return the value of `Strip.going` for an edge, from its params and type."""
+    if off_ground(params, kind):
         return "bridge"
     return "steps" if "highway.steps" in kind.split("|") else "plain"
 

@@ -35,6 +35,13 @@ _STAGES: Final = (
 measured on a city."""
 
 
+def sumo_home() -> Path:
+    """Return the folder of the installed SUMO package."""
+    import sumo
+
+    return Path(sumo.__file__).parent
+
+
 def netconvert(
     arguments: Sequence[str],
     output: Path,
@@ -46,14 +53,7 @@ def netconvert(
 
     progress: called with the share that is done, 0 to 1, whenever netconvert begins a stage.
     """
-    import sumo
-
-    command = [
-        str(Path(sumo.__file__).parent / "bin" / "netconvert"),
-        *arguments,
-        "-o",
-        str(output),
-    ]
+    command = [str(sumo_home() / "bin" / "netconvert"), *arguments, "-o", str(output)]
     try:
         returncode, said = _run(
             command if progress is None else [*command, "--verbose"], timeout_s, progress
