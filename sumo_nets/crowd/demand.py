@@ -1,4 +1,4 @@
-"""The rolling crowd: persons and vehicles around the robot, and where they enter."""
+"""Demand: entries and exits of persons and vehicles around the robot, random or replayed."""
 
 from __future__ import annotations
 
@@ -22,45 +22,50 @@ from sumo_nets.crowd.proxy import ROUND_THE_CORNER_M
 from sumo_nets.engine import Sumo
 
 SIGHT_M = 35.0
-"""Nobody appears nearer to the robot than this."""
-
+"""Smallest distance from the robot at which a person enters, metres."""
 FIRST_FILL_CLEAR_M = 8.0
-"""In the first fill, when nobody watches yet, nobody appears nearer than this."""
-
+"""Smallest distance from the robot in the first fill, before the episode starts, metres."""
 ENTER_M = 40.0
-"""People enter in the outer part of the crowd's radius, so wide."""
-
+"""Width of the outer part of the crowd's radius in which people enter, metres."""
 LINGER_M = 20.0
-"""How far beyond the crowd's radius a person may stray before it is taken out."""
-
+"""Distance beyond the crowd's radius at which a person is removed, metres."""
 STUCK_S = 60.0
-"""A person that has waited this long, but not at a red light, is taken out."""
-
+"""A person that has waited longer, except at a red light, is removed, seconds."""
 _EDGE_M = 0.4
+"""Distance of entering persons from the edge of the sidewalk, metres."""
 _PERSONAL_SPACE_M = 1.5
+"""Smallest distance of an entering person from others, metres."""
 _WALK_EDGES = 30
+"""Number of edges of a random walk."""
 BARRIER_MARGIN_M = 1.0
+"""Additional distance of entries from a closed port, metres."""
 PERSONS_AT_ONCE = 8
-
+"""Largest number of persons that enter in one update."""
 VEHICLE_RING_M = (60.0, 220.0)
+"""Range of distances from the robot at which vehicles enter, metres."""
 VEHICLE_FIRST_M = 25.0
+"""Smallest distance from the robot in the first fill, metres."""
 VEHICLE_FAR_M = 120.0
+"""Preferred smallest distance of later entries, metres."""
 VEHICLE_REACH_M = 250.0
+"""Distance at which a vehicle is removed, metres."""
 VEHICLE_STUCK_S = 180.0
+"""A vehicle outside of VEHICLE_RING_M that has waited longer is removed, seconds."""
 ROUTE_EDGES = 60
+"""Largest number of edges of a vehicle's route."""
 VEHICLES_AT_ONCE = 3
-
+"""Largest number of vehicles that enter in one update."""
 VEHICLE_TYPES: Mapping[str, tuple[float, float, float]] = {
     "small": (3.8, 1.7, 0.25),
     "car": (4.6, 1.8, 0.55),
     "van": (5.6, 2.0, 0.20),
 }
-"""Vehicle type -> length m, width m, share."""
+"""Length in metres, width in metres and share of each vehicle type."""
 
 
 class Seen(NamedTuple):
-    """A person or vehicle near the robot: position (for vehicles of the front bumper) m, and
-    seconds without moving."""
+    """Position of a person, or of a vehicle's front bumper, in metres, and its waiting time in
+    seconds."""
 
     x_m: float
     y_m: float
@@ -68,7 +73,7 @@ class Seen(NamedTuple):
 
 
 class Pedestrians:
-    """The background persons. ages: of everybody who ever entered, by name."""
+    """The background pedestrians. ages: ages of all persons that ever entered, by name."""
 
     def __init__(
         self,
@@ -101,11 +106,11 @@ class Pedestrians:
         self._groups = GroupDraws(spec, rng.spawn(1)[0])
 
     def fill(self, x_m: float, y_m: float) -> None:
-        """Everybody at once, before the episode."""
+        """Let all persons enter before the episode."""
         self._enter(self.wanted(x_m, y_m), x_m, y_m, FIRST_FILL_CLEAR_M, {})
 
     def wanted(self, x_m: float, y_m: float) -> int:
-        """How many persons there should be within the crowd's radius of a point."""
+        """Return the target number of persons within the crowd's radius of a point."""
         if self._room is None or self._spec.density is None:
             return self._spec.persons
         return round(self._spec.density * self._room.area_m2(x_m, y_m) / 1000.0)
@@ -113,11 +118,11 @@ class Pedestrians:
     def roll(
         self, x_m: float, y_m: float, seen: Mapping[str, Seen], at_red: Callable[[str], bool]
     ) -> None:
-        """Take out who is far away or stuck, with all who walk along; let others in instead; keep
+        """Remove persons that are far away or stuck, with their groups; let others enter; keep
         groups together.
 
-        seen: the persons within the crowd's radius and LINGER_M. at_red: whether a person waits at
-        a red light.
+        seen: persons within the crowd's radius plus LINGER_M.
+        at_red: returns whether a person waits at a red light.
         """
         person, radius_m = self._engine.person, self._spec.radius_m
         fellows = self._together.fellows
@@ -151,7 +156,7 @@ class Pedestrians:
         self._enter(min(missing, PERSONS_AT_ONCE), x_m, y_m, low_m, seen)
 
     def _remove(self, name: str) -> None:
-        """Take somebody who is still there out, with all who walk along."""
+        """Remove a person that is still in the simulation, with its group."""
         if name in self._engine.person.getIDList():
             for fellow in self._together.leave(name):
                 self._entrances.people[self._engine.simulation.getTime()].append(fellow)
@@ -206,10 +211,10 @@ class Pedestrians:
                 return
 
     def _one_way(self, walk: list[str], forward: bool) -> list[str]:
-        """A walk that SUMO takes in one direction only.
+        """Return a walk with a unique direction for SUMO.
 
-        From one sidewalk onto another between the same junctions SUMO may set out in either
-        direction, and dies where the two do not meet: there the corner between them is named.
+        Between two sidewalks that join the same two junctions SUMO may start in either direction,
+        and aborts where they do not meet. There the corner between them is added to the walk.
         """
         first, second = (
             {self._engine.edge.getFromJunction(e), self._engine.edge.getToJunction(e)}
@@ -219,7 +224,7 @@ class Pedestrians:
         return walk if first != second or corner is None else [walk[0], corner, *walk[1:]]
 
     def _name(self, age: Age) -> str:
-        """The next name, and who has it is so old."""
+        """Return a new name and store the person's age under it."""
         name = f"c{len(self.ages)}"
         self.ages[name] = age
         return name
@@ -237,7 +242,7 @@ class Pedestrians:
 
 
 class Drivers:
-    """The vehicles."""
+    """The background vehicles."""
 
     def __init__(
         self,
@@ -271,18 +276,18 @@ class Drivers:
             engine.vehicletype.setWidth(kind, width_m)
 
     def size_m(self, name: str) -> tuple[float, float]:
-        """Length and width of a vehicle in metres."""
+        """Return the length and width of a vehicle, metres."""
         return self._size[name]
 
     def fill(self, x_m: float, y_m: float) -> None:
-        """All at once, before the episode."""
+        """Let all vehicles enter before the episode."""
         ring = self._spots.ring(x_m, y_m, VEHICLE_FIRST_M, VEHICLE_RING_M[1])
         for _ in range(self._spec.vehicles if ring else 0):
             self._enter(ring)
 
     def roll(self, x_m: float, y_m: float, seen: Mapping[str, Seen]) -> None:
-        """Take out what is far away or stuck out of sight, let others in instead, far away when
-        possible."""
+        """Remove vehicles that are far away, or stuck out of sight, and let others enter, if
+        possible far away."""
         vehicle = self._engine.vehicle
         staying = 0
         for name in sorted(vehicle.getIDList()):
@@ -325,7 +330,7 @@ class Drivers:
         return route
 
     def _onward(self, edge: str) -> tuple[str, ...]:
-        """The edges a car can go on to; a turn back only where there is nothing else."""
+        """Return the edges that a car can continue on; a U-turn only at dead ends."""
         if edge not in self._next:
             onward: dict[str, bool] = {}
             for lane in self._lanes[edge]:
@@ -345,51 +350,53 @@ def replayed_demand(
     spec: CrowdSpec,
     closed: frozenset[Port],
     together: Together,
-) -> tuple[PedestriansAgain, DriversAgain]:
-    """Those who let the same people and vehicles in and out at the same moments. They draw
-    nothing."""
-    nothing = np.random.default_rng(0)
-    people = PedestriansAgain(engine, before, street_map, spec, nothing, closed, together)
-    return people, DriversAgain(engine, before, street_map, spec, nothing)
+) -> tuple[ReplayedPedestrians, ReplayedDrivers]:
+    """Return pedestrians and vehicles that repeat the entries and exits of `before` at the same
+    times."""
+    unused_rng = np.random.default_rng(0)
+    people = ReplayedPedestrians(engine, before, street_map, spec, unused_rng, closed, together)
+    return people, ReplayedDrivers(engine, before, street_map, spec, unused_rng)
 
 
-class PedestriansAgain(Pedestrians):
-    """People who enter and leave as they did before; who set out at one moment on one walk at one
-    speed are a group."""
+class ReplayedPedestrians(Pedestrians):
+    """Pedestrians that repeat recorded entries and exits.
+
+    Those who enter together with the same walk and speed form a group.
+    """
 
     def fill(self, x_m: float, y_m: float) -> None:
-        self._again()
+        self._replay()
 
     def roll(
         self, x_m: float, y_m: float, seen: Mapping[str, Seen], at_red: Callable[[str], bool]
     ) -> None:
         self._together.forget(self._engine.person.getIDList())
         self._together.keep(seen)
-        self._again()
+        self._replay()
 
-    def _again(self) -> None:
+    def _replay(self) -> None:
         here = set(self._engine.person.getIDList())
-        came = []
+        entered = []
         for one in self._entrances.people.get(self._engine.simulation.getTime(), ()):
             if isinstance(one, PersonEntry):
                 one.enter(self._engine)
-                came.append(one)
+                entered.append(one)
             elif one in here:
                 self._engine.person.remove(one)
-        for (walk, mps), group in groupby(came, key=lambda one: (one.walk, one.mps)):
+        for (walk, mps), group in groupby(entered, key=lambda one: (one.walk, one.mps)):
             self._together.join([one.name for one in group], mps, walk)
 
 
-class DriversAgain(Drivers):
-    """Vehicles that enter and leave as they did before."""
+class ReplayedDrivers(Drivers):
+    """Vehicles that repeat recorded entries and exits."""
 
     def fill(self, x_m: float, y_m: float) -> None:
-        self._again()
+        self._replay()
 
     def roll(self, x_m: float, y_m: float, seen: Mapping[str, Seen]) -> None:
-        self._again()
+        self._replay()
 
-    def _again(self) -> None:
+    def _replay(self) -> None:
         here = set(self._engine.vehicle.getIDList())
         for one in self._entrances.vehicles.get(self._engine.simulation.getTime(), ()):
             if not isinstance(one, str):

@@ -1,4 +1,5 @@
-"""Room: how much of the ground around a point can be walked on, for a crowd of a given density."""
+"""Free space for the crowd: walkable area around a point, and spots where persons or vehicles
+may enter."""
 
 from __future__ import annotations
 
@@ -13,11 +14,11 @@ from cosim.core.geometry import Floats, Polyline, Pose
 from cosim.place.street_map import StreetMap
 
 AGAIN_M: Final = 5.0
-"""How far the point moves before the area is measured again."""
+"""Distance that the point moves before the area is measured again, metres."""
 
 
 class Room:
-    """The walkable area within `radius_m` of a point that moves slowly."""
+    """The walkable area within `radius_m` of a slowly moving point."""
 
     def __init__(self, street_map: StreetMap, radius_m: float) -> None:
         strips = [strip.polygon for strip in street_map.strips.values()]
@@ -29,8 +30,8 @@ class Room:
         self._area_m2 = 0.0
 
     def area_m2(self, x_m: float, y_m: float) -> float:
-        """Square metres of sidewalks, crossings and corners around a point (up to AGAIN_M beside
-        it)."""
+        """Return the area of sidewalks, crossings and corners around a point, m2, accurate to a
+        shift of AGAIN_M."""
         if self._at is None or math.hypot(x_m - self._at[0], y_m - self._at[1]) > AGAIN_M:
             self._at = (x_m, y_m)
             disk = shapely.Point(x_m, y_m).buffer(self._radius_m)
@@ -40,15 +41,15 @@ class Room:
 
 
 class EntrySpot(NamedTuple):
-    """A place on the middle line of an edge, heading along it; share: of the edge's length that
-    lies before it."""
+    """A pose on the middle line of an edge, heading along it. share: share of the edge's length
+    before it."""
 
     edge: str
     share: float
     pose: Pose
 
     def beside(self, left_m: float, ahead_m: float) -> tuple[float, float]:
-        """A point so far to the left of it and ahead of it, in metres."""
+        """Return the point `left_m` to its left and `ahead_m` ahead of it, metres."""
         cos, sin = math.cos(self.pose.heading_rad), math.sin(self.pose.heading_rad)
         return (
             self.pose.x_m - left_m * sin + ahead_m * cos,
@@ -57,12 +58,11 @@ class EntrySpot(NamedTuple):
 
 
 class Spots:
-    """Where somebody may enter: points every `step_m` along lines, made for the lines that are
-    asked about."""
+    """Entry spots every `step_m` along lines, computed per line on demand."""
 
     def __init__(self, lines: Iterable[tuple[str, Floats, float, float]], step_m: float) -> None:
-        """lines: edge id, (N, 2) metres, and how much to leave free at its start and end in
-        metres."""
+        """Index the lines: edge id, points (N, 2), and margins without spots at the start and
+        end, metres."""
         self._lines = list(lines)
         self._step_m = step_m
         self._made: dict[int, tuple[Floats, Floats]] = {}
@@ -74,8 +74,8 @@ class Spots:
             self._high = np.maximum.reduceat(whole, starts)
 
     def ring(self, x_m: float, y_m: float, low_m: float, high_m: float) -> list[tuple[int, int]]:
-        """The spots at a distance in [low_m, high_m), each by the number of its line and its own on
-        it."""
+        """Return the spots at a distance in [low_m, high_m), as pairs of line index and spot
+        index."""
         if not self._lines:
             return []
         beside = np.maximum(np.maximum(self._low - (x_m, y_m), (x_m, y_m) - self._high), 0.0)
@@ -95,7 +95,7 @@ class Spots:
         return EntrySpot(self._lines[number][0], float(shares[k]), Pose(*poses[k].tolist()))
 
     def _on(self, number: int) -> tuple[Floats, Floats]:
-        """(N,) shares and (N, 3) poses of the spots of a line."""
+        """Return the shares (N,) and poses (N, 3) of the spots of a line."""
         if number not in self._made:
             _, xy, start_m, end_m = self._lines[number]
             line = Polyline(xy)

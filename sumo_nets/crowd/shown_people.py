@@ -1,5 +1,4 @@
-"""Everybody in a street, as it is shown: the crowd that SUMO moves and the people who are put where
-they are."""
+"""Displayed pedestrians: filtered poses of SUMO's crowd, and event pedestrians."""
 
 from __future__ import annotations
 
@@ -22,28 +21,34 @@ from cosim.spec.events import Actor
 from sumo_nets.crowd.separation import NearPairs, kept_apart
 
 MAX_SPEED_MPS = 2.2
-"""The fastest a shown person moves: above every walking speed, so that it catches up."""
+"""Largest displayed speed, m/s: above every walking speed, so that people catch up with SUMO."""
 
 MAX_TURN_RADPS = math.pi
-"""The fastest a shown person turns."""
+"""Largest displayed turn rate, rad/s."""
 
 LOOK_AHEAD_S = 0.3
-"""Time constant of the motion that the heading follows: a sidestep is over before the body has
-turned."""
+"""Time constant of the motion that the heading follows, seconds; short side steps do not turn
+the body."""
 
 TURNING_SPEED_MPS = 0.3
-"""Below this the motion says nothing about where somebody faces."""
+"""Below this speed the motion does not change the heading, m/s."""
 
 PERSON_STANDS_MPS = 0.1
-"""Below this SUMO's person stands."""
+"""Below this speed a SUMO person is standing, m/s."""
 
 NOBODY_ELSE: Floats = np.zeros((0, 2))
 
 
 @dataclass(slots=True)
 class PoseFilter:
-    """Remembers the shown poses of everybody; `update` moves them one period of `period_s` on.
-    standing: what people step round besides the robot."""
+    """Filter of the displayed poses, updated every `period_s` seconds.
+
+    SUMO's striping model moves a person by metres in one step where strips and corners meet, and
+    flips its angle on side steps. The displayed person follows at a limited speed and turn rate,
+    and avoids others and the robot.
+
+    standing: obstacles, besides the robot, that people step around.
+    """
 
     period_s: float
     standing: Standing = field(default_factory=Standing)
@@ -62,12 +67,13 @@ class PoseFilter:
         body: RobotBody | None = None,
         others: Floats = NOBODY_ELSE,
     ) -> tuple[Floats, Floats, Floats]:
-        """The shown positions (N, 2) m, headings (N,) rad and speeds (N,) m/s, given the simulated
-        ones.
+        """Return the displayed positions (N, 2) m, headings (N,) rad and speeds (N,) m/s.
 
-        Who is new is shown as simulated, facing as `facing_of` says; who is missing is forgotten.
-        body: the robot, round which people step. others (K, 2) m: people who are moved by somebody
-        else.
+        ids, xy, speed: the simulated people. New ones are displayed as simulated; missing ones are
+            dropped.
+        facing_of: initial heading of a new person, rad.
+        body: the robot, which people step around.
+        others: (K, 2) positions of people that are moved elsewhere, metres.
         """
         row, new = self._rows.of(ids)
         before, facing, motion = self._xy[row], self._heading[row], self._motion[row]
@@ -105,8 +111,7 @@ class PoseFilter:
     def _round(
         self, before: Floats, shown: Floats, body: RobotBody | None, stand: NDArray[np.bool_]
     ) -> Floats:
-        """Round the robot and what stands; who would step round that into the robot stays where it
-        is."""
+        """Step around the robot and obstacles; do not move if that would lead into the robot."""
         if body is None:
             return self.standing.stepped_round(before, shown, stand)
         past = stepped_round(before, shown, body, stand)
@@ -130,7 +135,7 @@ _NONE: Final = np.zeros(0)
 
 
 class ShownPeople:
-    """Puts crowd and actors into one value, tick after tick of `tick_s`, and counts their
+    """Merges crowd and event pedestrians into one value per tick of `tick_s`, and counts their
     strides."""
 
     def __init__(self, tick_s: float) -> None:
@@ -146,8 +151,12 @@ class ShownPeople:
         heading: Floats = _NONE,
         speed: Floats = _NONE,
     ) -> People:
-        """cast: the actors. ages: of the crowd. names, xy (N, 2), heading (N,), speed (N,): its
-        members, in metres, radians and m/s."""
+        """Return crowd and event pedestrians as one value.
+
+        cast: the event pedestrians.
+        ages: ages of the crowd.
+        names, xy, heading, speed: the crowd's N members; (N, 2) metres, (N,) radians, (N,) m/s.
+        """
         if (names, cast_of := [(a.id, a.kind, a.age) for a in cast]) != self._cast:
             self._cast = names, cast_of
             self._names = (*names, *(a.id for a in cast))
@@ -177,8 +186,7 @@ class ShownPeople:
 
 
 def cast_in_order(actors: tuple[Actor, ...], crowd: Mapping[str, Age]) -> list[Actor]:
-    """Actors in the order of their ids. Raises EngineError where two have one id, or one that of
-    the crowd's."""
+    """Return actors sorted by id. Raises EngineError for duplicate ids, also with the crowd's."""
     ids = {actor.id for actor in actors}
     if len(ids) != len(actors) or ids & crowd.keys():
         raise EngineError(
@@ -188,5 +196,5 @@ def cast_in_order(actors: tuple[Actor, ...], crowd: Mapping[str, Age]) -> list[A
 
 
 def places_of(cast: list[Actor]) -> Floats:
-    """Where actors are, (N, 2) metres."""
+    """Return the positions of actors, (N, 2) metres."""
     return np.array([(a.x_m, a.y_m) for a in cast], dtype=float).reshape(-1, 2)

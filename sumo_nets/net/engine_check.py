@@ -1,5 +1,5 @@
-"""SUMO and netconvert by themselves, on a crossroads that is written out here: what comes out hangs
-on them alone."""
+"""Reference run of netconvert and SUMO on a fixed crossroads, to compare their results between
+machines."""
 
 from __future__ import annotations
 
@@ -38,8 +38,10 @@ _DEMAND: Final = "<routes>{}</routes>".format(
 
 
 def sumo_alone() -> dict[str, str]:
-    """What netconvert makes of the crossroads, and where SUMO has walkers and vehicles on it, as
-    hashes. No other SUMO may run in this process."""
+    """Return hashes of netconvert's net and of SUMO's traffic on the fixed crossroads.
+
+    No other SUMO may run in this process.
+    """
     with tempfile.TemporaryDirectory() as folder:
         parts = {name: Path(folder) / f"c.{name}.xml" for name in ("nod", "edg", "rou", "net")}
         for name, text in (("nod", _NODES), ("edg", _EDGES), ("rou", _DEMAND)):

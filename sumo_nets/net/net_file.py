@@ -1,6 +1,6 @@
-"""Any .net.xml(.gz) as a StreetMap.
+"""Read a .net.xml or .net.xml.gz into a StreetMap.
 
-The reader streams the file once through expat and makes all polygons in a few vectorised calls.
+The reader streams the file once through expat and builds all polygons in a few vectorised calls.
 """
 
 from __future__ import annotations
@@ -28,24 +28,29 @@ from sumo_nets.net.raw_file import DEEPEST, hash_of, net_bytes
 from sumo_nets.net.signal_plans import SignalPrograms
 
 LANE_M = 3.2
-"""SUMO's width of a lane, sidewalks included, that names none."""
+"""SUMO's default width of lanes and sidewalks, metres."""
 SPECK_M2 = 0.5
+"""Smallest area of a corner, m2; smaller ones are dropped unless they connect strips."""
 HEAVY = frozenset(("rail", "rail_electric", "rail_fast", "subway", "ship", "cable_car", "aircraft"))
+"""Vehicle classes of railways and waterways, whose lanes are not roads."""
 TRAMS = frozenset(("tram", "rail_urban"))
+"""Vehicle classes of trams, which may share tracks with HEAVY."""
 NEEDED = {
     "edge": ("id",),
     "lane": ("id", "shape"),
     "junction": ("id",),
     "connection": ("from", "to"),
 }
+"""Required attributes of each element."""
 _WIDEST_M = 500.0
-"""No lane and no square is wider."""
+"""Largest width of a lane, metres."""
 
 Attributes = dict[str, str]
 
 
 def read_net(path: Path) -> StreetMap:
-    """The StreetMap of a .net.xml or .net.xml.gz. Raises MapError naming the file and the reason.
+    """Read the StreetMap of a .net.xml or .net.xml.gz. Raises MapError naming the file and the
+    reason.
 
     Nets without sidewalks or walking areas are read too: their strips or corners are empty.
     """
@@ -76,7 +81,7 @@ class _Edge:
 
 @dataclass(slots=True)
 class _Raw:
-    """The elements of a net that make a place."""
+    """The elements of a net that a StreetMap is built from."""
 
     net: Attributes = field(default_factory=dict)
     location: Attributes = field(default_factory=dict)
@@ -101,11 +106,8 @@ def _parse(path: Path, data: bytes) -> _Raw:
         if lacking := [name for name in NEEDED.get(tag, ()) if name not in attributes]:
             raise ValueError(f"<{tag}> '{attributes.get('id', '')}' lacks '{lacking[0]}'")
         if tag == "connection":
-            # Only those to and from walking areas and crossings, which are internal edges, matter
-            # here.
-            if attributes.get("from", "").startswith(":") or attributes.get("to", "").startswith(
-                ":"
-            ):
+            # Walking areas and crossings are internal edges; other connections are not needed.
+            if ":" in (attributes.get("from", "")[:1], attributes.get("to", "")[:1]):
                 links.append(attributes)
         elif tag == "lane" and parent == "edge":
             edges[-1].lanes.append(attributes)
@@ -165,7 +167,7 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
     lanes = [lane for _, lane, _ in (*walk.values(), *driven)]
     lines = polylines([lane["shape"] for lane in lanes], [lane["id"] for lane in lanes])
     widths = np.array([_width_m(lane) for lane in lanes])
-    # Foreign nets write -1 for SUMO's own width.
+    # Foreign nets write -1 for the default width.
     widths[widths <= 0.0] = LANE_M
     polygons = bands(lines, widths)
     corners = _corners(areas, raw.links)
@@ -175,7 +177,7 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
         for name in walk
     ]
     with np.errstate(divide="ignore", invalid="ignore"):
-        # Slivers in foreign nets have mitres at infinity, which GEOS cuts off by itself.
+        # Slivers in foreign nets have infinite mitres, which GEOS cuts off.
         polygons[: len(walk)] = close_seams(
             polygons[: len(walk)], lines[: len(walk)], widths[: len(walk)], met
         )
@@ -236,17 +238,17 @@ def _width_m(lane: Attributes) -> float:
     except ValueError:
         width_m = math.nan
     if math.isnan(width_m) or width_m > _WIDEST_M:
-        words = (
+        reason = (
             f"a width of {width_m:g} m, but none is more than {_WIDEST_M:g}"
             if width_m > _WIDEST_M
             else "no number"
         )
-        raise ValueError(f"lane '{lane['id']}': width '{said}' is {words}")
+        raise ValueError(f"lane '{lane['id']}': width '{said}' is {reason}")
     return width_m
 
 
 def _lane_of(link: Attributes, end: str) -> int:
-    """The number of the lane at an end, fromLane or toLane, of a connection."""
+    """Return the lane index at an end, "fromLane" or "toLane", of a connection."""
     try:
         return int(link.get(end, 0))
     except ValueError as error:
@@ -267,7 +269,8 @@ def _only_walked(lane: Attributes) -> bool:
 
 
 def _footway(edge: _Edge) -> int:
-    """Index of the lane for walking, paths shared with bicycles included; -1 without one."""
+    """Return the index of the lane for walking, paths shared with bicycles included; -1 without
+    one."""
     return next((i for i, lane in enumerate(edge.lanes) if _only_walked(lane)), -1)
 
 
@@ -280,7 +283,7 @@ def _is_verge(lane: Attributes) -> bool:
 
 
 def _is_track(lane: Attributes) -> bool:
-    """Whether only trains or ships go there: no road. Trams run in the street."""
+    """Return whether only trains or ships use a lane. Trams run in the street."""
     allowed = set(lane.get("allow", "").split())
     return bool(allowed & HEAVY) and allowed <= HEAVY | TRAMS
 
@@ -288,7 +291,7 @@ def _is_track(lane: Attributes) -> bool:
 def _corners(
     areas: dict[str, Attributes], links: Sequence[Attributes]
 ) -> dict[str, Polygon | MultiPolygon]:
-    """Polygons of the walking areas, repaired; specks are dropped unless they connect strips."""
+    """Return the repaired polygons of the walking areas, without specks that connect no strips."""
     if not areas:
         return {}
     joined: dict[str, set[str]] = defaultdict(set)
@@ -322,7 +325,7 @@ def _ports(
     corners: dict[str, Polygon | MultiPolygon],
     lines: Sequence[Floats],
 ) -> tuple[dict[tuple[str, int], str], set[str]]:
-    """Which corner lies at each end of each strip; and the ids of the signalised crossings."""
+    """Return the corner at each end of each strip, and the ids of the signalised crossings."""
     ports: dict[tuple[str, int], str] = {}
     signalised: set[str] = set()
     for link in links:
@@ -333,7 +336,7 @@ def _ports(
             ports.setdefault((head, 0), tail)
         if "tl" in link and head in walk and head.startswith(":"):
             signalised.add(head)
-    # A crossing's line may run against its connections: the nearer corner is the right one.
+    # A crossing's line may run against its connections: assign each end the nearer corner.
     for k, (name, (edge, _, _)) in enumerate(walk.items()):
         if edge.attributes.get("function") == "crossing" and {(name, 0), (name, 1)} <= ports.keys():
             first, last = corners[ports[name, 0]], corners[ports[name, 1]]
@@ -405,7 +408,8 @@ def _going(params: Mapping[str, str], kind: str) -> Literal["plain", "steps", "b
 
 
 def _driveways(points: str, line: Floats) -> tuple[float, ...]:
-    """Arc lengths of a sidewalk's line beside points of its street's middle line."""
+    """Return the arc lengths on a sidewalk's line nearest to points of its street's middle line,
+    metres."""
     if not points:
         return ()
     at, _ = coordinates([points], ["driveways"])

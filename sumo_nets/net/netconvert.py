@@ -1,4 +1,4 @@
-"""netconvert, the program that makes street nets, with its failures as MapError of one line."""
+"""Run netconvert, which builds street nets, and report its failures as one-line MapErrors."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Final
 from cosim.core.errors import MachineError, MapError
 
 WORDS = 400
-"""So many letters of netconvert's complaints are told."""
+"""Largest number of characters of netconvert's messages in an error."""
 _STAGES: Final = (
     (b"Parsing nodes", 0.0),
     (b"Parsing edges", 0.02),
@@ -31,7 +31,7 @@ _STAGES: Final = (
     (b"Building inner edges", 0.66),
     (b"Writing network", 0.75),
 )
-"""Words of netconvert at the begin of its stages, and the share of its time that is over then,
+"""Output of netconvert at the start of each stage, and the share of its run time before it,
 measured on a city."""
 
 
@@ -48,10 +48,11 @@ def netconvert(
     timeout_s: float = 120.0,
     progress: Callable[[float], None] | None = None,
 ) -> Path:
-    """Run netconvert to make `output`. Raises MapError with its complaints, MachineError when it
-    cannot be run.
+    """Run netconvert to build `output`, and return `output`.
 
-    progress: called with the share that is done, 0 to 1, whenever netconvert begins a stage.
+    progress: called with the share that is done, 0 to 1, at the start of each stage.
+
+    Raises MapError with netconvert's messages, MachineError if it cannot be run.
     """
     command = [str(sumo_home() / "bin" / "netconvert"), *arguments, "-o", str(output)]
     try:
@@ -68,7 +69,7 @@ def netconvert(
         ) from error
     if returncode != 0 or not output.exists():
         raise MapError(f"netconvert failed with exit code {returncode}{complaints(said)}")
-    # An exit code of 0 is no proof: an empty net ends in "Success" too.
+    # netconvert also returns 0 for an empty net.
     if b"<edge " not in output.read_bytes():
         raise MapError(f"netconvert made a net without any edge{complaints(said)}")
     return output
@@ -77,7 +78,7 @@ def netconvert(
 def _run(
     command: Sequence[str], timeout_s: float, progress: Callable[[float], None] | None
 ) -> tuple[int, str]:
-    """Run a command to its end. Returns its exit code and what it wrote to standard error."""
+    """Run a command and return its exit code and standard error."""
     began = time.monotonic()
     with tempfile.TemporaryFile() as errors, selectors.DefaultSelector() as ready:
         with subprocess.Popen(
@@ -91,7 +92,7 @@ def _run(
                     piece = os.read(process.stdout.fileno(), 1 << 16)
                     if not piece:
                         break
-                    # A stage's words may come in two pieces.
+                    # The start of a stage may be split between two reads.
                     said = said[-80:] + piece
                     begun = [share for words, share in _STAGES if words in said]
                     if progress is not None and begun:
@@ -105,8 +106,7 @@ def _run(
 
 
 def complaints(said: str) -> str:
-    """What a program of SUMO says of its failure, on one line: its errors, its last words where it
-    names none."""
+    """Summarize the messages of a SUMO program in one line: its errors, or its last line."""
     lines = [" ".join(line.split()) for line in said.splitlines() if line.strip()]
     errors = [line for line in lines if not line.startswith(("Warning", "Quitting"))]
     words = "; ".join(dict.fromkeys(line.removeprefix("Error: ") for line in errors or lines[-1:]))
