@@ -32,8 +32,8 @@ _SIGNAL_CLOCK_S: Final = 3600
 def goes_by_itself(street_map: StreetMap, spec: CrowdSpec, before: Entrances | None = None) -> bool:
     """Return whether a street does not need SUMO. before: recorded entries to replay instead of
     random ones."""
-    nobody = spec.empty if before is None else not (before.people or before.vehicles)
-    return nobody and street_map.signals_by_the_clock
+    no_crowd = spec.empty if before is None else not (before.people or before.vehicles)
+    return no_crowd and street_map.signals_by_the_clock
 
 
 def start_of(seed: int) -> tuple[int, int]:

@@ -78,8 +78,8 @@ class Spots:
         index."""
         if not self._lines:
             return []
-        beside = np.maximum(np.maximum(self._low - (x_m, y_m), (x_m, y_m) - self._high), 0.0)
-        lines = np.flatnonzero((beside * beside).sum(axis=1) <= high_m * high_m + 1.0)
+        gap_m = np.maximum(np.maximum(self._low - (x_m, y_m), (x_m, y_m) - self._high), 0.0)
+        lines = np.flatnonzero((gap_m * gap_m).sum(axis=1) <= high_m * high_m + 1.0)
         poses = [self._on(number)[1] for number in lines.tolist()]
         numbers = np.repeat(lines, [len(on) for on in poses])
         places = np.concatenate([np.arange(len(on)) for on in poses] or [numbers])

@@ -36,7 +36,7 @@ TURNING_SPEED_MPS = 0.3
 PERSON_STANDS_MPS = 0.1
 """Below this speed a SUMO person is standing, m/s."""
 
-NOBODY_ELSE: Floats = np.zeros((0, 2))
+_NO_POINTS: Final = np.zeros((0, 2))
 
 
 @dataclass(slots=True)
@@ -65,7 +65,7 @@ class PoseFilter:
         speed: Floats,
         facing_of: Callable[[str], float],
         body: RobotBody | None = None,
-        others: Floats = NOBODY_ELSE,
+        others: Floats = _NO_POINTS,
     ) -> tuple[Floats, Floats, Floats]:
         """Return the displayed positions (N, 2) m, headings (N,) rad and speeds (N,) m/s.
 
@@ -130,8 +130,7 @@ class PoseFilter:
         ]
 
 
-_NOWHERE: Final = np.zeros((0, 2))
-_NONE: Final = np.zeros(0)
+_NO_VALUES: Final = np.zeros(0)
 
 
 class ShownPeople:
@@ -147,9 +146,9 @@ class ShownPeople:
         cast: list[Actor],
         ages: Mapping[str, Age],
         names: tuple[str, ...] = (),
-        xy: Floats = _NOWHERE,
-        heading: Floats = _NONE,
-        speed: Floats = _NONE,
+        xy: Floats = _NO_POINTS,
+        heading: Floats = _NO_VALUES,
+        speed: Floats = _NO_VALUES,
     ) -> People:
         """Return crowd and event pedestrians as one value.
 

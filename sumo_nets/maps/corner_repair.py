@@ -1,9 +1,7 @@
-"""Corners of foreign nets that are torn or pinched: widened where people walk, so that a robot can
-pass.
+"""Widen torn or pinched corners of foreign nets, so that a robot can pass.
 
-netconvert draws many walking areas that cross themselves, shrink to a thread between two sidewalks
-or end short of one. SUMO's people do not mind, because they walk from lane to lane; a robot needs
-the ground.
+Many walking areas of netconvert cross themselves, narrow between two sidewalks or end short of one.
+SUMO's pedestrians ignore this, since they walk from lane to lane.
 """
 
 from __future__ import annotations
@@ -22,16 +20,18 @@ from cosim.place import overlay
 from cosim.place.street_map import SEAM_M, Corner, Port, StreetMap, Strip, union_closed
 
 CLEAR_M = 0.36
-"""Half the width that must be free on the way through a corner."""
+"""Half of the width that must be free through a corner, metres."""
 PAD_M = 0.5
-"""Radius of the ground added at a port of a mended corner."""
+"""Radius of the ground added at a port of a repaired corner, metres."""
 _WIDEST_M = 2.0
+"""Largest width of an added band, metres."""
 _EDGE_M = 0.05
+"""Distance from the edge of the ground within which a strip's end counts as torn, metres."""
 
 
 def mend_corners(root: ET.Element, street_map: StreetMap, progress: Progress = ignore) -> list[str]:
-    """Widen, in place, the walking areas through which a robot could not pass. What was changed, a
-    sentence."""
+    """Widen, in place, the walking areas that block a robot. Return the changes, a sentence
+    each."""
     lanes = {
         e.get("id"): e[0]
         for e in root.iter("edge")
@@ -55,8 +55,8 @@ def mend_corners(root: ET.Element, street_map: StreetMap, progress: Progress = i
 
 
 def widened_corner(street_map: StreetMap, corner: Corner) -> Polygon | None:
-    """The corner's polygon, widened by pads at its ports and bands between them; None when all is
-    well as it is."""
+    """Return a corner's polygon, widened by pads at its ports and bands between them; None if it
+    is passable."""
     ports = list(dict.fromkeys(corner.ports))
     if len(ports) < 2:
         return None
@@ -95,7 +95,7 @@ def _end(port: Port, strip: Strip) -> Floats:
 
 
 def _beside(corner: Corner, strip: Strip, end: Floats) -> bool:
-    """Whether a strip's end lies at the edge of the ground rather than on it."""
+    """Return whether a strip ends at the edge of the ground."""
     ground = union_closed([corner.polygon, strip.polygon])
     return float(shapely.distance(shapely.boundary(ground), shapely.Point(end))) < _EDGE_M
 
@@ -107,8 +107,7 @@ def _open(
     widths: Floats,
     clear_m: float,
 ) -> bool:
-    """Whether each two ports of a corner are in reach of each other over the corner and their own
-    strips."""
+    """Return whether all ports of a corner are connected across the corner and their own strips."""
     at = shapely.points(ends)
     core = shapely.buffer(polygon, -clear_m)
     if (
@@ -134,8 +133,8 @@ def _band(a: Floats, b: Floats, width_m: float) -> Polygon:
 
 
 def _groups(pieces: Sequence[shapely.Geometry], ends: Floats, clear_m: float) -> list[int]:
-    """For each port the number of the free part of the ground that it opens on; a number of its own
-    without any."""
+    """Return the index of the free part of the ground at each port; a negative number without
+    one."""
     free = shapely.buffer(union_closed(pieces), -clear_m)
     parts = [part for part in shapely.get_parts(free) if not part.is_empty]
     groups = []

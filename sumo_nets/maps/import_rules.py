@@ -1,4 +1,4 @@
-"""Versions of the importer: what each of them does to a map."""
+"""Versions of the importer, and the real places of the benchmark that are imported with them."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from sumo_nets.net.netconvert import sumo_home
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """What one version of the importer does. A change that changes imported nets needs a new
-    version.
+    """One version of the importer. A change that changes imported nets needs a new version.
 
-    version: recorded in the description of each imported map. widths_m: widths of guessed sidewalks
-    by street class; empty leaves netconvert's own widths. mends: changes of the finished net, in
-    place and in this order; each returns what it changed, a sentence each.
+    version: recorded in the description of each imported map.
+    widths_m: widths of guessed sidewalks by street class; empty for netconvert's widths.
+    mends: repairs of the finished net, in place and in this order; each returns its changes, a
+        sentence each.
     """
 
     version: int
@@ -31,10 +31,9 @@ class Rules:
 
 
 SUITE_RULES: Final = Rules(3, {}, (mend_signals,))
-"""The version that imports the SUMO nets of the shipped places: the suites hold the hashes of these
-nets."""
+"""Version for the shipped places: the suites contain the hashes of their nets."""
 NEWEST_RULES: Final = Rules(4, STREET_WIDTHS_M, (settle_levels, mend_signals, lengthen_walks))
-"""The version that imports everything else."""
+"""Version for all other maps."""
 
 
 _Box = tuple[float, float, float, float]
@@ -44,9 +43,9 @@ class WheelPlace(NamedTuple):
     """A crop of a net.
 
     net: path below the wheel's tools/game.
-    box: west, south, east, north in degrees, None for all of it.
+    box: west, south, east, north in degrees, None for the whole net.
     osm: drawn from OpenStreetMap data.
-    rules: the version of the importer, which decides the hash of the net.
+    rules: the version of the importer, which determines the hash of the net.
     """
 
     net: str
@@ -56,7 +55,7 @@ class WheelPlace(NamedTuple):
 
     @property
     def path(self) -> Path:
-        """Where the net lies on this machine."""
+        """Path of the net in the installed wheel."""
         return sumo_home() / "tools" / "game" / self.net
 
 
@@ -79,3 +78,5 @@ WHEEL_PLACES: Final[Mapping[str, WheelPlace]] = MappingProxyType(
         "wildau-1": WheelPlace(_WILDAU, (13.5939, 52.3129, 13.6059, 52.3202), osm=True),
     }
 )
+"""Crops of nets that the eclipse-sumo wheel installs, by place name. Each is imported on first
+use."""

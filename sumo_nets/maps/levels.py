@@ -1,7 +1,7 @@
-"""Streets above and below the ground: which ones they are, as far as tags and geometry show.
+"""Find streets above and below the ground, from tags and geometry.
 
-OpenStreetMap's `layer` orders what lies over what and is often set on whole streets. Alone it is no
-evidence.
+OpenStreetMap's `layer` gives the vertical order of crossing ways, and is often set on whole
+streets. Alone it is not evidence.
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ from sumo_nets.net.net_facts import footway, params_of
 from sumo_nets.net.net_file import LANE_M
 
 LEVEL_KEYS: Final = ("bridge", "tunnel", "layer", "covered", "location", "level")
-"""Tags of OSM ways that can say that a way is not on the ground."""
+"""Tags of OSM ways that can indicate a level off the ground."""
 _GROUND_LAYERS: Final = ("", "0")
 _MOSTLY: Final = 0.5
-"""A walkway with more of its area than this on roads of another layer lies over or under them."""
+"""A walkway with a larger share of its area on roads of another layer lies over or under them."""
 
 
 def is_levelled(tags: Mapping[str, str]) -> bool:
-    """Return whether tags of an OSM way may say that it is not on the ground."""
+    """Return whether tags of an OSM way may indicate a level off the ground."""
     raised = any(tags.get(key, "no") not in GROUND for key in ("bridge", "tunnel"))
     return raised or tags.get("layer", "0") not in _GROUND_LAYERS or _elsewhere(tags)
 
 
 def edges_of(ways: Mapping[str, int]) -> Iterator[str]:
-    """Yield the ids that netconvert may give the edges of OSM ways. ways: their numbers of nodes by
-    their ids."""
+    """Yield the ids that netconvert may give the edges of OSM ways. ways: number of nodes by way
+    id."""
     for way, nodes in ways.items():
         for name in (way, *(f"{way}#{part}" for part in range(nodes - 1))):
             yield name
@@ -39,12 +39,11 @@ def edges_of(ways: Mapping[str, int]) -> Iterator[str]:
 
 
 def settle_levels(root: ET.Element) -> list[str]:
-    """Decide, in place, which edges are not on the ground. Return what was changed, a sentence
-    each.
+    """Decide, in place, which edges are off the ground. Return the changes, a sentence each.
 
-    Bridges and tunnels stay as they are. An edge with a level or location off the ground gets a
-    layer. An edge with a layer keeps it if it is covered, or if it lies over or under a street of
-    another layer; else it is on the ground.
+    Bridges and tunnels are unchanged. An edge with a level or location off the ground gets a layer.
+    An edge with a layer keeps it if it is covered, or if it lies over or under a street of another
+    layer. Otherwise it is on the ground.
     """
     normal = [
         edge for edge in root.iter("edge") if not edge.get("function") and len(edge.findall("lane"))
@@ -90,7 +89,7 @@ def _set_layer(edge: ET.Element, layer: str | None) -> None:
 
 
 def _elsewhere(tags: Mapping[str, str]) -> bool:
-    """Whether level or location say that a way is on another storey than the ground's."""
+    """Return whether level or location indicate another storey than the ground's."""
     if tags.get("location") in ("underground", "overhead"):
         return True
     try:
@@ -103,8 +102,8 @@ def _elsewhere(tags: Mapping[str, str]) -> bool:
 def _stacked(
     doubtful: list[ET.Element], normal: list[ET.Element], said: Mapping[str, Mapping[str, str]]
 ) -> set[str]:
-    """The ids of those edges that cross a street of another layer, or lie mostly over or under such
-    streets."""
+    """Return the ids of edges that cross a street of another layer, or lie mostly over or under
+    such streets."""
     others = [
         edge
         for edge in normal
@@ -142,7 +141,7 @@ def _stacked(
 
 
 def _layer(tags: Mapping[str, str]) -> str:
-    """The layer of an edge; a bridge or tunnel without one is on a layer of its own."""
+    """Return the layer of an edge; a bridge or tunnel without one has a layer of its own."""
     for key in ("bridge", "tunnel"):
         if tags.get(key, "no") not in GROUND:
             return tags.get("layer", key)
@@ -155,7 +154,7 @@ def _line(lane: ET.Element) -> shapely.LineString:
 
 
 def _ground(edge: ET.Element) -> shapely.Geometry:
-    """The ground that an edge covers."""
+    """Return the ground that an edge covers."""
     lanes = [(_line(lane), float(lane.get("width", LANE_M))) for lane in edge.findall("lane")]
     return shapely.union_all(
         [shapely.buffer(line, width_m / 2.0, cap_style="flat") for line, width_m in lanes]

@@ -1,5 +1,4 @@
-"""Steps of an import that go through netconvert and SUMO: cropping, walkways, widths, the final
-test."""
+"""Steps of an import that use netconvert and SUMO: cropping, walkways, widths, test start."""
 
 from __future__ import annotations
 
@@ -21,20 +20,23 @@ from sumo_nets.net.net_file import allows
 from sumo_nets.net.netconvert import complaints, netconvert, sumo_home
 
 TIMEOUT_S = 300.0
+"""Timeout of each netconvert call, seconds."""
 START_TIMEOUT_S = 60.0
+"""Timeout of the test start of SUMO, seconds."""
 UPGRADE_OPTIONS: Final = ("--sidewalks.guess", "--crossings.guess", "--walkingareas")
 FOOT_TYPES: Final = ("highway.footway", "highway.pedestrian", "highway.steps", "highway.path")
 FOOT_MPS: Final = 1.4
-"""An edge of one lane that is as slow as this is a footway, whatever the net lets drive on it."""
+"""An edge of one lane with at most this speed limit is a footway, whatever vehicles it permits,
+m/s."""
 
 
 @dataclass(slots=True)
 class ImportWork:
-    """An import under way.
+    """An import in progress.
 
     folder: for scratch files.
     progress: receives the stages of the work.
-    changes: what was done to the map so far, a sentence each.
+    changes: changes to the map so far, a sentence each.
     """
 
     file: MapFile
@@ -43,7 +45,7 @@ class ImportWork:
     changes: list[str] = field(default_factory=list)
 
     def netconvert(self, stage: str, name: str, arguments: Sequence[str]) -> Path:
-        """Make the net `name` in the scratch folder."""
+        """Build the net `name` in the scratch folder."""
         self.progress(stage, 0.0)
         return netconvert(
             arguments, self.folder / name, TIMEOUT_S, lambda share: self.progress(stage, share)
@@ -57,8 +59,8 @@ class ImportWork:
 
 
 def crop_net(work: ImportWork, net: Path, box: Box | None) -> Path:
-    """Return the net inside a box. Raises MapError, with the bounds of the map, for a box with
-    nothing in it."""
+    """Return the net inside a box. Raises MapError, with the bounds of the map, for an empty
+    box."""
     if box is None:
         return net
     projected = read_facts(net).projected
@@ -70,7 +72,7 @@ def crop_net(work: ImportWork, net: Path, box: Box | None) -> Path:
     option = "--keep-edges.in-geo-boundary" if projected else "--keep-edges.in-boundary"
     words = ",".join(f"{v:.7f}" for v in box)
     try:
-        # In one call the two options keep netconvert busy for ever on some nets.
+        # With both options in one call, netconvert does not terminate on some nets.
         inside = work.netconvert(
             "cropping", "inside.net.xml", ["-s", str(net), f"{option}={words}"]
         )
@@ -91,7 +93,8 @@ def crop_net(work: ImportWork, net: Path, box: Box | None) -> Path:
 
 
 def _bounds(net: Path, projected: bool) -> Box | None:
-    """What a net covers, in degrees if it is projected; None when it does not say so."""
+    """Return the bounds of a net, in degrees if it is projected; None if it does not contain
+    them."""
     location = net_root(net).find("location")
     said = (
         ""
@@ -111,7 +114,7 @@ def _bounds(net: Path, projected: bool) -> Box | None:
 
 
 def add_walkways(work: ImportWork, net: Path, facts: NetFacts) -> Path:
-    """Return the net with sidewalks beside slow roads, crossings and walking areas."""
+    """Return the net with sidewalks along slow roads, crossings and walking areas."""
     root = net_root(net)
     freed = 0
     for edge in root.iter("edge"):
@@ -126,7 +129,7 @@ def add_walkways(work: ImportWork, net: Path, facts: NetFacts) -> Path:
             lanes[0].attrib.pop("disallow", None)
             lanes[0].set("allow", "pedestrian")
     ready = work.written(root, "ready.net.xml")
-    # --tls.guess would invent signals, some of which SUMO then refuses.
+    # --tls.guess would add signals, some of which SUMO refuses.
     upgraded = work.netconvert(
         "adding sidewalks", "upgraded.net.xml", ["-s", str(ready), *UPGRADE_OPTIONS]
     )
@@ -159,16 +162,14 @@ def widen_sidewalks(
         return net
     work.changes += said
     ready = work.written(root, "widths.net.xml")
-    # Wider sidewalks move corners, and netconvert drops crossings that miss theirs: it guesses
-    # these again.
+    # Wider sidewalks move corners. netconvert drops crossings that miss them and guesses new ones.
     return work.netconvert(
         "widening sidewalks", "widened.net.xml", ["-s", str(ready), "--crossings.guess"]
     )
 
 
 def start_sumo(file: MapFile, net: Path) -> None:
-    """Start SUMO on the net for a second: some nets that netconvert is content with are refused by
-    it."""
+    """Start SUMO on the net for a second: it refuses some nets that netconvert accepts."""
     command = [
         str(sumo_home() / "bin" / "sumo"),
         "-n",

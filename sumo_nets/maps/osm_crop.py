@@ -1,5 +1,4 @@
-"""A part of an OpenStreetMap file, cut out before it is converted: a city takes minutes, a part of
-it seconds."""
+"""Crop OpenStreetMap files before conversion: a city takes minutes, a part of it seconds."""
 
 from __future__ import annotations
 
@@ -12,20 +11,21 @@ from typing import Any, Final
 from cosim.core.errors import MapError
 
 MARGIN_M: Final = 500.0
-"""Streets are kept this far beyond the box: whole blocks are built, and the net is cropped to the
-box afterwards."""
+"""Width of the margin around the box, metres: blocks are complete, and the net is cropped
+afterwards."""
 MOST_MEMBERS: Final = 50
-"""Areas of more ways than this (rivers, borders) are left out."""
+"""Areas of more ways (rivers, borders) are omitted."""
 _DEGREE_M: Final = 111_195.0
+"""Length of a degree of latitude, metres."""
 
 Box = tuple[float, float, float, float]
 
 
 def crop_osm(file: Path, target: Path, box: Box, source: Path) -> None:
-    """Write the part of an OSM file (XML or PBF) that lies in a box, as XML, to `target`.
+    """Write the part of an OSM file (XML or PBF) in a box to `target`, as XML.
 
-    Open streets end one node outside of the margin; everything else is kept whole or left out.
-    Raises MapError, with the bounds of the file, when it has no street there.
+    Open streets end one node outside of the margin; everything else is complete or omitted. Raises
+    MapError, with the bounds of the file, when it has no street there.
 
     box: west, south, east, north in degrees.
     source: the file to name in errors.
@@ -40,26 +40,25 @@ def crop_osm(file: Path, target: Path, box: Box, source: Path) -> None:
 
 
 def refuse_box_outside(source: Path, box: Box, bounds: Box, unit: str = "degrees") -> None:
-    """Raise MapError, with the bounds of the map, when a box holds nothing of it."""
+    """Raise MapError, with the bounds of the map, when a box does not overlap it."""
     if _meet(box, bounds):
         return
     west, south, east, north = box
     swapped = (south, west, north, east)
     hint = (
-        f" (latitude and longitude swapped? --bbox {_words(swapped)})"
+        f" (latitude and longitude swapped? --bbox {_text(swapped)})"
         if _meet(swapped, bounds)
         else ""
     )
     raise MapError(
-        f"{source}: --bbox {_words(box)} is outside of the map, which covers {_words(bounds)} "
+        f"{source}: --bbox {_text(box)} is outside of the map, which covers {_text(bounds)} "
         f"(west,south,east,north in {unit}): give a part of that{hint}"
     )
 
 
 @dataclass(slots=True)
 class _Part:
-    """Ids of what is kept of a file. cuts: first and last node kept, by their places, of streets
-    that are cut."""
+    """Ids of the cropped part. cuts: indices of the first and last node of shortened streets."""
 
     nodes: set[int] = field(default_factory=set)
     ways: set[int] = field(default_factory=set)
@@ -90,8 +89,8 @@ def _chosen(file: Path, box: Box, source: Path) -> _Part:
         part.nodes.update(refs)
     if not streets:
         raise MapError(
-            f"{source}: no street or path (highway=*) of the file lies in --bbox {_words(box)}; "
-            f"the file covers {_words(bounds)}: choose a part with streets in it"
+            f"{source}: no street or path (highway=*) of the file lies in --bbox {_text(box)}; "
+            f"the file covers {_text(bounds)}: choose a part with streets in it"
         )
     further = set[int]()
     for relation in _of(file, "RELATION"):
@@ -115,7 +114,7 @@ def _chosen(file: Path, box: Box, source: Path) -> _Part:
 
 
 def _inside(file: Path, box: Box) -> tuple[set[int], Box]:
-    """The ids of the nodes in a box and its margin, and the bounds of all nodes."""
+    """Return the ids of the nodes in a box and its margin, and the bounds of all nodes."""
     west, south, east, north = box
     high = MARGIN_M / _DEGREE_M
     wide = high / max(math.cos(math.radians(0.5 * (south + north))), 0.01)
@@ -158,7 +157,7 @@ def _write(file: Path, target: Path, part: _Part) -> None:
 
 
 def _of(file: Path, kind: str) -> Iterator[Any]:
-    """The nodes, ways or relations of a file."""
+    """Yield the nodes, ways or relations of a file."""
     import osmium
 
     things: Iterable[Any] = osmium.FileProcessor(str(file), getattr(osmium.osm, kind))
@@ -169,5 +168,5 @@ def _meet(a: Box, b: Box) -> bool:
     return a[0] < b[2] and a[2] > b[0] and a[1] < b[3] and a[3] > b[1]
 
 
-def _words(box: Box) -> str:
+def _text(box: Box) -> str:
     return ",".join(f"{side:.6g}" if abs(side) < 1000.0 else f"{side:.0f}" for side in box)

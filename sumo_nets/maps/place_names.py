@@ -1,8 +1,8 @@
-"""What a user may call a place: a map by its name, a folder of `city make` or `map import`, a
-street net.
+"""Resolve a user's name of a place: a map's name, a folder of `city make` or `map import`, or a net
+file.
 
-Whatever it was, it becomes a place that a scenario can name and that can be found again: a city by
-its seed, a map by its name in the store; both with the hash of their net.
+The result can be stored in a scenario: a city by its seed or a map by its name, both with the hash
+    of their net.
 """
 
 from __future__ import annotations
@@ -36,17 +36,18 @@ HINT = "the folder of `cosim city make` or of an imported map, or a .net.xml fil
 
 
 class _MadeCity(msgspec.Struct):
-    """What city.json says."""
+    """Content of city.json."""
 
     city: City
     generator: int = 0
 
 
 def place_called(words: str, roughness: float = 0.0) -> Place:
-    """The place that a user calls so; nets that are not known yet are imported. roughness: of its
-    ground, 0 to 1.
+    """Return the place for a name or path; unknown nets are imported.
 
-    Raises UsageError with what there is, MapError when what is there cannot be used.
+    roughness: of its ground, 0 to 1.
+
+    Raises UsageError with the valid names, MapError when a file is unusable.
     """
     path = Path(words)
     found: Place = CityMap(map=words, roughness=roughness)
@@ -84,16 +85,14 @@ def _folder(folder: Path) -> Place:
 
 
 def _city(folder: Path) -> Place:
-    """The city in a folder, as its own net says; a net that another version made, or that was
-    changed, is a map."""
+    """Return the city in a folder, or a map if its net was changed or made by another version."""
     net, about = folder / NET_NAME, folder / ABOUT_NAME
     try:
         made = msgspec.json.decode(about.read_bytes(), type=_MadeCity)
     except (OSError, ValueError, msgspec.DecodeError) as error:
         raise MapError(f"{about}: cannot be read: {error}: make the city again") from error
     if made.generator == GENERATOR and net_content_hash(net) == made.city.net_hash:
-        # Built once more where the cache has none: the folder's word alone must not come into the
-        # cache.
+        # Build the net from its seed: files of the folder must not enter the cache.
         with suppress(MapError):
             city_net(made.city)
             return made.city
@@ -101,7 +100,7 @@ def _city(folder: Path) -> Place:
 
 
 def imported_place(net: Path) -> str:
-    """The name of a map's file in the store of maps, where it is imported unless it is there."""
+    """Return the name of a net file in the store of maps, and import it if it is missing."""
     source_hash, wanted = file_hash(net), map_name(net)
     name = _free_name(
         wanted, source_hash, lambda about: about.source_hash == source_hash and _as_it_is(about)
@@ -112,8 +111,7 @@ def imported_place(net: Path) -> str:
 
 
 def _adopted(folder: Path) -> str:
-    """The name of an imported map that lies in a folder of its own, in the store, where it is
-    copied to."""
+    """Copy an imported map from a folder into the store, and return its name there."""
     try:
         about = msgspec.json.decode((folder / ABOUT).read_bytes(), type=About)
     except (OSError, ValueError, msgspec.DecodeError) as error:
@@ -143,7 +141,7 @@ def _adopted(folder: Path) -> str:
 
 
 def _free_name(wanted: str, content: str, is_same: Callable[[About], bool]) -> str:
-    """The wanted name, or one with a part of the content's hash where another map has it."""
+    """Return the wanted name, with a part of the content's hash if another map has it."""
     names = known_maps()
     for name in (
         wanted,
@@ -161,7 +159,7 @@ def _free_name(wanted: str, content: str, is_same: Callable[[About], bool]) -> s
 
 
 def _as_it_is(about: About) -> bool:
-    """Whether a map was imported by this version with no options."""
+    """Return whether a map was imported by this version without options."""
     plain = (
         about.bbox is None
         and about.lefthand is None

@@ -70,11 +70,11 @@ def sumo_alone() -> dict[str, str]:
         try:
             for _ in range(2 * _SECONDS):
                 sumo.simulationStep()
-                everybody = (
+                traffic = (
                     engine.vehicles_near(0.0, 0.0, 1e3),
                     engine.persons_near(0.0, 0.0, 1e3, _WALKERS),
                 )
-                for one in everybody:
+                for one in traffic:
                     seen.update(
                         "".join(one.names).encode() + np.column_stack([one.xy, one.mps]).tobytes()
                     )
