@@ -359,9 +359,8 @@ def _with_source(file: MapFile, message: str) -> str:
         .replace(str(file.path), str(file.source))
         .replace(f"{file.path.parent}/", "")
     )
-    message = message.replace(
-        "cut the area of interest out first", "import a part of it with --bbox"
-    )
+    remedy = "import a part of it with --bbox"
+    message = message.replace("cut the area of interest out first", remedy)
     if "without any edge" in message or "No nodes loaded" in message:
         message += (
             "; no street of the file survived the conversion: import a larger area, with whole "

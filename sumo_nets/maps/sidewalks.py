@@ -75,13 +75,12 @@ def set_widths(
     tagged: Mapping[str, Mapping[str, str]],
     before: Collection[str] = (),
 ) -> list[str]:
-    """Set the widths of guessed sidewalks in place. Return what was changed, a sentence, or
-    nothing.
+    """Set the widths of guessed sidewalks in place. Return the change, a sentence, or nothing.
 
-    Walkways beside no lane for vehicles, or one for bicycles alone, keep their widths.
+    Walkways of edges without lanes for cars are unchanged.
 
-    widths_m: by street class; empty changes nothing.
-    tagged: tags of OSM ways that give widths of sidewalks, by the ids of the ways.
+    widths_m: by street class, metres; empty for no change.
+    tagged: tags of OSM ways with widths of sidewalks, by way id.
     before: ids of edges whose sidewalks are not guessed.
     """
     if not widths_m:
