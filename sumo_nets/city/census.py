@@ -272,15 +272,15 @@ def _zones(
         params = ways[strip.id].params if strip.id in ways else {}
         # The verge is the lane next to the sidewalk; a later one is a median.
         next_lane = lanes[strip.id][:1]
-        here = {
+        zone_widths = {
             "road": sum(lane.width_m for lane in lanes[strip.id] if lane.kind == "road"),
             "curb": float(params.get("curb_m", 0.0)) + float(params.get("gutter_m", 0.0)),
             "verge": sum(lane.width_m for lane in next_lane if lane.kind == "verge"),
             "sidewalk": strip.width_m,
             "frontage": float(params.get("frontage_m", 0.0)),
         }
-        missing += not all(here.values())
-        for zone, width_m in here.items():
+        missing += not all(zone_widths.values())
+        for zone, width_m in zone_widths.items():
             widths[zone].append(width_m)
     return {zone: Span.of(values) for zone, values in widths.items() if values}, missing
 

@@ -87,14 +87,14 @@ def plan_city(seed: int, size_m: float, style: str) -> CityPlan:
     entropy = (seed, round(size_m * 100), sorted(STYLES).index(style))
     seeds = np.random.SeedSequence(entropy).spawn(len(PURPOSES))
     rngs = {purpose: np.random.default_rng(s) for purpose, s in zip(PURPOSES, seeds, strict=True)}
-    made_of, pitch_m = _character(rngs["character"], STYLES[style])
-    draft = _lattice(rngs["lattice"], rngs["classes"], rngs["widths"], size_m, pitch_m, made_of)
-    _diagonals(draft, rngs["diagonals"], made_of.diagonals)
-    _remove(draft, rngs["removal"], made_of.removed)
-    _dissolve(draft)
-    _bend_streets(draft, rngs["shapes"], made_of)
-    _place_roundabouts(draft, rngs["roundabouts"], made_of.roundabouts)
-    return plan_of(draft, rngs, made_of.crosswalks)
+    shares, pitch_m = _character(rngs["character"], STYLES[style])
+    draft = _lattice(rngs["lattice"], rngs["classes"], rngs["widths"], size_m, pitch_m, shares)
+    _diagonals(draft, rngs["diagonals"], shares.diagonals)
+    _remove_streets(draft, rngs["removal"], shares.removed)
+    _join_at_two_arms(draft)
+    _bend_streets(draft, rngs["shapes"], shares)
+    _place_roundabouts(draft, rngs["roundabouts"], shares.roundabouts)
+    return plan_of(draft, rngs, shares.crosswalks)
 
 
 def _character(rng: np.random.Generator, style: _Style) -> tuple[_Style, float]:
@@ -117,7 +117,7 @@ def _lattice(
     style: _Style,
 ) -> Draft:
     cells = max(2, round((size_m - 2.0 * _MARGIN_M) / pitch_m))
-    xs, ys = (_spaced(rng, cells, size_m) for _ in range(2))
+    xs, ys = (_positions(rng, cells, size_m) for _ in range(2))
     sway = style.jitter * (min(b - a for line in (xs, ys) for a, b in pairwise(line)) - 55.0)
     wave_x, wave_y = (_Wave.draw(rng, size_m) for _ in range(2))
     at: dict[Cell, tuple[float, float]] = {}
@@ -146,7 +146,7 @@ def _lattice(
     return Draft(at, links)
 
 
-def _spaced(rng: np.random.Generator, cells: int, size_m: float) -> list[float]:
+def _positions(rng: np.random.Generator, cells: int, size_m: float) -> list[float]:
     """Return the unevenly spaced positions of rows or columns, with room for every block."""
     pitch = (size_m - 2.0 * _MARGIN_M) / cells
     loose = max(0.0, 0.6 * (pitch - 75.0))
@@ -212,7 +212,7 @@ def _diagonals(draft: Draft, rng: np.random.Generator, share: float) -> None:
                 break
 
 
-def _remove(draft: Draft, rng: np.random.Generator, share: float) -> None:
+def _remove_streets(draft: Draft, rng: np.random.Generator, share: float) -> None:
     """Remove a share of the streets without disconnecting the network or creating dead ends."""
     neighbours: dict[Cell, set[Cell]] = defaultdict(set)
     for link in draft.links:
@@ -220,9 +220,9 @@ def _remove(draft: Draft, rng: np.random.Generator, share: float) -> None:
         neighbours[link.b].add(link.a)
     slanting = {end for link in draft.links if link.turns != (0.0, 0.0) for end in (link.a, link.b)}
     wanted = round(share * len(draft.links))
-    gone: set[tuple[Cell, Cell]] = set()
+    removed: set[tuple[Cell, Cell]] = set()
     for k in rng.permutation(len(draft.links)).tolist():
-        if len(gone) == wanted:
+        if len(removed) == wanted:
             break
         link = draft.links[k]
         ends = (link.a, link.b)
@@ -239,28 +239,28 @@ def _remove(draft: Draft, rng: np.random.Generator, share: float) -> None:
             continue
         neighbours[link.a].discard(link.b)
         neighbours[link.b].discard(link.a)
-        if _reaches(neighbours, link.a, link.b):
-            gone.add(ends)
+        if _is_connected(neighbours, link.a, link.b):
+            removed.add(ends)
         else:
             neighbours[link.a].add(link.b)
             neighbours[link.b].add(link.a)
-    draft.links = [link for link in draft.links if (link.a, link.b) not in gone]
+    draft.links = [link for link in draft.links if (link.a, link.b) not in removed]
 
 
-def _reaches(neighbours: dict[Cell, set[Cell]], start: Cell, goal: Cell) -> bool:
+def _is_connected(neighbours: dict[Cell, set[Cell]], start: Cell, goal: Cell) -> bool:
     seen = {start}
-    front = [start]
-    while front:
-        cell = front.pop()
+    queue = [start]
+    while queue:
+        cell = queue.pop()
         if cell == goal:
             return True
-        fresh = neighbours[cell] - seen
-        seen |= fresh
-        front += sorted(fresh)
+        new = neighbours[cell] - seen
+        seen |= new
+        queue += sorted(new)
     return False
 
 
-def _dissolve(draft: Draft) -> None:
+def _join_at_two_arms(draft: Draft) -> None:
     """Join the two streets at every point with two arms into one with a rounded corner."""
     for cell, arms in draft.arms().items():
         if len(arms) != 2:
@@ -277,18 +277,18 @@ def _dissolve(draft: Draft) -> None:
 def _bend_streets(draft: Draft, rng: np.random.Generator, style: _Style) -> None:
     """Create Y junctions, curves and S-bends where all angles between arms remain wide."""
     arms = draft.arms()
-    for cell, mine in arms.items():
-        if rng.random() > style.ys or len(mine) != 3 or draft.on_border(cell):
+    for cell, own in arms.items():
+        if rng.random() > style.ys or len(own) != 3 or draft.on_border(cell):
             continue
         headings = sorted(
-            (draft.leaving(link, cell) % (2.0 * math.pi), i) for i, link in enumerate(mine)
+            (draft.leaving(link, cell) % (2.0 * math.pi), i) for i, link in enumerate(own)
         )
         gaps = [(headings[(k + 1) % 3][0] - headings[k][0]) % (2.0 * math.pi) for k in range(3)]
         k = max(range(3), key=lambda i: gaps[i])
         fold = min((gaps[k] - 2.0 * math.pi / 3.0) / 2.0, math.radians(28.0))
         # Only the two arms next to the widest gap turn into it.
-        _turn(draft, arms, mine[headings[k][1]], cell, fold)
-        _turn(draft, arms, mine[headings[(k + 1) % 3][1]], cell, -fold)
+        _turn(draft, arms, own[headings[k][1]], cell, fold)
+        _turn(draft, arms, own[headings[(k + 1) % 3][1]], cell, -fold)
     middle = max(draft.at)[0] / 2.0
     for link in draft.links:
         draw = rng.random()
@@ -328,16 +328,16 @@ def _place_roundabouts(draft: Draft, rng: np.random.Generator, share: float) -> 
     last = max(draft.at)[0]
     arms = draft.arms()
     spare: dict[Cell, float] = {}
-    for cell, mine in arms.items():
+    for cell, own in arms.items():
         radius = float(rng.uniform(19.0, 22.0))
         draw = rng.random()
-        if len(mine) < 3 or {0, last} & set(cell):
+        if len(own) < 3 or {0, last} & set(cell):
             continue
-        near = {end for link in mine for end in (link.a, link.b)}
+        near = {end for link in own for end in (link.a, link.b)}
         quiet = all(
-            CLASSES[link.street_class].lanes == 1 and draft.chord(link) > 85.0 for link in mine
+            CLASSES[link.street_class].lanes == 1 and draft.chord(link) > 85.0 for link in own
         )
-        if quiet and not near & set(draft.rings) and draft.gap(cell, mine) > math.radians(74.0):
+        if quiet and not near & set(draft.rings) and draft.gap(cell, own) > math.radians(74.0):
             (spare if draw > share else draft.rings)[cell] = radius
     for cell, radius in spare.items():
         near = {end for link in arms[cell] for end in (link.a, link.b)}

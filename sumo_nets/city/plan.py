@@ -227,16 +227,18 @@ def _add_street(
     tail, head = parts.joints[link.a, number], parts.joints[link.b, number]
     line = _line(draft, link, tail.at, head.at)
     name = f"s{number}"
-    made = CLASSES[link.street_class]
+    kind = CLASSES[link.street_class]
     draws = rngs["crosswalks"].random(3).tolist()
-    width_m = made.crossings_m[int(rngs["widths"].integers(len(made.crossings_m)))]
+    width_m = kind.crossings_m[int(rngs["widths"].integers(len(kind.crossings_m)))]
     blocked = sum(20.0 if end in draft.rings else 0.0 for end in (link.a, link.b))
     if length(line) > (106.0 if link.via is None else 180.0) + blocked and draws[0] < crosswalks:
         # On a street with a corner, the crosswalk lies well before it.
         where = 0.45 + 0.1 * draws[1] if link.via is None else 0.27
         first, second = split(line, where * length(line))
-        outline = _across(first[-1], direction(first[-2], second[1]), link.section.half_m, width_m)
-        middle = Node(f"{name}m", first[-1], draws[2] < (0.7 if made.lanes > 1 else 0.25), outline)
+        outline = _crosswalk_area(
+            first[-1], direction(first[-2], second[1]), link.section.half_m, width_m
+        )
+        middle = Node(f"{name}m", first[-1], draws[2] < (0.7 if kind.lanes > 1 else 0.25), outline)
         parts.nodes[middle.id] = middle
         parts.zebras[middle.id].append(Zebra(middle.id, (f"{name}a", f"-{name}a"), width_m))
         pieces = [(f"{name}a", tail, middle, first), (f"{name}b", middle, head, second)]
@@ -244,7 +246,7 @@ def _add_street(
         pieces = [(name, tail, head, line)]
     for piece, start, end, shape in pieces:
         there, back = (
-            _driveways(way, made.driveways, rngs["driveways"]) for way in (shape, shape[::-1])
+            _driveways(way, kind.driveways, rngs["driveways"]) for way in (shape, shape[::-1])
         )
         parts.edges.append(
             Edge(piece, start.id, end.id, link.street_class, link.section, shape, there)
@@ -257,7 +259,9 @@ def _add_street(
                 parts.zebras[node.id].append(Zebra(node.id, (piece, f"-{piece}"), width_m))
 
 
-def _across(at: Point, heading: float, half_m: float, crossing_m: float) -> tuple[Point, ...]:
+def _crosswalk_area(
+    at: Point, heading: float, half_m: float, crossing_m: float
+) -> tuple[Point, ...]:
     """Return the rectangle of a crosswalk and the sidewalks at its ends, with room for curb
     ramps."""
     ahead = 0.5 * crossing_m + CROSSWALK_ROOM_M

@@ -226,8 +226,12 @@ def _program(signal: _Signal, rng: np.random.Generator) -> list[Phase]:
         phases.append(Phase(max(walk_s, int(rng.integers(16, 27))), state))
         rest_s = clear_s - YELLOW_S - ALL_RED_S
         if rest_s > 0:
-            phases.append(Phase(rest_s, _with(state, {zebra.link: "r" for zebra in walking})))
-        phases.append(Phase(YELLOW_S, _with("r" * signal.links, {car.link: "y" for car in cars})))
+            phases.append(
+                Phase(rest_s, _with_letters(state, {zebra.link: "r" for zebra in walking}))
+            )
+        phases.append(
+            Phase(YELLOW_S, _with_letters("r" * signal.links, {car.link: "y" for car in cars}))
+        )
         phases.append(Phase(ALL_RED_S, "r" * signal.links))
     return phases
 
@@ -236,10 +240,10 @@ def _green(signal: _Signal, cars: list[_Car], walking: list[_Zebra]) -> str:
     """Return a stage's state; links that must yield to another green link have "g"."""
     going = {car.link for car in cars} | {zebra.link for zebra in walking}
     letters = {car.link: "g" if signal.yields.get(car.link, set()) & going else "G" for car in cars}
-    return _with("r" * signal.links, letters | {zebra.link: "G" for zebra in walking})
+    return _with_letters("r" * signal.links, letters | {zebra.link: "G" for zebra in walking})
 
 
-def _with(state: str, letters: dict[int, str]) -> str:
+def _with_letters(state: str, letters: dict[int, str]) -> str:
     return "".join(letters.get(i, letter) for i, letter in enumerate(state))
 
 

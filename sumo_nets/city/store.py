@@ -70,7 +70,7 @@ def _converted(plan: CityPlan, folder: Path) -> Path:
 def _edge(edge: Edge) -> str:
     """Return the XML of an edge: sidewalk as lane 0, then the verge, the road lanes, half of the
     median."""
-    made = CLASSES[edge.street_class]
+    kind = CLASSES[edge.street_class]
     section = edge.section
     lanes = [
         f'allow="pedestrian" width="{section.sidewalk_m}"',
@@ -92,7 +92,7 @@ def _edge(edge: Edge) -> str:
     zones = "".join(f'<param key="{key}" value="{value}"/>' for key, value in params.items())
     return (
         f'<edge id={quoteattr(edge.id)} from="{edge.tail}" to="{edge.head}" '
-        f'numLanes="{len(lanes)}" speed="{made.speed_mps}" priority="{made.priority}" '
+        f'numLanes="{len(lanes)}" speed="{kind.speed_mps}" priority="{kind.priority}" '
         f'type="{edge.street_class}" spreadType="right" '
         f'shape="{_shape(edge.line)}">{numbered}{zones}</edge>'
     )

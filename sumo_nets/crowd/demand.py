@@ -128,15 +128,15 @@ class Pedestrians:
         fellows = self._together.fellows
         present = sorted(self.ages.keys() & set(person.getIDList()))
         self._together.forget(present)
-        gone: set[str] = set()
+        removed: set[str] = set()
         for name in present:
             here = seen.get(name)
-            if name in gone:
+            if name in removed:
                 continue
             if here is None or (
                 here.waiting_s > STUCK_S and not any(at_red(fellow) for fellow in fellows(name))
             ):
-                gone.update(fellows(name))
+                removed.update(fellows(name))
                 self._remove(name)
         away_m = {name: math.hypot(p.x_m - x_m, p.y_m - y_m) for name, p in seen.items()}
         inside = [name for name, far_m in away_m.items() if far_m < radius_m]

@@ -22,7 +22,7 @@ from sumo_nets.crowd.group_sampling import PERSON_MPS
 from sumo_nets.crowd.proxy import KEEP_ROUTE, MATCH_M, ROUND_THE_CORNER_M
 from sumo_nets.engine import Sumo
 
-_SLACK_M: Final = 0.15
+_TOLERANCE_M: Final = 0.15
 """Smallest deviation from the group's middle that changes a member's speed, metres."""
 
 SLOWER_PER_M: Final = 0.3
@@ -41,22 +41,22 @@ WAIT_M = 2.0
 GO_M = 1.4
 """A waiting member continues when the last one is nearer, metres."""
 
-_BESIDE_M: Final = 1.0
+_TOO_WIDE_M: Final = 1.0
 """A member farther to the side of the next one steps closer, metres."""
 
-_STEP_M: Final = 0.34
+_SIDE_STEP_M: Final = 0.34
 """Size of a side step: more than half a stripe, so that SUMO continues to the middle of the next
 one, metres."""
 
-_ROOM_M = 0.9
+_FREE_RADIUS_M = 0.9
 """Smallest distance of others from the target of a side step, metres."""
-_AHEAD_M = 6.0
+_FREE_AHEAD_M = 6.0
 """Distance ahead that must be free of others for a side step, metres."""
 
 ROUGHLY: Final = 0.5
 """Factor on distances along the way at corners, where the direction is uncertain."""
 
-_APART_M: Final = 3.0
+_FAR_APART_M: Final = 3.0
 """For members farther apart, possibly around a corner, order follows from the edges of the walk,
 metres."""
 
@@ -130,7 +130,7 @@ class Together:
                 self._groups.pop(name, None)
             group.names = tuple(name for name in group.names if name in here)
             if len(group.names) == 1:
-                self._walk(group, group.names[0], 1.0)
+                self._set_speed(group, group.names[0], 1.0)
             elif group.names:
                 self._groups.update(dict.fromkeys(group.names, group))
 
@@ -146,28 +146,28 @@ class Together:
         for name, group in self._groups.items():
             if name == group.names[0] and all(fellow in seen for fellow in group.names):
                 here = {fellow: (seen[fellow].x_m, seen[fellow].y_m) for fellow in group.names}
-                self._order(here, group)
+                self._update_order(here, group)
                 if group.way is not None:
-                    self._pull(group)
-                    self._close(here, group, group.way, seen)
+                    self._adjust_speeds(group)
+                    self._close_gap(here, group, group.way, seen)
 
-    def _pull(self, group: _Group) -> None:
+    def _adjust_speeds(self, group: _Group) -> None:
         """Slow down or stop members ahead and speed up members behind."""
         last_m, first_m = min(group.ahead_m.values()), max(group.ahead_m.values())
-        if first_m - last_m <= _SLACK_M and not group.share:
+        if first_m - last_m <= _TOLERANCE_M and not group.share:
             return
         middle_m = sum(group.ahead_m.values()) / len(group.ahead_m)
         for name, ahead_m in group.ahead_m.items():
             share = 1.0
             if ahead_m - last_m > (GO_M if group.share.get(name) == 0.0 else WAIT_M):
                 share = 0.0
-            elif abs(ahead_m - middle_m) > _SLACK_M:
+            elif abs(ahead_m - middle_m) > _TOLERANCE_M:
                 share = min(max(1.0 - SLOWER_PER_M * (ahead_m - middle_m), SLOWEST), FASTEST)
             if share < 1.0 and self._on_crossing(name):
                 share = 1.0
-            self._walk(group, name, round(_STEPS * share) / _STEPS)
+            self._set_speed(group, name, round(_STEPS * share) / _STEPS)
 
-    def _close(
+    def _close_gap(
         self, here: Mapping[str, _Place], group: _Group, way: _Place, seen: Mapping[str, _Standing]
     ) -> None:
         """Let one member that is too far to the side in two successive updates step closer, the
@@ -176,7 +176,7 @@ class Together:
         too_wide = [
             (one, other)
             for (low_m, one), (high_m, other) in itertools.pairwise(left)
-            if _BESIDE_M < high_m - low_m < _APART_M
+            if _TOO_WIDE_M < high_m - low_m < _FAR_APART_M
             and 0.0 not in (group.share.get(one), group.share.get(other))
         ]
         before = group.wide
@@ -187,15 +187,15 @@ class Together:
         others = [(p.x_m, p.y_m) for name, p in seen.items() if name not in here]
         for name in sorted(too_wide[0], key=lambda name: (group.ahead_m[name], name)):
             on_m = self._tick_s * group.mps * group.share.get(name, 1.0)
-            left_m = _STEP_M if name == too_wide[0][0] else -_STEP_M
+            left_m = _SIDE_STEP_M if name == too_wide[0][0] else -_SIDE_STEP_M
             to = (
                 here[name][0] + on_m * way[0] - left_m * way[1],
                 here[name][1] + on_m * way[1] + left_m * way[0],
             )
-            if _is_free(to, way, others) and self._step(name, way, to):
+            if _is_free(to, way, others) and self._step_aside(name, way, to):
                 return
 
-    def _step(self, name: str, way: _Place, to: _Place) -> bool:
+    def _step_aside(self, name: str, way: _Place, to: _Place) -> bool:
         """Move a person sideways while it walks along a sidewalk. Returns whether it was
         possible."""
         person = self._engine.person
@@ -215,9 +215,9 @@ class Together:
         strip = self._strips.get(self._engine.person.getRoadID(name))
         return strip is not None and strip.kind == "crossing"
 
-    def _order(self, here: Mapping[str, _Place], group: _Group) -> None:
+    def _update_order(self, here: Mapping[str, _Place], group: _Group) -> None:
         """Update the group's direction and each member's distance along it."""
-        self._come_to(group)
+        self._advance_walk(group)
         x_m = y_m = 0.0
         for name, (now_x_m, now_y_m) in here.items():
             was_x_m, was_y_m = group.was.get(name, (now_x_m, now_y_m))
@@ -230,13 +230,13 @@ class Together:
         if group.way is None:
             return
         ahead_m = {n: group.way[0] * p[0] + group.way[1] * p[1] for n, p in here.items()}
-        if max(ahead_m.values()) - min(ahead_m.values()) > _SLACK_M:
-            ahead_m = self._along(group.names, group.way) or self._round_a_corner(
+        if max(ahead_m.values()) - min(ahead_m.values()) > _TOLERANCE_M:
+            ahead_m = self._on_one_edge(group.names, group.way) or self._across_edges(
                 here, ahead_m, group
             )
         group.ahead_m = ahead_m
 
-    def _along(self, names: tuple[str, ...], way: _Place) -> dict[str, float] | None:
+    def _on_one_edge(self, names: tuple[str, ...], way: _Place) -> dict[str, float] | None:
         """Return each member's arc length if all are on one sidewalk or crossing, exact even
         during evasion."""
         person = self._engine.person
@@ -250,27 +250,27 @@ class Together:
         sign = 1.0 if chord[0] * way[0] + chord[1] * way[1] > 0.0 else -1.0
         return {name: sign * person.getLanePosition(name) for name in names}
 
-    def _round_a_corner(
+    def _across_edges(
         self, here: Mapping[str, _Place], ahead_m: Mapping[str, float], group: _Group
     ) -> dict[str, float]:
         """Estimate who is ahead where the way turns or members are on several edges.
 
         Nearby members are compared along the group's direction, others by their edges of the walk.
         """
-        if max(math.dist(p, q) for p, q in itertools.combinations(here.values(), 2)) < _APART_M:
+        if max(math.dist(p, q) for p, q in itertools.combinations(here.values(), 2)) < _FAR_APART_M:
             return {name: ROUGHLY * m for name, m in ahead_m.items()}
-        edges = {name: self._edge(name, group) for name in here}
+        edges = {name: self._edge_index(name, group) for name in here}
         hindmost = [here[name] for name, edge in edges.items() if edge == min(edges.values())]
         return {name: min(math.dist(here[name], place) for place in hindmost) for name in here}
 
-    def _come_to(self, group: _Group) -> None:
+    def _advance_walk(self, group: _Group) -> None:
         """Update the group's position in its walk, from its first member."""
         edge = self._engine.person.getRoadID(group.names[0])
         ahead = group.walk[group.at : group.at + LOOK_AHEAD]
         if edge in ahead:
             group.at += ahead.index(edge)
 
-    def _edge(self, name: str, group: _Group) -> float:
+    def _edge_index(self, name: str, group: _Group) -> float:
         """Return the index in the walk of a person's edge, less a half on corners.
 
         If the edge occurs several times, the occurrence nearest to the group counts.
@@ -283,7 +283,7 @@ class Together:
         places = [k for k, part in enumerate(group.walk) if part == edge]
         return min(places, key=lambda k: abs(k - group.at), default=group.at) - half
 
-    def _walk(self, group: _Group, name: str, share: float) -> None:
+    def _set_speed(self, group: _Group, name: str, share: float) -> None:
         if group.share.get(name, 1.0) != share:
             group.share[name] = share
             if share == 1.0:
@@ -293,9 +293,9 @@ class Together:
 
 
 def _is_free(place: _Place, way: _Place, others: list[_Place]) -> bool:
-    """Return whether nobody is near a place or ahead of it within _AHEAD_M."""
+    """Return whether nobody is near a place or ahead of it within _FREE_AHEAD_M."""
     apart = np.array(others).reshape(-1, 2) - place
     ahead = apart @ way
     aside = apart @ (-way[1], way[0])
     behind = np.minimum(ahead, 0.0)
-    return not bool(((ahead < _AHEAD_M) & (np.hypot(behind, aside) < _ROOM_M)).any())
+    return not bool(((ahead < _FREE_AHEAD_M) & (np.hypot(behind, aside) < _FREE_RADIUS_M)).any())

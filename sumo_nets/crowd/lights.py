@@ -60,7 +60,7 @@ class Signals:
     def __init__(self, lights: Lights, street_map: StreetMap) -> None:
         self._lights = lights
         self._ids = sorted(lights.crossings)
-        self._lit = frozenset(self._ids)
+        self._signalised = frozenset(self._ids)
         middles = [street_map.strips[i].line.mean(axis=0) for i in self._ids]
         self._xy = np.array(middles, dtype=float).reshape(-1, 2)
         self._shown: dict[str, Showing] = {}
@@ -93,7 +93,7 @@ class Signals:
         return [
             i
             for i, one in enumerate(crossings)
-            if one in self._lit and not self._state(one, now_s).walk
+            if one in self._signalised and not self._state(one, now_s).walk
         ]
 
     def is_red(self, crossing: str) -> bool:

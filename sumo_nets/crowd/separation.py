@@ -69,7 +69,7 @@ class NearPairs:
         firm: (N,) whether a person does not give way.
         """
         if len(at) != len(self._at) or np.abs(at - self._at).max(initial=0.0) > 0.49 * _MARGIN_M:
-            self._look(at)
+            self._search(at)
         gap = at[self._one] - at[self._other]
         far_m2 = gap.real * gap.real + gap.imag * gap.imag
         close = far_m2 < SHOULDERS_M * SHOULDERS_M
@@ -81,7 +81,7 @@ class NearPairs:
                 return one[moves], other[moves]
         return self._one[:0], self._other[:0]
 
-    def _look(self, at: Complex) -> None:
+    def _search(self, at: Complex) -> None:
         pairs = pairs_within(np.column_stack([at.real, at.imag]), _NEAR_M + _MARGIN_M)
         self._one, self._other = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].T.copy()
         self._at = at

@@ -90,8 +90,8 @@ class PoseFilter:
         reach_m = MAX_SPEED_MPS * self.period_s
         shown = before + gap * (reach_m / np.maximum(distance, reach_m))[:, None]
         stand = speed < PERSON_STANDS_MPS
-        shown = self._apart(before, shown, others, stand)
-        shown = self._round(before, shown, body, stand)
+        shown = self._separated(before, shown, others, stand)
+        shown = self._around_obstacles(before, shown, body, stand)
         velocity = (shown - before) / self.period_s
         velocity[new] = simulated
         motion = motion + (velocity - motion) * min(self.period_s / LOOK_AHEAD_S, 1.0)
@@ -108,7 +108,7 @@ class PoseFilter:
             self._motion = motion
         return shown, facing, np.hypot(velocity[:, 0], velocity[:, 1])
 
-    def _round(
+    def _around_obstacles(
         self, before: Floats, shown: Floats, body: RobotBody | None, stand: NDArray[np.bool_]
     ) -> Floats:
         """Step around the robot and obstacles; do not move if that would lead into the robot."""
@@ -119,7 +119,7 @@ class PoseFilter:
         stays = (round_both != past).any(axis=1) & comes_too_near(before, round_both, body)
         return np.where(stays[:, None], before, round_both)
 
-    def _apart(
+    def _separated(
         self, before: Floats, shown: Floats, others: Floats, stand: NDArray[np.bool_]
     ) -> Floats:
         firm = np.arange(len(shown) + len(others)) >= len(shown)

@@ -31,15 +31,15 @@ class StopLines:
     def passed(self, vehicles: Collection[str]) -> list[Passed]:
         """Return the vehicles that crossed a stop line since the last call, with the current
         state of the light."""
-        ahead = {}
+        next_lights = {}
         for name in vehicles:
             lights = sumo.vehicle.getNextTLS(name)
             if lights:
-                ahead[name] = lights[0][:3]
+                next_lights[name] = lights[0][:3]
         lit = {
             link: _letter(link)
             for link in {
-                (light, link) for light, link, _ in (*ahead.values(), *self._next.values())
+                (light, link) for light, link, _ in (*next_lights.values(), *self._next.values())
             }
         }
         self._red_s = {
@@ -49,10 +49,10 @@ class StopLines:
         for name, (light, link, away_m) in self._next.items():
             # A distant light that disappears means a changed route. The same junction at a short
             # distance means a lane change at the stop line.
-            next_light, _, next_m = ahead.get(name, ("", -1, 0.0))
+            next_light, _, next_m = next_lights.get(name, ("", -1, 0.0))
             if name in vehicles and away_m < 3.0 and (next_light != light or next_m > away_m + 3.0):
                 found.append(Passed(name, lit[light, link], self._red_s.get((light, link), 0.0)))
-        self._next = ahead
+        self._next = next_lights
         return found
 
 

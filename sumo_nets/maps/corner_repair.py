@@ -37,7 +37,7 @@ def mend_corners(root: ET.Element, street_map: StreetMap, progress: Progress = i
         for e in root.iter("edge")
         if e.get("function") == "walkingarea" and len(e)
     }
-    mended = 0
+    widened = 0
     for number, corner in enumerate(street_map.corners.values()):
         if number % 100 == 0:
             progress("mending corners", number / len(street_map.corners))
@@ -45,11 +45,11 @@ def mend_corners(root: ET.Element, street_map: StreetMap, progress: Progress = i
         if polygon is not None and corner.id in lanes:
             ring = shapely.get_coordinates(polygon.exterior)[:-1]
             lanes[corner.id].set("shape", " ".join(f"{x:.2f},{y:.2f}" for x, y in ring))
-            mended += 1
-    if not mended:
+            widened += 1
+    if not widened:
         return []
     return [
-        f"{mended} of {len(street_map.corners)} corners were torn or pinched: widened along "
+        f"{widened} of {len(street_map.corners)} corners were torn or pinched: widened along "
         f"the ways across them"
     ]
 
@@ -61,13 +61,13 @@ def widened_corner(street_map: StreetMap, corner: Corner) -> Polygon | None:
     if len(ports) < 2:
         return None
     strips = [street_map.strips[port.strip] for port in ports]
-    ends = np.array([_end(port, strip) for port, strip in zip(ports, strips, strict=True)])
+    ends = np.array([_port_point(port, strip) for port, strip in zip(ports, strips, strict=True)])
     widths = np.array([strip.width_m for strip in strips])
     clear_m = min(CLEAR_M, 0.35 * float(widths.min()))
     torn = isinstance(corner.polygon, MultiPolygon) or any(
-        map(_beside, repeat(corner), strips, ends)
+        map(_is_torn, repeat(corner), strips, ends)
     )
-    if not torn and _open(corner.polygon, strips, ends, widths, clear_m):
+    if not torn and _is_passable(corner.polygon, strips, ends, widths, clear_m):
         return None
     pads = shapely.buffer(shapely.points(ends), np.minimum(widths / 2.0, PAD_M))
     groups = _groups([corner.polygon, *pads], ends, clear_m)
@@ -90,17 +90,17 @@ def widened_corner(street_map: StreetMap, corner: Corner) -> Polygon | None:
     )
 
 
-def _end(port: Port, strip: Strip) -> Floats:
+def _port_point(port: Port, strip: Strip) -> Floats:
     return strip.line[0 if port.end == 0 else -1, :2]
 
 
-def _beside(corner: Corner, strip: Strip, end: Floats) -> bool:
+def _is_torn(corner: Corner, strip: Strip, end: Floats) -> bool:
     """Return whether a strip ends at the edge of the ground."""
     ground = union_closed([corner.polygon, strip.polygon])
     return float(shapely.distance(shapely.boundary(ground), shapely.Point(end))) < _EDGE_M
 
 
-def _open(
+def _is_passable(
     polygon: Polygon | MultiPolygon,
     strips: Sequence[Strip],
     ends: Floats,

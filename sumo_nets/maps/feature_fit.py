@@ -50,13 +50,13 @@ EXTENT_M: Final[Mapping[str, tuple[float, float]]] = {
 
 _CLEAR_HALF_M: Final = 0.6
 """Half of the smallest clear width along the middle of a sidewalk, metres."""
-_EDGE_M: Final = 0.6
+_OUTER_M: Final = 0.6
 """Width of the outer parts of a sidewalk where objects may stand, metres."""
 WALL_GAP_M: Final = 0.2
 """Smallest distance of a building from streets and walkways, metres."""
 _GAP_M: Final = 0.1
 """Smallest distance between objects, metres."""
-_MOVED_M: Final = 3.0
+_MAX_MOVE_M: Final = 3.0
 """Largest displacement of an object to a permitted position, metres."""
 _CELL_M: Final = 2.5
 """Cell size of the search for touching objects, metres: touching objects are at most this far
@@ -93,17 +93,17 @@ def fitted(
         thing._replace(rings=tuple(utm_xy(ring, *zone) + offset for ring in thing.rings))
         for thing in around
     ]
-    near = _near(mapped, street_map)
+    near = _near_walkways(mapped, street_map)
     streets = _Streets(street_map)
-    buildings, cut_changes = _cut_back(
+    buildings, cut_changes = _cut_buildings(
         [thing for thing in near if thing.kind == "building"], streets
     )
     things = [thing for thing in near if thing.kind not in ("building", *LANDS)]
-    standing, moved_changes = _settled(things, streets, buildings)
+    standing, moved_changes = _placed(things, streets, buildings)
     lands = _clipped([thing for thing in near if thing.kind in LANDS], street_map)
     kinds = Counter(feature.kind for feature in (*buildings, *standing, *lands))
-    words = [f"{count} x {kind}" for kind, count in kinds.items()]
-    changes = [f"taken from the map: {', '.join(words)}"] if words else []
+    counts = [f"{count} x {kind}" for kind, count in kinds.items()]
+    changes = [f"taken from the map: {', '.join(counts)}"] if counts else []
     left_out = [f"{count} x {reason}" for reason, count in found.skipped.items()]
     if left_out:
         changes.append(f"left out: {', '.join(left_out)}")
@@ -116,7 +116,7 @@ def _in_zone(thing: Mapped, zone: int) -> bool:
     return bool((np.abs(east) < IN_ZONE_DEG).all())
 
 
-def _near(mapped: Sequence[Mapped], street_map: StreetMap) -> list[Mapped]:
+def _near_walkways(mapped: Sequence[Mapped], street_map: StreetMap) -> list[Mapped]:
     walked = [strip.polygon for strip in street_map.strips.values()]
     if not walked or not mapped:
         return []
@@ -162,7 +162,7 @@ class _Streets:
         ground: list[shapely.Geometry] = [lane.polygon for lane in lanes]
         ground += [corner.polygon for corner in street_map.corners.values()]
         self._ground = _Index([*ground, *(strip.polygon for strip in strips)])
-        self._closed = _Index([*ground, *(_band(strip) for strip in strips)])
+        self._closed = _Index([*ground, *(_closed_band(strip) for strip in strips)])
         self._roads = _Lines(lanes)
         self._walks = _Lines([strip for strip in strips if strip.kind == "sidewalk"])
 
@@ -172,7 +172,7 @@ class _Streets:
 
     def closed(self, at: Point) -> shapely.Geometry:
         """Return the ground around a point where objects are not permitted."""
-        return self._closed.union(at, 2.0 * _MOVED_M)
+        return self._closed.union(at, 2.0 * _MAX_MOVE_M)
 
     def heading(self, kind: str, at: Point | Polygon) -> float:
         """Return the heading of an object.
@@ -221,18 +221,18 @@ class _Lines:
         return math.atan2(y1 - y0, x1 - x0)
 
 
-def _band(strip: Strip) -> shapely.Geometry:
+def _closed_band(strip: Strip) -> shapely.Geometry:
     """Return the part of a strip without objects: all around a crossing, the middle of a
     sidewalk."""
     if strip.kind == "crossing":
         return shapely.buffer(strip.polygon, 1.0)
-    half = max(_CLEAR_HALF_M, 0.5 * strip.width_m - _EDGE_M)
+    half = max(_CLEAR_HALF_M, 0.5 * strip.width_m - _OUTER_M)
     if half >= 0.5 * strip.width_m:
         return strip.polygon
     return shapely.buffer(shapely.LineString(strip.line[:, :2]), half)
 
 
-def _cut_back(mapped: Sequence[Mapped], streets: _Streets) -> tuple[list[Feature], list[str]]:
+def _cut_buildings(mapped: Sequence[Mapped], streets: _Streets) -> tuple[list[Feature], list[str]]:
     """Return buildings without the ground of streets."""
     found: list[Feature] = []
     cut = dropped = 0
@@ -244,14 +244,14 @@ def _cut_back(mapped: Sequence[Mapped], streets: _Streets) -> tuple[list[Feature
         parts = [whole]
         taken = streets.under(shapely.buffer(whole, WALL_GAP_M))
         if not shapely.is_empty(taken):
-            parts = _without(whole, taken)
+            parts = _outside_streets(whole, taken)
             left = sum(part.area for part in parts) > LEFT_SHARE * whole.area
             cut += left
             dropped += not left
             parts = parts if left else []
         for part in parts:
             x, y = shapely.get_coordinates(shapely.point_on_surface(part))[0].tolist()
-            heading = round(_front(part, streets.heading("building", part)), 4)
+            heading = round(_front_heading(part, streets.heading("building", part)), 4)
             found.append(
                 Feature(
                     "building", round(x, 2), round(y, 2), heading, round(thing.height_m, 2), part
@@ -267,7 +267,7 @@ def _cut_back(mapped: Sequence[Mapped], streets: _Streets) -> tuple[list[Feature
     return found, changes
 
 
-def _front(part: Polygon, heading_rad: float) -> float:
+def _front_heading(part: Polygon, heading_rad: float) -> float:
     """Return the heading along the wall that faces a street to the right of `heading_rad`."""
     ring = shapely.get_coordinates(shapely.orient_polygons(part).exterior)
     sides = np.diff(ring, axis=0)
@@ -277,7 +277,7 @@ def _front(part: Polygon, heading_rad: float) -> float:
     return math.atan2(y, x)
 
 
-def _without(whole: Polygon, taken: shapely.Geometry) -> list[Polygon]:
+def _outside_streets(whole: Polygon, taken: shapely.Geometry) -> list[Polygon]:
     """Return the parts of a building outside of the streets, without splinters."""
     ground = shapely.buffer(taken, WALL_GAP_M, join_style="mitre", mitre_limit=2.0)
     left = shapely.simplify(overlay.difference(whole, ground), 0.05)
@@ -295,18 +295,18 @@ def _without(whole: Polygon, taken: shapely.Geometry) -> list[Polygon]:
     ]
 
 
-def _settled(
+def _placed(
     mapped: Sequence[Mapped], streets: _Streets, buildings: Sequence[Feature]
 ) -> tuple[list[Feature], list[str]]:
     """Place objects at permitted positions near the mapped ones, or omit them."""
     houses = _Index([building.polygon for building in buildings])
     found: list[Feature] = []
-    stood: dict[tuple[int, int], list[tuple[Floats, float]]] = defaultdict(list)
+    placed: dict[tuple[int, int], list[tuple[Floats, float]]] = defaultdict(list)
     counts: Counter[str] = Counter()
     for thing in mapped:
         radius = 0.5 * math.hypot(*EXTENT_M[thing.kind])
         spot = Point(thing.rings[0][0])
-        closed = overlay.union(streets.closed(spot), houses.union(spot, 2.0 * _MOVED_M))
+        closed = overlay.union(streets.closed(spot), houses.union(spot, 2.0 * _MAX_MOVE_M))
         at = _free_spot(spot, closed, radius)
         if at is None:
             counts["left out on a road, a crossing or in a narrow passage"] += 1
@@ -314,14 +314,17 @@ def _settled(
         xy = np.array([round(at.x, 2), round(at.y, 2)])
         i, j = (math.floor(c / _CELL_M) for c in xy)
         rivals = [
-            rival for a in (-1, 0, 1) for b in (-1, 0, 1) for rival in stood.get((i + a, j + b), ())
+            rival
+            for a in (-1, 0, 1)
+            for b in (-1, 0, 1)
+            for rival in placed.get((i + a, j + b), ())
         ]
         if any(np.hypot(*(xy - other)) < radius + reach + _GAP_M for other, reach in rivals):
             counts["left out where another one stands"] += 1
             continue
         if at is not spot:
             counts["moved aside by up to 3 m, off the road or the middle of a sidewalk"] += 1
-        stood[i, j].append((xy, radius))
+        placed[i, j].append((xy, radius))
         facing = thing.facing_rad
         turned = streets.heading(thing.kind, at) if facing is None else facing + 0.5 * math.pi
         heading = round(math.remainder(turned, 2.0 * math.pi), 4)
@@ -331,9 +334,9 @@ def _settled(
 
 
 def _free_spot(spot: Point, closed: shapely.Geometry, radius_m: float) -> Point | None:
-    """Return the nearest point for a disk outside of `closed`, or None beyond _MOVED_M."""
+    """Return the nearest point for a disk outside of `closed`, or None beyond _MAX_MOVE_M."""
     if shapely.is_empty(closed) or spot.distance(closed) > radius_m:
         return spot
     edge = shapely.boundary(shapely.buffer(closed, radius_m + 0.02))
     _, at = (Point(p) for p in shapely.get_coordinates(shapely.shortest_line(spot, edge)))
-    return at if spot.distance(at) <= _MOVED_M else None
+    return at if spot.distance(at) <= _MAX_MOVE_M else None

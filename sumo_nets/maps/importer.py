@@ -204,7 +204,7 @@ def _from_net(work: ImportWork, options: Options) -> Converted:
     facts = (
         read_facts(file.path)
         if options.lefthand is None
-        else _sided(read_facts(file.path), options, file)
+        else _check_driving_side(read_facts(file.path), options, file)
     )
     if not facts.edges:
         raise MapError(f"{file.source}: a net of 0 edges: export an area with streets in it")
@@ -223,7 +223,7 @@ def _from_net(work: ImportWork, options: Options) -> Converted:
         net = add_walkways(work, net, facts)
         net = widen_sidewalks(work, net, options.widths_m, {}, before)
         share = new_share(net_root(net), before)
-    elif _old(facts.version):
+    elif _is_old_format(facts.version):
         net = work.netconvert("renewing the net", "renewed.net.xml", ["-s", str(net)])
         changes.append(f"renewed by netconvert: format {facts.version} is too old to be simulated")
     return _finish(work, net, options.rules, share, [])
@@ -319,7 +319,7 @@ def _left_hand(found: OsmFacts, options: Options, changes: list[str]) -> bool:
     return True
 
 
-def _sided(facts: NetFacts, options: Options, file: MapFile) -> NetFacts:
+def _check_driving_side(facts: NetFacts, options: Options, file: MapFile) -> NetFacts:
     if options.lefthand != facts.left_hand:
         side = "left" if facts.left_hand else "right"
         raise MapError(
@@ -329,7 +329,7 @@ def _sided(facts: NetFacts, options: Options, file: MapFile) -> NetFacts:
     return facts
 
 
-def _old(version: str) -> bool:
+def _is_old_format(version: str) -> bool:
     return version.startswith("0.") or version == "?"
 
 

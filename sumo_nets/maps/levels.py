@@ -19,14 +19,14 @@ from sumo_nets.net.net_file import LANE_M
 LEVEL_KEYS: Final = ("bridge", "tunnel", "layer", "covered", "location", "level")
 """Tags of OSM ways that can indicate a level off the ground."""
 _GROUND_LAYERS: Final = ("", "0")
-_MOSTLY: Final = 0.5
+_HIDDEN_SHARE: Final = 0.5
 """A walkway with a larger share of its area on roads of another layer lies over or under them."""
 
 
 def is_levelled(tags: Mapping[str, str]) -> bool:
     """Return whether tags of an OSM way may indicate a level off the ground."""
     raised = any(tags.get(key, "no") not in GROUND for key in ("bridge", "tunnel"))
-    return raised or tags.get("layer", "0") not in _GROUND_LAYERS or _elsewhere(tags)
+    return raised or tags.get("layer", "0") not in _GROUND_LAYERS or _on_other_storey(tags)
 
 
 def edges_of(ways: Mapping[str, int]) -> Iterator[str]:
@@ -48,20 +48,20 @@ def settle_levels(root: ET.Element) -> list[str]:
     normal = [
         edge for edge in root.iter("edge") if not edge.get("function") and len(edge.findall("lane"))
     ]
-    said = {edge.get("id", ""): params_of(edge) for edge in normal}
+    params = {edge.get("id", ""): params_of(edge) for edge in normal}
     moved = 0
     doubtful = list[ET.Element]()
     for edge in normal:
-        tags = said[edge.get("id", "")]
+        tags = params[edge.get("id", "")]
         if any(tags.get(key, "no") not in GROUND for key in ("bridge", "tunnel")):
             continue
-        if _elsewhere(tags):
+        if _on_other_storey(tags):
             if tags.get("layer", "0") in _GROUND_LAYERS:
                 _set_layer(edge, "-1" if tags.get("level", "-1").startswith("-") else "1")
             moved += footway(edge) is not None
         elif tags.get("layer", "0") not in _GROUND_LAYERS and tags.get("covered", "no") == "no":
             doubtful.append(edge)
-    stacked = _stacked(doubtful, normal, said)
+    stacked = _over_or_under(doubtful, normal, params)
     settled = [edge for edge in doubtful if edge.get("id") not in stacked]
     for edge in settled:
         _set_layer(edge, None)
@@ -88,7 +88,7 @@ def _set_layer(edge: ET.Element, layer: str | None) -> None:
         ET.SubElement(edge, "param", {"key": "layer", "value": layer})
 
 
-def _elsewhere(tags: Mapping[str, str]) -> bool:
+def _on_other_storey(tags: Mapping[str, str]) -> bool:
     """Return whether level or location indicate another storey than the ground's."""
     if tags.get("location") in ("underground", "overhead"):
         return True
@@ -99,8 +99,8 @@ def _elsewhere(tags: Mapping[str, str]) -> bool:
     return all(level > 0.0 for level in levels) or all(level < 0.0 for level in levels)
 
 
-def _stacked(
-    doubtful: list[ET.Element], normal: list[ET.Element], said: Mapping[str, Mapping[str, str]]
+def _over_or_under(
+    doubtful: list[ET.Element], normal: list[ET.Element], params: Mapping[str, Mapping[str, str]]
 ) -> set[str]:
     """Return the ids of edges that cross a street of another layer, or lie mostly over or under
     such streets."""
@@ -118,7 +118,7 @@ def _stacked(
     for edge in doubtful:
         name = edge.get("id", "")
         ends = {edge.get("from"), edge.get("to")}
-        layer = said[name]["layer"]
+        layer = params[name]["layer"]
         line = _line(edge.findall("lane")[0])
         ground = _ground(edge)
         crossed = [others[k] for k in tree.query(line, predicate="crosses")]
@@ -129,12 +129,12 @@ def _stacked(
         under = [
             area
             for other, area in touched
-            if _layer(said[other.get("id", "")]) != layer
+            if _layer(params[other.get("id", "")]) != layer
             and not ends & {other.get("from"), other.get("to")}
         ]
         hidden_m2 = shapely.area(shapely.intersection(shapely.union_all(under), ground))
-        if hidden_m2 > _MOSTLY * shapely.area(ground) or any(
-            _layer(said[other.get("id", "")]) != layer for other in crossed
+        if hidden_m2 > _HIDDEN_SHARE * shapely.area(ground) or any(
+            _layer(params[other.get("id", "")]) != layer for other in crossed
         ):
             found.add(name)
     return found

@@ -99,8 +99,8 @@ def import_map(
             raise UsageError(
                 f"'{name}' is the name of a net that comes with SUMO: choose another with --name"
             )
-        options = _options_of(name)
-    return _keep(source, name, options, progress)
+        options = _supplied_options(name)
+    return _store(source, name, options, progress)
 
 
 def map_name(source: Path) -> str:
@@ -124,7 +124,7 @@ def map_net(place: CityMap | str) -> Path:
         supplied = _supplied()
         if name not in supplied:
             raise unknown("map", name, known_maps())
-        _keep(supplied[name], name, _options_of(name), in_place=False)
+        _store(supplied[name], name, _supplied_options(name), in_place=False)
     if (
         not isinstance(place, str)
         and place.net_hash
@@ -220,7 +220,7 @@ def _source_of(name: str) -> str:
         return "damaged: import it again"
 
 
-def _keep(
+def _store(
     source: Path, name: str, options: Options, progress: Progress = ignore, *, in_place: bool = True
 ) -> About:
     """Convert a map in a temporary folder, then move it into place."""
@@ -229,15 +229,17 @@ def _keep(
     try:
         with atomic_folder(folder / name, existing=existing) as ready:
             with TemporaryDirectory(dir=ready) as scratch:
-                made = convert(source, Path(scratch), options, progress)
-                made.net.rename(ready / "net.xml")
-            if made.features:
-                write_features(made.features, ready / NAME)
+                converted = convert(source, Path(scratch), options, progress)
+                converted.net.rename(ready / "net.xml")
+            if converted.features:
+                write_features(converted.features, ready / NAME)
             about = About(
                 name=name,
                 source=source.name,
                 source_hash=file_hash(source),
-                format=" ".join(filter(None, (made.format, made.facts.version, made.packing))),
+                format=" ".join(
+                    filter(None, (converted.format, converted.facts.version, converted.packing))
+                ),
                 imported_at=datetime.now(UTC).isoformat(timespec="seconds"),
                 bbox=options.bbox,
                 lefthand=options.lefthand,
@@ -247,9 +249,9 @@ def _keep(
                     "importer": str(options.rules.version),
                     "eclipse-sumo": version("eclipse-sumo"),
                 },
-                changes=made.changes,
-                guessed_share=made.guessed_share,
-                licences=_licences(name, source, made.licences),
+                changes=converted.changes,
+                guessed_share=converted.guessed_share,
+                licences=_licences(name, source, converted.licences),
                 net_hash=map_hash(ready / "net.xml"),
             )
             (ready / ABOUT).write_bytes(msgspec.json.format(msgspec.json.encode(about), indent=2))
@@ -260,11 +262,11 @@ def _keep(
 
 def _licences(name: str, source: Path, found: tuple[str, ...]) -> tuple[str, ...]:
     """Return the licences from the file itself and from texts in its folder."""
-    said = list(found)
+    licences = list(found)
     if source in _supplied().values():
-        said.append(GAME_LICENCE)
+        licences.append(GAME_LICENCE)
     if name in WHEEL_PLACES and WHEEL_PLACES[name].osm:
-        said.append(OSM_LICENCE)
+        licences.append(OSM_LICENCE)
     for name in ("LICENCE.txt", "LICENSE.txt", "LICENSE", "SOURCE.txt"):
         try:
             text = (source.resolve().parent / name).read_text(errors="replace")
@@ -273,8 +275,8 @@ def _licences(name: str, source: Path, found: tuple[str, ...]) -> tuple[str, ...
         lines = [line.strip() for line in text.splitlines() if line.strip()]
         if name == "SOURCE.txt":
             lines = [line for line in lines if line.startswith("Origin")]
-        said.append(f"{name}: {' '.join(lines)[:1000]}")
-    return tuple(said)
+        licences.append(f"{name}: {' '.join(lines)[:1000]}")
+    return tuple(licences)
 
 
 def _supplied() -> dict[str, Path]:
@@ -282,7 +284,7 @@ def _supplied() -> dict[str, Path]:
     return _game_nets() | {name: one.path for name, one in WHEEL_PLACES.items()}
 
 
-def _options_of(name: str) -> Options:
+def _supplied_options(name: str) -> Options:
     """Return the import options of a place from the SUMO package."""
     one = WHEEL_PLACES.get(name)
     return Options(rules=SUITE_RULES) if one is None else Options(bbox=one.box, rules=one.rules)

@@ -70,12 +70,10 @@ def crop_net(work: ImportWork, net: Path, box: Box | None) -> Path:
     if bounds is not None:
         refuse_box_outside(source, box, bounds, unit)
     option = "--keep-edges.in-geo-boundary" if projected else "--keep-edges.in-boundary"
-    words = ",".join(f"{v:.7f}" for v in box)
+    bbox = ",".join(f"{v:.7f}" for v in box)
     try:
         # With both options in one call, netconvert does not terminate on some nets.
-        inside = work.netconvert(
-            "cropping", "inside.net.xml", ["-s", str(net), f"{option}={words}"]
-        )
+        inside = work.netconvert("cropping", "inside.net.xml", ["-s", str(net), f"{option}={bbox}"])
         net = work.netconvert(
             "cropping", "cropped.net.xml", ["-s", str(inside), "--keep-edges.components=1"]
         )
@@ -84,10 +82,10 @@ def crop_net(work: ImportWork, net: Path, box: Box | None) -> Path:
             "" if bounds is None else f"; the map covers {','.join(f'{v:.6g}' for v in bounds)}"
         )
         raise MapError(
-            f"{source}: cropping to --bbox {words} (in {unit}) failed{covers}: {error}"
+            f"{source}: cropping to --bbox {bbox} (in {unit}) failed{covers}: {error}"
         ) from error
     work.changes.append(
-        f"cropped to {words}; whole streets are kept, and only the largest connected part"
+        f"cropped to {bbox}; whole streets are kept, and only the largest connected part"
     )
     return net
 
@@ -96,13 +94,13 @@ def _bounds(net: Path, projected: bool) -> Box | None:
     """Return the bounds of a net, in degrees if it is projected; None if it does not contain
     them."""
     location = net_root(net).find("location")
-    said = (
+    boundary = (
         ""
         if location is None
         else location.get("origBoundary" if projected else "convBoundary", "")
     )
     try:
-        west, south, east, north = (float(side) for side in said.split(","))
+        west, south, east, north = (float(side) for side in boundary.split(","))
     except ValueError:
         return None
     on_earth = -180.0 <= west < east <= 180.0 and -90.0 <= south < north <= 90.0
@@ -157,10 +155,10 @@ def widen_sidewalks(
 ) -> Path:
     """Return the net with the widths of guessed sidewalks set, see `set_widths`."""
     root = net_root(net)
-    said = set_widths(root, widths_m, tagged, before)
-    if not said:
+    changes = set_widths(root, widths_m, tagged, before)
+    if not changes:
         return net
-    work.changes += said
+    work.changes += changes
     ready = work.written(root, "widths.net.xml")
     # Wider sidewalks move corners. netconvert drops crossings that miss them and guesses new ones.
     return work.netconvert(

@@ -33,7 +33,7 @@ def crop_osm(file: Path, target: Path, box: Box, source: Path) -> None:
     import osmium
 
     try:
-        part = _chosen(file, box, source)
+        part = _selected_part(file, box, source)
         _write(file, target, part)
     except (OSError, RuntimeError, ValueError, osmium.InvalidLocationError) as error:
         raise MapError(f"{source}: cannot be cropped: {error}: get it again") from error
@@ -41,17 +41,17 @@ def crop_osm(file: Path, target: Path, box: Box, source: Path) -> None:
 
 def refuse_box_outside(source: Path, box: Box, bounds: Box, unit: str = "degrees") -> None:
     """Raise MapError, with the bounds of the map, when a box does not overlap it."""
-    if _meet(box, bounds):
+    if _overlap(box, bounds):
         return
     west, south, east, north = box
     swapped = (south, west, north, east)
     hint = (
-        f" (latitude and longitude swapped? --bbox {_text(swapped)})"
-        if _meet(swapped, bounds)
+        f" (latitude and longitude swapped? --bbox {_box_text(swapped)})"
+        if _overlap(swapped, bounds)
         else ""
     )
     raise MapError(
-        f"{source}: --bbox {_text(box)} is outside of the map, which covers {_text(bounds)} "
+        f"{source}: --bbox {_box_text(box)} is outside of the map, which covers {_box_text(bounds)} "
         f"(west,south,east,north in {unit}): give a part of that{hint}"
     )
 
@@ -66,14 +66,14 @@ class _Part:
     relations: set[int] = field(default_factory=set)
 
 
-def _chosen(file: Path, box: Box, source: Path) -> _Part:
+def _selected_part(file: Path, box: Box, source: Path) -> _Part:
     inside, bounds = _inside(file, box)
     if not math.isfinite(bounds[0]):
         raise MapError(f"{source}: an OpenStreetMap file without nodes: export a larger area")
     refuse_box_outside(source, box, bounds)
     part = _Part(set(inside))
     streets = 0
-    for way in _of(file, "WAY"):
+    for way in _elements(file, "WAY"):
         refs = [node.ref for node in way.nodes]
         hits = [place for place, ref in enumerate(refs) if ref in inside]
         if not hits:
@@ -89,11 +89,11 @@ def _chosen(file: Path, box: Box, source: Path) -> _Part:
         part.nodes.update(refs)
     if not streets:
         raise MapError(
-            f"{source}: no street or path (highway=*) of the file lies in --bbox {_text(box)}; "
-            f"the file covers {_text(bounds)}: choose a part with streets in it"
+            f"{source}: no street or path (highway=*) of the file lies in --bbox {_box_text(box)}; "
+            f"the file covers {_box_text(bounds)}: choose a part with streets in it"
         )
     further = set[int]()
-    for relation in _of(file, "RELATION"):
+    for relation in _elements(file, "RELATION"):
         members = [member.ref for member in relation.members if member.type == "w"]
         kind = relation.tags.get("type", "")
         if (
@@ -106,7 +106,7 @@ def _chosen(file: Path, box: Box, source: Path) -> _Part:
         elif kind == "restriction" and part.ways.issuperset(members):
             part.relations.add(relation.id)
     further -= part.ways
-    for way in _of(file, "WAY") if further else ():
+    for way in _elements(file, "WAY") if further else ():
         if way.id in further:
             part.ways.add(way.id)
             part.nodes.update(node.ref for node in way.nodes)
@@ -125,7 +125,7 @@ def _inside(file: Path, box: Box) -> tuple[set[int], Box]:
     low_lon = low_lat = math.inf
     high_lon = high_lat = -math.inf
     inside = set[int]()
-    for node in _of(file, "NODE"):
+    for node in _elements(file, "NODE"):
         if not node.location.valid():
             continue
         lon, lat = node.lon, node.lat
@@ -140,10 +140,10 @@ def _write(file: Path, target: Path, part: _Part) -> None:
     import osmium
 
     with osmium.SimpleWriter(str(target), overwrite=True) as writer:
-        for node in _of(file, "NODE"):
+        for node in _elements(file, "NODE"):
             if node.id in part.nodes:
                 writer.add_node(node)
-        for way in _of(file, "WAY"):
+        for way in _elements(file, "WAY"):
             if way.id in part.cuts:
                 first, last = part.cuts[way.id]
                 writer.add_way(
@@ -151,12 +151,12 @@ def _write(file: Path, target: Path, part: _Part) -> None:
                 )
             elif way.id in part.ways:
                 writer.add_way(way)
-        for relation in _of(file, "RELATION"):
+        for relation in _elements(file, "RELATION"):
             if relation.id in part.relations:
                 writer.add_relation(relation)
 
 
-def _of(file: Path, kind: str) -> Iterator[Any]:
+def _elements(file: Path, kind: str) -> Iterator[Any]:
     """Yield the nodes, ways or relations of a file."""
     import osmium
 
@@ -164,9 +164,9 @@ def _of(file: Path, kind: str) -> Iterator[Any]:
     yield from things
 
 
-def _meet(a: Box, b: Box) -> bool:
+def _overlap(a: Box, b: Box) -> bool:
     return a[0] < b[2] and a[2] > b[0] and a[1] < b[3] and a[3] > b[1]
 
 
-def _text(box: Box) -> str:
+def _box_text(box: Box) -> str:
     return ",".join(f"{side:.6g}" if abs(side) < 1000.0 else f"{side:.0f}" for side in box)

@@ -83,7 +83,7 @@ _GREEN = (
     "vineyard",
 )
 _SPORT = ("park", "garden", "pitch", "golf_course", "dog_park", "common", "nature_reserve")
-_OPEN: Mapping[LandKind, Mapping[str, tuple[str, ...]]] = {
+_LAND_VALUES: Mapping[LandKind, Mapping[str, tuple[str, ...]]] = {
     "lawn": {
         "landuse": (*_GREEN, "farmland", "greenfield", "plant_nursery", "greenery"),
         "leisure": _SPORT,
@@ -111,7 +111,7 @@ _OPEN: Mapping[LandKind, Mapping[str, tuple[str, ...]]] = {
 }
 LAND_OF: Mapping[tuple[str, str], LandKind] = {
     (key, value): kind
-    for kind, keys in _OPEN.items()
+    for kind, keys in _LAND_VALUES.items()
     for key, values in keys.items()
     for value in values
 }
@@ -281,12 +281,12 @@ def _buildings(scan: _Scan, skipped: Counter[str]) -> list[Mapped]:
             elif len(ring) < 4 or refs[0] != refs[-1]:
                 skipped["buildings with an open outline"] += 1
             else:
-                found += _built([Polygon(ring)], tags, skipped)
+                found += _building_features([Polygon(ring)], tags, skipped)
     for members, tags in scan.areas:
         if not _has_walls(tags, skipped):
             continue
         walled = _outlines(scan, members, "buildings", skipped)
-        found += _built(walled, tags, skipped)
+        found += _building_features(walled, tags, skipped)
     return found
 
 
@@ -304,11 +304,13 @@ def _lands(scan: _Scan, skipped: Counter[str]) -> list[Mapped]:
         if ring is None:
             skipped["pieces of land with missing nodes"] += 1
         else:
-            found += _covered(kind, [Polygon(ring)], skipped)
+            found += _land_features(kind, [Polygon(ring)], skipped)
     for members, tags in scan.lands:
         kind = _land(tags)
         if kind is not None:
-            found += _covered(kind, _outlines(scan, members, "pieces of land", skipped), skipped)
+            found += _land_features(
+                kind, _outlines(scan, members, "pieces of land", skipped), skipped
+            )
     return found
 
 
@@ -321,7 +323,7 @@ def _land(tags: Mapping[str, str]) -> LandKind | None:
     return next((LAND_OF[pair] for pair in tags.items() if pair in LAND_OF), None)
 
 
-def _covered(
+def _land_features(
     kind: LandKind, outlines: Sequence[shapely.Geometry], skipped: Counter[str]
 ) -> list[Mapped]:
     found = []
@@ -368,7 +370,7 @@ def _rings(scan: _Scan, refs: Sequence[str]) -> list[Polygon] | None:
     return [Polygon(shapely.get_exterior_ring(ring)) for ring in shapely.get_parts(rings)]
 
 
-def _built(
+def _building_features(
     outlines: Sequence[shapely.Geometry], tags: Mapping[str, str], skipped: Counter[str]
 ) -> list[Mapped]:
     found = []
@@ -407,24 +409,26 @@ def _has_walls(tags: Mapping[str, str], skipped: Counter[str]) -> bool:
 def building_height_m(tags: Mapping[str, str], area_m2: float, skipped: Counter[str]) -> float:
     """Return a building's height: as tagged, else by storeys, else by kind and size, limited to
     a plausible range."""
-    said = _height(tags, "height", skipped) or _height(tags, "building:levels", skipped) * _STOREY_M
-    if not said:
+    height_m = (
+        _height(tags, "height", skipped) or _height(tags, "building:levels", skipped) * _STOREY_M
+    )
+    if not height_m:
         kind = tags.get("building", "yes")
-        said = _STOREY_M * (
+        height_m = _STOREY_M * (
             1.0 if kind in LOW or area_m2 < SMALL_M2 else LEVELS_OF.get(kind, _LEVELS)
         )
-    return min(max(said, LOWEST_M), HIGHEST_BUILDING_M)
+    return min(max(height_m, LOWEST_M), HIGHEST_BUILDING_M)
 
 
 def _height(tags: Mapping[str, str], key: str, skipped: Counter[str]) -> float:
     """Return a tag's value in metres or storeys; 0 if missing or unusable, which is counted."""
     if key not in tags:
         return 0.0
-    said = metres(tags[key])
-    if said is None or not said < ABSURD_M:
+    value = metres(tags[key])
+    if value is None or not value < ABSURD_M:
         skipped["heights that cannot be read or cannot be"] += 1
         return 0.0
-    return said
+    return value
 
 
 def metres(value: str) -> float | None:

@@ -228,17 +228,17 @@ def _lonlat(node: dict[str, str]) -> tuple[float, float]:
 def _check_numbers(way: str, tags: dict[str, str]) -> None:
     """Raise ValueError for implausible lanes and widths, on which netconvert would not
     terminate."""
-    for key, said in tags.items():
-        words = key.split(":")
-        if words[0] == "lanes":
+    for key, value in tags.items():
+        parts = key.split(":")
+        if parts[0] == "lanes":
             most = MOST_LANES
-        elif "width" in (words[0], words[-1]):
+        elif "width" in (parts[0], parts[-1]):
             most = _WIDEST_M
         else:
             continue
-        if any(float(number) > most for number in _NUMBER.findall(said)):
+        if any(float(number) > most for number in _NUMBER.findall(value)):
             raise ValueError(
-                f"way {way}: {key}={said[:40]}, but no street has more than {most}: mend the tag"
+                f"way {way}: {key}={value[:40]}, but no street has more than {most}: mend the tag"
             )
 
 

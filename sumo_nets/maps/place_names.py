@@ -42,23 +42,23 @@ class _MadeCity(msgspec.Struct):
     generator: int = 0
 
 
-def place_called(words: str, roughness: float = 0.0) -> Place:
+def place_called(name: str, roughness: float = 0.0) -> Place:
     """Return the place for a name or path; unknown nets are imported.
 
     roughness: of its ground, 0 to 1.
 
     Raises UsageError with the valid names, MapError when a file is unusable.
     """
-    path = Path(words)
-    found: Place = CityMap(map=words, roughness=roughness)
-    if words in known_maps():
+    path = Path(name)
+    found: Place = CityMap(map=name, roughness=roughness)
+    if name in known_maps():
         return found
     if path.is_dir():
         found = _folder(path)
     elif path.exists():
         found = _file(path)
     else:
-        error = unknown("map", words, known_maps())
+        error = unknown("map", name, known_maps())
         raise UsageError(f"{error} Or give a path: {HINT}.")
     return msgspec.structs.replace(found, roughness=roughness)
 
@@ -77,7 +77,7 @@ def _folder(folder: Path) -> Place:
     if (folder / ABOUT_NAME).is_file():
         return _city(folder)
     if (folder / ABOUT).is_file():
-        return CityMap(map=_adopted(folder))
+        return CityMap(map=_copied_into_store(folder))
     raise UsageError(
         f"{folder}: a folder without {ABOUT_NAME} or {ABOUT}, so neither one of `cosim city make` "
         f"nor an imported map; give {HINT}, or the name of a map (`cosim map list`)"
@@ -103,14 +103,16 @@ def imported_place(net: Path) -> str:
     """Return the name of a net file in the store of maps, and import it if it is missing."""
     source_hash, wanted = file_hash(net), map_name(net)
     name = _free_name(
-        wanted, source_hash, lambda about: about.source_hash == source_hash and _as_it_is(about)
+        wanted,
+        source_hash,
+        lambda about: about.source_hash == source_hash and _has_default_options(about),
     )
     if not (maps_folder() / name).exists():
         import_map(net, name)
     return name
 
 
-def _adopted(folder: Path) -> str:
+def _copied_into_store(folder: Path) -> str:
     """Copy an imported map from a folder into the store, and return its name there."""
     try:
         about = msgspec.json.decode((folder / ABOUT).read_bytes(), type=About)
@@ -158,7 +160,7 @@ def _free_name(wanted: str, content: str, is_same: Callable[[About], bool]) -> s
     )
 
 
-def _as_it_is(about: About) -> bool:
+def _has_default_options(about: About) -> bool:
     """Return whether a map was imported by this version without options."""
     plain = (
         about.bbox is None

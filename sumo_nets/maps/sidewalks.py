@@ -64,7 +64,7 @@ def untagged_share(root: ET.Element, tagged: Collection[str]) -> float:
             continue
         length_m = float(lane.get("length", "0"))
         total_m += length_m
-        if len(edge.findall("lane")) > 1 and not set(_ways(edge)) & set(tagged):
+        if len(edge.findall("lane")) > 1 and not set(_way_ids(edge)) & set(tagged):
             guessed_m += length_m
     return guessed_m / max(total_m, 1e-9)
 
@@ -93,7 +93,7 @@ def set_widths(
         if (
             lane is None
             or edge.get("id") in before
-            or all(other is lane for other in _driven(edge))
+            or all(other is lane for other in _vehicle_lanes(edge))
         ):
             continue
         width_m = _tagged_m(edge, tagged, left_hand)
@@ -105,14 +105,14 @@ def set_widths(
         else:
             tagged_m += length_m
         lane.set("width", f"{width_m:.2f}")
-    words = [
+    parts = [
         f"{widths_m[kind]:g} m beside {kind} streets ({guessed_m[kind] / 1000.0:.1f} km)"
         for kind in STREET_WIDTHS_M
         if kind in guessed_m
     ]
     if tagged_m:
-        words.append(f"as tagged beside others ({tagged_m / 1000.0:.1f} km)")
-    return [f"sidewalks are {', '.join(words)}"] if words else []
+        parts.append(f"as tagged beside others ({tagged_m / 1000.0:.1f} km)")
+    return [f"sidewalks are {', '.join(parts)}"] if parts else []
 
 
 def street_class(edge: ET.Element) -> str:
@@ -122,12 +122,12 @@ def street_class(edge: ET.Element) -> str:
             return known
     return (
         "secondary"
-        if "highway." not in edge.get("type", "") and len(_driven(edge)) > 1
+        if "highway." not in edge.get("type", "") and len(_vehicle_lanes(edge)) > 1
         else "residential"
     )
 
 
-def _driven(edge: ET.Element) -> list[ET.Element]:
+def _vehicle_lanes(edge: ET.Element) -> list[ET.Element]:
     """Return the lanes of an edge that are not only for people and bicycles."""
     return [
         lane for lane in edge.findall("lane") if set(lane.get("allow", "all").split()) - _ON_PATHS
@@ -142,7 +142,7 @@ def _tagged_m(
     own = name.lstrip("-").split("#")[0]
     side = "left" if name.startswith("-") != left_hand else "right"
     found = []
-    for way in _ways(edge):
+    for way in _way_ids(edge):
         if way in tagged:
             # The direction of an edge along its further ways is unknown.
             sides = ("both", side) if way == own else ("both", "left", "right")
@@ -152,7 +152,7 @@ def _tagged_m(
     return min(found, default=None)
 
 
-def _ways(edge: ET.Element) -> list[str]:
+def _way_ids(edge: ET.Element) -> list[str]:
     """Return the ids of an edge's OSM ways."""
-    said = [param.get("value", "") for param in edge.iter("param") if param.get("key") == "origId"]
-    return re.findall(r"\d+", " ".join(said))
+    ids = [param.get("value", "") for param in edge.iter("param") if param.get("key") == "origId"]
+    return re.findall(r"\d+", " ".join(ids))

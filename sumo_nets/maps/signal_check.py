@@ -37,29 +37,29 @@ def mend_signals(root: ET.Element) -> list[str]:
         for e in root.iter("edge")
         if e.get("id") in never and len(e)
     }
-    at: dict[str, dict[int, float]] = defaultdict(dict)
+    missing: dict[str, dict[int, float]] = defaultdict(dict)
     for crossing in never:
         signal, link = links[crossing]
-        at[signal][link] = lengths.get(crossing, 0.0)
+        missing[signal][link] = lengths.get(crossing, 0.0)
     mended, left = list[str](), list[str]()
     for logic in root.iter("tlLogic"):
-        waiting = at.get(logic.get("id", ""))
+        waiting = missing.get(logic.get("id", ""))
         if waiting:
             (mended if _add_walk(logic, waiting) else left).append(logic.get("id", ""))
-    said = []
+    changes = []
     if mended:
         names = ", ".join(dict.fromkeys(mended))
-        said.append(
+        changes.append(
             f"signals that never let people cross got a walk phase at the end of each cycle: "
             f"{names}"
         )
     if left:
         names = ", ".join(dict.fromkeys(left))
-        said.append(
+        changes.append(
             f"signals that never let people cross, left as they are (programs of a special "
             f"kind): {names}"
         )
-    return said
+    return changes
 
 
 def _add_walk(logic: ET.Element, waiting: dict[int, float]) -> bool:
@@ -93,7 +93,7 @@ def lengthen_walks(root: ET.Element) -> list[str]:
     phases of the same program if possible; otherwise the cycle gets longer. Only fixed programs are
     changed.
     """
-    needs = _needs_s(root)
+    needs = _required_green_s(root)
     switched = any(element.tag.startswith("WAUT") for element in root)
     programs: dict[str, list[ET.Element]] = defaultdict(list)
     for logic in root.iter("tlLogic"):
@@ -105,7 +105,7 @@ def lengthen_walks(root: ET.Element) -> list[str]:
     longest_s = 0.0
     for signal, wanted in needs.items():
         plans = [(logic, _durations_s(logic)) for logic in programs[signal]]
-        short = {link for logic, _ in plans for link in _short(logic, wanted)}
+        short = {link for logic, _ in plans for link in _short_links(logic, wanted)}
         if not short:
             continue
         made = (
@@ -125,7 +125,7 @@ def lengthen_walks(root: ET.Element) -> list[str]:
             )
         changed.append(signal)
         crossings += len(short)
-    said = []
+    changes = []
     if changed:
         longer = [more for more in grown if more > 0.0]
         cycles = (
@@ -133,20 +133,20 @@ def lengthen_walks(root: ET.Element) -> list[str]:
             if longer
             else "no cycle is longer"
         )
-        said.append(
+        changes.append(
             f"green too short to walk at {_WALK_MPS:g} m/s after {_REACTION_S:g} s: longer for "
             f"{crossings} crossings of {len(changed)} signals, by up to {longest_s:g} s; {cycles}"
         )
     if left:
         names = ", ".join(left[:4]) + (" ..." if len(left) > 4 else "")
-        said.append(
+        changes.append(
             f"green too short to walk at {len(left)} signals, left as it is (not a fixed "
             f"program): {names}"
         )
-    return said
+    return changes
 
 
-def _needs_s(root: ET.Element) -> dict[str, dict[int, float]]:
+def _required_green_s(root: ET.Element) -> dict[str, dict[int, float]]:
     """Return the seconds of green that each crossing needs, by signal and link."""
     lengths_m = {
         e.get("id", ""): float(e[0].get("length", "0")) for e in root.iter("edge") if len(e)
@@ -177,7 +177,7 @@ def _durations_s(logic: ET.Element) -> list[float] | None:
     return durations if all(0.0 <= d < math.inf for d in durations) else None
 
 
-def _short(logic: ET.Element, wanted: Mapping[int, float]) -> list[int]:
+def _short_links(logic: ET.Element, wanted: Mapping[int, float]) -> list[int]:
     """Return the links of a program with too short a green, as far as durations can be read."""
     phases = logic.findall("phase")
     try:

@@ -158,7 +158,7 @@ class Profile:
         first = [0]
         streets: list[NDArray[np.bool_]] = []
         for c in courses:
-            points = _dense(c)
+            points = _resampled(c)
             start = first[-1]
             n = len(points)
             rows.append(points)
@@ -229,7 +229,7 @@ def _lowered(z_m: Floats, tail: _Ints, head: _Ints, most_m: Floats) -> Floats:
             return z
 
 
-def _dense(c: Course) -> Floats:
+def _resampled(c: Course) -> Floats:
     """Resample a course every few metres, (N, 3), with missing elevations interpolated.
 
     Returns no points for a course without any elevation.
@@ -344,7 +344,7 @@ def surveyed(
     nodes = Profile.of(filled, meets)
     level = nodes.clamped()
     moved = np.abs(level - nodes.z)[nodes.street]
-    terrain = _spread(nodes, level)
+    terrain = _terrain(nodes, level)
     return terrain, replace(
         found, clamped=int((moved > CLAMPED_M).sum()), moved_m=float(moved.max(initial=0.0))
     )
@@ -442,7 +442,11 @@ def _without_false_points(courses: Sequence[Course], heights: Floats) -> list[Co
         _drop_zeros(points)
         _drop_spikes(points)
         on: On = (
-            c.on if c.on != "path" else "steps" if _climb(points) > ROBOT_GRADE_MAX else "street"
+            c.on
+            if c.on != "path"
+            else "steps"
+            if _mean_grade(points) > ROBOT_GRADE_MAX
+            else "street"
         )
         out.append(Course(c.edge, points, on, c.ring))
     return out
@@ -476,14 +480,14 @@ def _drop_spikes(points: Floats) -> None:
     points[known[1:-1][spikes], 2] = np.nan
 
 
-def _climb(points: Floats) -> float:
+def _mean_grade(points: Floats) -> float:
     """Return the total rise and fall of a line per metre of its length."""
     known = points[np.isfinite(points[:, 2])]
     run = float(metres_along(known)[-1]) if len(known) else 0.0
     return float(np.abs(np.diff(known[:, 2])).sum()) / run if run > 0.0 else 0.0
 
 
-def _spread(nodes: Profile, level: Floats) -> Terrain:
+def _terrain(nodes: Profile, level: Floats) -> Terrain:
     """Build the terrain: flat across streets at their heights, smooth between them."""
     low = nodes.xy.min(axis=0) - _MARGIN_M
     high = nodes.xy.max(axis=0) + _MARGIN_M
@@ -498,7 +502,7 @@ def _spread(nodes: Profile, level: Floats) -> Terrain:
     # Where steps end at a street, the street's height applies.
     for which, reach_m in ((nodes.street, _KERB_M), (np.ones(len(level), dtype=bool), _REACH_M)):
         free = np.flatnonzero(np.isnan(surface))
-        surface[free] = _around(grid[free], nodes.xy[which], level[which], reach_m)
+        surface[free] = _mean_heights(grid[free], nodes.xy[which], level[which], reach_m)
     land: Floats = surface.reshape(rows, columns)
     open_land = ~np.isfinite(land)
     _, (j, i) = distance_transform_edt(open_land, return_indices=True)
@@ -511,7 +515,7 @@ def _spread(nodes: Profile, level: Floats) -> Terrain:
     return Terrain(float(origin[0]), float(origin[1]), step_m, heights, datum)
 
 
-def _around(grid: Floats, xy: Floats, level: Floats, reach_m: float) -> Floats:
+def _mean_heights(grid: Floats, xy: Floats, level: Floats, reach_m: float) -> Floats:
     """Return (N,) heights at lattice points: a weighted mean of the nodes on the level of the
     nearest one.
 

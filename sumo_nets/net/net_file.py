@@ -172,22 +172,22 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
     polygons = bands(lines, widths)
     corners = _corners(areas, raw.links)
     ports, signalised = _ports(raw.links, walk, corners, lines)
-    met = [
+    end_corners = [
         (corners.get(ports.get((name, 0), "")), corners.get(ports.get((name, 1), "")))
         for name in walk
     ]
     with np.errstate(divide="ignore", invalid="ignore"):
         # Slivers in foreign nets have infinite mitres, which GEOS cuts off.
         polygons[: len(walk)] = close_seams(
-            polygons[: len(walk)], lines[: len(walk)], widths[: len(walk)], met
+            polygons[: len(walk)], lines[: len(walk)], widths[: len(walk)], end_corners
         )
     plans = raw.programs.plans(raw.links, signalised)
     strips: dict[str, Strip] = {}
     for k, (name, (edge, _, index)) in enumerate(walk.items()):
         ends = ports.get((name, 0)), ports.get((name, 1))
-        made = _strip(edge, index, left_hand, lines[k], float(widths[k]), polygons[k], ends)
+        built = _strip(edge, index, left_hand, lines[k], float(widths[k]), polygons[k], ends)
         strips[name] = (
-            replace(made, signalised=True, plan=plans.get(name)) if name in signalised else made
+            replace(built, signalised=True, plan=plans.get(name)) if name in signalised else built
         )
     roads = {
         lane["id"]: Lane(
@@ -206,21 +206,22 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
     terrain, elevation = land_of(
         raw.edges, apart, {name: index for name, (_, _, index) in walk.items()}, ports
     )
-    at: dict[str, list[Port]] = defaultdict(list)
+    corner_ports: dict[str, list[Port]] = defaultdict(list)
     for (strip, end), corner in ports.items():
-        at[corner].append(Port(strip, 1 if end else 0))
-    meeting = {
-        c: Corner(id=c, polygon=polygon, ports=tuple(at[c])) for c, polygon in corners.items()
+        corner_ports[corner].append(Port(strip, 1 if end else 0))
+    corners_by_id = {
+        c: Corner(id=c, polygon=polygon, ports=tuple(corner_ports[c]))
+        for c, polygon in corners.items()
     }
     if terrain is not None and elevation is not None:
         steep = steep_strips(terrain, tuple(strips.values()))
-        closed = steep_ports(terrain, strips, meeting.values(), frozenset(steep))
+        closed = steep_ports(terrain, strips, corners_by_id.values(), frozenset(steep))
         elevation = replace(elevation, steep=steep, closed=closed)
     return StreetMap(
         name=re.sub(r"(\.net)?\.xml(\.gz)?$", "", path.name),
         bounds=_bounds(raw, lines),
         strips=strips,
-        corners=meeting,
+        corners=corners_by_id,
         lanes=roads,
         junctions=_junctions(raw.junctions),
         net_hash=net_hash,
@@ -232,9 +233,9 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
 
 
 def _width_m(lane: Attributes) -> float:
-    said = lane.get("width", LANE_M)
+    value = lane.get("width", LANE_M)
     try:
-        width_m = float(said)
+        width_m = float(value)
     except ValueError:
         width_m = math.nan
     if math.isnan(width_m) or width_m > _WIDEST_M:
@@ -243,7 +244,7 @@ def _width_m(lane: Attributes) -> float:
             if width_m > _WIDEST_M
             else "no number"
         )
-        raise ValueError(f"lane '{lane['id']}': width '{said}' is {reason}")
+        raise ValueError(f"lane '{lane['id']}': width '{value}' is {reason}")
     return width_m
 
 

@@ -56,7 +56,7 @@ def netconvert(
     """
     command = [str(sumo_home() / "bin" / "netconvert"), *arguments, "-o", str(output)]
     try:
-        returncode, said = _run(
+        returncode, messages = _run(
             command if progress is None else [*command, "--verbose"], timeout_s, progress
         )
     except subprocess.TimeoutExpired as error:
@@ -68,10 +68,10 @@ def netconvert(
             f"netconvert cannot be run: {error.strerror}: is eclipse-sumo installed?"
         ) from error
     if returncode != 0 or not output.exists():
-        raise MapError(f"netconvert failed with exit code {returncode}{complaints(said)}")
+        raise MapError(f"netconvert failed with exit code {returncode}{complaints(messages)}")
     # netconvert also returns 0 for an empty net.
     if b"<edge " not in output.read_bytes():
-        raise MapError(f"netconvert made a net without any edge{complaints(said)}")
+        raise MapError(f"netconvert made a net without any edge{complaints(messages)}")
     return output
 
 
@@ -86,15 +86,15 @@ def _run(
         ) as process:
             assert process.stdout is not None
             ready.register(process.stdout, selectors.EVENT_READ)
-            said = b""
+            recent = b""
             try:
                 while ready.select(max(began + timeout_s - time.monotonic(), 0.0)):
-                    piece = os.read(process.stdout.fileno(), 1 << 16)
-                    if not piece:
+                    chunk = os.read(process.stdout.fileno(), 1 << 16)
+                    if not chunk:
                         break
                     # The start of a stage may be split between two reads.
-                    said = said[-80:] + piece
-                    begun = [share for words, share in _STAGES if words in said]
+                    recent = recent[-80:] + chunk
+                    begun = [share for words, share in _STAGES if words in recent]
                     if progress is not None and begun:
                         progress(max(begun))
                 process.wait(max(began + timeout_s - time.monotonic(), 0.0))
@@ -105,9 +105,11 @@ def _run(
         return process.returncode, errors.read().decode(errors="replace")
 
 
-def complaints(said: str) -> str:
+def complaints(output: str) -> str:
     """Summarize the messages of a SUMO program in one line: its errors, or its last line."""
-    lines = [" ".join(line.split()) for line in said.splitlines() if line.strip()]
+    lines = [" ".join(line.split()) for line in output.splitlines() if line.strip()]
     errors = [line for line in lines if not line.startswith(("Warning", "Quitting"))]
-    words = "; ".join(dict.fromkeys(line.removeprefix("Error: ") for line in errors or lines[-1:]))
-    return f": {words[:WORDS]}{' ...' if len(words) > WORDS else ''}" if words else ""
+    summary = "; ".join(
+        dict.fromkeys(line.removeprefix("Error: ") for line in errors or lines[-1:])
+    )
+    return f": {summary[:WORDS]}{' ...' if len(summary) > WORDS else ''}" if summary else ""

@@ -52,11 +52,11 @@ def coordinates(shapes: Sequence[str], names: Sequence[str]) -> tuple[Floats, li
     except ValueError:
         flat = np.empty(0)
     if len(flat) != 2 * len(every) or not (np.abs(flat) < FARTHEST_M).all() or not all(counts):
-        _refuse(points, names)
+        _raise_for_first_invalid(points, names)
     return flat.reshape(-1, 2), counts
 
 
-def _refuse(points: Sequence[Sequence[str]], names: Sequence[str]) -> NoReturn:
+def _raise_for_first_invalid(points: Sequence[Sequence[str]], names: Sequence[str]) -> NoReturn:
     """Raise ValueError for the first invalid shape."""
     for name, row in zip(names, points, strict=True):
         wrong = [point for point in row if not _is_point(point)]
@@ -176,12 +176,13 @@ def joined(
     out: Polygons = polygons.copy()
     grown = overlay.union(polygons, wedges)
     out[wanted] = [
-        _holding(shape, strip) for shape, strip in zip(grown[wanted], polygons[wanted], strict=True)
+        _part_with(shape, strip)
+        for shape, strip in zip(grown[wanted], polygons[wanted], strict=True)
     ]
     return out
 
 
-def _holding(shape: Polygon | MultiPolygon, strip: Polygon) -> Polygon:
+def _part_with(shape: Polygon | MultiPolygon, strip: Polygon) -> Polygon:
     """Return the part of a shape that overlaps a strip most, without slivers on the far side of
     a corner."""
     if isinstance(shape, Polygon):

@@ -102,8 +102,8 @@ def file_pieces(source: Path, packing: str) -> Iterator[Iterator[bytes]]:
             f"{source}: broken {packing} file, probably cut short: {error}: get it again"
         ) from error
     except (OSError, ValueError) as error:
-        said = getattr(error, "strerror", None) or error
-        raise MapError(f"{source}: cannot be unpacked ({packing or 'plain'}): {said}") from error
+        reason = getattr(error, "strerror", None) or error
+        raise MapError(f"{source}: cannot be unpacked ({packing or 'plain'}): {reason}") from error
 
 
 def _bounded(source: Path, stream: IO[bytes], packed: int) -> Iterator[bytes]:
@@ -128,13 +128,13 @@ def _bounded(source: Path, stream: IO[bytes], packed: int) -> Iterator[bytes]:
 def parse(parser: expat.XMLParserType, path: Path) -> None:
     """Feed an XML file to a parser whose handlers are set. Raises ValueError with the line
     number."""
-    fed = 0
+    parsed = 0
     try:
         with path.open("rb") as file:
             while piece := file.read(PIECE_BYTES):
                 parser.Parse(piece, False)
-                fed += len(piece)
-                if fed - parser.CurrentByteIndex > LONGEST_BYTES:
+                parsed += len(piece)
+                if parsed - parser.CurrentByteIndex > LONGEST_BYTES:
                     raise ValueError(f"a single tag of more than {LONGEST_BYTES >> 20} MiB")
             parser.Parse(b"", True)
     except expat.ExpatError as error:

@@ -73,7 +73,7 @@ def map_as_bytes(street_map: StreetMap) -> bytes:
     arrays: list[NDArray[Any]] = []
     geometries: list[shapely.Geometry] = []
 
-    def numbered(value: Any) -> int:
+    def index_of(value: Any) -> int:
         if isinstance(value, np.ndarray):
             arrays.append(value)
             return len(arrays) - 1
@@ -82,25 +82,29 @@ def map_as_bytes(street_map: StreetMap) -> bytes:
             return len(geometries) - 1
         raise TypeError(f"a StreetMap cannot be stored with a {type(value).__name__} in it")
 
-    bare = {name: getattr(street_map, name) for name in _FIELDS}
-    body = msgspec.msgpack.encode(bare, enc_hook=numbered)
+    field_values = {name: getattr(street_map, name) for name in _FIELDS}
+    body = msgspec.msgpack.encode(field_values, enc_hook=index_of)
     ends = np.cumsum([0, *(a.nbytes for a in arrays)]).tolist()
     forms = [(a.dtype.str, a.shape, at) for a, at in zip(arrays, ends[:-1], strict=True)]
     wkb = shapely.to_wkb(np.array(geometries, dtype=object)).tolist() if geometries else []
-    held = _Snapshot(body, b"".join(np.ascontiguousarray(a).tobytes() for a in arrays), forms, wkb)
-    return msgspec.msgpack.encode(held)
+    snapshot_data = _Snapshot(
+        body, b"".join(np.ascontiguousarray(a).tobytes() for a in arrays), forms, wkb
+    )
+    return msgspec.msgpack.encode(snapshot_data)
 
 
 def thawed(data: bytes | memoryview) -> StreetMap:
     """Deserialize the result of `map_as_bytes`."""
     with _without_gc():
-        held = msgspec.msgpack.decode(data, type=_Snapshot)
+        snapshot_data = msgspec.msgpack.decode(data, type=_Snapshot)
         arrays = [
-            np.ndarray(shape, dtype, buffer=held.arrays, offset=at)
-            for dtype, shape, at in held.forms
+            np.ndarray(shape, dtype, buffer=snapshot_data.arrays, offset=at)
+            for dtype, shape, at in snapshot_data.forms
         ]
-        geometries = shapely.from_wkb(np.array(held.geometries, dtype=object)).tolist()
-        made: StreetMap = _maker(StreetMap)(msgspec.msgpack.decode(held.body), (arrays, geometries))
+        geometries = shapely.from_wkb(np.array(snapshot_data.geometries, dtype=object)).tolist()
+        made: StreetMap = _maker(StreetMap)(
+            msgspec.msgpack.decode(snapshot_data.body), (arrays, geometries)
+        )
         return made
 
 
@@ -151,11 +155,11 @@ def _key(name: str, net: bytes) -> str:
     ).hexdigest()[:32]
 
 
-_ROOMS: Final = (
+_READER_FOLDERS: Final = (
     Path(sumo_nets.__file__).parent,
     *(Path(cosim.__file__).parent / room for room in ("core", "place")),
 )
-_READER: Final = f"{sources_hash(*_ROOMS)} {shapely.geos_version_string}"
+_READER: Final = f"{sources_hash(*_READER_FOLDERS)} {shapely.geos_version_string}"
 """Hash of the source and the libraries that build a StreetMap from a net."""
 
 
