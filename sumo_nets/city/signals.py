@@ -76,9 +76,6 @@ class _Signal:
     def links(self) -> int:
         return 1 + max([car.link for car in self.cars] + [zebra.link for zebra in self.zebras])
 
-    def foe_cars(self, zebra: _Zebra) -> list[_Car]:
-        return [car for car in self.cars if car.tail in zebra.edges or car.head in zebra.edges]
-
 
 def with_programs(net: bytes, rng: np.random.Generator) -> bytes:
     """Return the net with generated programs in place of netconvert's."""
@@ -258,7 +255,9 @@ def _walk_faults(signal: _Signal, zebra: _Zebra, phases: list[Phase]) -> list[st
     shortest = min(len(run) for run in re.findall("[Gg]+", walks))
     if shortest < WALK_S:
         faults.append(f"has {shortest} s of green")
-    for car in signal.foe_cars(zebra):
+    for car in signal.cars:
+        if not {car.tail, car.head} & zebra.edges:
+            continue
         cycle = "".join(phase.duration_s * phase.state[car.link] for phase in phases)
         cycle = cycle[shift:] + cycle[:shift]
         starts = [t for t in range(len(cycle)) if cycle[t] in "Gg" and cycle[t - 1] == "r"]

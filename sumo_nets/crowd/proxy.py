@@ -173,9 +173,9 @@ class Walks:
 
         Returns None without other places.
         """
-        inner = [
-            edge for edge in self._internal.get(self._ends[walk.first][1], []) if _is_walkable(edge)
-        ]
+        inside = self._internal.get(self._ends[walk.first][1], [])
+        # Ids of walking areas end in "_w" and a number, those of crossings in "_c" and a number.
+        inner = [edge for edge in inside if edge.rsplit("_", 1)[1][0] in "wc"]
         others = [piece for piece in inner if self._place.get(piece) != walk.around]
         if not others:
             return None
@@ -352,11 +352,6 @@ def _by_junction(edges: Iterable[str]) -> dict[str, list[str]]:
         if edge.startswith(":"):
             inside.setdefault(junction_of(edge), []).append(edge)
     return inside
-
-
-def _is_walkable(internal: str) -> bool:
-    """Return whether an internal edge is a walking area or a crossing."""
-    return internal.rsplit("_", 1)[1][0] in "wc"
 
 
 def _line(engine: Sumo, edge: str) -> shapely.Geometry:

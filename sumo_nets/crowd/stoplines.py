@@ -37,7 +37,7 @@ class StopLines:
             if lights:
                 next_lights[name] = lights[0][:3]
         lit = {
-            link: _letter(link)
+            link: sumo.trafficlight.getRedYellowGreenState(link[0])[link[1]]
             for link in {
                 (light, link) for light, link, _ in (*next_lights.values(), *self._next.values())
             }
@@ -54,7 +54,3 @@ class StopLines:
                 found.append(Passed(name, lit[light, link], self._red_s.get((light, link), 0.0)))
         self._next = next_lights
         return found
-
-
-def _letter(link: tuple[str, int]) -> str:
-    return sumo.trafficlight.getRedYellowGreenState(link[0])[link[1]]

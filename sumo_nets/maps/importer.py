@@ -223,7 +223,7 @@ def _from_net(work: ImportWork, options: Options) -> Converted:
         net = add_walkways(work, net, facts)
         net = widen_sidewalks(work, net, options.widths_m, {}, before)
         share = new_share(net_root(net), before)
-    elif _is_old_format(facts.version):
+    elif facts.version == "?" or facts.version.startswith("0."):
         net = work.netconvert("renewing the net", "renewed.net.xml", ["-s", str(net)])
         changes.append(f"renewed by netconvert: format {facts.version} is too old to be simulated")
     return _finish(work, net, options.rules, share, [])
@@ -327,10 +327,6 @@ def _check_driving_side(facts: NetFacts, options: Options, file: MapFile) -> Net
             "this one; leave --lefthand and --righthand out"
         )
     return facts
-
-
-def _is_old_format(version: str) -> bool:
-    return version.startswith("0.") or version == "?"
 
 
 @contextmanager

@@ -50,8 +50,9 @@ def refuse_box_outside(source: Path, box: Box, bounds: Box, unit: str = "degrees
         if _overlap(swapped, bounds)
         else ""
     )
+    covers = _box_text(bounds)
     raise MapError(
-        f"{source}: --bbox {_box_text(box)} is outside of the map, which covers {_box_text(bounds)} "
+        f"{source}: --bbox {_box_text(box)} is outside of the map, which covers {covers} "
         f"(west,south,east,north in {unit}): give a part of that{hint}"
     )
 

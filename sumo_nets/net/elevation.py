@@ -239,11 +239,7 @@ def _resampled(c: Course) -> Floats:
         return np.zeros((0, 3))
     at = metres_along(c.points)
     count = max(int(np.ceil(at[-1] / _SPACING_M)), 1)
-    s = (
-        np.unique(np.concatenate([np.linspace(0.0, at[-1], count + 1)]))
-        if at[-1] > 0.0
-        else np.zeros(1)
-    )
+    s = np.linspace(0.0, at[-1], count + 1) if at[-1] > 0.0 else np.zeros(1)
     columns = [np.interp(s, at, c.points[:, k]) for k in (0, 1)]
     return np.column_stack([*columns, np.interp(s, at[known], c.points[known, 2])])
 
