@@ -1,9 +1,9 @@
 """Group cohesion: keep the members of a group together, although SUMO has no groups.
 
-Members share a walk and a speed, so they move alike until others or a red light separate them. Then
-members ahead of the group's middle slow down and members behind speed up. Members far ahead wait,
-but never on a crossing. On a wide sidewalk, a member who evaded somebody steps back towards the
-others if there is room.
+Members share a walk and a speed, so they move together until others or a red light separate them.
+Members ahead of the group's middle then slow down, and members behind speed up. Members far ahead
+wait, but never on a crossing. On a wide sidewalk, a member who evaded somebody steps back towards
+the others if there is room.
 """
 
 from __future__ import annotations
