@@ -1,7 +1,7 @@
-"""The one door to SUMO: libsumo, typed as far as it is used here. No other file imports it.
+"""Typed access to libsumo, for the functions that the project uses. No other file imports libsumo.
 
-One SUMO per process: `start` and `close` are its life, `sumo` its functions meanwhile, in SUMO's
-own names and units.
+SUMO runs once per process. `start` and `close` bound its run; `sumo` holds its functions, with
+SUMO's own names and units.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from itertools import chain, compress
 from typing import Any, Final, NamedTuple, Protocol
 
 import numpy as np
-import sumo as eclipse_sumo  # noqa: F401  sets where SUMO finds its data
+import sumo as eclipse_sumo  # noqa: F401  sets the path of SUMO's data
 
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats
@@ -25,8 +25,8 @@ from cosim.core.state import frozen
 
 @contextmanager
 def _unexecuted(package: str) -> Iterator[None]:
-    """Meanwhile modules of a package are imported without its `__init__`; who imports it afterwards
-    gets all of it."""
+    """Import modules of a package without running its `__init__`. Later imports get the whole
+    package."""
     found = importlib.util.find_spec(package)
     if package in sys.modules or found is None or found.submodule_search_locations is None:
         yield
@@ -38,30 +38,32 @@ def _unexecuted(package: str) -> Iterator[None]:
         del sys.modules[package]
 
 
-with _unexecuted("libsumo"):  # which would import traci, sumolib and pyproj, none of them used here
+with _unexecuted("libsumo"):  # its __init__ imports traci, sumolib and pyproj, which are not needed
     import libsumo.libsumo as _sumo
 
 libsumo: Any = _sumo
 libsumo.simulationStep = libsumo.simulation.step
-_told: Final = libsumo._libsumo
-"""The same without wrappers in Python, for what is asked hundreds of times a tick."""
+_native: Final = libsumo._libsumo
+"""libsumo without its Python wrappers, for functions that are called hundreds of times a tick."""
 
 _ERRORS: Final = (libsumo.TraCIException, libsumo.FatalTraCIError)
 
 
 class _Persons(Protocol):
-    def getIDList(self) -> Sequence[str]: ...
-    def getRoadID(self, name: str, /) -> str: ...
-    def getNextEdge(self, name: str, /) -> str: ...
-    def getPosition(self, name: str, /) -> tuple[float, float]: ...
-    def getLanePosition(self, name: str, /) -> float: ...
-    def getSpeed(self, name: str, /) -> float: ...
-    def getAngle(self, name: str, /) -> float: ...
-    def getWaitingTime(self, name: str, /) -> float: ...
+    getIDList: Callable[[], Sequence[str]]
+    getRoadID: Callable[[str], str]
+    getNextEdge: Callable[[str], str]
+    getPosition: Callable[[str], tuple[float, float]]
+    getLanePosition: Callable[[str], float]
+    getSpeed: Callable[[str], float]
+    getAngle: Callable[[str], float]
+    getWaitingTime: Callable[[str], float]
+
     def add(self, name: str, edge: str, at_m: float, /, *, typeID: str = ...) -> None: ...
     def appendWalkingStage(
         self, name: str, edges: list[str], until_m: float, /, *, speed: float = ...
     ) -> None: ...
+
     def moveToXY(
         self,
         name: str,
@@ -73,35 +75,36 @@ class _Persons(Protocol):
         match_m: float,
         /,
     ) -> None: ...
-    def setSpeed(self, name: str, mps: float, /) -> None: ...
-    def remove(self, name: str, /) -> None: ...
+
+    setSpeed: Callable[[str, float], None]
+    remove: Callable[[str], None]
 
 
 class _Cars(Protocol):
-    def getIDList(self) -> Sequence[str]: ...
-    def getNextTLS(self, name: str, /) -> Sequence[tuple[str, int, float, str]]: ...
-    def getWaitingTime(self, name: str, /) -> float: ...
+    getIDList: Callable[[], Sequence[str]]
+    getNextTLS: Callable[[str], Sequence[tuple[str, int, float, str]]]
+    getWaitingTime: Callable[[str], float]
+
     def add(
         self, name: str, route: str, /, *, typeID: str, departLane: str, departPos: str
     ) -> None: ...
-    def remove(self, name: str, /) -> None: ...
+
+    remove: Callable[[str], None]
 
 
 class _Lanes(Protocol):
-    def getLength(self, lane: str, /) -> float: ...
-    def getWidth(self, lane: str, /) -> float: ...
-    def getShape(self, lane: str, /) -> Sequence[Sequence[float]]: ...
-    def getAllowed(self, lane: str, /) -> Sequence[str]: ...
-    def getLinks(
-        self, lane: str, /
-    ) -> Sequence[tuple[str, bool, bool, bool, str, str, str, float]]: ...
+    getLength: Callable[[str], float]
+    getWidth: Callable[[str], float]
+    getShape: Callable[[str], Sequence[Sequence[float]]]
+    getAllowed: Callable[[str], Sequence[str]]
+    getLinks: Callable[[str], Sequence[tuple[str, bool, bool, bool, str, str, str, float]]]
 
 
 class _Edges(Protocol):
-    def getIDList(self) -> Sequence[str]: ...
-    def getFromJunction(self, edge: str, /) -> str: ...
-    def getToJunction(self, edge: str, /) -> str: ...
-    def getLaneNumber(self, edge: str, /) -> int: ...
+    getIDList: Callable[[], Sequence[str]]
+    getFromJunction: Callable[[str], str]
+    getToJunction: Callable[[str], str]
+    getLaneNumber: Callable[[str], int]
 
 
 class _Phase(Protocol):
@@ -116,32 +119,32 @@ class _Program(Protocol):
 
 
 class _Lights(Protocol):
-    def getIDList(self) -> Sequence[str]: ...
-    def getControlledLinks(self, light: str, /) -> Sequence[Sequence[tuple[str, str, str]]]: ...
-    def getNextSwitch(self, light: str, /) -> float: ...
-    def getRedYellowGreenState(self, light: str, /) -> str: ...
-    def getPhase(self, light: str, /) -> int: ...
-    def getProgram(self, light: str, /) -> str: ...
-    def getAllProgramLogics(self, light: str, /) -> Sequence[_Program]: ...
+    getIDList: Callable[[], Sequence[str]]
+    getControlledLinks: Callable[[str], Sequence[Sequence[tuple[str, str, str]]]]
+    getNextSwitch: Callable[[str], float]
+    getRedYellowGreenState: Callable[[str], str]
+    getPhase: Callable[[str], int]
+    getProgram: Callable[[str], str]
+    getAllProgramLogics: Callable[[str], Sequence[_Program]]
 
 
 class _Routes(Protocol):
-    def add(self, name: str, edges: list[str], /) -> None: ...
+    add: Callable[[str, list[str]], None]
 
 
 class _Types(Protocol):
-    def copy(self, kind: str, name: str, /) -> None: ...
-    def setLength(self, kind: str, metres: float, /) -> None: ...
-    def setWidth(self, kind: str, metres: float, /) -> None: ...
-    def setMinGap(self, kind: str, metres: float, /) -> None: ...
+    copy: Callable[[str, str], None]
+    setLength: Callable[[str, float], None]
+    setWidth: Callable[[str, float], None]
+    setMinGap: Callable[[str, float], None]
 
 
 class _Simulation(Protocol):
-    def getTime(self) -> float: ...
+    getTime: Callable[[], float]
 
 
 class Sumo(Protocol):
-    """SUMO's functions, by what they are about."""
+    """SUMO's functions, grouped by subject."""
 
     person: _Persons
     vehicle: _Cars
@@ -159,16 +162,16 @@ sumo: Final[Sumo] = libsumo
 
 
 def start(arguments: list[str]) -> None:
-    """Start SUMO with the arguments of its command line. Raises EngineError with all that it
-    says."""
-    said: list[str] = []
+    """Start SUMO with the arguments of its command line. Raises EngineError with SUMO's
+    messages."""
+    output: list[str] = []
     try:
-        with _stderr_into(said):
+        with _stderr_into(output):
             libsumo.simulation.start(["sumo", *arguments])
     except _ERRORS as error:
         with suppress(*_ERRORS):
             libsumo.simulation.close()
-        raise EngineError(" ".join("".join([*said, str(error)]).split())) from error
+        raise EngineError(" ".join("".join([*output, str(error)]).split())) from error
 
 
 def close() -> None:
@@ -178,7 +181,7 @@ def close() -> None:
 
 @contextmanager
 def translated(doing: str) -> Iterator[None]:
-    """What SUMO raises becomes an EngineError that names what was being done."""
+    """Raise SUMO's exceptions as EngineError. doing: the action, for the message."""
     try:
         yield
     except _ERRORS as error:
@@ -186,8 +189,12 @@ def translated(doing: str) -> Iterator[None]:
 
 
 class NearPersons(NamedTuple):
-    """N persons, in the order of their names: xy (N, 2) where, mps (N,) how fast, and the next
-    edges of their walks."""
+    """N persons, sorted by name.
+
+    xy: positions (N, 2), metres.
+    mps: speeds (N,), m/s.
+    ahead: next edges of their walks.
+    """
 
     names: tuple[str, ...]
     xy: Floats
@@ -196,8 +203,12 @@ class NearPersons(NamedTuple):
 
 
 class NearVehicles(NamedTuple):
-    """N vehicles, in the order of their names: xy (N, 2) where the middles of their front bumpers
-    are, mps (N,) how fast they drive, and their angles (N,)."""
+    """N vehicles, sorted by name.
+
+    xy: middles of the front bumpers (N, 2), metres.
+    mps: speeds (N,), m/s.
+    angle_deg: SUMO's angles (N,), degrees.
+    """
 
     names: tuple[str, ...]
     xy: Floats
@@ -206,23 +217,24 @@ class NearVehicles(NamedTuple):
 
 
 def persons_near(x_m: float, y_m: float, reach_m: float, crowd: Container[str]) -> NearPersons:
-    """Those of a crowd who have set out and are so near to a point."""
+    """Return the persons of a crowd within `reach_m` of a point."""
     of_crowd = [name for name in sorted(libsumo.person.getIDList()) if name in crowd]
-    names, xy = _near(x_m, y_m, reach_m, of_crowd, _told.person_getPosition)
+    names, xy = _near(x_m, y_m, reach_m, of_crowd, _native.person_getPosition)
     return NearPersons(
-        names, xy, _of_each(_told.person_getSpeed, names), [*map(_told.person_getNextEdge, names)]
+        names,
+        xy,
+        _of_each(_native.person_getSpeed, names),
+        [*map(_native.person_getNextEdge, names)],
     )
 
 
 def vehicles_near(x_m: float, y_m: float, reach_m: float) -> NearVehicles:
-    """The vehicles so near to a point."""
+    """Return the vehicles within `reach_m` of a point."""
     names, xy = _near(
-        x_m, y_m, reach_m, sorted(libsumo.vehicle.getIDList()), _told.vehicle_getPosition
+        x_m, y_m, reach_m, sorted(libsumo.vehicle.getIDList()), _native.vehicle_getPosition
     )
-    speeds, angles = (
-        _of_each(told, names) for told in (_told.vehicle_getSpeed, _told.vehicle_getAngle)
-    )
-    return NearVehicles(names, xy, speeds, angles)
+    speeds = _of_each(_native.vehicle_getSpeed, names)
+    return NearVehicles(names, xy, speeds, _of_each(_native.vehicle_getAngle, names))
 
 
 def _near(
@@ -230,37 +242,37 @@ def _near(
     y_m: float,
     reach_m: float,
     names: Sequence[str],
-    place_of: Callable[[str], tuple[float, float]],
+    position_of: Callable[[str], tuple[float, float]],
 ) -> tuple[tuple[str, ...], Floats]:
-    """Who of these is so near to a point, and where, (N, 2) metres."""
-    xy = np.fromiter(chain.from_iterable(map(place_of, names)), dtype=float).reshape(-1, 2)
+    """Return those of `names` within `reach_m` of a point, and their positions (N, 2), metres."""
+    xy = np.fromiter(chain.from_iterable(map(position_of, names)), dtype=float).reshape(-1, 2)
     gap = xy - (x_m, y_m)
-    far_m2 = gap[:, 0] * gap[:, 0] + gap[:, 1] * gap[:, 1]
-    near = np.sqrt(far_m2) <= reach_m
+    distance_m2 = gap[:, 0] * gap[:, 0] + gap[:, 1] * gap[:, 1]
+    near = np.sqrt(distance_m2) <= reach_m
     return tuple(compress(names, near.tolist())), frozen(xy[near])
 
 
-def _of_each(told: Callable[[str], float], names: Sequence[str]) -> Floats:
-    return np.fromiter(map(told, names), dtype=float, count=len(names))
+def _of_each(getter: Callable[[str], float], names: Sequence[str]) -> Floats:
+    return np.fromiter(map(getter, names), dtype=float, count=len(names))
 
 
 def put_crowd_stopwatch(timed: Callable[[str, Callable[[], None]], Callable[[], None]]) -> None:
-    """For the bench: replace SUMO's step by a timed one, for the rest of this process."""
+    """Replace SUMO's step by a timed one for the rest of this process, for benchmarks."""
     libsumo.simulationStep = timed("crowd", libsumo.simulationStep)
 
 
 @contextmanager
-def _stderr_into(said: list[str]) -> Iterator[None]:
-    """Collect what is written to the process's stderr: libsumo prints there what its exceptions
-    leave out."""
+def _stderr_into(output: list[str]) -> Iterator[None]:
+    """Append what the process writes to stderr to `output`: libsumo prints details there that
+    its exceptions leave out."""
     sys.stderr.flush()
-    with tempfile.TemporaryFile() as heard:
-        kept = os.dup(2)
-        os.dup2(heard.fileno(), 2)
+    with tempfile.TemporaryFile() as file:
+        original = os.dup(2)
+        os.dup2(file.fileno(), 2)
         try:
             yield
         finally:
-            os.dup2(kept, 2)
-            os.close(kept)
-            heard.seek(0)
-            said.append(heard.read().decode(errors="replace"))
+            os.dup2(original, 2)
+            os.close(original)
+            file.seek(0)
+            output.append(file.read().decode(errors="replace"))

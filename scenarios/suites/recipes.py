@@ -25,7 +25,7 @@ from scenarios.suites.long_horizon import build_long_horizon
 from scenarios.suites.reactive import build_reactive
 from scenarios.suites.unit import STRUCTURES, Structure, build_unit
 from sumo_nets.city.store import SEEDS, TEST_SEEDS
-from sumo_nets.maps.wheel_places import WHEEL_PLACES
+from sumo_nets.maps.import_rules import WHEEL_PLACES
 
 LONG_WAY: Final = "route"
 TEST_CROPS: Final = ("braunschweig-2", "wildau-1")

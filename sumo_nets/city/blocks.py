@@ -1,9 +1,8 @@
-"""What a street is made of: centre lines (straight, curve, S-bend, rounded corner, ring) and
-cross-sections, in metres.
+"""Building blocks of streets: centre lines (straight, curve, S-bend, rounded corner, ring) and
+cross-sections, metres.
 
-Together with the T, X and Y junctions that the plan of a city makes of them these are the seven
-primitive blocks. Trigonometry goes through `math`, not through numpy's kernels, which differ
-between processors.
+Together with the T, X and Y junctions of a city plan these are the seven primitive blocks.
+Trigonometry uses `math`, since numpy's kernels differ between processors.
 """
 
 from __future__ import annotations
@@ -19,13 +18,15 @@ Point = tuple[float, float]
 Line = list[Point]
 
 _STEP_M = 6.0
-"""Spacing of the points of a curved line."""
+"""Spacing of the points of a curved line, metres."""
 
 
 class Section(NamedTuple):
-    """Cross-section of a street from its middle outwards, per direction: half of the island in the
-    middle, lanes, gutter and curb (both drawn within the lanes and the verge), verge, sidewalk,
-    frontage."""
+    """Cross-section of a street per direction, from its middle outwards, metres.
+
+    median_m: half of the median island.
+    gutter_m, curb_m: drawn within the lanes and the verge.
+    """
 
     median_m: float
     lanes: int
@@ -38,7 +39,7 @@ class Section(NamedTuple):
 
     @property
     def half_m(self) -> float:
-        """From the middle of the street to the outer edge of the sidewalk."""
+        """Distance from the middle of the street to the outer edge of the sidewalk, metres."""
         return self.median_m + self.lanes * self.lane_m + self.verge_m + self.sidewalk_m
 
 
@@ -46,10 +47,12 @@ Range = tuple[float, float]
 
 
 class StreetClass(NamedTuple):
-    """What streets of a class have in common: lanes per direction, ranges of widths in metres.
+    """Common properties of the streets of a class; ranges of widths in metres.
 
-    sidewalks_m: widths to choose from, odd multiples of SUMO's 0.64 m stripes, or walkers jump
-    sideways at corners. driveways: per metre of sidewalk.
+    lanes: per direction.
+    sidewalks_m: widths to choose from, odd multiples of SUMO's 0.64 m stripes; with others,
+        pedestrians jump sideways at corners.
+    driveways: number per metre of sidewalk.
     """
 
     lanes: int
@@ -66,7 +69,7 @@ class StreetClass(NamedTuple):
     driveways: float = 0.0
 
     def section(self, rng: np.random.Generator) -> Section:
-        """A cross-section within the ranges, in steps of 5 cm."""
+        """Draw a cross-section within the ranges, in steps of 5 cm."""
 
         def within(span: Range) -> float:
             return round(round(float(rng.uniform(*span)) / 0.05) * 0.05, 2)
@@ -150,33 +153,33 @@ CLASSES = {
         1, 6.94, 5, (4.3, 4.7), (0.6, 1.2), (3.2,), (0.8, 1.5), (0.1, 0.2), (0.25, 0.4)
     ),
 }
-"""Streets of two lanes and more per direction have an island in their middle, a refuge for who
-crosses."""
+"""Street classes by name. Streets with two or more lanes per direction have a median island as a
+refuge for pedestrians."""
 
 
 def polar(centre: Point, radius_m: float, angle_rad: float) -> Point:
-    """The point `radius_m` from `centre` in the direction `angle_rad`."""
+    """Return the point `radius_m` from `centre` in the direction `angle_rad`."""
     return centre[0] + radius_m * math.cos(angle_rad), centre[1] + radius_m * math.sin(angle_rad)
 
 
 def direction(a: Point, b: Point) -> float:
-    """Heading from a to b in radians."""
+    """Return the heading from a to b, radians."""
     return math.atan2(b[1] - a[1], b[0] - a[0])
 
 
 def length(line: Sequence[Point]) -> float:
-    """Length of a line in metres."""
+    """Return the length of a line, metres."""
     return sum(math.dist(p, q) for p, q in pairwise(line))
 
 
 def straight(a: Point, b: Point) -> Line:
-    """The straight block."""
+    """Return the straight block."""
     return [a, b]
 
 
 def bend(a: Point, b: Point, leave_rad: float, arrive_rad: float) -> Line:
-    """From a, leaving with heading `leave_rad`, to b, arriving with heading `arrive_rad`: a cubic
-    Bezier."""
+    """Return a cubic Bezier curve from a with heading `leave_rad` to b with heading
+    `arrive_rad`."""
     handle = math.dist(a, b) / 3.0
     c = polar(a, handle, leave_rad)
     d = polar(b, -handle, arrive_rad)
@@ -190,8 +193,7 @@ def bend(a: Point, b: Point, leave_rad: float, arrive_rad: float) -> Line:
 
 
 def corner(a: Point, via: Point, b: Point, radius_m: float) -> Line:
-    """From a by `via` to b, the corner rounded with `radius_m` (less where the legs are too
-    short)."""
+    """Return the line from a by `via` to b, its corner rounded with at most `radius_m`."""
     into, out = direction(a, via), direction(via, b)
     turn = math.remainder(out - into, 2.0 * math.pi)
     if abs(turn) < 0.02:
@@ -205,21 +207,19 @@ def corner(a: Point, via: Point, b: Point, radius_m: float) -> Line:
 
 
 def arc(centre: Point, radius_m: float, from_rad: float, turn_rad: float) -> Line:
-    """A circular arc that starts at the angle `from_rad` and runs through `turn_rad`, left
-    positive."""
+    """Return a circular arc from the angle `from_rad` through `turn_rad`, left positive."""
     count = max(4, math.ceil(radius_m * abs(turn_rad) / (_STEP_M / 2.0)))
     return [polar(centre, radius_m, from_rad + turn_rad * i / count) for i in range(count + 1)]
 
 
 def ring(centre: Point, radius_m: float, angles_rad: Sequence[float]) -> list[Line]:
-    """The roundabout block: counter-clockwise arcs from each of the ascending angles to the next
-    one."""
+    """Return the roundabout block: counter-clockwise arcs between successive, ascending angles."""
     following = [*angles_rad[1:], angles_rad[0] + 2.0 * math.pi]
     return [arc(centre, radius_m, a, b - a) for a, b in zip(angles_rad, following, strict=True)]
 
 
 def split(line: Line, s_m: float) -> tuple[Line, Line]:
-    """A line cut in two at arc length `s_m`; points within 1 m of the cut are dropped."""
+    """Cut a line in two at arc length `s_m`; points within 1 m of the cut are dropped."""
     walked = 0.0
     for i, (p, q) in enumerate(pairwise(line)):
         step = math.dist(p, q)

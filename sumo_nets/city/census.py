@@ -1,8 +1,6 @@
-"""What a generated city is made of, counted on its net file: blocks, zones, walkways, signals; and
-what is wrong.
+"""Census of a generated city: counts of blocks, zones, walkways and signals, and faults.
 
-Nothing of the plan is used: everything is read back from the saved net and from the StreetMap made
-of it.
+Everything is read from the saved net and its StreetMap; the plan is not used.
 """
 
 from __future__ import annotations
@@ -29,20 +27,24 @@ from sumo_nets.net.net_file import read_net
 BLOCKS = ("straight", "curve", "s_bend", "t_junction", "x_junction", "y_junction", "roundabout")
 """The seven primitive blocks."""
 ZONES = ("road", "curb", "verge", "sidewalk", "frontage")
-"""The five zones of a street, from its middle outwards; curb: curb and gutter."""
+"""The five zones of a street, from its middle outwards; "curb" includes the gutter."""
 
 STRAIGHT_RAD = math.radians(8.0)
-"""Streets that turn less than this are straight; S-bends turn more than this both ways."""
+"""Streets that turn less are straight; S-bends turn more in both directions, radians."""
 FORK_RAD = math.radians(152.0)
-"""Three arms are a Y when no two of them are farther apart than this, else a T."""
+"""A junction of three arms is a Y if no two neighbouring arms are farther apart, else a T,
+radians."""
 
 LEAST_CLEAR_M = 1.2
+"""Smallest free width in a city without faults, metres."""
 _LONGEST_M = 1500.0
+"""Smallest length of the longest walk in a city without faults, metres."""
 ONE_PIECE = 0.99
+"""Smallest share of the walkable area in its largest part, in a city without faults."""
 
 
 class Span(NamedTuple):
-    """Smallest, middle and largest of many values."""
+    """Minimum, median and maximum of values."""
 
     low: float
     middle: float
@@ -50,19 +52,22 @@ class Span(NamedTuple):
 
     @classmethod
     def of(cls, values: Sequence[float]) -> Span:
-        """The span of at least one value."""
+        """Return the span of at least one value."""
         return cls(min(values), statistics.median(values), max(values))
 
 
 class Census(NamedTuple):
-    """A city in figures.
+    """Counts and measures of a city.
 
-    blocks: how many of each of BLOCKS. zones: widths in metres, one value per sidewalk; missing:
-    streets where a zone cannot be read back. crosswalks: crossings in the middle of a street;
-    refuges: crossings with an island. one_piece: share of the walkable area in its largest part.
-    clear_m: free width everywhere on the walkable ground, what was said to stand on it apart.
-    longest_m: the longest of all shortest walks that was found. faults: what breaks the promises of
-    a city.
+    blocks: number of each of BLOCKS.
+    zones: widths in metres, one value per sidewalk.
+    missing: number of streets without all zones.
+    crosswalks: crossings in the middle of a street.
+    refuges: crossings with a median island.
+    one_piece: share of the walkable area in its largest part.
+    clear_m: free width everywhere on the walkable ground, around the given furniture.
+    longest_m: length of the longest shortest walk found.
+    faults: violated requirements of a city, a sentence each.
     """
 
     name: str
@@ -85,7 +90,7 @@ class Census(NamedTuple):
 
 
 class _Way(NamedTuple):
-    """One direction of a street: end nodes, parameters, the line of its first lane for cars."""
+    """One direction of a street: end nodes, parameters, and the line of its first road lane."""
 
     tail: str
     head: str
@@ -96,8 +101,11 @@ class _Way(NamedTuple):
 def census(
     path: Path, street_map: StreetMap | None = None, standing: Sequence[shapely.Geometry] = ()
 ) -> Census:
-    """Count a city's net. street_map: of the same file, when it has been read already; standing:
-    ground that is covered by furniture."""
+    """Take the census of a city's net.
+
+    street_map: map of the same file, if already read.
+    standing: ground covered by furniture.
+    """
     place = read_net(path) if street_map is None else street_map
     net = path.read_bytes()
     root = ET.fromstring(net)
@@ -142,8 +150,11 @@ def clear_width_m(
     widest_m: float = 2.0,
     step_m: float = 0.05,
 ) -> float:
-    """The largest width, in steps, that passes everywhere: shrunk by half of it, the walkable
-    ground around what stands on it still has one piece that holds the middles of all strips."""
+    """Return the largest width, in steps of `step_m`, that fits everywhere.
+
+    The walkable ground around furniture, shrunk by half of that width, must have one piece that
+    holds the middles of all strips.
+    """
     ground: shapely.Geometry = shapely.simplify(place.walkable, 0.01)
     shapely.prepare(ground)
     if in_the_way := [thing for thing in standing if shapely.intersects(ground, thing)]:
@@ -169,15 +180,14 @@ def _passes(ground: shapely.Geometry, middles: Floats, half_m: float) -> bool:
     parts = shapely.get_parts(shapely.buffer(ground, -half_m, quad_segs=4))
     if not len(parts):
         return False
-    # A niche at a corner may come off; what matters is that every strip can be reached.
+    # A niche at a corner may be cut off; every strip must be reachable.
     free = parts[np.argmax(shapely.area(parts))]
     shapely.prepare(free)
     return bool(shapely.contains_xy(free, middles[:, 0], middles[:, 1]).all())
 
 
 def longest_walk_m(graph: WalkGraph) -> float:
-    """Length of the longest shortest walk that two sweeps find: from a far corner to the farthest
-    port, and again."""
+    """Return the length of the longest shortest walk found by two sweeps between far ports."""
     port = graph.ports[int(np.argmin(graph.xy.sum(axis=1)))]
     longest = 0.0
     for _ in range(2):
@@ -206,7 +216,7 @@ def _ways(root: ET.Element, place: StreetMap) -> dict[str, _Way]:
 
 
 def _blocks(root: ET.Element, ways: Mapping[str, _Way]) -> tuple[Counter[str], set[str]]:
-    """How many blocks of each kind; and the nodes in the middle of a street."""
+    """Count the blocks of each kind, and find the nodes in the middle of a street."""
     ring = {edge for row in root.iter("roundabout") for edge in row.get("edges", "").split()}
     found = Counter({"roundabout": sum(1 for _ in root.iter("roundabout"))})
     arms: dict[str, list[float]] = defaultdict(list)
@@ -234,7 +244,7 @@ def _blocks(root: ET.Element, ways: Mapping[str, _Way]) -> tuple[Counter[str], s
 
 
 def _shape(line: Floats) -> str:
-    """The kind of a street's middle line by how far it turns left and right."""
+    """Classify a street's middle line by its total turns to the left and right."""
     headings = [
         math.atan2(q[1] - p[1], q[0] - p[0])
         for p, q in pairwise(line.tolist())
@@ -251,7 +261,7 @@ def _shape(line: Floats) -> str:
 def _zones(
     place: StreetMap, ways: Mapping[str, _Way], sidewalks: Sequence[Strip]
 ) -> tuple[dict[str, Span], int]:
-    """Widths of the zones of every street, and how many streets lack one."""
+    """Return the widths of the zones of all streets, and the number of streets that lack one."""
     lanes: dict[str, list[Lane]] = defaultdict(list)
     for lane in place.lanes.values():
         if not lane.internal:
@@ -260,24 +270,23 @@ def _zones(
     missing = 0
     for strip in sidewalks:
         params = ways[strip.id].params if strip.id in ways else {}
-        # The verge is the first lane beside the sidewalk; a later one is an island.
-        beside = lanes[strip.id][:1]
-        here = {
+        # The verge is the lane next to the sidewalk; a later one is a median.
+        next_lane = lanes[strip.id][:1]
+        zone_widths = {
             "road": sum(lane.width_m for lane in lanes[strip.id] if lane.kind == "road"),
             "curb": float(params.get("curb_m", 0.0)) + float(params.get("gutter_m", 0.0)),
-            "verge": sum(lane.width_m for lane in beside if lane.kind == "verge"),
+            "verge": sum(lane.width_m for lane in next_lane if lane.kind == "verge"),
             "sidewalk": strip.width_m,
             "frontage": float(params.get("frontage_m", 0.0)),
         }
-        missing += not all(here.values())
-        for zone, width_m in here.items():
+        missing += not all(zone_widths.values())
+        for zone, width_m in zone_widths.items():
             widths[zone].append(width_m)
     return {zone: Span.of(values) for zone, values in widths.items() if values}, missing
 
 
 def _faults(found: Census, place: StreetMap, signals: Sequence[str]) -> list[str]:
-    """Which promises of a city are broken, a sentence each. Small cities need not have every
-    block."""
+    """Return the violated requirements, a sentence each. Small cities need not have every block."""
     faults = [
         f"no {name} block" for name, count in found.blocks.items() if not count and found.km2 > 3.0
     ]

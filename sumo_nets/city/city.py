@@ -1,9 +1,10 @@
-"""A whole city from a seed: a jittered lattice with streets removed, bent, joined by roundabouts
-and crosswalks.
+"""Plan a city from a seed: a jittered lattice with removed and bent streets, roundabouts and
+crosswalks.
 
-The plan is pure geometry and topology; `sumo_nets.city.store` makes a street net of it. A street
-class and its widths run along a whole row or column of the lattice. Metres, x east, y north; the
-city fills the square from 0, 0 to size_m, size_m."""
+The plan is geometry and topology; `sumo_nets.city.store` builds a net from it. A street class and
+its widths are constant along a row or column of the lattice. Units are metres, x east, y north; the
+city fills the square from (0, 0) to (size_m, size_m).
+"""
 
 from __future__ import annotations
 
@@ -17,22 +18,22 @@ import numpy as np
 from cosim.core.errors import MapError, unknown
 from cosim.spec.scenario import CITY_SIZE_M
 from sumo_nets.city.blocks import CLASSES
-from sumo_nets.city.draft import Cell, Draft, Link
-from sumo_nets.city.plan import CityPlan, plan_of
+from sumo_nets.city.plan import Cell, CityPlan, Draft, Link, plan_of
 
 _SIZE_M = (CITY_SIZE_M.low, CITY_SIZE_M.high)
-"""Smallest and largest city."""
+"""Smallest and largest side length of a city, metres."""
 PITCH_M = (102.0, 126.0)
+"""Range of the distance between parallel streets, metres."""
 _MARGIN_M = 22.0
+"""Distance of the outermost streets from the city's border, metres."""
 ROUNDABOUT_BLOCKS = 70
-"""At least one roundabout for so many blocks."""
+"""Number of blocks per roundabout, at most."""
 CLEAR_RAD = math.radians(58.0)
-"""Smallest angle between two arms of a junction."""
+"""Smallest angle between two arms of a junction, radians."""
 
 
 class _Style(NamedTuple):
-    """Shares of what cities are made of, on average; classes: weight of each street class among
-    rows and columns."""
+    """Average shares of the elements of a city. classes: weight of each street class."""
 
     classes: dict[str, float]
     jitter: float
@@ -69,12 +70,12 @@ PURPOSES = (
     "driveways",
     "signals",
 )
-"""Each has a random generator of its own."""
+"""Purposes with a random generator each, in the order of their seeds."""
 
 
 def plan_city(seed: int, size_m: float, style: str) -> CityPlan:
-    """The plan of a city; equal to the bit for equal arguments. Raises MapError for a size out of
-    range."""
+    """Plan a city; equal arguments give equal plans, bit for bit. Raises MapError for invalid
+    arguments."""
     if style not in STYLES:
         raise unknown("city style", style, STYLES)
     if not _SIZE_M[0] <= size_m <= _SIZE_M[1]:
@@ -86,19 +87,19 @@ def plan_city(seed: int, size_m: float, style: str) -> CityPlan:
     entropy = (seed, round(size_m * 100), sorted(STYLES).index(style))
     seeds = np.random.SeedSequence(entropy).spawn(len(PURPOSES))
     rngs = {purpose: np.random.default_rng(s) for purpose, s in zip(PURPOSES, seeds, strict=True)}
-    made_of, pitch_m = _character(rngs["character"], STYLES[style])
-    draft = _lattice(rngs["lattice"], rngs["classes"], rngs["widths"], size_m, pitch_m, made_of)
-    _diagonals(draft, rngs["diagonals"], made_of.diagonals)
-    _remove(draft, rngs["removal"], made_of.removed)
-    _dissolve(draft)
-    _bend_streets(draft, rngs["shapes"], made_of)
-    _place_roundabouts(draft, rngs["roundabouts"], made_of.roundabouts)
-    return plan_of(draft, rngs, made_of.crosswalks)
+    shares, pitch_m = _character(rngs["character"], STYLES[style])
+    draft = _lattice(rngs["lattice"], rngs["classes"], rngs["widths"], size_m, pitch_m, shares)
+    _diagonals(draft, rngs["diagonals"], shares.diagonals)
+    _remove_streets(draft, rngs["removal"], shares.removed)
+    _join_at_two_arms(draft)
+    _bend_streets(draft, rngs["shapes"], shares)
+    _place_roundabouts(draft, rngs["roundabouts"], shares.roundabouts)
+    return plan_of(draft, rngs, shares.crosswalks)
 
 
 def _character(rng: np.random.Generator, style: _Style) -> tuple[_Style, float]:
-    """What one city of a style is made of, and how far apart its streets are: cities differ as a
-    whole too."""
+    """Draw the shares and the street distance of one city of a style, so that cities differ as a
+    whole."""
     classes = {
         name: weight * float(rng.uniform(0.4, 1.6)) for name, weight in style.classes.items()
     }
@@ -116,7 +117,7 @@ def _lattice(
     style: _Style,
 ) -> Draft:
     cells = max(2, round((size_m - 2.0 * _MARGIN_M) / pitch_m))
-    xs, ys = (_spaced(rng, cells, size_m) for _ in range(2))
+    xs, ys = (_positions(rng, cells, size_m) for _ in range(2))
     sway = style.jitter * (min(b - a for line in (xs, ys) for a, b in pairwise(line)) - 55.0)
     wave_x, wave_y = (_Wave.draw(rng, size_m) for _ in range(2))
     at: dict[Cell, tuple[float, float]] = {}
@@ -145,8 +146,8 @@ def _lattice(
     return Draft(at, links)
 
 
-def _spaced(rng: np.random.Generator, cells: int, size_m: float) -> list[float]:
-    """Where the rows or columns lie: unevenly, but never so close that a block has no room."""
+def _positions(rng: np.random.Generator, cells: int, size_m: float) -> list[float]:
+    """Return the unevenly spaced positions of rows or columns, with room for every block."""
     pitch = (size_m - 2.0 * _MARGIN_M) / cells
     loose = max(0.0, 0.6 * (pitch - 75.0))
     gaps = [pitch + float(rng.uniform(-loose, loose)) for _ in range(cells)]
@@ -155,7 +156,7 @@ def _spaced(rng: np.random.Generator, cells: int, size_m: float) -> list[float]:
 
 
 class _Wave(NamedTuple):
-    """A slow bend of the whole lattice, none at the city's border."""
+    """A slow bend of the whole lattice, zero at the city's border."""
 
     height_m: float
     length_m: float
@@ -171,7 +172,7 @@ class _Wave(NamedTuple):
         )
 
     def shift(self, along_m: float, across_m: float, size_m: float) -> float:
-        """How far a point moves along one axis."""
+        """Return the displacement of a point along one axis, metres."""
         inside = math.sin(math.pi * (along_m - _MARGIN_M) / (size_m - 2.0 * _MARGIN_M))
         return (
             self.height_m
@@ -181,7 +182,8 @@ class _Wave(NamedTuple):
 
 
 def _diagonals(draft: Draft, rng: np.random.Generator, share: float) -> None:
-    """Replace two opposite sides of some blocks by one slanting street, which makes Y junctions."""
+    """Replace two opposite sides of some blocks by one diagonal street, which creates Y
+    junctions."""
     last = max(draft.at)[0]
     blocks = [(i, j) for i in range(1, last - 1) for j in range(1, last - 1)]
     taken: set[Cell] = set()
@@ -198,11 +200,11 @@ def _diagonals(draft: Draft, rng: np.random.Generator, share: float) -> None:
             if {link.a, link.b} <= corners
             and (link.a[1] == link.b[1] if across else link.a[0] == link.b[0])
         ]
-        kept = [link for link in draft.links if link not in dropped]
+        remaining = [link for link in draft.links if link not in dropped]
         for degrees in (14.0, 20.0, 26.0):
             turn = math.radians(degrees if rising != across else -degrees)
             slant = Link(a, b, dropped[0].street_class, dropped[0].section, turns=(turn, turn))
-            trial = Draft(draft.at, [*kept, slant])
+            trial = Draft(draft.at, [*remaining, slant])
             arms = trial.arms()
             if min(trial.gap(a, arms[a]), trial.gap(b, arms[b])) >= CLEAR_RAD:
                 draft.links = trial.links
@@ -210,24 +212,24 @@ def _diagonals(draft: Draft, rng: np.random.Generator, share: float) -> None:
                 break
 
 
-def _remove(draft: Draft, rng: np.random.Generator, share: float) -> None:
-    """Remove a share of the streets; the rest stays one network without dead ends."""
+def _remove_streets(draft: Draft, rng: np.random.Generator, share: float) -> None:
+    """Remove a share of the streets without disconnecting the network or creating dead ends."""
     neighbours: dict[Cell, set[Cell]] = defaultdict(set)
     for link in draft.links:
         neighbours[link.a].add(link.b)
         neighbours[link.b].add(link.a)
     slanting = {end for link in draft.links if link.turns != (0.0, 0.0) for end in (link.a, link.b)}
     wanted = round(share * len(draft.links))
-    gone: set[tuple[Cell, Cell]] = set()
+    removed: set[tuple[Cell, Cell]] = set()
     for k in rng.permutation(len(draft.links)).tolist():
-        if len(gone) == wanted:
+        if len(removed) == wanted:
             break
         link = draft.links[k]
         ends = (link.a, link.b)
         thin = [end for end in ends if len(neighbours[end]) == 3]
         if link.turns != (0.0, 0.0) or any(len(neighbours[end]) < 3 for end in ends):
             continue
-        # Two arms make one longer street: rarely, and never two such points in a row.
+        # Points with two arms make one longer street: rare, and never two in a row.
         if (
             any(len(neighbours[near]) < 3 for end in thin for near in neighbours[end])
             or len(thin) == 2
@@ -237,29 +239,29 @@ def _remove(draft: Draft, rng: np.random.Generator, share: float) -> None:
             continue
         neighbours[link.a].discard(link.b)
         neighbours[link.b].discard(link.a)
-        if _reaches(neighbours, link.a, link.b):
-            gone.add(ends)
+        if _is_connected(neighbours, link.a, link.b):
+            removed.add(ends)
         else:
             neighbours[link.a].add(link.b)
             neighbours[link.b].add(link.a)
-    draft.links = [link for link in draft.links if (link.a, link.b) not in gone]
+    draft.links = [link for link in draft.links if (link.a, link.b) not in removed]
 
 
-def _reaches(neighbours: dict[Cell, set[Cell]], start: Cell, goal: Cell) -> bool:
+def _is_connected(neighbours: dict[Cell, set[Cell]], start: Cell, goal: Cell) -> bool:
     seen = {start}
-    front = [start]
-    while front:
-        cell = front.pop()
+    queue = [start]
+    while queue:
+        cell = queue.pop()
         if cell == goal:
             return True
-        fresh = neighbours[cell] - seen
-        seen |= fresh
-        front += sorted(fresh)
+        new = neighbours[cell] - seen
+        seen |= new
+        queue += sorted(new)
     return False
 
 
-def _dissolve(draft: Draft) -> None:
-    """Join the two streets of every point with two arms into one with a rounded corner."""
+def _join_at_two_arms(draft: Draft) -> None:
+    """Join the two streets at every point with two arms into one with a rounded corner."""
     for cell, arms in draft.arms().items():
         if len(arms) != 2:
             continue
@@ -273,26 +275,26 @@ def _dissolve(draft: Draft) -> None:
 
 
 def _bend_streets(draft: Draft, rng: np.random.Generator, style: _Style) -> None:
-    """Y junctions, curves and S-bends, each only where every angle between arms stays wide."""
+    """Create Y junctions, curves and S-bends where all angles between arms remain wide."""
     arms = draft.arms()
-    for cell, mine in arms.items():
-        if rng.random() > style.ys or len(mine) != 3 or draft.on_border(cell):
+    for cell, own in arms.items():
+        if rng.random() > style.ys or len(own) != 3 or draft.on_border(cell):
             continue
         headings = sorted(
-            (draft.leaving(link, cell) % (2.0 * math.pi), i) for i, link in enumerate(mine)
+            (draft.leaving(link, cell) % (2.0 * math.pi), i) for i, link in enumerate(own)
         )
         gaps = [(headings[(k + 1) % 3][0] - headings[k][0]) % (2.0 * math.pi) for k in range(3)]
         k = max(range(3), key=lambda i: gaps[i])
         fold = min((gaps[k] - 2.0 * math.pi / 3.0) / 2.0, math.radians(28.0))
-        # Only the two arms beside the widest gap fold into it.
-        _turn(draft, arms, mine[headings[k][1]], cell, fold)
-        _turn(draft, arms, mine[headings[(k + 1) % 3][1]], cell, -fold)
+        # Only the two arms next to the widest gap turn into it.
+        _turn(draft, arms, own[headings[k][1]], cell, fold)
+        _turn(draft, arms, own[headings[(k + 1) % 3][1]], cell, -fold)
     middle = max(draft.at)[0] / 2.0
     for link in draft.links:
         draw = rng.random()
         side = 1.0 if rng.integers(2) else -1.0
         if draft.on_border(link.a, link.b):
-            # Towards the middle of the city, to stay inside its square.
+            # Bend towards the middle of the city, to remain inside its square.
             (x, y) = link.a
             (p, q) = link.b
             side = math.copysign(1.0, ((p - x) * (middle - y) - (q - y) * (middle - x)))
@@ -318,24 +320,24 @@ def _turn(draft: Draft, arms: dict[Cell, list[Link]], link: Link, cell: Cell, tu
 
 
 def _place_roundabouts(draft: Draft, rng: np.random.Generator, share: float) -> None:
-    """Radii of the roundabouts, at interior junctions of quiet streets that are far enough from
-    each other.
+    """Choose the radii of roundabouts at interior junctions of quiet streets, far enough from each
+    other.
 
-    A large city has a few of them, whatever its share, where there is room.
+    A large city has a minimum number of them, where there is room.
     """
     last = max(draft.at)[0]
     arms = draft.arms()
     spare: dict[Cell, float] = {}
-    for cell, mine in arms.items():
+    for cell, own in arms.items():
         radius = float(rng.uniform(19.0, 22.0))
         draw = rng.random()
-        if len(mine) < 3 or {0, last} & set(cell):
+        if len(own) < 3 or {0, last} & set(cell):
             continue
-        near = {end for link in mine for end in (link.a, link.b)}
+        near = {end for link in own for end in (link.a, link.b)}
         quiet = all(
-            CLASSES[link.street_class].lanes == 1 and draft.chord(link) > 85.0 for link in mine
+            CLASSES[link.street_class].lanes == 1 and draft.chord(link) > 85.0 for link in own
         )
-        if quiet and not near & set(draft.rings) and draft.gap(cell, mine) > math.radians(74.0):
+        if quiet and not near & set(draft.rings) and draft.gap(cell, own) > math.radians(74.0):
             (spare if draw > share else draft.rings)[cell] = radius
     for cell, radius in spare.items():
         near = {end for link in arms[cell] for end in (link.a, link.b)}

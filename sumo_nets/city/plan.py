@@ -1,12 +1,11 @@
-"""The plan of a city, ready to be built: nodes, edges, crossings and roundabouts, from a finished
-draft."""
+"""Draft of a city during planning, and the final plan: nodes, edges, crossings and roundabouts."""
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -25,18 +24,88 @@ from sumo_nets.city.blocks import (
     split,
     straight,
 )
-from sumo_nets.city.draft import Cell, Draft, Link
+
+Cell = tuple[int, int]
+"""Column and row of a lattice point."""
+
+
+@dataclass(slots=True)
+class Link:
+    """A street between lattice points.
+
+    via: lattice point of a rounded corner.
+    turns: left turn off the chord at either end, radians.
+    """
+
+    a: Cell
+    b: Cell
+    street_class: str
+    section: Section
+    via: Cell | None = None
+    turns: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def plain(self) -> bool:
+        """Whether the street has no bend yet."""
+        return self.via is None and self.turns == (0.0, 0.0)
+
+
+@dataclass(slots=True)
+class Draft:
+    """Lattice points, streets between them, and roundabouts. rings: radius of the roundabout at
+    a point, metres."""
+
+    at: dict[Cell, Point]
+    links: list[Link]
+    rings: dict[Cell, float] = field(default_factory=dict)
+
+    def arms(self) -> dict[Cell, list[Link]]:
+        """Return the streets at each point."""
+        arms: dict[Cell, list[Link]] = {cell: [] for cell in self.at}
+        for link in self.links:
+            arms[link.a].append(link)
+            arms[link.b].append(link)
+        return arms
+
+    def leaving(self, link: Link, cell: Cell) -> float:
+        """Return the heading with which `link` leaves the point of `cell`, radians."""
+        far = link.b if cell == link.a else link.a
+        chord = direction(self.at[cell], self.at[far if link.via is None else link.via])
+        return chord + link.turns[0 if cell == link.a else 1]
+
+    def gap(self, cell: Cell, arms: list[Link]) -> float:
+        """Return the smallest angle between two arms, radians."""
+        headings = sorted(self.leaving(link, cell) % (2.0 * math.pi) for link in arms)
+        around = [*headings[1:], headings[0] + 2.0 * math.pi]
+        return min(b - a for a, b in zip(headings, around, strict=True))
+
+    def on_border(self, *cells: Cell) -> bool:
+        """Return whether all cells lie on one side of the lattice."""
+        last = max(self.at)[0]
+        return any(
+            {cell[axis] for cell in cells} == {side} for axis in (0, 1) for side in (0, last)
+        )
+
+    def chord(self, link: Link) -> float:
+        """Return the distance between the ends of a street, metres."""
+        return math.dist(self.at[link.a], self.at[link.b])
+
 
 DRIVEWAY_CLEAR_M = 36.0
-"""Driveways keep this far from both ends of their street: junctions take up to 27 m of it."""
+"""Smallest distance of driveways from the ends of their street, metres; junctions take up to 27
+m."""
 DRIVEWAY_GAP_M = 12.0
+"""Smallest distance between driveways, metres."""
 CROSSWALK_ROOM_M = 0.4
-"""The area of a crosswalk in the middle of a street goes so far beyond it on either side."""
+"""Length of a mid-street crosswalk's area beyond the crosswalk on either side, metres."""
 
 
 class Node(NamedTuple):
-    """A junction. signalised: with traffic lights. outline: of its area, where netconvert would
-    make it too small."""
+    """A junction.
+
+    signalised: whether it has traffic lights.
+    outline: its area, where netconvert would make it too small.
+    """
 
     id: str
     at: Point
@@ -45,7 +114,7 @@ class Node(NamedTuple):
 
 
 class Edge(NamedTuple):
-    """One direction of a street. driveways: points of its line beside which one crosses the
+    """One direction of a street. driveways: points of its line where driveways cross the
     sidewalk."""
 
     id: str
@@ -66,7 +135,7 @@ class Zebra(NamedTuple):
 
 
 class _Ring(NamedTuple):
-    """A roundabout's nodes and edges."""
+    """Nodes and edges of a roundabout."""
 
     nodes: tuple[str, ...]
     edges: tuple[str, ...]
@@ -74,7 +143,7 @@ class _Ring(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class CityPlan:
-    """What is built: signal_rng draws the signal programs' times."""
+    """The elements of a city. signal_rng: random generator of the signal programs."""
 
     nodes: tuple[Node, ...]
     edges: tuple[Edge, ...]
@@ -85,8 +154,7 @@ class CityPlan:
 
 @dataclass(slots=True)
 class _Parts:
-    """What the plan has so far. joints: the node where a street, by number, meets a lattice
-    point."""
+    """Elements planned so far. joints: node where a street, by index, meets a lattice point."""
 
     nodes: dict[str, Node]
     edges: list[Edge]
@@ -96,8 +164,8 @@ class _Parts:
 
 
 def plan_of(draft: Draft, rngs: Mapping[str, np.random.Generator], crosswalks: float) -> CityPlan:
-    """The plan of a draft. crosswalks: share of the longer streets with a crosswalk in their
-    middle."""
+    """Return the plan of a draft. crosswalks: share of the longer streets with a mid-street
+    crosswalk."""
     parts = _Parts({}, [], [], {}, defaultdict(list))
     numbers = {id(link): number for number, link in enumerate(draft.links)}
     for cell, arms in draft.arms().items():
@@ -154,21 +222,23 @@ def _add_street(
     crosswalks: float,
     rngs: Mapping[str, np.random.Generator],
 ) -> None:
-    """Both directions of a street, in two pieces where it has a crosswalk in its middle, and its
-    crossings."""
+    """Add both directions of a street and its crossings, in two pieces if it has a mid-street
+    crosswalk."""
     tail, head = parts.joints[link.a, number], parts.joints[link.b, number]
     line = _line(draft, link, tail.at, head.at)
     name = f"s{number}"
-    made = CLASSES[link.street_class]
+    kind = CLASSES[link.street_class]
     draws = rngs["crosswalks"].random(3).tolist()
-    width_m = made.crossings_m[int(rngs["widths"].integers(len(made.crossings_m)))]
+    width_m = kind.crossings_m[int(rngs["widths"].integers(len(kind.crossings_m)))]
     blocked = sum(20.0 if end in draft.rings else 0.0 for end in (link.a, link.b))
     if length(line) > (106.0 if link.via is None else 180.0) + blocked and draws[0] < crosswalks:
-        # Well before the corner of a street that has one.
+        # On a street with a corner, the crosswalk lies well before it.
         where = 0.45 + 0.1 * draws[1] if link.via is None else 0.27
         first, second = split(line, where * length(line))
-        outline = _across(first[-1], direction(first[-2], second[1]), link.section.half_m, width_m)
-        middle = Node(f"{name}m", first[-1], draws[2] < (0.7 if made.lanes > 1 else 0.25), outline)
+        outline = _crosswalk_area(
+            first[-1], direction(first[-2], second[1]), link.section.half_m, width_m
+        )
+        middle = Node(f"{name}m", first[-1], draws[2] < (0.7 if kind.lanes > 1 else 0.25), outline)
         parts.nodes[middle.id] = middle
         parts.zebras[middle.id].append(Zebra(middle.id, (f"{name}a", f"-{name}a"), width_m))
         pieces = [(f"{name}a", tail, middle, first), (f"{name}b", middle, head, second)]
@@ -176,7 +246,7 @@ def _add_street(
         pieces = [(name, tail, head, line)]
     for piece, start, end, shape in pieces:
         there, back = (
-            _driveways(way, made.driveways, rngs["driveways"]) for way in (shape, shape[::-1])
+            _driveways(way, kind.driveways, rngs["driveways"]) for way in (shape, shape[::-1])
         )
         parts.edges.append(
             Edge(piece, start.id, end.id, link.street_class, link.section, shape, there)
@@ -189,9 +259,11 @@ def _add_street(
                 parts.zebras[node.id].append(Zebra(node.id, (piece, f"-{piece}"), width_m))
 
 
-def _across(at: Point, heading: float, half_m: float, crossing_m: float) -> tuple[Point, ...]:
-    """The rectangle of a crosswalk and the sidewalks at its ends, with room for the curb ramps
-    beside it."""
+def _crosswalk_area(
+    at: Point, heading: float, half_m: float, crossing_m: float
+) -> tuple[Point, ...]:
+    """Return the rectangle of a crosswalk and the sidewalks at its ends, with room for curb
+    ramps."""
     ahead = 0.5 * crossing_m + CROSSWALK_ROOM_M
     aside = half_m
     corners = ((ahead, aside), (ahead, -aside), (-ahead, -aside), (-ahead, aside))
@@ -200,8 +272,8 @@ def _across(at: Point, heading: float, half_m: float, crossing_m: float) -> tupl
 
 
 def _driveways(line: Line, per_m: float, rng: np.random.Generator) -> tuple[Point, ...]:
-    """Where driveways meet a street: `per_m` of them per metre on average, far from its ends and
-    from each other."""
+    """Draw the driveways of a street, on average `per_m` per metre, away from its ends and each
+    other."""
     found: list[Point] = []
     at = DRIVEWAY_CLEAR_M
     end = length(line) - DRIVEWAY_CLEAR_M
@@ -212,8 +284,7 @@ def _driveways(line: Line, per_m: float, rng: np.random.Generator) -> tuple[Poin
 
 
 def _line(draft: Draft, link: Link, a: Point, b: Point) -> Line:
-    """The centre line between the points where the street starts and ends, a roundabout's rim
-    included."""
+    """Return the centre line between the points where the street starts and ends."""
     leave = draft.leaving(link, link.a)
     arrive = draft.leaving(link, link.b) + math.pi
     if link.via is not None:

@@ -1,9 +1,9 @@
-"""Signal programs of a built net: netconvert's own ones leave some crossings without any green.
+"""Signal programs of generated nets; netconvert's programs leave some crossings without green.
 
-One stage for each pair of opposite approaches (or single approach), one more for crossings that no
-stage lets go. While a stage has green, people walk over the arms whose approach waits; turning cars
-yield to them. Every stage ends with: crossings red, cars still going while people clear the road,
-yellow, all red.
+A program has one stage for each pair of opposite approaches or single approach, and one for
+crossings that no other stage serves. During a stage, people cross the arms whose approach waits,
+and turning cars yield to them. Each stage ends with red for crossings while cars continue, yellow,
+and all red.
 """
 
 from __future__ import annotations
@@ -18,25 +18,29 @@ from typing import NamedTuple
 import numpy as np
 
 WALK_S = 8
-"""Shortest green of a crossing."""
+"""Shortest green of a crossing, seconds."""
 CLEARING_MPS = 1.1
-"""Walking speed for which the road is kept clear after a crossing's green."""
+"""Walking speed for the clearance time after a crossing's green, m/s."""
 START_S = 3
-"""Who starts within so many seconds of green crosses at CLEARING_MPS before it ends."""
+"""A person who starts within this time of green, at CLEARING_MPS, arrives before it ends,
+seconds."""
 YELLOW_S = 3
+"""Duration of yellow, seconds."""
 ALL_RED_S = 2
+"""Duration of red for all links at the end of a stage, seconds."""
 OPPOSITE_RAD = math.radians(38.0)
+"""Largest deviation from opposite headings of two approaches that share a stage, radians."""
 
 
 class Phase(NamedTuple):
-    """One phase of a program: state has a letter per link, as in SUMO."""
+    """One phase of a program. state: a letter per link, as in SUMO."""
 
     duration_s: int
     state: str
 
 
 class _Car(NamedTuple):
-    """A vehicle's link at a signal."""
+    """A vehicle link at a signal."""
 
     link: int
     tail: str
@@ -44,7 +48,7 @@ class _Car(NamedTuple):
 
 
 class _Zebra(NamedTuple):
-    """A crossing's link at a signal, and the edges it crosses."""
+    """A crossing link at a signal, and the edges it crosses."""
 
     link: int
     id: str
@@ -54,10 +58,11 @@ class _Zebra(NamedTuple):
 
 @dataclass(slots=True)
 class _Signal:
-    """What one traffic light controls.
+    """The links that one traffic light controls.
 
-    headings: of each approach at its stop line. foes[i], yields[i]: links that conflict with link
-    i, that it yields to.
+    headings: heading of each approach at its stop line, radians.
+    foes: links that conflict with a link.
+    yields: links that a link yields to.
     """
 
     id: str
@@ -71,12 +76,9 @@ class _Signal:
     def links(self) -> int:
         return 1 + max([car.link for car in self.cars] + [zebra.link for zebra in self.zebras])
 
-    def foe_cars(self, zebra: _Zebra) -> list[_Car]:
-        return [car for car in self.cars if car.tail in zebra.edges or car.head in zebra.edges]
-
 
 def with_programs(net: bytes, rng: np.random.Generator) -> bytes:
-    """The net with a program of ours for every traffic light, in place of netconvert's."""
+    """Return the net with generated programs in place of netconvert's."""
     programs = {
         signal.id: _program(signal, rng) for signal in _signals(ET.fromstring(net)).values()
     }
@@ -96,8 +98,7 @@ def with_programs(net: bytes, rng: np.random.Generator) -> bytes:
 
 
 def signal_faults(net: bytes) -> list[str]:
-    """What is wrong with the programs of a net, a sentence each: crossings without walk or
-    clearance, clashes."""
+    """Return the faults of a net's programs, a sentence each: no green, no clearance, conflicts."""
     root = ET.fromstring(net)
     signals = _signals(root)
     faults = []
@@ -139,8 +140,7 @@ def _signals(root: ET.Element) -> dict[str, _Signal]:
         tail = link.get("from", "")
         head = link.get("to", "")
         index = int(link.get("linkIndex", "0"))
-        # Our lights have one junction each, where link indices and rows of the right-of-way matrix
-        # agree.
+        # Each signal has one junction, so its link indices equal the rows of `request`.
         if head.startswith(":"):
             crossed = frozenset(edges[head].get("crossingEdges", "").split())
             span = float(edges[head][0].get("length", "0"))
@@ -168,8 +168,7 @@ def _signals(root: ET.Element) -> dict[str, _Signal]:
 
 
 def _stages(signal: _Signal) -> list[set[str]]:
-    """The approaches that go together: opposite ones in pairs, best pair first, the others
-    alone."""
+    """Group the approaches: opposite ones in pairs, best pair first, the others alone."""
     names = list(signal.headings)
     pairs = sorted(
         (
@@ -195,8 +194,8 @@ def _stages(signal: _Signal) -> list[set[str]]:
 
 
 def _deadlock(signal: _Signal, approaches: set[str]) -> bool:
-    """Whether two cars from these approaches would wait for each other, as at some bent main
-    roads."""
+    """Return whether two cars from these approaches would wait for each other, as at some bent
+    main roads."""
     links = {car.link for car in signal.cars if car.tail in approaches}
     return any(
         i in signal.yields.get(k, ()) for i in links for k in signal.yields.get(i, set()) & links
@@ -214,7 +213,7 @@ def _program(signal: _Signal, rng: np.random.Generator) -> list[Phase]:
     for stage, walking in zip(stages, walks, strict=True):
         span = max((zebra.length_m for zebra in walking), default=0.0)
         clear_s = math.ceil(span / CLEARING_MPS)
-        # Long enough to start late and still arrive within the green.
+        # A late starter must still arrive within the green.
         walk_s = max(WALK_S, clear_s + START_S)
         cars = [car for car in signal.cars if car.tail in stage]
         state = _green(signal, cars, walking)
@@ -224,20 +223,24 @@ def _program(signal: _Signal, rng: np.random.Generator) -> list[Phase]:
         phases.append(Phase(max(walk_s, int(rng.integers(16, 27))), state))
         rest_s = clear_s - YELLOW_S - ALL_RED_S
         if rest_s > 0:
-            phases.append(Phase(rest_s, _with(state, {zebra.link: "r" for zebra in walking})))
-        phases.append(Phase(YELLOW_S, _with("r" * signal.links, {car.link: "y" for car in cars})))
+            phases.append(
+                Phase(rest_s, _with_letters(state, {zebra.link: "r" for zebra in walking}))
+            )
+        phases.append(
+            Phase(YELLOW_S, _with_letters("r" * signal.links, {car.link: "y" for car in cars}))
+        )
         phases.append(Phase(ALL_RED_S, "r" * signal.links))
     return phases
 
 
 def _green(signal: _Signal, cars: list[_Car], walking: list[_Zebra]) -> str:
-    """A stage's state: who must yield to another one that goes has 'g'."""
+    """Return a stage's state; links that must yield to another green link have "g"."""
     going = {car.link for car in cars} | {zebra.link for zebra in walking}
     letters = {car.link: "g" if signal.yields.get(car.link, set()) & going else "G" for car in cars}
-    return _with("r" * signal.links, letters | {zebra.link: "G" for zebra in walking})
+    return _with_letters("r" * signal.links, letters | {zebra.link: "G" for zebra in walking})
 
 
-def _with(state: str, letters: dict[int, str]) -> str:
+def _with_letters(state: str, letters: dict[int, str]) -> str:
     return "".join(letters.get(i, letter) for i, letter in enumerate(state))
 
 
@@ -245,14 +248,16 @@ def _walk_faults(signal: _Signal, zebra: _Zebra, phases: list[Phase]) -> list[st
     walks = "".join(phase.duration_s * phase.state[zebra.link] for phase in phases)
     if not {"G", "g"} & set(walks) or not set(walks) - {"G", "g"}:
         return ["never changes between walk and stop"]
-    # Begin the cycle in the second in which the walk ends.
+    # Rotate the cycle to start in the second in which the walk ends.
     shift = next(t for t in range(len(walks)) if walks[t - 1] in "Gg" and walks[t] not in "Gg")
     walks = walks[shift:] + walks[:shift]
     faults = []
     shortest = min(len(run) for run in re.findall("[Gg]+", walks))
     if shortest < WALK_S:
         faults.append(f"has {shortest} s of green")
-    for car in signal.foe_cars(zebra):
+    for car in signal.cars:
+        if not {car.tail, car.head} & zebra.edges:
+            continue
         cycle = "".join(phase.duration_s * phase.state[car.link] for phase in phases)
         cycle = cycle[shift:] + cycle[:shift]
         starts = [t for t in range(len(cycle)) if cycle[t] in "Gg" and cycle[t - 1] == "r"]
@@ -269,7 +274,7 @@ def _walk_faults(signal: _Signal, zebra: _Zebra, phases: list[Phase]) -> list[st
 
 
 def _clashes(signal: _Signal, state: str) -> list[str]:
-    """Pairs of cars that may go at once though neither yields, or each waits for the other."""
+    """Return conflicting links that are green together although neither yields, or both do."""
     going = [car for car in signal.cars if state[car.link] in "Gg"]
     return [
         f"links {a.link} and {b.link} clash in {state}"

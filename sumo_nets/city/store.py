@@ -18,10 +18,11 @@ from sumo_nets.city.blocks import CLASSES, Point
 from sumo_nets.city.city import plan_city
 from sumo_nets.city.plan import CityPlan, Edge
 from sumo_nets.city.signals import with_programs
-from sumo_nets.net.net_hash import net_content_hash, without_comments
 from sumo_nets.net.netconvert import netconvert
+from sumo_nets.net.raw_file import net_content_hash, without_comments
 
 _CROSSING_M = 3.2
+"""Default width of crossings, metres."""
 _NETCONVERT = (
     "--walkingareas",
     "--no-turnarounds.except-deadend",
@@ -34,7 +35,7 @@ _NETCONVERT = (
 
 
 def city_as_net(city: City, folder: Path) -> bytes:
-    """The net of a city; folder: for what is written on the way."""
+    """Return the net of a city. folder: for temporary files."""
     plan = plan_city(city.seed, city.size_m, city.style)
     return with_programs(without_comments(_converted(plan, folder).read_bytes()), plan.signal_rng)
 
@@ -67,9 +68,9 @@ def _converted(plan: CityPlan, folder: Path) -> Path:
 
 
 def _edge(edge: Edge) -> str:
-    """An edge with its sidewalk as lane 0, the verge next to it, the lanes that are driven on, half
-    of the island."""
-    made = CLASSES[edge.street_class]
+    """Return the XML of an edge: sidewalk as lane 0, then the verge, the road lanes, half of the
+    median."""
+    kind = CLASSES[edge.street_class]
     section = edge.section
     lanes = [
         f'allow="pedestrian" width="{section.sidewalk_m}"',
@@ -91,7 +92,7 @@ def _edge(edge: Edge) -> str:
     zones = "".join(f'<param key="{key}" value="{value}"/>' for key, value in params.items())
     return (
         f'<edge id={quoteattr(edge.id)} from="{edge.tail}" to="{edge.head}" '
-        f'numLanes="{len(lanes)}" speed="{made.speed_mps}" priority="{made.priority}" '
+        f'numLanes="{len(lanes)}" speed="{kind.speed_mps}" priority="{kind.priority}" '
         f'type="{edge.street_class}" spreadType="right" '
         f'shape="{_shape(edge.line)}">{numbered}{zones}</edge>'
     )
@@ -103,30 +104,31 @@ def _shape(line: Sequence[Point]) -> str:
 
 VAL_SEEDS = tuple(range(1, 81))
 TEST_SEEDS = tuple(range(7001, 7021))
-"""Cities that nothing was tuned on: no test, measurement or example names them."""
+"""Seeds of held-out cities: no test, measurement or example uses them."""
 SEEDS = (*VAL_SEEDS, *TEST_SEEDS)
 
 
 def shipped_cities(
     count: int = len(SEEDS), size_m: float = 2000.0, style: str = "mixed"
 ) -> tuple[City, ...]:
-    """The first `count` of the shipped cities."""
+    """Return the first `count` of the shipped cities."""
     return tuple(City(seed=seed, size_m=size_m, style=style) for seed in SEEDS[:count])
 
 
 GENERATOR = 4
-"""Version of the generator: another one for every change that changes a net."""
+"""Version of the generator, incremented with every change of its nets."""
 NET_NAME = "city.net.xml"
 ABOUT_NAME = "city.json"
 MADE_WITH = ("sidewalk-cosim", "eclipse-sumo", "numpy")
-"""Packages that a net depends on."""
+"""Packages that determine a net."""
 SEAL = b"<!-- sha256 "
+"""Start of the last line of a cached net, which holds the hash of the lines before it."""
 
 
 def city_net(city: City) -> Path:
-    """The city's street net, built when the cache has none, or a damaged one.
+    """Return the city's street net, and build it if the cached one is missing or damaged.
 
-    Raises MapError when `city.net_hash` is set and the net is another one.
+    Raises MapError when `city.net_hash` is set and differs from the net's hash.
     """
     path = cache_folder() / f"{city.name}-g{GENERATOR}.net.xml"
     use_entry(path)
@@ -147,8 +149,7 @@ def city_net(city: City) -> Path:
 
 
 def is_whole(path: Path) -> bool:
-    """Whether a net that was built here is still what was written: its last line holds the hash of
-    all the others."""
+    """Return whether a cached net is undamaged, by the hash in its last line."""
     try:
         body, _, seal = path.read_bytes().rpartition(SEAL)
     except OSError:
@@ -161,11 +162,9 @@ def _seal(body: bytes) -> bytes:
 
 
 def write_city(city: City, folder: Path) -> City:
-    """Write a city as a folder: its net, and city.json with what it was made from. Equal to the
-    byte when made again.
+    """Write a city as a folder with its net and city.json. The result is reproducible to the byte.
 
-    Returns the city with the hash of its net. Raises MapError when the folder holds something else
-    already.
+    Returns the city with the hash of its net. Raises MapError when the folder holds other files.
     """
     known = {NET_NAME, ABOUT_NAME}
     try:
@@ -193,8 +192,8 @@ def write_city(city: City, folder: Path) -> City:
 
 
 def build_city(city: City, path: Path) -> None:
-    """Build a city's net at `path`, in one move: several processes may build the same city at once.
-    OSError passes."""
+    """Build a city's net at `path` atomically, so that several processes may build the same
+    city. Raises OSError."""
 
     with temp_folder(BUILDING, path.parent) as folder:
         body = city_as_net(city, folder)

@@ -1,8 +1,7 @@
-"""SumoCrowd: the people, vehicles and signals around the robot, by SUMO.
+"""SumoCrowd: background pedestrians, vehicles and signals around the robot, simulated by SUMO.
 
-One SUMO per process, and one step of it per tick. Persons, robot and event pedestrians share SUMO's
-sidewalks: the robot and the event pedestrians are mirrored in as proxies, so the crowd evades them
-one tick late.
+Each tick is one SUMO step. The robot and the event pedestrians are mirrored into SUMO as proxies,
+so the crowd evades them one tick late.
 """
 
 from __future__ import annotations
@@ -33,36 +32,45 @@ from cosim.spec.events import Actor, EventReply
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import CrowdSpec
 from sumo_nets import engine
-from sumo_nets.crowd.demand import LINGER_M, VEHICLE_REACH_M, Drivers, Pedestrians, Seen
+from sumo_nets.crowd.demand import (
+    LINGER_M,
+    VEHICLE_REACH_M,
+    Drivers,
+    Pedestrians,
+    Seen,
+    replayed_demand,
+)
 from sumo_nets.crowd.demand_log import Entrances
-from sumo_nets.crowd.demand_replay import replayed_demand
 from sumo_nets.crowd.empty_street import TICK_MS, start_of
 from sumo_nets.crowd.group_cohesion import Together
-from sumo_nets.crowd.kerb_waiting import Kerbs
-from sumo_nets.crowd.lights import Signals, SumoLights
-from sumo_nets.crowd.pose_filter import PoseFilter
+from sumo_nets.crowd.lights import Kerbs, Signals, SumoLights
 from sumo_nets.crowd.proxy import Proxy, Walks
-from sumo_nets.crowd.shown_people import ShownPeople, cast_in_order, places_of
+from sumo_nets.crowd.shown_people import PoseFilter, ShownPeople, cast_in_order, places_of
 from sumo_nets.engine import NearPersons, NearVehicles, sumo, translated
 
 _ROLL_TICKS = 10
-"""How often persons and vehicles come and go."""
+"""Interval in ticks at which persons and vehicles enter and leave."""
 
 _WARM_UP_S = 8.0
-"""How long the vehicles drive before the first tick; persons walk at once."""
+"""Driving time of the vehicles before the first tick, seconds; persons start at the first tick."""
 
 _BERTH_M = (0.3, 0.45)
-"""To SUMO's walkers the robot is so much longer and wider than it is: they pass it wide."""
+"""Length and width added to the robot's proxy, metres, so that SUMO's pedestrians keep their
+distance."""
 
 
 class SumoCrowd(Crowd):
-    """The crowd around the robot on the street net at `net_path`, of which `street_map` was read.
+    """The crowd on a street net. Use it as a context manager.
 
-    closed: ports where barriers stand; background walkers never pass them. start_xy: where the
-    robot starts, metres. footprint_m: its length and width. before: who entered and left a street
-    like this one, to be let in and out again. standing: what people step round besides the robot.
-    Everything random comes from `seed`: the same calls give the same streets, bit for bit. Use as a
-    context manager. entrances: who has come and gone since it was entered.
+    net_path: the street net.
+    street_map: the map read from that net.
+    seed: seed of all random draws; the same calls give the same streets, bit for bit.
+    closed: ports with barriers; background pedestrians never pass them.
+    start_xy: start position of the robot, metres.
+    footprint_m: length and width of the robot, metres.
+    before: entries and exits of an earlier run to replay.
+    standing: obstacles, besides the robot, that people step around.
+    entrances: entries and exits of this run.
     """
 
     _running: ClassVar[SumoCrowd | None] = None
@@ -125,21 +133,21 @@ class SumoCrowd(Crowd):
 
     @property
     def street(self) -> Street:
-        """The street now."""
+        """The current street."""
         if self._street is None:
             raise EngineError("this SumoCrowd is not running: use it as a context manager")
         return self._street
 
     @property
     def groups(self) -> tuple[tuple[str, ...], ...]:
-        """The ids of those who walk together, group by group."""
+        """The person ids of each group."""
         return self._together.groups
 
     def step(self, robot: RobotState, reply: EventReply, *, absent: bool = False) -> Street:
-        """One tick on, with the robot and the event pedestrians where they are now.
+        """Advance by one tick, with the robot and the event pedestrians at their current poses.
 
-        absent: nobody is there where the robot would be; the crowd still comes and goes around that
-        point.
+        absent: leave the robot out; its position still determines where the crowd enters and
+            leaves.
         """
         tick = self.street.tick
         with translated(f"stepping from tick {tick}"):
@@ -202,15 +210,16 @@ class SumoCrowd(Crowd):
     def _demand(
         self, rng_persons: np.random.Generator, rng_vehicles: np.random.Generator
     ) -> tuple[Pedestrians, Drivers]:
-        """Those who let people and vehicles in and out; what they do is kept in `entrances`."""
+        """Return the sources of pedestrians and vehicles; `entrances` records their entries and
+        exits."""
         self.entrances = Entrances()
         if self._before is not None:
             return replayed_demand(
                 sumo, self._before, self._map, self._spec, self._closed, self._together
             )
-        kept, spec = self.entrances, self._spec
-        people = Pedestrians(sumo, kept, self._map, spec, rng_persons, self._closed, self._together)
-        return people, Drivers(sumo, kept, self._map, spec, rng_vehicles)
+        logged = sumo, self.entrances, self._map, self._spec
+        people = Pedestrians(*logged, rng_persons, self._closed, self._together)
+        return people, Drivers(*logged, rng_vehicles)
 
     def _mirror(self, actors: tuple[Actor, ...]) -> None:
         present = {actor.id for actor in actors}
@@ -242,8 +251,8 @@ class SumoCrowd(Crowd):
         return self._shown.together(cast, self._pedestrians.ages, persons.names, *shown)
 
     def _vehicles(self, near: NearVehicles) -> Vehicles:
-        """SUMO's position is the middle of the front bumper; the street's is the middle of the
-        box."""
+        """Convert SUMO's positions, the middles of the front bumpers, to the middles of the
+        boxes."""
         if near.names != self._sized[0]:
             sizes = [self._drivers.size_m(name) for name in near.names]
             self._sized = near.names, write_protected(sizes, shape=(len(sizes), 2))
@@ -267,10 +276,10 @@ def _facing(person: str) -> float:
 
 
 def _arguments(net_path: Path, sumo_seed: int, begin_s: int) -> list[str]:
-    """SUMO's command line; see the options' own help for more.
+    """Return SUMO's command line.
 
-    Without jam times nobody squeezes through the robot. With route errors ignored, somebody who
-    cannot walk on jumps to the next edge of the walk: without, SUMO stops all persons for good.
+    Without jam times nobody squeezes past the robot. With route errors ignored, a blocked person
+    jumps to the next edge of its walk; otherwise SUMO stops all persons permanently.
     """
     options: dict[str, object] = {
         "net-file": net_path,

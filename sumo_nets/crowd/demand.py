@@ -1,133 +1,71 @@
-"""The rolling crowd: persons and vehicles around the robot, and where they enter."""
+"""Demand: entries and exits of persons and vehicles around the robot, random or replayed."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
+from itertools import groupby
 from typing import NamedTuple
 
 import numpy as np
 
-from cosim.core.geometry import Floats, Polyline, Pose, heading_to_sumo
+from cosim.core.geometry import Floats, heading_to_sumo
 from cosim.core.state import Age
 from cosim.place.street_map import Port, StreetMap
 from cosim.place.walk_graph import walk_graph_of
 from cosim.spec.scenario import CrowdSpec
 from sumo_nets.crowd.demand_log import Entrances, PersonEntry, VehicleEntry
-from sumo_nets.crowd.free_space import Room
+from sumo_nets.crowd.free_space import EntrySpot, Room, Spots
 from sumo_nets.crowd.group_cohesion import Together
 from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M, GroupDraws
 from sumo_nets.crowd.proxy import ROUND_THE_CORNER_M
 from sumo_nets.engine import Sumo
 
-
-class EntrySpot(NamedTuple):
-    """A place on the middle line of an edge, heading along it; share: of the edge's length that
-    lies before it."""
-
-    edge: str
-    share: float
-    pose: Pose
-
-    def beside(self, left_m: float, ahead_m: float) -> tuple[float, float]:
-        """A point so far to the left of it and ahead of it, in metres."""
-        cos, sin = math.cos(self.pose.heading_rad), math.sin(self.pose.heading_rad)
-        return (
-            self.pose.x_m - left_m * sin + ahead_m * cos,
-            self.pose.y_m + left_m * cos + ahead_m * sin,
-        )
-
-
-class Spots:
-    """Where somebody may enter: points every `step_m` along lines, made for the lines that are
-    asked about."""
-
-    def __init__(self, lines: Iterable[tuple[str, Floats, float, float]], step_m: float) -> None:
-        """lines: edge id, (N, 2) metres, and how much to leave free at its start and end in
-        metres."""
-        self._lines = list(lines)
-        self._step_m = step_m
-        self._made: dict[int, tuple[Floats, Floats]] = {}
-        points = [line for _, line, _, _ in self._lines]
-        starts = np.cumsum([0, *map(len, points)])[:-1]
-        if points:
-            whole = np.concatenate(points)
-            self._low = np.minimum.reduceat(whole, starts)
-            self._high = np.maximum.reduceat(whole, starts)
-
-    def ring(self, x_m: float, y_m: float, low_m: float, high_m: float) -> list[tuple[int, int]]:
-        """The spots at a distance in [low_m, high_m), each by the number of its line and its own on
-        it."""
-        if not self._lines:
-            return []
-        beside = np.maximum(np.maximum(self._low - (x_m, y_m), (x_m, y_m) - self._high), 0.0)
-        lines = np.flatnonzero((beside * beside).sum(axis=1) <= high_m * high_m + 1.0)
-        poses = [self._on(number)[1] for number in lines.tolist()]
-        numbers = np.repeat(lines, [len(on) for on in poses])
-        places = np.concatenate([np.arange(len(on)) for on in poses] or [numbers])
-        gap = np.concatenate([on[:, :2] for on in poses] or [np.zeros((0, 2))]) - (x_m, y_m)
-        here = ((gap * gap).sum(axis=1) <= high_m * high_m) & (
-            np.hypot(gap[:, 0], gap[:, 1]) >= low_m
-        )
-        return list(zip(numbers[here].tolist(), places[here].tolist(), strict=True))
-
-    def __getitem__(self, spot: tuple[int, int]) -> EntrySpot:
-        number, k = spot
-        shares, poses = self._on(number)
-        return EntrySpot(self._lines[number][0], float(shares[k]), Pose(*poses[k].tolist()))
-
-    def _on(self, number: int) -> tuple[Floats, Floats]:
-        """(N,) shares and (N, 3) poses of the spots of a line."""
-        if number not in self._made:
-            _, xy, start_m, end_m = self._lines[number]
-            line = Polyline(xy)
-            s = np.arange(start_m, line.length_m - end_m, self._step_m)
-            x, y = (np.interp([s - 0.1, s, s + 0.1], line.s_m, line.points[:, k]) for k in (0, 1))
-            poses = np.column_stack([x[1], y[1], np.arctan2(y[2] - y[0], x[2] - x[0])])
-            self._made[number] = s / line.length_m, poses
-        return self._made[number]
-
-
 SIGHT_M = 35.0
-"""Nobody appears nearer to the robot than this."""
-
+"""Smallest distance from the robot at which a person enters, metres."""
 FIRST_FILL_CLEAR_M = 8.0
-"""In the first fill, when nobody watches yet, nobody appears nearer than this."""
-
+"""Smallest distance from the robot in the first fill, before the episode starts, metres."""
 ENTER_M = 40.0
-"""People enter in the outer part of the crowd's radius, so wide."""
-
+"""Width of the outer part of the crowd's radius in which people enter, metres."""
 LINGER_M = 20.0
-"""How far beyond the crowd's radius a person may stray before it is taken out."""
-
+"""Distance beyond the crowd's radius at which a person is removed, metres."""
 STUCK_S = 60.0
-"""A person that has waited this long, but not at a red light, is taken out."""
-
+"""A person that has waited longer, except at a red light, is removed, seconds."""
 _EDGE_M = 0.4
+"""Distance of entering persons from the edge of the sidewalk, metres."""
 _PERSONAL_SPACE_M = 1.5
+"""Smallest distance of an entering person from others, metres."""
 _WALK_EDGES = 30
+"""Number of edges of a random walk."""
 BARRIER_MARGIN_M = 1.0
+"""Additional distance of entries from a closed port, metres."""
 PERSONS_AT_ONCE = 8
-
+"""Largest number of persons that enter in one update."""
 VEHICLE_RING_M = (60.0, 220.0)
+"""Range of distances from the robot at which vehicles enter, metres."""
 VEHICLE_FIRST_M = 25.0
+"""Smallest distance from the robot in the first fill, metres."""
 VEHICLE_FAR_M = 120.0
+"""Preferred smallest distance of later entries, metres."""
 VEHICLE_REACH_M = 250.0
+"""Distance at which a vehicle is removed, metres."""
 VEHICLE_STUCK_S = 180.0
+"""A vehicle outside of VEHICLE_RING_M that has waited longer is removed, seconds."""
 ROUTE_EDGES = 60
+"""Largest number of edges of a vehicle's route."""
 VEHICLES_AT_ONCE = 3
-
+"""Largest number of vehicles that enter in one update."""
 VEHICLE_TYPES: Mapping[str, tuple[float, float, float]] = {
     "small": (3.8, 1.7, 0.25),
     "car": (4.6, 1.8, 0.55),
     "van": (5.6, 2.0, 0.20),
 }
-"""Vehicle type -> length m, width m, share."""
+"""Length in metres, width in metres and share of each vehicle type."""
 
 
 class Seen(NamedTuple):
-    """A person or vehicle near the robot: position (for vehicles of the front bumper) m, and
-    seconds without moving."""
+    """Position of a person, or of a vehicle's front bumper, in metres, and its waiting time in
+    seconds."""
 
     x_m: float
     y_m: float
@@ -135,7 +73,7 @@ class Seen(NamedTuple):
 
 
 class Pedestrians:
-    """The background persons. ages: of everybody who ever entered, by name."""
+    """The background pedestrians. ages: ages of all persons that ever entered, by name."""
 
     def __init__(
         self,
@@ -168,11 +106,11 @@ class Pedestrians:
         self._groups = GroupDraws(spec, rng.spawn(1)[0])
 
     def fill(self, x_m: float, y_m: float) -> None:
-        """Everybody at once, before the episode."""
+        """Let all persons enter before the episode."""
         self._enter(self.wanted(x_m, y_m), x_m, y_m, FIRST_FILL_CLEAR_M, {})
 
     def wanted(self, x_m: float, y_m: float) -> int:
-        """How many persons there should be within the crowd's radius of a point."""
+        """Return the target number of persons within the crowd's radius of a point."""
         if self._room is None or self._spec.density is None:
             return self._spec.persons
         return round(self._spec.density * self._room.area_m2(x_m, y_m) / 1000.0)
@@ -180,25 +118,25 @@ class Pedestrians:
     def roll(
         self, x_m: float, y_m: float, seen: Mapping[str, Seen], at_red: Callable[[str], bool]
     ) -> None:
-        """Take out who is far away or stuck, with all who walk along; let others in instead; keep
+        """Remove persons that are far away or stuck, with their groups; let others enter; keep
         groups together.
 
-        seen: the persons within the crowd's radius and LINGER_M. at_red: whether a person waits at
-        a red light.
+        seen: persons within the crowd's radius plus LINGER_M.
+        at_red: returns whether a person waits at a red light.
         """
         person, radius_m = self._engine.person, self._spec.radius_m
         fellows = self._together.fellows
         present = sorted(self.ages.keys() & set(person.getIDList()))
         self._together.forget(present)
-        gone: set[str] = set()
+        removed: set[str] = set()
         for name in present:
             here = seen.get(name)
-            if name in gone:
+            if name in removed:
                 continue
             if here is None or (
                 here.waiting_s > STUCK_S and not any(at_red(fellow) for fellow in fellows(name))
             ):
-                gone.update(fellows(name))
+                removed.update(fellows(name))
                 self._remove(name)
         away_m = {name: math.hypot(p.x_m - x_m, p.y_m - y_m) for name, p in seen.items()}
         inside = [name for name, far_m in away_m.items() if far_m < radius_m]
@@ -218,7 +156,7 @@ class Pedestrians:
         self._enter(min(missing, PERSONS_AT_ONCE), x_m, y_m, low_m, seen)
 
     def _remove(self, name: str) -> None:
-        """Take somebody who is still there out, with all who walk along."""
+        """Remove a person that is still in the simulation, with its group."""
         if name in self._engine.person.getIDList():
             for fellow in self._together.leave(name):
                 self._entrances.people[self._engine.simulation.getTime()].append(fellow)
@@ -273,10 +211,10 @@ class Pedestrians:
                 return
 
     def _one_way(self, walk: list[str], forward: bool) -> list[str]:
-        """A walk that SUMO takes in one direction only.
+        """Return a walk with a unique direction for SUMO.
 
-        From one sidewalk onto another between the same junctions SUMO may set out in either
-        direction, and dies where the two do not meet: there the corner between them is named.
+        Between two sidewalks that join the same two junctions SUMO may start in either direction,
+        and aborts where they do not meet. There the corner between them is added to the walk.
         """
         first, second = (
             {self._engine.edge.getFromJunction(e), self._engine.edge.getToJunction(e)}
@@ -286,7 +224,7 @@ class Pedestrians:
         return walk if first != second or corner is None else [walk[0], corner, *walk[1:]]
 
     def _name(self, age: Age) -> str:
-        """The next name, and who has it is so old."""
+        """Return a new name and store the person's age under it."""
         name = f"c{len(self.ages)}"
         self.ages[name] = age
         return name
@@ -304,7 +242,7 @@ class Pedestrians:
 
 
 class Drivers:
-    """The vehicles."""
+    """The background vehicles."""
 
     def __init__(
         self,
@@ -338,18 +276,18 @@ class Drivers:
             engine.vehicletype.setWidth(kind, width_m)
 
     def size_m(self, name: str) -> tuple[float, float]:
-        """Length and width of a vehicle in metres."""
+        """Return the length and width of a vehicle, metres."""
         return self._size[name]
 
     def fill(self, x_m: float, y_m: float) -> None:
-        """All at once, before the episode."""
+        """Let all vehicles enter before the episode."""
         ring = self._spots.ring(x_m, y_m, VEHICLE_FIRST_M, VEHICLE_RING_M[1])
         for _ in range(self._spec.vehicles if ring else 0):
             self._enter(ring)
 
     def roll(self, x_m: float, y_m: float, seen: Mapping[str, Seen]) -> None:
-        """Take out what is far away or stuck out of sight, let others in instead, far away when
-        possible."""
+        """Remove vehicles that are far away, or stuck out of sight, and let others enter, if
+        possible far away."""
         vehicle = self._engine.vehicle
         staying = 0
         for name in sorted(vehicle.getIDList()):
@@ -392,7 +330,7 @@ class Drivers:
         return route
 
     def _onward(self, edge: str) -> tuple[str, ...]:
-        """The edges a car can go on to; a turn back only where there is nothing else."""
+        """Return the edges that a car can continue on; a U-turn only at dead ends."""
         if edge not in self._next:
             onward: dict[str, bool] = {}
             for lane in self._lanes[edge]:
@@ -403,3 +341,66 @@ class Drivers:
             ahead = tuple(to for to, back in sorted(onward.items()) if not back)
             self._next[edge] = ahead or tuple(sorted(onward))
         return self._next[edge]
+
+
+def replayed_demand(
+    engine: Sumo,
+    before: Entrances,
+    street_map: StreetMap,
+    spec: CrowdSpec,
+    closed: frozenset[Port],
+    together: Together,
+) -> tuple[ReplayedPedestrians, ReplayedDrivers]:
+    """Return pedestrians and vehicles that repeat the entries and exits of `before` at the same
+    times."""
+    unused_rng = np.random.default_rng(0)
+    people = ReplayedPedestrians(engine, before, street_map, spec, unused_rng, closed, together)
+    return people, ReplayedDrivers(engine, before, street_map, spec, unused_rng)
+
+
+class ReplayedPedestrians(Pedestrians):
+    """Pedestrians that repeat recorded entries and exits.
+
+    Those who enter together with the same walk and speed form a group.
+    """
+
+    def fill(self, x_m: float, y_m: float) -> None:
+        self._replay()
+
+    def roll(
+        self, x_m: float, y_m: float, seen: Mapping[str, Seen], at_red: Callable[[str], bool]
+    ) -> None:
+        self._together.forget(self._engine.person.getIDList())
+        self._together.keep(seen)
+        self._replay()
+
+    def _replay(self) -> None:
+        here = set(self._engine.person.getIDList())
+        entered = []
+        for one in self._entrances.people.get(self._engine.simulation.getTime(), ()):
+            if isinstance(one, PersonEntry):
+                one.enter(self._engine)
+                entered.append(one)
+            elif one in here:
+                self._engine.person.remove(one)
+        for (walk, mps), group in groupby(entered, key=lambda one: (one.walk, one.mps)):
+            self._together.join([one.name for one in group], mps, walk)
+
+
+class ReplayedDrivers(Drivers):
+    """Vehicles that repeat recorded entries and exits."""
+
+    def fill(self, x_m: float, y_m: float) -> None:
+        self._replay()
+
+    def roll(self, x_m: float, y_m: float, seen: Mapping[str, Seen]) -> None:
+        self._replay()
+
+    def _replay(self) -> None:
+        here = set(self._engine.vehicle.getIDList())
+        for one in self._entrances.vehicles.get(self._engine.simulation.getTime(), ()):
+            if not isinstance(one, str):
+                one.enter(self._engine)
+                self._size[one.name] = VEHICLE_TYPES[one.kind][:2]
+            elif one in here:
+                self._engine.vehicle.remove(one)

@@ -1,10 +1,8 @@
-"""Entrances: who came into a simulated street, when and where, and who was taken out; kept, and
-done again.
+"""Records of entries and exits in a simulated street, for replay.
 
-A street that is simulated a second time with something changed in it would soon have other people:
-who enters depends on who is missing. With the first one's entrances done again both have the same
-people and vehicles, from the same places, at the same times, and each of them can be compared with
-itself.
+Entries depend on the persons present, so a second simulation with a change would soon differ in its
+crowd. With replayed entries both runs have the same people and vehicles at the same times and
+places, and each can be compared with itself.
 """
 
 from __future__ import annotations
@@ -15,13 +13,20 @@ from typing import TYPE_CHECKING, NamedTuple
 from cosim.core.state import Age
 from sumo_nets.crowd.proxy import KEEP_ROUTE, MATCH_M
 
-if TYPE_CHECKING:  # a street that goes by itself does without SUMO
+if TYPE_CHECKING:  # an EmptyStreet does not need SUMO
     from sumo_nets.engine import Sumo
 
 
 class PersonEntry(NamedTuple):
-    """A person sets out: on an edge, so far from its start, on a walk that ends so far on its last
-    edge; at `xy`, m."""
+    """Entry of a person.
+
+    edge, at_m: start edge and the distance from its start, metres.
+    walk: edges of the walk.
+    until_m: distance on the last edge at which the walk ends, metres.
+    mps: walking speed, m/s.
+    xy: start position, metres.
+    angle_deg: SUMO's angle, degrees.
+    """
 
     name: str
     edge: str
@@ -33,15 +38,15 @@ class PersonEntry(NamedTuple):
     angle_deg: float
 
     def enter(self, engine: Sumo) -> None:
-        """SUMO lets everybody enter on the right edge of the way; the move spreads them over its
-        width."""
+        """Add the person to SUMO. SUMO starts everybody at the right edge, so the person is
+        moved to `xy`."""
         engine.person.add(self.name, self.edge, self.at_m)
         engine.person.appendWalkingStage(self.name, list(self.walk), self.until_m, speed=self.mps)
         engine.person.moveToXY(self.name, "", *self.xy, self.angle_deg, KEEP_ROUTE, MATCH_M)
 
 
 class VehicleEntry(NamedTuple):
-    """A vehicle of a kind sets out on a route, so far from the start of its first edge."""
+    """Entry of a vehicle on a route, `at_m` metres from the start of its first edge."""
 
     name: str
     kind: str
@@ -56,10 +61,9 @@ class VehicleEntry(NamedTuple):
 
 
 class Entrances:
-    """Who came and went, in order, by the simulated time in seconds: entries, and the names of
-    those taken out.
+    """Entries, and names at exits, of persons and vehicles, in order, by simulated time in seconds.
 
-    ages: of the people, by name.
+    ages: ages of the persons, by name.
     """
 
     def __init__(self) -> None:

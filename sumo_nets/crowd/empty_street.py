@@ -1,8 +1,7 @@
-"""EmptyStreet: a street without background crowd or vehicles, which needs no SUMO.
+"""EmptyStreet: a street without background crowd, which does not need SUMO.
 
-Of SUMO's walkers only the crowd is read, so that where there is none all that SUMO would tell is
-what the signals show, and where they go by the clock their plans tell that too. Actors are where
-they are, signals as with SUMO: the streets are those of a `SumoCrowd` with the same seed, bit for
+Without a crowd only the signals would be read from SUMO. If all signals have fixed plans, their
+states are computed instead. The streets equal those of a `SumoCrowd` with the same seed, bit for
 bit.
 """
 
@@ -24,28 +23,33 @@ from sumo_nets.crowd.lights import PlannedLights, Signals
 from sumo_nets.crowd.shown_people import ShownPeople, cast_in_order
 
 TICK_MS: Final = 50
-"""One step of SUMO."""
+"""Duration of a SUMO step, milliseconds."""
 
 _SIGNAL_CLOCK_S: Final = 3600
-"""The signals' clocks start somewhere in this span, drawn from the seed."""
+"""Range of the start time of the signals, drawn from the seed, seconds."""
 
 
 def goes_by_itself(street_map: StreetMap, spec: CrowdSpec, before: Entrances | None = None) -> bool:
-    """Whether a street needs no SUMO. before: who came and went, in place of who would be drawn."""
-    nobody = spec.empty if before is None else not (before.people or before.vehicles)
-    return nobody and street_map.signals_by_the_clock
+    """Return whether a street does not need SUMO. before: recorded entries to replay instead of
+    random ones."""
+    no_crowd = spec.empty if before is None else not (before.people or before.vehicles)
+    return no_crowd and street_map.signals_by_the_clock
 
 
 def start_of(seed: int) -> tuple[int, int]:
-    """SUMO's seed, and the second at which it begins."""
+    """Return SUMO's seed and its start time in seconds."""
     rng = np.random.default_rng(seed).spawn(1)[0]
     return int(rng.integers(2**31)), int(rng.integers(_SIGNAL_CLOCK_S))
 
 
 class EmptyStreet(Crowd):
-    """The street of a map around actors and signals alone; `goes_by_itself` says where that is all.
-    seed: of when the signals begin; start_xy: where the robot starts, metres. Use as a context
-    manager. entrances: nobody's."""
+    """A street with event pedestrians and planned signals only, see `goes_by_itself`. Use it as a
+    context manager.
+
+    seed: seed of the signals' start time.
+    start_xy: start position of the robot, metres.
+    entrances: always empty.
+    """
 
     def __init__(self, street_map: StreetMap, seed: int, start_xy: tuple[float, float]) -> None:
         self._map = street_map
@@ -71,14 +75,14 @@ class EmptyStreet(Crowd):
 
     @property
     def street(self) -> Street:
-        """The street now."""
+        """The current street."""
         if self._street is None:
             raise EngineError("this EmptyStreet is not running: use it as a context manager")
         return self._street
 
     def step(self, robot: RobotState, reply: EventReply, *, absent: bool = False) -> Street:
-        """One tick on, with the event pedestrians where they are now. absent: makes no
-        difference."""
+        """Advance by one tick, with the event pedestrians at their current poses. absent: has no
+        effect."""
         self._street = self._read(
             self.street.tick + 1, robot.pose.x_m, robot.pose.y_m, reply.actors
         )

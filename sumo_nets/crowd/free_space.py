@@ -1,21 +1,24 @@
-"""Room: how much of the ground around a point can be walked on, for a crowd of a given density."""
+"""Free space for the crowd: walkable area around a point, and spots where persons or vehicles
+may enter."""
 
 from __future__ import annotations
 
 import math
-from typing import Final
+from collections.abc import Iterable
+from typing import Final, NamedTuple
 
 import numpy as np
 import shapely
 
+from cosim.core.geometry import Floats, Polyline, Pose
 from cosim.place.street_map import StreetMap
 
 AGAIN_M: Final = 5.0
-"""How far the point moves before the area is measured again."""
+"""Distance that the point moves before the area is measured again, metres."""
 
 
 class Room:
-    """The walkable area within `radius_m` of a point that moves slowly."""
+    """The walkable area within `radius_m` of a slowly moving point."""
 
     def __init__(self, street_map: StreetMap, radius_m: float) -> None:
         strips = [strip.polygon for strip in street_map.strips.values()]
@@ -27,11 +30,77 @@ class Room:
         self._area_m2 = 0.0
 
     def area_m2(self, x_m: float, y_m: float) -> float:
-        """Square metres of sidewalks, crossings and corners around a point (up to AGAIN_M beside
-        it)."""
+        """Return the area of sidewalks, crossings and corners around a point, m2, accurate to a
+        shift of AGAIN_M."""
         if self._at is None or math.hypot(x_m - self._at[0], y_m - self._at[1]) > AGAIN_M:
             self._at = (x_m, y_m)
             disk = shapely.Point(x_m, y_m).buffer(self._radius_m)
             near = self._polygons[self._tree.query(disk, predicate="intersects")]
             self._area_m2 = float(shapely.area(shapely.intersection(near, disk)).sum())
         return self._area_m2
+
+
+class EntrySpot(NamedTuple):
+    """A pose on the middle line of an edge, heading along it. share: share of the edge's length
+    before it."""
+
+    edge: str
+    share: float
+    pose: Pose
+
+    def beside(self, left_m: float, ahead_m: float) -> tuple[float, float]:
+        """Return the point `left_m` to its left and `ahead_m` ahead of it, metres."""
+        cos, sin = math.cos(self.pose.heading_rad), math.sin(self.pose.heading_rad)
+        return (
+            self.pose.x_m - left_m * sin + ahead_m * cos,
+            self.pose.y_m + left_m * cos + ahead_m * sin,
+        )
+
+
+class Spots:
+    """Entry spots every `step_m` along lines, computed per line on demand."""
+
+    def __init__(self, lines: Iterable[tuple[str, Floats, float, float]], step_m: float) -> None:
+        """Index the lines: edge id, points (N, 2), and margins without spots at the start and
+        end, metres."""
+        self._lines = list(lines)
+        self._step_m = step_m
+        self._made: dict[int, tuple[Floats, Floats]] = {}
+        points = [line for _, line, _, _ in self._lines]
+        starts = np.cumsum([0, *map(len, points)])[:-1]
+        if points:
+            whole = np.concatenate(points)
+            self._low = np.minimum.reduceat(whole, starts)
+            self._high = np.maximum.reduceat(whole, starts)
+
+    def ring(self, x_m: float, y_m: float, low_m: float, high_m: float) -> list[tuple[int, int]]:
+        """Return the spots at a distance in [low_m, high_m), as pairs of line index and spot
+        index."""
+        if not self._lines:
+            return []
+        gap_m = np.maximum(np.maximum(self._low - (x_m, y_m), (x_m, y_m) - self._high), 0.0)
+        lines = np.flatnonzero((gap_m * gap_m).sum(axis=1) <= high_m * high_m + 1.0)
+        poses = [self._on(number)[1] for number in lines.tolist()]
+        numbers = np.repeat(lines, [len(on) for on in poses])
+        places = np.concatenate([np.arange(len(on)) for on in poses] or [numbers])
+        gap = np.concatenate([on[:, :2] for on in poses] or [np.zeros((0, 2))]) - (x_m, y_m)
+        here = ((gap * gap).sum(axis=1) <= high_m * high_m) & (
+            np.hypot(gap[:, 0], gap[:, 1]) >= low_m
+        )
+        return list(zip(numbers[here].tolist(), places[here].tolist(), strict=True))
+
+    def __getitem__(self, spot: tuple[int, int]) -> EntrySpot:
+        number, k = spot
+        shares, poses = self._on(number)
+        return EntrySpot(self._lines[number][0], float(shares[k]), Pose(*poses[k].tolist()))
+
+    def _on(self, number: int) -> tuple[Floats, Floats]:
+        """Return the shares (N,) and poses (N, 3) of the spots of a line."""
+        if number not in self._made:
+            _, xy, start_m, end_m = self._lines[number]
+            line = Polyline(xy)
+            s = np.arange(start_m, line.length_m - end_m, self._step_m)
+            x, y = (np.interp([s - 0.1, s, s + 0.1], line.s_m, line.points[:, k]) for k in (0, 1))
+            poses = np.column_stack([x[1], y[1], np.arctan2(y[2] - y[0], x[2] - x[0])])
+            self._made[number] = s / line.length_m, poses
+        return self._made[number]

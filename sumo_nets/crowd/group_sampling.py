@@ -1,12 +1,11 @@
-"""Groups: who enters the street together, how old they are, how fast they walk, how they stand
-beside each other.
+"""Group sampling: sizes, ages, speeds and formations of the groups that enter the street.
 
-Sources. Sizes, speeds, places: Moussaid, Perozo, Garnier, Helbing, Theraulaz, The walking behaviour
-of pedestrian social groups and its impact on crowd dynamics, PLoS ONE 5(4): e10047, 2010: up to 70
-% of people walk in groups, side by side about 0.8 m apart, and each further member costs 0.04 m/s
-(at low density). Ages: Gates, Noyce, Bill, Van Ee, Recommended walking speeds for timing of
-pedestrian clearance intervals, Transp. Res. Rec. 1982, 2006: people over 65 walk 1.16 m/s on the
-mean, 0.92 m/s at the 15th percentile, and children with adults like them.
+Sources. Sizes, speeds and formations: Moussaid, Perozo, Garnier, Helbing, Theraulaz, The walking
+behaviour of pedestrian social groups and its impact on crowd dynamics, PLoS ONE 5(4): e10047, 2010.
+Up to 70 % of people walk in groups, side by side about 0.8 m apart. Each further member costs 0.04
+m/s at low density. Ages: Gates, Noyce, Bill, Van Ee, Recommended walking speeds for timing of
+pedestrian clearance intervals, Transp. Res. Rec. 1982, 2006. People over 65 walk 1.16 m/s on
+average, 0.92 m/s at the 15th percentile; adults with children are similar.
 """
 
 from __future__ import annotations
@@ -20,33 +19,34 @@ from cosim.core.state import Age
 from cosim.spec.scenario import CrowdSpec
 
 PERSON_MPS: Final = (1.1, 1.65)
+"""Range of walking speeds of adults, m/s."""
 SLOWEST_GROUP_MPS: Final = (0.8, 1.1)
-"""Elderly people and children with their adults: those of them who walk outside PERSON_MPS."""
+"""Range of walking speeds of elderly people and of adults with children, m/s."""
 
 SLOWER_MPS: Final = 0.04
-"""How much slower a group walks for each further member, but not below the slowest of its kind."""
+"""Speed reduction of a group per further member, m/s, limited by the slowest speed of its kind."""
 
 TRIO_SHARE: Final = 0.25
-"""Of groups, how many are of three. Moussaid's counts fall with the size as a Poisson distribution
-does."""
+"""Share of groups with three members; Moussaid's group sizes follow a Poisson distribution."""
 
 GROUP_STRIPE_M: Final = 0.64
-"""How far beside each other people walk: a stripe of SUMO's. On narrower ways some walk behind,
-ROW_M."""
+"""Lateral spacing of a group, metres: one SUMO stripe. On narrow ways members form several rows."""
 
 ROW_M: Final = 0.8
+"""Distance between the rows of a group, metres."""
 
 
 CHILDREN_SHARE = 0.10
+"""Share of children where the spec sets no ages."""
 ELDERLY_SHARE = 0.12
-"""Of those whose ages nobody asked for."""
+"""Share of elderly people where the spec sets no ages."""
 
 _ANY_AGES: Final = (1.0 - CHILDREN_SHARE - ELDERLY_SHARE, 1.0 - ELDERLY_SHARE)
-"""Up to where draws from 0 to 1 are adults, and children."""
+"""Upper limits of a uniform draw for adults and for children."""
 
 
 class PersonGroup(NamedTuple):
-    """Those who enter together, one or more. ages: of each."""
+    """One or more persons that enter together, with their ages."""
 
     ages: tuple[Age, ...]
     pace_mps: tuple[float, float] = PERSON_MPS
@@ -56,16 +56,16 @@ class PersonGroup(NamedTuple):
         return len(self.ages)
 
     def walks_at(self, drawn_mps: float) -> float:
-        """Its speed, if somebody alone would walk at `drawn_mps`."""
+        """Return the group's speed if a single person would walk at `drawn_mps`."""
         return max(drawn_mps - SLOWER_MPS * (self.size - 1), self.pace_mps[0])
 
     def abreast(self, width_m: float) -> int:
-        """How many of it walk beside each other on a way so wide."""
+        """Return how many members walk side by side on a way of this width."""
         return max(min(self.size, int(width_m / GROUP_STRIPE_M + 1e-6)), 1)
 
     def places(self, width_m: float) -> list[tuple[float, float]]:
-        """How far to the left of its middle, and how far behind its front, each walks on a way so
-        wide, in metres."""
+        """Return each member's offset to the left of the group's middle and behind its front,
+        metres."""
         abreast = self.abreast(width_m)
         rows = [min(abreast, self.size - first) for first in range(0, self.size, abreast)]
         return [
@@ -76,11 +76,12 @@ class PersonGroup(NamedTuple):
 
 
 class GroupDraws:
-    """Draws who comes next, so that in the long run the shares of persons are those of the spec.
+    """Random sequence of groups whose long-run shares of persons match the spec.
 
-    Half of the children's families are children: one of two; one or two of three. coming: who
-    enters next; it stays the same until it has entered, or big groups, which find room less often,
-    would be too few.
+    Half of the members of families are children: one of two, one or two of three.
+
+    coming: the next group. It stays the same until it has entered; otherwise large groups, which
+        find room less often, would be too rare.
     """
 
     def __init__(self, spec: CrowdSpec, rng: np.random.Generator) -> None:
@@ -96,7 +97,7 @@ class GroupDraws:
         self.coming = self._draw()
 
     def entered(self) -> None:
-        """Who was coming is there: the next, please."""
+        """Draw the next group."""
         self.coming = self._draw()
 
     def _draw(self) -> PersonGroup:
@@ -116,7 +117,7 @@ class GroupDraws:
         return PersonGroup((Age.ADULT,) * size)
 
     def _any_ages(self, size: int) -> tuple[Age, ...]:
-        """How old they look where the spec asks for no ages; all walk alike."""
+        """Draw ages where the spec sets none; they do not affect walking."""
         return tuple(
             [Age(bisect(_ANY_AGES, draw)) for draw in self._rng_ages.random(size).tolist()]
         )

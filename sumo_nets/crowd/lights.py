@@ -1,4 +1,4 @@
-"""Signals: what the crosswalk signals near the robot show, and when that changes."""
+"""Crosswalk signals near the robot, and waiting positions of pedestrians at red."""
 
 from __future__ import annotations
 
@@ -8,18 +8,21 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 import numpy as np
+import shapely
 
+from cosim.core.geometry import Floats
 from cosim.core.state import Signal
-from cosim.place.street_map import SignalPlan, StreetMap
+from cosim.place import overlay
+from cosim.place.street_map import Lane, SignalPlan, StreetMap
 
-if TYPE_CHECKING:  # who shows planned lights does without SUMO
+if TYPE_CHECKING:  # planned lights do not need SUMO
     from sumo_nets.engine import Sumo
 
 _NEAR_M = 80.0
-"""The signals of crossings within this distance of the robot are shown."""
+"""Signals of crossings within this distance of the robot are shown, metres."""
 
 RESELECT_M = 5.0
-"""How far the robot moves before the near crossings are looked up again."""
+"""Distance that the robot moves before the near crossings are selected again, metres."""
 
 _WALK = "Gg"
 
@@ -27,8 +30,12 @@ _MS: Final = 1000
 
 
 class Showing(NamedTuple):
-    """What a signal shows: whether one may walk, the time at which that changes, None for unknown
-    or never, and the time until which this holds, in seconds of SUMO's time."""
+    """State of a signal.
+
+    walk: whether walking is permitted.
+    change_s: SUMO time at which `walk` changes, None for unknown or never.
+    until_s: SUMO time until which this state is valid.
+    """
 
     walk: bool
     change_s: float | None
@@ -36,24 +43,24 @@ class Showing(NamedTuple):
 
 
 class Lights(Protocol):
-    """Tells what signals show. crossings: those that have one."""
+    """Source of signal states. crossings: ids of the signalised crossings."""
 
     crossings: Collection[str]
 
     def now_s(self) -> float:
-        """SUMO's time."""
+        """Return SUMO's time, seconds."""
 
     def showing(self, crossing: str) -> Showing:
-        """What a crossing's signal shows now."""
+        """Return the current state of a crossing's signal."""
 
 
 class Signals:
-    """The signals of all crossings; their lights are asked once per switch."""
+    """The signals of all crossings; each state is queried once per switch."""
 
     def __init__(self, lights: Lights, street_map: StreetMap) -> None:
         self._lights = lights
         self._ids = sorted(lights.crossings)
-        self._lit = frozenset(self._ids)
+        self._signalised = frozenset(self._ids)
         middles = [street_map.strips[i].line.mean(axis=0) for i in self._ids]
         self._xy = np.array(middles, dtype=float).reshape(-1, 2)
         self._shown: dict[str, Showing] = {}
@@ -61,7 +68,7 @@ class Signals:
         self._near: list[str] = []
 
     def near(self, x_m: float, y_m: float) -> Mapping[str, Signal]:
-        """The signals within NEAR_M (up to RESELECT_M more or less) of a point, now."""
+        """Return the current signals within about _NEAR_M of a point."""
         if (
             self._centre is None
             or np.hypot(x_m - self._centre[0], y_m - self._centre[1]) > RESELECT_M
@@ -81,16 +88,16 @@ class Signals:
         return MappingProxyType(signals)
 
     def red(self, crossings: Sequence[str]) -> list[int]:
-        """The places in `crossings` of those that have a signal that forbids walking."""
+        """Return the indices of those `crossings` with a signal that forbids walking."""
         now_s = self._lights.now_s()
         return [
             i
             for i, one in enumerate(crossings)
-            if one in self._lit and not self._state(one, now_s).walk
+            if one in self._signalised and not self._state(one, now_s).walk
         ]
 
     def is_red(self, crossing: str) -> bool:
-        """Whether a crossing has a signal and it forbids walking."""
+        """Return whether a crossing has a signal that forbids walking."""
         return bool(self.red([crossing]))
 
     def _state(self, crossing: str, now_s: float) -> Showing:
@@ -101,8 +108,11 @@ class Signals:
 
 
 class PlannedLights:
-    """The signals of a map whose plans tell all of them: what SUMO would show, without it. begin_s:
-    when SUMO would have been started; `now_ms` is set to its time."""
+    """Signal states computed from plans, equal to SUMO's.
+
+    begin_s: SUMO's start time, seconds.
+    now_ms: SUMO's current time, milliseconds, set by the caller.
+    """
 
     def __init__(self, street_map: StreetMap, begin_s: int) -> None:
         self._strips = street_map.strips
@@ -115,8 +125,11 @@ class PlannedLights:
         return self.now_ms / _MS
 
     def showing(self, crossing: str) -> Showing:
-        """SUMO switches within the step that begins with or before the moment of it, so that the
-        moment itself still shows what was before."""
+        """Return the current state of a crossing's signal.
+
+        SUMO switches at the end of a step, so at the exact switching time the previous state is
+        still shown.
+        """
         plan: SignalPlan | None = self._strips[crossing].plan
         assert plan is not None, crossing
         ends_ms = list(itertools.accumulate(plan.durations_ms))
@@ -132,7 +145,7 @@ class PlannedLights:
 
 
 class SumoLights:
-    """The signals that SUMO simulates; programs are read once."""
+    """Signal states read from SUMO; programs are read once."""
 
     def __init__(self, engine: Sumo, street_map: StreetMap) -> None:
         self._engine = engine
@@ -172,7 +185,7 @@ class SumoLights:
         return None
 
     def _program(self, light: str) -> tuple[tuple[float, str], ...] | None:
-        """Durations and states of a static program; None for one that decides while it runs."""
+        """Return durations and states of a static program; None for an adaptive one."""
         if light not in self._phases:
             traffic_light = self._engine.trafficlight
             name = traffic_light.getProgram(light)
@@ -182,3 +195,98 @@ class SumoLights:
                 tuple((p.duration, p.state) for p in logic.phases) if static else None
             )
         return self._phases[light]
+
+
+_CURB_ROOM_M: Final = 0.3
+"""Distance of waiting pedestrians from the road, metres."""
+_CACHED_SPOTS: Final = 4096
+"""Largest number of cached waiting positions."""
+
+_Key = tuple[str, float, float]
+"""A crossing id and the position x, y in metres of a person before it."""
+
+
+class Kerbs:
+    """Waiting positions at the kerbs of a map, computed on demand.
+
+    SUMO lets people wait at the end of a crossing. Where a crossing meets its corner at an angle,
+    that end may lie on the road. Displayed people wait on the corner instead, at a shoulder's
+    distance from the road.
+    """
+
+    def __init__(self, street_map: StreetMap) -> None:
+        self._map = street_map
+        self._ends: dict[str, tuple[list[str], list[shapely.Geometry | None]]] = {}
+        self._ground: dict[str, shapely.Geometry] = {}
+        self._spots: dict[_Key, tuple[float, float]] = {}
+
+    def behind(self, crossings: Sequence[str], xy: Floats) -> Floats:
+        """Return the nearest waiting positions (N, 2) before `crossings` (N,) for positions `xy`
+        (N, 2), metres."""
+        if len(self._spots) > _CACHED_SPOTS:
+            self._spots.clear()
+        keys = [
+            (crossing, x_m, y_m)
+            for crossing, (x_m, y_m) in zip(crossings, xy.tolist(), strict=True)
+        ]
+        if new := [key for key in keys if key not in self._spots]:
+            self._find(new)
+        return np.array([self._spots[key] for key in keys]).reshape(-1, 2)
+
+    def _find(self, new: list[_Key]) -> None:
+        """Compute waiting positions that are not in the cache."""
+        xy = np.array([key[1:] for key in new])
+        ends = [self._corners(crossing) for crossing, _, _ in new]
+        outlines = np.array([outline for _, outline in ends], dtype=object)
+        # Most people are on a corner, which GEOS tests much faster than it computes distances.
+        on = shapely.intersects_xy(outlines, xy[:, :1], xy[:, 1:])
+        away_m = np.where(on, 0.0, 1.0)
+        off = ~on.any(axis=1)
+        if off.any():
+            away_m[off] = shapely.distance(
+                outlines[off], np.array(shapely.points(xy[off]))[:, None]
+            )
+        last = (away_m[:, 1] < away_m[:, 0]).tolist()
+        grounds = [
+            self._standing(corners[k]) if corners else None
+            for (corners, _), k in zip(ends, last, strict=True)
+        ]
+        ground = np.array(grounds, dtype=object)
+        aside = ~(
+            shapely.contains_xy(ground, *xy.T)
+            | shapely.is_missing(ground)
+            | shapely.is_empty(ground)
+        )
+        if aside.any():
+            ways = shapely.shortest_line(shapely.points(xy[aside]), ground[aside])
+            xy[aside] = shapely.get_coordinates(ways)[1::2]
+        self._spots.update(zip(new, map(tuple, xy.tolist()), strict=True))
+
+    def _corners(self, crossing: str) -> tuple[list[str], list[shapely.Geometry | None]]:
+        """Return the corners at the ends of a crossing and two outlines, None without a corner."""
+        if crossing not in self._ends:
+            corners = [
+                corner for corner in self._map.strips[crossing].corners if corner is not None
+            ]
+            outlines: list[shapely.Geometry] = [
+                self._map.corners[corner].polygon for corner in corners
+            ]
+            shapely.prepare(outlines)
+            self._ends[crossing] = corners, [*outlines, None, None][:2]
+        return self._ends[crossing]
+
+    def _standing(self, corner: str) -> shapely.Geometry:
+        """Return a corner without its crossings and roads, shrunk by _CURB_ROOM_M."""
+        if corner not in self._ground:
+            polygon = self._map.corners[corner].polygon
+            taken = [s.polygon for s in self._map.near("strip", polygon) if s.id.startswith(":")]
+            taken += [
+                s.polygon
+                for s in self._map.near("lane", polygon)
+                if isinstance(s, Lane) and s.kind == "road"
+            ]
+            free = overlay.difference(polygon, overlay.union_all(taken)) if taken else polygon
+            ground = shapely.buffer(free, -_CURB_ROOM_M)
+            shapely.prepare(ground)
+            self._ground[corner] = ground
+        return self._ground[corner]

@@ -1,4 +1,8 @@
-"""Proxies: how SUMO's persons and vehicles perceive the robot and the event pedestrians."""
+"""Proxies of the robot and the event pedestrians in SUMO.
+
+SUMO's persons and vehicles react to a proxy only if SUMO assigns its position to the lanes of its
+walk. Most of this module chooses walks and positions for which that holds.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +22,7 @@ if TYPE_CHECKING:
 
 
 class SidewalkLead:
-    """By how much sidewalks are nearer than other lanes. internal: the edges inside each
+    """Distances by which a sidewalk is nearer than other lanes. internal: edges inside each
     junction."""
 
     def __init__(self, engine: Sumo, internal: Mapping[str, Iterable[str]]) -> None:
@@ -27,10 +31,12 @@ class SidewalkLead:
         self._lines: dict[tuple[str, str], tuple[shapely.Geometry, shapely.Geometry]] = {}
 
     def metres(self, first: str, second: str, x_m: float, y_m: float) -> float:
-        """By how much a point in the sidewalk `first` is nearer to it than to any other lane that
-        SUMO may compare, for a proxy whose walk is `first` and then `second`, or by twice how far
-        it is from its sides if that is less. Negative where another lane is nearer; it changes by 2
-        m at most from a point to the next in 1 m.
+        """Return by how much `first` is nearer to a point on it than any other lane that SUMO
+        compares, metres.
+
+        The walk is `first`, then `second`. The result is at most twice the distance to the
+        sidewalk's sides, and negative where another lane is nearer. It changes by at most 2 m per
+        metre.
         """
         if (first, second) not in self._lines:
             inside = self._internal.get(self._engine.edge.getToJunction(first), ())
@@ -47,7 +53,7 @@ class SidewalkLead:
         )
 
     def _of(self, edge: str) -> list[LineString]:
-        """The lines of an edge's lanes, the sidewalk's first."""
+        """Return the lines of an edge's lanes, the sidewalk first."""
         lanes = [f"{edge}_{k}" for k in range(self._engine.edge.getLaneNumber(edge))]
         return [
             LineString([point[:2] for point in self._engine.lane.getShape(lane)]) for lane in lanes
@@ -55,30 +61,31 @@ class SidewalkLead:
 
 
 KEEP_ROUTE = 3
-"""moveToXY: keep the walk, may leave the network. The only mode that neither crashes nor clamps."""
+"""Mode of moveToXY: keep the walk, may leave the network. Other modes crash or clamp the
+position."""
 
 KEEP_ROUTE_ON_ROAD = 7
-"""The same with car lanes allowed: cars stop for somebody on the carriageway."""
+"""The same mode with car lanes allowed: cars stop for a proxy on the road."""
 
 MATCH_M = 100.0
+"""Largest distance of moveToXY's match, metres."""
 ROUND_THE_CORNER_M = 2.0
-"""Beyond its width, how near to the end of a sidewalk SUMO may take a proxy to be round the
-corner."""
+"""SUMO may assign a proxy to the corner within this distance plus the width of a sidewalk's end,
+metres."""
 
 NEARER_M = 0.01
-"""By how much the lines of its own place must be nearer to a proxy than those of others."""
+"""The lines of a proxy's own place must be nearer than others by this distance, metres."""
 
 _ROUNDING_M: Final = 0.001
-"""Distances hold but for this."""
+"""Tolerance of distances, metres."""
 
 NUDGES = (0.0, 0.1, 0.2, 0.4, 0.7, 0.98)
-"""Shares of the way to its own place's lines by which a proxy is moved to be nearer to them than to
-others."""
+"""Relative displacements tried to bring a proxy nearer to its own place than to others."""
 
 
 class Walk(NamedTuple):
-    """A walk of a proxy: from sidewalk `first` to sidewalk `second`, over the place `around` where
-    they meet."""
+    """Walk of a proxy from sidewalk `first` to sidewalk `second` across their meeting place
+    `around`."""
 
     around: str
     first: str
@@ -86,11 +93,11 @@ class Walk(NamedTuple):
 
 
 class Walks:
-    """Chooses a proxy's walk from where it is and where it heads.
+    """Chooses a proxy's walk from its position and heading.
 
     A meeting place is named by the first of the corners that crossings of one junction join, or by
-    the junction where there is no corner. Sidewalks of one junction that do not meet make a walk
-    that crashes SUMO.
+    the junction without a corner. A walk between sidewalks of one junction that do not meet crashes
+    SUMO.
     """
 
     def __init__(self, engine: Sumo, street_map: StreetMap) -> None:
@@ -117,7 +124,7 @@ class Walks:
                             self._into.setdefault(place, []).append(strip.id)
 
     def serves(self, walk: Walk, edge: str, pose: Pose) -> bool:
-        """Whether SUMO sees a proxy on `edge` when it has `walk`."""
+        """Return whether SUMO recognises a proxy on `edge` with this walk."""
         if edge.startswith(":"):
             best = self.choose(edge, pose)
             return best == walk or (
@@ -129,7 +136,7 @@ class Walks:
         return walk.first == edge and walk.around == self._ahead(edge, pose)
 
     def choose(self, edge: str, pose: Pose) -> Walk | None:
-        """A walk on which SUMO sees a proxy on `edge`; None where there is none."""
+        """Return a walk with which SUMO recognises a proxy on `edge`, or None."""
         if edge.startswith(":"):
             if edge not in self._best:
                 around = self._inside(edge)
@@ -140,11 +147,11 @@ class Walks:
         return None
 
     def seen_at(self, walk: Walk, x_m: float, y_m: float) -> tuple[float, float] | None:
-        """The place nearest to a point, in metres, at which SUMO can see a proxy with a walk; None
-        without any.
+        """Return the nearest position at which SUMO recognises a proxy with a walk, metres, or
+        None.
 
-        Where the corners of a junction are not joined by crossings, SUMO may take a proxy on one to
-        be on another.
+        At junctions whose corners are not joined by crossings, SUMO may assign a proxy to the wrong
+        corner.
         """
         if walk not in self._lines:
             self._lines[walk] = self._own_and_others(walk)
@@ -162,14 +169,13 @@ class Walks:
         return None
 
     def _own_and_others(self, walk: Walk) -> tuple[shapely.Geometry, shapely.Geometry] | None:
-        """The lines that SUMO compares with a proxy's position: of its walk and place, of the
-        junction's other places.
+        """Return the lines of the walk and its place, and those of the junction's other places.
 
-        None where there are no others.
+        Returns None without other places.
         """
-        inner = [
-            edge for edge in self._internal.get(self._ends[walk.first][1], []) if _is_walkable(edge)
-        ]
+        inside = self._internal.get(self._ends[walk.first][1], [])
+        # Ids of walking areas end in "_w" and a number, those of crossings in "_c" and a number.
+        inner = [edge for edge in inside if edge.rsplit("_", 1)[1][0] in "wc"]
         others = [piece for piece in inner if self._place.get(piece) != walk.around]
         if not others:
             return None
@@ -183,8 +189,8 @@ class Walks:
         )
 
     def _pair(self, around: str, firsts: list[str], edge: str) -> Walk | None:
-        """The walk that touches most corners of `edge`, if possible not from one side of a street
-        to its other."""
+        """Return the walk that touches most corners of `edge`, preferably on one side of the
+        street."""
         walks = [
             Walk(around, first, to)
             for first in firsts
@@ -201,8 +207,8 @@ class Walks:
         )
 
     def _touched(self, walk: Walk, edge: str) -> int:
-        """How many corners of a corner or crossing the walk's sidewalks touch: SUMO looks for its
-        path there."""
+        """Return how many corners of an edge the walk's sidewalks touch; SUMO searches its path
+        there."""
         if (walk, edge) not in self._touches:
             strips = self.street_map.strips
             corners = strips[edge].corners if edge in strips else (edge,)
@@ -214,7 +220,8 @@ class Walks:
         return self._touches[walk, edge]
 
     def _inside(self, edge: str) -> str:
-        """The meeting place of a corner or crossing; the junction of any other edge inside one."""
+        """Return the meeting place of a corner or crossing, or the junction of another internal
+        edge."""
         return self._place.get(edge) or junction_of(edge)
 
     def _meeting(self, strip: str, end: int) -> str:
@@ -222,10 +229,10 @@ class Walks:
         return self._ends[strip][end] if corner is None else self._place[corner]
 
     def _ahead(self, edge: str, pose: Pose) -> str:
-        """The meeting place at the end of a sidewalk that a pose heads to.
+        """Return the meeting place at the end of a sidewalk that a pose heads to.
 
-        Near the end where the edge ends it is always that one: SUMO may map a proxy there to the
-        walking area, and crashes when its walk turns away from it.
+        Close to the edge's end it is always that end: SUMO may assign a proxy there to the walking
+        area, and crashes if its walk turns away.
         """
         if edge not in self._chords:
             strip = self.street_map.strips[edge]
@@ -239,8 +246,8 @@ class Walks:
 
 
 class Proxy:
-    """The stand-in of one body. `base` starts the names of the SUMO persons it uses, one after
-    another."""
+    """SUMO person that represents one body. base: prefix of the names of its successive SUMO
+    persons."""
 
     def __init__(
         self, engine: Sumo, walks: Walks, *, base: str, kind: str, serial: Iterator[int]
@@ -259,8 +266,8 @@ class Proxy:
         self._leads = False
 
     def update(self, pose: Pose) -> None:
-        """Put it at a pose. To be called before every step of the simulation, or it walks on by
-        itself."""
+        """Move the proxy to a pose. Required before every simulation step; otherwise SUMO lets
+        it walk on."""
         x_m, y_m, heading_rad = pose
         place = self._locate(x_m, y_m)
         walk = self._walk
@@ -288,7 +295,7 @@ class Proxy:
             )
 
     def remove(self) -> None:
-        """Take it out of the simulation."""
+        """Remove the proxy from the simulation."""
         if self._name is not None and self._name in self._engine.person.getIDList():
             self._engine.person.remove(self._name)
         self._name = self._walk = None
@@ -302,8 +309,7 @@ class Proxy:
         person.appendWalkingStage(self._name, [walk.first, walk.second], lengths[1] / 2)
 
     def _is_on_sidewalk(self, walk: Walk, place: Located, x_m: float, y_m: float) -> bool:
-        """Whether SUMO will take it to be on the sidewalk where its walk begins, whichever lanes it
-        compares."""
+        """Return whether SUMO will assign the proxy to the first sidewalk of its walk."""
         if place.edge != walk.first or self._inside.radius_m == 0.0:
             return False
         if walk != self._walk or not self._compared.holds(x_m, y_m):
@@ -313,8 +319,7 @@ class Proxy:
         return self._leads
 
     def _locate(self, x_m: float, y_m: float) -> Located:
-        """The map's `locate`, asked again only when the body has left the walkable piece where it
-        was."""
+        """Locate a position on the map; cached while the body is on the same walkable piece."""
         if self._inside.holds(x_m, y_m):
             return self._place
         if self._piece is None or not shapely.contains_xy(self._piece, x_m, y_m):
@@ -336,13 +341,12 @@ class Proxy:
 
 
 def junction_of(internal: str) -> str:
-    """The junction of a walking area, crossing or internal edge: "a_b" of ":a_b_w0"."""
+    """Return the junction of an internal edge: "a_b" of ":a_b_w0"."""
     return internal[1:].rsplit("_", 1)[0]
 
 
 def _by_junction(edges: Iterable[str]) -> dict[str, list[str]]:
-    """Junction -> the edges inside it, walking areas and crossings included that are too small for
-    the map."""
+    """Group internal edges by junction, including those too small for the map."""
     inside: dict[str, list[str]] = {}
     for edge in edges:
         if edge.startswith(":"):
@@ -350,20 +354,14 @@ def _by_junction(edges: Iterable[str]) -> dict[str, list[str]]:
     return inside
 
 
-def _is_walkable(internal: str) -> bool:
-    """Whether an edge inside a junction is a walking area or crossing."""
-    return internal.rsplit("_", 1)[1][0] in "wc"
-
-
 def _line(engine: Sumo, edge: str) -> shapely.Geometry:
-    """What SUMO measures distances to: the middle line of an edge, the outline, left open, of a
-    walking area."""
+    """Return the line that SUMO measures distances to: an edge's middle line, or a walking
+    area's open outline."""
     return LineString([point[:2] for point in engine.lane.getShape(f"{edge}_0")])
 
 
 def _meeting_places(street_map: StreetMap) -> dict[str, str]:
-    """Corner or crossing id -> id of the first of the corners that it is joined with by
-    crossings."""
+    """Map each corner and crossing to the first of the corners that crossings join with it."""
     crossings = [
         strip
         for strip in street_map.strips.values()

@@ -13,11 +13,10 @@ from cosim.people.steering import SHOULDER_TO_SHOULDER_M
 
 
 def pairs_within(xy: Floats, reach_m: float) -> NDArray[np.intp]:
-    """(P, 2) numbers of those of (N, 2) points that are no farther apart, the lower number
-    first."""
+    """Return the index pairs (P, 2) of points (N, 2) within `reach_m`, the lower index first."""
     order = np.argsort(xy[:, 0], kind="stable")
     x_m = xy[order, 0]
-    # Along x everybody's neighbours follow it: how many do, and which.
+    # In the order of x, candidates follow each point: count them, then list them.
     ahead = np.searchsorted(x_m, x_m + 1.001 * reach_m, side="right") - np.arange(1, len(xy) + 1)
     one = np.repeat(np.arange(len(xy)), ahead)
     other = one + 1 + np.arange(len(one)) - np.repeat(np.cumsum(ahead) - ahead, ahead)
@@ -27,50 +26,50 @@ def pairs_within(xy: Floats, reach_m: float) -> NDArray[np.intp]:
 
 
 SHOULDERS_M: Final = SHOULDER_TO_SHOULDER_M
-"""Least distance of the middles of two people: shoulders touch. SUMO's queues, 0.465 m apart, stay
-as they are."""
+"""Smallest distance between the middles of two people, metres: shoulders touch. SUMO's queues,
+0.465 m apart, are unchanged."""
 
 _NEAR_M: Final = 0.6
-"""Pairs nearer than this are looked at: some of them come nearer by giving way to others."""
+"""Pairs within this distance are processed, since giving way may bring them closer, metres."""
 
 _MARGIN_M: Final = 1.0
-"""Who may come near is looked for so much farther out, and anew when somebody has moved half of
-it."""
+"""Additional search distance for near pairs, metres; the search is repeated after half of it."""
 
 ROUNDS: Final = 8
-"""One gives way to several in turn, at most so often."""
+"""Largest number of rounds of pushes."""
 
 ENOUGH_M: Final = 0.01
+"""Rounds end when the largest overlap is smaller, metres."""
 BENDS: Final = 2
-"""In the first rounds pushes bend aside."""
+"""Number of first rounds in which pushes are bent aside."""
 
 BEND: Final = 0.6
-"""Way to the side, as a share of the way back, where two walk at each other."""
+"""Sideways share of a push between two people who walk towards each other."""
 
 STIRS_M: Final = 0.002
-"""Nobody who stands moves in order to get nearer by less."""
+"""A standing person moves only if it gets closer to its goal by this distance, metres."""
 
 Rows = NDArray[np.intp]
 Complex = NDArray[np.complex128]
-"""Points of the plane, x + iy in metres: turning and measuring are single operations."""
+"""Points of the plane, x + iy in metres, for rotations and distances in single operations."""
 
 
 @dataclass(slots=True)
 class NearPairs:
-    """Finds who is near whom, moment by moment, and remembers who may be soon."""
+    """Finds near pairs of people, with a cache of candidates from step to step."""
 
     _at: Complex = field(default_factory=lambda: np.zeros(0, dtype=np.complex128))
     _one: Rows = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     _other: Rows = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
 
     def of(self, at: Complex, firm: NDArray[np.bool_]) -> tuple[Rows, Rows]:
-        """Numbers of those who are near each other, two arrays (P,), in order; none where nobody is
-        too near.
+        """Return the indices of near pairs, two arrays (P,) in order; empty if no pair is too near.
 
-        at, firm: (N,) where they are, and who does not give way.
+        at: (N,) positions.
+        firm: (N,) whether a person does not give way.
         """
         if len(at) != len(self._at) or np.abs(at - self._at).max(initial=0.0) > 0.49 * _MARGIN_M:
-            self._look(at)
+            self._search(at)
         gap = at[self._one] - at[self._other]
         far_m2 = gap.real * gap.real + gap.imag * gap.imag
         close = far_m2 < SHOULDERS_M * SHOULDERS_M
@@ -82,7 +81,7 @@ class NearPairs:
                 return one[moves], other[moves]
         return self._one[:0], self._other[:0]
 
-    def _look(self, at: Complex) -> None:
+    def _search(self, at: Complex) -> None:
         pairs = pairs_within(np.column_stack([at.real, at.imag]), _NEAR_M + _MARGIN_M)
         self._one, self._other = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].T.copy()
         self._at = at
@@ -96,11 +95,14 @@ def kept_apart(
     stand: NDArray[np.bool_] | None = None,
     near: NearPairs | None = None,
 ) -> Floats:
-    """Where people go who want to go from `before` to `wanted`, (N, 2) metres each.
+    """Return positions (N, 2) close to `wanted` at which people do not overlap, metres.
 
-    firm (N,): who does not give way. reach_m: the farthest that anybody goes in this step. stand
-    (N,): who wants to stand, and stays where it is rather than go somewhere that is no nearer to
-    where it wants to stand. near: what remembers, from step to step, who may come near whom.
+    before, wanted: (N, 2) current and wanted positions, metres.
+    firm: (N,) whether a person does not give way.
+    reach_m: largest step, metres.
+    stand: (N,) whether a person wants to stand; it does not move unless that brings it closer to
+        its goal.
+    near: cache of near pairs between steps.
     """
     goal = _points(wanted)
     one, other = (near or NearPairs()).of(goal, firm)
@@ -128,18 +130,17 @@ def _pushed(
     before: Complex,
     bend: Complex | None,
 ) -> Complex:
-    """Where people end up who are at `at` (N,) and give way to each other by `shares` (P,) of what
-    is lacking.
+    """Push apart people at `at` (N,), each by its share of `shares` (P,) of the overlap.
 
-    before (P,): from the first of each pair to the second at the beginning of the step. bend: see
-    `_bend`; None where nobody turns aside.
+    before: (P,) vectors from first to second of each pair at the start of the step.
+    bend: see `_bend`; None for straight pushes.
     """
     at = at.copy()
     for k in range(ROUNDS):
         apart = at[other] - at[one]
         far = np.abs(apart)
         if not (far > 1e-6).all():
-            # Two at one place part along the line on which they came.
+            # Two people at one position separate along their previous offset.
             apart = np.where(far > 1e-6, apart, np.where(np.abs(before) > 1e-6, before, 1.0 + 0j))
         lost = np.maximum(SHOULDERS_M - far, 0.0)
         push = lost * apart / np.abs(apart)
@@ -158,8 +159,8 @@ def _points(xy: Floats) -> Complex:
 
 
 def _bend(apart: Complex, step: Complex) -> Complex:
-    """(K,) by what a push is turned aside: to the side on which a step passes; not where the step
-    leads away."""
+    """Return factors (K,) that turn pushes towards the passing side, 1 for pairs that move
+    apart."""
     turned = apart.conj() * step
     side = np.where(turned.imag >= 0.0, 1.0, -1.0)
     return np.where(turned.real < 0.0, 1.0 + 1j * BEND * side, 1.0 + 0j)

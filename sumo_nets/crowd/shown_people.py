@@ -1,26 +1,138 @@
-"""Everybody in a street, as it is shown: the crowd that SUMO moves and the people who are put where
-they are."""
+"""Displayed pedestrians: filtered poses of SUMO's crowd, and event pedestrians."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.core.errors import EngineError
-from cosim.core.geometry import Floats
-from cosim.core.state import Age, Doing, People, PersonKind, frozen, write_protected
+from cosim.core.geometry import Floats, wrap_angles
+from cosim.core.state import Age, Doing, People, PersonKind, RowLookup, frozen, write_protected
 from cosim.people.gait import Strides
+from cosim.people.yielding import RobotBody, Standing, comes_too_near, stepped_round
 from cosim.spec.events import Actor
-from sumo_nets.crowd.pose_filter import PERSON_STANDS_MPS
+from sumo_nets.crowd.separation import NearPairs, kept_apart
 
-_NOWHERE: Final = np.zeros((0, 2))
-_NONE: Final = np.zeros(0)
+MAX_SPEED_MPS = 2.2
+"""Largest displayed speed, m/s: above every walking speed, so that people catch up with SUMO."""
+
+MAX_TURN_RADPS = math.pi
+"""Largest displayed turn rate, rad/s."""
+
+LOOK_AHEAD_S = 0.3
+"""Time constant of the motion that the heading follows, seconds; short side steps do not turn
+the body."""
+
+TURNING_SPEED_MPS = 0.3
+"""Below this speed the motion does not change the heading, m/s."""
+
+PERSON_STANDS_MPS = 0.1
+"""Below this speed a SUMO person is standing, m/s."""
+
+_NO_POINTS: Final = np.zeros((0, 2))
+
+
+@dataclass(slots=True)
+class PoseFilter:
+    """Filter of the displayed poses, updated every `period_s` seconds.
+
+    SUMO's striping model moves a person by metres in one step where strips and corners meet, and
+    flips its angle on side steps. The displayed person follows at a limited speed and turn rate,
+    and avoids others and the robot.
+
+    standing: obstacles, besides the robot, that people step around.
+    """
+
+    period_s: float
+    standing: Standing = field(default_factory=Standing)
+    _rows: RowLookup = field(default_factory=RowLookup)
+    _xy: Floats = field(default_factory=lambda: np.zeros((1, 2)))
+    _heading: Floats = field(default_factory=lambda: np.zeros(1))
+    _motion: Floats = field(default_factory=lambda: np.zeros((1, 2)))
+    _near: NearPairs = field(default_factory=NearPairs)
+
+    def update(
+        self,
+        ids: tuple[str, ...],
+        xy: Floats,
+        speed: Floats,
+        facing_of: Callable[[str], float],
+        body: RobotBody | None = None,
+        others: Floats = _NO_POINTS,
+    ) -> tuple[Floats, Floats, Floats]:
+        """Return the displayed positions (N, 2) m, headings (N,) rad and speeds (N,) m/s.
+
+        ids, xy, speed: the simulated people. New ones are displayed as simulated; missing ones are
+            dropped.
+        facing_of: initial heading of a new person, rad.
+        body: the robot, which people step around.
+        others: (K, 2) positions of people that are moved elsewhere, metres.
+        """
+        row, new = self._rows.of(ids)
+        before, facing, motion = self._xy[row], self._heading[row], self._motion[row]
+        if new:
+            before[new] = xy[new]
+            facing[new] = [facing_of(ids[i]) for i in new]
+            motion[new] = speed[new, None] * np.column_stack(
+                [np.cos(facing[new]), np.sin(facing[new])]
+            )
+        simulated = motion[new]
+
+        gap = xy - before
+        distance = np.hypot(gap[:, 0], gap[:, 1])
+        reach_m = MAX_SPEED_MPS * self.period_s
+        shown = before + gap * (reach_m / np.maximum(distance, reach_m))[:, None]
+        stand = speed < PERSON_STANDS_MPS
+        shown = self._separated(before, shown, others, stand)
+        shown = self._around_obstacles(before, shown, body, stand)
+        velocity = (shown - before) / self.period_s
+        velocity[new] = simulated
+        motion = motion + (velocity - motion) * min(self.period_s / LOOK_AHEAD_S, 1.0)
+
+        moving = np.hypot(motion[:, 0], motion[:, 1]) > TURNING_SPEED_MPS
+        aim = np.where(moving, np.arctan2(motion[:, 1], motion[:, 0]), facing)
+        turn_rad = MAX_TURN_RADPS * self.period_s
+        turn = np.minimum(np.maximum(wrap_angles(aim - facing), -turn_rad), turn_rad)
+        facing = wrap_angles(facing + turn)
+
+        if ids:
+            self._xy = shown
+            self._heading = facing
+            self._motion = motion
+        return shown, facing, np.hypot(velocity[:, 0], velocity[:, 1])
+
+    def _around_obstacles(
+        self, before: Floats, shown: Floats, body: RobotBody | None, stand: NDArray[np.bool_]
+    ) -> Floats:
+        """Step around the robot and obstacles; do not move if that would lead into the robot."""
+        if body is None:
+            return self.standing.stepped_round(before, shown, stand)
+        past = stepped_round(before, shown, body, stand)
+        round_both = self.standing.stepped_round(before, past, stand)
+        stays = (round_both != past).any(axis=1) & comes_too_near(before, round_both, body)
+        return np.where(stays[:, None], before, round_both)
+
+    def _separated(
+        self, before: Floats, shown: Floats, others: Floats, stand: NDArray[np.bool_]
+    ) -> Floats:
+        firm = np.arange(len(shown) + len(others)) >= len(shown)
+        stand = np.concatenate([stand, np.zeros(len(others), dtype=bool)])
+        before, wanted = np.concatenate([before, others]), np.concatenate([shown, others])
+        return kept_apart(before, wanted, firm, MAX_SPEED_MPS * self.period_s, stand, self._near)[
+            : len(shown)
+        ]
+
+
+_NO_VALUES: Final = np.zeros(0)
 
 
 class ShownPeople:
-    """Puts crowd and actors into one value, tick after tick of `tick_s`, and counts their
+    """Merges crowd and event pedestrians into one value per tick of `tick_s`, and counts their
     strides."""
 
     def __init__(self, tick_s: float) -> None:
@@ -32,12 +144,16 @@ class ShownPeople:
         cast: list[Actor],
         ages: Mapping[str, Age],
         names: tuple[str, ...] = (),
-        xy: Floats = _NOWHERE,
-        heading: Floats = _NONE,
-        speed: Floats = _NONE,
+        xy: Floats = _NO_POINTS,
+        heading: Floats = _NO_VALUES,
+        speed: Floats = _NO_VALUES,
     ) -> People:
-        """cast: the actors. ages: of the crowd. names, xy (N, 2), heading (N,), speed (N,): its
-        members, in metres, radians and m/s."""
+        """Return crowd and event pedestrians as one value.
+
+        cast: the event pedestrians.
+        ages: ages of the crowd.
+        names, xy, heading, speed: the crowd's N members; (N, 2) metres, (N,) radians, (N,) m/s.
+        """
         if (names, cast_of := [(a.id, a.kind, a.age) for a in cast]) != self._cast:
             self._cast = names, cast_of
             self._names = (*names, *(a.id for a in cast))
@@ -67,8 +183,7 @@ class ShownPeople:
 
 
 def cast_in_order(actors: tuple[Actor, ...], crowd: Mapping[str, Age]) -> list[Actor]:
-    """Actors in the order of their ids. Raises EngineError where two have one id, or one that of
-    the crowd's."""
+    """Return actors sorted by id. Raises EngineError for duplicate ids, also with the crowd's."""
     ids = {actor.id for actor in actors}
     if len(ids) != len(actors) or ids & crowd.keys():
         raise EngineError(
@@ -78,5 +193,5 @@ def cast_in_order(actors: tuple[Actor, ...], crowd: Mapping[str, Age]) -> list[A
 
 
 def places_of(cast: list[Actor]) -> Floats:
-    """Where actors are, (N, 2) metres."""
+    """Return the positions of actors, (N, 2) metres."""
     return np.array([(a.x_m, a.y_m) for a in cast], dtype=float).reshape(-1, 2)

@@ -1,5 +1,4 @@
-"""Stop lines: which vehicles drive over them, and what their lights show. For measuring; the crowd
-does without."""
+"""Stop line crossings of vehicles and the state of their lights, for measurements only."""
 
 from __future__ import annotations
 
@@ -10,8 +9,11 @@ from sumo_nets.engine import sumo
 
 
 class Passed(NamedTuple):
-    """A vehicle drove over a stop line. light: SUMO's letter of its link (G or g, y, r, ...);
-    red_s: for how long it has been red, as far as anybody was there to see."""
+    """A vehicle that crossed a stop line.
+
+    light: SUMO's letter of its link (G or g, y, r, ...).
+    red_s: observed time since the light turned red, seconds.
+    """
 
     vehicle: str
     light: str
@@ -19,7 +21,7 @@ class Passed(NamedTuple):
 
 
 class StopLines:
-    """Watches the vehicles of the running simulation, tick by tick."""
+    """Observer of the vehicles in the running simulation."""
 
     def __init__(self, tick_s: float) -> None:
         self._tick_s = tick_s
@@ -27,17 +29,17 @@ class StopLines:
         self._red_s: dict[tuple[str, int], float] = {}
 
     def passed(self, vehicles: Collection[str]) -> list[Passed]:
-        """The vehicles that have driven over a stop line since the last call, with what the light
-        shows now."""
-        ahead = {}
+        """Return the vehicles that crossed a stop line since the last call, with the current
+        state of the light."""
+        next_lights = {}
         for name in vehicles:
             lights = sumo.vehicle.getNextTLS(name)
             if lights:
-                ahead[name] = lights[0][:3]
+                next_lights[name] = lights[0][:3]
         lit = {
-            link: _letter(link)
+            link: sumo.trafficlight.getRedYellowGreenState(link[0])[link[1]]
             for link in {
-                (light, link) for light, link, _ in (*ahead.values(), *self._next.values())
+                (light, link) for light, link, _ in (*next_lights.values(), *self._next.values())
             }
         }
         self._red_s = {
@@ -45,15 +47,10 @@ class StopLines:
         }
         found = []
         for name, (light, link, away_m) in self._next.items():
-            # A light farther than a tick's way that is gone was turned away from; one that stays at
-            # hand is another lane's of the same junction: the vehicle has changed lanes at the stop
-            # line.
-            next_light, _, next_m = ahead.get(name, ("", -1, 0.0))
+            # A distant light that disappears means a changed route. The same junction at a short
+            # distance means a lane change at the stop line.
+            next_light, _, next_m = next_lights.get(name, ("", -1, 0.0))
             if name in vehicles and away_m < 3.0 and (next_light != light or next_m > away_m + 3.0):
                 found.append(Passed(name, lit[light, link], self._red_s.get((light, link), 0.0)))
-        self._next = ahead
+        self._next = next_lights
         return found
-
-
-def _letter(link: tuple[str, int]) -> str:
-    return sumo.trafficlight.getRedYellowGreenState(link[0])[link[1]]

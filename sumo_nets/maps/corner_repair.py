@@ -1,9 +1,7 @@
-"""Corners of foreign nets that are torn or pinched: widened where people walk, so that a robot can
-pass.
+"""Widen torn or pinched corners of foreign nets, so that a robot can pass.
 
-netconvert draws many walking areas that cross themselves, shrink to a thread between two sidewalks
-or end short of one. SUMO's people do not mind, because they walk from lane to lane; a robot needs
-the ground.
+Many walking areas of netconvert cross themselves, narrow between two sidewalks or end short of one.
+SUMO's pedestrians ignore this, since they walk from lane to lane.
 """
 
 from __future__ import annotations
@@ -22,22 +20,24 @@ from cosim.place import overlay
 from cosim.place.street_map import SEAM_M, Corner, Port, StreetMap, Strip, union_closed
 
 CLEAR_M = 0.36
-"""Half the width that must be free on the way through a corner."""
+"""Half of the width that must be free through a corner, metres."""
 PAD_M = 0.5
-"""Radius of the ground added at a port of a mended corner."""
+"""Radius of the ground added at a port of a repaired corner, metres."""
 _WIDEST_M = 2.0
+"""Largest width of an added band, metres."""
 _EDGE_M = 0.05
+"""Distance from the edge of the ground within which a strip's end counts as torn, metres."""
 
 
 def mend_corners(root: ET.Element, street_map: StreetMap, progress: Progress = ignore) -> list[str]:
-    """Widen, in place, the walking areas through which a robot could not pass. What was changed, a
-    sentence."""
+    """Widen, in place, the walking areas that block a robot. Return the changes, a sentence
+    each."""
     lanes = {
         e.get("id"): e[0]
         for e in root.iter("edge")
         if e.get("function") == "walkingarea" and len(e)
     }
-    mended = 0
+    widened = 0
     for number, corner in enumerate(street_map.corners.values()):
         if number % 100 == 0:
             progress("mending corners", number / len(street_map.corners))
@@ -45,29 +45,29 @@ def mend_corners(root: ET.Element, street_map: StreetMap, progress: Progress = i
         if polygon is not None and corner.id in lanes:
             ring = shapely.get_coordinates(polygon.exterior)[:-1]
             lanes[corner.id].set("shape", " ".join(f"{x:.2f},{y:.2f}" for x, y in ring))
-            mended += 1
-    if not mended:
+            widened += 1
+    if not widened:
         return []
     return [
-        f"{mended} of {len(street_map.corners)} corners were torn or pinched: widened along "
+        f"{widened} of {len(street_map.corners)} corners were torn or pinched: widened along "
         f"the ways across them"
     ]
 
 
 def widened_corner(street_map: StreetMap, corner: Corner) -> Polygon | None:
-    """The corner's polygon, widened by pads at its ports and bands between them; None when all is
-    well as it is."""
+    """Return a corner's polygon, widened by pads at its ports and bands between them; None if it
+    is passable."""
     ports = list(dict.fromkeys(corner.ports))
     if len(ports) < 2:
         return None
     strips = [street_map.strips[port.strip] for port in ports]
-    ends = np.array([_end(port, strip) for port, strip in zip(ports, strips, strict=True)])
+    ends = np.array([_port_point(port, strip) for port, strip in zip(ports, strips, strict=True)])
     widths = np.array([strip.width_m for strip in strips])
     clear_m = min(CLEAR_M, 0.35 * float(widths.min()))
     torn = isinstance(corner.polygon, MultiPolygon) or any(
-        map(_beside, repeat(corner), strips, ends)
+        map(_is_torn, repeat(corner), strips, ends)
     )
-    if not torn and _open(corner.polygon, strips, ends, widths, clear_m):
+    if not torn and _is_passable(corner.polygon, strips, ends, widths, clear_m):
         return None
     pads = shapely.buffer(shapely.points(ends), np.minimum(widths / 2.0, PAD_M))
     groups = _groups([corner.polygon, *pads], ends, clear_m)
@@ -90,25 +90,24 @@ def widened_corner(street_map: StreetMap, corner: Corner) -> Polygon | None:
     )
 
 
-def _end(port: Port, strip: Strip) -> Floats:
+def _port_point(port: Port, strip: Strip) -> Floats:
     return strip.line[0 if port.end == 0 else -1, :2]
 
 
-def _beside(corner: Corner, strip: Strip, end: Floats) -> bool:
-    """Whether a strip's end lies at the edge of the ground rather than on it."""
+def _is_torn(corner: Corner, strip: Strip, end: Floats) -> bool:
+    """Return whether a strip ends at the edge of the ground."""
     ground = union_closed([corner.polygon, strip.polygon])
     return float(shapely.distance(shapely.boundary(ground), shapely.Point(end))) < _EDGE_M
 
 
-def _open(
+def _is_passable(
     polygon: Polygon | MultiPolygon,
     strips: Sequence[Strip],
     ends: Floats,
     widths: Floats,
     clear_m: float,
 ) -> bool:
-    """Whether each two ports of a corner are in reach of each other over the corner and their own
-    strips."""
+    """Return whether all ports of a corner are connected across the corner and their own strips."""
     at = shapely.points(ends)
     core = shapely.buffer(polygon, -clear_m)
     if (
@@ -134,8 +133,8 @@ def _band(a: Floats, b: Floats, width_m: float) -> Polygon:
 
 
 def _groups(pieces: Sequence[shapely.Geometry], ends: Floats, clear_m: float) -> list[int]:
-    """For each port the number of the free part of the ground that it opens on; a number of its own
-    without any."""
+    """Return the index of the free part of the ground at each port; a negative number without
+    one."""
     free = shapely.buffer(union_closed(pieces), -clear_m)
     parts = [part for part in shapely.get_parts(free) if not part.is_empty]
     groups = []

@@ -1,4 +1,4 @@
-"""Which side people drive on, by coordinates: OSM files do not say."""
+"""Side of the road by coordinates, which OSM files do not contain."""
 
 from __future__ import annotations
 
@@ -84,12 +84,12 @@ LEFT_HAND: dict[str, tuple[_Box, ...]] = {
     "Guyana": ((-60.0, 1.2, -57.2, 8.6),),
     "Suriname": ((-57.2, 1.8, -54.2, 6.1),),
 }
-"""Boxes (west, south, east, north), degrees, of the countries that drive on the left. Rough near
-land borders."""
+"""Boxes (west, south, east, north), degrees, of countries with left-hand traffic; approximate
+near land borders."""
 
 
 def left_hand_country(lon: float, lat: float) -> str | None:
-    """The country whose box a point lies in, if people drive on the left there; None elsewhere."""
+    """Return the country with left-hand traffic at a point, or None."""
     for country, boxes in LEFT_HAND.items():
         if any(west <= lon <= east and south <= lat <= north for west, south, east, north in boxes):
             return country

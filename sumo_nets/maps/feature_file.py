@@ -1,4 +1,4 @@
-"""The features of an imported map on disk, beside its net: compact JSON, checked when it is
+"""Store the features of an imported map next to its net, as compact JSON that is validated when
 read."""
 
 from __future__ import annotations
@@ -28,27 +28,26 @@ class _Row(msgspec.Struct, frozen=True, array_like=True):
     rings: list[list[tuple[float, float]]]
 
 
-class _Kept(msgspec.Struct, frozen=True):
+class _Stored(msgspec.Struct, frozen=True):
     schema: int
     features: list[_Row]
 
 
 def write_features(features: Sequence[Feature], path: Path) -> None:
-    """Keep features at `path`."""
+    """Write features to `path`."""
     rows = [
         _Row(f.kind, f.x_m, f.y_m, f.heading_rad, f.height_m, _rings(f.polygon)) for f in features
     ]
-    path.write_bytes(msgspec.json.encode(_Kept(_SCHEMA, rows)))
+    path.write_bytes(msgspec.json.encode(_Stored(_SCHEMA, rows)))
 
 
 def read_features(path: Path) -> tuple[Feature, ...]:
-    """The features at `path`; none when there is no such file. Raises MapError when it is
-    broken."""
+    """Return the features at `path`, empty without a file. Raises MapError if it is damaged."""
     try:
-        kept = msgspec.json.decode(path.read_bytes(), type=_Kept)
-        if kept.schema != _SCHEMA:
-            raise ValueError(f"schema {kept.schema}; this version reads {_SCHEMA}")
-        return tuple(_feature(row) for row in kept.features)
+        stored = msgspec.json.decode(path.read_bytes(), type=_Stored)
+        if stored.schema != _SCHEMA:
+            raise ValueError(f"schema {stored.schema}; this version reads {_SCHEMA}")
+        return tuple(_feature(row) for row in stored.features)
     except FileNotFoundError:
         return ()
     except (OSError, ValueError, msgspec.DecodeError, shapely.errors.GEOSException) as error:
@@ -56,7 +55,7 @@ def read_features(path: Path) -> tuple[Feature, ...]:
 
 
 def with_features(net_hash: str, path: Path) -> str:
-    """The content hash of a map: its net's, and of the features where there are any."""
+    """Return the content hash of a map, from its net's hash and the feature file, if any."""
     try:
         features = path.read_bytes()
     except OSError:

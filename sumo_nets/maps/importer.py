@@ -1,8 +1,7 @@
-"""Foreign maps as SUMO nets that can be walked: OSM converted, car-only nets given walkways,
-signals mended.
+"""Import foreign maps as walkable SUMO nets: convert OSM, add walkways to car-only nets, repair
+signals.
 
-netconvert's exit code proves nothing, so every net is counted and started in SUMO before it counts
-as imported.
+netconvert's exit code is not reliable, so every net is checked and started in SUMO.
 """
 
 from __future__ import annotations
@@ -32,7 +31,6 @@ from sumo_nets.maps.net_steps import (
     add_walkways,
     crop_net,
     start_sumo,
-    sumo_home,
     widen_sidewalks,
 )
 from sumo_nets.maps.osm_crop import Box
@@ -47,6 +45,7 @@ from sumo_nets.maps.sidewalks import (
 )
 from sumo_nets.net.net_facts import facts_of, net_root, read_facts
 from sumo_nets.net.net_file import read_net
+from sumo_nets.net.netconvert import sumo_home
 
 TYPES = (
     "osmNetconvert.typ.xml",
@@ -72,8 +71,9 @@ OSM_OPTIONS = (
     "--osm.all-attributes",
     f"--osm.extra-attributes={','.join(LEVEL_KEYS)}",
 )
+"""Options of netconvert for OpenStreetMap files."""
 BIG = 10_000
-"""With more streets and paths than this an import takes minutes."""
+"""Number of streets and paths above which an import takes minutes."""
 OSM_LICENCE = (
     "Map data (c) OpenStreetMap contributors, Open Database License (ODbL) 1.0: credit them "
     "on what is shown, "
@@ -121,18 +121,17 @@ class Options:
 
     @property
     def widths_m(self) -> Mapping[str, float]:
-        """Widths of guessed sidewalks by street class; empty to leave them as netconvert chose
-        them."""
+        """Widths of guessed sidewalks by street class; empty for netconvert's widths."""
         one_m = self.sidewalk_width_m
         return self.rules.widths_m if one_m is None else dict.fromkeys(STREET_WIDTHS_M, one_m)
 
 
 @dataclass(frozen=True, slots=True)
 class Converted:
-    """A net ready to be kept, and what the map shows beside its streets.
+    """A finished net and the features of its map.
 
-    changes: what the importer did to it, a sentence each. guessed_share: of the length of the
-    pavements, the part no mapper has seen; None when it cannot be known.
+    changes: changes by the importer, a sentence each.
+    guessed_share: share of the pavements' length that the map does not contain; None if unknown.
     """
 
     net: Path
@@ -146,14 +145,14 @@ class Converted:
 
 
 def convert(source: Path, folder: Path, options: Options, progress: Progress = ignore) -> Converted:
-    """`source` as a net in the scratch `folder`. Raises MapError naming what was found and what to
-    do."""
+    """Convert `source` to a net in the scratch `folder`. Raises MapError with a finding and a
+    remedy."""
     progress(f"reading {source.name}")
     file = unpacked(source, folder, options.bbox)
     work = ImportWork(
         file, folder, progress, [f"unpacked ({file.packing})"] if file.packing else []
     )
-    with _told_of(file):
+    with _naming_source(file):
         return _from_osm(work, options) if file.format == "osm" else _from_net(work, options)
 
 
@@ -166,7 +165,7 @@ def _from_osm(work: ImportWork, options: Options) -> Converted:
         )
     found = osm_facts(file)
     extra = ["--lefthand"] if _left_hand(found, options, changes) else []
-    # Joined to a street on the ground, a bridge would take all of the street off the ground.
+    # If netconvert joined a bridge to a street, the whole street would be off the ground.
     apart = work.folder / "apart.txt"
     apart.write_text("\n".join(edges_of(found.levelled)))
     extra.append(f"--geometry.remove.keep-edges.input-file={apart}")
@@ -191,7 +190,7 @@ def _from_osm(work: ImportWork, options: Options) -> Converted:
 
 
 def _converting(streets: int, options: Options) -> str:
-    """The stage of a conversion, with advice where it takes minutes."""
+    """Return the name of the conversion stage, with advice if it takes minutes."""
     advice = (
         " (--bbox west,south,east,north: a part is faster)"
         if streets > BIG and options.bbox is None
@@ -205,7 +204,7 @@ def _from_net(work: ImportWork, options: Options) -> Converted:
     facts = (
         read_facts(file.path)
         if options.lefthand is None
-        else _sided(read_facts(file.path), options, file)
+        else _check_driving_side(read_facts(file.path), options, file)
     )
     if not facts.edges:
         raise MapError(f"{file.source}: a net of 0 edges: export an area with streets in it")
@@ -224,7 +223,7 @@ def _from_net(work: ImportWork, options: Options) -> Converted:
         net = add_walkways(work, net, facts)
         net = widen_sidewalks(work, net, options.widths_m, {}, before)
         share = new_share(net_root(net), before)
-    elif _old(facts.version):
+    elif facts.version == "?" or facts.version.startswith("0."):
         net = work.netconvert("renewing the net", "renewed.net.xml", ["-s", str(net)])
         changes.append(f"renewed by netconvert: format {facts.version} is too old to be simulated")
     return _finish(work, net, options.rules, share, [])
@@ -235,7 +234,7 @@ def _lacks_walkways(facts: NetFacts) -> bool:
 
 
 def _unchanged(work: ImportWork, net: Path, facts: NetFacts) -> Converted:
-    """The net as it is, with what is not possible on it. Raises MapError when SUMO does not start
+    """Return the net as it is, with a note on its limits. Raises MapError if SUMO does not start
     on it."""
     file = work.file
     changes = work.changes
@@ -257,8 +256,7 @@ def _unchanged(work: ImportWork, net: Path, facts: NetFacts) -> Converted:
 def _finish(
     work: ImportWork, net: Path, rules: Rules, share: float | None, licences: list[str]
 ) -> Converted:
-    """Mend what can be mended, then prove that the net holds walkways and that SUMO starts on
-    it."""
+    """Repair the net, then check that it has walkways and that SUMO starts on it."""
     file = work.file
     changes = work.changes
     progress = work.progress
@@ -295,10 +293,10 @@ def _finish(
     if file.format == "osm":
         progress("placing buildings and things")
         location = root.find("location")
-        features, told = fitted(
+        features, fit_changes = fitted(
             osm_features(file), {} if location is None else location.attrib, street_map
         )
-        changes += told
+        changes += fit_changes
     return Converted(
         final, facts, features, file.format, file.packing, tuple(changes), share, tuple(licences)
     )
@@ -321,7 +319,7 @@ def _left_hand(found: OsmFacts, options: Options, changes: list[str]) -> bool:
     return True
 
 
-def _sided(facts: NetFacts, options: Options, file: MapFile) -> NetFacts:
+def _check_driving_side(facts: NetFacts, options: Options, file: MapFile) -> NetFacts:
     if options.lefthand != facts.left_hand:
         side = "left" if facts.left_hand else "right"
         raise MapError(
@@ -331,18 +329,13 @@ def _sided(facts: NetFacts, options: Options, file: MapFile) -> NetFacts:
     return facts
 
 
-def _old(version: str) -> bool:
-    return version.startswith("0.") or version == "?"
-
-
 @contextmanager
-def _told_of(file: MapFile) -> Iterator[None]:
-    """Errors told with the user's file in place of our scratch files, so that their commands can be
-    repeated."""
+def _naming_source(file: MapFile) -> Iterator[None]:
+    """Raise errors with the user's file in place of scratch files."""
     try:
         yield
     except MapError as error:
-        raise MapError(_retold(file, str(error))) from error
+        raise MapError(_with_source(file, str(error))) from error
     except KeyError as error:
         raise MapError(
             f"{file.source}: not a street net that can be read: attribute {error} is missing"
@@ -355,17 +348,18 @@ def _told_of(file: MapFile) -> Iterator[None]:
         raise MapError(f"{file.source}: not a street net that can be read: {error}") from error
 
 
-def _retold(file: MapFile, words: str) -> str:
-    words = re.sub(rf"^{re.escape(str(file.path.parent))}/\S+?: ", "", words)
-    words = (
-        words.rstrip(".")
+def _with_source(file: MapFile, message: str) -> str:
+    message = re.sub(rf"^{re.escape(str(file.path.parent))}/\S+?: ", "", message)
+    message = (
+        message.rstrip(".")
         .replace(str(file.path), str(file.source))
         .replace(f"{file.path.parent}/", "")
     )
-    words = words.replace("cut the area of interest out first", "import a part of it with --bbox")
-    if "without any edge" in words or "No nodes loaded" in words:
-        words += (
+    remedy = "import a part of it with --bbox"
+    message = message.replace("cut the area of interest out first", remedy)
+    if "without any edge" in message or "No nodes loaded" in message:
+        message += (
             "; no street of the file survived the conversion: import a larger area, with whole "
             "streets in it"
         )
-    return words if words.startswith(f"{file.source}: ") else f"{file.source}: {words}"
+    return message if message.startswith(f"{file.source}: ") else f"{file.source}: {message}"

@@ -1,5 +1,4 @@
-"""The places one can run in besides generated cities: imported maps, kept in the cache folder, and
-SUMO's own nets."""
+"""Store of imported maps in the cache folder, including SUMO's own nets."""
 
 from __future__ import annotations
 
@@ -24,29 +23,28 @@ from cosim.place.map_check import MapCheck, check_map
 from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import CityMap, Place
 from sumo_nets.maps.feature_file import NAME, read_features, with_features, write_features
-from sumo_nets.maps.import_rules import NEWEST_RULES, SUITE_RULES
+from sumo_nets.maps.import_rules import NEWEST_RULES, SUITE_RULES, WHEEL_PLACES
 from sumo_nets.maps.importer import OSM_LICENCE, Options, convert
-from sumo_nets.maps.wheel_places import WHEEL_PLACES
 from sumo_nets.net.net_facts import read_facts
-from sumo_nets.net.net_hash import net_content_hash
-from sumo_nets.net.raw_file import head_of
+from sumo_nets.net.netconvert import sumo_home
+from sumo_nets.net.raw_file import head_of, net_content_hash
 from sumo_nets.net.snapshot import street_map_of
 
 ABOUT = "about.json"
 OSM_CREDIT = "(c) OpenStreetMap contributors, ODbL"
-"""The credit on pictures of places made from OpenStreetMap data; picture fonts have no copyright
+"""Credit on pictures of places made from OpenStreetMap data; picture fonts have no copyright
 sign."""
 GENERIC = ("input", "map", "net", "network", "osm", "converted", "export", "planet", "osm_bbox")
-"""File names that name no place: the folder's name is taken instead."""
+"""Generic file names, for which the folder's name is used instead."""
 NAMES = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
 GAME_LICENCE = "EPL-2.0 OR GPL-2.0-or-later, with Eclipse SUMO"
 
 
 class About(msgspec.Struct, frozen=True, kw_only=True):
-    """Where an imported map comes from and what was done to it.
+    """Origin of an imported map and its changes.
 
     source_hash: SHA-256 of the file, 16 hex digits.
-    versions: of the importer (`importrules.py`) and of SUMO.
+    versions: of the importer (`import_rules.py`) and of SUMO.
     """
 
     name: str
@@ -66,8 +64,7 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Known(msgspec.Struct, frozen=True):
-    """A place of the list. origin: "imported" or "sumo" (inside the SUMO package, imported when
-    first used)."""
+    """A known place. origin: "imported" or "sumo" (in the SUMO package, imported on first use)."""
 
     name: str
     origin: str
@@ -75,7 +72,7 @@ class Known(msgspec.Struct, frozen=True):
 
 
 def maps_folder() -> Path:
-    """Where imported maps are kept, a folder each."""
+    """Return the folder of imported maps."""
     return cache_folder() / "maps"
 
 
@@ -85,11 +82,11 @@ def import_map(
     options: Options | None = None,
     progress: Progress = ignore,
 ) -> About:
-    """Import a map file under a name (by default the file's), in place of an earlier one of that
+    """Import a map file under a name, by default the file's, and replace an earlier map of that
     name.
 
-    Raises MapError when the file makes no usable net, UsageError for an unusable name; then nothing
-    is kept.
+    Raises MapError when the file gives no usable net, UsageError for an unusable name. Then nothing
+    is stored.
     """
     name = map_name(source) if name is None else name
     if not NAMES.fullmatch(name):
@@ -102,12 +99,12 @@ def import_map(
             raise UsageError(
                 f"'{name}' is the name of a net that comes with SUMO: choose another with --name"
             )
-        options = _options_of(name)
-    return _keep(source, name, options, progress)
+        options = _supplied_options(name)
+    return _store(source, name, options, progress)
 
 
 def map_name(source: Path) -> str:
-    """The name a file's map gets when the user names none."""
+    """Return the default name of a map file."""
     stem = re.sub(r"\.(gz|bz2|pbf|xml|osm|net)$", "", source.name)
     while (shorter := re.sub(r"\.(gz|bz2|pbf|xml|osm|net)$", "", stem)) != stem:
         stem = shorter
@@ -117,9 +114,9 @@ def map_name(source: Path) -> str:
 
 
 def map_net(place: CityMap | str) -> Path:
-    """The street net of an imported or SUMO-supplied map.
+    """Return the street net of an imported or SUMO-supplied map.
 
-    Raises UsageError for an unknown name; MapError when `place` names the hash of another net.
+    Raises UsageError for an unknown name, MapError when `place` has the hash of another net.
     """
     name = place if isinstance(place, str) else place.map
     path = maps_folder() / name / "net.xml"
@@ -127,7 +124,7 @@ def map_net(place: CityMap | str) -> Path:
         supplied = _supplied()
         if name not in supplied:
             raise unknown("map", name, known_maps())
-        _keep(supplied[name], name, _options_of(name), in_place=False)
+        _store(supplied[name], name, _supplied_options(name), in_place=False)
     if (
         not isinstance(place, str)
         and place.net_hash
@@ -142,7 +139,7 @@ def map_net(place: CityMap | str) -> Path:
 
 
 def read_map(place: CityMap | str) -> StreetMap:
-    """The StreetMap of a map, under the map's name, with what the map shows beside its streets."""
+    """Return the StreetMap of a map, under the map's name, with its features."""
     name = place if isinstance(place, str) else place.map
     path = map_net(place)
     street_map = street_map_of(path)
@@ -153,20 +150,19 @@ def read_map(place: CityMap | str) -> StreetMap:
 
 
 def map_hash(net: Path) -> str:
-    """Content hash of a map by its net: of the net, and of the features beside it where there are
-    any."""
+    """Return the content hash of a map, of its net and the features next to it."""
     return with_features(net_content_hash(net), net.with_name(NAME))
 
 
 def file_hash(path: Path) -> str:
-    """SHA-256 (16 hex digits) of a file's bytes. Raises MapError when it cannot be read."""
+    """Return the SHA-256 (16 hex digits) of a file. Raises MapError when it cannot be read."""
     head_of(path)
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()[:16]
 
 
 def about_map(name: str) -> About:
-    """Where an imported map comes from. Imports a SUMO-supplied one first."""
+    """Return the origin of a map, and import a SUMO-supplied one first."""
     path = map_net(name).with_name(ABOUT)
     try:
         return msgspec.json.decode(path.read_bytes(), type=About)
@@ -175,7 +171,7 @@ def about_map(name: str) -> About:
 
 
 def credit_of(place: Place) -> str:
-    """Return the credit that pictures of a place need; "" where its map is not known to be from
+    """Return the credit that pictures of a place need; "" if its map is not known to be from
     OpenStreetMap."""
     if not isinstance(place, CityMap):
         return ""
@@ -187,7 +183,7 @@ def credit_of(place: Place) -> str:
 
 
 def checked_map(name: str) -> tuple[StreetMap, MapCheck, About]:
-    """A map, what it is worth and where it comes from."""
+    """Return a map, its check and its origin."""
     about, street_map = about_map(name), read_map(name)
     return (
         street_map,
@@ -197,8 +193,8 @@ def checked_map(name: str) -> tuple[StreetMap, MapCheck, About]:
 
 
 def known_maps() -> dict[str, Known]:
-    """Every place by name: imported ones, then nets with sidewalks that come with SUMO, whole and
-    as crops."""
+    """Return all places by name: imported maps, then nets with sidewalks from SUMO, whole and as
+    crops."""
     folder = maps_folder()
     found = sorted(p.parent for p in folder.glob(f"*/{ABOUT}")) if folder.is_dir() else []
     supplied = _supplied()
@@ -211,7 +207,7 @@ def known_maps() -> dict[str, Known]:
 
 
 def outdated(about: About) -> bool:
-    """Return whether importing the map again would apply rules that it was imported without."""
+    """Return whether importing the map again would apply newer rules."""
     return about.name not in _supplied() and about.versions.get("importer") != str(
         NEWEST_RULES.version
     )
@@ -224,24 +220,26 @@ def _source_of(name: str) -> str:
         return "damaged: import it again"
 
 
-def _keep(
+def _store(
     source: Path, name: str, options: Options, progress: Progress = ignore, *, in_place: bool = True
 ) -> About:
-    """Convert a map in a folder of its own, then move the whole into place."""
+    """Convert a map in a temporary folder, then move it into place."""
     folder = maps_folder()
     existing: Literal["replace", "keep"] = "replace" if in_place else "keep"
     try:
         with atomic_folder(folder / name, existing=existing) as ready:
             with TemporaryDirectory(dir=ready) as scratch:
-                made = convert(source, Path(scratch), options, progress)
-                made.net.rename(ready / "net.xml")
-            if made.features:
-                write_features(made.features, ready / NAME)
+                converted = convert(source, Path(scratch), options, progress)
+                converted.net.rename(ready / "net.xml")
+            if converted.features:
+                write_features(converted.features, ready / NAME)
             about = About(
                 name=name,
                 source=source.name,
                 source_hash=file_hash(source),
-                format=" ".join(filter(None, (made.format, made.facts.version, made.packing))),
+                format=" ".join(
+                    filter(None, (converted.format, converted.facts.version, converted.packing))
+                ),
                 imported_at=datetime.now(UTC).isoformat(timespec="seconds"),
                 bbox=options.bbox,
                 lefthand=options.lefthand,
@@ -251,9 +249,9 @@ def _keep(
                     "importer": str(options.rules.version),
                     "eclipse-sumo": version("eclipse-sumo"),
                 },
-                changes=made.changes,
-                guessed_share=made.guessed_share,
-                licences=_licences(name, source, made.licences),
+                changes=converted.changes,
+                guessed_share=converted.guessed_share,
+                licences=_licences(name, source, converted.licences),
                 net_hash=map_hash(ready / "net.xml"),
             )
             (ready / ABOUT).write_bytes(msgspec.json.format(msgspec.json.encode(about), indent=2))
@@ -263,12 +261,12 @@ def _keep(
 
 
 def _licences(name: str, source: Path, found: tuple[str, ...]) -> tuple[str, ...]:
-    """What the file itself and the texts beside it say about its licence."""
-    said = list(found)
+    """Return the licences from the file itself and from texts in its folder."""
+    licences = list(found)
     if source in _supplied().values():
-        said.append(GAME_LICENCE)
+        licences.append(GAME_LICENCE)
     if name in WHEEL_PLACES and WHEEL_PLACES[name].osm:
-        said.append(OSM_LICENCE)
+        licences.append(OSM_LICENCE)
     for name in ("LICENCE.txt", "LICENSE.txt", "LICENSE", "SOURCE.txt"):
         try:
             text = (source.resolve().parent / name).read_text(errors="replace")
@@ -277,29 +275,26 @@ def _licences(name: str, source: Path, found: tuple[str, ...]) -> tuple[str, ...
         lines = [line.strip() for line in text.splitlines() if line.strip()]
         if name == "SOURCE.txt":
             lines = [line for line in lines if line.startswith("Origin")]
-        said.append(f"{name}: {' '.join(lines)[:1000]}")
-    return tuple(said)
+        licences.append(f"{name}: {' '.join(lines)[:1000]}")
+    return tuple(licences)
 
 
 def _supplied() -> dict[str, Path]:
-    """The nets that come with the SUMO package, by the names of the places they make."""
+    """Return the nets of the SUMO package by place name."""
     return _game_nets() | {name: one.path for name, one in WHEEL_PLACES.items()}
 
 
-def _options_of(name: str) -> Options:
-    """How a place that comes with SUMO is imported."""
+def _supplied_options(name: str) -> Options:
+    """Return the import options of a place from the SUMO package."""
     one = WHEEL_PLACES.get(name)
     return Options(rules=SUITE_RULES) if one is None else Options(bbox=one.box, rules=one.rules)
 
 
 @cache
 def _game_nets() -> dict[str, Path]:
-    """Nets with sidewalks that come with the SUMO package, by the names they have here."""
-    import sumo
-
-    tools = Path(sumo.__file__).parent / "tools"
+    """Return the SUMO package's nets with sidewalks by place name."""
     found: dict[str, Path] = {}
-    for path in sorted((tools / "game").glob("*/*.net.xml*")):
+    for path in sorted((sumo_home() / "tools" / "game").glob("*/*.net.xml*")):
         data = path.read_bytes()
         if b'function="walkingarea"' in (gzip.decompress(data) if path.suffix == ".gz" else data):
             name = "sumo-" + path.parent.name.lower().replace("_", "-")

@@ -1,5 +1,4 @@
-"""Steps of an import that go through netconvert and SUMO: cropping, walkways, widths, the final
-test."""
+"""Steps of an import that use netconvert and SUMO: cropping, walkways, widths, test start."""
 
 from __future__ import annotations
 
@@ -16,24 +15,28 @@ from cosim.place.map_check import NetFacts
 from sumo_nets.maps.osm_crop import Box, refuse_box_outside
 from sumo_nets.maps.osm_file import MapFile
 from sumo_nets.maps.sidewalks import set_widths
-from sumo_nets.net.net_facts import allows, net_root, read_facts
-from sumo_nets.net.netconvert import complaints, netconvert
+from sumo_nets.net.net_facts import net_root, read_facts
+from sumo_nets.net.net_file import allows
+from sumo_nets.net.netconvert import complaints, netconvert, sumo_home
 
 TIMEOUT_S = 300.0
+"""Timeout of each netconvert call, seconds."""
 START_TIMEOUT_S = 60.0
+"""Timeout of the test start of SUMO, seconds."""
 UPGRADE_OPTIONS: Final = ("--sidewalks.guess", "--crossings.guess", "--walkingareas")
 FOOT_TYPES: Final = ("highway.footway", "highway.pedestrian", "highway.steps", "highway.path")
 FOOT_MPS: Final = 1.4
-"""An edge of one lane that is as slow as this is a footway, whatever the net lets drive on it."""
+"""An edge of one lane with at most this speed limit is a footway, whatever vehicles it permits,
+m/s."""
 
 
 @dataclass(slots=True)
 class ImportWork:
-    """An import under way.
+    """An import in progress.
 
     folder: for scratch files.
     progress: receives the stages of the work.
-    changes: what was done to the map so far, a sentence each.
+    changes: changes to the map so far, a sentence each.
     """
 
     file: MapFile
@@ -42,7 +45,7 @@ class ImportWork:
     changes: list[str] = field(default_factory=list)
 
     def netconvert(self, stage: str, name: str, arguments: Sequence[str]) -> Path:
-        """Make the net `name` in the scratch folder."""
+        """Build the net `name` in the scratch folder."""
         self.progress(stage, 0.0)
         return netconvert(
             arguments, self.folder / name, TIMEOUT_S, lambda share: self.progress(stage, share)
@@ -56,8 +59,8 @@ class ImportWork:
 
 
 def crop_net(work: ImportWork, net: Path, box: Box | None) -> Path:
-    """Return the net inside a box. Raises MapError, with the bounds of the map, for a box with
-    nothing in it."""
+    """Return the net inside a box. Raises MapError, with the bounds of the map, for an empty
+    box."""
     if box is None:
         return net
     projected = read_facts(net).projected
@@ -67,12 +70,10 @@ def crop_net(work: ImportWork, net: Path, box: Box | None) -> Path:
     if bounds is not None:
         refuse_box_outside(source, box, bounds, unit)
     option = "--keep-edges.in-geo-boundary" if projected else "--keep-edges.in-boundary"
-    words = ",".join(f"{v:.7f}" for v in box)
+    bbox = ",".join(f"{v:.7f}" for v in box)
     try:
-        # In one call the two options keep netconvert busy for ever on some nets.
-        inside = work.netconvert(
-            "cropping", "inside.net.xml", ["-s", str(net), f"{option}={words}"]
-        )
+        # With both options in one call, netconvert does not terminate on some nets.
+        inside = work.netconvert("cropping", "inside.net.xml", ["-s", str(net), f"{option}={bbox}"])
         net = work.netconvert(
             "cropping", "cropped.net.xml", ["-s", str(inside), "--keep-edges.components=1"]
         )
@@ -81,24 +82,25 @@ def crop_net(work: ImportWork, net: Path, box: Box | None) -> Path:
             "" if bounds is None else f"; the map covers {','.join(f'{v:.6g}' for v in bounds)}"
         )
         raise MapError(
-            f"{source}: cropping to --bbox {words} (in {unit}) failed{covers}: {error}"
+            f"{source}: cropping to --bbox {bbox} (in {unit}) failed{covers}: {error}"
         ) from error
     work.changes.append(
-        f"cropped to {words}; whole streets are kept, and only the largest connected part"
+        f"cropped to {bbox}; whole streets are kept, and only the largest connected part"
     )
     return net
 
 
 def _bounds(net: Path, projected: bool) -> Box | None:
-    """What a net covers, in degrees if it is projected; None when it does not say so."""
+    """Return the bounds of a net, in degrees if it is projected; None if it does not contain
+    them."""
     location = net_root(net).find("location")
-    said = (
+    boundary = (
         ""
         if location is None
         else location.get("origBoundary" if projected else "convBoundary", "")
     )
     try:
-        west, south, east, north = (float(side) for side in said.split(","))
+        west, south, east, north = (float(side) for side in boundary.split(","))
     except ValueError:
         return None
     on_earth = -180.0 <= west < east <= 180.0 and -90.0 <= south < north <= 90.0
@@ -110,7 +112,7 @@ def _bounds(net: Path, projected: bool) -> Box | None:
 
 
 def add_walkways(work: ImportWork, net: Path, facts: NetFacts) -> Path:
-    """Return the net with sidewalks beside slow roads, crossings and walking areas."""
+    """Return the net with sidewalks along slow roads, crossings and walking areas."""
     root = net_root(net)
     freed = 0
     for edge in root.iter("edge"):
@@ -118,14 +120,14 @@ def add_walkways(work: ImportWork, net: Path, facts: NetFacts) -> Path:
         if (
             len(lanes) == 1
             and not edge.get("function")
-            and allows(lanes[0], "pedestrian")
+            and allows(lanes[0].attrib, "pedestrian")
             and _is_footway(edge)
         ):
-            freed += allows(lanes[0], "passenger")
+            freed += allows(lanes[0].attrib, "passenger")
             lanes[0].attrib.pop("disallow", None)
             lanes[0].set("allow", "pedestrian")
     ready = work.written(root, "ready.net.xml")
-    # --tls.guess would invent signals, some of which SUMO then refuses.
+    # --tls.guess would add signals, some of which SUMO refuses.
     upgraded = work.netconvert(
         "adding sidewalks", "upgraded.net.xml", ["-s", str(ready), *UPGRADE_OPTIONS]
     )
@@ -153,21 +155,19 @@ def widen_sidewalks(
 ) -> Path:
     """Return the net with the widths of guessed sidewalks set, see `set_widths`."""
     root = net_root(net)
-    said = set_widths(root, widths_m, tagged, before)
-    if not said:
+    changes = set_widths(root, widths_m, tagged, before)
+    if not changes:
         return net
-    work.changes += said
+    work.changes += changes
     ready = work.written(root, "widths.net.xml")
-    # Wider sidewalks move corners, and netconvert drops crossings that miss theirs: it guesses
-    # these again.
+    # Wider sidewalks move corners. netconvert drops crossings that miss them and guesses new ones.
     return work.netconvert(
         "widening sidewalks", "widened.net.xml", ["-s", str(ready), "--crossings.guess"]
     )
 
 
 def start_sumo(file: MapFile, net: Path) -> None:
-    """Start SUMO on the net for a second: some nets that netconvert is content with are refused by
-    it."""
+    """Start SUMO on the net for a second: it refuses some nets that netconvert accepts."""
     command = [
         str(sumo_home() / "bin" / "sumo"),
         "-n",
@@ -197,10 +197,3 @@ def start_sumo(file: MapFile, net: Path) -> None:
     if done.returncode != 0:
         ended = f"(sumo -n NET -e 1 ends with {done.returncode})"
         raise MapError(f"{file.source}: SUMO refuses the net {ended}{complaints(done.stderr)}")
-
-
-def sumo_home() -> Path:
-    """Return the folder of the SUMO package."""
-    import sumo
-
-    return Path(sumo.__file__).parent

@@ -1,5 +1,4 @@
-"""A part of an OpenStreetMap file, cut out before it is converted: a city takes minutes, a part of
-it seconds."""
+"""Crop OpenStreetMap files before conversion: a city takes minutes, a part of it seconds."""
 
 from __future__ import annotations
 
@@ -12,20 +11,21 @@ from typing import Any, Final
 from cosim.core.errors import MapError
 
 MARGIN_M: Final = 500.0
-"""Streets are kept this far beyond the box: whole blocks are built, and the net is cropped to the
-box afterwards."""
+"""Width of the margin around the box, metres: blocks are complete, and the net is cropped
+afterwards."""
 MOST_MEMBERS: Final = 50
-"""Areas of more ways than this (rivers, borders) are left out."""
+"""Areas of more ways (rivers, borders) are omitted."""
 _DEGREE_M: Final = 111_195.0
+"""Length of a degree of latitude, metres."""
 
 Box = tuple[float, float, float, float]
 
 
 def crop_osm(file: Path, target: Path, box: Box, source: Path) -> None:
-    """Write the part of an OSM file (XML or PBF) that lies in a box, as XML, to `target`.
+    """Write the part of an OSM file (XML or PBF) in a box to `target`, as XML.
 
-    Open streets end one node outside of the margin; everything else is kept whole or left out.
-    Raises MapError, with the bounds of the file, when it has no street there.
+    Open streets end one node outside of the margin; everything else is complete or omitted. Raises
+    MapError, with the bounds of the file, when it has no street there.
 
     box: west, south, east, north in degrees.
     source: the file to name in errors.
@@ -33,33 +33,33 @@ def crop_osm(file: Path, target: Path, box: Box, source: Path) -> None:
     import osmium
 
     try:
-        part = _chosen(file, box, source)
+        part = _selected_part(file, box, source)
         _write(file, target, part)
     except (OSError, RuntimeError, ValueError, osmium.InvalidLocationError) as error:
         raise MapError(f"{source}: cannot be cropped: {error}: get it again") from error
 
 
 def refuse_box_outside(source: Path, box: Box, bounds: Box, unit: str = "degrees") -> None:
-    """Raise MapError, with the bounds of the map, when a box holds nothing of it."""
-    if _meet(box, bounds):
+    """Raise MapError, with the bounds of the map, when a box does not overlap it."""
+    if _overlap(box, bounds):
         return
     west, south, east, north = box
     swapped = (south, west, north, east)
     hint = (
-        f" (latitude and longitude swapped? --bbox {_words(swapped)})"
-        if _meet(swapped, bounds)
+        f" (latitude and longitude swapped? --bbox {_box_text(swapped)})"
+        if _overlap(swapped, bounds)
         else ""
     )
+    covers = _box_text(bounds)
     raise MapError(
-        f"{source}: --bbox {_words(box)} is outside of the map, which covers {_words(bounds)} "
+        f"{source}: --bbox {_box_text(box)} is outside of the map, which covers {covers} "
         f"(west,south,east,north in {unit}): give a part of that{hint}"
     )
 
 
 @dataclass(slots=True)
 class _Part:
-    """Ids of what is kept of a file. cuts: first and last node kept, by their places, of streets
-    that are cut."""
+    """Ids of the cropped part. cuts: indices of the first and last node of shortened streets."""
 
     nodes: set[int] = field(default_factory=set)
     ways: set[int] = field(default_factory=set)
@@ -67,14 +67,14 @@ class _Part:
     relations: set[int] = field(default_factory=set)
 
 
-def _chosen(file: Path, box: Box, source: Path) -> _Part:
+def _selected_part(file: Path, box: Box, source: Path) -> _Part:
     inside, bounds = _inside(file, box)
     if not math.isfinite(bounds[0]):
         raise MapError(f"{source}: an OpenStreetMap file without nodes: export a larger area")
     refuse_box_outside(source, box, bounds)
     part = _Part(set(inside))
     streets = 0
-    for way in _of(file, "WAY"):
+    for way in _elements(file, "WAY"):
         refs = [node.ref for node in way.nodes]
         hits = [place for place, ref in enumerate(refs) if ref in inside]
         if not hits:
@@ -90,11 +90,11 @@ def _chosen(file: Path, box: Box, source: Path) -> _Part:
         part.nodes.update(refs)
     if not streets:
         raise MapError(
-            f"{source}: no street or path (highway=*) of the file lies in --bbox {_words(box)}; "
-            f"the file covers {_words(bounds)}: choose a part with streets in it"
+            f"{source}: no street or path (highway=*) of the file lies in --bbox {_box_text(box)}; "
+            f"the file covers {_box_text(bounds)}: choose a part with streets in it"
         )
     further = set[int]()
-    for relation in _of(file, "RELATION"):
+    for relation in _elements(file, "RELATION"):
         members = [member.ref for member in relation.members if member.type == "w"]
         kind = relation.tags.get("type", "")
         if (
@@ -107,7 +107,7 @@ def _chosen(file: Path, box: Box, source: Path) -> _Part:
         elif kind == "restriction" and part.ways.issuperset(members):
             part.relations.add(relation.id)
     further -= part.ways
-    for way in _of(file, "WAY") if further else ():
+    for way in _elements(file, "WAY") if further else ():
         if way.id in further:
             part.ways.add(way.id)
             part.nodes.update(node.ref for node in way.nodes)
@@ -115,7 +115,7 @@ def _chosen(file: Path, box: Box, source: Path) -> _Part:
 
 
 def _inside(file: Path, box: Box) -> tuple[set[int], Box]:
-    """The ids of the nodes in a box and its margin, and the bounds of all nodes."""
+    """Return the ids of the nodes in a box and its margin, and the bounds of all nodes."""
     west, south, east, north = box
     high = MARGIN_M / _DEGREE_M
     wide = high / max(math.cos(math.radians(0.5 * (south + north))), 0.01)
@@ -126,7 +126,7 @@ def _inside(file: Path, box: Box) -> tuple[set[int], Box]:
     low_lon = low_lat = math.inf
     high_lon = high_lat = -math.inf
     inside = set[int]()
-    for node in _of(file, "NODE"):
+    for node in _elements(file, "NODE"):
         if not node.location.valid():
             continue
         lon, lat = node.lon, node.lat
@@ -141,10 +141,10 @@ def _write(file: Path, target: Path, part: _Part) -> None:
     import osmium
 
     with osmium.SimpleWriter(str(target), overwrite=True) as writer:
-        for node in _of(file, "NODE"):
+        for node in _elements(file, "NODE"):
             if node.id in part.nodes:
                 writer.add_node(node)
-        for way in _of(file, "WAY"):
+        for way in _elements(file, "WAY"):
             if way.id in part.cuts:
                 first, last = part.cuts[way.id]
                 writer.add_way(
@@ -152,22 +152,22 @@ def _write(file: Path, target: Path, part: _Part) -> None:
                 )
             elif way.id in part.ways:
                 writer.add_way(way)
-        for relation in _of(file, "RELATION"):
+        for relation in _elements(file, "RELATION"):
             if relation.id in part.relations:
                 writer.add_relation(relation)
 
 
-def _of(file: Path, kind: str) -> Iterator[Any]:
-    """The nodes, ways or relations of a file."""
+def _elements(file: Path, kind: str) -> Iterator[Any]:
+    """Yield the nodes, ways or relations of a file."""
     import osmium
 
     things: Iterable[Any] = osmium.FileProcessor(str(file), getattr(osmium.osm, kind))
     yield from things
 
 
-def _meet(a: Box, b: Box) -> bool:
+def _overlap(a: Box, b: Box) -> bool:
     return a[0] < b[2] and a[2] > b[0] and a[1] < b[3] and a[3] > b[1]
 
 
-def _words(box: Box) -> str:
+def _box_text(box: Box) -> str:
     return ",".join(f"{side:.6g}" if abs(side) < 1000.0 else f"{side:.0f}" for side in box)

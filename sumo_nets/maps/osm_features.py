@@ -1,7 +1,7 @@
-"""What OpenStreetMap shows beside its streets: buildings, trees, lamps, land and the like, in
-degrees as mapped.
+"""Extract the features of OpenStreetMap files besides streets: buildings, trees, lamps, land and
+others, in degrees.
 
-Nothing here raises for what mappers got wrong: what cannot be understood is left out and counted.
+Errors of mappers raise nothing: unusable features are omitted and counted.
 """
 
 from __future__ import annotations
@@ -22,13 +22,17 @@ from cosim.place.street_map import LandKind
 from sumo_nets.maps.osm_file import MapFile, scanned
 
 _STOREY_M = 3.2
+"""Height of a storey, metres."""
 LOWEST_M = 2.5
+"""Smallest height of a building, metres."""
 HIGHEST_BUILDING_M = 150.0
-"""Heights of buildings are kept within these."""
+"""Largest height of a building, metres."""
 ABSURD_M = 1000.0
+"""Tagged heights above this are ignored, metres."""
 SMALLEST_DEG2 = 1e-10
+"""Smallest area of a building or a piece of land, about 1 m2, in square degrees."""
 LARGEST_DEG2 = 1e-4
-"""About 1 m2 and 1 km2: outlines beyond are no buildings."""
+"""Largest area of a building, about 1 km2, in square degrees."""
 
 STANDING: Mapping[tuple[str, str], str] = {
     ("natural", "tree"): "tree",
@@ -39,14 +43,14 @@ STANDING: Mapping[tuple[str, str], str] = {
     ("emergency", "fire_hydrant"): "hydrant",
     ("amenity", "bicycle_parking"): "rack",
 }
-"""What stands on a spot, by its tag."""
+"""Kind of a point object by its tag."""
 ROWS: Mapping[tuple[str, str], tuple[str, float]] = {
     ("natural", "tree_row"): ("tree", 8.0),
     ("barrier", "bollard"): ("bollard", 1.5),
 }
-"""Ways along which things stand: the thing, and the metres between two of them."""
+"""Kind and spacing in metres of objects along a way, by the way's tag."""
 FLAT = ("no", "roof", "ruins", "construction", "proposed", "foundation", "collapsed")
-"""Values of building=* that have no walls."""
+"""Values of building=* without walls."""
 LOW = (
     "garage",
     "garages",
@@ -59,13 +63,15 @@ LOW = (
     "bungalow",
     "greenhouse",
 )
+"""Values of building=* with one storey."""
 LEVELS_OF = {"house": 2.0, "detached": 2.0, "semidetached_house": 2.0, "terrace": 2.0}
+"""Number of storeys by the value of building=*."""
 _LEVELS = 3.0
-"""Storeys of a building of which nothing is said."""
+"""Default number of storeys."""
 SMALL_M2 = 40.0
-"""Less than this on the ground has one storey: kiosks, sheds, advertising columns."""
+"""Buildings with a smaller area have one storey: kiosks, sheds, advertising columns, m2."""
 LARGEST_LAND_DEG2 = 1e-2
-"""About 100 km2."""
+"""Largest area of a piece of land, about 100 km2, in square degrees."""
 _GREEN = (
     "grass",
     "meadow",
@@ -77,7 +83,7 @@ _GREEN = (
     "vineyard",
 )
 _SPORT = ("park", "garden", "pitch", "golf_course", "dog_park", "common", "nature_reserve")
-_OPEN: Mapping[LandKind, Mapping[str, tuple[str, ...]]] = {
+_LAND_VALUES: Mapping[LandKind, Mapping[str, tuple[str, ...]]] = {
     "lawn": {
         "landuse": (*_GREEN, "farmland", "greenfield", "plant_nursery", "greenery"),
         "leisure": _SPORT,
@@ -105,15 +111,15 @@ _OPEN: Mapping[LandKind, Mapping[str, tuple[str, ...]]] = {
 }
 LAND_OF: Mapping[tuple[str, str], LandKind] = {
     (key, value): kind
-    for kind, keys in _OPEN.items()
+    for kind, keys in _LAND_VALUES.items()
     for key, values in keys.items()
     for value in values
 }
-"""What covers a piece of land, by its tag. Squares of people on which the net does not let walk are
-yards too."""
+"""Kind of land by its tag. Pedestrian squares that are not walkable in the net are yards too."""
 _ROOFED = ("underground", "multi-storey", "rooftop", "carports", "garage_boxes", "sheds")
-"""Values of parking=* that are no open land."""
+"""Values of parking=* that are not open land."""
 METRE_DEG = 1.0 / 111_195.0
+"""Degrees of latitude per metre."""
 _NUMBER = re.compile(r"\d{1,6}(?:\.\d{1,6})?")
 WINDS = (
     "N",
@@ -136,9 +142,13 @@ WINDS = (
 
 
 class Mapped(NamedTuple):
-    """A thing as mapped. rings: (N, 2) longitudes and latitudes: of buildings and land the outline
-    and its holes, of the others one point. height_m: 0 when nothing usable is said. facing_rad: the
-    way one looks who sits on it, None when nothing is said."""
+    """A feature as mapped.
+
+    rings: (N, 2) longitudes and latitudes; outline and holes of buildings and land, one point of
+        others.
+    height_m: 0 if unknown.
+    facing_rad: viewing direction of a person seated on it, None if unknown.
+    """
 
     kind: str
     rings: tuple[Floats, ...]
@@ -148,7 +158,7 @@ class Mapped(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """Everything of a file, in its order, and what was left out: how often for which reason."""
+    """All features of a file in order, and the number of omitted ones by reason."""
 
     things: tuple[Mapped, ...]
     skipped: Mapping[str, int]
@@ -156,8 +166,12 @@ class Found:
 
 @dataclass(slots=True)
 class _Scan:
-    """One pass over a file. spots: tagged nodes; ways: node ids and tags; areas, lands:
-    multipolygons with tags of buildings, and of land."""
+    """One pass over a file.
+
+    spots: tagged nodes.
+    ways: node ids and tags.
+    areas, lands: multipolygons with tags of buildings, and of land.
+    """
 
     lonlat: dict[str, tuple[float, float]] = field(default_factory=dict)
     spots: list[tuple[str, dict[str, str]]] = field(default_factory=list)
@@ -199,7 +213,7 @@ class _Scan:
 
 
 def osm_features(file: MapFile) -> Found:
-    """What an OSM file shows beside its streets. Raises MapError when the file itself is broken."""
+    """Return the features of an OSM file. Raises MapError if the file is damaged."""
     scan = _Scan()
     scanned(file, scan)
     skipped: Counter[str] = Counter()
@@ -232,7 +246,7 @@ def _spots(scan: _Scan, skipped: Counter[str]) -> list[Mapped]:
 
 
 def _rows(scan: _Scan, skipped: Counter[str]) -> list[Mapped]:
-    """Things along ways, from end to end, evenly spaced."""
+    """Return evenly spaced objects along ways."""
     found = []
     for refs, tags in scan.ways.values():
         row = next((ROWS[pair] for pair in tags.items() if pair in ROWS), None)
@@ -267,17 +281,17 @@ def _buildings(scan: _Scan, skipped: Counter[str]) -> list[Mapped]:
             elif len(ring) < 4 or refs[0] != refs[-1]:
                 skipped["buildings with an open outline"] += 1
             else:
-                found += _built([Polygon(ring)], tags, skipped)
+                found += _building_features([Polygon(ring)], tags, skipped)
     for members, tags in scan.areas:
         if not _has_walls(tags, skipped):
             continue
         walled = _outlines(scan, members, "buildings", skipped)
-        found += _built(walled, tags, skipped)
+        found += _building_features(walled, tags, skipped)
     return found
 
 
 def _lands(scan: _Scan, skipped: Counter[str]) -> list[Mapped]:
-    """Pieces of open land. Most maps end in the middle of some: those are left out, and only
+    """Return pieces of open land. Pieces with missing nodes, common at a map's edge, are only
     counted."""
     found = []
     for refs, tags in scan.ways.values():
@@ -290,17 +304,18 @@ def _lands(scan: _Scan, skipped: Counter[str]) -> list[Mapped]:
         if ring is None:
             skipped["pieces of land with missing nodes"] += 1
         else:
-            found += _covered(kind, [Polygon(ring)], skipped)
+            found += _land_features(kind, [Polygon(ring)], skipped)
     for members, tags in scan.lands:
         kind = _land(tags)
         if kind is not None:
-            found += _covered(kind, _outlines(scan, members, "pieces of land", skipped), skipped)
+            found += _land_features(
+                kind, _outlines(scan, members, "pieces of land", skipped), skipped
+            )
     return found
 
 
 def _land(tags: Mapping[str, str]) -> LandKind | None:
-    """What covers the land of an area; None where its tags do not say, or where it lies under or
-    above the ground."""
+    """Return the kind of land of an area; None if unknown or not at ground level."""
     if tags.get("parking") in _ROOFED or tags.get("layer", "0").lstrip("-") not in ("", "0"):
         return None
     if tags.get("tunnel", "no") != "no" or tags.get("location") == "underground":
@@ -308,7 +323,7 @@ def _land(tags: Mapping[str, str]) -> LandKind | None:
     return next((LAND_OF[pair] for pair in tags.items() if pair in LAND_OF), None)
 
 
-def _covered(
+def _land_features(
     kind: LandKind, outlines: Sequence[shapely.Geometry], skipped: Counter[str]
 ) -> list[Mapped]:
     found = []
@@ -321,27 +336,26 @@ def _covered(
 
 
 def _outlines(
-    scan: _Scan, members: Sequence[tuple[str, str]], what: str, skipped: Counter[str]
+    scan: _Scan, members: Sequence[tuple[str, str]], subject: str, skipped: Counter[str]
 ) -> list[shapely.Geometry]:
-    """The areas of a multipolygon, none where they cannot be put together, which is counted."""
+    """Return the areas of a multipolygon; empty, and counted, if they cannot be assembled."""
     outer, inner = (
         _rings(scan, [ref for ref, r in members if (r == "inner") == is_in])
         for is_in in (False, True)
     )
     if not outer or inner is None:
-        skipped[f"{what} with an open outline"] += 1
+        skipped[f"{subject} with an open outline"] += 1
         return []
     try:
         holes = shapely.union_all(inner)
         return [part for o in outer for part in shapely.get_parts(shapely.difference(o, holes))]
     except shapely.errors.GEOSException:
-        skipped[f"{what} whose outline crosses itself"] += 1
+        skipped[f"{subject} whose outline crosses itself"] += 1
         return []
 
 
 def _rings(scan: _Scan, refs: Sequence[str]) -> list[Polygon] | None:
-    """The closed rings that the ways of a multipolygon make; None when a way is missing or left
-    over."""
+    """Return the closed rings of a multipolygon's ways; None if a way is missing or left over."""
     lines = []
     for ref in refs:
         points = _points(scan, scan.ways[ref][0]) if ref in scan.ways else None
@@ -356,7 +370,7 @@ def _rings(scan: _Scan, refs: Sequence[str]) -> list[Polygon] | None:
     return [Polygon(shapely.get_exterior_ring(ring)) for ring in shapely.get_parts(rings)]
 
 
-def _built(
+def _building_features(
     outlines: Sequence[shapely.Geometry], tags: Mapping[str, str], skipped: Counter[str]
 ) -> list[Mapped]:
     found = []
@@ -393,33 +407,34 @@ def _has_walls(tags: Mapping[str, str], skipped: Counter[str]) -> bool:
 
 
 def building_height_m(tags: Mapping[str, str], area_m2: float, skipped: Counter[str]) -> float:
-    """Height of a building: as said, else by its storeys, else by kind and size; within LOWEST_M
-    and HIGHEST_M."""
-    said = _height(tags, "height", skipped) or _height(tags, "building:levels", skipped) * _STOREY_M
-    if not said:
+    """Return a building's height: as tagged, else by storeys, else by kind and size, limited to
+    a plausible range."""
+    height_m = (
+        _height(tags, "height", skipped) or _height(tags, "building:levels", skipped) * _STOREY_M
+    )
+    if not height_m:
         kind = tags.get("building", "yes")
-        said = _STOREY_M * (
+        height_m = _STOREY_M * (
             1.0 if kind in LOW or area_m2 < SMALL_M2 else LEVELS_OF.get(kind, _LEVELS)
         )
-    return min(max(said, LOWEST_M), HIGHEST_BUILDING_M)
+    return min(max(height_m, LOWEST_M), HIGHEST_BUILDING_M)
 
 
 def _height(tags: Mapping[str, str], key: str, skipped: Counter[str]) -> float:
-    """What a tag says in metres or storeys; 0 when it says nothing, or nothing usable, which is
-    counted."""
+    """Return a tag's value in metres or storeys; 0 if missing or unusable, which is counted."""
     if key not in tags:
         return 0.0
-    said = metres(tags[key])
-    if said is None or not said < ABSURD_M:
+    value = metres(tags[key])
+    if value is None or not value < ABSURD_M:
         skipped["heights that cannot be read or cannot be"] += 1
         return 0.0
-    return said
+    return value
 
 
-def metres(words: str) -> float | None:
-    """A number with or without a unit of length in metres ("12", "12.5 m", "12,5", "40'", "40 ft");
-    None for others."""
-    text = words.strip().lower().replace(",", ".")
+def metres(value: str) -> float | None:
+    """Parse a length in metres or feet ("12", "12.5 m", "12,5", "40'", "40 ft"); None for other
+    text."""
+    text = value.strip().lower().replace(",", ".")
     feet = re.fullmatch(
         rf"({_NUMBER.pattern})\s*(?:'|ft|feet)(?:\s*({_NUMBER.pattern})\s*(?:\"|in))?", text
     )
@@ -430,7 +445,8 @@ def metres(words: str) -> float | None:
 
 
 def _facing(tags: Mapping[str, str]) -> float | None:
-    """The direction tag, degrees or a point of the compass, clockwise from north, as a heading."""
+    """Return the direction tag, clockwise from north in degrees or a compass point, as a heading
+    in radians."""
     text = tags.get("direction", "").strip().upper()
     if text in WINDS:
         degrees = 360.0 * WINDS.index(text) / len(WINDS)
@@ -442,7 +458,8 @@ def _facing(tags: Mapping[str, str]) -> float | None:
 
 
 def _points(scan: _Scan, refs: Sequence[str]) -> Floats | None:
-    """(N, 2) coordinates of a way; None when nodes are missing or no place on earth."""
+    """Return the coordinates (N, 2) of a way; None if nodes are missing or have invalid
+    coordinates."""
     if not all(ref in scan.lonlat for ref in refs):
         return None
     points = np.array([scan.lonlat[ref] for ref in refs], dtype=float).reshape(-1, 2)

@@ -1,8 +1,7 @@
-"""Map files as a user has them, packed or not: what they are, unpacked, and what an OSM file says
-about itself.
+"""Identify and unpack map files of users, and read facts of OpenStreetMap files.
 
-netconvert reads neither bz2 nor PBF, and says so in riddles; here every file ends as plain XML or
-as a MapError.
+netconvert reads neither bz2 nor PBF, and its errors are unclear. Here every file becomes plain XML
+or raises a MapError.
 """
 
 from __future__ import annotations
@@ -35,7 +34,9 @@ NO_STREET = frozenset(
 )
 
 MOST_LANES = 40
+"""Largest plausible number of lanes."""
 _WIDEST_M = 200
+"""Largest plausible width of a street, metres."""
 _NUMBER = re.compile(r"\d+(?:\.\d*)?(?:[eE]\+?\d+)?")
 
 Format = Literal["net", "osm"]
@@ -43,8 +44,11 @@ Format = Literal["net", "osm"]
 
 @dataclass(frozen=True, slots=True)
 class MapFile:
-    """A map as plain XML in a scratch folder. source: the file it came from. packing: "", "gzip",
-    "bzip2", "PBF"."""
+    """A map as plain XML in a scratch folder.
+
+    source: the original file.
+    packing: "", "gzip", "bzip2" or "PBF".
+    """
 
     source: Path
     path: Path
@@ -54,12 +58,13 @@ class MapFile:
 
 @dataclass(frozen=True, slots=True)
 class OsmFacts:
-    """What an OSM file holds. centre: median longitude and latitude of its nodes, degrees.
+    """Facts of an OSM file.
 
     roads, ways_on_foot: counts of highway ways.
-    tagged: ids of roads whose tags speak of their sidewalks.
-    widths: tags of roads that give widths of their sidewalks, by the roads' ids.
-    levelled: numbers of nodes of the streets and paths that may not be on the ground, by their ids.
+    centre: median longitude and latitude of its nodes, degrees.
+    tagged: ids of roads with tags on their sidewalks.
+    widths: tags of roads with widths of their sidewalks, by road id.
+    levelled: number of nodes of streets and paths that may be off the ground, by id.
     """
 
     nodes: int
@@ -74,10 +79,9 @@ class OsmFacts:
 
 
 def unpacked(source: Path, folder: Path, box: Box | None = None) -> MapFile:
-    """`source` as plain XML inside `folder`. Raises MapError naming what was found when it is no
-    map.
+    """Unpack `source` as plain XML into `folder`. Raises MapError if it is not a map.
 
-    box: of an OpenStreetMap file the part to keep, see `crop_osm`.
+    box: part of an OpenStreetMap file to crop, see `crop_osm`.
     """
     head = head_of(source)
     if not head:
@@ -116,7 +120,7 @@ def _packing(source: Path, head: bytes) -> str:
         b"7z\xbc\xaf": "a 7z archive",
         b"(\xb5/\xfd": "zstd",
     }
-    # Of what it holds nothing is repeated: a scenario's place.file may name any file of the user's.
+    # The message must not repeat content: a scenario's place.file may name any private file.
     plain = "text" if head.isascii() and b"\0" not in head else "data of no known kind"
     found = next((what for magic, what in known.items() if head.startswith(magic)), plain)
     raise MapError(
@@ -222,31 +226,31 @@ def _lonlat(node: dict[str, str]) -> tuple[float, float]:
 
 
 def _check_numbers(way: str, tags: dict[str, str]) -> None:
-    """Raises ValueError for lanes and widths that no street has: netconvert would build them for
-    ever."""
-    for key, said in tags.items():
-        words = key.split(":")
-        if words[0] == "lanes":
+    """Raise ValueError for implausible lanes and widths, on which netconvert would not
+    terminate."""
+    for key, value in tags.items():
+        parts = key.split(":")
+        if parts[0] == "lanes":
             most = MOST_LANES
-        elif "width" in (words[0], words[-1]):
+        elif "width" in (parts[0], parts[-1]):
             most = _WIDEST_M
         else:
             continue
-        if any(float(number) > most for number in _NUMBER.findall(said)):
+        if any(float(number) > most for number in _NUMBER.findall(value)):
             raise ValueError(
-                f"way {way}: {key}={said[:40]}, but no street has more than {most}: mend the tag"
+                f"way {way}: {key}={value[:40]}, but no street has more than {most}: mend the tag"
             )
 
 
 class Elements(Protocol):
-    """Takes in the elements of an OSM file, one after another."""
+    """Receiver of the elements of an OSM file."""
 
     def start(self, tag: str, attributes: dict[str, str]) -> None: ...
     def end(self, tag: str) -> None: ...
 
 
 def scanned(file: MapFile, elements: Elements) -> None:
-    """Show the elements of an OSM file. Raises MapError when it is broken."""
+    """Pass the elements of an OSM file to `elements`. Raises MapError if the file is damaged."""
     parser = expat.ParserCreate()
     parser.StartElementHandler = elements.start
     parser.EndElementHandler = elements.end
@@ -257,7 +261,7 @@ def scanned(file: MapFile, elements: Elements) -> None:
 
 
 def osm_facts(file: MapFile) -> OsmFacts:
-    """Facts of an OSM file, from one pass over it. Raises MapError when it is broken or holds no
+    """Read the facts of an OSM file in one pass. Raises MapError if it is damaged or has no
     street."""
     scan = _Scan()
     scanned(file, scan)

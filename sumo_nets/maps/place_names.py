@@ -1,8 +1,8 @@
-"""What a user may call a place: a map by its name, a folder of `city make` or `map import`, a
-street net.
+"""Resolve a user's name of a place: a map's name, a folder of `city make` or `map import`, or a net
+file.
 
-Whatever it was, it becomes a place that a scenario can name and that can be found again: a city by
-its seed, a map by its name in the store; both with the hash of their net.
+The result can be stored in a scenario: a city by its seed or a map by its name, both with the hash
+    of their net.
 """
 
 from __future__ import annotations
@@ -30,34 +30,35 @@ from sumo_nets.maps.map_store import (
     map_name,
     maps_folder,
 )
-from sumo_nets.net.net_hash import net_content_hash
+from sumo_nets.net.raw_file import net_content_hash
 
 HINT = "the folder of `cosim city make` or of an imported map, or a .net.xml file"
 
 
 class _MadeCity(msgspec.Struct):
-    """What city.json says."""
+    """Content of city.json."""
 
     city: City
     generator: int = 0
 
 
-def place_called(words: str, roughness: float = 0.0) -> Place:
-    """The place that a user calls so; nets that are not known yet are imported. roughness: of its
-    ground, 0 to 1.
+def place_called(name: str, roughness: float = 0.0) -> Place:
+    """Return the place for a name or path; unknown nets are imported.
 
-    Raises UsageError with what there is, MapError when what is there cannot be used.
+    roughness: of its ground, 0 to 1.
+
+    Raises UsageError with the valid names, MapError when a file is unusable.
     """
-    path = Path(words)
-    found: Place = CityMap(map=words, roughness=roughness)
-    if words in known_maps():
+    path = Path(name)
+    found: Place = CityMap(map=name, roughness=roughness)
+    if name in known_maps():
         return found
     if path.is_dir():
         found = _folder(path)
     elif path.exists():
         found = _file(path)
     else:
-        error = unknown("map", words, known_maps())
+        error = unknown("map", name, known_maps())
         raise UsageError(f"{error} Or give a path: {HINT}.")
     return msgspec.structs.replace(found, roughness=roughness)
 
@@ -76,7 +77,7 @@ def _folder(folder: Path) -> Place:
     if (folder / ABOUT_NAME).is_file():
         return _city(folder)
     if (folder / ABOUT).is_file():
-        return CityMap(map=_adopted(folder))
+        return CityMap(map=_copied_into_store(folder))
     raise UsageError(
         f"{folder}: a folder without {ABOUT_NAME} or {ABOUT}, so neither one of `cosim city make` "
         f"nor an imported map; give {HINT}, or the name of a map (`cosim map list`)"
@@ -84,16 +85,14 @@ def _folder(folder: Path) -> Place:
 
 
 def _city(folder: Path) -> Place:
-    """The city in a folder, as its own net says; a net that another version made, or that was
-    changed, is a map."""
+    """Return the city in a folder, or a map if its net was changed or made by another version."""
     net, about = folder / NET_NAME, folder / ABOUT_NAME
     try:
         made = msgspec.json.decode(about.read_bytes(), type=_MadeCity)
     except (OSError, ValueError, msgspec.DecodeError) as error:
         raise MapError(f"{about}: cannot be read: {error}: make the city again") from error
     if made.generator == GENERATOR and net_content_hash(net) == made.city.net_hash:
-        # Built once more where the cache has none: the folder's word alone must not come into the
-        # cache.
+        # Build the net from its seed: files of the folder must not enter the cache.
         with suppress(MapError):
             city_net(made.city)
             return made.city
@@ -101,19 +100,20 @@ def _city(folder: Path) -> Place:
 
 
 def imported_place(net: Path) -> str:
-    """The name of a map's file in the store of maps, where it is imported unless it is there."""
+    """Return the name of a net file in the store of maps, and import it if it is missing."""
     source_hash, wanted = file_hash(net), map_name(net)
     name = _free_name(
-        wanted, source_hash, lambda about: about.source_hash == source_hash and _as_it_is(about)
+        wanted,
+        source_hash,
+        lambda about: about.source_hash == source_hash and _has_default_options(about),
     )
     if not (maps_folder() / name).exists():
         import_map(net, name)
     return name
 
 
-def _adopted(folder: Path) -> str:
-    """The name of an imported map that lies in a folder of its own, in the store, where it is
-    copied to."""
+def _copied_into_store(folder: Path) -> str:
+    """Copy an imported map from a folder into the store, and return its name there."""
     try:
         about = msgspec.json.decode((folder / ABOUT).read_bytes(), type=About)
     except (OSError, ValueError, msgspec.DecodeError) as error:
@@ -143,7 +143,7 @@ def _adopted(folder: Path) -> str:
 
 
 def _free_name(wanted: str, content: str, is_same: Callable[[About], bool]) -> str:
-    """The wanted name, or one with a part of the content's hash where another map has it."""
+    """Return the wanted name, with a part of the content's hash if another map has it."""
     names = known_maps()
     for name in (
         wanted,
@@ -160,8 +160,8 @@ def _free_name(wanted: str, content: str, is_same: Callable[[About], bool]) -> s
     )
 
 
-def _as_it_is(about: About) -> bool:
-    """Whether a map was imported by this version with no options."""
+def _has_default_options(about: About) -> bool:
+    """Return whether a map was imported by this version without options."""
     plain = (
         about.bbox is None
         and about.lefthand is None

@@ -1,4 +1,4 @@
-"""Sidewalks that the importer guesses: which they are, and how wide."""
+"""Find the sidewalks that the importer guesses, and set their widths."""
 
 from __future__ import annotations
 
@@ -25,24 +25,22 @@ Street Design Guide for 2.4 to 3.7 m in business districts. Tertiary and primary
 interpolated.
 """
 WIDTH_LIMITS_M: Final = 1.0, 10.0
-"""Narrowest and widest sidewalk that can be asked for; on less than 1 m a robot and a person cannot
-pass."""
+"""Range of the width option, metres; below 1 m a robot and a person cannot pass each other."""
 _TAGGED_M: Final = 0.5, 20.0
-"""Tagged widths outside of this are ignored."""
+"""Range of plausible tagged widths, metres; others are ignored."""
 _ON_PATHS: Final = frozenset(("pedestrian", "bicycle"))
 _CLASS_OF: Final = {"trunk": "primary"}
 _CLASS = re.compile(r"highway\.([a-z]+)")
 
 
 def pavement(edge: ET.Element) -> ET.Element | None:
-    """Return the lane for walking of an edge, unless cars share it."""
+    """Return the lane of an edge for walking, unless cars share it."""
     walked = None if edge.get("function") else footway(edge)
     return None if walked is None or walked[1] == "mixed" else walked[0]
 
 
 def pavements(root: ET.Element) -> dict[str, ET.Element]:
-    """Return the lanes for walking of a net by the ids of their edges, without those that cars
-    share."""
+    """Return the lanes for walking of a net by edge id, without those that cars share."""
     return {
         edge.get("id", ""): lane
         for edge in root.iter("edge")
@@ -51,14 +49,14 @@ def pavements(root: ET.Element) -> dict[str, ET.Element]:
 
 
 def new_share(root: ET.Element, before: Collection[str]) -> float:
-    """Return the part of the sidewalks' length on edges that are not in `before`."""
+    """Return the share of the sidewalks' length on edges outside of `before`."""
     lengths_m = {name: float(lane.get("length", "0")) for name, lane in pavements(root).items()}
     new_m = sum(length_m for name, length_m in lengths_m.items() if name not in before)
     return new_m / max(sum(lengths_m.values()), 1e-9)
 
 
 def untagged_share(root: ET.Element, tagged: Collection[str]) -> float:
-    """Return the part of the walkways' length beside roads of which no OSM way is in `tagged`."""
+    """Return the share of the walkways' length along roads without an OSM way in `tagged`."""
     total_m = guessed_m = 0.0
     for edge in root.iter("edge"):
         lane = pavement(edge)
@@ -66,7 +64,7 @@ def untagged_share(root: ET.Element, tagged: Collection[str]) -> float:
             continue
         length_m = float(lane.get("length", "0"))
         total_m += length_m
-        if len(edge.findall("lane")) > 1 and not set(_ways(edge)) & set(tagged):
+        if len(edge.findall("lane")) > 1 and not set(_way_ids(edge)) & set(tagged):
             guessed_m += length_m
     return guessed_m / max(total_m, 1e-9)
 
@@ -77,13 +75,12 @@ def set_widths(
     tagged: Mapping[str, Mapping[str, str]],
     before: Collection[str] = (),
 ) -> list[str]:
-    """Set the widths of guessed sidewalks in place. Return what was changed, a sentence, or
-    nothing.
+    """Set the widths of guessed sidewalks in place. Return the change, a sentence, or nothing.
 
-    Walkways beside no lane for vehicles, or one for bicycles alone, keep their widths.
+    Walkways of edges without lanes for cars are unchanged.
 
-    widths_m: by street class; empty changes nothing.
-    tagged: tags of OSM ways that give widths of sidewalks, by the ids of the ways.
+    widths_m: by street class, metres; empty for no change.
+    tagged: tags of OSM ways with widths of sidewalks, by way id.
     before: ids of edges whose sidewalks are not guessed.
     """
     if not widths_m:
@@ -96,7 +93,7 @@ def set_widths(
         if (
             lane is None
             or edge.get("id") in before
-            or all(other is lane for other in _driven(edge))
+            or all(other is lane for other in _vehicle_lanes(edge))
         ):
             continue
         width_m = _tagged_m(edge, tagged, left_hand)
@@ -108,31 +105,30 @@ def set_widths(
         else:
             tagged_m += length_m
         lane.set("width", f"{width_m:.2f}")
-    words = [
+    parts = [
         f"{widths_m[kind]:g} m beside {kind} streets ({guessed_m[kind] / 1000.0:.1f} km)"
         for kind in STREET_WIDTHS_M
         if kind in guessed_m
     ]
     if tagged_m:
-        words.append(f"as tagged beside others ({tagged_m / 1000.0:.1f} km)")
-    return [f"sidewalks are {', '.join(words)}"] if words else []
+        parts.append(f"as tagged beside others ({tagged_m / 1000.0:.1f} km)")
+    return [f"sidewalks are {', '.join(parts)}"] if parts else []
 
 
 def street_class(edge: ET.Element) -> str:
-    """Return the class of a street, a key of STREET_WIDTHS_M: as its type says, else by its number
-    of lanes."""
+    """Return the class of a street, a key of STREET_WIDTHS_M, from its type or number of lanes."""
     for found in _CLASS.finditer(edge.get("type", "")):
         if (known := _CLASS_OF.get(found[1], found[1])) in STREET_WIDTHS_M:
             return known
     return (
         "secondary"
-        if "highway." not in edge.get("type", "") and len(_driven(edge)) > 1
+        if "highway." not in edge.get("type", "") and len(_vehicle_lanes(edge)) > 1
         else "residential"
     )
 
 
-def _driven(edge: ET.Element) -> list[ET.Element]:
-    """The lanes of an edge that are not for people and bicycles alone."""
+def _vehicle_lanes(edge: ET.Element) -> list[ET.Element]:
+    """Return the lanes of an edge that are not only for people and bicycles."""
     return [
         lane for lane in edge.findall("lane") if set(lane.get("allow", "all").split()) - _ON_PATHS
     ]
@@ -141,15 +137,14 @@ def _driven(edge: ET.Element) -> list[ET.Element]:
 def _tagged_m(
     edge: ET.Element, tagged: Mapping[str, Mapping[str, str]], left_hand: bool
 ) -> float | None:
-    """The width that the tags of an edge's ways give its sidewalk, the smallest of several; None
-    without one."""
+    """Return the smallest tagged sidewalk width of an edge's ways, metres; None without one."""
     name = edge.get("id", "")
     own = name.lstrip("-").split("#")[0]
     side = "left" if name.startswith("-") != left_hand else "right"
     found = []
-    for way in _ways(edge):
+    for way in _way_ids(edge):
         if way in tagged:
-            # In which direction an edge follows its further ways is not known.
+            # The direction of an edge along its further ways is unknown.
             sides = ("both", side) if way == own else ("both", "left", "right")
             keys = ["sidewalk:width", *(f"sidewalk:{of}:width" for of in sides)]
             known = [metres(tagged[way][key]) for key in keys if key in tagged[way]]
@@ -157,7 +152,7 @@ def _tagged_m(
     return min(found, default=None)
 
 
-def _ways(edge: ET.Element) -> list[str]:
-    """The ids of the OSM ways that an edge was made of."""
-    said = [param.get("value", "") for param in edge.iter("param") if param.get("key") == "origId"]
-    return re.findall(r"\d+", " ".join(said))
+def _way_ids(edge: ET.Element) -> list[str]:
+    """Return the ids of an edge's OSM ways."""
+    ids = [param.get("value", "") for param in edge.iter("param") if param.get("key") == "origId"]
+    return re.findall(r"\d+", " ".join(ids))

@@ -1,7 +1,6 @@
-"""Signals that let people walk never, or for too short a time.
+"""Repair signals whose crossings never have green, or too short a green.
 
-Those that never do get one more phase in which only people go; greens that are too short are
-lengthened.
+Crossings without green get an additional pedestrian phase; short greens are extended.
 """
 
 from __future__ import annotations
@@ -16,20 +15,21 @@ from sumo_nets.city.signals import ALL_RED_S, CLEARING_MPS, WALK_S, YELLOW_S
 from sumo_nets.net.net_facts import GO, crossing_links, walks_of
 
 PLAIN_TYPES = ("static", "actuated", "delay_based")
-"""Programs that run their phases in turn, so that one can be added."""
+"""Program types that run their phases in order, so that one can be added."""
 _WALK_MPS: Final = 1.2
+"""Walking speed for the required length of a green, m/s."""
 _REACTION_S: Final = 4.0
-"""A green is long enough for a person who enters the crossing within 4 s and then walks at 1.2
-m/s."""
+"""Latest start within a green for which it must suffice, seconds."""
 _SHORTEST_S: Final = 10.0
-"""Other greens are not cut below this to keep the cycle."""
+"""Other greens are not shortened below this duration, seconds."""
 _PHASE: Final = frozenset(("duration", "state", "name"))
 _LEAVING: Final = frozenset("yYuU")
+"""Letters of links that are about to stop or start."""
 
 
 def mend_signals(root: ET.Element) -> list[str]:
-    """Give every crossing that never has green a phase of its own, in place. What was changed, a
-    sentence each."""
+    """Add a phase, in place, for every crossing without green. Return the changes, a sentence
+    each."""
     never = walks_of(root).never
     links = crossing_links(root)
     lengths = {
@@ -37,34 +37,34 @@ def mend_signals(root: ET.Element) -> list[str]:
         for e in root.iter("edge")
         if e.get("id") in never and len(e)
     }
-    at: dict[str, dict[int, float]] = defaultdict(dict)
+    missing: dict[str, dict[int, float]] = defaultdict(dict)
     for crossing in never:
         signal, link = links[crossing]
-        at[signal][link] = lengths.get(crossing, 0.0)
+        missing[signal][link] = lengths.get(crossing, 0.0)
     mended, left = list[str](), list[str]()
     for logic in root.iter("tlLogic"):
-        waiting = at.get(logic.get("id", ""))
+        waiting = missing.get(logic.get("id", ""))
         if waiting:
             (mended if _add_walk(logic, waiting) else left).append(logic.get("id", ""))
-    said = []
+    changes = []
     if mended:
         names = ", ".join(dict.fromkeys(mended))
-        said.append(
+        changes.append(
             f"signals that never let people cross got a walk phase at the end of each cycle: "
             f"{names}"
         )
     if left:
         names = ", ".join(dict.fromkeys(left))
-        said.append(
+        changes.append(
             f"signals that never let people cross, left as they are (programs of a special "
             f"kind): {names}"
         )
-    return said
+    return changes
 
 
 def _add_walk(logic: ET.Element, waiting: dict[int, float]) -> bool:
-    """Append: yellow for whoever goes, all red, walk, all red until the longest crossing is
-    cleared."""
+    """Append yellow, all red, walk, and all red until the longest crossing is cleared. Return
+    success."""
     phases = logic.findall("phase")
     plain = logic.get("type", "static") in PLAIN_TYPES and not any(
         "next" in phase.attrib for phase in phases
@@ -87,14 +87,13 @@ def _add_walk(logic: ET.Element, waiting: dict[int, float]) -> bool:
 
 
 def lengthen_walks(root: ET.Element) -> list[str]:
-    """Lengthen the greens of crossings that are too short to walk, in place. Return what was
-    changed, a sentence each.
+    """Extend too short greens of crossings, in place. Return the changes, a sentence each.
 
-    Phases keep their states, so what may go together stays the same. Seconds are taken from long
-    phases of the same program where there are any; else the cycle gets longer. Only fixed programs
-    are changed.
+    Phases and their states are unchanged, so no conflict is added. Seconds are taken from long
+    phases of the same program if possible; otherwise the cycle gets longer. Only fixed programs are
+    changed.
     """
-    needs = _needs_s(root)
+    needs = _required_green_s(root)
     switched = any(element.tag.startswith("WAUT") for element in root)
     programs: dict[str, list[ET.Element]] = defaultdict(list)
     for logic in root.iter("tlLogic"):
@@ -106,7 +105,7 @@ def lengthen_walks(root: ET.Element) -> list[str]:
     longest_s = 0.0
     for signal, wanted in needs.items():
         plans = [(logic, _durations_s(logic)) for logic in programs[signal]]
-        short = {link for logic, _ in plans for link in _short(logic, wanted)}
+        short = {link for logic, _ in plans for link in _short_links(logic, wanted)}
         if not short:
             continue
         made = (
@@ -126,7 +125,7 @@ def lengthen_walks(root: ET.Element) -> list[str]:
             )
         changed.append(signal)
         crossings += len(short)
-    said = []
+    changes = []
     if changed:
         longer = [more for more in grown if more > 0.0]
         cycles = (
@@ -134,21 +133,21 @@ def lengthen_walks(root: ET.Element) -> list[str]:
             if longer
             else "no cycle is longer"
         )
-        said.append(
+        changes.append(
             f"green too short to walk at {_WALK_MPS:g} m/s after {_REACTION_S:g} s: longer for "
             f"{crossings} crossings of {len(changed)} signals, by up to {longest_s:g} s; {cycles}"
         )
     if left:
         names = ", ".join(left[:4]) + (" ..." if len(left) > 4 else "")
-        said.append(
+        changes.append(
             f"green too short to walk at {len(left)} signals, left as it is (not a fixed "
             f"program): {names}"
         )
-    return said
+    return changes
 
 
-def _needs_s(root: ET.Element) -> dict[str, dict[int, float]]:
-    """For each signal the seconds of green that each of its crossings needs, by link."""
+def _required_green_s(root: ET.Element) -> dict[str, dict[int, float]]:
+    """Return the seconds of green that each crossing needs, by signal and link."""
     lengths_m = {
         e.get("id", ""): float(e[0].get("length", "0")) for e in root.iter("edge") if len(e)
     }
@@ -160,7 +159,7 @@ def _needs_s(root: ET.Element) -> dict[str, dict[int, float]]:
 
 
 def _durations_s(logic: ET.Element) -> list[float] | None:
-    """The durations of a program that runs by the clock alone; None for any other."""
+    """Return the durations of a fixed program, seconds; None for others."""
     phases = logic.findall("phase")
     states = {len(phase.get("state", "")) for phase in phases}
     if (
@@ -178,9 +177,8 @@ def _durations_s(logic: ET.Element) -> list[float] | None:
     return durations if all(0.0 <= d < math.inf for d in durations) else None
 
 
-def _short(logic: ET.Element, wanted: Mapping[int, float]) -> list[int]:
-    """The links of a program that have a green which is too short, as far as durations can be
-    read."""
+def _short_links(logic: ET.Element, wanted: Mapping[int, float]) -> list[int]:
+    """Return the links of a program with too short a green, as far as durations can be read."""
     phases = logic.findall("phase")
     try:
         durations = [float(phase.get("duration", "")) for phase in phases]
@@ -195,8 +193,7 @@ def _short(logic: ET.Element, wanted: Mapping[int, float]) -> list[int]:
 
 
 def _greens(states: list[str], link: int) -> list[list[int]]:
-    """The greens of a link: the phases of each, in their order round the cycle. None where it
-    always has green."""
+    """Return the phases of each green of a link, in cyclic order; empty for permanent green."""
     shown = [link < len(state) and state[link] in GO for state in states]
     if all(shown):
         return []
@@ -213,7 +210,7 @@ def _greens(states: list[str], link: int) -> list[list[int]]:
 def _lengthened(
     logic: ET.Element, durations: list[float], wanted: Mapping[int, float]
 ) -> list[float] | None:
-    """The durations with which every green is long enough; None when one cannot be lengthened."""
+    """Return durations with sufficient greens; None if a green cannot be extended."""
     states = [phase.get("state", "") for phase in logic.findall("phase")]
     runs = [(run, need_s) for link, need_s in wanted.items() for run in _greens(states, link)]
     after = list(durations)

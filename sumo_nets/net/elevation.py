@@ -1,4 +1,4 @@
-"""Elevations of a net as a clean Terrain, or none if they are implausible."""
+"""Build a Terrain from the elevations of a net, or reject implausible elevations."""
 
 from __future__ import annotations
 
@@ -26,12 +26,50 @@ from cosim.place.terrain import (
 )
 
 SAME_LEVEL_M: Final = 1.5
-"""Places side by side that differ by more are on different terraces."""
+"""Adjacent places whose heights differ by more, in metres, are on different terraces."""
+
+GROUND: Final = ("no", "", "building_passage")
+"""Values of the params `bridge` and `tunnel` for ways on the ground."""
 
 _SPACING_M = 4.0
-_BESIDE_M = 5.0
+"""Distance between the points of a Profile along a course, metres."""
+_JOIN_M = 5.0
+"""Points of courses closer than this, in metres, and on one level are joined."""
 _ROUNDS = 300
+"""Maximum number of relaxation rounds in `clamped`."""
 _NEAR_M = 1e-6
+"""Height change, in metres, below which `_lowered` has converged."""
+_SAMPLE_M: Final = 2.0
+"""Spacing of the terrain lattice, metres."""
+NODES_MAX: Final = 6_000_000
+"""Maximum number of lattice points; larger places get a coarser lattice."""
+_MARGIN_M: Final = 80.0
+"""Width of the terrain beyond the net, metres."""
+KNOWN_SHARE: Final = 0.5
+"""Elevations are dropped if a smaller share of the points has a plausible one."""
+FALSE_SHARE: Final = 0.15
+"""Elevations are dropped if a larger share of the streets' length is steeper than FALSE_GRADE."""
+DEEPEST_M: Final = -450.0
+"""Lowest plausible elevation of a street, metres."""
+HIGHEST_M: Final = 5500.0
+"""Highest plausible elevation of a street, metres."""
+
+_SPIKE_M = 3.0
+"""A single point that differs by more from both neighbours, in metres, is a false elevation."""
+_STEP_M = 0.5
+"""Tolerance on the height difference to a zero elevation, metres."""
+_ZERO_REACH_M = 12.0
+"""Zero elevations are compared with nonzero ones within this distance, metres."""
+_SIGMA_M = 4.0
+"""Standard deviation of the Gaussian weights of the terrain, metres."""
+_REACH_M = 12.0
+"""The terrain follows the profile within this distance, metres."""
+_KERB_M = 6.0
+"""Within this distance of a street, in metres, the terrain follows streets only."""
+_NEIGHBOURS = 24
+"""Number of profile points that a lattice point averages."""
+_FILL_ROUNDS = 40
+"""Number of smoothing passes over the land between streets."""
 
 _Ints = NDArray[np.intp]
 On = Literal["street", "path", "steps", "raised"]
@@ -39,9 +77,13 @@ On = Literal["street", "path", "steps", "raised"]
 
 @dataclass(frozen=True, slots=True)
 class Course:
-    """A line of a net with elevations. points: (N, 3) metres, NaN where the third is missing; on:
-    what lies there, "path" where nothing drives, "raised" for bridges and tunnels; ring: whether it
-    is the outline of a walking area; edge: SUMO edge id."""
+    """A polyline of a net with elevations.
+
+    edge: SUMO edge id.
+    points: (N, 3) metres, NaN for a missing elevation.
+    on: kind of ground; "path" without vehicles, "raised" for bridges and tunnels.
+    ring: whether it is the outline of a walking area.
+    """
 
     edge: str
     points: Floats
@@ -50,27 +92,39 @@ class Course:
 
 
 class Meeting(NamedTuple):
-    """A walking area: the number of its outline among the courses, and its ports: the number of a
-    course, and 0 for the start of its line or 1 for its end."""
+    """A walking area and the courses that end at it.
+
+    ring: index of its outline among the courses.
+    ports: index of a course, and 0 for the start of its line or 1 for its end.
+    """
 
     ring: int
     ports: tuple[tuple[int, int], ...]
 
 
 def course(edge: str, shape: str, on: On = "street", ring: bool = False) -> Course:
-    """A shape of points "x,y" and "x,y,z" in any mixture: netconvert leaves an elevation of 0 away,
-    and writes 0 where it knows none."""
+    """Parse a shape of points "x,y" and "x,y,z", in any mixture.
+
+    netconvert omits an elevation of 0, and writes 0 for an unknown one.
+    """
     rows = [[float(value) for value in point.split(",")] for point in shape.split()]
     points = np.array([[*row[:2], row[2] if len(row) > 2 else 0.0] for row in rows])
     return Course(edge, points, on, ring)
 
 
+def off_ground(params: Mapping[str, str], kind: str) -> bool:
+    """Return whether the params or the type of an edge say that it is a bridge or a tunnel."""
+    if any(params.get(key, "no") not in GROUND for key in ("bridge", "tunnel")):
+        return True
+    return params.get("layer", "0") not in ("0", "") or kind.endswith(("_bridge", "_tunnel"))
+
+
 def what_lies_there(kind: str, params: Mapping[str, str], apart: bool) -> On:
-    """What an edge leads over, as far as its type and params say. apart: nothing drives there."""
-    raised = any(
-        params.get(key, "no") not in ("no", "", "building_passage") for key in ("bridge", "tunnel")
-    )
-    if raised or params.get("layer", "0") not in ("0", "") or kind.endswith(("_bridge", "_tunnel")):
+    """Return the kind of ground under an edge, from its type and params.
+
+    apart: whether no vehicles drive on it.
+    """
+    if off_ground(params, kind):
         return "raised"
     if "steps" in kind:
         return "steps"
@@ -79,11 +133,14 @@ def what_lies_there(kind: str, params: Mapping[str, str], apart: bool) -> On:
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """Points every few metres along all courses, joined where one can walk or drive from one to the
-    other.
+    """Points every few metres along all courses, and joints between points that are connected by a
+    walk or a drive.
 
-    xy: (N, 2); z: (N,) heights; street: (N,) whether WALK_GRADE_MAX holds there; tail, head, run_m:
-    (E,) the joints.
+    xy: (N, 2) metres.
+    z: (N,) heights, metres.
+    street: (N,) whether WALK_GRADE_MAX applies.
+    tail, head: (E,) indices of the points of each joint.
+    run_m: (E,) horizontal lengths of the joints.
     """
 
     xy: Floats
@@ -101,7 +158,7 @@ class Profile:
         first = [0]
         streets: list[NDArray[np.bool_]] = []
         for c in courses:
-            points = _dense(c)
+            points = _resampled(c)
             start = first[-1]
             n = len(points)
             rows.append(points)
@@ -112,7 +169,7 @@ class Profile:
                 heads.append(start + np.arange(1, n))
         at = np.concatenate(rows)
         tree = cKDTree(at[:, :2])
-        pairs = tree.query_pairs(_BESIDE_M, output_type="ndarray")
+        pairs = tree.query_pairs(_JOIN_M, output_type="ndarray")
         near = np.abs(at[pairs[:, 0], 2] - at[pairs[:, 1], 2]) <= SAME_LEVEL_M
         tails.append(pairs[near, 0])
         heads.append(pairs[near, 1])
@@ -137,17 +194,17 @@ class Profile:
         return cls(at[:, :2], at[:, 2], street, tail, head, run)
 
     def clamped(self) -> Floats:
-        """(N,) heights with no joint on streets steeper than WALK_GRADE_MAX."""
+        """Return (N,) heights with no joint on streets steeper than WALK_GRADE_MAX."""
         return clamped(self.z, self.tail, self.head, WALK_GRADE_MAX * self.run_m)
 
 
 def clamped(z_m: Floats, tail: _Ints, head: _Ints, most_m: Floats) -> Floats:
-    """Heights near (N,) `z_m` of which those of `tail` and `head`, (E,) numbers, differ by (E,)
-    `most_m` at most.
+    """Return heights near `z_m` (N,) that differ by at most `most_m` (E,) between `tail` and `head`
+    (E,).
 
-    First every joint that is too steep pulls its ends together, many times, which takes narrow
-    faults away where they are. What is left is put half way between the highest heights below and
-    the lowest above that keep the bounds.
+    First, every joint that is too steep pulls its ends together, which removes narrow faults
+    locally. The rest is set half way between the highest heights below and the lowest above that
+    satisfy the bounds.
     """
     z = z_m.copy()
     count = len(z_m)
@@ -162,7 +219,7 @@ def clamped(z_m: Floats, tail: _Ints, head: _Ints, most_m: Floats) -> Floats:
 
 
 def _lowered(z_m: Floats, tail: _Ints, head: _Ints, most_m: Floats) -> Floats:
-    """The highest heights not above `z_m` that keep the bounds."""
+    """Return the highest heights at most `z_m` that satisfy the bounds."""
     z = z_m.copy()
     while True:
         before = z.copy()
@@ -172,52 +229,29 @@ def _lowered(z_m: Floats, tail: _Ints, head: _Ints, most_m: Floats) -> Floats:
             return z
 
 
-def _dense(c: Course) -> Floats:
-    """(N, 3) points of a course every few metres, missing elevations between known ones
-    interpolated; none at all where no point has one."""
+def _resampled(c: Course) -> Floats:
+    """Resample a course every few metres, (N, 3), with missing elevations interpolated.
+
+    Returns no points for a course without any elevation.
+    """
     known = np.isfinite(c.points[:, 2])
     if not known.any():
         return np.zeros((0, 3))
     at = metres_along(c.points)
     count = max(int(np.ceil(at[-1] / _SPACING_M)), 1)
-    s = (
-        np.unique(np.concatenate([np.linspace(0.0, at[-1], count + 1)]))
-        if at[-1] > 0.0
-        else np.zeros(1)
-    )
+    s = np.linspace(0.0, at[-1], count + 1) if at[-1] > 0.0 else np.zeros(1)
     columns = [np.interp(s, at, c.points[:, k]) for k in (0, 1)]
     return np.column_stack([*columns, np.interp(s, at[known], c.points[known, 2])])
 
 
 def metres_along(points: Floats) -> Floats:
-    """(N,) metres from the first of (N, 2) points or more columns, level."""
+    """Return the horizontal arc lengths (N,) of (N, 2) points, metres; further columns are
+    ignored."""
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points[:, :2], axis=0).T))])
 
 
-_SAMPLE_M: Final = 2.0
-NODES_MAX: Final = 6_000_000
-"""Larger places get a coarser lattice."""
-_MARGIN_M: Final = 80.0
-KNOWN_SHARE: Final = 0.5
-"""With fewer of the points known, an elevation is a guess."""
-FALSE_SHARE: Final = 0.15
-"""With more of the streets' length beyond FALSE_GRADE, the elevation is false as a whole."""
-DEEPEST_M: Final = -450.0
-HIGHEST_M: Final = 5500.0
-"""No street on Earth lies lower or higher."""
-
-_SPIKE_M = 3.0
-_STEP_M = 0.5
-_BESIDE_M_ELEVATION = 12.0
-_SIGMA_M = 4.0
-_REACH_M = 12.0
-_KERB_M = 6.0
-_NEIGHBOURS = 24
-_FILL_ROUNDS = 40
-
-
 class NetEdge(Protocol):
-    """An edge as it is in a net: its attributes, those of its lanes, and its params."""
+    """An edge of a net: its attributes, those of its lanes, and its params."""
 
     attributes: dict[str, str]
     lanes: list[dict[str, str]]
@@ -230,11 +264,13 @@ def land_of(
     walked: Mapping[str, int],
     ports: Mapping[tuple[str, int], str],
 ) -> tuple[Terrain | None, Elevation | None]:
-    """The land of a net as `surveyed` finds it; of bridges and tunnels only those count that one
-    can walk on.
+    """Return the terrain of a net and a report on its elevations, see `surveyed`.
 
-    apart: edges on which nothing drives. walked: edges with a strip, and the number of its lane.
-    ports: the walking area at an end, 0 or 1, of a strip.
+    Bridges and tunnels count only if they have a walkway.
+
+    apart: edges without vehicles.
+    walked: edges with a strip, and the index of its lane.
+    ports: walking area at end 0 or 1 of a strip.
     """
     outer = [edge for edge in edges if edge.lanes and edge.attributes.get("function") != "internal"]
     if not any(
@@ -268,10 +304,10 @@ def land_of(
 def surveyed(
     courses: Sequence[Course], meets: Sequence[Meeting] = ()
 ) -> tuple[Terrain | None, Elevation | None]:
-    """The land under the lines of a net, and what was done to its elevations; None and None without
-    any.
+    """Return the terrain under the courses of a net and a report on its elevations, or None and
+    None.
 
-    meets: where courses join, whatever their elevations say.
+    meets: places where courses join, regardless of their elevations.
     """
     heights = np.concatenate([c.points[:, 2] for c in courses]) if courses else np.zeros(0)
     heights = np.where((heights < DEEPEST_M) | (heights > HIGHEST_M), np.nan, heights)
@@ -304,15 +340,15 @@ def surveyed(
     nodes = Profile.of(filled, meets)
     level = nodes.clamped()
     moved = np.abs(level - nodes.z)[nodes.street]
-    terrain = _spread(nodes, level)
+    terrain = _terrain(nodes, level)
     return terrain, replace(
         found, clamped=int((moved > CLAMPED_M).sum()), moved_m=float(moved.max(initial=0.0))
     )
 
 
 def steep_strips(terrain: Terrain, strips: Sequence[Strip]) -> tuple[str, ...]:
-    """Ids of the strips with a spot steeper than ROBOT_GRADE_MAX, at their middle line or near
-    either side."""
+    """Return the ids of strips steeper than ROBOT_GRADE_MAX anywhere on their middle line or
+    near their sides."""
     half = [0.4 * strip.width_m for strip in strips]
     found = _steep(terrain, [strip.line for strip in strips], half)
     return tuple(strip.id for strip, is_steep in zip(strips, found, strict=True) if is_steep)
@@ -321,8 +357,11 @@ def steep_strips(terrain: Terrain, strips: Sequence[Strip]) -> tuple[str, ...]:
 def steep_ports(
     terrain: Terrain, strips: Mapping[str, Strip], corners: Iterable[Corner], steep: Collection[str]
 ) -> tuple[tuple[str, int], ...]:
-    """Ports, strip and end, to close so that no straight way across a corner is too steep: the
-    worst ones first."""
+    """Return the ports, strip and end, to close so that no straight way across a corner is too
+    steep.
+
+    The port with the most steep ways is closed first.
+    """
     met = [
         [port for port in dict.fromkeys(corner.ports) if port.strip not in steep]
         for corner in corners
@@ -347,7 +386,8 @@ def steep_ports(
 
 
 def _steep(terrain: Terrain, lines: Sequence[Floats], half_m: Sequence[float]) -> NDArray[np.bool_]:
-    """(N,) which lines have a spot steeper than ROBOT_GRADE_MAX on them or `half_m` beside them."""
+    """Return (N,) whether a line is steeper than ROBOT_GRADE_MAX anywhere on it or `half_m` to
+    its sides."""
     owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
     at, owner = shapely.get_coordinates(
         shapely.segmentize(shapely.linestrings(np.concatenate(lines), indices=owner), 1.0),
@@ -355,11 +395,11 @@ def _steep(terrain: Terrain, lines: Sequence[Floats], half_m: Sequence[float]) -
     )
     same = owner[1:] == owner[:-1]
     middle = (0.5 * (at[1:] + at[:-1]))[same]
-    metres_along = np.diff(at, axis=0)[same]
+    direction = np.diff(at, axis=0)[same]
     owner = owner[1:][same]
-    metres_along /= np.maximum(np.hypot(*metres_along.T), 1e-9)[:, None]
+    direction /= np.maximum(np.hypot(*direction.T), 1e-9)[:, None]
     aside = np.asarray(half_m)[owner][:, None] * np.column_stack(
-        [-metres_along[:, 1], metres_along[:, 0]]
+        [-direction[:, 1], direction[:, 0]]
     )
     steep = [
         np.hypot(*terrain.gradient(middle + k * aside).T) > ROBOT_GRADE_MAX for k in (-1, 0, 1)
@@ -368,8 +408,8 @@ def _steep(terrain: Terrain, lines: Sequence[Floats], half_m: Sequence[float]) -
 
 
 def false_share(courses: Sequence[Course]) -> float:
-    """Part of the streets' length, steps, bridges and tunnels apart, that is steeper than
-    FALSE_GRADE."""
+    """Return the share of the streets' length that is steeper than FALSE_GRADE, without steps
+    and bridges."""
     total = false = 0.0
     for c in courses:
         if c.on == "street" and not c.ring:
@@ -382,45 +422,45 @@ def false_share(courses: Sequence[Course]) -> float:
 
 
 def _without_false_points(courses: Sequence[Course], heights: Floats) -> list[Course]:
-    """The courses with NaN for each elevation that cannot be: zeros beside heights, and single
+    """Return the courses with NaN for false elevations: zeros next to heights, and single
     spikes."""
     ends = np.cumsum([len(c.points) for c in courses])[:-1]
     every = np.column_stack([np.concatenate([c.points[:, :2] for c in courses]), heights])
     high = every[np.isfinite(heights) & (heights != 0.0)]
-    gap, nearest = cKDTree(high[:, :2]).query(
-        every[:, :2], distance_upper_bound=_BESIDE_M_ELEVATION
-    )
-    beside = high[np.minimum(nearest, len(high) - 1), 2]
-    every[(heights == 0.0) & (np.abs(beside) > FALSE_GRADE * gap + _STEP_M), 2] = np.nan
+    gap, nearest = cKDTree(high[:, :2]).query(every[:, :2], distance_upper_bound=_ZERO_REACH_M)
+    reference_m = high[np.minimum(nearest, len(high) - 1), 2]
+    every[(heights == 0.0) & (np.abs(reference_m) > FALSE_GRADE * gap + _STEP_M), 2] = np.nan
     out = []
     for c, points in zip(courses, np.split(every, ends), strict=True):
         if c.ring and not np.nan_to_num(points[:, 2]).any():
-            # Corners mended on import have lost their elevations, and others say no more than the
-            # streets they join.
+            # Corners repaired on import have lost their elevations; the streets provide them.
             points[:, 2] = np.nan
         _drop_zeros(points)
         _drop_spikes(points)
         on: On = (
-            c.on if c.on != "path" else "steps" if _climb(points) > ROBOT_GRADE_MAX else "street"
+            c.on
+            if c.on != "path"
+            else "steps"
+            if _mean_grade(points) > ROBOT_GRADE_MAX
+            else "street"
         )
         out.append(Course(c.edge, points, on, c.ring))
     return out
 
 
 def _drop_zeros(points: Floats) -> None:
-    """Take away zeros that no street can come down to from the heights before and after them, in
-    place."""
+    """Set zeros to NaN, in place, that are too far below the elevations along the same course."""
     zero = points[:, 2] == 0.0
     high = ~zero & np.isfinite(points[:, 2])
     if zero.any() and high.any():
         at = metres_along(points)
-        beside = np.abs(np.interp(at[zero], at[high], points[high, 2]))
+        reference_m = np.abs(np.interp(at[zero], at[high], points[high, 2]))
         gap = np.abs(at[zero][:, None] - at[high][None]).min(axis=1)
-        points[np.flatnonzero(zero)[beside > FALSE_GRADE * gap + _STEP_M], 2] = np.nan
+        points[np.flatnonzero(zero)[reference_m > FALSE_GRADE * gap + _STEP_M], 2] = np.nan
 
 
 def _drop_spikes(points: Floats) -> None:
-    """Take away single points that stand out from both neighbours, in place."""
+    """Set single points to NaN, in place, that differ strongly from both neighbours."""
     known = np.flatnonzero(np.isfinite(points[:, 2]))
     if len(known) < 3:
         return
@@ -436,15 +476,15 @@ def _drop_spikes(points: Floats) -> None:
     points[known[1:-1][spikes], 2] = np.nan
 
 
-def _climb(points: Floats) -> float:
-    """All that a line rises and falls, for each metre of its length."""
+def _mean_grade(points: Floats) -> float:
+    """Return the total rise and fall of a line per metre of its length."""
     known = points[np.isfinite(points[:, 2])]
     run = float(metres_along(known)[-1]) if len(known) else 0.0
     return float(np.abs(np.diff(known[:, 2])).sum()) / run if run > 0.0 else 0.0
 
 
-def _spread(nodes: Profile, level: Floats) -> Terrain:
-    """The land: around streets at their heights, level across them; smooth between."""
+def _terrain(nodes: Profile, level: Floats) -> Terrain:
+    """Build the terrain: flat across streets at their heights, smooth between them."""
     low = nodes.xy.min(axis=0) - _MARGIN_M
     high = nodes.xy.max(axis=0) + _MARGIN_M
     step_m = _SAMPLE_M
@@ -455,10 +495,10 @@ def _spread(nodes: Profile, level: Floats) -> Terrain:
     x, y = origin[0] + step_m * np.arange(columns), origin[1] + step_m * np.arange(rows)
     grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
     surface = np.full(len(grid), np.nan)
-    # Steps end at streets: there the street's height holds.
+    # Where steps end at a street, the street's height applies.
     for which, reach_m in ((nodes.street, _KERB_M), (np.ones(len(level), dtype=bool), _REACH_M)):
         free = np.flatnonzero(np.isnan(surface))
-        surface[free] = _around(grid[free], nodes.xy[which], level[which], reach_m)
+        surface[free] = _mean_heights(grid[free], nodes.xy[which], level[which], reach_m)
     land: Floats = surface.reshape(rows, columns)
     open_land = ~np.isfinite(land)
     _, (j, i) = distance_transform_edt(open_land, return_indices=True)
@@ -471,9 +511,12 @@ def _spread(nodes: Profile, level: Floats) -> Terrain:
     return Terrain(float(origin[0]), float(origin[1]), step_m, heights, datum)
 
 
-def _around(grid: Floats, xy: Floats, level: Floats, reach_m: float) -> Floats:
-    """(N,) heights at points of the lattice: the mean around of what lies level with the nearest
-    node; NaN beyond reach. A terrace beside a street does not count, however near."""
+def _mean_heights(grid: Floats, xy: Floats, level: Floats, reach_m: float) -> Floats:
+    """Return (N,) heights at lattice points: a weighted mean of the nodes on the level of the
+    nearest one.
+
+    The result is NaN beyond `reach_m`. Nodes on another terrace are ignored.
+    """
     out = np.full(len(grid), np.nan)
     if not len(xy):
         return out

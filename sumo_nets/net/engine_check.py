@@ -1,5 +1,5 @@
-"""SUMO and netconvert by themselves, on a crossroads that is written out here: what comes out hangs
-on them alone."""
+"""Reference run of netconvert and SUMO on a fixed crossroads, to compare their results between
+machines."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import numpy as np
 
 from sumo_nets import engine
 from sumo_nets.engine import sumo
-from sumo_nets.net.net_hash import net_content_hash
 from sumo_nets.net.netconvert import netconvert
+from sumo_nets.net.raw_file import net_content_hash
 
 _SECONDS: Final = 60
 _NODES: Final = """<nodes>
@@ -38,8 +38,10 @@ _DEMAND: Final = "<routes>{}</routes>".format(
 
 
 def sumo_alone() -> dict[str, str]:
-    """What netconvert makes of the crossroads, and where SUMO has walkers and vehicles on it, as
-    hashes. No other SUMO may run in this process."""
+    """Return hashes of netconvert's net and of SUMO's traffic on the fixed crossroads.
+
+    No other SUMO may run in this process.
+    """
     with tempfile.TemporaryDirectory() as folder:
         parts = {name: Path(folder) / f"c.{name}.xml" for name in ("nod", "edg", "rou", "net")}
         for name, text in (("nod", _NODES), ("edg", _EDGES), ("rou", _DEMAND)):
@@ -68,11 +70,11 @@ def sumo_alone() -> dict[str, str]:
         try:
             for _ in range(2 * _SECONDS):
                 sumo.simulationStep()
-                everybody = (
+                traffic = (
                     engine.vehicles_near(0.0, 0.0, 1e3),
                     engine.persons_near(0.0, 0.0, 1e3, _WALKERS),
                 )
-                for one in everybody:
+                for one in traffic:
                     seen.update(
                         "".join(one.names).encode() + np.column_stack([one.xy, one.mps]).tobytes()
                     )

@@ -1,5 +1,5 @@
-"""What a SUMO net says beyond its StreetMap: elevations, levels, signals without walk, lanes shared
-with cars."""
+"""Facts of a SUMO net beyond its StreetMap: elevations, levels, signals without green, lanes
+shared with cars."""
 
 from __future__ import annotations
 
@@ -17,14 +17,17 @@ import shapely
 from cosim.core.errors import MapError
 from cosim.place.map_check import STEEP, NetFacts
 from cosim.place.terrain import FALSE_GRADE
-from sumo_nets.net.net_file import going_on
+from sumo_nets.net.elevation import off_ground
+from sumo_nets.net.net_file import allows
 from sumo_nets.net.raw_file import net_bytes, other_root
 
 GO = frozenset("Gg")
+"""Letters of signal states in which a link may go."""
 
 
 def read_facts(path: Path) -> NetFacts:
-    """The facts of a .net.xml or .net.xml.gz. Raises MapError naming the file and the reason."""
+    """Return the facts of a .net.xml or .net.xml.gz. Raises MapError naming the file and the
+    reason."""
     root = net_root(path)
     try:
         return facts_of(root)
@@ -37,7 +40,7 @@ def read_facts(path: Path) -> NetFacts:
 
 
 def net_root(path: Path) -> ET.Element:
-    """The <net> element of a net on disk."""
+    """Parse a net and return its <net> element."""
     data = net_bytes(path)
     try:
         root = ET.fromstring(data)
@@ -48,20 +51,11 @@ def net_root(path: Path) -> ET.Element:
     return root
 
 
-def allows(lane: ET.Element, vehicle: str) -> bool:
-    """Whether a lane lets a class of road users in."""
-    allow = lane.get("allow")
-    disallow = lane.get("disallow", "")
-    if allow is not None:
-        return allow == "all" or vehicle in allow.split()
-    return disallow != "all" and vehicle not in disallow.split()
-
-
 def footway(edge: ET.Element) -> tuple[ET.Element, str] | None:
-    """The lane of an edge that people walk on, and its kind: pavement, shared with bicycles, mixed
-    with cars."""
-    walked = [lane for lane in edge.iter("lane") if allows(lane, "pedestrian")]
-    apart = next((lane for lane in walked if not allows(lane, "passenger")), None)
+    """Return the lane of an edge for walking, and its kind: "pavement", "shared" with bicycles
+    or "mixed" with cars."""
+    walked = [lane for lane in edge.iter("lane") if allows(lane.attrib, "pedestrian")]
+    apart = next((lane for lane in walked if not allows(lane.attrib, "passenger")), None)
     if apart is not None:
         return apart, "pavement" if apart.get("allow") == "pedestrian" else "shared"
     return (walked[0], "mixed") if walked else None
@@ -69,8 +63,8 @@ def footway(edge: ET.Element) -> tuple[ET.Element, str] | None:
 
 @dataclass(slots=True)
 class _Walks:
-    """Signals of the crossings: never and always green, beyond the end of the program, without a
-    program."""
+    """Crossings by their signals: never green, always green, link beyond the program; and
+    signals without a program."""
 
     never: list[str] = field(default_factory=list)
     always: list[str] = field(default_factory=list)
@@ -79,7 +73,7 @@ class _Walks:
 
 
 def walks_of(root: ET.Element) -> _Walks:
-    """What the signals in use (the last program of each) show the crossings."""
+    """Classify the crossings of a net by the active signal programs (the last of each signal)."""
     programs = {logic.get("id", ""): logic for logic in root.iter("tlLogic")}
     walks = _Walks()
     for crossing, (signal, link) in crossing_links(root).items():
@@ -100,7 +94,7 @@ def walks_of(root: ET.Element) -> _Walks:
 
 
 def crossing_links(root: ET.Element) -> dict[str, tuple[str, int]]:
-    """The traffic light and link index of each signalised crossing."""
+    """Return the traffic light and link index of each signalised crossing."""
     crossings = {e.get("id", "") for e in root.iter("edge") if e.get("function") == "crossing"}
     links = {}
     for link in root.iter("connection"):
@@ -111,8 +105,8 @@ def crossing_links(root: ET.Element) -> dict[str, tuple[str, int]]:
 
 
 def facts_of(root: ET.Element) -> NetFacts:
-    """The facts of a parsed net. Raises KeyError or ValueError when attributes are missing or of
-    the wrong type."""
+    """Return the facts of a parsed net. Raises KeyError or ValueError for missing or wrong
+    attributes."""
     km: dict[str, float] = defaultdict(float)
     normal = areas = crossings = missing = twisted = steep = false_grades = 0
     heights: list[float] = []
@@ -141,7 +135,7 @@ def facts_of(root: ET.Element) -> NetFacts:
             grade = _steepest(lane.attrib["shape"])
             steep += grade > STEEP
             false_grades += grade > FALSE_GRADE
-            if _off_ground(edge):
+            if off_ground(params_of(edge), edge.get("type", "")):
                 levels[edge.attrib["id"]] = length_m / 1000.0
     walks = walks_of(root)
     location = root.find("location")
@@ -171,14 +165,14 @@ def facts_of(root: ET.Element) -> NetFacts:
 
 
 @contextmanager
-def _about(what: str) -> Iterator[None]:
-    """What is wrong is told with what it is about."""
+def _about(subject: str) -> Iterator[None]:
+    """Add `subject` to the message of an error raised inside."""
     try:
         yield
     except KeyError as error:
-        raise ValueError(f"{what}: attribute {error} is missing") from error
+        raise ValueError(f"{subject}: attribute {error} is missing") from error
     except ValueError as error:
-        raise ValueError(f"{what}: {error}") from error
+        raise ValueError(f"{subject}: {error}") from error
 
 
 def _points(shape: str) -> list[list[float]]:
@@ -191,8 +185,8 @@ def _twisted(shape: str) -> bool:
 
 
 def _steepest(shape: str) -> float:
-    """The largest grade between two points of a lane that both have an elevation and are 1 m apart
-    or more."""
+    """Return the largest grade between successive points of a lane that have elevations and are
+    at least 1 m apart."""
     grades = [0.0]
     for a, b in pairwise(_points(shape)):
         if len(a) > 2 and len(b) > 2:
@@ -201,7 +195,6 @@ def _steepest(shape: str) -> float:
     return max(grades)
 
 
-def _off_ground(edge: ET.Element) -> bool:
-    """Whether an edge is on a bridge or in a tunnel, as far as the net says so."""
-    said = {param.get("key", ""): param.get("value", "") for param in edge.findall("param")}
-    return going_on(said, edge.get("type", "")) == "bridge"
+def params_of(edge: ET.Element) -> dict[str, str]:
+    """Return the params of an edge by their keys."""
+    return {param.get("key", ""): param.get("value", "") for param in edge.findall("param")}

@@ -1,6 +1,6 @@
-"""Any .net.xml(.gz) as a StreetMap.
+"""Read a .net.xml or .net.xml.gz into a StreetMap.
 
-The reader streams the file once through expat and makes all polygons in a few vectorised calls.
+The reader streams the file once through expat and builds all polygons in a few vectorised calls.
 """
 
 from __future__ import annotations
@@ -22,33 +22,35 @@ from cosim.core.errors import MapError
 from cosim.core.geometry import Floats
 from cosim.place.overlay import where_geos_failed
 from cosim.place.street_map import Corner, Junction, Lane, Port, StreetMap, Strip
-from sumo_nets.net.elevation import land_of, steep_ports, steep_strips
-from sumo_nets.net.net_hash import hash_of
+from sumo_nets.net.elevation import land_of, off_ground, steep_ports, steep_strips
 from sumo_nets.net.outlines import areas_of, bands, close_seams, coordinates, polylines
-from sumo_nets.net.raw_file import DEEPEST, net_bytes
+from sumo_nets.net.raw_file import DEEPEST, hash_of, net_bytes
 from sumo_nets.net.signal_plans import SignalPrograms
 
 LANE_M = 3.2
-"""SUMO's width of a lane, sidewalks included, that names none."""
+"""SUMO's default width of lanes and sidewalks, metres."""
 SPECK_M2 = 0.5
-GROUND = ("no", "", "building_passage")
-"""What the params `bridge` and `tunnel` say of ways on the ground."""
+"""Smallest area of a corner, m2; smaller ones are dropped unless they connect strips."""
 HEAVY = frozenset(("rail", "rail_electric", "rail_fast", "subway", "ship", "cable_car", "aircraft"))
+"""Vehicle classes of railways and waterways, whose lanes are not roads."""
 TRAMS = frozenset(("tram", "rail_urban"))
+"""Vehicle classes of trams, which may share tracks with HEAVY."""
 NEEDED = {
     "edge": ("id",),
     "lane": ("id", "shape"),
     "junction": ("id",),
     "connection": ("from", "to"),
 }
+"""Required attributes of each element."""
 _WIDEST_M = 500.0
-"""No lane and no square is wider."""
+"""Largest width of a lane, metres."""
 
 Attributes = dict[str, str]
 
 
 def read_net(path: Path) -> StreetMap:
-    """The StreetMap of a .net.xml or .net.xml.gz. Raises MapError naming the file and the reason.
+    """Read the StreetMap of a .net.xml or .net.xml.gz. Raises MapError naming the file and the
+    reason.
 
     Nets without sidewalks or walking areas are read too: their strips or corners are empty.
     """
@@ -79,7 +81,7 @@ class _Edge:
 
 @dataclass(slots=True)
 class _Raw:
-    """The elements of a net that make a place."""
+    """The elements of a net that a StreetMap is built from."""
 
     net: Attributes = field(default_factory=dict)
     location: Attributes = field(default_factory=dict)
@@ -104,11 +106,8 @@ def _parse(path: Path, data: bytes) -> _Raw:
         if lacking := [name for name in NEEDED.get(tag, ()) if name not in attributes]:
             raise ValueError(f"<{tag}> '{attributes.get('id', '')}' lacks '{lacking[0]}'")
         if tag == "connection":
-            # Only those to and from walking areas and crossings, which are internal edges, matter
-            # here.
-            if attributes.get("from", "").startswith(":") or attributes.get("to", "").startswith(
-                ":"
-            ):
+            # Walking areas and crossings are internal edges; other connections are not needed.
+            if ":" in (attributes.get("from", "")[:1], attributes.get("to", "")[:1]):
                 links.append(attributes)
         elif tag == "lane" and parent == "edge":
             edges[-1].lanes.append(attributes)
@@ -168,27 +167,27 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
     lanes = [lane for _, lane, _ in (*walk.values(), *driven)]
     lines = polylines([lane["shape"] for lane in lanes], [lane["id"] for lane in lanes])
     widths = np.array([_width_m(lane) for lane in lanes])
-    # Foreign nets write -1 for SUMO's own width.
+    # Foreign nets write -1 for the default width.
     widths[widths <= 0.0] = LANE_M
     polygons = bands(lines, widths)
     corners = _corners(areas, raw.links)
     ports, signalised = _ports(raw.links, walk, corners, lines)
-    met = [
+    end_corners = [
         (corners.get(ports.get((name, 0), "")), corners.get(ports.get((name, 1), "")))
         for name in walk
     ]
     with np.errstate(divide="ignore", invalid="ignore"):
-        # Slivers in foreign nets have mitres at infinity, which GEOS cuts off by itself.
+        # Slivers in foreign nets have infinite mitres, which GEOS cuts off.
         polygons[: len(walk)] = close_seams(
-            polygons[: len(walk)], lines[: len(walk)], widths[: len(walk)], met
+            polygons[: len(walk)], lines[: len(walk)], widths[: len(walk)], end_corners
         )
     plans = raw.programs.plans(raw.links, signalised)
     strips: dict[str, Strip] = {}
     for k, (name, (edge, _, index)) in enumerate(walk.items()):
         ends = ports.get((name, 0)), ports.get((name, 1))
-        made = _strip(edge, index, left_hand, lines[k], float(widths[k]), polygons[k], ends)
+        built = _strip(edge, index, left_hand, lines[k], float(widths[k]), polygons[k], ends)
         strips[name] = (
-            replace(made, signalised=True, plan=plans.get(name)) if name in signalised else made
+            replace(built, signalised=True, plan=plans.get(name)) if name in signalised else built
         )
     roads = {
         lane["id"]: Lane(
@@ -199,7 +198,7 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
             width_m=float(widths[k]),
             polygon=polygons[k],
             internal=edge.attributes.get("function", "") == "internal",
-            cars=_allows(lane, "passenger"),
+            cars=allows(lane, "passenger"),
         )
         for k, (edge, lane, kind) in enumerate(driven, len(walk))
     }
@@ -207,21 +206,22 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
     terrain, elevation = land_of(
         raw.edges, apart, {name: index for name, (_, _, index) in walk.items()}, ports
     )
-    at: dict[str, list[Port]] = defaultdict(list)
+    corner_ports: dict[str, list[Port]] = defaultdict(list)
     for (strip, end), corner in ports.items():
-        at[corner].append(Port(strip, 1 if end else 0))
-    meeting = {
-        c: Corner(id=c, polygon=polygon, ports=tuple(at[c])) for c, polygon in corners.items()
+        corner_ports[corner].append(Port(strip, 1 if end else 0))
+    corners_by_id = {
+        c: Corner(id=c, polygon=polygon, ports=tuple(corner_ports[c]))
+        for c, polygon in corners.items()
     }
     if terrain is not None and elevation is not None:
         steep = steep_strips(terrain, tuple(strips.values()))
-        closed = steep_ports(terrain, strips, meeting.values(), frozenset(steep))
+        closed = steep_ports(terrain, strips, corners_by_id.values(), frozenset(steep))
         elevation = replace(elevation, steep=steep, closed=closed)
     return StreetMap(
         name=re.sub(r"(\.net)?\.xml(\.gz)?$", "", path.name),
         bounds=_bounds(raw, lines),
         strips=strips,
-        corners=meeting,
+        corners=corners_by_id,
         lanes=roads,
         junctions=_junctions(raw.junctions),
         net_hash=net_hash,
@@ -233,23 +233,23 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
 
 
 def _width_m(lane: Attributes) -> float:
-    said = lane.get("width", LANE_M)
+    value = lane.get("width", LANE_M)
     try:
-        width_m = float(said)
+        width_m = float(value)
     except ValueError:
         width_m = math.nan
     if math.isnan(width_m) or width_m > _WIDEST_M:
-        words = (
+        reason = (
             f"a width of {width_m:g} m, but none is more than {_WIDEST_M:g}"
             if width_m > _WIDEST_M
             else "no number"
         )
-        raise ValueError(f"lane '{lane['id']}': width '{said}' is {words}")
+        raise ValueError(f"lane '{lane['id']}': width '{value}' is {reason}")
     return width_m
 
 
 def _lane_of(link: Attributes, end: str) -> int:
-    """The number of the lane at an end, fromLane or toLane, of a connection."""
+    """Return the lane index at an end, "fromLane" or "toLane", of a connection."""
     try:
         return int(link.get(end, 0))
     except ValueError as error:
@@ -258,18 +258,20 @@ def _lane_of(link: Attributes, end: str) -> int:
         ) from error
 
 
-def _allows(lane: Attributes, vehicle: str) -> bool:
+def allows(lane: Attributes, vehicle: str) -> bool:
+    """Return whether a lane permits a SUMO vehicle class, for example "pedestrian"."""
     if "allow" in lane:
         return lane["allow"] == "all" or vehicle in lane["allow"].split()
     return lane.get("disallow", "") != "all" and vehicle not in lane.get("disallow", "").split()
 
 
 def _only_walked(lane: Attributes) -> bool:
-    return _allows(lane, "pedestrian") and not _allows(lane, "passenger")
+    return allows(lane, "pedestrian") and not allows(lane, "passenger")
 
 
 def _footway(edge: _Edge) -> int:
-    """Index of the lane for walking, paths shared with bicycles included; -1 without one."""
+    """Return the index of the lane for walking, paths shared with bicycles included; -1 without
+    one."""
     return next((i for i, lane in enumerate(edge.lanes) if _only_walked(lane)), -1)
 
 
@@ -282,7 +284,7 @@ def _is_verge(lane: Attributes) -> bool:
 
 
 def _is_track(lane: Attributes) -> bool:
-    """Whether only trains or ships go there: no road. Trams run in the street."""
+    """Return whether only trains or ships use a lane. Trams run in the street."""
     allowed = set(lane.get("allow", "").split())
     return bool(allowed & HEAVY) and allowed <= HEAVY | TRAMS
 
@@ -290,7 +292,7 @@ def _is_track(lane: Attributes) -> bool:
 def _corners(
     areas: dict[str, Attributes], links: Sequence[Attributes]
 ) -> dict[str, Polygon | MultiPolygon]:
-    """Polygons of the walking areas, repaired; specks are dropped unless they connect strips."""
+    """Return the repaired polygons of the walking areas, without specks that connect no strips."""
     if not areas:
         return {}
     joined: dict[str, set[str]] = defaultdict(set)
@@ -324,7 +326,7 @@ def _ports(
     corners: dict[str, Polygon | MultiPolygon],
     lines: Sequence[Floats],
 ) -> tuple[dict[tuple[str, int], str], set[str]]:
-    """Which corner lies at each end of each strip; and the ids of the signalised crossings."""
+    """Return the corner at each end of each strip, and the ids of the signalised crossings."""
     ports: dict[tuple[str, int], str] = {}
     signalised: set[str] = set()
     for link in links:
@@ -335,7 +337,7 @@ def _ports(
             ports.setdefault((head, 0), tail)
         if "tl" in link and head in walk and head.startswith(":"):
             signalised.add(head)
-    # A crossing's line may run against its connections: the nearer corner is the right one.
+    # A crossing's line may run against its connections: assign each end the nearer corner.
     for k, (name, (edge, _, _)) in enumerate(walk.items()):
         if edge.attributes.get("function") == "crossing" and {(name, 0), (name, 1)} <= ports.keys():
             first, last = corners[ports[name, 0]], corners[ports[name, 1]]
@@ -395,21 +397,20 @@ def _strip(
         verge_m=number("verge_m", sum(verges)),
         road_side=side,
         driveways=_driveways(edge.params.get("driveways", ""), line),
-        going=going_on(edge.params, edge.attributes.get("type", "")),
+        going=_going(edge.params, edge.attributes.get("type", "")),
     )
 
 
-def going_on(said: Mapping[str, str], kind: str) -> Literal["plain", "steps", "bridge"]:
-    """What an edge leads over, as far as its params and its type say so; tunnels count as
-    bridges."""
-    raised = any(said.get(key, "no") not in GROUND for key in ("bridge", "tunnel"))
-    if raised or said.get("layer", "0") not in ("0", "") or kind.endswith(("_bridge", "_tunnel")):
+def _going(params: Mapping[str, str], kind: str) -> Literal["plain", "steps", "bridge"]:
+    """Return the value of `Strip.going` for an edge, from its params and type."""
+    if off_ground(params, kind):
         return "bridge"
     return "steps" if "highway.steps" in kind.split("|") else "plain"
 
 
 def _driveways(points: str, line: Floats) -> tuple[float, ...]:
-    """Arc lengths of a sidewalk's line beside points of its street's middle line."""
+    """Return the arc lengths on a sidewalk's line nearest to points of its street's middle line,
+    metres."""
     if not points:
         return ()
     at, _ = coordinates([points], ["driveways"])

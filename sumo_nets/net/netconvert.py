@@ -1,4 +1,4 @@
-"""netconvert, the program that makes street nets, with its failures as MapError of one line."""
+"""Run netconvert, which builds street nets, and report its failures as one-line MapErrors."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Final
 from cosim.core.errors import MachineError, MapError
 
 WORDS = 400
-"""So many letters of netconvert's complaints are told."""
+"""Largest number of characters of netconvert's messages in an error."""
 _STAGES: Final = (
     (b"Parsing nodes", 0.0),
     (b"Parsing edges", 0.02),
@@ -31,8 +31,15 @@ _STAGES: Final = (
     (b"Building inner edges", 0.66),
     (b"Writing network", 0.75),
 )
-"""Words of netconvert at the begin of its stages, and the share of its time that is over then,
+"""Output of netconvert at the start of each stage, and the share of its run time before it,
 measured on a city."""
+
+
+def sumo_home() -> Path:
+    """Return the folder of the installed SUMO package."""
+    import sumo
+
+    return Path(sumo.__file__).parent
 
 
 def netconvert(
@@ -41,21 +48,15 @@ def netconvert(
     timeout_s: float = 120.0,
     progress: Callable[[float], None] | None = None,
 ) -> Path:
-    """Run netconvert to make `output`. Raises MapError with its complaints, MachineError when it
-    cannot be run.
+    """Run netconvert to build `output`, and return `output`.
 
-    progress: called with the share that is done, 0 to 1, whenever netconvert begins a stage.
+    progress: called with the share that is done, 0 to 1, at the start of each stage.
+
+    Raises MapError with netconvert's messages, MachineError if it cannot be run.
     """
-    import sumo
-
-    command = [
-        str(Path(sumo.__file__).parent / "bin" / "netconvert"),
-        *arguments,
-        "-o",
-        str(output),
-    ]
+    command = [str(sumo_home() / "bin" / "netconvert"), *arguments, "-o", str(output)]
     try:
-        returncode, said = _run(
+        returncode, messages = _run(
             command if progress is None else [*command, "--verbose"], timeout_s, progress
         )
     except subprocess.TimeoutExpired as error:
@@ -67,17 +68,17 @@ def netconvert(
             f"netconvert cannot be run: {error.strerror}: is eclipse-sumo installed?"
         ) from error
     if returncode != 0 or not output.exists():
-        raise MapError(f"netconvert failed with exit code {returncode}{complaints(said)}")
-    # An exit code of 0 is no proof: an empty net ends in "Success" too.
+        raise MapError(f"netconvert failed with exit code {returncode}{complaints(messages)}")
+    # netconvert also returns 0 for an empty net.
     if b"<edge " not in output.read_bytes():
-        raise MapError(f"netconvert made a net without any edge{complaints(said)}")
+        raise MapError(f"netconvert made a net without any edge{complaints(messages)}")
     return output
 
 
 def _run(
     command: Sequence[str], timeout_s: float, progress: Callable[[float], None] | None
 ) -> tuple[int, str]:
-    """Run a command to its end. Returns its exit code and what it wrote to standard error."""
+    """Run a command and return its exit code and standard error."""
     began = time.monotonic()
     with tempfile.TemporaryFile() as errors, selectors.DefaultSelector() as ready:
         with subprocess.Popen(
@@ -85,15 +86,15 @@ def _run(
         ) as process:
             assert process.stdout is not None
             ready.register(process.stdout, selectors.EVENT_READ)
-            said = b""
+            recent = b""
             try:
                 while ready.select(max(began + timeout_s - time.monotonic(), 0.0)):
-                    piece = os.read(process.stdout.fileno(), 1 << 16)
-                    if not piece:
+                    chunk = os.read(process.stdout.fileno(), 1 << 16)
+                    if not chunk:
                         break
-                    # A stage's words may come in two pieces.
-                    said = said[-80:] + piece
-                    begun = [share for words, share in _STAGES if words in said]
+                    # The start of a stage may be split between two reads.
+                    recent = recent[-80:] + chunk
+                    begun = [share for words, share in _STAGES if words in recent]
                     if progress is not None and begun:
                         progress(max(begun))
                 process.wait(max(began + timeout_s - time.monotonic(), 0.0))
@@ -104,10 +105,11 @@ def _run(
         return process.returncode, errors.read().decode(errors="replace")
 
 
-def complaints(said: str) -> str:
-    """What a program of SUMO says of its failure, on one line: its errors, its last words where it
-    names none."""
-    lines = [" ".join(line.split()) for line in said.splitlines() if line.strip()]
+def complaints(output: str) -> str:
+    """Summarize the messages of a SUMO program in one line: its errors, or its last line."""
+    lines = [" ".join(line.split()) for line in output.splitlines() if line.strip()]
     errors = [line for line in lines if not line.startswith(("Warning", "Quitting"))]
-    words = "; ".join(dict.fromkeys(line.removeprefix("Error: ") for line in errors or lines[-1:]))
-    return f": {words[:WORDS]}{' ...' if len(words) > WORDS else ''}" if words else ""
+    summary = "; ".join(
+        dict.fromkeys(line.removeprefix("Error: ") for line in errors or lines[-1:])
+    )
+    return f": {summary[:WORDS]}{' ...' if len(summary) > WORDS else ''}" if summary else ""

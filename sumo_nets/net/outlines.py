@@ -1,4 +1,4 @@
-"""Outlines of lanes and junctions as polygons, without gaps between them."""
+"""Build polygons of lanes and junctions without gaps between them."""
 
 from __future__ import annotations
 
@@ -15,13 +15,17 @@ from cosim.core.geometry import Floats
 from cosim.place import overlay
 
 _SHORTEST_M = 0.1
+"""Smallest length of a line and width of a band, metres."""
 FARTHEST_M = 1e8
-"""No point of a map in metres is farther from its origin, which may be that of a projection."""
+"""Largest coordinate of a map, metres; the origin may be that of a projection."""
 
 
 def polylines(shapes: Sequence[str], names: Sequence[str]) -> list[Floats]:
-    """(N, 2) metres of every shape, N >= 2 and never of zero length; elevations are dropped. names:
-    for errors."""
+    """Parse shapes into lines (N, 2), metres, with N >= 2 and a positive length; elevations are
+    dropped.
+
+    names: ids for errors.
+    """
     flat, counts = coordinates(shapes, names)
     lines = np.split(flat, np.cumsum(counts)[:-1])
     for i, line in enumerate(lines):
@@ -32,15 +36,15 @@ def polylines(shapes: Sequence[str], names: Sequence[str]) -> list[Floats]:
 
 
 def coordinates(shapes: Sequence[str], names: Sequence[str]) -> tuple[Floats, list[int]]:
-    """All points of all shapes, (sum of counts, 2) metres, and the count of each.
+    """Parse shapes into their points (sum of counts, 2), metres, and the count of each.
 
-    Raises ValueError with the name of a shape that is none.
+    Raises ValueError naming the first invalid shape.
     """
     points = [shape.split() for shape in shapes]
     counts = [len(row) for row in points]
     every = [point for row in points for point in row]
     if {p.count(",") for p in every} - {1}:
-        # Points with and without elevation mix, even in one shape.
+        # Points with and without elevation may be mixed, even in one shape.
         every = [",".join(p.split(",")[:2]) for p in every]
     numbers = ",".join(every).split(",") if every else []
     try:
@@ -48,12 +52,12 @@ def coordinates(shapes: Sequence[str], names: Sequence[str]) -> tuple[Floats, li
     except ValueError:
         flat = np.empty(0)
     if len(flat) != 2 * len(every) or not (np.abs(flat) < FARTHEST_M).all() or not all(counts):
-        _refuse(points, names)
+        _raise_for_first_invalid(points, names)
     return flat.reshape(-1, 2), counts
 
 
-def _refuse(points: Sequence[Sequence[str]], names: Sequence[str]) -> NoReturn:
-    """The error for the first shape that is none."""
+def _raise_for_first_invalid(points: Sequence[Sequence[str]], names: Sequence[str]) -> NoReturn:
+    """Raise ValueError for the first invalid shape."""
     for name, row in zip(names, points, strict=True):
         wrong = [point for point in row if not _is_point(point)]
         if wrong:
@@ -74,7 +78,7 @@ def _is_point(point: str) -> bool:
 
 
 def bands(lines: Sequence[Floats], widths: Floats) -> list[Polygon]:
-    """The bands of the given widths around lines, square at the ends."""
+    """Return the polygons of the given widths around lines, with flat ends."""
     if not lines:
         return []
     owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
@@ -91,7 +95,8 @@ def bands(lines: Sequence[Floats], widths: Floats) -> list[Polygon]:
 
 
 def areas_of(shape: shapely.Geometry, *, largest: bool) -> Any:
-    """The areas of a repaired shape: the largest as a Polygon, or all of them; None without any."""
+    """Return the polygonal parts of a repaired shape: the largest, or all of them; None without
+    any."""
     parts = [
         p
         for p in shapely.get_parts(shapely.get_parts(shape))
@@ -105,10 +110,10 @@ def areas_of(shape: shapely.Geometry, *, largest: bool) -> Any:
 
 
 _REACH_M = 2.5
-"""How far beyond its end a strip may look for its corner."""
+"""Distance beyond its end, in metres, within which a strip is extended to its corner."""
 
 WELD_M = 0.005
-"""Wedges are grown by this much, so that they and the strip become one polygon."""
+"""Distance by which wedges are grown, in metres, so that they merge with their strip."""
 
 Polygons = NDArray[np.object_]
 
@@ -119,8 +124,10 @@ def close_seams(
     widths_m: Floats,
     corners: Sequence[tuple[shapely.Geometry | None, shapely.Geometry | None]],
 ) -> list[Polygon]:
-    """The polygons of N strips, extended at both ends to the edges of their corners (None: no
-    corner there)."""
+    """Extend the polygons of N strips at both ends to the edges of their corners.
+
+    corners: polygons at the start and end of each strip, or None.
+    """
     if not len(polygons):
         return []
     grown = np.array(polygons, dtype=object)
@@ -131,7 +138,7 @@ def close_seams(
         one = joined(grown[rows], at[0][rows], at[1][rows], widths_m[rows], met[0][rows])
         return joined(one, at[2][rows], at[3][rows], widths_m[rows], met[1][rows])
 
-    # Strips do not depend on each other, and shapely works outside of Python's lock.
+    # Strips are independent, and shapely releases the GIL.
     half = len(grown) // 2
     with ThreadPoolExecutor(2) as threads:
         return [
@@ -142,11 +149,14 @@ def close_seams(
 def joined(
     polygons: Polygons, ends: Floats, inner: Floats, widths_m: Floats, corners: Polygons
 ) -> Polygons:
-    """Strips extended at one end to the edge of their corner.
+    """Extend strips at one end to the edge of their corner.
 
-    polygons: (N,) of the strips. ends, inner: (N, 2) metres, the last point of each middle line at
-    that end and the one before. widths_m: (N,). corners: (N,) polygons, None where a strip ends
-    nowhere. Returns (N,) polygons.
+    polygons: (N,) polygons of the strips.
+    ends, inner: (N, 2) metres, the last point of each middle line at that end and the one before.
+    widths_m: (N,) metres.
+    corners: (N,) polygons, None without a corner.
+
+    Returns (N,) polygons.
     """
     forth = ends - inner
     forth /= np.maximum(np.hypot(forth[:, 0], forth[:, 1]), 1e-9)[:, None]
@@ -160,20 +170,21 @@ def joined(
     met = overlay.intersection(beyond, corners)
     wanted = ~(shapely.is_missing(met) | shapely.is_empty(met))
     hulls = overlay.intersection(shapely.convex_hull(overlay.union(edges, met)), beyond)
-    # Slivers without width make GEOS divide by zero; it copes.
+    # Slivers without width make GEOS divide by zero, without effect on the result.
     with np.errstate(divide="ignore", invalid="ignore"):
         wedges = shapely.buffer(overlay.difference(hulls, corners), WELD_M, join_style="mitre")
     out: Polygons = polygons.copy()
     grown = overlay.union(polygons, wedges)
     out[wanted] = [
-        _holding(shape, strip) for shape, strip in zip(grown[wanted], polygons[wanted], strict=True)
+        _part_with(shape, strip)
+        for shape, strip in zip(grown[wanted], polygons[wanted], strict=True)
     ]
     return out
 
 
-def _holding(shape: Polygon | MultiPolygon, strip: Polygon) -> Polygon:
-    """The part of a shape that holds a strip: slivers of a wedge on the far side of a corner are
-    nothing."""
+def _part_with(shape: Polygon | MultiPolygon, strip: Polygon) -> Polygon:
+    """Return the part of a shape that overlaps a strip most, without slivers on the far side of
+    a corner."""
     if isinstance(shape, Polygon):
         return shape
     return max(shape.geoms, key=lambda part: float(overlay.intersection(part, strip).area))

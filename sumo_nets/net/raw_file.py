@@ -1,15 +1,17 @@
-"""Files that others made, as bytes: regular files alone, unpacked within bounds, XML without traps.
+"""Read map files of users within bounds, and hash nets by their content.
 
-What is no map must end soon, in words, and without filling disk or memory: pipes, gzip bombs, XML
-nested without end.
+Only regular files are read. Pipes, gzip bombs and deeply nested XML are refused before they fill
+disk or memory.
 """
 
 from __future__ import annotations
 
 import bz2
 import gzip
+import hashlib
 import io
 import lzma
+import re
 import stat
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -21,20 +23,22 @@ from xml.parsers import expat
 from cosim.core.errors import MapError, unwritable
 
 LARGEST_BYTES = 2 * 1024**3
-"""A file that unpacks to more than this is refused: cut the area out first."""
+"""Largest size of an unpacked file, bytes; larger maps must be cropped first."""
 TIMES_PACKED = 200
+"""Largest ratio of unpacked to packed size, for files above SMALL_BYTES."""
 SMALL_BYTES = 64 * 1024**2
-"""Beyond so many bytes a file may not be more than TIMES_PACKED times as large as it was packed."""
+"""Unpacked size in bytes up to which TIMES_PACKED is not checked."""
 DEEPEST = 40
-"""Elements of a map are not nested deeper; those of nets and OpenStreetMap are at most 5 deep."""
+"""Largest nesting depth of XML elements; nets and OpenStreetMap files need 5."""
 LONGEST_BYTES = 16 * 1024**2
-"""Of a single tag or comment."""
+"""Largest size of a single tag or comment, bytes."""
 PIECE_BYTES = 1 << 20
+"""Size of the chunks in which files are read, bytes."""
 KNOWN_ROOTS = ("additional", "gpx", "html", "kml", "osmChange", "routes", "svg", "tlLogics")
-"""What else is taken for a map. Other names are not repeated: a file that is no map may be any file
-of the user's."""
+"""Root elements of other file types that may be named in errors. Other names are not repeated:
+the file may be any private file of the user."""
 BLANK = b"\xef\xbb\xbf\xff\xfe\x00 \t\r\n"
-"""What may stand before the first element, marks of byte order included."""
+"""Bytes that may precede the first element, byte order marks included."""
 
 OPENERS: Mapping[str, Callable[[Path], Any]] = {
     "": io.FileIO,
@@ -45,7 +49,7 @@ BROKEN = (EOFError, zlib.error, lzma.LZMAError)
 
 
 def head_of(path: Path) -> bytes:
-    """The first 64 bytes of a regular file. Raises MapError naming what it is instead."""
+    """Return the first 64 bytes of a regular file. Raises MapError for anything else."""
     try:
         mode = path.stat().st_mode
         if not stat.S_ISREG(mode):
@@ -64,7 +68,7 @@ def head_of(path: Path) -> bytes:
 
 
 def pour(source: Path, packing: str, target: Path) -> None:
-    """Write `source`, unpacked, to `target`. Raises MapError when it is broken, too large or no
+    """Write `source`, unpacked, to `target`. Raises MapError if it is damaged, too large or not
     XML."""
     with file_pieces(source, packing) as unpacked:
         try:
@@ -78,7 +82,7 @@ def pour(source: Path, packing: str, target: Path) -> None:
 
 
 def net_bytes(path: Path) -> bytes:
-    """A .net.xml or .net.xml.gz as XML. Raises MapError when it cannot be read."""
+    """Return the XML of a .net.xml or .net.xml.gz. Raises MapError if it cannot be read."""
     packing = "gzip" if head_of(path)[:2] == b"\x1f\x8b" else ""
     whole = io.BytesIO()
     with file_pieces(path, packing) as unpacked:
@@ -89,7 +93,7 @@ def net_bytes(path: Path) -> bytes:
 
 @contextmanager
 def file_pieces(source: Path, packing: str) -> Iterator[Iterator[bytes]]:
-    """The content of a file, piece by piece. packing: "", "gzip" or "bzip2"."""
+    """Yield the content of a file in chunks. packing: "", "gzip" or "bzip2"."""
     try:
         with OPENERS[packing](source) as stream:
             yield _bounded(source, stream, source.stat().st_size)
@@ -98,8 +102,8 @@ def file_pieces(source: Path, packing: str) -> Iterator[Iterator[bytes]]:
             f"{source}: broken {packing} file, probably cut short: {error}: get it again"
         ) from error
     except (OSError, ValueError) as error:
-        said = getattr(error, "strerror", None) or error
-        raise MapError(f"{source}: cannot be unpacked ({packing or 'plain'}): {said}") from error
+        reason = getattr(error, "strerror", None) or error
+        raise MapError(f"{source}: cannot be unpacked ({packing or 'plain'}): {reason}") from error
 
 
 def _bounded(source: Path, stream: IO[bytes], packed: int) -> Iterator[bytes]:
@@ -122,15 +126,15 @@ def _bounded(source: Path, stream: IO[bytes], packed: int) -> Iterator[bytes]:
 
 
 def parse(parser: expat.XMLParserType, path: Path) -> None:
-    """Feed a file of XML to a parser whose handlers are set. What is refused is a ValueError that
-    names the line."""
-    fed = 0
+    """Feed an XML file to a parser whose handlers are set. Raises ValueError with the line
+    number."""
+    parsed = 0
     try:
         with path.open("rb") as file:
             while piece := file.read(PIECE_BYTES):
                 parser.Parse(piece, False)
-                fed += len(piece)
-                if fed - parser.CurrentByteIndex > LONGEST_BYTES:
+                parsed += len(piece)
+                if parsed - parser.CurrentByteIndex > LONGEST_BYTES:
                     raise ValueError(f"a single tag of more than {LONGEST_BYTES >> 20} MiB")
             parser.Parse(b"", True)
     except expat.ExpatError as error:
@@ -146,13 +150,13 @@ def parse(parser: expat.XMLParserType, path: Path) -> None:
 
 
 def other_root(tag: str) -> str:
-    """In words, the root element of a file of XML that is no map."""
+    """Describe the root element of an XML file that is not a map."""
     return f"its root element is <{tag}>" if tag in KNOWN_ROOTS else "its root element is another"
 
 
 def root_of(path: Path) -> str:
-    """The root element of a file of XML that was read to its end. What is broken or a trap is a
-    ValueError."""
+    """Return the root element of an XML file after reading all of it. Raises ValueError if it is
+    damaged or malicious."""
     parser = expat.ParserCreate()
     root: list[str] = []
     depth = 0
@@ -178,3 +182,27 @@ def root_of(path: Path) -> str:
     parser.EntityDeclHandler = entity
     parse(parser, path)
     return root[0]
+
+
+_SCHEMA = b"xsi:noNamespaceSchemaLocation"
+
+
+def without_comments(net: bytes) -> bytes:
+    """Return a net's XML without comments, which hold netconvert's time, version and paths."""
+    return re.sub(rb"<!--.*?-->\s*", b"", net, flags=re.DOTALL) if b"<!--" in net else net
+
+
+def net_content_hash(path: Path) -> str:
+    """Return the SHA-256 (16 hex digits) of a net, without comments, schema location and line
+    ends."""
+    return hash_of(net_bytes(path))
+
+
+def hash_of(data: bytes) -> str:
+    """Return the content hash of a net's XML, see `net_content_hash`."""
+    bare = without_comments(data)
+    # Searching for plain bytes first is much faster than the regular expression.
+    if _SCHEMA in bare:
+        pieces = re.split(_SCHEMA + rb'="[^"]*"', bare)
+        bare = b"".join([piece.rstrip() for piece in pieces[:-1]] + pieces[-1:])
+    return hashlib.sha256(bare.replace(b"\r\n", b"\n").strip()).hexdigest()[:16]

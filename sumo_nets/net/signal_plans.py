@@ -1,8 +1,7 @@
-"""Signal plans: what the crossings' signals of a net show at any time, where fixed programs decide
-it alone.
+"""Signal plans: the states of crossings over time, for signals with fixed programs.
 
-A plan is made only of a program that SUMO runs by the clock, whose elements are all known here and
-whose times are whole steps, which SUMO rounds to; everything else is left to SUMO.
+A plan is built only if the program runs by the clock, all its elements are known and its durations
+are whole steps of SUMO. Other signals are read from SUMO at run time.
 """
 
 from __future__ import annotations
@@ -25,8 +24,10 @@ _OFF: Final = "off"
 
 @dataclass(slots=True)
 class SignalPrograms:
-    """What a net says of its traffic lights, element by element. others: whether it also says when
-    programs change."""
+    """Traffic light elements of a net, collected one by one.
+
+    others: whether the net has elements that switch programs.
+    """
 
     logics: list[Mapping[str, str]] = field(default_factory=list)
     phases: list[list[Mapping[str, str]]] = field(default_factory=list)
@@ -34,7 +35,7 @@ class SignalPrograms:
     others: bool = False
 
     def add(self, tag: str, parent: str, attributes: Mapping[str, str]) -> None:
-        """The next element of the net, and what it stands in."""
+        """Add the next element of the net. parent: tag of the enclosing element."""
         if tag == "tlLogic":
             self.logics.append(attributes)
             self.phases.append([])
@@ -49,7 +50,8 @@ class SignalPrograms:
     def plans(
         self, links: Sequence[Mapping[str, str]], crossings: Iterable[str]
     ) -> dict[str, SignalPlan]:
-        """The plans of those crossings that have one. links: the connections to them."""
+        """Return the plans of those crossings that have one. links: connections to the
+        crossings."""
         names = [logic.get("id", "") for logic in self.logics]
         often = Counter(names)
         fixed = {} if self.others else {name: k for k, name in enumerate(names) if often[name] == 1}
@@ -85,7 +87,8 @@ class SignalPrograms:
 
 
 def _ms(seconds: str) -> int | None:
-    """Milliseconds, SUMO's own unit; None for what is no plain number or no whole steps."""
+    """Convert seconds to milliseconds, SUMO's unit; None if not a plain number or not whole
+    steps."""
     found = _SECONDS.fullmatch(seconds)
     ms = int(found[1] + (found[2] or "").ljust(3, "0")) if found is not None else 1
     return ms if ms % Clock().tick_ms == 0 else None

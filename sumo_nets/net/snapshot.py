@@ -1,7 +1,7 @@
-"""Cache street maps that were read from nets: reading one again takes a fifth of the time.
+"""Cache of street maps read from nets: loading a snapshot takes a fifth of the time.
 
-The name of a snapshot is a hash of what it depends on: the net's bytes, the source of the reader
-and the libraries that made its polygons. It holds plain data only.
+The cache key is a hash of the net's bytes, the reader's source and the geometry libraries. A
+snapshot holds plain data only.
 """
 
 from __future__ import annotations
@@ -33,8 +33,12 @@ _Maker = Callable[[Any, _Pools], Any]
 
 
 class _Snapshot(msgspec.Struct, array_like=True):
-    """body: the map as msgpack, with numbers in place of arrays and geometries. arrays: their
-    bytes, one after the other, as dtype, shape and offset tell; geometries: WKB."""
+    """A serialized StreetMap.
+
+    body: the map as msgpack, with indices in place of arrays and geometries.
+    arrays: bytes of all arrays; `forms` gives the dtype, shape and offset of each.
+    geometries: WKB.
+    """
 
     body: bytes
     arrays: bytes
@@ -43,67 +47,70 @@ class _Snapshot(msgspec.Struct, array_like=True):
 
 
 def street_map_of(path: Path) -> StreetMap:
-    """The StreetMap of a net: from its snapshot, else by `read_net`, which may raise MapError.
+    """Return the StreetMap of a net from its snapshot, or read it with `read_net`, which may raise
+    MapError.
 
-    A cache that cannot be written is no error: the net is read, and nothing kept.
+    If the cache cannot be written, the net is read without storing a snapshot.
     """
     try:
         net = path.read_bytes()
     except OSError:
         return _read(path)
-    made_of = _key(path.name, net)
-    snapshot = cache_folder() / SNAPSHOT_FOLDER / f"{made_of}.map"
+    key = _key(path.name, net)
+    snapshot = cache_folder() / SNAPSHOT_FOLDER / f"{key}.map"
     street_map = cached(snapshot, lambda: _read(path), lambda made: [map_as_bytes(made)], thawed)
-    return street_map.read_of(made_of)
+    return street_map.read_of(key)
 
 
 def _read(path: Path) -> StreetMap:
-    from sumo_nets.net.net_file import (
-        read_net,
-    )  # with all that reading takes: most nets were read before
+    from sumo_nets.net.net_file import read_net  # slow import, not needed for cached nets
 
     return read_net(path)
 
 
 def map_as_bytes(street_map: StreetMap) -> bytes:
-    """A StreetMap as bytes: equal maps give equal bytes."""
+    """Serialize a StreetMap: equal maps give equal bytes."""
     arrays: list[NDArray[Any]] = []
     geometries: list[shapely.Geometry] = []
 
-    def numbered(value: Any) -> int:
+    def index_of(value: Any) -> int:
         if isinstance(value, np.ndarray):
             arrays.append(value)
             return len(arrays) - 1
         if isinstance(value, Polygon | MultiPolygon):
             geometries.append(value)
             return len(geometries) - 1
-        raise TypeError(f"a StreetMap cannot be kept with a {type(value).__name__} in it")
+        raise TypeError(f"a StreetMap cannot be stored with a {type(value).__name__} in it")
 
-    bare = {name: getattr(street_map, name) for name in _FIELDS}
-    body = msgspec.msgpack.encode(bare, enc_hook=numbered)
+    field_values = {name: getattr(street_map, name) for name in _FIELDS}
+    body = msgspec.msgpack.encode(field_values, enc_hook=index_of)
     ends = np.cumsum([0, *(a.nbytes for a in arrays)]).tolist()
     forms = [(a.dtype.str, a.shape, at) for a, at in zip(arrays, ends[:-1], strict=True)]
     wkb = shapely.to_wkb(np.array(geometries, dtype=object)).tolist() if geometries else []
-    held = _Snapshot(body, b"".join(np.ascontiguousarray(a).tobytes() for a in arrays), forms, wkb)
-    return msgspec.msgpack.encode(held)
+    snapshot_data = _Snapshot(
+        body, b"".join(np.ascontiguousarray(a).tobytes() for a in arrays), forms, wkb
+    )
+    return msgspec.msgpack.encode(snapshot_data)
 
 
 def thawed(data: bytes | memoryview) -> StreetMap:
-    """Return the StreetMap in bytes of `map_as_bytes`."""
+    """Deserialize the result of `map_as_bytes`."""
     with _without_gc():
-        held = msgspec.msgpack.decode(data, type=_Snapshot)
+        snapshot_data = msgspec.msgpack.decode(data, type=_Snapshot)
         arrays = [
-            np.ndarray(shape, dtype, buffer=held.arrays, offset=at)
-            for dtype, shape, at in held.forms
+            np.ndarray(shape, dtype, buffer=snapshot_data.arrays, offset=at)
+            for dtype, shape, at in snapshot_data.forms
         ]
-        geometries = shapely.from_wkb(np.array(held.geometries, dtype=object)).tolist()
-        made: StreetMap = _maker(StreetMap)(msgspec.msgpack.decode(held.body), (arrays, geometries))
+        geometries = shapely.from_wkb(np.array(snapshot_data.geometries, dtype=object)).tolist()
+        made: StreetMap = _maker(StreetMap)(
+            msgspec.msgpack.decode(snapshot_data.body), (arrays, geometries)
+        )
         return made
 
 
 @cache
 def _maker(kind: Any) -> _Maker:
-    """How a value of this type is made of plain data and the pools."""
+    """Return the function that builds a value of a type from plain data and the pools."""
     parts, origin = get_args(kind), get_origin(kind)
     if origin is np.ndarray:
         return lambda number, pools: pools[0][number]
@@ -126,7 +133,7 @@ def _maker(kind: Any) -> _Maker:
 
 
 def _made_of(kind: Any) -> _Maker:
-    """The maker of a dataclass or a named tuple: the one is kept as a mapping, the other as a
+    """Return the maker of a dataclass, stored as a mapping, or of a named tuple, stored as a
     list."""
     hints = get_type_hints(kind)
     if hasattr(kind, "_fields"):
@@ -148,17 +155,17 @@ def _key(name: str, net: bytes) -> str:
     ).hexdigest()[:32]
 
 
-_ROOMS: Final = (
+_READER_FOLDERS: Final = (
     Path(sumo_nets.__file__).parent,
     *(Path(cosim.__file__).parent / room for room in ("core", "place")),
 )
-_READER: Final = f"{sources_hash(*_ROOMS)} {shapely.geos_version_string}"
-"""A hash of the source and of the libraries that make a StreetMap of a net."""
+_READER: Final = f"{sources_hash(*_READER_FOLDERS)} {shapely.geos_version_string}"
+"""Hash of the source and the libraries that build a StreetMap from a net."""
 
 
 @contextmanager
 def _without_gc() -> Iterator[None]:
-    """Thousands of new objects, none of them garbage: looking for some would double the time."""
+    """Pause the garbage collector: scanning thousands of live new objects would double the time."""
     was_on = gc.isenabled()
     gc.disable()
     try:

@@ -12,7 +12,7 @@ from cosim.core.geometry import Floats, Pose, box_disk_gap, wrap_angle
 from cosim.core.state import PERSON_RADIUS_M
 from cosim.people.yielding import RobotBody, Standing
 from cosim.spec.events import StandingBody
-from sumo_nets.crowd.pose_filter import MAX_SPEED_MPS, MAX_TURN_RADPS, PoseFilter
+from sumo_nets.crowd.shown_people import MAX_SPEED_MPS, MAX_TURN_RADPS, PoseFilter
 
 DT_S = 0.05
 

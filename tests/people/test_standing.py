@@ -18,7 +18,7 @@ from cosim.spec.events import EventQuery, Walker
 from cosim.spec.obstacle import OBSTACLE_SIZES_M, Obstacle, footprint
 from scenarios.events.sight import Sight
 from scenarios.events.walking import pressed_on, walked_on
-from sumo_nets.crowd.pose_filter import PoseFilter
+from sumo_nets.crowd.shown_people import PoseFilter
 
 DT_S = 0.05
 SIDEWALK = box(-20.0, -1.6, 20.0, 1.6)

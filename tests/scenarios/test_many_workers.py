@@ -44,7 +44,7 @@ from scenarios.runs.protocol import (
 from scenarios.runs.status import RunStatus
 from scenarios.runs.transport import HeldRun
 from scenarios.runs.zenoh_transport import workers_of_run
-from sumo_nets.net.net_hash import hash_of
+from sumo_nets.net.raw_file import hash_of
 from tests.conftest import PATIENCE_S, Cosim
 from tests.run_specs import changed, spec_of
 

@@ -38,8 +38,8 @@ from scenarios.tools.build.build_suite import build_suite
 from scenarios.tools.build.claims import CLAIMS, Read
 from scenarios.tools.build.place_claims import faults_in_places, narrow_places, sample_of, ways_left
 from sumo_nets.city.store import TEST_SEEDS, VAL_SEEDS
+from sumo_nets.maps.import_rules import WHEEL_PLACES
 from sumo_nets.maps.map_store import about_map, known_maps
-from sumo_nets.maps.wheel_places import WHEEL_PLACES
 from tests.conftest import Cosim
 
 SMALL = City(seed=1, size_m=500.0)

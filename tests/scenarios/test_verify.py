@@ -22,7 +22,7 @@ from scenarios.tools.verify.engines import DRIVER, ROOMS, room_hashes, textures
 from scenarios.tools.verify.shipped import SHIPPED, Given, trace_of, writable
 from scenarios.tools.verify.traces import Trace, kept_picture, traced
 from scenarios.tools.verify.verdict import blamed, findings, first_difference
-from sumo_nets.crowd import pose_filter
+from sumo_nets.crowd import shown_people
 from tests.conftest import ROOT, Cosim
 
 REMADE = "the suites were built anew: `cosim verify --write`"
@@ -238,7 +238,7 @@ def test_an_edited_source_is_told_by_its_room(tmp_path: Path) -> None:
             ROOT / room, tmp_path / room, ignore=shutil.ignore_patterns("__pycache__", "*.json")
         )
     before = room_hashes(tmp_path)
-    edited = tmp_path / "sumo_nets" / "crowd" / "pose_filter.py"
+    edited = tmp_path / "sumo_nets" / "crowd" / "shown_people.py"
     edited.write_text(edited.read_text().replace("MAX_SPEED_MPS = 2.2", "MAX_SPEED_MPS = 2.1"))
     after = room_hashes(tmp_path)
     assert before == room_hashes(ROOT)
@@ -290,7 +290,7 @@ def test_a_changed_constant_of_the_crowd_is_found(
 ) -> None:
     """The crowd differs first, before all that hangs on it."""
     (case,) = [case for case in verified_cases() if case.id == "lh-001-00"]
-    monkeypatch.setattr(pose_filter, "MAX_SPEED_MPS", 1.2)
+    monkeypatch.setattr(shown_people, "MAX_SPEED_MPS", 1.2)
     trace = traced(replace(case, time_limit_s=1.0))
     told = shipped.traces[case.id]
     assert isinstance(told, Trace) and first_difference(told, trace)[0] == "crowd"

@@ -25,7 +25,7 @@ from sumo_nets.city.city import STYLES
 from sumo_nets.city.signals import signal_faults
 from sumo_nets.city.store import SEEDS, build_city, city_net, is_whole, shipped_cities, write_city
 from sumo_nets.net.net_file import read_net
-from sumo_nets.net.net_hash import net_content_hash
+from sumo_nets.net.raw_file import net_content_hash
 from sumo_nets.net.snapshot import street_map_of
 
 pytestmark = pytest.mark.engine

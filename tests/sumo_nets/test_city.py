@@ -25,8 +25,8 @@ from sumo_nets.city.signals import signal_faults
 from sumo_nets.city.store import city_net
 from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M
 from sumo_nets.net.net_file import read_net
-from sumo_nets.net.net_hash import net_content_hash
 from sumo_nets.net.netconvert import netconvert
+from sumo_nets.net.raw_file import net_content_hash
 from tests.conftest import PATIENCE_S
 
 SAMPLE = [

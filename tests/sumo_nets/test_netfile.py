@@ -11,7 +11,7 @@ import pytest
 from cosim.core.errors import MapError
 from cosim.place.street_map import Port
 from sumo_nets.net.net_file import read_net
-from sumo_nets.net.net_hash import net_content_hash
+from sumo_nets.net.raw_file import net_content_hash
 
 NET = """<?xml version="1.0" encoding="UTF-8"?>
 <!-- generated on 2020-01-01 in /somewhere -->

@@ -16,7 +16,7 @@ from cosim.spec.events import EventReply
 from cosim.spec.scenario import City, CrowdSpec
 from sumo_nets.city.store import city_net
 from sumo_nets.crowd.crowd import SumoCrowd
-from sumo_nets.crowd.kerb_waiting import Kerbs
+from sumo_nets.crowd.lights import Kerbs
 from sumo_nets.crowd.proxy import KEEP_ROUTE, KEEP_ROUTE_ON_ROAD, MATCH_M, NEARER_M, Walks
 from sumo_nets.engine import persons_near, sumo, vehicles_near
 from sumo_nets.net.snapshot import street_map_of

@@ -21,7 +21,7 @@ from scenarios.suites.daylight import FOG_M, LOWEST_SUN_RAD, sun_rises_rad
 from scenarios.suites.proofs import Proofs, proofs_path
 from scenarios.suites.recipes import ALL_ROUTES_M, LONG_WAY, RECIPES
 from scenarios.suites.unit import STRUCTURES, TURN_RAD, WAY_M, turn_rad
-from sumo_nets.maps.wheel_places import WHEEL_PLACES
+from sumo_nets.maps.import_rules import WHEEL_PLACES
 
 _APART_M: Final = 5.0
 """Two scenarios of one structure in one place start farther apart than this, or lead elsewhere."""
