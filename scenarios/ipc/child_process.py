@@ -8,18 +8,28 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from contextlib import nullcontext, suppress
+from functools import partial
 from pathlib import Path
 from signal import SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 
 from cosim.core.child_process import ended_in_words
-from cosim.core.errors import unwritable
+from cosim.core.errors import MachineError, UsageError, unwritable
 from cosim.core.framing import MOST_WIRED_BYTES, Wire
-from scenarios.ipc.deadlines import Asked, Question
-from scenarios.ipc.messages import Job, MessageHandler, decode_message, encode_message
+from scenarios.ipc.deadlines import Asked, Patience, Question
+from scenarios.ipc.messages import (
+    Job,
+    Message,
+    MessageHandler,
+    Ready,
+    Unable,
+    decode_message,
+    encode_message,
+)
 
 WORKER: Final = "scenarios.runs.worker:serve_jobs"
 ENDING_S: Final = 10.0
@@ -133,3 +143,76 @@ class KeptProcess:
 
 def _in_words(code: int | None) -> str:
     return "closed its pipe to the run" if code is None else ended_in_words(code)
+
+
+class ProcessEnd(NamedTuple):
+    """The end of a process, in words.
+
+    question: the policy call that was pending.
+    in_engine: whether compiled code has ended it or hangs, while no policy call was pending.
+    hung: whether it was killed because it sent nothing.
+    allowed_s: the seconds that the policy had for its answer, if it was killed because there was
+    none.
+    """
+
+    words: str
+    question: Question | None = None
+    in_engine: bool = False
+    hung: bool = False
+    allowed_s: float | None = None
+
+
+class Watchdog:
+    """Watches one process.
+
+    silence_s: seconds without a message after which it hangs, unless a policy call is pending.
+    ready: whether it has loaded the engines and the policy.
+    heard_s: monotonic clock of its last sign of life.
+    """
+
+    def __init__(self, process: KeptProcess, patience: Patience, silence_s: float) -> None:
+        self.process = process
+        self.ready = False
+        self.heard_s = time.monotonic()
+        self._patience = patience
+        self._silence_s = silence_s
+
+    def poll(self, hear: MessageHandler, *, idle: bool = False) -> ProcessEnd | None:
+        """Pass on its messages. Returns its end, if it has ended or was killed because it hangs.
+
+        An `idle` process may be silent. Raises UsageError if it cannot load the policy,
+        MachineError if the machine lacks something."""
+        if not self.process.listen(partial(self._take, hear)):
+            words = self.process.end()
+            return ProcessEnd(words, self.process.question, self.process.in_engine)
+        question = self.process.question
+        now_s = time.monotonic()
+        if idle:
+            return None
+        if question is None:
+            if now_s - self.heard_s <= self._silence_s:
+                return None
+            self.process.kill()
+            words = f"the {self.process.called} process showed no sign of life"
+            return ProcessEnd(words, in_engine=True, hung=True)
+        self.heard_s = now_s
+        if not question.overdue(self._patience):
+            return None
+        self.process.kill()
+        words = f"the {self.process.called} process was ended"
+        return ProcessEnd(words, question, allowed_s=self._patience.of(question.doing))
+
+    def _take(self, hear: MessageHandler, message: Message) -> None:
+        self.heard_s = time.monotonic()
+        if isinstance(message, Unable):
+            raise_unable(message)
+        if isinstance(message, Ready):
+            self.ready = True
+        else:
+            hear(message)
+
+
+def raise_unable(message: Unable) -> None:
+    """Raise UsageError if the policy cannot be loaded, MachineError if the machine lacks
+    something."""
+    raise UsageError(message.reason) if message.blames_policy else MachineError(message.reason)

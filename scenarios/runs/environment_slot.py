@@ -16,7 +16,7 @@ from typing import Final
 
 from cosim.core.errors import MachineError, UsageError
 from cosim.core.log_event import happened
-from scenarios.ipc.child_process import WORKER, KeptProcess
+from scenarios.ipc.child_process import WORKER, KeptProcess, ProcessEnd, Watchdog
 from scenarios.ipc.faults import Failure
 from scenarios.ipc.messages import (
     Done,
@@ -27,7 +27,6 @@ from scenarios.ipc.messages import (
     MessageHandler,
     encode_message,
 )
-from scenarios.ipc.watchdog import ProcessEnd, Watchdog
 
 SILENCE_S = 300.0
 """Seconds after which a process that reports nothing, while its policy has nothing to answer, hangs

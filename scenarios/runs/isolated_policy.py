@@ -6,8 +6,13 @@ alone.
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+import os
+import signal
+from contextlib import ExitStack, suppress
+from socket import socket
 from typing import Final
+
+import msgspec
 
 from bridge.policy_server import (
     UNREADABLE,
@@ -15,24 +20,27 @@ from bridge.policy_server import (
     AskEnded,
     AskReset,
     PackedArray,
+    PolicyDesk,
     PolicyFault,
     PolicyInfo,
     Refusal,
     decode_info,
     encode_message,
     policy_call,
+    read_request,
 )
 from cosim.core.errors import UsageError
+from cosim.core.framing import Wire
 from cosim.episode.manifest_checks import with_goal
-from cosim.episode.policy_caller import LOADED_WITHIN_S, Timer
-from cosim.policies.load import checked_manifest
+from cosim.episode.policy_caller import LOADED_WITHIN_S, Timer, Untimed
+from cosim.policies.load import checked_manifest, load_policy
 from cosim.spec.manifest import Manifest
 from scenarios.ipc.child_process import KeptProcess
-from scenarios.ipc.observation_codec import Arrays
+from scenarios.ipc.observation_codec import Arrays, ObservationDecoder
 from scenarios.ipc.shared_memory import SharedMemory, room_for
 from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy
 
-_SERVES: Final = "scenarios.runs.isolated_child:serve_alone"
+_SERVES: Final = "scenarios.runs.isolated_policy:serve_alone"
 _MOST_BYTES: Final = 4 << 20
 """Bytes of an answer."""
 
@@ -116,3 +124,28 @@ def isolated_driver(
             )
         stack.pop_all()
     return HostedDriver(HostedPolicy(manifest, process, run), "isolated", info.source[:64], timer)
+
+
+def serve_alone(socket_descriptor: int, asked_descriptor: int, memory_descriptor: int) -> None:
+    """Answer until the socket closes. The first message is the policy's name; the reply is its
+    info.
+
+    asked_descriptor: not used, because the environment's process times the calls itself."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.close(asked_descriptor)
+    wire = Wire(socket(fileno=socket_descriptor))
+    memory = SharedMemory(memory_descriptor, writes=False)
+    os.close(memory_descriptor)
+    name = wire.receive().decode()
+    try:
+        driver = load_policy(name, Untimed())  # the process that started this one has the deadline
+    except UsageError as error:
+        wire.send(encode_message(Refusal("policy", str(error))))
+        return
+    desk = PolicyDesk(driver.policy, decoder=ObservationDecoder, batch=False)
+    info = PolicyInfo("", name, msgspec.to_builtins(driver.manifest), driver.source_hash)
+    wire.send(encode_message(info))
+    with suppress(EOFError):
+        while True:
+            (reply,) = desk.replies([read_request(wire.receive())], [memory.map])
+            wire.send(encode_message(reply))

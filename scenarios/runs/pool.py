@@ -8,10 +8,12 @@ kept if it comes first. Only this process writes to the run folder.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from functools import partial
 from logging import ERROR, WARNING
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
@@ -19,11 +21,12 @@ from cosim.core.errors import RunError
 from cosim.core.log_event import happened
 from cosim.episode.manifest_checks import with_goal
 from cosim.results.record import Record, Status
-from cosim.results.run_folder import RunFolder
+from cosim.results.run_folder import FailedAttempt, RunFolder
 from cosim.results.run_setup import NO_RENDERER
+from cosim.spec.episode_id import pseudonym_of
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario
-from scenarios.ipc.faults import Failure, failure_of_result
+from scenarios.ipc.faults import RULES, Failure, failure_of_result
 from scenarios.ipc.messages import (
     Done,
     FrameDrawn,
@@ -33,7 +36,6 @@ from scenarios.ipc.messages import (
     Message,
     MessageHandler,
 )
-from scenarios.runs.attempts import AttemptQueue
 from scenarios.runs.environment_slot import no_answer
 from scenarios.runs.shared_renderer import SharedRenderer
 from scenarios.runs.transport import LateResult, Reception, Transport, Worker
@@ -62,7 +64,7 @@ def run_all(
     a record cannot be written."""
     if renderer is not None:
         hello = msgspec.structs.replace(hello, renderer=renderer.at)
-    queue = AttemptQueue(folder, scenarios)
+    queue = _AttemptQueue(folder, scenarios)
     pool = _Pool(folder, queue, hello, transport, options, tell, renderer)
     happened("run begun", episodes=len(scenarios), policy=hello.policy, folder=str(folder.path))
     try:
@@ -81,7 +83,7 @@ class _Pool:
     def __init__(
         self,
         folder: RunFolder,
-        queue: AttemptQueue,
+        queue: _AttemptQueue,
         hello: Hello,
         transport: Transport,
         options: EpisodeOptions,
@@ -265,3 +267,56 @@ class _Pool:
         if self._renderer is not None:
             self._renderer.episode_ended()
         self._tell(Done(scenario.id, status))
+
+
+class _GivenUp(NamedTuple):
+    """The status and the reason of an episode after its last failed attempt."""
+
+    status: Status
+    reason: str
+
+
+class _AttemptQueue:
+    """Holds the scenarios that wait to be run, in the order of their pseudonyms.
+
+    A policy that counts its episodes thus does not learn which they are. Failed attempts are
+    counted in the run folder, so that a resumed run continues the count.
+    """
+
+    def __init__(self, folder: RunFolder, scenarios: Sequence[Scenario]) -> None:
+        self._folder = folder
+        self._waiting = deque(sorted(scenarios, key=partial(pseudonym_of, folder.spec.setup.seed)))
+        self._failed = folder.failed_attempts()
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def next(self) -> Scenario:
+        """Remove the first scenario, and return it."""
+        return self._waiting.popleft()
+
+    def named(self, name: str) -> Scenario | None:
+        """Return the scenario of this name if it waits."""
+        return next((scenario for scenario in self._waiting if scenario.id == name), None)
+
+    def remove(self, scenario: Scenario) -> None:
+        """Remove a scenario that waits."""
+        self._waiting.remove(scenario)
+
+    def failed(self, scenario: Scenario, failure: Failure) -> _GivenUp | None:
+        """Queue a scenario again after a failed attempt; after the last one, return how it is
+        recorded."""
+        rule = RULES[failure.fault]
+        if rule.attempts == 1:
+            return _GivenUp(rule.status, failure.why)
+        attempt = FailedAttempt(scenario.id, failure.fault == "machine_lost")
+        if rule.attempts is not None:
+            self._failed[attempt] += 1
+            self._folder.keep_failed_attempt(attempt)
+            if self._failed[attempt] >= rule.attempts:
+                times = f"{failure.why}, {rule.attempts} times; see logs/ in the run folder"
+                return _GivenUp(rule.status, times)
+        facts = {"why": failure.why, "attempts": self._failed[attempt], "of": rule.attempts or 0}
+        happened("retried", WARNING, scenario=scenario.id, **facts)
+        self._waiting.appendleft(scenario)
+        return None

@@ -24,6 +24,7 @@ from cosim.core.errors import MachineError, UsageError
 from cosim.policies.user_module import importable
 from cosim.results.run_spec import RunSpec
 from cosim.spec.scenario import Place
+from scenarios.ipc.child_process import raise_unable
 from scenarios.ipc.faults import Failure
 from scenarios.ipc.messages import (
     Done,
@@ -34,7 +35,6 @@ from scenarios.ipc.messages import (
     decode_message,
     encode_message,
 )
-from scenarios.ipc.watchdog import raise_unable
 from scenarios.runs.lease import Lease
 from scenarios.runs.net_transfer import Nets, travels
 from scenarios.runs.protocol import difference, installed_for, other_renderer

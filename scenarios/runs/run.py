@@ -35,11 +35,11 @@ from cosim.spec.scenario import Scenario, Suite, split_called
 from cosim.spec.selection import scenarios_chosen
 from physics.cameras.choice import camera_of_choice
 from scenarios.ipc.messages import MessageHandler
-from scenarios.runs.local import LocalProcesses
+from scenarios.runs.local import InProcess, LocalProcesses
 from scenarios.runs.planning import PlannedRun, check_folder, held_run, planned_run
 from scenarios.runs.pool import run_all
 from scenarios.runs.shared_renderer import SharedRenderer, check_shared
-from scenarios.runs.transport import HeldRun, InProcess, TransportFactory
+from scenarios.runs.transport import HeldRun, TransportFactory
 from scenarios.suites.catalog import load_suite, with_crowd, with_robot
 from scenarios.suites.fits import LOOKING, check_places
 from scenarios.suites.sample import suite_on_map

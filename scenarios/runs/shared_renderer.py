@@ -20,10 +20,9 @@ from cosim.core.errors import MachineError, UsageError
 from cosim.episode.policy_caller import Driver
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import CameraName, RendererAt
-from scenarios.ipc.child_process import KeptProcess
+from scenarios.ipc.child_process import KeptProcess, Watchdog
 from scenarios.ipc.deadlines import Patience
 from scenarios.ipc.messages import Hello, encode_message
-from scenarios.ipc.watchdog import Watchdog
 
 RENDERERS: Final = 3
 """So many may end, one after the other, without an episode that ends in between."""

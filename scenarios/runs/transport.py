@@ -12,12 +12,10 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from typing import Literal, NamedTuple, Protocol
 
-from cosim.episode.policy_caller import Driver
 from cosim.results.run_folder import RunFolder
 from cosim.spec.scenario import Scenario
 from scenarios.ipc.faults import Failure
 from scenarios.ipc.messages import Done, Hello, Job, MessageHandler
-from scenarios.runs.worker import run_job
 
 
 class Worker(Protocol):
@@ -104,55 +102,3 @@ TransportFactory = Callable[
     [HeldRun, MessageHandler], AbstractContextManager[tuple[Transport, MessageHandler]]
 ]
 """Creates the transport for a run and wraps its progress callback."""
-
-
-class InProcess:
-    """Runs episodes in this process, one after another, with a policy that is loaded here.
-
-    An episode that hangs or dies takes the run with it, and no time limit of an answer is enforced.
-    """
-
-    def __init__(self, driver: Driver) -> None:
-        self._driver = driver
-
-    def room(self, busy: int) -> int:
-        return 1 - busy
-
-    def unsolicited(self) -> tuple[()]:
-        return ()
-
-    def start(self, hello: Hello) -> _ThisProcess:
-        return _ThisProcess(self._driver)
-
-    def wait(self, timeout_s: float) -> None:
-        """Do nothing: the next poll runs the next job."""
-
-
-class _ThisProcess:
-    """Runs its job when it is polled."""
-
-    log = "this process's own output"
-    ended = False
-
-    def __init__(self, driver: Driver) -> None:
-        self._driver = driver
-        self._job: Job | None = None
-
-    def give(self, job: Job) -> None:
-        self._job = job
-
-    def poll(self, hear: MessageHandler) -> None:
-        job = self._job
-        self._job = None
-        if job is not None:
-            done, _ = run_job(job, self._driver, hear)
-            hear(done)
-
-    def cancel(self) -> None:
-        """Do nothing: nothing else runs while it works."""
-
-    def stop(self) -> None:
-        """Do nothing: this process continues."""
-
-    def end(self) -> None:
-        """Do nothing: this process continues."""

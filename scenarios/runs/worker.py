@@ -46,8 +46,7 @@ from scenarios.ipc.messages import (
     encode_message,
 )
 from scenarios.ipc.render_link import link_to
-from scenarios.runs.policy_host import policy_driver
-from scenarios.runs.shared_policy import shared_driver
+from scenarios.runs.policy_host import policy_driver, shared_driver
 
 REPORT_EVERY_TICKS = 20
 CANNOT_START = "an environment process cannot start:"

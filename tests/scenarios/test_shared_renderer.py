@@ -41,7 +41,7 @@ from scenarios.ipc.render_protocol import Draw, Rendered, Request, decode_reques
 from scenarios.ipc.shared_memory import SharedMemory
 from scenarios.places.nets import place
 from scenarios.runs import run as suite_run
-from scenarios.runs.shared_policy import shared_driver
+from scenarios.runs.policy_host import shared_driver
 from scenarios.runs.shared_renderer import End, SharedRenderer, check_shared
 from scenarios.tools.bench.cameras import busy_street
 from scenarios.tools.verify.doctor import small_scenario
