@@ -1,4 +1,4 @@
-"""A recorded episode run again: the same commands, the same injections, the same state hash."""
+"""Replay of a recorded episode: same commands, same injections, same state hash."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from sumo_nets.crowd.demand_log import Entrances
 
 
 class Recorded(NamedTuple):
-    """All that a run folder holds of an episode."""
+    """A finished episode as loaded from a run folder."""
 
     scenario: Scenario
     record: Record
@@ -37,7 +37,7 @@ class Recorded(NamedTuple):
 
 
 def recorded(folder: Path, scenario_id: str) -> Recorded:
-    """A finished episode. Raises UsageError with the valid names, RunError when it crashed."""
+    """Load a finished episode. Raises UsageError with the valid names, RunError if it crashed."""
     records = {record.scenario.id for record in read_records(folder)}
     if scenario_id not in records:
         raise unknown(f"finished episode in {folder}", scenario_id, records)
@@ -54,10 +54,9 @@ def recorded(folder: Path, scenario_id: str) -> Recorded:
 def replaying(
     told: Recorded, camera: CameraChoice = "auto", *watches: Watch, judged_alone: bool = False
 ) -> tuple[Episode, Replay]:
-    """The recorded episode once more, not begun yet, and the policy that does what was done in it.
+    """Return a new Episode for a replay, and the policy that repeats the recorded commands.
 
-    judged_alone: leave out what is measured beside what the referee judges, for a replay whose
-    result is not needed.
+    judged_alone: compute no measures, for a replay whose result is not needed.
     """
     options = EpisodeOptions(
         seed=told.record.setup.seed, camera=camera, injections=told.record.injections
@@ -74,13 +73,13 @@ def _judge_alone(stage: StagedScenario) -> None:
 
 
 def replayed(told: Recorded, *watches: Watch, progress: Progress = ignore) -> str:
-    """Run it again; the state hash that comes out."""
+    """Replay an episode, and return its state hash."""
     return _again(told, progress, *watches)[0]
 
 
 def compared(told: Recorded, progress: Progress = ignore) -> tuple[str, Compared]:
-    """Run it again, then its street without the robot; the state hash, and what the robot cost the
-    others."""
+    """Replay an episode, then its street without the robot; return the state hash and the
+    delays."""
     beside = Beside()
     state_hash, entrances = _again(told, progress, beside.watch)
     return state_hash, beside.compared(
@@ -100,8 +99,11 @@ def _again(told: Recorded, progress: Progress, *watches: Watch) -> tuple[str, En
 
 
 class Alike:
-    """Watches a replay, and holds every tick against the recorded trajectory, to the bit: the
-    robot's pose, speeds and command, its way, its resets, and how near the nearest person is."""
+    """Checker that every tick of a replay equals the recorded trajectory to the bit.
+
+    Compared are the robot's pose, speeds and command, its route position, its resets and the
+    distance to the nearest person.
+    """
 
     def __init__(self, folder: Path, told: Recorded) -> None:
         self._folder = folder
@@ -109,19 +111,19 @@ class Alike:
         self._footprint_m = robot_called(told.scenario.robot).footprint_m
 
     def watch(self, step: Step, verdict: Verdict) -> None:
-        """The next tick. Raises RunError when it is not the recorded one."""
+        """Check the next tick. Raises RunError if it differs from the recorded one."""
         if not self._told.log.same(Tick(step, verdict, self._footprint_m, OnRoad())):
             raise otherwise(self._folder, self._told, f"from {Clock().time_s(step.tick):g} s on")
 
 
 def check(folder: Path, told: Recorded, state_hash: str) -> None:
-    """Raises RunError when a replay came out otherwise than recorded."""
+    """Check the state hash of a replay. Raises RunError if it differs from the recorded one."""
     if state_hash != told.record.state_hash:
         raise otherwise(folder, told, f"{state_hash[:16]}, recorded {told.record.state_hash[:16]}")
 
 
 def otherwise(folder: Path, told: Recorded, what: str) -> RunError:
-    """The error for a replay that came out otherwise than recorded; what: the difference."""
+    """Return the error for a replay that differs from the record. what: the difference."""
     record = told.record
     here = versions()
     changed = [
