@@ -93,8 +93,8 @@ def waypoints_ahead(
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
     """Return the waypoints after each of n pictures, and how many of them the expert drove to.
 
-    Waypoint k is the robot's position (k + 1) * `every` ticks after the picture. After the first
-    disturbed picture, or the end of the trajectory, it is extrapolated by the expert's last command.
+    Waypoint k is the robot's position (k + 1) * `every` ticks after the picture. From the first
+    disturbed picture or the trajectory's end on, it is extrapolated by the expert's last command.
 
     pose (T + 1, 3): x in m, y in m and heading in rad at the start of each tick and at the end.
     ticks (n,): the tick of each picture, ascending.

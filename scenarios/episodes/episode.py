@@ -61,8 +61,8 @@ _engines_ran_in: set[int] = set()
 class Episode:
     """One episode of a scenario, for a policy with this manifest.
 
-    Use it in a `with` block: its engines start on entering, and are always closed. A process can run
-    one episode at a time, because SUMO runs once in each process.
+    Use it in a `with` block: its engines start on entering, and are always closed. A process can
+    run one episode at a time, because SUMO runs once in each process.
 
     id, seed: arguments of the policy's `reset`.
     watches: called at every tick.
@@ -72,9 +72,9 @@ class Episode:
     setup: of the run, with seed and latency; by default derived from the options.
     renderer: shared renderer of the run, used in place of an own camera.
 
-    Raises UsageError for a camera that the robot lacks, for a goal that the policy does not support,
-    and for calls in the wrong order. Raises PolicyError for an invalid command, EngineError when an
-    engine fails or runs already, and the errors of loading its place.
+    Raises UsageError for a camera that the robot lacks, for a goal that the policy does not
+    support, and for calls in the wrong order. Raises PolicyError for an invalid command,
+    EngineError when an engine fails or runs already, and the errors of loading its place.
 
     >>> from cosim import load_policy, load_suite
     >>> policy = load_policy("straight")

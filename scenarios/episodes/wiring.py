@@ -130,7 +130,7 @@ def staged(
         look = None if camera is None else partial(empty_street, camera, street, robot)
         director = stack.enter_context(director_of(scenario.id, options.director, waiting, kinds))
         if scenario.crowd.residents:
-            # Imported only where needed: it loads networkx.
+            # Imported only where needed: it loads scipy.
             from scenarios.events.resident_director import among_residents
 
             director = among_residents(
@@ -221,8 +221,8 @@ def sumo_crowd(
     before: Entrances | None = None,
     standing: Standing | None = None,
 ) -> SumoCrowd:
-    """Create the crowd and traffic of a net by SUMO, not started. Raises MachineError if SUMO cannot
-    be loaded."""
+    """Create the crowd and traffic of a net by SUMO, not started. Raises MachineError if SUMO
+    cannot be loaded."""
     try:
         from sumo_nets.crowd.crowd import SumoCrowd
     except (ImportError, OSError) as error:

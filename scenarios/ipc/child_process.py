@@ -1,5 +1,4 @@
-"""Starts processes of this machine, talks to them over a socket, and ends them with everything they
-have started."""
+"""Child processes of a run: started, watched, and ended with all their own children."""
 
 from __future__ import annotations
 
@@ -32,10 +31,11 @@ from scenarios.ipc.messages import (
 )
 
 WORKER: Final = "scenarios.runs.worker:serve_jobs"
+"""The function of an environment process."""
 ENDING_S: Final = 10.0
-"""Seconds that a process has to end by itself, and then its supervisor to clear up."""
+"""Seconds that a process may take to end before it is killed; then the same for its supervisor."""
 _FAULTS: Final = tuple(-fault for fault in (SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV))
-"""Exit codes of a process that compiled code has ended."""
+"""Exit codes of a process that crashed in compiled code."""
 _CODE: Final = (
     "import sys; sys.path[:] = {path!r}; from scenarios.ipc.supervisor import keep_worker; "
     "keep_worker({serves!r}, {given}, {run})"
@@ -43,10 +43,15 @@ _CODE: Final = (
 
 
 class KeptProcess:
-    """A shepherd and its worker (`scenarios.ipc.supervisor`). log: where it keeps what is printed,
-    None for this process's standard error; serves: the function that is the worker; called: what
-    kind of process that is; also: descriptors that it is given besides. open: it has not ended, as
-    far as the run knows. most_bytes: of a message from it."""
+    """A supervisor process and its worker (`scenarios.ipc.supervisor`).
+
+    log: file of its output, None for this process's standard error.
+    serves: function that the worker runs, as module:name.
+    called: kind of the process, for messages.
+    also: further descriptors to pass on.
+    most_bytes: size limit of a message from it.
+    open: whether it is not known to have ended.
+    """
 
     def __init__(
         self,
@@ -84,40 +89,46 @@ class KeptProcess:
 
     @property
     def question(self) -> Question | None:
+        """Return the pending call of the policy; after the end, the one that was pending then."""
         return self._asked.question if self.open else self._last_asked
 
     @property
     def descriptor(self) -> int | None:
-        """File descriptor that is readable when it has a message; None if it has ended."""
+        """Return the file descriptor that is readable when it has a message; None if it has
+        ended."""
         return self.wire.fileno() if self.open else None
 
     def give(self, job: Job) -> None:
         self.send(encode_message(job))
 
     def send(self, message: bytes) -> None:
-        """Send it a message. A process that has died, or was stopped, ignores it."""
+        """Send it a message, without waiting. A process that has ended ignores it."""
         with suppress(OSError):
             self.wire.post(message)
 
     def listen(self, hear: MessageHandler) -> bool:
+        """Pass on the messages that have arrived. Returns False if no more will."""
         with suppress(OSError):
             self.wire.flush()
         try:
             for message in self.wire.received():
                 hear(decode_message(message))
-        except (EOFError, msgspec.DecodeError):  # a policy can write to the socket, too
+        except (EOFError, msgspec.DecodeError):  # a policy can write garbage to the socket
             return False
         return True
 
     def hang_up(self) -> None:
+        """Close the socket, after which an idle worker ends."""
         self.wire.close()
 
     def kill(self, *, wait: bool = True) -> None:
+        """End it by force."""
         self._child.send_signal(signal.SIGTERM)
         if wait:
             self.end()
 
     def end(self) -> str:
+        """Wait for its end, by force if that takes too long. Returns the reason in words."""
         self.wire.close()
         code = self._code(ENDING_S)
         if code is None:
@@ -134,7 +145,7 @@ class KeptProcess:
         return f"the {self.called} process {_in_words(code)}{during}"
 
     def _code(self, wait_s: float) -> int | None:
-        """Its exit code; None if it has not ended in time."""
+        """Return its exit code; None if it has not ended in time."""
         try:
             return self._child.wait(wait_s)
         except subprocess.TimeoutExpired:
@@ -163,11 +174,11 @@ class ProcessEnd(NamedTuple):
 
 
 class Watchdog:
-    """Watches one process.
+    """Watches one process, and kills it when it hangs.
 
-    silence_s: seconds without a message after which it hangs, unless a policy call is pending.
+    silence_s: timeout in seconds of its heartbeats, unless a policy call is pending.
     ready: whether it has loaded the engines and the policy.
-    heard_s: monotonic clock of its last sign of life.
+    heard_s: monotonic clock of its last message.
     """
 
     def __init__(self, process: KeptProcess, patience: Patience, silence_s: float) -> None:
@@ -180,8 +191,9 @@ class Watchdog:
     def poll(self, hear: MessageHandler, *, idle: bool = False) -> ProcessEnd | None:
         """Pass on its messages. Returns its end, if it has ended or was killed because it hangs.
 
-        An `idle` process may be silent. Raises UsageError if it cannot load the policy,
-        MachineError if the machine lacks something."""
+        idle: whether it may be silent.
+        Raises UsageError if it cannot load the policy, MachineError if the machine lacks something.
+        """
         if not self.process.listen(partial(self._take, hear)):
             words = self.process.end()
             return ProcessEnd(words, self.process.question, self.process.in_engine)

@@ -1,5 +1,4 @@
-"""Defines the messages between a run and its workers; between processes and machines they are
-MessagePack."""
+"""Messages between a run and its workers, as MessagePack."""
 
 from __future__ import annotations
 
@@ -17,8 +16,8 @@ from scenarios.ipc.deadlines import Patience
 
 
 class Hello(msgspec.Struct, frozen=True, tag=True):
-    """Introduces the policy of a run to a worker: its name, and the manifest and the source that it
-    must have there.
+    """Introduces the policy of a run to a worker, with the manifest and source hash that it must
+    have there.
 
     renderer: address of the run's shared renderer, if it has one.
     host: where the policy runs.
@@ -39,14 +38,12 @@ class Job(msgspec.Struct, frozen=True, tag=True):
     """Requests an episode.
 
     setup: of the run; without one it follows from options and policy.
-    renderer: address of the run's shared renderer, if it has one.
-    net_hash: that of its street net, if the worker is on another machine; else "".
+    net_hash: hash of its street net, if the worker is on another machine; else "".
     """
 
     scenario: Scenario
     options: EpisodeOptions = EpisodeOptions()
     setup: RunSetup | None = None
-    renderer: RendererAt | None = None
     net_hash: str = ""
 
 

@@ -1,7 +1,7 @@
-"""A policy in a process of its own, with a shepherd of its own.
+"""Isolated policies: a policy in a supervised process of its own, and its client.
 
-Requests go over a socket, arrays through memory that it shares with the environment's process
-alone.
+Requests go over a socket, arrays through memory shared with the environment's process only. The
+policy's process loads no engine, and has no data of the run but observations.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ from scenarios.ipc.shared_memory import SharedMemory, room_for
 from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy
 
 _SERVES: Final = "scenarios.runs.isolated_policy:serve_alone"
+"""The function of the policy's process."""
 _MOST_BYTES: Final = 4 << 20
-"""Bytes of an answer."""
+"""Size limit of an answer in bytes."""
 
 
 class _PolicyProcess:
-    """Carries requests to a process of this machine. room: bytes for the arrays of an
-    observation."""
+    """Carrier of requests to a child process. room: bytes for the arrays of an observation."""
 
     loses = False
 
@@ -103,10 +103,12 @@ def isolated_driver(
     run: str = "",
     start_s: float = LOADED_WITHIN_S,
 ) -> HostedDriver:
-    """A policy by its name, in a process of its own. expected: its manifest as the run knows it,
-    with which it is to be asked; without, nothing is. start_s: without a timer it may take so long
-    to be loaded. Raises UsageError as `load_policy` does, and for one that is told what only the
-    simulator knows."""
+    """Load a policy in a process of its own.
+
+    expected: its manifest in the run, by which shared memory is sized; None if it is not queried.
+    start_s: timeout of loading in seconds, used without a timer.
+    Raises UsageError as `load_policy` does, and for a privileged policy.
+    """
     with ExitStack() as stack, policy_call("loading", timer=timer, passes=(BaseException,)):
         process = _PolicyProcess(name, room_for(expected))
         stack.callback(process.close)
@@ -127,10 +129,11 @@ def isolated_driver(
 
 
 def serve_alone(socket_descriptor: int, asked_descriptor: int, memory_descriptor: int) -> None:
-    """Answer until the socket closes. The first message is the policy's name; the reply is its
-    info.
+    """Answer requests until the socket closes. The first message is the policy's name, replied to
+    with its info.
 
-    asked_descriptor: not used, because the environment's process times the calls itself."""
+    asked_descriptor: not used, because the environment's process enforces the timeouts.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.close(asked_descriptor)
     wire = Wire(socket(fileno=socket_descriptor))
@@ -138,7 +141,7 @@ def serve_alone(socket_descriptor: int, asked_descriptor: int, memory_descriptor
     os.close(memory_descriptor)
     name = wire.receive().decode()
     try:
-        driver = load_policy(name, Untimed())  # the process that started this one has the deadline
+        driver = load_policy(name, Untimed())
     except UsageError as error:
         wire.send(encode_message(Refusal("policy", str(error))))
         return

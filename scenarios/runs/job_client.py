@@ -1,4 +1,4 @@
-"""Claims jobs for one environment slot of a worker, and reports on them to the coordinator.
+"""Client of the coordinator for one environment slot of a worker: claims jobs and reports on them.
 
 It holds no session: it returns the requests that are due, and takes in the replies. A request is
 repeated until there is a reply.
@@ -245,7 +245,8 @@ class JobClient:
         self._report_at_s = time.monotonic() + REPORT_S
         where = lease.job.scenario.place
         if isinstance(where, CityMap):
-            from scenarios.runs.net_transfer import Fetched, lacks  # with the importer of maps
+            # Imported only where needed: it loads the importer of maps.
+            from scenarios.runs.net_transfer import Fetched, lacks
 
             if lacks(where):
                 self._fetched = Fetched(where, lease.job.net_hash)

@@ -13,8 +13,7 @@ from scenarios.runs.worker import run_job
 
 
 class LocalProcesses:
-    """Runs up to `jobs` environment processes; each writes a file of its own in the folder
-    `logs`."""
+    """Transport to up to `jobs` environment processes; each has a log file in the folder `logs`."""
 
     def __init__(self, logs: Path, jobs: int = 1) -> None:
         self._logs = logs
@@ -44,9 +43,9 @@ class LocalProcesses:
 
 
 class InProcess:
-    """Runs episodes in this process, one after another, with a policy that is loaded here.
+    """Transport that runs episodes in this process, one after another, with a loaded policy.
 
-    An episode that hangs or dies takes the run with it, and no time limit of an answer is enforced.
+    An episode that hangs or dies ends the run, and no timeout of an answer is enforced.
     """
 
     def __init__(self, driver: Driver) -> None:
@@ -66,7 +65,7 @@ class InProcess:
 
 
 class _ThisProcess:
-    """Runs its job when it is polled."""
+    """Worker that runs its job when it is polled."""
 
     log = "this process's own output"
     ended = False

@@ -1,5 +1,5 @@
-"""The driver of a run's policy, wherever that is: in this process, in one of its own, or behind
-Zenoh."""
+"""Drivers of a run's policy in this process, in an isolated one, behind Zenoh, or in the shared
+renderer."""
 
 from __future__ import annotations
 
@@ -24,15 +24,18 @@ def policy_driver(
     expected: Manifest | None = None,
     start_s: float = LOADED_WITHIN_S,
 ) -> Driver:
-    """A policy by its name. expected: its manifest as the run knows it; one elsewhere is only asked
-    who it is without. start_s: without a timer it may take so long to be loaded, where it is loaded
-    in a process of its own. Raises UsageError.
+    """Load a policy by its name.
+
+    expected: its manifest in the run; None if only its manifest is needed.
+    start_s: timeout of loading in seconds, used without a timer.
+    Raises UsageError.
 
     >>> policy_driver("route", PolicyHost()).manifest.name
     'route'
     """
     name = importable(name)
     if name.startswith(REMOTE_SCHEME):
+        # Imported only where needed: it loads Zenoh and OpenCV.
         from scenarios.runs.remote_policy import remote_driver
 
         if host.isolated:
@@ -48,9 +51,10 @@ def policy_driver(
 def known_driver(
     name: str, host: PolicyHost, jobs: int = 1, start_s: float = LOADED_WITHIN_S
 ) -> Driver:
-    """A policy for who wants to know what it is, before a run asks it: one elsewhere is left at
-    once. Raises UsageError when its servers answer for fewer episodes at a time than there are
-    jobs."""
+    """Load a policy to inspect it before a run; connections and processes of its own are closed.
+
+    Raises UsageError if its servers answer for fewer episodes at a time than there are jobs.
+    """
     driver = policy_driver(name, host, start_s=start_s)
     driver.close()
     if 0 < driver.at_once < jobs:
@@ -62,7 +66,7 @@ def known_driver(
 
 
 class _RendererCarrier:
-    """Carries requests to the renderer, which has the picture already."""
+    """Carrier of requests to the shared renderer, which has the picture already."""
 
     loses = False
 
@@ -95,7 +99,6 @@ class _RendererCarrier:
 def shared_driver(
     manifest: Manifest, source_hash: str, renderer: RendererAt, run: str
 ) -> HostedDriver:
-    """Return the driver of the policy in a shared renderer, whose deadlines the run enforces
-    there."""
+    """Return the driver of a policy in the shared renderer, where the run enforces its timeouts."""
     policy = HostedPolicy(manifest, _RendererCarrier(renderer.address), run)
     return HostedDriver(policy, "in-process", source_hash)

@@ -1,9 +1,9 @@
-"""Runs scenarios by the workers that a transport reaches.
+"""Pool of workers that runs the scenarios of a run over a transport.
 
-A worker reports the failure of its job (`scenarios.ipc.faults`). The scenario is run again,
-or recorded after its last attempt, so that none is ever lost. An episode that loses the shared
-renderer is run again. A worker that is lost with its machine may still deliver its result, which is
-kept if it comes first. Only this process writes to the run folder.
+A worker reports the failure of its job (`scenarios.ipc.faults`). The scenario is retried, or
+recorded after its last attempt, so that none is lost. An episode that loses the shared renderer is
+retried. A lost worker may still deliver its result, which is stored if it is the first one. Only
+this process writes to the run folder.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ from scenarios.runs.shared_renderer import SharedRenderer
 from scenarios.runs.transport import LateResult, Reception, Transport, Worker
 
 POLL_S = 1.0
+"""Longest time in seconds between two polls of the workers."""
 
 
 def run_all(
@@ -112,7 +113,7 @@ class _Pool:
         worker = next(idle, None) or self._transport.start(self._hello)
         self._workers[worker] = scenario
         self._folder.forget(scenario.id)
-        worker.give(Job(scenario, self._options, self._setup, self._hello.renderer))
+        worker.give(Job(scenario, self._options, self._setup))
         happened("claimed", scenario=scenario.id, worker=Path(worker.log).stem)
 
     def poll(self) -> None:
@@ -198,15 +199,13 @@ class _Pool:
             self._give_up(scenario, given_up.reason, given_up.status)
 
     def _failure_of(self, scenario: Scenario, lost: LostRenderer) -> Failure:
-        """Return the failure of an episode whose shared renderer has ended: its policy's if that
-        was being queried."""
+        """Return the failure of an episode whose shared renderer has ended, the policy's if its
+        call was pending."""
         assert self._renderer is not None
         end = self._renderer.end_of(lost.number)
         if end is None:
-            return Failure(
-                "process_ended",
-                "the environment process lost its connection to the shared renderer",
-            )
+            words = "the environment process lost its connection to the shared renderer"
+            return Failure("process_ended", words)
         if not lost.asked:
             return Failure("handed_back")
         if end.unanswered_s is None:
@@ -215,8 +214,7 @@ class _Pool:
         return Failure("policy_timeout", f"{words} in {lost.asked} of {scenario.id}")
 
     def _late(self, done: Done) -> Reception:
-        """Keep a late result if there is none; its scenario is taken from the worker that has it
-        now."""
+        """Store a late result if there is none, and cancel the worker that runs the scenario."""
         busy = (
             worker
             for worker, job in self._workers.items()
@@ -227,9 +225,8 @@ class _Pool:
         if scenario is None:
             return self._second(done)
         record = self._record_of(scenario, done)
-        if (
-            record is None or done.again or self._options.frames_every_s
-        ):  # some of its frames may be lost
+        frames_may_be_lost = self._options.frames_every_s > 0.0
+        if record is None or done.again or frames_may_be_lost:
             return "refused"
         if worker is None:
             self._queue.remove(scenario)
@@ -277,10 +274,10 @@ class _GivenUp(NamedTuple):
 
 
 class _AttemptQueue:
-    """Holds the scenarios that wait to be run, in the order of their pseudonyms.
+    """Queue of the scenarios of a run, with a count of their failed attempts.
 
-    A policy that counts its episodes thus does not learn which they are. Failed attempts are
-    counted in the run folder, so that a resumed run continues the count.
+    They are sorted by pseudonym, so that a policy cannot identify a scenario by counting episodes.
+    Failed attempts are stored in the run folder, so that a resumed run continues the count.
     """
 
     def __init__(self, folder: RunFolder, scenarios: Sequence[Scenario]) -> None:

@@ -65,10 +65,11 @@ class EnvironmentActor:
             )
 
     def give(self, job: bytes, where: Place, digest: str, packed: bytes | None) -> None:
-        """Run a job. `packed` is its map, which is kept here if it is missing."""
+        """Run a job. `packed` is its map, which is stored on this node if it is missing."""
         try:
             if packed is not None:
-                from scenarios.runs.net_transfer import Fetched, lacks  # with the importer of maps
+                # Imported only where needed: it loads the importer of maps.
+                from scenarios.runs.net_transfer import Fetched, lacks
 
                 if isinstance(where, CityMap) and lacks(where):
                     Fetched(where, digest).keep(packed)
