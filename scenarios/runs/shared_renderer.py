@@ -1,7 +1,7 @@
-"""A run's shared renderer: started, replaced when it ends, ended with the run.
+"""Management of a run's shared renderer: started, replaced when it fails, ended with the run.
 
-The run holds the socket that environments connect to, so that its address lasts while renderers
-come and go: who connects in between waits for the next one.
+The run holds the socket that environments connect to, so that the address remains valid when a
+renderer is replaced. An environment that connects meanwhile waits for the next one.
 """
 
 from __future__ import annotations
@@ -18,32 +18,39 @@ import msgspec
 
 from cosim.core.errors import MachineError, UsageError
 from cosim.episode.policy_caller import Driver
-from cosim.spec.manifest import Manifest
 from cosim.spec.options import CameraName, RendererAt
 from scenarios.ipc.child_process import KeptProcess, Watchdog
 from scenarios.ipc.deadlines import Patience
 from scenarios.ipc.messages import Hello, encode_message
 
 RENDERERS: Final = 3
-"""So many may end, one after the other, without an episode that ends in between."""
+"""Number of renderers that may fail in a row without an episode that ends in between."""
 _SILENCE_S: Final = 120.0
-"""A renderer that says nothing for so long, while its policy has nothing to answer, hangs."""
+"""Timeout in seconds of a renderer's heartbeats while no policy call is pending."""
 _ENDING_S: Final = 5.0
-"""How long an ended renderer's socket to the run may stay open, after those to its environments."""
+"""Longest time in seconds between an environment's notice of a renderer's end and the run's."""
 _SERVES: Final = "scenarios.runs.renderer:serve_pictures"
+"""The function of the renderer's process."""
 
 
 class End(NamedTuple):
-    """How a renderer ended. words: in words; unanswered_s: how long its policy gave no answer,
-    where that was why."""
+    """The end of a renderer, in words.
+
+    unanswered_s: timeout of the policy call in seconds, if the renderer was killed for it.
+    """
 
     words: str
     unanswered_s: float | None = None
 
 
 class SharedRenderer:
-    """Use it in a `with` block. logs: the folder for what renderers print. hello: the policy of the
-    run; asks: whether it is asked there. at: what environments are told of it."""
+    """The shared renderer of a run. Use it in a `with` block.
+
+    logs: folder for the output of renderers.
+    hello: introduces the policy of the run.
+    asks: whether the renderer also queries the policy.
+    at: its address for environments.
+    """
 
     def __init__(
         self, logs: Path, hello: Hello, *, asks: bool, patience: Patience = Patience()
@@ -76,8 +83,8 @@ class SharedRenderer:
         self._listening.close()
 
     def tend(self) -> None:
-        """Take in what the renderer says; start another if it has ended or hangs. Raises UsageError
-        when it cannot load the policy, MachineError when there can be none."""
+        """Check the renderer, and replace it if it has ended or hangs. Raises UsageError if it
+        cannot load the policy, MachineError if none can be started."""
         if self._watchdog is None:
             self._start()
             return
@@ -98,8 +105,11 @@ class SharedRenderer:
         )
 
     def end_of(self, number: int) -> End | None:
-        """How the renderer of that number ended; None if it goes on, and an environment alone has
-        lost it. 0: that of one that has not answered at all."""
+        """Return the end of the renderer with this number; None if it still runs, and only an
+        environment has lost it.
+
+        number: from 1; 0 for an environment that never had a reply.
+        """
         if number == 0:
             return End("the renderer process could not be reached")
         deadline_s = time.monotonic() + _ENDING_S
@@ -113,7 +123,7 @@ class SharedRenderer:
         return self._ends[number - 1] if number <= len(self._ends) else None
 
     def episode_ended(self) -> None:
-        """The run comes along."""
+        """Reset the count of failed renderers."""
         self._in_a_row = 0
 
     def _start(self) -> None:
@@ -124,34 +134,34 @@ class SharedRenderer:
         self._watchdog = Watchdog(process, self._patience, _SILENCE_S)
 
     def _replace(self, watchdog: Watchdog, end: End, *, blames_policy: bool) -> None:
-        """The renderer has ended. Raises the run's error when it does so again and again."""
+        """Start another renderer. Raises UsageError or MachineError after too many failures in a
+        row."""
         self._ends.append(end)
-        if (
-            watchdog.ready and blames_policy
-        ):  # counted as attempts of the episodes that it was asked for
+        if watchdog.ready and blames_policy:  # counted as a failed attempt of its episodes
             self._start()
             return
         self._in_a_row += 1
         if self._in_a_row >= RENDERERS:
-            told = (
+            words = (
                 f"{end.words}, {RENDERERS} times, and no episode ended in between: see "
                 f"{watchdog.process.log}"
             )
             if blames_policy:
-                raise UsageError(f"policy '{self._hello.policy}' cannot be loaded: {told}")
+                raise UsageError(f"policy '{self._hello.policy}' cannot be loaded: {words}")
             raise MachineError(
-                f"{told}, and `cosim doctor`; without --shared-renderer each environment "
+                f"{words}, and `cosim doctor`; without --shared-renderer each environment "
                 f"draws for itself"
             )
         self._start()
 
 
 def check_shared(driver: Driver, camera: CameraName) -> bool:
-    """Whether the shared renderer of a run asks the policy, too. Raises UsageError where it has
-    nothing to do.
+    """Check that a run can have a shared renderer, and return whether it also queries the policy.
 
-    camera: what draws the pictures of the run."""
-    manifest: Manifest = driver.manifest
+    camera: the camera of the run.
+    Raises UsageError.
+    """
+    manifest = driver.manifest
     if manifest.camera is None and not driver.batches:
         raise UsageError(
             f"policy '{manifest.name}' has no camera and no method 'act_batch': leave "
