@@ -1,8 +1,7 @@
-"""Runs jobs in an environment process that is started, watched, timed out and replaced.
+"""Environment slot: runs jobs in an environment process that is watched and replaced.
 
-The local pool, a Zenoh worker and a Ray actor use the same slot: what the death or the silence of a
-process means is decided here, on the machine of the process. How often an episode is tried is
-decided by `scenarios.ipc.faults`.
+The local pool, a Zenoh worker and a Ray actor use the same slot. It decides, on the machine of the
+process, what the end or a timeout of the process means. `scenarios.ipc.faults` limits the attempts.
 """
 
 from __future__ import annotations
@@ -29,8 +28,7 @@ from scenarios.ipc.messages import (
 )
 
 SILENCE_S = 300.0
-"""Seconds after which a process that reports nothing, while its policy has nothing to answer, hangs
-in an engine."""
+"""Timeout in seconds of a process's heartbeats while no policy call is pending: an engine hangs."""
 STARTS: Final = 2
 """Number of processes in a row that may end before they are ready."""
 
@@ -43,7 +41,8 @@ def start_environment(log: Path, hello: Hello) -> KeptProcess:
 
 
 class EnvironmentSlot:
-    """Runs one job at a time in an environment process (`scenarios.runs.transport.Worker`).
+    """Worker that runs one job at a time in an environment process
+    (`scenarios.runs.transport.Worker`).
 
     Raises UsageError when the policy cannot be loaded, MachineError when no process can be started.
     """
@@ -110,7 +109,7 @@ class EnvironmentSlot:
             watchdog.process.kill()
 
     def stop(self) -> None:
-        """Tell the process to end, by force if it is busy, without waiting for that."""
+        """Request the process to end, by force if it is busy, without waiting."""
         if self._watchdog is not None:
             if self.job is not None:
                 self._watchdog.process.kill(wait=False)
@@ -132,7 +131,7 @@ class EnvironmentSlot:
         hear(message)
 
     def _ended(self, watchdog: Watchdog, end: ProcessEnd) -> Failure | None:
-        """Return the failure of a job that was begun; give one that was not to another process."""
+        """Return the failure of a started job; give a job that was not started to a new process."""
         self._watchdog = None
         idle = (
             self._ran

@@ -1,4 +1,4 @@
-"""Runs an environment slot on a node of a Ray cluster, as a Ray actor.
+"""Environment slot on a node of a Ray cluster, as a Ray actor.
 
 The actor loads no engine: the environment process of its slot does, as in a run on one machine.
 """

@@ -44,7 +44,7 @@ from scenarios.ipc.shared_memory import room_for
 from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy, PolicyServerBusy
 
 DOMAIN: Final = "default"
-"""First part of the keys of policies."""
+"""Domain in the keys of policy servers."""
 _QUALITY: Final = 90
 """Quality of JPEG pictures, of 100."""
 

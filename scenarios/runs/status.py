@@ -114,8 +114,10 @@ class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class WorkerRegistry:
-    """Lists the workers of one run, whose folder is locked by this process. `tell` is the run's
-    progress callback."""
+    """Registry of the workers of one run, whose folder is locked by this process.
+
+    tell: progress callback of the run.
+    """
 
     def __init__(
         self, held: RunFolder, scenarios: Sequence[Scenario], finished: int, tell: MessageHandler
@@ -197,7 +199,7 @@ class WorkerRegistry:
             self._workers[worker].state = "left"
 
     def turned_away(self, worker: str, host: str, why: str) -> None:
-        """Note that a worker can do nothing for this run."""
+        """Note that a worker cannot work for this run."""
         one = self._of(worker, host)
         if (one.state, one.why) != ("turned away", why):
             self.note(f"{worker}: turned away: {why}")

@@ -1,9 +1,7 @@
-"""Defines how jobs reach the workers that run episodes, and how their messages and results come
-back.
+"""Interfaces of transports and workers, which carry jobs to processes and results back.
 
-A transport starts workers; what a run does about a failed episode is decided in
-`scenarios.runs.pool`, and is the same for all transports. A record and its log travel as
-bytes, so that a worker needs no access to the run folder.
+`scenarios.runs.pool` decides about failed episodes, in the same way for all transports. A record
+and its log are sent as bytes, so that a worker needs no access to the run folder.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ from scenarios.ipc.messages import Done, Hello, Job, MessageHandler
 
 
 class Worker(Protocol):
-    """Runs episodes, one at a time, with the policy of its Hello."""
+    """Interface of a worker, which runs one episode at a time with the policy of its Hello."""
 
     @property
     def log(self) -> str:
@@ -47,35 +45,31 @@ class Worker(Protocol):
 
 
 Reception = Literal["kept", "duplicate", "conflict", "refused"]
-"""What became of a result: it is kept, equals or contradicts the one in the run folder, or is of no
-use."""
+"""Outcome of a result: it is stored, equals or contradicts the stored one, or is unusable."""
 
 
 class AdoptedJob(NamedTuple):
-    """A scenario that a worker runs already: the run was resumed, or had given the worker up for
-    lost."""
+    """A scenario that a worker runs already, because the run was resumed or the lease expired."""
 
     scenario: str
     worker: Worker
 
 
 class LateResult(NamedTuple):
-    """A result that arrives after the job was reassigned. `answer` is called with what became of
-    it."""
+    """A result that arrives after the job was reassigned. `answer` is called with its outcome."""
 
     done: Done
     answer: Callable[[Reception], None]
 
 
 class Transport(Protocol):
-    """Starts workers."""
+    """Interface of a transport, which starts workers."""
 
     def room(self, busy: int) -> int:
         """Return how many more jobs can be given now, while `busy` workers have one."""
 
     def unsolicited(self) -> Iterable[AdoptedJob | LateResult]:
-        """Return the jobs and results that have arrived since the last call without being
-        requested."""
+        """Return the unrequested jobs and results that have arrived since the last call."""
 
     def start(self, hello: Hello) -> Worker:
         """Start one more worker. Raises MachineError when that is impossible."""
@@ -88,8 +82,8 @@ class HeldRun(NamedTuple):
     """A run whose folder is locked by this process.
 
     hello: introduces its policy.
-    picked: its scenarios, of a shard those of the shard.
-    todo: those of them that are to be run.
+    picked: its scenarios, or those of its shard.
+    todo: those of them without a result.
     """
 
     held: RunFolder
