@@ -48,13 +48,13 @@ class Beside:
 
     def __init__(self) -> None:
         self._moments: list[tuple[RobotState, EventReply]] = []
-        self._present = Tracks(), Tracks()
+        self._with_robot = Tracks(), Tracks()
 
     def watch(self, step: Step, verdict: Verdict) -> None:
         """Record the next tick of the episode."""
         self._moments.append((step.robot, step.events))
-        self._present[0].add(_crowd(step.street_after))
-        self._present[1].add(step.street_after.vehicles)
+        self._with_robot[0].add(_crowd(step.street_after))
+        self._with_robot[1].add(step.street_after.vehicles)
 
     def compared(
         self, scenario: Scenario, entrances: Entrances, progress: Progress = ignore
@@ -64,24 +64,24 @@ class Beside:
         entrances: arrivals and departures of the episode's crowd.
         No SUMO may be running in this process.
         """
-        absent = Tracks(), Tracks()
+        without_robot = Tracks(), Tracks()
         with crowd_of(scenario, entrances) as crowd:
             for tick, (robot, reply) in enumerate(self._moments):
                 if tick % TELL_EVERY_TICKS == 0:
                     progress("without the robot", tick / len(self._moments))
                 street = crowd.step(robot, reply, absent=True)
-                absent[0].add(_crowd(street))
-                absent[1].add(street.vehicles)
+                without_robot[0].add(_crowd(street))
+                without_robot[1].add(street.vehicles)
         at = [(robot.pose.x_m, robot.pose.y_m) for robot, _ in self._moments]
         return Compared(
             *(
                 delay_of(at, a, b, Clock().tick_s)
-                for a, b in zip(self._present, absent, strict=True)
+                for a, b in zip(self._with_robot, without_robot, strict=True)
             )
         )
 
 
 def _crowd(street: Street) -> People:
-    """Return the people whom SUMO moves: event pedestrians and injected people move the same in
+    """Return the people that SUMO moves: event pedestrians and injected people move the same in
     both simulations."""
     return street.people.only(np.flatnonzero(street.people.are(PersonKind.CROWD)))

@@ -91,7 +91,7 @@ def waypoints_ahead(
     every: int,
     tick_s: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Return the waypoints after each of n pictures, and how many of them the expert drove to.
+    """Return the waypoints after each of n pictures, and the number that the expert drove to.
 
     Waypoint k is the robot's position (k + 1) * `every` ticks after the picture. From the first
     disturbed picture or the trajectory's end on, it is extrapolated by the expert's last command.

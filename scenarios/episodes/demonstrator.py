@@ -169,7 +169,7 @@ class _Rows:
         self._over = False
         self._ticks: list[int] = []
         self._numbers: list[tuple[float, ...]] = []
-        self._told: list[str] = []
+        self._instructions: list[str] = []
         self._glimpses: list[NDArray[np.uint8]] = []
         self._colours = np.zeros((3, 256), np.int64)
 
@@ -188,7 +188,7 @@ class _Rows:
         self._numbers.append(
             (seen.v_mps, seen.w_radps, x_m, y_m, answer.v_mps, answer.w_radps, float(disturbed))
         )
-        self._told.append(goal.text if isinstance(goal, Instruction) else "")
+        self._instructions.append(goal.text if isinstance(goal, Instruction) else "")
         self._glimpses.append(glimpse(rgb))
         self._colours += [
             np.bincount(channel.ravel(), minlength=256) for channel in np.moveaxis(rgb, 2, 0)
@@ -214,7 +214,7 @@ class _Rows:
             waypoints=waypoints,
             driven=driven,
             disturbed=disturbed,
-            told=np.array(self._told),
+            told=np.array(self._instructions),
             glimpses=np.stack(self._glimpses),
             colours=self._colours,
             clip=np.frombuffer(self._clip.finished(), np.uint8),

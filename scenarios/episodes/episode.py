@@ -155,8 +155,8 @@ class Episode:
             if self._through is not None:
                 self._through(stage)
             if self.options.live is not None:
-                air = stack.enter_context(OnAir(self.options.live, self.scenario, stage.injected))
-                self._watches.append(air.tell)
+                live = stack.enter_context(OnAir(self.options.live, self.scenario, stage.injected))
+                self._watches.append(live.tell)
             if self.options.pace:
                 pacer = Pacer(self.options.pace)
                 self._watches.append(lambda step, verdict: pacer.wait(self.clock.tick_s))

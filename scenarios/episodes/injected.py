@@ -77,21 +77,23 @@ class InjectedPeople:
             self._robot = robot
             self._lock.notify_all()
 
-    def offer(self, asked: InjectionRequest) -> Ack:
+    def offer(self, request: InjectionRequest) -> Ack:
         """Accept an injection for the next tick, or refuse it with a reason. Thread-safe."""
         with self._lock:
-            if asked.depends_on_robot and not self._lock.wait_for(self._robot_is_known, SETTLES_S):
+            if request.depends_on_robot and not self._lock.wait_for(
+                self._robot_is_known, SETTLES_S
+            ):
                 late = f"the tick under way takes longer than {SETTLES_S:g} s: send it again"
-                return Ack(id=asked.id, status="refused", reason=late)
-            injection = asked.resolved(self._robot.pose)
+                return Ack(id=request.id, status="refused", reason=late)
+            injection = request.resolved(self._robot.pose)
             tick = self._next_tick
-            if reason := self._objection(asked, injection):
-                return Ack(id=asked.id, status="refused", reason=reason)
+            if reason := self._objection(request, injection):
+                return Ack(id=request.id, status="refused", reason=reason)
             self._coming.append(Injected(tick=tick, injection=injection))
             self._names.add(injection.id)
         (x_m, y_m), *_ = injection.path
         return Ack(
-            id=asked.id,
+            id=request.id,
             status="accepted",
             tick=tick,
             time_s=tick * self._tick_ms / 1000,
@@ -104,9 +106,9 @@ class InjectedPeople:
         during a tick."""
         return self._robot.tick == self._next_tick
 
-    def _objection(self, asked: InjectionRequest, injection: Injection) -> str:
+    def _objection(self, request: InjectionRequest, injection: Injection) -> str:
         """Return why an injection is refused; "" if it is valid."""
-        for i, (point, (x_m, y_m)) in enumerate(zip(asked.path, injection.path, strict=True)):
+        for i, (point, (x_m, y_m)) in enumerate(zip(request.path, injection.path, strict=True)):
             if not self._on_map(x_m, y_m):
                 found = _in_json((x_m, y_m))
                 if isinstance(point, RelativePoint):

@@ -32,7 +32,7 @@ class OnAir:
         self._live = live
         self._scenario = scenario
         self._injected = injected
-        self._below = keys.env(live.run, keys.chunk(scenario.id))
+        self._prefix = keys.env(live.run, keys.chunk(scenario.id))
         self._step: Step | None = None
         self._happened: list[tuple[int, str]] = []
         self._acting: set[str] = set()
@@ -40,10 +40,10 @@ class OnAir:
 
     def __enter__(self) -> Self:
         self._session = open_session(self._live.connection)
-        serve_injections(self._session, f"{self._below}/inject", self._injected.offer)
-        self._session.serve(f"{self._below}/status", lambda _: self._status(), found=True)
-        self._session.serve(f"{self._below}/log", lambda _: self._log())
-        self._session.serve(f"{self._below}/camera", lambda _: self._camera())
+        serve_injections(self._session, f"{self._prefix}/inject", self._injected.offer)
+        self._session.serve(f"{self._prefix}/status", lambda _: self._status(), found=True)
+        self._session.serve(f"{self._prefix}/log", lambda _: self._log())
+        self._session.serve(f"{self._prefix}/camera", lambda _: self._camera())
         return self
 
     def __exit__(
@@ -115,8 +115,8 @@ class OnAir:
         }
         if news:
             topics["events"] = news
-        for topic, what in topics.items():
-            self._session.tell(f"{self._below}/{topic}", msgspec.json.encode(what))
+        for topic, content in topics.items():
+            self._session.tell(f"{self._prefix}/{topic}", msgspec.json.encode(content))
 
     def _status(self) -> bytes:
         tick = -1 if self._step is None else self._step.tick

@@ -60,16 +60,16 @@ def run_episode(
     something.
     """
     driver = Driver.of(policy)
-    beside = Beside()
-    trouble = ""
-    listening = [*watches, beside.watch] if options.counterfactual else watches
+    tracker = Beside()
+    comparison_error = ""
+    all_watches = [*watches, tracker.watch] if options.counterfactual else watches
     if setup is None:
         setup = RunSetup.of(options, policy_source=driver.source_hash, policy_runs=driver.runs)
     episode = Episode(
         scenario,
         driver.manifest,
         options,
-        watches=listening,
+        watches=all_watches,
         waiting=waiting,
         setup=setup,
         renderer=renderer,
@@ -91,15 +91,15 @@ def run_episode(
     if options.counterfactual:
         try:
             measures = (
-                record.measures | beside.compared(episode.scenario, entrances, comparing).measures
+                record.measures | tracker.compared(episode.scenario, entrances, comparing).measures
             )
             record = msgspec.structs.replace(record, measures=measures)
         except Exception as error:  # noqa: BLE001  the episode itself is valid
-            trouble = traceback.format_exc()
+            comparison_error = traceback.format_exc()
             record = msgspec.structs.replace(
                 record, reason=f"the street without the robot: {in_words(error)}"
             )
-    return Outcome(record, log, trouble)
+    return Outcome(record, log, comparison_error)
 
 
 def drive(episode: Episode, policy: Policy) -> None:

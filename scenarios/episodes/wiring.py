@@ -33,7 +33,7 @@ from cosim.spec.manifest import Manifest
 from cosim.spec.obstacle import Obstacle, footprint
 from cosim.spec.options import EpisodeOptions, RendererAt
 from cosim.spec.robot import COURIER, Robot, robot_called
-from cosim.spec.scenario import Barrier, CrowdSpec, Scenario, event_faults
+from cosim.spec.scenario import CrowdSpec, Scenario, event_faults
 from cosim.spec.spec_file import in_lines
 from physics.cameras.choice import camera_of, camera_of_choice, renderer_of
 from physics.dynamics.world import BulletWorld
@@ -103,7 +103,9 @@ def staged(
     with ExitStack() as stack:
         street = surface_of_place(scenario.place)
         robot = robot_called(scenario.robot)
-        world = stack.enter_context(world_of(street, scenario.barriers, robot, scenario.obstacles))
+        world = stack.enter_context(
+            BulletWorld(street, scenario.barriers, robot, scenario.obstacles)
+        )
         crowd = crowd_of(scenario)
         stack.enter_context(crowd)
 
@@ -174,16 +176,6 @@ def staged(
             injected=injected,
             entrances=crowd.entrances,
         )
-
-
-def world_of(
-    surface: Surface,
-    barriers: Sequence[Barrier] = (),
-    robot: Robot = COURIER,
-    obstacles: Sequence[Obstacle] = (),
-) -> BulletWorld:
-    """Create the physics of a surface, not started."""
-    return BulletWorld(surface, barriers, robot, obstacles)
 
 
 def crowd_of(scenario: Scenario, before: Entrances | None = None) -> SumoCrowd | EmptyStreet:

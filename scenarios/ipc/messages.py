@@ -22,7 +22,7 @@ class Hello(msgspec.Struct, frozen=True, tag=True):
     renderer: address of the run's shared renderer, if it has one.
     host: where the policy runs.
     learner: a second policy, which drives at times while demonstrations are collected.
-    patience: how long the policy may take for an answer.
+    patience: timeouts of the policy.
     """
 
     policy: str
@@ -60,7 +60,7 @@ class Unable(msgspec.Struct, frozen=True, tag=True):
 
 
 class Progress(msgspec.Struct, frozen=True, tag=True):
-    """Reports how far an episode is.
+    """Reports the progress of an episode.
 
     compared: share of the street that is simulated without the robot, 0 to 1; None before the
     episode is over.
@@ -74,7 +74,7 @@ class Progress(msgspec.Struct, frozen=True, tag=True):
 
 
 class Waits(msgspec.Struct, frozen=True, tag=True):
-    """Reports what an episode waits for."""
+    """Reports the reason for which an episode waits."""
 
     scenario: str
     reason: str

@@ -1,7 +1,7 @@
 """Environment slot: runs jobs in an environment process that is watched and replaced.
 
 The local pool, a Zenoh worker and a Ray actor use the same slot. It decides, on the machine of the
-process, what the end or a timeout of the process means. `scenarios.ipc.faults` limits the attempts.
+process, whether its end or timeout is a failure. `scenarios.ipc.faults` limits the attempts.
 """
 
 from __future__ import annotations
@@ -177,7 +177,7 @@ def no_answer(hello: Hello, allowed_s: float) -> str:
 
 
 def new_output(log: Path, begin: int, most_bytes: int) -> tuple[bytes, int]:
-    """Return the end of what was added to a log after byte `begin`, and the size of the log."""
+    """Return the last bytes of a log that were added after byte `begin`, and the log's size."""
     try:
         with log.open("rb") as file:
             size = file.seek(0, 2)

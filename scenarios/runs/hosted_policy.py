@@ -113,7 +113,7 @@ class HostedPolicy:
         self._carrier.close()
 
     def _reply(self, question: AskReset | AskAct) -> Begun | Answer:
-        """Return the reply to a request. Raises PolicyFault for what is the policy's fault,
+        """Return the reply to a request. Raises PolicyFault for errors of the policy,
         PolicyServerLost for a lost episode."""
         payload = self._carrier.ask(question)
         try:
@@ -171,16 +171,16 @@ class HostedDriver(Driver):
         self._hosted.close()
 
     def _own(self, observation: Observation) -> Observation:
-        return observation  # what is sent is a copy
+        return observation  # the message is a copy
 
 
-def _array(told: PackedArray) -> np.ndarray[Any, Any]:
+def _array(sent: PackedArray) -> np.ndarray[Any, Any]:
     """Return the waypoints of an answer. Raises PolicyFault or PolicyError if they are invalid."""
     try:
-        kind = np.dtype(told.dtype)
-        if kind.kind not in "biufc" or any(side < 0 for side in told.shape) or told.at >= 0:
-            raise ValueError(f"an array of {told.dtype} {told.shape}")
-        check_numbers(told.shape)
-        return np.frombuffer(told.data, kind).reshape(told.shape)
+        kind = np.dtype(sent.dtype)
+        if kind.kind not in "biufc" or any(side < 0 for side in sent.shape) or sent.at >= 0:
+            raise ValueError(f"an array of {sent.dtype} {sent.shape}")
+        check_numbers(sent.shape)
+        return np.frombuffer(sent.data, kind).reshape(sent.shape)
     except (TypeError, ValueError, OverflowError) as error:
         raise PolicyFault(f"answered waypoints that cannot be read: {error}"[:MOST_WORDS]) from None

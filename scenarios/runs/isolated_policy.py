@@ -128,14 +128,14 @@ def isolated_driver(
     return HostedDriver(HostedPolicy(manifest, process, run), "isolated", info.source[:64], timer)
 
 
-def serve_alone(socket_descriptor: int, asked_descriptor: int, memory_descriptor: int) -> None:
+def serve_alone(socket_descriptor: int, call_descriptor: int, memory_descriptor: int) -> None:
     """Answer requests until the socket closes. The first message is the policy's name, replied to
     with its info.
 
-    asked_descriptor: not used, because the environment's process enforces the timeouts.
+    call_descriptor: not used, because the environment's process enforces the timeouts.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    os.close(asked_descriptor)
+    os.close(call_descriptor)
     wire = Wire(socket(fileno=socket_descriptor))
     memory = SharedMemory(memory_descriptor, writes=False)
     os.close(memory_descriptor)

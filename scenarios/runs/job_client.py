@@ -71,8 +71,7 @@ class Request(NamedTuple):
 
 
 class Installation(NamedTuple):
-    """The worker that a client belongs to: its unique name, its host's name, and what is installed
-    there."""
+    """The worker of a client: its unique name, its host's name, and the installed versions."""
 
     worker: str
     host: str
@@ -174,7 +173,7 @@ class JobClient:
             self._give()
 
     def poll(self) -> None:
-        """Take in what the process reports. Raises UsageError or MachineError when it can run
+        """Take in messages of the process. Raises UsageError or MachineError when it can run
         nothing."""
         if self._slot is None or self._leaving:
             return
@@ -203,8 +202,7 @@ class JobClient:
         return Request("report", keys.job(self._run, "report"), encode(report), 5.0)
 
     def _claim(self) -> Request | None:
-        """Return the request for what this slot needs next: a map, the policy's introduction, or a
-        job."""
+        """Return the next request of this slot: for a map, the policy's introduction, or a job."""
         if self._fetched is not None:
             return Request(
                 "net", keys.net(self._run, self._fetched.digest), self._fetched.request, 10.0

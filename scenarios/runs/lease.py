@@ -66,7 +66,7 @@ class Lease:
         self._lost = self._lost or why
 
     def poll(self, hear: MessageHandler) -> Failure | None:
-        """Pass on what was reported. Returns the failure of the job if it has failed or its worker
+        """Pass on reported messages. Returns the failure of the job if it has failed or its worker
         is lost."""
         while self._reports and not self.ended:
             report = self._reports.popleft()

@@ -194,10 +194,10 @@ def check_alone(options: EpisodeOptions, jobs: int, shared: bool) -> None:
         )
 
 
-def seed_of_run(asked: int | None, resumed: Path | None) -> int:
+def seed_of_run(requested: int | None, resumed: Path | None) -> int:
     """Return the requested seed; else that of the resumed run; else a random one."""
-    if asked is not None:
-        return asked
+    if requested is not None:
+        return requested
     if resumed is None:
         return drawn_seed()
     refuse_unbegun(resumed)

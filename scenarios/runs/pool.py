@@ -117,7 +117,7 @@ class _Pool:
         happened("claimed", scenario=scenario.id, worker=Path(worker.log).stem)
 
     def poll(self) -> None:
-        """Take in what the workers report; queue or record the scenarios that failed."""
+        """Take in the workers' messages; queue or record the scenarios that failed."""
         self._transport.wait(POLL_S)
         if self._renderer is not None:
             self._renderer.tend()
@@ -301,8 +301,8 @@ class _AttemptQueue:
         self._waiting.remove(scenario)
 
     def failed(self, scenario: Scenario, failure: Failure) -> _GivenUp | None:
-        """Queue a scenario again after a failed attempt; after the last one, return how it is
-        recorded."""
+        """Queue a scenario again after a failed attempt; after the last one, return its status and
+        reason."""
         rule = RULES[failure.fault]
         if rule.attempts == 1:
             return _GivenUp(rule.status, failure.why)

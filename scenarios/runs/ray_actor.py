@@ -25,7 +25,7 @@ _LAST_PRINTED: Final = 1 << 20
 
 
 class NodeFound(NamedTuple):
-    """The host name of a node, and what is installed there."""
+    """The host name and the installed versions of a node."""
 
     host: str
     installed: Installed
@@ -108,6 +108,6 @@ class EnvironmentActor:
             return printed
 
     def _printed(self) -> bytes:
-        """Return what the process has printed since the last report."""
+        """Return the output of the process since the last report."""
         printed, self._log_sent = new_output(self._log, self._log_sent, _LAST_PRINTED)
         return printed

@@ -104,8 +104,8 @@ def by_ray(on: str, jobs: int | None, policy: str, say: _Say) -> Iterator[Transp
 def ray_cluster(on: str, policy: str, say: _Say) -> Iterator[None]:
     """Connect to a cluster, and send the policy's package there unless it is installed.
 
-    on: "ray" for the cluster of RAY_ADDRESS or of this machine, which is started, for the block, if
-    there is none; "auto" for the same without starting one; or "ray://HOST:PORT".
+    on: "ray" for the cluster of RAY_ADDRESS or of this machine; "auto" for the same; or
+        "ray://HOST:PORT". "ray" starts a cluster on this machine for the block if there is none.
 
     Raises UsageError if there is no cluster, or one of another Ray or Python."""
     ray = check_ray(on)
@@ -184,8 +184,8 @@ class RayWorkers:
         return worker
 
     def _packed_job(self, job: Job) -> tuple[bytes, Place, str, Any]:
-        """Return what an actor is given: a job, its place, the hash of its net, and a reference to
-        an imported map."""
+        """Return the arguments of an actor's `give`: a job, its place, the hash of its net, and a
+        reference to an imported map."""
         where = job.scenario.place
         digest = self._nets.hash_of(where)
         message = encode_message(msgspec.structs.replace(job, net_hash=digest))

@@ -30,8 +30,8 @@ from cosim.results.run_setup import NO_RENDERER
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Place, Scenario
 from physics.cameras.choice import renderer_of
+from physics.dynamics.world import BulletWorld
 from physics.street.street_surface import StreetSurface
-from scenarios.episodes.wiring import world_of
 from scenarios.ipc.deadlines import Asked
 from scenarios.ipc.messages import Ready, decode_hello
 from scenarios.ipc.observation_codec import ObservationDecoder
@@ -59,11 +59,11 @@ _PEER: Final = struct.Struct("3i")
 """Layout of process, user and group id of a connected process (SO_PEERCRED)."""
 
 
-def serve_pictures(pipe: int, asked: int, listening: int) -> None:
+def serve_pictures(pipe: int, pending_call: int, listening: int) -> None:
     """Serve environments until the run closes the socket.
 
     pipe: descriptor of the socket to the run.
-    asked: descriptor of the shared memory of the pending call.
+    pending_call: descriptor of the shared memory of the pending call.
     listening: descriptor of the socket that environments connect to.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -73,7 +73,7 @@ def serve_pictures(pipe: int, asked: int, listening: int) -> None:
     assert hello.renderer is not None
     desk = None
     if hello.renderer.asks:
-        timer = Asked(asked)
+        timer = Asked(pending_call)
         policy = policy_here(hello, timer, say).policy
         desk = PolicyDesk(policy, decoder=ObservationDecoder, timer=timer, forget_after_s=inf)
     with ExitStack() as stack:
@@ -237,7 +237,7 @@ class _Renderer:
         try:
             if self._atlas is not None:
                 robot = robot_called(scenario.robot)
-                world = world_of(
+                world = BulletWorld(
                     _surface(scenario.place), scenario.barriers, robot, scenario.obstacles
                 )
                 one.seat = self._atlas.join(world, scenario.light)

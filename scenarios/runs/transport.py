@@ -38,7 +38,7 @@ class Worker(Protocol):
         """Take its job away."""
 
     def stop(self) -> None:
-        """Tell it to end, by force if it is busy, without waiting for that."""
+        """Request it to end, by force if it is busy, without waiting."""
 
     def end(self) -> None:
         """Wait until it has ended."""

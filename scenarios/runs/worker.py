@@ -54,7 +54,7 @@ CANNOT_START = "an environment process cannot start:"
 """Beginning of the message that engines cannot be loaded."""
 
 
-def serve_jobs(socket_descriptor: int, asked_descriptor: int) -> None:
+def serve_jobs(socket_descriptor: int, call_descriptor: int) -> None:
     """Run jobs until the socket closes. An exception outside an episode ends the process, which the
     run then replaces."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -64,7 +64,7 @@ def serve_jobs(socket_descriptor: int, asked_descriptor: int) -> None:
     say = partial(said_to_run, wire, os.getpid())
     hello = decode_hello(wire.receive())
     _import_engines(say)
-    timer = Asked(asked_descriptor)
+    timer = Asked(call_descriptor)
     drivers: DriversHere | None = drivers_here(hello, timer, say)
     say(Ready())
     while True:

@@ -97,9 +97,9 @@ def work(
     say: called with each line for the user.
     logs: folder for the output of the processes; by default a temporary one.
 
-    Returns the number of the signal, or 0. Raises UsageError when the run refuses this worker,
-    MachineError when no episode can be run here, or with `once` when there has been no run for too
-    long."""
+    Returns the number of the signal, or 0. Raises UsageError if the run refuses this worker.
+    Raises MachineError if no episode can be run here, or with `once` without a run for GIVEN_UP_S.
+    """
     with ExitStack() as stack:
         leaving = stack.enter_context(_signals_caught())
         if logs is None:
