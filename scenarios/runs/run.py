@@ -32,13 +32,12 @@ from cosim.spec.robot import COURIER, robot_called
 from cosim.spec.run_config import RunConfig, RunEnds
 from cosim.spec.scenario import Scenario, Suite, split_called
 from cosim.spec.selection import scenarios_chosen
-from physics.cameras.choice import camera_of_choice
 from scenarios.ipc.messages import MessageHandler
 from scenarios.runs.local import InProcess, LocalProcesses
 from scenarios.runs.planning import PlannedRun, check_folder, held_run, planned_run
 from scenarios.runs.pool import run_all
 from scenarios.runs.ray_workers import by_ray, check_on_ray
-from scenarios.runs.shared_renderer import SharedRenderer, check_shared
+from scenarios.runs.shared_renderer import SharedRenderer
 from scenarios.runs.transport import HeldRun, TransportFactory
 from scenarios.suites.catalog import load_suite, with_crowd, with_robot
 from scenarios.suites.fits import LOOKING, check_places
@@ -420,10 +419,8 @@ def _run_todo(
     with ExitStack() as stack:
         renderer = None
         if plan.config.shared_renderer:
-            asks = check_shared(plan.driver, camera_of_choice(plan.options.camera))
-            renderer = SharedRenderer(
-                run.held.path / "logs", run.hello, asks=asks, patience=plan.patience
-            )
+            logs = run.held.path / "logs"
+            renderer = SharedRenderer(logs, run.hello, asks=plan.driver.batches)
             stack.enter_context(renderer)
         transport, tell = stack.enter_context(create_transport(run, tell))
         run_all(

@@ -20,7 +20,6 @@ from cosim.core.errors import MachineError, UsageError
 from cosim.episode.policy_caller import Driver
 from cosim.spec.options import CameraName, RendererAt
 from scenarios.ipc.child_process import KeptProcess, Watchdog
-from scenarios.ipc.deadlines import Patience
 from scenarios.ipc.messages import Hello, encode_message
 
 RENDERERS: Final = 3
@@ -52,11 +51,8 @@ class SharedRenderer:
     at: its address for environments.
     """
 
-    def __init__(
-        self, logs: Path, hello: Hello, *, asks: bool, patience: Patience = Patience()
-    ) -> None:
+    def __init__(self, logs: Path, hello: Hello, *, asks: bool) -> None:
         self._logs = logs
-        self._patience = patience
         self.at = RendererAt(address=f"cosim-renderer-{secrets.token_hex(8)}", asks=asks)
         self._hello = msgspec.structs.replace(hello, renderer=self.at)
         self._listening = socket.socket(socket.AF_UNIX)
@@ -131,7 +127,7 @@ class SharedRenderer:
         process = KeptProcess(log, _SERVES, "renderer", (self._listening.fileno(),))
         at = msgspec.structs.replace(self.at, number=len(self._ends) + 1)
         process.send(encode_message(msgspec.structs.replace(self._hello, renderer=at)))
-        self._watchdog = Watchdog(process, self._patience, _SILENCE_S)
+        self._watchdog = Watchdog(process, self._hello.patience, _SILENCE_S)
 
     def _replace(self, watchdog: Watchdog, end: End, *, blames_policy: bool) -> None:
         """Start another renderer. Raises UsageError or MachineError after too many failures in a
@@ -155,12 +151,8 @@ class SharedRenderer:
         self._start()
 
 
-def check_shared(driver: Driver, camera: CameraName) -> bool:
-    """Check that a run can have a shared renderer, and return whether it also queries the policy.
-
-    camera: the camera of the run.
-    Raises UsageError.
-    """
+def check_shared(driver: Driver, camera: CameraName) -> None:
+    """Check that a run can have a shared renderer. camera: of the run. Raises UsageError."""
     manifest = driver.manifest
     if manifest.camera is None and not driver.batches:
         raise UsageError(
@@ -178,4 +170,3 @@ def check_shared(driver: Driver, camera: CameraName) -> bool:
             f"--shared-renderer draws by OpenGL, not by the {camera} camera: use --camera gl "
             "(`cosim doctor` says whether it works here), or leave --shared-renderer out"
         )
-    return driver.batches
