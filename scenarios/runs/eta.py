@@ -99,11 +99,11 @@ def announcement(
         return paced(free, scenarios, known, policy, jobs, pace) if pace else free
 
     here = taken(jobs)
-    far_m = sum(s.route_line.length_m for s in scenarios)
-    far = f"{far_m / 1000.0:.1f} km" if far_m >= 1000.0 else f"{far_m:.0f} m"
+    length_m = sum(s.route_line.length_m for s in scenarios)
+    length = f"{length_m / 1000.0:.1f} km" if length_m >= 1000.0 else f"{length_m:.0f} m"
     most_s = sum(s.time_limit_s for s in scenarios)
     words = (
-        f"{_episodes(len(scenarios))}, {far} of route, at most {duration(most_s)} of simulated "
+        f"{_episodes(len(scenarios))}, {length} of route, at most {duration(most_s)} of simulated "
         f"time. "
     )
     words += f"About {span(here)} with --jobs {jobs}"
@@ -126,13 +126,13 @@ def estimate(
     known: measured on this machine, the newest last.
     """
     short = all(s.ends_on_failure for s in scenarios)
-    alike = [m for m in known if m.renderer == renderer and m.compared == compared]
-    same = [m for m in alike if (m.policy, m.short) == (policy, short)][-RECENT:]
-    others = alike[-RECENT:] if len(alike) >= ENOUGH else []
-    found = same if len(same) >= ENOUGH else others
+    comparable = [m for m in known if m.renderer == renderer and m.compared == compared]
+    of_policy = [m for m in comparable if (m.policy, m.short) == (policy, short)][-RECENT:]
+    any_policy = comparable[-RECENT:] if len(comparable) >= ENOUGH else []
+    samples = of_policy if len(of_policy) >= ENOUGH else any_policy
     slots = min(jobs, cores)
-    slower = _SHARED if slots > max((m.jobs for m in found), default=1) else 1.0
-    setup_s = _around([m.setup_s for m in found]) if found else SETS_UP_S
+    slower = _SHARED if slots > max((m.jobs for m in samples), default=1) else 1.0
+    setup_s = _around([m.setup_s for m in samples]) if samples else SETS_UP_S
 
     def taken_s(low_s: Iterable[float], high_s: Iterable[float]) -> tuple[float, float]:
         fast, slow = (
@@ -142,15 +142,15 @@ def estimate(
         return makespan(fast, slots), slower * makespan(slow, slots)
 
     lengths_m = [s.route_line.length_m for s in scenarios]
-    if found is same:
-        rates = _around([m.work_s / m.route_m for m in same])
-        basis = f"measured in {_episodes(len(same))} of '{policy}' on this machine"
+    if samples is of_policy:
+        rates = _around([m.work_s / m.route_m for m in of_policy])
+        basis = f"measured in {_episodes(len(of_policy))} of '{policy}' on this machine"
         return Estimate(
             *taken_s(*([rate * metres for metres in lengths_m] for rate in rates)), basis
         )
-    if others:
-        slow, fast = _around([m.simulated_s / m.work_s for m in others])
-        middle = statistics.median(m.simulated_s / m.work_s for m in others)
+    if any_policy:
+        slow, fast = _around([m.simulated_s / m.work_s for m in any_policy])
+        middle = statistics.median(m.simulated_s / m.work_s for m in any_policy)
         driven = f"the policy is taken to drive at {DRIVES_MPS[0]:g} to {DRIVES_MPS[1]:g} m/s"
         basis = f"this machine simulates {middle:.1f} s a second, {driven}"
     else:

@@ -21,6 +21,7 @@ from cosim.core.errors import MachineError, UsageError
 from cosim.core.log_event import happened
 from cosim.spec.connection import Connection
 from cosim.spec.scenario import CityMap
+from scenarios.ipc.child_process import KeptProcess
 from scenarios.ipc.faults import Failure
 from scenarios.ipc.messages import Done, FrameDrawn, Hello, Message, Progress, Waits
 from scenarios.runs.environment_slot import EnvironmentSlot, new_output, start_environment
@@ -38,7 +39,6 @@ from scenarios.runs.protocol import (
 )
 
 if TYPE_CHECKING:
-    from scenarios.ipc.child_process import KeptProcess
     from scenarios.runs.net_transfer import Fetched
 
 REPORT_S: Final = 1.0
