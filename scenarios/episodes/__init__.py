@@ -1,1 +1,1 @@
-"""One episode: its wiring, its judge, and what can be done with it."""
+"""One episode: wiring of engines, scoring, replay, comparison and demonstrations."""

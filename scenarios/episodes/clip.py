@@ -1,11 +1,9 @@
-"""Clips: the pictures of an episode as H.264, each encoded by itself; joined to one .mp4 without
-encoding them anew.
+"""Encoding of the pictures of an episode as an H.264 clip, and joining of clips to one .mp4.
 
-The same pictures give the same bytes, also back: one thread, no date, no B-frames, so that a clip
-begins and ends with itself; colours are converted here, in whole numbers (BT.601, as players take
-it): the library rounds otherwise from time to time, as its buffers lie in memory; and the encoder
-takes none of the short cuts that some processors offer: it decides otherwise with them, and with
-those of AVX-512 it does so from one call to the next.
+Joining does not encode again. The same pictures give the same bytes, and decode to the same
+pictures: the encoder uses one thread, no date, no B-frames and no processor-specific code, which
+with AVX-512 varies between calls. Colors are converted here in integers (BT.601), because the
+library's rounding depends on the alignment of its buffers.
 """
 
 from __future__ import annotations
@@ -39,7 +37,7 @@ _MUXED: Final = {"fflags": "+bitexact"}
 
 
 class Clip:
-    """A clip in the making. fps: pictures a second."""
+    """Encoder of one clip. size: width and height in pixels; fps: pictures per second."""
 
     def __init__(self, size: tuple[int, int], fps: int) -> None:
         self._bytes = io.BytesIO()
@@ -50,21 +48,25 @@ class Clip:
         self._stream.codec_context.thread_count = 1
 
     def add(self, rgb: NDArray[np.uint8]) -> None:
-        """The next picture, (H, W, 3)."""
+        """Add the next picture, (H, W, 3)."""
         frame = av.VideoFrame.from_ndarray(_planes_of(rgb), format=PIXELS)
         self._file.mux(self._stream.encode(frame))
 
     def finished(self) -> bytes:
-        """The .mp4 of all of them."""
+        """Return the .mp4 of all pictures, and end the encoding."""
         self._file.mux(self._stream.encode(None))
         self._file.close()
         return self._bytes.getvalue()
 
 
 def join_clips(clips: Iterable[bytes], lengths: Sequence[int], path: Path, fps: int) -> None:
-    """Write clips one after another into one .mp4. lengths: how many pictures each has; picture k
-    is shown k / fps seconds after the beginning. Raises RunError for a clip that has another number
-    of them."""
+    """Write clips one after another into one .mp4.
+
+    Picture k is shown k / fps seconds after the beginning.
+
+    lengths: number of pictures of each clip.
+    Raises RunError for a clip with another number of pictures.
+    """
     with av.open(
         str(path), "w", format="mp4", options={**_MUXED, "movflags": "+faststart"}
     ) as joined:
@@ -81,8 +83,8 @@ def join_clips(clips: Iterable[bytes], lengths: Sequence[int], path: Path, fps: 
                 packets = [packet for packet in one.demux(source) if packet.dts is not None]
                 if [packet.pts for packet in packets] != [k * step for k in range(length)]:
                     raise RunError(
-                        f"{path}: a clip of {len(packets)} pictures, {length} are told: "
-                        f"collect it anew"
+                        f"{path}: a clip has {len(packets)} pictures in place of {length}: "
+                        f"collect it again"
                     )
                 for number, packet in enumerate(packets, before):
                     packet.pts = packet.dts = number * step
@@ -92,8 +94,7 @@ def join_clips(clips: Iterable[bytes], lengths: Sequence[int], path: Path, fps: 
 
 
 def pictures_of(path: Path) -> Iterator[tuple[Fraction, NDArray[np.uint8]]]:
-    """The pictures of an .mp4 in their order: the time that each is shown at, seconds, and (H, W,
-    3) RGB."""
+    """Yield the pictures of an .mp4 in order: the time in seconds, and RGB (H, W, 3)."""
     with av.open(str(path), "r") as film:
         stream = film.streams.video[0]
         stream.codec_context.thread_count = 1
@@ -107,14 +108,18 @@ def pictures_of(path: Path) -> Iterator[tuple[Fraction, NDArray[np.uint8]]]:
 
 
 _TO_YUV: Final = np.array([[16829, 33039, 6416], [-9714, -19070, 28784], [28784, -24103, -4681]]).T
+"""Matrix from RGB to YUV in units of 1 / 65536, with one row for each input channel."""
 _TO_RGB: Final = np.array([[76309, 0, 104597], [76309, -25675, -53279], [76309, 132201, 0]]).T
-"""In units of 1 / 65536: a row for each of what is given."""
+"""Matrix from YUV to RGB in units of 1 / 65536, with one row for each input channel."""
 _BLACK: Final = np.array([16, 128, 128])
+"""YUV of black."""
 _HALF: Final = 1 << 15
+"""Half a unit of the result, added before the shift by 16 bits so that it rounds."""
 
 
 def _planes_of(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(H, W, 3) as (3 H / 2, W): brightness, and below it both colours, of half the size."""
+    """Convert RGB (H, W, 3) to the planes (3 H / 2, W): luma, and below it both chroma planes of
+    half the size."""
     high, wide, _ = rgb.shape
     small = cv2.resize(rgb, (wide // 2, high // 2), interpolation=cv2.INTER_AREA)
     bright = ((rgb @ _TO_YUV[:, 0] + _HALF) >> 16) + _BLACK[0]
@@ -124,7 +129,7 @@ def _planes_of(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _rgb_of(planes: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(H, W, 3) of what `_planes_of` gives."""
+    """Convert the planes of `_planes_of` to RGB (H, W, 3)."""
     high = planes.shape[0] * 2 // 3
     wide = planes.shape[1]
     colours = planes[high:].reshape(2, high // 2, wide // 2)

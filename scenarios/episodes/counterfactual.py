@@ -1,8 +1,8 @@
-"""An episode beside the same street without its robot: who was delayed, and by how much.
+"""Comparison of an episode with a counterfactual: the same street without the robot.
 
-When the episode is over its street is simulated again from the same seed: the same people and
-vehicles come and go at the same moments, event pedestrians and injected people are where they were,
-but nothing is where the robot was.
+After the episode its street is simulated again from the same seed. The same people and vehicles
+arrive at the same times, event pedestrians and injected people move as before. The difference is
+the delay that the robot causes.
 """
 
 from __future__ import annotations
@@ -23,18 +23,19 @@ from scenarios.episodes.wiring import crowd_of
 from sumo_nets.crowd.demand_log import Entrances
 
 TELL_EVERY_TICKS: Final = 20
+"""Ticks between two calls of the progress callback."""
 
 
 class Compared(NamedTuple):
-    """What the robot cost people and vehicles."""
+    """The delays that the robot caused to people and vehicles."""
 
     people: Delay
     vehicles: Delay
 
     @property
     def measures(self) -> dict[str, float | None]:
-        """As measures of a record: delays over those that came near the robot, absent where nobody
-        did."""
+        """Return the measures of a record: mean delays of those that came near the robot, None if
+        none did."""
         measures: dict[str, float | None] = {}
         for kind, delay in (("people", self.people), ("vehicles", self.vehicles)):
             measures[f"{kind}_delay_s"] = delay.near_s if delay.near else None
@@ -43,40 +44,44 @@ class Compared(NamedTuple):
 
 
 class Beside:
-    """Watches an episode; once it is over, compares it with the street without its robot."""
+    """Recorder of an episode, to be compared with the street without the robot afterwards."""
 
     def __init__(self) -> None:
         self._moments: list[tuple[RobotState, EventReply]] = []
-        self._present = Tracks(), Tracks()
+        self._with_robot = Tracks(), Tracks()
 
     def watch(self, step: Step, verdict: Verdict) -> None:
-        """The next tick of the episode."""
+        """Record the next tick of the episode."""
         self._moments.append((step.robot, step.events))
-        self._present[0].add(_crowd(step.street_after))
-        self._present[1].add(step.street_after.vehicles)
+        self._with_robot[0].add(_crowd(step.street_after))
+        self._with_robot[1].add(step.street_after.vehicles)
 
     def compared(
         self, scenario: Scenario, entrances: Entrances, progress: Progress = ignore
     ) -> Compared:
-        """entrances: of the episode. No SUMO may be running in this process."""
-        absent = Tracks(), Tracks()
+        """Simulate the street without the robot, and return the delays.
+
+        entrances: arrivals and departures of the episode's crowd.
+        No SUMO may be running in this process.
+        """
+        without_robot = Tracks(), Tracks()
         with crowd_of(scenario, entrances) as crowd:
             for tick, (robot, reply) in enumerate(self._moments):
                 if tick % TELL_EVERY_TICKS == 0:
                     progress("without the robot", tick / len(self._moments))
                 street = crowd.step(robot, reply, absent=True)
-                absent[0].add(_crowd(street))
-                absent[1].add(street.vehicles)
+                without_robot[0].add(_crowd(street))
+                without_robot[1].add(street.vehicles)
         at = [(robot.pose.x_m, robot.pose.y_m) for robot, _ in self._moments]
         return Compared(
             *(
                 delay_of(at, a, b, Clock().tick_s)
-                for a, b in zip(self._present, absent, strict=True)
+                for a, b in zip(self._with_robot, without_robot, strict=True)
             )
         )
 
 
 def _crowd(street: Street) -> People:
-    """Those who come and go by themselves: event pedestrians and injected people are where they
-    were."""
+    """Return the people that SUMO moves: event pedestrians and injected people move the same in
+    both simulations."""
     return street.people.only(np.flatnonzero(street.people.are(PersonKind.CROWD)))

@@ -1,5 +1,4 @@
-"""Demonstration: what is kept of one episode, row by row, and the waypoints that are taken from its
-trajectory."""
+"""Demonstration: the rows that are stored of one episode, and the waypoints of its trajectory."""
 
 from __future__ import annotations
 
@@ -17,7 +16,9 @@ from cosim.core.geometry import Floats
 from cosim.core.npz import arrays_in
 
 _GLIMPSE_PX: Final = (8, 6)
+"""Width and height in pixels of the thumbnails by which stored pictures are checked."""
 _STRAIGHT_RADPS: Final = 1e-6
+"""Yaw rate in rad/s below which a robot drives straight, because the arc's radius diverges."""
 
 
 def check_parquet() -> None:
@@ -30,12 +31,13 @@ def check_parquet() -> None:
 
 @dataclass(frozen=True)
 class Demonstration:
-    """One episode, n rows, one for each picture.
+    """The demonstration of one episode, with n rows, one for each picture.
 
     state, goal, command (n, 2), waypoints (n, K, 2), driven (n,), disturbed (n,): as in
-    `cosim.core.packed_demos`; told (n,): the instruction, "" where the goal is none. glimpses (n,
-    6, 8, 3) uint8: the pictures as they were drawn, area by area, to hold those that are read back
-    against. colours (3, 256) int64: how often each value of red, green and blue stands in them.
+        `cosim.core.packed_demos`.
+    told (n,): the instruction, "" for other goals.
+    glimpses (n, 6, 8, 3) uint8: thumbnails of the drawn pictures, to check the decoded ones.
+    colours (3, 256) int64: histograms of red, green and blue.
     clip: the bytes of an .mp4 with n pictures.
     """
 
@@ -54,7 +56,7 @@ class Demonstration:
         return len(self.state)
 
     def encoded(self) -> bytes:
-        """The .npz that is kept; equal demonstrations have equal bytes."""
+        """Return the .npz; equal demonstrations have equal bytes."""
         file = io.BytesIO()
         np.savez(
             file, allow_pickle=False, **{one.name: getattr(self, one.name) for one in fields(self)}
@@ -63,19 +65,19 @@ class Demonstration:
 
     @classmethod
     def decoded(cls, data: bytes, where: object) -> Demonstration:
-        """One that was encoded. where: what an error names. Raises RunError."""
+        """Decode a demonstration. where: the file that an error names. Raises RunError."""
         try:
             names = [one.name for one in fields(cls)]
             held = arrays_in(io.BytesIO(data), names)
             return cls(**{name: held[name] for name in names})
         except ValueError as error:
             raise RunError(
-                f"{where}: no demonstration: {error}: collect it anew, in another --out"
+                f"{where}: no demonstration: {error}: collect it again, in another --out"
             ) from error
 
 
 def glimpse(rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """(6, 8, 3) means of the areas of a picture (H, W, 3)."""
+    """Return the thumbnail (6, 8, 3) of a picture (H, W, 3): the mean color of each area."""
     small: NDArray[np.uint8] = cv2.resize(rgb, _GLIMPSE_PX, interpolation=cv2.INTER_AREA)
     return small
 
@@ -89,14 +91,16 @@ def waypoints_ahead(
     every: int,
     tick_s: float,
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Where the robot is 1 to `count` times `every` ticks after each of n pictures, (n, count, 2)
-    metres in its frame there, x ahead and y left; and how many of them it was driven to by the
-    expert alone, (n,).
+    """Return the waypoints after each of n pictures, and the number that the expert drove to.
 
-    pose (T + 1, 3): x m, y m, heading at the start of each tick and at the end; ticks (n,) of the
-    pictures, in their order; command (n, 2) the expert's, disturbed (n,): another one was driven
-    after that picture. From the first tick on at which that is so, or at which nothing more is
-    known, the robot is taken to go on by the expert's last command.
+    Waypoint k is the robot's position (k + 1) * `every` ticks after the picture. From the first
+    disturbed picture or the trajectory's end on, it is extrapolated by the expert's last command.
+
+    pose (T + 1, 3): x in m, y in m and heading in rad at the start of each tick and at the end.
+    ticks (n,): the tick of each picture, ascending.
+    command (n, 2): the expert's command.
+    disturbed (n,): whether another command was executed after the picture.
+    Returns waypoints (n, count, 2) in m, x ahead and y left of the robot, and counts (n,).
     """
     until = np.full(len(ticks), len(pose) - 1)
     last = len(pose) - 1
@@ -116,7 +120,7 @@ def waypoints_ahead(
 
 
 def arc_ahead(v_mps: Floats, w_radps: Floats, time_s: Floats) -> Floats:
-    """(..., 2) metres, x ahead and y left: where one is who has driven by a command for so long.
+    """Return the position after driving a constant command: (..., 2) in m, x ahead and y left.
 
     >>> arc_ahead(np.array(1.0), np.array(0.0), np.array(2.0)).tolist()
     [2.0, 0.0]
@@ -130,7 +134,7 @@ def arc_ahead(v_mps: Floats, w_radps: Floats, time_s: Floats) -> Floats:
 
 
 def _turned(offset: Floats, angle_rad: Floats) -> Floats:
-    """(..., 2) turned counter-clockwise by angles (...)."""
+    """Rotate offsets (..., 2) counter-clockwise by angles (...)."""
     cos, sin = np.cos(angle_rad), np.sin(angle_rad)
     x, y = offset[..., 0], offset[..., 1]
     return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)

@@ -1,5 +1,5 @@
-"""Demonstrator: an expert that drives, at times disturbed, while what it sees and answers is
-kept."""
+"""Demonstrator: an expert that drives, with disturbances, while its observations and commands are
+recorded."""
 
 from __future__ import annotations
 
@@ -27,19 +27,23 @@ from scenarios.episodes.clip import Clip
 from scenarios.episodes.demonstration import Demonstration, glimpse, waypoints_ahead
 
 _BURST_S: Final = (0.4, 1.0)
-"""So long another command is driven, least and most."""
+"""Shortest and longest disturbance in seconds."""
 _LEARNER_S: Final = (1.0, 5.0)
-"""So long a learner drives: until it comes where it errs, and stays there for a while."""
+"""Shortest and longest time in seconds that a learner drives, enough to reach its own errors."""
 _SLOWER: Final = (0.5, 1.2)
-"""By this the expert's speed is multiplied, and to its turning is added at most so much of the
-robot's fastest."""
+"""Range of the factor on the expert's speed during a disturbance."""
 _TURN: Final = 0.8
+"""Largest change of the expert's yaw rate in a disturbance, as a share of the robot's maximum."""
 
 
 class Demonstrator(Driver):
-    """The expert as it is asked in an episode. goal: of the run; see `EpisodeOptions`. learner:
-    where one drives at times (`learner_of`); it is asked at every picture, so that it knows those
-    before (Ross et al., DAgger, 2011). Raises UsageError."""
+    """Driver of an expert that records a demonstration.
+
+    goal: goal protocol of the run; see `EpisodeOptions`.
+    learner: drives at times (`learner_of`; Ross et al., DAgger, 2011). It is queried at every
+        picture, because it may have a memory.
+    Raises UsageError.
+    """
 
     def __init__(
         self,
@@ -75,7 +79,8 @@ class Demonstrator(Driver):
             self.learner.reset(episode_id, seed)
 
     def act(self, observation: Observation) -> Command:
-        """What is driven: the expert's command, or in a burst another one, or the learner's."""
+        """Return the command to execute: the expert's, in a disturbance another one or the
+        learner's."""
         rgb = observation.pictures[EYE].rgb if self._sees else observation.rgb
         assert rgb is not None
         answer = self._expert.act(observation)
@@ -90,15 +95,14 @@ class Demonstrator(Driver):
             self.learner.ended()
 
     def kept(self, scenario: Scenario, record: Record, log: Log | None) -> bytes:
-        """The demonstration, encoded; nothing where there is none: the episode crashed, or was not
-        solved."""
+        """Return the encoded demonstration; b"" if the episode crashed or was not solved."""
         if log is None or not (self._collecting.unsolved or solved(record, log)):
             return b""
         return self._rows.demonstration(scenario, log, self._collecting).encoded()
 
 
 def solved(record: Record, log: Log) -> bool:
-    """Whether the expert has done what the episode asks for, and was never put elsewhere."""
+    """Return whether the episode is a success without a reset."""
     return (
         record.status == "done"
         and record.measures["success"] == 1.0
@@ -107,7 +111,7 @@ def solved(record: Record, log: Log) -> bool:
 
 
 def learner_of(collecting: Collecting) -> Driver | None:
-    """The learner of what is collected as it is now. Raises UsageError."""
+    """Load the learner of a collection, None without one. Raises UsageError."""
     try:
         return load_policy(collecting.learner) if collecting.learner else None
     except UsageError as error:
@@ -115,7 +119,7 @@ def learner_of(collecting: Collecting) -> Driver | None:
 
 
 class _Bursts:
-    """When another command is driven, and which: drawn from the episode's seed alone."""
+    """Times and commands of disturbances, drawn from the episode's seed."""
 
     def __init__(self, seed: int, collecting: Collecting) -> None:
         self._draws = np.random.default_rng([seed, 0xDA66E5])
@@ -128,8 +132,10 @@ class _Bursts:
         self._slower = self._turn = 0.0
 
     def driven(self, answer: Command, robot: Robot, learned: Command | None = None) -> Command:
-        """What is driven where the expert answers this, and the learner, if there is one, that; the
-        answer itself outside of bursts."""
+        """Return the command to execute: outside of disturbances the expert's `answer` itself.
+
+        learned: the learner's command, if there is a learner.
+        """
         if not self._share:
             return answer
         if not self._left and self._calm:
@@ -147,8 +153,7 @@ class _Bursts:
         return clipped(Command(self._slower * answer.v_mps, turned_radps), robot)
 
     def _steps_of_calm(self) -> int:
-        """How many answers are driven as they are before the next burst, so that bursts have their
-        share."""
+        """Return the number of undisturbed commands before the next disturbance."""
         if not self._share:
             return 0
         mean_s = float(np.mean(self._lasts_s)) * (1.0 - self._share) / self._share
@@ -156,8 +161,7 @@ class _Bursts:
 
 
 class _Rows:
-    """What is seen and answered, from the beginning of an episode until the robot is put
-    elsewhere."""
+    """Observations and commands of an episode until its first reset."""
 
     def __init__(self, rate_hz: float) -> None:
         self._fps = round(rate_hz)
@@ -165,7 +169,7 @@ class _Rows:
         self._over = False
         self._ticks: list[int] = []
         self._numbers: list[tuple[float, ...]] = []
-        self._told: list[str] = []
+        self._instructions: list[str] = []
         self._glimpses: list[NDArray[np.uint8]] = []
         self._colours = np.zeros((3, 256), np.int64)
 
@@ -184,15 +188,14 @@ class _Rows:
         self._numbers.append(
             (seen.v_mps, seen.w_radps, x_m, y_m, answer.v_mps, answer.w_radps, float(disturbed))
         )
-        self._told.append(goal.text if isinstance(goal, Instruction) else "")
+        self._instructions.append(goal.text if isinstance(goal, Instruction) else "")
         self._glimpses.append(glimpse(rgb))
         self._colours += [
             np.bincount(channel.ravel(), minlength=256) for channel in np.moveaxis(rgb, 2, 0)
         ]
 
     def demonstration(self, scenario: Scenario, log: Log, collecting: Collecting) -> Demonstration:
-        """What was added, with the waypoints of the trajectory up to where the robot was put
-        elsewhere."""
+        """Return the demonstration, with waypoints of the trajectory up to the first reset."""
         assert self._clip is not None, "an episode has a picture before its first command"
         ticks, numbers = np.array(self._ticks), np.array(self._numbers)
         resets = np.flatnonzero(~np.isnan(log.reset_s_m))
@@ -201,8 +204,9 @@ class _Rows:
         every = Clock().ticks(collecting.waypoint_s)
         disturbed = numbers[:, 6] > 0.0
         command = numbers[:, 4:6]
-        ahead = ticks, command, disturbed, collecting.waypoints, every, log.tick_s
-        waypoints, driven = waypoints_ahead(pose, *ahead)
+        waypoints, driven = waypoints_ahead(
+            pose, ticks, command, disturbed, collecting.waypoints, every, log.tick_s
+        )
         return Demonstration(
             state=numbers[:, 0:2].astype(np.float32),
             goal=numbers[:, 2:4].astype(np.float32),
@@ -210,7 +214,7 @@ class _Rows:
             waypoints=waypoints,
             driven=driven,
             disturbed=disturbed,
-            told=np.array(self._told),
+            told=np.array(self._instructions),
             glimpses=np.stack(self._glimpses),
             colours=self._colours,
             clip=np.frombuffer(self._clip.finished(), np.uint8),

@@ -1,10 +1,8 @@
-"""Where the event pedestrians of an episode are decided: in a session beside it, or in a process of
-their own.
+"""The director of an episode's event pedestrians, in this process or in another one.
 
-By default an episode brings its director along: a Zenoh session with nobody else in it, which asks
-and answers in the same thread, with no socket. `cosim direct` serves any number of runs and
-episodes from outside (`cosim run --director ENDPOINT`). Both are asked over Zenoh at every tick,
-and both give the same bits.
+By default an episode has its own director in a Zenoh session without a socket, which replies in the
+same thread. `cosim direct` serves any number of runs and episodes (`cosim run --director
+ENDPOINT`). Both are queried over Zenoh at every tick, and give the same bits.
 """
 
 from __future__ import annotations
@@ -35,21 +33,24 @@ from cosim.spec.options import Outside
 from scenarios.events import EVENT_KINDS, react
 
 RETRY_S: Final = 0.2
+"""Seconds between two attempts to connect to a director."""
 _NEAR_M: Final = 0.5
-"""Of what stands there directors are told so much before people reach it."""
+"""Distance in m from people within which obstacles are sent to the director."""
 _OURS: Final = ("cosim.", "scenarios.")
+"""Prefixes of the modules whose source is part of the version of the behaviours."""
 
 
 def director_of(
     episode: str, outside: Outside | None, waiting: Progress, kinds: EventKinds = EVENT_KINDS
 ) -> AbstractContextManager[Director]:
-    """The director of an episode's event pedestrians: the one outside, or one of its own."""
+    """Return the director of an episode: the remote one, or without an address one in this
+    process."""
     return directed(episode, kinds) if outside is None else directed_by(outside, waiting, episode)
 
 
 @contextmanager
 def directed(episode: str, kinds: EventKinds = EVENT_KINDS) -> Iterator[Director]:
-    """A director of event pedestrians and the simulator's end of it, both in one Zenoh session."""
+    """Serve a director in a Zenoh session of its own, and yield the client."""
     key = keys.director("local", keys.chunk(episode))
     with LoneSession() as session:
         serve_director(session, key, partial(react, kinds=kinds))
@@ -58,16 +59,18 @@ def directed(episode: str, kinds: EventKinds = EVENT_KINDS) -> Iterator[Director
 
 @contextmanager
 def directed_by(outside: Outside, waiting: Progress, episode: str) -> Iterator[Director]:
-    """The simulator's end of a director outside, for one episode. Raises DirectorLost when it never
-    comes."""
-    with _reached(outside, waiting) as session:
+    """Connect to a remote director for one episode. Raises DirectorLost if there is none in
+    time."""
+    with _connected(outside, waiting) as session:
         key = keys.director(outside.run, keys.chunk(episode))
         yield RemoteDirector(session, key, by=behaviours(), wait_s=outside.wait_s, waiting=waiting)
 
 
 class AmongObstacles:
-    """A director that is told what stands near the people whom it moves. people: those on the
-    street now."""
+    """Adds obstacles near event pedestrians to the queries of a director.
+
+    people: returns the people on the street now.
+    """
 
     def __init__(
         self, director: Director, standing: Standing, people: Callable[[], People]
@@ -77,7 +80,7 @@ class AmongObstacles:
         self._people = people
 
     def react(self, query: EventQuery) -> EventReply:
-        """The director's reply, the obstacles being known."""
+        """Return the director's reply to a query with nearby obstacles."""
         people = self._people()
         near = self._standing.near(people.xy[people.are(*DIRECTED)], _NEAR_M)
         return self._director.react(
@@ -86,14 +89,14 @@ class AmongObstacles:
 
 
 def direct_all(session: Session) -> None:
-    """Direct every run and episode that asks on this session."""
+    """Serve all runs and episodes that query on this session."""
     serve_director(session, keys.EVERY_DIRECTOR, react, behaviours())
 
 
 @cache
 def behaviours() -> str:
-    """What the behaviours are: a hash of their source and of all of ours that it imports. 16
-    hexadecimal digits."""
+    """Return the version of the behaviours: a hash of their source and of the project's modules
+    that it imports, 16 hexadecimal digits."""
     digest = hashlib.sha256()
     for name, source in sorted(sources(scenarios.events.__name__).items()):
         digest.update(name.encode() + b"\0" + source + b"\0")
@@ -101,21 +104,21 @@ def behaviours() -> str:
 
 
 def sources(name: str) -> dict[str, bytes]:
-    """The source of a module and of all of ours that it imports, however indirectly, by their
-    names."""
+    """Return the source of a module and of the project's modules that it imports, directly or not,
+    by name."""
     found: dict[str, bytes] = {}
-    for each in (name, "cosim.rounding"):  # the second is loaded with any of our rooms
+    for each in (name, "cosim.rounding"):  # every package imports cosim.rounding
         _gather(each, found)
     return found
 
 
 def _gather(name: str, found: dict[str, bytes]) -> None:
-    """Put the source of a module, and of what it imports of ours, into `found`."""
+    """Add the source of a module and of the project's modules that it imports to `found`."""
     if name in found:
         return
     try:
         spec = importlib.util.find_spec(name)
-    except ModuleNotFoundError:  # what is imported from a module that is no package
+    except ModuleNotFoundError:  # an attribute of a module
         return
     if spec is None or spec.origin is None:
         return
@@ -128,18 +131,16 @@ def _gather(name: str, found: dict[str, bytes]) -> None:
             imported = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
         for other in imported:
             if other.startswith(_OURS):
-                rooms = other.split(".")
-                for depth in range(
-                    2, len(rooms) + 1
-                ):  # the rooms that it lies in are loaded before it
-                    _gather(".".join(rooms[:depth]), found)
+                parts = other.split(".")
+                for depth in range(2, len(parts) + 1):  # its packages are imported first
+                    _gather(".".join(parts[:depth]), found)
 
 
-def _reached(outside: Outside, waiting: Progress) -> Session:
-    """A session with the director's hub, as soon as there is one."""
+def _connected(outside: Outside, waiting: Progress) -> Session:
+    """Connect to the director's hub, with retries until the timeout. Raises DirectorLost."""
     deadline = time.monotonic() + outside.wait_s
     endpoint = outside.connection.endpoint
-    told = False
+    reported = False
     while True:
         try:
             return open_session(outside.connection)
@@ -151,7 +152,7 @@ def _reached(outside: Outside, waiting: Progress) -> Session:
                     f"no director at {endpoint} within {outside.wait_s:g} s: start one with `cosim "
                     f"direct --listen {endpoint}` ({error})"
                 ) from error
-        if not told:
+        if not reported:
             waiting(f"waits for a director at {endpoint}, {outside.wait_s:g} s at most")
-            told = True
+            reported = True
         time.sleep(RETRY_S)

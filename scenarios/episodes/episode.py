@@ -1,4 +1,4 @@
-"""Episode: a scenario that one can hold, and drive period by period of the policy.
+"""Episode: one run of a scenario, advanced by one period of the policy at a time.
 
     with Episode(scenario, policy.manifest) as episode:
         policy.reset(episode.id, episode.seed)
@@ -7,8 +7,8 @@
             observation = episode.advance(policy.act(observation))
     record, log = episode.result()
 
-It is the only wiring of engines, referee, recorder and event monitor: runs, films, replays,
-measurements and environments drive it. The policy stands outside.
+Runs, films, replays, measurements and Gymnasium environments all use it. The policy is not part of
+it.
 """
 
 from __future__ import annotations
@@ -49,27 +49,30 @@ from scenarios.events import EVENT_KINDS
 from sumo_nets.crowd.demand_log import Entrances
 
 Watch = Callable[[Step, Verdict], None]
-"""Told each Step of an episode, and what the referee says of it."""
+"""Callback for each Step of an episode and the referee's verdict on it."""
 
 
 _engines_ran_in: set[int] = set()
-"""Ids of this process and of those that it was forked from, if engines ran in them."""
+"""Ids of this process and of its ancestors by fork in which engines have run."""
 
 
 class Episode:
-    """One episode of a scenario, for a policy with this manifest. Use it in a `with` block: its
-    engines start on entering and are closed whatever happens. One at a time in a process, because
-    SUMO runs once in each.
+    """One episode of a scenario, for a policy with this manifest.
 
-    id, seed: what its policy is told when it begins. watches: told every tick. waiting: told what
-    the episode waits for when it stands still. through: may put stopwatches or stand-ins before the
-    engines, which have started and not begun. kinds: the table of events that there may be. setup:
-    of its run, which decides seed and latency; by default what the options request. renderer: the
-    shared one of its run, which draws in place of a camera of its own.
+    Use it in a `with` block: its engines start on entering, and are always closed. A process can
+    run one episode at a time, because SUMO runs once in each process.
 
-    Raises UsageError for a camera that the robot does not have, for goals that the policy cannot be
-    given and when it is used out of turn, PolicyError for an answer that is no command, EngineError
-    when an engine fails or runs already, and what its place raises.
+    id, seed: arguments of the policy's `reset`.
+    watches: called at every tick.
+    waiting: called when the episode waits for another process.
+    through: may wrap the engines, after they are started and before the first tick.
+    kinds: table of valid event kinds.
+    setup: of the run, with seed and latency; by default derived from the options.
+    renderer: shared renderer of the run, used in place of an own camera.
+
+    Raises UsageError for a camera that the robot lacks, for a goal that the policy does not
+    support, and for calls in the wrong order. Raises PolicyError for an invalid command,
+    EngineError when an engine fails or runs already, and the errors of loading its place.
 
     >>> from cosim import load_policy, load_suite
     >>> policy = load_policy("straight")
@@ -150,8 +153,8 @@ class Episode:
             if self._through is not None:
                 self._through(stage)
             if self.options.live is not None:
-                air = stack.enter_context(OnAir(self.options.live, self.scenario, stage.injected))
-                self._watches.append(air.tell)
+                live = stack.enter_context(OnAir(self.options.live, self.scenario, stage.injected))
+                self._watches.append(live.tell)
             if self.options.pace:
                 pacer = Pacer(self.options.pace)
                 self._watches.append(lambda step, verdict: pacer.wait(self.clock.tick_s))
@@ -173,62 +176,63 @@ class Episode:
         self.close()
 
     def close(self) -> None:
-        """End every engine; a second call does nothing. `result` can still be asked for."""
+        """Close all engines; a second call does nothing. `result` remains available."""
         self._stack.close()
         self._stage = None
 
     def watch(self, watch: Watch) -> None:
-        """Tell somebody else too of every tick from now on."""
+        """Add a callback for all further ticks."""
         self._watches.append(watch)
 
     @property
     def over(self) -> bool:
-        """Whether the referee has ended it."""
+        """Return whether the referee has ended the episode."""
         return self._verdict.ended is not None
 
     @property
     def time_s(self) -> float:
-        """Simulated seconds since its start."""
+        """Return the simulated seconds since the start."""
         return 0.0 if self._now is None else self.clock.time_s(self._now.tick)
 
     @property
     def moment(self) -> Moment:
-        """Where everything is now."""
+        """Return the current state."""
         return self._begun[1]
 
     @property
     def footprint_m(self) -> tuple[float, float]:
-        """Length and width of the robot."""
+        """Return length and width of the robot."""
         return self._open.parts.world.footprint_m
 
     @property
     def entrances(self) -> Entrances:
-        """Who has come into the street and left it so far."""
+        """Return the arrivals and departures of the crowd so far."""
         return self._open.entrances
 
     def eyes(self, spec: CameraSpec) -> AbstractContextManager[Eyes]:
-        """A further camera in its street, for humans."""
+        """Create a further camera, for viewing."""
         return self._open.eyes(spec)
 
     def reset(self) -> Observation:
-        """Put the robot at its start; what the policy sees there. Raises UsageError when that was
-        done."""
+        """Start the episode and return the first observation. Raises UsageError on a second
+        call."""
         stage = self._open
         if self._now is not None:
             raise UsageError(
-                "this Episode has begun: an episode cannot be begun anew, make another "
+                "this Episode has begun: an episode cannot be begun again, make another "
                 "Episode for that"
             )
         self._now = begin(self.scenario, stage.parts)
         return self._observe(stage, self._now, True)
 
     def advance(self, answer: object, *, until_tick: int | None = None) -> Observation:
-        """Go on for one period of the policy with its answer; what it sees then, or at the end of
-        the episode. In real time it goes on until the answer has arrived, too, which took as long
-        as the caller took to come here.
+        """Simulate one period of the policy with its answer, and return the next observation.
 
-        answer: a Command or waypoints; see `cosim.episode.control.command_of`. until_tick: stop
-        there, within the period, for somebody who wants to look.
+        In real time it also simulates until the answer has arrived. Its latency is the time since
+        the last observation was returned.
+
+        answer: a Command or waypoints; see `cosim.episode.control.command_of`.
+        until_tick: return at this tick within the period, for viewing.
         """
         took_ms = 1000.0 * (time.perf_counter() - self._asked_s)
         stage, now = self._begun
@@ -264,7 +268,7 @@ class Episode:
             frame = None
 
     def result(self) -> tuple[Record, Log]:
-        """What came out: the record and the log. Raises UsageError while the episode goes on."""
+        """Return the record and the log. Raises UsageError before the episode is over."""
         if not self.over:
             raise UsageError(
                 "this Episode is not over: advance() it until `over`, then ask for its result()"
@@ -281,7 +285,7 @@ class Episode:
         return self._result
 
     def _observe(self, stage: StagedScenario, now: Moment, asks: bool) -> Observation:
-        """What is seen now; asks: by the policy, whose turn it is."""
+        """Return the current observation. asks: whether it goes to the policy."""
         was_reset = self._was_reset
         self._was_reset = was_reset and not asks
         time_s = self.clock.time_s(now.tick)

@@ -1,7 +1,7 @@
-"""Injected people, beside those of the events. A director around a director.
+"""Injected people, added to the event pedestrians by a wrapper around the director.
 
-Injections come from any thread, or from a record that is replayed; they take effect at the boundary
-of a step, in the order in which they came.
+Injections come from any thread, or from a replayed record. They take effect at the start of a tick,
+in their order of arrival.
 """
 
 from __future__ import annotations
@@ -24,21 +24,18 @@ from scenarios.events.injected_person import (
 )
 
 MOST_INJECTED: Final = 100
-"""At once, those under way to their first step included."""
+"""Maximum number of injected people at a time, including accepted ones before their first tick."""
 MOST_EVER: Final = 5000
-"""In one episode: its record holds them all."""
-
-
+"""Maximum number of injected people in an episode, because its record lists all of them."""
 SUGGESTED_M: Final = 10.0
-"""A valid point that a refusal names lies so far ahead of the robot on its route."""
+"""Distance in m along the route from the robot to the valid point that a refusal suggests."""
 SETTLES_S: Final = 2.0
-"""Seconds to wait for the end of a tick under way, which takes milliseconds: only then is the
-robot's pose known."""
+"""Timeout in seconds for the end of the current tick, which gives the robot's pose."""
 
 
 class RobotOnRoute(NamedTuple):
-    """The robot at the start of a tick: its pose on the map and its arc length on the route, in
-    metres."""
+    """The robot at the start of a tick: its pose on the map and its arc length on the route in
+    m."""
 
     tick: int
     pose: Pose
@@ -48,8 +45,9 @@ class RobotOnRoute(NamedTuple):
 class InjectedPeople:
     """Adds injected people to a director's replies.
 
-    on_map(x_m, y_m): whether a point belongs to the place at all. route, start: of the robot.
-    script: injections of a record that is replayed.
+    on_map(x_m, y_m): returns whether a point belongs to the place.
+    route, start: of the robot.
+    script: injections of a replayed record.
     """
 
     def __init__(
@@ -74,26 +72,28 @@ class InjectedPeople:
         self._next_tick = 0
 
     def robot_at(self, robot: RobotOnRoute) -> None:
-        """Take in where the robot is when a tick begins: points from the robot refer to it."""
+        """Set the robot's pose at the start of a tick, the origin of relative points."""
         with self._lock:
             self._robot = robot
             self._lock.notify_all()
 
-    def offer(self, asked: InjectionRequest) -> Ack:
-        """Take an injection in for the next step, or say why not. Any thread may call this."""
+    def offer(self, request: InjectionRequest) -> Ack:
+        """Accept an injection for the next tick, or refuse it with a reason. Thread-safe."""
         with self._lock:
-            if asked.depends_on_robot and not self._lock.wait_for(self._robot_is_known, SETTLES_S):
+            if request.depends_on_robot and not self._lock.wait_for(
+                self._robot_is_known, SETTLES_S
+            ):
                 late = f"the tick under way takes longer than {SETTLES_S:g} s: send it again"
-                return Ack(id=asked.id, status="refused", reason=late)
-            injection = asked.resolved(self._robot.pose)
+                return Ack(id=request.id, status="refused", reason=late)
+            injection = request.resolved(self._robot.pose)
             tick = self._next_tick
-            if reason := self._objection(asked, injection):
-                return Ack(id=asked.id, status="refused", reason=reason)
+            if reason := self._objection(request, injection):
+                return Ack(id=request.id, status="refused", reason=reason)
             self._coming.append(Injected(tick=tick, injection=injection))
             self._names.add(injection.id)
         (x_m, y_m), *_ = injection.path
         return Ack(
-            id=asked.id,
+            id=request.id,
             status="accepted",
             tick=tick,
             time_s=tick * self._tick_ms / 1000,
@@ -102,13 +102,13 @@ class InjectedPeople:
         )
 
     def _robot_is_known(self) -> bool:
-        """Whether the robot's pose at the start of the next step is known: not while a step is
-        under way."""
+        """Return whether the robot's pose at the start of the next tick is known, which is not so
+        during a tick."""
         return self._robot.tick == self._next_tick
 
-    def _objection(self, asked: InjectionRequest, injection: Injection) -> str:
-        """Why an injection is refused; "" where nothing is against it."""
-        for i, (point, (x_m, y_m)) in enumerate(zip(asked.path, injection.path, strict=True)):
+    def _objection(self, request: InjectionRequest, injection: Injection) -> str:
+        """Return why an injection is refused; "" if it is valid."""
+        for i, (point, (x_m, y_m)) in enumerate(zip(request.path, injection.path, strict=True)):
             if not self._on_map(x_m, y_m):
                 found = _in_json((x_m, y_m))
                 if isinstance(point, RelativePoint):
@@ -125,7 +125,7 @@ class InjectedPeople:
         return ""
 
     def _valid_point(self) -> str:
-        """Where the robot is, and a point ahead of it that is valid, in words."""
+        """Return a sentence with the robot's position and a valid point ahead of it."""
         pose, route_s_m = self._robot.pose, self._robot.route_s_m
         there = self._route.at(route_s_m + SUGGESTED_M)
         relative = RelativePoint.of(there.x_m, there.y_m, pose)
@@ -137,12 +137,12 @@ class InjectedPeople:
 
     @property
     def log(self) -> tuple[Injected, ...]:
-        """What took effect so far, in order."""
+        """Return the injections that have taken effect, in order."""
         with self._lock:
             return tuple(self._log)
 
     def react(self, query: EventQuery) -> EventReply:
-        """The director's reply, with the injected people of this tick among its actors."""
+        """Return the director's reply with the injected people of this tick."""
         with self._lock:
             due = [entry for entry in self._coming if entry.tick <= query.tick]
             self._coming = [entry for entry in self._coming if entry.tick > query.tick]
@@ -170,7 +170,7 @@ class InjectedPeople:
 
 
 def _in_json(point: tuple[float, float] | RelativePoint) -> str:
-    """A point as it stands in a message, in metres to 0.1 m."""
+    """Return a point as in a message, in m."""
     if isinstance(point, RelativePoint):
         return f'{{"ahead": {point.ahead:.10g}, "left": {point.left:.10g}}}'
     return f"[{point[0]:.1f}, {point[1]:.1f}]"

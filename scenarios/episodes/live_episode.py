@@ -1,5 +1,4 @@
-"""An episode on the air: reachable over Zenoh while it runs (`cosim run --live`), for injections
-and telemetry."""
+"""Live access to a running episode over Zenoh (`cosim run --live`): injections and telemetry."""
 
 from __future__ import annotations
 
@@ -18,28 +17,22 @@ from cosim.core.clock import Clock
 from cosim.core.state import Age, PersonKind
 from cosim.episode.loop import Step
 from cosim.results.referee import Verdict
-from cosim.spec.injection import Injected, Live
+from cosim.spec.injection import Live
 from cosim.spec.scenario import Scenario
 from scenarios.episodes.injected import InjectedPeople, RobotOnRoute
 
 
-class _Told(msgspec.Struct, frozen=True, kw_only=True):
-    """What `log` answers: the tick, what was injected, and which events and failures there were,
-    with their ticks."""
-
-    tick: int
-    injections: tuple[Injected, ...]
-    happened: tuple[tuple[int, str], ...]
-
-
 class OnAir:
-    """One episode's end of the air. Use in a `with` block."""
+    """Publisher of an episode's telemetry, and server of injections, status, log and camera.
+
+    Use it in a `with` block.
+    """
 
     def __init__(self, live: Live, scenario: Scenario, injected: InjectedPeople) -> None:
         self._live = live
         self._scenario = scenario
         self._injected = injected
-        self._below = keys.env(live.run, keys.chunk(scenario.id))
+        self._prefix = keys.env(live.run, keys.chunk(scenario.id))
         self._step: Step | None = None
         self._happened: list[tuple[int, str]] = []
         self._acting: set[str] = set()
@@ -47,10 +40,10 @@ class OnAir:
 
     def __enter__(self) -> Self:
         self._session = open_session(self._live.connection)
-        serve_injections(self._session, f"{self._below}/inject", self._injected.offer)
-        self._session.serve(f"{self._below}/status", lambda _: self._status(), found=True)
-        self._session.serve(f"{self._below}/log", lambda _: self._log())
-        self._session.serve(f"{self._below}/camera", lambda _: self._camera())
+        serve_injections(self._session, f"{self._prefix}/inject", self._injected.offer)
+        self._session.serve(f"{self._prefix}/status", lambda _: self._status(), found=True)
+        self._session.serve(f"{self._prefix}/log", lambda _: self._log())
+        self._session.serve(f"{self._prefix}/camera", lambda _: self._camera())
         return self
 
     def __exit__(
@@ -62,7 +55,7 @@ class OnAir:
         self._session.close()
 
     def tell(self, step: Step, verdict: Verdict) -> None:
-        """Tell everybody what this tick did."""
+        """Publish the telemetry of a tick."""
         self._step = step
         pose = step.motion.robot.pose
         route_s_m = step.route_s_after_m
@@ -122,8 +115,8 @@ class OnAir:
         }
         if news:
             topics["events"] = news
-        for topic, what in topics.items():
-            self._session.tell(f"{self._below}/{topic}", msgspec.json.encode(what))
+        for topic, content in topics.items():
+            self._session.tell(f"{self._prefix}/{topic}", msgspec.json.encode(content))
 
     def _status(self) -> bytes:
         tick = -1 if self._step is None else self._step.tick
@@ -132,13 +125,15 @@ class OnAir:
         )
 
     def _log(self) -> bytes:
+        """Return the tick, the injections, and the events and failures with their ticks, as
+        JSON."""
         tick = -1 if self._step is None else self._step.tick
         return msgspec.json.encode(
-            _Told(tick=tick, injections=self._injected.log, happened=tuple(self._happened))
+            {"tick": tick, "injections": self._injected.log, "happened": self._happened}
         )
 
     def _camera(self) -> bytes:
-        """The last picture that the policy got, as PNG. Raises LookupError before there is one."""
+        """Return the last picture of the policy as PNG. Raises LookupError before the first one."""
         if self._rgb is None:
             raise LookupError("the policy has had no picture yet")
         done, data = cv2.imencode(".png", self._rgb[..., ::-1])

@@ -1,4 +1,4 @@
-"""A recorded episode run again: the same commands, the same injections, the same state hash."""
+"""Replay of a recorded episode: same commands, same injections, same state hash."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from sumo_nets.crowd.demand_log import Entrances
 
 
 class Recorded(NamedTuple):
-    """All that a run folder holds of an episode."""
+    """A finished episode as loaded from a run folder."""
 
     scenario: Scenario
     record: Record
@@ -37,7 +37,7 @@ class Recorded(NamedTuple):
 
 
 def recorded(folder: Path, scenario_id: str) -> Recorded:
-    """A finished episode. Raises UsageError with the valid names, RunError when it crashed."""
+    """Load a finished episode. Raises UsageError with the valid names, RunError if it crashed."""
     records = {record.scenario.id for record in read_records(folder)}
     if scenario_id not in records:
         raise unknown(f"finished episode in {folder}", scenario_id, records)
@@ -52,77 +52,82 @@ def recorded(folder: Path, scenario_id: str) -> Recorded:
 
 
 def replaying(
-    told: Recorded, camera: CameraChoice = "auto", *watches: Watch, judged_alone: bool = False
+    original: Recorded, camera: CameraChoice = "auto", *watches: Watch, judged_alone: bool = False
 ) -> tuple[Episode, Replay]:
-    """The recorded episode once more, not begun yet, and the policy that does what was done in it.
+    """Return a new Episode for a replay, and the policy that repeats the recorded commands.
 
-    judged_alone: leave out what is measured beside what the referee judges, for a replay whose
-    result is not needed.
+    judged_alone: compute no measures, for a replay whose result is not needed.
     """
     options = EpisodeOptions(
-        seed=told.record.setup.seed, camera=camera, injections=told.record.injections
+        seed=original.record.setup.seed, camera=camera, injections=original.record.injections
     )
-    policy = Replay(told.log.command)
-    through = _judge_alone if judged_alone else None
-    return Episode(
-        told.scenario, policy.manifest, options, watches=watches, through=through
-    ), policy
+    policy = Replay(original.log.command)
+
+    def judge_alone(stage: StagedScenario) -> None:
+        stage.scorer.judge_alone()
+
+    through = judge_alone if judged_alone else None
+    episode = Episode(original.scenario, policy.manifest, options, watches=watches, through=through)
+    return episode, policy
 
 
-def _judge_alone(stage: StagedScenario) -> None:
-    stage.scorer.judge_alone()
+def replayed(original: Recorded, *watches: Watch, progress: Progress = ignore) -> str:
+    """Replay an episode, and return its state hash."""
+    return _again(original, progress, *watches)[0]
 
 
-def replayed(told: Recorded, *watches: Watch, progress: Progress = ignore) -> str:
-    """Run it again; the state hash that comes out."""
-    return _again(told, progress, *watches)[0]
-
-
-def compared(told: Recorded, progress: Progress = ignore) -> tuple[str, Compared]:
-    """Run it again, then its street without the robot; the state hash, and what the robot cost the
-    others."""
-    beside = Beside()
-    state_hash, entrances = _again(told, progress, beside.watch)
-    return state_hash, beside.compared(
-        told.scenario, entrances, partial(progress, "the street without the robot")
+def compared(original: Recorded, progress: Progress = ignore) -> tuple[str, Compared]:
+    """Replay an episode, then its street without the robot; return the state hash and the
+    delays."""
+    tracker = Beside()
+    state_hash, entrances = _again(original, progress, tracker.watch)
+    return state_hash, tracker.compared(
+        original.scenario, entrances, partial(progress, "the street without the robot")
     )
 
 
-def _again(told: Recorded, progress: Progress, *watches: Watch) -> tuple[str, Entrances]:
+def _again(original: Recorded, progress: Progress, *watches: Watch) -> tuple[str, Entrances]:
     def watch(step: Step, _: Verdict) -> None:
-        progress(f"replaying {told.scenario.id}", step.tick / len(told.log))
+        progress(f"replaying {original.scenario.id}", step.tick / len(original.log))
 
     progress("starting SUMO and PyBullet")
-    episode, policy = replaying(told, "auto", watch, *watches)
+    episode, policy = replaying(original, "auto", watch, *watches)
     with episode:
         drive(episode, policy)
         return episode.result()[0].state_hash, episode.entrances
 
 
 class Alike:
-    """Watches a replay, and holds every tick against the recorded trajectory, to the bit: the
-    robot's pose, speeds and command, its way, its resets, and how near the nearest person is."""
+    """Checker that every tick of a replay equals the recorded trajectory to the bit.
 
-    def __init__(self, folder: Path, told: Recorded) -> None:
+    Compared are the robot's pose, speeds and command, its route position, its resets and the
+    distance to the nearest person.
+    """
+
+    def __init__(self, folder: Path, original: Recorded) -> None:
         self._folder = folder
-        self._told = told
-        self._footprint_m = robot_called(told.scenario.robot).footprint_m
+        self._original = original
+        self._footprint_m = robot_called(original.scenario.robot).footprint_m
 
     def watch(self, step: Step, verdict: Verdict) -> None:
-        """The next tick. Raises RunError when it is not the recorded one."""
-        if not self._told.log.same(Tick(step, verdict, self._footprint_m, OnRoad())):
-            raise otherwise(self._folder, self._told, f"from {Clock().time_s(step.tick):g} s on")
+        """Check the next tick. Raises RunError if it differs from the recorded one."""
+        if not self._original.log.same(Tick(step, verdict, self._footprint_m, OnRoad())):
+            raise otherwise(
+                self._folder, self._original, f"from {Clock().time_s(step.tick):g} s on"
+            )
 
 
-def check(folder: Path, told: Recorded, state_hash: str) -> None:
-    """Raises RunError when a replay came out otherwise than recorded."""
-    if state_hash != told.record.state_hash:
-        raise otherwise(folder, told, f"{state_hash[:16]}, recorded {told.record.state_hash[:16]}")
+def check(folder: Path, original: Recorded, state_hash: str) -> None:
+    """Check the state hash of a replay. Raises RunError if it differs from the recorded one."""
+    if state_hash != original.record.state_hash:
+        raise otherwise(
+            folder, original, f"{state_hash[:16]}, recorded {original.record.state_hash[:16]}"
+        )
 
 
-def otherwise(folder: Path, told: Recorded, what: str) -> RunError:
-    """The error for a replay that came out otherwise than recorded; what: the difference."""
-    record = told.record
+def otherwise(folder: Path, original: Recorded, what: str) -> RunError:
+    """Return the error for a replay that differs from the record. what: the difference."""
+    record = original.record
     here = versions()
     changed = [
         f"{name} {record.setup.versions.get(name)}, here {here[name]}"

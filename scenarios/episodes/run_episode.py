@@ -1,4 +1,4 @@
-"""run_episode(scenario, policy, options) -> outcome: the pure function that every worker runs."""
+"""Running of one episode from start to end, as every worker does it."""
 
 from __future__ import annotations
 
@@ -25,8 +25,12 @@ from scenarios.ipc.faults import verdict_on
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came out of an episode. log: None if it crashed; traceback: of a crash, or of a
-    comparison that failed; again: an engine failed, which may not happen another time."""
+    """The result of an episode.
+
+    log: None if the episode crashed.
+    traceback: of a crash, or of a failed comparison.
+    again: whether an engine failed, so that another attempt may succeed.
+    """
 
     record: Record
     log: Log | None
@@ -45,26 +49,27 @@ def run_episode(
     waiting: Progress = ignore,
     comparing: Progress = ignore,
 ) -> Outcome:
-    """Run one scenario to its end. Whatever goes wrong inside becomes a record, `crashed` where it
-    was the policy, `invalid` where it was anything else; but for a shared renderer that has ended:
-    then it raises RendererLost, and is to be run again; and for what the machine lacks:
-    MachineError, which is no episode's fault. One whose policy server is gone is to be run again,
-    and has crashed if it is not.
+    """Run one scenario to its end, and return its record and log.
+
+    An error becomes a record: `crashed` if the policy failed, `invalid` otherwise. An episode whose
+    policy server is lost is `crashed` unless it is run again.
 
     setup, renderer, watches, waiting: see `Episode`.
-    comparing: receives how far the comparison with the street without the robot has come.
+    comparing: progress callback of the comparison with the street without the robot.
+    Raises RendererLost if the shared renderer has ended, MachineError if the machine lacks
+    something.
     """
     driver = Driver.of(policy)
-    beside = Beside()
-    trouble = ""
-    listening = [*watches, beside.watch] if options.counterfactual else watches
+    tracker = Beside()
+    comparison_error = ""
+    all_watches = [*watches, tracker.watch] if options.counterfactual else watches
     if setup is None:
         setup = RunSetup.of(options, policy_source=driver.source_hash, policy_runs=driver.runs)
     episode = Episode(
         scenario,
         driver.manifest,
         options,
-        watches=listening,
+        watches=all_watches,
         waiting=waiting,
         setup=setup,
         renderer=renderer,
@@ -77,7 +82,7 @@ def run_episode(
             entrances = episode.entrances
     except (RendererLost, MachineError):
         raise
-    except Exception as error:  # noqa: BLE001  here a failing episode is turned into its record
+    except Exception as error:  # noqa: BLE001  a failed episode becomes a record
         status, again = verdict_on(error)
         record = msgspec.structs.replace(episode.record, status=status, reason=in_words(error))
         return Outcome(record, None, traceback.format_exc(), again)
@@ -86,19 +91,19 @@ def run_episode(
     if options.counterfactual:
         try:
             measures = (
-                record.measures | beside.compared(episode.scenario, entrances, comparing).measures
+                record.measures | tracker.compared(episode.scenario, entrances, comparing).measures
             )
             record = msgspec.structs.replace(record, measures=measures)
-        except Exception as error:  # noqa: BLE001  the episode itself is over and sound
-            trouble = traceback.format_exc()
+        except Exception as error:  # noqa: BLE001  the episode itself is valid
+            comparison_error = traceback.format_exc()
             record = msgspec.structs.replace(
                 record, reason=f"the street without the robot: {in_words(error)}"
             )
-    return Outcome(record, log, trouble)
+    return Outcome(record, log, comparison_error)
 
 
 def drive(episode: Episode, policy: Policy) -> None:
-    """Let a policy drive an episode to its end."""
+    """Drive an episode to its end with a policy."""
     policy.reset(episode.id, episode.seed)
     observation = episode.reset()
     while not episode.over:
@@ -106,8 +111,7 @@ def drive(episode: Episode, policy: Policy) -> None:
 
 
 def in_words(error: Exception) -> str:
-    """What a record says of an error: its message, with its type unless the project raised it on
-    purpose."""
+    """Return the message of an error, with its type unless it is an error of the project."""
     return (
         str(error) if isinstance(error, CosimError) else f"{type(error).__name__}: {said_by(error)}"
     )

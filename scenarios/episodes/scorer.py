@@ -1,4 +1,4 @@
-"""Scorer: what is judged, measured and recorded of an episode, Step by Step."""
+"""Scorer: passes the Steps of an episode to referee, recorder and monitors."""
 
 from __future__ import annotations
 
@@ -21,8 +21,12 @@ from cosim.spec.scenario import Scenario
 
 
 class Scorer:
-    """Takes in the Steps of one episode, in order. kinds: the table of its events; area: where the
-    robot may be; hidden: see `EventMonitor`."""
+    """Referee, recorder and monitors of one episode.
+
+    kinds: table of event kinds.
+    area: where the robot may drive.
+    hidden: see `EventMonitor`.
+    """
 
     def __init__(
         self,
@@ -48,11 +52,11 @@ class Scorer:
         self._measures = True
 
     def judge_alone(self) -> None:
-        """From now on ask the referee, and measure and record nothing: there will be no result."""
+        """Record no measures from now on, so that there is no result: only the referee judges."""
         self._measures = False
 
     def score(self, step: Step) -> Verdict:
-        """The referee's verdict on a Step, which is recorded with it."""
+        """Return the referee's verdict on the next Step, and record both."""
         verdict = self._verdict = self._referee.judge(step)
         if not self._measures:
             return verdict
@@ -65,9 +69,10 @@ class Scorer:
         return verdict
 
     def result(self, begun: Record, commands: InFlight) -> tuple[Record, Log]:
-        """The record that was begun, with all that came out so far, and the log. commands: all that
-        was answered.
+        """Return the completed record, and the log.
 
+        begun: the record from the start of the episode.
+        commands: all answers of the policy.
         Raises UsageError after `judge_alone`.
         """
         if not self._measures:

@@ -1,4 +1,4 @@
-"""The only wiring of engines: a scenario becomes running parts, behind their ports."""
+"""Wiring of an episode: starts the engines of a scenario behind their interfaces."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from cosim.spec.manifest import Manifest
 from cosim.spec.obstacle import Obstacle, footprint
 from cosim.spec.options import EpisodeOptions, RendererAt
 from cosim.spec.robot import COURIER, Robot, robot_called
-from cosim.spec.scenario import Barrier, CrowdSpec, Scenario, event_faults
+from cosim.spec.scenario import CrowdSpec, Scenario, event_faults
 from cosim.spec.spec_file import in_lines
 from physics.cameras.choice import camera_of, camera_of_choice, renderer_of
 from physics.dynamics.world import BulletWorld
@@ -51,20 +51,23 @@ if TYPE_CHECKING:
     from sumo_nets.crowd.crowd import SumoCrowd
 
 CORRIDOR_M = 40.0
-"""The walkable area is judged this far around the route; beyond it everything is out of lane."""
-
+"""Distance in m from the route within which the walkable area is loaded; beyond it all is out of
+lane."""
 _BESIDE_M = 10.0
-"""The walkable ground is looked at so far around obstacles."""
-
+"""Distance in m from obstacles within which the walkable area is loaded for pedestrians."""
 FRONTAGE_M = 2.0
-"""Beside a sidewalk there is room for this much."""
+"""Distance in m from a street at which injected people may still be."""
 
 
 @dataclass(slots=True)
 class StagedScenario:
-    """A scenario ready to run. parts: its engines; robot: which one drives. renderer: what draws
-    for the policy. observer: makes what it is given. eyes: makes further cameras. injected: takes
-    pedestrians in. entrances: who comes and goes in the street."""
+    """A scenario whose engines run.
+
+    renderer: name of the policy's renderer in records.
+    observer: builds observations.
+    eyes: creates further cameras.
+    entrances: arrivals and departures of the crowd.
+    """
 
     parts: Parts
     robot: Robot
@@ -87,8 +90,11 @@ def staged(
     kinds: EventKinds,
     shared: RendererAt | None = None,
 ) -> Iterator[StagedScenario]:
-    """Start every engine of a scenario; all are closed at the end, whatever happened. seed: of the
-    run; shared: draws in place of a camera of its own."""
+    """Start the engines of a scenario; all are closed at the end of the block.
+
+    seed: of the run.
+    shared: shared renderer, used in place of an own camera.
+    """
     if faults := list(event_faults(scenario, kinds)):
         raise SpecError(f"scenario '{scenario.id}': {in_lines(faults)}")
     _, street_map = place(scenario.place)
@@ -97,7 +103,9 @@ def staged(
     with ExitStack() as stack:
         street = surface_of_place(scenario.place)
         robot = robot_called(scenario.robot)
-        world = stack.enter_context(world_of(street, scenario.barriers, robot, scenario.obstacles))
+        world = stack.enter_context(
+            BulletWorld(street, scenario.barriers, robot, scenario.obstacles)
+        )
         crowd = crowd_of(scenario)
         stack.enter_context(crowd)
 
@@ -113,10 +121,10 @@ def staged(
         camera: Camera | None = None
         renderer = NO_RENDERER
         if shared is not None:
-            elsewhere = stack.enter_context(SharedCamera(shared, scenario))
+            shared_camera = stack.enter_context(SharedCamera(shared, scenario))
             if manifest.camera is not None:
-                camera = elsewhere
-                renderer = elsewhere.renderer
+                camera = shared_camera
+                renderer = shared_camera.renderer
         elif manifest.camera is not None:
             camera = stack.enter_context(eyes(manifest.camera))
             renderer = renderer_of(camera_of_choice(options.camera))
@@ -124,9 +132,8 @@ def staged(
         look = None if camera is None else partial(empty_street, camera, street, robot)
         director = stack.enter_context(director_of(scenario.id, options.director, waiting, kinds))
         if scenario.crowd.residents:
-            from scenarios.events.resident_director import (
-                among_residents,
-            )  # with what draws their graph
+            # Imported only where needed: it loads scipy.
+            from scenarios.events.resident_director import among_residents
 
             director = among_residents(
                 director, scenario, street_map, street, lambda: crowd.street.people
@@ -147,11 +154,11 @@ def staged(
 
         @cache
         def free() -> Polygon | MultiPolygon:
-            """Made for those who are told it: props have to be placed along the whole route."""
-            footing = clear_of(
+            """Compute the free ground, only for policies that get it: placing all props is slow."""
+            ground = clear_of(
                 fenced(walkable, scenario.barriers), street.standing(around), scenario.obstacles
             )
-            room = shapely.buffer(footing, -robot.width_m / 2)
+            room = shapely.buffer(ground, -robot.width_m / 2)
             shapely.prepare(room)
             return room
 
@@ -171,19 +178,11 @@ def staged(
         )
 
 
-def world_of(
-    surface: Surface,
-    barriers: Sequence[Barrier] = (),
-    robot: Robot = COURIER,
-    obstacles: Sequence[Obstacle] = (),
-) -> BulletWorld:
-    """The physics of a surface, not running yet."""
-    return BulletWorld(surface, barriers, robot, obstacles)
-
-
 def crowd_of(scenario: Scenario, before: Entrances | None = None) -> SumoCrowd | EmptyStreet:
-    """The street life of a scenario, not running yet. before: who comes and goes, in place of who
-    would be drawn."""
+    """Create the crowd and traffic of a scenario, not started.
+
+    before: recorded arrivals and departures, used in place of random ones.
+    """
     net_path, street_map = place(scenario.place)
     robot = robot_called(scenario.robot)
     start_xy = scenario.start[:2]
@@ -214,8 +213,8 @@ def sumo_crowd(
     before: Entrances | None = None,
     standing: Standing | None = None,
 ) -> SumoCrowd:
-    """The street life of any net, not running yet, by SUMO. Raises MachineError if it cannot be
-    loaded."""
+    """Create the crowd and traffic of a net by SUMO, not started. Raises MachineError if SUMO
+    cannot be loaded."""
     try:
         from sumo_nets.crowd.crowd import SumoCrowd
     except (ImportError, OSError) as error:
@@ -227,7 +226,7 @@ def sumo_crowd(
 
 
 def standing_in(scenario: Scenario, street_map: StreetMap) -> Standing:
-    """The obstacles of a scenario as people see them."""
+    """Return the obstacles of a scenario as pedestrians avoid them."""
     if not scenario.obstacles:
         return Standing()
     around = shapely.union_all([footprint(one, _BESIDE_M) for one in scenario.obstacles])
@@ -235,7 +234,7 @@ def standing_in(scenario: Scenario, street_map: StreetMap) -> Standing:
 
 
 def known(scenario: Scenario, free: Polygon | MultiPolygon, now: Moment) -> Privileged:
-    """All that the simulator knows at a moment."""
+    """Return the privileged state for an observation."""
     crossings = tuple((c.id, c.enter_s_m, c.leave_s_m) for c in scenario.crossings)
     street = now.street
     return Privileged(
@@ -251,21 +250,21 @@ def known(scenario: Scenario, free: Polygon | MultiPolygon, now: Moment) -> Priv
 
 
 def empty_street(camera: Camera, surface: Surface, robot: Robot, pose: Pose) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8: what a robot would see by a camera at a pose, with nobody in the street."""
+    """Draw the view of a robot's camera at a pose in the empty street, (H, W, 3) uint8."""
     z_m, _, _ = surface.lean(pose, robot.drive.span_m)
     return camera.render(RobotState(pose, z_m=z_m), Street(0)).rgb
 
 
 def on_map(street_map: StreetMap, x_m: float, y_m: float) -> bool:
-    """Whether somebody may be there: on a street, or within FRONTAGE_M of one."""
+    """Return whether a point is on a street, or within FRONTAGE_M of one."""
     return street_map.locate(x_m, y_m, FRONTAGE_M).kind != "off"
 
 
 def clear_of(
     area: Polygon | MultiPolygon, props: Sequence[Prop], obstacles: Sequence[Obstacle] = ()
 ) -> Polygon | MultiPolygon:
-    """An area minus the ground that props and obstacles cover; the area itself where none stands on
-    it."""
+    """Return an area minus the footprints of props and obstacles; the area itself if none
+    intersects it."""
     ground = np.array([*footprints(props), *map(footprint, obstacles)], dtype=object)
     ground = ground[shapely.intersects(area, ground)]
     return overlay.difference(area, overlay.union_all(ground)) if len(ground) else area

@@ -1,5 +1,4 @@
-"""Starts processes of this machine, talks to them over a socket, and ends them with everything they
-have started."""
+"""Child processes of a run: started, watched, and ended with all their own children."""
 
 from __future__ import annotations
 
@@ -8,24 +7,35 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from contextlib import nullcontext, suppress
+from functools import partial
 from pathlib import Path
 from signal import SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV
-from typing import Final
+from typing import Final, NamedTuple
 
 import msgspec
 
 from cosim.core.child_process import ended_in_words
-from cosim.core.errors import unwritable
+from cosim.core.errors import MachineError, UsageError, unwritable
 from cosim.core.framing import MOST_WIRED_BYTES, Wire
-from scenarios.ipc.deadlines import Asked, Question
-from scenarios.ipc.messages import Job, MessageHandler, decode_message, encode_message
+from scenarios.ipc.deadlines import Asked, Patience, Question
+from scenarios.ipc.messages import (
+    Job,
+    Message,
+    MessageHandler,
+    Ready,
+    Unable,
+    decode_message,
+    encode_message,
+)
 
 WORKER: Final = "scenarios.runs.worker:serve_jobs"
+"""The function of an environment process."""
 ENDING_S: Final = 10.0
-"""Seconds that a process has to end by itself, and then its supervisor to clear up."""
+"""Seconds that a process may take to end before it is killed; then the same for its supervisor."""
 _FAULTS: Final = tuple(-fault for fault in (SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV))
-"""Exit codes of a process that compiled code has ended."""
+"""Exit codes of a process that crashed in compiled code."""
 _CODE: Final = (
     "import sys; sys.path[:] = {path!r}; from scenarios.ipc.supervisor import keep_worker; "
     "keep_worker({serves!r}, {given}, {run})"
@@ -33,10 +43,15 @@ _CODE: Final = (
 
 
 class KeptProcess:
-    """A shepherd and its worker (`scenarios.ipc.supervisor`). log: where it keeps what is printed,
-    None for this process's standard error; serves: the function that is the worker; called: what
-    kind of process that is; also: descriptors that it is given besides. open: it has not ended, as
-    far as the run knows. most_bytes: of a message from it."""
+    """A supervisor process and its worker (`scenarios.ipc.supervisor`).
+
+    log: file of its output, None for this process's standard error.
+    serves: function that the worker runs, as module:name.
+    called: kind of the process, for messages.
+    also: further descriptors to pass on.
+    most_bytes: size limit of a message from it.
+    open: whether it is not known to have ended.
+    """
 
     def __init__(
         self,
@@ -74,40 +89,46 @@ class KeptProcess:
 
     @property
     def question(self) -> Question | None:
+        """Return the pending call of the policy; after the end, the one that was pending then."""
         return self._asked.question if self.open else self._last_asked
 
     @property
     def descriptor(self) -> int | None:
-        """File descriptor that is readable when it has a message; None if it has ended."""
+        """Return the file descriptor that is readable when it has a message; None if it has
+        ended."""
         return self.wire.fileno() if self.open else None
 
     def give(self, job: Job) -> None:
         self.send(encode_message(job))
 
     def send(self, message: bytes) -> None:
-        """Send it a message. A process that has died, or was stopped, ignores it."""
+        """Send it a message, without waiting. A process that has ended ignores it."""
         with suppress(OSError):
             self.wire.post(message)
 
     def listen(self, hear: MessageHandler) -> bool:
+        """Pass on the messages that have arrived. Returns False if no more will."""
         with suppress(OSError):
             self.wire.flush()
         try:
             for message in self.wire.received():
                 hear(decode_message(message))
-        except (EOFError, msgspec.DecodeError):  # a policy can write to the socket, too
+        except (EOFError, msgspec.DecodeError):  # a policy can write garbage to the socket
             return False
         return True
 
     def hang_up(self) -> None:
+        """Close the socket, after which an idle worker ends."""
         self.wire.close()
 
     def kill(self, *, wait: bool = True) -> None:
+        """End it by force."""
         self._child.send_signal(signal.SIGTERM)
         if wait:
             self.end()
 
     def end(self) -> str:
+        """Wait for its end, by force if that takes too long. Returns the reason in words."""
         self.wire.close()
         code = self._code(ENDING_S)
         if code is None:
@@ -124,7 +145,7 @@ class KeptProcess:
         return f"the {self.called} process {_in_words(code)}{during}"
 
     def _code(self, wait_s: float) -> int | None:
-        """Its exit code; None if it has not ended in time."""
+        """Return its exit code; None if it has not ended in time."""
         try:
             return self._child.wait(wait_s)
         except subprocess.TimeoutExpired:
@@ -133,3 +154,77 @@ class KeptProcess:
 
 def _in_words(code: int | None) -> str:
     return "closed its pipe to the run" if code is None else ended_in_words(code)
+
+
+class ProcessEnd(NamedTuple):
+    """The end of a process, in words.
+
+    question: the policy call that was pending.
+    in_engine: whether compiled code has ended it or hangs, while no policy call was pending.
+    hung: whether it was killed because it sent nothing.
+    allowed_s: the seconds that the policy had for its answer, if it was killed because there was
+    none.
+    """
+
+    words: str
+    question: Question | None = None
+    in_engine: bool = False
+    hung: bool = False
+    allowed_s: float | None = None
+
+
+class Watchdog:
+    """Watches one process, and kills it when it hangs.
+
+    silence_s: timeout in seconds of its heartbeats, unless a policy call is pending.
+    ready: whether it has loaded the engines and the policy.
+    heard_s: monotonic clock of its last message.
+    """
+
+    def __init__(self, process: KeptProcess, patience: Patience, silence_s: float) -> None:
+        self.process = process
+        self.ready = False
+        self.heard_s = time.monotonic()
+        self._patience = patience
+        self._silence_s = silence_s
+
+    def poll(self, hear: MessageHandler, *, idle: bool = False) -> ProcessEnd | None:
+        """Pass on its messages. Returns its end, if it has ended or was killed because it hangs.
+
+        idle: whether it may be silent.
+        Raises UsageError if it cannot load the policy, MachineError if the machine lacks something.
+        """
+        if not self.process.listen(partial(self._take, hear)):
+            words = self.process.end()
+            return ProcessEnd(words, self.process.question, self.process.in_engine)
+        question = self.process.question
+        now_s = time.monotonic()
+        if idle:
+            return None
+        if question is None:
+            if now_s - self.heard_s <= self._silence_s:
+                return None
+            self.process.kill()
+            words = f"the {self.process.called} process showed no sign of life"
+            return ProcessEnd(words, in_engine=True, hung=True)
+        self.heard_s = now_s
+        if not question.overdue(self._patience):
+            return None
+        self.process.kill()
+        words = f"the {self.process.called} process was ended"
+        return ProcessEnd(words, question, allowed_s=self._patience.of(question.doing))
+
+    def _take(self, hear: MessageHandler, message: Message) -> None:
+        self.heard_s = time.monotonic()
+        if isinstance(message, Unable):
+            raise_unable(message)
+        if isinstance(message, Ready):
+            self.ready = True
+        else:
+            hear(message)
+
+
+def raise_unable(message: Unable) -> None:
+    """Raise UsageError if the policy cannot be loaded, MachineError if the machine lacks
+    something."""
+    raise UsageError(message.reason) if message.blames_policy else MachineError(message.reason)

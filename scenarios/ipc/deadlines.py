@@ -1,7 +1,7 @@
-"""Deadlines of policies: the pending call of a policy, in shared memory, and how long it may take.
+"""Deadlines of policy calls, enforced by the run through shared memory.
 
 A policy that hangs may hold the interpreter's lock or be stopped by a signal, so that its process
-sends nothing more. The run reads the pending call here, and enforces the deadline.
+sends nothing more. The run reads the pending call from shared memory, and enforces the deadline.
 """
 
 from __future__ import annotations
@@ -14,29 +14,34 @@ from cosim.episode.policy_caller import LOADED_WITHIN_S, PolicyCall, when
 from scenarios.ipc.shared_memory import SharedMemory
 
 _DOINGS: Final[tuple[PolicyCall, ...]] = get_args(PolicyCall)
-_LAYOUT: Final = struct.Struct(
-    "dqq"
-)  # since when, 0.0 while nothing is asked; what it is doing; at which tick
+_LAYOUT: Final = struct.Struct("dqq")
+"""Layout of a pending call: its start time in s, 0.0 without a call; its kind; its tick."""
 
 
 class Patience(NamedTuple):
-    """Seconds a policy may take: for an answer; for being loaded, for a reset, for the first answer
-    after it."""
+    """Timeouts of policy calls in seconds.
+
+    answer_s: of an answer.
+    start_s: of loading, of a reset, and of the first answer after it.
+    """
 
     answer_s: float = 60.0
     start_s: float = LOADED_WITHIN_S
 
     def of(self, doing: PolicyCall) -> float:
+        """Return the timeout of a kind of call."""
         return self.start_s if doing in ("loading", "reset", "first act") else self.answer_s
 
 
 class ServerTimes(NamedTuple):
-    """Seconds by which a policy behind Zenoh is queried.
+    """Timeouts of a policy behind Zenoh, in seconds.
 
-    found_s: to find a server for the next episode, before the run ends. first_found_s: the same
-    before a run begins. lost_after_s: a server that is not reached for so long is gone; a link that
-    was cut is up again sooner. try_s: for one attempt of a request, which is then repeated. end_s:
-    for the reply to the end of an episode. pause_s: between two attempts.
+    found_s: to find a server for the next episode, before the run ends.
+    first_found_s: the same before a run begins.
+    lost_after_s: until an unreachable server is lost; a broken link recovers sooner.
+    try_s: of one attempt of a request, which is then repeated.
+    end_s: of the reply to the end of an episode.
+    pause_s: between two attempts.
     """
 
     found_s: float = 60.0
@@ -48,25 +53,28 @@ class ServerTimes(NamedTuple):
 
 
 class Question(NamedTuple):
-    """What a policy is asked. since_s: on the monotonic clock, which all processes of a machine
-    share."""
+    """A pending call of a policy.
+
+    since_s: its start on the monotonic clock, which all processes of a machine share.
+    """
 
     since_s: float
     doing: PolicyCall
     tick: int
 
     def overdue(self, patience: Patience) -> bool:
-        """Whether the answer has taken too long."""
+        """Return whether the call has exceeded its timeout."""
         return time.monotonic() - self.since_s > patience.of(self.doing)
 
     @property
     def when(self) -> str:
-        """In words: "reset", or "act at 3.2 s"."""
+        """Return the call in words: "reset", or "act at 3.2 s"."""
         return when(self.doing, self.tick)
 
 
 class Asked(SharedMemory):
-    """The pending call: made by the run, opened by the policy's process, whose `Timer` it is."""
+    """Shared memory with the pending call: created by the run, written as `Timer` by the policy's
+    process."""
 
     def starts(self, doing: PolicyCall, tick: int) -> None:
         _LAYOUT.pack_into(self.map, 0, time.monotonic(), _DOINGS.index(doing), tick)
@@ -76,6 +84,6 @@ class Asked(SharedMemory):
 
     @property
     def question(self) -> Question | None:
-        """The pending call; None while the policy has nothing to do."""
+        """Return the pending call; None without one."""
         since_s, doing, tick = _LAYOUT.unpack_from(self.map, 0)
         return Question(since_s, _DOINGS[doing], tick) if since_s else None

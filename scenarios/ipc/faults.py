@@ -1,8 +1,7 @@
-"""Decides what a failed attempt at an episode means: run it again, or record it as crashed or
-invalid.
+"""Rules for failed attempts at an episode: retry, or record as crashed or invalid.
 
-An episode whose engine fails is invalid, because the simulator owes it. It is crashed if the policy
-may be the cause, so that a policy gains nothing by ending its own process.
+An episode whose engine fails is invalid. It is crashed if the policy may be the cause, so that a
+policy gains nothing by ending its own process.
 """
 
 from __future__ import annotations
@@ -41,8 +40,8 @@ RULES: Final[Mapping[Fault, Rule]] = {
     "handed_back": Rule(None, "invalid"),
     "worker_unable": Rule(None, "invalid"),
 }
-"""The rule of each fault. A machine loses all its episodes at once, so that its losses say little
-about each."""
+"""Rule of each fault. A lost machine has more attempts, because its loss says little about the
+episode."""
 
 
 class Failure(NamedTuple):

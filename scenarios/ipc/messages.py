@@ -1,5 +1,4 @@
-"""Defines the messages between a run and its workers; between processes and machines they are
-MessagePack."""
+"""Messages between a run and its workers, as MessagePack."""
 
 from __future__ import annotations
 
@@ -16,13 +15,13 @@ from scenarios.ipc.deadlines import Patience
 
 
 class Hello(msgspec.Struct, frozen=True, tag=True):
-    """Introduces the policy of a run to a worker: its name, and the manifest and the source that it
-    must have there.
+    """Introduces the policy of a run to a worker, with the manifest and source hash that it must
+    have there.
 
     renderer: address of the run's shared renderer, if it has one.
     host: where the policy runs.
     learner: a second policy, which drives at times while demonstrations are collected.
-    patience: how long the policy may take for an answer.
+    patience: timeouts of the policy.
     """
 
     policy: str
@@ -38,14 +37,12 @@ class Job(msgspec.Struct, frozen=True, tag=True):
     """Requests an episode.
 
     setup: of the run; without one it follows from options and policy.
-    renderer: address of the run's shared renderer, if it has one.
-    net_hash: that of its street net, if the worker is on another machine; else "".
+    net_hash: hash of its street net, if the worker is on another machine; else "".
     """
 
     scenario: Scenario
     options: EpisodeOptions = EpisodeOptions()
     setup: RunSetup | None = None
-    renderer: RendererAt | None = None
     net_hash: str = ""
 
 
@@ -62,7 +59,7 @@ class Unable(msgspec.Struct, frozen=True, tag=True):
 
 
 class Progress(msgspec.Struct, frozen=True, tag=True):
-    """Reports how far an episode is.
+    """Reports the progress of an episode.
 
     compared: share of the street that is simulated without the robot, 0 to 1; None before the
     episode is over.
@@ -76,7 +73,7 @@ class Progress(msgspec.Struct, frozen=True, tag=True):
 
 
 class Waits(msgspec.Struct, frozen=True, tag=True):
-    """Reports what an episode waits for."""
+    """Reports the reason for which an episode waits."""
 
     scenario: str
     reason: str

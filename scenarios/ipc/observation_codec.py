@@ -1,5 +1,4 @@
-"""The codec of observations for policies in other processes: an Observation as a message, and
-back."""
+"""Codec of observations for policies in other processes."""
 
 from __future__ import annotations
 
@@ -47,7 +46,7 @@ def decode_extra(kind: type, packed: Any) -> Any:
 _Moment = tuple[
     RobotState, float, People, Vehicles, Mapping[str, Signal], tuple[tuple[str, float, float], ...]
 ]
-"""The fields of `Privileged` that change, in their order, without route and free ground."""
+"""The fields of `Privileged` that change during an episode, in their order."""
 _encode = msgspec.msgpack.Encoder(enc_hook=encode_extra).encode
 _decode_moment = msgspec.msgpack.Decoder(_Moment, dec_hook=decode_extra).decode
 _decode_ground = msgspec.msgpack.Decoder(
@@ -61,13 +60,13 @@ def encoded_about(seen: Observation) -> AboutEpisode:
     cameras = {name: one.camera for name, one in seen.pictures.items()}
     if seen.camera is not None:
         cameras[""] = seen.camera
-    told = {
+    calibrations = {
         name: (one.matrix.tolist(), one.distortion.tolist(), one.on_robot.tolist())
         for name, one in cameras.items()
     }
     known = seen.privileged
     ground = b"" if known is None else _encode((known.route.points, shapely.to_wkb(known.free)))
-    return AboutEpisode(robot, told, ground)
+    return AboutEpisode(robot, calibrations, ground)
 
 
 def encoded_fields(seen: Observation) -> tuple[dict[str, Any], Arrays]:
@@ -100,9 +99,9 @@ def encoded_fields(seen: Observation) -> tuple[dict[str, Any], Arrays]:
 
 
 class ObservationDecoder(EpisodeDecoder):
-    """Decodes the observations of one episode to what a policy in this process would get.
+    """Decoder of the observations of one episode, to the same types as in this process.
 
-    Raises an error for what is no observation.
+    Raises an error for an invalid message.
     """
 
     makes: ClassVar[dict[str, Any]] = {

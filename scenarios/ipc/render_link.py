@@ -1,6 +1,6 @@
-"""An environment's connection to the shared renderer, and the camera that draws over it.
+"""Connection of an environment to the shared renderer, and the camera that uses it.
 
-One connection lasts as long as the process; its end shows the renderer that the environment ended.
+One connection lasts as long as the process; when it closes, the environment has ended.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ WAITING_EVERY_S: Final = 60.0
 
 
 class RendererLink:
-    """The connection. Its methods raise RendererLost when the renderer is gone.
+    """Connection to the shared renderer. Its methods raise RendererLost when it has ended.
 
-    waiting: called every waiting_every_s seconds while a reply is waited for. number, renderer: of
-    `Rendered`, once there was one.
+    waiting: called every waiting_every_s seconds while a reply is pending.
+    number, renderer: of the last `Rendered`.
     """
 
     def __init__(
@@ -66,19 +66,19 @@ class RendererLink:
         self._memory = SharedMemory(descriptor)
 
     def tell(self, request: Request) -> None:
-        """Send a request that is not replied to."""
+        """Send a request without waiting for a reply."""
         try:
             self._wire.send(encode_exchange(request))
         except OSError as error:
             raise self.lost() from error
 
     def exchange(self, request: Request, call: str = "") -> bytes:
-        """Return the reply to a request. call: which call of the policy that is, in words."""
+        """Return the reply to a request. call: the policy call in words, for errors."""
         self.tell(request)
         return self.received(call)
 
     def received(self, call: str = "") -> bytes:
-        """Wait for the reply to a request that was sent."""
+        """Wait for the reply to the last request."""
         try:
             self._wait()
             return self._wire.receive()
@@ -86,11 +86,11 @@ class RendererLink:
             raise self.lost(call) from error
 
     def enter(self, scenario: Scenario) -> None:
-        """Report the scenario that this environment runs from now on. Raises EngineError."""
+        """Report the scenario that this environment runs. Raises EngineError."""
         self._rendered(self.exchange(Enter(scenario)))
 
     def draw(self, robot: RobotState, street: Street) -> Frame:
-        """Return what the robot sees. Raises EngineError."""
+        """Return the picture of the robot's camera. Raises EngineError."""
         return self.drawn(self.exchange(Draw(robot, street)))
 
     def drawn(self, payload: bytes) -> Frame:
@@ -103,7 +103,7 @@ class RendererLink:
         return Frame(arrays["rgb"], arrays["labels"])
 
     def laid(self, name: str, array: object) -> PackedArray | None:
-        """Return where an array of the last picture is; None for any other array."""
+        """Return the location of an array of the last picture; None for any other array."""
         arrays, laid = self._drawn
         return laid[name] if arrays.get(name) is array else None
 
@@ -169,7 +169,7 @@ class SharedCamera:
 
     @property
     def renderer(self) -> str:
-        """What draws, as records name it."""
+        """Return the name of the renderer in records."""
         return self._link.renderer
 
     def __enter__(self) -> Self:

@@ -1,7 +1,7 @@
 """Messages between environment processes and the shared renderer, as MessagePack.
 
-An environment sends one request at a time and waits for the reply. In addition to these it sends
-the requests to a policy (`bridge.policy_server`), which are answered as everywhere else.
+An environment sends one request at a time and waits for the reply. The requests to a policy are
+those of `bridge.policy_server`.
 """
 
 from __future__ import annotations
@@ -15,23 +15,23 @@ from scenarios.ipc.observation_codec import decode_extra, encode_extra
 
 
 class Enter(msgspec.Struct, frozen=True, tag="enter"):
-    """The environment runs this scenario from now on; None: it runs none, which is not replied
-    to."""
+    """Reports the scenario of an environment; None, without a reply, if it runs none."""
 
     scenario: Scenario | None
 
 
 class Draw(msgspec.Struct, frozen=True, tag="draw"):
-    """Draw what the robot sees."""
+    """Requests the picture of the robot's camera."""
 
     robot: RobotState
     street: Street
 
 
 class Rendered(msgspec.Struct, frozen=True, tag="rendered"):
-    """The reply to Enter and Draw.
+    """Replies to Enter and Draw.
 
-    number: which renderer of the run this is, from 1. renderer: what draws, as records name it.
+    number: number of the renderer in the run, from 1.
+    renderer: its name in records.
     arrays: the picture, in the memory shared with the environment.
     """
 

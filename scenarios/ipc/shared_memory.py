@@ -1,8 +1,7 @@
-"""Memory that two processes of a machine share: sealed, without a name, freed when both have closed
-it.
+"""Anonymous sealed memory shared by two processes of a machine, freed when both have closed it.
 
-64 bytes   the head: a few numbers, for whoever maps it
-the rest   arrays of one message, each from a multiple of 64 bytes
+64 bytes   header with a few numbers
+the rest   arrays of one message, each aligned to 64 bytes
 """
 
 from __future__ import annotations
@@ -21,14 +20,17 @@ from cosim.spec.goal import most_goal_bytes
 from cosim.spec.manifest import Manifest
 
 HEAD_BYTES: Final = 64
+"""Bytes of the header."""
 _ALIGNED_BYTES: Final = 64
+"""Alignment of arrays in bytes."""
 _SEALS: Final = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
+"""Seals that fix the size: a smaller file would crash the process that maps it."""
 _PER_PIXEL_BYTES: Final = 8
 """Bytes of a pixel's color, label and depth."""
 
 
 class SharedMemory:
-    """One end. descriptor: for the other end, which cannot change the size. map: the bytes."""
+    """One end of shared memory. descriptor: to be passed to the other end. map: the bytes."""
 
     def __init__(self, descriptor: int, *, writes: bool = True) -> None:
         self.descriptor = descriptor
@@ -37,14 +39,15 @@ class SharedMemory:
 
     @classmethod
     def new(cls, size: int = 0) -> Self:
-        """Create memory with a head and room for size bytes of arrays."""
+        """Create memory with a header and room for size bytes of arrays."""
         descriptor = os.memfd_create("cosim", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
         os.ftruncate(descriptor, HEAD_BYTES + size)
         fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, _SEALS)
         return cls(descriptor)
 
     def lay(self, arrays: dict[str, np.ndarray[Any, Any]]) -> dict[str, PackedArray]:
-        """Write arrays in place of the last ones. Raises ValueError where there is no room."""
+        """Write arrays over the last ones, and return their locations. Raises ValueError without
+        enough room."""
         laid = {}
         at = HEAD_BYTES
         for name, array in arrays.items():
@@ -59,12 +62,13 @@ class SharedMemory:
         return laid
 
     def take(self, laid: dict[str, PackedArray]) -> dict[str, Any]:
-        """Return copies of arrays. Raises ValueError for what is none."""
+        """Return copies of arrays. Raises ValueError for an invalid location."""
         return {name: unpacked(array, self.map) for name, array in laid.items()}
 
     @property
     def busy(self) -> bool:
-        """Whether the policy is being queried for this memory's environment, or was at the end."""
+        """Return whether a policy call for this environment is pending, or was when the renderer
+        ended."""
         return bool(self.map[0])
 
     @busy.setter
@@ -79,7 +83,7 @@ class SharedMemory:
 
 
 def room_for(manifest: Manifest | None) -> int:
-    """Return the bytes of the largest observation by a manifest; few without one.
+    """Return the bytes of the largest observation by a manifest; 0 without one.
 
     >>> room_for(None)
     0

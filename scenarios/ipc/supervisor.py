@@ -1,13 +1,13 @@
-"""Stands between a run and one environment process, so that nothing of it is left when it ends.
+"""Supervisor of one worker process, which leaves no process behind when it ends.
 
-run -> shepherd -> worker -> whatever the policy starts
+run -> supervisor -> worker -> processes of the policy
 
-The shepherd forks the worker, writes what it prints to its log, and ends as the worker ended: with
-its exit code or by its signal. First it kills what the worker has left behind: children whose
-parent is dead become the shepherd's, also those that made a session of their own. It does the same
-when the run tells it to end (SIGTERM) or dies.
+The supervisor forks the worker, writes its output to a log, and ends with the worker's exit code or
+signal. First it kills the processes that the worker has left: orphans become children of the
+supervisor, also those in a session of their own. It does the same on SIGTERM from the run, or when
+the run dies.
 
-It imports little but the standard library: it is small, and forks before there is a thread.
+It imports little but the standard library, and forks before it starts a thread.
 """
 
 from __future__ import annotations
@@ -28,33 +28,37 @@ from types import FrameType
 from cosim.core.child_process import end_with
 
 PR_SET_CHILD_SUBREAPER = 36
+"""Option of `prctl` by which orphans become children of this process."""
 FIRST_BYTES = LAST_BYTES = 2 << 20
-"""Of what a worker prints the beginning and the end are kept; what a policy pours out in between is
-left out."""
+"""Bytes of a worker's output that are logged from its beginning and from its end."""
 CHUNK_BYTES = 1 << 16
+"""Bytes of output that are read at a time."""
 KILLING_S = 10.0
-"""A killed process is gone at once, unless the kernel holds it."""
+"""Timeout in seconds for the end of killed processes, which the kernel may delay."""
 
 
 def keep_worker(serves: str, descriptors: tuple[int, ...], parent: int) -> None:
-    """Run one worker and end as it ended.
+    """Run one worker, and end with its exit code or signal.
 
-    serves: the function that is the worker, as module:name; descriptors: what it is called with, of
-    its socket to the run first. parent: process id of the run. What the worker prints goes to this
-    process's standard output."""
+    Its output goes to this process's standard output.
+
+    serves: function that the worker runs, as module:name.
+    descriptors: its arguments, first the socket to the run.
+    parent: process id of the run.
+    """
     end_with(parent, signal.SIGTERM)
     ctypes.CDLL(None, use_errno=True).prctl(PR_SET_CHILD_SUBREAPER, 1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     printed, prints = os.pipe()
-    shepherd = os.getpid()
+    supervisor = os.getpid()
     pid = os.fork()
     if pid == 0:
         os.close(printed)
-        _be_worker(serves, descriptors, prints, shepherd)
+        _run_worker(serves, descriptors, prints, supervisor)
         return
     for descriptor in (*descriptors, prints):
         os.close(descriptor)
-    log = threading.Thread(target=_keep, args=(printed, BoundedLog(1)), daemon=True)
+    log = threading.Thread(target=_copy, args=(printed, BoundedLog(1)), daemon=True)
     log.start()
     status = 0
     with suppress(_Ended):
@@ -67,8 +71,10 @@ def keep_worker(serves: str, descriptors: tuple[int, ...], parent: int) -> None:
 
 
 class BoundedLog:
-    """A file that takes any amount of text: its first and last bytes are kept. The last ones are
-    written at the end."""
+    """Log of bounded size that contains the first and the last bytes of a text.
+
+    The last bytes are written when it is closed.
+    """
 
     def __init__(self, descriptor: int, first: int = FIRST_BYTES, last: int = LAST_BYTES) -> None:
         self._descriptor = descriptor
@@ -94,14 +100,13 @@ class BoundedLog:
         self._put(b"".join(self._tail))
 
     def _put(self, text: bytes) -> None:
-        with suppress(OSError):  # a full disk: the worker's own report tells it
+        with suppress(OSError):  # the run reports a full disk
             while text:
                 text = text[os.write(self._descriptor, text) :]
 
 
 def kill_children() -> None:
-    """Kill all children of this process, and theirs, which become this process's as their parents
-    die."""
+    """Kill all descendants of this process, which become its children as their parents die."""
     deadline = time.monotonic() + KILLING_S
     while time.monotonic() < deadline:
         for child in _children():
@@ -116,10 +121,10 @@ def kill_children() -> None:
 
 
 def _children() -> list[int]:
-    """Process ids of the children of this process."""
+    """Return the process ids of the children of this process."""
     found = []
     me = str(os.getpid())
-    for name in os.listdir("/proc"):  # noqa: PTH208  this much faster, and it is only names
+    for name in os.listdir("/proc"):  # noqa: PTH208  faster than Path.iterdir
         if name.isdigit():
             with suppress(OSError):
                 after_name = (
@@ -131,17 +136,17 @@ def _children() -> list[int]:
 
 
 class _Ended(Exception):
-    """The run is gone, or wants this to end."""
+    """The run has ended, or has sent SIGTERM."""
 
 
 def _ended(number: int, frame: FrameType | None) -> None:
     raise _Ended
 
 
-def _be_worker(serves: str, descriptors: tuple[int, ...], prints: int, shepherd: int) -> None:
-    """What the forked child does, until its pipe is closed."""
+def _run_worker(serves: str, descriptors: tuple[int, ...], prints: int, supervisor: int) -> None:
+    """Run the worker in the forked child, until its socket is closed."""
     os.setsid()
-    end_with(shepherd)
+    end_with(supervisor)
     os.dup2(prints, 1)
     os.dup2(prints, 2)
     os.close(prints)
@@ -151,25 +156,25 @@ def _be_worker(serves: str, descriptors: tuple[int, ...], prints: int, shepherd:
 
 
 def _status_of(pid: int) -> int:
-    """Wait for the worker; others that end meanwhile are let go."""
+    """Wait for the worker, and reap other children; return its wait status."""
     while True:
         ended, status = os.wait()
         if ended == pid:
             return status
 
 
-def _keep(printed: int, log: BoundedLog) -> None:
-    """Everything that comes out of a pipe goes to a log."""
+def _copy(printed: int, log: BoundedLog) -> None:
+    """Copy a pipe to a log until it is closed."""
     while text := os.read(printed, CHUNK_BYTES):
         log.write(text)
     log.close()
 
 
 def _end_as(status: int) -> None:
-    """End like a process with this wait status, without a core dump."""
+    """End with the exit code or signal of a wait status, without a core dump."""
     if os.WIFSIGNALED(status):
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        with suppress(OSError):  # of SIGKILL nothing can be changed
+        with suppress(OSError):  # SIGKILL has no handler
             signal.signal(os.WTERMSIG(status), signal.SIG_DFL)
         os.kill(os.getpid(), os.WTERMSIG(status))
     os._exit(os.waitstatus_to_exitcode(status))

@@ -1,1 +1,1 @@
-
+"""Places of scenarios: nets, street maps and surfaces."""

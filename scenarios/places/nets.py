@@ -1,4 +1,4 @@
-"""The places of scenarios: their nets, and what was read from them."""
+"""Loading of the nets, street maps and surfaces of places."""
 
 from __future__ import annotations
 
@@ -15,18 +15,19 @@ from sumo_nets.net.snapshot import street_map_of
 
 @lru_cache(maxsize=1)
 def place(where: Place) -> tuple[Path, StreetMap]:
-    """The net of a place and what was read from it; the last one is kept."""
+    """Return the net file of a place and its street map; the last one is cached."""
     if isinstance(where, City):
         path = city_net(where)
         return path, street_map_of(path)
-    from sumo_nets.maps.map_store import map_net, read_map  # with the importer of maps
+    # Imported only where needed: it loads the importer of maps, which takes a second.
+    from sumo_nets.maps.map_store import map_net, read_map
 
     return map_net(where), read_map(where)
 
 
 def check_place(where: Place, net_hash: str) -> None:
-    """Raises MachineError when a place cannot be had on this machine, or its net is another one
-    than the run's."""
+    """Check that the net of a place is the run's. Raises MachineError if it differs or cannot be
+    built or loaded."""
     try:
         found = place(where)[1].net_hash
     except (MapError, UsageError, SpecError) as error:
@@ -42,5 +43,5 @@ def check_place(where: Place, net_hash: str) -> None:
 
 @lru_cache(maxsize=1)
 def surface_of_place(where: Place) -> StreetSurface:
-    """The surface of a place, with the tiles that were built of it; the last one is kept."""
+    """Return the surface of a place with its tiles; the last one is cached."""
     return StreetSurface(place(where)[1], where.seed, where.roughness)

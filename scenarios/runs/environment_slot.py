@@ -1,8 +1,7 @@
-"""Runs jobs in an environment process that is started, watched, timed out and replaced.
+"""Environment slot: runs jobs in an environment process that is watched and replaced.
 
-The local pool, a Zenoh worker and a Ray actor use the same slot: what the death or the silence of a
-process means is decided here, on the machine of the process. How often an episode is tried is
-decided by `scenarios.ipc.faults`.
+The local pool, a Zenoh worker and a Ray actor use the same slot. It decides, on the machine of the
+process, whether its end or timeout is a failure. `scenarios.ipc.faults` limits the attempts.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from typing import Final
 
 from cosim.core.errors import MachineError, UsageError
 from cosim.core.log_event import happened
-from scenarios.ipc.child_process import WORKER, KeptProcess
+from scenarios.ipc.child_process import WORKER, KeptProcess, ProcessEnd, Watchdog
 from scenarios.ipc.faults import Failure
 from scenarios.ipc.messages import (
     Done,
@@ -27,11 +26,9 @@ from scenarios.ipc.messages import (
     MessageHandler,
     encode_message,
 )
-from scenarios.ipc.watchdog import ProcessEnd, Watchdog
 
 SILENCE_S = 300.0
-"""Seconds after which a process that reports nothing, while its policy has nothing to answer, hangs
-in an engine."""
+"""Timeout in seconds of a process's heartbeats while no policy call is pending: an engine hangs."""
 STARTS: Final = 2
 """Number of processes in a row that may end before they are ready."""
 
@@ -44,7 +41,8 @@ def start_environment(log: Path, hello: Hello) -> KeptProcess:
 
 
 class EnvironmentSlot:
-    """Runs one job at a time in an environment process (`scenarios.runs.transport.Worker`).
+    """Worker that runs one job at a time in an environment process
+    (`scenarios.runs.transport.Worker`).
 
     Raises UsageError when the policy cannot be loaded, MachineError when no process can be started.
     """
@@ -111,7 +109,7 @@ class EnvironmentSlot:
             watchdog.process.kill()
 
     def stop(self) -> None:
-        """Tell the process to end, by force if it is busy, without waiting for that."""
+        """Request the process to end, by force if it is busy, without waiting."""
         if self._watchdog is not None:
             if self.job is not None:
                 self._watchdog.process.kill(wait=False)
@@ -133,7 +131,7 @@ class EnvironmentSlot:
         hear(message)
 
     def _ended(self, watchdog: Watchdog, end: ProcessEnd) -> Failure | None:
-        """Return the failure of a job that was begun; give one that was not to another process."""
+        """Return the failure of a started job; give a job that was not started to a new process."""
         self._watchdog = None
         idle = (
             self._ran
@@ -179,7 +177,7 @@ def no_answer(hello: Hello, allowed_s: float) -> str:
 
 
 def new_output(log: Path, begin: int, most_bytes: int) -> tuple[bytes, int]:
-    """Return the end of what was added to a log after byte `begin`, and the size of the log."""
+    """Return the last bytes of a log that were added after byte `begin`, and the log's size."""
     try:
         with log.open("rb") as file:
             size = file.seek(0, 2)

@@ -1,8 +1,7 @@
-"""How long a run takes on this machine: said before it starts, learned from every run that was
-there.
+"""Estimates of the duration of a run, from the durations of earlier episodes on this machine.
 
-After a run one line for each of its episodes is added to `pace.jsonl` in the cache folder. It is a
-help, no result: where it cannot be read or written nothing is lost but the estimate.
+After a run one line for each of its episodes is added to `pace.jsonl` in the cache folder. Errors
+of this file are ignored, because only the estimate depends on it.
 """
 
 from __future__ import annotations
@@ -30,31 +29,34 @@ from cosim.results.run_folder import RunFolder
 from cosim.spec.scenario import Scenario
 
 FILE: Final = "pace.jsonl"
+"""Name of the file of durations in the cache folder."""
 EPISODES_KEPT: Final = 500
-"""So many lines stay when there are twice as many."""
+"""Number of lines to which the file is truncated when it has twice as many."""
 RECENT: Final = 40
-"""The newest episodes that are looked at: the code and the machine change."""
+"""Number of newest episodes that an estimate uses, because the code and the machine change."""
 ENOUGH: Final = 3
-"""Of fewer episodes nothing is concluded."""
+"""Smallest number of episodes that an estimate is based on."""
 DRIVES_MPS: Final = (0.9, 1.4)
-"""How fast most policies come along, waiting at red included."""
+"""Mean speed in m/s of slow and fast policies, including waits at red lights."""
 SIMULATES: Final = (3.0, 8.0)
-"""Simulated seconds a second of an environment process, on a core of most machines."""
+"""Simulated seconds per second of an environment process, on slow and fast cores."""
 SETS_UP_S: Final = (2.0, 10.0)
-"""Until an episode's first tick: more where its city is not built yet."""
+"""Shortest and longest time in seconds to an episode's first tick; longer if its city is new."""
 COMPARES: Final = 1.4
-"""The time of an episode that is compared with its street without the robot, in episodes that are
-not."""
+"""Duration of an episode with the comparison without the robot, relative to one without it."""
 AT_LEAST: Final = (0.6, 1.5)
-"""No estimate is narrower than this around its middle: a machine has other work, too, at times."""
+"""Narrowest range of an estimate as factors on its median, because other programs also run."""
 _SHARED: Final = 1.4
-"""More processes than were measured share caches and memory: one of them may take so much
-longer."""
+"""Factor on durations with more processes than were measured, which share caches and memory."""
 
 
 class Measured(msgspec.Struct, frozen=True, kw_only=True):
-    """An episode that was run. setup_s: until its first tick; work_s: from then on; short: it ends
-    on a failure."""
+    """Durations of an episode.
+
+    short: whether it ends on a failure.
+    setup_s: seconds until its first tick.
+    work_s: seconds from then on.
+    """
 
     machine: str
     policy: str
@@ -69,7 +71,7 @@ class Measured(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Estimate(NamedTuple):
-    """Seconds that a run takes, and what they were taken from."""
+    """Range of the duration of a run in seconds, and its basis in words."""
 
     low_s: float
     high_s: float
@@ -84,8 +86,11 @@ def announcement(
     compared: bool,
     pace: float = 0.0,
 ) -> str:
-    """What a run comes to, in one line: episodes, way, simulated time at most, about how long it
-    takes here. pace: see `cosim.spec.options.EpisodeOptions`."""
+    """Return a line with the number of episodes of a run, its route length, the maximum simulated
+    time and the estimate.
+
+    pace: see `cosim.spec.options.EpisodeOptions`.
+    """
     known = recall()
     cores = len(os.sched_getaffinity(0))
 
@@ -94,11 +99,11 @@ def announcement(
         return paced(free, scenarios, known, policy, jobs, pace) if pace else free
 
     here = taken(jobs)
-    far_m = sum(s.route_line.length_m for s in scenarios)
-    far = f"{far_m / 1000.0:.1f} km" if far_m >= 1000.0 else f"{far_m:.0f} m"
+    length_m = sum(s.route_line.length_m for s in scenarios)
+    length = f"{length_m / 1000.0:.1f} km" if length_m >= 1000.0 else f"{length_m:.0f} m"
     most_s = sum(s.time_limit_s for s in scenarios)
     words = (
-        f"{_episodes(len(scenarios))}, {far} of route, at most {duration(most_s)} of simulated "
+        f"{_episodes(len(scenarios))}, {length} of route, at most {duration(most_s)} of simulated "
         f"time. "
     )
     words += f"About {span(here)} with --jobs {jobs}"
@@ -116,16 +121,18 @@ def estimate(
     compared: bool,
     cores: int,
 ) -> Estimate:
-    """How long scenarios take with `jobs` processes. known: what was measured on this machine, the
-    newest last."""
+    """Estimate the duration of scenarios with `jobs` processes.
+
+    known: measured on this machine, the newest last.
+    """
     short = all(s.ends_on_failure for s in scenarios)
-    alike = [m for m in known if m.renderer == renderer and m.compared == compared]
-    same = [m for m in alike if (m.policy, m.short) == (policy, short)][-RECENT:]
-    others = alike[-RECENT:] if len(alike) >= ENOUGH else []
-    found = same if len(same) >= ENOUGH else others
+    comparable = [m for m in known if m.renderer == renderer and m.compared == compared]
+    of_policy = [m for m in comparable if (m.policy, m.short) == (policy, short)][-RECENT:]
+    any_policy = comparable[-RECENT:] if len(comparable) >= ENOUGH else []
+    samples = of_policy if len(of_policy) >= ENOUGH else any_policy
     slots = min(jobs, cores)
-    slower = _SHARED if slots > max((m.jobs for m in found), default=1) else 1.0
-    setup_s = _around([m.setup_s for m in found]) if found else SETS_UP_S
+    slower = _SHARED if slots > max((m.jobs for m in samples), default=1) else 1.0
+    setup_s = _around([m.setup_s for m in samples]) if samples else SETS_UP_S
 
     def taken_s(low_s: Iterable[float], high_s: Iterable[float]) -> tuple[float, float]:
         fast, slow = (
@@ -135,15 +142,15 @@ def estimate(
         return makespan(fast, slots), slower * makespan(slow, slots)
 
     lengths_m = [s.route_line.length_m for s in scenarios]
-    if found is same:
-        rates = _around([m.work_s / m.route_m for m in same])
-        basis = f"measured in {_episodes(len(same))} of '{policy}' on this machine"
+    if samples is of_policy:
+        rates = _around([m.work_s / m.route_m for m in of_policy])
+        basis = f"measured in {_episodes(len(of_policy))} of '{policy}' on this machine"
         return Estimate(
             *taken_s(*([rate * metres for metres in lengths_m] for rate in rates)), basis
         )
-    if others:
-        slow, fast = _around([m.simulated_s / m.work_s for m in others])
-        middle = statistics.median(m.simulated_s / m.work_s for m in others)
+    if any_policy:
+        slow, fast = _around([m.simulated_s / m.work_s for m in any_policy])
+        middle = statistics.median(m.simulated_s / m.work_s for m in any_policy)
         driven = f"the policy is taken to drive at {DRIVES_MPS[0]:g} to {DRIVES_MPS[1]:g} m/s"
         basis = f"this machine simulates {middle:.1f} s a second, {driven}"
     else:
@@ -168,8 +175,10 @@ def paced(
     jobs: int,
     pace: float,
 ) -> Estimate:
-    """How long the same takes where episodes are held to `pace` times real time. free: how long it
-    takes where they are not."""
+    """Estimate the duration of scenarios that are limited to `pace` times real time.
+
+    free: the estimate without this limit.
+    """
     short = all(s.ends_on_failure for s in scenarios)
     same = [m for m in known if (m.policy, m.short) == (policy, short)][-RECENT:]
     if len(same) >= ENOUGH:
@@ -193,7 +202,7 @@ def paced(
 
 
 def makespan(taken_s: Sequence[float], slots: int) -> float:
-    """When the last of several tasks ends that are begun in order by `slots` workers."""
+    """Return the end of the last of several tasks that `slots` workers start in order, in s."""
     free_at = [0.0] * slots
     for one_s in taken_s:
         heapq.heapreplace(free_at, free_at[0] + one_s)
@@ -201,7 +210,7 @@ def makespan(taken_s: Sequence[float], slots: int) -> float:
 
 
 def span(found: Estimate) -> str:
-    """An estimate in words: 9 to 15 min."""
+    """Format an estimate, as "9 to 15 min"."""
     low, high = duration(found.low_s), duration(found.high_s)
     if low == high:
         return low
@@ -214,8 +223,10 @@ def span(found: Estimate) -> str:
 def remembered(
     held: RunFolder, todo: Sequence[Scenario], jobs: int, pace: float = 0.0
 ) -> Iterator[None]:
-    """What of `todo` is finished in the block is remembered at its end, however it ends. Episodes
-    that are held to a `pace` are not: they do not show how fast this machine is."""
+    """Record the durations of the episodes of `todo` that finish in the block, also after an error.
+
+    Episodes with a `pace` are not recorded: they do not show how fast this machine is.
+    """
     try:
         yield
     finally:
@@ -225,7 +236,7 @@ def remembered(
 
 
 def remember(held: RunFolder, todo: Sequence[Scenario], jobs: int) -> None:
-    """Add the episodes of a run that are finished to what is known of this machine."""
+    """Add the durations of the finished episodes of a run to the file."""
     lines = []
     for scenario in todo:
         path = held.episode_folder(scenario.id) / "record.json"
@@ -245,7 +256,7 @@ def remember(held: RunFolder, todo: Sequence[Scenario], jobs: int) -> None:
 def measured(
     record: Record, scenario: Scenario, policy: str, compared: bool, jobs: int
 ) -> Measured:
-    """What an episode took."""
+    """Return the durations of an episode."""
     setup_s = record.clock["setup_s"]
     return Measured(
         machine=machine(),
@@ -262,8 +273,7 @@ def measured(
 
 
 def recall() -> list[Measured]:
-    """What was measured on this machine, the newest last; lines that are no such thing are left
-    out."""
+    """Load the durations measured on this machine, the newest last. Invalid lines are skipped."""
     found = []
     with suppress(OSError):
         for line in (cache_folder() / FILE).read_bytes().splitlines():
@@ -274,7 +284,7 @@ def recall() -> list[Measured]:
 
 
 def machine() -> str:
-    """Machines of the same processor and as many usable cores take the same time."""
+    """Return the processor and the number of usable cores, on which durations depend."""
     with suppress(OSError):
         if model := re.search(
             r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE
@@ -284,7 +294,7 @@ def machine() -> str:
 
 
 def _around(values: Sequence[float]) -> tuple[float, float]:
-    """Between which two most values lie, and never narrower than AT_LEAST."""
+    """Return the quantiles 0.2 and 0.8 of values, widened to AT_LEAST."""
     low, middle, high = np.quantile(values, [0.2, 0.5, 0.8])
     return float(min(low, AT_LEAST[0] * middle)), float(max(high, AT_LEAST[1] * middle))
 

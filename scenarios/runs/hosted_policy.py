@@ -1,7 +1,7 @@
-"""Querying a policy in another process: the same requests and replies, whatever carries them.
+"""Client of a policy in another process, independent of how requests are carried.
 
-No reply is trusted: an answer must be signed with the run, episode, attempt and step of the
-request. It becomes a command by the same checks as that of a policy in this process.
+An answer must be signed with the run, episode, attempt and step of the request. It becomes a
+command by the same checks as that of a policy in this process.
 """
 
 from __future__ import annotations
@@ -42,19 +42,18 @@ class PolicyServerBusy(PolicyServerLost):
 
 
 class QuestionCarrier(Protocol):
-    """Carries requests to where a policy is. loses: whether an episode can be lost there."""
+    """Carrier of requests to a policy. loses: whether the policy's side can lose an episode."""
 
     @property
     def loses(self) -> bool: ...
 
     def lay(self, arrays: Arrays) -> dict[str, PackedArray]:
-        """Lay the arrays of the next request, and return them as the request has them."""
+        """Pack the arrays of the next request."""
 
     def ask(self, question: AskReset | AskAct) -> bytes:
         """Return the reply to a request.
 
-        Raises PolicyFault where none will come, an EngineError where that is not the policy's
-        fault.
+        Raises PolicyFault if none will come, an EngineError if that is not the policy's fault.
         """
 
     def tell_ended(self, question: AskEnded) -> None:
@@ -65,10 +64,11 @@ class QuestionCarrier(Protocol):
 
 
 class HostedPolicy:
-    """A policy elsewhere, which is queried like one in this process.
+    """A policy in another process, with the interface of one in this process.
 
-    run: signs the requests. took_ms: the time of each answer of the episode. lost: whether the
-    policy was gone when an episode had ended.
+    run: signs the requests.
+    took_ms: time of each answer of the episode.
+    lost: whether the policy was lost when an episode had ended.
     """
 
     def __init__(self, manifest: Manifest, carrier: QuestionCarrier, run: str) -> None:
@@ -103,7 +103,7 @@ class HostedPolicy:
         return Planned(answer.v_mps, answer.w_radps, waypoints, self.manifest.waypoints.index)
 
     def tell_ended(self) -> None:
-        """Report the end of the episode. Failures of that change nothing."""
+        """Report the end of the episode. Errors are ignored."""
         try:
             self._carrier.tell_ended(AskEnded(*self._sign))
         except (PolicyFault, EngineError):
@@ -113,8 +113,8 @@ class HostedPolicy:
         self._carrier.close()
 
     def _reply(self, question: AskReset | AskAct) -> Begun | Answer:
-        """Return the reply to a request. This decides what is the policy's fault, and what is
-        not."""
+        """Return the reply to a request. Raises PolicyFault for errors of the policy,
+        PolicyServerLost for a lost episode."""
         payload = self._carrier.ask(question)
         try:
             reply: PolicyReply = decode_reply(payload)
@@ -135,9 +135,9 @@ class HostedPolicy:
 
 
 class HostedDriver(Driver):
-    """The driver of a policy elsewhere: its answers are checked as those of one in this process.
+    """Driver of a policy in another process, with the same checks of its answers.
 
-    A lost server or renderer, and what the machine lacks, is not the policy's fault.
+    A lost server or renderer, or a machine that lacks something, is not the policy's fault.
     """
 
     _passes: ClassVar[tuple[type[Exception], ...]] = (PolicyError, EngineError, MachineError)
@@ -171,16 +171,16 @@ class HostedDriver(Driver):
         self._hosted.close()
 
     def _own(self, observation: Observation) -> Observation:
-        return observation  # what is sent is a copy
+        return observation  # the message is a copy
 
 
-def _array(told: PackedArray) -> np.ndarray[Any, Any]:
-    """Return the waypoints of an answer. Raises PolicyFault or PolicyError where they are none."""
+def _array(sent: PackedArray) -> np.ndarray[Any, Any]:
+    """Return the waypoints of an answer. Raises PolicyFault or PolicyError if they are invalid."""
     try:
-        kind = np.dtype(told.dtype)
-        if kind.kind not in "biufc" or any(side < 0 for side in told.shape) or told.at >= 0:
-            raise ValueError(f"an array of {told.dtype} {told.shape}")
-        check_numbers(told.shape)
-        return np.frombuffer(told.data, kind).reshape(told.shape)
+        kind = np.dtype(sent.dtype)
+        if kind.kind not in "biufc" or any(side < 0 for side in sent.shape) or sent.at >= 0:
+            raise ValueError(f"an array of {sent.dtype} {sent.shape}")
+        check_numbers(sent.shape)
+        return np.frombuffer(sent.data, kind).reshape(sent.shape)
     except (TypeError, ValueError, OverflowError) as error:
         raise PolicyFault(f"answered waypoints that cannot be read: {error}"[:MOST_WORDS]) from None

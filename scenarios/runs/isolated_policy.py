@@ -1,13 +1,18 @@
-"""A policy in a process of its own, with a shepherd of its own.
+"""Isolated policies: a policy in a supervised process of its own, and its client.
 
-Requests go over a socket, arrays through memory that it shares with the environment's process
-alone.
+Requests go over a socket, arrays through memory shared with the environment's process only. The
+policy's process loads no engine, and has no data of the run but observations.
 """
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+import os
+import signal
+from contextlib import ExitStack, suppress
+from socket import socket
 from typing import Final
+
+import msgspec
 
 from bridge.policy_server import (
     UNREADABLE,
@@ -15,31 +20,34 @@ from bridge.policy_server import (
     AskEnded,
     AskReset,
     PackedArray,
+    PolicyDesk,
     PolicyFault,
     PolicyInfo,
     Refusal,
     decode_info,
     encode_message,
     policy_call,
+    read_request,
 )
 from cosim.core.errors import UsageError
+from cosim.core.framing import Wire
 from cosim.episode.manifest_checks import with_goal
-from cosim.episode.policy_caller import LOADED_WITHIN_S, Timer
-from cosim.policies.load import checked_manifest
+from cosim.episode.policy_caller import LOADED_WITHIN_S, Timer, Untimed
+from cosim.policies.load import checked_manifest, load_policy
 from cosim.spec.manifest import Manifest
 from scenarios.ipc.child_process import KeptProcess
-from scenarios.ipc.observation_codec import Arrays
+from scenarios.ipc.observation_codec import Arrays, ObservationDecoder
 from scenarios.ipc.shared_memory import SharedMemory, room_for
 from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy
 
-_SERVES: Final = "scenarios.runs.isolated_child:serve_alone"
+_SERVES: Final = "scenarios.runs.isolated_policy:serve_alone"
+"""The function of the policy's process."""
 _MOST_BYTES: Final = 4 << 20
-"""Bytes of an answer."""
+"""Size limit of an answer in bytes."""
 
 
 class _PolicyProcess:
-    """Carries requests to a process of this machine. room: bytes for the arrays of an
-    observation."""
+    """Carrier of requests to a child process. room: bytes for the arrays of an observation."""
 
     loses = False
 
@@ -95,10 +103,12 @@ def isolated_driver(
     run: str = "",
     start_s: float = LOADED_WITHIN_S,
 ) -> HostedDriver:
-    """A policy by its name, in a process of its own. expected: its manifest as the run knows it,
-    with which it is to be asked; without, nothing is. start_s: without a timer it may take so long
-    to be loaded. Raises UsageError as `load_policy` does, and for one that is told what only the
-    simulator knows."""
+    """Load a policy in a process of its own.
+
+    expected: its manifest in the run, by which shared memory is sized; None if it is not queried.
+    start_s: timeout of loading in seconds, used without a timer.
+    Raises UsageError as `load_policy` does, and for a privileged policy.
+    """
     with ExitStack() as stack, policy_call("loading", timer=timer, passes=(BaseException,)):
         process = _PolicyProcess(name, room_for(expected))
         stack.callback(process.close)
@@ -116,3 +126,29 @@ def isolated_driver(
             )
         stack.pop_all()
     return HostedDriver(HostedPolicy(manifest, process, run), "isolated", info.source[:64], timer)
+
+
+def serve_alone(socket_descriptor: int, call_descriptor: int, memory_descriptor: int) -> None:
+    """Answer requests until the socket closes. The first message is the policy's name, replied to
+    with its info.
+
+    call_descriptor: not used, because the environment's process enforces the timeouts.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.close(call_descriptor)
+    wire = Wire(socket(fileno=socket_descriptor))
+    memory = SharedMemory(memory_descriptor, writes=False)
+    os.close(memory_descriptor)
+    name = wire.receive().decode()
+    try:
+        driver = load_policy(name, Untimed())
+    except UsageError as error:
+        wire.send(encode_message(Refusal("policy", str(error))))
+        return
+    desk = PolicyDesk(driver.policy, decoder=ObservationDecoder, batch=False)
+    info = PolicyInfo("", name, msgspec.to_builtins(driver.manifest), driver.source_hash)
+    wire.send(encode_message(info))
+    with suppress(EOFError):
+        while True:
+            (reply,) = desk.replies([read_request(wire.receive())], [memory.map])
+            wire.send(encode_message(reply))

@@ -1,4 +1,4 @@
-"""Claims jobs for one environment slot of a worker, and reports on them to the coordinator.
+"""Client of the coordinator for one environment slot of a worker: claims jobs and reports on them.
 
 It holds no session: it returns the requests that are due, and takes in the replies. A request is
 repeated until there is a reply.
@@ -21,6 +21,7 @@ from cosim.core.errors import MachineError, UsageError
 from cosim.core.log_event import happened
 from cosim.spec.connection import Connection
 from cosim.spec.scenario import CityMap
+from scenarios.ipc.child_process import KeptProcess
 from scenarios.ipc.faults import Failure
 from scenarios.ipc.messages import Done, FrameDrawn, Hello, Message, Progress, Waits
 from scenarios.runs.environment_slot import EnvironmentSlot, new_output, start_environment
@@ -38,7 +39,6 @@ from scenarios.runs.protocol import (
 )
 
 if TYPE_CHECKING:
-    from scenarios.ipc.child_process import KeptProcess
     from scenarios.runs.net_transfer import Fetched
 
 REPORT_S: Final = 1.0
@@ -71,8 +71,7 @@ class Request(NamedTuple):
 
 
 class Installation(NamedTuple):
-    """The worker that a client belongs to: its unique name, its host's name, and what is installed
-    there."""
+    """The worker of a client: its unique name, its host's name, and the installed versions."""
 
     worker: str
     host: str
@@ -174,7 +173,7 @@ class JobClient:
             self._give()
 
     def poll(self) -> None:
-        """Take in what the process reports. Raises UsageError or MachineError when it can run
+        """Take in messages of the process. Raises UsageError or MachineError when it can run
         nothing."""
         if self._slot is None or self._leaving:
             return
@@ -203,8 +202,7 @@ class JobClient:
         return Request("report", keys.job(self._run, "report"), encode(report), 5.0)
 
     def _claim(self) -> Request | None:
-        """Return the request for what this slot needs next: a map, the policy's introduction, or a
-        job."""
+        """Return the next request of this slot: for a map, the policy's introduction, or a job."""
         if self._fetched is not None:
             return Request(
                 "net", keys.net(self._run, self._fetched.digest), self._fetched.request, 10.0
@@ -245,7 +243,8 @@ class JobClient:
         self._report_at_s = time.monotonic() + REPORT_S
         where = lease.job.scenario.place
         if isinstance(where, CityMap):
-            from scenarios.runs.net_transfer import Fetched, lacks  # with the importer of maps
+            # Imported only where needed: it loads the importer of maps.
+            from scenarios.runs.net_transfer import Fetched, lacks
 
             if lacks(where):
                 self._fetched = Fetched(where, lease.job.net_hash)

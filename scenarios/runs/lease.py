@@ -1,4 +1,4 @@
-"""Holds the lease of a job that a worker on another machine runs, over Zenoh or Ray."""
+"""Lease of a job by a worker on another machine, over Zenoh or Ray."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class _Reported(NamedTuple):
 
 
 class Lease:
-    """A job that a worker holds as long as it reports at least every `lasts_s` seconds.
+    """Lease of a job, which expires after `lasts_s` seconds without a report of the worker.
 
     holder: name of the worker.
     number: identifies this lease among those of the same worker.
@@ -66,7 +66,7 @@ class Lease:
         self._lost = self._lost or why
 
     def poll(self, hear: MessageHandler) -> Failure | None:
-        """Pass on what was reported. Returns the failure of the job if it has failed or its worker
+        """Pass on reported messages. Returns the failure of the job if it has failed or its worker
         is lost."""
         while self._reports and not self.ended:
             report = self._reports.popleft()

@@ -1,18 +1,19 @@
-"""Runs episodes in environment processes of this machine: a transport."""
+"""Transports on this machine: environment processes, or the process of the run itself."""
 
 from __future__ import annotations
 
 from multiprocessing.connection import wait
 from pathlib import Path
 
+from cosim.episode.policy_caller import Driver
 from scenarios.ipc.child_process import KeptProcess
-from scenarios.ipc.messages import Hello
+from scenarios.ipc.messages import Hello, Job, MessageHandler
 from scenarios.runs.environment_slot import EnvironmentSlot, start_environment
+from scenarios.runs.worker import run_job
 
 
 class LocalProcesses:
-    """Runs up to `jobs` environment processes; each writes a file of its own in the folder
-    `logs`."""
+    """Transport to up to `jobs` environment processes; each has a log file in the folder `logs`."""
 
     def __init__(self, logs: Path, jobs: int = 1) -> None:
         self._logs = logs
@@ -39,3 +40,55 @@ class LocalProcesses:
     def wait(self, timeout_s: float) -> None:
         descriptors = [slot.descriptor for slot in self._slots]
         wait([one for one in descriptors if one is not None], timeout_s)
+
+
+class InProcess:
+    """Transport that runs episodes in this process, one after another, with a loaded policy.
+
+    An episode that hangs or dies ends the run, and no timeout of an answer is enforced.
+    """
+
+    def __init__(self, driver: Driver) -> None:
+        self._driver = driver
+
+    def room(self, busy: int) -> int:
+        return 1 - busy
+
+    def unsolicited(self) -> tuple[()]:
+        return ()
+
+    def start(self, hello: Hello) -> _ThisProcess:
+        return _ThisProcess(self._driver)
+
+    def wait(self, timeout_s: float) -> None:
+        """Do nothing: the next poll runs the next job."""
+
+
+class _ThisProcess:
+    """Worker that runs its job when it is polled."""
+
+    log = "this process's own output"
+    ended = False
+
+    def __init__(self, driver: Driver) -> None:
+        self._driver = driver
+        self._job: Job | None = None
+
+    def give(self, job: Job) -> None:
+        self._job = job
+
+    def poll(self, hear: MessageHandler) -> None:
+        job = self._job
+        self._job = None
+        if job is not None:
+            done, _ = run_job(job, self._driver, hear)
+            hear(done)
+
+    def cancel(self) -> None:
+        """Do nothing: nothing else runs while it works."""
+
+    def stop(self) -> None:
+        """Do nothing: this process continues."""
+
+    def end(self) -> None:
+        """Do nothing: this process continues."""

@@ -1,7 +1,7 @@
-"""Sends imported maps from the coordinator to workers, by the hash of their street net.
+"""Transfer of imported maps from the coordinator to workers, by the hash of their street net.
 
-Generated cities and places that come with SUMO are made by each worker. Every net is compared with
-the coordinator's hash before an episode is run on it.
+Each worker builds generated cities and places of SUMO itself. Every net is compared with the
+coordinator's hash before an episode runs on it.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ from sumo_nets.maps.feature_file import NAME
 from sumo_nets.maps.map_store import ABOUT, NAMES, known_maps, map_hash, map_net, maps_folder
 
 _PART_BYTES: Final = 2 << 20
+"""Size in bytes of a part of a map."""
 _MOST_BYTES: Final = 1 << 30
+"""Size limit in bytes of a map, packed and unpacked."""
 _NET: Final = "net.xml"
 _FILES: Final = (_NET, ABOUT, NAME)
 
@@ -77,7 +79,7 @@ class Nets:
 
 
 class Fetched:
-    """A map on its way to a worker."""
+    """Download of a map by a worker."""
 
     def __init__(self, where: CityMap, digest: str) -> None:
         self._where = where

@@ -1,4 +1,4 @@
-"""Plan a run: load its policy, draw its seed, and say what it is (`RunSpec`)."""
+"""Planning of a run: its policy, its seed and its identity (`RunSpec`)."""
 
 from __future__ import annotations
 
@@ -35,10 +35,14 @@ from scenarios.runs.transport import HeldRun
 class PlannedRun(NamedTuple):
     """A run whose policy is loaded and whose seed is drawn.
 
-    config: what was asked for. whole: its suite; of_run: the scenarios chosen from that; shard:
-    which part of them, where not all. policy: its name; driver: it, as it was loaded here; host:
-    where episodes ask it; patience: with it. options: of each episode, with the seed of the run and
-    the camera of this machine.
+    whole: its suite.
+    of_run: the scenarios selected from the suite.
+    shard: the part of them that is run here, None for all.
+    policy: name of the policy.
+    driver: the policy as loaded in this process.
+    options: of each episode, with the seed of the run and the camera of this machine.
+    host: where episodes query the policy.
+    patience: timeouts of the policy.
     """
 
     config: RunConfig
@@ -58,7 +62,7 @@ class PlannedRun(NamedTuple):
 
     @property
     def spec(self) -> RunSpec:
-        """What the run is, for its folder. Raises UsageError."""
+        """Return the identity of the run. Raises UsageError."""
         shared = self.config.shared_renderer
         return run_spec(
             self.whole, self.of_run, self.policy, self.driver, self.options, shared, self.shard
@@ -74,10 +78,10 @@ def planned_run(
     options: EpisodeOptions | None = None,
     host: PolicyHost = PolicyHost(),  # noqa: B008  a frozen value
 ) -> PlannedRun:
-    """Load the policy of a run and draw its seed; its places are not looked at.
+    """Load the policy of a run and draw its seed, without building its places.
 
     policy: an object that drives in this process, in place of the config's name.
-    options: in place of those that the config gives.
+    options: in place of the config's.
     Raises UsageError, MachineError.
     """
     options = EpisodeOptions.asked(config) if options is None else options
@@ -107,13 +111,13 @@ def planned_run(
 
 
 def check_folder(plan: PlannedRun, folder: Path) -> None:
-    """Refuse a folder in which the run cannot continue. Raises RunError, UsageError."""
+    """Check that the run can continue in a folder. Raises RunError, UsageError."""
     _folder(plan, folder)
 
 
 @contextmanager
 def held_run(plan: PlannedRun, folder: Path) -> Iterator[HeldRun]:
-    """Hold a run in its folder, begun there or continued. Raises RunError for a folder of another
+    """Create or resume the run folder, and hold its lock. Raises RunError for a folder of another
     run."""
     held = _folder(plan, folder)
     hello = Hello(
@@ -142,9 +146,14 @@ def run_spec(
     shared: bool = False,
     shard: Shard | None = None,
 ) -> RunSpec:
-    """What a run is, for its folder. policy: its name; shared: one renderer draws for all of it;
-    shard: what of it the folder holds, if not all. Raises UsageError when a robot has no such
-    camera, unless one of its own was asked for, or the policy cannot be given what it asks for."""
+    """Build the identity of a run.
+
+    policy: name of the policy.
+    shared: whether one renderer draws for all episodes.
+    shard: the part of the run in the folder, None for all.
+    Raises UsageError if a robot lacks the policy's camera, unless the options allow an own camera,
+    or if the policy does not support the goal.
+    """
     manifest = with_goal(driver.manifest, options.goal)
     robots = [robot_called(name) for name in sorted({one.robot for one in picked})]
     if manifest.camera is not None:
@@ -173,8 +182,8 @@ def run_spec(
 
 
 def check_alone(options: EpisodeOptions, jobs: int, shared: bool) -> None:
-    """Raises UsageError where the answers of a run in real time would wait for those of other
-    episodes."""
+    """Check that the answers of a run in real time do not wait for those of other episodes. Raises
+    UsageError."""
     if options.real_time and (jobs != 1 or shared):
         much = "a shared renderer" if shared else f"{jobs} jobs"
         raise UsageError(
@@ -183,11 +192,10 @@ def check_alone(options: EpisodeOptions, jobs: int, shared: bool) -> None:
         )
 
 
-def seed_of_run(asked: int | None, resumed: Path | None) -> int:
-    """The seed that was asked for; else that of the run that is resumed; else one that is drawn
-    anew."""
-    if asked is not None:
-        return asked
+def seed_of_run(requested: int | None, resumed: Path | None) -> int:
+    """Return the requested seed; else that of the resumed run; else a random one."""
+    if requested is not None:
+        return requested
     if resumed is None:
         return drawn_seed()
     refuse_unbegun(resumed)

@@ -1,14 +1,18 @@
-"""The driver of a run's policy, wherever that is: in this process, in one of its own, or behind
-Zenoh."""
+"""Drivers of a run's policy in this process, in an isolated one, behind Zenoh, or in the shared
+renderer."""
 
 from __future__ import annotations
 
+from bridge.policy_server import AskAct, AskEnded, AskReset, PackedArray, packed
 from cosim.core.errors import UsageError
-from cosim.episode.policy_caller import LOADED_WITHIN_S, Driver, Timer
+from cosim.episode.policy_caller import LOADED_WITHIN_S, Driver, Timer, when
 from cosim.policies.load import REMOTE_SCHEME, load_policy
 from cosim.policies.user_module import importable
 from cosim.spec.manifest import Manifest
-from cosim.spec.options import PolicyHost
+from cosim.spec.options import PolicyHost, RendererAt
+from scenarios.ipc.observation_codec import Arrays
+from scenarios.ipc.render_link import RendererLink, link_to
+from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy
 from scenarios.runs.isolated_policy import isolated_driver
 
 
@@ -19,15 +23,18 @@ def policy_driver(
     expected: Manifest | None = None,
     start_s: float = LOADED_WITHIN_S,
 ) -> Driver:
-    """A policy by its name. expected: its manifest as the run knows it; one elsewhere is only asked
-    who it is without. start_s: without a timer it may take so long to be loaded, where it is loaded
-    in a process of its own. Raises UsageError.
+    """Load a policy by its name.
+
+    expected: its manifest in the run; None if only its manifest is needed.
+    start_s: timeout of loading in seconds, used without a timer.
+    Raises UsageError.
 
     >>> policy_driver("route", PolicyHost()).manifest.name
     'route'
     """
     name = importable(name)
     if name.startswith(REMOTE_SCHEME):
+        # Imported only where needed: it loads Zenoh and OpenCV.
         from scenarios.runs.remote_policy import remote_driver
 
         if host.isolated:
@@ -43,9 +50,10 @@ def policy_driver(
 def known_driver(
     name: str, host: PolicyHost, jobs: int = 1, start_s: float = LOADED_WITHIN_S
 ) -> Driver:
-    """A policy for who wants to know what it is, before a run asks it: one elsewhere is left at
-    once. Raises UsageError when its servers answer for fewer episodes at a time than there are
-    jobs."""
+    """Load a policy to inspect it before a run; connections and processes of its own are closed.
+
+    Raises UsageError if its servers answer for fewer episodes at a time than there are jobs.
+    """
     driver = policy_driver(name, host, start_s=start_s)
     driver.close()
     if 0 < driver.at_once < jobs:
@@ -54,3 +62,42 @@ def known_driver(
             f"{jobs} jobs: serve its class in place of an object, more servers, or take fewer jobs"
         )
     return driver
+
+
+class _RendererCarrier:
+    """Carrier of requests to the shared renderer, which has the picture already."""
+
+    loses = False
+
+    def __init__(self, address: str) -> None:
+        self._address = address
+        self._link: RendererLink | None = None
+
+    def lay(self, arrays: Arrays) -> dict[str, PackedArray]:
+        link = self._linked()
+        return {name: link.laid(name, array) or packed(array) for name, array in arrays.items()}
+
+    def ask(self, question: AskReset | AskAct) -> bytes:
+        if isinstance(question, AskAct):
+            return self._linked().exchange(question, when("act", question.tick))
+        self._link = link_to(self._address)
+        return self._link.exchange(question, "reset")
+
+    def tell_ended(self, question: AskEnded) -> None:
+        self._linked().tell(question)
+
+    def close(self) -> None:
+        """Nothing to release: the connection lasts as long as the process."""
+
+    def _linked(self) -> RendererLink:
+        """Return the connection of this episode, which is not replaced when it is lost."""
+        assert self._link is not None, "reset comes first"
+        return self._link
+
+
+def shared_driver(
+    manifest: Manifest, source_hash: str, renderer: RendererAt, run: str
+) -> HostedDriver:
+    """Return the driver of a policy in the shared renderer, where the run enforces its timeouts."""
+    policy = HostedPolicy(manifest, _RendererCarrier(renderer.address), run)
+    return HostedDriver(policy, "in-process", source_hash)

@@ -1,17 +1,19 @@
-"""Runs scenarios by the workers that a transport reaches.
+"""Pool of workers that runs the scenarios of a run over a transport.
 
-A worker reports the failure of its job (`scenarios.ipc.faults`). The scenario is run again,
-or recorded after its last attempt, so that none is ever lost. An episode that loses the shared
-renderer is run again. A worker that is lost with its machine may still deliver its result, which is
-kept if it comes first. Only this process writes to the run folder.
+A worker reports the failure of its job (`scenarios.ipc.faults`). The scenario is retried, or
+recorded after its last attempt, so that none is lost. An episode that loses the shared renderer is
+retried. A lost worker may still deliver its result, which is stored if it is the first one. Only
+this process writes to the run folder.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from functools import partial
 from logging import ERROR, WARNING
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 
@@ -19,11 +21,12 @@ from cosim.core.errors import RunError
 from cosim.core.log_event import happened
 from cosim.episode.manifest_checks import with_goal
 from cosim.results.record import Record, Status
-from cosim.results.run_folder import RunFolder
+from cosim.results.run_folder import FailedAttempt, RunFolder
 from cosim.results.run_setup import NO_RENDERER
+from cosim.spec.episode_id import pseudonym_of
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario
-from scenarios.ipc.faults import Failure, failure_of_result
+from scenarios.ipc.faults import RULES, Failure, failure_of_result
 from scenarios.ipc.messages import (
     Done,
     FrameDrawn,
@@ -33,12 +36,12 @@ from scenarios.ipc.messages import (
     Message,
     MessageHandler,
 )
-from scenarios.runs.attempts import AttemptQueue
 from scenarios.runs.environment_slot import no_answer
 from scenarios.runs.shared_renderer import SharedRenderer
 from scenarios.runs.transport import LateResult, Reception, Transport, Worker
 
 POLL_S = 1.0
+"""Longest time in seconds between two polls of the workers."""
 
 
 def run_all(
@@ -62,7 +65,7 @@ def run_all(
     a record cannot be written."""
     if renderer is not None:
         hello = msgspec.structs.replace(hello, renderer=renderer.at)
-    queue = AttemptQueue(folder, scenarios)
+    queue = _AttemptQueue(folder, scenarios)
     pool = _Pool(folder, queue, hello, transport, options, tell, renderer)
     happened("run begun", episodes=len(scenarios), policy=hello.policy, folder=str(folder.path))
     try:
@@ -81,7 +84,7 @@ class _Pool:
     def __init__(
         self,
         folder: RunFolder,
-        queue: AttemptQueue,
+        queue: _AttemptQueue,
         hello: Hello,
         transport: Transport,
         options: EpisodeOptions,
@@ -110,11 +113,11 @@ class _Pool:
         worker = next(idle, None) or self._transport.start(self._hello)
         self._workers[worker] = scenario
         self._folder.forget(scenario.id)
-        worker.give(Job(scenario, self._options, self._setup, self._hello.renderer))
+        worker.give(Job(scenario, self._options, self._setup))
         happened("claimed", scenario=scenario.id, worker=Path(worker.log).stem)
 
     def poll(self) -> None:
-        """Take in what the workers report; queue or record the scenarios that failed."""
+        """Take in the workers' messages; queue or record the scenarios that failed."""
         self._transport.wait(POLL_S)
         if self._renderer is not None:
             self._renderer.tend()
@@ -196,15 +199,13 @@ class _Pool:
             self._give_up(scenario, given_up.reason, given_up.status)
 
     def _failure_of(self, scenario: Scenario, lost: LostRenderer) -> Failure:
-        """Return the failure of an episode whose shared renderer has ended: its policy's if that
-        was being queried."""
+        """Return the failure of an episode whose shared renderer has ended, the policy's if its
+        call was pending."""
         assert self._renderer is not None
         end = self._renderer.end_of(lost.number)
         if end is None:
-            return Failure(
-                "process_ended",
-                "the environment process lost its connection to the shared renderer",
-            )
+            words = "the environment process lost its connection to the shared renderer"
+            return Failure("process_ended", words)
         if not lost.asked:
             return Failure("handed_back")
         if end.unanswered_s is None:
@@ -213,8 +214,7 @@ class _Pool:
         return Failure("policy_timeout", f"{words} in {lost.asked} of {scenario.id}")
 
     def _late(self, done: Done) -> Reception:
-        """Keep a late result if there is none; its scenario is taken from the worker that has it
-        now."""
+        """Store a late result if there is none, and cancel the worker that runs the scenario."""
         busy = (
             worker
             for worker, job in self._workers.items()
@@ -225,9 +225,8 @@ class _Pool:
         if scenario is None:
             return self._second(done)
         record = self._record_of(scenario, done)
-        if (
-            record is None or done.again or self._options.frames_every_s
-        ):  # some of its frames may be lost
+        frames_may_be_lost = self._options.frames_every_s > 0.0
+        if record is None or done.again or frames_may_be_lost:
             return "refused"
         if worker is None:
             self._queue.remove(scenario)
@@ -265,3 +264,56 @@ class _Pool:
         if self._renderer is not None:
             self._renderer.episode_ended()
         self._tell(Done(scenario.id, status))
+
+
+class _GivenUp(NamedTuple):
+    """The status and the reason of an episode after its last failed attempt."""
+
+    status: Status
+    reason: str
+
+
+class _AttemptQueue:
+    """Queue of the scenarios of a run, with a count of their failed attempts.
+
+    They are sorted by pseudonym, so that a policy cannot identify a scenario by counting episodes.
+    Failed attempts are stored in the run folder, so that a resumed run continues the count.
+    """
+
+    def __init__(self, folder: RunFolder, scenarios: Sequence[Scenario]) -> None:
+        self._folder = folder
+        self._waiting = deque(sorted(scenarios, key=partial(pseudonym_of, folder.spec.setup.seed)))
+        self._failed = folder.failed_attempts()
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def next(self) -> Scenario:
+        """Remove the first scenario, and return it."""
+        return self._waiting.popleft()
+
+    def named(self, name: str) -> Scenario | None:
+        """Return the scenario of this name if it waits."""
+        return next((scenario for scenario in self._waiting if scenario.id == name), None)
+
+    def remove(self, scenario: Scenario) -> None:
+        """Remove a scenario that waits."""
+        self._waiting.remove(scenario)
+
+    def failed(self, scenario: Scenario, failure: Failure) -> _GivenUp | None:
+        """Queue a scenario again after a failed attempt; after the last one, return its status and
+        reason."""
+        rule = RULES[failure.fault]
+        if rule.attempts == 1:
+            return _GivenUp(rule.status, failure.why)
+        attempt = FailedAttempt(scenario.id, failure.fault == "machine_lost")
+        if rule.attempts is not None:
+            self._failed[attempt] += 1
+            self._folder.keep_failed_attempt(attempt)
+            if self._failed[attempt] >= rule.attempts:
+                times = f"{failure.why}, {rule.attempts} times; see logs/ in the run folder"
+                return _GivenUp(rule.status, times)
+        facts = {"why": failure.why, "attempts": self._failed[attempt], "of": rule.attempts or 0}
+        happened("retried", WARNING, scenario=scenario.id, **facts)
+        self._waiting.appendleft(scenario)
+        return None

@@ -1,8 +1,7 @@
-"""Defines the messages between a run's coordinator and its workers on other machines: MessagePack,
-typed and bounded.
+"""Messages between a run's coordinator and its workers on other machines, as bounded MessagePack.
 
-A worker sends a request, the coordinator replies. Every request may be repeated: the reply is the
-same.
+A worker sends a request, the coordinator replies. Every request may be repeated, and gets the same
+reply.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from scenarios.ipc.faults import Fault
 from scenarios.ipc.messages import Done, FrameDrawn, Hello, Job, Progress, Waits
 
 PROTOCOL: Final = 2
-"""Version of these messages: it changes with each of them."""
+"""Version of these messages, raised with every change."""
 MOST_SENT_BYTES: Final = 15 << 20
 """Size limit of a message in bytes: Zenoh drops messages of more than 16 MiB."""
 MOST_WORDS: Final = 2000
@@ -37,15 +36,15 @@ _Slot = Annotated[int, Meta(ge=0, lt=4096)]
 _Printed = Annotated[bytes, Meta(max_length=1 << 16)]
 
 Installed = Mapping[str, str]
-"""What decides results: where all of it is equal they are equal to the bit."""
+"""Versions by name. Equal installations give results that are equal to the bit."""
 
 
 @lru_cache(maxsize=1)
 def installed_here() -> Installed:
     """Return the versions and the hash of the source that are installed here."""
-    rooms = Path(__file__).parents[2]
+    checkout = Path(__file__).parents[2]
     source = sources_hash(
-        *(rooms / name for name in ("cosim", "sumo_nets", "physics", "bridge", "scenarios"))
+        *(checkout / name for name in ("cosim", "sumo_nets", "physics", "bridge", "scenarios"))
     )
     return {
         **versions(),
@@ -56,7 +55,7 @@ def installed_here() -> Installed:
 
 
 def difference(here: Installed, run: Installed) -> str:
-    """Return in words where an installation differs from that of the run; "" if it does not."""
+    """Return how an installation differs from that of the run, in words; "" if it does not."""
     names = sorted(name for name in here.keys() | run.keys() if here.get(name) != run.get(name))
     return ", ".join(
         f"{n} {here.get(n, 'missing')} in place of {run.get(n, 'none')}" for n in names
@@ -116,8 +115,8 @@ class Reply(msgspec.Struct, frozen=True, tag=True):
     over: the run is over.
     renewed: the lease is renewed.
     revoked: the job is done, or another worker's.
-    kept, duplicate, conflict, refused: what became of a result; a failure is "kept".
-    turned_away: this worker can do nothing for this run, for the reason `why`.
+    kept, duplicate, conflict, refused: the outcome of a result; a failure is "kept".
+    turned_away: this worker cannot work for this run, for the reason `why`.
     """
 
     kind: Literal[
@@ -135,8 +134,7 @@ class Reply(msgspec.Struct, frozen=True, tag=True):
 
 
 class NetPart(msgspec.Struct, frozen=True):
-    """A part of a street net, from byte `begin` on, of `whole` bytes; without data it requests the
-    part."""
+    """Carries a part of a map of `whole` bytes, from byte `begin` on; without data, requests it."""
 
     begin: _Count
     whole: _Count = 0
@@ -147,14 +145,14 @@ CoordinatorReply = Hello | Assignment | Reply
 
 
 def digest_of(done: Done) -> str:
-    """Return a hash of the record and the log of a result, by which damage is noticed."""
+    """Return a hash of the record and the log of a result, which detects damage."""
     return hashlib.blake2b(
         len(done.record).to_bytes(8, "big") + done.record + done.log, digest_size=16
     ).hexdigest()
 
 
 class Origin(msgspec.Struct):
-    """The fields of a record that say where it comes from."""
+    """The fields of a record that identify its run and machine."""
 
     suite_hash: str
     run_seed: int
@@ -165,7 +163,7 @@ class Origin(msgspec.Struct):
 
 
 def origin_of(done: Done) -> Origin | None:
-    """Return where a result comes from; None if it is damaged."""
+    """Decode the origin of a result; None if it is damaged."""
     try:
         return msgspec.json.decode(done.record, type=Origin)
     except msgspec.DecodeError:
@@ -173,8 +171,8 @@ def origin_of(done: Done) -> Origin | None:
 
 
 def other_renderer(done: Done, renderer: str) -> str:
-    """Return in words that the pictures of a result were not drawn by the renderer of the run; ""
-    if they were."""
+    """Return how the renderer of a result differs from that of the run, in words; "" if it does
+    not."""
     origin = origin_of(done)
     if origin is None or origin.ended is None or origin.renderer == renderer:
         return ""
@@ -182,7 +180,7 @@ def other_renderer(done: Done, renderer: str) -> str:
 
 
 def run_hash(spec: RunSpec) -> str:
-    """Return the name of a run in keys: a resumed run has the same."""
+    """Return the name of a run in keys, which does not change when it is resumed."""
     return hashlib.blake2b(RUN_FILE.encode(spec), digest_size=8).hexdigest()
 
 

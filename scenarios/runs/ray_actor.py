@@ -1,4 +1,4 @@
-"""Runs an environment slot on a node of a Ray cluster, as a Ray actor.
+"""Environment slot on a node of a Ray cluster, as a Ray actor.
 
 The actor loads no engine: the environment process of its slot does, as in a run on one machine.
 """
@@ -25,7 +25,7 @@ _LAST_PRINTED: Final = 1 << 20
 
 
 class NodeFound(NamedTuple):
-    """The host name of a node, and what is installed there."""
+    """The host name and the installed versions of a node."""
 
     host: str
     installed: Installed
@@ -65,10 +65,11 @@ class EnvironmentActor:
             )
 
     def give(self, job: bytes, where: Place, digest: str, packed: bytes | None) -> None:
-        """Run a job. `packed` is its map, which is kept here if it is missing."""
+        """Run a job. `packed` is its map, which is stored on this node if it is missing."""
         try:
             if packed is not None:
-                from scenarios.runs.net_transfer import Fetched, lacks  # with the importer of maps
+                # Imported only where needed: it loads the importer of maps.
+                from scenarios.runs.net_transfer import Fetched, lacks
 
                 if isinstance(where, CityMap) and lacks(where):
                     Fetched(where, digest).keep(packed)
@@ -107,6 +108,6 @@ class EnvironmentActor:
             return printed
 
     def _printed(self) -> bytes:
-        """Return what the process has printed since the last report."""
+        """Return the output of the process since the last report."""
         printed, self._log_sent = new_output(self._log, self._log_sent, _LAST_PRINTED)
         return printed

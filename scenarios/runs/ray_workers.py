@@ -1,8 +1,8 @@
-"""Reaches workers on a Ray cluster: a transport.
+"""Transport to workers on a Ray cluster.
 
-Ray places the workers and waits for nodes to come; `scenarios.runs.pool` decides about an
-episode whose worker is lost. Ray sends Python objects: a cluster must be trusted as much as
-everyone that can reach it.
+Ray places the workers, and waits for nodes; `scenarios.runs.pool` decides about an episode whose
+worker is lost. Ray sends Python objects: every machine that can connect to the cluster must be
+trusted.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from cosim.core.errors import MachineError, UsageError
 from cosim.policies.user_module import importable
 from cosim.results.run_spec import RunSpec
 from cosim.spec.scenario import Place
+from scenarios.ipc.child_process import raise_unable
 from scenarios.ipc.faults import Failure
 from scenarios.ipc.messages import (
     Done,
@@ -34,7 +35,6 @@ from scenarios.ipc.messages import (
     decode_message,
     encode_message,
 )
-from scenarios.ipc.watchdog import raise_unable
 from scenarios.runs.lease import Lease
 from scenarios.runs.net_transfer import Nets, travels
 from scenarios.runs.protocol import difference, installed_for, other_renderer
@@ -42,6 +42,7 @@ from scenarios.runs.ray_actor import EnvironmentActor, NodeFound, SlotReport
 from scenarios.runs.transport import HeldRun, Transport, TransportFactory
 
 _POLL_S: Final = 1.0
+"""Longest time in seconds between two reports of an actor."""
 LEASE_S: Final = 60.0
 """Seconds without a report after which an actor has lost its lease, whether or not Ray still lists
 its node."""
@@ -56,7 +57,7 @@ _Packed = Callable[[Job], tuple[bytes, Place, str, Any]]
 
 
 def check_ray(on: str) -> Any:
-    """Return the package. Raises UsageError if it is not installed, or if this names no cluster."""
+    """Import Ray, and return it. Raises UsageError if it is missing, or if `on` is no cluster."""
     if on not in ("ray", "auto") and not on.startswith("ray://"):
         raise UsageError(
             f"--on {on}: give ray, auto, or the address of a cluster, like ray://head.lan:10001"
@@ -70,15 +71,16 @@ def check_ray(on: str) -> Any:
 
 
 def check_on_ray(on: str, of_here: Mapping[str, object]) -> None:
-    """Check the options of a run on Ray. of_here: those that need processes of this machine, by
-    name.
+    """Check the options of a run on Ray.
 
-    Raises UsageError if one of them is set, without Ray, and if this names no cluster."""
+    of_here: whether options are set that need processes of this machine, by name.
+    Raises UsageError if one is set, if Ray is missing, or if `on` is no cluster.
+    """
     check_ray(on)
     for name in (name for name, is_set in of_here.items() if is_set):
         raise UsageError(
-            f"{name} is of processes of this machine, and these are of a cluster: leave it, "
-            f"or that, out"
+            f"{name} needs processes of this machine, and this run uses those of a cluster: "
+            f"leave one of both out"
         )
 
 
@@ -102,8 +104,8 @@ def by_ray(on: str, jobs: int | None, policy: str, say: _Say) -> Iterator[Transp
 def ray_cluster(on: str, policy: str, say: _Say) -> Iterator[None]:
     """Connect to a cluster, and send the policy's package there unless it is installed.
 
-    on: "ray" for the cluster of RAY_ADDRESS or of this machine, which is started, for the block, if
-    there is none; "auto" for the same without starting one; or "ray://HOST:PORT".
+    on: "ray" for the cluster of RAY_ADDRESS or of this machine; "auto" for the same; or
+        "ray://HOST:PORT". "ray" starts a cluster on this machine for the block if there is none.
 
     Raises UsageError if there is no cluster, or one of another Ray or Python."""
     ray = check_ray(on)
@@ -125,7 +127,7 @@ def ray_cluster(on: str, policy: str, say: _Say) -> Iterator[None]:
             say("no Ray cluster is there: one was started on this machine, for this run")
         except (RuntimeError, ValueError, OSError) as error:
             raise UsageError(f"--on {on}: {_first_line(error)}") from None
-        signal.signal(signal.SIGTERM, before)  # Ray puts its own in place
+        signal.signal(signal.SIGTERM, before)  # Ray replaces it
         yield
     finally:
         with suppress(Exception):
@@ -134,7 +136,7 @@ def ray_cluster(on: str, policy: str, say: _Say) -> Iterator[None]:
 
 
 class RayWorkers:
-    """Runs workers that are Ray actors of one CPU each.
+    """Transport to workers that are Ray actors of one CPU each.
 
     jobs: their number, by default one for each CPU of the cluster; never more than there are
     episodes.
@@ -160,7 +162,7 @@ class RayWorkers:
         self._placed: list[tuple[Any, NodeFound]] = []
         self._workers: list[_RayWorker] = []
         self._count = self._failed = 0
-        self._told_s = time.monotonic()
+        self._noted_s = time.monotonic()
         self._nets = Nets()
         self._sent = cache(lambda digest: self._ray.put(self._nets.packed(digest)))
 
@@ -182,8 +184,8 @@ class RayWorkers:
         return worker
 
     def _packed_job(self, job: Job) -> tuple[bytes, Place, str, Any]:
-        """Return what an actor is given: a job, its place, the hash of its net, and a reference to
-        an imported map."""
+        """Return the arguments of an actor's `give`: a job, its place, the hash of its net, and a
+        reference to an imported map."""
         where = job.scenario.place
         digest = self._nets.hash_of(where)
         message = encode_message(msgspec.structs.replace(job, net_hash=digest))
@@ -212,9 +214,9 @@ class RayWorkers:
             if self._ray.wait([ref], timeout=0)[0]:
                 self._take(ref, self._coming.pop(ref))
         now_s = time.monotonic()
-        if self._placed or self._workers or now_s - self._told_s < _TELLS_S:
+        if self._placed or self._workers or now_s - self._noted_s < _TELLS_S:
             return
-        self._told_s = now_s
+        self._noted_s = now_s
         free = self._ray.available_resources().get("CPU", 0)
         self._say(
             f"waits for Ray to place a worker, which takes one CPU: {free:g} of the "
@@ -320,8 +322,7 @@ class _RayWorker:
 
 
 def _own_module(policy: str) -> str:
-    """Return the path of the package or file of a policy that is not installed; "" for all
-    others."""
+    """Return the path of the package or file of a policy that is not installed; "" if it is."""
     policy = importable(policy)
     name = policy.partition(":")[0].partition(".")[0] if ":" in policy else ""
     spec = importlib.util.find_spec(name) if name else None

@@ -1,9 +1,9 @@
-"""A policy behind Zenoh: found by its name at one or several endpoints, queried in lockstep.
+"""Client of a policy behind Zenoh, found by its name at one or several endpoints.
 
-Each episode stays with one server. A late answer is waited for, and the request of its step is
-repeated, until the deadline of the run: the server answers a repeated step from its cache. A server
-that is gone, frozen or restarted has lost the episode, which is run again from its start. Sessions
-are used in the environment's process: nothing in them is watched by others, and no handler runs.
+Each episode uses one server. A request is repeated until its reply or the run's timeout; the server
+replies to a repeated step from its cache. A server that has ended, hangs or was restarted has lost
+the episode, which is run again from its start. Sessions belong to the environment's process, and
+have no handlers.
 """
 
 from __future__ import annotations
@@ -44,12 +44,13 @@ from scenarios.ipc.shared_memory import room_for
 from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy, PolicyServerBusy
 
 DOMAIN: Final = "default"
+"""Domain in the keys of policy servers."""
 _QUALITY: Final = 90
 """Quality of JPEG pictures, of 100."""
 
 
 class _Server(NamedTuple):
-    """hub: who it is reached by; "" where that is not itself."""
+    """A policy server. hub: Zenoh ids of its session if it listens itself; else ""."""
 
     session: Session
     info: PolicyInfo
@@ -57,14 +58,14 @@ class _Server(NamedTuple):
 
     @property
     def replaced(self) -> bool:
-        """Whether another one listens where it did. A link to one that has gone may be seen a
-        moment longer."""
+        """Return whether another server listens at its endpoint. A closed link may be listed a
+        little longer."""
         known, now = ({*hub.split(", ")} - {""} for hub in (self.hub, self.session.hub))
         return bool(known and now) and known.isdisjoint(now)
 
 
 class PolicyServers:
-    """The servers of a policy: carries the requests of one episode to one of them."""
+    """Carrier of requests to the servers of a policy; each episode uses one of them."""
 
     loses = True
 
@@ -78,8 +79,8 @@ class PolicyServers:
         self._jpeg = False
 
     def know(self, within_s: float) -> list[PolicyInfo]:
-        """Who answers, as soon as somebody does; from now on only servers of the same policy are
-        asked."""
+        """Find servers, and use only those of the same policy from now on. Raises UsageError if
+        their policies differ, MachineError if there is none in time."""
         infos = [one.info for one in self._found(within_s)]
         first = infos[0]
         for info in infos[1:]:
@@ -93,8 +94,8 @@ class PolicyServers:
         return infos
 
     def choose(self) -> None:
-        """Take the server with the least to do for the next episode. Raises MachineError when there
-        is none."""
+        """Choose the server with the fewest episodes for the next episode. Raises MachineError if
+        there is none."""
         found = self._found(self.times.found_s)
         same = [one for one in found if (one.info.manifest, one.info.source) == self._wanted]
         if not same:
@@ -114,11 +115,9 @@ class PolicyServers:
         }
 
     def ask(self, question: AskReset | AskAct) -> bytes:
-        unreached_since_s = (
-            None  # a request that was under way for long is no sign of a lost server
-        )
+        unreached_since_s = None
         while True:
-            how, payload = self._sent(question, self.times.try_s)
+            how, payload = self._send(question, self.times.try_s)
             if how in ("answered", "refused"):
                 return payload
             now_s = time.monotonic()
@@ -128,22 +127,22 @@ class PolicyServers:
             unreached_since_s = now_s if unreached_since_s is None else unreached_since_s
             assert self._server is not None
             if self._server.replaced or now_s - unreached_since_s > self.times.lost_after_s:
-                raise self._gone()
+                raise self._lost()
             time.sleep(self.times.pause_s)
 
     def tell_ended(self, question: AskEnded) -> None:
-        if self._sent(question, self.times.end_s)[0] not in ("answered", "refused"):
-            raise self._gone()
+        if self._send(question, self.times.end_s)[0] not in ("answered", "refused"):
+            raise self._lost()
 
-    def _sent(self, question: AskReset | AskAct | AskEnded, timeout_s: float) -> tuple[str, bytes]:
-        """Send a request once. Returns how it went, and the reply."""
+    def _send(self, question: AskReset | AskAct | AskEnded, timeout_s: float) -> tuple[str, bytes]:
+        """Send a request once. Returns the outcome and the reply."""
         assert self._server is not None
         kind = str(question.__struct_config__.tag)
         key = f"{policy_key(DOMAIN, self.name, self._server.info.server)}/{kind}"
-        heard = self._server.session.ask_once(key, encode_message(question), timeout_s=timeout_s)
-        return heard.how, heard.payload
+        reply = self._server.session.ask_once(key, encode_message(question), timeout_s=timeout_s)
+        return reply.how, reply.payload
 
-    def _gone(self) -> PolicyServerLost:
+    def _lost(self) -> PolicyServerLost:
         assert self._server is not None
         return PolicyServerLost(
             f"the server {self._server.info.server} of policy '{self.name}' is gone"
@@ -155,7 +154,7 @@ class PolicyServers:
         self._sessions.clear()
 
     def _found(self, within_s: float) -> list[_Server]:
-        """All that answer, as soon as there is one. Raises MachineError."""
+        """Return all servers that reply, as soon as there is one. Raises MachineError."""
         until_s = time.monotonic() + within_s
         key = f"{policy_key(DOMAIN, self.name, '*')}/info"
         while True:
@@ -165,8 +164,8 @@ class PolicyServers:
                     if endpoint.endpoint not in self._sessions:
                         self._sessions[endpoint.endpoint] = open_session(endpoint)
                     session = self._sessions[endpoint.endpoint]
-                    told = session.answers(key, timeout_s=2.0)
-                    infos = [_info(payload) for payload in told.values()]
+                    replies = session.answers(key, timeout_s=2.0)
+                    infos = [_info(payload) for payload in replies.values()]
                     hub = session.hub
                     found += [
                         _Server(session, info, hub * info.listens)
@@ -186,7 +185,7 @@ class PolicyServers:
 
 
 class RemoteDriver(HostedDriver):
-    """The driver of a policy behind Zenoh."""
+    """Driver of a policy behind Zenoh."""
 
     def __init__(
         self,
@@ -200,7 +199,7 @@ class RemoteDriver(HostedDriver):
         self._servers = servers
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """A server that is free is looked for first, which takes no time of the policy's."""
+        """Reset the policy on a free server. The search does not count as time of the policy."""
         until_s = time.monotonic() + self._servers.times.found_s
         while True:
             self._servers.choose()
@@ -218,8 +217,8 @@ def remote_driver(
     timer: Timer | None = None,
     times: ServerTimes = ServerTimes(),  # noqa: B008  a frozen value
 ) -> RemoteDriver:
-    """A policy as `zenoh:NAME`. Raises UsageError for one that cannot be asked so, MachineError
-    when nobody answers."""
+    """Connect to the servers of policy `zenoh:NAME`. Raises UsageError if it cannot be queried over
+    a network, MachineError if no server replies."""
     called = name.partition(":")[2]
     if not host.servers:
         raise UsageError(f"policy '{name}' needs --policy-at ENDPOINT: where `cosim serve` listens")
@@ -252,7 +251,7 @@ def remote_driver(
 
 
 def _check(name: str, manifest: Manifest) -> None:
-    """Raises UsageError for what cannot be asked over a network."""
+    """Check that a policy can be queried over a network. Raises UsageError."""
     if manifest.privileged:
         raise UsageError(
             f"policy '{name}' is told what the simulator knows (privileged), and a remote "
@@ -266,9 +265,9 @@ def _check(name: str, manifest: Manifest) -> None:
 
 
 def _info(payload: bytes) -> PolicyInfo | None:
+    """Decode the info of a server; None if it is invalid."""
     with suppress(*UNREADABLE):
-        told = msgspec.msgpack.decode(payload, type=PolicyInfo)
-        return told if isinstance(told, PolicyInfo) else None
+        return msgspec.msgpack.decode(payload, type=PolicyInfo)
     return None
 
 

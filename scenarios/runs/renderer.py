@@ -1,10 +1,10 @@
 """The shared renderer: one process that draws for all environments of a run.
 
-Where the policy has `act_batch`, this process queries it for all episodes together. Environments
-connect, and send one request at a time (`scenarios.ipc.render_protocol`). All requested pictures
-are drawn together, at once. An environment that has just got one queries the policy next: a batch
-waits for those a moment. A picture is a function of robot and street alone, and each environment
-continues with its own reply: it makes no difference which of them are served together.
+It also queries a policy with `act_batch` for all episodes together. Environments connect, and send
+one request at a time (`scenarios.ipc.render_protocol`). All requested pictures are drawn together.
+An environment queries the policy after it has its picture, so a batch waits a moment for these
+environments. A picture depends on robot and street only, so results do not depend on how requests
+are batched.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ from cosim.core.framing import Wire
 from cosim.results.run_setup import NO_RENDERER
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Place, Scenario
+from physics.cameras.choice import renderer_of
+from physics.dynamics.world import BulletWorld
 from physics.street.street_surface import StreetSurface
-from scenarios.episodes.wiring import world_of
 from scenarios.ipc.deadlines import Asked
 from scenarios.ipc.messages import Ready, decode_hello
 from scenarios.ipc.observation_codec import ObservationDecoder
@@ -55,12 +56,16 @@ _BEAT_S: Final = 1.0
 _PLACES_KEPT: Final = 8
 """Surfaces of places that are cached."""
 _PEER: Final = struct.Struct("3i")
-"""Process, user and group of who has connected (SO_PEERCRED)."""
+"""Layout of process, user and group id of a connected process (SO_PEERCRED)."""
 
 
-def serve_pictures(pipe: int, asked: int, listening: int) -> None:
-    """Draw and query until the run has gone. pipe, asked: as of a worker; listening: the descriptor
-    of the socket that environments connect to."""
+def serve_pictures(pipe: int, pending_call: int, listening: int) -> None:
+    """Serve environments until the run closes the socket.
+
+    pipe: descriptor of the socket to the run.
+    pending_call: descriptor of the shared memory of the pending call.
+    listening: descriptor of the socket that environments connect to.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     wire = Wire(socket.socket(fileno=pipe))
     say = partial(said_to_run, wire, os.getpid())
@@ -68,15 +73,14 @@ def serve_pictures(pipe: int, asked: int, listening: int) -> None:
     assert hello.renderer is not None
     desk = None
     if hello.renderer.asks:
-        timer = Asked(asked)
+        timer = Asked(pending_call)
         policy = policy_here(hello, timer, say).policy
         desk = PolicyDesk(policy, decoder=ObservationDecoder, timer=timer, forget_after_s=inf)
     with ExitStack() as stack:
         atlas = None
         drawn_by = NO_RENDERER
         if (spec := hello.manifest.camera) is not None:
-            from physics.cameras.choice import renderer_of
-            from physics.cameras.gl.atlas import Atlas
+            from physics.cameras.gl.atlas import Atlas  # needs OpenGL
 
             atlas = stack.enter_context(Atlas(spec))
             drawn_by = renderer_of("gl")
@@ -86,11 +90,12 @@ def serve_pictures(pipe: int, asked: int, listening: int) -> None:
 
 
 class _Environment:
-    """An environment process that has connected.
+    """A connected environment process.
 
-    began: the last request that began an episode of the policy, until it ends. seat: its place in
-    the atlas. wants: the request that waits for a reply. asks_next: it has a picture that the
-    policy has not got yet.
+    began: the request that began the current episode of the policy.
+    seat: its place in the atlas.
+    wants: the pending request.
+    asks_next: whether its next request is to the policy, with the picture that it has.
     """
 
     def __init__(self, end: socket.socket, room: int) -> None:
@@ -104,14 +109,13 @@ class _Environment:
 
     @property
     def order(self) -> str:
-        """By which environments are served: what their episodes are called."""
+        """Return the key by which environments are sorted: the name of the episode."""
         return "" if self.began is None else self.began.episode
 
     def reply(self, reply: Reply) -> None:
-        """Send a reply. One that has ended does not get it: reading from it shows its end.
+        """Send a reply. Errors are ignored: the end of the process is detected when reading.
 
-        One that cannot be reached, because the policy has closed its socket, stays one for which
-        the policy is queried.
+        After an error its policy call stays pending, because the policy may have closed its socket.
         """
         self.wants = None
         with suppress(OSError):
@@ -124,9 +128,11 @@ class _Environment:
 
 
 class _Renderer:
-    """Answers environments until the run has gone.
+    """Server of the environments of a run.
 
-    rendered: the reply to Enter. room: bytes of a picture. beat: the heartbeat to the run.
+    rendered: reply to Enter.
+    room: bytes of an observation.
+    beat: sends a heartbeat to the run.
     """
 
     def __init__(
@@ -148,8 +154,8 @@ class _Renderer:
         self._open = True
 
     def serve(self, listening: socket.socket, pipe: int) -> None:
-        self._selector.register(listening, selectors.EVENT_READ, partial(self._welcomed, listening))
-        self._selector.register(pipe, selectors.EVENT_READ, self._ended)
+        self._selector.register(listening, selectors.EVENT_READ, partial(self._accept, listening))
+        self._selector.register(pipe, selectors.EVENT_READ, self._run_ended)
         beat_at_s = 0.0
         while self._open:
             if time.monotonic() >= beat_at_s:
@@ -161,7 +167,7 @@ class _Renderer:
                 self._answer()
 
     def _left_s(self) -> float:
-        """Return how long to wait for further requests."""
+        """Return the seconds to wait for further requests."""
         wanted = [one.wants for one in self._environments if one.wants is not None]
         if not wanted:
             return _BEAT_S
@@ -170,16 +176,15 @@ class _Renderer:
         expected = len(wanted) + sum(one.asks_next for one in self._environments)
         return self._desk.wait_s(len(wanted), expected, self._since_s)
 
-    def _ended(self) -> None:
-        """The run has gone: it says nothing after its first message."""
+    def _run_ended(self) -> None:
+        """Stop serving: the run sends nothing after its first message, so its socket is closed."""
         self._open = False
 
-    def _welcomed(self, listening: socket.socket) -> None:
+    def _accept(self, listening: socket.socket) -> None:
+        """Accept an environment's connection; one of another user is closed."""
         end, _ = listening.accept()
-        if (
-            _PEER.unpack(end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))[1]
-            != os.getuid()
-        ):
+        peer = end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size)
+        if _PEER.unpack(peer)[1] != os.getuid():
             end.close()
             return
         one = _Environment(end, self._room)
@@ -187,17 +192,17 @@ class _Renderer:
         self._selector.register(end, selectors.EVENT_READ, partial(self._hear, one))
 
     def _hear(self, one: _Environment) -> None:
-        """Something that an environment asks, or its end. One that does not speak as it should is
-        left."""
+        """Read the requests of an environment. It is disconnected when it ends, or after an invalid
+        request."""
         try:
             for message in one.wire.received():
                 if not self._take(one, decode_request(message)):
-                    self._part(one)
+                    self._disconnect(one)
                     return
         except (EOFError, OSError, msgspec.DecodeError, ValueError, TypeError):
-            self._part(one)
+            self._disconnect(one)
 
-    def _part(self, one: _Environment) -> None:
+    def _disconnect(self, one: _Environment) -> None:
         self._leave(one)
         self._end(one)
         self._selector.unregister(one.wire)
@@ -205,7 +210,7 @@ class _Renderer:
         one.close()
 
     def _take(self, one: _Environment, request: Request) -> bool:
-        """Note a request. False when it is out of turn."""
+        """Process or store a request. Returns False if it is out of order."""
         if one.wants is not None:
             return False
         if isinstance(request, Enter):
@@ -228,18 +233,20 @@ class _Renderer:
         return True
 
     def _entered(self, one: _Environment, scenario: Scenario) -> Reply:
+        """Add the scenario of an environment to the atlas, and return the reply."""
         try:
             if self._atlas is not None:
                 robot = robot_called(scenario.robot)
-                world = world_of(
+                world = BulletWorld(
                     _surface(scenario.place), scenario.barriers, robot, scenario.obstacles
                 )
                 one.seat = self._atlas.join(world, scenario.light)
-        except Exception as error:  # noqa: BLE001  of one scenario: the others continue
+        except Exception as error:  # noqa: BLE001  concerns one scenario only
             return _refused(error)
         return self._rendered
 
     def _leave(self, one: _Environment) -> None:
+        """Remove the scenario of an environment from the atlas."""
         if one.seat is not None and self._atlas is not None:
             self._atlas.leave(one.seat)
         one.seat = one.wants = None
@@ -252,8 +259,7 @@ class _Renderer:
         one.began = None
 
     def _answer(self) -> None:
-        """Answer what waits: pictures and resets, and if none of these does, queries of the
-        policy."""
+        """Answer pending pictures and resets; if there are none, the policy's observations."""
         waiting = sorted(
             (one for one in self._environments if one.wants is not None), key=lambda one: one.order
         )
@@ -268,8 +274,8 @@ class _Renderer:
                 self._ask([one])
 
     def _draw(self, which: list[_Environment]) -> None:
-        """Draw for these, together. Where that cannot be, by halves: it may be the fault of one of
-        them."""
+        """Draw for environments together. After an error draw for each half, to isolate the
+        environment that causes it."""
         if not which or self._atlas is None:
             return
         wanted = [(one.seat, one.wants) for one in which]
@@ -280,7 +286,7 @@ class _Renderer:
         ]
         try:
             frames = self._atlas.render(looks)
-        except Exception as error:  # noqa: BLE001  told to whom it concerns
+        except Exception as error:  # noqa: BLE001  sent to the environment that causes it
             if len(which) == 1:
                 which[0].reply(_refused(error))
                 return
@@ -294,7 +300,7 @@ class _Renderer:
             one.reply(msgspec.structs.replace(self._rendered, arrays=laid))
 
     def _ask(self, which: list[_Environment]) -> None:
-        """Query the policy for these, together."""
+        """Query the policy for environments together."""
         if not which or self._desk is None:
             return
         for one in which:
@@ -313,6 +319,6 @@ def _refused(error: Exception) -> Refusal:
 
 @lru_cache(maxsize=_PLACES_KEPT)
 def _surface(where: Place) -> StreetSurface:
-    """The surface of a place, one for all environments in it."""
+    """Return the surface of a place, shared by all environments in it."""
     _, street_map = place(where)
     return StreetSurface(street_map, where.seed, where.roughness)

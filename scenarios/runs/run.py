@@ -1,5 +1,4 @@
-"""Run a suite: load, choose, plan, check, open, run, finish; for the command line and `cosim.run`
-alike."""
+"""Run of a suite, for the command line and for `cosim.run`."""
 
 from __future__ import annotations
 
@@ -32,21 +31,21 @@ from cosim.spec.robot import COURIER, robot_called
 from cosim.spec.run_config import RunConfig, RunEnds
 from cosim.spec.scenario import Scenario, Suite, split_called
 from cosim.spec.selection import scenarios_chosen
-from physics.cameras.choice import camera_of_choice
 from scenarios.ipc.messages import MessageHandler
-from scenarios.runs.local import LocalProcesses
+from scenarios.runs.local import InProcess, LocalProcesses
 from scenarios.runs.planning import PlannedRun, check_folder, held_run, planned_run
 from scenarios.runs.pool import run_all
-from scenarios.runs.shared_renderer import SharedRenderer, check_shared
-from scenarios.runs.transport import HeldRun, InProcess, TransportFactory
+from scenarios.runs.ray_workers import by_ray, check_on_ray
+from scenarios.runs.shared_renderer import SharedRenderer
+from scenarios.runs.transport import HeldRun, TransportFactory
 from scenarios.suites.catalog import load_suite, with_crowd, with_robot
 from scenarios.suites.fits import LOOKING, check_places
 from scenarios.suites.sample import suite_on_map
 
 Carrier = AbstractContextManager[TransportFactory]
-"""Connects to machines whose workers run the episodes, in place of processes of this machine."""
+"""Connection to the workers of a run."""
 _VEHICLES_SHARE = 2 / 3
-"""Vehicles that a crowd of so many people adds, for each person."""
+"""Number of vehicles for each person of a crowd that is set by an option."""
 
 
 def ignore(message: object) -> None:
@@ -54,8 +53,8 @@ def ignore(message: object) -> None:
 
 
 class Given(NamedTuple):
-    """Objects of a Python caller, in place of what a config names. Without a folder such a run uses
-    a temporary one."""
+    """Objects of a Python caller, in place of names in a config. The default folder of such a run
+    is temporary."""
 
     suite: Suite | None = None
     policy: Policy | None = None
@@ -64,27 +63,26 @@ class Given(NamedTuple):
 
 
 class Reporter(Protocol):
-    """Shows how a run goes. The command line has its own (`cosim.cli.run_display`)."""
+    """Display of the progress of a run (`cosim.cli.run_display`)."""
 
     def say(self, words: str) -> None:
-        """Show a notice in a line."""
+        """Show a line."""
 
     def stage(self, words: str) -> AbstractContextManager[Progress]:
-        """Show what takes its time until the block ends."""
+        """Show a stage until the block ends, and return its progress callback."""
 
     def planned(self, plan: PlannedRun) -> None:
-        """Called when the policy is loaded, before places are built."""
+        """Show a plan: called when the policy is loaded, before places are built."""
 
     def opening(self, plan: PlannedRun, folder: Path) -> AbstractContextManager[None]:
-        """Entered before workers are connected and anything is written, for as long as the run
-        takes."""
+        """Show a run: entered before workers are connected and files written, until the end."""
 
     def running(self, plan: PlannedRun, run: HeldRun) -> AbstractContextManager[MessageHandler]:
-        """Entered while episodes run; receives the messages of workers."""
+        """Show progress: entered while episodes run, returns the handler of workers' messages."""
 
 
 class Silent(NamedTuple):
-    """Shows nothing of a run. tell: receives the messages of workers."""
+    """Reporter that shows nothing. tell: called with the messages of workers."""
 
     tell: MessageHandler = ignore
 
@@ -119,20 +117,23 @@ def run(
     options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
     tell: MessageHandler = ignore,
 ) -> pd.DataFrame:
-    """Run a suite with a policy; one row per episode, sorted by scenario, as in `results.csv`.
+    """Run a suite with a policy. Returns a row per episode, sorted by scenario, as `results.csv`.
 
-    suite: a loaded one, or a name or path as for `load_suite`. policy: an object drives in this
-    process; a name, as "my.py:Class", in `jobs` processes that survive its faults. episodes,
-    scenarios, events: run only the first so many, these ids, these kinds of events. shard: only a
-    part of that, as "1/4", of a run with a seed: `cosim merge` makes one of all. on: a Ray cluster
-    ("ray", "auto", "ray://HOST:10001") whose workers drive, by default as many as it has CPUs. out:
-    the run folder, kept and resumed; without one only the table is. shared_renderer: one process
-    draws for all others and asks a policy with `act_batch` (`BatchPolicy`). host: where a named
-    policy is asked: `PolicyHost(isolated=True)` gives it a process of its own. options: without a
-    seed one is drawn, or taken from the run that is resumed; each row has it (`run_seed`). tell:
-    receives the messages of workers.
+    suite: a loaded one, or a name or path as for `load_suite`.
+    policy: an object, which drives in this process; or a name, as "my.py:Class", which drives in
+        `jobs` processes that survive its errors.
+    episodes, scenarios, events: run only the first episodes, these ids, these kinds of events.
+    shard: run only a part of them, as "1/4", of a run with a seed; `cosim merge` joins the parts.
+    on: a Ray cluster ("ray", "auto", "ray://HOST:10001"), by default with a worker for each CPU.
+    out: the run folder; without one only the table is returned.
+    resume: continue the run in `out`.
+    shared_renderer: draw in one process for all others, which also queries a policy with
+        `act_batch` (`BatchPolicy`).
+    host: where a named policy is queried: `PolicyHost(isolated=True)` gives it its own process.
+    options: options of the episodes; without a seed it is random, or that of the resumed run.
+    tell: called with the messages of workers.
 
-    An episode that fails is a row with status "crashed". Raises UsageError, SpecError, RunError,
+    A failed episode is a row with status "crashed". Raises UsageError, SpecError, RunError,
     MachineError.
 
     >>> table = run("reactive", "straight", scenarios=["obstructing-001"])
@@ -169,7 +170,7 @@ def run(
 def _refuse_for_object(
     policy: Policy | str, jobs: int | None, on: str, host: PolicyHost, shared: bool
 ) -> None:
-    """Refuse other processes for a policy that is an object. Raises UsageError."""
+    """Check that a policy object is not used with other processes. Raises UsageError."""
     needs = {f"jobs={jobs}": jobs not in (None, 1), f"on='{on}'": on != "", "host": host.isolated}
     asked = next(
         (words for words, is_asked in needs.items() if is_asked), "shared_renderer=True" * shared
@@ -188,10 +189,12 @@ def carry_out(
     reporter: Reporter = Silent(),  # noqa: B008  a frozen value
     carrier: Carrier | None = None,
 ) -> pd.DataFrame:
-    """Run what a config asks for, and return the table of its results.
+    """Run a config, and return the table of its results.
 
-    given: objects in place of what the config names. reporter: shows how it goes. carrier: connects
-    to workers elsewhere. Raises what `run` raises.
+    given: objects in place of names in the config.
+    reporter: shows progress.
+    carrier: connects to workers, in place of those that the config requests.
+    Raises what `run` raises.
     """
     ends = config.ends
     for line in (line for end in ends.all for line in notices_of(end)):
@@ -207,22 +210,20 @@ def carry_out(
     reporter.planned(plan)
     with ExitStack() as stack:
         folder = config.out or _default_folder(plan, stack, temporary=given is not None)
-        plan = _checked(plan, folder, reporter, 1 if given else _lookers(config, carrier))
+        plan = _checked(plan, folder, reporter, 1 if given else _checking_jobs(config, carrier))
         stack.enter_context(reporter.opening(plan, folder))
-        reaches = stack.enter_context(carrier or _workers(plan, given, reporter))
+        create_transport = stack.enter_context(carrier or _workers(plan, given, reporter))
         plan = stack.enter_context(_connected(plan, folder, ends))
         held = stack.enter_context(held_run(plan, folder))
         with reporter.running(plan, held) as hear:
-            _run_what_is_left(plan, held, reaches, hear)
+            _run_todo(plan, held, create_transport, hear)
         return held.held.finish()
 
 
 def _check_cluster(config: RunConfig, given: Given | None) -> None:
-    """Refuse what a cluster cannot do. Raises UsageError."""
+    """Check that a cluster supports the options of a run. Raises UsageError."""
     if not config.on:
         return
-    from scenarios.runs.ray_workers import check_on_ray
-
     of_here: dict[str, Any] = {
         "shared_renderer": config.shared_renderer,
         "real_time": config.real_time,
@@ -235,7 +236,7 @@ def _check_cluster(config: RunConfig, given: Given | None) -> None:
 
 
 def _loaded(config: RunConfig, given: Given | None, reporter: Reporter) -> Suite:
-    """The suite of a run, with its robot and crowd. Raises UsageError, SpecError, MapError."""
+    """Load the suite of a run, with its robot and crowd. Raises UsageError, SpecError, MapError."""
     if given is not None and given.suite is not None:
         whole = given.suite
     elif config.map is not None:
@@ -275,7 +276,7 @@ def _planned(
 
 
 def _default_folder(plan: PlannedRun, stack: ExitStack, *, temporary: bool) -> Path:
-    """The folder of a run that names none."""
+    """Return the default run folder."""
     if temporary:
         return Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run"
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
@@ -283,31 +284,31 @@ def _default_folder(plan: PlannedRun, stack: ExitStack, *, temporary: bool) -> P
     return Path("runs") / f"{plan.whole.name}-{plan.driver.manifest.name}-{stamp}{shard}"
 
 
-def _lookers(config: RunConfig, carrier: Carrier | None) -> int:
-    """Processes that look at places."""
+def _checking_jobs(config: RunConfig, carrier: Carrier | None) -> int:
+    """Return the number of processes that check places."""
     return (config.jobs or 1) if carrier is None and not config.on else len(os.sched_getaffinity(0))
 
 
 def _checked(plan: PlannedRun, folder: Path, reporter: Reporter, jobs: int) -> PlannedRun:
-    """Check folder and places of a run, and measure its latency where that is asked for."""
+    """Check folder and places of a run, and measure its latency if the config requests it."""
     latency_ms = plan.config.latency_ms
     if latency_ms is None and plan.config.resume:
         latency_ms = read_spec(folder).setup.latency_ms
     if latency_ms is not None:
-        plan = _late(plan, latency_ms)
+        plan = _with_latency(plan, latency_ms)
     if plan.config.resume:
         check_folder(plan, folder)
     with reporter.stage(LOOKING) as looking:
         check_places(plan.whole, plan.picked, looking, jobs)
-    return _late(plan, _measured(plan, reporter)) if latency_ms is None else plan
+    return _with_latency(plan, _measured(plan, reporter)) if latency_ms is None else plan
 
 
-def _late(plan: PlannedRun, latency_ms: float) -> PlannedRun:
+def _with_latency(plan: PlannedRun, latency_ms: float) -> PlannedRun:
     return plan._replace(options=msgspec.structs.replace(plan.options, latency_ms=latency_ms))
 
 
 def _measured(plan: PlannedRun, reporter: Reporter) -> float:
-    """The latency that the policy shows in the first episode, in milliseconds."""
+    """Measure the latency of the policy in the first episode, in ms, and report it."""
     first = plan.picked[0]
     with reporter.stage(f"measuring the latency of {plan.policy} in {first.id}"):
         answer_ms, latency_ms = measured_latency(
@@ -327,10 +328,10 @@ def _measured(plan: PlannedRun, reporter: Reporter) -> float:
 
 
 class MeasuredLatency(NamedTuple):
-    """Medians over an episode, in milliseconds.
+    """Medians over an episode, in ms.
 
-    answer_ms: what the policy took for an answer.
-    latency_ms: after what they answer the commands took effect, at whole ticks.
+    answer_ms: time of an answer of the policy.
+    latency_ms: time until its command takes effect, in whole ticks.
     """
 
     answer_ms: float
@@ -344,9 +345,9 @@ def measured_latency(
     options: EpisodeOptions,
     host: PolicyHost = PolicyHost(),  # noqa: B008  a frozen value
 ) -> MeasuredLatency:
-    """Measure the latency of a policy in an episode in real time, in a process of its own. Raises
-    UsageError where the episode does not come to its end."""
-    alone = EpisodeOptions(
+    """Measure the latency of a policy in an episode in real time, in a separate process. Raises
+    UsageError if the episode does not end."""
+    real_time = EpisodeOptions(
         seed=options.seed,
         robot=options.robot,
         goal=options.goal,
@@ -354,7 +355,7 @@ def measured_latency(
         camera=options.camera,
         real_time=True,
     )
-    row = run(whole, policy, scenarios=[first.id], options=alone, host=host).iloc[0]
+    row = run(whole, policy, scenarios=[first.id], options=real_time, host=host).iloc[0]
     if not isinstance(row["ended"], str):
         raise UsageError(
             f"the latency of '{policy}' cannot be measured: {first.id} is {row['status']}: "
@@ -364,11 +365,8 @@ def measured_latency(
 
 
 def _workers(plan: PlannedRun, given: Given | None, reporter: Reporter) -> Carrier:
-    """How the workers of a run are reached: in a cluster, in this process, or as processes of this
-    machine."""
+    """Return the connection to the workers of a run: on Ray, this process, or child processes."""
     if plan.config.on:
-        from scenarios.runs.ray_workers import by_ray
-
         return by_ray(plan.config.on, plan.config.jobs, plan.policy, reporter.say)
     if given is not None and given.policy is not None:
         return nullcontext(partial(_in_this_process, plan.driver))
@@ -389,42 +387,41 @@ def _in_this_process(
 
 @contextmanager
 def _connected(plan: PlannedRun, folder: Path, ends: RunEnds) -> Iterator[PlannedRun]:
-    """Connect a run to its director, and put it on the air, where the config says so."""
+    """Connect a run to its director and to live clients, if the config requests them."""
     options = plan.options
     named = keys.chunk(folder.name)
     if ends.director is not None:
         outside = Outside(connection=ends.director, run=named, wait_s=plan.config.director_wait)
         options = msgspec.structs.replace(options, director=outside)
-    with _on_the_air(ends.live, named) as live:
+    with _live(ends.live, named) as live:
         if live is not None:
             options = msgspec.structs.replace(options, live=live)
         yield plan._replace(options=options)
 
 
 @contextmanager
-def _on_the_air(air: Connection | None, named: str) -> Iterator[Live | None]:
-    if air is None:
+def _live(connection: Connection | None, named: str) -> Iterator[Live | None]:
+    """Open the session for live clients, and yield its address for episodes."""
+    if connection is None:
         yield None
         return
-    with open_session(air) as hub:
+    with open_session(connection) as hub:
         yield Live(connection=hub.inside, run=named)
 
 
-def _run_what_is_left(
-    plan: PlannedRun, run: HeldRun, reaches: TransportFactory, tell: MessageHandler
+def _run_todo(
+    plan: PlannedRun, run: HeldRun, create_transport: TransportFactory, tell: MessageHandler
 ) -> None:
-    """Run the episodes that have no result yet. Raises MachineError, UsageError."""
+    """Run the episodes without a result. Raises MachineError, UsageError."""
     if not run.todo:
         return
     with ExitStack() as stack:
         renderer = None
         if plan.config.shared_renderer:
-            asks = check_shared(plan.driver, camera_of_choice(plan.options.camera))
-            drawing = SharedRenderer(
-                run.held.path / "logs", run.hello, asks=asks, patience=plan.patience
-            )
-            renderer = stack.enter_context(drawing)
-        transport, tell = stack.enter_context(reaches(run, tell))
+            logs = run.held.path / "logs"
+            renderer = SharedRenderer(logs, run.hello, asks=plan.driver.batches)
+            stack.enter_context(renderer)
+        transport, tell = stack.enter_context(create_transport(run, tell))
         run_all(
             run.held,
             run.todo,

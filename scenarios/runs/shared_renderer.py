@@ -1,7 +1,7 @@
-"""A run's shared renderer: started, replaced when it ends, ended with the run.
+"""Management of a run's shared renderer: started, replaced when it fails, ended with the run.
 
-The run holds the socket that environments connect to, so that its address lasts while renderers
-come and go: who connects in between waits for the next one.
+The run holds the socket that environments connect to, so that the address remains valid when a
+renderer is replaced. An environment that connects meanwhile waits for the next one.
 """
 
 from __future__ import annotations
@@ -18,39 +18,41 @@ import msgspec
 
 from cosim.core.errors import MachineError, UsageError
 from cosim.episode.policy_caller import Driver
-from cosim.spec.manifest import Manifest
 from cosim.spec.options import CameraName, RendererAt
-from scenarios.ipc.child_process import KeptProcess
-from scenarios.ipc.deadlines import Patience
+from scenarios.ipc.child_process import KeptProcess, Watchdog
 from scenarios.ipc.messages import Hello, encode_message
-from scenarios.ipc.watchdog import Watchdog
 
 RENDERERS: Final = 3
-"""So many may end, one after the other, without an episode that ends in between."""
+"""Number of renderers that may fail in a row without an episode that ends in between."""
 _SILENCE_S: Final = 120.0
-"""A renderer that says nothing for so long, while its policy has nothing to answer, hangs."""
+"""Timeout in seconds of a renderer's heartbeats while no policy call is pending."""
 _ENDING_S: Final = 5.0
-"""How long an ended renderer's socket to the run may stay open, after those to its environments."""
+"""Longest time in seconds between an environment's notice of a renderer's end and the run's."""
 _SERVES: Final = "scenarios.runs.renderer:serve_pictures"
+"""The function of the renderer's process."""
 
 
 class End(NamedTuple):
-    """How a renderer ended. words: in words; unanswered_s: how long its policy gave no answer,
-    where that was why."""
+    """The end of a renderer, in words.
+
+    unanswered_s: timeout of the policy call in seconds, if the renderer was killed for it.
+    """
 
     words: str
     unanswered_s: float | None = None
 
 
 class SharedRenderer:
-    """Use it in a `with` block. logs: the folder for what renderers print. hello: the policy of the
-    run; asks: whether it is asked there. at: what environments are told of it."""
+    """The shared renderer of a run. Use it in a `with` block.
 
-    def __init__(
-        self, logs: Path, hello: Hello, *, asks: bool, patience: Patience = Patience()
-    ) -> None:
+    logs: folder for the output of renderers.
+    hello: introduces the policy of the run.
+    asks: whether the renderer also queries the policy.
+    at: its address for environments.
+    """
+
+    def __init__(self, logs: Path, hello: Hello, *, asks: bool) -> None:
         self._logs = logs
-        self._patience = patience
         self.at = RendererAt(address=f"cosim-renderer-{secrets.token_hex(8)}", asks=asks)
         self._hello = msgspec.structs.replace(hello, renderer=self.at)
         self._listening = socket.socket(socket.AF_UNIX)
@@ -77,8 +79,8 @@ class SharedRenderer:
         self._listening.close()
 
     def tend(self) -> None:
-        """Take in what the renderer says; start another if it has ended or hangs. Raises UsageError
-        when it cannot load the policy, MachineError when there can be none."""
+        """Check the renderer, and replace it if it has ended or hangs. Raises UsageError if it
+        cannot load the policy, MachineError if none can be started."""
         if self._watchdog is None:
             self._start()
             return
@@ -99,8 +101,11 @@ class SharedRenderer:
         )
 
     def end_of(self, number: int) -> End | None:
-        """How the renderer of that number ended; None if it goes on, and an environment alone has
-        lost it. 0: that of one that has not answered at all."""
+        """Return the end of the renderer with this number; None if it still runs, and only an
+        environment has lost it.
+
+        number: from 1; 0 for an environment that never had a reply.
+        """
         if number == 0:
             return End("the renderer process could not be reached")
         deadline_s = time.monotonic() + _ENDING_S
@@ -114,7 +119,7 @@ class SharedRenderer:
         return self._ends[number - 1] if number <= len(self._ends) else None
 
     def episode_ended(self) -> None:
-        """The run comes along."""
+        """Reset the count of failed renderers."""
         self._in_a_row = 0
 
     def _start(self) -> None:
@@ -122,37 +127,33 @@ class SharedRenderer:
         process = KeptProcess(log, _SERVES, "renderer", (self._listening.fileno(),))
         at = msgspec.structs.replace(self.at, number=len(self._ends) + 1)
         process.send(encode_message(msgspec.structs.replace(self._hello, renderer=at)))
-        self._watchdog = Watchdog(process, self._patience, _SILENCE_S)
+        self._watchdog = Watchdog(process, self._hello.patience, _SILENCE_S)
 
     def _replace(self, watchdog: Watchdog, end: End, *, blames_policy: bool) -> None:
-        """The renderer has ended. Raises the run's error when it does so again and again."""
+        """Start another renderer. Raises UsageError or MachineError after too many failures in a
+        row."""
         self._ends.append(end)
-        if (
-            watchdog.ready and blames_policy
-        ):  # counted as attempts of the episodes that it was asked for
+        if watchdog.ready and blames_policy:  # counted as a failed attempt of its episodes
             self._start()
             return
         self._in_a_row += 1
         if self._in_a_row >= RENDERERS:
-            told = (
+            words = (
                 f"{end.words}, {RENDERERS} times, and no episode ended in between: see "
                 f"{watchdog.process.log}"
             )
             if blames_policy:
-                raise UsageError(f"policy '{self._hello.policy}' cannot be loaded: {told}")
+                raise UsageError(f"policy '{self._hello.policy}' cannot be loaded: {words}")
             raise MachineError(
-                f"{told}, and `cosim doctor`; without --shared-renderer each environment "
+                f"{words}, and `cosim doctor`; without --shared-renderer each environment "
                 f"draws for itself"
             )
         self._start()
 
 
-def check_shared(driver: Driver, camera: CameraName) -> bool:
-    """Whether the shared renderer of a run asks the policy, too. Raises UsageError where it has
-    nothing to do.
-
-    camera: what draws the pictures of the run."""
-    manifest: Manifest = driver.manifest
+def check_shared(driver: Driver, camera: CameraName) -> None:
+    """Check that a run can have a shared renderer. camera: of the run. Raises UsageError."""
+    manifest = driver.manifest
     if manifest.camera is None and not driver.batches:
         raise UsageError(
             f"policy '{manifest.name}' has no camera and no method 'act_batch': leave "
@@ -169,4 +170,3 @@ def check_shared(driver: Driver, camera: CameraName) -> bool:
             f"--shared-renderer draws by OpenGL, not by the {camera} camera: use --camera gl "
             "(`cosim doctor` says whether it works here), or leave --shared-renderer out"
         )
-    return driver.batches

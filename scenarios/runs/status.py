@@ -32,7 +32,7 @@ _MOST_REFUSED: Final = 1000
 _MOST_GONE: Final = 1000
 """Number of workers that have left or were lost and are still listed."""
 _MOST_PRINTED: Final = 4 << 20
-"""Size limit in bytes of the output that is kept of each environment process."""
+"""Size limit in bytes of the log of each environment process."""
 
 State = Literal["working", "idle", "silent", "lost", "left", "turned away"]
 
@@ -43,7 +43,7 @@ class RunningEpisode(msgspec.Struct, kw_only=True):
     time_s: simulated seconds.
     share: driven part of its route, 0 to 1.
     moved_at_s: wall clock of its last progress.
-    waits: what it waits for, "" if for nothing.
+    waits: reason for which it waits, "" if it does not.
     """
 
     scenario: str
@@ -69,7 +69,7 @@ class WorkerStatus(msgspec.Struct, kw_only=True):
 
     heard_at_s: wall clock of its last message.
     done: number of its results.
-    episodes: what it runs, by the number of the slot.
+    episodes: running episodes by slot number.
     """
 
     name: str
@@ -114,8 +114,10 @@ class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class WorkerRegistry:
-    """Lists the workers of one run, whose folder is locked by this process. `tell` is the run's
-    progress callback."""
+    """Registry of the workers of one run, whose folder is locked by this process.
+
+    tell: progress callback of the run.
+    """
 
     def __init__(
         self, held: RunFolder, scenarios: Sequence[Scenario], finished: int, tell: MessageHandler
@@ -197,7 +199,7 @@ class WorkerRegistry:
             self._workers[worker].state = "left"
 
     def turned_away(self, worker: str, host: str, why: str) -> None:
-        """Note that a worker can do nothing for this run."""
+        """Note that a worker cannot work for this run."""
         one = self._of(worker, host)
         if (one.state, one.why) != ("turned away", why):
             self.note(f"{worker}: turned away: {why}")

@@ -1,9 +1,7 @@
-"""Defines how jobs reach the workers that run episodes, and how their messages and results come
-back.
+"""Interfaces of transports and workers, which carry jobs to processes and results back.
 
-A transport starts workers; what a run does about a failed episode is decided in
-`scenarios.runs.pool`, and is the same for all transports. A record and its log travel as
-bytes, so that a worker needs no access to the run folder.
+`scenarios.runs.pool` decides about failed episodes, in the same way for all transports. A record
+and its log are sent as bytes, so that a worker needs no access to the run folder.
 """
 
 from __future__ import annotations
@@ -12,16 +10,14 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager
 from typing import Literal, NamedTuple, Protocol
 
-from cosim.episode.policy_caller import Driver
 from cosim.results.run_folder import RunFolder
 from cosim.spec.scenario import Scenario
 from scenarios.ipc.faults import Failure
 from scenarios.ipc.messages import Done, Hello, Job, MessageHandler
-from scenarios.runs.worker import run_job
 
 
 class Worker(Protocol):
-    """Runs episodes, one at a time, with the policy of its Hello."""
+    """Interface of a worker, which runs one episode at a time with the policy of its Hello."""
 
     @property
     def log(self) -> str:
@@ -42,42 +38,38 @@ class Worker(Protocol):
         """Take its job away."""
 
     def stop(self) -> None:
-        """Tell it to end, by force if it is busy, without waiting for that."""
+        """Request it to end, by force if it is busy, without waiting."""
 
     def end(self) -> None:
         """Wait until it has ended."""
 
 
 Reception = Literal["kept", "duplicate", "conflict", "refused"]
-"""What became of a result: it is kept, equals or contradicts the one in the run folder, or is of no
-use."""
+"""Outcome of a result: it is stored, equals or contradicts the stored one, or is unusable."""
 
 
 class AdoptedJob(NamedTuple):
-    """A scenario that a worker runs already: the run was resumed, or had given the worker up for
-    lost."""
+    """A scenario that a worker runs already, because the run was resumed or the lease expired."""
 
     scenario: str
     worker: Worker
 
 
 class LateResult(NamedTuple):
-    """A result that arrives after the job was reassigned. `answer` is called with what became of
-    it."""
+    """A result that arrives after the job was reassigned. `answer` is called with its outcome."""
 
     done: Done
     answer: Callable[[Reception], None]
 
 
 class Transport(Protocol):
-    """Starts workers."""
+    """Interface of a transport, which starts workers."""
 
     def room(self, busy: int) -> int:
         """Return how many more jobs can be given now, while `busy` workers have one."""
 
     def unsolicited(self) -> Iterable[AdoptedJob | LateResult]:
-        """Return the jobs and results that have arrived since the last call without being
-        requested."""
+        """Return the unrequested jobs and results that have arrived since the last call."""
 
     def start(self, hello: Hello) -> Worker:
         """Start one more worker. Raises MachineError when that is impossible."""
@@ -90,8 +82,8 @@ class HeldRun(NamedTuple):
     """A run whose folder is locked by this process.
 
     hello: introduces its policy.
-    picked: its scenarios, of a shard those of the shard.
-    todo: those of them that are to be run.
+    picked: its scenarios, or those of its shard.
+    todo: those of them without a result.
     """
 
     held: RunFolder
@@ -104,55 +96,3 @@ TransportFactory = Callable[
     [HeldRun, MessageHandler], AbstractContextManager[tuple[Transport, MessageHandler]]
 ]
 """Creates the transport for a run and wraps its progress callback."""
-
-
-class InProcess:
-    """Runs episodes in this process, one after another, with a policy that is loaded here.
-
-    An episode that hangs or dies takes the run with it, and no time limit of an answer is enforced.
-    """
-
-    def __init__(self, driver: Driver) -> None:
-        self._driver = driver
-
-    def room(self, busy: int) -> int:
-        return 1 - busy
-
-    def unsolicited(self) -> tuple[()]:
-        return ()
-
-    def start(self, hello: Hello) -> _ThisProcess:
-        return _ThisProcess(self._driver)
-
-    def wait(self, timeout_s: float) -> None:
-        """Do nothing: the next poll runs the next job."""
-
-
-class _ThisProcess:
-    """Runs its job when it is polled."""
-
-    log = "this process's own output"
-    ended = False
-
-    def __init__(self, driver: Driver) -> None:
-        self._driver = driver
-        self._job: Job | None = None
-
-    def give(self, job: Job) -> None:
-        self._job = job
-
-    def poll(self, hear: MessageHandler) -> None:
-        job = self._job
-        self._job = None
-        if job is not None:
-            done, _ = run_job(job, self._driver, hear)
-            hear(done)
-
-    def cancel(self) -> None:
-        """Do nothing: nothing else runs while it works."""
-
-    def stop(self) -> None:
-        """Do nothing: this process continues."""
-
-    def end(self) -> None:
-        """Do nothing: this process continues."""

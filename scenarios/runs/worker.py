@@ -1,8 +1,7 @@
-"""A worker: takes scenarios, runs them, tells how they go and what came out. It writes no file of
-the run.
+"""Worker: runs the episodes of jobs, and sends progress and results. It writes no file of the run.
 
-One that is a process takes them over a socket; its shepherd starts it, keeps its log and clears up
-after it (`scenarios.ipc.supervisor`).
+An environment process receives jobs over a socket; its supervisor writes its log and ends it
+(`scenarios.ipc.supervisor`).
 """
 
 from __future__ import annotations
@@ -28,6 +27,7 @@ from cosim.episode.loop import Step
 from cosim.episode.policy_caller import Driver
 from cosim.policies.load import load_policy
 from cosim.results.referee import Verdict
+from cosim.spec.options import RendererAt
 from scenarios.ipc.deadlines import Asked
 from scenarios.ipc.messages import (
     Done,
@@ -46,24 +46,25 @@ from scenarios.ipc.messages import (
     encode_message,
 )
 from scenarios.ipc.render_link import link_to
-from scenarios.runs.policy_host import policy_driver
-from scenarios.runs.shared_policy import shared_driver
+from scenarios.runs.policy_host import policy_driver, shared_driver
 
 REPORT_EVERY_TICKS = 20
+"""Ticks between two progress messages."""
 CANNOT_START = "an environment process cannot start:"
+"""Beginning of the message that engines cannot be loaded."""
 
 
-def serve_jobs(socket_descriptor: int, asked_descriptor: int) -> None:
-    """Serve jobs until the socket closes. An exception outside an episode ends the process; its run
-    starts another."""
+def serve_jobs(socket_descriptor: int, call_descriptor: int) -> None:
+    """Run jobs until the socket closes. An exception outside an episode ends the process, which the
+    run then replaces."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     wire = Wire(socket(fileno=socket_descriptor))
     home = Path.cwd()
-    printed_to = _printed_to()
+    outputs = _open_outputs()
     say = partial(said_to_run, wire, os.getpid())
     hello = decode_hello(wire.receive())
     _import_engines(say)
-    timer = Asked(asked_descriptor)
+    timer = Asked(call_descriptor)
     drivers: DriversHere | None = drivers_here(hello, timer, say)
     say(Ready())
     while True:
@@ -71,37 +72,36 @@ def serve_jobs(socket_descriptor: int, asked_descriptor: int) -> None:
             job = decode_job(wire.receive())
         except EOFError:
             return
-        os.chdir(home)  # the policy may have gone elsewhere
+        os.chdir(home)  # the policy may have changed it
         drivers = drivers or drivers_here(hello, timer, say, again=True)
         try:
-            done, trouble = run_job(job, drivers.policy, say, drivers.learner)
+            done, failed = run_job(job, drivers.policy, say, drivers.learner, hello.renderer)
         except MachineError as lack:
             say(Unable(str(lack), blames_policy=False))
             raise
-        if trouble or drivers.spent:
+        if failed or drivers.spent:
             drivers.close()
-            drivers = None  # made anew for the next one
+            drivers = None  # loaded again for the next job
         say(done)
-        if _printed_to() != printed_to:
-            # the policy has closed it: what was opened since may have its number, and would be
-            # written into
+        if _open_outputs() != outputs:
+            # The policy has closed an output: a file that was opened since may have its descriptor.
             return
 
 
-def _printed_to() -> list[tuple[int, int]]:
-    """What standard output and standard error are; without what is closed."""
+def _open_outputs() -> list[tuple[int, int]]:
+    """Return device and inode of standard output and standard error, if they are open."""
     found = []
     for descriptor in (1, 2):
         with suppress(OSError):
-            what = os.fstat(descriptor)
-            found.append((what.st_dev, what.st_ino))
+            status = os.fstat(descriptor)
+            found.append((status.st_dev, status.st_ino))
     return found
 
 
 def _import_engines(say: MessageHandler) -> None:
-    """An engine that cannot be imported is told, and ends the process."""
+    """Import the engines. An error is sent to the run, and ends the process."""
     try:
-        import scenarios.episodes.run_episode  # noqa: F401  the engines greet on stdout when they are imported
+        import scenarios.episodes.run_episode  # noqa: F401  engines print a greeting on import
     except (ImportError, OSError) as error:
         say(
             Unable(
@@ -113,8 +113,7 @@ def _import_engines(say: MessageHandler) -> None:
 
 @dataclass(frozen=True)
 class DriversHere:
-    """What drives here: the policy, or who asks the shared renderer's; and the learner where drives
-    are collected."""
+    """The drivers of a worker: of the run's policy, and of the learner of a collection."""
 
     policy: Driver
     learner: Driver | None
@@ -132,7 +131,7 @@ class DriversHere:
 def drivers_here(
     hello: Hello, timer: Asked, say: MessageHandler, *, again: bool = False
 ) -> DriversHere:
-    """See `policy_here`; the learner is held against what it was for the run in the same way."""
+    """Load the drivers of a worker, with the checks of `policy_here`."""
     if hello.renderer is not None and hello.renderer.asks:
         driver: Driver = shared_driver(
             hello.manifest, hello.source_hash, hello.renderer, hello.host.run
@@ -141,24 +140,25 @@ def drivers_here(
         driver = policy_here(hello, timer, say, again=again)
     if (learner := hello.learner) is None:
         return DriversHere(driver, None)
-    with _unable_told(say):
-        return DriversHere(driver, _as_begun(load_policy(learner.policy, timer), learner, again))
+    with _load_errors_sent(say):
+        return DriversHere(driver, _checked(load_policy(learner.policy, timer), learner, again))
 
 
 def policy_here(hello: Hello, timer: Asked, say: MessageHandler, *, again: bool = False) -> Driver:
-    """The policy of the run. One that cannot be loaded here, or is another one here, is told, and
-    ends the process.
+    """Load the policy of the run. An error, or a policy that differs from the run's, is sent to the
+    run, and ends the process.
 
-    again: it was loaded here before; what it has made of its class's manifest since means
-    nothing."""
-    with _unable_told(say):
-        return _as_begun(
-            policy_driver(hello.policy, hello.host, timer, hello.manifest), hello, again
-        )
+    again: whether it was loaded in this process before, so that it may have changed the manifest of
+        its class.
+    """
+    with _load_errors_sent(say):
+        driver = policy_driver(hello.policy, hello.host, timer, hello.manifest)
+        return _checked(driver, hello, again)
 
 
 @contextmanager
-def _unable_told(say: MessageHandler) -> Iterator[None]:
+def _load_errors_sent(say: MessageHandler) -> Iterator[None]:
+    """Send UsageError and MachineError of the block to the run, and raise them again."""
     try:
         yield
     except (UsageError, MachineError) as error:
@@ -166,30 +166,39 @@ def _unable_told(say: MessageHandler) -> Iterator[None]:
         raise
 
 
-def _as_begun(driver: Driver, begun: Hello, again: bool) -> Driver:
-    """A driver that was loaded here, if it is what it was for the run. Raises UsageError."""
-    if driver.source_hash != begun.source_hash:
+def _checked(driver: Driver, expected: Hello, again: bool) -> Driver:
+    """Return a driver if it equals that of the run. Raises UsageError."""
+    if driver.source_hash != expected.source_hash:
         raise UsageError(
-            f"policy '{begun.policy}' was edited while the run was going on: begin another "
+            f"policy '{expected.policy}' was edited while the run was going on: begin another "
             f"run. Or it is a network "
             "on another kind of processor than the run's, which answers otherwise in the last bit"
         )
     if again:
-        driver.manifest = begun.manifest
-    if driver.manifest != begun.manifest:
+        driver.manifest = expected.manifest
+    if driver.manifest != expected.manifest:
         raise UsageError(
-            f"policy '{begun.policy}' has another manifest in each process: {driver.manifest} in "
-            f"this one, {begun.manifest} in the first"
+            f"policy '{expected.policy}' has another manifest in each process: "
+            f"{driver.manifest} in this one, {expected.manifest} in the first"
         )
     return driver
 
 
 def run_job(
-    job: Job, driver: Driver, say: MessageHandler, learner: Driver | None = None
+    job: Job,
+    driver: Driver,
+    say: MessageHandler,
+    learner: Driver | None = None,
+    renderer: RendererAt | None = None,
 ) -> tuple[Done | LostRenderer, bool]:
-    """Run one episode and tell how it goes. Returns what came out, and whether anything went wrong:
-    its traceback is printed, because a record holds the message alone. learner: of a job that is
-    collected."""
+    """Run one episode, and send its progress.
+
+    Returns the result, and whether there was an error, whose traceback is printed.
+
+    learner: drives at times while demonstrations are collected.
+    renderer: shared renderer of the run.
+    """
+    # Imported here, so that `_import_engines` can report a failure.
     from scenarios.episodes.run_episode import run_episode
     from scenarios.places.nets import check_place
 
@@ -203,14 +212,14 @@ def run_job(
         expert = Demonstrator(driver, collecting, job.options.goal, learner)
     watcher = _Watcher(job, say)
     try:
-        if job.renderer is not None:
-            link_to(job.renderer.address, lambda: say(Waits(name, "waits for the shared renderer")))
+        if renderer is not None:
+            link_to(renderer.address, lambda: say(Waits(name, "waits for the shared renderer")))
         outcome = run_episode(
             job.scenario,
             expert or driver,
             job.options,
             setup=job.setup and msgspec.structs.replace(job.setup, versions=versions()),
-            renderer=job.renderer,
+            renderer=renderer,
             watches=[watcher.watch],
             waiting=lambda reason, _=None: say(Waits(name, reason)),
             comparing=watcher.compared,
@@ -226,7 +235,7 @@ def run_job(
 
 
 class _Watcher:
-    """Reports the progress of an episode, and the camera frames that its job asks for."""
+    """Sender of the progress of an episode, and of the camera frames that its job requests."""
 
     def __init__(self, job: Job, say: MessageHandler) -> None:
         self._every_s = job.options.frames_every_s
@@ -253,9 +262,8 @@ class _Watcher:
 
 
 def said_to_run(wire: Wire, worker: int, message: Message) -> None:
-    """Say something to the run. When it is gone this process ends at once: that is no crash of the
-    episode. So does a copy of the worker that its policy has forked: one process speaks on a
-    socket."""
+    """Send a message to the run. If the run has ended, or this is a fork of the worker by its
+    policy, end this process at once."""
     try:
         if os.getpid() == worker:
             wire.send(encode_message(message))

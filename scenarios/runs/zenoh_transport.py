@@ -1,8 +1,6 @@
-"""Reaches workers on other machines over Zenoh: a transport. Free workers claim jobs from the run's
-coordinator.
+"""Transport to workers on other machines over Zenoh, which claim jobs from the run's coordinator.
 
-Zenoh's threads only put what arrives into a queue; all else is done by the run's thread, when it
-waits.
+Zenoh's threads put arriving messages into a queue, which the run's thread processes in `wait`.
 """
 
 from __future__ import annotations
@@ -114,7 +112,7 @@ class _LeasedWorker(Lease):
         self._server.forget(self)
 
     def end(self) -> None:
-        """Do nothing: the reply to its next report informs the worker."""
+        """Do nothing: the worker ends its job after the reply to its next report."""
 
 
 class ZenohWorkers:
@@ -196,8 +194,8 @@ class ZenohWorkers:
         self.registry.write()
 
     def close(self) -> None:
-        """Tell workers that the run is over, until all have left: a reply just before a session
-        closes may be lost."""
+        """Answer claims with "over" until all workers have left, because a reply just before the
+        session closes may be lost."""
         self._over = True
         until_s = time.monotonic() + PARTING_S
         for query, _ in self._claims.values():
@@ -268,10 +266,8 @@ class ZenohWorkers:
             _answer(query, self._hello)
             return
         lease = self._leases.get(seat)
-        if (
-            lease is not None and lease.job is not None and not lease.ended
-        ):  # the answer to its last claim was lost
-            _answer(query, Assignment(lease.number, lease.job))
+        if lease is not None and lease.job is not None and not lease.ended:
+            _answer(query, Assignment(lease.number, lease.job))  # the first reply was lost
             return
         if lease is not None:
             lease.lose(f"worker {claim.worker} does not continue with it")
@@ -372,7 +368,7 @@ def workers_of_run(
 ) -> Iterator[tuple[ZenohWorkers, MessageHandler]]:
     """Create the transport of a run and wrap its progress callback.
 
-    At the end of the block, unless it failed, workers are told that the run is over."""
+    At the end of the block, unless it failed, workers are informed that the run is over."""
     registry = WorkerRegistry(run.held, run.picked, len(run.picked) - len(run.todo), tell)
     workers = ZenohWorkers(session, run.held.spec, run.hello, registry, resumed=resumed)
     workers.open()

@@ -1,9 +1,7 @@
-"""Works for runs on other machines: holds the Zenoh session with the coordinator, and environment
-slots for its jobs.
+"""Worker for runs on other machines, with a Zenoh session to the coordinator and environment slots.
 
-No engine is loaded in this process, so that a failure of an environment process does not touch the
-session. It needs nothing of the run but the address: policy, options and scenarios come with the
-jobs.
+No engine is loaded in this process, so that a crash of an engine does not end the session. It needs
+only the run's address: policy, options and scenarios are sent with the jobs.
 """
 
 from __future__ import annotations
@@ -31,7 +29,9 @@ from scenarios.runs.job_client import Installation, JobClient, Request, RunEnded
 from scenarios.runs.protocol import installed_here
 
 _RETRY_S: Final = 0.5
+"""Seconds between two attempts to find a coordinator or a run."""
 _WAIT_S: Final = 0.25
+"""Longest time in seconds between two checks of the environment slots."""
 _LOOKS_S: Final = 5.0
 """Seconds without a reply after which a worker looks for another run at the same address."""
 _PARTING_S: Final = 10.0
@@ -97,16 +97,16 @@ def work(
     say: called with each line for the user.
     logs: folder for the output of the processes; by default a temporary one.
 
-    Returns the number of the signal, or 0. Raises UsageError when the run refuses this worker,
-    MachineError when no episode can be run here, or with `once` when there has been no run for too
-    long."""
+    Returns the number of the signal, or 0. Raises UsageError if the run refuses this worker.
+    Raises MachineError if no episode can be run here, or with `once` without a run for GIVEN_UP_S.
+    """
     with ExitStack() as stack:
         leaving = stack.enter_context(_signals_caught())
         if logs is None:
             logs = stack.enter_context(temp_folder("cosim-worker-"))
         logs.mkdir(parents=True, exist_ok=True)
         contact = _Contact(connection.endpoint, once, say)
-        session = _reached(connection, leaving, contact, say)
+        session = _connected(connection, leaving, contact, say)
         if session is None:
             return leaving.signal
         stack.enter_context(session)
@@ -145,7 +145,7 @@ class _Contact:
         self._at_s = time.monotonic()
 
     def missing(self, words: str) -> None:
-        """Progress, once, that there is no contact. Raises MachineError if the last one is too long
+        """Report, once, that there is no contact. Raises MachineError if the last one is too long
         ago."""
         if self._once and time.monotonic() - self._at_s > GIVEN_UP_S:
             raise MachineError(
@@ -157,7 +157,7 @@ class _Contact:
         self._quiet = True
 
 
-def _reached(
+def _connected(
     connection: Connection, leaving: Leaving, contact: _Contact, say: Progress
 ) -> Session | None:
     """Wait for a session with the coordinator, and return it; None after a request to leave. Raises
@@ -211,7 +211,7 @@ class _Service:
                 if self._other_run():
                     self._say("another run is there now")
                     return False
-            self._part()
+            self._hand_back()
         except RunEnded:
             self._say(f"run {self._run} is over")
             return True
@@ -268,8 +268,8 @@ class _Service:
         runs = [key.split("/")[1] for key in self._session.answers(keys.EVERY_RUN, timeout_s=2.0)]
         return bool(runs) and self._run not in runs
 
-    def _part(self) -> None:
-        """Hand the jobs back, and deliver the results that are ready."""
+    def _hand_back(self) -> None:
+        """Return the jobs to the run, and deliver the results that are ready."""
         for client in self._clients:
             client.release()
         until_s = time.monotonic() + _PARTING_S

@@ -268,7 +268,7 @@ def test_a_clip_of_another_length_is_refused(
     tmp_path: Path, demonstrations: list[Demonstration]
 ) -> None:
     """A film is not made of a clip that has not as many pictures as its episode has rows."""
-    with pytest.raises(RunError, match="a clip of 7 pictures, 6 are told"):
+    with pytest.raises(RunError, match="a clip has 7 pictures in place of 6"):
         join_clips([demonstrations[0].clip.tobytes()], [6], tmp_path / "film.mp4", FPS)
 
 

@@ -155,9 +155,9 @@ def test_what_is_no_cluster_is_refused(cosim: Cosim, tmp_path: Path) -> None:
     )
     said = cosim(*words, "--on", "ray", "--shared-renderer", cwd=tmp_path)
     assert (
-        said.returncode == 2 and "--shared-renderer is of processes of this machine" in said.stderr
+        said.returncode == 2 and "--shared-renderer needs processes of this machine" in said.stderr
     )
-    with pytest.raises(UsageError, match="shared_renderer is of processes of this machine"):
+    with pytest.raises(UsageError, match="shared_renderer needs processes of this machine"):
         run("reactive", "straight", on="ray", shared_renderer=True, out=tmp_path / "run")
     with pytest.raises(UsageError, match="on='ray' needs a policy by its name"):
         run("reactive", Straight(), on="ray")

@@ -20,8 +20,7 @@ from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Suite
 from scenarios.ipc.messages import Done, Hello, Job, Message, MessageHandler
 from scenarios.runs import run as suite_run
-from scenarios.runs.local import LocalProcesses
-from scenarios.runs.transport import InProcess
+from scenarios.runs.local import InProcess, LocalProcesses
 from scenarios.tools.verify.doctor import small_scenario
 
 

@@ -107,11 +107,11 @@ def whole_frame(camera: CameraName, persons: int, frames: int, size_m: float) ->
     """Time a whole picture by `gl`, `bullet` or `bullet-egl`: arranged, drawn and read back;
     median seconds."""
     from physics.cameras.choice import camera_of
+    from physics.dynamics.world import BulletWorld
     from physics.street.street_surface import StreetSurface
-    from scenarios.episodes.wiring import world_of
 
     street_map = camera_city(size_m)
-    world = world_of(StreetSurface(street_map, 5))
+    world = BulletWorld(StreetSurface(street_map, 5))
     busy = busy_street(street_map, persons, frames)
     with camera_of(camera, world, CameraSpec(*SIZE, fov_deg=60.0)) as eyes:
         return _median(lambda street: eyes.render(busy.robot, street), busy.streets)
@@ -137,11 +137,11 @@ def together(environments: int, frames: int, size_m: float) -> float:
     """Time one environment's picture of several that are drawn into one atlas and read back at
     once; median seconds."""
     from physics.cameras.gl.atlas import Atlas
+    from physics.dynamics.world import BulletWorld
     from physics.street.street_surface import StreetSurface
-    from scenarios.episodes.wiring import world_of
 
     street_map = camera_city(size_m)
-    world = world_of(StreetSurface(street_map, 5))
+    world = BulletWorld(StreetSurface(street_map, 5))
     busy = busy_street(street_map, PERSONS, frames)
     spec = CameraSpec(*SIZE, fov_deg=60.0)
     with Atlas(spec) as eyes:

@@ -28,7 +28,8 @@ from cosim.spec.options import CameraName
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario
 from physics.cameras.choice import camera_of
-from scenarios.episodes.wiring import CORRIDOR_M, clear_of, empty_street, known, world_of
+from physics.dynamics.world import BulletWorld
+from scenarios.episodes.wiring import CORRIDOR_M, clear_of, empty_street, known
 from scenarios.places.nets import place, surface_of_place
 from scenarios.suites.catalog import load_suite
 
@@ -106,7 +107,7 @@ def _drive(
         return shapely.buffer(ground, -robot.width_m / 2)
 
     with ExitStack() as stack:
-        world = stack.enter_context(world_of(surface, robot=robot))
+        world = stack.enter_context(BulletWorld(surface, robot=robot))
         cameras = {
             name: stack.enter_context(
                 camera_of(camera, world, spec, light=scenario.light, depth=spec.depth)
