@@ -1,4 +1,4 @@
-"""An episode from above: map, route, barriers, track, people, events, failures, as one picture."""
+"""Picture of an episode from above: map, route, barriers, track, people, events and failures."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from cosim.spec.scenario import Scenario
 _MARGIN_M: Final = 25.0
 LONGEST_PX: Final = 2400
 USUAL_PX: Final = 1400
-"""Longest side of the picture of a short way."""
+"""Longest side, pixels, of the picture of a short route."""
 PX_PER_M: Final = 10.0
 TEXT_GAP_PX: Final = 6
 PLAIN_STD: Final = 25.0
-"""Words go elsewhere if what is under them varies more than this."""
+"""Standard deviation of pixel values above which a background is too busy for a label."""
 EVENT_RING_M: Final = 0.9
 FAILURE_RING_M: Final = 0.6
 END_M: Final = 0.6
-"""Radius of the dots at start and goal."""
+"""Radius, metres, of the dots at start and goal."""
 
 GROUND_COLOUR: Final[Rgb255] = GROUND_LOOKS[PLAIN_GROUND].drawn
 ROAD: Final[Rgb255] = (120, 120, 124)
@@ -62,8 +62,10 @@ FAILURES: Final[dict[str, Rgb255]] = {
 
 
 class Sheet:
-    """A picture of a part of the world: x east is right, y north is up. bounds: x0, y0, x1, y1 in
-    metres."""
+    """Picture of a part of the world: x east is right, y north is up.
+
+    bounds: x0, y0, x1, y1 in metres
+    """
 
     def __init__(
         self, bounds: tuple[float, float, float, float], px_per_m: float = PX_PER_M
@@ -77,7 +79,7 @@ class Sheet:
         self._labels: list[Polygon] = []
 
     def px(self, xy: Floats) -> NDArray[np.int32]:
-        """World metres (N, 2) as sixteenths of pixels."""
+        """Convert world metres (N, 2) to sixteenths of pixels."""
         xy = np.asarray(xy, dtype=float).reshape(-1, 2)
         at = np.column_stack([xy[:, 0] - self._x0, self._y1 - xy[:, 1]]) * self.px_per_m * 16
         return np.round(at).astype(np.int32)
@@ -115,11 +117,10 @@ class Sheet:
         beside_m: float = 0.0,
         size: float = 0.5,
     ) -> None:
-        """Words on a light plate near a place: below it, above it or beside it, where there is
-        least under them.
+        """Draw a label on a light plate below, above or next to a place, where it hides least.
 
-        beside_m: clear of what is drawn so far around the place; size: of the words, in OpenCV's
-        units.
+        beside_m: gap to the place, metres, to avoid covering its mark
+        size: font scale of OpenCV
         """
         x, y = (self.px(np.array([xy]))[0] // 16).tolist()
         clear = round(beside_m * self.px_per_m)
@@ -162,13 +163,13 @@ class Sheet:
         )
 
     def _pixels(self, box: Polygon) -> Image:
-        """The part of the picture in a box of pixels."""
+        """Return the part of the picture in a box of pixels."""
         x0, y0, x1, y1 = (max(int(edge), 0) for edge in box.bounds)
         return self.image[y0:y1, x0:x1]
 
 
 def draw_above(street_map: StreetMap, scenario: Scenario, record: Record, log: Log) -> Image:
-    """The picture of an episode, (H, W, 3) uint8 RGB."""
+    """Draw an episode: (H, W, 3) uint8 RGB."""
     route = np.array(scenario.route)
     low = route.min(axis=0) - _MARGIN_M
     high = route.max(axis=0) + _MARGIN_M
@@ -192,7 +193,7 @@ def draw_above(street_map: StreetMap, scenario: Scenario, record: Record, log: L
 
 
 def draw_way_and_things(sheet: Sheet, scenario: Scenario) -> None:
-    """The way of a scenario, and what stands there."""
+    """Draw the route, barriers and obstacles of a scenario."""
     sheet.line(np.array(scenario.route), ROUTE, 0.4)
     for barrier in scenario.barriers:
         across = (
@@ -207,7 +208,7 @@ def draw_way_and_things(sheet: Sheet, scenario: Scenario) -> None:
 
 
 def draw_ends_and_events(sheet: Sheet, scenario: Scenario) -> None:
-    """Start, goal and events of a scenario, by name."""
+    """Draw and label start, goal and events of a scenario."""
     sheet.dot(np.array([scenario.start[:2], scenario.goal]), TRACK, END_M)
     sheet.text(scenario.start[:2], "start", TRACK, END_M)
     sheet.text(scenario.goal, "goal", TRACK, END_M)
@@ -217,7 +218,7 @@ def draw_ends_and_events(sheet: Sheet, scenario: Scenario) -> None:
 
 
 def draw_streets(sheet: Sheet, street_map: StreetMap, area: Polygon) -> None:
-    """Ground zones of a part of a map."""
+    """Draw the ground zones of a part of a map."""
     for kind, shape in street_areas(street_map, area):
         sheet.area(shape, _GROUNDS[kind])
 
@@ -225,8 +226,10 @@ def draw_streets(sheet: Sheet, street_map: StreetMap, area: Polygon) -> None:
 def street_areas(
     street_map: StreetMap, area: Polygon
 ) -> Iterator[tuple[str, Polygon | MultiPolygon]]:
-    """What lies in a part of a map, in the order in which it is drawn: what covers open ground
-    (`GROUND_LOOKS`), road, verge, walk or crossing, and its shape."""
+    """Yield (kind, shape) of the ground zones in a part of a map, in drawing order.
+
+    Kinds: open ground (`GROUND_LOOKS`), road, verge, walk, crossing.
+    """
     yield from open_ground(street_map, area)
     lanes = [piece for piece in street_map.near("lane", area) if isinstance(piece, Lane)]
     for junction in street_map.near("junction", area):
@@ -240,7 +243,7 @@ def street_areas(
 
 
 def draw_track(sheet: Sheet, log: Log) -> None:
-    """The robot's track, with a dashed jump where it was reset."""
+    """Draw the robot's track, with a dashed line for each reset."""
     jumps = np.flatnonzero(~np.isnan(log.reset_s_m)) + 1
     pieces = np.split(log.pose[:, :2], jumps)
     for piece in pieces:
@@ -256,7 +259,7 @@ def draw_track(sheet: Sheet, log: Log) -> None:
 
 
 def _facts(scenario: Scenario, record: Record, time_s: float) -> list[tuple[str, Rgb255]]:
-    """What stands below the picture: how the episode went, and what each colour means."""
+    """Return the legend: outcome of the episode and meaning of each colour."""
     measures = record.measures
     return [
         (record.scenario.id, TRACK),

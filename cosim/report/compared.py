@@ -1,4 +1,4 @@
-"""Makes readable tables of a comparison: rows of words, and these as Markdown and LaTeX."""
+"""Tables of a run comparison as text, Markdown and LaTeX."""
 
 from __future__ import annotations
 
@@ -58,8 +58,7 @@ _SIGNED: Final = re.compile(r"(?<!\S)[-+]\d[\d.]*(?!\S)")
 
 
 class WrittenTable(NamedTuple):
-    """A title, heads of columns, rows of words; names: how many columns are names, the others are
-    figures."""
+    """Table of text cells. names: number of columns with names; the others are figures."""
 
     title: str
     heads: tuple[str, ...]
@@ -68,8 +67,11 @@ class WrittenTable(NamedTuple):
 
 
 def tables_of_comparison(told: RunComparison, other: ComparedRun) -> tuple[WrittenTable, ...]:
-    """Of the first run and one of the others: the whole suite by metric, and its groups by the most
-    telling metrics. What no pair of episodes has is left out."""
+    """Build the tables of the first run against another: the whole suite by metric, then its
+    groups.
+
+    Metrics without a common episode are omitted.
+    """
     told_of = told.differences["after"] == other.label
     rows = told.differences[told_of & (told.differences["n"] > 0)].to_dict("records")
     title = f"{other.label} (B) against {told.before.label} (A), suite {told.suite}"
@@ -102,7 +104,7 @@ def _signed(value: float) -> str:
 
 
 def flips_in_words(told: RunComparison, other: ComparedRun) -> tuple[str, ...]:
-    """Which scenarios the other run won, and which it lost, by name."""
+    """Return which scenarios only one of two runs solved, by name."""
     flipped = told.flipped[told.flipped["after"] == other.label]
     lines = []
     for flip, what in (
@@ -115,7 +117,7 @@ def flips_in_words(told: RunComparison, other: ComparedRun) -> tuple[str, ...]:
 
 
 def how_to_read(told: RunComparison) -> str:
-    """What the figures are, in words."""
+    """Return the explanation of the figures."""
     tables = [table for other in told.others for table in tables_of_comparison(told, other)]
     shown = sum(row[-3] != "-" for table in tables for row in table.rows)
     in_all = int(told.differences["low"].notna().sum())
@@ -131,7 +133,7 @@ def how_to_read(told: RunComparison) -> str:
 
 
 def as_markdown(told: RunComparison) -> str:
-    """All of it for a page of Markdown."""
+    """Format the whole comparison as Markdown."""
     blocks = []
     for other in told.others:
         for table in tables_of_comparison(told, other):
@@ -145,7 +147,7 @@ def as_markdown(told: RunComparison) -> str:
 
 
 def as_latex(told: RunComparison) -> str:
-    """All of it for a paper, to be taken in with \\input; it needs no package."""
+    """Format the whole comparison as LaTeX for \\input; it needs no package."""
     blocks = []
     for other in told.others:
         for table in tables_of_comparison(told, other):
@@ -182,4 +184,4 @@ def _one_line(text: str) -> str:
 
 
 FORMATS: Final[dict[str, Callable[[RunComparison], str]]] = {".md": as_markdown, ".tex": as_latex}
-"""By the end of a file's name."""
+"""Formatters by file suffix."""

@@ -1,5 +1,4 @@
-"""Curves of a sweep: a panel for each metric, the first field along it, a line for each value of
-the others."""
+"""Curves of a sweep: one panel per metric, first field on the x axis, one line per other value."""
 
 from __future__ import annotations
 
@@ -37,27 +36,34 @@ _COLOURS: Final = (
 )
 _MARKS: Final = "osD^v<>P"
 _MOST_NAMED: Final = 16
-"""Of more lines than this none is named."""
+"""Maximum number of lines with a legend."""
 _PANEL_LETTERS = 44
+"""Characters of tick labels that fit horizontally below a panel."""
 _PANEL_LINES = 24
+"""Lines of vertical tick labels that fit below a panel."""
 _UPRIGHT_LETTERS = 26
+"""Characters of a vertical tick label before it wraps."""
 _TITLE_LETTERS = 120
+"""Characters of the title before it wraps."""
 _LEGEND_LETTERS = 168
-"""Letters that fit side by side below a panel; lines that fit there upright, and the letters of
-each; letters that fit above all panels, and below them."""
+"""Characters that fit into one row of the legend."""
 _LOW = 7.4
+"""Figure height, inches, with horizontal tick labels."""
 _HIGH = 10.4
-"""The figure's height in inches, with names side by side and with upright ones."""
+"""Figure height, inches, with vertical tick labels."""
 _APART: Final = 0.012
-"""Lines stand so far beside each other, of the width of a panel, so that their intervals can be
-told apart."""
+"""Horizontal offset between lines, as a share of the panel width, to separate their intervals."""
 
 
 def draw_curves(
     summary: pd.DataFrame, fields: Sequence[str], metrics: Sequence[str], title: str
 ) -> bytes:
-    """A PNG of the means with their intervals. summary: rows of fields, metric, mean, low, high, n.
-    Raises MachineError where the library that draws is not installed."""
+    """Draw the means with their intervals as PNG.
+
+    summary: rows of fields, metric, mean, low, high, n
+
+    Raises MachineError if matplotlib is not installed.
+    """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -117,8 +123,7 @@ def draw_curves(
 
 
 def _name_ticks(panel: Axes, names: Sequence[str]) -> None:
-    """Name places along a panel: side by side where there is room, else upright, folded, of many
-    every second or so."""
+    """Label the ticks of a panel: horizontal if they fit, else vertical, wrapped and thinned."""
     if _side_by_side(names):
         panel.set_xticks(range(len(names)), names)
         return
@@ -129,13 +134,12 @@ def _name_ticks(panel: Axes, names: Sequence[str]) -> None:
 
 
 def _side_by_side(names: Sequence[str]) -> bool:
-    """Return whether names fit side by side below a panel."""
+    """Return whether labels fit horizontally below a panel."""
     return sum(map(len, names)) + 2 * len(names) <= _PANEL_LETTERS
 
 
 def _places(values: pd.Series[Any]) -> tuple[np.ndarray, list[str] | None]:
-    """Where values stand along a panel: numbers where they are, words one after the other, with
-    their names."""
+    """Return x positions: numbers as they are, words as 0, 1, ... with their labels."""
     numbers = pd.to_numeric(values, errors="coerce")
     if numbers.notna().all() and not values.map(lambda value: isinstance(value, bool)).any():
         return numbers.to_numpy(dtype=float), None
@@ -144,6 +148,6 @@ def _places(values: pd.Series[Any]) -> tuple[np.ndarray, list[str] | None]:
 
 
 def _named(fields: Sequence[str], values: Any) -> str:
-    """What a line is of."""
+    """Return the legend label of a line."""
     values = values if isinstance(values, tuple) else (values,)
     return ", ".join(f"{field} {value}" for field, value in zip(fields, values, strict=True))

@@ -19,15 +19,17 @@ from cosim.core.files import atomic_file
 from cosim.report.legend import Image
 
 _MOST_PX = 4096
-"""Longest side of a video."""
+"""Longest side of a video, pixels."""
 
 
 class Video:
-    """An .mp4 in the making. Use in a `with` block; the file appears at its end, and only if
-    nothing went wrong.
+    """Video file (.mp4) that is being written; use in a `with` block.
 
-    size: width, height, both even; fps: pictures a second. Raises MachineError when it cannot be
-    written.
+    size: width, height, both even
+    fps: frames per second
+
+    The file appears at the end of the block, only without an error. Raises MachineError if it
+    cannot be written.
     """
 
     def __init__(self, path: Path, size: tuple[int, int], fps: int) -> None:
@@ -58,7 +60,7 @@ class Video:
         return self
 
     def add(self, rgb: NDArray[np.uint8]) -> None:
-        """The next picture, (height, width, 3)."""
+        """Append a frame (height, width, 3)."""
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")
         self._write(frame)
 
@@ -87,17 +89,17 @@ class Video:
 
 _QUALITY: Final = 58
 _EFFORT: Final = "2"
-"""Of 0 to 6: half the time of 4, which OpenCV takes, for 4 % more bytes and the same error."""
+"""WebP effort, 0 to 6: half the time of 4, OpenCV's default, for 4 % more bytes."""
 _CODER: Final = "libwebp"
 
 
 def image_url(rgb: Image, quality: int = _QUALITY) -> str:
-    """Return an (H, W, 3) picture as it stands in a page."""
+    """Return an (H, W, 3) picture as a WebP data URL."""
     return "data:image/webp;base64," + base64.b64encode(as_webp(rgb, quality)).decode()
 
 
 def as_webp(rgb: Image, quality: int = _QUALITY) -> bytes:
-    """Return an (H, W, 3) picture as a WebP file."""
+    """Encode an (H, W, 3) picture as WebP."""
     if _CODER not in av.codecs_available:
         return cv2.imencode(".webp", rgb[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])[
             1

@@ -1,4 +1,4 @@
-"""A whole map from above, its islands and problems marked."""
+"""Maps from above: a whole map with its problems marked, or a scenario before it is run."""
 
 from __future__ import annotations
 
@@ -39,8 +39,11 @@ def draw_map(
     part: tuple[float, float, float, float] | None = None,
     credit: str = "",
 ) -> Image:
-    """Draw a map, or the `part` x0, y0, x1, y1 (metres) of it: (H, W, 3) uint8 RGB. credit: of the
-    map's data."""
+    """Draw a map with its problems: (H, W, 3) uint8 RGB.
+
+    part: x0, y0, x1, y1 in metres; None for the whole map
+    credit: attribution of the map data
+    """
     x0, y0, x1, y1 = street_map.bounds if part is None else part
     margin_m = _MARGIN_M if part is None else 0.0
     bounds = (x0 - margin_m, y0 - margin_m, x1 + margin_m, y1 + margin_m)
@@ -61,8 +64,10 @@ def draw_map(
 
 
 def write_png(image: Image, path: Path) -> None:
-    """Write an RGB picture. Raises UsageError for a name that is no PNG's, MachineError where it
-    cannot be written."""
+    """Write an RGB picture.
+
+    Raises UsageError for a name without .png, MachineError if it cannot be written.
+    """
     if path.suffix.lower() != ".png":
         raise UsageError(f"{path}: cannot be written as a picture; use a name that ends in .png")
     try:
@@ -75,7 +80,7 @@ def write_png(image: Image, path: Path) -> None:
 
 
 def _facts(check: MapCheck) -> list[tuple[str, Rgb255]]:
-    """What stands below the picture: the figures, then what each colour means."""
+    """Return the legend: size of the map and meaning of each colour."""
     kinds = [kind for kind in MARKS if any(problem.kind == kind for problem in check.problems)]
     crossings = f"{check.crossings} crossings, {check.signalised} with signals"
     words = f"{check.name}  {check.walkable_km:.1f} km walkable, {crossings}"
@@ -83,7 +88,7 @@ def _facts(check: MapCheck) -> list[tuple[str, Rgb255]]:
 
 
 def _scale_bar(sheet: Sheet, bounds: tuple[float, float, float, float]) -> None:
-    """A bar of a round number of metres in the lower left corner."""
+    """Draw a scale bar of a round number of metres in the lower left corner."""
     width_m = bounds[2] - bounds[0]
     bar_m = max(
         b

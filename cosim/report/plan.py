@@ -30,14 +30,14 @@ _GRID: Final[Rgb255] = (160, 172, 186)
 _INK: Final[Rgb255] = (70, 84, 104)
 _STEPS_M: Final = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0)
 _LINES = 10
+"""Maximum number of grid lines across the picture of a scenario."""
 _LINES_OF_ALL = 25
-"""The grid has so many lines across the picture, at most, and across that of a whole place or a
-part of one."""
+"""Maximum number of grid lines across the picture of a place or a part of it."""
 _MARGIN_M: Final = 12.0
 _LEAST_SHARE: Final = 0.6
-"""The shorter side of a picture is this much of the longer, about."""
+"""Least ratio of the shorter to the longer side of a picture."""
 _BETWEEN_PX: Final = 60.0
-"""From one number along the way to the next, at least."""
+"""Least distance, pixels, between two labels along the route."""
 _Bounds = tuple[float, float, float, float]
 
 
@@ -49,8 +49,13 @@ def draw_plan(
     part: _Bounds | None = None,
     credit: str = "",
 ) -> Image:
-    """Draw a scenario, (H, W, 3) uint8 RGB; None: the place alone. whole: its whole place; part:
-    what lies within x0, y0, x1, y1 (metres) of it; credit: of the map's data."""
+    """Draw a scenario on its place: (H, W, 3) uint8 RGB.
+
+    scenario: None to draw the place alone
+    whole: True to show the whole place
+    part: x0, y0, x1, y1 in metres to show
+    credit: attribution of the map data
+    """
     bounds = part or _around(street_map.bounds if whole or scenario is None else _ends(scenario))
     lines = _LINES_OF_ALL if part or whole or scenario is None else _LINES
     longest_m = max(bounds[2] - bounds[0], bounds[3] - bounds[1])
@@ -72,7 +77,7 @@ def draw_plan(
 
 
 def _ends(scenario: Scenario) -> _Bounds:
-    """What a scenario covers."""
+    """Return the bounds of a scenario."""
     spots = [*scenario.route, *((event.x_m, event.y_m) for event in scenario.events)]
     (x0, y0) = np.min(spots, axis=0).tolist()
     (x1, y1) = np.max(spots, axis=0).tolist()
@@ -80,7 +85,7 @@ def _ends(scenario: Scenario) -> _Bounds:
 
 
 def _around(bounds: _Bounds) -> _Bounds:
-    """The same with a margin, and not much longer than wide."""
+    """Return bounds with a margin and a limited aspect ratio."""
     x0, y0, x1, y1 = bounds
     least_m = _LEAST_SHARE * max(x1 - x0, y1 - y0)
     wide_m, high_m = (_MARGIN_M + max(0.0, least_m - long_m) / 2 for long_m in (x1 - x0, y1 - y0))
@@ -88,7 +93,7 @@ def _around(bounds: _Bounds) -> _Bounds:
 
 
 def _grid(sheet: Sheet, bounds: _Bounds, step_m: float) -> None:
-    """Lines of equal x and y, with their coordinates at the lower and the left edge."""
+    """Draw grid lines with their coordinates at the lower and left edge."""
     x0, y0, x1, y1 = bounds
     edge_m = 14.0 / sheet.px_per_m
     for x in np.arange(np.ceil(x0 / step_m) * step_m, x1, step_m).tolist():
@@ -100,7 +105,7 @@ def _grid(sheet: Sheet, bounds: _Bounds, step_m: float) -> None:
 
 
 def _metres(sheet: Sheet, scenario: Scenario) -> None:
-    """How far it is along the way."""
+    """Label the route with its arc length, metres."""
     route = scenario.route_line
     least_m = max(route.length_m / _LINES, _BETWEEN_PX / sheet.px_per_m)
     step_m = next((step for step in _STEPS_M[1:] if step >= least_m), _STEPS_M[-1])
@@ -111,7 +116,7 @@ def _metres(sheet: Sheet, scenario: Scenario) -> None:
 
 
 def _words(scenario: Scenario) -> list[tuple[str, Rgb255]]:
-    """What stands below the picture."""
+    """Return the legend of a scenario."""
     return [
         (scenario.id, TRACK),
         (f"way of {scenario.route_line.length_m:.1f} m", ROUTE),

@@ -1,4 +1,4 @@
-"""Run folders: files of an episode, the database `results.sqlite`, and what resuming needs."""
+"""Run folder: episode files, the database `results.sqlite`, locking and resuming."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ DATABASE = "results.sqlite"
 REMEDY = (
     "give the command of the run again with --resume, which makes it anew from the records on disk"
 )
-_DAMAGE = {
+_DAMAGE_CODES = {
     sqlite3.SQLITE_ERROR,
     sqlite3.SQLITE_CORRUPT,
     sqlite3.SQLITE_NOTADB,
@@ -41,7 +41,7 @@ _DAMAGE = {
 
 
 def connected(path: Path) -> sqlite3.Connection:
-    """The database of a run folder, opened; made where there is none."""
+    """Open the database of a run folder; create it if missing."""
     database = sqlite3.connect(path / DATABASE, timeout=30.0)
     try:
         database.execute("pragma journal_mode = wal")
@@ -53,8 +53,10 @@ def connected(path: Path) -> sqlite3.Connection:
 
 
 def check_database(path: Path) -> None:
-    """Read all of the database, made where there is none. Raises sqlite3.Error or DecodeError if it
-    is damaged."""
+    """Read the whole database; create it if missing.
+
+    Raises sqlite3.Error or DecodeError if it is damaged.
+    """
     with closing(connected(path)) as database, database:
         database.execute(
             "create table if not exists episodes (scenario text primary key, record text)"
@@ -66,7 +68,7 @@ def check_database(path: Path) -> None:
 
 
 def records_in(database: sqlite3.Connection) -> list[Record]:
-    """All records, in the order in which their episodes ended. Raises sqlite3.Error,
+    """Return all records in the order in which their episodes ended. Raises sqlite3.Error,
     DecodeError."""
     rows: Sequence[tuple[object]] = database.execute(
         "select record from episodes order by rowid"
@@ -81,18 +83,18 @@ def _text(value: object) -> str:
 
 
 def is_damaged(error: sqlite3.Error) -> bool:
-    """Whether it is the file that is wrong, not the disk or who holds it."""
+    """Return whether an error means a damaged file, not a full disk or a lock."""
     code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
-    return code & 0xFF in _DAMAGE or code == sqlite3.SQLITE_IOERR_SHORT_READ
+    return code & 0xFF in _DAMAGE_CODES or code == sqlite3.SQLITE_IOERR_SHORT_READ
 
 
 def damaged(path: Path, error: Exception) -> RunError:
-    """The error for the damaged database of a run folder."""
+    """Return the error for a damaged database of a run folder."""
     return RunError(f"{path / DATABASE} is damaged ({error}): {REMEDY}")
 
 
 def trouble_with(path: Path, error: sqlite3.Error) -> RunError | MachineError:
-    """What is said of an error of the database."""
+    """Return the error to raise for a database error."""
     if is_damaged(error):
         return damaged(path, error)
     return MachineError(
@@ -106,26 +108,28 @@ RUN_AGAIN = (
     "give the command of the run again with --resume, which runs this episode again and keeps "
     "the others"
 )
-"""The remedy for files that are damaged or missing."""
+"""Remedy for files that are damaged or missing."""
 
 
 def record_file(path: Path, scenario_id: str) -> Path:
-    """Where the record of an episode is."""
+    """Return the path of an episode's record."""
     return path / "episodes" / scenario_id / "record.json"
 
 
 def damage_of_episode(path: Path, scenario_id: str, row: Record | None = None) -> str:
-    """What is wrong with the files of an episode that has ended, with the file; "" if nothing is.
-    row: the record that the run's database holds, with which the file must agree."""
+    """Return what is wrong with the files of an ended episode, naming the file; "" if nothing is.
+
+    row: record in the run's database, which the file must match
+    """
     file = record_file(path, scenario_id)
     if row is not None and row.ended is None and not file.exists():
-        return ""  # it was given up, and left no file
+        return ""  # given up: an episode without files
     try:
         record = Record.load(file)
         if record.scenario.id != scenario_id:
             return f"{file} is of scenario {shown(record.scenario.id)}"
-        if row is not None and (apart := told_apart(record, row)):
-            return f"{file}: not what results.sqlite has of this episode: {apart}"
+        if row is not None and (difference := told_apart(record, row)):
+            return f"{file}: not what results.sqlite has of this episode: {difference}"
         trajectory = file.with_name(TRAJECTORY)
         if record.ended is not None and (ticks := len(Log.load(trajectory))) != record.ticks:
             return f"{trajectory}: holds {ticks} ticks, and its record {record.ticks}"
@@ -144,39 +148,39 @@ def _damage_of_demonstration(file: Path) -> str:
 
 
 def told_apart(mine: Record, theirs: Record) -> str:
-    """Where two records of an episode are first apart, in words; "" where they are not."""
-    told, other = (msgspec.to_builtins(RECORD_FILE.flat(record)) for record in (mine, theirs))
-    for field, value in told.items():
+    """Return the first difference between two records, in words; "" if they are equal."""
+    fields, their_fields = (
+        msgspec.to_builtins(RECORD_FILE.flat(record)) for record in (mine, theirs)
+    )
+    for field, value in fields.items():
         if isinstance(value, dict):
-            for name in dict.fromkeys([*value, *other[field]]):
-                if value.get(name) != other[field].get(name):
-                    return f"{field}.{name} is {value.get(name)}, there {other[field].get(name)}"
-        elif value != other[field]:
-            return f"{field} is {shown(value)}, there {shown(other[field])}"
+            for name in dict.fromkeys([*value, *their_fields[field]]):
+                if value.get(name) != (their_value := their_fields[field].get(name)):
+                    return f"{field}.{name} is {value.get(name)}, there {their_value}"
+        elif value != their_fields[field]:
+            return f"{field} is {shown(value)}, there {shown(their_fields[field])}"
     return ""
 
 
 _ATTEMPTS = "attempts.jsonl"
 _MOST_BYTES = 256 << 20
-_KEPT = "finished episodes are kept; make room and go on with --resume"
+_ROOM_REMEDY = "finished episodes are kept; make room and go on with --resume"
 UNFINISHED = {"episodes", "logs", "lock", "scenarios.json", "run.json.part"}
-"""All that a run leaves that was killed before it began."""
+"""Files that a run leaves if it was killed before it began."""
 
 
 class FailedAttempt(NamedTuple):
-    """A scenario that was begun in vain. away: its worker was lost together with its machine, or
-    left."""
+    """Failed attempt at a scenario. away: its worker left, or its machine was lost."""
 
     scenario: str
     away: bool
 
 
 class RunFolder:
-    """A run folder held by this process. Use as a context manager: it is locked meanwhile, before
-    anything is written.
+    """Run folder locked by this process; use as a context manager.
 
-    path: absolute, so that it stays what it is wherever the process goes. notes: what was mended as
-    it was opened, in words.
+    path: absolute path
+    notes: repairs made on opening, in words
     """
 
     def __init__(self, path: Path, spec: RunSpec, suite: Suite | None = None) -> None:
@@ -185,19 +189,25 @@ class RunFolder:
         self.notes: list[str] = []
         self._suite = suite
         self._lock = lock(path / "lock", wait=False)
-        self._adding: sqlite3.Connection | None = None
+        self._add_connection: sqlite3.Connection | None = None
 
     @classmethod
     def create(cls, path: Path, spec: RunSpec, suite: Suite) -> RunFolder:
-        """A new run folder. Raises RunError when one is there already, MachineError where nothing
-        can be written."""
+        """Prepare a new run folder.
+
+        Raises RunError if the folder holds a run, MachineError if it cannot be written.
+        """
         refuse_used(path)
         return cls(path, spec, suite)
 
     @classmethod
     def resume(cls, path: Path, spec: RunSpec, whole: Suite | None = None) -> RunFolder:
-        """The run folder at `path`, to be finished. Raises RunError, naming the difference, if it
-        is of another run. whole: the suite that its scenarios are of."""
+        """Prepare to resume the run folder at `path`.
+
+        whole: suite that its scenarios are from
+
+        Raises RunError, naming the difference, if the folder holds another run.
+        """
         refuse_unbegun(path)
         found = read_spec(path)
         if found.policy == spec.policy and found.setup.policy_source != spec.setup.policy_source:
@@ -205,11 +215,11 @@ class RunFolder:
                 f"{path} is of another run: the source of policy '{spec.policy}' was edited since "
                 "it began. Resume with the source as it was, or choose another --out."
             )
-        if (apart := found.apart(spec, whole=whole)) is not None:
+        if (difference := found.apart(spec, whole=whole)) is not None:
             raise RunError(
-                f"{path} is of another run: its {apart.field} is {apart.mine}, now asked for "
-                f"is {apart.theirs}. "
-                f"Resume with the same command, or choose another --out.{apart.hint}"
+                f"{path} is of another run: its {difference.field} is "
+                f"{difference.mine}, now asked for is {difference.theirs}. "
+                f"Resume with the same command, or choose another --out.{difference.hint}"
             )
         return cls(path, found)
 
@@ -235,16 +245,16 @@ class RunFolder:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if self._adding is not None:
-            self._adding.close()
-            self._adding = None
+        if self._add_connection is not None:
+            self._add_connection.close()
+            self._add_connection = None
         self._lock.release()
 
     def episode_folder(self, scenario_id: str) -> Path:
         return self.path / "episodes" / scenario_id
 
     def finished(self) -> set[str]:
-        """Ids of the scenarios that have a row."""
+        """Return ids of the scenarios with a row."""
         try:
             with closing(connected(self.path)) as database:
                 return {
@@ -254,12 +264,12 @@ class RunFolder:
             raise trouble_with(self.path, error) from error
 
     def add(self, record: Record) -> None:
-        """Append a finished episode. A second one of the same scenario is not taken."""
+        """Append the row of a finished episode; a second one of the same scenario is ignored."""
         values = record.scenario.id, RECORD_FILE.encode(record).decode()
         try:
-            if self._adding is None:  # kept open: opening and closing takes longer than adding
-                self._adding = connected(self.path)
-            with self._adding as database:
+            if self._add_connection is None:  # reused: opening takes longer than adding
+                self._add_connection = connected(self.path)
+            with self._add_connection as database:
                 database.execute(
                     "insert or ignore into episodes (scenario, record) values (?, ?)", values
                 )
@@ -267,7 +277,7 @@ class RunFolder:
             raise trouble_with(self.path, error) from error
 
     def _remove(self, scenarios: Sequence[str]) -> None:
-        """Remove the rows of episodes that are to be run again."""
+        """Delete the rows of episodes that will run again."""
         try:
             with closing(connected(self.path)) as database, database:
                 database.executemany(
@@ -277,8 +287,10 @@ class RunFolder:
             raise trouble_with(self.path, error) from error
 
     def keep(self, record: Record, log: bytes = b"", demonstration: bytes = b"") -> None:
-        """Write what came out of an episode, the record last, and add its row. log: the bytes of
-        its `Log`."""
+        """Write the files of an episode, the record last, and add its row.
+
+        log: bytes of the `Log`
+        """
         target = self.episode_folder(record.scenario.id)
         try:
             target.mkdir(parents=True, exist_ok=True)
@@ -287,7 +299,7 @@ class RunFolder:
                     write_atomic(target / name, data)
             record.save(target / "record.json")
         except OSError as error:
-            raise unwritable(target, error, _KEPT) from error
+            raise unwritable(target, error, _ROOM_REMEDY) from error
         self.add(record)
 
     def keep_frame(self, scenario_id: str, tick: int, png: bytes) -> None:
@@ -297,39 +309,38 @@ class RunFolder:
             frames.mkdir(parents=True, exist_ok=True)
             (frames / f"{tick:06d}.png").write_bytes(png)
         except OSError as error:
-            raise unwritable(frames, error, _KEPT) from error
+            raise unwritable(frames, error, _ROOM_REMEDY) from error
 
     def failed_attempts(self) -> Counter[FailedAttempt]:
-        """How often each scenario was begun in vain, since the run began: whoever coordinated it
-        then."""
+        """Return the number of failed attempts by scenario since the run began."""
         try:
             lines = (self.path / _ATTEMPTS).read_bytes().splitlines()
         except FileNotFoundError:
             return Counter()
         except OSError as error:
-            raise unwritable(self.path / _ATTEMPTS, error, _KEPT) from error
+            raise unwritable(self.path / _ATTEMPTS, error, _ROOM_REMEDY) from error
         found: Counter[FailedAttempt] = Counter()
         for line in lines:
-            with suppress(ValueError, RecursionError):  # the last line of a machine that failed
+            with suppress(ValueError, RecursionError):  # an incomplete last line
                 found[msgspec.json.decode(line, type=FailedAttempt)] += 1
         return found
 
     def keep_failed_attempt(self, attempt: FailedAttempt) -> None:
-        """Write down that a scenario was begun in vain."""
+        """Append a failed attempt to the run's file."""
         try:
             with (self.path / _ATTEMPTS).open("ab") as file:
                 file.write(msgspec.json.encode(attempt) + b"\n")
         except OSError as error:
-            raise unwritable(self.path / _ATTEMPTS, error, _KEPT) from error
+            raise unwritable(self.path / _ATTEMPTS, error, _ROOM_REMEDY) from error
 
     def _is_whole(self, scenario_id: str, row: Record | None = None) -> bool:
-        """Whether what an episode has left can be kept; what is damaged is noted."""
+        """Return whether the files of an episode are valid; note any damage."""
         if damage := damage_of_episode(self.path, scenario_id, row):
             self.notes.append(f"{damage}. This episode is run again.")
         return not damage
 
     def forget(self, scenario_id: str) -> None:
-        """Remove what an earlier attempt at a scenario has left."""
+        """Delete the files of an earlier attempt at a scenario."""
         folder = self.episode_folder(scenario_id)
         shutil.rmtree(folder / "frames", ignore_errors=True)
         try:
@@ -350,7 +361,7 @@ class RunFolder:
         return table
 
     def _begin(self, suite: Suite) -> None:
-        """Write what is run; run.json last, because a folder with it can be resumed."""
+        """Write the spec and scenarios; run.json last, since it marks the folder as resumable."""
         try:
             for folder in (self.path / "episodes", self.path / "logs"):
                 folder.mkdir(exist_ok=True)
@@ -364,38 +375,38 @@ class RunFolder:
             raise unwritable(self.path, error) from error
 
     def _open_database(self) -> None:
-        """Make sure of a sound database with a row for each episode that is whole on disk, and for
-        no other."""
+        """Repair the database, so that exactly the episodes with valid files have a row."""
         database = self.path / DATABASE
-        mended = ""
+        damage = ""
         try:
             check_database(self.path)
         except (sqlite3.Error, msgspec.DecodeError) as error:
             if isinstance(error, sqlite3.Error) and not is_damaged(error):
                 raise trouble_with(self.path, error) from error
-            mended = str(error)
+            damage = str(error)
             for end in ("-wal", "-shm"):
                 database.with_name(DATABASE + end).unlink(missing_ok=True)
             database.replace(database.with_name(DATABASE + ".damaged"))
             check_database(self.path)
         rows = [] if self._suite is not None else read_records(self.path)
-        if gone := [row.scenario.id for row in rows if not self._is_whole(row.scenario.id, row)]:
-            self._remove(gone)
+        if invalid := [row.scenario.id for row in rows if not self._is_whole(row.scenario.id, row)]:
+            self._remove(invalid)
         on_disk = {
             p.parent.name: p.stat().st_mtime_ns for p in self.path.glob("episodes/*/record.json")
         }
-        lacking = set(self.spec.scenarios) & on_disk.keys() - self.finished() - {*gone}
-        whole = [name for name in sorted(lacking, key=on_disk.__getitem__) if self._is_whole(name)]
-        for name in whole:
+        without_row = set(self.spec.scenarios) & on_disk.keys() - self.finished() - {*invalid}
+        restored = [
+            name for name in sorted(without_row, key=on_disk.__getitem__) if self._is_whole(name)
+        ]
+        for name in restored:
             self.add(Record.load(self.episode_folder(name) / "record.json"))
-        if mended:
-            made = f"made anew from {len(whole)} records on disk, kept as {DATABASE}.damaged"
-            self.notes.append(f"{database} was damaged ({mended}): {made}")
+        if damage:
+            repair = f"made anew from {len(restored)} records on disk, kept as {DATABASE}.damaged"
+            self.notes.append(f"{database} was damaged ({damage}): {repair}")
 
 
 def read_spec(path: Path) -> RunSpec:
-    """What the run in a folder is. Raises UsageError, with the runs in it and beside it, when it
-    holds none."""
+    """Load the spec of a run. Raises UsageError, listing nearby runs, if the folder holds none."""
     try:
         return decoded_spec(read_within(path / "run.json", _MOST_BYTES), path / "run.json")
     except FileNotFoundError:
@@ -404,8 +415,8 @@ def read_spec(path: Path) -> RunSpec:
         ]
         if path.is_dir():
             refuse_unbegun(path)
-            there = f"Runs in it and beside it: {listed(str(path), near)}"
-            raise UsageError(f"{path} is no run folder: it holds no run.json. {there}") from None
+            nearby = f"Runs in it and beside it: {listed(str(path), near)}"
+            raise UsageError(f"{path} is no run folder: it holds no run.json. {nearby}") from None
         raise unknown("run", str(path), near) from None
     except NotADirectoryError:
         raise UsageError(
@@ -419,8 +430,7 @@ def read_spec(path: Path) -> RunSpec:
 
 
 def refuse_unbegun(path: Path) -> None:
-    """Raises UsageError where a run is to be resumed that was stopped before its folder was
-    written, or never given."""
+    """Raise UsageError if a folder to be resumed is missing or was stopped before its run began."""
     if not path.exists() or (
         path.is_dir() and {entry.name for entry in path.iterdir()} <= UNFINISHED
     ):
@@ -431,8 +441,10 @@ def refuse_unbegun(path: Path) -> None:
 
 
 def read_records(path: Path, *, untouched: bool = False) -> list[Record]:
-    """The records of a run folder, finished or not, in the order in which they ended. untouched: no
-    byte of the folder changes, also where a run was killed: a copy of its database is read."""
+    """Load the records of a run folder in the order in which their episodes ended.
+
+    untouched: read a copy of the database, so that no byte of the folder changes
+    """
     read_spec(path)
     if not (path / DATABASE).exists():
         if any(path.glob("episodes/*/record.json")):
@@ -453,14 +465,13 @@ def read_records(path: Path, *, untouched: bool = False) -> list[Record]:
 
 
 def refuse_in_use(path: Path) -> None:
-    """Raises RunError, naming the process, while a run is writing to its folder."""
+    """Raise RunError, naming the process, while a run is writing to its folder."""
     if is_locked(path / "lock"):
         raise _in_use(path)
 
 
 def refuse_used(path: Path) -> None:
-    """Raises RunError when a folder holds a run, or something else that is not a run's
-    beginning."""
+    """Raise RunError if a folder holds a run, or files other than the start of one."""
     try:
         if (path / "run.json").exists():
             raise RunError(
@@ -472,10 +483,10 @@ def refuse_used(path: Path) -> None:
         raise unwritable(path, error) from error
 
 
-def _acquire(held: FileLock, path: Path) -> None:
+def _acquire(folder_lock: FileLock, path: Path) -> None:
     """Lock the folder. Raises RunError, naming the process that holds it."""
     try:
-        held.acquire()
+        folder_lock.acquire()
     except TimeoutError:
         raise _in_use(path) from None
     (path / "lock").write_text(str(os.getpid()))

@@ -1,5 +1,5 @@
-"""Which failures stand in the gallery: few enough to draw, all runs, structures, events, causes,
-real places."""
+"""Choice of the failures for the gallery: few, but covering runs, structures, events, causes and
+places."""
 
 from __future__ import annotations
 
@@ -14,23 +14,27 @@ from cosim.spec.scenario import CityMap
 
 MOST_FAILURES: Final = 48
 LEAST_FAILURES: Final = 36
-"""So many, if there are, also where fewer show everything."""
+"""Number of failures to show, if available, even without new facets."""
 _START_S: Final = 15.0
-"""To start an episode and draw a failure takes about as long as to simulate so much."""
+"""Cost of starting an episode and drawing a failure, in seconds of simulation."""
 _MOST_S: Final = 600.0
-"""So many seconds are simulated again in all."""
+"""Budget of simulated time for all failures, seconds."""
 WITHIN_S: Final = 150.0
-"""Of an episode failures later than this are not shown where an earlier one is: to come there takes
-long."""
+"""Time in an episode, seconds, after which only its first failure is shown; later ones are costly.
+"""
 _ENOUGH_ALIKE: Final = 30
-"""Of failures with the same facets so many are looked at, the earliest."""
+"""Maximum number of failures considered with the same facets, the earliest ones."""
 _OF_AN_EPISODE: Final = 40
-"""Later failures of one long way are not looked at: to come there takes long."""
+"""Maximum number of failures considered per episode; later ones are costly to replay."""
 
 
 class FailureToShow(NamedTuple):
-    """A failure that may be shown. run: its number; event: of its event, "" without; facets: what
-    it is an example of; place: where."""
+    """Failure that may be shown.
+
+    run: index of the run
+    event: kind of its event, "" without one
+    facets: categories that it is an example of
+    """
 
     run: int
     scenario: str
@@ -41,7 +45,7 @@ class FailureToShow(NamedTuple):
 
 
 def shown_of(runs: Sequence[ReportedRun]) -> list[FailureToShow]:
-    """Every failure that can be shown again: of episodes that came to their end."""
+    """Return every failure that can be replayed: those of completed episodes."""
     found = []
     for number, run in enumerate(runs):
         for record in run.records:
@@ -70,8 +74,7 @@ def shown_of(runs: Sequence[ReportedRun]) -> list[FailureToShow]:
 
 
 class Chosen(NamedTuple):
-    """The failures to show, and the limit that left others out, in words; "" where all are
-    shown."""
+    """Failures to show, and the limit that excluded others, in words; "" if all are shown."""
 
     picks: list[FailureToShow]
     limit: str
@@ -80,10 +83,12 @@ class Chosen(NamedTuple):
 def most_telling(
     candidates: Sequence[FailureToShow], most: int = MOST_FAILURES, within_s: float = WITHIN_S
 ) -> Chosen:
-    """The most telling ones, the most telling first: each adds as many facets as it can for the
-    time that it takes to come there, then a new episode and a new place. Stops when there is
-    nothing new, but not below LEAST_FAILURES; what would take longer than _MOST_S in all is left
-    out, and so are failures later than within_s of their episode, but for its first."""
+    """Choose failures greedily, the most informative first.
+
+    Each choice adds the most new facets per simulated time, then a new episode, then a new place.
+    The choice ends without new facets, but not below LEAST_FAILURES. It stays within _MOST_S of
+    simulation. Failures later than within_s of their episode are skipped, except its first.
+    """
     alike: Counter[frozenset[Hashable]] = Counter()
     left: list[FailureToShow] = []
     begun: set[tuple[int, str]] = set()
@@ -112,8 +117,7 @@ def most_telling(
 
 
 class _Choice:
-    """What is taken so far. reached: of each episode, up to which second it is run again; room_s:
-    what is left."""
+    """Failures chosen so far. room_s: remaining simulation budget."""
 
     def __init__(self) -> None:
         self.picked: list[FailureToShow] = []
@@ -123,13 +127,13 @@ class _Choice:
         self._reached: dict[tuple[int, str], float] = {}
 
     def further_s(self, one: FailureToShow) -> float:
-        """How long its episode has to be simulated beyond what is taken already."""
+        """Return the additional simulated time to reach a failure, seconds."""
         return max(
             Clock().time_s(one.mishap.tick) - self._reached.get((one.run, one.scenario), 0.0), 0.0
         )
 
     def worth(self, one: FailureToShow) -> tuple[bool, float, bool, bool]:
-        """More is better: that there is room for it, new facets for its time, a new episode, a new
+        """Return the sort key of a failure: fits the budget, new facets per time, new episode, new
         place."""
         further_s = self.further_s(one)
         new_episode = (one.run, one.scenario) not in self._reached

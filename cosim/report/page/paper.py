@@ -1,9 +1,8 @@
-"""What the paper reports of the models it ran, in its own engine with its own pictures: facts,
-typed in as they stand.
+"""Results of the paper's models, in its own engine with its own pictures, copied as published.
 
 Source: "SidewalkBench", its tables `tab:terrain_only` (unit tests), `tab:hand_crafted` and
-`tab:hand_crafted_full` (pedestrian-reactive), `tab:long_horizon`. None: the paper has a dash there,
-or no row.
+    `tab:hand_crafted_full` (pedestrian-reactive), `tab:long_horizon`. None: the paper has a dash,
+    or no row.
 """
 
 from __future__ import annotations
@@ -26,7 +25,7 @@ EVENT_COLUMNS: Final = (
     "ped_crossing",
     "gesturing",
 )
-"""Of its pedestrian-reactive tables, in its order."""
+"""Columns of the paper's pedestrian-reactive tables, in its order."""
 
 UNIT_OF_PAPER: Final[Mapping[str, Row]] = {
     "ViNT": (
@@ -210,7 +209,7 @@ UNIT_OF_PAPER: Final[Mapping[str, Row]] = {
         0.91,
     ),
 }
-"""SR, SPL, RC of straight, curve, crosswalk in generated places, then the same in scanned ones."""
+"""SR, SPL, RC of straight, curve, crosswalk in generated places, then in scanned ones."""
 
 REACTIVE_OF_PAPER: Final[Mapping[str, Mapping[str, Row]]] = {
     "success": {
@@ -247,8 +246,7 @@ REACTIVE_OF_PAPER: Final[Mapping[str, Mapping[str, Row]]] = {
         "OpenPilot": (_NO, 0.93, 0.71, 0.64, 0.92, 1.03, 0.95, _NO, 1.04),
     },
 }
-"""By metric: static, obstructing, conversing, queueing, frontal, lateral, overtaking, ped_crossing,
-gesturing."""
+"""Results by metric and model, in the order of EVENT_COLUMNS."""
 
 LONG_OF_PAPER: Final[Mapping[str, Row]] = {
     "ViNT": (21.20, 4.29, 16.90, 0.00, 1.11, 27.52, 4.87, 8.24, 14.42, 0.39),
@@ -261,4 +259,4 @@ LONG_OF_PAPER: Final[Mapping[str, Row]] = {
     "FlowPilot": (3.40, 2.30, 1.10, 0.00, 1.22, 1.69, 1.31, 0.00, 0.37, 0.73),
     "OpenPilot": (1.34, 1.01, 0.33, 0.01, 1.34, 0.94, 0.56, 0.00, 0.37, 0.83),
 }
-"""FC, C, OL, F per 100 m and V in generated places, then the same in scanned ones."""
+"""FC, C, OL, F per 100 m and V, m/s, in generated places, then in scanned ones."""

@@ -1,4 +1,4 @@
-"""Why an episode failed, in words: from its record, its log, and who the other was."""
+"""Describe in words why an episode failed, from its record and log."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from cosim.spec.events import Event
 from cosim.spec.scenario import Scenario
 
 _STANDS_MPS: Final = 0.2
-"""Slower than this somebody is said to have stood."""
+"""Speed below which a body counts as standing."""
 _ASTRAY_M: Final = 5.0
-"""Farther from the route there is no telling on which side of it the way was left."""
+"""Distance from the route, metres, beyond which its side is meaningless."""
 _OVER_S: Final = 0.4
-"""Over so long a time a speed is taken from recorded places."""
+"""Time span, seconds, over which a velocity is estimated from recorded positions."""
 CAUSES: Final = (
     "person",
     "vehicle",
@@ -31,7 +31,7 @@ CAUSES: Final = (
     "broke the rule",
     "policy crashed",
 )
-"""Kinds of reasons, in the order in which they are shown."""
+"""Causes of failures, in display order."""
 _THINGS: Final = {
     "sign": "sandwich board",
     "cafe": "cafe table",
@@ -46,8 +46,7 @@ _THINGS: Final = {
 
 
 class Other(NamedTuple):
-    """Whom or what the robot met: place and velocity in the robot's frame, x ahead and y left,
-    metres and m/s."""
+    """Body that the robot met, in the robot's frame: x ahead and y left, metres and m/s."""
 
     x_m: float
     y_m: float
@@ -56,15 +55,19 @@ class Other(NamedTuple):
 
     @classmethod
     def seen_from(cls, robot: Floats, at: Floats, velocity: Floats) -> Other:
-        """From the world's frame. robot: (3,) x, y, heading; at, velocity: (2,)."""
+        """Convert from the world frame. robot: (3,) x, y, heading; at, velocity: (2,)."""
         cos, sin = math.cos(robot[2]), math.sin(robot[2])
         turn = np.array([[cos, sin], [-sin, cos]])
         return cls(*(turn @ (at - robot[:2])).tolist(), *(turn @ velocity).tolist())
 
 
 class Mishap(NamedTuple):
-    """What went wrong in an episode, and when. tick: of the log; failure: None where the referee
-    counted none, as when time ran out. cause: one of CAUSES."""
+    """Cause and time of a failed episode.
+
+    tick: index into the log
+    cause: one of CAUSES
+    failure: None if the referee counted none, for example at a timeout
+    """
 
     tick: int
     cause: str
@@ -72,7 +75,7 @@ class Mishap(NamedTuple):
 
 
 def mishaps_of(record: Record) -> list[Mishap]:
-    """Everything that went wrong in an episode, in order; nothing where it succeeded or is
+    """Return everything that went wrong in an episode, in order; empty if it succeeded or is
     invalid."""
     if record.status == "crashed":
         return [Mishap(record.ticks, "policy crashed")]
@@ -86,7 +89,7 @@ def mishaps_of(record: Record) -> list[Mishap]:
 
 
 def cause_of(failure: Failure) -> str:
-    """Which of CAUSES a failure is."""
+    """Return which of CAUSES a failure has."""
     if failure.kind == "out_of_lane":
         return "off the sidewalk"
     if failure.kind == "freezing":
@@ -97,8 +100,10 @@ def cause_of(failure: Failure) -> str:
 def reason_of(
     scenario: Scenario, record: Record, mishap: Mishap, log: Log | None, other: Other | None = None
 ) -> str:
-    """One sentence without its full stop. other: whom the robot met, where that is known better
-    than from the log."""
+    """Return the reason of a mishap as one sentence without its full stop.
+
+    other: body that the robot met, if known more precisely than from the log
+    """
     if mishap.cause == "policy crashed":
         return f"the policy crashed: {record.reason}"
     failure = mishap.failure
@@ -118,7 +123,7 @@ def reason_of(
 
 
 def thing_in_words(failure: Failure) -> str:
-    """What was touched that is neither person nor vehicle: "a parked bike"."""
+    """Return the touched thing, neither person nor vehicle, such as "a parked bike"."""
     of, _, which = failure.other.partition(":")
     kind = which.rpartition(":")[2] if of == "obstacle" else of
     words = (
@@ -129,8 +134,7 @@ def thing_in_words(failure: Failure) -> str:
 
 
 def event_of(scenario: Scenario, mishap: Mishap) -> Event | None:
-    """The event that a mishap belongs to: that of the person who was met, or the scenario's only
-    one."""
+    """Return the event of the person who was met, or the scenario's only event."""
     who = mishap.failure.other if mishap.failure else ""
     theirs = [event for event in scenario.events if who in event.names]
     if not theirs and scenario.ends_on_failure and len(scenario.events) == 1:
@@ -139,8 +143,10 @@ def event_of(scenario: Scenario, mishap: Mishap) -> Event | None:
 
 
 def _met(failure: Failure, other: Other | None, whom: str) -> str:
-    """A collision with somebody who moves, or who stood. The speed that is told is the other's, or
-    the robot's where the other stood."""
+    """Describe a collision with a person or vehicle.
+
+    The speed is the other's, or the robot's if the other stood.
+    """
     stood = failure.robot_speed_mps < _STANDS_MPS
     at = "where it stood" if stood else f"at {failure.robot_speed_mps:.1f} m/s"
     if other is None:
@@ -165,7 +171,7 @@ def _met(failure: Failure, other: Other | None, whom: str) -> str:
 
 
 def _side(x: float, y: float, front: str, aside: str = "to the ", behind: str = "behind") -> str:
-    """Which side of the robot a direction in its frame is."""
+    """Return the side of the robot that a direction in its frame points to."""
     angle = abs(math.degrees(math.atan2(y, x)))
     if angle <= 45.0:
         return front
@@ -173,7 +179,7 @@ def _side(x: float, y: float, front: str, aside: str = "to the ", behind: str = 
 
 
 def _in_tracks(scenario: Scenario, failure: Failure, log: Log | None) -> Other | None:
-    """Who of an event was met, from the tracks of its people; None for anybody else."""
+    """Return the event person that was met, from the event tracks; None for any other person."""
     if log is None:
         return None
     for number, event in enumerate(scenario.events):
@@ -227,7 +233,7 @@ def _nearest(log: Log | None, tick: int) -> str:
 
 
 def _ended(scenario: Scenario, record: Record) -> str:
-    """An episode that failed without a failure of the referee's."""
+    """Describe an episode that failed without a failure of the referee."""
     done = 100.0 * (record.measures.get("route_completion") or 0.0)
     if record.ended == "goal":
         return "came to the goal, but went between people that it should have passed round"
