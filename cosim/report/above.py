@@ -21,7 +21,7 @@ from cosim.report.legend import Image, Rgb255, legend, wide_px
 from cosim.results.log import Log
 from cosim.results.record import Record
 from cosim.spec.obstacle import footprint
-from cosim.spec.scenario import Scenario
+from cosim.spec.scenario import Barrier, Scenario
 
 _MARGIN_M: Final = 25.0
 LONGEST_PX: Final = 2400
@@ -60,6 +60,9 @@ FAILURES: Final[dict[str, Rgb255]] = {
     "freezing": (0, 140, 200),
 }
 
+Bounds = tuple[float, float, float, float]
+"""Part of the world in metres: x0, y0, x1, y1."""
+
 
 class Sheet:
     """Picture of a part of the world: x east is right, y north is up.
@@ -67,9 +70,7 @@ class Sheet:
     bounds: x0, y0, x1, y1 in metres
     """
 
-    def __init__(
-        self, bounds: tuple[float, float, float, float], px_per_m: float = PX_PER_M
-    ) -> None:
+    def __init__(self, bounds: Bounds, px_per_m: float = PX_PER_M) -> None:
         x0, y0, x1, y1 = bounds
         self.px_per_m = min(px_per_m, LONGEST_PX / max(x1 - x0, y1 - y0))
         self._x0 = x0
@@ -123,31 +124,33 @@ class Sheet:
         size: font scale of OpenCV
         """
         x, y = (self.px(np.array([xy]))[0] // 16).tolist()
-        clear = round(beside_m * self.px_per_m)
-        wide = wide_px(words, size)
-        tall = round(22 * size)
-        gap = clear + TEXT_GAP_PX
-        left = x - wide // 2
+        clear_px = round(beside_m * self.px_per_m)
+        text_width = wide_px(words, size)
+        text_height = round(22 * size)
+        gap = clear_px + TEXT_GAP_PX
+        left = x - text_width // 2
         corners = [
-            (left, y + gap + tall),
+            (left, y + gap + text_height),
             (left, y - gap),
-            (x + gap, y + tall // 2),
-            (x - gap - wide, y + tall // 2),
+            (x + gap, y + text_height // 2),
+            (x - gap - text_width, y + text_height // 2),
         ]
         for row in (1, 2, 3):
-            further = row * (tall + 10)
-            corners += [(left, y + gap + tall + further), (left, y - gap - further)]
+            further = row * (text_height + 10)
+            corners += [(left, y + gap + text_height + further), (left, y - gap - further)]
         height, width = self.image.shape[:2]
         corners = [
-            (max(3, min(a, width - wide - 3)), max(tall + 3, min(b, height - 5)))
+            (max(3, min(a, width - text_width - 3)), max(text_height + 3, min(b, height - 5)))
             for a, b in corners
         ]
-        plates = [shapely.box(a - 3, b - tall - 3, a + wide + 3, b + 5) for a, b in corners]
-        mark = shapely.box(x - clear, y - clear, x + clear, y + clear)
-        taken = shapely.union_all([*self._labels, mark])
-        free = [k for k, plate in enumerate(plates) if not taken.intersects(plate)]
-        under = [self._pixels(plate).std() for plate in plates]
-        chosen = min(free, key=lambda k: (round(under[k] / PLAIN_STD), k)) if free else 0
+        plates = [
+            shapely.box(a - 3, b - text_height - 3, a + text_width + 3, b + 5) for a, b in corners
+        ]
+        mark = shapely.box(x - clear_px, y - clear_px, x + clear_px, y + clear_px)
+        occupied = shapely.union_all([*self._labels, mark])
+        free = [k for k, plate in enumerate(plates) if not occupied.intersects(plate)]
+        contrast = [self._pixels(plate).std() for plate in plates]
+        chosen = min(free, key=lambda k: (round(contrast[k] / PLAIN_STD), k)) if free else 0
         self._labels += [plates[chosen], mark]
         plate = self._pixels(plates[chosen])
         plate[:] = 191 + plate // 4
@@ -168,12 +171,16 @@ class Sheet:
         return self.image[y0:y1, x0:x1]
 
 
+def bounds_around(points: Sequence[tuple[float, float]], margin_m: float) -> Bounds:
+    """Return the bounds of points with a margin, metres."""
+    low = np.min(points, axis=0) - margin_m
+    high = np.max(points, axis=0) + margin_m
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
 def draw_above(street_map: StreetMap, scenario: Scenario, record: Record, log: Log) -> Image:
     """Draw an episode: (H, W, 3) uint8 RGB."""
-    route = np.array(scenario.route)
-    low = route.min(axis=0) - _MARGIN_M
-    high = route.max(axis=0) + _MARGIN_M
-    bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    bounds = bounds_around(scenario.route, _MARGIN_M)
     sheet = Sheet(
         bounds, max(PX_PER_M, USUAL_PX / max(bounds[2] - bounds[0], bounds[3] - bounds[1]))
     )
@@ -196,15 +203,17 @@ def draw_way_and_things(sheet: Sheet, scenario: Scenario) -> None:
     """Draw the route, barriers and obstacles of a scenario."""
     sheet.line(np.array(scenario.route), ROUTE, 0.4)
     for barrier in scenario.barriers:
-        across = (
-            np.array([-math.sin(barrier.heading_rad), math.cos(barrier.heading_rad)])
-            * barrier.length_m
-            / 2
-        )
-        middle = np.array([barrier.x_m, barrier.y_m])
-        sheet.line(np.array([middle - across, middle + across]), BARRIER, 0.5)
+        sheet.line(barrier_line(barrier), BARRIER, 0.5)
     for obstacle in scenario.obstacles:
         sheet.area(footprint(obstacle), OBSTACLE)
+
+
+def barrier_line(barrier: Barrier) -> Floats:
+    """Return the (2, 2) ends of a barrier, metres."""
+    cos, sin = math.cos(barrier.heading_rad), math.sin(barrier.heading_rad)
+    across = np.array([-sin, cos]) * barrier.length_m / 2
+    middle = np.array([barrier.x_m, barrier.y_m])
+    return np.array([middle - across, middle + across])
 
 
 def draw_ends_and_events(sheet: Sheet, scenario: Scenario) -> None:

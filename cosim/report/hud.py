@@ -61,9 +61,9 @@ def fill(image: Image, area: Area, picture: Image, title: str = "") -> None:
         image[area.y : area.y + 2, area.x : area.x + area.width] = 250
     if title:
         size = max(0.33, 0.45 * len(image) / 720)
-        tall = cv2.getTextSize(title, _FONT, size, 1)[0][1]
-        shade(image, (area.x, area.y, area.x + area.width, area.y + tall + 12))
-        words(image, title, (area.x + 7, area.y + tall + 6), size, QUIET)
+        height = cv2.getTextSize(title, _FONT, size, 1)[0][1]
+        shade(image, (area.x, area.y, area.x + area.width, area.y + height + 12))
+        words(image, title, (area.x + 7, area.y + height + 6), size, QUIET)
 
 
 def shade(image: Image, area: tuple[int, int, int, int], strength: float = 0.6) -> None:
@@ -87,20 +87,20 @@ def bar(image: Image, area: Area, left: str, right: str, share: float) -> None:
         150,
         250,
     )
-    needed = sum(cv2.getTextSize(text, _FONT, 1.0, 1)[0][0] for text in (left, right))
-    size = min(max(0.4, 0.0125 * area.height), (area.width - 3 * _MARGIN_PX) / needed)
-    long, tall = cv2.getTextSize(right, _FONT, size, 1)[0]
-    y = area.y + line_px + (area.height - line_px + tall) // 2
+    unit_width = sum(cv2.getTextSize(text, _FONT, 1.0, 1)[0][0] for text in (left, right))
+    size = min(max(0.4, 0.0125 * area.height), (area.width - 3 * _MARGIN_PX) / unit_width)
+    width, height = cv2.getTextSize(right, _FONT, size, 1)[0]
+    y = area.y + line_px + (area.height - line_px + height) // 2
     words(image, left, (_MARGIN_PX, y), size)
-    words(image, right, (area.width - _MARGIN_PX - long, y), size)
+    words(image, right, (area.width - _MARGIN_PX - width, y), size)
 
 
 def caption(image: Image, area: Area, text: str, colour: Rgb255) -> None:
     """Draw a line of text at the upper middle of an area."""
     size = max(0.5, 0.9 * area.height / 676)
-    long, tall = cv2.getTextSize(text, _FONT, size, 1)[0]
-    x = area.x + (area.width - long) // 2
-    y = area.y + tall
-    edge = tall * 2 // 3
-    shade(image, (max(x - edge, 0), y - edge, x + long + edge, y + tall + edge), 0.65)
-    words(image, text, (x, y + tall), size, colour)
+    width, height = cv2.getTextSize(text, _FONT, size, 1)[0]
+    x = area.x + (area.width - width) // 2
+    y = area.y + height
+    edge = height * 2 // 3
+    shade(image, (max(x - edge, 0), y - edge, x + width + edge, y + height + edge), 0.65)
+    words(image, text, (x, y + height), size, colour)

@@ -21,6 +21,8 @@ from cosim.report.above import (
     RESIDENT,
     ROUTE,
     Sheet,
+    barrier_line,
+    bounds_around,
     draw_streets,
 )
 from cosim.report.legend import Image, Rgb255
@@ -54,21 +56,12 @@ class Minimap:
     def __init__(
         self, street_map: StreetMap, scenario: Scenario, footprint_m: tuple[float, float]
     ) -> None:
-        route = np.array(scenario.route)
-        low = route.min(axis=0) - 4.0 * MINIMAP_REACH_M
-        high = route.max(axis=0) + 4.0 * MINIMAP_REACH_M
-        bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+        bounds = bounds_around(scenario.route, 4.0 * MINIMAP_REACH_M)
         sheet = Sheet(bounds, SHARPEST_PX_PER_M)
         draw_streets(sheet, street_map, shapely.box(*bounds))
-        sheet.line(route, ROUTE, 0.2)
+        sheet.line(np.array(scenario.route), ROUTE, 0.2)
         for barrier in scenario.barriers:
-            across = (
-                np.array([-math.sin(barrier.heading_rad), math.cos(barrier.heading_rad)])
-                * barrier.length_m
-                / 2
-            )
-            middle = np.array([barrier.x_m, barrier.y_m])
-            sheet.line(np.array([middle - across, middle + across]), BARRIER, 0.4)
+            sheet.line(barrier_line(barrier), BARRIER, 0.4)
         for obstacle in scenario.obstacles:
             sheet.area(footprint(obstacle), OBSTACLE)
         sheet.dot(np.array([scenario.goal]), ROUTE, 0.7)

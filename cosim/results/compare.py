@@ -63,6 +63,9 @@ class PairedDifference(NamedTuple):
         return "better" if (self.low > 0.0) == higher_is_better else "worse"
 
 
+_NO_PAIRS: Final = PairedDifference(math.nan, math.nan, math.nan, math.nan, 0, 0)
+
+
 def difference_of_means(before: Floats, after: Floats) -> PairedDifference:
     """Return the difference of means over (N,) paired values; pairs with a NaN are skipped."""
     both = ~(np.isnan(before) | np.isnan(after))
@@ -70,7 +73,7 @@ def difference_of_means(before: Floats, after: Floats) -> PairedDifference:
     n = len(before)
     changes = after - before
     if not n:
-        return PairedDifference(math.nan, math.nan, math.nan, math.nan, 0, 0)
+        return _NO_PAIRS
     low, high = _interval(changes[_draws(n)].sum(axis=1) / n, n) if changes.any() else (0.0, 0.0)
     return PairedDifference(
         float(before.mean()), float(after.mean()), low, high, n, int(np.count_nonzero(changes))
@@ -91,7 +94,7 @@ def difference_of_rates(
     columns = columns[:, ~np.isnan(columns).any(axis=0)]
     n = columns.shape[1]
     if not n or min(columns[1].sum(), columns[3].sum()) < RATE_NEEDS_M:
-        return PairedDifference(math.nan, math.nan, math.nan, math.nan, 0, 0)
+        return _NO_PAIRS
     counted, metres, counted_after, metres_after = columns
     rates = per * counted.sum() / metres.sum(), per * counted_after.sum() / metres_after.sum()
     differs = (counted != counted_after) | (metres != metres_after)
@@ -272,7 +275,7 @@ def _difference(name: str, before: pd.DataFrame, after: pd.DataFrame) -> PairedD
     if name not in POOLED:
         return difference_of_means(numbers(before, name), numbers(after, name))
     if "crashed" in {*before["status"], *after["status"]}:
-        return PairedDifference(math.nan, math.nan, math.nan, math.nan, 0, 0)
+        return _NO_PAIRS
     counted, metres = POOLED[name]
     one, other = ((numbers(table, counted), numbers(table, metres)) for table in (before, after))
     return difference_of_rates(one, other)

@@ -18,13 +18,13 @@ from cosim.results.finished_run import check_records, read_record
 from cosim.results.record import Record
 from cosim.results.run_folder import (
     RUN_AGAIN,
-    TRAJECTORY,
     RunFolder,
     read_records,
     read_spec,
     record_file,
     refuse_in_use,
     told_apart,
+    trajectory_file,
 )
 from cosim.results.run_spec import RunSpec
 from cosim.spec.scenario import Scenario, read_suite
@@ -127,8 +127,9 @@ def _read(path: Path, first: _Part | None) -> _Part:
             records[name] = (
                 in_table[name] if name in in_table else _not_in_table(path, file, scenarios)
             )
-            if records[name].ended is not None and not file.with_name(TRAJECTORY).exists():
-                raise RunError(f"{file.with_name(TRAJECTORY)}: not there: {RUN_AGAIN}")
+            trajectory = trajectory_file(path, name)
+            if records[name].ended is not None and not trajectory.exists():
+                raise RunError(f"{trajectory}: not there: {RUN_AGAIN}")
     return _Part(path, spec, records)
 
 
@@ -148,7 +149,7 @@ def _check_equal(name: str, one: _Part, other: _Part) -> None:
     )
     difference = told_apart(other_record, record)
     if not difference:
-        logs = [record_file(part.path, name).with_name(TRAJECTORY) for part in (one, other)]
+        logs = [trajectory_file(part.path, name) for part in (one, other)]
         difference = "" if _same_arrays(*logs) else "trajectory.npz is another one"
     if difference:
         raise RunError(

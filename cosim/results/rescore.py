@@ -18,11 +18,10 @@ from cosim.core.errors import RunError
 from cosim.core.progress import Progress, ignore
 from cosim.results.event_monitor import why_invalid
 from cosim.results.finished_run import WholeRun, read_whole_run
-from cosim.results.log import Log
 from cosim.results.metrics import COUNTERFACTUAL, METRICS, EpisodeFacts, every_metric
 from cosim.results.record import Record
 from cosim.results.rejudge import contradictions
-from cosim.results.run_folder import RUN_AGAIN, TRAJECTORY, record_file
+from cosim.results.run_folder import load_log
 from cosim.results.table import table_of
 from cosim.spec.scenario import Scenario
 
@@ -87,7 +86,7 @@ def _scored(run: WholeRun, scenario: Scenario, record: Record) -> tuple[Record, 
     measures: dict[str, float | None] = {}
     found = []
     if record.ended is not None:
-        log = _trajectory(run.path, record.scenario.id)
+        log = load_log(run.path, record.scenario.id)
         found = [
             (what, recorded, shown)
             for what, recorded, shown in contradictions(record, scenario, log)
@@ -109,14 +108,6 @@ def _scored(run: WholeRun, scenario: Scenario, record: Record) -> tuple[Record, 
         for what, a, b in found
     ]
     return msgspec.structs.replace(record, measures=measures), differences
-
-
-def _trajectory(path: Path, scenario_id: str) -> Log:
-    file = record_file(path, scenario_id).with_name(TRAJECTORY)
-    try:
-        return Log.load(file)
-    except RunError as error:
-        raise RunError(f"{error}: {RUN_AGAIN}") from error
 
 
 def _cells_that_differ(file: Path, computed: list[Record]) -> Iterator[Difference]:

@@ -116,6 +116,19 @@ def record_file(path: Path, scenario_id: str) -> Path:
     return path / "episodes" / scenario_id / "record.json"
 
 
+def trajectory_file(path: Path, scenario_id: str) -> Path:
+    """Return the path of an episode's trajectory."""
+    return record_file(path, scenario_id).with_name(TRAJECTORY)
+
+
+def load_log(path: Path, scenario_id: str) -> Log:
+    """Load the log of an episode. Raises RunError with the remedy."""
+    try:
+        return Log.load(trajectory_file(path, scenario_id))
+    except RunError as error:
+        raise RunError(f"{error}: {RUN_AGAIN}") from error
+
+
 def damage_of_episode(path: Path, scenario_id: str, row: Record | None = None) -> str:
     """Return what is wrong with the files of an ended episode, naming the file; "" if nothing is.
 

@@ -17,14 +17,14 @@ LEAST_FAILURES: Final = 36
 """Number of failures to show, if available, even without new facets."""
 _START_S: Final = 15.0
 """Cost of starting an episode and drawing a failure, in seconds of simulation."""
-_MOST_S: Final = 600.0
+_BUDGET_S: Final = 600.0
 """Budget of simulated time for all failures, seconds."""
 WITHIN_S: Final = 150.0
 """Time in an episode, seconds, after which only its first failure is shown; later ones are costly.
 """
-_ENOUGH_ALIKE: Final = 30
+_MAX_ALIKE: Final = 30
 """Maximum number of failures considered with the same facets, the earliest ones."""
-_OF_AN_EPISODE: Final = 40
+_MAX_PER_EPISODE: Final = 40
 """Maximum number of failures considered per episode; later ones are costly to replay."""
 
 
@@ -53,7 +53,7 @@ def shown_of(runs: Sequence[ReportedRun]) -> list[FailureToShow]:
                 continue
             scenario = run.scenarios[record.scenario.id]
             family, kind = table_of_paper(scenario), example_of(scenario)
-            for mishap in mishaps_of(record)[:_OF_AN_EPISODE]:
+            for mishap in mishaps_of(record)[:_MAX_PER_EPISODE]:
                 event = event_of(scenario, mishap)
                 facets: set[Hashable] = {
                     (run.label, family, kind),
@@ -63,11 +63,11 @@ def shown_of(runs: Sequence[ReportedRun]) -> list[FailureToShow]:
                     facets.add((run.label, family, "event", event.kind))
                 if isinstance(scenario.place, CityMap):
                     facets.add(scenario.place.map)
-                words = "" if event is None else event.kind
-                where = place_in_words(scenario)
+                event_kind = "" if event is None else event.kind
+                place = place_in_words(scenario)
                 found.append(
                     FailureToShow(
-                        number, record.scenario.id, mishap, words, frozenset(facets), where
+                        number, record.scenario.id, mishap, event_kind, frozenset(facets), place
                     )
                 )
     return found
@@ -86,7 +86,7 @@ def most_telling(
     """Choose failures greedily, the most informative first.
 
     Each choice adds the most new facets per simulated time, then a new episode, then a new place.
-    The choice ends without new facets, but not below LEAST_FAILURES. It stays within _MOST_S of
+    The choice ends without new facets, but not below LEAST_FAILURES. It stays within _BUDGET_S of
     simulation. Failures later than within_s of their episode are skipped, except its first.
     """
     alike: Counter[frozenset[Hashable]] = Counter()
@@ -96,7 +96,7 @@ def most_telling(
         soon = (one.run, one.scenario) not in begun or Clock().time_s(one.mishap.tick) <= within_s
         begun.add((one.run, one.scenario))
         alike[one.facets] += soon
-        if soon and alike[one.facets] <= _ENOUGH_ALIKE:
+        if soon and alike[one.facets] <= _MAX_ALIKE:
             left.append(one)
     choice = _Choice()
     limit = ""
@@ -105,7 +105,7 @@ def most_telling(
         if len(choice.picked) >= most:
             limit = f"--failures {most}"
         elif choice.further_s(best) > choice.room_s:
-            limit = f"more than {_MOST_S:g} s would be simulated again"
+            limit = f"more than {_BUDGET_S:g} s would be simulated again"
         elif len(choice.picked) >= LEAST_FAILURES and not best.facets - choice.seen:
             limit = "the others show no other run, event, cause or place"
         else:
@@ -122,7 +122,7 @@ class _Choice:
     def __init__(self) -> None:
         self.picked: list[FailureToShow] = []
         self.seen: set[Hashable] = set()
-        self.room_s = _MOST_S
+        self.room_s = _BUDGET_S
         self._places: set[str] = set()
         self._reached: dict[tuple[int, str], float] = {}
 

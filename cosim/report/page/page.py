@@ -23,13 +23,13 @@ from cosim.results.log import holds_waypoints
 from cosim.results.table import injections_in_words, policy_in_words
 from cosim.results.throughput import median_answer_ms
 
-_POLICY: Final = (
+_SECURITY_POLICY: Final = (
     "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 )
 """Content security policy of the page: nothing from outside."""
-_MOST_LISTED: Final = 4
+_MAX_RUNS_NAMED: Final = 4
 """Maximum number of runs named in the heading."""
-_MOST_TOLD: Final = 12
+_MAX_LOST_LISTED: Final = 12
 """Maximum number of crashed and invalid episodes listed per run."""
 _FILTERS: Final = {"run": "label", "cause": "cause", "kind": "kind", "place": "place"}
 """Filters above the gallery: name and field of an entry."""
@@ -81,7 +81,7 @@ def page_of(
     style, viewer, script = map(_asset, ("page.css", "viewer.html", "page.js"))
     template = _templates().get_template("page.html")
     text = template.render(
-        policy=_POLICY,
+        policy=_SECURITY_POLICY,
         labels=list(dict.fromkeys(run.label for run in runs)),
         suites=list(dict.fromkeys(run.spec.suite for run in runs)),
         episodes=sum(len(run.records) for run in runs),
@@ -138,8 +138,8 @@ def _json(name: str, value: object) -> str:
 
 
 def _listed(words: Sequence[str]) -> str:
-    if len(words) > _MOST_LISTED:
-        words = [*words[: _MOST_LISTED - 1], f"{len(words) - _MOST_LISTED + 1} more"]
+    if len(words) > _MAX_RUNS_NAMED:
+        words = [*words[: _MAX_RUNS_NAMED - 1], f"{len(words) - _MAX_RUNS_NAMED + 1} more"]
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
@@ -188,14 +188,14 @@ def _what_was_run(runs: Sequence[ReportedRun]) -> dict[str, Any]:
 
 def _facts(run: ReportedRun) -> dict[str, str]:
     spec = run.spec
-    walls = [record.clock["wall_s"] for record in run.records if "wall_s" in record.clock]
+    wall_times_s = [record.clock["wall_s"] for record in run.records if "wall_s" in record.clock]
     wall = (
-        f"{duration(sum(walls))} in all, {np.median(walls):.1f} s the median episode"
-        if walls
+        f"{duration(sum(wall_times_s))} in all, {np.median(wall_times_s):.1f} s the median episode"
+        if wall_times_s
         else "not told"
     )
     took_ms = median_answer_ms(run.records)
-    follows = any(map(holds_waypoints, run.path.glob("episodes/*/trajectory.npz")))
+    has_waypoints = any(map(holds_waypoints, run.path.glob("episodes/*/trajectory.npz")))
     called = policy_in_words(spec.manifest.name, run.records[0].manifest.privileged)
     return {
         "policy": f"{called} {spec.manifest.version} ({spec.policy})",
@@ -215,7 +215,7 @@ def _facts(run: ReportedRun) -> dict[str, str]:
         if run.records[0].manifest.privileged
         else "no",
         "waypoints": spec.manifest.waypoints.in_words
-        if follows
+        if has_waypoints
         else "none: it answers with commands",
         "robot": ", ".join(f"{name} ({digest})" for name, digest in spec.robots.items()),
         "seed of the run": str(spec.setup.seed),
@@ -230,8 +230,8 @@ def _lost(run: ReportedRun) -> list[str]:
     bad = run.table[run.table["status"] != "done"]
     rows = bad[["status", "scenario", "reason"]].itertuples(index=False)
     lines = [f"{status} {name}: {why}" for status, name, why in rows]
-    more = [f"and {len(lines) - _MOST_TOLD} more"] if len(lines) > _MOST_TOLD else []
-    return [*lines[:_MOST_TOLD], *more]
+    more = [f"and {len(lines) - _MAX_LOST_LISTED} more"] if len(lines) > _MAX_LOST_LISTED else []
+    return [*lines[:_MAX_LOST_LISTED], *more]
 
 
 def _causes_of(runs: Sequence[ReportedRun]) -> Mapping[str, Counter[str]]:

@@ -57,7 +57,7 @@ _NEAR_EDGES: Final = (1.0, 3.0, 6.0, 10.0)
 _NEAR_WORDS: Final = ("nobody", "1 to 2", "3 to 5", "6 to 9", "10 or more")
 _SPEED_EDGES: Final = (0.25, 0.75, 1.25, 1.75)
 _SPEED_WORDS: Final = ("below 0.25", "0.25 to 0.75", "0.75 to 1.25", "1.25 to 1.75", "above 1.75")
-_LEAST_M: Final = 20.0
+_MIN_M: Final = 20.0
 """Least distance travelled, metres, for a rate."""
 _BAR_PX: Final = 40
 _FAMILIES: Final[Mapping[PaperTable, str]] = {
@@ -88,11 +88,15 @@ def plots_of(
     """Build every plot for which the runs have data. colours: by run label."""
     rate = "Failures per 100 m"
     found = [
-        _by(runs, colours, "unit", "kind", UNIT_COLUMNS, "success", "Success by structure"),
-        _by(runs, colours, "reactive", "kind", EVENT_COLUMNS, "success", "Success by event"),
-        _endings(runs),
-        _rates_by_cause(runs),
-        _by(
+        _metric_plot(
+            runs, colours, "unit", "kind", UNIT_COLUMNS, "success", "Success by structure"
+        ),
+        _metric_plot(
+            runs, colours, "reactive", "kind", EVENT_COLUMNS, "success", "Success by event"
+        ),
+        _endings_plot(runs),
+        _cause_rates_plot(runs),
+        _metric_plot(
             runs,
             colours,
             "unit",
@@ -101,7 +105,7 @@ def plots_of(
             "success",
             "Success by light, unit tests",
         ),
-        _by(
+        _metric_plot(
             runs,
             colours,
             "reactive",
@@ -110,7 +114,7 @@ def plots_of(
             "success",
             "Success by light, people in the way",
         ),
-        _by(
+        _metric_plot(
             runs,
             colours,
             "long",
@@ -131,13 +135,13 @@ def plots_of(
     )
     moving = f"{note} Without freezings, which happen at no speed."
     found.append(
-        _exposed(
+        _exposure_plot(
             people, colours, _NEAR_WORDS, f"{rate} by people within {NEAR_M:g} m, long ways", note
         )
     )
     for words, of in speed.items():
         found.append(
-            _exposed(
+            _exposure_plot(
                 of, colours, _SPEED_WORDS, f"{rate} by the robot's speed, m/s, {words}", moving
             )
         )
@@ -201,7 +205,7 @@ def _exposures(runs: Sequence[ReportedRun], progress: Progress) -> tuple[_ByRun,
     return near, fast
 
 
-def _exposed(
+def _exposure_plot(
     of: Mapping[str, list[Exposure]],
     colours: Mapping[str, str],
     words: Sequence[str],
@@ -221,7 +225,7 @@ def _exposed(
             MeanOfEpisodes(
                 100.0 * f.sum() / m.sum(), *interval_of(100.0 * f, m), int((m > 0).sum())
             )
-            if m.sum() >= _LEAST_M
+            if m.sum() >= _MIN_M
             else MeanOfEpisodes(np.nan, np.nan, np.nan, 0)
             for f, m in zip(failures.T, metres.T, strict=True)
         ]
@@ -234,7 +238,7 @@ def _exposed(
     )
 
 
-def _by(
+def _metric_plot(
     runs: Sequence[ReportedRun],
     colours: Mapping[str, str],
     family: PaperTable,
@@ -357,7 +361,7 @@ def _stacked(rows: Mapping[str, Mapping[str, float]], axis: str, form: str) -> d
     }
 
 
-def _endings(runs: Sequence[ReportedRun]) -> Plot | None:
+def _endings_plot(runs: Sequence[ReportedRun]) -> Plot | None:
     """Return the plot of how short episodes ended, as shares."""
     rows: dict[str, dict[str, float]] = {}
     for run in runs:
@@ -384,7 +388,7 @@ def _endings(runs: Sequence[ReportedRun]) -> Plot | None:
     return Plot("How short episodes end", note, _stacked(shares, "share of episodes", ".0%"))
 
 
-def _rates_by_cause(runs: Sequence[ReportedRun]) -> Plot | None:
+def _cause_rates_plot(runs: Sequence[ReportedRun]) -> Plot | None:
     """Return the plot of failure rates by cause on long ways.
 
     An episode whose policy crashed has no metres; the note counts it.
@@ -408,7 +412,7 @@ def _rates_by_cause(runs: Sequence[ReportedRun]) -> Plot | None:
     rows = {
         escape(label): {cause: 100.0 * n / metres[label] for cause, n in row.items()}
         for label, row in counts.items()
-        if metres[label] >= _LEAST_M
+        if metres[label] >= _MIN_M
     }
     if not any(rows.values()):
         return None
@@ -416,12 +420,12 @@ def _rates_by_cause(runs: Sequence[ReportedRun]) -> Plot | None:
         "Failures per 100 m, all metres of episodes that ended. After a failure the robot is put "
         "back and goes on."
     )
-    told = [
+    crash_counts = [
         f"{sum(which)} of {len(which)} of {label}" for label, which in crashed.items() if any(which)
     ]
     note += (
-        f" Not in it are the episodes in which the policy crashed: {', '.join(told)}."
-        if told
+        f" Not in it are the episodes in which the policy crashed: {', '.join(crash_counts)}."
+        if crash_counts
         else ""
     )
     return Plot("What goes wrong on long ways", note, _stacked(rows, "failures per 100 m", ".1f"))

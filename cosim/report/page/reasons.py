@@ -17,9 +17,9 @@ from cosim.spec.scenario import Scenario
 
 _STANDS_MPS: Final = 0.2
 """Speed below which a body counts as standing."""
-_ASTRAY_M: Final = 5.0
+_SIDE_LIMIT_M: Final = 5.0
 """Distance from the route, metres, beyond which its side is meaningless."""
-_OVER_S: Final = 0.4
+_VELOCITY_SPAN_S: Final = 0.4
 """Time span, seconds, over which a velocity is estimated from recorded positions."""
 CAUSES: Final = (
     "person",
@@ -32,7 +32,7 @@ CAUSES: Final = (
     "policy crashed",
 )
 """Causes of failures, in display order."""
-_THINGS: Final = {
+_THING_NAMES: Final = {
     "sign": "sandwich board",
     "cafe": "cafe table",
     "bike": "parked bike",
@@ -108,12 +108,12 @@ def reason_of(
         return f"the policy crashed: {record.reason}"
     failure = mishap.failure
     if failure is None:
-        return _ended(scenario, record)
+        return _missed_goal(scenario, record)
     if failure.kind == "freezing":
         near = _nearest(log, failure.tick)
         return f"stayed within {FREEZE_MOVE_M:g} m for {FREEZE_WINDOW_S:g} s{near}"
     if failure.kind == "out_of_lane":
-        return _left(scenario, failure)
+        return _off_sidewalk(scenario, failure)
     if failure.other_kind == "pedestrian":
         other = other or _in_tracks(scenario, failure, log)
         return f"{_met(failure, other, 'a person')}{_after_trigger(scenario, record, failure)}"
@@ -127,7 +127,7 @@ def thing_in_words(failure: Failure) -> str:
     of, _, which = failure.other.partition(":")
     kind = which.rpartition(":")[2] if of == "obstacle" else of
     words = (
-        _THINGS.get(kind, kind if of == "obstacle" else failure.other_kind).replace("_", " ")
+        _THING_NAMES.get(kind, kind if of == "obstacle" else failure.other_kind).replace("_", " ")
         or "something"
     )
     return f"{'an' if words[0] in 'aeiou' else 'a'} {words}"
@@ -135,14 +135,14 @@ def thing_in_words(failure: Failure) -> str:
 
 def event_of(scenario: Scenario, mishap: Mishap) -> Event | None:
     """Return the event of the person who was met, or the scenario's only event."""
-    who = mishap.failure.other if mishap.failure else ""
-    theirs = [event for event in scenario.events if who in event.names]
-    if not theirs and scenario.ends_on_failure and len(scenario.events) == 1:
+    person = mishap.failure.other if mishap.failure else ""
+    matching = [event for event in scenario.events if person in event.names]
+    if not matching and scenario.ends_on_failure and len(scenario.events) == 1:
         return scenario.events[0]
-    return theirs[0] if theirs else None
+    return matching[0] if matching else None
 
 
-def _met(failure: Failure, other: Other | None, whom: str) -> str:
+def _met(failure: Failure, other: Other | None, body: str) -> str:
     """Describe a collision with a person or vehicle.
 
     The speed is the other's, or the robot's if the other stood.
@@ -150,24 +150,23 @@ def _met(failure: Failure, other: Other | None, whom: str) -> str:
     stood = failure.robot_speed_mps < _STANDS_MPS
     at = "where it stood" if stood else f"at {failure.robot_speed_mps:.1f} m/s"
     if other is None:
-        return f"{'was touched by' if stood else 'ran into'} {whom} {at}"
+        return f"{'was touched by' if stood else 'ran into'} {body} {at}"
     speed_mps = math.hypot(other.vx_mps, other.vy_mps)
-    whom += " who" if whom == "a person" else " that"
+    body += " who" if body == "a person" else " that"
     if speed_mps < _STANDS_MPS:
         where = _side(other.x_m, other.y_m, "ahead")
         return (
-            f"touched {whom} stood {where}, both at rest"
+            f"touched {body} stood {where}, both at rest"
             if stood
-            else f"drove into {whom} stood {where}, {at}"
+            else f"drove into {body} stood {where}, {at}"
         )
     side = _side(-other.vx_mps, -other.vy_mps, "from the front", "from the ", "from behind")
     if side == "from behind" and other.x_m > 0.0:
-        return (
-            f"{'touched' if stood else 'drove into'} {whom} went ahead of it at {speed_mps:.1f} m/s"
-        )
-    alike = failure.fault == "shared" or failure.other_kind == "vehicle" or side == "from behind"
-    verb = "was hit by" if stood else "collided with" if alike else "drove into"
-    return f"{verb} {whom} came {side} at {speed_mps:.1f} m/s"
+        verb = "touched" if stood else "drove into"
+        return f"{verb} {body} went ahead of it at {speed_mps:.1f} m/s"
+    both = failure.fault == "shared" or failure.other_kind == "vehicle" or side == "from behind"
+    verb = "was hit by" if stood else "collided with" if both else "drove into"
+    return f"{verb} {body} came {side} at {speed_mps:.1f} m/s"
 
 
 def _side(x: float, y: float, front: str, aside: str = "to the ", behind: str = "behind") -> str:
@@ -189,7 +188,7 @@ def _in_tracks(scenario: Scenario, failure: Failure, log: Log | None) -> Other |
             )
             track = log.event_tracks[of_it & (log.event_tracks[:, 0] <= failure.tick)]
             if len(track):
-                since = track[track[:, 0] >= track[-1, 0] - round(_OVER_S / log.tick_s)]
+                since = track[track[:, 0] >= track[-1, 0] - round(_VELOCITY_SPAN_S / log.tick_s)]
                 ticks = max(since[-1, 0] - since[0, 0], 1.0)
                 velocity = (since[-1, 3:5] - since[0, 3:5]) / (ticks * log.tick_s)
                 return Other.seen_from(log.pose[failure.tick], track[-1, 3:5], velocity)
@@ -198,21 +197,21 @@ def _in_tracks(scenario: Scenario, failure: Failure, log: Log | None) -> Other |
 
 def _after_trigger(scenario: Scenario, record: Record, failure: Failure) -> str:
     event = event_of(scenario, Mishap(failure.tick, "person", failure))
-    told: TriggeredEvent | None = next(
+    outcome: TriggeredEvent | None = next(
         (e for e in record.events if event is not None and e.id == event.id), None
     )
-    if told is None:
+    if outcome is None:
         return ""
-    if told.triggered_at_s is None:
+    if outcome.triggered_at_s is None:
         return ", before its event began"
-    after_s = Clock().time_s(failure.tick + 1) - told.triggered_at_s
+    after_s = Clock().time_s(failure.tick + 1) - outcome.triggered_at_s
     return f", {after_s:.1f} s after the trigger" if after_s >= 0.0 else ", before its event began"
 
 
-def _left(scenario: Scenario, failure: Failure) -> str:
+def _off_sidewalk(scenario: Scenario, failure: Failure) -> str:
     near = (failure.route_s_m - 5.0, failure.route_s_m + 5.0)
     _, left_m = scenario.route_line.project(failure.x_m, failure.y_m, near)
-    if abs(left_m) > _ASTRAY_M:
+    if abs(left_m) > _SIDE_LIMIT_M:
         return (
             f"left the walkable ground at {failure.robot_speed_mps:.1f} m/s, {abs(left_m):.0f} m "
             f"off the route"
@@ -232,7 +231,7 @@ def _nearest(log: Log | None, tick: int) -> str:
     return f", the nearest person {log.person_m[tick]:.1f} m away"
 
 
-def _ended(scenario: Scenario, record: Record) -> str:
+def _missed_goal(scenario: Scenario, record: Record) -> str:
     """Describe an episode that failed without a failure of the referee."""
     done = 100.0 * (record.measures.get("route_completion") or 0.0)
     if record.ended == "goal":

@@ -17,7 +17,7 @@ from cosim.core.progress import Progress, ignore
 from cosim.results.finished_run import WholeRun, read_whole_run
 from cosim.results.log import Log
 from cosim.results.record import Record
-from cosim.results.run_folder import RUN_AGAIN, TRAJECTORY, record_file
+from cosim.results.run_folder import RUN_AGAIN, load_log, trajectory_file
 from cosim.results.run_spec import RunSpec
 from cosim.results.table import table_of
 from cosim.spec.scenario import CityMap, Light, Scenario
@@ -79,14 +79,9 @@ class ReportedRun:
 
     def log(self, scenario: str) -> Log | None:
         """Load the trajectory of an episode; None without one. Raises RunError if damaged."""
-        file = record_file(self.path, scenario)
-        path = file.with_name(TRAJECTORY)
-        if not path.exists():
+        if not trajectory_file(self.path, scenario).exists():
             return None
-        try:
-            return Log.load(path)
-        except RunError as error:
-            raise RunError(f"{error}: {RUN_AGAIN}") from error
+        return load_log(self.path, scenario)
 
     def tracks(self) -> Iterator[tuple[Record, Mapping[str, Any]]]:
         """Yield the record and _COLUMNS of the log of each "done" episode with a trajectory.
@@ -94,8 +89,7 @@ class ReportedRun:
         Raises RunError for a damaged one.
         """
         for record in self.records:
-            file = record_file(self.path, record.scenario.id)
-            path = file.with_name(TRAJECTORY)
+            path = trajectory_file(self.path, record.scenario.id)
             if record.status != "done" or not path.exists():
                 continue
             try:
