@@ -413,7 +413,7 @@ def test_it_needs_nothing_but_pytorch_numpy_and_onnx() -> None:
     """What the project has besides is not imported by a training: a GPU host's own Python can do
     it."""
     code = (
-        "import sys, cosim.learning.progress; print(sorted({m.partition('.')[0] for m in "
+        "import sys, cosim.learning.training; print(sorted({m.partition('.')[0] for m in "
         "sys.modules} & {'msgspec', 'shapely', 'pandas', 'scipy', 'cv2', 'av', 'typer', 'rich', "
         "'onnxruntime', 'libsumo'}))"
     )
