@@ -46,7 +46,7 @@ def wide_px(words: str, size: float = _SIZE) -> int:
 
 
 def _lines(cells: Sequence[tuple[str, Rgb255]], width_px: int) -> list[list[tuple[str, Rgb255]]]:
-    """The cells in lines that are no wider than the picture, unless a single word is."""
+    """Wrap cells into lines no wider than the picture, unless a single word is wider."""
     room = width_px - 2 * MARGIN_PX
     lines: list[list[tuple[str, Rgb255]]] = [[]]
     left = room

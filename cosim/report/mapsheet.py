@@ -61,10 +61,7 @@ _LABEL_GAP_PX: Final = 60.0
 
 
 def draw_map(
-    street_map: StreetMap,
-    check: MapCheck,
-    part: Bounds | None = None,
-    credit: str = "",
+    street_map: StreetMap, check: MapCheck, part: Bounds | None = None, credit: str = ""
 ) -> Image:
     """Draw a map with its problems: (H, W, 3) uint8 RGB.
 

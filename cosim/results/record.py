@@ -44,7 +44,7 @@ class TriggeredEvent(msgspec.Struct, frozen=True, kw_only=True):
 
     triggered_at_s, trigger_distance_m: None if the trigger never fired
     seen: whether the standard camera saw one of its people (`cosim.results.event_monitor`)
-    rule_met: whether the robot kept the event's rule; None without a rule
+    rule_met: whether the robot obeyed the event's rule; None without a rule
     """
 
     id: str
