@@ -86,6 +86,7 @@ class Sheet:
         return np.round(at).astype(np.int32)
 
     def area(self, shape: Polygon | MultiPolygon, colour: Rgb255) -> None:
+        """Fill a shape, metres."""
         for part in shapely.get_parts(shape):
             if isinstance(part, Polygon) and not part.is_empty:
                 rings = [
@@ -94,10 +95,12 @@ class Sheet:
                 cv2.fillPoly(self.image, rings, colour, cv2.LINE_AA, 4)
 
     def line(self, xy: Floats, colour: Rgb255, width_m: float) -> None:
+        """Draw a polyline (N, 2), metres."""
         thickness = max(1, round(width_m * self.px_per_m))
         cv2.polylines(self.image, [self.px(xy)], False, colour, thickness, cv2.LINE_AA, 4)
 
     def dot(self, xy: Floats, colour: Rgb255, radius_m: float, *, filled: bool = True) -> None:
+        """Draw circles at (N, 2), metres, of at least 2 pixels radius."""
         radius = max(2, round(radius_m * self.px_per_m))
         for x, y in self.px(xy):
             cv2.circle(

@@ -112,6 +112,7 @@ def _interval(differences: Floats, n: int) -> tuple[float, float]:
     """Return the confidence interval of differences drawn from n pairs; NaN for a single pair."""
     if n < 2 or not len(differences):
         return math.nan, math.nan
+    # Expanded percentile interval: the plain one is too narrow for small n.
     t = stdtrit(n - 1, 0.5 + CONFIDENCE / 2)
     tail = float(ndtr(-t * math.sqrt(n / (n - 1))))
     low, high = np.quantile(differences, [tail, 1.0 - tail])

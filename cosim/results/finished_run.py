@@ -12,6 +12,7 @@ from cosim.results.run_folder import (
     DATABASE,
     RUN_AGAIN,
     read_records,
+    read_scenarios,
     read_spec,
     record_file,
     refuse_in_use,
@@ -19,7 +20,7 @@ from cosim.results.run_folder import (
 )
 from cosim.results.run_setup import METRIC_SCHEMA
 from cosim.results.run_spec import RunSpec
-from cosim.spec.scenario import Scenario, content_hash, read_suite
+from cosim.spec.scenario import Scenario, content_hash
 
 _UNKNOWN_SCHEMA = "an earlier version, which did not tell its metric schema"
 
@@ -54,9 +55,7 @@ def read_whole_run(path: Path) -> WholeRun:
         raise RunError(
             f"{path}: no episode of it has ended: give the command of the run again with --resume"
         )
-    scenarios = {
-        scenario.id: scenario for scenario in read_suite(path / "scenarios.json").scenarios
-    }
+    scenarios = read_scenarios(path)
     check_records(path, records, scenarios)
     return WholeRun(path, spec, scenarios, records)
 

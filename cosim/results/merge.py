@@ -20,6 +20,7 @@ from cosim.results.run_folder import (
     RUN_AGAIN,
     RunFolder,
     read_records,
+    read_scenarios,
     read_spec,
     record_file,
     refuse_in_use,
@@ -115,9 +116,7 @@ def _read(path: Path, first: _Part | None) -> _Part:
             raise RunError(
                 f"{path / 'scenarios.json'} is not that of {first.path}: one of them was edited"
             )
-    scenarios = {
-        scenario.id: scenario for scenario in read_suite(path / "scenarios.json").scenarios
-    }
+    scenarios = read_scenarios(path)
     in_table = {record.scenario.id: record for record in read_records(path, untouched=True)}
     check_records(path, in_table, scenarios)
     records: dict[str, Record] = {}

@@ -16,8 +16,8 @@ import numpy as np
 from cosim.core.clock import Clock
 from cosim.core.geometry import Floats
 from cosim.results.log import Log
-from cosim.results.record import Ended, Record
-from cosim.results.referee import Failure
+from cosim.results.record import Record
+from cosim.results.referee import Ended, Failure
 from cosim.spec.scenario import Scenario
 
 STALLED_MPS = 0.05

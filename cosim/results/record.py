@@ -23,7 +23,7 @@ from cosim.episode.command_delay import InFlight
 from cosim.episode.step import Step
 from cosim.results.flat_file import FlatFile
 from cosim.results.log import COLUMNS, Log, Tick
-from cosim.results.referee import Failure, Verdict
+from cosim.results.referee import Ended, Failure, Verdict
 from cosim.results.run_setup import RunSetup
 from cosim.results.traffic import OnRoad
 from cosim.spec.episode_id import pseudonym_of
@@ -36,7 +36,6 @@ _SCHEMA = 1
 _MOST_BYTES = 256 << 20
 
 Status = Literal["done", "crashed", "invalid"]
-Ended = Literal["goal", "stop", "timeout", "failure"]
 
 
 class TriggeredEvent(msgspec.Struct, frozen=True, kw_only=True):
@@ -211,6 +210,7 @@ class StateHash:
         self._hash = hashlib.blake2b(digest_size=16)
 
     def add(self, step: Step) -> None:
+        """Add the state at the end of a step."""
         robot = step.motion.robot
         street = step.street_after
         for array in (
@@ -244,6 +244,7 @@ class Recorder:
         self.hash = StateHash()
 
     def add(self, step: Step, verdict: Verdict, road: OnRoad = OnRoad()) -> None:  # noqa: B008  a frozen value
+        """Record one tick; people only every PEOPLE_EVERY_TICKS within PEOPLE_WITHIN_M."""
         self.hash.add(step)
         tick = Tick(step, verdict, self._footprint_m, road)
         for name, column in COLUMNS.items():

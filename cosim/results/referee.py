@@ -79,6 +79,7 @@ LEFT_M = 0.3
 """Distance, metres, before a crossing at which the robot has left it and may enter it again."""
 
 FailureKind = Literal["collision", "out_of_lane", "freezing"]
+Ended = Literal["goal", "stop", "timeout", "failure"]
 Fault = Literal["robot_at_fault", "pedestrian_at_fault", "shared"]
 
 
@@ -112,7 +113,7 @@ class Verdict:
     failures: tuple[Failure, ...] = ()
     walked_into: tuple[Failure, ...] = ()
     reset: Reset | None = None
-    ended: Literal["goal", "stop", "timeout", "failure"] | None = None
+    ended: Ended | None = None
     red_light_entry: str | None = None
     waits_at_red: bool = False
 
@@ -162,7 +163,7 @@ class Referee:
         self._entered.clear()
         return Verdict(failures, into, reset, None, red, waits)
 
-    def _end(self, step: Step) -> Literal["goal", "stop", "timeout", "failure"] | None:
+    def _end(self, step: Step) -> Ended | None:
         if self._scenario.ends_at == "stop":
             return self._end_by_stop(step)
         pose = step.motion.robot.pose
@@ -181,7 +182,7 @@ class Referee:
             self._fences, straight
         )
 
-    def _end_by_stop(self, step: Step) -> Literal["stop", "timeout", "failure"] | None:
+    def _end_by_stop(self, step: Step) -> Ended | None:
         """Return the end of a `gesturing` episode: the robot stopped before the pedestrian or
         passed it."""
         robot = step.motion.robot

@@ -18,8 +18,8 @@ from cosim.episode.command_delay import median_ms
 from cosim.episode.loop import ROUTE_WINDOW_M
 from cosim.people.yielding import ROBOT_STANDS_MPS
 from cosim.results.log import Log
-from cosim.results.record import Ended, Record
-from cosim.results.referee import STOP_S, FreezeWindow, at_goal, is_round, near_goal
+from cosim.results.record import Record
+from cosim.results.referee import STOP_S, Ended, FreezeWindow, at_goal, is_round, near_goal
 from cosim.spec.scenario import Scenario
 
 _ROUNDING_M = 1e-9

@@ -6,8 +6,8 @@ import os
 import shutil
 import sqlite3
 from collections import Counter
-from collections.abc import Sequence
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
@@ -24,7 +24,7 @@ from cosim.results.log import Log
 from cosim.results.record import RECORD_FILE, Record
 from cosim.results.run_spec import RUN_FILE, RunSpec, decoded_spec
 from cosim.results.table import table_of
-from cosim.spec.scenario import Suite, write_suite
+from cosim.spec.scenario import Scenario, Suite, read_suite, write_suite
 from cosim.spec.validation import shown
 
 DATABASE = "results.sqlite"
@@ -237,11 +237,9 @@ class RunFolder:
         return cls(path, found)
 
     def __enter__(self) -> Self:
-        try:
+        with _write_errors(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
             _acquire(self._lock, self.path)
-        except OSError as error:
-            raise unwritable(self.path, error) from error
         try:
             if self._suite is not None:
                 refuse_used(self.path)
@@ -264,40 +262,35 @@ class RunFolder:
         self._lock.release()
 
     def episode_folder(self, scenario_id: str) -> Path:
+        """Return the folder of an episode."""
         return self.path / "episodes" / scenario_id
 
     def finished(self) -> set[str]:
         """Return ids of the scenarios with a row."""
-        try:
-            with closing(connected(self.path)) as database:
-                return {
-                    scenario for (scenario,) in database.execute("select scenario from episodes")
-                }
-        except sqlite3.Error as error:
-            raise trouble_with(self.path, error) from error
+        with _database_errors(self.path), closing(connected(self.path)) as database:
+            return {scenario for (scenario,) in database.execute("select scenario from episodes")}
 
     def add(self, record: Record) -> None:
         """Append the row of a finished episode; a second one of the same scenario is ignored."""
         values = record.scenario.id, RECORD_FILE.encode(record).decode()
-        try:
+        with _database_errors(self.path):
             if self._add_connection is None:  # reused: opening takes longer than adding
                 self._add_connection = connected(self.path)
             with self._add_connection as database:
                 database.execute(
                     "insert or ignore into episodes (scenario, record) values (?, ?)", values
                 )
-        except sqlite3.Error as error:
-            raise trouble_with(self.path, error) from error
 
     def _remove(self, scenarios: Sequence[str]) -> None:
         """Delete the rows of episodes that will run again."""
-        try:
-            with closing(connected(self.path)) as database, database:
-                database.executemany(
-                    "delete from episodes where scenario = ?", [(name,) for name in scenarios]
-                )
-        except sqlite3.Error as error:
-            raise trouble_with(self.path, error) from error
+        with (
+            _database_errors(self.path),
+            closing(connected(self.path)) as database,
+            database,
+        ):
+            database.executemany(
+                "delete from episodes where scenario = ?", [(name,) for name in scenarios]
+            )
 
     def keep(self, record: Record, log: bytes = b"", demonstration: bytes = b"") -> None:
         """Write the files of an episode, the record last, and add its row.
@@ -305,24 +298,20 @@ class RunFolder:
         log: bytes of the `Log`
         """
         target = self.episode_folder(record.scenario.id)
-        try:
+        with _write_errors(target, _ROOM_REMEDY):
             target.mkdir(parents=True, exist_ok=True)
             for name, data in ((TRAJECTORY, log), (DEMONSTRATION, demonstration)):
                 if data:
                     write_atomic(target / name, data)
             record.save(target / "record.json")
-        except OSError as error:
-            raise unwritable(target, error, _ROOM_REMEDY) from error
         self.add(record)
 
     def keep_frame(self, scenario_id: str, tick: int, png: bytes) -> None:
         """Write a camera frame of an episode."""
         frames = self.episode_folder(scenario_id) / "frames"
-        try:
+        with _write_errors(frames, _ROOM_REMEDY):
             frames.mkdir(parents=True, exist_ok=True)
             (frames / f"{tick:06d}.png").write_bytes(png)
-        except OSError as error:
-            raise unwritable(frames, error, _ROOM_REMEDY) from error
 
     def failed_attempts(self) -> Counter[FailedAttempt]:
         """Return the number of failed attempts by scenario since the run began."""
@@ -340,11 +329,9 @@ class RunFolder:
 
     def keep_failed_attempt(self, attempt: FailedAttempt) -> None:
         """Append a failed attempt to the run's file."""
-        try:
-            with (self.path / _ATTEMPTS).open("ab") as file:
-                file.write(msgspec.json.encode(attempt) + b"\n")
-        except OSError as error:
-            raise unwritable(self.path / _ATTEMPTS, error, _ROOM_REMEDY) from error
+        path = self.path / _ATTEMPTS
+        with _write_errors(path, _ROOM_REMEDY), path.open("ab") as file:
+            file.write(msgspec.json.encode(attempt) + b"\n")
 
     def _is_whole(self, scenario_id: str, row: Record | None = None) -> bool:
         """Return whether the files of an episode are valid; note any damage."""
@@ -356,26 +343,22 @@ class RunFolder:
         """Delete the files of an earlier attempt at a scenario."""
         folder = self.episode_folder(scenario_id)
         shutil.rmtree(folder / "frames", ignore_errors=True)
-        try:
+        with _write_errors(folder):
             for name in ("record.json", TRAJECTORY, DEMONSTRATION):
                 (folder / name).unlink(missing_ok=True)
                 (folder / f"{name}.part").unlink(missing_ok=True)
-        except OSError as error:
-            raise unwritable(folder, error) from error
 
     def finish(self) -> pd.DataFrame:
         """Write results.csv and return its table."""
         table = table_of(read_records(self.path))
-        try:
-            write_atomic(self.path / "results.csv", table.to_csv(index=False).encode())
-        except OSError as error:
-            remedy = "all episodes are kept; make room and add --resume"
-            raise unwritable(self.path / "results.csv", error, remedy) from error
+        path = self.path / "results.csv"
+        with _write_errors(path, "all episodes are kept; make room and add --resume"):
+            write_atomic(path, table.to_csv(index=False).encode())
         return table
 
     def _begin(self, suite: Suite) -> None:
         """Write the spec and scenarios; run.json last, since it marks the folder as resumable."""
-        try:
+        with _write_errors(self.path):
             for folder in (self.path / "episodes", self.path / "logs"):
                 folder.mkdir(exist_ok=True)
             wanted = set(self.spec.scenarios)
@@ -384,8 +367,6 @@ class RunFolder:
             )
             write_suite(chosen, self.path / "scenarios.json")
             write_atomic(self.path / "run.json", RUN_FILE.in_lines(self.spec))
-        except OSError as error:
-            raise unwritable(self.path, error) from error
 
     def _open_database(self) -> None:
         """Repair the database, so that exactly the episodes with valid files have a row."""
@@ -416,6 +397,29 @@ class RunFolder:
         if damage:
             repair = f"made anew from {len(restored)} records on disk, kept as {DATABASE}.damaged"
             self.notes.append(f"{database} was damaged ({damage}): {repair}")
+
+
+@contextmanager
+def _write_errors(path: Path, remedy: str = "") -> Iterator[None]:
+    """Convert an OSError in a block to the error for an unwritable path."""
+    try:
+        yield
+    except OSError as error:
+        raise unwritable(path, error, remedy) from error
+
+
+@contextmanager
+def _database_errors(path: Path) -> Iterator[None]:
+    """Convert a sqlite3.Error in a block to the error for the database of a run folder."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        raise trouble_with(path, error) from error
+
+
+def read_scenarios(path: Path) -> Mapping[str, Scenario]:
+    """Load the scenarios of a run folder by id. Raises SpecError."""
+    return {one.id: one for one in read_suite(path / "scenarios.json").scenarios}
 
 
 def read_spec(path: Path) -> RunSpec:

@@ -141,6 +141,7 @@ class _Choice:
         return further_s <= self.room_s, telling, new_episode, one.place not in self._places
 
     def take(self, one: FailureToShow) -> None:
+        """Add a failure to the choice."""
         self.picked.append(one)
         self.seen |= one.facets
         self.room_s -= self.further_s(one)

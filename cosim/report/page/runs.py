@@ -66,6 +66,7 @@ class ReportedRun:
 
     @cached_property
     def table(self) -> pd.DataFrame:
+        """Return one row per episode, see the class."""
         table = table_of(self.records)
         of = [self.scenarios[name] for name in table["scenario"]]
         return table.assign(
