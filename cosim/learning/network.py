@@ -35,8 +35,7 @@ TURN_UNIT_RADPS: Final = 0.65
 CRUISE_MPS: Final = 1.5
 """Unit of the network's speed output."""
 TURN_BINS: Final = 27
-"""Number of turn rates from full left to full right; bins avoid averaging both ways around a thing.
-"""
+"""Number of turn rates, full left to full right; bins avoid averaging both ways around a thing."""
 SHARPNESS: Final = 2.0
 """Factor on the log odds of the bins before their mean is computed."""
 

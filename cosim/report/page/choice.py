@@ -20,8 +20,7 @@ _START_S: Final = 15.0
 _BUDGET_S: Final = 600.0
 """Budget of simulated time for all failures, seconds."""
 WITHIN_S: Final = 150.0
-"""Time in an episode, seconds, after which only its first failure is shown; later ones are costly.
-"""
+"""Time in an episode, seconds, after which only its first failure is shown; replay is costly."""
 _MAX_ALIKE: Final = 30
 """Maximum number of failures considered with the same facets, the earliest ones."""
 _MAX_PER_EPISODE: Final = 40
