@@ -253,21 +253,13 @@ def differences_of(
             continue
         pair = table_before.loc[inside], table_after.loc[inside]
         for name in names:
-            pair_difference = _difference(name, *pair)
+            paired = _difference(name, *pair)
             unit, better = METRICS[name][:2] if name in METRICS else (COUNTERFACTUAL[name], None)
-            values = (
-                pair_difference.n,
-                pair_difference.before,
-                pair_difference.after,
-                pair_difference.difference,
-                pair_difference.low,
-                pair_difference.high,
-                pair_difference.changed,
-            )
-            verdict = (
-                pair_difference.verdict(better if judged else None) if pair_difference.n else ""
-            )
-            rows.append((before.label, after.label, by, group, name, unit, *values, verdict))
+            verdict = paired.verdict(better if judged else None) if paired.n else ""
+            key = (before.label, after.label, by, group, name, unit)
+            means = (paired.before, paired.after, paired.difference)
+            interval = (paired.low, paired.high)
+            rows.append((*key, paired.n, *means, *interval, paired.changed, verdict))
     return pd.DataFrame(rows, columns=list(DIFFERENCES))
 
 

@@ -155,10 +155,15 @@ def velocity_mean_mps(episode: EpisodeFacts) -> float | None:
     return travelled_m(episode) / time_s(episode) if len(episode.log) else None
 
 
+def _least(values: Floats) -> float | None:
+    """Return the minimum; None if there is no finite value."""
+    least = float(values.min(initial=np.inf))
+    return least if np.isfinite(least) else None
+
+
 def pedestrian_distance_min_m(episode: EpisodeFacts) -> float | None:
     """Return the least centre distance to a person; None without people."""
-    nearest = float(episode.log.person_m.min()) if len(episode.log) else np.inf
-    return nearest if np.isfinite(nearest) else None
+    return _least(episode.log.person_m)
 
 
 def pedestrian_distance_min_success_m(episode: EpisodeFacts) -> float | None:
@@ -168,8 +173,7 @@ def pedestrian_distance_min_success_m(episode: EpisodeFacts) -> float | None:
 
 def clearance_min_m(episode: EpisodeFacts) -> float | None:
     """Return the least gap between robot outline and a person's 0.3 m disk; None without people."""
-    least = float(episode.log.clearance_m.min()) if len(episode.log) else np.inf
-    return least if np.isfinite(least) else None
+    return _least(episode.log.clearance_m)
 
 
 def time_to_collision_min_s(episode: EpisodeFacts) -> float | None:
@@ -178,8 +182,7 @@ def time_to_collision_min_s(episode: EpisodeFacts) -> float | None:
     Both are disks, see `cosim.results.log.time_to_collision_s` (Francis et al., after Biswas et al.
     2022).
     """
-    least = float(episode.log.collision_in_s.min()) if len(episode.log) else np.inf
-    return least if np.isfinite(least) else None
+    return _least(episode.log.collision_in_s)
 
 
 def space_compliance(episode: EpisodeFacts) -> float | None:
