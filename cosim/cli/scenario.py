@@ -171,8 +171,7 @@ def draw_own(
     ] = None,
 ) -> None:
     """Draw the map from above, with coordinates, route, fences, obstacles and events."""
-    from cosim.report.mapsheet import write_png
-    from cosim.report.plan import draw_plan
+    from cosim.report.mapsheet import draw_plan, write_png
     from scenarios.places.nets import place
     from scenarios.suites.user_scenarios.build import made_one, place_of_own
     from scenarios.suites.user_scenarios.read import read_own

@@ -74,7 +74,7 @@ def train_command(
     """
     if lacking := [package for package in ("torch", "onnx") if find_spec(package) is None]:
         raise MachineError(f"{' and '.join(lacking)} cannot be imported: {TO_INSTALL}")
-    from cosim.learning.progress import trained
+    from cosim.learning.training import trained
 
     training = Training(
         steps=steps,

@@ -1,2 +1,1 @@
-"""A small policy of one's own, learned from demonstrations: needs PyTorch, NumPy and onnx, and
-nothing else."""
+"""Training of a small policy from demonstrations; needs only PyTorch, NumPy and onnx."""

@@ -1,5 +1,4 @@
-"""`python -m cosim.learning` is `cosim train`, in a Python that has PyTorch, NumPy and onnx and
-nothing else."""
+"""`python -m cosim.learning`: `cosim train` in a Python that has only PyTorch, NumPy and onnx."""
 
 from __future__ import annotations
 
@@ -8,13 +7,16 @@ import sys
 from pathlib import Path
 
 from cosim.core.errors import SOME_CRASHED, CosimError
-from cosim.learning.progress import trained
 from cosim.learning.settings import PLANNED_STEPS, Training
+from cosim.learning.training import trained
 
 
 def _main() -> None:
-    """Train by the words of the command line."""
-    parser = argparse.ArgumentParser(prog="python -m cosim.learning", description=trained.__doc__)
+    """Parse the command line and train."""
+    parser = argparse.ArgumentParser(
+        prog="python -m cosim.learning",
+        description="Train a small policy on packed demonstrations.",
+    )
     default = Training()
     parser.add_argument(
         "data", nargs="+", type=Path, help="packed demonstrations: cosim dataset pack"

@@ -1,5 +1,5 @@
-"""The bundle of a trained network: `model.onnx`, `manifest.json`, `example.npz`, as `--policy
-onnx:FOLDER` takes it."""
+"""Bundle of a trained network for `--policy onnx:FOLDER`: `model.onnx`, `manifest.json`,
+`example.npz`."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ _TOLERANCE: Final = 1e-4
 
 
 class BundleFacts(NamedTuple):
-    """What is told of a bundle that a training begins with. digest: of its graph."""
+    """Name of a bundle and hash of its graph."""
 
     name: str
     digest: str
 
 
 def bundle_facts(folder: Path) -> BundleFacts:
-    """Raises RunError where there is no such bundle."""
+    """Read the facts of a bundle. Raises RunError if it cannot be read."""
     path = folder / MODEL
     try:
         digest = hashlib.blake2b(path.read_bytes(), digest_size=8).hexdigest()
@@ -58,22 +58,26 @@ def bundle_facts(folder: Path) -> BundleFacts:
 def write_bundle(
     folder: Path, parameters: Parameters, examples: Examples, name: str, source: str
 ) -> None:
-    """Write it, with the first held-out example. source: what it was made of. Raises RunError where
-    the graph does not answer as the network does, or what it answers is no number."""
+    """Write a bundle with the first held-out example.
+
+    source: description of the training data
+
+    Raises RunError if the graph and the network give different or non-finite plans.
+    """
     graph = graph_of(parameters)
     batch = examples.rows(examples.held_out[:1])
     inputs = {key: getattr(batch, key).cpu().numpy().astype(np.float32) for key in INPUTS}
-    held = {key: value.cpu() for key, value in parameters.items()}
+    on_cpu = {key: value.cpu() for key, value in parameters.items()}
     with torch.no_grad():
-        wanted = plan(answers(held, *(torch.from_numpy(inputs[key]) for key in INPUTS))).numpy()
-    off = float(np.abs(run_graph(graph, inputs) - wanted).max())
-    if not off <= _TOLERANCE:
+        expected = plan(answers(on_cpu, *(torch.from_numpy(inputs[key]) for key in INPUTS))).numpy()
+    error = float(np.abs(run_graph(graph, inputs) - expected).max())
+    if not error <= _TOLERANCE:
         raise RunError(
-            f"{folder}: the graph answers {off:g} otherwise than the network: train anew, at "
+            f"{folder}: the graph answers {error:g} otherwise than the network: train anew, at "
             f"a lower --rate"
         )
     example = io.BytesIO()
-    np.savez_compressed(example, **{**inputs, f"expected.{PLAN}": wanted})
+    np.savez_compressed(example, **{**inputs, f"expected.{PLAN}": expected})
     manifest = {**manifest_of(name, examples.meta, source), "files": {MODEL: _facts(graph)}}
     write_atomic(folder / MODEL, graph)
     write_atomic(folder / "example.npz", example.getvalue())
@@ -81,23 +85,23 @@ def write_bundle(
 
 
 def _facts(data: bytes) -> dict[str, Any]:
-    """Size and hash of a file, as manifests have them."""
+    """Return size and hash of a file, as in manifests."""
     return {"bytes": len(data), "blake2b": hashlib.blake2b(data, digest_size=32).hexdigest()}
 
 
 def source_of(meta: dict[str, Any], seed: int, begun: BundleFacts | None = None) -> str:
-    """What a network was made of, by what the demonstrations say of themselves."""
+    """Describe the training data by the metadata of the demonstrations."""
     experts, learners = (
         ", ".join(dict.fromkeys(filter(None, meta[name]))) for name in ("policy", "learner")
     )
-    taught = f", and would have done where {learners} drove" if learners else ""
-    return f"cosim train, seed {seed}, on what {experts} drove{taught}" + (
+    corrections = f", and would have done where {learners} drove" if learners else ""
+    return f"cosim train, seed {seed}, on what {experts} drove{corrections}" + (
         f"; begun with {begun.name}" if begun else ""
     )
 
 
 def manifest_of(name: str, meta: dict[str, Any], source: str) -> dict[str, Any]:
-    """What the graph wants and answers, by what the demonstrations say of themselves."""
+    """Return the manifest of the graph, from the metadata of the demonstrations."""
     camera = {
         field: meta["camera"].get(field)
         for field in ("width", "height", "fov_deg", "mount", "crop")

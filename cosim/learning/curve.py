@@ -1,5 +1,4 @@
-"""The curve of a training, a row for each look at the held-out episodes: a file and a picture.
-Needs no PyTorch."""
+"""Learning curve, one row per evaluation, as a file and a picture; needs no PyTorch."""
 
 from __future__ import annotations
 
@@ -14,7 +13,7 @@ PICTURE: Final = "curve.png"
 
 
 def write_curve(folder: Path, curve: Sequence[Mapping[str, float]]) -> None:
-    """Write the rows as `curve.csv`. OSError passes."""
+    """Write the rows as `curve.csv`. Raises OSError."""
     lines = [
         ",".join(curve[0]),
         *(",".join(f"{value:.6g}" for value in row.values()) for row in curve),
@@ -23,8 +22,7 @@ def write_curve(folder: Path, curve: Sequence[Mapping[str, float]]) -> None:
 
 
 def draw_curve(folder: Path) -> None:
-    """Draw `curve.csv` as `curve.png`: losses, and errors of the held-out episodes, by step. Needs
-    matplotlib."""
+    """Draw `curve.csv` as `curve.png`: losses and held-out errors by step. Needs matplotlib."""
     import matplotlib as mpl
 
     mpl.use("Agg")

@@ -1,7 +1,8 @@
-"""Demonstrations as examples: put together from packed files, divided into those to learn from and
-those held out, and drawn in batches, of which a half is mirrored, and each is lit otherwise and
-shaken a little; the moments in which the expert stops or drives off are drawn more often than they
-come."""
+"""Training examples from packed demonstrations, split into training and held-out episodes.
+
+Batches are augmented: half is mirrored, brightness and tint vary, pictures are shifted. Rows in
+which the expert stops or starts are oversampled.
+"""
 
 from __future__ import annotations
 
@@ -32,32 +33,42 @@ from cosim.learning.network import (
 )
 
 HELD_OUT: Final = 0.1
-"""Of the episodes."""
+"""Share of episodes that are held out."""
 STOPS_MPS: Final = 0.3
-"""Who is told to drive slower than this is told to stop, and who drives slower stands."""
+"""Speed below which a command is a stop and a robot is at rest."""
 _DARK = 0.6
 _BRIGHT = 1.5
 _TINT: Final = 0.12
-_SHAKEN_PX: Final = 3
-_FORGOTTEN: Final = 0.8
+_SHIFT_PX: Final = 3
+_HIDDEN_SPEEDS: Final = 0.8
+"""Share of rows whose speeds are hidden.
+
+A network that sees its own low speed takes it as the reason to stop. It would then fail to stop
+when it approaches a person fast.
+"""
 _FROZEN: Final = 0.5
-"""So often the robot's speeds are not told, and older pictures are the newest one, as when an
-episode begins: who sees that it is slow takes that for the reason to stop, and does not where it
-comes fast to somebody for whom it should."""
-_CHANGES: Final = 0.3
-"""Of a batch such a share is of rows in which the expert stops while the robot drives, or drives
-off while it stands. They are one in fifty of what was driven, and who is asked for the others alone
-goes on as it is going."""
+"""Share of rows whose older pictures equal the newest, as at the start of an episode."""
+_CHANGE_SHARE: Final = 0.3
+"""Share of a batch in which the expert stops a moving robot or starts a resting one.
+
+Only one row in fifty is such a change; trained on the others alone, a network keeps its speed.
+"""
 _ROUNDING: Final = 1e-4
 _LISTED: Final = ("policy", "learner")
-_ALIKE: Final = ("camera", "rate_hz", "waypoint_s", "goal", "robot")
+_SAME_META: Final = ("camera", "rate_hz", "waypoint_s", "goal", "robot")
 
 
 @dataclass(frozen=True)
 class Batch:
-    """What goes into the network, and what is wanted of it. pictures, goal, speeds: as
-    `network.answers` takes them; speed: (B,) in units of CRUISE_MPS; turn: (B,) rad/s; stop: (B,) 0
-    or 1; way: (B, WAYPOINTS, 2) m, driven: which of these were."""
+    """Batch of network inputs and targets.
+
+    pictures, goal, speeds: inputs, see `network.answers`
+    speed: (B,) in units of CRUISE_MPS
+    turn: (B,) rad/s
+    stop: (B,) 0 or 1
+    way: (B, WAYPOINTS, 2) m
+    driven: (B, WAYPOINTS) 1 for waypoints that were driven, else 0
+    """
 
     pictures: Tensor
     goal: Tensor
@@ -70,15 +81,17 @@ class Batch:
 
 
 class Examples:
-    """All demonstrations, on the device. learned, held_out: rows (M,) of the episodes that are
-    learned from, and of those that are not; meta: of the files, where these agree; policy and
-    learner of all of them."""
+    """All demonstrations, on the device.
+
+    learned, held_out: rows (M,) of training and held-out episodes
+    meta: common metadata of the files, with policy and learner of all of them
+    """
 
     def __init__(self, paths: Sequence[Path], seed: int, device: torch.device) -> None:
         packed = [_checked(path) for path in paths]
         self.meta: dict[str, Any] = dict(packed[0].meta)
         for path, other in zip(paths[1:], packed[1:], strict=True):
-            for field in _ALIKE:
+            for field in _SAME_META:
                 if other.meta.get(field) != self.meta.get(field):
                     raise RunError(
                         f"{path}: {field} is {other.meta.get(field)}, and {self.meta.get(field)} "
@@ -87,13 +100,13 @@ class Examples:
         self.meta |= {
             name: [value for one in packed for value in one.meta.get(name, [])] for name in _LISTED
         }
-        before = np.cumsum([0, *(len(one) for one in packed)])
-        episodes = np.cumsum([0, *(int(one.episode[-1]) + 1 for one in packed)])
+        first_rows = np.cumsum([0, *(len(one) for one in packed)])
+        first_episodes = np.cumsum([0, *(int(one.episode[-1]) + 1 for one in packed)])
         history = np.concatenate(
-            [one.history(HISTORY, EVERY) + n for one, n in zip(packed, before, strict=False)]
+            [one.history(HISTORY, EVERY) + n for one, n in zip(packed, first_rows, strict=False)]
         )
         episode = np.concatenate(
-            [one.episode + n for one, n in zip(packed, episodes, strict=False)]
+            [one.episode + n for one, n in zip(packed, first_episodes, strict=False)]
         )
         held_out = np.random.default_rng([seed, 0x4E1D]).random(int(episode[-1]) + 1) < HELD_OUT
         if held_out.all() or not held_out.any():
@@ -130,9 +143,9 @@ class Examples:
         self._device = device
 
     def drawn(self, seed: int, step: int, size: int) -> Batch:
-        """The batch of a step: a function of seed and step alone."""
+        """Draw the augmented batch of a step: a function of seed and step."""
         draws = np.random.default_rng([seed, 0xBA7C4, step])
-        change = draws.random(size) < _CHANGES
+        change = draws.random(size) < _CHANGE_SHARE
         batch = self.rows(
             np.where(change, draws.choice(self._changes, size), draws.choice(self.learned, size))
         )
@@ -141,10 +154,10 @@ class Examples:
             -_TINT, _TINT, (size, 3)
         )
         gain = np.tile(np.exp(light), (1, HISTORY)).astype(np.float32)[:, :, None, None]
-        told = torch.from_numpy((draws.random(size) >= _FORGOTTEN).astype(np.float32)).to(
+        visible = torch.from_numpy((draws.random(size) >= _HIDDEN_SPEEDS).astype(np.float32)).to(
             self._device
         )
-        off_px = torch.from_numpy(draws.integers(0, 2 * _SHAKEN_PX + 1, (2, size, 1, 1))).to(
+        off_px = torch.from_numpy(draws.integers(0, 2 * _SHIFT_PX + 1, (2, size, 1, 1))).to(
             self._device
         )
         newest = (
@@ -154,21 +167,21 @@ class Examples:
         )
         frozen = torch.from_numpy(draws.random(size) < _FROZEN).to(self._device)
         pictures = torch.where(frozen[:, None, None, None], newest, batch.pictures)
-        lit = (_shaken(pictures, off_px) * torch.from_numpy(gain).to(self._device)).clamp(max=1.0)
-        whole = Batch(
+        lit = (_shifted(pictures, off_px) * torch.from_numpy(gain).to(self._device)).clamp(max=1.0)
+        augmented = Batch(
             lit,
             batch.goal,
-            batch.speeds * told[:, None],
+            batch.speeds * visible[:, None],
             batch.speed,
             batch.turn,
             batch.stop,
             batch.way,
             batch.driven,
         )
-        return _either(mirrored, mirror(whole), whole)
+        return _select(mirrored, mirror(augmented), augmented)
 
     def rows(self, rows: NDArray[np.int64]) -> Batch:
-        """The examples at some rows, as they are."""
+        """Return the examples at some rows, without augmentation."""
         at = torch.from_numpy(rows).to(self._device)
         frames = self._frames[self._history[at]]  # (B, HISTORY, H, W, 3)
         pictures = frames.permute(0, 1, 4, 2, 3).flatten(1, 2).float() / 255.0
@@ -191,7 +204,7 @@ class Examples:
 
 
 def mirror(batch: Batch) -> Batch:
-    """What the same street would ask for, left and right exchanged."""
+    """Mirror a batch: left and right exchanged."""
     other_side = torch.tensor([1.0, -1.0], device=batch.goal.device)
     return Batch(
         pictures=batch.pictures.flip(3),
@@ -205,22 +218,24 @@ def mirror(batch: Batch) -> Batch:
     )
 
 
-def _shaken(pictures: Tensor, off_px: Tensor) -> Tensor:
-    """Each picture a little aside; what comes in is what was at its edge. off_px: (2, B, 1, 1),
-    down and to the right, from 0 to twice what is the most to either side."""
+def _shifted(pictures: Tensor, off_px: Tensor) -> Tensor:
+    """Shift pictures, repeating their edge.
+
+    off_px: (2, B, 1, 1) down and right, from 0 to 2 _SHIFT_PX; _SHIFT_PX is no shift
+    """
     count, _, high, wide = pictures.shape
     one = torch.arange(count, device=pictures.device).view(-1, 1, 1)
-    row = (
-        torch.arange(high, device=pictures.device).view(1, -1, 1) + off_px[0] - _SHAKEN_PX
-    ).clamp(0, high - 1)
+    row = (torch.arange(high, device=pictures.device).view(1, -1, 1) + off_px[0] - _SHIFT_PX).clamp(
+        0, high - 1
+    )
     column = (
-        torch.arange(wide, device=pictures.device).view(1, 1, -1) + off_px[1] - _SHAKEN_PX
+        torch.arange(wide, device=pictures.device).view(1, 1, -1) + off_px[1] - _SHIFT_PX
     ).clamp(0, wide - 1)
     return pictures.permute(0, 2, 3, 1)[one, row, column].permute(0, 3, 1, 2)
 
 
-def _either(first: Tensor, one: Batch, other: Batch) -> Batch:
-    """Of one batch where `first` (B,) is true, of the other elsewhere."""
+def _select(first: Tensor, one: Batch, other: Batch) -> Batch:
+    """Select rows from `one` where `first` (B,) is true, else from `other`."""
     mixed = {
         name: torch.where(
             first.view(-1, *[1] * (getattr(one, name).ndim - 1)), getattr(one, name), value
@@ -231,7 +246,7 @@ def _either(first: Tensor, one: Batch, other: Batch) -> Batch:
 
 
 def _checked(path: Path) -> Packed:
-    """The demonstrations of a file. Raises RunError where this network cannot learn from them."""
+    """Load a file. Raises RunError if this network cannot learn from it."""
     packed = read_packed(path)
     size = packed.frames.shape[1:3]
     ahead = packed.waypoints.shape[1]

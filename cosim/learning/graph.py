@@ -1,5 +1,4 @@
-"""The network as an ONNX graph: written node by node from its parameters, and these read back out
-of one."""
+"""ONNX graph of the network: written node by node from its parameters, and read back."""
 
 from __future__ import annotations
 
@@ -35,11 +34,11 @@ INPUTS: Final = {
 PLAN: Final = "plan"
 _OPSET: Final = 17
 _IR: Final = 8
-"""Old enough for every runtime of the last years."""
+"""ONNX IR version, old enough for common runtimes."""
 
 
 class _Writer:
-    """Nodes in their order, each named by what it makes."""
+    """Builder of graph nodes, each named by its output."""
 
     def __init__(self, parameters: Parameters) -> None:
         self.nodes: list[Any] = []
@@ -48,7 +47,7 @@ class _Writer:
             for name, value in parameters.items()
         ]
 
-    def made(self, kind: str, inputs: Sequence[str], output: str = "", **attributes: Any) -> str:
+    def add(self, kind: str, inputs: Sequence[str], output: str = "", **attributes: Any) -> str:
         output = output or f"{kind.lower()}{len(self.nodes)}"
         self.nodes.append(helper.make_node(kind, list(inputs), [output], **attributes))
         return output
@@ -57,51 +56,50 @@ class _Writer:
         self.constants.append(numpy_helper.from_array(np.asarray(value, dtype), name))
         return name
 
-    def convolved(self, x: str, name: str, size: int = 3) -> str:
+    def conv(self, x: str, name: str, size: int = 3) -> str:
         inputs = [x, f"{name}.weight", f"{name}.bias"]
-        return self.made("Conv", inputs, strides=[STRIDES.get(name, 1)] * 2, pads=[size // 2] * 4)
+        return self.add("Conv", inputs, strides=[STRIDES.get(name, 1)] * 2, pads=[size // 2] * 4)
 
     def linear(self, x: str, name: str) -> str:
-        return self.made("Gemm", [x, f"{name}.weight", f"{name}.bias"], transB=1)
+        return self.add("Gemm", [x, f"{name}.weight", f"{name}.bias"], transB=1)
 
     def relu(self, x: str) -> str:
-        return self.made("Relu", [x])
+        return self.add("Relu", [x])
 
 
 def graph_of(parameters: Parameters) -> bytes:
-    """The graph, its inputs and output as `network.answers` and `network.plan` have them, for one
-    at a time."""
+    """Build the graph for batches of one, equal to `network.answers` and `network.plan`."""
     g = _Writer(parameters)
-    x = g.made(
-        "Mul", [g.made("Sub", ["pictures", g.constant("grey", 0.5)]), g.constant("contrast", 4.0)]
+    x = g.add(
+        "Mul", [g.add("Sub", ["pictures", g.constant("grey", 0.5)]), g.constant("contrast", 4.0)]
     )
     for name, size in (("stem", 5), ("down1", 3), ("down2", 3)):
-        x = g.relu(g.convolved(x, name, size))
-    x = g.made("Add", [x, g.convolved(g.relu(g.convolved(x, "block2a")), "block2b")])
-    x = g.relu(g.convolved(g.relu(x), "down3"))
-    x = g.made("Add", [x, g.convolved(g.relu(g.convolved(x, "block3a")), "block3b")])
-    x = g.relu(g.convolved(g.relu(x), "narrow", 1))
-    seen = g.relu(g.linear(g.made("Flatten", [x]), "seen"))
-    told = g.relu(g.linear(g.made("Concat", ["goal", "speeds"], axis=1), "told"))
-    joined = g.relu(g.linear(g.made("Concat", [seen, told], axis=1), "joined"))
+        x = g.relu(g.conv(x, name, size))
+    x = g.add("Add", [x, g.conv(g.relu(g.conv(x, "block2a")), "block2b")])
+    x = g.relu(g.conv(g.relu(x), "down3"))
+    x = g.add("Add", [x, g.conv(g.relu(g.conv(x, "block3a")), "block3b")])
+    x = g.relu(g.conv(g.relu(x), "narrow", 1))
+    image = g.relu(g.linear(g.add("Flatten", [x]), "seen"))
+    inputs = g.relu(g.linear(g.add("Concat", ["goal", "speeds"], axis=1), "told"))
+    joined = g.relu(g.linear(g.add("Concat", [image, inputs], axis=1), "joined"))
 
-    sharp = g.made("Mul", [g.linear(joined, "turn"), g.constant("sharpness", SHARPNESS)])
-    turn = g.made(
+    sharp = g.add("Mul", [g.linear(joined, "turn"), g.constant("sharpness", SHARPNESS)])
+    turn = g.add(
         "MatMul",
         [
-            g.made("Softmax", [sharp], axis=1),
+            g.add("Softmax", [sharp], axis=1),
             g.constant("turns", turns_radps().reshape(-1, 1).numpy()),
         ],
     )
-    speed = g.made("Mul", [g.relu(g.linear(joined, "speed")), g.constant("cruise", CRUISE_MPS)])
-    both = g.made("Concat", [speed, turn], axis=1)
-    tiled = g.made("Tile", [both, g.constant("times", [1, WAYPOINTS], np.int64)])
+    speed = g.add("Mul", [g.relu(g.linear(joined, "speed")), g.constant("cruise", CRUISE_MPS)])
+    both = g.add("Concat", [speed, turn], axis=1)
+    tiled = g.add("Tile", [both, g.constant("times", [1, WAYPOINTS], np.int64)])
     shape = g.constant("rows", [1, WAYPOINTS, 2], np.int64)
-    ways = g.made("Reshape", [g.linear(joined, "way"), shape])
-    rows = g.made("Concat", [ways, g.made("Reshape", [tiled, shape])], axis=2)
-    stops = g.made("Greater", [g.linear(joined, "stop"), g.constant("even", 0.0)])
-    goes = g.made("Cast", [g.made("Not", [stops])], to=TensorProto.FLOAT)
-    g.made("Mul", [rows, goes], PLAN)
+    ways = g.add("Reshape", [g.linear(joined, "way"), shape])
+    rows = g.add("Concat", [ways, g.add("Reshape", [tiled, shape])], axis=2)
+    stops = g.add("Greater", [g.linear(joined, "stop"), g.constant("even", 0.0)])
+    goes = g.add("Cast", [g.add("Not", [stops])], to=TensorProto.FLOAT)
+    g.add("Mul", [rows, goes], PLAN)
 
     floats = TensorProto.FLOAT
     graph = helper.make_graph(
@@ -119,29 +117,29 @@ def graph_of(parameters: Parameters) -> bytes:
 
 
 def parameters_of(path: Path) -> dict[str, torch.Tensor]:
-    """The parameters in a graph that `graph_of` wrote. Raises RunError for any other."""
+    """Load the parameters from a graph written by `graph_of`. Raises RunError for any other."""
     wanted = new_parameters(0)
     try:
-        held = {one.name: numpy_helper.to_array(one) for one in onnx.load(path).graph.initializer}
+        arrays = {one.name: numpy_helper.to_array(one) for one in onnx.load(path).graph.initializer}
     except OSError as error:
         raise RunError(f"{path}: cannot be read: {error.strerror or error}") from error
     except Exception as error:
         raise RunError(f"{path}: no ONNX graph: {error}") from error
     found: dict[str, torch.Tensor] = {}
     for name, like in wanted.items():
-        shape = held[name].shape if name in held else None
+        shape = arrays[name].shape if name in arrays else None
         if shape != tuple(like.shape):
-            told = "is not there" if shape is None else f"has the shape {shape}"
+            problem = "is not there" if shape is None else f"has the shape {shape}"
             raise RunError(
-                f"{path}: {name} {told}, and is wanted as {tuple(like.shape)}: train on from a "
+                f"{path}: {name} {problem}, and is wanted as {tuple(like.shape)}: train on from a "
                 "bundle that this version of cosim train made"
             )
-        found[name] = torch.from_numpy(np.array(held[name], np.float32))
+        found[name] = torch.from_numpy(np.array(arrays[name], np.float32))
     return found
 
 
 def run_graph(graph: bytes, inputs: dict[str, NDArray[np.float32]]) -> NDArray[np.float32]:
-    """The plan by the graph, computed by onnx's own reference."""
+    """Return the plan of the graph, computed by onnx's reference evaluator."""
     from onnx.reference import ReferenceEvaluator
 
     (plan,) = ReferenceEvaluator(onnx.load_model_from_string(graph)).run([PLAN], inputs)

@@ -1,12 +1,11 @@
-"""The network: what the camera saw of late, the goal and the robot's speeds -> a plan; parameters
-are a dictionary.
+"""Network from recent pictures, goal and speeds to a plan; parameters are a dictionary.
 
-It has no normalisation layers, so that the graph that is shipped holds the same parameters as the
-one that is trained: any bundle can be trained on. Residual blocks begin as the identity instead.
+It has no normalisation layers, so the exported graph holds the trained parameters and any bundle
+can be trained further. Residual blocks start close to the identity instead.
 
-Its plan is (B, WAYPOINTS, 4): x ahead and y to the left in metres, speed in m/s, turn in rad/s, the
-same in every row. To stop is a decision of its own, and no small speed: where it is more likely
-than not all four are 0.
+The plan is (B, WAYPOINTS, 4): x ahead and y left in metres, speed in m/s, turn in rad/s. Speed and
+turn are the same in every row. Stopping is a separate decision: if its probability is above one
+half, all four are 0.
 """
 
 from __future__ import annotations
@@ -22,8 +21,9 @@ from torch.nn import functional
 Parameters = Mapping[str, Tensor]
 
 HISTORY: Final = 4
+"""Number of pictures in the input, the newest last."""
 EVERY: Final = 1
-"""So many pictures are seen, so many answers apart, the newest last."""
+"""Policy steps between two pictures of the input."""
 WIDTH_PX: Final = 160
 HEIGHT_PX: Final = 90
 WAYPOINTS: Final = 8
@@ -33,12 +33,11 @@ SPEED_MEAN_MPS: Final = 1.0
 SPEED_UNIT_MPS: Final = 0.5
 TURN_UNIT_RADPS: Final = 0.65
 CRUISE_MPS: Final = 1.5
-"""The unit of the speeds that it answers."""
+"""Unit of the network's speed output."""
 TURN_BINS: Final = 27
-"""Ways to turn, evenly from all to the left to all to the right: past either side of a thing, not
-the mean of both."""
+"""Number of turn rates, full left to full right; bins avoid averaging both ways around a thing."""
 SHARPNESS: Final = 2.0
-"""Of the odds of the bins before their mean is taken."""
+"""Factor on the log odds of the bins before their mean is computed."""
 
 _MIDDLE: Final = 256
 _SHAPES: Final[Mapping[str, tuple[int, ...]]] = {
@@ -59,16 +58,22 @@ _SHAPES: Final[Mapping[str, tuple[int, ...]]] = {
     "stop": (1, _MIDDLE),
     "way": (2 * WAYPOINTS, _MIDDLE),
 }
-"""Of the weights; of four axes: a convolution (out, in, high, wide), of two: a linear layer (out,
-in). Multiples of 16 channels are what processors compute fastest."""
+"""Shapes of the weights: convolutions (out, in, height, width), linear layers (out, in).
+
+Multiples of 16 channels are the fastest on CPUs.
+"""
 STRIDES: Final[Mapping[str, int]] = {"stem": 2, "down1": 2, "down2": 2, "down3": 2}
-"""Of the convolutions; 1 where it is not said."""
+"""Strides of the convolutions; 1 if missing."""
 
 
 class Answers(NamedTuple):
-    """What the network says before it is made a plan. speed: (B,), in units of CRUISE_MPS, of a
-    robot that does not stop; turn: (B, TURN_BINS) log odds; stop: (B,) log odds; way: (B,
-    WAYPOINTS, 2) m."""
+    """Raw outputs of the network.
+
+    speed: (B,) in units of CRUISE_MPS, of a robot that does not stop
+    turn: (B, TURN_BINS) log odds
+    stop: (B,) log odds
+    way: (B, WAYPOINTS, 2) m
+    """
 
     speed: Tensor
     turn: Tensor
@@ -77,7 +82,7 @@ class Answers(NamedTuple):
 
 
 def new_parameters(seed: int) -> dict[str, Tensor]:
-    """Drawn from a seed: "stem.weight", "stem.bias" and so on, float32."""
+    """Draw float32 parameters from a seed, named "stem.weight", "stem.bias" and so on."""
     draws = torch.Generator().manual_seed(seed)
     parameters: dict[str, Tensor] = {}
     for name, shape in _SHAPES.items():
@@ -90,13 +95,17 @@ def new_parameters(seed: int) -> dict[str, Tensor]:
 
 
 def turns_radps(device: str | torch.device = "cpu") -> Tensor:
-    """(TURN_BINS,): the turn that each bin stands for, from the left to the right."""
+    """Return (TURN_BINS,) the turn rates of the bins, from left to right."""
     return torch.linspace(TURN_UNIT_RADPS, -TURN_UNIT_RADPS, TURN_BINS, device=device)
 
 
 def answers(parameters: Parameters, pictures: Tensor, goal: Tensor, speeds: Tensor) -> Answers:
-    """pictures: (B, 3 HISTORY, HEIGHT_PX, WIDTH_PX), 0 to 1, oldest first. goal: (B, 2), x and y in
-    GOAL_UNIT_M. speeds: (B, 2), v less its mean and w, in their units."""
+    """Compute the raw outputs of the network.
+
+    pictures: (B, 3 HISTORY, HEIGHT_PX, WIDTH_PX), 0 to 1, oldest first
+    goal: (B, 2), x and y in GOAL_UNIT_M
+    speeds: (B, 2), v minus its mean in SPEED_UNIT_MPS, w in TURN_UNIT_RADPS
+    """
 
     def convolved(x: Tensor, name: str) -> Tensor:
         weight, bias = parameters[f"{name}.weight"], parameters[f"{name}.bias"]
@@ -112,9 +121,9 @@ def answers(parameters: Parameters, pictures: Tensor, goal: Tensor, speeds: Tens
     x = convolved(x.relu(), "down3").relu()
     x = x + convolved(convolved(x, "block3a").relu(), "block3b")
     x = convolved(x.relu(), "narrow").relu()
-    seen = linear(x.flatten(1), "seen").relu()
-    told = linear(torch.cat([goal, speeds], 1), "told").relu()
-    joined = linear(torch.cat([seen, told], 1), "joined").relu()
+    image = linear(x.flatten(1), "seen").relu()
+    inputs = linear(torch.cat([goal, speeds], 1), "told").relu()
+    joined = linear(torch.cat([image, inputs], 1), "joined").relu()
     return Answers(
         linear(joined, "speed").squeeze(1),
         linear(joined, "turn"),
@@ -123,9 +132,9 @@ def answers(parameters: Parameters, pictures: Tensor, goal: Tensor, speeds: Tens
     )
 
 
-def plan(said: Answers) -> Tensor:
-    """(B, WAYPOINTS, 4): see above."""
-    turn = (SHARPNESS * said.turn).softmax(1) @ turns_radps(said.turn.device)
-    speeds = torch.stack([CRUISE_MPS * said.speed.relu(), turn], 1)
-    rows = torch.cat([said.way, speeds[:, None].expand(-1, WAYPOINTS, -1)], 2)
-    return rows * (said.stop <= 0.0).float()[:, None, None]
+def plan(output: Answers) -> Tensor:
+    """Convert raw outputs to a plan (B, WAYPOINTS, 4), see the module."""
+    turn = (SHARPNESS * output.turn).softmax(1) @ turns_radps(output.turn.device)
+    speeds = torch.stack([CRUISE_MPS * output.speed.relu(), turn], 1)
+    rows = torch.cat([output.way, speeds[:, None].expand(-1, WAYPOINTS, -1)], 2)
+    return rows * (output.stop <= 0.0).float()[:, None, None]

@@ -1,4 +1,4 @@
-"""The settings of a training, and the rules for continuing one. Needs no PyTorch."""
+"""Settings of a training, and the rules for continuing one; needs no PyTorch."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from typing import Any, Final, NamedTuple
 from cosim.core.errors import RunError, UsageError
 
 PLANNED_STEPS: Final = 20_000
-"""A training has so many steps unless others are asked for."""
-_LOOKS: Final = 20
-"""The held-out episodes are looked at so often in a training, at least _STEPS_APART steps apart: a
-look takes as long as thirty steps or more."""
-_STEPS_APART: Final = 200
+"""Default number of steps of a training."""
+_EVALUATIONS: Final = 20
+"""Number of evaluations on the held-out episodes in a training."""
+_MIN_STEPS_BETWEEN: Final = 200
+"""Least number of steps between evaluations; one takes as long as thirty steps or more."""
 _WARM_UP: Final = 0.03
-"""The rate of learning rises during this share of the steps."""
+"""Share of the steps in which the learning rate rises."""
 CPU_WHEEL: Final = "pip install torch --index-url https://download.pytorch.org/whl/cpu"
-"""How PyTorch's own documentation installs the build without CUDA."""
+"""Command that PyTorch documents for the build without CUDA."""
 TO_INSTALL: Final = (
     f"{CPU_WHEEL} (0.8 GB on disk; without --index-url pip installs the build for NVIDIA GPUs, 7 "
     "GB), then pip install -e '.[train]' in the checkout"
@@ -28,13 +28,15 @@ TO_INSTALL: Final = (
 
 @dataclass(frozen=True, kw_only=True)
 class Training:
-    """How a training is done. Raises UsageError.
+    """Settings of a training. Raises UsageError.
 
-    steps: in all, from the first one on; None for those of the training that is continued, else
-    PLANNED_STEPS. batch: examples a step. rate: the highest rate of learning. device: "" for the
-    GPU if there is one. begin: a bundle whose parameters it begins with; None for new ones. name:
-    of the policy. minutes: it stops after so long, with a bundle of what it has learned by then,
-    and can be continued.
+    steps: total number; None for those of the continued training, else PLANNED_STEPS
+    batch: examples per step
+    rate: highest learning rate
+    device: "" for the GPU if available
+    begin: bundle with the initial parameters; None for new ones
+    minutes: time limit; the training then writes its bundle and can be continued
+    name: of the policy
     """
 
     steps: int | None = None
@@ -54,14 +56,14 @@ class Training:
 
     @property
     def spec(self) -> dict[str, Any]:
-        """Return what must be the same when a training is continued."""
+        """Return the settings that must not change when a training is continued."""
         return {
             name: value for name, value in asdict(self).items() if name in ("seed", "batch", "rate")
         }
 
 
 class Reached(NamedTuple):
-    """How far a training has come: steps done, and planned in all."""
+    """Steps of a training: done, and planned in total."""
 
     step: int
     steps: int
@@ -72,23 +74,22 @@ class Reached(NamedTuple):
 
 
 def looks_after(step: int, steps: int) -> bool:
-    """Return whether the held-out episodes are looked at when so many of all steps are done."""
-    return step % max(steps // _LOOKS, _STEPS_APART) == 0 or step == steps
+    """Return whether the held-out episodes are evaluated after a step."""
+    return step % max(steps // _EVALUATIONS, _MIN_STEPS_BETWEEN) == 0 or step == steps
 
 
 def rate_share(step: int, steps: int) -> float:
-    """Return the share of the highest rate by which a step learns: it rises, then falls as a cosine
-    to 0 at the end."""
+    """Return the learning rate of a step as a share of the highest: warm-up, then a cosine to 0."""
     return min(
         (step + 1) / max(1.0, _WARM_UP * steps), 0.5 * (1.0 + math.cos(math.pi * step / steps))
     )
 
 
 def planned_steps(path: Path, asked: int | None, planned: int, done: int) -> int:
-    """Return how many steps a continued training has in all: those asked for, else those planned
+    """Return the total steps of a continued training: the requested ones, else those planned
     before.
 
-    Raises RunError where more are done already.
+    Raises RunError if more are already done.
     """
     steps = planned if asked is None else asked
     if steps < done:
@@ -100,18 +101,17 @@ def planned_steps(path: Path, asked: int | None, planned: int, done: int) -> int
 
 
 def refuse_another(path: Path, was: Mapping[str, Any], spec: Mapping[str, Any]) -> None:
-    """Raise RunError with the differences where a checkpoint is of another training."""
+    """Raise RunError with the differences if a checkpoint is from another training."""
     if different := [name for name in spec if was.get(name) != spec[name]]:
-        told = ", ".join(f"{name} {was.get(name)}, not {spec[name]}" for name in different)
+        differences = ", ".join(f"{name} {was.get(name)}, not {spec[name]}" for name in different)
         raise RunError(
-            f"{path}: of another training: {told}: continue it as it was begun, or choose "
+            f"{path}: of another training: {differences}: continue it as it was begun, or choose "
             f"another folder"
         )
 
 
 def state_in_words(step: int, plans: Sequence[int]) -> str:
-    """Return what the source of a bundle adds about its training: nothing where it ended as it was
-    first planned.
+    """Return what the source of a bundle adds about its training; "" if it ended as first planned.
 
     >>> state_in_words(100, [100]), state_in_words(40, [100]), state_in_words(300, [100, 300])
     ('', '; step 40 of 100', '; 100 steps, continued to 300')
@@ -125,8 +125,9 @@ def state_in_words(step: int, plans: Sequence[int]) -> str:
 def fits_in_words(
     training: Training, step: int, steps: int, since_s: float, per_step_s: float
 ) -> str:
-    """Return how many of the steps fit in the minutes that there are; "" where all do. since_s:
-    from the start on.
+    """Return how many steps fit in the time limit; "" if all do.
+
+    since_s: time since the start
 
     >>> fits_in_words(Training(minutes=1.0), 4, 20_000, since_s=10.0, per_step_s=0.5)
     'about 104 of 20000 steps fit in --minutes 1: with --steps 104 a training would end by then'
@@ -142,7 +143,7 @@ def fits_in_words(
 
 
 def outcome_in_words(folder: Path, reached: Reached) -> str:
-    """Return how a training ended: what the folder holds, and how to continue."""
+    """Return how a training ended: content of the folder, and how to continue."""
     bundle = f"a bundle: --policy onnx:{folder}"
     if reached.whole:
         return f"{folder}: {bundle}; more steps: --resume --steps {2 * reached.steps}"

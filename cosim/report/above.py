@@ -1,4 +1,4 @@
-"""An episode from above: map, route, barriers, track, people, events, failures, as one picture."""
+"""Picture of an episode from above: map, route, barriers, track, people, events and failures."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from cosim.report.legend import Image, Rgb255, legend, wide_px
 from cosim.results.log import Log
 from cosim.results.record import Record
 from cosim.spec.obstacle import footprint
-from cosim.spec.scenario import Scenario
+from cosim.spec.scenario import Barrier, Scenario
 
 _MARGIN_M: Final = 25.0
 LONGEST_PX: Final = 2400
 USUAL_PX: Final = 1400
-"""Longest side of the picture of a short way."""
+"""Longest side, pixels, of the picture of a short route."""
 PX_PER_M: Final = 10.0
 TEXT_GAP_PX: Final = 6
 PLAIN_STD: Final = 25.0
-"""Words go elsewhere if what is under them varies more than this."""
+"""Standard deviation of pixel values above which a background is too busy for a label."""
 EVENT_RING_M: Final = 0.9
 FAILURE_RING_M: Final = 0.6
 END_M: Final = 0.6
-"""Radius of the dots at start and goal."""
+"""Radius, metres, of the dots at start and goal."""
 
 GROUND_COLOUR: Final[Rgb255] = GROUND_LOOKS[PLAIN_GROUND].drawn
 ROAD: Final[Rgb255] = (120, 120, 124)
@@ -60,14 +60,17 @@ FAILURES: Final[dict[str, Rgb255]] = {
     "freezing": (0, 140, 200),
 }
 
+Bounds = tuple[float, float, float, float]
+"""Part of the world in metres: x0, y0, x1, y1."""
+
 
 class Sheet:
-    """A picture of a part of the world: x east is right, y north is up. bounds: x0, y0, x1, y1 in
-    metres."""
+    """Picture of a part of the world: x east is right, y north is up.
 
-    def __init__(
-        self, bounds: tuple[float, float, float, float], px_per_m: float = PX_PER_M
-    ) -> None:
+    bounds: x0, y0, x1, y1 in metres
+    """
+
+    def __init__(self, bounds: Bounds, px_per_m: float = PX_PER_M) -> None:
         x0, y0, x1, y1 = bounds
         self.px_per_m = min(px_per_m, LONGEST_PX / max(x1 - x0, y1 - y0))
         self._x0 = x0
@@ -77,12 +80,13 @@ class Sheet:
         self._labels: list[Polygon] = []
 
     def px(self, xy: Floats) -> NDArray[np.int32]:
-        """World metres (N, 2) as sixteenths of pixels."""
+        """Convert world metres (N, 2) to sixteenths of pixels."""
         xy = np.asarray(xy, dtype=float).reshape(-1, 2)
         at = np.column_stack([xy[:, 0] - self._x0, self._y1 - xy[:, 1]]) * self.px_per_m * 16
         return np.round(at).astype(np.int32)
 
     def area(self, shape: Polygon | MultiPolygon, colour: Rgb255) -> None:
+        """Fill a shape, metres."""
         for part in shapely.get_parts(shape):
             if isinstance(part, Polygon) and not part.is_empty:
                 rings = [
@@ -91,10 +95,12 @@ class Sheet:
                 cv2.fillPoly(self.image, rings, colour, cv2.LINE_AA, 4)
 
     def line(self, xy: Floats, colour: Rgb255, width_m: float) -> None:
+        """Draw a polyline (N, 2), metres."""
         thickness = max(1, round(width_m * self.px_per_m))
         cv2.polylines(self.image, [self.px(xy)], False, colour, thickness, cv2.LINE_AA, 4)
 
     def dot(self, xy: Floats, colour: Rgb255, radius_m: float, *, filled: bool = True) -> None:
+        """Draw circles at (N, 2), metres, of at least 2 pixels radius."""
         radius = max(2, round(radius_m * self.px_per_m))
         for x, y in self.px(xy):
             cv2.circle(
@@ -115,38 +121,39 @@ class Sheet:
         beside_m: float = 0.0,
         size: float = 0.5,
     ) -> None:
-        """Words on a light plate near a place: below it, above it or beside it, where there is
-        least under them.
+        """Draw a label on a light plate below, above or next to a place, where it hides least.
 
-        beside_m: clear of what is drawn so far around the place; size: of the words, in OpenCV's
-        units.
+        beside_m: gap to the place, metres, to avoid covering its mark
+        size: font scale of OpenCV
         """
         x, y = (self.px(np.array([xy]))[0] // 16).tolist()
-        clear = round(beside_m * self.px_per_m)
-        wide = wide_px(words, size)
-        tall = round(22 * size)
-        gap = clear + TEXT_GAP_PX
-        left = x - wide // 2
+        clear_px = round(beside_m * self.px_per_m)
+        text_width = wide_px(words, size)
+        text_height = round(22 * size)
+        gap = clear_px + TEXT_GAP_PX
+        left = x - text_width // 2
         corners = [
-            (left, y + gap + tall),
+            (left, y + gap + text_height),
             (left, y - gap),
-            (x + gap, y + tall // 2),
-            (x - gap - wide, y + tall // 2),
+            (x + gap, y + text_height // 2),
+            (x - gap - text_width, y + text_height // 2),
         ]
         for row in (1, 2, 3):
-            further = row * (tall + 10)
-            corners += [(left, y + gap + tall + further), (left, y - gap - further)]
+            further = row * (text_height + 10)
+            corners += [(left, y + gap + text_height + further), (left, y - gap - further)]
         height, width = self.image.shape[:2]
         corners = [
-            (max(3, min(a, width - wide - 3)), max(tall + 3, min(b, height - 5)))
+            (max(3, min(a, width - text_width - 3)), max(text_height + 3, min(b, height - 5)))
             for a, b in corners
         ]
-        plates = [shapely.box(a - 3, b - tall - 3, a + wide + 3, b + 5) for a, b in corners]
-        mark = shapely.box(x - clear, y - clear, x + clear, y + clear)
-        taken = shapely.union_all([*self._labels, mark])
-        free = [k for k, plate in enumerate(plates) if not taken.intersects(plate)]
-        under = [self._pixels(plate).std() for plate in plates]
-        chosen = min(free, key=lambda k: (round(under[k] / PLAIN_STD), k)) if free else 0
+        plates = [
+            shapely.box(a - 3, b - text_height - 3, a + text_width + 3, b + 5) for a, b in corners
+        ]
+        mark = shapely.box(x - clear_px, y - clear_px, x + clear_px, y + clear_px)
+        occupied = shapely.union_all([*self._labels, mark])
+        free = [k for k, plate in enumerate(plates) if not occupied.intersects(plate)]
+        contrast = [self._pixels(plate).std() for plate in plates]
+        chosen = min(free, key=lambda k: (round(contrast[k] / PLAIN_STD), k)) if free else 0
         self._labels += [plates[chosen], mark]
         plate = self._pixels(plates[chosen])
         plate[:] = 191 + plate // 4
@@ -162,17 +169,21 @@ class Sheet:
         )
 
     def _pixels(self, box: Polygon) -> Image:
-        """The part of the picture in a box of pixels."""
+        """Return the part of the picture in a box of pixels."""
         x0, y0, x1, y1 = (max(int(edge), 0) for edge in box.bounds)
         return self.image[y0:y1, x0:x1]
 
 
+def bounds_around(points: Sequence[tuple[float, float]], margin_m: float) -> Bounds:
+    """Return the bounds of points with a margin, metres."""
+    low = np.min(points, axis=0) - margin_m
+    high = np.max(points, axis=0) + margin_m
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])
+
+
 def draw_above(street_map: StreetMap, scenario: Scenario, record: Record, log: Log) -> Image:
-    """The picture of an episode, (H, W, 3) uint8 RGB."""
-    route = np.array(scenario.route)
-    low = route.min(axis=0) - _MARGIN_M
-    high = route.max(axis=0) + _MARGIN_M
-    bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    """Draw an episode: (H, W, 3) uint8 RGB."""
+    bounds = bounds_around(scenario.route, _MARGIN_M)
     sheet = Sheet(
         bounds, max(PX_PER_M, USUAL_PX / max(bounds[2] - bounds[0], bounds[3] - bounds[1]))
     )
@@ -192,22 +203,24 @@ def draw_above(street_map: StreetMap, scenario: Scenario, record: Record, log: L
 
 
 def draw_way_and_things(sheet: Sheet, scenario: Scenario) -> None:
-    """The way of a scenario, and what stands there."""
+    """Draw the route, barriers and obstacles of a scenario."""
     sheet.line(np.array(scenario.route), ROUTE, 0.4)
     for barrier in scenario.barriers:
-        across = (
-            np.array([-math.sin(barrier.heading_rad), math.cos(barrier.heading_rad)])
-            * barrier.length_m
-            / 2
-        )
-        middle = np.array([barrier.x_m, barrier.y_m])
-        sheet.line(np.array([middle - across, middle + across]), BARRIER, 0.5)
+        sheet.line(barrier_line(barrier), BARRIER, 0.5)
     for obstacle in scenario.obstacles:
         sheet.area(footprint(obstacle), OBSTACLE)
 
 
+def barrier_line(barrier: Barrier) -> Floats:
+    """Return the (2, 2) ends of a barrier, metres."""
+    cos, sin = math.cos(barrier.heading_rad), math.sin(barrier.heading_rad)
+    across = np.array([-sin, cos]) * barrier.length_m / 2
+    middle = np.array([barrier.x_m, barrier.y_m])
+    return np.array([middle - across, middle + across])
+
+
 def draw_ends_and_events(sheet: Sheet, scenario: Scenario) -> None:
-    """Start, goal and events of a scenario, by name."""
+    """Draw and label start, goal and events of a scenario."""
     sheet.dot(np.array([scenario.start[:2], scenario.goal]), TRACK, END_M)
     sheet.text(scenario.start[:2], "start", TRACK, END_M)
     sheet.text(scenario.goal, "goal", TRACK, END_M)
@@ -217,7 +230,7 @@ def draw_ends_and_events(sheet: Sheet, scenario: Scenario) -> None:
 
 
 def draw_streets(sheet: Sheet, street_map: StreetMap, area: Polygon) -> None:
-    """Ground zones of a part of a map."""
+    """Draw the ground zones of a part of a map."""
     for kind, shape in street_areas(street_map, area):
         sheet.area(shape, _GROUNDS[kind])
 
@@ -225,8 +238,10 @@ def draw_streets(sheet: Sheet, street_map: StreetMap, area: Polygon) -> None:
 def street_areas(
     street_map: StreetMap, area: Polygon
 ) -> Iterator[tuple[str, Polygon | MultiPolygon]]:
-    """What lies in a part of a map, in the order in which it is drawn: what covers open ground
-    (`GROUND_LOOKS`), road, verge, walk or crossing, and its shape."""
+    """Yield (kind, shape) of the ground zones in a part of a map, in drawing order.
+
+    Kinds: open ground (`GROUND_LOOKS`), road, verge, walk, crossing.
+    """
     yield from open_ground(street_map, area)
     lanes = [piece for piece in street_map.near("lane", area) if isinstance(piece, Lane)]
     for junction in street_map.near("junction", area):
@@ -240,7 +255,7 @@ def street_areas(
 
 
 def draw_track(sheet: Sheet, log: Log) -> None:
-    """The robot's track, with a dashed jump where it was reset."""
+    """Draw the robot's track, with a dashed line for each reset."""
     jumps = np.flatnonzero(~np.isnan(log.reset_s_m)) + 1
     pieces = np.split(log.pose[:, :2], jumps)
     for piece in pieces:
@@ -256,7 +271,7 @@ def draw_track(sheet: Sheet, log: Log) -> None:
 
 
 def _facts(scenario: Scenario, record: Record, time_s: float) -> list[tuple[str, Rgb255]]:
-    """What stands below the picture: how the episode went, and what each colour means."""
+    """Return the legend: outcome of the episode and meaning of each colour."""
     measures = record.measures
     return [
         (record.scenario.id, TRACK),

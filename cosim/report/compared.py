@@ -1,4 +1,4 @@
-"""Makes readable tables of a comparison: rows of words, and these as Markdown and LaTeX."""
+"""Tables of a run comparison as text, Markdown and LaTeX."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _HLINES: Final[list[Any]] = [
     {"selector": f"{rule}rule", "props": ":hline"} for rule in ("top", "mid", "bottom")
 ]
 """Rules of a LaTeX table that need no package."""
-_OF_THE_SUITE: Final = (
+_SUITE_METRICS: Final = (
     "success",
     "goal_reached",
     "route_completion",
@@ -36,8 +36,8 @@ _OF_THE_SUITE: Final = (
     "clearance_min_m",
     "time_to_goal_s",
 )
-_OF_GROUPS: Final = {"success": "SR", "route_completion": "RC", "failures_per_100m": "FC"}
-_LATEX: Final = {
+_GROUP_METRICS: Final = {"success": "SR", "route_completion": "RC", "failures_per_100m": "FC"}
+_LATEX_ESCAPES: Final = {
     "\\": r"\textbackslash{}",
     "{": r"\{",
     "}": r"\}",
@@ -53,13 +53,12 @@ _LATEX: Final = {
     "|": r"\textbar{}",
     '"': r"\textquotedbl{}",
 }
-_MARKS: Final = re.compile(r"([\\`*_{}\[\]#|~$&])")
-_SIGNED: Final = re.compile(r"(?<!\S)[-+]\d[\d.]*(?!\S)")
+_MARKDOWN_SPECIAL: Final = re.compile(r"([\\`*_{}\[\]#|~$&])")
+_SIGNED_NUMBER: Final = re.compile(r"(?<!\S)[-+]\d[\d.]*(?!\S)")
 
 
 class WrittenTable(NamedTuple):
-    """A title, heads of columns, rows of words; names: how many columns are names, the others are
-    figures."""
+    """Table of text cells. names: number of columns with names; the others are figures."""
 
     title: str
     heads: tuple[str, ...]
@@ -67,22 +66,27 @@ class WrittenTable(NamedTuple):
     names: int
 
 
-def tables_of_comparison(told: RunComparison, other: ComparedRun) -> tuple[WrittenTable, ...]:
-    """Of the first run and one of the others: the whole suite by metric, and its groups by the most
-    telling metrics. What no pair of episodes has is left out."""
-    told_of = told.differences["after"] == other.label
-    rows = told.differences[told_of & (told.differences["n"] > 0)].to_dict("records")
-    title = f"{other.label} (B) against {told.before.label} (A), suite {told.suite}"
+def tables_of_comparison(result: RunComparison, other: ComparedRun) -> tuple[WrittenTable, ...]:
+    """Build the tables of the first run against another: the whole suite by metric, then its
+    groups.
+
+    Metrics without a common episode are omitted.
+    """
+    is_other = result.differences["after"] == other.label
+    rows = result.differences[is_other & (result.differences["n"] > 0)].to_dict("records")
+    title = f"{other.label} (B) against {result.before.label} (A), suite {result.suite}"
     figures = ("A", "B", "B - A", "95 % of B - A", "n", "")
-    whole = [row for row in rows if row["by"] == "suite" and row["metric"] in _OF_THE_SUITE]
+    whole = [row for row in rows if row["by"] == "suite" and row["metric"] in _SUITE_METRICS]
     tables = [
         WrittenTable(
             title, ("metric", *figures), tuple((row["metric"], *_figures(row)) for row in whole), 1
         )
     ]
-    if parts := [row for row in rows if row["by"] != "suite" and row["metric"] in _OF_GROUPS]:
-        named = " and ".join(dict.fromkeys(row["by"] for row in parts))
-        each = tuple((row["group"], _OF_GROUPS[row["metric"]], *_figures(row)) for row in parts)
+    if grouped := [row for row in rows if row["by"] != "suite" and row["metric"] in _GROUP_METRICS]:
+        named = " and ".join(dict.fromkeys(row["by"] for row in grouped))
+        each = tuple(
+            (row["group"], _GROUP_METRICS[row["metric"]], *_figures(row)) for row in grouped
+        )
         tables.append(WrittenTable(f"{title}, by {named}", ("group", "", *figures), each, 2))
     return tuple(tables)
 
@@ -101,24 +105,24 @@ def _signed(value: float) -> str:
     return f"{value + 0.0:+.{3 if abs(value) < 10.0 else 2 if abs(value) < 100.0 else 1}f}"
 
 
-def flips_in_words(told: RunComparison, other: ComparedRun) -> tuple[str, ...]:
-    """Which scenarios the other run won, and which it lost, by name."""
-    flipped = told.flipped[told.flipped["after"] == other.label]
+def flips_in_words(result: RunComparison, other: ComparedRun) -> tuple[str, ...]:
+    """Return which scenarios only one of two runs solved, by name."""
+    flipped = result.flipped[result.flipped["after"] == other.label]
     lines = []
     for flip, what in (
         ("won", f"solved by {other.label} alone"),
-        ("lost", f"solved by {told.before.label} alone"),
+        ("lost", f"solved by {result.before.label} alone"),
     ):
         names = flipped.loc[flipped["flip"] == flip, "scenario"].tolist()
         lines.append(f"{what}, {len(names)}: {', '.join(names) or 'none'}")
     return tuple(lines)
 
 
-def how_to_read(told: RunComparison) -> str:
-    """What the figures are, in words."""
-    tables = [table for other in told.others for table in tables_of_comparison(told, other)]
+def how_to_read(result: RunComparison) -> str:
+    """Return the explanation of the figures."""
+    tables = [table for other in result.others for table in tables_of_comparison(result, other)]
     shown = sum(row[-3] != "-" for table in tables for row in table.rows)
-    in_all = int(told.differences["low"].notna().sum())
+    in_all = int(result.differences["low"].notna().sum())
     return (
         "Paired by scenario, rates pooled; intervals by drawing scenarios again in pairs, "
         f"{BOOTSTRAP} times, always the same. Within noise: the interval holds 0. Too few: it does "
@@ -130,25 +134,27 @@ def how_to_read(told: RunComparison) -> str:
     )
 
 
-def as_markdown(told: RunComparison) -> str:
-    """All of it for a page of Markdown."""
+def as_markdown(result: RunComparison) -> str:
+    """Format the whole comparison as Markdown."""
     blocks = []
-    for other in told.others:
-        for table in tables_of_comparison(told, other):
+    for other in result.others:
+        for table in tables_of_comparison(result, other):
             align = ["left"] * table.names + ["right"] * (len(table.heads) - table.names)
             rows = _frame(table, _in_markdown).to_markdown(
                 index=False, colalign=align, disable_numparse=True
             )
             blocks.append(f"**{_in_markdown(table.title)}**\n\n{rows}")
-        blocks.append("\n".join(f"- {_in_markdown(line)}" for line in flips_in_words(told, other)))
-    return "\n\n".join([*blocks, *map(_in_markdown, (*told.notes, how_to_read(told)))]) + "\n"
+        blocks.append(
+            "\n".join(f"- {_in_markdown(line)}" for line in flips_in_words(result, other))
+        )
+    return "\n\n".join([*blocks, *map(_in_markdown, (*result.notes, how_to_read(result)))]) + "\n"
 
 
-def as_latex(told: RunComparison) -> str:
-    """All of it for a paper, to be taken in with \\input; it needs no package."""
+def as_latex(result: RunComparison) -> str:
+    """Format the whole comparison as LaTeX for \\input; it needs no package."""
     blocks = []
-    for other in told.others:
-        for table in tables_of_comparison(told, other):
+    for other in result.others:
+        for table in tables_of_comparison(result, other):
             style = _frame(table, _in_latex).style.hide(axis="index").set_table_styles(_HLINES)
             columns = "l" * table.names + "r" * (len(table.heads) - table.names - 1) + "l"
             title = _in_latex(table.title)
@@ -157,8 +163,8 @@ def as_latex(told: RunComparison) -> str:
                     column_format=columns, caption=title, position_float="centering"
                 ).strip()
             )
-        blocks.append("\n\n".join(map(_in_latex, flips_in_words(told, other))))
-    return "\n\n".join([*blocks, *map(_in_latex, (*told.notes, how_to_read(told)))]) + "\n"
+        blocks.append("\n\n".join(map(_in_latex, flips_in_words(result, other))))
+    return "\n\n".join([*blocks, *map(_in_latex, (*result.notes, how_to_read(result)))]) + "\n"
 
 
 def _frame(table: WrittenTable, escaped: Callable[[str], str]) -> pd.DataFrame:
@@ -169,12 +175,12 @@ def _frame(table: WrittenTable, escaped: Callable[[str], str]) -> pd.DataFrame:
 
 
 def _in_latex(text: str) -> str:
-    plain = "".join(_LATEX.get(letter, letter) for letter in _one_line(text))
-    return _SIGNED.sub(r"$\g<0>$", plain)
+    plain = "".join(_LATEX_ESCAPES.get(letter, letter) for letter in _one_line(text))
+    return _SIGNED_NUMBER.sub(r"$\g<0>$", plain)
 
 
 def _in_markdown(text: str) -> str:
-    return _MARKS.sub(r"\\\1", _one_line(text)).replace("<", "&lt;").replace(">", "&gt;")
+    return _MARKDOWN_SPECIAL.sub(r"\\\1", _one_line(text)).replace("<", "&lt;").replace(">", "&gt;")
 
 
 def _one_line(text: str) -> str:
@@ -182,4 +188,4 @@ def _one_line(text: str) -> str:
 
 
 FORMATS: Final[dict[str, Callable[[RunComparison], str]]] = {".md": as_markdown, ".tex": as_latex}
-"""By the end of a file's name."""
+"""Formatters by file suffix."""

@@ -1,5 +1,4 @@
-"""Curves of a sweep: a panel for each metric, the first field along it, a line for each value of
-the others."""
+"""Curves of a sweep: one panel per metric, first field on the x axis, one line per other value."""
 
 from __future__ import annotations
 
@@ -36,28 +35,35 @@ _COLOURS: Final = (
     "#882255",
 )
 _MARKS: Final = "osD^v<>P"
-_MOST_NAMED: Final = 16
-"""Of more lines than this none is named."""
+_MAX_NAMED: Final = 16
+"""Maximum number of lines with a legend."""
 _PANEL_LETTERS = 44
+"""Characters of tick labels that fit horizontally below a panel."""
 _PANEL_LINES = 24
+"""Lines of vertical tick labels that fit below a panel."""
 _UPRIGHT_LETTERS = 26
+"""Characters of a vertical tick label before it wraps."""
 _TITLE_LETTERS = 120
+"""Characters of the title before it wraps."""
 _LEGEND_LETTERS = 168
-"""Letters that fit side by side below a panel; lines that fit there upright, and the letters of
-each; letters that fit above all panels, and below them."""
-_LOW = 7.4
-_HIGH = 10.4
-"""The figure's height in inches, with names side by side and with upright ones."""
-_APART: Final = 0.012
-"""Lines stand so far beside each other, of the width of a panel, so that their intervals can be
-told apart."""
+"""Characters that fit into one row of the legend."""
+_HEIGHT = 7.4
+"""Figure height, inches, with horizontal tick labels."""
+_TALL_HEIGHT = 10.4
+"""Figure height, inches, with vertical tick labels."""
+_OFFSET: Final = 0.012
+"""Horizontal offset between lines, as a share of the panel width, to separate their intervals."""
 
 
 def draw_curves(
     summary: pd.DataFrame, fields: Sequence[str], metrics: Sequence[str], title: str
 ) -> bytes:
-    """A PNG of the means with their intervals. summary: rows of fields, metric, mean, low, high, n.
-    Raises MachineError where the library that draws is not installed."""
+    """Draw the means with their intervals as PNG.
+
+    summary: rows of fields, metric, mean, low, high, n
+
+    Raises MachineError if matplotlib is not installed.
+    """
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -67,29 +73,29 @@ def draw_curves(
             "the same with --resume"
         ) from error
     first, *others = fields
-    along, ticks = _places(summary[first])
-    whole = summary.assign(_along=along)
+    x, ticks = _x_positions(summary[first])
+    whole = summary.assign(_along=x)
     lines = list(whole.groupby(others, sort=False)) if others else [((), whole)]
     figure = Figure(
-        figsize=(13.0, _LOW if ticks is None or _side_by_side(ticks) else _HIGH),
+        figsize=(13.0, _HEIGHT if ticks is None or _fit_horizontally(ticks) else _TALL_HEIGHT),
         dpi=120,
         layout="constrained",
     )
     FigureCanvasAgg(figure)
     for panel, metric in zip(figure.subplots(2, -(-len(metrics) // 2)).flat, metrics, strict=True):
-        shift = _APART * (float(np.ptp(along)) or 1.0)
+        shift = _OFFSET * (float(np.ptp(x)) or 1.0)
         for number, (values, rows) in enumerate(lines):
-            colour, mark = _COLOURS[number % len(_COLOURS)], _MARKS[number % len(_MARKS)]
-            here = rows[(rows["metric"] == metric) & rows["mean"].notna()]
-            at = here["_along"] + shift * (number - (len(lines) - 1) / 2)
-            ends = [here["mean"] - here["low"], here["high"] - here["mean"]]
-            named = _named(others, values)
+            colour, marker = _COLOURS[number % len(_COLOURS)], _MARKS[number % len(_MARKS)]
+            points = rows[(rows["metric"] == metric) & rows["mean"].notna()]
+            line_x = points["_along"] + shift * (number - (len(lines) - 1) / 2)
+            error_bars = [points["mean"] - points["low"], points["high"] - points["mean"]]
+            named = _line_label(others, values)
             panel.errorbar(
-                at,
-                here["mean"],
-                ends,
+                line_x,
+                points["mean"],
+                error_bars,
                 color=colour,
-                marker=mark,
+                marker=marker,
                 capsize=3,
                 lw=1.6,
                 ms=5,
@@ -104,7 +110,7 @@ def draw_curves(
             panel.set_ylim(-0.03, 1.03)
         else:
             panel.set_ylim(bottom=0.0)
-    if others and len(lines) <= _MOST_NAMED:
+    if others and len(lines) <= _MAX_NAMED:
         handles, names = figure.axes[0].get_legend_handles_labels()
         columns = min(len(names), 4, max(1, _LEGEND_LETTERS // (6 + max(map(len, names)))))
         figure.legend(handles, names, loc="outside lower center", ncols=columns, fontsize=9)
@@ -117,9 +123,8 @@ def draw_curves(
 
 
 def _name_ticks(panel: Axes, names: Sequence[str]) -> None:
-    """Name places along a panel: side by side where there is room, else upright, folded, of many
-    every second or so."""
-    if _side_by_side(names):
+    """Label the ticks of a panel: horizontal if they fit, else vertical, wrapped and thinned."""
+    if _fit_horizontally(names):
         panel.set_xticks(range(len(names)), names)
         return
     folded = [textwrap.fill(name, _UPRIGHT_LETTERS) for name in names]
@@ -128,14 +133,13 @@ def _name_ticks(panel: Axes, names: Sequence[str]) -> None:
     panel.set_xticks(range(0, len(names), every), folded[::every], rotation=90, fontsize=9)
 
 
-def _side_by_side(names: Sequence[str]) -> bool:
-    """Return whether names fit side by side below a panel."""
+def _fit_horizontally(names: Sequence[str]) -> bool:
+    """Return whether labels fit horizontally below a panel."""
     return sum(map(len, names)) + 2 * len(names) <= _PANEL_LETTERS
 
 
-def _places(values: pd.Series[Any]) -> tuple[np.ndarray, list[str] | None]:
-    """Where values stand along a panel: numbers where they are, words one after the other, with
-    their names."""
+def _x_positions(values: pd.Series[Any]) -> tuple[np.ndarray, list[str] | None]:
+    """Return x positions: numbers as they are, words as 0, 1, ... with their labels."""
     numbers = pd.to_numeric(values, errors="coerce")
     if numbers.notna().all() and not values.map(lambda value: isinstance(value, bool)).any():
         return numbers.to_numpy(dtype=float), None
@@ -143,7 +147,7 @@ def _places(values: pd.Series[Any]) -> tuple[np.ndarray, list[str] | None]:
     return np.array([names.index(str(value)) for value in values], dtype=float), names
 
 
-def _named(fields: Sequence[str], values: Any) -> str:
-    """What a line is of."""
+def _line_label(fields: Sequence[str], values: Any) -> str:
+    """Return the legend label of a line."""
     values = values if isinstance(values, tuple) else (values,)
     return ", ".join(f"{field} {value}" for field, value in zip(fields, values, strict=True))

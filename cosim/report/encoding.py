@@ -18,25 +18,27 @@ from cosim.core.errors import RunError, unwritable
 from cosim.core.files import atomic_file
 from cosim.report.legend import Image
 
-_MOST_PX = 4096
-"""Longest side of a video."""
+_MAX_PX = 4096
+"""Longest side of a video, pixels."""
 
 
 class Video:
-    """An .mp4 in the making. Use in a `with` block; the file appears at its end, and only if
-    nothing went wrong.
+    """Video file (.mp4) that is being written; use in a `with` block.
 
-    size: width, height, both even; fps: pictures a second. Raises MachineError when it cannot be
-    written.
+    size: width, height, both even
+    fps: frames per second
+
+    The file appears at the end of the block, only without an error. Raises MachineError if it
+    cannot be written.
     """
 
     def __init__(self, path: Path, size: tuple[int, int], fps: int) -> None:
         if path.suffix != ".mp4":
             raise RunError(f"{path}: a video's name ends in .mp4")
-        if any(side % 2 or not 16 <= side <= _MOST_PX for side in size):
+        if any(side % 2 or not 16 <= side <= _MAX_PX for side in size):
             raise RunError(
                 f"a video of {size[0]}x{size[1]} pixels: both sides must be even, from 16 to "
-                f"{_MOST_PX}"
+                f"{_MAX_PX}"
             )
         self._path = path
         try:
@@ -45,7 +47,7 @@ class Video:
                 part.touch()
                 self._file = av.open(str(part), "w", format="mp4")
                 stack.callback(self._file.close)
-                self._making = stack.pop_all()
+                self._context = stack.pop_all()
         except OSError as error:
             raise unwritable(path, error) from error
         self._stream = self._file.add_stream(
@@ -58,7 +60,7 @@ class Video:
         return self
 
     def add(self, rgb: NDArray[np.uint8]) -> None:
-        """The next picture, (height, width, 3)."""
+        """Append a frame (height, width, 3)."""
         frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")
         self._write(frame)
 
@@ -70,10 +72,10 @@ class Video:
     ) -> None:
         try:
             if kind is None:
-                with self._making:
+                with self._context:
                     self._write(None)
             else:
-                self._making.__exit__(kind, error, trace)
+                self._context.__exit__(kind, error, trace)
         except OSError as problem:
             raise unwritable(self._path, problem) from problem
 
@@ -87,28 +89,28 @@ class Video:
 
 _QUALITY: Final = 58
 _EFFORT: Final = "2"
-"""Of 0 to 6: half the time of 4, which OpenCV takes, for 4 % more bytes and the same error."""
-_CODER: Final = "libwebp"
+"""WebP effort, 0 to 6: half the time of 4, OpenCV's default, for 4 % more bytes."""
+_CODEC: Final = "libwebp"
 
 
 def image_url(rgb: Image, quality: int = _QUALITY) -> str:
-    """Return an (H, W, 3) picture as it stands in a page."""
+    """Return an (H, W, 3) picture as a WebP data URL."""
     return "data:image/webp;base64," + base64.b64encode(as_webp(rgb, quality)).decode()
 
 
 def as_webp(rgb: Image, quality: int = _QUALITY) -> bytes:
-    """Return an (H, W, 3) picture as a WebP file."""
-    if _CODER not in av.codecs_available:
+    """Encode an (H, W, 3) picture as WebP."""
+    if _CODEC not in av.codecs_available:
         return cv2.imencode(".webp", rgb[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])[
             1
         ].tobytes()
-    coder = av.CodecContext.create(_CODER, "w")
-    coder.height, coder.width = rgb.shape[:2]
-    coder.pix_fmt = "yuv420p"
-    coder.time_base = Fraction(1)
-    coder.options = {"quality": str(quality), "compression_level": _EFFORT}
+    codec = av.CodecContext.create(_CODEC, "w")
+    codec.height, codec.width = rgb.shape[:2]
+    codec.pix_fmt = "yuv420p"
+    codec.time_base = Fraction(1)
+    codec.options = {"quality": str(quality), "compression_level": _EFFORT}
     frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24").reformat(
         format="yuv420p"
     )
     frame.pts = 0
-    return b"".join(bytes(packet) for part in (frame, None) for packet in coder.encode(part))
+    return b"".join(bytes(packet) for part in (frame, None) for packet in codec.encode(part))

@@ -1,5 +1,4 @@
-"""How a film is laid out, and what is written in it: panels, figures, captions of events and
-failures."""
+"""Layout and text overlays of a film: panels, figures, captions."""
 
 from __future__ import annotations
 
@@ -15,13 +14,13 @@ QUIET: Final[Rgb255] = (190, 196, 204)
 GOOD: Final[Rgb255] = (120, 220, 140)
 BAD: Final[Rgb255] = (255, 110, 90)
 CAPTION_S: Final = 2.5
-"""How long a caption stays."""
+"""Time, seconds, that a caption is shown."""
 _FONT: Final = cv2.FONT_HERSHEY_DUPLEX
 _MARGIN_PX: Final = 16
 
 
 class Area(NamedTuple):
-    """A part of the film in pixels: upper left corner, width, height."""
+    """Rectangle of the film in pixels: upper left corner, width, height."""
 
     x: int
     y: int
@@ -30,8 +29,7 @@ class Area(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Where things are in a film: the view, beside it a second view (4:3) over the map, below them
-    all the bar."""
+    """Areas of a film: main view, second view (4:3) above the map on its right, bar below."""
 
     view: Area
     second: Area
@@ -40,7 +38,7 @@ class Layout(NamedTuple):
 
     @classmethod
     def of(cls, width: int, height: int) -> Layout:
-        """For films of any size; nothing covers anything."""
+        """Build the layout for a film size, without overlaps."""
         bar_px = max(22, height * 44 // 720)
         tall = height - bar_px
         column = min(width * 3 // 10, tall * 4 // 7) // 4 * 4
@@ -55,7 +53,7 @@ class Layout(NamedTuple):
 
 
 def fill(image: Image, area: Area, picture: Image, title: str = "") -> None:
-    """Put a picture of its size into an area, with a title over its upper edge."""
+    """Copy a picture of the area's size into it, with a title along its upper edge."""
     image[area.y : area.y + area.height, area.x : area.x + area.width] = picture
     if area.x:
         image[area.y : area.y + area.height, area.x : area.x + 2] = 250
@@ -63,25 +61,24 @@ def fill(image: Image, area: Area, picture: Image, title: str = "") -> None:
         image[area.y : area.y + 2, area.x : area.x + area.width] = 250
     if title:
         size = max(0.33, 0.45 * len(image) / 720)
-        tall = cv2.getTextSize(title, _FONT, size, 1)[0][1]
-        shade(image, (area.x, area.y, area.x + area.width, area.y + tall + 12))
-        words(image, title, (area.x + 7, area.y + tall + 6), size, QUIET)
+        height = cv2.getTextSize(title, _FONT, size, 1)[0][1]
+        shade(image, (area.x, area.y, area.x + area.width, area.y + height + 12))
+        words(image, title, (area.x + 7, area.y + height + 6), size, QUIET)
 
 
 def shade(image: Image, area: tuple[int, int, int, int], strength: float = 0.6) -> None:
-    """Darken x0, y0, x1, y1, so that words can be read there."""
+    """Darken the area x0, y0, x1, y1 so that text is readable."""
     x0, y0, x1, y1 = area
     image[y0:y1, x0:x1] = (image[y0:y1, x0:x1] * (1.0 - strength)).astype(np.uint8)
 
 
 def words(image: Image, text: str, at: tuple[int, int], size: float, colour: Rgb255 = INK) -> None:
-    """One line of text; at: x, y of its lower left."""
+    """Draw one line of text. at: x, y of its lower left corner."""
     cv2.putText(image, text, at, _FONT, size, colour, 1, cv2.LINE_AA)
 
 
 def bar(image: Image, area: Area, left: str, right: str, share: float) -> None:
-    """The bar along the lower edge: what runs, its figures, and how much of the way is done. Words
-    as large as fit."""
+    """Draw the bar at the lower edge: two texts and the share of the route done."""
     line_px = max(2, area.height // 10)
     image[area.y :] = (18, 20, 26)
     image[area.y : area.y + line_px] = 60
@@ -90,20 +87,20 @@ def bar(image: Image, area: Area, left: str, right: str, share: float) -> None:
         150,
         250,
     )
-    needed = sum(cv2.getTextSize(text, _FONT, 1.0, 1)[0][0] for text in (left, right))
-    size = min(max(0.4, 0.0125 * area.height), (area.width - 3 * _MARGIN_PX) / needed)
-    long, tall = cv2.getTextSize(right, _FONT, size, 1)[0]
-    y = area.y + line_px + (area.height - line_px + tall) // 2
+    unit_width = sum(cv2.getTextSize(text, _FONT, 1.0, 1)[0][0] for text in (left, right))
+    size = min(max(0.4, 0.0125 * area.height), (area.width - 3 * _MARGIN_PX) / unit_width)
+    width, height = cv2.getTextSize(right, _FONT, size, 1)[0]
+    y = area.y + line_px + (area.height - line_px + height) // 2
     words(image, left, (_MARGIN_PX, y), size)
-    words(image, right, (area.width - _MARGIN_PX - long, y), size)
+    words(image, right, (area.width - _MARGIN_PX - width, y), size)
 
 
 def caption(image: Image, area: Area, text: str, colour: Rgb255) -> None:
-    """A line in the upper middle of an area."""
+    """Draw a line of text at the upper middle of an area."""
     size = max(0.5, 0.9 * area.height / 676)
-    long, tall = cv2.getTextSize(text, _FONT, size, 1)[0]
-    x = area.x + (area.width - long) // 2
-    y = area.y + tall
-    edge = tall * 2 // 3
-    shade(image, (max(x - edge, 0), y - edge, x + long + edge, y + tall + edge), 0.65)
-    words(image, text, (x, y + tall), size, colour)
+    width, height = cv2.getTextSize(text, _FONT, size, 1)[0]
+    x = area.x + (area.width - width) // 2
+    y = area.y + height
+    edge = height * 2 // 3
+    shade(image, (max(x - edge, 0), y - edge, x + width + edge, y + height + edge), 0.65)
+    words(image, text, (x, y + height), size, colour)

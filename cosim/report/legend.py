@@ -1,5 +1,4 @@
-"""The band below a picture: what it shows and what its colours mean, on as many lines as that
-takes."""
+"""Legend below a picture: coloured text cells, wrapped into lines."""
 
 from __future__ import annotations
 
@@ -16,17 +15,17 @@ Image = NDArray[np.uint8]
 LINE_PX: Final = 22
 MARGIN_PX: Final = 8
 GAP_PX: Final = 24
-"""Between two cells of a line."""
+"""Gap between two cells of a line, pixels."""
 _FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
 _SIZE: Final = 0.5
 
 
 def legend(image: Image, cells: Sequence[tuple[str, Rgb255]]) -> Image:
-    """The picture, (H, W, 3) uint8 RGB, with a white band below it that holds every cell: words and
-    their colour.
+    """Append a white band with text cells below an (H, W, 3) uint8 RGB picture.
 
-    A cell that no longer fits into a line begins the next one; one that is wider than the picture
-    breaks at blanks.
+    cells: text and colour
+
+    Cells wrap to the next line; a cell wider than the picture breaks at blanks.
     """
     lines = _lines(cells, image.shape[1])
     band: Image = np.full(
@@ -42,12 +41,12 @@ def legend(image: Image, cells: Sequence[tuple[str, Rgb255]]) -> Image:
 
 
 def wide_px(words: str, size: float = _SIZE) -> int:
-    """How long a line of words is."""
+    """Return the width of a line of text, pixels."""
     return int(cv2.getTextSize(words, _FONT, size, 1)[0][0])
 
 
 def _lines(cells: Sequence[tuple[str, Rgb255]], width_px: int) -> list[list[tuple[str, Rgb255]]]:
-    """The cells in lines that are no wider than the picture, unless a single word is."""
+    """Wrap cells into lines no wider than the picture, unless a single word is wider."""
     room = width_px - 2 * MARGIN_PX
     lines: list[list[tuple[str, Rgb255]]] = [[]]
     left = room
@@ -63,7 +62,7 @@ def _lines(cells: Sequence[tuple[str, Rgb255]], width_px: int) -> list[list[tupl
 
 
 def _pieces(words: str, room_px: int) -> list[str]:
-    """A cell, broken at blanks into pieces that fit into a line."""
+    """Split a cell at blanks into pieces that fit into a line."""
     pieces = [""]
     for word in words.split():
         longer = f"{pieces[-1]} {word}".strip()

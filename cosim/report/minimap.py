@@ -1,4 +1,4 @@
-"""Minimap: the neighbourhood of the robot from above, north up, at one moment."""
+"""Minimap: surroundings of the robot from above at one moment, north up."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ from cosim.report.above import (
     RESIDENT,
     ROUTE,
     Sheet,
+    barrier_line,
+    bounds_around,
     draw_streets,
 )
 from cosim.report.legend import Image, Rgb255
@@ -28,9 +30,9 @@ from cosim.spec.obstacle import footprint
 from cosim.spec.scenario import Scenario
 
 MINIMAP_REACH_M: Final = 11.0
-"""Metres from the middle of the map to its nearer borders."""
+"""Distance from the middle of the map to its nearer borders, metres."""
 _AHEAD_M: Final = 4.0
-"""The middle of the map is so far ahead of the robot."""
+"""Distance of the map's middle ahead of the robot, metres."""
 SHARPEST_PX_PER_M: Final = 16.0
 ROBOT: Final[Rgb255] = (20, 20, 20)
 NOSE: Final[Rgb255] = (90, 200, 255)
@@ -40,35 +42,26 @@ RED_SIGNAL: Final[Rgb255] = (220, 30, 30)
 PLANNED: Final[Rgb255] = (15, 163, 177)
 _INK: Final[Rgb255] = (40, 40, 40)
 COLOURS: Final = (PERSON, EVENT, RESIDENT, EVENT)
-"""Of people, by their kind."""
+"""Colours of people by `PersonKind`."""
 _NOSE_M: Final = 0.62
-"""From the middle of a person to the tip that shows where the body faces."""
+"""Distance, metres, from a person's centre to the tip that shows the heading."""
 
 
 class Minimap:
-    """Draws the streets around a scenario's route once, and what moves on them for each picture.
+    """Minimap of a scenario: static streets drawn once, moving things per picture.
 
-    footprint_m: length and width of the robot.
+    footprint_m: length and width of the robot
     """
 
     def __init__(
         self, street_map: StreetMap, scenario: Scenario, footprint_m: tuple[float, float]
     ) -> None:
-        route = np.array(scenario.route)
-        low = route.min(axis=0) - 4.0 * MINIMAP_REACH_M
-        high = route.max(axis=0) + 4.0 * MINIMAP_REACH_M
-        bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+        bounds = bounds_around(scenario.route, 4.0 * MINIMAP_REACH_M)
         sheet = Sheet(bounds, SHARPEST_PX_PER_M)
         draw_streets(sheet, street_map, shapely.box(*bounds))
-        sheet.line(route, ROUTE, 0.2)
+        sheet.line(np.array(scenario.route), ROUTE, 0.2)
         for barrier in scenario.barriers:
-            across = (
-                np.array([-math.sin(barrier.heading_rad), math.cos(barrier.heading_rad)])
-                * barrier.length_m
-                / 2
-            )
-            middle = np.array([barrier.x_m, barrier.y_m])
-            sheet.line(np.array([middle - across, middle + across]), BARRIER, 0.4)
+            sheet.line(barrier_line(barrier), BARRIER, 0.4)
         for obstacle in scenario.obstacles:
             sheet.area(footprint(obstacle), OBSTACLE)
         sheet.dot(np.array([scenario.goal]), ROUTE, 0.7)
@@ -87,11 +80,14 @@ class Minimap:
         ahead: Floats,
         plan: Floats | None = None,
     ) -> Image:
-        """(height, width, 3) uint8 RGB; size_px: width, height; ahead: (2,) where the map shows
-        more; plan: (N, 2) waypoints that are followed, if any.
+        """Draw the map around the robot: (height, width, 3) uint8 RGB.
 
-        People have a nose where they face; those of events are orange, residents green; a hand held
-        up to the robot is red. A word says what event people do.
+        size_px: width, height
+        ahead: (2,) direction in which the map shows more
+        plan: (N, 2) waypoints that are followed, or None
+
+        People have a nose in their heading. Event people are orange and labelled with what they do,
+        residents are green. A stopping hand is red.
         """
         width, height = size_px
         half_m = MINIMAP_REACH_M * np.array([width, height]) / min(width, height)
@@ -121,7 +117,7 @@ class Minimap:
         return sheet.image
 
     def _ground(self, x0: float, y1: float, px_per_m: float, size_px: tuple[int, int]) -> Image:
-        """The streets of the part whose upper left corner is at metres x0, y1."""
+        """Return the streets of the part whose upper left corner is at x0, y1, metres."""
         streets = self._streets
         left, upper = (streets.px(np.array([[x0, y1]]))[0] / 16.0).tolist()
         zoom = streets.px_per_m / px_per_m
@@ -138,7 +134,7 @@ class Minimap:
 
 
 def _draw_people(sheet: Sheet, people: People) -> None:
-    """Everybody with a nose; event people over the others, with what they do."""
+    """Draw people with a nose, event people on top and labelled with what they do."""
     event = people.are(*DIRECTED)
     ahead = np.column_stack([np.cos(people.heading), np.sin(people.heading)])
     for row in np.argsort(event, kind="stable").tolist():
@@ -164,7 +160,7 @@ def _draw_people(sheet: Sheet, people: People) -> None:
 
 
 def _box(xy: Floats, heading_rad: float, size_m: Floats) -> Floats:
-    """(4, 2) corners of a box: fore left, fore right, aft right, aft left."""
+    """Return the (4, 2) corners of a box: fore left, fore right, aft right, aft left."""
     along = 0.5 * size_m[0] * np.array([math.cos(heading_rad), math.sin(heading_rad)])
     aside = 0.5 * size_m[1] * np.array([-math.sin(heading_rad), math.cos(heading_rad)])
     return np.array(

@@ -28,13 +28,18 @@ from cosim.results.table import (
 from cosim.spec.scenario import Scenario
 
 FEWEST_CHANGED: Final = 6
+"""Minimum number of changed pairs for a verdict."""
 PairedVerdict = Literal["within noise", "too few", "better", "worse", "differs"]
 
 
 class PairedDifference(NamedTuple):
-    """before, after: over the pairs in which both have a value; NaN where none has one. low, high:
-    of after - before. n: such pairs; changed: those of them that are not the same in both, and of a
-    rate had something counted in one."""
+    """Difference of a metric between two runs, paired by scenario.
+
+    before, after: means over the pairs in which both runs have a value; NaN without such pairs
+    low, high: bounds of the interval of after - before
+    n: number of these pairs
+    changed: number of pairs whose values differ; for a rate, only pairs with at least one count
+    """
 
     before: float
     after: float
@@ -48,7 +53,7 @@ class PairedDifference(NamedTuple):
         return self.after - self.before
 
     def verdict(self, higher_is_better: bool | None) -> PairedVerdict:
-        """In words, of a metric of which more is better, worse, or neither (None)."""
+        """Return the verdict in words. higher_is_better: None if neither direction is better."""
         if not self.n or self.low <= 0.0 <= self.high:
             return "within noise"
         if self.changed < FEWEST_CHANGED:
@@ -58,15 +63,17 @@ class PairedDifference(NamedTuple):
         return "better" if (self.low > 0.0) == higher_is_better else "worse"
 
 
+_NO_PAIRS: Final = PairedDifference(math.nan, math.nan, math.nan, math.nan, 0, 0)
+
+
 def difference_of_means(before: Floats, after: Floats) -> PairedDifference:
-    """Of two runs of the same (N,) scenarios, NaN where a value does not exist: such a pair is left
-    out."""
+    """Return the difference of means over (N,) paired values; pairs with a NaN are skipped."""
     both = ~(np.isnan(before) | np.isnan(after))
     before, after = before[both], after[both]
     n = len(before)
     changes = after - before
     if not n:
-        return PairedDifference(math.nan, math.nan, math.nan, math.nan, 0, 0)
+        return _NO_PAIRS
     low, high = _interval(changes[_draws(n)].sum(axis=1) / n, n) if changes.any() else (0.0, 0.0)
     return PairedDifference(
         float(before.mean()), float(after.mean()), low, high, n, int(np.count_nonzero(changes))
@@ -76,18 +83,23 @@ def difference_of_means(before: Floats, after: Floats) -> PairedDifference:
 def difference_of_rates(
     before: tuple[Floats, Floats], after: tuple[Floats, Floats], per: float = 100.0
 ) -> PairedDifference:
-    """Of pooled rates: of each run what was counted (N,) and the metres (N,) it is counted on. All
-    that was counted on all metres of the scenarios that are drawn, in both runs the same ones."""
+    """Return the difference of pooled rates.
+
+    before, after: counts (N,) and metres (N,) of the same N scenarios
+    per: metres that the rate refers to
+
+    A bootstrap sample draws the same scenarios for both runs and divides all counts by all metres.
+    """
     columns = np.array([*before, *after])
     columns = columns[:, ~np.isnan(columns).any(axis=0)]
     n = columns.shape[1]
     if not n or min(columns[1].sum(), columns[3].sum()) < RATE_NEEDS_M:
-        return PairedDifference(math.nan, math.nan, math.nan, math.nan, 0, 0)
+        return _NO_PAIRS
     counted, metres, counted_after, metres_after = columns
     rates = per * counted.sum() / metres.sum(), per * counted_after.sum() / metres_after.sum()
-    apart = (counted != counted_after) | (metres != metres_after)
-    changed = int((apart & ((counted > 0.0) | (counted_after > 0.0))).sum())
-    if not apart.any() or not (counted.any() or counted_after.any()):
+    differs = (counted != counted_after) | (metres != metres_after)
+    changed = int((differs & ((counted > 0.0) | (counted_after > 0.0))).sum())
+    if not differs.any() or not (counted.any() or counted_after.any()):
         return PairedDifference(*rates, 0.0, 0.0, n, 0)
     drawn = [column[_draws(n)].sum(axis=1) for column in columns]
     moved = (drawn[1] > 0.0) & (drawn[3] > 0.0)
@@ -97,9 +109,10 @@ def difference_of_rates(
 
 
 def _interval(differences: Floats, n: int) -> tuple[float, float]:
-    """The middle of what was drawn of n pairs; none for one pair, which has no spread."""
+    """Return the confidence interval of differences drawn from n pairs; NaN for a single pair."""
     if n < 2 or not len(differences):
         return math.nan, math.nan
+    # Expanded percentile interval: the plain one is too narrow for small n.
     t = stdtrit(n - 1, 0.5 + CONFIDENCE / 2)
     tail = float(ndtr(-t * math.sqrt(n / (n - 1))))
     low, high = np.quantile(differences, [tail, 1.0 - tail])
@@ -108,7 +121,7 @@ def _interval(differences: Floats, n: int) -> tuple[float, float]:
 
 @lru_cache(maxsize=8)
 def _draws(n: int) -> NDArray[np.int64]:
-    """(BOOTSTRAP, n) which of n pairs are drawn."""
+    """Return the (BOOTSTRAP, n) indices of the pairs in each bootstrap sample."""
     draws = np.random.default_rng(0).integers(n, size=(BOOTSTRAP, n))
     draws.flags.writeable = False
     return draws
@@ -142,12 +155,15 @@ FLIPPED: Final = (
 )
 
 Groups = Mapping[tuple[str, str], frozenset[str]]
-"""Scenario ids by what they have in common: ("suite" | "event" | "structure" | "split", its
-name)."""
+"""Scenario ids by group: key ("suite" | "event" | "structure" | "split", name)."""
 
 
 class ComparedRun(NamedTuple):
-    """label: what it is called in tables; table: a row per episode, as in results.csv."""
+    """One run of a comparison.
+
+    label: name in tables
+    table: one row per episode, as in results.csv
+    """
 
     label: str
     path: Path
@@ -155,8 +171,12 @@ class ComparedRun(NamedTuple):
 
 
 class RunComparison(NamedTuple):
-    """before: the run that the others are compared with. differences, flipped: a row each,
-    `DIFFERENCES`, `FLIPPED`. notes: what a reader of these must know."""
+    """Result of comparing runs.
+
+    before: the run that the others are compared with
+    differences, flipped: tables with the columns `DIFFERENCES` and `FLIPPED`
+    notes: warnings for the reader
+    """
 
     suite: str
     before: ComparedRun
@@ -167,9 +187,11 @@ class RunComparison(NamedTuple):
 
 
 def compare_runs(paths: Sequence[Path]) -> RunComparison:
-    """The first run with each of the others. Raises UsageError for fewer than two, what
-    `read_whole_run` raises, and RunError, naming folder and remedy, for runs that are of different
-    suites, or share no scenario."""
+    """Compare the first run with each of the others.
+
+    Raises UsageError for fewer than two runs and whatever `read_whole_run` raises. Raises RunError
+    for runs of different suites or without a common scenario.
+    """
     if len(paths) < 2:
         raise UsageError("a comparison needs two runs or more: cosim compare RUN OTHER ...")
     runs = [read_whole_run(path) for path in paths]
@@ -181,22 +203,21 @@ def compare_runs(paths: Sequence[Path]) -> RunComparison:
     )
     groups = groups_of(runs[0].spec.suite, runs[0].scenarios.values())
     pairs = [(before, other) for other in others]
-    compared = [differences_of(*pair, groups, judged=not _terms_apart(*pair)) for pair in pairs]
+    compared = [differences_of(*pair, groups, judged=not _differing_terms(*pair)) for pair in pairs]
     differences = pd.concat(compared, ignore_index=True)
     flipped = pd.concat([flipped_between(*pair) for pair in pairs], ignore_index=True)
-    notes = (*_notes(runs, [before, *others]), *_lonely(pairs))
+    notes = (*_notes(runs, [before, *others]), *_unpaired_notes(pairs))
     return RunComparison(runs[0].spec.suite, before, tuple(others), differences, flipped, notes)
 
 
 def groups_of(suite: str, scenarios: Iterable[Scenario]) -> dict[tuple[str, str], frozenset[str]]:
-    """The whole suite, and by event (who has it on the way), structure and split; none that is the
-    same as another."""
+    """Return the groups of a suite: all, then by event, structure and split, without duplicates."""
     members: dict[tuple[str, str], set[str]] = {}
-    for one in scenarios:
-        kinds = dict.fromkeys(event.kind for event in one.events)
+    for scenario in scenarios:
+        kinds = dict.fromkeys(event.kind for event in scenario.events)
         named = [("suite", suite), *(("event", kind) for kind in kinds)]
-        for key in [*named, ("structure", one.structure), ("split", one.split)]:
-            members.setdefault(key, set()).add(one.id)
+        for key in [*named, ("structure", scenario.structure), ("split", scenario.split)]:
+            members.setdefault(key, set()).add(scenario.id)
     order = ("suite", "event", "structure", "split")
     found: dict[tuple[str, str], frozenset[str]] = {}
     for key in sorted(members, key=lambda key: order.index(key[0])):
@@ -212,87 +233,94 @@ def differences_of(
     names: Sequence[str] = (),
     judged: bool = True,
 ) -> pd.DataFrame:
-    """A row for each group and metric, `DIFFERENCES`: over the scenarios that both runs have.
-    names: of metrics; all that both have where none is named. judged: whether a difference is
-    called better or worse; else it "differs"."""
-    one, other = (run.table.set_index("scenario") for run in (before, after))
-    ids = [name for name in one.index if name in other.index]
+    """Return one row (`DIFFERENCES`) for each group and metric, over the scenarios that both runs
+    have.
+
+    names: metrics; all that both runs have if empty
+    judged: False to report "differs" instead of better or worse
+    """
+    table_before, table_after = (run.table.set_index("scenario") for run in (before, after))
+    ids = [name for name in table_before.index if name in table_after.index]
     names = names or [
         name
         for name in (*METRICS, *COUNTERFACTUAL)
-        if name in one.columns and name in other.columns
+        if name in table_before.columns and name in table_after.columns
     ]
     rows = []
     for (by, group), members in groups.items():
         inside = [name for name in ids if name in members]
         if not inside:
             continue
-        pair = one.loc[inside], other.loc[inside]
+        pair = table_before.loc[inside], table_after.loc[inside]
         for name in names:
-            found = _difference(name, *pair)
+            paired = _difference(name, *pair)
             unit, better = METRICS[name][:2] if name in METRICS else (COUNTERFACTUAL[name], None)
-            values = (
-                found.n,
-                found.before,
-                found.after,
-                found.difference,
-                found.low,
-                found.high,
-                found.changed,
-            )
-            verdict = found.verdict(better if judged else None) if found.n else ""
-            rows.append((before.label, after.label, by, group, name, unit, *values, verdict))
+            verdict = paired.verdict(better if judged else None) if paired.n else ""
+            key = (before.label, after.label, by, group, name, unit)
+            means = (paired.before, paired.after, paired.difference)
+            interval = (paired.low, paired.high)
+            rows.append((*key, paired.n, *means, *interval, paired.changed, verdict))
     return pd.DataFrame(rows, columns=list(DIFFERENCES))
 
 
 def _difference(name: str, before: pd.DataFrame, after: pd.DataFrame) -> PairedDifference:
-    """Of a metric, over rows of the same scenarios. A rate has none where a policy crashed: what it
-    would have done after that cannot be counted."""
+    """Return the paired difference of a metric; a rate is undefined if a policy crashed."""
     if name not in POOLED:
         return difference_of_means(numbers(before, name), numbers(after, name))
     if "crashed" in {*before["status"], *after["status"]}:
-        return PairedDifference(math.nan, math.nan, math.nan, math.nan, 0, 0)
+        return _NO_PAIRS
     counted, metres = POOLED[name]
     one, other = ((numbers(table, counted), numbers(table, metres)) for table in (before, after))
     return difference_of_rates(one, other)
 
 
 def flipped_between(before: ComparedRun, after: ComparedRun) -> pd.DataFrame:
-    """A row for each scenario that one run solved and the other did not, `FLIPPED`: "won" by the
-    second, or "lost"."""
-    one, other = (run.table.set_index("scenario") for run in (before, after))
+    """Return one row (`FLIPPED`) for each scenario solved by exactly one of two runs.
+
+    The flip is "won" if the second run solved it, else "lost".
+    """
+    table_before, table_after = (run.table.set_index("scenario") for run in (before, after))
     rows = []
-    for name in one.index.intersection(other.index):
-        mine, theirs = one.loc[name], other.loc[name]
+    for name in table_before.index.intersection(table_after.index):
+        row_before, row_after = table_before.loc[name], table_after.loc[name]
         if (
-            pd.notna(mine["success"])
-            and pd.notna(theirs["success"])
-            and mine["success"] != theirs["success"]
+            pd.notna(row_before["success"])
+            and pd.notna(row_after["success"])
+            and row_before["success"] != row_after["success"]
         ):
-            flip = "won" if theirs["success"] > mine["success"] else "lost"
+            flip = "won" if row_after["success"] > row_before["success"] else "lost"
             ends = (
                 str(row["ended"] if row["status"] == "done" else row["status"])
-                for row in (mine, theirs)
+                for row in (row_before, row_after)
             )
             rows.append(
-                (before.label, after.label, name, mine["split"], mine["structure"], flip, *ends)
+                (
+                    before.label,
+                    after.label,
+                    name,
+                    row_before["split"],
+                    row_before["structure"],
+                    flip,
+                    *ends,
+                )
             )
     return pd.DataFrame(rows, columns=list(FLIPPED))
 
 
 def _check_suites(one: WholeRun, other: WholeRun) -> None:
-    """Raises RunError where two runs are not of the same suite, or share no scenario."""
-    mine, theirs = one.spec, other.spec
-    my_hash, their_hash = mine.setup.suite_hash, theirs.setup.suite_hash
-    if my_hash != their_hash:
+    """Raise RunError if two runs have different suites or no common scenario."""
+    spec, other_spec = one.spec, other.spec
+    suite_hash, other_hash = spec.setup.suite_hash, other_spec.setup.suite_hash
+    if suite_hash != other_hash:
         what = (
             "the same suite"
-            if mine.suite != theirs.suite
+            if spec.suite != other_spec.suite
             else "the same version of it (edited, robot, --crowd?)"
         )
         raise RunError(
-            f"{other.path} is of suite '{theirs.suite}' {theirs.suite_version} ({their_hash}), "
-            f"{one.path} of '{mine.suite}' {mine.suite_version} ({my_hash}): run both on {what}"
+            f"{other.path} is of suite '{other_spec.suite}' {other_spec.suite_version} "
+            f"({other_hash}), "
+            f"{one.path} of '{spec.suite}' {spec.suite_version} ({suite_hash}): run both on {what}"
         )
     if not one.records.keys() & other.records.keys():
         raise RunError(
@@ -302,8 +330,7 @@ def _check_suites(one: WholeRun, other: WholeRun) -> None:
 
 
 def _labels(runs: Sequence[WholeRun]) -> list[str]:
-    """What runs are called: by their policies where these are apart, else by their folders, and
-    numbers."""
+    """Return unique labels: policy names if they differ, else folder names, numbered if equal."""
     names = [run.spec.manifest.name for run in runs]
     if len({*names}) < len(names):
         names = [run.path.absolute().name for run in runs]
@@ -313,49 +340,49 @@ def _labels(runs: Sequence[WholeRun]) -> list[str]:
     ]
 
 
-def _notes(runs: Sequence[WholeRun], told: Sequence[ComparedRun]) -> Iterator[str]:
-    """What makes runs unlike in more than their policies, and what is not to be quoted."""
-    for run, one in zip(runs, told, strict=True):
-        if reason := not_to_be_quoted(one.table, len(run.spec.scenarios)):
-            yield f"{one.label} is not to be quoted: {reason}"
-        if odd := next(
+def _notes(runs: Sequence[WholeRun], compared: Sequence[ComparedRun]) -> Iterator[str]:
+    """Yield warnings: why a run is inconclusive, and what differs besides the policy."""
+    first = runs[0].spec.setup
+    first_label = compared[0].label
+    first_camera = _camera_in_words(compared[0].table)
+    for run, other in zip(runs, compared, strict=True):
+        if reason := not_to_be_quoted(other.table, len(run.spec.scenarios)):
+            yield f"{other.label} is not to be quoted: {reason}"
+        if nonstandard := next(
             (record.nonstandard for record in run.records.values() if record.nonstandard), ""
         ):
-            yield f"{one.label} is nonstandard: {odd}"
-        if words := injections_in_words(one.table):
-            yield f"{one.label}: {words}"
+            yield f"{other.label} is nonstandard: {nonstandard}"
+        if words := injections_in_words(other.table):
+            yield f"{other.label}: {words}"
         crashed = sum(record.status == "crashed" for record in run.records.values())
         if crashed:
             yield (
-                f"{one.label}: {crashed} crashed, counted as the worst there is; groups with "
+                f"{other.label}: {crashed} crashed, counted as the worst there is; groups with "
                 f"them have no rates"
             )
-        first = runs[0].spec.setup
-        if terms := _terms_apart(told[0], one):
+        if terms := _differing_terms(compared[0], other):
             yield (
-                f"No verdict of {one.label} against {told[0].label}: they drove by other terms, "
-                f"{terms}. What differs is called neither better nor worse"
+                f"No verdict of {other.label} against {first_label}: they drove by other "
+                f"terms, {terms}. What differs is called neither better nor worse"
             )
-        sees = _eyes(one.table)
-        saw = _eyes(told[0].table)
-        if sees and saw and sees != saw:
+        camera = _camera_in_words(other.table)
+        if camera and first_camera and camera != first_camera:
             yield (
-                f"{told[0].label} sees by {saw}; {one.label} by {sees}: a difference may be the "
-                f"camera's"
+                f"{first_label} sees by {first_camera}; {other.label} by {camera}: "
+                "a difference may be the camera's"
             )
         if changed := [n for n, v in first.versions.items() if run.spec.setup.versions.get(n) != v]:
-            apart = ", ".join(
+            differing = ", ".join(
                 f"{n} {first.versions[n]} and {run.spec.setup.versions.get(n)}" for n in changed
             )
             yield (
-                f"{told[0].label} and {one.label} ran with other versions, a difference may be "
-                f"theirs: {apart}"
+                f"{first_label} and {other.label} ran with other versions, a difference may be "
+                f"theirs: {differing}"
             )
 
 
-def _terms_apart(before: ComparedRun, after: ComparedRun) -> str:
-    """The terms by which two runs did not drive alike, with those of each: what their policies were
-    told, and when their commands took effect; "" where there are none."""
+def _differing_terms(before: ComparedRun, after: ComparedRun) -> str:
+    """Return in words the terms that differ between two runs; "" if none do."""
     one, other = _terms(before.table), _terms(after.table)
     apart = [name for name in one if one[name] != other[name]]
     return "; ".join(
@@ -363,14 +390,14 @@ def _terms_apart(before: ComparedRun, after: ComparedRun) -> str:
     )
 
 
-def _eyes(table: pd.DataFrame) -> str:
-    """By what a run's policy saw; "" for a blind one."""
+def _camera_in_words(table: pd.DataFrame) -> str:
+    """Return camera and rate of a run's policy in words; "" without a camera."""
     camera, rate_hz = table[["camera", "rate_hz"]].iloc[0]
     return "" if camera == "none" else f"{camera}, at {rate_hz:g} Hz"
 
 
 def _terms(table: pd.DataFrame) -> dict[str, str]:
-    """What makes a run harder or easier, whatever its policy is."""
+    """Return the settings that affect how hard a run is, independent of the policy."""
     first = table.iloc[0]
     return {
         "goal": first["goal_protocol"],
@@ -380,10 +407,13 @@ def _terms(table: pd.DataFrame) -> dict[str, str]:
     }
 
 
-def _lonely(pairs: Sequence[tuple[ComparedRun, ComparedRun]]) -> Iterator[str]:
-    """Episodes that no pair has."""
+def _unpaired_notes(pairs: Sequence[tuple[ComparedRun, ComparedRun]]) -> Iterator[str]:
+    """Yield a note for each pair of runs that do not have the same scenarios."""
     for before, after in pairs:
-        mine, theirs = ({*run.table["scenario"]} for run in (before, after))
-        if mine != theirs:
-            alone = f"{len(mine - theirs)} of {before.label}, {len(theirs - mine)} of {after.label}"
-            yield f"scenarios that only one of both runs has are left out: {alone}"
+        before_ids, after_ids = ({*run.table["scenario"]} for run in (before, after))
+        if before_ids != after_ids:
+            only_before, only_after = len(before_ids - after_ids), len(after_ids - before_ids)
+            yield (
+                "scenarios that only one of both runs has are left out: "
+                f"{only_before} of {before.label}, {only_after} of {after.label}"
+            )

@@ -1,12 +1,13 @@
-"""Delay: what the robot costs the people and vehicles around it, against the same street without
-it.
+"""Delay that the robot causes for people and vehicles, measured against the street without it.
 
-Both streets begin alike. As far as somebody is in both (the same id, entered at the same tick and
-place), it is asked at the end of the shared time how long ago it would have been, without the
-robot, where it is now; negative for who got on faster. Who steps aside and back has not got on.
-Within SLACK_M is the same place, so that delays are told rather too small. Somebody who never moves
-without the robot is left out. A small cause spreads: far from the robot the two streets differ by
-chance, so the sum over those that came near it is told apart.
+Both streets start identically. A body is compared if it has the same id, entry tick and entry place
+in both. At the end of the common time, its delay is how much earlier it would have reached its
+current position without the robot. The delay is negative if it got ahead. Stepping aside and back
+counts as no progress. Positions within _SLACK_M are the same, so delays are slightly
+underestimated. Bodies that never move without the robot are skipped.
+
+Small changes spread: far from the robot the streets differ by chance. The sum over bodies that came
+near the robot is therefore reported separately.
 """
 
 from __future__ import annotations
@@ -22,17 +23,20 @@ from cosim.core.geometry import Floats
 from cosim.core.state import People, Vehicles
 
 DELAY_NEAR_M: Final = 10.0
+"""Distance to the robot, metres, below which a body counts as near."""
 MOVING_MPS: Final = 0.1
+"""Speed above which a body counts as moving."""
 _SAME_PLACE_M: Final = 0.5
 _SLACK_M: Final = 0.5
 
 
 class Delay(NamedTuple):
-    """delay_s: summed over everybody compared; near_s: over those that came within NEAR_M of the
-    robot.
+    """Delay that a robot caused.
 
-    compared, near: how many. unmatched: how many of the street with the robot are not the same in
-    both.
+    delay_s: sum over all compared bodies
+    near_s: sum over those that came within DELAY_NEAR_M of the robot
+    compared, near: number of these bodies
+    unmatched: number of bodies in the street with the robot that have no counterpart
     """
 
     delay_s: float
@@ -43,7 +47,7 @@ class Delay(NamedTuple):
 
 
 class Tracks:
-    """Where everybody was, tick by tick, from when it was first seen until it was first missed."""
+    """Positions of all bodies by tick, from first appearance to first absence."""
 
     def __init__(self) -> None:
         self._tick = 0
@@ -51,7 +55,7 @@ class Tracks:
         self.began: dict[str, int] = {}
 
     def add(self, bodies: People | Vehicles) -> None:
-        """The next tick."""
+        """Append the positions of one tick."""
         for name, (x_m, y_m) in zip(bodies.ids, bodies.xy.tolist(), strict=True):
             began = self.began.setdefault(name, self._tick)
             way = self._xy.setdefault(name, array("d"))
@@ -60,56 +64,62 @@ class Tracks:
         self._tick += 1
 
     def way(self, name: str) -> Floats:
-        """(N, 2) m: where somebody was; nowhere for one who never came."""
+        """Return the (N, 2) positions of a body, metres; empty for an unknown id."""
         return np.array(self._xy.get(name, ()), dtype=float).reshape(-1, 2)
 
 
 def delay_of(
     robot: Sequence[tuple[float, float]], present: Tracks, absent: Tracks, tick_s: float
 ) -> Delay:
-    """The delay that a robot caused that was at (x, y) at each tick of `present`."""
-    at = np.array(robot, dtype=float).reshape(-1, 2)
+    """Compute the delay that a robot caused.
+
+    robot: (x, y) in metres at each tick of `present`
+    present, absent: tracks with and without the robot
+    """
+    robot_xy = np.array(robot, dtype=float).reshape(-1, 2)
     delay_s = near_s = 0.0
     compared = near = unmatched = 0
     for name in sorted(present.began):
-        mine, other = present.way(name), absent.way(name)
+        with_robot, without_robot = present.way(name), absent.way(name)
         first = present.began[name]
-        same = first == absent.began.get(name) and np.hypot(*(mine[0] - other[0])) < _SAME_PLACE_M
+        same = (
+            first == absent.began.get(name)
+            and np.hypot(*(with_robot[0] - without_robot[0])) < _SAME_PLACE_M
+        )
         if not same:
             unmatched += 1
             continue
-        shared = min(len(mine), len(other))
-        mine, other = mine[:shared], other[:shared]
-        if _steps(other).max(initial=0.0) <= MOVING_MPS * tick_s:
+        shared = min(len(with_robot), len(without_robot))
+        with_robot, without_robot = with_robot[:shared], without_robot[:shared]
+        if _step_lengths(without_robot).max(initial=0.0) <= MOVING_MPS * tick_s:
             continue
-        late_s = _late(mine, other) * tick_s
-        gap = mine - at[first : first + shared]
-        is_near = bool((np.hypot(gap[:, 0], gap[:, 1]) < DELAY_NEAR_M).any())
-        delay_s = delay_s + late_s
-        compared = compared + 1
-        near_s = near_s + late_s * is_near
-        near = near + is_near
+        delayed_s = _lag_ticks(with_robot, without_robot) * tick_s
+        offset = with_robot - robot_xy[first : first + shared]
+        is_near = bool((np.hypot(offset[:, 0], offset[:, 1]) < DELAY_NEAR_M).any())
+        delay_s += delayed_s
+        compared += 1
+        near_s += delayed_s * is_near
+        near += is_near
     return Delay(delay_s, near_s, compared, near, unmatched)
 
 
-def _late(mine: Floats, other: Floats) -> int:
-    """By how many ticks the end of one way (N, 2) comes later than on the other, which goes the
-    same way."""
-    behind, off_m = _since(mine[-1], other)
-    ahead, off_other_m = _since(other[-1], mine)
-    return behind if off_m <= off_other_m else -ahead
+def _lag_ticks(track: Floats, reference: Floats) -> int:
+    """Return by how many ticks the end of a track (N, 2) lags behind another track."""
+    behind, track_off_m = _ticks_since(track[-1], reference)
+    ahead, reference_off_m = _ticks_since(reference[-1], track)
+    return behind if track_off_m <= reference_off_m else -ahead
 
 
-def _since(point: Floats, way: Floats) -> tuple[int, float]:
-    """How many ticks before the end of a way (N, 2) it was last at a point (2,), and how near it
-    came to it."""
+def _ticks_since(point: Floats, way: Floats) -> tuple[int, float]:
+    """Return the ticks since a track (N, 2) was last at a point (2,), and its least distance,
+    metres."""
     away = np.hypot(*(way - point).T)
     nearest = float(away.min())
-    # A circle that cuts SLACK_M off a straight way which passes the point at a distance.
+    # This circle cuts _SLACK_M off a straight track that passes the point at the least distance.
     last = np.flatnonzero(away <= math.hypot(nearest, _SLACK_M))[-1]
     return len(way) - 1 - int(last), nearest
 
 
-def _steps(way: Floats) -> Floats:
-    """(N - 1,) metres between the points of a way (N, 2)."""
+def _step_lengths(way: Floats) -> Floats:
+    """Return the (N - 1,) distances between the points of a track (N, 2), metres."""
     return np.asarray(np.hypot(*np.diff(way, axis=0).T))

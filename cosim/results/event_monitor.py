@@ -1,15 +1,14 @@
-"""Watches the events of an episode: when they triggered, whether the camera could see them, whether
-their rules held.
+"""Monitor for the events of an episode: trigger time, visibility and rules.
 
-Positions are those that the street showed, not what the director says of itself.
+All positions come from the street, not from the event director.
 
-Seen is an event once a tenth of the body of one of its people was unhidden in the picture of the
-standard camera, at most SEEN_WITHIN_M away: found by rays, so that it is the same for a policy
-without a camera and for every renderer.
+An event is seen once a tenth of one of its people is unoccluded in the picture of the standard
+camera, at most SEEN_WITHIN_M away. Visibility is tested by rays, so it does not depend on the
+renderer and also exists for policies without a camera.
 
-Rules beyond the goal (the paper's table): the robot passes round the whole group of `conversing`
-and the whole line of `queueing` (`EventKind.passed_round`), never between two of them. (`gesturing`
-ends its episode by a stop: see the referee.)
+The paper's table has rules beyond the goal: the robot passes around the whole group of `conversing`
+and the whole line of `queueing` (`EventKind.passed_round`), never between two people. `gesturing`
+ends its episode at a stop: see the referee.
 """
 
 from __future__ import annotations
@@ -32,26 +31,31 @@ from cosim.spec.robot import Mount, Robot
 from cosim.spec.scenario import Scenario
 
 SEEN_WITHIN_M: Final = 20.0
-"""Farther away nobody counts as seen; so far the engine has everything that can hide somebody."""
-_UNHIDDEN: Final = 0.1
-"""Share of a body that must be in the picture and unhidden."""
+"""Distance, metres, beyond which people do not count as seen; all occluders are loaded up to it."""
+_VISIBLE_SHARE: Final = 0.1
+"""Share of a body that must be in the picture and unoccluded."""
 STANDARD_CAMERA: Final = CameraSpec()
 _BODY_M: Final = np.stack(
     np.meshgrid(np.linspace(-0.2, 0.2, 4), np.linspace(0.1, 1.6, 10)), axis=-1
 ).reshape(-1, 2)
-"""Points of a body as it is seen: metres to its left and up."""
+"""Sample points of a body as seen by the camera: metres to its left and up."""
 PASSED_M: Final = 5.0
-"""An event lies behind once the robot is this far beyond its place."""
+"""Distance, metres, that the robot must be beyond an event to have passed it."""
 _MOVED_M: Final = 1e-6
-_MOVED: Final = np.full(2, np.nan)
+_HAS_MOVED: Final = np.full(2, np.nan)
 
 Hidden = Callable[[Floats, Floats], NDArray[np.bool_]]
-"""Whether something solid stands between an eye (3,) and each of (N, 3) points, metres."""
+"""Occlusion test: for each of (N, 3) points, whether a solid is between it and the eye (3,),
+metres."""
 
 
 class EventMonitor:
-    """Watches the steps of one episode, in order. kinds: the table of its events; robot: who
-    carries the camera; hidden: asked about the moment at which a Step ends."""
+    """Monitor of the steps of one episode, called in order.
+
+    kinds: table of event kinds
+    robot: the robot that carries the camera
+    hidden: occlusion test at the end of the current step
+    """
 
     def __init__(
         self, scenario: Scenario, kinds: EventKinds, robot: Robot, hidden: Hidden, tick_ms: int
@@ -59,17 +63,17 @@ class EventMonitor:
         self._events = scenario.events
         self._mount = STANDARD_CAMERA.on(robot)
         self._hidden = hidden
-        self._round = [kinds[event.kind].passed_round for event in scenario.events]
+        self._passed_round = [kinds[event.kind].passed_round for event in scenario.events]
         self._tick_ms = tick_ms
         self._states: tuple[EventState, ...] = ()
         self._seen = [False] * len(self._events)
-        self._between = [False] * len(self._events)
+        self._went_between = [False] * len(self._events)
         self._furthest_m = 0.0
         self._waiting: dict[tuple[int, int], Floats] = {}
         self._tracks: list[tuple[float, ...]] = []
 
     def see(self, step: Step) -> None:
-        """Take in what happened in a tick."""
+        """Process one tick."""
         self._states = step.events.states
         self._furthest_m = max(self._furthest_m, step.route_s_after_m)
         people = step.street_after.people
@@ -84,37 +88,36 @@ class EventMonitor:
                 continue
             bodies = np.array(list(places.values())).reshape(-1, 2)
             self._seen[i] = self._seen[i] or self._sees(step.motion.robot, bodies)
-            if state.phase == "acting" and self._round[i]:
-                self._between[i] |= went_between(before.xy, after.xy, bodies)
+            if state.phase == "acting" and self._passed_round[i]:
+                self._went_between[i] |= went_between(before.xy, after.xy, bodies)
 
     def _track(self, tick: int, event: int, places: Mapping[int, Floats]) -> None:
-        """Keep where the people of an event are, each from its first move on."""
+        """Record the positions of an event's people, each from its first move."""
         for person, xy in places.items():
             waits_at = self._waiting.setdefault((event, person), xy)
-            if waits_at is _MOVED or np.abs(xy - waits_at).max() > _MOVED_M:
-                self._waiting[event, person] = _MOVED
+            if waits_at is _HAS_MOVED or np.abs(xy - waits_at).max() > _MOVED_M:
+                self._waiting[event, person] = _HAS_MOVED
                 self._tracks.append((tick, event, person, *xy))
 
     def _sees(self, robot: RobotState, bodies: Floats) -> bool:
-        """Whether one of the (N, 2) bodies is in the picture, a tenth of it unhidden."""
+        """Return whether the camera sees one of the (N, 2) bodies."""
         eye = eye_of(robot, self._mount)
         height_m = robot.z_m
         for xy in bodies[np.hypot(*(bodies - robot.pose.xy).T) <= SEEN_WITHIN_M]:
             points = body_points(eye, xy, height_m)
             inside = points[in_picture(robot.pose, self._mount, STANDARD_CAMERA, points - eye)]
-            least = _UNHIDDEN * len(points)
+            least = _VISIBLE_SHARE * len(points)
             if len(inside) >= least and (~self._hidden(eye, inside)).sum() >= least:
                 return True
         return False
 
     @property
     def tracks(self) -> Floats:
-        """(E, 5) tick, number of the event, number of the person in it, x m, y m; from each one's
-        first move on."""
+        """Return (E, 5) from each person's first move: tick, event, person, x m, y m."""
         return np.array(self._tracks, dtype=float).reshape(-1, 5)
 
     def outcomes(self) -> tuple[TriggeredEvent, ...]:
-        """What became of each event."""
+        """Return the outcome of each event."""
         return tuple(
             TriggeredEvent(
                 id=event.id,
@@ -128,13 +131,18 @@ class EventMonitor:
                 rule_met=not between if judged else None,
             )
             for event, state, seen, judged, between in zip(
-                self._events, self._states, self._seen, self._round, self._between, strict=True
+                self._events,
+                self._states,
+                self._seen,
+                self._passed_round,
+                self._went_between,
+                strict=True,
             )
         )
 
 
 def eye_of(robot: RobotState, mount: Mount) -> Floats:
-    """(3,) where a camera at a mount of the robot is, metres."""
+    """Return the position (3,) of a camera mounted on the robot, metres."""
     ahead, left, up = mount.at_m
     cos, sin = math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)
     x, y = robot.pose[:2]
@@ -142,14 +150,14 @@ def eye_of(robot: RobotState, mount: Mount) -> Floats:
 
 
 def body_points(eye: Floats, xy: Floats, ground_m: float) -> Floats:
-    """(N, 3) points of somebody at (2,) who stands on the ground and is seen from an eye."""
+    """Return (N, 3) sample points of a person at (2,), facing the eye, metres."""
     to = (xy - eye[:2]) / max(float(np.hypot(*(xy - eye[:2]))), 1e-9)
     left = np.array([-to[1], to[0]])
     return np.column_stack([xy + _BODY_M[:, :1] * left, ground_m + _BODY_M[:, 1]])
 
 
 def in_picture(robot: Pose, mount: Mount, camera: CameraSpec, rays: Floats) -> NDArray[np.bool_]:
-    """Which of (N, 3) rays from the eye of a camera end in its picture."""
+    """Return which of (N, 3) rays from the camera's eye fall into its picture."""
     cos, sin = math.cos(robot.heading_rad), math.sin(robot.heading_rad)
     level = rays[:, 0] * cos + rays[:, 1] * sin
     left = -rays[:, 0] * sin + rays[:, 1] * cos
@@ -165,13 +173,15 @@ def in_picture(robot: Pose, mount: Mount, camera: CameraSpec, rays: Floats) -> N
 
 
 def went_between(before: Floats, after: Floats, people: Floats) -> bool:
-    """Whether a step (2,) -> (2,) crosses the line between any two of (N, 2) people."""
+    """Return whether a step (2,) -> (2,) crosses the line between any two of (N, 2) people."""
     return any(_cross(before, after, a, b) for a, b in itertools.combinations(people, 2))
 
 
 def _cross(a: Floats, b: Floats, c: Floats, d: Floats) -> bool:
-    """Whether the step ab leads over the open segment cd; one that ends on it, or the next one, but
-    not both."""
+    """Return whether the step ab crosses the open segment cd.
+
+    A crossing at an end of ab counts for one of two consecutive steps, not for both.
+    """
     over = (_side(c, d, a) >= 0.0) != (_side(c, d, b) >= 0.0)
     return bool(over and _side(a, b, c) * _side(a, b, d) < 0.0)
 
@@ -181,10 +191,9 @@ def _side(a: Floats, b: Floats, p: Floats) -> float:
 
 
 def why_invalid(record: Record, scenario: Scenario) -> str:
-    """Why an episode that is about its event says nothing about the robot that came by; "" if it
-    does. Whoever fails before it comes by has failed.
+    """Return why an episode about an event is inconclusive; "" if it is valid.
 
-    A long way has events that a robot may fail to come to; there this makes nothing invalid.
+    A failure before the event counts as a failure. Long ways are never invalid.
     """
     if not scenario.ends_on_failure or record.failures or record.ended not in ("goal", "stop"):
         return ""
@@ -196,7 +205,7 @@ def why_invalid(record: Record, scenario: Scenario) -> str:
 
 
 def why_unseen(event: Event, outcome: TriggeredEvent) -> str:
-    """Why an event says nothing about the robot that came by, in words; "" if it does."""
+    """Return why an event is inconclusive, in words; "" if it is valid."""
     if outcome.triggered_at_s is None:
         return f"event {event.id} ({event.kind}) never triggered"
     return "" if outcome.seen else f"nobody of event {event.id} ({event.kind}) could be seen"

@@ -1,5 +1,4 @@
-"""WholeRun: a run that has ended, read with care: what in its folder does not belong together is
-refused, by name."""
+"""Read a run folder and verify that its files are consistent."""
 
 from __future__ import annotations
 
@@ -13,6 +12,7 @@ from cosim.results.run_folder import (
     DATABASE,
     RUN_AGAIN,
     read_records,
+    read_scenarios,
     read_spec,
     record_file,
     refuse_in_use,
@@ -20,13 +20,17 @@ from cosim.results.run_folder import (
 )
 from cosim.results.run_setup import METRIC_SCHEMA
 from cosim.results.run_spec import RunSpec
-from cosim.spec.scenario import Scenario, content_hash, read_suite
+from cosim.spec.scenario import Scenario, content_hash
 
-_UNTOLD = "an earlier version, which did not tell its metric schema"
+_UNKNOWN_SCHEMA = "an earlier version, which did not tell its metric schema"
 
 
 class WholeRun(NamedTuple):
-    """scenarios: that were to be run; records: of those that have ended. Both by scenario id."""
+    """Run with at least one ended episode.
+
+    scenarios: all scheduled scenarios by id
+    records: records of the ended episodes by scenario id
+    """
 
     path: Path
     spec: RunSpec
@@ -35,12 +39,11 @@ class WholeRun(NamedTuple):
 
 
 def read_whole_run(path: Path) -> WholeRun:
-    """The run in a folder.
+    """Read and verify the run in a folder.
 
-    Raises UsageError where there is none; RunError, naming file and remedy, while it is going on,
-    before an episode has ended, for a record that is gone, truncated or not what `results.sqlite`
-    has, for scenarios that were edited since, and for measures of another metric schema; SpecError
-    for a damaged `scenarios.json`.
+    Raises UsageError if the folder holds no run, SpecError for a damaged `scenarios.json`. Raises
+    RunError, naming file and remedy, if the run is in progress or has no ended episode. The same
+    holds for a missing, damaged or inconsistent record, edited scenarios and another metric schema.
     """
     spec = read_spec(path)
     refuse_in_use(path)
@@ -52,9 +55,7 @@ def read_whole_run(path: Path) -> WholeRun:
         raise RunError(
             f"{path}: no episode of it has ended: give the command of the run again with --resume"
         )
-    scenarios = {
-        scenario.id: scenario for scenario in read_suite(path / "scenarios.json").scenarios
-    }
+    scenarios = read_scenarios(path)
     check_records(path, records, scenarios)
     return WholeRun(path, spec, scenarios, records)
 
@@ -62,8 +63,10 @@ def read_whole_run(path: Path) -> WholeRun:
 def check_records(
     path: Path, records: Mapping[str, Record], scenarios: Mapping[str, Scenario]
 ) -> None:
-    """Hold records of `results.sqlite` against the files of a run folder. Raises RunError as
-    `read_whole_run` does."""
+    """Check records of `results.sqlite` against the files of a run folder.
+
+    Raises RunError as `read_whole_run` does.
+    """
     for name, record in records.items():
         _check_schema(path, record)
         if name not in scenarios or content_hash(scenarios[name]) != record.scenario.hash:
@@ -75,18 +78,20 @@ def check_records(
 
 
 def check_record_file(path: Path, record: Record) -> None:
-    """Raises RunError, naming file and remedy, where the record of an episode that `results.sqlite`
-    has is not the one in its file, or that is gone or damaged."""
+    """Raise RunError if a record of `results.sqlite` differs from its file, or the file is
+    unreadable."""
     file = record_file(path, record.scenario.id)
     if not file.exists():
         if record.ended is not None:
             raise RunError(f"{file}: not there: {RUN_AGAIN}")
-    elif apart := told_apart(read_record(file), record):
-        raise RunError(f"{file}: not what {DATABASE} has of this episode: {apart}: {RUN_AGAIN}")
+    elif difference := told_apart(read_record(file), record):
+        raise RunError(
+            f"{file}: not what {DATABASE} has of this episode: {difference}: {RUN_AGAIN}"
+        )
 
 
 def read_record(file: Path) -> Record:
-    """The record in a file of a run folder. Raises RunError, with what mends it."""
+    """Load a record of a run folder. Raises RunError with the remedy."""
     try:
         return Record.load(file)
     except RunError as error:
@@ -94,11 +99,11 @@ def read_record(file: Path) -> Record:
 
 
 def _check_schema(path: Path, record: Record) -> None:
-    """Raises RunError where measures are not by the definitions of this version."""
+    """Raise RunError if the measures have another metric schema."""
     if (schema := record.setup.metric_schema) != METRIC_SCHEMA:
-        made = f"metric schema {schema}" if schema else _UNTOLD
+        recorded = f"metric schema {schema}" if schema else _UNKNOWN_SCHEMA
         raise RunError(
-            f"{path}: the measures of '{record.scenario.id}' are of {made}; this version has "
+            f"{path}: the measures of '{record.scenario.id}' are of {recorded}; this version has "
             f"{METRIC_SCHEMA}, and "
             "other definitions are not compared: run it again with this version"
         )

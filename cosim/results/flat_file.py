@@ -1,4 +1,4 @@
-"""Write a struct with embedded values as one flat JSON object, and read it back."""
+"""Serialize a struct with embedded structs as one flat JSON object."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ _T = TypeVar("_T")
 
 
 class FlatFile(Generic[_T]):
-    """The JSON file of a struct that embeds others: the fields of `parts` are keys of the file
-    itself.
+    """Flat JSON layout of a struct: the fields of the embedded `parts` are keys of the file itself.
 
-    order: the keys in the order of the file; each is a field, or `KEY=PART.FIELD` where the file
-    calls it otherwise. Fields that are not listed follow, so that a new field is written without
-    more. without: fields, as `PART.FIELD`, that the file does not hold. defaults: of keys that may
-    be missing, where the field has another default or none. keys: for each key of the file its
-    field, as `PART.FIELD`, or `FIELD` of the struct itself.
+    order: keys in file order; a field name, or `KEY=PART.FIELD` if the key differs. Other fields
+        follow
+    without: fields, as `PART.FIELD`, that the file omits
+    defaults: values of optional keys, if the field has another default or none
+
+    `keys` maps each key of the file to `PART.FIELD`, or to `FIELD` of the struct itself.
     """
 
     def __init__(
@@ -58,19 +58,19 @@ class FlatFile(Generic[_T]):
         self._shape = msgspec.defstruct(f"{whole.__name__}File", of_key.values(), kw_only=True)
 
     def flat(self, value: _T) -> dict[str, Any]:
-        """The values of a struct by the keys of its file, in their order."""
+        """Return the values of a struct by file key, in file order."""
         return {name: attrgetter(path)(value) for name, path in self.keys.items()}
 
     def encode(self, value: _T) -> bytes:
-        """The JSON of a struct, in one line."""
+        """Return the JSON of a struct in one line."""
         return msgspec.json.encode(self.flat(value))
 
     def in_lines(self, value: _T) -> bytes:
-        """The JSON of a struct as its file has it, indented."""
+        """Return the indented JSON of a struct, as its file holds it."""
         return msgspec.json.format(self.encode(value), indent=1) + b"\n"
 
     def decode(self, data: bytes | str) -> _T:
-        """The struct in the JSON of a file. Raises msgspec.DecodeError, naming the key."""
+        """Decode the JSON of a file. Raises msgspec.DecodeError, naming the key."""
         read = msgspec.json.decode(data, type=self._shape)
         found: dict[str, dict[str, Any]] = {part: {} for part in ("", *self._parts)}
         for name, path in self.keys.items():

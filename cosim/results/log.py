@@ -1,4 +1,4 @@
-"""Log: what happened in an episode, tick by tick, as arrays: `trajectory.npz`."""
+"""Per-tick log of an episode as arrays: `trajectory.npz`."""
 
 from __future__ import annotations
 
@@ -14,24 +14,79 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.errors import RunError
-from cosim.core.geometry import Floats
+from cosim.core.geometry import Floats, box_disk_gap
 from cosim.core.npz import names_in_npz, read_npz
-from cosim.core.state import RobotState
+from cosim.core.state import PERSON_RADIUS_M, People, RobotState
 from cosim.episode.loop import Step
-from cosim.results.nearness import Nearness, nearness
 from cosim.results.referee import Verdict
 from cosim.results.traffic import OnRoad
 
-_OF_PLANS = {"plan_sizes", "plan_points", "plan_index"}
-_LATER = {"answers"} | _OF_PLANS
-"""Arrays that older files do not have."""
-_OF_PEOPLE = {"people_tick": 0, "people_xy": 2, "people_kind": 0, "people_age": 0}
-"""How many columns each array with a row for each person has, 0 for one without columns."""
+_PLAN_ARRAYS = {"plan_sizes", "plan_points", "plan_index"}
+_OPTIONAL = {"answers"} | _PLAN_ARRAYS
+"""Arrays that older files lack."""
+_PEOPLE_WIDTHS = {"people_tick": 0, "people_xy": 2, "people_kind": 0, "people_age": 0}
+"""Number of columns of each array with one row per person; 0 for a one-dimensional array."""
+_SLOWEST_MPS: Final = 1e-9
+
+
+class Nearness(NamedTuple):
+    """Least values over all people, inf without people.
+
+    person_m: distance between centres
+    clearance_m: gap between the robot's outline and a person's disk, at least 0
+    collision_in_s: time to collision at constant velocities, inf without one
+    """
+
+    person_m: float = np.inf
+    clearance_m: float = np.inf
+    collision_in_s: float = np.inf
+
+
+def nearness(robot: RobotState, people: People, footprint_m: tuple[float, float]) -> Nearness:
+    """Return the proximity of people to a robot of this length and width, metres."""
+    if not len(people):
+        return Nearness()
+    to = people.xy - robot.pose.xy
+    away_m = np.hypot(to[:, 0], to[:, 1])
+    least_m = float(away_m.min())
+    # A gap is at most the centre distance, and smaller by at most half the diagonal of the robot.
+    close = people.xy[away_m <= least_m + 0.5 * np.hypot(*footprint_m)]
+    half_length_m, half_width_m = 0.5 * footprint_m[0], 0.5 * footprint_m[1]
+    gap_m = float(
+        box_disk_gap(np.array([robot.pose]), half_length_m, half_width_m, close[None]).min()
+    )
+    heading = robot.pose.heading_rad
+    v_mps = robot.v_mps
+    going = people.speed[:, None] * np.column_stack(
+        [np.cos(people.heading), np.sin(people.heading)]
+    )
+    closing = going - v_mps * np.array([np.cos(heading), np.sin(heading)])
+    in_s = time_to_collision_s(to, closing, half_length_m + PERSON_RADIUS_M)
+    return Nearness(least_m, max(gap_m - PERSON_RADIUS_M, 0.0), float(in_s.min()))
+
+
+def time_to_collision_s(offset: Floats, velocity: Floats, radius_m: float) -> Floats:
+    """Return the time in seconds (N,) until points come within a radius of the origin.
+
+    offset: positions (N, 2), metres
+    velocity: velocities (N, 2), m/s
+
+    A point already inside gets 0, a point that never comes inside inf.
+    """
+    speed2 = (velocity**2).sum(axis=1)
+    along = (offset * velocity).sum(axis=1)
+    outside = (offset**2).sum(axis=1) - radius_m**2
+    root2 = along**2 - speed2 * outside
+    meets = (along < -_SLOWEST_MPS) & (root2 >= 0.0)
+    in_s = np.full(len(offset), np.inf)
+    in_s[meets] = outside[meets] / (np.sqrt(root2[meets]) - along[meets])
+    in_s[outside <= 0.0] = 0.0
+    return in_s
 
 
 @dataclass(frozen=True)
 class Tick:
-    """A tick that is recorded. footprint_m: length and width of the robot."""
+    """One recorded tick. footprint_m: length and width of the robot."""
 
     step: Step
     verdict: Verdict
@@ -40,29 +95,29 @@ class Tick:
 
     @property
     def robot(self) -> RobotState:
-        """The robot at the end of the tick."""
+        """Return the robot at the end of the tick."""
         return self.step.motion.robot
 
     @cached_property
     def near(self) -> Nearness:
-        """How near people are at the end of the tick."""
+        """Return the proximity of people at the end of the tick."""
         return nearness(self.robot, self.step.street_after.people, self.footprint_m)
 
     @property
     def travelled_m(self) -> float:
-        """Length of the way of this tick, in metres."""
+        """Return the distance driven in this tick, metres."""
         track = np.concatenate([[self.step.robot.pose[:2]], self.step.motion.trace[:, :2]])
         way = track[1:] - track[:-1]
         return float(np.hypot(way[:, 0], way[:, 1]).sum())
 
 
 class Column(NamedTuple):
-    """A recorded column: an array of `Log` with a row for each tick.
+    """Array of `Log` with one row per tick.
 
-    read: takes the value from a tick.
-    width: how many columns the array has, 0 for one without columns.
-    dtype: the array's type.
-    replayed: whether a replay measures it too; what is measured of the roads is not.
+    read: extracts the value from a tick
+    width: number of columns, 0 for a one-dimensional array
+    dtype: element type
+    replayed: False for road measurements, which a replay cannot reproduce
     """
 
     read: Callable[[Tick], float | Sequence[float]]
@@ -71,7 +126,7 @@ class Column(NamedTuple):
     replayed: bool = True
 
     def array(self, values: Sequence[float | Sequence[float]]) -> NDArray[Any]:
-        """Return the column of these values, one for each tick."""
+        """Return the column for one value per tick."""
         return np.array(values, self.dtype).reshape(
             (len(values), self.width) if self.width else len(values)
         )
@@ -84,8 +139,7 @@ def _column(
 
 
 def holds_waypoints(path: Path) -> bool:
-    """Return whether a trajectory.npz has answers that were waypoints; False for a file that cannot
-    be read."""
+    """Return whether a trajectory.npz holds waypoints; False if it cannot be read."""
     try:
         return "plan_points" in names_in_npz(path)
     except (OSError, ValueError):
@@ -94,31 +148,32 @@ def holds_waypoints(path: Path) -> bool:
 
 @dataclass(frozen=True)
 class Log:
-    """An episode tick by tick: T ticks, values at the end of each.
+    """Episode tick by tick: T ticks, values at the end of each.
 
-    pose (T, 3): x m, y m, heading rad. speed (T, 2): v m/s, w rad/s. command (T, 2): v m/s, w
-    rad/s. route_s_m (T,): arc length on the route. travelled_m (T,): length of the way of this
-    tick. person_m (T,): centre distance to the nearest person, inf without one. clearance_m (T,):
-    least gap between the robot's outline and a person's disk, not below 0, inf without a person.
-    collision_in_s (T,): least time until robot and a person would meet at their velocities, inf if
-    they would not. reset_s_m (T,): arc length that the robot was reset to after the tick, NaN
-    without reset. waits_at_red (T,) bool: whether the robot waits at a red light. on_carriageway
-    (T,) bool, vehicles_braked (T,): see `cosim.results.traffic`.
+    pose (T, 3): x m, y m, heading rad
+    speed (T, 2): v m/s, w rad/s
+    command (T, 2): v m/s, w rad/s
+    route_s_m (T,): arc length on the route
+    travelled_m (T,): distance driven in this tick
+    person_m (T,): centre distance to the nearest person, inf without one
+    clearance_m (T,): least gap between the robot's outline and a person's disk, at least 0, inf
+        without people
+    collision_in_s (T,): time to collision with a person at constant velocities, inf without one
+    reset_s_m (T,): arc length that the robot was reset to after the tick, NaN without a reset
+    waits_at_red (T,) bool: whether the robot waits at a red light
+    on_carriageway (T,) bool, vehicles_braked (T,): see `cosim.results.traffic`
+    people_tick (P,), people_xy (P, 2), people_kind (P,), people_age (P,): people within 30 m once a
+        second, with `PersonKind` and `Age`, for pictures
+    event_tracks (E, 5): tick, event, person in it, x m, y m, from each event's trigger on
+    answers (A, 4): tick of the observation, ticks until the answer took effect, v m/s, w rad/s
+    plan_sizes (A,): number of waypoints of each answer, 0 for a command
+    plan_points (W, 2) float32: waypoints of all answers in order, x ahead and y left of the robot
+        at its observation, metres; (W, 4) with cosine and sine of the heading, NaN where missing
+    plan_index: index of the waypoint of an answer that is followed, from 0
 
-    people_tick (P,), people_xy (P, 2), people_kind, people_age (P,) of `PersonKind` and `Age`:
-    persons within 30 m, once a second, for pictures.
-
-    event_tracks (E, 5): tick, event, person of it, x m, y m, from each event's trigger on.
-
-    answers (A, 4): the tick of an observation, the ticks until the policy's answer took effect, and
-    the command that it was, v m/s and w rad/s. Answers that were delayed when the robot was put
-    elsewhere never took effect (`cosim.episode.command_delay`). Empty in older files.
-
-    plan_sizes (A,): how many waypoints each answer was, 0 for a command. plan_points (W, 2)
-    float32: the waypoints of one answer after another, x ahead and y left of the robot at its
-    observation, metres; (W, 4) with cosine and sine of the heading there, NaN where an answer had
-    none. plan_index: which waypoint of an answer is followed, from 0. Without waypoints plan_sizes
-    and plan_points are empty, and no part of the file.
+    Answers still delayed at a reset never took effect (`cosim.episode.command_delay`). `answers` is
+    empty in older files. Without waypoints, plan_sizes and plan_points are empty and omitted from
+    the file.
 
     `Log.load` reads the trajectory.npz of a run folder and raises RunError naming the file.
 
@@ -166,7 +221,7 @@ class Log:
         return len(self.pose)
 
     def same(self, tick: Tick) -> bool:
-        """Return whether a tick of a replay is the recorded one, to the bit."""
+        """Return whether a replayed tick equals the recorded one, bit for bit."""
         at = tick.step.tick
         return all(
             np.array_equal(
@@ -177,26 +232,30 @@ class Log:
         )
 
     def encoded(self) -> bytes:
-        """The compressed .npz that is the file."""
+        """Return the bytes of the compressed .npz file."""
         file = io.BytesIO()
-        names = [f.name for f in fields(self) if len(self.plan_points) or f.name not in _OF_PLANS]
+        names = [
+            f.name for f in fields(self) if len(self.plan_points) or f.name not in _PLAN_ARRAYS
+        ]
         arrays = {name: np.asarray(getattr(self, name)) for name in names}
         np.savez_compressed(file, allow_pickle=False, **arrays)
         return file.getvalue()
 
     @classmethod
     def load(cls, path: Path) -> Log:
-        """Read a saved log. Raises RunError naming the file."""
+        """Load a log. Raises RunError naming the file."""
         try:
-            held = read_npz(path)
+            arrays = read_npz(path)
             values: dict[str, Any] = {
-                f.name: held[f.name] for f in fields(cls) if f.name in held or f.name not in _LATER
+                f.name: arrays[f.name]
+                for f in fields(cls)
+                if f.name in arrays or f.name not in _OPTIONAL
             }
-            if values.keys() & _OF_PLANS:
-                counts = len(held["plan_sizes"]), held["plan_sizes"].sum()
-                if counts != (len(held["answers"]), len(held["plan_points"])):
+            if values.keys() & _PLAN_ARRAYS:
+                counts = len(arrays["plan_sizes"]), arrays["plan_sizes"].sum()
+                if counts != (len(arrays["answers"]), len(arrays["plan_points"])):
                     raise ValueError("plan_sizes, plan_points and answers are not of each other")
-                values["plan_index"] = int(held["plan_index"])
+                values["plan_index"] = int(arrays["plan_index"])
             values["tick_s"] = float(values["tick_s"])
             _check_shapes(values)
         except KeyError as error:
@@ -209,20 +268,22 @@ class Log:
 COLUMNS: Final[Mapping[str, Column]] = MappingProxyType(
     {one.name: one.metadata["column"] for one in fields(Log) if "column" in one.metadata}
 )
-"""The columns with a row for each tick, by name, in the file's order."""
+"""Columns with one row per tick, by name, in file order."""
 
 
-def _check_shapes(held: Mapping[str, Any]) -> None:
-    """Raises ValueError for an array that holds no numbers, has other columns, or not as many rows
-    as it should."""
+def _check_shapes(arrays: Mapping[str, Any]) -> None:
+    """Raise ValueError for an array with a non-numeric type or a wrong shape."""
     widths = {name: column.width for name, column in COLUMNS.items()}
     tables = [
-        (widths, len(np.atleast_1d(held["pose"]))),
-        (_OF_PEOPLE, len(np.atleast_1d(held["people_tick"]))),
+        (widths, len(np.atleast_1d(arrays["pose"]))),
+        (_PEOPLE_WIDTHS, len(np.atleast_1d(arrays["people_tick"]))),
     ]
-    for columns, rows in (*tables, ({"event_tracks": 5}, len(np.atleast_1d(held["event_tracks"])))):
+    for columns, rows in (
+        *tables,
+        ({"event_tracks": 5}, len(np.atleast_1d(arrays["event_tracks"]))),
+    ):
         for name, width in columns.items():
-            array = held[name]
+            array = arrays[name]
             shape = (rows, width) if width else (rows,)
             if array.dtype.kind not in "biuf" or array.shape != shape:
                 raise ValueError(

@@ -1,5 +1,4 @@
-"""One run folder from the shards of a run, wherever they ran. The shards are read, and not a byte
-of them changes."""
+"""Merge the shards of a run into one run folder, without changing the shards."""
 
 from __future__ import annotations
 
@@ -19,22 +18,26 @@ from cosim.results.finished_run import check_records, read_record
 from cosim.results.record import Record
 from cosim.results.run_folder import (
     RUN_AGAIN,
-    TRAJECTORY,
     RunFolder,
     read_records,
+    read_scenarios,
     read_spec,
     record_file,
     refuse_in_use,
     told_apart,
+    trajectory_file,
 )
 from cosim.results.run_spec import RunSpec
 from cosim.spec.scenario import Scenario, read_suite
 
 
 class Merged(NamedTuple):
-    """What became of a merge. table: of the merged run, as in results.csv; missing: scenarios that
-    no shard has, without which there is no results.csv yet; twice: scenarios that several have,
-    equal to the bit."""
+    """Result of a merge.
+
+    table: table of the merged run, as in results.csv
+    missing: scenarios that no shard has; results.csv is not written while there are any
+    twice: scenarios that several shards have, with bit-identical episodes
+    """
 
     spec: RunSpec
     table: pd.DataFrame
@@ -43,7 +46,7 @@ class Merged(NamedTuple):
 
 
 class _Part(NamedTuple):
-    """A folder that is merged. records: by scenario id."""
+    """Folder to be merged. records: by scenario id."""
 
     path: Path
     spec: RunSpec
@@ -51,12 +54,11 @@ class _Part(NamedTuple):
 
 
 def merge_runs(folders: Sequence[Path], target: Path, progress: Progress) -> Merged:
-    """Make the run folder `target`, whole or not at all, of run folders that are the same run but
-    for their shard.
+    """Merge run folders that differ only in their shard into `target`, atomically.
 
-    Raises UsageError where there is no run, RunError, naming both sides, for folders of different
-    runs, for one that is in use or damaged, for a scenario of which two folders have different
-    episodes, and where `target` is not free.
+    Raises UsageError if a folder holds no run. Raises RunError for folders of different runs, a
+    folder in use or damaged, conflicting episodes of one scenario, and a `target` that is not
+    empty.
     """
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise RunError(f"{target} exists already: choose another --out")
@@ -75,44 +77,46 @@ def merge_runs(folders: Sequence[Path], target: Path, progress: Progress) -> Mer
             else:
                 taken[name] = part
     try:
-        with atomic_folder(target, existing="refuse") as made:
+        with atomic_folder(target, existing="refuse") as target_part:
             for name, part in taken.items():
                 progress(f"copying the episodes of {part.path}")
-                shutil.copytree(part.path / "episodes" / name, made / "episodes" / name)
+                shutil.copytree(part.path / "episodes" / name, target_part / "episodes" / name)
             for number, part in enumerate(parts, 1):
                 if (part.path / "logs").is_dir():
                     shutil.copytree(
-                        part.path / "logs", made / "logs" / f"{number}-{part.path.resolve().name}"
+                        part.path / "logs",
+                        target_part / "logs" / f"{number}-{part.path.resolve().name}",
                     )
             progress("making the tables")
             missing = tuple(name for name in spec.scenarios if name not in taken)
-            with RunFolder.create(made, spec, read_suite(parts[0].path / "scenarios.json")) as held:
-                table = held.finish()
+            with RunFolder.create(
+                target_part, spec, read_suite(parts[0].path / "scenarios.json")
+            ) as run_folder:
+                table = run_folder.finish()
             if missing:
-                (made / "results.csv").unlink()
+                (target_part / "results.csv").unlink()
     except (OSError, shutil.Error) as error:
-        why = error if isinstance(error, OSError) and error.errno else OSError(str(error))
-        raise unwritable(target, why) from error
+        cause = error if isinstance(error, OSError) and error.errno else OSError(str(error))
+        raise unwritable(target, cause) from error
     return Merged(spec, table, missing, tuple(twice))
 
 
 def _read(path: Path, first: _Part | None) -> _Part:
-    """A folder, held against the first one and against itself."""
+    """Read a folder and check it against the first folder and its own database."""
     spec = read_spec(path)
     refuse_in_use(path)
     if first is not None:
-        if (apart := spec.apart(first.spec, but="shard")) is not None:
+        if (difference := spec.apart(first.spec, but="shard")) is not None:
             raise RunError(
-                f"{path} is of another run than {first.path}: its {apart.field} is {apart.mine}, "
-                f"there it is {apart.theirs}: only what is of one run can be merged.{apart.hint}"
+                f"{path} is of another run than {first.path}: its {difference.field} is "
+                f"{difference.mine}, there it is {difference.theirs}: only what is of one run "
+                f"can be merged.{difference.hint}"
             )
         if _bytes(path / "scenarios.json") != _bytes(first.path / "scenarios.json"):
             raise RunError(
                 f"{path / 'scenarios.json'} is not that of {first.path}: one of them was edited"
             )
-    scenarios = {
-        scenario.id: scenario for scenario in read_suite(path / "scenarios.json").scenarios
-    }
+    scenarios = read_scenarios(path)
     in_table = {record.scenario.id: record for record in read_records(path, untouched=True)}
     check_records(path, in_table, scenarios)
     records: dict[str, Record] = {}
@@ -122,13 +126,14 @@ def _read(path: Path, first: _Part | None) -> _Part:
             records[name] = (
                 in_table[name] if name in in_table else _not_in_table(path, file, scenarios)
             )
-            if records[name].ended is not None and not file.with_name(TRAJECTORY).exists():
-                raise RunError(f"{file.with_name(TRAJECTORY)}: not there: {RUN_AGAIN}")
+            trajectory = trajectory_file(path, name)
+            if records[name].ended is not None and not trajectory.exists():
+                raise RunError(f"{trajectory}: not there: {RUN_AGAIN}")
     return _Part(path, spec, records)
 
 
 def _not_in_table(path: Path, file: Path, scenarios: Mapping[str, Scenario]) -> Record:
-    """A record that was written a moment before its run was killed."""
+    """Load a record that was written just before its run was killed, so that it has no row."""
     record = read_record(file)
     if record.scenario.id != file.parent.name:
         raise RunError(f"{file} is of scenario '{record.scenario.id}': {RUN_AGAIN}")
@@ -137,33 +142,34 @@ def _not_in_table(path: Path, file: Path, scenarios: Mapping[str, Scenario]) -> 
 
 
 def _check_equal(name: str, one: _Part, other: _Part) -> None:
-    """Raises RunError where two folders have different episodes of a scenario. Wall times may
-    differ."""
-    mine, theirs = (msgspec.structs.replace(part.records[name], clock={}) for part in (other, one))
-    apart = told_apart(mine, theirs)
-    if not apart:
-        logs = [record_file(part.path, name).with_name(TRAJECTORY) for part in (one, other)]
-        apart = "" if _same_arrays(*logs) else "trajectory.npz is another one"
-    if apart:
+    """Raise RunError if two folders have different episodes of a scenario, ignoring wall times."""
+    other_record, record = (
+        msgspec.structs.replace(part.records[name], clock={}) for part in (other, one)
+    )
+    difference = told_apart(other_record, record)
+    if not difference:
+        logs = [trajectory_file(part.path, name) for part in (one, other)]
+        difference = "" if _same_arrays(*logs) else "trajectory.npz is another one"
+    if difference:
         raise RunError(
             f"CONFLICT: {other.path} and {one.path} have different episodes of '{name}': in the "
-            f"first {apart}. `cosim replay {other.path} {name}` says whether that is what comes "
-            "out here; leave out the folder that is wrong"
+            f"first {difference}. `cosim replay {other.path} {name}` says whether that is what "
+            "comes out here; leave out the folder that is wrong"
         )
 
 
 def _same_arrays(one: Path, other: Path) -> bool:
-    """Whether two trajectories hold the same bits; how they are compressed is another matter."""
+    """Return whether two trajectories hold the same bits, regardless of compression."""
     if not (one.exists() and other.exists()):
         return one.exists() == other.exists()
     if one.read_bytes() == other.read_bytes():
         return True
     try:
-        mine, theirs = read_npz(one), read_npz(other)
-        return {*mine} == {*theirs} and all(
-            mine[name].dtype == theirs[name].dtype
-            and mine[name].tobytes() == theirs[name].tobytes()
-            for name in mine
+        arrays, other_arrays = read_npz(one), read_npz(other)
+        return {*arrays} == {*other_arrays} and all(
+            arrays[name].dtype == other_arrays[name].dtype
+            and arrays[name].tobytes() == other_arrays[name].tobytes()
+            for name in arrays
         )
     except (OSError, ValueError) as error:
         raise RunError(f"{one} and {other}: one is no trajectory: {error}") from error

@@ -1,8 +1,7 @@
-"""METRICS: name -> definition. Each is a pure function of one episode; a value that does not exist
-is None.
+"""Metrics of an episode: `METRICS` maps each name to its definition, a pure function.
 
-Names as in the field (Anderson et al. 1807.06757; Francis et al. 2306.16740; the SidewalkBench
-paper).
+A value that does not exist is None. Names follow the literature (Anderson et al. 1807.06757;
+Francis et al. 2306.16740; the SidewalkBench paper).
 """
 
 from __future__ import annotations
@@ -17,8 +16,8 @@ import numpy as np
 from cosim.core.clock import Clock
 from cosim.core.geometry import Floats
 from cosim.results.log import Log
-from cosim.results.record import Ended, Record
-from cosim.results.referee import Failure
+from cosim.results.record import Record
+from cosim.results.referee import Ended, Failure
 from cosim.spec.scenario import Scenario
 
 STALLED_MPS = 0.05
@@ -27,14 +26,18 @@ INTIMATE_SPACE_M = 0.45
 PROGRESS_WINDOW_S = 5.0
 PROGRESS_MIN_M = 0.1
 RATE_NEEDS_M = 1.0
-"""A rate per 100 m needs at least this distance."""
+"""Least distance, metres, for a rate per 100 m."""
 
 
 @dataclass(frozen=True)
 class EpisodeFacts:
-    """What the metrics see of an episode. route_length_m: of the reference route, the geodesic
-    walkable length. rules_broken: of events that were not passed as they should be. walked_into:
-    contacts at a person's fault. period_ticks: of the policy, from one command to the next."""
+    """Input of the metrics of one episode.
+
+    route_length_m: geodesic walkable length of the reference route
+    rules_broken: number of events whose rule was broken
+    walked_into: contacts at a person's fault
+    period_ticks: ticks between two commands of the policy
+    """
 
     log: Log
     failures: tuple[Failure, ...]
@@ -47,7 +50,7 @@ class EpisodeFacts:
 
     @classmethod
     def of(cls, record: Record, scenario: Scenario, log: Log) -> EpisodeFacts:
-        """Those of an episode that was recorded: all that a metric sees stands in its files."""
+        """Build the facts of a recorded episode from its files."""
         clock = Clock.for_rate(record.manifest.rate_hz)
         return cls(
             log=log,
@@ -62,14 +65,17 @@ class EpisodeFacts:
 
 
 class Metric(NamedTuple):
-    """A metric of an episode.
+    """Definition of a metric.
 
-    unit: "" for a number without one. higher_is_better: None for neither. of: the definition.
-    worst: the value of an episode whose policy crashed, so that no policy gains by crashing. None
-    where there is no worst value, as of a rate: a run in which a policy crashed has no mean of it.
-    pooled: of a rate, the metric that is counted and the metres that it is counted on. Of several
-        episodes a rate is all that was counted on all the metres. A mean of rates would let an
-        episode of 2 m outweigh one of 400 m, and leave out policies that never moved.
+    unit: "" if dimensionless
+    higher_is_better: None if neither direction is better
+    of: computes the value
+    worst: value of an episode whose policy crashed, so that crashing gains nothing; None if there
+        is no worst value, then a run with a crash has no mean
+    pooled: for a rate, the metric counted and the metres it is counted on
+
+    A rate over several episodes divides all counts by all metres. A mean of rates would let an
+    episode of 2 m outweigh one of 400 m, and skip policies that never moved.
     """
 
     unit: str
@@ -80,8 +86,7 @@ class Metric(NamedTuple):
 
 
 def goal_reached(episode: EpisodeFacts) -> float:
-    """1 if the episode ended at the goal within its time limit, however many failures were
-    counted."""
+    """Return 1 if the goal was reached within the time limit, regardless of failures."""
     return float(episode.ended == "goal")
 
 
@@ -92,32 +97,29 @@ SUCCESS_IN_WORDS = (
 
 
 def success(episode: EpisodeFacts) -> float:
-    """1 if the goal was reached, or the stop made that was asked for, in time, without a failure or
-    a broken rule."""
+    """Return 1 if the goal or required stop was reached in time, without failure or broken rule."""
     return float(
         episode.ended in ("goal", "stop") and not episode.failures and not episode.rules_broken
     )
 
 
 def travelled_m(episode: EpisodeFacts) -> float:
-    """Driven length: sum of displacements at the physics rate, reset jumps excluded."""
+    """Return the driven length: sum of displacements at the physics rate, without reset jumps."""
     return float(episode.log.travelled_m.sum())
 
 
 def route_length_m(episode: EpisodeFacts) -> float:
-    """Length of the reference route, driven or not."""
+    """Return the length of the reference route."""
     return episode.route_length_m
 
 
 def progress_m(episode: EpisodeFacts) -> float:
-    """Arc length of the route gained by driving: growth of the furthest arc length, reset jumps
-    excluded."""
+    """Return the arc length gained by driving: growth of its maximum, without reset jumps."""
     return progress_of(episode.log.route_s_m, episode.log.reset_s_m)
 
 
 def progress_of(route_s_m: np.ndarray, reset_s_m: np.ndarray) -> float:
-    """`progress_m` from arc lengths (T,) and the arc lengths of resets (T,), NaN where there was
-    none."""
+    """Return `progress_m` of arc lengths (T,) and reset arc lengths (T,), NaN without a reset."""
     furthest = gained = 0.0
     for s_m, reset_to_m in zip(route_s_m.tolist(), reset_s_m.tolist(), strict=True):
         gained += max(s_m - furthest, 0.0)
@@ -128,15 +130,14 @@ def progress_of(route_s_m: np.ndarray, reset_s_m: np.ndarray) -> float:
 
 
 def route_completion(episode: EpisodeFacts) -> float:
-    """Progress / route length, in [0, 1]; 1 needs the goal, or the stop where that is asked for."""
+    """Return progress / route length, in [0, 1]; 1 at the goal or required stop without a reset."""
     if episode.ended in ("goal", "stop") and not np.isfinite(episode.log.reset_s_m).any():
         return 1.0
     return min(progress_m(episode) / episode.route_length_m, 1.0)
 
 
 def spl(episode: EpisodeFacts) -> float:
-    """Success weighted by path length, S l / max(p, l) (Anderson et al.), l the geodesic walkable
-    length."""
+    """Return SPL, success weighted by path length: S l / max(p, l) (Anderson et al.)."""
     return (
         success(episode)
         * episode.route_length_m
@@ -145,63 +146,69 @@ def spl(episode: EpisodeFacts) -> float:
 
 
 def time_s(episode: EpisodeFacts) -> float:
+    """Return the simulated duration."""
     return len(episode.log) * episode.log.tick_s
 
 
 def velocity_mean_mps(episode: EpisodeFacts) -> float | None:
-    """Metres travelled / simulated time, frozen time included."""
+    """Return metres travelled / simulated time, including time at rest."""
     return travelled_m(episode) / time_s(episode) if len(episode.log) else None
 
 
+def _least(values: Floats) -> float | None:
+    """Return the minimum; None if there is no finite value."""
+    least = float(values.min(initial=np.inf))
+    return least if np.isfinite(least) else None
+
+
 def pedestrian_distance_min_m(episode: EpisodeFacts) -> float | None:
-    """Least centre distance to a person; absent if there never was one."""
-    nearest = float(episode.log.person_m.min()) if len(episode.log) else np.inf
-    return nearest if np.isfinite(nearest) else None
+    """Return the least centre distance to a person; None without people."""
+    return _least(episode.log.person_m)
 
 
 def pedestrian_distance_min_success_m(episode: EpisodeFacts) -> float | None:
-    """Least centre distance to a person in an episode that succeeded, as the paper averages it;
-    absent in others."""
+    """Return `pedestrian_distance_min_m` of a successful episode, as in the paper; else None."""
     return pedestrian_distance_min_m(episode) if success(episode) else None
 
 
 def clearance_min_m(episode: EpisodeFacts) -> float | None:
-    """Least gap between the robot's outline and a person's 0.3 m disk, 0 where they met; absent
-    without people."""
-    least = float(episode.log.clearance_m.min()) if len(episode.log) else np.inf
-    return least if np.isfinite(least) else None
+    """Return the least gap between robot outline and a person's 0.3 m disk; None without people."""
+    return _least(episode.log.clearance_m)
 
 
 def time_to_collision_min_s(episode: EpisodeFacts) -> float | None:
-    """Least time until robot and a person would have met had both kept their velocities (Francis et
-    al., after Biswas et al. 2022), both taken as disks
-    (`cosim.results.record.time_to_collision_s`); absent if they never would have."""
-    least = float(episode.log.collision_in_s.min()) if len(episode.log) else np.inf
-    return least if np.isfinite(least) else None
+    """Return the least time to collision with a person at constant velocities; None without one.
+
+    Both are disks, see `cosim.results.log.time_to_collision_s` (Francis et al., after Biswas et al.
+    2022).
+    """
+    return _least(episode.log.collision_in_s)
 
 
 def space_compliance(episode: EpisodeFacts) -> float | None:
-    """Share of ticks with nobody within 0.45 m (centre distance); absent without people."""
+    """Return the share of ticks without a person within 0.45 m (centres); None without people."""
     if pedestrian_distance_min_m(episode) is None:
         return None
     return float((episode.log.person_m > INTIMATE_SPACE_M).mean())
 
 
 def personal_space_violation(episode: EpisodeFacts) -> float | None:
-    """Share of ticks with somebody nearer than 1.2 m (centre distance); absent without people."""
+    """Return the share of ticks with a person within 1.2 m (centres); None without people."""
     if pedestrian_distance_min_m(episode) is None:
         return None
     return float((episode.log.person_m < _PERSONAL_SPACE_M).mean())
 
 
 def stalled_time_s(episode: EpisodeFacts) -> float:
-    """Time slower than 0.05 m/s."""
+    """Return the time slower than 0.05 m/s."""
     return float((np.abs(episode.log.speed[:, 0]) < STALLED_MPS).sum() * episode.log.tick_s)
 
 
 def failure_to_progress(episode: EpisodeFacts) -> float:
-    """Number of successive 5 s windows in which driving gained less than 0.1 m of arc length; jumps
-    do not count."""
+    """Return the number of successive 5 s windows with less than 0.1 m of arc length gained.
+
+    Reset jumps do not count.
+    """
     window = round(PROGRESS_WINDOW_S / episode.log.tick_s)
     s_m, reset_s_m = episode.log.route_s_m, episode.log.reset_s_m
     begins = np.concatenate([[0.0], np.where(np.isnan(reset_s_m), s_m, reset_s_m)[:-1]])
@@ -211,8 +218,10 @@ def failure_to_progress(episode: EpisodeFacts) -> float:
 
 
 def accelerations_mps2(episode: EpisodeFacts) -> list[Floats]:
-    """Accelerations along the robot's heading, from one command to the next; an array for each
-    stretch without a reset, across which nothing is differenced."""
+    """Return accelerations along the heading from command to command, one array per stretch.
+
+    A reset ends a stretch; no difference is taken across it.
+    """
     log, period = episode.log, episode.period_ticks
     ends = [*(np.flatnonzero(np.isfinite(log.reset_s_m)) + 1).tolist(), len(log)]
     stretches = zip([0, *ends[:-1]], ends, strict=True)
@@ -223,13 +232,12 @@ def accelerations_mps2(episode: EpisodeFacts) -> list[Floats]:
 
 
 def mean_acceleration_mps2(episode: EpisodeFacts) -> float | None:
-    """Mean magnitude of the acceleration, at the policy's rate (Francis et al.)."""
+    """Return the mean magnitude of the acceleration, at the policy's rate (Francis et al.)."""
     return _mean_magnitude(accelerations_mps2(episode))
 
 
 def mean_jerk_mps3(episode: EpisodeFacts) -> float | None:
-    """Mean magnitude of the change of acceleration in a second, at the policy's rate (Francis et
-    al.)."""
+    """Return the mean magnitude of the jerk, at the policy's rate (Francis et al.)."""
     period_s = episode.period_ticks * episode.log.tick_s
     return _mean_magnitude([np.diff(one) / period_s for one in accelerations_mps2(episode)])
 
@@ -240,44 +248,41 @@ def _mean_magnitude(stretches: list[Floats]) -> float | None:
 
 
 def carriageway_time_s(episode: EpisodeFacts) -> float:
-    """Time with the base centre on a road outside the crossings, or on a crossing whose signal says
-    stop."""
+    """Return the time with the base centre on a road, or on a crossing at red."""
     return float(episode.log.on_carriageway.sum() * episode.log.tick_s)
 
 
 def vehicles_braked(episode: EpisodeFacts) -> float:
-    """How often a vehicle had to slow down by more than 2 m/s2 for a robot without green
-    (`cosim.results.traffic`)."""
+    """Return how often a vehicle braked by more than 2 m/s2 for a robot without right of way."""
     return float(episode.log.vehicles_braked.sum())
 
 
 def count(kind: str) -> Callable[[EpisodeFacts], float]:
-    """Number of failures of a kind; "" counts all."""
+    """Return a metric that counts failures of a kind; "" counts all."""
     return lambda episode: float(sum(kind in ("", failure.kind) for failure in episode.failures))
 
 
 def collisions_with(other_kind: str) -> Callable[[EpisodeFacts], float]:
-    """Number of collisions with a kind of thing."""
+    """Return a metric that counts collisions with a kind of thing."""
     return lambda episode: float(
         sum(f.kind == "collision" and f.other_kind == other_kind for f in episode.failures)
     )
 
 
 def had(count_of: Callable[[EpisodeFacts], float]) -> Callable[[EpisodeFacts], float]:
-    """1 if there was one or more of what is counted: its mean over episodes is a rate of
-    episodes."""
+    """Return a metric that is 1 if the count is above 0; its mean is a rate of episodes."""
     return lambda episode: float(count_of(episode) > 0.0)
 
 
 def collisions_with_the_rest(episode: EpisodeFacts) -> float:
-    """Number of collisions with anything but a person."""
+    """Return the number of collisions with anything but a person."""
     return count("collision")(episode) - collisions_with("pedestrian")(episode)
 
 
 def per_100m(
     kind: str, distance: Callable[[EpisodeFacts], float]
 ) -> Callable[[EpisodeFacts], float | None]:
-    """Failures of a kind per 100 m of a distance; absent below 1 m."""
+    """Return a metric of failures of a kind per 100 m of a distance; None below 1 m."""
 
     def rate(episode: EpisodeFacts) -> float | None:
         metres = distance(episode)
@@ -360,20 +365,22 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
 POOLED: Mapping[str, tuple[str, str]] = MappingProxyType(
     {name: metric.pooled for name, metric in METRICS.items() if metric.pooled}
 )
-"""The rates, with what each is counted on."""
+"""Rates, each with the count and the metres that it is pooled from."""
 WORST: Mapping[str, float] = MappingProxyType(
     {name: metric.worst for name, metric in METRICS.items() if metric.worst is not None}
 )
-"""The measures of an episode whose policy crashed. An invalid episode has none."""
+"""Measures of an episode whose policy crashed; an invalid episode has none."""
 
 COUNTERFACTUAL: Mapping[str, str] = MappingProxyType(
     {"people_delay_s": "s", "people_compared": "", "vehicles_delay_s": "s", "vehicles_compared": ""}
 )
-"""Name -> unit of what is measured against the same street without the robot
-(`cosim.results.delay`), when that is asked for: delay of those that came near the robot, summed,
-and how many they were. No part of any other episode."""
+"""Name and unit of measures against the street without the robot (`cosim.results.delay`).
+
+Delays of bodies that came near the robot, summed, and their number; only in episodes that request
+it.
+"""
 
 
 def every_metric(episode: EpisodeFacts) -> dict[str, float | None]:
-    """Every metric of an episode."""
+    """Compute every metric of an episode."""
     return {name: metric.of(episode) for name, metric in METRICS.items()}

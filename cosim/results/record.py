@@ -1,8 +1,7 @@
-"""One episode on disk: `record.json` (what came out) and `trajectory.npz` (what happened, tick by
-tick).
+"""Record of an episode: `record.json`, and the recorder for `trajectory.npz`.
 
-Everything in a record but its `clock` part is a function of scenario, policy and versions: two runs
-give the same bytes.
+All of a record except `clock` is a function of scenario, policy and versions: two runs give the
+same bytes.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from cosim.episode.loop import Step
 from cosim.episode.manifest_checks import nonstandard
 from cosim.results.flat_file import FlatFile
 from cosim.results.log import COLUMNS, Log, Tick
-from cosim.results.referee import Failure, Verdict
+from cosim.results.referee import Ended, Failure, Verdict
 from cosim.results.run_setup import RunSetup
 from cosim.results.traffic import OnRoad
 from cosim.spec.episode_id import pseudonym_of
@@ -37,15 +36,15 @@ _SCHEMA = 1
 _MOST_BYTES = 256 << 20
 
 Status = Literal["done", "crashed", "invalid"]
-Ended = Literal["goal", "stop", "timeout", "failure"]
 
 
 class TriggeredEvent(msgspec.Struct, frozen=True, kw_only=True):
-    """What became of an event. triggered_at_s and trigger_distance_m are absent if its trigger
-    never fired.
+    """Outcome of an event.
 
-    seen: one of its people was before the robot once (`cosim.results.event_monitor`). rule_met:
-    whether the robot kept the event's rule; absent where there is none."""
+    triggered_at_s, trigger_distance_m: None if the trigger never fired
+    seen: whether the standard camera saw one of its people (`cosim.results.event_monitor`)
+    rule_met: whether the robot obeyed the event's rule; None without a rule
+    """
 
     id: str
     kind: str
@@ -57,15 +56,18 @@ class TriggeredEvent(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RedLightEntry(msgspec.Struct, frozen=True):
-    """The robot entered a crossing of its route whose signal said stop."""
+    """Entry of a crossing of the route at red."""
 
     tick: int
     crossing: str
 
 
 class ScenarioFacts(msgspec.Struct, frozen=True, kw_only=True):
-    """Which scenario an episode is of. hash: of all of its spec; crowd_added: its crowd is not the
-    suite's own (`CrowdSpec.added`)."""
+    """Identity of an episode's scenario.
+
+    hash: content hash of the whole spec
+    crowd_added: whether the crowd is not the suite's own (`CrowdSpec.added`)
+    """
 
     id: str
     hash: str
@@ -78,6 +80,7 @@ class ScenarioFacts(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def of(cls, scenario: Scenario) -> ScenarioFacts:
+        """Extract the facts of a scenario."""
         return cls(
             id=scenario.id,
             hash=content_hash(scenario),
@@ -91,20 +94,21 @@ class ScenarioFacts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Record(msgspec.Struct, frozen=True, kw_only=True):
-    """What came out of one episode: of which scenario, how the run was set up, what its policy says
-    of itself, and the outcome. In record.json and results.csv all of it is flat; a field that is
-    added is written to both.
+    """Result of one episode: scenario, run set-up, manifest and outcome.
 
-    episode: what the policy was told that the episode is called, drawn from the seed of the run.
-    manifest: with the goals of the run; without `goals`, which are not recorded. nonstandard: what
-    of its cameras no mount of the robot allows, in words. reason: why it crashed or is invalid.
-    clock: wall times, not reproducible; also how long the answers took of a policy that ran
-    elsewhere. walked_into: contacts with people who walked into the robot where it stood; no
-    failures. injections: pedestrians that came in from outside; with them the episode can be
-    replayed. status: crashed: its policy crashed, which counts as a failure. invalid: what the
-    simulator owes, counted apart: it came to its end without a failure, and its event had not
-    happened or could not be seen; or an engine failed, twice. ended: absent if it did not come to
-    its end: then there is no trajectory.
+    In record.json and results.csv all of it is flat; a new field appears in both.
+
+    manifest: includes the goals of the run, except `goals`, which are not recorded
+    episode: id of the episode sent to the policy, drawn from the run's seed
+    nonstandard: what no camera mount of the robot allows, in words
+    status: "crashed": the policy crashed, which counts as a failure. "invalid": the simulator is at
+        fault: no failure, but the event did not happen or could not be seen; or an engine failed
+        twice
+    reason: why the episode crashed or is invalid
+    ended: None if the episode did not end; then there is no trajectory
+    walked_into: contacts with people who walked into the resting robot; not failures
+    injections: pedestrians injected from outside; needed for a replay
+    clock: wall times, not reproducible, and answer times of a policy in another process
 
     `Record.load` reads the record.json of a run folder and raises RunError naming the file and the
     field.
@@ -135,8 +139,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def begun(cls, scenario: Scenario, manifest: Manifest, setup: RunSetup) -> Record:
-        """The record of an episode of which nothing is known yet but what is run: crashed, until it
-        is done."""
+        """Create the record of an episode that starts; its status is "crashed" until it is done."""
         return cls(
             scenario=ScenarioFacts.of(scenario),
             setup=setup,
@@ -148,21 +151,20 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def answer_ms(self) -> float | None:
-        """In real time the median of what the policy took for an answer, as it was measured; else
-        None."""
+        """Return the median measured answer time of the policy in real time; else None."""
         return self.clock.get("answer_ms") if self.setup.real_time else None
 
     def save(self, path: Path) -> None:
-        """Write as JSON, whole or not at all."""
+        """Write the record as JSON, atomically."""
         write_atomic(path, self.encoded())
 
     def encoded(self) -> bytes:
-        """The JSON that is the file."""
+        """Return the bytes of the JSON file."""
         return RECORD_FILE.in_lines(self)
 
     @classmethod
     def load(cls, path: Path) -> Record:
-        """Read a record. Raises RunError naming the file and the field."""
+        """Load a record. Raises RunError naming the file and the field."""
         try:
             data = read_within(path, _MOST_BYTES)
         except OSError as error:
@@ -173,7 +175,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
     @classmethod
     def decoded(cls, data: bytes, where: Path) -> Record:
-        """The record in a file's bytes. where: what an error names. Raises RunError."""
+        """Decode a record. where: path named in errors. Raises RunError."""
         try:
             record = RECORD_FILE.decode(data)
         except (msgspec.DecodeError, RecursionError, SpecError) as error:
@@ -197,17 +199,18 @@ RECORD_FILE = FlatFile(
     without="manifest.goals",
     defaults={"camera": None},
 )
-"""The layout of record.json, which is older than the parts of a `Record`."""
+"""Layout of record.json: flat, for compatibility with files written before `Record` had parts."""
 
 
 class StateHash:
-    """A running hash of everything simulated: robot, people, vehicles, signals, contacts, at every
+    """Running hash of the simulated state: robot, people, vehicles, signals and contacts at each
     tick."""
 
     def __init__(self) -> None:
         self._hash = hashlib.blake2b(digest_size=16)
 
     def add(self, step: Step) -> None:
+        """Add the state at the end of a step."""
         robot = step.motion.robot
         street = step.street_after
         for array in (
@@ -228,7 +231,7 @@ class StateHash:
 
 
 class Recorder:
-    """Collects the Steps of an episode into a Log."""
+    """Collects the steps of an episode into a Log."""
 
     PEOPLE_EVERY_TICKS = 20
     PEOPLE_WITHIN_M = 30.0
@@ -241,6 +244,7 @@ class Recorder:
         self.hash = StateHash()
 
     def add(self, step: Step, verdict: Verdict, road: OnRoad = OnRoad()) -> None:  # noqa: B008  a frozen value
+        """Record one tick; people only every PEOPLE_EVERY_TICKS within PEOPLE_WITHIN_M."""
         self.hash.add(step)
         tick = Tick(step, verdict, self._footprint_m, road)
         for name, column in COLUMNS.items():
@@ -257,7 +261,11 @@ class Recorder:
                 self._people.append((step.tick, *xy, kind, age))
 
     def log(self, event_tracks: Floats, commands: InFlight) -> Log:
-        """The episode so far. event_tracks: see `Log`; commands: all that the policy answered."""
+        """Build the log of the ticks so far.
+
+        event_tracks: see `Log`
+        commands: all answers of the policy
+        """
         people = np.array(self._people, dtype=float).reshape(-1, 5)
         plan_sizes, plan_points, plan_index = commands.plans
         return Log(

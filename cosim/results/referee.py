@@ -1,29 +1,30 @@
-"""The referee: contacts and poses of a Step -> failures, resets, the end of the episode.
+"""Referee: judges contacts and poses of each Step and returns failures, resets and the end.
 
 Rules (the paper leaves them open; each is a decision of this benchmark):
 
 - collision: the body touches anything but the ground, or its footprint overlaps a person's 0.3 m
-  disk or a vehicle's box, at any physics substep. One event per thing until they have been apart
-  for 1 s (people and vehicles: more than 0.1 m apart; walls and objects: without contact). Two
-  things touched in one tick are two.
+  disk or a vehicle's box, at any physics substep. Each thing counts once until it has been away for
+  1 s. People and vehicles are away beyond 0.1 m, walls and objects without contact. Two things
+  touched in one tick count as two.
 - A person who walks into a robot of which no point has moved faster than 0.05 m/s for 1 s is at
-  fault: that is counted (`walked_into`), and no failure. A robot that drives on while that person
-  touches it has collided.
+  fault. This is recorded (`walked_into`) and is no failure. A robot that drives on while that
+  person touches it has collided.
 - out_of_lane: the base centre is outside the walkable area (sidewalks, corners, crossings).
-- freezing, where the episode does not end on a failure: for 10 s the robot was never 0.5 m away
-  from where it was at their beginning; time of waiting before a red crossing of the route does not
-  count. In a short episode waiting costs nothing but its time.
+- freezing, if the episode does not end on a failure: for 10 s the robot was never 0.5 m away from
+  its position at their beginning. Waiting before a red crossing of the route does not count. In a
+  short episode waiting only costs time.
 - Signals are judged on the crossings of the reference route, by arc length.
-- Failures of one kind a tick: collisions before out_of_lane before freezing; one reset for all of
-  them.
-- The goal is reached within its radius, at the end of the route; or wherever the arc length is,
-  from where one can walk straight on to the goal: a part of the route was skipped on foot. Where
-  the route itself passes that near before its end, a round, its end alone counts.
-- Where an episode ends at a stop (`gesturing`): stopped within 3 m in front of the pedestrian for 2
-  s ends it well, passing the pedestrian ends it badly.
-- After a failure the robot is put at the nearest free waypoint of the route (every 5 m, never on a
-  crossing, at an obstacle nor at the goal), heading along it; after 3 failures within 10 m of the
-  route, at the first free one at least 1 m beyond them, or between waypoints where none is.
+- One kind of failure per tick: collisions before out_of_lane before freezing, with one reset for
+  all of them.
+- The goal is reached within its radius at the end of the route. It is also reached at any arc
+  length if walkable ground leads straight to it: the robot skipped a part of the route. If the
+  route passes its goal before its end (a loop), only its end counts.
+- If an episode ends at a stop (`gesturing`), stopping within 3 m in front of the pedestrian for 2 s
+  succeeds. Passing the pedestrian fails.
+- After a failure the robot is reset to the nearest free waypoint of the route, heading along it.
+  Waypoints are every 5 m, never on a crossing, at an obstacle or at the goal. After 3 failures
+  within 10 m of the route, it is reset to the first free waypoint at least 1 m beyond them, or
+  between waypoints if none is free.
 - The jump counts neither as travel nor as progress.
 """
 
@@ -63,28 +64,32 @@ _SAME_PLACE_M = 10.0
 SAME_PLACE_FAILURES = 3
 _BEYOND_M = 1.0
 _BETWEEN_M = 0.1
-_OFF_GOAL_M = 0.2
-"""Where no waypoint beyond is free, as before the goal, places so far apart are tried, up to so far
-from the goal's circle."""
+"""Spacing, metres, of reset positions that are tried if no waypoint beyond the failures is free."""
+_GOAL_MARGIN_M = 0.2
+"""Least distance, metres, between a reset position and the goal's circle."""
 RED_WAIT_M = 4.0
-"""A robot this close before a red crossing of its route waits lawfully."""
+"""Distance, metres, before a red crossing of the route within which waiting is lawful."""
 STOP_S = 2.0
+"""Time, seconds, that the robot must be stopped before a stopping hand."""
 STOP_WITHIN_M = 3.0
-"""Before a stopping hand: slower than STANDING_MPS for STOP_S, the base centre at most so far in
-front of it."""
+"""Distance, metres, in front of a stopping hand within which the robot must stop."""
 ROUND_M = 0.5
-"""A route is a round where it passes its goal, before its end, within the goal's radius and
-this."""
+"""Margin, metres, added to the goal's radius when testing whether a route is a loop."""
 LEFT_M = 0.3
-"""A robot this far before a crossing has left it and may enter it anew."""
+"""Distance, metres, before a crossing at which the robot has left it and may enter it again."""
 
 FailureKind = Literal["collision", "out_of_lane", "freezing"]
+Ended = Literal["goal", "stop", "timeout", "failure"]
 Fault = Literal["robot_at_fault", "pedestrian_at_fault", "shared"]
 
 
 @dataclass(frozen=True, slots=True)
 class Failure:
-    """One counted failure. other: what was touched; fault: who moved into whom, for pedestrians."""
+    """One counted failure.
+
+    other: id of the thing touched
+    fault: for pedestrians, which side moved into the other
+    """
 
     kind: FailureKind
     tick: int
@@ -99,20 +104,22 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What the referee says of one Step. walked_into: contacts that people are at fault for, which
-    are no failures. red_light_entry: the crossing that was entered at red, if one was."""
+    """Judgement of one Step.
+
+    walked_into: contacts at a person's fault, which are no failures
+    red_light_entry: crossing that was entered at red, if any
+    """
 
     failures: tuple[Failure, ...] = ()
     walked_into: tuple[Failure, ...] = ()
     reset: Reset | None = None
-    ended: Literal["goal", "stop", "timeout", "failure"] | None = None
+    ended: Ended | None = None
     red_light_entry: str | None = None
     waits_at_red: bool = False
 
 
 class Referee:
-    """Judges the Steps of one episode, in order. Memory: contacts under way, the freezing window,
-    past failures."""
+    """Referee of one episode; judges its Steps in order."""
 
     def __init__(
         self, scenario: Scenario, area: WalkableArea, footprint_m: tuple[float, float], clock: Clock
@@ -134,11 +141,11 @@ class Referee:
         self._window = FreezeWindow(clock)
         self._failed_at_s: list[float] = []
         self._entered: set[str] = set()
-        self._stood_ticks = 0
+        self._stopped_ticks = 0
         self._inside = Circle()
 
     def judge(self, step: Step) -> Verdict:
-        """The verdict on one Step; a failure comes with a reset unless it ends the episode."""
+        """Judge one Step; a failure comes with a reset unless it ends the episode."""
         waits = self._waits_at_red(step)
         red = self._red_light_entry(step)
         contacts = self._contacts(step)
@@ -156,19 +163,18 @@ class Referee:
         self._entered.clear()
         return Verdict(failures, into, reset, None, red, waits)
 
-    def _end(self, step: Step) -> Literal["goal", "stop", "timeout", "failure"] | None:
+    def _end(self, step: Step) -> Ended | None:
         if self._scenario.ends_at == "stop":
             return self._end_by_stop(step)
         pose = step.motion.robot.pose
         if at_goal(
             self._scenario, np.array([pose]), np.array([step.route_s_after_m])
-        ).any() or self._walks_in(pose):
+        ).any() or self._goal_straight_ahead(pose):
             return "goal"
         return "timeout" if step.tick + 1 >= self._limit_ticks else None
 
-    def _walks_in(self, pose: Pose) -> bool:
-        """Whether the goal is near and straight ahead on walkable ground, by whatever way the robot
-        came."""
+    def _goal_straight_ahead(self, pose: Pose) -> bool:
+        """Return whether the goal is near and straight ahead on walkable ground."""
         if self._is_round or not near_goal(self._scenario, np.array([pose])).any():
             return False
         straight = shapely.LineString([(pose.x_m, pose.y_m), self._scenario.goal])
@@ -176,26 +182,26 @@ class Referee:
             self._fences, straight
         )
 
-    def _end_by_stop(self, step: Step) -> Literal["stop", "timeout", "failure"] | None:
-        """The episode of a gesturing pedestrian: over when the robot has stopped before it, or has
+    def _end_by_stop(self, step: Step) -> Ended | None:
+        """Return the end of a `gesturing` episode: the robot stopped before the pedestrian or
         passed it."""
         robot = step.motion.robot
         here = any(
             state.phase == "acting" and stands_before(robot.pose, event, state)
             for event, state in zip(self._scenario.events, step.events.states, strict=True)
         )
-        self._stood_ticks = (
-            self._stood_ticks + 1 if here and abs(robot.v_mps) < ROBOT_STANDS_MPS else 0
+        self._stopped_ticks = (
+            self._stopped_ticks + 1 if here and abs(robot.v_mps) < ROBOT_STANDS_MPS else 0
         )
-        if self._stood_ticks >= self._clock.ticks(STOP_S):
+        if self._stopped_ticks >= self._clock.ticks(STOP_S):
             return "stop"
         if all(step.route_s_after_m > event.route_s_m for event in self._scenario.events):
             return "failure"
         return "timeout" if step.tick + 1 >= self._limit_ticks else None
 
     def _contacts(self, step: Step) -> list[Failure]:
-        """The contacts that begin in a tick, one for each thing."""
-        self._forget_the_parted(step)
+        """Return the contacts that begin in a tick, one per thing."""
+        self._forget_distant(step)
         moves = outline_mps(step.robot.v_mps, step.robot.w_radps, self._half_m) >= ROBOT_STANDS_MPS
         self._still_ticks = 0 if moves else self._still_ticks + 1
         stood = self._still_ticks >= self._clock.ticks(STOOD_S)
@@ -216,14 +222,14 @@ class Referee:
             found.append(self._failure("collision", step, name, contact.kind, fault))
         return found
 
-    def _forget_the_parted(self, step: Step) -> None:
-        """A thing may collide anew once it has been away for a second."""
+    def _forget_distant(self, step: Step) -> None:
+        """Forget contacts with things that have been away for a second."""
         if not self._touching:
             return
         gaps = person_gaps(step, self._half_m)
-        beside = vehicles_within(step, self._half_m, _APART_M)
+        near_vehicles = vehicles_within(step, self._half_m, _APART_M)
         for other, last_tick in list(self._touching.items()):
-            if gaps.get(other, np.inf) <= _APART_M or other in beside:
+            if gaps.get(other, np.inf) <= _APART_M or other in near_vehicles:
                 self._touching[other] = step.tick
             elif (step.tick - last_tick) * self._clock.tick_s > _APART_S:
                 del self._touching[other]
@@ -304,7 +310,7 @@ class Referee:
         if (found := self._first_free(order, step)) is not None:
             return found
         if stuck:
-            end_m = self._route.length_m - self._scenario.goal_radius_m - _OFF_GOAL_M
+            end_m = self._route.length_m - self._scenario.goal_radius_m - _GOAL_MARGIN_M
             if (
                 found := self._first_free(self._clear(np.arange(begin_m, end_m, _BETWEEN_M)), step)
             ) is not None:
@@ -313,7 +319,7 @@ class Referee:
         return Reset(self._route.at(s_m), s_m)
 
     def _first_free(self, places: Floats, step: Step) -> Reset | None:
-        """At the first of these arc lengths, metres, at which nobody and nothing is in the way."""
+        """Return a reset to the first of these arc lengths, metres, that is free."""
         for s_m in places.tolist():
             pose = self._route.at(s_m)
             if self._free(pose, s_m, step):
@@ -321,7 +327,7 @@ class Referee:
         return None
 
     def _clear(self, waypoints: Floats) -> Floats:
-        """Those at which the robot can turn on the spot between the obstacles."""
+        """Return the waypoints at which the robot can turn on the spot between the obstacles."""
         if not self._scenario.obstacles or not len(waypoints):
             return waypoints
         at = shapely.points([self._route.at(s_m).xy for s_m in waypoints.tolist()])
@@ -344,45 +350,44 @@ class Referee:
 
 
 class FreezeWindow:
-    """Where a robot was within the last 10 s, those left out in which it waited lawfully."""
+    """Positions of a robot within the last 10 s, without ticks in which it waited lawfully."""
 
     def __init__(self, clock: Clock) -> None:
         self._at: deque[tuple[float, float]] = deque(maxlen=clock.ticks(FREEZE_WINDOW_S) + 1)
 
     def frozen(self, xy: tuple[float, float]) -> bool:
-        """Whether it is frozen now that it is here after a further tick, metres."""
+        """Append the position of a tick, metres, and return whether the robot is frozen."""
         self._at.append(xy)
         if len(self._at) < (self._at.maxlen or 0):
             return False
-        # Mostly it is far from where it was, whatever lies between.
+        # Fast path: usually the robot is far from its oldest position.
         if math.dist(self._at[0], xy) > FREEZE_MOVE_M + _ROUNDING_M:
             return False
         track = np.array(self._at)
         return bool(np.hypot(*(track - track[0]).T).max() < FREEZE_MOVE_M)
 
     def clear(self) -> None:
-        """It was put elsewhere."""
+        """Clear the window after a reset."""
         self._at.clear()
 
 
 def at_goal(scenario: Scenario, pose: Floats, route_s_m: Floats) -> NDArray[np.bool_]:
-    """(T,) at which of (T, 3) poses with these arc lengths (T,) the goal is reached at the end of
-    the route."""
+    """Return (T,) whether poses (T, 3) with arc lengths (T,) reach the goal at the end of the
+    route."""
     last_m = scenario.route_line.length_m - 2 * scenario.goal_radius_m
     reached: NDArray[np.bool_] = near_goal(scenario, pose) & (route_s_m >= last_m)
     return reached
 
 
 def near_goal(scenario: Scenario, pose: Floats) -> NDArray[np.bool_]:
-    """(T,) which of (T, 3) poses are within the goal's radius."""
+    """Return (T,) which of (T, 3) poses are within the goal's radius."""
     away_m = np.hypot(pose[:, 0] - scenario.goal[0], pose[:, 1] - scenario.goal[1])
     near: NDArray[np.bool_] = away_m <= scenario.goal_radius_m
     return near
 
 
 def is_round(scenario: Scenario) -> bool:
-    """Whether a route passes its own goal before its end, so that being there does not say that it
-    was driven."""
+    """Return whether a route is a loop: it passes its own goal before its end."""
     route = scenario.route_line
     last_m = route.length_m - 2 * scenario.goal_radius_m
     before = shapely.LineString([*route.points[route.s_m < last_m], route.at(last_m).xy])
@@ -390,7 +395,7 @@ def is_round(scenario: Scenario) -> bool:
 
 
 def stands_before(robot: Pose, event: Event, state: EventState) -> bool:
-    """Whether the robot is within STOP_WITHIN_M of somebody, on the side from which it came."""
+    """Return whether the robot is within STOP_WITHIN_M of a person, on the side it came from."""
     for walker in state.walkers:
         dx, dy = robot.x_m - walker.x_m, robot.y_m - walker.y_m
         behind = dx * math.cos(event.heading_rad) + dy * math.sin(event.heading_rad) > 0.0
@@ -400,13 +405,13 @@ def stands_before(robot: Pose, event: Event, state: EventState) -> bool:
 
 
 def signal_is_red(crossing_id: str, signals: Mapping[str, Signal]) -> bool:
-    """Whether a crossing has a signal and it says stop."""
+    """Return whether a crossing has a signal and it shows red."""
     signal = signals.get(crossing_id)
     return signal is not None and not signal.walk
 
 
 def person_gaps(step: Step, half_m: tuple[float, float]) -> dict[str, float]:
-    """Gap in metres from the robot's footprint to each person's disk at the end of a Step."""
+    """Return the gap in metres from the robot's footprint to each person's disk after a Step."""
     people = step.street_after.people
     pose = step.motion.robot.pose
     if not len(people):
@@ -416,8 +421,7 @@ def person_gaps(step: Step, half_m: tuple[float, float]) -> dict[str, float]:
 
 
 def vehicles_within(step: Step, half_m: tuple[float, float], gap_m: float) -> set[str]:
-    """Ids of the vehicles whose box comes within a gap of the robot's outline at the end of a
-    Step."""
+    """Return ids of the vehicles whose box is within a gap of the robot's outline after a Step."""
     vehicles = step.street_after.vehicles
     pose = step.motion.robot.pose
     if not len(vehicles):
@@ -428,8 +432,10 @@ def vehicles_within(step: Step, half_m: tuple[float, float], gap_m: float) -> se
 
 
 def fault_of(person: str, stood: bool, step: Step) -> Fault:
-    """Who moved into whom. stood: the robot has stood long enough to be walked into; a person who
-    does not come nearer is driven into."""
+    """Return which side moved into the other.
+
+    stood: whether the robot was at rest long enough for the person to be at fault
+    """
     if stood:
         return "pedestrian_at_fault"
     people = step.street.people

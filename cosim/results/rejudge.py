@@ -1,10 +1,8 @@
-"""Evidence: what a record says came out of an episode, held against the trajectory that was
-recorded with it.
+"""Check a record against the trajectory that was recorded with it.
 
-From the trajectory alone follow how long it was, where and how fast the robot was at each failure,
-when it was put back, how it came forward on its route, every freezing, and its end. Recorded as
-they were found, because only the engines can find them, are contacts, being off the walkable area,
-crossings entered at red, what became of events.
+The trajectory determines its duration, position and speed at each failure, resets, progress,
+freezings and the end. Contacts, leaving the walkable area, red light entries and event outcomes
+need the engines; they are taken from the record.
 """
 
 from __future__ import annotations
@@ -20,17 +18,17 @@ from cosim.episode.command_delay import median_ms
 from cosim.episode.loop import ROUTE_WINDOW_M
 from cosim.people.yielding import ROBOT_STANDS_MPS
 from cosim.results.log import Log
-from cosim.results.record import Ended, Record
-from cosim.results.referee import STOP_S, FreezeWindow, at_goal, is_round, near_goal
+from cosim.results.record import Record
+from cosim.results.referee import STOP_S, Ended, FreezeWindow, at_goal, is_round, near_goal
 from cosim.spec.scenario import Scenario
 
 _ROUNDING_M = 1e-9
 _BLOCK_TICKS = 2000
-"""So many at a time need a few MiB."""
+"""Number of ticks per block; limits memory to a few MiB."""
 
 
 class Contradiction(NamedTuple):
-    """What a record says, and what its trajectory shows instead."""
+    """Field whose recorded value differs from the trajectory."""
 
     what: str
     recorded: object
@@ -38,7 +36,7 @@ class Contradiction(NamedTuple):
 
 
 def contradictions(record: Record, scenario: Scenario, log: Log) -> Iterator[Contradiction]:
-    """Where a record is not what its trajectory shows; nothing where all of it is."""
+    """Yield the differences between a record and its trajectory."""
     if record.ticks != len(log):
         yield Contradiction("ticks", record.ticks, len(log))
         return
@@ -47,9 +45,9 @@ def contradictions(record: Record, scenario: Scenario, log: Log) -> Iterator[Con
     ):
         yield Contradiction("latency_ms", record.setup.latency_ms, latency_ms)
     yield from _failures_as_driven(record, log)
-    yield from _resets(record, scenario, log)
-    yield from _red_entries(record, scenario, log)
-    yield from _way(scenario, log)
+    yield from _resets(record, log)
+    yield from _red_light_entries(record, scenario, log)
+    yield from _progress(scenario, log)
     yield from _freezings(record, scenario, log)
     if record.ended not in (ends := _ends(record, scenario, log)):
         yield Contradiction("ended", record.ended, " or ".join(ends) or "not yet over")
@@ -57,33 +55,37 @@ def contradictions(record: Record, scenario: Scenario, log: Log) -> Iterator[Con
 
 def _failures_as_driven(record: Record, log: Log) -> Iterator[Contradiction]:
     start_mps = np.abs(
-        np.where(np.isfinite(_before(log.reset_s_m, np.nan)), 0.0, _before(log.speed[:, 0], 0.0))
+        np.where(
+            np.isfinite(_previous(log.reset_s_m, np.nan)), 0.0, _previous(log.speed[:, 0], 0.0)
+        )
     )
     for failure in (*record.failures, *record.walked_into):
-        told = (failure.x_m, failure.y_m, failure.route_s_m, failure.robot_speed_mps)
-        k = failure.tick
+        recorded = (failure.x_m, failure.y_m, failure.route_s_m, failure.robot_speed_mps)
+        tick = failure.tick
         shown = (
-            (*log.pose[k, :2].tolist(), float(log.route_s_m[k]), float(start_mps[k]))
-            if k < len(log)
+            (*log.pose[tick, :2].tolist(), float(log.route_s_m[tick]), float(start_mps[tick]))
+            if tick < len(log)
             else ()
         )
-        if told != shown:
+        if recorded != shown:
             yield Contradiction(
-                f"{failure.kind} at tick {k}: x_m, y_m, route_s_m, robot_speed_mps", told, shown
+                f"{failure.kind} at tick {tick}: x_m, y_m, route_s_m, robot_speed_mps",
+                recorded,
+                shown,
             )
 
 
-def _resets(record: Record, scenario: Scenario, log: Log) -> Iterator[Contradiction]:
-    """After every tick with failures the robot is put back, but where they end the episode."""
+def _resets(record: Record, log: Log) -> Iterator[Contradiction]:
+    """Check that the robot is reset after each tick with failures, except the last one."""
     failed = sorted({failure.tick for failure in record.failures} - {len(log) - 1})
     resets = np.flatnonzero(np.isfinite(log.reset_s_m)).tolist()
     if failed != resets:
-        k = min({*failed} ^ {*resets})
-        yield Contradiction(f"failures at tick {k}", int(k in failed), int(k in resets))
+        tick = min({*failed} ^ {*resets})
+        yield Contradiction(f"failures at tick {tick}", int(tick in failed), int(tick in resets))
 
 
-def _red_entries(record: Record, scenario: Scenario, log: Log) -> Iterator[Contradiction]:
-    """Whatever the signal showed, the robot was on the crossing then."""
+def _red_light_entries(record: Record, scenario: Scenario, log: Log) -> Iterator[Contradiction]:
+    """Check that the robot was on the crossing at each red light entry."""
     crossings = {crossing.id: crossing for crossing in scenario.crossings}
     for entry in record.red_light_entries:
         crossing = crossings.get(entry.crossing)
@@ -96,14 +98,16 @@ def _red_entries(record: Record, scenario: Scenario, log: Log) -> Iterator[Contr
             )
 
 
-def _way(scenario: Scenario, log: Log) -> Iterator[Contradiction]:
-    """Arc lengths are those of the poses, and no tick went farther than was travelled in it."""
-    reset_to_m = _before(log.reset_s_m, 0.0)
-    last_m = np.where(np.isnan(reset_to_m), _before(log.route_s_m, 0.0), reset_to_m)
+def _progress(scenario: Scenario, log: Log) -> Iterator[Contradiction]:
+    """Check that arc lengths match the poses, and that no tick moved farther than it travelled."""
+    reset_to_m = _previous(log.reset_s_m, 0.0)
+    last_m = np.where(np.isnan(reset_to_m), _previous(log.route_s_m, 0.0), reset_to_m)
     shown_m = places_on_route(scenario.route_line, log.pose, last_m)
-    if len(apart := np.flatnonzero(shown_m != log.route_s_m)):
-        k = int(apart[0])
-        yield Contradiction(f"route_s_m at tick {k}", float(log.route_s_m[k]), float(shown_m[k]))
+    if len(differing := np.flatnonzero(shown_m != log.route_s_m)):
+        tick = int(differing[0])
+        yield Contradiction(
+            f"route_s_m at tick {tick}", float(log.route_s_m[tick]), float(shown_m[tick])
+        )
         return
     went_m = np.hypot(*np.diff(log.pose[:, :2], axis=0).T)
     short = (
@@ -111,15 +115,17 @@ def _way(scenario: Scenario, log: Log) -> Iterator[Contradiction]:
         + 1
     )
     if len(short):
-        k = int(short[0])
+        tick = int(short[0])
         yield Contradiction(
-            f"travelled_m at tick {k}", float(log.travelled_m[k]), f"{went_m[k - 1]} or more"
+            f"travelled_m at tick {tick}",
+            float(log.travelled_m[tick]),
+            f"{went_m[tick - 1]} or more",
         )
 
 
 def places_on_route(route: Polyline, pose: Floats, last_s_m: Floats) -> Floats:
-    """(T,) what `cosim.episode.loop.place_on_route` gives, to the bit, for (T, 3) poses and last
-    arc lengths (T,)."""
+    """Return `cosim.episode.loop.place_on_route` (T,), bit-identical, of poses (T, 3) and last arc
+    lengths (T,)."""
     first = np.maximum(np.searchsorted(route.s_m, last_s_m - ROUTE_WINDOW_M, side="right") - 1, 0)
     steps = np.diff(route.points, axis=0)
     lengths = np.hypot(steps[:, 0], steps[:, 1])
@@ -147,29 +153,31 @@ def places_on_route(route: Polyline, pose: Floats, last_s_m: Floats) -> Floats:
 
 
 def _freezings(record: Record, scenario: Scenario, log: Log) -> Iterator[Contradiction]:
-    """By the referee's rule, where nothing else had failed."""
+    """Check freezings by the referee's rule, in ticks without another failure."""
     if scenario.ends_on_failure:
         return
     window = FreezeWindow(Clock())
-    told = {failure.tick: failure.kind for failure in record.failures}
-    for k, (x_m, y_m, waits) in enumerate(
+    kinds = {failure.tick: failure.kind for failure in record.failures}
+    for tick, (x_m, y_m, waits) in enumerate(
         zip(
             log.pose[:, 0].tolist(), log.pose[:, 1].tolist(), log.waits_at_red.tolist(), strict=True
         )
     ):
-        kind = told.get(k)
+        kind = kinds.get(tick)
         if kind in (None, "freezing") and (frozen := not waits and window.frozen((x_m, y_m))) != (
             kind == "freezing"
         ):
-            yield Contradiction(f"freezings at tick {k}", int(kind == "freezing"), int(frozen))
+            yield Contradiction(f"freezings at tick {tick}", int(kind == "freezing"), int(frozen))
             return
         if kind is not None:
             window.clear()
 
 
 def _ends(record: Record, scenario: Scenario, log: Log) -> list[Ended]:
-    """The ends that the trajectory allows; one that is over before its last tick has none. Only the
-    map tells whether one can walk straight on to a goal that is near."""
+    """Return the ends that the trajectory allows; none if it was over before its last tick.
+
+    Whether the robot can walk straight to a near goal needs the map, so both answers are allowed.
+    """
     last = len(log) - 1
     late = last + 1 >= Clock().ticks(scenario.time_limit_s)
     if any(failure.tick == last for failure in record.failures):
@@ -190,6 +198,6 @@ def _allowed(*ends: tuple[Ended, bool]) -> list[Ended]:
     return [ended for ended, allowed in ends if allowed]
 
 
-def _before(values: Floats, first: float) -> Floats:
-    """(T,) each tick's value of the tick before it."""
+def _previous(values: Floats, first: float) -> Floats:
+    """Return (T,) the values of the previous tick."""
     return np.concatenate([[first], values[:-1]])

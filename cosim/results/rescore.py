@@ -1,9 +1,7 @@
-"""Score a run: every metric computed again from the recorded trajectories, and held against what
-the run recorded.
+"""Recompute every metric of a run from its trajectories and compare with the recorded values.
 
-No engine is started. Of an episode its record, its scenario and its trajectory are read; where what
-follows from these is not, to the last bit, what record.json, results.sqlite and results.csv hold,
-it is told.
+No engine is started: only record, scenario and trajectory are read. Any difference to record.json,
+results.sqlite and results.csv is reported, down to the last bit.
 """
 
 from __future__ import annotations
@@ -20,11 +18,10 @@ from cosim.core.errors import RunError
 from cosim.core.progress import Progress, ignore
 from cosim.results.event_monitor import why_invalid
 from cosim.results.finished_run import WholeRun, read_whole_run
-from cosim.results.log import Log
 from cosim.results.metrics import COUNTERFACTUAL, METRICS, EpisodeFacts, every_metric
 from cosim.results.record import Record
 from cosim.results.rejudge import contradictions
-from cosim.results.run_folder import RUN_AGAIN, TRAJECTORY, record_file
+from cosim.results.run_folder import load_log
 from cosim.results.table import table_of
 from cosim.spec.scenario import Scenario
 
@@ -32,8 +29,11 @@ _TABLE = "results.csv"
 
 
 class Difference(NamedTuple):
-    """file: which of the run's differs; recorded: what it has; computed: what follows from the
-    trajectory."""
+    """Value that differs from the recomputed one.
+
+    file: file of the run with the recorded value
+    computed: value that follows from the trajectory
+    """
 
     file: str
     episode: str
@@ -43,8 +43,12 @@ class Difference(NamedTuple):
 
 
 class Scored(NamedTuple):
-    """episodes, without_trajectory: that have ended; untested: measures that no trajectory can
-    tell; table: whether the run is whole, and has its table."""
+    """Result of recomputing a run.
+
+    episodes, without_trajectory: number of ended episodes with and without a trajectory
+    untested: measures that cannot be computed from a trajectory
+    table: whether results.csv was compared
+    """
 
     episodes: int
     without_trajectory: int
@@ -55,8 +59,10 @@ class Scored(NamedTuple):
 
 
 def score_run(path: Path, progress: Progress = ignore) -> Scored:
-    """Compute every metric of a run again. Raises what `read_whole_run` raises, and RunError for a
-    trajectory that is missing or damaged."""
+    """Recompute every metric of a run.
+
+    Raises what `read_whole_run` raises, and RunError for a missing or damaged trajectory.
+    """
     run = read_whole_run(path)
     computed: list[Record] = []
     found: list[Difference] = []
@@ -76,12 +82,15 @@ def score_run(path: Path, progress: Progress = ignore) -> Scored:
 
 
 def _scored(run: WholeRun, scenario: Scenario, record: Record) -> tuple[Record, list[Difference]]:
-    """The record of an episode as it follows from its trajectory, and where it is another."""
+    """Return the recomputed record of an episode and its differences."""
     measures: dict[str, float | None] = {}
     found = []
     if record.ended is not None:
-        log = _trajectory(run.path, record.scenario.id)
-        found = [(what, told, shown) for what, told, shown in contradictions(record, scenario, log)]
+        log = load_log(run.path, record.scenario.id)
+        found = [
+            (what, recorded, shown)
+            for what, recorded, shown in contradictions(record, scenario, log)
+        ]
         if not found:
             measures = every_metric(EpisodeFacts.of(record, scenario, log))
             measures |= {
@@ -101,44 +110,37 @@ def _scored(run: WholeRun, scenario: Scenario, record: Record) -> tuple[Record, 
     return msgspec.structs.replace(record, measures=measures), differences
 
 
-def _trajectory(path: Path, scenario_id: str) -> Log:
-    file = record_file(path, scenario_id).with_name(TRAJECTORY)
-    try:
-        return Log.load(file)
-    except RunError as error:
-        raise RunError(f"{error}: {RUN_AGAIN}") from error
-
-
 def _cells_that_differ(file: Path, computed: list[Record]) -> Iterator[Difference]:
-    """Where the table that the run has written is another; it is compared as it is written, digit
-    by digit."""
-    follows = table_of(computed).to_csv(index=False)
-    told = file.read_bytes().decode(errors="replace")
-    if told == follows:
+    """Yield the cells in which results.csv differs from the recomputed table, as text."""
+    expected_text = table_of(computed).to_csv(index=False)
+    recorded_text = file.read_bytes().decode(errors="replace")
+    if recorded_text == expected_text:
         return
-    mine = _rows_of(follows)
+    expected = _rows_of(expected_text)
     try:
-        theirs = _rows_of(told)
+        recorded = _rows_of(recorded_text)
     except csv.Error:
-        theirs = {}
-    if not theirs.keys() <= mine.keys() or not theirs:
+        recorded = {}
+    if not recorded.keys() <= expected.keys() or not recorded:
         raise RunError(
             f"{file}: not the table of this run: remove it, and give the command of the run "
             f"with --resume"
         )
-    columns = next(iter(theirs.values()))
-    for name, row in mine.items():
-        other = theirs.get(name, {})
-        for (
-            column,
-            value,
-        ) in row.items():  # all metrics, and of the others those that the run's version had
-            if (column in METRICS or column in columns) and other.get(column) != value:
+    columns = next(iter(recorded.values()))
+    for name, row in expected.items():
+        recorded_row = recorded.get(name, {})
+        # All metrics; other columns only if the run's version wrote them.
+        for column, value in row.items():
+            if (column in METRICS or column in columns) and recorded_row.get(column) != value:
                 yield Difference(
-                    file.name, name, column, other.get(column) or "nothing", value or "nothing"
+                    file.name,
+                    name,
+                    column,
+                    recorded_row.get(column) or "nothing",
+                    value or "nothing",
                 )
 
 
 def _rows_of(table: str) -> dict[str, dict[str, str]]:
-    """The rows of a table, by scenario."""
+    """Return the rows of a CSV table by scenario."""
     return {row["scenario"]: row for row in csv.DictReader(io.StringIO(table)) if "scenario" in row}

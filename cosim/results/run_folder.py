@@ -1,18 +1,15 @@
-"""A run folder: what was asked for, and what came out, episode by episode; survives a kill at any
-moment.
+"""Run folder: episode files, the database `results.sqlite`, locking and resuming.
 
-run.json                         what is run: suite, policy, scenarios, versions, renderer
+run.json                         the run: suite, policy, scenarios, versions, renderer
 scenarios.json                   the resolved specs
-episodes/<scenario>/record.json  and trajectory.npz, written by the run's process, whole or not at
-                                 all; frames/;
-                                 demonstration.npz where these are collected
+episodes/<scenario>/record.json  and trajectory.npz, written atomically by the run's process;
+                                 frames/ and demonstration.npz where these are collected
 results.sqlite                   one row per finished episode, in the order in which they ended
 results.csv                      the same, sorted by scenario, written at the end
-attempts.jsonl                   scenarios that were begun in vain, a line each time: whoever goes
-                                 on counts on
-figures.json                     how fast it was, each time that it went on
-logs/                            what the engines of each worker printed
-lock                             held while a run is going on
+attempts.jsonl                   failed attempts, one a line; counted again by --resume
+figures.json                     throughput of each start of the run
+logs/                            output of the engines of each worker
+lock                             locked while the run is in progress
 """
 
 from __future__ import annotations
@@ -21,8 +18,8 @@ import os
 import shutil
 import sqlite3
 from collections import Counter
-from collections.abc import Sequence
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
@@ -39,14 +36,14 @@ from cosim.results.log import Log
 from cosim.results.record import RECORD_FILE, Record
 from cosim.results.run_spec import RUN_FILE, RunSpec, decoded_spec
 from cosim.results.table import table_of
-from cosim.spec.scenario import Suite, write_suite
+from cosim.spec.scenario import Scenario, Suite, read_suite, write_suite
 from cosim.spec.validation import shown
 
 DATABASE = "results.sqlite"
 REMEDY = (
     "give the command of the run again with --resume, which makes it anew from the records on disk"
 )
-_DAMAGE = {
+_DAMAGE_CODES = {
     sqlite3.SQLITE_ERROR,
     sqlite3.SQLITE_CORRUPT,
     sqlite3.SQLITE_NOTADB,
@@ -56,7 +53,7 @@ _DAMAGE = {
 
 
 def connected(path: Path) -> sqlite3.Connection:
-    """The database of a run folder, opened; made where there is none."""
+    """Open the database of a run folder; create it if missing."""
     database = sqlite3.connect(path / DATABASE, timeout=30.0)
     try:
         database.execute("pragma journal_mode = wal")
@@ -68,8 +65,10 @@ def connected(path: Path) -> sqlite3.Connection:
 
 
 def check_database(path: Path) -> None:
-    """Read all of the database, made where there is none. Raises sqlite3.Error or DecodeError if it
-    is damaged."""
+    """Read the whole database; create it if missing.
+
+    Raises sqlite3.Error or DecodeError if it is damaged.
+    """
     with closing(connected(path)) as database, database:
         database.execute(
             "create table if not exists episodes (scenario text primary key, record text)"
@@ -81,7 +80,7 @@ def check_database(path: Path) -> None:
 
 
 def records_in(database: sqlite3.Connection) -> list[Record]:
-    """All records, in the order in which their episodes ended. Raises sqlite3.Error,
+    """Return all records in the order in which their episodes ended. Raises sqlite3.Error,
     DecodeError."""
     rows: Sequence[tuple[object]] = database.execute(
         "select record from episodes order by rowid"
@@ -96,18 +95,18 @@ def _text(value: object) -> str:
 
 
 def is_damaged(error: sqlite3.Error) -> bool:
-    """Whether it is the file that is wrong, not the disk or who holds it."""
+    """Return whether an error means a damaged file, not a full disk or a lock."""
     code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
-    return code & 0xFF in _DAMAGE or code == sqlite3.SQLITE_IOERR_SHORT_READ
+    return code & 0xFF in _DAMAGE_CODES or code == sqlite3.SQLITE_IOERR_SHORT_READ
 
 
 def damaged(path: Path, error: Exception) -> RunError:
-    """The error for the damaged database of a run folder."""
+    """Return the error for a damaged database of a run folder."""
     return RunError(f"{path / DATABASE} is damaged ({error}): {REMEDY}")
 
 
 def trouble_with(path: Path, error: sqlite3.Error) -> RunError | MachineError:
-    """What is said of an error of the database."""
+    """Return the error to raise for a database error."""
     if is_damaged(error):
         return damaged(path, error)
     return MachineError(
@@ -121,26 +120,41 @@ RUN_AGAIN = (
     "give the command of the run again with --resume, which runs this episode again and keeps "
     "the others"
 )
-"""The remedy for files that are damaged or missing."""
+"""Remedy for files that are damaged or missing."""
 
 
 def record_file(path: Path, scenario_id: str) -> Path:
-    """Where the record of an episode is."""
+    """Return the path of an episode's record."""
     return path / "episodes" / scenario_id / "record.json"
 
 
+def trajectory_file(path: Path, scenario_id: str) -> Path:
+    """Return the path of an episode's trajectory."""
+    return record_file(path, scenario_id).with_name(TRAJECTORY)
+
+
+def load_log(path: Path, scenario_id: str) -> Log:
+    """Load the log of an episode. Raises RunError with the remedy."""
+    try:
+        return Log.load(trajectory_file(path, scenario_id))
+    except RunError as error:
+        raise RunError(f"{error}: {RUN_AGAIN}") from error
+
+
 def damage_of_episode(path: Path, scenario_id: str, row: Record | None = None) -> str:
-    """What is wrong with the files of an episode that has ended, with the file; "" if nothing is.
-    row: the record that the run's database holds, with which the file must agree."""
+    """Return what is wrong with the files of an ended episode, naming the file; "" if nothing is.
+
+    row: record in the run's database, which the file must match
+    """
     file = record_file(path, scenario_id)
     if row is not None and row.ended is None and not file.exists():
-        return ""  # it was given up, and left no file
+        return ""  # given up: an episode without files
     try:
         record = Record.load(file)
         if record.scenario.id != scenario_id:
             return f"{file} is of scenario {shown(record.scenario.id)}"
-        if row is not None and (apart := told_apart(record, row)):
-            return f"{file}: not what results.sqlite has of this episode: {apart}"
+        if row is not None and (difference := told_apart(record, row)):
+            return f"{file}: not what results.sqlite has of this episode: {difference}"
         trajectory = file.with_name(TRAJECTORY)
         if record.ended is not None and (ticks := len(Log.load(trajectory))) != record.ticks:
             return f"{trajectory}: holds {ticks} ticks, and its record {record.ticks}"
@@ -159,39 +173,39 @@ def _damage_of_demonstration(file: Path) -> str:
 
 
 def told_apart(mine: Record, theirs: Record) -> str:
-    """Where two records of an episode are first apart, in words; "" where they are not."""
-    told, other = (msgspec.to_builtins(RECORD_FILE.flat(record)) for record in (mine, theirs))
-    for field, value in told.items():
+    """Return the first difference between two records, in words; "" if they are equal."""
+    fields, their_fields = (
+        msgspec.to_builtins(RECORD_FILE.flat(record)) for record in (mine, theirs)
+    )
+    for field, value in fields.items():
         if isinstance(value, dict):
-            for name in dict.fromkeys([*value, *other[field]]):
-                if value.get(name) != other[field].get(name):
-                    return f"{field}.{name} is {value.get(name)}, there {other[field].get(name)}"
-        elif value != other[field]:
-            return f"{field} is {shown(value)}, there {shown(other[field])}"
+            for name in dict.fromkeys([*value, *their_fields[field]]):
+                if value.get(name) != (their_value := their_fields[field].get(name)):
+                    return f"{field}.{name} is {value.get(name)}, there {their_value}"
+        elif value != their_fields[field]:
+            return f"{field} is {shown(value)}, there {shown(their_fields[field])}"
     return ""
 
 
 _ATTEMPTS = "attempts.jsonl"
 _MOST_BYTES = 256 << 20
-_KEPT = "finished episodes are kept; make room and go on with --resume"
+_ROOM_REMEDY = "finished episodes are kept; make room and go on with --resume"
 UNFINISHED = {"episodes", "logs", "lock", "scenarios.json", "run.json.part"}
-"""All that a run leaves that was killed before it began."""
+"""Files that a run leaves if it was killed before it began."""
 
 
 class FailedAttempt(NamedTuple):
-    """A scenario that was begun in vain. away: its worker was lost together with its machine, or
-    left."""
+    """Failed attempt at a scenario. away: its worker left, or its machine was lost."""
 
     scenario: str
     away: bool
 
 
 class RunFolder:
-    """A run folder held by this process. Use as a context manager: it is locked meanwhile, before
-    anything is written.
+    """Run folder locked by this process; use as a context manager.
 
-    path: absolute, so that it stays what it is wherever the process goes. notes: what was mended as
-    it was opened, in words.
+    path: absolute path
+    notes: repairs made on opening, in words
     """
 
     def __init__(self, path: Path, spec: RunSpec, suite: Suite | None = None) -> None:
@@ -200,19 +214,25 @@ class RunFolder:
         self.notes: list[str] = []
         self._suite = suite
         self._lock = lock(path / "lock", wait=False)
-        self._adding: sqlite3.Connection | None = None
+        self._add_connection: sqlite3.Connection | None = None
 
     @classmethod
     def create(cls, path: Path, spec: RunSpec, suite: Suite) -> RunFolder:
-        """A new run folder. Raises RunError when one is there already, MachineError where nothing
-        can be written."""
+        """Prepare a new run folder.
+
+        Raises RunError if the folder holds a run, MachineError if it cannot be written.
+        """
         refuse_used(path)
         return cls(path, spec, suite)
 
     @classmethod
     def resume(cls, path: Path, spec: RunSpec, whole: Suite | None = None) -> RunFolder:
-        """The run folder at `path`, to be finished. Raises RunError, naming the difference, if it
-        is of another run. whole: the suite that its scenarios are of."""
+        """Prepare to resume the run folder at `path`.
+
+        whole: suite that its scenarios are from
+
+        Raises RunError, naming the difference, if the folder holds another run.
+        """
         refuse_unbegun(path)
         found = read_spec(path)
         if found.policy == spec.policy and found.setup.policy_source != spec.setup.policy_source:
@@ -220,20 +240,18 @@ class RunFolder:
                 f"{path} is of another run: the source of policy '{spec.policy}' was edited since "
                 "it began. Resume with the source as it was, or choose another --out."
             )
-        if (apart := found.apart(spec, whole=whole)) is not None:
+        if (difference := found.apart(spec, whole=whole)) is not None:
             raise RunError(
-                f"{path} is of another run: its {apart.field} is {apart.mine}, now asked for "
-                f"is {apart.theirs}. "
-                f"Resume with the same command, or choose another --out.{apart.hint}"
+                f"{path} is of another run: its {difference.field} is "
+                f"{difference.mine}, now asked for is {difference.theirs}. "
+                f"Resume with the same command, or choose another --out.{difference.hint}"
             )
         return cls(path, found)
 
     def __enter__(self) -> Self:
-        try:
+        with _write_errors(self.path):
             self.path.mkdir(parents=True, exist_ok=True)
             _acquire(self._lock, self.path)
-        except OSError as error:
-            raise unwritable(self.path, error) from error
         try:
             if self._suite is not None:
                 refuse_used(self.path)
@@ -250,123 +268,109 @@ class RunFolder:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if self._adding is not None:
-            self._adding.close()
-            self._adding = None
+        if self._add_connection is not None:
+            self._add_connection.close()
+            self._add_connection = None
         self._lock.release()
 
     def episode_folder(self, scenario_id: str) -> Path:
+        """Return the folder of an episode."""
         return self.path / "episodes" / scenario_id
 
     def finished(self) -> set[str]:
-        """Ids of the scenarios that have a row."""
-        try:
-            with closing(connected(self.path)) as database:
-                return {
-                    scenario for (scenario,) in database.execute("select scenario from episodes")
-                }
-        except sqlite3.Error as error:
-            raise trouble_with(self.path, error) from error
+        """Return ids of the scenarios with a row."""
+        with _database_errors(self.path), closing(connected(self.path)) as database:
+            return {scenario for (scenario,) in database.execute("select scenario from episodes")}
 
     def add(self, record: Record) -> None:
-        """Append a finished episode. A second one of the same scenario is not taken."""
+        """Append the row of a finished episode; a second one of the same scenario is ignored."""
         values = record.scenario.id, RECORD_FILE.encode(record).decode()
-        try:
-            if self._adding is None:  # kept open: opening and closing takes longer than adding
-                self._adding = connected(self.path)
-            with self._adding as database:
+        with _database_errors(self.path):
+            if self._add_connection is None:  # reused: opening takes longer than adding
+                self._add_connection = connected(self.path)
+            with self._add_connection as database:
                 database.execute(
                     "insert or ignore into episodes (scenario, record) values (?, ?)", values
                 )
-        except sqlite3.Error as error:
-            raise trouble_with(self.path, error) from error
 
     def _remove(self, scenarios: Sequence[str]) -> None:
-        """Remove the rows of episodes that are to be run again."""
-        try:
-            with closing(connected(self.path)) as database, database:
-                database.executemany(
-                    "delete from episodes where scenario = ?", [(name,) for name in scenarios]
-                )
-        except sqlite3.Error as error:
-            raise trouble_with(self.path, error) from error
+        """Delete the rows of episodes that will run again."""
+        with (
+            _database_errors(self.path),
+            closing(connected(self.path)) as database,
+            database,
+        ):
+            database.executemany(
+                "delete from episodes where scenario = ?", [(name,) for name in scenarios]
+            )
 
     def keep(self, record: Record, log: bytes = b"", demonstration: bytes = b"") -> None:
-        """Write what came out of an episode, the record last, and add its row. log: the bytes of
-        its `Log`."""
+        """Write the files of an episode, the record last, and add its row.
+
+        log: bytes of the `Log`
+        """
         target = self.episode_folder(record.scenario.id)
-        try:
+        with _write_errors(target, _ROOM_REMEDY):
             target.mkdir(parents=True, exist_ok=True)
             for name, data in ((TRAJECTORY, log), (DEMONSTRATION, demonstration)):
                 if data:
                     write_atomic(target / name, data)
             record.save(target / "record.json")
-        except OSError as error:
-            raise unwritable(target, error, _KEPT) from error
         self.add(record)
 
     def keep_frame(self, scenario_id: str, tick: int, png: bytes) -> None:
         """Write a camera frame of an episode."""
         frames = self.episode_folder(scenario_id) / "frames"
-        try:
+        with _write_errors(frames, _ROOM_REMEDY):
             frames.mkdir(parents=True, exist_ok=True)
             (frames / f"{tick:06d}.png").write_bytes(png)
-        except OSError as error:
-            raise unwritable(frames, error, _KEPT) from error
 
     def failed_attempts(self) -> Counter[FailedAttempt]:
-        """How often each scenario was begun in vain, since the run began: whoever coordinated it
-        then."""
+        """Return the number of failed attempts by scenario since the run began."""
         try:
             lines = (self.path / _ATTEMPTS).read_bytes().splitlines()
         except FileNotFoundError:
             return Counter()
         except OSError as error:
-            raise unwritable(self.path / _ATTEMPTS, error, _KEPT) from error
+            raise unwritable(self.path / _ATTEMPTS, error, _ROOM_REMEDY) from error
         found: Counter[FailedAttempt] = Counter()
         for line in lines:
-            with suppress(ValueError, RecursionError):  # the last line of a machine that failed
+            with suppress(ValueError, RecursionError):  # an incomplete last line
                 found[msgspec.json.decode(line, type=FailedAttempt)] += 1
         return found
 
     def keep_failed_attempt(self, attempt: FailedAttempt) -> None:
-        """Write down that a scenario was begun in vain."""
-        try:
-            with (self.path / _ATTEMPTS).open("ab") as file:
-                file.write(msgspec.json.encode(attempt) + b"\n")
-        except OSError as error:
-            raise unwritable(self.path / _ATTEMPTS, error, _KEPT) from error
+        """Append a failed attempt to the run's file."""
+        path = self.path / _ATTEMPTS
+        with _write_errors(path, _ROOM_REMEDY), path.open("ab") as file:
+            file.write(msgspec.json.encode(attempt) + b"\n")
 
     def _is_whole(self, scenario_id: str, row: Record | None = None) -> bool:
-        """Whether what an episode has left can be kept; what is damaged is noted."""
+        """Return whether the files of an episode are valid; note any damage."""
         if damage := damage_of_episode(self.path, scenario_id, row):
             self.notes.append(f"{damage}. This episode is run again.")
         return not damage
 
     def forget(self, scenario_id: str) -> None:
-        """Remove what an earlier attempt at a scenario has left."""
+        """Delete the files of an earlier attempt at a scenario."""
         folder = self.episode_folder(scenario_id)
         shutil.rmtree(folder / "frames", ignore_errors=True)
-        try:
+        with _write_errors(folder):
             for name in ("record.json", TRAJECTORY, DEMONSTRATION):
                 (folder / name).unlink(missing_ok=True)
                 (folder / f"{name}.part").unlink(missing_ok=True)
-        except OSError as error:
-            raise unwritable(folder, error) from error
 
     def finish(self) -> pd.DataFrame:
         """Write results.csv and return its table."""
         table = table_of(read_records(self.path))
-        try:
-            write_atomic(self.path / "results.csv", table.to_csv(index=False).encode())
-        except OSError as error:
-            remedy = "all episodes are kept; make room and add --resume"
-            raise unwritable(self.path / "results.csv", error, remedy) from error
+        path = self.path / "results.csv"
+        with _write_errors(path, "all episodes are kept; make room and add --resume"):
+            write_atomic(path, table.to_csv(index=False).encode())
         return table
 
     def _begin(self, suite: Suite) -> None:
-        """Write what is run; run.json last, because a folder with it can be resumed."""
-        try:
+        """Write the spec and scenarios; run.json last, since it marks the folder as resumable."""
+        with _write_errors(self.path):
             for folder in (self.path / "episodes", self.path / "logs"):
                 folder.mkdir(exist_ok=True)
             wanted = set(self.spec.scenarios)
@@ -375,42 +379,63 @@ class RunFolder:
             )
             write_suite(chosen, self.path / "scenarios.json")
             write_atomic(self.path / "run.json", RUN_FILE.in_lines(self.spec))
-        except OSError as error:
-            raise unwritable(self.path, error) from error
 
     def _open_database(self) -> None:
-        """Make sure of a sound database with a row for each episode that is whole on disk, and for
-        no other."""
+        """Repair the database, so that exactly the episodes with valid files have a row."""
         database = self.path / DATABASE
-        mended = ""
+        damage = ""
         try:
             check_database(self.path)
         except (sqlite3.Error, msgspec.DecodeError) as error:
             if isinstance(error, sqlite3.Error) and not is_damaged(error):
                 raise trouble_with(self.path, error) from error
-            mended = str(error)
+            damage = str(error)
             for end in ("-wal", "-shm"):
                 database.with_name(DATABASE + end).unlink(missing_ok=True)
             database.replace(database.with_name(DATABASE + ".damaged"))
             check_database(self.path)
         rows = [] if self._suite is not None else read_records(self.path)
-        if gone := [row.scenario.id for row in rows if not self._is_whole(row.scenario.id, row)]:
-            self._remove(gone)
+        if invalid := [row.scenario.id for row in rows if not self._is_whole(row.scenario.id, row)]:
+            self._remove(invalid)
         on_disk = {
             p.parent.name: p.stat().st_mtime_ns for p in self.path.glob("episodes/*/record.json")
         }
-        lacking = set(self.spec.scenarios) & on_disk.keys() - self.finished() - {*gone}
-        whole = [name for name in sorted(lacking, key=on_disk.__getitem__) if self._is_whole(name)]
-        for name in whole:
+        without_row = set(self.spec.scenarios) & on_disk.keys() - self.finished() - {*invalid}
+        restored = [
+            name for name in sorted(without_row, key=on_disk.__getitem__) if self._is_whole(name)
+        ]
+        for name in restored:
             self.add(Record.load(self.episode_folder(name) / "record.json"))
-        if mended:
-            made = f"made anew from {len(whole)} records on disk, kept as {DATABASE}.damaged"
-            self.notes.append(f"{database} was damaged ({mended}): {made}")
+        if damage:
+            repair = f"made anew from {len(restored)} records on disk, kept as {DATABASE}.damaged"
+            self.notes.append(f"{database} was damaged ({damage}): {repair}")
+
+
+@contextmanager
+def _write_errors(path: Path, remedy: str = "") -> Iterator[None]:
+    """Convert an OSError in a block to the error for an unwritable path."""
+    try:
+        yield
+    except OSError as error:
+        raise unwritable(path, error, remedy) from error
+
+
+@contextmanager
+def _database_errors(path: Path) -> Iterator[None]:
+    """Convert a sqlite3.Error in a block to the error for the database of a run folder."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        raise trouble_with(path, error) from error
+
+
+def read_scenarios(path: Path) -> Mapping[str, Scenario]:
+    """Load the scenarios of a run folder by id. Raises SpecError."""
+    return {one.id: one for one in read_suite(path / "scenarios.json").scenarios}
 
 
 def read_spec(path: Path) -> RunSpec:
-    """What the run in a folder is. Raises UsageError, with the runs in it and beside it, when it
-    holds none."""
+    """Load the spec of a run. Raises UsageError, listing nearby runs, if the folder holds none."""
     try:
         return decoded_spec(read_within(path / "run.json", _MOST_BYTES), path / "run.json")
     except FileNotFoundError:
@@ -419,8 +444,8 @@ def read_spec(path: Path) -> RunSpec:
         ]
         if path.is_dir():
             refuse_unbegun(path)
-            there = f"Runs in it and beside it: {listed(str(path), near)}"
-            raise UsageError(f"{path} is no run folder: it holds no run.json. {there}") from None
+            nearby = f"Runs in it and beside it: {listed(str(path), near)}"
+            raise UsageError(f"{path} is no run folder: it holds no run.json. {nearby}") from None
         raise unknown("run", str(path), near) from None
     except NotADirectoryError:
         raise UsageError(
@@ -434,8 +459,7 @@ def read_spec(path: Path) -> RunSpec:
 
 
 def refuse_unbegun(path: Path) -> None:
-    """Raises UsageError where a run is to be resumed that was stopped before its folder was
-    written, or never given."""
+    """Raise UsageError if a folder to be resumed is missing or was stopped before its run began."""
     if not path.exists() or (
         path.is_dir() and {entry.name for entry in path.iterdir()} <= UNFINISHED
     ):
@@ -446,8 +470,10 @@ def refuse_unbegun(path: Path) -> None:
 
 
 def read_records(path: Path, *, untouched: bool = False) -> list[Record]:
-    """The records of a run folder, finished or not, in the order in which they ended. untouched: no
-    byte of the folder changes, also where a run was killed: a copy of its database is read."""
+    """Load the records of a run folder in the order in which their episodes ended.
+
+    untouched: read a copy of the database, so that no byte of the folder changes
+    """
     read_spec(path)
     if not (path / DATABASE).exists():
         if any(path.glob("episodes/*/record.json")):
@@ -468,14 +494,13 @@ def read_records(path: Path, *, untouched: bool = False) -> list[Record]:
 
 
 def refuse_in_use(path: Path) -> None:
-    """Raises RunError, naming the process, while a run is writing to its folder."""
+    """Raise RunError, naming the process, while a run is writing to its folder."""
     if is_locked(path / "lock"):
         raise _in_use(path)
 
 
 def refuse_used(path: Path) -> None:
-    """Raises RunError when a folder holds a run, or something else that is not a run's
-    beginning."""
+    """Raise RunError if a folder holds a run, or files other than the start of one."""
     try:
         if (path / "run.json").exists():
             raise RunError(
@@ -487,10 +512,10 @@ def refuse_used(path: Path) -> None:
         raise unwritable(path, error) from error
 
 
-def _acquire(held: FileLock, path: Path) -> None:
+def _acquire(folder_lock: FileLock, path: Path) -> None:
     """Lock the folder. Raises RunError, naming the process that holds it."""
     try:
-        held.acquire()
+        folder_lock.acquire()
     except TimeoutError:
         raise _in_use(path) from None
     (path / "lock").write_text(str(os.getpid()))

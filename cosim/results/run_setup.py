@@ -1,4 +1,4 @@
-"""RunSetup: the facts that all episodes of a run share, beside the policy's manifest."""
+"""Settings that all episodes of a run share, in addition to the policy's manifest."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from cosim.core.versions import versions
 from cosim.spec.options import EpisodeOptions, PolicyRuns
 
 METRIC_SCHEMA = 3
-"""Raised whenever a definition of `cosim.results.metrics` comes or changes; other schemas are not
-compared with it."""
+"""Version of the metric definitions; results of other schemas are not compared."""
 NO_RENDERER = "none"
-"""The renderer of an episode whose policy has no camera."""
+"""Renderer name of an episode whose policy has no camera."""
 
 
 class RunSetup(msgspec.Struct, frozen=True, kw_only=True):
-    """How a run is set up: embedded in its `RunSpec` and in the `Record` of each of its episodes.
+    """Set-up of a run, embedded in its `RunSpec` and in each `Record`.
 
-    A field that is added here is a key of record.json and run.json and a column of results.csv.
-    Runs in which it differs are not the same. It needs a default, which is that of older runs.
+    A new field is a key of record.json and run.json and a column of results.csv. Runs that differ
+    in it are different runs. It needs the default of older runs.
 
-    suite_hash: of the suite that the scenarios are of. seed: of the run, from which the names and
-    seeds of episodes are drawn that a policy gets. policy_source: hash of the file that the policy
-    is written in (`cosim.policies.load.source_hash`). policy_runs: where the policy runs.
-    latency_ms: of commands, as requested; in a record of real time the median of the measured ones.
-    real_time: whether the latency of each answer is measured; such an episode is replayed, not made
-    again. renderer: what draws the pictures for the policy. metric_schema: METRIC_SCHEMA of the
-    version that computes the measures, 0 where that is not known.
+    suite_hash: hash of the suite
+    seed: seed of the run; episode ids and seeds for the policy are drawn from it
+    policy_source: hash of the policy's source file (`cosim.policies.load.source_hash`)
+    policy_runs: where the policy runs
+    latency_ms: requested latency of commands; in a real-time record the median of the measured ones
+    real_time: whether the latency of each answer is measured; such an episode can only be replayed
+    renderer: renderer of the policy's pictures
+    metric_schema: METRIC_SCHEMA of the version that computes the measures, 0 if unknown
     """
 
     suite_hash: str
@@ -48,7 +48,7 @@ class RunSetup(msgspec.Struct, frozen=True, kw_only=True):
         policy_source: str = "",
         policy_runs: PolicyRuns = "in-process",
     ) -> RunSetup:
-        """The set-up that options request, with the versions that are installed here."""
+        """Build the set-up that options request, with the installed versions."""
         return cls(
             suite_hash=suite_hash,
             seed=options.seed or 0,

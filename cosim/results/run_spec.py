@@ -1,4 +1,4 @@
-"""RunSpec: what a run is; and Shard, the part of one that a folder holds."""
+"""Specification of a run and of its shards: run.json."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from cosim.spec.selection import selection_in_words
 
 _T = TypeVar("_T")
 SCHEMA = 1
-"""Raised whenever run.json changes its meaning; other schemas are refused."""
+"""Version of the meaning of run.json; other versions are refused."""
 _MAY_DIFFER = {"policy_name", "shared_renderer", "schema"}
-"""Keys of run.json in which runs may differ and be the same run."""
-_ARITHMETIC = (
+"""Keys of run.json that may differ between two starts of the same run."""
+_ARITHMETIC_HINT = (
     " Of two machines whose arithmetic is apart the processors or C libraries round differently: "
     "episodes of one are not those of the other to the bit."
 )
 
-_OF_SUITE = ("suite_version", "suite_hash")
-_OTHER_SUITE = (
+_SUITE_FIELDS = ("suite_version", "suite_hash")
+_SUITE_HINT = (
     " The suite was edited; or --robot, --crowd and the like differ; or, with --map, --seed, "
     "--episodes or --event do."
 )
 
 
 class Shard(msgspec.Struct, frozen=True):
-    """Every `of`-th scenario of a run, beginning with the `number`-th, which counts from 1."""
+    """Part of a run: every `of`-th scenario, from the `number`-th on, counted from 1."""
 
     number: int
     of: int
 
     @classmethod
     def called(cls, words: str, scenarios: int) -> Shard:
-        """The one that "2/8" names, of a run of so many scenarios. Raises UsageError."""
+        """Parse a shard such as "2/8" for a run of `scenarios` scenarios. Raises UsageError."""
         found = re.fullmatch(r"([1-9][0-9]{0,5})/([1-9][0-9]{0,5})", words, re.ASCII)
         number, of = (int(part) for part in found.groups()) if found else (0, 0)
         if not 0 < number <= of:
@@ -60,13 +60,12 @@ class Shard(msgspec.Struct, frozen=True):
         return f"{self.number}/{self.of}"
 
     def share(self, whole: Sequence[_T]) -> list[_T]:
-        """What of the whole run is this shard's."""
+        """Return this shard's part of the whole run."""
         return list(whole[self.number - 1 :: self.of])
 
 
 class Apart(NamedTuple):
-    """A field in which two runs are not the same, with both values in words, and what else is to be
-    said of it."""
+    """First difference between two runs: field, both values in words, and a hint."""
 
     field: str
     mine: str
@@ -75,20 +74,22 @@ class Apart(NamedTuple):
 
 
 class _Schema(msgspec.Struct):
-    """The part of a run.json that says how the rest is to be read."""
+    """Schema version of a run.json."""
 
     schema: int = 1
 
 
 class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
-    """What a run is. Two runs with the same RunSpec have the same results.
+    """Specification of a run: two runs with the same RunSpec have the same results.
 
-    robots: which drive, and the hash of each. policy: the name that loads it. manifest: of the
-    policy, with the goals of the run; run.json does not hold its `privileged` and `goals`, so a
-    spec that was read has their defaults. scenarios: of the whole run; shard: which part of them
-    the folder holds, where it is not all. counterfactual: whether each episode is compared with its
-    street without the robot. shared_renderer: whether one process drew for all others when it
-    began; what comes out is the same.
+    robots: hash of each robot by name
+    policy: name that loads the policy
+    manifest: includes the goals of the run; run.json omits `privileged` and `goals`, which a loaded
+        spec has as defaults
+    scenarios: ids of the whole run
+    shard: part of the run in this folder, None for all
+    counterfactual: whether each episode is compared with its street without the robot
+    shared_renderer: whether one process drew for all others; results do not depend on it
     """
 
     suite: str
@@ -104,15 +105,18 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     schema: int = SCHEMA
 
     def apart(self, other: RunSpec, but: str = "", whole: Suite | None = None) -> Apart | None:
-        """The first field in which another run is not the same; None where it is. but: a field that
-        may differ. whole: the suite of both, for words about which of its scenarios they have."""
+        """Return the first field in which another run differs; None if they are the same run.
+
+        but: a field that may differ
+        whole: suite of both runs, to describe the choice of scenarios
+        """
         others = RUN_FILE.flat(other)
         for field, mine in RUN_FILE.flat(self).items():
             theirs = others[field]
             if mine == theirs or field == but or field in _MAY_DIFFER:
                 continue
             if field == "scenarios":
-                return _chosen_apart(self.scenarios, other.scenarios, whole)
+                return _choice_difference(self.scenarios, other.scenarios, whole)
             changed: set[str] = set()
             if isinstance(mine, dict) and isinstance(theirs, dict):
                 changed = {
@@ -122,10 +126,10 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
                 }
                 mine, theirs = ({n: of.get(n) for n in sorted(changed)} for of in (mine, theirs))
             hint = (
-                _ARITHMETIC
+                _ARITHMETIC_HINT
                 if "arithmetic" in changed
-                else _OTHER_SUITE
-                if field in _OF_SUITE
+                else _SUITE_HINT
+                if field in _SUITE_FIELDS
                 else ""
             )
             return Apart(field, brief(mine), brief(theirs), hint)
@@ -144,14 +148,15 @@ RUN_FILE = FlatFile(
     without="manifest.privileged manifest.goals",
     defaults={"camera": None, "renderer": "unknown"},
 )
-"""The layout of run.json, which is older than the parts of a `RunSpec`."""
+"""Layout of run.json: flat, for compatibility with files written before `RunSpec` had parts."""
 
 
-def _chosen_apart(mine: Sequence[str], theirs: Sequence[str], whole: Suite | None) -> Apart:
-    """How many scenarios two runs of a suite have, and by which options, or else one that only one
-    of them has."""
+def _choice_difference(mine: Sequence[str], theirs: Sequence[str], whole: Suite | None) -> Apart:
+    """Describe the different choice of scenarios of two runs of a suite."""
     if whole is None:
-        return Apart("choice of scenarios", _counted(mine, theirs), _counted(theirs, mine), "")
+        return Apart(
+            "choice of scenarios", _count_in_words(mine, theirs), _count_in_words(theirs, mine), ""
+        )
     return Apart(
         "choice of scenarios",
         selection_in_words(whole, mine),
@@ -160,15 +165,17 @@ def _chosen_apart(mine: Sequence[str], theirs: Sequence[str], whole: Suite | Non
     )
 
 
-def _counted(ids: Sequence[str], others: Sequence[str]) -> str:
-    """How many scenarios, and one of them that is not among the others."""
+def _count_in_words(ids: Sequence[str], others: Sequence[str]) -> str:
+    """Return the number of scenarios, and one that is not among the others."""
     more = next((f", with {name}" for name in ids if name not in others), "")
     return f"{len(ids)}{more}"
 
 
 def decoded_spec(data: bytes, where: Path) -> RunSpec:
-    """What the bytes of a run.json say. where: what an error names. Raises RunError for another
-    schema, ValueError for bytes that are no run.json."""
+    """Decode a run.json. where: path named in errors.
+
+    Raises RunError for another schema, ValueError for bytes that are no run.json.
+    """
     try:
         if (schema := msgspec.json.decode(data, type=_Schema).schema) != SCHEMA:
             raise RunError(
@@ -181,6 +188,6 @@ def decoded_spec(data: bytes, where: Path) -> RunSpec:
 
 
 def brief(value: object) -> str:
-    """A value in words, in at most 80 letters."""
+    """Return a value in words, in at most 80 characters."""
     text = str(getattr(value, "in_words", value))
     return text if len(text) <= 80 else text[:77] + "..."

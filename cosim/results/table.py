@@ -1,4 +1,4 @@
-"""From many records to tables: one row per episode, and summaries with intervals."""
+"""Tables of many records: one row per episode, and summaries with intervals."""
 
 from __future__ import annotations
 
@@ -62,23 +62,23 @@ _RECORD_ONLY = {
 }
 """Keys of record.json that are no column of results.csv."""
 COLUMNS = (*_ORDER, *(key for key in RECORD_FILE.keys if key not in {*_ORDER, *_RECORD_ONLY}))
-"""The columns of results.csv before the metrics: `answer_ms`, and all keys of record.json but
+"""Columns of results.csv before the metrics: `answer_ms`, and keys of record.json without
 `_RECORD_ONLY`."""
 ORACLE = "orca"
-"""The policy that suites are proved by: it knows what no robot can, and its results are no
-contestant's."""
+"""Policy used to prove suites; it has privileged knowledge and does not compete."""
 BOOTSTRAP = 2000
 CONFIDENCE = 0.95
 MOST_INVALID = 0.02
-"""Of what was scheduled; where more is invalid a table says nothing of its policy."""
+"""Share of scheduled episodes; with more invalid ones, a run is inconclusive."""
 INJECTED = "injected"
-"""The column that counts the pedestrians injected into each episode; only runs with injections have
-it."""
+"""Column with the number of pedestrians injected into an episode; only in runs with injections."""
 
 
 def table_row(record: Record) -> dict[str, Any]:
-    """One flat row. A function of scenario, policy and versions alone, but in real time: other wall
-    times are left out."""
+    """Return the row of a record.
+
+    It depends only on scenario, policy and versions; in real time also on measured answer times.
+    """
     flat = RECORD_FILE.flat(record) | {"answer_ms": record.answer_ms}
     row: dict[str, Any] = {key: flat[key] for key in COLUMNS}
     row["waypoints"] = record.manifest.waypoints.in_words
@@ -101,9 +101,9 @@ def table_row(record: Record) -> dict[str, Any]:
 
 
 def table_of(records: Iterable[Record]) -> pd.DataFrame:
-    """One row per episode, sorted by scenario id, whatever order they ended in.
+    """Build a table with one row per episode, sorted by scenario id.
 
-    A run into which pedestrians were injected has the column `INJECTED`, how many in each episode.
+    A run with injected pedestrians has the column `INJECTED`, their number in each episode.
     """
     records = sorted(records, key=lambda record: record.scenario.id)
     rows = [table_row(record) for record in records]
@@ -117,7 +117,7 @@ def table_of(records: Iterable[Record]) -> pd.DataFrame:
 
 
 def policy_in_words(name: str, privileged: bool) -> str:
-    """A policy's name as tables show it, with what sets it apart from one that only sees.
+    """Return a policy's name as in tables, marked if the policy is privileged.
 
     >>> policy_in_words("orca", privileged=True)
     'orca (oracle, privileged)'
@@ -126,12 +126,11 @@ def policy_in_words(name: str, privileged: bool) -> str:
 
 
 def summary_of(table: pd.DataFrame, names: Sequence[str] = tuple(METRICS)) -> pd.DataFrame:
-    """Mean over episodes per metric, its bootstrap interval, and n, the number of episodes that
-    have a value. Rates are pooled (`cosim.results.metrics.POOLED`): all that was counted on all the
-    metres, bootstrapped over episodes.
+    """Summarize each metric over episodes: mean, bootstrap interval and number of values n.
 
-    Columns: mean, low, high, n; index: metric. A metric that no episode has is absent (NaN, n = 0),
-    and so is a rate where a policy crashed: what it would have done after that cannot be counted.
+    Columns: mean, low, high, n; index: metric. Rates are pooled (`cosim.results.metrics.POOLED`):
+        all counts divided by all metres, bootstrapped over episodes. A metric without values is NaN
+        with n = 0. So is a rate if a policy crashed, since failures after the crash are unknown.
     """
     rows = [_summary(table, name) for name in names]
     return pd.DataFrame(
@@ -153,13 +152,17 @@ def _summary(table: pd.DataFrame, name: str) -> tuple[float, float, float, int]:
 
 
 def numbers(table: pd.DataFrame, name: str) -> Floats:
-    """A column of a table; NaN where it is empty."""
+    """Return a column as numbers; NaN if empty."""
     return np.asarray(pd.to_numeric(table[name], errors="coerce"), dtype=float)
 
 
 def interval_of(values: Floats, weights: Floats | None = None) -> tuple[float, float]:
-    """Percentile bootstrap interval of the mean at CONFIDENCE, or of sum(values) / sum(weights);
-    NaN for no values. Always the same draws."""
+    """Return the percentile bootstrap interval of the mean at CONFIDENCE; NaN without values.
+
+    weights: if given, the interval of sum(values) / sum(weights)
+
+    The draws are always the same.
+    """
     if not len(values):
         return float("nan"), float("nan")
     draws = np.random.default_rng(0).integers(len(values), size=(BOOTSTRAP, len(values)))
@@ -189,7 +192,7 @@ def injections_in_words(table: pd.DataFrame) -> str:
 
 
 def not_to_be_quoted(table: pd.DataFrame, scheduled: int) -> str:
-    """Why the means of a run say nothing of its policy, in words; "" if they do."""
+    """Return why the means of a run are inconclusive, in words; "" if they are not."""
     invalid = int((table["status"] == "invalid").sum())
     if invalid > MOST_INVALID * scheduled:
         return (

@@ -1,4 +1,4 @@
-"""How fast a run was: figures.json of its folder, an entry for each time that it went on."""
+"""Throughput of a run: figures.json of its folder, one entry per session."""
 
 from __future__ import annotations
 
@@ -22,10 +22,15 @@ _FILE = "figures.json"
 
 
 class Figures(msgspec.Struct, frozen=True, kw_only=True):
-    """Of one go of a run. began: UTC; simulated_s: of all episodes; setup_s, driving_s: seconds of
-    its processes, until the first observation and from there on; retried: episodes that were begun
-    again; given_up: after the last attempt. answer_ms: how long episodes waited for an answer of
-    the policy, wherever it was asked, the median of their medians; None where that is not known.
+    """Throughput of one session of a run.
+
+    began: UTC
+    wall_s: wall time of the session
+    simulated_s: simulated time of all episodes
+    setup_s, driving_s: process time before and after the first observation
+    retried: number of attempts repeated
+    given_up: number of scenarios given up after the last attempt
+    answer_ms: median over episodes of the median answer time of the policy; None if unknown
     """
 
     began: str
@@ -42,7 +47,7 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def in_words(self) -> str:
-        """In a line."""
+        """Return the figures in one line."""
         busy_s = self.setup_s + self.driving_s
         setup = f", {100.0 * self.setup_s / busy_s:.0f} % of it setting up" if busy_s else ""
         return (
@@ -58,8 +63,12 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Going:
-    """One go of a run, from now on. todo: the scenarios that are to be run; counts: of events, by
-    their names in the log. figures: of it, once it has ended and if an episode has."""
+    """Session of a run that starts now.
+
+    todo: scenarios to run
+    counts: number of events by log name
+    figures: throughput, once the session has ended with at least one episode
+    """
 
     def __init__(self, folder: Path, todo: Collection[str], counts: Mapping[str, int]) -> None:
         self._folder = folder
@@ -70,7 +79,7 @@ class Going:
         self.figures: Figures | None = None
 
     def end(self) -> None:
-        """Keep the figures, however it ended. Raises MachineError."""
+        """Compute and store the figures. Raises MachineError."""
         ended = [
             record for record in read_records(self._folder) if record.scenario.id in self._todo
         ]
@@ -84,7 +93,7 @@ class Going:
 def _figures_of(
     records: Collection[Record], began: str, wall_s: float, counts: Mapping[str, int]
 ) -> Figures:
-    """Of the episodes that ended in one go. counts: of events, by their names in the log."""
+    """Compute the figures of the episodes that ended in one session."""
     simulated_s = sum(Clock().time_s(record.ticks) for record in records)
     setup_s = sum(record.clock.get("setup_s", 0.0) for record in records)
     return Figures(
@@ -103,14 +112,13 @@ def _figures_of(
 
 
 def median_answer_ms(records: Iterable[Record]) -> float | None:
-    """How long episodes waited for an answer of the policy, the median of their medians; None where
-    none tells."""
-    told = [record.clock["answer_ms"] for record in records if "answer_ms" in record.clock]
-    return statistics.median(told) if told else None
+    """Return the median over episodes of the median answer time; None if unknown."""
+    medians = [record.clock["answer_ms"] for record in records if "answer_ms" in record.clock]
+    return statistics.median(medians) if medians else None
 
 
 def keep_figures(folder: Path, figures: Figures) -> None:
-    """Add an entry. One that cannot be read is written anew. Raises MachineError."""
+    """Append an entry to figures.json; replace an unreadable file. Raises MachineError."""
     path = folder / _FILE
     try:
         before = msgspec.json.decode(path.read_bytes(), type=list[Figures])

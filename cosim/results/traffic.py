@@ -1,13 +1,12 @@
-"""The robot among vehicles: whether it is on the carriageway without right, and which vehicles it
-makes brake.
+"""Monitor of the robot among vehicles: time on the carriageway and vehicles that brake.
 
-- carriageway: the base centre is on a road outside the crossings, or on a crossing whose signal
-  says stop, between the ends of its line: what closes the seam before its kerb is no road. Nor is a
-  sidewalk or corner that reaches over a lane; the inside of a junction is.
-- braked: a vehicle slows down by more than BRAKES_MPS2 while the robot, on the carriageway or on a
-  crossing that gives it no green, is the nearest body in the vehicle's straight way. Once per
-  vehicle until it has not done so for APART_S. At a green crossing vehicles stop for their own red
-  light or for whoever walks: that is not counted.
+- carriageway: the base centre is on a road outside the crossings, or on a crossing at red, between
+  the ends of its line. The strip that joins a crossing to its kerb is no road, nor is a sidewalk or
+  corner that overlaps a lane. The inside of a junction is road.
+- braked: a vehicle slows down by more than BRAKES_MPS2 while the robot, without right of way, is
+  the nearest body straight ahead of it. It counts once until the vehicle has not braked for
+  _APART_S. At a green crossing vehicles stop for their own red light or for pedestrians, so nothing
+  is counted.
 """
 
 from __future__ import annotations
@@ -25,46 +24,52 @@ from cosim.place import overlay
 from cosim.place.street_map import StreetMap, Strip
 
 BRAKES_MPS2: Final = 2.0
+"""Deceleration above which a vehicle counts as braking."""
 _AHEAD_M: Final = 40.0
 ASIDE_M: Final = 1.0
-"""Within half the vehicle's width and this of its middle line somebody is in its way."""
+"""Margin, metres, added to half a vehicle's width: bodies within it block the vehicle."""
 
 _APART_S: Final = 2.0
 _ROUNDING_M: Final = 1e-6
 
 
 class OnRoad(NamedTuple):
-    """carriageway: see above; braked: number of vehicles that the robot has begun to make brake in
-    this tick."""
+    """State of the robot on the road in one tick.
+
+    carriageway: see the module
+    braked: number of vehicles that began to brake for the robot
+    """
 
     carriageway: bool = False
     braked: int = 0
 
 
 class TrafficMonitor:
-    """Judges the Steps of one episode, in order."""
+    """Monitor of the Steps of one episode, called in order."""
 
     def __init__(self, street_map: StreetMap, tick_s: float) -> None:
         self._map = street_map
         self._tick_s = tick_s
         self._last: dict[str, int] = {}
-        self._here: shapely.Geometry | None = None
+        self._off_road_here: shapely.Geometry | None = None
         self._inside = Circle()
-        self._beside: dict[str, shapely.Geometry] = {}
+        self._off_road_parts: dict[str, shapely.Geometry] = {}
 
     def see(self, step: Step) -> OnRoad:
-        """What a tick did."""
+        """Process one tick."""
         pose = step.motion.robot.pose
         if self._inside.holds(pose.x_m, pose.y_m):
             return OnRoad()
-        if self._here is not None and shapely.contains_xy(self._here, pose.x_m, pose.y_m):
+        if self._off_road_here is not None and shapely.contains_xy(
+            self._off_road_here, pose.x_m, pose.y_m
+        ):
             room_m = shapely.distance(
-                shapely.boundary(self._here), shapely.Point(pose.x_m, pose.y_m)
+                shapely.boundary(self._off_road_here), shapely.Point(pose.x_m, pose.y_m)
             )
             self._inside = Circle(pose.x_m, pose.y_m, max(float(room_m) - _ROUNDING_M, 0.0))
             return OnRoad()
         place = self._map.locate(pose.x_m, pose.y_m, 0.0)
-        self._here = self._beside_the_road(place.edge) if place.kind == "walk" else None
+        self._off_road_here = self._off_road_part(place.edge) if place.kind == "walk" else None
         strip = self._map.strips.get(place.edge) if place.kind == "walk" else None
         crossing = strip is not None and strip.kind == "crossing"
         signal = step.street.signals.get(place.edge) if crossing else None
@@ -89,13 +94,15 @@ class TrafficMonitor:
         self._last |= dict.fromkeys(names, step.tick)
         return OnRoad(carriageway, len(new))
 
-    def _beside_the_road(self, edge: str) -> shapely.Geometry | None:
-        """The part of a walkable piece that is beside the road whatever its signals show: all of a
-        corner, and a sidewalk less the crossings that reach into it. None for a crossing."""
+    def _off_road_part(self, edge: str) -> shapely.Geometry | None:
+        """Return the part of a walkable piece that is never road; None for a crossing.
+
+        This is all of a corner, and a sidewalk without the crossings that overlap it.
+        """
         strip = self._map.strips.get(edge)
         if strip is not None and strip.kind == "crossing":
             return None
-        if edge not in self._beside:
+        if edge not in self._off_road_parts:
             piece: shapely.Geometry = (
                 strip.polygon if strip is not None else self._map.corners[edge].polygon
             )
@@ -104,12 +111,12 @@ class TrafficMonitor:
                 crossings = [s.polygon for s in others if s.kind == "crossing"]
                 piece = overlay.difference(piece, overlay.union_all(crossings))
             shapely.prepare(piece)
-            self._beside[edge] = piece
-        return self._beside[edge]
+            self._off_road_parts[edge] = piece
+        return self._off_road_parts[edge]
 
 
 def between_its_ends(strip: Strip, pose: Pose) -> bool:
-    """Whether a point of a strip lies beside its line, and not beyond one of its ends."""
+    """Return whether a pose projects onto a strip's line, not beyond its ends."""
     first = strip.line[0, :2]
     last = strip.line[-1, :2]
     along = last - first
@@ -117,7 +124,7 @@ def between_its_ends(strip: Strip, pose: Pose) -> bool:
 
 
 def braking_for(robot: Pose, before: Street, after: Street, tick_s: float) -> list[str]:
-    """Ids of the vehicles that brake in a tick and have the robot next in their straight way."""
+    """Return ids of the vehicles that brake in a tick with the robot nearest straight ahead."""
     vehicles = after.vehicles
     speed_mps = dict(zip(before.vehicles.ids, before.vehicles.speed.tolist(), strict=True))
     found = []
@@ -136,8 +143,8 @@ def braking_for(robot: Pose, before: Street, after: Street, tick_s: float) -> li
 
 
 def _ahead_m(xy: Floats, heading_rad: float, size_m: Floats, points: Floats) -> Floats:
-    """(N,) metres from a vehicle's bumper to bodies at (N, 2) points in its way; inf for those that
-    are not."""
+    """Return (N,) distances, metres, from a vehicle's bumper to bodies at (N, 2); inf if not in its
+    way."""
     cos, sin = math.cos(heading_rad), math.sin(heading_rad)
     dx, dy = (points - xy).T
     along = cos * dx + sin * dy - 0.5 * size_m[0]

@@ -10,7 +10,6 @@ import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -18,6 +17,7 @@ import pytest
 
 from cosim.core.errors import CosimError
 from cosim.core.packed_demos import Packed
+from cosim.core.progress import ignore
 from cosim.episode.interfaces import Observation
 from cosim.policies.load import load_policy
 from cosim.policies.onnx.feeding import Feeder
@@ -90,13 +90,9 @@ def learned(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bundle that has learned from that street."""
     folder = tmp_path_factory.mktemp("learned")
     assert train(
-        [data], folder, Training(steps=60, batch=12, rate=2e-3, device="cpu"), False, heard([])
+        [data], folder, Training(steps=60, batch=12, rate=2e-3, device="cpu"), False, ignore
     ).whole
     return folder
-
-
-def heard(rows: list[dict[str, float]]) -> Any:
-    return lambda step, steps, row: rows.append(dict(row)) if row else None
 
 
 def steps_of(folder: Path) -> list[str]:
@@ -168,11 +164,9 @@ def test_a_camera_of_which_a_part_was_seen_shows_the_same_part_again() -> None:
 def test_a_training_that_was_stopped_ends_as_one_in_one_piece(data: Path, tmp_path: Path) -> None:
     """Stopped after each step and gone on with, it writes the same graph to the byte, and the same
     curve."""
-    assert train([data], tmp_path / "whole", BRISK, False, heard([])).whole
+    assert train([data], tmp_path / "whole", BRISK, False, ignore).whole
     pieces = 1
-    while not train(
-        [data], tmp_path / "pieces", replace(BRISK, minutes=1e-9), True, heard([])
-    ).whole:
+    while not train([data], tmp_path / "pieces", replace(BRISK, minutes=1e-9), True, ignore).whole:
         pieces += 1
     assert pieces == BRISK.steps
     for name in ("model.onnx", "curve.csv"):
@@ -205,9 +199,9 @@ def test_a_finished_training_is_continued_with_more_steps(data: Path, tmp_path: 
     """Four steps, then six: a curve of both, another graph, the same again to the byte, and the
     bundle says so. Fewer steps than are done are refused."""
     for name in ("one", "other"):
-        assert train([data], tmp_path / name, BRISK, False, heard([])).whole
+        assert train([data], tmp_path / name, BRISK, False, ignore).whole
         before = (tmp_path / name / "model.onnx").read_bytes()
-        assert train([data], tmp_path / name, replace(BRISK, steps=6), True, heard([])) == (6, 6)
+        assert train([data], tmp_path / name, replace(BRISK, steps=6), True, ignore) == (6, 6)
         assert (tmp_path / name / "model.onnx").read_bytes() != before
     for name in ("model.onnx", "curve.csv"):
         assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
@@ -218,7 +212,7 @@ def test_a_finished_training_is_continued_with_more_steps(data: Path, tmp_path: 
     with pytest.raises(
         CosimError, match=r"6 steps are done, and --steps asks for 5 in all: give more than 6"
     ):
-        train([data], tmp_path / "one", replace(BRISK, steps=5), True, heard([]))
+        train([data], tmp_path / "one", replace(BRISK, steps=5), True, ignore)
 
 
 def test_it_can_be_trained_on_from_the_shipped_graph_alone(
@@ -228,7 +222,7 @@ def test_it_can_be_trained_on_from_the_shipped_graph_alone(
     stays as it is."""
     held = parameters_of(learned / "model.onnx")
     assert train(
-        [data], tmp_path / "on", replace(BRISK, begin=learned, rate=1e-12), False, heard([])
+        [data], tmp_path / "on", replace(BRISK, begin=learned, rate=1e-12), False, ignore
     ).whole
     for name, value in parameters_of(tmp_path / "on" / "model.onnx").items():
         torch.testing.assert_close(value, held[name], atol=1e-6, rtol=0)
@@ -381,7 +375,7 @@ def test_what_cannot_be_trained_on_is_refused(
         other.write_bytes(b"PK")
     again = wrong in ("another", "other data", "other begin")
     if wrong == "folder" or again:
-        train([data], out, replace(BRISK, minutes=1e-9), False, heard([]))
+        train([data], out, replace(BRISK, minutes=1e-9), False, ignore)
     if wrong == "graph":
         (tmp_path / "model.onnx").write_bytes(b"\xff\xff")
     before = sorted(out.rglob("*"))
@@ -404,7 +398,7 @@ def test_what_cannot_be_trained_on_is_refused(
             out,
             training,
             again,
-            heard([]),
+            ignore,
         )
     assert sorted(out.rglob("*")) == before
 
@@ -413,7 +407,7 @@ def test_it_needs_nothing_but_pytorch_numpy_and_onnx() -> None:
     """What the project has besides is not imported by a training: a GPU host's own Python can do
     it."""
     code = (
-        "import sys, cosim.learning.progress; print(sorted({m.partition('.')[0] for m in "
+        "import sys, cosim.learning.training; print(sorted({m.partition('.')[0] for m in "
         "sys.modules} & {'msgspec', 'shapely', 'pandas', 'scipy', 'cv2', 'av', 'typer', 'rich', "
         "'onnxruntime', 'libsumo'}))"
     )

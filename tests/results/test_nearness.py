@@ -9,7 +9,7 @@ import pytest
 
 from cosim.core.geometry import Pose, box_disk_gap
 from cosim.core.state import People, RobotState
-from cosim.results.nearness import Nearness, nearness, time_to_collision_s
+from cosim.results.log import Nearness, nearness, time_to_collision_s
 
 FOOTPRINT = (0.7, 0.55)
 

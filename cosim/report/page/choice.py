@@ -1,5 +1,5 @@
-"""Which failures stand in the gallery: few enough to draw, all runs, structures, events, causes,
-real places."""
+"""Choice of the failures for the gallery: few, but covering runs, structures, events, causes and
+places."""
 
 from __future__ import annotations
 
@@ -14,23 +14,26 @@ from cosim.spec.scenario import CityMap
 
 MOST_FAILURES: Final = 48
 LEAST_FAILURES: Final = 36
-"""So many, if there are, also where fewer show everything."""
+"""Number of failures to show, if available, even without new facets."""
 _START_S: Final = 15.0
-"""To start an episode and draw a failure takes about as long as to simulate so much."""
-_MOST_S: Final = 600.0
-"""So many seconds are simulated again in all."""
+"""Cost of starting an episode and drawing a failure, in seconds of simulation."""
+_BUDGET_S: Final = 600.0
+"""Budget of simulated time for all failures, seconds."""
 WITHIN_S: Final = 150.0
-"""Of an episode failures later than this are not shown where an earlier one is: to come there takes
-long."""
-_ENOUGH_ALIKE: Final = 30
-"""Of failures with the same facets so many are looked at, the earliest."""
-_OF_AN_EPISODE: Final = 40
-"""Later failures of one long way are not looked at: to come there takes long."""
+"""Time in an episode, seconds, after which only its first failure is shown; replay is costly."""
+_MAX_ALIKE: Final = 30
+"""Maximum number of failures considered with the same facets, the earliest ones."""
+_MAX_PER_EPISODE: Final = 40
+"""Maximum number of failures considered per episode; later ones are costly to replay."""
 
 
 class FailureToShow(NamedTuple):
-    """A failure that may be shown. run: its number; event: of its event, "" without; facets: what
-    it is an example of; place: where."""
+    """Failure that may be shown.
+
+    run: index of the run
+    event: kind of its event, "" without one
+    facets: categories that it is an example of
+    """
 
     run: int
     scenario: str
@@ -41,7 +44,7 @@ class FailureToShow(NamedTuple):
 
 
 def shown_of(runs: Sequence[ReportedRun]) -> list[FailureToShow]:
-    """Every failure that can be shown again: of episodes that came to their end."""
+    """Return every failure that can be replayed: those of completed episodes."""
     found = []
     for number, run in enumerate(runs):
         for record in run.records:
@@ -49,7 +52,7 @@ def shown_of(runs: Sequence[ReportedRun]) -> list[FailureToShow]:
                 continue
             scenario = run.scenarios[record.scenario.id]
             family, kind = table_of_paper(scenario), example_of(scenario)
-            for mishap in mishaps_of(record)[:_OF_AN_EPISODE]:
+            for mishap in mishaps_of(record)[:_MAX_PER_EPISODE]:
                 event = event_of(scenario, mishap)
                 facets: set[Hashable] = {
                     (run.label, family, kind),
@@ -59,19 +62,18 @@ def shown_of(runs: Sequence[ReportedRun]) -> list[FailureToShow]:
                     facets.add((run.label, family, "event", event.kind))
                 if isinstance(scenario.place, CityMap):
                     facets.add(scenario.place.map)
-                words = "" if event is None else event.kind
-                where = place_in_words(scenario)
+                event_kind = "" if event is None else event.kind
+                place = place_in_words(scenario)
                 found.append(
                     FailureToShow(
-                        number, record.scenario.id, mishap, words, frozenset(facets), where
+                        number, record.scenario.id, mishap, event_kind, frozenset(facets), place
                     )
                 )
     return found
 
 
 class Chosen(NamedTuple):
-    """The failures to show, and the limit that left others out, in words; "" where all are
-    shown."""
+    """Failures to show, and the limit that excluded others, in words; "" if all are shown."""
 
     picks: list[FailureToShow]
     limit: str
@@ -80,10 +82,12 @@ class Chosen(NamedTuple):
 def most_telling(
     candidates: Sequence[FailureToShow], most: int = MOST_FAILURES, within_s: float = WITHIN_S
 ) -> Chosen:
-    """The most telling ones, the most telling first: each adds as many facets as it can for the
-    time that it takes to come there, then a new episode and a new place. Stops when there is
-    nothing new, but not below LEAST_FAILURES; what would take longer than _MOST_S in all is left
-    out, and so are failures later than within_s of their episode, but for its first."""
+    """Choose failures greedily, the most informative first.
+
+    Each choice adds the most new facets per simulated time, then a new episode, then a new place.
+    The choice ends without new facets, but not below LEAST_FAILURES. It stays within _BUDGET_S of
+    simulation. Failures later than within_s of their episode are skipped, except its first.
+    """
     alike: Counter[frozenset[Hashable]] = Counter()
     left: list[FailureToShow] = []
     begun: set[tuple[int, str]] = set()
@@ -91,7 +95,7 @@ def most_telling(
         soon = (one.run, one.scenario) not in begun or Clock().time_s(one.mishap.tick) <= within_s
         begun.add((one.run, one.scenario))
         alike[one.facets] += soon
-        if soon and alike[one.facets] <= _ENOUGH_ALIKE:
+        if soon and alike[one.facets] <= _MAX_ALIKE:
             left.append(one)
     choice = _Choice()
     limit = ""
@@ -100,7 +104,7 @@ def most_telling(
         if len(choice.picked) >= most:
             limit = f"--failures {most}"
         elif choice.further_s(best) > choice.room_s:
-            limit = f"more than {_MOST_S:g} s would be simulated again"
+            limit = f"more than {_BUDGET_S:g} s would be simulated again"
         elif len(choice.picked) >= LEAST_FAILURES and not best.facets - choice.seen:
             limit = "the others show no other run, event, cause or place"
         else:
@@ -112,24 +116,23 @@ def most_telling(
 
 
 class _Choice:
-    """What is taken so far. reached: of each episode, up to which second it is run again; room_s:
-    what is left."""
+    """Failures chosen so far. room_s: remaining simulation budget."""
 
     def __init__(self) -> None:
         self.picked: list[FailureToShow] = []
         self.seen: set[Hashable] = set()
-        self.room_s = _MOST_S
+        self.room_s = _BUDGET_S
         self._places: set[str] = set()
         self._reached: dict[tuple[int, str], float] = {}
 
     def further_s(self, one: FailureToShow) -> float:
-        """How long its episode has to be simulated beyond what is taken already."""
+        """Return the additional simulated time to reach a failure, seconds."""
         return max(
             Clock().time_s(one.mishap.tick) - self._reached.get((one.run, one.scenario), 0.0), 0.0
         )
 
     def worth(self, one: FailureToShow) -> tuple[bool, float, bool, bool]:
-        """More is better: that there is room for it, new facets for its time, a new episode, a new
+        """Return the sort key of a failure: fits the budget, new facets per time, new episode, new
         place."""
         further_s = self.further_s(one)
         new_episode = (one.run, one.scenario) not in self._reached
@@ -137,6 +140,7 @@ class _Choice:
         return further_s <= self.room_s, telling, new_episode, one.place not in self._places
 
     def take(self, one: FailureToShow) -> None:
+        """Add a failure to the choice."""
         self.picked.append(one)
         self.seen |= one.facets
         self.room_s -= self.further_s(one)

@@ -1,5 +1,4 @@
-"""Writes the report as one HTML file that holds its text, style, scripts, data and pictures, and
-loads nothing."""
+"""Report page: one HTML file with text, style, scripts, data and pictures; it loads nothing."""
 
 from __future__ import annotations
 
@@ -24,21 +23,25 @@ from cosim.results.log import holds_waypoints
 from cosim.results.table import injections_in_words, policy_in_words
 from cosim.results.throughput import median_answer_ms
 
-_POLICY: Final = (
+_SECURITY_POLICY: Final = (
     "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 )
-"""What the page may load: nothing from outside."""
-_MOST_LISTED: Final = 4
-"""Of more runs than this the heading names fewer."""
-_MOST_TOLD: Final = 12
-"""Of crashed and invalid episodes of a run so many are told by name."""
+"""Content security policy of the page: nothing from outside."""
+_MAX_RUNS_NAMED: Final = 4
+"""Maximum number of runs named in the heading."""
+_MAX_LOST_LISTED: Final = 12
+"""Maximum number of crashed and invalid episodes listed per run."""
 _FILTERS: Final = {"run": "label", "cause": "cause", "kind": "kind", "place": "place"}
-"""The choices above the gallery: by their names the fields of an entry."""
+"""Filters above the gallery: name and field of an entry."""
 
 
 class Maps(msgspec.Struct, frozen=True):
-    """Where things went wrong. pictures: of some places; spots: of all, by place; episodes: of
-    each place, all and failed."""
+    """Maps of failures.
+
+    pictures: pictures of some places
+    spots: failures by place, for all places
+    episodes: number of all and of failed episodes by place
+    """
 
     pictures: list[PlacePicture]
     spots: dict[str, list[Spot]]
@@ -46,7 +49,7 @@ class Maps(msgspec.Struct, frozen=True):
 
 
 def colours_of(runs: Sequence[ReportedRun]) -> dict[str, str]:
-    """A colour for each label, the same in all plots."""
+    """Return a colour for each label, the same in all plots."""
     labels = dict.fromkeys(run.label for run in runs)
     return {label: RUN_COLOURS[k % len(RUN_COLOURS)] for k, label in enumerate(labels)}
 
@@ -58,7 +61,7 @@ def page_of(
     maps: Maps,
     note: str,
 ) -> bytes:
-    """The file. note: what the gallery could not show, "" if nothing."""
+    """Render the HTML file. note: what the gallery could not show, "" if nothing."""
     from plotly.offline import get_plotlyjs
 
     causes = _causes_of(runs)
@@ -78,7 +81,7 @@ def page_of(
     style, viewer, script = map(_asset, ("page.css", "viewer.html", "page.js"))
     template = _templates().get_template("page.html")
     text = template.render(
-        policy=_POLICY,
+        policy=_SECURITY_POLICY,
         labels=list(dict.fromkeys(run.label for run in runs)),
         suites=list(dict.fromkeys(run.spec.suite for run in runs)),
         episodes=sum(len(run.records) for run in runs),
@@ -110,7 +113,7 @@ def page_of(
 
 @cache
 def _templates() -> jinja2.Environment:
-    """Return the page's templates, which escape every value that they do not mark as safe."""
+    """Return the page's templates, with autoescape."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("cosim.report", "page"),
         autoescape=True,
@@ -123,25 +126,25 @@ def _templates() -> jinja2.Environment:
 
 
 def _asset(name: str) -> str:
-    """Return a file of this package that is put into the page as it is."""
+    """Return the text of a file in this package."""
     return files("cosim.report.page").joinpath(name).read_text(encoding="utf-8")
 
 
 def _json(name: str, value: object) -> str:
-    """Return data for the page: nothing in it can end its element."""
+    """Return a JSON script element; the data cannot close the element."""
     text = msgspec.json.encode(value, enc_hook=np.generic.item).decode()
     safe = text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
     return f'<script type="application/json" id="{name}">{safe}</script>\n'
 
 
 def _listed(words: Sequence[str]) -> str:
-    if len(words) > _MOST_LISTED:
-        words = [*words[: _MOST_LISTED - 1], f"{len(words) - _MOST_LISTED + 1} more"]
+    if len(words) > _MAX_RUNS_NAMED:
+        words = [*words[: _MAX_RUNS_NAMED - 1], f"{len(words) - _MAX_RUNS_NAMED + 1} more"]
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def _counts(entries: Sequence[Entry], field: str) -> list[tuple[str, int]]:
-    """Return how many entries have each value of a field; causes in their order."""
+    """Return the number of entries by value of a field; causes in their order."""
     counts = Counter(str(getattr(entry, field)) for entry in entries)
     if field == "cause":
         return sorted(
@@ -151,7 +154,7 @@ def _counts(entries: Sequence[Entry], field: str) -> list[tuple[str, int]]:
 
 
 def _credits(maps: Maps) -> dict[str, list[str]]:
-    """Return the places that were made from map data, by the credit that its licence asks for."""
+    """Return the places made from map data by the credit their licence requires."""
     places: dict[str, list[str]] = {}
     for picture in maps.pictures:
         if picture.credit:
@@ -160,8 +163,7 @@ def _credits(maps: Maps) -> dict[str, list[str]]:
 
 
 def _what_was_run(runs: Sequence[ReportedRun]) -> dict[str, Any]:
-    """Return what each run was, so that others can repeat it: what they share, what differs,
-    lost episodes."""
+    """Return the facts needed to repeat the runs: shared ones, differing ones, lost episodes."""
     facts = [_facts(run) for run in runs]
     shared = {
         name: value for name, value in facts[0].items() if all(one[name] == value for one in facts)
@@ -186,14 +188,14 @@ def _what_was_run(runs: Sequence[ReportedRun]) -> dict[str, Any]:
 
 def _facts(run: ReportedRun) -> dict[str, str]:
     spec = run.spec
-    walls = [record.clock["wall_s"] for record in run.records if "wall_s" in record.clock]
+    wall_times_s = [record.clock["wall_s"] for record in run.records if "wall_s" in record.clock]
     wall = (
-        f"{duration(sum(walls))} in all, {np.median(walls):.1f} s the median episode"
-        if walls
+        f"{duration(sum(wall_times_s))} in all, {np.median(wall_times_s):.1f} s the median episode"
+        if wall_times_s
         else "not told"
     )
     took_ms = median_answer_ms(run.records)
-    follows = any(map(holds_waypoints, run.path.glob("episodes/*/trajectory.npz")))
+    has_waypoints = any(map(holds_waypoints, run.path.glob("episodes/*/trajectory.npz")))
     called = policy_in_words(spec.manifest.name, run.records[0].manifest.privileged)
     return {
         "policy": f"{called} {spec.manifest.version} ({spec.policy})",
@@ -213,7 +215,7 @@ def _facts(run: ReportedRun) -> dict[str, str]:
         if run.records[0].manifest.privileged
         else "no",
         "waypoints": spec.manifest.waypoints.in_words
-        if follows
+        if has_waypoints
         else "none: it answers with commands",
         "robot": ", ".join(f"{name} ({digest})" for name, digest in spec.robots.items()),
         "seed of the run": str(spec.setup.seed),
@@ -228,13 +230,12 @@ def _lost(run: ReportedRun) -> list[str]:
     bad = run.table[run.table["status"] != "done"]
     rows = bad[["status", "scenario", "reason"]].itertuples(index=False)
     lines = [f"{status} {name}: {why}" for status, name, why in rows]
-    more = [f"and {len(lines) - _MOST_TOLD} more"] if len(lines) > _MOST_TOLD else []
-    return [*lines[:_MOST_TOLD], *more]
+    more = [f"and {len(lines) - _MAX_LOST_LISTED} more"] if len(lines) > _MAX_LOST_LISTED else []
+    return [*lines[:_MAX_LOST_LISTED], *more]
 
 
 def _causes_of(runs: Sequence[ReportedRun]) -> Mapping[str, Counter[str]]:
-    """How often each cause was, by place: of all failures, also of those that no map has room
-    for."""
+    """Return the number of failures by place and cause."""
     found: defaultdict[str, Counter[str]] = defaultdict(Counter)
     for run in runs:
         for name, record in run.whole.records.items():
@@ -245,7 +246,7 @@ def _causes_of(runs: Sequence[ReportedRun]) -> Mapping[str, Counter[str]]:
 
 
 def counts_of(runs: Sequence[ReportedRun]) -> Mapping[str, tuple[int, int]]:
-    """Episodes and failed episodes of each place, the most failures first."""
+    """Return the number of all and of failed episodes by place, most failures first."""
     total: Counter[str] = Counter()
     failed: Counter[str] = Counter()
     for run in runs:

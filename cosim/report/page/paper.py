@@ -1,9 +1,8 @@
-"""What the paper reports of the models it ran, in its own engine with its own pictures: facts,
-typed in as they stand.
+"""Results of the paper's models, in its own engine with its own pictures, copied as published.
 
 Source: "SidewalkBench", its tables `tab:terrain_only` (unit tests), `tab:hand_crafted` and
-`tab:hand_crafted_full` (pedestrian-reactive), `tab:long_horizon`. None: the paper has a dash there,
-or no row.
+    `tab:hand_crafted_full` (pedestrian-reactive), `tab:long_horizon`. None: the paper has a dash,
+    or no row.
 """
 
 from __future__ import annotations
@@ -26,191 +25,36 @@ EVENT_COLUMNS: Final = (
     "ped_crossing",
     "gesturing",
 )
-"""Of its pedestrian-reactive tables, in its order."""
+"""Columns of the paper's pedestrian-reactive tables, in its order."""
 
-UNIT_OF_PAPER: Final[Mapping[str, Row]] = {
-    "ViNT": (
-        0.00,
-        0.00,
-        0.21,
-        0.00,
-        0.00,
-        0.21,
-        0.00,
-        0.00,
-        0.44,
-        0.00,
-        0.00,
-        0.33,
-        0.00,
-        0.00,
-        0.26,
-        0.00,
-        0.00,
-        0.32,
-    ),
-    "NoMaD": (
-        0.00,
-        0.00,
-        0.36,
-        0.02,
-        0.02,
-        0.51,
-        0.00,
-        0.00,
-        0.87,
-        0.00,
-        0.00,
-        0.42,
-        0.30,
-        0.30,
-        0.66,
-        0.00,
-        0.00,
-        0.57,
-    ),
-    "MBRA": (
-        0.41,
-        0.40,
-        0.68,
-        0.00,
-        0.00,
-        0.44,
-        0.68,
-        0.67,
-        0.99,
-        0.40,
-        0.40,
-        0.67,
-        0.00,
-        0.00,
-        0.53,
-        0.60,
-        0.60,
-        0.87,
-    ),
-    "InternVLA-N1": (
-        0.30,
-        0.29,
-        0.55,
-        0.01,
-        0.01,
-        0.44,
-        0.01,
-        0.01,
-        0.72,
-        0.00,
-        0.00,
-        0.47,
-        0.00,
-        0.00,
-        0.34,
-        0.00,
-        0.00,
-        0.39,
-    ),
-    "CityWalker": (
-        0.48,
-        0.47,
-        0.70,
-        0.02,
-        0.02,
-        0.49,
-        0.99,
-        0.95,
-        0.99,
-        0.80,
-        0.79,
-        0.84,
-        0.10,
-        0.10,
-        0.70,
-        1.00,
-        0.98,
-        1.00,
-    ),
-    "MIMIC": (
-        0.39,
-        0.39,
-        0.59,
-        0.23,
-        0.23,
-        0.54,
-        0.56,
-        0.55,
-        0.69,
-        0.30,
-        0.30,
-        0.39,
-        0.00,
-        0.00,
-        0.30,
-        0.40,
-        0.40,
-        0.94,
-    ),
-    "S2E": (
-        0.69,
-        0.68,
-        0.83,
-        0.28,
-        0.28,
-        0.63,
-        0.75,
-        0.74,
-        0.99,
-        0.90,
-        0.90,
-        0.91,
-        0.50,
-        0.50,
-        0.76,
-        0.30,
-        0.30,
-        0.80,
-    ),
-    "FlowPilot": (
-        0.70,
-        0.69,
-        0.83,
-        0.47,
-        0.47,
-        0.70,
-        0.68,
-        0.66,
-        0.98,
-        0.80,
-        0.79,
-        0.88,
-        0.20,
-        0.20,
-        0.70,
-        1.00,
-        1.00,
-        1.00,
-    ),
-    "OpenPilot": (
-        0.78,
-        0.77,
-        0.87,
-        0.57,
-        0.57,
-        0.80,
-        0.98,
-        0.97,
-        1.00,
-        0.90,
-        0.89,
-        0.96,
-        0.60,
-        0.59,
-        0.86,
-        0.90,
-        0.88,
-        0.91,
-    ),
+_UNIT_GENERATED: Final[Mapping[str, Row]] = {
+    "ViNT": (0.00, 0.00, 0.21, 0.00, 0.00, 0.21, 0.00, 0.00, 0.44),
+    "NoMaD": (0.00, 0.00, 0.36, 0.02, 0.02, 0.51, 0.00, 0.00, 0.87),
+    "MBRA": (0.41, 0.40, 0.68, 0.00, 0.00, 0.44, 0.68, 0.67, 0.99),
+    "InternVLA-N1": (0.30, 0.29, 0.55, 0.01, 0.01, 0.44, 0.01, 0.01, 0.72),
+    "CityWalker": (0.48, 0.47, 0.70, 0.02, 0.02, 0.49, 0.99, 0.95, 0.99),
+    "MIMIC": (0.39, 0.39, 0.59, 0.23, 0.23, 0.54, 0.56, 0.55, 0.69),
+    "S2E": (0.69, 0.68, 0.83, 0.28, 0.28, 0.63, 0.75, 0.74, 0.99),
+    "FlowPilot": (0.70, 0.69, 0.83, 0.47, 0.47, 0.70, 0.68, 0.66, 0.98),
+    "OpenPilot": (0.78, 0.77, 0.87, 0.57, 0.57, 0.80, 0.98, 0.97, 1.00),
 }
-"""SR, SPL, RC of straight, curve, crosswalk in generated places, then the same in scanned ones."""
+"""SR, SPL, RC of straight, curve, crosswalk in generated places."""
+_UNIT_SCANNED: Final[Mapping[str, Row]] = {
+    "ViNT": (0.00, 0.00, 0.33, 0.00, 0.00, 0.26, 0.00, 0.00, 0.32),
+    "NoMaD": (0.00, 0.00, 0.42, 0.30, 0.30, 0.66, 0.00, 0.00, 0.57),
+    "MBRA": (0.40, 0.40, 0.67, 0.00, 0.00, 0.53, 0.60, 0.60, 0.87),
+    "InternVLA-N1": (0.00, 0.00, 0.47, 0.00, 0.00, 0.34, 0.00, 0.00, 0.39),
+    "CityWalker": (0.80, 0.79, 0.84, 0.10, 0.10, 0.70, 1.00, 0.98, 1.00),
+    "MIMIC": (0.30, 0.30, 0.39, 0.00, 0.00, 0.30, 0.40, 0.40, 0.94),
+    "S2E": (0.90, 0.90, 0.91, 0.50, 0.50, 0.76, 0.30, 0.30, 0.80),
+    "FlowPilot": (0.80, 0.79, 0.88, 0.20, 0.20, 0.70, 1.00, 1.00, 1.00),
+    "OpenPilot": (0.90, 0.89, 0.96, 0.60, 0.59, 0.86, 0.90, 0.88, 0.91),
+}
+"""SR, SPL, RC of straight, curve, crosswalk in scanned places."""
+UNIT_OF_PAPER: Final[Mapping[str, Row]] = {
+    model: row + _UNIT_SCANNED[model] for model, row in _UNIT_GENERATED.items()
+}
+"""Both of these: generated places, then scanned ones."""
 
 REACTIVE_OF_PAPER: Final[Mapping[str, Mapping[str, Row]]] = {
     "success": {
@@ -247,8 +91,7 @@ REACTIVE_OF_PAPER: Final[Mapping[str, Mapping[str, Row]]] = {
         "OpenPilot": (_NO, 0.93, 0.71, 0.64, 0.92, 1.03, 0.95, _NO, 1.04),
     },
 }
-"""By metric: static, obstructing, conversing, queueing, frontal, lateral, overtaking, ped_crossing,
-gesturing."""
+"""Results by metric and model, in the order of EVENT_COLUMNS."""
 
 LONG_OF_PAPER: Final[Mapping[str, Row]] = {
     "ViNT": (21.20, 4.29, 16.90, 0.00, 1.11, 27.52, 4.87, 8.24, 14.42, 0.39),
@@ -261,4 +104,4 @@ LONG_OF_PAPER: Final[Mapping[str, Row]] = {
     "FlowPilot": (3.40, 2.30, 1.10, 0.00, 1.22, 1.69, 1.31, 0.00, 0.37, 0.73),
     "OpenPilot": (1.34, 1.01, 0.33, 0.01, 1.34, 0.94, 0.56, 0.00, 0.37, 0.83),
 }
-"""FC, C, OL, F per 100 m and V in generated places, then the same in scanned ones."""
+"""FC, C, OL, F per 100 m and V, m/s, in generated places, then in scanned ones."""

@@ -1,5 +1,4 @@
-"""The plots of a report, as figures of Plotly: plain values, drawn in the browser by the library in
-the page."""
+"""Plots of a report as Plotly figures: plain values, drawn in the browser."""
 
 from __future__ import annotations
 
@@ -58,8 +57,8 @@ _NEAR_EDGES: Final = (1.0, 3.0, 6.0, 10.0)
 _NEAR_WORDS: Final = ("nobody", "1 to 2", "3 to 5", "6 to 9", "10 or more")
 _SPEED_EDGES: Final = (0.25, 0.75, 1.25, 1.75)
 _SPEED_WORDS: Final = ("below 0.25", "0.25 to 0.75", "0.75 to 1.25", "1.25 to 1.75", "above 1.75")
-_LEAST_M: Final = 20.0
-"""Of fewer metres travelled no rate is shown."""
+_MIN_M: Final = 20.0
+"""Least distance travelled, metres, for a rate."""
 _BAR_PX: Final = 40
 _FAMILIES: Final[Mapping[PaperTable, str]] = {
     "unit": "unit tests",
@@ -69,7 +68,7 @@ _FAMILIES: Final[Mapping[PaperTable, str]] = {
 
 
 class Plot(NamedTuple):
-    """One figure: what is said above it, data and layout as Plotly takes them."""
+    """Figure with title and note; data and layout in Plotly's format."""
 
     title: str
     note: str
@@ -77,8 +76,7 @@ class Plot(NamedTuple):
 
 
 class Exposure(NamedTuple):
-    """One episode, split by what was around at each moment: failures (B,), metres travelled
-    (B,)."""
+    """Failures (B,) and metres travelled (B,) of one episode by bin of a condition."""
 
     failures: Floats
     metres: Floats
@@ -87,14 +85,18 @@ class Exposure(NamedTuple):
 def plots_of(
     runs: Sequence[ReportedRun], colours: Mapping[str, str], progress: Progress = ignore
 ) -> list[Plot]:
-    """Every plot that the runs have something for. colours: of the labels."""
+    """Build every plot for which the runs have data. colours: by run label."""
     rate = "Failures per 100 m"
     found = [
-        _by(runs, colours, "unit", "kind", UNIT_COLUMNS, "success", "Success by structure"),
-        _by(runs, colours, "reactive", "kind", EVENT_COLUMNS, "success", "Success by event"),
-        _endings(runs),
-        _rates_by_cause(runs),
-        _by(
+        _metric_plot(
+            runs, colours, "unit", "kind", UNIT_COLUMNS, "success", "Success by structure"
+        ),
+        _metric_plot(
+            runs, colours, "reactive", "kind", EVENT_COLUMNS, "success", "Success by event"
+        ),
+        _endings_plot(runs),
+        _cause_rates_plot(runs),
+        _metric_plot(
             runs,
             colours,
             "unit",
@@ -103,7 +105,7 @@ def plots_of(
             "success",
             "Success by light, unit tests",
         ),
-        _by(
+        _metric_plot(
             runs,
             colours,
             "reactive",
@@ -112,7 +114,7 @@ def plots_of(
             "success",
             "Success by light, people in the way",
         ),
-        _by(
+        _metric_plot(
             runs,
             colours,
             "long",
@@ -133,13 +135,13 @@ def plots_of(
     )
     moving = f"{note} Without freezings, which happen at no speed."
     found.append(
-        _exposed(
+        _exposure_plot(
             people, colours, _NEAR_WORDS, f"{rate} by people within {NEAR_M:g} m, long ways", note
         )
     )
     for words, of in speed.items():
         found.append(
-            _exposed(
+            _exposure_plot(
                 of, colours, _SPEED_WORDS, f"{rate} by the robot's speed, m/s, {words}", moving
             )
         )
@@ -147,8 +149,10 @@ def plots_of(
 
 
 def near_of(pose: Floats, people_tick: NDArray[np.int64], people_xy: Floats) -> Floats:
-    """(T,) how many people were within NEAR_M of the robot, as recorded once a second; columns of
-    `Log`."""
+    """Return (T,) the number of people within NEAR_M of the robot, recorded once a second.
+
+    pose, people_tick, people_xy: columns of `Log`
+    """
     away = people_xy - pose[people_tick, :2]
     close = people_tick[np.hypot(away[:, 0], away[:, 1]) < NEAR_M]
     every = Recorder.PEOPLE_EVERY_TICKS
@@ -159,8 +163,12 @@ def near_of(pose: Floats, people_tick: NDArray[np.int64], people_xy: Floats) -> 
 def exposure_of(
     record: Record, travelled_m: Floats, value: Floats, edges: Sequence[float], *, moving: bool
 ) -> Exposure:
-    """Failures and metres of an episode by a value that it has at each tick, (T,). travelled_m:
-    (T,) of each tick. moving: freezings, which have no metres, are left out."""
+    """Bin failures and metres of an episode by a value per tick.
+
+    travelled_m, value: (T,) of each tick
+    edges: inner edges of the bins
+    moving: True to skip freezings, which have no metres
+    """
     bins = np.digitize(value, edges)
     ticks = [
         f.tick
@@ -176,7 +184,7 @@ _ByRun = dict[tuple[str, PaperTable], list[Exposure]]
 
 
 def _exposures(runs: Sequence[ReportedRun], progress: Progress) -> tuple[_ByRun, _ByRun]:
-    """Of every episode with a trajectory: by people near, by speed."""
+    """Return exposures by people nearby and by speed, of every episode with a trajectory."""
     near: _ByRun = {}
     fast: _ByRun = {}
     for number, run in enumerate(runs):
@@ -197,14 +205,14 @@ def _exposures(runs: Sequence[ReportedRun], progress: Progress) -> tuple[_ByRun,
     return near, fast
 
 
-def _exposed(
+def _exposure_plot(
     of: Mapping[str, list[Exposure]],
     colours: Mapping[str, str],
     words: Sequence[str],
     title: str,
     note: str,
 ) -> Plot | None:
-    """Of all runs, or of none where none has a failure."""
+    """Return the plot of failure rates by bin; None without a failure."""
     if not any(part.failures.any() for parts in of.values() for part in parts):
         return None
     cells: dict[str, list[MeanOfEpisodes]] = {}
@@ -217,7 +225,7 @@ def _exposed(
             MeanOfEpisodes(
                 100.0 * f.sum() / m.sum(), *interval_of(100.0 * f, m), int((m > 0).sum())
             )
-            if m.sum() >= _LEAST_M
+            if m.sum() >= _MIN_M
             else MeanOfEpisodes(np.nan, np.nan, np.nan, 0)
             for f, m in zip(failures.T, metres.T, strict=True)
         ]
@@ -230,7 +238,7 @@ def _exposed(
     )
 
 
-def _by(
+def _metric_plot(
     runs: Sequence[ReportedRun],
     colours: Mapping[str, str],
     family: PaperTable,
@@ -239,7 +247,7 @@ def _by(
     metric: str,
     title: str,
 ) -> Plot | None:
-    """A metric of a family by the values of a column; nothing where there is but one value."""
+    """Return the plot of a metric by the values of a column; None for fewer than two values."""
     tables = episodes_of(runs, family)
     present = [
         value for value in order if any((table[column] == value).any() for table in tables.values())
@@ -272,7 +280,7 @@ def _points(
     *,
     share: bool,
 ) -> dict[str, Any]:
-    """A row for each word, in it a point with its interval for each label."""
+    """Return a figure with one row per word, with a point and interval per label."""
     data = []
     for label, row in cells.items():
         shown = [
@@ -325,7 +333,7 @@ def _points(
 
 
 def _stacked(rows: Mapping[str, Mapping[str, float]], axis: str, form: str) -> dict[str, Any]:
-    """A bar for each row, made of causes. rows: by their names as Plotly shows them."""
+    """Return a figure with one stacked bar of causes per row. rows: by their Plotly label."""
     causes = [cause for cause in CAUSE_COLOURS if any(row.get(cause) for row in rows.values())]
     data = [
         {
@@ -353,8 +361,8 @@ def _stacked(rows: Mapping[str, Mapping[str, float]], axis: str, form: str) -> d
     }
 
 
-def _endings(runs: Sequence[ReportedRun]) -> Plot | None:
-    """How short episodes ended, as shares."""
+def _endings_plot(runs: Sequence[ReportedRun]) -> Plot | None:
+    """Return the plot of how short episodes ended, as shares."""
     rows: dict[str, dict[str, float]] = {}
     for run in runs:
         for record in run.records:
@@ -380,9 +388,11 @@ def _endings(runs: Sequence[ReportedRun]) -> Plot | None:
     return Plot("How short episodes end", note, _stacked(shares, "share of episodes", ".0%"))
 
 
-def _rates_by_cause(runs: Sequence[ReportedRun]) -> Plot | None:
-    """What goes wrong on long ways. An episode whose policy crashed has no metres: it is told
-    beside."""
+def _cause_rates_plot(runs: Sequence[ReportedRun]) -> Plot | None:
+    """Return the plot of failure rates by cause on long ways.
+
+    An episode whose policy crashed has no metres; the note counts it.
+    """
     counts: dict[str, dict[str, float]] = {}
     metres: dict[str, float] = {}
     crashed: dict[str, list[bool]] = {}
@@ -402,7 +412,7 @@ def _rates_by_cause(runs: Sequence[ReportedRun]) -> Plot | None:
     rows = {
         escape(label): {cause: 100.0 * n / metres[label] for cause, n in row.items()}
         for label, row in counts.items()
-        if metres[label] >= _LEAST_M
+        if metres[label] >= _MIN_M
     }
     if not any(rows.values()):
         return None
@@ -410,12 +420,12 @@ def _rates_by_cause(runs: Sequence[ReportedRun]) -> Plot | None:
         "Failures per 100 m, all metres of episodes that ended. After a failure the robot is put "
         "back and goes on."
     )
-    told = [
+    crash_counts = [
         f"{sum(which)} of {len(which)} of {label}" for label, which in crashed.items() if any(which)
     ]
     note += (
-        f" Not in it are the episodes in which the policy crashed: {', '.join(told)}."
-        if told
+        f" Not in it are the episodes in which the policy crashed: {', '.join(crash_counts)}."
+        if crash_counts
         else ""
     )
     return Plot("What goes wrong on long ways", note, _stacked(rows, "failures per 100 m", ".1f"))

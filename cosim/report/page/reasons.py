@@ -1,4 +1,4 @@
-"""Why an episode failed, in words: from its record, its log, and who the other was."""
+"""Describe in words why an episode failed, from its record and log."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from cosim.spec.events import Event
 from cosim.spec.scenario import Scenario
 
 _STANDS_MPS: Final = 0.2
-"""Slower than this somebody is said to have stood."""
-_ASTRAY_M: Final = 5.0
-"""Farther from the route there is no telling on which side of it the way was left."""
-_OVER_S: Final = 0.4
-"""Over so long a time a speed is taken from recorded places."""
+"""Speed below which a body counts as standing."""
+_SIDE_LIMIT_M: Final = 5.0
+"""Distance from the route, metres, beyond which its side is meaningless."""
+_VELOCITY_SPAN_S: Final = 0.4
+"""Time span, seconds, over which a velocity is estimated from recorded positions."""
 CAUSES: Final = (
     "person",
     "vehicle",
@@ -31,8 +31,8 @@ CAUSES: Final = (
     "broke the rule",
     "policy crashed",
 )
-"""Kinds of reasons, in the order in which they are shown."""
-_THINGS: Final = {
+"""Causes of failures, in display order."""
+_THING_NAMES: Final = {
     "sign": "sandwich board",
     "cafe": "cafe table",
     "bike": "parked bike",
@@ -46,8 +46,7 @@ _THINGS: Final = {
 
 
 class Other(NamedTuple):
-    """Whom or what the robot met: place and velocity in the robot's frame, x ahead and y left,
-    metres and m/s."""
+    """Body that the robot met, in the robot's frame: x ahead and y left, metres and m/s."""
 
     x_m: float
     y_m: float
@@ -56,15 +55,19 @@ class Other(NamedTuple):
 
     @classmethod
     def seen_from(cls, robot: Floats, at: Floats, velocity: Floats) -> Other:
-        """From the world's frame. robot: (3,) x, y, heading; at, velocity: (2,)."""
+        """Convert from the world frame. robot: (3,) x, y, heading; at, velocity: (2,)."""
         cos, sin = math.cos(robot[2]), math.sin(robot[2])
         turn = np.array([[cos, sin], [-sin, cos]])
         return cls(*(turn @ (at - robot[:2])).tolist(), *(turn @ velocity).tolist())
 
 
 class Mishap(NamedTuple):
-    """What went wrong in an episode, and when. tick: of the log; failure: None where the referee
-    counted none, as when time ran out. cause: one of CAUSES."""
+    """Cause and time of a failed episode.
+
+    tick: index into the log
+    cause: one of CAUSES
+    failure: None if the referee counted none, for example at a timeout
+    """
 
     tick: int
     cause: str
@@ -72,7 +75,7 @@ class Mishap(NamedTuple):
 
 
 def mishaps_of(record: Record) -> list[Mishap]:
-    """Everything that went wrong in an episode, in order; nothing where it succeeded or is
+    """Return everything that went wrong in an episode, in order; empty if it succeeded or is
     invalid."""
     if record.status == "crashed":
         return [Mishap(record.ticks, "policy crashed")]
@@ -86,7 +89,7 @@ def mishaps_of(record: Record) -> list[Mishap]:
 
 
 def cause_of(failure: Failure) -> str:
-    """Which of CAUSES a failure is."""
+    """Return which of CAUSES a failure has."""
     if failure.kind == "out_of_lane":
         return "off the sidewalk"
     if failure.kind == "freezing":
@@ -97,18 +100,20 @@ def cause_of(failure: Failure) -> str:
 def reason_of(
     scenario: Scenario, record: Record, mishap: Mishap, log: Log | None, other: Other | None = None
 ) -> str:
-    """One sentence without its full stop. other: whom the robot met, where that is known better
-    than from the log."""
+    """Return the reason of a mishap as one sentence without its full stop.
+
+    other: body that the robot met, if known more precisely than from the log
+    """
     if mishap.cause == "policy crashed":
         return f"the policy crashed: {record.reason}"
     failure = mishap.failure
     if failure is None:
-        return _ended(scenario, record)
+        return _missed_goal(scenario, record)
     if failure.kind == "freezing":
         near = _nearest(log, failure.tick)
         return f"stayed within {FREEZE_MOVE_M:g} m for {FREEZE_WINDOW_S:g} s{near}"
     if failure.kind == "out_of_lane":
-        return _left(scenario, failure)
+        return _off_sidewalk(scenario, failure)
     if failure.other_kind == "pedestrian":
         other = other or _in_tracks(scenario, failure, log)
         return f"{_met(failure, other, 'a person')}{_after_trigger(scenario, record, failure)}"
@@ -118,54 +123,54 @@ def reason_of(
 
 
 def thing_in_words(failure: Failure) -> str:
-    """What was touched that is neither person nor vehicle: "a parked bike"."""
+    """Return the touched thing, neither person nor vehicle, such as "a parked bike"."""
     of, _, which = failure.other.partition(":")
     kind = which.rpartition(":")[2] if of == "obstacle" else of
     words = (
-        _THINGS.get(kind, kind if of == "obstacle" else failure.other_kind).replace("_", " ")
+        _THING_NAMES.get(kind, kind if of == "obstacle" else failure.other_kind).replace("_", " ")
         or "something"
     )
     return f"{'an' if words[0] in 'aeiou' else 'a'} {words}"
 
 
 def event_of(scenario: Scenario, mishap: Mishap) -> Event | None:
-    """The event that a mishap belongs to: that of the person who was met, or the scenario's only
-    one."""
-    who = mishap.failure.other if mishap.failure else ""
-    theirs = [event for event in scenario.events if who in event.names]
-    if not theirs and scenario.ends_on_failure and len(scenario.events) == 1:
+    """Return the event of the person who was met, or the scenario's only event."""
+    person = mishap.failure.other if mishap.failure else ""
+    matching = [event for event in scenario.events if person in event.names]
+    if not matching and scenario.ends_on_failure and len(scenario.events) == 1:
         return scenario.events[0]
-    return theirs[0] if theirs else None
+    return matching[0] if matching else None
 
 
-def _met(failure: Failure, other: Other | None, whom: str) -> str:
-    """A collision with somebody who moves, or who stood. The speed that is told is the other's, or
-    the robot's where the other stood."""
+def _met(failure: Failure, other: Other | None, body: str) -> str:
+    """Describe a collision with a person or vehicle.
+
+    The speed is the other's, or the robot's if the other stood.
+    """
     stood = failure.robot_speed_mps < _STANDS_MPS
     at = "where it stood" if stood else f"at {failure.robot_speed_mps:.1f} m/s"
     if other is None:
-        return f"{'was touched by' if stood else 'ran into'} {whom} {at}"
+        return f"{'was touched by' if stood else 'ran into'} {body} {at}"
     speed_mps = math.hypot(other.vx_mps, other.vy_mps)
-    whom += " who" if whom == "a person" else " that"
+    body += " who" if body == "a person" else " that"
     if speed_mps < _STANDS_MPS:
         where = _side(other.x_m, other.y_m, "ahead")
         return (
-            f"touched {whom} stood {where}, both at rest"
+            f"touched {body} stood {where}, both at rest"
             if stood
-            else f"drove into {whom} stood {where}, {at}"
+            else f"drove into {body} stood {where}, {at}"
         )
     side = _side(-other.vx_mps, -other.vy_mps, "from the front", "from the ", "from behind")
     if side == "from behind" and other.x_m > 0.0:
-        return (
-            f"{'touched' if stood else 'drove into'} {whom} went ahead of it at {speed_mps:.1f} m/s"
-        )
-    alike = failure.fault == "shared" or failure.other_kind == "vehicle" or side == "from behind"
-    verb = "was hit by" if stood else "collided with" if alike else "drove into"
-    return f"{verb} {whom} came {side} at {speed_mps:.1f} m/s"
+        verb = "touched" if stood else "drove into"
+        return f"{verb} {body} went ahead of it at {speed_mps:.1f} m/s"
+    both = failure.fault == "shared" or failure.other_kind == "vehicle" or side == "from behind"
+    verb = "was hit by" if stood else "collided with" if both else "drove into"
+    return f"{verb} {body} came {side} at {speed_mps:.1f} m/s"
 
 
 def _side(x: float, y: float, front: str, aside: str = "to the ", behind: str = "behind") -> str:
-    """Which side of the robot a direction in its frame is."""
+    """Return the side of the robot that a direction in its frame points to."""
     angle = abs(math.degrees(math.atan2(y, x)))
     if angle <= 45.0:
         return front
@@ -173,7 +178,7 @@ def _side(x: float, y: float, front: str, aside: str = "to the ", behind: str = 
 
 
 def _in_tracks(scenario: Scenario, failure: Failure, log: Log | None) -> Other | None:
-    """Who of an event was met, from the tracks of its people; None for anybody else."""
+    """Return the event person that was met, from the event tracks; None for any other person."""
     if log is None:
         return None
     for number, event in enumerate(scenario.events):
@@ -183,7 +188,7 @@ def _in_tracks(scenario: Scenario, failure: Failure, log: Log | None) -> Other |
             )
             track = log.event_tracks[of_it & (log.event_tracks[:, 0] <= failure.tick)]
             if len(track):
-                since = track[track[:, 0] >= track[-1, 0] - round(_OVER_S / log.tick_s)]
+                since = track[track[:, 0] >= track[-1, 0] - round(_VELOCITY_SPAN_S / log.tick_s)]
                 ticks = max(since[-1, 0] - since[0, 0], 1.0)
                 velocity = (since[-1, 3:5] - since[0, 3:5]) / (ticks * log.tick_s)
                 return Other.seen_from(log.pose[failure.tick], track[-1, 3:5], velocity)
@@ -192,21 +197,21 @@ def _in_tracks(scenario: Scenario, failure: Failure, log: Log | None) -> Other |
 
 def _after_trigger(scenario: Scenario, record: Record, failure: Failure) -> str:
     event = event_of(scenario, Mishap(failure.tick, "person", failure))
-    told: TriggeredEvent | None = next(
+    outcome: TriggeredEvent | None = next(
         (e for e in record.events if event is not None and e.id == event.id), None
     )
-    if told is None:
+    if outcome is None:
         return ""
-    if told.triggered_at_s is None:
+    if outcome.triggered_at_s is None:
         return ", before its event began"
-    after_s = Clock().time_s(failure.tick + 1) - told.triggered_at_s
+    after_s = Clock().time_s(failure.tick + 1) - outcome.triggered_at_s
     return f", {after_s:.1f} s after the trigger" if after_s >= 0.0 else ", before its event began"
 
 
-def _left(scenario: Scenario, failure: Failure) -> str:
+def _off_sidewalk(scenario: Scenario, failure: Failure) -> str:
     near = (failure.route_s_m - 5.0, failure.route_s_m + 5.0)
     _, left_m = scenario.route_line.project(failure.x_m, failure.y_m, near)
-    if abs(left_m) > _ASTRAY_M:
+    if abs(left_m) > _SIDE_LIMIT_M:
         return (
             f"left the walkable ground at {failure.robot_speed_mps:.1f} m/s, {abs(left_m):.0f} m "
             f"off the route"
@@ -226,8 +231,8 @@ def _nearest(log: Log | None, tick: int) -> str:
     return f", the nearest person {log.person_m[tick]:.1f} m away"
 
 
-def _ended(scenario: Scenario, record: Record) -> str:
-    """An episode that failed without a failure of the referee's."""
+def _missed_goal(scenario: Scenario, record: Record) -> str:
+    """Describe an episode that failed without a failure of the referee."""
     done = 100.0 * (record.measures.get("route_completion") or 0.0)
     if record.ended == "goal":
         return "came to the goal, but went between people that it should have passed round"

@@ -1,5 +1,4 @@
-"""The runs that a report is about, read whole, and refused in one line where a table of them would
-mislead."""
+"""Runs of a report: loaded, verified and refused if one table would mislead."""
 
 from __future__ import annotations
 
@@ -18,18 +17,18 @@ from cosim.core.progress import Progress, ignore
 from cosim.results.finished_run import WholeRun, read_whole_run
 from cosim.results.log import Log
 from cosim.results.record import Record
-from cosim.results.run_folder import RUN_AGAIN, TRAJECTORY, record_file
+from cosim.results.run_folder import RUN_AGAIN, load_log, trajectory_file
 from cosim.results.run_spec import RunSpec
 from cosim.results.table import table_of
 from cosim.spec.scenario import CityMap, Light, Scenario
 
 PaperTable = Literal["unit", "reactive", "long"]
-"""Short ways past things; short ways with one event, or the same without; long ways, which go on
-after a failure."""
+"""Short ways past things; short ways with at most one event; long ways, which continue after
+failures."""
 _COLUMNS: Final = ("pose", "speed", "travelled_m", "people_tick", "people_xy")
-"""What plots are made of: to read all that a log holds takes four times as long."""
+"""Columns that plots use; loading a whole log takes four times as long."""
 OF_THE_PAPER: Final = ("unit", "reactive", "long-horizon")
-"""The suites whose rows stand beside the paper's."""
+"""Suites shown together with the paper's rows."""
 KINDS_OF_LIGHT: Final = ("high sun", "low sun", "overcast", "fog")
 _OVERCAST: Final = 0.8
 _LOW_SUN_DEG: Final = 20.0
@@ -37,9 +36,13 @@ _LOW_SUN_DEG: Final = 20.0
 
 @dataclass(frozen=True)
 class ReportedRun:
-    """One run. label: what it is called on the page: its policy; with the suite, for one's own
-    suite beside others; its folder, where two runs of a suite have the same policy. table: a row
-    per episode with the columns of `table_of` and kind, family, place, real, light."""
+    """Run of a report.
+
+    label: name on the page: its policy, with suite or folder if the policy is not unique
+
+    The table has one row per episode: columns of `table_of`, and label, kind, family, place, real,
+    light.
+    """
 
     label: str
     whole: WholeRun
@@ -58,11 +61,12 @@ class ReportedRun:
 
     @property
     def records(self) -> tuple[Record, ...]:
-        """Sorted by scenario."""
+        """Return the records, sorted by scenario."""
         return tuple(self.whole.records.values())
 
     @cached_property
     def table(self) -> pd.DataFrame:
+        """Return one row per episode, see the class."""
         table = table_of(self.records)
         of = [self.scenarios[name] for name in table["scenario"]]
         return table.assign(
@@ -75,23 +79,18 @@ class ReportedRun:
         )
 
     def log(self, scenario: str) -> Log | None:
-        """The trajectory of an episode; None where the folder has none. Raises RunError for a
-        damaged one."""
-        file = record_file(self.path, scenario)
-        path = file.with_name(TRAJECTORY)
-        if not path.exists():
+        """Load the trajectory of an episode; None without one. Raises RunError if damaged."""
+        if not trajectory_file(self.path, scenario).exists():
             return None
-        try:
-            return Log.load(path)
-        except RunError as error:
-            raise RunError(f"{error}: {RUN_AGAIN}") from error
+        return load_log(self.path, scenario)
 
     def tracks(self) -> Iterator[tuple[Record, Mapping[str, Any]]]:
-        """_COLUMNS of the log of each episode that counts and has a trajectory; an invalid one does
-        not count. Raises RunError for a damaged one."""
+        """Yield the record and _COLUMNS of the log of each "done" episode with a trajectory.
+
+        Raises RunError for a damaged one.
+        """
         for record in self.records:
-            file = record_file(self.path, record.scenario.id)
-            path = file.with_name(TRAJECTORY)
+            path = trajectory_file(self.path, record.scenario.id)
             if record.status != "done" or not path.exists():
                 continue
             try:
@@ -102,8 +101,11 @@ class ReportedRun:
 
 
 def read_runs(paths: Sequence[Path], progress: Progress = ignore) -> list[ReportedRun]:
-    """Raises UsageError where a run is given twice, RunError for runs whose figures cannot stand in
-    one table, and what `read_whole_run` raises."""
+    """Load the runs of a report.
+
+    Raises UsageError for a run given twice, RunError for runs that cannot share a table, and
+    whatever `read_whole_run` raises.
+    """
     resolved = [path.resolve() for path in paths]
     for path, real in zip(paths, resolved, strict=True):
         if resolved.count(real) > 1:
@@ -131,21 +133,21 @@ def read_runs(paths: Sequence[Path], progress: Progress = ignore) -> list[Report
 
 
 def table_of_paper(scenario: Scenario) -> PaperTable:
-    """Which of the paper's three tables a scenario belongs to."""
+    """Return which of the paper's three tables a scenario belongs to."""
     if not scenario.ends_on_failure:
         return "long"
     return "reactive" if scenario.events or scenario.structure == "static" else "unit"
 
 
 def example_of(scenario: Scenario) -> str:
-    """What it is an example of: its structure, or the kind of its one event."""
+    """Return the kind of a scenario: its structure, or the kind of its only event."""
     if not scenario.structure and scenario.ends_on_failure and len(scenario.events) == 1:
         return scenario.events[0].kind
     return scenario.structure or ("route" if not scenario.ends_on_failure else "other")
 
 
 def place_in_words(scenario: Scenario) -> str:
-    """ "berlin-3", or "city 17"."""
+    """Return the place of a scenario, such as "berlin-3" or "city 17"."""
     where = scenario.place
     if isinstance(where, CityMap):
         return where.map
@@ -153,7 +155,7 @@ def place_in_words(scenario: Scenario) -> str:
 
 
 def light_in_words(light: Light) -> str:
-    """One of KINDS_OF_LIGHT: fog before clouds before the height of the sun."""
+    """Return one of KINDS_OF_LIGHT: fog before clouds before the sun's elevation."""
     if light.fog_m is not None:
         return "fog"
     if light.cloud_cover >= _OVERCAST:
@@ -162,7 +164,7 @@ def light_in_words(light: Light) -> str:
 
 
 def sun_deg(light: Light) -> float:
-    """The sun's height over the horizon, by the usual formula of hour, day and latitude."""
+    """Return the sun's elevation, degrees, from hour, day and latitude."""
     declination = math.radians(-23.44) * math.cos(2.0 * math.pi * (light.day_of_year + 10) / 365.25)
     latitude = math.radians(light.latitude_deg)
     hour = math.radians(15.0 * (light.hour - 12.0))
@@ -173,8 +175,7 @@ def sun_deg(light: Light) -> float:
 
 
 def _refuse_other_suites(runs: Sequence[WholeRun]) -> None:
-    """Raises RunError for two runs of one suite's name and not of one suite: their rows would be
-    read as alike."""
+    """Raise RunError for two runs whose suites have the same name but different content."""
     first: dict[str, WholeRun] = {}
     for run in runs:
         other = first.setdefault(run.spec.suite, run)

@@ -1,5 +1,4 @@
-"""What the page shows of one failure, and of one place, as it travels there: JSON of short names
-and whole numbers."""
+"""Data of one failure and one place in the page: JSON with short names and integers."""
 
 from __future__ import annotations
 
@@ -10,9 +9,14 @@ Outline = list[int]
 
 
 class Track(msgspec.Struct, frozen=True):
-    """Somebody who moves. first: the sample at which it begins; at: x, y in centimetres and heading
-    in milliradians for each sample. kind: "crowd", "event", "resident", "injected" or "vehicle";
-    size: length and width in centimetres; doing: (sample, word) where what it does changes."""
+    """Moving body.
+
+    kind: "crowd", "event", "resident", "injected" or "vehicle"
+    first: first sample
+    at: x, y in centimetres and heading in milliradians for each sample
+    size: length and width in centimetres
+    doing: (sample, word) at each change of activity
+    """
 
     kind: str
     first: int
@@ -22,17 +26,19 @@ class Track(msgspec.Struct, frozen=True):
 
 
 class CrossingLight(msgspec.Struct, frozen=True):
-    """The light of one crossing. states: a letter for each sample, g where one may walk, r where
-    not, - unknown."""
+    """Light of one crossing. states: one letter per sample, g walk, r stop, - unknown."""
 
     line: Outline
     states: str
 
 
 class DrawnWay(msgspec.Struct, frozen=True):
-    """The way ahead in a picture, in tenths of its pixels from its upper left corner: pieces of a
-    line; of waypoints those that are in the picture; the number of the followed one among these, -1
-    if it is not."""
+    """Waypoints projected into a picture, in tenths of pixels from its upper left corner.
+
+    lines: pieces of the line
+    points: waypoints inside the picture
+    follows: index of the followed one in points, -1 if outside
+    """
 
     lines: list[Outline]
     points: Outline = []
@@ -40,8 +46,12 @@ class DrawnWay(msgspec.Struct, frozen=True):
 
 
 class Pictures(msgspec.Struct, frozen=True):
-    """Frames as data URLs, and the samples at which they were taken. ways: that of each of the
-    robot's; size: theirs, width and height in pixels."""
+    """Frames as data URLs.
+
+    at: samples at which they were taken
+    ways: projected waypoints for each of the robot's frames
+    size: width and height of the robot's frames in pixels
+    """
 
     at: list[int]
     robot: list[str]
@@ -51,14 +61,17 @@ class Pictures(msgspec.Struct, frozen=True):
 
 
 class Scene(msgspec.Struct, frozen=True):
-    """The last seconds before a failure. step_s: between samples; end_s: of the last one, in the
-    episode's time.
+    """Last seconds before a failure.
 
-    robot: x, y (cm), heading (mrad), speed (cm/s), command (cm/s, mrad/s) for each sample. ground:
-    pairs of what it is and its rings, drawn in turn. hit: the number of the track that the robot
-    met, -1 for none. size: of the robot, cm. plans: (sample, outline) where the waypoints change
-    that are followed: where the robot was when it was asked, and these; empty where there are none.
-    follows: which point of an outline is followed.
+    step_s: time between samples
+    end_s: time of the last sample in the episode
+    robot: x, y (cm), heading (mrad), speed (cm/s), command (cm/s, mrad/s) for each sample
+    size: of the robot, cm
+    ground: kind and rings of each zone, in drawing order
+    hit: index of the track that the robot met, -1 for none
+    plans: (sample, outline) at each change of waypoints: robot position at the request, then
+        waypoints; empty without waypoints
+    follows: index of the followed point in an outline
     """
 
     step_s: float
@@ -77,8 +90,11 @@ class Scene(msgspec.Struct, frozen=True):
 
 
 class Entry(msgspec.Struct, frozen=True, kw_only=True):
-    """One card of the gallery. scene: absent where the episode could not be shown again; why says
-    so then."""
+    """Card of the gallery.
+
+    scene: None if the episode could not be replayed
+    why: reason for a missing scene
+    """
 
     label: str
     suite: str
@@ -95,8 +111,12 @@ class Entry(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class PlacePicture(msgspec.Struct, frozen=True, kw_only=True):
-    """A place from above. image: data URL; bounds: x0, y0, x1, y1 in metres; credit: of the map's
-    data."""
+    """Place from above.
+
+    image: data URL
+    bounds: x0, y0, x1, y1 in metres
+    credit: attribution of the map data
+    """
 
     place: str
     image: str
@@ -105,7 +125,7 @@ class PlacePicture(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Spot(msgspec.Struct, frozen=True, kw_only=True):
-    """Where something went wrong on a place. entry: the number of its card, -1 without one."""
+    """Position of a failure on a place. entry: index of its card, -1 without one."""
 
     x_m: float
     y_m: float

@@ -1,5 +1,4 @@
-"""The paper's three tables for the runs of a report: our figures with intervals, the paper's own
-below."""
+"""Tables of a report like the paper's three: own figures with intervals, the paper's below."""
 
 from __future__ import annotations
 
@@ -39,7 +38,7 @@ _PLACES: Final = ((False, "Generated places"), (True, "Real places"))
 
 
 class MeanOfEpisodes(NamedTuple):
-    """A mean, its interval, and of how many episodes."""
+    """Mean with its interval over n episodes."""
 
     mean: float
     low: float
@@ -51,8 +50,11 @@ _NOTHING: Final = MeanOfEpisodes(np.nan, np.nan, np.nan, 0)
 
 
 class TableRow(NamedTuple):
-    """A row of figures. notes: what a reader must know of it; suite, colour: in the summary of
-    all runs."""
+    """Row of figures.
+
+    notes: what a reader must know of it
+    suite, colour: only in the summary of all runs
+    """
 
     name: str
     cells: tuple[MeanOfEpisodes, ...]
@@ -64,11 +66,11 @@ class TableRow(NamedTuple):
 
 
 class ReportTable(NamedTuple):
-    """A table of the page.
+    """Table of the page.
 
-    spans: lines of (words, columns) above the heads.
-    edges: for each column whether a group of columns begins with it.
-    paper: rows of the paper's models.
+    spans: lines of (words, columns) above the heads
+    edges: for each column whether a group of columns begins with it
+    paper: rows of the paper's models
     """
 
     title: str
@@ -81,10 +83,10 @@ class ReportTable(NamedTuple):
 
 
 class RunWarnings(NamedTuple):
-    """Reasons against quoting figures.
+    """Reasons why figures are inconclusive.
 
-    unquotable: (run and suite, reason).
-    mixed: (suite, scenarios of each of its runs) where these differ.
+    unquotable: (run and suite, reason)
+    mixed: (suite, number of scenarios of each run) if these differ
     """
 
     unquotable: tuple[tuple[str, str], ...]
@@ -92,8 +94,11 @@ class RunWarnings(NamedTuple):
 
 
 class _Column(NamedTuple):
-    """One column: the rows of a table that it is about, and the metric. over, group: words above
-    its head."""
+    """Column of a table.
+
+    over, group: words above its head
+    of: column values that select its rows
+    """
 
     over: str
     group: str
@@ -103,13 +108,13 @@ class _Column(NamedTuple):
 
 
 def tables_of(runs: Sequence[ReportedRun]) -> list[ReportTable]:
-    """Return all tables that the runs have rows for."""
+    """Return all tables for which the runs have rows."""
     tables = [_unit(runs), *_reactive(runs), _long(runs), _other(runs)]
     return [table for table in tables if table is not None]
 
 
 def summary_table(runs: Sequence[ReportedRun], colours: Mapping[str, str]) -> ReportTable:
-    """Return a row for each run: the figures that are looked at first. colours: of the labels."""
+    """Return a table with one row of main figures per run. colours: by run label."""
     rows = []
     for run in runs:
         invalid = int((run.table["status"] == "invalid").sum())
@@ -127,7 +132,7 @@ def summary_table(runs: Sequence[ReportedRun], colours: Mapping[str, str]) -> Re
 
 
 def cell_of(table: pd.DataFrame, metric: str) -> MeanOfEpisodes:
-    """A metric over the rows of a table."""
+    """Return the mean of a metric over the rows of a table."""
     if not len(table):
         return _NOTHING
     mean, low, high, n = summary_of(table, [metric]).iloc[0]
@@ -135,7 +140,7 @@ def cell_of(table: pd.DataFrame, metric: str) -> MeanOfEpisodes:
 
 
 def episodes_of(runs: Iterable[ReportedRun], family: PaperTable) -> dict[str, pd.DataFrame]:
-    """By label the episodes of one family; labels without any are left out."""
+    """Return the episodes of one family by run label; labels without episodes are omitted."""
     found: dict[str, list[pd.DataFrame]] = {}
     for run in runs:
         part = run.table[run.table["family"] == family]
@@ -145,7 +150,7 @@ def episodes_of(runs: Iterable[ReportedRun], family: PaperTable) -> dict[str, pd
 
 
 def kind_in_words(kind: str) -> str:
-    """As a head of a column."""
+    """Return a scenario kind as a column head."""
     return kind.replace("ped_", "ped. ")
 
 
@@ -196,7 +201,7 @@ def _long(runs: Sequence[ReportedRun]) -> ReportTable | None:
 
 
 def _other(runs: Sequence[ReportedRun]) -> ReportTable | None:
-    """A row for each kind of scenario that the paper has not, with success and completion."""
+    """Return a table of scenario kinds that the paper lacks, with success and completion."""
     known = {"unit": UNIT_COLUMNS, "reactive": EVENT_COLUMNS, "long": ("route",)}
     found: dict[str, pd.DataFrame] = {}
     for run in runs:
@@ -263,7 +268,7 @@ def _part(table: pd.DataFrame, column: _Column) -> pd.DataFrame:
 
 
 def _notes(table: pd.DataFrame) -> str:
-    """Return what a reader must know of a row: its number of episodes, and what the policy knew."""
+    """Return the notes of a row: number of episodes, privileged policy, nonstandard camera."""
     notes = [f"{len(table)} episode{'s' * (len(table) != 1)}"]
     notes += ["crowd added"] * bool(table["crowd_added"].any())
     if table["privileged"].any():
@@ -273,8 +278,7 @@ def _notes(table: pd.DataFrame) -> str:
 
 
 def warnings_of(runs: Sequence[ReportedRun]) -> RunWarnings:
-    """Return why figures of runs should not be quoted, and which suites were run with different
-    scenarios."""
+    """Return which runs are inconclusive, and which suites were run with different scenarios."""
     reasons = [(run, not_to_be_quoted(run.table, len(run.spec.scenarios))) for run in runs]
     suites: dict[str, list[ReportedRun]] = {}
     for run in runs:

@@ -12,8 +12,7 @@ import numpy as np
 
 from cosim.core.state import Command, RobotState
 from cosim.episode.loop import Step
-from cosim.results.record import Ended
-from cosim.results.referee import Failure, Verdict
+from cosim.results.referee import Ended, Failure, Verdict
 from cosim.spec.scenario import Scenario
 
 _NEAR_M: Final = 1.2
