@@ -1,5 +1,4 @@
-"""How much room there is beside a route: the signed distance to the edge of free ground, on a
-lattice of points."""
+"""Distance field near a route: signed distance to the edge of the free area on a grid."""
 
 from __future__ import annotations
 
@@ -13,16 +12,19 @@ from cosim.place import overlay
 from cosim.place.street_map import WalkableArea
 
 LATTICE_M: Final = 0.2
+"""Grid spacing in metres."""
 _BESIDE_M: Final = 4.5
-"""Ground farther than this from the route is not looked at; it counts as not free."""
+"""Metres from the route covered by the field; farther points count as not free."""
 _FAR_OUT_M: Final = -1.0
+"""Lower bound of the signed distance in metres."""
 
 
 class Clearance:
-    """Distance in metres to the edge of the ground where the base centre may be, positive on it,
-    near a route.
+    """Signed distance in metres to the edge of the free area, positive inside, near a route.
 
-    free: that ground, `Privileged.free`. Exact on a lattice of LATTICE_M, bilinear between.
+    Exact on the grid, bilinear between.
+
+    free: Area for the robot's base centre, `Privileged.free`.
     """
 
     def __init__(self, free: Polygon | MultiPolygon, route: Polyline) -> None:
@@ -37,12 +39,12 @@ class Clearance:
         self.depth[self.rows(self.cells)] = np.maximum(depth, _FAR_OUT_M)
 
     def rows(self, cells: np.ndarray) -> np.ndarray:
-        """(N,) where points (N, 2) of the lattice stand in `depth`."""
+        """Return (N,) indices into `depth` of grid points (N, 2)."""
         at: np.ndarray = (cells[:, 0] - self.low[0]) * self.columns + cells[:, 1] - self.low[1]
         return at
 
     def at(self, xy: Floats) -> Floats:
-        """(...) metres at points (..., 2)."""
+        """Return (...) distances in metres at points (..., 2)."""
         scaled = xy / LATTICE_M - self.low
         u, v = (
             np.clip(scaled[..., 0], 0.0, self._most[0]),
@@ -59,7 +61,7 @@ class Clearance:
         return depth
 
     def uphill(self, xy: Floats) -> Floats:
-        """(N, 2) the way in which there is more room, of length 1 at most, at points (N, 2)."""
+        """Return (N, 2) gradients of the distance at points (N, 2), of length 1 at most."""
         half = 0.5 * LATTICE_M
         ways = [
             (self.at(xy + step) - self.at(xy - step)) / LATTICE_M
@@ -69,7 +71,7 @@ class Clearance:
 
 
 def _beside(route: Polyline) -> np.ndarray:
-    """(N, 2) the points of the lattice near a route, in whole steps of it."""
+    """Return (N, 2) integer grid points near a route."""
     count = int(_BESIDE_M / LATTICE_M)
     steps = np.arange(-count, count + 1)
     disk = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)

@@ -1,5 +1,4 @@
-"""The body that the baselines plan with: a robot as disks, in whole centimetres, so that nothing of
-it sticks out."""
+"""Robot body as disks that cover it, rounded up to whole centimetres."""
 
 from __future__ import annotations
 
@@ -10,8 +9,12 @@ from cosim.spec.robot import Robot
 
 
 class BodyDisks(NamedTuple):
-    """Two disks, `nose_m` before and behind the base centre, and one around it, `around_m`, that
-    hold the robot."""
+    """Disks that cover a robot.
+
+    nose_m: Distance of two disks before and behind the base centre.
+    radius_m: Radius of those disks.
+    around_m: Radius of a single disk around the base centre.
+    """
 
     nose_m: float
     radius_m: float

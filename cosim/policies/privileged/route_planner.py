@@ -1,7 +1,7 @@
-"""The line that the oracle follows: the reference route, led round what stands on it.
+"""Route planner of the oracle: shortest paths to the goal around standing obstacles.
 
-Searched once on the lattice of `clearance`, from the goal back to everywhere, and then drawn taut
-like a band that keeps off the edges.
+Dijkstra's algorithm on the grid of the distance field, from the goal to all points. The path is
+then smoothed like a rubber band that keeps off the edges.
 """
 
 from __future__ import annotations
@@ -18,23 +18,29 @@ from cosim.policies.privileged.distance_field import LATTICE_M, Clearance
 from cosim.policies.privileged.standing_groups import distances
 
 _WANTED_M: Final = 0.5
-"""Room to either side that is worth a way round."""
+"""Wanted distance in metres to the edge of the free area."""
 _TIGHT_COST: Final = 6.0
-"""How many times dearer a metre without any room is."""
+"""Extra cost factor of a metre at the edge."""
 _ASIDE_COST: Final = 0.15
-"""What a metre costs more for each metre that it lies beside the route."""
+"""Extra cost factor per metre of distance from the route."""
 _LEAST_M: Final = 0.03
+"""Smallest distance in metres to the edge for a grid point to be used."""
 _PERSON_M: Final = PERSON_RADIUS_M + 0.45
+"""Metres around a standing person that are avoided."""
 _PERSON_COST: Final = 60.0
-"""How near to who stands, and how many times dearer, a metre is then."""
+"""Extra cost factor of a metre near a standing person."""
 _STEP_M: Final = 0.4
+"""Metres between points of a path."""
 _ROUNDS: Final = 60
+"""Number of smoothing iterations."""
 _PUSH: Final = 0.3
+"""Step of the push off the edges in one iteration."""
 _NEIGHBOURS: Final = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))
+"""Offsets of half of the 16 grid neighbours; the graph is undirected."""
 
 
 class Guide:
-    """Ways to the end of a route from wherever the robot is."""
+    """Paths to the end of a route from any position."""
 
     def __init__(self, clearance: Clearance, route: Polyline) -> None:
         self.clearance = clearance
@@ -55,8 +61,11 @@ class Guide:
         self.search(np.zeros((0, 2, 2)))
 
     def search(self, ends: Floats) -> None:
-        """Find the ways anew, round people who stand along lines (M, 2, 2) m."""
-        from scipy.sparse import csr_array  # 0.2 s, for those who are guided
+        """Recompute the paths.
+
+        ends: (M, 2, 2) lines in metres along which people stand.
+        """
+        from scipy.sparse import csr_array  # takes 0.2 s to import
         from scipy.sparse.csgraph import dijkstra
 
         count = len(self._points)
@@ -74,8 +83,8 @@ class Guide:
         )
 
     def from_here(self, xy: Floats) -> Polyline:
-        """The way from (2,) metres to the end of the route; the route itself where none is
-        known."""
+        """Return the path from (2,) metres to the end of the route; the route itself if
+        unreachable."""
         known = np.isfinite(self._far)
         if not known.any():
             return self._route
@@ -92,7 +101,7 @@ class Guide:
         return int(np.argmin(np.where(among, off[:, 0] ** 2 + off[:, 1] ** 2, np.inf)))
 
     def _taut(self, points: Floats) -> Polyline:
-        """The line drawn taut, but pushed off what is nearer than _WANTED_M; its ends stay."""
+        """Return the smoothed line, pushed off edges nearer than _WANTED_M; its ends are fixed."""
         points = points.copy()
         for _ in range(_ROUNDS):
             inner = points[1:-1]
@@ -103,7 +112,7 @@ class Guide:
 
 
 def _aside(points: Floats, route: Polyline) -> Floats:
-    """(N,) metres from points (N, 2) to a route."""
+    """Return (N,) distances in metres from points (N, 2) to a route."""
     line = LineString(route.points)
     shapely.prepare(line)
     return np.asarray(shapely.distance(line, shapely.points(points)), dtype=float)
