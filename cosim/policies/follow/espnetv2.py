@@ -1,11 +1,11 @@
-"""ESPNetv2 for streets as an ONNX graph, made of its published weights.
+"""Convert published weights of ESPNetv2 for streets to an ONNX graph.
 
     python -m cosim.policies.follow.espnetv2 espnetv2_s_1.0_city_512x256.pth [-o FOLDER]
 
 Source: S. Mehta et al., "ESPNetv2: a light-weight, power efficient, and general purpose
-convolutional neural network", arXiv 1811.11431: EESP units, strided ones with the picture fed in
-again at each size, and a decoder of efficient pyramids of pooled sizes, for 20 classes of
-Cityscapes. It needs no PyTorch, and takes `pip install 'sidewalk-cosim[convert]'`.
+    convolutional neural network", arXiv 1811.11431. The encoder has EESP units; strided ones also
+    get the resized picture. The decoder has efficient pyramids of pooled sizes, for 20 classes of
+    Cityscapes. It needs no PyTorch, but `pip install 'sidewalk-cosim[convert]'`.
 """
 
 from __future__ import annotations
@@ -23,26 +23,29 @@ from cosim.policies.follow.torch_file import read_torch_file
 from cosim.policies.onnx.converting import Converter, GraphWriter, PublishedArrays
 
 HEIGHT: Final = 256
+"""Height of the picture in pixels."""
 WIDTH: Final = 512
+"""Width of the picture in pixels."""
 _CLASSES: Final = 20
 _SCALES: Final = (2.0, 1.5, 1.0, 0.5, 0.1)
-"""The sizes at which a pyramid looks at its input."""
+"""Relative sizes at which a pyramid processes its input."""
 _PLANES: Final = 10
 """Channels of a pyramid at each size."""
 _DECODER: Final = ((64, 64), (48, 16), (32, 32))
-"""Channels of each step of the decoder, and groups of the convolution that brings the encoder's to
-them."""
+"""Channels of each decoder step, and groups of the convolution of the encoder's output."""
 
 
 def street_graph(weights: dict[str, NDArray[Any]]) -> bytes:
-    """The graph as ONNX: `picture` (1, 3, 256, 512), RGB / 255, normalised as for ImageNet, to
-    `scores` (1, 20, 128, 256), half the size of the picture. Raises ValueError where the weights
-    are not those of this network."""
+    """Build the ONNX graph.
+
+    Input `picture` (1, 3, 256, 512) is RGB / 255, normalised as for ImageNet. Output `scores` (1,
+    20, 128, 256) has half the size. Raises ValueError for weights of another network.
+    """
     return _Builder(weights).street()
 
 
 class _Builder:
-    """Operators one behind the other; a name of a tensor stands for it."""
+    """Builds the graph; tensors are identified by name."""
 
     def __init__(self, weights: dict[str, NDArray[Any]]) -> None:
         self._weights = PublishedArrays(weights)
@@ -73,7 +76,7 @@ class _Builder:
             out = self._op("Add", merged, self._resized(out, planes, size))
             out = self._act(self._norm(out, f"bu_br_l{step}.0"), f"bu_br_l{step}.1")
             out = self._pyramid(out, f"bu_dec_l{step}", size)
-        # The file holds a last activation of strided units, which the network leaves out.
+        # The file contains a last activation of strided units, which the network does not use.
         unused = tuple(f"base_net.level{n}_0.eesp.module_act.weight" for n in (2, 3, 4))
         self._weights.check_all_taken(
             lambda name: name in unused or name.endswith(".num_batches_tracked")
@@ -84,8 +87,8 @@ class _Builder:
         )
 
     def _unit(self, x: str, name: str, dilations: tuple[int, ...], stride: int = 1) -> str:
-        """An EESP unit: projected in groups, seen at growing dilations, each added to the one
-        before, joined again."""
+        """Add an EESP unit: grouped projection, summed dilated convolutions, and grouped
+        expansion."""
         groups = len(dilations)
         projected = self._conv_act(x, f"{name}.proj_1x1", groups=groups)
         planes = self._weights.take(f"{name}.spp_dw.0.conv.weight").shape[0]
@@ -109,8 +112,7 @@ class _Builder:
         return joined if stride > 1 else self._act(self._op("Add", joined, x), f"{name}.module_act")
 
     def _down(self, x: str, name: str, picture: str) -> str:
-        """A strided unit beside an average of its input, and the picture in that size added to
-        both."""
+        """Add a strided unit, concatenated with the averaged input, plus the resized picture."""
         strided = self._unit(x, f"{name}.eesp", (1, 2, 3, 4), stride=2)
         both = self._op("Concat", self._halved(x), strided, axis=1)
         again = self._conv(
@@ -121,7 +123,7 @@ class _Builder:
         )
 
     def _pyramid(self, x: str, name: str, size: tuple[int, int]) -> str:
-        """An efficient pyramid: few channels, seen at five sizes, shuffled, and merged."""
+        """Add an efficient pyramid: few channels at five sizes, shuffled and merged."""
         x = self._conv_act(x, f"{name}.projection_layer", "cbr.0", "cbr.1", "cbr.2")
         seen = []
         for i, scale in enumerate(_SCALES):
@@ -153,7 +155,7 @@ class _Builder:
         )
 
     def _merged(self, x: str, name: str, groups: int) -> str:
-        """What the encoder saw, weighed by channel."""
+        """Weight the encoder's output by channel."""
         weight = self._op(
             "Sigmoid", self._conv(self._op("GlobalAveragePool", x), f"{name}.wt_layer.1")
         )
@@ -204,8 +206,8 @@ class _Builder:
         return self._op("BatchNormalization", x, *numbers, epsilon=1e-5)
 
     def _act(self, x: str, name: str) -> str:
-        """PReLU in four operators: the same bits as the one called so, which takes the runtime
-        twice as long."""
+        """Add PReLU as four operators: bit-identical to the operator, and twice as fast in
+        onnxruntime."""
         above = self._op("Relu", x)
         slope = self._constant(self._weights.take(f"{name}.weight").reshape(-1, 1, 1))
         return self._op("Add", above, self._op("Mul", self._op("Sub", x, above), slope))
@@ -227,7 +229,7 @@ class _Builder:
         )
 
     def _pooled(self, x: str, size: tuple[int, int], to: tuple[int, int]) -> str:
-        """Averages over parts of unequal size, as two products with matrices."""
+        """Add adaptive average pooling as two matrix products."""
         rows = self._op("MatMul", self._constant(_parts(size[0], to[0])), x)
         return self._op(
             "MatMul", rows, self._constant(np.ascontiguousarray(_parts(size[1], to[1]).T))
@@ -241,8 +243,7 @@ class _Builder:
 
 
 def _parts(count: int, parts: int) -> NDArray[np.float32]:
-    """(parts, count): the mean of each of so many parts of a row, which overlap where it does not
-    divide evenly."""
+    """Return (parts, count): the averaging matrix of adaptive pooling; parts may overlap."""
     weights = np.zeros((parts, count), np.float32)
     for i in range(parts):
         begin = i * count // parts

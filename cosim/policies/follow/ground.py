@@ -1,7 +1,6 @@
-"""The ground before the robot, as its camera sees it: which of it is walkable, and where on it
-people stand.
+"""Map of the ground in front of the robot: walkable cells and people.
 
-The ground is taken for a plane; the robot's lean is not known.
+The ground is assumed to be a plane; the robot's tilt is unknown.
 """
 
 from __future__ import annotations
@@ -19,37 +18,41 @@ from cosim.policies.onnx.pictures import picture_numbers
 from cosim.spec.camera import Calibration
 
 GROUND_CELL_M: Final = 0.1
+"""Side of a cell in metres."""
 GROUND_AHEAD_M: Final = 8.0
+"""Metres ahead of the robot's centre covered by the map."""
 GROUND_ASIDE_M: Final = 4.0
-"""What is looked at: from the robot's middle to so far ahead, and so far to either side."""
-_HOW: Final = PictureInput(size=(512, 256), mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225))
+"""Metres to either side covered by the map."""
+_STREET_INPUT: Final = PictureInput(size=(512, 256), mean=(0.485, 0.456, 0.406), std=(0.229, 0.224, 0.225))
+"""Preprocessing of the picture for ESPNetv2."""
 _ROAD = 0
 _SIDEWALK = 1
 _LIGHT = 6
 _SIGN = 7
 _SKY = 10
 _NO_OBSTACLE: Final = (_ROAD, _SIDEWALK, _LIGHT, _SIGN, _SKY)
-"""Classes of Cityscapes that stop nobody: most of a near sidewalk is road to a network that learned
-from cars; lights, signs and sky do not stand on the ground, but are seen in the joints of a
-pavement."""
+"""Classes of Cityscapes that are not obstacles. A network trained on cars labels most of a near
+sidewalk road. Lights, signs and sky are false detections in the joints of a pavement."""
 _SPECKS: Final = 5
-"""Specks of up to half so many pixels are wiped out."""
+"""Size of the median filter in pixels."""
 
 
 def walkable_pixels(rgb: NDArray[np.uint8], network: Graph) -> NDArray[np.bool_]:
-    """(128, 256): where a picture (H, W, 3) shows what can be driven on."""
-    tensor = np.ascontiguousarray(picture_numbers(rgb, _HOW).transpose(2, 0, 1)[None], np.float32)
+    """Return (128, 256): whether a picture (H, W, 3) shows walkable area."""
+    tensor = np.ascontiguousarray(picture_numbers(rgb, _STREET_INPUT).transpose(2, 0, 1)[None], np.float32)
     kinds = network.ask({"picture": tensor}, ["scores"])["scores"][0].argmax(axis=0)
     free = np.isin(kinds, _NO_OBSTACLE).astype(np.uint8)
     return np.asarray(cv2.medianBlur(free, _SPECKS), np.bool_)
 
 
 class Ground:
-    """Cells of `GROUND_CELL_M`: rows ahead from the robot's middle, columns from the right to the
-    left."""
+    """Map with cells of `GROUND_CELL_M`: rows ahead from the robot's centre, columns from right to
+    left.
+
+    size: Width and height of the picture.
+    """
 
     def __init__(self, camera: Calibration, size: tuple[int, int]) -> None:
-        """size: width and height of the picture."""
         self._camera = camera
         self._size = size
         ahead = np.arange(0.0, GROUND_AHEAD_M, GROUND_CELL_M) + 0.5 * GROUND_CELL_M
@@ -66,7 +69,7 @@ class Ground:
         self._share = np.clip(pixels / np.array(size), 0.0, 0.999)
 
     def free(self, walkable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """(80, 80): which cells are walkable; those that no pixel shows are taken to be."""
+        """Return (80, 80): whether cells are walkable; invisible cells count as walkable."""
         rows, columns = walkable.shape
         there = walkable[
             (self._share[..., 1] * rows).astype(int), (self._share[..., 0] * columns).astype(int)
@@ -74,8 +77,10 @@ class Ground:
         return np.asarray(there | ~self._seen)
 
     def feet_of(self, boxes: Floats) -> Floats:
-        """(N, 2): where on the ground, in the robot's frame, the people in boxes (N, 4) stand;
-        those whose feet are not below the horizon, or farther than is looked at, are left out."""
+        """Return (N, 2) ground positions in the robot's frame of people in boxes (N, 4).
+
+        People whose feet are above the horizon or beyond `GROUND_AHEAD_M` are left out.
+        """
         if not len(boxes):
             return np.zeros((0, 2))
         bottom = np.minimum(boxes[:, 3], self._size[1] - 1.0)

@@ -1,8 +1,6 @@
-"""NetworkFile out of a PyTorch file of before 2020, without PyTorch: pickles, one behind the other,
-then raw numbers.
+"""Read arrays of a PyTorch file from before 2020 without PyTorch: pickles followed by raw numbers.
 
-Nothing of such a file is run: of all names that a pickle may ask for, those of tensors are known,
-and no others.
+No code of the file is run: only the classes of tensors are known.
 """
 
 from __future__ import annotations
@@ -16,16 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 _MAGIC: Final = 0x1950A86A20F9469CFC6C
+"""First pickled number of such a file."""
 _KINDS: Final = {"FloatStorage": "<f4", "LongStorage": "<i8"}
+"""Types of numbers by their storage class."""
 _Stored = tuple[str, str]
-"""Kind and key of a run of numbers."""
+"""Type and key of a block of numbers."""
 
 
 def read_torch_file(data: bytes) -> dict[str, NDArray[Any]]:
-    """Arrays by their names. Raises ValueError for what is no such file, or holds anything but
-    arrays."""
+    """Return arrays by name. Raises ValueError for an invalid file or other objects."""
     try:
-        return _read(io.BytesIO(data))
+        return _read_torch(io.BytesIO(data))
     except (
         pickle.UnpicklingError,
         EOFError,
@@ -39,7 +38,7 @@ def read_torch_file(data: bytes) -> dict[str, NDArray[Any]]:
         ) from None
 
 
-def _read(file: io.BytesIO) -> dict[str, NDArray[Any]]:
+def _read_torch(file: io.BytesIO) -> dict[str, NDArray[Any]]:
     if _Pickle(file).load() != _MAGIC:
         raise ValueError(
             "no PyTorch file of weights in the form of before 2020: it begins otherwise"
@@ -66,20 +65,20 @@ def _read(file: io.BytesIO) -> dict[str, NDArray[Any]]:
 
 
 class _Pickle(pickle.Unpickler):
-    """Knows tensors, and refuses whatever else a pickle asks for."""
+    """Unpickler that knows tensors and rejects all other classes."""
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == ("collections", "OrderedDict"):
             return OrderedDict
         if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
-            return _tensor
+            return _stored_tensor
         if module == "torch" and name in _KINDS:
             return _KINDS[name]
         raise ValueError(f"holds a {module}.{name}: weights alone are read")
 
-    def persistent_load(self, told: Any) -> _Stored:
-        return told[1], told[2]
+    def persistent_load(self, identifier: Any) -> _Stored:
+        return identifier[1], identifier[2]
 
 
-def _tensor(stored: _Stored, offset: int, shape: Any, steps: Any, *_: Any) -> Any:
+def _stored_tensor(stored: _Stored, offset: int, shape: Any, steps: Any, *_: Any) -> Any:
     return stored, offset, shape, steps

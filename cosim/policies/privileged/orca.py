@@ -9,7 +9,7 @@ area and signal timing. Future motion is predicted at constant velocity (`people
 2. Adjust the velocity towards that lane by ORCA half-planes (`cosim.people.orca`) of moving people.
 The robot does all of the avoiding.
 3. Roll out many plans (`rollout`), and take the one closest to that velocity that keeps clear of
-people and stays on the free area (`distance_field`).
+people and stays on the free area (`Clearance`).
 
 The robot limits its speed to stop before red signals, vehicles near a crossing, gestures and the
 crowd directly ahead. It stops for people who walk at it or across its path, because people walk
@@ -28,14 +28,13 @@ from cosim.core.geometry import Floats, Polyline, wrap_angles
 from cosim.core.state import DIRECTED, PERSON_RADIUS_M, Command, People
 from cosim.episode.interfaces import Observation, Privileged
 from cosim.people.orca import best_velocity, half_plane
-from cosim.policies.privileged.distance_field import Clearance
 from cosim.policies.privileged.people_prediction import Yielding, bodies, gaps_to_people, walks
-from cosim.policies.privileged.robot_disks import BodyDisks
 from cosim.policies.privileged.rollout import (
     STEP_S,
     STEP_TIMES_S,
     STEPS,
     Ahead,
+    BodyDisks,
     Plans,
     Way,
     foresee,
@@ -47,7 +46,7 @@ from cosim.policies.privileged.route import (
     car_disks,
     crossing_limit,
 )
-from cosim.policies.privileged.route_planner import Guide
+from cosim.policies.privileged.route_planner import Clearance, Guide
 from cosim.policies.privileged.standing_groups import distances, lines, who_stands
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import Robot

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Floats, wrap_angles
 from cosim.core.state import DIRECTED, PERSON_RADIUS_M, People
 from cosim.episode.interfaces import Privileged
-from cosim.policies.privileged.robot_disks import BodyDisks
-from cosim.policies.privileged.rollout import STEP_TIMES_S, Ahead
+from cosim.policies.privileged.rollout import STEP_TIMES_S, Ahead, BodyDisks
 from cosim.policies.privileged.standing_groups import distances, who_stands
 from cosim.spec.robot import Robot
 

@@ -16,7 +16,7 @@ from cosim.core.geometry import Floats, Polyline, wrap_angle
 from cosim.core.state import PERSON_RADIUS_M, Command
 from cosim.episode.control import clipped
 from cosim.episode.interfaces import Observation, Privileged
-from cosim.policies.privileged.robot_disks import BodyDisks
+from cosim.policies.privileged.rollout import BodyDisks
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import Robot
 
