@@ -1,9 +1,9 @@
 """Build DroNet's graph.
 
 Source: A. Loquercio et al., "DroNet: learning to fly by driving", IEEE Robotics and Automation
-    Letters 3 (2018). A ResNet of three blocks, each of which halves the size, then steering and the
-    probability of a collision. Tensors have the layer names of the weight file, connected as in the
-    published `model_struct.json`.
+Letters 3 (2018). A ResNet of three blocks, each of which halves the size, then steering and the
+probability of a collision. Tensors have the layer names of the weight file, connected as in the
+published `model_struct.json`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Build the graph of OpenBot's driving network.
 
 Source: M. Müller and V. Koltun, "OpenBot: turning smartphones into robots", arXiv 2008.10631:
-    convolutions of the picture, with the command as input of three layers. The file is converted
-    operator by operator. Tensor 7 is named t7; the weights of operator 7 are w7 and b7, or p7.
+convolutions of the picture, with the command as input of three layers. The file is converted
+operator by operator. Tensor 7 is named t7; the weights of operator 7 are w7 and b7, or p7.
 
 Most weights are int8 with a scale. The graph computes in float32 with dequantized weights, while
 TensorFlow Lite also quantizes the activations. Its wheel speeds differ by up to 0.02.
