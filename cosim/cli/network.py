@@ -397,7 +397,7 @@ def serve_command(
             listen=connection.listen,
             connect=connection.connect,
             jpeg=jpeg,
-            told=first.manifest,
+            manifest=first.manifest,
             source=first.source_hash,
             decoder=ObservationDecoder,
             session=session.itself,
