@@ -1,6 +1,6 @@
-"""What a folder of `--tls` says: whose it is, until when, and whether its files belong together.
+"""Check the certificate files of `--tls`: role, validity and consistency.
 
-Zenoh refuses wrong files without saying which, so they are looked at before a session is opened.
+Zenoh rejects wrong files without a reason, so they are checked before a session is opened.
 """
 
 from __future__ import annotations
@@ -22,12 +22,15 @@ CA = "ca.pem"
 CERTIFICATE = "cert.pem"
 KEY = "key.pem"
 SOON: Final = timedelta(days=30)
-"""Before the end so long it is said that a certificate ends."""
+"""Time before its end from which a certificate counts as expiring."""
 
 
 class Identity(NamedTuple):
-    """A certificate as it was read. hosts: the names that others may reach it by; ends: when it, or
-    what it is issued by, expires."""
+    """Certificate of a role.
+
+    hosts: Names by which others may connect.
+    begins, ends: Validity, limited by the authority's.
+    """
 
     role: Role
     hosts: tuple[str, ...]
@@ -36,15 +39,14 @@ class Identity(NamedTuple):
 
 
 def identity_in(folder: Path) -> Identity:
-    """Whose the files of a folder are. Raises AccessError when one is missing, or they do not
-    belong together."""
+    """Read the files of a folder. Raises AccessError if one is missing or they do not match."""
     certificate, authority = (_certificate(folder / name) for name in (CERTIFICATE, CA))
     key = folder / KEY
     try:
-        ours = load_pem_private_key(_read(key), None).public_key() == certificate.public_key()
+        matches = load_pem_private_key(_read(key), None).public_key() == certificate.public_key()
     except (ValueError, TypeError) as error:
         raise AccessError(f"{key}: holds no private key without a password") from error
-    if not ours:
+    if not matches:
         raise AccessError(
             f"{key} is not the key of {folder / CERTIFICATE}: copy the whole folder from "
             f"where it was made"
@@ -76,8 +78,10 @@ def identity_in(folder: Path) -> Identity:
 
 
 def checked_identity(connection: Connection, now: datetime | None = None) -> str:
-    """Check the files that one end of a session shows, and say if they end soon, else "". Raises
-    AccessError."""
+    """Check the files for a connection; return a warning if they expire soon, else "".
+
+    Raises AccessError.
+    """
     folder = Path(connection.tls)
     found = identity_in(folder)
     now = datetime.now(UTC) if now is None else now
@@ -102,13 +106,13 @@ def checked_identity(connection: Connection, now: datetime | None = None) -> str
 
 
 def time_left(identity: Identity) -> str:
-    """Until when it is valid, and how long that is."""
+    """Return the end of validity and the days left as text."""
     days = (identity.ends - datetime.now(UTC)).days
     return f"{identity.ends:%Y-%m-%d} ({f'{days} days' if days >= 0 else 'expired'})"
 
 
 def said(moment: datetime) -> str:
-    """A moment as it is printed."""
+    """Format a time."""
     return f"{moment:%Y-%m-%d %H:%M} UTC"
 
 

@@ -1,5 +1,5 @@
-"""Why a TLS connection was refused: by another handshake, because Zenoh only says that it timed
-out."""
+"""Find out why a TLS connection was refused with a second handshake: Zenoh only reports a
+timeout."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from bridge.security.identity import CA, CERTIFICATE, KEY
 from cosim.spec.connection import Connection
 
 _PATIENCE_S: Final = 3.0
+"""Timeout of the handshake in seconds."""
 _OTHER_AUTHORITY: Final = (
     "was issued by another authority than {folder}/ca.pem: both need `cosim certs` of one authority"
 )
@@ -26,7 +27,7 @@ _OF_THE_HUB: Final = {
     64: "is not for the address {host}: connect to a name of it, or make it anew with --host "
     "{host}",
 }
-"""By OpenSSL's numbers (X509_V_ERR_...)."""
+"""Faults of the hub's certificate by OpenSSL's error numbers (X509_V_ERR_...)."""
 _OF_OURS: Final = {
     "UNKNOWN_CA": "was issued by another authority than the one there trusts",
     "DECRYPT_ERROR": "was issued by another authority of the same name",
@@ -35,11 +36,11 @@ _OF_OURS: Final = {
     "BAD_CERTIFICATE": "was not accepted there",
     "UNSUPPORTED_CERTIFICATE": "is not of one who connects",
 }
-"""By the ends of TLS alerts' names."""
+"""Faults of our certificate by the end of the TLS alert's name."""
 
 
 def why_refused(connection: Connection) -> str:
-    """Why the other side and this one do not agree; "" where nobody answers, or they do agree."""
+    """Return why the handshake fails; "" if it succeeds or there is no answer."""
     host, _, port = connection.connect.partition("/")[2].rpartition(":")
     host = host.strip("[]")
     folder = Path(connection.tls)
@@ -51,9 +52,7 @@ def why_refused(connection: Connection) -> str:
             socket.create_connection((host, int(port)), timeout=_PATIENCE_S) as plain,
             context.wrap_socket(plain, server_hostname=host) as guarded,
         ):
-            guarded.recv(
-                1
-            )  # what TLS 1.3 has against a client's certificate is said after the handshake
+            guarded.recv(1)  # TLS 1.3 rejects a client's certificate after the handshake
     except ssl.SSLCertVerificationError as error:
         words = _OF_THE_HUB.get(error.verify_code, f"was refused: {error.verify_message}")
         return f"the certificate of {connection.connect} {words.format(host=host, folder=folder)}"

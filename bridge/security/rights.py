@@ -1,10 +1,8 @@
-"""Who may do what on a hub: by the role that a certificate names, and by the way that somebody
-came.
+"""Access rights on a hub by role and transport.
 
-What no row allows is refused: only the run itself, which comes by a socket of its own
-(`Session.inside`), tells where robot and crowd are, and only the hub gives out episodes. Where
-there are no certificates (TCP of this machine, or --insecure) everybody may do what all roles that
-belong at such a hub may do together, and no more.
+Everything else is denied. Only the run itself, which uses a private socket (`Session.inside`),
+publishes positions, and only the hub assigns episodes. Without certificates (TCP of this machine,
+or --insecure) every client has the rights of all roles allowed at the hub.
 """
 
 from __future__ import annotations
@@ -17,9 +15,14 @@ _ENV = "cosim/*/env/*"
 
 
 class _Rights(NamedTuple):
-    """words: what they are, for whoever reads them. The rest are key expressions. ask: may be
-    asked; hear: what is told there is heard; answer: may be answered on; show: tokens of being
-    alive may be shown."""
+    """Rights of a role, as key expressions.
+
+    words: Description for users.
+    ask: Keys it may query.
+    hear: Keys it may subscribe to.
+    answer: Keys on which it may declare queryables.
+    show: Keys of its liveliness tokens.
+    """
 
     words: str
     ask: tuple[str, ...] = ()
@@ -52,12 +55,13 @@ RIGHTS: Final[dict[Role, _Rights]] = {
     ),
     "injector": _Rights("inject pedestrians", ask=(f"{_ENV}/inject", f"{_ENV}/status")),
 }
+"""Rights by role."""
 _ADMITTED: Final[dict[Role, tuple[Role, ...]]] = {
     "coordinator": ("worker", "policy", "viewer", "injector", "coordinator"),
     "director": ("worker", "coordinator"),
     "policy": ("worker", "coordinator", "policy"),
 }
-"""Whom a hub has business with."""
+"""Roles allowed at each hub."""
 _LARGEST_B: Final = {
     64 << 10: (f"{_ENV}/inject", "cosim/*/jobs/claim"),
     1 << 20: (f"{_ENV}/director",),
@@ -67,7 +71,7 @@ _LARGEST_B: Final = {
         *(f"{_ENV}/{key}" for key in ("status", "log", "camera")),
     ),
 }
-"""Longer messages are dropped unread. All others are bounded by what a session takes at all."""
+"""Size limit in bytes by key; larger messages are dropped. Others have the session's limit."""
 _ALL: Final = (
     "put",
     "delete",
@@ -79,11 +83,14 @@ _ALL: Final = (
     "declare_liveliness_subscriber",
     "liveliness_query",
 )
+"""All types of messages in Zenoh's access control."""
 
 
 def access_of(connection: Connection) -> dict[str, object]:
-    """Zenoh's settings for a hub: whom it lets do what, and how long their messages may be. Of one
-    that listens at a Unix socket: none, because the file's permissions decide who comes."""
+    """Return Zenoh's settings for the access rights and size limits of a hub.
+
+    Empty for a Unix socket, which is protected by file permissions.
+    """
     if connection.listen.startswith("unixsock-stream/"):
         return {}
     guests = _ADMITTED[connection.role]
@@ -127,7 +134,7 @@ def access_of(connection: Connection) -> dict[str, object]:
 
 
 def _rules(role: Role) -> list[dict[str, object]]:
-    """What messages of whom a role's rights amount to, into the hub and out of it."""
+    """Return the access rules of a role, for messages into and out of the hub."""
     may = RIGHTS[role]
     rules = [
         _rule(f"{role} asks", "ingress", ("query",), may.ask),

@@ -1,5 +1,4 @@
-"""How a session is set: over the endpoints that are named, found by nobody else, with no memory
-shared."""
+"""Zenoh settings of a session: explicit endpoints, no discovery, no shared memory."""
 
 from __future__ import annotations
 
@@ -19,12 +18,13 @@ _ALWAYS: Final[dict[str, object]] = {
     "transport/shared_memory/enabled": False,
     "transport/link/rx/max_message_size": 16 << 20,
 }
+"""Settings of every session."""
 CONNECTS_WITHIN_S: Final = 2.0
-"""So long an end that connects tries to; a hub that has just been started is there sooner."""
+"""Timeout in seconds to connect; a hub that was just started needs less."""
 
 
 def settings_alone() -> dict[str, object]:
-    """Of a session with nobody else in it, by Zenoh's names of settings."""
+    """Return the settings of a session without endpoints."""
     return _ALWAYS | {
         "mode": "peer",
         "listen/endpoints": [],
@@ -34,7 +34,10 @@ def settings_alone() -> dict[str, object]:
 
 
 def settings_of(connection: Connection, own: Sequence[str] = ()) -> dict[str, object]:
-    """Of one end of a session. own: where else it listens, for processes of its own."""
+    """Return the settings of one end of a session.
+
+    own: Further endpoints to listen at, for processes of this run.
+    """
     settings = _ALWAYS | {
         "mode": "router" if connection.listen else "client",
         "listen/endpoints": [connection.listen, *own] if connection.listen else [],
