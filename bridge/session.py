@@ -413,7 +413,7 @@ def _connected(connection: Connection) -> Session:
         )
     except EngineError as error:
         if connection.tls:
-            from bridge.security.refusal import why_refused
+            from bridge.security.identity import why_refused
 
             if why := why_refused(connection):
                 raise AccessError(why) from error

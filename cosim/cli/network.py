@@ -95,7 +95,7 @@ def show_certificates(
     """Show whose the certificates of a folder are, how they are reached, what they may do, and
     until when."""
     from bridge.security.identity import identity_in, time_left
-    from bridge.security.rights import RIGHTS
+    from bridge.security.settings import RIGHTS
 
     places = (folder, *(folder / name for name in get_args(Role)))
     found = [path for path in places if (path / "cert.pem").exists()]
