@@ -68,7 +68,7 @@ class AboutEpisode(msgspec.Struct, frozen=True):
     knowledge: bytes = b""
 
 
-class _Signed(msgspec.Struct, frozen=True):
+class _EpisodeMessage(msgspec.Struct, frozen=True):
     """Message with run, episode and attempt, to reject replies to other runs or attempts."""
 
     run: str
@@ -80,13 +80,13 @@ class _Signed(msgspec.Struct, frozen=True):
         return self.run, self.episode, self.attempt
 
 
-class AskReset(_Signed, frozen=True, tag="reset"):
+class AskReset(_EpisodeMessage, frozen=True, tag="reset"):
     """Request: an episode begins."""
 
     seed: int
 
 
-class AskAct(_Signed, frozen=True, tag="act"):
+class AskAct(_EpisodeMessage, frozen=True, tag="act"):
     """Request: an observation.
 
     step: Number of this request, from 0.
@@ -108,7 +108,7 @@ class AskAct(_Signed, frozen=True, tag="act"):
     knowledge: bytes = b""
 
 
-class AskEnded(_Signed, frozen=True, tag="ended"):
+class AskEnded(_EpisodeMessage, frozen=True, tag="ended"):
     """Request: the episode ended."""
 
 
@@ -127,11 +127,11 @@ class PolicyInfo(msgspec.Struct, frozen=True, tag="info"):
     protocol: int = POLICY_PROTOCOL
 
 
-class Begun(_Signed, frozen=True, tag="begun"):
+class Begun(_EpisodeMessage, frozen=True, tag="begun"):
     """Reply: the policy was reset, or the episode was closed."""
 
 
-class Answer(_Signed, frozen=True, tag="answer"):
+class Answer(_EpisodeMessage, frozen=True, tag="answer"):
     """Reply: a command, waypoints, or with `planned` both."""
 
     step: int
@@ -235,7 +235,7 @@ def _line_of(error: BaseException) -> str:
     return found
 
 
-class _Given(SimpleNamespace):
+class _PlainFields(SimpleNamespace):
     """Goal, pose or picture. As a numpy array: its picture or only array, else its numbers."""
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> Any:
@@ -256,9 +256,9 @@ class EpisodeDecoder:
     """
 
     makes: ClassVar[dict[str, Any]] = {
-        **dict.fromkeys(("camera", "picture", "odometry"), _Given),
+        **dict.fromkeys(("camera", "picture", "odometry"), _PlainFields),
         **dict.fromkeys(("robot", "observation"), SimpleNamespace),
-        "goal": lambda type, **fields: _Given(**fields),
+        "goal": lambda type, **fields: _PlainFields(**fields),
     }
 
     def __init__(self, episode: str, about: AboutEpisode) -> None:
@@ -439,12 +439,11 @@ class PolicyDesk:
         except Exception as error:  # noqa: BLE001  whatever is wrong with the message
             slot.reply = Refusal("message", f"not an observation: {error}"[:MOST_WORDS])
             return None
+        earlier = slot.reply
         if one.reset and callable(on_reset := getattr(slot.policy, "on_reset", None)):
             with self._call([slot], "on_reset", one.tick):
                 on_reset(*([slot.called] if self._for_many else []))
-                return observation
-            return None
-        return observation
+        return observation if slot.reply is earlier else None
 
     def _answer(self, group: list[tuple[_Slot, AskAct, Any]]) -> None:
         """Query the policy for a group; an invalid answer affects only its episode."""

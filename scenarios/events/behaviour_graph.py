@@ -188,9 +188,7 @@ def behavior_graph(
     idle = np.concatenate([idle, np.zeros(len(middles), dtype=bool)])
     ends = _pairs(xy, middles)
     ends = ends[shapely.covers(footing, _segments(xy[ends[:, 0]], xy[ends[:, 1]]))]
-    found, at = _places(
-        list(spots(street_map, props, buildings)), xy, open_ground, footing, strips, things
-    )
+    found, at = _places(list(spots(street_map, props, buildings)), xy, open_ground, strips, things)
     spurs = np.column_stack([at, len(xy) + np.arange(len(at))]).reshape(-1, 2)
     places = np.array([(s.x_m, s.y_m) for s in found]).reshape(-1, 2)
     return _joined(
@@ -270,7 +268,6 @@ def _places(
     offered: Sequence[InteractionSpot],
     xy: Floats,
     open_ground: shapely.Geometry,
-    footing: shapely.Geometry,
     strips: Sequence[Strip],
     things: Sequence[shapely.Geometry],
 ) -> tuple[list[InteractionSpot], NDArray[np.intp]]:

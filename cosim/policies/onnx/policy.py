@@ -128,7 +128,9 @@ class OnnxPolicy:
         self.manifest = found.manifest.policy
         self._files = files = bundle_files(found.folder, self.bundle)
         self._within_s = within_s if runs_on_cpu() else None
-        self._names = [*dict.fromkeys([*self.bundle.output.outputs, *_state_outputs(self.bundle)])]
+        inputs = self.bundle.inputs.values()
+        states = [one.output for one in inputs if isinstance(one, StateInput)]
+        self._names = [*dict.fromkeys([*self.bundle.output.outputs, *states])]
         with self.on_trial() as graph:
             self._check(graph)
             self._memory = _Memory(Feeder(self.bundle.inputs, graph.inputs, 0))
@@ -338,7 +340,3 @@ def example_differences(policy: OnnxPolicy) -> dict[str, float]:
         name: float(np.abs(found[name].astype(float) - array).max(initial=0.0))
         for name, array in wanted.items()
     }
-
-
-def _state_outputs(bundle: BundleManifest) -> list[str]:
-    return [one.output for one in bundle.inputs.values() if isinstance(one, StateInput)]
