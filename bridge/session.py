@@ -143,9 +143,9 @@ class Session:
         self._queryables.append(self._session.declare_queryable(key, answer, complete=True))
 
     def collect(self, key: str, take: Callable[[Query], None], *, found: bool = False) -> None:
-        """Pass queries on `key` to `take`, in a thread of Zenoh that must not block, to be answered
-        later.
+        """Pass queries on `key` to `take`, in a thread of Zenoh that must not block.
 
+        The query is answered later.
         found: See `serve`; such a query is answered on `key`.
         """
 
@@ -204,8 +204,7 @@ class Session:
         return leave
 
     def watch(self, key: str, changed: Callable[[str, bool], None]) -> None:
-        """Call `changed(key, alive)` for every liveliness token at a key expression, now and
-        later."""
+        """Call `changed(key, alive)` for every liveliness token at a key, now and later."""
 
         def received(sample: zenoh.Sample) -> None:
             changed(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)

@@ -1,5 +1,7 @@
-"""Load a policy by name: bundled, `path/to/file.py:Class`, `package.module:Class` or
-`onnx:FOLDER`."""
+"""Load a policy by name.
+
+A name is bundled, `path/to/file.py:Class`, `package.module:Class` or `onnx:FOLDER`.
+"""
 
 from __future__ import annotations
 
@@ -37,8 +39,7 @@ def shipped_bundles(below: Path = Path(__file__).parent) -> Mapping[str, Path]:
 
 
 def bundle_in_words(folder: Path) -> str:
-    """Describe a bundle in one line: location of its weights, or that they are missing, and
-    origin."""
+    """Describe a bundle in one line: location of its weights, or "missing", and origin."""
     bundle = read_bundle_manifest(folder)
     facts = bundle.files.get(bundle.model)
     try:
@@ -180,8 +181,10 @@ def _made(name: str) -> Policy:
 
 
 def _checked(name: str, policy: Policy) -> Manifest:
-    """Return a checked copy of the policy's manifest. Raises UsageError if it or a method is
-    missing."""
+    """Return a checked copy of the policy's manifest.
+
+    Raises UsageError if the manifest or a method is missing.
+    """
     with _in_words(f"policy '{name}': its manifest:"):
         manifest = getattr(policy, "manifest", None)
         lacking = [

@@ -173,8 +173,7 @@ def remedy_for_missing(name: str, missing: str) -> str:
 
 
 def _files_below(name: str) -> list[Path]:
-    """Return relative paths of files with this name, down to two levels below the current
-    folder."""
+    """Return relative paths of files with this name, at most two folders below the current one."""
     here = Path.cwd()
     return [
         file.relative_to(here)

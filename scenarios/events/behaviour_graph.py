@@ -104,8 +104,7 @@ class BehaviorGraph:
         return {what: np.array(found[what], dtype=np.intp) for what in sorted(found)}
 
     def distances(self, node: int) -> tuple[Floats, NDArray[np.int32]]:
-        """Return (N,) walking distances in metres from a node, inf if unreachable, and (N,)
-        predecessors."""
+        """Return (N,) walking distances in metres (inf if unreachable) and (N,) predecessors."""
         return self._reached(node)
 
     def way(self, start: int, goal: int) -> tuple[int, ...]:
@@ -230,8 +229,8 @@ def _joined(
 
 
 def _along(strips: Sequence[Strip], footing: shapely.Geometry) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return waypoints in up to two lanes along each sidewalk, and whether people may idle at
-    each."""
+    """Return waypoints in up to two lanes along each sidewalk, and whether people may idle
+    there."""
     rows: list[tuple[float, float, bool]] = []
     for strip in strips:
         line = Polyline(strip.line[:, :2])

@@ -30,8 +30,10 @@ _BEFORE_M: Final = 0.8
 BEHIND_ROBOT_M: Final = 1.6
 """Extra metres for people from behind, because the robot has just passed them."""
 MEETS_AMONG: Final = 2
-"""Largest group whose first person walks on the robot's line; in larger groups it walks in the
-middle, because others meet a robot at the side."""
+"""Largest group whose first person walks on the robot's line.
+
+In larger groups it walks in the middle, because others meet a robot at the side.
+"""
 TO_LINE_M: Final = 1.5
 """Look-ahead distance in metres at which a person aims for its line."""
 _ABREAST_M: Final = 0.75

@@ -99,8 +99,7 @@ def _pace_to_meet(walker: Walker, aim_rad: float, query: EventQuery) -> float | 
 
 
 def collision_course(walker: Walker, query: EventQuery, side: int) -> tuple[float, float]:
-    """Return (heading, speed) at a right angle to the robot, to meet its centre at constant
-    velocity.
+    """Return (heading, speed) at a right angle to the robot, to meet its centre.
 
     side: Side of the robot's path the walker comes from: left (1) or right (-1).
     """

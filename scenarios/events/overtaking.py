@@ -101,8 +101,7 @@ def _slowed_mps(query: EventQuery) -> float:
 
 
 def _beside_m(event: Event, line_m: float) -> float:
-    """Return the lateral offset in metres at which it passes a robot: on its own side if there is
-    room."""
+    """Return the lateral offset in metres at which it passes, on its own side if there is room."""
     room_m = event.half_width_m - PERSON_RADIUS_M
     own_side_m = line_m + event.side * BESIDE_ROBOT_M
     return own_side_m if abs(own_side_m) <= room_m else line_m - event.side * BESIDE_ROBOT_M

@@ -1,5 +1,4 @@
-"""One resident: walks to a node of the behaviour graph, idles or does an activity there, and walks
-on.
+"""One resident: walks to a node of the behaviour graph, idles or does an activity there.
 
 Pure functions. Phases: "walking" along its path, "idle" at a waypoint, "interacting" with a bench,
 shop window or bus stop. Random choices use the generator passed in.

@@ -118,8 +118,7 @@ def fellow(walker: Walker | NearbyPerson) -> Neighbour:
 
 
 def met(nearby: Iterable[NearbyPerson]) -> list[Neighbour]:
-    """Return people nearby as neighbours. The crowd does not avoid; injected people and residents
-    do."""
+    """Return people nearby as neighbours; the crowd does not avoid, others do."""
     return [
         Neighbour(b.x_m, b.y_m, b.vx_mps, b.vy_mps) if b.kind == PersonKind.CROWD else fellow(b)
         for b in nearby
@@ -143,11 +142,11 @@ def led_round(
     *,
     insisting: bool = False,
 ) -> Vector:
-    """Return where a step to `wanted` (m) ends after avoiding people; `wanted` itself if it is
-    free.
+    """Return where a step to `wanted` (m) ends after avoiding people.
 
     goal: Where the walker is going to stop.
     insisting: Approach the goal even if it is occupied; the other person makes room.
+    Returns `wanted` itself if it is free.
     """
     tick_s = sight.query.tick_ms / 1000
     at = (walker.x_m, walker.y_m)
@@ -178,8 +177,7 @@ def led_round(
 def edges(
     walker: Walker, wanted: Vector, event: Event | None, tick_s: float
 ) -> tuple[HalfPlane, ...]:
-    """Return the half-planes of velocities that keep a person on the sidewalk or crosswalk of its
-    event.
+    """Return half-planes of velocities that keep a person on the ground of its event.
 
     Empty for a person that is leaving it anyway.
     """

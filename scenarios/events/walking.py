@@ -1,5 +1,4 @@
-"""Motion of event pedestrians: event coordinates, turning rate, and steps around people and the
-robot.
+"""Motion of event pedestrians: event coordinates, turning rate, avoidance.
 
 Event coordinates are metres along the event's heading and metres to the left.
 """
@@ -152,8 +151,7 @@ def stepped(
 
 
 def _round_things(walker: Walker, wanted: Vector, query: EventQuery) -> Vector:
-    """Return where a step to `wanted` (m) ends after avoiding obstacles; `wanted` itself if it is
-    free."""
+    """Return where a step to `wanted` (m) ends after avoiding obstacles."""
     for thing in query.standing:
         body = as_met(thing)
         if math.dist(wanted, body.pose[:2]) < within_reach_m(body):

@@ -163,8 +163,7 @@ class _Builder:
         )
 
     def _unit(self, x: str, name: str, dilations: tuple[int, ...], stride: int = 1) -> str:
-        """Add an EESP unit: grouped projection, summed dilated convolutions, and grouped
-        expansion."""
+        """Add an EESP unit: grouped projection, summed dilated convolutions, grouped expansion."""
         groups = len(dilations)
         projected = self._conv_act(x, f"{name}.proj_1x1", groups=groups)
         planes = self._weights.take(f"{name}.spp_dw.0.conv.weight").shape[0]
@@ -282,8 +281,7 @@ class _Builder:
         return self._op("BatchNormalization", x, *numbers, epsilon=1e-5)
 
     def _act(self, x: str, name: str) -> str:
-        """Add PReLU as four operators: bit-identical to the operator, and twice as fast in
-        onnxruntime."""
+        """Add PReLU as four operators: same bits as the operator, twice as fast in onnxruntime."""
         above = self._op("Relu", x)
         slope = self._constant(self._weights.take(f"{name}.weight").reshape(-1, 1, 1))
         return self._op("Add", above, self._op("Mul", self._op("Sub", x, above), slope))

@@ -1,5 +1,4 @@
-"""Policy `follow`: detects people and walkable area with two networks and drives along the
-middle."""
+"""Policy `follow`: detects people and walkable area with networks, and drives along the middle."""
 
 from __future__ import annotations
 
@@ -56,8 +55,7 @@ def walkable_pixels(rgb: NDArray[np.uint8], network: Graph) -> NDArray[np.bool_]
 
 
 class Ground:
-    """Map with cells of `GROUND_CELL_M`: rows ahead from the robot's centre, columns from right to
-    left.
+    """Map with cells of `GROUND_CELL_M`: rows ahead from the robot's centre, columns right to left.
 
     size: Width and height of the picture.
     """
@@ -120,8 +118,7 @@ _OVERLAP: Final = 0.45
 
 
 def people_in(rgb: NDArray[np.uint8], network: Graph) -> Floats:
-    """Return (N, 4): left, top, right and bottom in pixels of each person in a picture (H, W,
-    3)."""
+    """Return (N, 4): left, top, right and bottom in pixels of people in a picture (H, W, 3)."""
     tensor = np.ascontiguousarray(
         picture_numbers(rgb, _PEOPLE_INPUT).transpose(2, 0, 1)[None], np.float32
     )

@@ -136,8 +136,7 @@ class Feeder:
         return np.array([np.zeros(len(one.values)) if row is None else row for row in numbers])
 
     def _past_of(self, one: PastInput, now: Any) -> list[Any]:
-        """Add the newest value of an input and return its selected history; None is replaced by
-        zeros."""
+        """Add the newest value of an input and return its selected history; None means zeros."""
         past = self._past.get(id(one))
         if past is None:
             count = (one.frames - 1) * one.every

@@ -68,8 +68,7 @@ class TensorPort:
 
 
 class AskedGraph(Protocol):
-    """Graph that can be run: in this process (`Graph`) or in a child
-    (`cosim.policies.onnx.trial`)."""
+    """Graph that can be run: in this process (`Graph`) or in a child (`TrialGraph`)."""
 
     path: Path
     inputs: Mapping[str, TensorPort]
@@ -146,8 +145,10 @@ def _port_facts(port: Any) -> tuple[str, str, Sequence[Any]]:
 
 
 def _providers(available: Sequence[str]) -> tuple[str, ...]:
-    """Return the providers of the environment variable. Raises UsageError for an unavailable
-    one."""
+    """Return the providers of the environment variable.
+
+    Raises UsageError for an unavailable provider.
+    """
     asked = [
         name.strip() for name in os.environ.get(PROVIDERS_VARIABLE, _CPU).split(",") if name.strip()
     ]

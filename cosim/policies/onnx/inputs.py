@@ -53,8 +53,7 @@ class AnyInput(Ranged, frozen=True, kw_only=True):
 
 
 class PastInput(AnyInput, frozen=True, kw_only=True):
-    """History: the last `frames` values, one of `every` commands of the policy, including the
-    current.
+    """History of `frames` values, one of `every` commands of the policy, including the current.
 
     before: Values before the episode began or the robot was moved: the first one repeated, or
         zeros.

@@ -44,8 +44,7 @@ _HASH: Final = re.compile(r"[0-9a-f]{64}")
 
 
 def refusal_of_name(name: str) -> str:
-    """Return the fault of a bundle's file name; "" if valid. Files are directly in the bundle's
-    folder.
+    """Return the fault of a file name in a bundle's folder; "" if valid.
 
     >>> refusal_of_name("model.onnx.data"), refusal_of_name("../model.onnx")[:17]
     ('', "'../model.onnx' i")
@@ -208,6 +207,8 @@ class BundleManifest(Ranged, frozen=True, kw_only=True):
 
 
 def read_bundle_manifest(folder: Path) -> BundleManifest:
-    """Read the manifest of a bundle's folder. Raises SpecError with every fault and the valid
-    choices."""
+    """Read the manifest of a bundle's folder.
+
+    Raises SpecError with every fault and the valid choices.
+    """
     return read_spec_file(folder / MANIFEST_FILE, BundleManifest)

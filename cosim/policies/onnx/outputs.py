@@ -130,8 +130,7 @@ class WaypointsOutput(Ranged, frozen=True, kw_only=True, tag="waypoints", tag_fi
 
 
 class WheelsOutput(Ranged, frozen=True, kw_only=True, tag="wheels", tag_field="what"):
-    """Speeds of the left and right wheels in units of `unit_mps`, converted by the robot's track
-    width."""
+    """Speeds of the left and right wheels in units of `unit_mps`."""
 
     left: Element
     right: Element
@@ -177,8 +176,7 @@ class SteeringOutput(Ranged, frozen=True, kw_only=True, tag="steering", tag_fiel
 
 
 class CommandOutput(Ranged, frozen=True, kw_only=True, tag="command", tag_field="what"):
-    """Speed in units of `unit_mps` and turning rate in units of `unit_radps`, positive to the
-    left."""
+    """Speed in units of `unit_mps`, and turning rate to the left in units of `unit_radps`."""
 
     v: Element
     w: Element

@@ -22,8 +22,7 @@ _RESAMPLED: Final = {
 
 
 def picture_numbers(rgb: NDArray[np.uint8], how: PixelsInput) -> NDArray[Any]:
-    """Return a picture (H, W, 3) as (rows, columns, channels), float32, or uint8 if not
-    normalised."""
+    """Return a picture (H, W, 3) as (rows, columns, channels): float32, or unchanged uint8."""
     pixels = _coloured(_fitted(_cut(rgb, how), how), how.colour)
     if how.as_they_are:
         return pixels

@@ -93,8 +93,10 @@ class TrialGraph:
         self._child.close()
 
     def ask(self, tensors: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
-        """Run the graph and return the named outputs. Raises RuntimeError with the runtime's
-        message."""
+        """Run the graph and return the named outputs.
+
+        Raises RuntimeError with the runtime's message.
+        """
         packed = {name: _packed(array) for name, array in tensors.items()}
         try:
             self._child.wire.send(msgspec.msgpack.encode(_Request(packed, list(names))))

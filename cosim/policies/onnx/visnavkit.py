@@ -234,8 +234,7 @@ def _frame_output(path: Path, metadata: _Metadata) -> WaypointsOutput:
 
 
 def _times_s(points: int, seconds: float, common: dict[str, Any]) -> NDArray[np.floating]:
-    """Return the time of each point: evenly spaced, or quadratic from 0 unless
-    `offset_t_anchors`."""
+    """Return the time of each point: evenly spaced or quadratic."""
     if common.get("uniform_t_anchors", False):
         return np.arange(1, points + 1) * (seconds / points)
     if common.get("offset_t_anchors", False):

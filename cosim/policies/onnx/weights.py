@@ -122,8 +122,10 @@ def bundle_files(folder: Path, manifest: BundleManifest) -> BundleFiles:
 
 
 def _found(folder: Path, manifest: BundleManifest, name: str) -> Path:
-    """Return the path of a file. Raises UsageError for a link that leads out of the bundle's
-    folder."""
+    """Return the path of a file.
+
+    Raises UsageError for a link that leads out of the bundle's folder.
+    """
     path = weights_file(manifest.name, name, manifest.files.get(name), manifest.source, [folder])
     return _inside(path, folder) if path.parent == folder else path
 
@@ -156,8 +158,10 @@ def _read_in_words(path: Path) -> Iterator[None]:
 
 
 def _digested(path: Path, name: str, manifest: BundleManifest, digest: hashlib.blake2b) -> int:
-    """Add a file to a digest and return its size. Raises UsageError if it differs from the
-    manifest."""
+    """Add a file to a digest and return its size.
+
+    Raises UsageError if it differs from the manifest.
+    """
     facts = manifest.files.get(path.name)
     wanted: dict[str, int | str] = {} if facts is None else {"bytes": facts.bytes, **facts.hashes}
 

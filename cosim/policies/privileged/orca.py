@@ -94,8 +94,7 @@ _JUMP_M: Final = 1.0
 _STRAYED_M: Final = 2.6
 """Lateral offset in metres above which the path is planned again."""
 _PAST_END_M: Final = 0.05
-"""Metres before the end of the path at which the robot has missed the goal and the path is planned
-again."""
+"""Metres before the end of the path at which the robot has missed the goal and replans."""
 _PATIENCE_S: Final = 3.0
 """Seconds without progress after which the robot is stuck."""
 _LED_ANEW_S: Final = 1.6
@@ -365,8 +364,7 @@ def lane_past(
 def bent(
     known: Privileged, robot: Robot, here: Here, people: People, aim_m: float, limit_mps: float
 ) -> Floats:
-    """Return the velocity (2,) towards the lane, without collisions with moving people within
-    _HORIZON_S."""
+    """Return the velocity (2,) towards the lane without collisions within _HORIZON_S."""
     state = known.robot
     beside = here.way.lateral(state.pose, here.s_m)
     lane_m = beside + max(-1.0, min(1.0, aim_m - beside))
@@ -385,8 +383,7 @@ def bent(
 
 
 def lanes_inside(here: Here) -> Floats:
-    """Return the lanes that are inside the free area somewhere in the next metres, and the path
-    itself."""
+    """Return the lanes that are partly inside the free area ahead, and the path itself."""
     along, lane = np.meshgrid(here.s_m + np.array([0.5, 1.5, 3.0, 5.0]), LANES_M)
     inside = (here.clearance.at(here.way.place(along, lane)) > _EDGE_M).any(axis=1)
     lanes: Floats = LANES_M[inside | (LANES_M == 0.0)]

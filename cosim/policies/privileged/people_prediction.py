@@ -33,8 +33,7 @@ _SOON: Final = 4
 _DARTS_M: Final = 0.15
 """Length in metres of the step aside."""
 _COMES_M: Final = 4.5
-"""Metres within which the robot yields. It yields to people of events, not to the crowd, which
-would wait too."""
+"""Metres within which the robot yields to people of events; the crowd would wait, too."""
 _COMES_RAD: Final = 0.12
 """Heading error in radians below which a person walks straight at the robot."""
 _SIDEWAYS: Final = 0.7
@@ -102,8 +101,7 @@ def gaps_to_people(
 
 
 def _squared(people: Floats, x: Floats, y: Floats) -> Floats:
-    """Return (T, K) squared distances in m^2 from points (T, K) to the nearest of people (..., N,
-    2)."""
+    """Return (T, K) squared distances in m^2 from points (T, K) to the nearest of (..., N, 2)."""
     dx, dy = people[..., 0] - x[..., None], people[..., 1] - y[..., None]
     return np.asarray((dx * dx + dy * dy).min(axis=-1))
 

@@ -125,8 +125,7 @@ def bearing_to(known: Privileged, offset_m: float) -> float:
 
 
 def crossing_limit(known: Privileged, robot: Robot) -> float:
-    """Return the speed in m/s at which the robot can stop before the next crossing it must not
-    enter."""
+    """Return the speed in m/s at which the robot can stop before a crossing it must not enter."""
     half_m = robot.length_m / 2
     crosses_mps = robot.cruise_mps * 13 / 15
     for crossing_id, enter_s_m, leave_s_m in known.crossings:
@@ -229,8 +228,7 @@ def obstacles(known: Privileged) -> tuple[Floats, Floats, Floats]:
 
 
 def car_disks(known: Privileged) -> tuple[Floats, Floats, Floats]:
-    """Return vehicles as three disks each, as in `obstacles`; empty away from crossings of the
-    route."""
+    """Return vehicles as three disks each, as in `obstacles`; empty away from crossings."""
     cars = known.vehicles
     if not any(enter - 3.0 < known.route_s_m < leave for _, enter, leave in known.crossings):
         return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
@@ -274,8 +272,7 @@ def smallest_gaps(
     velocities: Floats,
     radii: Floats,
 ) -> Floats:
-    """Return (lanes, speeds): the smallest gap in metres between the body and any predicted
-    disk."""
+    """Return (lanes, speeds): smallest gap in metres between the body and predicted disks."""
     people = centres + velocities * TIMES_S[:, None, None]
     nose = disks.nose_m * np.array([math.cos(heading_rad), math.sin(heading_rad)])
     gaps = np.full(paths.shape[:2], np.inf)

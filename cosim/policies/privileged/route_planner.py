@@ -158,8 +158,7 @@ class Guide:
         )
 
     def from_here(self, xy: Floats) -> Polyline:
-        """Return the path from (2,) metres to the end of the route; the route itself if
-        unreachable."""
+        """Return the path from (2,) metres to the route's end; the route itself if unreachable."""
         known = np.isfinite(self._far)
         if not known.any():
             return self._route

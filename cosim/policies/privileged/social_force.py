@@ -95,8 +95,8 @@ def force(known: Privileged, robot: Robot, velocity: Floats) -> Floats:
 
 
 def bodies_m(robot: Robot) -> float:
-    """Return the distance in metres between the centres of the robot and a person at its front,
-    with a gap of 1 cm."""
+    """Return the distance in metres between the centres of the robot and a person 1 cm ahead of
+    it."""
     return robot.length_m / 2 + 0.01 + PERSON_RADIUS_M
 
 

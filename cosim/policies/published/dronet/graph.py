@@ -84,8 +84,7 @@ class _Layers:
         )
 
     def _block(self, x: str, i: int, planes: int, more: int) -> str:
-        """Add a residual block: two normalised convolutions, and a 1 x 1 convolution as
-        shortcut."""
+        """Add a residual block: two normalised convolutions with a 1 x 1 shortcut."""
         norm, conv = 2 * i - 1, 3 * i - 1
         y = self._conv(self._norm_relu(x, norm, planes), conv, 3, (planes, more), 2)
         y = self._norm_relu(y, norm + 1, more)

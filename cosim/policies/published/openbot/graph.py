@@ -39,8 +39,7 @@ def openbot_graph(model: LiteModel) -> bytes:
 
 
 class _Translation:
-    """Converts operators to ONNX. Pictures have their channels last in the file and first in
-    ONNX."""
+    """Converts operators to ONNX; channels are last in the file and first in ONNX."""
 
     def __init__(self, model: LiteModel) -> None:
         self._model = model
