@@ -141,25 +141,25 @@ def stepped(
     )
     if led != wanted:
         heading_rad = facing(walker, led, sight)
-    x_m, y_m = led
-    robot = robot_of(sight.query)
-    if math.dist(led, robot.pose[:2]) < within_reach_m(robot):
-        x_m, y_m = stepped_round(np.array([[walker.x_m, walker.y_m]]), np.array([led]), robot)[
-            0
-        ].tolist()
+    x_m, y_m = _round_body(walker, led, robot_of(sight.query))
     return msgspec.structs.replace(walker, x_m=x_m, y_m=y_m, heading_rad=heading_rad)
 
 
 def _round_things(walker: Walker, wanted: Vector, query: EventQuery) -> Vector:
     """Return where a step to `wanted` (m) ends after avoiding obstacles."""
     for thing in query.standing:
-        body = as_met(thing)
-        if math.dist(wanted, body.pose[:2]) < within_reach_m(body):
-            x_m, y_m = stepped_round(
-                np.array([[walker.x_m, walker.y_m]]), np.array([wanted]), body
-            )[0].tolist()
-            wanted = wanted if math.dist(wanted, (x_m, y_m)) < _SAME_M else (x_m, y_m)
+        moved = _round_body(walker, wanted, as_met(thing))
+        wanted = wanted if math.dist(wanted, moved) < _SAME_M else moved
     return wanted
+
+
+def _round_body(walker: Walker, wanted: Vector, body: RobotBody) -> Vector:
+    """Return where a step to `wanted` (m) ends after avoiding a body."""
+    if math.dist(wanted, body.pose[:2]) >= within_reach_m(body):
+        return wanted
+    start = np.array([[walker.x_m, walker.y_m]])
+    x_m, y_m = stepped_round(start, np.array([wanted]), body)[0].tolist()
+    return x_m, y_m
 
 
 def facing(walker: Walker, after: Vector, sight: Sight) -> float:
