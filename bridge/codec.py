@@ -1,5 +1,4 @@
-"""MessagePack for the messages of the bridge: typed, refused when malformed, never a pickle.
-Pure."""
+"""Encode and decode messages of the bridge as MessagePack with type checks."""
 
 from __future__ import annotations
 
@@ -15,12 +14,12 @@ _encoder = msgspec.msgpack.Encoder()
 
 
 def encode(message: msgspec.Struct | tuple[msgspec.Struct, ...]) -> bytes:
-    """A message, or several, as MessagePack, fields by name."""
+    """Encode a message, or a tuple of messages, with field names."""
     return _encoder.encode(message)
 
 
 def decode(payload: bytes, kind: type[_T]) -> _T:
-    """The message of type `kind` in `payload`. Raises EngineError when it is anything else."""
+    """Decode a message of type `kind`. Raises EngineError if invalid."""
     try:
         return msgspec.msgpack.decode(payload, type=kind)
     except (msgspec.DecodeError, RecursionError, ValueError) as error:

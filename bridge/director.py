@@ -1,11 +1,10 @@
-"""The director of the event pedestrians, at either end of a Zenoh session.
+"""Director of event pedestrians over a Zenoh session: client and server.
 
-Lockstep pull: at every tick the simulator asks and waits. The director keeps no state (see
-`cosim.spec.events`), so a query may be repeated and a director killed and started again without
-changing the episode.
+The simulator queries the director in every tick and waits (lockstep). The director is stateless
+(`cosim.spec.events`), so a query may be repeated, and a director may be restarted without changing
+the episode.
 
-Both ends sign what they say with the version of their behaviours: a director that would do
-something else is refused, never believed.
+Both ends sign messages with the version of their behaviours and reject other versions.
 """
 
 from __future__ import annotations
@@ -28,28 +27,27 @@ from cosim.spec.events import Event, EventQuery, EventReply
 React = Callable[[EventQuery], EventReply]
 
 NOTICE_S = 2.0
-"""After so long without an answer whoever runs the episode is told what it waits for."""
+"""Seconds without a reply after which the progress callback is called."""
 LONGEST_REASON = 500
-"""Letters: what a broken director says may be of any length."""
+"""Longest error of a director in characters."""
 
 _T = TypeVar("_T")
 
 
 class Signed(msgspec.Struct, frozen=True):
-    """by: the version of the behaviours of whoever sends it."""
+    """Message with the version of the sender's behaviours."""
 
     by: Annotated[str, msgspec.Meta(max_length=64)] = ""
     message: msgspec.Raw = msgspec.Raw(b"")
 
 
 def signed(message: msgspec.Struct, by: str) -> bytes:
-    """A message with the version of its sender's behaviours."""
+    """Encode a message with the version of its sender's behaviours."""
     return encode(Signed(by, msgspec.Raw(encode(message))))
 
 
 def opened(payload: bytes, kind: type[_T], by: str) -> _T:
-    """The message in `payload`. Raises EngineError when it is none, or its sender's behaviours are
-    others than `by`."""
+    """Decode a signed message. Raises EngineError if invalid or from another version than `by`."""
     envelope = decode(payload, Signed)
     if envelope.by != by:
         raise EngineError(
@@ -60,42 +58,42 @@ def opened(payload: bytes, kind: type[_T], by: str) -> _T:
 
 
 class QueryParts(msgspec.Struct, frozen=True):
-    """A query as it travels. events: its own, apart, because they are the same at every tick."""
+    """Query with its events as a separate block, because they are the same in every tick."""
 
     query: msgspec.Raw
     events: msgspec.Raw
 
 
 def signed_query(query: EventQuery, by: str) -> bytes:
-    """A signed query."""
+    """Encode a signed query."""
     bare = msgspec.structs.replace(query, events=())
     return signed(QueryParts(msgspec.Raw(encode(bare)), msgspec.Raw(encode(query.events))), by)
 
 
 def opened_query(payload: bytes, by: str) -> EventQuery:
-    """The query in a payload. Raises EngineError as `opened` does."""
-    told = opened(payload, QueryParts, by)
-    query = decode(bytes(told.query), EventQuery)
-    return msgspec.structs.replace(query, events=_events(bytes(told.events)))
+    """Decode a signed query. Raises EngineError as `opened` does."""
+    parts = opened(payload, QueryParts, by)
+    query = decode(bytes(parts.query), EventQuery)
+    return msgspec.structs.replace(query, events=_events(bytes(parts.events)))
 
 
 @lru_cache(maxsize=64)
 def _events(payload: bytes) -> tuple[Event, ...]:
-    """Read, and checked by the events themselves, once for an episode."""
+    """Decode events; cached for an episode."""
     return decode(payload, tuple[Event, ...])
 
 
 def serve_director(session: Session, key: str, react: React, by: str = "") -> None:
-    """Answer the simulator's queries on `key` with the pure function `react`. by: the version of
-    its behaviours."""
+    """Answer queries on `key` with the pure function `react`. by: version of its behaviours."""
     session.serve(key, lambda payload: signed(react(opened_query(payload, by)), by))
 
 
 class RemoteDirector:
-    """The simulator's end: a `cosim.episode.interfaces.Director` that asks over Zenoh.
+    """`cosim.episode.interfaces.Director` that queries over Zenoh.
 
-    by: the version of the simulator's behaviours. wait_s: how long an answer is waited for;
-    waiting: told so, once NOTICE_S are over.
+    by: Version of the simulator's behaviours.
+    wait_s: Timeout of a reply in seconds.
+    waiting: Called after NOTICE_S without a reply.
     """
 
     def __init__(
@@ -114,8 +112,7 @@ class RemoteDirector:
         self._waiting = waiting
 
     def react(self, query: EventQuery) -> EventReply:
-        """The director's reply. Raises DirectorLost when none comes or it answers something
-        else."""
+        """Return the director's reply. Raises DirectorLost on timeout or an invalid reply."""
         try:
             reply = opened(
                 self._ask(signed_query(query, self._by), query.tick), EventReply, self._by
@@ -129,7 +126,7 @@ class RemoteDirector:
         return reply
 
     def _ask(self, payload: bytes, tick: int) -> bytes:
-        """The answer, however often it takes until the time is over."""
+        """Return the reply, with retries until the timeout."""
         began = time.monotonic()
         if self._waiting is not None and self._wait_s > NOTICE_S:
             try:
@@ -145,7 +142,7 @@ class RemoteDirector:
 
 
 def _check(reply: EventReply, query: EventQuery) -> None:
-    """Raises EngineError for an answer to something else, or one that nobody could be shown by."""
+    """Raise EngineError for a reply to another query, or with invalid people."""
     if (reply.episode, reply.tick) != (query.episode, query.tick):
         raise EngineError(f"it answered tick {reply.tick} of '{reply.episode}'")
     people = [event.people for event in query.events]
@@ -163,10 +160,10 @@ def _check(reply: EventReply, query: EventQuery) -> None:
     if other := [actor.id for actor in reply.actors if actor.kind != PersonKind.EVENT]:
         raise EngineError(f"it showed people of events as others: {', '.join(other[:5])}")
     walkers = [walker for state in reply.states for walker in state.walkers]
-    told = sum(abs(w.x_m) + abs(w.y_m) + abs(w.heading_rad) for w in walkers)
-    told += sum(
+    total = sum(abs(w.x_m) + abs(w.y_m) + abs(w.heading_rad) for w in walkers)
+    total += sum(
         abs(a.x_m) + abs(a.y_m) + abs(a.heading_rad) + abs(a.speed_mps) + abs(a.pace_mps or 0.0)
         for a in reply.actors
     )
-    if not math.isfinite(told):
+    if not math.isfinite(total):
         raise EngineError("it answered with a place, heading or speed that is no number")

@@ -1,4 +1,4 @@
-"""Key expressions of the bridge, and the names that may stand in them."""
+"""Key expressions of the bridge, and valid names in them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 
 
 def name(value: str) -> str:
-    """`value` if it may be one chunk of a key. Raises SpecError otherwise."""
+    """Return a valid chunk of a key. Raises SpecError otherwise."""
     if not _NAME.fullmatch(value):
         raise SpecError(
             f"'{value}' cannot name a run or environment: use 1 to 64 of A-Z a-z 0-9 _ -"
@@ -19,45 +19,45 @@ def name(value: str) -> str:
 
 
 def chunk(value: str) -> str:
-    """Any name made fit to stand in a key: what may not stand there becomes "-"."""
+    """Convert any name to a chunk of a key; invalid characters become "-"."""
     return name(re.sub(r"[^A-Za-z0-9_-]", "-", value)[:64])
 
 
 def env(run: str, episode: str) -> str:
-    """What all keys of one running episode begin with."""
+    """Return the key prefix of a running episode."""
     return f"cosim/{name(run)}/env/{name(episode)}"
 
 
 def director(run: str, env: str) -> str:
-    """Where the simulator of one environment asks for the event pedestrians of a tick."""
+    """Return the key on which an environment queries the director."""
     return f"cosim/{name(run)}/env/{name(env)}/director"
 
 
 def job(run: str, act: str) -> str:
-    """Where workers of a run do this with its jobs: claim, report."""
+    """Return the key on which workers claim or report jobs."""
     return f"cosim/{name(run)}/jobs/{name(act)}"
 
 
 def worker(run: str, worker: str) -> str:
-    """Where a worker of a run is seen to be there; "*" for any."""
+    """Return the liveliness key of a worker; "*" for any."""
     return f"cosim/{name(run)}/workers/{worker if worker == '*' else name(worker)}"
 
 
 def status(run: str) -> str:
-    """Where a run's coordinator tells how it goes."""
+    """Return the key of the status of a run."""
     return f"cosim/{name(run)}/status"
 
 
 def net(run: str, digest: str) -> str:
-    """Where a run's coordinator hands out a street net, by its hash; "*" for any."""
+    """Return the key of a street net, by its hash; "*" for any."""
     return f"cosim/{name(run)}/nets/{digest if digest == '*' else name(digest)}"
 
 
 EVERY_RUN = "cosim/*/status"
-"""Asked, the coordinator of a run answers."""
+"""Key of the status of all runs."""
 
 EVERY_DIRECTOR = "cosim/*/env/*/director"
-"""What a director of any run answers."""
+"""Key of the directors of all running episodes."""
 
 EVERY_STATUS = "cosim/*/env/*/status"
-"""Asked, every running episode answers."""
+"""Key of the status of all running episodes."""

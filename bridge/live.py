@@ -1,9 +1,8 @@
-"""A running episode on the network: it takes injections, answers for its state, and tells what
-happens.
+"""Injection of pedestrians into a running episode over the network.
 
-Keys, below `cosim/<run>/env/<episode>/`: `inject`, `status`, `log` and `camera` are asked
-(queryables); `clock`, `robot`, `crowd`, `signals` and `events` are told every tick (JSON). Who
-comes late asks for the log.
+Keys below `cosim/<run>/env/<episode>/`: `inject`, `status`, `log` and `camera` are queryables;
+`clock`, `robot`, `crowd`, `signals` and `events` are published every tick (JSON). Late subscribers
+query the log.
 """
 
 from __future__ import annotations
@@ -20,20 +19,23 @@ from cosim.core.errors import EngineError, SpecError
 from cosim.spec.injection import POINT_FORMS, Ack, InjectionRequest
 
 LARGEST_B: Final = 64 * 1024
-"""Longer injections are refused unread."""
+"""Largest injection in bytes."""
 _MOST_SHOWN: Final = 60
-"""Characters of a wrong value that an error shows."""
+"""Longest invalid value in an error message in characters."""
 _JSON_BEGINS: Final = b"{[ \t\r\n"
+"""First bytes of a JSON message."""
 _PLACE: Final = re.compile(r"at `\$([^`]*)`")
+"""Path of the invalid value in an error of msgspec."""
 _STEP: Final = re.compile(r"\.(\w+)|\[(\d+)\]")
+"""Field or index in such a path."""
 _OF_PATH: Final = re.compile(r"path\b|`(ahead|left)`")
+"""Errors about the path of an injection."""
 
 Offer = Callable[[InjectionRequest], Ack]
 
 
 def serve_injections(session: Session, key: str, offer: Offer) -> None:
-    """Take injections in as JSON or MessagePack, and answer in the same. Whatever is wrong becomes
-    a refusal."""
+    """Answer injections, in JSON or MessagePack like the request. Errors become refusals."""
 
     def answer(payload: bytes) -> bytes:
         return _encoded(answer_to(payload, offer), as_json=payload[:1] in _JSON_BEGINS)
@@ -42,7 +44,7 @@ def serve_injections(session: Session, key: str, offer: Offer) -> None:
 
 
 def answer_to(payload: bytes, offer: Offer) -> Ack:
-    """What becomes of a message."""
+    """Return the acknowledgement of a message."""
     if len(payload) > LARGEST_B:
         return Ack(
             id="",
@@ -52,14 +54,14 @@ def answer_to(payload: bytes, offer: Offer) -> Ack:
     try:
         return offer(_decoder(payload)(payload, type=InjectionRequest))
     except (msgspec.DecodeError, RecursionError, ValueError, SpecError) as error:
-        words = str(error)
+        fault = str(error)
         return Ack(
-            id="", status="refused", reason=f"{words}{_found(payload, words)}{_choices(words)}"
+            id="", status="refused", reason=f"{fault}{_found(payload, fault)}{_choices(fault)}"
         )
 
 
 def _found(payload: bytes, error: str) -> str:
-    """The value at the place that an error names; "" where the error shows it or names no place."""
+    """Return the value at the path of an error; "" if unknown or already shown."""
     place = _PLACE.search(error)
     if place is None or not error.startswith("Expected") or ", got " in error:
         return ""
@@ -72,7 +74,7 @@ def _found(payload: bytes, error: str) -> str:
 
 
 def _choices(error: str) -> str:
-    """The valid choices for the field that an error is about; "" where there are none to list."""
+    """Return the valid choices for the field of an error; "" if there are none."""
     if "unknown field" in error and "$.path" not in error:
         valid: tuple[str, ...] = InjectionRequest.__struct_fields__
     elif error.startswith("Invalid enum") and (place := _PLACE.search(error)) is not None:
@@ -94,7 +96,7 @@ def _encoded(ack: Ack, *, as_json: bool) -> bytes:
 def send_injection(session: Session, key: str, injection: bytes, timeout_s: float = 5.0) -> Ack:
     """Send an injection (JSON) and wait for its acknowledgement.
 
-    Raises SpecError for one that is too long, EngineError when nobody answers, or something else.
+    Raises SpecError if it is too long, EngineError on timeout or an invalid reply.
     """
     if len(injection) > LARGEST_B:
         raise SpecError(f"{len(injection)} bytes: an injection has at most {LARGEST_B}")

@@ -1,15 +1,15 @@
 """Serve a policy to `cosim run --policy zenoh:NAME --policy-at ENDPOINT`, from any Python >= 3.9.
 
-Copy this file next to a policy; it needs eclipse-zenoh, msgspec and numpy. `serve` queries the
-policy in the thread that calls it. cosim itself imports this file: the messages, `PolicyDesk` and
-the faults of policies are the same for isolated policies, served ones and the shared renderer.
-A request is signed with run, episode, attempt and step: a repeated one gets the cached reply.
+Copy this file next to a policy; it needs eclipse-zenoh, msgspec and numpy. cosim imports it, too,
+for isolated policies and the shared renderer. A request carries run, episode, attempt and step: a
+repeated one gets the cached reply.
 """
 
 from __future__ import annotations
 
 import hashlib
 import inspect
+import io
 import json
 import os
 import platform
@@ -22,7 +22,6 @@ import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext, suppress
 from ipaddress import ip_address
-from itertools import repeat
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar, Optional, Union
@@ -31,31 +30,28 @@ import msgspec
 import numpy as np
 
 POLICY_PROTOCOL = 2
-"""Raised whenever the messages below change their meaning."""
+"""Version of the messages below, increased when their meaning changes."""
 MOST_WORDS = 500
-"""Characters of an error's message that are quoted."""
+"""Longest quoted error message in characters."""
 MOST_MESSAGE_BYTES = 16 << 20
-"""Bytes of one message over Zenoh."""
+"""Largest message over Zenoh in bytes."""
 _WINDOW_S = 0.002
 """Seconds that a policy with act_batch waits for further requests before it answers a batch."""
-_MOST_SEATS = 4096
-"""Episodes under way in one server; beyond that the longest idle one is dropped."""
+_MOST_SLOTS = 4096
+"""Largest number of open episodes of a server; beyond it the longest idle one is dropped."""
 FORGET_AFTER_S = 300.0
 """Seconds without a request after which a server drops an episode."""
 _TAKEN_OVER_AFTER_S = 30.0
 """Seconds without a request after which a policy object for one episode at a time is free again."""
 _MOST_ANSWER_BYTES = 2 << 20
-"""Bytes of an answer; of a larger array only the shape is sent, and the simulator refuses it."""
-_ARRAYS = {"|u1", "<f4"}
-_QUESTIONS = ("reset", "act", "ended")
+"""Largest answer in bytes; of a larger array, which is invalid, only the shape is sent."""
 _OWN_PACKAGES = {"cosim", "scenarios", "sumo_nets", "physics", "bridge"}
 _PICTURE = ("rgb", "depth", "labels")
 _NUMBERS = ("tick", "time_s", "v_mps", "w_radps", "reset")
 
 
 class PackedArray(msgspec.Struct, frozen=True):
-    """An array as it travels. data: its bytes, or those of a picture as JPEG; at: where it begins
-    in shared memory, -1 where it is in the message."""
+    """Serialized array. data: its bytes or JPEG; at: offset in shared memory, -1 if in data."""
 
     dtype: str
     shape: tuple[int, ...]
@@ -65,19 +61,15 @@ class PackedArray(msgspec.Struct, frozen=True):
 
 
 class AboutEpisode(msgspec.Struct, frozen=True):
-    """The constants of an episode. robot: its size and limits. knowledge: as in `AskAct`.
-
-    cameras: K (3 x 3), distortion (5) and pose on the robot (4 x 4); "" is the policy's first one.
-    """
+    """Constants of an episode. cameras: K (3 x 3), distortion (5), pose on the robot (4 x 4)."""
 
     robot: dict[str, Union[str, float]] = {}
     cameras: dict[str, tuple[list[list[float]], list[float], list[list[float]]]] = {}
     knowledge: bytes = b""
 
 
-class _Signed(msgspec.Struct, frozen=True):
-    """run, episode, attempt: so that no answer of another run or attempt is taken for one of
-    this."""
+class _EpisodeMessage(msgspec.Struct, frozen=True):
+    """Message with run, episode and attempt, to reject replies to other runs or attempts."""
 
     run: str
     episode: str
@@ -88,17 +80,19 @@ class _Signed(msgspec.Struct, frozen=True):
         return self.run, self.episode, self.attempt
 
 
-class AskReset(_Signed, frozen=True, tag="reset"):
-    """An episode begins."""
+class AskReset(_EpisodeMessage, frozen=True, tag="reset"):
+    """Request: an episode begins."""
 
     seed: int
 
 
-class AskAct(_Signed, frozen=True, tag="act"):
-    """An observation; with the first one about. step: the number of this request, from 0.
+class AskAct(_EpisodeMessage, frozen=True, tag="act"):
+    """Request: an observation.
 
-    arrays: by names like "rgb", those of a goal "goal.rgb", of a further camera "left/rgb".
-    knowledge: for a privileged policy in the shared renderer, encoded by cosim.
+    step: Number of this request, from 0.
+    arrays: By names like "rgb", "goal.rgb" of a goal, "left/rgb" of a further camera.
+    about: Only in the first request.
+    knowledge: For a privileged policy in the shared renderer, encoded by cosim.
     """
 
     step: int
@@ -114,14 +108,12 @@ class AskAct(_Signed, frozen=True, tag="act"):
     knowledge: bytes = b""
 
 
-class AskEnded(_Signed, frozen=True, tag="ended"):
-    """Nothing more is asked about an episode."""
+class AskEnded(_EpisodeMessage, frozen=True, tag="ended"):
+    """Request: the episode ended."""
 
 
 class PolicyInfo(msgspec.Struct, frozen=True, tag="info"):
-    """Who answers here. source: a hash of the policy's source, "" where that is unknown; at_once:
-    for so many episodes it can answer at a time, 0 for any number; under_way: there are so many;
-    jpeg: pictures as JPEG; listens: itself."""
+    """Description of a server. at_once: largest number of episodes at a time, 0 for any."""
 
     server: str
     name: str
@@ -135,13 +127,12 @@ class PolicyInfo(msgspec.Struct, frozen=True, tag="info"):
     protocol: int = POLICY_PROTOCOL
 
 
-class Begun(_Signed, frozen=True, tag="begun"):
-    """The policy was reset, or has been told that the episode ended."""
+class Begun(_EpisodeMessage, frozen=True, tag="begun"):
+    """Reply: the policy was reset, or the episode was closed."""
 
 
-class Answer(_Signed, frozen=True, tag="answer"):
-    """The policy's answer at a step: two speeds, or waypoints; planned: both, a plan with its
-    command."""
+class Answer(_EpisodeMessage, frozen=True, tag="answer"):
+    """Reply: a command, waypoints, or with `planned` both."""
 
     step: int
     v_mps: float = 0.0
@@ -151,10 +142,10 @@ class Answer(_Signed, frozen=True, tag="answer"):
 
 
 class Refusal(msgspec.Struct, frozen=True, tag="refusal"):
-    """There is no answer. during, together: see `PolicyFault`.
+    """Reply: an error.
 
-    why: "policy", its fault; "unknown", the episode did not begin here; "busy", with another
-    episode; "message", it cannot be decoded; "renderer", the shared renderer itself failed.
+    why: "policy", its fault; "unknown", the episode did not begin here; "busy" with another
+        episode; "message", decoding failed; "renderer", the shared renderer failed.
     """
 
     why: str
@@ -170,20 +161,17 @@ decode_request = msgspec.msgpack.Decoder(PolicyRequest).decode
 decode_reply = msgspec.msgpack.Decoder(PolicyReply).decode
 decode_info = msgspec.msgpack.Decoder(Union[PolicyInfo, Refusal]).decode
 UNREADABLE = (msgspec.DecodeError, RecursionError, ValueError, TypeError, OverflowError)
-"""What decoding bytes of unknown origin may raise."""
+"""Exceptions that decoding may raise."""
 
 
 def packed(array: Any) -> PackedArray:
-    """Pack an array into a message."""
+    """Serialize an array."""
     array = np.ascontiguousarray(array)
     return PackedArray(array.dtype.str, tuple(array.shape), array.reshape(-1).view(np.uint8).data)
 
 
 class PolicyFault(Exception):
-    """Something that a policy did wrong, in printable words.
-
-    during: in which call, "" for the requested one. together: for so many episodes at once.
-    """
+    """Error of a policy, with the name of the call ("" for the requested one) and its episodes."""
 
     def __init__(self, words: str, during: str = "", together: int = 1) -> None:
         words = words.encode("utf-8", "replace").decode()
@@ -197,22 +185,21 @@ class PolicyFault(Exception):
 def said_by(error: BaseException) -> str:
     """Return the message of an error as printable text of bounded length."""
     try:
-        text = PolicyFault(str(error)).args[0]
+        text = str(PolicyFault(str(error)).args[0])
     except BaseException:  # noqa: BLE001  even the message of an error can raise
         return "(its message cannot be read)"
-    if len(text) <= MOST_WORDS:
-        return str(text)
-    return f"{text[:MOST_WORDS]} ... ({len(text)} characters)"
+    end = "" if len(text) <= MOST_WORDS else f" ... ({len(text)} characters)"
+    return text[:MOST_WORDS] + end
 
 
 @contextmanager
 def policy_call(
     doing: str, tick: int = 0, timer: Any = None, passes: tuple[type[BaseException], ...] = ()
 ) -> Iterator[None]:
-    """Guard a call of a policy: whatever it raises becomes a PolicyFault, but for Ctrl-C.
+    """Guard a call of a policy: convert exceptions to PolicyFault, except Ctrl-C.
 
-    timer: its `starts(doing, tick)` and `stops()` are called. passes: errors that are not the
-    policy's, or that have their words already. A copy of the process that the policy forked ends.
+    timer: Its `starts(doing, tick)` and `stops()` are called.
+    passes: Exceptions that are not the policy's, or already have a message.
     """
     process = os.getpid()
     if timer is not None:
@@ -228,57 +215,50 @@ def policy_call(
         words = f"raised {type(error).__name__}{': ' * bool(said)}{said}{_line_of(error)}"
         raise PolicyFault(words) from error
     finally:
-        if os.getpid() != process:
+        if os.getpid() != process:  # a copy that the policy forked
             os._exit(1)
         if timer is not None:
             timer.stops()
 
 
 def _line_of(error: BaseException) -> str:
-    """Return the file and line of the user's code that an error came from, as " in mine.py:12";
-    else ""."""
+    """Return " in mine.py:12" for the user's line that raised an error; else ""."""
     found = ""
     stdlib = Path(traceback.__file__).parent
     for frame, line in traceback.walk_tb(error.__traceback__):
         file = Path(frame.f_code.co_filename)
-        installed = (
-            "site-packages" in file.parts or file.name.startswith("<") or stdlib in file.parents
-        )
-        ours = (
-            frame.f_globals.get("__name__", "").partition(".")[0] in _OWN_PACKAGES
-            or str(file) == __file__
-        )
-        if not installed and not ours:
+        package = frame.f_globals.get("__name__", "").partition(".")[0]
+        installed = "site-packages" in file.parts or stdlib in file.parents
+        ours = package in _OWN_PACKAGES or str(file) == __file__
+        if not (installed or ours or file.name.startswith("<")):
             found = f" in {file.name}:{line}"
     return found
 
 
-class _Given(SimpleNamespace):
-    """A goal, a pose or a picture. For numpy: its picture or only array, else its numbers."""
+class _PlainFields(SimpleNamespace):
+    """Goal, pose or picture. As a numpy array: its picture or only array, else its numbers."""
 
     def __array__(self, dtype: Any = None, copy: Any = None) -> Any:
-        held = {name: value for name, value in vars(self).items() if value is not None}
-        values = list(held.values())
+        fields = {name: value for name, value in vars(self).items() if value is not None}
+        values = list(fields.values())
         if all(isinstance(value, (int, float)) for value in values):
             return np.array(values, dtype)
-        array = values[0] if len(values) == 1 else held.get("rgb")
+        array = values[0] if len(values) == 1 else fields.get("rgb")
         if not isinstance(array, np.ndarray):
-            raise TypeError(f"this is no array: read its {', '.join(held)}")
+            raise TypeError(f"this is no array: read its {', '.join(fields)}")
         return np.array(array, dtype)
 
 
 class EpisodeDecoder:
-    """Decodes the observations of one episode to plain objects with the names of
-    `cosim.Observation`.
+    """Decodes observations of one episode to plain objects with the names of `cosim.Observation`.
 
-    A subclass that decodes to other objects overrides `makes`, the maker of each part, and
-    `privileged`. They raise an error for wrong values.
+    For other types, override `makes`, the constructor of each part, and `privileged`.
     """
 
     makes: ClassVar[dict[str, Any]] = {
-        **dict.fromkeys(("camera", "picture", "odometry"), _Given),
+        **dict.fromkeys(("camera", "picture", "odometry"), _PlainFields),
         **dict.fromkeys(("robot", "observation"), SimpleNamespace),
-        "goal": lambda type, **fields: _Given(**fields),
+        "goal": lambda type, **fields: _PlainFields(**fields),
     }
 
     def __init__(self, episode: str, about: AboutEpisode) -> None:
@@ -312,13 +292,12 @@ class EpisodeDecoder:
         )
 
     def privileged(self, knowledge: bytes) -> Any:
-        """Decode what a privileged policy gets: nothing here."""
+        """Decode the knowledge of a privileged policy; None here."""
         return None
 
 
-class _Seat:
-    """An episode under way. called: its name before the policy. step: the last one, with its
-    reply."""
+class _Slot:
+    """Open episode with its last step and reply. called: name passed to the policy."""
 
     def __init__(self, called: str, attempt: str) -> None:
         self.policy: Any = None
@@ -332,11 +311,11 @@ class _Seat:
 
 
 class PolicyDesk:
-    """Queries a policy for any number of episodes, whatever carries requests and replies.
+    """Queries a policy for any number of episodes, independent of the transport.
 
-    policy: an object; or a class or function that makes one for each episode under way. An object
-    with `act_batch` answers for any number at once, unless batch is False; any other for one.
-    decoder: an `EpisodeDecoder`. timer: see `policy_call`. forget_after_s: when idle ones end.
+    policy: An object, or a class or function that makes one for each open episode.
+    batch: Use `act_batch`, if the object has it, for any number of episodes at once.
+    forget_after_s: Seconds after which idle episodes are closed.
     """
 
     def __init__(
@@ -354,7 +333,7 @@ class PolicyDesk:
         self.batches = batch and self._for_many
         self.at_once = int(not self.batches and self._make is None)
         self._idle = [] if self.batches else [self.policy]
-        self._seats: dict[tuple[str, str], _Seat] = {}
+        self._slots: dict[tuple[str, str], _Slot] = {}
         self._decoder = decoder
         self._timer = timer
         most_s = _TAKEN_OVER_AFTER_S if self.at_once else forget_after_s
@@ -362,11 +341,11 @@ class PolicyDesk:
 
     @property
     def under_way(self) -> int:
-        """How many episodes have begun and not ended."""
-        return len(self._seats)
+        """Number of open episodes."""
+        return len(self._slots)
 
     def wait_s(self, waiting: int, expected: int, since_s: float) -> float:
-        """Return how long a batch of requests, the first of since_s, waits for those expected."""
+        """Return how long to wait for further requests of a batch; its first arrived at since_s."""
         if not self.batches or waiting >= expected:
             return 0.0
         return max(since_s + _WINDOW_S - time.monotonic(), 0.0)
@@ -376,134 +355,128 @@ class PolicyDesk:
     ) -> list[PolicyReply]:
         """Return the reply to each request. A Refusal is a request that could not be decoded.
 
-        memories: for each request the buffer of its arrays that are not in the message.
+        memories: Shared memory with the arrays of each request that are not in the message.
         """
         began = {i: self._begin(one) for i, one in enumerate(requests) if isinstance(one, AskReset)}
-        fresh = {}
-        for one, memory in zip(requests, memories or repeat(None)):
-            seat = self._seat(one) if isinstance(one, AskAct) else None
-            if seat is not None and isinstance(one, AskAct) and one.step == seat.step + 1:
-                fresh[id(seat)] = seat, one, memory
-        self._act(list(fresh.values()))
+        new = {}
+        for one, memory in zip(requests, memories or [None] * len(requests)):
+            slot = self._slot(one) if isinstance(one, AskAct) else None
+            if slot is not None and isinstance(one, AskAct) and one.step == slot.step + 1:
+                new[id(slot)] = slot, one, memory
+        self._act(list(new.values()))
         return [began[i] if i in began else self._reply(one) for i, one in enumerate(requests)]
 
-    def _seat(self, one: Any) -> _Seat | None:
-        seat = self._seats.get((one.run, one.episode))
-        return seat if seat is not None and seat.attempt == one.attempt else None
+    def _slot(self, one: Any) -> _Slot | None:
+        slot = self._slots.get((one.run, one.episode))
+        return slot if slot is not None and slot.attempt == one.attempt else None
 
     def _reply(self, one: Any) -> PolicyReply:
         if isinstance(one, Refusal):
             return one
-        seat = self._seat(one)
+        slot = self._slot(one)
         if isinstance(one, AskEnded):
-            self._end((one.run, one.episode), seat)
+            self._end((one.run, one.episode), slot)
             return Begun(*one.signature)
-        if seat is None:
+        if slot is None:
             return Refusal("unknown", "this episode did not begin here, or was dropped")
-        seat.used_at_s = time.monotonic()
-        if one.step != seat.step:
-            return Refusal("message", f"step {one.step} was requested after step {seat.step}")
-        return seat.reply
+        slot.used_at_s = time.monotonic()
+        if one.step != slot.step:
+            return Refusal("message", f"step {one.step} was requested after step {slot.step}")
+        return slot.reply
 
     def _begin(self, one: AskReset) -> PolicyReply:
         key = one.run, one.episode
-        seat = self._seat(one)
-        if seat is not None and seat.step < 0:  # a repeated request: the reply was lost
-            return seat.reply
-        self._end(key, self._seats.get(key))
+        slot = self._slot(one)
+        if slot is not None and slot.step < 0:  # a repeated request: the reply was lost
+            return slot.reply
+        self._end(key, self._slots.get(key))
         self._forget()
         if self.at_once and not self._idle:
             return Refusal("busy", "this policy answers for one episode at a time: serve its class")
         # Two runs of one seed may begin at once: the names of their episodes must differ.
-        taken = any(other.called == one.episode for other in self._seats.values())
+        taken = any(other.called == one.episode for other in self._slots.values())
         called = f"{one.episode}-{one.run[:4]}" if taken else one.episode
-        self._seats[key] = seat = _Seat(called, one.attempt)
-        try:
-            with policy_call("reset", timer=self._timer):
-                seat.policy = self.policy if self.batches else (self._idle or [self._make()]).pop()
-                seat.policy.reset(seat.called, one.seed)
-            seat.reply = Begun(*one.signature)
-        except PolicyFault as fault:
-            seat.reply = _refused(fault)
-        return seat.reply
+        self._slots[key] = slot = _Slot(called, one.attempt)
+        with self._call([slot], "reset"):
+            slot.policy = self.policy if self.batches else (self._idle or [self._make()]).pop()
+            slot.policy.reset(slot.called, one.seed)
+            slot.reply = Begun(*one.signature)
+        return slot.reply
 
-    def _end(self, key: tuple[str, str], seat: _Seat | None) -> None:
-        if seat is None or self._seats.pop(key, None) is None or seat.policy is None:
+    def _end(self, key: tuple[str, str], slot: _Slot | None) -> None:
+        if slot is None or self._slots.pop(key, None) is None or slot.policy is None:
             return
         if not self.batches:
-            self._idle.append(seat.policy)
-        try:
-            if self._for_many and callable(ended := getattr(seat.policy, "ended", None)):
-                with policy_call("ended", timer=self._timer):
-                    ended(seat.called)
-        except PolicyFault as fault:
-            _refused(fault)  # printed; the episode is over
+            self._idle.append(slot.policy)
+        if self._for_many and callable(ended := getattr(slot.policy, "ended", None)):
+            with self._call([slot], "ended"):
+                ended(slot.called)
 
     def _forget(self) -> None:
-        """Drop idle episodes, and the longest idle one where there are too many."""
+        """Close idle episodes, and the longest idle one if there are too many."""
         now = time.monotonic()
-        seats = sorted(self._seats.items(), key=lambda item: item[1].used_at_s)
-        for number, (key, seat) in enumerate(seats):
-            if now - seat.used_at_s > self._forget_after_s or len(seats) - number >= _MOST_SEATS:
-                self._end(key, seat)
+        slots = sorted(self._slots.items(), key=lambda item: item[1].used_at_s)
+        for number, (key, slot) in enumerate(slots):
+            if now - slot.used_at_s > self._forget_after_s or len(slots) - number >= _MOST_SLOTS:
+                self._end(key, slot)
 
-    def _act(self, asked: list[tuple[_Seat, AskAct, Any]]) -> None:
-        """Query the policy. Each seat gets its reply."""
-        seen = [(seat, one, self._observation(seat, one, memory)) for seat, one, memory in asked]
+    def _act(self, requests: list[tuple[_Slot, AskAct, Any]]) -> None:
+        """Query the policy and set the reply of each slot."""
+        seen = [(slot, one, self._observation(slot, one, memory)) for slot, one, memory in requests]
         ready = [one for one in seen if one[2] is not None]
         for group in [ready] * bool(ready) if self.batches else [[one] for one in ready]:
             self._answer(group)
 
-    def _observation(self, seat: _Seat, one: AskAct, memory: Any) -> Any:
-        """Decode an observation, and report a reset to the policy; None if refused."""
-        seat.step = one.step
-        seat.used_at_s = time.monotonic()
+    def _observation(self, slot: _Slot, one: AskAct, memory: Any) -> Any:
+        """Decode an observation and report a reset to the policy; None if refused."""
+        slot.step = one.step
+        slot.used_at_s = time.monotonic()
         try:
-            if seat.decoder is None or one.about is not None:
-                seat.decoder = self._decoder(seat.called, one.about or AboutEpisode())
+            if slot.decoder is None or one.about is not None:
+                slot.decoder = self._decoder(slot.called, one.about or AboutEpisode())
             arrays = {name: unpacked(array, memory) for name, array in one.arrays.items()}
-            observation = seat.decoder.decoded(one, arrays)
+            observation = slot.decoder.decoded(one, arrays)
         except Exception as error:  # noqa: BLE001  whatever is wrong with the message
-            seat.reply = Refusal("message", f"not an observation: {error}"[:MOST_WORDS])
+            slot.reply = Refusal("message", f"not an observation: {error}"[:MOST_WORDS])
             return None
-        try:
-            if one.reset and callable(on_reset := getattr(seat.policy, "on_reset", None)):
-                with policy_call("on_reset", one.tick, self._timer):
-                    on_reset(*([seat.called] if self._for_many else []))
-        except PolicyFault as fault:
-            fault.during = "on_reset"
-            seat.reply = _refused(fault)
-            return None
-        return observation
+        earlier = slot.reply
+        if one.reset and callable(on_reset := getattr(slot.policy, "on_reset", None)):
+            with self._call([slot], "on_reset", one.tick):
+                on_reset(*([slot.called] if self._for_many else []))
+        return observation if slot.reply is earlier else None
 
-    def _answer(self, group: list[tuple[_Seat, AskAct, Any]]) -> None:
-        """Query the policy for observations together. A bad answer concerns its own episode."""
-        doing = "act" if all(seat.answered for seat, _, _ in group) else "first act"
+    def _answer(self, group: list[tuple[_Slot, AskAct, Any]]) -> None:
+        """Query the policy for a group; an invalid answer affects only its episode."""
+        slots = [slot for slot, _, _ in group]
+        doing = "act" if all(slot.answered for slot in slots) else "first act"
         observations = tuple(observation for _, _, observation in group)
+        answers: list[Any] = []
+        with self._call(slots, doing, max(one.tick for _, one, _ in group)):
+            if self.batches:
+                answers = _as_many(self.policy.act_batch(observations), len(group))
+            else:
+                answers = [group[0][0].policy.act(observations[0])]
+        for (slot, one, _), answer in zip(group, answers):
+            slot.answered = True
+            with self._call([slot], doing, one.tick):
+                slot.reply = _packed_answer(one, answer)
+
+    @contextmanager
+    def _call(self, slots: list[_Slot], doing: str, tick: int = 0) -> Iterator[None]:
+        """Guard a call of the policy; print a fault and make it the reply of these slots."""
         try:
-            with policy_call(doing, max(one.tick for _, one, _ in group), self._timer):
-                if self.batches:
-                    answers = _as_many(self.policy.act_batch(observations), len(group))
-                else:
-                    answers = [group[0][0].policy.act(observations[0])]
+            with policy_call(doing, tick, self._timer):
+                yield
         except PolicyFault as fault:
-            fault.together = len(group)
-            refusal = _refused(fault)
-            for seat, _, _ in group:
-                seat.reply = refusal
-            return
-        for (seat, one, _), answer in zip(group, answers):
-            seat.answered = True
-            try:
-                with policy_call(doing, one.tick, self._timer):
-                    seat.reply = _packed_answer(one, answer)
-            except PolicyFault as fault:
-                seat.reply = _refused(fault)
+            if (cause := fault.__cause__) is not None:
+                traceback.print_exception(type(cause), cause, cause.__traceback__)
+            during = doing if doing == "on_reset" else fault.during
+            for slot in slots:
+                slot.reply = Refusal("policy", fault.words, during, len(slots))
 
 
 def _as_many(answers: Any, count: int) -> list[Any]:
-    """Return the answers of a batch. Raises PolicyFault unless there is one for each
-    observation."""
+    """Return the answers of a batch. Raises PolicyFault unless there is one per observation."""
     if not hasattr(answers, "__len__") or not hasattr(answers, "__getitem__"):
         kind = type(answers).__name__
         raise PolicyFault(f"answered a {kind}: a batch is answered with a sequence")
@@ -512,31 +485,20 @@ def _as_many(answers: Any, count: int) -> list[Any]:
     return [answers[i] for i in range(count)]
 
 
-def _refused(fault: PolicyFault) -> Refusal:
-    """Print the traceback of a fault, and return it as a message."""
-    cause = fault.__cause__
-    if cause is not None:
-        traceback.print_exception(type(cause), cause, cause.__traceback__)
-    return Refusal("policy", fault.words, fault.during, fault.together)
-
-
 def _from_jpeg(data: memoryview) -> Any:
-    """(H, W, 3) uint8. Only who asks for JPEG needs OpenCV or Pillow. Raises ValueError."""
+    """Decode JPEG to (H, W, 3) uint8 with OpenCV or Pillow. Raises ValueError."""
     try:
         import cv2
-
-        bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        return np.ascontiguousarray(np.asarray(bgr)[..., ::-1])
     except ImportError:
-        from io import BytesIO
-
         from PIL import Image
 
-        return np.array(Image.open(BytesIO(data)).convert("RGB"))
+        return np.array(Image.open(io.BytesIO(data)).convert("RGB"))
+    bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+    return np.ascontiguousarray(np.asarray(bgr)[..., ::-1])
 
 
 def read_request(payload: bytes) -> Union[PolicyRequest, Refusal]:
-    """Decode a request; a Refusal where it is none."""
+    """Decode a request; return a Refusal if invalid."""
     try:
         request: PolicyRequest = decode_request(payload)
         return request
@@ -545,10 +507,10 @@ def read_request(payload: bytes) -> Union[PolicyRequest, Refusal]:
 
 
 def unpacked(array: PackedArray, memory: Any = None) -> Any:
-    """Return a copy of an array of an observation. Raises ValueError for what is none."""
+    """Return a copy of an array of an observation. Raises ValueError if invalid."""
     if array.jpeg:
         return _from_jpeg(array.data).reshape(array.shape)
-    if array.dtype not in _ARRAYS or any(side < 0 for side in array.shape):
+    if array.dtype not in ("|u1", "<f4") or any(side < 0 for side in array.shape):
         raise ValueError(f"an array of {array.dtype} {array.shape}")
     count = int(np.prod(array.shape, dtype=np.int64))
     if array.at < 0:
@@ -559,8 +521,7 @@ def unpacked(array: PackedArray, memory: Any = None) -> Any:
 
 
 def _packed_answer(one: AskAct, answer: Any) -> Answer:
-    """Pack a policy's answer. Raises PolicyFault for what is none, and whatever reading it
-    raises."""
+    """Serialize an answer. Raises PolicyFault if invalid, and any exception of its attributes."""
     if isinstance(answer, dict) and set(answer) == {"v_mps", "w_radps"}:
         answer = SimpleNamespace(**answer)
     if not (hasattr(answer, "v_mps") and hasattr(answer, "w_radps")):
@@ -604,22 +565,24 @@ def serve(
     jpeg: bool = False,
     tls: str = "",
     insecure: bool = False,
-    told: Any = None,
+    manifest: Any = None,
     source: str = "",
     decoder: Any = EpisodeDecoder,
     session: Any = None,
 ) -> None:
-    """Answer for a policy until Ctrl-C.
+    """Serve a policy in the calling thread until Ctrl-C. Raises ValueError for invalid arguments.
 
-    policy: an object; or a class, of which there is then one for each episode (`PolicyDesk`). told:
-    its manifest, in place of `policy.manifest`: a mapping with the fields of `cosim.Manifest`;
-    source: a hash of what it is written in. name: what runs ask for, else the manifest's. listen;
-    or connect, to where `cosim serve` listens. tls: a folder with ca.pem, cert.pem and key.pem
-    (`cosim certs`). insecure: it may reach beyond this machine without. jpeg: pictures are to come
-    as JPEG. session: an open Zenoh session, in place of all that. Raises ValueError.
+    policy: An object, or a class to make one for each episode (`PolicyDesk`).
+    name: Name used by runs; the manifest's by default.
+    listen, connect: Endpoint to listen at, or where `cosim serve` listens.
+    jpeg: Request pictures as JPEG.
+    tls: Folder with ca.pem, cert.pem and key.pem (`cosim certs`).
+    insecure: Allow endpoints beyond this machine without tls.
+    manifest: Replaces `policy.manifest`: a mapping with the fields of `cosim.Manifest`.
+    session: Open Zenoh session, in place of an endpoint.
     """
     desk = PolicyDesk(policy, decoder=decoder)
-    manifest = msgspec.to_builtins(desk.policy.manifest if told is None else told)
+    manifest = msgspec.to_builtins(desk.policy.manifest if manifest is None else manifest)
     name = name or manifest["name"]
     server = secrets.token_hex(4)
     if not all(re.fullmatch(r"[A-Za-z0-9_-]{1,64}", part) for part in (name, domain)):
@@ -628,17 +591,17 @@ def serve(
         )
     below = policy_key(domain, name, server)
     source = source or _source_of(desk.policy)
-    asked: queue.SimpleQueue[Any] = queue.SimpleQueue()
+    requests: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
-    def tell(query: Any) -> None:
+    def answer_info(query: Any) -> None:
         with query:
-            busy = desk.at_once, desk.under_way
-            info = PolicyInfo(server, name, manifest, source, *busy, jpeg, bool(listen))
+            counts = desk.at_once, desk.under_way
+            info = PolicyInfo(server, name, manifest, source, *counts, jpeg, bool(listen))
             query.reply(f"{below}/info", encode_message(info))
 
-    opens = nullcontext(session) if session else _opened(listen, connect, tls, insecure)
-    with opens as opened, suppress(KeyboardInterrupt):
-        answers = {"info": tell, **dict.fromkeys(_QUESTIONS, asked.put)}
+    opening = nullcontext(session) if session else _opened(listen, connect, tls, insecure)
+    with opening as opened, suppress(KeyboardInterrupt):
+        answers = {"info": answer_info, **dict.fromkeys(("reset", "act", "ended"), requests.put)}
         _declared = [
             opened.declare_queryable(f"{below}/{kind}", answer, complete=True)
             for kind, answer in answers.items()
@@ -646,17 +609,17 @@ def serve(
         where = f"at {listen or connect} as server {server}"
         print(f"policy '{name}' answers {where}; stop with Ctrl-C", flush=True)
         while True:
-            _answer_waiting(desk, asked)
+            _answer_waiting(desk, requests)
 
 
-def _answer_waiting(desk: PolicyDesk, asked: Any) -> None:
+def _answer_waiting(desk: PolicyDesk, requests: Any) -> None:
     """Answer the waiting requests, at least one."""
-    queries = [asked.get()]
+    queries = [requests.get()]
     since_s = time.monotonic()
     with suppress(queue.Empty):
         while True:
             wait_s = desk.wait_s(len(queries), desk.under_way, since_s)
-            queries.append(asked.get(timeout=wait_s))
+            queries.append(requests.get(timeout=wait_s))
     # A request to several servers at once is refused: an answer would be lost.
     read = [query.payload is not None and "*" not in str(query.key_expr) for query in queries]
     payloads = [query.payload.to_bytes() if reads else b"" for query, reads in zip(queries, read)]
@@ -669,7 +632,7 @@ def _answer_waiting(desk: PolicyDesk, asked: Any) -> None:
 
 
 def policy_key(domain: str, name: str, server: str) -> str:
-    """What the keys of a server begin with; _QUESTIONS of questions, and `info`, stand below."""
+    """Return the key prefix of a server; `info`, `reset`, `act` and `ended` follow it."""
     return f"cosim/{domain}/policy/{name}/{server}"
 
 
@@ -682,7 +645,7 @@ def _source_of(policy: Any) -> str:
 
 
 def _opened(listen: str, connect: str, tls: str, insecure: bool) -> Any:
-    """A Zenoh session that reaches no further than it says."""
+    """Open a Zenoh session at one endpoint, without discovery."""
     import zenoh
 
     found = re.fullmatch(r"(tcp|tls)/(.+):\d{1,5}|unixsock-stream/.+", listen or connect)
@@ -694,9 +657,9 @@ def _opened(listen: str, connect: str, tls: str, insecure: bool) -> Any:
         host = "localhost" if ip_address(host).is_loopback else host
     if host != "localhost" and not insecure and not (tls and found[1] == "tls"):
         raise ValueError(
-            f"{found[0]} is beyond this machine and unguarded: whoever can reach it may ask "
-            f"the policy and read all "
-            "that is sent. Use tls/... with tls=FOLDER (`cosim certs` makes it), or say insecure"
+            f"{found[0]} is beyond this machine and unguarded: whoever can reach it may ask the "
+            "policy and read all that is sent. Use tls/... with tls=FOLDER (`cosim certs` makes "
+            "it), or say insecure"
         )
     settings: dict[str, Any] = {
         "mode": "router" if listen else "client",
@@ -710,25 +673,25 @@ def _opened(listen: str, connect: str, tls: str, insecure: bool) -> Any:
         "transport/link/rx/max_message_size": MOST_MESSAGE_BYTES,
     }
     if tls:
-        ours = {"certificate": str(Path(tls, "cert.pem")), "private_key": str(Path(tls, "key.pem"))}
-        guard: dict[str, Any] = {"enable_mtls": True, "verify_name_on_connect": True}
-        for end in ("listen", "connect"):
-            guard.update({f"{end}_{what}": path for what, path in ours.items()})
-        guard["root_ca_certificate"] = str(Path(tls, "ca.pem"))
-        settings["transport/link/tls"] = guard
-    if listen and found[1]:  # runs may ask; nobody else may, and nobody may answer in its place
+        ends = ("listen", "connect")
+        files = ("certificate", "cert.pem"), ("private_key", "key.pem")
+        settings["transport/link/tls"] = {
+            "enable_mtls": True,
+            "verify_name_on_connect": True,
+            "root_ca_certificate": str(Path(tls, "ca.pem")),
+            **{f"{end}_{kind}": str(Path(tls, file)) for end in ends for kind, file in files},
+        }
+    if listen and found[1]:  # only runs may send queries, and only this server may answer
         may = {"permission": "allow", "key_exprs": ["cosim/*/policy/**"]}
         flows = {"ingress": ["query"], "egress": ["declare_queryable", "reply"]}
         rules = [{"id": flow, "flows": [flow], "messages": flows[flow], **may} for flow in flows]
-        who = {"link_protocols": ["tcp"]}
-        if tls:
-            who = {"cert_common_names": ["worker", "coordinator"]}
+        roles = {"cert_common_names": ["worker", "coordinator"]}
         settings["access_control"] = {
             "enabled": True,
             "default_permission": "deny",
             "rules": rules,
-            "subjects": [{"id": "runs", **who}],
-            "policies": [{"rules": ["ingress", "egress"], "subjects": ["runs"]}],
+            "subjects": [{"id": "runs", **(roles if tls else {"link_protocols": ["tcp"]})}],
+            "policies": [{"rules": list(flows), "subjects": ["runs"]}],
         }
     config = zenoh.Config()
     for key, value in settings.items():

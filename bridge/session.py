@@ -1,8 +1,7 @@
-"""Zenoh sessions: the one place that imports zenoh.
+"""Zenoh sessions: the only module that imports zenoh.
 
-Over one explicit endpoint, or within one session: no scouting, no shared memory. A handler that
-raises answers with its error instead of silence. `open_session` opens all that reach another
-process, as a `Connection` says.
+A session uses one explicit endpoint, or none, without discovery and shared memory. A handler that
+raises sends an error reply. `open_session` opens sessions to other processes.
 """
 
 from __future__ import annotations
@@ -25,13 +24,14 @@ from cosim.core.errors import AccessError, EngineError
 from cosim.spec.connection import Connection
 
 Handler = Callable[[bytes], bytes]
-_Heard = zenoh.Subscriber["zenoh.Handler[zenoh.Sample]"]
+_Subscriber = zenoh.Subscriber["zenoh.Handler[zenoh.Sample]"]
 
 _SOURCE_LINE = re.compile(r" at /\S+\.rs:\d+\.?")
-"""In zenoh's errors: where it was built, of no use to anybody here."""
+"""Source location in Zenoh's errors."""
 
 _ANSWER = "answer"
-_WRITTEN = (
+"""Last chunk of the key of replies in a `LoneSession`."""
+_ENCODINGS = (
     "zenoh/bytes",
     "application/msgpack",
     "application/json",
@@ -39,16 +39,21 @@ _WRITTEN = (
     "text/plain",
     "zenoh/string",
 )
-"""How a message may say that it is written: as none that makes objects of any kind."""
+"""Accepted encodings of messages: none creates arbitrary objects."""
 _LONGEST_FOLDER = 70
-"""Letters: the whole path of a Unix socket has at most 107."""
+"""Longest folder name in characters: the path of a Unix socket has at most 107."""
 _FIRST_RETRY_S = 0.005
+"""First pause in seconds between retries; it doubles with each retry."""
 _LONGEST_RETRY_S = 0.2
+"""Longest pause in seconds between retries."""
 
 
 class Query:
-    """A query that waits for its reply, from any thread. key: what was asked; payload: what came
-    with it."""
+    """Query that can be answered once, from any thread.
+
+    key: Key expression of the query.
+    payload: Bytes of the query.
+    """
 
     def __init__(self, query: zenoh.Query) -> None:
         self.key = str(query.key_expr)
@@ -56,7 +61,7 @@ class Query:
         self._query: zenoh.Query | None = query
 
     def answer(self, payload: bytes) -> None:
-        """Reply, once; to who is gone already nothing happens."""
+        """Send the reply; without effect if the querier has left."""
         query = self._query
         self._query = None
         if query is not None:
@@ -64,7 +69,7 @@ class Query:
                 query.reply(self.key, payload)
 
     def refuse(self, words: str) -> None:
-        """Reply with an error."""
+        """Send an error reply."""
         query = self._query
         self._query = None
         if query is not None:
@@ -73,21 +78,21 @@ class Query:
 
 
 HowHeard = Literal["answered", "refused", "late", "nobody"]
+"""Result of a query: reply, error reply, timeout, or no queryable."""
 
 
 class QueryHeard(NamedTuple):
-    """What came of a query: an answer, an error of the other side's, nothing in time, or nobody is
-    there."""
+    """Result of a query with the payload of its reply."""
 
     how: HowHeard
     payload: bytes = b""
 
 
 class Session:
-    """An open Zenoh session. Use as a context manager: a session left open keeps the process alive.
+    """Open Zenoh session. Use as a context manager: an open session keeps the process alive.
 
-    inside: of one that listens: how processes of its own run on this machine reach it, by a socket
-    that nobody else may open. They may do all; everybody else what their role may.
+    inside: For a listening session, the connection of its own processes on this machine, by a
+        private socket. They have all rights; other processes have those of their role.
     """
 
     def __init__(
@@ -102,25 +107,25 @@ class Session:
 
     @property
     def itself(self) -> zenoh.Session:
-        """What Zenoh opened, for the one file that answers by it without this one
-        (`bridge.policy_server`)."""
+        """Zenoh's session, for `bridge.policy_server` only."""
         return self._session
 
     @property
     def inside(self) -> Connection:
+        """Connection of processes on this machine."""
         assert self._inside is not None, "this session listens nowhere"
         return self._inside
 
     @property
     def hub(self) -> str:
-        """Which hub this end is connected to now, by an id that no other one has; "" for none."""
+        """Ids of the connected routers; "" for none."""
         return ", ".join(str(one) for one in self._session.info.routers_zid())
 
     def serve(self, key: str, handler: Handler, *, found: bool = False) -> None:
         """Answer queries on `key` with `handler(payload)`; its exceptions become error replies.
 
-        key: may hold wildcards; then queries on every key of that form are answered, each on its
-        own. found: queries on key expressions that include `key` are answered too.
+        key: May have wildcards; then queries on every matching key are answered.
+        found: Also answer queries on key expressions that include `key`.
         """
 
         def answer(query: zenoh.Query) -> None:
@@ -129,28 +134,30 @@ class Session:
                     query.reply_err(objection.encode())
                     return
                 payload = query.payload.to_bytes() if query.payload is not None else b""
-                asked = str(query.key_expr)
+                queried = str(query.key_expr)
                 try:
-                    query.reply(key if "*" in asked else asked, handler(payload))
+                    query.reply(key if "*" in queried else queried, handler(payload))
                 except Exception as error:  # noqa: BLE001  a silent callback would look like a lost peer
                     query.reply_err(f"{type(error).__name__}: {error}".encode())
 
         self._queryables.append(self._session.declare_queryable(key, answer, complete=True))
 
     def collect(self, key: str, take: Callable[[Query], None], *, found: bool = False) -> None:
-        """Hand queries on `key` over to `take`, in a thread of Zenoh's, where nothing may wait:
-        they are answered later, elsewhere. found: see `serve`; such a query is to be answered on
-        `key`."""
+        """Pass queries on `key` to `take`, in a thread of Zenoh that must not block.
 
-        def handed(query: zenoh.Query) -> None:
-            asked = Query(query)
+        The query is answered later.
+        found: See `serve`; such a query is answered on `key`.
+        """
+
+        def collected(query: zenoh.Query) -> None:
+            pending = Query(query)
             if objection := _objection(query, key, found=found):
-                asked.refuse(objection)
+                pending.refuse(objection)
                 return
-            asked.key = key if "*" in asked.key else asked.key
-            take(asked)
+            pending.key = key if "*" in pending.key else pending.key
+            take(pending)
 
-        self._queryables.append(self._session.declare_queryable(key, handed, complete=True))
+        self._queryables.append(self._session.declare_queryable(key, collected, complete=True))
 
     def send(
         self,
@@ -160,33 +167,33 @@ class Session:
         *,
         timeout_s: float,
     ) -> None:
-        """Ask once, without waiting. `replied` is called once, in a thread of Zenoh's, where
-        nothing may wait: with the reply; or with None, and the other side's error, "" where nobody
-        answered in time."""
+        """Send a query without waiting.
+
+        replied: Called once, in a thread of Zenoh that must not block, with the reply and ""; or
+            with None and the error reply, "" on timeout.
+        """
         found: list[bytes] = []
         errors: list[str] = []
 
-        def heard(reply: zenoh.Reply) -> None:
+        def received(reply: zenoh.Reply) -> None:
             if reply.ok is not None:
                 found.append(bytes(reply.ok.payload.to_bytes()))
             elif reply.err is not None and (words := reply.err.payload.to_string()) != "Timeout":
                 errors.append(words)
 
-        def over() -> None:
+        def finished() -> None:
             replied(found[0] if found else None, errors[0] if errors else "")
 
-        hears = zenoh.handlers.Callback(heard, over, indirect=False)
         self._session.get(
             key,
-            hears,
+            zenoh.handlers.Callback(received, finished, indirect=False),
             payload=payload,
             timeout=timeout_s,
             consolidation=zenoh.ConsolidationMode.NONE,
         )
 
     def stand(self, key: str) -> Callable[[], None]:
-        """Be seen at `key` by those who `watch` it, as long as this session is there, or until what
-        is returned is called."""
+        """Declare a liveliness token at `key`; return a function that removes it."""
         token = self._session.liveliness().declare_token(key)
         self._tokens.append(token)
 
@@ -196,74 +203,70 @@ class Session:
 
         return leave
 
-    def watch(self, key: str, heard: Callable[[str, bool], None]) -> None:
-        """Call `heard(key, there)` for everybody who `stand`s at a key expression now or later, and
-        when they go."""
+    def watch(self, key: str, changed: Callable[[str, bool], None]) -> None:
+        """Call `changed(key, alive)` for every liveliness token at a key, now and later."""
 
-        def told(sample: zenoh.Sample) -> None:
-            heard(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+        def received(sample: zenoh.Sample) -> None:
+            changed(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
         self._subscribers.append(
-            self._session.liveliness().declare_subscriber(key, told, history=True)
+            self._session.liveliness().declare_subscriber(key, received, history=True)
         )
 
     def answers(self, key: str, *, timeout_s: float) -> dict[str, bytes]:
-        """Everybody's replies to one empty query on a key expression, by their keys; errors are
-        left out."""
+        """Return all replies to an empty query on a key expression by key, without errors."""
         replies = self._session.get(key, timeout=timeout_s)
         return {
             str(r.ok.key_expr): bytes(r.ok.payload.to_bytes()) for r in replies if r.ok is not None
         }
 
     def tell(self, key: str, payload: bytes) -> None:
-        """Publish; whoever is slow to listen misses it."""
+        """Publish; slow subscribers miss messages."""
         self._session.put(key, payload, congestion_control=zenoh.CongestionControl.DROP)
 
     def listen(self, key: str, handler: Callable[[str, bytes], None]) -> None:
-        """Call `handler(key, payload)` for whatever is published on a key expression."""
+        """Call `handler(key, payload)` for every publication on a key expression."""
 
-        def heard(sample: zenoh.Sample) -> None:
+        def received(sample: zenoh.Sample) -> None:
             handler(str(sample.key_expr), sample.payload.to_bytes())
 
-        self._subscribers.append(self._session.declare_subscriber(key, heard))
+        self._subscribers.append(self._session.declare_subscriber(key, received))
 
     def ask_once(self, key: str, payload: bytes, *, timeout_s: float) -> QueryHeard:
-        """What comes of one query, whoever answers it first."""
+        """Send one query and return its first result."""
         began_s = time.monotonic()
-        # Unconsolidated: else a reply is held back until every other side has said that it has
-        # none.
-        one_by_one = zenoh.ConsolidationMode.NONE
+        # Consolidation would delay a reply until all other queryables have finished.
+        unconsolidated = zenoh.ConsolidationMode.NONE
         for reply in self._session.get(
-            key, payload=payload, timeout=timeout_s, consolidation=one_by_one
+            key, payload=payload, timeout=timeout_s, consolidation=unconsolidated
         ):
             if reply.ok is not None:
                 return QueryHeard("answered", bytes(reply.ok.payload.to_bytes()))
             message = bytes(reply.err.payload.to_bytes()) if reply.err is not None else b""
             if message != b"Timeout":
                 return QueryHeard("refused", message)
-        # Where both ends run out of time at once, a query may end without that message.
+        # If both ends time out at once, a query may end without that message.
         return QueryHeard("late" if time.monotonic() - began_s >= timeout_s else "nobody")
 
     def ask(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
-        """The reply to one query. Asks again while nobody answers, until `timeout_s` is over.
+        """Return the reply to a query, with retries until the timeout.
 
-        Raises TimeoutError when nobody answered, EngineError when the other side answered with an
-        error.
+        Raises TimeoutError without a reply, EngineError for an error reply.
         """
         deadline = time.monotonic() + timeout_s
         pause_s = _FIRST_RETRY_S
         while (left_s := deadline - time.monotonic()) > 0:
-            heard = self.ask_once(key, payload, timeout_s=left_s)
-            if heard.how == "answered":
-                return heard.payload
-            if heard.how == "refused":
-                raise EngineError(f"'{key}' answered: {heard.payload.decode(errors='replace')}")
+            result = self.ask_once(key, payload, timeout_s=left_s)
+            if result.how == "answered":
+                return result.payload
+            if result.how == "refused":
+                raise EngineError(f"'{key}' answered: {result.payload.decode(errors='replace')}")
             time.sleep(min(pause_s, max(deadline - time.monotonic(), 0.0)))
             pause_s = min(2 * pause_s, _LONGEST_RETRY_S)
         raise TimeoutError(f"nobody answered on '{key}' for {timeout_s:g} s")
 
     def close(self) -> None:
-        """Close the session; closing twice is fine."""
+        """Close the session; safe to call twice."""
         with suppress(zenoh.ZError):
             for queryable in self._queryables:
                 queryable.undeclare()  # type: ignore[no-untyped-call]
@@ -291,54 +294,54 @@ class Session:
 
 
 def _objection(query: zenoh.Query, key: str, *, found: bool) -> str:
-    """What is against answering a query on a key, "" for nothing: it asks several at once, or would
-    have us unpickle.
+    """Return why a query is refused, "" if valid: several keys at once, or an unsafe encoding.
 
-    found: whether several may be asked at once."""
-    asked = str(query.key_expr)
-    written = str(query.encoding or _WRITTEN[0])
-    if "*" in asked and not (found and query.key_expr.includes(zenoh.KeyExpr(key))):
-        return f"ask for exactly '{key}', not '{asked}'"
-    if written not in _WRITTEN:
-        return f"'{written[:64]}' is not read here: send {_WRITTEN[1]} or {_WRITTEN[2]}"
+    found: Whether several keys are allowed.
+    """
+    queried = str(query.key_expr)
+    encoding = str(query.encoding or _ENCODINGS[0])
+    if "*" in queried and not (found and query.key_expr.includes(zenoh.KeyExpr(key))):
+        return f"ask for exactly '{key}', not '{queried}'"
+    if encoding not in _ENCODINGS:
+        return f"'{encoding[:64]}' is not read here: send {_ENCODINGS[1]} or {_ENCODINGS[2]}"
     return ""
 
 
 class LoneSession(Session):
-    """A session with nobody else in it and no socket: what it asks it answers itself, in the thread
-    that asks.
+    """Session within one thread, without a socket: `ask` runs the handler itself.
 
-    For one thread. Question and answer are publications, not a query: a thread of Zenoh's watches
-    over the time of a query, and on a busy machine whoever wakes it waits for a turn of its own.
-    What interrupts the thread that asks interrupts the handler.
+    Query and reply are publications, because Zenoh's queries use a timer thread that adds latency
+    on a busy machine. An interrupt of the calling thread interrupts the handler.
     """
 
     def __init__(self) -> None:
         super().__init__(
             _open(settings_alone(), "cannot open a session", "Has this machine threads to spare?")
         )
-        self._served: list[tuple[_Heard, _Heard, Handler]] = []
+        self._served: list[tuple[_Subscriber, _Subscriber, Handler]] = []
 
     def serve(self, key: str, handler: Handler, *, found: bool = False) -> None:
-        """Answer what is asked on `key`, in `ask`."""
-        # Of the newest alone: an interrupted `ask` may have left a question or an answer behind.
+        """Answer queries on `key` in `ask`."""
+        # Only the newest message: an interrupted `ask` may have left an older one.
         question = self._session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
         answer = self._session.declare_subscriber(f"{key}/{_ANSWER}", zenoh.handlers.RingChannel(1))
         self._subscribers += [question, answer]
         self._served.append((question, answer, handler))
 
     def ask(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
-        """The answer to one question. Raises TimeoutError at once when nobody serves the key,
-        EngineError when its handler raised."""
+        """Return the reply of the handler.
+
+        Raises TimeoutError at once if the key is not served, EngineError if its handler raised.
+        """
         self._session.put(key, payload)
         for question, answer, handler in self._served:
-            if (asked := question.try_recv()) is not None:
-                self._answer(f"{key}/{_ANSWER}", handler, asked.payload.to_bytes())
-                told = answer.try_recv()
-                assert told is not None  # it was put in this thread
-                if told.attachment is not None:
-                    raise EngineError(f"'{key}' answered: {told.payload.to_string()}")
-                return bytes(told.payload.to_bytes())
+            if (query := question.try_recv()) is not None:
+                self._answer(f"{key}/{_ANSWER}", handler, query.payload.to_bytes())
+                reply = answer.try_recv()
+                assert reply is not None  # it was put in this thread
+                if reply.attachment is not None:
+                    raise EngineError(f"'{key}' answered: {reply.payload.to_string()}")
+                return bytes(reply.payload.to_bytes())
         raise TimeoutError(f"nobody answers on '{key}'")
 
     def _answer(self, key: str, handler: Handler, payload: bytes) -> None:
@@ -351,12 +354,11 @@ class LoneSession(Session):
 
 
 def open_session(connection: Connection, say: Callable[[str], None] = lambda _: None) -> Session:
-    """Open one end of a session: a hub where it listens, else a client of the hub that it connects
-    to.
+    """Open one end of a session: a hub if it listens, else a client of the hub it connects to.
 
-    say: told, once it is open, in a line each what is insecure and which certificate ends soon.
-    Raises AccessError for certificates that do not fit, here or there (trying again changes
-    nothing), EngineError when an endpoint is taken or nobody answers.
+    say: Called once it is open with each warning: insecure settings, expiring certificates.
+    Raises AccessError for invalid certificates on either side (a retry is useless), EngineError if
+    the endpoint is in use or does not answer.
 
     >>> from cosim.spec.connection import Connection
     >>> with open_session(Connection(role="coordinator", listen="tcp/127.0.0.1:7461")) as hub:
@@ -373,8 +375,7 @@ def open_session(connection: Connection, say: Callable[[str], None] = lambda _: 
 
 
 def notices_of(connection: Connection) -> list[str]:
-    """What is insecure about a connection, and which certificate ends soon, a line each. Raises
-    AccessError."""
+    """Return warnings about insecure settings and expiring certificates. Raises AccessError."""
     soon = ""
     if connection.tls:
         from bridge.security.identity import checked_identity
@@ -391,8 +392,8 @@ def _listening(connection: Connection) -> Session:
     if connection.listen.startswith("unixsock-stream/"):
         inside = Connection(role=connection.role, connect=connection.listen)
         return Session(_open(settings_of(connection), failure, remedy), inside)
-    brief = tempfile.gettempdir() if len(tempfile.gettempdir()) < _LONGEST_FOLDER else "/tmp"
-    folder = Path(tempfile.mkdtemp(prefix="cosim-", dir=brief))
+    short = tempfile.gettempdir() if len(tempfile.gettempdir()) < _LONGEST_FOLDER else "/tmp"
+    folder = Path(tempfile.mkdtemp(prefix="cosim-", dir=short))
     inside = Connection(role=connection.role, connect=f"unixsock-stream/{folder}/hub.sock")
     try:
         return Session(
@@ -411,7 +412,7 @@ def _connected(connection: Connection) -> Session:
         )
     except EngineError as error:
         if connection.tls:
-            from bridge.security.refusal import why_refused
+            from bridge.security.identity import why_refused
 
             if why := why_refused(connection):
                 raise AccessError(why) from error

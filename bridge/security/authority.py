@@ -1,8 +1,7 @@
-"""A private authority and the certificates that it issues, one for each role: files in a folder.
+"""Create a private certificate authority and issue a certificate for each role.
 
-`ca.pem` and `ca.key` of the authority, and beside them a folder for each role, which is copied
-whole to where it is needed. Who listens is issued for the names that others reach it by, and nobody
-else can stand in for it.
+A folder has the authority's `ca.pem` and `ca.key`, and a subfolder for each role to copy to its
+machine. A listening role is issued for its host names, so no other role can impersonate it.
 """
 
 from __future__ import annotations
@@ -39,18 +38,22 @@ from cosim.spec.connection import HUBS, Role
 
 _CA_KEY: Final = "ca.key"
 _AUTHORITY_DAYS: Final = 3650
+"""Validity of an authority in days."""
 _SKEW: Final = timedelta(days=1)
-"""Valid from so long ago: clocks of other machines may be behind."""
+"""Validity before the issue, because clocks of other machines may be behind."""
 _HOST: Final = re.compile(
     r"(?=.{1,253}$)[A-Za-z0-9]([A-Za-z0-9-]{0,62})(\.[A-Za-z0-9]([A-Za-z0-9-]{0,62}))*"
 )
+"""Valid host names."""
 
 
 def make_authority(
     folder: Path, hosts: Sequence[str], days: int, now: datetime | None = None
 ) -> None:
-    """Make a folder with a new authority and the certificate of a coordinator. Raises UsageError
-    when it is there."""
+    """Create a folder with an authority and a coordinator's certificate.
+
+    Raises UsageError if the folder exists.
+    """
     names = [_name(host) for host in hosts]
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"{folder} is a file: name a folder that is not there yet, like certs")
@@ -76,16 +79,17 @@ def make_authority(
 def issue(
     folder: Path, role: Role, hosts: Sequence[str], days: int, *, renew: bool = False
 ) -> Path:
-    """Issue the certificate of a role and give its folder. One that is there is replaced only if
-    `renew`, and keeps its hosts if none are given. Raises UsageError, AccessError."""
+    """Issue the certificate of a role and return its folder.
+
+    renew: Replace an existing certificate; its hosts are reused if none are given.
+    Raises UsageError, AccessError.
+    """
     names = [_name(host) for host in hosts]
     place = folder / role
     if place.exists():
         if not renew:
-            there = identity_in(place)
-            raise UsageError(
-                f"{place} is there, and valid until {said(there.ends)}: --renew replaces it"
-            )
+            ends = said(identity_in(place).ends)
+            raise UsageError(f"{place} is there, and valid until {ends}: --renew replaces it")
         names = names or [_name(host) for host in identity_in(place).hosts]
     if role in ("coordinator", "director") and not names:
         raise UsageError(
@@ -102,7 +106,7 @@ def issue(
 def _issue(
     folder: Path, role: Role, hosts: list[x509.GeneralName], days: int, now: datetime
 ) -> None:
-    authority, signs = _authority(folder)
+    authority, signing_key = _authority(folder)
     key = generate_private_key(SECP256R1())
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, role)])
     ends = min(now + timedelta(days=days), authority.not_valid_after_utc)
@@ -113,13 +117,13 @@ def _issue(
     builder = builder.add_extension(_usage(signs_certificates=False), critical=True)
     uses = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
     builder = builder.add_extension(x509.ExtendedKeyUsage(uses), critical=False)
-    theirs = x509.AuthorityKeyIdentifier.from_issuer_public_key(signs.public_key())
-    builder = builder.add_extension(theirs, critical=False)
+    issuer = x509.AuthorityKeyIdentifier.from_issuer_public_key(signing_key.public_key())
+    builder = builder.add_extension(issuer, critical=False)
     if hosts:
         builder = builder.add_extension(x509.SubjectAlternativeName(hosts), critical=False)
     with _whole_folder(folder / role) as made:
         _write(made / CA, authority.public_bytes(Encoding.PEM))
-        _write(made / CERTIFICATE, builder.sign(signs, SHA256()).public_bytes(Encoding.PEM))
+        _write(made / CERTIFICATE, builder.sign(signing_key, SHA256()).public_bytes(Encoding.PEM))
         _write(made / KEY, _pem(key))
 
 
@@ -190,7 +194,7 @@ def _pem(key: EllipticCurvePrivateKey) -> bytes:
 
 @contextmanager
 def _whole_folder(folder: Path) -> Iterator[Path]:
-    """Yield a folder that takes the place of `folder` at the end of the block."""
+    """Yield a folder that replaces `folder` at the end of the block."""
     try:
         with atomic_folder(folder) as made:
             made.chmod(0o700)
@@ -200,7 +204,7 @@ def _whole_folder(folder: Path) -> Iterator[Path]:
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Readable by nobody else from the first byte on, if it is a key."""
+    """Write a file. A key is never readable by other users."""
     mode = 0o644 if path.suffix == ".pem" and path.name != KEY else 0o600
     with open(path, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
         file.write(data)

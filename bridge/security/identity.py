@@ -1,10 +1,13 @@
-"""What a folder of `--tls` says: whose it is, until when, and whether its files belong together.
+"""Check the certificate files of `--tls`: role, validity and consistency.
 
-Zenoh refuses wrong files without saying which, so they are looked at before a session is opened.
+Zenoh rejects wrong files without a reason, so they are checked before a session is opened. If a
+connection is refused, a second handshake finds the reason.
 """
 
 from __future__ import annotations
 
+import socket
+import ssl
 import stat
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -22,12 +25,15 @@ CA = "ca.pem"
 CERTIFICATE = "cert.pem"
 KEY = "key.pem"
 SOON: Final = timedelta(days=30)
-"""Before the end so long it is said that a certificate ends."""
+"""Time before its end from which a certificate counts as expiring."""
 
 
 class Identity(NamedTuple):
-    """A certificate as it was read. hosts: the names that others may reach it by; ends: when it, or
-    what it is issued by, expires."""
+    """Certificate of a role.
+
+    hosts: Names by which others may connect.
+    begins, ends: Validity, limited by the authority's.
+    """
 
     role: Role
     hosts: tuple[str, ...]
@@ -36,15 +42,14 @@ class Identity(NamedTuple):
 
 
 def identity_in(folder: Path) -> Identity:
-    """Whose the files of a folder are. Raises AccessError when one is missing, or they do not
-    belong together."""
+    """Read the files of a folder. Raises AccessError if one is missing or they do not match."""
     certificate, authority = (_certificate(folder / name) for name in (CERTIFICATE, CA))
     key = folder / KEY
     try:
-        ours = load_pem_private_key(_read(key), None).public_key() == certificate.public_key()
+        matches = load_pem_private_key(_read(key), None).public_key() == certificate.public_key()
     except (ValueError, TypeError) as error:
         raise AccessError(f"{key}: holds no private key without a password") from error
-    if not ours:
+    if not matches:
         raise AccessError(
             f"{key} is not the key of {folder / CERTIFICATE}: copy the whole folder from "
             f"where it was made"
@@ -76,8 +81,10 @@ def identity_in(folder: Path) -> Identity:
 
 
 def checked_identity(connection: Connection, now: datetime | None = None) -> str:
-    """Check the files that one end of a session shows, and say if they end soon, else "". Raises
-    AccessError."""
+    """Check the files for a connection; return a warning if they expire soon, else "".
+
+    Raises AccessError.
+    """
     folder = Path(connection.tls)
     found = identity_in(folder)
     now = datetime.now(UTC) if now is None else now
@@ -102,13 +109,13 @@ def checked_identity(connection: Connection, now: datetime | None = None) -> str
 
 
 def time_left(identity: Identity) -> str:
-    """Until when it is valid, and how long that is."""
+    """Return the end of validity and the days left as text."""
     days = (identity.ends - datetime.now(UTC)).days
     return f"{identity.ends:%Y-%m-%d} ({f'{days} days' if days >= 0 else 'expired'})"
 
 
 def said(moment: datetime) -> str:
-    """A moment as it is printed."""
+    """Format a time."""
     return f"{moment:%Y-%m-%d %H:%M} UTC"
 
 
@@ -135,3 +142,61 @@ def _hosts(certificate: x509.Certificate) -> tuple[str, ...]:
         return ()
     addresses = [str(address) for address in names.get_values_for_type(x509.IPAddress)]
     return (*names.get_values_for_type(x509.DNSName), *addresses)
+
+
+_PATIENCE_S: Final = 3.0
+"""Timeout of the handshake in seconds."""
+_OTHER_AUTHORITY: Final = (
+    "was issued by another authority than {folder}/ca.pem: both need `cosim certs` of one authority"
+)
+_OF_THE_HUB: Final = {
+    9: "is not valid yet: are the clocks of both machines right?",
+    10: "has expired: `cosim certs role ... --renew` makes another, there",
+    18: _OTHER_AUTHORITY,
+    19: _OTHER_AUTHORITY,
+    20: _OTHER_AUTHORITY,
+    26: "is not of one who listens: a coordinator, a director or a policy server",
+    62: "is not for the name {host}: connect to a name of it, or make it anew with --host {host}",
+    64: "is not for the address {host}: connect to a name of it, or make it anew with --host "
+    "{host}",
+}
+"""Faults of the hub's certificate by OpenSSL's error numbers (X509_V_ERR_...)."""
+_OF_OURS: Final = {
+    "UNKNOWN_CA": "was issued by another authority than the one there trusts",
+    "DECRYPT_ERROR": "was issued by another authority of the same name",
+    "CERTIFICATE_EXPIRED": "has expired there: are the clocks of both machines right?",
+    "CERTIFICATE_REQUIRED": "was not shown",
+    "BAD_CERTIFICATE": "was not accepted there",
+    "UNSUPPORTED_CERTIFICATE": "is not of one who connects",
+}
+"""Faults of our certificate by the end of the TLS alert's name."""
+
+
+def why_refused(connection: Connection) -> str:
+    """Return why the handshake fails; "" if it succeeds or there is no answer."""
+    host, _, port = connection.connect.partition("/")[2].rpartition(":")
+    host = host.strip("[]")
+    folder = Path(connection.tls)
+    try:
+        context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+        context.load_verify_locations(folder / CA)
+        context.load_cert_chain(folder / CERTIFICATE, folder / KEY)
+        with (
+            socket.create_connection((host, int(port)), timeout=_PATIENCE_S) as plain,
+            context.wrap_socket(plain, server_hostname=host) as guarded,
+        ):
+            guarded.recv(1)  # TLS 1.3 rejects a client's certificate after the handshake
+    except ssl.SSLCertVerificationError as error:
+        words = _OF_THE_HUB.get(error.verify_code, f"was refused: {error.verify_message}")
+        return f"the certificate of {connection.connect} {words.format(host=host, folder=folder)}"
+    except ssl.SSLError as error:
+        for name, words in _OF_OURS.items():
+            if (error.reason or "").endswith(name):
+                return f"{connection.connect} refused us: the certificate in {folder} {words}"
+        return (
+            f"{connection.connect} does not answer as TLS does ({error.reason}): is it there as "
+            f"tls/...?"
+        )
+    except OSError:
+        return ""
+    return ""

@@ -1,14 +1,168 @@
-"""How a session is set: over the endpoints that are named, found by nobody else, with no memory
-shared."""
+"""Zenoh settings of a session: explicit endpoints and, on a hub, access rights by role.
+
+No discovery and no shared memory. Everything that no right allows is denied. Only the run itself,
+which uses a private socket (`Session.inside`), publishes positions, and only the hub assigns
+episodes. Without certificates (TCP of this machine, or --insecure) every client has the rights of
+all roles allowed at the hub.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
-from bridge.security.rights import access_of
-from cosim.spec.connection import Connection
+from cosim.spec.connection import Connection, Role
+
+_ENV = "cosim/*/env/*"
+
+
+class _Rights(NamedTuple):
+    """Rights of a role, as key expressions.
+
+    words: Description for users.
+    ask: Keys it may query.
+    hear: Keys it may subscribe to.
+    answer: Keys on which it may declare queryables.
+    show: Keys of its liveliness tokens.
+    """
+
+    words: str
+    ask: tuple[str, ...] = ()
+    hear: tuple[str, ...] = ()
+    answer: tuple[str, ...] = ()
+    show: tuple[str, ...] = ()
+
+
+RIGHTS: Final[dict[Role, _Rights]] = {
+    "coordinator": _Rights(
+        "ask policies and directors", ask=("cosim/*/policy/**", f"{_ENV}/director")
+    ),
+    "director": _Rights("nothing elsewhere"),
+    "worker": _Rights(
+        "take episodes and tell their results, ask policies and directors",
+        ask=(
+            "cosim/*/status",
+            "cosim/*/jobs/*",
+            "cosim/*/nets/*",
+            "cosim/*/policy/**",
+            f"{_ENV}/director",
+        ),
+        show=("cosim/*/workers/*",),
+    ),
+    "policy": _Rights("answer as a policy", answer=("cosim/*/policy/**",)),
+    "viewer": _Rights(
+        "watch",
+        ask=("cosim/*/status", *(f"{_ENV}/{key}" for key in ("status", "log", "camera"))),
+        hear=tuple(f"{_ENV}/{key}" for key in ("clock", "robot", "crowd", "signals", "events")),
+    ),
+    "injector": _Rights("inject pedestrians", ask=(f"{_ENV}/inject", f"{_ENV}/status")),
+}
+"""Rights by role."""
+_ADMITTED: Final[dict[Role, tuple[Role, ...]]] = {
+    "coordinator": ("worker", "policy", "viewer", "injector", "coordinator"),
+    "director": ("worker", "coordinator"),
+    "policy": ("worker", "coordinator", "policy"),
+}
+"""Roles allowed at each hub."""
+_LARGEST_B: Final = {
+    64 << 10: (f"{_ENV}/inject", "cosim/*/jobs/claim"),
+    1 << 20: (f"{_ENV}/director",),
+    1 << 10: (
+        "cosim/*/status",
+        "cosim/*/nets/*",
+        *(f"{_ENV}/{key}" for key in ("status", "log", "camera")),
+    ),
+}
+"""Size limit in bytes by key; larger messages are dropped. Others have the session's limit."""
+_ALL: Final = (
+    "put",
+    "delete",
+    "declare_subscriber",
+    "query",
+    "declare_queryable",
+    "reply",
+    "liveliness_token",
+    "declare_liveliness_subscriber",
+    "liveliness_query",
+)
+"""All types of messages in Zenoh's access control."""
+
+
+def access_of(connection: Connection) -> dict[str, object]:
+    """Return Zenoh's settings for the access rights and size limits of a hub.
+
+    Empty for a Unix socket, which is protected by file permissions.
+    """
+    if connection.listen.startswith("unixsock-stream/"):
+        return {}
+    guests = _ADMITTED[connection.role]
+    rules = [_rule("inside", flow, _ALL, ("**",)) for flow in ("ingress", "egress")]
+    subjects: list[dict[str, object]] = [{"id": "inside", "link_protocols": ["unixsock-stream"]}]
+    policies: list[dict[str, object]] = [
+        {"rules": ["inside ingress", "inside egress"], "subjects": ["inside"]}
+    ]
+    if not connection.tls:
+        subjects.append({"id": "anybody", "link_protocols": ["tcp"]})
+    for role in guests:
+        theirs = _rules(role)
+        rules += theirs
+        if connection.tls:
+            subjects.append({"id": role, "cert_common_names": [role], "link_protocols": ["tls"]})
+        policies.append(
+            {
+                "rules": [rule["id"] for rule in theirs],
+                "subjects": [role if connection.tls else "anybody"],
+            }
+        )
+    limits = [
+        {
+            "id": f"{size_b} bytes",
+            "flows": ["ingress"],
+            "link_protocols": ["tcp", "tls"],
+            "messages": ["put", "query"],
+            "key_exprs": list(keys),
+            "size_limit": size_b,
+        }
+        for size_b, keys in _LARGEST_B.items()
+    ]
+    control = {
+        "enabled": True,
+        "default_permission": "deny",
+        "rules": rules,
+        "subjects": subjects,
+        "policies": policies,
+    }
+    return {"access_control": control, "low_pass_filter": limits}
+
+
+def _rules(role: Role) -> list[dict[str, object]]:
+    """Return the access rules of a role, for messages into and out of the hub."""
+    may = RIGHTS[role]
+    rules = [
+        _rule(f"{role} asks", "ingress", ("query",), may.ask),
+        _rule(f"{role} is answered", "egress", ("declare_queryable", "reply"), may.ask),
+        _rule(f"{role} hears", "ingress", ("declare_subscriber",), may.hear),
+        _rule(f"{role} is told", "egress", ("put",), may.hear),
+        _rule(f"{role} answers", "ingress", ("declare_queryable", "reply"), may.answer),
+        _rule(f"{role} is asked", "egress", ("query",), may.answer),
+        _rule(f"{role} shows", "ingress", ("liveliness_token",), may.show),
+    ]
+    return [rule for rule in rules if rule["key_exprs"]]
+
+
+def _rule(
+    name: str, flow: str, messages: tuple[str, ...], keys: tuple[str, ...]
+) -> dict[str, object]:
+    named = f"{name} {flow}" if name == "inside" else name
+    return {
+        "id": named,
+        "flows": [flow],
+        "permission": "allow",
+        "messages": list(messages),
+        "key_exprs": list(keys),
+    }
+
 
 _ALWAYS: Final[dict[str, object]] = {
     "scouting/multicast/enabled": False,
@@ -19,12 +173,13 @@ _ALWAYS: Final[dict[str, object]] = {
     "transport/shared_memory/enabled": False,
     "transport/link/rx/max_message_size": 16 << 20,
 }
+"""Settings of every session."""
 CONNECTS_WITHIN_S: Final = 2.0
-"""So long an end that connects tries to; a hub that has just been started is there sooner."""
+"""Timeout in seconds to connect; a hub that was just started needs less."""
 
 
 def settings_alone() -> dict[str, object]:
-    """Of a session with nobody else in it, by Zenoh's names of settings."""
+    """Return the settings of a session without endpoints."""
     return _ALWAYS | {
         "mode": "peer",
         "listen/endpoints": [],
@@ -34,7 +189,10 @@ def settings_alone() -> dict[str, object]:
 
 
 def settings_of(connection: Connection, own: Sequence[str] = ()) -> dict[str, object]:
-    """Of one end of a session. own: where else it listens, for processes of its own."""
+    """Return the settings of one end of a session.
+
+    own: Further endpoints to listen at, for processes of this run.
+    """
     settings = _ALWAYS | {
         "mode": "router" if connection.listen else "client",
         "listen/endpoints": [connection.listen, *own] if connection.listen else [],

@@ -92,7 +92,7 @@ def show_certificates(
 ) -> None:
     """Show role, host names, rights and end of validity of the certificates in a folder."""
     from bridge.security.identity import identity_in, time_left
-    from bridge.security.rights import RIGHTS
+    from bridge.security.settings import RIGHTS
 
     places = (folder, *(folder / name for name in get_args(Role)))
     found = [path for path in places if (path / "cert.pem").exists()]
@@ -401,7 +401,7 @@ def serve_command(
             listen=connection.listen,
             connect=connection.connect,
             jpeg=jpeg,
-            told=first.manifest,
+            manifest=first.manifest,
             source=first.source_hash,
             decoder=ObservationDecoder,
             session=session.itself,

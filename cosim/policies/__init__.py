@@ -1,4 +1,4 @@
-"""Policies that ship with the project, by name."""
+"""Bundled policies."""
 
 from __future__ import annotations
 
@@ -14,3 +14,4 @@ from cosim.policies.privileged.social_force import SocialForce
 POLICIES: Mapping[str, Callable[[], Policy]] = MappingProxyType(
     {"stop": Stop, "straight": Straight, "route": Route, "orca": Orca, "social_force": SocialForce}
 )
+"""Constructors of the bundled Python policies by name."""

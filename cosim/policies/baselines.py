@@ -1,4 +1,4 @@
-"""Baselines without sensors, and the replay of recorded commands."""
+"""Baselines without sensors, and replay of recorded commands."""
 
 from __future__ import annotations
 
@@ -16,38 +16,39 @@ class Stop:
     manifest = Manifest("stop")
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Nothing to forget."""
+        """Do nothing: the policy has no state."""
 
     def act(self, observation: Observation) -> Command:
         return STILL
 
 
 class Straight:
-    """Drives straight ahead, four fifths as fast as the robot travels: the courier at walking
-    speed."""
+    """Drives straight ahead at four fifths of the robot's cruising speed."""
 
     manifest = Manifest("straight")
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Nothing to forget."""
+        """Do nothing: the policy has no state."""
 
     def act(self, observation: Observation) -> Command:
         return Command(observation.robot.cruise_mps * 4 / 5, 0.0)
 
 
 class Replay:
-    """Says at every tick what was recorded there. commands: (T, 2) m/s, rad/s. It sees nothing and
-    asks nothing."""
+    """Returns the recorded command of each tick, without sensors.
+
+    commands: (T, 2) in m/s and rad/s.
+    """
 
     def __init__(self, commands: Floats) -> None:
         self.manifest = Manifest("replay", rate_hz=1.0 / Clock().tick_s, camera=None)
         self._commands = commands
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Nothing to forget."""
+        """Do nothing: the policy has no state."""
 
     def act(self, observation: Observation) -> Command:
-        """Raises RunError beyond the end of the record."""
+        """Return the command of this tick. Raises RunError after the last recorded tick."""
         if observation.tick >= len(self._commands):
             raise RunError(
                 f"the record ends after {len(self._commands)} ticks, the episode goes on: "

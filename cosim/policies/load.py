@@ -1,5 +1,7 @@
-"""Load a policy by name: a bundled one, `path/to/file.py:Class`, `package.module:Class` or
-`onnx:FOLDER`."""
+"""Load a policy by name.
+
+A name is bundled, `path/to/file.py:Class`, `package.module:Class` or `onnx:FOLDER`.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +31,7 @@ from cosim.spec.manifest import Manifest
 
 
 def shipped_bundles(below: Path = Path(__file__).parent) -> Mapping[str, Path]:
-    """The folders of the ONNX bundles that ship with the project, by name:
-    `cosim/policies/*/NAME/manifest.json`."""
+    """Return folders of the bundled ONNX bundles by name: `cosim/policies/*/NAME/manifest.json`."""
     return {
         manifest.parent.name: manifest.parent
         for manifest in sorted(below.glob(f"*/*/{MANIFEST_FILE}"))
@@ -38,8 +39,7 @@ def shipped_bundles(below: Path = Path(__file__).parent) -> Mapping[str, Path]:
 
 
 def bundle_in_words(folder: Path) -> str:
-    """Where the weights of a bundle lie, or that they are missing, and in short where they come
-    from: a run that lacks them tells it whole."""
+    """Describe a bundle in one line: location of its weights, or "missing", and origin."""
     bundle = read_bundle_manifest(folder)
     facts = bundle.files.get(bundle.model)
     try:
@@ -51,25 +51,26 @@ def bundle_in_words(folder: Path) -> str:
 
 
 _MOST_PX = 4096
+"""Largest side of a camera image in pixels."""
 LONGEST_NAME = 100
+"""Largest number of characters in a policy's name or version."""
 FOLLOW = "follow"
-"""The policy of `cosim.policies.follow`, which sees by networks whose weights are not included."""
+"""Name of the policy in `cosim.policies.follow`; the weights of its networks are not included."""
 ONNX_SCHEME = "onnx:"
-"""Before the folder of an ONNX bundle (`cosim.policies.onnx`)."""
+"""Prefix of the folder of an ONNX bundle (`cosim.policies.onnx`)."""
 REMOTE_SCHEME = "zenoh:"
-"""Before the name of a policy that `cosim serve` or `bridge/policy_server.py` serves."""
+"""Prefix of a policy served by `cosim serve` or `bridge/policy_server.py`."""
 
 OTHER_NAMES = ("path/to/file.py:Class", "package.module:Class", f"{ONNX_SCHEME}FOLDER")
-"""How policies are named that are not listed."""
+"""Forms of policy names that are not listed."""
 
 
 def load_policy(name: str, timer: Timer | None = None, start_s: float = LOADED_WITHIN_S) -> Driver:
-    """A new policy, its manifest read. Raises UsageError when the name means nothing or the class
-    is no policy.
+    """Load a new policy and read its manifest.
 
-    timer: is told while the policy is loaded and whenever it is asked; whoever reads it ends what
-    takes too long. start_s: without a timer an ONNX graph may take so long to be loaded and to
-    answer once.
+    timer: Records the pending call while the policy loads and answers, to enforce timeouts.
+    start_s: Timeout in seconds for an ONNX graph to load and answer once, used without a timer.
+    Raises UsageError if the name is unknown or the class is not a policy.
 
     >>> load_policy("route").manifest.name
     'route'
@@ -105,13 +106,16 @@ def load_policy(name: str, timer: Timer | None = None, start_s: float = LOADED_W
 
 
 class _Networked(Policy, Protocol):
-    """A policy that loads networks; digest: of them, and of whatever else decides its answers."""
+    """Policy that loads networks.
+
+    digest: Hash of the networks and everything else that determines its commands.
+    """
 
     digest: str
 
 
 def _bundle(folder: Path, within_s: float | None) -> Callable[[], _Networked]:
-    """What makes the policy of an ONNX bundle; within_s: see `OnnxPolicy`."""
+    """Return a function that loads the policy of an ONNX bundle. within_s: see `OnnxPolicy`."""
 
     def make() -> _Networked:
         from cosim.policies.onnx.policy import onnx_policy  # onnxruntime takes a moment to import
@@ -128,7 +132,7 @@ def _follow() -> _Networked:
 
 
 def _by_networks(name: str, make: Callable[[], _Networked], timer: Timer | None) -> Driver:
-    """The policy that `make` makes. Raises UsageError for whatever is wrong with its networks."""
+    """Load a policy with networks. Raises UsageError if a network is missing or invalid."""
     try:
         with policy_call("loading", timer=timer, passes=(BaseException,)):
             policy = make()
@@ -141,11 +145,9 @@ def _by_networks(name: str, make: Callable[[], _Networked], timer: Timer | None)
 
 
 def source_hash(policy: Policy) -> str:
-    """Of the files in which the policy's class and its base classes are written; "" when none can
-    be read.
+    """Return a hash of the files that define the policy's class and base classes; "" if unreadable.
 
-    What these import, and weights that they read, is not covered: a manifest's version is to tell
-    that.
+    Imported modules and weight files are not included; the manifest's version identifies those.
     """
     digest = hashlib.blake2b(digest_size=8)
     read = False
@@ -160,7 +162,7 @@ def source_hash(policy: Policy) -> str:
 
 
 def _made(name: str) -> Policy:
-    """The object that `package.module:Class` makes."""
+    """Import and construct `package.module:Class`."""
     try:
         with _in_words(f"policy '{name}': module '{name.partition(':')[0]}' cannot be imported:"):
             module, class_name = policy_module(name)
@@ -179,7 +181,10 @@ def _made(name: str) -> Policy:
 
 
 def _checked(name: str, policy: Policy) -> Manifest:
-    """A copy of the policy's manifest. Raises UsageError when it has none, or lacks a method."""
+    """Return a checked copy of the policy's manifest.
+
+    Raises UsageError if the manifest or a method is missing.
+    """
     with _in_words(f"policy '{name}': its manifest:"):
         manifest = getattr(policy, "manifest", None)
         lacking = [
@@ -195,18 +200,20 @@ def _checked(name: str, policy: Policy) -> Manifest:
         )
     try:
         with_goal(manifest, None)
-        told = msgspec.to_builtins(manifest)
+        fields = msgspec.to_builtins(manifest)
     except (UsageError, TypeError, ValueError, OverflowError) as error:
         raise UsageError(f"policy '{name}': its manifest: {error}") from error
-    return checked_manifest(name, told)
+    return checked_manifest(name, fields)
 
 
-def checked_manifest(name: str, told: object) -> Manifest:
-    """A manifest as it was told in another process, or copied. Raises UsageError, saying what is
-    wrong with it."""
+def checked_manifest(name: str, fields: object) -> Manifest:
+    """Convert a manifest from another process and validate it. Raises UsageError with the fault.
+
+    fields: The manifest as builtins.
+    """
     try:
-        manifest = msgspec.convert(told, Manifest)
-        _refuse_unknown_fields(told, msgspec.to_builtins(manifest))
+        manifest = msgspec.convert(fields, Manifest)
+        _refuse_unknown_fields(fields, msgspec.to_builtins(manifest))
         with_goal(manifest, None)
         Clock.for_rate(manifest.rate_hz)
         wrong = _wrong(manifest)
@@ -224,18 +231,18 @@ def checked_manifest(name: str, told: object) -> Manifest:
     return manifest
 
 
-def _refuse_unknown_fields(told: object, known: object, place: str = "") -> None:
-    """Raise UsageError for a field of a manifest, or of its cameras, that does not exist."""
-    if not (isinstance(told, dict) and isinstance(known, dict)):
+def _refuse_unknown_fields(fields: object, known: object, place: str = "") -> None:
+    """Raise UsageError for an unknown field of a manifest or of its cameras."""
+    if not (isinstance(fields, dict) and isinstance(known, dict)):
         return
-    for name in told:
+    for name in fields:
         if name not in known:
             raise unknown(f"field{f' of {place}' if place else ''}", str(name), known)
-        _refuse_unknown_fields(told[name], known[name], f"{place}.{name}" if place else str(name))
+        _refuse_unknown_fields(fields[name], known[name], f"{place}.{name}" if place else str(name))
 
 
 def _wrong(manifest: Manifest) -> str:
-    """What is wrong with the values of a manifest; "" if nothing is."""
+    """Return the first fault in a manifest's values; "" if valid."""
     for field, text in (("name", manifest.name), ("version", manifest.version)):
         if (
             not 0 < len(text) <= LONGEST_NAME
@@ -252,6 +259,7 @@ def _wrong(manifest: Manifest) -> str:
 
 
 def _wrong_camera(camera: CameraSpec) -> str:
+    """Return the first fault in a camera's values; "" if valid."""
     if not all(1 <= side <= _MOST_PX for side in (camera.width, camera.height)):
         return (
             f"camera must have sides of 1 to {_MOST_PX} pixels, not {camera.width} x "
@@ -273,8 +281,7 @@ def _wrong_camera(camera: CameraSpec) -> str:
 
 @contextmanager
 def _in_words(what: str) -> Iterator[None]:
-    """Whatever the user's code raises, SystemExit included, as a UsageError; Ctrl-C stays what it
-    is."""
+    """Convert exceptions of the user's code, including SystemExit, to UsageError; Ctrl-C passes."""
     try:
         with policy_call("loading"):
             yield

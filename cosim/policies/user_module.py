@@ -1,4 +1,4 @@
-"""Find and import a user's policy class: `package.module:Class`, or `path/to/file.py:Class`."""
+"""Find and import a user's policy class: `package.module:Class` or `path/to/file.py:Class`."""
 
 from __future__ import annotations
 
@@ -18,8 +18,11 @@ _SUFFIX = ".py"
 
 
 class _File(NamedTuple):
-    """A policy's source file. root: the folder to import from; module: its dotted name below that
-    folder."""
+    """Source file of a policy.
+
+    root: Folder to import from.
+    module: Dotted module name below root.
+    """
 
     path: Path
     root: Path
@@ -27,12 +30,11 @@ class _File(NamedTuple):
 
 
 def importable(name: str) -> str:
-    """Return a policy's name as `package.module:Class`, which every process of a run imports alike.
+    """Return a policy's name as `package.module:Class`, importable in every process of a run.
 
-    The folder of a `path/to/file.py:Class` goes to the front of `sys.path`, which the processes of
-    a run inherit. A file in a package is imported as part of it. All other names are returned
-    unchanged. Raises UsageError for a file that does not exist, names no class, or has the name of
-    another module.
+    For `path/to/file.py:Class`, the import root is put first on `sys.path`, which child processes
+    inherit. A file in a package is imported as part of it. Other names are returned unchanged.
+    Raises UsageError if the file is missing, no class is named, or another module has its name.
     """
     path, class_name = _split(name)
     if not path.endswith(_SUFFIX):
@@ -50,16 +52,17 @@ def importable(name: str) -> str:
 
 
 def policy_module(name: str) -> tuple[ModuleType, str]:
-    """Import the module of a policy's name. Returns it and the class name. Raises whatever the
-    module raises."""
+    """Import the module of a policy's name; return it and the class name.
+
+    Raises any exception of the module.
+    """
     module_name, class_name = _split(name)
     search(Path.cwd())
     return importlib.import_module(module_name), class_name
 
 
 def policy_class(module: ModuleType, class_name: str) -> Callable[[], object]:
-    """Return a class of a module. Raises UsageError, listing the classes written there that have
-    `act`, else all."""
+    """Return a class of a module. Raises UsageError with the valid choices."""
     if not hasattr(module, class_name):
         there = {
             k: v
@@ -73,8 +76,10 @@ def policy_class(module: ModuleType, class_name: str) -> Callable[[], object]:
 
 
 def search(folder: Path, *, first: bool = False) -> None:
-    """Add a folder to the front of `sys.path`. first: also where it is already on it, farther
-    back."""
+    """Add a folder to the front of `sys.path`.
+
+    first: Move it to the front if it is already on the path.
+    """
     entry = str(folder)
     if first and entry in sys.path[1:]:
         sys.path.remove(entry)
@@ -83,7 +88,7 @@ def search(folder: Path, *, first: bool = False) -> None:
 
 
 def _classes_written(file: Path) -> list[str]:
-    """The classes with a method `act` at the top of a file, which is not run."""
+    """Return the top-level classes with a method `act`, without running the file."""
     try:
         top = ast.parse(file.read_bytes()).body
     except (OSError, SyntaxError, ValueError):
@@ -95,13 +100,13 @@ def _classes_written(file: Path) -> list[str]:
 
 
 def _split(name: str) -> tuple[str, str]:
-    """Module or file, and class."""
+    """Split a name into module or file, and class."""
     before, colon, after = name.rpartition(":")
     return (before, after) if colon else (name, "")
 
 
 def _located(name: str, path: Path) -> _File:
-    """Raises UsageError where the file is missing, or cannot be imported under its name."""
+    """Find a file and its import root. Raises UsageError if it is missing or cannot be imported."""
     if not path.is_file():
         here = (
             sorted(file.name for file in path.parent.glob(f"*{_SUFFIX}"))
@@ -134,7 +139,7 @@ def _located(name: str, path: Path) -> _File:
 
 
 def _other_module(top: str, ours: Path) -> str:
-    """Where a module of that name is that is not ours, in words; "" if there is none."""
+    """Describe another module with the same name; "" if there is none."""
     if top in sys.stdlib_module_names:
         return "which comes with Python"
     loaded = getattr(sys.modules.get(top), "__file__", None)
@@ -144,8 +149,10 @@ def _other_module(top: str, ours: Path) -> str:
 
 
 def remedy_for_missing(name: str, missing: str) -> str:
-    """Return the folders searched for a missing module, and what to do. missing: the module, of
-    that policy or not."""
+    """Describe the folders searched for a missing module, and a remedy.
+
+    missing: Name of the module, the policy's own or one that it imports.
+    """
     module_name, class_name = _split(name)
     own = {sysconfig.get_path(kind) for kind in ("stdlib", "platstdlib")}
     own |= {str(Path(folder, "lib-dynload")) for folder in own} | {
@@ -166,8 +173,7 @@ def remedy_for_missing(name: str, missing: str) -> str:
 
 
 def _files_below(name: str) -> list[Path]:
-    """The files of a name in the current folder and in two levels of folders below it, as relative
-    paths."""
+    """Return relative paths of files with this name, at most two folders below the current one."""
     here = Path.cwd()
     return [
         file.relative_to(here)

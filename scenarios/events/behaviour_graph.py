@@ -1,9 +1,8 @@
-"""The behaviour graph of a street: waypoints on its sidewalks, and places where there is something
-to do.
+"""Behaviour graph of the streets near a route: waypoints on sidewalks, and interaction spots.
 
-A pure function of the place, its seed, the route, its barriers and obstacles. Ways keep to the
-sidewalks and corners near the route, never lead over a road or a crossing, and are clear of
-everything that stands there by a person's radius.
+A pure function of the place, its seed, the route, its barriers and obstacles. Edges stay on
+sidewalks and corners near the route, never cross a road or crosswalk, and keep a person's radius
+from all objects.
 """
 
 from __future__ import annotations
@@ -36,33 +35,37 @@ from physics.street.placement import CLEAR_HALF_M
 from physics.street.street_surface import StreetSurface
 
 _REACH_M: Final = 55.0
-"""The graph covers the sidewalks this near to the route."""
+"""Metres from the route within which sidewalks are in the graph."""
 SPACING_M: Final = 4.0
-"""From waypoint to waypoint along a sidewalk."""
+"""Metres between waypoints along a sidewalk."""
 OFF_WALK_M: Final = 1.2
-"""So far beside the sidewalk, on open ground, somebody may stand at a window or sit on a bench."""
+"""Metres of open ground beyond the sidewalk on which people may use a window or bench."""
 _GAP_M: Final = 0.04
-"""Between a person's disk and what stands there."""
+"""Metres between a person's disk and objects."""
 _EDGE_M: Final = 0.35
-"""Waypoints keep so far from the edge of the walkable ground."""
+"""Metres between waypoints and the edge of the walkable area."""
 _NEXT_M: Final = 2.2 * SPACING_M
+"""Metres within which two waypoints are joined by an edge."""
 _ROUND_M: Final = 14.0
-"""So far the middle of a corner may be from the waypoints that it joins."""
+"""Metres within which the middle of a corner is joined to waypoints."""
 _STEP_OUT_M: Final = 3.5
-"""A place to do something has its waypoint so near."""
+"""Metres within which an interaction spot needs a waypoint."""
 _SPUR_M: Final = 0.12
-"""How far from the straight way to such a place one may be on it."""
+"""Half the width in metres of the path between an interaction spot and its waypoint."""
 _LEAST_NODES: Final = 4
+"""Fewest waypoints of a connected part; smaller parts are removed."""
 
 
 @dataclass(frozen=True)
 class BehaviorGraph:
-    """Waypoints first, then the places of `spots`, one node each.
+    """Graph of N nodes: first the W waypoints, then the interaction spots.
 
-    xy: (N, 2) metres. idle: (W,) whether somebody who stands at the waypoint leaves the middle of
-    the sidewalk free. spots: the places, node W + i is that of spots[i]. arcs: (N, N) lengths of
-    the ways, symmetric. ground: where the middle of a person may be: walkable ground, clear of all
-    that stands there, and the ways to the places.
+    xy: Positions of nodes, (N, 2) metres.
+    idle: (W,) whether a person standing at the waypoint leaves the middle of the sidewalk free.
+    spots: Interaction spots; spots[i] is node W + i.
+    arcs: (N, N) symmetric sparse matrix of edge lengths in metres.
+    part: (N,) index of each node's connected part.
+    ground: Area that the centre of a person may occupy, including paths to the spots.
     """
 
     xy: Floats
@@ -80,33 +83,32 @@ class BehaviorGraph:
         return len(self.xy)
 
     def spot(self, node: int) -> InteractionSpot | None:
-        """What there is to do at a node; None at a waypoint."""
+        """Return the interaction spot of a node; None for a waypoint."""
         return self.spots[node - self.waypoints] if node >= self.waypoints else None
 
     def free(self, x_m: float, y_m: float) -> bool:
-        """Whether the middle of a person may be at a point."""
+        """Return whether the centre of a person may be at a point."""
         return bool(shapely.contains_xy(self.ground, x_m, y_m))
 
     @cached_property
     def points(self) -> list[tuple[float, float]]:
-        """xy, as numbers that are quick to reckon with one by one."""
+        """`xy` as plain floats, faster to read one by one."""
         return [(x, y) for x, y in self.xy.tolist()]
 
     @cached_property
     def by_what(self) -> Mapping[What, NDArray[np.intp]]:
-        """The nodes of the places, by what there is to do."""
+        """Nodes of the interaction spots by activity."""
         found: dict[What, list[int]] = {}
         for i, spot in enumerate(self.spots):
             found.setdefault(spot.what, []).append(self.waypoints + i)
         return {what: np.array(found[what], dtype=np.intp) for what in sorted(found)}
 
     def distances(self, node: int) -> tuple[Floats, NDArray[np.int32]]:
-        """(N,) metres to walk from a node, inf out of reach, and (N,) the node before each on the
-        way."""
+        """Return (N,) walking distances in metres (inf if unreachable) and (N,) predecessors."""
         return self._reached(node)
 
     def way(self, start: int, goal: int) -> tuple[int, ...]:
-        """The nodes of the shortest way, the first left out; empty where there is none."""
+        """Return the nodes of the shortest path without the start; empty if unreachable."""
         distance, before = self._reached(start)
         if not np.isfinite(distance[goal]):
             return ()
@@ -116,8 +118,7 @@ class BehaviorGraph:
         return tuple(reversed(nodes))
 
     def nearest(self, x_m: float, y_m: float) -> int | None:
-        """The nearest node to which one can walk straight from a point; None without any within
-        reach."""
+        """Return the nearest node that is reachable in a straight line; None if none is near."""
         away = np.hypot(self.xy[:, 0] - x_m, self.xy[:, 1] - y_m)
         for node in np.argsort(away, kind="stable")[:8].tolist():
             if away[node] < _NEXT_M and shapely.covers(
@@ -144,7 +145,7 @@ def behavior_graph(
     barriers: Sequence[Barrier] = (),
     obstacles: Sequence[Obstacle] = (),
 ) -> BehaviorGraph:
-    """The graph of the streets around a route."""
+    """Build the graph of the streets around a route."""
     area = shapely.buffer(LineString(route), _REACH_M)
     strips = [
         s
@@ -186,9 +187,7 @@ def behavior_graph(
     idle = np.concatenate([idle, np.zeros(len(middles), dtype=bool)])
     ends = _pairs(xy, middles)
     ends = ends[shapely.covers(footing, _segments(xy[ends[:, 0]], xy[ends[:, 1]]))]
-    found, at = _places(
-        list(spots(street_map, props, buildings)), xy, open_ground, footing, strips, things
-    )
+    found, at = _places(list(spots(street_map, props, buildings)), xy, open_ground, strips, things)
     spurs = np.column_stack([at, len(xy) + np.arange(len(at))]).reshape(-1, 2)
     places = np.array([(s.x_m, s.y_m) for s in found]).reshape(-1, 2)
     return _joined(
@@ -209,7 +208,7 @@ def _joined(
     footing: shapely.Geometry,
     open_ground: shapely.Geometry,
 ) -> BehaviorGraph:
-    """The graph without what hangs on too few waypoints to walk about."""
+    """Build the graph without connected parts that have too few waypoints."""
     length = np.hypot(*(xy[ends[:, 0]] - xy[ends[:, 1]]).T)
     arcs = csr_array((length, (ends[:, 0], ends[:, 1])), shape=(len(xy), len(xy)))
     _, part = connected_components(arcs, directed=False)
@@ -230,8 +229,8 @@ def _joined(
 
 
 def _along(strips: Sequence[Strip], footing: shapely.Geometry) -> tuple[Floats, NDArray[np.bool_]]:
-    """Waypoints in two lanes along each sidewalk that is wide enough, and whether one can stand
-    about there."""
+    """Return waypoints in up to two lanes along each sidewalk, and whether people may idle
+    there."""
     rows: list[tuple[float, float, bool]] = []
     for strip in strips:
         line = Polyline(strip.line[:, :2])
@@ -252,7 +251,7 @@ def _along(strips: Sequence[Strip], footing: shapely.Geometry) -> tuple[Floats, 
 
 
 def _middles(corners: Sequence[Corner], footing: shapely.Geometry) -> Floats:
-    """(C, 2) points in the middle of corners."""
+    """Return (C, 2) points in the middle of corners."""
     parts = [
         p
         for c in corners
@@ -268,12 +267,14 @@ def _places(
     offered: Sequence[InteractionSpot],
     xy: Floats,
     open_ground: shapely.Geometry,
-    footing: shapely.Geometry,
     strips: Sequence[Strip],
     things: Sequence[shapely.Geometry],
 ) -> tuple[list[InteractionSpot], NDArray[np.intp]]:
-    """The spots where somebody fits, beside the middle of the sidewalk, in sight of the thing, and
-    the waypoint of each; one for each seat or window."""
+    """Return the usable spots, at most one per seat or window, and the waypoint of each.
+
+    A usable spot fits a person, leaves the middle of the sidewalk free and has a clear view of its
+    object.
+    """
     if not offered or not len(xy):
         return [], np.zeros(0, dtype=np.intp)
     at = np.array([(s.x_m, s.y_m) for s in offered])
@@ -305,8 +306,10 @@ def _places(
 
 
 def _pairs(xy: Floats, middles: Floats) -> NDArray[np.intp]:
-    """(P, 2) waypoints near to one another, the first before the second; `middles` are the last of
-    xy."""
+    """Return (P, 2) index pairs of waypoints to join, the smaller index first.
+
+    middles: The last rows of xy.
+    """
     if not len(xy):
         return np.zeros((0, 2), dtype=np.intp)
     near = cKDTree(xy).query_pairs(_ROUND_M if len(middles) else _NEXT_M, output_type="ndarray")

@@ -1,7 +1,6 @@
-"""`ped_crossing`: people cross from the far side and from behind when the robot enters the
-crosswalk.
+"""`ped_crossing`: people cross from both ends when the robot enters the crosswalk.
 
-The first comes from the front, in the middle or on the robot's line; every second one comes from
+The first comes from the front, in the middle or on the robot's line. Every second one comes from
 behind.
 """
 
@@ -26,16 +25,18 @@ from scenarios.events.walking import (
 )
 
 _BEFORE_M: Final = 0.8
-"""How far before its end of the crosswalk each one waits, and behind its other end it is done."""
+"""Metres before the crosswalk where each person waits, and after it where they have crossed."""
 BEHIND_ROBOT_M: Final = 1.6
-"""Those from behind wait this much farther back: the robot has just passed them."""
+"""Extra metres for people from behind, because the robot has just passed them."""
 MEETS_AMONG: Final = 2
-"""Among so few the first one walks on the robot's line wherever that is, else in the middle: who
-keeps to a side meets one of the others there."""
+"""Largest group whose first person walks on the robot's line.
+
+In larger groups it walks in the middle, because others meet a robot at the side.
+"""
 TO_LINE_M: Final = 1.5
-"""It walks towards the point of its line so far ahead."""
+"""Look-ahead distance in metres at which a person aims for its line."""
 _ABREAST_M: Final = 0.75
-"""Between the lines of two who walk the same way."""
+"""Metres between the lines of two people walking in the same direction."""
 
 
 def _begin(event: Event, number: int) -> Walker:
@@ -47,12 +48,12 @@ def _begin(event: Event, number: int) -> Walker:
 
 
 def from_front(number: int) -> bool:
-    """Whether this person comes towards the robot."""
+    """Return whether this person walks towards the robot."""
     return number % 2 == 0
 
 
 def line_m(event: Event, number: int) -> float:
-    """How far left of the middle of the crosswalk a person walks; the first one on the middle."""
+    """Return the lateral offset in metres of a person's line, left of the middle."""
     rank = number // 2
     if from_front(number):
         return -event.side * rank * _ABREAST_M
@@ -89,7 +90,7 @@ def _across(event: Event, walker: Walker, number: int) -> bool:
 
 
 def _group(half_width_m: float, rng: np.random.Generator) -> int:
-    """One from either side at least."""
+    """Draw a group size with at least one person from either side."""
     return int(rng.integers(2, 5))
 
 

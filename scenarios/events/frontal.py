@@ -1,10 +1,7 @@
-"""`frontal`: walks straight at the robot's current position, commits to a line, passes and walks
-on.
+"""`frontal`: walks at the robot's current position, commits to a line, passes and walks on.
 
-Who steps round somebody on the way takes aim anew.
-
-A robot that has stood for a second is walked round. One that has run into the robot does not push
-it: it stands, gives up, and goes round.
+A person who avoids others on the way takes aim again. A robot that has stood for a second is
+avoided. A person who touches the robot stops, waits, gives up and walks around it.
 """
 
 from __future__ import annotations
@@ -17,7 +14,7 @@ from scenarios.events.sight import sight_of
 from scenarios.events.walking import aimed, gave_up, pressed_on, walked_on, walker_at
 
 COMMIT_M: Final = 5.0
-"""It aims at the robot's current position until this close, then keeps its line as people do."""
+"""Distance in metres to the robot below which the person stops aiming and keeps its line."""
 
 
 def _begin(event: Event, number: int) -> Walker:

@@ -1,7 +1,7 @@
-"""An injected pedestrian: walks its path, stays at the end for its time, and is gone.
+"""Injected pedestrians: walk a path, stay at its end for a given time, then disappear.
 
-It goes round people and the robot; a point of its path at which somebody or the robot stands counts
-as reached beside it.
+They avoid people and the robot. An occupied point of the path counts as reached once the person is
+near it.
 """
 
 from __future__ import annotations
@@ -21,8 +21,12 @@ from scenarios.events.walking import robot_of, turned, walked_to
 
 
 class InjectedPerson(NamedTuple):
-    """Where an injected pedestrian stands. leg: the point of its path it walks to; arrived_tick: at
-    the last one."""
+    """State of an injected pedestrian.
+
+    leg: Index of the path point it walks to.
+    arrived_tick: Tick of arrival at the last point; None while walking.
+    moved_m: Metres moved in the last tick.
+    """
 
     injection: Injection
     walker: Walker
@@ -32,7 +36,7 @@ class InjectedPerson(NamedTuple):
 
 
 def arriving(injected: Injected) -> InjectedPerson:
-    """An injected person as it appears: at the first point, facing the second."""
+    """Return an injected person at its first point, facing the second."""
     injection = injected.injection
     (x, y), *others = injection.path
     facing = injection.heading_rad or 0.0
@@ -44,7 +48,7 @@ def arriving(injected: Injected) -> InjectedPerson:
 
 
 def injected_moved_on(person: InjectedPerson, query: EventQuery) -> InjectedPerson | None:
-    """One tick on; None once it is gone."""
+    """Advance an injected person by one tick; None once it disappears."""
     injection, walker = person.injection, person.walker
     if person.arrived_tick is not None:
         if (query.tick - person.arrived_tick) * query.tick_ms / 1000 >= injection.stay_s:
@@ -77,8 +81,7 @@ def injected_moved_on(person: InjectedPerson, query: EventQuery) -> InjectedPers
 
 
 def _robot_stands_at(goal: tuple[float, float], walker: Walker, query: EventQuery) -> bool:
-    """Whether the robot stands where nobody can reach a point then, and the walker has come up to
-    it."""
+    """Return whether a standing robot blocks a point that the walker has come near."""
     near = math.dist((walker.x_m, walker.y_m), goal) < BESIDE_M
     return (
         near
@@ -88,12 +91,12 @@ def _robot_stands_at(goal: tuple[float, float], walker: Walker, query: EventQuer
 
 
 def shown_id(injection: Injection) -> str:
-    """The id under which the world shows an injected person."""
+    """Return the id of an injected person in the world."""
     return f"{INJECTED_ID}{injection.id}"
 
 
 def injected_actor(person: InjectedPerson, tick_ms: int) -> Actor:
-    """An injected person as the world shows it; who is held up on the way stands."""
+    """Return the actor of an injected person; one that is blocked on the way stands."""
     walker = person.walker
     still = "stand" if person.arrived_tick is None else person.injection.doing
     return Actor(

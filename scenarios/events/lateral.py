@@ -1,10 +1,9 @@
-"""`lateral`: crosses the robot's projected path at a right angle, to be where the robot is if that
-keeps its velocity.
+"""`lateral`: crosses the robot's path at a right angle, on a collision course at constant velocity.
 
-Its direction is fixed at the trigger, and anew where it had to step round somebody; its pace goes
-with the robot's: it slows down as the robot does, and stands when the robot stands. So a robot that
-happens to slow down now and then has not let it cross. One that has stood for it is given way to no
-longer: it crosses, walks to the other edge of the sidewalk, and on along it.
+Its direction is fixed at the trigger, and again after it avoided a person. Its speed follows the
+robot's: it slows down and stops with the robot, so slowing down does not let it cross. Once the
+robot has stood for `LET_CROSS_S`, it crosses to the other edge of the sidewalk and walks on along
+it.
 """
 
 from __future__ import annotations
@@ -21,12 +20,13 @@ from scenarios.events.sight import sight_of
 from scenarios.events.walking import edge_m, gave_up, pressed_on, walked_on, walker_at
 
 SLOWEST_MPS: Final = 0.05
+"""Lower bound of its speed in m/s."""
 _FASTEST_MPS: Final = 2.0
-"""However slow the robot, it is met; nobody runs faster than this."""
+"""Upper bound of its speed in m/s, for very fast robots."""
 _SQUARE: Final = 0.3
-"""Sine of the angle between their ways, at least, for them to meet at all."""
+"""Smallest sine of the angle between both paths at which a meeting point is computed."""
 LET_CROSS_S: Final = 2.5
-"""Who crosses goes first once the robot has stood for so long."""
+"""Seconds that the robot must stand before the person crosses first."""
 
 
 def _begin(event: Event, number: int) -> Walker:
@@ -62,8 +62,11 @@ def _ends(event: Event, state: EventState, query: EventQuery) -> bool:
 
 
 def _course(event: Event, walker: Walker, query: EventQuery) -> tuple[float, float]:
-    """The collision course; straight on at its pace for who was led aside, once the robot can be
-    met no more."""
+    """Return heading and speed of the collision course.
+
+    A person that avoided others and can no longer meet the robot walks straight across at its last
+    speed.
+    """
     aim_rad, pace_mps = collision_course(walker, query, event.side)
     if walker.pace_mps is None:
         return aim_rad, pace_mps
@@ -76,8 +79,10 @@ def _course(event: Event, walker: Walker, query: EventQuery) -> tuple[float, flo
 
 
 def _pace_to_meet(walker: Walker, aim_rad: float, query: EventQuery) -> float | None:
-    """Metres a second at which the walker is on the robot's line when the robot is there; None once
-    it is there, or the robot past it."""
+    """Return the speed in m/s to reach the robot's line together with the robot.
+
+    None if the person is on the line already, or the robot is past it.
+    """
     cos, sin = math.cos(query.robot_heading_rad), math.sin(query.robot_heading_rad)
     dx, dy = walker.x_m - query.robot_x_m, walker.y_m - query.robot_y_m
     across = cos * math.sin(aim_rad) - sin * math.cos(aim_rad)
@@ -93,18 +98,17 @@ def _pace_to_meet(walker: Walker, aim_rad: float, query: EventQuery) -> float | 
 
 
 def collision_course(walker: Walker, query: EventQuery, side: int) -> tuple[float, float]:
-    """(heading, speed) at right angles to the robot's heading, to meet the robot's centre if that
-    keeps its velocity.
+    """Return (heading, speed) at a right angle to the robot, to meet its centre.
 
-    side: where the walker stands, left (1) or right (-1) of the robot's path.
+    side: Side of the robot's path the walker comes from: left (1) or right (-1).
     """
     cos, sin = math.cos(query.robot_heading_rad), math.sin(query.robot_heading_rad)
     dx, dy = walker.x_m - query.robot_x_m, walker.y_m - query.robot_y_m
     ahead_m = cos * dx + sin * dy
     left_m = -sin * dx + cos * dy
     towards = -math.copysign(1.0, left_m if abs(left_m) > 1e-6 else side)
-    in_s = max(ahead_m, 0.0) / max(query.robot_v_mps, 1e-6)
-    pace_mps = abs(left_m) / max(in_s, 1e-6)
+    arrival_s = max(ahead_m, 0.0) / max(query.robot_v_mps, 1e-6)
+    pace_mps = abs(left_m) / max(arrival_s, 1e-6)
     return query.robot_heading_rad + towards * math.pi / 2, min(
         max(pace_mps, SLOWEST_MPS), _FASTEST_MPS
     )

@@ -1,9 +1,8 @@
-"""`overtaking`: sets out when the robot has just passed it, comes from behind, faster, passes close
-by, and cuts in.
+"""`overtaking`: follows when the robot has just passed, overtakes closely and cuts in.
 
-Before the robot it slows down to half of the robot's speed, whatever that becomes. A robot that
-only keeps its course, at whatever speed or by fits and starts, runs into it then; one that slows
-down for it until it has been let in, or goes round it, does not. Then it walks on at its own pace.
+In front of the robot it slows down to half of the robot's current speed. A robot that keeps its
+course at any speed collides. A robot that slows down until the person is let in, or drives around,
+does not. Then the person continues at its own pace.
 """
 
 from __future__ import annotations
@@ -27,23 +26,31 @@ from scenarios.events.walking import (
 )
 
 _FASTER_MPS: Final = 0.8
+"""Speed difference to the robot in m/s while overtaking."""
 _FASTEST_MPS: Final = 3.3
-"""It is so much faster than the robot, up to a jogger's pace."""
+"""Highest speed in m/s, a jogger's pace."""
 WAITS_ASIDE_M: Final = 1.2
+"""Largest distance in metres from the middle of the sidewalk where it waits."""
 BESIDE_ROBOT_M: Final = 0.95
-"""Between its middle and the robot's as it passes."""
+"""Lateral distance in metres between its centre and the robot's while it passes."""
 _CUTS_IN_M: Final = 1.0
+"""Lead in metres at which it turns to the robot's line."""
 _BEFORE_ROBOT_M: Final = 1.5
-"""Its lead when it turns to the robot's line, and when it slows down there."""
+"""Lead in metres at which it slows down on the robot's line."""
 ON_LINE_M: Final = 0.15
+"""Lateral distance in metres at which it counts as on the robot's line."""
 SLOWED: Final = 0.5
+"""Its speed after cutting in, as a fraction of the robot's."""
 _CREEPS_MPS: Final = 0.1
+"""Lowest speed in m/s after cutting in."""
 _EASES_MPS2: Final = 0.6
-"""How fast its pace goes with the robot's from then on."""
+"""Acceleration in m/s^2 with which its speed follows the robot's after cutting in."""
 YIELDED_S: Final = 5.0
+"""Seconds without an approach after which the robot counts as having let it in."""
 _NEARER_M: Final = 0.1
-"""A robot that for so long has not come nearer by this has let it in."""
+"""Metres by which the lead must shrink to count as an approach."""
 _LOOK_AHEAD_M: Final = 1.5
+"""Metres ahead on its line that it aims at."""
 
 
 def _begin(event: Event, number: int) -> Walker:
@@ -74,7 +81,7 @@ def _step(event: Event, state: EventState, number: int, query: EventQuery) -> Wa
 
 
 def _eased(event: Event, walker: Walker, query: EventQuery) -> Walker:
-    """Its pace goes with the robot's; it counts how long the robot has come no nearer."""
+    """Adapt its speed to the robot's and count the ticks without an approach."""
     assert walker.pace_mps is not None
     change_mps = _EASES_MPS2 * query.tick_ms / 1000
     pace_mps = walker.pace_mps + max(
@@ -93,10 +100,10 @@ def _slowed_mps(query: EventQuery) -> float:
 
 
 def _beside_m(event: Event, line_m: float) -> float:
-    """How far left of the middle it passes a robot: on its side, if there is room."""
+    """Return the lateral offset in metres at which it passes, on its own side if there is room."""
     room_m = event.half_width_m - PERSON_RADIUS_M
-    on_its_side = line_m + event.side * BESIDE_ROBOT_M
-    return on_its_side if abs(on_its_side) <= room_m else line_m - event.side * BESIDE_ROBOT_M
+    own_side_m = line_m + event.side * BESIDE_ROBOT_M
+    return own_side_m if abs(own_side_m) <= room_m else line_m - event.side * BESIDE_ROBOT_M
 
 
 def _lead_m(event: Event, walker: Walker, query: EventQuery) -> float:
@@ -104,7 +111,7 @@ def _lead_m(event: Event, walker: Walker, query: EventQuery) -> float:
 
 
 def _ends(event: Event, state: EventState, query: EventQuery) -> bool:
-    """The robot has let it in, or has passed it in turn."""
+    """Return whether the robot has let it in or has overtaken it."""
     (walker,) = state.walkers
     passed = walker.pace_mps is not None and _lead_m(event, walker, query) < -1.0
     return passed or walker.counted_ticks * query.tick_ms / 1000 >= YIELDED_S

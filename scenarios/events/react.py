@@ -1,8 +1,10 @@
-"""One tick of every event: triggers, state machines, who is shown."""
+"""Registry of event kinds, and one tick of all events: triggers, state machines, visible people."""
 
 from __future__ import annotations
 
 import math
+from types import MappingProxyType
+from typing import Final
 
 import msgspec
 
@@ -19,21 +21,31 @@ from cosim.spec.events import (
     EventState,
     Walker,
 )
-from scenarios.events.table import EVENT_KINDS
+from scenarios.events.crossing import PED_CROSSING
+from scenarios.events.frontal import FRONTAL
+from scenarios.events.lateral import LATERAL
+from scenarios.events.overtaking import OVERTAKING
+from scenarios.events.standing import CONVERSING, GESTURING, OBSTRUCTING, QUEUEING
 from scenarios.events.walking import left_m
 
+_ROWS = (OBSTRUCTING, CONVERSING, QUEUEING, FRONTAL, LATERAL, OVERTAKING, PED_CROSSING, GESTURING)
+EVENT_KINDS: Final[EventKinds] = MappingProxyType({kind.name: kind for kind in _ROWS})
+"""Bundled event kinds by name; each is defined in its own module."""
+
 SHOWN_AHEAD_M = 60.0
+"""Metres of route ahead of the robot within which people of an event exist."""
 SHOWN_BEHIND_M = 30.0
-"""An event's pedestrians exist while the robot is within these arc lengths of its place."""
+"""Metres of route behind the robot within which people of an event exist."""
 
 LEAVES_M = 15.0
-"""Those whose event is over are gone for good when the robot is this far from all of them: out of
-its sight."""
+"""Distance in metres, out of the robot's sight, at which people of a finished event are removed."""
 
 
 def react(query: EventQuery, kinds: EventKinds = EVENT_KINDS) -> EventReply:
-    """One tick of every event. A pure function of query and table. Raises SpecError when states and
-    events do not match, or an event is not of the table."""
+    """Advance all events by one tick. A pure function of query and table.
+
+    Raises SpecError if states do not match the events, or an event is not in the table.
+    """
     if strange := sorted({event.kind for event in query.events} - kinds.keys()):
         raise SpecError(f"event '{strange[0]}' is none of {', '.join(kinds)}")
     rows = [kinds[event.kind] for event in query.events]
@@ -42,24 +54,25 @@ def react(query: EventQuery, kinds: EventKinds = EVENT_KINDS) -> EventReply:
         raise SpecError(
             f"{len(query.events)} events came with {len(states)} states, or with other people"
         )
-    told = list(zip(rows, query.events, states, strict=True))
-    new = tuple(_advance(kind, event, state, query) for kind, event, state in told)
+    before = list(zip(rows, query.events, states, strict=True))
+    after = tuple(_advance(kind, event, state, query) for kind, event, state in before)
     actors = tuple(
         actor
-        for (kind, event, before), after in zip(told, new, strict=True)
-        if _present(event, after, query)
-        for actor in _shown(kind, event, before, after, query)
+        for (kind, event, old), new in zip(before, after, strict=True)
+        if _present(event, new, query)
+        for actor in _shown(kind, event, old, new, query)
     )
-    return EventReply(episode=query.episode, tick=query.tick, states=new, actors=actors)
+    return EventReply(episode=query.episode, tick=query.tick, states=after, actors=actors)
 
 
 def _waiting(kind: EventKind, event: Event) -> EventState:
+    """Return the initial state of an event."""
     walkers = tuple(kind.begin(event, number) for number in range(event.people))
     return EventState(phase="waiting", since_tick=0, walkers=walkers)
 
 
 def _triggered_m(trigger_m: float | None, event: Event, query: EventQuery) -> float | None:
-    """Metres along the route from the robot to the event's place, once it begins; None before."""
+    """Return the route distance in metres from robot to event if the event triggers; else None."""
     gap_m = event.route_s_m - query.route_s_m
     if trigger_m is None:
         begins = abs(gap_m) <= event.half_length_m
@@ -109,7 +122,7 @@ def _stands(query: EventQuery) -> bool:
 
 
 def _timed(old: Walker, new: Walker, tick_ms: int) -> Walker:
-    """A walker after its step, with the velocity of it."""
+    """Return a walker after its step with its velocity."""
     vx, vy = (new.x_m - old.x_m) * 1000 / tick_ms, (new.y_m - old.y_m) * 1000 / tick_ms
     return (
         new

@@ -1,9 +1,7 @@
-"""One resident: walks to a place, stands about or does what there is to do there, and walks on.
-Pure functions.
+"""One resident: walks to a node of the behaviour graph, idles or does an activity there.
 
-States: "walking" along its way; "idle" at a waypoint beside the middle of the sidewalk;
-"interacting" with a bench, a shop window or a bus stop. What is random comes from the generator
-that is handed in when a choice is due.
+Pure functions. Phases: "walking" along its path, "idle" at a waypoint, "interacting" with a bench,
+shop window or bus stop. Random choices use the generator passed in.
 """
 
 from __future__ import annotations
@@ -26,45 +24,55 @@ from scenarios.events.behaviour_graph import BehaviorGraph
 from scenarios.events.walking import robot_of, turned
 
 SPEED_MPS: Final = (1.1, 1.65)
+"""Range of walking speeds in m/s."""
 STAYS_S: Final = {
     "bench": (20.0, 60.0),
     "window": (5.0, 25.0),
     "stop": (15.0, 60.0),
     "idle": (5.0, 20.0),
 }
+"""Ranges of the seconds that a resident stays, by activity."""
 _FAR_M: Final = 120.0
-"""Nobody sets out for something that is farther to walk."""
+"""Largest walking distance in metres to a goal."""
 TO_DO: Final = 0.75
-"""How likely one goes to do something rather than to stand about, where there is something to
-do."""
+"""Probability of choosing an interaction spot over a waypoint, if one is available."""
 _APART_M: Final = 1.2
-"""Nobody chooses to stand nearer to somebody who stands; two sit on a bench."""
+"""Smallest distance in metres between standing residents, except on a bench."""
 ACCELERATION_MPS2: Final = 3.0
+"""Largest change of velocity in m/s^2."""
 ARRIVES_M: Final = 0.04
+"""Metres from the goal at which a resident arrives."""
 PASSES_M: Final = 0.3
-"""So near to a waypoint one goes on to the next."""
+"""Metres from a waypoint at which a resident heads for the next."""
 LOOKS_AHEAD_TICKS: Final = 8
+"""Ticks between checks whether a waypoint can be skipped."""
 _GIVES_UP_S: Final = 3.0
-"""Who makes no way for so long goes elsewhere."""
+"""Seconds without progress after which a resident chooses another goal."""
 TREADS_MPS: Final = 0.25
-"""What a body shows that turns on the spot: `cosim.people.gait` blends from it into what it does
-next."""
+"""Animated speed in m/s while turning on the spot: `cosim.people.gait` blends from it."""
 LEAVES_S: Final = 0.55
-"""How long a body takes from what it did, such as sitting, to the pose in which it treads; it stays
-where it is."""
+"""Seconds in which a body rises from its activity, such as sitting, before it moves."""
 LEAVES_MPS: Final = 0.3
+"""Animated speed in m/s during `LEAVES_S`."""
 _ABOUT: Final[tuple[Doing, ...]] = ("stand", "look", "phone")
+"""Activities of an idle resident."""
 _FACES_RAD: Final = 0.02
+"""Heading error in radians below which a resident faces its activity."""
 _DETOURS_RAD: Final = (0.0, 0.4, -0.4, 0.8, -0.8, 1.2, -1.2)
+"""Turns in radians that are tried in order when a step is blocked."""
 
 
 class Resident(NamedTuple):
-    """Where a resident stands. way: the nodes still to walk to, the last is the goal; goal: where
-    it goes or is.
+    """State of a resident.
 
-    doing: what it does there. since_tick: when it faced what it does; None before. choices: how
-    many it made. moving_mps: velocity of its last step; shown_mps: what its body shows, more where
-    it treads on the spot.
+    goal: Node it walks to or is at.
+    way: Nodes still to visit; the last is the goal.
+    doing: Activity at the goal.
+    stay_s: Seconds it stays at the goal.
+    since_tick: Tick at which the activity began; None before.
+    moving_mps: Velocity of its last step.
+    shown_mps: Animated speed; greater than zero also while it turns on the spot.
+    choices: Number of goals chosen, which seeds the next choice.
     """
 
     number: int
@@ -90,7 +98,7 @@ class Resident(NamedTuple):
 
 
 def resident_actor(resident: Resident) -> Actor:
-    """The resident as the world shows it."""
+    """Return the actor of a resident."""
     here = resident.phase != "walking" and resident.since_tick is not None
     return Actor(
         id=resident.name,
@@ -106,7 +114,7 @@ def resident_actor(resident: Resident) -> Actor:
 
 
 def wants_to_choose(resident: Resident, query: EventQuery) -> bool:
-    """Whether it is done here, or makes no way."""
+    """Return whether its stay is over or it makes no progress."""
     if resident.phase == "walking":
         return resident.blocked_ticks * query.tick_ms / 1000 >= _GIVES_UP_S
     return _here_s(resident, query) >= resident.stay_s + LEAVES_S
@@ -115,7 +123,10 @@ def wants_to_choose(resident: Resident, query: EventQuery) -> bool:
 def next_errand(
     resident: Resident, graph: BehaviorGraph, rng: np.random.Generator, taken: Collection[int]
 ) -> Resident:
-    """The resident on its way to something new. taken: nodes where others are or go to."""
+    """Choose a new goal for a resident.
+
+    taken: Nodes that other residents occupy or walk to.
+    """
     node = graph.nearest(resident.x_m, resident.y_m)
     resident = resident._replace(
         blocked_ticks=0, choices=resident.choices + 1, since_tick=None, phase="walking"
@@ -136,8 +147,10 @@ def next_errand(
 def drawn_spot(
     graph: BehaviorGraph, open_to: NDArray[np.bool_], rng: np.random.Generator
 ) -> int | None:
-    """One of the nodes (N,) bool where there is something to do: first what, then where; None
-    without any."""
+    """Draw an interaction spot: first the activity, then the node; None if there is none.
+
+    open_to: (N,) bool, the nodes to choose from.
+    """
     offered = [
         nodes for of_what in graph.by_what.values() if len(nodes := of_what[open_to[of_what]])
     ]
@@ -153,8 +166,10 @@ def drawn_waypoint(
     rng: np.random.Generator,
     taken: Collection[int],
 ) -> int | None:
-    """One of the waypoints (N,) bool where one may stand about, away from others who stand; without
-    any, where one may not; None without either."""
+    """Draw a waypoint away from occupied nodes, preferably one for idling; None if there is none.
+
+    open_to: (N,) bool, the nodes to choose from.
+    """
     open_to = open_to[: graph.waypoints].copy()
     for x, y in graph.xy[sorted(taken)].tolist():
         open_to &= np.hypot(*(graph.xy[: graph.waypoints] - (x, y)).T) > _APART_M
@@ -166,13 +181,13 @@ def drawn_waypoint(
 def bound_for(
     resident: Resident, graph: BehaviorGraph, goal: int, rng: np.random.Generator
 ) -> Resident:
-    """The resident with a goal: what it will do there, and for how long."""
+    """Set a resident's goal, its activity there and the duration."""
     spot = graph.spot(goal)
     low, high = STAYS_S["idle" if spot is None else spot.what]
     stay_s = float(rng.uniform(low, high))
     doing = _ABOUT[int(rng.integers(len(_ABOUT)))]
     if spot is None and not graph.idle[goal]:
-        stay_s = 0.0  # who would stand in the way of others walks on at once
+        stay_s = 0.0  # standing here would block others
     elif spot is not None and spot.what != "stop":
         doing = "sit" if spot.what == "bench" else "look"
     return resident._replace(goal=goal, doing=doing, stay_s=stay_s)
@@ -181,7 +196,7 @@ def bound_for(
 def resident_moved_on(
     resident: Resident, graph: BehaviorGraph, query: EventQuery, neighbours: Sequence[Neighbour]
 ) -> Resident:
-    """One tick on."""
+    """Advance a resident by one tick."""
     if resident.phase == "walking":
         return _walked(resident, graph, query, neighbours)
     if resident.since_tick is None:
@@ -191,7 +206,7 @@ def resident_moved_on(
 
 
 def arrived(resident: Resident, graph: BehaviorGraph) -> Resident:
-    """The resident at its goal, about to turn to what it does there."""
+    """Place a resident at its goal, before it turns to its activity."""
     x, y = graph.points[resident.goal]
     phase: Literal["idle", "interacting"] = (
         "idle" if graph.spot(resident.goal) is None else "interacting"
@@ -253,7 +268,7 @@ def _walked(
 
 
 def _ahead(resident: Resident, graph: BehaviorGraph, query: EventQuery) -> tuple[int, ...]:
-    """The way without the waypoints that are reached, or that one need not touch any more."""
+    """Return the path without waypoints that are reached or can be skipped."""
     way = resident.way
     at = (resident.x_m, resident.y_m)
     while len(way) > 1 and math.dist(at, graph.points[way[0]]) < PASSES_M:
@@ -265,7 +280,7 @@ def _ahead(resident: Resident, graph: BehaviorGraph, query: EventQuery) -> tuple
 
 
 def _eased(before: Vector, wanted: Vector, tick_s: float) -> Vector:
-    """The velocity changed no faster than a body can."""
+    """Return the velocity limited by the acceleration of a person."""
     dx, dy = wanted[0] - before[0], wanted[1] - before[1]
     share = min(1.0, ACCELERATION_MPS2 * tick_s / max(math.hypot(dx, dy), 1e-9))
     return before[0] + share * dx, before[1] + share * dy
@@ -279,8 +294,10 @@ def _stepped(
     neighbours: Sequence[Neighbour],
     tick_s: float,
 ) -> Vector:
-    """Where a step leads: round the robot, never off the graph's ground, nor into somebody; where
-    it is if nowhere."""
+    """Return the position after a step around the robot, people and the graph's boundary.
+
+    The current position if every detour is blocked.
+    """
     robot = robot_of(query)
     for turn_rad in _DETOURS_RAD:
         cos, sin = math.cos(turn_rad), math.sin(turn_rad)
@@ -297,7 +314,7 @@ def _stepped(
 
 
 def _nearer(at: Vector, onward: Vector, one: Neighbour) -> bool:
-    """Whether a step leads nearer to somebody who is too near."""
+    """Return whether a step leads closer to a person who is too close."""
     far_m = math.hypot(onward[0] - one.x_m, onward[1] - one.y_m)
     return far_m < SHOULDER_TO_SHOULDER_M and far_m < math.hypot(at[0] - one.x_m, at[1] - one.y_m)
 

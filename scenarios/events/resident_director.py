@@ -1,7 +1,7 @@
-"""Residents beside the pedestrians of the events. A director around a director.
+"""Director that adds residents to another director's replies.
 
-So many are kept around the robot. They come and go out of its sight, and each draws from generators
-of its own, so what one does hangs on nothing but the scenario, its number, and what it meets.
+A fixed number is around the robot; residents appear and disappear out of its sight. Each draws from
+its own generators, so its behaviour depends only on the scenario, its number and what it meets.
 """
 
 from __future__ import annotations
@@ -40,18 +40,19 @@ from sumo_nets.crowd.demand import FIRST_FILL_CLEAR_M, SIGHT_M
 from sumo_nets.crowd.group_sampling import ELDERLY_SHARE
 
 WITHIN_M: Final = 60.0
-"""Residents appear no farther from the robot."""
+"""Largest distance in metres from the robot at which residents appear."""
 GONE_M: Final = 70.0
-"""Beyond this they are gone."""
-_ROLL_TICKS: Final = 10
-"""How often they come and go."""
+"""Distance in metres from the robot beyond which residents are removed."""
+_POPULATION_TICKS: Final = 10
+"""Ticks between updates of the population."""
 _ROOM_M: Final = 1.5
-"""Nobody appears nearer to somebody."""
+"""Smallest distance in metres between a new resident and other people."""
 SETTLED: Final = 0.5
-"""How likely somebody who appears is busy already, where there is something to do."""
+"""Probability that a new resident is already at an interaction spot, if one is available."""
 _MOST_NEIGHBOURS: Final = 6
+"""Largest number of people that a resident's steering considers."""
 _KIND: Final = 0x8E51
-"""Tells the generators of residents from others of the same seed."""
+"""Separates the random generators of residents from others with the same seed."""
 
 
 def among_residents(
@@ -61,7 +62,7 @@ def among_residents(
     ground: StreetSurface,
     people: Callable[[], People],
 ) -> Director:
-    """A director with the scenario's residents around it; itself where there are none."""
+    """Wrap a director to add the scenario's residents; unchanged if the scenario has none."""
     count = scenario.crowd.residents
     if not count:
         return director
@@ -72,8 +73,10 @@ def among_residents(
 
 
 class Residents:
-    """Adds residents to another director's replies. people: those on the street now, the residents
-    among them."""
+    """Adds residents to another director's replies.
+
+    people: Returns all people on the street, including residents.
+    """
 
     def __init__(
         self,
@@ -93,16 +96,16 @@ class Residents:
 
     @property
     def here(self) -> tuple[Resident, ...]:
-        """Those who are there now."""
+        """Residents that exist now."""
         return tuple(self._here.values())
 
     def react(self, query: EventQuery) -> EventReply:
-        """The director's reply, with the residents of this tick among its actors."""
+        """Return the director's reply with the residents of this tick among its actors."""
         reply = self._director.react(query)
         people = self._people()
         self._advance(query, people)
-        if query.tick % _ROLL_TICKS == 0:
-            self._roll(query, people)
+        if query.tick % _POPULATION_TICKS == 0:
+            self._repopulate(query, people)
         if not self._here:
             return reply
         return msgspec.structs.replace(
@@ -126,7 +129,7 @@ class Residents:
                 resident, self._graph, query, (robot, *around.get(number, ()))
             )
 
-    def _roll(self, query: EventQuery, people: People) -> None:
+    def _repopulate(self, query: EventQuery, people: People) -> None:
         robot = np.array([query.robot_x_m, query.robot_y_m])
         for number, one in list(self._here.items()):
             if np.hypot(one.x_m - robot[0], one.y_m - robot[1]) > GONE_M:
@@ -150,8 +153,10 @@ class Residents:
     def _appearing(
         self, ring: NDArray[np.bool_], others: Floats, query: EventQuery
     ) -> Resident | None:
-        """Somebody new at one of the nodes (N,) bool, busy there or on the way; None where others
-        leave no room."""
+        """Create a resident at one of the nodes, busy or walking; None if people are too close.
+
+        ring: (N,) bool, the nodes to choose from.
+        """
         number, graph = self._next, self._graph
         rng = self._rng(number, 0)
         self._next += 1
@@ -177,7 +182,7 @@ class Residents:
 
 
 def _around(walking: Sequence[Resident], people: People) -> dict[int, list[Neighbour]]:
-    """The nearest people around each resident that walks, by its number."""
+    """Return the nearest people around each walking resident, by its number."""
     if not walking or not len(people):
         return {one.number: [] for one in walking}
     at = np.array([(one.x_m, one.y_m) for one in walking])

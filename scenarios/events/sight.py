@@ -1,4 +1,4 @@
-"""Sight: what one person of an event knows of a tick: the query, and the people round it."""
+"""What one person of an event knows in a tick: the query and the people nearby."""
 
 from __future__ import annotations
 
@@ -22,32 +22,32 @@ from cosim.people.yielding import STOOD_S
 from cosim.spec.events import Event, EventQuery, NearbyPerson, Walker
 
 COMES_UP_M = 1.5
-"""From here on, who insists on a place walks up to whoever is there, not round."""
+"""Metres from an occupied goal below which an insisting person approaches instead of avoiding."""
 
 BESIDE_M = 1.0
-"""So near to a place that is taken one comes; one who does not insist on it stands there."""
+"""Metres from an occupied goal at which a person that does not insist stops."""
 
 STILL_MPS = 0.1
-"""Slower ones stand."""
+"""Speed in m/s below which a person counts as standing."""
 
 SQUEEZES_S = 3.0
+"""Seconds after which a person insisting on its goal accepts smaller gaps."""
 PRESSES_S = 6.0
-"""Who insists on a place and is not there after the first time squeezes through; after the second
-the crowd gives way."""
+"""Seconds after which a person insisting on its goal ignores the crowd."""
 
 SAME_M = 0.001
-"""Who is nearer is in the same place."""
+"""Metres below which two people count as being at the same position."""
 
 SHARED = 0.5
-"""Of the avoidance between two who steer the same way."""
+"""Fraction of the avoidance that each of two people using the same steering takes."""
 
 
 class Sight(NamedTuple):
-    """What somebody knows: the query, the people round it but not itself, the event on whose ground
-    it stays.
+    """Knowledge of one person: the query, other people nearby, and the event whose area bounds it.
 
-    room_m: what it keeps from others where it can. robot_stands: whether the robot has stood long
-    enough to be walked round like anything that stands.
+    others: Other people, and the robot if it has stood long enough.
+    room_m: Gap in metres to others where possible.
+    robot_stands: Whether the robot has stood long enough to be avoided like an obstacle.
     """
 
     query: EventQuery
@@ -58,10 +58,10 @@ class Sight(NamedTuple):
 
 
 def sight_of(event: Event, number: int, query: EventQuery, waited_s: float = 0.0) -> Sight:
-    """The sight of person `number` of an event: it sees its fellows, people of other events, and
-    who is near.
+    """Return the sight of a person of an event: people of all events and people nearby.
 
-    waited_s: how long it has been on its way to a place on which it insists.
+    number: Index of the person in the event.
+    waited_s: Seconds it has been on its way to a goal on which it insists.
     """
     others = [
         fellow(walker)
@@ -79,7 +79,7 @@ def sight_of(event: Event, number: int, query: EventQuery, waited_s: float = 0.0
 
 
 def standing_robot(query: EventQuery) -> list[Neighbour]:
-    """The robot as two who stand, one behind the other."""
+    """Return the robot as two standing people, one behind the other."""
     quarter_m = query.robot_length_m / 4
     cos, sin = math.cos(query.robot_heading_rad), math.sin(query.robot_heading_rad)
     return [
@@ -89,17 +89,19 @@ def standing_robot(query: EventQuery) -> list[Neighbour]:
 
 
 def sight_of_injected(name: str, person: Walker, query: EventQuery) -> Sight:
-    """The sight of the injected person that is shown under this id."""
+    """Return the sight of the injected person with this id."""
     walkers = [
         walker for state in query.states if state.phase != "gone" for walker in state.walkers
     ]
-    others = (_told_apart(name, person, one) for one in query.nearby if one.id != name)
+    others = (_separated(name, person, one) for one in query.nearby if one.id != name)
     return Sight(query, [*map(fellow, walkers), *met(others)])
 
 
-def _told_apart(name: str, person: Walker, other: NearbyPerson) -> NearbyPerson:
-    """Who is in the very same place, as two are who are injected there at once, is seen a little to
-    one side: else they would walk in each other for ever."""
+def _separated(name: str, person: Walker, other: NearbyPerson) -> NearbyPerson:
+    """Shift a person at the same position to one side.
+
+    Otherwise two people injected at one point would walk inside each other for ever.
+    """
     if math.hypot(other.x_m - person.x_m, other.y_m - person.y_m) > SAME_M:
         return other
     left_m = SAME_M if name < other.id else -SAME_M
@@ -110,13 +112,13 @@ def _told_apart(name: str, person: Walker, other: NearbyPerson) -> NearbyPerson:
 
 
 def fellow(walker: Walker | NearbyPerson) -> Neighbour:
-    """Somebody who steers the same way, but for who stands: that one stays."""
+    """Return a person that uses the same steering; a standing one does not move aside."""
     moves = walker.vx_mps != 0.0 or walker.vy_mps != 0.0
     return Neighbour(walker.x_m, walker.y_m, walker.vx_mps, walker.vy_mps, SHARED if moves else 1.0)
 
 
 def met(nearby: Iterable[NearbyPerson]) -> list[Neighbour]:
-    """The crowd pays no heed; injected people and residents who walk steer the same way."""
+    """Return people nearby as neighbours; the crowd does not avoid, others do."""
     return [
         Neighbour(b.x_m, b.y_m, b.vx_mps, b.vy_mps) if b.kind == PersonKind.CROWD else fellow(b)
         for b in nearby
@@ -124,8 +126,7 @@ def met(nearby: Iterable[NearbyPerson]) -> list[Neighbour]:
 
 
 def place_taken(walker: Walker, goal: Vector, sight: Sight) -> bool:
-    """Whether somebody stands where the walker wants to stop, and the walker has come up to
-    them."""
+    """Return whether a person stands at the walker's goal, and the walker has come near."""
     return math.dist((walker.x_m, walker.y_m), goal) < BESIDE_M and any(
         math.dist(other[:2], goal) < SHOULDER_TO_SHOULDER_M
         and math.hypot(other.vx_mps, other.vy_mps) < STILL_MPS
@@ -141,11 +142,11 @@ def led_round(
     *,
     insisting: bool = False,
 ) -> Vector:
-    """Where a step ends that should end at `wanted` (m), once it is led round people; `wanted`
-    itself where it is not.
+    """Return where a step to `wanted` (m) ends after avoiding people.
 
-    goal: where the walker is going to stop. insisting: even if somebody is there, who will make
-    room.
+    goal: Where the walker is going to stop.
+    insisting: Approach the goal even if it is occupied; the other person makes room.
+    Returns `wanted` itself if it is free.
     """
     tick_s = sight.query.tick_ms / 1000
     at = (walker.x_m, walker.y_m)
@@ -176,8 +177,10 @@ def led_round(
 def edges(
     walker: Walker, wanted: Vector, event: Event | None, tick_s: float
 ) -> tuple[HalfPlane, ...]:
-    """The velocities that keep somebody on the sidewalk or crosswalk of its event; none for who
-    leaves it anyway."""
+    """Return half-planes of velocities that keep a person on the ground of its event.
+
+    Empty for a person that is leaving it anyway.
+    """
     if event is None:
         return ()
     ahead_x, ahead_y = math.cos(event.heading_rad), math.sin(event.heading_rad)

@@ -1,9 +1,8 @@
-"""Those who stand in the way: `obstructing`, `conversing`, `queueing`, `gesturing`.
+"""Events of people standing in the way: `obstructing`, `conversing`, `queueing`, `gesturing`.
 
 They wait at the edge of the sidewalk and step to their places when triggered: on the middle of the
-sidewalk, or before a robot that does not drive there, so that who only keeps its course meets them.
-They stay until the robot is past, and the stopping hand until the robot has stood before it; then
-they step back.
+sidewalk, or in front of a robot that drives elsewhere. They stay until the robot has passed;
+`gesturing` ends when the robot has stopped. Then they step back.
 """
 
 from __future__ import annotations
@@ -33,32 +32,35 @@ from scenarios.events.walking import (
 )
 
 _TRIGGER_M: Final = 10.0
+"""Route distance in metres at which these events trigger."""
 LOOK_PERIOD_S: Final = 4.0
+"""Seconds of one swing of the head while looking around."""
 LOOK_SWING_RAD: Final = 1.0
+"""Amplitude of the swing in radians."""
 TALK_M: Final = 0.62
-"""From the middle of a group of talkers to each of them; a little more for four."""
+"""Radius in metres of a group of talkers; groups of four are 15 % larger."""
 QUEUE_M: Final = 0.65
-"""From one person of a queue to the next: tight, and more than two radii."""
+"""Metres between people in a queue: tight, but more than two radii."""
 OPEN_M: Final = 1.25
-"""Width that a drawn queue leaves beside it."""
+"""Metres of sidewalk that a queue leaves free."""
 GROUP_M: Final = 1.95
-"""Half the width of a sidewalk on which one can pass round a group of talkers in its middle."""
+"""Smallest half width in metres of a sidewalk on which one can pass a group of talkers."""
 WAITING_M: Final = 0.8
-"""From one to the next of those who wait at the edge."""
+"""Metres between people waiting at the edge."""
 PASSED_BY_M: Final = 3.0
-"""So far beyond the last of them along the route the robot has passed them."""
+"""Metres along the route beyond the last person at which the robot has passed."""
 
 _Step = Callable[[Event, EventState, int, EventQuery], Walker]
 _Place = tuple[float, float]
 """Metres along the event's heading and to the left."""
 _Places = Callable[[Event, float], tuple[_Place, ...]]
-"""Of an event's people, given how far left of the middle the robot drove at the trigger."""
+"""Places of an event's people, given the robot's lateral offset at the trigger."""
 _Facing = Callable[[Event, Walker, EventQuery, EventState], float]
 _PASSABLE: Final = SidewalkLayout((18.0, 20.0), (11.0, 13.0))
 
 
 def talking_places(event: Event, lane_m: float) -> tuple[_Place, ...]:
-    """Evenly on a circle, two of them abreast of the robot's way."""
+    """Return places on a circle, two of them side by side across the robot's path."""
     radius_m = TALK_M * (1.15 if event.people == 4 else 1.0)
     angles = [math.pi / 2 + 2.0 * math.pi * k / event.people for k in range(event.people)]
     left_m = met_m(lane_m, max(edge_m(event) - radius_m, 0.0))
@@ -66,7 +68,7 @@ def talking_places(event: Event, lane_m: float) -> tuple[_Place, ...]:
 
 
 def queue_places(event: Event, lane_m: float) -> tuple[_Place, ...]:
-    """A tight line across the sidewalk that begins at the edge of its side, or of the robot's."""
+    """Return a tight line across the sidewalk, starting at the event's edge or the robot's."""
     side = _queue_side(event, lane_m)
     first_m = event.half_width_m - PERSON_RADIUS_M
     return tuple((0.0, side * (first_m - k * QUEUE_M)) for k in range(event.people))
@@ -77,12 +79,12 @@ def _queue_side(event: Event, lane_m: float) -> float:
 
 
 def in_the_way(event: Event, lane_m: float) -> tuple[_Place, ...]:
-    """One person."""
+    """Return the place of a single person."""
     return ((0.0, met_m(lane_m, edge_m(event))),)
 
 
 def _aside(event: Event, number: int) -> _Place:
-    """Where somebody waits for the trigger: along the edge."""
+    """Return the place at the edge where a person waits for the trigger."""
     return (WAITING_M * (number - (event.people - 1) / 2), event.side * edge_m(event))
 
 
@@ -91,19 +93,19 @@ def _begin(event: Event, number: int) -> Walker:
 
 
 def _ends(event: Event, state: EventState, query: EventQuery) -> bool:
-    """The robot is past all of them."""
+    """Return whether the robot has passed all of them."""
     last_m = max(along_m(event, walker.x_m, walker.y_m) for walker in state.walkers)
     return query.route_s_m - event.route_s_m >= max(last_m, 0.0) + PASSED_BY_M
 
 
 def _obeyed(event: Event, state: EventState, query: EventQuery) -> bool:
-    """The robot has stopped before the hand, or is past it."""
+    """Return whether the robot has stopped for the gesture or has passed."""
     (walker,) = state.walkers
     return walker.counted_ticks * query.tick_ms / 1000 >= STOP_S or _ends(event, state, query)
 
 
 def _standing(places: _Places, facing: _Facing) -> _Step:
-    """The steps of those who go to `places` and face somewhere there."""
+    """Build the step function of people who go to `places` and face as `facing` says."""
 
     def step(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:
         walker = state.walkers[number]
@@ -126,7 +128,7 @@ def _standing(places: _Places, facing: _Facing) -> _Step:
 
 
 def _with_hand(step: _Step) -> _Step:
-    """Who counts besides how long the robot has stood before it."""
+    """Extend a step function to count the ticks that the robot has stood in front of the person."""
 
     def counted(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:
         after = step(event, state, number, query)
@@ -139,30 +141,30 @@ def _with_hand(step: _Step) -> _Step:
 
 
 def _about(event: Event, walker: Walker, query: EventQuery, state: EventState) -> float:
-    """Against the robot's way, swinging to either side."""
+    """Return a heading against the robot's direction that swings to both sides."""
     phase = 2 * math.pi * (query.tick - state.since_tick) * query.tick_ms / 1000 / LOOK_PERIOD_S
     return event.heading_rad + math.pi + LOOK_SWING_RAD * math.sin(phase)
 
 
 def _inward(event: Event, walker: Walker, query: EventQuery, state: EventState) -> float:
-    """To the middle of the group."""
+    """Return the heading to the middle of the group."""
     places = talking_places(event, state.lane_m)
     x_m, y_m = spot(event, 0.0, sum(left for _, left in places) / len(places))
     return math.atan2(y_m - walker.y_m, x_m - walker.x_m)
 
 
 def _forward(event: Event, walker: Walker, query: EventQuery, state: EventState) -> float:
-    """To the head of the queue, at its side of the sidewalk."""
+    """Return the heading to the head of the queue."""
     return wrap_angle(event.heading_rad + _queue_side(event, state.lane_m) * math.pi / 2)
 
 
 def _at_robot(event: Event, walker: Walker, query: EventQuery, state: EventState) -> float:
-    """At the robot."""
+    """Return the heading to the robot."""
     return math.atan2(query.robot_y_m - walker.y_m, query.robot_x_m - walker.x_m)
 
 
 def _queue(half_width_m: float, rng: np.random.Generator) -> int:
-    """As long as leaves OPEN_M beside it, past the middle."""
+    """Return the longest queue past the middle that leaves OPEN_M free."""
     return max(2, min(5, int((2 * half_width_m - OPEN_M - 2 * PERSON_RADIUS_M) / QUEUE_M) + 1))
 
 

@@ -1,5 +1,7 @@
-"""How event pedestrians move: places beside an event, turning at a human rate, steps round people
-and the robot."""
+"""Motion of event pedestrians: event coordinates, turning rate, avoidance.
+
+Event coordinates are metres along the event's heading and metres to the left.
+"""
 
 from __future__ import annotations
 
@@ -16,62 +18,70 @@ from cosim.spec.events import Event, EventQuery, Walker
 from scenarios.events.sight import Sight, led_round, place_taken
 
 EDGE_GAP_M = 0.1
+"""Gap in metres between a person's shoulder and the edge of the sidewalk."""
 TURN_RADPS = math.pi
+"""Turning rate of a person in rad/s."""
 ON_THE_MIDDLE_M = 0.3
-"""A robot no farther from the middle of the way is met there."""
+"""Lateral offset in metres up to which a robot counts as driving on the middle."""
 SLOW_MPS = 0.3
-"""Below this the motion says nothing about where somebody faces."""
+"""Speed in m/s below which motion does not change a person's heading."""
 _SAME_M = 1e-9
+"""Metres below which two positions are equal."""
 _GIVES_UP_S = 2.0
-"""How long somebody stands against a robot that it has run into before it goes round."""
+"""Seconds of contact with the robot after which a person walks around it."""
 
 
 def walker_at(event: Event, along_m: float, left_m: float, facing_rad: float) -> Walker:
-    """Somebody at a place of the event's frame: metres along its heading and to the left, facing in
-    that frame."""
+    """Return a person at event coordinates.
+
+    facing_rad: Heading relative to the event's heading.
+    """
     x_m, y_m = spot(event, along_m, left_m)
     return Walker(x_m=x_m, y_m=y_m, heading_rad=wrap_angle(event.heading_rad + facing_rad))
 
 
 def spot(event: Event, along_m: float, left_m: float) -> tuple[float, float]:
-    """World metres of a place in the event's frame."""
+    """Convert event coordinates to world metres."""
     cos, sin = math.cos(event.heading_rad), math.sin(event.heading_rad)
     return event.x_m + cos * along_m - sin * left_m, event.y_m + sin * along_m + cos * left_m
 
 
 def along_m(event: Event, x_m: float, y_m: float) -> float:
-    """Metres of a point of the world along the event's heading, from its place."""
+    """Return the coordinate of a world point along the event's heading."""
     return math.cos(event.heading_rad) * (x_m - event.x_m) + math.sin(event.heading_rad) * (
         y_m - event.y_m
     )
 
 
 def left_m(event: Event, x_m: float, y_m: float) -> float:
-    """Metres of a point of the world to the left of the event's heading, from its place."""
+    """Return the coordinate of a world point to the left of the event's heading."""
     return math.cos(event.heading_rad) * (y_m - event.y_m) - math.sin(event.heading_rad) * (
         x_m - event.x_m
     )
 
 
 def edge_m(event: Event) -> float:
-    """How far from the middle one can stand with both shoulders on the sidewalk."""
+    """Return the largest lateral offset at which both shoulders are on the sidewalk."""
     return max(event.half_width_m - PERSON_RADIUS_M - EDGE_GAP_M, 0.0)
 
 
 def met_m(lane_m: float, room_m: float) -> float:
-    """How far left of the middle of the way a robot is met that was `lane_m` left of it at the
-    trigger, with so much room to either side."""
+    """Return the lateral offset at which to meet a robot.
+
+    lane_m: The robot's lateral offset at the trigger.
+    room_m: Largest offset to either side.
+    """
     return max(-room_m, min(room_m, lane_m)) if abs(lane_m) > ON_THE_MIDDLE_M else 0.0
 
 
 def robot_of(query: EventQuery) -> RobotBody:
-    """The robot as people see it."""
+    """Return the robot's body from a query."""
     pose = Pose(query.robot_x_m, query.robot_y_m, query.robot_heading_rad)
     return RobotBody(pose, (query.robot_length_m / 2, query.robot_width_m / 2), query.robot_v_mps)
 
 
 def turned(heading_rad: float, wanted_rad: float, tick_s: float) -> float:
-    """Heading after one tick of turning at a human rate."""
+    """Return the heading after turning for one tick at a human rate."""
     error = wrap_angle(wanted_rad - heading_rad)
     return wrap_angle(heading_rad + max(-TURN_RADPS * tick_s, min(TURN_RADPS * tick_s, error)))
 
@@ -85,9 +95,10 @@ def walked_to(
     *,
     insisting: bool = False,
 ) -> Walker:
-    """One tick towards a point, facing it, round people and the robot where they are in the way;
-    exactly there when in reach. Where somebody is there already one stands beside them, unless one
-    insists: then they make room."""
+    """Move one tick towards a point, around people and the robot; exactly onto it when in reach.
+
+    insisting: Approach the point even if it is occupied; otherwise the walker stops near it.
+    """
     if not insisting and place_taken(walker, (x_m, y_m), sight):
         return walker
     tick_s = sight.query.tick_ms / 1000
@@ -104,7 +115,7 @@ def walked_to(
 
 
 def walked_on(walker: Walker, heading_rad: float, speed_mps: float, sight: Sight) -> Walker:
-    """One tick in a direction, round people and the robot where they are in the way."""
+    """Move one tick in a direction, around people and the robot."""
     tick_s = sight.query.tick_ms / 1000
     step_m = speed_mps * tick_s
     onward = (
@@ -123,38 +134,35 @@ def stepped(
     *,
     insisting: bool = False,
 ) -> Walker:
-    """The walker one step on, with the step led round people, then round what stands there, then
-    round the robot."""
+    """Move one step, changed in turn to avoid people, obstacles and the robot."""
     led = _round_things(
         walker, led_round(walker, wanted, sight, goal, insisting=insisting), sight.query
     )
     if led != wanted:
         heading_rad = facing(walker, led, sight)
-    x_m, y_m = led
-    robot = robot_of(sight.query)
-    if math.dist(led, robot.pose[:2]) < within_reach_m(robot):
-        x_m, y_m = stepped_round(np.array([[walker.x_m, walker.y_m]]), np.array([led]), robot)[
-            0
-        ].tolist()
+    x_m, y_m = _round_body(walker, led, robot_of(sight.query))
     return msgspec.structs.replace(walker, x_m=x_m, y_m=y_m, heading_rad=heading_rad)
 
 
 def _round_things(walker: Walker, wanted: Vector, query: EventQuery) -> Vector:
-    """Where a step ends that should end at `wanted` (m), once it is led round what stands there;
-    `wanted` itself where it is not."""
+    """Return where a step to `wanted` (m) ends after avoiding obstacles."""
     for thing in query.standing:
-        body = as_met(thing)
-        if math.dist(wanted, body.pose[:2]) < within_reach_m(body):
-            x_m, y_m = stepped_round(
-                np.array([[walker.x_m, walker.y_m]]), np.array([wanted]), body
-            )[0].tolist()
-            wanted = wanted if math.dist(wanted, (x_m, y_m)) < _SAME_M else (x_m, y_m)
+        moved = _round_body(walker, wanted, as_met(thing))
+        wanted = wanted if math.dist(wanted, moved) < _SAME_M else moved
     return wanted
 
 
+def _round_body(walker: Walker, wanted: Vector, body: RobotBody) -> Vector:
+    """Return where a step to `wanted` (m) ends after avoiding a body."""
+    if math.dist(wanted, body.pose[:2]) >= within_reach_m(body):
+        return wanted
+    start = np.array([[walker.x_m, walker.y_m]])
+    x_m, y_m = stepped_round(start, np.array([wanted]), body)[0].tolist()
+    return x_m, y_m
+
+
 def facing(walker: Walker, after: Vector, sight: Sight) -> float:
-    """Heading after a step that was led aside: the body turns to where it goes; that of who is held
-    up stays."""
+    """Return the heading after a changed step: the direction of motion, or unchanged if blocked."""
     dx, dy = after[0] - walker.x_m, after[1] - walker.y_m
     tick_s = sight.query.tick_ms / 1000
     if math.hypot(dx, dy) < SLOW_MPS * tick_s:
@@ -163,8 +171,10 @@ def facing(walker: Walker, after: Vector, sight: Sight) -> float:
 
 
 def aimed(walker: Walker, query: EventQuery, commit_m: float) -> tuple[Walker, float]:
-    """The walker and where it heads (rad) who walks at the robot's current position, and keeps its
-    line once it is so near."""
+    """Return the walker and its heading (rad) at the robot's position.
+
+    commit_m: Distance to the robot below which the walker keeps its heading.
+    """
     dx, dy = query.robot_x_m - walker.x_m, query.robot_y_m - walker.y_m
     if walker.aim_rad is not None:
         return walker, walker.aim_rad
@@ -174,9 +184,10 @@ def aimed(walker: Walker, query: EventQuery, commit_m: float) -> tuple[Walker, f
 
 
 def pressed_on(walker: Walker, heading_rad: float, speed_mps: float, sight: Sight) -> Walker:
-    """One tick straight on whether or not the robot is there, but round people and round a robot
-    that stands; one that meets the robot stands and does not push it. Who is led round anybody
-    takes aim anew."""
+    """Move one tick straight ahead without avoiding a moving robot, but around people.
+
+    A walker in contact with the robot stops. One that avoids people has to aim again.
+    """
     if sight.robot_stands:
         return msgspec.structs.replace(
             walked_on(walker, heading_rad, speed_mps, sight), aim_rad=None
@@ -199,5 +210,5 @@ def pressed_on(walker: Walker, heading_rad: float, speed_mps: float, sight: Sigh
 
 
 def gave_up(walker: Walker, query: EventQuery) -> bool:
-    """Whether somebody has stood against the robot long enough."""
+    """Return whether a person has been in contact with the robot for long enough."""
     return walker.blocked_ticks * query.tick_ms / 1000 >= _GIVES_UP_S

@@ -467,13 +467,13 @@ def test_a_policy_that_is_not_served_or_not_enough_is_said(hub: Connection) -> N
         known_driver("zenoh:counting", at, 4)
     knows = Counting.manifest | {"privileged": True}
     with (
-        served(hub, Counting(), told=knows),
+        served(hub, Counting(), manifest=knows),
         pytest.raises(UsageError, match="a remote one sees only observations"),
     ):
         known_driver("zenoh:counting", at)
     wrong = Counting.manifest | {"camera": {"width": 64, "hight": 64}}
     with (
-        served(hub, Counting(), told=wrong),
+        served(hub, Counting(), manifest=wrong),
         pytest.raises(
             UsageError,
             match=r"unknown field of camera 'hight'\. Valid choices: .*Did you mean height",
@@ -482,7 +482,7 @@ def test_a_policy_that_is_not_served_or_not_enough_is_said(hub: Connection) -> N
         known_driver("zenoh:counting", at)
     large = Counting.manifest | {"camera": {"width": 2000, "height": 2000}}
     with (
-        served(hub, Counting(), told=large),
+        served(hub, Counting(), manifest=large),
         pytest.raises(UsageError, match="MiB of pictures a step"),
     ):
         known_driver("zenoh:counting", at)

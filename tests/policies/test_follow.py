@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from cosim.core.errors import UsageError
 from cosim.core.state import STILL, Command
 from cosim.episode.manifest_checks import calibration_of
-from cosim.policies.follow.espnetv2 import street_graph
-from cosim.policies.follow.ground import GROUND_CELL_M, Ground, walkable_pixels
+from cosim.policies.follow.espnetv2 import read_torch_file, street_graph
 from cosim.policies.follow.networks import (
     ESPNET_GRAPH,
     ESPNET_WEIGHTS,
@@ -27,14 +26,16 @@ from cosim.policies.follow.networks import (
     weights_in_words,
 )
 from cosim.policies.follow.policy import (
+    GROUND_CELL_M,
     LOOKS_M,
+    Ground,
     WaitForPeople,
     best_arc,
     boxes_of,
     command_along,
     turn_aside,
+    walkable_pixels,
 )
-from cosim.policies.follow.torch_file import read_torch_file
 from cosim.policies.load import load_policy
 from cosim.policies.onnx.graph import Graph
 from cosim.policies.onnx.policy import in_grey

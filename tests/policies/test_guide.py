@@ -16,9 +16,8 @@ from shapely.geometry.base import BaseGeometry
 from cosim.core.geometry import Floats, Polyline, Pose
 from cosim.core.state import NO_VEHICLES, NOBODY, Command, People, RobotState
 from cosim.episode.interfaces import Observation, Privileged
-from cosim.policies.privileged.distance_field import Clearance
 from cosim.policies.privileged.orca import Orca
-from cosim.policies.privileged.route_planner import Guide
+from cosim.policies.privileged.route_planner import Clearance, Guide
 from cosim.spec.robot import COURIER
 
 GAP_M = COURIER.width_m + 0.5

@@ -15,7 +15,6 @@ from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import NO_VEHICLES, Doing, People, PersonKind, RobotState, Signal, Vehicles
 from cosim.episode.interfaces import Observation, Privileged
 from cosim.episode.policy_caller import Driver
-from cosim.policies.privileged.distance_field import Clearance
 from cosim.policies.privileged.orca import (
     STOP_BEFORE_M,
     Here,
@@ -26,9 +25,9 @@ from cosim.policies.privileged.orca import (
     stop_limit,
 )
 from cosim.policies.privileged.people_prediction import Yielding, gaps_to_people
-from cosim.policies.privileged.robot_disks import BodyDisks
-from cosim.policies.privileged.rollout import STEP_S, Plans, Way, foresee
+from cosim.policies.privileged.rollout import STEP_S, BodyDisks, Plans, Way, foresee
 from cosim.policies.privileged.route import crossing_limit
+from cosim.policies.privileged.route_planner import Clearance
 from cosim.policies.privileged.standing_groups import distances, groups, lines
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City, CrowdSpec

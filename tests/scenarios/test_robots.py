@@ -24,11 +24,10 @@ from cosim.episode.policy_caller import Driver
 from cosim.place.barriers import fenced
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies import POLICIES
-from cosim.policies.privileged.distance_field import Clearance
 from cosim.policies.privileged.orca import Here, lane_past
-from cosim.policies.privileged.robot_disks import BodyDisks
-from cosim.policies.privileged.rollout import STEP_S, Plans, Way, foresee
+from cosim.policies.privileged.rollout import STEP_S, BodyDisks, Plans, Way, foresee
 from cosim.policies.privileged.route import best_lane, crossing_limit
+from cosim.policies.privileged.route_planner import Clearance
 from cosim.policies.privileged.social_force import bodies_m
 from cosim.policies.privileged.standing_groups import lines
 from cosim.results.run_folder import RunFolder

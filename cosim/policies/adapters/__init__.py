@@ -1,2 +1,1 @@
-"""Manifests of the paper's navigation networks, and one that is served; README.md tells what is
-known of them."""
+"""Manifests of the paper's navigation networks and of a served one; see README.md."""

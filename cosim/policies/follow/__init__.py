@@ -1,2 +1,1 @@
-"""`follow`: two networks see the street, a few rules drive: along the middle of the walkable
-ground, round people."""
+"""`follow`: two networks detect people and walkable area; rules drive along its middle."""

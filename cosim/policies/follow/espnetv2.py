@@ -1,17 +1,20 @@
-"""ESPNetv2 for streets as an ONNX graph, made of its published weights.
+"""Convert published weights of ESPNetv2 for streets to an ONNX graph.
 
     python -m cosim.policies.follow.espnetv2 espnetv2_s_1.0_city_512x256.pth [-o FOLDER]
 
 Source: S. Mehta et al., "ESPNetv2: a light-weight, power efficient, and general purpose
-convolutional neural network", arXiv 1811.11431: EESP units, strided ones with the picture fed in
-again at each size, and a decoder of efficient pyramids of pooled sizes, for 20 classes of
-Cityscapes. It needs no PyTorch, and takes `pip install -e '.[convert]'`.
+convolutional neural network", arXiv 1811.11431. The encoder has EESP units; strided ones also get
+the resized picture. The decoder has efficient pyramids of pooled sizes, for 20 classes of
+Cityscapes. It needs no PyTorch, but `pip install -e '.[convert]'`.
 """
 
 from __future__ import annotations
 
+import io
 import math
+import pickle
 import sys
+from collections import OrderedDict
 from itertools import count
 from typing import Any, Final
 
@@ -19,30 +22,106 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.policies.follow.networks import ESPNET_GRAPH, ESPNET_WEIGHTS
-from cosim.policies.follow.torch_file import read_torch_file
 from cosim.policies.onnx.converting import Converter, GraphWriter, PublishedArrays
 
+_MAGIC: Final = 0x1950A86A20F9469CFC6C
+"""First pickled number of a PyTorch file."""
+_KINDS: Final = {"FloatStorage": "<f4", "LongStorage": "<i8"}
+"""Types of numbers in a PyTorch file by storage class."""
+_Stored = tuple[str, str]
+"""Type and key of a block of numbers in a PyTorch file."""
+
+
+def read_torch_file(data: bytes) -> dict[str, NDArray[Any]]:
+    """Return arrays of a PyTorch file from before 2020. Raises ValueError if invalid.
+
+    Does not need PyTorch and runs no code of the file: only classes of tensors are known.
+    """
+    try:
+        return _read_torch(io.BytesIO(data))
+    except (
+        pickle.UnpicklingError,
+        EOFError,
+        AttributeError,
+        IndexError,
+        KeyError,
+        TypeError,
+    ) as error:
+        raise ValueError(
+            f"no PyTorch file of weights in the form of before 2020: {error}"
+        ) from None
+
+
+def _read_torch(file: io.BytesIO) -> dict[str, NDArray[Any]]:
+    if _Pickle(file).load() != _MAGIC:
+        raise ValueError(
+            "no PyTorch file of weights in the form of before 2020: it begins otherwise"
+        )
+    _version, _system = _Pickle(file).load(), _Pickle(file).load()
+    tensors: dict[str, tuple[_Stored, int, tuple[int, ...], tuple[int, ...]]] = _Pickle(file).load()
+    kinds = {key: kind for (kind, key), _, _, _ in tensors.values()}
+    stored: dict[str, NDArray[Any]] = {}
+    for key in _Pickle(file).load():
+        count = int.from_bytes(file.read(8), "little")
+        dtype = np.dtype(kinds[key])
+        numbers = file.read(count * dtype.itemsize)
+        if len(numbers) != count * dtype.itemsize:
+            raise ValueError("ends too early")
+        stored[key] = np.frombuffer(numbers, dtype)
+    arrays: dict[str, NDArray[Any]] = {}
+    for name, ((_, key), offset, shape, steps) in tensors.items():
+        whole = np.ones(shape, np.bool_).strides
+        size = int(np.prod(shape))
+        if (size > 1 and tuple(steps) != whole) or offset + size > stored[key].size:
+            raise ValueError(f"'{name}' is not laid out row by row")
+        arrays[name] = stored[key][offset : offset + size].reshape(shape)
+    return arrays
+
+
+class _Pickle(pickle.Unpickler):
+    """Unpickler that knows tensors and rejects all other classes."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (module, name) == ("collections", "OrderedDict"):
+            return OrderedDict
+        if (module, name) == ("torch._utils", "_rebuild_tensor_v2"):
+            return _stored_tensor
+        if module == "torch" and name in _KINDS:
+            return _KINDS[name]
+        raise ValueError(f"holds a {module}.{name}: weights alone are read")
+
+    def persistent_load(self, identifier: Any) -> _Stored:
+        return identifier[1], identifier[2]
+
+
+def _stored_tensor(stored: _Stored, offset: int, shape: Any, steps: Any, *_: Any) -> Any:
+    return stored, offset, shape, steps
+
+
 HEIGHT: Final = 256
+"""Height of the picture in pixels."""
 WIDTH: Final = 512
+"""Width of the picture in pixels."""
 _CLASSES: Final = 20
 _SCALES: Final = (2.0, 1.5, 1.0, 0.5, 0.1)
-"""The sizes at which a pyramid looks at its input."""
+"""Relative sizes at which a pyramid processes its input."""
 _PLANES: Final = 10
 """Channels of a pyramid at each size."""
 _DECODER: Final = ((64, 64), (48, 16), (32, 32))
-"""Channels of each step of the decoder, and groups of the convolution that brings the encoder's to
-them."""
+"""Channels of each decoder step, and groups of the convolution of the encoder's output."""
 
 
 def street_graph(weights: dict[str, NDArray[Any]]) -> bytes:
-    """The graph as ONNX: `picture` (1, 3, 256, 512), RGB / 255, normalised as for ImageNet, to
-    `scores` (1, 20, 128, 256), half the size of the picture. Raises ValueError where the weights
-    are not those of this network."""
+    """Build the ONNX graph.
+
+    Input `picture` (1, 3, 256, 512) is RGB / 255, normalised as for ImageNet. Output `scores` (1,
+    20, 128, 256) has half the size. Raises ValueError for weights of another network.
+    """
     return _Builder(weights).street()
 
 
 class _Builder:
-    """Operators one behind the other; a name of a tensor stands for it."""
+    """Builds the graph; tensors are identified by name."""
 
     def __init__(self, weights: dict[str, NDArray[Any]]) -> None:
         self._weights = PublishedArrays(weights)
@@ -73,7 +152,7 @@ class _Builder:
             out = self._op("Add", merged, self._resized(out, planes, size))
             out = self._act(self._norm(out, f"bu_br_l{step}.0"), f"bu_br_l{step}.1")
             out = self._pyramid(out, f"bu_dec_l{step}", size)
-        # The file holds a last activation of strided units, which the network leaves out.
+        # The file contains a last activation of strided units, which the network does not use.
         unused = tuple(f"base_net.level{n}_0.eesp.module_act.weight" for n in (2, 3, 4))
         self._weights.check_all_taken(
             lambda name: name in unused or name.endswith(".num_batches_tracked")
@@ -84,8 +163,7 @@ class _Builder:
         )
 
     def _unit(self, x: str, name: str, dilations: tuple[int, ...], stride: int = 1) -> str:
-        """An EESP unit: projected in groups, seen at growing dilations, each added to the one
-        before, joined again."""
+        """Add an EESP unit: grouped projection, summed dilated convolutions, grouped expansion."""
         groups = len(dilations)
         projected = self._conv_act(x, f"{name}.proj_1x1", groups=groups)
         planes = self._weights.take(f"{name}.spp_dw.0.conv.weight").shape[0]
@@ -109,8 +187,7 @@ class _Builder:
         return joined if stride > 1 else self._act(self._op("Add", joined, x), f"{name}.module_act")
 
     def _down(self, x: str, name: str, picture: str) -> str:
-        """A strided unit beside an average of its input, and the picture in that size added to
-        both."""
+        """Add a strided unit, concatenated with the averaged input, plus the resized picture."""
         strided = self._unit(x, f"{name}.eesp", (1, 2, 3, 4), stride=2)
         both = self._op("Concat", self._halved(x), strided, axis=1)
         again = self._conv(
@@ -121,7 +198,7 @@ class _Builder:
         )
 
     def _pyramid(self, x: str, name: str, size: tuple[int, int]) -> str:
-        """An efficient pyramid: few channels, seen at five sizes, shuffled, and merged."""
+        """Add an efficient pyramid: few channels at five sizes, shuffled and merged."""
         x = self._conv_act(x, f"{name}.projection_layer", "cbr.0", "cbr.1", "cbr.2")
         seen = []
         for i, scale in enumerate(_SCALES):
@@ -153,7 +230,7 @@ class _Builder:
         )
 
     def _merged(self, x: str, name: str, groups: int) -> str:
-        """What the encoder saw, weighed by channel."""
+        """Weight the encoder's output by channel."""
         weight = self._op(
             "Sigmoid", self._conv(self._op("GlobalAveragePool", x), f"{name}.wt_layer.1")
         )
@@ -204,8 +281,7 @@ class _Builder:
         return self._op("BatchNormalization", x, *numbers, epsilon=1e-5)
 
     def _act(self, x: str, name: str) -> str:
-        """PReLU in four operators: the same bits as the one called so, which takes the runtime
-        twice as long."""
+        """Add PReLU as four operators: same bits as the operator, twice as fast in onnxruntime."""
         above = self._op("Relu", x)
         slope = self._constant(self._weights.take(f"{name}.weight").reshape(-1, 1, 1))
         return self._op("Add", above, self._op("Mul", self._op("Sub", x, above), slope))
@@ -227,7 +303,7 @@ class _Builder:
         )
 
     def _pooled(self, x: str, size: tuple[int, int], to: tuple[int, int]) -> str:
-        """Averages over parts of unequal size, as two products with matrices."""
+        """Add adaptive average pooling as two matrix products."""
         rows = self._op("MatMul", self._constant(_parts(size[0], to[0])), x)
         return self._op(
             "MatMul", rows, self._constant(np.ascontiguousarray(_parts(size[1], to[1]).T))
@@ -241,8 +317,7 @@ class _Builder:
 
 
 def _parts(count: int, parts: int) -> NDArray[np.float32]:
-    """(parts, count): the mean of each of so many parts of a row, which overlap where it does not
-    divide evenly."""
+    """Return (parts, count): the averaging matrix of adaptive pooling; parts may overlap."""
     weights = np.zeros((parts, count), np.float32)
     for i in range(parts):
         begin = i * count // parts

@@ -1,4 +1,4 @@
-"""The two networks that `follow` sees by: which files they are, and where these come from."""
+"""Networks of `follow`: their files and origin."""
 
 from __future__ import annotations
 
@@ -35,14 +35,11 @@ YOLOX_NANO: Final = NetworkFile(
     ),
 )
 
-_BOTH: Final = (ESPNET_GRAPH, YOLOX_NANO)
-
 
 class Networks:
-    """Both graphs, loaded; digest: of their bytes, of how this processor answers by them, and of
-    the rules that drive.
+    """Both graphs, loaded. Raises UsageError if a file is missing or differs.
 
-    Raises UsageError for a file that is missing, or another.
+    digest: Hash of both files, of their answers on this processor and of the driving rules.
     """
 
     def __init__(self) -> None:
@@ -50,7 +47,7 @@ class Networks:
         for source in sorted(Path(__file__).parent.glob("*.py")):
             digest.update(source.read_bytes())
         graphs = []
-        for weights, given, told in (
+        for weights, given, output in (
             (ESPNET_GRAPH, ("picture", (1, 3, 256, 512)), ("scores", (1, 20, 128, 256))),
             (YOLOX_NANO, ("images", (1, 3, 416, 416)), ("output", (1, 3549, 85))),
         ):
@@ -58,18 +55,20 @@ class Networks:
             data = path.read_bytes()
             weights.check(path, data)
             graphs.append(Graph(path))
-            digest.update(data + _answer_in_grey(graphs[-1], given, told))
+            digest.update(data + _answer_in_grey(graphs[-1], given, output))
         self.street, self.people = graphs
         self.digest = digest.hexdigest()
 
 
 def _answer_in_grey(
-    graph: Graph, given: tuple[str, tuple[int, ...]], told: tuple[str, tuple[int, ...]]
+    graph: Graph, given: tuple[str, tuple[int, ...]], output: tuple[str, tuple[int, ...]]
 ) -> bytes:
-    """What a graph answers to grey, whose last bits hang on the processor. Raises UsageError for a
-    graph that does not take what is given, or tell what is wanted."""
-    (name, shape) = given
-    (wanted, sides) = told
+    """Return a graph's output for a grey picture; its last bits depend on the processor.
+
+    Raises UsageError if the graph's input or output differs.
+    """
+    name, shape = given
+    wanted, sides = output
     try:
         answer = graph.ask({name: np.full(shape, 0.5, np.float32)}, [wanted])[wanted]
     except Exception as error:
@@ -84,10 +83,10 @@ def _answer_in_grey(
 
 
 def weights_in_words() -> str:
-    """Where the weights of both lie, or which are missing: a run tells where these come from."""
+    """Describe where the weights of both networks are, or which are missing."""
     missing = []
     found = []
-    for weights in _BOTH:
+    for weights in (ESPNET_GRAPH, YOLOX_NANO):
         try:
             found.append(str(_found(weights)))
         except UsageError:

@@ -1,1 +1,1 @@
-"""Policies that are ONNX graphs: a folder with `model.onnx`, `manifest.json` and `example.npz`."""
+"""Policies as ONNX graphs: a folder with `model.onnx`, `manifest.json` and `example.npz`."""

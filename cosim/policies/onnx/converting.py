@@ -1,4 +1,4 @@
-"""Converts published weights of another format to an ONNX graph, by a command of its own."""
+"""Convert published weights of another format to an ONNX graph with a command."""
 
 from __future__ import annotations
 
@@ -36,19 +36,19 @@ class GraphWriter:
         self._constants: list[Any] = []
 
     def constant(self, name: str, numbers: NDArray[Any]) -> str:
-        """Add numbers that the graph holds; returns their name."""
+        """Add a constant; return its name."""
         self._constants.append(
             self._onnx.numpy_helper.from_array(np.ascontiguousarray(numbers), name)
         )
         return name
 
     def operator(self, kind: str, out: str, *inputs: str, **attributes: Any) -> str:
-        """Add an operator with one output; returns the output's name."""
+        """Add an operator with one output; return the output's name."""
         self._nodes.append(self._onnx.helper.make_node(kind, list(inputs), [out], **attributes))
         return out
 
     def whole(self, inputs: PortShapes, outputs: PortShapes) -> bytes:
-        """Return the graph as a file. Raises ValueError where the parts do not fit together."""
+        """Serialize the graph. Raises ValueError if it is invalid."""
         make = self._onnx.helper
         graph = make.make_graph(
             self._nodes, self._name, self._ports(inputs), self._ports(outputs), self._constants
@@ -73,7 +73,7 @@ class GraphWriter:
 
 
 class PublishedArrays:
-    """Named arrays of a published file, each of which must be used by the graph."""
+    """Arrays of a published file by name; each must be used by the graph."""
 
     def __init__(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         self._arrays = arrays
@@ -83,8 +83,7 @@ class PublishedArrays:
         return name in self._arrays
 
     def take(self, name: str, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
-        """Return an array. Raises ValueError where there is none, or one of another shape or
-        type than given."""
+        """Return an array. Raises ValueError if it is missing or has another shape or type."""
         if name not in self._arrays:
             raise ValueError(f"has no '{name}'")
         numbers = self._arrays[name]
@@ -96,7 +95,7 @@ class PublishedArrays:
         return numbers
 
     def check_all_taken(self, ignored: Callable[[str], bool] = lambda _: False) -> None:
-        """Raises ValueError for arrays that were not taken and are not ignored."""
+        """Raise ValueError for arrays that were neither taken nor ignored."""
         if left := [name for name in self._unused if not ignored(name)]:
             raise ValueError(
                 f"holds '{min(left)}', and {len(left) - 1} more, of which there is no place"
@@ -104,19 +103,18 @@ class PublishedArrays:
 
 
 def graph_of_bundle(folder: Path) -> NetworkFile:
-    """Return the graph that a bundle's manifest names, with the size and hash that a run
-    requires."""
+    """Return the graph named by a bundle's manifest, with the size and hash required in a run."""
     manifest = read_bundle_manifest(folder)
     return NetworkFile(manifest.model, manifest.source, manifest.files[manifest.model])
 
 
 @dataclass(frozen=True)
 class Converter:
-    """The command `python -m MODULE FILE [-o FOLDER]`, which writes the graph of a network.
+    """Command `python -m MODULE FILE [-o FOLDER]` that writes the graph of a network.
 
-    weights: the published file.
-    make: returns the graph's bytes for the file's bytes.
-    graph: returns the graph's file, whose facts are None where any version may be written.
+    weights: Published file.
+    make: Converts the file's bytes to the graph's bytes.
+    graph: Returns the graph's file; its facts are None if any version may be written.
     """
 
     module: str
@@ -125,10 +123,10 @@ class Converter:
     graph: Callable[[], NetworkFile]
 
     def write(self, path: Path, folder: Path) -> Path:
-        """Write the graph of the file at `path` into a folder; returns the graph's path.
+        """Convert the file at `path` and write the graph into a folder; return its path.
 
-        Raises UsageError for another file, MachineError where a package is missing, where it would
-        write another graph than runs require, or cannot write.
+        Raises UsageError for a wrong file, MachineError if a package is missing, the graph would
+        differ from the required one, or it cannot be written.
         """
         graph = self.graph()
         data = self._made(path)
@@ -164,7 +162,7 @@ class Converter:
             ) from error
 
     def command(self, arguments: Sequence[str]) -> None:
-        """Run the command; errors of this project are one line."""
+        """Run the command; errors of this project are printed on one line."""
         parser = argparse.ArgumentParser(f"python -m {self.module}")
         parser.add_argument("file", type=Path, help=f"{self.weights.name} of {self.weights.source}")
         parser.add_argument(

@@ -1,5 +1,4 @@
-"""From observations to a graph's inputs: what is remembered of an episode, and the tensors of its
-next question."""
+"""Convert observations to a graph's input tensors, including the history of an episode."""
 
 from __future__ import annotations
 
@@ -40,10 +39,12 @@ _GOAL_IS_GIVEN: Final = "a run gives the goals that the manifest asks for"
 
 
 class Feeder:
-    """What is remembered of one episode. `feed` is asked once for every answer of the policy.
+    """Input tensors and history of one episode. Call `feed` once for each command of the policy.
 
-    inputs: by the names of `ports`, the graph's. Raises UsageError where a tensor cannot have the
-    shape or type that the graph wants.
+    inputs: Inputs of the manifest by name.
+    ports: Inputs of the graph by name.
+    seed: Seed of noise inputs.
+    Raises UsageError if a tensor cannot have the shape or type of the graph's input.
     """
 
     def __init__(
@@ -60,7 +61,7 @@ class Feeder:
         self.forget()
 
     def forget(self) -> None:
-        """The robot was put elsewhere: what was seen before is no history."""
+        """Clear the history after the robot was moved."""
         self._past.clear()
         for name, one in self._inputs.items():
             if isinstance(one, StateInput):
@@ -69,21 +70,19 @@ class Feeder:
                 )
 
     def feed(self, seen: Observation) -> dict[str, Tensor]:
-        """The tensors of one question, their first axis of length 1 where the graph has any."""
+        """Return the input tensors, with a batch axis of length 1 if the graph has one."""
         return {name: self._tensor(name, one, seen) for name, one in self._inputs.items()}
 
     def remember(self, answer: Mapping[str, Tensor]) -> None:
-        """Keep of an answer what is the graph's state."""
+        """Store the outputs that are the graph's state."""
         for name, one in self._inputs.items():
             if isinstance(one, StateInput):
-                held = self._state[name]
-                told = answer[one.output].astype(self._ports[name].dtype)
+                state = self._state[name]
+                new = answer[one.output].astype(self._ports[name].dtype)
                 if one.append:
-                    told = np.concatenate(
-                        [held, told.reshape(held.shape[0], 1, *held.shape[2:])], axis=1
-                    )
-                    told = told[:, told.shape[1] - held.shape[1] :]
-                self._state[name] = told.reshape(held.shape)
+                    row = new.reshape(state.shape[0], 1, *state.shape[2:])
+                    new = np.concatenate([state, row], axis=1)[:, 1:]
+                self._state[name] = new.reshape(state.shape)
 
     def _tensor(self, name: str, one: AnyInput, seen: Observation) -> Tensor:
         port = self._ports[name]
@@ -101,7 +100,7 @@ class Feeder:
         return _shaped(name, self._numbers(one, seen), port)
 
     def _frames(self, one: PixelsInput | RoutePatchInput, seen: Observation) -> list[NDArray[Any]]:
-        """The last ones, each as `axes_turned` gives it."""
+        """Return the selected frames, transposed by `axes_turned`."""
         now = _frame(one, seen)
         if now is None:
             assert (
@@ -112,13 +111,13 @@ class Feeder:
         return [np.zeros_like(now) if frame is None else frame for frame in self._past_of(one, now)]
 
     def _numbers(self, one: AnyInput, seen: Observation) -> NDArray[np.float64]:
-        """Those of a vector, (frames, values) or fewer axes."""
+        """Return the numbers of a vector, (frames, values) or fewer axes."""
         if isinstance(one, JoinedInput):
             return np.concatenate([self._numbers(part, seen).ravel() for part in one.parts])
         if isinstance(one, ConstantInput):
             return np.atleast_1d(np.asarray(one.value, float))
         if isinstance(one, TurnInput):
-            return np.asarray(_turn_told(one, seen.goal), float)
+            return np.asarray(_turn_values(one, seen.goal), float)
         assert isinstance(one, VectorInput)
         if isinstance(one, PastPositionsInput):
             rows: list[NDArray[np.float64] | None] = _seen_from_now(
@@ -137,21 +136,19 @@ class Feeder:
         return np.array([np.zeros(len(one.values)) if row is None else row for row in numbers])
 
     def _past_of(self, one: PastInput, now: Any) -> list[Any]:
-        """What is kept of an input, now the newest; None for zeros."""
-        kept = self._past.get(id(one))
-        if kept is None:
-            kept = self._past[id(one)] = deque(maxlen=(one.frames - 1) * one.every + 1)
-            if one.before == "repeat":
-                kept.extend([now] * ((one.frames - 1) * one.every))
-            else:
-                kept.extend([None] * ((one.frames - 1) * one.every))
-        kept.append(now)
-        chosen = list(kept)[:: one.every]
+        """Add the newest value of an input and return its selected history; None means zeros."""
+        past = self._past.get(id(one))
+        if past is None:
+            count = (one.frames - 1) * one.every
+            past = self._past[id(one)] = deque(maxlen=count + 1)
+            past.extend([now if one.before == "repeat" else None] * count)
+        past.append(now)
+        chosen = list(past)[:: one.every]
         return chosen if one.order == "oldest_first" else chosen[::-1]
 
 
 def _frame(one: PixelsInput | RoutePatchInput, seen: Observation) -> NDArray[Any] | None:
-    """(rows, columns, channels) of now; None where the goal is another."""
+    """Return (rows, columns, channels) of the current frame; None for another type of goal."""
     goal = seen.goal
     if isinstance(one, RoutePatchInput):
         if not isinstance(goal, RoutePatch):
@@ -165,8 +162,7 @@ def _frame(one: PixelsInput | RoutePatchInput, seen: Observation) -> NDArray[Any
 
 
 def _goal_values(one: GoalPointInput, goal: Goal | None) -> NDArray[np.float64]:
-    """Those of a point, in its units; what stands for it where there is none, as it would be after
-    normalisation."""
+    """Return the values of a goal point in its units, or `missing` before normalisation."""
     if not isinstance(goal, PointGoal):
         assert one.missing is not None, _GOAL_IS_GIVEN
         return np.asarray(one.missing, float) * (one.std or 1.0) + (one.mean or 0.0)
@@ -190,12 +186,12 @@ def _speeds(one: VectorInput, seen: Observation) -> NDArray[np.float64]:
 
 
 def _chosen(names: tuple[str, ...], known: Mapping[str, float]) -> NDArray[np.float64]:
-    """Values by their names; "-" before one turns its sign."""
+    """Return values by name; a leading "-" negates."""
     return np.array([-known[name[1:]] if name.startswith("-") else known[name] for name in names])
 
 
 def _place(seen: Observation) -> tuple[float, float, float]:
-    """Where the robot takes itself to be: x, y in metres, heading in radians."""
+    """Return the odometry pose: x, y in metres and heading in radians."""
     odometry = seen.odometry
     assert odometry is not None and odometry.heading_rad is not None, (
         "the manifest asks for odometry with a heading"
@@ -204,7 +200,7 @@ def _place(seen: Observation) -> tuple[float, float, float]:
 
 
 def _seen_from_now(past: list[Any], one: PastPositionsInput) -> list[NDArray[np.float64] | None]:
-    """Places in the frame of the newest of them, a row each; None where there was none."""
+    """Return poses relative to the newest one, a row each; None where there is no pose."""
     x0, y0, heading0 = past[-1] if one.order == "oldest_first" else past[0]
     cos, sin = math.cos(heading0), math.sin(heading0)
     rows: list[NDArray[np.float64] | None] = []
@@ -226,8 +222,8 @@ def _seen_from_now(past: list[Any], one: PastPositionsInput) -> list[NDArray[np.
     return rows
 
 
-def _turn_told(one: TurnInput, goal: Goal | None) -> tuple[float, ...]:
-    """The numbers of the way to go."""
+def _turn_values(one: TurnInput, goal: Goal | None) -> tuple[float, ...]:
+    """Return the numbers of the direction to take."""
     if isinstance(goal, TurningGoal):
         turns = {"left": one.left, "straight": one.straight, "right": one.right}
         return turns[goal.turn(one.ahead_m, one.beyond_deg)]
@@ -236,7 +232,7 @@ def _turn_told(one: TurnInput, goal: Goal | None) -> tuple[float, ...]:
 
 
 def _whole(name: str, port: TensorPort) -> tuple[int, ...]:
-    """The shape of an input whose first axis alone may be of any length, which is 1 then."""
+    """Return the shape of an input; only its first axis may be dynamic, and becomes 1."""
     if None in port.shape[1:]:
         raise UsageError(
             f"inputs.{name}: the graph wants {port.in_words}: export it with fixed sides but "
@@ -246,7 +242,7 @@ def _whole(name: str, port: TensorPort) -> tuple[int, ...]:
 
 
 def _shaped(name: str, numbers: NDArray[np.float64], port: TensorPort) -> Tensor:
-    """Numbers in the shape of an input, of which one axis beside the first may be of any length."""
+    """Reshape numbers to an input, of which one axis in addition to the first may be dynamic."""
     shape = [1 if side is None and axis == 0 else side for axis, side in enumerate(port.shape)]
     free = shape.count(None)
     held = math.prod(side for side in shape if side is not None)
@@ -259,7 +255,7 @@ def _shaped(name: str, numbers: NDArray[np.float64], port: TensorPort) -> Tensor
 
 
 def _check_pixels(name: str, one: PixelsInput | RoutePatchInput, port: TensorPort) -> None:
-    """Raises UsageError unless a tensor of pixels has the shape and the type of an input."""
+    """Raise UsageError unless a picture tensor matches the shape and type of an input."""
     shape = shape_of(_sides(one), one.frames, one.layout)
     if len(port.shape) != len(shape) or any(
         side not in (None, there) for side, there in zip(port.shape, shape, strict=True)
@@ -276,7 +272,7 @@ def _check_pixels(name: str, one: PixelsInput | RoutePatchInput, port: TensorPor
 
 
 def _sides(one: PixelsInput | RoutePatchInput) -> tuple[int, int, int]:
-    """Rows, columns and channels of a frame."""
+    """Return rows, columns and channels of a frame."""
     return (
         (PATCH_PX, PATCH_PX, 1) if isinstance(one, RoutePatchInput) else (*one.sides, one.channels)
     )

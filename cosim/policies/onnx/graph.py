@@ -1,5 +1,4 @@
-"""A graph that can be asked: a session of onnxruntime, one thread, and what its inputs and outputs
-are."""
+"""Run an ONNX graph with onnxruntime in one thread, and describe its inputs and outputs."""
 
 from __future__ import annotations
 
@@ -16,18 +15,20 @@ from numpy.typing import NDArray
 from cosim.core.errors import MachineError, UsageError
 
 PROVIDERS_VARIABLE: Final = "COSIM_ONNX_PROVIDERS"
-"""Names of onnxruntime's providers, with commas between them; without it the CPU's."""
+"""Environment variable with comma-separated onnxruntime providers; the CPU by default."""
 _CPU: Final = "CPUExecutionProvider"
 
 _PLACES: Final = re.compile(
     r"\[ONNXRuntimeError\] : \d+ : \w+ : |Load model from .*? failed: ?|"
     r"/onnxruntime_src/\S+:\d+ [^()]*\((?:[^()]|\([^()]*\))*\)(?: const)? "
 )
+"""Error codes and source locations in messages of onnxruntime."""
 _MOST_SAID: Final = 400
+"""Largest number of characters of a runtime's message that is shown."""
 
 Tensor = NDArray[Any]
 NUMBERS: Final = "biuf"
-"""The kinds of numpy that the tensors of a graph may be."""
+"""Kinds of numpy types allowed for tensors."""
 
 _TYPES: Final[Mapping[str, Any]] = {
     "tensor(float)": np.float32,
@@ -43,15 +44,17 @@ _TYPES: Final[Mapping[str, Any]] = {
 
 @dataclass(frozen=True)
 class TensorPort:
-    """An input or output of a graph. shape: None for an axis of any length, such as that of a
-    batch."""
+    """Input or output of a graph.
+
+    shape: None for a dynamic axis, such as a batch.
+    """
 
     name: str
     dtype: np.dtype[Any]
     shape: tuple[int | None, ...]
 
     def takes(self, array: Tensor) -> bool:
-        """Whether an array has this type and shape."""
+        """Return whether an array has this type and shape."""
         fits = len(array.shape) == len(self.shape) and all(
             mine in (None, theirs) for mine, theirs in zip(self.shape, array.shape, strict=True)
         )
@@ -65,34 +68,35 @@ class TensorPort:
 
 
 class AskedGraph(Protocol):
-    """A graph that can be asked: in this process (`Graph`), or on trial in another
-    (`cosim.policies.onnx.trial`)."""
+    """Graph that can be run: in this process (`Graph`) or in a child (`TrialGraph`)."""
 
     path: Path
     inputs: Mapping[str, TensorPort]
     outputs: Mapping[str, TensorPort]
 
     def ask(self, tensors: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
-        """The outputs of these names. Whatever the runtime raises is raised."""
+        """Run the graph and return the named outputs. Errors of the runtime are passed on."""
 
 
 class Graph:
-    """A graph, loaded. Raises UsageError for one that the runtime refuses; MachineError where there
-    is no runtime."""
+    """Graph loaded in this process.
+
+    Raises UsageError if the runtime rejects it; MachineError without a runtime.
+    """
 
     def __init__(self, path: Path) -> None:
         onnxruntime = import_runtime()
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.use_deterministic_compute = True
-        options.log_severity_level = 4  # what is wrong is raised
+        options.log_severity_level = 4  # errors are raised
         self.providers = _providers(onnxruntime.get_available_providers())
         try:
             self._session = onnxruntime.InferenceSession(
                 str(path), options, providers=list(self.providers), enable_fallback=0
             )
             inputs, outputs = (
-                [*map(_told, ports)]
+                [*map(_port_facts, ports)]
                 for ports in (self._session.get_inputs(), self._session.get_outputs())
             )
         except Exception as error:
@@ -103,7 +107,7 @@ class Graph:
 
     @property
     def on_cpu(self) -> bool:
-        """Whether it is asked on the CPU alone."""
+        """Whether the graph runs on the CPU only."""
         return self.providers == (_CPU,)
 
     def _port(self, name: str, kind: str, sides: Sequence[Any]) -> TensorPort:
@@ -115,12 +119,12 @@ class Graph:
         return TensorPort(name, np.dtype(_TYPES[kind]), shape)
 
     def ask(self, tensors: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
-        """The outputs of these names. What the runtime raises is raised."""
+        """Run the graph and return the named outputs. Errors of the runtime are passed on."""
         return dict(zip(names, self._session.run(list(names), dict(tensors)), strict=True))
 
 
 def import_runtime() -> Any:
-    """The module onnxruntime. Raises MachineError where there is none."""
+    """Import onnxruntime. Raises MachineError if it is missing."""
     try:
         import onnxruntime
     except ImportError as error:
@@ -131,19 +135,20 @@ def import_runtime() -> Any:
 
 
 def runs_on_cpu() -> bool:
-    """Whether graphs are asked on the CPU alone."""
+    """Return whether graphs run on the CPU only."""
     return _providers(import_runtime().get_available_providers()) == (_CPU,)
 
 
-def _told(port: Any) -> tuple[str, str, Sequence[Any]]:
-    """Name, type and shape of an input or output, which the runtime cannot tell of every graph that
-    it loads."""
+def _port_facts(port: Any) -> tuple[str, str, Sequence[Any]]:
+    """Return name, type and shape of a port. Fails for some graphs that the runtime loads."""
     return port.name, port.type, port.shape
 
 
 def _providers(available: Sequence[str]) -> tuple[str, ...]:
-    """Those that the environment asks for. Raises UsageError for one that onnxruntime does not have
-    here."""
+    """Return the providers of the environment variable.
+
+    Raises UsageError for an unavailable provider.
+    """
     asked = [
         name.strip() for name in os.environ.get(PROVIDERS_VARIABLE, _CPU).split(",") if name.strip()
     ]
@@ -156,7 +161,7 @@ def _providers(available: Sequence[str]) -> tuple[str, ...]:
 
 
 def _refusal(error: Exception, version: str) -> str:
-    """Why the runtime does not load a graph, in words."""
+    """Describe why the runtime does not load a graph."""
     said = said_by_runtime(error)
     lacks = any(
         part in said
@@ -172,7 +177,6 @@ def _refusal(error: Exception, version: str) -> str:
 
 
 def said_by_runtime(error: Exception) -> str:
-    """What the runtime has to say, on one line, without its codes, its own source's places, and the
-    file's."""
+    """Return a runtime's message on one line, without codes and source locations."""
     said = _PLACES.sub("", " ".join(str(error).split()))
     return said if len(said) <= _MOST_SAID else f"{said[:_MOST_SAID]}..."

@@ -1,7 +1,6 @@
-"""What an ONNX file says without a runtime: its weights and the files that hold more of them.
+"""Read an ONNX file without a runtime: its weights, and the names of files with further weights.
 
-An ONNX file is a protobuf message; this reads the few fields of it that are named here, by their
-numbers in onnx.proto.
+An ONNX file is a protobuf message. Only the fields below are read, by their numbers in onnx.proto.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ _PARTS: Final[Mapping[str, Mapping[int, str]]] = {
     },
     "sparse tensor": {1: "tensor", 2: "tensor"},
 }
-"""By its fields what each message holds that may hold tensors."""
+"""Fields of each message that may contain tensors."""
 _TYPE = 2
 _FLOATS = 4
 _NAME = 8
@@ -38,6 +37,7 @@ _EXTERNAL = 13
 """Fields of a tensor."""
 _KEY = 1
 _VALUE = 2
+"""Fields of an entry of external data."""
 _FLOAT = 1
 _FLOAT16 = 10
 _DOUBLE = 11
@@ -49,8 +49,7 @@ _Field = tuple[int, int | memoryview]
 
 
 def external_files(data: bytes) -> list[str]:
-    """The names of the files beside the graph that hold weights of it. Raises ValueError for what
-    is no ONNX file."""
+    """Return names of files with weights of the graph. Raises ValueError for an invalid file."""
     found = set[str]()
     for tensor in _tensors(memoryview(data)):
         for number, entry in _fields(tensor):
@@ -66,10 +65,9 @@ def external_files(data: bytes) -> list[str]:
 
 
 def weights_not_finite(data: bytes) -> list[str]:
-    """The names of the weights in the file that hold NaN or infinities. Raises ValueError for what
-    is no ONNX file.
+    """Return names of weights with NaN or infinities. Raises ValueError for an invalid file.
 
-    Minus infinity is let through: masks of attention are made of it.
+    Minus infinity is allowed, because attention masks contain it.
     """
     return [_name(tensor) for tensor in _tensors(memoryview(data)) if not _is_finite(tensor)]
 
@@ -94,8 +92,7 @@ def _name(tensor: memoryview) -> str:
 
 
 def _tensors(model: memoryview) -> Iterator[memoryview]:
-    """All tensors of a model: its weights, and those of constants, functions and graphs within
-    it."""
+    """Yield all tensors of a model, including those of constants, functions and subgraphs."""
     if not any(_PARTS["model"].get(number) == "graph" for number, _ in _fields(model)):
         raise ValueError("has no graph")
     messages = [("model", model)]
@@ -112,7 +109,7 @@ def _tensors(model: memoryview) -> Iterator[memoryview]:
 
 
 def _fields(message: memoryview) -> Iterator[_Field]:
-    """Number and value of each field of a protobuf message. Raises ValueError for what is none."""
+    """Yield number and value of each field of a protobuf message. Raises ValueError if invalid."""
     at = 0
     while at < len(message):
         key, at = _varint(message, at)
@@ -135,7 +132,7 @@ def _fields(message: memoryview) -> Iterator[_Field]:
 
 
 def _varint(message: memoryview, at: int) -> tuple[int, int]:
-    """A number of variable length, and where it ends."""
+    """Return a number of variable length, and the offset of its end."""
     value = 0
     for shift in range(0, 70, 7):
         if at >= len(message):

@@ -1,4 +1,4 @@
-"""What goes into a graph, input by input: the field `inputs` of a bundle's manifest.
+"""Inputs of a graph: the manifest field `inputs`.
 
 {"what": "picture", "frames": 6, "size": [85, 64], "layout": "N(TC)HW", "mean": [0.485, 0.456,
  0.406], "std": [0.229, 0.224, 0.225]}
@@ -29,8 +29,10 @@ _AXES: Final = {"N", "T", "C", "H", "W"}
 
 
 class AnyInput(Ranged, frozen=True, kw_only=True):
+    """Base class of all inputs."""
+
     made_of: ClassVar[type[AnyGoal] | None] = None
-    """The type of goal that it is made of, if any. Such an input has a field `missing`."""
+    """Type of goal that the input needs, if any; such an input has a field `missing`."""
 
     @property
     def called(self) -> str:
@@ -38,8 +40,7 @@ class AnyInput(Ranged, frozen=True, kw_only=True):
 
     @property
     def needs(self) -> tuple[GoalProtocol, ...]:
-        """The protocols of the goals that it needs; () where it is made of none, or `missing`
-        replaces them."""
+        """Goal protocols that the input can use; () without a goal or with `missing`."""
         return (
             protocols_of(self.made_of)
             if self.made_of and getattr(self, "missing", None) is None
@@ -47,14 +48,16 @@ class AnyInput(Ranged, frozen=True, kw_only=True):
         )
 
     def takes(self, goal: Goal | None) -> bool:
-        """Return whether it is made of this goal."""
+        """Return whether the input can use this goal."""
         return self.made_of is not None and isinstance(goal, self.made_of)
 
 
 class PastInput(AnyInput, frozen=True, kw_only=True):
-    """The last `frames` of something, `every` so many answers of the policy, the newest of now.
-    before: what stands for those from before the episode's beginning, or before the robot was put
-    elsewhere: the first since, or zeros."""
+    """History of `frames` values, one of `every` commands of the policy, including the current.
+
+    before: Values before the episode began or the robot was moved: the first one repeated, or
+        zeros.
+    """
 
     frames: Annotated[int, Within(1, 256)] = 1
     every: Annotated[int, Within(1, 256)] = 1
@@ -63,8 +66,10 @@ class PastInput(AnyInput, frozen=True, kw_only=True):
 
 
 class VectorInput(PastInput, frozen=True, kw_only=True):
-    """Numbers: (frames, values), in the shape that the graph has. mean, std: one of each value,
-    which becomes (value - mean) / std; empty for 0 and 1."""
+    """Numbers (frames, values), reshaped to the graph's input.
+
+    mean, std: One of each value, which becomes (value - mean) / std; empty for 0 and 1.
+    """
 
     values: tuple[str, ...] = ()
     mean: Annotated[tuple[float, ...], Counted(0, 16)] = ()
@@ -75,16 +80,21 @@ class VectorInput(PastInput, frozen=True, kw_only=True):
 
 
 class PixelsInput(PastInput, frozen=True, kw_only=True):
-    """Pictures. crop: of the picture, as shares (x0, y0, x1, y1) of its sides; then fit brings it
-    to size (width, height): stretched, cut to the shape of size around its middle, or whole, in the
-    middle (letterbox) or in the upper left corner, with a border of grey `border` (0 to 255).
-    resample: how; colour: the channels' order; yuv420: six channels of half the size (four of Y, U,
-    V), as openpilot has them. Numbers become (pixel / scale - mean) / std; scale 1 leaves 0 to 255,
-    which a graph of uint8 needs.
+    """Pictures.
 
-    layout: the graph's axes, outermost first: N of 1, T frames, C channels, H rows, W columns;
-    those in brackets are one axis, such as "N(TC)HW", frames stacked into channels. N, and T and C
-    where there is one of them, may be absent.
+    size: Width and height in pixels.
+    crop: Part of the picture to use, as fractions (x0, y0, x1, y1) of its sides.
+    fit: How the part is brought to `size`: stretched, cropped to its aspect ratio, or whole in the
+        middle (letterbox) or in the upper left corner.
+    border: Grey value (0 to 255) around a whole picture.
+    resample: Interpolation.
+    colour: Order of channels; yuv420 is six channels of half the size (four of Y, U, V) as in
+        openpilot.
+    scale, mean, std: A number becomes (pixel / scale - mean) / std; scale 1 leaves 0 to 255, which
+        a uint8 graph needs.
+    layout: Axes of the graph, outermost first: N of 1, T frames, C channels, H rows, W columns.
+        Letters in brackets are one axis: "N(TC)HW" stacks frames into channels. N may be absent; T
+        and C may be absent if they are 1.
     """
 
     size: tuple[Annotated[int, _SIDE], Annotated[int, _SIDE]]
@@ -100,7 +110,7 @@ class PixelsInput(PastInput, frozen=True, kw_only=True):
 
     @property
     def channels(self) -> int:
-        """How many there are of a frame."""
+        """Number of channels of a frame."""
         return {"grey": 1, "yuv420": 6}.get(self.colour, 3)
 
     @property
@@ -131,7 +141,9 @@ class PixelsInput(PastInput, frozen=True, kw_only=True):
 
 
 class PictureInput(PixelsInput, frozen=True, kw_only=True, tag="picture", tag_field="what"):
-    """What the camera sees. camera: of which one, a name of `cameras`; "" for the camera.
+    """Camera image.
+
+    camera: A name in `cameras`; "" for `camera`.
 
     >>> PictureInput(size=(85, 64), frames=6, layout="N(TC)HW").channels
     3
@@ -143,18 +155,23 @@ class PictureInput(PixelsInput, frozen=True, kw_only=True, tag="picture", tag_fi
 class GoalPictureInput(
     PixelsInput, frozen=True, kw_only=True, tag="goal_picture", tag_field="what"
 ):
-    """The picture of where to go. missing: fills the tensor where a run's goals are no pictures;
-    None: refused."""
+    """Goal picture.
+
+    missing: Fills the tensor if a run has no goal picture; None: refused.
+    """
 
     made_of = ImageGoal
     missing: Annotated[float | None, _NUMBER] = None
 
 
 class GoalPointInput(VectorInput, frozen=True, kw_only=True, tag="goal_point", tag_field="what"):
-    """The point of where to go, in the robot's frame of its frame. x, y, distance in units of
-    `unit_m`; a distance of more than `most_m` becomes that, x and y in proportion; bearing in
-    radians, counter-clockwise from ahead. missing: the values where a run's goals are no points, as
-    the graph gets them; None: refused."""
+    """Goal point in the robot's frame.
+
+    values: x, y and distance in units of `unit_m`; bearing in radians, counter-clockwise from
+        ahead.
+    most_m: Upper bound of the distance in metres; x and y are scaled in proportion.
+    missing: Normalised values if a run has no goal point; None: refused.
+    """
 
     made_of = PointGoal
     values: Annotated[
@@ -178,9 +195,11 @@ class GoalPointInput(VectorInput, frozen=True, kw_only=True, tag="goal_point", t
 
 
 class RoutePatchInput(PastInput, frozen=True, kw_only=True, tag="route_patch", tag_field="what"):
-    """The raster of the route around the robot (`cosim.spec.goal.RoutePatch`), with the numbers
-    `on` the route and `off` it. missing: fills the tensor where a run's goals are no route patches;
-    None: refused."""
+    """Raster of the route around the robot (`cosim.spec.goal.RoutePatch`).
+
+    on, off: Values of pixels on and off the route.
+    missing: Fills the tensor if a run has no route patch; None: refused.
+    """
 
     made_of = RoutePatch
     on: Annotated[float, _NUMBER] = 1.0
@@ -193,9 +212,12 @@ class RoutePatchInput(PastInput, frozen=True, kw_only=True, tag="route_patch", t
 
 
 class TurnInput(AnyInput, frozen=True, kw_only=True, tag="command", tag_field="what"):
-    """Which way to go: the numbers of left, straight or right. Of an instruction, what is due, or
-    told within `ahead_m`; of a point, where it lies more than `beyond_deg` aside. missing: with
-    other goals; None: refused."""
+    """Direction to take: the numbers of left, straight or right.
+
+    ahead_m: Distance in metres from which an instruction applies.
+    beyond_deg: Bearing in degrees from which a goal point is to the left or right.
+    missing: Numbers for other goals; None: refused.
+    """
 
     made_of = TurningGoal
     left: Annotated[tuple[float, ...], Counted(1, 16)] = (-1.0,)
@@ -216,7 +238,7 @@ class TurnInput(AnyInput, frozen=True, kw_only=True, tag="command", tag_field="w
 
 
 class SpeedsInput(VectorInput, frozen=True, kw_only=True, tag="speeds", tag_field="what"):
-    """The robot's own speeds, m/s and rad/s."""
+    """Robot's own speeds in m/s and rad/s."""
 
     values: Annotated[tuple[Literal["v", "w", "-w"], ...], Counted(1, 8)] = ("v", "w")
 
@@ -224,8 +246,11 @@ class SpeedsInput(VectorInput, frozen=True, kw_only=True, tag="speeds", tag_fiel
 class PastPositionsInput(
     VectorInput, frozen=True, kw_only=True, tag="past_positions", tag_field="what"
 ):
-    """Where the robot was, by its odometry, in its frame of now; the last one is now, at the
-    origin. heading: in radians, counter-clockwise from that of now."""
+    """Past positions by odometry in the current robot frame; the last one is the origin.
+
+    values: x and y in units of `unit_m`; heading in radians, counter-clockwise from the current
+        one.
+    """
 
     values: Annotated[
         tuple[Literal["x", "-x", "y", "-y", "cos", "sin", "-sin", "heading", "-heading"], ...],
@@ -235,26 +260,28 @@ class PastPositionsInput(
 
 
 class MaskInput(AnyInput, frozen=True, kw_only=True, tag="mask", tag_field="what"):
-    """A number that tells whether there is a goal that another input takes."""
+    """Number that says whether there is a goal that another input uses."""
 
     given: Annotated[float, _NUMBER] = 0.0
     missing: Annotated[float, _NUMBER] = 1.0
 
 
 class ConstantInput(AnyInput, frozen=True, kw_only=True, tag="constant", tag_field="what"):
-    """Always the same: one number for the whole tensor, or all of them, the last axis first."""
+    """Constant: one number for the whole tensor, or all numbers in row-major order."""
 
     value: float | tuple[float, ...]
 
 
 class NoiseInput(AnyInput, frozen=True, kw_only=True, tag="noise", tag_field="what"):
-    """Normal noise, drawn anew for every answer from the episode's seed."""
+    """Normal noise, drawn for every command from the episode's seed."""
 
 
 class StateInput(AnyInput, frozen=True, kw_only=True, tag="state", tag_field="what"):
-    """What the graph remembers: the output `output` of the answer before, or with `append` a row of
-    it behind the older rows, of which the first goes. `begin` fills it when an episode begins, or
-    the robot was put elsewhere."""
+    """Recurrent state: the output `output` of the previous call.
+
+    append: Append the output as a row and drop the oldest row.
+    begin: Fills the tensor when an episode begins or the robot was moved.
+    """
 
     output: str
     append: bool = False
@@ -265,7 +292,7 @@ _Part = GoalPointInput | SpeedsInput | PastPositionsInput | TurnInput | Constant
 
 
 class JoinedInput(AnyInput, frozen=True, kw_only=True, tag="joined", tag_field="what"):
-    """Vectors one behind the other: all numbers of the first, then all of the second."""
+    """Concatenated vectors."""
 
     parts: Annotated[tuple[_Part, ...], Counted(1, 8)]
 
@@ -298,14 +325,13 @@ GraphInput = (
 
 
 def common_goals(inputs: Iterable[AnyInput]) -> tuple[GoalProtocol, ...]:
-    """Return the protocols whose goals all of these inputs can be made of; () where they need
-    none."""
+    """Return the protocols that all of these inputs can use; () if they need none."""
     wanted = [set(one.needs) for one in inputs if one.needs]
     return tuple(name for name in GOALS if wanted and name in set.intersection(*wanted))
 
 
 def axes_of(layout: str) -> list[str]:
-    """The axes of a layout, outermost first: those in brackets are one.
+    """Return the axes of a layout, outermost first; letters in brackets are one axis.
 
     >>> axes_of("N(TC)HW")
     ['N', 'TC', 'H', 'W']
@@ -324,7 +350,7 @@ def axes_of(layout: str) -> list[str]:
 
 
 def layout_refusal(called: str, layout: str, **counts: int) -> str:
-    """What is wrong with a layout of so many frames T and channels C; "" if nothing is."""
+    """Return the fault of a layout for given numbers of frames T and channels C; "" if valid."""
     groups = axes_of(layout)
     letters = "".join(groups)
     brackets = layout.replace("(", "").replace(")", "") == letters and layout.count(
@@ -346,7 +372,7 @@ def layout_refusal(called: str, layout: str, **counts: int) -> str:
 def _normalised(
     called: str, mean: Sequence[float], std: Sequence[float], count: int
 ) -> Iterator[str]:
-    """What is wrong with the mean and standard deviation of `count` values."""
+    """Yield faults of the mean and standard deviation of `count` values."""
     for field, numbers in (("mean", mean), ("std", std)):
         if numbers and len(numbers) != count:
             yield f"{called}{field} must hold {count} numbers or none, not {len(numbers)}"

@@ -1,5 +1,4 @@
-"""The manifest of an ONNX bundle, `manifest.json`: what its graph wants, what it answers, and where
-it comes from.
+"""Manifest of an ONNX bundle, `manifest.json`: inputs and output of the graph, and its origin.
 
 {"format": 1, "name": "mine", "rate_hz": 5, "goal": "route_point", "camera": {"width": 160,
  "height": 90}, "inputs": {"pictures": {"what": "picture", "frames": 4, "size": [160, 90], "layout":
@@ -35,18 +34,17 @@ from cosim.spec.validation import Named, Ranged, Text, Within, shown
 
 MANIFEST_FILE: Final = "manifest.json"
 EXAMPLE_FILE: Final = "example.npz"
-"""For each input of the graph an array of its name, and for each output one of the name
-`expected.<name>`."""
+"""File with an array of each input's name, and `expected.<name>` of each output."""
 MOST_EXAMPLE_BYTES: Final = 512 << 20
-"""Of an example, packed and unpacked."""
+"""Largest size of an example in bytes, packed and unpacked."""
 
 _MOST_NAME_BYTES: Final = 255
+"""Longest file name in bytes."""
 _HASH: Final = re.compile(r"[0-9a-f]{64}")
 
 
 def refusal_of_name(name: str) -> str:
-    """Why a file of a bundle cannot be called so; "" if it can. Files of a bundle lie in its
-    folder, not below it.
+    """Return the fault of a file name in a bundle's folder; "" if valid.
 
     >>> refusal_of_name("model.onnx.data"), refusal_of_name("../model.onnx")[:17]
     ('', "'../model.onnx' i")
@@ -65,36 +63,34 @@ def refusal_of_name(name: str) -> str:
 
 
 class FileFacts(Ranged, frozen=True, kw_only=True):
-    """How large a file of a bundle is, and a hash of its bytes, in hexadecimal: the BLAKE2b, 32
-    bytes long, or the SHA-256 where its authors tell that, or both."""
+    """Size of a file and hexadecimal hashes: BLAKE2b of 32 bytes, SHA-256, or both."""
 
     bytes: Annotated[int, Within(0, 10**12)]
     blake2b: str = ""
     sha256: str = ""
 
     def contradictions(self) -> Iterator[str]:
-        for name, told in self.hashes.items():
-            if told and not _HASH.fullmatch(told):
-                yield f"{name} must be 64 hexadecimal digits, not {told[:80]!r}"
+        for name, digits in self.hashes.items():
+            if digits and not _HASH.fullmatch(digits):
+                yield f"{name} must be 64 hexadecimal digits, not {digits[:80]!r}"
         if not any(self.hashes.values()):
             yield "blake2b or sha256 must be given"
 
     @property
     def hashes(self) -> dict[str, str]:
-        """By their names; "" for one that is not told."""
+        """Hashes by name; "" for a missing one."""
         return {"blake2b": self.blake2b, "sha256": self.sha256}
 
     @property
     def in_words(self) -> str:
-        """As a refusal tells it."""
-        told = {"BLAKE2b": self.blake2b, "SHA-256": self.sha256}
-        return ", ".join(
-            [f"{self.bytes} bytes", *(f"{name} {one}" for name, one in told.items() if one)]
-        )
+        """Size and hashes as text for error messages."""
+        hashes = {"BLAKE2b": self.blake2b, "SHA-256": self.sha256}
+        known = (f"{name} {digits}" for name, digits in hashes.items() if digits)
+        return ", ".join([f"{self.bytes} bytes", *known])
 
 
 def file_facts(data: bytes) -> FileFacts:
-    """The facts of a file that holds `data`.
+    """Return size and hashes of data.
 
     >>> file_facts(b"graph").bytes
     5
@@ -104,7 +100,7 @@ def file_facts(data: bytes) -> FileFacts:
 
 
 class BundleCamera(Ranged, frozen=True, kw_only=True):
-    """A camera, as `cosim.spec.camera.CameraSpec` has it; it sits at one of the robot's mounts."""
+    """Camera as in `cosim.spec.camera.CameraSpec`, at one of the robot's mounts."""
 
     width: Annotated[int, Within(1, 4096)]
     height: Annotated[int, Within(1, 4096)]
@@ -124,11 +120,13 @@ class BundleCamera(Ranged, frozen=True, kw_only=True):
 
 
 class BundleManifest(Ranged, frozen=True, kw_only=True):
-    """A manifest. inputs: by the names of the graph's inputs; model: the graph's file in the
-    folder, or of the same name in a folder of weights (`cosim.policies.onnx.weights`); files: what
-    is known of it and of others.
+    """Manifest of a bundle.
 
-    licence, source: of the weights, in words; a source says where they are to be had.
+    inputs: By the names of the graph's inputs.
+    model: File name of the graph in the bundle's folder or a folder of weights
+        (`cosim.policies.onnx.weights`).
+    files: Size and hashes of the graph and other files.
+    licence, source: Licence and origin of the weights as text.
     """
 
     format: Literal[1]
@@ -152,12 +150,12 @@ class BundleManifest(Ranged, frozen=True, kw_only=True):
 
     @property
     def goals(self) -> tuple[GoalProtocol, ...]:
-        """The goals that all of its inputs can be made of; () where they need none."""
+        """Goals that all inputs can use; () if they need none."""
         return common_goals(self.inputs.values())
 
     @property
     def policy(self) -> Manifest:
-        """As a run knows it."""
+        """Manifest of the policy in a run."""
         waypoints = (
             self.output.waypoint_rule
             if isinstance(self.output, WaypointsOutput)
@@ -209,6 +207,8 @@ class BundleManifest(Ranged, frozen=True, kw_only=True):
 
 
 def read_bundle_manifest(folder: Path) -> BundleManifest:
-    """The manifest of a bundle's folder. Raises SpecError with every fault, its place, and what may
-    stand there."""
+    """Read the manifest of a bundle's folder.
+
+    Raises SpecError with every fault and the valid choices.
+    """
     return read_spec_file(folder / MANIFEST_FILE, BundleManifest)

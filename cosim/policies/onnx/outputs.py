@@ -1,4 +1,4 @@
-"""Outputs of a graph: the field `output` of a bundle's manifest, and its decoding."""
+"""Outputs of a graph: the manifest field `output` and its decoding."""
 
 from __future__ import annotations
 
@@ -20,33 +20,40 @@ _ABOVE_0: Final = Within(0, 1e9, above=True)
 
 
 class Element(Ranged, frozen=True, kw_only=True):
-    """One number of an output, from 0, counted through it with the last axis first."""
+    """One number of an output.
+
+    index: Index into the flattened output, from 0.
+    """
 
     name: str
     index: Annotated[int, Within(0, 10**9)] = 0
 
 
 class Mixture(Ranged, frozen=True, kw_only=True):
-    """Waypoints in one row of numbers: for each of `modes` the values of all points, as many scales
-    of them, and one score, of which the highest is taken."""
+    """Waypoints of several modes in one row of numbers.
+
+    Each of `modes` has the values of all points, an equal number of scales, and a score. The mode
+    with the highest score is used.
+    """
 
     modes: Annotated[int, Within(1, 10_000)]
     points: Annotated[int, Within(1, 10_000)]
 
 
 class WaypointsOutput(Ranged, frozen=True, kw_only=True, tag="waypoints", tag_field="what"):
-    """Waypoints in the robot's frame: the output's last axis holds `columns`, the one before the
-    waypoints.
+    """Waypoints in the robot's frame: the last axis holds `columns`, the one before the waypoints.
 
-    columns: what each is: x ahead, y left, -y right, heading in radians; "speed" m/s, "turn" rad/s;
-    "" for what is not used. Numbers become number * scale + offset, one of each column, empty for 1
-    and 0. steps: each row is the way from the row before, x and y are summed up. unit_m: metres in
-    one unit of x and y; index, dt_s, rule: which is followed and how
-    (`cosim.spec.manifest.WaypointRule`). follow: "speeds" takes speed and turn of row `index` for
-    the command.
-
-    Further axes are modes or samples: the first is taken, or the one with the highest of the output
+    Further axes are modes or samples. The first is used, or the one with the highest of the output
     `scores`.
+
+    columns: Meaning of each column: x ahead, y left, -y right, heading in radians; "speed" in m/s,
+        "turn" in rad/s; "" is unused.
+    scale, offset: A number becomes number * scale + offset, one of each column; empty for 1 and 0.
+    steps: Rows are differences; x, y and heading are summed.
+    unit_m: Metres in one unit of x and y.
+    index, dt_s, rule: Waypoint to follow, and how (`cosim.spec.manifest.WaypointRule`).
+    follow: "speeds" uses speed and turn of row `index` as the command.
+    scores: Output that selects the mode.
     """
 
     name: str
@@ -92,7 +99,7 @@ class WaypointsOutput(Ranged, frozen=True, kw_only=True, tag="waypoints", tag_fi
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """The names of the graph's outputs that it reads."""
+        """Names of the graph's outputs that it reads."""
         return (self.name,) if self.scores is None else (self.name, self.scores)
 
     def contradictions(self) -> Iterator[str]:
@@ -123,8 +130,7 @@ class WaypointsOutput(Ranged, frozen=True, kw_only=True, tag="waypoints", tag_fi
 
 
 class WheelsOutput(Ranged, frozen=True, kw_only=True, tag="wheels", tag_field="what"):
-    """Speeds of the wheels at the left and at the right, in units of `unit_mps`; the robot's track
-    makes them a turn."""
+    """Speeds of the left and right wheels in units of `unit_mps`."""
 
     left: Element
     right: Element
@@ -140,9 +146,13 @@ class WheelsOutput(Ranged, frozen=True, kw_only=True, tag="wheels", tag_field="w
 
 
 class SteeringOutput(Ranged, frozen=True, kw_only=True, tag="steering", tag_field="what"):
-    """A turn, in units of `unit_radps`, to the left unless that is negative; and a speed:
-    `speed_mps`, times the number `speed`, times 1 less the number `stop`, where these are named.
-    keep_turn, keep_speed: the share of the last command that stays in the next one."""
+    """Turning rate in units of `unit_radps`, positive to the left, and a speed.
+
+    The speed is `speed_mps`, times the number `speed`, times 1 minus the number `stop`, if these
+    are given.
+
+    keep_turn, keep_speed: Fraction of the previous command in the next one (low-pass filter).
+    """
 
     turn: Element
     unit_radps: Annotated[float, _NUMBER] = 1.0
@@ -166,8 +176,7 @@ class SteeringOutput(Ranged, frozen=True, kw_only=True, tag="steering", tag_fiel
 
 
 class CommandOutput(Ranged, frozen=True, kw_only=True, tag="command", tag_field="what"):
-    """A speed in units of `unit_mps`, and a turn to the left in units of `unit_radps` (negative: to
-    the right)."""
+    """Speed in units of `unit_mps`, and turning rate to the left in units of `unit_radps`."""
 
     v: Element
     w: Element
@@ -194,27 +203,33 @@ PolicyAnswer = Command | NDArray[np.float64]
 
 
 def answer_of(
-    output: GraphOutput, told: Mapping[str, Tensor], robot: Robot, last: Command = STILL
+    output: GraphOutput, tensors: Mapping[str, Tensor], robot: Robot, last: Command = STILL
 ) -> PolicyAnswer:
-    """What the policy answers when the graph tells this; each tensor is of one observation. last:
-    the answer before, STILL at the beginning. Raises PolicyError for what is not finite."""
+    """Decode the outputs of a graph for one observation.
+
+    last: Previous command, STILL at the beginning.
+    Raises PolicyError for values that are not finite.
+    """
     for name in output.outputs:
-        if not np.isfinite(told[name]).all():
+        if not np.isfinite(tensors[name]).all():
             raise PolicyError(f"output '{name}' of the graph holds NaN or infinity")
     if isinstance(output, WaypointsOutput):
-        return _waypoints(output, told)
+        return _waypoints(output, tensors)
     if isinstance(output, WheelsOutput):
-        left, right = (_number(told, one) * output.unit_mps for one in (output.left, output.right))
+        left, right = (
+            _number(tensors, one) * output.unit_mps for one in (output.left, output.right)
+        )
         return Command((left + right) / 2.0, (right - left) / robot.drive.span_m[1])
     if isinstance(output, CommandOutput):
         return Command(
-            _number(told, output.v) * output.unit_mps, _number(told, output.w) * output.unit_radps
+            _number(tensors, output.v) * output.unit_mps,
+            _number(tensors, output.w) * output.unit_radps,
         )
-    return _steered(output, told, last)
+    return _steered(output, tensors, last)
 
 
 def check_outputs(output: GraphOutput, ports: Mapping[str, TensorPort]) -> None:
-    """Raises UsageError for an output that the graph does not have."""
+    """Raise UsageError for an output that the graph does not have."""
     for name in output.outputs:
         if name not in ports:
             raise UsageError(
@@ -222,8 +237,8 @@ def check_outputs(output: GraphOutput, ports: Mapping[str, TensorPort]) -> None:
             )
 
 
-def _number(told: Mapping[str, Tensor], one: Element) -> float:
-    numbers = told[one.name].ravel()
+def _number(tensors: Mapping[str, Tensor], one: Element) -> float:
+    numbers = tensors[one.name].ravel()
     if one.index >= numbers.size:
         raise UsageError(
             f"output: '{one.name}' holds {numbers.size} numbers, and number {one.index} "
@@ -232,23 +247,25 @@ def _number(told: Mapping[str, Tensor], one: Element) -> float:
     return float(numbers[one.index])
 
 
-def _steered(output: SteeringOutput, told: Mapping[str, Tensor], last: Command) -> Command:
+def _steered(output: SteeringOutput, tensors: Mapping[str, Tensor], last: Command) -> Command:
     v_mps = output.speed_mps
     if output.speed is not None:
-        v_mps *= _number(told, output.speed)
+        v_mps *= _number(tensors, output.speed)
     if output.stop is not None:
-        v_mps *= 1.0 - _number(told, output.stop)
-    w_radps = _number(told, output.turn) * output.unit_radps
+        v_mps *= 1.0 - _number(tensors, output.stop)
+    w_radps = _number(tensors, output.turn) * output.unit_radps
     return Command(
         output.keep_speed * last.v_mps + (1.0 - output.keep_speed) * v_mps,
         output.keep_turn * last.w_radps + (1.0 - output.keep_turn) * w_radps,
     )
 
 
-def _waypoints(output: WaypointsOutput, told: Mapping[str, Tensor]) -> PolicyAnswer:
-    """(N, 2), or (N, 4) with cosine and sine of the heading, in the output's units; by the speeds a
-    Planned."""
-    rows = _rows(output, told)
+def _waypoints(output: WaypointsOutput, tensors: Mapping[str, Tensor]) -> PolicyAnswer:
+    """Return (N, 2), or (N, 4) with cosine and sine of the heading, in the output's units.
+
+    A `Planned` if the speeds are followed.
+    """
+    rows = _rows(output, tensors)
     if output.scale:
         rows = rows * output.scale
     if output.offset:
@@ -283,9 +300,9 @@ def _waypoints(output: WaypointsOutput, told: Mapping[str, Tensor]) -> PolicyAns
     return Planned(v_mps, w_radps, answer.astype(np.float32), output.index)
 
 
-def _rows(output: WaypointsOutput, told: Mapping[str, Tensor]) -> NDArray[np.float64]:
-    """The rows of the mode that is followed, (N, columns)."""
-    numbers: NDArray[np.float64] = told[output.name].astype(float)
+def _rows(output: WaypointsOutput, tensors: Mapping[str, Tensor]) -> NDArray[np.float64]:
+    """Return the rows of the selected mode, (N, columns)."""
+    numbers: NDArray[np.float64] = tensors[output.name].astype(float)
     width = len(output.columns)
     if output.mixture is not None:
         modes, points = output.mixture.modes, output.mixture.points
@@ -309,7 +326,7 @@ def _rows(output: WaypointsOutput, told: Mapping[str, Tensor]) -> NDArray[np.flo
         return numbers.reshape(-1, width)
     points = numbers.shape[-2]
     modes_of = numbers.reshape(-1, points, width)
-    scores = told[output.scores].ravel() if output.scores else np.zeros(len(modes_of))
+    scores = tensors[output.scores].ravel() if output.scores else np.zeros(len(modes_of))
     if len(scores) != len(modes_of):
         raise UsageError(
             f"output: '{output.scores}' holds {len(scores)} scores of {len(modes_of)} modes"

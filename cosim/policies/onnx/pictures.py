@@ -1,4 +1,4 @@
-"""From pictures to numbers: cut, size, colour, normalisation, and the order of a tensor's axes."""
+"""Convert camera images to tensors: crop, resize, colour, normalisation and axis order."""
 
 from __future__ import annotations
 
@@ -22,8 +22,7 @@ _RESAMPLED: Final = {
 
 
 def picture_numbers(rgb: NDArray[np.uint8], how: PixelsInput) -> NDArray[Any]:
-    """One picture (H, W, 3) as a graph sees it: (rows, columns, channels), float32; uint8 where it
-    stays as it is."""
+    """Return a picture (H, W, 3) as (rows, columns, channels): float32, or unchanged uint8."""
     pixels = _coloured(_fitted(_cut(rgb, how), how), how.colour)
     if how.as_they_are:
         return pixels
@@ -36,7 +35,7 @@ def picture_numbers(rgb: NDArray[np.uint8], how: PixelsInput) -> NDArray[Any]:
 
 @cache
 def _numbers_of_bytes(how: PixelsInput) -> NDArray[np.float32]:
-    """(256, channels): what each byte of a channel becomes."""
+    """Return (256, channels): the normalised value of each byte."""
     numbers = np.arange(256, dtype=np.float32)[:, None] * np.full(
         how.channels, 1.0 / how.scale, np.float32
     )
@@ -48,8 +47,7 @@ def _numbers_of_bytes(how: PixelsInput) -> NDArray[np.float32]:
 
 
 def axes_turned(frame: NDArray[Any], layout: str) -> NDArray[Any]:
-    """A frame (H, W, C), its axes in the order in which a layout has these letters; C alone may be
-    absent from it.
+    """Transpose a frame (H, W, C) to the order of a layout, in which C may be absent.
 
     >>> axes_turned(np.zeros((64, 85, 3)), "N(TC)HW").shape
     (3, 64, 85)
@@ -61,7 +59,7 @@ def axes_turned(frame: NDArray[Any], layout: str) -> NDArray[Any]:
 
 
 def laid_out(frames: Sequence[NDArray[Any]], layout: str) -> NDArray[Any]:
-    """Frames as `axes_turned` gives them with the axes of a layout, in which N is of length 1.
+    """Combine frames from `axes_turned` to a tensor with the axes of a layout; N is 1.
 
     >>> laid_out([np.zeros((3, 64, 85))] * 6, "N(TC)HW").shape
     (1, 18, 64, 85)
@@ -75,7 +73,7 @@ def laid_out(frames: Sequence[NDArray[Any]], layout: str) -> NDArray[Any]:
 
 
 def shape_of(sides: tuple[int, int, int], frames: int, layout: str) -> tuple[int, ...]:
-    """Of a tensor of so many frames with so many rows, columns and channels.
+    """Return the shape of a tensor. sides: rows, columns and channels of a frame.
 
     >>> shape_of((64, 85, 3), 6, "N(TC)HW")
     (1, 18, 64, 85)
@@ -85,8 +83,7 @@ def shape_of(sides: tuple[int, int, int], frames: int, layout: str) -> tuple[int
 
 
 def _cut(rgb: NDArray[np.uint8], how: PixelsInput) -> NDArray[np.uint8]:
-    """The part of a picture that `crop` names, and of that the part of the shape of `size` where
-    that is asked for."""
+    """Crop a picture to `crop`, and to the aspect ratio of `size` for fit "crop"."""
     rows, columns = rgb.shape[:2]
     if how.crop is not None:
         x0, y0, x1, y1 = how.crop
@@ -104,13 +101,13 @@ def _cut(rgb: NDArray[np.uint8], how: PixelsInput) -> NDArray[np.uint8]:
 
 
 def _within(low: float, high: float, most: int) -> tuple[int, int]:
-    """Whole pixels, one at least."""
+    """Return a range in whole pixels, at least one pixel wide."""
     first = min(round(low), most - 1)
     return first, max(round(high), first + 1)
 
 
 def _fitted(rgb: NDArray[np.uint8], how: PixelsInput) -> NDArray[np.uint8]:
-    """A picture in the size (width, height)."""
+    """Resize a picture to the size (width, height)."""
     width, height = how.size
     if how.fit in ("stretch", "crop"):
         return _resized(rgb, width, height, how)
@@ -134,8 +131,10 @@ def _resized(
 
 
 def _coloured(rgb: NDArray[np.uint8], colour: str) -> NDArray[np.uint8]:
-    """(H, W, 3) in other channels; yuv420 as (H / 2, W / 2, 6): Y of even and odd rows at even
-    columns, then at odd ones, U, V."""
+    """Convert the colours of (H, W, 3).
+
+    yuv420 gives (H / 2, W / 2, 6): Y of even and odd rows at even columns, then at odd ones, U, V.
+    """
     if colour == "bgr":
         return rgb[..., ::-1]
     if colour == "grey":

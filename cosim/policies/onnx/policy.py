@@ -48,7 +48,7 @@ from cosim.spec.robot import COURIER
 
 @dataclass(frozen=True)
 class FoundBundle:
-    """A bundle: its folder, its manifest, and where an example of it would be."""
+    """Folder and manifest of a bundle, and the path of its example."""
 
     folder: Path
     manifest: BundleManifest
@@ -56,8 +56,10 @@ class FoundBundle:
 
 
 def read_bundle(place: Path) -> FoundBundle:
-    """The bundle in a folder; or visnavkit's export, in a folder or as the path of its graph.
-    Raises UsageError where there is none, or several; SpecError for a manifest with faults."""
+    """Find the bundle in a folder, or visnavkit's export, in a folder or by the path of its graph.
+
+    Raises UsageError if there is none or more than one; SpecError for an invalid manifest.
+    """
     if (place / MANIFEST_FILE).exists():
         return FoundBundle(place, read_bundle_manifest(place), place / EXAMPLE_FILE)
     if place.is_file() and (place.parent / MANIFEST_FILE).exists():
@@ -77,11 +79,14 @@ def read_bundle(place: Path) -> FoundBundle:
 
 
 _GREY = 128
+"""Value of all pixels of a grey picture."""
 
 
 def onnx_policy(place: Path, within_s: float | None = LOADED_WITHIN_S) -> OnnxPolicy:
-    """The policy of a bundle. Off the CPU, and where the graph's first axis may be of any length,
-    it answers for many episodes at once. Raises as `OnnxPolicy` does."""
+    """Load the policy of a bundle. Raises as `OnnxPolicy` does.
+
+    It answers in batches if the graph's first axis is dynamic and it does not run on the CPU.
+    """
     policy = OnnxPolicy(place, within_s)
     return (
         policy
@@ -91,7 +96,7 @@ def onnx_policy(place: Path, within_s: float | None = LOADED_WITHIN_S) -> OnnxPo
 
 
 class _Memory:
-    """What is kept of one episode."""
+    """State of one episode."""
 
     def __init__(self, feeder: Feeder) -> None:
         self.feeder = feeder
@@ -103,14 +108,17 @@ class _Memory:
 
 
 class OnnxPolicy:
-    """A bundle's policy. Raises UsageError or SpecError, before anything is driven, for whatever of
-    the bundle is missing or does not fit together; it is asked once, in a grey street, to see that.
-    within_s: it is loaded and asked in a child process first, which may take so long
-    (`TrialGraph`); None where another process limits this one.
+    """Policy of an ONNX bundle.
 
-    bundle: its manifest; digest: a hash of that, of the weights, and of what the graph answers in
-    that street: its last bits hang on the processor, of which runs that are continued or merged
-    must be one kind; example: where its example would be.
+    The constructor checks the bundle and runs the graph once on grey pictures. Raises UsageError or
+    SpecError if a file is missing or invalid.
+
+    within_s: Timeout in seconds to load and run the graph in a child process first (`TrialGraph`);
+        None if another process limits this one.
+    bundle: The manifest.
+    digest: Hash of the manifest, the weights and the outputs for grey pictures. Their last bits
+        depend on the processor, which must not change within a run.
+    example: Path of the bundle's example.
     """
 
     def __init__(self, place: Path, within_s: float | None = LOADED_WITHIN_S) -> None:
@@ -120,7 +128,9 @@ class OnnxPolicy:
         self.manifest = found.manifest.policy
         self._files = files = bundle_files(found.folder, self.bundle)
         self._within_s = within_s if runs_on_cpu() else None
-        self._names = [*dict.fromkeys([*self.bundle.output.outputs, *_state_outputs(self.bundle)])]
+        inputs = self.bundle.inputs.values()
+        states = [one.output for one in inputs if isinstance(one, StateInput)]
+        self._names = [*dict.fromkeys([*self.bundle.output.outputs, *states])]
         with self.on_trial() as graph:
             self._check(graph)
             self._memory = _Memory(Feeder(self.bundle.inputs, graph.inputs, 0))
@@ -133,8 +143,7 @@ class OnnxPolicy:
 
     @property
     def takes_batches(self) -> bool:
-        """Whether the graph can be asked several questions at once, along the first axis of all it
-        takes and tells."""
+        """Whether all inputs and outputs have a dynamic batch axis."""
         ports = [*self.graph.inputs.values(), *(self.graph.outputs[name] for name in self._names)]
         layouts = [getattr(one, "layout", "N") for one in self.bundle.inputs.values()]
         return all(port.shape[:1] == (None,) for port in ports) and all(
@@ -142,19 +151,19 @@ class OnnxPolicy:
         )
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Nothing of the episode before is remembered."""
+        """Clear the history and seed noise inputs."""
         self._memory = self._begun(seed)
 
     def on_reset(self) -> None:
-        """What was seen before is no history."""
+        """Clear the history."""
         self._memory.forget()
 
     def act(self, observation: Observation) -> PolicyAnswer:
-        """Waypoints (N, 2) or (N, 4) in units of the manifest's rule, or a command."""
+        """Return waypoints (N, 2) or (N, 4) in units of the manifest's rule, or a command."""
         return self._answers(self.graph, [self._memory], [observation])[0]
 
     def on_trial(self) -> AbstractContextManager[Graph | TrialGraph]:
-        """The graph where it cannot do harm; in this process where that is limited by others."""
+        """Return the graph in a child process; in this process if another one limits it."""
         if self._within_s is None:
             return nullcontext(Graph(self._files.graph))
         return TrialGraph(self._files.graph, self._files.size, self._within_s)
@@ -165,36 +174,35 @@ class OnnxPolicy:
     def _answers(
         self, graph: AskedGraph, memories: Sequence[_Memory], seen: Sequence[Observation]
     ) -> list[PolicyAnswer]:
-        """To one question; to several where the graph takes them."""
-        asked = [memory.feeder.feed(one) for memory, one in zip(memories, seen, strict=True)]
-        if len(asked) == 1:
-            told = [graph.ask(asked[0], self._names)]
+        """Run the graph on one observation, or on a batch."""
+        inputs = [memory.feeder.feed(one) for memory, one in zip(memories, seen, strict=True)]
+        if len(inputs) == 1:
+            outputs = [graph.ask(inputs[0], self._names)]
         else:
-            whole = {name: np.concatenate([one[name] for one in asked]) for name in asked[0]}
-            all_told = graph.ask(whole, self._names)
-            told = [
-                {name: array[i : i + 1] for name, array in all_told.items()}
-                for i in range(len(asked))
+            batch = {name: np.concatenate([one[name] for one in inputs]) for name in inputs[0]}
+            together = graph.ask(batch, self._names)
+            outputs = [
+                {name: array[i : i + 1] for name, array in together.items()}
+                for i in range(len(inputs))
             ]
-        return [self._answer(*each) for each in zip(memories, seen, told, strict=True)]
+        return [self._answer(*each) for each in zip(memories, seen, outputs, strict=True)]
 
     def _answer(
-        self, memory: _Memory, seen: Observation, told: Mapping[str, Tensor]
+        self, memory: _Memory, seen: Observation, outputs: Mapping[str, Tensor]
     ) -> PolicyAnswer:
-        memory.feeder.remember(told)
-        answer = answer_of(self.bundle.output, told, seen.robot, memory.last)
+        memory.feeder.remember(outputs)
+        answer = answer_of(self.bundle.output, outputs, seen.robot, memory.last)
         if isinstance(answer, Command):
             memory.last = answer
         return answer
 
     def _check(self, graph: AskedGraph) -> None:
-        """Raises UsageError unless graph and manifest have the same inputs, and the graph the
-        outputs."""
+        """Raise UsageError unless the inputs of graph and manifest match and the outputs exist."""
         wanted = graph.inputs
         given = self.bundle.inputs
         if lacking := sorted(wanted.keys() - given.keys()):
-            told = "; ".join(f"'{name}' {wanted[name].in_words}" for name in lacking)
-            raise UsageError(f"inputs: the graph wants {told}, of which the manifest says nothing")
+            ports = "; ".join(f"'{name}' {wanted[name].in_words}" for name in lacking)
+            raise UsageError(f"inputs: the graph wants {ports}, of which the manifest says nothing")
         if over := sorted(given.keys() - wanted.keys()):
             raise UsageError(
                 f"inputs: the graph has no input '{over[0]}'. Valid choices: {', '.join(wanted)}"
@@ -209,15 +217,17 @@ class OnnxPolicy:
                 )
 
     def _try(self, graph: AskedGraph) -> bytes:
-        """Asks once, as a run would, and gives the bytes of what the graph answered. Raises
-        UsageError for what the runtime cannot do, and for an answer that is none."""
+        """Run the graph on grey pictures and return the bytes of its outputs.
+
+        Raises UsageError if the runtime fails or the answer is invalid.
+        """
         seen = in_grey(self.manifest)
         try:
             for _ in range(2):
                 answer = self._answers(graph, [self._memory], [seen])[0]
                 command_of(answer, rule=self.manifest.waypoints, robot=seen.robot)
-            told = graph.ask(self._memory.feeder.feed(seen), self._names)
-            return b"".join(told[name].tobytes() for name in self._names)
+            outputs = graph.ask(self._memory.feeder.feed(seen), self._names)
+            return b"".join(outputs[name].tobytes() for name in self._names)
         except UsageError:
             raise
         except PolicyError as error:
@@ -231,37 +241,36 @@ class OnnxPolicy:
 
 
 class OnnxBatchPolicy(OnnxPolicy):
-    """The same for many episodes at once (`cosim.episode.interfaces.BatchPolicy`)."""
+    """ONNX policy for several episodes at once (`cosim.episode.interfaces.BatchPolicy`)."""
 
     def __init__(self, place: Path, within_s: float | None = LOADED_WITHIN_S) -> None:
         super().__init__(place, within_s)
         self._memories: dict[str, _Memory] = {}
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Another episode begins."""
+        """Begin an episode."""
         self._memories[episode_id] = self._begun(seed)
 
     def on_reset(self, episode_id: str = "") -> None:
-        """What was seen before in this episode is no history."""
+        """Clear the history of an episode."""
         self._memories[episode_id].forget()
 
     def ended(self, episode_id: str) -> None:
-        """Nothing more is asked about this episode."""
+        """Remove an episode."""
         self._memories.pop(episode_id, None)
 
     def act(self, observation: Observation) -> PolicyAnswer:
         return self.act_batch([observation])[0]
 
     def act_batch(self, observations: Sequence[Observation]) -> list[PolicyAnswer]:
-        """For each observation what `act` would answer, up to what the processor makes of the last
-        bits."""
+        """Return the answer of `act` for each observation, up to the last bits."""
         return self._answers(
             self.graph, [self._memories[one.episode] for one in observations], observations
         )
 
 
 def in_grey(manifest: Manifest) -> Observation:
-    """What a policy might be given: grey pictures, at rest, the goal 10 m ahead."""
+    """Return an example observation: grey pictures, standing still, goal 10 m ahead."""
 
     def grey(size: tuple[int, int]) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
         return np.full((size[1], size[0], 3), _GREY, np.uint8)
@@ -284,10 +293,9 @@ def in_grey(manifest: Manifest) -> Observation:
 
 
 def example_differences(policy: OnnxPolicy) -> dict[str, float]:
-    """For each output in the bundle's example the largest difference between what the graph tells
-    and what is expected.
+    """Return the largest difference of each output in the bundle's example.
 
-    Raises UsageError for a bundle without an example, or with one that does not fit the graph.
+    Raises UsageError if the example is missing or does not fit the graph.
     """
     path = policy.example
     try:
@@ -318,21 +326,17 @@ def example_differences(policy: OnnxPolicy) -> dict[str, float]:
             )
     try:
         with policy.on_trial() as graph:
-            told = graph.ask({name: held[name] for name in graph.inputs}, list(graph.outputs))
+            found = graph.ask({name: held[name] for name in graph.inputs}, list(graph.outputs))
     except UsageError:
         raise
     except Exception as error:
         raise UsageError(f"{path}: does not fit the graph: {said_by_runtime(error)}") from error
     for name, array in wanted.items():
-        if told[name].shape != array.shape:
+        if found[name].shape != array.shape:
             raise UsageError(
-                f"{path}: expected.{name} is {array.shape}, the graph tells {told[name].shape}"
+                f"{path}: expected.{name} is {array.shape}, the graph tells {found[name].shape}"
             )
     return {
-        name: float(np.abs(told[name].astype(float) - array).max(initial=0.0))
+        name: float(np.abs(found[name].astype(float) - array).max(initial=0.0))
         for name, array in wanted.items()
     }
-
-
-def _state_outputs(bundle: BundleManifest) -> list[str]:
-    return [one.output for one in bundle.inputs.values() if isinstance(one, StateInput)]

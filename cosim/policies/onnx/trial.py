@@ -1,8 +1,7 @@
-"""A graph on trial: loaded and asked in a child process, with limits of time and memory.
+"""Run a graph in a child process with limits of time and memory.
 
-A graph may hold a loop without end, or ask for more memory than there is. Neither can be
-interrupted, but a process of its own can be ended. What the trial answers has the bits of the same
-graph in this process.
+A graph may loop for ever or allocate too much memory. Neither can be interrupted, but a child
+process can be killed. The outputs are bit-identical to those in this process.
 """
 
 from __future__ import annotations
@@ -22,45 +21,55 @@ from cosim.core.framing import Wire
 from cosim.policies.onnx.graph import Graph, Tensor, TensorPort, import_runtime
 
 ROOM_BYTES: Final = 4 << 30
-"""So much memory a graph may use for its answers, and TIMES its files."""
+"""Memory in bytes that a graph may use in addition to _TIMES the size of its files."""
 _TIMES: Final = 8
+"""Memory that a graph may use, as a multiple of the size of its files."""
 _MOST_ANSWER_BYTES: Final = 512 << 20
+"""Largest size of all outputs in bytes."""
 
 _Packed = tuple[str, tuple[int, ...], bytes]
 _Port = tuple[str, str, tuple[int | None, ...]]
 
 
 class _Ports(msgspec.Struct, tag=True):
-    """A graph was loaded."""
+    """Reply: the graph was loaded."""
 
     inputs: list[_Port]
     outputs: list[_Port]
 
 
-class _Ask(msgspec.Struct):
-    """A question to it."""
+class _Request(msgspec.Struct):
+    """Request to run the graph."""
 
     tensors: dict[str, _Packed]
     names: list[str]
 
 
-class _Told(msgspec.Struct, tag=True):
-    """The answer."""
+class _Outputs(msgspec.Struct, tag=True):
+    """Reply: the outputs."""
 
     tensors: dict[str, _Packed]
 
 
 class _Raised(msgspec.Struct, tag=True):
-    """What was raised instead. refused: it cannot be loaded."""
+    """Reply: an error.
+
+    refused: The graph cannot be loaded.
+    """
 
     words: str
     refused: bool = False
 
 
 class TrialGraph:
-    """A graph in a child process. Use as a context manager. Raises UsageError as `Graph` does, and
-    where loading and all answers take more than `within_s` seconds together, or end the child.
-    size: bytes of the graph's files."""
+    """Graph in a child process. Use as a context manager.
+
+    Raises UsageError as `Graph` does, if all calls together exceed `within_s` seconds, or the child
+    ends.
+
+    size: Size of the bundle's files in bytes.
+    within_s: Timeout in seconds.
+    """
 
     def __init__(self, path: Path, size: int, within_s: float) -> None:
         import_runtime()
@@ -84,18 +93,20 @@ class TrialGraph:
         self._child.close()
 
     def ask(self, tensors: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
-        """The outputs of these names. What the runtime raises is raised as a RuntimeError with its
-        words."""
+        """Run the graph and return the named outputs.
+
+        Raises RuntimeError with the runtime's message.
+        """
         packed = {name: _packed(array) for name, array in tensors.items()}
         try:
-            self._child.wire.send(msgspec.msgpack.encode(_Ask(packed, list(names))))
+            self._child.wire.send(msgspec.msgpack.encode(_Request(packed, list(names))))
         except OSError:
             raise self._dead() from None
-        told = self._reply()
-        assert isinstance(told, _Told)
-        return {name: _unpacked(told.tensors[name]) for name in names}
+        reply = self._reply()
+        assert isinstance(reply, _Outputs)
+        return {name: _unpacked(reply.tensors[name]) for name in names}
 
-    def _reply(self) -> _Ports | _Told:
+    def _reply(self) -> _Ports | _Outputs:
         try:
             message = self._child.wire.receive(max(self._until_s - time.monotonic(), 0.0))
         except TimeoutError:
@@ -106,7 +117,7 @@ class TrialGraph:
             ) from None
         except (EOFError, OSError):
             raise self._dead() from None
-        reply = msgspec.msgpack.decode(message, type=_Ports | _Told | _Raised)
+        reply = msgspec.msgpack.decode(message, type=_Ports | _Outputs | _Raised)
         if isinstance(reply, _Raised):
             raise UsageError(reply.words) if reply.refused else RuntimeError(reply.words)
         return reply
@@ -119,7 +130,7 @@ class TrialGraph:
 
 
 def _serve(path: Path, wire: Wire) -> None:
-    """In the child: load the graph, then answer until the wire closes."""
+    """Load the graph and answer requests until the wire closes, in the child."""
     try:
         graph = Graph(path)
     except UsageError as error:
@@ -131,23 +142,25 @@ def _serve(path: Path, wire: Wire) -> None:
     )
     wire.send(msgspec.msgpack.encode(_Ports(*ports)))
     while True:
-        asked = msgspec.msgpack.decode(wire.receive(), type=_Ask)
+        request = msgspec.msgpack.decode(wire.receive(), type=_Request)
         try:
-            told = graph.ask(
-                {name: _unpacked(one) for name, one in asked.tensors.items()}, asked.names
+            outputs = graph.ask(
+                {name: _unpacked(one) for name, one in request.tensors.items()}, request.names
             )
-            if (size := sum(array.nbytes for array in told.values())) > _MOST_ANSWER_BYTES:
+            if (size := sum(array.nbytes for array in outputs.values())) > _MOST_ANSWER_BYTES:
                 raise ValueError(
                     f"the outputs hold {size} bytes; at most {_MOST_ANSWER_BYTES} are taken"
                 )
-            reply: _Told | _Raised = _Told({name: _packed(array) for name, array in told.items()})
+            reply: _Outputs | _Raised = _Outputs(
+                {name: _packed(array) for name, array in outputs.items()}
+            )
         except Exception as error:  # noqa: BLE001  whatever the runtime raises
             reply = _Raised(_with_room(str(error) or type(error).__name__))
         wire.send(msgspec.msgpack.encode(reply))
 
 
 def _with_room(words: str) -> str:
-    """The words of an error; where memory was lacking, with how much there was."""
+    """Return an error's message, with the memory limit if memory was exhausted."""
     lacks = any(part in words.lower() for part in ("alloc", "memory"))
     return (
         f"{words} (a graph may use {ROOM_BYTES >> 30} GiB and {_TIMES} times its size)"
@@ -156,8 +169,8 @@ def _with_room(words: str) -> str:
     )
 
 
-def _port(told: _Port) -> TensorPort:
-    name, dtype, shape = told
+def _port(port: _Port) -> TensorPort:
+    name, dtype, shape = port
     return TensorPort(name, np.dtype(dtype), shape)
 
 
@@ -165,6 +178,6 @@ def _packed(array: Tensor) -> _Packed:
     return array.dtype.str, array.shape, array.tobytes()
 
 
-def _unpacked(told: _Packed) -> Tensor:
-    dtype, shape, data = told
+def _unpacked(packed: _Packed) -> Tensor:
+    dtype, shape, data = packed
     return np.frombuffer(data, dtype).reshape(shape)

@@ -1,9 +1,9 @@
-"""Bundles as visnavkit exports them: `X.onnx`, with `X.metadata.json` and `X.inputs.npz` beside it.
+"""Read exports of visnavkit: `X.onnx` with `X.metadata.json` and `X.inputs.npz`.
 
-Two graphs of it are known: of a window of frames (`vision`, `route_patch`, `goal`, `ego`,
-`action_bounds` to `modes` and `probs`), and of one frame with a buffer of features (`vision`,
-`feature_buffer`, `goal`, `ego` to `plan` and `feat_out`). What the files do not say is taken as
-that project has it: 20 Hz for a window, 10 Hz for frames.
+Two types of graph are known. A window of frames: `vision`, `route_patch`, `goal`, `ego`,
+`action_bounds` to `modes` and `probs`. Single frames with a feature buffer: `vision`,
+`feature_buffer`, `goal`, `ego` to `plan` and `feat_out`. Missing values are that project's
+defaults: 20 Hz for a window, 10 Hz for frames.
 """
 
 from __future__ import annotations
@@ -39,18 +39,23 @@ from cosim.spec.goal import GoalProtocol
 METADATA: Final = ".metadata.json"
 EXAMPLE: Final = ".inputs.npz"
 _FOV_DEG: Final = 60.0
+"""Field of view in degrees assumed for the camera."""
 _WINDOW_HZ = 20.0
+"""Default rate in Hz of a graph that takes a window of frames."""
 _FRAME_HZ = 10.0
+"""Default rate in Hz of a graph that takes single frames."""
 _MOST_METADATA_BYTES: Final = 16 << 20
+"""Largest size of a metadata file in bytes."""
 _REACHED_S: Final = 0.5
-"""Of waypoints at other times each the first that is to be reached no sooner is followed."""
+"""Time in seconds of the waypoint to follow: the first at or after it."""
 _AHEAD: Final = (20.0, 1.0, 0.0)
-"""Distance, cosine and sine of a goal that a run does not tell as a point: straight ahead."""
+"""Distance, cosine and sine of a goal straight ahead, used if a run has no goal point."""
 _POINT: Final = ("distance", "cos", "sin")
+"""Values of a goal point."""
 
 
 class _Metadata(msgspec.Struct):
-    """The fields that are read of a metadata file; shapes by the names of inputs and outputs."""
+    """Fields of a metadata file; shapes by the names of inputs and outputs."""
 
     input_shapes: dict[str, tuple[int, ...]]
     output_shapes: dict[str, tuple[int, ...]]
@@ -60,46 +65,50 @@ class _Metadata(msgspec.Struct):
 
 
 def manifest_of_export(graph: Path) -> BundleManifest:
-    """What visnavkit's files beside a graph say, as a manifest. Raises UsageError where they cannot
-    be read, are of another graph, or of inputs and outputs that are not known."""
+    """Return the manifest of an exported graph.
+
+    Raises UsageError if the metadata is unreadable, belongs to another graph, or has unknown inputs
+    or outputs.
+    """
     path = graph.with_suffix(METADATA)
     try:
-        told = msgspec.json.decode(read_file(path, _MOST_METADATA_BYTES), type=_Metadata)
+        metadata = msgspec.json.decode(read_file(path, _MOST_METADATA_BYTES), type=_Metadata)
     except (msgspec.DecodeError, RecursionError) as error:
         raise UsageError(f"{path}: cannot be read: {error}") from error
     found = hashlib.sha256(read_file(graph)).hexdigest()
-    if told.onnx_sha256 not in ("", found):
+    if metadata.onnx_sha256 not in ("", found):
         raise UsageError(
             f"{graph}: is another file than {path.name} says: onnx_sha256 is "
-            f"{told.onnx_sha256[:16]}... there, {found[:16]}... found"
+            f"{metadata.onnx_sha256[:16]}... there, {found[:16]}... found"
         )
-    vision = told.input_shapes.get("vision", ())
+    vision = metadata.input_shapes.get("vision", ())
     if len(vision) not in (4, 5):
-        shapes = ", ".join(f"{name} {list(shape)}" for name, shape in told.input_shapes.items())
+        shapes = ", ".join(f"{name} {list(shape)}" for name, shape in metadata.input_shapes.items())
         raise UsageError(f"{path}: input_shapes has no vision of 4 or 5 axes: {shapes}")
     window = len(vision) == 5
     inputs = {
-        name: _input(graph, name, shape, told, window) for name, shape in told.input_shapes.items()
+        name: _input(graph, name, shape, metadata, window)
+        for name, shape in metadata.input_shapes.items()
     }
     try:
         return BundleManifest(
             format=1,
-            name=re.sub(r"[^A-Za-z0-9_-]+", "-", told.exp_name or graph.stem).strip("-.")
+            name=re.sub(r"[^A-Za-z0-9_-]+", "-", metadata.exp_name or graph.stem).strip("-.")
             or "visnavkit",
             source="exported by visnavkit",
             model=graph.name,
-            rate_hz=_rate_hz(told, window),
+            rate_hz=_rate_hz(metadata, window),
             goal=_protocol(inputs),
             camera=BundleCamera(width=vision[-1], height=vision[-2], fov_deg=_FOV_DEG),
             inputs=inputs,
-            output=_window_output(path, told) if window else _frame_output(path, told),
+            output=_window_output(path, metadata) if window else _frame_output(path, metadata),
         )
     except SpecError as error:
         raise UsageError(f"{path}: {error}") from error
 
 
 def exports_in(folder: Path) -> list[Path]:
-    """The graphs in a folder that visnavkit's metadata lie beside."""
+    """Return the graphs in a folder that have visnavkit metadata."""
     found = (
         path.with_name(path.name.removesuffix(METADATA) + ".onnx")
         for path in sorted(folder.glob(f"*{METADATA}"))
@@ -108,9 +117,9 @@ def exports_in(folder: Path) -> list[Path]:
 
 
 def _input(
-    graph: Path, name: str, shape: tuple[int, ...], told: _Metadata, window: bool
+    graph: Path, name: str, shape: tuple[int, ...], metadata: _Metadata, window: bool
 ) -> GraphInput:
-    """What goes into an input."""
+    """Return the manifest's description of an input."""
     frames = shape[1] if window and len(shape) > 2 else 1
     if name == "vision":
         size = shape[-1], shape[-2]
@@ -118,7 +127,7 @@ def _input(
     if name == "route_patch":
         return RoutePatchInput(frames=frames, layout="NTHW", missing=0.0)
     if name == "ego":
-        return SpeedsInput(frames=frames, values=tuple(_ego(graph, shape[-1], told)))
+        return SpeedsInput(frames=frames, values=tuple(_ego(graph, shape[-1], metadata)))
     if name == "noise":
         return NoiseInput()
     if name == "feature_buffer":
@@ -137,9 +146,11 @@ def _input(
     )
 
 
-def _ego(graph: Path, width: int, told: _Metadata) -> Iterator[Literal["v", "w"]]:
-    """The names of the robot's own numbers."""
-    features = _looked_up(told.config, "common", "ego_features") or ["speed", "yaw_rate"][:width]
+def _ego(graph: Path, width: int, metadata: _Metadata) -> Iterator[Literal["v", "w"]]:
+    """Yield the names of the robot's speeds."""
+    features = (
+        _looked_up(metadata.config, "common", "ego_features") or ["speed", "yaw_rate"][:width]
+    )
     names: dict[str, Literal["v", "w"]] = {"speed": "v", "yaw_rate": "w"}
     for feature in features:
         if feature not in names:
@@ -151,8 +162,7 @@ def _ego(graph: Path, width: int, told: _Metadata) -> Iterator[Literal["v", "w"]
 
 
 def _example(graph: Path, name: str) -> tuple[float, ...]:
-    """The numbers of an input that are the same for every question, as they were when the graph was
-    exported."""
+    """Return the numbers of a constant input from the exported example."""
     path = graph.with_suffix(EXAMPLE)
     try:
         array = read_npz(path, [name], MOST_EXAMPLE_BYTES)[name]
@@ -162,7 +172,7 @@ def _example(graph: Path, name: str) -> tuple[float, ...]:
 
 
 def _protocol(inputs: dict[str, GraphInput]) -> GoalProtocol:
-    """The goals that a run has by default."""
+    """Return the default goal protocol."""
     goal = inputs.get("goal")
     if isinstance(goal, GoalPictureInput):
         return "image"
@@ -171,8 +181,8 @@ def _protocol(inputs: dict[str, GraphInput]) -> GoalProtocol:
     return "none" if goal is None else "route_point"
 
 
-def _rate_hz(told: _Metadata, window: bool) -> float:
-    rate = _looked_up(told.config, "dataset", "train_loader", "hz")
+def _rate_hz(metadata: _Metadata, window: bool) -> float:
+    rate = _looked_up(metadata.config, "dataset", "train_loader", "hz")
     return (
         float(rate)
         if isinstance(rate, int | float) and rate > 0
@@ -180,15 +190,15 @@ def _rate_hz(told: _Metadata, window: bool) -> float:
     )
 
 
-def _window_output(path: Path, told: _Metadata) -> WaypointsOutput:
-    """The plan with the highest probability, driven by its first speeds."""
-    shape = told.output_shapes.get("modes", ())
-    if len(shape) != 4 or shape[-1] != 5 or "probs" not in told.output_shapes:
+def _window_output(path: Path, metadata: _Metadata) -> WaypointsOutput:
+    """Describe the output: the plan with the highest probability, driven by its first speeds."""
+    shape = metadata.output_shapes.get("modes", ())
+    if len(shape) != 4 or shape[-1] != 5 or "probs" not in metadata.output_shapes:
         raise UsageError(
             f"{path}: output_shapes has no probs, or no modes of (1, k, steps, 5): "
-            f"{told.output_shapes}"
+            f"{metadata.output_shapes}"
         )
-    seconds = _looked_up(told.config, "plan_len_seconds") or 0.05 * shape[2]
+    seconds = _looked_up(metadata.config, "plan_len_seconds") or 0.05 * shape[2]
     return WaypointsOutput(
         name="modes",
         scores="probs",
@@ -199,13 +209,13 @@ def _window_output(path: Path, told: _Metadata) -> WaypointsOutput:
     )
 
 
-def _frame_output(path: Path, told: _Metadata) -> WaypointsOutput:
-    """The mode with the highest score, at the time of one of its points."""
-    common = _looked_up(told.config, "common") or {}
+def _frame_output(path: Path, metadata: _Metadata) -> WaypointsOutput:
+    """Describe the output: the mode with the highest score, and one of its points."""
+    common = _looked_up(metadata.config, "common") or {}
     points = common.get("plan_len_points", 0)
     seconds = float(common.get("plan_len_seconds", 0.0))
     width = 3 if common.get("use_full_pose", True) else 2
-    shape = told.output_shapes.get("plan", ())
+    shape = metadata.output_shapes.get("plan", ())
     each = points * 2 * width + 1
     if len(shape) != 2 or points < 1 or seconds <= 0.0 or shape[1] % each:
         raise UsageError(
@@ -224,8 +234,7 @@ def _frame_output(path: Path, told: _Metadata) -> WaypointsOutput:
 
 
 def _times_s(points: int, seconds: float, common: dict[str, Any]) -> NDArray[np.floating]:
-    """When each point is to be reached: evenly spaced, or growing with the square, from 0 unless
-    that is left out."""
+    """Return the time of each point: evenly spaced or quadratic."""
     if common.get("uniform_t_anchors", False):
         return np.arange(1, points + 1) * (seconds / points)
     if common.get("offset_t_anchors", False):
@@ -234,7 +243,7 @@ def _times_s(points: int, seconds: float, common: dict[str, Any]) -> NDArray[np.
 
 
 def _looked_up(config: Any, *names: str) -> Any:
-    """A field of a config within others, None where there is none."""
+    """Return a nested field of a config; None if missing."""
     for name in names:
         config = config.get(name) if isinstance(config, dict) else None
     return config

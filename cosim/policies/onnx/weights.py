@@ -1,5 +1,4 @@
-"""The files of a bundle: where they are, that they are the right ones, and a hash of all that
-decides its answers."""
+"""Find the files of a bundle, check them against the manifest, and hash them."""
 
 from __future__ import annotations
 
@@ -19,17 +18,23 @@ from cosim.policies.onnx.graph_file import external_files, weights_not_finite
 from cosim.policies.onnx.manifest import BundleManifest, FileFacts, file_facts, refusal_of_name
 
 WEIGHTS_VARIABLE: Final = "COSIM_WEIGHTS"
+"""Environment variable with a folder of weights."""
 _MOST_BYTES: Final = 8_000_000_000
+"""Largest size of a file of a bundle in bytes."""
 _MOST_GRAPH_BYTES: Final = 2 << 30
-"""An ONNX file is a protobuf message, which holds no more; larger weights lie in files beside
-it."""
+"""Largest size of an ONNX file in bytes, the limit of a protobuf message."""
 _PIECE_BYTES: Final = 1 << 20
+"""Bytes read at once while hashing."""
 
 
 @dataclass(frozen=True)
 class BundleFiles:
-    """A graph's file; the BLAKE2b of it, of the files that it names, and of those that the manifest
-    names; and how many bytes all of these hold."""
+    """Files of a bundle.
+
+    graph: Path of the ONNX file.
+    digest: BLAKE2b of the graph, its external files and the files of the manifest.
+    size: Total size in bytes.
+    """
 
     graph: Path
     digest: str
@@ -38,14 +43,14 @@ class BundleFiles:
 
 @dataclass(frozen=True)
 class NetworkFile:
-    """A file: its name, where it is to be had, and its facts; None where it is made here."""
+    """File of a network: name, origin, and its size and hash; None if it is generated here."""
 
     name: str
     source: str
     facts: FileFacts | None
 
     def check(self, path: Path, data: bytes) -> None:
-        """Raises UsageError where the data of the file at `path` are not these."""
+        """Raise UsageError unless the data of the file at `path` has this size and hash."""
         if self.facts is None:
             return
         found = file_facts(data)
@@ -57,8 +62,7 @@ class NetworkFile:
 
 
 def weight_folders() -> list[Path]:
-    """Where weights are looked for that do not lie beside their manifest: $COSIM_WEIGHTS, then a
-    folder of the user's data."""
+    """Return the folders of weights: $COSIM_WEIGHTS, then one in the user's data folder."""
     named = os.environ.get(WEIGHTS_VARIABLE, "")
     return [*([Path(named)] if named else []), user_data_path("sidewalk-cosim") / "weights"]
 
@@ -66,8 +70,10 @@ def weight_folders() -> list[Path]:
 def weights_file(
     policy: str, name: str, facts: FileFacts | None, source: str, beside: Sequence[Path] = ()
 ) -> Path:
-    """Where a policy's file is: in one of the folders `beside`, or of weights. Raises UsageError
-    where it is in none, saying where it is to be had."""
+    """Return the path of a policy's file in the folders `beside` or the folders of weights.
+
+    Raises UsageError with the file's origin if it is missing.
+    """
     places = [*beside, *weight_folders()]
     for place in places:
         if (place / name).is_file():
@@ -82,9 +88,11 @@ def weights_file(
 
 
 def bundle_files(folder: Path, manifest: BundleManifest) -> BundleFiles:
-    """The files of the bundle in a folder. Raises UsageError for one that is missing, saying where
-    it is to be had, or is another than its manifest says; for a graph that is none, or has weights
-    that are no numbers."""
+    """Find and check the files of the bundle in a folder.
+
+    Raises UsageError if a file is missing or differs from its manifest, or the graph is invalid or
+    has weights that are not finite.
+    """
     graph = _found(folder, manifest, manifest.model)
     data = read_file(graph)
     try:
@@ -114,14 +122,16 @@ def bundle_files(folder: Path, manifest: BundleManifest) -> BundleFiles:
 
 
 def _found(folder: Path, manifest: BundleManifest, name: str) -> Path:
-    """Where a file of a bundle is. Raises UsageError for one in its folder that is a link out of
-    it."""
+    """Return the path of a file.
+
+    Raises UsageError for a link that leads out of the bundle's folder.
+    """
     path = weights_file(manifest.name, name, manifest.files.get(name), manifest.source, [folder])
     return _inside(path, folder) if path.parent == folder else path
 
 
 def _inside(path: Path, folder: Path) -> Path:
-    """A file of a bundle's folder. Raises UsageError where it is a link that leads elsewhere."""
+    """Return a path in a bundle's folder. Raises UsageError for a link that leads out of it."""
     if path.is_symlink() and not path.resolve().is_relative_to(folder.resolve()):
         raise UsageError(
             f"{path}: is a link that leads out of its bundle: put the file there, or in a folder "
@@ -131,14 +141,14 @@ def _inside(path: Path, folder: Path) -> Path:
 
 
 def read_file(path: Path, most_bytes: int = _MOST_GRAPH_BYTES) -> bytes:
-    """All of a file, by default of a graph. Raises UsageError for what is no regular file, and for
-    more bytes."""
+    """Read a file. Raises UsageError if it is not a regular file or larger than most_bytes."""
     with _read_in_words(path):
         return read_within(path, most_bytes)
 
 
 @contextmanager
 def _read_in_words(path: Path) -> Iterator[None]:
+    """Convert errors of reading a file to UsageError."""
     try:
         yield
     except OSError as error:
@@ -148,16 +158,18 @@ def _read_in_words(path: Path) -> Iterator[None]:
 
 
 def _digested(path: Path, name: str, manifest: BundleManifest, digest: hashlib.blake2b) -> int:
-    """Take a file into a digest, piece by piece, and return its size. Raises UsageError for one
-    that is another than its manifest says."""
-    said = manifest.files.get(path.name)
-    told: dict[str, int | str] = {} if said is None else {"bytes": said.bytes, **said.hashes}
+    """Add a file to a digest and return its size.
+
+    Raises UsageError if it differs from the manifest.
+    """
+    facts = manifest.files.get(path.name)
+    wanted: dict[str, int | str] = {} if facts is None else {"bytes": facts.bytes, **facts.hashes}
 
     def check(what: str, found: int | str) -> None:
-        if told.get(what, "") not in ("", found):
+        if wanted.get(what, "") not in ("", found):
             raise UsageError(
                 f"{path}: is another file than the manifest of '{manifest.name}' says: "
-                f"files.{path.name}.{what} is {told[what]} there, {found} found"
+                f"files.{path.name}.{what} is {wanted[what]} there, {found} found"
             )
 
     blake2b = hashlib.blake2b(digest_size=32)
@@ -169,7 +181,7 @@ def _digested(path: Path, name: str, manifest: BundleManifest, digest: hashlib.b
         with path.open("rb") as file:
             while piece := file.read(_PIECE_BYTES):
                 digest.update(piece)
-                if told:
+                if wanted:
                     blake2b.update(piece)
                     sha256.update(piece)
     check("blake2b", blake2b.hexdigest())

@@ -1,2 +1,1 @@
-"""Policies that know the simulator's state: `orca` (the oracle), `route`, `social_force`, and their
-parts."""
+"""Policies that know the simulator's state: `orca` (the oracle), `route`, `social_force`."""

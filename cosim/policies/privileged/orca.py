@@ -1,23 +1,19 @@
-"""`orca`: the oracle. Sees everybody and the map; anticipates, yields, goes round groups and
-things, stops when told.
+"""`orca`: the oracle. Predicts people, yields, avoids groups and obstacles, obeys gestures.
 
-It knows what no camera shows: where everybody is and how they walk, the free ground, signals and
-when they change; and what people are doing, which tells it who talks, who queues and who holds out
-a stopping hand. How people will go on it does not know: they are taken to walk on as they do
-(`encounters`).
+It knows what no camera shows: positions and velocities of all people, what they are doing, the free
+area and signal timing. Future motion is predicted at constant velocity (`people_prediction`).
 
-The route is led round what stands on it for good (`guide`). Each time it acts:
+`route_planner` leads the path around permanent obstacles. Each action has three steps:
 
-1. who stands (groups are one obstacle) decides on a lane beside that line;
-2. what moves bends the velocity towards that lane by ORCA half-planes (`cosim.people.orca`), the
-   robot doing all of the avoiding, because people need not;
-3. many plans are driven ahead in the head (`foresight`), and the one is taken that comes nearest to
-   that velocity while the body stays clear of everybody and on free ground (`clearance`).
+1. Choose a lane parallel to that path around standing people; a group is one obstacle.
+2. Adjust the velocity towards that lane by ORCA half-planes (`cosim.people.orca`) of moving people.
+The robot does all of the avoiding.
+3. Roll out many plans (`rollout`), and take the one closest to that velocity that keeps clear of
+people and stays on the free area (`Clearance`).
 
-Red signals, cars near a crossing, a stopping hand and whoever of the crowd is right before it limit
-the speed so that it comes to rest before them; for who walks straight at it from near, or across
-its way, it stands, since people go round a robot that does. Where a green is too short it comes up
-slowly, so that it stands there at red.
+The robot limits its speed to stop before red signals, vehicles near a crossing, gestures and the
+crowd directly ahead. It stops for people who walk at it or across its path, because people walk
+around a standing robot. If a green phase is too short, it approaches slowly.
 """
 
 from __future__ import annotations
@@ -32,14 +28,13 @@ from cosim.core.geometry import Floats, Polyline, wrap_angles
 from cosim.core.state import DIRECTED, PERSON_RADIUS_M, Command, People
 from cosim.episode.interfaces import Observation, Privileged
 from cosim.people.orca import best_velocity, half_plane
-from cosim.policies.privileged.distance_field import Clearance
 from cosim.policies.privileged.people_prediction import Yielding, bodies, gaps_to_people, walks
-from cosim.policies.privileged.robot_disks import BodyDisks
 from cosim.policies.privileged.rollout import (
     STEP_S,
     STEP_TIMES_S,
     STEPS,
     Ahead,
+    BodyDisks,
     Plans,
     Way,
     foresee,
@@ -51,72 +46,92 @@ from cosim.policies.privileged.route import (
     car_disks,
     crossing_limit,
 )
-from cosim.policies.privileged.route_planner import Guide
+from cosim.policies.privileged.route_planner import Clearance, Guide
 from cosim.policies.privileged.standing_groups import distances, lines, who_stands
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import Robot
 
 LANES_M: Final = np.arange(-8, 9) * 0.25
+"""Lateral offsets of the lanes in metres, left positive."""
 _SPEED_THIRTIETHS: Final = (28, 18, 9)
-"""Speeds of plans, in thirtieths of the robot's pace: who foresees so much drives a little slower
-than that."""
+"""Speeds of plans in thirtieths of the cruising speed; the fastest is slightly below it."""
 MANOEUVRES: Final = ((0.0, 0.35), (0.0, 0.9), (0.6, 0.9), (1.2, 0.9))
-"""Delay in seconds and sideways metres per metre of a change of lanes."""
+"""Lane changes: delay in seconds, and lateral metres per metre."""
 OUT_OF_A_NOOK: Final = (0.0, 3.0)
-"""The same of turning nearly on the spot first, at the slowest speed: past somebody whom it stands
-right before."""
+"""Lane change that turns almost on the spot first, to get past a person directly ahead."""
 
 _HORIZON_S: Final = 3.0
-"""ORCA's tau."""
+"""ORCA's time horizon tau in seconds."""
 
 _CLEARANCE_M: Final = 0.3
+"""Clearance in metres to people and vehicles."""
 _TIGHT_M: Final = 0.12
+"""Clearance in metres if the robot is stuck."""
 _NEARNESS_COST: Final = 15.0
+"""Cost in m/s per metre below the clearance."""
 TOUCH_COST: Final = 60.0
-"""m/s given up per metre nearer than the clearance, and nearer than a hand's breadth."""
+"""Cost in m/s per metre below 5 cm."""
 CAR_DEEP_M: Final = 0.5
+"""Largest violation of the clearance to vehicles in metres that is counted."""
 LANE_COST: Final = 0.25
+"""Cost in m/s per metre of difference to the chosen lane."""
 _CHANGE_COST: Final = 0.4
+"""Cost in m/s per metre of lane change."""
 EDGE_COST: Final = 6.0
-"""m/s given up when all of a plan lies outside the walkable area."""
+"""Cost in m/s of a plan that is entirely outside the walkable area."""
 _EDGE_M: Final = 0.06
+"""Distance in metres to the edge below which a point is outside."""
 _SOLID_M: Final = 0.05
-"""Nearer to the edge than this a corner of the body may touch what stands there."""
+"""Distance in metres to the edge below which a corner of the body may touch an obstacle."""
 _SOLID_COST: Final = 60.0
+"""Cost in m/s per metre that the body gets deeper into obstacles."""
 _DEEP_M: Final = 0.4
+"""Largest such depth in metres that is counted."""
 _SOON: Final = 5
-"""So many steps of two STEP_S a plan is kept off what is solid; later ones will be chosen anew."""
+"""Number of steps (of two STEP_S) checked against obstacles; later ones are planned again."""
 _JUMP_M: Final = 1.0
+"""Metres between two actions above which the robot was moved."""
 _STRAYED_M: Final = 2.6
+"""Lateral offset in metres above which the path is planned again."""
 _PAST_END_M: Final = 0.05
-"""A robot nearer to the end of its line than this has missed the goal and is led back."""
+"""Metres before the end of the path at which the robot has missed the goal and replans."""
 _PATIENCE_S: Final = 3.0
+"""Seconds without progress after which the robot is stuck."""
 _LED_ANEW_S: Final = 1.6
-"""Who has not come on for so long, and somebody stands near, looks for another way."""
+"""Seconds without progress after which the path is planned again around standing people."""
 STUCK_M: Final = 0.5
-"""A robot that has not come this far for PATIENCE_S, and was not held, takes tighter ways."""
+"""Metres that count as progress."""
 NEAR_S: Final = 1.2
-"""A plan is compared with ORCA's velocity over so long."""
+"""Seconds over which a plan is compared with ORCA's velocity."""
 LANE_AHEAD_M: Final = np.arange(0.5, 9.1, 0.5)
+"""Distances ahead in metres at which lanes are checked for standing people."""
 LANE_SLOPE: Final = 0.4
+"""Lateral metres per metre of the lanes in that check."""
 
 _STANDS_AT_WALK_S: Final = 6.0
-"""Who comes too late to cross at green rolls up to the crossing, to stand there for so long before
-it is red."""
+"""Seconds before red at which a robot too late for green arrives at the crossing."""
 
 _REACTS_S: Final = 0.25
+"""Reaction time in seconds in the speed limit for a crowd."""
 _AHEAD: Final = 0.3
+"""Cosine above which a person of the crowd is ahead."""
 _CREEPS_MPS: Final = 0.15
-"""In a throng it drives so fast that it comes to rest, after a moment, before whom it drives at;
-never slower than this."""
+"""Lower bound in m/s of the speed limit for a crowd."""
 
 STOP_BEFORE_M: Final = 2.0
+"""Metres before a stopping gesture at which the robot stops."""
 STOP_BRAKE_MPS2: Final = 0.5
+"""Deceleration in m/s^2 before a stopping gesture."""
 
 
 class Weights(NamedTuple):
-    """What counts how much: clearance m, m/s of progress, effort of leaving wish and lane, lying
-    off the walkway."""
+    """Weights of the scoring.
+
+    clearance_m: Required gap in metres.
+    progress: Weight of the progress in m/s.
+    effort: Weight of the difference to the wanted velocity and lane.
+    edge: Cost in m/s of being outside the walkable area.
+    """
 
     clearance_m: float
     progress: float
@@ -125,11 +140,13 @@ class Weights(NamedTuple):
 
 
 PATIENT: Final = Weights(_CLEARANCE_M, 0.4, 1.0, EDGE_COST)
+"""Weights while the robot makes progress."""
 STUCK: Final = Weights(_TIGHT_M, 2.5, 0.1, 0.5 * EDGE_COST)
+"""Weights after `_PATIENCE_S` without progress: tighter paths are accepted."""
 
 
 class Here(NamedTuple):
-    """The way to the goal, the robot's arc length on it, and the room beside it."""
+    """Path to the goal, the robot's arc length on it, and the distance field."""
 
     way: Way
     s_m: float
@@ -137,8 +154,7 @@ class Here(NamedTuple):
 
 
 class Orca:
-    """Anticipates, yields, goes round groups, stops for a hand: the oracle; knows what no camera
-    sees."""
+    """Oracle that predicts, yields, avoids groups and obeys gestures; privileged."""
 
     manifest = Manifest("orca", version="4", rate_hz=5.0, camera=None, privileged=True)
 
@@ -212,7 +228,7 @@ class Orca:
         aim_m: float,
         weights: Weights,
     ) -> Floats:
-        """How good each plan is among people, (K,) in m/s of speed."""
+        """Return (K,) scores of the plans in m/s."""
         near = max(round(NEAR_S / STEP_S), 1)
         velocity = (ahead.pose[near - 1, :2].T - known.robot.pose.xy) / (near * STEP_S)
         off_wish = np.hypot(*(velocity - wished).T)
@@ -228,8 +244,10 @@ class Orca:
         return scores
 
     def _find(self, known: Privileged, ends: Floats) -> Here:
-        """Where the robot is on its line, which is led anew from where it was put or has strayed
-        to, and round those who stand where it has not come on."""
+        """Return the robot's position on its path.
+
+        The path is planned again if the robot was moved or strayed, or if standing people block it.
+        """
         x_m, y_m, _ = known.robot.pose
         if self._guide is None or self._guide[0] is not known.route:
             clearance = Clearance(known.free, known.route)
@@ -255,8 +273,7 @@ class Orca:
 
 
 def nearby(known: Privileged) -> People:
-    """Those who matter: near, and not right behind, from where they step round the robot
-    themselves."""
+    """Return people nearby, except those directly behind, who avoid the robot themselves."""
     pose = known.robot.pose
     people = known.people
     offset = people.xy - pose.xy
@@ -269,8 +286,10 @@ def nearby(known: Privileged) -> People:
 
 
 def unhurried(known: Privileged, robot: Robot, crossing_mps: float) -> float:
-    """Speed in m/s at which the robot comes up to a crossing not long before its signal turns red,
-    if it is near and the green that is left is too short. crossing_mps: its `crossing_limit`."""
+    """Return the speed in m/s at which to approach a crossing whose green phase is too short.
+
+    crossing_mps: The robot's `crossing_limit`.
+    """
     for crossing_id, enter_s_m, _ in known.crossings:
         room_m = enter_s_m - known.route_s_m - (robot.length_m / 2 + STOP_SHORT_M)
         signal = known.signals.get(crossing_id)
@@ -287,8 +306,7 @@ def unhurried(known: Privileged, robot: Robot, crossing_mps: float) -> float:
 
 
 def pressed_limit(known: Privileged, robot: Robot) -> float:
-    """Speed in m/s at which the robot comes to rest before anybody of the crowd ahead, wherever
-    they turn."""
+    """Return the speed in m/s at which the robot can stop before any person of the crowd ahead."""
     pose = known.robot.pose
     people = known.people
     offset = (people.xy - pose.xy)[~people.are(*DIRECTED)]
@@ -309,8 +327,7 @@ def pressed_limit(known: Privileged, robot: Robot) -> float:
 
 
 def stop_limit(known: Privileged) -> float:
-    """Speed in m/s at which the robot comes to rest before somebody ahead who holds out a stopping
-    hand."""
+    """Return the speed in m/s at which the robot can stop before a stopping gesture."""
     pose = known.robot.pose
     people = known.people
     limit_mps = math.inf
@@ -329,8 +346,7 @@ def stop_limit(known: Privileged) -> float:
 def lane_past(
     known: Privileged, disks: BodyDisks, here: Here, ends: Floats, current_m: float
 ) -> float:
-    """The lane beside the way, m to the left, on which the robot best gets past what stands
-    ahead."""
+    """Return the lateral offset in metres of the best lane past standing people."""
     way, s_m, clearance = here
     beside = way.lateral(known.robot.pose, s_m)
     shift = LANE_SLOPE * LANE_AHEAD_M
@@ -348,7 +364,7 @@ def lane_past(
 def bent(
     known: Privileged, robot: Robot, here: Here, people: People, aim_m: float, limit_mps: float
 ) -> Floats:
-    """The velocity (2,) towards the lane, bent so that nobody who walks is met within HORIZON_S."""
+    """Return the velocity (2,) towards the lane without collisions within _HORIZON_S."""
     state = known.robot
     beside = here.way.lateral(state.pose, here.s_m)
     lane_m = beside + max(-1.0, min(1.0, aim_m - beside))
@@ -367,7 +383,7 @@ def bent(
 
 
 def lanes_inside(here: Here) -> Floats:
-    """The lanes with room somewhere in the next metres, and the way itself."""
+    """Return the lanes that are partly inside the free area ahead, and the path itself."""
     along, lane = np.meshgrid(here.s_m + np.array([0.5, 1.5, 3.0, 5.0]), LANES_M)
     inside = (here.clearance.at(here.way.place(along, lane)) > _EDGE_M).any(axis=1)
     lanes: Floats = LANES_M[inside | (LANES_M == 0.0)]
@@ -375,12 +391,12 @@ def lanes_inside(here: Here) -> Floats:
 
 
 def speeds_of(robot: Robot) -> list[float]:
-    """The speeds of plans, m/s, the fastest first."""
+    """Return the speeds of plans in m/s, the fastest first."""
     return [robot.cruise_mps * part / 30 for part in _SPEED_THIRTIETHS]
 
 
 def all_plans(lanes: Floats, speeds: Sequence[float]) -> Plans:
-    """Every lane at every speed in every manner, and waiting."""
+    """Return the plans: every lane at every speed with every manoeuvre, and waiting."""
     rows = [
         (lane, speed, slope, delay)
         for lane in lanes
@@ -393,12 +409,11 @@ def all_plans(lanes: Floats, speeds: Sequence[float]) -> Plans:
 
 
 def car_nearness(known: Privileged, disks: BodyDisks, ahead: Ahead) -> Floats:
-    """(K,) m: how much nearer than the clearance each plan comes to vehicles that brake for it, at
-    most CAR_DEEP_M.
+    """Return (K,) in metres: by how much each plan violates the clearance to braking vehicles.
 
-    Who enters a crossing only when every car near can still stop (`crossing_limit`) may count on
-    their stopping; what remains is to keep away from where they do. All plans near a car being bad
-    must not hide how bad each is to people.
+    At most CAR_DEEP_M, so that people are still compared when all plans are near a vehicle.
+    `crossing_limit` lets the robot enter only if all vehicles can stop, so only the places where
+    they stop are avoided.
     """
     xy, velocity, radii = car_disks(known)
     if not len(xy):
@@ -418,9 +433,12 @@ def car_nearness(known: Privileged, disks: BodyDisks, ahead: Ahead) -> Floats:
 
 
 def off_ground(known: Privileged, here: Here, ahead: Ahead, nose_m: float) -> tuple[Floats, Floats]:
-    """(K,) the share of each plan in which the base centre, or a point `nose_m` before it, is off
-    free ground, what is near weighing most; and (K,) m: how much deeper in what is solid the body
-    gets soon than it is now."""
+    """Return how far each plan leaves the free area.
+
+    nose_m: Distance in metres from the base centre to the points checked before and behind it.
+    Returns: (K,) weighted fraction of the plan outside the free area, where early steps weigh most;
+        and (K,) metres that the body soon gets deeper into obstacles.
+    """
     present = np.array(known.robot.pose)[:, None]
     pose = np.concatenate([np.broadcast_to(present, (1, *ahead.pose.shape[1:])), ahead.pose[::2]])
     along = nose_m * np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=-1)

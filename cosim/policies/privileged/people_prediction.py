@@ -1,8 +1,8 @@
-"""How near the robot's plans bring it to people, and whom it waits for.
+"""Prediction of people near the robot: gaps of plans, and yielding.
 
-People are taken to walk on as they walk. Besides, who is near may stay where it is, and who walks
-the robot's way may slow down. For who walks straight at the robot from near, or crosses and would
-meet it, it stands until they have passed: people go round what stands, and go first.
+People are predicted at constant velocity. In addition, people nearby may stop, and people walking
+in the robot's direction may slow down. For a person who walks straight at the robot, or crosses on
+a collision course, the robot stops until they have passed.
 """
 
 from __future__ import annotations
@@ -16,40 +16,42 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Floats, wrap_angles
 from cosim.core.state import DIRECTED, PERSON_RADIUS_M, People
 from cosim.episode.interfaces import Privileged
-from cosim.policies.privileged.robot_disks import BodyDisks
-from cosim.policies.privileged.rollout import STEP_TIMES_S, Ahead
+from cosim.policies.privileged.rollout import STEP_TIMES_S, Ahead, BodyDisks
 from cosim.policies.privileged.standing_groups import distances, who_stands
 from cosim.spec.robot import Robot
 
 _FOLLOWED: Final = 0.6
-"""Those who walk the robot's way may stop: they are foreseen so much slower than they walk."""
+"""Predicted fraction of the speed of people walking ahead in the robot's direction."""
 _LATER_M_PER_S: Final = 0.04
-"""What is foreseen later may come out otherwise: so much nearer a plan may come for each second
-ahead."""
+"""Reduction of the required gap per second of prediction, because predictions are uncertain."""
 _REACH_M: Final = 0.3
+"""Margin in metres of the distance at which people are considered."""
 _NEAR_M: Final = 1.5
+"""Metres within which people are also predicted to stand still or step aside."""
 _SOON: Final = 4
+"""Number of steps for which that prediction is used."""
 _DARTS_M: Final = 0.15
-"""Who is so near is foreseen to stay there, too, for so many steps, or to have come so much nearer
-by a step aside."""
+"""Length in metres of the step aside."""
 _COMES_M: Final = 4.5
+"""Metres within which the robot yields to people of events; the crowd would wait, too."""
 _COMES_RAD: Final = 0.12
-"""Who ahead walks at the robot so exactly, and is so near, is waited for (not the crowd, which
-would wait too),"""
+"""Heading error in radians below which a person walks straight at the robot."""
 _SIDEWAYS: Final = 0.7
+"""Lateral fraction of the speed above which a person crosses."""
 _MET_M: Final = 0.6
-"""and who walks across, by such a share of its pace, and would pass the robot's middle so near,"""
+"""Smallest passing distance in metres below which a crossing person is on a collision course."""
 _LEAVES_RAD: Final = 1.7
+"""Heading error in radians above which a person walks away."""
 _PAST_M: Final = 1.4
-"""until it walks away, and is so far behind or off: who is still beside the robot may turn to it
-anew,"""
+"""Distance in metres up to which a person that walks away may still turn back to the robot."""
 _WAITS_S: Final = 7.0
+"""Longest wait in seconds in one place."""
 _SAME_PLACE_M: Final = 0.5
-"""or the robot has been in the same place for so long."""
+"""Metres within which the robot is in the same place."""
 
 
 def walks(people: People) -> Floats:
-    """(N, 2) m/s: how they walk; those who stand do not."""
+    """Return (N, 2) velocities in m/s; zero for standing people."""
     speed = np.where(who_stands(people), 0.0, people.speed)
     velocity: Floats = speed[:, None] * np.column_stack(
         [np.cos(people.heading), np.sin(people.heading)]
@@ -58,7 +60,7 @@ def walks(people: People) -> Floats:
 
 
 def _followed(known: Privileged, people: People) -> Floats:
-    """`walks`, but slower for those ahead who walk the robot's way."""
+    """Return `walks` with people slowed that walk ahead in the robot's direction."""
     pose = known.robot.pose
     velocity = walks(people)
     forward = np.array([math.cos(pose.heading_rad), math.sin(pose.heading_rad)])
@@ -70,8 +72,10 @@ def _followed(known: Privileged, people: People) -> Floats:
 def gaps_to_people(
     known: Privileged, robot: Robot, ahead: Ahead, people: People, ends: Floats
 ) -> Floats:
-    """(K,) m: the smallest gap of each plan between the body and anybody. ends: the lines of those
-    who stand."""
+    """Return (K,) in metres: the smallest gap of each plan between the body and people.
+
+    ends: (M, 2, 2) lines of standing people.
+    """
     here = known.robot.pose.xy
     disks = BodyDisks.of(robot)
     moving = ~who_stands(people)
@@ -97,20 +101,20 @@ def gaps_to_people(
 
 
 def _squared(people: Floats, x: Floats, y: Floats) -> Floats:
-    """(T, K) m2 from the nearest of people (..., N, 2) to points (T, K)."""
+    """Return (T, K) squared distances in m^2 from points (T, K) to the nearest of (..., N, 2)."""
     dx, dy = people[..., 0] - x[..., None], people[..., 1] - y[..., None]
     return np.asarray((dx * dx + dy * dy).min(axis=-1))
 
 
 def bodies(ahead: Ahead, disks: BodyDisks) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
-    """x and y, (STEPS, K) m each, of the middles of the two disks of the body."""
+    """Return x and y, (STEPS, K) each in metres, of the centres of both body disks."""
     x, y, heading = ahead.pose[:, 0], ahead.pose[:, 1], ahead.pose[:, 2]
     nose_x, nose_y = disks.nose_m * np.cos(heading), disks.nose_m * np.sin(heading)
     return (x + nose_x, y + nose_y), (x - nose_x, y - nose_y)
 
 
 def _crosses(known: Privileged, offset: Floats) -> NDArray[np.bool_]:
-    """(N,): who comes from a side, and would meet the robot if both kept their velocity."""
+    """Return (N,) whether a person crosses on a collision course at constant velocity."""
     pose = known.robot.pose
     people = known.people
     forward = np.array([math.cos(pose.heading_rad), math.sin(pose.heading_rad)])
@@ -124,8 +128,10 @@ def _crosses(known: Privileged, offset: Floats) -> NDArray[np.bool_]:
 
 
 class Yielding:
-    """Whom the robot stands for: who came straight at it, or across, until past it; no longer than
-    _WAITS_S in one place."""
+    """Tracks people the robot yields to, from their approach until they have passed.
+
+    The robot waits at most _WAITS_S in one place.
+    """
 
     def __init__(self) -> None:
         self._for: set[str] = set()
@@ -133,7 +139,7 @@ class Yielding:
         self._since_s = 0.0
 
     def waits(self, known: Privileged, time_s: float) -> bool:
-        """Whether the robot is to stand now."""
+        """Return whether the robot has to wait now."""
         pose = known.robot.pose
         people = known.people
         offset = people.xy - pose.xy

@@ -1,8 +1,7 @@
-"""Foresight: what becomes of many plans at once, each driven ahead in the head with the robot's own
-steering.
+"""Rollout of many plans at once with the robot's steering.
 
-A plan is a lane beside the way, a speed, how boldly it changes lanes and after how long. The robot
-is a unicycle with the limits of its drive.
+A plan is a lane parallel to the path, a speed, the slope of the lane change and its delay. The
+robot is a unicycle with the limits of its drive.
 """
 
 from __future__ import annotations
@@ -15,23 +14,62 @@ import numpy as np
 from cosim.core.geometry import Floats, Polyline, Pose, wrap_angles
 from cosim.spec.robot import Robot
 
+
+class BodyDisks(NamedTuple):
+    """Disks that cover a robot.
+
+    nose_m: Distance of two disks before and behind the base centre.
+    radius_m: Radius of those disks.
+    around_m: Radius of a single disk around the base centre.
+    """
+
+    nose_m: float
+    radius_m: float
+    around_m: float
+
+    @classmethod
+    def of(cls, robot: Robot) -> BodyDisks:
+        quarter_m, half_m = robot.length_m / 4, robot.width_m / 2
+        return cls(
+            _up(quarter_m),
+            _up(math.hypot(quarter_m, half_m)),
+            _up(math.hypot(2.0 * quarter_m, half_m)),
+        )
+
+
+def _up(length_m: float) -> float:
+    return math.ceil(100.0 * length_m) / 100.0
+
+
 STEP_S: Final = 0.2
+"""Time step of a rollout in seconds."""
 STEPS: Final = 20
+"""Number of steps of a rollout."""
 STEP_TIMES_S: Final = STEP_S * np.arange(1, STEPS + 1)
+"""(STEPS,) times of the steps in seconds."""
 _GAIN_PER_S: Final = 2.4
+"""Gain of the turning rate on the bearing in 1/s."""
 _LOOK_M: Final = 1.0
+"""Look-ahead distance in metres."""
 TURN_FIRST_RAD: Final = 1.1
-"""A robot whose target is this far off its heading turns nearly on the spot."""
+"""Bearing in radians above which the robot turns almost on the spot."""
 _GRID_M: Final = 0.2
+"""Sampling distance of a path in metres."""
 _LOOK_CELLS: Final = round(_LOOK_M / _GRID_M)
 _BEYOND_M: Final = 10.0
+"""Length in metres of the straight extension at the end of a path."""
 GOAL_LANE_M: Final = 0.6
-"""The lane at the goal: it counts as reached from within 1 m."""
+"""Largest lane offset in metres at the goal, which counts as reached within 1 m."""
 
 
 class Plans(NamedTuple):
-    """K plans, (K,) each: m left of the way, m/s, sideways m per m of the change of lanes, s until
-    that begins."""
+    """K plans, each array (K,).
+
+    lane_m: Metres to the left of the path.
+    speed_mps: Speed in m/s; 0 is waiting.
+    slope: Lateral metres per metre of a lane change.
+    delay_s: Seconds until the lane change begins.
+    """
 
     lane_m: Floats
     speed_mps: Floats
@@ -40,7 +78,7 @@ class Plans(NamedTuple):
 
 
 class Way:
-    """A line as arrays over arc length, continued straight on beyond its end."""
+    """Path sampled over arc length, extended straight beyond its end."""
 
     def __init__(self, line: Polyline) -> None:
         self.length_m = line.length_m
@@ -60,8 +98,10 @@ class Way:
         self._last = len(s) - 1
 
     def at(self, s_m: Floats, cells_on: int = 0) -> Floats:
-        """(4, ...) at arc lengths: x, y, and the x and y of the direction to the left. cells_on: so
-        many _GRID_M on."""
+        """Return (4, ...) at arc lengths: x, y, and the unit vector to the left.
+
+        cells_on: Number of samples (_GRID_M) to look ahead.
+        """
         scaled = np.minimum(np.maximum(s_m * (1.0 / _GRID_M), 0.0), self._last - cells_on)
         cell = scaled.astype(np.intp)
         part = scaled - cell
@@ -70,19 +110,23 @@ class Way:
         return found
 
     def lateral(self, pose: Pose, s_m: float) -> float:
-        """How far left of the way a pose is, given its arc length."""
+        """Return the lateral offset in metres of a pose with this arc length, left positive."""
         x, y, left_x, left_y = self.at(np.array(s_m)).tolist()
         return float((pose.x_m - x) * left_x + (pose.y_m - y) * left_y)
 
     def place(self, s_m: Floats, lane_m: Floats) -> Floats:
-        """(..., 2) m: points beside the way."""
+        """Return (..., 2) points in metres at arc lengths and lateral offsets."""
         x, y, left_x, left_y = self.at(s_m)
         return np.stack([x + lane_m * left_x, y + lane_m * left_y], axis=-1)
 
 
 class Ahead(NamedTuple):
-    """What becomes of K plans at STEPS times. pose: (STEPS, 3, K) x, y, heading; s_m: (STEPS, K);
-    command: (2, K) v and w to be given now. Who waits does not turn either."""
+    """Rollout of K plans at STEPS times.
+
+    pose: (STEPS, 3, K) x, y and heading.
+    s_m: (STEPS, K) arc lengths.
+    command: (2, K) v and w of the first step.
+    """
 
     pose: Floats
     s_m: Floats
@@ -92,8 +136,11 @@ class Ahead(NamedTuple):
 def foresee(
     way: Way, plans: Plans, robot: Robot, pose: Pose, s_m: float, speeds: tuple[float, float]
 ) -> Ahead:
-    """Drive every plan STEPS ahead with a robot. s_m: its arc length; speeds: v m/s and w rad/s
-    now."""
+    """Roll out every plan. A waiting plan does not turn either.
+
+    s_m: Arc length of the robot in metres.
+    speeds: Current v in m/s and w in rad/s.
+    """
     count = len(plans.lane_m)
     v_step, w_step = (
         STEP_S * (robot.acceleration_mps2 * 4 / 5),

@@ -1,9 +1,8 @@
-"""`route`: the privileged baseline. Follows the reference route, waits at red, yields to people and
-cars.
+"""`route`: privileged baseline that follows the reference route, waits at red and yields.
 
-A few lanes beside the route are compared at a few speeds: a plan is good if nobody's predicted path
-(constant velocity) comes nearer than a clearance. The best lane is followed with a PD controller on
-the bearing of a point ahead; signals and gaps in traffic limit the speed before crossings.
+Lanes parallel to the route are compared at a few speeds. A plan is good if it keeps a clearance to
+all people, predicted at constant velocity. A PD controller follows the best lane by the bearing of
+a point ahead. Signals and gaps in traffic limit the speed before crossings.
 """
 
 from __future__ import annotations
@@ -17,46 +16,59 @@ from cosim.core.geometry import Floats, Polyline, wrap_angle
 from cosim.core.state import PERSON_RADIUS_M, Command
 from cosim.episode.control import clipped
 from cosim.episode.interfaces import Observation, Privileged
-from cosim.policies.privileged.robot_disks import BodyDisks
+from cosim.policies.privileged.rollout import BodyDisks
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import Robot
 
 _SPEED_THIRDS = np.array([3.0, 2.0, 1.0, 0.0])
-"""Speeds that are compared, in thirds of the robot's pace, the last one waiting."""
+"""Speeds to compare, in thirds of the cruising speed; the last is waiting."""
 
 OFFSETS_M = np.array([0.0, 0.35, -0.35, 0.7, -0.7, 1.05, -1.05, 1.4, -1.4])
+"""Lateral offsets of the lanes in metres, left positive."""
 TIMES_S = np.linspace(0.25, 3.5, 14)
+"""Prediction times in seconds."""
 SHIFT_M_PER_M = 0.35
+"""Lateral metres per metre driven in a lane change."""
 SHIFT_AFTER_M = 0.3
-"""Changing lanes: sideways metres per metre driven, and metres until it begins to show."""
+"""Metres driven before a lane change has an effect."""
 
 _LOOK_AHEAD_M = 1.2
+"""Look-ahead distance in metres."""
 GAIN_P_PER_S = 2.4
+"""Proportional gain on the bearing in 1/s."""
 GAIN_D = 0.12
+"""Derivative gain on the bearing."""
 BRAKE_MPS2 = 1.2
+"""Deceleration in m/s^2 before a crossing."""
 CAR_BRAKE_MPS2 = 3.0
+"""Assumed deceleration of vehicles in m/s^2."""
 STOP_SHORT_M = 0.55
-"""Distance of the robot's front from the edge of a crossing that it waits at."""
+"""Metres between the robot's front and a crossing at which it waits."""
 
 HELD_MPS = 0.1
-"""A robot that is slower has stopped at red, and does not start because it has crept nearer."""
+"""Speed in m/s below which the robot has stopped at red, so creeping closer does not start it."""
 CAR_RADIUS_M = 1.1
-"""A vehicle as three disks along its length."""
+"""Radius in metres of the three disks that represent a vehicle."""
 
 _CLEARANCE_M = 0.3
+"""Clearance in metres to people."""
 _TIGHT_M = 0.1
+"""Clearance in metres after waiting for long."""
 OFFSET_COST = 0.25
+"""Cost in m/s per metre of offset from the route."""
 _CHANGE_COST = 0.5
+"""Cost in m/s per metre of lane change."""
 _NEARNESS_COST = 15.0
-"""Costs in m/s of speed given up: per metre beside the route, per metre of change, per metre too
-near."""
+"""Cost in m/s per metre below the clearance."""
 
 _PATIENCE_S = 3.0
+"""Seconds of waiting after which smaller clearances are accepted."""
 SEEN_M = 11.0
+"""Metres within which obstacles are considered."""
 
 
 class Route:
-    """Drives the reference route as a careful person would; knows what no camera sees."""
+    """Follows the reference route like a careful pedestrian; privileged."""
 
     manifest = Manifest("route", version="1", rate_hz=10.0, privileged=True)
 
@@ -97,8 +109,10 @@ class Route:
 
 
 def bearing_to(known: Privileged, offset_m: float) -> float:
-    """Bearing, in the robot's frame, of the point LOOK_AHEAD_M ahead on the lane at `offset_m`
-    (left positive)."""
+    """Return the bearing, in the robot's frame, of the look-ahead point on a lane.
+
+    offset_m: Lateral offset of the lane, left positive.
+    """
     x, y, heading = known.robot.pose
     look_m = _LOOK_AHEAD_M if known.route_s_m + _LOOK_AHEAD_M < known.route.length_m else 0.8
     ahead = known.route.at(min(known.route_s_m + look_m, known.route.length_m))
@@ -111,8 +125,7 @@ def bearing_to(known: Privileged, offset_m: float) -> float:
 
 
 def crossing_limit(known: Privileged, robot: Robot) -> float:
-    """Speed in m/s at which the robot can still stop before the next crossing that it must not
-    enter now."""
+    """Return the speed in m/s at which the robot can stop before a crossing it must not enter."""
     half_m = robot.length_m / 2
     crosses_mps = robot.cruise_mps * 13 / 15
     for crossing_id, enter_s_m, leave_s_m in known.crossings:
@@ -139,7 +152,7 @@ def crossing_limit(known: Privileged, robot: Robot) -> float:
 
 
 def car_coming(known: Privileged, enter_s_m: float, leave_s_m: float) -> bool:
-    """Whether a car will reach the crossing soon and could not stop for somebody on it."""
+    """Return whether a vehicle arrives at the crossing soon and cannot stop for a person on it."""
     vehicles = known.vehicles
     if not len(vehicles):
         return False
@@ -160,13 +173,12 @@ def car_coming(known: Privileged, enter_s_m: float, leave_s_m: float) -> bool:
 def best_lane(
     known: Privileged, robot: Robot, current_m: float, *, patient: bool
 ) -> tuple[float, float]:
-    """(offset, speed): the lane beside the route worth taking and the speed to drive on it, 0 to
-    wait.
+    """Return (offset, speed) of the best lane; speed 0 to wait.
 
-    The fastest plan wins, less what it costs to leave the route, to change the lane, and to come
-    nearer to anyone than a clearance. Waiting is a plan like the others: it is no good when
-    somebody walks straight at the robot. One that has waited long takes any lane and a smaller
-    clearance.
+    The fastest plan wins after costs for leaving the route, changing the lane and coming close to
+    people. Waiting is evaluated like other plans: it fails if a person walks straight at the robot.
+
+    patient: False after a long wait; then any lane and a smaller clearance are accepted.
     """
     centres, velocities, radii = obstacles(known)
     if not len(centres):
@@ -192,15 +204,15 @@ def best_lane(
 
 
 def lateral_of(known: Privileged) -> float:
-    """Where the robot is beside its route, left positive, in metres."""
+    """Return the robot's lateral offset from its route in metres, left positive."""
     near = (known.route_s_m - 3.0, known.route_s_m + 3.0)
     return known.route.project(known.robot.pose.x_m, known.robot.pose.y_m, near)[1]
 
 
 def obstacles(known: Privileged) -> tuple[Floats, Floats, Floats]:
-    """Disks to keep away from: centres (N, 2) m, velocities (N, 2) m/s, radii (N,) m.
+    """Return disks to avoid: centres (N, 2) m, velocities (N, 2) m/s, radii (N,) m.
 
-    People near and not behind; on a crossing vehicles too, three disks each.
+    People nearby and not behind; on a crossing also vehicles, three disks each.
     """
     pose = known.robot.pose
     people = known.people
@@ -216,7 +228,7 @@ def obstacles(known: Privileged) -> tuple[Floats, Floats, Floats]:
 
 
 def car_disks(known: Privileged) -> tuple[Floats, Floats, Floats]:
-    """Vehicles as three disks each, as in `obstacles`; none away from crossings of the route."""
+    """Return vehicles as three disks each, as in `obstacles`; empty away from crossings."""
     cars = known.vehicles
     if not any(enter - 3.0 < known.route_s_m < leave for _, enter, leave in known.crossings):
         return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
@@ -231,8 +243,7 @@ def car_disks(known: Privileged) -> tuple[Floats, Floats, Floats]:
 
 
 def plans(route: Polyline, s_m: float, lateral_m: float, speeds_mps: Floats) -> Floats:
-    """Where the robot would be on each lane, at each speed, at each of TIMES_S: (lanes, speeds,
-    times, 2) metres."""
+    """Return predicted positions (lanes, speeds, times, 2) in metres at TIMES_S."""
     driven = speeds_mps[:, None] * TIMES_S
     along = np.minimum(s_m + driven, route.length_m)
     x, y = (
@@ -261,8 +272,7 @@ def smallest_gaps(
     velocities: Floats,
     radii: Floats,
 ) -> Floats:
-    """The smallest gap of each plan between the body and any predicted disk, (lanes, speeds)
-    metres."""
+    """Return (lanes, speeds): smallest gap in metres between the body and predicted disks."""
     people = centres + velocities * TIMES_S[:, None, None]
     nose = disks.nose_m * np.array([math.cos(heading_rad), math.sin(heading_rad)])
     gaps = np.full(paths.shape[:2], np.inf)

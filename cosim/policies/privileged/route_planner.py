@@ -1,7 +1,7 @@
-"""The line that the oracle follows: the reference route, led round what stands on it.
+"""Route planner of the oracle: shortest paths to the goal around standing obstacles.
 
-Searched once on the lattice of `clearance`, from the goal back to everywhere, and then drawn taut
-like a band that keeps off the edges.
+Dijkstra's algorithm on the grid of the distance field, from the goal to all points. The path is
+then smoothed like a rubber band that keeps off the edges.
 """
 
 from __future__ import annotations
@@ -10,31 +10,112 @@ from typing import Final
 
 import numpy as np
 import shapely
-from shapely.geometry import LineString
+from shapely.geometry import LineString, MultiPolygon, Polygon
 
 from cosim.core.geometry import Floats, Polyline
 from cosim.core.state import PERSON_RADIUS_M
-from cosim.policies.privileged.distance_field import LATTICE_M, Clearance
+from cosim.place import overlay
+from cosim.place.street_map import WalkableArea
 from cosim.policies.privileged.standing_groups import distances
 
+LATTICE_M: Final = 0.2
+"""Grid spacing in metres."""
+_BESIDE_M: Final = 4.5
+"""Metres from the route covered by the field; farther points count as not free."""
+_FAR_OUT_M: Final = -1.0
+"""Lower bound of the signed distance in metres."""
+
+
+class Clearance:
+    """Signed distance in metres to the edge of the free area, positive inside, near a route.
+
+    Exact on the grid, bilinear between.
+
+    free: Area for the robot's base centre, `Privileged.free`.
+    """
+
+    def __init__(self, free: Polygon | MultiPolygon, route: Polyline) -> None:
+        self.cells = _beside(route)
+        self.low = self.cells.min(axis=0) - 1
+        shape = self.cells.max(axis=0) - self.low + 2
+        self.columns = int(shape[1])
+        self._most = shape - 2
+        near = overlay.intersection(free, LineString(route.points).buffer(_BESIDE_M + 2.0))
+        depth = WalkableArea(near).signed_distance(self.cells * LATTICE_M)
+        self.depth = np.full(int(shape.prod()), _FAR_OUT_M)
+        self.depth[self.rows(self.cells)] = np.maximum(depth, _FAR_OUT_M)
+
+    def rows(self, cells: np.ndarray) -> np.ndarray:
+        """Return (N,) indices into `depth` of grid points (N, 2)."""
+        at: np.ndarray = (cells[:, 0] - self.low[0]) * self.columns + cells[:, 1] - self.low[1]
+        return at
+
+    def at(self, xy: Floats) -> Floats:
+        """Return (...) distances in metres at points (..., 2)."""
+        scaled = xy / LATTICE_M - self.low
+        u, v = (
+            np.clip(scaled[..., 0], 0.0, self._most[0]),
+            np.clip(scaled[..., 1], 0.0, self._most[1]),
+        )
+        i, j = u.astype(np.intp), v.astype(np.intp)
+        u, v = u - i, v - j
+        first = i * self.columns + j
+        here, there = (
+            self.depth.take(row) * (1.0 - v) + self.depth.take(row + 1) * v
+            for row in (first, first + self.columns)
+        )
+        depth: Floats = here + u * (there - here)
+        return depth
+
+    def uphill(self, xy: Floats) -> Floats:
+        """Return (N, 2) gradients of the distance at points (N, 2), of length 1 at most."""
+        half = 0.5 * LATTICE_M
+        ways = [
+            (self.at(xy + step) - self.at(xy - step)) / LATTICE_M
+            for step in (np.array([half, 0.0]), np.array([0.0, half]))
+        ]
+        return np.stack(ways, axis=-1)
+
+
+def _beside(route: Polyline) -> np.ndarray:
+    """Return (N, 2) integer grid points near a route."""
+    count = int(_BESIDE_M / LATTICE_M)
+    steps = np.arange(-count, count + 1)
+    disk = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
+    disk = disk[(disk**2).sum(axis=1) <= count * count]
+    along = np.unique(np.round(route.resampled(1.0).points / LATTICE_M).astype(int), axis=0)
+    low = along.min(axis=0) - count
+    near = np.zeros(along.max(axis=0) + count - low + 1, dtype=bool)
+    for offset in disk - low:
+        near[tuple((along + offset).T)] = True
+    cells: np.ndarray = np.argwhere(near) + low
+    return cells
+
+
 _WANTED_M: Final = 0.5
-"""Room to either side that is worth a way round."""
+"""Wanted distance in metres to the edge of the free area."""
 _TIGHT_COST: Final = 6.0
-"""How many times dearer a metre without any room is."""
+"""Extra cost factor of a metre at the edge."""
 _ASIDE_COST: Final = 0.15
-"""What a metre costs more for each metre that it lies beside the route."""
+"""Extra cost factor per metre of distance from the route."""
 _LEAST_M: Final = 0.03
+"""Smallest distance in metres to the edge for a grid point to be used."""
 _PERSON_M: Final = PERSON_RADIUS_M + 0.45
+"""Metres around a standing person that are avoided."""
 _PERSON_COST: Final = 60.0
-"""How near to who stands, and how many times dearer, a metre is then."""
+"""Extra cost factor of a metre near a standing person."""
 _STEP_M: Final = 0.4
+"""Metres between points of a path."""
 _ROUNDS: Final = 60
+"""Number of smoothing iterations."""
 _PUSH: Final = 0.3
+"""Step of the push off the edges in one iteration."""
 _NEIGHBOURS: Final = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))
+"""Offsets of half of the 16 grid neighbours; the graph is undirected."""
 
 
 class Guide:
-    """Ways to the end of a route from wherever the robot is."""
+    """Paths to the end of a route from any position."""
 
     def __init__(self, clearance: Clearance, route: Polyline) -> None:
         self.clearance = clearance
@@ -55,8 +136,11 @@ class Guide:
         self.search(np.zeros((0, 2, 2)))
 
     def search(self, ends: Floats) -> None:
-        """Find the ways anew, round people who stand along lines (M, 2, 2) m."""
-        from scipy.sparse import csr_array  # 0.2 s, for those who are guided
+        """Recompute the paths.
+
+        ends: (M, 2, 2) lines in metres along which people stand.
+        """
+        from scipy.sparse import csr_array  # takes 0.2 s to import
         from scipy.sparse.csgraph import dijkstra
 
         count = len(self._points)
@@ -74,8 +158,7 @@ class Guide:
         )
 
     def from_here(self, xy: Floats) -> Polyline:
-        """The way from (2,) metres to the end of the route; the route itself where none is
-        known."""
+        """Return the path from (2,) metres to the route's end; the route itself if unreachable."""
         known = np.isfinite(self._far)
         if not known.any():
             return self._route
@@ -92,7 +175,7 @@ class Guide:
         return int(np.argmin(np.where(among, off[:, 0] ** 2 + off[:, 1] ** 2, np.inf)))
 
     def _taut(self, points: Floats) -> Polyline:
-        """The line drawn taut, but pushed off what is nearer than _WANTED_M; its ends stay."""
+        """Return the smoothed line, pushed off edges nearer than _WANTED_M; its ends are fixed."""
         points = points.copy()
         for _ in range(_ROUNDS):
             inner = points[1:-1]
@@ -103,7 +186,7 @@ class Guide:
 
 
 def _aside(points: Floats, route: Polyline) -> Floats:
-    """(N,) metres from points (N, 2) to a route."""
+    """Return (N,) distances in metres from points (N, 2) to a route."""
     line = LineString(route.points)
     shapely.prepare(line)
     return np.asarray(shapely.distance(line, shapely.points(points)), dtype=float)

@@ -1,15 +1,14 @@
-"""`social_force`: people and edges push the robot, its goal pulls it.
+"""`social_force`: repulsion by people and edges, attraction by the goal.
 
-Sources: goal and edges after D. Helbing, P. Molnar, "Social force model for pedestrian dynamics",
-Physical Review E 51, 4282 (1995), without its attractions by friends and shop windows; people after
-A. Johansson, D. Helbing, P. Shukla, "Specification of the social force pedestrian model by
-evolutionary adjustment to video tracking data", Advances in Complex Systems 10, 271 (2007), its
-second elliptical form, fitted to tracks of real people: the force of 1995 reaches so short that a
-robot that turns slowly drives into whoever stands. Constants are named below.
+Goal and edges: D. Helbing, P. Molnar, "Social force model for pedestrian dynamics", Physical Review
+E 51, 4282 (1995), without attraction by friends and shop windows. People: A. Johansson, D. Helbing,
+P. Shukla, "Specification of the social force pedestrian model by evolutionary adjustment to video
+tracking data", Advances in Complex Systems 10, 271 (2007), second elliptical form, fitted to tracks
+of people. The force of 1995 is too short-ranged for a robot that turns slowly.
 
-Their people are points that step sideways at will and waver at random. Distances here are between
-the outlines of robot and person, the robot turns towards the velocity that the forces would give
-it, and where it meets somebody head-on it leans to the right.
+The papers model people as points that step sideways freely and fluctuate at random. Here distances
+are between the outlines of robot and person. The robot turns towards the velocity that the forces
+would give, and passes people head-on on the right.
 """
 
 from __future__ import annotations
@@ -29,39 +28,42 @@ from cosim.spec.manifest import Manifest
 from cosim.spec.robot import Robot
 
 DESIRED_MPS: Final = 1.34
-"""The paper's mean desired speed; a slower robot's pace is lower."""
+"""Mean desired speed of the paper in m/s; limited by the robot's cruising speed."""
 RELAXATION_S: Final = 0.5
-"""tau: how fast the desired velocity is taken up again."""
+"""Relaxation time tau in seconds towards the desired velocity."""
 PEOPLE_MPS2: Final = 4.30
+"""Strength A of the repulsion by people in m/s^2."""
 PEOPLE_M: Final = 1.07
-"""A and B of the repulsion by people."""
+"""Range B of the repulsion by people in metres."""
 STEP_AHEAD_S: Final = 0.5
-"""Delta t: the relative motion over this time stretches the ellipse."""
+"""Delta t in seconds: relative motion over this time stretches the ellipse."""
 BEHIND: Final = 0.06
-"""lambda: what is right behind counts for so much."""
+"""Anisotropy lambda: weight of a person directly behind."""
 LEANS_RAD: Final = math.radians(15.0)
-"""A push is turned by so much, so that the robot passes on the right of whoever is straight
-ahead."""
+"""Rotation of pushes in radians, so that the robot passes people straight ahead on their right."""
 EDGES_M2PS2: Final = 10.0
+"""Repulsive potential U0 of edges in m^2/s^2."""
 EDGES_M: Final = 0.2
-"""U0 and R of the repulsive potential of edges."""
+"""Range R of the repulsive potential of edges in metres."""
 ACTS_FOR_S: Final = 0.5
-"""Forces change the velocity over this time to give the one that the robot turns to."""
+"""Seconds over which forces change the velocity to obtain the one to turn to."""
 TOUCHING_M: Final = 0.05
-"""Outlines are never nearer than this for the force, which would grow beyond all bounds."""
+"""Lower bound of distances between outlines in metres, which bounds the force."""
 _LOOK_M: Final = 2.0
+"""Look-ahead distance in metres along the route."""
 _GAIN_PER_S: Final = 2.0
+"""Gain of the turning rate on the bearing in 1/s."""
 _NEAR_M: Final = 8.0
+"""Metres within which people push."""
 
 
 class SocialForce:
-    """Pushed by people and edges, pulled along its route (Helbing and Molnar 1995); knows what no
-    camera sees."""
+    """Social force model (Helbing and Molnar 1995) along the reference route; privileged."""
 
     manifest = Manifest("social_force", version="2", rate_hz=10.0, camera=None, privileged=True)
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Nothing to forget."""
+        """Do nothing: the policy has no state."""
 
     def act(self, observation: Observation) -> Command:
         known = observation.privileged
@@ -93,18 +95,20 @@ def force(known: Privileged, robot: Robot, velocity: Floats) -> Floats:
 
 
 def bodies_m(robot: Robot) -> float:
-    """Between the middles of a robot and of a person that it touches with its front, a centimetre
-    apart."""
+    """Return the distance in metres between the centres of the robot and a person 1 cm ahead of
+    it."""
     return robot.length_m / 2 + 0.01 + PERSON_RADIUS_M
 
 
 def from_people(people: People, robot: Robot, here: Floats, velocity: Floats) -> Floats:
-    """(N, 2) m/s2: the push of each person on a robot at `here` (2,) that drives at `velocity`
-    (2,).
+    """Return (N, 2) in m/s^2: the push of each person on the robot.
 
-    d: from the person to the robot, between their outlines; y: how the person moves relative to the
-    robot in Delta t; 2 b = sqrt((|d| + |d - y|)^2 - |y|^2): the push is A exp(-b / B) (|d| + |d -
-    y|) / 2 b along the mean of the directions of d and d - y.
+    Let d point from person to robot between their outlines, and y be the person's motion relative
+    to the robot in Delta t. With 2 b = sqrt((|d| + |d - y|)^2 - |y|^2), the push is A exp(-b / B)
+    (|d| + |d - y|) / 2 b along the mean of the directions of d and d - y.
+
+    here: (2,) the robot's position in metres.
+    velocity: (2,) the robot's velocity in m/s.
     """
     away = here - people.xy
     r = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-9)
@@ -125,8 +129,10 @@ def from_people(people: People, robot: Robot, here: Floats, velocity: Floats) ->
 
 
 def seen(pushes: Floats, direction: Floats) -> Floats:
-    """Pushes (N, 2), turned by LEANS_RAD and weaker for what is not ahead: w = lambda + (1 -
-    lambda) (1 + cos) / 2."""
+    """Rotate pushes (N, 2) by LEANS_RAD and weight them by direction.
+
+    w = lambda + (1 - lambda) (1 + cos) / 2.
+    """
     strength = np.maximum(np.hypot(pushes[:, 0], pushes[:, 1]), 1e-9)
     ahead = -pushes @ direction / strength
     cos, sin = math.cos(LEANS_RAD), math.sin(LEANS_RAD)
@@ -136,7 +142,7 @@ def seen(pushes: Floats, direction: Floats) -> Floats:
 
 
 def from_edge(known: Privileged, robot: Robot, here: Floats) -> Floats:
-    """(2,) m/s2: the push of the nearest edge of the free area; back inside from beyond it."""
+    """Return (2,) in m/s^2: the push of the nearest edge into the free area."""
     point = shapely.Point(here)
     edge = known.free.boundary
     nearest = np.asarray(edge.interpolate(edge.project(point)).coords[0])

@@ -1,8 +1,7 @@
-"""Who stands together: people who talk or queue, or stand so close that the robot does not fit
-between them.
+"""Groups of standing people: talking, queueing, or too close for the robot to pass between them.
 
-A group is one obstacle, passed round as a whole. It is made of the lines between its members, each
-with the width of a person: nothing passes between two of them without crossing a line.
+A group is one obstacle made of lines between its members, each as wide as a person. No path leads
+between two members without crossing a line.
 """
 
 from __future__ import annotations
@@ -16,20 +15,21 @@ from cosim.core.geometry import Floats
 from cosim.core.state import PERSON_RADIUS_M, People
 
 STANDS_MPS: Final = 0.15
+"""Speed in m/s below which a person stands."""
 _GAP_M: Final = 0.9
-"""Two who leave less than this between their shoulders are not to be passed between."""
+"""Metres between shoulders below which the robot does not pass between two people."""
 FELLOWS_M: Final = 2.5
-"""Talkers and queuers this near to each other belong together, whatever the gap."""
+"""Metres within which talking or queueing people form a group."""
 
 
 def who_stands(people: People) -> np.ndarray:
-    """(N,) whether each of them stands."""
+    """Return (N,) whether each person stands."""
     still: np.ndarray = people.speed < STANDS_MPS
     return still
 
 
 def groups(people: People) -> list[list[int]]:
-    """Rows of those who stand, group by group; one alone is a group of one."""
+    """Return rows of standing people, group by group; a person alone is a group of one."""
     rows = np.flatnonzero(who_stands(people)).tolist()
     left = set(rows)
     found = []
@@ -61,8 +61,10 @@ def _together(people: People, a: int, b: int) -> bool:
 
 
 def lines(people: People) -> Floats:
-    """(M, 2, 2) m: the lines between any two of each group; of one who stands alone, a line without
-    length."""
+    """Return (M, 2, 2) in metres: lines between all pairs of each group.
+
+    A person alone gives a line of length zero.
+    """
     ends = [
         (people.xy[a], people.xy[b])
         for group in groups(people)
@@ -72,7 +74,7 @@ def lines(people: People) -> Floats:
 
 
 def distances(points: Floats, ends: Floats) -> Floats:
-    """Distance from points (..., 2) to lines (M, 2, 2), (..., M) metres."""
+    """Return (..., M) distances in metres from points (..., 2) to lines (M, 2, 2)."""
     start = ends[:, 0]
     along = ends[:, 1] - ends[:, 0]
     away = points[..., None, :] - start

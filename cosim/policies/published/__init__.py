@@ -1,2 +1,1 @@
-"""Networks as others published them: what their graphs want and answer, and the commands that make
-these graphs."""
+"""Published networks: their manifests, and commands that generate their graphs."""

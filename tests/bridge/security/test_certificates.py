@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from bridge.security import refusal, settings
+from bridge.security import identity, settings
 from bridge.security.authority import issue, make_authority
 from bridge.security.identity import checked_identity, identity_in
 from bridge.session import open_session
@@ -193,7 +193,7 @@ def test_a_hub_that_does_not_fit_is_refused_in_words(
         monkeypatch.context() as patch,
         pytest.raises(EngineError, match="by the same protocol"),
     ):
-        patch.setattr(refusal, "_PATIENCE_S", 0.2)  # who speaks no TLS never answers
+        patch.setattr(identity, "_PATIENCE_S", 0.2)  # who speaks no TLS never answers
         open_session(
             Connection(role="worker", connect=plain.replace("tcp", "tls"), tls=str(made / "worker"))
         )

@@ -29,7 +29,7 @@ from cosim.core.errors import unknown
 from cosim.results.metrics import METRICS, SUCCESS_IN_WORDS
 from cosim.results.table import table_of
 from cosim.spec.scenario import CityMap, Suite
-from scenarios.events.table import EVENT_KINDS
+from scenarios.events import EVENT_KINDS
 from scenarios.suites.catalog import SUITES, load_suite
 from scenarios.tools.viewing.event_sheet import COLUMNS
 from tests.support.documents import text_of

@@ -1,1 +1,1 @@
-"""DroNet: its manifest, and its graph made of the weights that its authors publish."""
+"""DroNet: its manifest, and its graph generated from the published weights."""

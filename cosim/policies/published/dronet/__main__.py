@@ -1,4 +1,4 @@
-"""Writes DroNet as an ONNX graph, from its published weights.
+"""Convert the published weights of DroNet to an ONNX graph.
 
 python -m cosim.policies.published.dronet model_weights.h5 [-o FOLDER]
 

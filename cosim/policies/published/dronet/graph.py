@@ -1,9 +1,9 @@
-"""DroNet's graph, and what it is made of.
+"""Build DroNet's graph.
 
 Source: A. Loquercio et al., "DroNet: learning to fly by driving", IEEE Robotics and Automation
-Letters 3 (2018): a ResNet of three blocks, each of half the size of its input, then steering and
-the probability of a collision. Tensors are called as the layers in the file of weights, and joined
-as the `model_struct.json` published beside it tells.
+Letters 3 (2018). A ResNet of three blocks, each of which halves the size, then steering and the
+probability of a collision. Tensors have the layer names of the weight file, connected as in the
+published `model_struct.json`.
 """
 
 from __future__ import annotations
@@ -20,18 +20,20 @@ from cosim.policies.onnx.manifest import FileFacts
 from cosim.policies.onnx.weights import NetworkFile
 
 _SIDE: Final = 200
+"""Side of the picture in pixels."""
 _PLANES: Final = (32, 32, 64, 128)
-"""Channels of the first layer, and of each block."""
+"""Channels of the first layer and of each block."""
 _CELLS: Final = 7 * 7
-"""What is left of the picture after the last block."""
+"""Pixels after the last block."""
 _EPSILON: Final = 1e-3
+"""Epsilon of batch normalisation in Keras."""
 
 KerasWeights = dict[str, NDArray[np.float32]]
-"""By their paths in the file, as "conv2d_1/conv2d_1/kernel:0"."""
+"""Arrays by their path in the file, such as "conv2d_1/conv2d_1/kernel:0"."""
 
 
 def read_keras_weights(data: bytes) -> KerasWeights:
-    """All arrays of a file of weights of Keras. Raises ValueError for what is none."""
+    """Return all arrays of a Keras weight file. Raises ValueError for an invalid file."""
     import h5py
 
     found: KerasWeights = {}
@@ -49,13 +51,16 @@ def read_keras_weights(data: bytes) -> KerasWeights:
 
 
 def dronet_graph(weights: KerasWeights) -> bytes:
-    """The graph as ONNX: `image` (N, 1, 200, 200), grey / 255, to `steering` (N, 1) and
-    `collision_prob` (N, 1). Raises ValueError where the weights are not those of this network."""
+    """Build the ONNX graph. Raises ValueError for weights of another network.
+
+    Input `image` (N, 1, 200, 200) is grey / 255. Outputs are `steering` (N, 1) and `collision_prob`
+    (N, 1).
+    """
     return _Layers(weights).dronet()
 
 
 class _Layers:
-    """Layers by the names that they have in the file; each gives the name of its output."""
+    """Builds layers by their names in the file; each returns the name of its output."""
 
     def __init__(self, weights: KerasWeights) -> None:
         self._writer = GraphWriter("dronet")
@@ -79,8 +84,7 @@ class _Layers:
         )
 
     def _block(self, x: str, i: int, planes: int, more: int) -> str:
-        """A residual block: two convolutions, each after its normalisation, beside one of single
-        pixels."""
+        """Add a residual block: two normalised convolutions with a 1 x 1 shortcut."""
         norm, conv = 2 * i - 1, 3 * i - 1
         y = self._conv(self._norm_relu(x, norm, planes), conv, 3, (planes, more), 2)
         y = self._norm_relu(y, norm + 1, more)

@@ -1,2 +1,1 @@
-"""OpenBot's driving network: its manifest, and its graph made of the file that its authors
-publish."""
+"""OpenBot's driving network: its manifest, and its graph generated from the published file."""

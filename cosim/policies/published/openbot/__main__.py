@@ -1,4 +1,4 @@
-"""Writes OpenBot's driving network as an ONNX graph, from its published file.
+"""Convert the published file of OpenBot's driving network to an ONNX graph.
 
 python -m cosim.policies.published.openbot autopilot_float.tflite [-o FOLDER]
 

@@ -1,13 +1,11 @@
-"""The graph of OpenBot's driving network, and what it is made of.
+"""Build the graph of OpenBot's driving network.
 
 Source: M. Müller and V. Koltun, "OpenBot: turning smartphones into robots", arXiv 2008.10631:
-convolutions see the picture, and the command goes in at three places. The file is translated
-operator by operator; number 7 of its tensors is called t7, the weights of its operator 7 are w7 and
-b7, or p7.
+convolutions of the picture, with the command as input of three layers. The file is converted
+operator by operator. Tensor 7 is named t7; the weights of operator 7 are w7 and b7, or p7.
 
-Most weights are int8 with a scale in the file. The graph computes in float32 with what they stand
-for, where TensorFlow Lite rounds to int8 what is multiplied with them, too: its wheels differ from
-these by up to 0.02.
+Most weights are int8 with a scale. The graph computes in float32 with dequantized weights, while
+TensorFlow Lite also quantizes the activations. Its wheel speeds differ by up to 0.02.
 """
 
 from __future__ import annotations
@@ -26,20 +24,22 @@ from cosim.policies.published.openbot.lite_file import (
 )
 
 _INPUTS: Final = {"img_input": ("img", (96, 256, 3)), "cmd_input": ("cmd", (1,))}
-"""What the inputs of the file are called here, and their shapes without the first axis."""
+"""Names and shapes, without the first axis, of the file's inputs."""
 _OUTPUT: Final = ("left_right", (2,))
+"""Name and shape, without the first axis, of the output."""
 
 
 def openbot_graph(model: LiteModel) -> bytes:
-    """The graph as ONNX: `img` (N, 96, 256, 3), RGB / 255, and `cmd` (N, 1), -1 left, 0 straight, 1
-    right, to `left_right` (N, 2), the wheels. Raises ValueError for a model with other inputs,
-    outputs, or ways to go on."""
+    """Build the ONNX graph. Raises ValueError for a model with other inputs, outputs or operators.
+
+    Inputs are `img` (N, 96, 256, 3), RGB / 255, and `cmd` (N, 1): -1 left, 0 straight, 1 right.
+    Output `left_right` (N, 2) is the wheel speeds.
+    """
     return _Translation(model).whole()
 
 
 class _Translation:
-    """The operators of a model as ONNX has them. Pictures have their channels last there and first
-    here."""
+    """Converts operators to ONNX; channels are last in the file and first in ONNX."""
 
     def __init__(self, model: LiteModel) -> None:
         self._model = model
@@ -49,11 +49,11 @@ class _Translation:
     def whole(self) -> bytes:
         shapes = {self._tensor(i).name: self._tensor(i).shape for i in self._model.inputs}
         wanted = {name: (1, *shape) for name, (_, shape) in _INPUTS.items()}
-        told = [self._tensor(i).shape for i in self._model.outputs]
+        found = [self._tensor(i).shape for i in self._model.outputs]
         name, shape = _OUTPUT
-        if shapes != wanted or told != [(1, *shape)]:
+        if shapes != wanted or found != [(1, *shape)]:
             raise ValueError(
-                f"has inputs {shapes} and outputs {told}; wanted are {wanted} and {[(1, *shape)]}"
+                f"has inputs {shapes} and outputs {found}; wanted are {wanted} and {[(1, *shape)]}"
             )
         self._names = {i: _INPUTS[self._tensor(i).name][0] for i in self._model.inputs}
         for i in self._model.inputs:
@@ -69,7 +69,7 @@ class _Translation:
         return self._writer.whole(inputs, {name: ("N", *shape)})
 
     def _translated(self, number: int, operator: LiteOperator) -> str:
-        """The name of what the operator makes."""
+        """Convert an operator; return the name of its output."""
         out = f"t{operator.output}"
         made = f"{out}_" if operator.relu else out
         if operator.kind == "concat":
@@ -88,7 +88,7 @@ class _Translation:
         return self._writer.operator("Relu", out, made) if operator.relu else out
 
     def _by_channel(self, made: str, number: int, operator: LiteOperator) -> None:
-        """A sum or product with one number for each channel."""
+        """Add a sum or product with one number per channel."""
         x, by = operator.inputs
         numbers = self._tensor(by).numbers
         axes = len(self._tensor(x).shape)
@@ -100,7 +100,7 @@ class _Translation:
         self._writer.operator(operator.kind.capitalize(), made, self._name(x), param)
 
     def _flat(self, tensor: int) -> str:
-        """A picture as a row of numbers, its channels last."""
+        """Flatten a picture with its channels last."""
         x = self._name(tensor)
         if len(self._tensor(tensor).shape) == 4:
             x = self._writer.operator(
@@ -111,7 +111,7 @@ class _Translation:
         return x
 
     def _weights(self, number: int, operator: LiteOperator) -> list[str]:
-        """Of a convolution, or a product with a matrix: a kernel, and what is added."""
+        """Return kernel and bias of a convolution or matrix product."""
         kernel, bias = (self._tensor(i).numbers for i in operator.inputs[1:])
         if kernel is None or bias is None or kernel.ndim != (4 if operator.kind == "conv" else 2):
             raise ValueError(f"operator {number}: is a {operator.kind} without weights")

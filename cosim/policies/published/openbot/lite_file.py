@@ -1,7 +1,6 @@
-"""What a TensorFlow Lite file holds: tensors, and operators one behind the other.
+"""Read tensors and operators of a TensorFlow Lite file.
 
-Such a file is a FlatBuffer; this reads the few fields of it that are named here, by their numbers
-in schema.fbs.
+The file is a FlatBuffer. Only the fields below are read, by their numbers in schema.fbs.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ _GRAPHS = 2
 _BUFFERS = 4
 """Fields of a model."""
 _CODE: Final = 0
-"""Of a kind of operators."""
+"""Field of an operator code."""
 _TENSORS = 0
 _INPUTS = 1
 _OUTPUTS = 2
@@ -43,9 +42,9 @@ _OPTIONS = 4
 _PADDING = 0
 _STRIDE_W = 1
 _STRIDE_H = 2
-"""Fields of the options of a convolution; padding is 0 for that which keeps the size."""
+"""Fields of the options of a convolution; padding 0 keeps the size."""
 _DATA: Final = 0
-"""Of a buffer."""
+"""Field of a buffer."""
 _FLOAT32 = 0
 _INT8 = 9
 """Types of a tensor's numbers."""
@@ -54,14 +53,15 @@ _DTYPES: Final = {_FLOAT32: "<f4", _INT8: "i1"}
 LiteKind = Literal["add", "concat", "conv", "dense", "mul"]
 _KINDS: Final[dict[int, LiteKind]] = {0: "add", 2: "concat", 3: "conv", 9: "dense", 18: "mul"}
 _ACTIVATION: Final[dict[LiteKind, int]] = {"add": 0, "concat": 1, "conv": 3, "dense": 0, "mul": 0}
-"""Where in the options of each kind it stands what the result goes through: 0 for nothing, 1 for a
-ReLU."""
+"""Field of the activation in the options of each operator: 0 is none, 1 is ReLU."""
 
 
 @dataclass(frozen=True)
 class LiteTensor:
-    """numbers: float32 of its shape, those that are int8 in the file multiplied out; None for what
-    is computed."""
+    """Tensor.
+
+    numbers: float32, dequantized if int8 in the file; None for computed tensors.
+    """
 
     name: str
     shape: tuple[int, ...]
@@ -70,8 +70,12 @@ class LiteTensor:
 
 @dataclass(frozen=True)
 class LiteOperator:
-    """inputs, output: which tensors; relu: whether its result goes through one; strides: down and
-    right."""
+    """Operator.
+
+    inputs, output: Indices of tensors.
+    relu: Whether the output passes through a ReLU.
+    strides: Down and right.
+    """
 
     kind: LiteKind
     inputs: tuple[int, ...]
@@ -82,7 +86,10 @@ class LiteOperator:
 
 @dataclass(frozen=True)
 class LiteModel:
-    """inputs, outputs: which tensors."""
+    """Model.
+
+    inputs, outputs: Indices of tensors.
+    """
 
     tensors: tuple[LiteTensor, ...]
     inputs: tuple[int, ...]
@@ -91,7 +98,7 @@ class LiteModel:
 
 
 def read_lite_file(data: bytes) -> LiteModel:
-    """A model of one graph. Raises ValueError for what is none, or holds what is not known here."""
+    """Read a model with one graph. Raises ValueError for an invalid file or unknown operators."""
     if data[4:8] != _MARK:
         raise ValueError("is no TensorFlow Lite file: it begins otherwise")
     try:
@@ -148,8 +155,7 @@ def _operator(row: _Row, codes: list[int]) -> LiteOperator:
 
 
 class _Row:
-    """A table of the file at a place of it; its fields by their numbers, 0 or nothing where it has
-    none."""
+    """FlatBuffer table at an offset of the file; missing fields are 0 or empty."""
 
     def __init__(self, data: bytes, at: int) -> None:
         from flatbuffers.table import Table
@@ -157,7 +163,7 @@ class _Row:
         self._table: Any = Table(data, at)
 
     def number(self, field: int, kind: str) -> int:
-        """kind: as `struct` has it."""
+        """Return a number. kind: format character of `struct`."""
         at = self._at(field)
         return (
             int(struct.unpack_from(f"<{kind}", self._table.Bytes, at + self._table.Pos)[0])
