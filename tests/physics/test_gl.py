@@ -188,17 +188,6 @@ def test_a_picture_depends_on_its_moment_alone(world: BulletWorld) -> None:
     assert same(first, again) and same(first, fresh)
 
 
-def test_two_cameras_take_turns(world: BulletWorld) -> None:
-    """Cameras of one process do not disturb each other."""
-    robot, street = moment(world)
-    elsewhere = moment(world, 5)
-    with GlCamera(world, SPEC) as one, GlCamera(world, CameraSpec(64, 64)) as other:
-        first = one.render(robot, street)
-        second = other.render(*elsewhere)
-        assert same(one.render(robot, street), first)
-        assert same(other.render(*elsewhere), second)
-
-
 def test_the_robot_is_seen_from_outside_only(world: BulletWorld) -> None:
     """Its body is in a picture for humans, standing on the ground, and not in its own."""
     robot, street = moment(world)

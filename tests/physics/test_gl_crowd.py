@@ -16,7 +16,7 @@ from cosim.core.state import LABELS, Age, People
 from physics.cameras.gl import crowd as crowds
 from physics.cameras.gl.camera import NOON
 from physics.cameras.gl.context import available, context
-from physics.cameras.gl.crowd import LEVEL_PX, CrowdDrawing, PeopleSeen
+from physics.cameras.gl.crowd import CrowdDrawing, PeopleSeen
 from physics.cameras.gl.lighting import lighting_of
 from physics.cameras.gl.shading import SceneBlocks, anchor_of, camera_matrix
 from physics.cameras.gl.shots import Shots
@@ -26,7 +26,6 @@ from physics.cameras.view import Shot, shot
 from physics.people.appearance import ALL, look_of
 from physics.people.body import body
 from physics.people.clips import own_clips
-from physics.people.figure import LEVELS, RIBBONS
 from physics.people.poses import poses
 from tests.support.blend import skinned
 
@@ -109,41 +108,6 @@ def test_levels_of_detail_keep_the_silhouettes(
     assert changed < 0.03 * total
 
 
-@pytest.mark.parametrize("level", range(1, LEVELS))
-def test_each_level_is_like_full_detail_where_it_begins(
-    crowd: CrowdDrawing, monkeypatch: pytest.MonkeyPatch, level: int
-) -> None:
-    """At the size at which a level begins it changes less than 3 % of silhouette pixels, ribbons
-    less than 4 %."""
-    far = 1.75 / LEVEL_PX[level - 1] * 0.5 * WIDE[1] / np.tan(np.radians(37.5))
-    taken = shot((-1.02 * far, 0.0, 0.6), (0.0, 0.0, 0.6), WIDE, 75.0)
-    changed = total = 0
-    for i in range(24):
-        age = (Age.ADULT, Age.ADULT, Age.CHILD, Age.ELDERLY)[i % 4]
-        people = People.of(
-            (f"c{i}",),
-            [[0.0, 0.0]],
-            [1.7 * i],
-            [1.3 * (i % 3 > 0)],
-            ("stand",),
-            [0.37 * i],
-            age=age,
-        )
-        shown = []
-        for forced in (level, 0):
-            monkeypatch.setattr(
-                crowds, "levels", lambda shots, whose, xy, z_m, k=forced: np.full(len(xy), k)
-            )
-            shown.append(mask(crowd, people, taken))
-        changed = changed + int((shown[0] ^ shown[1]).sum())
-        total = total + int(shown[1].sum())
-    print(
-        f"level {level}, {LEVEL_PX[level - 1]:.0f} pixels tall: {100 * changed / total:.2f} "
-        f"% changed"
-    )
-    assert changed < (0.04 if level == RIBBONS else 0.03) * total
-
-
 def test_the_card_skins_as_the_reference_does(crowd: CrowdDrawing) -> None:
     """The outline of a walker near by is that of the mesh skinned by numpy: head, hands and feet
     where they belong."""
@@ -164,10 +128,3 @@ def test_the_card_skins_as_the_reference_does(crowd: CrowdDrawing) -> None:
     v = 200.0 - focal * (world[:, 2] - 1.0) / world[:, 0]
     assert (columns.min(), columns.max() + 1) == pytest.approx((u.min(), u.max()), abs=2.0)
     assert (rows.min(), rows.max() + 1) == pytest.approx((v.min(), v.max()), abs=2.0)
-
-
-def test_nobody_is_drawn_as_nothing(crowd: CrowdDrawing) -> None:
-    """Without people the picture stays empty, and drawing does no harm."""
-    taken = shot((0.0, 0.0, 0.6), (10.0, 0.0, 0.6), WIDE, 75.0)
-    assert not mask(crowd, street(0, 0), taken).any()
-    crowd.draw("moving", shadows=True)

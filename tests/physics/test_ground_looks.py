@@ -4,7 +4,6 @@ sidewalk is a road."""
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections import Counter
 
 import cv2
@@ -23,7 +22,7 @@ from physics.cameras.bullet_camera import BulletCamera
 from physics.cameras.gl import context
 from physics.cameras.gl.camera import GlCamera
 from physics.dynamics.world import BulletWorld
-from physics.ground.materials import MATERIALS, PAVINGS, SEEN_AS, friction
+from physics.ground.materials import PAVINGS, SEEN_AS
 from physics.ground.tiles import SURFACES, Key, build_tile, surface
 from physics.street.covers import covers_in
 from physics.street.street_surface import StreetSurface
@@ -103,25 +102,6 @@ def test_sidewalks_roads_and_open_ground_share_no_material_and_no_colour() -> No
             )
     drawn = [look.drawn for look in GROUND_LOOKS.values()]
     assert len(set(drawn)) == len(drawn)
-
-
-def test_no_tile_shows_ground_as_a_sidewalk_or_a_sidewalk_as_anything_else() -> None:
-    """On every tile of a map, with sidewalks of every material, patches of ground have no layer of
-    a sidewalk, and patches of a sidewalk have one; wheels rub on it as on its material."""
-    seen = Counter[str]()
-    for street, key in itertools.product([StreetSurface(MAP, seed) for seed in (3, 4, 10)], KEYS):
-        finish = street.finish(key)
-        for patch in (*street.chunk(key).ground, *street.covers(key), *finish.laid):
-            if patch.label in ("ground", "verge", "road"):
-                assert not walked_on(patch.layer), patch.name
-            elif patch.label == "sidewalk":
-                assert walked_on(patch.layer) and patch.friction == friction(patch.name), patch.name
-            seen[patch.name] += len(patch.mesh)
-    assert {"ground", "ground:planting", "ground:yard", "ground:water"} <= set(seen)
-    materials = {name.split(":")[1] for name in seen if name.startswith("sidewalk:")}
-    assert materials == set(MATERIALS) - {"grass"} and friction("sidewalk:asphalt:0") > friction(
-        "sidewalk:concrete:0"
-    )
 
 
 def test_what_covers_open_ground_hangs_on_land_use_then_on_neighbours() -> None:

@@ -6,7 +6,6 @@ import dataclasses
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 import shapely
@@ -141,12 +140,6 @@ def test_places_without_walks_or_corners_are_not_usable() -> None:
         check.reasons == ("nothing is walkable: no sidewalk, path or crossing",)
         and check.islands == ()
     )
-
-
-def test_a_check_survives_json() -> None:
-    """What --json prints is the whole check."""
-    check = check_map(town(), None, facts_of(net()), 0.25)
-    assert msgspec.json.decode(msgspec.json.encode(check), type=type(check)) == check
 
 
 def test_the_picture_marks_problems() -> None:

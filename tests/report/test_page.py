@@ -7,17 +7,13 @@ import json
 import os
 import re
 from collections.abc import Callable
-from concurrent.futures import Future
 from html.parser import HTMLParser
 from pathlib import Path
 
-import cv2
 import msgspec
 import numpy as np
 import pytest
 
-from cosim.place.open_ground import GROUND_LOOKS
-from cosim.report.encoding import as_webp
 from cosim.report.page.choice import most_telling, shown_of
 from cosim.report.page.page import Maps, colours_of, counts_of, page_of
 from cosim.report.page.paper import LONG_OF_PAPER, REACTIVE_OF_PAPER, UNIT_OF_PAPER
@@ -28,9 +24,7 @@ from cosim.report.page.three_tables import tables_of, warnings_of
 from cosim.results.run_folder import RunFolder, read_spec
 from cosim.results.table import summary_of
 from cosim.spec.scenario import read_suite
-from scenarios.tools.viewing.report import _wait
 from tests.conftest import ROOT, Cosim
-from tests.run_specs import changed
 from tests.support.driven_runs import HIT, episode_of, failure_at, run_of, short_way
 
 PAPER = Path(os.environ.get("COSIM_SHARED", ROOT.parent / "shared")) / "paper/sidewalkbench.tex"
@@ -85,25 +79,6 @@ def test_a_cell_of_ours_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
     assert not other.paper and [row.name for row in other.rows] == ["mine: straight"]
 
 
-def test_the_page_paints_the_ground_as_maps_from_above(tmp_path: Path) -> None:
-    """Each kind of area of a scene has a colour in the page; those of open ground are the table's
-    of all maps."""
-    data = next(
-        one
-        for one in Elements(page(run_of(tmp_path / "run", [HIT], "mine"))).data
-        if "ground" in dict(one)
-    )  # type: ignore[call-overload]
-    assert isinstance(data, dict)
-    assert {kind: tuple(bytes.fromhex(hue[1:])) for kind, hue in data["ground"].items()} == {
-        kind: look.drawn for kind, look in GROUND_LOOKS.items()
-    }
-    script = (ROOT / "cosim/report/page/page.js").read_text()
-    known = re.search(r"const COLOURS = \{ \.\.\.data\.ground, (.*?)\};", script, re.DOTALL)
-    assert known is not None and {"road", "walk", "crossing", "verge"} <= set(
-        re.findall(r"(\w+):", known[1])
-    )
-
-
 @pytest.mark.skipif(not PAPER.exists(), reason="the paper is not here")
 def test_the_papers_figures_are_those_of_its_tables() -> None:
     """Every row of ours is what stands in the table of the paper's source, figure by figure."""
@@ -144,25 +119,6 @@ def test_the_gallery_shows_every_kind_and_cause_and_no_more_than_asked_for(tmp_p
     )
 
 
-def test_what_takes_long_to_come_to_is_not_shown_where_something_else_tells_as_much(
-    tmp_path: Path,
-) -> None:
-    """A failure after 100 s yields to one after 4 s of the same facets, and many of them to the
-    time that there is."""
-    runs = read_runs([run_of(tmp_path / "run", [HIT], "mine")])
-    (soon,) = shown_of(runs)
-    late = [
-        soon._replace(
-            scenario=f"l-{k}",
-            mishap=soon.mishap._replace(tick=2000 + k),
-            facets=soon.facets | {k} if k else soon.facets,
-        )
-        for k in range(12)
-    ]
-    assert most_telling([late[0], soon], 1) == ([soon], "--failures 1")
-    assert len(most_telling([*late, soon]).picks) == 6
-
-
 def test_of_an_episode_its_first_failure_is_shown_and_others_that_come_soon(tmp_path: Path) -> None:
     """Failures after 4 s, 100 s and 200 s, each of another kind: the last is left out, but not
     where it is the first of its episode, and not where it is asked for."""
@@ -177,38 +133,6 @@ def test_of_an_episode_its_first_failure_is_shown_and_others_that_come_soon(tmp_
     picked = {(one.scenario, one.mishap.tick) for one in most_telling(every).picks}
     assert picked == {("one", 80), ("one", 2000), ("other", 4000)}
     assert len(most_telling(every, within_s=200.0).picks) == 4
-
-
-def test_how_far_the_failures_are_is_told_while_they_are_shown() -> None:
-    """Of two episodes of 100 and 300 ticks, the first done and the second half done: 62 %; of maps
-    alone no share."""
-    first = Future[None]()
-    second = Future[None]()
-    told = list[tuple[str, float | None]]()
-    first.set_result(None)
-
-    def tell(stage: str, share: float | None = None) -> None:
-        told.append((stage, share))
-        if len(told) == 2:
-            second.set_result(None)
-
-    _wait([first, second], [100, 300], [20.0, 150.0], tell)
-    assert told[0] == ("showing failures again", 0.625) and told[-1] == (
-        "showing failures again",
-        0.99,
-    )
-    _wait([first], [], [], lambda *words: told.append(words))  # type: ignore[arg-type]
-    assert told[-1] == ("drawing maps", None)
-
-
-@pytest.mark.parametrize("size", [(216, 384), (33, 41), (1, 1)])
-def test_pictures_of_a_page_are_read_again(size: tuple[int, int]) -> None:
-    """Of odd sizes too, with little error, by what OpenCV makes of them."""
-    rows, columns = np.mgrid[: size[0], : size[1]]
-    rgb = np.stack([rows % 256, columns % 256, (rows + columns) % 256], axis=2).astype(np.uint8)
-    read = cv2.imdecode(np.frombuffer(as_webp(rgb), np.uint8), cv2.IMREAD_COLOR)
-    assert read is not None and read.shape == rgb.shape
-    assert np.abs(read[..., ::-1].astype(int) - rgb).mean() < 12.0
 
 
 def test_a_failure_counts_where_so_many_people_were_near() -> None:
@@ -311,29 +235,6 @@ def test_runs_of_other_scenarios_of_a_suite_are_told_apart(tmp_path: Path) -> No
     assert warnings_of([first, part]).mixed == (("s", "one 3, other 2"),)
     text = page_of([first, part], [], [], Maps([], {}, {}), "").decode()
     assert "not all runs are of the same scenarios (one 3, other 2)" in text
-
-
-def test_versions_that_differ_stand_side_by_side_and_the_others_once(tmp_path: Path) -> None:
-    """Two runs of one numpy and two of glibc: a line for what is alike, a row for what is not."""
-    runs = read_runs([run_of(tmp_path / name, ["goal"], name) for name in ("one", "other")])
-    told = []
-    for run, glibc in zip(runs, ("2.36", "2.39"), strict=True):
-        spec = changed(run.spec, versions={"numpy": "2", "glibc": glibc})
-        told.append(ReportedRun(run.label, run.whole._replace(spec=spec)))
-    text = page_of(told, [], [], Maps([], {}, dict(counts_of(told))), "").decode()
-    assert "<dt>versions</dt><dd>numpy 2</dd>" in text
-    assert '<th scope="row">glibc</th><td>2.36</td><td>2.39</td>' in text
-
-
-def test_the_table_of_places_counts_failures_that_the_map_has_no_room_for(tmp_path: Path) -> None:
-    """Three failures of which the map shows one are three."""
-    text = page(
-        run_of(tmp_path / "run", [HIT] * 3 + ["goal"]),
-        maps=Maps(
-            [], {"city 0": [Spot(x_m=0.0, y_m=0.0, cause="obstacle", words="")]}, {"city 0": (4, 3)}
-        ),
-    )
-    assert '<td>4</td><td>3</td><td class="word">obstacle 3</td>' in text
 
 
 def test_names_and_reasons_cannot_break_out_of_the_page(tmp_path: Path) -> None:

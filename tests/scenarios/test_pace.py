@@ -21,7 +21,6 @@ from scenarios.runs.eta import (
     makespan,
     recall,
     remembered,
-    span,
 )
 from scenarios.suites.catalog import load_suite
 from tests.run_specs import record_of, spec_of
@@ -134,21 +133,6 @@ def test_the_line_says_episodes_way_limit_and_time() -> None:
     assert " with --jobs 1, " in line and " with --jobs 2: a guess" in line and "\n" not in line
     assert "--jobs 2" not in announcement(LONG[:1], "route", GL, 1, False)
     assert announcement(LONG[:1], "route", GL, 1, False).startswith("1 episode, 482 m")
-
-
-@pytest.mark.parametrize(
-    ("low_s", "high_s", "words"),
-    [
-        (500.0, 900.0, "8 to 15 min"),
-        (40.0, 170.0, "40 s to 3 min"),
-        (610.0, 620.0, "10 min"),
-        (3000.0, 8000.0, "50 min to 2 h 10 min"),
-    ],
-    ids=["minutes", "mixed", "same", "hours"],
-)
-def test_a_span_is_said_with_its_unit_once(low_s: float, high_s: float, words: str) -> None:
-    """Both ends in the unit that fits them, said once where it is the same."""
-    assert span(Estimate(low_s, high_s, "")) == words
 
 
 def finished(folder: RunFolder, scenario: Scenario, status: str) -> None:
