@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from bridge import director, keys
+from bridge import keys
 from bridge.codec import encode
 from bridge.director import (
     QueryParts,
@@ -238,25 +238,6 @@ def test_one_director_answers_every_run_and_episode(tmp_path: Path) -> None:
                 signed_query(query(), ""),
                 timeout_s=PATIENCE_S,
             )
-
-
-def test_whoever_runs_the_episode_is_told_what_it_waits_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Once, after a while; the director that comes then is taken."""
-    monkeypatch.setattr(director, "NOTICE_S", 0.1)
-    told: list[str] = []
-    with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
-
-        def waiting(words: str, _share: float | None = None, /) -> None:
-            told.append(words)
-            serve_director(hub, KEY, echo)
-
-        assert (
-            RemoteDirector(client, KEY, wait_s=PATIENCE_S, waiting=waiting).react(query(3)).tick
-            == 3
-        )
-    assert told == [f"waits at tick 3 for the director, {PATIENCE_S:g} s at most"]
 
 
 @pytest.mark.parametrize(

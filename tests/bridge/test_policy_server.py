@@ -515,7 +515,7 @@ def test_cosim_serve_is_asked_beside_others_where_one_listens(tmp_path: Path) ->
         "-m",
         "cosim",
         "serve",
-        "tests.support.isolated_policies:Honest",
+        "tests.support.hostile:Honest",
         "--name",
         "both",
     ]

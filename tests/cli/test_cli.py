@@ -412,40 +412,6 @@ def test_names_that_do_not_exist_are_answered_with_those_that_do(
         assert "Traceback" not in said.stderr
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"route": [[0, 0]]}, "route needs two points"),
-        ({"goal": [1.0, 2.0]}, "is not the route's end"),
-        (
-            {"time_limit_s": "long"},
-            "Expected `float`, got `str` - at `$.scenarios[0].time_limit_s`",
-        ),
-        ({"crowd": {"persons": -1}}, "crowd persons must be in [0, 1000], not -1"),
-        ({"schema": 99}, "has schema 99"),
-        (
-            {"crowd": {"gruops": 0.4}},
-            "unknown field `gruops` - at `$.scenarios[0].crowd`. Valid choices: persons, radius",
-        ),
-        (
-            {"ends_at": "noon"},
-            "Invalid enum value 'noon' - at `$.scenarios[0].ends_at`. Valid choices: goal, stop",
-        ),
-        ({"id": "../../elsewhere"}, "scenario id '../../elsewhere' cannot name a folder"),
-    ],
-)
-def test_a_broken_suite_file_is_named_with_its_field(
-    desk: Path, cosim: Cosim, change: dict[str, object], message: str
-) -> None:
-    """A scenario file that contradicts itself is refused before anything runs."""
-    suite = json.loads((desk / "tiny.json").read_text())
-    suite["scenarios"][0] |= change
-    (desk / "bad.json").write_text(json.dumps(suite))
-    said = cosim("run", "bad.json", "--out", "bad", cwd=desk)
-    assert said.returncode == 2 and "bad.json" in said.stderr and message in said.stderr
-    assert not (desk / "bad").exists()
-
-
 def test_a_suite_without_scenarios_is_refused(desk: Path, cosim: Cosim) -> None:
     """Nothing to run is an error that names the file, not a run of nothing that went well."""
     suite = json.loads((desk / "tiny.json").read_text())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import mmap
 import subprocess
 import sys
 from collections.abc import Callable
@@ -85,14 +84,6 @@ def test_arrays_are_made_once(get: Get) -> None:
     write-protected."""
     make = Maker()
     assert same(get("a", "0_0", make)) and same(get("a", "0_0", make)) and make.times == 1
-
-
-def test_mapped_arrays_lie_in_the_file() -> None:
-    """They are mapped at once, also by the process that made them, at aligned addresses."""
-    for _ in range(2):
-        for array in mapped("a", "0_0", Maker()).values():
-            assert isinstance(array.base, mmap.mmap)
-            assert array.ctypes.data % 64 == 0
 
 
 @both

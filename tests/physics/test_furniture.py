@@ -27,7 +27,6 @@ from physics.ground.tiles import CURB_M, TILE_M, Tile, build_tile, key_at, keys_
 from physics.street.buildings import Frontage
 from physics.street.clearance import clear_width, on_driveways
 from physics.street.furniture import (
-    CATALOGUE,
     KINDS,
     PROP_VARIANTS,
     Prop,
@@ -40,7 +39,6 @@ from physics.street.placement import (
     PROP_END_GAP_M,
     Placement,
     clear_half_m,
-    street_style,
 )
 from physics.street.street_surface import StreetSurface
 from sumo_nets.city.store import city_net
@@ -114,16 +112,6 @@ def test_a_prop_is_small_cheap_and_stands_on_the_ground(kind: object) -> None:
         for solid in solids_of(entry.name, variant):
             assert abs(solid.at_m[0]) + 0.5 * solid.size_m[0] <= 0.5 * length + 1e-9
             assert abs(solid.at_m[1]) + 0.5 * solid.size_m[1] <= 0.5 * depth + 1e-9
-
-
-def test_street_classes_of_any_map_have_a_column() -> None:
-    """Our own classes are themselves; types of imported edges go by their words; the rest are
-    residential."""
-    assert street_style("boulevard") == "boulevard"
-    assert street_style("highway.primary_link") == "avenue"
-    assert street_style("highway.living_street") == "narrow"
-    assert street_style("highway.footway") == street_style("") == "residential"
-    assert all({*kind.per_100m} == {*CATALOGUE[0].per_100m} for kind in CATALOGUE)
 
 
 def test_props_keep_off_what_is_not_theirs() -> None:

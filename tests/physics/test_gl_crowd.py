@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
-from cosim.core.state import LABELS, Age, People
+from cosim.core.state import LABELS, People
 from physics.cameras.gl import crowd as crowds
 from physics.cameras.gl.camera import NOON
 from physics.cameras.gl.context import available, context
@@ -23,11 +23,6 @@ from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.targets import Target
 from physics.cameras.sky import sky_of
 from physics.cameras.view import Shot, shot
-from physics.people.appearance import ALL, look_of
-from physics.people.body import body
-from physics.people.clips import own_clips
-from physics.people.poses import poses
-from tests.support.blend import skinned
 
 pytestmark = [pytest.mark.engine, pytest.mark.skipif(not available(), reason="no OpenGL here")]
 
@@ -106,25 +101,3 @@ def test_levels_of_detail_keep_the_silhouettes(
     total = sum(int(b.sum()) for b in full)
     print(f"{100 * changed / total:.2f} % of {total} silhouette pixels changed")
     assert changed < 0.03 * total
-
-
-def test_the_card_skins_as_the_reference_does(crowd: CrowdDrawing) -> None:
-    """The outline of a walker near by is that of the mesh skinned by numpy: head, hands and feet
-    where they belong."""
-    people = People.of(("c3",), [[5.0, 0.0]], [0.8], [1.4], ("walk",), [0.3])
-    taken = shot((0.0, 0.0, 1.0), (5.0, 0.0, 1.0), (400, 400), 40.0)
-    rows, columns = np.nonzero(mask(crowd, people, taken))
-    pose = poses(people, 2.0)
-    who = look_of("c3", Age.ADULT)
-    made = body(ALL[who.outfit], 1)
-    grown = made.vertices + made.normals * (made.fat * who.girth_m)[:, None]
-    at = skinned(grown, made.joints, made.weights, pose.matrices(own_clips())[0]) * pose.scale[0]
-    cos, sin = np.cos(0.8), np.sin(0.8)
-    world = np.column_stack(
-        [cos * at[:, 0] - sin * at[:, 1] + 5.0, sin * at[:, 0] + cos * at[:, 1], at[:, 2]]
-    )
-    focal = 200.0 / np.tan(np.radians(20.0))
-    u = 200.0 - focal * world[:, 1] / world[:, 0]
-    v = 200.0 - focal * (world[:, 2] - 1.0) / world[:, 0]
-    assert (columns.min(), columns.max() + 1) == pytest.approx((u.min(), u.max()), abs=2.0)
-    assert (rows.min(), rows.max() + 1) == pytest.approx((v.min(), v.max()), abs=2.0)

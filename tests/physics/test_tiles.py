@@ -12,7 +12,6 @@ from physics.ground.tiles import (
     Key,
     Tile,
     build_tile,
-    distance_to,
     key_at,
     keys_within,
     square,
@@ -89,15 +88,6 @@ def test_tiles_do_not_depend_on_the_order(tiles: dict[Key, Tile]) -> None:
     for name, mesh in tiles[(0, -1)].parts.items():
         assert np.array_equal(mesh.vertices, again.parts[name].vertices)
         assert np.array_equal(mesh.triangles, again.parts[name].triangles)
-
-
-def test_keys_cover_a_disk() -> None:
-    """The tiles within a radius hold every point of the disk, and each is no farther than the
-    radius."""
-    keys = keys_within(13.0, -7.0, 30.0)
-    angle = np.linspace(0.0, 6.28, 60)
-    assert {key_at(13.0 + 29.9 * np.cos(a), -7.0 + 29.9 * np.sin(a)) for a in angle} <= set(keys)
-    assert all(distance_to(key, 13.0, -7.0) <= 30.0 for key in keys)
 
 
 def test_buildings_line_the_street_and_keep_off_it() -> None:

@@ -119,22 +119,6 @@ def test_the_gallery_shows_every_kind_and_cause_and_no_more_than_asked_for(tmp_p
     )
 
 
-def test_of_an_episode_its_first_failure_is_shown_and_others_that_come_soon(tmp_path: Path) -> None:
-    """Failures after 4 s, 100 s and 200 s, each of another kind: the last is left out, but not
-    where it is the first of its episode, and not where it is asked for."""
-    runs = read_runs([run_of(tmp_path / "run", [HIT], "mine")])
-    (soon,) = shown_of(runs)
-    every = [
-        soon._replace(
-            scenario=name, mishap=soon.mishap._replace(tick=tick), facets=soon.facets | {name, tick}
-        )
-        for name, tick in (("one", 80), ("one", 2000), ("one", 4000), ("other", 4000))
-    ]
-    picked = {(one.scenario, one.mishap.tick) for one in most_telling(every).picks}
-    assert picked == {("one", 80), ("one", 2000), ("other", 4000)}
-    assert len(most_telling(every, within_s=200.0).picks) == 4
-
-
 def test_a_failure_counts_where_so_many_people_were_near() -> None:
     """Two people within 10 m in the second of the failure: it and that second's metres are in their
     bin."""

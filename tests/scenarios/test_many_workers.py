@@ -458,25 +458,6 @@ def test_a_result_that_cannot_be_written_is_not_acknowledged(
         assert len(run.over()) == 2
 
 
-def test_a_policy_timeout_that_a_worker_reports_is_the_last_attempt(tmp_path: Path) -> None:
-    """The worker enforces the time limit of an answer; its episode has crashed, once, for the
-    reason that it gives."""
-    run = Run(tmp_path)
-    with hands(run, 1) as (one,):
-        silent = one.job()
-        assert (
-            one.fail(
-                Failure("policy_timeout", "policy 'stop' gave no answer for 60 s in act at 3.20 s")
-            )
-            == KEPT
-        )
-        one.job()
-        assert one.deliver() == KEPT
-        records = run.over()
-    assert records[silent].status == "crashed"
-    assert records[silent].reason == "policy 'stop' gave no answer for 60 s in act at 3.20 s"
-
-
 def test_a_map_reaches_workers_that_lack_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

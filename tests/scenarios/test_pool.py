@@ -4,10 +4,7 @@ once."""
 from __future__ import annotations
 
 import os
-import select
 import socket
-import struct
-import threading
 import time
 from pathlib import Path
 
@@ -539,29 +536,6 @@ def test_a_job_of_any_length_reaches_a_worker_that_listens_late() -> None:
     with pytest.raises(OSError):
         run.post(jobs[0])
     run.close()
-
-
-def test_half_a_message_keeps_nobody_waiting() -> None:
-    """Who is stopped in the middle of a message of megabytes is not waited for: what came whole is
-    told, the rest when it comes, and the end after all of it."""
-    ours, theirs = socket.socketpair()
-    wire = Wire(ours)
-    message = os.urandom(3_000_000)
-    framed = struct.pack("!I", len(message)) + message
-    assert list(wire.received()) == []
-    heard: list[bytes] = []
-    for part in (framed[:2], framed[2:1000], framed[1000:] + framed[:5000], framed[5000:]):
-        sender = threading.Thread(target=theirs.sendall, args=(part,))
-        sender.start()
-        while sender.is_alive() or select.select([ours], [], [], 0.0)[0]:
-            heard += wire.received()
-    assert heard == [message, message]
-    theirs.sendall(framed[:10])
-    theirs.close()
-    with pytest.raises(EOFError):
-        heard += wire.received()
-    assert len(heard) == 2
-    wire.close()
 
 
 class Notes(Fake):

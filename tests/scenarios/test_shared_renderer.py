@@ -3,7 +3,6 @@ others go on."""
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import signal
 import socket
@@ -21,7 +20,7 @@ from bridge.policy_server import Answer, AskAct, AskReset, Begun, PolicyReply, R
 from cosim.core.errors import EngineError, PolicyError, RendererLost, UsageError
 from cosim.core.framing import Wire
 from cosim.core.geometry import Polyline, Pose
-from cosim.core.state import NO_VEHICLES, Frame, People, RobotState, Signal, Street
+from cosim.core.state import NO_VEHICLES, Frame, People, RobotState, Street
 from cosim.episode.interfaces import Observation, Policy, Privileged
 from cosim.episode.policy_caller import Driver
 from cosim.policies.load import load_policy
@@ -37,7 +36,7 @@ from scenarios.ipc.deadlines import Patience
 from scenarios.ipc.messages import Hello, Progress
 from scenarios.ipc.observation_codec import encoded_about, encoded_fields
 from scenarios.ipc.render_link import RendererLink
-from scenarios.ipc.render_protocol import Draw, Rendered, Request, decode_request, encode_exchange
+from scenarios.ipc.render_protocol import Draw, Rendered, Request, encode_exchange
 from scenarios.ipc.shared_memory import SharedMemory
 from scenarios.places.nets import place
 from scenarios.runs import run as suite_run
@@ -260,41 +259,6 @@ def test_what_takes_the_policy_down_names_whom_it_was_asked_for(tmp_path: Path) 
             assert renderer.end_of(number) == end
 
 
-def test_a_policy_may_write_into_what_it_is_told_from_afar() -> None:
-    """What arrives is equal to the bit and its reader's own: write-protected as an episode's is, no
-    more than that."""
-    people = People.of(
-        ("c1", "c2"),
-        [[3.0, 0.1], [1 / 3, 0.2]],
-        [0.0, 1.0],
-        [1.0, 0.0],
-        ("walk", "sit"),
-        kind=[1, 2],
-    )
-    sent = Draw(
-        RobotState(Pose(0.1, 0.2, 0.3), 0.4), Street(7, people, signals={"x": Signal(True, 2.5)})
-    )
-    came = decode_request(encode_exchange(sent))
-    assert (
-        isinstance(came, Draw)
-        and came.robot == sent.robot
-        and came.street.signals == sent.street.signals
-    )
-    for column in dataclasses.fields(People):
-        mine = getattr(people, column.name)
-        theirs = getattr(came.street.people, column.name)
-        assert type(mine) is type(theirs)
-        if isinstance(mine, np.ndarray):
-            assert (
-                mine.dtype == theirs.dtype
-                and mine.tobytes() == theirs.tobytes()
-                and not theirs.flags.writeable
-            )
-            theirs.setflags(write=True)
-        else:
-            assert mine == theirs
-
-
 @pytest.fixture(scope="module")
 def by_themselves(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of two episodes in this process, each drawing for itself."""
@@ -386,15 +350,6 @@ def test_episodes_whose_renderer_is_killed_are_run_again(
     assert killed and same(by_themselves, folder)
     logs = sorted(path.name for path in (folder / "logs").iterdir())
     assert logs == ["renderer-0.log", "renderer-1.log", "worker-0.log", "worker-1.log"]
-
-
-def test_what_a_shared_renderer_cannot_do_is_wrong_use(cosim: Cosim) -> None:
-    """It is told before anything is started."""
-    said = cosim("run", "reactive", "--camera", "bullet", "--shared-renderer")
-    assert (
-        said.returncode == 2
-        and "--shared-renderer draws by OpenGL, not by the bullet camera" in said.stderr
-    )
 
 
 def test_where_there_is_nothing_to_share_it_is_said() -> None:

@@ -26,12 +26,12 @@ from physics.dynamics.world import BulletWorld
 from physics.ground.tiles import TILE_M, keys_within
 from physics.street.buildings import Frontage, facade_meshes
 from physics.street.clearance import clear_width
-from physics.street.furniture import KINDS, footprints
+from physics.street.furniture import footprints
 from physics.street.mapped import HOUSES_M, MAPPED_NEAR_M, MappedThings
 from physics.street.placement import props_of
 from physics.street.street_surface import StreetSurface
 from sumo_nets.maps.feature_file import NAME, read_features, with_features, write_features
-from sumo_nets.maps.feature_fit import EXTENT_M, WALL_GAP_M, fitted, utm_xy, utm_zone
+from sumo_nets.maps.feature_fit import WALL_GAP_M, fitted, utm_xy, utm_zone
 from sumo_nets.maps.map_store import about_map, import_map, map_hash, map_net, read_map
 from sumo_nets.maps.osm_features import (
     HIGHEST_BUILDING_M,
@@ -386,13 +386,6 @@ def test_the_robot_stops_at_a_mapped_wall() -> None:
         ("wall", "map")
     }
     assert not place.features[0].polygon.contains(shapely.Point(motions[-1].robot.pose.xy))
-
-
-def test_room_is_kept_for_the_largest_of_each_thing() -> None:
-    """What the importer keeps free for a thing is at least what the catalogue's largest covers."""
-    for kind, (length, depth) in EXTENT_M.items():
-        large = KINDS[kind].sizes_m[1]
-        assert length >= large[0] and depth >= large[1], kind
 
 
 def test_features_survive_their_file_and_change_the_hash(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Floats, Pose
-from cosim.core.state import Age, People, RobotState, Street
+from cosim.core.state import Age, RobotState, Street
 from cosim.place.street_map import Strip
 from cosim.spec.events import EventReply
 from cosim.spec.scenario import City, CrowdSpec
@@ -187,19 +187,6 @@ def test_who_has_left_is_forgotten() -> None:
     assert together.groups == (("c0", "c1"),) and together.fellows("c2") == ("c2",)
     together.forget(["c0"])
     assert together.groups == () and walkers.told["c0"] == 1.3
-
-
-def test_the_gap_of_a_group_is_that_of_its_loneliest_member() -> None:
-    """Of three in a row, 0.5 and 2 m apart, the last is 2 m from its nearest fellow; who is alone
-    has no gap."""
-    people = People.of(
-        ("a", "b", "c", "d"),
-        [[0.0, 0.0], [0.5, 0.0], [2.5, 0.0], [9.0, 0.0]],
-        np.zeros(4),
-        np.ones(4),
-        ("walk",) * 4,
-    )
-    assert widest_gaps([("a", "b", "c"), ("d", "gone")], people) == [2.0]
 
 
 def test_a_suite_can_be_asked_for_groups() -> None:
