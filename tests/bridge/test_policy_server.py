@@ -4,7 +4,6 @@ street."""
 from __future__ import annotations
 
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -44,7 +43,8 @@ from cosim.spec.robot import COURIER
 from scenarios.ipc.deadlines import ServerTimes
 from scenarios.runs.policy_host import known_driver
 from scenarios.runs.remote_policy import PolicyServers, RemoteDriver, remote_driver
-from tests.conftest import PATIENCE_S, ROOT, Cosim
+from tests.conftest import PATIENCE_S, ROOT, Cosim, wait_until
+from tests.support.plain import free_port
 
 SPEC = CameraSpec(64, 40)
 RGB = np.arange(40 * 64 * 3, dtype=np.uint8).reshape(40, 64, 3)
@@ -163,13 +163,6 @@ def served(at: Connection, policy: Any, name: str = "counting", **more: Any) -> 
         heard[1](None)  # no query: the end
         thread.join(PATIENCE_S)
         session.close()
-
-
-def wait_until(what: Callable[[], bool]) -> None:
-    until_s = time.monotonic() + PATIENCE_S
-    while not what():
-        assert time.monotonic() < until_s
-        time.sleep(0.01)
 
 
 @contextmanager
@@ -559,9 +552,3 @@ def test_a_policy_that_knows_everything_is_not_served(cosim: Cosim) -> None:
     )
     said = cosim("serve", "stop", "--listen", "tcp/0.0.0.0:7449")
     assert said.returncode == 2 and "is beyond this machine and unguarded" in said.stderr
-
-
-def free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        return int(one.getsockname()[1])

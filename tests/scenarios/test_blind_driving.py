@@ -280,7 +280,6 @@ def test_who_overtakes_is_not_touched_by_a_robot_that_slows_down_and_walks_on(v_
 @pytest.mark.parametrize(
     ("kind", "policy"),
     [
-        ("obstructing", Crawl(0.8)),
         ("obstructing", EdgeDriver(1.2)),
         ("overtaking", Crawl(2.5)),
         ("frontal", Stander(1.2, 5.0)),

@@ -45,7 +45,7 @@ from scenarios.runs.status import RunStatus
 from scenarios.runs.transport import HeldRun
 from scenarios.runs.zenoh_transport import workers_of_run
 from sumo_nets.net.net_hash import hash_of
-from tests.conftest import PATIENCE_S, Cosim
+from tests.conftest import PATIENCE_S, Cosim, wait_until
 from tests.run_specs import changed, spec_of
 
 pytestmark = pytest.mark.engine
@@ -241,13 +241,6 @@ def hands(run: Run, count: int) -> Iterator[list[Hand]]:
         yield found
 
 
-def until(true: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not true():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
 def test_jobs_are_claimed_renewed_and_delivered_once(tmp_path: Path) -> None:
     """A newcomer learns the policy; an answer that was lost is given again; a second result changes
     nothing, one of other content is told loudly; the first one stays."""
@@ -299,7 +292,7 @@ def test_who_comes_back_goes_on(tmp_path: Path) -> None:
     with hands(run, 1) as (one,):
         one.job()
         one.session.close()
-        until(lambda: f"{one.name}: lost" in run.log)
+        wait_until(lambda: f"{one.name}: lost" in run.log)
         one.session = open_session(Connection(role="worker", connect=run.endpoint))
         with one.session:
             assert one.renew() == RENEWED and one.deliver() == KEPT
@@ -347,7 +340,7 @@ def test_attempts_are_bounded_and_leaving_is_none(
             with hands(run, 1) as (another,):
                 one.session.close()
                 assert another.job() == unlucky
-            until(lambda losses=losses: run.log.count("lost, with") > losses)
+            wait_until(lambda losses=losses: run.log.count("lost, with") > losses)
         records = run.over()
     assert (
         records[poison].status == "crashed"
@@ -508,9 +501,9 @@ def test_status_tells_of_a_lost_a_silent_and_a_working_worker(
         lost.job()
         name = one.job()
         lost.session.close()
-        until(lambda: f"{lost.name}: lost" in run.log)
+        wait_until(lambda: f"{lost.name}: lost" in run.log)
         silent.job()
-        until(
+        wait_until(
             lambda: (
                 (run.folder / "status.json").exists()
                 and silent.name in (run.folder / "status.json").read_text()

@@ -56,9 +56,6 @@ class Mine:
 class Exits(Mine):
     def __init__(self):
         if IN_A_WORKER: sys.exit("no GPU left")
-class Dies(Mine):
-    def __init__(self):
-        if IN_A_WORKER: os._exit(7)
 class Hangs(Mine):
     def __init__(self):
         if IN_A_WORKER: time.sleep(3600)
@@ -71,11 +68,6 @@ class Edits(Mine):
 }
 CANNOT_BEGIN = {
     "Exits": (2, "error: policy 'mine:Exits' cannot be made: SystemExit: no GPU left"),
-    "Dies": (
-        2,
-        "error: policy 'mine:Dies' cannot be loaded: the environment process ended with exit "
-        "code 7",
-    ),
     "Hangs": (
         2,
         "error: policy 'mine' gave no answer for 1 s while it was loaded in an environment process",
