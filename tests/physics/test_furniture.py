@@ -22,8 +22,7 @@ from cosim.spec.camera import CameraSpec
 from cosim.spec.scenario import City
 from physics.cameras.bullet_camera import BulletCamera
 from physics.dynamics.world import BulletWorld
-from physics.ground.materials import Paving
-from physics.ground.tiles import CURB_M, TILE_M, Tile, build_tile, key_at, keys_within, kind_of
+from physics.ground.tiles import CURB_M, Tile, build_tile, key_at, keys_within
 from physics.street.buildings import Frontage
 from physics.street.clearance import clear_width, on_driveways
 from physics.street.furniture import (
@@ -268,35 +267,6 @@ def test_a_prop_is_seen_where_it_stands() -> None:
             assert frame.labels[rows.max() + 1, 48] in (LABELS["verge"], LABELS["ground"])
             nearest = 3.0 - 0.5 * prop.size_m[1] - frame.depth[rows, 48].min()
             assert 0.0 < nearest < 0.5
-
-
-def test_paved_ground_has_the_shape_of_plain_ground() -> None:
-    """A paved tile covers its square once, at the same heights, kind by kind the same areas;
-    corners stay plain."""
-    paving = Paving(MAP, 1)
-    for key in keys_within(0.0, 0.0, 40.0):
-        plain = build_tile(MAP, key)
-        paved = build_tile(MAP, key, paving)
-        areas: dict[str, list[float]] = {}
-        for side, tile in enumerate((plain, paved)):
-            for name, mesh in tile.parts.items():
-                corners = mesh.vertices[mesh.triangles]
-                one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-                area = 0.5 * (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]).sum()
-                areas.setdefault(kind_of(name), [0.0, 0.0])[side] += area
-                low, high = mesh.vertices[:, 2].min(), mesh.vertices[:, 2].max()
-                assert low >= 0.0 and high <= CURB_M + 1e-9
-        assert all(one == pytest.approx(two, abs=1e-3) for one, two in areas.values())
-        assert sum(two for _, two in areas.values()) == pytest.approx(TILE_M**2, abs=1e-6)
-        for name in set(paved.parts) - set(plain.parts):
-            mesh = paved.parts[name]
-            middles = mesh.vertices[mesh.triangles].mean(axis=1)
-            strips = [s for s in sidewalks(MAP) if paving.surface(s) == name]
-            lanes = [lane for lane in MAP.lanes.values() if paving.surface(lane) == name]
-            where = shapely.union_all([p.polygon for p in (*strips, *lanes)])
-            assert shapely.contains_xy(
-                shapely.buffer(where, 0.01), middles[:, 0], middles[:, 1]
-            ).all()
 
 
 def rough_height(tile: Tile, xy: np.ndarray) -> np.ndarray:

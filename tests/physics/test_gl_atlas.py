@@ -108,27 +108,6 @@ def _same(one: Frame, other: Frame) -> bool:
     return np.array_equal(one.rgb, other.rgb) and np.array_equal(one.labels, other.labels)
 
 
-def test_people_alone_are_the_same_with_the_next_picture_under_way() -> None:
-    """People, fetched while the next are drawn: bit for bit what is drawn one by one, and they
-    move."""
-    from physics.cameras.gl.people_only import PeopleAlone
-
-    busy = busy_street(camera_city(300.0), 8, 3)
-    with PeopleAlone((96, 54), 60.0) as eyes:
-        single = [eyes.render(busy.robot.pose, street) for street in busy.streets]
-        found = []
-        for street in busy.streets:
-            eyes.begin(busy.robot.pose, street)
-            if street.tick:
-                found.append(eyes.end())
-        found.append(eyes.end())
-        with pytest.raises(EngineError, match="under way"):
-            eyes.end()
-    for one, other in zip(single, found, strict=True):
-        assert np.array_equal(one.rgb, other.rgb) and np.array_equal(one.labels, other.labels)
-    assert not np.array_equal(found[0].rgb, found[2].rgb)
-
-
 def test_an_atlas_too_large_is_refused_with_the_limit(worlds: list[BulletWorld]) -> None:
     """More rows than a texture may have; and an atlas that is not running says so."""
     from physics.cameras.gl.atlas import Atlas

@@ -21,7 +21,6 @@ from physics.people.families import FAMILIES, skeleton
 from physics.people.figure import MESH_LEVELS
 from physics.people.gaits import CYCLE_FRAMES
 from physics.people.gestures import SEAT_M, SEATED_BACK_M
-from physics.people.parts import RIGID_PARTS, part_colours, part_meshes, placed_parts
 from physics.people.poses import poses
 from physics.people.skeleton import INDEX, JOINTS, forward, rodrigues
 from tests.support.blend import skinned
@@ -220,50 +219,6 @@ def test_strides_follow_the_way_walked() -> None:
         == count[0]
     )
     assert stride_m(1.4, 1.75) == pytest.approx(STRIDES_M[PACES_MPS.index(1.4)])
-
-
-def test_starting_is_smooth() -> None:
-    """From standing to walking no joint's matrix changes by more than a little from one tick to the
-    next."""
-    clips = own_clips()
-    strides = Strides(0.05)
-    x = 0.0
-    before = None
-    largest = 0.0
-    for k in range(60):
-        speed = 0.0 if k < 10 or k >= 40 else 1.3
-        x += 0.05 * speed
-        count, pace = strides.update(("c1",), np.array([[x, 0.0]]), np.array([speed]), [Age.ADULT])
-        doing = "walk" if speed else "stand"
-        now = poses(
-            People.of(("c1",), [[x, 0.0]], [0.0], [speed], (doing,), count, pace), 0.05 * k, clips
-        ).matrices(clips)
-        if before is not None:
-            largest = max(largest, float(np.abs(now[..., :3] - before[..., :3]).max()))
-        before = now
-    assert largest < 0.45
-
-
-def test_rigid_parts_follow_the_joints() -> None:
-    """Thirteen parts per person; the hand of the stopping arm is where the skinned one is."""
-    people = People.of(("e1",), [[3.0, 4.0]], [0.0], [0.0], ("stop",))
-    parts = placed_parts(people, np.array([0.5]), 0.0)
-    assert (
-        parts.at_m.shape == (1, len(RIGID_PARTS), 3)
-        and len(part_colours("e1", Age.ADULT)) == len(RIGID_PARTS) == 13
-    )
-    assert np.linalg.norm(parts.turn, axis=-1) == pytest.approx(1.0)
-    family = family_of("e1", Age.ADULT)
-    wrist = [joint for joint, _ in RIGID_PARTS].index("right_wrist")
-    x, y, z, w = parts.turn[0, wrist]
-    mesh = part_meshes(family)[wrist].vertices
-    turned = (
-        mesh
-        + 2.0 * np.cross((x, y, z), np.cross((x, y, z), mesh) + w * mesh)
-        + parts.at_m[0, wrist]
-    )
-    assert turned[:, 0].max() > 3.5 and turned[:, 2].max() > 0.5 + 0.75 * stature_m("e1", Age.ADULT)
-    assert sum(len(mesh) for mesh in part_meshes(family)) < 320
 
 
 def test_broken_captures_are_named(tmp_path: Path) -> None:

@@ -158,23 +158,6 @@ def test_paths_up_hills_count_as_steps_only_when_steep() -> None:
         assert along(terrain)[-5] - along(terrain)[5] == pytest.approx(0.9 * rise_m, rel=0.03)
 
 
-def test_streets_that_meet_at_a_corner_meet_in_height() -> None:
-    """Ends that a corner joins are drawn together, though their elevations say otherwise and its
-    own are missing."""
-    one = straight([10, 10], 60.0)
-    two = course("f", "62,0,16 122,0,16")
-    corner = Course(
-        "c",
-        np.array([[60, -1, np.nan], [62, -1, np.nan], [62, 1, np.nan], [60, 1, np.nan]]),
-        ring=True,
-    )
-    apart, _ = surveyed([one, two, corner])
-    joined, _ = surveyed([one, two, corner], [Meeting(2, ((0, 1), (1, 0)))])
-    assert apart is not None and joined is not None
-    assert np.abs(np.diff(along(apart, 122.0))).max() > 0.5
-    assert np.abs(np.diff(along(joined, 122.0))).max() < WALK_GRADE_MAX + 0.03
-
-
 def test_false_elevations_are_dropped() -> None:
     """Spikes, steps of tens of metres, one height everywhere, hardly any height: flat ground, and
     the reason."""

@@ -8,7 +8,6 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -132,66 +131,9 @@ def test_a_file_that_is_no_hdf5_is_refused(tmp_path: Path) -> None:
             read_keras_weights(wrong)
 
 
-def lite_file(code: int = 9, activation: int = 1) -> bytes:
-    """A model of one operator, by default a product of x (1, 2) with int8 numbers, [[-1, 0]] less
-    1, in halves."""
-    builder: Any = pytest.importorskip("flatbuffers").Builder(0)
-
-    def table(**fields: int) -> int:
-        """Of fields by kind and number: b0 is a byte in the field 0, i an int32, o what lies
-        elsewhere."""
-        builder.StartObject(1 + max(int(name[1:]) for name in fields))
-        put = {
-            "b": builder.PrependInt8Slot,
-            "i": builder.PrependInt32Slot,
-            "o": builder.PrependUOffsetTRelativeSlot,
-        }
-        for name, value in fields.items():
-            put[name[0]](int(name[1:]), value, 0)
-        return int(builder.EndObject())
-
-    def tables(*held: int) -> int:
-        builder.StartVector(4, len(held), 4)
-        for one in reversed(held):
-            builder.PrependUOffsetTRelative(one)
-        return int(builder.EndVector())
-
-    def numbers(*held: float, dtype: str = "<i4") -> int:
-        return int(builder.CreateNumpyVector(np.array(held, dtype)))
-
-    def tensor(name: str, buffer: int, *shape: int, **more: int) -> int:
-        return table(o0=numbers(*shape), i2=buffer, o3=builder.CreateString(name), **more)
-
-    halves = table(o2=numbers(0.5, dtype="<f4"), o3=numbers(1, dtype="<i8"))
-    tensors = (
-        tensor("x", 0, 1, 2),
-        tensor("kernel", 1, 1, 2, b1=9, o4=halves),
-        tensor("bias", 2, 1),
-        tensor("y", 0, 1, 1),
-    )
-    operator = table(o1=numbers(0, 1, 2), o2=numbers(3), o4=table(b0=activation))
-    graph = table(o0=tables(*tensors), o1=numbers(0), o2=numbers(3), o3=tables(operator))
-    held = (
-        table(b1=0),
-        table(o0=numbers(-1, 0, dtype="i1")),
-        table(o0=numbers(0, 0, 128, 63, dtype="u1")),
-    )
-    builder.Finish(
-        table(o1=tables(table(b0=code)), o2=tables(graph), o4=tables(*held)),
-        file_identifier=b"TFL3",
-    )
-    return bytes(builder.Output())
-
-
 def test_a_file_that_is_no_lite_file_is_refused() -> None:
-    """What begins otherwise, what is cut off, and operators of which nothing is known here."""
-    data = lite_file()
-    for wrong in (b"", b"no weights", data[:100], data[:8] + b"\xff" * 300):
+    """A file that begins otherwise or is cut off is refused."""
+    pytest.importorskip("flatbuffers")
+    for wrong in (b"", b"no weights", b"\x20\0\0\0TFL3" + b"\xff" * 300):
         with pytest.raises(ValueError, match=r"is no (whole )?TensorFlow Lite file"):
             read_lite_file(wrong)
-    with pytest.raises(ValueError, match=r"has an operator of kind 4\. Known are 0, 2, 3, 9, 18"):
-        read_lite_file(lite_file(code=4))
-    with pytest.raises(
-        ValueError, match="has an operator with the activation 3, which is not known"
-    ):
-        read_lite_file(lite_file(activation=3))

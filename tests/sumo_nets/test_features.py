@@ -14,8 +14,6 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from cosim.core.errors import MapError
 from cosim.core.geometry import Pose
@@ -485,68 +483,6 @@ def test_broken_outlines_are_left_out_and_counted(tmp_path: Path) -> None:
         "roofs, ruins and plans of buildings": 1,
         "buildings above or under the ground": 2,
     }
-
-
-WORDS = st.text(max_size=6) | st.sampled_from(
-    ["", "tall", "1e9", "12 m", "40'", "-3", "nan", "inf", "0", "9" * 30, "Ø", "5;6"]
-)
-PAIRS = st.sampled_from(
-    [
-        ("building", "yes"),
-        ("natural", "tree"),
-        ("natural", "tree_row"),
-        ("highway", "street_lamp"),
-        ("amenity", "bench"),
-        ("barrier", "bollard"),
-        ("emergency", "fire_hydrant"),
-        ("type", "multipolygon"),
-    ]
-)
-KEYS = st.sampled_from(
-    [
-        "height",
-        "building:levels",
-        "min_height",
-        "building",
-        "direction",
-        "layer",
-        "fire_hydrant:type",
-        "location",
-    ]
-)
-
-
-@settings(max_examples=100)
-@given(data=st.data())
-def test_any_tags_are_read_or_counted(
-    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
-) -> None:
-    """Any tags, outlines, members and missing nodes: no exception, only finite things of sound
-    height and outline."""
-    drawing = Drawing()
-    spots = st.tuples(st.floats(-200, 200), st.floats(-200, 200))
-    tags = st.dictionaries(KEYS, WORDS.filter(lambda w: w.isprintable()), max_size=4)
-    at = data.draw(st.lists(spots, max_size=6))
-    nodes = [drawing.node(x, y, dict([data.draw(PAIRS)]) | data.draw(tags)) for x, y in at]
-    refs = st.lists(st.sampled_from([*nodes, 77_777]), max_size=7)
-    ways = []
-    for way in data.draw(st.lists(refs, max_size=4)):
-        closed = [*way, way[0]] if way and data.draw(st.booleans()) else way
-        ways.append(drawing.way(closed, dict([data.draw(PAIRS)]) | data.draw(tags)))
-    roles = st.sampled_from(["outer", "inner", "?"])
-    members = st.lists(st.tuples(st.sampled_from([*ways, 88_888]), roles), max_size=4)
-    drawing.relation(
-        data.draw(members), {"building": "yes", "type": "multipolygon"} | data.draw(tags)
-    )
-    things, skipped = drawing.found(tmp_path_factory.mktemp("any") / "any.osm")
-    assert all(count > 0 for count in skipped.values())
-    for thing in things:
-        assert (
-            all(np.isfinite(ring).all() for ring in thing.rings) and 0.0 <= thing.height_m < 1000.0
-        )
-        if thing.kind == "building":
-            assert LOWEST_M <= thing.height_m <= HIGHEST_BUILDING_M
-            assert shapely.Polygon(thing.rings[0], thing.rings[1:]).is_valid
 
 
 def test_the_projection_is_utm_or_none() -> None:

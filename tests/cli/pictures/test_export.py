@@ -101,15 +101,6 @@ def ground_of(path: Path) -> np.ndarray:  # type: ignore[type-arg]
     return np.column_stack([x, -back, up])
 
 
-def test_the_ground_of_a_written_street_lies_at_its_heights(
-    street: StreetSurface, file: Path
-) -> None:
-    """The middle of each triangle that carries is as high as the street there."""
-    ground = ground_of(file)
-    away = np.abs(ground[:, 2] - street.heights(ground[:, :2]))
-    assert len(ground) > 100 and np.quantile(away, 0.97) < 0.005
-
-
 @pytest.mark.engine
 def test_the_command_writes_the_tiles_along_a_route(tmp_path: Path, cosim: Cosim) -> None:
     """A scenario of a suite's file is exported: there is ground along its route from end to end,
