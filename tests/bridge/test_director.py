@@ -124,7 +124,7 @@ def test_a_director_that_raises_is_reported_with_its_words(tmp_path: Path) -> No
 
 
 def test_a_missing_director_is_waited_for_and_then_lost(tmp_path: Path) -> None:
-    """Nobody on the key: asked again until the time is over, then an error that says so."""
+    """A query to a missing director is retried until its timeout and then fails."""
     with listening_at(endpoint(tmp_path)), connected_to(endpoint(tmp_path)) as client:
         began = time.monotonic()
         with pytest.raises(DirectorLost, match=r"nobody answered .* for 0\.5 s"):

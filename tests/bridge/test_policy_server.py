@@ -219,8 +219,7 @@ def test_a_remote_policy_is_asked_as_one_here(hub: Connection) -> None:
 
 @pytest.mark.engine
 def test_a_step_that_is_asked_again_is_answered_from_what_was_kept(hub: Connection) -> None:
-    """An answer that comes after the question was given up is had by asking the same step again:
-    the policy is asked once."""
+    """A repeated query of a step is answered from the cache."""
     policy = Counting()
     with served(hub, policy), driver_at(hub, times=ServerTimes(try_s=0.2)) as driver:
         driver.reset("slow", 7)
@@ -235,8 +234,7 @@ def test_a_step_that_is_asked_again_is_answered_from_what_was_kept(hub: Connecti
 def test_a_link_cut_while_a_question_is_under_way_for_long_is_waited_for(
     hub: Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A server is gone when nobody has heard of it for a while after the link was cut, however long
-    it had thought."""
+    """A server is lost a fixed time after its link was cut, however long its answer took before."""
     ask_once = Session.ask_once
     cuts = ["one"]
 
@@ -302,8 +300,7 @@ def test_servers_of_one_name_share_the_episodes_and_each_keeps_its_own(hub: Conn
 
 @pytest.mark.engine
 def test_a_server_begun_anew_has_lost_the_episode(hub: Connection) -> None:
-    """Whether it is gone or another has taken its place, nobody answers in the middle of an episode
-    for it: it is lost, and begun again it is whole."""
+    """A restarted server has lost its episode, which starts again."""
     with driver_after(hub) as driver:
         with served(hub, Counting()):
             driver.reset("k1", 7)

@@ -444,8 +444,8 @@ def test_ctrl_c_while_the_modules_load_is_no_traceback(monkeypatch: pytest.Monke
 
 
 def test_a_suite_that_does_not_fit_its_place_is_refused(desk: Path, cosim: Cosim) -> None:
-    """A start off the sidewalk, another street net, a robot and a map that nobody knows: told
-    together, before anything runs, and no folder is left."""
+    """All faults of a suite against its place are reported together before anything runs, and no
+    folder is left."""
     suite = json.loads((desk / "four.json").read_text())
     off, other, robot, unknown = suite["scenarios"]
     off["start"][:2] = off["route"][0] = [-50.0, -50.0]

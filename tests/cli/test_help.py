@@ -66,8 +66,7 @@ def test_help_is_read_in_80_columns(words: tuple[str, ...]) -> None:
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
 def test_maps_in_examples_are_there_or_imported_by_them(words: tuple[str, ...]) -> None:
-    """Nobody who types an example is told that its map is unknown: it comes with SUMO, or an
-    example imports it."""
+    """Every map in an example comes with SUMO or is imported by an example."""
     named = re.findall(
         r"(?:--map|map check|map endure) ([a-z][\w-]*)", COMMANDS[words].epilog or ""
     )

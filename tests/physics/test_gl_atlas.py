@@ -59,9 +59,8 @@ def test_an_atlas_holds_the_pictures_of_its_cameras(worlds: list[BulletWorld]) -
 def test_environments_join_and_leave_an_atlas(
     worlds: list[BulletWorld], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever else is in it, before, beside or after, one that cannot be drawn too: an environment
-    of a place, light and robot of its own has the pictures of a camera of its own, in the order
-    asked for, also one that left before its picture was fetched."""
+    """An environment in an atlas gets the pictures of its own camera, whichever environments join,
+    leave or fail."""
     from physics.cameras.gl.atlas import Atlas
 
     busy = busy_street(camera_city(300.0), 8, 4)

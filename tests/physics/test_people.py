@@ -200,8 +200,7 @@ def test_statures_are_of_all_ages() -> None:
 
 
 def test_strides_follow_the_way_walked() -> None:
-    """Ten metres at the reference pace are ten metres over the stride; who stands counts none; who
-    jumps neither."""
+    """Strides count the metres walked; standing and jumping count none."""
     strides = Strides(0.05)
     start = first_stride("c1")
     for k in range(201):

@@ -61,8 +61,8 @@ class Elements(HTMLParser):
 
 
 def test_a_cell_of_ours_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
-    """Success of straight ways, with its interval, stands in the row of the policy; the paper's
-    rows are marked, and stand only beside those of its suites."""
+    """A cell of a policy is the summary of its episodes; rows of the paper are marked and appear
+    only with its suites."""
     (own,) = read_runs([run_of(tmp_path / "run", ["goal", HIT, HIT, "goal", "goal"], "mine")])
     spec = msgspec.structs.replace(own.spec, suite="unit")
     told = ReportedRun("mine", own.whole._replace(spec=spec))
@@ -180,8 +180,7 @@ def test_a_run_without_a_failure_stands_at_0_beside_one_with(
 
 
 def test_long_ways_on_which_a_policy_crashed_are_told_beside_their_rates(tmp_path: Path) -> None:
-    """Two of three crash: their metres are nobody's, the note says how many they are, and who did
-    not crash is not in it."""
+    """Rates of long ways leave out crashed episodes, and a note counts them."""
     ways = [short_way(f"s-{k}", ends_on_failure=False, time_limit_s=300.0) for k in range(3)]
     # 4 m to a failure in each: the rates of a run need 20 m
     runs = read_runs(

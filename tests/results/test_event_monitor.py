@@ -66,9 +66,8 @@ def share_in_picture(x_m: float, y_m: float) -> float:
 
 
 def test_the_standard_camera_sees_what_lies_within_its_field() -> None:
-    """A camera 75 degrees wide, 0.3 m before the middle: all of who stands 5 m ahead or 30 degrees
-    aside, nothing of who stands 45 degrees aside or behind; of somebody half a metre before it no
-    head, but more than a tenth."""
+    """The share of a person in a picture 75 degrees wide is 1 ahead, 0 at 45 degrees or behind, and
+    partial at half a metre."""
     aside = {
         deg: (8.0 * math.sin(math.radians(deg)), 0.3 + 8.0 * math.cos(math.radians(deg)))
         for deg in (30, 45)

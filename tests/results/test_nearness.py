@@ -38,8 +38,8 @@ def test_two_who_drive_at_each_other_meet_halfway() -> None:
 
 
 def test_who_passes_aside_or_walks_away_is_never_met() -> None:
-    """One on a line 0.7 m beside the robot's, one who keeps ahead at its pace, one who stands
-    behind it."""
+    """A person who passes aside, walks ahead at the same pace or is behind has no time to
+    collision."""
     passing = people((5.0, 0.7, math.pi, 1.0), (3.0, 0.0, 0.0, 1.0), (-2.0, 0.0, 0.0, 0.0))
     near = nearness(RobotState(Pose(0.0, 0.0, 0.0), v_mps=1.0), passing, FOOTPRINT)
     assert (

@@ -168,7 +168,7 @@ def test_a_log_keeps_its_beginning_and_its_end(tmp_path: Path, printed: int) -> 
 def test_a_first_answer_may_take_longer(
     doing: PolicyCall, answer_s: float, start_s: float, overdue: bool
 ) -> None:
-    """What loads a model has a time of its own; nobody is late before anything is asked."""
+    """The first answer has its own timeout, and none runs before a query."""
     asked = Asked.new()
     assert asked.question is None
     asked.starts(doing, 64)

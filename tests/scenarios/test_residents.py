@@ -219,9 +219,8 @@ def test_nobody_passes_a_fence() -> None:
 
 
 def test_who_does_something_faces_it_and_leaves_the_middle_free() -> None:
-    """A bench is behind who sits, a window before who looks into it, a road before who waits; 0.6 m
-    to either side of the middle of the sidewalk stay free, and nobody is farther than 1.2 m beside
-    it."""
+    """A resident sits with its back to a bench, looks into a window and waits facing a road, and
+    leaves 0.6 m on both sides of the middle of the sidewalk free."""
     seen = set()
     for one in towns():
         area = LineString(one.route).buffer(90.0)
@@ -302,8 +301,7 @@ def test_a_resident_walks_idles_and_does_something(three_minutes: list[Moment]) 
 
 
 def test_speeds_are_those_of_the_motion(three_minutes: list[Moment]) -> None:
-    """In three minutes nobody's speed differs from what it moved in the tick, also of who treads to
-    turn or to rise."""
+    """The speed of each resident is the distance it moved in the tick."""
     before: dict[str, Floats] = {}
     treads = 0
     for moment in three_minutes:
@@ -320,8 +318,7 @@ def test_speeds_are_those_of_the_motion(three_minutes: list[Moment]) -> None:
 
 
 def test_residents_keep_out_of_things_people_and_the_robot() -> None:
-    """75 seconds in each of two cities beside a robot that drives: never in a prop or house by a
-    disk's radius, never within 0.45 m of somebody, never within the robot's outline."""
+    """Residents never overlap an object, a person or the robot."""
     for city in CITIES[:2]:
         one = town(*city)
         tree = shapely.STRtree(list(one.things))

@@ -207,9 +207,8 @@ def knows(name: str, step: int) -> AskAct:
 
 @pytest.mark.engine
 def test_what_takes_the_policy_down_names_whom_it_was_asked_for(tmp_path: Path) -> None:
-    """What act_batch raises concerns all that it was queried for. A policy that hangs, exits or
-    closes what is not its own takes the renderer with it, and who was not asked knows that it was
-    not."""
+    """An error in act_batch crashes all its episodes; a policy that ends the renderer costs an
+    attempt only of the queried ones."""
     with renderer_for(tmp_path, Knowing(), Patience(answer_s=1.0)) as renderer:
 
         def begun(*names: str) -> list[RendererLink]:

@@ -498,9 +498,8 @@ def test_a_sample_holds_every_structure() -> None:
 
 @pytest.mark.engine
 def test_a_build_goes_on_where_it_was_and_its_proofs_hold(tmp_path: Path, cosim: Cosim) -> None:
-    """A candidate whose process died twice is dropped and told, the next is kept; built again,
-    nothing is done anew; the expert comes to the same state to the bit, and another state in the
-    proof is found out."""
+    """A candidate whose process died twice is dropped, a second build repeats nothing, and a wrong
+    state in a proof is found."""
     out = tmp_path / "unit.json"
     lines: list[str] = []
     parts = out.with_suffix(".parts")

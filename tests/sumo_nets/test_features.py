@@ -267,8 +267,7 @@ def test_nothing_is_made_up_where_the_map_shows_it(
 def test_land_is_shown_and_changes_nothing_that_stands_or_rolls(
     drawn: tuple[StreetMap, tuple[str, ...]],
 ) -> None:
-    """A parking lot of the file is a yard of the map, told and covered by its hash; without it
-    everything that stands, and the ground that wheels feel, is the same to the bit."""
+    """Land use changes the look and the hash of a map, and no bit of its objects and ground."""
     street_map, changes = drawn
     (lot,) = (f for f in street_map.features if f.kind in LANDS)
     assert lot.kind == "yard" and "1 x yard" in " | ".join(changes)

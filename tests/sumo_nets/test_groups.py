@@ -126,8 +126,8 @@ def test_a_group_walks_abreast_where_there_is_room() -> None:
 
 
 def test_who_is_ahead_slows_down_and_who_lags_hurries() -> None:
-    """A metre apart on a sidewalk the first is told to walk slower, the second faster, abreast
-    nobody is told anything; but nobody slows down on a crossing."""
+    """The member of a group that is ahead slows down and the one behind hurries, except on a
+    crossing."""
     told = kept(Walkers(c0=("s", 11.0, 0.0), c1=("s", 10.0, 0.64)))
     assert told["c0"] < 1.2 and 1.3 < told["c1"] < 1.44
     assert kept(Walkers(c0=("s", 10.1, 0.0), c1=("s", 10.0, 0.64))) == {}
@@ -261,8 +261,7 @@ def test_groups_stay_together_on_the_street(tmp_path: Path) -> None:
 
 @pytest.mark.engine
 def test_a_group_is_taken_out_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where everybody who does not wait at red is taken out at the next look, all who walk along
-    leave in that tick."""
+    """Members of a stuck group leave the street in the same tick."""
     monkeypatch.setattr("sumo_nets.crowd.demand.STUCK_S", -1.0)
     net = tmp_path / "city.net.xml"
     build_city(City(seed=2, size_m=600.0), net)

@@ -325,8 +325,7 @@ def test_what_would_have_to_be_unpickled_is_not_read(tmp_path: Path, written: st
 
 
 def test_what_is_too_long_is_dropped_unread(certs: Path) -> None:
-    """An injection of 64 KiB arrives, one byte more does not; what nobody may send at all ends
-    nobody's link."""
+    """A message longer than 64 KiB is dropped, and one of a role without rights ends no link."""
     at = f"tls/localhost:{free_port()}"
     lengths: list[int] = []
     with ExitStack() as stack:
