@@ -45,7 +45,7 @@ def test_an_episode_imports_only_what_it_drives_with() -> None:
 def test_the_kth_episode_of_a_process_is_the_first_one_of_another(
     request: pytest.FixtureRequest,
 ) -> None:
-    """Ten episodes, 30 with --whole, two cities, many crowds, grounds, robots and lights in random
+    """Six episodes, 30 with --whole, two cities, many crowds, grounds, robots and lights in random
     order: same states, same pictures."""
     whole = request.config.getoption("--whole")
     count, only = (COUNT, []) if whole else (SAMPLE_COUNT, ["--sample"])

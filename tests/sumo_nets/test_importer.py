@@ -54,11 +54,8 @@ NAMES = (
     sorted(p.name for p in MAPS.glob("*") if (p / "stats.json").exists()) if MAPS.is_dir() else []
 )
 SAMPLE = (
-    "berlin-doerpfeldstr",
-    "berlin-neukoelln",
     "braunschweig-bs3d",
     "frederiksted",
-    "london-st-georges",
     "taipei",
     "west-oakland",
 )

@@ -94,11 +94,6 @@ class Leaves(Honest):
         return super().act(seen)
 
 
-class Mute(Exception):
-    def __str__(self) -> str:
-        raise SystemExit(1)
-
-
 class Endless:
     """A sequence without end."""
 
@@ -251,15 +246,6 @@ DEEDS = {
         "policy 'honest' raised KeyError: 'no such weight' (act at 0.25 s)",
     ),
     "exits": Deed(lambda self, seen: sys.exit("enough"), "raised SystemExit: enough", None),
-    "exits-in-reset": Deed(
-        lambda self, seen: sys.exit(3), "raised SystemExit: 3 (reset)", None, "reset"
-    ),
-    "mute": Deed(lambda self, seen: _raise(Mute()), "raised Mute: (its message cannot", None),
-    "odd-text": Deed(
-        lambda self, seen: _raise(ValueError("\ud800 \x1b[31m red \x00")),
-        "raised ValueError: ? ?[31m red ?",
-        None,
-    ),
     "pretends-to-be-an-engine": Deed(
         lambda self, seen: _raise(EngineError("SUMO failed")), "EngineError: SUMO failed", None
     ),
@@ -267,11 +253,6 @@ DEEDS = {
         lambda self, seen: _raise(PolicyServerLost("the server is gone")),
         None,
         "policy 'honest' raised PolicyServerLost: the server is gone (act at 0.25 s)",
-    ),
-    "nan": Deed(
-        lambda self, seen: Command(float("nan"), 0.0),
-        "answered Command(v_mps=nan, w_radps=0.0): both must be finite",
-        None,
     ),
     "without-end": Deed(lambda self, seen: Endless(), "policy 'honest' ", None),
     "too-many-numbers": Deed(lambda self, seen: np.zeros((50_001, 2)), _TOO_MANY, _TOO_MANY),
