@@ -108,7 +108,7 @@ def test_a_run_says_whom_its_robot_delayed_only_when_asked(
 ) -> None:
     """The delays are in row and record of the run that asked; nothing else differs from the run
     that did not."""
-    short = msgspec.structs.replace(scenario, time_limit_s=5.0)
+    short = msgspec.structs.replace(scenario, time_limit_s=10.0)
     write_suite(Suite(name="one", version="1", scenarios=(short,)), tmp_path / "one.json")
     done = cosim(
         "run", "one.json", "--policy", "orca", "--out", "asked", "--counterfactual", cwd=tmp_path
