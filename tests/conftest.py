@@ -12,6 +12,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from importlib.metadata import version
@@ -165,6 +166,14 @@ def _as_a_program(words: tuple[str, ...], folder: Path) -> Iterator[None]:
             if source and Path(source).is_relative_to(folder):
                 del sys.modules[name]
         signal.signal(signal.SIGTERM, before[4])
+
+
+def wait_until(holds: Callable[[], object]) -> None:
+    """Wait until something holds, as long as a test waits at most."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not holds():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
 
 
 def without_lines(text: str) -> str:

@@ -144,34 +144,3 @@ def test_each_engine_is_imported_where_architecture_says() -> None:
         "libsumo is imported only in `sumo_nets/engine.py`, PyBullet and moderngl only in "
         "`physics`, zenoh only in `bridge/session.py` and in `bridge/policy_server.py`" in said
     )
-
-
-def test_architecture_tells_the_size_of_the_tiles_that_are_loaded() -> None:
-    """The sentence about the ground's tiles names the size that the code has."""
-    from physics.ground.tiles import TILE_M
-
-    assert (
-        f"Tiles of {TILE_M:g} m are loaded around the robot."
-        in (ROOT / "ARCHITECTURE.md").read_text()
-    )
-
-
-_LOOKS_INTO_AN_ID = re.compile(
-    r"""startswith\((?:INJECTED_ID|"(?:[cenv]|ei-)"\))|\bids\[\w+\]\["""
-    r"""|(?:\.id|\b(?<!\.)name)\[0\] (?:in|==|!=)|bisect_\w+\([\w.]*ids"""
-)
-
-
-def test_nobody_looks_into_a_persons_id() -> None:
-    """Whose a person is, and how old, are columns of `People`: no file asks how an id begins, nor
-    for its letters."""
-    guilty = (
-        'ids[i][0] in "en"',
-        'n.startswith("c")',
-        'b.id[0] in "en"',
-        'bisect_left(people.ids, "e")',
-        "name[0] == k",
-    )
-    assert all(map(_LOOKS_INTO_AN_ID.search, guilty))
-    texts = {path: path.read_text() for room in ROOMS for path in (ROOT / room).rglob("*.py")}
-    assert not [str(path) for path, text in texts.items() if _LOOKS_INTO_AN_ID.search(text)]

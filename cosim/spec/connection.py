@@ -15,7 +15,7 @@ import msgspec
 from cosim.core.errors import UsageError
 
 Role = Literal["coordinator", "director", "policy", "worker", "viewer", "injector"]
-"""Role of an end of a session, for its rights (`bridge.security.rights`)."""
+"""Role of an end of a session, for its rights (`bridge.security.settings`)."""
 HUBS: Final[tuple[Role, ...]] = ("coordinator", "director", "policy")
 """Roles that listen; the others connect."""
 

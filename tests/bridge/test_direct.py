@@ -251,8 +251,7 @@ def test_a_director_that_lies_spoils_its_episodes_and_no_other(
 
 
 def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cosim: Cosim) -> None:
-    """Nobody there at first: the run says so, and goes on when somebody is; one that never comes is
-    an error."""
+    """A run waits for its director and says so; without one it ends with an error."""
     from cosim.core.errors import DirectorLost
     from cosim.spec.events import EventQuery
     from cosim.spec.options import Outside

@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from threading import Thread
 from typing import Any, NamedTuple
 
 import msgspec
@@ -163,26 +162,6 @@ def test_points_from_the_robot_are_taken_where_it_is_when_the_pedestrian_enters(
     assert [again.react(query(tick)).actors for tick in range(1, 100)] == shown
 
 
-def test_points_from_the_robot_wait_for_the_tick_under_way() -> None:
-    """Offered in the middle of a tick the pedestrian enters at the next one, and ahead of the robot
-    as it is then."""
-    acks: list[Ack] = []
-    here = InjectionRequest(id="a", path=(RelativePoint(10.0),))
-
-    class Busy(Nobody):
-        def react(self, query: EventQuery) -> EventReply:
-            offering.start()
-            return super().react(query)
-
-    one = injected_people(director=Busy())
-    offering = Thread(target=lambda: acks.append(one.offer(here)))
-    one.react(query(0))
-    assert not acks
-    one.robot_at(RobotOnRoute(1, Pose(20.0, 30.0, 0.0), 40.0))
-    offering.join(PATIENCE_S)
-    assert acks == [Ack(id="a", status="accepted", tick=1, time_s=0.05, x_m=30.0, y_m=30.0)]
-
-
 def test_a_tick_that_does_not_end_refuses_points_from_the_robot(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -326,21 +305,6 @@ def test_a_flood_is_bounded() -> None:
     assert sum(ack.status == "accepted" for ack in acks) == MOST_INJECTED
     assert "are here already" in acks[-1].reason
     assert len(one.react(query(0)).actors) == MOST_INJECTED
-
-
-def test_those_who_enter_count_while_the_director_is_asked() -> None:
-    """An offer that comes in between finds the street as full as it is about to be."""
-    acks: list[Ack] = []
-
-    class Slow(Nobody):
-        def react(self, query: EventQuery) -> EventReply:
-            acks.append(one.offer(anna(id="late")))
-            return super().react(query)
-
-    one = injected_people(director=Slow())
-    assert all(one.offer(anna(id=f"p{i}")).status == "accepted" for i in range(MOST_INJECTED))
-    assert len(one.react(query(0)).actors) == MOST_INJECTED
-    assert acks[0].status == "refused" and "are here already" in acks[0].reason
 
 
 def test_an_injected_person_does_not_walk_through_the_robot() -> None:

@@ -47,8 +47,7 @@ def put_on_the_air(hub: Session, name: str) -> None:
 
 
 def test_listen_waits_until_an_episode_is_on_the_air(tmp_path: Path) -> None:
-    """Started before the run it says that it waits, then which episode came, and tells what that
-    one tells."""
+    """`cosim listen` waits for an episode, says so, and then prints its messages."""
     at = f"unixsock-stream/{tmp_path}/air.sock"
     words = ("listen", "events", "--connect", at, "--seconds", "0", "--wait", str(PATIENCE_S))
     with started(*words) as listening, listening_at(at) as hub:

@@ -3,7 +3,6 @@ requests."""
 
 from __future__ import annotations
 
-import itertools
 import re
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
@@ -27,10 +26,8 @@ from bridge.policy_server import (
     packed,
     read_request,
 )
-from cosim.core.errors import PolicyError
 from cosim.core.state import STILL, Command, Planned
 from cosim.episode.interfaces import Observation
-from cosim.episode.policy_caller import PolicyCall
 from cosim.spec.manifest import Manifest, WaypointRule
 from cosim.spec.robot import COURIER
 from scenarios.ipc.observation_codec import ObservationDecoder
@@ -162,34 +159,6 @@ def test_what_is_no_answer_to_a_batch_is_the_crash_of_all_of_it(
     assert refused == [Refusal("policy", words, together=2)] * 2
 
 
-def test_the_first_answer_of_any_episode_of_a_batch_may_take_longer() -> None:
-    """A call is a first one while one of its episodes has not been answered since its reset."""
-    timed: list[PolicyCall] = []
-
-    class Timer:
-        def starts(self, doing: PolicyCall, tick: int) -> None:
-            timed.append(doing)
-
-        def stops(self) -> None:
-            """Nothing to note."""
-
-    desk = began(NotesMany(lambda some: [STILL for _ in some]), "a", "b", timer=Timer())
-    timed.clear()
-    for step, names in enumerate(("a", "a")):
-        desk.replies([act(name, step=step) for name in names])
-    desk.replies([act("a", step=2), act("b", step=0)])
-    desk.replies([act("a", step=3), act("b", step=1)])
-    desk.replies([AskReset("r", "b", "again", 7)])
-    assert [doing for doing, _ in itertools.groupby(timed)] == [
-        "first act",
-        "act",
-        "first act",
-        "act",
-        "ended",
-        "reset",
-    ]
-
-
 def test_a_policy_for_many_episodes_gets_resets_and_ends_of_each() -> None:
     """`on_reset` comes before the act that follows, `ended` once."""
     policy = NotesMany(lambda some: [STILL for _ in some])
@@ -301,20 +270,3 @@ def test_a_plan_with_its_command_stays_one() -> None:
     command = driver.act(seen(0))
     assert isinstance(command, Planned) and (command.v_mps, command.w_radps) == (0.5, 0.1)
     assert command.waypoints.tobytes() == plan.tobytes() and command.index == 1
-
-
-def test_a_fault_elsewhere_has_the_words_of_one_in_this_process() -> None:
-    """Which call it was, and when; an error's long message is cut once."""
-    driver = hosted(NotesMany())
-    driver.reset("bad", 0)
-    where = r"in test_policy_desk\.py:\d+ \(on_reset at 0\.25 s\)"
-    with pytest.raises(
-        PolicyError, match=rf"^policy 'mine' raised LookupError: no history {where}$"
-    ):
-        driver.act(seen(5, reset=True))
-    driver = hosted(Notes(raising(ValueError("x" * 10_000))))
-    driver.reset("a", 0)
-    with pytest.raises(
-        PolicyError, match=r"raised ValueError: x{500} \.\.\. \(10000 characters\) in \S+ \(act at"
-    ):
-        driver.act(seen(5))

@@ -116,8 +116,7 @@ def test_the_examples_of_documents_and_help_step_into_the_first_scenario(
 def test_the_printed_command_reaches_the_run(
     listen: str, how: dict[str, object], words: str
 ) -> None:
-    """An address that stands for all is replaced by one to connect to; certificates are those of
-    the role beside."""
+    """The printed command has an address to connect to and the certificates of its role."""
     hub = Connection(role="coordinator", listen=listen, **how)  # type: ignore[arg-type]
     assert reached_by(hub, "injector") == f" {words}"
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import sys
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import pytest
 from cosim.cli.app import main
 from cosim.core import errors
 from cosim.core.errors import CosimError
-from tests.conftest import Cosim
 from tests.support.documents import text_of
 
 CODES = {
@@ -132,10 +130,3 @@ def test_the_documents_list_the_exit_codes() -> None:
         errors.UNREAD,
     ):
         assert f"\n| {code} |" in page
-
-
-def test_the_help_tells_the_exit_codes(cosim: Cosim) -> None:
-    """`cosim --help` names every code of the table in docs/first-run.md."""
-    codes = re.findall(r"^\| (\d+) \|", text_of("docs/first-run.md"), re.MULTILINE)
-    told = " ".join(cosim("--help").stdout.split()).partition("Exit codes: ")[2]
-    assert len(codes) == 6 and re.findall(r"(?:^|; )(\d+) ", told) == codes

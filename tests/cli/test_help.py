@@ -19,8 +19,6 @@ from cosim.core.errors import UsageError
 from cosim.spec.connection import checked_endpoint
 from tests.conftest import PATIENCE_S
 
-FIRST = ("run", "list", "show", "doctor")
-
 
 def commands(group: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
     """Every command below a group, with the words that call it."""
@@ -66,31 +64,14 @@ def test_help_is_read_in_80_columns(words: tuple[str, ...]) -> None:
     assert not re.findall(r"<[a-z|-]*[|][a-z|-]*(?![a-z|>-])", "\n".join(lines))
 
 
-def test_h_is_help() -> None:
-    """Whoever types -h is helped, everywhere."""
-    assert said("-h") == said("--help") and said("map", "check", "-h") == said(
-        "map", "check", "--help"
-    )
-
-
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
 def test_maps_in_examples_are_there_or_imported_by_them(words: tuple[str, ...]) -> None:
-    """Nobody who types an example is told that its map is unknown: it comes with SUMO, or an
-    example imports it."""
+    """Every map in an example comes with SUMO or is imported by an example."""
     named = re.findall(
         r"(?:--map|map check|map endure) ([a-z][\w-]*)", COMMANDS[words].epilog or ""
     )
     imported = re.findall(r"map import ([\w-]+)[.]", COMMANDS["map", "import"].epilog)
     assert all(name.startswith("sumo-") or name in imported for name in named), named
-
-
-def test_what_a_newcomer_needs_comes_first() -> None:
-    """`cosim --help` begins with the commands of the README's first section."""
-    shown = said("--help")
-    places = [shown.index(f"│ {name} ") for name in FIRST]
-    assert places == sorted(places)
-    others = {words[0] for words in COMMANDS} - set(FIRST)
-    assert all(shown.index(f"│ {name} ") > places[-1] for name in others)
 
 
 def test_the_version_is_said_without_an_engine() -> None:

@@ -1,4 +1,4 @@
-"""What is recorded of a machine's arithmetic."""
+"""The arithmetic of a machine: what records say of it, and numpy without AVX-512."""
 
 from __future__ import annotations
 
@@ -41,3 +41,46 @@ def test_numpy_with_avx512_tells_something_else() -> None:
     if "avx512f" not in FLAGS:
         pytest.skip("this processor has no AVX-512")
     assert told("import numpy; " + TELLS, NPY_DISABLE_CPU_FEATURES="").strip() != arithmetic()
+
+
+_FEATURES = "from numpy._core._multiarray_umath import __cpu_features__ as f; print(f['X86_V4'])"
+
+
+def _said(program: str) -> subprocess.CompletedProcess[str]:
+    clean = {"PYTHONPATH": ":".join(sys.path)}
+    return subprocess.run(
+        [sys.executable, "-c", program], env=clean, capture_output=True, text=True, check=True
+    )
+
+
+@pytest.mark.parametrize(
+    "room",
+    [
+        "cosim",
+        "scenarios.suites.user_scenarios.read",
+        "physics.robots",
+        "sumo_nets.city",
+        "bridge.codec",
+    ],
+)
+def test_whatever_room_is_imported_numpy_goes_without_avx512(room: str) -> None:
+    """Whatever room of the project a program imports first, numpy computes without AVX-512
+    there."""
+    assert _said(f"import {room}; {_FEATURES}").stdout == "False\n"
+
+
+def test_a_program_that_loads_numpy_first_is_warned() -> None:
+    """Where numpy computes with AVX-512 because it was loaded before cosim, a warning says so and
+    what to do."""
+    if _said(_FEATURES).stdout == "False\n":
+        pytest.skip("this processor has no AVX-512")
+    assert "Import cosim first" in _said("import numpy, cosim").stderr
+    assert "AVX-512" not in _said("import cosim, numpy").stderr
+
+
+def test_what_the_user_leaves_out_stays_left_out() -> None:
+    """Features of numpy that the environment leaves out already are left out still."""
+    asked = "import os; os.environ['NPY_DISABLE_CPU_FEATURES'] = 'X86_V3, X86_V4'; import cosim; "
+    assert _said(asked + "print(os.environ['NPY_DISABLE_CPU_FEATURES'])").stdout.startswith(
+        "X86_V3 X86_V4 "
+    )

@@ -105,8 +105,7 @@ def test_the_manifest_says_which_waypoint_is_followed_and_in_which_units() -> No
 
 
 def test_a_command_tells_the_waypoints_that_it_follows_one_of() -> None:
-    """In metres, as they were answered, with the index; asked again it is the same; nobody tells
-    any that are none."""
+    """A command carries its waypoints in metres and the index of the followed one."""
     rule = WaypointRule(index=1, unit_m=0.5)
     told = command_of([[1.0, 0.5, 0.6, 0.8], [2.0, -1.0, 1.0, 0.0]], rule=rule, robot=COURIER)
     assert isinstance(told, Planned) and told.index == 1 and told.waypoints.dtype == np.float32

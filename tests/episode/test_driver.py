@@ -249,8 +249,7 @@ def test_a_child_that_a_policy_forks_does_not_go_on_with_the_episode() -> None:
 
 
 def test_a_policy_at_work_is_timed() -> None:
-    """Every question is told when it begins and ends, also if it ends badly; the first answer is
-    told apart."""
+    """Every query of a policy is timed, also one that fails; the first is marked."""
     told: list[tuple[str, int] | None] = []
 
     class Notes:
@@ -357,8 +356,7 @@ class RemembersMany(Remembers):
 
 
 def test_on_reset_comes_before_the_act_that_follows_a_teleport() -> None:
-    """Only then; a policy without it is asked all the same, and what it raises is a crash told as
-    its own."""
+    """on_reset is called only before the act after a teleport; an error in it is a crash."""
     policy = Remembers()
     driver = Driver(policy)
     for observation in (seen(0), put_back("", 5), seen(10)):

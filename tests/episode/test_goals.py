@@ -67,8 +67,8 @@ def point(goal: Goal | None) -> tuple[float, float]:
 
 
 def test_the_point_of_the_route_lies_5_to_20_m_along_it() -> None:
-    """Set 20 m along it, kept until 5 m are left to it, then set anew; set anew too when the robot
-    was put back; from 20 m before it, the end of the route, however near."""
+    """The goal is set 20 m along the route and set again at 5 m or after a reset; near the end it
+    is the end."""
     told = goals("route_point")
     assert point(told.at(Pose(0.0, 0.0, 0.0), 0.0)) == (20.0, 0.0)
     assert point(told.at(Pose(15.0, 1.0, 0.0), 15.0)) == (5.0, -1.0)

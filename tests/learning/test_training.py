@@ -235,8 +235,8 @@ def test_it_can_be_trained_on_from_the_shipped_graph_alone(
 
 
 def test_the_mirror_exchanges_left_and_right_everywhere(data: Path) -> None:
-    """Picture, goal, speeds, turn and way are mirrored together: twice is as before, and the street
-    with somebody at the left becomes the one with somebody at the right."""
+    """Mirroring exchanges left and right in picture, goal, speeds and waypoints; twice it changes
+    nothing."""
     batch = Examples([data], 0, CPU).rows(np.array([0, 4]))
     there = mirror(batch)
     back = mirror(mirror(batch))

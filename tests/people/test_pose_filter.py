@@ -95,8 +95,7 @@ def test_people_come_and_go() -> None:
 
 @pytest.mark.parametrize("aside_m", [0.3, 0.6, 0.8, 1.0], ids=["close", "near", "middle", "apart"])
 def test_nobody_steps_round_what_stands_into_the_robot(aside_m: float) -> None:
-    """Who hurries past a thing that stands, with the robot driving beside it, comes no nearer to
-    the robot for it."""
+    """A person who passes an obstacle comes no nearer to a robot that drives on the other side."""
     half_m = 0.35, 0.275
     standing = Standing([StandingBody(0.0, -aside_m, 0.0, 1.0, 0.6, 0.0, -1.0)])
     poses = PoseFilter(DT_S, standing)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sumo_nets.crowd.separation import SHOULDERS_M, NearPairs, kept_apart
+from sumo_nets.crowd.separation import SHOULDERS_M, kept_apart
 
 REACH_M = 2.2 * 0.05
 
@@ -89,29 +89,3 @@ def test_who_stands_gives_way_to_who_comes_through() -> None:
         assert np.hypot(*(at[1] - at[0])) > 0.9 * SHOULDERS_M
     assert at[0, 0] > 2.0
     assert np.hypot(*at[1]) < 0.05
-
-
-def test_who_may_come_near_is_remembered_without_a_change() -> None:
-    """Among forty who walk, come, go and jump, step by step the same pairs are found as by looking
-    at all of them."""
-    rng = np.random.default_rng(3)
-    at = rng.uniform(0.0, 6.0, (40, 2))
-    near = NearPairs()
-    found = 0
-    for k in range(300):
-        at = at + rng.normal(0.0, 0.05, at.shape)
-        if k % 40 == 39:
-            at[int(rng.integers(len(at)))] = rng.uniform(0.0, 6.0, 2)
-        if k % 60 == 59:
-            at = at[int(k % 120 == 59) :]
-        firm = np.arange(len(at)) >= len(at) - 4
-        one, other = near.of(at[:, 0] + 1j * at[:, 1], firm)
-        gap = np.hypot(*(at[:, None] - at[None]).transpose(2, 0, 1))
-        pairs = np.triu((gap <= 0.6) & ~(firm[:, None] & firm[None]), 1)
-        too_near = (pairs & (gap < SHOULDERS_M)).any()
-        assert np.array_equal(np.column_stack([one, other]), np.argwhere(pairs & too_near))
-        found += len(one)
-    assert found > 100
-    assert [
-        len(side) for side in NearPairs().of(np.zeros(0, dtype=complex), np.zeros(0, dtype=bool))
-    ] == [0, 0]

@@ -75,8 +75,7 @@ def walk(
 
 
 def test_who_meets_nobody_walks_exactly_as_wanted() -> None:
-    """To the bit: with nobody there, with somebody beside the way, behind, far off, and ahead but
-    going away."""
+    """A person whom no one meets walks as wanted, to the bit."""
     wanted = (1.1 / 3.0, -0.7 / 3.0)
     assert steered((3.3, 4.7), (0.0, 0.0), wanted, []) == wanted
     beside = [

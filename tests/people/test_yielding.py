@@ -80,7 +80,7 @@ def test_who_walks_ahead_does_not_see_the_robot_come_from_behind() -> None:
 
 @pytest.mark.parametrize("x_m", [-0.3, 0.0, 0.5])
 def test_who_wants_to_stand_where_the_robot_is_stands_beside_it(x_m: float) -> None:
-    """Somebody who waits comes up to the robot, a hand's breadth away, and then stands still."""
+    """A person who wants to stand where the robot is comes within a hand's breadth of it and stops."""
     body = RobotBody(Pose(0.0, 0.0, 0.0), HALF)
     place = np.array([x_m, 0.45])
     xy = np.array([[2.0, 1.2]])

@@ -17,17 +17,15 @@ import shapely
 from cosim.core.errors import UsageError
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import LABELS, Command, RobotState, Street
-from cosim.place.street_map import StreetMap, Strip, street_of
+from cosim.place.street_map import StreetMap, Strip
 from cosim.spec.camera import CameraSpec
 from cosim.spec.scenario import City
 from physics.cameras.bullet_camera import BulletCamera
 from physics.dynamics.world import BulletWorld
-from physics.ground.materials import MATERIALS, PAVINGS, Paving, friction
-from physics.ground.tiles import CURB_M, TILE_M, Tile, build_tile, key_at, keys_within, kind_of
+from physics.ground.tiles import CURB_M, Tile, build_tile, key_at, keys_within
 from physics.street.buildings import Frontage
 from physics.street.clearance import clear_width, on_driveways
 from physics.street.furniture import (
-    CATALOGUE,
     KINDS,
     PROP_VARIANTS,
     Prop,
@@ -40,7 +38,6 @@ from physics.street.placement import (
     PROP_END_GAP_M,
     Placement,
     clear_half_m,
-    street_style,
 )
 from physics.street.street_surface import StreetSurface
 from sumo_nets.city.store import city_net
@@ -116,51 +113,6 @@ def test_a_prop_is_small_cheap_and_stands_on_the_ground(kind: object) -> None:
             assert abs(solid.at_m[1]) + 0.5 * solid.size_m[1] <= 0.5 * depth + 1e-9
 
 
-def test_crowns_are_closed_and_keep_to_their_room() -> None:
-    """Of every tree: each edge of the crown has two sides, it hangs above the heads, within its
-    spread, all lit."""
-    kind = KINDS["tree"]
-    for variant, look in itertools.product(range(PROP_VARIANTS), range(len(kind.paints))):
-        crown = parts_of("tree", variant, look)[1]
-        t = crown.mesh.triangles
-        edges = np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]])
-        assert {tuple(e) for e in edges.tolist()} == {tuple(e) for e in edges[:, ::-1].tolist()}
-        one, two = (crown.mesh.vertices[t[:, i]] - crown.mesh.vertices[t[:, 0]] for i in (1, 2))
-        outward = crown.mesh.vertices[t].mean(axis=1) - crown.mesh.vertices.mean(axis=0)
-        assert ((np.cross(one, two) * outward).sum(axis=1) > 0.0).mean() > 0.97
-        assert crown.mesh.vertices[:, 2].min() > 2.1
-        assert np.hypot(*crown.mesh.vertices[:, :2].T).max() < kind.spread_m + 0.1
-        assert crown.shade is not None and 0.2 < crown.shade.min() < crown.shade.max() <= 1.0
-
-
-def test_what_is_drawn_may_be_turned_and_bumps_as_before() -> None:
-    """Lamps behind a sidewalk turn their arms to the road, trees each their own way; headings are
-    left alone."""
-    for seed in range(4):
-        for prop in all_props(MAP, seed):
-            if prop.kind == "lamp":
-                strip = MAP.strips[prop.id.split(":")[1]]
-                aside = prop.drawn_rad + 0.5 * math.pi
-                arm = np.array([prop.x_m + math.cos(aside), prop.y_m + math.sin(aside)])
-                road = (
-                    Polyline(strip.line).project(*arm.tolist())[1]
-                    - Polyline(strip.line).project(prop.x_m, prop.y_m)[1]
-                )
-                assert road * strip.road_side > 0.9
-            elif prop.kind != "tree":
-                assert prop.drawn_rad == prop.heading_rad
-
-
-def test_street_classes_of_any_map_have_a_column() -> None:
-    """Our own classes are themselves; types of imported edges go by their words; the rest are
-    residential."""
-    assert street_style("boulevard") == "boulevard"
-    assert street_style("highway.primary_link") == "avenue"
-    assert street_style("highway.living_street") == "narrow"
-    assert street_style("highway.footway") == street_style("") == "residential"
-    assert all({*kind.per_100m} == {*CATALOGUE[0].per_100m} for kind in CATALOGUE)
-
-
 def test_props_keep_off_what_is_not_theirs() -> None:
     """Over several seeds: no prop on a corner, a road, a crossing, another prop, a house, or near a
     strip's end."""
@@ -213,23 +165,6 @@ def test_props_do_not_depend_on_the_order_but_on_the_seed() -> None:
     assert all(
         key_at(prop.x_m, prop.y_m) == key for key, props in forward.items() for prop in props
     )
-
-
-def test_streets_differ_by_their_class() -> None:
-    """Trees stand on boulevards and not in narrow streets, cafés rather in commercial ones; all
-    kinds are found."""
-    found: dict[str, list[str]] = {}
-    for seed in range(12):
-        for prop in all_props(MAP, seed):
-            found.setdefault(CLASSES[prop.id.split(":")[1]], []).append(prop.kind)
-    assert found["boulevard"].count("tree") > 20 and "tree" not in found["narrow"]
-    assert found["commercial"].count("cafe") > found["residential"].count("cafe")
-    assert {kind for kinds in found.values() for kind in kinds} >= {
-        kind.name for kind in CATALOGUE
-    } - {
-        "car",
-        "shelter",
-    }
 
 
 def test_the_checker_finds_a_prop_in_the_way() -> None:
@@ -332,62 +267,6 @@ def test_a_prop_is_seen_where_it_stands() -> None:
             assert frame.labels[rows.max() + 1, 48] in (LABELS["verge"], LABELS["ground"])
             nearest = 3.0 - 0.5 * prop.size_m[1] - frame.depth[rows, 48].min()
             assert 0.0 < nearest < 0.5
-
-
-def test_names_of_edges_give_their_street() -> None:
-    """Both directions and all pieces of a street are one street."""
-    assert {street_of(edge) for edge in ("s12", "-s12", "-s12a", "s12b")} == {"s12"}
-    assert {street_of(edge) for edge in ("-27#3", "27#-1", "27")} == {"27"}
-    assert street_of("gneE1") != street_of("gneE2")
-
-
-def test_streets_differ_by_their_paving() -> None:
-    """The paving of a street is the same for both sides and each time, differs by seed, and every
-    class has several."""
-    strips = [
-        dataclasses.replace(MAP.strips["nw"], id=f"{sign}s{i}", street_class=name)
-        for name in ("residential", "commercial", "narrow")
-        for i in range(20)
-        for sign in ("", "-")
-    ]
-    one, two, other = (Paving(MAP, seed) for seed in (1, 1, 2))
-    surfaces = [one.surface(strip) for strip in strips]
-    assert surfaces == [two.surface(strip) for strip in strips]
-    assert surfaces != [other.surface(strip) for strip in strips]
-    assert surfaces[::2] == surfaces[1::2]
-    assert {name.split(":")[1] for name in surfaces} == set(MATERIALS) - {"grass"}
-    assert all(name in PAVINGS for name in surfaces)
-    assert friction("sidewalk:brick:0") < friction("sidewalk") < friction("sidewalk:asphalt:1")
-    assert friction("verge") == friction("verge:grass:1") == MATERIALS["grass"].friction
-
-
-def test_paved_ground_has_the_shape_of_plain_ground() -> None:
-    """A paved tile covers its square once, at the same heights, kind by kind the same areas;
-    corners stay plain."""
-    paving = Paving(MAP, 1)
-    for key in keys_within(0.0, 0.0, 40.0):
-        plain = build_tile(MAP, key)
-        paved = build_tile(MAP, key, paving)
-        areas: dict[str, list[float]] = {}
-        for side, tile in enumerate((plain, paved)):
-            for name, mesh in tile.parts.items():
-                corners = mesh.vertices[mesh.triangles]
-                one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-                area = 0.5 * (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]).sum()
-                areas.setdefault(kind_of(name), [0.0, 0.0])[side] += area
-                low, high = mesh.vertices[:, 2].min(), mesh.vertices[:, 2].max()
-                assert low >= 0.0 and high <= CURB_M + 1e-9
-        assert all(one == pytest.approx(two, abs=1e-3) for one, two in areas.values())
-        assert sum(two for _, two in areas.values()) == pytest.approx(TILE_M**2, abs=1e-6)
-        for name in set(paved.parts) - set(plain.parts):
-            mesh = paved.parts[name]
-            middles = mesh.vertices[mesh.triangles].mean(axis=1)
-            strips = [s for s in sidewalks(MAP) if paving.surface(s) == name]
-            lanes = [lane for lane in MAP.lanes.values() if paving.surface(lane) == name]
-            where = shapely.union_all([p.polygon for p in (*strips, *lanes)])
-            assert shapely.contains_xy(
-                shapely.buffer(where, 0.01), middles[:, 0], middles[:, 1]
-            ).all()
 
 
 def rough_height(tile: Tile, xy: np.ndarray) -> np.ndarray:

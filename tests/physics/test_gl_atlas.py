@@ -59,9 +59,8 @@ def test_an_atlas_holds_the_pictures_of_its_cameras(worlds: list[BulletWorld]) -
 def test_environments_join_and_leave_an_atlas(
     worlds: list[BulletWorld], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever else is in it, before, beside or after, one that cannot be drawn too: an environment
-    of a place, light and robot of its own has the pictures of a camera of its own, in the order
-    asked for, also one that left before its picture was fetched."""
+    """An environment in an atlas gets the pictures of its own camera, whichever environments join,
+    leave or fail."""
     from physics.cameras.gl.atlas import Atlas
 
     busy = busy_street(camera_city(300.0), 8, 4)
@@ -106,27 +105,6 @@ def _alone(world: BulletWorld, light: Light, asked: list[tuple[RobotState, Stree
 def _same(one: Frame, other: Frame) -> bool:
     assert one.labels is not None and other.labels is not None
     return np.array_equal(one.rgb, other.rgb) and np.array_equal(one.labels, other.labels)
-
-
-def test_people_alone_are_the_same_with_the_next_picture_under_way() -> None:
-    """People, fetched while the next are drawn: bit for bit what is drawn one by one, and they
-    move."""
-    from physics.cameras.gl.people_only import PeopleAlone
-
-    busy = busy_street(camera_city(300.0), 8, 3)
-    with PeopleAlone((96, 54), 60.0) as eyes:
-        single = [eyes.render(busy.robot.pose, street) for street in busy.streets]
-        found = []
-        for street in busy.streets:
-            eyes.begin(busy.robot.pose, street)
-            if street.tick:
-                found.append(eyes.end())
-        found.append(eyes.end())
-        with pytest.raises(EngineError, match="under way"):
-            eyes.end()
-    for one, other in zip(single, found, strict=True):
-        assert np.array_equal(one.rgb, other.rgb) and np.array_equal(one.labels, other.labels)
-    assert not np.array_equal(found[0].rgb, found[2].rgb)
 
 
 def test_an_atlas_too_large_is_refused_with_the_limit(worlds: list[BulletWorld]) -> None:

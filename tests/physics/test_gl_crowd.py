@@ -12,23 +12,17 @@ import pytest
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
-from cosim.core.state import LABELS, Age, People
+from cosim.core.state import LABELS, People
 from physics.cameras.gl import crowd as crowds
 from physics.cameras.gl.camera import NOON
 from physics.cameras.gl.context import available, context
-from physics.cameras.gl.crowd import LEVEL_PX, CrowdDrawing, PeopleSeen
+from physics.cameras.gl.crowd import CrowdDrawing, PeopleSeen
 from physics.cameras.gl.lighting import lighting_of
 from physics.cameras.gl.shading import SceneBlocks, anchor_of, camera_matrix
 from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.targets import Target
 from physics.cameras.sky import sky_of
 from physics.cameras.view import Shot, shot
-from physics.people.appearance import ALL, look_of
-from physics.people.body import body
-from physics.people.clips import own_clips
-from physics.people.figure import LEVELS, RIBBONS
-from physics.people.poses import poses
-from tests.support.blend import skinned
 
 pytestmark = [pytest.mark.engine, pytest.mark.skipif(not available(), reason="no OpenGL here")]
 
@@ -107,67 +101,3 @@ def test_levels_of_detail_keep_the_silhouettes(
     total = sum(int(b.sum()) for b in full)
     print(f"{100 * changed / total:.2f} % of {total} silhouette pixels changed")
     assert changed < 0.03 * total
-
-
-@pytest.mark.parametrize("level", range(1, LEVELS))
-def test_each_level_is_like_full_detail_where_it_begins(
-    crowd: CrowdDrawing, monkeypatch: pytest.MonkeyPatch, level: int
-) -> None:
-    """At the size at which a level begins it changes less than 3 % of silhouette pixels, ribbons
-    less than 4 %."""
-    far = 1.75 / LEVEL_PX[level - 1] * 0.5 * WIDE[1] / np.tan(np.radians(37.5))
-    taken = shot((-1.02 * far, 0.0, 0.6), (0.0, 0.0, 0.6), WIDE, 75.0)
-    changed = total = 0
-    for i in range(24):
-        age = (Age.ADULT, Age.ADULT, Age.CHILD, Age.ELDERLY)[i % 4]
-        people = People.of(
-            (f"c{i}",),
-            [[0.0, 0.0]],
-            [1.7 * i],
-            [1.3 * (i % 3 > 0)],
-            ("stand",),
-            [0.37 * i],
-            age=age,
-        )
-        shown = []
-        for forced in (level, 0):
-            monkeypatch.setattr(
-                crowds, "levels", lambda shots, whose, xy, z_m, k=forced: np.full(len(xy), k)
-            )
-            shown.append(mask(crowd, people, taken))
-        changed = changed + int((shown[0] ^ shown[1]).sum())
-        total = total + int(shown[1].sum())
-    print(
-        f"level {level}, {LEVEL_PX[level - 1]:.0f} pixels tall: {100 * changed / total:.2f} "
-        f"% changed"
-    )
-    assert changed < (0.04 if level == RIBBONS else 0.03) * total
-
-
-def test_the_card_skins_as_the_reference_does(crowd: CrowdDrawing) -> None:
-    """The outline of a walker near by is that of the mesh skinned by numpy: head, hands and feet
-    where they belong."""
-    people = People.of(("c3",), [[5.0, 0.0]], [0.8], [1.4], ("walk",), [0.3])
-    taken = shot((0.0, 0.0, 1.0), (5.0, 0.0, 1.0), (400, 400), 40.0)
-    rows, columns = np.nonzero(mask(crowd, people, taken))
-    pose = poses(people, 2.0)
-    who = look_of("c3", Age.ADULT)
-    made = body(ALL[who.outfit], 1)
-    grown = made.vertices + made.normals * (made.fat * who.girth_m)[:, None]
-    at = skinned(grown, made.joints, made.weights, pose.matrices(own_clips())[0]) * pose.scale[0]
-    cos, sin = np.cos(0.8), np.sin(0.8)
-    world = np.column_stack(
-        [cos * at[:, 0] - sin * at[:, 1] + 5.0, sin * at[:, 0] + cos * at[:, 1], at[:, 2]]
-    )
-    focal = 200.0 / np.tan(np.radians(20.0))
-    u = 200.0 - focal * world[:, 1] / world[:, 0]
-    v = 200.0 - focal * (world[:, 2] - 1.0) / world[:, 0]
-    assert (columns.min(), columns.max() + 1) == pytest.approx((u.min(), u.max()), abs=2.0)
-    assert (rows.min(), rows.max() + 1) == pytest.approx((v.min(), v.max()), abs=2.0)
-
-
-def test_nobody_is_drawn_as_nothing(crowd: CrowdDrawing) -> None:
-    """Without people the picture stays empty, and drawing does no harm."""
-    taken = shot((0.0, 0.0, 0.6), (10.0, 0.0, 0.6), WIDE, 75.0)
-    assert not mask(crowd, street(0, 0), taken).any()
-    crowd.draw("moving", shadows=True)

@@ -4,7 +4,6 @@ sidewalk is a road."""
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections import Counter
 
 import cv2
@@ -23,14 +22,12 @@ from physics.cameras.bullet_camera import BulletCamera
 from physics.cameras.gl import context
 from physics.cameras.gl.camera import GlCamera
 from physics.dynamics.world import BulletWorld
-from physics.ground.materials import MATERIALS, PAVINGS, SEEN_AS, friction
-from physics.ground.tiles import SURFACES, Key, build_tile, surface
-from physics.street.covers import covers_in
+from physics.ground.materials import PAVINGS, SEEN_AS
+from physics.ground.tiles import SURFACES, Key, surface
 from physics.street.street_surface import StreetSurface
 from physics.street.surface import Chunk, Finish, Patch
-from physics.street.tile_cache import covers_as_arrays, covers_of_arrays
 from physics.textures.ground import SURFACE_LAYERS, layer_of
-from tests.support.tiny_street import KEYS, tiny_map, triangles
+from tests.support.tiny_street import KEYS, tiny_map
 
 LEAST_DISTANCE = 15.0
 """Between two mean colours in CIELAB: 2.3 can just be told apart side by side."""
@@ -105,25 +102,6 @@ def test_sidewalks_roads_and_open_ground_share_no_material_and_no_colour() -> No
     assert len(set(drawn)) == len(drawn)
 
 
-def test_no_tile_shows_ground_as_a_sidewalk_or_a_sidewalk_as_anything_else() -> None:
-    """On every tile of a map, with sidewalks of every material, patches of ground have no layer of
-    a sidewalk, and patches of a sidewalk have one; wheels rub on it as on its material."""
-    seen = Counter[str]()
-    for street, key in itertools.product([StreetSurface(MAP, seed) for seed in (3, 4, 10)], KEYS):
-        finish = street.finish(key)
-        for patch in (*street.chunk(key).ground, *street.covers(key), *finish.laid):
-            if patch.label in ("ground", "verge", "road"):
-                assert not walked_on(patch.layer), patch.name
-            elif patch.label == "sidewalk":
-                assert walked_on(patch.layer) and patch.friction == friction(patch.name), patch.name
-            seen[patch.name] += len(patch.mesh)
-    assert {"ground", "ground:planting", "ground:yard", "ground:water"} <= set(seen)
-    materials = {name.split(":")[1] for name in seen if name.startswith("sidewalk:")}
-    assert materials == set(MATERIALS) - {"grass"} and friction("sidewalk:asphalt:0") > friction(
-        "sidewalk:concrete:0"
-    )
-
-
 def test_what_covers_open_ground_hangs_on_land_use_then_on_neighbours() -> None:
     """A parking lot is a yard and a pond in a wood is water; between a sidewalk and the house
     behind it lies a bed; nothing overlaps, and the rest is lawn. Generated cities have none of
@@ -165,34 +143,6 @@ def test_maps_from_above_show_the_same_ground_as_cameras() -> None:
                     assert tuple(sheet.image[row, column]) == GROUND_LOOKS[kind].drawn, (kind, x, y)  # type: ignore[index]
                     checked[kind] += 1
     assert {"yard", "water", "planting"} <= set(checked)
-
-
-def test_covers_lie_on_the_ground_once_and_are_kept_as_they_are_made() -> None:
-    """A tile's covers do not overlap, lie 3 mm above its ground and within it, with rims or
-    without, and what is read of them is what was made, to the bit."""
-    for key in KEYS:
-        tile = build_tile(MAP, key)
-        ground = shapely.union_all(
-            shapely.polygons(triangles(tile, "ground")[:, :, :2]), grid_size=1e-6
-        )
-        bare, rimmed = (covers_in(MAP, tile, rims) for rims in (False, True))
-        again = covers_of_arrays(covers_as_arrays(bare))
-        assert [*again] == [*bare] == [*rimmed]
-        flat = []
-        for kind, mesh in bare.items():
-            for field in ("vertices", "normals", "triangles"):
-                made = getattr(mesh, field)
-                read = getattr(again[kind], field)
-                assert made.dtype == read.dtype and made.tobytes() == read.tobytes()
-            assert mesh.vertices[:, 2] - tile.height(mesh.vertices[:, :2]) == pytest.approx(
-                0.003, abs=1e-6
-            )
-            assert len(rimmed[kind]) > len(mesh)
-            flat += [*shapely.polygons(mesh.vertices[mesh.triangles][:, :, :2])]
-        if flat:
-            whole = shapely.union_all(flat, grid_size=1e-6)
-            assert shapely.area(flat).sum() == pytest.approx(whole.area, rel=1e-4)
-            assert whole.difference(shapely.buffer(ground, 0.002)).area < 1e-3
 
 
 class Looked(StreetSurface):

@@ -4,7 +4,6 @@ through an episode."""
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 
 from cosim.core.geometry import Polyline, Pose
-from cosim.core.state import LABELS, NOBODY, STILL, Command, Street, Vehicles
+from cosim.core.state import LABELS, NOBODY, Command, Street, Vehicles
 from cosim.place.street_map import StreetMap
 from cosim.policies.privileged.route import Route
 from cosim.spec.camera import CameraSpec
@@ -120,18 +119,6 @@ def test_the_robot_holds_its_speed_up_and_down(
     assert max(map(abs, over)) < 0.02
     assert abs(state.z_m - start_m) == pytest.approx(GRADE * 29.5, rel=0.1)
     assert (state.z_m > start_m) == up
-
-
-@pytest.mark.parametrize("turned_rad", [0.0, math.pi / 2, math.pi])
-def test_the_robot_stands_on_a_slope(
-    hill: StreetMap, world: BulletWorld, turned_rad: float
-) -> None:
-    """Ten seconds at zero command move it less than a centimetre, whichever way it faces."""
-    x, y, heading = uphill(hill).at(30.0)
-    start = world.place(Pose(x, y, heading + turned_rad)).pose
-    for _ in range(200):
-        end = world.step(STILL, EMPTY, EMPTY, 10).robot.pose
-    assert math.dist(start[:2], end[:2]) < 0.01
 
 
 def test_vehicles_are_on_the_slope(hill: StreetMap, world: BulletWorld) -> None:

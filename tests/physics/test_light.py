@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cosim.core.errors import SpecError
-from cosim.spec.scenario import City, Light, Scenario, Suite, content_hash, read_suite, write_suite
+from cosim.spec.scenario import City, Light, Scenario, Suite, read_suite, write_suite
 
 
 def scenario(light: Light) -> Scenario:
@@ -47,14 +47,6 @@ def test_a_light_with_a_foreign_picture_is_refused() -> None:
         SpecError, match=r"light hdri must be a Radiance \.hdr file, not 'sky\.exr'"
     ):
         Light(hdri="sky.exr")
-
-
-def test_a_light_is_part_of_a_scenarios_hash() -> None:
-    """A dusk has another than a noon, and half an hour later another again."""
-    plain, dusk, later = (
-        scenario(light) for light in (Light(), Light(hour=20.0), Light(hour=20.5))
-    )
-    assert len({content_hash(one) for one in (plain, dusk, later)}) == 3
 
 
 def test_light_survives_a_suite_file(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-import trimesh
 
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Pose
@@ -96,6 +95,8 @@ def test_an_obstacle_is_seen_where_it_stands(make: type[Camera]) -> None:
 
 def test_obstacles_are_exported_by_their_names(tmp_path: Path) -> None:
     """A .glb holds each of them where it stands, under a node named by its kind."""
+    import trimesh
+
     surface = StreetSurface(MAP, seed=1)
     path = tmp_path / "street.glb"
     those = [ahead(kind, 3.0 + 3.0 * k) for k, kind in enumerate(KINDS)]

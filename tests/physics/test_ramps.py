@@ -32,8 +32,8 @@ from sumo_nets.net.snapshot import street_map_of
 pytestmark = pytest.mark.engine
 
 CITIES = (City(seed=11, size_m=600.0), City(seed=23, size_m=600.0, style="suburb"))
-CLIMBS_PER_CITY = 5
-CURBS_PER_CITY = 5
+CLIMBS_PER_CITY = 3
+CURBS_PER_CITY = 3
 V_MPS = 1.3
 FULL_MPS = 2.5
 TICK_S = 0.05

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 
 from cosim.core.errors import EngineError, SpecError
 from cosim.spec.robot import COURIER
@@ -29,6 +28,8 @@ def with_visual(folder: Path, shape: str) -> Path:
 def test_a_body_from_a_file_is_drawn_like_one_of_boxes(tmp_path: Path, ending: str) -> None:
     """A box in a file, scaled by the URDF, has the corners, normals, colour and place of the box it
     stands for."""
+    import trimesh
+
     box = CHASSIS.search(urdf_of(COURIER).read_text())
     assert box is not None
     size = np.array(box[1].split(), dtype=float)

@@ -68,23 +68,6 @@ def test_heights_by_hand() -> None:
     assert HAND.height(points).tolist() == expected
 
 
-def test_gradients_by_hand() -> None:
-    """Each triangle has its own; across the edge, beyond the lattice, nothing rises."""
-    rises = HAND.gradient([(11, 20.5), (13.5, 20.5), (12.5, 21.5), (5, 20.5), (13.5, 30)])
-    assert rises.tolist() == [[0.5, 0], [0.5, 2], [2.5, 0], [0, 0], [2.5, 0]]
-
-
-def test_creases_are_where_the_land_bends() -> None:
-    """A plane has none inside; the pulled corner bends its cell along the diagonal and at the side
-    it shares."""
-    x, y = np.meshgrid(np.arange(0.0, 20.0, 2.0), np.arange(0.0, 20.0, 2.0))
-    plane = Terrain(0.0, 0.0, 2.0, (0.25 * x - 0.5 * y).astype(np.float32))
-    assert len(plane.creases((3.0, 3.0, 15.0, 15.0))) == 0
-    bent = {tuple(map(tuple, side)) for side in HAND.creases((10.0, 20.0, 14.0, 22.0)).tolist()}
-    assert ((12.0, 20.0), (14.0, 22.0)) in bent
-    assert ((12.0, 20.0), (12.0, 22.0)) in bent
-
-
 @given(st.lists(st.tuples(*[st.floats(-1e4, 1e4)] * 2), min_size=1, max_size=40))
 def test_a_height_does_not_depend_on_its_company(points: list[tuple[float, float]]) -> None:
     """Many points asked at once get the very bits that each gets alone."""
@@ -173,23 +156,6 @@ def test_paths_up_hills_count_as_steps_only_when_steep() -> None:
         terrain, found = surveyed([straight([0.5, 0.5 + rise_m], on="path")])
         assert terrain is not None and found is not None and (found.clamped > 0) == moved
         assert along(terrain)[-5] - along(terrain)[5] == pytest.approx(0.9 * rise_m, rel=0.03)
-
-
-def test_streets_that_meet_at_a_corner_meet_in_height() -> None:
-    """Ends that a corner joins are drawn together, though their elevations say otherwise and its
-    own are missing."""
-    one = straight([10, 10], 60.0)
-    two = course("f", "62,0,16 122,0,16")
-    corner = Course(
-        "c",
-        np.array([[60, -1, np.nan], [62, -1, np.nan], [62, 1, np.nan], [60, 1, np.nan]]),
-        ring=True,
-    )
-    apart, _ = surveyed([one, two, corner])
-    joined, _ = surveyed([one, two, corner], [Meeting(2, ((0, 1), (1, 0)))])
-    assert apart is not None and joined is not None
-    assert np.abs(np.diff(along(apart, 122.0))).max() > 0.5
-    assert np.abs(np.diff(along(joined, 122.0))).max() < WALK_GRADE_MAX + 0.03
 
 
 def test_false_elevations_are_dropped() -> None:

@@ -13,11 +13,9 @@ import pytest
 from cosim.core.errors import SpecError, UsageError
 from physics.ground.materials import PAVINGS
 from physics.ground.tiles import SURFACES
-from physics.textures.brick_patterns import basket, courses, herringbone
 from physics.textures.facades import BAY_VARIANTS, DOORS, STREETS, WALL_STYLES, facade_layers
 from physics.textures.ground import GROUND_RECIPES, SURFACE_LAYERS, ground_layers, layer_of
 from physics.textures.layers import Layers, encoded, joined_layers, linear
-from physics.textures.noise import Noise, cells
 from physics.textures.walls import prop_layers, wall_layers
 
 STACKS = (ground_layers, wall_layers, prop_layers, facade_layers)
@@ -38,12 +36,6 @@ def test_surfaces_have_no_seams(stack: object) -> None:
         for axis in (0, 1):
             steps = rough(picture, axis)
             assert steps[-1] <= 1.05 * steps[:-1].max() + 0.5, (name, axis)
-
-
-def test_a_seam_would_be_seen() -> None:
-    """The measure of the test above finds a picture whose edges do not meet."""
-    ramp = np.tile(np.arange(64, dtype=np.uint8)[:, None, None], (1, 64, 3))
-    assert rough(ramp, 0)[-1] > 10 * rough(ramp, 0)[:-1].max()
 
 
 def test_textures_are_the_same_in_every_process() -> None:
@@ -91,46 +83,6 @@ def test_every_name_in_the_tables_is_a_layer() -> None:
         )
     assert len({layer_of("sidewalk:brick:0", seed) for seed in range(20)}) == len(
         SURFACE_LAYERS["brick"]
-    )
-
-
-def test_a_facade_lets_the_wall_through_where_there_is_no_window() -> None:
-    """The middle of a sash window hides the wall, the corner of the bay shows it alone."""
-    layers = facade_layers(256)
-    sash = layers.rgba[layers.index("sash-0")]
-    assert sash[105, 115, 3] == 0 and sash[105, 115, :3].max() > 20
-    assert sash[2, 2].tolist() == [0, 0, 0, 255]
-    assert layers.finish is not None and layers.finish[layers.index("sash-0"), 105, 115, 0] == 255
-    assert layers.metres[0].tolist() == pytest.approx([3.0, 3.2])
-
-
-@pytest.mark.parametrize(
-    ("bond", "area_m2"),
-    [
-        (courses(256, 1.6, 16, [0.2], [0.0, 0.5]), 0.02),
-        (herringbone(256, 1.6, 0.1), 0.02),
-        (basket(256, 1.6, 0.1), 0.02),
-        (courses(256, 2.4, 6, [0.6], [0.0, 0.5]), 0.24),
-    ],
-)
-def test_bonds_are_laid_of_equal_stones(bond: object, area_m2: float) -> None:
-    """Every stone of a bond has the area of one, and no pixel is farther from a joint than half its
-    width."""
-    ids, edge = bond.id, bond.edge  # type: ignore[attr-defined]
-    side_m = 2.4 if area_m2 > 0.1 else 1.6
-    counts = np.unique(ids, return_counts=True)[1]
-    assert len(counts) == round(side_m**2 / area_m2)
-    assert np.allclose(counts * (side_m / 256) ** 2, area_m2, rtol=0.12)
-    assert edge.min() >= 0.0 and 0.4 * 0.1 < edge.max() <= 0.5 * (0.4 if area_m2 > 0.1 else 0.1)
-
-
-def test_cells_meet_over_the_edges() -> None:
-    """Scattered cells keep their number over the picture's edge nearly everywhere."""
-    found = cells(Noise(256, (1,)), 8)
-    assert found.n == 64 and len(np.unique(found.id)) == 64
-    assert (
-        np.mean(found.id[0] == found.id[-1]) > 0.8
-        and np.mean(found.id[:, 0] == found.id[:, -1]) > 0.8
     )
 
 

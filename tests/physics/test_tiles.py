@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 import shapely
@@ -14,14 +12,11 @@ from physics.ground.tiles import (
     Key,
     Tile,
     build_tile,
-    distance_to,
     key_at,
     keys_within,
     square,
 )
 from physics.street.buildings import Frontage
-from physics.street.frontage import frontage_in
-from physics.street.paint import paint_in
 from tests.support.tiny_street import KEYS, no_cracks, plan_areas, tiny_map, triangles
 
 MAP = tiny_map()
@@ -95,15 +90,6 @@ def test_tiles_do_not_depend_on_the_order(tiles: dict[Key, Tile]) -> None:
         assert np.array_equal(mesh.triangles, again.parts[name].triangles)
 
 
-def test_keys_cover_a_disk() -> None:
-    """The tiles within a radius hold every point of the disk, and each is no farther than the
-    radius."""
-    keys = keys_within(13.0, -7.0, 30.0)
-    angle = np.linspace(0.0, 6.28, 60)
-    assert {key_at(13.0 + 29.9 * np.cos(a), -7.0 + 29.9 * np.sin(a)) for a in angle} <= set(keys)
-    assert all(distance_to(key, 13.0, -7.0) <= 30.0 for key in keys)
-
-
 def test_buildings_line_the_street_and_keep_off_it() -> None:
     """Both sides have buildings, none over walkable ground or road, and they begin at the frontage
     distance."""
@@ -126,99 +112,3 @@ def test_buildings_do_not_depend_on_the_order_but_on_the_seed() -> None:
     assert forward != {key: other.in_tile(key) for key in KEYS}
     ids = [b.id for buildings in forward.values() for b in buildings]
     assert len(ids) == len(set(ids))
-
-
-def test_paint_lies_on_its_ground() -> None:
-    """Lines are on roads and domes on walkable ground, millimetres above it."""
-    crossing = dataclasses.replace(MAP.strips[":c0"], signalised=True, crosses=("e", "-e"))
-    street_map = dataclasses.replace(MAP, strips={**MAP.strips, ":c0": crossing})
-    found: dict[str, int] = {}
-    for key in keys_within(0.0, 0.0, 60.0):
-        tile = build_tile(street_map, key)
-        for name, mesh in paint_in(street_map, tile).items():
-            middles = mesh.vertices[mesh.triangles].mean(axis=1)
-            kinds = (
-                ("strip", "corner") if name.startswith("tactile") else ("lane", "junction", "strip")
-            )
-            for x, y in middles[:, :2].tolist():
-                assert any(street_map.near(kind, shapely.Point(x, y)) for kind in kinds), (
-                    name,
-                    x,
-                    y,
-                )
-            above = mesh.vertices[:, 2] - tile.height(mesh.vertices[:, :2])
-            assert (above.min() > 0.003 and above.max() < 0.005) or name.startswith("tactile")
-            found[name] = found.get(name, 0) + len(mesh)
-    assert found["tactile-domes"] >= 4 and found["paint"] >= 20
-
-
-def test_domes_lie_in_the_triangles_of_the_ground() -> None:
-    """Beside a crossing that meets its corner at an angle the ground bends many times: no field of
-    domes is under it or more than 5 mm above it anywhere, and together they cover the fields."""
-    line = np.array([[-1.4, -4.0], [1.4, 4.0]])
-    askew = dataclasses.replace(
-        MAP.strips[":c0"],
-        line=line,
-        polygon=shapely.LineString(line).buffer(1.6, cap_style="flat"),
-        width_m=3.2,
-    )
-    street_map = dataclasses.replace(MAP, strips={**MAP.strips, ":c0": askew})
-    spread = []
-    checked = 0
-    for key in keys_within(0.0, 0.0, 60.0):
-        tile = build_tile(street_map, key)
-        domes = paint_in(street_map, tile).get("tactile-domes")
-        if domes is None:
-            continue
-        spread.append(shapely.polygons(domes.vertices[domes.triangles][:, :, :2]))
-        ground = np.concatenate([mesh.vertices[mesh.triangles] for mesh in tile.parts.values()])
-        flat = shapely.area(shapely.polygons(ground[:, :, :2])) > 1e-7
-        ground = ground[flat]
-        tree = shapely.STRtree(shapely.polygons(ground[:, :, :2]))
-        for triangle in domes.vertices[domes.triangles]:
-            middle = triangle.mean(axis=0)
-            for k in tree.query(shapely.Point(middle[:2]), "within").tolist():
-                a, b, c = ground[k]
-                share = np.linalg.solve(np.column_stack([b - a, c - a])[:2], middle[:2] - a[:2])
-                height = a[2] + share @ np.array([b[2] - a[2], c[2] - a[2]])
-                assert 0.003 < middle[2] - height < 0.005
-                checked += 1
-    pieces = np.concatenate(spread)
-    assert checked > 20 and shapely.area(pieces).sum() == pytest.approx(
-        shapely.union_all(pieces, grid_size=1e-6).area, rel=1e-3
-    )
-
-
-def test_the_frontage_is_paved_where_there_are_shops(tiles: dict[Key, Tile]) -> None:
-    """In a generated city it is covered before shops from the sidewalk to the houses, without holes
-    or doubles, a little above the ground, with a rim down to it where it ends; a home's driveway
-    reaches from its sidewalk to the houses; the ground itself stays what it was."""
-    changed = {
-        "nw": dataclasses.replace(MAP.strips["nw"], street_class="commercial"),
-        "ne": dataclasses.replace(MAP.strips["ne"], street_class="residential", driveways=(30.0,)),
-    }
-    street_map = dataclasses.replace(MAP, strips={**MAP.strips, **changed}, planned=True)
-    covered = []
-    layers = set()
-    rims = []
-    for key in KEYS:
-        tile = build_tile(street_map, key)
-        assert set(tile.parts) - {"ramp"} == set(tiles[key].parts) - {"ramp"}
-        for mesh, cover in frontage_in(street_map, tile, 3):
-            layers.add(cover.layer)
-            above = mesh.vertices[:, 2] - tile.height(mesh.vertices[:, :2])
-            faces = mesh.vertices[mesh.triangles]
-            flat = np.abs(plan_areas(faces)) > 1e-9
-            assert above[mesh.triangles[flat]].min() > 0.002 and above.max() < 0.004
-            rim = mesh.triangles[~flat]
-            assert above.min() > -0.001 and above[rim].min(axis=1).max() < 0.001
-            edge = mesh.vertices[rim].reshape(-1, 3)
-            rims += np.abs(edge[np.abs(edge[:, 1] - 6.5) < 1e-3, 0]).tolist()
-            covered.append(shapely.polygons(faces[flat][:, :, :2]))
-    pieces = np.concatenate(covered)
-    whole = shapely.union_all(pieces, grid_size=1e-6)
-    assert shapely.area(pieces).sum() == pytest.approx(whole.area, rel=1e-4)
-    assert whole.covers(shapely.box(-55.0, 6.51, -3.0, 8.49))
-    assert whole.covers(shapely.box(30.6, 6.51, 33.4, 8.49))
-    assert whole.intersection(shapely.box(-55.0, -8.0, 55.0, 6.45)).area < 1e-6
-    assert len(layers) >= 2 and max(rims) > 30.0 > min(rims)

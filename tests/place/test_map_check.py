@@ -6,7 +6,6 @@ import dataclasses
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pytest
 import shapely
@@ -15,7 +14,6 @@ from cosim.core.errors import MapError
 from cosim.place.map_check import NetFacts, check_map
 from cosim.place.street_map import Corner, Lane, Port, StreetMap, Strip
 from cosim.place.terrain import Elevation
-from cosim.report.mapsheet import MARKS, SIGNAL, draw_map
 from sumo_nets.net.net_facts import facts_of, walks_of
 from sumo_nets.net.net_file import read_net
 
@@ -141,28 +139,6 @@ def test_places_without_walks_or_corners_are_not_usable() -> None:
         check.reasons == ("nothing is walkable: no sidewalk, path or crossing",)
         and check.islands == ()
     )
-
-
-def test_a_check_survives_json() -> None:
-    """What --json prints is the whole check."""
-    check = check_map(town(), None, facts_of(net()), 0.25)
-    assert msgspec.json.decode(msgspec.json.encode(check), type=type(check)) == check
-
-
-def test_the_picture_marks_problems() -> None:
-    """Every kind of problem has a colour, and those of the place are in its picture; parts can be
-    drawn alone."""
-    street_map = town()
-    check = check_map(street_map)
-    image = draw_map(street_map, check)
-    numbers = np.unique(image.reshape(-1, 3).astype(int) @ (1 << 16, 1 << 8, 1))
-    colours = {(n >> 16, n >> 8 & 255, n & 255) for n in numbers.tolist()}
-    assert {
-        MARKS[kind][0] for kind in ("narrow", "on_road", "stacked")
-    } <= colours and SIGNAL in colours
-    assert {p.kind for p in check.problems} <= set(MARKS)
-    part = draw_map(street_map, check, (190.0, -10.0, 210.0, 20.0))
-    assert part.shape[1] == 200
 
 
 def net() -> ET.Element:

@@ -127,17 +127,6 @@ def test_wander_is_connected_and_keeps_out_of_traps() -> None:
             assert set(street_map.strips[a].corners) & set(street_map.strips[b].corners)
 
 
-def test_wander_never_passes_a_closed_port() -> None:
-    """With the crossing closed at its far end nobody sets out over it, nor leaves a strip through a
-    closed port."""
-    graph = WalkGraph(square())
-    rng = np.random.default_rng(1)
-    closed = frozenset({Port(":n_c0", 1)})
-    for _ in range(50):
-        assert ":n_c0" not in graph.wander(rng, "south", True, 9, closed)
-    assert graph.wander(rng, "south", True, 9, frozenset({Port("south", 1)})) == ["south"]
-
-
 def test_an_unknown_strip_is_named() -> None:
     """Asking for a strip that the map lacks says so."""
     with pytest.raises(MapError, match="no strip 'nowhere' on this map to walk on"):

@@ -183,8 +183,8 @@ def test_boxes_are_where_the_network_says() -> None:
 
 
 def test_feet_are_where_they_stand() -> None:
-    """Who stands 4 m ahead and 1 m to the left is found there by the lower edge of the box; who
-    hovers is left out."""
+    """A person 4 m ahead and 1 m left is located by the lower edge of its box; a box above the
+    horizon is left out."""
     x, y, depth = CAMERA.matrix @ (np.linalg.inv(CAMERA.on_robot) @ [4.0, 1.0, 0.0, 1.0])[:3]
     u, v = x / depth, y / depth
     feet = GROUND.feet_of(np.array([[u - 10, v - 60, u + 10, v], [200.0, 10.0, 220.0, 60.0]]))
@@ -223,8 +223,7 @@ def test_arcs_keep_to_the_middle_and_lead_to_the_goal(robot: Robot) -> None:
 
 
 def test_it_goes_round_a_person_with_room_and_stops_before_one_without() -> None:
-    """On open ground it swerves; in a lane of 1.4 m it stands 0.9 m before what is kept from the
-    person."""
+    """The policy passes a person on open ground and stops before one in a lane of 1.4 m."""
     person = np.array([[2.5, 0.0]])
     round_him = best_arc(OPEN, person, COURIER, None)
     assert abs(round_him.curvature) > 0.1 and round_him.free_m == LOOKS_M
@@ -243,8 +242,8 @@ def test_it_turns_on_the_spot_to_the_freer_side() -> None:
 
 
 def test_it_stands_four_seconds_for_who_is_near_and_then_goes_round() -> None:
-    """Also where the detector misses them once; who comes when nobody was there for a second is
-    waited for anew."""
+    """The policy waits four seconds for a person near it, even if the detector misses a frame, and
+    then passes."""
     near = np.array([[2.0, 0.3]])
     far = np.array([[4.0, 0.0], [2.0, 1.5]])
     waiting = WaitForPeople()

@@ -183,8 +183,7 @@ def test_a_robot_that_was_put_elsewhere_is_led_from_there() -> None:
 
 
 def test_another_way_is_found_where_somebody_stands_in_the_first() -> None:
-    """A long box leaves a way on each side; who stands far inside the shorter one is seen too late,
-    and left behind."""
+    """The oracle takes another way where a person blocks the first."""
     course = straight(box(5.0, -1.1, 17.0, 0.8), width_m=4.6)
     somebody = People.of(("p0",), [(15.0, 1.55)], [0.0], [0.0], ("stand",))
     track = driven(course, Pose(0.0, 0.0, 0.0), people=somebody)

@@ -83,7 +83,7 @@ def test_a_group_is_passed_round_on_the_side_with_room() -> None:
 
 
 def test_it_comes_to_rest_before_a_hand_and_stays() -> None:
-    """Braking from afar, zero at 2 m, no limit by somebody who only stands."""
+    """The oracle brakes for a stopping hand and rests 2 m before it."""
     hand, nobody = (
         people((12.0, 0.2, math.pi, 0.0, "stop")),
         people((12.0, 0.2, math.pi, 0.0, "stand")),

@@ -7,17 +7,13 @@ import json
 import os
 import re
 from collections.abc import Callable
-from concurrent.futures import Future
 from html.parser import HTMLParser
 from pathlib import Path
 
-import cv2
 import msgspec
 import numpy as np
 import pytest
 
-from cosim.place.open_ground import GROUND_LOOKS
-from cosim.report.encoding import as_webp
 from cosim.report.page.choice import most_telling, shown_of
 from cosim.report.page.page import Maps, colours_of, counts_of, page_of
 from cosim.report.page.paper import LONG_OF_PAPER, REACTIVE_OF_PAPER, UNIT_OF_PAPER
@@ -28,9 +24,7 @@ from cosim.report.page.three_tables import tables_of, warnings_of
 from cosim.results.run_folder import RunFolder, read_spec
 from cosim.results.table import summary_of
 from cosim.spec.scenario import read_suite
-from scenarios.tools.viewing.report import _wait
 from tests.conftest import ROOT, Cosim
-from tests.run_specs import changed
 from tests.support.driven_runs import HIT, episode_of, failure_at, run_of, short_way
 
 PAPER = Path(os.environ.get("COSIM_SHARED", ROOT.parent / "shared")) / "paper/sidewalkbench.tex"
@@ -67,8 +61,8 @@ class Elements(HTMLParser):
 
 
 def test_a_cell_of_ours_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
-    """Success of straight ways, with its interval, stands in the row of the policy; the paper's
-    rows are marked, and stand only beside those of its suites."""
+    """A cell of a policy is the summary of its episodes; rows of the paper are marked and appear
+    only with its suites."""
     (own,) = read_runs([run_of(tmp_path / "run", ["goal", HIT, HIT, "goal", "goal"], "mine")])
     spec = msgspec.structs.replace(own.spec, suite="unit")
     told = ReportedRun("mine", own.whole._replace(spec=spec))
@@ -83,25 +77,6 @@ def test_a_cell_of_ours_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
     assert text.count('class="paper"') == len(UNIT_OF_PAPER)
     (other,) = tables_of([own])
     assert not other.paper and [row.name for row in other.rows] == ["mine: straight"]
-
-
-def test_the_page_paints_the_ground_as_maps_from_above(tmp_path: Path) -> None:
-    """Each kind of area of a scene has a colour in the page; those of open ground are the table's
-    of all maps."""
-    data = next(
-        one
-        for one in Elements(page(run_of(tmp_path / "run", [HIT], "mine"))).data
-        if "ground" in dict(one)
-    )  # type: ignore[call-overload]
-    assert isinstance(data, dict)
-    assert {kind: tuple(bytes.fromhex(hue[1:])) for kind, hue in data["ground"].items()} == {
-        kind: look.drawn for kind, look in GROUND_LOOKS.items()
-    }
-    script = (ROOT / "cosim/report/page/page.js").read_text()
-    known = re.search(r"const COLOURS = \{ \.\.\.data\.ground, (.*?)\};", script, re.DOTALL)
-    assert known is not None and {"road", "walk", "crossing", "verge"} <= set(
-        re.findall(r"(\w+):", known[1])
-    )
 
 
 @pytest.mark.skipif(not PAPER.exists(), reason="the paper is not here")
@@ -142,73 +117,6 @@ def test_the_gallery_shows_every_kind_and_cause_and_no_more_than_asked_for(tmp_p
         and len({one.scenario for one in picked}) == 36
         and limit.startswith("the others show no")
     )
-
-
-def test_what_takes_long_to_come_to_is_not_shown_where_something_else_tells_as_much(
-    tmp_path: Path,
-) -> None:
-    """A failure after 100 s yields to one after 4 s of the same facets, and many of them to the
-    time that there is."""
-    runs = read_runs([run_of(tmp_path / "run", [HIT], "mine")])
-    (soon,) = shown_of(runs)
-    late = [
-        soon._replace(
-            scenario=f"l-{k}",
-            mishap=soon.mishap._replace(tick=2000 + k),
-            facets=soon.facets | {k} if k else soon.facets,
-        )
-        for k in range(12)
-    ]
-    assert most_telling([late[0], soon], 1) == ([soon], "--failures 1")
-    assert len(most_telling([*late, soon]).picks) == 6
-
-
-def test_of_an_episode_its_first_failure_is_shown_and_others_that_come_soon(tmp_path: Path) -> None:
-    """Failures after 4 s, 100 s and 200 s, each of another kind: the last is left out, but not
-    where it is the first of its episode, and not where it is asked for."""
-    runs = read_runs([run_of(tmp_path / "run", [HIT], "mine")])
-    (soon,) = shown_of(runs)
-    every = [
-        soon._replace(
-            scenario=name, mishap=soon.mishap._replace(tick=tick), facets=soon.facets | {name, tick}
-        )
-        for name, tick in (("one", 80), ("one", 2000), ("one", 4000), ("other", 4000))
-    ]
-    picked = {(one.scenario, one.mishap.tick) for one in most_telling(every).picks}
-    assert picked == {("one", 80), ("one", 2000), ("other", 4000)}
-    assert len(most_telling(every, within_s=200.0).picks) == 4
-
-
-def test_how_far_the_failures_are_is_told_while_they_are_shown() -> None:
-    """Of two episodes of 100 and 300 ticks, the first done and the second half done: 62 %; of maps
-    alone no share."""
-    first = Future[None]()
-    second = Future[None]()
-    told = list[tuple[str, float | None]]()
-    first.set_result(None)
-
-    def tell(stage: str, share: float | None = None) -> None:
-        told.append((stage, share))
-        if len(told) == 2:
-            second.set_result(None)
-
-    _wait([first, second], [100, 300], [20.0, 150.0], tell)
-    assert told[0] == ("showing failures again", 0.625) and told[-1] == (
-        "showing failures again",
-        0.99,
-    )
-    _wait([first], [], [], lambda *words: told.append(words))  # type: ignore[arg-type]
-    assert told[-1] == ("drawing maps", None)
-
-
-@pytest.mark.parametrize("size", [(216, 384), (33, 41), (1, 1)])
-def test_pictures_of_a_page_are_read_again(size: tuple[int, int]) -> None:
-    """Of odd sizes too, with little error, by what OpenCV makes of them."""
-    rows, columns = np.mgrid[: size[0], : size[1]]
-    rgb = np.stack([rows % 256, columns % 256, (rows + columns) % 256], axis=2).astype(np.uint8)
-    read = cv2.imdecode(np.frombuffer(as_webp(rgb), np.uint8), cv2.IMREAD_COLOR)
-    assert read is not None and read.shape == rgb.shape
-    assert np.abs(read[..., ::-1].astype(int) - rgb).mean() < 12.0
 
 
 def test_a_failure_counts_where_so_many_people_were_near() -> None:
@@ -272,8 +180,7 @@ def test_a_run_without_a_failure_stands_at_0_beside_one_with(
 
 
 def test_long_ways_on_which_a_policy_crashed_are_told_beside_their_rates(tmp_path: Path) -> None:
-    """Two of three crash: their metres are nobody's, the note says how many they are, and who did
-    not crash is not in it."""
+    """Rates of long ways leave out crashed episodes, and a note counts them."""
     ways = [short_way(f"s-{k}", ends_on_failure=False, time_limit_s=300.0) for k in range(3)]
     # 4 m to a failure in each: the rates of a run need 20 m
     runs = read_runs(
@@ -311,29 +218,6 @@ def test_runs_of_other_scenarios_of_a_suite_are_told_apart(tmp_path: Path) -> No
     assert warnings_of([first, part]).mixed == (("s", "one 3, other 2"),)
     text = page_of([first, part], [], [], Maps([], {}, {}), "").decode()
     assert "not all runs are of the same scenarios (one 3, other 2)" in text
-
-
-def test_versions_that_differ_stand_side_by_side_and_the_others_once(tmp_path: Path) -> None:
-    """Two runs of one numpy and two of glibc: a line for what is alike, a row for what is not."""
-    runs = read_runs([run_of(tmp_path / name, ["goal"], name) for name in ("one", "other")])
-    told = []
-    for run, glibc in zip(runs, ("2.36", "2.39"), strict=True):
-        spec = changed(run.spec, versions={"numpy": "2", "glibc": glibc})
-        told.append(ReportedRun(run.label, run.whole._replace(spec=spec)))
-    text = page_of(told, [], [], Maps([], {}, dict(counts_of(told))), "").decode()
-    assert "<dt>versions</dt><dd>numpy 2</dd>" in text
-    assert '<th scope="row">glibc</th><td>2.36</td><td>2.39</td>' in text
-
-
-def test_the_table_of_places_counts_failures_that_the_map_has_no_room_for(tmp_path: Path) -> None:
-    """Three failures of which the map shows one are three."""
-    text = page(
-        run_of(tmp_path / "run", [HIT] * 3 + ["goal"]),
-        maps=Maps(
-            [], {"city 0": [Spot(x_m=0.0, y_m=0.0, cause="obstacle", words="")]}, {"city 0": (4, 3)}
-        ),
-    )
-    assert '<td>4</td><td>3</td><td class="word">obstacle 3</td>' in text
 
 
 def test_names_and_reasons_cannot_break_out_of_the_page(tmp_path: Path) -> None:

@@ -3,7 +3,6 @@ minimap."""
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 
 import numpy as np
@@ -13,59 +12,10 @@ import shapely
 from cosim.core.geometry import Pose
 from cosim.core.state import People, PersonKind, RobotState, Street
 from cosim.place.street_map import StreetMap, Strip
-from cosim.report.above import EVENT, PERSON, ROUTE, Sheet
+from cosim.report.above import EVENT, PERSON, ROUTE
 from cosim.report.hud import Layout
-from cosim.report.legend import MARGIN_PX, legend
 from cosim.report.minimap import MINIMAP_REACH_M, NOSE, RED_SIGNAL, Minimap
 from cosim.spec.scenario import City, Scenario
-
-INK = (10, 20, 30)
-WORDS = [
-    ("conversing-001", INK),
-    ("policy orca", INK),
-    ("goal after 13 s and so on", (200, 0, 0)),
-    ("route", (0, 0, 250)),
-]
-
-
-@pytest.mark.parametrize("width", [140, 200, 514, 2400])
-def test_a_legend_fits_below_its_picture(width: int) -> None:
-    """However narrow a picture is, no word runs out of it, and every cell is there in its
-    colour."""
-    image = np.full((40, width, 3), 90, dtype=np.uint8)
-    both = legend(image, WORDS)
-    band = both[40:]
-    assert both.shape[1] == width and (both[:40] == 90).all()
-    assert (band[:, -MARGIN_PX:] == 255).all() and (band[-4:] == 255).all()
-    for colour in {colour for _, colour in WORDS}:
-        assert (band == colour).all(axis=2).any(), colour
-    assert len(legend(np.zeros((40, 140, 3), np.uint8), WORDS)) > len(
-        legend(np.zeros((40, 2400, 3), np.uint8), WORDS)
-    )
-
-
-def test_labels_do_not_cover_one_another() -> None:
-    """Three labels of one place: each keeps all the ink that it had alone, and none lies on the
-    ring around it."""
-    alone = []
-    sheet = Sheet((0.0, 0.0, 40.0, 30.0))
-    sheet.dot(np.array([[20.0, 15.0]]), EVENT, 0.9, filled=False)
-    ring = (sheet.image == EVENT).all(axis=2)
-    for colour in ((250, 0, 0), (0, 0, 250), (0, 90, 0)):
-        sheet.text((20.0, 15.0), "e0 conversing", colour, 0.9)
-        alone.append(((sheet.image == colour).all(axis=2), colour))
-    assert all(ink.sum() > 20 and (sheet.image[ink] == colour).all() for ink, colour in alone)
-    assert (sheet.image[ring] == EVENT).all()
-
-
-def test_labels_stay_in_the_picture() -> None:
-    """At the right edge and in a corner a label is drawn whole, as it is in the middle."""
-    counts = []
-    for place in ((20.0, 15.0), (39.9, 15.0), (39.9, 0.1), (0.1, 29.9)):
-        sheet = Sheet((0.0, 0.0, 40.0, 30.0))
-        sheet.text(place, "goal", INK)
-        counts.append(int((sheet.image == INK).all(axis=2).sum()))
-    assert len(set(counts)) == 1 and counts[0] > 8
 
 
 @pytest.mark.parametrize(
@@ -141,10 +91,3 @@ def test_the_map_follows_its_robot() -> None:
         assert image.shape == (200, 300, 3)
         shift.append(where(image, EVENT).mean(axis=0))
     assert shift[0] - shift[1] == pytest.approx((2.0 * 200 / (2.0 * MINIMAP_REACH_M), 0.0), abs=0.5)
-
-
-def test_a_robot_outside_its_map_has_ground_around_it() -> None:
-    """Far off the drawn streets the map is plain, and the robot is in it."""
-    lost = dataclasses.replace(RobotState(Pose(30.0, 0.0, 0.0)), pose=Pose(900.0, 0.0, 0.0))
-    image = minimap().picture(lost, Street(0), (200, 200), np.array([0.0, 1.0]))
-    assert len(where(image, NOSE)) > 4 and not len(where(image, ROUTE))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import os
 import re
@@ -14,19 +12,13 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from rich.console import Console
 
-from cosim.cli.results import print_comparison
 from cosim.report.compared import as_latex, as_markdown, flips_in_words, tables_of_comparison
 from cosim.results.compare import (
-    ComparedRun,
     RunComparison,
     compare_runs,
-    differences_of,
-    flipped_between,
     groups_of,
 )
-from cosim.results.metrics import METRICS
 from cosim.results.run_folder import RunFolder, read_records, read_spec
 from cosim.spec.camera import CameraSpec
 from cosim.spec.events import Event
@@ -216,18 +208,6 @@ def rewritten(run: Path, target: Path, of: str = "", **fields: object) -> Path:
     return target
 
 
-def test_intervals_are_counted_where_they_stand(runs: Path) -> None:
-    """Who reads the tables is told how many intervals are in them, and how many more are in the
-    .csv of all metrics."""
-    told = compare_runs([runs / "a", runs / "b", runs / "c"])
-    page = as_markdown(told)
-    shown = len(re.findall(r"\| +[+-][\d.]+ to [+-][\d.]+ \|", page))
-    lines = csv.DictReader(io.StringIO(told.differences.to_csv(index=False)))
-    in_all = sum(line["low"] != "" for line in lines)
-    assert 0 < shown < in_all
-    assert f"{shown} stand in these tables, {in_all} in a .csv" in page.replace("\\", "")
-
-
 def test_a_run_is_within_noise_of_itself(runs: Path, cosim: Cosim) -> None:
     """In every metric and group, and nothing flipped; of a name twice the second has a number."""
     told = compare_runs([runs / "a", runs / "a"])
@@ -262,35 +242,6 @@ def test_who_crashes_is_compared_at_its_worst_and_has_no_rates(runs: Path) -> No
     )
 
 
-def test_a_planted_difference_of_three_in_a_hundred_is_found_on_800_scenarios() -> None:
-    """60 solved no more and 36 more, of 800: 24 fewer, found in the suite, where both kinds of
-    flips are named; in the event that has all of them, too; and nothing anywhere else."""
-    names = [f"s-{i:03d}" for i in range(800)]
-    table = pd.DataFrame({name: [None] * 800 for name in METRICS})
-    base = pd.DataFrame(
-        {"scenario": names, "status": "done", "ended": "goal", "split": "val", "structure": ""}
-    )
-    solved = [1.0 if i % 4 else 0.0 for i in range(800)]
-    planted = list(solved)
-    for i in [i for i in range(400) if solved[i]][:60] + [i for i in range(400) if not solved[i]][
-        :36
-    ]:
-        planted[i] = 1.0 - planted[i]
-    first, second = (
-        ComparedRun(label, Path(label), pd.concat([base, table], axis=1).assign(success=values))
-        for label, values in (("a", solved), ("b", planted))
-    )
-    groups = {("suite", "s"): frozenset(names), ("event", "hard"): frozenset(names[:400])}
-    groups["event", "easy"] = frozenset(names[400:])
-    found = differences_of(first, second, groups, ["success"]).set_index("group")
-    assert found.loc["s", "difference"] == pytest.approx(-0.03)
-    assert found["verdict"].to_dict() == {"s": "worse", "hard": "worse", "easy": "within noise"}
-    assert flipped_between(first, second)["flip"].value_counts().to_dict() == {
-        "lost": 60,
-        "won": 36,
-    }
-
-
 def test_a_comparison_is_printed_and_written(runs: Path, tmp_path: Path, cosim: Cosim) -> None:
     """CSV holds every metric in full; Markdown and LaTeX the tables that are printed; the same each
     time."""
@@ -320,25 +271,6 @@ def test_a_comparison_is_printed_and_written(runs: Path, tmp_path: Path, cosim: 
     )
     assert files[1].read_text() == as_markdown(told) and files[2].read_text() == as_latex(told)
     assert not [*tmp_path.glob("*.part")]
-
-
-def test_a_comparison_fits_80_columns(runs: Path) -> None:
-    """Long ways, fast robots, many failures: no row of a table is longer, none is broken, nothing
-    is cut."""
-    told = compare_runs([runs / "a", runs / "b"])
-    figures = dict.fromkeys(("value_before", "value_after", "difference", "low", "high"), -123.456)
-    said = io.StringIO()
-    print_comparison(
-        Console(file=said, width=80),
-        told._replace(differences=told.differences.assign(verdict="within noise", **figures)),
-    )
-    lines = said.getvalue().splitlines()
-    assert "…" not in said.getvalue()
-    rows = [line for line in lines if line.rstrip().endswith("within noise")]
-    assert len(rows) > 10 and max(map(len, rows)) <= 80
-    assert [
-        line for line in rows if line.startswith("pedestrian_distance_min_m -123.5 -123.5 -123.5 ")
-    ]
 
 
 def test_names_are_escaped(runs: Path) -> None:

@@ -94,8 +94,7 @@ def test_shards_are_merged_to_the_run_that_they_are_of(tmp_path: Path, of: int) 
 
 
 def test_a_shard_that_was_killed_is_read_as_it_lies(tmp_path: Path) -> None:
-    """What it wrote last stands beside its database, and its last record has no row yet: all is
-    taken, and not a byte changes."""
+    """A merge reads a killed shard completely and changes none of its bytes."""
     parts = shards(tmp_path, 2)
     with closing(sqlite3.connect(parts[0] / "results.sqlite")) as database:
         with database:

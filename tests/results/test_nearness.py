@@ -1,4 +1,4 @@
-"""How near people are, on cases worked out by hand."""
+"""Distances to people and times to collision, and places on a route."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from cosim.core.geometry import Pose, box_disk_gap
+from cosim.core.geometry import Polyline, Pose, box_disk_gap
 from cosim.core.state import People, RobotState
+from cosim.episode.loop import place_on_route
 from cosim.results.log import Nearness, nearness, time_to_collision_s
+from cosim.results.rejudge import places_on_route
 
 FOOTPRINT = (0.7, 0.55)
 
@@ -38,8 +40,8 @@ def test_two_who_drive_at_each_other_meet_halfway() -> None:
 
 
 def test_who_passes_aside_or_walks_away_is_never_met() -> None:
-    """One on a line 0.7 m beside the robot's, one who keeps ahead at its pace, one who stands
-    behind it."""
+    """A person who passes aside, walks ahead at the same pace or is behind has no time to
+    collision."""
     passing = people((5.0, 0.7, math.pi, 1.0), (3.0, 0.0, 0.0, 1.0), (-2.0, 0.0, 0.0, 0.0))
     near = nearness(RobotState(Pose(0.0, 0.0, 0.0), v_mps=1.0), passing, FOOTPRINT)
     assert (
@@ -84,3 +86,22 @@ def test_at_the_time_that_is_told_they_touch() -> None:
     never = ~np.isfinite(in_s)
     for t in np.linspace(0.0, 20.0, 400):
         assert (np.hypot(*(offset[never] + t * velocity[never]).T) > 0.65).all()
+
+
+@pytest.mark.parametrize("spacing_m", [0.3, 1.0, 25.0])
+def test_all_places_on_a_route_are_those_that_are_found_one_by_one(spacing_m: float) -> None:
+    """To the bit: on a way that winds, comes back near itself and ends, from poses on it, off it
+    and beyond it."""
+    rng = np.random.default_rng(2)
+    turns = np.cumsum(rng.normal(0.0, 0.4, 300))
+    route = Polyline(np.cumsum(spacing_m * np.column_stack([np.cos(turns), np.sin(turns)]), axis=0))
+    last_m = rng.uniform(-15.0, route.length_m + 15.0, 5000)
+    at = np.array([route.at(s_m) for s_m in last_m.tolist()])
+    pose = at + rng.normal(0.0, 1.0, at.shape) * rng.choice([0.0, 0.5, 8.0], len(at))[:, None]
+    found = places_on_route(route, pose, last_m)
+    one_by_one = [
+        place_on_route(route, Pose(*p), s_m)
+        for p, s_m in zip(pose.tolist(), last_m.tolist(), strict=True)
+    ]
+    assert found.tolist() == one_by_one
+    assert places_on_route(route, pose[:0], last_m[:0]).shape == (0,)

@@ -220,8 +220,7 @@ def test_out_of_lane_is_told_at_every_step_of_a_walk_to_and_fro_over_the_edge() 
 
 
 def test_freezing_is_half_a_metre_in_ten_seconds() -> None:
-    """A robot that stands for 10 s freezes at once then; one that creeps 0.06 m/s does not; the
-    count starts anew."""
+    """A robot that moves less than half a metre in 10 s freezes, and then the count restarts."""
     still = judge_all(referee(), [step(t, 20.0) for t in range(402)])
     frozen_at = [t for t, v in enumerate(still) if v.failures]
     assert frozen_at == [200, 401]
@@ -265,8 +264,8 @@ def test_entering_a_crossing_at_red_is_noted_once() -> None:
 
 
 def test_a_reset_keeps_off_obstacles() -> None:
-    """Whatever stands where the robot would be put, or too near to turn there, sends it to the next
-    waypoint; where something stands at every one of them it is put at the nearest."""
+    """A reset moves on to the next waypoint that is free of obstacles, or to the nearest if none
+    is."""
 
     def bin_at(x_m: float, y_m: float = 0.0) -> Obstacle:
         return Obstacle(kind="bin", x_m=x_m, y_m=y_m, heading_rad=0.0)

@@ -165,19 +165,6 @@ def test_resuming_with_something_else_is_refused(tmp_path: Path, field: str, val
         RunFolder.resume(tmp_path / "run", other)
 
 
-def test_another_waypoint_rule_is_told_in_words(tmp_path: Path) -> None:
-    """The one of the run, and the one that is asked for now."""
-    with RunFolder.create(tmp_path / "run", SPEC, SUITE):
-        pass
-    other = changed(SPEC, waypoints=WaypointRule(index=0, dt_s=0.2, rule="atan2"))
-    with pytest.raises(RunError) as caught:
-        RunFolder.resume(tmp_path / "run", other)
-    assert (
-        "its waypoints is waypoint 2, units of 1 m, in 0.25 s, shipped, now asked for is waypoint "
-        "0, units of 1 m, in 0.2 s, atan2. Resume with the same command"
-    ) in str(caught.value)
-
-
 def test_another_camera_is_told_in_words(tmp_path: Path) -> None:
     """Mount, size, field of view and crop of both."""
     spec = changed(SPEC, camera=CameraSpec(512, 288, 60.0))

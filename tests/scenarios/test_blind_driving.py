@@ -280,7 +280,6 @@ def test_who_overtakes_is_not_touched_by_a_robot_that_slows_down_and_walks_on(v_
 @pytest.mark.parametrize(
     ("kind", "policy"),
     [
-        ("obstructing", Crawl(0.8)),
         ("obstructing", EdgeDriver(1.2)),
         ("overtaking", Crawl(2.5)),
         ("frontal", Stander(1.2, 5.0)),
@@ -289,9 +288,8 @@ def test_who_overtakes_is_not_touched_by_a_robot_that_slows_down_and_walks_on(v_
 def test_blind_policies_do_not_solve_events_and_who_stands_has_not_failed(
     kind: str, policy: Crawl
 ) -> None:
-    """With real engines and nobody else in the street: the event takes place and is seen; a blind
-    driver collides and is at fault or shares it, and who stands waits for its goal until the time
-    is up."""
+    """A blind policy that drives collides and is at fault or shares it; one that stands waits until
+    its time is up."""
     from cosim.place.walk_graph import WalkGraph
     from scenarios.episodes.run_episode import run_episode
     from scenarios.places.nets import place

@@ -400,35 +400,6 @@ def test_a_learner_drives_in_every_process_as_it_does_in_this_one(
     assert said.returncode == 2 and "is of another data set: its learner_source is" in said.stderr
 
 
-def test_a_learner_that_fails_is_told_as_a_policy_is(desk: Desk, cosim: Cosim) -> None:
-    """One that is another in each process ends the run; one that dies has crashed its episodes."""
-    (desk.folder / "failing.py").write_text(BESIDE)
-    asked = (
-        "collect",
-        "ways.json",
-        "--scenario",
-        "way-0",
-        "--camera",
-        "64x48",
-        "--noise",
-        "0.6",
-        "--learner",
-    )
-    said = cosim(*asked, "failing:Another", "--out", "other", cwd=desk.folder)
-    assert (
-        said.returncode == 2
-        and "policy 'failing:Another' has another manifest in each process" in said.stderr
-    )
-    said = cosim(*asked, "failing:Dies", "--out", "dead", cwd=desk.folder)
-    assert said.returncode == 2 and "nothing to keep of 1 episodes: crashed (1)" in said.stderr, (
-        said.stderr
-    )
-    said = cosim(*asked, "zenoh:mine", "--out", "far", cwd=desk.folder)
-    assert (
-        said.returncode == 2 and "learner: policy 'zenoh:mine' is served elsewhere" in said.stderr
-    )
-
-
 def test_a_learner_that_would_see_something_else_is_refused() -> None:
     """With what to give; so is one beside an expert that sees by a camera of its own, and one that
     is blind."""

@@ -133,8 +133,7 @@ def test_a_run_says_whom_its_robot_delayed_only_when_asked(
 
 
 def test_a_run_gives_signs_of_life_while_it_compares(scenario: Scenario, tmp_path: Path) -> None:
-    """Between the last progress of an episode of five seconds and its end it tells five times how
-    far it is."""
+    """A counterfactual comparison sends five progress messages."""
     short = Suite(
         name="s", version="1", scenarios=(msgspec.structs.replace(scenario, time_limit_s=5.0),)
     )

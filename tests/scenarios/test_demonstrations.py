@@ -9,7 +9,6 @@ from fractions import Fraction
 from pathlib import Path
 
 import cv2
-import msgspec
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
@@ -21,7 +20,7 @@ from cosim.spec.demo_options import Collecting, demonstrating
 from cosim.spec.goal import GOALS, goal_called
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import COURIER
-from scenarios.episodes.clip import _OPTIONS, Clip, _planes_of, _rgb_of, join_clips, pictures_of
+from scenarios.episodes.clip import _OPTIONS, Clip, _planes_of, _rgb_of, pictures_of
 from scenarios.episodes.demonstration import Demonstration, glimpse, waypoints_ahead
 from scenarios.episodes.demonstrator import _Bursts
 from scenarios.suites.new_scenarios import fresh, fresh_cities
@@ -264,14 +263,6 @@ def test_rows_beside_their_pictures_are_found_when_it_is_read_back(
         read_back(data_set, episodes_of(kept))
 
 
-def test_a_clip_of_another_length_is_refused(
-    tmp_path: Path, demonstrations: list[Demonstration]
-) -> None:
-    """A film is not made of a clip that has not as many pictures as its episode has rows."""
-    with pytest.raises(RunError, match="a clip has 7 pictures in place of 6"):
-        join_clips([demonstrations[0].clip.tobytes()], [6], tmp_path / "film.mp4", FPS)
-
-
 def test_waypoints_are_where_the_robot_is_later_in_its_own_frame() -> None:
     """Of a robot that drives a circle to the left, its place on the circle, and at the end the same
     circle goes on by its command."""
@@ -411,13 +402,3 @@ def test_a_damaged_demonstration_is_named(demonstrations: list[Demonstration]) -
     assert Demonstration.decoded(data, "here").encoded() == data
     with pytest.raises(RunError, match="here: no demonstration"):
         Demonstration.decoded(data[:-100], "here")
-
-
-def test_what_is_kept_travels_with_the_options_of_an_episode() -> None:
-    """Options that ask for demonstrations are the same behind MessagePack."""
-    from cosim.spec.options import EpisodeOptions
-
-    options = EpisodeOptions(
-        collecting=Collecting(noise=0.1, camera=CameraSpec(width=96, height=96))
-    )
-    assert msgspec.msgpack.decode(msgspec.msgpack.encode(options), type=EpisodeOptions) == options

@@ -63,10 +63,8 @@ class Ahead:
 def test_what_is_given_in_an_episode_holds_no_secret_and_is_what_it_says(
     scenario: Scenario,
 ) -> None:
-    """Everything that a manifest can ask for but knowledge, after a second among people: nothing
-    that only the simulator knows is reached from it, before its driver copies it and after. The
-    goal is the picture of the place 20 m along the route with nobody there: with somebody in it it
-    is another."""
+    """An unprivileged observation with everything that can be requested reaches nothing that only
+    the simulator knows; its goal picture shows the place without people."""
     policy = Ahead(ALL)
     driver = Driver(policy)
     with Episode(scenario, ALL, SEED) as episode, episode.eyes(SPEC) as camera:

@@ -1,11 +1,10 @@
-"""Policies that do what no policy should, all in one run: every episode gets its row, and nothing
-else breaks."""
+"""Hostile policies, in the simulator's process and isolated: every episode gets its row, and
+nothing else breaks."""
 
 from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 import time
@@ -18,118 +17,89 @@ import msgspec
 import pandas as pd
 import pytest
 
-from cosim.place.walk_graph import WalkGraph
+from cosim.core.errors import UsageError
+from cosim.results.record import Record
+from cosim.results.run_folder import read_records, read_spec
 from cosim.spec.episode_id import pseudonym_of
-from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
-from scenarios.events import EVENT_KINDS
-from tests.conftest import PATIENCE_S, WIDE, Cosim, Said, without_lines
-from tests.support.hostile import ACTS, FLOOD_BYTES, RESETS
+from cosim.spec.options import EpisodeOptions, PolicyHost
+from cosim.spec.scenario import Scenario, Suite, write_suite
+from scenarios.runs import run as suite_run
+from scenarios.runs.isolated_policy import isolated_driver
+from scenarios.tools.verify.doctor import small_scenario
+from tests.conftest import PATIENCE_S, ROOT, WIDE, Cosim, Said, without_lines
+from tests.support.hostile import ANSWER_S, DEEDS, DESK, DONE, FLOOD_BYTES, Honest
 
-pytestmark = pytest.mark.engine
-
-ANSWER_S = 3.0
-START_S = 3.0
-DONE = ""
-"""Nothing to say: the episode is done, and simulated as if the policy had done nothing."""
-
-EXPECTED: dict[str, str] = {
-    "error": "policy 'hostile' raised KeyError: 'no such weight' (act at 0.50 s)",
-    "exit": "raised SystemExit: enough (act at 0.50 s)",
-    "exit-with-0": "raised SystemExit: 0",
-    "exit-in-reset": "raised SystemExit: 3 (reset)",
-    "error-in-reset": "raised FileNotFoundError: weights.pt (reset)",
-    "ctrl-c": "raised KeyboardInterrupt (act",
-    "generator-exit": "raised GeneratorExit (act",
-    "stop-iteration": "raised StopIteration (act",
-    "cancelled": "raised CancelledError (act",
-    "too-much-memory": "raised MemoryError: Unable to allocate",
-    "recursion": "raised RecursionError: maximum recursion depth",
-    "mute": "raised Mute: (its message cannot be read)",
-    "odd-text": "raised ValueError: ? ?[31m red ?",
-    "long-text": "xxx ... (1000000 characters) (act",
-    "pretends-to-be-an-engine": "policy 'hostile' raised EngineError: SUMO failed",
-    "nothing": "policy 'hostile' answered None: neither a Command nor waypoints (act at 0.50 s)",
-    "nan": "answered Command(v_mps=nan, w_radps=0.0): both must be finite",
-    "infinity": "answered waypoints with NaN or infinity: [inf, 0.0]",
-    "huge-integer": "answered Command(v_mps=an integer of 1329 bits, "
-    "w_radps=0.0): both must be finite",
-    "complex": "answered an array of complex128: waypoints are real numbers",
-    "texts": "answered an array of str96: waypoints are real numbers",
-    "truths": "answered an array of bool: waypoints are real numbers",
-    "objects": "answered an array of object: waypoints are real numbers",
-    "ragged": "answered [[1.0, 0.0], [1.0]]: neither a Command nor waypoints",
-    "wrong-shape": "answered an array of shape (3, 7)",
-    "no-waypoint": "answered an array of shape (0, 2)",
-    "too-many-numbers": "policy 'hostile' answered an array of shape (50001, 2): 100002 numbers; "
-    "an answer holds at most 100000 (act at 0.50 s)",
-    "a-coroutine": "answered a coroutine: neither a Command nor waypoints",
-    "an-unreal-float": "raised KeyboardInterrupt",
-    "without-end": "policy 'hostile' ",
-    "honest": DONE,
-    "scribbles": DONE,
-    "another-manifest": DONE,
-    "elsewhere": DONE,
-    "deletes-its-folder": DONE,
-    "forges-its-record": DONE,
-    "floods": DONE,
-    "closes-its-output": DONE,
-    "forks": DONE,
-    "a-busy-thread": DONE,
-    "closes-everything": "the environment process",
-    "dies-and-leaves-processes": "the environment process ended with exit code 0 in the "
-    "policy's act at 0.50 s",
-    "kills-its-parent": "the environment process was killed by SIGKILL in the policy's act at "
-    "0.50 s, 2 times",
-    "hangs-with-the-lock": "policy 'hostile' gave no answer for 3 s in act at 0.50 s "
-    "of hangs-with-the-lock",
-    "stops-itself": "gave no answer for 3 s in act at 0.50 s of stops-itself",
-    "hangs-in-reset": "gave no answer for 3 s in reset of hangs-in-reset",
-}
-SEED = "5"
-TWICE = {"dies-and-leaves-processes", "kills-its-parent", "closes-everything"}
-"""A process may have died of something else: these are tried again."""
+OF = "tests.support.hostile"
+SEED = 5
+MARK = "HOSTILE_MARK"
+_WRITES = """
+import os, stat
+for i in range(3, 1024):
+    try:
+        if stat.S_ISSOCK(os.fstat(i).st_mode):
+            os.write(i, b"0" * 99)
+    except OSError:
+        pass
+"""
 
 
 class War(NamedTuple):
-    """The one run of all of them. mark: what every process of it has in its environment."""
+    """One run of all behaviours of a hosting.
+
+    folder: of the run
+    outcome: DONE or a part of the crash's reason, by behaviour
+    mark: what every process of the run has in its environment
+    """
 
     folder: Path
+    outcome: dict[str, str]
     said: Said
+    records: dict[str, Record]
     mark: str
 
 
+def named(name: str) -> Scenario:
+    return msgspec.structs.replace(small_scenario(), time_limit_s=1.0, id=name)
+
+
+def prepare(desk: Path, names: list[str], mark: str) -> dict[str, str]:
+    """Write the suite of some behaviours; return the environment of its run."""
+    suite = Suite(name="hostile", version="1", scenarios=tuple(map(named, names)))
+    write_suite(suite, desk / "hostile.json")
+    told = {pseudonym_of(SEED, each).episode: each.id for each in suite.scenarios}
+    (desk / "names.json").write_text(json.dumps(told))
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    return {DESK: str(desk), MARK: mark, "PYTHONPATH": path}
+
+
+def war(desk: Path, fresh_cosim: Cosim, outcome: dict[str, str], *options: str) -> War:
+    """Run all behaviours by two processes at a time."""
+    mark = f"hostile-{uuid.uuid4()}"
+    timeout = ("--answer-timeout", f"{ANSWER_S:g}", "--start-timeout", f"{ANSWER_S:g}")
+    words = ("--policy", f"{OF}:Hostile", "--jobs", "2", "--seed", str(SEED), "--out", "run")
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in prepare(desk, [*outcome], mark).items():
+            patch.setenv(name, value)
+        said = fresh_cosim("run", "hostile.json", *words, *timeout, *options, cwd=desk)
+    records = {one.scenario.id: one for one in read_records(desk / "run")}
+    return War(desk / "run", outcome, said, records, mark)
+
+
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a suite that has one short scenario for each of them, and the policies."""
-    from scenarios.places.nets import place
-    from scenarios.suites.reactive import build_reactive
-
-    folder = tmp_path_factory.mktemp("desk")
-    city = City(seed=1, size_m=500.0)
-    _, street_map = place(city)
-    whole = build_reactive(
-        EVENT_KINDS["obstructing"], city, street_map, WalkGraph(street_map), 0, "t"
-    )
-    crowd = CrowdSpec(persons=4, radius_m=50.0, vehicles=1)
-    one = msgspec.structs.replace(whole, crowd=crowd, time_limit_s=1.0, events=())
-    names: dict[str, str] = {}
-    for name, scenarios in (("hostile", [*EXPECTED]), ("pictures", ["honest", "blackens"])):
-        suite = Suite(
-            name=name, version="1", scenarios=tuple(named(one, scenario) for scenario in scenarios)
-        )
-        write_suite(suite, folder / f"{name}.json")
-        names |= {pseudonym_of(int(SEED), each).episode: each.id for each in suite.scenarios}
-    (folder / "names.json").write_text(json.dumps(names))
-    shutil.copy(Path(__file__).parents[1] / "support" / "hostile.py", folder)
-    return folder
+def here(tmp_path_factory: pytest.TempPathFactory, fresh_cosim: Cosim) -> War:
+    outcome = {name: deed.here for name, deed in DEEDS.items() if deed.here is not None}
+    options = ("--log-json", "log.jsonl", "--frames", "0.25")
+    return war(tmp_path_factory.mktemp("here"), fresh_cosim, outcome, *options)
 
 
-def named(scenario: Scenario, name: str) -> Scenario:
-    return msgspec.structs.replace(scenario, id=name)
+@pytest.fixture(scope="module")
+def isolated(tmp_path_factory: pytest.TempPathFactory, fresh_cosim: Cosim) -> War:
+    outcome = {name: deed.isolated for name, deed in DEEDS.items() if deed.isolated is not None}
+    return war(tmp_path_factory.mktemp("isolated"), fresh_cosim, outcome, "--isolated")
 
 
 def with_mark(mark: str) -> list[int]:
-    """Processes that have this in their environment."""
+    """Return the processes that have a mark in their environment."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
         try:
@@ -140,172 +110,110 @@ def with_mark(mark: str) -> list[int]:
     return found
 
 
-@pytest.fixture(scope="module")
-def war(desk: Path, fresh_cosim: Cosim) -> War:
-    """One run over all of them, by two processes at a time."""
-    mark = f"hostile-{uuid.uuid4()}"
-    times = ("--answer-timeout", f"{ANSWER_S:g}", "--start-timeout", f"{START_S:g}")
-    words = (
-        "--policy",
-        "hostile:Hostile",
-        "--jobs",
-        "2",
-        "--seed",
-        SEED,
-        "--out",
-        "war",
-        "--log-json",
-        "log.jsonl",
-    )
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("HOSTILE_DESK", str(desk))
-        patch.setenv("HOSTILE_MARK", mark)
-        said = fresh_cosim("run", "hostile.json", *words, *times, cwd=desk)
-    return War(desk / "war", said, mark)
+@pytest.mark.engine
+@pytest.mark.parametrize("hosting", ["here", "isolated"])
+def test_a_hostile_policy_is_recorded_for_what_it_did(
+    hosting: str, request: pytest.FixtureRequest
+) -> None:
+    """An episode has crashed with the reason, or is to the bit that of an honest policy."""
+    run: War = request.getfixturevalue(hosting)
+    honest = run.records["honest"]
+    for name, expected in run.outcome.items():
+        record = run.records[name]
+        if expected == DONE:
+            assert record.status == "done", f"{name}: {record.reason}"
+            told = (record.state_hash, record.ended, record.measures, record.failures)
+            assert told == (honest.state_hash, honest.ended, honest.measures, honest.failures), name
+        else:
+            reason = without_lines(record.reason)
+            assert record.status == "crashed" and expected in reason, f"{name}: {reason}"
+            assert len(reason) < 700, name
+    began = Counter((run.folder.parent / "began.txt").read_text().split())
+    attempts = {name: 1 if hosting == "isolated" else DEEDS[name].attempts for name in run.outcome}
+    assert began == attempts
+    assert {record.setup.policy_runs for record in run.records.values()} == {
+        "in-process" if hosting == "here" else "isolated"
+    }
 
 
-def record(war: War, name: str) -> dict[str, object]:
-    return json.loads((war.folder / "episodes" / name / "record.json").read_text())
+@pytest.mark.engine
+@pytest.mark.parametrize("hosting", ["here", "isolated"])
+def test_a_run_of_hostile_policies_ends_in_order(
+    hosting: str, request: pytest.FixtureRequest
+) -> None:
+    """The run has a row for every episode, exit code 1, no traceback, small logs, and leaves no
+    process."""
+    run: War = request.getfixturevalue(hosting)
+    assert run.said.returncode == 1 and "Traceback" not in run.said.stderr, run.said.stderr
+    assert f"scheduled {len(run.outcome)}, scored {len(run.outcome)}" in run.said.stdout
+    assert "crashed error" in run.said.stdout
+    table = pd.read_csv(run.folder / "results.csv", index_col="scenario", keep_default_na=False)
+    assert list(table.index) == sorted(run.outcome)
+    assert {float(each) for each in table["success"][table["status"] == "crashed"]} == {0.0}
+    logs = [path.read_bytes() for path in (run.folder / "logs").iterdir()]
+    assert max(map(len, logs)) < FLOOD_BYTES / 2
+    for words in (b"the flood begins", b"bytes were printed here and left out", b"the flood ends"):
+        assert any(words in log for log in logs), words
+    assert with_mark(run.mark) == []
 
 
-def test_every_hostile_policy_is_expected() -> None:
-    """The table names each function of tests/support/hostile.py, and they are many."""
-    assert set(EXPECTED) == set(ACTS) | set(RESETS)
-    assert len(EXPECTED) >= 45
-
-
-@pytest.mark.parametrize("name", EXPECTED)
-def test_a_hostile_policy_is_recorded_for_what_it_did(war: War, name: str) -> None:
-    """A crash with the reason in words, once unless a process died; or an episode that nothing has
-    changed."""
-    told = record(war, name)
-    began = Counter((war.folder.parent / "began.txt").read_text().split())
-    if EXPECTED[name] == DONE and name not in TWICE:
-        assert told["status"] == "done", told["reason"]
-        assert told["state_hash"] == record(war, "honest")["state_hash"]
-    else:
-        assert told["status"] == "crashed"
-        assert (
-            EXPECTED[name] in without_lines(str(told["reason"])) and len(str(told["reason"])) < 700
-        )
-    assert began[name] == (2 if name in TWICE else 1)
-    assert told["policy"] == "hostile"
-
-
-def test_a_run_of_hostile_policies_ends_in_order(war: War) -> None:
-    """A row for every episode, exit code 1, no traceback."""
-    assert war.said.returncode == 1 and "Traceback" not in war.said.stderr, war.said.stderr
-    assert f"scheduled {len(EXPECTED)}, scored {len(EXPECTED)}" in war.said.stdout
-    assert "crashed error" in war.said.stdout and EXPECTED["error"] in without_lines(
-        war.said.stdout
-    )
-    table = pd.read_csv(
-        war.folder / "results.csv", index_col="scenario", keep_default_na=False, na_values=[""]
-    )
-    assert list(table.index) == sorted(EXPECTED)
-    assert set(table["success"][table["status"] == "crashed"]) == {0.0}
-
-
-def test_nobody_pays_for_what_another_did_to_the_process(war: War) -> None:
-    """Processes end by what is expected to end them; else they go on, or leave in order with a
+@pytest.mark.engine
+def test_nobody_pays_for_what_another_did_to_the_process(here: War) -> None:
+    """Processes end by what is expected to end them; others continue, or leave in order with a
     closed output."""
-    events = [
-        json.loads(line) for line in (war.folder.parent / "log.jsonl").read_text().splitlines()
-    ]
-    lost = {one["scenario"]: one["why"] for one in events if one["event"] == "lost"}
-    lost = {name: why for name, why in lost.items() if name not in TWICE}
-    assert set(lost.values()) <= {"the environment process ended with exit code 0"}, lost
+    log = (here.folder.parent / "log.jsonl").read_text().splitlines()
+    lost = [one for one in map(json.loads, log) if one["event"] == "lost"]
+    why = {one["why"] for one in lost if DEEDS[one["scenario"]].attempts == 1}
+    assert why <= {"the environment process ended with exit code 0"}
 
 
-def test_pictures_are_kept_as_they_were_drawn(desk: Path, cosim: Cosim) -> None:
-    """A policy that blackens the picture it is given does not blacken the one that is kept; and
-    what a policy has not declared when it was loaded it does not come to know later."""
-    words = (
-        "--policy",
-        "hostile:Painter",
-        "--camera",
-        "bullet",
-        "--frames",
-        "0.25",
-        "--seed",
-        SEED,
-        "--out",
-        "pictures",
-    )
-    run = cosim("run", "pictures.json", *words, cwd=desk)
-    assert run.returncode == 0, run.stdout
+@pytest.mark.engine
+def test_pictures_are_kept_as_they_were_drawn(here: War) -> None:
+    """A policy that blackens the picture it is given does not blacken the one that is kept."""
+    episodes = here.folder / "episodes"
     honest, blackened = (
-        [
-            path.read_bytes()
-            for path in sorted((desk / "pictures/episodes" / name / "frames").glob("*.png"))
-        ]
-        for name in ("honest", "blackens")
+        [path.read_bytes() for path in sorted((episodes / name / "frames").glob("*.png"))]
+        for name in ("honest", "scribbles")
     )
     assert len(honest) == 4 and honest == blackened
 
 
-def test_a_flood_of_text_leaves_small_logs(war: War) -> None:
-    """Of what a policy prints the beginning and the end are kept."""
-    logs = [path.read_bytes() for path in (war.folder / "logs").iterdir()]
-    assert max(map(len, logs)) < FLOOD_BYTES / 2
-    assert any(
-        b"the flood begins" in log and b"bytes were printed here and left out" in log
-        for log in logs
-    )
-    assert any(b"the flood ends" in log for log in logs)
+@pytest.mark.engine
+def test_an_isolated_policy_sees_nothing_of_the_simulator(isolated: War) -> None:
+    """Its process holds no engine and nothing of the street, and SUMO has no person there."""
+    assert json.loads((isolated.folder.parent / "peeked.json").read_text()) == []
+    assert read_spec(isolated.folder).setup.policy_runs == "isolated"
+    assert "policy isolated" in isolated.said.stdout
 
 
-def test_nothing_is_left_of_a_run(war: War) -> None:
-    """No process that any policy has started outlives its environment process."""
-    assert with_mark(war.mark) == []
+@pytest.mark.engine
+def test_isolated_or_not_an_episode_is_the_same_to_the_bit(isolated: War, tmp_path: Path) -> None:
+    """In the simulator's process the same commands come out of the same pictures."""
+    suite = Suite(name="hostile", version="1", scenarios=(named("honest"),))
+    table = suite_run.run(suite, Honest(), out=tmp_path / "run", options=EpisodeOptions(seed=SEED))
+    honest = isolated.records["honest"]
+    assert table["policy_runs"].tolist() == ["in-process"]
+    assert table["state_hash"].tolist() == [honest.state_hash]
+    assert {"answer_median_ms", "answer_p95_ms"} <= honest.clock.keys()
 
 
-def test_a_run_is_not_finished_with_an_edited_policy(desk: Path, cosim: Cosim, war: War) -> None:
-    """Also when the policy's version was left as it was: wrong use, and nothing is run."""
-    source = desk / "hostile.py"
-    kept = source.read_text()
-    source.write_text(kept.replace("WALK = Command(1.0, 0.0)", "WALK = Command(2.0, 0.0)"))
-    words = ("run", "hostile.json", "--policy", "hostile:Hostile", "--out", "war", "--resume")
-    try:
-        edited = cosim(*words, cwd=desk)
-    finally:
-        source.write_text(kept)
-    assert edited.returncode == 2
-    assert (
-        "war is of another run: the source of policy 'hostile:Hostile' was edited since it began"
-        in edited.stderr
-    )
-    assert cosim(*words, cwd=desk).returncode == 1  # as it was: every episode is finished
-
-
-def test_nothing_is_left_of_a_run_that_is_killed(desk: Path) -> None:
-    """Also the processes that a policy has started, in sessions of their own, end with the run."""
+@pytest.mark.engine
+def test_nothing_is_left_of_a_run_that_is_killed(tmp_path: Path) -> None:
+    """The processes that a policy has started, in their own sessions, end with a killed run."""
     mark = f"hostile-{uuid.uuid4()}"
-    words = (
-        "run",
-        "hostile.json",
-        "--scenario",
-        "honest",
-        "--policy",
-        "hostile:Leaves",
-        "--seed",
-        SEED,
-        "--out",
-        "leaves",
-    )
+    words = ("--policy", f"{OF}:Leaves", "--seed", str(SEED), "--out", "leaves")
     run = subprocess.Popen(
-        [sys.executable, "-m", "cosim", *words],
-        cwd=desk,
-        env=os.environ | WIDE | {"HOSTILE_DESK": str(desk), "HOSTILE_MARK": mark},
+        [sys.executable, "-m", "cosim", "run", "hostile.json", *words],
+        cwd=tmp_path,
+        env=os.environ | WIDE | prepare(tmp_path, ["honest"], mark),
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
     )
     deadline = time.monotonic() + PATIENCE_S
-    while not (desk / "left").exists():
+    while not (tmp_path / "left").exists():
         assert run.poll() is None and time.monotonic() < deadline
         time.sleep(0.02)
-    # The run, the shepherd, the worker, and the two that were left: one that has just been started
-    # has no environment.
+    # The run, the shepherd, the worker, and the two that were left.
     while len(with_mark(mark)) < 5:
         assert time.monotonic() < deadline
         time.sleep(0.02)
@@ -314,3 +222,29 @@ def test_nothing_is_left_of_a_run_that_is_killed(desk: Path) -> None:
     while with_mark(mark):
         assert time.monotonic() < deadline, "processes are left"
         time.sleep(0.02)
+
+
+def test_isolated_what_cannot_be_loaded_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cosim: Cosim
+) -> None:
+    """An isolated policy that is missing, ends its process, writes to its socket, hangs or is
+    privileged is refused in a line."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "ends.py").write_text("import os\nos._exit(3)\n")
+    (tmp_path / "writes.py").write_text(_WRITES)
+    told = {
+        f"{OF}:Honset": "unknown class in module 'tests.support.hostile' 'Honset'.*Did "
+        "you mean Honest?",
+        "ends:Any": "policy 'ends:Any' cannot be loaded: it gave no answer: the policy process "
+        "ended with exit code 3",
+        "writes:Any": "policy 'writes:Any' cannot be loaded: it ",
+    }
+    for name, words in told.items():
+        with pytest.raises(UsageError, match=words):
+            isolated_driver(name)
+    with pytest.raises(UsageError, match=r"it gave no answer for 1 s: --start-timeout gives it"):
+        isolated_driver(f"{OF}:Hanging", start_s=1.0)
+    said = cosim("run", "unit", "--policy", "route", "--isolated", "--episodes", "1", cwd=tmp_path)
+    assert said.returncode == 2 and "is told what the simulator knows (privileged)" in said.stderr
+    with pytest.raises(UsageError, match="needs a policy by its name"):
+        suite_run.run("unit", Honest(), host=PolicyHost(isolated=True))

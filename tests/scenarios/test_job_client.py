@@ -3,18 +3,22 @@ without a session."""
 
 from __future__ import annotations
 
+import threading
 from pathlib import Path
 
 import msgspec
 import pytest
 
-from cosim.core.errors import UsageError
+from cosim.core.errors import MachineError, UsageError
 from cosim.policies.load import load_policy
 from cosim.spec.connection import Connection
 from scenarios.ipc.messages import Done, FrameDrawn, Hello, Job, Message, Progress, Ready
-from scenarios.runs import job_client
+from scenarios.runs import job_client, zenoh_worker
 from scenarios.runs.job_client import Installation, JobClient, Request
 from scenarios.runs.protocol import Assignment, Claim, CoordinatorReply, Reply, Report, encode_reply
+from scenarios.runs.zenoh_worker import work
+from tests.conftest import wait_until
+from tests.scenarios.test_many_workers import Run
 from tests.scenarios.test_pool import SCENARIO, Fake
 
 HERE = Installation(
@@ -148,3 +152,30 @@ def test_a_worker_that_is_turned_away_ends(tmp_path: Path) -> None:
     bench.assigned()
     with pytest.raises(UsageError, match="another run"):
         bench.answer(bench.report()[0], Reply("turned_away", "another run"))
+
+
+@pytest.mark.engine
+def test_a_worker_for_one_run_does_not_wait_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ends, and says why, when it was cut off from a run that is over, and when none was ever
+    there."""
+    monkeypatch.setattr(zenoh_worker, "_LOOKS_S", 0.0)
+    run = Run(tmp_path)
+    said = list[str]()
+
+    def over_unheard() -> None:
+        wait_until(lambda: ": is connected" in run.log)
+        monkeypatch.setattr(zenoh_worker, "GIVEN_UP_S", 0.5)
+        run.kill()
+
+    other = threading.Thread(target=over_unheard)
+    other.start()
+    at = Connection(role="worker", connect=run.endpoint)
+    with pytest.raises(MachineError, match=r"no run was heard of at .* for 0\.5 s: is it over\?"):
+        work(at, 1, lambda line, *_: said.append(line), once=True)
+    other.join()
+    assert any(line.startswith("works for run") for line in said)
+    run.over()
+    with pytest.raises(MachineError, match="no run was heard of"):
+        work(at, 1, lambda line, *_: said.append(line), once=True)

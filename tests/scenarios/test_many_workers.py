@@ -12,6 +12,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from sumo_nets.net.net_hash import hash_of
 
 from bridge import keys
 from bridge.codec import encode
@@ -44,8 +45,7 @@ from scenarios.runs.protocol import (
 from scenarios.runs.status import RunStatus
 from scenarios.runs.transport import HeldRun
 from scenarios.runs.zenoh_transport import workers_of_run
-from sumo_nets.net.raw_file import hash_of
-from tests.conftest import PATIENCE_S, Cosim
+from tests.conftest import PATIENCE_S, Cosim, wait_until
 from tests.run_specs import changed, spec_of
 
 pytestmark = pytest.mark.engine
@@ -241,16 +241,9 @@ def hands(run: Run, count: int) -> Iterator[list[Hand]]:
         yield found
 
 
-def until(true: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not true():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
 def test_jobs_are_claimed_renewed_and_delivered_once(tmp_path: Path) -> None:
-    """A newcomer learns the policy; an answer that was lost is given again; a second result changes
-    nothing, one of other content is told loudly; the first one stays."""
+    """A job is claimed and delivered once; a second result changes nothing, and one that differs is
+    logged as a conflict."""
     run = Run(tmp_path)
     with hands(run, 2) as (one, other):
         welcome = one.claim(ready=False)
@@ -276,8 +269,7 @@ def test_jobs_are_claimed_renewed_and_delivered_once(tmp_path: Path) -> None:
 
 
 def test_the_job_of_a_lost_worker_is_free_at_once(tmp_path: Path) -> None:
-    """Another one gets it; who was taken for lost is told to let go, and a result that it has all
-    the same is taken, if it is the first."""
+    """The job of a lost worker goes to another at once; the first result of either counts."""
     run = Run(tmp_path)
     with hands(run, 3) as (lost, other, third):
         first = lost.job()
@@ -294,12 +286,12 @@ def test_the_job_of_a_lost_worker_is_free_at_once(tmp_path: Path) -> None:
 
 
 def test_who_comes_back_goes_on(tmp_path: Path) -> None:
-    """A worker whose job nobody has taken since it was cut off keeps it."""
+    """A worker that reconnects keeps its job if no other has claimed it."""
     run = Run(tmp_path)
     with hands(run, 1) as (one,):
         one.job()
         one.session.close()
-        until(lambda: f"{one.name}: lost" in run.log)
+        wait_until(lambda: f"{one.name}: lost" in run.log)
         one.session = open_session(Connection(role="worker", connect=run.endpoint))
         with one.session:
             assert one.renew() == RENEWED and one.deliver() == KEPT
@@ -311,8 +303,7 @@ def test_who_comes_back_goes_on(tmp_path: Path) -> None:
 def test_a_coordinator_begun_anew_takes_what_its_workers_go_on_with(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither who works nor who is done with its job loses anything when the coordinator is
-    killed."""
+    """A restarted coordinator takes the leases and results of its workers."""
     monkeypatch.setattr(
         remote, "SETTLING_S", PATIENCE_S
     )  # nothing can be given before both have told
@@ -330,8 +321,8 @@ def test_a_coordinator_begun_anew_takes_what_its_workers_go_on_with(
 def test_attempts_are_bounded_and_leaving_is_none(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A scenario that ends its process is tried twice, one that is lost with its worker eight
-    times, one that is handed back as often as that happens; then they are named."""
+    """A scenario crashes after two ended processes or eight lost workers; handing a job back costs
+    no attempt."""
     run = Run(tmp_path)
     with hands(run, 1) as (one,):
         poison = one.job()
@@ -347,7 +338,7 @@ def test_attempts_are_bounded_and_leaving_is_none(
             with hands(run, 1) as (another,):
                 one.session.close()
                 assert another.job() == unlucky
-            until(lambda losses=losses: run.log.count("lost, with") > losses)
+            wait_until(lambda losses=losses: run.log.count("lost, with") > losses)
         records = run.over()
     assert (
         records[poison].status == "crashed"
@@ -360,8 +351,7 @@ def test_attempts_are_bounded_and_leaving_is_none(
 
 
 def test_attempts_outlive_the_coordinator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A scenario that has ended its process once before the coordinator was killed is tried once
-    more, and named."""
+    """Attempts of a scenario count across a restart of the coordinator."""
     monkeypatch.setattr(remote, "SETTLING_S", 0.0)  # nobody else works for it
     run = Run(tmp_path)
     with hands(run, 1) as (one,):
@@ -382,8 +372,7 @@ def test_attempts_outlive_the_coordinator(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_what_is_none_of_the_run_s_is_refused_in_words(tmp_path: Path) -> None:
-    """Garbage, damaged and oversized messages, other runs, scenarios and installations, keys with
-    wildcards: nothing is changed by any, and the run goes on."""
+    """Malformed, oversized and foreign messages are refused and change nothing."""
     run = Run(tmp_path)
     with hands(run, 2) as (one, foe):
         name = one.job()
@@ -435,7 +424,7 @@ def test_what_is_none_of_the_run_s_is_refused_in_words(tmp_path: Path) -> None:
 def test_a_result_that_cannot_be_written_is_not_acknowledged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A full disk ends the run with its message; begun anew it takes the same result."""
+    """A full disk ends the run, and a resumed run accepts the same result."""
 
     def full(self: RunFolder, record: Record, *data: bytes) -> None:
         raise MachineError("cannot be written: no space left on device")
@@ -458,30 +447,10 @@ def test_a_result_that_cannot_be_written_is_not_acknowledged(
         assert len(run.over()) == 2
 
 
-def test_a_policy_timeout_that_a_worker_reports_is_the_last_attempt(tmp_path: Path) -> None:
-    """The worker enforces the time limit of an answer; its episode has crashed, once, for the
-    reason that it gives."""
-    run = Run(tmp_path)
-    with hands(run, 1) as (one,):
-        silent = one.job()
-        assert (
-            one.fail(
-                Failure("policy_timeout", "policy 'stop' gave no answer for 60 s in act at 3.20 s")
-            )
-            == KEPT
-        )
-        one.job()
-        assert one.deliver() == KEPT
-        records = run.over()
-    assert records[silent].status == "crashed"
-    assert records[silent].reason == "policy 'stop' gave no answer for 60 s in act at 3.20 s"
-
-
 def test_a_map_reaches_workers_that_lack_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It comes in parts, under its name, and only if its hash is right; what the run has no map of
-    is refused."""
+    """A missing map is sent in parts and stored only if its hash is right."""
     there, here = tmp_path / "there", tmp_path / "here"
     where = CityMap(
         map="mine",
@@ -518,8 +487,7 @@ def test_a_map_reaches_workers_that_lack_it(
 def test_status_tells_of_a_lost_a_silent_and_a_working_worker(
     cosim: Cosim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By the run folder and by the coordinator's address the same; afterwards what the folder
-    holds; where there is no run, in words."""
+    """`cosim status` shows lost, silent and working workers from the run folder or the address."""
     monkeypatch.setattr(status, "SILENT_S", 0.0)
     monkeypatch.setattr(status, "_WRITTEN_EVERY_S", 0.0)
     run = Run(tmp_path)
@@ -527,9 +495,9 @@ def test_status_tells_of_a_lost_a_silent_and_a_working_worker(
         lost.job()
         name = one.job()
         lost.session.close()
-        until(lambda: f"{lost.name}: lost" in run.log)
+        wait_until(lambda: f"{lost.name}: lost" in run.log)
         silent.job()
-        until(
+        wait_until(
             lambda: (
                 (run.folder / "status.json").exists()
                 and silent.name in (run.folder / "status.json").read_text()

@@ -21,12 +21,10 @@ from scenarios.runs.eta import (
     makespan,
     recall,
     remembered,
-    span,
 )
-from scenarios.suites.catalog import load_suite
 from tests.run_specs import record_of, spec_of
+from tests.support.shipped import long_ways
 
-LONG = load_suite("long-horizon").scenarios[:12]
 GL = "gl: llvmpipe"
 
 
@@ -59,13 +57,13 @@ def episodes(count: int, **changes: object) -> list[Measured]:
 def of(
     known: list[Measured], policy: str = "route", jobs: int = 1, compared: bool = False
 ) -> Estimate:
-    return estimate(LONG, known, policy, GL, jobs, compared, cores=2)
+    return estimate(long_ways()[:12], known, policy, GL, jobs, compared, cores=2)
 
 
 def test_an_estimate_holds_what_the_same_policy_took() -> None:
     """12 episodes of 4.8 km at 0.125 s a metre and 4 s each come to 653 s: that lies inside, and
     the span is fair."""
-    true_s = 12 * 4.0 + 0.125 * sum(s.route_line.length_m for s in LONG)
+    true_s = 12 * 4.0 + 0.125 * sum(s.route_line.length_m for s in long_ways()[:12])
     found = of(episodes(5))
     assert found.low_s < true_s < found.high_s and found.high_s < 3.0 * found.low_s
     assert found.basis == "measured in 5 episodes of 'route' on this machine"
@@ -83,7 +81,7 @@ def test_without_the_same_policy_the_machines_speed_counts_and_the_policy_is_sai
     assert nothing.high_s / nothing.low_s > others.high_s / others.low_s
     assert "simulates 6.0 s a second" in others.basis and "0.9 to 1.4 m/s" in others.basis
     assert nothing.basis.startswith("a guess, as nothing is measured on this machine yet")
-    most_s = sum(s.time_limit_s for s in LONG)
+    most_s = sum(s.time_limit_s for s in long_ways()[:12])
     assert f"up to {duration(12 * 6.0 + most_s / 3.6)} if it stands still" in others.basis
     assert "if it stands still" in nothing.basis and "longer if it thinks long" in nothing.basis
 
@@ -117,38 +115,23 @@ def test_what_is_held_to_real_time_takes_that_time(known: list[Measured], pace_x
 
     Two processes take half of that, and four on two cores a quarter, as they wait."""
     for jobs in (1, 2, 4):
-        true_s = makespan([0.75 * s.route_line.length_m / pace_x for s in LONG], jobs)
-        found = pace.paced(of(known, jobs=jobs), LONG, known, "route", jobs, pace_x)
+        true_s = makespan([0.75 * s.route_line.length_m / pace_x for s in long_ways()[:12]], jobs)
+        found = pace.paced(of(known, jobs=jobs), long_ways()[:12], known, "route", jobs, pace_x)
         assert found.low_s < 1.1 * true_s and 0.9 * true_s < found.high_s < 3.0 * true_s
         assert f"held to {pace_x:g} x real time" in found.basis
-    assert pace.paced(of(known), LONG, known, "route", 1, 100.0) == of(known)
+    assert pace.paced(of(known), long_ways()[:12], known, "route", 1, 100.0) == of(known)
 
 
 def test_the_line_says_episodes_way_limit_and_time() -> None:
     """One line: 12 episodes of 4.8 km, 6 h 40 min simulated at most, with one process and with as
     many as cores."""
-    line = announcement(LONG, "route", GL, 1, False)
+    line = announcement(long_ways()[:12], "route", GL, 1, False)
     assert line.startswith(
         "12 episodes, 4.8 km of route, at most 6 h 40 min of simulated time. About "
     )
     assert " with --jobs 1, " in line and " with --jobs 2: a guess" in line and "\n" not in line
-    assert "--jobs 2" not in announcement(LONG[:1], "route", GL, 1, False)
-    assert announcement(LONG[:1], "route", GL, 1, False).startswith("1 episode, 482 m")
-
-
-@pytest.mark.parametrize(
-    ("low_s", "high_s", "words"),
-    [
-        (500.0, 900.0, "8 to 15 min"),
-        (40.0, 170.0, "40 s to 3 min"),
-        (610.0, 620.0, "10 min"),
-        (3000.0, 8000.0, "50 min to 2 h 10 min"),
-    ],
-    ids=["minutes", "mixed", "same", "hours"],
-)
-def test_a_span_is_said_with_its_unit_once(low_s: float, high_s: float, words: str) -> None:
-    """Both ends in the unit that fits them, said once where it is the same."""
-    assert span(Estimate(low_s, high_s, "")) == words
+    assert "--jobs 2" not in announcement(long_ways()[:1], "route", GL, 1, False)
+    assert announcement(long_ways()[:1], "route", GL, 1, False).startswith("1 episode, 482 m")
 
 
 def finished(folder: RunFolder, scenario: Scenario, status: str) -> None:
@@ -165,7 +148,7 @@ def finished(folder: RunFolder, scenario: Scenario, status: str) -> None:
 
 
 def run_of(path: Path) -> RunFolder:
-    suite = Suite(name="s", version="1", scenarios=LONG)
+    suite = Suite(name="s", version="1", scenarios=long_ways()[:12])
     return RunFolder.create(path, spec_of(suite, "route", versions=versions(), renderer=GL), suite)
 
 
@@ -175,25 +158,25 @@ def test_a_run_is_remembered_even_when_it_is_stopped(tmp_path: Path, cache: Path
     with (
         run_of(tmp_path / "run") as held,
         pytest.raises(KeyboardInterrupt),
-        remembered(held, LONG[:6], 2),
+        remembered(held, long_ways()[:6], 2),
     ):
-        for scenario in LONG[:4]:
-            finished(held, scenario, "crashed" if scenario is LONG[0] else "done")
+        for scenario in long_ways()[:4]:
+            finished(held, scenario, "crashed" if scenario is long_ways()[:12][0] else "done")
         raise KeyboardInterrupt
     known = recall()
     assert [(m.route_m, m.jobs, m.work_s, m.setup_s, m.simulated_s) for m in known] == [
-        (s.route_line.length_m, 2, 16.0, 4.0, 80.0) for s in LONG[1:4]
+        (s.route_line.length_m, 2, 16.0, 4.0, 80.0) for s in long_ways()[:12][1:4]
     ]
     assert "measured in 3 episodes of 'route' on this machine" in announcement(
-        LONG, "route", GL, 1, False
+        long_ways()[:12], "route", GL, 1, False
     )
 
 
 def test_a_run_that_is_held_to_real_time_is_not_remembered(tmp_path: Path, cache: Path) -> None:
     """It took as long as it was to take, and the next estimate does not rest on that."""
     with run_of(tmp_path / "run") as held:
-        finished(held, LONG[0], "done")
-        with remembered(held, LONG, 1, 1.0):
+        finished(held, long_ways()[:12][0], "done")
+        with remembered(held, long_ways()[:12], 1, 1.0):
             pass
     assert recall() == []
 
@@ -207,12 +190,12 @@ def test_what_is_remembered_stays_small_and_survives_damage(tmp_path: Path, cach
     path.write_bytes(b"nonsense\n\xff\n" + (line + b"\n") * (2 * pace.EPISODES_KEPT))
     assert recall() == []
     with run_of(tmp_path / "run") as held:
-        finished(held, LONG[0], "done")
-        with remembered(held, LONG, 1):
+        finished(held, long_ways()[:12][0], "done")
+        with remembered(held, long_ways()[:12], 1):
             pass
         assert len(path.read_bytes().splitlines()) == pace.EPISODES_KEPT and len(recall()) == 1
         path.unlink()
         path.mkdir()
-        with remembered(held, LONG, 1):
+        with remembered(held, long_ways()[:12], 1):
             pass
     assert recall() == []

@@ -53,16 +53,3 @@ def test_the_unit_of_a_worker_is_one_that_systemd_takes(tmp_path: Path) -> None:
         [verify, "verify", tmp_path / "cosim-worker.service"], capture_output=True, text=True
     )
     assert (done.returncode, done.stderr) == (0, "")
-
-
-def test_the_recipe_for_kuberay_is_a_ray_job() -> None:
-    """Its kind, a head that runs no episodes, workers that do, and the command that a driver
-    gives."""
-    yaml = pytest.importorskip("yaml", reason="comes with Ray")
-    job = yaml.safe_load((RECIPES / "kuberay.yaml").read_text())
-    cluster = job["spec"]["rayClusterSpec"]
-    assert (job["apiVersion"], job["kind"]) == ("ray.io/v1", "RayJob") and "--on auto" in job[
-        "spec"
-    ]["entrypoint"]
-    assert cluster["headGroupSpec"]["rayStartParams"]["num-cpus"] == "0"
-    assert cluster["workerGroupSpecs"][0]["template"]["spec"]["containers"]

@@ -31,7 +31,7 @@ from scenarios.runs.remote_policy import RemoteDriver, remote_driver
 from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import PATIENCE_S, ROOT, Cosim, seed_in_order
 from tests.support.documents import blocks
-from tests.support.isolated_policies import Honest
+from tests.support.hostile import Honest
 
 SERVER = ROOT / "bridge" / "policy_server.py"
 OTHERS = ("python3.9", "python3.10", "python3.12", "python3.13", "python3.14")

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 import pytest
 import shapely
+from cosim.policies.privileged.robot_disks import BodyDisks
 from shapely.geometry import LineString, box
 
 from cosim.core.errors import RunError, SpecError, UsageError
@@ -25,7 +26,7 @@ from cosim.place.barriers import fenced
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies import POLICIES
 from cosim.policies.privileged.orca import Here, lane_past
-from cosim.policies.privileged.rollout import STEP_S, BodyDisks, Plans, Way, foresee
+from cosim.policies.privileged.rollout import Way
 from cosim.policies.privileged.route import best_lane, crossing_limit
 from cosim.policies.privileged.route_planner import Clearance
 from cosim.policies.privileged.social_force import bodies_m
@@ -38,7 +39,6 @@ from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import COURIER, ROBOTS, SCOUT, Mount, Robot, Skid
 from cosim.spec.scenario import Suite, content_hash
 from physics.cameras.view import robot_shot
-from physics.dynamics.drive import SkidDrive
 from physics.robots import hash_of_robot, urdf_of
 from physics.street.street_surface import StreetSurface
 from scenarios.places.nets import place
@@ -162,18 +162,6 @@ def test_policies_travel_at_their_robots_pace_and_turn_as_it_can(robot: Robot) -
         ), name
 
 
-@EVERY
-def test_foresight_knows_ramps_and_turning_rate(robot: Robot) -> None:
-    """What is foreseen of a plan turns and speeds up no faster than the robot does."""
-    plans = Plans(np.array([1.5]), np.array([robot.cruise_mps]), np.array([0.9]), np.array([0.0]))
-    way = Way(Polyline([(0.0, 0.0), (50.0, 0.0)]))
-    ahead = foresee(way, plans, robot, Pose(5.0, 0.0, -0.8), 5.0, (0.0, 0.0))
-    turns = np.abs(np.diff(np.append(-0.8, ahead.pose[:, 2, 0]))) / STEP_S
-    speeds = np.hypot(*np.diff(np.vstack([[5.0, 0.0], ahead.pose[:, :2, 0]]), axis=0).T) / STEP_S
-    assert turns.max() == pytest.approx(robot.w_max_radps)
-    assert np.diff(np.append(0.0, speeds)).max() <= robot.acceleration_mps2 * STEP_S
-
-
 def test_a_wider_robot_keeps_farther_from_who_stands_and_a_longer_one_stops_earlier() -> None:
     """Past somebody beside the way, before a person, before a crossing at red."""
     for small, large in itertools.pairwise((SCOUT, COURIER, BARROW)):
@@ -201,18 +189,6 @@ def test_answers_are_clipped_to_the_robot_that_drives() -> None:
     for answer in (Command(9.0, -9.0), np.array([[2.0, -9.0]] * 3)):
         told = command_of(answer, rule=WaypointRule(), robot=BARROW)
         assert (told.v_mps, told.w_radps) == (1.0, -0.4)
-
-
-@EVERY
-def test_motors_ramp_as_the_row_says(robot: Robot) -> None:
-    """Wheels reach a speed after as long as the acceleration takes, and every joint is told one."""
-    drive = SkidDrive(robot)
-    dt_s = 0.005
-    for k in range(1, 40):
-        speeds = drive.joint_speeds(Command(robot.v_max_mps, 0.0), 0.0, dt_s)
-        assert speeds == pytest.approx(
-            [k * dt_s * robot.acceleration_mps2 / robot.drive.wheel_radius_m] * 4
-        )
 
 
 def test_a_camera_sits_where_its_robot_carries_it(barrow: Robot) -> None:

@@ -47,8 +47,7 @@ from scenarios.suites.proofs import read_proofs
 from scenarios.suites.sample import suite_on_map
 from scenarios.suites.unit import build_unit
 from sumo_nets.maps.map_store import read_map
-
-LONG = load_suite("long-horizon").scenarios
+from tests.support.shipped import long_ways
 
 
 def test_the_long_horizon_suite_is_what_it_promises() -> None:
@@ -195,11 +194,16 @@ def test_free_space_ends_at_furniture() -> None:
 
 
 def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
-    """The shipped routes: of the first city by default, all with --whole."""
+    """Take one route by default, all with --whole."""
     if "shipped" in metafunc.fixturenames:
         whole = metafunc.config.getoption("--whole")
-        sample = [scenario for scenario in LONG if whole or scenario.place == LONG[0].place]
-        metafunc.parametrize("shipped", sample, ids=lambda s: s.id)
+        metafunc.parametrize("shipped", range(105 if whole else 1), indirect=True)
+
+
+@pytest.fixture
+def shipped(request: pytest.FixtureRequest) -> Scenario:
+    """A route of `long-horizon`."""
+    return long_ways()[request.param]
 
 
 @pytest.mark.engine
@@ -439,7 +443,7 @@ def test_every_policy_answers_within_its_manifest(name: str, robot: Robot) -> No
     Clock.for_rate(driver.manifest.rate_hz)
     route = Polyline([(0, 0), (50, 0)])
     driver.reset("t", 0)
-    for tick in range(0, 200, 2):
+    for tick in range(0, 200, 20):
         known = Privileged(
             RobotState(route.at(tick * 0.05), 1.0),
             route,

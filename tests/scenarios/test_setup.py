@@ -24,8 +24,8 @@ NOT_DRIVEN_WITH = (
 
 
 def test_an_episode_imports_only_what_it_drives_with() -> None:
-    """Neither what reads maps, nor SUMO's tools in Python, nor tables, nor SUMO before somebody is
-    to be simulated; who imports libsumo besides gets all of it."""
+    """Making an Episode imports no map reader, no SUMO tools and no pandas, and SUMO only when it
+    simulates."""
     code = (
         f"import sys, cosim\ncosim.Episode\nprint(sorted(set({NOT_DRIVEN_WITH}) & "
         "set(sys.modules)), 'sumo_nets.engine' in sys.modules)\nfrom sumo_nets.engine import "
@@ -45,7 +45,7 @@ def test_an_episode_imports_only_what_it_drives_with() -> None:
 def test_the_kth_episode_of_a_process_is_the_first_one_of_another(
     request: pytest.FixtureRequest,
 ) -> None:
-    """Ten episodes, 30 with --whole, two cities, many crowds, grounds, robots and lights in random
+    """Six episodes, 30 with --whole, two cities, many crowds, grounds, robots and lights in random
     order: same states, same pictures."""
     whole = request.config.getoption("--whole")
     count, only = (COUNT, []) if whole else (SAMPLE_COUNT, ["--sample"])

@@ -3,7 +3,6 @@ others go on."""
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import signal
 import socket
@@ -21,7 +20,7 @@ from bridge.policy_server import Answer, AskAct, AskReset, Begun, PolicyReply, R
 from cosim.core.errors import EngineError, PolicyError, RendererLost, UsageError
 from cosim.core.framing import Wire
 from cosim.core.geometry import Polyline, Pose
-from cosim.core.state import NO_VEHICLES, Frame, People, RobotState, Signal, Street
+from cosim.core.state import NO_VEHICLES, Frame, People, RobotState, Street
 from cosim.episode.interfaces import Observation, Policy, Privileged
 from cosim.episode.policy_caller import Driver
 from cosim.policies.load import load_policy
@@ -37,7 +36,7 @@ from scenarios.ipc.deadlines import Patience
 from scenarios.ipc.messages import Hello, Progress
 from scenarios.ipc.observation_codec import encoded_about, encoded_fields
 from scenarios.ipc.render_link import RendererLink
-from scenarios.ipc.render_protocol import Draw, Rendered, Request, decode_request, encode_exchange
+from scenarios.ipc.render_protocol import Draw, Rendered, Request, encode_exchange
 from scenarios.ipc.shared_memory import SharedMemory
 from scenarios.places.nets import place
 from scenarios.runs import run as suite_run
@@ -45,7 +44,7 @@ from scenarios.runs.policy_host import shared_driver
 from scenarios.runs.shared_renderer import End, SharedRenderer, check_shared
 from scenarios.tools.bench.cameras import busy_street
 from scenarios.tools.verify.doctor import small_scenario
-from tests.conftest import Cosim
+from tests.conftest import Cosim, without_lines
 from tests.support.shared_policies import NOTES, Knowing, Seeing, Together
 
 OF = "tests.support.shared_policies"
@@ -213,9 +212,8 @@ def knows(name: str, step: int) -> AskAct:
 
 @pytest.mark.engine
 def test_what_takes_the_policy_down_names_whom_it_was_asked_for(tmp_path: Path) -> None:
-    """What act_batch raises concerns all that it was queried for. A policy that hangs, exits or
-    closes what is not its own takes the renderer with it, and who was not asked knows that it was
-    not."""
+    """An error in act_batch crashes all its episodes; a policy that ends the renderer costs an
+    attempt only of the queried ones."""
     with renderer_for(tmp_path, Knowing(), Patience(answer_s=1.0)) as renderer:
 
         def begun(*names: str) -> list[RendererLink]:
@@ -236,14 +234,14 @@ def test_what_takes_the_policy_down_names_whom_it_was_asked_for(tmp_path: Path) 
             return [decode_reply(reply) for reply in asked_together(links, *requests)]
 
         names = "honest", "raises"
-        first, second = together(begun(*names), names, 2)
-        assert isinstance(first, Refusal) and first == second
-        assert (first.why, first.together) == ("policy", 2)
-        assert first.words.startswith("raised KeyError: 'no such weight' in shared_policies.py:")
+        refused = Refusal("policy", "raised KeyError: 'no such weight'", together=2)
+        replies = together(begun(*names), names, 2)
+        assert [
+            msgspec.structs.replace(reply, words=without_lines(reply.words)) for reply in replies
+        ] == [refused] * 2
         driver = shared_driver(Knowing.manifest, "", renderer.at, "r")
         with pytest.raises(
-            PolicyError,
-            match=r"policy 'knowing' raised FileNotFoundError: weights\.pt in .* \(reset\)",
+            PolicyError, match=r"policy 'knowing' raised FileNotFoundError: weights\.pt.* \(reset\)"
         ):
             driver.reset("fails-in-reset", 0)
         renderer.tend()
@@ -266,41 +264,6 @@ def test_what_takes_the_policy_down_names_whom_it_was_asked_for(tmp_path: Path) 
                 honest_one.received("act at 0.50 s")
             assert lost.value.asked == ""
             assert renderer.end_of(number) == end
-
-
-def test_a_policy_may_write_into_what_it_is_told_from_afar() -> None:
-    """What arrives is equal to the bit and its reader's own: write-protected as an episode's is, no
-    more than that."""
-    people = People.of(
-        ("c1", "c2"),
-        [[3.0, 0.1], [1 / 3, 0.2]],
-        [0.0, 1.0],
-        [1.0, 0.0],
-        ("walk", "sit"),
-        kind=[1, 2],
-    )
-    sent = Draw(
-        RobotState(Pose(0.1, 0.2, 0.3), 0.4), Street(7, people, signals={"x": Signal(True, 2.5)})
-    )
-    came = decode_request(encode_exchange(sent))
-    assert (
-        isinstance(came, Draw)
-        and came.robot == sent.robot
-        and came.street.signals == sent.street.signals
-    )
-    for column in dataclasses.fields(People):
-        mine = getattr(people, column.name)
-        theirs = getattr(came.street.people, column.name)
-        assert type(mine) is type(theirs)
-        if isinstance(mine, np.ndarray):
-            assert (
-                mine.dtype == theirs.dtype
-                and mine.tobytes() == theirs.tobytes()
-                and not theirs.flags.writeable
-            )
-            theirs.setflags(write=True)
-        else:
-            assert mine == theirs
 
 
 @pytest.fixture(scope="module")
@@ -394,15 +357,6 @@ def test_episodes_whose_renderer_is_killed_are_run_again(
     assert killed and same(by_themselves, folder)
     logs = sorted(path.name for path in (folder / "logs").iterdir())
     assert logs == ["renderer-0.log", "renderer-1.log", "worker-0.log", "worker-1.log"]
-
-
-def test_what_a_shared_renderer_cannot_do_is_wrong_use(cosim: Cosim) -> None:
-    """It is told before anything is started."""
-    said = cosim("run", "reactive", "--camera", "bullet", "--shared-renderer")
-    assert (
-        said.returncode == 2
-        and "--shared-renderer draws by OpenGL, not by the bullet camera" in said.stderr
-    )
 
 
 def test_where_there_is_nothing_to_share_it_is_said() -> None:

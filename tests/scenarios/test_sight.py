@@ -106,7 +106,7 @@ def gap_m(robot_x_m: float, x_m: float, y_m: float) -> float:
 
 @pytest.mark.parametrize("kind", EVENT_KINDS)
 def test_people_who_are_in_nobodys_way_change_nothing(kind: str) -> None:
-    """To the bit: with somebody who stands off the sidewalk, and without."""
+    """A person off the sidewalk changes no bit of an event."""
     alone = drive(event(kind), 600, 1.0, 25.0)
     assert drive(event(kind), 600, 1.0, 25.0, NearbyPerson("c1", 50.0, 9.0, 0.0, 0.0)) == alone
 
@@ -150,8 +150,7 @@ def test_who_stands_in_the_way_is_gone_round_and_who_stands_on_the_place_is_walk
 
 @pytest.mark.parametrize("y_m", [0.0, 0.2, -0.2])
 def test_a_frontal_pedestrian_goes_round_people_and_still_walks_at_the_robot(y_m: float) -> None:
-    """Somebody stands on its line, somebody comes towards it: it passes both, no faster than told,
-    and meets the robot that creeps."""
+    """A frontal pedestrian passes people on its line and still meets the robot."""
     crowd = (NearbyPerson("c1", 44.0, y_m, 0.0, 0.0), NearbyPerson("c2", 34.0, y_m, 1.1, 0.0))
     track = drive(event("frontal"), 500, 0.06, 31.0, *crowd)
     robots = [x_m for x_m, r in track if r.states[0].phase == "acting"]
@@ -168,8 +167,7 @@ def test_a_frontal_pedestrian_goes_round_people_and_still_walks_at_the_robot(y_m
 
 @pytest.mark.parametrize("side", [-1, 1])
 def test_a_lateral_pedestrian_goes_round_somebody_and_still_meets_the_robot(side: int) -> None:
-    """Somebody stands on its line: it steps round, and takes aim anew at a robot that keeps its
-    velocity."""
+    """A lateral pedestrian steps round a person on its line and aims again at the robot."""
     track = drive(
         event("lateral", side=side), 400, 0.8, 40.0, NearbyPerson("c1", 50.1, side * 0.9, 0.0, 0.0)
     )
@@ -190,7 +188,7 @@ def test_an_overtaking_pedestrian_overtakes_people_too() -> None:
 
 
 def test_an_injected_person_goes_round_people_and_ends_beside_who_stands_at_its_end() -> None:
-    """On a way of 10 m somebody stands halfway, and somebody else at the end."""
+    """An injected person passes people on its path and ends next to the one at its end."""
     person = arriving(
         Injected(
             tick=0, injection=Injection(id="anna", path=((0.0, 5.0), (10.0, 5.0)), stay_s=100.0)

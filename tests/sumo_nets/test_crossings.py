@@ -76,7 +76,7 @@ def test_the_bench_drives_over_crossings_and_counts_what_goes_at_red(
     """One crossing from the command line: the robot arrives, nothing at red by it; people and
     vehicles are counted."""
     told = bench("--crossings", "1", "--policy", "orca")
-    rows = dict(re.findall(r"(?m)^ *([a-z][a-z ,]+?)  +([\d.]+)", told))
+    rows = dict(re.findall(r"^ ([a-z ,]+?)  +([\d.]+)", told, re.MULTILINE))
     assert (rows["reached the goal"], rows["entered at red"], rows["crashed"]) == ("1", "0", "0")
     assert rows["waited at red"] == "1"
     assert int(re.findall(r"(\d+) vehicles passed stop lines", told)[0]) > 0
@@ -111,7 +111,7 @@ def test_the_bench_keeps_what_was_driven_before_its_process_died(
     rows say which."""
     (tmp_path / "dies.py").write_text(DIES)
     told = bench("--crossings", "2", "--cities", "1", "--policy", "dies:Dies", cwd=tmp_path)
-    (crashed,) = re.findall(r"(?m)^ *crashed  +2  +(.+?) *$", told)
+    (crashed,) = re.findall(r"^ crashed +2  (.+?) *$", told, re.MULTILINE)
     assert re.fullmatch(r"crossing-001-00 .*no idea.*, crossing-001-01 the process died", crashed)
 
 
@@ -156,8 +156,8 @@ def test_cars_brake_for_a_robot_that_walks_at_red_and_are_counted() -> None:
 
 @pytest.mark.parametrize("who", ["nobody", "robot", "person"])
 def test_vehicles_yield_on_a_crossing_without_signals(who: str) -> None:
-    """In a minute of traffic cars drive over the middle of a crossing; where a robot or a person
-    stands, none does."""
+    """Cars drive over the middle of a crossing, but not where a robot or a person stands for half a
+    minute."""
     net, street_map = place(SMALL)
     crossing = Polyline(street_map.strips[":n1x2_c1"].line[:, :2])
     assert not street_map.strips[":n1x2_c1"].signalised
@@ -176,7 +176,9 @@ def test_vehicles_yield_on_a_crossing_without_signals(who: str) -> None:
     with SumoCrowd(
         net, street_map, CrowdSpec(persons=0, vehicles=40), 7, frozenset(), middle[:2]
     ) as crowd:
-        for tick in range(1200):
+        for tick in range(1200 if who == "nobody" else 600):
+            if over:
+                break
             reply = EventReply(
                 episode="t", tick=tick, states=(), actors=(guest,) if who == "person" else ()
             )

@@ -55,9 +55,8 @@ def test_an_entry_at_red_is_told_from_one_at_the_end_of_green() -> None:
 
 
 def test_a_light_that_is_red_when_it_comes_into_view_is_red() -> None:
-    """Entries at red count before any green was seen, and when the light was out of view; a red
-    from before that is forgotten; who stands on a crossing that comes into view does not enter
-    it."""
+    """An entry at red counts also where no green was seen before, but not for a person already on
+    the crossing."""
 
     def counted(xs: list[float], walks: list[bool | None]) -> list[float]:
         """How many entered, entered at red, and entered within a second of red."""

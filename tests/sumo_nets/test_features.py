@@ -14,8 +14,6 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from cosim.core.errors import MapError
 from cosim.core.geometry import Pose
@@ -26,12 +24,12 @@ from physics.dynamics.world import BulletWorld
 from physics.ground.tiles import TILE_M, keys_within
 from physics.street.buildings import Frontage, facade_meshes
 from physics.street.clearance import clear_width
-from physics.street.furniture import KINDS, footprints
+from physics.street.furniture import footprints
 from physics.street.mapped import HOUSES_M, MAPPED_NEAR_M, MappedThings
 from physics.street.placement import props_of
 from physics.street.street_surface import StreetSurface
 from sumo_nets.maps.feature_file import NAME, read_features, with_features, write_features
-from sumo_nets.maps.feature_fit import EXTENT_M, WALL_GAP_M, fitted, utm_xy, utm_zone
+from sumo_nets.maps.feature_fit import WALL_GAP_M, fitted, utm_xy, utm_zone
 from sumo_nets.maps.map_store import about_map, import_map, map_hash, map_net, read_map
 from sumo_nets.maps.osm_features import (
     HIGHEST_BUILDING_M,
@@ -269,8 +267,7 @@ def test_nothing_is_made_up_where_the_map_shows_it(
 def test_land_is_shown_and_changes_nothing_that_stands_or_rolls(
     drawn: tuple[StreetMap, tuple[str, ...]],
 ) -> None:
-    """A parking lot of the file is a yard of the map, told and covered by its hash; without it
-    everything that stands, and the ground that wheels feel, is the same to the bit."""
+    """Land use changes the look and the hash of a map, and no bit of its objects and ground."""
     street_map, changes = drawn
     (lot,) = (f for f in street_map.features if f.kind in LANDS)
     assert lot.kind == "yard" and "1 x yard" in " | ".join(changes)
@@ -388,13 +385,6 @@ def test_the_robot_stops_at_a_mapped_wall() -> None:
     assert not place.features[0].polygon.contains(shapely.Point(motions[-1].robot.pose.xy))
 
 
-def test_room_is_kept_for_the_largest_of_each_thing() -> None:
-    """What the importer keeps free for a thing is at least what the catalogue's largest covers."""
-    for kind, (length, depth) in EXTENT_M.items():
-        large = KINDS[kind].sizes_m[1]
-        assert length >= large[0] and depth >= large[1], kind
-
-
 def test_features_survive_their_file_and_change_the_hash(tmp_path: Path) -> None:
     """Written and read they are the same; a broken file is named; a map's hash covers them."""
     lot = Feature("yard", 24.0, 4.0, polygon=shapely.box(20.0, 0.0, 29.0, 8.0))
@@ -492,68 +482,6 @@ def test_broken_outlines_are_left_out_and_counted(tmp_path: Path) -> None:
         "roofs, ruins and plans of buildings": 1,
         "buildings above or under the ground": 2,
     }
-
-
-WORDS = st.text(max_size=6) | st.sampled_from(
-    ["", "tall", "1e9", "12 m", "40'", "-3", "nan", "inf", "0", "9" * 30, "Ø", "5;6"]
-)
-PAIRS = st.sampled_from(
-    [
-        ("building", "yes"),
-        ("natural", "tree"),
-        ("natural", "tree_row"),
-        ("highway", "street_lamp"),
-        ("amenity", "bench"),
-        ("barrier", "bollard"),
-        ("emergency", "fire_hydrant"),
-        ("type", "multipolygon"),
-    ]
-)
-KEYS = st.sampled_from(
-    [
-        "height",
-        "building:levels",
-        "min_height",
-        "building",
-        "direction",
-        "layer",
-        "fire_hydrant:type",
-        "location",
-    ]
-)
-
-
-@settings(max_examples=100)
-@given(data=st.data())
-def test_any_tags_are_read_or_counted(
-    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
-) -> None:
-    """Any tags, outlines, members and missing nodes: no exception, only finite things of sound
-    height and outline."""
-    drawing = Drawing()
-    spots = st.tuples(st.floats(-200, 200), st.floats(-200, 200))
-    tags = st.dictionaries(KEYS, WORDS.filter(lambda w: w.isprintable()), max_size=4)
-    at = data.draw(st.lists(spots, max_size=6))
-    nodes = [drawing.node(x, y, dict([data.draw(PAIRS)]) | data.draw(tags)) for x, y in at]
-    refs = st.lists(st.sampled_from([*nodes, 77_777]), max_size=7)
-    ways = []
-    for way in data.draw(st.lists(refs, max_size=4)):
-        closed = [*way, way[0]] if way and data.draw(st.booleans()) else way
-        ways.append(drawing.way(closed, dict([data.draw(PAIRS)]) | data.draw(tags)))
-    roles = st.sampled_from(["outer", "inner", "?"])
-    members = st.lists(st.tuples(st.sampled_from([*ways, 88_888]), roles), max_size=4)
-    drawing.relation(
-        data.draw(members), {"building": "yes", "type": "multipolygon"} | data.draw(tags)
-    )
-    things, skipped = drawing.found(tmp_path_factory.mktemp("any") / "any.osm")
-    assert all(count > 0 for count in skipped.values())
-    for thing in things:
-        assert (
-            all(np.isfinite(ring).all() for ring in thing.rings) and 0.0 <= thing.height_m < 1000.0
-        )
-        if thing.kind == "building":
-            assert LOWEST_M <= thing.height_m <= HIGHEST_BUILDING_M
-            assert shapely.Polygon(thing.rings[0], thing.rings[1:]).is_valid
 
 
 def test_the_projection_is_utm_or_none() -> None:

@@ -12,7 +12,7 @@ import pytest
 
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Floats, Pose
-from cosim.core.state import Age, People, RobotState, Street
+from cosim.core.state import Age, RobotState, Street
 from cosim.place.street_map import Strip
 from cosim.spec.events import EventReply
 from cosim.spec.scenario import City, CrowdSpec
@@ -126,8 +126,8 @@ def test_a_group_walks_abreast_where_there_is_room() -> None:
 
 
 def test_who_is_ahead_slows_down_and_who_lags_hurries() -> None:
-    """A metre apart on a sidewalk the first is told to walk slower, the second faster, abreast
-    nobody is told anything; but nobody slows down on a crossing."""
+    """The member of a group that is ahead slows down and the one behind hurries, except on a
+    crossing."""
     told = kept(Walkers(c0=("s", 11.0, 0.0), c1=("s", 10.0, 0.64)))
     assert told["c0"] < 1.2 and 1.3 < told["c1"] < 1.44
     assert kept(Walkers(c0=("s", 10.1, 0.0), c1=("s", 10.0, 0.64))) == {}
@@ -187,19 +187,6 @@ def test_who_has_left_is_forgotten() -> None:
     assert together.groups == (("c0", "c1"),) and together.fellows("c2") == ("c2",)
     together.forget(["c0"])
     assert together.groups == () and walkers.told["c0"] == 1.3
-
-
-def test_the_gap_of_a_group_is_that_of_its_loneliest_member() -> None:
-    """Of three in a row, 0.5 and 2 m apart, the last is 2 m from its nearest fellow; who is alone
-    has no gap."""
-    people = People.of(
-        ("a", "b", "c", "d"),
-        [[0.0, 0.0], [0.5, 0.0], [2.5, 0.0], [9.0, 0.0]],
-        np.zeros(4),
-        np.ones(4),
-        ("walk",) * 4,
-    )
-    assert widest_gaps([("a", "b", "c"), ("d", "gone")], people) == [2.0]
 
 
 def test_a_suite_can_be_asked_for_groups() -> None:
@@ -274,8 +261,7 @@ def test_groups_stay_together_on_the_street(tmp_path: Path) -> None:
 
 @pytest.mark.engine
 def test_a_group_is_taken_out_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where everybody who does not wait at red is taken out at the next look, all who walk along
-    leave in that tick."""
+    """Members of a stuck group leave the street in the same tick."""
     monkeypatch.setattr("sumo_nets.crowd.demand.STUCK_S", -1.0)
     net = tmp_path / "city.net.xml"
     build_city(City(seed=2, size_m=600.0), net)

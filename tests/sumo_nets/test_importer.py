@@ -6,15 +6,12 @@ from __future__ import annotations
 import bz2
 import gzip
 import json
-import re
 import xml.etree.ElementTree as ET
 from functools import cache
 from itertools import groupby
 from pathlib import Path
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from cosim.core.cache import cache_folder
 from cosim.core.errors import MapError, UsageError
@@ -57,11 +54,8 @@ NAMES = (
     sorted(p.name for p in MAPS.glob("*") if (p / "stats.json").exists()) if MAPS.is_dir() else []
 )
 SAMPLE = (
-    "berlin-doerpfeldstr",
-    "berlin-neukoelln",
     "braunschweig-bs3d",
     "frederiksted",
-    "london-st-georges",
     "taipei",
     "west-oakland",
 )
@@ -756,90 +750,6 @@ def test_command_line(tmp_path: Path, cosim: Cosim) -> None:
     assert done.returncode == 2 and "NOT USABLE" in done.stdout
     done = cosim("map", "import", str(cars), "--as-is")
     assert done.returncode == 2 and "import it without --as-is" in done.stdout, done.stderr
-
-
-def spoiled(draw: st.DrawFn, data: bytes) -> bytes:
-    """The file with one of the usual damages."""
-    how = draw(st.sampled_from(("cut", "flip", "drop", "type", "none"))) if data else "none"
-    if how == "cut":
-        return data[: draw(st.integers(0, len(data)))]
-    if how == "none":
-        return data
-    if how == "flip":
-        spoilt = bytearray(data)
-        for at in draw(st.lists(st.integers(0, len(data) - 1), min_size=1, max_size=12)):
-            spoilt[at] ^= 1 << draw(st.integers(0, 7))
-        return bytes(spoilt)
-    names = sorted(set(re.findall(rb' ([A-Za-z]+)="', data)))
-    if not names:
-        return data
-    name = draw(st.sampled_from(names))
-    places = list(re.finditer(rb" " + name + rb'="([^"]*)"', data))
-    few = draw(st.booleans())
-    chosen = [places[draw(st.integers(0, len(places) - 1))]] if few else places
-    values = (
-        b"",
-        b"nan",
-        b"-1",
-        b"1e999",
-        b"x y",
-        b"0,0",
-        b"1,1 1,1",
-        "七".encode(),
-        b"99999999999",
-        b":",
-        b"true",
-    )
-    value = b"" if how == "drop" else b" " + name + b'="' + draw(st.sampled_from(values)) + b'"'
-    for place in reversed(chosen):
-        data = data[: place.start()] + value + data[place.end() :]
-    return data
-
-
-@st.composite
-def spoiled_nets(draw: st.DrawFn) -> bytes:
-    """Damaged nets of a small city, packed or not."""
-    data = spoiled(draw, small_city())
-    return spoiled(draw, gzip.compress(data, 1)) if draw(st.integers(0, 5)) == 0 and data else data
-
-
-@st.composite
-def spoiled_osm(draw: st.DrawFn) -> bytes:
-    """Damaged OpenStreetMap files."""
-    return spoiled(draw, osm(blocks=2).encode())
-
-
-@settings(max_examples=100)
-@given(data=spoiled_nets())
-def test_reading_damaged_nets_ends_in_a_map_or_a_map_error(
-    tmp_path_factory: pytest.TempPathFactory, data: bytes
-) -> None:
-    """read_net and read_facts raise MapError or succeed, whatever is in the file."""
-    path = tmp_path_factory.mktemp("net") / "spoiled.net.xml"
-    path.write_bytes(data)
-    for read in (read_net, read_facts):
-        try:
-            read(path)
-        except MapError as error:
-            assert str(path) in str(error)
-
-
-@pytest.mark.engine
-@settings(max_examples=12)
-@given(data=st.one_of(spoiled_nets(), spoiled_osm()), as_is=st.booleans())
-def test_importing_damaged_files_ends_in_a_map_or_a_map_error(
-    tmp_path_factory: pytest.TempPathFactory, data: bytes, as_is: bool
-) -> None:
-    """import_map raises MapError or keeps a whole map, never anything between."""
-    path = tmp_path_factory.mktemp("spoiled") / "spoiled.xml"
-    before = kept()
-    path.write_bytes(data)
-    try:
-        import_map(path, "spoiled", Options(as_is=as_is))
-    except (MapError, UsageError):
-        assert kept() == before
-    else:
-        assert read_map("spoiled").strips or as_is
 
 
 @pytest.mark.engine

@@ -216,9 +216,8 @@ IMPORTER = """
 import sys
 from pathlib import Path
 from sumo_nets.maps.map_store import import_map, read_map
-for _ in range(2):
-    import_map(Path(sys.argv[1]), "shared")
-    assert read_map("shared").strips
+import_map(Path(sys.argv[1]), "shared")
+assert read_map("shared").strips
 """
 
 

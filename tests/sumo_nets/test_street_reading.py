@@ -45,8 +45,7 @@ def crowd(street_map: StreetMap) -> Iterator[SumoCrowd]:
 
 @pytest.mark.engine
 def test_who_is_near_is_who_is_within_reach(crowd: SumoCrowd) -> None:
-    """Of a crowd all within reach of a point are told, nobody beyond, with places, speeds and
-    edges; vehicles alike."""
+    """A query returns exactly the persons and vehicles within its radius."""
     x_m, y_m = crowd.street.people.xy.mean(axis=0).tolist()
     ours = set(sumo.person.getIDList()[::2])
     for reach_m in (60.0, 75.0, 500.0):
@@ -115,8 +114,7 @@ def test_where_a_sidewalk_leads_it_is_all_the_same_which_lanes_sumo_compares(
 
 @pytest.mark.engine
 def test_who_waits_before_a_crossing_stands_on_its_nearest_corner(street_map: StreetMap) -> None:
-    """Asked for many at once or one by one, a spot lies on the corner; who is well inside it
-    already stays."""
+    """A waiting spot before a crossing lies on its nearest corner."""
     kerbs = Kerbs(street_map)
     rng = np.random.default_rng(5)
     crossings = [

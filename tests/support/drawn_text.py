@@ -1,15 +1,16 @@
-"""The texts of pictures that matplotlib draws: what of them is cut off, or runs into another."""
+"""Texts of matplotlib figures that are cut off or cover another."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
-from matplotlib.backends.backend_agg import RendererAgg
-from matplotlib.figure import Figure
-from matplotlib.text import Text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from matplotlib.text import Text
 
 _SLACK_PX = 1.0
 """Boxes of letters are so much larger than their ink."""
@@ -18,6 +19,10 @@ _SLACK_PX = 1.0
 def clipped_texts(monkeypatch: pytest.MonkeyPatch, draw: Callable[[], object]) -> list[str]:
     """Draw a figure; return each text that is not whole within it, and each pair of which one
     covers the other."""
+    from matplotlib.backends.backend_agg import RendererAgg
+    from matplotlib.figure import Figure
+    from matplotlib.text import Text
+
     drawn: list[Text] = []
     faults: list[str] = []
     text_draw, figure_draw = Text.draw, Figure.draw

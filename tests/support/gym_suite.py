@@ -24,7 +24,7 @@ from scenarios.tools.gym.environment import SidewalkEnv
 
 CITY = City(seed=1, size_m=500.0)
 BLIND = cosim.Manifest("blind", camera=None, goal="final_point", odometry="wheel")
-COUNT = 8
+COUNT = 4
 
 
 def short_ways(**more: Any) -> Suite:

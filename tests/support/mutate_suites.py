@@ -105,7 +105,6 @@ WORDS: Final = (
     "gesturing",
     "queueing",
 )
-SCRAPS: Final = (b"null", b"NaN", b"1e999", b"9" * 5000, b'"', b"\\", b",,", b"\x00")
 JUNK: Final = (
     None,
     True,

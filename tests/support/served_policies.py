@@ -13,7 +13,7 @@ from typing import ClassVar
 
 
 class Steady:
-    """Drives by the brightness of its picture, as tests.support.isolated_policies:Honest does."""
+    """Drives by the brightness of its picture, as tests.support.hostile:Honest does."""
 
     manifest: ClassVar = {
         "name": "honest",

@@ -6,7 +6,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import get_args
@@ -19,7 +19,7 @@ from bridge.security.authority import issue, make_authority
 from bridge.session import open_session
 from cosim.core.errors import EngineError
 from cosim.spec.connection import Connection, Role
-from tests.conftest import PATIENCE_S
+from tests.conftest import PATIENCE_S, wait_until
 from tests.support.ends import listening_at
 from tests.support.plain import free_port, plain_zenoh
 
@@ -56,13 +56,6 @@ def certs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def until(holds: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not holds():
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
-
-
 def replies(session: zenoh.Session, key: str) -> list[str]:
     """What a query is answered, errors included."""
     got = session.get(
@@ -93,7 +86,7 @@ class Air:
         self.policy.declare_queryable(POLICY, self._answer)
         self.hub.listen("cosim/**", lambda key, _: self.seen.append(key))
         self.run.listen("cosim/**", lambda key, _: self.seen.append(key))
-        until(lambda: self.hub.ask(POLICY, b"", timeout_s=PATIENCE_S) == POLICY.encode())
+        wait_until(lambda: self.hub.ask(POLICY, b"", timeout_s=PATIENCE_S) == POLICY.encode())
 
     def _saw(self, key: str) -> bytes:
         self.seen.append(key)
@@ -109,7 +102,7 @@ class Air:
         for end in (self.run, self.hub):
             mark = f"{ENV}/mark{time.monotonic_ns()}"
             end.tell(mark, b"")
-            until(lambda mark=mark: self.seen.count(mark) == 2)  # type: ignore[misc]
+            wait_until(lambda mark=mark: self.seen.count(mark) == 2)  # type: ignore[misc]
 
 
 class Guest:
@@ -143,7 +136,7 @@ class Guest:
         """Until all that it sent before is with the hub: what it asks, or is asked, goes after
         that."""
         if may_ask:
-            until(lambda: may_ask[0] in replies(self.session, may_ask[0]))
+            wait_until(lambda: may_ask[0] in replies(self.session, may_ask[0]))
         else:
             self.answers()
         self.air.settle()
@@ -171,7 +164,7 @@ def try_all(
     air.seen.clear()
     for key in ASKED:
         if key in may_ask:
-            until(lambda key=key: key in replies(guest.session, key))  # type: ignore[misc]
+            wait_until(lambda key=key: key in replies(guest.session, key))  # type: ignore[misc]
         else:
             assert [one for one in replies(guest.session, key) if one != "FORGED"] == [], key
     wide = [
@@ -194,7 +187,7 @@ def try_all(
         air.run.tell(key, b"true")
     air.hub.ask(POLICY, b"secret", timeout_s=PATIENCE_S)
     if watches:
-        until(lambda: set(TOLD) <= set(guest.heard))
+        wait_until(lambda: set(TOLD) <= set(guest.heard))
     guest.passed(may_ask)
     foreign = {"cosim/r/policy/theirs/info"} if answers else set()
     assert {key for key in guest.heard if key not in TOLD} - foreign == set()
@@ -254,7 +247,7 @@ def test_who_is_asked_is_asked_by_runs_alone(certs: Path, hub: Role, key: str) -
             if role != "policy" or hub != "policy":  # one policy server may answer beside another
                 guest.declare_queryable(key, lambda query: query.reply(query.key_expr, b"FORGED"))
         for role in ("worker", "coordinator"):
-            until(lambda role=role: "honest" in replies(guests[role], key))  # type: ignore[misc]
+            wait_until(lambda role=role: "honest" in replies(guests[role], key))  # type: ignore[misc]
         asked.clear()
         for role in ("director", "policy", "viewer", "injector"):
             assert set(replies(guests[role], key)) <= {"FORGED"}, (
@@ -290,7 +283,7 @@ def test_the_file_that_is_copied_is_asked_by_runs_alone(certs: Path) -> None:
         }
         info = "cosim/default/policy/mine/*/info"
         for role in ("worker", "coordinator"):
-            until(lambda role=role: len(list(guests[role].get(info))) == 1)  # type: ignore[misc]
+            wait_until(lambda role=role: len(list(guests[role].get(info))) == 1)  # type: ignore[misc]
         for role in ("director", "policy", "viewer", "injector"):
             assert list(guests[role].get(info)) == [], role
         guests["viewer"].declare_queryable(
@@ -332,8 +325,7 @@ def test_what_would_have_to_be_unpickled_is_not_read(tmp_path: Path, written: st
 
 
 def test_what_is_too_long_is_dropped_unread(certs: Path) -> None:
-    """An injection of 64 KiB arrives, one byte more does not; what nobody may send at all ends
-    nobody's link."""
+    """A message longer than 64 KiB is dropped, and one of a role without rights ends no link."""
     at = f"tls/localhost:{free_port()}"
     lengths: list[int] = []
     with ExitStack() as stack:
@@ -343,9 +335,9 @@ def test_what_is_too_long_is_dropped_unread(certs: Path) -> None:
         for key in (f"{ENV}/inject", f"{ENV}/status"):
             hub.serve(key, lambda payload: lengths.append(len(payload)) or b"taken")  # type: ignore[func-returns-value]
         guest = stack.enter_context(plain_zenoh(at, certs, "injector"))
-        until(lambda: replies(guest, f"{ENV}/status") == ["taken"])
+        wait_until(lambda: replies(guest, f"{ENV}/status") == ["taken"])
         lengths.clear()
         for length in (LARGEST_B, LARGEST_B + 1, 1 << 20, 20 << 20):
             list(guest.get(f"{ENV}/inject", payload=bytes(length), timeout=GIVEN_UP_S))
-        until(lambda: replies(guest, f"{ENV}/status") == ["taken"])
+        wait_until(lambda: replies(guest, f"{ENV}/status") == ["taken"])
         assert lengths == [LARGEST_B, len(OWN)]

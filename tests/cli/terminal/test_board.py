@@ -12,10 +12,7 @@ from rich.console import Console
 from cosim.cli.run_progress import SETUP_M, Board, Left
 from cosim.core.units import duration
 from scenarios.ipc.messages import Done, Progress
-from scenarios.suites.catalog import load_suite
-
-LONG = load_suite("long-horizon").scenarios
-SHORT = load_suite("reactive").scenarios
+from tests.support.shipped import long_ways, shipped
 
 
 class Clock:
@@ -40,16 +37,6 @@ def test_what_is_left_is_judged_by_the_way_not_by_the_count() -> None:
     assert left.seconds(200.0) == 0.0
 
 
-def test_nothing_is_left_of_a_run_that_is_done() -> None:
-    """However the lengths of its ways are rounded as they are added up: never less than nothing."""
-    lengths_m = {str(i): 0.1 + i / 3.0 for i in range(200)}
-    for order in (list(lengths_m), list(reversed(lengths_m)), sorted(lengths_m)):
-        left = Left(lengths_m)
-        for name in order:
-            left.at(name, 1.0)
-        assert left.share == 1.0 and left.seconds(1e6) == 0.0
-
-
 def board_of(
     scenarios: tuple, done: tuple[str, ...] = (), **options: object
 ) -> tuple[Board, Clock, io.StringIO]:
@@ -62,21 +49,26 @@ def board_of(
 def test_a_log_says_how_many_are_done_and_how_long_the_rest_takes() -> None:
     """A line for each episode that ends: its status, how many of how many, about how long it still
     takes."""
-    board, clock, said = board_of(LONG[:3], done=(LONG[0].id,))
+    board, clock, said = board_of(long_ways()[:3], done=(long_ways()[0].id,))
     clock.now_s = 40.0
-    board.tell(Done(LONG[1].id, "done"))
+    board.tell(Done(long_ways()[1].id, "done"))
     (line,) = said.getvalue().splitlines()
-    rest_m, gone_m = LONG[2].route_line.length_m + SETUP_M, LONG[1].route_line.length_m + SETUP_M
-    assert line == f"{LONG[1].id}: done, 2 of 3; about {duration(40.0 * rest_m / gone_m)} left"
+    rest_m, gone_m = (
+        long_ways()[2].route_line.length_m + SETUP_M,
+        long_ways()[1].route_line.length_m + SETUP_M,
+    )
+    assert (
+        line == f"{long_ways()[1].id}: done, 2 of 3; about {duration(40.0 * rest_m / gone_m)} left"
+    )
     clock.now_s = 160.0
-    board.tell(Done(LONG[2].id, "crashed"))
-    assert said.getvalue().splitlines()[1] == f"{LONG[2].id}: crashed, 3 of 3"
+    board.tell(Done(long_ways()[2].id, "crashed"))
+    assert said.getvalue().splitlines()[1] == f"{long_ways()[2].id}: crashed, 3 of 3"
 
 
 def test_an_episode_that_stands_still_comes_nearer_to_its_end() -> None:
     """A robot that gets nowhere uses up its time limit: the share is that of the time, and what is
     left is known."""
-    one = msgspec.structs.replace(SHORT[0], id="stuck")
+    one = msgspec.structs.replace(shipped("reactive").scenarios[0], id="stuck")
     board, clock, _ = board_of((one,))
     clock.now_s = 30.0
     board.tell(Progress(one.id, one.time_limit_s / 2, 0.0, 0))
@@ -89,45 +81,33 @@ def test_an_episode_that_stands_still_comes_nearer_to_its_end() -> None:
 def test_a_comparison_is_part_of_its_episode() -> None:
     """With --counterfactual an episode at its goal is not over yet: the street without the robot is
     still to come."""
-    board, clock, _ = board_of(LONG[:1], compared=True)
+    board, clock, _ = board_of(long_ways()[:1], compared=True)
     clock.now_s = 70.0
-    board.tell(Progress(LONG[0].id, 100.0, LONG[0].route_line.length_m, 0))
+    board.tell(Progress(long_ways()[0].id, 100.0, long_ways()[0].route_line.length_m, 0))
     at_goal_s = board.left.seconds(70.0)
-    board.tell(Progress(LONG[0].id, 1.0, 1.0, 0, compared=0.5))
+    board.tell(Progress(long_ways()[0].id, 1.0, 1.0, 0, compared=0.5))
     assert at_goal_s is not None and at_goal_s > 15.0
     assert (half_s := board.left.seconds(70.0)) is not None and half_s < at_goal_s / 1.5
 
 
-def test_a_run_that_is_held_to_real_time_is_judged_by_that() -> None:
-    """At --pace 1 starting an episode takes little of it: after 2 % of its way, and after 10 %, the
-    rest is known."""
-    length_m = LONG[0].route_line.length_m
-    board, *_ = board_of(LONG[:1], pace=1.0)
-    for share in (0.02, 0.1):
-        board.tell(Progress(LONG[0].id, share * length_m, share * length_m, 0))
-        since_s = 4.0 + share * length_m
-        left_s = (1.0 - share) * length_m
-        assert board.left.seconds(since_s) == pytest.approx(left_s, rel=0.15)
-
-
 def test_a_run_with_nothing_left_to_do_is_all_done() -> None:
     """Resumed after its last episode: the bar is full."""
-    board, *_ = board_of(LONG[:1], done=(LONG[0].id,))
+    board, *_ = board_of(long_ways()[:1], done=(long_ways()[0].id,))
     assert board.left.share == 1.0 and "1/1" in str(board.bars.tasks[0].fields["count"])
 
 
 def test_the_bars_fit_80_columns() -> None:
     """The longest name, thousands of seconds, dozens of failures: no line is broken and nothing is
     cut."""
-    named = msgspec.structs.replace(LONG[7], id="ped_crossing-001")
-    board, clock, said = board_of((named, *LONG[:2]))
+    named = msgspec.structs.replace(long_ways()[7], id="ped_crossing-001")
+    board, clock, said = board_of((named, *long_ways()[:2]))
     clock.now_s = 4000.0
     board.tell(Progress(named.id, 3185.2, 630.4, 88))
     board.bars.refresh()
     Console(file=said, width=80).print(board.bars.get_renderable())
     lines = said.getvalue().splitlines()
     assert max(map(len, lines)) <= 80 and "…" not in said.getvalue()
-    way = f"630/{LONG[7].route_line.length_m:.0f} m"
+    way = f"630/{long_ways()[7].route_line.length_m:.0f} m"
     assert any(
         "ped_crossing-001" in line and way in line and "88 failures" in line for line in lines
     )

@@ -7,8 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
-from cosim.cli import progress
-from cosim.cli.progress import doing, stage_in_words
+from cosim.cli.progress import doing
 from cosim.core.units import duration
 
 
@@ -23,16 +22,6 @@ def test_a_log_gets_one_line_for_each_stage() -> None:
     assert said.getvalue() == "reading [the] city ...\nsimulating to 20 s ...\ndrawing ...\n"
 
 
-def test_a_log_gets_further_lines_of_a_long_stage(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A stage that takes long says from time to time how much of it is done, if it knows."""
-    monkeypatch.setattr(progress, "AGAIN_S", 0.0)
-    said = io.StringIO()
-    with doing("converting", Console(file=said, width=80)) as tell:
-        tell("converting")
-        tell("converting", 0.5)
-    assert said.getvalue() == "converting ...\nconverting: 50 %, after 0 s\n"
-
-
 def test_a_terminal_gets_a_line_that_moves_and_is_gone() -> None:
     """In a terminal the stage stands with its share and the time; at the end the line is taken
     away."""
@@ -44,18 +33,6 @@ def test_a_terminal_gets_a_line_that_moves_and_is_gone() -> None:
         tell("simulating to 20 s", 0.5)
     assert "simulating to 20 s: 50 %" in said.getvalue() and "0:00:00" in said.getvalue()
     assert said.getvalue().endswith("\x1b[2K") or "\x1b[1A\x1b[2K" in said.getvalue()
-
-
-def test_what_is_left_is_said_when_it_is_known() -> None:
-    """A tenth took ten seconds: a minute and a half is left; of the first moments nothing is
-    concluded."""
-    assert stage_in_words("filming", 0.1, 10.0) == "filming: 10 %, about 90 s left"
-    assert stage_in_words("filming", 0.5, 10.0) == "filming: 50 %, about 10 s left"
-    assert (
-        stage_in_words("filming", 0.01, 10.0) == "filming: 1 %"
-        and stage_in_words("filming", 0.5, 1.0) == "filming: 50 %"
-    )
-    assert stage_in_words("filming", None, 10.0) == "filming"
 
 
 @pytest.mark.parametrize(

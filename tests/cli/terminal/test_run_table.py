@@ -7,13 +7,10 @@ import io
 import re
 from pathlib import Path
 
-import msgspec
 import numpy as np
 import pandas as pd
-import pytest
 from rich.console import Console
 
-from cosim.cli.results import print_sheet
 from cosim.cli.run_table import (
     COUNTS,
     LETTERS,
@@ -24,14 +21,12 @@ from cosim.cli.run_table import (
     print_table,
     print_terms,
 )
-from cosim.cli.suites import print_names, print_scenarios
+from cosim.cli.suites import print_names
 from cosim.core.errors import unknown
 from cosim.results.metrics import METRICS, SUCCESS_IN_WORDS
 from cosim.results.table import table_of
-from cosim.spec.scenario import CityMap, Suite
 from scenarios.events import EVENT_KINDS
-from scenarios.suites.catalog import SUITES, load_suite
-from scenarios.tools.viewing.event_sheet import COLUMNS
+from scenarios.suites.catalog import load_suite
 from tests.support.documents import text_of
 from tests.support.driven_runs import episode_of, short_way
 
@@ -39,42 +34,6 @@ from tests.support.driven_runs import episode_of, short_way
 def terminal(width: int = 80) -> tuple[Console, io.StringIO]:
     said = io.StringIO()
     return Console(file=said, width=width), said
-
-
-@pytest.mark.parametrize("name", SUITES)
-def test_the_scenarios_of_a_suite_fit_80_columns(name: str) -> None:
-    """No name and no number is cut, and every scenario has a line with its place."""
-    out, said = terminal()
-    print_scenarios(out, load_suite(name))
-    assert "…" not in said.getvalue()
-    for scenario in load_suite(name).scenarios:
-        assert (
-            f" {scenario.id} " in said.getvalue() and f" {scenario.place.name} " in said.getvalue()
-        )
-
-
-def test_a_name_with_brackets_is_shown_as_it_is() -> None:
-    """What would end or begin a colour is part of the name of a map."""
-    (scenario,) = load_suite("long-horizon").scenarios[:1]
-    odd = msgspec.structs.replace(scenario, place=CityMap(map="[/x][red]"))
-    out, said = terminal()
-    print_scenarios(out, Suite(name="s", version="1", scenarios=(odd,)))
-    assert " map-[/x][red] " in said.getvalue()
-
-
-def test_a_bad_run_fits_80_columns() -> None:
-    """The longest shipped name, two digits before every point, and dozens of failures: nothing is
-    cut."""
-    row = dict.fromkeys(METRICS, 34.56) | {
-        "scenario": "ped_crossing-001",
-        "status": "done",
-        "ended": "timeout",
-    }
-    row |= {name: 34.56 for name, _ in SHOWN} | {name: 120 for name, _ in COUNTS}  # type: ignore[dict-item]
-    out, said = terminal()
-    print_table(out, pd.DataFrame([row]), 1)
-    assert "…" not in said.getvalue()
-    assert "ped_crossing-001 timeout" in said.getvalue() and "120/120/120" in said.getvalue()
 
 
 def pair_of_kinds() -> tuple[pd.DataFrame, dict[str, str]]:
@@ -130,47 +89,6 @@ def test_success_names_the_events_that_end_otherwise() -> None:
     assert sum(kind.name in SUCCESS_IN_WORDS for kind in EVENT_KINDS.values()) == sum(
         kind.ends_at == "stop" or kind.passed_round for kind in EVENT_KINDS.values()
     )
-
-
-def test_the_table_by_kind_fits_80_columns() -> None:
-    """The longest event, hundreds of episodes, an interval: no line is longer than the terminal and
-    none is broken."""
-    table, kinds = pair_of_kinds()
-    out, said = terminal()
-    print_by_kind(out, table, kinds)
-    assert "…" not in said.getvalue() and max(map(len, said.getvalue().splitlines())) <= 80
-    assert re.search(r"^ ped_crossing +1 +0\.25 +0\.25\.\.0\.25 ", said.getvalue(), re.MULTILINE)
-
-
-def test_a_whole_suite_by_kind_fits_80_columns_with_all_its_headings() -> None:
-    """A hundred episodes of each event: neither a heading nor a number is cut."""
-    table, kinds = pair_of_kinds()
-    whole = pd.concat([table] * 100, ignore_index=True)
-    out, said = terminal()
-    print_by_kind(out, whole, kinds)
-    assert "…" not in said.getvalue() and max(map(len, said.getvalue().splitlines())) <= 80
-    assert re.search(r"^ ped_crossing +100 ", said.getvalue(), re.MULTILINE)
-
-
-def test_the_sheet_of_events_fits_80_columns() -> None:
-    """A long map's name and two digits before each point: numbers and headings are whole."""
-    row = (
-        "sumo-fokr-bs-demo-003 12",
-        "ped_crossing",
-        -19.98,
-        0.123,
-        0.060,
-        1.65,
-        1.65,
-        -12.34,
-        -180.0,
-        12.34,
-    )
-    out, said = terminal()
-    print_sheet(out, pd.DataFrame([row], columns=list(COLUMNS)))
-    assert "…" not in said.getvalue() and max(map(len, said.getvalue().splitlines())) <= 80
-    for word in ("trigger", "stated", "-19.98", "0.123", "-12.34", "-180", "12.34"):
-        assert word in said.getvalue()
 
 
 def test_of_many_valid_names_the_likely_ones_are_listed() -> None:

@@ -21,7 +21,6 @@ from cosim.policies.onnx.graph import Graph
 from cosim.policies.onnx.manifest import file_facts
 from cosim.policies.onnx.policy import OnnxBatchPolicy, OnnxPolicy, example_differences, in_grey
 from tests.support.graphs import (
-    MANIFEST,
     PICTURE,
     POINT,
     bundle,
@@ -317,15 +316,6 @@ def test_the_example_of_a_bundle_is_held_against_its_graph(
         example_differences(exemplary(obs=obs, **expected))
     with pytest.raises(UsageError, match="does not fit the graph"):
         example_differences(exemplary(obs=obs[:, :3], goal=goal, **expected))
-
-
-def test_every_fault_of_the_manifest_is_told_of_a_policy(tmp_path: Path) -> None:
-    """As of a file, with the policy's name before it."""
-    place = bundle(tmp_path, tiny_graph(), MANIFEST, goal="none", rate_hz=-1)
-    with pytest.raises(
-        UsageError, match=r"policy 'onnx:.*manifest\.json: rate_hz must be in \(0, 20\]"
-    ):
-        load_policy(f"onnx:{place}")
 
 
 def test_the_hash_of_a_bundle_is_another_where_a_processor_answers_otherwise(

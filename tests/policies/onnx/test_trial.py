@@ -18,7 +18,7 @@ from onnx import TensorProto, helper
 
 from cosim.core.errors import UsageError
 from cosim.policies.onnx.graph import Graph
-from cosim.policies.onnx.policy import OnnxPolicy, example_differences
+from cosim.policies.onnx.policy import OnnxPolicy
 from tests.conftest import PATIENCE_S, ROOT, WIDE, Cosim, still_runs
 from tests.support.graphs import bundle, graph_bytes, port, tiny_graph
 
@@ -146,15 +146,6 @@ def test_a_graph_that_ends_its_process_is_refused(
         UsageError, match="ends onnxruntime: the process that ran it was killed by SIGKILL"
     ):
         OnnxPolicy(place)
-
-
-def test_an_example_that_never_ends_is_refused(tmp_path: Path) -> None:
-    """A graph that answers in a grey street, and loops for its example."""
-    place = bundle(tmp_path / "net", endless(), **constant(0.0))
-    np.savez(place / "example.npz", obs=np.ones((1, 5, 2), np.float32))
-    policy = OnnxPolicy(place, within_s=1.0)
-    with pytest.raises(UsageError, match="gives no answer within 1 s"):
-        example_differences(policy)
 
 
 def test_a_trial_answers_with_the_bits_of_this_process(tmp_path: Path) -> None:
