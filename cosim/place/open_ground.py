@@ -56,7 +56,7 @@ def open_ground(
     """What covers the plain ground within `area`: areas that do not overlap, and reach under
     streets and houses.
 
-    Nothing for a generated city: `physics/street/frontage.py` covers its ground."""
+    Nothing for a generated city: `physics/street/covers.py` covers its ground."""
     if street_map.planned:
         return []
     lands = [(cast(LandKind, land.kind), land.polygon) for land in street_map.lands_near(area)]

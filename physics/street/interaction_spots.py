@@ -16,10 +16,11 @@ import shapely
 from cosim.core.geometry import wrap_angle
 from cosim.core.state import PERSON_RADIUS_M
 from cosim.place.street_map import Lane, StreetMap
-from physics.street.building_style import shop_windows
+from physics.street.building_style import NARROWEST_FRONT_M, face_of, style_of
 from physics.street.buildings import Building
-from physics.street.frontage import paved
+from physics.street.covers import paved
 from physics.street.furniture import Prop
+from physics.textures.facade_canvas import BAY_M
 
 What = Literal["bench", "window", "stop"]
 
@@ -32,6 +33,19 @@ _BY_SHELTER_M: Final = 0.45
 _WINDOW_M: Final = (0.8, 0.55, 1.2, 1.6, 2.0, 2.3)
 """How far from a shop window one looks into it, the best first."""
 _ROAD_M: Final = 30.0
+
+_DISPLAYS = ("shop-window", "cafe")
+"""Bays between the doors of a front that are large windows with something behind them to look
+at."""
+
+
+class ShopWindow(NamedTuple):
+    """The middle of a shop window on the ground, in metres; heading_rad: from the street straight
+    into it."""
+
+    x_m: float
+    y_m: float
+    heading_rad: float
 
 
 class InteractionSpot(NamedTuple):
@@ -109,3 +123,32 @@ def _by_shelter(shelter: Prop, street_map: StreetMap) -> Iterator[InteractionSpo
 def _beside(prop: Prop, along_m: float, right_m: float) -> tuple[float, float]:
     cos, sin = math.cos(prop.heading_rad), math.sin(prop.heading_rad)
     return prop.x_m + along_m * cos + right_m * sin, prop.y_m + along_m * sin - right_m * cos
+
+
+def shop_windows(building: Building, street_map: StreetMap) -> Iterator[ShopWindow]:
+    """The shop windows of a building: the bays without a door of its ground floor, where that is a
+    shop or a cafe."""
+    face = face_of(building, style_of(building, street_map))
+    if face.front.between not in _DISPLAYS:
+        return
+    for x0, y0, x1, y1 in (
+        building.walls if building.outline is not None else [_street_wall(building)]
+    ):
+        width = math.hypot(x1 - x0, y1 - y0)
+        if width < NARROWEST_FRONT_M:
+            continue
+        count = max(round(width / BAY_M), 1)
+        into = math.atan2(x1 - x0, -(y1 - y0))  # the outside is to the right of the wall
+        for k in range(count):
+            if k % face.front.every != face.first_door:
+                share = (k + 0.5) / count
+                yield ShopWindow(x0 + share * (x1 - x0), y0 + share * (y1 - y0), into)
+
+
+def _street_wall(building: Building) -> tuple[float, float, float, float]:
+    """The wall of a box that looks to the street, which is to its right."""
+    cos, sin = math.cos(building.heading_rad), math.sin(building.heading_rad)
+    half, away = 0.5 * building.size_m[0], 0.5 * building.size_m[1]
+    x = building.x_m + away * sin
+    y = building.y_m - away * cos
+    return x - half * cos, y - half * sin, x + half * cos, y + half * sin

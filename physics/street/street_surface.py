@@ -21,8 +21,7 @@ from physics.ground.mesh import Mesh
 from physics.ground.tiles import Key, Tile, build_tile, cells_of, keys_in, surface
 from physics.street.building_style import style_of
 from physics.street.buildings import Building, Frontage, on_land
-from physics.street.covers import covers_in
-from physics.street.frontage import frontage_in
+from physics.street.covers import covers_in, frontage_in
 from physics.street.furniture import Prop
 from physics.street.mapped import MappedThings
 from physics.street.paint import paint_in

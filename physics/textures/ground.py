@@ -10,10 +10,23 @@ from typing import Final
 
 import numpy as np
 
-from physics.textures.brick_patterns import Bond, basket, courses, herringbone, random_courses
 from physics.textures.layers import Colour, Generator, Layers, Picture, Recipe, stacked
 from physics.textures.noise import Field, Noise, blurred, cells, step
-from physics.textures.surface import bond_of, cracks, laid, mixed, plain, relief, shaded, stained
+from physics.textures.surface import (
+    Bond,
+    basket,
+    bond_of,
+    courses,
+    cracks,
+    herringbone,
+    laid,
+    mixed,
+    plain,
+    random_courses,
+    relief,
+    shaded,
+    stained,
+)
 
 _GRASS_TINT: Final = 0.3
 """Grass has its own green: a tint only leans it."""

@@ -7,8 +7,16 @@ from typing import Final
 
 import numpy as np
 
-from physics.textures.facade_canvas import BAY_M, STOREY_M, FacadeCanvas
-from physics.textures.glazing import WHITE_FRAME, opening, pane, sill, surround
+from physics.textures.facade_canvas import (
+    BAY_M,
+    STOREY_M,
+    WHITE_FRAME,
+    FacadeCanvas,
+    opening,
+    pane,
+    sill,
+    surround,
+)
 from physics.textures.layers import Colour, linear
 from physics.textures.noise import step
 

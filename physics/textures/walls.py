@@ -9,15 +9,16 @@ from typing import Final
 
 import numpy as np
 
-from physics.textures.brick_patterns import courses, random_courses
 from physics.textures.layers import Colour, Generator, Layers, Picture, Recipe, stacked
 from physics.textures.noise import Field, Noise, blurred, cells, step
 from physics.textures.surface import (
     bond_of,
+    courses,
     cracks,
     laid,
     mixed,
     plain,
+    random_courses,
     relief,
     shaded,
     stained,

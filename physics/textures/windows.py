@@ -8,13 +8,15 @@ from typing import Final
 
 import numpy as np
 
-from physics.textures.facade_canvas import BAY_M, STOREY_M, FacadeCanvas
-from physics.textures.glazing import (
+from physics.textures.facade_canvas import (
+    BAY_M,
     BROWN,
     DARK,
     GREEN,
     STONE,
+    STOREY_M,
     WHITE_FRAME,
+    FacadeCanvas,
     opening,
     pane,
     railing,

@@ -13,11 +13,11 @@ import pytest
 from cosim.core.errors import SpecError, UsageError
 from physics.ground.materials import PAVINGS
 from physics.ground.tiles import SURFACES
-from physics.textures.brick_patterns import basket, courses, herringbone
 from physics.textures.facades import BAY_VARIANTS, DOORS, STREETS, WALL_STYLES, facade_layers
 from physics.textures.ground import GROUND_RECIPES, SURFACE_LAYERS, ground_layers, layer_of
 from physics.textures.layers import Layers, encoded, joined_layers, linear
 from physics.textures.noise import Noise, cells
+from physics.textures.surface import basket, courses, herringbone
 from physics.textures.walls import prop_layers, wall_layers
 
 STACKS = (ground_layers, wall_layers, prop_layers, facade_layers)

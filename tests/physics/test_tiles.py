@@ -20,7 +20,7 @@ from physics.ground.tiles import (
     square,
 )
 from physics.street.buildings import Frontage
-from physics.street.frontage import frontage_in
+from physics.street.covers import frontage_in
 from physics.street.paint import paint_in
 from tests.support.tiny_street import KEYS, no_cracks, plan_areas, tiny_map, triangles
 
