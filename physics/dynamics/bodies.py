@@ -1,5 +1,4 @@
-"""The collision bodies in one PyBullet client: robot, ground, buildings, barriers, and what moves
-near the robot."""
+"""Collision bodies in one PyBullet client: robot, ground, street and traffic."""
 
 from __future__ import annotations
 
@@ -25,13 +24,19 @@ from physics.street.furniture import Prop, solids_of
 from physics.street.surface import Chunk
 
 PERSON_M: Final = 1.7
+"""Height of a person's cylinder in metres."""
+
 VEHICLE_M: Final = 1.5
+"""Height of a vehicle's box in metres."""
+
 WALL_M: Final = 0.2
-"""How thick the walls of mapped buildings are."""
+"""Thickness of a mapped building's walls in metres."""
 
 FAR_BELOW_M: Final = -50.0
+"""Height in metres at which inactive bodies are parked."""
+
 _AROUND_M: Final = 0.5
-"""What stands around the robot is looked up anew when it has moved by so much."""
+"""Distance in metres that the robot moves before nearby static bodies are searched again."""
 _NO_CHANGE: Final = (0.0, 0.0, 0.0)
 _NOWHERE: Final = (math.inf, math.inf, math.inf)
 _UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)
@@ -41,20 +46,26 @@ _TYRE: Final = {
     "contactStiffness": 30_000.0,
     "contactDamping": 1_000.0,
 }
-"""Soft tyres share the load evenly and slide more easily sideways (y is the axle): without both,
-and with the friction cone, skid turns come in jerks."""
+"""Contact parameters of a tyre.
+
+Soft tyres share the load evenly and slide more easily sideways (y is the axle). With stiff tyres,
+or with the friction cone, skid turns are jerky.
+"""
 
 BodyKind = Literal["pedestrian", "vehicle", "wall", "object"]
 Moving = Literal["pedestrian", "vehicle"]
 _Placing = tuple[tuple[float, float, float], tuple[float, float, float, float]]
-"""Where the middle of a body comes to be, and its attitude as a quaternion."""
+"""Position of a body's centre, and its orientation as a quaternion."""
 
 
 class Bodies:
-    """A running engine. Bodies that are not shown wait far below the ground for their next use.
+    """A running PyBullet client with all collision bodies of an episode.
 
-    at_m: where the robot's base frame is; yaw_rate_radps: its rate of turn about the vertical;
-    watched: the bodies that `robot_contacts` asks for.
+    at_m: position of the robot's base frame
+    yaw_rate_radps: yaw rate of the robot
+    watched: bodies that `robot_contacts` checks
+
+    Inactive bodies of people and vehicles are parked far below the ground and reused.
     """
 
     def __init__(self, robot: Robot, substep_s: float) -> None:
@@ -107,10 +118,11 @@ class Bodies:
         self._read()
 
     def close(self) -> None:
+        """Disconnect the client."""
         p.disconnect(self._client)
 
     def add_chunk(self, chunk: Chunk) -> list[int]:
-        """What is in a square of a surface; returns what `remove` takes."""
+        """Add the bodies of a tile; return their ids for `remove`."""
         self._looked_from = _NOWHERE
         of_friction: dict[float, list[Mesh]] = {}
         for patch in chunk.ground:
@@ -147,6 +159,7 @@ class Bodies:
         return bodies
 
     def add_prop(self, prop: Prop, z_m: float) -> int:
+        """Add a prop whose foot is at height `z_m`; return its body id."""
         pool = (prop.kind, prop.variant)
         if pool not in self._shapes:
             solids = solids_of(*pool)
@@ -164,6 +177,7 @@ class Bodies:
         return body
 
     def add_barrier(self, barrier: Barrier, z_m: float) -> int:
+        """Add a barrier whose foot is at height `z_m`; return its body id."""
         half = (0.5 * barrier.thickness_m, 0.5 * barrier.length_m, 0.5 * barrier.height_m)
         shape = self._do("createCollisionShape", p.GEOM_BOX, halfExtents=half)
         turn = p.getQuaternionFromEuler((0.0, 0.0, barrier.heading_rad))
@@ -172,14 +186,17 @@ class Bodies:
         return body
 
     def remove(self, bodies: Sequence[int]) -> None:
+        """Remove bodies."""
         self._looked_from = _NOWHERE
         for body in bodies:
             self._do("removeBody", body)
             self._what.pop(body, None)
 
     def show(self, kind: Moving, movers: Sequence[Mover]) -> None:
-        """Let exactly these people or vehicles have a body, which stays where it is until it is
-        led."""
+        """Activate a body for exactly these people or vehicles.
+
+        A body stays at its place until `lead` moves it.
+        """
         shown = self._shown[kind]
         ids = [mover.id for mover in movers]
         if list(shown) == ids:
@@ -198,15 +215,18 @@ class Bodies:
         self._shown[kind] = {name: shown[name] for name in ids}
 
     def stands(self, kind: Moving, mover: Mover) -> bool:
-        """Whether a shown body is where it was led to, and stays there."""
+        """Return whether an active body is at rest where `lead` last put it."""
         return (
             mover.change == _NO_CHANGE
             and self._left_at.get(self._shown[kind][mover.id][0]) == mover.start
         )
 
     def lead(self, kind: Moving, ways: Mapping[Mover, TickPoses], z_m: Sequence[float]) -> None:
-        """Let these of the shown go their ways, substep by substep (`step`); the others stay. z_m:
-        height of the ground under each."""
+        """Set the poses of active bodies for each substep of the next tick; all others stay.
+
+        ways: poses after each substep
+        z_m: height of the ground under each body
+        """
         half = 0.5 * (PERSON_M if kind == "pedestrian" else VEHICLE_M)
         self._led[kind] = []
         for (mover, way), z in zip(ways.items(), z_m, strict=True):
@@ -251,7 +271,7 @@ class Bodies:
     def place_robot(
         self, xyz_m: tuple[float, float, float], roll_pitch_yaw: tuple[float, float, float]
     ) -> None:
-        """The robot at rest with its base frame there."""
+        """Put the robot at rest with its base frame at a position and attitude."""
         turn = p.getQuaternionFromEuler(roll_pitch_yaw)
         m = p.getMatrixFromQuaternion(turn)
         h = self._com_height_m
@@ -263,9 +283,10 @@ class Bodies:
         self._read()
 
     def step(self, substep: int, speeds_radps: list[float]) -> tuple[float, float, float]:
-        """One substep of a tick, from 0; x, y, heading of the robot's base frame after it.
+        """Run one substep; return x, y and heading of the robot's base frame.
 
-        speeds_radps: at which the motors turn the drive's joints, in the order of `Skid.joints`.
+        substep: index within the tick, from 0
+        speeds_radps: target speeds of the drive joints, in the order of `Skid.joints`
         """
         for led in self._led.values():
             for body, way in led:
@@ -284,7 +305,7 @@ class Bodies:
         return self._read()
 
     def _read(self) -> tuple[float, float, float]:
-        """Ask the engine where the robot is, and how it moves."""
+        """Read the robot's pose and velocity from the engine."""
         self._velocity = p.getBaseVelocity(self._robot, self._client)
         (x, y, z), turn = p.getBasePositionAndOrientation(self._robot, self._client)
         self._turned = m = p.getMatrixFromQuaternion(turn)
@@ -294,6 +315,7 @@ class Bodies:
         return x, y, math.atan2(m[3], m[0])
 
     def robot_state(self) -> RobotState:
+        """Return the robot's pose, velocities and tilt."""
         (x, y, z) = self.at_m
         m = self._turned
         (linear, angular) = self._velocity
@@ -303,8 +325,10 @@ class Bodies:
         return RobotState(pose, forward, turn, z, math.acos(min(max(m[8], -1.0), 1.0)))
 
     def watch(self, reach_m: float, movers: Iterable[tuple[Moving, Mover]]) -> None:
-        """Ask for contacts with these of the shown, and with what stands within a reach of the
-        robot."""
+        """Select the bodies for contact checks.
+
+        These are the given movers, and static bodies within reach of the robot.
+        """
         x, y, z = self.at_m
         if math.dist(self.at_m, self._looked_from) > _AROUND_M:
             far_m = reach_m + _AROUND_M
@@ -326,7 +350,7 @@ class Bodies:
         self.watched += [self._shown[kind][mover.id][0] for kind, mover in movers]
 
     def robot_contacts(self) -> list[tuple[BodyKind, str]]:
-        """What of the watched the robot touches now."""
+        """Return kind and id of each watched body that the robot touches."""
         return [
             self._what[body]
             for body in self.watched
@@ -337,7 +361,7 @@ class Bodies:
         ]
 
     def blocked(self, begin_m: Floats, end_m: Floats) -> NDArray[np.bool_]:
-        """On which of (N, 3) -> (N, 3) lines something stands."""
+        """Return which of N lines, from (N, 3) to (N, 3) points in metres, hit a body."""
         hits = self._do("rayTestBatch", begin_m.tolist(), end_m.tolist())
         return np.array([hit[0] >= 0 for hit in hits], dtype=bool)
 
@@ -351,8 +375,10 @@ class Bodies:
 def _wall_box(
     wall: Wall, height_m: float
 ) -> tuple[tuple[float, float], float, tuple[float, float, float]]:
-    """Middle, heading and size of a wall: WALL_M thick, its outer face on the line, the outside to
-    the line's right."""
+    """Return centre, heading and size of a wall.
+
+    The wall is WALL_M thick; its outer face is on the line, with the outside on the right.
+    """
     x0, y0, x1, y1 = wall
     length, heading = math.hypot(x1 - x0, y1 - y0), math.atan2(y1 - y0, x1 - x0)
     x = 0.5 * (x0 + x1) - 0.5 * WALL_M * math.sin(heading)

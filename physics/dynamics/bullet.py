@@ -1,5 +1,4 @@
-"""PyBullet, imported without its greeting, which it would write to stderr among progress bars and
-tables."""
+"""Import of PyBullet without its start-up message, engine fingerprint, and timing hooks."""
 
 from __future__ import annotations
 
@@ -13,10 +12,13 @@ from typing import Any, Final
 import numpy as np
 
 _STEPS: Final = 240
+"""Physics steps in the fingerprint simulation."""
+
 _Timed = Callable[[str, Callable[..., Any]], Callable[..., Any]]
 
 
 def _imported() -> Any:
+    """Import PyBullet with stderr redirected, so that progress bars stay intact."""
     sys.stderr.flush()
     kept = os.dup(2)
     try:
@@ -33,8 +35,10 @@ p = _imported()
 
 
 def bullet_alone() -> dict[str, str]:
-    """Where boxes and balls come to that fall on one another, and a picture of them by
-    TinyRenderer, as hashes."""
+    """Return hashes of a small simulation and of a TinyRenderer image.
+
+    The scene uses no project code, so the hashes depend on the PyBullet build alone.
+    """
     client = p.connect(p.DIRECT)
     try:
         p.setGravity(0, 0, -9.81, physicsClientId=client)
@@ -75,6 +79,6 @@ def bullet_alone() -> dict[str, str]:
 
 
 def put_physics_stopwatch(timed: _Timed) -> None:
-    """Replace PyBullet's step and picture by timed ones, for the rest of this process."""
+    """Replace PyBullet's step and image functions by timed ones for the rest of the process."""
     p.stepSimulation = timed("physics", p.stepSimulation)
     p.getCameraImage = timed("camera", p.getCameraImage)

@@ -1,4 +1,4 @@
-"""Where people and vehicles near the robot are between two snapshots of the street."""
+"""Interpolation of people and vehicles near the robot between two street snapshots."""
 
 from __future__ import annotations
 
@@ -11,15 +11,24 @@ from cosim.core.geometry import Pose
 from cosim.core.state import PERSON_RADIUS_M, People, Vehicles
 
 _JUMP_M: Final = 5.0
-"""A longer way within one tick is a jump: the thing is at its new place at once."""
+"""Distance in metres above which a move within one tick counts as a teleport."""
 _ROUNDING_M: Final = 0.01
+"""Margin in metres for rounding in the vectorized distance test."""
+
 TickPoses = list[tuple[float, float, float]]
+"""x, y and heading after each substep of a tick."""
+
 _PERSON_SIZE_M: Final = (2.0 * PERSON_RADIUS_M, 2.0 * PERSON_RADIUS_M)
+"""Length and width of a person in metres."""
 
 
 class Mover(NamedTuple):
-    """Somebody or something that moves evenly during a tick. size_m: length and width; change: of
-    x, y and heading from the start of the tick to its end."""
+    """A person or vehicle that moves uniformly during a tick.
+
+    size_m: length and width
+    start: pose at the start of the tick
+    change: change of x, y and heading by the end of the tick
+    """
 
     id: str
     size_m: tuple[float, float]
@@ -27,12 +36,12 @@ class Mover(NamedTuple):
     change: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def passes(self, x_m: float, y_m: float, reach_m: float) -> bool:
-        """Whether any part of it may come within `reach_m` of a point, somewhere on its way."""
+        """Return whether any part may come within `reach_m` of a point during the tick."""
         way_m = math.hypot(*self.change[:2]) + 0.5 * math.hypot(*self.size_m)
         return math.hypot(self.start.x_m - x_m, self.start.y_m - y_m) <= way_m + reach_m
 
     def way(self, substeps: int) -> TickPoses:
-        """x, y, heading after each substep."""
+        """Return the pose after each substep."""
         (x, y, heading) = self.start
         (dx, dy, turn) = self.change
         shares = [(k + 1) / substeps for k in range(substeps)]
@@ -42,8 +51,10 @@ class Mover(NamedTuple):
 def movers_near(
     before: People | Vehicles, after: People | Vehicles, x_m: float, y_m: float, reach_m: float
 ) -> list[Mover]:
-    """What of `after` comes within `reach_m` of a point, at the start or at the end; a thing that
-    `before` lacks is at its new place at once."""
+    """Return the people or vehicles that are within `reach_m` of a point at either end of a tick.
+
+    Those missing from `before` are placed at their new pose at once.
+    """
     away = np.hypot(after.xy[:, 0] - x_m, after.xy[:, 1] - y_m)
     same = before.ids == after.ids
     if same:

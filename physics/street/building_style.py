@@ -1,5 +1,4 @@
-"""What a building shows to its street: its style, and what it draws of it by its name, such as shop
-windows."""
+"""Choice of a building's style, wall, roof, windows and ground floor."""
 
 from __future__ import annotations
 
@@ -14,13 +13,20 @@ from physics.street.placement import street_style
 from physics.textures.facades import BAY_VARIANTS, DOORS, STREETS, WALL_STYLES, Front, WallStyle
 
 NARROWEST_FRONT_M = 2.2
-"""A narrower wall has no windows."""
+"""Smallest width in metres of a wall with windows."""
 
 
 class Face(NamedTuple):
-    """What a building drew: names of the layers of its wall, roof and upper storeys, the number of
-    its bays' variant, its ground floor, and which of its bays has the first door. tint: of the
-    wall, None for its own colour."""
+    """Appearance of one building.
+
+    wall, roof: names of texture layers
+    upper: style of the upper storeys
+    number: variant of the bays
+    front: ground floor
+    first_door: index of the first bay with a door
+    tint: sRGB colour of the wall, None for the layer's own
+    chance: two random bytes for the shader
+    """
 
     wall: str
     roof: str
@@ -33,14 +39,14 @@ class Face(NamedTuple):
 
 
 def style_of(building: Building, street_map: StreetMap) -> WallStyle:
-    """What a building looks like: drawn by its name from those that its street has."""
+    """Return the style of a building, chosen by its name among the styles of its street."""
     strip = street_map.strips.get(building.id.removeprefix("building:").rpartition(":")[0])
     names = STREETS.get(street_style(strip.street_class) if strip is not None else "", STREETS[""])
     return WALL_STYLES[names[zlib.crc32(f"style:{building.id}".encode()) % len(names)]]
 
 
 def face_of(building: Building, style: WallStyle) -> Face:
-    """What a building of a style draws by its name."""
+    """Return the appearance of a building, drawn from its style by its name."""
     rng = np.random.default_rng(zlib.crc32(building.id.encode()))
     wall, roof, upper = (
         str(rng.choice(style.walls)),

@@ -1,4 +1,8 @@
-"""x"""
+"""Thin covers on open ground: land use on mapped places, frontages in generated cities.
+
+Frontages are paved areas before shops, gardens before homes, and driveways. Covers lie a few
+millimetres above the ground. They change camera images, but not labels, friction or wheel contacts.
+"""
 
 from __future__ import annotations
 
@@ -22,23 +26,32 @@ from physics.street.placement import street_style
 from physics.textures.layers import Colour
 
 _LIFT_M: Final = 0.003
+"""Height of a cover above the ground in metres."""
+
 _GRID_M: Final = 1e-4
-"""Ends of edges nearer to one another than about this are the same."""
+"""Distance in metres below which edge ends coincide."""
 _AT_END_M: Final = 0.005
+"""Tolerance in metres for an edge on the border of a cover."""
+
 _LEVEL_M: Final = 1e-6
+"""Height tolerance in metres of level ground."""
 
 _REACH_M: Final = 12.0
+"""Distance in metres from a tile within which sidewalks may have frontage in it."""
+
 _UNDER_M: Final = 0.6
-"""So far it reaches under the houses, whose fronts are straight where a street bends."""
+"""Overlap in metres of beds and buildings; fronts are straight where a street bends."""
 _DEEPEST_M: Final = 6.0
+"""Largest depth of a frontage in metres."""
+
 _YARD_M: Final = 3.0
-"""Depth of the paved yards between the houses of a street that is paved."""
+"""Depth in metres of paved yards between the buildings of a paved street."""
 _BED_M: Final = (0.45, 0.8)
-"""Width of the beds at the feet of houses with gardens."""
+"""Smallest and largest width in metres of garden beds along buildings."""
 
 
 class Cover(NamedTuple):
-    """A layer of ground (physics.textures.ground) and its colour; None is the layer's own."""
+    """A layer of `physics.textures.ground` and its tint; None keeps the layer's own colour."""
 
     layer: str
     colour: Colour | None
@@ -66,26 +79,31 @@ _COVERS: Final[Mapping[str, tuple[Cover, ...]]] = {
     "narrow": (Cover("setts", None), Cover("cobbles", None), Cover("slabs-worn", None)),
     "ring": (Cover("slabs-square", _SLABS), Cover("concrete-cast", None)),
 }
-"""What the frontage of a class of streets may be paved with; other classes have gardens."""
+"""Possible frontage pavings by street class; other classes have gardens."""
 _WAYS: Final = (
     Cover("concrete-cast", None),
     Cover("pavers-herringbone", (0.56, 0.52, 0.49)),
     Cover("gravel", None),
 )
+"""Possible surfaces of driveways."""
+
 _BEDS: Final = Cover("earth", None)
+"""Surface of garden beds."""
 
 
 class Laid(NamedTuple):
-    """A part of a tile's ground that has a cover."""
+    """A mesh on the ground with its cover."""
 
     mesh: Mesh
     cover: Cover
 
 
 def covers_in(street_map: StreetMap, tile: Tile, rims: bool) -> dict[LandKind, Mesh]:
-    """What lies on the open ground of a tile, by its look; where nothing lies the ground shows its
-    own. rims: upright ones around each cover, so that a low eye does not look under it; they take
-    two thirds of all triangles."""
+    """Return the covers of open ground in a tile by kind of land.
+
+    rims: add vertical rims, so that low cameras do not see under a cover; they are two thirds of
+        all triangles
+    """
     if "ground" not in tile.parts:
         return {}
     ground = tile.parts["ground"]
@@ -102,12 +120,12 @@ def covers_in(street_map: StreetMap, tile: Tile, rims: bool) -> dict[LandKind, M
 
 
 def laid_over(mesh: Mesh, area: shapely.Geometry) -> Mesh:
-    """The parts of a mesh that lie in an area, lifted a little, with an upright rim around them."""
+    """Return the parts of a mesh within an area, lifted slightly, with a vertical rim."""
     return _edged(_clipped(mesh, area))
 
 
 def _spread(mesh: Mesh, area: shapely.Geometry) -> Mesh:
-    """As `_clipped`, but where the mesh is level in as few triangles as the area needs."""
+    """Clip a mesh to an area like `_clipped`, but with few triangles where it is level."""
     height = mesh.vertices[mesh.triangles][:, :, 2]
     level = (height > height.max() - _LEVEL_M).all(axis=1)
     sheet = overlay.intersection(overlay.union_all(_outlines(mesh)[level]), area)
@@ -124,7 +142,7 @@ def _spread(mesh: Mesh, area: shapely.Geometry) -> Mesh:
 
 
 def _clipped(mesh: Mesh, area: shapely.Geometry) -> Mesh:
-    """The parts of a mesh's triangles that lie in an area, lifted a little."""
+    """Return the parts of a mesh within an area, lifted slightly."""
     shapely.prepare(area)
     corners = mesh.vertices[mesh.triangles]
     outlines = _outlines(mesh)
@@ -142,16 +160,14 @@ def _clipped(mesh: Mesh, area: shapely.Geometry) -> Mesh:
 
 
 def _outlines(mesh: Mesh) -> NDArray[np.object_]:
-    """The triangles of a mesh from above."""
+    """Return the triangles of a mesh as plan polygons."""
     return np.asarray(shapely.polygons(mesh.vertices[mesh.triangles][:, :, :2]), dtype=object)
 
 
 def _edged(mesh: Mesh, ends: shapely.Geometry | None = None) -> Mesh:
-    """A mesh with an upright rim under every edge at which it ends, so that a low eye does not look
-    under it.
+    """Add a vertical rim under the outer edges of a mesh, so that low cameras do not see under it.
 
-    ends: where it does; None: at every edge of one triangle alone, also where neighbours are
-    divided otherwise.
+    ends: border of the mesh; None adds a rim at every edge with only one triangle
     """
     if not len(mesh):
         return mesh
@@ -176,7 +192,10 @@ def _edged(mesh: Mesh, ends: shapely.Geometry | None = None) -> Mesh:
 
 
 def _cut(part: shapely.Geometry, corners: Floats, normals: Floats) -> Mesh:
-    """A part of a triangle, (3, 3) corners and normals, as triangles in its plane."""
+    """Triangulate a part of a triangle in the triangle's plane.
+
+    corners, normals: (3, 3) of the triangle
+    """
     pieces = [p for p in shapely.get_parts(part) if shapely.get_dimensions(p) == 2]
     at = plan_triangles(pieces)[0].reshape(-1, 2)
     shares = np.column_stack([at, np.ones(len(at))]) @ np.linalg.inv(
@@ -189,8 +208,7 @@ def _cut(part: shapely.Geometry, corners: Floats, normals: Floats) -> Mesh:
 
 
 def frontage_in(street_map: StreetMap, tile: Tile, seed: int) -> list[Laid]:
-    """What lies on the open ground of a tile of a generated city, a few millimetres above it;
-    nothing on other maps."""
+    """Return the frontage covers in a tile of a generated city; empty on other maps."""
     if not street_map.planned or "ground" not in tile.parts:
         return []
     x0, y0, x1, y1 = square(tile.key)
@@ -214,13 +232,12 @@ def frontage_in(street_map: StreetMap, tile: Tile, seed: int) -> list[Laid]:
 
 
 def paved(strip: Strip) -> bool:
-    """Whether what lies before the houses of a sidewalk's street is paved; else there are
-    gardens."""
+    """Return whether the frontage of a sidewalk's street is paved instead of gardens."""
     return street_style(strip.street_class) in _COVERS
 
 
 def _of(strip: Strip, seed: int) -> list[tuple[Cover, shapely.Geometry]]:
-    """The frontage of a sidewalk and its driveways."""
+    """Return the frontage and driveways of a sidewalk with their covers."""
     rng = np.random.default_rng([seed, zlib.crc32(strip.id.encode()), 0xF207])
     edge = 0.5 * strip.width_m
     depth = min(strip.frontage_m, _DEEPEST_M)

@@ -1,4 +1,4 @@
-"""A surface as glTF (y up, metres): what stands in its squares, a node for each kind and colour."""
+"""Export of a street surface as glTF (y up, metres), with a node per kind and colour."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from physics.textures.ground import ground_layers
 from physics.textures.layers import Colour, encoded, linear
 
 _GROUPS: Final = ("surfaces", "buildings", "trees", "furniture", "signals", "barriers", "obstacles")
-"""The nodes right below the root; each holds nodes named by what they show, such as
-"sidewalk:brick:2"."""
+"""Nodes below the root; their children have names such as "sidewalk:brick:2"."""
 _LAYERS_PX: Final = 256
+"""Size in pixels of the texture layers whose mean colours are used."""
 
 
 def as_gltf(
@@ -35,7 +35,7 @@ def as_gltf(
     progress: Progress = ignore,
     obstacles: Sequence[Obstacle] = (),
 ) -> bytes:
-    """A .glb file of the squares of a surface and of the fences and obstacles on it."""
+    """Return a .glb file of tiles of a surface with barriers and obstacles."""
     parts = _Parts()
     for n, key in enumerate(keys):
         progress("building tiles", n / len(keys))
@@ -100,11 +100,11 @@ class _Parts:
             self.add(group, name, mesh, part.colour or KINDS[prop.kind].paints[prop.paint])
 
     def _shown(self, patch: Patch) -> Colour:
-        """The mean colour of what cameras with textures show."""
+        """Return the mean colour that cameras with textures show."""
         return patch.colour if patch.tinted else self._means[patch.layer]
 
     def scene(self) -> trimesh.Scene:
-        """One node for each kind and colour, below those of _GROUPS."""
+        """Return a scene with one node per kind and colour below the nodes of _GROUPS."""
         scene = trimesh.Scene()
         shades = {(group, name): 0 for group, name, _ in self._meshes}
         for group in _GROUPS:
@@ -120,6 +120,7 @@ class _Parts:
 
 
 def _shape(mesh: Mesh, name: str, colour: Colour) -> trimesh.Trimesh:
+    """Convert a mesh to a glTF geometry with y up."""
     turn = np.array(
         [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
     )  # from z up to glTF's y up

@@ -1,8 +1,6 @@
-"""What there is to do on a street: benches to sit on, shop windows to look into, shelters to wait
-at, as they stand.
+"""Spots where pedestrians can sit on a bench, look into a shop window or wait at a shelter.
 
-Each spot says where one would stand or have the feet, and which way one would face; whether
-somebody fits there is for who sends people there.
+A spot gives the position and heading of a person. The caller checks whether the person fits there.
 """
 
 from __future__ import annotations
@@ -25,23 +23,29 @@ from physics.textures.facade_canvas import BAY_M
 What = Literal["bench", "window", "stop"]
 
 _BEFORE_M: Final = PERSON_RADIUS_M + 0.05
-"""From the edge of a bench to who sits on it: there the legs are (see
-`physics.people.gestures.SEATED_BACK_M`)."""
+"""Distance in metres from the edge of a bench to a seated person's position, which is at the legs.
+
+See `physics.people.gestures.SEATED_BACK_M`.
+"""
 _SEAT_M: Final = 0.36
-"""From the middle of a bench to the middle of a seat: two sit on one."""
+"""Distance in metres from the centre of a bench to the centre of each of its two seats."""
 _BY_SHELTER_M: Final = 0.45
+"""Distance in metres from a shelter's open side to waiting people."""
+
 _WINDOW_M: Final = (0.8, 0.55, 1.2, 1.6, 2.0, 2.3)
-"""How far from a shop window one looks into it, the best first."""
+"""Viewing distances from a shop window in metres, best first."""
 _ROAD_M: Final = 30.0
+"""Search radius in metres for the road that people at a shelter watch."""
 
 _DISPLAYS = ("shop-window", "cafe")
-"""Bays between the doors of a front that are large windows with something behind them to look
-at."""
+"""Ground-floor bays that are shop windows."""
 
 
 class ShopWindow(NamedTuple):
-    """The middle of a shop window on the ground, in metres; heading_rad: from the street straight
-    into it."""
+    """Centre of a shop window on the ground.
+
+    heading_rad: direction from the street into the window
+    """
 
     x_m: float
     y_m: float
@@ -49,9 +53,12 @@ class ShopWindow(NamedTuple):
 
 
 class InteractionSpot(NamedTuple):
-    """A place to do something. thing: id of the prop or building, and the number of the seat or
-    window at it; spots of one thing exclude each other. at_m: the point of the thing that one sits
-    on, looks at, or waits by."""
+    """Position and heading for an activity.
+
+    thing: id of the prop or building, and number of its seat or window; spots of one thing exclude
+        each other
+    at_m: point on the thing that the person sits on, looks at or waits at
+    """
 
     what: What
     thing: str
@@ -64,7 +71,7 @@ class InteractionSpot(NamedTuple):
 def spots(
     street_map: StreetMap, props: Sequence[Prop], buildings: Sequence[Building]
 ) -> Iterator[InteractionSpot]:
-    """Everything to do at these props and buildings; a thing's best spot first."""
+    """Return all spots at these props and buildings; the best spot of a thing comes first."""
     for prop in props:
         if prop.kind == "bench":
             yield from _seats(prop)
@@ -85,7 +92,7 @@ def spots(
 
 
 def _seats(bench: Prop) -> Iterator[InteractionSpot]:
-    """Who sits on a bench faces right of its heading, the back to its other side."""
+    """Return the seats of a bench; people face right of its heading."""
     for number, along_m in enumerate((-_SEAT_M, _SEAT_M)):
         seat = _beside(bench, along_m, 0.0)
         feet = _beside(bench, along_m, 0.5 * bench.size_m[1] + _BEFORE_M)
@@ -99,7 +106,7 @@ def _seats(bench: Prop) -> Iterator[InteractionSpot]:
 
 
 def _by_shelter(shelter: Prop, street_map: StreetMap) -> Iterator[InteractionSpot]:
-    """Before the open side of a bus shelter, looking to the road."""
+    """Return spots before a shelter's open side, facing the road."""
     point = shapely.Point(shelter.x_m, shelter.y_m)
     lanes = [
         p
@@ -121,13 +128,13 @@ def _by_shelter(shelter: Prop, street_map: StreetMap) -> Iterator[InteractionSpo
 
 
 def _beside(prop: Prop, along_m: float, right_m: float) -> tuple[float, float]:
+    """Return the point at an offset along and right of a prop."""
     cos, sin = math.cos(prop.heading_rad), math.sin(prop.heading_rad)
     return prop.x_m + along_m * cos + right_m * sin, prop.y_m + along_m * sin - right_m * cos
 
 
 def shop_windows(building: Building, street_map: StreetMap) -> Iterator[ShopWindow]:
-    """The shop windows of a building: the bays without a door of its ground floor, where that is a
-    shop or a cafe."""
+    """Return a building's shop windows: ground-floor bays of shops and cafes without a door."""
     face = face_of(building, style_of(building, street_map))
     if face.front.between not in _DISPLAYS:
         return
@@ -146,7 +153,7 @@ def shop_windows(building: Building, street_map: StreetMap) -> Iterator[ShopWind
 
 
 def _street_wall(building: Building) -> tuple[float, float, float, float]:
-    """The wall of a box that looks to the street, which is to its right."""
+    """Return the wall of a box-shaped building that faces the street."""
     cos, sin = math.cos(building.heading_rad), math.sin(building.heading_rad)
     half, away = 0.5 * building.size_m[0], 0.5 * building.size_m[1]
     x = building.x_m + away * sin

@@ -1,7 +1,6 @@
-"""What the map itself shows beside its streets, as buildings and props: cut by tiles, found by
-place.
+"""Buildings and props that a map shows, by tile.
 
-Where it shows something, nothing of the kind is made up: see `shows`.
+No objects of the same kind are generated near them (see `MappedThings.shows`).
 """
 
 from __future__ import annotations
@@ -24,15 +23,19 @@ from physics.street.buildings import FACADES, Building, Wall
 from physics.street.furniture import KINDS, PROP_VARIANTS, Prop
 
 HOUSES_M: Final = 30.0
+"""Distance in metres from mapped buildings within which none are generated."""
+
 MAPPED_NEAR_M: Final = 40.0
-"""So near to a building of the map no building is made up, and so near to a thing of the map none
-of its kind."""
+"""Distance in metres from mapped props within which none of the same kind are generated."""
 _SPLINTER_M2: Final = 0.05
+"""Area in square metres below which a part of a building in a tile is dropped."""
 
 
 class MappedThings:
-    """The buildings and things that a street map shows, for the engines; a pure function of the
-    map. kinds: of the things."""
+    """Buildings and props of a map; a pure function of the map.
+
+    kinds: kinds of the mapped props
+    """
 
     def __init__(self, street_map: StreetMap) -> None:
         by_kind: dict[str, list[Feature]] = defaultdict(list)
@@ -56,15 +59,15 @@ class MappedThings:
 
     @property
     def all_props(self) -> tuple[Prop, ...]:
-        """Things of every tile."""
+        """Return the props of all tiles."""
         return tuple(prop for props in self._props.values() for prop in props)
 
     def props(self, key: Key) -> Sequence[Prop]:
-        """Things whose middle lies in a tile."""
+        """Return the props whose centre lies in a tile."""
         return self._props.get(key, ())
 
     def buildings(self, key: Key) -> tuple[Building, ...]:
-        """The parts of buildings that lie in a tile, each a building of its own."""
+        """Return the parts of buildings in a tile, each as a building."""
         tile = shapely.box(*square(key))
         found = []
         for i in np.sort(self._house_tree.query(tile, predicate="intersects")).tolist():
@@ -74,8 +77,7 @@ class MappedThings:
         return tuple(found)
 
     def shows(self, kind: str, place: shapely.Geometry) -> bool:
-        """Whether the map shows things of a kind near a place, so that none need be made up
-        there."""
+        """Return whether the map shows objects of a kind near a place."""
         tree = self._trees.get(kind)
         reach = HOUSES_M if kind == "building" else MAPPED_NEAR_M
         return tree is not None and bool(
@@ -84,7 +86,11 @@ class MappedThings:
 
 
 def _prop(number: int, feature: Feature) -> Prop:
-    """The size nearest to the mapped height, else one drawn by number; the same for the paint."""
+    """Convert a feature to a prop.
+
+    The size is the nearest to the mapped height; without a height it is random by number. The paint
+    is random by number.
+    """
     kind = KINDS[feature.kind]
     drawn = zlib.crc32(f"{feature.kind}:{number}".encode())
     variant = drawn % PROP_VARIANTS
@@ -105,7 +111,7 @@ def _prop(number: int, feature: Feature) -> Prop:
 
 
 def _floor_m(whole: Polygon, terrain: Terrain | None) -> float:
-    """The floor of a house: as high as the land around it, on average."""
+    """Return a building's floor height: the mean height of the land around it."""
     if terrain is None:
         return 0.0
     return float(
@@ -114,8 +120,10 @@ def _floor_m(whole: Polygon, terrain: Terrain | None) -> float:
 
 
 def _building(number: int, house: Feature, part: Polygon, floor_m: float) -> Building:
-    """A part of a mapped building, in the box around it along its street; all parts of one bear its
-    name and look."""
+    """Return a part of a mapped building as a building.
+
+    It has the whole building's name and appearance. Its box is the bounding box along the street.
+    """
     part = shapely.orient_polygons(part)
     cos, sin = math.cos(house.heading_rad), math.sin(house.heading_rad)
     turn = np.array([[cos, -sin], [sin, cos]])
@@ -138,8 +146,7 @@ def _building(number: int, house: Feature, part: Polygon, floor_m: float) -> Bui
 
 
 def _walls(part: Polygon, whole: Polygon) -> tuple[Wall, ...]:
-    """The sides of a part that are sides of the whole, the outside to their right; cuts between
-    tiles are none."""
+    """Return the sides of a part that belong to the whole building, without tile cuts."""
     sides = []
     for ring in (part.exterior, *part.interiors):
         xy = shapely.get_coordinates(ring)

@@ -1,10 +1,8 @@
-"""Where street furniture stands: drawn for each sidewalk from the street map and a seed, zone by
-zone.
+"""Random placement of street furniture along sidewalks.
 
-A sidewalk's props are drawn from its own generator, and a prop belongs to the tile of its middle:
-what stands in a tile does not depend on which tiles were asked for before. Along the middle of
-every sidewalk a band is kept free. No car is parked on the road: the crowd engine drives on every
-lane. Cars stand at the ends of driveways.
+Each sidewalk draws its props from its own generator. A prop belongs to the tile of its centre, so
+tiles do not depend on the order in which they are built. A band along the middle of every sidewalk
+stays free. Cars stand only at the ends of driveways, because traffic uses every lane of the road.
 """
 
 from __future__ import annotations
@@ -35,46 +33,60 @@ from physics.street.furniture import (
 from physics.street.mapped import MappedThings
 
 CLEAR_HALF_M: Final = 0.6
-"""The least half width of the band that is kept free along the middle of a sidewalk."""
+"""Smallest half width in metres of the free band along the middle of a sidewalk."""
 
 PROP_END_GAP_M: Final = 2.0
-"""Nothing stands nearer to the end of a sidewalk or to a crossing."""
+"""Smallest distance in metres between a prop and a crossing or the end of a sidewalk."""
 
 _GAP_M: Final = 0.25
-"""Least distance between two props."""
+"""Smallest distance in metres between two props."""
 
 _EDGE_M: Final = 0.6
-"""The outer edge of a wide sidewalk that props at the curb may use."""
+"""Width in metres of the outer edge of a wide sidewalk for props at the curb."""
 
 GOLDEN_RAD: Final = 2.399963
-"""Each tree is turned by so much more than the one before: no two look alike."""
+"""Rotation in radians from one tree to the next, so that trees look different."""
 
 _MARGIN_M: Final = 0.06
+"""Distance in metres between props and the border of their zone."""
+
 _VERGE_MIN_M: Final = 0.3
+"""Smallest width in metres of a verge with props."""
+
 _ZONE_MAX_M: Final = 6.0
+"""Largest width of a zone in metres."""
+
 _REACH_M: Final = 12.0
-"""Props stand nearer than this to their sidewalk, and the middle of a house to its walls."""
+"""Search distance in metres for props of a sidewalk and for buildings near props.
+
+Props are closer than this to their sidewalk, and centres of buildings to their walls.
+"""
 
 _STREET: Final[tuple[PieceKind, ...]] = ("strip", "corner", "lane", "junction")
+"""Kinds of map pieces that props must not cover."""
+
 _BY_TYPE: Final = (
     (("motorway", "trunk", "primary", "secondary"), "avenue"),
     (("tertiary",), "commercial"),
     (("living", "service", "alley"), "narrow"),
 )
-"""Street classes of imported maps, by words in the type of the edge; the rest are residential."""
+"""Street classes of imported maps by words in the edge type; the default is residential."""
 
 
 class _Band(NamedTuple):
-    """Where the props of a zone may be: distances from the middle line, positive away from the
-    road, in metres."""
+    """Range of distances from the centre line, positive away from the road, in metres."""
 
     low_m: float
     high_m: float
 
 
 class Placement:
-    """The props of a map under a seed; pure functions of map, seed and what is asked for, kept once
-    known."""
+    """Street furniture of a map.
+
+    mapped: mapped props, near which none of the same kind are generated
+
+    Results are pure functions of map, seed and arguments, and are cached.
+    """
 
     def __init__(
         self,
@@ -92,7 +104,7 @@ class Placement:
         self._houses: dict[Key, list[shapely.Geometry]] = {}
 
     def in_tile(self, key: Key) -> tuple[Prop, ...]:
-        """Props whose middle lies in the tile, in the net's order."""
+        """Return the props whose centre lies in a tile, in map order."""
         strips = self._map.near("strip", shapely.box(*_grown(square(key), _REACH_M)))
         props = [prop for s in strips if isinstance(s, Strip) for prop in self.on_strip(s)]
         return (
@@ -101,8 +113,10 @@ class Placement:
         )
 
     def on_strip(self, strip: Strip) -> tuple[Prop, ...]:
-        """Props of a sidewalk: as drawn, without those that meet a house or what another sidewalk
-        has drawn."""
+        """Return the props of a sidewalk without overlaps.
+
+        Props that overlap a building or a prop of an earlier sidewalk are removed.
+        """
         if strip.id not in self._kept:
             props, ground = self._draw(strip)
             hit = np.zeros(len(props), dtype=bool)
@@ -136,8 +150,10 @@ class Placement:
         return [house for key in keys for house in self._houses[key]]
 
     def _draw(self, strip: Strip) -> tuple[list[Prop], NDArray[np.object_]]:
-        """Props of a sidewalk that fit its zones, the street and each other, and their
-        footprints."""
+        """Return random props of a sidewalk that fit its zones, the street and each other.
+
+        Returns: props and their (N,) footprints
+        """
         if strip.id not in self._drawn:
             props = list(draw(strip, self._seed)) if strip.kind == "sidewalk" else []
             shown = self._mapped.kinds
@@ -157,8 +173,7 @@ class Placement:
 
 
 def draw(strip: Strip, seed: int) -> Iterable[Prop]:
-    """Props for a sidewalk, drawn kind by kind; they may still meet each other or another
-    street."""
+    """Return random props of a sidewalk, kind by kind, before overlaps are removed."""
     line = Polyline(strip.line if strip.road_side <= 0 else strip.line[::-1])
     bands = zones(strip)
     usable = line.length_m - 2.0 * PROP_END_GAP_M
@@ -220,8 +235,13 @@ def _stood(
     turned: bool,
     n: int,
 ) -> Prop | None:
-    """A prop at an arc length of the line and a share of the free depth of its zone; None when it
-    is too deep."""
+    """Return a prop in a zone of a sidewalk, or None if it does not fit.
+
+    at_m: arc length along the line
+    share: position within the free depth of the zone, 0 to 1
+    turned: place the prop across the street direction
+    n: number of the prop along the sidewalk
+    """
     length, depth, _ = kind.size_m(variant)
     if turned:
         length, depth = depth, length
@@ -249,7 +269,7 @@ def _stood(
 
 
 def zones(strip: Strip) -> dict[Zone, _Band]:
-    """The zones beside a sidewalk that props may use."""
+    """Return the zones of a sidewalk that props may use."""
     half = 0.5 * strip.width_m
     found: dict[Zone, _Band] = {}
     if strip.road_side != 0:
@@ -267,12 +287,12 @@ def zones(strip: Strip) -> dict[Zone, _Band]:
 
 
 def clear_half_m(strip: Strip) -> float:
-    """Half the width of the band along the middle of a sidewalk where nothing stands."""
+    """Return half the width in metres of the free band along the middle of a sidewalk."""
     return min(max(CLEAR_HALF_M, 0.5 * strip.width_m - _EDGE_M), 0.5 * strip.width_m)
 
 
 def street_style(street_class: str) -> str:
-    """The column of the catalogue for a street class of ours or a type of an imported edge."""
+    """Return the catalogue column for a street class or the type of an imported edge."""
     if street_class in CATALOGUE[0].per_100m:
         return street_class
     return next(
@@ -281,7 +301,7 @@ def street_style(street_class: str) -> str:
 
 
 def props_of(street_map: StreetMap, seed: int) -> tuple[Prop, ...]:
-    """Every prop of a map, sidewalk by sidewalk. Seconds on a large map."""
+    """Return all props of a map, sidewalk by sidewalk; takes seconds on large maps."""
     mapped = MappedThings(street_map)
     placement = Placement(street_map, seed, Frontage(street_map, seed, mapped), mapped)
     made_up = (prop for strip in street_map.strips.values() for prop in placement.on_strip(strip))
@@ -289,8 +309,10 @@ def props_of(street_map: StreetMap, seed: int) -> tuple[Prop, ...]:
 
 
 def driveway_ground(strip: Strip) -> list[shapely.Geometry]:
-    """For each driveway of a sidewalk what must stay open: its way from the road through verge,
-    sidewalk and frontage, and the flares of its ramp."""
+    """Return the area to keep free for each driveway of a sidewalk.
+
+    It is the way through verge, sidewalk and frontage, and the flares of its ramp.
+    """
     line = Polyline(strip.line)
     found: list[shapely.Geometry] = []
     for at_m in strip.driveways:
@@ -308,8 +330,7 @@ def driveway_ground(strip: Strip) -> list[shapely.Geometry]:
 def _fits(
     street_map: StreetMap, strip: Strip, props: Sequence[Prop], ground: NDArray[np.object_]
 ) -> NDArray[np.bool_]:
-    """Which props keep off the clear band, off other streets' ground and off each other, the
-    earlier first."""
+    """Return which props are clear of the free band, other streets and earlier props."""
     area = shapely.box(*_grown(shapely.total_bounds(ground), PROP_END_GAP_M))
     taken: list[shapely.Geometry] = []
     for piece in [piece for kind in _STREET for piece in street_map.near(kind, area)]:
@@ -342,6 +363,7 @@ def _fits(
 def _meets(
     ground: NDArray[np.object_], taken: Sequence[shapely.Geometry], gap_m: float
 ) -> NDArray[np.bool_]:
+    """Return which footprints are within a distance of taken areas."""
     hit = np.zeros(len(ground), dtype=bool)
     if taken:
         hit[shapely.STRtree(taken).query(ground, predicate="dwithin", distance=gap_m)[0]] = True
@@ -349,12 +371,12 @@ def _meets(
 
 
 def _blocks(at_m: float, length_m: float, driveway_m: float) -> bool:
-    """Whether something stands on a driveway or on the ramp to it."""
+    """Return whether a prop stands on a driveway or its ramp."""
     return abs(at_m - driveway_m) < 0.5 * (DRIVEWAY_M + length_m) + RAMP_M
 
 
 def _keys_of(area: shapely.Geometry) -> list[Key]:
-    """The tiles that the bounds of an area touch."""
+    """Return the tiles that the bounds of an area touch."""
     x0, y0, x1, y1 = shapely.bounds(area).tolist()
     (i0, j0) = key_at(x0, y0)
     (i1, j1) = key_at(x1, y1)

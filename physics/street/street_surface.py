@@ -1,5 +1,4 @@
-"""A street map as a surface: tiles, buildings and props by key, heights by point; made when first
-needed on a machine, and kept for all its processes."""
+"""Surface of a street map: tiles, buildings, props and heights, with a disk cache."""
 
 from __future__ import annotations
 
@@ -41,13 +40,13 @@ from physics.street.tile_cache import (
 from physics.textures.ground import layer_of
 
 _KEPT: Final = 100
+"""Number of tiles in the in-memory LRU cache."""
 
 
 class StreetSurface(Surface):
-    """Tiles, buildings and props of a street map under a seed; the least recently used tiles are
-    forgotten.
+    """Surface of a street map for a seed.
 
-    roughness: of the ground, from 0 (flat) to 1.
+    roughness: unevenness of the ground, 0 (flat) to 1
     """
 
     def __init__(self, street_map: StreetMap, seed: int, roughness: float = 0.0) -> None:
@@ -70,6 +69,7 @@ class StreetSurface(Surface):
         return Chunk(tuple(ground), self.buildings(key), self.props(key))
 
     def _patch(self, name: str, mesh: Mesh) -> Patch:
+        """Return a ground mesh with its label, colour and texture layer."""
         label, colour = surface(name)
         shown, colour = (
             (name, colour) if self.street_map.planned else SEEN_AS.get(name, (name, colour))
@@ -89,6 +89,7 @@ class StreetSurface(Surface):
         return self._looking(covers_of_arrays(held))
 
     def _looking(self, covers: Mapping[LandKind, Mesh]) -> tuple[Patch, ...]:
+        """Return covers as patches with the look of their kind of land."""
         laid = []
         for kind, mesh in covers.items():
             name = f"ground:{kind}"
@@ -129,6 +130,7 @@ class StreetSurface(Surface):
         return Finish(tuple(laid), tuple(painted), tuple(styles))
 
     def tile(self, key: Key) -> Tile:
+        """Return the ground of a tile from the cache, or build it."""
         if key not in self._tiles:
             held = self.kept("ground", key, lambda: tile_as_arrays(self._built(key)))
             self._tiles[key] = tile_of_arrays(held, key, self.street_map.terrain)
@@ -141,11 +143,11 @@ class StreetSurface(Surface):
         return self._cache.get(f"{kind}_{key[0]}_{key[1]}", make)
 
     def buildings(self, key: Key) -> tuple[Building, ...]:
-        """Buildings whose centre lies in the tile, on their land."""
+        """Return the buildings whose centre lies in the tile, placed on the land."""
         return self._standing_in(key).buildings
 
     def props(self, key: Key) -> tuple[tuple[Prop, float], ...]:
-        """Props whose middle lies in the tile, each with the height of its foot in metres."""
+        """Return the props whose centre lies in the tile, each with the height of its foot."""
         props = self._standing_in(key).props
         heights = self.tile(key).height([(prop.x_m, prop.y_m) for prop in props])
         if props and not self.level:
@@ -162,10 +164,11 @@ class StreetSurface(Surface):
         )
 
     def standing(self, area: shapely.Geometry) -> list[Prop]:
-        """Props in the tiles that an area touches."""
+        """Return the props in the tiles that an area touches."""
         return [prop for key in keys_in(area) for prop in self._standing_in(key).props]
 
     def _standing_in(self, key: Key) -> TileThings:
+        """Return buildings and props of a tile from the cache, or place them."""
         if key not in self._things:
             held = self.kept("things", key, lambda: things_as_arrays(self._placed(key)))
             self._things[key] = things_of_arrays(held)
@@ -184,7 +187,7 @@ class StreetSurface(Surface):
         return build_tile(self.street_map, key, self._paving, self.roughness, self.seed, roots)
 
     def _trees(self, key: Key) -> list[tuple[float, float]]:
-        """Where trees stand in a tile and around it."""
+        """Return the positions of trees in a tile and its neighbours."""
         around = [(key[0] + i, key[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
         props = [
             prop for near in around for prop in self._standing_in(near).props if prop.kind == "tree"
@@ -192,7 +195,7 @@ class StreetSurface(Surface):
         return [(prop.x_m, prop.y_m) for prop in props]
 
     def heights(self, xy: ArrayLike) -> Floats:
-        """Height of the ground at (N, 2) points, (N,) metres."""
+        """Return the (N,) ground heights in metres at (N, 2) points."""
         xy = np.asarray(xy, dtype=float).reshape(-1, 2)
         cells = cells_of(xy)
         if len(xy) and (cells == cells[0]).all():

@@ -1,4 +1,4 @@
-"""Convert a tile and what stands in it to arrays for the cache, and back without a changed bit."""
+"""Lossless conversion of tiles and their contents to arrays for the disk cache."""
 
 from __future__ import annotations
 
@@ -30,20 +30,28 @@ _ROOMS: Final = (
         for room in ("ground", "street", "textures", "cameras/gl")
     ),
 )
+"""Folders whose source code determines the cached arrays."""
+
 _MADE_BY: Final = f"{sources_hash(*_ROOMS)} {shapely.geos_version_string}"
+"""Cache key part: hash of the sources and version of GEOS."""
+
 _Name = TypeVar("_Name", bound=str)
 
 
 class TileThings(msgspec.Struct, frozen=True, array_like=True):
-    """What stands in a tile: buildings on their land, and props."""
+    """Buildings, placed on the land, and props of a tile."""
 
     buildings: tuple[Building, ...]
     props: tuple[Prop, ...]
 
 
 class _Ground(msgspec.Struct, array_like=True):
-    """What of a tile is no array. parts: names, vertices and triangles of its meshes; low,
-    crossings: WKB; relief: roughness and seed."""
+    """Fields of a tile that are not arrays.
+
+    parts: name, vertex count and triangle count of each mesh
+    low, crossings: areas as WKB
+    relief: roughness and seed, None without relief
+    """
 
     parts: list[tuple[str, int, int]]
     low: bytes
@@ -52,7 +60,7 @@ class _Ground(msgspec.Struct, array_like=True):
 
 
 def tile_cache(street_map: StreetMap, seed: int, roughness: float) -> ArrayCache:
-    """Return the cache of the tiles of a place."""
+    """Return the cache of a map's tiles."""
     told = f"{street_map.made_of} {seed} {roughness!r} {_MADE_BY}"
     return ArrayCache(
         "tiles", hashlib.sha256(told.encode()).hexdigest()[:32] if street_map.made_of else ""
@@ -60,7 +68,7 @@ def tile_cache(street_map: StreetMap, seed: int, roughness: float) -> ArrayCache
 
 
 def tile_as_arrays(tile: Tile) -> Arrays:
-    """For `tile_of_arrays`."""
+    """Convert a tile to arrays for `tile_of_arrays`."""
     relief = tile.relief
     words = _Ground(
         _rows(tile.parts),
@@ -73,7 +81,7 @@ def tile_as_arrays(tile: Tile) -> Arrays:
 
 
 def tile_of_arrays(held: Arrays, key: Key, terrain: Terrain | None) -> Tile:
-    """The tile again."""
+    """Restore a tile from arrays."""
     words = msgspec.msgpack.decode(held["words"].data, type=_Ground)
     parts = _parts_of(words.parts, held)
     low, crossings = shapely.from_wkb([words.low, words.crossings])
@@ -86,20 +94,20 @@ def tile_of_arrays(held: Arrays, key: Key, terrain: Terrain | None) -> Tile:
 
 
 def covers_as_arrays(covers: Mapping[LandKind, Mesh]) -> Arrays:
-    """For `covers_of_arrays`."""
+    """Convert covers to arrays for `covers_of_arrays`."""
     words = np.frombuffer(msgspec.msgpack.encode(_rows(covers)), dtype=np.uint8)
     return {"words": words, **_joined_parts(covers)}
 
 
 def covers_of_arrays(held: Arrays) -> dict[LandKind, Mesh]:
-    """The covers again."""
+    """Restore covers from arrays."""
     return _parts_of(
         msgspec.msgpack.decode(held["words"].data, type=list[tuple[LandKind, int, int]]), held
     )
 
 
 def _rows(parts: Mapping[_Name, Mesh]) -> list[tuple[_Name, int, int]]:
-    """Names of meshes, with how many vertices and triangles they have."""
+    """Return name, vertex count and triangle count of each mesh."""
     return [(name, len(mesh.vertices), len(mesh)) for name, mesh in parts.items()]
 
 
@@ -125,12 +133,12 @@ def _parts_of(rows: Sequence[tuple[_Name, int, int]], held: Arrays) -> dict[_Nam
 
 
 def things_as_arrays(things: TileThings) -> Arrays:
-    """For `things_of_arrays`."""
+    """Convert tile contents to arrays for `things_of_arrays`."""
     return {"words": _as_array(things)}
 
 
 def things_of_arrays(held: Arrays) -> TileThings:
-    """The things again."""
+    """Restore tile contents from arrays."""
     return msgspec.msgpack.decode(held["words"].data, type=TileThings, dec_hook=_geometry)
 
 

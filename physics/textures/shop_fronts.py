@@ -1,4 +1,4 @@
-"""Ground floors: shops with and without awnings, cafes, doors, lobbies, garages, plain walls."""
+"""Ground-floor bays: shops, cafes, entrances, lobbies, garages and blank walls."""
 
 from __future__ import annotations
 
@@ -28,12 +28,16 @@ _FASCIAS: Final[tuple[Colour, ...]] = (
     (0.72, 0.68, 0.60),
     (0.42, 0.34, 0.24),
 )
+"""sRGB colours of shop fronts."""
+
 _CLOTHS: Final[tuple[Colour, ...]] = (
     (0.47, 0.24, 0.21),
     (0.26, 0.37, 0.32),
     (0.28, 0.35, 0.45),
     (0.58, 0.47, 0.30),
 )
+"""sRGB colours of awnings."""
+
 _DOORS: Final[tuple[Colour, ...]] = (
     (0.25, 0.32, 0.28),
     (0.37, 0.24, 0.17),
@@ -42,6 +46,8 @@ _DOORS: Final[tuple[Colour, ...]] = (
     (0.24, 0.24, 0.25),
     (0.50, 0.40, 0.28),
 )
+"""sRGB colours of doors."""
+
 _GOODS: Final[tuple[Colour, ...]] = (
     (0.72, 0.68, 0.60),
     (0.55, 0.42, 0.32),
@@ -52,27 +58,31 @@ _GOODS: Final[tuple[Colour, ...]] = (
     (0.30, 0.33, 0.40),
     (0.78, 0.76, 0.72),
 )
+"""sRGB colours of goods in shop windows."""
+
 _PLINTH_M: Final = 0.42
+"""Height of the plinth in metres."""
 
 
 def _pick(canvas: FacadeCanvas, colours: tuple[Colour, ...]) -> Colour:
+    """Return a random colour."""
     return colours[int(canvas.rng.integers(len(colours)))]
 
 
 def _scaled(colour: Colour, by: float) -> Colour:
+    """Return a brighter or darker colour."""
     return tuple(min(1.0, by * c) for c in colour)  # type: ignore[return-value]
 
 
 def _plinth(canvas: FacadeCanvas) -> None:
-    """The foot of the wall: the wall itself, darker, with a ledge; dirt splashed up from the
-    ground."""
+    """Draw a dark plinth with a ledge and splashed dirt."""
     canvas.shade(0.0, BAY_M, 0.0, _PLINTH_M, 0.42)
     canvas.box(0.0, BAY_M, _PLINTH_M - 0.03, _PLINTH_M, (0.60, 0.59, 0.56), 0.5)
     canvas.shade(0.0, BAY_M, 0.0, 0.12, 0.35)
 
 
 def _display(canvas: FacadeCanvas, x0: float, x1: float, z0: float, z1: float) -> None:
-    """A shop window: a warm room, shelves and goods as soft blocks, the street mirrored on it."""
+    """Draw a shop window with a lit room, shelves, goods and a reflection of the street."""
     rng = canvas.rng
     area, cover, across, up = canvas.local(x0, x1, z0, z1)
     warm = linear((0.68, 0.62, 0.54))
@@ -108,7 +118,7 @@ def _display(canvas: FacadeCanvas, x0: float, x1: float, z0: float, z1: float) -
 
 
 def _fascia(canvas: FacadeCanvas, colour: Colour, z0: float = 2.55, z1: float = 3.0) -> None:
-    """A sign board over the whole bay with an abstract mark: bars and a disc, no letters."""
+    """Draw a sign board across the bay with an abstract mark instead of letters."""
     canvas.box(0.0, BAY_M, z0, z1, colour)
     canvas.box(0.0, BAY_M, z1 - 0.05, z1, _scaled(colour, 1.3))
     canvas.shade(0.0, BAY_M, z0 - 0.12, z0, 0.4, 0.12)
@@ -124,6 +134,7 @@ def _fascia(canvas: FacadeCanvas, colour: Colour, z0: float = 2.55, z1: float = 
 
 
 def _shop(canvas: FacadeCanvas, door: bool = True) -> None:
+    """Draw a shop with or without a door."""
     colour = _FASCIAS[2 * canvas.number % len(_FASCIAS)]
     canvas.box(0.0, BAY_M, 0.0, 3.0, _scaled(colour, 0.9))
     right = 1.85 if door else BAY_M - 0.1
@@ -143,7 +154,7 @@ def _shop(canvas: FacadeCanvas, door: bool = True) -> None:
 
 
 def _awning(canvas: FacadeCanvas, z0: float, z1: float) -> None:
-    """Striped cloth with a straight valance, and its shade on what is below."""
+    """Draw striped cloth with a straight valance and its shadow."""
     cloth = _pick(canvas, _CLOTHS)
     pale = (0.78, 0.76, 0.70)
     canvas.shade(0.0, BAY_M, z0 - 0.85, z0, 0.55, 0.8)
@@ -169,6 +180,7 @@ def _shop_awning(canvas: FacadeCanvas) -> None:
 
 
 def _cafe(canvas: FacadeCanvas, door: bool = False) -> None:
+    """Draw a cafe with or without a door."""
     frame = _FASCIAS[(2 * canvas.number + 1) % len(_FASCIAS)]
     canvas.box(0.0, BAY_M, 0.0, 2.9, frame)
     for k in range(3):
@@ -191,7 +203,7 @@ def _cafe_door(canvas: FacadeCanvas) -> None:
 
 
 def _entrance(canvas: FacadeCanvas) -> None:
-    """The door of a house with flats: leaf, light above it, a step, bells."""
+    """Draw the door of an apartment building with a transom window, a step and bells."""
     _plinth(canvas)
     leaf = _pick(canvas, _DOORS)
     x0 = 0.9
@@ -245,7 +257,7 @@ def _garage(canvas: FacadeCanvas) -> None:
 
 
 def _lobby(canvas: FacadeCanvas) -> None:
-    """Glass from the floor up, in steel."""
+    """Draw a full-height glass front in steel."""
     canvas.box(0.0, BAY_M, 0.0, STOREY_M, (0.30, 0.31, 0.32))
     for k in range(2):
         pane(canvas, 1.5 * k + 0.04, 1.5 * k + 1.46, 0.12, 2.35, dress=False)
@@ -280,4 +292,4 @@ FRONTS: Final[Mapping[str, Callable[[FacadeCanvas], None]]] = {
     "lobby": _lobby,
     "blank": _blank,
 }
-"""Styles of ground floors."""
+"""Ground-floor bay styles by name."""

@@ -1,4 +1,4 @@
-"""What surfaces have in common: a colour that varies a little, stones in joints, grain, dirt."""
+"""Shared steps of surface textures: bonds of bricks and stones, joints, grain and dirt."""
 
 from __future__ import annotations
 
@@ -13,8 +13,12 @@ from physics.textures.noise import Cells, Field, Ids, Noise, blurred, step
 
 @dataclass(frozen=True, slots=True)
 class Bond:
-    """A laid surface. id: (S, S) which unit; edge: (S, S) metres to the middle of the nearest
-    joint; n: units."""
+    """A tileable pattern of bricks, slabs or stones.
+
+    id: (S, S) index of the unit
+    edge: (S, S) distance in metres to the centre of the nearest joint
+    n: number of units
+    """
 
     id: Ids
     edge: Field
@@ -24,8 +28,11 @@ class Bond:
 def courses(
     size: int, side_m: float, rows: int, unit_m: Sequence[float], shift: Sequence[float]
 ) -> Bond:
-    """Rows of units of equal height. unit_m: lengths that follow each other in a row, a whole
-    number of times; shift: how far each row is moved, as a share of the pattern, repeating."""
+    """Return rows of units of equal height.
+
+    unit_m: repeating lengths of the units in a row
+    shift: repeating offsets of the rows, as fractions of the pattern
+    """
     pattern = np.asarray(unit_m, dtype=float)
     period = float(pattern.sum())
     times = round(side_m / period)
@@ -42,7 +49,7 @@ def random_courses(
     heights_m: Sequence[float],
     length_m: tuple[float, float],
 ) -> Bond:
-    """Rows of given heights, of units of random lengths."""
+    """Return rows of given heights with units of random lengths."""
     tops = np.concatenate([[0.0], np.cumsum(heights_m)])
     ends = []
     for _ in heights_m:
@@ -54,7 +61,10 @@ def random_courses(
 
 
 def herringbone(size: int, side_m: float, width_m: float) -> Bond:
-    """Bricks twice as long as wide, at right angles. The side must be a multiple of four widths."""
+    """Return a herringbone of bricks twice as long as wide.
+
+    The side must be a multiple of four widths.
+    """
     i, j, fx, fy = _grid(size, side_m, width_m)
     k = (i - j) % 4
     lying = k < 2
@@ -69,7 +79,10 @@ def herringbone(size: int, side_m: float, width_m: float) -> Bond:
 
 
 def basket(size: int, side_m: float, width_m: float) -> Bond:
-    """Pairs of bricks, turned from square to square. The side must be a multiple of four widths."""
+    """Return pairs of bricks in a basket weave.
+
+    The side must be a multiple of four widths.
+    """
     i, j, fx, fy = _grid(size, side_m, width_m)
     lying = ((i // 2 + j // 2) % 2) == 0
     long = (np.where(lying, i % 2 + fx, j % 2 + fy)) * width_m
@@ -83,6 +96,7 @@ def basket(size: int, side_m: float, width_m: float) -> Bond:
 def _rows(
     size: int, side_m: float, tops: np.ndarray, ends: Sequence[np.ndarray], shift: Sequence[float]
 ) -> Bond:
+    """Return the bond of rows between `tops` with units between `ends`."""
     at = (np.arange(size) + 0.5) / size * side_m
     row = np.clip(np.searchsorted(tops, at, side="right") - 1, 0, len(tops) - 2)
     down = np.minimum(at - tops[row], tops[row + 1] - at).astype(np.float32)
@@ -98,7 +112,7 @@ def _rows(
 
 
 def _grid(size: int, side_m: float, width_m: float) -> tuple[Ids, Ids, Field, Field]:
-    """Columns and rows of a square grid, (S, S), and where in its square each pixel is."""
+    """Return (S, S) columns and rows of a square grid, and each pixel's position in its square."""
     at = (np.arange(size, dtype=np.float32) + 0.5) / size * round(side_m / width_m)
     whole = np.floor(at).astype(np.int32)
     part = (at - whole).astype(np.float32)
@@ -110,7 +124,10 @@ def _grid(size: int, side_m: float, width_m: float) -> tuple[Ids, Ids, Field, Fi
 def plain(
     noise: Noise, colour: Colour, clouds: float = 0.02, grain: float = 0.03, cells: int = 8
 ) -> Rgb:
-    """One colour with large soft patches and fine grain, both given as deviations of sRGB."""
+    """Return one colour with soft patches and fine grain.
+
+    clouds, grain: standard deviations of sRGB
+    """
     tone = np.float32(clouds) * noise.clouds(cells) + np.float32(grain) * noise.grain()
     return np.asarray(
         np.asarray(colour, dtype=np.float32)
@@ -120,14 +137,13 @@ def plain(
 
 
 def mixed(one: Rgb | Colour, two: Rgb | Colour, share: Field) -> Rgb:
-    """`one` where share is 0, `two` where it is 1."""
+    """Blend from `one` at share 0 to `two` at share 1."""
     a, b = np.asarray(one, dtype=np.float32), np.asarray(two, dtype=np.float32)
     return np.asarray(a + (b - a) * share[..., None], dtype=np.float32)
 
 
 def relief(height: Field, strength: float) -> Field:
-    """Light and shade of a height field under a high light from the upper left: factors around
-    1."""
+    """Return brightness factors of a height field lit from the upper left, about 1."""
     slope = np.roll(height, (-1, -1), (0, 1)) - np.roll(height, (1, 1), (0, 1))
     return np.asarray(1.0 + np.clip(np.float32(strength) * slope, -0.35, 0.35), dtype=np.float32)
 
@@ -147,8 +163,14 @@ def laid(
     clouds: float = 0.02,
     joint_tint: float = 0.35,
 ) -> Picture:
-    """Stones in joints. colours: drawn for each unit; spread: deviation of brightness from unit to
-    unit; wobble_m: how uneven edges are; joint_tint: share of the tint in the joints."""
+    """Draw a bond of stones and joints.
+
+    colours: sRGB colours of units, chosen randomly
+    joint: sRGB colour of joints
+    spread: deviation of brightness between units
+    wobble_m: unevenness of edges
+    joint_tint: fraction of the tint in joints
+    """
     pixel_m = side_m / noise.size
     width = max(joint_m, 0.9 * pixel_m)
     edge = bond.edge + np.float32(wobble_m) * noise.clouds(32) if wobble_m else bond.edge
@@ -170,29 +192,32 @@ def laid(
 
 
 def bond_of(found: Cells, side_m: float) -> Bond:
-    """Scattered cells as a bond."""
+    """Return Voronoi cells as a bond."""
     return Bond(found.id, found.edge * np.float32(side_m), found.n)
 
 
 def cracks(noise: Noise, found: Cells, width: float, wiggle: float = 0.012) -> Field:
-    """Lines along some borders of cells, `width` of the side wide: 0 none, 1 in a crack."""
+    """Return the intensity of cracks along some cell borders, 0 to 1.
+
+    width: width of a crack as a fraction of the side
+    """
     edge = noise.warped(found.edge, wiggle, 8)
     line = 1.0 - step(0.25 * width, width, edge)
     return np.asarray(line * step(0.2, 0.9, noise.clouds(4)), dtype=np.float32)
 
 
 def stained(rgb: Rgb, noise: Noise, depth: float = 0.10, cells: int = 8) -> Rgb:
-    """Darker where dirt has settled, in soft patches."""
+    """Darken soft patches as by dirt."""
     dirt = step(-0.4, 2.4, noise.clouds(cells))
     return np.asarray(rgb * (1.0 - np.float32(depth) * dirt[..., None]), dtype=np.float32)
 
 
 def weathered(rgb: Rgb, noise: Noise, depth: float) -> Rgb:
-    """Darker where water has run down a wall."""
+    """Darken vertical streaks as by water."""
     runs = step(-0.6, 3.2, noise.streaks(64, 16) + 0.6 * noise.clouds(8))
     return np.asarray(rgb * (1.0 - np.float32(depth) * runs[..., None]), dtype=np.float32)
 
 
 def shaded(rgb: Rgb, factor: Field) -> Rgb:
-    """Brighter or darker by (S, S) factors."""
+    """Multiply an image by (S, S) factors."""
     return np.asarray(rgb * factor[..., None], dtype=np.float32)
