@@ -17,21 +17,21 @@ _STEPS: Final = 240
 _Timed = Callable[[str, Callable[..., Any]], Callable[..., Any]]
 
 
-def _imported() -> Any:
+def _import_quietly() -> Any:
     """Import PyBullet with stderr redirected, so that progress bars stay intact."""
     sys.stderr.flush()
-    kept = os.dup(2)
+    saved = os.dup(2)
     try:
-        with Path(os.devnull).open("wb") as nowhere:
-            os.dup2(nowhere.fileno(), 2)
+        with Path(os.devnull).open("wb") as devnull:
+            os.dup2(devnull.fileno(), 2)
             import pybullet
     finally:
-        os.dup2(kept, 2)
-        os.close(kept)
+        os.dup2(saved, 2)
+        os.close(saved)
     return pybullet
 
 
-p = _imported()
+p = _import_quietly()
 
 
 def bullet_alone() -> dict[str, str]:

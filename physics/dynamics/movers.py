@@ -55,22 +55,22 @@ def movers_near(
 
     Those missing from `before` are placed at their new pose at once.
     """
-    away = np.hypot(after.xy[:, 0] - x_m, after.xy[:, 1] - y_m)
+    distance = np.hypot(after.xy[:, 0] - x_m, after.xy[:, 1] - y_m)
     same = before.ids == after.ids
     if same:
-        away = np.minimum(away, np.hypot(before.xy[:, 0] - x_m, before.xy[:, 1] - y_m))
+        distance = np.minimum(distance, np.hypot(before.xy[:, 0] - x_m, before.xy[:, 1] - y_m))
     found = []
-    for i in (away <= reach_m + _ROUNDING_M + (0.0 if same else _JUMP_M)).nonzero()[0].tolist():
+    for i in (distance <= reach_m + _ROUNDING_M + (0.0 if same else _JUMP_M)).nonzero()[0].tolist():
         name = after.ids[i]
-        was = None
+        start = None
         if same:
-            was = _pose(before, i)
+            start = _pose(before, i)
         elif name in before.ids:
-            was = _pose(before, before.ids.index(name))
+            start = _pose(before, before.ids.index(name))
         size_m = _PERSON_SIZE_M
         if isinstance(after, Vehicles):
             size_m = float(after.size[i, 0]), float(after.size[i, 1])
-        mover = _moving(name, size_m, was, _pose(after, i))
+        mover = _mover(name, size_m, start, _pose(after, i))
         from_x, from_y = mover.start.x_m - x_m, mover.start.y_m - y_m
         if (
             math.hypot(from_x, from_y) <= reach_m
@@ -80,11 +80,11 @@ def movers_near(
     return found
 
 
-def _moving(name: str, size_m: tuple[float, float], was: Pose | None, end: Pose) -> Mover:
-    if was is None or math.dist(was[:2], end[:2]) > _JUMP_M:
+def _mover(name: str, size_m: tuple[float, float], start: Pose | None, end: Pose) -> Mover:
+    if start is None or math.dist(start[:2], end[:2]) > _JUMP_M:
         return Mover(name, size_m, end)
-    turn = math.pi - (math.pi - (end.heading_rad - was.heading_rad)) % (2.0 * math.pi)
-    return Mover(name, size_m, was, (end.x_m - was.x_m, end.y_m - was.y_m, turn))
+    turn = math.pi - (math.pi - (end.heading_rad - start.heading_rad)) % (2.0 * math.pi)
+    return Mover(name, size_m, start, (end.x_m - start.x_m, end.y_m - start.y_m, turn))
 
 
 def _pose(things: People | Vehicles, row: int) -> Pose:

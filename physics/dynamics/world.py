@@ -51,7 +51,7 @@ _UNLOAD_M: Final = 40.0
 
 _STRAY_M: Final = 0.2
 """Movement of the robot in metres after which contact candidates are selected again."""
-_CLEAR_M: Final = 0.5
+_CONTACT_MARGIN_M: Final = 0.5
 """Margin in metres around the robot for contact candidates.
 
 It exceeds the distance that the robot strays before the next selection.
@@ -59,7 +59,7 @@ It exceeds the distance that the robot strays before the next selection.
 _ROUNDING_M: Final = 1e-6
 """Margin in metres for rounding when deciding whether tiles must be loaded."""
 
-_OWN_M: Final = 0.45
+_SIGHT_MARGIN_M: Final = 0.45
 """Length in metres ignored at both ends of a line of sight.
 
 It covers the robot itself and the body of the target.
@@ -89,10 +89,11 @@ class BulletWorld:
         self._drive = SkidDrive(robot)
         self._bodies: Bodies | None = None
         self._tiles: dict[Key, list[int]] = {}
-        self._streamed = (0.0, 0.0)
-        self._settled_m = 0.0
+        self._loaded_at_m = (0.0, 0.0)
+        self._reload_after_m = 0.0
         self._reach_m = (
-            math.hypot(0.5 * robot.length_m, 0.5 * robot.width_m, robot.height_m) + _CLEAR_M
+            math.hypot(0.5 * robot.length_m, 0.5 * robot.width_m, robot.height_m)
+            + _CONTACT_MARGIN_M
         )
 
     @property
@@ -125,12 +126,12 @@ class BulletWorld:
             self._bodies.close()
             self._bodies = None
             self._tiles.clear()
-            self._settled_m = 0.0
+            self._reload_after_m = 0.0
 
     def place(self, pose: Pose) -> RobotState:
         """Put the robot at rest at a pose, with its wheels on the ground."""
         bodies = self._engine
-        self._stream(pose.x_m, pose.y_m)
+        self._load_tiles(pose.x_m, pose.y_m)
         self._drive.reset()
         z, roll, pitch = self.surface.lean(pose, self.robot.drive.span_m)
         bodies.place_robot((pose.x_m, pose.y_m, z + 0.001), (roll, pitch, pose.heading_rad))
@@ -139,15 +140,15 @@ class BulletWorld:
     def hidden(self, eye_m: Floats, points_m: Floats) -> NDArray[np.bool_]:
         """Return which of (N, 3) points are occluded from the robot's eye (3,), both in metres.
 
-        Bodies within _OWN_M of either end of a line of sight are ignored. Occluders farther than
-        _LOAD_M from the robot may be missing.
+        Bodies within _SIGHT_MARGIN_M of either end of a line of sight are ignored. Occluders
+        farther than _LOAD_M from the robot may be missing.
         """
         rays = points_m - eye_m
         far_m = np.sqrt((rays**2).sum(axis=1))
         hidden = np.zeros(len(points_m), dtype=bool)
-        long = far_m > 2 * _OWN_M
+        long = far_m > 2 * _SIGHT_MARGIN_M
         if long.any():
-            inset = _OWN_M * rays[long] / far_m[long, None]
+            inset = _SIGHT_MARGIN_M * rays[long] / far_m[long, None]
             hidden[long] = self._engine.blocked(eye_m + inset, points_m[long] - inset)
         return hidden
 
@@ -155,7 +156,7 @@ class BulletWorld:
         """Run one tick of physics; people and vehicles move uniformly from `before` to `after`."""
         bodies = self._engine
         x, y, _ = pose = bodies.at_m
-        self._stream(x, y)
+        self._load_tiles(x, y)
         near: dict[Moving, list[Mover]] = {
             "pedestrian": movers_near(before.people, after.people, x, y, PEOPLE_REACH_M),
             "vehicle": movers_near(before.vehicles, after.vehicles, x, y, _VEHICLE_REACH_M),
@@ -165,14 +166,14 @@ class BulletWorld:
             ways = {
                 mover: mover.way(substeps) for mover in movers if not bodies.stands(kind, mover)
             }
-            bodies.lead(kind, ways, self._feet(kind, ways) if ways else [])
-        close = self._watched(near, x, y)
+            bodies.lead(kind, ways, self._foot_heights(kind, ways) if ways else [])
+        close = self._watch_near(near, x, y)
         trace: list[float] = []
         found: set[Contact] = set()
         for k in range(substeps):
             if abs(pose[0] - x) > _STRAY_M or abs(pose[1] - y) > _STRAY_M:
                 x, y, _ = pose
-                close |= self._watched(near, x, y)
+                close |= self._watch_near(near, x, y)
             pose = bodies.step(
                 k, self._drive.joint_speeds(command, bodies.yaw_rate_radps, SUBSTEP_S)
             )
@@ -185,7 +186,7 @@ class BulletWorld:
         contacts = tuple(sorted(found, key=lambda c: (c.substep, c.kind, c.other))) if found else ()
         return Motion(bodies.robot_state(), poses, contacts)
 
-    def _watched(
+    def _watch_near(
         self, near: Mapping[Moving, Sequence[Mover]], x_m: float, y_m: float
     ) -> set[tuple[Moving, Mover]]:
         """Select contact candidates for a robot near a point; return the movers among them."""
@@ -198,7 +199,7 @@ class BulletWorld:
         self._engine.watch(self._reach_m, close)
         return close
 
-    def _feet(self, kind: Moving, ways: Mapping[Mover, TickPoses]) -> list[float]:
+    def _foot_heights(self, kind: Moving, ways: Mapping[Mover, TickPoses]) -> list[float]:
         """Return the ground height in metres under each mover at the end of the tick."""
         end = np.array([way[-1] for way in ways.values()])
         if kind == "pedestrian":
@@ -217,9 +218,12 @@ class BulletWorld:
             hit = boxes_overlap(trace[:, None], half, way, 0.5 * np.array([[mover.size_m]]))
         return [Contact(kind, mover.id, k) for k in np.flatnonzero(hit).tolist()]
 
-    def _stream(self, x_m: float, y_m: float) -> None:
+    def _load_tiles(self, x_m: float, y_m: float) -> None:
         """Load tiles near a point and unload distant ones, once the robot has moved far enough."""
-        if math.hypot(x_m - self._streamed[0], y_m - self._streamed[1]) < self._settled_m:
+        if (
+            math.hypot(x_m - self._loaded_at_m[0], y_m - self._loaded_at_m[1])
+            < self._reload_after_m
+        ):
             return
         bodies = self._engine
         for key in [k for k in self._tiles if distance_to(k, x_m, y_m) > _UNLOAD_M]:
@@ -227,20 +231,17 @@ class BulletWorld:
         for key in keys_within(x_m, y_m, _LOAD_M):
             if key not in self._tiles:
                 self._tiles[key] = bodies.add_chunk(self.surface.chunk(key))
-        ahead = [
+        to_load_m = [
             far_m - _LOAD_M
             for far_m, key in distances_within(x_m, y_m, _UNLOAD_M)
             if key not in self._tiles
         ]
-        left = [_UNLOAD_M - distance_to(key, x_m, y_m) for key in self._tiles]
-        self._streamed = (x_m, y_m)
-        self._settled_m = min(ahead + left) - _ROUNDING_M
+        to_unload_m = [_UNLOAD_M - distance_to(key, x_m, y_m) for key in self._tiles]
+        self._loaded_at_m = (x_m, y_m)
+        self._reload_after_m = min(to_load_m + to_unload_m) - _ROUNDING_M
 
     @property
     def _engine(self) -> Bodies:
         if self._bodies is None:
             raise EngineError("the physics is not running: use BulletWorld in a 'with' block")
         return self._bodies
-
-
-__all__ = ["SUBSTEP_S", "BulletWorld"]

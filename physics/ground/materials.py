@@ -69,18 +69,18 @@ _ROADS: Final[Mapping[str, Mapping[str, float]]] = {
 _VERGES: Final[Mapping[str, Mapping[str, float]]] = {"": {"grass": 1}}
 """Weight of each verge material by street class."""
 
-_PAVED: Final = {"sidewalk": _SIDEWALKS, "road": _ROADS, "verge": _VERGES}
+_WEIGHTS: Final = {"sidewalk": _SIDEWALKS, "road": _ROADS, "verge": _VERGES}
 """Material weights for each kind of paved piece."""
 
-_OVERLAP_M: Final = 0.3
+_LANE_GAP_M: Final = 0.3
 """Largest distance in metres of a point to its lane; lanes leave gaps between them."""
 
-_OF_KIND: Final[Mapping[str, str]] = {"verge": "grass", "ground": "grass"}
+_DEFAULT_MATERIALS: Final[Mapping[str, str]] = {"verge": "grass", "ground": "grass"}
 """Material of each kind of ground whose name has no material."""
 
 PAVINGS: Final[Mapping[str, Colour]] = {
     f"{kind}:{name}:{i}": colour
-    for kind, tables in _PAVED.items()
+    for kind, tables in _WEIGHTS.items()
     for name in dict.fromkeys(name for table in tables.values() for name in table if name)
     for i, colour in enumerate(MATERIALS[name].colours)
 }
@@ -101,7 +101,7 @@ light.
 def friction(surface: str) -> float:
     """Return the friction coefficient of a surface name."""
     kind, _, rest = surface.partition(":")
-    name = rest.partition(":")[0] if rest else _OF_KIND.get(kind, "")
+    name = rest.partition(":")[0] if rest else _DEFAULT_MATERIALS.get(kind, "")
     return MATERIALS[name].friction if name else PLAIN_FRICTION
 
 
@@ -119,7 +119,7 @@ class Paving:
         """
         edge = piece.edge if isinstance(piece, Lane) else piece.id
         strip = self._map.strips.get(edge)
-        tables = _PAVED[piece.kind]
+        tables = _WEIGHTS[piece.kind]
         table = tables.get(strip.street_class if strip is not None else "", tables[""])
         rng = np.random.default_rng(
             [self._seed, zlib.crc32(street_of(edge).encode()), zlib.crc32(piece.kind.encode())]
@@ -161,21 +161,21 @@ class Paving:
         area: area that contains the points
         """
         names = np.asarray(kinds, dtype=object)
-        at = np.asarray(shapely.points(points), dtype=object)
+        located = np.asarray(shapely.points(points), dtype=object)
         in_corner = np.zeros(len(names), dtype=bool)
         corners = [corner.polygon for corner in self._map.near("corner", area)]
         if corners:
-            in_corner[shapely.STRtree(corners).query(at, predicate="intersects")[0]] = True
-        for kind in _PAVED:
-            own = [piece for piece in pieces if piece.kind == kind]
+            in_corner[shapely.STRtree(corners).query(located, predicate="intersects")[0]] = True
+        for kind in _WEIGHTS:
+            candidates = [piece for piece in pieces if piece.kind == kind]
             rows = np.flatnonzero((names == kind) & ~in_corner)
-            if own and len(rows):
-                tree = shapely.STRtree([piece.polygon for piece in own])
-                # Lanes of a road leave gaps between them: the nearest one counts.
+            if candidates and len(rows):
+                tree = shapely.STRtree([piece.polygon for piece in candidates])
+                # Lanes of a road have gaps between them, so the nearest lane is used.
                 row, piece = tree.query_nearest(
-                    at[rows], max_distance=_OVERLAP_M, all_matches=False
+                    located[rows], max_distance=_LANE_GAP_M, all_matches=False
                 )
-                names[rows[row]] = [self.surface(own[k]) for k in piece.tolist()]
+                names[rows[row]] = [self.surface(candidates[k]) for k in piece.tolist()]
         return list(names)
 
 
@@ -189,9 +189,9 @@ def cuts(pieces: Sequence[Strip | Lane]) -> NDArray[np.object_]:
     ends = np.array([(p.line[i, :2], p.line[j, :2]) for p in pieces for i, j in ((0, 1), (-1, -2))])
     along = ends[:, 1] - ends[:, 0]
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-    half = np.repeat([0.5 * p.width_m + _OVERLAP_M for p in pieces], 2)[:, None]
-    aside = half * along[:, ::-1] * (-1.0, 1.0)
+    half = np.repeat([0.5 * p.width_m + _LANE_GAP_M for p in pieces], 2)[:, None]
+    offset = half * along[:, ::-1] * (-1.0, 1.0)
     return np.asarray(
-        shapely.linestrings(np.stack([ends[:, 0] - aside, ends[:, 0] + aside], axis=1)),
+        shapely.linestrings(np.stack([ends[:, 0] - offset, ends[:, 0] + offset], axis=1)),
         dtype=object,
     )

@@ -166,6 +166,17 @@ def plan_triangles(
     return corners, area
 
 
+def flat_shaded(corners: Floats, normals: Floats | None = None) -> Mesh:
+    """Build a mesh of separate triangles.
+
+    corners: (3 * T, 3) m, three per triangle
+    normals: (3 * T, 3) unit vectors; None points all of them up
+    """
+    if normals is None:
+        normals = np.tile([0.0, 0.0, 1.0], (len(corners), 1))
+    return Mesh(corners, normals, np.arange(len(corners), dtype=np.int32).reshape(-1, 3))
+
+
 def quads(corners: Floats) -> Mesh:
     """Build flat quadrilaterals.
 

@@ -95,22 +95,24 @@ class Relief:
         bounds: x0, y0, x1, y1 of the tile, m
         """
         x0, y0, x1, y1 = bounds
-        at_x, at_y = (
+        joints_x, joints_y = (
             np.arange(np.floor(a / SLAB_M), np.ceil(b / SLAB_M) + 1) * SLAB_M
             for a, b in ((x0, x1), (y0, y1))
         )
-        joints = [((x, y0), (x, y1)) for x in at_x.tolist()] + [
-            ((x0, y), (x1, y)) for y in at_y.tolist()
+        joints = [((x, y0), (x, y1)) for x in joints_x.tolist()] + [
+            ((x0, y), (x1, y)) for y in joints_y.tolist()
         ]
         angle = 2.0 * np.pi * np.arange(_SIDES + 1) / _SIDES
         circle = np.column_stack([np.cos(angle), np.sin(angle)])
         rims = [(x, y) + r * circle for x, y, r in self.holes]
         spokes = [(rim[k], rim[k + _SIDES // 2]) for rim in rims for k in (0, _SIDES // 4)]
-        cut = np.asarray(
+        clipped = np.asarray(
             shapely.intersection(shapely.linestrings(np.array(joints)), pavement), dtype=object
         )
-        around = np.array([shapely.LineString(points) for points in [*rims, *spokes]], dtype=object)
-        return np.concatenate([cut, around])
+        outlines = np.array(
+            [shapely.LineString(points) for points in [*rims, *spokes]], dtype=object
+        )
+        return np.concatenate([clipped, outlines])
 
 
 def potholes(
@@ -126,10 +128,10 @@ def potholes(
         for a, b in ((x0, x1), (y0, y1))
     )
     cell = np.stack(np.meshgrid(i, j), axis=-1).reshape(-1, 2)
-    there, u, v, w = (_hashed(cell, seed + 2 + k) for k in range(4))
+    chance, u, v, w = (_hash_noise(cell, seed + 2 + k) for k in range(4))
     x, y = ((cell + np.column_stack([u, v])) * POTHOLE_CELL_M).T
     low, high = POTHOLE_RADIUS_M
-    holes = np.column_stack([x, y, low + (high - low) * w])[there < POTHOLE_SHARE * roughness]
+    holes = np.column_stack([x, y, low + (high - low) * w])[chance < POTHOLE_SHARE * roughness]
     if not len(holes) or shapely.is_empty(road):
         return np.zeros((0, 3))
     inside = shapely.contains_xy(road, holes[:, 0], holes[:, 1])
@@ -152,7 +154,7 @@ def _noise(xy: Floats, cell_m: float, seed: int, smooth: bool, spikes: bool = Fa
     for dx in (0, 1):
         for dy in (0, 1):
             weight = np.abs(1 - dx - share[:, 0]) * np.abs(1 - dy - share[:, 1])
-            node = _hashed(base + np.array([dx, dy]), seed)
+            node = _hash_noise(base + np.array([dx, dy]), seed)
             height = 2.0 * node - 1.0
             if spikes:
                 height = SLAB_HEIGHT_M * height + RAISED_M * (node > 1.0 - RAISED_SHARE)
@@ -160,7 +162,7 @@ def _noise(xy: Floats, cell_m: float, seed: int, smooth: bool, spikes: bool = Fa
     return value
 
 
-def _hashed(cell: Floats, seed: int) -> Floats:
+def _hash_noise(cell: Floats, seed: int) -> Floats:
     """Return a pseudo-random number in [0, 1) for each of (N, 2) integer cells."""
     i, j = cell.astype(np.int64).astype(np.uint64).T
     mixed = i * np.uint64(0x9E3779B97F4A7C15) ^ j * np.uint64(0xC2B2AE3D27D4EB4F)

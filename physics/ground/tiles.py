@@ -81,7 +81,7 @@ def kind_of(name: str) -> str:
     return name.partition(":")[0]
 
 
-_WALKED: Final[tuple[PieceKind, ...]] = ("strip", "corner")
+_WALKABLE: Final[tuple[PieceKind, ...]] = ("strip", "corner")
 """Kinds of map pieces that are walkable."""
 
 _LOW = ("road", "crossing", "stripe")
@@ -134,6 +134,12 @@ def square(key: Key) -> tuple[float, float, float, float]:
     return x, y, x + TILE_M, y + TILE_M
 
 
+def grown_box(bounds: Iterable[float], margin_m: float) -> shapely.Polygon:
+    """Return the box of bounds (x0, y0, x1, y1) enlarged by a margin, in metres."""
+    x0, y0, x1, y1 = (float(b) for b in bounds)
+    return shapely.box(x0 - margin_m, y0 - margin_m, x1 + margin_m, y1 + margin_m)
+
+
 def keys_within(x_m: float, y_m: float, radius_m: float) -> list[Key]:
     """Return the tiles within a radius of a point, row by row."""
     return [key for _, key in distances_within(x_m, y_m, radius_m)]
@@ -180,7 +186,7 @@ def build_tile(
     roots: (N, 2) trees in and around the tile, m
     """
     border = shapely.box(*square(key))
-    reach = shapely.box(*_grown(square(key), RAMP_M + 1.0))
+    reach = grown_box(square(key), RAMP_M + 1.0)
     zones, stripes = _zones(street_map, reach)
     low = shapely.union_all([zones["road"], zones["crossing"]])
     shapely.prepare(low)
@@ -220,7 +226,9 @@ def _zones(
         lane.polygon for lane in lanes if getattr(lane, "kind", "") == "road"
     ]
     roads += [
-        part for j in street_map.near("junction", reach) for part in _driven(street_map, j.polygon)
+        part
+        for j in street_map.near("junction", reach)
+        for part in _junction_roads(street_map, j.polygon)
     ]
     verges = [lane.polygon for lane in lanes if getattr(lane, "kind", "") == "verge"]
     crossings = [s for s in strips if s.kind == "crossing"]
@@ -230,9 +238,12 @@ def _zones(
     crossing = overlay.difference(zebras, pavement)
     road = overlay.difference(_union(roads, reach), overlay.union(pavement, zebras))
     verge = overlay.difference(_union(verges, reach), overlay.union_all([pavement, zebras, road]))
-    mouths = [_driveway(s, at_m, 0.0, 0.1) for s in strips for at_m in s.driveways]
+    mouths = [_driveway_part(s, at_m, 0.0, 0.1) for s in strips for at_m in s.driveways]
     aprons = [
-        _driveway(s, at_m, -s.verge_m, 0.0) for s in strips for at_m in s.driveways if s.verge_m
+        _driveway_part(s, at_m, -s.verge_m, 0.0)
+        for s in strips
+        for at_m in s.driveways
+        if s.verge_m
     ]
     apron = overlay.intersection(_union(aprons, reach, closed=False), verge)
     ramp_to = overlay.union(zebras, _union(mouths, reach, closed=False))
@@ -252,7 +263,7 @@ def _zones(
     return zones, stripes
 
 
-def _driveway(strip: Strip, at_m: float, from_m: float, to_m: float) -> shapely.Polygon:
+def _driveway_part(strip: Strip, at_m: float, from_m: float, to_m: float) -> shapely.Polygon:
     """Return the part of a driveway between two distances from the road's edge.
 
     Distances are positive on the road.
@@ -265,11 +276,11 @@ def _driveway(strip: Strip, at_m: float, from_m: float, to_m: float) -> shapely.
     return shapely.Polygon([near - along, near + along, far + along, far - along])
 
 
-def _driven(street_map: StreetMap, outline: shapely.Geometry) -> list[shapely.Geometry]:
+def _junction_roads(street_map: StreetMap, outline: shapely.Geometry) -> list[shapely.Geometry]:
     """Return the parts of a junction that belong to its roads, without slivers behind corners."""
     junction = shapely.make_valid(outline)
     walked: list[shapely.Geometry] = [
-        p.polygon for kind in _WALKED for p in street_map.near(kind, junction)
+        p.polygon for kind in _WALKABLE for p in street_map.near(kind, junction)
     ]
     lanes = [
         lane.polygon
@@ -351,7 +362,7 @@ def _classify(
     kind[shapely.contains_xy(zones["verge"], x, y)] = "verge"
     pavement = shapely.contains_xy(zones["pavement"], x, y)
     kind[pavement] = "sidewalk"
-    kind[pavement & (_raised(point, zones["ramp_to"]) < CURB_M - 1e-6)] = "ramp"
+    kind[pavement & (_height_above_land(point, zones["ramp_to"]) < CURB_M - 1e-6)] = "ramp"
     kind[shapely.contains_xy(zones["apron"], x, y)] = "ramp"
     points = shapely.points(point)
     kind[shapely.distance(points, zones["road"]) < CURBSTONE_M] = "curb"
@@ -378,17 +389,17 @@ def _triangulate(
     land, low, high = _heights(xy, ramp_to, relief, terrain)
     found = [*SURFACES, *sorted(set(names) - SURFACES.keys())]
     surface_of = np.array([found.index(name) for name in names])[face]
-    lies_low = np.array([kind_of(name) in _LOW for name in found])
+    at_road_level = np.array([kind_of(name) in _LOW for name in found])
     parts = {
-        name: _flat(
+        name: _surface_mesh(
             xy,
-            low if lies_low[i] else high,
+            low if at_road_level[i] else high,
             triangles[surface_of == i],
             relief is not None or terrain is not None,
         )
         for i, name in enumerate(found)
     }
-    walls = _walls(xy, land, high, triangles, lies_low[surface_of])
+    walls = _walls(xy, land, high, triangles, at_road_level[surface_of])
     parts["curb"] = join([parts["curb"], walls])
     return {name: mesh for name, mesh in parts.items() if len(mesh)}
 
@@ -418,7 +429,9 @@ def _walls(
     return Mesh(walls.vertices, walls.normals, walls.triangles[real])
 
 
-def _flat(xy: Floats, z: Floats, triangles: NDArray[np.int64], shaded: bool = False) -> Mesh:
+def _surface_mesh(
+    xy: Floats, z: Floats, triangles: NDArray[np.int64], shaded: bool = False
+) -> Mesh:
     """Build a mesh from the used vertices; `shaded` computes smooth normals."""
     used, index = np.unique(triangles, return_inverse=True)
     corners = index.reshape(-1, 3).astype(np.int32)
@@ -439,21 +452,16 @@ def _heights(
     """
     land = np.zeros(len(xy)) if terrain is None else terrain.height(xy)
     low = land
-    high = _raised(xy, ramp_to)
+    high = _height_above_land(xy, ramp_to)
     if relief is not None:
         low = land + relief.on_road(xy)
         high = high + relief.on_pavement(xy) * high / CURB_M
     return land, low, high if terrain is None else land + high
 
 
-def _raised(xy: Floats, ramp_to: shapely.Geometry) -> Floats:
+def _height_above_land(xy: Floats, ramp_to: shapely.Geometry) -> Floats:
     """Return the height of high ground above the land at (N, 2) points: CURB_M, less on ramps."""
     if shapely.is_empty(ramp_to):
         return np.full(len(xy), CURB_M)
     gap = np.asarray(shapely.distance(shapely.points(xy), ramp_to), dtype=float)
     return np.minimum(CURB_M, gap * RAMP_SLOPE)
-
-
-def _grown(bounds: Iterable[float], by_m: float) -> tuple[float, float, float, float]:
-    x0, y0, x1, y1 = bounds
-    return x0 - by_m, y0 - by_m, x1 + by_m, y1 + by_m

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Polyline
 from cosim.place.street_map import Lane, PieceKind, StreetMap, Strip
 from cosim.place.terrain import Terrain
-from physics.ground.mesh import Mesh, box, join, plan_triangles, quads
-from physics.ground.tiles import CURB_M, Key, key_at, square
+from physics.ground.mesh import Mesh, box, flat_shaded, join, plan_triangles, quads
+from physics.ground.tiles import CURB_M, Key, grown_box, key_at, square
 
 _MARGIN_M: Final = 0.2
 """Smallest distance in metres between a building and walkable or drivable ground."""
 
-_REACH_M: Final = 40.0
+_SEARCH_M: Final = 40.0
 """Distance in metres from a tile within which sidewalks may place buildings in it."""
 
 _STOREY_M: Final = 3.2
@@ -130,17 +130,16 @@ class Frontage:
 
     def in_tile(self, key: Key) -> tuple[Building, ...]:
         """Return the buildings whose centre lies in a tile, in map order."""
-        x0, y0, x1, y1 = square(key)
-        reach = shapely.box(x0 - _REACH_M, y0 - _REACH_M, x1 + _REACH_M, y1 + _REACH_M)
+        reach = grown_box(square(key), _SEARCH_M)
         found = [] if self._mapped is None else list(self._mapped.buildings(key))
         for strip in self._map.near("strip", reach):
             if isinstance(strip, Strip) and strip.kind == "sidewalk" and strip.road_side != 0:
                 if strip.id not in self._rows:
-                    self._rows[strip.id] = self._row(strip)
+                    self._rows[strip.id] = self._generate_row(strip)
                 found += [b for b in self._rows[strip.id] if key_at(b.x_m, b.y_m) == key]
         return tuple(found)
 
-    def _row(self, strip: Strip) -> tuple[Building, ...]:
+    def _generate_row(self, strip: Strip) -> tuple[Building, ...]:
         """Return the generated buildings along a sidewalk."""
         rng = np.random.default_rng([self._seed, zlib.crc32(strip.id.encode())])
         line = Polyline(strip.line if strip.road_side < 0 else strip.line[::-1])
@@ -152,14 +151,14 @@ class Frontage:
             depth, height = float(rng.uniform(*_DEPTH_M)), float(rng.uniform(*_HEIGHT_M))
             facade = int(rng.integers(len(FACADES)))
             gap = float(rng.choice([0.0, 0.0, 3.0]))
-            building = self._fitted(strip, line, at_m, lot, (depth, height, facade), n)
+            building = self._fit_building(strip, line, at_m, lot, (depth, height, facade), n)
             if building is not None:
                 row.append(building)
             at_m += lot + gap
             n += 1
         return tuple(row)
 
-    def _fitted(
+    def _fit_building(
         self,
         strip: Strip,
         line: Polyline,
@@ -200,11 +199,11 @@ class Frontage:
                 (width, deep, height),
                 facade,
             )
-            if self._clear(built):
+            if self._is_clear(built):
                 return built
         return None
 
-    def _clear(self, building: Building) -> bool:
+    def _is_clear(self, building: Building) -> bool:
         """Return whether a building overlaps neither streets nor mapped buildings."""
         outline = building.polygon
         if self._mapped is not None and self._mapped.shows("building", outline):
@@ -248,8 +247,8 @@ def facade_meshes(buildings: tuple[Building, ...]) -> dict[int, Mesh]:
     walls: dict[int, list[Mesh]] = {}
     for b in buildings:
         if b.outline is not None:
-            walls.setdefault(b.facade, []).append(_outlined(b, b.outline))
-            walls.setdefault(-1, []).append(_windows(b))
+            walls.setdefault(b.facade, []).append(_mapped_walls(b, b.outline))
+            walls.setdefault(-1, []).append(_mapped_windows(b))
         else:
             width, deep, height = b.size_m
             body = box((width, deep, height), (0.0, 0.0, 0.5 * height), skip=("bottom",))
@@ -261,7 +260,7 @@ def facade_meshes(buildings: tuple[Building, ...]) -> dict[int, Mesh]:
     return {facade: join(meshes) for facade, meshes in sorted(walls.items())}
 
 
-def _outlined(building: Building, outline: shapely.Polygon) -> Mesh:
+def _mapped_walls(building: Building, outline: shapely.Polygon) -> Mesh:
     """Build walls and the flat roof of a mapped building."""
     x0, y0, x1, y1 = np.array(building.walls).reshape(-1, 4).T
     ground = building.floor_m + CURB_M
@@ -273,16 +272,10 @@ def _outlined(building: Building, outline: shapely.Polygon) -> Mesh:
     ]
     roof, _ = plan_triangles([outline])
     top = np.column_stack([roof.reshape(-1, 2), np.full(3 * len(roof), roof_m)])
-    up = np.tile([0.0, 0.0, 1.0], (len(top), 1))
-    return join(
-        [
-            quads(np.stack(at, axis=1)),
-            Mesh(top, up, np.arange(len(top), dtype=np.int32).reshape(-1, 3)),
-        ]
-    )
+    return join([quads(np.stack(at, axis=1)), flat_shaded(top)])
 
 
-def _windows(building: Building) -> Mesh:
+def _mapped_windows(building: Building) -> Mesh:
     """Build windows and doors in the walls of a mapped building that are long enough."""
     found = []
     for x0, y0, x1, y1 in building.walls:

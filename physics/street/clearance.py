@@ -20,7 +20,7 @@ from physics.street.placement import driveway_ground
 STATION_M: Final = 0.25
 """Distance between cross-sections in metres."""
 
-_AT_ONCE: Final = 400_000
+_BATCH_PAIRS: Final = 400_000
 """Pairs of cross-sections and outline corners per batch; limits memory."""
 
 
@@ -50,7 +50,7 @@ def clear_width(
         )
         if not len(stations):
             stations = np.array([0.5 * line.length_m])
-        middles, aside = _across(line, stations)
+        middles, aside = _cross_sections(line, stations)
         reach = 0.5 * strip.width_m + 0.5
         left, right, within = _gaps(middles, aside, [strip.polygon], reach)
         bare = np.where(within, left + right, 0.0)
@@ -72,7 +72,7 @@ def on_driveways(strips: Iterable[Strip], props: Sequence[Prop]) -> list[str]:
     return [still[i].id for i in np.unique(hit)]
 
 
-def _across(line: Polyline, stations_m: Floats) -> tuple[Floats, Floats]:
+def _cross_sections(line: Polyline, stations_m: Floats) -> tuple[Floats, Floats]:
     """Return (N, 2) points at arc lengths and (N, 2) unit vectors to their left."""
     segment = np.clip(np.searchsorted(line.s_m, stations_m, side="right") - 1, 0, len(line.s_m) - 2)
     steps = np.diff(line.points, axis=0)
@@ -102,7 +102,7 @@ def _gaps(
     along = np.column_stack([aside[:, 1], -aside[:, 0]])
     left, right = np.full(len(middles), reach_m), np.full(len(middles), reach_m)
     to_the_left = np.zeros(len(middles), dtype=int)
-    step = max(_AT_ONCE // max(len(corners), 1), 1)
+    step = max(_BATCH_PAIRS // max(len(corners), 1), 1)
     for i in range(0, len(middles), step):
         rows = slice(i, i + step)
         ahead = along[rows] @ corners.T - (along[rows] * at[rows]).sum(axis=1)[:, None]

@@ -20,15 +20,15 @@ from cosim.core.geometry import Floats, Polyline
 from cosim.place import overlay
 from cosim.place.open_ground import beside, open_ground
 from cosim.place.street_map import LandKind, StreetMap, Strip, street_of
-from physics.ground.mesh import Mesh, join, plan_triangles, quads
-from physics.ground.tiles import DRIVEWAY_M, Tile, square
+from physics.ground.mesh import Mesh, flat_shaded, join, plan_triangles, quads
+from physics.ground.tiles import DRIVEWAY_M, Tile, grown_box, square
 from physics.street.placement import street_style
 from physics.textures.layers import Colour
 
 _LIFT_M: Final = 0.003
 """Height of a cover above the ground in metres."""
 
-_GRID_M: Final = 1e-4
+_EDGE_GRID_M: Final = 1e-4
 """Distance in metres below which edge ends coincide."""
 _AT_END_M: Final = 0.005
 """Tolerance in metres for an edge on the border of a cover."""
@@ -36,12 +36,12 @@ _AT_END_M: Final = 0.005
 _LEVEL_M: Final = 1e-6
 """Height tolerance in metres of level ground."""
 
-_REACH_M: Final = 12.0
+_SEARCH_M: Final = 12.0
 """Distance in metres from a tile within which sidewalks may have frontage in it."""
 
-_UNDER_M: Final = 0.6
+_BED_OVERLAP_M: Final = 0.6
 """Overlap in metres of beds and buildings; fronts are straight where a street bends."""
-_DEEPEST_M: Final = 6.0
+_MAX_DEPTH_M: Final = 6.0
 """Largest depth of a frontage in metres."""
 
 _YARD_M: Final = 3.0
@@ -80,7 +80,7 @@ _COVERS: Final[Mapping[str, tuple[Cover, ...]]] = {
     "ring": (Cover("slabs-square", _SLABS), Cover("concrete-cast", None)),
 }
 """Possible frontage pavings by street class; other classes have gardens."""
-_WAYS: Final = (
+_DRIVEWAYS: Final = (
     Cover("concrete-cast", None),
     Cover("pavers-herringbone", (0.56, 0.52, 0.49)),
     Cover("gravel", None),
@@ -111,9 +111,9 @@ def covers_in(street_map: StreetMap, tile: Tile, rims: bool) -> dict[LandKind, M
     areas = open_ground(street_map, shapely.box(*square(tile.key)))
     outline = overlay.union_all(_outlines(ground)) if areas and rims else None
     for kind, area in areas:
-        mesh = _spread(ground, area)
+        mesh = _clip_simplified(ground, area)
         if outline is not None:
-            mesh = _edged(mesh, shapely.boundary(overlay.intersection(area, outline)))
+            mesh = _with_rim(mesh, shapely.boundary(overlay.intersection(area, outline)))
         if len(mesh):
             found[kind] = mesh
     return found
@@ -121,11 +121,11 @@ def covers_in(street_map: StreetMap, tile: Tile, rims: bool) -> dict[LandKind, M
 
 def laid_over(mesh: Mesh, area: shapely.Geometry) -> Mesh:
     """Return the parts of a mesh within an area, lifted slightly, with a vertical rim."""
-    return _edged(_clipped(mesh, area))
+    return _with_rim(_clip(mesh, area))
 
 
-def _spread(mesh: Mesh, area: shapely.Geometry) -> Mesh:
-    """Clip a mesh to an area like `_clipped`, but with few triangles where it is level."""
+def _clip_simplified(mesh: Mesh, area: shapely.Geometry) -> Mesh:
+    """Clip a mesh to an area like `_clip`, but with few triangles where it is level."""
     height = mesh.vertices[mesh.triangles][:, :, 2]
     level = (height > height.max() - _LEVEL_M).all(axis=1)
     sheet = overlay.intersection(overlay.union_all(_outlines(mesh)[level]), area)
@@ -136,26 +136,25 @@ def _spread(mesh: Mesh, area: shapely.Geometry) -> Mesh:
     ]
     xy = plan_triangles(parts)[0].reshape(-1, 2) if parts else np.zeros((0, 2))
     corners = np.column_stack([xy, np.full(len(xy), height.max() + _LIFT_M)])
-    up = np.tile([0.0, 0.0, 1.0], (len(xy), 1))
-    flat = Mesh(corners, up, np.arange(len(xy), dtype=np.int32).reshape(-1, 3))
-    return join([flat, _clipped(Mesh(mesh.vertices, mesh.normals, mesh.triangles[~level]), area)])
+    flat = flat_shaded(corners)
+    return join([flat, _clip(Mesh(mesh.vertices, mesh.normals, mesh.triangles[~level]), area)])
 
 
-def _clipped(mesh: Mesh, area: shapely.Geometry) -> Mesh:
+def _clip(mesh: Mesh, area: shapely.Geometry) -> Mesh:
     """Return the parts of a mesh within an area, lifted slightly."""
     shapely.prepare(area)
     corners = mesh.vertices[mesh.triangles]
     outlines = _outlines(mesh)
-    met = np.flatnonzero(shapely.intersects(area, outlines))
-    whole = shapely.contains_properly(area, outlines[met])
-    kept = met[whole]
-    used, index = np.unique(mesh.triangles[kept], return_inverse=True)
+    touched = np.flatnonzero(shapely.intersects(area, outlines))
+    whole = shapely.contains_properly(area, outlines[touched])
+    inside = touched[whole]
+    used, index = np.unique(mesh.triangles[inside], return_inverse=True)
     lifted = mesh.vertices[used] + np.array([0.0, 0.0, _LIFT_M])
     found = [Mesh(lifted, mesh.normals[used], index.reshape(-1, 3).astype(np.int32))]
-    for i in met[~whole].tolist():
+    for i in touched[~whole].tolist():
         part = shapely.intersection(outlines[i], area)
         if shapely.area(part) > 1e-4:
-            found.append(_cut(part, corners[i], mesh.normals[mesh.triangles[i]]))
+            found.append(_clip_triangle(part, corners[i], mesh.normals[mesh.triangles[i]]))
     return join(found)
 
 
@@ -164,7 +163,7 @@ def _outlines(mesh: Mesh) -> NDArray[np.object_]:
     return np.asarray(shapely.polygons(mesh.vertices[mesh.triangles][:, :, :2]), dtype=object)
 
 
-def _edged(mesh: Mesh, ends: shapely.Geometry | None = None) -> Mesh:
+def _with_rim(mesh: Mesh, ends: shapely.Geometry | None = None) -> Mesh:
     """Add a vertical rim under the outer edges of a mesh, so that low cameras do not see under it.
 
     ends: border of the mesh; None adds a rim at every edge with only one triangle
@@ -173,25 +172,24 @@ def _edged(mesh: Mesh, ends: shapely.Geometry | None = None) -> Mesh:
         return mesh
     corners = mesh.vertices[mesh.triangles]
     edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
-    grid = np.rint(edges[:, :, :2] / _GRID_M).astype(np.int64)
+    grid = np.rint(edges[:, :, :2] / _EDGE_GRID_M).astype(np.int64)
     one, two = (np.ascontiguousarray(grid[:, i]).view("i8,i8").ravel() for i in (0, 1))
     order = {(a, b): k for k, (a, b) in enumerate(zip(one.tolist(), two.tolist(), strict=True))}
-    alone = edges[[k for (a, b), k in order.items() if (b, a) not in order and a != b]]
-    if ends is not None and len(alone):
-        alone = alone[
-            shapely.dwithin(shapely.points(alone[:, :, :2].mean(axis=1)), ends, _AT_END_M)
+    outer = edges[[k for (a, b), k in order.items() if (b, a) not in order and a != b]]
+    if ends is not None and len(outer):
+        outer = outer[
+            shapely.dwithin(shapely.points(outer[:, :, :2].mean(axis=1)), ends, _AT_END_M)
         ]
-    if not len(alone):
+    if not len(outer):
         return mesh
-    under = alone - np.array([0.0, 0.0, _LIFT_M])
-    rim = quads(np.stack([under[:, 0], under[:, 1], alone[:, 1], alone[:, 0]], axis=1))
-    lit = np.tile(
-        [0.0, 0.0, 1.0], (len(rim.vertices), 1)
-    )  # like the surface: a millimetre's wall would be a dark line
-    return join([mesh, Mesh(rim.vertices, lit, rim.triangles)])
+    below = outer - np.array([0.0, 0.0, _LIFT_M])
+    rim = quads(np.stack([below[:, 0], below[:, 1], outer[:, 1], outer[:, 0]], axis=1))
+    # Upward normals light the rim like the surface; otherwise it would be a dark line.
+    normals = np.tile([0.0, 0.0, 1.0], (len(rim.vertices), 1))
+    return join([mesh, Mesh(rim.vertices, normals, rim.triangles)])
 
 
-def _cut(part: shapely.Geometry, corners: Floats, normals: Floats) -> Mesh:
+def _clip_triangle(part: shapely.Geometry, corners: Floats, normals: Floats) -> Mesh:
     """Triangulate a part of a triangle in the triangle's plane.
 
     corners, normals: (3, 3) of the triangle
@@ -204,26 +202,25 @@ def _cut(part: shapely.Geometry, corners: Floats, normals: Floats) -> Mesh:
     z = shares @ corners[:, 2] + _LIFT_M
     slopes = shares @ normals
     slopes /= np.linalg.norm(slopes, axis=1, keepdims=True)
-    return Mesh(np.column_stack([at, z]), slopes, np.arange(len(at), dtype=np.int32).reshape(-1, 3))
+    return flat_shaded(np.column_stack([at, z]), slopes)
 
 
 def frontage_in(street_map: StreetMap, tile: Tile, seed: int) -> list[Laid]:
     """Return the frontage covers in a tile of a generated city; empty on other maps."""
     if not street_map.planned or "ground" not in tile.parts:
         return []
-    x0, y0, x1, y1 = square(tile.key)
-    reach = shapely.box(x0 - _REACH_M, y0 - _REACH_M, x1 + _REACH_M, y1 + _REACH_M)
+    reach = grown_box(square(tile.key), _SEARCH_M)
     strips = [s for s in street_map.near("strip", reach) if isinstance(s, Strip)]
     areas: dict[Cover, list[shapely.Geometry]] = {}
     for strip in strips:
         if strip.kind == "sidewalk":
-            for cover, area in _of(strip, seed):
+            for cover, area in _frontage_of(strip, seed):
                 areas.setdefault(cover, []).append(area)
     triangles = tile.parts["ground"]
     found: list[Laid] = []
     taken: shapely.Geometry = shapely.Polygon()
     for cover in sorted(
-        areas, key=lambda cover: (cover not in _WAYS, cover.layer, cover.colour or ())
+        areas, key=lambda cover: (cover not in _DRIVEWAYS, cover.layer, cover.colour or ())
     ):
         area = shapely.union_all(areas[cover])
         found.append(Laid(laid_over(triangles, shapely.difference(area, taken)), cover))
@@ -236,11 +233,11 @@ def paved(strip: Strip) -> bool:
     return street_style(strip.street_class) in _COVERS
 
 
-def _of(strip: Strip, seed: int) -> list[tuple[Cover, shapely.Geometry]]:
+def _frontage_of(strip: Strip, seed: int) -> list[tuple[Cover, shapely.Geometry]]:
     """Return the frontage and driveways of a sidewalk with their covers."""
     rng = np.random.default_rng([seed, zlib.crc32(strip.id.encode()), 0xF207])
     edge = 0.5 * strip.width_m
-    depth = min(strip.frontage_m, _DEEPEST_M)
+    depth = min(strip.frontage_m, _MAX_DEPTH_M)
     covers = _COVERS.get(street_style(strip.street_class))
     of_street = np.random.default_rng([seed, zlib.crc32(street_of(strip.id).encode()), 0xF207])
     found: list[tuple[Cover, shapely.Geometry]] = []
@@ -251,8 +248,8 @@ def _of(strip: Strip, seed: int) -> list[tuple[Cover, shapely.Geometry]]:
         found.append((cover, beside(strip, edge - 0.05, edge + depth + _YARD_M)))
     elif strip.street_class == "residential" and rng.random() < 0.6:
         width = float(rng.uniform(*_BED_M))
-        found.append((_BEDS, beside(strip, edge + depth - width, edge + depth + _UNDER_M)))
-    way = _WAYS[int(of_street.integers(len(_WAYS)))]
+        found.append((_BEDS, beside(strip, edge + depth - width, edge + depth + _BED_OVERLAP_M)))
+    way = _DRIVEWAYS[int(of_street.integers(len(_DRIVEWAYS)))]
     middle = Polyline(strip.line)
     for at_m in strip.driveways:
         x, y, heading = middle.at(at_m)

@@ -39,13 +39,11 @@ class Solid:
 
     size_m: length, depth and height; for a cylinder diameter, diameter and height
     at_m: centre on the ground
-    low_m: height of the lower end
     """
 
     shape: Literal["box", "cylinder"]
     size_m: Size
     at_m: tuple[float, float] = (0.0, 0.0)
-    low_m: float = 0.0
 
 
 def upright_solid(size: Size) -> tuple[Solid, ...]:

@@ -22,14 +22,14 @@ from physics.textures.facade_canvas import BAY_M
 
 What = Literal["bench", "window", "stop"]
 
-_BEFORE_M: Final = PERSON_RADIUS_M + 0.05
+_SEAT_FRONT_M: Final = PERSON_RADIUS_M + 0.05
 """Distance in metres from the edge of a bench to a seated person's position, which is at the legs.
 
 See `physics.people.gestures.SEATED_BACK_M`.
 """
 _SEAT_M: Final = 0.36
 """Distance in metres from the centre of a bench to the centre of each of its two seats."""
-_BY_SHELTER_M: Final = 0.45
+_SHELTER_GAP_M: Final = 0.45
 """Distance in metres from a shelter's open side to waiting people."""
 
 _WINDOW_M: Final = (0.8, 0.55, 1.2, 1.6, 2.0, 2.3)
@@ -37,7 +37,7 @@ _WINDOW_M: Final = (0.8, 0.55, 1.2, 1.6, 2.0, 2.3)
 _ROAD_M: Final = 30.0
 """Search radius in metres for the road that people at a shelter watch."""
 
-_DISPLAYS = ("shop-window", "cafe")
+_SHOP_BAYS = ("shop-window", "cafe")
 """Ground-floor bays that are shop windows."""
 
 
@@ -76,11 +76,11 @@ def spots(
         if prop.kind == "bench":
             yield from _seats(prop)
         elif prop.kind == "shelter":
-            yield from _by_shelter(prop, street_map)
+            yield from _shelter_spots(prop, street_map)
     for building in buildings:
         strip = street_map.strips.get(building.id.removeprefix("building:").rpartition(":")[0])
         if strip is not None and not paved(strip):
-            continue  # nobody tramples a garden
+            continue  # people do not walk on gardens
         for number, window in enumerate(shop_windows(building, street_map)):
             for away_m in _WINDOW_M:
                 x = window.x_m - away_m * math.cos(window.heading_rad)
@@ -94,8 +94,8 @@ def spots(
 def _seats(bench: Prop) -> Iterator[InteractionSpot]:
     """Return the seats of a bench; people face right of its heading."""
     for number, along_m in enumerate((-_SEAT_M, _SEAT_M)):
-        seat = _beside(bench, along_m, 0.0)
-        feet = _beside(bench, along_m, 0.5 * bench.size_m[1] + _BEFORE_M)
+        seat = _offset(bench, along_m, 0.0)
+        feet = _offset(bench, along_m, 0.5 * bench.size_m[1] + _SEAT_FRONT_M)
         yield InteractionSpot(
             "bench",
             f"{bench.id}/{number}",
@@ -105,7 +105,7 @@ def _seats(bench: Prop) -> Iterator[InteractionSpot]:
         )
 
 
-def _by_shelter(shelter: Prop, street_map: StreetMap) -> Iterator[InteractionSpot]:
+def _shelter_spots(shelter: Prop, street_map: StreetMap) -> Iterator[InteractionSpot]:
     """Return spots before a shelter's open side, facing the road."""
     point = shapely.Point(shelter.x_m, shelter.y_m)
     lanes = [
@@ -121,13 +121,13 @@ def _by_shelter(shelter: Prop, street_map: StreetMap) -> Iterator[InteractionSpo
     ahead = (to[0] - shelter.x_m) * math.cos(open_rad) + (to[1] - shelter.y_m) * math.sin(open_rad)
     facing = wrap_angle(open_rad if ahead > 0.0 else open_rad + math.pi)
     for number, share in enumerate((-0.3, 0.0, 0.3)):
-        feet = _beside(shelter, share * shelter.size_m[0], 0.5 * shelter.size_m[1] + _BY_SHELTER_M)
+        feet = _offset(shelter, share * shelter.size_m[0], 0.5 * shelter.size_m[1] + _SHELTER_GAP_M)
         yield InteractionSpot(
             "stop", f"{shelter.id}/{number}", *feet, facing, (shelter.x_m, shelter.y_m)
         )
 
 
-def _beside(prop: Prop, along_m: float, right_m: float) -> tuple[float, float]:
+def _offset(prop: Prop, along_m: float, right_m: float) -> tuple[float, float]:
     """Return the point at an offset along and right of a prop."""
     cos, sin = math.cos(prop.heading_rad), math.sin(prop.heading_rad)
     return prop.x_m + along_m * cos + right_m * sin, prop.y_m + along_m * sin - right_m * cos
@@ -136,7 +136,7 @@ def _beside(prop: Prop, along_m: float, right_m: float) -> tuple[float, float]:
 def shop_windows(building: Building, street_map: StreetMap) -> Iterator[ShopWindow]:
     """Return a building's shop windows: ground-floor bays of shops and cafes without a door."""
     face = face_of(building, style_of(building, street_map))
-    if face.front.between not in _DISPLAYS:
+    if face.front.between not in _SHOP_BAYS:
         return
     for x0, y0, x1, y1 in (
         building.walls if building.outline is not None else [_street_wall(building)]
@@ -145,7 +145,7 @@ def shop_windows(building: Building, street_map: StreetMap) -> Iterator[ShopWind
         if width < NARROWEST_FRONT_M:
             continue
         count = max(round(width / BAY_M), 1)
-        into = math.atan2(x1 - x0, -(y1 - y0))  # the outside is to the right of the wall
+        into = math.atan2(x1 - x0, -(y1 - y0))  # the outside is on the right of the wall
         for k in range(count):
             if k % face.front.every != face.first_door:
                 share = (k + 0.5) / count

@@ -27,7 +27,7 @@ HOUSES_M: Final = 30.0
 
 MAPPED_NEAR_M: Final = 40.0
 """Distance in metres from mapped props within which none of the same kind are generated."""
-_SPLINTER_M2: Final = 0.05
+_MIN_PART_M2: Final = 0.05
 """Area in square metres below which a part of a building in a tile is dropped."""
 
 
@@ -42,14 +42,16 @@ class MappedThings:
         for feature in street_map.features:
             if feature.kind not in LANDS:
                 by_kind[feature.kind].append(feature)
-        self._houses = by_kind.pop("building", [])
-        self._floors_m = [_floor_m(house.polygon, street_map.terrain) for house in self._houses]
-        self._house_tree = shapely.STRtree([house.polygon for house in self._houses])
+        self._buildings = by_kind.pop("building", [])
+        self._floors_m = [
+            _floor_m(building.polygon, street_map.terrain) for building in self._buildings
+        ]
+        self._building_tree = shapely.STRtree([building.polygon for building in self._buildings])
         self._trees = {
             kind: shapely.STRtree([shapely.Point(f.x_m, f.y_m) for f in features])
             for kind, features in by_kind.items()
         }
-        self._trees["building"] = self._house_tree
+        self._trees["building"] = self._building_tree
         self.kinds = frozenset(by_kind)
         self._props: dict[Key, list[Prop]] = defaultdict(list)
         for i, feature in enumerate(
@@ -70,10 +72,10 @@ class MappedThings:
         """Return the parts of buildings in a tile, each as a building."""
         tile = shapely.box(*square(key))
         found = []
-        for i in np.sort(self._house_tree.query(tile, predicate="intersects")).tolist():
-            parts = shapely.get_parts(overlay.intersection(self._houses[i].polygon, tile))
-            solid = [p for p in parts if isinstance(p, Polygon) and p.area > _SPLINTER_M2]
-            found += [_building(i, self._houses[i], part, self._floors_m[i]) for part in solid]
+        for i in np.sort(self._building_tree.query(tile, predicate="intersects")).tolist():
+            parts = shapely.get_parts(overlay.intersection(self._buildings[i].polygon, tile))
+            solid = [p for p in parts if isinstance(p, Polygon) and p.area > _MIN_PART_M2]
+            found += [_building(i, self._buildings[i], part, self._floors_m[i]) for part in solid]
         return tuple(found)
 
     def shows(self, kind: str, place: shapely.Geometry) -> bool:
@@ -92,12 +94,12 @@ def _prop(number: int, feature: Feature) -> Prop:
     is random by number.
     """
     kind = KINDS[feature.kind]
-    drawn = zlib.crc32(f"{feature.kind}:{number}".encode())
-    variant = drawn % PROP_VARIANTS
+    random_number = zlib.crc32(f"{feature.kind}:{number}".encode())
+    variant = random_number % PROP_VARIANTS
     if feature.height_m > 0.0:
         variant = min(range(PROP_VARIANTS), key=lambda v: abs(kind.size_m(v)[2] - feature.height_m))
-    paint = drawn // PROP_VARIANTS % len(kind.paints)
-    turned = number % 7 * 0.9 if kind.grown else 0.0
+    paint = random_number // PROP_VARIANTS % len(kind.paints)
+    turned_rad = number % 7 * 0.9 if kind.grown else 0.0
     return Prop(
         f"prop:map:{number}",
         feature.kind,
@@ -106,7 +108,7 @@ def _prop(number: int, feature: Feature) -> Prop:
         feature.y_m,
         feature.heading_rad,
         paint,
-        turned,
+        turned_rad,
     )
 
 
@@ -119,13 +121,13 @@ def _floor_m(whole: Polygon, terrain: Terrain | None) -> float:
     )
 
 
-def _building(number: int, house: Feature, part: Polygon, floor_m: float) -> Building:
+def _building(number: int, building: Feature, part: Polygon, floor_m: float) -> Building:
     """Return a part of a mapped building as a building.
 
     It has the whole building's name and appearance. Its box is the bounding box along the street.
     """
     part = shapely.orient_polygons(part)
-    cos, sin = math.cos(house.heading_rad), math.sin(house.heading_rad)
+    cos, sin = math.cos(building.heading_rad), math.sin(building.heading_rad)
     turn = np.array([[cos, -sin], [sin, cos]])
     corners = shapely.get_coordinates(part) @ turn
     low, high = corners.min(axis=0), corners.max(axis=0)
@@ -135,11 +137,11 @@ def _building(number: int, house: Feature, part: Polygon, floor_m: float) -> Bui
         id=f"building:map:{number}",
         x_m=x,
         y_m=y,
-        heading_rad=house.heading_rad,
-        size_m=(length, deep, house.height_m),
-        facade=zlib.crc32(f"{number}:{house.x_m:.2f}".encode()) % len(FACADES),
+        heading_rad=building.heading_rad,
+        size_m=(length, deep, building.height_m),
+        facade=zlib.crc32(f"{number}:{building.x_m:.2f}".encode()) % len(FACADES),
         outline=part,
-        walls=_walls(part, house.polygon),
+        walls=_walls(part, building.polygon),
         floor_m=floor_m,
         base_m=floor_m,
     )

@@ -32,7 +32,7 @@ def wheeled_bin(size: Size) -> tuple[Part, ...]:
         _tapered((0.5 * length, 0.5 * depth), (0.42 * length, 0.42 * depth), 0.9 * h, h),
         box((0.05, 0.8 * depth, 0.05), (-0.5 * length + 0.025, 0.0, 0.9 * h - 0.02)),
     ]
-    wheels = [_wheel(0.1, 0.1, (-0.3 * length, s * 0.32 * depth, 0.1)) for s in (-1, 1)]
+    wheels = [_ring(0.1, 0.1, 0.099, (-0.3 * length, s * 0.32 * depth, 0.1)) for s in (-1, 1)]
     return Part(body, None), Part(join(lid), METAL), Part(join(wheels), _RUBBER)
 
 
@@ -70,7 +70,7 @@ def sandwich_board(size: Size) -> tuple[Part, ...]:
     tall = (h - 0.02) / math.cos(lean)
     boards = []
     faces = []
-    words = []
+    text_lines = []
     for side in (-1, 1):
         foot = side * (0.5 * length - 0.03)
         pivot = (foot, 0.0, 0.0)
@@ -88,8 +88,8 @@ def sandwich_board(size: Size) -> tuple[Part, ...]:
                 (0.008, share * depth, 0.07 * tall),
                 (foot + side * 0.020, 0.0, (0.78 - 0.17 * k) * tall),
             )
-            words.append(box(*line, skip=("bottom", "top")).tilted(-side * lean, pivot))
-    return Part(join(boards), WHITE), Part(join(faces), None), Part(join(words), _PAPER)
+            text_lines.append(box(*line, skip=("bottom", "top")).tilted(-side * lean, pivot))
+    return Part(join(boards), WHITE), Part(join(faces), None), Part(join(text_lines), _PAPER)
 
 
 def construction_fence(size: Size) -> tuple[Part, ...]:
@@ -141,10 +141,6 @@ def _tube(one: tuple[float, float], other: tuple[float, float], thick_m: float) 
     far = math.hypot(x1 - x0, z1 - z0)
     bar = box((far, thick_m, thick_m), (x0 + 0.5 * far, 0.0, z0), skip=("front", "back"))
     return bar.tilted(-math.atan2(z1 - z0, x1 - x0), (x0, 0.0, z0))
-
-
-def _wheel(radius_m: float, wide_m: float, centre_m: tuple[float, float, float]) -> Mesh:
-    return _ring(radius_m, wide_m, radius_m - 0.001, centre_m)
 
 
 def _ring(

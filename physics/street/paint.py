@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats, Polyline
 from cosim.place.street_map import Lane, StreetMap, Strip
-from physics.ground.mesh import EMPTY, Mesh, join, plan_triangles
-from physics.ground.tiles import Tile, key_at, kind_of, square
+from physics.ground.mesh import EMPTY, Mesh, flat_shaded, join, plan_triangles
+from physics.ground.tiles import Tile, grown_box, key_at, kind_of, square
 
 LINE_M: Final = 0.12
 """Width of lane lines in metres."""
@@ -34,7 +34,7 @@ _DASH_M: Final = (3.0, 6.0)
 
 _CENTRE_DASH_M: Final = (3.0, 3.0)
 """Length of a centre-line dash and of the gap after it in metres."""
-_PIECE_M: Final = 1.0
+_QUAD_MAX_M: Final = 1.0
 """Largest length in metres of a quad, so that lines follow bends and slopes."""
 
 _STOP_BEFORE_M: Final = 0.5
@@ -49,36 +49,35 @@ _TACTILE_BEHIND_M: Final = 0.25
 _LIFT_M: Final = 0.004
 """Height of paint above the ground in metres."""
 
-_REACH_M: Final = 8.0
+_SEARCH_M: Final = 8.0
 """Distance in metres from a tile within which streets may have paint in it."""
 
-_WALKED_ON: Final = ("sidewalk", "ramp", "curb")
+_WALKABLE: Final = ("sidewalk", "ramp", "curb")
 """Kinds of ground that tactile paving covers."""
 
 
 def paint_in(street_map: StreetMap, tile: Tile) -> Mapping[str, Mesh]:
     """Return the paint of a tile by ground layer, 4 mm above the ground."""
-    x0, y0, x1, y1 = square(tile.key)
-    reach = shapely.box(x0 - _REACH_M, y0 - _REACH_M, x1 + _REACH_M, y1 + _REACH_M)
+    reach = grown_box(square(tile.key), _SEARCH_M)
     lanes = [lane for lane in street_map.near("lane", reach) if isinstance(lane, Lane)]
     roads = [lane for lane in lanes if lane.kind == "road" and not lane.internal]
     strips = [strip for strip in street_map.near("strip", reach) if isinstance(strip, Strip)]
     crossings = [strip for strip in strips if strip.kind == "crossing"]
-    lines = [quad for lane in roads for quad in _lines(street_map, lane)]
+    lines = [quad for lane in roads for quad in _lane_lines(street_map, lane)]
     lines += [quad for lane in roads for quad in _stop_line(lane, crossings)]
-    found = {"paint": _laid([np.asarray(quad) for quad in lines], tile)}
-    found["tactile-domes"] = _fields(street_map, crossings, tile)
+    found = {"paint": _marking_mesh([np.asarray(quad) for quad in lines], tile)}
+    found["tactile-domes"] = _tactile_mesh(street_map, crossings, tile)
     return {name: mesh for name, mesh in found.items() if len(mesh)}
 
 
-def _lines(street_map: StreetMap, lane: Lane) -> Iterator[Floats]:
+def _lane_lines(street_map: StreetMap, lane: Lane) -> Iterator[Floats]:
     """Return quads (4, 2) along the inner side of a lane: a lane line or a centre line."""
     side = -1.0 if street_map.left_hand else 1.0
     edge, _, index = lane.id.rpartition("_")
-    beside = street_map.lanes.get(f"{edge}_{int(index) + 1}") if index.isdecimal() else None
-    if beside is not None and beside.kind == "road":
+    neighbour = street_map.lanes.get(f"{edge}_{int(index) + 1}") if index.isdecimal() else None
+    if neighbour is not None and neighbour.kind == "road":
         dash = _DASH_M
-    elif _meets(street_map, lane, side, f"-{edge}"):
+    elif _is_adjacent(street_map, lane, side, f"-{edge}"):
         dash = _CENTRE_DASH_M
     else:
         return
@@ -86,12 +85,12 @@ def _lines(street_map: StreetMap, lane: Lane) -> Iterator[Floats]:
     end_m = line.length_m - 1.0
     for start in np.arange(0.5, end_m, sum(dash)):
         stop = min(start + dash[0], end_m)
-        count = max(math.ceil((stop - start) / _PIECE_M), 1)
+        count = max(math.ceil((stop - start) / _QUAD_MAX_M), 1)
         cuts = np.linspace(start, stop, count + 1)
         yield from _band(line, cuts, side * 0.5 * lane.width_m, LINE_M)
 
 
-def _meets(street_map: StreetMap, lane: Lane, side: float, edge: str) -> bool:
+def _is_adjacent(street_map: StreetMap, lane: Lane, side: float, edge: str) -> bool:
     """Return whether lanes of another edge are adjacent, without a verge.
 
     side: 1 for left, -1 for right
@@ -115,7 +114,7 @@ def _stop_line(lane: Lane, crossings: Sequence[Strip]) -> Iterator[Floats]:
             and end.distance(crossing.polygon) < _STOP_WITHIN_M
         ):
             line = Polyline(lane.line)
-            at_m = min(line.length_m, _before(line, crossing)) - _STOP_BEFORE_M
+            at_m = min(line.length_m, _crossing_at_m(line, crossing)) - _STOP_BEFORE_M
             if at_m > 1.0:
                 yield from _band(
                     line, np.array([at_m - STOP_LINE_M, at_m]), 0.0, lane.width_m - 0.2
@@ -123,7 +122,7 @@ def _stop_line(lane: Lane, crossings: Sequence[Strip]) -> Iterator[Floats]:
             return
 
 
-def _before(line: Polyline, crossing: Strip) -> float:
+def _crossing_at_m(line: Polyline, crossing: Strip) -> float:
     """Return the arc length at which a line meets a crossing; infinite if it does not."""
     met = shapely.intersection(shapely.LineString(line.points), crossing.polygon)
     if shapely.is_empty(met):
@@ -146,7 +145,7 @@ def _band(line: Polyline, cuts: Floats, aside_m: float, width_m: float) -> Itera
         yield np.stack([right0, right1, left1, left0])
 
 
-def _laid(quads: Sequence[Floats], tile: Tile) -> Mesh:
+def _marking_mesh(quads: Sequence[Floats], tile: Tile) -> Mesh:
     """Return the mesh of quads (4, 2) whose centre is in the tile, on its ground."""
     own = [quad for quad in quads if key_at(*quad.mean(axis=0).tolist()) == tile.key]
     if not own:
@@ -165,19 +164,19 @@ def _on_ground(xy: Floats, triangles: NDArray[np.int64], tile: Tile) -> Mesh:
     )
 
 
-def _fields(street_map: StreetMap, crossings: Sequence[Strip], tile: Tile) -> Mesh:
+def _tactile_mesh(street_map: StreetMap, crossings: Sequence[Strip], tile: Tile) -> Mesh:
     """Return tactile paving at both ends of crossings, clipped to walkable ground of the tile."""
     border = shapely.box(*square(tile.key))
     ends = [(line, one.width_m) for one in crossings for line in (one.line, one.line[::-1])]
-    fields = [_field(street_map, Polyline(line), width_m) for line, width_m in ends]
+    fields = [_tactile_area(street_map, Polyline(line), width_m) for line, width_m in ends]
     here = [field for field in fields if shapely.intersects(field, border)]
     if not here:
         return EMPTY
-    walked = join([mesh for name, mesh in tile.parts.items() if kind_of(name) in _WALKED_ON])
-    return join([_draped(field, walked) for field in here])
+    walkable = join([mesh for name, mesh in tile.parts.items() if kind_of(name) in _WALKABLE])
+    return join([_drape(field, walkable) for field in here])
 
 
-def _draped(field: shapely.Geometry, ground: Mesh) -> Mesh:
+def _drape(field: shapely.Geometry, ground: Mesh) -> Mesh:
     """Return a field cut along the ground's triangles and lifted 4 mm above them."""
     faces = ground.vertices[ground.triangles]
     normal = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
@@ -192,11 +191,10 @@ def _draped(field: shapely.Geometry, ground: Mesh) -> Mesh:
     slope = normal[of, None, :2] / normal[of, None, 2:]
     z = faces[of, :1, 2] - ((xy - faces[of, :1, :2]) * slope).sum(axis=2)
     vertices = np.concatenate([xy, z[..., None] + _LIFT_M], axis=2).reshape(-1, 3)
-    up = np.tile([0.0, 0.0, 1.0], (len(vertices), 1))
-    return Mesh(vertices, up, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3))
+    return flat_shaded(vertices)
 
 
-def _field(street_map: StreetMap, line: Polyline, width_m: float) -> shapely.Geometry:
+def _tactile_area(street_map: StreetMap, line: Polyline, width_m: float) -> shapely.Geometry:
     """Return the area of tactile paving beyond the end of a crossing's line."""
     x, y, heading = line.at(line.length_m)
     along = np.array([math.cos(heading), math.sin(heading)])
@@ -204,10 +202,12 @@ def _field(street_map: StreetMap, line: Polyline, width_m: float) -> shapely.Geo
     near = np.array([x, y]) + _TACTILE_BEHIND_M * along
     far = near + TACTILE_M * along
     field = shapely.Polygon([near - left, far - left, far + left, near + left])
-    walked = [corner.polygon for corner in street_map.near("corner", field)]
-    walked += [
+    walkable = [corner.polygon for corner in street_map.near("corner", field)]
+    walkable += [
         s.polygon
         for s in street_map.near("strip", field)
         if isinstance(s, Strip) and s.kind == "sidewalk"
     ]
-    return shapely.intersection(field, shapely.union_all(walked)) if walked else shapely.Polygon()
+    return (
+        shapely.intersection(field, shapely.union_all(walkable)) if walkable else shapely.Polygon()
+    )

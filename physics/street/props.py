@@ -12,7 +12,7 @@ from cosim.core.geometry import Polyline
 from cosim.place.street_map import StreetMap, Strip
 from cosim.spec.scenario import Barrier
 from physics.ground.mesh import Mesh, box, join
-from physics.ground.tiles import Key, key_at, square
+from physics.ground.tiles import Key, grown_box, key_at, square
 
 PROP_RED: Final = (0.82, 0.10, 0.09)
 PROP_WHITE: Final = (0.93, 0.93, 0.91)
@@ -59,8 +59,7 @@ class SignalPost:
 
 def posts_in(street_map: StreetMap, key: Key) -> list[SignalPost]:
     """Return the pedestrian signals in a tile."""
-    x0, y0, x1, y1 = square(key)
-    strips = street_map.near("strip", shapely.box(x0 - 5.0, y0 - 5.0, x1 + 5.0, y1 + 5.0))
+    strips = street_map.near("strip", grown_box(square(key), 5.0))
     crossings = [s for s in strips if isinstance(s, Strip) and s.signalised]
     posts = [post for s in crossings for post in signal_posts(street_map, s)]
     return [post for post in posts if key_at(post.x_m, post.y_m) == key]
@@ -74,12 +73,13 @@ def signal_posts(street_map: StreetMap, crossing: Strip) -> tuple[SignalPost, Si
     """
     line = Polyline(crossing.line)
     first, second = (
-        _post(street_map, crossing, Polyline(points)) for points in (line.points, line.points[::-1])
+        _signal_post(street_map, crossing, Polyline(points))
+        for points in (line.points, line.points[::-1])
     )
     return first, second
 
 
-def _post(street_map: StreetMap, crossing: Strip, line: Polyline) -> SignalPost:
+def _signal_post(street_map: StreetMap, crossing: Strip, line: Polyline) -> SignalPost:
     x, y, heading = line.at(line.length_m)
     cos, sin = math.cos(heading), math.sin(heading)
     aside = 0.5 * crossing.width_m + 0.3

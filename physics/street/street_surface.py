@@ -39,7 +39,7 @@ from physics.street.tile_cache import (
 )
 from physics.textures.ground import layer_of
 
-_KEPT: Final = 100
+_CACHED_TILES: Final = 100
 """Number of tiles in the in-memory LRU cache."""
 
 
@@ -81,14 +81,14 @@ class StreetSurface(Surface):
     def covers(self, key: Key) -> tuple[Patch, ...]:
         if self.street_map.planned:
             return ()
-        held = self.kept(
+        arrays = self.kept(
             "covers",
             key,
             lambda: covers_as_arrays(covers_in(self.street_map, self.tile(key), rims=False)),
         )
-        return self._looking(covers_of_arrays(held))
+        return self._cover_patches(covers_of_arrays(arrays))
 
-    def _looking(self, covers: Mapping[LandKind, Mesh]) -> tuple[Patch, ...]:
+    def _cover_patches(self, covers: Mapping[LandKind, Mesh]) -> tuple[Patch, ...]:
         """Return covers as patches with the look of their kind of land."""
         laid = []
         for kind, mesh in covers.items():
@@ -105,7 +105,7 @@ class StreetSurface(Surface):
     def finish(self, key: Key) -> Finish:
         tile = self.tile(key)
         painted = []
-        laid = [*self._looking(covers_in(self.street_map, tile, rims=True))]
+        laid = [*self._cover_patches(covers_in(self.street_map, tile, rims=True))]
         for mesh, (layer, colour) in frontage_in(self.street_map, tile, self.seed):
             tint = colour or (1.0, 1.0, 1.0)
             laid.append(
@@ -132,9 +132,9 @@ class StreetSurface(Surface):
     def tile(self, key: Key) -> Tile:
         """Return the ground of a tile from the cache, or build it."""
         if key not in self._tiles:
-            held = self.kept("ground", key, lambda: tile_as_arrays(self._built(key)))
-            self._tiles[key] = tile_of_arrays(held, key, self.street_map.terrain)
-            if len(self._tiles) > _KEPT:
+            arrays = self.kept("ground", key, lambda: tile_as_arrays(self._built(key)))
+            self._tiles[key] = tile_of_arrays(arrays, key, self.street_map.terrain)
+            if len(self._tiles) > _CACHED_TILES:
                 self._tiles.popitem(last=False)
         self._tiles.move_to_end(key)
         return self._tiles[key]
@@ -144,11 +144,11 @@ class StreetSurface(Surface):
 
     def buildings(self, key: Key) -> tuple[Building, ...]:
         """Return the buildings whose centre lies in the tile, placed on the land."""
-        return self._standing_in(key).buildings
+        return self._things_in(key).buildings
 
     def props(self, key: Key) -> tuple[tuple[Prop, float], ...]:
         """Return the props whose centre lies in the tile, each with the height of its foot."""
-        props = self._standing_in(key).props
+        props = self._things_in(key).props
         heights = self.tile(key).height([(prop.x_m, prop.y_m) for prop in props])
         if props and not self.level:
             sizes = np.array([prop.size_m[:2] for prop in props])
@@ -165,32 +165,30 @@ class StreetSurface(Surface):
 
     def standing(self, area: shapely.Geometry) -> list[Prop]:
         """Return the props in the tiles that an area touches."""
-        return [prop for key in keys_in(area) for prop in self._standing_in(key).props]
+        return [prop for key in keys_in(area) for prop in self._things_in(key).props]
 
-    def _standing_in(self, key: Key) -> TileThings:
+    def _things_in(self, key: Key) -> TileThings:
         """Return buildings and props of a tile from the cache, or place them."""
         if key not in self._things:
-            held = self.kept("things", key, lambda: things_as_arrays(self._placed(key)))
-            self._things[key] = things_of_arrays(held)
+            arrays = self.kept("things", key, lambda: things_as_arrays(self._place_things(key)))
+            self._things[key] = things_of_arrays(arrays)
         return self._things[key]
 
-    def _placed(self, key: Key) -> TileThings:
+    def _place_things(self, key: Key) -> TileThings:
         buildings = self._frontage.in_tile(key)
         terrain = self.street_map.terrain
-        on_their_land = (
-            buildings if terrain is None else tuple(on_land(b, terrain) for b in buildings)
-        )
-        return TileThings(on_their_land, self._placement.in_tile(key))
+        grounded = buildings if terrain is None else tuple(on_land(b, terrain) for b in buildings)
+        return TileThings(grounded, self._placement.in_tile(key))
 
     def _built(self, key: Key) -> Tile:
-        roots = self._trees(key) if self.roughness > 0.0 else []
+        roots = self._tree_positions(key) if self.roughness > 0.0 else []
         return build_tile(self.street_map, key, self._paving, self.roughness, self.seed, roots)
 
-    def _trees(self, key: Key) -> list[tuple[float, float]]:
+    def _tree_positions(self, key: Key) -> list[tuple[float, float]]:
         """Return the positions of trees in a tile and its neighbours."""
         around = [(key[0] + i, key[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
         props = [
-            prop for near in around for prop in self._standing_in(near).props if prop.kind == "tree"
+            prop for near in around for prop in self._things_in(near).props if prop.kind == "tree"
         ]
         return [(prop.x_m, prop.y_m) for prop in props]
 

@@ -27,7 +27,7 @@ from physics.street.props import SignalPost
 from physics.textures.facades import WallStyle
 from physics.textures.layers import Colour
 
-_WHEELS: Final = np.array([0.32, 0.4])
+_WHEEL_SHARE: Final = np.array([0.32, 0.4])
 """Position of a vehicle's wheels as a fraction of its length and width from the centre."""
 
 
@@ -82,7 +82,7 @@ class Surface(ABC):
 
     seed: int = 0
     level: bool = False
-    _leant: tuple[Pose, tuple[float, float], tuple[float, float, float]] | None = None
+    _last_lean: tuple[Pose, tuple[float, float], tuple[float, float, float]] | None = None
 
     @abstractmethod
     def heights(self, xy: ArrayLike) -> Floats:
@@ -141,15 +141,15 @@ class Surface(ABC):
         size_m: (N, 2) length and width
         """
         size = np.asarray(size_m, dtype=float).reshape(-1, 2)
-        land = self._land_around(xy, heading_rad, _WHEELS * size)
+        land = self._land_around(xy, heading_rad, _WHEEL_SHARE * size)
         if land is None:
             return np.zeros((len(size), 3))
         front_left, front_right, rear_left, rear_right = land.T
         pitch = np.arctan2(
-            rear_left + rear_right - front_left - front_right, 4.0 * _WHEELS[0] * size[:, 0]
+            rear_left + rear_right - front_left - front_right, 4.0 * _WHEEL_SHARE[0] * size[:, 0]
         )
         roll = np.arctan2(
-            front_left + rear_left - front_right - rear_right, 4.0 * _WHEELS[1] * size[:, 1]
+            front_left + rear_left - front_right - rear_right, 4.0 * _WHEEL_SHARE[1] * size[:, 1]
         )
         return np.column_stack([land.mean(axis=1), roll, pitch])
 
@@ -185,9 +185,9 @@ class Surface(ABC):
 
         The last result is cached.
         """
-        if self._leant is None or self._leant[:2] != (pose, span_m):
-            self._leant = pose, span_m, self._lean(pose, span_m)
-        return self._leant[2]
+        if self._last_lean is None or self._last_lean[:2] != (pose, span_m):
+            self._last_lean = pose, span_m, self._lean(pose, span_m)
+        return self._last_lean[2]
 
     def _lean(self, pose: Pose, span_m: tuple[float, float]) -> tuple[float, float, float]:
         cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)

@@ -23,16 +23,16 @@ from physics.ground.tiles import Key, Tile
 from physics.street.buildings import Building
 from physics.street.furniture import Prop
 
-_ROOMS: Final = (
-    *(Path(cosim.__file__).parent / room for room in ("core", "place")),
+_SOURCE_FOLDERS: Final = (
+    *(Path(cosim.__file__).parent / folder for folder in ("core", "place")),
     *(
-        Path(physics.__file__).parent / room
-        for room in ("ground", "street", "textures", "cameras/gl")
+        Path(physics.__file__).parent / folder
+        for folder in ("ground", "street", "textures", "cameras/gl")
     ),
 )
 """Folders whose source code determines the cached arrays."""
 
-_MADE_BY: Final = f"{sources_hash(*_ROOMS)} {shapely.geos_version_string}"
+_SOURCES_KEY: Final = f"{sources_hash(*_SOURCE_FOLDERS)} {shapely.geos_version_string}"
 """Cache key part: hash of the sources and version of GEOS."""
 
 _Name = TypeVar("_Name", bound=str)
@@ -45,7 +45,7 @@ class TileThings(msgspec.Struct, frozen=True, array_like=True):
     props: tuple[Prop, ...]
 
 
-class _Ground(msgspec.Struct, array_like=True):
+class _TileFields(msgspec.Struct, array_like=True):
     """Fields of a tile that are not arrays.
 
     parts: name, vertex count and triangle count of each mesh
@@ -61,16 +61,16 @@ class _Ground(msgspec.Struct, array_like=True):
 
 def tile_cache(street_map: StreetMap, seed: int, roughness: float) -> ArrayCache:
     """Return the cache of a map's tiles."""
-    told = f"{street_map.made_of} {seed} {roughness!r} {_MADE_BY}"
+    key_text = f"{street_map.made_of} {seed} {roughness!r} {_SOURCES_KEY}"
     return ArrayCache(
-        "tiles", hashlib.sha256(told.encode()).hexdigest()[:32] if street_map.made_of else ""
+        "tiles", hashlib.sha256(key_text.encode()).hexdigest()[:32] if street_map.made_of else ""
     )
 
 
 def tile_as_arrays(tile: Tile) -> Arrays:
     """Convert a tile to arrays for `tile_of_arrays`."""
     relief = tile.relief
-    words = _Ground(
+    words = _TileFields(
         _rows(tile.parts),
         shapely.to_wkb(tile.low),
         shapely.to_wkb(tile.crossings),
@@ -80,16 +80,16 @@ def tile_as_arrays(tile: Tile) -> Arrays:
     return found if relief is None else found | {"roots": relief.roots, "holes": relief.holes}
 
 
-def tile_of_arrays(held: Arrays, key: Key, terrain: Terrain | None) -> Tile:
+def tile_of_arrays(arrays: Arrays, key: Key, terrain: Terrain | None) -> Tile:
     """Restore a tile from arrays."""
-    words = msgspec.msgpack.decode(held["words"].data, type=_Ground)
-    parts = _parts_of(words.parts, held)
+    words = msgspec.msgpack.decode(arrays["words"].data, type=_TileFields)
+    parts = _parts_of(words.parts, arrays)
     low, crossings = shapely.from_wkb([words.low, words.crossings])
     shapely.prepare([low, crossings])
     relief = None
     if words.relief is not None:
         roughness, seed = words.relief
-        relief = Relief(roughness, seed, held["roots"], held["holes"])
+        relief = Relief(roughness, seed, arrays["roots"], arrays["holes"])
     return Tile(key, parts, low, crossings, relief, terrain)
 
 
@@ -99,10 +99,10 @@ def covers_as_arrays(covers: Mapping[LandKind, Mesh]) -> Arrays:
     return {"words": words, **_joined_parts(covers)}
 
 
-def covers_of_arrays(held: Arrays) -> dict[LandKind, Mesh]:
+def covers_of_arrays(arrays: Arrays) -> dict[LandKind, Mesh]:
     """Restore covers from arrays."""
     return _parts_of(
-        msgspec.msgpack.decode(held["words"].data, type=list[tuple[LandKind, int, int]]), held
+        msgspec.msgpack.decode(arrays["words"].data, type=list[tuple[LandKind, int, int]]), arrays
     )
 
 
@@ -120,14 +120,14 @@ def _joined_parts(parts: Mapping[_Name, Mesh]) -> dict[str, NDArray[Any]]:
     }
 
 
-def _parts_of(rows: Sequence[tuple[_Name, int, int]], held: Arrays) -> dict[_Name, Mesh]:
+def _parts_of(rows: Sequence[tuple[_Name, int, int]], arrays: Arrays) -> dict[_Name, Mesh]:
     parts = {}
     corner = 0
     triangle = 0
     for name, corners, triangles in rows:
         here = slice(corner, corner + corners)
-        faces = held["triangles"][triangle : triangle + triangles]
-        parts[name] = Mesh(held["vertices"][here], held["normals"][here], faces)
+        faces = arrays["triangles"][triangle : triangle + triangles]
+        parts[name] = Mesh(arrays["vertices"][here], arrays["normals"][here], faces)
         corner, triangle = corner + corners, triangle + triangles
     return parts
 
@@ -137,18 +137,18 @@ def things_as_arrays(things: TileThings) -> Arrays:
     return {"words": _as_array(things)}
 
 
-def things_of_arrays(held: Arrays) -> TileThings:
+def things_of_arrays(arrays: Arrays) -> TileThings:
     """Restore tile contents from arrays."""
-    return msgspec.msgpack.decode(held["words"].data, type=TileThings, dec_hook=_geometry)
+    return msgspec.msgpack.decode(arrays["words"].data, type=TileThings, dec_hook=_decode)
 
 
 def _as_array(words: msgspec.Struct) -> NDArray[np.uint8]:
-    return np.frombuffer(msgspec.msgpack.encode(words, enc_hook=_plain), dtype=np.uint8)
+    return np.frombuffer(msgspec.msgpack.encode(words, enc_hook=_encode), dtype=np.uint8)
 
 
-def _plain(value: Any) -> Any:
+def _encode(value: Any) -> Any:
     return shapely.to_wkb(value) if isinstance(value, shapely.Geometry) else value.item()
 
 
-def _geometry(_: type, wkb: Any) -> Any:
+def _decode(_: type, wkb: Any) -> Any:
     return shapely.from_wkb(wkb)

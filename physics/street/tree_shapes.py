@@ -21,7 +21,7 @@ _SIDES: Final = 13
 
 _ROWS: Final = 8
 """Rings between the poles of the crown; 2 * 13 * 8 = 208 triangles."""
-_SHARP: Final = 16.0
+_SHARPNESS: Final = 16.0
 """Exponent of the power mean that joins the clumps; larger values give deeper creases."""
 
 
@@ -77,12 +77,12 @@ def crown(species: Species, height_m: float) -> Crown:
     half = 0.5 * (height_m - low)
     wide = species.wide * height_m
     rng = np.random.default_rng(zlib.crc32(f"{species}:{height_m:.3f}".encode()))
-    rays, triangles = _globe()
-    reach = _reach(rays, species, rng) * rng.uniform(0.91, 1.09, len(rays))
+    rays, triangles = _sphere()
+    reach = _envelope(rays, species, rng) * rng.uniform(0.91, 1.09, len(rays))
     reach[[0, -1]] = (
         0.96 * reach[1 : 1 + _SIDES].mean(),
         0.96 * reach[-1 - _SIDES : -1].mean(),
-    )  # no tips at the poles
+    )  # avoids tips at the poles
     at = rays * reach[:, None]
     widest = np.hypot(at[:, 0], at[:, 1]).max()
     bottom, top = at[:, 2].min(), at[:, 2].max()
@@ -119,7 +119,7 @@ def tree_trunk(species: Species, height_m: float, radius_m: float) -> Mesh:
     return join(tubes)
 
 
-def _globe() -> tuple[Floats, Ints]:
+def _sphere() -> tuple[Floats, Ints]:
     """Return (V, 3) unit vectors of rings between two poles, and (T, 3) triangles.
 
     Every other ring is rotated by half a side.
@@ -158,7 +158,7 @@ def _globe() -> tuple[Floats, Ints]:
     return rays, np.concatenate(found).astype(np.int32)
 
 
-def _reach(rays: Floats, species: Species, rng: np.random.Generator) -> Floats:
+def _envelope(rays: Floats, species: Species, rng: np.random.Generator) -> Floats:
     """Return (V,) the relative radius of the envelope in each direction, about 1."""
     golden = np.pi * (3.0 - math.sqrt(5.0))
     n = species.clumps
@@ -176,7 +176,7 @@ def _reach(rays: Floats, species: Species, rng: np.random.Generator) -> Floats:
     along = rays @ middle.T
     inside = radius**2 - (middle**2).sum(axis=1) + along**2
     far = np.where(inside > 0.0, along + np.sqrt(np.maximum(inside, 0.0)), 0.0)
-    reach = (np.maximum(far, 0.0) ** _SHARP).sum(axis=1) ** (1.0 / _SHARP)
+    reach = (np.maximum(far, 0.0) ** _SHARPNESS).sum(axis=1) ** (1.0 / _SHARPNESS)
     return np.asarray(reach)
 
 

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from physics.textures.layers import Colour, Picture, encoded, linear
-from physics.textures.noise import Field, Noise, step
+from physics.textures.noise import Field, Noise, pixel_centres, step
 
 BAY_M: Final = 3.0
 """Width of a bay in metres."""
@@ -20,7 +20,7 @@ BAY_M: Final = 3.0
 STOREY_M: Final = 3.2
 """Height of a storey in metres."""
 
-_CODES: Final = encoded(np.arange(4097) / 4096.0)
+_SRGB_CODES: Final = encoded(np.arange(4097) / 4096.0)
 """Table of 4097 linear values encoded as sRGB."""
 
 _Area = tuple[slice, slice]
@@ -63,20 +63,20 @@ class FacadeCanvas:
         self.wall = np.ones((size, size), np.float32)
         self.gloss = np.zeros((size, size), np.float32)
         self.glow = np.zeros((size, size), np.float32)
-        self._x = (np.arange(size, dtype=np.float32) + 0.5) / size * BAY_M
-        self._z = STOREY_M - (np.arange(size, dtype=np.float32) + 0.5) / size * STOREY_M
+        self._x = pixel_centres(size) * BAY_M
+        self._z = STOREY_M - pixel_centres(size) * STOREY_M
 
     def box(
         self, x0: float, x1: float, z0: float, z1: float, colour: Colour, opacity: float = 1.0
     ) -> None:
         """Fill a rectangle, which also removes gloss and glow."""
-        (rows, columns), across, up = self._shares(x0, x1, z0, z1)
+        (rows, columns), across, up = self._coverage(x0, x1, z0, z1)
         light = linear(colour)
         if opacity < 1.0:
             self.fill((rows, columns), np.float32(opacity) * up[:, None] * across[None, :], light)
             return
-        # All but the rim is covered whole: that is most of it, and cheaper.
-        full_x, full_z = _whole(across, columns.start), _whole(up, rows.start)
+        # Pixels inside the rim are fully covered, so they are assigned, which is faster.
+        full_x, full_z = _full_range(across, columns.start), _full_range(up, rows.start)
         for plane, value in (
             (self.rgb, light),
             (self.wall, 0.0),
@@ -148,14 +148,16 @@ class FacadeCanvas:
     def picture(self) -> Picture:
         """Return the drawing as a layer."""
         at = (np.clip(self.rgb, 0.0, 1.0) * np.float32(4096.0) + np.float32(0.5)).astype(np.uint16)
-        return Picture(np.take(_CODES, at), self.wall, np.stack([self.gloss, self.glow], axis=-1))
+        return Picture(
+            np.take(_SRGB_CODES, at), self.wall, np.stack([self.gloss, self.glow], axis=-1)
+        )
 
     def _cover(self, x0: float, x1: float, z0: float, z1: float) -> tuple[_Area, Field]:
         """Return the pixels of a rectangle and the covered fraction of each."""
-        area, across, up = self._shares(x0, x1, z0, z1)
+        area, across, up = self._coverage(x0, x1, z0, z1)
         return area, up[:, None] * across[None, :]
 
-    def _shares(self, x0: float, x1: float, z0: float, z1: float) -> tuple[_Area, Field, Field]:
+    def _coverage(self, x0: float, x1: float, z0: float, z1: float) -> tuple[_Area, Field, Field]:
         """Return the pixels of a rectangle and the covered fractions of its columns and rows."""
         px, pz = BAY_M / self.size, STOREY_M / self.size
         columns = slice(max(0, int(np.floor(x0 / px))), min(self.size, int(np.ceil(x1 / px))))
@@ -171,12 +173,17 @@ class FacadeCanvas:
         return (rows, columns), across.astype(np.float32), up.astype(np.float32)
 
 
-def _whole(shares: Field, start: int) -> slice:
+def _full_range(shares: Field, start: int) -> slice:
     """Return the range of fully covered pixels, offset by `start`."""
     full = np.flatnonzero(shares > 0.999)
     return (
         slice(start + int(full[0]), start + int(full[-1]) + 1) if len(full) else slice(start, start)
     )
+
+
+def scaled(colour: Colour, factor: float) -> Colour:
+    """Return a brighter or darker colour."""
+    return tuple(min(1.0, factor * c) for c in colour)  # type: ignore[return-value]
 
 
 def pane(
@@ -263,7 +270,7 @@ def opening(
 def sill(canvas: FacadeCanvas, x0: float, x1: float, z: float, colour: Colour = STONE) -> None:
     """Draw a window sill and its shadow."""
     canvas.box(x0 - 0.08, x1 + 0.08, z - 0.07, z, colour)
-    canvas.box(x0 - 0.08, x1 + 0.08, z - 0.012, z, tuple(min(1.0, 1.1 * c) for c in colour))  # type: ignore[arg-type]
+    canvas.box(x0 - 0.08, x1 + 0.08, z - 0.012, z, scaled(colour, 1.1))
     canvas.shade(x0 - 0.06, x1 + 0.06, z - 0.22, z - 0.07, 0.45, 0.15)
 
 

@@ -22,14 +22,14 @@ def facade_layers(size_px: int = 256, seed: int = 0) -> Layers:
     """Return every bay layer: upper storeys, then ground floors. 256 pixels are 12 mm each."""
     styles = {**WINDOW_STYLES, **FRONTS}
     recipes = {
-        f"{name}-{k}": Recipe((BAY_M, STOREY_M), _drawn(style, k))
+        f"{name}-{k}": Recipe((BAY_M, STOREY_M), _generator(style, k))
         for name, style in styles.items()
         for k in range(BAY_VARIANTS)
     }
     return stacked("facades", recipes, size_px, seed)
 
 
-def _drawn(style: Callable[[FacadeCanvas], None], number: int) -> Callable[[Noise], Picture]:
+def _generator(style: Callable[[FacadeCanvas], None], number: int) -> Callable[[Noise], Picture]:
     """Return a generator that draws a variant of a style."""
 
     def make(noise: Noise) -> Picture:

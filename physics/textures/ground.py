@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from physics.textures.layers import Colour, Generator, Layers, Picture, Recipe, stacked
-from physics.textures.noise import Field, Noise, blurred, cells, step
+from physics.textures.noise import Field, Noise, blurred, cells, pixel_centres, step
 from physics.textures.surface import (
     Bond,
     basket,
@@ -78,7 +78,7 @@ def _patches(noise: Noise) -> Field:
 
     The unit is the side of the texture.
     """
-    at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size
+    at = pixel_centres(noise.size)
     x, y = np.meshgrid(at, at)
     repairs = ((0.27, 0.24, 0.12, 0.10), (0.70, 0.66, 0.17, 0.13), (0.50, 0.44, 0.50, 0.035))
     edges = [
@@ -164,7 +164,7 @@ def _granite(noise: Noise) -> Picture:
 
 def _grass(dry: float, worn: float = 0.0) -> Generator:
     def make(noise: Noise) -> Picture:
-        # Blades lean every way: streaks bent by noise, so that no direction shows.
+        # Warped streaks give blades without a common direction.
         one = noise.warped(noise.streaks(256, 8), 0.03, 8)
         two = noise.warped(noise.streaks(256, 8, 1), 0.03, 8)
         blades = 0.7 * np.maximum(one, two) + 0.45 * noise.grain(0.7) - 0.4
@@ -228,7 +228,7 @@ def _tactile(bars: bool) -> Generator:
     """Return a generator of 0.3 m slabs with domes 60 mm apart, or bars 75 mm apart (ISO 23599)."""
 
     def make(noise: Noise) -> Picture:
-        at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size * 0.6
+        at = pixel_centres(noise.size) * 0.6
         x, y = np.meshgrid(at, at)
         if bars:
             inset = np.maximum(np.abs((y % 0.3) - 0.15) - 0.122, 0.0)

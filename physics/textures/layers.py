@@ -34,7 +34,7 @@ Colour = tuple[float, float, float]
 SIZES: Final = (256, 512, 1024)
 """Allowed texture sizes in pixels."""
 
-_MADE_BY: Final = sources_hash(Path(__file__).parent)
+_SOURCES_KEY: Final = sources_hash(Path(__file__).parent)
 """Cache key part: hash of the sources."""
 
 
@@ -106,7 +106,7 @@ def stacked(kind: str, recipes: Mapping[str, Recipe], size_px: int, seed: int) -
             f"a texture's size_px must be one of {', '.join(map(str, SIZES))}, not {size_px}"
         )
     arrays = mapped_arrays(
-        f"{kind}-{size_px}-{seed}", _MADE_BY, lambda: _made(recipes, size_px, seed)
+        f"{kind}-{size_px}-{seed}", _SOURCES_KEY, lambda: _generate(recipes, size_px, seed)
     )
     metres = np.array(
         [np.broadcast_to(recipe.metres, 2) for recipe in recipes.values()], np.float32
@@ -115,7 +115,7 @@ def stacked(kind: str, recipes: Mapping[str, Recipe], size_px: int, seed: int) -
     return Layers(tuple(recipes), arrays["rgba"], metres, arrays["mean"], arrays.get("finish"))
 
 
-def _made(recipes: Mapping[str, Recipe], size_px: int, seed: int) -> Arrays:
+def _generate(recipes: Mapping[str, Recipe], size_px: int, seed: int) -> Arrays:
     """Generate all layers."""
     made: dict[str, NDArray[Any]] = {
         "rgba": np.empty((len(recipes), size_px, size_px, 4), np.uint8),

@@ -36,16 +36,16 @@ class Noise:
 
         cells: largest features per side: 2, 4 .. 64
         """
-        return self._moved(_clouds(self.size, cells))
+        return self._shifted(_clouds(self.size, cells))
 
     def grain(self, soft_px: float = 0.0) -> Field:
         """Return white noise with zero mean and unit deviation.
 
         soft_px: blur in pixels of a 512 px texture
         """
-        return self._moved(_grain(self.size, soft_px))
+        return self._shifted(_grain(self.size, soft_px))
 
-    def _moved(self, field: Field) -> Field:
+    def _shifted(self, field: Field) -> Field:
         """Return a field shifted and mirrored randomly."""
         dy, dx = self.rng.integers(0, self.size, 2)
         moved = np.roll(field, (int(dy), int(dx)), axis=(0, 1))
@@ -124,6 +124,11 @@ def remapped(field: Field, dx_px: Field, dy_px: Field) -> Field:
     )
 
 
+def pixel_centres(size: int) -> Field:
+    """Return the (size,) positions of pixel centres along a side, 0 to 1."""
+    return (np.arange(size, dtype=np.float32) + 0.5) / size
+
+
 def blurred(field: Field, sigma_px: float) -> Field:
     """Return a field with a Gaussian blur."""
     if sigma_px <= 0.05:
@@ -149,10 +154,10 @@ def _clouds(size: int, cells: int) -> Field:
     while n <= size // 2:
         total += np.float32(share) * _resized(_grid(rng, n), size)
         share, n = 0.55 * share, 2 * n
-    # Bent a little by other noise, so that the grid it was drawn on does not show.
+    # Warping hides the grid of the random values.
     bend = [np.float32(0.10 * size / cells) * _resized(_grid(rng, cells), size) for _ in range(2)]
     total = remapped(total, bend[0], bend[1])
-    return _locked((total - total.mean()) / total.std())
+    return _read_only((total - total.mean()) / total.std())
 
 
 def _grid(rng: np.random.Generator, cells: int) -> Field:
@@ -161,16 +166,18 @@ def _grid(rng: np.random.Generator, cells: int) -> Field:
 
 @lru_cache(maxsize=16)
 def _grain(size: int, soft_px: float) -> Field:
-    # Drawn at 512 and scaled, so that a laptop's texture is a smaller picture of the same thing.
+    # Generated at 512 px and resized, so that all sizes show the same pattern.
     rng = np.random.default_rng([7, round(100 * soft_px)])
     field = blurred(rng.standard_normal((512, 512)).astype(np.float32), soft_px)
     if size != 512:
         field = cv2.resize(
             field, (size, size), interpolation=cv2.INTER_AREA if size < 512 else cv2.INTER_LINEAR
         )
-        # An area's mean is calmer than its points; half of what is lost is given back.
+        # Averaging lowers the contrast; the square root restores half of the loss.
         field *= np.float32(np.sqrt(1.0 / max(float(field.std()), 1e-6)))
-    return _locked(field / max(1.0, float(field.std())) if soft_px == 0.0 else field / field.std())
+    return _read_only(
+        field / max(1.0, float(field.std())) if soft_px == 0.0 else field / field.std()
+    )
 
 
 def _resized(grid: Field, size: int) -> Field:
@@ -182,7 +189,7 @@ def _resized(grid: Field, size: int) -> Field:
     return np.asarray(drawn[3 * fy : 3 * fy + size, 3 * fx : 3 * fx + size])
 
 
-def _locked(field: NDArray[np.floating]) -> Field:
+def _read_only(field: NDArray[np.floating]) -> Field:
     """Return a read-only float32 copy."""
     whole = np.ascontiguousarray(field, dtype=np.float32)
     whole.flags.writeable = False

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -14,6 +15,7 @@ from physics.textures.facade_canvas import (
     FacadeCanvas,
     opening,
     pane,
+    scaled,
     sill,
     surround,
 )
@@ -69,11 +71,6 @@ def _pick(canvas: FacadeCanvas, colours: tuple[Colour, ...]) -> Colour:
     return colours[int(canvas.rng.integers(len(colours)))]
 
 
-def _scaled(colour: Colour, by: float) -> Colour:
-    """Return a brighter or darker colour."""
-    return tuple(min(1.0, by * c) for c in colour)  # type: ignore[return-value]
-
-
 def _plinth(canvas: FacadeCanvas) -> None:
     """Draw a dark plinth with a ledge and splashed dirt."""
     canvas.shade(0.0, BAY_M, 0.0, _PLINTH_M, 0.42)
@@ -120,7 +117,7 @@ def _display(canvas: FacadeCanvas, x0: float, x1: float, z0: float, z1: float) -
 def _fascia(canvas: FacadeCanvas, colour: Colour, z0: float = 2.55, z1: float = 3.0) -> None:
     """Draw a sign board across the bay with an abstract mark instead of letters."""
     canvas.box(0.0, BAY_M, z0, z1, colour)
-    canvas.box(0.0, BAY_M, z1 - 0.05, z1, _scaled(colour, 1.3))
+    canvas.box(0.0, BAY_M, z1 - 0.05, z1, scaled(colour, 1.3))
     canvas.shade(0.0, BAY_M, z0 - 0.12, z0, 0.4, 0.12)
     if canvas.rng.random() < 0.75:
         mark = (0.82, 0.79, 0.70) if sum(colour) < 1.5 else (0.26, 0.25, 0.24)
@@ -136,17 +133,17 @@ def _fascia(canvas: FacadeCanvas, colour: Colour, z0: float = 2.55, z1: float = 
 def _shop(canvas: FacadeCanvas, door: bool = True) -> None:
     """Draw a shop with or without a door."""
     colour = _FASCIAS[2 * canvas.number % len(_FASCIAS)]
-    canvas.box(0.0, BAY_M, 0.0, 3.0, _scaled(colour, 0.9))
+    canvas.box(0.0, BAY_M, 0.0, 3.0, scaled(colour, 0.9))
     right = 1.85 if door else BAY_M - 0.1
-    canvas.box(0.1, right, 0.08, 0.45, _scaled(colour, 1.12))
+    canvas.box(0.1, right, 0.08, 0.45, scaled(colour, 1.12))
     canvas.shade(0.1, right, 0.42, 0.45, 0.4)
     _display(canvas, 0.1, right, 0.5, 2.45)
     for x in np.linspace(0.1, right, 2 if not door else 1, endpoint=False)[1:]:
         canvas.box(float(x) - 0.03, float(x) + 0.03, 0.5, 2.45, colour)
-    canvas.frame(0.1, right, 0.46, 2.49, 0.04, _scaled(colour, 1.25))
+    canvas.frame(0.1, right, 0.46, 2.49, 0.04, scaled(colour, 1.25))
     if door:
-        canvas.box(1.95, 2.9, 0.0, 2.45, _scaled(colour, 0.5))
-        canvas.frame(2.0, 2.85, 0.04, 2.4, 0.09, _scaled(colour, 1.2))
+        canvas.box(1.95, 2.9, 0.0, 2.45, scaled(colour, 0.5))
+        canvas.frame(2.0, 2.85, 0.04, 2.4, 0.09, scaled(colour, 1.2))
         pane(canvas, 2.09, 2.76, 0.35, 2.31, dress=False)
         canvas.box(2.12, 2.15, 1.0, 1.25, (0.70, 0.66, 0.52))
     _fascia(canvas, colour)
@@ -170,10 +167,6 @@ def _awning(canvas: FacadeCanvas, z0: float, z1: float) -> None:
     canvas.shade(0.0, BAY_M, z0 + 0.21 * (z1 - z0), z0 + 0.24 * (z1 - z0), 0.4)
 
 
-def _shop_window(canvas: FacadeCanvas) -> None:
-    _shop(canvas, door=False)
-
-
 def _shop_awning(canvas: FacadeCanvas) -> None:
     _shop(canvas, door=False)
     _awning(canvas, 1.98, 2.56)
@@ -186,20 +179,16 @@ def _cafe(canvas: FacadeCanvas, door: bool = False) -> None:
     for k in range(3):
         x0 = 0.08 + 0.96 * k
         if door and k == 1:
-            canvas.box(x0, x0 + 0.88, 0.0, 2.15, _scaled(frame, 0.6))
-            canvas.frame(x0 + 0.04, x0 + 0.84, 0.02, 2.13, 0.09, _scaled(frame, 1.2))
+            canvas.box(x0, x0 + 0.88, 0.0, 2.15, scaled(frame, 0.6))
+            canvas.frame(x0 + 0.04, x0 + 0.84, 0.02, 2.13, 0.09, scaled(frame, 1.2))
             pane(canvas, x0 + 0.13, x0 + 0.75, 0.35, 2.04, dress=False)
             continue
-        canvas.box(x0, x0 + 0.88, 0.06, 0.55, _scaled(frame, 1.25))
+        canvas.box(x0, x0 + 0.88, 0.06, 0.55, scaled(frame, 1.25))
         canvas.shade(x0 + 0.08, x0 + 0.80, 0.14, 0.47, 0.25)
         _display(canvas, x0, x0 + 0.88, 0.62, 2.15)
         pane(canvas, x0, x0 + 0.88, 2.22, 2.6, dress=False)
     canvas.shade(0.0, BAY_M, 2.45, 2.6, 0.4, 0.15)
-    _fascia(canvas, _scaled(frame, 0.85), 2.62, 3.0)
-
-
-def _cafe_door(canvas: FacadeCanvas) -> None:
-    _cafe(canvas, door=True)
+    _fascia(canvas, scaled(frame, 0.85), 2.62, 3.0)
 
 
 def _entrance(canvas: FacadeCanvas) -> None:
@@ -214,10 +203,10 @@ def _entrance(canvas: FacadeCanvas) -> None:
     for a, b in ((x0 + 0.15, 1.46), (1.54, x1 - 0.15)):
         for low, high in ((0.25, 0.95), (1.1, 2.02)):
             canvas.shade(a, b, low, high, 0.30)
-            canvas.box(a + 0.025, b - 0.025, low, high - 0.025, _scaled(leaf, 1.12))
+            canvas.box(a + 0.025, b - 0.025, low, high - 0.025, scaled(leaf, 1.12))
         if canvas.rng.random() < 0.5:
             pane(canvas, a + 0.04, b - 0.04, 1.14, 1.98, dress=False)
-    canvas.box(1.49, 1.51, 0.1, 2.15, _scaled(leaf, 0.5))
+    canvas.box(1.49, 1.51, 0.1, 2.15, scaled(leaf, 0.5))
     canvas.box(1.55, 1.59, 1.0, 1.12, (0.72, 0.66, 0.46))
     pane(canvas, x0 + 0.08, x1 - 0.08, 2.22, 2.6, dress=False)
     canvas.shade(x0, x1, 2.4, 2.65, 0.5, 0.25)
@@ -282,10 +271,10 @@ def _blank(canvas: FacadeCanvas) -> None:
 
 FRONTS: Final[Mapping[str, Callable[[FacadeCanvas], None]]] = {
     "shop": _shop,
-    "shop-window": _shop_window,
+    "shop-window": partial(_shop, door=False),
     "shop-awning": _shop_awning,
     "cafe": _cafe,
-    "cafe-door": _cafe_door,
+    "cafe-door": partial(_cafe, door=True),
     "entrance": _entrance,
     "home": _home,
     "garage": _garage,

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from physics.textures.layers import Colour, Picture, Rgb
-from physics.textures.noise import Cells, Field, Ids, Noise, blurred, step
+from physics.textures.noise import Cells, Field, Ids, Noise, blurred, pixel_centres, step
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ def _rows(
 
 def _grid(size: int, side_m: float, width_m: float) -> tuple[Ids, Ids, Field, Field]:
     """Return (S, S) columns and rows of a square grid, and each pixel's position in its square."""
-    at = (np.arange(size, dtype=np.float32) + 0.5) / size * round(side_m / width_m)
+    at = pixel_centres(size) * round(side_m / width_m)
     whole = np.floor(at).astype(np.int32)
     part = (at - whole).astype(np.float32)
     i, j = np.meshgrid(whole, whole)
@@ -176,7 +176,7 @@ def laid(
     edge = bond.edge + np.float32(wobble_m) * noise.clouds(32) if wobble_m else bond.edge
     soft = max(bevel_m, pixel_m)
     face = step(0.5 * width - 0.5 * soft, 0.5 * width + 0.5 * soft, edge)
-    # A joint thinner than a pixel is drawn a pixel wide and paler.
+    # A joint narrower than a pixel is drawn one pixel wide with less contrast.
     face = 1.0 - (1.0 - face) * np.float32(min(1.0, joint_m / width + 0.25))
     palette = np.asarray(colours, dtype=np.float32)[noise.rng.integers(len(colours), size=bond.n)]
     palette *= (1.0 + noise.rng.normal(0.0, spread, (bond.n, 1))).astype(np.float32)

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from physics.textures.layers import Colour, Generator, Layers, Picture, Recipe, stacked
-from physics.textures.noise import Field, Noise, blurred, cells, step
+from physics.textures.noise import Field, Noise, blurred, cells, pixel_centres, step
 from physics.textures.surface import (
     bond_of,
     courses,
@@ -119,7 +119,7 @@ def _panels(noise: Noise) -> Picture:
         wobble_m=0.0,
         grain=0.014,
     )
-    at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size * 3.0
+    at = pixel_centres(noise.size) * 3.0
     x, y = np.meshgrid(at, at)
     hole = 1.0 - step(0.012, 0.022, np.hypot((x % 1.5) - 0.75, np.abs((y % 1.5) - 0.75) - 0.4))
     pores = step(2.0, 2.8, noise.grain(0.5))
@@ -210,7 +210,7 @@ def _boards(
             grain=0.01,
             joint_tint=0.3,
         )
-        at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size * rows % 1.0
+        at = pixel_centres(noise.size) * rows % 1.0
         lap = np.broadcast_to(
             (1.0 - 0.22 * np.exp(-at / 0.10) + 0.05 * at)[:, None], (noise.size,) * 2
         )
@@ -223,7 +223,7 @@ def _boards(
 
 def _corrugated(noise: Noise) -> Picture:
     """Draw sheet metal with vertical waves of 0.1 m."""
-    at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size * 20.0
+    at = pixel_centres(noise.size) * 20.0
     wave = np.broadcast_to(1.0 + 0.13 * np.sin(2.0 * np.pi * at), (noise.size,) * 2).astype(
         np.float32
     )
@@ -268,7 +268,7 @@ def _glazed(noise: Noise) -> Picture:
 def _roof_tiles(noise: Noise) -> Picture:
     """Draw pantiles, 0.25 m wide with 0.3125 m visible."""
     size = noise.size
-    at = (np.arange(size, dtype=np.float32) + 0.5) / size
+    at = pixel_centres(size)
     across, down = at * 10.0, at * 8.0
     column, row = np.floor(across).astype(int), np.floor(down).astype(int)
     tone = noise.rng.normal(1.0, 0.07, (8, 10)).astype(np.float32)[np.ix_(row, column)]
@@ -314,7 +314,7 @@ def _roof_gravel(noise: Noise) -> Picture:
 
 def _seamed(noise: Noise) -> Picture:
     """Draw a sheet-metal roof with a standing seam every 0.5 m."""
-    at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size * 4.0 % 1.0
+    at = pixel_centres(noise.size) * 4.0 % 1.0
     seam = (
         1.0
         + 0.18 * np.exp(-(((at - 0.48) / 0.012) ** 2))
@@ -345,7 +345,7 @@ def _felt(noise: Noise) -> Picture:
 
 def _glass(noise: Noise) -> Picture:
     """Draw a curtain wall of 1.5 m panes that reflect sky and street."""
-    at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size * 2.0 % 1.0
+    at = pixel_centres(noise.size) * 2.0 % 1.0
     x, y = np.meshgrid(at, at)
     sky = step(0.15, 0.85, 1.0 - y + 0.05 * noise.clouds(8))
     rgb = mixed((0.15, 0.19, 0.21), (0.44, 0.52, 0.57), sky)

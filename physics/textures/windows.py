@@ -124,7 +124,7 @@ def _arched(canvas: FacadeCanvas) -> None:
     area, _, across, up = canvas.local(x0 - 0.25, x1 + 0.25, 2.25, 2.8)
     x = (across - 0.5) * (x1 - x0 + 0.5)
     z = up * 0.55
-    # The circle through the springers at z 0.1 and the crown at z 0.3 of this area.
+    # The circle passes through the springers at z = 0.1 and the crown at z = 0.3.
     radius = (0.55**2 + 0.2**2) / (2.0 * 0.2)
     rise = z - (0.3 - radius)
     r = np.sqrt(x * x + rise * rise)
