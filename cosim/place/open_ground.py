@@ -60,7 +60,7 @@ def open_ground(
     """Return the covers within `area`, as areas that do not overlap and reach under streets and
     houses.
 
-    It is empty for a generated city, whose ground comes from `physics/street/frontage.py`.
+    It is empty for a generated city, whose ground comes from `physics/street/covers.py`.
     """
     if street_map.planned:
         return []

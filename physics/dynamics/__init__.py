@@ -1,1 +1,1 @@
-"""The robot's dynamics in PyBullet."""
+"""Robot dynamics in PyBullet."""

@@ -1,5 +1,4 @@
-"""The collision bodies in one PyBullet client: robot, ground, buildings, barriers, and what moves
-near the robot."""
+"""Collision bodies in one PyBullet client: robot, ground, street and traffic."""
 
 from __future__ import annotations
 
@@ -25,15 +24,21 @@ from physics.street.furniture import Prop, solids_of
 from physics.street.surface import Chunk
 
 PERSON_M: Final = 1.7
+"""Height of a person's cylinder in metres."""
+
 VEHICLE_M: Final = 1.5
+"""Height of a vehicle's box in metres."""
+
 WALL_M: Final = 0.2
-"""How thick the walls of mapped buildings are."""
+"""Thickness of a mapped building's walls in metres."""
 
 FAR_BELOW_M: Final = -50.0
-_AROUND_M: Final = 0.5
-"""What stands around the robot is looked up anew when it has moved by so much."""
+"""Height in metres at which inactive bodies are parked."""
+
+_SEARCH_STEP_M: Final = 0.5
+"""Distance in metres that the robot moves before nearby static bodies are searched again."""
 _NO_CHANGE: Final = (0.0, 0.0, 0.0)
-_NOWHERE: Final = (math.inf, math.inf, math.inf)
+_UNKNOWN: Final = (math.inf, math.inf, math.inf)
 _UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)
 _TYRE: Final = {
     "lateralFriction": 1.0,
@@ -41,20 +46,26 @@ _TYRE: Final = {
     "contactStiffness": 30_000.0,
     "contactDamping": 1_000.0,
 }
-"""Soft tyres share the load evenly and slide more easily sideways (y is the axle): without both,
-and with the friction cone, skid turns come in jerks."""
+"""Contact parameters of a tyre.
+
+Soft tyres share the load evenly and slide more easily sideways (y is the axle). With stiff tyres,
+or with the friction cone, skid turns are jerky.
+"""
 
 BodyKind = Literal["pedestrian", "vehicle", "wall", "object"]
 Moving = Literal["pedestrian", "vehicle"]
-_Placing = tuple[tuple[float, float, float], tuple[float, float, float, float]]
-"""Where the middle of a body comes to be, and its attitude as a quaternion."""
+_Placement = tuple[tuple[float, float, float], tuple[float, float, float, float]]
+"""Position of a body's centre, and its orientation as a quaternion."""
 
 
 class Bodies:
-    """A running engine. Bodies that are not shown wait far below the ground for their next use.
+    """A running PyBullet client with all collision bodies of an episode.
 
-    at_m: where the robot's base frame is; yaw_rate_radps: its rate of turn about the vertical;
-    watched: the bodies that `robot_contacts` asks for.
+    at_m: position of the robot's base frame
+    yaw_rate_radps: yaw rate of the robot
+    watched: bodies that `robot_contacts` checks
+
+    Inactive bodies of people and vehicles are parked far below the ground and reused.
     """
 
     def __init__(self, robot: Robot, substep_s: float) -> None:
@@ -62,37 +73,37 @@ class Bodies:
         if self._client < 0:
             raise EngineError("PyBullet did not start")
         self._com_height_m = robot.com_height_m
-        self._what: dict[int, tuple[BodyKind, str]] = {}
-        self._pools: dict[Any, list[int]] = {}
-        self._shown: dict[Moving, dict[str, tuple[int, Any]]] = {"pedestrian": {}, "vehicle": {}}
-        self._led: dict[Moving, list[tuple[int, list[_Placing]]]] = {}
-        self._left_at: dict[int, tuple[float, float, float]] = {}
-        self.at_m = _NOWHERE
+        self._identities: dict[int, tuple[BodyKind, str]] = {}
+        self._idle: dict[Any, list[int]] = {}
+        self._active: dict[Moving, dict[str, tuple[int, Any]]] = {"pedestrian": {}, "vehicle": {}}
+        self._paths: dict[Moving, list[tuple[int, list[_Placement]]]] = {}
+        self._final_poses: dict[int, tuple[float, float, float]] = {}
+        self.at_m = _UNKNOWN
         self.yaw_rate_radps = 0.0
-        self._looked_from = _NOWHERE
-        self._around: dict[int, Any] = {}
+        self._searched_at_m = _UNKNOWN
+        self._static_near: dict[int, Any] = {}
         self.watched: list[int] = []
-        self._asked_radps: list[float] = []
+        self._target_radps: list[float] = []
         self._shapes: dict[Any, int] = {}
-        self._do("setGravity", 0.0, 0.0, -9.81)
-        self._do(
+        self._call("setGravity", 0.0, 0.0, -9.81)
+        self._call(
             "setPhysicsEngineParameter",
             fixedTimeStep=substep_s,
             numSubSteps=0,
             deterministicOverlappingPairs=1,
             enableConeFriction=0,
         )
-        self._robot: int = self._do(
+        self._robot: int = self._call(
             "loadURDF", str(urdf_of(robot)), flags=p.URDF_USE_INERTIA_FROM_FILE
         )
         infos = [
-            self._do("getJointInfo", self._robot, j)
-            for j in range(self._do("getNumJoints", self._robot))
+            self._call("getJointInfo", self._robot, j)
+            for j in range(self._call("getNumJoints", self._robot))
         ]
         joints = {info[1].decode(): info[0] for info in infos}
         self._wheels = [joints[name] for name in robot.drive.joints]
         self._torques = [robot.drive.torque_nm] * len(self._wheels)
-        self._do(
+        self._call(
             "changeDynamics",
             self._robot,
             -1,
@@ -101,17 +112,18 @@ class Bodies:
             angularDamping=0.0,
         )
         for wheel in self._wheels:
-            self._do(
+            self._call(
                 "changeDynamics", self._robot, wheel, linearDamping=0.0, angularDamping=0.0, **_TYRE
             )
         self._read()
 
     def close(self) -> None:
+        """Disconnect the client."""
         p.disconnect(self._client)
 
     def add_chunk(self, chunk: Chunk) -> list[int]:
-        """What is in a square of a surface; returns what `remove` takes."""
-        self._looked_from = _NOWHERE
+        """Add the bodies of a tile; return their ids for `remove`."""
+        self._searched_at_m = _UNKNOWN
         of_friction: dict[float, list[Mesh]] = {}
         for patch in chunk.ground:
             of_friction.setdefault(patch.friction, []).append(patch.mesh)
@@ -123,11 +135,11 @@ class Bodies:
         middle = mesh.vertices.mean(axis=0) * (1.0, 1.0, 0.0)
         flags = p.GEOM_FORCE_CONCAVE_TRIMESH
         with as_lists(mesh.triangles, mesh.vertices - middle) as (indices, (vertices,)):
-            shape = self._do(
+            shape = self._call(
                 "createCollisionShape", p.GEOM_MESH, vertices=vertices, indices=indices, flags=flags
             )
-        ground = self._body(shape, middle)
-        self._do("changeDynamics", ground, -1, lateralFriction=value)
+        ground = self._create_body(shape, middle)
+        self._call("changeDynamics", ground, -1, lateralFriction=value)
         return ground
 
     def _add_building(self, building: Building) -> list[int]:
@@ -139,18 +151,28 @@ class Bodies:
             boxes = [_wall_box(wall, height) for wall in building.walls]
         bodies = []
         for (x, y), heading, size in boxes:
-            half = [0.5 * s for s in size]
-            shape = self._do("createCollisionShape", p.GEOM_BOX, halfExtents=half)
-            turn = p.getQuaternionFromEuler((0.0, 0.0, heading))
-            bodies.append(self._body(shape, (x, y, building.base_m + CURB_M + half[2]), turn))
-            self._what[bodies[-1]] = ("wall", building.id)
+            bodies.append(self._add_box((x, y, building.base_m + CURB_M), heading, size))
+            self._identities[bodies[-1]] = ("wall", building.id)
         return bodies
 
+    def _add_box(
+        self,
+        foot_m: tuple[float, float, float],
+        heading_rad: float,
+        size_m: tuple[float, float, float],
+    ) -> int:
+        half = [0.5 * size for size in size_m]
+        shape = self._call("createCollisionShape", p.GEOM_BOX, halfExtents=half)
+        x, y, z = foot_m
+        turn = p.getQuaternionFromEuler((0.0, 0.0, heading_rad))
+        return self._create_body(shape, (x, y, z + half[2]), turn)
+
     def add_prop(self, prop: Prop, z_m: float) -> int:
+        """Add a prop whose foot is at height `z_m`; return its body id."""
         pool = (prop.kind, prop.variant)
         if pool not in self._shapes:
             solids = solids_of(*pool)
-            self._shapes[pool] = self._do(
+            self._shapes[pool] = self._call(
                 "createCollisionShapeArray",
                 shapeTypes=[p.GEOM_BOX if s.shape == "box" else p.GEOM_CYLINDER for s in solids],
                 halfExtents=[[0.5 * c for c in s.size_m] for s in solids],
@@ -159,86 +181,91 @@ class Bodies:
                 collisionFramePositions=[[*s.at_m, 0.5 * s.size_m[2]] for s in solids],
             )
         turn = p.getQuaternionFromEuler((0.0, 0.0, prop.heading_rad))
-        body = self._body(self._shapes[pool], (prop.x_m, prop.y_m, z_m), turn)
-        self._what[body] = ("object", prop.id)
+        body = self._create_body(self._shapes[pool], (prop.x_m, prop.y_m, z_m), turn)
+        self._identities[body] = ("object", prop.id)
         return body
 
     def add_barrier(self, barrier: Barrier, z_m: float) -> int:
-        half = (0.5 * barrier.thickness_m, 0.5 * barrier.length_m, 0.5 * barrier.height_m)
-        shape = self._do("createCollisionShape", p.GEOM_BOX, halfExtents=half)
-        turn = p.getQuaternionFromEuler((0.0, 0.0, barrier.heading_rad))
-        body = self._body(shape, (barrier.x_m, barrier.y_m, z_m + half[2]), turn)
-        self._what[body] = ("object", f"barrier:{barrier.strip}:{barrier.end}")
+        """Add a barrier whose foot is at height `z_m`; return its body id."""
+        size = (barrier.thickness_m, barrier.length_m, barrier.height_m)
+        body = self._add_box((barrier.x_m, barrier.y_m, z_m), barrier.heading_rad, size)
+        self._identities[body] = ("object", f"barrier:{barrier.strip}:{barrier.end}")
         return body
 
     def remove(self, bodies: Sequence[int]) -> None:
-        self._looked_from = _NOWHERE
+        """Remove bodies."""
+        self._searched_at_m = _UNKNOWN
         for body in bodies:
-            self._do("removeBody", body)
-            self._what.pop(body, None)
+            self._call("removeBody", body)
+            self._identities.pop(body, None)
 
     def show(self, kind: Moving, movers: Sequence[Mover]) -> None:
-        """Let exactly these people or vehicles have a body, which stays where it is until it is
-        led."""
-        shown = self._shown[kind]
+        """Activate a body for exactly these people or vehicles.
+
+        A body stays at its place until `lead` moves it.
+        """
+        shown = self._active[kind]
         ids = [mover.id for mover in movers]
         if list(shown) == ids:
             return
         for name in [name for name in shown if name not in ids]:
             body, pool = shown.pop(name)
-            self._what.pop(body)
-            self._pools[pool].append(body)
+            self._identities.pop(body)
+            self._idle[pool].append(body)
             self._park(body)
         for mover in movers:
             if mover.id not in shown:
                 pool = kind if kind == "pedestrian" else (kind, *mover.size_m)
-                body = self._taken(pool)
+                body = self._acquire(pool)
                 shown[mover.id] = (body, pool)
-                self._what[body] = (kind, mover.id)
-        self._shown[kind] = {name: shown[name] for name in ids}
+                self._identities[body] = (kind, mover.id)
+        self._active[kind] = {name: shown[name] for name in ids}
 
     def stands(self, kind: Moving, mover: Mover) -> bool:
-        """Whether a shown body is where it was led to, and stays there."""
+        """Return whether an active body is at rest where `lead` last put it."""
         return (
             mover.change == _NO_CHANGE
-            and self._left_at.get(self._shown[kind][mover.id][0]) == mover.start
+            and self._final_poses.get(self._active[kind][mover.id][0]) == mover.start
         )
 
     def lead(self, kind: Moving, ways: Mapping[Mover, TickPoses], z_m: Sequence[float]) -> None:
-        """Let these of the shown go their ways, substep by substep (`step`); the others stay. z_m:
-        height of the ground under each."""
+        """Set the poses of active bodies for each substep of the next tick; all others stay.
+
+        ways: poses after each substep
+        z_m: height of the ground under each body
+        """
         half = 0.5 * (PERSON_M if kind == "pedestrian" else VEHICLE_M)
-        self._led[kind] = []
+        self._paths[kind] = []
         for (mover, way), z in zip(ways.items(), z_m, strict=True):
-            body = self._shown[kind][mover.id][0]
-            self._left_at[body] = way[-1]
-            placings = [
+            body = self._active[kind][mover.id][0]
+            self._final_poses[body] = way[-1]
+            placements = [
                 ((x, y, z + half), (0.0, 0.0, math.sin(0.5 * heading), math.cos(0.5 * heading)))
                 for x, y, heading in way
             ]
-            self._led[kind].append((body, placings))
+            self._paths[kind].append((body, placements))
 
     def _park(self, body: int) -> None:
-        self._left_at.pop(body, None)
+        self._final_poses.pop(body, None)
         p.resetBasePositionAndOrientation(body, (0.0, 0.0, FAR_BELOW_M), _UPRIGHT, self._client)
 
-    def _taken(self, pool: Any) -> int:
-        waiting = self._pools.setdefault(pool, [])
+    def _acquire(self, pool: Any) -> int:
+        waiting = self._idle.setdefault(pool, [])
         if waiting:
             return waiting.pop()
         if pool not in self._shapes:
             if pool == "pedestrian":
-                shape = self._do(
+                shape = self._call(
                     "createCollisionShape", p.GEOM_CYLINDER, radius=PERSON_RADIUS_M, height=PERSON_M
                 )
             else:
                 half = (0.5 * pool[1], 0.5 * pool[2], 0.5 * VEHICLE_M)
-                shape = self._do("createCollisionShape", p.GEOM_BOX, halfExtents=half)
+                shape = self._call("createCollisionShape", p.GEOM_BOX, halfExtents=half)
             self._shapes[pool] = shape
-        return self._body(self._shapes[pool], (0.0, 0.0, FAR_BELOW_M))
+        return self._create_body(self._shapes[pool], (0.0, 0.0, FAR_BELOW_M))
 
-    def _body(self, shape: int, at: Any, turn: Any = _UPRIGHT) -> int:
-        body: int = self._do(
+    def _create_body(self, shape: int, at: Any, turn: Any = _UPRIGHT) -> int:
+        body: int = self._call(
             "createMultiBody",
             baseMass=0.0,
             baseCollisionShapeIndex=shape,
@@ -251,27 +278,28 @@ class Bodies:
     def place_robot(
         self, xyz_m: tuple[float, float, float], roll_pitch_yaw: tuple[float, float, float]
     ) -> None:
-        """The robot at rest with its base frame there."""
+        """Put the robot at rest with its base frame at a position and attitude."""
         turn = p.getQuaternionFromEuler(roll_pitch_yaw)
         m = p.getMatrixFromQuaternion(turn)
         h = self._com_height_m
         middle = [c + h * up for c, up in zip(xyz_m, (m[2], m[5], m[8]), strict=True)]
-        self._do("resetBasePositionAndOrientation", self._robot, middle, turn)
-        self._do("resetBaseVelocity", self._robot, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        self._call("resetBasePositionAndOrientation", self._robot, middle, turn)
+        self._call("resetBaseVelocity", self._robot, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         for wheel in self._wheels:
-            self._do("resetJointState", self._robot, wheel, 0.0, 0.0)
+            self._call("resetJointState", self._robot, wheel, 0.0, 0.0)
         self._read()
 
     def step(self, substep: int, speeds_radps: list[float]) -> tuple[float, float, float]:
-        """One substep of a tick, from 0; x, y, heading of the robot's base frame after it.
+        """Run one substep; return x, y and heading of the robot's base frame.
 
-        speeds_radps: at which the motors turn the drive's joints, in the order of `Skid.joints`.
+        substep: index within the tick, from 0
+        speeds_radps: target speeds of the drive joints, in the order of `Skid.joints`
         """
-        for led in self._led.values():
+        for led in self._paths.values():
             for body, way in led:
                 p.resetBasePositionAndOrientation(body, *way[substep], self._client)
-        if speeds_radps != self._asked_radps:  # the motors keep what they were asked for
-            self._asked_radps = speeds_radps
+        if speeds_radps != self._target_radps:  # PyBullet keeps the last targets
+            self._target_radps = speeds_radps
             p.setJointMotorControlArray(
                 self._robot,
                 self._wheels,
@@ -284,18 +312,19 @@ class Bodies:
         return self._read()
 
     def _read(self) -> tuple[float, float, float]:
-        """Ask the engine where the robot is, and how it moves."""
+        """Read the robot's pose and velocity from the engine."""
         self._velocity = p.getBaseVelocity(self._robot, self._client)
         (x, y, z), turn = p.getBasePositionAndOrientation(self._robot, self._client)
-        self._turned = m = p.getMatrixFromQuaternion(turn)
-        h = self._com_height_m  # the engine reports the centre of mass
+        self._rotation = m = p.getMatrixFromQuaternion(turn)
+        h = self._com_height_m  # PyBullet reports the centre of mass
         self.at_m = x, y, _ = x - h * m[2], y - h * m[5], z - h * m[8]
         self.yaw_rate_radps = self._velocity[1][2]
         return x, y, math.atan2(m[3], m[0])
 
     def robot_state(self) -> RobotState:
+        """Return the robot's pose, velocities and tilt."""
         (x, y, z) = self.at_m
-        m = self._turned
+        m = self._rotation
         (linear, angular) = self._velocity
         forward = linear[0] * m[0] + linear[1] * m[3] + linear[2] * m[6]
         turn = angular[0] * m[2] + angular[1] * m[5] + angular[2] * m[8]
@@ -303,32 +332,36 @@ class Bodies:
         return RobotState(pose, forward, turn, z, math.acos(min(max(m[8], -1.0), 1.0)))
 
     def watch(self, reach_m: float, movers: Iterable[tuple[Moving, Mover]]) -> None:
-        """Ask for contacts with these of the shown, and with what stands within a reach of the
-        robot."""
+        """Select the bodies for contact checks.
+
+        These are the given movers, and static bodies within reach of the robot.
+        """
         x, y, z = self.at_m
-        if math.dist(self.at_m, self._looked_from) > _AROUND_M:
-            far_m = reach_m + _AROUND_M
+        if math.dist(self.at_m, self._searched_at_m) > _SEARCH_STEP_M:
+            far_m = reach_m + _SEARCH_STEP_M
             found = p.getOverlappingObjects(
                 (x - far_m, y - far_m, z - far_m), (x + far_m, y + far_m, z + far_m), self._client
             )
             standing = {
                 body
                 for body, _ in found or ()
-                if body in self._what and self._what[body][0] in ("wall", "object")
+                if body in self._identities and self._identities[body][0] in ("wall", "object")
             }
-            self._around = {body: p.getAABB(body, -1, self._client) for body in sorted(standing)}
-            self._looked_from = self.at_m
+            self._static_near = {
+                body: p.getAABB(body, -1, self._client) for body in sorted(standing)
+            }
+            self._searched_at_m = self.at_m
         self.watched = [
             body
-            for body, ((x0, y0, _), (x1, y1, _)) in self._around.items()
+            for body, ((x0, y0, _), (x1, y1, _)) in self._static_near.items()
             if x0 - reach_m <= x <= x1 + reach_m and y0 - reach_m <= y <= y1 + reach_m
         ]
-        self.watched += [self._shown[kind][mover.id][0] for kind, mover in movers]
+        self.watched += [self._active[kind][mover.id][0] for kind, mover in movers]
 
     def robot_contacts(self) -> list[tuple[BodyKind, str]]:
-        """What of the watched the robot touches now."""
+        """Return kind and id of each watched body that the robot touches."""
         return [
-            self._what[body]
+            self._identities[body]
             for body in self.watched
             if any(
                 c[8] <= 0.0
@@ -337,11 +370,11 @@ class Bodies:
         ]
 
     def blocked(self, begin_m: Floats, end_m: Floats) -> NDArray[np.bool_]:
-        """On which of (N, 3) -> (N, 3) lines something stands."""
-        hits = self._do("rayTestBatch", begin_m.tolist(), end_m.tolist())
+        """Return which of N lines, from (N, 3) to (N, 3) points in metres, hit a body."""
+        hits = self._call("rayTestBatch", begin_m.tolist(), end_m.tolist())
         return np.array([hit[0] >= 0 for hit in hits], dtype=bool)
 
-    def _do(self, call: str, *args: Any, **options: Any) -> Any:
+    def _call(self, call: str, *args: Any, **options: Any) -> Any:
         try:
             return getattr(p, call)(*args, **options, physicsClientId=self._client)
         except p.error as error:
@@ -351,8 +384,10 @@ class Bodies:
 def _wall_box(
     wall: Wall, height_m: float
 ) -> tuple[tuple[float, float], float, tuple[float, float, float]]:
-    """Middle, heading and size of a wall: WALL_M thick, its outer face on the line, the outside to
-    the line's right."""
+    """Return centre, heading and size of a wall.
+
+    The wall is WALL_M thick; its outer face is on the line, with the outside on the right.
+    """
     x0, y0, x1, y1 = wall
     length, heading = math.hypot(x1 - x0, y1 - y0), math.atan2(y1 - y0, x1 - x0)
     x = 0.5 * (x0 + x1) - 0.5 * WALL_M * math.sin(heading)

@@ -1,9 +1,8 @@
-"""Skid steering: a command of forward speed and yaw rate becomes wheel speeds.
+"""Skid steering: converts forward speed and yaw rate into wheel speeds.
 
-Wheels that must slide sideways turn a robot by less than their speeds say, and by how much depends
-on the floor. As on real robots a yaw-rate loop (feed-forward, proportional, integral) closes that
-gap; speed needs no loop, because the wheels hardly slip along their way. At rest the wheels are
-simply locked.
+Wheels that slide sideways turn the robot less than their speeds imply, depending on the floor. A
+yaw-rate controller (feed-forward, proportional, integral) closes that gap, as on real robots. Speed
+needs no controller because wheels hardly slip lengthwise. At rest the wheels are locked.
 """
 
 from __future__ import annotations
@@ -14,46 +13,56 @@ from typing import Final
 from cosim.core.state import Command
 from cosim.spec.robot import Robot
 
-_FORWARD: Final = 1.2
+_FEED_FORWARD: Final = 1.2
+"""Feed-forward gain of the yaw-rate controller."""
+
 _PROPORTIONAL: Final = 0.5
+"""Proportional gain of the yaw-rate controller."""
+
 _INTEGRAL_HZ: Final = 5.0
-_EXTRA_MAX_RADPS: Final = 2.0
+"""Integral gain of the yaw-rate controller in 1/s."""
+
+_INTEGRAL_MAX_RADPS: Final = 2.0
+"""Limit of the integral term in rad/s."""
 
 
 class SkidDrive:
-    """The drive of one robot; remembers its ramps and the yaw loop's integral."""
+    """Drive controller of one robot: acceleration ramps and yaw-rate integral."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        self._still = [0.0] * len(robot.drive.joints)
+        self._zero_speeds = [0.0] * len(robot.drive.joints)
         self.reset()
 
     def reset(self) -> None:
-        """At rest."""
+        """Reset the controller to rest."""
         self._v_mps = 0.0
         self._w_radps = 0.0
-        self._extra_radps = 0.0
+        self._integral_radps = 0.0
 
     def joint_speeds(self, command: Command, w_radps: float, dt_s: float) -> list[float]:
-        """Speeds of the wheels in rad/s, in the order of `Skid.joints`, given the measured yaw
-        rate; one call per substep. The command is within the robot's limits
-        (`cosim.episode.control`)."""
+        """Return wheel speeds in rad/s, in the order of `Skid.joints`. Call once per substep.
+
+        command: within the robot's limits (see `cosim.episode.control`)
+        w_radps: measured yaw rate
+        dt_s: duration of a substep
+        """
         robot = self._robot
-        skid = self._robot.drive
+        drive = self._robot.drive
         self._v_mps = _towards(self._v_mps, command.v_mps, robot.acceleration_mps2 * dt_s)
         self._w_radps = _towards(self._w_radps, command.w_radps, robot.acceleration_radps2 * dt_s)
         if self._v_mps == 0.0 and self._w_radps == 0.0:
-            self._extra_radps = 0.0
-            return self._still
+            self._integral_radps = 0.0
+            return self._zero_speeds
         error = self._w_radps - w_radps
-        extra = self._extra_radps + _INTEGRAL_HZ * error * dt_s
-        self._extra_radps = min(max(extra, -_EXTRA_MAX_RADPS), _EXTRA_MAX_RADPS)
-        turn = _FORWARD * self._w_radps + _PROPORTIONAL * error + self._extra_radps
-        apart = 0.5 * skid.span_m[1] * turn
-        radius_m = skid.wheel_radius_m
-        left = (self._v_mps - apart) / radius_m
-        right = (self._v_mps + apart) / radius_m
-        return [left] * len(skid.left) + [right] * len(skid.right)
+        integral = self._integral_radps + _INTEGRAL_HZ * error * dt_s
+        self._integral_radps = min(max(integral, -_INTEGRAL_MAX_RADPS), _INTEGRAL_MAX_RADPS)
+        turn = _FEED_FORWARD * self._w_radps + _PROPORTIONAL * error + self._integral_radps
+        half_difference = 0.5 * drive.span_m[1] * turn
+        radius_m = drive.wheel_radius_m
+        left = (self._v_mps - half_difference) / radius_m
+        right = (self._v_mps + half_difference) / radius_m
+        return [left] * len(drive.left) + [right] * len(drive.right)
 
 
 def _towards(value: float, goal: float, step: float) -> float:

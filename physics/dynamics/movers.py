@@ -1,4 +1,4 @@
-"""Where people and vehicles near the robot are between two snapshots of the street."""
+"""Interpolation of people and vehicles near the robot between two street snapshots."""
 
 from __future__ import annotations
 
@@ -11,15 +11,24 @@ from cosim.core.geometry import Pose
 from cosim.core.state import PERSON_RADIUS_M, People, Vehicles
 
 _JUMP_M: Final = 5.0
-"""A longer way within one tick is a jump: the thing is at its new place at once."""
+"""Distance in metres above which a move within one tick counts as a teleport."""
 _ROUNDING_M: Final = 0.01
+"""Margin in metres for rounding in the vectorized distance test."""
+
 TickPoses = list[tuple[float, float, float]]
+"""x, y and heading after each substep of a tick."""
+
 _PERSON_SIZE_M: Final = (2.0 * PERSON_RADIUS_M, 2.0 * PERSON_RADIUS_M)
+"""Length and width of a person in metres."""
 
 
 class Mover(NamedTuple):
-    """Somebody or something that moves evenly during a tick. size_m: length and width; change: of
-    x, y and heading from the start of the tick to its end."""
+    """A person or vehicle that moves uniformly during a tick.
+
+    size_m: length and width
+    start: pose at the start of the tick
+    change: change of x, y and heading by the end of the tick
+    """
 
     id: str
     size_m: tuple[float, float]
@@ -27,12 +36,12 @@ class Mover(NamedTuple):
     change: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def passes(self, x_m: float, y_m: float, reach_m: float) -> bool:
-        """Whether any part of it may come within `reach_m` of a point, somewhere on its way."""
+        """Return whether any part may come within `reach_m` of a point during the tick."""
         way_m = math.hypot(*self.change[:2]) + 0.5 * math.hypot(*self.size_m)
         return math.hypot(self.start.x_m - x_m, self.start.y_m - y_m) <= way_m + reach_m
 
     def way(self, substeps: int) -> TickPoses:
-        """x, y, heading after each substep."""
+        """Return the pose after each substep."""
         (x, y, heading) = self.start
         (dx, dy, turn) = self.change
         shares = [(k + 1) / substeps for k in range(substeps)]
@@ -42,24 +51,26 @@ class Mover(NamedTuple):
 def movers_near(
     before: People | Vehicles, after: People | Vehicles, x_m: float, y_m: float, reach_m: float
 ) -> list[Mover]:
-    """What of `after` comes within `reach_m` of a point, at the start or at the end; a thing that
-    `before` lacks is at its new place at once."""
-    away = np.hypot(after.xy[:, 0] - x_m, after.xy[:, 1] - y_m)
+    """Return the people or vehicles that are within `reach_m` of a point at either end of a tick.
+
+    Those missing from `before` are placed at their new pose at once.
+    """
+    distance = np.hypot(after.xy[:, 0] - x_m, after.xy[:, 1] - y_m)
     same = before.ids == after.ids
     if same:
-        away = np.minimum(away, np.hypot(before.xy[:, 0] - x_m, before.xy[:, 1] - y_m))
+        distance = np.minimum(distance, np.hypot(before.xy[:, 0] - x_m, before.xy[:, 1] - y_m))
     found = []
-    for i in (away <= reach_m + _ROUNDING_M + (0.0 if same else _JUMP_M)).nonzero()[0].tolist():
+    for i in (distance <= reach_m + _ROUNDING_M + (0.0 if same else _JUMP_M)).nonzero()[0].tolist():
         name = after.ids[i]
-        was = None
+        start = None
         if same:
-            was = _pose(before, i)
+            start = _pose(before, i)
         elif name in before.ids:
-            was = _pose(before, before.ids.index(name))
+            start = _pose(before, before.ids.index(name))
         size_m = _PERSON_SIZE_M
         if isinstance(after, Vehicles):
             size_m = float(after.size[i, 0]), float(after.size[i, 1])
-        mover = _moving(name, size_m, was, _pose(after, i))
+        mover = _mover(name, size_m, start, _pose(after, i))
         from_x, from_y = mover.start.x_m - x_m, mover.start.y_m - y_m
         if (
             math.hypot(from_x, from_y) <= reach_m
@@ -69,11 +80,11 @@ def movers_near(
     return found
 
 
-def _moving(name: str, size_m: tuple[float, float], was: Pose | None, end: Pose) -> Mover:
-    if was is None or math.dist(was[:2], end[:2]) > _JUMP_M:
+def _mover(name: str, size_m: tuple[float, float], start: Pose | None, end: Pose) -> Mover:
+    if start is None or math.dist(start[:2], end[:2]) > _JUMP_M:
         return Mover(name, size_m, end)
-    turn = math.pi - (math.pi - (end.heading_rad - was.heading_rad)) % (2.0 * math.pi)
-    return Mover(name, size_m, was, (end.x_m - was.x_m, end.y_m - was.y_m, turn))
+    turn = math.pi - (math.pi - (end.heading_rad - start.heading_rad)) % (2.0 * math.pi)
+    return Mover(name, size_m, start, (end.x_m - start.x_m, end.y_m - start.y_m, turn))
 
 
 def _pose(things: People | Vehicles, row: int) -> Pose:

@@ -1,9 +1,7 @@
-"""BulletWorld: the robot among streets, buildings, props, barriers, people and vehicles, stepped by
-PyBullet.
+"""Physics world of one episode: the robot among ground, buildings, props, barriers and traffic.
 
-Only what the robot can touch is in the engine: ground, buildings and props of the tiles around it,
-and the people and vehicles within reach. Pictures are drawn elsewhere
-(physics.cameras.bullet_camera), from the same values.
+Only nearby bodies are in the engine: the tiles around the robot, and people and vehicles within
+    reach. Images are rendered from the same values by `physics.cameras`.
 """
 
 from __future__ import annotations
@@ -37,27 +35,44 @@ from physics.ground.tiles import Key, distance_to, distances_within, keys_within
 from physics.street.surface import Surface, stood
 
 SUBSTEP_S: Final = 0.005
+"""Duration of a physics substep in seconds."""
+
 PEOPLE_REACH_M: Final = 6.0
+"""Distance in metres within which people have collision bodies."""
+
 _VEHICLE_REACH_M: Final = 10.0
+"""Distance in metres within which vehicles have collision bodies."""
+
 _LOAD_M: Final = 20.0
+"""Distance in metres within which tiles are loaded."""
+
 _UNLOAD_M: Final = 40.0
+"""Distance in metres beyond which tiles are unloaded."""
+
 _STRAY_M: Final = 0.2
-"""Who can be touched is found anew when the robot comes so far within a tick, as when something
-throws it."""
-_CLEAR_M: Final = 0.5
-"""Who can be touched is who a robot would touch that were larger by this: more than it strays
-before that is seen."""
+"""Movement of the robot in metres after which contact candidates are selected again."""
+_CONTACT_MARGIN_M: Final = 0.5
+"""Margin in metres around the robot for contact candidates.
+
+It exceeds the distance that the robot strays before the next selection.
+"""
 _ROUNDING_M: Final = 1e-6
-_OWN_M: Final = 0.45
-"""From a point of a body, at most so far lies its surface."""
+"""Margin in metres for rounding when deciding whether tiles must be loaded."""
+
+_SIGHT_MARGIN_M: Final = 0.45
+"""Length in metres ignored at both ends of a line of sight.
+
+It covers the robot itself and the body of the target.
+"""
 
 
 class BulletWorld:
-    """The physics of one episode. Use it in a `with` block; one PyBullet client each, so several
-    may live at once.
+    """Physics of one episode, used in a `with` block.
 
-    surface: what it stands on. barriers, obstacles: what stands on it for the whole episode
-    besides.
+    Each instance has its own PyBullet client, so several can run at once.
+
+    surface: ground with buildings and props
+    barriers, obstacles: additional static bodies of the episode
     """
 
     def __init__(
@@ -74,15 +89,16 @@ class BulletWorld:
         self._drive = SkidDrive(robot)
         self._bodies: Bodies | None = None
         self._tiles: dict[Key, list[int]] = {}
-        self._streamed = (0.0, 0.0)
-        self._settled_m = 0.0
+        self._loaded_at_m = (0.0, 0.0)
+        self._reload_after_m = 0.0
         self._reach_m = (
-            math.hypot(0.5 * robot.length_m, 0.5 * robot.width_m, robot.height_m) + _CLEAR_M
+            math.hypot(0.5 * robot.length_m, 0.5 * robot.width_m, robot.height_m)
+            + _CONTACT_MARGIN_M
         )
 
     @property
     def footprint_m(self) -> tuple[float, float]:
-        """Length and width of the robot."""
+        """Return length and width of the robot in metres."""
         return self.robot.footprint_m
 
     def __enter__(self) -> Self:
@@ -105,40 +121,42 @@ class BulletWorld:
         self.close()
 
     def close(self) -> None:
-        """End the engine; a second call does nothing."""
+        """Stop the engine. Repeated calls do nothing."""
         if self._bodies is not None:
             self._bodies.close()
             self._bodies = None
             self._tiles.clear()
-            self._settled_m = 0.0
+            self._reload_after_m = 0.0
 
     def place(self, pose: Pose) -> RobotState:
-        """Put the robot at rest at a pose, its wheels on the ground."""
+        """Put the robot at rest at a pose, with its wheels on the ground."""
         bodies = self._engine
-        self._stream(pose.x_m, pose.y_m)
+        self._load_tiles(pose.x_m, pose.y_m)
         self._drive.reset()
         z, roll, pitch = self.surface.lean(pose, self.robot.drive.span_m)
         bodies.place_robot((pose.x_m, pose.y_m, z + 0.001), (roll, pitch, pose.heading_rad))
         return bodies.robot_state()
 
     def hidden(self, eye_m: Floats, points_m: Floats) -> NDArray[np.bool_]:
-        """Which of (N, 3) points something solid hides from an eye (3,) on the robot. What stands
-        closer than _OWN_M to a point is what is looked at, and what is so near the eye is the
-        robot. What stands farther than _LOAD_M from the robot may not be in the engine."""
+        """Return which of (N, 3) points are occluded from the robot's eye (3,), both in metres.
+
+        Bodies within _SIGHT_MARGIN_M of either end of a line of sight are ignored. Occluders
+        farther than _LOAD_M from the robot may be missing.
+        """
         rays = points_m - eye_m
         far_m = np.sqrt((rays**2).sum(axis=1))
         hidden = np.zeros(len(points_m), dtype=bool)
-        long = far_m > 2 * _OWN_M
+        long = far_m > 2 * _SIGHT_MARGIN_M
         if long.any():
-            inset = _OWN_M * rays[long] / far_m[long, None]
+            inset = _SIGHT_MARGIN_M * rays[long] / far_m[long, None]
             hidden[long] = self._engine.blocked(eye_m + inset, points_m[long] - inset)
         return hidden
 
     def step(self, command: Command, before: Street, after: Street, substeps: int) -> Motion:
-        """One tick of physics; people and vehicles move evenly from `before` to `after`."""
+        """Run one tick of physics; people and vehicles move uniformly from `before` to `after`."""
         bodies = self._engine
         x, y, _ = pose = bodies.at_m
-        self._stream(x, y)
+        self._load_tiles(x, y)
         near: dict[Moving, list[Mover]] = {
             "pedestrian": movers_near(before.people, after.people, x, y, PEOPLE_REACH_M),
             "vehicle": movers_near(before.vehicles, after.vehicles, x, y, _VEHICLE_REACH_M),
@@ -148,14 +166,14 @@ class BulletWorld:
             ways = {
                 mover: mover.way(substeps) for mover in movers if not bodies.stands(kind, mover)
             }
-            bodies.lead(kind, ways, self._feet(kind, ways) if ways else [])
-        close = self._watched(near, x, y)
+            bodies.lead(kind, ways, self._foot_heights(kind, ways) if ways else [])
+        close = self._watch_near(near, x, y)
         trace: list[float] = []
         found: set[Contact] = set()
         for k in range(substeps):
             if abs(pose[0] - x) > _STRAY_M or abs(pose[1] - y) > _STRAY_M:
                 x, y, _ = pose
-                close |= self._watched(near, x, y)
+                close |= self._watch_near(near, x, y)
             pose = bodies.step(
                 k, self._drive.joint_speeds(command, bodies.yaw_rate_radps, SUBSTEP_S)
             )
@@ -168,11 +186,10 @@ class BulletWorld:
         contacts = tuple(sorted(found, key=lambda c: (c.substep, c.kind, c.other))) if found else ()
         return Motion(bodies.robot_state(), poses, contacts)
 
-    def _watched(
+    def _watch_near(
         self, near: Mapping[Moving, Sequence[Mover]], x_m: float, y_m: float
     ) -> set[tuple[Moving, Mover]]:
-        """Whom the robot could touch while it is within _STRAY_M of a point. Contacts are asked for
-        with them and with what stands there, nothing else."""
+        """Select contact candidates for a robot near a point; return the movers among them."""
         close = {
             (kind, mover)
             for kind, movers in near.items()
@@ -182,8 +199,8 @@ class BulletWorld:
         self._engine.watch(self._reach_m, close)
         return close
 
-    def _feet(self, kind: Moving, ways: Mapping[Mover, TickPoses]) -> list[float]:
-        """Height of the ground under each at the end of the tick."""
+    def _foot_heights(self, kind: Moving, ways: Mapping[Mover, TickPoses]) -> list[float]:
+        """Return the ground height in metres under each mover at the end of the tick."""
         end = np.array([way[-1] for way in ways.values()])
         if kind == "pedestrian":
             z_m = self.surface.heights(end[:, :2])
@@ -192,7 +209,7 @@ class BulletWorld:
         return list(map(float, z_m))
 
     def _overlaps(self, kind: Moving, mover: Mover, trace: Floats) -> list[Contact]:
-        """Overlaps of the footprint with a disk or box, whatever the engine made of it."""
+        """Return overlaps of the robot's footprint with a mover, independent of the engine."""
         half = 0.5 * np.array(self.footprint_m)
         way = np.array(mover.way(len(trace)))[:, None]
         if kind == "pedestrian":
@@ -201,10 +218,12 @@ class BulletWorld:
             hit = boxes_overlap(trace[:, None], half, way, 0.5 * np.array([[mover.size_m]]))
         return [Contact(kind, mover.id, k) for k in np.flatnonzero(hit).tolist()]
 
-    def _stream(self, x_m: float, y_m: float) -> None:
-        """Load the tiles around a point and drop those left behind; nothing to do before it has
-        moved far enough."""
-        if math.hypot(x_m - self._streamed[0], y_m - self._streamed[1]) < self._settled_m:
+    def _load_tiles(self, x_m: float, y_m: float) -> None:
+        """Load tiles near a point and unload distant ones, once the robot has moved far enough."""
+        if (
+            math.hypot(x_m - self._loaded_at_m[0], y_m - self._loaded_at_m[1])
+            < self._reload_after_m
+        ):
             return
         bodies = self._engine
         for key in [k for k in self._tiles if distance_to(k, x_m, y_m) > _UNLOAD_M]:
@@ -212,20 +231,17 @@ class BulletWorld:
         for key in keys_within(x_m, y_m, _LOAD_M):
             if key not in self._tiles:
                 self._tiles[key] = bodies.add_chunk(self.surface.chunk(key))
-        ahead = [
+        to_load_m = [
             far_m - _LOAD_M
             for far_m, key in distances_within(x_m, y_m, _UNLOAD_M)
             if key not in self._tiles
         ]
-        left = [_UNLOAD_M - distance_to(key, x_m, y_m) for key in self._tiles]
-        self._streamed = (x_m, y_m)
-        self._settled_m = min(ahead + left) - _ROUNDING_M
+        to_unload_m = [_UNLOAD_M - distance_to(key, x_m, y_m) for key in self._tiles]
+        self._loaded_at_m = (x_m, y_m)
+        self._reload_after_m = min(to_load_m + to_unload_m) - _ROUNDING_M
 
     @property
     def _engine(self) -> Bodies:
         if self._bodies is None:
             raise EngineError("the physics is not running: use BulletWorld in a 'with' block")
         return self._bodies
-
-
-__all__ = ["SUBSTEP_S", "BulletWorld"]

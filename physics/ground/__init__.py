@@ -1,1 +1,1 @@
-"""The ground: meshes, materials, relief and tiles."""
+"""Ground meshes, materials, relief and tiles."""

@@ -1,8 +1,7 @@
-"""What the ground is made of: a literal table of materials, and the paving of each street, drawn
-from a seed.
+"""Ground materials, and the random choice of a material for each street.
 
-A street keeps its paving on both sides and over its mid-block crossings. Corners and junctions are
-paved plainly, so that streets meet on neutral ground.
+Both sidewalks of a street and its mid-block crossings share one material. Corners and junctions
+keep the plain material, so that streets meet on neutral ground.
 """
 
 from __future__ import annotations
@@ -22,11 +21,17 @@ from cosim.place.street_map import Lane, StreetMap, Strip, street_of
 from physics.textures.layers import Colour
 
 PLAIN_FRICTION: Final = 0.9
+"""Friction coefficient of ground without a material of its own, such as roads."""
 
 
 @dataclass(frozen=True, slots=True)
 class Material:
-    """friction: coefficient of a surface against a tyre of 1.0. colours: what it may look like."""
+    """A ground material.
+
+    name: key in `MATERIALS`
+    friction: coefficient of friction against a tyre of 1.0
+    colours: sRGB colours to choose from
+    """
 
     name: str
     friction: float
@@ -43,6 +48,7 @@ MATERIALS: Final[Mapping[str, Material]] = {
         Material("grass", 0.70, ((0.35, 0.50, 0.24), (0.42, 0.50, 0.26), (0.30, 0.44, 0.22))),
     )
 }
+"""Every ground material by name."""
 
 _SIDEWALKS: Final[Mapping[str, Mapping[str, float]]] = {
     "residential": {"concrete": 4, "pavers": 3, "asphalt": 2, "brick": 1},
@@ -52,56 +58,68 @@ _SIDEWALKS: Final[Mapping[str, Mapping[str, float]]] = {
     "narrow": {"brick": 4, "pavers": 4, "concrete": 1},
     "": {"concrete": 5, "pavers": 3, "asphalt": 2, "brick": 1},
 }
+"""Weight of each sidewalk material by street class; "" is the default class."""
+
 _ROADS: Final[Mapping[str, Mapping[str, float]]] = {
     "narrow": {"": 3, "pavers": 3, "brick": 2},
     "": {"": 1},
 }
-"""Shares of the streets of a class whose sidewalks or roads have a material; "": as every road."""
+"""Weight of each road material by street class; the material "" is plain asphalt."""
 
 _VERGES: Final[Mapping[str, Mapping[str, float]]] = {"": {"grass": 1}}
-_PAVED: Final = {"sidewalk": _SIDEWALKS, "road": _ROADS, "verge": _VERGES}
-_OVERLAP_M: Final = 0.3
-_OF_KIND: Final[Mapping[str, str]] = {"verge": "grass", "ground": "grass"}
+"""Weight of each verge material by street class."""
+
+_WEIGHTS: Final = {"sidewalk": _SIDEWALKS, "road": _ROADS, "verge": _VERGES}
+"""Material weights for each kind of paved piece."""
+
+_LANE_GAP_M: Final = 0.3
+"""Largest distance in metres of a point to its lane; lanes leave gaps between them."""
+
+_DEFAULT_MATERIALS: Final[Mapping[str, str]] = {"verge": "grass", "ground": "grass"}
+"""Material of each kind of ground whose name has no material."""
 
 PAVINGS: Final[Mapping[str, Colour]] = {
     f"{kind}:{name}:{i}": colour
-    for kind, tables in _PAVED.items()
+    for kind, tables in _WEIGHTS.items()
     for name in dict.fromkeys(name for table in tables.values() for name in table if name)
     for i, colour in enumerate(MATERIALS[name].colours)
 }
-"""Colours of paved surfaces. A surface is called by its kind, its material and the number of its
-colour."""
+"""Colour of each paved surface by name: "kind:material:colour index"."""
 
 SEEN_AS: Final[Mapping[str, tuple[str, Colour]]] = {
     "ground": ("ground", GROUND_LOOKS[PLAIN_GROUND].seen),
     "sidewalk:asphalt:0": ("sidewalk:footway:0", (0.57, 0.55, 0.52)),
     "sidewalk:asphalt:1": ("sidewalk:footway:1", (0.62, 0.60, 0.58)),
 }
-"""What surfaces look like where that is not their own look, on every map but generated cities:
-nothing that is walked on resembles a carriageway or open ground, so the asphalt of a footway is
-light."""
+"""Texture and colour that replace a surface's own on every map except generated cities.
+
+Walkable ground must not resemble a carriageway or open ground, so the asphalt of a footway is
+light.
+"""
 
 
 def friction(surface: str) -> float:
-    """Friction of a surface, by its name."""
+    """Return the friction coefficient of a surface name."""
     kind, _, rest = surface.partition(":")
-    name = rest.partition(":")[0] if rest else _OF_KIND.get(kind, "")
+    name = rest.partition(":")[0] if rest else _DEFAULT_MATERIALS.get(kind, "")
     return MATERIALS[name].friction if name else PLAIN_FRICTION
 
 
 class Paving:
-    """The materials of a map's streets under a seed."""
+    """Assignment of materials to the streets of a map."""
 
     def __init__(self, street_map: StreetMap, seed: int) -> None:
         self._map = street_map
         self._seed = seed
 
     def surface(self, piece: Strip | Lane) -> str:
-        """The name of a sidewalk's, road's or verge's surface; its kind alone where it is as
-        everywhere."""
+        """Return the surface name of a sidewalk, road or verge.
+
+        Plain pieces have their kind alone as name.
+        """
         edge = piece.edge if isinstance(piece, Lane) else piece.id
         strip = self._map.strips.get(edge)
-        tables = _PAVED[piece.kind]
+        tables = _WEIGHTS[piece.kind]
         table = tables.get(strip.street_class if strip is not None else "", tables[""])
         rng = np.random.default_rng(
             [self._seed, zlib.crc32(street_of(edge).encode()), zlib.crc32(piece.kind.encode())]
@@ -115,7 +133,7 @@ class Paving:
         )
 
     def pieces(self, area: shapely.Geometry) -> list[Strip | Lane]:
-        """The paved pieces that touch an area."""
+        """Return the sidewalks and lanes that touch an area."""
         strips = [
             s
             for s in self._map.near("strip", area)
@@ -135,37 +153,45 @@ class Paving:
         pieces: Sequence[Strip | Lane],
         area: shapely.Geometry,
     ) -> list[str]:
-        """Kinds of ground at (N, 2) points as names of surfaces."""
+        """Return surface names for points whose kind of ground is known.
+
+        kinds: kind of ground at each point
+        points: (N, 2) m
+        pieces: result of `pieces` for the area
+        area: area that contains the points
+        """
         names = np.asarray(kinds, dtype=object)
-        at = np.asarray(shapely.points(points), dtype=object)
+        located = np.asarray(shapely.points(points), dtype=object)
         in_corner = np.zeros(len(names), dtype=bool)
         corners = [corner.polygon for corner in self._map.near("corner", area)]
         if corners:
-            in_corner[shapely.STRtree(corners).query(at, predicate="intersects")[0]] = True
-        for kind in _PAVED:
-            own = [piece for piece in pieces if piece.kind == kind]
+            in_corner[shapely.STRtree(corners).query(located, predicate="intersects")[0]] = True
+        for kind in _WEIGHTS:
+            candidates = [piece for piece in pieces if piece.kind == kind]
             rows = np.flatnonzero((names == kind) & ~in_corner)
-            if own and len(rows):
-                tree = shapely.STRtree([piece.polygon for piece in own])
-                # Lanes of a road leave gaps between them: the nearest one counts.
+            if candidates and len(rows):
+                tree = shapely.STRtree([piece.polygon for piece in candidates])
+                # Lanes of a road have gaps between them, so the nearest lane is used.
                 row, piece = tree.query_nearest(
-                    at[rows], max_distance=_OVERLAP_M, all_matches=False
+                    located[rows], max_distance=_LANE_GAP_M, all_matches=False
                 )
-                names[rows[row]] = [self.surface(own[k]) for k in piece.tolist()]
+                names[rows[row]] = [self.surface(candidates[k]) for k in piece.tolist()]
         return list(names)
 
 
 def cuts(pieces: Sequence[Strip | Lane]) -> NDArray[np.object_]:
-    """Lines across the ends of pieces: there the ground is divided, so that each piece can be of
-    its own."""
+    """Return lines across both ends of each piece.
+
+    The ground is divided along them, so that each piece can have its own surface.
+    """
     if not pieces:
         return np.zeros(0, dtype=object)
     ends = np.array([(p.line[i, :2], p.line[j, :2]) for p in pieces for i, j in ((0, 1), (-1, -2))])
     along = ends[:, 1] - ends[:, 0]
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-9)
-    half = np.repeat([0.5 * p.width_m + _OVERLAP_M for p in pieces], 2)[:, None]
-    aside = half * along[:, ::-1] * (-1.0, 1.0)
+    half = np.repeat([0.5 * p.width_m + _LANE_GAP_M for p in pieces], 2)[:, None]
+    offset = half * along[:, ::-1] * (-1.0, 1.0)
     return np.asarray(
-        shapely.linestrings(np.stack([ends[:, 0] - aside, ends[:, 0] + aside], axis=1)),
+        shapely.linestrings(np.stack([ends[:, 0] - offset, ends[:, 0] + offset], axis=1)),
         dtype=object,
     )

@@ -1,4 +1,4 @@
-"""Mesh: triangles as a value, and the few shapes that everything here is made of."""
+"""Triangle meshes and the basic shapes that all models are built from."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from physics.textures.layers import Colour
 Ints = NDArray[np.int32]
 
 _BOX_CORNERS = np.array([[x, y, z] for z in (-0.5, 0.5) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
+"""(8, 3) corners of the unit cube."""
+
 _BOX_FACES = {
     "top": (4, 5, 7, 6),
     "bottom": (0, 2, 3, 1),
@@ -25,13 +27,17 @@ _BOX_FACES = {
     "left": (2, 6, 7, 3),
     "right": (0, 1, 5, 4),
 }
-"""Corners of each face, counter-clockwise from outside; front is +x, left +y."""
+"""Corner indices of each face, counter-clockwise from outside; the front is +x, left is +y."""
 
 
 @dataclass(frozen=True, slots=True)
 class Mesh:
-    """A surface. vertices, normals: (V, 3) metres and unit vectors; triangles: (T, 3), front
-    counter-clockwise."""
+    """Immutable triangle mesh.
+
+    vertices: (V, 3) m
+    normals: (V, 3) unit vectors
+    triangles: (T, 3) vertex indices, counter-clockwise from the front
+    """
 
     vertices: Floats
     normals: Floats
@@ -41,15 +47,21 @@ class Mesh:
         return len(self.triangles)
 
     def moved(self, offset_m: Sequence[float] | Floats, heading_rad: float = 0.0) -> Mesh:
-        """Turned about the vertical by `heading_rad`, then shifted by (3,) `offset_m`."""
+        """Return the mesh rotated about the vertical, then translated.
+
+        offset_m: (3,) m
+        """
         turn = yaw_matrix(heading_rad)
         return Mesh(
             self.vertices @ turn.T + np.asarray(offset_m), self.normals @ turn.T, self.triangles
         )
 
     def tilted(self, angle_rad: float, pivot_m: Sequence[float]) -> Mesh:
-        """Turned about the y axis through `pivot_m`; a positive angle swings what hangs below it
-        backwards."""
+        """Return the mesh rotated about an axis parallel to y.
+
+        angle_rad: positive angles swing parts below the pivot backwards
+        pivot_m: (3,) point on the axis, m
+        """
         cos, sin = np.cos(angle_rad), np.sin(angle_rad)
         turn = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
         pivot = np.asarray(pivot_m)
@@ -57,9 +69,14 @@ class Mesh:
 
 
 class Part(NamedTuple):
-    """A mesh of one colour; None is the thing's own paint. What only some cameras show: cover, a
-    layer of physics.textures.walls that takes the colour, "lamp" for what shines at night ("":
-    none); shade: (V,) light that reaches each corner, 0 to 1; glows: shines in its colour."""
+    """A mesh with one colour.
+
+    colour: sRGB; None uses the object's own paint
+    cover: layer of `physics.textures.walls` tinted by the colour, "lamp" for lights at night, or
+        ""; only cameras with textures show it
+    shade: (V,) fraction of light that reaches each vertex
+    glows: True if the part emits its colour as light
+    """
 
     mesh: Mesh
     colour: Colour | None = None
@@ -69,14 +86,15 @@ class Part(NamedTuple):
 
 
 _idle_rows: list[list[float]] = []
+"""Recycled row lists for `as_lists`."""
 
 
 @contextmanager
 def as_lists(indices: Ints, *tables: Floats) -> Iterator[tuple[list[int], list[list[list[float]]]]]:
-    """A flat array and (N, 3) tables as the lists PyBullet wants, for the time of one call.
+    """Provide an index array and (N, 3) tables as the lists that PyBullet takes.
 
-    PyBullet never lets go of a list it was given, nor of the rows in it: so rows are used again and
-    again, and what else it keeps is left empty.
+    PyBullet never releases a list or a row that it received. Rows are therefore reused, and all
+    other lists are emptied on exit.
     """
     flat = indices.ravel().tolist()
     lists = []
@@ -97,16 +115,17 @@ def as_lists(indices: Ints, *tables: Floats) -> Iterator[tuple[list[int], list[l
 
 
 EMPTY = Mesh(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))
+"""Mesh without triangles."""
 
 
 def yaw_matrix(heading_rad: float) -> Floats:
-    """(3, 3) rotation about the vertical."""
+    """Return the (3, 3) rotation about the vertical."""
     cos, sin = np.cos(heading_rad), np.sin(heading_rad)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 def join(meshes: Sequence[Mesh]) -> Mesh:
-    """All triangles as one mesh."""
+    """Return one mesh with all triangles."""
     if not meshes:
         return EMPTY
     starts = np.cumsum([0, *(len(m.vertices) for m in meshes[:-1])])
@@ -120,7 +139,7 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
 
 
 def smooth_normals(vertices: Floats, triangles: Ints) -> Floats:
-    """(V, 3) unit normals: means of the triangles around, by area."""
+    """Return (V, 3) unit normals, averaged over adjacent triangles by area."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     face = np.cross(b - a, c - a)
     total = np.zeros_like(vertices)
@@ -132,8 +151,11 @@ def smooth_normals(vertices: Floats, triangles: Ints) -> Floats:
 def plan_triangles(
     areas: Sequence[shapely.Geometry] | NDArray[np.object_],
 ) -> tuple[Floats, NDArray[np.int64]]:
-    """(T, 3, 2) corners of triangles that fill areas of the ground, counter-clockwise from above,
-    and (T,) which area each is of."""
+    """Triangulate areas of the ground.
+
+    Returns: (T, 3, 2) corners, counter-clockwise from above, and the (T,) index of each triangle's
+        area
+    """
     parts, area = shapely.get_parts(
         shapely.constrained_delaunay_triangles(np.asarray(areas, dtype=object)), return_index=True
     )
@@ -144,8 +166,22 @@ def plan_triangles(
     return corners, area
 
 
+def flat_shaded(corners: Floats, normals: Floats | None = None) -> Mesh:
+    """Build a mesh of separate triangles.
+
+    corners: (3 * T, 3) m, three per triangle
+    normals: (3 * T, 3) unit vectors; None points all of them up
+    """
+    if normals is None:
+        normals = np.tile([0.0, 0.0, 1.0], (len(corners), 1))
+    return Mesh(corners, normals, np.arange(len(corners), dtype=np.int32).reshape(-1, 3))
+
+
 def quads(corners: Floats) -> Mesh:
-    """Flat quadrilaterals. corners: (N, 4, 3), counter-clockwise from the front."""
+    """Build flat quadrilaterals.
+
+    corners: (N, 4, 3) m, counter-clockwise from the front
+    """
     if len(corners) == 0:
         return EMPTY
     normal = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
@@ -160,8 +196,11 @@ def quads(corners: Floats) -> Mesh:
 def box(
     size_m: Sequence[float], centre_m: Sequence[float] = (0.0, 0.0, 0.0), skip: Sequence[str] = ()
 ) -> Mesh:
-    """An upright box: length (x), width (y), height (z). skip: faces left out, of top bottom front
-    back left right."""
+    """Build an upright box.
+
+    size_m: length (x), width (y), height (z)
+    skip: faces to leave out: top, bottom, front, back, left, right
+    """
     corners = _BOX_CORNERS * np.asarray(size_m) + np.asarray(centre_m)
     return quads(
         np.stack([corners[list(face)] for name, face in _BOX_FACES.items() if name not in skip])
@@ -175,7 +214,11 @@ def frustum(
     high_m: float,
     sides: int = 6,
 ) -> Mesh:
-    """An upright tapered prism with a top: (x, y) half axes at heights low_m and high_m."""
+    """Build an upright tapered prism with a top and no bottom.
+
+    radius_low_m, radius_high_m: half axes (x, y) at the two heights
+    low_m, high_m: heights of the two ends
+    """
     angle = 2.0 * np.pi * (np.arange(sides) + 0.5) / sides
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     low = np.column_stack([circle * radius_low_m, np.full(sides, low_m)])
@@ -195,7 +238,7 @@ def frustum(
 
 
 def disc(radius_m: float, centre_m: Sequence[float], sides: int, turn_rad: float = 0.0) -> Mesh:
-    """An upright regular polygon that faces +x, its first corner above unless it is turned."""
+    """Build an upright regular polygon that faces +x; its first corner is on top unless turned."""
     angle = 0.5 * np.pi + turn_rad + 2.0 * np.pi * np.arange(sides) / sides
     at = np.column_stack(
         [np.zeros(sides), radius_m * np.cos(angle), radius_m * np.sin(angle)]

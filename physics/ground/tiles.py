@@ -1,16 +1,15 @@
-"""The ground: a StreetMap cut into square tiles of triangles, each built alone and alike from
-either side.
+"""Ground of a street map, built as square tiles of triangles.
 
-Road and crossings lie at height 0, everything else at CURB_M above; towards a crossing, and towards
-the mouth of a driveway, the high ground sinks with a slope of 1:12, so that a curb ramp and its
-flares come from one formula: min(CURB_M, distance / 12).
+Roads and crossings lie at height 0 and all other ground at CURB_M. Towards crossings and driveways
+the high ground slopes down at 1:12. One formula, min(CURB_M, distance / 12), gives curb ramps and
+their flares.
 
-On hilly places all this lies on the terrain, and the sides of the terrain's triangles divide the
-faces: the ground's triangles lie in the terrain's planes.
+On hilly maps the ground is added to the terrain. Edges of terrain triangles divide the faces, so
+that ground triangles lie in terrain planes.
 
-A tile is one planar arrangement: all outlines are noded together on a millimetre grid, the faces
-between them are classified and triangulated. Neighbouring faces share their vertices, so there are
-no cracks.
+A tile is one planar arrangement. All outlines are noded on a millimetre grid, then the faces
+between them are classified and triangulated. Neighbouring faces share vertices, so there are no
+cracks. Each tile depends only on the map around it, so adjacent tiles fit.
 """
 
 from __future__ import annotations
@@ -33,18 +32,30 @@ from physics.ground.mesh import Mesh, join, plan_triangles, quads, smooth_normal
 from physics.ground.relief import Relief, potholes
 
 TILE_M: Final = 48.0
+"""Side of a tile in metres."""
+
 CURB_M: Final = 0.12
+"""Height of a curb in metres."""
+
 RAMP_SLOPE: Final = 1.0 / 12.0
+"""Slope of curb ramps."""
+
 RAMP_M: Final = CURB_M / RAMP_SLOPE
+"""Length of a curb ramp in metres."""
+
 CURBSTONE_M: Final = 0.15
+"""Width of the curb's top in metres."""
+
 DRIVEWAY_M: Final = 3.0
-"""Width of a driveway where it meets the road."""
+"""Width of a driveway at the road in metres."""
 STRIPE_M: Final = 0.5
-"""Length of a zebra stripe, and of the gap after it, along the crossing."""
+"""Length of a zebra stripe, and of the gap after it, along the crossing in metres."""
 
 _GRID_M = 1e-3
+"""Grid size in metres to which vertices are rounded."""
+
 _ORIGIN_M = 0.4137
-"""Shift of the tile lattice, so that no street's edge runs along a tile's border."""
+"""Offset of the tile grid in metres, so that no street edge lies on a tile border."""
 
 SURFACES: Mapping[str, tuple[str, tuple[float, float, float]]] = {
     "road": ("road", (0.29, 0.29, 0.31)),
@@ -56,31 +67,42 @@ SURFACES: Mapping[str, tuple[str, tuple[float, float, float]]] = {
     "verge": ("verge", (0.35, 0.50, 0.24)),
     "ground": ("ground", (0.50, 0.55, 0.40)),
 }
-"""Kinds of ground: label of cosim.core.state.LABELS, and colour."""
+"""Label (see `cosim.core.state.LABELS`) and sRGB colour of each kind of ground."""
 
 
 def surface(name: str) -> tuple[str, tuple[float, float, float]]:
-    """Label and colour of a part of a tile: a kind of ground, or one with a material of its own."""
+    """Return the label and sRGB colour of a surface name."""
     label, colour = SURFACES[kind_of(name)]
     return label, PAVINGS.get(name, colour)
 
 
 def kind_of(name: str) -> str:
-    """The kind of ground of a part of a tile."""
+    """Return the kind of ground of a surface name."""
     return name.partition(":")[0]
 
 
-_WALKED: Final[tuple[PieceKind, ...]] = ("strip", "corner")
+_WALKABLE: Final[tuple[PieceKind, ...]] = ("strip", "corner")
+"""Kinds of map pieces that are walkable."""
+
 _LOW = ("road", "crossing", "stripe")
+"""Kinds of ground at road level."""
 
 Key = tuple[int, int]
+"""Column and row of a tile."""
 
 
 @dataclass(frozen=True, slots=True)
 class Tile:
-    """One square of ground. parts: name of `surface` -> mesh; low: road and crossings; crossings:
-    all that ramps lead to, mouths of driveways included. Both reach RAMP_M and more beyond the
-    square."""
+    """Ground of one square.
+
+    parts: mesh of each surface name
+    low: area of roads and crossings
+    crossings: area that ramps lead to: crossings and mouths of driveways
+    relief: unevenness, None at roughness 0
+    terrain: heights of the land, None on flat maps
+
+    Both areas extend at least RAMP_M beyond the square.
+    """
 
     key: Key
     parts: Mapping[str, Mesh]
@@ -90,35 +112,41 @@ class Tile:
     terrain: Terrain | None = None
 
     def height(self, xy: ArrayLike) -> Floats:
-        """Height of the ground at (N, 2) points in the square, (N,) metres."""
+        """Return the (N,) ground heights in metres at (N, 2) points in the square."""
         xy = np.asarray(xy, dtype=float).reshape(-1, 2)
         _, low, high = _heights(xy, self.crossings, self.relief, self.terrain)
         return np.where(shapely.contains_xy(self.low, xy[:, 0], xy[:, 1]), low, high)
 
 
 def key_at(x_m: float, y_m: float) -> Key:
-    """The tile that holds a point."""
+    """Return the tile that contains a point."""
     return math.floor((x_m - _ORIGIN_M) / TILE_M), math.floor((y_m - _ORIGIN_M) / TILE_M)
 
 
 def cells_of(xy: Floats) -> NDArray[np.int64]:
-    """(N, 2) the tiles that hold (N, 2) points, as `key_at` says."""
+    """Return the (N, 2) tiles that contain (N, 2) points."""
     return np.asarray(np.floor((xy - _ORIGIN_M) / TILE_M), dtype=np.int64)
 
 
 def square(key: Key) -> tuple[float, float, float, float]:
-    """x0, y0, x1, y1 of a tile in metres."""
+    """Return x0, y0, x1, y1 of a tile in metres."""
     x, y = key[0] * TILE_M + _ORIGIN_M, key[1] * TILE_M + _ORIGIN_M
     return x, y, x + TILE_M, y + TILE_M
 
 
+def grown_box(bounds: Iterable[float], margin_m: float) -> shapely.Polygon:
+    """Return the box of bounds (x0, y0, x1, y1) enlarged by a margin, in metres."""
+    x0, y0, x1, y1 = (float(b) for b in bounds)
+    return shapely.box(x0 - margin_m, y0 - margin_m, x1 + margin_m, y1 + margin_m)
+
+
 def keys_within(x_m: float, y_m: float, radius_m: float) -> list[Key]:
-    """Tiles with a point within `radius_m` of (x_m, y_m), row by row."""
+    """Return the tiles within a radius of a point, row by row."""
     return [key for _, key in distances_within(x_m, y_m, radius_m)]
 
 
 def distances_within(x_m: float, y_m: float, radius_m: float) -> list[tuple[float, Key]]:
-    """The tiles of `keys_within`, each with its distance."""
+    """Return the tiles of `keys_within`, each with its distance in metres."""
     (i0, j0) = key_at(x_m - radius_m, y_m - radius_m)
     (i1, j1) = key_at(x_m + radius_m, y_m + radius_m)
     keys = [(i, j) for j in range(j0, j1 + 1) for i in range(i0, i1 + 1)]
@@ -127,7 +155,7 @@ def distances_within(x_m: float, y_m: float, radius_m: float) -> list[tuple[floa
 
 
 def keys_in(area: shapely.Geometry) -> list[Key]:
-    """Tiles that an area touches, column by column."""
+    """Return the tiles that an area touches, column by column."""
     x0, y0, x1, y1 = shapely.bounds(area).tolist()
     (i0, j0) = key_at(x0, y0)
     (i1, j1) = key_at(x1, y1)
@@ -137,7 +165,7 @@ def keys_in(area: shapely.Geometry) -> list[Key]:
 
 
 def distance_to(key: Key, x_m: float, y_m: float) -> float:
-    """Distance from a point to a tile's square in metres; 0 inside."""
+    """Return the distance in metres from a point to a tile; 0 inside."""
     x0, y0, x1, y1 = square(key)
     return math.hypot(max(x0 - x_m, x_m - x1, 0.0), max(y0 - y_m, y_m - y1, 0.0))
 
@@ -150,13 +178,15 @@ def build_tile(
     seed: int = 0,
     roots: ArrayLike = (),
 ) -> Tile:
-    """The ground of one tile; depends on nothing but the map around it and the paving, None being
-    plain.
+    """Build the ground of one tile.
 
-    roughness: 0 (flat) to 1; seed: of the unevenness; roots: (N, 2) trees in and around the tile.
+    paving: materials of the streets; None for plain ground
+    roughness: 0 (flat) to 1
+    seed: seed of the unevenness
+    roots: (N, 2) trees in and around the tile, m
     """
     border = shapely.box(*square(key))
-    reach = shapely.box(*_grown(square(key), RAMP_M + 1.0))
+    reach = grown_box(square(key), RAMP_M + 1.0)
     zones, stripes = _zones(street_map, reach)
     low = shapely.union_all([zones["road"], zones["crossing"]])
     shapely.prepare(low)
@@ -182,11 +212,11 @@ def build_tile(
 def _zones(
     street_map: StreetMap, reach: shapely.Polygon
 ) -> tuple[dict[str, shapely.Geometry], shapely.Geometry]:
-    """Disjoint areas within `reach` (pavement before crossing before road before verge), and the
-    zebra stripes.
+    """Return disjoint areas of the ground within `reach`, and the zebra stripes.
 
-    "ramp_to" is the union of the crossings, also where pavement covers them, and of the mouths of
-    the driveways; "apron" is where driveways cross the verge.
+    Where pieces overlap, pavement takes precedence over crossings, then roads, then verges.
+    "ramp_to" is the union of all crossings and driveway mouths. "apron" is where driveways cross
+    the verge.
     """
     strips = [s for s in street_map.near("strip", reach) if isinstance(s, Strip)]
     lanes = street_map.near("lane", reach)
@@ -196,7 +226,9 @@ def _zones(
         lane.polygon for lane in lanes if getattr(lane, "kind", "") == "road"
     ]
     roads += [
-        part for j in street_map.near("junction", reach) for part in _driven(street_map, j.polygon)
+        part
+        for j in street_map.near("junction", reach)
+        for part in _junction_roads(street_map, j.polygon)
     ]
     verges = [lane.polygon for lane in lanes if getattr(lane, "kind", "") == "verge"]
     crossings = [s for s in strips if s.kind == "crossing"]
@@ -206,9 +238,12 @@ def _zones(
     crossing = overlay.difference(zebras, pavement)
     road = overlay.difference(_union(roads, reach), overlay.union(pavement, zebras))
     verge = overlay.difference(_union(verges, reach), overlay.union_all([pavement, zebras, road]))
-    mouths = [_driveway(s, at_m, 0.0, 0.1) for s in strips for at_m in s.driveways]
+    mouths = [_driveway_part(s, at_m, 0.0, 0.1) for s in strips for at_m in s.driveways]
     aprons = [
-        _driveway(s, at_m, -s.verge_m, 0.0) for s in strips for at_m in s.driveways if s.verge_m
+        _driveway_part(s, at_m, -s.verge_m, 0.0)
+        for s in strips
+        for at_m in s.driveways
+        if s.verge_m
     ]
     apron = overlay.intersection(_union(aprons, reach, closed=False), verge)
     ramp_to = overlay.union(zebras, _union(mouths, reach, closed=False))
@@ -228,8 +263,11 @@ def _zones(
     return zones, stripes
 
 
-def _driveway(strip: Strip, at_m: float, from_m: float, to_m: float) -> shapely.Polygon:
-    """The part of a driveway between two distances from the road's edge, positive on the road."""
+def _driveway_part(strip: Strip, at_m: float, from_m: float, to_m: float) -> shapely.Polygon:
+    """Return the part of a driveway between two distances from the road's edge.
+
+    Distances are positive on the road.
+    """
     x, y, heading = Polyline(strip.line).at(at_m)
     road = strip.road_side * (0.5 * strip.width_m + strip.verge_m)
     along = 0.5 * DRIVEWAY_M * np.array([math.cos(heading), math.sin(heading)])
@@ -238,12 +276,11 @@ def _driveway(strip: Strip, at_m: float, from_m: float, to_m: float) -> shapely.
     return shapely.Polygon([near - along, near + along, far + along, far - along])
 
 
-def _driven(street_map: StreetMap, outline: shapely.Geometry) -> list[shapely.Geometry]:
-    """The parts of a junction's outline that belong to its roads, not the slivers behind its
-    corners."""
+def _junction_roads(street_map: StreetMap, outline: shapely.Geometry) -> list[shapely.Geometry]:
+    """Return the parts of a junction that belong to its roads, without slivers behind corners."""
     junction = shapely.make_valid(outline)
     walked: list[shapely.Geometry] = [
-        p.polygon for kind in _WALKED for p in street_map.near(kind, junction)
+        p.polygon for kind in _WALKABLE for p in street_map.near(kind, junction)
     ]
     lanes = [
         lane.polygon
@@ -261,6 +298,7 @@ def _driven(street_map: StreetMap, outline: shapely.Geometry) -> list[shapely.Ge
 def _union(
     polygons: Sequence[shapely.Geometry], reach: shapely.Polygon, closed: bool = True
 ) -> shapely.Geometry:
+    """Return the union of polygons within `reach`; `closed` also fills small gaps."""
     if not polygons:
         return shapely.Polygon()
     cut = overlay.intersection(shapely.make_valid(np.asarray(polygons, dtype=object)), reach)
@@ -271,7 +309,7 @@ def _union(
 
 
 def _stripes(crossing: Strip) -> shapely.Geometry:
-    """Zebra stripes of a crossing: bars across its width, spread evenly over its length."""
+    """Return the zebra stripes of a crossing: bars across it, evenly spaced."""
     line = Polyline(crossing.line)
     count = max(int(line.length_m / (2.0 * STRIPE_M)), 1)
     bars = []
@@ -295,8 +333,10 @@ def _faces(
     stripes: shapely.Geometry,
     ends: NDArray[np.object_],
 ) -> NDArray[np.object_]:
-    """The faces of the arrangement of all outlines within `border`; ends: lines that divide them
-    further."""
+    """Return the faces of the arrangement of all outlines within `border`.
+
+    ends: additional lines that divide the faces
+    """
     contours = [
         shapely.buffer(zones["ramp_to"], share * RAMP_M, quad_segs=3) for share in (0.5, 1.0)
     ]
@@ -316,13 +356,13 @@ def _faces(
 def _classify(
     point: Floats, zones: Mapping[str, shapely.Geometry], stripes: shapely.Geometry
 ) -> list[str]:
-    """The kind of ground at (N, 2) points."""
+    """Return the kind of ground at (N, 2) points."""
     x, y = point[:, 0], point[:, 1]
     kind = np.full(len(point), "ground", dtype=object)
     kind[shapely.contains_xy(zones["verge"], x, y)] = "verge"
     pavement = shapely.contains_xy(zones["pavement"], x, y)
     kind[pavement] = "sidewalk"
-    kind[pavement & (_raised(point, zones["ramp_to"]) < CURB_M - 1e-6)] = "ramp"
+    kind[pavement & (_height_above_land(point, zones["ramp_to"]) < CURB_M - 1e-6)] = "ramp"
     kind[shapely.contains_xy(zones["apron"], x, y)] = "ramp"
     points = shapely.points(point)
     kind[shapely.distance(points, zones["road"]) < CURBSTONE_M] = "curb"
@@ -339,7 +379,7 @@ def _triangulate(
     relief: Relief | None,
     terrain: Terrain | None,
 ) -> dict[str, Mesh]:
-    """A mesh for each surface, walls of the curbs included."""
+    """Return a mesh for each surface name; the mesh of curbs includes their walls."""
     corners, face = plan_triangles(faces)
     grid, index = np.unique(
         np.rint(corners.reshape(-1, 2) / _GRID_M).astype(np.int64), axis=0, return_inverse=True
@@ -349,17 +389,17 @@ def _triangulate(
     land, low, high = _heights(xy, ramp_to, relief, terrain)
     found = [*SURFACES, *sorted(set(names) - SURFACES.keys())]
     surface_of = np.array([found.index(name) for name in names])[face]
-    lies_low = np.array([kind_of(name) in _LOW for name in found])
+    at_road_level = np.array([kind_of(name) in _LOW for name in found])
     parts = {
-        name: _flat(
+        name: _surface_mesh(
             xy,
-            low if lies_low[i] else high,
+            low if at_road_level[i] else high,
             triangles[surface_of == i],
             relief is not None or terrain is not None,
         )
         for i, name in enumerate(found)
     }
-    walls = _walls(xy, land, high, triangles, lies_low[surface_of])
+    walls = _walls(xy, land, high, triangles, at_road_level[surface_of])
     parts["curb"] = join([parts["curb"], walls])
     return {name: mesh for name, mesh in parts.items() if len(mesh)}
 
@@ -367,8 +407,7 @@ def _triangulate(
 def _walls(
     xy: Floats, land: Floats, high: Floats, triangles: NDArray[np.int64], is_low: NDArray[np.bool_]
 ) -> Mesh:
-    """Upright faces from the land up wherever a low and a high triangle share an edge; they look to
-    the low side."""
+    """Build vertical faces between adjacent low and high triangles; they face the low side."""
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     low = np.tile(is_low, 3)
     codes = edges[:, 0] * len(xy) + edges[:, 1]
@@ -390,7 +429,10 @@ def _walls(
     return Mesh(walls.vertices, walls.normals, walls.triangles[real])
 
 
-def _flat(xy: Floats, z: Floats, triangles: NDArray[np.int64], shaded: bool = False) -> Mesh:
+def _surface_mesh(
+    xy: Floats, z: Floats, triangles: NDArray[np.int64], shaded: bool = False
+) -> Mesh:
+    """Build a mesh from the used vertices; `shaded` computes smooth normals."""
     used, index = np.unique(triangles, return_inverse=True)
     corners = index.reshape(-1, 3).astype(np.int32)
     vertices = np.column_stack([xy[used], z[used]])
@@ -404,25 +446,22 @@ def _flat(xy: Floats, z: Floats, triangles: NDArray[np.int64], shaded: bool = Fa
 def _heights(
     xy: Floats, ramp_to: shapely.Geometry, relief: Relief | None, terrain: Terrain | None
 ) -> tuple[Floats, Floats, Floats]:
-    """Heights of the land, of the road and of high ground at (N, 2) points; the unevenness of
-    pavement ends at the ramps."""
+    """Return heights of the land, of the road and of high ground at (N, 2) points, each (N,) m.
+
+    The unevenness of pavement fades out along ramps.
+    """
     land = np.zeros(len(xy)) if terrain is None else terrain.height(xy)
     low = land
-    high = _raised(xy, ramp_to)
+    high = _height_above_land(xy, ramp_to)
     if relief is not None:
         low = land + relief.on_road(xy)
         high = high + relief.on_pavement(xy) * high / CURB_M
     return land, low, high if terrain is None else land + high
 
 
-def _raised(xy: Floats, ramp_to: shapely.Geometry) -> Floats:
-    """Height of high ground at (N, 2) points: CURB_M, less near crossings."""
+def _height_above_land(xy: Floats, ramp_to: shapely.Geometry) -> Floats:
+    """Return the height of high ground above the land at (N, 2) points: CURB_M, less on ramps."""
     if shapely.is_empty(ramp_to):
         return np.full(len(xy), CURB_M)
     gap = np.asarray(shapely.distance(shapely.points(xy), ramp_to), dtype=float)
     return np.minimum(CURB_M, gap * RAMP_SLOPE)
-
-
-def _grown(bounds: Iterable[float], by_m: float) -> tuple[float, float, float, float]:
-    x0, y0, x1, y1 = bounds
-    return x0 - by_m, y0 - by_m, x1 + by_m, y1 + by_m

@@ -1,4 +1,4 @@
-"""The URDFs of the robots, written for this project; their numbers stand in `cosim.spec.robot`."""
+"""URDF files of the robots; dimensions and limits are in `cosim.spec.robot`."""
 
 from __future__ import annotations
 
@@ -9,13 +9,12 @@ from cosim.spec.robot import Robot
 
 
 def urdf_of(robot: Robot) -> Path:
-    """The file of a robot's bodies and joints."""
+    """Return the path of a robot's URDF file."""
     return Path(__file__).parent / robot.urdf
 
 
 def hash_of_robot(robot: Robot) -> str:
-    """Of its row and of the bodies and joints in its URDF: another robot under the same name has
-    another."""
+    """Return a hash of a robot's specification and its URDF file."""
     return hashlib.blake2b(
         repr(robot).encode() + urdf_of(robot).read_bytes(), digest_size=8
     ).hexdigest()

@@ -1,1 +1,1 @@
-
+"""Buildings, street furniture, vehicles and ground covers of a street map."""

@@ -1,7 +1,7 @@
-"""Buildings along the frontage: boxes behind the sidewalks, drawn from the street map and a seed.
+"""Generated buildings along sidewalks, and meshes of all buildings.
 
-Each sidewalk decides on its own row of buildings, and a building belongs to the tile of its centre:
-what stands in a tile does not depend on which tiles were asked for before.
+Each sidewalk generates its own row from the map and a seed. A building belongs to the tile of its
+centre, so tiles do not depend on the order in which they are built.
 """
 
 from __future__ import annotations
@@ -18,18 +18,29 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Polyline
 from cosim.place.street_map import Lane, PieceKind, StreetMap, Strip
 from cosim.place.terrain import Terrain
-from physics.ground.mesh import Mesh, box, join, plan_triangles, quads
-from physics.ground.tiles import CURB_M, Key, key_at, square
+from physics.ground.mesh import Mesh, box, flat_shaded, join, plan_triangles, quads
+from physics.ground.tiles import CURB_M, Key, grown_box, key_at, square
 
 _MARGIN_M: Final = 0.2
-"""Least distance of a building from anything walkable or driven on."""
+"""Smallest distance in metres between a building and walkable or drivable ground."""
 
-_REACH_M: Final = 40.0
+_SEARCH_M: Final = 40.0
+"""Distance in metres from a tile within which sidewalks may place buildings in it."""
+
 _STOREY_M: Final = 3.2
+"""Height of a storey in metres."""
+
 _LOT_M: Final = (9.0, 20.0)
+"""Smallest and largest length of a lot along the street in metres."""
+
 _DEPTH_M: Final = (8.0, 14.0)
+"""Smallest and largest depth of a building in metres."""
+
 _HEIGHT_M: Final = (6.0, 25.0)
+"""Smallest and largest height of a building in metres."""
+
 _WINDOW_WALL_M: Final = 4.0
+"""Smallest length in metres of a mapped wall with windows."""
 
 FACADES: Final = (
     (0.71, 0.45, 0.36),
@@ -39,20 +50,26 @@ FACADES: Final = (
     (0.55, 0.38, 0.33),
     (0.84, 0.82, 0.78),
 )
+"""sRGB colours of facades."""
+
 WINDOW_COLOUR: Final = (0.23, 0.27, 0.33)
+"""sRGB colour of windows and doors."""
 
 
 Wall = tuple[float, float, float, float]
-"""A wall from (x, y) to (x, y) on the ground, in metres, the outside to its right."""
+"""x0, y0, x1, y1 of a wall on the ground in metres, with the outside on its right."""
 
 
 @dataclass(frozen=True, slots=True)
 class Building:
-    """A box on the high ground. size_m: along the street, away from it, height. heading_rad: along
-    the sidewalk, the street to its right. floor_m, base_m: the land at its front, and the lowest
-    under it.
+    """A box-shaped or mapped building on high ground.
 
-    A building of the map has an outline and walls of its own; the box is then the one around it.
+    size_m: along the street, away from it, and height
+    heading_rad: along the sidewalk, with the street on the right
+    facade: index in FACADES
+    outline, walls: ground plan of a mapped building; the box is its bounding box
+    floor_m: height of the land at the front
+    base_m: lowest height of the land under the building
     """
 
     id: str
@@ -68,7 +85,7 @@ class Building:
 
     @property
     def polygon(self) -> shapely.Polygon:
-        """The outline on the ground."""
+        """Return the outline on the ground."""
         if self.outline is not None:
             return self.outline
         along = (
@@ -88,20 +105,21 @@ class Building:
 
 
 class _Mapped(Protocol):
-    """What the map shows of buildings."""
+    """Buildings that a map shows."""
 
     def buildings(self, key: Key) -> tuple[Building, ...]:
-        """Those in a tile, or the parts of them there."""
+        """Return the mapped buildings, or parts of them, in a tile."""
 
     def shows(self, kind: str, place: shapely.Geometry) -> bool:
-        """Whether there are things of a kind near a place."""
+        """Return whether the map shows objects of a kind near a place."""
 
 
 class Frontage:
-    """The buildings of a map: `in_tile` is a pure function of the map, the seed and the tile, kept
-    once known.
+    """Generator of a map's buildings.
 
-    mapped: buildings that the map shows; near them none is made up. None: the map shows none.
+    mapped: mapped buildings, near which none are generated; None without them
+
+    `in_tile` is a pure function of the map, the seed and the tile. Rows are cached.
     """
 
     def __init__(self, street_map: StreetMap, seed: int, mapped: _Mapped | None = None) -> None:
@@ -111,18 +129,18 @@ class Frontage:
         self._rows: dict[str, tuple[Building, ...]] = {}
 
     def in_tile(self, key: Key) -> tuple[Building, ...]:
-        """Buildings whose centre lies in the tile, in the net's order."""
-        x0, y0, x1, y1 = square(key)
-        reach = shapely.box(x0 - _REACH_M, y0 - _REACH_M, x1 + _REACH_M, y1 + _REACH_M)
+        """Return the buildings whose centre lies in a tile, in map order."""
+        reach = grown_box(square(key), _SEARCH_M)
         found = [] if self._mapped is None else list(self._mapped.buildings(key))
         for strip in self._map.near("strip", reach):
             if isinstance(strip, Strip) and strip.kind == "sidewalk" and strip.road_side != 0:
                 if strip.id not in self._rows:
-                    self._rows[strip.id] = self._row(strip)
+                    self._rows[strip.id] = self._generate_row(strip)
                 found += [b for b in self._rows[strip.id] if key_at(b.x_m, b.y_m) == key]
         return tuple(found)
 
-    def _row(self, strip: Strip) -> tuple[Building, ...]:
+    def _generate_row(self, strip: Strip) -> tuple[Building, ...]:
+        """Return the generated buildings along a sidewalk."""
         rng = np.random.default_rng([self._seed, zlib.crc32(strip.id.encode())])
         line = Polyline(strip.line if strip.road_side < 0 else strip.line[::-1])
         row = []
@@ -133,14 +151,14 @@ class Frontage:
             depth, height = float(rng.uniform(*_DEPTH_M)), float(rng.uniform(*_HEIGHT_M))
             facade = int(rng.integers(len(FACADES)))
             gap = float(rng.choice([0.0, 0.0, 3.0]))
-            building = self._fitted(strip, line, at_m, lot, (depth, height, facade), n)
+            building = self._fit_building(strip, line, at_m, lot, (depth, height, facade), n)
             if building is not None:
                 row.append(building)
             at_m += lot + gap
             n += 1
         return tuple(row)
 
-    def _fitted(
+    def _fit_building(
         self,
         strip: Strip,
         line: Polyline,
@@ -149,8 +167,12 @@ class Frontage:
         shape: tuple[float, float, int],
         n: int,
     ) -> Building | None:
-        """The building of a lot, made smaller until it keeps clear of streets; None when nothing
-        fits."""
+        """Return the building of a lot, shrunk until it is clear of streets; None if none fits.
+
+        at_m, lot_m: start and length of the lot along the line
+        shape: depth and height in metres, and facade index
+        n: number of the building along the sidewalk
+        """
         depth, height, facade = shape
         for share_along, share_deep in ((1.0, 1.0), (1.0, 0.6), (0.7, 0.8), (0.5, 0.5)):
             start = line.at(at_m)
@@ -177,11 +199,12 @@ class Frontage:
                 (width, deep, height),
                 facade,
             )
-            if self._clear(built):
+            if self._is_clear(built):
                 return built
         return None
 
-    def _clear(self, building: Building) -> bool:
+    def _is_clear(self, building: Building) -> bool:
+        """Return whether a building overlaps neither streets nor mapped buildings."""
         outline = building.polygon
         if self._mapped is not None and self._mapped.shows("building", outline):
             return False
@@ -200,9 +223,12 @@ def _between(line: Polyline, at_m: float, lot_m: float) -> NDArray[np.bool_]:
 
 
 def on_land(building: Building, terrain: Terrain) -> Building:
-    """The building with a base down to the lowest land around it, and its floor level with the land
-    at its front; the floor of a building of the map, of which this may be a part, is known
-    already."""
+    """Return the building with its floor and base set to the terrain.
+
+    The floor of a generated building is level with the land at its front. A mapped building keeps
+    its floor, because it may be a part of a larger one. The base is the lowest land around the
+    outline.
+    """
     around = shapely.get_coordinates(shapely.segmentize(building.polygon.exterior, 1.0))
     lowest = float(terrain.height(around).min())
     if building.outline is not None:
@@ -217,12 +243,12 @@ def on_land(building: Building, terrain: Terrain) -> Building:
 
 
 def facade_meshes(buildings: tuple[Building, ...]) -> dict[int, Mesh]:
-    """Walls and roofs by facade; -1 for the windows and doors on the side towards the street."""
+    """Return walls and roofs by facade index; index -1 holds windows and doors."""
     walls: dict[int, list[Mesh]] = {}
     for b in buildings:
         if b.outline is not None:
-            walls.setdefault(b.facade, []).append(_outlined(b, b.outline))
-            walls.setdefault(-1, []).append(_windows(b))
+            walls.setdefault(b.facade, []).append(_mapped_walls(b, b.outline))
+            walls.setdefault(-1, []).append(_mapped_windows(b))
         else:
             width, deep, height = b.size_m
             body = box((width, deep, height), (0.0, 0.0, 0.5 * height), skip=("bottom",))
@@ -234,8 +260,8 @@ def facade_meshes(buildings: tuple[Building, ...]) -> dict[int, Mesh]:
     return {facade: join(meshes) for facade, meshes in sorted(walls.items())}
 
 
-def _outlined(building: Building, outline: shapely.Polygon) -> Mesh:
-    """Walls and the flat roof of a building of the map."""
+def _mapped_walls(building: Building, outline: shapely.Polygon) -> Mesh:
+    """Build walls and the flat roof of a mapped building."""
     x0, y0, x1, y1 = np.array(building.walls).reshape(-1, 4).T
     ground = building.floor_m + CURB_M
     roof_m = building.floor_m + CURB_M + building.size_m[2]
@@ -246,17 +272,11 @@ def _outlined(building: Building, outline: shapely.Polygon) -> Mesh:
     ]
     roof, _ = plan_triangles([outline])
     top = np.column_stack([roof.reshape(-1, 2), np.full(3 * len(roof), roof_m)])
-    up = np.tile([0.0, 0.0, 1.0], (len(top), 1))
-    return join(
-        [
-            quads(np.stack(at, axis=1)),
-            Mesh(top, up, np.arange(len(top), dtype=np.int32).reshape(-1, 3)),
-        ]
-    )
+    return join([quads(np.stack(at, axis=1)), flat_shaded(top)])
 
 
-def _windows(building: Building) -> Mesh:
-    """Windows in the walls of a building of the map, with a door in those long enough for one."""
+def _mapped_windows(building: Building) -> Mesh:
+    """Build windows and doors in the walls of a mapped building that are long enough."""
     found = []
     for x0, y0, x1, y1 in building.walls:
         length, heading = math.hypot(x1 - x0, y1 - y0), math.atan2(y1 - y0, x1 - x0)
@@ -271,7 +291,7 @@ def _windows(building: Building) -> Mesh:
 
 
 def _base(building: Building) -> Mesh:
-    """Blank walls from the floor down to the lowest land."""
+    """Build blank walls from the floor down to the lowest land."""
     if building.outline is not None:
         a, b = np.array(building.walls).reshape(-1, 2, 2).transpose(1, 0, 2)
     else:
@@ -285,7 +305,7 @@ def _base(building: Building) -> Mesh:
 
 
 def _openings(building: Building) -> Mesh:
-    """A band of windows on the street side of each storey, the lowest one broken by a door."""
+    """Build a row of windows per storey on the street side; the lowest row has a door."""
     width, deep, height = building.size_m
     y = -0.5 * deep - 0.03
     half = 0.5 * width - 0.7

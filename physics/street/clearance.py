@@ -1,8 +1,6 @@
-"""The free width of sidewalks on the final geometry: what their outlines and the props on them
-leave around the middle.
+"""Measurement of the free width of sidewalks between their outlines and props.
 
-Measured on lines across the sidewalk, cut by its outline and by the footprints of props: every
-quarter of a metre and at every corner of a footprint.
+Cross-sections are taken every quarter of a metre and at each corner of a prop's footprint.
 """
 
 from __future__ import annotations
@@ -20,16 +18,20 @@ from physics.street.furniture import Prop, footprints
 from physics.street.placement import driveway_ground
 
 STATION_M: Final = 0.25
-_AT_ONCE: Final = 400_000
-"""Pairs of lines across and corners of outlines that are looked at in one piece, to bound the
-memory."""
+"""Distance between cross-sections in metres."""
+
+_BATCH_PAIRS: Final = 400_000
+"""Pairs of cross-sections and outline corners per batch; limits memory."""
 
 
 def clear_width(
     strips: Iterable[Strip], props: Sequence[Prop]
 ) -> Mapping[str, tuple[float, float]]:
-    """For each sidewalk the least width in metres that is free on both sides of its middle line: as
-    it is, and as it would be without props. 0 where the middle itself is not free."""
+    """Return the smallest free width of each sidewalk around its centre line.
+
+    Returns: sidewalk id -> (width with props, width without props) in metres; 0 if the centre line
+        itself is blocked
+    """
     ground = footprints(props)
     tree = shapely.STRtree(ground)
     found = {}
@@ -48,7 +50,7 @@ def clear_width(
         )
         if not len(stations):
             stations = np.array([0.5 * line.length_m])
-        middles, aside = _across(line, stations)
+        middles, aside = _cross_sections(line, stations)
         reach = 0.5 * strip.width_m + 0.5
         left, right, within = _gaps(middles, aside, [strip.polygon], reach)
         bare = np.where(within, left + right, 0.0)
@@ -63,16 +65,15 @@ def clear_width(
 
 
 def on_driveways(strips: Iterable[Strip], props: Sequence[Prop]) -> list[str]:
-    """Ids of the props that stand on a driveway or the flares of its ramp; cars, which belong
-    there, apart."""
+    """Return the ids of props, except cars, on a driveway or the flares of its ramp."""
     still = [prop for prop in props if prop.kind != "car"]
     ways = [way for strip in strips for way in driveway_ground(strip)]
     hit, _ = shapely.STRtree(ways).query(footprints(still), predicate="intersects")
     return [still[i].id for i in np.unique(hit)]
 
 
-def _across(line: Polyline, stations_m: Floats) -> tuple[Floats, Floats]:
-    """(N, 2) points at arc lengths and (N, 2) unit vectors to their left."""
+def _cross_sections(line: Polyline, stations_m: Floats) -> tuple[Floats, Floats]:
+    """Return (N, 2) points at arc lengths and (N, 2) unit vectors to their left."""
     segment = np.clip(np.searchsorted(line.s_m, stations_m, side="right") - 1, 0, len(line.s_m) - 2)
     steps = np.diff(line.points, axis=0)
     along = steps / np.hypot(*steps.T)[:, None]
@@ -86,8 +87,14 @@ def _gaps(
     polygons: Sequence[shapely.Geometry] | NDArray[np.object_],
     reach_m: float,
 ) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """(N,) distances from points to the first side of a polygon to their left and right, at most
-    `reach_m`; and whether a point lies within: an odd number of sides to its left."""
+    """Return free distances from points to polygon sides on their left and right.
+
+    middles, aside: (N, 2) points and unit vectors to their left
+    reach_m: upper limit of the distances
+
+    Returns: left (N,) m, right (N,) m, and (N,) whether a point is inside (odd number of sides on
+        its left)
+    """
     corners, ring = shapely.get_coordinates(
         shapely.get_rings(np.asarray(polygons, dtype=object)), return_index=True
     )
@@ -95,7 +102,7 @@ def _gaps(
     along = np.column_stack([aside[:, 1], -aside[:, 0]])
     left, right = np.full(len(middles), reach_m), np.full(len(middles), reach_m)
     to_the_left = np.zeros(len(middles), dtype=int)
-    step = max(_AT_ONCE // max(len(corners), 1), 1)
+    step = max(_BATCH_PAIRS // max(len(corners), 1), 1)
     for i in range(0, len(middles), step):
         rows = slice(i, i + step)
         ahead = along[rows] @ corners.T - (along[rows] * at[rows]).sum(axis=1)[:, None]

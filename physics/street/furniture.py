@@ -1,5 +1,4 @@
-"""The catalogue of street furniture: a literal table of parametric props, and the prop that stands
-somewhere."""
+"""Catalogue of street furniture and scenario obstacles, and the placed prop."""
 
 from __future__ import annotations
 
@@ -21,18 +20,25 @@ from physics.street.furniture_shapes import METAL, WOOD, Size, Solid
 from physics.textures.layers import Colour
 
 Zone = Literal["verge", "curb", "frontage", "driveway"]
-"""Where a prop stands: between curb and sidewalk; on the sidewalk's edge at the curb, where there
-is no verge; between sidewalk and buildings; in the frontage at the end of a driveway."""
+"""Zone of a sidewalk where a prop is placed.
+
+verge: between curb and sidewalk
+curb: edge of the sidewalk, where there is no verge
+frontage: between sidewalk and buildings
+driveway: frontage at the end of a driveway
+"""
 
 _Forms = tuple[
     Callable[[Size], tuple[Solid, ...]], Callable[..., tuple[Part, ...]], tuple[Colour, ...]
 ]
+"""Functions for solids and parts, and the paints of an obstacle."""
 
 PROP_VARIANTS: Final = OBSTACLE_VARIANTS
-"""Sizes of each prop, evenly from its smallest to its largest: few, so that many props share a
-shape."""
+"""Sizes of each prop from smallest to largest; few, so that props share shapes."""
 
 LEAVES: Final = ((0.22, 0.42, 0.17), (0.30, 0.48, 0.18), (0.18, 0.36, 0.22), (0.42, 0.46, 0.17))
+"""sRGB colours of tree crowns."""
+
 SIGNS: Final = ((0.12, 0.30, 0.66), (0.80, 0.12, 0.10), (0.95, 0.80, 0.12), (0.90, 0.90, 0.90))
 HYDRANTS: Final = ((0.80, 0.13, 0.10), (0.90, 0.70, 0.10))
 BINS: Final = ((0.16, 0.33, 0.22), (0.30, 0.31, 0.33), (0.16, 0.25, 0.42))
@@ -55,12 +61,17 @@ PLANTS: Final = ((0.30, 0.46, 0.20), (0.24, 0.40, 0.18), (0.55, 0.34, 0.40), (0.
 
 @dataclass(frozen=True, slots=True)
 class PropKind:
-    """An entry of the catalogue.
+    """A catalogue entry.
 
-    sizes_m: smallest and largest, of what stands on the ground and is bumped into. per_100m: how
-    many a street of a class has along 100 m of one sidewalk. row: stands in a row, evenly spaced.
-    spread_m: radius of what is above the heads and may hang over a sidewalk, not into a house.
-    seen_m: farthest it is drawn. grown: its parts differ from paint to paint.
+    sizes_m: smallest and largest size of the solid part
+    zones: zones where the prop may be placed
+    per_100m: expected count per 100 m of sidewalk by street class
+    solids, parts: functions of the size
+    paints: sRGB colours to choose from
+    row: place evenly spaced in a row
+    spread_m: radius of parts above head height, which may overhang sidewalks but not buildings
+    seen_m: drawing distance
+    grown: the parts depend on the paint index
     """
 
     name: str
@@ -76,6 +87,7 @@ class PropKind:
     grown: bool = False
 
     def size_m(self, variant: int) -> Size:
+        """Return length, depth and height of a variant."""
         low, high = np.array(self.sizes_m)
         length, depth, height = (low + (high - low) * variant / (PROP_VARIANTS - 1)).tolist()
         return length, depth, height
@@ -84,6 +96,7 @@ class PropKind:
 def _along(
     residential: float, commercial: float, avenue: float, boulevard: float, narrow: float
 ) -> dict[str, float]:
+    """Return counts per 100 m of sidewalk by street class."""
     return {
         "residential": residential,
         "commercial": commercial,
@@ -243,7 +256,7 @@ CATALOGUE: Final[tuple[PropKind, ...]] = (
         row=True,
     ),
 )
-"""In the order in which they find a place: the large first."""
+"""All street furniture, in order of placement: large props first."""
 
 _OBSTACLES: Final[Mapping[ObstacleKind, _Forms]] = {
     "bin": (shapes.block, obstacle_shapes.wheeled_bin, ((0.12, 0.30, 0.20), *BINS)),
@@ -255,7 +268,7 @@ _OBSTACLES: Final[Mapping[ObstacleKind, _Forms]] = {
     "scooter": (shapes.block, shapes.scooter, SCOOTERS),
     "cafe": (shapes.table_and_chairs, shapes.cafe, CHAIRS),
 }
-"""Solids, parts and paints of what scenarios put on the way."""
+"""Solids, parts and paints of scenario obstacles."""
 
 KINDS: Final[Mapping[str, PropKind]] = {kind.name: kind for kind in CATALOGUE} | {
     f"obstacle:{name}": PropKind(
@@ -263,14 +276,18 @@ KINDS: Final[Mapping[str, PropKind]] = {kind.name: kind for kind in CATALOGUE} |
     )
     for name, forms in _OBSTACLES.items()
 }
+"""Every kind of prop by name, including scenario obstacles."""
 
 
 @dataclass(frozen=True, slots=True)
 class Prop:
-    """A thing that stands on the street. heading_rad: of its x axis; paint: index of its kind's
-    paints.
+    """A placed prop.
 
-    turned_rad: what is drawn of it is turned further by so much; what is bumped into is not.
+    kind: key in `KINDS`
+    variant: index of the size
+    heading_rad: direction of the prop's x axis
+    paint: index in the kind's paints
+    turned_rad: additional rotation of the drawn parts; solids are not rotated by it
     """
 
     id: str
@@ -284,21 +301,22 @@ class Prop:
 
     @property
     def size_m(self) -> Size:
+        """Return length, depth and height."""
         return KINDS[self.kind].size_m(self.variant)
 
     @property
     def form(self) -> tuple[str, int, int]:
-        """What `parts_of` takes: props with equal forms are drawn with the same meshes."""
+        """Return the arguments of `parts_of`; props with equal forms share meshes."""
         return self.kind, self.variant, self.paint if KINDS[self.kind].grown else 0
 
     @property
     def drawn_rad(self) -> float:
-        """Heading of what is drawn."""
+        """Return the heading of the drawn parts."""
         return self.heading_rad + self.turned_rad
 
 
 def obstacle_prop(obstacle: Obstacle, number: int) -> Prop:
-    """An obstacle, the scenario's number so many, as the prop that is bumped into and drawn."""
+    """Return a scenario obstacle as a prop; `number` is its index in the scenario."""
     kind = KINDS[f"obstacle:{obstacle.kind}"]
     paint = obstacle.paint % len(kind.paints)
     at = obstacle.x_m, obstacle.y_m, obstacle.heading_rad
@@ -306,7 +324,7 @@ def obstacle_prop(obstacle: Obstacle, number: int) -> Prop:
 
 
 def footprints(props: Sequence[Prop], margin_m: float = 0.0) -> NDArray[np.object_]:
-    """(N,) rectangles of ground that props cover, grown by a margin."""
+    """Return the (N,) ground rectangles of props, enlarged by a margin."""
     if not props:
         return np.zeros(0, dtype=object)
     half = 0.5 * np.array([prop.size_m[:2] for prop in props]) + margin_m
@@ -320,7 +338,10 @@ def footprints(props: Sequence[Prop], margin_m: float = 0.0) -> NDArray[np.objec
 
 @cache
 def parts_of(kind: str, variant: int, look: int = 0) -> tuple[Part, ...]:
-    """What is drawn of a prop. look: tells apart those of one size, where a kind is `grown`."""
+    """Return the drawn parts of a prop.
+
+    look: paint index for kinds that are `grown`, else 0
+    """
     entry = KINDS[kind]
     size = entry.size_m(variant)
     return entry.parts(size, look) if entry.grown else entry.parts(size)
@@ -328,6 +349,6 @@ def parts_of(kind: str, variant: int, look: int = 0) -> tuple[Part, ...]:
 
 @cache
 def solids_of(kind: str, variant: int) -> tuple[Solid, ...]:
-    """What is bumped into of a prop."""
+    """Return the collision shapes of a prop."""
     entry = KINDS[kind]
     return entry.solids(entry.size_m(variant))

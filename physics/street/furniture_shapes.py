@@ -1,9 +1,8 @@
-"""What street furniture is made of: a few low-poly meshes of one colour each, and the solids to
-bump into.
+"""Low-poly parts and collision shapes of street furniture.
 
-A prop's own frame: x along the street, y to the left, z up from its foot; it faces -y. Each
-function takes the prop's size and makes about sixty triangles at most, because the software
-renderer's time is triangles.
+Prop frame: x along the street, y to the left, z up from the foot; the front faces -y. Each function
+    takes the size and returns at most about sixty triangles, which limits the time of the software
+    renderer.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from physics.street.tree_shapes import SPECIES, crown, tree_trunk
 from physics.street.vehicles import vehicle_parts
 
 Size = tuple[float, float, float]
-"""Length along the street, depth across it, height, in metres."""
+"""Length along the street, depth across it, and height, in metres."""
 
 METAL: Final = (0.24, 0.26, 0.28)
 ZINC: Final = (0.52, 0.53, 0.54)
@@ -36,28 +35,29 @@ PANE: Final = (0.66, 0.76, 0.80)
 
 @dataclass(frozen=True, slots=True)
 class Solid:
-    """What the robot bumps into: an upright box (length, depth, height) or cylinder (diameter
-    twice, height).
+    """A collision shape: an upright box or cylinder.
 
-    at_m: its middle across the ground; low_m: its lower end.
+    size_m: length, depth and height; for a cylinder diameter, diameter and height
+    at_m: centre on the ground
     """
 
     shape: Literal["box", "cylinder"]
     size_m: Size
     at_m: tuple[float, float] = (0.0, 0.0)
-    low_m: float = 0.0
 
 
 def upright_solid(size: Size) -> tuple[Solid, ...]:
+    """Return a cylinder of the prop's size."""
     return (Solid("cylinder", size),)
 
 
 def block(size: Size) -> tuple[Solid, ...]:
+    """Return a box of the prop's size."""
     return (Solid("box", size),)
 
 
 def three_walls(size: Size) -> tuple[Solid, ...]:
-    """Back wall and both sides of a shelter that is open to the front."""
+    """Return the back and side walls of a shelter."""
     length, depth, height = size
     wall = (length, 0.08, height)
     side = (0.08, depth, height)
@@ -66,6 +66,7 @@ def three_walls(size: Size) -> tuple[Solid, ...]:
 
 
 def table_and_chairs(size: Size) -> tuple[Solid, ...]:
+    """Return a cylinder for the table and boxes for two chairs."""
     chairs = [Solid("box", (0.42, 0.42, 0.85), (s * (0.5 * size[0] - 0.21), 0.0)) for s in (-1, 1)]
     return Solid("cylinder", (size[1], size[1], 0.74)), *chairs
 
@@ -76,6 +77,7 @@ def _hoops_at(length: float) -> Floats:
 
 
 def hoops(size: Size) -> tuple[Solid, ...]:
+    """Return a box for each hoop of a bicycle rack."""
     return tuple(
         Solid("box", (0.06, size[1], size[2]), (float(x), 0.0)) for x in _hoops_at(size[0])
     )
@@ -95,8 +97,7 @@ def lamp(size: Size) -> tuple[Part, ...]:
 
 
 def sign(size: Size) -> tuple[Part, ...]:
-    """A plate on a pole, its face to the oncoming traffic, its back bare metal: a square, a disc or
-    a triangle."""
+    """Return a traffic sign (square, disc or triangle) that faces oncoming traffic."""
     h = size[2]
     pole = frustum((0.03, 0.03), (0.03, 0.03), 0.0, h, 6)
     shape = ((4, 0.25 * math.pi), (14, 0.0), (3, 0.0))[round(100.0 * size[0]) % 3]
@@ -162,7 +163,7 @@ def park_bench(size: Size) -> tuple[Part, ...]:
 
 
 def tree(size: Size, look: int) -> tuple[Part, ...]:
-    """look: which species."""
+    """Return a tree; `look` selects the species."""
     species = SPECIES[look % len(SPECIES)]
     leaves = crown(species, size[2])
     stem = tree_trunk(species, size[2], 0.5 * size[0])

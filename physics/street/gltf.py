@@ -1,4 +1,4 @@
-"""A surface as glTF (y up, metres): what stands in its squares, a node for each kind and colour."""
+"""Export of a street surface as glTF (y up, metres), with a node per kind and colour."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from physics.textures.ground import ground_layers
 from physics.textures.layers import Colour, encoded, linear
 
 _GROUPS: Final = ("surfaces", "buildings", "trees", "furniture", "signals", "barriers", "obstacles")
-"""The nodes right below the root; each holds nodes named by what they show, such as
-"sidewalk:brick:2"."""
+"""Nodes below the root; their children have names such as "sidewalk:brick:2"."""
 _LAYERS_PX: Final = 256
+"""Size in pixels of the texture layers whose mean colours are used."""
 
 
 def as_gltf(
@@ -35,7 +35,7 @@ def as_gltf(
     progress: Progress = ignore,
     obstacles: Sequence[Obstacle] = (),
 ) -> bytes:
-    """A .glb file of the squares of a surface and of the fences and obstacles on it."""
+    """Return a .glb file of tiles of a surface with barriers and obstacles."""
     parts = _Parts()
     for n, key in enumerate(keys):
         progress("building tiles", n / len(keys))
@@ -65,7 +65,7 @@ class _Parts:
     def __init__(self) -> None:
         self._meshes: dict[tuple[str, str, Colour], list[Mesh]] = {}
         layers = ground_layers(_LAYERS_PX)
-        self._means: dict[str, Colour] = dict(
+        self._layer_means: dict[str, Colour] = dict(
             zip(layers.names, map(tuple, encoded(layers.mean).tolist()), strict=True)
         )
 
@@ -76,7 +76,7 @@ class _Parts:
     def add_square(self, surface: Surface, key: Key) -> None:
         chunk, finish = surface.chunk(key), surface.finish(key)
         for patch in (*chunk.ground, *finish.laid, *finish.painted):
-            self.add("surfaces", patch.name, patch.mesh, self._shown(patch))
+            self.add("surfaces", patch.name, patch.mesh, self._mean_colour(patch))
         for facade, mesh in facade_meshes(chunk.buildings).items():
             name, colour = ("windows", WINDOW_COLOUR) if facade < 0 else ("walls", FACADES[facade])
             self.add("buildings", f"building:{name}", mesh, colour)
@@ -99,30 +99,29 @@ class _Parts:
             mesh = part.mesh.moved((prop.x_m, prop.y_m, z_m), prop.drawn_rad)
             self.add(group, name, mesh, part.colour or KINDS[prop.kind].paints[prop.paint])
 
-    def _shown(self, patch: Patch) -> Colour:
-        """The mean colour of what cameras with textures show."""
-        return patch.colour if patch.tinted else self._means[patch.layer]
+    def _mean_colour(self, patch: Patch) -> Colour:
+        """Return the mean colour that cameras with textures show."""
+        return patch.colour if patch.tinted else self._layer_means[patch.layer]
 
     def scene(self) -> trimesh.Scene:
-        """One node for each kind and colour, below those of _GROUPS."""
+        """Return a scene with one node per kind and colour below the nodes of _GROUPS."""
         scene = trimesh.Scene()
-        shades = {(group, name): 0 for group, name, _ in self._meshes}
+        node_counts = {(group, name): 0 for group, name, _ in self._meshes}
         for group in _GROUPS:
             scene.graph.update(frame_from=scene.graph.base_frame, frame_to=group)
         for (group, name, colour), meshes in self._meshes.items():
-            number = shades[group, name]
-            shades[group, name] += 1
+            number = node_counts[group, name]
+            node_counts[group, name] += 1
             node = f"{name}/{number}" if number else name
             scene.add_geometry(
-                _shape(join(meshes), node, colour), node, node, parent_node_name=group
+                _geometry(join(meshes), node, colour), node, node, parent_node_name=group
             )
         return scene
 
 
-def _shape(mesh: Mesh, name: str, colour: Colour) -> trimesh.Trimesh:
-    turn = np.array(
-        [[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]
-    )  # from z up to glTF's y up
+def _geometry(mesh: Mesh, name: str, colour: Colour) -> trimesh.Trimesh:
+    """Convert a mesh to a glTF geometry with y up."""
+    turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     factor = np.append(linear(colour), 1.0)
     material = PBRMaterial(
         name=name, baseColorFactor=factor, metallicFactor=0.0, roughnessFactor=1.0

@@ -1,7 +1,6 @@
-"""What the map itself shows beside its streets, as buildings and props: cut by tiles, found by
-place.
+"""Buildings and props that a map shows, by tile.
 
-Where it shows something, nothing of the kind is made up: see `shows`.
+No objects of the same kind are generated near them (see `MappedThings.shows`).
 """
 
 from __future__ import annotations
@@ -24,29 +23,35 @@ from physics.street.buildings import FACADES, Building, Wall
 from physics.street.furniture import KINDS, PROP_VARIANTS, Prop
 
 HOUSES_M: Final = 30.0
+"""Distance in metres from mapped buildings within which none are generated."""
+
 MAPPED_NEAR_M: Final = 40.0
-"""So near to a building of the map no building is made up, and so near to a thing of the map none
-of its kind."""
-_SPLINTER_M2: Final = 0.05
+"""Distance in metres from mapped props within which none of the same kind are generated."""
+_MIN_PART_M2: Final = 0.05
+"""Area in square metres below which a part of a building in a tile is dropped."""
 
 
 class MappedThings:
-    """The buildings and things that a street map shows, for the engines; a pure function of the
-    map. kinds: of the things."""
+    """Buildings and props of a map; a pure function of the map.
+
+    kinds: kinds of the mapped props
+    """
 
     def __init__(self, street_map: StreetMap) -> None:
         by_kind: dict[str, list[Feature]] = defaultdict(list)
         for feature in street_map.features:
             if feature.kind not in LANDS:
                 by_kind[feature.kind].append(feature)
-        self._houses = by_kind.pop("building", [])
-        self._floors_m = [_floor_m(house.polygon, street_map.terrain) for house in self._houses]
-        self._house_tree = shapely.STRtree([house.polygon for house in self._houses])
+        self._buildings = by_kind.pop("building", [])
+        self._floors_m = [
+            _floor_m(building.polygon, street_map.terrain) for building in self._buildings
+        ]
+        self._building_tree = shapely.STRtree([building.polygon for building in self._buildings])
         self._trees = {
             kind: shapely.STRtree([shapely.Point(f.x_m, f.y_m) for f in features])
             for kind, features in by_kind.items()
         }
-        self._trees["building"] = self._house_tree
+        self._trees["building"] = self._building_tree
         self.kinds = frozenset(by_kind)
         self._props: dict[Key, list[Prop]] = defaultdict(list)
         for i, feature in enumerate(
@@ -56,26 +61,25 @@ class MappedThings:
 
     @property
     def all_props(self) -> tuple[Prop, ...]:
-        """Things of every tile."""
+        """Return the props of all tiles."""
         return tuple(prop for props in self._props.values() for prop in props)
 
     def props(self, key: Key) -> Sequence[Prop]:
-        """Things whose middle lies in a tile."""
+        """Return the props whose centre lies in a tile."""
         return self._props.get(key, ())
 
     def buildings(self, key: Key) -> tuple[Building, ...]:
-        """The parts of buildings that lie in a tile, each a building of its own."""
+        """Return the parts of buildings in a tile, each as a building."""
         tile = shapely.box(*square(key))
         found = []
-        for i in np.sort(self._house_tree.query(tile, predicate="intersects")).tolist():
-            parts = shapely.get_parts(overlay.intersection(self._houses[i].polygon, tile))
-            solid = [p for p in parts if isinstance(p, Polygon) and p.area > _SPLINTER_M2]
-            found += [_building(i, self._houses[i], part, self._floors_m[i]) for part in solid]
+        for i in np.sort(self._building_tree.query(tile, predicate="intersects")).tolist():
+            parts = shapely.get_parts(overlay.intersection(self._buildings[i].polygon, tile))
+            solid = [p for p in parts if isinstance(p, Polygon) and p.area > _MIN_PART_M2]
+            found += [_building(i, self._buildings[i], part, self._floors_m[i]) for part in solid]
         return tuple(found)
 
     def shows(self, kind: str, place: shapely.Geometry) -> bool:
-        """Whether the map shows things of a kind near a place, so that none need be made up
-        there."""
+        """Return whether the map shows objects of a kind near a place."""
         tree = self._trees.get(kind)
         reach = HOUSES_M if kind == "building" else MAPPED_NEAR_M
         return tree is not None and bool(
@@ -84,14 +88,18 @@ class MappedThings:
 
 
 def _prop(number: int, feature: Feature) -> Prop:
-    """The size nearest to the mapped height, else one drawn by number; the same for the paint."""
+    """Convert a feature to a prop.
+
+    The size is the nearest to the mapped height; without a height it is random by number. The paint
+    is random by number.
+    """
     kind = KINDS[feature.kind]
-    drawn = zlib.crc32(f"{feature.kind}:{number}".encode())
-    variant = drawn % PROP_VARIANTS
+    random_number = zlib.crc32(f"{feature.kind}:{number}".encode())
+    variant = random_number % PROP_VARIANTS
     if feature.height_m > 0.0:
         variant = min(range(PROP_VARIANTS), key=lambda v: abs(kind.size_m(v)[2] - feature.height_m))
-    paint = drawn // PROP_VARIANTS % len(kind.paints)
-    turned = number % 7 * 0.9 if kind.grown else 0.0
+    paint = random_number // PROP_VARIANTS % len(kind.paints)
+    turned_rad = number % 7 * 0.9 if kind.grown else 0.0
     return Prop(
         f"prop:map:{number}",
         feature.kind,
@@ -100,12 +108,12 @@ def _prop(number: int, feature: Feature) -> Prop:
         feature.y_m,
         feature.heading_rad,
         paint,
-        turned,
+        turned_rad,
     )
 
 
 def _floor_m(whole: Polygon, terrain: Terrain | None) -> float:
-    """The floor of a house: as high as the land around it, on average."""
+    """Return a building's floor height: the mean height of the land around it."""
     if terrain is None:
         return 0.0
     return float(
@@ -113,11 +121,13 @@ def _floor_m(whole: Polygon, terrain: Terrain | None) -> float:
     )
 
 
-def _building(number: int, house: Feature, part: Polygon, floor_m: float) -> Building:
-    """A part of a mapped building, in the box around it along its street; all parts of one bear its
-    name and look."""
+def _building(number: int, building: Feature, part: Polygon, floor_m: float) -> Building:
+    """Return a part of a mapped building as a building.
+
+    It has the whole building's name and appearance. Its box is the bounding box along the street.
+    """
     part = shapely.orient_polygons(part)
-    cos, sin = math.cos(house.heading_rad), math.sin(house.heading_rad)
+    cos, sin = math.cos(building.heading_rad), math.sin(building.heading_rad)
     turn = np.array([[cos, -sin], [sin, cos]])
     corners = shapely.get_coordinates(part) @ turn
     low, high = corners.min(axis=0), corners.max(axis=0)
@@ -127,19 +137,18 @@ def _building(number: int, house: Feature, part: Polygon, floor_m: float) -> Bui
         id=f"building:map:{number}",
         x_m=x,
         y_m=y,
-        heading_rad=house.heading_rad,
-        size_m=(length, deep, house.height_m),
-        facade=zlib.crc32(f"{number}:{house.x_m:.2f}".encode()) % len(FACADES),
+        heading_rad=building.heading_rad,
+        size_m=(length, deep, building.height_m),
+        facade=zlib.crc32(f"{number}:{building.x_m:.2f}".encode()) % len(FACADES),
         outline=part,
-        walls=_walls(part, house.polygon),
+        walls=_walls(part, building.polygon),
         floor_m=floor_m,
         base_m=floor_m,
     )
 
 
 def _walls(part: Polygon, whole: Polygon) -> tuple[Wall, ...]:
-    """The sides of a part that are sides of the whole, the outside to their right; cuts between
-    tiles are none."""
+    """Return the sides of a part that belong to the whole building, without tile cuts."""
     sides = []
     for ring in (part.exterior, *part.interiors):
         xy = shapely.get_coordinates(ring)

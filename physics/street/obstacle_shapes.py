@@ -1,7 +1,7 @@
-"""What the things are made of that scenarios put on the way and streets do not have of themselves.
+"""Low-poly parts of scenario obstacles that are not street furniture.
 
-As in `furniture_shapes`: a thing's own frame has x along its length, y to the left, z up from its
-foot; each function takes the size and makes about a hundred triangles at most.
+The frame is that of `furniture_shapes`: x along the length, y to the left, z up from the foot. Each
+    function takes the size and returns at most about a hundred triangles.
 """
 
 from __future__ import annotations
@@ -18,24 +18,26 @@ _RUBBER: Final = (0.07, 0.07, 0.08)
 _RED: Final = (0.82, 0.10, 0.09)
 _PAPER: Final = (0.90, 0.88, 0.80)
 _WHEEL_SIDES: Final = 10
+"""Corners of a wheel."""
+
 _BOARD_M: Final = 0.30
-"""Length of the red and the white fields of a fence."""
+"""Length in metres of the red and white fields of a fence."""
 
 
 def wheeled_bin(size: Size) -> tuple[Part, ...]:
-    """It opens to +x; its wheels are behind."""
+    """Return a wheeled bin that opens to +x; its wheels are at the back."""
     length, depth, h = size
     body = _tapered((0.36 * length, 0.38 * depth), (0.46 * length, 0.48 * depth), 0.06, 0.9 * h)
     lid = [
         _tapered((0.5 * length, 0.5 * depth), (0.42 * length, 0.42 * depth), 0.9 * h, h),
         box((0.05, 0.8 * depth, 0.05), (-0.5 * length + 0.025, 0.0, 0.9 * h - 0.02)),
     ]
-    wheels = [_wheel(0.1, 0.1, (-0.3 * length, s * 0.32 * depth, 0.1)) for s in (-1, 1)]
+    wheels = [_ring(0.1, 0.1, 0.099, (-0.3 * length, s * 0.32 * depth, 0.1)) for s in (-1, 1)]
     return Part(body, None), Part(join(lid), METAL), Part(join(wheels), _RUBBER)
 
 
 def bike(size: Size) -> tuple[Part, ...]:
-    """On its stand, its front wheel towards +x."""
+    """Return a bicycle on its stand, with the front wheel towards +x."""
     length, depth, h = size
     r = 0.335
     rear = (-0.5 * length + r, r)
@@ -62,13 +64,13 @@ def bike(size: Size) -> tuple[Part, ...]:
 
 
 def sandwich_board(size: Size) -> tuple[Part, ...]:
-    """Two boards that lean on each other, one to be read from ahead and one from behind."""
+    """Return an A-board with one face to the front and one to the back."""
     length, depth, h = size
     lean = math.atan2(0.5 * length - 0.03, h)
     tall = (h - 0.02) / math.cos(lean)
     boards = []
     faces = []
-    words = []
+    text_lines = []
     for side in (-1, 1):
         foot = side * (0.5 * length - 0.03)
         pivot = (foot, 0.0, 0.0)
@@ -86,12 +88,12 @@ def sandwich_board(size: Size) -> tuple[Part, ...]:
                 (0.008, share * depth, 0.07 * tall),
                 (foot + side * 0.020, 0.0, (0.78 - 0.17 * k) * tall),
             )
-            words.append(box(*line, skip=("bottom", "top")).tilted(-side * lean, pivot))
-    return Part(join(boards), WHITE), Part(join(faces), None), Part(join(words), _PAPER)
+            text_lines.append(box(*line, skip=("bottom", "top")).tilted(-side * lean, pivot))
+    return Part(join(boards), WHITE), Part(join(faces), None), Part(join(text_lines), _PAPER)
 
 
 def construction_fence(size: Size) -> tuple[Part, ...]:
-    """A board in red and white over bars between two posts on heavy feet."""
+    """Return a red and white board over bars between two posts on heavy feet."""
     length, depth, h = size
     count = max(2 * round(length / _BOARD_M / 2.0) + 1, 3)
     step = length / count
@@ -120,8 +122,11 @@ def construction_fence(size: Size) -> tuple[Part, ...]:
 def _tapered(
     low_m: tuple[float, float], high_m: tuple[float, float], from_m: float, to_m: float
 ) -> Mesh:
-    """A box that widens or narrows upwards: half its length and depth at two heights; without a
-    bottom."""
+    """Return a box without a bottom that widens or narrows upwards.
+
+    low_m, high_m: half length and half depth at the two heights
+    from_m, to_m: heights
+    """
     turns = np.array([(1, -1), (1, 1), (-1, 1), (-1, -1)])
     low = np.column_stack([turns * low_m, np.full(4, from_m)])
     high = np.column_stack([turns * high_m, np.full(4, to_m)])
@@ -130,7 +135,7 @@ def _tapered(
 
 
 def _tube(one: tuple[float, float], other: tuple[float, float], thick_m: float) -> Mesh:
-    """A square bar between two points (x, z) of the middle plane."""
+    """Return a square bar between two points (x, z) of the centre plane."""
     (x0, z0) = one
     (x1, z1) = other
     far = math.hypot(x1 - x0, z1 - z0)
@@ -138,14 +143,10 @@ def _tube(one: tuple[float, float], other: tuple[float, float], thick_m: float) 
     return bar.tilted(-math.atan2(z1 - z0, x1 - x0), (x0, 0.0, z0))
 
 
-def _wheel(radius_m: float, wide_m: float, centre_m: tuple[float, float, float]) -> Mesh:
-    return _ring(radius_m, wide_m, radius_m - 0.001, centre_m)
-
-
 def _ring(
     radius_m: float, wide_m: float, thick_m: float, centre_m: tuple[float, float, float]
 ) -> Mesh:
-    """A wheel that rolls along x, open within: its tread and its two flanks."""
+    """Return a wheel that rolls along x, open at the hub: tread and two sides."""
     angle = 2.0 * np.pi * np.arange(_WHEEL_SIDES + 1) / _WHEEL_SIDES
     circle = np.column_stack([np.cos(angle), np.zeros_like(angle), np.sin(angle)])
     half = np.array([0.0, 0.5 * wide_m, 0.0])

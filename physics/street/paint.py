@@ -1,8 +1,8 @@
-"""Paint and tactile paving: what lies on the ground without changing what the ground is.
+"""Road markings and tactile paving, which change only the look of the ground.
 
-Lines between lanes and between the directions of a road, stop lines before signalised crossings,
-and fields of domes where a crossing begins. Lines belong to the tile of their middle and follow its
-heights; domes lie in the triangles of the ground, of whichever tile.
+Markings are lane lines, centre lines and stop lines before signalised crossings. Tactile domes lie
+where a crossing begins. A marking belongs to the tile of its centre and follows that tile's
+heights. Domes are cut along the triangles of each tile.
 """
 
 from __future__ import annotations
@@ -18,50 +18,66 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats, Polyline
 from cosim.place.street_map import Lane, StreetMap, Strip
-from physics.ground.mesh import EMPTY, Mesh, join, plan_triangles
-from physics.ground.tiles import Tile, key_at, kind_of, square
+from physics.ground.mesh import EMPTY, Mesh, flat_shaded, join, plan_triangles
+from physics.ground.tiles import Tile, grown_box, key_at, kind_of, square
 
 LINE_M: Final = 0.12
+"""Width of lane lines in metres."""
+
 STOP_LINE_M: Final = 0.40
+"""Width of stop lines in metres."""
+
 TACTILE_M: Final = 0.60
-"""Depth of a field of domes, along the way over the crossing."""
+"""Depth of tactile paving along the crossing in metres."""
 _DASH_M: Final = (3.0, 6.0)
+"""Length of a lane-line dash and of the gap after it in metres."""
+
 _CENTRE_DASH_M: Final = (3.0, 3.0)
-"""Length of a dash, and of the gap after it."""
-_PIECE_M: Final = 1.0
+"""Length of a centre-line dash and of the gap after it in metres."""
+_QUAD_MAX_M: Final = 1.0
+"""Largest length in metres of a quad, so that lines follow bends and slopes."""
+
 _STOP_BEFORE_M: Final = 0.5
+"""Distance in metres between a stop line and the crossing."""
+
 _STOP_WITHIN_M: Final = 12.0
+"""Largest distance in metres between a lane's end and its crossing."""
+
 _TACTILE_BEHIND_M: Final = 0.25
+"""Distance in metres between the curb and tactile paving."""
+
 _LIFT_M: Final = 0.004
-_REACH_M: Final = 8.0
-_WALKED_ON: Final = ("sidewalk", "ramp", "curb")
-"""Kinds of ground that domes lie on."""
+"""Height of paint above the ground in metres."""
+
+_SEARCH_M: Final = 8.0
+"""Distance in metres from a tile within which streets may have paint in it."""
+
+_WALKABLE: Final = ("sidewalk", "ramp", "curb")
+"""Kinds of ground that tactile paving covers."""
 
 
 def paint_in(street_map: StreetMap, tile: Tile) -> Mapping[str, Mesh]:
-    """What lies on a tile, by the name of its ground layer; 4 mm above the ground."""
-    x0, y0, x1, y1 = square(tile.key)
-    reach = shapely.box(x0 - _REACH_M, y0 - _REACH_M, x1 + _REACH_M, y1 + _REACH_M)
+    """Return the paint of a tile by ground layer, 4 mm above the ground."""
+    reach = grown_box(square(tile.key), _SEARCH_M)
     lanes = [lane for lane in street_map.near("lane", reach) if isinstance(lane, Lane)]
     roads = [lane for lane in lanes if lane.kind == "road" and not lane.internal]
     strips = [strip for strip in street_map.near("strip", reach) if isinstance(strip, Strip)]
     crossings = [strip for strip in strips if strip.kind == "crossing"]
-    lines = [quad for lane in roads for quad in _lines(street_map, lane)]
+    lines = [quad for lane in roads for quad in _lane_lines(street_map, lane)]
     lines += [quad for lane in roads for quad in _stop_line(lane, crossings)]
-    found = {"paint": _laid([np.asarray(quad) for quad in lines], tile)}
-    found["tactile-domes"] = _fields(street_map, crossings, tile)
+    found = {"paint": _marking_mesh([np.asarray(quad) for quad in lines], tile)}
+    found["tactile-domes"] = _tactile_mesh(street_map, crossings, tile)
     return {name: mesh for name, mesh in found.items() if len(mesh)}
 
 
-def _lines(street_map: StreetMap, lane: Lane) -> Iterator[Floats]:
-    """Quads (4, 2) along the inner side of a lane: dashes to the next lane, or to the other
-    direction."""
+def _lane_lines(street_map: StreetMap, lane: Lane) -> Iterator[Floats]:
+    """Return quads (4, 2) along the inner side of a lane: a lane line or a centre line."""
     side = -1.0 if street_map.left_hand else 1.0
     edge, _, index = lane.id.rpartition("_")
-    beside = street_map.lanes.get(f"{edge}_{int(index) + 1}") if index.isdecimal() else None
-    if beside is not None and beside.kind == "road":
+    neighbour = street_map.lanes.get(f"{edge}_{int(index) + 1}") if index.isdecimal() else None
+    if neighbour is not None and neighbour.kind == "road":
         dash = _DASH_M
-    elif _meets(street_map, lane, side, f"-{edge}"):
+    elif _is_adjacent(street_map, lane, side, f"-{edge}"):
         dash = _CENTRE_DASH_M
     else:
         return
@@ -69,14 +85,16 @@ def _lines(street_map: StreetMap, lane: Lane) -> Iterator[Floats]:
     end_m = line.length_m - 1.0
     for start in np.arange(0.5, end_m, sum(dash)):
         stop = min(start + dash[0], end_m)
-        count = max(math.ceil((stop - start) / _PIECE_M), 1)
+        count = max(math.ceil((stop - start) / _QUAD_MAX_M), 1)
         cuts = np.linspace(start, stop, count + 1)
         yield from _band(line, cuts, side * 0.5 * lane.width_m, LINE_M)
 
 
-def _meets(street_map: StreetMap, lane: Lane, side: float, edge: str) -> bool:
-    """Whether another road's lanes lie right beside a lane, no verge between them. side: 1 left, -1
-    right."""
+def _is_adjacent(street_map: StreetMap, lane: Lane, side: float, edge: str) -> bool:
+    """Return whether lanes of another edge are adjacent, without a verge.
+
+    side: 1 for left, -1 for right
+    """
     line = Polyline(lane.line)
     x, y, heading = line.at(0.5 * line.length_m)
     aside = side * (0.5 * lane.width_m + 0.3)
@@ -87,7 +105,7 @@ def _meets(street_map: StreetMap, lane: Lane, side: float, edge: str) -> bool:
 
 
 def _stop_line(lane: Lane, crossings: Sequence[Strip]) -> Iterator[Floats]:
-    """Quads across a lane where it ends before a signalised crossing."""
+    """Return the stop line of a lane that ends before a signalised crossing."""
     end = shapely.Point(lane.line[-1])
     for crossing in crossings:
         if (
@@ -96,7 +114,7 @@ def _stop_line(lane: Lane, crossings: Sequence[Strip]) -> Iterator[Floats]:
             and end.distance(crossing.polygon) < _STOP_WITHIN_M
         ):
             line = Polyline(lane.line)
-            at_m = min(line.length_m, _before(line, crossing)) - _STOP_BEFORE_M
+            at_m = min(line.length_m, _crossing_at_m(line, crossing)) - _STOP_BEFORE_M
             if at_m > 1.0:
                 yield from _band(
                     line, np.array([at_m - STOP_LINE_M, at_m]), 0.0, lane.width_m - 0.2
@@ -104,8 +122,8 @@ def _stop_line(lane: Lane, crossings: Sequence[Strip]) -> Iterator[Floats]:
             return
 
 
-def _before(line: Polyline, crossing: Strip) -> float:
-    """Arc length at which a lane meets a crossing; infinite where it ends first."""
+def _crossing_at_m(line: Polyline, crossing: Strip) -> float:
+    """Return the arc length at which a line meets a crossing; infinite if it does not."""
     met = shapely.intersection(shapely.LineString(line.points), crossing.polygon)
     if shapely.is_empty(met):
         return math.inf
@@ -116,7 +134,7 @@ def _before(line: Polyline, crossing: Strip) -> float:
 
 
 def _band(line: Polyline, cuts: Floats, aside_m: float, width_m: float) -> Iterator[Floats]:
-    """Quads (4, 2) between arc lengths, `aside_m` to the left of a line."""
+    """Return quads (4, 2) between arc lengths, at an offset to the left of a line."""
     rows = []
     for s in cuts.tolist():
         x, y, heading = line.at(s)
@@ -127,8 +145,8 @@ def _band(line: Polyline, cuts: Floats, aside_m: float, width_m: float) -> Itera
         yield np.stack([right0, right1, left1, left0])
 
 
-def _laid(quads: Sequence[Floats], tile: Tile) -> Mesh:
-    """Quads (4, 2) whose middle is in the tile, on its ground."""
+def _marking_mesh(quads: Sequence[Floats], tile: Tile) -> Mesh:
+    """Return the mesh of quads (4, 2) whose centre is in the tile, on its ground."""
     own = [quad for quad in quads if key_at(*quad.mean(axis=0).tolist()) == tile.key]
     if not own:
         return EMPTY
@@ -139,28 +157,27 @@ def _laid(quads: Sequence[Floats], tile: Tile) -> Mesh:
 
 
 def _on_ground(xy: Floats, triangles: NDArray[np.int64], tile: Tile) -> Mesh:
+    """Return a mesh at the height of the ground."""
     up = np.tile([0.0, 0.0, 1.0], (len(xy), 1))
     return Mesh(
         np.column_stack([xy, tile.height(xy) + _LIFT_M]), up, np.asarray(triangles, dtype=np.int32)
     )
 
 
-def _fields(street_map: StreetMap, crossings: Sequence[Strip], tile: Tile) -> Mesh:
-    """Domes at both ends of the crossings, on walkable ground only: what of them lies on the
-    tile."""
+def _tactile_mesh(street_map: StreetMap, crossings: Sequence[Strip], tile: Tile) -> Mesh:
+    """Return tactile paving at both ends of crossings, clipped to walkable ground of the tile."""
     border = shapely.box(*square(tile.key))
     ends = [(line, one.width_m) for one in crossings for line in (one.line, one.line[::-1])]
-    fields = [_field(street_map, Polyline(line), width_m) for line, width_m in ends]
+    fields = [_tactile_area(street_map, Polyline(line), width_m) for line, width_m in ends]
     here = [field for field in fields if shapely.intersects(field, border)]
     if not here:
         return EMPTY
-    walked = join([mesh for name, mesh in tile.parts.items() if kind_of(name) in _WALKED_ON])
-    return join([_draped(field, walked) for field in here])
+    walkable = join([mesh for name, mesh in tile.parts.items() if kind_of(name) in _WALKABLE])
+    return join([_drape(field, walkable) for field in here])
 
 
-def _draped(field: shapely.Geometry, ground: Mesh) -> Mesh:
-    """A field cut along the triangles of the ground under it, so that it lies in them; 4 mm
-    above."""
+def _drape(field: shapely.Geometry, ground: Mesh) -> Mesh:
+    """Return a field cut along the ground's triangles and lifted 4 mm above them."""
     faces = ground.vertices[ground.triangles]
     normal = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
     x0, y0, x1, y1 = shapely.bounds(field)
@@ -174,22 +191,23 @@ def _draped(field: shapely.Geometry, ground: Mesh) -> Mesh:
     slope = normal[of, None, :2] / normal[of, None, 2:]
     z = faces[of, :1, 2] - ((xy - faces[of, :1, :2]) * slope).sum(axis=2)
     vertices = np.concatenate([xy, z[..., None] + _LIFT_M], axis=2).reshape(-1, 3)
-    up = np.tile([0.0, 0.0, 1.0], (len(vertices), 1))
-    return Mesh(vertices, up, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3))
+    return flat_shaded(vertices)
 
 
-def _field(street_map: StreetMap, line: Polyline, width_m: float) -> shapely.Geometry:
-    """Where domes lie before a line's end, beyond it as seen from the crossing."""
+def _tactile_area(street_map: StreetMap, line: Polyline, width_m: float) -> shapely.Geometry:
+    """Return the area of tactile paving beyond the end of a crossing's line."""
     x, y, heading = line.at(line.length_m)
     along = np.array([math.cos(heading), math.sin(heading)])
     left = 0.5 * (width_m - 0.3) * np.array([-along[1], along[0]])
     near = np.array([x, y]) + _TACTILE_BEHIND_M * along
     far = near + TACTILE_M * along
     field = shapely.Polygon([near - left, far - left, far + left, near + left])
-    walked = [corner.polygon for corner in street_map.near("corner", field)]
-    walked += [
+    walkable = [corner.polygon for corner in street_map.near("corner", field)]
+    walkable += [
         s.polygon
         for s in street_map.near("strip", field)
         if isinstance(s, Strip) and s.kind == "sidewalk"
     ]
-    return shapely.intersection(field, shapely.union_all(walked)) if walked else shapely.Polygon()
+    return (
+        shapely.intersection(field, shapely.union_all(walkable)) if walkable else shapely.Polygon()
+    )

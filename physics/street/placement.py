@@ -1,10 +1,8 @@
-"""Where street furniture stands: drawn for each sidewalk from the street map and a seed, zone by
-zone.
+"""Random placement of street furniture along sidewalks.
 
-A sidewalk's props are drawn from its own generator, and a prop belongs to the tile of its middle:
-what stands in a tile does not depend on which tiles were asked for before. Along the middle of
-every sidewalk a band is kept free. No car is parked on the road: the crowd engine drives on every
-lane. Cars stand at the ends of driveways.
+Each sidewalk draws its props from its own generator. A prop belongs to the tile of its centre, so
+tiles do not depend on the order in which they are built. A band along the middle of every sidewalk
+stays free. Cars stand only at the ends of driveways, because traffic uses every lane of the road.
 """
 
 from __future__ import annotations
@@ -21,7 +19,16 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Polyline
 from cosim.place import overlay
 from cosim.place.street_map import Lane, PieceKind, StreetMap, Strip
-from physics.ground.tiles import CURBSTONE_M, DRIVEWAY_M, RAMP_M, Key, key_at, square
+from physics.ground.tiles import (
+    CURBSTONE_M,
+    DRIVEWAY_M,
+    RAMP_M,
+    Key,
+    grown_box,
+    key_at,
+    keys_in,
+    square,
+)
 from physics.street.buildings import Frontage
 from physics.street.furniture import (
     CATALOGUE,
@@ -35,46 +42,60 @@ from physics.street.furniture import (
 from physics.street.mapped import MappedThings
 
 CLEAR_HALF_M: Final = 0.6
-"""The least half width of the band that is kept free along the middle of a sidewalk."""
+"""Smallest half width in metres of the free band along the middle of a sidewalk."""
 
 PROP_END_GAP_M: Final = 2.0
-"""Nothing stands nearer to the end of a sidewalk or to a crossing."""
+"""Smallest distance in metres between a prop and a crossing or the end of a sidewalk."""
 
 _GAP_M: Final = 0.25
-"""Least distance between two props."""
+"""Smallest distance in metres between two props."""
 
 _EDGE_M: Final = 0.6
-"""The outer edge of a wide sidewalk that props at the curb may use."""
+"""Width in metres of the outer edge of a wide sidewalk for props at the curb."""
 
 GOLDEN_RAD: Final = 2.399963
-"""Each tree is turned by so much more than the one before: no two look alike."""
+"""Rotation in radians from one tree to the next, so that trees look different."""
 
 _MARGIN_M: Final = 0.06
-_VERGE_MIN_M: Final = 0.3
-_ZONE_MAX_M: Final = 6.0
-_REACH_M: Final = 12.0
-"""Props stand nearer than this to their sidewalk, and the middle of a house to its walls."""
+"""Distance in metres between props and the border of their zone."""
 
-_STREET: Final[tuple[PieceKind, ...]] = ("strip", "corner", "lane", "junction")
-_BY_TYPE: Final = (
+_VERGE_MIN_M: Final = 0.3
+"""Smallest width in metres of a verge with props."""
+
+_ZONE_MAX_M: Final = 6.0
+"""Largest width of a zone in metres."""
+
+_SEARCH_M: Final = 12.0
+"""Search distance in metres for props of a sidewalk and for buildings near props.
+
+Props are closer than this to their sidewalk, and centres of buildings to their walls.
+"""
+
+_STREET_PIECES: Final[tuple[PieceKind, ...]] = ("strip", "corner", "lane", "junction")
+"""Kinds of map pieces that props must not cover."""
+
+_CLASS_OF_WORDS: Final = (
     (("motorway", "trunk", "primary", "secondary"), "avenue"),
     (("tertiary",), "commercial"),
     (("living", "service", "alley"), "narrow"),
 )
-"""Street classes of imported maps, by words in the type of the edge; the rest are residential."""
+"""Street classes of imported maps by words in the edge type; the default is residential."""
 
 
 class _Band(NamedTuple):
-    """Where the props of a zone may be: distances from the middle line, positive away from the
-    road, in metres."""
+    """Range of distances from the centre line, positive away from the road, in metres."""
 
     low_m: float
     high_m: float
 
 
 class Placement:
-    """The props of a map under a seed; pure functions of map, seed and what is asked for, kept once
-    known."""
+    """Street furniture of a map.
+
+    mapped: mapped props, near which none of the same kind are generated
+
+    Results are pure functions of map, seed and arguments, and are cached.
+    """
 
     def __init__(
         self,
@@ -87,13 +108,13 @@ class Placement:
         self._seed = seed
         self._frontage = frontage
         self._mapped = MappedThings(street_map) if mapped is None else mapped
-        self._drawn: dict[str, tuple[list[Prop], NDArray[np.object_]]] = {}
-        self._kept: dict[str, tuple[Prop, ...]] = {}
+        self._candidates: dict[str, tuple[list[Prop], NDArray[np.object_]]] = {}
+        self._final: dict[str, tuple[Prop, ...]] = {}
         self._houses: dict[Key, list[shapely.Geometry]] = {}
 
     def in_tile(self, key: Key) -> tuple[Prop, ...]:
-        """Props whose middle lies in the tile, in the net's order."""
-        strips = self._map.near("strip", shapely.box(*_grown(square(key), _REACH_M)))
+        """Return the props whose centre lies in a tile, in map order."""
+        strips = self._map.near("strip", grown_box(square(key), _SEARCH_M))
         props = [prop for s in strips if isinstance(s, Strip) for prop in self.on_strip(s)]
         return (
             *self._mapped.props(key),
@@ -101,64 +122,67 @@ class Placement:
         )
 
     def on_strip(self, strip: Strip) -> tuple[Prop, ...]:
-        """Props of a sidewalk: as drawn, without those that meet a house or what another sidewalk
-        has drawn."""
-        if strip.id not in self._kept:
-            props, ground = self._draw(strip)
+        """Return the props of a sidewalk without overlaps.
+
+        Props that overlap a building or a prop of an earlier sidewalk are removed.
+        """
+        if strip.id not in self._final:
+            props, ground = self._draw_candidates(strip)
             hit = np.zeros(len(props), dtype=bool)
             if props:
-                area = shapely.box(*_grown(shapely.total_bounds(ground), _REACH_M))
+                area = grown_box(shapely.total_bounds(ground), _SEARCH_M)
                 others = [
                     s
                     for s in self._map.near("strip", area)
                     if isinstance(s, Strip) and s.id < strip.id
                 ]
-                rivals = [polygon for s in others for polygon in self._draw(s)[1]]
-                rivals += list(footprints(self._mapped_in(area)))
-                hit |= _meets(ground, rivals, _GAP_M)
+                others_ground = [polygon for s in others for polygon in self._draw_candidates(s)[1]]
+                others_ground += list(footprints(self._mapped_in(area)))
+                hit |= _within(ground, others_ground, _GAP_M)
                 spread = np.array([KINDS[prop.kind].spread_m for prop in props])
-                hit |= _meets(
+                hit |= _within(
                     shapely.buffer(ground, spread, quad_segs=2), self._houses_in(area), _MARGIN_M
                 )
-            self._kept[strip.id] = tuple(
+            self._final[strip.id] = tuple(
                 prop for prop, is_hit in zip(props, hit, strict=True) if not is_hit
             )
-        return self._kept[strip.id]
+        return self._final[strip.id]
 
     def _mapped_in(self, area: shapely.Polygon) -> list[Prop]:
-        return [prop for key in _keys_of(area) for prop in self._mapped.props(key)]
+        return [prop for key in keys_in(area) for prop in self._mapped.props(key)]
 
     def _houses_in(self, area: shapely.Polygon) -> list[shapely.Geometry]:
-        keys = _keys_of(area)
+        keys = keys_in(area)
         for key in keys:
             if key not in self._houses:
                 self._houses[key] = [b.polygon for b in self._frontage.in_tile(key)]
         return [house for key in keys for house in self._houses[key]]
 
-    def _draw(self, strip: Strip) -> tuple[list[Prop], NDArray[np.object_]]:
-        """Props of a sidewalk that fit its zones, the street and each other, and their
-        footprints."""
-        if strip.id not in self._drawn:
+    def _draw_candidates(self, strip: Strip) -> tuple[list[Prop], NDArray[np.object_]]:
+        """Return random props of a sidewalk that fit its zones, the street and each other.
+
+        Returns: props and their (N,) footprints
+        """
+        if strip.id not in self._candidates:
             props = list(draw(strip, self._seed)) if strip.kind == "sidewalk" else []
-            shown = self._mapped.kinds
+            mapped_kinds = self._mapped.kinds
             props = [
                 p
                 for p in props
-                if p.kind not in shown
+                if p.kind not in mapped_kinds
                 or not self._mapped.shows(p.kind, shapely.Point(p.x_m, p.y_m))
             ]
             ground = footprints(props)
             if props:
-                free = _fits(self._map, strip, props, ground)
+                free = _find_free(self._map, strip, props, ground)
                 props = [prop for prop, is_free in zip(props, free, strict=True) if is_free]
                 ground = ground[free]
-            self._drawn[strip.id] = props, ground
-        return self._drawn[strip.id]
+            self._candidates[strip.id] = props, ground
+        return self._candidates[strip.id]
 
 
 def draw(strip: Strip, seed: int) -> Iterable[Prop]:
-    """Props for a sidewalk, drawn kind by kind; they may still meet each other or another
-    street."""
+    """Return random props of a sidewalk, kind by kind, before overlaps are removed."""
     line = Polyline(strip.line if strip.road_side <= 0 else strip.line[::-1])
     bands = zones(strip)
     usable = line.length_m - 2.0 * PROP_END_GAP_M
@@ -167,15 +191,15 @@ def draw(strip: Strip, seed: int) -> Iterable[Prop]:
     rng = np.random.default_rng([seed, zlib.crc32(strip.id.encode()), 0x9209])
     style = street_style(strip.street_class)
     driveways = [s if strip.road_side <= 0 else line.length_m - s for s in strip.driveways]
-    busy = float(rng.uniform(0.5, 1.5))
+    density = float(rng.uniform(0.5, 1.5))
     n = 0
     for kind in CATALOGUE:
         fitting = [zone for zone in kind.zones if zone in bands]
-        expected = kind.per_100m[style] * busy * usable / 100.0
+        expected = kind.per_100m[style] * density * usable / 100.0
         count = int(expected + rng.random())
         variant = int(rng.integers(PROP_VARIANTS))
         paint = int(rng.integers(len(kind.paints)))
-        aside, phase = rng.random(2)
+        aside, row_phase = rng.random(2)
         if not fitting:
             continue
         if "driveway" in fitting:
@@ -183,8 +207,8 @@ def draw(strip: Strip, seed: int) -> Iterable[Prop]:
         for k in range(count):
             u, v, w = rng.random(3)
             if kind.row:
-                # What stands in a row is alike: one size, one distance from the curb.
-                s = (k + 0.2 + 0.6 * phase + 0.05 * u) / count * usable
+                # Props in a row share one size and one distance from the curb.
+                s = (k + 0.2 + 0.6 * row_phase + 0.05 * u) / count * usable
                 share = aside
                 zone = fitting[0]
             else:
@@ -195,19 +219,19 @@ def draw(strip: Strip, seed: int) -> Iterable[Prop]:
                 paint = int(rng.integers(len(kind.paints)))
             size = kind.size_m(variant)
             at_m = driveways[k] if zone == "driveway" else PROP_END_GAP_M + s
-            turned = zone == "driveway" and _room(bands[zone]) > size[0]
-            prop = _stood(
+            turned = zone == "driveway" and _depth_m(bands[zone]) > size[0]
+            prop = _place(
                 strip, line, at_m, bands[zone], share, kind, variant, paint, zone, turned, n
             )
             if prop is None or (
-                zone != "driveway" and any(_blocks(at_m, size[0], d) for d in driveways)
+                zone != "driveway" and any(_blocks_driveway(at_m, size[0], d) for d in driveways)
             ):
                 continue
             yield prop
             n += 1
 
 
-def _stood(
+def _place(
     strip: Strip,
     line: Polyline,
     at_m: float,
@@ -220,12 +244,17 @@ def _stood(
     turned: bool,
     n: int,
 ) -> Prop | None:
-    """A prop at an arc length of the line and a share of the free depth of its zone; None when it
-    is too deep."""
+    """Return a prop in a zone of a sidewalk, or None if it does not fit.
+
+    at_m: arc length along the line
+    share: position within the free depth of the zone, 0 to 1
+    turned: place the prop across the street direction
+    n: number of the prop along the sidewalk
+    """
     length, depth, _ = kind.size_m(variant)
     if turned:
         length, depth = depth, length
-    slack = _room(band) - depth
+    slack = _depth_m(band) - depth
     if (
         slack < 0.0
         or not PROP_END_GAP_M + 0.5 * length
@@ -240,16 +269,16 @@ def _stood(
     )
     x = x - away * math.sin(along)
     y = y + away * math.cos(along)
-    further = 0.0
+    turned_rad = 0.0
     if kind.name == "lamp" and zone == "frontage":
-        further = math.pi  # its arm reaches over the sidewalk and the road, not into the houses
+        turned_rad = math.pi  # the arm must point to the road, not into buildings
     elif kind.grown:
-        further = GOLDEN_RAD * n
-    return Prop(f"prop:{strip.id}:{n}", kind.name, variant, x, y, heading, paint, further)
+        turned_rad = GOLDEN_RAD * n
+    return Prop(f"prop:{strip.id}:{n}", kind.name, variant, x, y, heading, paint, turned_rad)
 
 
 def zones(strip: Strip) -> dict[Zone, _Band]:
-    """The zones beside a sidewalk that props may use."""
+    """Return the zones of a sidewalk that props may use."""
     half = 0.5 * strip.width_m
     found: dict[Zone, _Band] = {}
     if strip.road_side != 0:
@@ -267,21 +296,22 @@ def zones(strip: Strip) -> dict[Zone, _Band]:
 
 
 def clear_half_m(strip: Strip) -> float:
-    """Half the width of the band along the middle of a sidewalk where nothing stands."""
+    """Return half the width in metres of the free band along the middle of a sidewalk."""
     return min(max(CLEAR_HALF_M, 0.5 * strip.width_m - _EDGE_M), 0.5 * strip.width_m)
 
 
 def street_style(street_class: str) -> str:
-    """The column of the catalogue for a street class of ours or a type of an imported edge."""
+    """Return the catalogue column for a street class or the type of an imported edge."""
     if street_class in CATALOGUE[0].per_100m:
         return street_class
     return next(
-        (ours for words, ours in _BY_TYPE if any(w in street_class for w in words)), "residential"
+        (ours for words, ours in _CLASS_OF_WORDS if any(w in street_class for w in words)),
+        "residential",
     )
 
 
 def props_of(street_map: StreetMap, seed: int) -> tuple[Prop, ...]:
-    """Every prop of a map, sidewalk by sidewalk. Seconds on a large map."""
+    """Return all props of a map, sidewalk by sidewalk; takes seconds on large maps."""
     mapped = MappedThings(street_map)
     placement = Placement(street_map, seed, Frontage(street_map, seed, mapped), mapped)
     made_up = (prop for strip in street_map.strips.values() for prop in placement.on_strip(strip))
@@ -289,8 +319,10 @@ def props_of(street_map: StreetMap, seed: int) -> tuple[Prop, ...]:
 
 
 def driveway_ground(strip: Strip) -> list[shapely.Geometry]:
-    """For each driveway of a sidewalk what must stay open: its way from the road through verge,
-    sidewalk and frontage, and the flares of its ramp."""
+    """Return the area to keep free for each driveway of a sidewalk.
+
+    It is the way through verge, sidewalk and frontage, and the flares of its ramp.
+    """
     line = Polyline(strip.line)
     found: list[shapely.Geometry] = []
     for at_m in strip.driveways:
@@ -305,28 +337,27 @@ def driveway_ground(strip: Strip) -> list[shapely.Geometry]:
     return found
 
 
-def _fits(
+def _find_free(
     street_map: StreetMap, strip: Strip, props: Sequence[Prop], ground: NDArray[np.object_]
 ) -> NDArray[np.bool_]:
-    """Which props keep off the clear band, off other streets' ground and off each other, the
-    earlier first."""
-    area = shapely.box(*_grown(shapely.total_bounds(ground), PROP_END_GAP_M))
+    """Return which props are clear of the free band, other streets and earlier props."""
+    area = grown_box(shapely.total_bounds(ground), PROP_END_GAP_M)
     taken: list[shapely.Geometry] = []
-    for piece in [piece for kind in _STREET for piece in street_map.near(kind, area)]:
+    for piece in [piece for kind in _STREET_PIECES for piece in street_map.near(kind, area)]:
         if piece is strip or (isinstance(piece, Lane) and piece.kind == "verge"):
             continue
         is_crossing = isinstance(piece, Strip) and piece.kind == "crossing"
         taken.append(
             shapely.buffer(piece.polygon, PROP_END_GAP_M) if is_crossing else piece.polygon
         )
-    free = ~_meets(ground, taken, 0.02)
+    free = ~_within(ground, taken, 0.02)
     ways = [
         way
         for s in street_map.near("strip", area)
         if isinstance(s, Strip)
         for way in driveway_ground(s)
     ]
-    free &= ~_meets(ground, ways, 0.0) | np.array([prop.kind == "car" for prop in props])
+    free &= ~_within(ground, ways, 0.0) | np.array([prop.kind == "car" for prop in props])
     half = clear_half_m(strip) if "curb" in zones(strip) else 0.5 * strip.width_m
     free &= np.asarray(shapely.distance(shapely.linestrings(strip.line), ground) >= half)
     one, two = shapely.STRtree(ground).query(ground, predicate="dwithin", distance=_GAP_M)
@@ -339,32 +370,20 @@ def _fits(
     return np.asarray(free, dtype=bool)
 
 
-def _meets(
+def _within(
     ground: NDArray[np.object_], taken: Sequence[shapely.Geometry], gap_m: float
 ) -> NDArray[np.bool_]:
+    """Return which footprints are within a distance of taken areas."""
     hit = np.zeros(len(ground), dtype=bool)
     if taken:
         hit[shapely.STRtree(taken).query(ground, predicate="dwithin", distance=gap_m)[0]] = True
     return hit
 
 
-def _blocks(at_m: float, length_m: float, driveway_m: float) -> bool:
-    """Whether something stands on a driveway or on the ramp to it."""
+def _blocks_driveway(at_m: float, length_m: float, driveway_m: float) -> bool:
+    """Return whether a prop stands on a driveway or its ramp."""
     return abs(at_m - driveway_m) < 0.5 * (DRIVEWAY_M + length_m) + RAMP_M
 
 
-def _keys_of(area: shapely.Geometry) -> list[Key]:
-    """The tiles that the bounds of an area touch."""
-    x0, y0, x1, y1 = shapely.bounds(area).tolist()
-    (i0, j0) = key_at(x0, y0)
-    (i1, j1) = key_at(x1, y1)
-    return [(i, j) for i in range(i0, i1 + 1) for j in range(j0, j1 + 1)]
-
-
-def _room(band: _Band) -> float:
+def _depth_m(band: _Band) -> float:
     return band.high_m - band.low_m
-
-
-def _grown(bounds: Iterable[float], by_m: float) -> tuple[float, float, float, float]:
-    x0, y0, x1, y1 = (float(b) for b in bounds)
-    return x0 - by_m, y0 - by_m, x1 + by_m, y1 + by_m

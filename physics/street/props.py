@@ -1,4 +1,4 @@
-"""What is drawn of fences and crosswalk signals."""
+"""Meshes of barriers and pedestrian signals, and the positions of signals."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from cosim.core.geometry import Polyline
 from cosim.place.street_map import StreetMap, Strip
 from cosim.spec.scenario import Barrier
 from physics.ground.mesh import Mesh, box, join
-from physics.ground.tiles import Key, key_at, square
+from physics.ground.tiles import Key, grown_box, key_at, square
 
 PROP_RED: Final = (0.82, 0.10, 0.09)
 PROP_WHITE: Final = (0.93, 0.93, 0.91)
 POLE: Final = (0.22, 0.24, 0.25)
 LAMPS: Final = {True: (0.10, 0.85, 0.35), False: (0.95, 0.12, 0.08)}
-"""Colour of the lit lamp: may one walk?"""
+"""sRGB colour of the lit lamp: True is walk, False is stop."""
 
 _BOARD_M: Final = 0.35
+"""Length in metres of the red and white fields of a barrier."""
 
 
 def barrier_meshes(barrier: Barrier) -> tuple[Mesh, Mesh]:
-    """Red and white parts of a fence about its foot, before it is turned: x along the way it
-    closes."""
+    """Return the red and white parts of a barrier about its foot, blocking the x direction."""
     count = max(2 * round(barrier.length_m / _BOARD_M / 2.0) + 1, 3)
     step = barrier.length_m / count
     red: list[Mesh] = []
@@ -49,7 +49,7 @@ def barrier_meshes(barrier: Barrier) -> tuple[Mesh, Mesh]:
 
 @dataclass(frozen=True, slots=True)
 class SignalPost:
-    """A pedestrian signal at one end of a crossing; its face looks over the crossing."""
+    """A pedestrian signal at one end of a crossing that faces the crossing."""
 
     crossing: str
     x_m: float
@@ -58,25 +58,28 @@ class SignalPost:
 
 
 def posts_in(street_map: StreetMap, key: Key) -> list[SignalPost]:
-    """The pedestrian signals that stand in a tile."""
-    x0, y0, x1, y1 = square(key)
-    strips = street_map.near("strip", shapely.box(x0 - 5.0, y0 - 5.0, x1 + 5.0, y1 + 5.0))
+    """Return the pedestrian signals in a tile."""
+    strips = street_map.near("strip", grown_box(square(key), 5.0))
     crossings = [s for s in strips if isinstance(s, Strip) and s.signalised]
     posts = [post for s in crossings for post in signal_posts(street_map, s)]
     return [post for post in posts if key_at(post.x_m, post.y_m) == key]
 
 
 def signal_posts(street_map: StreetMap, crossing: Strip) -> tuple[SignalPost, SignalPost]:
-    """The posts at both ends of a signalised crossing: at the curb beside it, where nobody walks,
-    on the right as one comes towards it unless that is walkable."""
+    """Return the signals at both ends of a crossing.
+
+    A signal is at the curb next to the crossing: on the right in walking direction, or on the left
+        if only that side is not walkable.
+    """
     line = Polyline(crossing.line)
     first, second = (
-        _post(street_map, crossing, Polyline(points)) for points in (line.points, line.points[::-1])
+        _signal_post(street_map, crossing, Polyline(points))
+        for points in (line.points, line.points[::-1])
     )
     return first, second
 
 
-def _post(street_map: StreetMap, crossing: Strip, line: Polyline) -> SignalPost:
+def _signal_post(street_map: StreetMap, crossing: Strip, line: Polyline) -> SignalPost:
     x, y, heading = line.at(line.length_m)
     cos, sin = math.cos(heading), math.sin(heading)
     aside = 0.5 * crossing.width_m + 0.3
@@ -95,7 +98,7 @@ def _walkable(street_map: StreetMap, at: tuple[float, float]) -> bool:
 
 
 def post_mesh() -> Mesh:
-    """Pole and housing, the face towards +x."""
+    """Return pole and housing of a signal; the face is towards +x."""
     return join(
         [
             box((0.08, 0.08, 2.2), (0.0, 0.0, 1.1), skip=("bottom",)),
@@ -105,5 +108,5 @@ def post_mesh() -> Mesh:
 
 
 def lamp_mesh(walk: bool) -> Mesh:
-    """The lit lamp on the face: red above, green below."""
+    """Return the lit lamp of a signal: red at the top, green at the bottom."""
     return box((0.03, 0.24, 0.24), (0.11, 0.0, 2.27 if walk else 2.54), skip=("back",))

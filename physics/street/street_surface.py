@@ -1,5 +1,4 @@
-"""A street map as a surface: tiles, buildings and props by key, heights by point; made when first
-needed on a machine, and kept for all its processes."""
+"""Surface of a street map: tiles, buildings, props and heights, with a disk cache."""
 
 from __future__ import annotations
 
@@ -21,8 +20,7 @@ from physics.ground.mesh import Mesh
 from physics.ground.tiles import Key, Tile, build_tile, cells_of, keys_in, surface
 from physics.street.building_style import style_of
 from physics.street.buildings import Building, Frontage, on_land
-from physics.street.covers import covers_in
-from physics.street.frontage import frontage_in
+from physics.street.covers import covers_in, frontage_in
 from physics.street.furniture import Prop
 from physics.street.mapped import MappedThings
 from physics.street.paint import paint_in
@@ -41,14 +39,14 @@ from physics.street.tile_cache import (
 )
 from physics.textures.ground import layer_of
 
-_KEPT: Final = 100
+_CACHED_TILES: Final = 100
+"""Number of tiles in the in-memory LRU cache."""
 
 
 class StreetSurface(Surface):
-    """Tiles, buildings and props of a street map under a seed; the least recently used tiles are
-    forgotten.
+    """Surface of a street map for a seed.
 
-    roughness: of the ground, from 0 (flat) to 1.
+    roughness: unevenness of the ground, 0 (flat) to 1
     """
 
     def __init__(self, street_map: StreetMap, seed: int, roughness: float = 0.0) -> None:
@@ -71,6 +69,7 @@ class StreetSurface(Surface):
         return Chunk(tuple(ground), self.buildings(key), self.props(key))
 
     def _patch(self, name: str, mesh: Mesh) -> Patch:
+        """Return a ground mesh with its label, colour and texture layer."""
         label, colour = surface(name)
         shown, colour = (
             (name, colour) if self.street_map.planned else SEEN_AS.get(name, (name, colour))
@@ -82,14 +81,15 @@ class StreetSurface(Surface):
     def covers(self, key: Key) -> tuple[Patch, ...]:
         if self.street_map.planned:
             return ()
-        held = self.kept(
+        arrays = self.kept(
             "covers",
             key,
             lambda: covers_as_arrays(covers_in(self.street_map, self.tile(key), rims=False)),
         )
-        return self._looking(covers_of_arrays(held))
+        return self._cover_patches(covers_of_arrays(arrays))
 
-    def _looking(self, covers: Mapping[LandKind, Mesh]) -> tuple[Patch, ...]:
+    def _cover_patches(self, covers: Mapping[LandKind, Mesh]) -> tuple[Patch, ...]:
+        """Return covers as patches with the look of their kind of land."""
         laid = []
         for kind, mesh in covers.items():
             name = f"ground:{kind}"
@@ -105,7 +105,7 @@ class StreetSurface(Surface):
     def finish(self, key: Key) -> Finish:
         tile = self.tile(key)
         painted = []
-        laid = [*self._looking(covers_in(self.street_map, tile, rims=True))]
+        laid = [*self._cover_patches(covers_in(self.street_map, tile, rims=True))]
         for mesh, (layer, colour) in frontage_in(self.street_map, tile, self.seed):
             tint = colour or (1.0, 1.0, 1.0)
             laid.append(
@@ -130,10 +130,11 @@ class StreetSurface(Surface):
         return Finish(tuple(laid), tuple(painted), tuple(styles))
 
     def tile(self, key: Key) -> Tile:
+        """Return the ground of a tile from the cache, or build it."""
         if key not in self._tiles:
-            held = self.kept("ground", key, lambda: tile_as_arrays(self._built(key)))
-            self._tiles[key] = tile_of_arrays(held, key, self.street_map.terrain)
-            if len(self._tiles) > _KEPT:
+            arrays = self.kept("ground", key, lambda: tile_as_arrays(self._built(key)))
+            self._tiles[key] = tile_of_arrays(arrays, key, self.street_map.terrain)
+            if len(self._tiles) > _CACHED_TILES:
                 self._tiles.popitem(last=False)
         self._tiles.move_to_end(key)
         return self._tiles[key]
@@ -142,12 +143,12 @@ class StreetSurface(Surface):
         return self._cache.get(f"{kind}_{key[0]}_{key[1]}", make)
 
     def buildings(self, key: Key) -> tuple[Building, ...]:
-        """Buildings whose centre lies in the tile, on their land."""
-        return self._standing_in(key).buildings
+        """Return the buildings whose centre lies in the tile, placed on the land."""
+        return self._things_in(key).buildings
 
     def props(self, key: Key) -> tuple[tuple[Prop, float], ...]:
-        """Props whose middle lies in the tile, each with the height of its foot in metres."""
-        props = self._standing_in(key).props
+        """Return the props whose centre lies in the tile, each with the height of its foot."""
+        props = self._things_in(key).props
         heights = self.tile(key).height([(prop.x_m, prop.y_m) for prop in props])
         if props and not self.level:
             sizes = np.array([prop.size_m[:2] for prop in props])
@@ -163,37 +164,36 @@ class StreetSurface(Surface):
         )
 
     def standing(self, area: shapely.Geometry) -> list[Prop]:
-        """Props in the tiles that an area touches."""
-        return [prop for key in keys_in(area) for prop in self._standing_in(key).props]
+        """Return the props in the tiles that an area touches."""
+        return [prop for key in keys_in(area) for prop in self._things_in(key).props]
 
-    def _standing_in(self, key: Key) -> TileThings:
+    def _things_in(self, key: Key) -> TileThings:
+        """Return buildings and props of a tile from the cache, or place them."""
         if key not in self._things:
-            held = self.kept("things", key, lambda: things_as_arrays(self._placed(key)))
-            self._things[key] = things_of_arrays(held)
+            arrays = self.kept("things", key, lambda: things_as_arrays(self._place_things(key)))
+            self._things[key] = things_of_arrays(arrays)
         return self._things[key]
 
-    def _placed(self, key: Key) -> TileThings:
+    def _place_things(self, key: Key) -> TileThings:
         buildings = self._frontage.in_tile(key)
         terrain = self.street_map.terrain
-        on_their_land = (
-            buildings if terrain is None else tuple(on_land(b, terrain) for b in buildings)
-        )
-        return TileThings(on_their_land, self._placement.in_tile(key))
+        grounded = buildings if terrain is None else tuple(on_land(b, terrain) for b in buildings)
+        return TileThings(grounded, self._placement.in_tile(key))
 
     def _built(self, key: Key) -> Tile:
-        roots = self._trees(key) if self.roughness > 0.0 else []
+        roots = self._tree_positions(key) if self.roughness > 0.0 else []
         return build_tile(self.street_map, key, self._paving, self.roughness, self.seed, roots)
 
-    def _trees(self, key: Key) -> list[tuple[float, float]]:
-        """Where trees stand in a tile and around it."""
+    def _tree_positions(self, key: Key) -> list[tuple[float, float]]:
+        """Return the positions of trees in a tile and its neighbours."""
         around = [(key[0] + i, key[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
         props = [
-            prop for near in around for prop in self._standing_in(near).props if prop.kind == "tree"
+            prop for near in around for prop in self._things_in(near).props if prop.kind == "tree"
         ]
         return [(prop.x_m, prop.y_m) for prop in props]
 
     def heights(self, xy: ArrayLike) -> Floats:
-        """Height of the ground at (N, 2) points, (N,) metres."""
+        """Return the (N,) ground heights in metres at (N, 2) points."""
         xy = np.asarray(xy, dtype=float).reshape(-1, 2)
         cells = cells_of(xy)
         if len(xy) and (cells == cells[0]).all():

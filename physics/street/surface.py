@@ -1,9 +1,8 @@
-"""Surface: what wheels and feet stand on. The world and the cameras take one and do not know what
-it was made from.
+"""Interface of surfaces that robots, people and vehicles move on.
 
-A surface is cut into the squares of physics.ground.tiles, so that only what is near is held. Two
-methods make one, `heights` and `chunk`; what stands on a street (signals, textures, paint) is told
-by those that a plain one inherits.
+Physics and cameras use this interface only. A surface is divided into the tiles of
+`physics.ground.tiles`, so that only nearby ones are loaded. Subclasses implement `heights` and
+`chunk`; the other methods have defaults for plain surfaces.
 """
 
 from __future__ import annotations
@@ -28,14 +27,19 @@ from physics.street.props import SignalPost
 from physics.textures.facades import WallStyle
 from physics.textures.layers import Colour
 
-_WHEELS: Final = np.array([0.32, 0.4])
-"""Where a vehicle's wheels are, as shares of its length and width from its middle."""
+_WHEEL_SHARE: Final = np.array([0.32, 0.4])
+"""Position of a vehicle's wheels as a fraction of its length and width from the centre."""
 
 
 class Patch(NamedTuple):
-    """Triangles of one material. friction: against a tyre of 1.0; label: of
-    cosim.core.state.LABELS; layer: of physics.textures.ground, which cameras with textures show, in
-    the colour if it is tinted."""
+    """Triangles of one material.
+
+    friction: coefficient of friction against a tyre of 1.0
+    label: one of `cosim.core.state.LABELS`
+    colour: sRGB colour
+    layer: layer of `physics.textures.ground` for cameras with textures
+    tinted: whether the colour tints the layer
+    """
 
     name: str
     mesh: Mesh
@@ -48,8 +52,7 @@ class Patch(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """What is in a square: ground, buildings, and props with the heights of their feet in
-    metres."""
+    """Contents of a tile: ground, buildings, and props with the height of their foot in metres."""
 
     ground: tuple[Patch, ...]
     buildings: tuple[Building, ...] = ()
@@ -58,8 +61,12 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True)
 class Finish:
-    """What cameras with textures add to a chunk. laid: thin covers, drawn before the ground they
-    lie on; painted: what changes colours alone; styles: of the chunk's buildings, one each."""
+    """Details of a tile for cameras with textures.
+
+    laid: thin covers, drawn before the ground under them
+    painted: markings that change colours only
+    styles: style of each building of the chunk
+    """
 
     laid: tuple[Patch, ...] = ()
     painted: tuple[Patch, ...] = ()
@@ -67,69 +74,87 @@ class Finish:
 
 
 class Surface(ABC):
-    """Heights, and chunks of what is solid and seen. seed: of what is drawn by chance over it:
-    clouds, a lens's noise. level: whether the land lies flat at height 0."""
+    """Ground heights and tile contents.
+
+    seed: seed of random details such as clouds and lens noise
+    level: whether the land is flat at height 0
+    """
 
     seed: int = 0
     level: bool = False
-    _leant: tuple[Pose, tuple[float, float], tuple[float, float, float]] | None = None
+    _last_lean: tuple[Pose, tuple[float, float], tuple[float, float, float]] | None = None
 
     @abstractmethod
     def heights(self, xy: ArrayLike) -> Floats:
-        """Height of the surface at (N, 2) points, (N,) metres."""
+        """Return the (N,) heights of the surface in metres at (N, 2) points."""
 
     @abstractmethod
     def chunk(self, key: Key) -> Chunk:
-        """What is in a square."""
+        """Return the contents of a tile."""
 
     def posts(self, key: Key) -> list[SignalPost]:
-        """The pedestrian signals in a square."""
+        """Return the pedestrian signals in a tile."""
         return []
 
     def covers(self, key: Key) -> tuple[Patch, ...]:
-        """Thin covers on the ground of a square, for cameras that show no finish, which has them
-        too."""
+        """Return thin ground covers of a tile for cameras without textures.
+
+        The covers are also part of `finish`.
+        """
         return ()
 
     def finish(self, key: Key) -> Finish:
-        """What cameras with textures add to the chunk of a square."""
+        """Return the details of a tile for cameras with textures."""
         return Finish()
 
     def kept(self, kind: str, key: Key, make: Callable[[], Arrays]) -> Arrays:
-        """What `make` makes of a square, or what it has made of it before; kind: its name."""
+        """Return the cached arrays of a tile, or compute them with `make`.
+
+        kind: name of the arrays in the cache
+        """
         return make()
 
     def land(self, xy: ArrayLike) -> Floats:
-        """The lie of the land at (N, 2) points, (N,) metres, steps such as curbs left out."""
+        """Return the (N,) heights of the land in metres at (N, 2) points.
+
+        Steps such as curbs are excluded.
+        """
         return self.heights(xy)
 
     def foot(
         self, x_m: float, y_m: float, heading_rad: float, size_m: tuple[float, float]
     ) -> float:
-        """Height of the foot of a level thing of some length (along its heading) and width: nothing
-        of it floats."""
+        """Return the height in metres of the foot of a level object.
+
+        It is low enough that no corner floats.
+
+        size_m: length along the heading, and width
+        """
         return float(
             self.heights([[x_m, y_m]])[0] - self.fall([(x_m, y_m)], [heading_rad], [size_m])[0]
         )
 
     def road(self, xy: ArrayLike, heading_rad: ArrayLike, size_m: ArrayLike) -> Floats:
-        """(N, 3) height, roll and pitch of N vehicles at (N, 2) points, (N, 2) long and wide, on
-        their wheels."""
+        """Return (N, 3) height, roll and pitch of N vehicles on their wheels.
+
+        xy: (N, 2) positions, m
+        size_m: (N, 2) length and width
+        """
         size = np.asarray(size_m, dtype=float).reshape(-1, 2)
-        land = self._land_around(xy, heading_rad, _WHEELS * size)
+        land = self._land_around(xy, heading_rad, _WHEEL_SHARE * size)
         if land is None:
             return np.zeros((len(size), 3))
         front_left, front_right, rear_left, rear_right = land.T
         pitch = np.arctan2(
-            rear_left + rear_right - front_left - front_right, 4.0 * _WHEELS[0] * size[:, 0]
+            rear_left + rear_right - front_left - front_right, 4.0 * _WHEEL_SHARE[0] * size[:, 0]
         )
         roll = np.arctan2(
-            front_left + rear_left - front_right - rear_right, 4.0 * _WHEELS[1] * size[:, 1]
+            front_left + rear_left - front_right - rear_right, 4.0 * _WHEEL_SHARE[1] * size[:, 1]
         )
         return np.column_stack([land.mean(axis=1), roll, pitch])
 
     def fall(self, xy: ArrayLike, heading_rad: ArrayLike, size_m: ArrayLike) -> Floats:
-        """(N,) how far the land at the lowest corner of things lies below that at their middle."""
+        """Return (N,) the drop in metres of the land from objects' centres to the lowest corner."""
         around = self._land_around(
             xy, heading_rad, 0.5 * np.asarray(size_m, dtype=float).reshape(-1, 2)
         )
@@ -138,8 +163,10 @@ class Surface(ABC):
         return np.asarray(np.maximum(self.land(xy) - around.min(axis=1), 0.0))
 
     def _land_around(self, xy: ArrayLike, heading_rad: ArrayLike, half_m: Floats) -> Floats | None:
-        """(N, 4) land at the corners of N rectangles: front left, front right, rear left, rear
-        right; None if level."""
+        """Return (N, 4) land heights at the corners of N rectangles; None on level land.
+
+        Order: front left, front right, rear left, rear right.
+        """
         if self.level:
             return None
         at = np.asarray(xy, dtype=float).reshape(-1, 2)
@@ -152,12 +179,15 @@ class Surface(ABC):
         return self.land(corners.reshape(-1, 2)).reshape(-1, 4)
 
     def lean(self, pose: Pose, span_m: tuple[float, float]) -> tuple[float, float, float]:
-        """How a robot whose feet span this length and width stands at a pose: height of the base
-        frame in metres, roll and pitch in radians. Who asks for the same pose again gets the last
-        answer."""
-        if self._leant is None or self._leant[:2] != (pose, span_m):
-            self._leant = pose, span_m, self._lean(pose, span_m)
-        return self._leant[2]
+        """Return height in metres, roll and pitch in radians of a robot's base frame at a pose.
+
+        span_m: length and width between the outer wheels
+
+        The last result is cached.
+        """
+        if self._last_lean is None or self._last_lean[:2] != (pose, span_m):
+            self._last_lean = pose, span_m, self._lean(pose, span_m)
+        return self._last_lean[2]
 
     def _lean(self, pose: Pose, span_m: tuple[float, float]) -> tuple[float, float, float]:
         cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
@@ -171,7 +201,7 @@ class Surface(ABC):
 
 
 def stood(obstacles: Sequence[Obstacle], surface: Surface) -> list[tuple[Prop, float]]:
-    """Obstacles as props, each with the height of its foot on a surface in metres."""
+    """Return obstacles as props, each with the height of its foot on the surface in metres."""
     props = [obstacle_prop(obstacle, number) for number, obstacle in enumerate(obstacles)]
     return [
         (prop, surface.foot(prop.x_m, prop.y_m, prop.heading_rad, prop.size_m[:2]))

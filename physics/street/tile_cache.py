@@ -1,4 +1,4 @@
-"""Convert a tile and what stands in it to arrays for the cache, and back without a changed bit."""
+"""Lossless conversion of tiles and their contents to arrays for the disk cache."""
 
 from __future__ import annotations
 
@@ -23,27 +23,35 @@ from physics.ground.tiles import Key, Tile
 from physics.street.buildings import Building
 from physics.street.furniture import Prop
 
-_ROOMS: Final = (
-    *(Path(cosim.__file__).parent / room for room in ("core", "place")),
+_SOURCE_FOLDERS: Final = (
+    *(Path(cosim.__file__).parent / folder for folder in ("core", "place")),
     *(
-        Path(physics.__file__).parent / room
-        for room in ("ground", "street", "textures", "cameras/gl")
+        Path(physics.__file__).parent / folder
+        for folder in ("ground", "street", "textures", "cameras/gl")
     ),
 )
-_MADE_BY: Final = f"{sources_hash(*_ROOMS)} {shapely.geos_version_string}"
+"""Folders whose source code determines the cached arrays."""
+
+_SOURCES_KEY: Final = f"{sources_hash(*_SOURCE_FOLDERS)} {shapely.geos_version_string}"
+"""Cache key part: hash of the sources and version of GEOS."""
+
 _Name = TypeVar("_Name", bound=str)
 
 
 class TileThings(msgspec.Struct, frozen=True, array_like=True):
-    """What stands in a tile: buildings on their land, and props."""
+    """Buildings, placed on the land, and props of a tile."""
 
     buildings: tuple[Building, ...]
     props: tuple[Prop, ...]
 
 
-class _Ground(msgspec.Struct, array_like=True):
-    """What of a tile is no array. parts: names, vertices and triangles of its meshes; low,
-    crossings: WKB; relief: roughness and seed."""
+class _TileFields(msgspec.Struct, array_like=True):
+    """Fields of a tile that are not arrays.
+
+    parts: name, vertex count and triangle count of each mesh
+    low, crossings: areas as WKB
+    relief: roughness and seed, None without relief
+    """
 
     parts: list[tuple[str, int, int]]
     low: bytes
@@ -52,17 +60,17 @@ class _Ground(msgspec.Struct, array_like=True):
 
 
 def tile_cache(street_map: StreetMap, seed: int, roughness: float) -> ArrayCache:
-    """Return the cache of the tiles of a place."""
-    told = f"{street_map.made_of} {seed} {roughness!r} {_MADE_BY}"
+    """Return the cache of a map's tiles."""
+    key_text = f"{street_map.made_of} {seed} {roughness!r} {_SOURCES_KEY}"
     return ArrayCache(
-        "tiles", hashlib.sha256(told.encode()).hexdigest()[:32] if street_map.made_of else ""
+        "tiles", hashlib.sha256(key_text.encode()).hexdigest()[:32] if street_map.made_of else ""
     )
 
 
 def tile_as_arrays(tile: Tile) -> Arrays:
-    """For `tile_of_arrays`."""
+    """Convert a tile to arrays for `tile_of_arrays`."""
     relief = tile.relief
-    words = _Ground(
+    words = _TileFields(
         _rows(tile.parts),
         shapely.to_wkb(tile.low),
         shapely.to_wkb(tile.crossings),
@@ -72,34 +80,34 @@ def tile_as_arrays(tile: Tile) -> Arrays:
     return found if relief is None else found | {"roots": relief.roots, "holes": relief.holes}
 
 
-def tile_of_arrays(held: Arrays, key: Key, terrain: Terrain | None) -> Tile:
-    """The tile again."""
-    words = msgspec.msgpack.decode(held["words"].data, type=_Ground)
-    parts = _parts_of(words.parts, held)
+def tile_of_arrays(arrays: Arrays, key: Key, terrain: Terrain | None) -> Tile:
+    """Restore a tile from arrays."""
+    words = msgspec.msgpack.decode(arrays["words"].data, type=_TileFields)
+    parts = _parts_of(words.parts, arrays)
     low, crossings = shapely.from_wkb([words.low, words.crossings])
     shapely.prepare([low, crossings])
     relief = None
     if words.relief is not None:
         roughness, seed = words.relief
-        relief = Relief(roughness, seed, held["roots"], held["holes"])
+        relief = Relief(roughness, seed, arrays["roots"], arrays["holes"])
     return Tile(key, parts, low, crossings, relief, terrain)
 
 
 def covers_as_arrays(covers: Mapping[LandKind, Mesh]) -> Arrays:
-    """For `covers_of_arrays`."""
+    """Convert covers to arrays for `covers_of_arrays`."""
     words = np.frombuffer(msgspec.msgpack.encode(_rows(covers)), dtype=np.uint8)
     return {"words": words, **_joined_parts(covers)}
 
 
-def covers_of_arrays(held: Arrays) -> dict[LandKind, Mesh]:
-    """The covers again."""
+def covers_of_arrays(arrays: Arrays) -> dict[LandKind, Mesh]:
+    """Restore covers from arrays."""
     return _parts_of(
-        msgspec.msgpack.decode(held["words"].data, type=list[tuple[LandKind, int, int]]), held
+        msgspec.msgpack.decode(arrays["words"].data, type=list[tuple[LandKind, int, int]]), arrays
     )
 
 
 def _rows(parts: Mapping[_Name, Mesh]) -> list[tuple[_Name, int, int]]:
-    """Names of meshes, with how many vertices and triangles they have."""
+    """Return name, vertex count and triangle count of each mesh."""
     return [(name, len(mesh.vertices), len(mesh)) for name, mesh in parts.items()]
 
 
@@ -112,35 +120,35 @@ def _joined_parts(parts: Mapping[_Name, Mesh]) -> dict[str, NDArray[Any]]:
     }
 
 
-def _parts_of(rows: Sequence[tuple[_Name, int, int]], held: Arrays) -> dict[_Name, Mesh]:
+def _parts_of(rows: Sequence[tuple[_Name, int, int]], arrays: Arrays) -> dict[_Name, Mesh]:
     parts = {}
     corner = 0
     triangle = 0
     for name, corners, triangles in rows:
         here = slice(corner, corner + corners)
-        faces = held["triangles"][triangle : triangle + triangles]
-        parts[name] = Mesh(held["vertices"][here], held["normals"][here], faces)
+        faces = arrays["triangles"][triangle : triangle + triangles]
+        parts[name] = Mesh(arrays["vertices"][here], arrays["normals"][here], faces)
         corner, triangle = corner + corners, triangle + triangles
     return parts
 
 
 def things_as_arrays(things: TileThings) -> Arrays:
-    """For `things_of_arrays`."""
+    """Convert tile contents to arrays for `things_of_arrays`."""
     return {"words": _as_array(things)}
 
 
-def things_of_arrays(held: Arrays) -> TileThings:
-    """The things again."""
-    return msgspec.msgpack.decode(held["words"].data, type=TileThings, dec_hook=_geometry)
+def things_of_arrays(arrays: Arrays) -> TileThings:
+    """Restore tile contents from arrays."""
+    return msgspec.msgpack.decode(arrays["words"].data, type=TileThings, dec_hook=_decode)
 
 
 def _as_array(words: msgspec.Struct) -> NDArray[np.uint8]:
-    return np.frombuffer(msgspec.msgpack.encode(words, enc_hook=_plain), dtype=np.uint8)
+    return np.frombuffer(msgspec.msgpack.encode(words, enc_hook=_encode), dtype=np.uint8)
 
 
-def _plain(value: Any) -> Any:
+def _encode(value: Any) -> Any:
     return shapely.to_wkb(value) if isinstance(value, shapely.Geometry) else value.item()
 
 
-def _geometry(_: type, wkb: Any) -> Any:
+def _decode(_: type, wkb: Any) -> Any:
     return shapely.from_wkb(wkb)

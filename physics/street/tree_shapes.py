@@ -1,8 +1,7 @@
-"""Trees: a trunk that tapers and forks, and a crown of clumps, drawn as one closed surface.
+"""Tree models: a tapered trunk with branches, and a crown as one closed surface.
 
-A crown is the outline of several balls as seen from its middle: the farthest of them in each
-direction. So the clumps cost no triangles that nobody sees, and every camera draws the same solid:
-labels need no leaf to be see-through.
+The crown is the outer envelope of several spheres as seen from its centre. Hidden parts of the
+spheres cost no triangles. Every camera draws the same opaque solid, so labels need no transparency.
 """
 
 from __future__ import annotations
@@ -18,18 +17,25 @@ from cosim.core.geometry import Floats
 from physics.ground.mesh import Ints, Mesh, join, smooth_normals
 
 _SIDES: Final = 13
+"""Vertices around the crown."""
+
 _ROWS: Final = 8
-"""Corners around a crown and rings between its poles: 2 * 13 * 8 = 208 triangles."""
-_SHARP: Final = 16.0
-"""How deep the creases between clumps are: the power of the mean that joins them."""
+"""Rings between the poles of the crown; 2 * 13 * 8 = 208 triangles."""
+_SHARPNESS: Final = 16.0
+"""Exponent of the power mean that joins the clumps; larger values give deeper creases."""
 
 
 @dataclass(frozen=True, slots=True)
 class Species:
-    """How a kind of tree grows. clear: share of its height below the crown; wide: widest radius of
-    the crown as a share of the height; full: height of the widest part in the crown, 0 to 1;
-    clumps: how many; loose: their size as a share of the crown's; cover: a layer of
-    physics.textures.walls."""
+    """Growth parameters of a tree species. The representation seeds the crown's shape.
+
+    clear: height below the crown as a fraction of the total height
+    wide: largest radius of the crown as a fraction of the height
+    full: relative height of the widest part of the crown, 0 to 1
+    clumps: number of spheres
+    loose: radius of the spheres as a fraction of the crown's
+    cover: layer of `physics.textures.walls`
+    """
 
     clear: float
     wide: float
@@ -45,35 +51,38 @@ SPECIES: Final = (
     Species(0.33, 0.165, 0.36, 8, 0.50, "foliage-dark"),
     Species(0.42, 0.250, 0.55, 7, 0.55, "foliage"),
 )
-"""A spreading tree, an oval, a narrow dark one, an umbrella."""
+"""A spreading tree, an oval tree, a narrow dark tree and an umbrella-shaped tree."""
 
 
 @dataclass(frozen=True, slots=True)
 class Crown:
-    """mesh: closed, from the middle outwards; shade: (V,) how much light reaches between the
-    leaves, 0 to 1."""
+    """Crown of a tree.
+
+    mesh: closed surface, facing outwards
+    shade: (V,) fraction of light that reaches each vertex
+    """
 
     mesh: Mesh
     shade: Floats
 
 
 def clear_m(species: Species, height_m: float) -> float:
-    """Height below the crown: one walks under it."""
+    """Return the height in metres below the crown; people fit under it."""
     return max(species.clear * height_m, 2.15)
 
 
 def crown(species: Species, height_m: float) -> Crown:
-    """The crown of a tree of a height, its foot at the origin."""
+    """Return the crown of a tree with its foot at the origin."""
     low = clear_m(species, height_m)
     half = 0.5 * (height_m - low)
     wide = species.wide * height_m
     rng = np.random.default_rng(zlib.crc32(f"{species}:{height_m:.3f}".encode()))
-    rays, triangles = _globe()
-    reach = _reach(rays, species, rng) * rng.uniform(0.91, 1.09, len(rays))
+    rays, triangles = _sphere()
+    reach = _envelope(rays, species, rng) * rng.uniform(0.91, 1.09, len(rays))
     reach[[0, -1]] = (
         0.96 * reach[1 : 1 + _SIDES].mean(),
         0.96 * reach[-1 - _SIDES : -1].mean(),
-    )  # no tips at the poles
+    )  # avoids tips at the poles
     at = rays * reach[:, None]
     widest = np.hypot(at[:, 0], at[:, 1]).max()
     bottom, top = at[:, 2].min(), at[:, 2].max()
@@ -89,7 +98,7 @@ def crown(species: Species, height_m: float) -> Crown:
 
 
 def tree_trunk(species: Species, height_m: float, radius_m: float) -> Mesh:
-    """A trunk that flares at its foot and ends within the crown, with three branches."""
+    """Return a trunk that flares at its foot and ends inside the crown, with three branches."""
     low = clear_m(species, height_m)
     top = low + 0.30 * (height_m - low)
     heights = np.array([0.0, 0.35, 0.8 * low, top])
@@ -110,9 +119,11 @@ def tree_trunk(species: Species, height_m: float, radius_m: float) -> Mesh:
     return join(tubes)
 
 
-def _globe() -> tuple[Floats, Ints]:
-    """Unit vectors (V, 3) of rings between two poles, every other ring turned by half a side; (T,
-    3) triangles."""
+def _sphere() -> tuple[Floats, Ints]:
+    """Return (V, 3) unit vectors of rings between two poles, and (T, 3) triangles.
+
+    Every other ring is rotated by half a side.
+    """
     polar = np.pi * np.arange(1, _ROWS + 1) / (_ROWS + 1)
     turn = (
         2.0 * np.pi * (np.arange(_SIDES)[None, :] + 0.5 * (np.arange(_ROWS)[:, None] % 2)) / _SIDES
@@ -147,8 +158,8 @@ def _globe() -> tuple[Floats, Ints]:
     return rays, np.concatenate(found).astype(np.int32)
 
 
-def _reach(rays: Floats, species: Species, rng: np.random.Generator) -> Floats:
-    """(V,) how far the clumps reach in each direction, about 1."""
+def _envelope(rays: Floats, species: Species, rng: np.random.Generator) -> Floats:
+    """Return (V,) the relative radius of the envelope in each direction, about 1."""
     golden = np.pi * (3.0 - math.sqrt(5.0))
     n = species.clumps
     up = np.linspace(-0.55, 0.95, n) + rng.uniform(-0.08, 0.08, n)
@@ -165,20 +176,23 @@ def _reach(rays: Floats, species: Species, rng: np.random.Generator) -> Floats:
     along = rays @ middle.T
     inside = radius**2 - (middle**2).sum(axis=1) + along**2
     far = np.where(inside > 0.0, along + np.sqrt(np.maximum(inside, 0.0)), 0.0)
-    reach = (np.maximum(far, 0.0) ** _SHARP).sum(axis=1) ** (1.0 / _SHARP)
+    reach = (np.maximum(far, 0.0) ** _SHARPNESS).sum(axis=1) ** (1.0 / _SHARPNESS)
     return np.asarray(reach)
 
 
 def _neighbours(triangles: Ints, count: int) -> tuple[Ints, Ints]:
-    """Of each corner its own number and its neighbours', one after the other, and where each
-    corner's begin."""
+    """Return the neighbours of each vertex.
+
+    Returns: the lists of all vertices (own index and neighbours) joined together, and each list's
+        start
+    """
     pairs = np.concatenate([triangles[:, [i, j]] for i in range(3) for j in range(3)])
     pairs = np.unique(pairs, axis=0)
     return pairs[:, 1], np.searchsorted(pairs[:, 0], np.arange(count)).astype(np.int32)
 
 
 def _tube(middles: Floats, radii: Floats, around: Floats) -> Mesh:
-    """A tube through (N, 3) points with (N,) radii, open at its ends, its rings level."""
+    """Return a tube through (N, 3) points with (N,) radii, open at both ends, with level rings."""
     circle = np.column_stack([np.cos(around), np.sin(around), np.zeros(len(around))])
     at = (middles[:, None] + radii[:, None, None] * circle).reshape(-1, 3)
     k = np.arange(len(around))

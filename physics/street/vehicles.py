@@ -1,8 +1,6 @@
-"""What is drawn of vehicles: cars of several shapes, vans, lorries, buses and two-wheelers, by
-length and name.
+"""Low-poly models of cars, vans, lorries, buses and scooters, selected by length and name.
 
-A vehicle's own frame: x ahead, y left, the road at z = 0. A form is a few meshes of one colour
-each.
+Vehicle frame: x forward, y left, z = 0 on the road.
 """
 
 from __future__ import annotations
@@ -32,6 +30,8 @@ _PAINTS: Final = (
     (0.70, 0.72, 0.74),
     (0.44, 0.31, 0.22),
 )
+"""sRGB colours of vehicles."""
+
 GLASS: Final = (0.16, 0.20, 0.25)
 TYRE: Final = (0.07, 0.07, 0.08)
 RIM: Final = (0.58, 0.59, 0.61)
@@ -39,29 +39,42 @@ LAMP: Final = (0.94, 0.94, 0.90)
 REAR_LAMP: Final = (0.66, 0.05, 0.05)
 SKIN: Final = (0.30, 0.31, 0.33)
 _CARS: Final[tuple[Shape, ...]] = ("sedan", "hatchback", "estate", "suv")
+"""Shapes of cars."""
+
 _SHORT_M: Final = 3.0
+"""Length in metres below which a vehicle is a scooter."""
+
 _VAN_M: Final = 5.2
+"""Length in metres from which a vehicle is a van."""
+
 _LORRY_M: Final = 6.5
+"""Length in metres from which a vehicle is a lorry."""
+
 _BUS_M: Final = 9.0
-_PROUD_M: Final = 0.012
-"""How far panes and lamps stand before the sheet metal."""
+"""Length in metres from which a vehicle is a bus."""
+
+_LIFT_M: Final = 0.012
+"""Distance in metres of windows and lamps in front of the body."""
 
 _Profile = Sequence[tuple[float, float]]
-"""(x, z) of a convex outline seen from the right, counter-clockwise; x as a share of the length, z
-in metres."""
+"""Convex outline (x, z) as seen from the right, counter-clockwise."""
 
 
-class _Car(NamedTuple):
-    """lower: outline of the body; waist: (x, z) of windscreen and rear window at their feet; roof:
-    likewise above."""
+class _CarProfile(NamedTuple):
+    """Side view of a car, with x as a fraction of the length and z in metres.
+
+    lower: outline of the body
+    waist: lower ends of windscreen and rear window
+    roof: their upper ends
+    """
 
     lower: _Profile
     waist: tuple[tuple[float, float], tuple[float, float]]
     roof: tuple[tuple[float, float], tuple[float, float]]
 
 
-_OUTLINES: Final[dict[Shape, _Car]] = {
-    "sedan": _Car(
+_CAR_PROFILES: Final[dict[Shape, _CarProfile]] = {
+    "sedan": _CarProfile(
         (
             (-0.5, 0.30),
             (0.5, 0.28),
@@ -74,31 +87,32 @@ _OUTLINES: Final[dict[Shape, _Car]] = {
         ((0.23, 0.86), (-0.36, 0.90)),
         ((0.05, 1.42), (-0.20, 1.42)),
     ),
-    "hatchback": _Car(
+    "hatchback": _CarProfile(
         ((-0.5, 0.30), (0.5, 0.28), (0.5, 0.60), (0.43, 0.76), (0.25, 0.90), (-0.48, 0.94)),
         ((0.26, 0.88), (-0.48, 0.92)),
         ((0.07, 1.48), (-0.36, 1.46)),
     ),
-    "estate": _Car(
+    "estate": _CarProfile(
         ((-0.5, 0.30), (0.5, 0.28), (0.5, 0.58), (0.43, 0.74), (0.23, 0.88), (-0.49, 0.92)),
         ((0.24, 0.86), (-0.49, 0.90)),
         ((0.06, 1.45), (-0.41, 1.47)),
     ),
-    "suv": _Car(
+    "suv": _CarProfile(
         ((-0.5, 0.38), (0.5, 0.36), (0.5, 0.72), (0.45, 0.92), (0.25, 1.04), (-0.49, 1.06)),
         ((0.26, 1.02), (-0.49, 1.04)),
         ((0.10, 1.68), (-0.42, 1.70)),
     ),
 }
+"""Side view of each shape of car."""
 
 
 def paint(name: str) -> Colour:
-    """The colour of the vehicle called `name`: always the same."""
+    """Return the colour of a vehicle, determined by its name."""
     return _PAINTS[zlib.crc32(name.encode()) % len(_PAINTS)]
 
 
 def shape(name: str, length_m: float) -> Shape:
-    """The shape of the vehicle called `name`: always the same."""
+    """Return the shape of a vehicle, determined by its name and length."""
     if length_m < _SHORT_M:
         return "scooter"
     if length_m < _VAN_M:
@@ -108,19 +122,19 @@ def shape(name: str, length_m: float) -> Shape:
 
 @cache
 def vehicle_parts(shape: Shape, length_m: float, width_m: float) -> tuple[Part, ...]:
-    """What is drawn of a vehicle of a size."""
+    """Return the parts of a vehicle."""
     if shape == "scooter":
         return _scooter(length_m, width_m)
-    if shape in _OUTLINES:
-        return _car(_OUTLINES[shape], length_m, width_m)
+    if shape in _CAR_PROFILES:
+        return _car(_CAR_PROFILES[shape], length_m, width_m)
     return {"van": _van, "lorry": _lorry, "bus": _bus}[shape](length_m, width_m)
 
 
-def _car(car: _Car, length_m: float, width_m: float) -> tuple[Part, ...]:
+def _car(car: _CarProfile, length_m: float, width_m: float) -> tuple[Part, ...]:
     half = 0.5 * width_m - 0.03
     lower = _hull([(x * length_m, z) for x, z in car.lower], half, half - 0.04)
     waist, roof = ([(x * length_m, z) for x, z in ends] for ends in (car.waist, car.roof))
-    cabin = _cabin(waist, roof, half - 0.05, half - 0.20)
+    cabin = _hull([waist[1], waist[0], roof[0], roof[1]], half - 0.05, half - 0.20)
     wheelbase = 0.29 * length_m
     wheels = [(x, s * (half - 0.08)) for x in (wheelbase, -wheelbase) for s in (1, -1)]
     tyres, rims = _wheels(wheels, 0.33 if car.roof[0][1] > 1.6 else 0.31, 0.20)
@@ -160,7 +174,7 @@ def _van(length_m: float, width_m: float) -> tuple[Part, ...]:
     ]
     screen = _cross_pane((front - 0.92, 1.30), (front - 1.44, 2.15), half - 0.12, half - 0.2)
     back = _cross_pane((-front, 2.05), (-front, 1.35), half - 0.25, half - 0.25, back=True)
-    return _boxy(body, [*side, screen, back], length_m, half, 0.35, 0.8, 1.0)
+    return _large_vehicle(body, [*side, screen, back], length_m, half, 0.35, 0.8, 1.0)
 
 
 def _lorry(length_m: float, width_m: float) -> tuple[Part, ...]:
@@ -184,7 +198,9 @@ def _lorry(length_m: float, width_m: float) -> tuple[Part, ...]:
         for s in (1, -1)
     ]
     screen = _cross_pane((front - 0.02, 1.45), (front - 0.19, 2.25), half - 0.12, half - 0.12)
-    parts = _boxy(_hull(cab, half, half - 0.04), [*side, screen], length_m, half, 0.45, 0.75, 0.95)
+    parts = _large_vehicle(
+        _hull(cab, half, half - 0.04), [*side, screen], length_m, half, 0.45, 0.75, 0.95
+    )
     return (*parts, Part(load, LAMP), Part(frame, SKIN))
 
 
@@ -209,10 +225,10 @@ def _bus(length_m: float, width_m: float) -> tuple[Part, ...]:
             side.append(_side_pane(pane, s, half))
     screen = _cross_pane((front, 1.1), (front, 2.65), half - 0.12, half - 0.12)
     back = _cross_pane((-front, 2.5), (-front, 1.5), half - 0.25, half - 0.25, back=True)
-    return _boxy(body, [*side, screen, back], length_m, half, 0.48, 0.7, 0.9)
+    return _large_vehicle(body, [*side, screen, back], length_m, half, 0.48, 0.7, 0.9)
 
 
-def _boxy(
+def _large_vehicle(
     body: Mesh,
     panes: Sequence[Mesh],
     length_m: float,
@@ -221,8 +237,11 @@ def _boxy(
     lamp_m: float,
     rear_m: float,
 ) -> tuple[Part, ...]:
-    """A large vehicle from its body and panes: wheels and lamps are added. lamp_m, rear_m: heights
-    of the lamps."""
+    """Return a large vehicle: body, windows, wheels and lamps.
+
+    radius_m: radius of the wheels
+    lamp_m, rear_m: heights of front and rear lamps
+    """
     front = 0.5 * length_m
     wheels = [
         (x, s * (half - 0.12))
@@ -243,7 +262,7 @@ def _boxy(
 
 
 def _scooter(length_m: float, width_m: float) -> tuple[Part, ...]:
-    """A two-wheeler and its rider, who wears a helmet."""
+    """Return a scooter and its rider with a helmet."""
     front = 0.5 * length_m
     body = _hull(
         [(-0.75 * front, 0.45), (0.3 * front, 0.28), (0.62 * front, 0.95), (-0.8 * front, 0.80)],
@@ -266,7 +285,10 @@ def _scooter(length_m: float, width_m: float) -> tuple[Part, ...]:
 
 
 def _hull(outline: _Profile, half_low_m: float, half_high_m: float) -> Mesh:
-    """A convex outline (x, z) in metres drawn out to both sides, narrower towards its top."""
+    """Extrude a convex outline (x, z) in metres to both sides.
+
+    half_low_m, half_high_m: half widths at the bottom and the top
+    """
     z = np.array([p[1] for p in outline])
     share = (z - z.min()) / (z.max() - z.min())
     half = half_low_m + (half_high_m - half_low_m) * share
@@ -283,15 +305,10 @@ def _hull(outline: _Profile, half_low_m: float, half_high_m: float) -> Mesh:
     )
 
 
-def _cabin(waist: _Profile, roof: _Profile, half_low_m: float, half_high_m: float) -> Mesh:
-    return _hull([waist[1], waist[0], roof[0], roof[1]], half_low_m, half_high_m)
-
-
 def _panes(waist: _Profile, roof: _Profile, half_low_m: float, half_high_m: float) -> Mesh:
-    """Windscreen, rear window, and two windows on each side, just before the cabin's sheet
-    metal."""
+    """Return windscreen, rear window, and two windows on each side."""
     foot, head, brow, sill = (
-        _towards(waist[k], roof[k], share)
+        _interpolate(waist[k], roof[k], share)
         for k, share in ((0, 0.06), (0, 0.92), (1, 0.90), (1, 0.14))
     )
     front = _cross_pane(foot, head, half_low_m - 0.08, half_high_m - 0.06)
@@ -311,7 +328,7 @@ def _panes(waist: _Profile, roof: _Profile, half_low_m: float, half_high_m: floa
             (ends[0][0], middle + 0.04, ends[1][0], middle + 0.04),
             (middle - 0.04, ends[0][1], middle - 0.04, ends[1][1]),
         ):
-            y = [half_low_m - lean * (h - base) + _PROUD_M for h in (low, high)]
+            y = [half_low_m - lean * (h - base) + _LIFT_M for h in (low, high)]
             corner = [
                 (x0, s * y[0], low),
                 (x1, s * y[0], low),
@@ -322,7 +339,10 @@ def _panes(waist: _Profile, roof: _Profile, half_low_m: float, half_high_m: floa
     return join([front, rear, *sides])
 
 
-def _towards(a: tuple[float, float], b: tuple[float, float], share: float) -> tuple[float, float]:
+def _interpolate(
+    a: tuple[float, float], b: tuple[float, float], share: float
+) -> tuple[float, float]:
+    """Interpolate between two points."""
     return a[0] + (b[0] - a[0]) * share, a[1] + (b[1] - a[1]) * share
 
 
@@ -333,11 +353,11 @@ def _cross_pane(
     half_high_m: float,
     back: bool = False,
 ) -> Mesh:
-    """A pane across the vehicle from (x, z) to (x, z), seen from ahead, or from behind."""
-    out = -_PROUD_M if back else _PROUD_M
+    """Return a window across the vehicle between two points (x, z), facing forward or back."""
+    out = -_LIFT_M if back else _LIFT_M
     (x0, z0) = low
     (x1, z1) = high
-    lift = 0.6 * _PROUD_M
+    lift = 0.6 * _LIFT_M
     corners = [
         (x0 + out, -half_low_m, z0 + lift),
         (x0 + out, half_low_m, z0 + lift),
@@ -348,15 +368,17 @@ def _cross_pane(
 
 
 def _side_pane(outline: _Profile, side: int, half_m: float) -> Mesh:
-    """A pane in the left (1) or right (-1) side; its outline (x, z) goes round from the front foot
-    backwards."""
-    corners = [(x, side * (half_m + _PROUD_M), z) for x, z in outline]
+    """Return a window on the left (1) or right (-1) side.
+
+    outline: (x, z) from the lower front corner backwards
+    """
+    corners = [(x, side * (half_m + _LIFT_M), z) for x, z in outline]
     return quads(np.array([corners if side > 0 else corners[::-1]]))
 
 
 def _plate(x_m: float, y_m: float, z_m: float, width_m: float, height_m: float) -> Mesh:
-    """A small upright plate on the front (x > 0) or the rear, facing away from the vehicle."""
-    out = math.copysign(_PROUD_M, x_m)
+    """Return a small upright plate on the front (x > 0) or rear that faces outwards."""
+    out = math.copysign(_LIFT_M, x_m)
     half, tall = 0.5 * width_m, 0.5 * height_m
     corners = [
         (x_m + out, y_m - half, z_m - tall),
@@ -370,7 +392,7 @@ def _plate(x_m: float, y_m: float, z_m: float, width_m: float, height_m: float) 
 def _wheels(
     at: Sequence[tuple[float, float]], radius_m: float, width_m: float, sides: int = 8
 ) -> tuple[Mesh, Mesh]:
-    """Tyres and rims of wheels whose middles are at (x, y), the rims on the outer side."""
+    """Return tyres and rims of wheels whose centres are at (x, y); rims face outwards."""
     angle = 2.0 * np.pi * np.arange(sides) / sides
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     fan = np.array([(0, i, i + 1) for i in range(1, sides - 1)], dtype=np.int32)
@@ -391,6 +413,6 @@ def _wheels(
         face = np.tile([0.0, out, 0.0], (sides, 1))
         tyres.append(Mesh(outer, face, turned))
         middle = np.array([x, 0.0, radius_m])
-        hub = middle + (outer - middle) * (0.62, 1.0, 0.62) + np.array([0.0, out * _PROUD_M, 0.0])
+        hub = middle + (outer - middle) * (0.62, 1.0, 0.62) + np.array([0.0, out * _LIFT_M, 0.0])
         rims.append(Mesh(hub, face, turned))
     return join(tyres), join(rims)

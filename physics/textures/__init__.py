@@ -1,1 +1,1 @@
-
+"""Procedural textures for ground, walls, facades and props."""

@@ -1,5 +1,4 @@
-"""Facades: one bay by one storey, to be laid over a wall; which bays and walls go together in one
-building."""
+"""Facade layers of one bay by one storey, and building styles that combine them."""
 
 from __future__ import annotations
 
@@ -15,23 +14,24 @@ from physics.textures.shop_fronts import FRONTS
 from physics.textures.windows import WINDOW_STYLES
 
 BAY_VARIANTS: Final = 3
-"""Layers of each style of bay, told apart by a number: "sash-0", "sash-1" ..."""
+"""Number of layers per bay style, named "sash-0", "sash-1" and so on."""
 
 
 @lru_cache(maxsize=4)
 def facade_layers(size_px: int = 256, seed: int = 0) -> Layers:
-    """Every bay, BAY_M wide and STOREY_M high: upper storeys, then ground floors. 256 pixels are 12
-    mm each."""
+    """Return every bay layer: upper storeys, then ground floors. 256 pixels are 12 mm each."""
     styles = {**WINDOW_STYLES, **FRONTS}
     recipes = {
-        f"{name}-{k}": Recipe((BAY_M, STOREY_M), _drawn(style, k))
+        f"{name}-{k}": Recipe((BAY_M, STOREY_M), _generator(style, k))
         for name, style in styles.items()
         for k in range(BAY_VARIANTS)
     }
     return stacked("facades", recipes, size_px, seed)
 
 
-def _drawn(style: Callable[[FacadeCanvas], None], number: int) -> Callable[[Noise], Picture]:
+def _generator(style: Callable[[FacadeCanvas], None], number: int) -> Callable[[Noise], Picture]:
+    """Return a generator that draws a variant of a style."""
+
     def make(noise: Noise) -> Picture:
         canvas = FacadeCanvas(noise, number)
         style(canvas)
@@ -42,10 +42,16 @@ def _drawn(style: Callable[[FacadeCanvas], None], number: int) -> Callable[[Nois
 
 @dataclass(frozen=True, slots=True)
 class WallStyle:
-    """What a kind of building shows. walls, roofs: names of wall layers; uppers, fronts: styles of
-    bays, with a number behind them in the layers. A building takes one wall, one roof, one upper
-    style whose number changes from bay to bay, and one front (see DOORS) of one number. tints: sRGB
-    colours of the wall, of which it takes one; empty: the wall's own colour."""
+    """Style of buildings.
+
+    walls, roofs: names of wall layers
+    uppers: styles of upper bays
+    fronts: keys of `DOORS`
+    tints: sRGB wall colours; empty keeps the wall's own colour
+
+    A building has one wall, roof, upper style, front and tint. The variant of the upper style
+    changes from bay to bay.
+    """
 
     walls: tuple[str, ...]
     uppers: tuple[str, ...]
@@ -56,8 +62,12 @@ class WallStyle:
 
 @dataclass(frozen=True, slots=True)
 class Front:
-    """A ground floor: the bays between its doors, a bay with a door, and one door every so many
-    bays (at most 15)."""
+    """Arrangement of a ground floor.
+
+    between: bay style between doors
+    door: bay style with a door
+    every: a door in every n-th bay, at most 15
+    """
 
     between: str
     door: str
@@ -74,10 +84,14 @@ DOORS: Final[Mapping[str, Front]] = {
     "lobby": Front("lobby", "lobby", 1),
     "blank": Front("blank", "entrance", 7),
 }
-"""What the fronts of WallStyle are."""
+"""Ground floors by name."""
 
 _SHOPS: Final = ("shop", "shop-awning", "cafe", "shop", "entrance")
+"""Ground floors in streets with shops."""
+
 _HOMES: Final = ("entrance", "home", "home", "blank", "garage")
+"""Ground floors of residential buildings."""
+
 _PASTELS: Final = (
     (0.84, 0.80, 0.72),
     (0.82, 0.74, 0.60),
@@ -88,6 +102,7 @@ _PASTELS: Final = (
     (0.68, 0.70, 0.72),
     (0.78, 0.77, 0.66),
 )
+"""sRGB colours of plaster."""
 
 WALL_STYLES: Final[Mapping[str, WallStyle]] = {
     "plaster-old": WallStyle(
@@ -164,9 +179,11 @@ WALL_STYLES: Final[Mapping[str, WallStyle]] = {
         tints=((0.62, 0.64, 0.66), (0.52, 0.57, 0.60), (0.70, 0.68, 0.62)),
     ),
 }
-"""Kinds of buildings."""
+"""Building styles by name."""
 
 _OLD: Final = ("plaster-old", "brick-old", "brick-painted", "stone")
+"""Styles of old buildings."""
+
 STREETS: Final[Mapping[str, tuple[str, ...]]] = {
     "commercial": (*_OLD, *_OLD, "plaster-old", "brick-painted", "office"),
     "narrow": (*_OLD, *_OLD, "plaster-old", "plaster-old", "wood"),
@@ -194,5 +211,4 @@ STREETS: Final[Mapping[str, tuple[str, ...]]] = {
         "slab",
     ),
 }
-"""Which of WALL_STYLES stand in a class of streets, as often as they are named; "": wherever that
-is not known."""
+"""Building styles by street class, repeated by frequency; "" is the default class."""

@@ -1,5 +1,4 @@
-"""Ground: asphalt, slabs, pavers, brick, setts, curbs, grass, gravel, tactile paving, paint; and
-what lies where."""
+"""Ground textures, and the choice of a texture for each surface."""
 
 from __future__ import annotations
 
@@ -10,13 +9,26 @@ from typing import Final
 
 import numpy as np
 
-from physics.textures.brick_patterns import Bond, basket, courses, herringbone, random_courses
 from physics.textures.layers import Colour, Generator, Layers, Picture, Recipe, stacked
-from physics.textures.noise import Field, Noise, blurred, cells, step
-from physics.textures.surface import bond_of, cracks, laid, mixed, plain, relief, shaded, stained
+from physics.textures.noise import Field, Noise, blurred, cells, pixel_centres, step
+from physics.textures.surface import (
+    Bond,
+    basket,
+    bond_of,
+    courses,
+    cracks,
+    herringbone,
+    laid,
+    mixed,
+    plain,
+    random_courses,
+    relief,
+    shaded,
+    stained,
+)
 
 _GRASS_TINT: Final = 0.3
-"""Grass has its own green: a tint only leans it."""
+"""Fraction of the tint in grass, which keeps most of its own green."""
 _GREY: Final = ((0.57, 0.56, 0.54), (0.55, 0.54, 0.51), (0.59, 0.58, 0.56))
 _WORN: Final = (*_GREY, (0.52, 0.51, 0.48))
 _RED: Final = ((0.55, 0.39, 0.33), (0.51, 0.36, 0.31), (0.58, 0.42, 0.35), (0.48, 0.35, 0.31))
@@ -26,13 +38,21 @@ _DARK: Final = (0.36, 0.35, 0.34)
 
 @lru_cache(maxsize=4)
 def ground_layers(size_px: int = 512, seed: int = 0) -> Layers:
-    """Every layer of ground. size_px: 256 suits a laptop."""
+    """Return every ground layer; 256 pixels suit a laptop."""
     return stacked("ground", GROUND_RECIPES, size_px, seed)
 
 
 def _asphalt(
     stone: float, tone: float = 0.33, worn: float = 0.0, patches: bool = False
 ) -> Generator:
+    """Return a generator of asphalt.
+
+    stone: contrast of the stones
+    tone: brightness
+    worn: strength of cracks and stains
+    patches: add repairs
+    """
+
     def make(noise: Noise) -> Picture:
         chips = noise.grain(0.6)
         colour = (tone, tone, 1.02 * tone)
@@ -54,9 +74,11 @@ def _asphalt(
 
 
 def _patches(noise: Noise) -> Field:
-    """Signed distance to the outlines of two repairs and a trench, positive inside, as a share of
-    the side."""
-    at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size
+    """Return the signed distance to two repairs and a trench, positive inside.
+
+    The unit is the side of the texture.
+    """
+    at = pixel_centres(noise.size)
     x, y = np.meshgrid(at, at)
     repairs = ((0.27, 0.24, 0.12, 0.10), (0.70, 0.66, 0.17, 0.13), (0.50, 0.44, 0.50, 0.035))
     edges = [
@@ -76,8 +98,12 @@ def _stones(
     tint: float = 1.0,
     **look: float,
 ) -> Recipe:
-    """A laid surface. lay: its bond, given pixels and side; tint: share of the tint in the
-    stones."""
+    """Return the recipe of a paved surface.
+
+    lay: bond for a size in pixels and a side in metres
+    tint: fraction of the tint in the stones
+    look: arguments of `laid`
+    """
 
     def make(noise: Noise) -> Picture:
         whole = laid(noise, lay(noise.size, side_m), side_m, colours, joint, **look)
@@ -89,6 +115,7 @@ def _stones(
 def _rows(
     rows: int, unit_m: Sequence[float], shift: Sequence[float] = (0.0,)
 ) -> Callable[[int, float], Bond]:
+    """Return a function that lays rows of units."""
     return lambda size, side_m: courses(size, side_m, rows, unit_m, shift)
 
 
@@ -137,7 +164,7 @@ def _granite(noise: Noise) -> Picture:
 
 def _grass(dry: float, worn: float = 0.0) -> Generator:
     def make(noise: Noise) -> Picture:
-        # Blades lean every way: streaks bent by noise, so that no direction shows.
+        # Warped streaks give blades without a common direction.
         one = noise.warped(noise.streaks(256, 8), 0.03, 8)
         two = noise.warped(noise.streaks(256, 8, 1), 0.03, 8)
         blades = 0.7 * np.maximum(one, two) + 0.45 * noise.grain(0.7) - 0.4
@@ -158,7 +185,7 @@ def _grass(dry: float, worn: float = 0.0) -> Generator:
 
 
 def _planting(noise: Noise) -> Picture:
-    """Low shrubs: leaves of some centimetres, dark between them."""
+    """Draw low shrubs with leaves of a few centimetres and dark gaps."""
     leaves = cells(noise, 40, 0.9)
     tone = noise.rng.normal(1.0, 0.18, (leaves.n, 1)).astype(np.float32)
     palette = np.asarray(
@@ -198,10 +225,10 @@ def _gravel(noise: Noise) -> Picture:
 
 
 def _tactile(bars: bool) -> Generator:
-    """Slabs of 0.3 m with domes 60 mm apart, or bars 75 mm apart (ISO 23599)."""
+    """Return a generator of 0.3 m slabs with domes 60 mm apart, or bars 75 mm apart (ISO 23599)."""
 
     def make(noise: Noise) -> Picture:
-        at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size * 0.6
+        at = pixel_centres(noise.size) * 0.6
         x, y = np.meshgrid(at, at)
         if bars:
             inset = np.maximum(np.abs((y % 0.3) - 0.15) - 0.122, 0.0)
@@ -230,7 +257,7 @@ def _tactile(bars: bool) -> Generator:
 
 
 def _paint(worn: float) -> Generator:
-    """Road paint: it takes the tint; where it is worn off the asphalt below keeps its colour."""
+    """Return a generator of tinted road paint; worn parts show asphalt."""
 
     def make(noise: Noise) -> Picture:
         below = _asphalt(0.05)(noise).rgb
@@ -244,7 +271,7 @@ def _paint(worn: float) -> Generator:
 
 
 def _cast(noise: Noise) -> Picture:
-    """Cast concrete with a joint every 1.5 m."""
+    """Draw cast concrete with a joint every 1.5 m."""
     bond = courses(noise.size, 3.0, 2, [1.5], [0.0])
     whole = laid(
         noise,
@@ -316,6 +343,7 @@ GROUND_RECIPES: Final[Mapping[str, Recipe]] = {
     "paint-worn": Recipe(2.0, _paint(1.0)),
     "plain": Recipe(1.0, lambda noise: Picture(np.full((noise.size, noise.size, 3), 0.8))),
 }
+"""Recipe of every ground layer by name."""
 
 SURFACE_LAYERS: Final[Mapping[str, tuple[str, ...]]] = {
     "road": ("asphalt", "asphalt-worn", "asphalt-patched"),
@@ -344,15 +372,16 @@ SURFACE_LAYERS: Final[Mapping[str, tuple[str, ...]]] = {
     "yard": ("asphalt-worn",),
     "water": ("water",),
 }
-"""Layers that a kind of ground (physics.ground.tiles), a material (physics.ground.materials) or a
-look of open ground (cosim.place.open_ground) may show."""
+"""Possible layers by kind of ground, material or kind of open ground.
+
+Keys are from `physics.ground.tiles`, `physics.ground.materials` and `cosim.place.open_ground`.
+"""
 
 
 def layer_of(surface: str, seed: int = 0) -> str:
-    """The layer of a part of a tile, drawn from its own name and a seed: "sidewalk:brick:2" is one
-    of brick.
+    """Return the layer of a surface name such as "sidewalk:brick:2", chosen by name and seed.
 
-    Ground of a kind that the table does not know is asphalt.
+    Unknown kinds of ground are asphalt.
     """
     kind, _, rest = surface.partition(":")
     material = rest.partition(":")[0]

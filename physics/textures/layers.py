@@ -1,15 +1,14 @@
-"""Layers: square textures of one size, stacked as a texture array, and how a colour is put on them.
+"""Square textures of one size, stacked as a texture array.
 
-A texel's albedo, everything linear (decoded from sRGB; filtering and mip-maps too are linear,
+Albedo of a texel, with linear values (decoded from sRGB; filtering and mip-maps are linear,
 GL_SRGB8_ALPHA8):
 
-    surface (ground, wall, prop):  mix(rgb, rgb / mean * tint, alpha)      without a tint of its
-                                   own: rgb
-    facade over a wall:            rgb + alpha * wall                       rgb is premultiplied
+    surface with a tint:   mix(rgb, rgb / mean * tint, alpha)
+    surface without tint:  rgb
+    facade over a wall:    rgb + alpha * wall, with premultiplied rgb
 
-so that alpha is the share of the tint in a surface (mortar keeps its own colour), and the share of
-the wall behind in
-a facade.
+Alpha is the fraction of tint in a surface (mortar keeps its colour), or the visible fraction of the
+wall behind a facade.
 """
 
 from __future__ import annotations
@@ -28,19 +27,26 @@ from cosim.core.errors import SpecError, UsageError, unknown
 from physics.textures.noise import Field, Noise
 
 Rgb = NDArray[np.floating[Any]]
-"""(S, S, 3) sRGB, 0 to 1."""
+"""(S, S, 3) sRGB image, 0 to 1."""
 Colour = tuple[float, float, float]
+"""Red, green and blue, 0 to 1."""
 
 SIZES: Final = (256, 512, 1024)
-_MADE_BY: Final = sources_hash(Path(__file__).parent)
+"""Allowed texture sizes in pixels."""
+
+_SOURCES_KEY: Final = sources_hash(Path(__file__).parent)
+"""Cache key part: hash of the sources."""
 
 
 @dataclass(frozen=True, slots=True)
 class Layers:
-    """Textures of one size S. names: L, unique; rgba: (L, S, S, 4) uint8, rows down the picture,
-    colours sRGB; metres: (L, 2) width and height of a texture in the world; mean: (L, 3) linear
-    mean colour; finish: (L, S, S, 2) uint8, gloss (how much of a mirror: panes) and glow (light of
-    its own at night). Arrays are write-protected.
+    """Texture layers of one size S. Arrays are read-only.
+
+    names: L unique names
+    rgba: (L, S, S, 4) uint8 sRGB, rows from the top
+    metres: (L, 2) width and height in the world
+    mean: (L, 3) linear mean colour
+    finish: (L, S, S, 2) uint8 gloss (mirror reflection of panes) and glow (emitted light at night)
     """
 
     names: tuple[str, ...]
@@ -53,7 +59,10 @@ class Layers:
         return len(self.names)
 
     def index(self, name: str) -> int:
-        """The number of a layer. Raises UsageError that lists the names."""
+        """Return the index of a layer.
+
+        Raises: UsageError with the valid names
+        """
         try:
             return self.names.index(name)
         except ValueError:
@@ -62,8 +71,12 @@ class Layers:
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """One layer before it is stacked. rgb: (S, S, 3) sRGB; alpha: (S, S) or None for 1; finish: (S,
-    S, 2)."""
+    """One layer before it is stacked.
+
+    rgb: (S, S, 3) sRGB
+    alpha: (S, S); None is 1
+    finish: (S, S, 2) gloss and glow
+    """
 
     rgb: Rgb
     alpha: Field | None = None
@@ -75,25 +88,25 @@ Generator = Callable[[Noise], Picture]
 
 @dataclass(frozen=True, slots=True)
 class Recipe:
-    """How a layer is made, and what it shows in metres: the side of a square, or width and
-    height."""
+    """Generator of a layer and the size in metres: the side of a square, or width and height."""
 
     metres: float | tuple[float, float]
     make: Generator
 
 
 def stacked(kind: str, recipes: Mapping[str, Recipe], size_px: int, seed: int) -> Layers:
-    """Every recipe's layer, in the table's order. Each has its own generator, so that a new one
-    changes no other.
+    """Return the layers of all recipes from the cache, or generate them.
 
-    kind: what they are, a word in the name under which they are kept (`mapped_arrays`).
+    kind: name of the stack in the cache
+
+    Each layer has its own random generator, so new layers change no others.
     """
     if size_px not in SIZES:
         raise SpecError(
             f"a texture's size_px must be one of {', '.join(map(str, SIZES))}, not {size_px}"
         )
     arrays = mapped_arrays(
-        f"{kind}-{size_px}-{seed}", _MADE_BY, lambda: _made(recipes, size_px, seed)
+        f"{kind}-{size_px}-{seed}", _SOURCES_KEY, lambda: _generate(recipes, size_px, seed)
     )
     metres = np.array(
         [np.broadcast_to(recipe.metres, 2) for recipe in recipes.values()], np.float32
@@ -102,7 +115,8 @@ def stacked(kind: str, recipes: Mapping[str, Recipe], size_px: int, seed: int) -
     return Layers(tuple(recipes), arrays["rgba"], metres, arrays["mean"], arrays.get("finish"))
 
 
-def _made(recipes: Mapping[str, Recipe], size_px: int, seed: int) -> Arrays:
+def _generate(recipes: Mapping[str, Recipe], size_px: int, seed: int) -> Arrays:
+    """Generate all layers."""
     made: dict[str, NDArray[Any]] = {
         "rgba": np.empty((len(recipes), size_px, size_px, 4), np.uint8),
         "mean": np.empty((len(recipes), 3), np.float32),
@@ -120,7 +134,10 @@ def _made(recipes: Mapping[str, Recipe], size_px: int, seed: int) -> Arrays:
 
 
 def joined_layers(*stacks: Layers) -> Layers:
-    """Several stacks of one size as one; names must differ, finishes are not kept."""
+    """Return several stacks of one size as one, without finishes.
+
+    Raises: UsageError if sizes differ or names repeat
+    """
     names = tuple(name for stack in stacks for name in stack.names)
     if len(set(names)) != len(names) or len({stack.rgba.shape[1] for stack in stacks}) != 1:
         raise UsageError(
@@ -134,7 +151,7 @@ def joined_layers(*stacks: Layers) -> Layers:
 
 
 def linear(srgb: NDArray[np.floating] | Colour) -> NDArray[np.float32]:
-    """sRGB values 0 to 1, decoded (IEC 61966-2-1)."""
+    """Decode sRGB values from 0 to 1 (IEC 61966-2-1)."""
     s = np.asarray(srgb, dtype=np.float32)
     return np.where(s <= 0.04045, s / 12.92, ((np.maximum(s, 0.0) + 0.055) / 1.055) ** 2.4).astype(
         np.float32
@@ -142,21 +159,21 @@ def linear(srgb: NDArray[np.floating] | Colour) -> NDArray[np.float32]:
 
 
 def encoded(value: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Linear values 0 to 1 as sRGB (IEC 61966-2-1)."""
+    """Encode linear values from 0 to 1 as sRGB (IEC 61966-2-1)."""
     v = np.clip(np.asarray(value, dtype=np.float32), 0.0, 1.0)
     return np.where(v <= 0.0031308, 12.92 * v, 1.055 * v ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
 LINEAR: Final = linear(np.arange(256) / 255.0)
-"""(256,) decoded values of sRGB bytes."""
+"""(256,) linear values of sRGB bytes."""
 
 
 def quantised(values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
-    """Values 0 to 1 as bytes, rounded; what lies outside is cut off."""
+    """Return values from 0 to 1 as rounded and clipped bytes."""
     return np.asarray(cv2.convertScaleAbs(np.maximum(values, 0.0), alpha=255.0), dtype=np.uint8)
 
 
 def mean_linear(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """(3,) linear mean of an sRGB picture (..., 3)."""
+    """Return the (3,) linear mean of an sRGB image (..., 3)."""
     counts = [cv2.calcHist([rgb], [c], None, [256], [0, 256]).ravel() for c in range(3)]
     return np.array([LINEAR @ count / count.sum() for count in counts], dtype=np.float32)

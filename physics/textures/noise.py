@@ -1,8 +1,7 @@
-"""Noise that tiles: every field here continues over its edges, so that a texture made of it has no
-seams.
+"""Tileable noise fields.
 
-All fields are (S, S), float32 where it matters for speed, with S a power of two; rows run down the
-picture.
+Fields are (S, S) with S a power of two and rows from the top. They wrap at the edges, so textures
+have no seams.
 """
 
 from __future__ import annotations
@@ -16,51 +15,67 @@ import numpy as np
 from numpy.typing import NDArray
 
 Field = NDArray[np.floating[Any]]
+"""(S, S) values."""
+
 Ids = NDArray[np.int32]
+"""(S, S) indices."""
 
 
 class Noise:
-    """The noise of one layer: shared fields, each call moved and turned afresh by the layer's own
-    generator."""
+    """Noise generator of one layer.
+
+    Cached fields are shifted and mirrored randomly at each call.
+    """
 
     def __init__(self, size: int, seed: tuple[int, ...]) -> None:
         self.size = size
         self.rng = np.random.default_rng(seed)
 
     def clouds(self, cells: int) -> Field:
-        """Fractal noise of zero mean and unit deviation; its largest features are 1/`cells` of the
-        side: 2, 4 .. 64."""
-        return self._moved(_clouds(self.size, cells))
+        """Return fractal noise with zero mean and unit deviation.
+
+        cells: largest features per side: 2, 4 .. 64
+        """
+        return self._shifted(_clouds(self.size, cells))
 
     def grain(self, soft_px: float = 0.0) -> Field:
-        """White noise of zero mean and unit deviation, blurred over `soft_px` pixels of a 512 px
-        texture."""
-        return self._moved(_grain(self.size, soft_px))
+        """Return white noise with zero mean and unit deviation.
 
-    def _moved(self, field: Field) -> Field:
+        soft_px: blur in pixels of a 512 px texture
+        """
+        return self._shifted(_grain(self.size, soft_px))
+
+    def _shifted(self, field: Field) -> Field:
+        """Return a field shifted and mirrored randomly."""
         dy, dx = self.rng.integers(0, self.size, 2)
         moved = np.roll(field, (int(dy), int(dx)), axis=(0, 1))
         turn = int(self.rng.integers(4))
         return np.ascontiguousarray(moved[:: 1 - 2 * (turn & 1), :: 1 - (turn & 2)])
 
     def streaks(self, cells: int, stretch: int, axis: int = 0) -> Field:
-        """Noise drawn out `stretch` times along an axis (0 down, 1 across): run marks, wood grain,
-        brushed metal."""
+        """Return noise stretched along an axis, for run marks, wood grain or brushed metal.
+
+        axis: 0 down, 1 across
+        """
         size = self.size
         grid = self.rng.standard_normal((max(2, cells // stretch), cells)).astype(np.float32)
         field = _resized(grid if axis == 0 else np.ascontiguousarray(grid.T), size)
         return np.asarray(field / max(float(field.std()), 1e-6), dtype=np.float32)
 
     def warped(self, field: Field, by: float, cells: int) -> Field:
-        """A field whose points are moved by about `by` of the side."""
+        """Return a field distorted by about `by` of the side."""
         dx, dy = (self.clouds(cells) * np.float32(by * self.size) for _ in range(2))
         return remapped(field, dx, dy)
 
 
 @dataclass(frozen=True, slots=True)
 class Cells:
-    """A division into cells around scattered points. id: (S, S) which cell; edge: distance to the
-    nearest border as a share of the side; n: number of cells."""
+    """Voronoi cells.
+
+    id: (S, S) index of the cell
+    edge: (S, S) distance to the nearest border as a fraction of the side
+    n: number of cells
+    """
 
     id: Ids
     edge: Field
@@ -68,8 +83,7 @@ class Cells:
 
 
 def cells(noise: Noise, across: int, jitter: float = 0.8) -> Cells:
-    """Cells around the points of a jittered grid of `across` x `across` (Worley's cellular
-    pattern)."""
+    """Return Voronoi cells of a jittered grid of `across` x `across` points."""
     size = noise.size
     n = across * across
     at = (
@@ -102,7 +116,7 @@ def cells(noise: Noise, across: int, jitter: float = 0.8) -> Cells:
 
 
 def remapped(field: Field, dx_px: Field, dy_px: Field) -> Field:
-    """A tiling field read at points moved by (S, S) pixels."""
+    """Return a field sampled at points shifted by (S, S) pixels."""
     size = len(field)
     across, down = np.meshgrid(np.arange(size, dtype=np.float32), np.arange(size, dtype=np.float32))
     return np.asarray(
@@ -110,8 +124,13 @@ def remapped(field: Field, dx_px: Field, dy_px: Field) -> Field:
     )
 
 
+def pixel_centres(size: int) -> Field:
+    """Return the (size,) positions of pixel centres along a side, 0 to 1."""
+    return (np.arange(size, dtype=np.float32) + 0.5) / size
+
+
 def blurred(field: Field, sigma_px: float) -> Field:
-    """A tiling field, blurred."""
+    """Return a field with a Gaussian blur."""
     if sigma_px <= 0.05:
         return field
     margin = min(len(field), int(4 * sigma_px) + 1)
@@ -121,7 +140,7 @@ def blurred(field: Field, sigma_px: float) -> Field:
 
 
 def step(low: float, high: float, field: Field) -> Field:
-    """Smooth step from 0 at `low` to 1 at `high`."""
+    """Return a smooth step from 0 at `low` to 1 at `high`."""
     t = np.clip((field - np.float32(low)) / np.float32(high - low), 0.0, 1.0)
     return np.asarray(t * t * (3.0 - 2.0 * t), dtype=np.float32)
 
@@ -135,10 +154,10 @@ def _clouds(size: int, cells: int) -> Field:
     while n <= size // 2:
         total += np.float32(share) * _resized(_grid(rng, n), size)
         share, n = 0.55 * share, 2 * n
-    # Bent a little by other noise, so that the grid it was drawn on does not show.
+    # Warping hides the grid of the random values.
     bend = [np.float32(0.10 * size / cells) * _resized(_grid(rng, cells), size) for _ in range(2)]
     total = remapped(total, bend[0], bend[1])
-    return _locked((total - total.mean()) / total.std())
+    return _read_only((total - total.mean()) / total.std())
 
 
 def _grid(rng: np.random.Generator, cells: int) -> Field:
@@ -147,20 +166,22 @@ def _grid(rng: np.random.Generator, cells: int) -> Field:
 
 @lru_cache(maxsize=16)
 def _grain(size: int, soft_px: float) -> Field:
-    # Drawn at 512 and scaled, so that a laptop's texture is a smaller picture of the same thing.
+    # Generated at 512 px and resized, so that all sizes show the same pattern.
     rng = np.random.default_rng([7, round(100 * soft_px)])
     field = blurred(rng.standard_normal((512, 512)).astype(np.float32), soft_px)
     if size != 512:
         field = cv2.resize(
             field, (size, size), interpolation=cv2.INTER_AREA if size < 512 else cv2.INTER_LINEAR
         )
-        # An area's mean is calmer than its points; half of what is lost is given back.
+        # Averaging lowers the contrast; the square root restores half of the loss.
         field *= np.float32(np.sqrt(1.0 / max(float(field.std()), 1e-6)))
-    return _locked(field / max(1.0, float(field.std())) if soft_px == 0.0 else field / field.std())
+    return _read_only(
+        field / max(1.0, float(field.std())) if soft_px == 0.0 else field / field.std()
+    )
 
 
 def _resized(grid: Field, size: int) -> Field:
-    """A grid of random values, drawn smoothly over `size` pixels, its edges joined."""
+    """Resize a grid of random values to `size` pixels with wrapped cubic interpolation."""
     rows, columns = grid.shape
     wide = cv2.copyMakeBorder(grid, 3, 3, 3, 3, cv2.BORDER_WRAP)
     fy, fx = size // rows, size // columns
@@ -168,7 +189,8 @@ def _resized(grid: Field, size: int) -> Field:
     return np.asarray(drawn[3 * fy : 3 * fy + size, 3 * fx : 3 * fx + size])
 
 
-def _locked(field: NDArray[np.floating]) -> Field:
+def _read_only(field: NDArray[np.floating]) -> Field:
+    """Return a read-only float32 copy."""
     whole = np.ascontiguousarray(field, dtype=np.float32)
     whole.flags.writeable = False
     return whole

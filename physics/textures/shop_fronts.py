@@ -1,14 +1,24 @@
-"""Ground floors: shops with and without awnings, cafes, doors, lobbies, garages, plain walls."""
+"""Ground-floor bays: shops, cafes, entrances, lobbies, garages and blank walls."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Final
 
 import numpy as np
 
-from physics.textures.facade_canvas import BAY_M, STOREY_M, FacadeCanvas
-from physics.textures.glazing import WHITE_FRAME, opening, pane, sill, surround
+from physics.textures.facade_canvas import (
+    BAY_M,
+    STOREY_M,
+    WHITE_FRAME,
+    FacadeCanvas,
+    opening,
+    pane,
+    scaled,
+    sill,
+    surround,
+)
 from physics.textures.layers import Colour, linear
 from physics.textures.noise import step
 
@@ -20,12 +30,16 @@ _FASCIAS: Final[tuple[Colour, ...]] = (
     (0.72, 0.68, 0.60),
     (0.42, 0.34, 0.24),
 )
+"""sRGB colours of shop fronts."""
+
 _CLOTHS: Final[tuple[Colour, ...]] = (
     (0.47, 0.24, 0.21),
     (0.26, 0.37, 0.32),
     (0.28, 0.35, 0.45),
     (0.58, 0.47, 0.30),
 )
+"""sRGB colours of awnings."""
+
 _DOORS: Final[tuple[Colour, ...]] = (
     (0.25, 0.32, 0.28),
     (0.37, 0.24, 0.17),
@@ -34,6 +48,8 @@ _DOORS: Final[tuple[Colour, ...]] = (
     (0.24, 0.24, 0.25),
     (0.50, 0.40, 0.28),
 )
+"""sRGB colours of doors."""
+
 _GOODS: Final[tuple[Colour, ...]] = (
     (0.72, 0.68, 0.60),
     (0.55, 0.42, 0.32),
@@ -44,27 +60,26 @@ _GOODS: Final[tuple[Colour, ...]] = (
     (0.30, 0.33, 0.40),
     (0.78, 0.76, 0.72),
 )
+"""sRGB colours of goods in shop windows."""
+
 _PLINTH_M: Final = 0.42
+"""Height of the plinth in metres."""
 
 
 def _pick(canvas: FacadeCanvas, colours: tuple[Colour, ...]) -> Colour:
+    """Return a random colour."""
     return colours[int(canvas.rng.integers(len(colours)))]
 
 
-def _scaled(colour: Colour, by: float) -> Colour:
-    return tuple(min(1.0, by * c) for c in colour)  # type: ignore[return-value]
-
-
 def _plinth(canvas: FacadeCanvas) -> None:
-    """The foot of the wall: the wall itself, darker, with a ledge; dirt splashed up from the
-    ground."""
+    """Draw a dark plinth with a ledge and splashed dirt."""
     canvas.shade(0.0, BAY_M, 0.0, _PLINTH_M, 0.42)
     canvas.box(0.0, BAY_M, _PLINTH_M - 0.03, _PLINTH_M, (0.60, 0.59, 0.56), 0.5)
     canvas.shade(0.0, BAY_M, 0.0, 0.12, 0.35)
 
 
 def _display(canvas: FacadeCanvas, x0: float, x1: float, z0: float, z1: float) -> None:
-    """A shop window: a warm room, shelves and goods as soft blocks, the street mirrored on it."""
+    """Draw a shop window with a lit room, shelves, goods and a reflection of the street."""
     rng = canvas.rng
     area, cover, across, up = canvas.local(x0, x1, z0, z1)
     warm = linear((0.68, 0.62, 0.54))
@@ -100,9 +115,9 @@ def _display(canvas: FacadeCanvas, x0: float, x1: float, z0: float, z1: float) -
 
 
 def _fascia(canvas: FacadeCanvas, colour: Colour, z0: float = 2.55, z1: float = 3.0) -> None:
-    """A sign board over the whole bay with an abstract mark: bars and a disc, no letters."""
+    """Draw a sign board across the bay with an abstract mark instead of letters."""
     canvas.box(0.0, BAY_M, z0, z1, colour)
-    canvas.box(0.0, BAY_M, z1 - 0.05, z1, _scaled(colour, 1.3))
+    canvas.box(0.0, BAY_M, z1 - 0.05, z1, scaled(colour, 1.3))
     canvas.shade(0.0, BAY_M, z0 - 0.12, z0, 0.4, 0.12)
     if canvas.rng.random() < 0.75:
         mark = (0.82, 0.79, 0.70) if sum(colour) < 1.5 else (0.26, 0.25, 0.24)
@@ -116,18 +131,19 @@ def _fascia(canvas: FacadeCanvas, colour: Colour, z0: float = 2.55, z1: float = 
 
 
 def _shop(canvas: FacadeCanvas, door: bool = True) -> None:
+    """Draw a shop with or without a door."""
     colour = _FASCIAS[2 * canvas.number % len(_FASCIAS)]
-    canvas.box(0.0, BAY_M, 0.0, 3.0, _scaled(colour, 0.9))
+    canvas.box(0.0, BAY_M, 0.0, 3.0, scaled(colour, 0.9))
     right = 1.85 if door else BAY_M - 0.1
-    canvas.box(0.1, right, 0.08, 0.45, _scaled(colour, 1.12))
+    canvas.box(0.1, right, 0.08, 0.45, scaled(colour, 1.12))
     canvas.shade(0.1, right, 0.42, 0.45, 0.4)
     _display(canvas, 0.1, right, 0.5, 2.45)
     for x in np.linspace(0.1, right, 2 if not door else 1, endpoint=False)[1:]:
         canvas.box(float(x) - 0.03, float(x) + 0.03, 0.5, 2.45, colour)
-    canvas.frame(0.1, right, 0.46, 2.49, 0.04, _scaled(colour, 1.25))
+    canvas.frame(0.1, right, 0.46, 2.49, 0.04, scaled(colour, 1.25))
     if door:
-        canvas.box(1.95, 2.9, 0.0, 2.45, _scaled(colour, 0.5))
-        canvas.frame(2.0, 2.85, 0.04, 2.4, 0.09, _scaled(colour, 1.2))
+        canvas.box(1.95, 2.9, 0.0, 2.45, scaled(colour, 0.5))
+        canvas.frame(2.0, 2.85, 0.04, 2.4, 0.09, scaled(colour, 1.2))
         pane(canvas, 2.09, 2.76, 0.35, 2.31, dress=False)
         canvas.box(2.12, 2.15, 1.0, 1.25, (0.70, 0.66, 0.52))
     _fascia(canvas, colour)
@@ -135,7 +151,7 @@ def _shop(canvas: FacadeCanvas, door: bool = True) -> None:
 
 
 def _awning(canvas: FacadeCanvas, z0: float, z1: float) -> None:
-    """Striped cloth with a straight valance, and its shade on what is below."""
+    """Draw striped cloth with a straight valance and its shadow."""
     cloth = _pick(canvas, _CLOTHS)
     pale = (0.78, 0.76, 0.70)
     canvas.shade(0.0, BAY_M, z0 - 0.85, z0, 0.55, 0.8)
@@ -151,39 +167,32 @@ def _awning(canvas: FacadeCanvas, z0: float, z1: float) -> None:
     canvas.shade(0.0, BAY_M, z0 + 0.21 * (z1 - z0), z0 + 0.24 * (z1 - z0), 0.4)
 
 
-def _shop_window(canvas: FacadeCanvas) -> None:
-    _shop(canvas, door=False)
-
-
 def _shop_awning(canvas: FacadeCanvas) -> None:
     _shop(canvas, door=False)
     _awning(canvas, 1.98, 2.56)
 
 
 def _cafe(canvas: FacadeCanvas, door: bool = False) -> None:
+    """Draw a cafe with or without a door."""
     frame = _FASCIAS[(2 * canvas.number + 1) % len(_FASCIAS)]
     canvas.box(0.0, BAY_M, 0.0, 2.9, frame)
     for k in range(3):
         x0 = 0.08 + 0.96 * k
         if door and k == 1:
-            canvas.box(x0, x0 + 0.88, 0.0, 2.15, _scaled(frame, 0.6))
-            canvas.frame(x0 + 0.04, x0 + 0.84, 0.02, 2.13, 0.09, _scaled(frame, 1.2))
+            canvas.box(x0, x0 + 0.88, 0.0, 2.15, scaled(frame, 0.6))
+            canvas.frame(x0 + 0.04, x0 + 0.84, 0.02, 2.13, 0.09, scaled(frame, 1.2))
             pane(canvas, x0 + 0.13, x0 + 0.75, 0.35, 2.04, dress=False)
             continue
-        canvas.box(x0, x0 + 0.88, 0.06, 0.55, _scaled(frame, 1.25))
+        canvas.box(x0, x0 + 0.88, 0.06, 0.55, scaled(frame, 1.25))
         canvas.shade(x0 + 0.08, x0 + 0.80, 0.14, 0.47, 0.25)
         _display(canvas, x0, x0 + 0.88, 0.62, 2.15)
         pane(canvas, x0, x0 + 0.88, 2.22, 2.6, dress=False)
     canvas.shade(0.0, BAY_M, 2.45, 2.6, 0.4, 0.15)
-    _fascia(canvas, _scaled(frame, 0.85), 2.62, 3.0)
-
-
-def _cafe_door(canvas: FacadeCanvas) -> None:
-    _cafe(canvas, door=True)
+    _fascia(canvas, scaled(frame, 0.85), 2.62, 3.0)
 
 
 def _entrance(canvas: FacadeCanvas) -> None:
-    """The door of a house with flats: leaf, light above it, a step, bells."""
+    """Draw the door of an apartment building with a transom window, a step and bells."""
     _plinth(canvas)
     leaf = _pick(canvas, _DOORS)
     x0 = 0.9
@@ -194,10 +203,10 @@ def _entrance(canvas: FacadeCanvas) -> None:
     for a, b in ((x0 + 0.15, 1.46), (1.54, x1 - 0.15)):
         for low, high in ((0.25, 0.95), (1.1, 2.02)):
             canvas.shade(a, b, low, high, 0.30)
-            canvas.box(a + 0.025, b - 0.025, low, high - 0.025, _scaled(leaf, 1.12))
+            canvas.box(a + 0.025, b - 0.025, low, high - 0.025, scaled(leaf, 1.12))
         if canvas.rng.random() < 0.5:
             pane(canvas, a + 0.04, b - 0.04, 1.14, 1.98, dress=False)
-    canvas.box(1.49, 1.51, 0.1, 2.15, _scaled(leaf, 0.5))
+    canvas.box(1.49, 1.51, 0.1, 2.15, scaled(leaf, 0.5))
     canvas.box(1.55, 1.59, 1.0, 1.12, (0.72, 0.66, 0.46))
     pane(canvas, x0 + 0.08, x1 - 0.08, 2.22, 2.6, dress=False)
     canvas.shade(x0, x1, 2.4, 2.65, 0.5, 0.25)
@@ -237,7 +246,7 @@ def _garage(canvas: FacadeCanvas) -> None:
 
 
 def _lobby(canvas: FacadeCanvas) -> None:
-    """Glass from the floor up, in steel."""
+    """Draw a full-height glass front in steel."""
     canvas.box(0.0, BAY_M, 0.0, STOREY_M, (0.30, 0.31, 0.32))
     for k in range(2):
         pane(canvas, 1.5 * k + 0.04, 1.5 * k + 1.46, 0.12, 2.35, dress=False)
@@ -262,14 +271,14 @@ def _blank(canvas: FacadeCanvas) -> None:
 
 FRONTS: Final[Mapping[str, Callable[[FacadeCanvas], None]]] = {
     "shop": _shop,
-    "shop-window": _shop_window,
+    "shop-window": partial(_shop, door=False),
     "shop-awning": _shop_awning,
     "cafe": _cafe,
-    "cafe-door": _cafe_door,
+    "cafe-door": partial(_cafe, door=True),
     "entrance": _entrance,
     "home": _home,
     "garage": _garage,
     "lobby": _lobby,
     "blank": _blank,
 }
-"""Styles of ground floors."""
+"""Ground-floor bay styles by name."""

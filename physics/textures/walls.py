@@ -1,5 +1,4 @@
-"""Walls and roofs: plaster, brick, concrete, stone, wood, metal, tiles, gravel, glass; and what
-street things show."""
+"""Textures of walls, roofs, trees and street furniture."""
 
 from __future__ import annotations
 
@@ -9,15 +8,16 @@ from typing import Final
 
 import numpy as np
 
-from physics.textures.brick_patterns import courses, random_courses
 from physics.textures.layers import Colour, Generator, Layers, Picture, Recipe, stacked
-from physics.textures.noise import Field, Noise, blurred, cells, step
+from physics.textures.noise import Field, Noise, blurred, cells, pixel_centres, step
 from physics.textures.surface import (
     bond_of,
+    courses,
     cracks,
     laid,
     mixed,
     plain,
+    random_courses,
     relief,
     shaded,
     stained,
@@ -25,24 +25,38 @@ from physics.textures.surface import (
 )
 
 _CLAY: Final = ((0.56, 0.34, 0.27), (0.52, 0.31, 0.25), (0.60, 0.38, 0.30), (0.47, 0.29, 0.25))
+"""sRGB colours of clay bricks."""
+
 _LIME: Final = (0.66, 0.62, 0.56)
+"""sRGB colour of lime mortar."""
+
 _STRETCHER = 0.225
+"""Length of a stretcher including its joint in metres."""
+
 _HEADER = 0.1125
+"""Length of a header including its joint in metres."""
 
 
 @lru_cache(maxsize=4)
 def wall_layers(size_px: int = 512, seed: int = 0) -> Layers:
-    """Every layer of walls and roofs, and of glass."""
+    """Return every layer of walls, roofs and glass."""
     return stacked("walls", WALLS, size_px, seed)
 
 
 @lru_cache(maxsize=4)
 def prop_layers(size_px: int = 512, seed: int = 0) -> Layers:
-    """Every layer for trees and street furniture: bark, foliage, planks, metal, stone."""
+    """Return every layer for trees and street furniture."""
     return stacked("props", PROPS, size_px, seed)
 
 
 def _plaster(rough: float, dirt: float, crazed: float = 0.0) -> Generator:
+    """Return a generator of plaster.
+
+    rough: strength of the relief
+    dirt: strength of stains
+    crazed: strength of cracks
+    """
+
     def make(noise: Noise) -> Picture:
         bumps = 0.6 * noise.clouds(64) + 0.6 * noise.grain(1.2)
         rgb = plain(noise, (0.80, 0.78, 0.74), 0.012 + 0.02 * dirt, 0.006 + 0.010 * rough)
@@ -67,7 +81,11 @@ def _brick(
     colours: Sequence[Colour],
     joint: Colour,
 ) -> Recipe:
-    """A wall of 2.7 m: 36 courses, whose patterns of lengths follow each other."""
+    """Return the recipe of a 2.7 m brick wall.
+
+    units: one or two alternating patterns of lengths for its 36 courses
+    shift: offsets of the rows, see `courses`
+    """
 
     def make(noise: Noise) -> Picture:
         bonds = [courses(noise.size, 2.7, 36, unit, shift) for unit in units]
@@ -88,7 +106,7 @@ def _brick(
 
 
 def _panels(noise: Noise) -> Picture:
-    """Cast panels of 3 m x 1.5 m with tie holes."""
+    """Draw cast panels of 3 m x 1.5 m with tie holes."""
     whole = laid(
         noise,
         courses(noise.size, 3.0, 2, [3.0], [0.0]),
@@ -101,7 +119,7 @@ def _panels(noise: Noise) -> Picture:
         wobble_m=0.0,
         grain=0.014,
     )
-    at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size * 3.0
+    at = pixel_centres(noise.size) * 3.0
     x, y = np.meshgrid(at, at)
     hole = 1.0 - step(0.012, 0.022, np.hypot((x % 1.5) - 0.75, np.abs((y % 1.5) - 0.75) - 0.4))
     pores = step(2.0, 2.8, noise.grain(0.5))
@@ -110,7 +128,7 @@ def _panels(noise: Noise) -> Picture:
 
 
 def _boarded(noise: Noise) -> Picture:
-    """Concrete with the print of the boards of its mould."""
+    """Draw concrete with the print of formwork boards."""
     bond = courses(
         noise.size,
         2.4,
@@ -172,7 +190,7 @@ def _aged(picture: Picture, noise: Noise) -> Picture:
 def _boards(
     side_m: float, board_m: float, upright: bool, colour: Colour = (0.62, 0.54, 0.43)
 ) -> Recipe:
-    """Wooden boards; each throws a little shadow on the next."""
+    """Return the recipe of wooden boards, each with a small shadow on the next."""
 
     def make(noise: Noise) -> Picture:
         rows = round(side_m / board_m)
@@ -192,7 +210,7 @@ def _boards(
             grain=0.01,
             joint_tint=0.3,
         )
-        at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size * rows % 1.0
+        at = pixel_centres(noise.size) * rows % 1.0
         lap = np.broadcast_to(
             (1.0 - 0.22 * np.exp(-at / 0.10) + 0.05 * at)[:, None], (noise.size,) * 2
         )
@@ -204,8 +222,8 @@ def _boards(
 
 
 def _corrugated(noise: Noise) -> Picture:
-    """Sheet metal with upright waves of 0.1 m."""
-    at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size * 20.0
+    """Draw sheet metal with vertical waves of 0.1 m."""
+    at = pixel_centres(noise.size) * 20.0
     wave = np.broadcast_to(1.0 + 0.13 * np.sin(2.0 * np.pi * at), (noise.size,) * 2).astype(
         np.float32
     )
@@ -214,7 +232,7 @@ def _corrugated(noise: Noise) -> Picture:
 
 
 def _cassettes(noise: Noise) -> Picture:
-    """Flat metal panels of 1.5 m x 0.75 m with open joints."""
+    """Draw flat metal panels of 1.5 m x 0.75 m with open joints."""
     bond = courses(noise.size, 3.0, 4, [1.5], [0.0])
     tone = ((0.62, 0.63, 0.65), (0.60, 0.61, 0.63))
     whole = laid(
@@ -248,9 +266,9 @@ def _glazed(noise: Noise) -> Picture:
 
 
 def _roof_tiles(noise: Noise) -> Picture:
-    """Pantiles: 0.25 m wide, 0.3125 m of each showing."""
+    """Draw pantiles, 0.25 m wide with 0.3125 m visible."""
     size = noise.size
-    at = (np.arange(size, dtype=np.float32) + 0.5) / size
+    at = pixel_centres(size)
     across, down = at * 10.0, at * 8.0
     column, row = np.floor(across).astype(int), np.floor(down).astype(int)
     tone = noise.rng.normal(1.0, 0.07, (8, 10)).astype(np.float32)[np.ix_(row, column)]
@@ -295,8 +313,8 @@ def _roof_gravel(noise: Noise) -> Picture:
 
 
 def _seamed(noise: Noise) -> Picture:
-    """Sheet metal roof with a standing seam every 0.5 m."""
-    at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size * 4.0 % 1.0
+    """Draw a sheet-metal roof with a standing seam every 0.5 m."""
+    at = pixel_centres(noise.size) * 4.0 % 1.0
     seam = (
         1.0
         + 0.18 * np.exp(-(((at - 0.48) / 0.012) ** 2))
@@ -311,7 +329,7 @@ def _seamed(noise: Noise) -> Picture:
 
 
 def _felt(noise: Noise) -> Picture:
-    """Bitumen sheets, 1 m wide."""
+    """Draw bitumen sheets, 1 m wide."""
     bond = courses(noise.size, 3.0, 3, [3.0], [0.0, 0.4, 0.7])
     return laid(
         noise,
@@ -326,8 +344,8 @@ def _felt(noise: Noise) -> Picture:
 
 
 def _glass(noise: Noise) -> Picture:
-    """A curtain wall's panes of 1.5 m: sky above, the other side of the street below."""
-    at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size * 2.0 % 1.0
+    """Draw a curtain wall of 1.5 m panes that reflect sky and street."""
+    at = pixel_centres(noise.size) * 2.0 % 1.0
     x, y = np.meshgrid(at, at)
     sky = step(0.15, 0.85, 1.0 - y + 0.05 * noise.clouds(8))
     rgb = mixed((0.15, 0.19, 0.21), (0.44, 0.52, 0.57), sky)
@@ -343,6 +361,12 @@ def _bark(noise: Noise) -> Picture:
 
 
 def _foliage(light: Colour, dark: Colour, leaf: int) -> Generator:
+    """Return a generator of leaves.
+
+    light, dark: sRGB colours
+    leaf: number of leaves per side
+    """
+
     def make(noise: Noise) -> Picture:
         tone = np.zeros((noise.size,) * 2, np.float32)
         for depth in (0.0, 0.45, 1.0):
@@ -404,6 +428,7 @@ WALLS: Final[Mapping[str, Recipe]] = {
     "roof-metal": Recipe(2.0, _seamed),
     "roof-felt": Recipe(3.0, _felt),
 }
+"""Recipe of every wall and roof layer by name."""
 
 PROPS: Final[Mapping[str, Recipe]] = {
     "bark": Recipe(0.6, _bark),
@@ -418,3 +443,4 @@ PROPS: Final[Mapping[str, Recipe]] = {
         1.0, lambda noise: Picture(stained(plain(noise, (0.62, 0.60, 0.57), 0.03, 0.04), noise))
     ),
 }
+"""Recipe of every prop layer by name."""

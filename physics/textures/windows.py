@@ -1,5 +1,4 @@
-"""Windows of the upper storeys. A style is the same in every bay; what differs is what is behind
-the panes."""
+"""Upper-storey bays. A style has one shape in every bay; only rooms behind panes differ."""
 
 from __future__ import annotations
 
@@ -8,13 +7,15 @@ from typing import Final
 
 import numpy as np
 
-from physics.textures.facade_canvas import BAY_M, STOREY_M, FacadeCanvas
-from physics.textures.glazing import (
+from physics.textures.facade_canvas import (
+    BAY_M,
     BROWN,
     DARK,
     GREEN,
     STONE,
+    STOREY_M,
     WHITE_FRAME,
+    FacadeCanvas,
     opening,
     pane,
     railing,
@@ -27,14 +28,16 @@ from physics.textures.noise import step
 _Style = Callable[[FacadeCanvas], None]
 
 _COURSE: Final = (0.66, 0.64, 0.60)
+"""sRGB colour of string courses."""
 
 
 def _middle(width: float) -> tuple[float, float]:
+    """Return the left and right edge of a centred opening."""
     return 0.5 * (BAY_M - width), 0.5 * (BAY_M + width)
 
 
 def _string_course(canvas: FacadeCanvas) -> None:
-    """A moulded band along the floor of the storey."""
+    """Draw a moulded band along the floor of the storey."""
     canvas.box(0.0, BAY_M, 0.0, 0.13, _COURSE)
     canvas.shade(0.0, BAY_M, 0.0, 0.05, 0.35)
     canvas.box(0.0, BAY_M, 0.11, 0.13, (0.76, 0.74, 0.70))
@@ -114,14 +117,14 @@ def _square(frame: Colour, width: float, panes: int) -> _Style:
 
 
 def _arched(canvas: FacadeCanvas) -> None:
-    """A segmental arch of voussoirs over a window with a straight head set back in it."""
+    """Draw a segmental arch of voussoirs over a recessed window with a straight head."""
     x0, x1 = _middle(1.1)
     _string_course(canvas)
     opening(canvas, x0, x1, 0.85, 2.5, WHITE_FRAME, (2, 2))
     area, _, across, up = canvas.local(x0 - 0.25, x1 + 0.25, 2.25, 2.8)
     x = (across - 0.5) * (x1 - x0 + 0.5)
     z = up * 0.55
-    # The circle through the springers at z 0.1 and the crown at z 0.3 of this area.
+    # The circle passes through the springers at z = 0.1 and the crown at z = 0.3.
     radius = (0.55**2 + 0.2**2) / (2.0 * 0.2)
     rise = z - (0.3 - radius)
     r = np.sqrt(x * x + rise * rise)
@@ -133,8 +136,7 @@ def _arched(canvas: FacadeCanvas) -> None:
 
 
 def _balcony(front: Colour | None, frame: Colour) -> _Style:
-    """A balcony with a solid front, or a railing; its door and window lie in the shade behind
-    it."""
+    """Return a style with a balcony; `front` is its solid front, None for a railing."""
 
     def draw(canvas: FacadeCanvas) -> None:
         opening(canvas, 0.35, 2.65, 0.12, 2.5, frame, (3, 1), 0.12)
@@ -154,7 +156,7 @@ def _balcony(front: Colour | None, frame: Colour) -> _Style:
 
 
 def _ribbon(canvas: FacadeCanvas) -> None:
-    """Glass from edge to edge; bays side by side make one band."""
+    """Draw a continuous band of glass."""
     canvas.box(0.0, BAY_M, 0.95, 2.6, DARK)
     for k in range(2):
         pane(canvas, k * 1.5 + 0.03, k * 1.5 + 1.47, 1.0, 2.55)
@@ -163,7 +165,7 @@ def _ribbon(canvas: FacadeCanvas) -> None:
 
 
 def _office(spandrel: Colour) -> _Style:
-    """Curtain wall: panes above an opaque breast, upright fins."""
+    """Return a style of a curtain wall with opaque spandrels and vertical fins."""
 
     def draw(canvas: FacadeCanvas) -> None:
         canvas.box(0.0, BAY_M, 0.0, STOREY_M, (0.24, 0.25, 0.27))
@@ -177,7 +179,7 @@ def _office(spandrel: Colour) -> _Style:
 
 
 def _blank(canvas: FacadeCanvas) -> None:
-    """No window; perhaps a grille."""
+    """Draw no window, sometimes a grille."""
     if canvas.rng.random() < 0.5:
         canvas.box(1.3, 1.7, 2.3, 2.6, (0.40, 0.40, 0.41))
         for z in np.arange(2.32, 2.58, 0.05):
@@ -206,4 +208,4 @@ WINDOW_STYLES: Final[Mapping[str, _Style]] = {
     "office-light": _office((0.60, 0.60, 0.58)),
     "blank-upper": _blank,
 }
-"""Styles of upper bays."""
+"""Upper-storey bay styles by name."""

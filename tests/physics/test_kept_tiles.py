@@ -137,7 +137,7 @@ def test_what_is_kept_of_a_place_is_of_that_place_alone(cache: Path) -> None:
 
 def test_a_name_tells_all_that_a_tile_stands_on() -> None:
     """What the sources of tiles import is in their rooms, or in the list of packages."""
-    files = [path for room in kept_tiles._ROOMS[2:5] for path in room.rglob("*.py")]
+    files = [path for room in kept_tiles._SOURCE_FOLDERS[2:5] for path in room.rglob("*.py")]
     bodies = {"bodies.py", "bullet.py", "drive.py", "gltf.py", "movers.py", "world.py"}
     trees = [ast.parse(path.read_text()) for path in files if path.name not in bodies]
     names = {
@@ -153,7 +153,7 @@ def test_a_name_tells_all_that_a_tile_stands_on() -> None:
         if isinstance(node, ast.Import)
         for a in node.names
     }
-    rooms = {".".join(room.relative_to(ROOT).parts) for room in kept_tiles._ROOMS}
+    rooms = {".".join(room.relative_to(ROOT).parts) for room in kept_tiles._SOURCE_FOLDERS}
     ours = {name for name in names if name.startswith(("cosim.", "physics."))}
     assert {name for name in ours if not {name, name.rpartition(".")[0]} & rooms} <= {
         "cosim.spec.scenario",

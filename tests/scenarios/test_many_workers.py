@@ -12,7 +12,6 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from sumo_nets.net.net_hash import hash_of
 
 from bridge import keys
 from bridge.codec import encode
@@ -45,6 +44,7 @@ from scenarios.runs.protocol import (
 from scenarios.runs.status import RunStatus
 from scenarios.runs.transport import HeldRun
 from scenarios.runs.zenoh_transport import workers_of_run
+from sumo_nets.net.raw_file import hash_of
 from tests.conftest import PATIENCE_S, Cosim, wait_until
 from tests.run_specs import changed, spec_of
 

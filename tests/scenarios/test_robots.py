@@ -13,7 +13,6 @@ import msgspec
 import numpy as np
 import pytest
 import shapely
-from cosim.policies.privileged.robot_disks import BodyDisks
 from shapely.geometry import LineString, box
 
 from cosim.core.errors import RunError, SpecError, UsageError
@@ -26,7 +25,7 @@ from cosim.place.barriers import fenced
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies import POLICIES
 from cosim.policies.privileged.orca import Here, lane_past
-from cosim.policies.privileged.rollout import Way
+from cosim.policies.privileged.rollout import BodyDisks, Way
 from cosim.policies.privileged.route import best_lane, crossing_limit
 from cosim.policies.privileged.route_planner import Clearance
 from cosim.policies.privileged.social_force import bodies_m

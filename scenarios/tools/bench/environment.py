@@ -198,7 +198,7 @@ def _bare_query_ms() -> float:
 
 def _drive(size_m: float, policy: Route) -> _Drive:
     """Drive for _MEASURED_S simulated seconds in a city of a size."""
-    import physics.dynamics.profiling
+    import physics.dynamics.bullet
     import sumo_nets.engine
     from cosim.episode.loop import Parts
     from scenarios.episodes.episode import Episode
@@ -206,7 +206,7 @@ def _drive(size_m: float, policy: Route) -> _Drive:
     scenario = scenario_in(size_m)
     spent = Spent()
     engine = Spent()
-    physics.dynamics.profiling.put_physics_stopwatch(engine.timed)
+    physics.dynamics.bullet.put_physics_stopwatch(engine.timed)
     sumo_nets.engine.put_crowd_stopwatch(engine.timed)
 
     def timed(stage: StagedScenario) -> None:

@@ -15,7 +15,7 @@ import shapely
 import cosim
 from cosim.core.errors import EngineError
 from physics.cameras.driver_check import driver_alone
-from physics.dynamics.engine_check import bullet_alone
+from physics.dynamics.bullet import bullet_alone
 from physics.textures.facades import facade_layers
 from physics.textures.ground import ground_layers
 from physics.textures.walls import prop_layers, wall_layers
