@@ -34,21 +34,21 @@ LONGEST_REASON = 500
 _T = TypeVar("_T")
 
 
-class Signed(msgspec.Struct, frozen=True):
+class SignedMessage(msgspec.Struct, frozen=True):
     """Message with the version of the sender's behaviours."""
 
     by: Annotated[str, msgspec.Meta(max_length=64)] = ""
     message: msgspec.Raw = msgspec.Raw(b"")
 
 
-def signed(message: msgspec.Struct, by: str) -> bytes:
+def sign(message: msgspec.Struct, by: str) -> bytes:
     """Encode a message with the version of its sender's behaviours."""
-    return encode(Signed(by, msgspec.Raw(encode(message))))
+    return encode(SignedMessage(by, msgspec.Raw(encode(message))))
 
 
-def opened(payload: bytes, kind: type[_T], by: str) -> _T:
+def verify(payload: bytes, kind: type[_T], by: str) -> _T:
     """Decode a signed message. Raises EngineError if invalid or from another version than `by`."""
-    envelope = decode(payload, Signed)
+    envelope = decode(payload, SignedMessage)
     if envelope.by != by:
         raise EngineError(
             f"behaviours '{envelope.by}' met behaviours '{by}': run and director must be "
@@ -64,15 +64,15 @@ class QueryParts(msgspec.Struct, frozen=True):
     events: msgspec.Raw
 
 
-def signed_query(query: EventQuery, by: str) -> bytes:
+def sign_query(query: EventQuery, by: str) -> bytes:
     """Encode a signed query."""
     bare = msgspec.structs.replace(query, events=())
-    return signed(QueryParts(msgspec.Raw(encode(bare)), msgspec.Raw(encode(query.events))), by)
+    return sign(QueryParts(msgspec.Raw(encode(bare)), msgspec.Raw(encode(query.events))), by)
 
 
-def opened_query(payload: bytes, by: str) -> EventQuery:
-    """Decode a signed query. Raises EngineError as `opened` does."""
-    parts = opened(payload, QueryParts, by)
+def verify_query(payload: bytes, by: str) -> EventQuery:
+    """Decode a signed query. Raises EngineError as `verify` does."""
+    parts = verify(payload, QueryParts, by)
     query = decode(bytes(parts.query), EventQuery)
     return msgspec.structs.replace(query, events=_events(bytes(parts.events)))
 
@@ -85,7 +85,7 @@ def _events(payload: bytes) -> tuple[Event, ...]:
 
 def serve_director(session: Session, key: str, react: React, by: str = "") -> None:
     """Answer queries on `key` with the pure function `react`. by: version of its behaviours."""
-    session.serve(key, lambda payload: signed(react(opened_query(payload, by)), by))
+    session.serve(key, lambda payload: sign(react(verify_query(payload, by)), by))
 
 
 class RemoteDirector:
@@ -114,9 +114,7 @@ class RemoteDirector:
     def react(self, query: EventQuery) -> EventReply:
         """Return the director's reply. Raises DirectorLost on timeout or an invalid reply."""
         try:
-            reply = opened(
-                self._ask(signed_query(query, self._by), query.tick), EventReply, self._by
-            )
+            reply = verify(self._ask(sign_query(query, self._by), query.tick), EventReply, self._by)
             _check(reply, query)
         except (TimeoutError, EngineError) as error:
             why = str(error)[:LONGEST_REASON]

@@ -38,12 +38,12 @@ def serve_injections(session: Session, key: str, offer: Offer) -> None:
     """Answer injections, in JSON or MessagePack like the request. Errors become refusals."""
 
     def answer(payload: bytes) -> bytes:
-        return _encoded(answer_to(payload, offer), as_json=payload[:1] in _JSON_BEGINS)
+        return _encoded(answer_injection(payload, offer), as_json=payload[:1] in _JSON_BEGINS)
 
     session.serve(key, answer)
 
 
-def answer_to(payload: bytes, offer: Offer) -> Ack:
+def answer_injection(payload: bytes, offer: Offer) -> Ack:
     """Return the acknowledgement of a message."""
     if len(payload) > LARGEST_B:
         return Ack(

@@ -31,15 +31,15 @@ import numpy as np
 
 POLICY_PROTOCOL = 2
 """Version of the messages below, increased when their meaning changes."""
-MOST_WORDS = 500
+LONGEST_MESSAGE = 500
 """Longest quoted error message in characters."""
-MOST_MESSAGE_BYTES = 16 << 20
+LARGEST_MESSAGE_BYTES = 16 << 20
 """Largest message over Zenoh in bytes."""
 _WINDOW_S = 0.002
 """Seconds that a policy with act_batch waits for further requests before it answers a batch."""
 _MOST_SLOTS = 4096
 """Largest number of open episodes of a server; beyond it the longest idle one is dropped."""
-FORGET_AFTER_S = 300.0
+CLOSE_AFTER_S = 300.0
 """Seconds without a request after which a server drops an episode."""
 _TAKEN_OVER_AFTER_S = 30.0
 """Seconds without a request after which a policy object for one episode at a time is free again."""
@@ -60,7 +60,7 @@ class PackedArray(msgspec.Struct, frozen=True):
     jpeg: bool = False
 
 
-class AboutEpisode(msgspec.Struct, frozen=True):
+class EpisodeConstants(msgspec.Struct, frozen=True):
     """Constants of an episode. cameras: K (3 x 3), distortion (5), pose on the robot (4 x 4)."""
 
     robot: dict[str, Union[str, float]] = {}
@@ -80,13 +80,13 @@ class _EpisodeMessage(msgspec.Struct, frozen=True):
         return self.run, self.episode, self.attempt
 
 
-class AskReset(_EpisodeMessage, frozen=True, tag="reset"):
+class ResetRequest(_EpisodeMessage, frozen=True, tag="reset"):
     """Request: an episode begins."""
 
     seed: int
 
 
-class AskAct(_EpisodeMessage, frozen=True, tag="act"):
+class ActRequest(_EpisodeMessage, frozen=True, tag="act"):
     """Request: an observation.
 
     step: Number of this request, from 0.
@@ -104,11 +104,11 @@ class AskAct(_EpisodeMessage, frozen=True, tag="act"):
     goal: Optional[dict[str, Any]] = None
     odometry: Optional[tuple[float, float, Optional[float]]] = None
     arrays: dict[str, PackedArray] = {}
-    about: Optional[AboutEpisode] = None
+    about: Optional[EpisodeConstants] = None
     knowledge: bytes = b""
 
 
-class AskEnded(_EpisodeMessage, frozen=True, tag="ended"):
+class EndRequest(_EpisodeMessage, frozen=True, tag="ended"):
     """Request: the episode ended."""
 
 
@@ -127,11 +127,11 @@ class PolicyInfo(msgspec.Struct, frozen=True, tag="info"):
     protocol: int = POLICY_PROTOCOL
 
 
-class Begun(_EpisodeMessage, frozen=True, tag="begun"):
+class EpisodeReply(_EpisodeMessage, frozen=True, tag="begun"):
     """Reply: the policy was reset, or the episode was closed."""
 
 
-class Answer(_EpisodeMessage, frozen=True, tag="answer"):
+class ActReply(_EpisodeMessage, frozen=True, tag="answer"):
     """Reply: a command, waypoints, or with `planned` both."""
 
     step: int
@@ -154,8 +154,8 @@ class Refusal(msgspec.Struct, frozen=True, tag="refusal"):
     together: int = 1
 
 
-PolicyRequest = Union[AskReset, AskAct, AskEnded]
-PolicyReply = Union[Begun, Answer, Refusal]
+PolicyRequest = Union[ResetRequest, ActRequest, EndRequest]
+PolicyReply = Union[EpisodeReply, ActReply, Refusal]
 encode_message = msgspec.msgpack.Encoder().encode
 decode_request = msgspec.msgpack.Decoder(PolicyRequest).decode
 decode_reply = msgspec.msgpack.Decoder(PolicyReply).decode
@@ -164,7 +164,7 @@ UNREADABLE = (msgspec.DecodeError, RecursionError, ValueError, TypeError, Overfl
 """Exceptions that decoding may raise."""
 
 
-def packed(array: Any) -> PackedArray:
+def pack_array(array: Any) -> PackedArray:
     """Serialize an array."""
     array = np.ascontiguousarray(array)
     return PackedArray(array.dtype.str, tuple(array.shape), array.reshape(-1).view(np.uint8).data)
@@ -177,19 +177,19 @@ class PolicyFault(Exception):
         words = words.encode("utf-8", "replace").decode()
         words = "".join(c if c.isprintable() or c == "\n" else "?" for c in words)
         super().__init__(words)
-        self.words = words[: 2 * MOST_WORDS]
+        self.words = words[: 2 * LONGEST_MESSAGE]
         self.during = during
         self.together = together
 
 
-def said_by(error: BaseException) -> str:
+def error_text(error: BaseException) -> str:
     """Return the message of an error as printable text of bounded length."""
     try:
         text = str(PolicyFault(str(error)).args[0])
     except BaseException:  # noqa: BLE001  even the message of an error can raise
         return "(its message cannot be read)"
-    end = "" if len(text) <= MOST_WORDS else f" ... ({len(text)} characters)"
-    return text[:MOST_WORDS] + end
+    end = "" if len(text) <= LONGEST_MESSAGE else f" ... ({len(text)} characters)"
+    return text[:LONGEST_MESSAGE] + end
 
 
 @contextmanager
@@ -211,7 +211,7 @@ def policy_call(
         ignored = signal.getsignal(signal.SIGINT) is signal.SIG_IGN
         if isinstance(error, (PolicyFault, *passes, *([] if ignored else [KeyboardInterrupt]))):
             raise
-        said = said_by(error)
+        said = error_text(error)
         words = f"raised {type(error).__name__}{': ' * bool(said)}{said}{_line_of(error)}"
         raise PolicyFault(words) from error
     finally:
@@ -261,7 +261,7 @@ class EpisodeDecoder:
         "goal": lambda type, **fields: _PlainFields(**fields),
     }
 
-    def __init__(self, episode: str, about: AboutEpisode) -> None:
+    def __init__(self, episode: str, about: EpisodeConstants) -> None:
         self.episode = episode
         self.about = about
         self.robot = self.makes["robot"](**about.robot)
@@ -270,7 +270,7 @@ class EpisodeDecoder:
             parts = zip(("matrix", "distortion", "on_robot"), map(np.array, camera))
             self.cameras[name] = self.makes["camera"](**dict(parts))
 
-    def decoded(self, one: AskAct, arrays: dict[str, Any]) -> Any:
+    def decoded(self, one: ActRequest, arrays: dict[str, Any]) -> Any:
         """Return the observation in a request with these arrays."""
         makes = self.makes
         pictures = {}
@@ -325,7 +325,7 @@ class PolicyDesk:
         decoder: Any = EpisodeDecoder,
         timer: Any = None,
         batch: bool = True,
-        forget_after_s: float = FORGET_AFTER_S,
+        forget_after_s: float = CLOSE_AFTER_S,
     ) -> None:
         self._make: Any = policy if isinstance(policy, type) or not hasattr(policy, "act") else None
         self.policy: Any = policy if self._make is None else self._make()
@@ -357,11 +357,13 @@ class PolicyDesk:
 
         memories: Shared memory with the arrays of each request that are not in the message.
         """
-        began = {i: self._begin(one) for i, one in enumerate(requests) if isinstance(one, AskReset)}
+        began = {
+            i: self._begin(one) for i, one in enumerate(requests) if isinstance(one, ResetRequest)
+        }
         new = {}
         for one, memory in zip(requests, memories or [None] * len(requests)):
-            slot = self._slot(one) if isinstance(one, AskAct) else None
-            if slot is not None and isinstance(one, AskAct) and one.step == slot.step + 1:
+            slot = self._slot(one) if isinstance(one, ActRequest) else None
+            if slot is not None and isinstance(one, ActRequest) and one.step == slot.step + 1:
                 new[id(slot)] = slot, one, memory
         self._act(list(new.values()))
         return [began[i] if i in began else self._reply(one) for i, one in enumerate(requests)]
@@ -374,9 +376,9 @@ class PolicyDesk:
         if isinstance(one, Refusal):
             return one
         slot = self._slot(one)
-        if isinstance(one, AskEnded):
+        if isinstance(one, EndRequest):
             self._end((one.run, one.episode), slot)
-            return Begun(*one.signature)
+            return EpisodeReply(*one.signature)
         if slot is None:
             return Refusal("unknown", "this episode did not begin here, or was dropped")
         slot.used_at_s = time.monotonic()
@@ -384,7 +386,7 @@ class PolicyDesk:
             return Refusal("message", f"step {one.step} was requested after step {slot.step}")
         return slot.reply
 
-    def _begin(self, one: AskReset) -> PolicyReply:
+    def _begin(self, one: ResetRequest) -> PolicyReply:
         key = one.run, one.episode
         slot = self._slot(one)
         if slot is not None and slot.step < 0:  # a repeated request: the reply was lost
@@ -400,7 +402,7 @@ class PolicyDesk:
         with self._call([slot], "reset"):
             slot.policy = self.policy if self.batches else (self._idle or [self._make()]).pop()
             slot.policy.reset(slot.called, one.seed)
-            slot.reply = Begun(*one.signature)
+            slot.reply = EpisodeReply(*one.signature)
         return slot.reply
 
     def _end(self, key: tuple[str, str], slot: _Slot | None) -> None:
@@ -420,24 +422,24 @@ class PolicyDesk:
             if now - slot.used_at_s > self._forget_after_s or len(slots) - number >= _MOST_SLOTS:
                 self._end(key, slot)
 
-    def _act(self, requests: list[tuple[_Slot, AskAct, Any]]) -> None:
+    def _act(self, requests: list[tuple[_Slot, ActRequest, Any]]) -> None:
         """Query the policy and set the reply of each slot."""
         seen = [(slot, one, self._observation(slot, one, memory)) for slot, one, memory in requests]
         ready = [one for one in seen if one[2] is not None]
         for group in [ready] * bool(ready) if self.batches else [[one] for one in ready]:
             self._answer(group)
 
-    def _observation(self, slot: _Slot, one: AskAct, memory: Any) -> Any:
+    def _observation(self, slot: _Slot, one: ActRequest, memory: Any) -> Any:
         """Decode an observation and report a reset to the policy; None if refused."""
         slot.step = one.step
         slot.used_at_s = time.monotonic()
         try:
             if slot.decoder is None or one.about is not None:
-                slot.decoder = self._decoder(slot.called, one.about or AboutEpisode())
-            arrays = {name: unpacked(array, memory) for name, array in one.arrays.items()}
+                slot.decoder = self._decoder(slot.called, one.about or EpisodeConstants())
+            arrays = {name: unpack_array(array, memory) for name, array in one.arrays.items()}
             observation = slot.decoder.decoded(one, arrays)
         except Exception as error:  # noqa: BLE001  whatever is wrong with the message
-            slot.reply = Refusal("message", f"not an observation: {error}"[:MOST_WORDS])
+            slot.reply = Refusal("message", f"not an observation: {error}"[:LONGEST_MESSAGE])
             return None
         earlier = slot.reply
         if one.reset and callable(on_reset := getattr(slot.policy, "on_reset", None)):
@@ -445,7 +447,7 @@ class PolicyDesk:
                 on_reset(*([slot.called] if self._for_many else []))
         return observation if slot.reply is earlier else None
 
-    def _answer(self, group: list[tuple[_Slot, AskAct, Any]]) -> None:
+    def _answer(self, group: list[tuple[_Slot, ActRequest, Any]]) -> None:
         """Query the policy for a group; an invalid answer affects only its episode."""
         slots = [slot for slot, _, _ in group]
         doing = "act" if all(slot.answered for slot in slots) else "first act"
@@ -503,10 +505,10 @@ def read_request(payload: bytes) -> Union[PolicyRequest, Refusal]:
         request: PolicyRequest = decode_request(payload)
         return request
     except UNREADABLE as error:
-        return Refusal("message", f"not a question: {error}"[:MOST_WORDS])
+        return Refusal("message", f"not a question: {error}"[:LONGEST_MESSAGE])
 
 
-def unpacked(array: PackedArray, memory: Any = None) -> Any:
+def unpack_array(array: PackedArray, memory: Any = None) -> Any:
     """Return a copy of an array of an observation. Raises ValueError if invalid."""
     if array.jpeg:
         return _from_jpeg(array.data).reshape(array.shape)
@@ -520,22 +522,22 @@ def unpacked(array: PackedArray, memory: Any = None) -> Any:
     return np.frombuffer(memory, array.dtype, count, array.at).reshape(array.shape).copy()
 
 
-def _packed_answer(one: AskAct, answer: Any) -> Answer:
+def _packed_answer(one: ActRequest, answer: Any) -> ActReply:
     """Serialize an answer. Raises PolicyFault if invalid, and any exception of its attributes."""
     if isinstance(answer, dict) and set(answer) == {"v_mps", "w_radps"}:
         answer = SimpleNamespace(**answer)
     if not (hasattr(answer, "v_mps") and hasattr(answer, "w_radps")):
-        return Answer(*one.signature, one.step, waypoints=_packed_waypoints(answer))
+        return ActReply(*one.signature, one.step, waypoints=_packed_waypoints(answer))
     speeds = answer.v_mps, answer.w_radps
     numbers = (int, float, np.integer, np.floating)
     if not all(isinstance(v, numbers) and not isinstance(v, bool) for v in speeds):
-        shown = "Command(v_mps={!r}, w_radps={!r})".format(*speeds)[:MOST_WORDS]
+        shown = "Command(v_mps={!r}, w_radps={!r})".format(*speeds)[:LONGEST_MESSAGE]
         raise PolicyFault(f"answered {shown}: both must be finite numbers")
     v_mps, w_radps = map(_float, speeds)
     plan = getattr(answer, "waypoints", None)
     if plan is None:
-        return Answer(*one.signature, one.step, v_mps, w_radps)
-    return Answer(*one.signature, one.step, v_mps, w_radps, _packed_waypoints(plan), planned=True)
+        return ActReply(*one.signature, one.step, v_mps, w_radps)
+    return ActReply(*one.signature, one.step, v_mps, w_radps, _packed_waypoints(plan), planned=True)
 
 
 def _float(value: Any) -> float:
@@ -552,7 +554,7 @@ def _packed_waypoints(answer: Any) -> PackedArray:
         raise PolicyFault(f"answered {shown}: neither a Command nor waypoints")
     if array.nbytes > _MOST_ANSWER_BYTES:
         return PackedArray(array.dtype.str, array.shape)
-    return packed(array)
+    return pack_array(array)
 
 
 def serve(
@@ -670,7 +672,7 @@ def _opened(listen: str, connect: str, tls: str, insecure: bool) -> Any:
         "transport/shared_memory/enabled": False,
         "transport/link/tx/lease": 2000,
         "transport/link/tx/queue/size/data": 16,
-        "transport/link/rx/max_message_size": MOST_MESSAGE_BYTES,
+        "transport/link/rx/max_message_size": LARGEST_MESSAGE_BYTES,
     }
     if tls:
         ends = ("listen", "connect")

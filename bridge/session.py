@@ -19,7 +19,7 @@ from typing import Any, Literal, NamedTuple, Self
 
 import zenoh
 
-from bridge.security.settings import settings_alone, settings_of
+from bridge.security.settings import local_settings, session_settings
 from cosim.core.errors import AccessError, EngineError
 from cosim.spec.connection import Connection
 
@@ -30,7 +30,7 @@ _SOURCE_LINE = re.compile(r" at /\S+\.rs:\d+\.?")
 """Source location in Zenoh's errors."""
 
 _ANSWER = "answer"
-"""Last chunk of the key of replies in a `LoneSession`."""
+"""Last chunk of the key of replies in a `LocalSession`."""
 _ENCODINGS = (
     "zenoh/bytes",
     "application/msgpack",
@@ -77,14 +77,14 @@ class Query:
                 query.reply_err(words.encode())
 
 
-HowHeard = Literal["answered", "refused", "late", "nobody"]
+QueryOutcome = Literal["answered", "refused", "late", "nobody"]
 """Result of a query: reply, error reply, timeout, or no queryable."""
 
 
-class QueryHeard(NamedTuple):
+class QueryResult(NamedTuple):
     """Result of a query with the payload of its reply."""
 
-    how: HowHeard
+    how: QueryOutcome
     payload: bytes = b""
 
 
@@ -106,7 +106,7 @@ class Session:
         self._tokens: list[zenoh.LivelinessToken] = []
 
     @property
-    def itself(self) -> zenoh.Session:
+    def zenoh_session(self) -> zenoh.Session:
         """Zenoh's session, for `bridge.policy_server` only."""
         return self._session
 
@@ -232,7 +232,7 @@ class Session:
 
         self._subscribers.append(self._session.declare_subscriber(key, received))
 
-    def ask_once(self, key: str, payload: bytes, *, timeout_s: float) -> QueryHeard:
+    def ask_once(self, key: str, payload: bytes, *, timeout_s: float) -> QueryResult:
         """Send one query and return its first result."""
         began_s = time.monotonic()
         # Consolidation would delay a reply until all other queryables have finished.
@@ -241,12 +241,12 @@ class Session:
             key, payload=payload, timeout=timeout_s, consolidation=unconsolidated
         ):
             if reply.ok is not None:
-                return QueryHeard("answered", bytes(reply.ok.payload.to_bytes()))
+                return QueryResult("answered", bytes(reply.ok.payload.to_bytes()))
             message = bytes(reply.err.payload.to_bytes()) if reply.err is not None else b""
             if message != b"Timeout":
-                return QueryHeard("refused", message)
+                return QueryResult("refused", message)
         # If both ends time out at once, a query may end without that message.
-        return QueryHeard("late" if time.monotonic() - began_s >= timeout_s else "nobody")
+        return QueryResult("late" if time.monotonic() - began_s >= timeout_s else "nobody")
 
     def ask(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
         """Return the reply to a query, with retries until the timeout.
@@ -307,7 +307,7 @@ def _objection(query: zenoh.Query, key: str, *, found: bool) -> str:
     return ""
 
 
-class LoneSession(Session):
+class LocalSession(Session):
     """Session within one thread, without a socket: `ask` runs the handler itself.
 
     Query and reply are publications, because Zenoh's queries use a timer thread that adds latency
@@ -316,7 +316,7 @@ class LoneSession(Session):
 
     def __init__(self) -> None:
         super().__init__(
-            _open(settings_alone(), "cannot open a session", "Has this machine threads to spare?")
+            _open(local_settings(), "cannot open a session", "Has this machine threads to spare?")
         )
         self._served: list[tuple[_Subscriber, _Subscriber, Handler]] = []
 
@@ -367,14 +367,14 @@ def open_session(connection: Connection, say: Callable[[str], None] = lambda _: 
     ...         one.ask("cosim/r/status", b"well?", timeout_s=60.0)
     b'WELL?'
     """
-    notices = notices_of(connection)
+    notices = connection_warnings(connection)
     session = _listening(connection) if connection.listen else _connected(connection)
     for line in notices:
         say(line)
     return session
 
 
-def notices_of(connection: Connection) -> list[str]:
+def connection_warnings(connection: Connection) -> list[str]:
     """Return warnings about insecure settings and expiring certificates. Raises AccessError."""
     soon = ""
     if connection.tls:
@@ -391,13 +391,13 @@ def _listening(connection: Connection) -> Session:
     failure = f"cannot listen at {connection.listen}"
     if connection.listen.startswith("unixsock-stream/"):
         inside = Connection(role=connection.role, connect=connection.listen)
-        return Session(_open(settings_of(connection), failure, remedy), inside)
+        return Session(_open(session_settings(connection), failure, remedy), inside)
     short = tempfile.gettempdir() if len(tempfile.gettempdir()) < _LONGEST_FOLDER else "/tmp"
     folder = Path(tempfile.mkdtemp(prefix="cosim-", dir=short))
     inside = Connection(role=connection.role, connect=f"unixsock-stream/{folder}/hub.sock")
     try:
         return Session(
-            _open(settings_of(connection, [inside.connect]), failure, remedy), inside, folder
+            _open(session_settings(connection, [inside.connect]), failure, remedy), inside, folder
         )
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
@@ -408,13 +408,13 @@ def _connected(connection: Connection) -> Session:
     remedy = "Is a process started that listens there, by the same protocol and port?"
     try:
         return Session(
-            _open(settings_of(connection), f"no hub answers at {connection.connect}", remedy)
+            _open(session_settings(connection), f"no hub answers at {connection.connect}", remedy)
         )
     except EngineError as error:
         if connection.tls:
-            from bridge.security.identity import why_refused
+            from bridge.security.identity import refusal_reason
 
-            if why := why_refused(connection):
+            if why := refusal_reason(connection):
                 raise AccessError(why) from error
         raise
 

@@ -20,7 +20,7 @@ import sumo as eclipse_sumo  # noqa: F401  sets the path of SUMO's data
 
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats
-from cosim.core.state import frozen
+from cosim.core.state import write_protect
 
 
 @contextmanager
@@ -180,7 +180,7 @@ def close() -> None:
 
 
 @contextmanager
-def translated(doing: str) -> Iterator[None]:
+def sumo_errors(doing: str) -> Iterator[None]:
     """Raise SUMO's exceptions as EngineError. doing: the action, for the message."""
     try:
         yield
@@ -249,14 +249,14 @@ def _near(
     gap = xy - (x_m, y_m)
     distance_m2 = gap[:, 0] * gap[:, 0] + gap[:, 1] * gap[:, 1]
     near = np.sqrt(distance_m2) <= reach_m
-    return tuple(compress(names, near.tolist())), frozen(xy[near])
+    return tuple(compress(names, near.tolist())), write_protect(xy[near])
 
 
 def _of_each(getter: Callable[[str], float], names: Sequence[str]) -> Floats:
     return np.fromiter(map(getter, names), dtype=float, count=len(names))
 
 
-def put_crowd_stopwatch(timed: Callable[[str, Callable[[], None]], Callable[[], None]]) -> None:
+def time_crowd_steps(timed: Callable[[str, Callable[[], None]], Callable[[], None]]) -> None:
     """Replace SUMO's step by a timed one for the rest of this process, for benchmarks."""
     libsumo.simulationStep = timed("crowd", libsumo.simulationStep)
 

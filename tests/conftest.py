@@ -24,7 +24,7 @@ import pytest
 from hypothesis import HealthCheck, settings
 
 if TYPE_CHECKING:
-    from cosim.spec.episode_id import Pseudonym
+    from cosim.spec.episode_id import EpisodeId
     from cosim.spec.scenario import Scenario
 
 ROOT = Path(__file__).parents[1]
@@ -61,10 +61,10 @@ def still_runs(pid: int) -> bool:
 def seed_in_order(scenarios: Sequence[Scenario]) -> int:
     """The least seed of a run that goes through scenarios in the order in which they are given
     here."""
-    from cosim.spec.episode_id import pseudonym_of
+    from cosim.spec.episode_id import episode_id_of
 
-    def told(seed: int) -> list[Pseudonym]:
-        return [pseudonym_of(seed, scenario) for scenario in scenarios]
+    def told(seed: int) -> list[EpisodeId]:
+        return [episode_id_of(seed, scenario) for scenario in scenarios]
 
     return next(seed for seed in itertools.count() if told(seed) == sorted(told(seed)))
 

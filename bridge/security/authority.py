@@ -31,7 +31,7 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from bridge.security.identity import CA, CERTIFICATE, KEY, identity_in, said
+from bridge.security.identity import CA, CERTIFICATE, KEY, format_time, identity_in
 from cosim.core.errors import AccessError, UsageError, unwritable
 from cosim.core.files import atomic_folder
 from cosim.spec.connection import HUBS, Role
@@ -88,7 +88,7 @@ def issue(
     place = folder / role
     if place.exists():
         if not renew:
-            ends = said(identity_in(place).ends)
+            ends = format_time(identity_in(place).ends)
             raise UsageError(f"{place} is there, and valid until {ends}: --renew replaces it")
         names = names or [_name(host) for host in identity_in(place).hosts]
     if role in ("coordinator", "director") and not names:

@@ -98,14 +98,19 @@ def checked_identity(connection: Connection, now: datetime | None = None) -> str
     renew = f"`cosim certs role ... {found.role} --renew` makes another"
     if now > found.ends:
         raise AccessError(
-            f"{folder} has expired on {said(found.ends)} (here it is {said(now)}): {renew}"
+            f"{folder} has expired on {format_time(found.ends)} "
+            f"(here it is {format_time(now)}): {renew}"
         )
     if now < found.begins:
         raise AccessError(
-            f"{folder} is valid from {said(found.begins)}, and here it is {said(now)}: is "
-            f"this machine's clock right?"
+            f"{folder} is valid from {format_time(found.begins)}, and here it is "
+            f"{format_time(now)}: is this machine's clock right?"
         )
-    return f"{folder} expires on {said(found.ends)}: {renew}." if found.ends - now < SOON else ""
+    return (
+        f"{folder} expires on {format_time(found.ends)}: {renew}."
+        if found.ends - now < SOON
+        else ""
+    )
 
 
 def time_left(identity: Identity) -> str:
@@ -114,7 +119,7 @@ def time_left(identity: Identity) -> str:
     return f"{identity.ends:%Y-%m-%d} ({f'{days} days' if days >= 0 else 'expired'})"
 
 
-def said(moment: datetime) -> str:
+def format_time(moment: datetime) -> str:
     """Format a time."""
     return f"{moment:%Y-%m-%d %H:%M} UTC"
 
@@ -172,7 +177,7 @@ _OF_OURS: Final = {
 """Faults of our certificate by the end of the TLS alert's name."""
 
 
-def why_refused(connection: Connection) -> str:
+def refusal_reason(connection: Connection) -> str:
     """Return why the handshake fails; "" if it succeeds or there is no answer."""
     host, _, port = connection.connect.partition("/")[2].rpartition(":")
     host = host.strip("[]")

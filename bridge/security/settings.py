@@ -89,7 +89,7 @@ _ALL: Final = (
 """All types of messages in Zenoh's access control."""
 
 
-def access_of(connection: Connection) -> dict[str, object]:
+def access_settings(connection: Connection) -> dict[str, object]:
     """Return Zenoh's settings for the access rights and size limits of a hub.
 
     Empty for a Unix socket, which is protected by file permissions.
@@ -178,7 +178,7 @@ CONNECTS_WITHIN_S: Final = 2.0
 """Timeout in seconds to connect; a hub that was just started needs less."""
 
 
-def settings_alone() -> dict[str, object]:
+def local_settings() -> dict[str, object]:
     """Return the settings of a session without endpoints."""
     return _ALWAYS | {
         "mode": "peer",
@@ -188,7 +188,7 @@ def settings_alone() -> dict[str, object]:
     }
 
 
-def settings_of(connection: Connection, own: Sequence[str] = ()) -> dict[str, object]:
+def session_settings(connection: Connection, own: Sequence[str] = ()) -> dict[str, object]:
     """Return the settings of one end of a session.
 
     own: Further endpoints to listen at, for processes of this run.
@@ -211,4 +211,4 @@ def settings_of(connection: Connection, own: Sequence[str] = ()) -> dict[str, ob
             "enable_mtls": True,
             "verify_name_on_connect": True,
         }
-    return settings | (access_of(connection) if connection.listen else {})
+    return settings | (access_settings(connection) if connection.listen else {})

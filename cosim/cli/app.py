@@ -10,7 +10,7 @@ from rich.markup import escape
 
 from cosim.cli.bench import bench_app
 from cosim.cli.collect import collect_app, dataset_app
-from cosim.cli.console import err, told_streams
+from cosim.cli.console import err, guarded_streams
 from cosim.cli.installation import cache_app, installation_app
 from cosim.cli.network import certs_app, direct_app, live_app, serve_app
 from cosim.cli.options import LEARN, MEASURE, PLACES, STEP_IN, with_paths_checked
@@ -30,7 +30,7 @@ from cosim.cli.suites import list_app, suite_app
 from cosim.cli.train import train_app
 from cosim.cli.workers import coordinator_app, status_app
 from cosim.core.cache import cache_limit_bytes
-from cosim.core.errors import CosimError, of_file
+from cosim.core.errors import CosimError, file_error
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -88,7 +88,7 @@ def common(
 def main() -> None:
     """Run the command line. SIGTERM ends it like Ctrl-C: exit code 130, no half-written files."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    with told_streams():
+    with guarded_streams():
         try:
             with_paths_checked(typer.main.get_command(app))()
         except CosimError as error:
@@ -96,7 +96,7 @@ def main() -> None:
         except OSError as error:
             if error.filename is None:
                 raise
-            _end(of_file(error))
+            _end(file_error(error))
 
 
 def _end(error: CosimError) -> NoReturn:

@@ -269,7 +269,7 @@ def _percentiles(values: Floats, percent: Sequence[float]) -> str:
 
 
 bench_app = typer.Typer()
-NONE = ("none: see below", "")
+NO_FIGURE = ("none: see below", "")
 
 
 @bench_app.command(
@@ -429,7 +429,7 @@ def bench_cameras(rounds: int) -> None:
         rows.append(
             (
                 figure.name,
-                *(spread(fps) if fps else NONE),
+                *(spread(fps) if fps else NO_FIGURE),
                 "" if least is None else f">= {least:,.4g}",
             )
         )
@@ -437,7 +437,7 @@ def bench_cameras(rounds: int) -> None:
     ratios = []
     for name, above, below, target in RATIOS:
         values = [a / b for a, b in zip(found[above].fps, found[below].fps, strict=False)]
-        ratios.append((name, *(spread(values) if values else NONE), target))
+        ratios.append((name, *(spread(values) if values else NO_FIGURE), target))
     tables.show(
         out, [*tables.names("ratio"), *tables.figures("median", "spread", "target")], ratios
     )

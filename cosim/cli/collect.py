@@ -15,14 +15,14 @@ import typer
 
 from cosim.cli.console import err, out, say
 from cosim.cli.generated_options import Fields, configured
-from cosim.cli.options import LEARN, camera_here, check_output, replaced, size_called
+from cosim.cli.options import LEARN, camera_here, check_output, parse_size, replacement_note
 from cosim.cli.progress import doing, stages_in_lines
-from cosim.cli.run_progress import Board
+from cosim.cli.run_progress import ProgressDisplay
 from cosim.core.errors import INTERRUPTED, UsageError
 from cosim.spec.run_config import Option, RunConfig
 
 if TYPE_CHECKING:
-    from cosim.spec.demo_options import Collecting
+    from cosim.spec.demo_options import DemoOptions
     from cosim.spec.scenario import Scenario, Suite
     from scenarios.suites.new_scenarios import Fresh
     from scenarios.tools.dataset.collect import Gathered
@@ -127,13 +127,13 @@ class DemoConfig:
     ] = False
 
     @property
-    def collecting(self) -> Collecting:
+    def collecting(self) -> DemoOptions:
         """Return the settings of the recorded data. Raises UsageError, SpecError."""
         from cosim.spec.camera import CameraSpec
-        from cosim.spec.demo_options import Collecting
+        from cosim.spec.demo_options import DemoOptions
 
-        wide, high = size_called("--camera", self.size)
-        return Collecting(
+        wide, high = parse_size("--camera", self.size)
+        return DemoOptions(
             camera=CameraSpec(width=wide, height=high, fov_deg=self.fov, mount=self.mount),
             rate_hz=self.rate,
             waypoints=self.waypoints,
@@ -170,14 +170,14 @@ def collect_command(
 
     check_parquet()
     from cosim.spec.options import EpisodeOptions
-    from scenarios.runs.policy_host import known_driver
+    from scenarios.runs.policy_host import inspected_driver
     from scenarios.tools.dataset.collect import collect
 
     folder = config.out
     jobs = config.jobs or 1
     assert folder is not None
     collecting = demo.collecting
-    expert = known_driver(config.policy, PolicyHost(), jobs)
+    expert = inspected_driver(config.policy, PolicyHost(), jobs)
     options = EpisodeOptions.asked(replace(config, camera=camera_here(config.camera)))
     source = _source(config, demo)
     began_s = time.monotonic()
@@ -237,7 +237,7 @@ def _source(config: RunConfig, demo: DemoConfig) -> Suite | Fresh:
 
     from cosim.spec.robot import COURIER, robot_called
     from cosim.spec.scenario import split_called
-    from cosim.spec.selection import scenarios_chosen
+    from cosim.spec.selection import select_scenarios
     from scenarios.suites.catalog import load_suite, with_robot
     from scenarios.suites.new_scenarios import fresh, fresh_cities
 
@@ -266,7 +266,7 @@ def _source(config: RunConfig, demo: DemoConfig) -> Suite | Fresh:
             )
     split = split_called(config.split)
     whole = with_robot(load_suite(config.suite), config.robot)
-    chosen = scenarios_chosen(whole, config.scenario, None, config.event, split)
+    chosen = select_scenarios(whole, config.scenario, None, config.event, split)
     return msgspec.structs.replace(whole, scenarios=chosen)
 
 
@@ -274,7 +274,7 @@ def _source(config: RunConfig, demo: DemoConfig) -> Suite | Fresh:
 def _show_board(
     scenarios: Sequence[Scenario], done: set[str]
 ) -> Iterator[Callable[[object], None]]:
-    board = Board(scenarios, done)
+    board = ProgressDisplay(scenarios, done)
     with board.bars:
         yield board.tell
 
@@ -316,10 +316,10 @@ def pack(
 
     check_parquet()
     check_output(output, "packed arrays", (".npz",))
-    wanted = size_called("--size", size) if size else None
+    wanted = parse_size("--size", size) if size else None
     from scenarios.tools.dataset.read import packed_sets
 
-    instead = replaced(output)
+    instead = replacement_note(output)
     with doing("reading the rows") as progress:
         packed = packed_sets(folders, wanted, progress)
         progress("writing the arrays")

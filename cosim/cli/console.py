@@ -16,8 +16,8 @@ from typing import Annotated, Any, TextIO
 import typer
 from rich.console import Console
 
-from cosim.core.errors import BROKEN_MACHINE, UNREAD, unknown, unwritable
-from cosim.core.log_event import JOURNAL
+from cosim.core.errors import BROKEN_MACHINE, BROKEN_PIPE, unknown, unwritable
+from cosim.core.log_event import LOGGER
 from cosim.spec.run_config import help_of
 
 out = Console(emoji=False)
@@ -64,16 +64,16 @@ def logged(level: str, json_file: Path | None) -> Iterator[Counter[str]]:
                 )
             except OSError as error:
                 raise unwritable(json_file, error) from error
-        before = JOURNAL.level
-        JOURNAL.setLevel(min(lowest, logging.INFO))
+        before = LOGGER.level
+        LOGGER.setLevel(min(lowest, logging.INFO))
         for one in handlers:
-            JOURNAL.addHandler(one)
+            LOGGER.addHandler(one)
         try:
             yield counts
         finally:
-            JOURNAL.setLevel(before)
+            LOGGER.setLevel(before)
             for one in handlers:
-                JOURNAL.removeHandler(one)
+                LOGGER.removeHandler(one)
 
 
 class _Handler(logging.Handler):
@@ -162,7 +162,7 @@ class Stream:
         except OSError as error:
             raise Unwritable(self, error) from None
 
-    def let_go(self) -> None:
+    def discard_rest(self) -> None:
         """Discard buffered output, which the interpreter would fail to write at its end."""
         with suppress(OSError):
             nowhere = os.open(os.devnull, os.O_WRONLY)
@@ -171,7 +171,7 @@ class Stream:
 
 
 @contextmanager
-def told_streams() -> Iterator[None]:
+def guarded_streams() -> Iterator[None]:
     """Run a block with guarded standard streams.
 
     Output that finds a full disk ends the program with one line and exit code 3. Output without a
@@ -188,9 +188,9 @@ def told_streams() -> Iterator[None]:
             if out is not None:
                 out.flush()
     except Unwritable as lost:
-        lost.stream.let_go()
+        lost.stream.discard_rest()
         if isinstance(lost.reason, BrokenPipeError):
-            raise SystemExit(UNREAD) from None
+            raise SystemExit(BROKEN_PIPE) from None
         with suppress(Unwritable):
             print(
                 f"error: standard output cannot be written: {lost.reason.strerror}",
@@ -198,7 +198,7 @@ def told_streams() -> Iterator[None]:
                 flush=True,
             )
         if err is not None:
-            err.let_go()
+            err.discard_rest()
         raise SystemExit(BROKEN_MACHINE) from None
     finally:
         sys.stdout, sys.stderr = before

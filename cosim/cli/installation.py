@@ -22,7 +22,7 @@ from cosim.core.cache import (
     cache_entries,
     cache_folder,
     cache_limit_bytes,
-    forget_entries,
+    clean_up,
 )
 from cosim.core.errors import BROKEN_MACHINE, SOME_CRASHED, EngineError, UsageError, unknown
 from cosim.core.units import bytes_in_words, duration
@@ -67,7 +67,7 @@ def show_cache(
         raise UsageError("--unused-for says what --prune removes: give --prune, too")
     if prune:
         days = UNUSED_S / _DAY_S if unused_for is None else unused_for
-        gone = forget_entries(days * _DAY_S if days else -math.inf, limit_bytes)
+        gone = clean_up(days * _DAY_S if days else -math.inf, limit_bytes)
         in_use = f"; {len(gone.in_use)} in use stay" if gone.in_use else ""
         out.print(
             f"Removed: {_counted(len(gone.entries))}, {bytes_in_words(gone.size_bytes)}{in_use}",

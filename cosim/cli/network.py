@@ -137,11 +137,13 @@ def direct(
     reaches the same state hash. A run with other source code is refused.
     """
     from bridge.session import open_session
-    from scenarios.episodes.director import behaviours, direct_all
+    from scenarios.episodes.director import behaviour_version, serve_all_directors
 
     with open_session(listening("director", "--listen", listen, tls, insecure), notice) as session:
-        direct_all(session)
-        print(f"directing at {listen}, behaviours {behaviours()}; stop with Ctrl-C", flush=True)
+        serve_all_directors(session)
+        print(
+            f"directing at {listen}, behaviours {behaviour_version()}; stop with Ctrl-C", flush=True
+        )
         try:
             while True:
                 time.sleep(3600.0)
@@ -375,7 +377,7 @@ def serve_command(
     from bridge.policy_server import serve
     from bridge.session import open_session
     from cosim.episode.interfaces import Policy
-    from cosim.episode.policy_caller import Untimed
+    from cosim.episode.policy_caller import NoTimer
     from cosim.policies.load import load_policy
     from scenarios.ipc.observation_codec import ObservationDecoder
 
@@ -388,7 +390,7 @@ def serve_command(
     spare = [first.policy]
 
     def another() -> Policy:
-        return spare.pop() if spare else load_policy(policy, Untimed()).policy
+        return spare.pop() if spare else load_policy(policy, NoTimer()).policy
 
     if connect:
         connection = connecting("policy", "--connect", connect, tls, insecure)
@@ -404,6 +406,6 @@ def serve_command(
             manifest=first.manifest,
             source=first.source_hash,
             decoder=ObservationDecoder,
-            session=session.itself,
+            session=session.zenoh_session,
         )
     raise typer.Exit(INTERRUPTED)

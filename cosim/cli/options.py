@@ -16,7 +16,7 @@ import typer
 
 from cosim.cli.console import err, out
 from cosim.cli.progress import doing
-from cosim.core.errors import MachineError, UsageError, too_long, unwritable
+from cosim.core.errors import MachineError, UsageError, path_too_long, unwritable
 from cosim.spec.connection import Connection, Role
 from cosim.spec.run_config import CameraChoice, help_of
 
@@ -37,7 +37,7 @@ def camera_here(choice: CameraChoice) -> Literal["gl", "bullet", "bullet-egl"]:
     return name
 
 
-def size_called(option: str, words: str, span: tuple[int, int] = (1, 9999)) -> tuple[int, int]:
+def parse_size(option: str, words: str, span: tuple[int, int] = (1, 9999)) -> tuple[int, int]:
     """Return (width, height) of a text such as "160x90".
 
     option: its name, for the error message.
@@ -58,26 +58,26 @@ def size_called(option: str, words: str, span: tuple[int, int] = (1, 9999)) -> t
 DEFAULT = "tcp/127.0.0.1:7447"
 DIRECTOR = "tcp/127.0.0.1:7448"
 POLICIES_AT = "tcp/127.0.0.1:7449"
-EVERY_ADDRESS = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
+WILDCARD_ADDRESSES = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
 """Wildcard addresses, and the loopback address by which a machine reaches itself."""
 
 Tls = Annotated[str, typer.Option("--tls", metavar="FOLDER", help=help_of("tls"))]
 Insecure = Annotated[bool, typer.Option("--insecure", help=help_of("insecure"))]
 
 
-def reached_by(hub: Connection, role: Role) -> str:
+def connect_options(hub: Connection, role: Role) -> str:
     """Return the options with which a command in a role connects to a hub from this machine.
 
     Returns: the options with a leading space.
     """
     protocol, _, address = hub.listen.partition("/")
     host, _, port = address.rpartition(":")
-    if host in EVERY_ADDRESS:
-        address = f"{_certified_host(hub.tls) if hub.tls else EVERY_ADDRESS[host]}:{port}"
+    if host in WILDCARD_ADDRESSES:
+        address = f"{_certified_host(hub.tls) if hub.tls else WILDCARD_ADDRESSES[host]}:{port}"
     options = ["--connect", f"{protocol}/{address}"]
     if hub.tls:
         options += ["--tls", str(Path(hub.tls).parent / role)]
-    elif hub.insecure and not hub.of_this_machine and host not in EVERY_ADDRESS:
+    elif hub.insecure and not hub.is_local and host not in WILDCARD_ADDRESSES:
         options += ["--insecure"]
     return " " + shlex.join(options)
 
@@ -116,13 +116,13 @@ def _check(path: Path) -> None:
         os.lstat(path)
     except OSError as error:
         if error.errno == errno.ENAMETOOLONG:
-            raise too_long(path) from None
+            raise path_too_long(path) from None
 
 
 PICTURES = (".png", ".jpg", ".jpeg")
 
 
-def replaced(path: Path | None) -> str:
+def replacement_note(path: Path | None) -> str:
     """Return the remark for a file that is about to be replaced, or "". Call before writing."""
     return ", in place of the one that was there" if path is not None and path.exists() else ""
 
@@ -180,7 +180,7 @@ def write_rerun(folder: Path, episodes: list[str], path: Path | None) -> None:
         return
     from scenarios.tools.viewing.rerun_file import record_for_rerun
 
-    instead = replaced(path)
+    instead = replacement_note(path)
     with doing(f"recording {episodes[0]}") as progress:
         record_for_rerun(folder, episodes[0], path, progress=progress)
     size = f"{path.stat().st_size / 1e6:.1f} MB, the state hash is the record's"

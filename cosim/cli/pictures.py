@@ -10,7 +10,7 @@ import typer
 
 from cosim.cli import tables
 from cosim.cli.console import out
-from cosim.cli.options import LOOK, Camera, camera_here, check_output, replaced, size_called
+from cosim.cli.options import LOOK, Camera, camera_here, check_output, parse_size, replacement_note
 from cosim.cli.progress import doing
 from cosim.core.errors import MachineError, UsageError, listed, unknown
 from cosim.spec.run_config import help_of
@@ -37,12 +37,12 @@ def export(
 ) -> None:
     """Export the street along a scenario's route as glTF, with buildings, trees and furniture."""
     check_output(output, "glTF", (".glb",))
-    from cosim.spec.selection import scenarios_chosen
+    from cosim.spec.selection import select_scenarios
     from scenarios.suites.catalog import holding, load_suite
     from scenarios.tools.viewing.export import export_street
 
-    (one,) = scenarios_chosen(holding(scenario) if suite is None else load_suite(suite), [scenario])
-    instead = replaced(output)
+    (one,) = select_scenarios(holding(scenario) if suite is None else load_suite(suite), [scenario])
+    instead = replacement_note(output)
     with doing("reading the scenario") as progress:
         tiles = export_street(one, output, progress)
     size = f"{tiles} tiles, {output.stat().st_size / 1e6:.1f} MB"
@@ -123,12 +123,12 @@ def film(
             f"{folder}: name one of its episodes, or give --failure: {_episodes(folder)}"
         )
     from_s, until_s = from_s if start is None else start, until_s if end is None else end
-    instead = replaced(output)
+    instead = replacement_note(output)
     with doing("choosing the camera") as progress:
         cut = Cut(
             from_s,
             until_s,
-            size_called("--size", size, (16, 4096)),
+            parse_size("--size", size, (16, 4096)),
             speed,
             camera_here(camera),
             picked,
@@ -197,7 +197,7 @@ def look(
     from scenarios.tools.viewing.look import look_at
 
     picked = view_of(view)
-    pixels = size_called("--size", size, (16, 4096))
+    pixels = parse_size("--size", size, (16, 4096))
     check_output(output)
     found, of = one_scenario(scenario, suite, which)
     changed = with_crowd(
@@ -211,7 +211,7 @@ def look(
     more = "" if which or of == 1 else f"; 1 of {of} scenarios: --scenario chooses another"
     with doing("choosing the camera") as progress:
         image, time_s = look_at(one, policy, at, picked, pixels, camera_here(camera), progress)
-    instead = replaced(output)
+    instead = replacement_note(output)
     _save(image, output)
     out.print(
         f"Picture: {output} ({one.id} at {time_s:.2f} s, {view}{more}){instead}",
@@ -249,12 +249,12 @@ def compare_one(
 ) -> None:
     """Simulate an episode's street again without the robot, and print the delays it caused."""
     from cosim.results.delay import DELAY_NEAR_M
-    from scenarios.episodes.replay import check, compared, recorded
+    from scenarios.episodes.replay import check_state_hash, load_recorded, replay_and_compare
 
     with doing(f"reading {episode}") as progress:
-        record = recorded(folder, episode)
-        state_hash, found = compared(record, progress)
-    check(folder, record, state_hash)
+        record = load_recorded(folder, episode)
+        state_hash, found = replay_and_compare(record, progress)
+    check_state_hash(folder, record, state_hash)
     rows = []
     for name, delay in (("people", found.people), ("vehicles", found.vehicles)):
         near = (f"{delay.near_s:+.1f}", str(delay.near))
@@ -278,10 +278,10 @@ def replay(
     episode: Annotated[str, typer.Argument(help="One of its episodes.")],
 ) -> None:
     """Run a finished episode again from its record, and compare the state hash."""
-    from scenarios.episodes.replay import check, recorded, replayed
+    from scenarios.episodes.replay import check_state_hash, load_recorded, replay_state_hash
 
     with doing(f"reading {episode}") as progress:
-        record = recorded(folder, episode)
-        again = replayed(record, progress=progress)
-    check(folder, record, again)
+        record = load_recorded(folder, episode)
+        again = replay_state_hash(record, progress=progress)
+    check_state_hash(folder, record, again)
     out.print(f"{episode}: state hash {again}, as recorded", highlight=False)

@@ -20,9 +20,9 @@ from rich.progress import (
 
 from cosim.cli import tables
 from cosim.cli.console import err, out, say
-from cosim.cli.options import replaced
+from cosim.cli.options import replacement_note
 from cosim.cli.progress import doing
-from cosim.core.bounding_box import box_of, refuse_outside
+from cosim.core.bounding_box import check_overlap, parse_box
 from cosim.core.errors import SOME_CRASHED, WRONG_USE, MapError, UsageError
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ _FIGURES: tuple[tuple[str, Callable[[Survey], float], str], ...] = (
 )
 """Columns of the table of cities: head, value, format."""
 
-MEANING = (
+TABLE_LEGEND = (
     "straight, curve, S: streets; T, X, Y, round: junctions; walk km, walk %: sidewalks, share of "
     "the city's area; cross, lit, mid, refuge: crossings, with signals, in mid-street, with an "
     "island; drive: driveways; props: street furniture; side m: least width next to it on any "
@@ -134,12 +134,12 @@ def draw_city(
     from sumo_nets.city.store import city_net
     from sumo_nets.net.snapshot import street_map_of
 
-    part = (0.0, 0.0, size, size) if zoom is None else box_of("--zoom", zoom, "x0,y0,x1,y1")
+    part = (0.0, 0.0, size, size) if zoom is None else parse_box("--zoom", zoom, "x0,y0,x1,y1")
     city = City(seed=seed, size_m=size, style=style)
-    instead = replaced(picture)
+    instead = replacement_note(picture)
     with doing(f"building {city.name}") as progress:
         street_map = street_map_of(city_net(city))
-        refuse_outside("--zoom", part, street_map.bounds)
+        check_overlap("--zoom", part, street_map.bounds)
         progress("drawing")
         write_png(_picture(street_map, part), picture)
     out.print(f"Picture: {picture}{instead}", soft_wrap=True)
@@ -170,7 +170,7 @@ def print_cities(found: Sequence[Survey]) -> None:
     tables.show(
         out, [*tables.names("zone"), *tables.figures("narrowest m", "median m", "widest m")], zones
     )
-    out.print(MEANING)
+    out.print(TABLE_LEGEND)
     faulty = [(one.seed, fault) for one in found for fault in one.faults]
     for seed, fault in faulty:
         say(f"city {seed}: {fault}")
@@ -264,7 +264,7 @@ def import_(
     from sumo_nets.maps.importer import Options
     from sumo_nets.maps.map_store import checked_map, import_map
 
-    box = None if bbox is None else box_of("--bbox", bbox)
+    box = None if bbox is None else parse_box("--bbox", bbox)
     options = Options(bbox=box, lefthand=lefthand, as_is=as_is, sidewalk_width_m=sidewalk_width)
     with doing(f"reading {file.name}") as progress:
         about = import_map(file, name, options, progress)
@@ -299,10 +299,10 @@ def report_map_check(
     as_json: Annotated[bool, typer.Option("--json", help="Print the check as JSON.")] = False,
 ) -> None:
     """Print a map's description, defects and uses. Exit code 2: it is not usable."""
-    part = None if zoom is None else box_of("--zoom", zoom)
+    part = None if zoom is None else parse_box("--zoom", zoom)
     if part is not None and picture is None:
         raise UsageError("--zoom is for the picture: say where to write it with -o")
-    instead = replaced(picture)
+    instead = replacement_note(picture)
     with doing(f"checking {place}") as progress:
         street_map, found, about = _look_up(place)
         capacity = _capacity(street_map, found)
@@ -312,7 +312,7 @@ def report_map_check(
             from sumo_nets.maps.map_store import credit_of
 
             if part is not None:
-                refuse_outside("--zoom", part, street_map.bounds)
+                check_overlap("--zoom", part, street_map.bounds)
             progress("drawing")
             credit = "" if about is None else credit_of(CityMap(map=about.name))
             write_png(draw_map(street_map, found, part, credit), picture)
@@ -347,9 +347,9 @@ def endure_map(
     """Simulate crowd and traffic around a robot that drives anywhere. Exit code 1: SUMO died."""
     from cosim.core.clock import Clock
     from scenarios.tools.bench.places import endure as endured_on
-    from sumo_nets.maps.place_names import place_called
+    from sumo_nets.maps.place_names import resolve_place
 
-    places = [place_called(name) for name in maps]
+    places = [resolve_place(name) for name in maps]
     rows = []
     failed = False
     for name, where in zip(maps, places, strict=True):
@@ -456,13 +456,13 @@ def _look_up(called: str) -> tuple[StreetMap, MapCheck, About | None]:
     from cosim.spec.scenario import CityMap
     from sumo_nets.city.store import city_net
     from sumo_nets.maps.map_store import checked_map
-    from sumo_nets.maps.place_names import place_called
+    from sumo_nets.maps.place_names import resolve_place
     from sumo_nets.net.net_facts import read_facts
     from sumo_nets.net.snapshot import street_map_of
 
     path = Path(called)
     if not path.is_file():
-        where = place_called(called)
+        where = resolve_place(called)
         if isinstance(where, CityMap):
             return checked_map(where.map)
         path = city_net(where)

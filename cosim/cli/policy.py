@@ -11,10 +11,10 @@ from rich.text import Text
 
 from cosim.cli import tables
 from cosim.cli.console import out
-from cosim.cli.options import Camera, Insecure, Tls, camera_here, check_output, replaced
+from cosim.cli.options import Camera, Insecure, Tls, camera_here, check_output, replacement_note
 from cosim.cli.progress import doing
 from cosim.core.errors import SOME_CRASHED, unknown
-from cosim.spec.run_config import ends_of_run
+from cosim.spec.run_config import run_connections
 
 if TYPE_CHECKING:
     from scenarios.tools.policy_check.checks import CheckedPolicy
@@ -76,12 +76,12 @@ def check_policy(
 
     if picture is not None:
         check_output(picture, endings=(".png",))
-    instead = replaced(picture)
+    instead = replacement_note(picture)
     for check in only or ():
         if check not in POLICY_CHECKS:
             raise unknown("check", check, POLICY_CHECKS)
     asked_goal = goal_called(goal) if goal else None
-    servers = ends_of_run(None, None, policy_at or (), tls, insecure).servers
+    servers = run_connections(None, None, policy_at or (), tls, insecure).servers
     driver = policy_driver(name, PolicyHost(servers=servers, run=token_hex(8)))
     try:
         manifest = with_goal(driver.manifest, asked_goal)

@@ -14,7 +14,7 @@ from cosim.cli.console import err
 from cosim.core.progress import Progress, time_left_s
 from cosim.core.units import duration
 
-AGAIN_S = 30.0
+REPEAT_S = 30.0
 """Seconds between the lines of a long stage whose share is known, without a terminal."""
 
 
@@ -62,7 +62,7 @@ def stages_in_lines(console: Console = err, first: str = "") -> Progress:
         if stage != shown:
             shown, began, last = stage, now_s, now_s
             console.print(f"{stage} ...", soft_wrap=True, markup=False, highlight=False)
-        elif share is not None and now_s - last >= AGAIN_S:
+        elif share is not None and now_s - last >= REPEAT_S:
             last = now_s
             words = (
                 f"{stage_in_words(stage, share, now_s - began)}, after {duration(now_s - began)}"

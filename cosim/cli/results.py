@@ -18,7 +18,7 @@ from cosim.cli.options import (
     Camera,
     camera_here,
     check_output,
-    replaced,
+    replacement_note,
     write_rerun,
 )
 from cosim.cli.progress import doing
@@ -65,7 +65,7 @@ def compare(
             )
     with doing(f"comparing {len(folders)} runs"):
         comparison = compare_runs(folders)
-    instead = {path: replaced(path) for path in outputs or ()}
+    instead = {path: replacement_note(path) for path in outputs or ()}
     for path in outputs or ():
         if path.suffix == ".csv":
             _write(path, comparison.differences.to_csv(index=False))
@@ -142,7 +142,7 @@ def report(
     check_output(output, "a page", (".html", ".htm"))
     from scenarios.tools.viewing.report import make_report
 
-    instead = replaced(output)
+    instead = replacement_note(output)
     with doing("choosing the camera") as progress:
         drawn_by = camera_here(camera)
         made = make_report(
@@ -263,7 +263,7 @@ def show(
         )
     if record.ended is not None:
         path = picture or folder / "episodes" / episode / "above.png"
-        instead = replaced(picture)
+        instead = replacement_note(picture)
         with doing(f"drawing {episode}"):
             draw_episode(folder, episode, path)
         out.print(f"Picture: {path}{instead}", soft_wrap=True)

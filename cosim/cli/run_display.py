@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 import typer
 
 from cosim.cli.console import err, logged, notice, out
-from cosim.cli.options import NO_OPENGL, check_rerun, reached_by, write_rerun
-from cosim.cli.run_progress import Board, EpisodeBars
+from cosim.cli.options import NO_OPENGL, check_rerun, connect_options, write_rerun
+from cosim.cli.run_progress import EpisodeBars, ProgressDisplay
 from cosim.cli.run_table import kinds_of, print_by_kind, print_next_commands, print_table
 from cosim.core.errors import INTERRUPTED, SOME_CRASHED
-from cosim.results.throughput import Figures, Going
+from cosim.results.throughput import Throughput, ThroughputTimer
 from cosim.spec.connection import Connection
-from cosim.spec.episode_id import pseudonym_of
+from cosim.spec.episode_id import episode_id_of
 from cosim.spec.run_config import RunConfig
 
 if TYPE_CHECKING:
@@ -40,9 +40,9 @@ def run_in_terminal(config: RunConfig, carrier: Carrier | None = None) -> None:
     """
     terminal = Terminal(config, of_here=carrier is None and not config.on)
     with _noticed_if_not_begun(config.out):
-        from scenarios.runs.run import carry_out
+        from scenarios.runs.run import execute_run
 
-        table = carry_out(config, reporter=terminal, carrier=carrier)
+        table = execute_run(config, reporter=terminal, carrier=carrier)
     _print_end(terminal, table)
 
 
@@ -56,7 +56,7 @@ class Terminal(EpisodeBars):
 
     plan: PlannedRun
     folder: Path
-    figures: Figures | None = None
+    figures: Throughput | None = None
 
     def __init__(self, config: RunConfig, *, of_here: bool) -> None:
         self._config = config
@@ -82,19 +82,19 @@ class Terminal(EpisodeBars):
     @contextmanager
     def running(self, plan: PlannedRun, run: HeldRun) -> Iterator[MessageHandler]:
         """Show the progress of episodes and, after Ctrl-C, the command that continues."""
-        from scenarios.runs.eta import remembered
+        from scenarios.runs.eta import recording_durations
 
         config = self._config
         self._print_beginning(plan, run)
         done = {one.id for one in plan.picked} - {one.id for one in run.todo}
-        board = Board(plan.picked, done, compared=config.counterfactual, pace=config.pace)
-        going = Going(run.held.path, [one.id for one in run.todo], self._counts)
+        board = ProgressDisplay(plan.picked, done, compared=config.counterfactual, pace=config.pace)
+        going = ThroughputTimer(run.held.path, [one.id for one in run.todo], self._counts)
         try:
             with ExitStack() as stack:
                 stack.callback(going.end)
                 if self._of_here:
                     stack.enter_context(
-                        remembered(run.held, run.todo, config.jobs or 1, config.pace)
+                        recording_durations(run.held, run.todo, config.jobs or 1, config.pace)
                     )
                 stack.enter_context(board.bars)
                 yield board.tell
@@ -150,11 +150,13 @@ def _print_live_commands(hub: Connection, run: HeldRun, *, several: bool, paced:
     """
     from bridge import keys
 
-    first = min(run.todo, key=partial(pseudonym_of, run.held.spec.setup.seed))
+    first = min(run.todo, key=partial(episode_id_of, run.held.spec.setup.seed))
     env = f" --env {keys.chunk(run.held.path.name)}/{keys.chunk(first.id)}" if several else ""
     notice(f"On the air at {hub.listen}. From another terminal:")
-    notice(f"  cosim listen events{reached_by(hub, 'viewer')}{env} --wait 60")
-    notice(f"  cosim inject '{_EXAMPLE_PEDESTRIAN}'{reached_by(hub, 'injector')}{env} --wait 60")
+    notice(f"  cosim listen events{connect_options(hub, 'viewer')}{env} --wait 60")
+    notice(
+        f"  cosim inject '{_EXAMPLE_PEDESTRIAN}'{connect_options(hub, 'injector')}{env} --wait 60"
+    )
     if not paced:
         notice(
             "It runs as fast as it can. --pace 1 holds it to real time, so that there is "

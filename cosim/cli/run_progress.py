@@ -29,13 +29,13 @@ SETUP_M = 30.0
 """Metres of route that take as long to simulate as the start of an episode."""
 PACED_SETUP_M = 3.0
 """The same per unit of pace in a paced run, whose episodes take longer while starts do not."""
-ALONE = 0.74
+EPISODE_SHARE = 0.74
 """Share of the episode itself in the work of an episode with a counterfactual."""
-BAR = 12
+BAR_COLUMNS = 12
 """Width of a bar in characters, so that the display fits 80 columns."""
 
 
-class Left:
+class RemainingWork:
     """Remaining work of a run. An episode weighs its route length plus its start, in metres.
 
     lengths_m: route length by scenario id.
@@ -66,7 +66,7 @@ class Left:
         return time_left_s(self.share, since_s)
 
 
-class Board:
+class ProgressDisplay:
     """Progress display of a run: a bar for the run and one for each running episode.
 
     done: ids of the scenarios that were finished before.
@@ -87,13 +87,15 @@ class Board:
         text = ("{task.description}", "{task.fields[count]}", "{task.fields[note]}")
         name, count, note = (TextColumn(words, markup=False) for words in text)
         self.bars = Progress(
-            name, BarColumn(BAR), count, note, TimeElapsedColumn(), console=console
+            name, BarColumn(BAR_COLUMNS), count, note, TimeElapsedColumn(), console=console
         )
         lengths_m = {s.id: s.route_line.length_m for s in scenarios if s.id not in done}
-        self.left = Left(lengths_m, min(SETUP_M, PACED_SETUP_M * pace) if pace else SETUP_M)
+        self.left = RemainingWork(
+            lengths_m, min(SETUP_M, PACED_SETUP_M * pace) if pace else SETUP_M
+        )
         self._scenarios = {s.id: s for s in scenarios}
         self._finished = len(done)
-        self._alone = ALONE if compared else 1.0
+        self._alone = EPISODE_SHARE if compared else 1.0
         self._console = console
         self._clock = clock
         self._began_s = clock()
@@ -184,6 +186,8 @@ class EpisodeBars:
     @contextmanager
     def running(self, plan: PlannedRun, run: HeldRun) -> Iterator[MessageHandler]:
         """Show the progress of the episodes."""
-        board = Board(plan.picked, {one.id for one in plan.picked} - {one.id for one in run.todo})
+        board = ProgressDisplay(
+            plan.picked, {one.id for one in plan.picked} - {one.id for one in run.todo}
+        )
         with board.bars:
             yield board.tell

@@ -16,9 +16,9 @@ from cosim.results.metrics import COUNTERFACTUAL, SUCCESS_IN_WORDS
 from cosim.results.table import (
     INJECTED,
     injections_in_words,
-    not_to_be_quoted,
     policy_in_words,
     summary_of,
+    why_inconclusive,
 )
 from cosim.spec.scenario import Scenario, read_suite
 
@@ -154,7 +154,7 @@ def print_statuses(out: Console, table: pd.DataFrame, scheduled: int) -> None:
             markup=False,
             highlight=False,
         )
-    if reason := not_to_be_quoted(table, scheduled):
+    if reason := why_inconclusive(table, scheduled):
         out.print(f"not to be quoted: {reason}", soft_wrap=True, highlight=False)
 
 
@@ -250,11 +250,11 @@ def kinds_of(folder: Path) -> Mapping[str, str]:
     """Return each scenario's structure, or the kind of its single event, or ""."""
     scenarios = read_suite(folder / "scenarios.json").scenarios
     return {
-        s.id: s.structure or (s.events[0].kind if about_one_event(s) else "") for s in scenarios
+        s.id: s.structure or (s.events[0].kind if has_single_event(s) else "") for s in scenarios
     }
 
 
-def about_one_event(scenario: Scenario) -> bool:
+def has_single_event(scenario: Scenario) -> bool:
     """Return whether a scenario tests its single event."""
     return scenario.ends_on_failure and len(scenario.events) == 1
 

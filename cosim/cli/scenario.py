@@ -14,9 +14,9 @@ import typer
 from cosim.cli import tables
 from cosim.cli.console import err, notice, out, say
 from cosim.cli.generated_options import Fields, configured
-from cosim.cli.options import camera_here, check_rerun, replaced, write_rerun
+from cosim.cli.options import camera_here, check_rerun, replacement_note, write_rerun
 from cosim.cli.progress import doing
-from cosim.core.bounding_box import box_of, refuse_outside
+from cosim.core.bounding_box import check_overlap, parse_box
 from cosim.core.errors import (
     INTERRUPTED,
     SOME_CRASHED,
@@ -177,13 +177,13 @@ def draw_own(
     from scenarios.suites.user_scenarios.read import read_own
     from sumo_nets.maps.map_store import credit_of
 
-    part = None if zoom is None else box_of("--zoom", zoom)
+    part = None if zoom is None else parse_box("--zoom", zoom)
     own = read_own(file)
     variants = {variant.id: variant for variant in own.variants}
     if scenario is not None and scenario not in variants:
         raise unknown("scenario", scenario, variants)
     variant = variants[scenario] if scenario else own.variants[0]
-    instead = replaced(picture)
+    instead = replacement_note(picture)
     with doing(f"drawing {variant.id}"):
         made = made_one(variant, own.name)
         if made.scenario is None and not whole and part is None:
@@ -194,7 +194,7 @@ def draw_own(
         where = place_of_own(variant.own.place) if made.scenario is None else made.scenario.place
         _, street_map = place(where)
         if part is not None:
-            refuse_outside("--zoom", part, street_map.bounds)
+            check_overlap("--zoom", part, street_map.bounds)
         plan = draw_plan(street_map, made.scenario, whole=whole, part=part, credit=credit_of(where))
         write_png(plan, picture)
     for fault in made.faults:
@@ -254,7 +254,7 @@ def _run_parts(own: OwnFile, suite: Suite, config: RunConfig, path: Path) -> lis
     from cosim.cli.run_progress import EpisodeBars
     from cosim.results.run_folder import read_spec
     from scenarios.runs.planning import seed_of_run
-    from scenarios.runs.run import Given, carry_out
+    from scenarios.runs.run import RunObjects, execute_run
 
     parts = _parts(own, path)
     begun = [part for part in parts.values() if config.resume and (part / "run.json").exists()]
@@ -270,7 +270,9 @@ def _run_parts(own: OwnFile, suite: Suite, config: RunConfig, path: Path) -> lis
             config, suite=own.name, scenario=ids, goal=goal or "", out=part, resume=part in begun
         )
         try:
-            tables.append(carry_out(of_part, given=Given(suite=suite), reporter=EpisodeBars()))
+            tables.append(
+                execute_run(of_part, given=RunObjects(suite=suite), reporter=EpisodeBars())
+            )
         except KeyboardInterrupt:
             notice(
                 f"Stopped. Finished episodes are stored in {part}: continue with --out {path} "

@@ -74,7 +74,7 @@ def train_command(
     """
     if lacking := [package for package in ("torch", "onnx") if find_spec(package) is None]:
         raise MachineError(f"{' and '.join(lacking)} cannot be imported: {TO_INSTALL}")
-    from cosim.learning.training import trained
+    from cosim.learning.training import train_and_report
 
     training = Training(
         steps=steps,
@@ -86,5 +86,5 @@ def train_command(
         minutes=minutes,
         name=name,
     )
-    if not trained(data, out, training, resume, notice):
+    if not train_and_report(data, out, training, resume, notice):
         raise typer.Exit(SOME_CRASHED)

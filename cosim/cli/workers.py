@@ -21,7 +21,7 @@ from cosim.cli.console import LogJson, LogLevel, logged, notice, out
 from cosim.cli.generated_options import Fields, configured
 from cosim.cli.options import DEFAULT, MANY, Insecure, Tls
 from cosim.core.errors import INTERRUPTED, EngineError, RunError, UsageError
-from cosim.core.log_event import happened
+from cosim.core.log_event import log_event
 from cosim.core.units import duration
 from cosim.spec.connection import connecting, listening
 from cosim.spec.run_config import RunConfig
@@ -72,7 +72,7 @@ def coordinator_command(
     Workers may connect and disconnect at any time. A coordinator that was killed continues with
     --resume, and so do its workers. `cosim status` shows the progress.
     """
-    from bridge.session import notices_of, open_session
+    from bridge.session import connection_warnings, open_session
     from cosim.cli.run_display import run_in_terminal
     from scenarios.runs.zenoh_transport import workers_of_run
 
@@ -85,7 +85,7 @@ def coordinator_command(
     files = tls if any(one.startswith("tls/") for one in config.policy_at) else ""
     ours = tls if listen.startswith("tls/") or not files else ""
     connection = listening("coordinator", "--listen", listen, ours, insecure)
-    notices_of(connection)
+    connection_warnings(connection)
 
     @contextmanager
     def carrier() -> Iterator[Any]:
@@ -142,7 +142,7 @@ def worker_command(
 
 
 def _log_and_print(words: str, _share: float | None = None, /) -> None:
-    happened("said", words=words)
+    log_event("said", words=words)
     notice(words)
 
 

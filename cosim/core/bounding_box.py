@@ -7,7 +7,7 @@ from cosim.core.errors import UsageError
 _Box = tuple[float, float, float, float]
 
 
-def box_of(option: str, words: str, sides: str = "west,south,east,north") -> _Box:
+def parse_box(option: str, words: str, sides: str = "west,south,east,north") -> _Box:
     """Parse the four numbers of a bounding-box option.
 
     option: the option's name, for the error.
@@ -25,7 +25,7 @@ def box_of(option: str, words: str, sides: str = "west,south,east,north") -> _Bo
     return x0, y0, x1, y1
 
 
-def refuse_outside(option: str, part: _Box, bounds: _Box) -> None:
+def check_overlap(option: str, part: _Box, bounds: _Box) -> None:
     """Raise UsageError with the bounds of the place when a box does not overlap them."""
     (x0, y0, x1, y1) = part
     (west, south, east, north) = bounds

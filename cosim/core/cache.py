@@ -32,7 +32,14 @@ import msgspec
 from platformdirs import user_cache_path
 
 from cosim.core.errors import UsageError
-from cosim.core.files import MAKING, atomic_file, is_locked, lock, remove_dead, temp_folder
+from cosim.core.files import (
+    UNFINISHED_PREFIX,
+    atomic_file,
+    is_locked,
+    lock,
+    remove_dead,
+    temp_folder,
+)
 
 if TYPE_CHECKING:  # the command line starts without numpy
     import numpy as np
@@ -41,7 +48,7 @@ if TYPE_CHECKING:  # the command line starts without numpy
 Arrays: TypeAlias = "Mapping[str, NDArray[Any]]"
 _T = TypeVar("_T")
 
-BUILDING: Final = ".building-"
+BUILDING_PREFIX: Final = ".building-"
 """Prefix of the folders in which city nets are built."""
 _ARRAY_PACKAGES: Final = ("numpy", "opencv-python-headless", "pybullet", "scipy", "shapely")
 """Packages that cached arrays depend on."""
@@ -111,7 +118,7 @@ class CacheEntry(NamedTuple):
     used_s: float
 
 
-class Forgotten(NamedTuple):
+class CleanupResult(NamedTuple):
     """Result of a clean-up: the removed entries, and those not removed because they are in use."""
 
     entries: tuple[CacheEntry, ...] = ()
@@ -154,21 +161,21 @@ def use_entry(entry: Path) -> None:
         os.utime(entry)
 
 
-def make_room() -> None:
+def clean_up_if_due() -> None:
     """Remove entries if the last clean-up of this process is long ago. Call it before writing an
     entry."""
     folder = cache_folder()
     now_s = time.monotonic()
     if now_s - _last_cleanup_s.get(folder, -math.inf) >= _CLEANUP_INTERVAL_S:
         _last_cleanup_s[folder] = now_s
-        forget_entries()
+        clean_up()
 
 
 _last_cleanup_s: Final[dict[Path, float]] = {}
 """Monotonic time of this process's last clean-up, by cache folder."""
 
 
-def forget_entries(unused_s: float = UNUSED_S, limit_bytes: int | None = None) -> Forgotten:
+def clean_up(unused_s: float = UNUSED_S, limit_bytes: int | None = None) -> CleanupResult:
     """Remove unused entries, the least recently used ones beyond the limit, and unfinished files.
 
     unused_s: remove entries unused for this long.
@@ -186,7 +193,7 @@ def forget_entries(unused_s: float = UNUSED_S, limit_bytes: int | None = None) -
             room -= entry.size_bytes
             if room < 0 or now_s - entry.used_s >= unused_s:
                 expired.append(entry)
-    return _delete_entries(folder, expired) if expired else Forgotten()
+    return _delete_entries(folder, expired) if expired else CleanupResult()
 
 
 def cache_entries() -> list[CacheEntry]:
@@ -200,7 +207,7 @@ def cache_entries() -> list[CacheEntry]:
     ]
 
 
-def say_not_kept(folder: Path, error: Exception) -> None:
+def report_uncached(folder: Path, error: Exception) -> None:
     """Print that something could not be cached, once in a process for each message."""
     _print_once(f"note: {folder}: not kept for the next process, which makes it anew: {error}")
 
@@ -243,7 +250,7 @@ def _in_use_list(folder: Path, _pid: int) -> _InUseList:
     return _InUseList(folder)
 
 
-def _delete_entries(folder: Path, expired: list[CacheEntry]) -> Forgotten:
+def _delete_entries(folder: Path, expired: list[CacheEntry]) -> CleanupResult:
     """Move entries aside that are still unused, then delete them."""
     removed = []
     in_use = []
@@ -259,7 +266,7 @@ def _delete_entries(folder: Path, expired: list[CacheEntry]) -> Forgotten:
             with suppress(OSError):
                 entry.path.rename(trash / str(number))
                 removed.append(entry)
-    return Forgotten(tuple(removed), tuple(in_use))
+    return CleanupResult(tuple(removed), tuple(in_use))
 
 
 def _entries_in_use(lists: Path) -> set[str]:
@@ -289,10 +296,10 @@ def _remove_list_of(path: Path, pid: int) -> None:
 def _remove_unfinished(folder: Path) -> None:
     """Remove unfinished files of killed processes. `atomic_folder` does this for imported maps."""
     remove_dead(folder, _REMOVED)
-    remove_dead(folder, BUILDING)
+    remove_dead(folder, BUILDING_PREFIX)
     places = {(folder / kind.pattern).parent for kind in CACHE_KINDS if not kind.stays}
     for place in (*places, *folder.glob("tiles/*")):
-        remove_dead(place, MAKING)
+        remove_dead(place, UNFINISHED_PREFIX)
 
 
 def _used_s(path: Path) -> float:
@@ -335,11 +342,11 @@ def cached(
     made = make()
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        make_room()
+        clean_up_if_due()
         _write(path, [*encode(made)])
         return decode(_read(path, mapped)) if mapped else made
     except (OSError, ValueError, msgspec.DecodeError) as error:
-        say_not_kept(entry.parent, error)
+        report_uncached(entry.parent, error)
         return made
 
 

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from cosim.core.framing import Wire
+from cosim.core.framing import MessageSocket
 
 _PR_SET_PDEATHSIG = 1
 """Number of Linux's prctl operation that sends a signal when the parent dies."""
@@ -21,7 +21,7 @@ _POLL_INTERVAL_S = 0.001
 """Interval at which an exiting child is polled, in seconds."""
 
 
-def end_with(parent: int, how: signal.Signals = signal.SIGKILL) -> None:
+def exit_with_parent(parent: int, how: signal.Signals = signal.SIGKILL) -> None:
     """Let Linux signal this process when its parent dies; exit at once if the parent is dead.
 
     parent: process id of the parent.
@@ -32,7 +32,7 @@ def end_with(parent: int, how: signal.Signals = signal.SIGKILL) -> None:
         os._exit(1)
 
 
-def ended_in_words(code: int) -> str:
+def exit_in_words(code: int) -> str:
     """Return how a process with this exit code ended, such as "was killed by SIGSEGV"."""
     return (
         f"was killed by {signal.Signals(-code).name}"
@@ -51,7 +51,7 @@ class ForkedChild:
     room_bytes: memory that the child may allocate in addition to this process's.
     """
 
-    def __init__(self, serves: Callable[[Wire], None], room_bytes: int) -> None:
+    def __init__(self, serves: Callable[[MessageSocket], None], room_bytes: int) -> None:
         ours, theirs = socket.socketpair()
         parent = os.getpid()
         self._pid = os.fork()
@@ -59,7 +59,7 @@ class ForkedChild:
             ours.close()
             _run_child(serves, theirs, parent, room_bytes)
         theirs.close()
-        self.wire = Wire(ours)
+        self.wire = MessageSocket(ours)
 
     def close(self) -> None:
         """Kill the child."""
@@ -78,7 +78,7 @@ class ForkedChild:
             while True:
                 ended, status = os.waitpid(pid, os.WNOHANG)
                 if ended:
-                    return ended_in_words(os.waitstatus_to_exitcode(status))
+                    return exit_in_words(os.waitstatus_to_exitcode(status))
                 if time.monotonic() > until_s:
                     os.kill(pid, signal.SIGKILL)
                 time.sleep(_POLL_INTERVAL_S)
@@ -87,14 +87,14 @@ class ForkedChild:
 
 
 def _run_child(
-    serves: Callable[[Wire], None], end: socket.socket, parent: int, room_bytes: int
+    serves: Callable[[MessageSocket], None], end: socket.socket, parent: int, room_bytes: int
 ) -> None:
     """Run the child's function with its limits, then exit."""
     code = 1
     try:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, signal.SIG_DFL)
-        end_with(parent)
+        exit_with_parent(parent)
         null_device = os.open(os.devnull, os.O_RDWR)
         for descriptor in range(3):
             os.dup2(null_device, descriptor)
@@ -102,7 +102,7 @@ def _run_child(
         most = pages * resource.getpagesize() + room_bytes
         _limit(resource.RLIMIT_AS, most)
         _limit(resource.RLIMIT_CORE, 0)
-        serves(Wire(end))
+        serves(MessageSocket(end))
         code = 0
     except BaseException:  # noqa: BLE001  the child must exit here
         pass

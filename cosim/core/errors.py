@@ -33,7 +33,7 @@ BROKEN_MACHINE = 3
 """Exit code for a failed engine or machine."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells use it."""
-UNREAD = 141
+BROKEN_PIPE = 141
 """Exit code when the reader of standard output has closed the pipe, as shells use it."""
 
 MOST_LISTED = 30
@@ -134,7 +134,7 @@ class MachineError(CosimError):
     exit_code = BROKEN_MACHINE
 
 
-def too_long(path: str | Path) -> UsageError:
+def path_too_long(path: str | Path) -> UsageError:
     """Return the error for a path that is too long for any file system."""
     size = max(len(os.fsencode(part)) for part in Path(path).parts)
     shown = str(path) if len(str(path)) <= _SHOWN_LETTERS else f"{str(path)[:_SHOWN_LETTERS]}..."
@@ -149,7 +149,7 @@ def too_long(path: str | Path) -> UsageError:
     )
 
 
-def of_file(error: OSError) -> CosimError:
+def file_error(error: OSError) -> CosimError:
     """Return the error for a file that the system refuses, when only its path is known."""
     name = (
         os.fsdecode(error.filename)
@@ -157,7 +157,7 @@ def of_file(error: OSError) -> CosimError:
         else str(error.filename)
     )
     return (
-        too_long(name)
+        path_too_long(name)
         if error.errno == errno.ENAMETOOLONG
         else MachineError(f"{name}: {error.strerror}")
     )
@@ -172,7 +172,7 @@ def unwritable(path: Path, error: OSError, remedy: str = "") -> MachineError | U
     remedy: advice that replaces the default one.
     """
     if error.errno == errno.ENAMETOOLONG:
-        return too_long(path)
+        return path_too_long(path)
     reason = error.strerror or str(error)
     if isinstance(error, FileExistsError | NotADirectoryError):
         for file in (path, *path.parents):

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Final, Literal
 if TYPE_CHECKING:
     from filelock import FileLock
 
-MAKING: Final = ".making-"
+UNFINISHED_PREFIX: Final = ".making-"
 """Prefix of unfinished folders, and of unfinished files that several processes write."""
 _LOCK_FILE: Final = ".held"
 """File in a temporary folder that its process locks."""
@@ -60,7 +60,9 @@ def atomic_file(path: Path, *, shared: bool = False) -> Iterator[Path]:
     shared: several processes may write the file at once. It is not flushed to disk, as for a file
         that can be made again.
     """
-    part = path.with_name(MAKING + secrets.token_hex(8) if shared else f"{path.name}.part")
+    part = path.with_name(
+        UNFINISHED_PREFIX + secrets.token_hex(8) if shared else f"{path.name}.part"
+    )
     try:
         yield part
         if not shared:
@@ -109,7 +111,7 @@ def atomic_folder(
     existing: policy for a folder that exists by then: replace it, keep it, or raise OSError. An
         empty one is always replaced.
     """
-    with temp_folder(MAKING, target.parent) as scratch:
+    with temp_folder(UNFINISHED_PREFIX, target.parent) as scratch:
         made = scratch / target.name
         made.mkdir()
         yield made
@@ -134,9 +136,12 @@ def folder_holds(target: Path, name: str) -> bool:
     for _ in range(100):
         if (target / name).exists():
             return True
-        if not any((one / _OLD / target.name).exists() for one in target.parent.glob(f"{MAKING}*")):
+        if not any(
+            (one / _OLD / target.name).exists()
+            for one in target.parent.glob(f"{UNFINISHED_PREFIX}*")
+        ):
             break
-        remove_dead(target.parent, MAKING)
+        remove_dead(target.parent, UNFINISHED_PREFIX)
         time.sleep(0.01)
     return (target / name).exists()
 
@@ -168,7 +173,7 @@ def _restore(scratch: Path) -> None:
                 old.rename(target)
 
 
-def size_within(path: Path, most_bytes: int) -> int:
+def checked_size(path: Path, most_bytes: int) -> int:
     """Return the size of a file in bytes. Raises OSError.
 
     Raises ValueError for a larger file, and for a folder, a pipe or a device.
@@ -181,7 +186,7 @@ def size_within(path: Path, most_bytes: int) -> int:
     return about.st_size
 
 
-def read_within(path: Path, most_bytes: int) -> bytes:
-    """Read a whole file, unless it is too large. Raises as `size_within` does."""
-    size_within(path, most_bytes)
+def read_limited(path: Path, most_bytes: int) -> bytes:
+    """Read a whole file, unless it is too large. Raises as `checked_size` does."""
+    checked_size(path, most_bytes)
     return path.read_bytes()

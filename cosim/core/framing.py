@@ -13,18 +13,18 @@ _LENGTH: Final = struct.Struct("!I")
 _CHUNK_BYTES: Final = 1 << 16
 """Bytes read at a time. Larger buffers make the kernel allocate memory for each read, which is
 slower."""
-MOST_WIRED_BYTES: Final = 1 << 30
+MAX_MESSAGE_BYTES: Final = 1 << 30
 """Maximum length of a message in bytes. A longer one means that a policy wrote to its process's
 socket."""
 
 
-class Wire:
+class MessageSocket:
     """One end of a message socket. Messages longer than `most_bytes` are refused.
 
     Only `send` and `receive` wait: the sender of a message may be stopped in the middle of it.
     """
 
-    def __init__(self, end: socket.socket, most_bytes: int = MOST_WIRED_BYTES) -> None:
+    def __init__(self, end: socket.socket, most_bytes: int = MAX_MESSAGE_BYTES) -> None:
         self._end = end
         self._incoming = bytearray()
         self._outgoing = bytearray()

@@ -5,14 +5,14 @@ from __future__ import annotations
 import logging
 from typing import Final
 
-JOURNAL: Final = logging.getLogger("cosim")
-JOURNAL.addHandler(logging.NullHandler())
-JOURNAL.propagate = False
+LOGGER: Final = logging.getLogger("cosim")
+LOGGER.addHandler(logging.NullHandler())
+LOGGER.propagate = False
 
 
-def happened(event: str, level: int = logging.INFO, /, **facts: object) -> None:
+def log_event(event: str, level: int = logging.INFO, /, **facts: object) -> None:
     """Log an event with its facts. Without a log handler this costs next to nothing.
 
     >>> happened("retried", logging.WARNING, scenario="frontal-001", why="its worker was lost")
     """
-    JOURNAL.log(level, event, extra={"facts": facts})
+    LOGGER.log(level, event, extra={"facts": facts})

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.core.files import size_within
+from cosim.core.files import checked_size
 
 MOST_NPZ_BYTES: Final = 2 << 30
 """Maximum size of a file, packed or unpacked, in bytes."""
@@ -30,7 +30,7 @@ _HEADERS: Final = {
     (2, 0): np.lib.format.read_array_header_2_0,
 }
 """Reader of the array header by version of the .npy format."""
-NO_NPZ: Final = (
+NPZ_ERRORS: Final = (
     EOFError,
     KeyError,
     MemoryError,
@@ -57,21 +57,21 @@ def read_npz(
     Raises ValueError with the reason: not a regular file, not an .npz, truncated, damaged, pickled
     objects, or larger than `most_bytes`. Raises OSError.
     """
-    size_within(path, most_bytes)
+    checked_size(path, most_bytes)
     with path.open("rb") as file:
-        return arrays_in(file, only, most_bytes)
+        return read_open_npz(file, only, most_bytes)
 
 
-def names_in_npz(path: Path) -> list[str]:
+def npz_names(path: Path) -> list[str]:
     """Return the names of the arrays in a file without reading them. Raises ValueError, OSError."""
     try:
         with zipfile.ZipFile(path) as held:
             return [name.removesuffix(_ENDING) for name in held.namelist()]
-    except NO_NPZ as error:
+    except NPZ_ERRORS as error:
         raise ValueError(f"cannot be read as .npz: {error}") from error
 
 
-def arrays_in(
+def read_open_npz(
     file: BinaryIO, only: Collection[str] | None = None, most_bytes: int = MOST_NPZ_BYTES
 ) -> dict[str, NDArray[Any]]:
     """Return the arrays of an open file by name, as `read_npz` does."""
@@ -89,7 +89,7 @@ def arrays_in(
                 raise ValueError(f"has no array '{lacking[0]}'")
             names = [name for name in entries if only is None or name in only]
             return {name: _array(name, held.read(entries[name])) for name in names}
-    except NO_NPZ as error:
+    except NPZ_ERRORS as error:
         why = f"{error}" or type(error).__name__
         raise ValueError(f"cannot be read as .npz: {why}") from error
 

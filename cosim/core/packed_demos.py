@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import RunError, unwritable
 from cosim.core.files import atomic_file
-from cosim.core.npz import NO_NPZ
+from cosim.core.npz import NPZ_ERRORS
 
 _FORMAT: Final = 1
 """Version of the file format."""
@@ -108,7 +108,7 @@ def packed_digest(path: Path) -> str:
     try:
         with zipfile.ZipFile(path) as held:
             checksums = [(one.filename, one.file_size, one.CRC) for one in held.infolist()]
-    except (OSError, *NO_NPZ) as error:
+    except (OSError, *NPZ_ERRORS) as error:
         raise _unreadable(path, error) from error
     return hashlib.blake2b(repr(checksums).encode(), digest_size=8).hexdigest()
 
@@ -121,7 +121,7 @@ def read_packed(path: Path) -> Packed:
             arrays = {one.name: held[one.name] for one in fields(Packed) if one.name != "meta"}
         if meta.pop("format") != _FORMAT or len({len(array) for array in arrays.values()}) != 1:
             raise ValueError("its arrays are of different lengths, or of another format")
-    except (OSError, *NO_NPZ) as error:
+    except (OSError, *NPZ_ERRORS) as error:
         raise _unreadable(path, error) from error
     return Packed(**arrays, meta=meta)
 

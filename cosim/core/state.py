@@ -46,17 +46,17 @@ class Age(IntEnum):
     ELDERLY = 2
 
 
-def write_protected(
+def write_protected_copy(
     array: Any, dtype: Any = np.float64, shape: tuple[int, ...] | None = None
 ) -> NDArray[Any]:
     """Return a write-protected copy of an array."""
     copy = np.array(array, dtype=dtype)
     if shape is not None:
         copy = copy.reshape(shape)
-    return frozen(copy)
+    return write_protect(copy)
 
 
-def frozen(array: NDArray[Any]) -> NDArray[Any]:
+def write_protect(array: NDArray[Any]) -> NDArray[Any]:
     """Write-protect an array in place and return it."""
     array.flags.writeable = False
     return array
@@ -125,14 +125,14 @@ class People:
         n = len(ids)
         return cls(
             ids,
-            write_protected(xy, shape=(n, 2)),
-            write_protected(heading, shape=(n,)),
-            write_protected(speed, shape=(n,)),
+            write_protected_copy(xy, shape=(n, 2)),
+            write_protected_copy(heading, shape=(n,)),
+            write_protected_copy(speed, shape=(n,)),
             doing,
-            write_protected(np.zeros(n) if strides is None else strides, shape=(n,)),
-            write_protected(speed if pace is None else pace, shape=(n,)),
-            write_protected(np.broadcast_to(kind, n), np.int8),
-            write_protected(np.broadcast_to(age, n), np.int8),
+            write_protected_copy(np.zeros(n) if strides is None else strides, shape=(n,)),
+            write_protected_copy(speed if pace is None else pace, shape=(n,)),
+            write_protected_copy(np.broadcast_to(kind, n), np.int8),
+            write_protected_copy(np.broadcast_to(age, n), np.int8),
         )
 
     def copied(self) -> People:
@@ -183,17 +183,17 @@ class Vehicles:
         n = len(ids)
         return cls(
             ids,
-            write_protected(xy, shape=(n, 2)),
-            write_protected(heading, shape=(n,)),
-            write_protected(speed, shape=(n,)),
-            write_protected(size, shape=(n, 2)),
+            write_protected_copy(xy, shape=(n, 2)),
+            write_protected_copy(heading, shape=(n,)),
+            write_protected_copy(speed, shape=(n,)),
+            write_protected_copy(size, shape=(n, 2)),
         )
 
     def __len__(self) -> int:
         return len(self.ids)
 
 
-NOBODY = People.of((), [], [], [], ())
+NO_PEOPLE = People.of((), [], [], [], ())
 NO_VEHICLES = Vehicles.of((), [], [], [], [])
 
 
@@ -218,7 +218,7 @@ class Street:
     """
 
     tick: int
-    people: People = NOBODY
+    people: People = NO_PEOPLE
     vehicles: Vehicles = NO_VEHICLES
     signals: Mapping[str, Signal] = field(default_factory=lambda: MappingProxyType({}))
 
@@ -236,7 +236,7 @@ class Command:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Planned(Command):
+class WaypointCommand(Command):
     """Command that follows one of a policy's waypoints.
 
     waypoints: (N, 2) float32, metres ahead and to the left of the robot at its observation; (N, 4)

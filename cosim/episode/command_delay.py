@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
-from cosim.core.state import STILL, Command, Planned
+from cosim.core.state import STILL, Command, WaypointCommand
 
 _NO_PLAN = np.empty((0, 2), dtype=np.float32)
 """Waypoints of a command without any."""
 
 
-class InFlight:
+class CommandDelay:
     """Pending commands of an episode, in the order of their ticks."""
 
     def __init__(self) -> None:
@@ -31,15 +31,15 @@ class InFlight:
         self._answers: list[tuple[float, float, float, float]] = []
         self._plans: list[NDArray[np.float32]] = []
         self._index = 0
-        self.arrived_by = 0
+        self.last_arrival_tick = 0
         """Tick at which the last command takes effect."""
 
     def answered(self, tick: int, delay: int, command: Command) -> None:
         """Add a command for the observation of `tick`, which takes effect `delay` ticks later."""
-        self.arrived_by = tick + delay
-        self._pending.append((self.arrived_by, command))
+        self.last_arrival_tick = tick + delay
+        self._pending.append((self.last_arrival_tick, command))
         self._answers.append((tick, delay, command.v_mps, command.w_radps))
-        if isinstance(command, Planned):
+        if isinstance(command, WaypointCommand):
             self._plans.append(command.waypoints)
             self._index = command.index
         else:

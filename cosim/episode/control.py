@@ -13,7 +13,7 @@ import numpy as np
 
 from cosim.core.errors import PolicyError
 from cosim.core.geometry import Floats
-from cosim.core.state import STILL, Command, Planned
+from cosim.core.state import STILL, Command, WaypointCommand
 from cosim.spec.manifest import WaypointRule
 from cosim.spec.robot import Robot
 
@@ -73,7 +73,7 @@ def command_of(answer: object, *, rule: WaypointRule, robot: Robot) -> Command:
             )
             raise PolicyError(f"answered Command({shown}): both must be finite numbers")
         command = clipped(Command(*numbers), robot)
-        if not isinstance(answer, Planned):
+        if not isinstance(answer, WaypointCommand):
             return command
         return _planned(command, _waypoints(answer.waypoints, rule.index), rule.index)
     waypoints = _waypoints(answer, rule.index)
@@ -84,12 +84,12 @@ def command_of(answer: object, *, rule: WaypointRule, robot: Robot) -> Command:
     return _planned(command, waypoints, rule.index)
 
 
-def _planned(command: Command, waypoints: Floats, index: int) -> Planned:
+def _planned(command: Command, waypoints: Floats, index: int) -> WaypointCommand:
     """Return a command together with its waypoints in metres."""
     recorded = np.clip(waypoints[: max(_MOST_RECORDED, index + 1)], -_LARGEST, _LARGEST).astype(
         np.float32
     )
-    return Planned(command.v_mps, command.w_radps, recorded, index)
+    return WaypointCommand(command.v_mps, command.w_radps, recorded, index)
 
 
 def _waypoints(answer: object, index: int) -> Floats:

@@ -182,7 +182,7 @@ class Camera(Protocol):
     def render(self, robot: RobotState, street: Street) -> Frame: ...
 
 
-class Eyes(Camera, Protocol):
+class ViewCamera(Camera, Protocol):
     """Camera that also renders views for humans."""
 
     def picture(

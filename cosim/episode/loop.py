@@ -56,7 +56,7 @@ ROUTE_WINDOW_M = 10.0
 
 
 @dataclass(frozen=True, slots=True)
-class Parts:
+class EpisodeEngines:
     """Engines of an episode."""
 
     world: World
@@ -80,7 +80,7 @@ class Moment:
     states: tuple[EventState, ...] = ()
 
 
-def begin(scenario: Scenario, parts: Parts) -> Moment:
+def begin(scenario: Scenario, parts: EpisodeEngines) -> Moment:
     """Return the first moment, with the robot at rest at its start."""
     return Moment(0, parts.world.place(scenario.start_pose), parts.crowd.street, 0.0)
 
@@ -88,7 +88,7 @@ def begin(scenario: Scenario, parts: Parts) -> Moment:
 def tick(
     scenario: Scenario,
     clock: Clock,
-    parts: Parts,
+    parts: EpisodeEngines,
     now: Moment,
     command: Command,
     frame: Frame | None = None,
@@ -115,7 +115,7 @@ def tick(
     )
 
 
-def after(step: Step, reset: Reset | None, parts: Parts) -> Moment:
+def after(step: Step, reset: Reset | None, parts: EpisodeEngines) -> Moment:
     """Return the moment after a step; a reset puts the robot elsewhere, at rest."""
     robot = step.motion.robot
     route_s_m = step.route_s_after_m

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from cosim.core.errors import UsageError, unknown
-from cosim.core.state import frozen
+from cosim.core.state import write_protect
 from cosim.spec.camera import Calibration, CameraSpec
 from cosim.spec.goal import GOALS, GoalProtocol, goal_called
 from cosim.spec.manifest import Manifest
@@ -37,8 +37,8 @@ def with_goal(manifest: Manifest, goal: GoalProtocol | None) -> Manifest:
             f"policy '{manifest.name}' has cameras, but no camera: give its manifest one of "
             f"them as that"
         )
-    if kind.of_camera and settled.camera is None:
-        others = ", ".join(one.name for one in GOALS.values() if not one.of_camera)
+    if kind.needs_camera and settled.camera is None:
+        others = ", ".join(one.name for one in GOALS.values() if not one.needs_camera)
         raise UsageError(
             f"policy '{manifest.name}' has no camera, and goal protocol '{settled.goal}' gives "
             f"what its camera would show: give its manifest a camera, or choose one of {others}"
@@ -75,9 +75,9 @@ def calibration_of(spec: CameraSpec, robot: Robot) -> Calibration:
     on_robot[:3, 1] = np.cross(on_robot[:3, 2], on_robot[:3, 0])
     on_robot[:3, 3] = mount.at_m
     return Calibration(
-        frozen(matrix),
-        frozen(np.array([spec.lens.k1, spec.lens.k2, 0.0, 0.0, 0.0])),
-        frozen(on_robot),
+        write_protect(matrix),
+        write_protect(np.array([spec.lens.k1, spec.lens.k2, 0.0, 0.0, 0.0])),
+        write_protect(on_robot),
     )
 
 

@@ -14,8 +14,8 @@ from cosim.episode.interfaces import Camera, Observation, Privileged
 from cosim.episode.loop import Moment, Step
 from cosim.episode.manifest_checks import calibration_of
 from cosim.spec.camera import CameraPicture, CameraSpec
-from cosim.spec.episode_id import pseudonym_of, seed_for
-from cosim.spec.goal import TakePicture, goals_for, seen_from
+from cosim.spec.episode_id import episode_id_of, seed_for
+from cosim.spec.goal import TakePicture, goals_for, in_robot_frame
 from cosim.spec.manifest import Manifest
 from cosim.spec.odometry import GpsNoise, Odometry, OdometryKind, WheelNoise
 from cosim.spec.robot import robot_called
@@ -51,7 +51,7 @@ class _ExactOdometer:
         """Nothing to count."""
 
     def read(self, pose: Pose, time_s: float) -> Odometry | None:
-        place = seen_from(self._start, pose)
+        place = in_robot_frame(self._start, pose)
         turned = wrap_angle(pose.heading_rad - self._start.heading_rad)
         return Odometry(place.x_m, place.y_m, turned) if self._reported else None
 
@@ -69,7 +69,7 @@ class WheelOdometer:
         self._x_m = self._y_m = self._heading_rad = 0.0
 
     def moved(self, before: Pose, after: Pose) -> None:
-        along_m = seen_from(before, after).x_m
+        along_m = in_robot_frame(before, after).x_m
         turned = wrap_angle(after.heading_rad - before.heading_rad)
         far_m = abs(along_m)
         (one, two) = self._draws.standard_normal(2).tolist()
@@ -108,7 +108,7 @@ class Gps:
         fresh = math.sqrt(1.0 - decay * decay) * self._noise.bias_m
         self._bias_m = decay * self._bias_m + fresh * self._draws.standard_normal(2)
         self._time_s = time_s
-        place = seen_from(self._start, pose)
+        place = in_robot_frame(self._start, pose)
         x_m, y_m = (self._bias_m + self._noise.noise_m * self._draws.standard_normal(2)).tolist()
         return Odometry(place.x_m + x_m, place.y_m + y_m, None)
 
@@ -136,7 +136,7 @@ class Observer:
             return np.random.default_rng(seed_for(purpose, run_seed, scenario))
 
         spec = manifest.camera
-        self._episode_id = pseudonym_of(run_seed, scenario).episode
+        self._episode_id = episode_id_of(run_seed, scenario).episode
         self._robot = robot_called(scenario.robot)
         self._manifest = manifest
         self._known = known

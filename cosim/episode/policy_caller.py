@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Literal, Protocol
 
 from numpy.typing import NDArray
 
-from bridge.policy_server import PolicyFault, policy_call, said_by
+from bridge.policy_server import PolicyFault, error_text, policy_call
 from cosim.core.clock import Clock
 from cosim.core.errors import PolicyError
 from cosim.core.geometry import Polyline
@@ -23,12 +23,12 @@ from cosim.core.state import Command, RobotState, Signal, Vehicles
 from cosim.episode.control import command_of
 from cosim.episode.interfaces import Observation, Policy, Privileged
 from cosim.spec.manifest import Manifest
-from cosim.spec.options import PolicyRuns
+from cosim.spec.options import PolicyProcess
 
 PolicyCall = Literal["loading", "reset", "first act", "act", "on_reset", "ended"]
 """Kinds of calls of a policy. The first act of an episode has a longer timeout than the others."""
 
-LOADED_WITHIN_S = 300.0
+LOAD_TIMEOUT_S = 300.0
 """Default timeout in seconds for loading a policy, for a reset and for the first act."""
 
 
@@ -40,7 +40,7 @@ class Timer(Protocol):
     def stops(self) -> None: ...
 
 
-class Untimed:
+class NoTimer:
     """Timer that does nothing."""
 
     def starts(self, doing: PolicyCall, tick: int) -> None:
@@ -50,7 +50,7 @@ class Untimed:
         """Do nothing."""
 
 
-class Driver:
+class PolicyCaller:
     """Wraps a policy; its answers are commands within the robot's limits. It is a Policy itself.
 
     manifest: manifest of the policy, read once.
@@ -59,7 +59,7 @@ class Driver:
     at_once: maximum number of episodes at a time, 0 for any number.
     """
 
-    runs: PolicyRuns = "in-process"
+    runs: PolicyProcess = "in-process"
     at_once = 0
     _passes: ClassVar[tuple[type[Exception], ...]] = (PolicyError,)
     """Exceptions of a call that are raised unchanged."""
@@ -105,9 +105,9 @@ class Driver:
         return callable(getattr(self._policy, "act_batch", None))
 
     @classmethod
-    def of(cls, policy: Policy) -> Driver:
+    def of(cls, policy: Policy) -> PolicyCaller:
         """Return the driver of a policy: the policy itself if it is one."""
-        return policy if isinstance(policy, Driver) else cls(policy)
+        return policy if isinstance(policy, PolicyCaller) else cls(policy)
 
     def reset(self, episode_id: str, seed: int) -> None:
         """Start an episode. Raises PolicyError."""
@@ -130,7 +130,7 @@ class Driver:
         self._has_answered = True
         return command
 
-    def heard_by(self, hears: Callable[[object], None]) -> None:
+    def on_answer(self, hears: Callable[[object], None]) -> None:
         """Set a callback for raw answers, before checks and limits."""
         self._on_answer = hears
 
@@ -163,7 +163,7 @@ class Driver:
             with policy_call(doing, tick, self._timer, self._passes):
                 yield
         except (PolicyFault, PolicyError) as error:
-            fault = error if isinstance(error, PolicyFault) else PolicyFault(said_by(error))
+            fault = error if isinstance(error, PolicyFault) else PolicyFault(error_text(error))
             during = when(doing if fault.during != "on_reset" else "on_reset", tick)
             together = (
                 f", asked for {fault.together} episodes together" if fault.together > 1 else ""

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cosim.core.errors import SOME_CRASHED, CosimError
 from cosim.learning.settings import PLANNED_STEPS, Training
-from cosim.learning.training import trained
+from cosim.learning.training import train_and_report
 
 
 def _main() -> None:
@@ -36,7 +36,7 @@ def _main() -> None:
     words = vars(parser.parse_args())
     data, out, resume = words.pop("data"), words.pop("out"), words.pop("resume")
     try:
-        whole = trained(
+        whole = train_and_report(
             data,
             out,
             Training(**words),

@@ -15,19 +15,19 @@ import torch
 from cosim.core.errors import RunError
 from cosim.core.files import write_atomic
 from cosim.learning.examples import Examples
-from cosim.learning.graph import INPUTS, PLAN, graph_of, run_graph
+from cosim.learning.graph import INPUTS, PLAN, build_graph, run_graph
 from cosim.learning.network import (
-    EVERY,
     GOAL_MOST_M,
     GOAL_UNIT_M,
     HEIGHT_PX,
     HISTORY,
+    PICTURE_INTERVAL,
     SPEED_MEAN_MPS,
     SPEED_UNIT_MPS,
     TURN_UNIT_RADPS,
     WIDTH_PX,
     Parameters,
-    answers,
+    forward,
     plan,
 )
 
@@ -64,12 +64,12 @@ def write_bundle(
 
     Raises RunError if the graph and the network give different or non-finite plans.
     """
-    graph = graph_of(parameters)
+    graph = build_graph(parameters)
     batch = examples.rows(examples.held_out[:1])
     inputs = {key: getattr(batch, key).cpu().numpy().astype(np.float32) for key in INPUTS}
     on_cpu = {key: value.cpu() for key, value in parameters.items()}
     with torch.no_grad():
-        expected = plan(answers(on_cpu, *(torch.from_numpy(inputs[key]) for key in INPUTS))).numpy()
+        expected = plan(forward(on_cpu, *(torch.from_numpy(inputs[key]) for key in INPUTS))).numpy()
     error = float(np.abs(run_graph(graph, inputs) - expected).max())
     if not error <= _TOLERANCE:
         raise RunError(
@@ -119,7 +119,7 @@ def manifest_of(name: str, meta: dict[str, Any], source: str) -> dict[str, Any]:
             "pictures": {
                 "what": "picture",
                 "frames": HISTORY,
-                "every": EVERY,
+                "every": PICTURE_INTERVAL,
                 "size": [WIDTH_PX, HEIGHT_PX],
                 "layout": "N(TC)HW",
             },

@@ -20,11 +20,11 @@ from cosim.core.errors import RunError
 from cosim.core.packed_demos import Packed, read_packed
 from cosim.learning.network import (
     CRUISE_MPS,
-    EVERY,
     GOAL_MOST_M,
     GOAL_UNIT_M,
     HEIGHT_PX,
     HISTORY,
+    PICTURE_INTERVAL,
     SPEED_MEAN_MPS,
     SPEED_UNIT_MPS,
     TURN_UNIT_RADPS,
@@ -103,7 +103,10 @@ class Examples:
         first_rows = np.cumsum([0, *(len(one) for one in packed)])
         first_episodes = np.cumsum([0, *(int(one.episode[-1]) + 1 for one in packed)])
         history = np.concatenate(
-            [one.history(HISTORY, EVERY) + n for one, n in zip(packed, first_rows, strict=False)]
+            [
+                one.history(HISTORY, PICTURE_INTERVAL) + n
+                for one, n in zip(packed, first_rows, strict=False)
+            ]
         )
         episode = np.concatenate(
             [one.episode + n for one, n in zip(packed, first_episodes, strict=False)]

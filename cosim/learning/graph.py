@@ -67,7 +67,7 @@ class _Writer:
         return self.add("Relu", [x])
 
 
-def graph_of(parameters: Parameters) -> bytes:
+def build_graph(parameters: Parameters) -> bytes:
     """Build the graph for batches of one, equal to `network.answers` and `network.plan`."""
     g = _Writer(parameters)
     x = g.add(
@@ -116,8 +116,8 @@ def graph_of(parameters: Parameters) -> bytes:
     return bytes(model.SerializeToString())
 
 
-def parameters_of(path: Path) -> dict[str, torch.Tensor]:
-    """Load the parameters from a graph written by `graph_of`. Raises RunError for any other."""
+def load_parameters(path: Path) -> dict[str, torch.Tensor]:
+    """Load the parameters from a graph written by `build_graph`. Raises RunError for any other."""
     wanted = new_parameters(0)
     try:
         arrays = {one.name: numpy_helper.to_array(one) for one in onnx.load(path).graph.initializer}

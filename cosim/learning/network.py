@@ -22,7 +22,7 @@ Parameters = Mapping[str, Tensor]
 
 HISTORY: Final = 4
 """Number of pictures in the input, the newest last."""
-EVERY: Final = 1
+PICTURE_INTERVAL: Final = 1
 """Policy steps between two pictures of the input."""
 WIDTH_PX: Final = 160
 HEIGHT_PX: Final = 90
@@ -66,7 +66,7 @@ STRIDES: Final[Mapping[str, int]] = {"stem": 2, "down1": 2, "down2": 2, "down3":
 """Strides of the convolutions; 1 if missing."""
 
 
-class Answers(NamedTuple):
+class NetworkOutput(NamedTuple):
     """Raw outputs of the network.
 
     speed: (B,) in units of CRUISE_MPS, of a robot that does not stop
@@ -99,7 +99,9 @@ def turns_radps(device: str | torch.device = "cpu") -> Tensor:
     return torch.linspace(TURN_UNIT_RADPS, -TURN_UNIT_RADPS, TURN_BINS, device=device)
 
 
-def answers(parameters: Parameters, pictures: Tensor, goal: Tensor, speeds: Tensor) -> Answers:
+def forward(
+    parameters: Parameters, pictures: Tensor, goal: Tensor, speeds: Tensor
+) -> NetworkOutput:
     """Compute the raw outputs of the network.
 
     pictures: (B, 3 HISTORY, HEIGHT_PX, WIDTH_PX), 0 to 1, oldest first
@@ -124,7 +126,7 @@ def answers(parameters: Parameters, pictures: Tensor, goal: Tensor, speeds: Tens
     image = linear(x.flatten(1), "seen").relu()
     inputs = linear(torch.cat([goal, speeds], 1), "told").relu()
     joined = linear(torch.cat([image, inputs], 1), "joined").relu()
-    return Answers(
+    return NetworkOutput(
         linear(joined, "speed").squeeze(1),
         linear(joined, "turn"),
         linear(joined, "stop").squeeze(1),
@@ -132,7 +134,7 @@ def answers(parameters: Parameters, pictures: Tensor, goal: Tensor, speeds: Tens
     )
 
 
-def plan(output: Answers) -> Tensor:
+def plan(output: NetworkOutput) -> Tensor:
     """Convert raw outputs to a plan (B, WAYPOINTS, 4), see the module."""
     turn = (SHARPNESS * output.turn).softmax(1) @ turns_radps(output.turn.device)
     speeds = torch.stack([CRUISE_MPS * output.speed.relu(), turn], 1)

@@ -62,7 +62,7 @@ class Training:
         }
 
 
-class Reached(NamedTuple):
+class StepsReached(NamedTuple):
     """Steps of a training: done, and planned in total."""
 
     step: int
@@ -73,7 +73,7 @@ class Reached(NamedTuple):
         return self.step == self.steps
 
 
-def looks_after(step: int, steps: int) -> bool:
+def is_evaluated(step: int, steps: int) -> bool:
     """Return whether the held-out episodes are evaluated after a step."""
     return step % max(steps // _EVALUATIONS, _MIN_STEPS_BETWEEN) == 0 or step == steps
 
@@ -142,7 +142,7 @@ def fits_in_words(
     )
 
 
-def outcome_in_words(folder: Path, reached: Reached) -> str:
+def outcome_in_words(folder: Path, reached: StepsReached) -> str:
     """Return how a training ended: content of the folder, and how to continue."""
     bundle = f"a bundle: --policy onnx:{folder}"
     if reached.whole:

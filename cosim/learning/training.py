@@ -28,22 +28,22 @@ from cosim.core.units import duration
 from cosim.learning.bundle import MODEL, bundle_facts, source_of, write_bundle
 from cosim.learning.curve import CURVE, draw_curve, write_curve
 from cosim.learning.examples import Batch, Examples
-from cosim.learning.graph import parameters_of
+from cosim.learning.graph import load_parameters
 from cosim.learning.network import (
     CRUISE_MPS,
     TURN_BINS,
     Parameters,
-    answers,
+    forward,
     new_parameters,
     plan,
     turns_radps,
 )
 from cosim.learning.settings import (
     PLANNED_STEPS,
-    Reached,
+    StepsReached,
     Training,
     fits_in_words,
-    looks_after,
+    is_evaluated,
     outcome_in_words,
     planned_steps,
     rate_share,
@@ -84,7 +84,7 @@ class _State:
 
 def train(
     paths: Sequence[Path], folder: Path, training: Training, resume: bool, progress: Progress
-) -> Reached:
+) -> StepsReached:
     """Train on packed demonstrations; write curve and bundle into a folder, also at the time limit.
 
     resume: continue the training in the folder, if any; with more steps also a finished one
@@ -100,7 +100,7 @@ def train(
 
 def _train(
     paths: Sequence[Path], folder: Path, training: Training, resume: bool, progress: Progress
-) -> Reached:
+) -> StepsReached:
     device = _device(training.device)
     torch.manual_seed(training.seed)
     torch.backends.cudnn.deterministic = True
@@ -114,7 +114,7 @@ def _train(
     begin = (
         None
         if training.begin is None or checkpoint.exists()
-        else parameters_of(training.begin / MODEL)
+        else load_parameters(training.begin / MODEL)
     )
     base = None if training.begin is None else bundle_facts(training.begin)
     examples = Examples(paths, training.seed, device)
@@ -136,7 +136,7 @@ def _train(
         loss_parts = _take_step(state, examples, training, steps)
         state.step += 1
         over = time.monotonic() - began_s > 60.0 * training.minutes
-        scheduled = looks_after(state.step, steps)
+        scheduled = is_evaluated(state.step, steps)
         if scheduled or over:
             parts = {f"{name}_loss": float(part) for name, part in loss_parts.items()}
             row = {"step": float(state.step), **parts, **_errors(state.averaged, examples)}
@@ -160,7 +160,7 @@ def _train(
     _write_checkpoint(checkpoint, state, spec)
     source = source_of(examples.meta, training.seed, base) + state_in_words(state.step, state.plans)
     write_bundle(folder, state.averaged, examples, training.name, source)
-    return Reached(state.step, steps)
+    return StepsReached(state.step, steps)
 
 
 def _step_in_words(step: int, steps: int, row: Mapping[str, float] = MappingProxyType({})) -> str:
@@ -229,7 +229,7 @@ def losses(parameters: Parameters, batch: Batch) -> dict[str, Tensor]:
 
     Speed and turn count only if the expert does not stop; waypoints only if they were driven.
     """
-    output = answers(parameters, batch.pictures, batch.goal, batch.speeds)
+    output = forward(parameters, batch.pictures, batch.goal, batch.speeds)
     moves = 1.0 - batch.stop
     per_moving = 1.0 / moves.sum().clamp(min=1.0)
     turn_errors = turns_radps(batch.turn.device) - batch.turn[:, None]
@@ -260,7 +260,7 @@ def _errors(parameters: Parameters, examples: Examples) -> dict[str, float]:
     with torch.no_grad():
         for part in np.array_split(rows, max(1, len(rows) // 512)):
             batch = examples.rows(part)
-            output = answers(parameters, batch.pictures, batch.goal, batch.speeds)
+            output = forward(parameters, batch.pictures, batch.goal, batch.speeds)
             planned = plan(output)
             stops = output.stop > 0.0
             both = (batch.stop == 0.0) & ~stops
@@ -335,7 +335,7 @@ def _read_checkpoint(
     )
 
 
-def trained(
+def train_and_report(
     paths: Sequence[Path],
     folder: Path,
     training: Training,

@@ -35,7 +35,7 @@ Ages = Sequence[int] | NDArray[np.int8]
 _PACES_MPS = np.array(PACES_MPS)
 _STRIDES_M = np.array(STRIDES_M)
 
-SETTLE_S: Final = 0.25
+PACE_TIME_CONSTANT_S: Final = 0.25
 """Time constant in seconds with which the shown pace follows the speed."""
 
 _JUMP_M: Final = 1.0
@@ -111,7 +111,7 @@ class Strides:
         for i in new:
             at[i], strides[i], pace[i] = xy[i], first_stride(ids[i]), speed[i]
             stature[i] = stature_m(ids[i], age[i])
-        pace = pace + (speed - pace) * min(self.period_s / SETTLE_S, 1.0)
+        pace = pace + (speed - pace) * min(self.period_s / PACE_TIME_CONSTANT_S, 1.0)
         step = xy - at
         moved = np.hypot(step[:, 0], step[:, 1])
         if ids:

@@ -25,14 +25,14 @@ STEERING_NEAR_M: Final = 4.0
 HORIZON_S: Final = 2.0
 """Time horizon of the steering and of the half-planes in seconds."""
 
-ROOM_M: Final = 2 * PERSON_RADIUS_M
+PASSING_DISTANCE_M: Final = 2 * PERSON_RADIUS_M
 """Preferred distance between the centres of people who pass each other, in metres."""
 
 SHOULDER_TO_SHOULDER_M: Final = 0.45
 """Distance between centres at which shoulders touch, in metres: used if no heading is free. People
 who are closer separate."""
 
-PARTED_S: Final = 0.5
+SEPARATION_TIME_S: Final = 0.5
 """Time in which people who are too close separate, in seconds."""
 
 TURNS: Final = tuple(
@@ -40,7 +40,7 @@ TURNS: Final = tuple(
 )
 """Cosine and sine of the turns that are tried to either side, 10 to 110 degrees."""
 
-GIVES: Final = 0.98
+LEAST_DISTANCE_SHARE: Final = 0.98
 """Share of their distance that people closer than two radii keep at least."""
 
 _CROSSING: Final = 0.35
@@ -84,7 +84,7 @@ def steered(
     neighbours: Sequence[Neighbour],
     *,
     horizon_s: float = HORIZON_S,
-    room_m: float = ROOM_M,
+    room_m: float = PASSING_DISTANCE_M,
     walls: Sequence[HalfPlane] = (),
 ) -> Vector:
     """Return the velocity (m/s) of a person, no faster than preferred.
@@ -116,7 +116,9 @@ def steered(
         disks = _relevant_disks(at_m, wanted_mps, neighbours, SHOULDER_TO_SHOULDER_M)
         heading_mps, _ = _freest_heading(wanted_mps, moving_mps, disks, walls, horizon_s)
     planes = [
-        half_plane(d.apart_m, moving_mps, d.moving_mps, d.keep_m, horizon_s, d.share, PARTED_S)
+        half_plane(
+            d.apart_m, moving_mps, d.moving_mps, d.keep_m, horizon_s, d.share, SEPARATION_TIME_S
+        )
         for d in disks
     ]
     planes += walls
@@ -137,7 +139,7 @@ def _relevant_disks(
         far_m = math.hypot(dx, dy)
         ahead = dx * wanted_mps[0] + dy * wanted_mps[1] > 0.0
         if far_m < STEERING_NEAR_M and (ahead or far_m < SHOULDER_TO_SHOULDER_M):
-            keep_m = min(room_m, max(GIVES * far_m, SHOULDER_TO_SHOULDER_M))
+            keep_m = min(room_m, max(LEAST_DISTANCE_SHARE * far_m, SHOULDER_TO_SHOULDER_M))
             room_m2 = dx * dx + dy * dy - keep_m * keep_m
             disks.append(_Disk((dx, dy), (one.vx_mps, one.vy_mps), keep_m, one.share, room_m2))
     return disks

@@ -29,7 +29,7 @@ STEP_ROUND_GAP_M = 0.12
 """Gap between a person's disk and the robot's outline below which the person steps round, in
 metres."""
 
-DRAWS_BACK_M = 0.015
+BACK_AWAY_M = 0.015
 """Distance per tick of 0.05 s by which a standing person backs away from the robot, in metres."""
 
 TOUCH_M = 0.01
@@ -41,7 +41,7 @@ STOOD_S: Final = 1.0
 walk round it, and the referee blames those who walk into it."""
 _ROUNDING_M: Final = 1e-6
 """Tolerance for rounding in metres."""
-FORESEEN_S = 0.6
+ANTICIPATION_S = 0.6
 """Time ahead in which people avoid the ground that the robot will cover, in seconds."""
 _ROOM_M: Final = 2.0 * (PERSON_RADIUS_M + STEP_ROUND_GAP_M)
 """Width in metres below which a gap is too narrow for a person."""
@@ -64,17 +64,17 @@ class RobotBody(NamedTuple):
     closed: tuple[float, float] = (0.0, 0.0)
 
 
-def within_reach_m(body: RobotBody) -> float:
+def reaction_distance_m(body: RobotBody) -> float:
     """Return the distance to the body's centre within which people step round it, in metres."""
     return (
         math.hypot(*body.half_m)
-        + FORESEEN_S * max(body.v_mps, 0.0)
+        + ANTICIPATION_S * max(body.v_mps, 0.0)
         + PERSON_RADIUS_M
         + STEP_ROUND_GAP_M
     )
 
 
-def stepped_round(
+def stepped_around(
     before: Floats, wanted: Floats, body: RobotBody, stand: NDArray[np.bool_] | None = None
 ) -> Floats:
     """Return new positions of people near a body, (N, 2) metres.
@@ -89,14 +89,14 @@ def stepped_round(
     people do not oscillate.
     """
     length, width = body.half_m
-    ahead = FORESEEN_S * max(body.v_mps, 0.0)
+    ahead = ANTICIPATION_S * max(body.v_mps, 0.0)
     low = np.array([-length, -width])
     high = np.array([length, width])
     reach = np.array([ahead, 0.0])
     offset = wanted - body.pose.xy
     if (
         np.hypot(offset[:, 0], offset[:, 1]).min(initial=np.inf)
-        > within_reach_m(body) + _ROUNDING_M
+        > reaction_distance_m(body) + _ROUNDING_M
     ):
         return wanted
     turn = _axes(body)
@@ -123,7 +123,7 @@ def stepped_round(
     slides = (_disk_gap(near, low, high) < STEP_ROUND_GAP_M) & (inward > 0.0) & (far > 1e-6)
     moved = np.where(slides[:, None], local + tangent * (side * pace)[:, None], near)
     if stand is not None:
-        back = np.clip(STEP_ROUND_GAP_M + PERSON_RADIUS_M - far, 0.0, DRAWS_BACK_M)
+        back = np.clip(STEP_ROUND_GAP_M + PERSON_RADIUS_M - far, 0.0, BACK_AWAY_M)
         comes_up = slides & stand[rows]
         moved[comes_up] = (near + normal * (inward + back)[:, None])[comes_up]
 
@@ -135,7 +135,7 @@ def stepped_round(
     return rounded
 
 
-def comes_too_near(before: Floats, after: Floats, body: RobotBody) -> NDArray[np.bool_]:
+def approaches_body(before: Floats, after: Floats, body: RobotBody) -> NDArray[np.bool_]:
     """Return whether each step approaches the robot's outline below the gap, (N,) booleans."""
     turn = _axes(body)
     half = np.array(body.half_m)
@@ -166,7 +166,7 @@ def _disk_gap(points: Floats, low: Floats, high: Floats) -> Floats:
     return gap
 
 
-class Standing:
+class StandingObstacles:
     """Obstacles of a scenario as people avoid them.
 
     bodies: obstacles as the director gets them.
@@ -174,22 +174,22 @@ class Standing:
 
     def __init__(self, bodies: Sequence[StandingBody] = ()) -> None:
         self.bodies = tuple(bodies)
-        self._footprints = [as_met(body) for body in self.bodies]
+        self._footprints = [obstacle_body(body) for body in self.bodies]
         self._xy = np.array([(body.x_m, body.y_m) for body in self.bodies]).reshape(-1, 2)
-        self._reach_m = np.array([within_reach_m(body) for body in self._footprints])
+        self._reach_m = np.array([reaction_distance_m(body) for body in self._footprints])
 
     def near(self, xy: Floats, margin_m: float = 0.0) -> tuple[StandingBody, ...]:
         """Return the obstacles near people at (N, 2) metres, within stepping distance plus a
         margin."""
         return tuple(self.bodies[i] for i in self._rows(xy, margin_m))
 
-    def stepped_round(
+    def stepped_around(
         self, before: Floats, wanted: Floats, stand: NDArray[np.bool_] | None = None
     ) -> Floats:
-        """Return new positions of people, as `stepped_round` does, for all near obstacles."""
+        """Return new positions of people, as `stepped_around` does, for all near obstacles."""
         if len(self.bodies) and len(wanted):
             for i in self._rows(wanted, 0.0):
-                wanted = stepped_round(before, wanted, self._footprints[i], stand)
+                wanted = stepped_around(before, wanted, self._footprints[i], stand)
         return wanted
 
     def _rows(self, xy: Floats, margin_m: float) -> list[int]:
@@ -199,11 +199,13 @@ class Standing:
         return rows
 
 
-def standing_bodies(obstacles: Sequence[Obstacle], walkable: Polygon | MultiPolygon) -> Standing:
+def standing_obstacles(
+    obstacles: Sequence[Obstacle], walkable: Polygon | MultiPolygon
+) -> StandingObstacles:
     """Return the obstacles on walkable ground as people avoid them."""
     grounds = np.array([footprint(one) for one in obstacles], dtype=object)
     if not len(grounds):
-        return Standing()
+        return StandingObstacles()
     together = shapely.get_parts(shapely.union_all(shapely.buffer(grounds, 0.5 * _ROOM_M)))
     edge = shapely.boundary(walkable)
     bodies = []
@@ -222,10 +224,10 @@ def standing_bodies(obstacles: Sequence[Obstacle], walkable: Polygon | MultiPoly
         heading = float(np.arctan2(ahead[1], ahead[0]))
         long, wide = float(np.hypot(*ahead)), float(np.hypot(*aside))
         bodies.append(StandingBody(x_m, y_m, heading, long, wide, *closed))
-    return Standing(bodies)
+    return StandingObstacles(bodies)
 
 
-def as_met(body: StandingBody) -> RobotBody:
+def obstacle_body(body: StandingBody) -> RobotBody:
     """Return an obstacle as a footprint to step round."""
     pose = Pose(body.x_m, body.y_m, body.heading_rad)
     return RobotBody(

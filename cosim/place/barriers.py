@@ -30,7 +30,9 @@ def outline(barrier: Barrier, margin_m: float = 0.0) -> Polygon:
     return shapely.buffer(line, barrier.thickness_m / 2 + margin_m, cap_style="flat")
 
 
-def fenced(area: Polygon | MultiPolygon, barriers: Iterable[Barrier]) -> Polygon | MultiPolygon:
+def without_barriers(
+    area: Polygon | MultiPolygon, barriers: Iterable[Barrier]
+) -> Polygon | MultiPolygon:
     """Return the walkable area without the footprints of the barriers."""
     fences = [outline(barrier) for barrier in barriers]
     if not fences:
@@ -69,7 +71,7 @@ _SEGMENT_M: Final = 30.0
 """Maximum length of a straight segment in that search, in metres."""
 
 
-def branches(street_map: StreetMap, way: Sequence[Port]) -> list[Port]:
+def ports_to_close(street_map: StreetMap, way: Sequence[Port]) -> list[Port]:
     """Return the ports to close: the others at the corners of a way, and the far ends of its first
     and last strip."""
     corners = sorted({corner_of(street_map, port) for port in way} - {""})
@@ -123,7 +125,9 @@ def _slanting_barrier(street_map: StreetMap, port: Port) -> Barrier:
     corner = street_map.corners.get(corner_of(street_map, port))
     if corner is not None:
         reach_m = min(MOUTH_M, line.length_m / 2)
-        left, right = (mouth(edge, along, reach_m, corner.polygon) for edge in (left, right))
+        left, right = (
+            edge_at_corner(edge, along, reach_m, corner.polygon) for edge in (left, right)
+        )
     return barrier_along(left - right, (left + right) / 2 + into_m * along, port)
 
 
@@ -145,7 +149,9 @@ def barrier_along(across: Floats, middle: Floats, port: Port) -> Barrier:
     )
 
 
-def mouth(end: Floats, along: Floats, reach_m: float, corner: Polygon | MultiPolygon) -> Floats:
+def edge_at_corner(
+    end: Floats, along: Floats, reach_m: float, corner: Polygon | MultiPolygon
+) -> Floats:
     """Return where an edge of a strip meets a corner, (2,) metres; `end` if it does not.
 
     end: (2,) end of the edge at the port.
@@ -179,7 +185,7 @@ def prove_single_path(
     Raises SpecError with the first condition that fails.
     """
     surroundings, walkable = ground_around(street_map, route, way) if ground is None else ground
-    free = fenced(walkable, barriers)
+    free = without_barriers(walkable, barriers)
     start = Point(route.points[0])
     goal = Point(route.points[-1])
     part = _part_containing(free, start)

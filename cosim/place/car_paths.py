@@ -9,7 +9,7 @@ from cosim.core.geometry import Floats
 from cosim.place import overlay
 from cosim.place.street_map import Lane, StreetMap, Strip
 
-CAR_M = 2.0
+CAR_WIDTH_M = 2.0
 """Width of the widest vehicle in metres."""
 _NEAR_M = 4.0
 """Distance in metres beyond which a car path is ignored."""
@@ -24,7 +24,7 @@ def paths_near(street_map: StreetMap, area: shapely.Geometry) -> list[shapely.Li
     return [shapely.LineString(lane.line[:, :2]) for lane in inner]
 
 
-def from_car_paths_m(street_map: StreetMap, xy: Floats) -> Floats:
+def distance_to_car_paths_m(street_map: StreetMap, xy: Floats) -> Floats:
     """Return the distance of (N, 2) points along a way to the nearest car path, (N,) metres.
 
     It is inf beyond 4 m.
@@ -50,7 +50,7 @@ def corners_driven_over(street_map: StreetMap) -> dict[str, shapely.Geometry]:
         if not lines:
             continue
         driven = overlay.union_all(
-            shapely.buffer(np.array(lines), CAR_M / 2.0, cap_style="flat").tolist()
+            shapely.buffer(np.array(lines), CAR_WIDTH_M / 2.0, cap_style="flat").tolist()
         )
         crossings = [
             strip.polygon

@@ -23,11 +23,11 @@ _NARROW_M = 1.0
 """Width of a strip in metres below which a robot and a person cannot pass each other."""
 STUB_M = 1.0
 """Length in metres below which a strip counts as a stub."""
-STEEP = 0.08
+STEEP_GRADE = 0.08
 """Grade from which a walkable lane counts as steep."""
-MOSTLY = 0.5
+MOSTLY_SHARE = 0.5
 """Share of a sidewalk's area on roads above which it counts as lying on the road."""
-LARGEST = 0.6
+LEAST_ISLAND_SHARE = 0.6
 """Share of the largest island below which the check warns; scenarios use only the largest one."""
 
 
@@ -162,7 +162,7 @@ def check_map(
     lengths = {s.id: s.length_m for s in strips}
     share = on_road_shares(street_map, sidewalks)
     areas = np.array([s.polygon.area for s in sidewalks])
-    on_road = [s for s, part in zip(sidewalks, share, strict=True) if part > MOSTLY]
+    on_road = [s for s, part in zip(sidewalks, share, strict=True) if part > MOSTLY_SHARE]
     stacked = [s for s in stacked_on_roads(street_map, sidewalks) if s not in on_road]
     narrow = [s for s in sidewalks if s.width_m < _NARROW_M]
     driven_over = corners_driven_over(street_map)
@@ -294,7 +294,7 @@ def _unusable_reasons(street_map: StreetMap) -> list[str]:
 
 
 def _island_warnings(islands: Sequence[Island]) -> list[str]:
-    if not islands or islands[0].share >= LARGEST:
+    if not islands or islands[0].share >= LEAST_ISLAND_SHARE:
         return []
     return [
         f"the largest of {len(islands)} islands of connected walkways has {islands[0].share:.0%} "

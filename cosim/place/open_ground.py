@@ -64,7 +64,7 @@ def open_ground(
     """
     if street_map.planned:
         return []
-    lands = [(cast(LandKind, land.kind), land.polygon) for land in street_map.lands_near(area)]
+    lands = [(cast(LandKind, land.kind), land.polygon) for land in street_map.land_near(area)]
     found: dict[LandKind, list[Polygon]] = defaultdict(list)
     taken: shapely.Geometry = Polygon()
     for kind, whole in (*lands, *_beds(street_map, area)):

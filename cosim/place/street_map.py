@@ -130,7 +130,7 @@ class Junction:
 
 LandKind = Literal["lawn", "planting", "soil", "yard", "water"]
 """Covers of open land. A yard is land to park, drive or work on, such as a parking lot."""
-LANDS: Final[tuple[LandKind, ...]] = get_args(LandKind)
+LAND_KINDS: Final[tuple[LandKind, ...]] = get_args(LandKind)
 """All covers of open land."""
 FeatureKind = (
     Literal["building", "tree", "lamp", "bench", "bollard", "bin", "hydrant", "rack"] | LandKind
@@ -204,13 +204,13 @@ class StreetMap:
         """Hash of the map's inputs and of the code that read it; "" if built otherwise."""
         return self._made_of
 
-    def read_of(self, made_of: str) -> Self:
+    def with_source_hash(self, made_of: str) -> Self:
         """Set `made_of` and return the map, for its reader."""
         object.__setattr__(self, "_made_of", made_of)
         return self
 
     @cached_property
-    def signals_by_the_clock(self) -> bool:
+    def signals_fixed_time(self) -> bool:
         """Whether all signals of crossings have a fixed-time program."""
         return all(strip.plan is not None for strip in self.strips.values() if strip.signalised)
 
@@ -231,7 +231,7 @@ class StreetMap:
         tree, pieces = self._tree(kind)
         return [pieces[i] for i in np.sort(tree.query(area, predicate="intersects"))]
 
-    def lands_near(self, area: shapely.Geometry) -> list[Feature]:
+    def land_near(self, area: shapely.Geometry) -> list[Feature]:
         """Return the mapped land that intersects `area`, the smallest piece first."""
         tree, lands = self._lands
         return sorted(
@@ -246,7 +246,7 @@ class StreetMap:
 
     @cached_property
     def _lands(self) -> tuple[shapely.STRtree, tuple[Feature, ...]]:
-        return _indexed(feature for feature in self.features if feature.kind in LANDS)
+        return _indexed(feature for feature in self.features if feature.kind in LAND_KINDS)
 
     @cached_property
     def _houses(self) -> tuple[shapely.STRtree, tuple[Feature, ...]]:

@@ -23,10 +23,10 @@ ROBOT_GRADE_MAX = 0.20
 """Maximum grade of the land on a route, along or across a strip; curb ramps are excluded."""
 
 
-FALSE_GRADE = 0.25
+IMPLAUSIBLE_GRADE = 0.25
 """Grade above which a map's elevation counts as wrong; hardly any street is steeper."""
 
-CLAMPED_M = 0.25
+CLAMP_THRESHOLD_M = 0.25
 """Correction of a street's height in metres above which the point counts as clamped."""
 
 

@@ -21,11 +21,16 @@ from cosim.core.clock import Clock
 from cosim.core.errors import SpecError, UsageError, unknown
 from cosim.episode.interfaces import Policy
 from cosim.episode.manifest_checks import with_goal
-from cosim.episode.policy_caller import LOADED_WITHIN_S, Driver, Timer
+from cosim.episode.policy_caller import LOAD_TIMEOUT_S, PolicyCaller, Timer
 from cosim.policies import POLICIES
 from cosim.policies.onnx.manifest import MANIFEST_FILE, read_bundle_manifest
 from cosim.policies.onnx.weights import weights_file
-from cosim.policies.user_module import importable, policy_class, policy_module, remedy_for_missing
+from cosim.policies.user_module import (
+    importable_name,
+    policy_class,
+    policy_module,
+    remedy_for_missing,
+)
 from cosim.spec.camera import CameraSpec
 from cosim.spec.manifest import Manifest
 
@@ -65,7 +70,9 @@ OTHER_NAMES = ("path/to/file.py:Class", "package.module:Class", f"{ONNX_SCHEME}F
 """Forms of policy names that are not listed."""
 
 
-def load_policy(name: str, timer: Timer | None = None, start_s: float = LOADED_WITHIN_S) -> Driver:
+def load_policy(
+    name: str, timer: Timer | None = None, start_s: float = LOAD_TIMEOUT_S
+) -> PolicyCaller:
     """Load a new policy and read its manifest.
 
     timer: Records the pending call while the policy loads and answers, to enforce timeouts.
@@ -75,7 +82,7 @@ def load_policy(name: str, timer: Timer | None = None, start_s: float = LOADED_W
     >>> load_policy("route").manifest.name
     'route'
     """
-    name = importable(name)
+    name = importable_name(name)
     within_s = start_s if timer is None else None
     if name.startswith(ONNX_SCHEME):
         return _by_networks(
@@ -88,7 +95,7 @@ def load_policy(name: str, timer: Timer | None = None, start_s: float = LOADED_W
     if ":" not in name:
         if name in POLICIES:
             policy = POLICIES[name]()
-            return Driver(policy, source_hash=source_hash(policy), timer=timer)
+            return PolicyCaller(policy, source_hash=source_hash(policy), timer=timer)
         bundles = shipped_bundles()
         if name in bundles:
             return _by_networks(name, _bundle(bundles[name], within_s), timer)
@@ -102,7 +109,7 @@ def load_policy(name: str, timer: Timer | None = None, start_s: float = LOADED_W
             manifest = _checked(name, policy)
         finally:
             os.chdir(home)  # the user's code may have gone elsewhere
-    return Driver(policy, manifest, source_hash(policy), timer)
+    return PolicyCaller(policy, manifest, source_hash(policy), timer)
 
 
 class _Networked(Policy, Protocol):
@@ -131,7 +138,7 @@ def _follow() -> _Networked:
     return Follow()
 
 
-def _by_networks(name: str, make: Callable[[], _Networked], timer: Timer | None) -> Driver:
+def _by_networks(name: str, make: Callable[[], _Networked], timer: Timer | None) -> PolicyCaller:
     """Load a policy with networks. Raises UsageError if a network is missing or invalid."""
     try:
         with policy_call("loading", timer=timer, passes=(BaseException,)):
@@ -141,7 +148,7 @@ def _by_networks(name: str, make: Callable[[], _Networked], timer: Timer | None)
         said = str(error).removeprefix(f"policy '{name}': ")
         raise UsageError(f"policy '{name}': {said}") from error
     digest = hashlib.blake2b(f"{source_hash(policy)}{policy.digest}".encode(), digest_size=8)
-    return Driver(policy, manifest, digest.hexdigest(), timer)
+    return PolicyCaller(policy, manifest, digest.hexdigest(), timer)
 
 
 def source_hash(policy: Policy) -> str:

@@ -29,7 +29,7 @@ class _File(NamedTuple):
     module: str
 
 
-def importable(name: str) -> str:
+def importable_name(name: str) -> str:
     """Return a policy's name as `package.module:Class`, importable in every process of a run.
 
     For `path/to/file.py:Class`, the import root is put first on `sys.path`, which child processes
@@ -46,8 +46,8 @@ def importable(name: str) -> str:
             f"policy '{name}' names a file and no class: write {name}:{(*classes, 'CLASS')[0]}. "
             f"Classes in it: {', '.join(classes) or 'none'}"
         )
-    search(Path.cwd())
-    search(file.root, first=True)
+    add_to_path(Path.cwd())
+    add_to_path(file.root, first=True)
     return f"{file.module}:{class_name}"
 
 
@@ -57,7 +57,7 @@ def policy_module(name: str) -> tuple[ModuleType, str]:
     Raises any exception of the module.
     """
     module_name, class_name = _split(name)
-    search(Path.cwd())
+    add_to_path(Path.cwd())
     return importlib.import_module(module_name), class_name
 
 
@@ -75,7 +75,7 @@ def policy_class(module: ModuleType, class_name: str) -> Callable[[], object]:
     return found
 
 
-def search(folder: Path, *, first: bool = False) -> None:
+def add_to_path(folder: Path, *, first: bool = False) -> None:
     """Add a folder to the front of `sys.path`.
 
     first: Move it to the front if it is already on the path.

@@ -17,7 +17,7 @@ from cosim.core.geometry import Floats
 from cosim.core.state import DIRECTED, PersonKind
 from cosim.place.open_ground import GROUND_LOOKS, PLAIN_GROUND, open_ground
 from cosim.place.street_map import Lane, StreetMap
-from cosim.report.legend import Image, Rgb255, legend, wide_px
+from cosim.report.legend import Image, Rgb255, legend, text_width_px
 from cosim.results.log import Log
 from cosim.results.record import Record
 from cosim.spec.obstacle import footprint
@@ -128,7 +128,7 @@ class Sheet:
         """
         x, y = (self.px(np.array([xy]))[0] // 16).tolist()
         clear_px = round(beside_m * self.px_per_m)
-        text_width = wide_px(words, size)
+        text_width = text_width_px(words, size)
         text_height = round(22 * size)
         gap = clear_px + TEXT_GAP_PX
         left = x - text_width // 2
@@ -188,7 +188,7 @@ def draw_above(street_map: StreetMap, scenario: Scenario, record: Record, log: L
         bounds, max(PX_PER_M, USUAL_PX / max(bounds[2] - bounds[0], bounds[3] - bounds[1]))
     )
     draw_streets(sheet, street_map, shapely.box(*bounds))
-    draw_way_and_things(sheet, scenario)
+    draw_route_and_objects(sheet, scenario)
     sheet.dot(log.people_xy[log.people_kind == PersonKind.CROWD], PERSON, 0.15)
     sheet.dot(log.people_xy[log.people_kind == PersonKind.RESIDENT], RESIDENT, 0.2)
     sheet.dot(log.people_xy[np.isin(log.people_kind, DIRECTED)], EVENT, 0.25)
@@ -202,7 +202,7 @@ def draw_above(street_map: StreetMap, scenario: Scenario, record: Record, log: L
     return legend(sheet.image, _facts(scenario, record, len(log) * log.tick_s))
 
 
-def draw_way_and_things(sheet: Sheet, scenario: Scenario) -> None:
+def draw_route_and_objects(sheet: Sheet, scenario: Scenario) -> None:
     """Draw the route, barriers and obstacles of a scenario."""
     sheet.line(np.array(scenario.route), ROUTE, 0.4)
     for barrier in scenario.barriers:

@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 
 import pandas as pd
 
-from cosim.results.compare import FEWEST_CHANGED, ComparedRun, RunComparison
+from cosim.results.compare import MIN_CHANGED, ComparedRun, RunComparison
 from cosim.results.metrics import SUCCESS_IN_WORDS
 from cosim.results.table import BOOTSTRAP
 
@@ -57,7 +57,7 @@ _MARKDOWN_SPECIAL: Final = re.compile(r"([\\`*_{}\[\]#|~$&])")
 _SIGNED_NUMBER: Final = re.compile(r"(?<!\S)[-+]\d[\d.]*(?!\S)")
 
 
-class WrittenTable(NamedTuple):
+class TextTable(NamedTuple):
     """Table of text cells. names: number of columns with names; the others are figures."""
 
     title: str
@@ -66,7 +66,7 @@ class WrittenTable(NamedTuple):
     names: int
 
 
-def tables_of_comparison(result: RunComparison, other: ComparedRun) -> tuple[WrittenTable, ...]:
+def tables_of_comparison(result: RunComparison, other: ComparedRun) -> tuple[TextTable, ...]:
     """Build the tables of the first run against another: the whole suite by metric, then its
     groups.
 
@@ -78,7 +78,7 @@ def tables_of_comparison(result: RunComparison, other: ComparedRun) -> tuple[Wri
     figures = ("A", "B", "B - A", "95 % of B - A", "n", "")
     whole = [row for row in rows if row["by"] == "suite" and row["metric"] in _SUITE_METRICS]
     tables = [
-        WrittenTable(
+        TextTable(
             title, ("metric", *figures), tuple((row["metric"], *_figures(row)) for row in whole), 1
         )
     ]
@@ -87,7 +87,7 @@ def tables_of_comparison(result: RunComparison, other: ComparedRun) -> tuple[Wri
         each = tuple(
             (row["group"], _GROUP_METRICS[row["metric"]], *_figures(row)) for row in grouped
         )
-        tables.append(WrittenTable(f"{title}, by {named}", ("group", "", *figures), each, 2))
+        tables.append(TextTable(f"{title}, by {named}", ("group", "", *figures), each, 2))
     return tuple(tables)
 
 
@@ -126,7 +126,7 @@ def how_to_read(result: RunComparison) -> str:
     return (
         "Paired by scenario, rates pooled; intervals by drawing scenarios again in pairs, "
         f"{BOOTSTRAP} times, always the same. Within noise: the interval holds 0. Too few: it does "
-        f"not, but fewer than {FEWEST_CHANGED} scenarios changed (of a rate: of those with a "
+        f"not, but fewer than {MIN_CHANGED} scenarios changed (of a rate: of those with a "
         "failure). Differs: it does not, and there is no verdict. One interval in twenty misses "
         f"by chance alone: {shown} stand in these tables, {in_all} in a .csv, a row for every "
         f"metric of every group. SR {SUCCESS_IN_WORDS}; RC share of the route done; FC failures "
@@ -167,7 +167,7 @@ def as_latex(result: RunComparison) -> str:
     return "\n\n".join([*blocks, *map(_in_latex, (*result.notes, how_to_read(result)))]) + "\n"
 
 
-def _frame(table: WrittenTable, escaped: Callable[[str], str]) -> pd.DataFrame:
+def _frame(table: TextTable, escaped: Callable[[str], str]) -> pd.DataFrame:
     """Return a table with its heads and cells escaped."""
     return pd.DataFrame(
         [[*map(escaped, row)] for row in table.rows], columns=[*map(escaped, table.heads)]

@@ -36,11 +36,11 @@ def legend(image: Image, cells: Sequence[tuple[str, Rgb255]]) -> Image:
         y = MARGIN_PX + LINE_PX * row + 16
         for words, colour in line:
             cv2.putText(band, words, (x, y), _FONT, _SIZE, colour, 1, cv2.LINE_AA)
-            x += wide_px(words) + GAP_PX
+            x += text_width_px(words) + GAP_PX
     return np.concatenate([image, band])
 
 
-def wide_px(words: str, size: float = _SIZE) -> int:
+def text_width_px(words: str, size: float = _SIZE) -> int:
     """Return the width of a line of text, pixels."""
     return int(cv2.getTextSize(words, _FONT, size, 1)[0][0])
 
@@ -52,7 +52,7 @@ def _lines(cells: Sequence[tuple[str, Rgb255]], width_px: int) -> list[list[tupl
     left = room
     for words, colour in cells:
         for piece in _pieces(words, room):
-            needed = wide_px(piece)
+            needed = text_width_px(piece)
             if needed > left and lines[-1]:
                 lines.append([])
                 left = room
@@ -66,7 +66,7 @@ def _pieces(words: str, room_px: int) -> list[str]:
     pieces = [""]
     for word in words.split():
         longer = f"{pieces[-1]} {word}".strip()
-        if pieces[-1] and wide_px(longer) > room_px:
+        if pieces[-1] and text_width_px(longer) > room_px:
             pieces.append(word)
         else:
             pieces[-1] = longer

@@ -24,8 +24,8 @@ from cosim.report.above import (
     Bounds,
     Sheet,
     draw_ends_and_events,
+    draw_route_and_objects,
     draw_streets,
-    draw_way_and_things,
 )
 from cosim.report.legend import Image, Rgb255, legend
 from cosim.spec.scenario import Scenario
@@ -155,7 +155,7 @@ def draw_plan(
     cells += [(credit, _INK)] if credit else []
     if scenario is None:
         return legend(sheet.image, cells)
-    draw_way_and_things(sheet, scenario)
+    draw_route_and_objects(sheet, scenario)
     draw_ends_and_events(sheet, scenario)
     _draw_arc_lengths(sheet, scenario)
     return legend(sheet.image, [*_scenario_legend(scenario), *cells])

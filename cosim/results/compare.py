@@ -21,13 +21,13 @@ from cosim.results.table import (
     BOOTSTRAP,
     CONFIDENCE,
     injections_in_words,
-    not_to_be_quoted,
-    numbers,
+    numeric_column,
     table_of,
+    why_inconclusive,
 )
 from cosim.spec.scenario import Scenario
 
-FEWEST_CHANGED: Final = 6
+MIN_CHANGED: Final = 6
 """Minimum number of changed pairs for a verdict."""
 PairedVerdict = Literal["within noise", "too few", "better", "worse", "differs"]
 
@@ -56,7 +56,7 @@ class PairedDifference(NamedTuple):
         """Return the verdict in words. higher_is_better: None if neither direction is better."""
         if not self.n or self.low <= 0.0 <= self.high:
             return "within noise"
-        if self.changed < FEWEST_CHANGED:
+        if self.changed < MIN_CHANGED:
             return "too few"
         if higher_is_better is None:
             return "differs"
@@ -266,11 +266,13 @@ def differences_of(
 def _difference(name: str, before: pd.DataFrame, after: pd.DataFrame) -> PairedDifference:
     """Return the paired difference of a metric; a rate is undefined if a policy crashed."""
     if name not in POOLED:
-        return difference_of_means(numbers(before, name), numbers(after, name))
+        return difference_of_means(numeric_column(before, name), numeric_column(after, name))
     if "crashed" in {*before["status"], *after["status"]}:
         return _NO_PAIRS
     counted, metres = POOLED[name]
-    one, other = ((numbers(table, counted), numbers(table, metres)) for table in (before, after))
+    one, other = (
+        (numeric_column(table, counted), numeric_column(table, metres)) for table in (before, after)
+    )
     return difference_of_rates(one, other)
 
 
@@ -346,7 +348,7 @@ def _notes(runs: Sequence[WholeRun], compared: Sequence[ComparedRun]) -> Iterato
     first_label = compared[0].label
     first_camera = _camera_in_words(compared[0].table)
     for run, other in zip(runs, compared, strict=True):
-        if reason := not_to_be_quoted(other.table, len(run.spec.scenarios)):
+        if reason := why_inconclusive(other.table, len(run.spec.scenarios)):
             yield f"{other.label} is not to be quoted: {reason}"
         if nonstandard := next(
             (record.nonstandard for record in run.records.values() if record.nonstandard), ""

@@ -44,7 +44,7 @@ PASSED_M: Final = 5.0
 _MOVED_M: Final = 1e-6
 _HAS_MOVED: Final = np.full(2, np.nan)
 
-Hidden = Callable[[Floats, Floats], NDArray[np.bool_]]
+OcclusionTest = Callable[[Floats, Floats], NDArray[np.bool_]]
 """Occlusion test: for each of (N, 3) points, whether a solid is between it and the eye (3,),
 metres."""
 
@@ -58,12 +58,17 @@ class EventMonitor:
     """
 
     def __init__(
-        self, scenario: Scenario, kinds: EventKinds, robot: Robot, hidden: Hidden, tick_ms: int
+        self,
+        scenario: Scenario,
+        kinds: EventKinds,
+        robot: Robot,
+        hidden: OcclusionTest,
+        tick_ms: int,
     ) -> None:
         self._events = scenario.events
         self._mount = STANDARD_CAMERA.on(robot)
         self._hidden = hidden
-        self._passed_round = [kinds[event.kind].passed_round for event in scenario.events]
+        self._passed_round = [kinds[event.kind].passed_as_group for event in scenario.events]
         self._tick_ms = tick_ms
         self._states: tuple[EventState, ...] = ()
         self._seen = [False] * len(self._events)
@@ -89,7 +94,7 @@ class EventMonitor:
             bodies = np.array(list(places.values())).reshape(-1, 2)
             self._seen[i] = self._seen[i] or self._sees(step.motion.robot, bodies)
             if state.phase == "acting" and self._passed_round[i]:
-                self._went_between[i] |= went_between(before.xy, after.xy, bodies)
+                self._went_between[i] |= passed_between(before.xy, after.xy, bodies)
 
     def _track(self, tick: int, event: int, places: Mapping[int, Floats]) -> None:
         """Record the positions of an event's people, each from its first move."""
@@ -101,7 +106,7 @@ class EventMonitor:
 
     def _sees(self, robot: RobotState, bodies: Floats) -> bool:
         """Return whether the camera sees one of the (N, 2) bodies."""
-        eye = eye_of(robot, self._mount)
+        eye = camera_position(robot, self._mount)
         height_m = robot.z_m
         for xy in bodies[np.hypot(*(bodies - robot.pose.xy).T) <= SEEN_WITHIN_M]:
             points = body_points(eye, xy, height_m)
@@ -141,7 +146,7 @@ class EventMonitor:
         )
 
 
-def eye_of(robot: RobotState, mount: Mount) -> Floats:
+def camera_position(robot: RobotState, mount: Mount) -> Floats:
     """Return the position (3,) of a camera mounted on the robot, metres."""
     ahead, left, up = mount.at_m
     cos, sin = math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)
@@ -172,7 +177,7 @@ def in_picture(robot: Pose, mount: Mount, camera: CameraSpec, rays: Floats) -> N
     return inside
 
 
-def went_between(before: Floats, after: Floats, people: Floats) -> bool:
+def passed_between(before: Floats, after: Floats, people: Floats) -> bool:
     """Return whether a step (2,) -> (2,) crosses the line between any two of (N, 2) people."""
     return any(_cross(before, after, a, b) for a, b in itertools.combinations(people, 2))
 

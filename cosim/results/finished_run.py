@@ -14,9 +14,9 @@ from cosim.results.run_folder import (
     read_records,
     read_scenarios,
     read_spec,
+    record_difference,
     record_file,
     refuse_in_use,
-    told_apart,
 )
 from cosim.results.run_setup import METRIC_SCHEMA
 from cosim.results.run_spec import RunSpec
@@ -84,7 +84,7 @@ def check_record_file(path: Path, record: Record) -> None:
     if not file.exists():
         if record.ended is not None:
             raise RunError(f"{file}: not there: {RUN_AGAIN}")
-    elif difference := told_apart(read_record(file), record):
+    elif difference := record_difference(read_record(file), record):
         raise RunError(
             f"{file}: not what {DATABASE} has of this episode: {difference}: {RUN_AGAIN}"
         )

@@ -65,7 +65,7 @@ class FlatFile(Generic[_T]):
         """Return the JSON of a struct in one line."""
         return msgspec.json.encode(self.flat(value))
 
-    def in_lines(self, value: _T) -> bytes:
+    def encode_indented(self, value: _T) -> bytes:
         """Return the indented JSON of a struct, as its file holds it."""
         return msgspec.json.format(self.encode(value), indent=1) + b"\n"
 

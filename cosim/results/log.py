@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import RunError
 from cosim.core.geometry import Floats, box_disk_gap
-from cosim.core.npz import names_in_npz, read_npz
+from cosim.core.npz import npz_names, read_npz
 from cosim.core.state import PERSON_RADIUS_M, People, RobotState
 from cosim.episode.loop import Step
 from cosim.results.referee import Verdict
-from cosim.results.traffic import OnRoad
+from cosim.results.traffic import RoadState
 
 _PLAN_ARRAYS = {"plan_sizes", "plan_points", "plan_index"}
 _OPTIONAL = {"answers"} | _PLAN_ARRAYS
@@ -91,7 +91,7 @@ class Tick:
     step: Step
     verdict: Verdict
     footprint_m: tuple[float, float]
-    road: OnRoad
+    road: RoadState
 
     @property
     def robot(self) -> RobotState:
@@ -141,7 +141,7 @@ def _column(
 def holds_waypoints(path: Path) -> bool:
     """Return whether a trajectory.npz holds waypoints; False if it cannot be read."""
     try:
-        return "plan_points" in names_in_npz(path)
+        return "plan_points" in npz_names(path)
     except (OSError, ValueError):
         return False
 

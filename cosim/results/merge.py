@@ -22,16 +22,16 @@ from cosim.results.run_folder import (
     read_records,
     read_scenarios,
     read_spec,
+    record_difference,
     record_file,
     refuse_in_use,
-    told_apart,
     trajectory_file,
 )
 from cosim.results.run_spec import RunSpec
 from cosim.spec.scenario import Scenario, read_suite
 
 
-class Merged(NamedTuple):
+class MergeResult(NamedTuple):
     """Result of a merge.
 
     table: table of the merged run, as in results.csv
@@ -53,7 +53,7 @@ class _Part(NamedTuple):
     records: Mapping[str, Record]
 
 
-def merge_runs(folders: Sequence[Path], target: Path, progress: Progress) -> Merged:
+def merge_runs(folders: Sequence[Path], target: Path, progress: Progress) -> MergeResult:
     """Merge run folders that differ only in their shard into `target`, atomically.
 
     Raises UsageError if a folder holds no run. Raises RunError for folders of different runs, a
@@ -98,7 +98,7 @@ def merge_runs(folders: Sequence[Path], target: Path, progress: Progress) -> Mer
     except (OSError, shutil.Error) as error:
         cause = error if isinstance(error, OSError) and error.errno else OSError(str(error))
         raise unwritable(target, cause) from error
-    return Merged(spec, table, missing, tuple(twice))
+    return MergeResult(spec, table, missing, tuple(twice))
 
 
 def _read(path: Path, first: _Part | None) -> _Part:
@@ -146,7 +146,7 @@ def _check_equal(name: str, one: _Part, other: _Part) -> None:
     other_record, record = (
         msgspec.structs.replace(part.records[name], clock={}) for part in (other, one)
     )
-    difference = told_apart(other_record, record)
+    difference = record_difference(other_record, record)
     if not difference:
         logs = [trajectory_file(part.path, name) for part in (one, other)]
         difference = "" if _same_arrays(*logs) else "trajectory.npz is another one"

@@ -269,12 +269,12 @@ def collisions_with(other_kind: str) -> Callable[[EpisodeFacts], float]:
     )
 
 
-def had(count_of: Callable[[EpisodeFacts], float]) -> Callable[[EpisodeFacts], float]:
+def any_of(count_of: Callable[[EpisodeFacts], float]) -> Callable[[EpisodeFacts], float]:
     """Return a metric that is 1 if the count is above 0; its mean is a rate of episodes."""
     return lambda episode: float(count_of(episode) > 0.0)
 
 
-def collisions_with_the_rest(episode: EpisodeFacts) -> float:
+def collisions_with_others(episode: EpisodeFacts) -> float:
     """Return the number of collisions with anything but a person."""
     return count("collision")(episode) - collisions_with("pedestrian")(episode)
 
@@ -335,11 +335,11 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
         "collisions_wall": Metric("", False, collisions_with("wall")),
         "collisions_object": Metric("", False, collisions_with("object")),
         "walked_into": Metric("", None, lambda episode: float(len(episode.walked_into))),
-        "pedestrian_collision": Metric("", False, had(collisions_with("pedestrian")), worst=1.0),
-        "other_collision": Metric("", False, had(collisions_with_the_rest), worst=1.0),
-        "left_lane": Metric("", False, had(count("out_of_lane")), worst=1.0),
+        "pedestrian_collision": Metric("", False, any_of(collisions_with("pedestrian")), worst=1.0),
+        "other_collision": Metric("", False, any_of(collisions_with_others), worst=1.0),
+        "left_lane": Metric("", False, any_of(count("out_of_lane")), worst=1.0),
         "broke_rule": Metric(
-            "", False, had(lambda episode: float(episode.rules_broken)), worst=1.0
+            "", False, any_of(lambda episode: float(episode.rules_broken)), worst=1.0
         ),
         "red_light_entries": Metric("", False, lambda episode: float(episode.red_light_entries)),
         "carriageway_time_s": Metric("s", False, carriageway_time_s),
@@ -381,6 +381,6 @@ it.
 """
 
 
-def every_metric(episode: EpisodeFacts) -> dict[str, float | None]:
+def compute_metrics(episode: EpisodeFacts) -> dict[str, float | None]:
     """Compute every metric of an episode."""
     return {name: metric.of(episode) for name, metric in METRICS.items()}

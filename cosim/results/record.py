@@ -16,17 +16,17 @@ import msgspec
 import numpy as np
 
 from cosim.core.errors import RunError, SpecError
-from cosim.core.files import read_within, write_atomic
+from cosim.core.files import read_limited, write_atomic
 from cosim.core.geometry import Floats
-from cosim.episode.command_delay import InFlight
+from cosim.episode.command_delay import CommandDelay
 from cosim.episode.loop import Step
 from cosim.episode.manifest_checks import nonstandard
 from cosim.results.flat_file import FlatFile
 from cosim.results.log import COLUMNS, Log, Tick
 from cosim.results.referee import Ended, Failure, Verdict
 from cosim.results.run_setup import RunSetup
-from cosim.results.traffic import OnRoad
-from cosim.spec.episode_id import pseudonym_of
+from cosim.results.traffic import RoadState
+from cosim.spec.episode_id import episode_id_of
 from cosim.spec.injection import Injected
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import robot_called
@@ -144,7 +144,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
             scenario=ScenarioFacts.of(scenario),
             setup=setup,
             manifest=replace(manifest, cameras=dict(manifest.cameras), goals=()),
-            episode=pseudonym_of(setup.seed, scenario).episode,
+            episode=episode_id_of(setup.seed, scenario).episode,
             nonstandard=nonstandard(manifest, robot_called(scenario.robot)),
             status="crashed",
         )
@@ -160,13 +160,13 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
     def encoded(self) -> bytes:
         """Return the bytes of the JSON file."""
-        return RECORD_FILE.in_lines(self)
+        return RECORD_FILE.encode_indented(self)
 
     @classmethod
     def load(cls, path: Path) -> Record:
         """Load a record. Raises RunError naming the file and the field."""
         try:
-            data = read_within(path, _MOST_BYTES)
+            data = read_limited(path, _MOST_BYTES)
         except OSError as error:
             raise RunError(f"{path}: not an episode record: {error.strerror}") from error
         except ValueError as error:
@@ -243,7 +243,7 @@ class Recorder:
         self._people: list[tuple[float, ...]] = []
         self.hash = StateHash()
 
-    def add(self, step: Step, verdict: Verdict, road: OnRoad = OnRoad()) -> None:  # noqa: B008  a frozen value
+    def add(self, step: Step, verdict: Verdict, road: RoadState = RoadState()) -> None:  # noqa: B008  a frozen value
         """Record one tick; people only every PEOPLE_EVERY_TICKS within PEOPLE_WITHIN_M."""
         self.hash.add(step)
         tick = Tick(step, verdict, self._footprint_m, road)
@@ -260,7 +260,7 @@ class Recorder:
             ):
                 self._people.append((step.tick, *xy, kind, age))
 
-    def log(self, event_tracks: Floats, commands: InFlight) -> Log:
+    def log(self, event_tracks: Floats, commands: CommandDelay) -> Log:
         """Build the log of the ticks so far.
 
         event_tracks: see `Log`

@@ -73,9 +73,9 @@ STOP_S = 2.0
 """Time, seconds, that the robot must be stopped before a stopping hand."""
 STOP_WITHIN_M = 3.0
 """Distance, metres, in front of a stopping hand within which the robot must stop."""
-ROUND_M = 0.5
+LOOP_MARGIN_M = 0.5
 """Margin, metres, added to the goal's radius when testing whether a route is a loop."""
-LEFT_M = 0.3
+CROSSING_LEFT_M = 0.3
 """Distance, metres, before a crossing at which the robot has left it and may enter it again."""
 
 FailureKind = Literal["collision", "out_of_lane", "freezing"]
@@ -133,7 +133,7 @@ class Referee:
             [footprint(obstacle) for obstacle in scenario.obstacles]
         )
         self._fences = shapely.union_all([outline(barrier) for barrier in scenario.barriers])
-        self._is_round = is_round(scenario)
+        self._is_round = is_loop(scenario)
         self._limit_ticks = clock.ticks(scenario.time_limit_s)
         self._touching: dict[str, int] = {}
         self._walked_into: set[str] = set()
@@ -187,7 +187,7 @@ class Referee:
         passed it."""
         robot = step.motion.robot
         here = any(
-            state.phase == "acting" and stands_before(robot.pose, event, state)
+            state.phase == "acting" and is_in_front_of_event(robot.pose, event, state)
             for event, state in zip(self._scenario.events, step.events.states, strict=True)
         )
         self._stopped_ticks = (
@@ -265,7 +265,7 @@ class Referee:
                 self._entered.add(crossing.id)
                 if signal_is_red(crossing.id, step.street.signals):
                     return crossing.id
-            elif step.route_s_after_m < crossing.enter_s_m - LEFT_M:
+            elif step.route_s_after_m < crossing.enter_s_m - CROSSING_LEFT_M:
                 self._entered.discard(crossing.id)
         return None
 
@@ -386,15 +386,15 @@ def near_goal(scenario: Scenario, pose: Floats) -> NDArray[np.bool_]:
     return near
 
 
-def is_round(scenario: Scenario) -> bool:
+def is_loop(scenario: Scenario) -> bool:
     """Return whether a route is a loop: it passes its own goal before its end."""
     route = scenario.route_line
     last_m = route.length_m - 2 * scenario.goal_radius_m
     before = shapely.LineString([*route.points[route.s_m < last_m], route.at(last_m).xy])
-    return before.distance(shapely.Point(scenario.goal)) <= scenario.goal_radius_m + ROUND_M
+    return before.distance(shapely.Point(scenario.goal)) <= scenario.goal_radius_m + LOOP_MARGIN_M
 
 
-def stands_before(robot: Pose, event: Event, state: EventState) -> bool:
+def is_in_front_of_event(robot: Pose, event: Event, state: EventState) -> bool:
     """Return whether the robot is within STOP_WITHIN_M of a person, on the side it came from."""
     for walker in state.walkers:
         dx, dy = robot.x_m - walker.x_m, robot.y_m - walker.y_m

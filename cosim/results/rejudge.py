@@ -19,7 +19,7 @@ from cosim.episode.loop import ROUTE_WINDOW_M
 from cosim.people.yielding import ROBOT_STANDS_MPS
 from cosim.results.log import Log
 from cosim.results.record import Record
-from cosim.results.referee import STOP_S, Ended, FreezeWindow, at_goal, is_round, near_goal
+from cosim.results.referee import STOP_S, Ended, FreezeWindow, at_goal, is_loop, near_goal
 from cosim.spec.scenario import Scenario
 
 _ROUNDING_M = 1e-9
@@ -190,7 +190,7 @@ def _ends(record: Record, scenario: Scenario, log: Log) -> list[Ended]:
     goals[[failure.tick for failure in record.failures]] = False
     if goals.any():
         return ["goal"] if int(np.argmax(goals)) == last else []
-    near = bool(near_goal(scenario, log.pose[-1:]).any()) and not is_round(scenario)
+    near = bool(near_goal(scenario, log.pose[-1:]).any()) and not is_loop(scenario)
     return _allowed(("goal", near), ("timeout", late))
 
 

@@ -18,7 +18,7 @@ from cosim.core.errors import RunError
 from cosim.core.progress import Progress, ignore
 from cosim.results.event_monitor import why_invalid
 from cosim.results.finished_run import WholeRun, read_whole_run
-from cosim.results.metrics import COUNTERFACTUAL, METRICS, EpisodeFacts, every_metric
+from cosim.results.metrics import COUNTERFACTUAL, METRICS, EpisodeFacts, compute_metrics
 from cosim.results.record import Record
 from cosim.results.rejudge import contradictions
 from cosim.results.run_folder import load_log
@@ -42,7 +42,7 @@ class Difference(NamedTuple):
     computed: str
 
 
-class Scored(NamedTuple):
+class ScoreResult(NamedTuple):
     """Result of recomputing a run.
 
     episodes, without_trajectory: number of ended episodes with and without a trajectory
@@ -58,7 +58,7 @@ class Scored(NamedTuple):
     differences: tuple[Difference, ...]
 
 
-def score_run(path: Path, progress: Progress = ignore) -> Scored:
+def score_run(path: Path, progress: Progress = ignore) -> ScoreResult:
     """Recompute every metric of a run.
 
     Raises what `read_whole_run` raises, and RunError for a missing or damaged trajectory.
@@ -76,7 +76,7 @@ def score_run(path: Path, progress: Progress = ignore) -> Scored:
         found += _cells_that_differ(path / _TABLE, computed)
     driven = sum(record.ended is not None for record in computed)
     untested = tuple(n for n in COUNTERFACTUAL if any(n in record.measures for record in computed))
-    return Scored(
+    return ScoreResult(
         driven, len(computed) - driven, len(run.spec.scenarios), untested, has_table, tuple(found)
     )
 
@@ -92,7 +92,7 @@ def _scored(run: WholeRun, scenario: Scenario, record: Record) -> tuple[Record, 
             for what, recorded, shown in contradictions(record, scenario, log)
         ]
         if not found:
-            measures = every_metric(EpisodeFacts.of(record, scenario, log))
+            measures = compute_metrics(EpisodeFacts.of(record, scenario, log))
             measures |= {
                 name: value for name, value in record.measures.items() if name in COUNTERFACTUAL
             }

@@ -30,11 +30,11 @@ import pandas as pd
 from filelock import FileLock
 
 from cosim.core.errors import MachineError, RunError, UsageError, listed, unknown, unwritable
-from cosim.core.files import is_locked, lock, read_within, write_atomic
+from cosim.core.files import is_locked, lock, read_limited, write_atomic
 from cosim.core.npz import read_npz
 from cosim.results.log import Log
 from cosim.results.record import RECORD_FILE, Record
-from cosim.results.run_spec import RUN_FILE, RunSpec, decoded_spec
+from cosim.results.run_spec import RUN_FILE, RunSpec, decode_spec
 from cosim.results.table import table_of
 from cosim.spec.scenario import Scenario, Suite, read_suite, write_suite
 from cosim.spec.validation import shown
@@ -52,7 +52,7 @@ _DAMAGE_CODES = {
 }
 
 
-def connected(path: Path) -> sqlite3.Connection:
+def connect_database(path: Path) -> sqlite3.Connection:
     """Open the database of a run folder; create it if missing."""
     database = sqlite3.connect(path / DATABASE, timeout=30.0)
     try:
@@ -69,17 +69,17 @@ def check_database(path: Path) -> None:
 
     Raises sqlite3.Error or DecodeError if it is damaged.
     """
-    with closing(connected(path)) as database, database:
+    with closing(connect_database(path)) as database, database:
         database.execute(
             "create table if not exists episodes (scenario text primary key, record text)"
         )
         faults = [fault for (fault,) in database.execute("pragma quick_check")]
         if faults != ["ok"]:
             raise sqlite3.DatabaseError(faults[0])
-        records_in(database)
+        select_records(database)
 
 
-def records_in(database: sqlite3.Connection) -> list[Record]:
+def select_records(database: sqlite3.Connection) -> list[Record]:
     """Return all records in the order in which their episodes ended. Raises sqlite3.Error,
     DecodeError."""
     rows: Sequence[tuple[object]] = database.execute(
@@ -100,15 +100,15 @@ def is_damaged(error: sqlite3.Error) -> bool:
     return code & 0xFF in _DAMAGE_CODES or code == sqlite3.SQLITE_IOERR_SHORT_READ
 
 
-def damaged(path: Path, error: Exception) -> RunError:
+def damaged_error(path: Path, error: Exception) -> RunError:
     """Return the error for a damaged database of a run folder."""
     return RunError(f"{path / DATABASE} is damaged ({error}): {REMEDY}")
 
 
-def trouble_with(path: Path, error: sqlite3.Error) -> RunError | MachineError:
+def database_error(path: Path, error: sqlite3.Error) -> RunError | MachineError:
     """Return the error to raise for a database error."""
     if is_damaged(error):
-        return damaged(path, error)
+        return damaged_error(path, error)
     return MachineError(
         f"{path / DATABASE}: {error}. Finished episodes are safe: make room and add --resume."
     )
@@ -153,7 +153,7 @@ def damage_of_episode(path: Path, scenario_id: str, row: Record | None = None) -
         record = Record.load(file)
         if record.scenario.id != scenario_id:
             return f"{file} is of scenario {shown(record.scenario.id)}"
-        if row is not None and (difference := told_apart(record, row)):
+        if row is not None and (difference := record_difference(record, row)):
             return f"{file}: not what results.sqlite has of this episode: {difference}"
         trajectory = file.with_name(TRAJECTORY)
         if record.ended is not None and (ticks := len(Log.load(trajectory))) != record.ticks:
@@ -172,7 +172,7 @@ def _damage_of_demonstration(file: Path) -> str:
     return ""
 
 
-def told_apart(mine: Record, theirs: Record) -> str:
+def record_difference(mine: Record, theirs: Record) -> str:
     """Return the first difference between two records, in words; "" if they are equal."""
     fields, their_fields = (
         msgspec.to_builtins(RECORD_FILE.flat(record)) for record in (mine, theirs)
@@ -233,7 +233,7 @@ class RunFolder:
 
         Raises RunError, naming the difference, if the folder holds another run.
         """
-        refuse_unbegun(path)
+        refuse_not_begun(path)
         found = read_spec(path)
         if found.policy == spec.policy and found.setup.policy_source != spec.setup.policy_source:
             raise RunError(
@@ -279,7 +279,7 @@ class RunFolder:
 
     def finished(self) -> set[str]:
         """Return ids of the scenarios with a row."""
-        with _database_errors(self.path), closing(connected(self.path)) as database:
+        with _database_errors(self.path), closing(connect_database(self.path)) as database:
             return {scenario for (scenario,) in database.execute("select scenario from episodes")}
 
     def add(self, record: Record) -> None:
@@ -287,7 +287,7 @@ class RunFolder:
         values = record.scenario.id, RECORD_FILE.encode(record).decode()
         with _database_errors(self.path):
             if self._add_connection is None:  # reused: opening takes longer than adding
-                self._add_connection = connected(self.path)
+                self._add_connection = connect_database(self.path)
             with self._add_connection as database:
                 database.execute(
                     "insert or ignore into episodes (scenario, record) values (?, ?)", values
@@ -297,7 +297,7 @@ class RunFolder:
         """Delete the rows of episodes that will run again."""
         with (
             _database_errors(self.path),
-            closing(connected(self.path)) as database,
+            closing(connect_database(self.path)) as database,
             database,
         ):
             database.executemany(
@@ -318,7 +318,7 @@ class RunFolder:
             record.save(target / "record.json")
         self.add(record)
 
-    def keep_frame(self, scenario_id: str, tick: int, png: bytes) -> None:
+    def write_frame(self, scenario_id: str, tick: int, png: bytes) -> None:
         """Write a camera frame of an episode."""
         frames = self.episode_folder(scenario_id) / "frames"
         with _write_errors(frames, _ROOM_REMEDY):
@@ -339,7 +339,7 @@ class RunFolder:
                 found[msgspec.json.decode(line, type=FailedAttempt)] += 1
         return found
 
-    def keep_failed_attempt(self, attempt: FailedAttempt) -> None:
+    def add_failed_attempt(self, attempt: FailedAttempt) -> None:
         """Append a failed attempt to the run's file."""
         path = self.path / _ATTEMPTS
         with _write_errors(path, _ROOM_REMEDY), path.open("ab") as file:
@@ -378,7 +378,7 @@ class RunFolder:
                 suite, scenarios=tuple(s for s in suite.scenarios if s.id in wanted)
             )
             write_suite(chosen, self.path / "scenarios.json")
-            write_atomic(self.path / "run.json", RUN_FILE.in_lines(self.spec))
+            write_atomic(self.path / "run.json", RUN_FILE.encode_indented(self.spec))
 
     def _open_database(self) -> None:
         """Repair the database, so that exactly the episodes with valid files have a row."""
@@ -388,7 +388,7 @@ class RunFolder:
             check_database(self.path)
         except (sqlite3.Error, msgspec.DecodeError) as error:
             if isinstance(error, sqlite3.Error) and not is_damaged(error):
-                raise trouble_with(self.path, error) from error
+                raise database_error(self.path, error) from error
             damage = str(error)
             for end in ("-wal", "-shm"):
                 database.with_name(DATABASE + end).unlink(missing_ok=True)
@@ -426,7 +426,7 @@ def _database_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except sqlite3.Error as error:
-        raise trouble_with(path, error) from error
+        raise database_error(path, error) from error
 
 
 def read_scenarios(path: Path) -> Mapping[str, Scenario]:
@@ -437,13 +437,13 @@ def read_scenarios(path: Path) -> Mapping[str, Scenario]:
 def read_spec(path: Path) -> RunSpec:
     """Load the spec of a run. Raises UsageError, listing nearby runs, if the folder holds none."""
     try:
-        return decoded_spec(read_within(path / "run.json", _MOST_BYTES), path / "run.json")
+        return decode_spec(read_limited(path / "run.json", _MOST_BYTES), path / "run.json")
     except FileNotFoundError:
         near = [
             str(run.parent) for run in (*path.glob("*/run.json"), *path.parent.glob("*/run.json"))
         ]
         if path.is_dir():
-            refuse_unbegun(path)
+            refuse_not_begun(path)
             nearby = f"Runs in it and beside it: {listed(str(path), near)}"
             raise UsageError(f"{path} is no run folder: it holds no run.json. {nearby}") from None
         raise unknown("run", str(path), near) from None
@@ -458,7 +458,7 @@ def read_spec(path: Path) -> RunSpec:
         ) from error
 
 
-def refuse_unbegun(path: Path) -> None:
+def refuse_not_begun(path: Path) -> None:
     """Raise UsageError if a folder to be resumed is missing or was stopped before its run began."""
     if not path.exists() or (
         path.is_dir() and {entry.name for entry in path.iterdir()} <= UNFINISHED
@@ -484,11 +484,11 @@ def read_records(path: Path, *, untouched: bool = False) -> list[Record]:
             where = Path(stack.enter_context(TemporaryDirectory())) if untouched else path
             for file in path.glob(f"{DATABASE}*") if untouched else ():
                 shutil.copyfile(file, where / file.name)
-            return records_in(stack.enter_context(closing(connected(where))))
+            return select_records(stack.enter_context(closing(connect_database(where))))
     except msgspec.DecodeError as error:
-        raise damaged(path, error) from error
+        raise damaged_error(path, error) from error
     except sqlite3.Error as error:
-        raise trouble_with(path, error) from error
+        raise database_error(path, error) from error
     except OSError as error:
         raise RunError(f"{path / DATABASE}: cannot be read: {error.strerror or error}") from error
 

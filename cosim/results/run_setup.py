@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from cosim.core.versions import versions
-from cosim.spec.options import EpisodeOptions, PolicyRuns
+from cosim.spec.options import EpisodeOptions, PolicyProcess
 
 METRIC_SCHEMA = 3
 """Version of the metric definitions; results of other schemas are not compared."""
@@ -32,7 +32,7 @@ class RunSetup(msgspec.Struct, frozen=True, kw_only=True):
     suite_hash: str
     seed: int = 0
     policy_source: str = ""
-    policy_runs: PolicyRuns = "in-process"
+    policy_runs: PolicyProcess = "in-process"
     latency_ms: float = 0.0
     real_time: bool = False
     renderer: str = NO_RENDERER
@@ -46,7 +46,7 @@ class RunSetup(msgspec.Struct, frozen=True, kw_only=True):
         *,
         suite_hash: str = "",
         policy_source: str = "",
-        policy_runs: PolicyRuns = "in-process",
+        policy_runs: PolicyProcess = "in-process",
     ) -> RunSetup:
         """Build the set-up that options request, with the installed versions."""
         return cls(

@@ -64,7 +64,7 @@ class Shard(msgspec.Struct, frozen=True):
         return list(whole[self.number - 1 :: self.of])
 
 
-class Apart(NamedTuple):
+class SpecDifference(NamedTuple):
     """First difference between two runs: field, both values in words, and a hint."""
 
     field: str
@@ -104,7 +104,9 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     shard: Shard | None = None
     schema: int = SCHEMA
 
-    def apart(self, other: RunSpec, but: str = "", whole: Suite | None = None) -> Apart | None:
+    def apart(
+        self, other: RunSpec, but: str = "", whole: Suite | None = None
+    ) -> SpecDifference | None:
         """Return the first field in which another run differs; None if they are the same run.
 
         but: a field that may differ
@@ -132,7 +134,7 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
                 if field in _SUITE_FIELDS
                 else ""
             )
-            return Apart(field, brief(mine), brief(theirs), hint)
+            return SpecDifference(field, brief(mine), brief(theirs), hint)
         return None
 
 
@@ -151,13 +153,15 @@ RUN_FILE = FlatFile(
 """Layout of run.json: flat, for compatibility with files written before `RunSpec` had parts."""
 
 
-def _choice_difference(mine: Sequence[str], theirs: Sequence[str], whole: Suite | None) -> Apart:
+def _choice_difference(
+    mine: Sequence[str], theirs: Sequence[str], whole: Suite | None
+) -> SpecDifference:
     """Describe the different choice of scenarios of two runs of a suite."""
     if whole is None:
-        return Apart(
+        return SpecDifference(
             "choice of scenarios", _count_in_words(mine, theirs), _count_in_words(theirs, mine), ""
         )
-    return Apart(
+    return SpecDifference(
         "choice of scenarios",
         selection_in_words(whole, mine),
         selection_in_words(whole, theirs),
@@ -171,7 +175,7 @@ def _count_in_words(ids: Sequence[str], others: Sequence[str]) -> str:
     return f"{len(ids)}{more}"
 
 
-def decoded_spec(data: bytes, where: Path) -> RunSpec:
+def decode_spec(data: bytes, where: Path) -> RunSpec:
     """Decode a run.json. where: path named in errors.
 
     Raises RunError for another schema, ValueError for bytes that are no run.json.

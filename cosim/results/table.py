@@ -68,7 +68,7 @@ ORACLE = "orca"
 """Policy used to prove suites; it has privileged knowledge and does not compete."""
 BOOTSTRAP = 2000
 CONFIDENCE = 0.95
-MOST_INVALID = 0.02
+MAX_INVALID_SHARE = 0.02
 """Share of scheduled episodes; with more invalid ones, a run is inconclusive."""
 INJECTED = "injected"
 """Column with the number of pedestrians injected into an episode; only in runs with injections."""
@@ -140,23 +140,31 @@ def summary_of(table: pd.DataFrame, names: Sequence[str] = tuple(METRICS)) -> pd
 
 def _summary(table: pd.DataFrame, name: str) -> tuple[float, float, float, int]:
     if name not in POOLED:
-        values = numbers(table, name)
+        values = numeric_column(table, name)
         values = values[~np.isnan(values)]
-        return (float(values.mean()) if len(values) else np.nan, *interval_of(values), len(values))
-    counted, metres = (numbers(table, column) for column in POOLED[name])
+        return (
+            float(values.mean()) if len(values) else np.nan,
+            *bootstrap_interval(values),
+            len(values),
+        )
+    counted, metres = (numeric_column(table, column) for column in POOLED[name])
     known = ~(np.isnan(counted) | np.isnan(metres))
     if (table["status"] == "crashed").any() or metres[known].sum() < RATE_NEEDS_M:
         return np.nan, np.nan, np.nan, 0
     counted, metres = counted[known], metres[known]
-    return 100.0 * counted.sum() / metres.sum(), *interval_of(100.0 * counted, metres), len(counted)
+    return (
+        100.0 * counted.sum() / metres.sum(),
+        *bootstrap_interval(100.0 * counted, metres),
+        len(counted),
+    )
 
 
-def numbers(table: pd.DataFrame, name: str) -> Floats:
+def numeric_column(table: pd.DataFrame, name: str) -> Floats:
     """Return a column as numbers; NaN if empty."""
     return np.asarray(pd.to_numeric(table[name], errors="coerce"), dtype=float)
 
 
-def interval_of(values: Floats, weights: Floats | None = None) -> tuple[float, float]:
+def bootstrap_interval(values: Floats, weights: Floats | None = None) -> tuple[float, float]:
     """Return the percentile bootstrap interval of the mean at CONFIDENCE; NaN without values.
 
     weights: if given, the interval of sum(values) / sum(weights)
@@ -191,13 +199,13 @@ def injections_in_words(table: pd.DataFrame) -> str:
     )
 
 
-def not_to_be_quoted(table: pd.DataFrame, scheduled: int) -> str:
+def why_inconclusive(table: pd.DataFrame, scheduled: int) -> str:
     """Return why the means of a run are inconclusive, in words; "" if they are not."""
     invalid = int((table["status"] == "invalid").sum())
-    if invalid > MOST_INVALID * scheduled:
+    if invalid > MAX_INVALID_SHARE * scheduled:
         return (
             f"{invalid} of {scheduled} scheduled episodes are invalid, more than "
-            f"{100 * MOST_INVALID:.0f} %"
+            f"{100 * MAX_INVALID_SHARE:.0f} %"
         )
     missing = scheduled - len(table)
     return f"{missing} of {scheduled} scheduled episodes have not ended" if missing else ""

@@ -13,7 +13,7 @@ import msgspec
 from cosim.core.clock import Clock
 from cosim.core.errors import unwritable
 from cosim.core.files import write_atomic
-from cosim.core.log_event import happened
+from cosim.core.log_event import log_event
 from cosim.core.units import milliseconds
 from cosim.results.record import Record
 from cosim.results.run_folder import read_records
@@ -21,7 +21,7 @@ from cosim.results.run_folder import read_records
 _FILE = "figures.json"
 
 
-class Figures(msgspec.Struct, frozen=True, kw_only=True):
+class Throughput(msgspec.Struct, frozen=True, kw_only=True):
     """Throughput of one session of a run.
 
     began: UTC
@@ -62,7 +62,7 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
         )
 
 
-class Going:
+class ThroughputTimer:
     """Session of a run that starts now.
 
     todo: scenarios to run
@@ -76,27 +76,27 @@ class Going:
         self._counts = counts
         self._began = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
         self._began_s = time.monotonic()
-        self.figures: Figures | None = None
+        self.figures: Throughput | None = None
 
     def end(self) -> None:
         """Compute and store the figures. Raises MachineError."""
         ended = [
             record for record in read_records(self._folder) if record.scenario.id in self._todo
         ]
-        happened("run over", episodes=len(ended), of=len(self._todo), folder=str(self._folder))
+        log_event("run over", episodes=len(ended), of=len(self._todo), folder=str(self._folder))
         if ended:
             wall_s = max(time.monotonic() - self._began_s, 1e-3)
             self.figures = _figures_of(ended, self._began, wall_s, self._counts)
-            keep_figures(self._folder, self.figures)
+            append_throughput(self._folder, self.figures)
 
 
 def _figures_of(
     records: Collection[Record], began: str, wall_s: float, counts: Mapping[str, int]
-) -> Figures:
+) -> Throughput:
     """Compute the figures of the episodes that ended in one session."""
     simulated_s = sum(Clock().time_s(record.ticks) for record in records)
     setup_s = sum(record.clock.get("setup_s", 0.0) for record in records)
-    return Figures(
+    return Throughput(
         began=began,
         wall_s=wall_s,
         episodes=len(records),
@@ -117,11 +117,11 @@ def median_answer_ms(records: Iterable[Record]) -> float | None:
     return statistics.median(medians) if medians else None
 
 
-def keep_figures(folder: Path, figures: Figures) -> None:
+def append_throughput(folder: Path, figures: Throughput) -> None:
     """Append an entry to figures.json; replace an unreadable file. Raises MachineError."""
     path = folder / _FILE
     try:
-        before = msgspec.json.decode(path.read_bytes(), type=list[Figures])
+        before = msgspec.json.decode(path.read_bytes(), type=list[Throughput])
     except (OSError, msgspec.DecodeError):
         before = []
     try:

@@ -23,17 +23,17 @@ from cosim.episode.loop import Step
 from cosim.place import overlay
 from cosim.place.street_map import StreetMap, Strip
 
-BRAKES_MPS2: Final = 2.0
+BRAKING_MPS2: Final = 2.0
 """Deceleration above which a vehicle counts as braking."""
 _AHEAD_M: Final = 40.0
-ASIDE_M: Final = 1.0
+IN_WAY_MARGIN_M: Final = 1.0
 """Margin, metres, added to half a vehicle's width: bodies within it block the vehicle."""
 
 _APART_S: Final = 2.0
 _ROUNDING_M: Final = 1e-6
 
 
-class OnRoad(NamedTuple):
+class RoadState(NamedTuple):
     """State of the robot on the road in one tick.
 
     carriageway: see the module
@@ -55,11 +55,11 @@ class TrafficMonitor:
         self._inside = Circle()
         self._off_road_parts: dict[str, shapely.Geometry] = {}
 
-    def see(self, step: Step) -> OnRoad:
+    def see(self, step: Step) -> RoadState:
         """Process one tick."""
         pose = step.motion.robot.pose
         if self._inside.holds(pose.x_m, pose.y_m):
-            return OnRoad()
+            return RoadState()
         if self._off_road_here is not None and shapely.contains_xy(
             self._off_road_here, pose.x_m, pose.y_m
         ):
@@ -67,7 +67,7 @@ class TrafficMonitor:
                 shapely.boundary(self._off_road_here), shapely.Point(pose.x_m, pose.y_m)
             )
             self._inside = Circle(pose.x_m, pose.y_m, max(float(room_m) - _ROUNDING_M, 0.0))
-            return OnRoad()
+            return RoadState()
         place = self._map.locate(pose.x_m, pose.y_m, 0.0)
         self._off_road_here = self._off_road_part(place.edge) if place.kind == "walk" else None
         strip = self._map.strips.get(place.edge) if place.kind == "walk" else None
@@ -80,19 +80,19 @@ class TrafficMonitor:
             strip is not None
             and signal is not None
             and not signal.walk
-            and between_its_ends(strip, pose)
+            and projects_onto_strip(strip, pose)
         )
         carriageway = place.kind == "road" or inside or at_red
         if not carriageway and (not crossing or signal is not None):
-            return OnRoad()
-        names = braking_for(pose, step.street, step.street_after, self._tick_s)
+            return RoadState()
+        names = vehicles_braking_for(pose, step.street, step.street_after, self._tick_s)
         new = [
             name
             for name in names
             if (step.tick - self._last.get(name, -(10**9))) * self._tick_s > _APART_S
         ]
         self._last |= dict.fromkeys(names, step.tick)
-        return OnRoad(carriageway, len(new))
+        return RoadState(carriageway, len(new))
 
     def _off_road_part(self, edge: str) -> shapely.Geometry | None:
         """Return the part of a walkable piece that is never road; None for a crossing.
@@ -115,7 +115,7 @@ class TrafficMonitor:
         return self._off_road_parts[edge]
 
 
-def between_its_ends(strip: Strip, pose: Pose) -> bool:
+def projects_onto_strip(strip: Strip, pose: Pose) -> bool:
     """Return whether a pose projects onto a strip's line, not beyond its ends."""
     first = strip.line[0, :2]
     last = strip.line[-1, :2]
@@ -123,13 +123,13 @@ def between_its_ends(strip: Strip, pose: Pose) -> bool:
     return bool(0.0 < (pose.xy - first) @ along < along @ along)
 
 
-def braking_for(robot: Pose, before: Street, after: Street, tick_s: float) -> list[str]:
+def vehicles_braking_for(robot: Pose, before: Street, after: Street, tick_s: float) -> list[str]:
     """Return ids of the vehicles that brake in a tick with the robot nearest straight ahead."""
     vehicles = after.vehicles
     speed_mps = dict(zip(before.vehicles.ids, before.vehicles.speed.tolist(), strict=True))
     found = []
     for k, name in enumerate(vehicles.ids):
-        if (speed_mps.get(name, 0.0) - float(vehicles.speed[k])) / tick_s <= BRAKES_MPS2:
+        if (speed_mps.get(name, 0.0) - float(vehicles.speed[k])) / tick_s <= BRAKING_MPS2:
             continue
         others = np.concatenate([after.people.xy, np.delete(vehicles.xy, k, axis=0)])
         front = _ahead_m(
@@ -148,5 +148,7 @@ def _ahead_m(xy: Floats, heading_rad: float, size_m: Floats, points: Floats) -> 
     cos, sin = math.cos(heading_rad), math.sin(heading_rad)
     dx, dy = (points - xy).T
     along = cos * dx + sin * dy - 0.5 * size_m[0]
-    in_way = (np.abs(cos * dy - sin * dx) < 0.5 * size_m[1] + ASIDE_M) & (along > -PERSON_RADIUS_M)
+    in_way = (np.abs(cos * dy - sin * dx) < 0.5 * size_m[1] + IN_WAY_MARGIN_M) & (
+        along > -PERSON_RADIUS_M
+    )
     return np.where(in_way, along, math.inf)

@@ -15,7 +15,7 @@ _FARTHEST_M = 200.0
 """Limit, metres, of waypoint coordinates; farther ones are not visible."""
 
 
-class Following:
+class WaypointReplay:
     """Waypoints that the robot follows, from the Steps of an episode in order.
 
     The waypoints are those whose command took effect last, at the robot's pose when they were

@@ -60,7 +60,7 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
                 f"{self.endpoint} needs --tls FOLDER, which holds ca.pem, cert.pem and key.pem of "
                 f"the role {self.role}: `cosim certs` makes them"
             )
-        if not (self.tls or self.insecure or self.of_this_machine):
+        if not (self.tls or self.insecure or self.is_local):
             raise UsageError(
                 f"{self.endpoint} is beyond this machine and unguarded: {self._risk}. Use "
                 f"tls/{address} with --tls FOLDER (`cosim certs` makes it), or say --insecure"
@@ -77,7 +77,7 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
         return msgspec.structs.replace(self, role=other.role, tls=other.tls if self.tls else "")
 
     @property
-    def of_this_machine(self) -> bool:
+    def is_local(self) -> bool:
         """Whether the endpoint is reachable only on this machine."""
         protocol, address = _parts(self.endpoint)
         return protocol == "unixsock-stream" or _is_loopback(address.rpartition(":")[0].strip("[]"))
@@ -85,7 +85,7 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def warning(self) -> str:
         """Consequence of --insecure in one line; "" if nothing is insecure."""
-        return "" if not self.insecure or self.of_this_machine else f"--insecure: {self._risk}."
+        return "" if not self.insecure or self.is_local else f"--insecure: {self._risk}."
 
     @property
     def _risk(self) -> str:

@@ -14,7 +14,7 @@ from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import GOALS, GoalProtocol, goal_called
 from cosim.spec.manifest import Manifest
 
-EYE: Final = "collected"
+RECORDING_CAMERA: Final = "collected"
 """Name of the recording camera when the expert has a camera of its own."""
 _MOST_NOISE: Final = 0.9
 """Maximum share of the time with disturbed commands."""
@@ -24,7 +24,7 @@ _FASTEST_HZ: Final = 20.0
 """Maximum rate of pictures; a tick takes 0.05 s."""
 
 
-class Collecting(msgspec.Struct, frozen=True, kw_only=True):
+class DemoOptions(msgspec.Struct, frozen=True, kw_only=True):
     """Options of recorded demonstrations.
 
     camera: camera of the pictures.
@@ -89,7 +89,7 @@ def _ticks(time_s: float) -> int:
 
 
 def check_learner(
-    learner: Manifest, collecting: Collecting, expert: Manifest, goal: GoalProtocol
+    learner: Manifest, collecting: DemoOptions, expert: Manifest, goal: GoalProtocol
 ) -> None:
     """Raise UsageError if a learner's inputs differ from the recorded ones.
 
@@ -134,8 +134,8 @@ def _matching_options(camera: CameraSpec, rate_hz: float) -> str:
     )
 
 
-def demonstrating(
-    expert: Manifest, collecting: Collecting, goal: GoalProtocol | None = None
+def recording_manifest(
+    expert: Manifest, collecting: DemoOptions, goal: GoalProtocol | None = None
 ) -> Manifest:
     """Return the manifest of an expert for recording, with the recording camera and rate.
 
@@ -146,8 +146,8 @@ def demonstrating(
     """
     goal = goal or expert.goal
     kind = GOALS[goal_called(goal)]
-    if not kind.in_data_sets:
-        others = ", ".join(one.name for one in GOALS.values() if one.in_data_sets)
+    if not kind.has_data_set_column:
+        others = ", ".join(one.name for one in GOALS.values() if one.has_data_set_column)
         raise UsageError(
             f"goal protocol '{goal}' ({kind.summary}) cannot be told in a data set: give "
             f"--goal, one of {others}"
@@ -161,4 +161,4 @@ def demonstrating(
     settled = replace(expert, name=name, rate_hz=collecting.rate_hz, goal=goal)
     if expert.camera is None:
         return replace(settled, camera=collecting.camera)
-    return replace(settled, cameras={**expert.cameras, EYE: collecting.camera})
+    return replace(settled, cameras={**expert.cameras, RECORDING_CAMERA: collecting.camera})

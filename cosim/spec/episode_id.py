@@ -20,21 +20,21 @@ _SEED_BYTES: Final = 4
 """Size of a derived seed in bytes."""
 
 
-class Pseudonym(NamedTuple):
+class EpisodeId(NamedTuple):
     """Id of an episode for its policy, and the policy's seed, 0 to 2^32 - 1."""
 
     episode: str
     seed: int
 
 
-def pseudonym_of(run_seed: int, scenario: Scenario) -> Pseudonym:
+def episode_id_of(run_seed: int, scenario: Scenario) -> EpisodeId:
     """Return the id and seed of a scenario in a run. They depend only on run seed and scenario.
 
     >>> from scenarios.suites.catalog import load_suite
     >>> pseudonym_of(1, load_suite("reactive").scenarios[0]).episode[0]
     'k'
     """
-    return Pseudonym(
+    return EpisodeId(
         "k" + _digest(run_seed, scenario, "episode").hex()[:11],
         seed_for("policy", run_seed, scenario),
     )
@@ -48,7 +48,7 @@ def seed_for(purpose: str, run_seed: int, scenario: Scenario) -> int:
     return int.from_bytes(_digest(run_seed, scenario, purpose)[:_SEED_BYTES], "big")
 
 
-def drawn_seed() -> int:
+def random_run_seed() -> int:
     """Return a random seed for a run."""
     return secrets.randbits(_RANDOM_BITS)
 

@@ -18,7 +18,7 @@ import msgspec
 import numpy as np
 
 from cosim.core.state import PERSON_RADIUS_M, Age, Doing, PersonKind
-from cosim.spec.validation import ALONG_M, HEADING_RAD, WHERE_M, Ranged, Within, shown
+from cosim.spec.validation import ARC_LENGTH_M, COORDINATE_M, HEADING_RAD, Ranged, Within, shown
 
 INJECTED_ID: Final = "ei-"
 """Prefix of the ids of injected pedestrians."""
@@ -40,10 +40,10 @@ class Event(Ranged, frozen=True, kw_only=True):
 
     id: str
     kind: str
-    x_m: Annotated[float, WHERE_M]
-    y_m: Annotated[float, WHERE_M]
+    x_m: Annotated[float, COORDINATE_M]
+    y_m: Annotated[float, COORDINATE_M]
     heading_rad: Annotated[float, HEADING_RAD]
-    route_s_m: Annotated[float, ALONG_M]
+    route_s_m: Annotated[float, ARC_LENGTH_M]
     half_width_m: Annotated[float, Within(PERSON_RADIUS_M, 50, above=True)]
     speed_mps: Annotated[float, Within(0, 3, above=True)] = 1.3
     side: Literal[-1, 1] = 1
@@ -235,7 +235,7 @@ class EventKind:
     ends: Callable[[Event, EventState, EventQuery], bool]
     pose: Doing = "stand"
     age: Age = Age.ADULT
-    passed_round: bool = False
+    passed_as_group: bool = False
     ends_at: Literal["goal", "stop"] = "goal"
 
 

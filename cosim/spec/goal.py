@@ -73,7 +73,7 @@ _ANNOUNCEMENT: Final = re.compile(r"(?:In (\d+) m, )?(?:turn|bear) (left|right)"
 """Pattern of a turn in an instruction, with its distance if it is not due."""
 
 
-class Bounds(NamedTuple):
+class ArraySpace(NamedTuple):
     """Array space of a type of goal for learners."""
 
     low: float
@@ -82,7 +82,7 @@ class Bounds(NamedTuple):
     dtype: type[np.uint8] | type[np.float32]
 
 
-class Letters(NamedTuple):
+class TextSpace(NamedTuple):
     """Text space of a type of goal for learners: at most `most` characters of `charset`."""
 
     most: int
@@ -93,7 +93,7 @@ class AnyGoal(msgspec.Struct, frozen=True):
     """Base class of goals. Fields are numbers, texts and arrays."""
 
     @classmethod
-    def space(cls, size: tuple[int, int]) -> Bounds | Letters:
+    def space(cls, size: tuple[int, int]) -> ArraySpace | TextSpace:
         """Return the space of the goal's plain values.
 
         size: width and height of the policy's pictures.
@@ -176,8 +176,8 @@ class PointGoal(TurningGoal, frozen=True, tag="point"):
         return np.array((self.x_m, self.y_m), dtype)
 
     @classmethod
-    def space(cls, size: tuple[int, int]) -> Bounds:
-        return Bounds(-_FARTHEST_M, _FARTHEST_M, (2,), np.float32)
+    def space(cls, size: tuple[int, int]) -> ArraySpace:
+        return ArraySpace(-_FARTHEST_M, _FARTHEST_M, (2,), np.float32)
 
     @classmethod
     def example(cls, size: tuple[int, int]) -> PointGoal:
@@ -214,8 +214,8 @@ class ImageGoal(AnyGoal, frozen=True, tag="image"):
         return np.array(self.rgb, dtype, copy=copy)
 
     @classmethod
-    def space(cls, size: tuple[int, int]) -> Bounds:
-        return Bounds(0, 255, (size[1], size[0], 3), np.uint8)
+    def space(cls, size: tuple[int, int]) -> ArraySpace:
+        return ArraySpace(0, 255, (size[1], size[0], 3), np.uint8)
 
     @classmethod
     def example(cls, size: tuple[int, int]) -> ImageGoal:
@@ -249,8 +249,8 @@ class Instruction(TurningGoal, frozen=True, tag="instruction"):
         )
 
     @classmethod
-    def space(cls, size: tuple[int, int]) -> Letters:
-        return Letters(_MOST_LETTERS, string.ascii_letters + string.digits + " .,")
+    def space(cls, size: tuple[int, int]) -> TextSpace:
+        return TextSpace(_MOST_LETTERS, string.ascii_letters + string.digits + " .,")
 
     @classmethod
     def example(cls, size: tuple[int, int]) -> Instruction:
@@ -297,8 +297,8 @@ class RoutePatch(AnyGoal, frozen=True, tag="route_patch"):
         return np.array(self.pixels, dtype, copy=copy)
 
     @classmethod
-    def space(cls, size: tuple[int, int]) -> Bounds:
-        return Bounds(0, 255, (PATCH_PX, PATCH_PX), np.uint8)
+    def space(cls, size: tuple[int, int]) -> ArraySpace:
+        return ArraySpace(0, 255, (PATCH_PX, PATCH_PX), np.uint8)
 
     @classmethod
     def example(cls, size: tuple[int, int]) -> RoutePatch:
@@ -312,7 +312,7 @@ class RoutePatch(AnyGoal, frozen=True, tag="route_patch"):
         ends = {"ahead": (20.0, 0.0), "left": (6.0, 20.0), "right": (6.0, -20.0)}
         routes = {name: np.array([(-20.0, 0.0), (6.0, 0.0), end]) for name, end in ends.items()}
         turns = {
-            name: RoutePatch(patch_around(Pose(0.0, 0.0, 0.0), route))
+            name: RoutePatch(route_patch_at(Pose(0.0, 0.0, 0.0), route))
             for name, route in routes.items()
         }
         return {**turns, "zero": RoutePatch(np.zeros_like(self.pixels))}
@@ -361,12 +361,12 @@ class GoalKind(NamedTuple):
     summary: str
     type: type[Goal] | None
     draw: Callable[[GoalSource], Goals]
-    of_camera: bool = False
+    needs_camera: bool = False
     noise: bool = False
-    in_data_sets: bool = False
+    has_data_set_column: bool = False
 
 
-def seen_from(pose: Pose, point: Pose) -> PointGoal:
+def in_robot_frame(pose: Pose, point: Pose) -> PointGoal:
     """Return a point in the frame of a robot at a pose."""
     dx, dy = point.x_m - pose.x_m, point.y_m - pose.y_m
     cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
@@ -416,7 +416,7 @@ class _RandomPoints:
         self._point: Pose | None = None
 
     def at(self, pose: Pose, route_s_m: float) -> PointGoal:
-        goal = None if self._point is None else seen_from(pose, self._point)
+        goal = None if self._point is None else in_robot_frame(pose, self._point)
         if goal is None or goal.distance_m <= _REACHED_M or goal.x_m <= 0.0:
             ahead, aside = self._draws.uniform(
                 (_NEAREST_M, -_ASIDE_M), (_FARTHEST_DRAWN_M, _ASIDE_M)
@@ -456,7 +456,7 @@ class Manoeuvre(NamedTuple):
     """Part of the route with an instruction, as an interval of arc length."""
 
     s_m: float
-    until_s_m: float
+    end_s_m: float
     words: str
 
 
@@ -493,7 +493,7 @@ def _turn_at(route: Polyline, s_m: float) -> float:
     return wrap_angle(math.atan2(by, bx) - math.atan2(ay, ax))
 
 
-def told_at(route_s_m: float, steps: Sequence[Manoeuvre]) -> str:
+def instruction_at(route_s_m: float, steps: Sequence[Manoeuvre]) -> str:
     """Return the instruction at an arc length: due manoeuvres, then the next one within 20 m.
 
     Distances are rounded to 5 m.
@@ -502,7 +502,7 @@ def told_at(route_s_m: float, steps: Sequence[Manoeuvre]) -> str:
     >>> told_at(29.0, ways), told_at(39.0, ways)
     ('Follow the sidewalk. In 10 m, turn left.', 'Turn left.')
     """
-    due = [one.words for one in steps if one.s_m - _DUE_M <= route_s_m < one.until_s_m]
+    due = [one.words for one in steps if one.s_m - _DUE_M <= route_s_m < one.end_s_m]
     sentences = [f"{words.capitalize()}." for words in due] or ["Follow the sidewalk."]
     coming = [one for one in steps if _DUE_M < one.s_m - route_s_m <= _ANNOUNCED_M]
     if coming:
@@ -511,7 +511,7 @@ def told_at(route_s_m: float, steps: Sequence[Manoeuvre]) -> str:
     return " ".join(sentences)
 
 
-def patch_around(pose: Pose, route: Floats) -> NDArray[np.uint8]:
+def route_patch_at(pose: Pose, route: Floats) -> NDArray[np.uint8]:
     """Return a raster as in `RoutePatch`, (80, 80) uint8.
 
     route: (N, 2) points in metres.
@@ -537,12 +537,12 @@ def patch_around(pose: Pose, route: Floats) -> NDArray[np.uint8]:
 def _route_points(source: GoalSource) -> Goals:
     route = source.scenario.route_line
     subgoals = SubGoals(route.length_m)
-    return _PositionGoals(lambda pose, s_m: seen_from(pose, route.at(subgoals.after(s_m))))
+    return _PositionGoals(lambda pose, s_m: in_robot_frame(pose, route.at(subgoals.after(s_m))))
 
 
 def _final_points(source: GoalSource) -> Goals:
     end = Pose(*source.scenario.goal, 0.0)
-    return _PositionGoals(lambda pose, s_m: seen_from(pose, end))
+    return _PositionGoals(lambda pose, s_m: in_robot_frame(pose, end))
 
 
 def _images(source: GoalSource) -> Goals:
@@ -557,12 +557,12 @@ def _random_images(source: GoalSource) -> Goals:
 
 def _instructions(source: GoalSource) -> Goals:
     steps = manoeuvres(source.scenario.route_line, source.scenario.crossings)
-    return _PositionGoals(lambda pose, s_m: Instruction(told_at(s_m, steps)))
+    return _PositionGoals(lambda pose, s_m: Instruction(instruction_at(s_m, steps)))
 
 
 def _route_patches(source: GoalSource) -> Goals:
     points = source.scenario.route_line.points
-    return _PositionGoals(lambda pose, s_m: RoutePatch(patch_around(pose, points)))
+    return _PositionGoals(lambda pose, s_m: RoutePatch(route_patch_at(pose, points)))
 
 
 _ROWS: Final = (
@@ -572,21 +572,21 @@ _ROWS: Final = (
         None,
         lambda source: _PositionGoals(lambda pose, s_m: None),
         noise=True,
-        in_data_sets=True,
+        has_data_set_column=True,
     ),
     GoalKind(
         "route_point",
         "the next point of the reference route, 5 to 20 m along it",
         PointGoal,
         _route_points,
-        in_data_sets=True,
+        has_data_set_column=True,
     ),
     GoalKind(
         "final_point",
         "the goal of the episode, as a point",
         PointGoal,
         _final_points,
-        in_data_sets=True,
+        has_data_set_column=True,
     ),
     GoalKind(
         "random_point",
@@ -599,14 +599,14 @@ _ROWS: Final = (
         "what the policy's camera would see at the next point of the route, without people",
         ImageGoal,
         _images,
-        of_camera=True,
+        needs_camera=True,
     ),
     GoalKind(
         "random_image",
         "a picture of noise, drawn once per episode",
         ImageGoal,
         _random_images,
-        of_camera=True,
+        needs_camera=True,
         noise=True,
     ),
     GoalKind(
@@ -614,7 +614,7 @@ _ROWS: Final = (
         'a text, such as "Follow the sidewalk. In 10 m, turn left."',
         Instruction,
         _instructions,
-        in_data_sets=True,
+        has_data_set_column=True,
     ),
     GoalKind(
         "route_patch",
@@ -678,5 +678,5 @@ def most_goal_bytes(size: tuple[int, int]) -> int:
     return max(
         math.prod(one.shape) * np.dtype(one.dtype).itemsize
         for one in spaces
-        if isinstance(one, Bounds)
+        if isinstance(one, ArraySpace)
     )

@@ -99,7 +99,7 @@ class InjectionRequest(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown
             raise SpecError(f"pedestrian '{self.id}': heading_rad is no number")
 
     @property
-    def depends_on_robot(self) -> bool:
+    def has_relative_points(self) -> bool:
         """Whether the path has a point relative to the robot."""
         return any(isinstance(point, RelativePoint) for point in self.path)
 
@@ -145,7 +145,7 @@ class Ack(msgspec.Struct, frozen=True, kw_only=True):
     reason: str = ""
 
 
-class Live(msgspec.Struct, frozen=True, kw_only=True):
+class LiveAddress(msgspec.Struct, frozen=True, kw_only=True):
     """Address of a live run.
 
     connection: connection to its hub.

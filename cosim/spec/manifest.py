@@ -13,7 +13,7 @@ from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import GoalProtocol
 from cosim.spec.odometry import OdometryKind
 
-HowFollowed = Literal["shipped", "atan2"]
+WaypointRuleName = Literal["shipped", "atan2"]
 """Names of the rules that turn a waypoint into a command."""
 
 
@@ -38,7 +38,7 @@ class WaypointRule:
     index: int = 2
     unit_m: float = 1.0
     dt_s: float = 0.25
-    rule: HowFollowed = "shipped"
+    rule: WaypointRuleName = "shipped"
 
     def __post_init__(self) -> None:
         if isinstance(self.index, bool) or not isinstance(self.index, int) or self.index < 0:
@@ -47,9 +47,9 @@ class WaypointRule:
             value = getattr(self, field)
             if not (math.isfinite(value) and value > 0.0):
                 raise SpecError(f"waypoints {field} must be a positive number, not {value}")
-        if self.rule not in get_args(HowFollowed):
+        if self.rule not in get_args(WaypointRuleName):
             raise SpecError(
-                f"waypoints rule must be one of {', '.join(get_args(HowFollowed))}, not "
+                f"waypoints rule must be one of {', '.join(get_args(WaypointRuleName))}, not "
                 f"{self.rule!r}"
             )
 

@@ -9,7 +9,7 @@ from typing import Annotated, Final, Literal
 import shapely
 from shapely.geometry import Polygon
 
-from cosim.spec.validation import HEADING_RAD, WHERE_M, Ranged, Within, shown
+from cosim.spec.validation import COORDINATE_M, HEADING_RAD, Ranged, Within, shown
 
 ObstacleKind = Literal["bin", "bike", "sign", "planter", "box", "fence", "scooter", "cafe"]
 """Kinds of obstacles. "sign" is a sandwich board, "box" a stack of parcels, "fence" a construction
@@ -47,8 +47,8 @@ class Obstacle(Ranged, frozen=True, kw_only=True):
     """
 
     kind: ObstacleKind
-    x_m: Annotated[float, WHERE_M]
-    y_m: Annotated[float, WHERE_M]
+    x_m: Annotated[float, COORDINATE_M]
+    y_m: Annotated[float, COORDINATE_M]
     heading_rad: Annotated[float, HEADING_RAD]
     form: Annotated[int, Within(0, OBSTACLE_FORMS - 1)] = 0
 

@@ -9,13 +9,13 @@ import msgspec
 
 from cosim.core.errors import UsageError
 from cosim.spec.connection import Connection
-from cosim.spec.demo_options import Collecting
+from cosim.spec.demo_options import DemoOptions
 from cosim.spec.episode_id import check_seed
 from cosim.spec.goal import GoalProtocol, goal_called
-from cosim.spec.injection import Injected, Live
+from cosim.spec.injection import Injected, LiveAddress
 from cosim.spec.run_config import MOST_LATENCY_MS, CameraChoice, RunConfig
 
-PolicyRuns = Literal["in-process", "isolated", "remote", "remote, jpeg"]
+PolicyProcess = Literal["in-process", "isolated", "remote", "remote, jpeg"]
 """Process that runs a policy: the simulator's, an isolated one on the same machine, or a server
 over Zenoh. "remote, jpeg" means that its pictures may have been sent as JPEG."""
 
@@ -46,7 +46,7 @@ CameraName = Literal["gl", "bullet", "bullet-egl"]
 """Renderers of a policy's pictures."""
 
 
-class Outside(msgspec.Struct, frozen=True, kw_only=True):
+class DirectorAddress(msgspec.Struct, frozen=True, kw_only=True):
     """Address of a director in another process.
 
     connection: connection to it.
@@ -59,7 +59,7 @@ class Outside(msgspec.Struct, frozen=True, kw_only=True):
     wait_s: float
 
 
-class RendererAt(msgspec.Struct, frozen=True, kw_only=True):
+class RendererAddress(msgspec.Struct, frozen=True, kw_only=True):
     """Address of a run's shared renderer.
 
     address: socket on which it listens.
@@ -111,14 +111,14 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     own_camera: bool = False
     camera: CameraChoice = "auto"
     frames_every_s: float = 0.0
-    live: Live | None = None
+    live: LiveAddress | None = None
     pace: float = 0.0
-    director: Outside | None = None
+    director: DirectorAddress | None = None
     counterfactual: bool = False
     injections: tuple[Injected, ...] = ()
     latency_ms: float = 0.0
     real_time: bool = False
-    collecting: Collecting | None = None
+    collecting: DemoOptions | None = None
 
     @classmethod
     def asked(cls, config: RunConfig) -> EpisodeOptions:

@@ -384,9 +384,9 @@ class RunConfig:
         return latency_ms
 
     @property
-    def ends(self) -> RunEnds:
+    def ends(self) -> RunConnections:
         """Network connections of the run. Raises UsageError."""
-        return ends_of_run(self.live, self.director, self.policy_at, self.tls, self.insecure)
+        return run_connections(self.live, self.director, self.policy_at, self.tls, self.insecure)
 
 
 def help_of(field: str) -> str:
@@ -404,7 +404,7 @@ def option_of(config: type, field: str) -> Option:
     return found
 
 
-class RunEnds(NamedTuple):
+class RunConnections(NamedTuple):
     """Network connections of a run.
 
     live: endpoint on which it listens.
@@ -422,9 +422,9 @@ class RunEnds(NamedTuple):
         return tuple(end for end in (self.live, self.director, *self.servers) if end is not None)
 
 
-def ends_of_run(
+def run_connections(
     live: str | None, director: str | None, policies: Sequence[str], tls: str, insecure: bool
-) -> RunEnds:
+) -> RunConnections:
     """Return the connections of a run. `--tls` applies to tls/... endpoints. Raises UsageError."""
     at = {f"--policy-at {end}": end for end in policies}
     given = {
@@ -438,7 +438,7 @@ def ends_of_run(
     if tls and not guarded:
         raise UsageError(f"--tls goes with tls/ADDRESS:PORT, not with {', '.join(given.values())}")
     files = {name: tls if name in guarded else "" for name in given}
-    return RunEnds(
+    return RunConnections(
         None
         if live is None
         else listening("coordinator", "--live", live, files["--live"], insecure),

@@ -21,14 +21,14 @@ from cosim.core.geometry import Polyline, Pose
 from cosim.spec.events import Event, EventKinds
 from cosim.spec.obstacle import Obstacle
 from cosim.spec.robot import COURIER, robot_called
-from cosim.spec.spec_file import in_lines, read_spec_file
+from cosim.spec.spec_file import join_faults, read_spec_file
 from cosim.spec.validation import (
-    ALONG_M,
+    ARC_LENGTH_M,
+    COORDINATE_M,
     HEADING_RAD,
     SEED,
-    WHERE_M,
-    Counted,
-    Named,
+    ItemCount,
+    PathName,
     Points,
     Ranged,
     Text,
@@ -49,7 +49,7 @@ EVENT_BEYOND_M = 60.0
 SHARE = Within(0, 1, words="must be a share in {range}, not {value}")
 """Range of a share."""
 _NAME = Text(200)
-FOLDER = Named("a folder")
+FOLDER = PathName("a folder")
 
 
 _ROUGHNESS = Within(0, 1, words="is {value:g}, but it lies between 0 (flat) and 1")
@@ -67,7 +67,7 @@ class City(Ranged, frozen=True, kw_only=True, tag="city", tag_field="kind"):
 
     seed: Annotated[int, SEED]
     size_m: Annotated[float, CITY_SIZE_M] = 2000.0
-    style: Annotated[str, Named("a style")] = "mixed"
+    style: Annotated[str, PathName("a style")] = "mixed"
     net_hash: Annotated[str, _NAME] = ""
     roughness: Annotated[float, _ROUGHNESS] = 0.0
 
@@ -108,8 +108,8 @@ class Barrier(Ranged, frozen=True, kw_only=True):
     strip, end: port of the walking graph that it closes.
     """
 
-    x_m: Annotated[float, WHERE_M]
-    y_m: Annotated[float, WHERE_M]
+    x_m: Annotated[float, COORDINATE_M]
+    y_m: Annotated[float, COORDINATE_M]
     heading_rad: Annotated[float, HEADING_RAD]
     length_m: Annotated[float, Within(0.1, 200)]
     strip: Annotated[str, _NAME]
@@ -122,8 +122,8 @@ class RouteCrossing(Ranged, frozen=True, kw_only=True):
     """Crossing on the reference route, from arc length enter_s_m to leave_s_m."""
 
     id: Annotated[str, _NAME]
-    enter_s_m: Annotated[float, ALONG_M]
-    leave_s_m: Annotated[float, ALONG_M]
+    enter_s_m: Annotated[float, ARC_LENGTH_M]
+    leave_s_m: Annotated[float, ARC_LENGTH_M]
     signalised: bool
 
     @property
@@ -246,12 +246,14 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
     start: tuple[float, float, float]
     goal: tuple[float, float]
     route: Annotated[
-        tuple[tuple[float, float], ...], Counted(0, 50_000), Points(WHERE_M.low, WHERE_M.high)
+        tuple[tuple[float, float], ...],
+        ItemCount(0, 50_000),
+        Points(COORDINATE_M.low, COORDINATE_M.high),
     ]
-    crossings: Annotated[tuple[RouteCrossing, ...], Counted(0, 1000)] = ()
-    barriers: Annotated[tuple[Barrier, ...], Counted(0, 1000)] = ()
-    obstacles: Annotated[tuple[Obstacle, ...], Counted(0, 1000)] = ()
-    events: Annotated[tuple[Event, ...], Counted(0, 200)] = ()
+    crossings: Annotated[tuple[RouteCrossing, ...], ItemCount(0, 1000)] = ()
+    barriers: Annotated[tuple[Barrier, ...], ItemCount(0, 1000)] = ()
+    obstacles: Annotated[tuple[Obstacle, ...], ItemCount(0, 1000)] = ()
+    events: Annotated[tuple[Event, ...], ItemCount(0, 200)] = ()
     crowd: CrowdSpec = CrowdSpec()
     robot: Annotated[str, _NAME] = COURIER.name
     goal_radius_m: Annotated[float, Within(0.1, 20)] = 1.0
@@ -327,7 +329,7 @@ class Suite(Ranged, frozen=True, kw_only=True):
     16
     """
 
-    name: Annotated[str, Named("a suite, and the folder of a run")]
+    name: Annotated[str, PathName("a suite, and the folder of a run")]
     version: Annotated[str, _NAME]
     scenarios: tuple[Scenario, ...]
     description: Annotated[str, Text(10_000)] = ""
@@ -412,7 +414,7 @@ def read_suite(path: Path, kinds: EventKinds | None = None) -> Suite:
             event_faults(one, kinds, f"$.scenarios[{i}]") for i, one in enumerate(suite.scenarios)
         )
         if faults := list(chain.from_iterable(faults_by_scenario)):
-            raise SpecError(f"{path}: {in_lines(faults)}")
+            raise SpecError(f"{path}: {join_faults(faults)}")
     return suite
 
 

@@ -15,7 +15,7 @@ _MOST_NAMED: Final = 3
 """Maximum number of scenarios that are listed by name, if no other options select them."""
 
 
-def scenarios_chosen(
+def select_scenarios(
     whole: Suite,
     ids: Sequence[str] = (),
     episodes: int | None = None,
@@ -87,7 +87,7 @@ def _options_for(whole: Suite, ids: Sequence[str]) -> list[str]:
     choices = product((None, *get_args(Split)), ((), *common, every), (None, len(ids)))
     for split, kinds, episodes in sorted(choices, key=lambda one: sum(map(bool, one))):
         try:
-            found = scenarios_chosen(whole, (), episodes, kinds, split)
+            found = select_scenarios(whole, (), episodes, kinds, split)
         except UsageError:
             continue
         if {scenario.id for scenario in found} == {*ids}:

@@ -14,15 +14,15 @@ from typing import Annotated, Any, Final, Literal, TypeVar, Union, get_args, get
 import msgspec
 
 from cosim.core.errors import SpecError, nearest
-from cosim.spec.validation import MOST_SHOWN, Ranged, printable, refusal_of, rules_of, shown
+from cosim.spec.validation import MOST_SHOWN, Ranged, field_error, one_line, rules_of, shown
 
 MOST_BYTES: Final = 1_000_000_000
 """Maximum size of a file in bytes."""
-MOST_TOLD: Final = 5
+MOST_LISTED_FAULTS: Final = 5
 """Maximum number of errors that a message lists."""
 MOST_COUNTED: Final = 1000
 """Maximum number of errors that are counted."""
-MOST_LETTERS: Final = 400
+MOST_FAULT_LETTERS: Final = 400
 """Maximum length of one error in characters."""
 _PLACE: Final = re.compile(r" - at `(key in )?\$[^`]*`$")
 """Place that msgspec appends to an error."""
@@ -52,10 +52,10 @@ def read_spec_file(path: Path, kind: type[Spec]) -> Spec:
         return msgspec.json.decode(data, type=kind)
     except _REFUSED as error:
         faults = list(islice(_faults(data, kind, error), MOST_COUNTED))
-        raise SpecError(f"{path}: {in_lines(faults)}") from error
+        raise SpecError(f"{path}: {join_faults(faults)}") from error
 
 
-def in_lines(faults: Sequence[str], most: int = MOST_TOLD) -> str:
+def join_faults(faults: Sequence[str], most: int = MOST_LISTED_FAULTS) -> str:
     """Join errors to a message: one as it is; of several, their number and the first `most`, one a
     line."""
     if len(faults) == 1:
@@ -141,7 +141,7 @@ def faults_in(tree: Any, kind: Any, place: str) -> Iterator[str]:
         if isinstance(tree, str):
             message = message.replace(f"'{tree}'", shown(tree))
         yield (
-            f"{printable(_PLACE.sub('', message), MOST_LETTERS)} - at "
+            f"{one_line(_PLACE.sub('', message), MOST_FAULT_LETTERS)} - at "
             f"`{place}`{_choices(kind, tree)}"
         )
 
@@ -157,7 +157,7 @@ def _faults_below(tree: Any, kind: Any, place: str) -> Iterator[str]:
         fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}
         for name in sorted(tree.keys() - fields.keys() - {kind.__struct_config__.tag_field}):
             yield (
-                f"Object contains unknown field `{printable(name, MOST_SHOWN)}` - at "
+                f"Object contains unknown field `{one_line(name, MOST_SHOWN)}` - at "
                 f"`{place}`{_listed(fields, name)}"
             )
         for name, field in fields.items():
@@ -167,7 +167,7 @@ def _faults_below(tree: Any, kind: Any, place: str) -> Iterator[str]:
                 yield f"Object missing required field `{name}` - at `{place}`"
     elif isinstance(tree, dict) and get_origin(kind) is dict:
         for name, item in tree.items():
-            yield from faults_in(item, get_args(kind)[1], f"{place}.{printable(name, MOST_SHOWN)}")
+            yield from faults_in(item, get_args(kind)[1], f"{place}.{one_line(name, MOST_SHOWN)}")
     elif isinstance(tree, list) and get_origin(kind) is tuple:
         parts = get_args(kind)
         if parts[-1] is not Ellipsis and len(parts) != len(tree):
@@ -186,7 +186,7 @@ def _out_of_range(tree: Any, kind: Any, place: str) -> Iterator[str]:
     for field, rule in rules_of(kind):
         with suppress(*_REFUSED):
             if field in tree and (
-                refusal := refusal_of(field, rule, msgspec.convert(tree[field], types[field]))
+                refusal := field_error(field, rule, msgspec.convert(tree[field], types[field]))
             ):
                 yield f"{refusal} - at `{place}`"
 

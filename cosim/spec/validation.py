@@ -69,7 +69,7 @@ class Points(NamedTuple):
         return next(filter(None, refusals))
 
 
-class Counted(NamedTuple):
+class ItemCount(NamedTuple):
     """Range of the number of items."""
 
     fewest: int
@@ -95,7 +95,7 @@ class Text(NamedTuple):
         )
 
 
-class Named(NamedTuple):
+class PathName(NamedTuple):
     """Name that is valid in paths and keys.
 
     what: thing that it names, for the message.
@@ -112,11 +112,11 @@ class Named(NamedTuple):
         )
 
 
-WHERE_M: Final = Within(-10_000_000, 10_000_000)
+COORDINATE_M: Final = Within(-10_000_000, 10_000_000)
 """Range of a coordinate in metres. On maps in UTM coordinates they are millions."""
 HEADING_RAD: Final = Within(-2 * math.pi, 2 * math.pi)
 """Range of a heading in radians."""
-ALONG_M: Final = Within(0, 20_000)
+ARC_LENGTH_M: Final = Within(0, 20_000)
 """Range of an arc length of a route in metres."""
 SEED: Final = Within(0, 2**32 - 1)
 """Range of a scenario's seed."""
@@ -135,7 +135,7 @@ class Ranged(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
 
     def _out_of_range(self) -> list[str]:
         refusals = (
-            refusal_of(field, rule, getattr(self, field)) for field, rule in rules_of(type(self))
+            field_error(field, rule, getattr(self, field)) for field, rule in rules_of(type(self))
         )
         return [self.called + refusal for refusal in refusals if refusal]
 
@@ -160,7 +160,7 @@ def rules_of(kind: type[Ranged]) -> tuple[tuple[str, Rule], ...]:
     )
 
 
-def refusal_of(field: str, rule: Rule, value: Any) -> str:
+def field_error(field: str, rule: Rule, value: Any) -> str:
     """Return the error of a field's value; "" if it is valid or None."""
     return "" if value is None else rule.refusal(field, value)
 
@@ -168,13 +168,13 @@ def refusal_of(field: str, rule: Rule, value: Any) -> str:
 def shown(value: object) -> str:
     """Return a value for a message: on one line, quoted if it is text, cut if it is long."""
     return (
-        f"'{printable(value, MOST_SHOWN)}'"
+        f"'{one_line(value, MOST_SHOWN)}'"
         if isinstance(value, str)
-        else printable(repr(value), MOST_SHOWN)
+        else one_line(repr(value), MOST_SHOWN)
     )
 
 
-def printable(text: str, most: int) -> str:
+def one_line(text: str, most: int) -> str:
     """Return text on one line, cut to `most` characters, with unprintable ones escaped."""
     line = (
         text

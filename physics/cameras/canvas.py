@@ -16,7 +16,7 @@ from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS
 from physics.dynamics.bullet import p
-from physics.ground.mesh import Mesh, as_lists
+from physics.ground.mesh import Mesh, pybullet_lists
 from physics.textures.layers import Colour
 
 _AWAY: Final = (0.0, 0.0, -200.0)
@@ -59,7 +59,7 @@ class BulletCanvas:
         """A form that bodies can share."""
         if self._folder is not None:
             return self._shape_of_file(mesh, Path(self._folder.name))
-        with as_lists(mesh.triangles, mesh.vertices, mesh.normals) as (
+        with pybullet_lists(mesh.triangles, mesh.vertices, mesh.normals) as (
             indices,
             (vertices, normals),
         ):

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from cosim.core.geometry import Floats
-from physics.textures.noise import Field, Noise, step
+from physics.textures.noise import Field, Noise, smooth_step
 
 _SIZE: Final = 512
 _PER_SIDE: Final = 5.0
@@ -43,13 +43,18 @@ def clouded(
     low = float(np.clip((sun[2] + 0.05) / 0.25, 0.0, 1.0))
     white = beam * (0.30 + 0.30 * low) * max(float(sun[2]), 0.12 if sun[2] > -0.05 else 0.0) ** 0.35
     cloud = white * (lit * glow)[..., None] + sky_light * (0.95 - 0.35 * dense)[..., None]
-    thick = dense * step(0.0, 0.10, up)
+    thick = dense * smooth_step(0.0, 0.10, up)
     broken = clear + (cloud - clear) * thick[..., None]
-    closed = float(step(0.65, 1.0, np.asarray(cover)))
-    seen = 1.0 - float(step(0.45, 0.95, np.asarray(cover)))
+    closed = float(smooth_step(0.65, 1.0, np.asarray(cover)))
+    seen = 1.0 - float(smooth_step(0.45, 0.95, np.asarray(cover)))
     total = sky_light + beam * max(float(sun[2]), 0.0)
     grey = 0.30 * (0.75 * float(total.mean()) + 0.25 * total)
-    vault = (1.0 + 2.0 * up) / 3.0 * (9.0 / 7.0) * (1.0 + 0.10 * (dense - 0.5) * step(0.0, 0.3, up))
+    vault = (
+        (1.0 + 2.0 * up)
+        / 3.0
+        * (9.0 / 7.0)
+        * (1.0 + 0.10 * (dense - 0.5) * smooth_step(0.0, 0.3, up))
+    )
     overcast = grey * vault[..., None]
     return broken + (overcast - broken) * closed, seen
 
@@ -58,7 +63,7 @@ def _layer(seed: int) -> Field:
     """(S, S) noise of the layer, its values spread evenly over 0 to 1, so that a cover is a
     threshold."""
     noise = Noise(_SIZE, (seed, 9001))
-    field = noise.warped(
+    field = noise.distort(
         np.asarray(noise.clouds(4) + 0.6 * noise.clouds(16) + 0.15 * noise.clouds(64), np.float32),
         0.012,
         8,
@@ -72,4 +77,4 @@ def _dense(layer: Field, ways: Floats, cover: float, moved: Floats) -> Field:
     flat = ways[..., :2] / np.maximum(ways[..., 2:] + 0.12, 0.06) + moved
     at = (flat / _PER_SIDE % 1.0 * _SIZE).astype(np.float32)
     found = cv2.remap(layer, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-    return step(1.0 - cover, 1.0 - cover + 0.24, np.asarray(found, np.float32))
+    return smooth_step(1.0 - cover, 1.0 - cover + 0.24, np.asarray(found, np.float32))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.errors import SpecError
-from cosim.core.files import read_within
+from cosim.core.files import read_limited
 from cosim.core.geometry import Floats
 from physics.cameras.clearsky import LUMINANCE
 
@@ -29,7 +29,7 @@ def read_hdri(path: str) -> _Image:
     if not file.is_file():
         raise SpecError(f"hdri '{path}' does not exist")
     try:
-        data = np.frombuffer(read_within(file, _MOST_BYTES), np.uint8)
+        data = np.frombuffer(read_limited(file, _MOST_BYTES), np.uint8)
     except (OSError, ValueError) as error:
         raise SpecError(
             f"hdri '{path}' cannot be read: {getattr(error, 'strerror', error)}"

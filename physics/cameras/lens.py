@@ -21,7 +21,7 @@ from cosim.core.errors import SpecError
 from cosim.core.state import Frame, RobotState
 from cosim.spec.camera import CameraSpec, Lens
 from cosim.spec.robot import Mount
-from physics.textures.layers import LINEAR, encoded
+from physics.textures.layers import LINEAR_OF_SRGB_BYTE, linear_to_srgb
 
 GREY: Final = 0.18
 """Mean linear value that auto-exposure aims at."""
@@ -33,7 +33,7 @@ _DRAWN_MAX: Final = 4096
 _OFFSETS: Final = 1 << 18
 _FAR_M: Final = 15.0
 """What is not the ground is taken to be this far away: the walls of a street."""
-_CODES: Final = (encoded(np.arange(4097) / 4096.0) * 255.0 + 0.5).astype(np.uint8)
+_CODES: Final = (linear_to_srgb(np.arange(4097) / 4096.0) * 255.0 + 0.5).astype(np.uint8)
 Map = NDArray[np.floating[Any]]
 
 
@@ -97,13 +97,13 @@ def through(spec: CameraSpec, frame: Frame, robot: RobotState, seed: int, tick: 
         if len(moments) == 1:
             rgb = _moved(rgb, spec, source, flow, read, cv2.INTER_LINEAR)
         else:
-            open_ = LINEAR[rgb]
+            open_ = LINEAR_OF_SRGB_BYTE[rgb]
             light = np.zeros((spec.height, spec.width, 3), np.float32)
             for moment in moments:
                 light += _moved(open_, spec, source, flow, read + moment, cv2.INTER_LINEAR)
             light /= np.float32(len(moments))
     if toned:
-        light = _sensed(LINEAR[rgb] if light is None else light, spec, seed, tick)
+        light = _sensed(LINEAR_OF_SRGB_BYTE[rgb] if light is None else light, spec, seed, tick)
     if light is not None:
         rgb = _CODES[
             (np.clip(light, 0.0, 1.0) * np.float32(4096.0) + np.float32(0.5)).astype(np.int16)

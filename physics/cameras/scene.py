@@ -21,15 +21,15 @@ from physics.cameras.view import (
     View,
 )
 from physics.dynamics.world import BulletWorld
-from physics.ground.tiles import Key, distance_to, keys_within, square
+from physics.ground.tiles import Key, tile_bounds, tile_distance, tiles_within
 from physics.people.appearance import family_of
 from physics.people.families import FAMILIES
 from physics.people.parts import part_colours, part_meshes, placed_parts
-from physics.robots import urdf_of
+from physics.robots import urdf_path
 from physics.street import props, vehicles
 from physics.street.buildings import FACADES, WINDOW_COLOUR, facade_meshes
 from physics.street.furniture import KINDS, Prop, parts_of
-from physics.street.surface import stood
+from physics.street.surface import grounded_obstacles
 from physics.textures.layers import Colour
 
 
@@ -67,8 +67,10 @@ class BulletScene:
         self._vehicles: dict[tuple[vehicles.Shape, float, float], Rigs] = {}
         self._furniture: dict[tuple[str, int, int], Rigs] = {}
         self._painted: dict[int, Colour] = {}
-        self._robot = canvas.load(urdf_of(world.robot), "robot")
-        self._obstacles = _with_furniture({}, [], tuple(stood(world.obstacles, surface)))
+        self._robot = canvas.load(urdf_path(world.robot), "robot")
+        self._obstacles = _with_furniture(
+            {}, [], tuple(grounded_obstacles(world.obstacles, surface))
+        )
         for barrier in world.barriers:
             size = (barrier.thickness_m, barrier.length_m)
             z = surface.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, size)
@@ -101,14 +103,14 @@ class BulletScene:
 
     def _stream(self, view: View) -> None:
         x, y = float(view.eye_m[0]), float(view.eye_m[1])
-        for key in [k for k in self._tiles if distance_to(k, x, y) > FORGET_M]:
+        for key in [k for k in self._tiles if tile_distance(k, x, y) > FORGET_M]:
             self._canvas.remove(list(self._tiles.pop(key).bodies))
             self._shown.discard(key)
-        wanted = set(keys_within(x, y, VISIBLE_M))
+        wanted = set(tiles_within(x, y, VISIBLE_M))
         for key in self._shown - wanted:
             for body in self._tiles[key].bodies:
                 self._canvas.put_away(body)
-        for key in keys_within(x, y, VISIBLE_M):
+        for key in tiles_within(x, y, VISIBLE_M):
             if key not in self._tiles:
                 self._tiles[key] = self._built(key)
                 self.built += 1
@@ -118,7 +120,7 @@ class BulletScene:
         self._shown = wanted
 
     def _built(self, key: Key) -> _TileBodies:
-        x0, y0, x1, y1 = square(key)
+        x0, y0, x1, y1 = tile_bounds(key)
         middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0])
         chunk, posts = self._surface.chunk(key), self._surface.posts(key)
         parts = [
@@ -167,11 +169,11 @@ class BulletScene:
         leans = self._surface.road(which.xy[rows], which.heading[rows], which.size[rows]).tolist()
         for i, (z, roll, pitch) in zip(rows.tolist(), leans, strict=True):
             length, width = (round(float(side), 1) for side in which.size[i])
-            form = vehicles.shape(which.ids[i], length), length, width
+            form = vehicles.vehicle_shape(which.ids[i], length), length, width
             parts = vehicles.vehicle_parts(*form)
             if form not in self._vehicles:
                 self._vehicles[form] = Rigs(self._canvas, [part.mesh for part in parts], "vehicle")
-            paint = vehicles.paint(which.ids[i])
+            paint = vehicles.vehicle_colour(which.ids[i])
             at = (float(which.xy[i, 0]), float(which.xy[i, 1]), z)
             for body, part in zip(self._vehicles[form].lend(), parts, strict=True):
                 if roll or pitch:
@@ -214,7 +216,7 @@ class BulletScene:
                         self._canvas, [part.mesh for part in parts], "prop"
                     )
                 for body, part in zip(self._furniture[form].lend(), parts, strict=True):
-                    self._canvas.put(body, (prop.x_m, prop.y_m, z), prop.drawn_rad)
+                    self._canvas.put(body, (prop.x_m, prop.y_m, z), prop.drawn_heading_rad)
                     colour = part.colour or KINDS[prop.kind].paints[prop.paint]
                     if self._painted.get(body) != colour:
                         self._painted[body] = colour

@@ -16,23 +16,23 @@ from cosim.spec.robot import Robot
 from cosim.spec.scenario import Barrier
 from physics.dynamics.bullet import p
 from physics.dynamics.movers import Mover, TickPoses
-from physics.ground.mesh import Mesh, as_lists, join
+from physics.ground.mesh import Mesh, join, pybullet_lists
 from physics.ground.tiles import CURB_M
-from physics.robots import urdf_of
+from physics.robots import urdf_path
 from physics.street.buildings import Building, Wall
 from physics.street.furniture import Prop, solids_of
 from physics.street.surface import Chunk
 
-PERSON_M: Final = 1.7
+PERSON_HEIGHT_M: Final = 1.7
 """Height of a person's cylinder in metres."""
 
-VEHICLE_M: Final = 1.5
+VEHICLE_HEIGHT_M: Final = 1.5
 """Height of a vehicle's box in metres."""
 
-WALL_M: Final = 0.2
+WALL_THICKNESS_M: Final = 0.2
 """Thickness of a mapped building's walls in metres."""
 
-FAR_BELOW_M: Final = -50.0
+PARKED_Z_M: Final = -50.0
 """Height in metres at which inactive bodies are parked."""
 
 _SEARCH_STEP_M: Final = 0.5
@@ -94,7 +94,7 @@ class Bodies:
             enableConeFriction=0,
         )
         self._robot: int = self._call(
-            "loadURDF", str(urdf_of(robot)), flags=p.URDF_USE_INERTIA_FROM_FILE
+            "loadURDF", str(urdf_path(robot)), flags=p.URDF_USE_INERTIA_FROM_FILE
         )
         infos = [
             self._call("getJointInfo", self._robot, j)
@@ -134,7 +134,7 @@ class Bodies:
     def _add_ground(self, mesh: Mesh, value: float) -> int:
         middle = mesh.vertices.mean(axis=0) * (1.0, 1.0, 0.0)
         flags = p.GEOM_FORCE_CONCAVE_TRIMESH
-        with as_lists(mesh.triangles, mesh.vertices - middle) as (indices, (vertices,)):
+        with pybullet_lists(mesh.triangles, mesh.vertices - middle) as (indices, (vertices,)):
             shape = self._call(
                 "createCollisionShape", p.GEOM_MESH, vertices=vertices, indices=indices, flags=flags
             )
@@ -234,7 +234,7 @@ class Bodies:
         ways: poses after each substep
         z_m: height of the ground under each body
         """
-        half = 0.5 * (PERSON_M if kind == "pedestrian" else VEHICLE_M)
+        half = 0.5 * (PERSON_HEIGHT_M if kind == "pedestrian" else VEHICLE_HEIGHT_M)
         self._paths[kind] = []
         for (mover, way), z in zip(ways.items(), z_m, strict=True):
             body = self._active[kind][mover.id][0]
@@ -247,7 +247,7 @@ class Bodies:
 
     def _park(self, body: int) -> None:
         self._final_poses.pop(body, None)
-        p.resetBasePositionAndOrientation(body, (0.0, 0.0, FAR_BELOW_M), _UPRIGHT, self._client)
+        p.resetBasePositionAndOrientation(body, (0.0, 0.0, PARKED_Z_M), _UPRIGHT, self._client)
 
     def _acquire(self, pool: Any) -> int:
         waiting = self._idle.setdefault(pool, [])
@@ -256,13 +256,16 @@ class Bodies:
         if pool not in self._shapes:
             if pool == "pedestrian":
                 shape = self._call(
-                    "createCollisionShape", p.GEOM_CYLINDER, radius=PERSON_RADIUS_M, height=PERSON_M
+                    "createCollisionShape",
+                    p.GEOM_CYLINDER,
+                    radius=PERSON_RADIUS_M,
+                    height=PERSON_HEIGHT_M,
                 )
             else:
-                half = (0.5 * pool[1], 0.5 * pool[2], 0.5 * VEHICLE_M)
+                half = (0.5 * pool[1], 0.5 * pool[2], 0.5 * VEHICLE_HEIGHT_M)
                 shape = self._call("createCollisionShape", p.GEOM_BOX, halfExtents=half)
             self._shapes[pool] = shape
-        return self._create_body(self._shapes[pool], (0.0, 0.0, FAR_BELOW_M))
+        return self._create_body(self._shapes[pool], (0.0, 0.0, PARKED_Z_M))
 
     def _create_body(self, shape: int, at: Any, turn: Any = _UPRIGHT) -> int:
         body: int = self._call(
@@ -369,7 +372,7 @@ class Bodies:
             )
         ]
 
-    def blocked(self, begin_m: Floats, end_m: Floats) -> NDArray[np.bool_]:
+    def lines_blocked(self, begin_m: Floats, end_m: Floats) -> NDArray[np.bool_]:
         """Return which of N lines, from (N, 3) to (N, 3) points in metres, hit a body."""
         hits = self._call("rayTestBatch", begin_m.tolist(), end_m.tolist())
         return np.array([hit[0] >= 0 for hit in hits], dtype=bool)
@@ -390,6 +393,6 @@ def _wall_box(
     """
     x0, y0, x1, y1 = wall
     length, heading = math.hypot(x1 - x0, y1 - y0), math.atan2(y1 - y0, x1 - x0)
-    x = 0.5 * (x0 + x1) - 0.5 * WALL_M * math.sin(heading)
-    y = 0.5 * (y0 + y1) + 0.5 * WALL_M * math.cos(heading)
-    return (x, y), heading, (length, WALL_M, height_m)
+    x = 0.5 * (x0 + x1) - 0.5 * WALL_THICKNESS_M * math.sin(heading)
+    y = 0.5 * (y0 + y1) + 0.5 * WALL_THICKNESS_M * math.cos(heading)
+    return (x, y), heading, (length, WALL_THICKNESS_M, height_m)

@@ -34,7 +34,7 @@ def _import_quietly() -> Any:
 p = _import_quietly()
 
 
-def bullet_alone() -> dict[str, str]:
+def bullet_fingerprint() -> dict[str, str]:
     """Return hashes of a small simulation and of a TinyRenderer image.
 
     The scene uses no project code, so the hashes depend on the PyBullet build alone.
@@ -78,7 +78,7 @@ def bullet_alone() -> dict[str, str]:
     }
 
 
-def put_physics_stopwatch(timed: _Timed) -> None:
+def time_physics_calls(timed: _Timed) -> None:
     """Replace PyBullet's step and image functions by timed ones for the rest of the process."""
     p.stepSimulation = timed("physics", p.stepSimulation)
     p.getCameraImage = timed("camera", p.getCameraImage)

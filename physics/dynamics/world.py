@@ -23,7 +23,7 @@ from cosim.core.state import (
     Motion,
     RobotState,
     Street,
-    write_protected,
+    write_protected_copy,
 )
 from cosim.spec.obstacle import Obstacle
 from cosim.spec.robot import COURIER, Robot
@@ -31,8 +31,8 @@ from cosim.spec.scenario import Barrier
 from physics.dynamics.bodies import Bodies, Moving
 from physics.dynamics.drive import SkidDrive
 from physics.dynamics.movers import Mover, TickPoses, movers_near
-from physics.ground.tiles import Key, distance_to, distances_within, keys_within
-from physics.street.surface import Surface, stood
+from physics.ground.tiles import Key, tile_distance, tile_distances_within, tiles_within
+from physics.street.surface import Surface, grounded_obstacles
 
 SUBSTEP_S: Final = 0.005
 """Duration of a physics substep in seconds."""
@@ -108,7 +108,7 @@ class BulletWorld:
                 size = (barrier.thickness_m, barrier.length_m)
                 z = self.surface.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, size)
                 self._bodies.add_barrier(barrier, z)
-            for prop, z in stood(self.obstacles, self.surface):
+            for prop, z in grounded_obstacles(self.obstacles, self.surface):
                 self._bodies.add_prop(prop, z)
         return self
 
@@ -149,7 +149,7 @@ class BulletWorld:
         long = far_m > 2 * _SIGHT_MARGIN_M
         if long.any():
             inset = _SIGHT_MARGIN_M * rays[long] / far_m[long, None]
-            hidden[long] = self._engine.blocked(eye_m + inset, points_m[long] - inset)
+            hidden[long] = self._engine.lines_blocked(eye_m + inset, points_m[long] - inset)
         return hidden
 
     def step(self, command: Command, before: Street, after: Street, substeps: int) -> Motion:
@@ -180,7 +180,7 @@ class BulletWorld:
             trace += pose
             if bodies.watched:
                 found |= {Contact(what, other, k) for what, other in bodies.robot_contacts()}
-        poses = write_protected(trace, shape=(substeps, 3))
+        poses = write_protected_copy(trace, shape=(substeps, 3))
         for kind, mover in close:
             found.update(self._overlaps(kind, mover, poses))
         contacts = tuple(sorted(found, key=lambda c: (c.substep, c.kind, c.other))) if found else ()
@@ -226,17 +226,17 @@ class BulletWorld:
         ):
             return
         bodies = self._engine
-        for key in [k for k in self._tiles if distance_to(k, x_m, y_m) > _UNLOAD_M]:
+        for key in [k for k in self._tiles if tile_distance(k, x_m, y_m) > _UNLOAD_M]:
             bodies.remove(self._tiles.pop(key))
-        for key in keys_within(x_m, y_m, _LOAD_M):
+        for key in tiles_within(x_m, y_m, _LOAD_M):
             if key not in self._tiles:
                 self._tiles[key] = bodies.add_chunk(self.surface.chunk(key))
         to_load_m = [
             far_m - _LOAD_M
-            for far_m, key in distances_within(x_m, y_m, _UNLOAD_M)
+            for far_m, key in tile_distances_within(x_m, y_m, _UNLOAD_M)
             if key not in self._tiles
         ]
-        to_unload_m = [_UNLOAD_M - distance_to(key, x_m, y_m) for key in self._tiles]
+        to_unload_m = [_UNLOAD_M - tile_distance(key, x_m, y_m) for key in self._tiles]
         self._loaded_at_m = (x_m, y_m)
         self._reload_after_m = min(to_load_m + to_unload_m) - _ROUNDING_M
 

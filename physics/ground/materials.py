@@ -86,7 +86,7 @@ PAVINGS: Final[Mapping[str, Colour]] = {
 }
 """Colour of each paved surface by name: "kind:material:colour index"."""
 
-SEEN_AS: Final[Mapping[str, tuple[str, Colour]]] = {
+APPEARANCE_OVERRIDES: Final[Mapping[str, tuple[str, Colour]]] = {
     "ground": ("ground", GROUND_LOOKS[PLAIN_GROUND].seen),
     "sidewalk:asphalt:0": ("sidewalk:footway:0", (0.57, 0.55, 0.52)),
     "sidewalk:asphalt:1": ("sidewalk:footway:1", (0.62, 0.60, 0.58)),
@@ -146,7 +146,7 @@ class Paving:
         ]
         return [*strips, *lanes]
 
-    def refined(
+    def surface_names(
         self,
         kinds: Sequence[str],
         points: Floats,
@@ -179,7 +179,7 @@ class Paving:
         return list(names)
 
 
-def cuts(pieces: Sequence[Strip | Lane]) -> NDArray[np.object_]:
+def end_lines(pieces: Sequence[Strip | Lane]) -> NDArray[np.object_]:
     """Return lines across both ends of each piece.
 
     The ground is divided along them, so that each piece can have its own surface.

@@ -86,11 +86,13 @@ class Part(NamedTuple):
 
 
 _idle_rows: list[list[float]] = []
-"""Recycled row lists for `as_lists`."""
+"""Recycled row lists for `pybullet_lists`."""
 
 
 @contextmanager
-def as_lists(indices: Ints, *tables: Floats) -> Iterator[tuple[list[int], list[list[list[float]]]]]:
+def pybullet_lists(
+    indices: Ints, *tables: Floats
+) -> Iterator[tuple[list[int], list[list[list[float]]]]]:
     """Provide an index array and (N, 3) tables as the lists that PyBullet takes.
 
     PyBullet never releases a list or a row that it received. Rows are therefore reused, and all
@@ -148,7 +150,7 @@ def smooth_normals(vertices: Floats, triangles: Ints) -> Floats:
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12))
 
 
-def plan_triangles(
+def triangulate_areas(
     areas: Sequence[shapely.Geometry] | NDArray[np.object_],
 ) -> tuple[Floats, NDArray[np.int64]]:
     """Triangulate areas of the ground.

@@ -72,7 +72,7 @@ class Relief:
     roots: Floats
     holes: Floats
 
-    def on_pavement(self, xy: Floats) -> Floats:
+    def pavement_offset(self, xy: Floats) -> Floats:
         """Return the (N,) height offsets in metres at (N, 2) pavement points."""
         waves = WAVE_HEIGHT_M * _noise(xy, WAVE_M, self.seed, smooth=True)
         slabs = _noise(xy, SLAB_M, self.seed + 1, smooth=False, spikes=True)

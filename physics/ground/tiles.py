@@ -27,8 +27,8 @@ from cosim.core.geometry import Floats, Polyline
 from cosim.place import overlay
 from cosim.place.street_map import PieceKind, StreetMap, Strip, union_closed
 from cosim.place.terrain import Terrain
-from physics.ground.materials import PAVINGS, Paving, cuts
-from physics.ground.mesh import Mesh, join, plan_triangles, quads, smooth_normals
+from physics.ground.materials import PAVINGS, Paving, end_lines
+from physics.ground.mesh import Mesh, join, quads, smooth_normals, triangulate_areas
 from physics.ground.relief import Relief, potholes
 
 TILE_M: Final = 48.0
@@ -70,13 +70,13 @@ SURFACES: Mapping[str, tuple[str, tuple[float, float, float]]] = {
 """Label (see `cosim.core.state.LABELS`) and sRGB colour of each kind of ground."""
 
 
-def surface(name: str) -> tuple[str, tuple[float, float, float]]:
+def surface_look(name: str) -> tuple[str, tuple[float, float, float]]:
     """Return the label and sRGB colour of a surface name."""
-    label, colour = SURFACES[kind_of(name)]
+    label, colour = SURFACES[ground_kind(name)]
     return label, PAVINGS.get(name, colour)
 
 
-def kind_of(name: str) -> str:
+def ground_kind(name: str) -> str:
     """Return the kind of ground of a surface name."""
     return name.partition(":")[0]
 
@@ -118,17 +118,17 @@ class Tile:
         return np.where(shapely.contains_xy(self.low, xy[:, 0], xy[:, 1]), low, high)
 
 
-def key_at(x_m: float, y_m: float) -> Key:
+def tile_at(x_m: float, y_m: float) -> Key:
     """Return the tile that contains a point."""
     return math.floor((x_m - _ORIGIN_M) / TILE_M), math.floor((y_m - _ORIGIN_M) / TILE_M)
 
 
-def cells_of(xy: Floats) -> NDArray[np.int64]:
+def tile_indices(xy: Floats) -> NDArray[np.int64]:
     """Return the (N, 2) tiles that contain (N, 2) points."""
     return np.asarray(np.floor((xy - _ORIGIN_M) / TILE_M), dtype=np.int64)
 
 
-def square(key: Key) -> tuple[float, float, float, float]:
+def tile_bounds(key: Key) -> tuple[float, float, float, float]:
     """Return x0, y0, x1, y1 of a tile in metres."""
     x, y = key[0] * TILE_M + _ORIGIN_M, key[1] * TILE_M + _ORIGIN_M
     return x, y, x + TILE_M, y + TILE_M
@@ -140,33 +140,33 @@ def grown_box(bounds: Iterable[float], margin_m: float) -> shapely.Polygon:
     return shapely.box(x0 - margin_m, y0 - margin_m, x1 + margin_m, y1 + margin_m)
 
 
-def keys_within(x_m: float, y_m: float, radius_m: float) -> list[Key]:
+def tiles_within(x_m: float, y_m: float, radius_m: float) -> list[Key]:
     """Return the tiles within a radius of a point, row by row."""
-    return [key for _, key in distances_within(x_m, y_m, radius_m)]
+    return [key for _, key in tile_distances_within(x_m, y_m, radius_m)]
 
 
-def distances_within(x_m: float, y_m: float, radius_m: float) -> list[tuple[float, Key]]:
-    """Return the tiles of `keys_within`, each with its distance in metres."""
-    (i0, j0) = key_at(x_m - radius_m, y_m - radius_m)
-    (i1, j1) = key_at(x_m + radius_m, y_m + radius_m)
+def tile_distances_within(x_m: float, y_m: float, radius_m: float) -> list[tuple[float, Key]]:
+    """Return the tiles of `tiles_within`, each with its distance in metres."""
+    (i0, j0) = tile_at(x_m - radius_m, y_m - radius_m)
+    (i1, j1) = tile_at(x_m + radius_m, y_m + radius_m)
     keys = [(i, j) for j in range(j0, j1 + 1) for i in range(i0, i1 + 1)]
-    found = [(distance_to(key, x_m, y_m), key) for key in keys]
+    found = [(tile_distance(key, x_m, y_m), key) for key in keys]
     return [one for one in found if one[0] <= radius_m]
 
 
-def keys_in(area: shapely.Geometry) -> list[Key]:
+def tiles_touching(area: shapely.Geometry) -> list[Key]:
     """Return the tiles that an area touches, column by column."""
     x0, y0, x1, y1 = shapely.bounds(area).tolist()
-    (i0, j0) = key_at(x0, y0)
-    (i1, j1) = key_at(x1, y1)
+    (i0, j0) = tile_at(x0, y0)
+    (i1, j1) = tile_at(x1, y1)
     keys = [(i, j) for i in range(i0, i1 + 1) for j in range(j0, j1 + 1)]
     shapely.prepare(area)
-    return [key for key in keys if shapely.intersects(area, shapely.box(*square(key)))]
+    return [key for key in keys if shapely.intersects(area, shapely.box(*tile_bounds(key)))]
 
 
-def distance_to(key: Key, x_m: float, y_m: float) -> float:
+def tile_distance(key: Key, x_m: float, y_m: float) -> float:
     """Return the distance in metres from a point to a tile; 0 inside."""
-    x0, y0, x1, y1 = square(key)
+    x0, y0, x1, y1 = tile_bounds(key)
     return math.hypot(max(x0 - x_m, x_m - x1, 0.0), max(y0 - y_m, y_m - y1, 0.0))
 
 
@@ -185,26 +185,26 @@ def build_tile(
     seed: seed of the unevenness
     roots: (N, 2) trees in and around the tile, m
     """
-    border = shapely.box(*square(key))
-    reach = grown_box(square(key), RAMP_M + 1.0)
+    border = shapely.box(*tile_bounds(key))
+    reach = grown_box(tile_bounds(key), RAMP_M + 1.0)
     zones, stripes = _zones(street_map, reach)
     low = shapely.union_all([zones["road"], zones["crossing"]])
     shapely.prepare(low)
     pieces = paving.pieces(reach) if paving else []
-    ends = cuts(pieces)
+    ends = end_lines(pieces)
     relief = None
     if roughness > 0.0:
-        holes = potholes(zones["road"], square(key), roughness, seed)
+        holes = potholes(zones["road"], tile_bounds(key), roughness, seed)
         relief = Relief(roughness, seed, np.asarray(roots, dtype=float).reshape(-1, 2), holes)
-        ends = np.concatenate([ends, relief.lines(zones["pavement"], square(key))])
+        ends = np.concatenate([ends, relief.lines(zones["pavement"], tile_bounds(key))])
     terrain = street_map.terrain
     if terrain is not None:
-        ends = np.concatenate([ends, shapely.linestrings(terrain.creases(square(key)))])
+        ends = np.concatenate([ends, shapely.linestrings(terrain.creases(tile_bounds(key)))])
     faces = _faces(border, zones, low, stripes, ends)
     points = shapely.get_coordinates(shapely.point_on_surface(faces))
     names = _classify(points, zones, stripes)
     if paving:
-        names = paving.refined(names, points, pieces, reach)
+        names = paving.surface_names(names, points, pieces, reach)
     parts = _triangulate(faces, names, zones["ramp_to"], relief, terrain)
     return Tile(key, parts, low, zones["ramp_to"], relief, terrain)
 
@@ -380,7 +380,7 @@ def _triangulate(
     terrain: Terrain | None,
 ) -> dict[str, Mesh]:
     """Return a mesh for each surface name; the mesh of curbs includes their walls."""
-    corners, face = plan_triangles(faces)
+    corners, face = triangulate_areas(faces)
     grid, index = np.unique(
         np.rint(corners.reshape(-1, 2) / _GRID_M).astype(np.int64), axis=0, return_inverse=True
     )
@@ -389,7 +389,7 @@ def _triangulate(
     land, low, high = _heights(xy, ramp_to, relief, terrain)
     found = [*SURFACES, *sorted(set(names) - SURFACES.keys())]
     surface_of = np.array([found.index(name) for name in names])[face]
-    at_road_level = np.array([kind_of(name) in _LOW for name in found])
+    at_road_level = np.array([ground_kind(name) in _LOW for name in found])
     parts = {
         name: _surface_mesh(
             xy,
@@ -432,7 +432,7 @@ def _walls(
 def _surface_mesh(
     xy: Floats, z: Floats, triangles: NDArray[np.int64], shaded: bool = False
 ) -> Mesh:
-    """Build a mesh from the used vertices; `shaded` computes smooth normals."""
+    """Build a mesh from the used vertices; `scale_brightness` computes smooth normals."""
     used, index = np.unique(triangles, return_inverse=True)
     corners = index.reshape(-1, 3).astype(np.int32)
     vertices = np.column_stack([xy[used], z[used]])
@@ -455,7 +455,7 @@ def _heights(
     high = _height_above_land(xy, ramp_to)
     if relief is not None:
         low = land + relief.on_road(xy)
-        high = high + relief.on_pavement(xy) * high / CURB_M
+        high = high + relief.pavement_offset(xy) * high / CURB_M
     return land, low, high if terrain is None else land + high
 
 

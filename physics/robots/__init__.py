@@ -8,13 +8,13 @@ from pathlib import Path
 from cosim.spec.robot import Robot
 
 
-def urdf_of(robot: Robot) -> Path:
+def urdf_path(robot: Robot) -> Path:
     """Return the path of a robot's URDF file."""
     return Path(__file__).parent / robot.urdf
 
 
-def hash_of_robot(robot: Robot) -> str:
+def robot_hash(robot: Robot) -> str:
     """Return a hash of a robot's specification and its URDF file."""
     return hashlib.blake2b(
-        repr(robot).encode() + urdf_of(robot).read_bytes(), digest_size=8
+        repr(robot).encode() + urdf_path(robot).read_bytes(), digest_size=8
     ).hexdigest()

@@ -10,13 +10,20 @@ import numpy as np
 from cosim.place.street_map import StreetMap
 from physics.street.buildings import Building
 from physics.street.placement import street_style
-from physics.textures.facades import BAY_VARIANTS, DOORS, STREETS, WALL_STYLES, Front, WallStyle
+from physics.textures.facades import (
+    BAY_VARIANTS,
+    FRONTS_BY_NAME,
+    STREET_STYLES,
+    WALL_STYLES,
+    Front,
+    WallStyle,
+)
 
-NARROWEST_FRONT_M = 2.2
+WINDOW_WALL_MIN_M = 2.2
 """Smallest width in metres of a wall with windows."""
 
 
-class Face(NamedTuple):
+class BuildingAppearance(NamedTuple):
     """Appearance of one building.
 
     wall, roof: names of texture layers
@@ -38,14 +45,16 @@ class Face(NamedTuple):
     chance: tuple[int, int]
 
 
-def style_of(building: Building, street_map: StreetMap) -> WallStyle:
+def wall_style_of(building: Building, street_map: StreetMap) -> WallStyle:
     """Return the style of a building, chosen by its name among the styles of its street."""
     strip = street_map.strips.get(building.id.removeprefix("building:").rpartition(":")[0])
-    names = STREETS.get(street_style(strip.street_class) if strip is not None else "", STREETS[""])
+    names = STREET_STYLES.get(
+        street_style(strip.street_class) if strip is not None else "", STREET_STYLES[""]
+    )
     return WALL_STYLES[names[zlib.crc32(f"style:{building.id}".encode()) % len(names)]]
 
 
-def face_of(building: Building, style: WallStyle) -> Face:
+def building_appearance(building: Building, style: WallStyle) -> BuildingAppearance:
     """Return the appearance of a building, drawn from its style by its name."""
     rng = np.random.default_rng(zlib.crc32(building.id.encode()))
     wall, roof, upper = (
@@ -54,8 +63,8 @@ def face_of(building: Building, style: WallStyle) -> Face:
         str(rng.choice(style.uppers)),
     )
     number = int(rng.integers(BAY_VARIANTS))
-    front = DOORS[str(rng.choice(style.fronts))]
+    front = FRONTS_BY_NAME[str(rng.choice(style.fronts))]
     first_door = int(rng.integers(front.every))
     tint = style.tints[int(rng.integers(len(style.tints)))] if style.tints else None
     some, other = rng.integers(0, 256, 2).tolist()
-    return Face(wall, roof, upper, number, front, first_door, tint, (some, other))
+    return BuildingAppearance(wall, roof, upper, number, front, first_door, tint, (some, other))

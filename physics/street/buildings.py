@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Polyline
 from cosim.place.street_map import Lane, PieceKind, StreetMap, Strip
 from cosim.place.terrain import Terrain
-from physics.ground.mesh import Mesh, box, flat_shaded, join, plan_triangles, quads
-from physics.ground.tiles import CURB_M, Key, grown_box, key_at, square
+from physics.ground.mesh import Mesh, box, flat_shaded, join, quads, triangulate_areas
+from physics.ground.tiles import CURB_M, Key, grown_box, tile_at, tile_bounds
 
 _MARGIN_M: Final = 0.2
 """Smallest distance in metres between a building and walkable or drivable ground."""
@@ -114,7 +114,7 @@ class _Mapped(Protocol):
         """Return whether the map shows objects of a kind near a place."""
 
 
-class Frontage:
+class BuildingRows:
     """Generator of a map's buildings.
 
     mapped: mapped buildings, near which none are generated; None without them
@@ -130,13 +130,13 @@ class Frontage:
 
     def in_tile(self, key: Key) -> tuple[Building, ...]:
         """Return the buildings whose centre lies in a tile, in map order."""
-        reach = grown_box(square(key), _SEARCH_M)
+        reach = grown_box(tile_bounds(key), _SEARCH_M)
         found = [] if self._mapped is None else list(self._mapped.buildings(key))
         for strip in self._map.near("strip", reach):
             if isinstance(strip, Strip) and strip.kind == "sidewalk" and strip.road_side != 0:
                 if strip.id not in self._rows:
                     self._rows[strip.id] = self._generate_row(strip)
-                found += [b for b in self._rows[strip.id] if key_at(b.x_m, b.y_m) == key]
+                found += [b for b in self._rows[strip.id] if tile_at(b.x_m, b.y_m) == key]
         return tuple(found)
 
     def _generate_row(self, strip: Strip) -> tuple[Building, ...]:
@@ -222,7 +222,7 @@ def _between(line: Polyline, at_m: float, lot_m: float) -> NDArray[np.bool_]:
     return inside
 
 
-def on_land(building: Building, terrain: Terrain) -> Building:
+def with_foundation(building: Building, terrain: Terrain) -> Building:
     """Return the building with its floor and base set to the terrain.
 
     The floor of a generated building is level with the land at its front. A mapped building keeps
@@ -270,7 +270,7 @@ def _mapped_walls(building: Building, outline: shapely.Polygon) -> Mesh:
         np.column_stack(corner)
         for corner in ((x0, y0, low), (x1, y1, low), (x1, y1, high), (x0, y0, high))
     ]
-    roof, _ = plan_triangles([outline])
+    roof, _ = triangulate_areas([outline])
     top = np.column_stack([roof.reshape(-1, 2), np.full(3 * len(roof), roof_m)])
     return join([quads(np.stack(at, axis=1)), flat_shaded(top)])
 

@@ -24,7 +24,7 @@ _BATCH_PAIRS: Final = 400_000
 """Pairs of cross-sections and outline corners per batch; limits memory."""
 
 
-def clear_width(
+def clear_widths(
     strips: Iterable[Strip], props: Sequence[Prop]
 ) -> Mapping[str, tuple[float, float]]:
     """Return the smallest free width of each sidewalk around its centre line.
@@ -64,7 +64,7 @@ def clear_width(
     return found
 
 
-def on_driveways(strips: Iterable[Strip], props: Sequence[Prop]) -> list[str]:
+def props_on_driveways(strips: Iterable[Strip], props: Sequence[Prop]) -> list[str]:
     """Return the ids of props, except cars, on a driveway or the flares of its ramp."""
     still = [prop for prop in props if prop.kind != "car"]
     ways = [way for strip in strips for way in driveway_ground(strip)]

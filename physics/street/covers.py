@@ -20,8 +20,8 @@ from cosim.core.geometry import Floats, Polyline
 from cosim.place import overlay
 from cosim.place.open_ground import beside, open_ground
 from cosim.place.street_map import LandKind, StreetMap, Strip, street_of
-from physics.ground.mesh import Mesh, flat_shaded, join, plan_triangles, quads
-from physics.ground.tiles import DRIVEWAY_M, Tile, grown_box, square
+from physics.ground.mesh import Mesh, flat_shaded, join, quads, triangulate_areas
+from physics.ground.tiles import DRIVEWAY_M, Tile, grown_box, tile_bounds
 from physics.street.placement import street_style
 from physics.textures.layers import Colour
 
@@ -91,14 +91,14 @@ _BEDS: Final = Cover("earth", None)
 """Surface of garden beds."""
 
 
-class Laid(NamedTuple):
+class CoveredMesh(NamedTuple):
     """A mesh on the ground with its cover."""
 
     mesh: Mesh
     cover: Cover
 
 
-def covers_in(street_map: StreetMap, tile: Tile, rims: bool) -> dict[LandKind, Mesh]:
+def land_covers(street_map: StreetMap, tile: Tile, rims: bool) -> dict[LandKind, Mesh]:
     """Return the covers of open ground in a tile by kind of land.
 
     rims: add vertical rims, so that low cameras do not see under a cover; they are two thirds of
@@ -108,7 +108,7 @@ def covers_in(street_map: StreetMap, tile: Tile, rims: bool) -> dict[LandKind, M
         return {}
     ground = tile.parts["ground"]
     found = {}
-    areas = open_ground(street_map, shapely.box(*square(tile.key)))
+    areas = open_ground(street_map, shapely.box(*tile_bounds(tile.key)))
     outline = overlay.union_all(_outlines(ground)) if areas and rims else None
     for kind, area in areas:
         mesh = _clip_simplified(ground, area)
@@ -119,7 +119,7 @@ def covers_in(street_map: StreetMap, tile: Tile, rims: bool) -> dict[LandKind, M
     return found
 
 
-def laid_over(mesh: Mesh, area: shapely.Geometry) -> Mesh:
+def clip_with_rim(mesh: Mesh, area: shapely.Geometry) -> Mesh:
     """Return the parts of a mesh within an area, lifted slightly, with a vertical rim."""
     return _with_rim(_clip(mesh, area))
 
@@ -134,7 +134,7 @@ def _clip_simplified(mesh: Mesh, area: shapely.Geometry) -> Mesh:
         for part in shapely.get_parts(shapely.simplify(sheet, 1e-3))
         if isinstance(part, Polygon)
     ]
-    xy = plan_triangles(parts)[0].reshape(-1, 2) if parts else np.zeros((0, 2))
+    xy = triangulate_areas(parts)[0].reshape(-1, 2) if parts else np.zeros((0, 2))
     corners = np.column_stack([xy, np.full(len(xy), height.max() + _LIFT_M)])
     flat = flat_shaded(corners)
     return join([flat, _clip(Mesh(mesh.vertices, mesh.normals, mesh.triangles[~level]), area)])
@@ -195,7 +195,7 @@ def _clip_triangle(part: shapely.Geometry, corners: Floats, normals: Floats) -> 
     corners, normals: (3, 3) of the triangle
     """
     pieces = [p for p in shapely.get_parts(part) if shapely.get_dimensions(p) == 2]
-    at = plan_triangles(pieces)[0].reshape(-1, 2)
+    at = triangulate_areas(pieces)[0].reshape(-1, 2)
     shares = np.column_stack([at, np.ones(len(at))]) @ np.linalg.inv(
         np.column_stack([corners[:, :2], np.ones(3)])
     )
@@ -205,11 +205,11 @@ def _clip_triangle(part: shapely.Geometry, corners: Floats, normals: Floats) -> 
     return flat_shaded(np.column_stack([at, z]), slopes)
 
 
-def frontage_in(street_map: StreetMap, tile: Tile, seed: int) -> list[Laid]:
+def frontage_covers(street_map: StreetMap, tile: Tile, seed: int) -> list[CoveredMesh]:
     """Return the frontage covers in a tile of a generated city; empty on other maps."""
     if not street_map.planned or "ground" not in tile.parts:
         return []
-    reach = grown_box(square(tile.key), _SEARCH_M)
+    reach = grown_box(tile_bounds(tile.key), _SEARCH_M)
     strips = [s for s in street_map.near("strip", reach) if isinstance(s, Strip)]
     areas: dict[Cover, list[shapely.Geometry]] = {}
     for strip in strips:
@@ -217,18 +217,18 @@ def frontage_in(street_map: StreetMap, tile: Tile, seed: int) -> list[Laid]:
             for cover, area in _frontage_of(strip, seed):
                 areas.setdefault(cover, []).append(area)
     triangles = tile.parts["ground"]
-    found: list[Laid] = []
+    found: list[CoveredMesh] = []
     taken: shapely.Geometry = shapely.Polygon()
     for cover in sorted(
         areas, key=lambda cover: (cover not in _DRIVEWAYS, cover.layer, cover.colour or ())
     ):
         area = shapely.union_all(areas[cover])
-        found.append(Laid(laid_over(triangles, shapely.difference(area, taken)), cover))
+        found.append(CoveredMesh(clip_with_rim(triangles, shapely.difference(area, taken)), cover))
         taken = shapely.union(taken, area)
     return [laid for laid in found if len(laid.mesh)]
 
 
-def paved(strip: Strip) -> bool:
+def has_paved_frontage(strip: Strip) -> bool:
     """Return whether the frontage of a sidewalk's street is paved instead of gardens."""
     return street_style(strip.street_class) in _COVERS
 

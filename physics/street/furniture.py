@@ -310,7 +310,7 @@ class Prop:
         return self.kind, self.variant, self.paint if KINDS[self.kind].grown else 0
 
     @property
-    def drawn_rad(self) -> float:
+    def drawn_heading_rad(self) -> float:
         """Return the heading of the drawn parts."""
         return self.heading_rad + self.turned_rad
 

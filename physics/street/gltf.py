@@ -18,9 +18,9 @@ from physics.ground.tiles import Key
 from physics.street import props
 from physics.street.buildings import FACADES, WINDOW_COLOUR, facade_meshes
 from physics.street.furniture import KINDS, Prop, parts_of
-from physics.street.surface import Patch, Surface, stood
+from physics.street.surface import Patch, Surface, grounded_obstacles
 from physics.textures.ground import ground_layers
-from physics.textures.layers import Colour, encoded, linear
+from physics.textures.layers import Colour, linear_to_srgb, srgb_to_linear
 
 _GROUPS: Final = ("surfaces", "buildings", "trees", "furniture", "signals", "barriers", "obstacles")
 """Nodes below the root; their children have names such as "sidewalk:brick:2"."""
@@ -52,7 +52,7 @@ def as_gltf(
         parts.add(
             "barriers", "barrier:white", white.moved(at, barrier.heading_rad), props.PROP_WHITE
         )
-    for prop, z in stood(obstacles, surface):
+    for prop, z in grounded_obstacles(obstacles, surface):
         parts.add_prop("obstacles", prop, z)
     progress("writing")
     written: bytes = parts.scene().export(file_type="glb", include_normals=True)
@@ -66,7 +66,7 @@ class _Parts:
         self._meshes: dict[tuple[str, str, Colour], list[Mesh]] = {}
         layers = ground_layers(_LAYERS_PX)
         self._layer_means: dict[str, Colour] = dict(
-            zip(layers.names, map(tuple, encoded(layers.mean).tolist()), strict=True)
+            zip(layers.names, map(tuple, linear_to_srgb(layers.mean).tolist()), strict=True)
         )
 
     def add(self, group: str, name: str, mesh: Mesh, colour: Colour) -> None:
@@ -96,7 +96,7 @@ class _Parts:
     def add_prop(self, group: str, prop: Prop, z_m: float) -> None:
         name = prop.kind if group == "obstacles" else f"prop:{prop.kind}"
         for part in parts_of(*prop.form):
-            mesh = part.mesh.moved((prop.x_m, prop.y_m, z_m), prop.drawn_rad)
+            mesh = part.mesh.moved((prop.x_m, prop.y_m, z_m), prop.drawn_heading_rad)
             self.add(group, name, mesh, part.colour or KINDS[prop.kind].paints[prop.paint])
 
     def _mean_colour(self, patch: Patch) -> Colour:
@@ -122,7 +122,7 @@ class _Parts:
 def _geometry(mesh: Mesh, name: str, colour: Colour) -> trimesh.Trimesh:
     """Convert a mesh to a glTF geometry with y up."""
     turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    factor = np.append(linear(colour), 1.0)
+    factor = np.append(srgb_to_linear(colour), 1.0)
     material = PBRMaterial(
         name=name, baseColorFactor=factor, metallicFactor=0.0, roughnessFactor=1.0
     )

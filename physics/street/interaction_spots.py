@@ -14,13 +14,13 @@ import shapely
 from cosim.core.geometry import wrap_angle
 from cosim.core.state import PERSON_RADIUS_M
 from cosim.place.street_map import Lane, StreetMap
-from physics.street.building_style import NARROWEST_FRONT_M, face_of, style_of
+from physics.street.building_style import WINDOW_WALL_MIN_M, building_appearance, wall_style_of
 from physics.street.buildings import Building
-from physics.street.covers import paved
+from physics.street.covers import has_paved_frontage
 from physics.street.furniture import Prop
 from physics.textures.facade_canvas import BAY_M
 
-What = Literal["bench", "window", "stop"]
+SpotKind = Literal["bench", "window", "stop"]
 
 _SEAT_FRONT_M: Final = PERSON_RADIUS_M + 0.05
 """Distance in metres from the edge of a bench to a seated person's position, which is at the legs.
@@ -60,7 +60,7 @@ class InteractionSpot(NamedTuple):
     at_m: point on the thing that the person sits on, looks at or waits at
     """
 
-    what: What
+    what: SpotKind
     thing: str
     x_m: float
     y_m: float
@@ -79,7 +79,7 @@ def spots(
             yield from _shelter_spots(prop, street_map)
     for building in buildings:
         strip = street_map.strips.get(building.id.removeprefix("building:").rpartition(":")[0])
-        if strip is not None and not paved(strip):
+        if strip is not None and not has_paved_frontage(strip):
             continue  # people do not walk on gardens
         for number, window in enumerate(shop_windows(building, street_map)):
             for away_m in _WINDOW_M:
@@ -135,14 +135,14 @@ def _offset(prop: Prop, along_m: float, right_m: float) -> tuple[float, float]:
 
 def shop_windows(building: Building, street_map: StreetMap) -> Iterator[ShopWindow]:
     """Return a building's shop windows: ground-floor bays of shops and cafes without a door."""
-    face = face_of(building, style_of(building, street_map))
+    face = building_appearance(building, wall_style_of(building, street_map))
     if face.front.between not in _SHOP_BAYS:
         return
     for x0, y0, x1, y1 in (
         building.walls if building.outline is not None else [_street_wall(building)]
     ):
         width = math.hypot(x1 - x0, y1 - y0)
-        if width < NARROWEST_FRONT_M:
+        if width < WINDOW_WALL_MIN_M:
             continue
         count = max(round(width / BAY_M), 1)
         into = math.atan2(x1 - x0, -(y1 - y0))  # the outside is on the right of the wall

@@ -1,6 +1,6 @@
 """Buildings and props that a map shows, by tile.
 
-No objects of the same kind are generated near them (see `MappedThings.shows`).
+No objects of the same kind are generated near them (see `MappedObjects.shows`).
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ import shapely
 from shapely.geometry import Polygon
 
 from cosim.place import overlay
-from cosim.place.street_map import LANDS, Feature, StreetMap
+from cosim.place.street_map import LAND_KINDS, Feature, StreetMap
 from cosim.place.terrain import Terrain
-from physics.ground.tiles import Key, key_at, square
+from physics.ground.tiles import Key, tile_at, tile_bounds
 from physics.street.buildings import FACADES, Building, Wall
 from physics.street.furniture import KINDS, PROP_VARIANTS, Prop
 
-HOUSES_M: Final = 30.0
+BUILDING_EXCLUSION_M: Final = 30.0
 """Distance in metres from mapped buildings within which none are generated."""
 
-MAPPED_NEAR_M: Final = 40.0
+PROP_EXCLUSION_M: Final = 40.0
 """Distance in metres from mapped props within which none of the same kind are generated."""
 _MIN_PART_M2: Final = 0.05
 """Area in square metres below which a part of a building in a tile is dropped."""
 
 
-class MappedThings:
+class MappedObjects:
     """Buildings and props of a map; a pure function of the map.
 
     kinds: kinds of the mapped props
@@ -40,7 +40,7 @@ class MappedThings:
     def __init__(self, street_map: StreetMap) -> None:
         by_kind: dict[str, list[Feature]] = defaultdict(list)
         for feature in street_map.features:
-            if feature.kind not in LANDS:
+            if feature.kind not in LAND_KINDS:
                 by_kind[feature.kind].append(feature)
         self._buildings = by_kind.pop("building", [])
         self._floors_m = [
@@ -55,9 +55,9 @@ class MappedThings:
         self.kinds = frozenset(by_kind)
         self._props: dict[Key, list[Prop]] = defaultdict(list)
         for i, feature in enumerate(
-            f for f in street_map.features if f.kind not in ("building", *LANDS)
+            f for f in street_map.features if f.kind not in ("building", *LAND_KINDS)
         ):
-            self._props[key_at(feature.x_m, feature.y_m)].append(_prop(i, feature))
+            self._props[tile_at(feature.x_m, feature.y_m)].append(_prop(i, feature))
 
     @property
     def all_props(self) -> tuple[Prop, ...]:
@@ -70,7 +70,7 @@ class MappedThings:
 
     def buildings(self, key: Key) -> tuple[Building, ...]:
         """Return the parts of buildings in a tile, each as a building."""
-        tile = shapely.box(*square(key))
+        tile = shapely.box(*tile_bounds(key))
         found = []
         for i in np.sort(self._building_tree.query(tile, predicate="intersects")).tolist():
             parts = shapely.get_parts(overlay.intersection(self._buildings[i].polygon, tile))
@@ -81,7 +81,7 @@ class MappedThings:
     def shows(self, kind: str, place: shapely.Geometry) -> bool:
         """Return whether the map shows objects of a kind near a place."""
         tree = self._trees.get(kind)
-        reach = HOUSES_M if kind == "building" else MAPPED_NEAR_M
+        reach = BUILDING_EXCLUSION_M if kind == "building" else PROP_EXCLUSION_M
         return tree is not None and bool(
             len(tree.query(place, predicate="dwithin", distance=reach))
         )

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats, Polyline
 from cosim.place.street_map import Lane, StreetMap, Strip
-from physics.ground.mesh import EMPTY, Mesh, flat_shaded, join, plan_triangles
-from physics.ground.tiles import Tile, grown_box, key_at, kind_of, square
+from physics.ground.mesh import EMPTY, Mesh, flat_shaded, join, triangulate_areas
+from physics.ground.tiles import Tile, ground_kind, grown_box, tile_at, tile_bounds
 
 LINE_M: Final = 0.12
 """Width of lane lines in metres."""
@@ -56,9 +56,9 @@ _WALKABLE: Final = ("sidewalk", "ramp", "curb")
 """Kinds of ground that tactile paving covers."""
 
 
-def paint_in(street_map: StreetMap, tile: Tile) -> Mapping[str, Mesh]:
+def tile_markings(street_map: StreetMap, tile: Tile) -> Mapping[str, Mesh]:
     """Return the paint of a tile by ground layer, 4 mm above the ground."""
-    reach = grown_box(square(tile.key), _SEARCH_M)
+    reach = grown_box(tile_bounds(tile.key), _SEARCH_M)
     lanes = [lane for lane in street_map.near("lane", reach) if isinstance(lane, Lane)]
     roads = [lane for lane in lanes if lane.kind == "road" and not lane.internal]
     strips = [strip for strip in street_map.near("strip", reach) if isinstance(strip, Strip)]
@@ -147,7 +147,7 @@ def _band(line: Polyline, cuts: Floats, aside_m: float, width_m: float) -> Itera
 
 def _marking_mesh(quads: Sequence[Floats], tile: Tile) -> Mesh:
     """Return the mesh of quads (4, 2) whose centre is in the tile, on its ground."""
-    own = [quad for quad in quads if key_at(*quad.mean(axis=0).tolist()) == tile.key]
+    own = [quad for quad in quads if tile_at(*quad.mean(axis=0).tolist()) == tile.key]
     if not own:
         return EMPTY
     xy = np.concatenate(own)
@@ -166,13 +166,13 @@ def _on_ground(xy: Floats, triangles: NDArray[np.int64], tile: Tile) -> Mesh:
 
 def _tactile_mesh(street_map: StreetMap, crossings: Sequence[Strip], tile: Tile) -> Mesh:
     """Return tactile paving at both ends of crossings, clipped to walkable ground of the tile."""
-    border = shapely.box(*square(tile.key))
+    border = shapely.box(*tile_bounds(tile.key))
     ends = [(line, one.width_m) for one in crossings for line in (one.line, one.line[::-1])]
     fields = [_tactile_area(street_map, Polyline(line), width_m) for line, width_m in ends]
     here = [field for field in fields if shapely.intersects(field, border)]
     if not here:
         return EMPTY
-    walkable = join([mesh for name, mesh in tile.parts.items() if kind_of(name) in _WALKABLE])
+    walkable = join([mesh for name, mesh in tile.parts.items() if ground_kind(name) in _WALKABLE])
     return join([_drape(field, walkable) for field in here])
 
 
@@ -187,7 +187,7 @@ def _drape(field: shapely.Geometry, ground: Mesh) -> Mesh:
     pieces = shapely.intersection(shapely.polygons(faces[:, :, :2]), field)
     own = shapely.area(pieces) > 1e-6
     faces, normal = faces[own], normal[own]
-    xy, of = plan_triangles(pieces[own])
+    xy, of = triangulate_areas(pieces[own])
     slope = normal[of, None, :2] / normal[of, None, 2:]
     z = faces[of, :1, 2] - ((xy - faces[of, :1, :2]) * slope).sum(axis=2)
     vertices = np.concatenate([xy, z[..., None] + _LIFT_M], axis=2).reshape(-1, 3)

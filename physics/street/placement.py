@@ -25,11 +25,11 @@ from physics.ground.tiles import (
     RAMP_M,
     Key,
     grown_box,
-    key_at,
-    keys_in,
-    square,
+    tile_at,
+    tile_bounds,
+    tiles_touching,
 )
-from physics.street.buildings import Frontage
+from physics.street.buildings import BuildingRows
 from physics.street.furniture import (
     CATALOGUE,
     KINDS,
@@ -39,7 +39,7 @@ from physics.street.furniture import (
     Zone,
     footprints,
 )
-from physics.street.mapped import MappedThings
+from physics.street.mapped import MappedObjects
 
 CLEAR_HALF_M: Final = 0.6
 """Smallest half width in metres of the free band along the middle of a sidewalk."""
@@ -53,7 +53,7 @@ _GAP_M: Final = 0.25
 _EDGE_M: Final = 0.6
 """Width in metres of the outer edge of a wide sidewalk for props at the curb."""
 
-GOLDEN_RAD: Final = 2.399963
+TREE_TURN_RAD: Final = 2.399963
 """Rotation in radians from one tree to the next, so that trees look different."""
 
 _MARGIN_M: Final = 0.06
@@ -89,7 +89,7 @@ class _Band(NamedTuple):
     high_m: float
 
 
-class Placement:
+class PropPlacement:
     """Street furniture of a map.
 
     mapped: mapped props, near which none of the same kind are generated
@@ -101,27 +101,27 @@ class Placement:
         self,
         street_map: StreetMap,
         seed: int,
-        frontage: Frontage,
-        mapped: MappedThings | None = None,
+        frontage: BuildingRows,
+        mapped: MappedObjects | None = None,
     ) -> None:
         self._map = street_map
         self._seed = seed
         self._frontage = frontage
-        self._mapped = MappedThings(street_map) if mapped is None else mapped
+        self._mapped = MappedObjects(street_map) if mapped is None else mapped
         self._candidates: dict[str, tuple[list[Prop], NDArray[np.object_]]] = {}
         self._final: dict[str, tuple[Prop, ...]] = {}
         self._houses: dict[Key, list[shapely.Geometry]] = {}
 
     def in_tile(self, key: Key) -> tuple[Prop, ...]:
         """Return the props whose centre lies in a tile, in map order."""
-        strips = self._map.near("strip", grown_box(square(key), _SEARCH_M))
-        props = [prop for s in strips if isinstance(s, Strip) for prop in self.on_strip(s)]
+        strips = self._map.near("strip", grown_box(tile_bounds(key), _SEARCH_M))
+        props = [prop for s in strips if isinstance(s, Strip) for prop in self.props_of_strip(s)]
         return (
             *self._mapped.props(key),
-            *(prop for prop in props if key_at(prop.x_m, prop.y_m) == key),
+            *(prop for prop in props if tile_at(prop.x_m, prop.y_m) == key),
         )
 
-    def on_strip(self, strip: Strip) -> tuple[Prop, ...]:
+    def props_of_strip(self, strip: Strip) -> tuple[Prop, ...]:
         """Return the props of a sidewalk without overlaps.
 
         Props that overlap a building or a prop of an earlier sidewalk are removed.
@@ -149,10 +149,10 @@ class Placement:
         return self._final[strip.id]
 
     def _mapped_in(self, area: shapely.Polygon) -> list[Prop]:
-        return [prop for key in keys_in(area) for prop in self._mapped.props(key)]
+        return [prop for key in tiles_touching(area) for prop in self._mapped.props(key)]
 
     def _houses_in(self, area: shapely.Polygon) -> list[shapely.Geometry]:
-        keys = keys_in(area)
+        keys = tiles_touching(area)
         for key in keys:
             if key not in self._houses:
                 self._houses[key] = [b.polygon for b in self._frontage.in_tile(key)]
@@ -164,7 +164,7 @@ class Placement:
         Returns: props and their (N,) footprints
         """
         if strip.id not in self._candidates:
-            props = list(draw(strip, self._seed)) if strip.kind == "sidewalk" else []
+            props = list(draw_props(strip, self._seed)) if strip.kind == "sidewalk" else []
             mapped_kinds = self._mapped.kinds
             props = [
                 p
@@ -181,10 +181,10 @@ class Placement:
         return self._candidates[strip.id]
 
 
-def draw(strip: Strip, seed: int) -> Iterable[Prop]:
+def draw_props(strip: Strip, seed: int) -> Iterable[Prop]:
     """Return random props of a sidewalk, kind by kind, before overlaps are removed."""
     line = Polyline(strip.line if strip.road_side <= 0 else strip.line[::-1])
-    bands = zones(strip)
+    bands = prop_zones(strip)
     usable = line.length_m - 2.0 * PROP_END_GAP_M
     if usable < 1.0 or not bands:
         return
@@ -273,11 +273,11 @@ def _place(
     if kind.name == "lamp" and zone == "frontage":
         turned_rad = math.pi  # the arm must point to the road, not into buildings
     elif kind.grown:
-        turned_rad = GOLDEN_RAD * n
+        turned_rad = TREE_TURN_RAD * n
     return Prop(f"prop:{strip.id}:{n}", kind.name, variant, x, y, heading, paint, turned_rad)
 
 
-def zones(strip: Strip) -> dict[Zone, _Band]:
+def prop_zones(strip: Strip) -> dict[Zone, _Band]:
     """Return the zones of a sidewalk that props may use."""
     half = 0.5 * strip.width_m
     found: dict[Zone, _Band] = {}
@@ -312,9 +312,11 @@ def street_style(street_class: str) -> str:
 
 def props_of(street_map: StreetMap, seed: int) -> tuple[Prop, ...]:
     """Return all props of a map, sidewalk by sidewalk; takes seconds on large maps."""
-    mapped = MappedThings(street_map)
-    placement = Placement(street_map, seed, Frontage(street_map, seed, mapped), mapped)
-    made_up = (prop for strip in street_map.strips.values() for prop in placement.on_strip(strip))
+    mapped = MappedObjects(street_map)
+    placement = PropPlacement(street_map, seed, BuildingRows(street_map, seed, mapped), mapped)
+    made_up = (
+        prop for strip in street_map.strips.values() for prop in placement.props_of_strip(strip)
+    )
     return (*mapped.all_props, *made_up)
 
 
@@ -358,7 +360,7 @@ def _find_free(
         for way in driveway_ground(s)
     ]
     free &= ~_within(ground, ways, 0.0) | np.array([prop.kind == "car" for prop in props])
-    half = clear_half_m(strip) if "curb" in zones(strip) else 0.5 * strip.width_m
+    half = clear_half_m(strip) if "curb" in prop_zones(strip) else 0.5 * strip.width_m
     free &= np.asarray(shapely.distance(shapely.linestrings(strip.line), ground) >= half)
     one, two = shapely.STRtree(ground).query(ground, predicate="dwithin", distance=_GAP_M)
     earlier: dict[int, list[int]] = {}

@@ -12,7 +12,7 @@ from cosim.core.geometry import Polyline
 from cosim.place.street_map import StreetMap, Strip
 from cosim.spec.scenario import Barrier
 from physics.ground.mesh import Mesh, box, join
-from physics.ground.tiles import Key, grown_box, key_at, square
+from physics.ground.tiles import Key, grown_box, tile_at, tile_bounds
 
 PROP_RED: Final = (0.82, 0.10, 0.09)
 PROP_WHITE: Final = (0.93, 0.93, 0.91)
@@ -57,12 +57,12 @@ class SignalPost:
     heading_rad: float
 
 
-def posts_in(street_map: StreetMap, key: Key) -> list[SignalPost]:
+def signals_in_tile(street_map: StreetMap, key: Key) -> list[SignalPost]:
     """Return the pedestrian signals in a tile."""
-    strips = street_map.near("strip", grown_box(square(key), 5.0))
+    strips = street_map.near("strip", grown_box(tile_bounds(key), 5.0))
     crossings = [s for s in strips if isinstance(s, Strip) and s.signalised]
     posts = [post for s in crossings for post in signal_posts(street_map, s)]
-    return [post for post in posts if key_at(post.x_m, post.y_m) == key]
+    return [post for post in posts if tile_at(post.x_m, post.y_m) == key]
 
 
 def signal_posts(street_map: StreetMap, crossing: Strip) -> tuple[SignalPost, SignalPost]:

@@ -15,27 +15,27 @@ from cosim.core.errors import UsageError
 from cosim.core.geometry import Floats
 from cosim.place.open_ground import GROUND_LOOKS
 from cosim.place.street_map import LandKind, StreetMap
-from physics.ground.materials import PAVINGS, PLAIN_FRICTION, SEEN_AS, Paving, friction
+from physics.ground.materials import APPEARANCE_OVERRIDES, PAVINGS, PLAIN_FRICTION, Paving, friction
 from physics.ground.mesh import Mesh
-from physics.ground.tiles import Key, Tile, build_tile, cells_of, keys_in, surface
-from physics.street.building_style import style_of
-from physics.street.buildings import Building, Frontage, on_land
-from physics.street.covers import covers_in, frontage_in
+from physics.ground.tiles import Key, Tile, build_tile, surface_look, tile_indices, tiles_touching
+from physics.street.building_style import wall_style_of
+from physics.street.buildings import Building, BuildingRows, with_foundation
+from physics.street.covers import frontage_covers, land_covers
 from physics.street.furniture import Prop
-from physics.street.mapped import MappedThings
-from physics.street.paint import paint_in
-from physics.street.placement import Placement
-from physics.street.props import SignalPost, posts_in
-from physics.street.surface import Chunk, Finish, Patch, Surface
+from physics.street.mapped import MappedObjects
+from physics.street.paint import tile_markings
+from physics.street.placement import PropPlacement
+from physics.street.props import SignalPost, signals_in_tile
+from physics.street.surface import Chunk, Patch, Surface, TexturedDetails
 from physics.street.tile_cache import (
-    TileThings,
+    TileObjects,
     covers_as_arrays,
-    covers_of_arrays,
-    things_as_arrays,
-    things_of_arrays,
+    covers_from_arrays,
+    objects_as_arrays,
+    objects_from_arrays,
     tile_as_arrays,
     tile_cache,
-    tile_of_arrays,
+    tile_from_arrays,
 )
 from physics.textures.ground import layer_of
 
@@ -56,13 +56,13 @@ class StreetSurface(Surface):
         self.seed = seed
         self.roughness = roughness
         self.level = street_map.terrain is None
-        mapped = MappedThings(street_map)
-        self._frontage = Frontage(street_map, seed, mapped)
+        mapped = MappedObjects(street_map)
+        self._frontage = BuildingRows(street_map, seed, mapped)
         self._paving = Paving(street_map, seed)
-        self._placement = Placement(street_map, seed, self._frontage, mapped)
+        self._placement = PropPlacement(street_map, seed, self._frontage, mapped)
         self._cache = tile_cache(street_map, seed, roughness)
         self._tiles: OrderedDict[Key, Tile] = OrderedDict()
-        self._things: dict[Key, TileThings] = {}
+        self._things: dict[Key, TileObjects] = {}
 
     def chunk(self, key: Key) -> Chunk:
         ground = [self._patch(name, mesh) for name, mesh in self.tile(key).parts.items()]
@@ -70,9 +70,11 @@ class StreetSurface(Surface):
 
     def _patch(self, name: str, mesh: Mesh) -> Patch:
         """Return a ground mesh with its label, colour and texture layer."""
-        label, colour = surface(name)
+        label, colour = surface_look(name)
         shown, colour = (
-            (name, colour) if self.street_map.planned else SEEN_AS.get(name, (name, colour))
+            (name, colour)
+            if self.street_map.planned
+            else APPEARANCE_OVERRIDES.get(name, (name, colour))
         )
         return Patch(
             name, mesh, friction(name), label, colour, layer_of(shown, self.seed), name in PAVINGS
@@ -84,9 +86,9 @@ class StreetSurface(Surface):
         arrays = self.kept(
             "covers",
             key,
-            lambda: covers_as_arrays(covers_in(self.street_map, self.tile(key), rims=False)),
+            lambda: covers_as_arrays(land_covers(self.street_map, self.tile(key), rims=False)),
         )
-        return self._cover_patches(covers_of_arrays(arrays))
+        return self._cover_patches(covers_from_arrays(arrays))
 
     def _cover_patches(self, covers: Mapping[LandKind, Mesh]) -> tuple[Patch, ...]:
         """Return covers as patches with the look of their kind of land."""
@@ -100,13 +102,13 @@ class StreetSurface(Surface):
         return tuple(laid)
 
     def posts(self, key: Key) -> list[SignalPost]:
-        return posts_in(self.street_map, key)
+        return signals_in_tile(self.street_map, key)
 
-    def finish(self, key: Key) -> Finish:
+    def finish(self, key: Key) -> TexturedDetails:
         tile = self.tile(key)
         painted = []
-        laid = [*self._cover_patches(covers_in(self.street_map, tile, rims=True))]
-        for mesh, (layer, colour) in frontage_in(self.street_map, tile, self.seed):
+        laid = [*self._cover_patches(land_covers(self.street_map, tile, rims=True))]
+        for mesh, (layer, colour) in frontage_covers(self.street_map, tile, self.seed):
             tint = colour or (1.0, 1.0, 1.0)
             laid.append(
                 Patch(
@@ -119,21 +121,21 @@ class StreetSurface(Surface):
                     colour is not None,
                 )
             )
-        for layer, mesh in paint_in(self.street_map, tile).items():
+        for layer, mesh in tile_markings(self.street_map, tile).items():
             label = "road" if layer == "paint" else "sidewalk"
             painted.append(
                 Patch(
                     f"{label}:{layer}", mesh, PLAIN_FRICTION, label, (1.0, 1.0, 1.0), layer, False
                 )
             )
-        styles = [style_of(building, self.street_map) for building in self.buildings(key)]
-        return Finish(tuple(laid), tuple(painted), tuple(styles))
+        styles = [wall_style_of(building, self.street_map) for building in self.buildings(key)]
+        return TexturedDetails(tuple(laid), tuple(painted), tuple(styles))
 
     def tile(self, key: Key) -> Tile:
         """Return the ground of a tile from the cache, or build it."""
         if key not in self._tiles:
             arrays = self.kept("ground", key, lambda: tile_as_arrays(self._built(key)))
-            self._tiles[key] = tile_of_arrays(arrays, key, self.street_map.terrain)
+            self._tiles[key] = tile_from_arrays(arrays, key, self.street_map.terrain)
             if len(self._tiles) > _CACHED_TILES:
                 self._tiles.popitem(last=False)
         self._tiles.move_to_end(key)
@@ -152,7 +154,7 @@ class StreetSurface(Surface):
         heights = self.tile(key).height([(prop.x_m, prop.y_m) for prop in props])
         if props and not self.level:
             sizes = np.array([prop.size_m[:2] for prop in props])
-            heights = heights - self.fall(
+            heights = heights - self.drop_to_corner(
                 [(p.x_m, p.y_m) for p in props], [p.heading_rad for p in props], sizes
             )
         return tuple(zip(props, heights.tolist(), strict=True))
@@ -165,20 +167,22 @@ class StreetSurface(Surface):
 
     def standing(self, area: shapely.Geometry) -> list[Prop]:
         """Return the props in the tiles that an area touches."""
-        return [prop for key in keys_in(area) for prop in self._things_in(key).props]
+        return [prop for key in tiles_touching(area) for prop in self._things_in(key).props]
 
-    def _things_in(self, key: Key) -> TileThings:
+    def _things_in(self, key: Key) -> TileObjects:
         """Return buildings and props of a tile from the cache, or place them."""
         if key not in self._things:
-            arrays = self.kept("things", key, lambda: things_as_arrays(self._place_things(key)))
-            self._things[key] = things_of_arrays(arrays)
+            arrays = self.kept("things", key, lambda: objects_as_arrays(self._place_things(key)))
+            self._things[key] = objects_from_arrays(arrays)
         return self._things[key]
 
-    def _place_things(self, key: Key) -> TileThings:
+    def _place_things(self, key: Key) -> TileObjects:
         buildings = self._frontage.in_tile(key)
         terrain = self.street_map.terrain
-        grounded = buildings if terrain is None else tuple(on_land(b, terrain) for b in buildings)
-        return TileThings(grounded, self._placement.in_tile(key))
+        grounded = (
+            buildings if terrain is None else tuple(with_foundation(b, terrain) for b in buildings)
+        )
+        return TileObjects(grounded, self._placement.in_tile(key))
 
     def _built(self, key: Key) -> Tile:
         roots = self._tree_positions(key) if self.roughness > 0.0 else []
@@ -195,7 +199,7 @@ class StreetSurface(Surface):
     def heights(self, xy: ArrayLike) -> Floats:
         """Return the (N,) ground heights in metres at (N, 2) points."""
         xy = np.asarray(xy, dtype=float).reshape(-1, 2)
-        cells = cells_of(xy)
+        cells = tile_indices(xy)
         if len(xy) and (cells == cells[0]).all():
             return self.tile((int(cells[0, 0]), int(cells[0, 1]))).height(xy)
         height = np.zeros(len(xy))

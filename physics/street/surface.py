@@ -60,7 +60,7 @@ class Chunk:
 
 
 @dataclass(frozen=True, slots=True)
-class Finish:
+class TexturedDetails:
     """Details of a tile for cameras with textures.
 
     laid: thin covers, drawn before the ground under them
@@ -103,9 +103,9 @@ class Surface(ABC):
         """
         return ()
 
-    def finish(self, key: Key) -> Finish:
+    def finish(self, key: Key) -> TexturedDetails:
         """Return the details of a tile for cameras with textures."""
-        return Finish()
+        return TexturedDetails()
 
     def kept(self, kind: str, key: Key, make: Callable[[], Arrays]) -> Arrays:
         """Return the cached arrays of a tile, or compute them with `make`.
@@ -131,7 +131,8 @@ class Surface(ABC):
         size_m: length along the heading, and width
         """
         return float(
-            self.heights([[x_m, y_m]])[0] - self.fall([(x_m, y_m)], [heading_rad], [size_m])[0]
+            self.heights([[x_m, y_m]])[0]
+            - self.drop_to_corner([(x_m, y_m)], [heading_rad], [size_m])[0]
         )
 
     def road(self, xy: ArrayLike, heading_rad: ArrayLike, size_m: ArrayLike) -> Floats:
@@ -153,7 +154,7 @@ class Surface(ABC):
         )
         return np.column_stack([land.mean(axis=1), roll, pitch])
 
-    def fall(self, xy: ArrayLike, heading_rad: ArrayLike, size_m: ArrayLike) -> Floats:
+    def drop_to_corner(self, xy: ArrayLike, heading_rad: ArrayLike, size_m: ArrayLike) -> Floats:
         """Return (N,) the drop in metres of the land from objects' centres to the lowest corner."""
         around = self._land_around(
             xy, heading_rad, 0.5 * np.asarray(size_m, dtype=float).reshape(-1, 2)
@@ -200,7 +201,7 @@ class Surface(ABC):
         return 0.25 * (front_left + front_right + rear_left + rear_right), roll, pitch
 
 
-def stood(obstacles: Sequence[Obstacle], surface: Surface) -> list[tuple[Prop, float]]:
+def grounded_obstacles(obstacles: Sequence[Obstacle], surface: Surface) -> list[tuple[Prop, float]]:
     """Return obstacles as props, each with the height of its foot on the surface in metres."""
     props = [obstacle_prop(obstacle, number) for number, obstacle in enumerate(obstacles)]
     return [

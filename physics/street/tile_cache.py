@@ -38,7 +38,7 @@ _SOURCES_KEY: Final = f"{sources_hash(*_SOURCE_FOLDERS)} {shapely.geos_version_s
 _Name = TypeVar("_Name", bound=str)
 
 
-class TileThings(msgspec.Struct, frozen=True, array_like=True):
+class TileObjects(msgspec.Struct, frozen=True, array_like=True):
     """Buildings, placed on the land, and props of a tile."""
 
     buildings: tuple[Building, ...]
@@ -68,7 +68,7 @@ def tile_cache(street_map: StreetMap, seed: int, roughness: float) -> ArrayCache
 
 
 def tile_as_arrays(tile: Tile) -> Arrays:
-    """Convert a tile to arrays for `tile_of_arrays`."""
+    """Convert a tile to arrays for `tile_from_arrays`."""
     relief = tile.relief
     words = _TileFields(
         _rows(tile.parts),
@@ -80,7 +80,7 @@ def tile_as_arrays(tile: Tile) -> Arrays:
     return found if relief is None else found | {"roots": relief.roots, "holes": relief.holes}
 
 
-def tile_of_arrays(arrays: Arrays, key: Key, terrain: Terrain | None) -> Tile:
+def tile_from_arrays(arrays: Arrays, key: Key, terrain: Terrain | None) -> Tile:
     """Restore a tile from arrays."""
     words = msgspec.msgpack.decode(arrays["words"].data, type=_TileFields)
     parts = _parts_of(words.parts, arrays)
@@ -94,12 +94,12 @@ def tile_of_arrays(arrays: Arrays, key: Key, terrain: Terrain | None) -> Tile:
 
 
 def covers_as_arrays(covers: Mapping[LandKind, Mesh]) -> Arrays:
-    """Convert covers to arrays for `covers_of_arrays`."""
+    """Convert covers to arrays for `covers_from_arrays`."""
     words = np.frombuffer(msgspec.msgpack.encode(_rows(covers)), dtype=np.uint8)
     return {"words": words, **_joined_parts(covers)}
 
 
-def covers_of_arrays(arrays: Arrays) -> dict[LandKind, Mesh]:
+def covers_from_arrays(arrays: Arrays) -> dict[LandKind, Mesh]:
     """Restore covers from arrays."""
     return _parts_of(
         msgspec.msgpack.decode(arrays["words"].data, type=list[tuple[LandKind, int, int]]), arrays
@@ -132,14 +132,14 @@ def _parts_of(rows: Sequence[tuple[_Name, int, int]], arrays: Arrays) -> dict[_N
     return parts
 
 
-def things_as_arrays(things: TileThings) -> Arrays:
-    """Convert tile contents to arrays for `things_of_arrays`."""
+def objects_as_arrays(things: TileObjects) -> Arrays:
+    """Convert tile contents to arrays for `objects_from_arrays`."""
     return {"words": _as_array(things)}
 
 
-def things_of_arrays(arrays: Arrays) -> TileThings:
+def objects_from_arrays(arrays: Arrays) -> TileObjects:
     """Restore tile contents from arrays."""
-    return msgspec.msgpack.decode(arrays["words"].data, type=TileThings, dec_hook=_decode)
+    return msgspec.msgpack.decode(arrays["words"].data, type=TileObjects, dec_hook=_decode)
 
 
 def _as_array(words: msgspec.Struct) -> NDArray[np.uint8]:

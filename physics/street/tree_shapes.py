@@ -66,14 +66,14 @@ class Crown:
     shade: Floats
 
 
-def clear_m(species: Species, height_m: float) -> float:
+def clear_height_m(species: Species, height_m: float) -> float:
     """Return the height in metres below the crown; people fit under it."""
     return max(species.clear * height_m, 2.15)
 
 
 def crown(species: Species, height_m: float) -> Crown:
     """Return the crown of a tree with its foot at the origin."""
-    low = clear_m(species, height_m)
+    low = clear_height_m(species, height_m)
     half = 0.5 * (height_m - low)
     wide = species.wide * height_m
     rng = np.random.default_rng(zlib.crc32(f"{species}:{height_m:.3f}".encode()))
@@ -99,7 +99,7 @@ def crown(species: Species, height_m: float) -> Crown:
 
 def tree_trunk(species: Species, height_m: float, radius_m: float) -> Mesh:
     """Return a trunk that flares at its foot and ends inside the crown, with three branches."""
-    low = clear_m(species, height_m)
+    low = clear_height_m(species, height_m)
     top = low + 0.30 * (height_m - low)
     heights = np.array([0.0, 0.35, 0.8 * low, top])
     radii = radius_m * np.array([1.0, 0.80, 0.62, 0.30])

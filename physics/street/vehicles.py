@@ -106,12 +106,12 @@ _CAR_PROFILES: Final[dict[Shape, _CarProfile]] = {
 """Side view of each shape of car."""
 
 
-def paint(name: str) -> Colour:
+def vehicle_colour(name: str) -> Colour:
     """Return the colour of a vehicle, determined by its name."""
     return _PAINTS[zlib.crc32(name.encode()) % len(_PAINTS)]
 
 
-def shape(name: str, length_m: float) -> Shape:
+def vehicle_shape(name: str, length_m: float) -> Shape:
     """Return the shape of a vehicle, determined by its name and length."""
     if length_m < _SHORT_M:
         return "scooter"
@@ -121,13 +121,13 @@ def shape(name: str, length_m: float) -> Shape:
 
 
 @cache
-def vehicle_parts(shape: Shape, length_m: float, width_m: float) -> tuple[Part, ...]:
+def vehicle_parts(vehicle_shape: Shape, length_m: float, width_m: float) -> tuple[Part, ...]:
     """Return the parts of a vehicle."""
-    if shape == "scooter":
+    if vehicle_shape == "scooter":
         return _scooter(length_m, width_m)
-    if shape in _CAR_PROFILES:
-        return _car(_CAR_PROFILES[shape], length_m, width_m)
-    return {"van": _van, "lorry": _lorry, "bus": _bus}[shape](length_m, width_m)
+    if vehicle_shape in _CAR_PROFILES:
+        return _car(_CAR_PROFILES[vehicle_shape], length_m, width_m)
+    return {"van": _van, "lorry": _lorry, "bus": _bus}[vehicle_shape](length_m, width_m)
 
 
 def _car(car: _CarProfile, length_m: float, width_m: float) -> tuple[Part, ...]:

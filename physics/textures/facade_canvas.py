@@ -11,8 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from physics.textures.layers import Colour, Picture, encoded, linear
-from physics.textures.noise import Field, Noise, pixel_centres, step
+from physics.textures.layers import Colour, Picture, linear_to_srgb, srgb_to_linear
+from physics.textures.noise import Field, Noise, pixel_centres, smooth_step
 
 BAY_M: Final = 3.0
 """Width of a bay in metres."""
@@ -20,7 +20,7 @@ BAY_M: Final = 3.0
 STOREY_M: Final = 3.2
 """Height of a storey in metres."""
 
-_SRGB_CODES: Final = encoded(np.arange(4097) / 4096.0)
+_SRGB_CODES: Final = linear_to_srgb(np.arange(4097) / 4096.0)
 """Table of 4097 linear values encoded as sRGB."""
 
 _Area = tuple[slice, slice]
@@ -71,7 +71,7 @@ class FacadeCanvas:
     ) -> None:
         """Fill a rectangle, which also removes gloss and glow."""
         (rows, columns), across, up = self._coverage(x0, x1, z0, z1)
-        light = linear(colour)
+        light = srgb_to_linear(colour)
         if opacity < 1.0:
             self.fill((rows, columns), np.float32(opacity) * up[:, None] * across[None, :], light)
             return
@@ -195,13 +195,13 @@ def pane(
     """
     rng = canvas.rng
     area, cover, across, up = canvas.local(x0, x1, z0, z1)
-    room = linear((0.13, 0.14, 0.15)) * (0.6 + 0.8 * (1.0 - up)[..., None])
+    room = srgb_to_linear((0.13, 0.14, 0.15)) * (0.6 + 0.8 * (1.0 - up)[..., None])
     colour = np.broadcast_to(room, (*cover.shape, 3)).copy()
     lit = rng.random() < LIT_SHARE
     glow = np.full(cover.shape, 0.75 if lit else 0.0, np.float32) * (0.7 + 0.3 * up)
     if dress:
         kind = rng.choice(["curtains", "net", "blind", "bare"], p=[0.38, 0.17, 0.2, 0.25])
-        cloth = linear(_CURTAINS[int(rng.integers(len(_CURTAINS)))])
+        cloth = srgb_to_linear(_CURTAINS[int(rng.integers(len(_CURTAINS)))])
         folds: Field = 0.80 + 0.20 * np.sin(
             2.0 * np.pi * (across * (x1 - x0) / 0.085 + rng.random())
         )
@@ -210,7 +210,8 @@ def pane(
             open_ = rng.uniform(0.12, 0.3)
             share = (
                 np.maximum(
-                    step(-open_ - 0.02, -open_, -across), step(1.0 - open_, 1.02 - open_, across)
+                    smooth_step(-open_ - 0.02, -open_, -across),
+                    smooth_step(1.0 - open_, 1.02 - open_, across),
                 )
                 + 0.0 * up
             )
@@ -218,17 +219,19 @@ def pane(
             share = (0.55 + 0.0 * up) * np.ones_like(across)
         elif kind == "blind":
             low = rng.uniform(0.25, 0.8)
-            share = 0.9 * step(low, low + 0.01, up) * np.ones_like(across)
+            share = 0.9 * smooth_step(low, low + 0.01, up) * np.ones_like(across)
             folds = 0.84 + 0.16 * np.sin(2.0 * np.pi * up * (z1 - z0) / 0.06)
         colour += (0.75 * cloth * np.asarray(folds)[..., None] - colour) * share[..., None]
         glow *= 1.0 - 0.45 * share
     roofs = np.repeat(rng.uniform(0.12, 0.45, 4), 3)[: int(rng.integers(4, 10))]
     skyline = np.interp(across[0], np.linspace(-0.1, 1.1, len(roofs)), roofs)[None, :]
-    sky = step(-0.03, 0.05, up - skyline.astype(np.float32))
-    house, above = linear((0.44, 0.42, 0.39)), linear((0.66, 0.73, 0.80))
+    sky = smooth_step(-0.03, 0.05, up - skyline.astype(np.float32))
+    house, above = srgb_to_linear((0.44, 0.42, 0.39)), srgb_to_linear((0.66, 0.73, 0.80))
     mirror = house + (above - house) * sky[..., None]
     colour += (mirror - colour) * np.float32(rng.uniform(0.34, 0.52))
-    colour *= (1.0 - 0.35 * step(0.86, 1.0, up) - 0.15 * step(0.9, 1.0, across))[..., None]
+    colour *= (1.0 - 0.35 * smooth_step(0.86, 1.0, up) - 0.15 * smooth_step(0.9, 1.0, across))[
+        ..., None
+    ]
     canvas.fill(area, cover, colour)
     canvas.gloss[area] = np.maximum(canvas.gloss[area], cover)
     canvas.glow[area] = np.maximum(canvas.glow[area], cover * glow)

@@ -8,7 +8,7 @@ from functools import lru_cache
 from typing import Final
 
 from physics.textures.facade_canvas import BAY_M, STOREY_M, FacadeCanvas
-from physics.textures.layers import Layers, Picture, Recipe, stacked
+from physics.textures.layers import Layers, Picture, Recipe, stack_layers
 from physics.textures.noise import Noise
 from physics.textures.shop_fronts import FRONTS
 from physics.textures.windows import WINDOW_STYLES
@@ -26,7 +26,7 @@ def facade_layers(size_px: int = 256, seed: int = 0) -> Layers:
         for name, style in styles.items()
         for k in range(BAY_VARIANTS)
     }
-    return stacked("facades", recipes, size_px, seed)
+    return stack_layers("facades", recipes, size_px, seed)
 
 
 def _generator(style: Callable[[FacadeCanvas], None], number: int) -> Callable[[Noise], Picture]:
@@ -74,7 +74,7 @@ class Front:
     every: int
 
 
-DOORS: Final[Mapping[str, Front]] = {
+FRONTS_BY_NAME: Final[Mapping[str, Front]] = {
     "shop": Front("shop-window", "shop", 3),
     "shop-awning": Front("shop-awning", "shop", 4),
     "cafe": Front("cafe", "cafe-door", 4),
@@ -184,7 +184,7 @@ WALL_STYLES: Final[Mapping[str, WallStyle]] = {
 _OLD: Final = ("plaster-old", "brick-old", "brick-painted", "stone")
 """Styles of old buildings."""
 
-STREETS: Final[Mapping[str, tuple[str, ...]]] = {
+STREET_STYLES: Final[Mapping[str, tuple[str, ...]]] = {
     "commercial": (*_OLD, *_OLD, "plaster-old", "brick-painted", "office"),
     "narrow": (*_OLD, *_OLD, "plaster-old", "plaster-old", "wood"),
     "avenue": (*_OLD, "plaster-old", "office", "office", "plaster-new", "slab"),

@@ -9,22 +9,22 @@ from typing import Final
 
 import numpy as np
 
-from physics.textures.layers import Colour, Generator, Layers, Picture, Recipe, stacked
-from physics.textures.noise import Field, Noise, blurred, cells, pixel_centres, step
+from physics.textures.layers import Colour, Generator, Layers, Picture, Recipe, stack_layers
+from physics.textures.noise import Field, Noise, blur_field, cells, pixel_centres, smooth_step
 from physics.textures.surface import (
     Bond,
+    add_dirt,
     basket,
-    bond_of,
+    blend_colours,
+    bond_from_cells,
     courses,
     cracks,
+    draw_bond,
     herringbone,
-    laid,
-    mixed,
-    plain,
+    plain_colour,
     random_courses,
-    relief,
-    shaded,
-    stained,
+    relief_shading,
+    scale_brightness,
 )
 
 _GRASS_TINT: Final = 0.3
@@ -39,7 +39,7 @@ _DARK: Final = (0.36, 0.35, 0.34)
 @lru_cache(maxsize=4)
 def ground_layers(size_px: int = 512, seed: int = 0) -> Layers:
     """Return every ground layer; 256 pixels suit a laptop."""
-    return stacked("ground", GROUND_RECIPES, size_px, seed)
+    return stack_layers("ground", GROUND_RECIPES, size_px, seed)
 
 
 def _asphalt(
@@ -56,18 +56,20 @@ def _asphalt(
     def make(noise: Noise) -> Picture:
         chips = noise.grain(0.6)
         colour = (tone, tone, 1.02 * tone)
-        rgb = plain(noise, colour, 0.010, 0.0, 8)
-        light = step(0.9, 2.2, chips) - 0.8 * step(0.7, 2.0, -chips)
+        rgb = plain_colour(noise, colour, 0.010, 0.0, 8)
+        light = smooth_step(0.9, 2.2, chips) - 0.8 * smooth_step(0.7, 2.0, -chips)
         rgb = rgb + np.float32(stone) * (light + 0.35 * noise.grain())[..., None]
         if patches:
             edge = _patches(noise)
-            fresh = plain(noise, (tone - 0.035,) * 3, 0.008, 0.02)
-            seam = 1.0 - step(0.0, 0.006, np.abs(edge))
-            rgb = shaded(mixed(rgb, fresh, step(0.0, 0.005, edge)), 1.0 - 0.22 * seam)
+            fresh = plain_colour(noise, (tone - 0.035,) * 3, 0.008, 0.02)
+            seam = 1.0 - smooth_step(0.0, 0.006, np.abs(edge))
+            rgb = scale_brightness(
+                blend_colours(rgb, fresh, smooth_step(0.0, 0.005, edge)), 1.0 - 0.22 * seam
+            )
         if worn:
             split = cracks(noise, cells(noise, 4), 0.004)
-            rgb = shaded(rgb, 1.0 - 0.48 * np.float32(worn) * split)
-            rgb = stained(rgb, noise, 0.10 * worn)
+            rgb = scale_brightness(rgb, 1.0 - 0.48 * np.float32(worn) * split)
+            rgb = add_dirt(rgb, noise, 0.10 * worn)
         return Picture(rgb)
 
     return make
@@ -102,12 +104,12 @@ def _stones(
 
     lay: bond for a size in pixels and a side in metres
     tint: fraction of the tint in the stones
-    look: arguments of `laid`
+    look: arguments of `draw_bond`
     """
 
     def make(noise: Noise) -> Picture:
-        whole = laid(noise, lay(noise.size, side_m), side_m, colours, joint, **look)
-        return Picture(stained(whole.rgb, noise, 0.08), np.float32(tint) * np.asarray(whole.alpha))
+        whole = draw_bond(noise, lay(noise.size, side_m), side_m, colours, joint, **look)
+        return Picture(add_dirt(whole.rgb, noise, 0.08), np.float32(tint) * np.asarray(whole.alpha))
 
     return Recipe(side_m, make)
 
@@ -121,7 +123,7 @@ def _rows(
 
 def _setts(noise: Noise) -> Picture:
     bond = random_courses(noise.rng, noise.size, 1.6, [0.1] * 16, (0.09, 0.15))
-    return laid(
+    return draw_bond(
         noise,
         bond,
         1.6,
@@ -136,8 +138,8 @@ def _setts(noise: Noise) -> Picture:
 
 
 def _cobbles(noise: Noise) -> Picture:
-    bond = bond_of(cells(noise, 14, 0.55), 1.6)
-    return laid(
+    bond = bond_from_cells(cells(noise, 14, 0.55), 1.6)
+    return draw_bond(
         noise,
         bond,
         1.6,
@@ -154,31 +156,34 @@ def _cobbles(noise: Noise) -> Picture:
 def _granite(noise: Noise) -> Picture:
     bond = courses(noise.size, 1.0, 1, [1.0], [0.0])
     speck = noise.grain(0.7)
-    whole = laid(
+    whole = draw_bond(
         noise, bond, 1.0, ((0.63, 0.62, 0.61),), _DARK, joint_m=0.006, wobble_m=0.0, grain=0.03
     )
     return Picture(
-        whole.rgb + 0.05 * (step(0.8, 1.6, speck) - 1.3 * step(1.0, 1.8, -speck))[..., None]
+        whole.rgb
+        + 0.05 * (smooth_step(0.8, 1.6, speck) - 1.3 * smooth_step(1.0, 1.8, -speck))[..., None]
     )
 
 
 def _grass(dry: float, worn: float = 0.0) -> Generator:
     def make(noise: Noise) -> Picture:
         # Warped streaks give blades without a common direction.
-        one = noise.warped(noise.streaks(256, 8), 0.03, 8)
-        two = noise.warped(noise.streaks(256, 8, 1), 0.03, 8)
+        one = noise.distort(noise.streaks(256, 8), 0.03, 8)
+        two = noise.distort(noise.streaks(256, 8, 1), 0.03, 8)
         blades = 0.7 * np.maximum(one, two) + 0.45 * noise.grain(0.7) - 0.4
         tuft = noise.clouds(16)
-        green = mixed((0.25, 0.31, 0.16), (0.40, 0.45, 0.25), step(-1.6, 1.8, blades + 0.5 * tuft))
-        rgb = mixed(
+        green = blend_colours(
+            (0.25, 0.31, 0.16), (0.40, 0.45, 0.25), smooth_step(-1.6, 1.8, blades + 0.5 * tuft)
+        )
+        rgb = blend_colours(
             green,
             (0.52, 0.48, 0.32),
-            np.float32(dry) * step(-0.3, 2.6, noise.clouds(8) + 0.7 * blades),
+            np.float32(dry) * smooth_step(-0.3, 2.6, noise.clouds(8) + 0.7 * blades),
         )
         if worn:
-            bare = np.float32(worn) * step(0.3, 2.0, noise.clouds(8) + 0.35 * blades)
-            rgb = mixed(rgb, plain(noise, (0.43, 0.37, 0.29), 0.02, 0.04), bare)
-        rgb = shaded(rgb, 1.0 + 0.04 * noise.clouds(8) + 0.06 * blades)
+            bare = np.float32(worn) * smooth_step(0.3, 2.0, noise.clouds(8) + 0.35 * blades)
+            rgb = blend_colours(rgb, plain_colour(noise, (0.43, 0.37, 0.29), 0.02, 0.04), bare)
+        rgb = scale_brightness(rgb, 1.0 + 0.04 * noise.clouds(8) + 0.06 * blades)
         return Picture(rgb, np.full_like(tuft, _GRASS_TINT))
 
     return make
@@ -192,26 +197,30 @@ def _planting(noise: Noise) -> Picture:
         ((0.24, 0.35, 0.16), (0.20, 0.30, 0.13), (0.27, 0.36, 0.19)), dtype=np.float32
     )
     green = palette[noise.rng.integers(len(palette), size=leaves.n)] * tone
-    rgb = mixed((0.08, 0.12, 0.06), green[leaves.id], step(0.0, 0.006, leaves.edge))
-    return Picture(shaded(rgb, 1.0 + 0.10 * noise.clouds(8) + 0.10 * noise.clouds(64)))
+    rgb = blend_colours((0.08, 0.12, 0.06), green[leaves.id], smooth_step(0.0, 0.006, leaves.edge))
+    return Picture(scale_brightness(rgb, 1.0 + 0.10 * noise.clouds(8) + 0.10 * noise.clouds(64)))
 
 
 def _water(noise: Noise) -> Picture:
-    ripples = noise.warped(noise.streaks(32, 8), 0.05, 8)
-    return Picture(shaded(plain(noise, (0.16, 0.28, 0.36), 0.01, 0.0), 1.0 + 0.06 * ripples))
+    ripples = noise.distort(noise.streaks(32, 8), 0.05, 8)
+    return Picture(
+        scale_brightness(plain_colour(noise, (0.16, 0.28, 0.36), 0.01, 0.0), 1.0 + 0.06 * ripples)
+    )
 
 
 def _earth(noise: Noise) -> Picture:
-    rgb = stained(plain(noise, (0.43, 0.36, 0.28), 0.03, 0.03, 8), noise, 0.15, 8)
+    rgb = add_dirt(plain_colour(noise, (0.43, 0.36, 0.28), 0.03, 0.03, 8), noise, 0.15, 8)
     pebbles = cells(noise, 40, 0.9)
     some = (noise.rng.random(pebbles.n) < 0.2).astype(np.float32)[pebbles.id]
-    return Picture(mixed(rgb, (0.55, 0.50, 0.43), 0.7 * some * step(0.003, 0.008, pebbles.edge)))
+    return Picture(
+        blend_colours(rgb, (0.55, 0.50, 0.43), 0.7 * some * smooth_step(0.003, 0.008, pebbles.edge))
+    )
 
 
 def _gravel(noise: Noise) -> Picture:
-    bond = bond_of(cells(noise, 64, 0.9), 1.2)
+    bond = bond_from_cells(cells(noise, 64, 0.9), 1.2)
     colours = ((0.58, 0.55, 0.50), (0.50, 0.47, 0.43), (0.64, 0.61, 0.56), (0.45, 0.43, 0.41))
-    return laid(
+    return draw_bond(
         noise,
         bond,
         1.2,
@@ -233,11 +242,11 @@ def _tactile(bars: bool) -> Generator:
         if bars:
             inset = np.maximum(np.abs((y % 0.3) - 0.15) - 0.122, 0.0)
             distance = np.hypot(np.abs((x % 0.075) - 0.0375), inset)
-            bump = 1.0 - step(0.011, 0.017, distance)
+            bump = 1.0 - smooth_step(0.011, 0.017, distance)
         else:
-            bump = 1.0 - step(0.009, 0.0165, np.hypot((x % 0.06) - 0.03, (y % 0.06) - 0.03))
+            bump = 1.0 - smooth_step(0.009, 0.0165, np.hypot((x % 0.06) - 0.03, (y % 0.06) - 0.03))
         colour = ((0.74, 0.66, 0.44), (0.72, 0.64, 0.42), (0.76, 0.68, 0.47))
-        slab = laid(
+        slab = draw_bond(
             noise,
             courses(noise.size, 0.6, 2, [0.3], [0.0]),
             0.6,
@@ -246,12 +255,13 @@ def _tactile(bars: bool) -> Generator:
             joint_m=0.005,
             spread=0.02,
         )
-        soft = blurred(bump, 0.004 / 0.6 * noise.size)
-        rgb = shaded(
+        soft = blur_field(bump, 0.004 / 0.6 * noise.size)
+        rgb = scale_brightness(
             slab.rgb,
-            relief(blurred(bump, 1.2), 0.30) * (1.0 - 0.18 * np.clip(soft - bump, 0.0, 1.0)),
+            relief_shading(blur_field(bump, 1.2), 0.30)
+            * (1.0 - 0.18 * np.clip(soft - bump, 0.0, 1.0)),
         )
-        return Picture(shaded(rgb, 1.0 + 0.05 * bump), slab.alpha)
+        return Picture(scale_brightness(rgb, 1.0 + 0.05 * bump), slab.alpha)
 
     return make
 
@@ -261,11 +271,11 @@ def _paint(worn: float) -> Generator:
 
     def make(noise: Noise) -> Picture:
         below = _asphalt(0.05)(noise).rgb
-        paint = plain(noise, (0.86, 0.86, 0.84), 0.015, 0.018)
+        paint = plain_colour(noise, (0.86, 0.86, 0.84), 0.015, 0.018)
         chips = 0.7 * noise.clouds(8) + 0.6 * noise.clouds(64) + 0.7 * noise.grain(0.6)
-        lost = step(2.2 - 1.3 * worn, 2.9 - 1.2 * worn, chips)
+        lost = smooth_step(2.2 - 1.3 * worn, 2.9 - 1.2 * worn, chips)
         lost = np.maximum(lost, worn * cracks(noise, cells(noise, 6), 0.003))
-        return Picture(mixed(paint, below, 0.9 * lost), 1.0 - 0.9 * lost)
+        return Picture(blend_colours(paint, below, 0.9 * lost), 1.0 - 0.9 * lost)
 
     return make
 
@@ -273,7 +283,7 @@ def _paint(worn: float) -> Generator:
 def _cast(noise: Noise) -> Picture:
     """Draw cast concrete with a joint every 1.5 m."""
     bond = courses(noise.size, 3.0, 2, [1.5], [0.0])
-    whole = laid(
+    whole = draw_bond(
         noise,
         bond,
         3.0,
@@ -284,9 +294,11 @@ def _cast(noise: Noise) -> Picture:
         wobble_m=0.0,
         grain=0.016,
     )
-    pores = step(1.9, 2.6, noise.grain(0.5))
-    rgb = stained(shaded(whole.rgb, 1.0 - 0.16 * pores), noise, 0.08)
-    return Picture(shaded(rgb, 1.0 - 0.32 * cracks(noise, cells(noise, 3), 0.003)), whole.alpha)
+    pores = smooth_step(1.9, 2.6, noise.grain(0.5))
+    rgb = add_dirt(scale_brightness(whole.rgb, 1.0 - 0.16 * pores), noise, 0.08)
+    return Picture(
+        scale_brightness(rgb, 1.0 - 0.32 * cracks(noise, cells(noise, 3), 0.003)), whole.alpha
+    )
 
 
 GROUND_RECIPES: Final[Mapping[str, Recipe]] = {

@@ -94,7 +94,7 @@ class Recipe:
     make: Generator
 
 
-def stacked(kind: str, recipes: Mapping[str, Recipe], size_px: int, seed: int) -> Layers:
+def stack_layers(kind: str, recipes: Mapping[str, Recipe], size_px: int, seed: int) -> Layers:
     """Return the layers of all recipes from the cache, or generate them.
 
     kind: name of the stack in the cache
@@ -123,17 +123,17 @@ def _generate(recipes: Mapping[str, Recipe], size_px: int, seed: int) -> Arrays:
     }
     for k, (name, recipe) in enumerate(recipes.items()):
         picture = recipe.make(Noise(size_px, (seed, *name.encode())))
-        rgb = quantised(picture.rgb)
+        rgb = as_uint8(picture.rgb)
         made["rgba"][k, ..., :3] = rgb
-        made["rgba"][k, ..., 3] = 255 if picture.alpha is None else quantised(picture.alpha)
+        made["rgba"][k, ..., 3] = 255 if picture.alpha is None else as_uint8(picture.alpha)
         made["mean"][k] = mean_linear(rgb)
         if picture.finish is not None:
             made.setdefault("finish", np.zeros((len(recipes), size_px, size_px, 2), np.uint8))
-            made["finish"][k] = quantised(picture.finish)
+            made["finish"][k] = as_uint8(picture.finish)
     return made
 
 
-def joined_layers(*stacks: Layers) -> Layers:
+def join_layers(*stacks: Layers) -> Layers:
     """Return several stacks of one size as one, without finishes.
 
     Raises: UsageError if sizes differ or names repeat
@@ -150,7 +150,7 @@ def joined_layers(*stacks: Layers) -> Layers:
     return Layers(names, *arrays)
 
 
-def linear(srgb: NDArray[np.floating] | Colour) -> NDArray[np.float32]:
+def srgb_to_linear(srgb: NDArray[np.floating] | Colour) -> NDArray[np.float32]:
     """Decode sRGB values from 0 to 1 (IEC 61966-2-1)."""
     s = np.asarray(srgb, dtype=np.float32)
     return np.where(s <= 0.04045, s / 12.92, ((np.maximum(s, 0.0) + 0.055) / 1.055) ** 2.4).astype(
@@ -158,17 +158,17 @@ def linear(srgb: NDArray[np.floating] | Colour) -> NDArray[np.float32]:
     )
 
 
-def encoded(value: NDArray[np.floating]) -> NDArray[np.float32]:
+def linear_to_srgb(value: NDArray[np.floating]) -> NDArray[np.float32]:
     """Encode linear values from 0 to 1 as sRGB (IEC 61966-2-1)."""
     v = np.clip(np.asarray(value, dtype=np.float32), 0.0, 1.0)
     return np.where(v <= 0.0031308, 12.92 * v, 1.055 * v ** (1 / 2.4) - 0.055).astype(np.float32)
 
 
-LINEAR: Final = linear(np.arange(256) / 255.0)
+LINEAR_OF_SRGB_BYTE: Final = srgb_to_linear(np.arange(256) / 255.0)
 """(256,) linear values of sRGB bytes."""
 
 
-def quantised(values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
+def as_uint8(values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
     """Return values from 0 to 1 as rounded and clipped bytes."""
     return np.asarray(cv2.convertScaleAbs(np.maximum(values, 0.0), alpha=255.0), dtype=np.uint8)
 
@@ -176,4 +176,6 @@ def quantised(values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
 def mean_linear(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return the (3,) linear mean of an sRGB image (..., 3)."""
     counts = [cv2.calcHist([rgb], [c], None, [256], [0, 256]).ravel() for c in range(3)]
-    return np.array([LINEAR @ count / count.sum() for count in counts], dtype=np.float32)
+    return np.array(
+        [LINEAR_OF_SRGB_BYTE @ count / count.sum() for count in counts], dtype=np.float32
+    )

@@ -62,10 +62,10 @@ class Noise:
         field = _resized(grid if axis == 0 else np.ascontiguousarray(grid.T), size)
         return np.asarray(field / max(float(field.std()), 1e-6), dtype=np.float32)
 
-    def warped(self, field: Field, by: float, cells: int) -> Field:
+    def distort(self, field: Field, by: float, cells: int) -> Field:
         """Return a field distorted by about `by` of the side."""
         dx, dy = (self.clouds(cells) * np.float32(by * self.size) for _ in range(2))
-        return remapped(field, dx, dy)
+        return warp(field, dx, dy)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +115,7 @@ def cells(noise: Noise, across: int, jitter: float = 0.8) -> Cells:
     return Cells(whole[middle, middle], np.asarray(edge[middle, middle] / np.float32(size)), n)
 
 
-def remapped(field: Field, dx_px: Field, dy_px: Field) -> Field:
+def warp(field: Field, dx_px: Field, dy_px: Field) -> Field:
     """Return a field sampled at points shifted by (S, S) pixels."""
     size = len(field)
     across, down = np.meshgrid(np.arange(size, dtype=np.float32), np.arange(size, dtype=np.float32))
@@ -129,7 +129,7 @@ def pixel_centres(size: int) -> Field:
     return (np.arange(size, dtype=np.float32) + 0.5) / size
 
 
-def blurred(field: Field, sigma_px: float) -> Field:
+def blur_field(field: Field, sigma_px: float) -> Field:
     """Return a field with a Gaussian blur."""
     if sigma_px <= 0.05:
         return field
@@ -139,7 +139,7 @@ def blurred(field: Field, sigma_px: float) -> Field:
     return np.ascontiguousarray(soft[margin:-margin, margin:-margin])
 
 
-def step(low: float, high: float, field: Field) -> Field:
+def smooth_step(low: float, high: float, field: Field) -> Field:
     """Return a smooth step from 0 at `low` to 1 at `high`."""
     t = np.clip((field - np.float32(low)) / np.float32(high - low), 0.0, 1.0)
     return np.asarray(t * t * (3.0 - 2.0 * t), dtype=np.float32)
@@ -156,7 +156,7 @@ def _clouds(size: int, cells: int) -> Field:
         share, n = 0.55 * share, 2 * n
     # Warping hides the grid of the random values.
     bend = [np.float32(0.10 * size / cells) * _resized(_grid(rng, cells), size) for _ in range(2)]
-    total = remapped(total, bend[0], bend[1])
+    total = warp(total, bend[0], bend[1])
     return _read_only((total - total.mean()) / total.std())
 
 
@@ -168,7 +168,7 @@ def _grid(rng: np.random.Generator, cells: int) -> Field:
 def _grain(size: int, soft_px: float) -> Field:
     # Generated at 512 px and resized, so that all sizes show the same pattern.
     rng = np.random.default_rng([7, round(100 * soft_px)])
-    field = blurred(rng.standard_normal((512, 512)).astype(np.float32), soft_px)
+    field = blur_field(rng.standard_normal((512, 512)).astype(np.float32), soft_px)
     if size != 512:
         field = cv2.resize(
             field, (size, size), interpolation=cv2.INTER_AREA if size < 512 else cv2.INTER_LINEAR

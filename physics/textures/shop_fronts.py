@@ -19,8 +19,8 @@ from physics.textures.facade_canvas import (
     sill,
     surround,
 )
-from physics.textures.layers import Colour, linear
-from physics.textures.noise import step
+from physics.textures.layers import Colour, srgb_to_linear
+from physics.textures.noise import smooth_step
 
 _FASCIAS: Final[tuple[Colour, ...]] = (
     (0.20, 0.28, 0.27),
@@ -82,7 +82,7 @@ def _display(canvas: FacadeCanvas, x0: float, x1: float, z0: float, z1: float) -
     """Draw a shop window with a lit room, shelves, goods and a reflection of the street."""
     rng = canvas.rng
     area, cover, across, up = canvas.local(x0, x1, z0, z1)
-    warm = linear((0.68, 0.62, 0.54))
+    warm = srgb_to_linear((0.68, 0.62, 0.54))
     depth = 0.35 + 0.65 * np.exp(-(((up - 0.85) / 0.3) ** 2)) * (0.9 + 0.1 * np.cos(9.0 * across))
     colour = np.broadcast_to(0.55 * warm * depth[..., None], (*cover.shape, 3)).copy()
     for shelf in (0.08, 0.38):
@@ -90,23 +90,27 @@ def _display(canvas: FacadeCanvas, x0: float, x1: float, z0: float, z1: float) -
         while x < 0.95:
             wide, high = rng.uniform(0.04, 0.13), rng.uniform(0.07, 0.24)
             hue = np.asarray(_GOODS[int(rng.integers(len(_GOODS)))]) * rng.uniform(0.7, 1.1)
-            inside = step(x - 0.01, x, across) * (1.0 - step(x + wide, x + wide + 0.01, across))
+            inside = smooth_step(x - 0.01, x, across) * (
+                1.0 - smooth_step(x + wide, x + wide + 0.01, across)
+            )
             inside = (
                 inside
-                * step(shelf - 0.01, shelf, up)
-                * (1.0 - step(shelf + high, shelf + high + 0.01, up))
+                * smooth_step(shelf - 0.01, shelf, up)
+                * (1.0 - smooth_step(shelf + high, shelf + high + 0.01, up))
             )
-            colour += (0.8 * linear(hue) - colour) * inside[..., None]
+            colour += (0.8 * srgb_to_linear(hue) - colour) * inside[..., None]
             x += wide + rng.uniform(0.01, 0.12)
         board = (
-            step(shelf - 0.03, shelf - 0.025, up)
-            * (1.0 - step(shelf - 0.008, shelf, up))
+            smooth_step(shelf - 0.03, shelf - 0.025, up)
+            * (1.0 - smooth_step(shelf - 0.008, shelf, up))
             * np.ones_like(across)
         )
-        colour += (linear((0.34, 0.30, 0.26)) - colour) * board[..., None]
+        colour += (srgb_to_linear((0.34, 0.30, 0.26)) - colour) * board[..., None]
     mirror = (
-        linear((0.62, 0.68, 0.74))
-        * step(0.35, 0.75, up + 0.12 * np.sin(5.0 * across + rng.uniform(0.0, 6.0)))[..., None]
+        srgb_to_linear((0.62, 0.68, 0.74))
+        * smooth_step(0.35, 0.75, up + 0.12 * np.sin(5.0 * across + rng.uniform(0.0, 6.0)))[
+            ..., None
+        ]
     )
     colour += (mirror - colour) * np.float32(0.16)
     canvas.fill(area, cover, colour)
@@ -157,12 +161,14 @@ def _awning(canvas: FacadeCanvas, z0: float, z1: float) -> None:
     canvas.shade(0.0, BAY_M, z0 - 0.85, z0, 0.55, 0.8)
     area, cover, across, up = canvas.local(0.0, BAY_M, z0, z1)
     stripe = (
-        step(-0.08, 0.08, np.sin(2.0 * np.pi * across * BAY_M / 0.5))
+        smooth_step(-0.08, 0.08, np.sin(2.0 * np.pi * across * BAY_M / 0.5))
         if canvas.rng.random() < 0.65
         else 0.0 * across
     )
     tone = (0.72 + 0.30 * up) * np.where(up < 0.22, 0.82, 1.0)
-    colour = linear(cloth) + (linear(pale) - linear(cloth)) * stripe[..., None]
+    colour = (
+        srgb_to_linear(cloth) + (srgb_to_linear(pale) - srgb_to_linear(cloth)) * stripe[..., None]
+    )
     canvas.fill(area, cover, np.asarray(colour * tone[..., None], np.float32))
     canvas.shade(0.0, BAY_M, z0 + 0.21 * (z1 - z0), z0 + 0.24 * (z1 - z0), 0.4)
 
@@ -239,7 +245,7 @@ def _garage(canvas: FacadeCanvas) -> None:
     canvas.fill(
         area,
         cover,
-        linear(colour) * np.broadcast_to(ribs, cover.shape)[..., None].astype(np.float32),
+        srgb_to_linear(colour) * np.broadcast_to(ribs, cover.shape)[..., None].astype(np.float32),
     )
     canvas.box(1.42, 1.58, 0.9, 0.95, (0.20, 0.20, 0.21))
     canvas.shade(0.22, 2.78, 2.1, 2.5, 0.55, 0.4)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from physics.textures.layers import Colour, Picture, Rgb
-from physics.textures.noise import Cells, Field, Ids, Noise, blurred, pixel_centres, step
+from physics.textures.noise import Cells, Field, Ids, Noise, blur_field, pixel_centres, smooth_step
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,7 +121,7 @@ def _grid(size: int, side_m: float, width_m: float) -> tuple[Ids, Ids, Field, Fi
     return i, j, fx, fy
 
 
-def plain(
+def plain_colour(
     noise: Noise, colour: Colour, clouds: float = 0.02, grain: float = 0.03, cells: int = 8
 ) -> Rgb:
     """Return one colour with soft patches and fine grain.
@@ -136,19 +136,19 @@ def plain(
     )
 
 
-def mixed(one: Rgb | Colour, two: Rgb | Colour, share: Field) -> Rgb:
+def blend_colours(one: Rgb | Colour, two: Rgb | Colour, share: Field) -> Rgb:
     """Blend from `one` at share 0 to `two` at share 1."""
     a, b = np.asarray(one, dtype=np.float32), np.asarray(two, dtype=np.float32)
     return np.asarray(a + (b - a) * share[..., None], dtype=np.float32)
 
 
-def relief(height: Field, strength: float) -> Field:
+def relief_shading(height: Field, strength: float) -> Field:
     """Return brightness factors of a height field lit from the upper left, about 1."""
     slope = np.roll(height, (-1, -1), (0, 1)) - np.roll(height, (1, 1), (0, 1))
     return np.asarray(1.0 + np.clip(np.float32(strength) * slope, -0.35, 0.35), dtype=np.float32)
 
 
-def laid(
+def draw_bond(
     noise: Noise,
     bond: Bond,
     side_m: float,
@@ -175,23 +175,24 @@ def laid(
     width = max(joint_m, 0.9 * pixel_m)
     edge = bond.edge + np.float32(wobble_m) * noise.clouds(32) if wobble_m else bond.edge
     soft = max(bevel_m, pixel_m)
-    face = step(0.5 * width - 0.5 * soft, 0.5 * width + 0.5 * soft, edge)
+    face = smooth_step(0.5 * width - 0.5 * soft, 0.5 * width + 0.5 * soft, edge)
     # A joint narrower than a pixel is drawn one pixel wide with less contrast.
     face = 1.0 - (1.0 - face) * np.float32(min(1.0, joint_m / width + 0.25))
     palette = np.asarray(colours, dtype=np.float32)[noise.rng.integers(len(colours), size=bond.n)]
     palette *= (1.0 + noise.rng.normal(0.0, spread, (bond.n, 1))).astype(np.float32)
     tone = 1.0 + np.float32(clouds) * noise.clouds(8) + np.float32(grain) * noise.grain()
-    worn = step(0.0, 4.0 * soft + 0.004, edge - np.float32(0.5 * width))
+    worn = smooth_step(0.0, 4.0 * soft + 0.004, edge - np.float32(0.5 * width))
     tone *= 0.90 + 0.10 * worn
-    tone *= relief(blurred(face, 0.7), 0.10)
+    tone *= relief_shading(blur_field(face, 0.7), 0.10)
     stone = palette[bond.id] * tone[..., None]
-    bed = plain(noise, joint, 0.02, grain)
+    bed = plain_colour(noise, joint, 0.02, grain)
     return Picture(
-        mixed(bed, stone, face), np.float32(joint_tint) + np.float32(1.0 - joint_tint) * face
+        blend_colours(bed, stone, face),
+        np.float32(joint_tint) + np.float32(1.0 - joint_tint) * face,
     )
 
 
-def bond_of(found: Cells, side_m: float) -> Bond:
+def bond_from_cells(found: Cells, side_m: float) -> Bond:
     """Return Voronoi cells as a bond."""
     return Bond(found.id, found.edge * np.float32(side_m), found.n)
 
@@ -201,23 +202,23 @@ def cracks(noise: Noise, found: Cells, width: float, wiggle: float = 0.012) -> F
 
     width: width of a crack as a fraction of the side
     """
-    edge = noise.warped(found.edge, wiggle, 8)
-    line = 1.0 - step(0.25 * width, width, edge)
-    return np.asarray(line * step(0.2, 0.9, noise.clouds(4)), dtype=np.float32)
+    edge = noise.distort(found.edge, wiggle, 8)
+    line = 1.0 - smooth_step(0.25 * width, width, edge)
+    return np.asarray(line * smooth_step(0.2, 0.9, noise.clouds(4)), dtype=np.float32)
 
 
-def stained(rgb: Rgb, noise: Noise, depth: float = 0.10, cells: int = 8) -> Rgb:
+def add_dirt(rgb: Rgb, noise: Noise, depth: float = 0.10, cells: int = 8) -> Rgb:
     """Darken soft patches as by dirt."""
-    dirt = step(-0.4, 2.4, noise.clouds(cells))
+    dirt = smooth_step(-0.4, 2.4, noise.clouds(cells))
     return np.asarray(rgb * (1.0 - np.float32(depth) * dirt[..., None]), dtype=np.float32)
 
 
-def weathered(rgb: Rgb, noise: Noise, depth: float) -> Rgb:
+def add_water_streaks(rgb: Rgb, noise: Noise, depth: float) -> Rgb:
     """Darken vertical streaks as by water."""
-    runs = step(-0.6, 3.2, noise.streaks(64, 16) + 0.6 * noise.clouds(8))
+    runs = smooth_step(-0.6, 3.2, noise.streaks(64, 16) + 0.6 * noise.clouds(8))
     return np.asarray(rgb * (1.0 - np.float32(depth) * runs[..., None]), dtype=np.float32)
 
 
-def shaded(rgb: Rgb, factor: Field) -> Rgb:
+def scale_brightness(rgb: Rgb, factor: Field) -> Rgb:
     """Multiply an image by (S, S) factors."""
     return np.asarray(rgb * factor[..., None], dtype=np.float32)

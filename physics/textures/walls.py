@@ -8,20 +8,20 @@ from typing import Final
 
 import numpy as np
 
-from physics.textures.layers import Colour, Generator, Layers, Picture, Recipe, stacked
-from physics.textures.noise import Field, Noise, blurred, cells, pixel_centres, step
+from physics.textures.layers import Colour, Generator, Layers, Picture, Recipe, stack_layers
+from physics.textures.noise import Field, Noise, blur_field, cells, pixel_centres, smooth_step
 from physics.textures.surface import (
-    bond_of,
+    add_dirt,
+    add_water_streaks,
+    blend_colours,
+    bond_from_cells,
     courses,
     cracks,
-    laid,
-    mixed,
-    plain,
+    draw_bond,
+    plain_colour,
     random_courses,
-    relief,
-    shaded,
-    stained,
-    weathered,
+    relief_shading,
+    scale_brightness,
 )
 
 _CLAY: Final = ((0.56, 0.34, 0.27), (0.52, 0.31, 0.25), (0.60, 0.38, 0.30), (0.47, 0.29, 0.25))
@@ -40,13 +40,13 @@ _HEADER = 0.1125
 @lru_cache(maxsize=4)
 def wall_layers(size_px: int = 512, seed: int = 0) -> Layers:
     """Return every layer of walls, roofs and glass."""
-    return stacked("walls", WALLS, size_px, seed)
+    return stack_layers("walls", WALLS, size_px, seed)
 
 
 @lru_cache(maxsize=4)
 def prop_layers(size_px: int = 512, seed: int = 0) -> Layers:
     """Return every layer for trees and street furniture."""
-    return stacked("props", PROPS, size_px, seed)
+    return stack_layers("props", PROPS, size_px, seed)
 
 
 def _plaster(rough: float, dirt: float, crazed: float = 0.0) -> Generator:
@@ -59,16 +59,18 @@ def _plaster(rough: float, dirt: float, crazed: float = 0.0) -> Generator:
 
     def make(noise: Noise) -> Picture:
         bumps = 0.6 * noise.clouds(64) + 0.6 * noise.grain(1.2)
-        rgb = plain(noise, (0.80, 0.78, 0.74), 0.012 + 0.02 * dirt, 0.006 + 0.010 * rough)
-        rgb = shaded(rgb, relief(bumps, 0.03 * rough))
+        rgb = plain_colour(noise, (0.80, 0.78, 0.74), 0.012 + 0.02 * dirt, 0.006 + 0.010 * rough)
+        rgb = scale_brightness(rgb, relief_shading(bumps, 0.03 * rough))
         if dirt:
-            rgb = stained(weathered(rgb, noise, 0.14 * dirt), noise, 0.06 * dirt)
+            rgb = add_dirt(add_water_streaks(rgb, noise, 0.14 * dirt), noise, 0.06 * dirt)
         if crazed:
-            rgb = shaded(
+            rgb = scale_brightness(
                 rgb, 1.0 - 0.4 * np.float32(crazed) * cracks(noise, cells(noise, 4), 0.003)
             )
-            bare = step(2.2, 2.4, noise.clouds(8) + 0.12 * noise.grain(1.2))
-            rgb = mixed(rgb, plain(noise, (0.66, 0.62, 0.56), 0.02, 0.03), 0.7 * bare)
+            bare = smooth_step(2.2, 2.4, noise.clouds(8) + 0.12 * noise.grain(1.2))
+            rgb = blend_colours(
+                rgb, plain_colour(noise, (0.66, 0.62, 0.56), 0.02, 0.03), 0.7 * bare
+            )
             return Picture(rgb, 1.0 - 0.7 * bare)
         return Picture(rgb)
 
@@ -97,17 +99,17 @@ def _brick(
                 np.where(other[:, None], bonds[1].edge, bond.edge),
                 max(b.n for b in bonds),
             )
-        whole = laid(
+        whole = draw_bond(
             noise, bond, 2.7, colours, joint, joint_m=0.010, spread=0.07, grain=0.03, joint_tint=0.2
         )
-        return Picture(weathered(whole.rgb, noise, 0.08), whole.alpha)
+        return Picture(add_water_streaks(whole.rgb, noise, 0.08), whole.alpha)
 
     return Recipe(2.7, make)
 
 
 def _panels(noise: Noise) -> Picture:
     """Draw cast panels of 3 m x 1.5 m with tie holes."""
-    whole = laid(
+    whole = draw_bond(
         noise,
         courses(noise.size, 3.0, 2, [3.0], [0.0]),
         3.0,
@@ -121,10 +123,12 @@ def _panels(noise: Noise) -> Picture:
     )
     at = pixel_centres(noise.size) * 3.0
     x, y = np.meshgrid(at, at)
-    hole = 1.0 - step(0.012, 0.022, np.hypot((x % 1.5) - 0.75, np.abs((y % 1.5) - 0.75) - 0.4))
-    pores = step(2.0, 2.8, noise.grain(0.5))
-    rgb = shaded(whole.rgb, (1.0 - 0.45 * hole) * (1.0 - 0.12 * pores))
-    return Picture(weathered(rgb, noise, 0.10), whole.alpha)
+    hole = 1.0 - smooth_step(
+        0.012, 0.022, np.hypot((x % 1.5) - 0.75, np.abs((y % 1.5) - 0.75) - 0.4)
+    )
+    pores = smooth_step(2.0, 2.8, noise.grain(0.5))
+    rgb = scale_brightness(whole.rgb, (1.0 - 0.45 * hole) * (1.0 - 0.12 * pores))
+    return Picture(add_water_streaks(rgb, noise, 0.10), whole.alpha)
 
 
 def _boarded(noise: Noise) -> Picture:
@@ -138,10 +142,12 @@ def _boarded(noise: Noise) -> Picture:
         ],
         [0.0, 0.35, 0.7],
     )
-    rgb = laid(
+    rgb = draw_bond(
         noise, bond, 2.4, ((0.64, 0.63, 0.61),), (0.50, 0.49, 0.47), joint_m=0.004, spread=0.03
     ).rgb
-    return Picture(weathered(shaded(rgb, 1.0 + 0.025 * noise.streaks(64, 8, 1)), noise, 0.05))
+    return Picture(
+        add_water_streaks(scale_brightness(rgb, 1.0 + 0.025 * noise.streaks(64, 8, 1)), noise, 0.05)
+    )
 
 
 def _ashlar(noise: Noise) -> Picture:
@@ -149,7 +155,7 @@ def _ashlar(noise: Noise) -> Picture:
         noise.rng, noise.size, 3.0, [0.3, 0.4, 0.3, 0.35, 0.4, 0.3, 0.35, 0.3, 0.3], (0.45, 0.8)
     )
     return _aged(
-        laid(
+        draw_bond(
             noise,
             bond,
             3.0,
@@ -165,9 +171,9 @@ def _ashlar(noise: Noise) -> Picture:
 
 
 def _rubble(noise: Noise) -> Picture:
-    bond = bond_of(cells(noise, 12, 0.75), 2.4)
+    bond = bond_from_cells(cells(noise, 12, 0.75), 2.4)
     return _aged(
-        laid(
+        draw_bond(
             noise,
             bond,
             2.4,
@@ -184,7 +190,7 @@ def _rubble(noise: Noise) -> Picture:
 
 
 def _aged(picture: Picture, noise: Noise) -> Picture:
-    return Picture(weathered(picture.rgb, noise, 0.10), picture.alpha)
+    return Picture(add_water_streaks(picture.rgb, noise, 0.10), picture.alpha)
 
 
 def _boards(
@@ -197,7 +203,7 @@ def _boards(
         bond = courses(noise.size, side_m, rows, [side_m], noise.rng.random(rows).tolist())
         grain = noise.streaks(128, 32, 1) + 0.7 * noise.streaks(256, 32, 1)
         darker = tuple(0.93 * c for c in colour)
-        whole = laid(
+        whole = draw_bond(
             noise,
             bond,
             side_m,
@@ -214,7 +220,7 @@ def _boards(
         lap = np.broadcast_to(
             (1.0 - 0.22 * np.exp(-at / 0.10) + 0.05 * at)[:, None], (noise.size,) * 2
         )
-        rgb = shaded(whole.rgb, (1.0 + 0.03 * grain) * lap.astype(np.float32))
+        rgb = scale_brightness(whole.rgb, (1.0 + 0.03 * grain) * lap.astype(np.float32))
         alpha = np.asarray(whole.alpha)
         return Picture(rgb.transpose(1, 0, 2), alpha.T) if upright else Picture(rgb, alpha)
 
@@ -227,15 +233,15 @@ def _corrugated(noise: Noise) -> Picture:
     wave = np.broadcast_to(1.0 + 0.13 * np.sin(2.0 * np.pi * at), (noise.size,) * 2).astype(
         np.float32
     )
-    rgb = shaded(plain(noise, (0.66, 0.67, 0.68), 0.012, 0.008), wave)
-    return Picture(shaded(rgb, 1.0 - 0.07 * step(0.5, 2.5, noise.streaks(64, 32))))
+    rgb = scale_brightness(plain_colour(noise, (0.66, 0.67, 0.68), 0.012, 0.008), wave)
+    return Picture(scale_brightness(rgb, 1.0 - 0.07 * smooth_step(0.5, 2.5, noise.streaks(64, 32))))
 
 
 def _cassettes(noise: Noise) -> Picture:
     """Draw flat metal panels of 1.5 m x 0.75 m with open joints."""
     bond = courses(noise.size, 3.0, 4, [1.5], [0.0])
     tone = ((0.62, 0.63, 0.65), (0.60, 0.61, 0.63))
-    whole = laid(
+    whole = draw_bond(
         noise,
         bond,
         3.0,
@@ -247,12 +253,12 @@ def _cassettes(noise: Noise) -> Picture:
         grain=0.006,
         clouds=0.01,
     )
-    return Picture(shaded(whole.rgb, 1.0 + 0.01 * noise.streaks(128, 64)), whole.alpha)
+    return Picture(scale_brightness(whole.rgb, 1.0 + 0.01 * noise.streaks(128, 64)), whole.alpha)
 
 
 def _glazed(noise: Noise) -> Picture:
     bond = courses(noise.size, 1.5, 10, [0.3], [0.0, 0.5])
-    return laid(
+    return draw_bond(
         noise,
         bond,
         1.5,
@@ -279,27 +285,33 @@ def _roof_tiles(noise: Noise) -> Picture:
     )
     lip = 1.0 - 0.42 * np.exp(-(down % 1.0) / 0.07) + 0.06 * (down % 1.0)
     shape = (hump[None, :] * lip[:, None]).astype(np.float32)
-    rgb = shaded(plain(noise, (0.55, 0.35, 0.28), 0.02, 0.025, 8), shape * tone)
-    moss = step(1.0, 2.6, noise.clouds(8) + 0.4 * noise.grain(1.2))
+    rgb = scale_brightness(plain_colour(noise, (0.55, 0.35, 0.28), 0.02, 0.025, 8), shape * tone)
+    moss = smooth_step(1.0, 2.6, noise.clouds(8) + 0.4 * noise.grain(1.2))
     return Picture(
-        mixed(rgb, shaded(plain(noise, (0.36, 0.35, 0.24), 0.02, 0.03), shape), 0.6 * moss)
+        blend_colours(
+            rgb,
+            scale_brightness(plain_colour(noise, (0.36, 0.35, 0.24), 0.02, 0.03), shape),
+            0.6 * moss,
+        )
     )
 
 
 def _slate(noise: Noise) -> Picture:
     bond = courses(noise.size, 2.4, 12, [0.3], [0.0, 0.5])
     tones = ((0.36, 0.38, 0.41), (0.40, 0.41, 0.43), (0.33, 0.34, 0.37))
-    whole = laid(noise, bond, 2.4, tones, (0.18, 0.18, 0.20), joint_m=0.005, spread=0.06)
+    whole = draw_bond(noise, bond, 2.4, tones, (0.18, 0.18, 0.20), joint_m=0.005, spread=0.06)
     lip = 1.0 - 0.25 * np.exp(-((np.arange(noise.size) + 0.5) / noise.size * 12.0 % 1.0) / 0.06)
     return Picture(
-        shaded(whole.rgb, np.broadcast_to(lip[:, None], (noise.size,) * 2).astype(np.float32)),
+        scale_brightness(
+            whole.rgb, np.broadcast_to(lip[:, None], (noise.size,) * 2).astype(np.float32)
+        ),
         whole.alpha,
     )
 
 
 def _roof_gravel(noise: Noise) -> Picture:
-    bond = bond_of(cells(noise, 64, 0.9), 2.0)
-    return laid(
+    bond = bond_from_cells(cells(noise, 64, 0.9), 2.0)
+    return draw_bond(
         noise,
         bond,
         2.0,
@@ -320,10 +332,11 @@ def _seamed(noise: Noise) -> Picture:
         + 0.18 * np.exp(-(((at - 0.48) / 0.012) ** 2))
         - 0.30 * np.exp(-(((at - 0.52) / 0.015) ** 2))
     )
-    rgb = plain(noise, (0.48, 0.51, 0.52), 0.012, 0.008)
+    rgb = plain_colour(noise, (0.48, 0.51, 0.52), 0.012, 0.008)
     return Picture(
-        shaded(
-            weathered(rgb, noise, 0.08), np.broadcast_to(seam, (noise.size,) * 2).astype(np.float32)
+        scale_brightness(
+            add_water_streaks(rgb, noise, 0.08),
+            np.broadcast_to(seam, (noise.size,) * 2).astype(np.float32),
         )
     )
 
@@ -331,7 +344,7 @@ def _seamed(noise: Noise) -> Picture:
 def _felt(noise: Noise) -> Picture:
     """Draw bitumen sheets, 1 m wide."""
     bond = courses(noise.size, 3.0, 3, [3.0], [0.0, 0.4, 0.7])
-    return laid(
+    return draw_bond(
         noise,
         bond,
         3.0,
@@ -347,17 +360,19 @@ def _glass(noise: Noise) -> Picture:
     """Draw a curtain wall of 1.5 m panes that reflect sky and street."""
     at = pixel_centres(noise.size) * 2.0 % 1.0
     x, y = np.meshgrid(at, at)
-    sky = step(0.15, 0.85, 1.0 - y + 0.05 * noise.clouds(8))
-    rgb = mixed((0.15, 0.19, 0.21), (0.44, 0.52, 0.57), sky)
-    frame = step(0.02, 0.028, np.minimum(np.minimum(x, 1.0 - x), np.minimum(y, 1.0 - y)))
+    sky = smooth_step(0.15, 0.85, 1.0 - y + 0.05 * noise.clouds(8))
+    rgb = blend_colours((0.15, 0.19, 0.21), (0.44, 0.52, 0.57), sky)
+    frame = smooth_step(0.02, 0.028, np.minimum(np.minimum(x, 1.0 - x), np.minimum(y, 1.0 - y)))
     finish = np.stack([frame, np.zeros_like(frame)], axis=-1)
-    return Picture(mixed((0.25, 0.26, 0.27), rgb, frame), np.full_like(frame, 0.6), finish)
+    return Picture(blend_colours((0.25, 0.26, 0.27), rgb, frame), np.full_like(frame, 0.6), finish)
 
 
 def _bark(noise: Noise) -> Picture:
     ridge = noise.streaks(32, 4) + 0.6 * noise.streaks(64, 4) + 0.4 * noise.clouds(32)
-    rgb = mixed((0.22, 0.18, 0.15), (0.47, 0.41, 0.35), step(-1.3, 1.5, ridge))
-    return Picture(shaded(rgb, relief(blurred(np.asarray(ridge, np.float32), 1.0), 0.12)))
+    rgb = blend_colours((0.22, 0.18, 0.15), (0.47, 0.41, 0.35), smooth_step(-1.3, 1.5, ridge))
+    return Picture(
+        scale_brightness(rgb, relief_shading(blur_field(np.asarray(ridge, np.float32), 1.0), 0.12))
+    )
 
 
 def _foliage(light: Colour, dark: Colour, leaf: int) -> Generator:
@@ -372,23 +387,25 @@ def _foliage(light: Colour, dark: Colour, leaf: int) -> Generator:
         for depth in (0.0, 0.45, 1.0):
             leaves = cells(noise, leaf, 1.0)
             some = noise.rng.random(leaves.n).astype(np.float32)
-            blade = step(0.000, 0.25 / leaf, leaves.edge) * (some > 0.35)[leaves.id]
+            blade = smooth_step(0.000, 0.25 / leaf, leaves.edge) * (some > 0.35)[leaves.id]
             shade = (0.25 + 0.75 * depth) * (0.65 + 0.5 * some[leaves.id])
             tone = np.where(blade > 0.4, shade * (0.8 + 0.2 * blade), tone).astype(np.float32)
-        return Picture(mixed(dark, light, np.clip(tone * (1.0 + 0.15 * noise.clouds(4)), 0.0, 1.2)))
+        return Picture(
+            blend_colours(dark, light, np.clip(tone * (1.0 + 0.15 * noise.clouds(4)), 0.0, 1.2))
+        )
 
     return make
 
 
 def _brushed(noise: Noise) -> Picture:
     tone: Field = 1.0 + 0.015 * noise.streaks(256, 64, 1) + 0.01 * noise.clouds(4)
-    return Picture(shaded(plain(noise, (0.62, 0.63, 0.64), 0.01, 0.006), tone))
+    return Picture(scale_brightness(plain_colour(noise, (0.62, 0.63, 0.64), 0.01, 0.006), tone))
 
 
 def _painted(noise: Noise) -> Picture:
-    rgb = plain(noise, (0.70, 0.70, 0.70), 0.010, 0.008)
-    rust = step(2.5, 3.0, 0.6 * noise.clouds(16) + 0.8 * noise.grain(1.2))
-    return Picture(mixed(rgb, (0.40, 0.26, 0.18), 0.7 * rust), 1.0 - 0.7 * rust)
+    rgb = plain_colour(noise, (0.70, 0.70, 0.70), 0.010, 0.008)
+    rust = smooth_step(2.5, 3.0, 0.6 * noise.clouds(16) + 0.8 * noise.grain(1.2))
+    return Picture(blend_colours(rgb, (0.40, 0.26, 0.18), 0.7 * rust), 1.0 - 0.7 * rust)
 
 
 WALLS: Final[Mapping[str, Recipe]] = {
@@ -440,7 +457,8 @@ PROPS: Final[Mapping[str, Recipe]] = {
     "metal-brushed": Recipe(0.5, _brushed),
     "metal-painted": Recipe(1.0, _painted),
     "stone": Recipe(
-        1.0, lambda noise: Picture(stained(plain(noise, (0.62, 0.60, 0.57), 0.03, 0.04), noise))
+        1.0,
+        lambda noise: Picture(add_dirt(plain_colour(noise, (0.62, 0.60, 0.57), 0.03, 0.04), noise)),
     ),
 }
 """Recipe of every prop layer by name."""

@@ -22,8 +22,8 @@ from physics.textures.facade_canvas import (
     sill,
     surround,
 )
-from physics.textures.layers import Colour, linear
-from physics.textures.noise import step
+from physics.textures.layers import Colour, srgb_to_linear
+from physics.textures.noise import smooth_step
 
 _Style = Callable[[FacadeCanvas], None]
 
@@ -80,7 +80,7 @@ def _shutters(colour: Colour) -> _Style:
             area, cover, _, up = canvas.local(a + 0.06, b - 0.06, 0.95, 2.41)
             slats = 0.62 + 0.3 * (up * 1.46 / 0.055 % 1.0)
             canvas.fill(
-                area, cover, linear(colour) * np.broadcast_to(slats, cover.shape)[..., None]
+                area, cover, srgb_to_linear(colour) * np.broadcast_to(slats, cover.shape)[..., None]
             )
             canvas.box(a + 0.05, b - 0.05, 1.60, 1.70, colour)
 
@@ -129,9 +129,13 @@ def _arched(canvas: FacadeCanvas) -> None:
     rise = z - (0.3 - radius)
     r = np.sqrt(x * x + rise * rise)
     wedge = np.abs(np.arctan2(x, rise)) < np.arcsin(0.55 / radius) + 0.02
-    ring = step(-0.008, 0.008, r - radius) * (1.0 - step(-0.008, 0.008, r - radius - 0.17)) * wedge
+    ring = (
+        smooth_step(-0.008, 0.008, r - radius)
+        * (1.0 - smooth_step(-0.008, 0.008, r - radius - 0.17))
+        * wedge
+    )
     joints = 1.0 - 0.18 * (np.cos(44.0 * np.arctan2(x, rise)) > 0.93)
-    canvas.fill(area, np.asarray(ring, np.float32), linear(STONE) * joints[..., None])
+    canvas.fill(area, np.asarray(ring, np.float32), srgb_to_linear(STONE) * joints[..., None])
     sill(canvas, x0, x1, 0.85)
 
 

@@ -93,7 +93,7 @@ def join_clips(clips: Iterable[bytes], lengths: Sequence[int], path: Path, fps: 
             before += length
 
 
-def pictures_of(path: Path) -> Iterator[tuple[Fraction, NDArray[np.uint8]]]:
+def read_pictures(path: Path) -> Iterator[tuple[Fraction, NDArray[np.uint8]]]:
     """Yield the pictures of an .mp4 in order: the time in seconds, and RGB (H, W, 3)."""
     with av.open(str(path), "r") as film:
         stream = film.streams.video[0]

@@ -22,11 +22,11 @@ from cosim.spec.scenario import Scenario
 from scenarios.episodes.wiring import crowd_of
 from sumo_nets.crowd.demand_log import Entrances
 
-TELL_EVERY_TICKS: Final = 20
+PROGRESS_EVERY_TICKS: Final = 20
 """Ticks between two calls of the progress callback."""
 
 
-class Compared(NamedTuple):
+class DelayComparison(NamedTuple):
     """The delays that the robot caused to people and vehicles."""
 
     people: Delay
@@ -43,7 +43,7 @@ class Compared(NamedTuple):
         return measures
 
 
-class Beside:
+class CounterfactualTracker:
     """Recorder of an episode, to be compared with the street without the robot afterwards."""
 
     def __init__(self) -> None:
@@ -58,7 +58,7 @@ class Beside:
 
     def compared(
         self, scenario: Scenario, entrances: Entrances, progress: Progress = ignore
-    ) -> Compared:
+    ) -> DelayComparison:
         """Simulate the street without the robot, and return the delays.
 
         entrances: arrivals and departures of the episode's crowd.
@@ -67,13 +67,13 @@ class Beside:
         without_robot = Tracks(), Tracks()
         with crowd_of(scenario, entrances) as crowd:
             for tick, (robot, reply) in enumerate(self._moments):
-                if tick % TELL_EVERY_TICKS == 0:
+                if tick % PROGRESS_EVERY_TICKS == 0:
                     progress("without the robot", tick / len(self._moments))
                 street = crowd.step(robot, reply, absent=True)
                 without_robot[0].add(_crowd(street))
                 without_robot[1].add(street.vehicles)
         at = [(robot.pose.x_m, robot.pose.y_m) for robot, _ in self._moments]
-        return Compared(
+        return DelayComparison(
             *(
                 delay_of(at, a, b, Clock().tick_s)
                 for a, b in zip(self._with_robot, without_robot, strict=True)

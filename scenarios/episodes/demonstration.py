@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import MachineError, RunError
 from cosim.core.geometry import Floats
-from cosim.core.npz import arrays_in
+from cosim.core.npz import read_open_npz
 
 _GLIMPSE_PX: Final = (8, 6)
 """Width and height in pixels of the thumbnails by which stored pictures are checked."""
@@ -68,7 +68,7 @@ class Demonstration:
         """Decode a demonstration. where: the file that an error names. Raises RunError."""
         try:
             names = [one.name for one in fields(cls)]
-            held = arrays_in(io.BytesIO(data), names)
+            held = read_open_npz(io.BytesIO(data), names)
             return cls(**{name: held[name] for name in names})
         except ValueError as error:
             raise RunError(

@@ -15,11 +15,11 @@ from cosim.core.state import Command
 from cosim.episode.control import clipped
 from cosim.episode.interfaces import Observation
 from cosim.episode.manifest_checks import with_goal
-from cosim.episode.policy_caller import Driver
+from cosim.episode.policy_caller import PolicyCaller
 from cosim.policies.load import load_policy
 from cosim.results.log import Log
 from cosim.results.record import Record
-from cosim.spec.demo_options import EYE, Collecting, check_learner, demonstrating
+from cosim.spec.demo_options import RECORDING_CAMERA, DemoOptions, check_learner, recording_manifest
 from cosim.spec.goal import GoalProtocol, Instruction, PointGoal
 from cosim.spec.robot import Robot
 from cosim.spec.scenario import Scenario
@@ -36,23 +36,23 @@ _TURN: Final = 0.8
 """Largest change of the expert's yaw rate in a disturbance, as a share of the robot's maximum."""
 
 
-class Demonstrator(Driver):
+class Demonstrator(PolicyCaller):
     """Driver of an expert that records a demonstration.
 
     goal: goal protocol of the run; see `EpisodeOptions`.
-    learner: drives at times (`learner_of`; Ross et al., DAgger, 2011). It is queried at every
+    learner: drives at times (`load_learner`; Ross et al., DAgger, 2011). It is queried at every
         picture, because it may have a memory.
     Raises UsageError.
     """
 
     def __init__(
         self,
-        expert: Driver,
-        collecting: Collecting,
+        expert: PolicyCaller,
+        collecting: DemoOptions,
         goal: GoalProtocol | None = None,
-        learner: Driver | None = None,
+        learner: PolicyCaller | None = None,
     ) -> None:
-        manifest = with_goal(demonstrating(expert.manifest, collecting, goal), None)
+        manifest = with_goal(recording_manifest(expert.manifest, collecting, goal), None)
         super().__init__(expert, manifest, expert.source_hash)
         self.runs = expert.runs
         self.at_once = expert.at_once
@@ -81,7 +81,7 @@ class Demonstrator(Driver):
     def act(self, observation: Observation) -> Command:
         """Return the command to execute: the expert's, in a disturbance another one or the
         learner's."""
-        rgb = observation.pictures[EYE].rgb if self._sees else observation.rgb
+        rgb = observation.pictures[RECORDING_CAMERA].rgb if self._sees else observation.rgb
         assert rgb is not None
         answer = self._expert.act(observation)
         learned = None if self.learner is None else self.learner.act(observation)
@@ -110,7 +110,7 @@ def solved(record: Record, log: Log) -> bool:
     )
 
 
-def learner_of(collecting: Collecting) -> Driver | None:
+def load_learner(collecting: DemoOptions) -> PolicyCaller | None:
     """Load the learner of a collection, None without one. Raises UsageError."""
     try:
         return load_policy(collecting.learner) if collecting.learner else None
@@ -121,7 +121,7 @@ def learner_of(collecting: Collecting) -> Driver | None:
 class _Bursts:
     """Times and commands of disturbances, drawn from the episode's seed."""
 
-    def __init__(self, seed: int, collecting: Collecting) -> None:
+    def __init__(self, seed: int, collecting: DemoOptions) -> None:
         self._draws = np.random.default_rng([seed, 0xDA66E5])
         self._period_s = 1.0 / collecting.rate_hz
         self._share = collecting.noise
@@ -194,7 +194,7 @@ class _Rows:
             np.bincount(channel.ravel(), minlength=256) for channel in np.moveaxis(rgb, 2, 0)
         ]
 
-    def demonstration(self, scenario: Scenario, log: Log, collecting: Collecting) -> Demonstration:
+    def demonstration(self, scenario: Scenario, log: Log, collecting: DemoOptions) -> Demonstration:
         """Return the demonstration, with waypoints of the trajectory up to the first reset."""
         assert self._clip is not None, "an episode has a picture before its first command"
         ticks, numbers = np.array(self._ticks), np.array(self._numbers)

@@ -22,14 +22,14 @@ import msgspec
 import scenarios.events
 from bridge import keys
 from bridge.director import RemoteDirector, serve_director
-from bridge.session import LoneSession, Session, open_session
+from bridge.session import LocalSession, Session, open_session
 from cosim.core.errors import AccessError, DirectorLost, EngineError
 from cosim.core.progress import Progress
 from cosim.core.state import DIRECTED, People
 from cosim.episode.interfaces import Director
-from cosim.people.yielding import Standing
+from cosim.people.yielding import StandingObstacles
 from cosim.spec.events import EventKinds, EventQuery, EventReply
-from cosim.spec.options import Outside
+from cosim.spec.options import DirectorAddress
 from scenarios.events import EVENT_KINDS, react
 
 RETRY_S: Final = 0.2
@@ -41,39 +41,50 @@ _OURS: Final = ("cosim.", "scenarios.")
 
 
 def director_of(
-    episode: str, outside: Outside | None, waiting: Progress, kinds: EventKinds = EVENT_KINDS
+    episode: str,
+    outside: DirectorAddress | None,
+    waiting: Progress,
+    kinds: EventKinds = EVENT_KINDS,
 ) -> AbstractContextManager[Director]:
     """Return the director of an episode: the remote one, or without an address one in this
     process."""
-    return directed(episode, kinds) if outside is None else directed_by(outside, waiting, episode)
+    return (
+        in_process_director(episode, kinds)
+        if outside is None
+        else remote_director(outside, waiting, episode)
+    )
 
 
 @contextmanager
-def directed(episode: str, kinds: EventKinds = EVENT_KINDS) -> Iterator[Director]:
+def in_process_director(episode: str, kinds: EventKinds = EVENT_KINDS) -> Iterator[Director]:
     """Serve a director in a Zenoh session of its own, and yield the client."""
     key = keys.director("local", keys.chunk(episode))
-    with LoneSession() as session:
+    with LocalSession() as session:
         serve_director(session, key, partial(react, kinds=kinds))
         yield RemoteDirector(session, key)
 
 
 @contextmanager
-def directed_by(outside: Outside, waiting: Progress, episode: str) -> Iterator[Director]:
+def remote_director(
+    outside: DirectorAddress, waiting: Progress, episode: str
+) -> Iterator[Director]:
     """Connect to a remote director for one episode. Raises DirectorLost if there is none in
     time."""
     with _connected(outside, waiting) as session:
         key = keys.director(outside.run, keys.chunk(episode))
-        yield RemoteDirector(session, key, by=behaviours(), wait_s=outside.wait_s, waiting=waiting)
+        yield RemoteDirector(
+            session, key, by=behaviour_version(), wait_s=outside.wait_s, waiting=waiting
+        )
 
 
-class AmongObstacles:
+class ObstacleAwareDirector:
     """Adds obstacles near event pedestrians to the queries of a director.
 
     people: returns the people on the street now.
     """
 
     def __init__(
-        self, director: Director, standing: Standing, people: Callable[[], People]
+        self, director: Director, standing: StandingObstacles, people: Callable[[], People]
     ) -> None:
         self._director = director
         self._standing = standing
@@ -88,22 +99,22 @@ class AmongObstacles:
         )
 
 
-def direct_all(session: Session) -> None:
+def serve_all_directors(session: Session) -> None:
     """Serve all runs and episodes that query on this session."""
-    serve_director(session, keys.EVERY_DIRECTOR, react, behaviours())
+    serve_director(session, keys.EVERY_DIRECTOR, react, behaviour_version())
 
 
 @cache
-def behaviours() -> str:
+def behaviour_version() -> str:
     """Return the version of the behaviours: a hash of their source and of the project's modules
     that it imports, 16 hexadecimal digits."""
     digest = hashlib.sha256()
-    for name, source in sorted(sources(scenarios.events.__name__).items()):
+    for name, source in sorted(imported_sources(scenarios.events.__name__).items()):
         digest.update(name.encode() + b"\0" + source + b"\0")
     return digest.hexdigest()[:16]
 
 
-def sources(name: str) -> dict[str, bytes]:
+def imported_sources(name: str) -> dict[str, bytes]:
     """Return the source of a module and of the project's modules that it imports, directly or not,
     by name."""
     found: dict[str, bytes] = {}
@@ -136,7 +147,7 @@ def _gather(name: str, found: dict[str, bytes]) -> None:
                     _gather(".".join(parts[:depth]), found)
 
 
-def _connected(outside: Outside, waiting: Progress) -> Session:
+def _connected(outside: DirectorAddress, waiting: Progress) -> Session:
     """Connect to the director's hub, with retries until the timeout. Raises DirectorLost."""
     deadline = time.monotonic() + outside.wait_s
     endpoint = outside.connection.endpoint

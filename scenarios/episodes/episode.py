@@ -27,9 +27,9 @@ from cosim.core.clock import Clock, Pacer
 from cosim.core.errors import EngineError, PolicyError, UsageError
 from cosim.core.progress import Progress, ignore
 from cosim.core.state import Frame
-from cosim.episode.command_delay import InFlight, whole_ticks
+from cosim.episode.command_delay import CommandDelay, whole_ticks
 from cosim.episode.control import command_of
-from cosim.episode.interfaces import Eyes, Observation
+from cosim.episode.interfaces import Observation, ViewCamera
 from cosim.episode.loop import Moment, Step, after, begin, tick
 from cosim.episode.manifest_checks import check_camera, with_goal
 from cosim.results.log import Log
@@ -37,13 +37,13 @@ from cosim.results.record import Record
 from cosim.results.referee import Verdict
 from cosim.results.run_setup import RunSetup
 from cosim.spec.camera import CameraSpec
-from cosim.spec.episode_id import pseudonym_of
+from cosim.spec.episode_id import episode_id_of
 from cosim.spec.events import EventKinds
 from cosim.spec.manifest import Manifest
-from cosim.spec.options import EpisodeOptions, RendererAt
+from cosim.spec.options import EpisodeOptions, RendererAddress
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario
-from scenarios.episodes.live_episode import OnAir
+from scenarios.episodes.live_episode import LiveEpisode
 from scenarios.episodes.wiring import StagedScenario, staged
 from scenarios.events import EVENT_KINDS
 from sumo_nets.crowd.demand_log import Entrances
@@ -96,7 +96,7 @@ class Episode:
         through: Callable[[StagedScenario], None] | None = None,
         kinds: EventKinds = EVENT_KINDS,
         setup: RunSetup | None = None,
-        renderer: RendererAt | None = None,
+        renderer: RendererAddress | None = None,
     ) -> None:
         self.scenario = scenario = scenario.driven_by(options.robot)
         manifest = with_goal(manifest, options.goal)
@@ -104,7 +104,7 @@ class Episode:
         self.options = options
         check_camera(manifest, robot_called(scenario.robot), options.own_camera)
         self.setup = setup or RunSetup.of(options)
-        self.id, self.seed = pseudonym_of(self.setup.seed, scenario)
+        self.id, self.seed = episode_id_of(self.setup.seed, scenario)
         self.clock = Clock.for_rate(manifest.rate_hz)
         self.record = Record.begun(scenario, manifest, self.setup)
         self._renderer = renderer
@@ -120,7 +120,7 @@ class Episode:
         self._frame: Frame | None = None
         self._verdict = Verdict()
         self._was_reset = False
-        self._commands = InFlight()
+        self._commands = CommandDelay()
         self._asked_s = 0.0
         self._took_ms: list[float] = []
         self._result: tuple[Record, Log] | None = None
@@ -153,7 +153,9 @@ class Episode:
             if self._through is not None:
                 self._through(stage)
             if self.options.live is not None:
-                live = stack.enter_context(OnAir(self.options.live, self.scenario, stage.injected))
+                live = stack.enter_context(
+                    LiveEpisode(self.options.live, self.scenario, stage.injected)
+                )
                 self._watches.append(live.tell)
             if self.options.pace:
                 pacer = Pacer(self.options.pace)
@@ -209,7 +211,7 @@ class Episode:
         """Return the arrivals and departures of the crowd so far."""
         return self._open.entrances
 
-    def eyes(self, spec: CameraSpec) -> AbstractContextManager[Eyes]:
+    def eyes(self, spec: CameraSpec) -> AbstractContextManager[ViewCamera]:
         """Create a further camera, for viewing."""
         return self._open.eyes(spec)
 
@@ -249,7 +251,7 @@ class Episode:
         latency_ms = took_ms if setup.real_time else setup.latency_ms
         self._took_ms.append(took_ms)
         self._commands.answered(now.tick, whole_ticks(latency_ms, self.clock.tick_ms), command)
-        free_again = self._commands.arrived_by if setup.real_time else 0
+        free_again = self._commands.last_arrival_tick if setup.real_time else 0
         while True:
             step = tick(
                 self.scenario, self.clock, stage.parts, now, self._commands.at(now.tick), frame

@@ -18,18 +18,18 @@ from cosim.spec.events import EventQuery, EventReply
 from cosim.spec.injection import Ack, Injected, Injection, InjectionRequest, RelativePoint
 from scenarios.events.injected_person import (
     InjectedPerson,
-    arriving,
     injected_actor,
-    injected_moved_on,
+    spawn_injected,
+    step_injected,
 )
 
 MOST_INJECTED: Final = 100
 """Maximum number of injected people at a time, including accepted ones before their first tick."""
-MOST_EVER: Final = 5000
+MOST_INJECTED_PER_EPISODE: Final = 5000
 """Maximum number of injected people in an episode, because its record lists all of them."""
-SUGGESTED_M: Final = 10.0
+SUGGESTED_AHEAD_M: Final = 10.0
 """Distance in m along the route from the robot to the valid point that a refusal suggests."""
-SETTLES_S: Final = 2.0
+TICK_TIMEOUT_S: Final = 2.0
 """Timeout in seconds for the end of the current tick, which gives the robot's pose."""
 
 
@@ -71,7 +71,7 @@ class InjectedPeople:
         self._names = {entry.injection.id for entry in script}
         self._next_tick = 0
 
-    def robot_at(self, robot: RobotOnRoute) -> None:
+    def set_robot(self, robot: RobotOnRoute) -> None:
         """Set the robot's pose at the start of a tick, the origin of relative points."""
         with self._lock:
             self._robot = robot
@@ -80,10 +80,10 @@ class InjectedPeople:
     def offer(self, request: InjectionRequest) -> Ack:
         """Accept an injection for the next tick, or refuse it with a reason. Thread-safe."""
         with self._lock:
-            if request.depends_on_robot and not self._lock.wait_for(
-                self._robot_is_known, SETTLES_S
+            if request.has_relative_points and not self._lock.wait_for(
+                self._robot_is_known, TICK_TIMEOUT_S
             ):
-                late = f"the tick under way takes longer than {SETTLES_S:g} s: send it again"
+                late = f"the tick under way takes longer than {TICK_TIMEOUT_S:g} s: send it again"
                 return Ack(id=request.id, status="refused", reason=late)
             injection = request.resolved(self._robot.pose)
             tick = self._next_tick
@@ -120,14 +120,16 @@ class InjectedPeople:
             return (
                 f"{MOST_INJECTED} injected pedestrians are here already: wait until some are gone"
             )
-        if len(self._names) >= MOST_EVER:
-            return f"{MOST_EVER} pedestrians were injected into this episode: no more"
+        if len(self._names) >= MOST_INJECTED_PER_EPISODE:
+            return (
+                f"{MOST_INJECTED_PER_EPISODE} pedestrians were injected into this episode: no more"
+            )
         return ""
 
     def _valid_point(self) -> str:
         """Return a sentence with the robot's position and a valid point ahead of it."""
         pose, route_s_m = self._robot.pose, self._robot.route_s_m
-        there = self._route.at(route_s_m + SUGGESTED_M)
+        there = self._route.at(route_s_m + SUGGESTED_AHEAD_M)
         relative = RelativePoint.of(there.x_m, there.y_m, pose)
         return (
             f"The robot is at {_in_json(pose[:2])}, heading_rad {pose.heading_rad:.2f}. A "
@@ -149,12 +151,12 @@ class InjectedPeople:
             self._log += due
             self._next_tick = query.tick + 1
             before = self._here
-            new = {entry.injection.id: arriving(entry) for entry in due}
+            new = {entry.injection.id: spawn_injected(entry) for entry in due}
             self._here = before | new
         reply = self._director.react(query)
         here = {}
         for name, person in before.items():
-            after = injected_moved_on(person, query)
+            after = step_injected(person, query)
             if after is not None:
                 here[name] = after
         here |= new

@@ -17,18 +17,18 @@ from cosim.core.clock import Clock
 from cosim.core.state import Age, PersonKind
 from cosim.episode.loop import Step
 from cosim.results.referee import Verdict
-from cosim.spec.injection import Live
+from cosim.spec.injection import LiveAddress
 from cosim.spec.scenario import Scenario
 from scenarios.episodes.injected import InjectedPeople, RobotOnRoute
 
 
-class OnAir:
+class LiveEpisode:
     """Publisher of an episode's telemetry, and server of injections, status, log and camera.
 
     Use it in a `with` block.
     """
 
-    def __init__(self, live: Live, scenario: Scenario, injected: InjectedPeople) -> None:
+    def __init__(self, live: LiveAddress, scenario: Scenario, injected: InjectedPeople) -> None:
         self._live = live
         self._scenario = scenario
         self._injected = injected
@@ -61,7 +61,7 @@ class OnAir:
         route_s_m = step.route_s_after_m
         if verdict.reset is not None:
             pose, route_s_m = verdict.reset.pose, verdict.reset.route_s_m
-        self._injected.robot_at(RobotOnRoute(step.tick + 1, pose, route_s_m))
+        self._injected.set_robot(RobotOnRoute(step.tick + 1, pose, route_s_m))
         if step.frame is not None:
             self._rgb = step.frame.rgb
         tick = step.tick

@@ -16,19 +16,19 @@ from cosim.results.log import Log, Tick
 from cosim.results.record import Record
 from cosim.results.referee import Verdict
 from cosim.results.run_folder import read_records
-from cosim.results.traffic import OnRoad
+from cosim.results.traffic import RoadState
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import robot_called
 from cosim.spec.run_config import CameraChoice
 from cosim.spec.scenario import Scenario, read_suite
-from scenarios.episodes.counterfactual import Beside, Compared
+from scenarios.episodes.counterfactual import CounterfactualTracker, DelayComparison
 from scenarios.episodes.episode import Episode, Watch
 from scenarios.episodes.run_episode import drive
 from scenarios.episodes.wiring import StagedScenario
 from sumo_nets.crowd.demand_log import Entrances
 
 
-class Recorded(NamedTuple):
+class RecordedEpisode(NamedTuple):
     """A finished episode as loaded from a run folder."""
 
     scenario: Scenario
@@ -36,7 +36,7 @@ class Recorded(NamedTuple):
     log: Log
 
 
-def recorded(folder: Path, scenario_id: str) -> Recorded:
+def load_recorded(folder: Path, scenario_id: str) -> RecordedEpisode:
     """Load a finished episode. Raises UsageError with the valid names, RunError if it crashed."""
     records = {record.scenario.id for record in read_records(folder)}
     if scenario_id not in records:
@@ -48,11 +48,14 @@ def recorded(folder: Path, scenario_id: str) -> Recorded:
         raise RunError(
             f"{folder}: '{scenario_id}' did not come to its end: there is nothing to run again"
         )
-    return Recorded(scenarios[scenario_id], record, Log.load(episode / "trajectory.npz"))
+    return RecordedEpisode(scenarios[scenario_id], record, Log.load(episode / "trajectory.npz"))
 
 
-def replaying(
-    original: Recorded, camera: CameraChoice = "auto", *watches: Watch, judged_alone: bool = False
+def replay_episode(
+    original: RecordedEpisode,
+    camera: CameraChoice = "auto",
+    *watches: Watch,
+    judged_alone: bool = False,
 ) -> tuple[Episode, Replay]:
     """Return a new Episode for a replay, and the policy that repeats the recorded commands.
 
@@ -63,69 +66,73 @@ def replaying(
     )
     policy = Replay(original.log.command)
 
-    def judge_alone(stage: StagedScenario) -> None:
-        stage.scorer.judge_alone()
+    def skip_measures(stage: StagedScenario) -> None:
+        stage.scorer.skip_measures()
 
-    through = judge_alone if judged_alone else None
+    through = skip_measures if judged_alone else None
     episode = Episode(original.scenario, policy.manifest, options, watches=watches, through=through)
     return episode, policy
 
 
-def replayed(original: Recorded, *watches: Watch, progress: Progress = ignore) -> str:
+def replay_state_hash(
+    original: RecordedEpisode, *watches: Watch, progress: Progress = ignore
+) -> str:
     """Replay an episode, and return its state hash."""
     return _again(original, progress, *watches)[0]
 
 
-def compared(original: Recorded, progress: Progress = ignore) -> tuple[str, Compared]:
+def replay_and_compare(
+    original: RecordedEpisode, progress: Progress = ignore
+) -> tuple[str, DelayComparison]:
     """Replay an episode, then its street without the robot; return the state hash and the
     delays."""
-    tracker = Beside()
+    tracker = CounterfactualTracker()
     state_hash, entrances = _again(original, progress, tracker.watch)
     return state_hash, tracker.compared(
         original.scenario, entrances, partial(progress, "the street without the robot")
     )
 
 
-def _again(original: Recorded, progress: Progress, *watches: Watch) -> tuple[str, Entrances]:
+def _again(original: RecordedEpisode, progress: Progress, *watches: Watch) -> tuple[str, Entrances]:
     def watch(step: Step, _: Verdict) -> None:
         progress(f"replaying {original.scenario.id}", step.tick / len(original.log))
 
     progress("starting SUMO and PyBullet")
-    episode, policy = replaying(original, "auto", watch, *watches)
+    episode, policy = replay_episode(original, "auto", watch, *watches)
     with episode:
         drive(episode, policy)
         return episode.result()[0].state_hash, episode.entrances
 
 
-class Alike:
+class ReplayChecker:
     """Checker that every tick of a replay equals the recorded trajectory to the bit.
 
     Compared are the robot's pose, speeds and command, its route position, its resets and the
     distance to the nearest person.
     """
 
-    def __init__(self, folder: Path, original: Recorded) -> None:
+    def __init__(self, folder: Path, original: RecordedEpisode) -> None:
         self._folder = folder
         self._original = original
         self._footprint_m = robot_called(original.scenario.robot).footprint_m
 
     def watch(self, step: Step, verdict: Verdict) -> None:
         """Check the next tick. Raises RunError if it differs from the recorded one."""
-        if not self._original.log.same(Tick(step, verdict, self._footprint_m, OnRoad())):
-            raise otherwise(
+        if not self._original.log.same(Tick(step, verdict, self._footprint_m, RoadState())):
+            raise replay_mismatch(
                 self._folder, self._original, f"from {Clock().time_s(step.tick):g} s on"
             )
 
 
-def check(folder: Path, original: Recorded, state_hash: str) -> None:
+def check_state_hash(folder: Path, original: RecordedEpisode, state_hash: str) -> None:
     """Check the state hash of a replay. Raises RunError if it differs from the recorded one."""
     if state_hash != original.record.state_hash:
-        raise otherwise(
+        raise replay_mismatch(
             folder, original, f"{state_hash[:16]}, recorded {original.record.state_hash[:16]}"
         )
 
 
-def otherwise(folder: Path, original: Recorded, what: str) -> RunError:
+def replay_mismatch(folder: Path, original: RecordedEpisode, what: str) -> RunError:
     """Return the error for a replay that differs from the record. what: the difference."""
     record = original.record
     here = versions()

@@ -8,17 +8,17 @@ from dataclasses import dataclass
 
 import msgspec
 
-from bridge.policy_server import said_by
+from bridge.policy_server import error_text
 from cosim.core.errors import CosimError, MachineError, RendererLost
 from cosim.core.progress import Progress, ignore
 from cosim.episode.interfaces import Policy
-from cosim.episode.policy_caller import Driver
+from cosim.episode.policy_caller import PolicyCaller
 from cosim.results.log import Log
 from cosim.results.record import Record
 from cosim.results.run_setup import RunSetup
-from cosim.spec.options import EpisodeOptions, RendererAt
+from cosim.spec.options import EpisodeOptions, RendererAddress
 from cosim.spec.scenario import Scenario
-from scenarios.episodes.counterfactual import Beside
+from scenarios.episodes.counterfactual import CounterfactualTracker
 from scenarios.episodes.episode import Episode, Watch
 from scenarios.ipc.faults import verdict_on
 
@@ -44,7 +44,7 @@ def run_episode(
     options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
     *,
     setup: RunSetup | None = None,
-    renderer: RendererAt | None = None,
+    renderer: RendererAddress | None = None,
     watches: Sequence[Watch] = (),
     waiting: Progress = ignore,
     comparing: Progress = ignore,
@@ -59,8 +59,8 @@ def run_episode(
     Raises RendererLost if the shared renderer has ended, MachineError if the machine lacks
     something.
     """
-    driver = Driver.of(policy)
-    tracker = Beside()
+    driver = PolicyCaller.of(policy)
+    tracker = CounterfactualTracker()
     comparison_error = ""
     all_watches = [*watches, tracker.watch] if options.counterfactual else watches
     if setup is None:
@@ -84,7 +84,7 @@ def run_episode(
         raise
     except Exception as error:  # noqa: BLE001  a failed episode becomes a record
         status, again = verdict_on(error)
-        record = msgspec.structs.replace(episode.record, status=status, reason=in_words(error))
+        record = msgspec.structs.replace(episode.record, status=status, reason=error_message(error))
         return Outcome(record, None, traceback.format_exc(), again)
     finally:
         driver.ended()
@@ -97,7 +97,7 @@ def run_episode(
         except Exception as error:  # noqa: BLE001  the episode itself is valid
             comparison_error = traceback.format_exc()
             record = msgspec.structs.replace(
-                record, reason=f"the street without the robot: {in_words(error)}"
+                record, reason=f"the street without the robot: {error_message(error)}"
             )
     return Outcome(record, log, comparison_error)
 
@@ -110,8 +110,10 @@ def drive(episode: Episode, policy: Policy) -> None:
         observation = episode.advance(policy.act(observation))
 
 
-def in_words(error: Exception) -> str:
+def error_message(error: Exception) -> str:
     """Return the message of an error, with its type unless it is an error of the project."""
     return (
-        str(error) if isinstance(error, CosimError) else f"{type(error).__name__}: {said_by(error)}"
+        str(error)
+        if isinstance(error, CosimError)
+        else f"{type(error).__name__}: {error_text(error)}"
     )

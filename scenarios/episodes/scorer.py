@@ -6,12 +6,12 @@ import msgspec
 
 from cosim.core.clock import Clock
 from cosim.core.errors import UsageError
-from cosim.episode.command_delay import InFlight, median_ms
+from cosim.episode.command_delay import CommandDelay, median_ms
 from cosim.episode.loop import Step
 from cosim.place.street_map import StreetMap, WalkableArea
-from cosim.results.event_monitor import EventMonitor, Hidden, why_invalid
+from cosim.results.event_monitor import EventMonitor, OcclusionTest, why_invalid
 from cosim.results.log import Log
-from cosim.results.metrics import EpisodeFacts, every_metric
+from cosim.results.metrics import EpisodeFacts, compute_metrics
 from cosim.results.record import Record, Recorder, RedLightEntry, Status
 from cosim.results.referee import Failure, Referee, Verdict
 from cosim.results.traffic import TrafficMonitor
@@ -35,7 +35,7 @@ class Scorer:
         street_map: StreetMap,
         area: WalkableArea,
         robot: Robot,
-        hidden: Hidden,
+        hidden: OcclusionTest,
         clock: Clock,
     ) -> None:
         self._scenario = scenario
@@ -51,7 +51,7 @@ class Scorer:
         self._verdict = Verdict()
         self._measures = True
 
-    def judge_alone(self) -> None:
+    def skip_measures(self) -> None:
         """Record no measures from now on, so that there is no result: only the referee judges."""
         self._measures = False
 
@@ -68,12 +68,12 @@ class Scorer:
             self._red_lights.append(RedLightEntry(step.tick, verdict.red_light_entry))
         return verdict
 
-    def result(self, begun: Record, commands: InFlight) -> tuple[Record, Log]:
+    def result(self, begun: Record, commands: CommandDelay) -> tuple[Record, Log]:
         """Return the completed record, and the log.
 
         begun: the record from the start of the episode.
         commands: all answers of the policy.
-        Raises UsageError after `judge_alone`.
+        Raises UsageError after `skip_measures`.
         """
         if not self._measures:
             raise UsageError(
@@ -98,7 +98,7 @@ class Scorer:
             red_light_entries=tuple(self._red_lights),
             events=events,
         )
-        measures = every_metric(EpisodeFacts.of(record, scenario, log))
+        measures = compute_metrics(EpisodeFacts.of(record, scenario, log))
         reason = why_invalid(record, scenario)
         status: Status = "invalid" if reason else "done"
         return msgspec.structs.replace(record, status=status, reason=reason, measures=measures), log

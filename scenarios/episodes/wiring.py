@@ -19,33 +19,33 @@ from cosim.core.errors import MachineError, SpecError
 from cosim.core.geometry import Pose
 from cosim.core.progress import Progress
 from cosim.core.state import RobotState, Street
-from cosim.episode.interfaces import Camera, Director, Eyes, Privileged
-from cosim.episode.loop import Moment, Parts
+from cosim.episode.interfaces import Camera, Director, Privileged, ViewCamera
+from cosim.episode.loop import EpisodeEngines, Moment
 from cosim.episode.observer import Observer
-from cosim.people.yielding import Standing, standing_bodies
+from cosim.people.yielding import StandingObstacles, standing_obstacles
 from cosim.place import overlay
-from cosim.place.barriers import fenced
+from cosim.place.barriers import without_barriers
 from cosim.place.street_map import Port, StreetMap, WalkableArea
 from cosim.results.run_setup import NO_RENDERER
 from cosim.spec.camera import CameraSpec
 from cosim.spec.events import EventKinds
 from cosim.spec.manifest import Manifest
 from cosim.spec.obstacle import Obstacle, footprint
-from cosim.spec.options import EpisodeOptions, RendererAt
+from cosim.spec.options import EpisodeOptions, RendererAddress
 from cosim.spec.robot import COURIER, Robot, robot_called
 from cosim.spec.scenario import CrowdSpec, Scenario, event_faults
-from cosim.spec.spec_file import in_lines
+from cosim.spec.spec_file import join_faults
 from physics.cameras.choice import camera_of, camera_of_choice, renderer_of
 from physics.dynamics.world import BulletWorld
 from physics.street.furniture import Prop, footprints
 from physics.street.surface import Surface
-from scenarios.episodes.director import AmongObstacles, director_of
+from scenarios.episodes.director import ObstacleAwareDirector, director_of
 from scenarios.episodes.injected import InjectedPeople
 from scenarios.episodes.scorer import Scorer
 from scenarios.ipc.render_link import SharedCamera
 from scenarios.places.nets import place, surface_of_place
 from sumo_nets.crowd.demand_log import Entrances
-from sumo_nets.crowd.empty_street import EmptyStreet, goes_by_itself
+from sumo_nets.crowd.empty_street import EmptyStreet, needs_no_sumo
 
 if TYPE_CHECKING:
     from sumo_nets.crowd.crowd import SumoCrowd
@@ -69,12 +69,12 @@ class StagedScenario:
     entrances: arrivals and departures of the crowd.
     """
 
-    parts: Parts
+    parts: EpisodeEngines
     robot: Robot
     renderer: str
     scorer: Scorer
     observer: Observer
-    eyes: Callable[[CameraSpec], AbstractContextManager[Eyes]]
+    eyes: Callable[[CameraSpec], AbstractContextManager[ViewCamera]]
     injected: InjectedPeople
     entrances: Entrances
 
@@ -88,7 +88,7 @@ def staged(
     clock: Clock,
     waiting: Progress,
     kinds: EventKinds,
-    shared: RendererAt | None = None,
+    shared: RendererAddress | None = None,
 ) -> Iterator[StagedScenario]:
     """Start the engines of a scenario; all are closed at the end of the block.
 
@@ -96,7 +96,7 @@ def staged(
     shared: shared renderer, used in place of an own camera.
     """
     if faults := list(event_faults(scenario, kinds)):
-        raise SpecError(f"scenario '{scenario.id}': {in_lines(faults)}")
+        raise SpecError(f"scenario '{scenario.id}': {join_faults(faults)}")
     _, street_map = place(scenario.place)
     around = shapely.buffer(LineString(scenario.route), CORRIDOR_M)
     walkable = street_map.walkable_near(around)
@@ -109,7 +109,7 @@ def staged(
         crowd = crowd_of(scenario)
         stack.enter_context(crowd)
 
-        def eyes(spec: CameraSpec) -> AbstractContextManager[Eyes]:
+        def eyes(spec: CameraSpec) -> AbstractContextManager[ViewCamera]:
             return camera_of(
                 camera_of_choice(options.camera),
                 world,
@@ -129,48 +129,55 @@ def staged(
             camera = stack.enter_context(eyes(manifest.camera))
             renderer = renderer_of(camera_of_choice(options.camera))
         cameras = {name: stack.enter_context(eyes(spec)) for name, spec in manifest.cameras.items()}
-        look = None if camera is None else partial(empty_street, camera, street, robot)
+        look = None if camera is None else partial(draw_empty_street, camera, street, robot)
         director = stack.enter_context(director_of(scenario.id, options.director, waiting, kinds))
         if scenario.crowd.residents:
             # Imported only where needed: it loads scipy.
-            from scenarios.events.resident_director import among_residents
+            from scenarios.events.resident_director import with_residents
 
-            director = among_residents(
+            director = with_residents(
                 director, scenario, street_map, street, lambda: crowd.street.people
             )
         injected = InjectedPeople(
             director,
             clock.tick_ms,
-            partial(on_map, street_map),
+            partial(is_on_map, street_map),
             scenario.route_line,
             scenario.start_pose,
             options.injections,
         )
         directed: Director = injected
         if scenario.obstacles:
-            directed = AmongObstacles(
-                injected, standing_in(scenario, street_map), lambda: crowd.street.people
+            directed = ObstacleAwareDirector(
+                injected, pedestrian_obstacles(scenario, street_map), lambda: crowd.street.people
             )
 
         @cache
         def free() -> Polygon | MultiPolygon:
             """Compute the free ground, only for policies that get it: placing all props is slow."""
-            ground = clear_of(
-                fenced(walkable, scenario.barriers), street.standing(around), scenario.obstacles
+            ground = without_obstacles(
+                without_barriers(walkable, scenario.barriers),
+                street.standing(around),
+                scenario.obstacles,
             )
             room = shapely.buffer(ground, -robot.width_m / 2)
             shapely.prepare(room)
             return room
 
         yield StagedScenario(
-            parts=Parts(world, crowd, directed, camera),
+            parts=EpisodeEngines(world, crowd, directed, camera),
             robot=robot,
             renderer=renderer,
             scorer=Scorer(
                 scenario, kinds, street_map, WalkableArea(walkable), robot, world.hidden, clock
             ),
             observer=Observer(
-                scenario, manifest, seed, lambda now: known(scenario, free(), now), cameras, look
+                scenario,
+                manifest,
+                seed,
+                lambda now: privileged_state(scenario, free(), now),
+                cameras,
+                look,
             ),
             eyes=eyes,
             injected=injected,
@@ -186,7 +193,7 @@ def crowd_of(scenario: Scenario, before: Entrances | None = None) -> SumoCrowd |
     net_path, street_map = place(scenario.place)
     robot = robot_called(scenario.robot)
     start_xy = scenario.start[:2]
-    if goes_by_itself(street_map, scenario.crowd, before):
+    if needs_no_sumo(street_map, scenario.crowd, before):
         return EmptyStreet(street_map, scenario.seed, start_xy)
     closed = frozenset(Port(barrier.strip, barrier.end) for barrier in scenario.barriers)
     return sumo_crowd(
@@ -198,7 +205,7 @@ def crowd_of(scenario: Scenario, before: Entrances | None = None) -> SumoCrowd |
         start_xy,
         robot.footprint_m,
         before,
-        standing_in(scenario, street_map),
+        pedestrian_obstacles(scenario, street_map),
     )
 
 
@@ -211,7 +218,7 @@ def sumo_crowd(
     start_xy: tuple[float, float],
     footprint_m: tuple[float, float] = COURIER.footprint_m,
     before: Entrances | None = None,
-    standing: Standing | None = None,
+    standing: StandingObstacles | None = None,
 ) -> SumoCrowd:
     """Create the crowd and traffic of a net by SUMO, not started. Raises MachineError if SUMO
     cannot be loaded."""
@@ -225,15 +232,15 @@ def sumo_crowd(
     )
 
 
-def standing_in(scenario: Scenario, street_map: StreetMap) -> Standing:
+def pedestrian_obstacles(scenario: Scenario, street_map: StreetMap) -> StandingObstacles:
     """Return the obstacles of a scenario as pedestrians avoid them."""
     if not scenario.obstacles:
-        return Standing()
+        return StandingObstacles()
     around = shapely.union_all([footprint(one, _BESIDE_M) for one in scenario.obstacles])
-    return standing_bodies(scenario.obstacles, street_map.walkable_near(around))
+    return standing_obstacles(scenario.obstacles, street_map.walkable_near(around))
 
 
-def known(scenario: Scenario, free: Polygon | MultiPolygon, now: Moment) -> Privileged:
+def privileged_state(scenario: Scenario, free: Polygon | MultiPolygon, now: Moment) -> Privileged:
     """Return the privileged state for an observation."""
     crossings = tuple((c.id, c.enter_s_m, c.leave_s_m) for c in scenario.crossings)
     street = now.street
@@ -249,18 +256,20 @@ def known(scenario: Scenario, free: Polygon | MultiPolygon, now: Moment) -> Priv
     )
 
 
-def empty_street(camera: Camera, surface: Surface, robot: Robot, pose: Pose) -> NDArray[np.uint8]:
+def draw_empty_street(
+    camera: Camera, surface: Surface, robot: Robot, pose: Pose
+) -> NDArray[np.uint8]:
     """Draw the view of a robot's camera at a pose in the empty street, (H, W, 3) uint8."""
     z_m, _, _ = surface.lean(pose, robot.drive.span_m)
     return camera.render(RobotState(pose, z_m=z_m), Street(0)).rgb
 
 
-def on_map(street_map: StreetMap, x_m: float, y_m: float) -> bool:
+def is_on_map(street_map: StreetMap, x_m: float, y_m: float) -> bool:
     """Return whether a point is on a street, or within FRONTAGE_M of one."""
     return street_map.locate(x_m, y_m, FRONTAGE_M).kind != "off"
 
 
-def clear_of(
+def without_obstacles(
     area: Polygon | MultiPolygon, props: Sequence[Prop], obstacles: Sequence[Obstacle] = ()
 ) -> Polygon | MultiPolygon:
     """Return an area minus the footprints of props and obstacles; the area itself if none

@@ -28,9 +28,9 @@ from cosim.place.barriers import outline
 from cosim.place.street_map import Corner, Lane, StreetMap, Strip, union_closed
 from cosim.spec.obstacle import Obstacle, footprint
 from cosim.spec.scenario import Barrier
-from physics.ground.tiles import key_at
+from physics.ground.tiles import tile_at
 from physics.street.furniture import footprints
-from physics.street.interaction_spots import InteractionSpot, What, spots
+from physics.street.interaction_spots import InteractionSpot, SpotKind, spots
 from physics.street.placement import CLEAR_HALF_M
 from physics.street.street_surface import StreetSurface
 
@@ -38,7 +38,7 @@ _REACH_M: Final = 55.0
 """Metres from the route within which sidewalks are in the graph."""
 SPACING_M: Final = 4.0
 """Metres between waypoints along a sidewalk."""
-OFF_WALK_M: Final = 1.2
+OPEN_GROUND_M: Final = 1.2
 """Metres of open ground beyond the sidewalk on which people may use a window or bench."""
 _GAP_M: Final = 0.04
 """Metres between a person's disk and objects."""
@@ -96,9 +96,9 @@ class BehaviorGraph:
         return [(x, y) for x, y in self.xy.tolist()]
 
     @cached_property
-    def by_what(self) -> Mapping[What, NDArray[np.intp]]:
+    def nodes_by_activity(self) -> Mapping[SpotKind, NDArray[np.intp]]:
         """Nodes of the interaction spots by activity."""
-        found: dict[What, list[int]] = {}
+        found: dict[SpotKind, list[int]] = {}
         for i, spot in enumerate(self.spots):
             found.setdefault(spot.what, []).append(self.waypoints + i)
         return {what: np.array(found[what], dtype=np.intp) for what in sorted(found)}
@@ -155,8 +155,8 @@ def behavior_graph(
     corners = [c for c in street_map.near("corner", area) if isinstance(c, Corner)]
     props = ground.standing(area)
     x0, y0, x1, y1 = area.bounds
-    (i0, j0) = key_at(x0, y0)
-    (i1, j1) = key_at(x1, y1)
+    (i0, j0) = tile_at(x0, y0)
+    (i1, j1) = tile_at(x1, y1)
     buildings = [
         b for i in range(i0, i1 + 1) for j in range(j0, j1 + 1) for b in ground.buildings((i, j))
     ]
@@ -176,7 +176,7 @@ def behavior_graph(
     blocked = overlay.union_all(
         _grown(things, PERSON_RADIUS_M + _GAP_M) + _grown(roads, PERSON_RADIUS_M)
     )
-    open_ground = overlay.difference(shapely.buffer(walk, OFF_WALK_M, quad_segs=4), blocked)
+    open_ground = overlay.difference(shapely.buffer(walk, OPEN_GROUND_M, quad_segs=4), blocked)
     footing = overlay.difference(shapely.buffer(walk, -_EDGE_M), blocked)
     for shape in (open_ground, footing):
         shapely.prepare(shape)

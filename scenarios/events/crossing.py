@@ -16,11 +16,11 @@ from scenarios.events.sight import sight_of
 from scenarios.events.walking import (
     along_m,
     edge_m,
-    gave_up,
+    gives_up,
     left_m,
-    met_m,
-    pressed_on,
-    walked_on,
+    meeting_offset_m,
+    walk_on,
+    walk_straight,
     walker_at,
 )
 
@@ -28,7 +28,7 @@ _BEFORE_M: Final = 0.8
 """Metres before the crosswalk where each person waits, and after it where they have crossed."""
 BEHIND_ROBOT_M: Final = 1.6
 """Extra metres for people from behind, because the robot has just passed them."""
-MEETS_AMONG: Final = 2
+LARGEST_MEETING_GROUP: Final = 2
 """Largest group whose first person walks on the robot's line.
 
 In larger groups it walks in the middle, because others meet a robot at the side.
@@ -64,15 +64,15 @@ def _step(event: Event, state: EventState, number: int, query: EventQuery) -> Wa
     walker = state.walkers[number]
     sight = sight_of(event, number, query)
     heading_rad = event.heading_rad + (math.pi if from_front(number) else 0.0)
-    if from_front(number) and not gave_up(walker, query) and not _passed(event, walker, query):
+    if from_front(number) and not gives_up(walker, query) and not _passed(event, walker, query):
         if number == 0:
-            room_m = edge_m(event) if event.people <= MEETS_AMONG else 0.0
-            off_m = left_m(event, walker.x_m, walker.y_m) - met_m(state.lane_m, room_m)
+            room_m = edge_m(event) if event.people <= LARGEST_MEETING_GROUP else 0.0
+            off_m = left_m(event, walker.x_m, walker.y_m) - meeting_offset_m(state.lane_m, room_m)
             heading_rad += math.atan2(off_m, TO_LINE_M)
-        return pressed_on(walker, heading_rad, event.speed_mps, sight)
+        return walk_straight(walker, heading_rad, event.speed_mps, sight)
     if _across(event, walker, number):
         return walker
-    return walked_on(walker, heading_rad, event.speed_mps, sight)
+    return walk_on(walker, heading_rad, event.speed_mps, sight)
 
 
 def _ends(event: Event, state: EventState, query: EventQuery) -> bool:

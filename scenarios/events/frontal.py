@@ -11,7 +11,7 @@ from typing import Final
 
 from cosim.spec.events import Event, EventKind, EventQuery, EventState, SidewalkLayout, Walker
 from scenarios.events.sight import sight_of
-from scenarios.events.walking import aimed, gave_up, pressed_on, walked_on, walker_at
+from scenarios.events.walking import aim_at_robot, gives_up, walk_on, walk_straight, walker_at
 
 COMMIT_M: Final = 5.0
 """Distance in metres to the robot below which the person stops aiming and keeps its line."""
@@ -26,9 +26,11 @@ def _step(event: Event, state: EventState, number: int, query: EventQuery) -> Wa
     sight = sight_of(event, number, query)
     on_rad = event.heading_rad + math.pi
     if state.phase == "over":
-        return walked_on(walker, on_rad, event.speed_mps, sight)
-    walker, heading_rad = (walker, on_rad) if sight.robot_stands else aimed(walker, query, COMMIT_M)
-    return pressed_on(walker, heading_rad, event.speed_mps, sight)
+        return walk_on(walker, on_rad, event.speed_mps, sight)
+    walker, heading_rad = (
+        (walker, on_rad) if sight.robot_stands else aim_at_robot(walker, query, COMMIT_M)
+    )
+    return walk_straight(walker, heading_rad, event.speed_mps, sight)
 
 
 def _ends(event: Event, state: EventState, query: EventQuery) -> bool:
@@ -36,7 +38,7 @@ def _ends(event: Event, state: EventState, query: EventQuery) -> bool:
     dx, dy = query.robot_x_m - walker.x_m, query.robot_y_m - walker.y_m
     back_rad = event.heading_rad + math.pi
     passed = dx * math.cos(back_rad) + dy * math.sin(back_rad) < -1.0
-    return passed or gave_up(walker, query)
+    return passed or gives_up(walker, query)
 
 
 FRONTAL: Final = EventKind(

@@ -16,8 +16,8 @@ from cosim.core.state import Age, PersonKind
 from cosim.people.yielding import STEP_ROUND_GAP_M, touches
 from cosim.spec.events import INJECTED_ID, Actor, EventQuery, Walker
 from cosim.spec.injection import Injected, Injection
-from scenarios.events.sight import BESIDE_M, STILL_MPS, place_taken, sight_of_injected
-from scenarios.events.walking import robot_of, turned, walked_to
+from scenarios.events.sight import STANDING_MPS, STOPS_NEAR_M, goal_occupied, sight_of_injected
+from scenarios.events.walking import robot_body, turn_towards, walk_to
 
 
 class InjectedPerson(NamedTuple):
@@ -35,7 +35,7 @@ class InjectedPerson(NamedTuple):
     moved_m: float = 0.0
 
 
-def arriving(injected: Injected) -> InjectedPerson:
+def spawn_injected(injected: Injected) -> InjectedPerson:
     """Return an injected person at its first point, facing the second."""
     injection = injected.injection
     (x, y), *others = injection.path
@@ -47,24 +47,24 @@ def arriving(injected: Injected) -> InjectedPerson:
     )
 
 
-def injected_moved_on(person: InjectedPerson, query: EventQuery) -> InjectedPerson | None:
+def step_injected(person: InjectedPerson, query: EventQuery) -> InjectedPerson | None:
     """Advance an injected person by one tick; None once it disappears."""
     injection, walker = person.injection, person.walker
     if person.arrived_tick is not None:
         if (query.tick - person.arrived_tick) * query.tick_ms / 1000 >= injection.stay_s:
             return None
         if injection.heading_rad is not None:
-            heading = turned(walker.heading_rad, injection.heading_rad, query.tick_ms / 1000)
+            heading = turn_towards(walker.heading_rad, injection.heading_rad, query.tick_ms / 1000)
             walker = msgspec.structs.replace(walker, heading_rad=heading)
         return person._replace(
             walker=msgspec.structs.replace(walker, vx_mps=0.0, vy_mps=0.0), moved_m=0.0
         )
     goal = injection.path[person.leg]
-    sight = sight_of_injected(shown_id(injection), walker, query)
-    after = walked_to(walker, *goal, injection.speed_mps, sight)
+    sight = sight_of_injected(actor_id(injection), walker, query)
+    after = walk_to(walker, *goal, injection.speed_mps, sight)
     reached = (
         (after.x_m, after.y_m) == goal
-        or place_taken(walker, goal, sight)
+        or goal_occupied(walker, goal, sight)
         or _robot_stands_at(goal, walker, query)
     )
     vx_mps, vy_mps = (
@@ -82,15 +82,15 @@ def injected_moved_on(person: InjectedPerson, query: EventQuery) -> InjectedPers
 
 def _robot_stands_at(goal: tuple[float, float], walker: Walker, query: EventQuery) -> bool:
     """Return whether a standing robot blocks a point that the walker has come near."""
-    near = math.dist((walker.x_m, walker.y_m), goal) < BESIDE_M
+    near = math.dist((walker.x_m, walker.y_m), goal) < STOPS_NEAR_M
     return (
         near
-        and abs(query.robot_v_mps) < STILL_MPS
-        and touches(np.array(goal), robot_of(query), STEP_ROUND_GAP_M)
+        and abs(query.robot_v_mps) < STANDING_MPS
+        and touches(np.array(goal), robot_body(query), STEP_ROUND_GAP_M)
     )
 
 
-def shown_id(injection: Injection) -> str:
+def actor_id(injection: Injection) -> str:
     """Return the id of an injected person in the world."""
     return f"{INJECTED_ID}{injection.id}"
 
@@ -100,7 +100,7 @@ def injected_actor(person: InjectedPerson, tick_ms: int) -> Actor:
     walker = person.walker
     still = "stand" if person.arrived_tick is None else person.injection.doing
     return Actor(
-        id=shown_id(person.injection),
+        id=actor_id(person.injection),
         x_m=walker.x_m,
         y_m=walker.y_m,
         heading_rad=walker.heading_rad,

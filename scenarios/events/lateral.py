@@ -2,8 +2,8 @@
 
 Its direction is fixed at the trigger, and again after it avoided a person. Its speed follows the
 robot's: it slows down and stops with the robot, so slowing down does not let it cross. Once the
-robot has stood for `LET_CROSS_S`, it crosses to the other edge of the sidewalk and walks on along
-it.
+robot has stood for `CROSSES_AFTER_S`, it crosses to the other edge of the sidewalk and walks on
+along it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from cosim.core.state import PERSON_RADIUS_M
 from cosim.people.yielding import ROBOT_STANDS_MPS
 from cosim.spec.events import Event, EventKind, EventQuery, EventState, SidewalkLayout, Walker
 from scenarios.events.sight import sight_of
-from scenarios.events.walking import edge_m, gave_up, pressed_on, walked_on, walker_at
+from scenarios.events.walking import edge_m, gives_up, walk_on, walk_straight, walker_at
 
 SLOWEST_MPS: Final = 0.05
 """Lower bound of its speed in m/s."""
@@ -25,7 +25,7 @@ _FASTEST_MPS: Final = 2.0
 """Upper bound of its speed in m/s, for very fast robots."""
 _SQUARE: Final = 0.3
 """Smallest sine of the angle between both paths at which a meeting point is computed."""
-LET_CROSS_S: Final = 2.5
+CROSSES_AFTER_S: Final = 2.5
 """Seconds that the robot must stand before the person crosses first."""
 
 
@@ -37,11 +37,11 @@ def _step(event: Event, state: EventState, number: int, query: EventQuery) -> Wa
     walker = state.walkers[number]
     sight = sight_of(event, number, query)
     if state.phase == "over":
-        return walked_on(walker, event.heading_rad + math.pi, event.speed_mps, sight)
+        return walk_on(walker, event.heading_rad + math.pi, event.speed_mps, sight)
     across_rad = event.heading_rad - event.side * math.pi / 2
-    if state.robot_stood_ticks * query.tick_ms >= 1000 * LET_CROSS_S:
+    if state.robot_stood_ticks * query.tick_ms >= 1000 * CROSSES_AFTER_S:
         return msgspec.structs.replace(
-            walked_on(walker, across_rad, event.speed_mps, sight), aim_rad=None
+            walk_on(walker, across_rad, event.speed_mps, sight), aim_rad=None
         )
     if walker.aim_rad is None or walker.pace_mps is None:
         aim_rad, pace_mps = _course(event, walker, query)
@@ -51,14 +51,14 @@ def _step(event: Event, state: EventState, number: int, query: EventQuery) -> Wa
             return walker
         walker = msgspec.structs.replace(walker, pace_mps=now_mps)
     assert walker.aim_rad is not None and walker.pace_mps is not None
-    return pressed_on(walker, walker.aim_rad, walker.pace_mps, sight)
+    return walk_straight(walker, walker.aim_rad, walker.pace_mps, sight)
 
 
 def _ends(event: Event, state: EventState, query: EventQuery) -> bool:
     (walker,) = state.walkers
     dx, dy = walker.x_m - event.x_m, walker.y_m - event.y_m
     left_m = -dx * math.sin(event.heading_rad) + dy * math.cos(event.heading_rad)
-    return -event.side * left_m >= edge_m(event) or gave_up(walker, query)
+    return -event.side * left_m >= edge_m(event) or gives_up(walker, query)
 
 
 def _course(event: Event, walker: Walker, query: EventQuery) -> tuple[float, float]:

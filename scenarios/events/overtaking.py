@@ -18,11 +18,11 @@ from scenarios.events.walking import (
     along_m,
     edge_m,
     left_m,
-    pressed_on,
-    spot,
-    walked_on,
-    walked_to,
+    walk_on,
+    walk_straight,
+    walk_to,
     walker_at,
+    world_point,
 )
 
 _FASTER_MPS: Final = 0.8
@@ -39,7 +39,7 @@ _BEFORE_ROBOT_M: Final = 1.5
 """Lead in metres at which it slows down on the robot's line."""
 ON_LINE_M: Final = 0.15
 """Lateral distance in metres at which it counts as on the robot's line."""
-SLOWED: Final = 0.5
+SLOWED_FRACTION: Final = 0.5
 """Its speed after cutting in, as a fraction of the robot's."""
 _CREEPS_MPS: Final = 0.1
 """Lowest speed in m/s after cutting in."""
@@ -61,9 +61,11 @@ def _step(event: Event, state: EventState, number: int, query: EventQuery) -> Wa
     walker = state.walkers[number]
     sight = sight_of(event, number, query)
     if state.phase == "over":
-        return walked_on(walker, event.heading_rad, event.speed_mps, sight)
+        return walk_on(walker, event.heading_rad, event.speed_mps, sight)
     if walker.pace_mps is not None:
-        return pressed_on(_eased(event, walker, query), event.heading_rad, walker.pace_mps, sight)
+        return walk_straight(
+            _eased(event, walker, query), event.heading_rad, walker.pace_mps, sight
+        )
     lead_m = _lead_m(event, walker, query)
     line_m = left_m(event, query.robot_x_m, query.robot_y_m)
     if walker.aim_rad is None and lead_m >= _CUTS_IN_M:
@@ -76,8 +78,8 @@ def _step(event: Event, state: EventState, number: int, query: EventQuery) -> Wa
     ):
         return msgspec.structs.replace(walker, pace_mps=_slowed_mps(query))
     pace_mps = min(max(event.speed_mps, query.robot_v_mps + _FASTER_MPS), _FASTEST_MPS)
-    aim = spot(event, along_m(event, walker.x_m, walker.y_m) + _LOOK_AHEAD_M, line_m)
-    return walked_to(walker, *aim, pace_mps, sight)
+    aim = world_point(event, along_m(event, walker.x_m, walker.y_m) + _LOOK_AHEAD_M, line_m)
+    return walk_to(walker, *aim, pace_mps, sight)
 
 
 def _eased(event: Event, walker: Walker, query: EventQuery) -> Walker:
@@ -96,7 +98,7 @@ def _eased(event: Event, walker: Walker, query: EventQuery) -> Walker:
 
 
 def _slowed_mps(query: EventQuery) -> float:
-    return max(SLOWED * query.robot_v_mps, _CREEPS_MPS)
+    return max(SLOWED_FRACTION * query.robot_v_mps, _CREEPS_MPS)
 
 
 def _beside_m(event: Event, line_m: float) -> float:

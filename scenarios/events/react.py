@@ -37,7 +37,7 @@ SHOWN_AHEAD_M = 60.0
 SHOWN_BEHIND_M = 30.0
 """Metres of route behind the robot within which people of an event exist."""
 
-LEAVES_M = 15.0
+REMOVED_BEYOND_M = 15.0
 """Distance in metres, out of the robot's sight, at which people of a finished event are removed."""
 
 
@@ -103,7 +103,7 @@ def _advance(kind: EventKind, event: Event, state: EventState, query: EventQuery
             lane_m=left_m(event, query.robot_x_m, query.robot_y_m),
         )
     if state.phase == "over" and all(
-        math.hypot(w.x_m - query.robot_x_m, w.y_m - query.robot_y_m) > LEAVES_M
+        math.hypot(w.x_m - query.robot_x_m, w.y_m - query.robot_y_m) > REMOVED_BEYOND_M
         for w in state.walkers
     ):
         return msgspec.structs.replace(state, phase="gone", since_tick=query.tick)

@@ -18,14 +18,14 @@ from shapely.geometry import LineString
 from cosim.core.geometry import wrap_angle
 from cosim.core.state import Age, Doing, PersonKind
 from cosim.people.steering import SHOULDER_TO_SHOULDER_M, Neighbour, Vector, steered
-from cosim.people.yielding import stepped_round, within_reach_m
+from cosim.people.yielding import reaction_distance_m, stepped_around
 from cosim.spec.events import Actor, EventQuery
 from scenarios.events.behaviour_graph import BehaviorGraph
-from scenarios.events.walking import robot_of, turned
+from scenarios.events.walking import robot_body, turn_towards
 
 SPEED_MPS: Final = (1.1, 1.65)
 """Range of walking speeds in m/s."""
-STAYS_S: Final = {
+STAY_RANGES_S: Final = {
     "bench": (20.0, 60.0),
     "window": (5.0, 25.0),
     "stop": (15.0, 60.0),
@@ -34,26 +34,26 @@ STAYS_S: Final = {
 """Ranges of the seconds that a resident stays, by activity."""
 _FAR_M: Final = 120.0
 """Largest walking distance in metres to a goal."""
-TO_DO: Final = 0.75
+SPOT_PROBABILITY: Final = 0.75
 """Probability of choosing an interaction spot over a waypoint, if one is available."""
 _APART_M: Final = 1.2
 """Smallest distance in metres between standing residents, except on a bench."""
 ACCELERATION_MPS2: Final = 3.0
 """Largest change of velocity in m/s^2."""
-ARRIVES_M: Final = 0.04
+ARRIVAL_M: Final = 0.04
 """Metres from the goal at which a resident arrives."""
-PASSES_M: Final = 0.3
+WAYPOINT_PASSED_M: Final = 0.3
 """Metres from a waypoint at which a resident heads for the next."""
-LOOKS_AHEAD_TICKS: Final = 8
+SHORTCUT_TICKS: Final = 8
 """Ticks between checks whether a waypoint can be skipped."""
 _GIVES_UP_S: Final = 3.0
 """Seconds without progress after which a resident chooses another goal."""
-TREADS_MPS: Final = 0.25
+TURNING_MPS: Final = 0.25
 """Animated speed in m/s while turning on the spot: `cosim.people.gait` blends from it."""
-LEAVES_S: Final = 0.55
+RISING_S: Final = 0.55
 """Seconds in which a body rises from its activity, such as sitting, before it moves."""
-LEAVES_MPS: Final = 0.3
-"""Animated speed in m/s during `LEAVES_S`."""
+RISING_MPS: Final = 0.3
+"""Animated speed in m/s during `RISING_S`."""
 _ABOUT: Final[tuple[Doing, ...]] = ("stand", "look", "phone")
 """Activities of an idle resident."""
 _FACES_RAD: Final = 0.02
@@ -113,14 +113,14 @@ def resident_actor(resident: Resident) -> Actor:
     )
 
 
-def wants_to_choose(resident: Resident, query: EventQuery) -> bool:
+def needs_new_goal(resident: Resident, query: EventQuery) -> bool:
     """Return whether its stay is over or it makes no progress."""
     if resident.phase == "walking":
         return resident.blocked_ticks * query.tick_ms / 1000 >= _GIVES_UP_S
-    return _here_s(resident, query) >= resident.stay_s + LEAVES_S
+    return _here_s(resident, query) >= resident.stay_s + RISING_S
 
 
-def next_errand(
+def choose_goal(
     resident: Resident, graph: BehaviorGraph, rng: np.random.Generator, taken: Collection[int]
 ) -> Resident:
     """Choose a new goal for a resident.
@@ -136,15 +136,15 @@ def next_errand(
     distance, _ = graph.distances(node)
     within = (distance > 0.0) & (distance < _FAR_M)
     within[sorted({*taken, resident.goal})] = False
-    goal = drawn_spot(graph, within, rng) if rng.random() < TO_DO else None
+    goal = draw_spot(graph, within, rng) if rng.random() < SPOT_PROBABILITY else None
     if goal is None:
-        goal = drawn_waypoint(graph, within, rng, taken)
+        goal = draw_waypoint(graph, within, rng, taken)
     if goal is None:
         return resident
-    return bound_for(resident._replace(way=(node, *graph.way(node, goal))), graph, goal, rng)
+    return assign_goal(resident._replace(way=(node, *graph.way(node, goal))), graph, goal, rng)
 
 
-def drawn_spot(
+def draw_spot(
     graph: BehaviorGraph, open_to: NDArray[np.bool_], rng: np.random.Generator
 ) -> int | None:
     """Draw an interaction spot: first the activity, then the node; None if there is none.
@@ -152,7 +152,9 @@ def drawn_spot(
     open_to: (N,) bool, the nodes to choose from.
     """
     offered = [
-        nodes for of_what in graph.by_what.values() if len(nodes := of_what[open_to[of_what]])
+        nodes
+        for of_what in graph.nodes_by_activity.values()
+        if len(nodes := of_what[open_to[of_what]])
     ]
     if not offered:
         return None
@@ -160,7 +162,7 @@ def drawn_spot(
     return int(nodes[int(rng.integers(len(nodes)))])
 
 
-def drawn_waypoint(
+def draw_waypoint(
     graph: BehaviorGraph,
     open_to: NDArray[np.bool_],
     rng: np.random.Generator,
@@ -178,12 +180,12 @@ def drawn_waypoint(
     return int(nodes[int(rng.integers(len(nodes)))]) if len(nodes) else None
 
 
-def bound_for(
+def assign_goal(
     resident: Resident, graph: BehaviorGraph, goal: int, rng: np.random.Generator
 ) -> Resident:
     """Set a resident's goal, its activity there and the duration."""
     spot = graph.spot(goal)
-    low, high = STAYS_S["idle" if spot is None else spot.what]
+    low, high = STAY_RANGES_S["idle" if spot is None else spot.what]
     stay_s = float(rng.uniform(low, high))
     doing = _ABOUT[int(rng.integers(len(_ABOUT)))]
     if spot is None and not graph.idle[goal]:
@@ -193,7 +195,7 @@ def bound_for(
     return resident._replace(goal=goal, doing=doing, stay_s=stay_s)
 
 
-def resident_moved_on(
+def step_resident(
     resident: Resident, graph: BehaviorGraph, query: EventQuery, neighbours: Sequence[Neighbour]
 ) -> Resident:
     """Advance a resident by one tick."""
@@ -202,7 +204,7 @@ def resident_moved_on(
     if resident.since_tick is None:
         return _turned(resident, graph, query)
     leaves = _here_s(resident, query) >= resident.stay_s
-    return resident._replace(shown_mps=LEAVES_MPS if leaves else 0.0)
+    return resident._replace(shown_mps=RISING_MPS if leaves else 0.0)
 
 
 def arrived(resident: Resident, graph: BehaviorGraph) -> Resident:
@@ -219,9 +221,9 @@ def arrived(resident: Resident, graph: BehaviorGraph) -> Resident:
 def _turned(resident: Resident, graph: BehaviorGraph, query: EventQuery) -> Resident:
     spot = graph.spot(resident.goal)
     wanted = resident.heading_rad if spot is None else spot.heading_rad
-    heading = turned(resident.heading_rad, wanted, query.tick_ms / 1000)
+    heading = turn_towards(resident.heading_rad, wanted, query.tick_ms / 1000)
     if abs(wrap_angle(heading - wanted)) > _FACES_RAD:
-        return resident._replace(heading_rad=heading, moving_mps=(0.0, 0.0), shown_mps=TREADS_MPS)
+        return resident._replace(heading_rad=heading, moving_mps=(0.0, 0.0), shown_mps=TURNING_MPS)
     return resident._replace(
         heading_rad=wanted, moving_mps=(0.0, 0.0), shown_mps=0.0, since_tick=query.tick
     )
@@ -239,7 +241,7 @@ def _walked(
     way = _ahead(resident, graph, query)
     x, y = graph.points[way[0]]
     far_m = math.dist(at, (x, y))
-    if len(way) == 1 and far_m < max(ARRIVES_M, 0.5 * resident.shown_mps * tick_s):
+    if len(way) == 1 and far_m < max(ARRIVAL_M, 0.5 * resident.shown_mps * tick_s):
         return arrived(resident, graph)._replace(
             moving_mps=((x - at[0]) / tick_s, (y - at[1]) / tick_s)
         )
@@ -254,7 +256,7 @@ def _walked(
     shown = math.hypot(*moved)
     heading = resident.heading_rad
     if shown > 0.1:
-        heading = turned(heading, math.atan2(moved[1], moved[0]), tick_s)
+        heading = turn_towards(heading, math.atan2(moved[1], moved[0]), tick_s)
     slow = shown < 0.3 * pace
     return resident._replace(
         x_m=after[0],
@@ -271,9 +273,9 @@ def _ahead(resident: Resident, graph: BehaviorGraph, query: EventQuery) -> tuple
     """Return the path without waypoints that are reached or can be skipped."""
     way = resident.way
     at = (resident.x_m, resident.y_m)
-    while len(way) > 1 and math.dist(at, graph.points[way[0]]) < PASSES_M:
+    while len(way) > 1 and math.dist(at, graph.points[way[0]]) < WAYPOINT_PASSED_M:
         way = way[1:]
-    looks = (query.tick + resident.number) % LOOKS_AHEAD_TICKS == 0
+    looks = (query.tick + resident.number) % SHORTCUT_TICKS == 0
     if len(way) > 1 and looks and covers(graph.ground, LineString([at, graph.points[way[1]]])):
         way = way[1:]
     return way
@@ -298,15 +300,15 @@ def _stepped(
 
     The current position if every detour is blocked.
     """
-    robot = robot_of(query)
+    robot = robot_body(query)
     for turn_rad in _DETOURS_RAD:
         cos, sin = math.cos(turn_rad), math.sin(turn_rad)
         onward = (
             at[0] + tick_s * (cos * velocity[0] - sin * velocity[1]),
             at[1] + tick_s * (sin * velocity[0] + cos * velocity[1]),
         )
-        if math.dist(onward, robot.pose[:2]) < within_reach_m(robot):
-            x, y = stepped_round(np.array([at]), np.array([onward]), robot)[0].tolist()
+        if math.dist(onward, robot.pose[:2]) < reaction_distance_m(robot):
+            x, y = stepped_around(np.array([at]), np.array([onward]), robot)[0].tolist()
             onward = x, y
         if graph.free(*onward) and not any(_nearer(at, onward, one) for one in neighbours):
             return onward

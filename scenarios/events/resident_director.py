@@ -27,27 +27,27 @@ from scenarios.events.resident import (
     SPEED_MPS,
     Resident,
     arrived,
-    bound_for,
-    drawn_spot,
-    drawn_waypoint,
-    next_errand,
+    assign_goal,
+    choose_goal,
+    draw_spot,
+    draw_waypoint,
+    needs_new_goal,
     resident_actor,
-    resident_moved_on,
-    wants_to_choose,
+    step_resident,
 )
-from scenarios.events.sight import SHARED, STILL_MPS
+from scenarios.events.sight import AVOIDANCE_SHARE, STANDING_MPS
 from sumo_nets.crowd.demand import FIRST_FILL_CLEAR_M, SIGHT_M
 from sumo_nets.crowd.group_sampling import ELDERLY_SHARE
 
-WITHIN_M: Final = 60.0
+APPEARS_WITHIN_M: Final = 60.0
 """Largest distance in metres from the robot at which residents appear."""
-GONE_M: Final = 70.0
+REMOVED_BEYOND_M: Final = 70.0
 """Distance in metres from the robot beyond which residents are removed."""
 _POPULATION_TICKS: Final = 10
 """Ticks between updates of the population."""
 _ROOM_M: Final = 1.5
 """Smallest distance in metres between a new resident and other people."""
-SETTLED: Final = 0.5
+SETTLED_PROBABILITY: Final = 0.5
 """Probability that a new resident is already at an interaction spot, if one is available."""
 _MOST_NEIGHBOURS: Final = 6
 """Largest number of people that a resident's steering considers."""
@@ -55,7 +55,7 @@ _KIND: Final = 0x8E51
 """Separates the random generators of residents from others with the same seed."""
 
 
-def among_residents(
+def with_residents(
     director: Director,
     scenario: Scenario,
     street_map: StreetMap,
@@ -117,28 +117,28 @@ class Residents:
             query.robot_x_m, query.robot_y_m, *_velocity(query.robot_v_mps, query.robot_heading_rad)
         )
         for number, resident in list(self._here.items()):
-            if wants_to_choose(resident, query):
+            if needs_new_goal(resident, query):
                 taken = {one.goal for one in self._here.values() if one.number != number}
-                resident = next_errand(
+                resident = choose_goal(
                     resident, self._graph, self._rng(number, resident.choices), taken
                 )
             self._here[number] = resident
         around = _around([one for one in self._here.values() if one.phase == "walking"], people)
         for number, resident in list(self._here.items()):
-            self._here[number] = resident_moved_on(
+            self._here[number] = step_resident(
                 resident, self._graph, query, (robot, *around.get(number, ()))
             )
 
     def _repopulate(self, query: EventQuery, people: People) -> None:
         robot = np.array([query.robot_x_m, query.robot_y_m])
         for number, one in list(self._here.items()):
-            if np.hypot(one.x_m - robot[0], one.y_m - robot[1]) > GONE_M:
+            if np.hypot(one.x_m - robot[0], one.y_m - robot[1]) > REMOVED_BEYOND_M:
                 del self._here[number]
         if len(self._here) >= self._count or not len(self._graph):
             return
         away = np.hypot(*(self._graph.xy - robot).T)
         nearest = SIGHT_M if query.tick else FIRST_FILL_CLEAR_M
-        ring = (away >= nearest) & (away <= WITHIN_M)
+        ring = (away >= nearest) & (away <= APPEARS_WITHIN_M)
         ring[[one.goal for one in self._here.values()]] = False
         for _ in range(self._count - len(self._here)):
             others = np.array(
@@ -160,10 +160,10 @@ class Residents:
         number, graph = self._next, self._graph
         rng = self._rng(number, 0)
         self._next += 1
-        node = drawn_spot(graph, ring, rng) if rng.random() < SETTLED else None
+        node = draw_spot(graph, ring, rng) if rng.random() < SETTLED_PROBABILITY else None
         settled = node is not None
         if node is None:
-            node = drawn_waypoint(graph, ring, rng, ())
+            node = draw_waypoint(graph, ring, rng, ())
         if node is None or (np.hypot(*(others - graph.xy[node]).T) < _ROOM_M).any():
             return None
         x, y = graph.xy[node].tolist()
@@ -171,10 +171,10 @@ class Residents:
         heading = float(rng.uniform(-np.pi, np.pi)) if spot is None else spot.heading_rad
         one = Resident(number, x, y, heading, float(rng.uniform(*SPEED_MPS)), node, choices=1)
         if settled:
-            one = arrived(bound_for(one, graph, node, rng), graph)
+            one = arrived(assign_goal(one, graph, node, rng), graph)
             one = one._replace(since_tick=query.tick, stay_s=one.stay_s * float(rng.random()))
         else:
-            one = next_errand(one, graph, rng, {other.goal for other in self._here.values()})
+            one = choose_goal(one, graph, rng, {other.goal for other in self._here.values()})
         return one._replace(age=Age.ELDERLY if rng.random() < ELDERLY_SHARE else Age.ADULT)
 
     def _rng(self, number: int, choice: int) -> np.random.Generator:
@@ -193,8 +193,8 @@ def _around(walking: Sequence[Resident], people: People) -> dict[int, list[Neigh
         if people.ids[i] != walking[k].name:
             moving = _velocity(float(people.speed[i]), float(people.heading[i]))
             x, y = people.xy[i].tolist()
-            steers = people.kind[i] != PersonKind.CROWD and people.speed[i] > STILL_MPS
-            one = Neighbour(x, y, *moving, SHARED if steers else 1.0)
+            steers = people.kind[i] != PersonKind.CROWD and people.speed[i] > STANDING_MPS
+            one = Neighbour(x, y, *moving, AVOIDANCE_SHARE if steers else 1.0)
             found[walking[k].number].append((float(square[k, i]), one))
     return {
         number: [one for _, one in sorted(near)[:_MOST_NEIGHBOURS]]

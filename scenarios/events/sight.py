@@ -12,7 +12,7 @@ from cosim.core.state import PERSON_RADIUS_M, PersonKind
 from cosim.people.orca import HalfPlane
 from cosim.people.steering import (
     HORIZON_S,
-    ROOM_M,
+    PASSING_DISTANCE_M,
     SHOULDER_TO_SHOULDER_M,
     Neighbour,
     Vector,
@@ -21,24 +21,24 @@ from cosim.people.steering import (
 from cosim.people.yielding import STOOD_S
 from cosim.spec.events import Event, EventQuery, NearbyPerson, Walker
 
-COMES_UP_M = 1.5
+APPROACH_M = 1.5
 """Metres from an occupied goal below which an insisting person approaches instead of avoiding."""
 
-BESIDE_M = 1.0
+STOPS_NEAR_M = 1.0
 """Metres from an occupied goal at which a person that does not insist stops."""
 
-STILL_MPS = 0.1
+STANDING_MPS = 0.1
 """Speed in m/s below which a person counts as standing."""
 
-SQUEEZES_S = 3.0
+SMALL_GAPS_AFTER_S = 3.0
 """Seconds after which a person insisting on its goal accepts smaller gaps."""
-PRESSES_S = 6.0
+IGNORES_CROWD_AFTER_S = 6.0
 """Seconds after which a person insisting on its goal ignores the crowd."""
 
-SAME_M = 0.001
+SAME_POSITION_M = 0.001
 """Metres below which two people count as being at the same position."""
 
-SHARED = 0.5
+AVOIDANCE_SHARE = 0.5
 """Fraction of the avoidance that each of two people using the same steering takes."""
 
 
@@ -53,7 +53,7 @@ class Sight(NamedTuple):
     query: EventQuery
     others: Sequence[Neighbour] = ()
     event: Event | None = None
-    room_m: float = ROOM_M
+    room_m: float = PASSING_DISTANCE_M
     robot_stands: bool = False
 
 
@@ -64,15 +64,15 @@ def sight_of(event: Event, number: int, query: EventQuery, waited_s: float = 0.0
     waited_s: Seconds it has been on its way to a goal on which it insists.
     """
     others = [
-        fellow(walker)
+        cooperative_neighbour(walker)
         for one, state in zip(query.events, query.states, strict=False)
         if state.phase != "gone"
         for k, walker in enumerate(state.walkers)
         if (one.id, k) != (event.id, number)
     ]
-    if waited_s < PRESSES_S:
-        others += met(query.nearby)
-    room_m = ROOM_M if waited_s < SQUEEZES_S else SHOULDER_TO_SHOULDER_M
+    if waited_s < IGNORES_CROWD_AFTER_S:
+        others += nearby_neighbours(query.nearby)
+    room_m = PASSING_DISTANCE_M if waited_s < SMALL_GAPS_AFTER_S else SHOULDER_TO_SHOULDER_M
     ticks = max((state.robot_stood_ticks for state in query.states), default=0)
     stands = ticks * query.tick_ms >= 1000 * STOOD_S
     return Sight(query, others + standing_robot(query) if stands else others, event, room_m, stands)
@@ -94,7 +94,7 @@ def sight_of_injected(name: str, person: Walker, query: EventQuery) -> Sight:
         walker for state in query.states if state.phase != "gone" for walker in state.walkers
     ]
     others = (_separated(name, person, one) for one in query.nearby if one.id != name)
-    return Sight(query, [*map(fellow, walkers), *met(others)])
+    return Sight(query, [*map(cooperative_neighbour, walkers), *nearby_neighbours(others)])
 
 
 def _separated(name: str, person: Walker, other: NearbyPerson) -> NearbyPerson:
@@ -102,39 +102,43 @@ def _separated(name: str, person: Walker, other: NearbyPerson) -> NearbyPerson:
 
     Otherwise two people injected at one point would walk inside each other for ever.
     """
-    if math.hypot(other.x_m - person.x_m, other.y_m - person.y_m) > SAME_M:
+    if math.hypot(other.x_m - person.x_m, other.y_m - person.y_m) > SAME_POSITION_M:
         return other
-    left_m = SAME_M if name < other.id else -SAME_M
+    left_m = SAME_POSITION_M if name < other.id else -SAME_POSITION_M
     cos, sin = math.cos(person.heading_rad), math.sin(person.heading_rad)
     return msgspec.structs.replace(
         other, x_m=person.x_m - left_m * sin, y_m=person.y_m + left_m * cos
     )
 
 
-def fellow(walker: Walker | NearbyPerson) -> Neighbour:
+def cooperative_neighbour(walker: Walker | NearbyPerson) -> Neighbour:
     """Return a person that uses the same steering; a standing one does not move aside."""
     moves = walker.vx_mps != 0.0 or walker.vy_mps != 0.0
-    return Neighbour(walker.x_m, walker.y_m, walker.vx_mps, walker.vy_mps, SHARED if moves else 1.0)
+    return Neighbour(
+        walker.x_m, walker.y_m, walker.vx_mps, walker.vy_mps, AVOIDANCE_SHARE if moves else 1.0
+    )
 
 
-def met(nearby: Iterable[NearbyPerson]) -> list[Neighbour]:
+def nearby_neighbours(nearby: Iterable[NearbyPerson]) -> list[Neighbour]:
     """Return people nearby as neighbours; the crowd does not avoid, others do."""
     return [
-        Neighbour(b.x_m, b.y_m, b.vx_mps, b.vy_mps) if b.kind == PersonKind.CROWD else fellow(b)
+        Neighbour(b.x_m, b.y_m, b.vx_mps, b.vy_mps)
+        if b.kind == PersonKind.CROWD
+        else cooperative_neighbour(b)
         for b in nearby
     ]
 
 
-def place_taken(walker: Walker, goal: Vector, sight: Sight) -> bool:
+def goal_occupied(walker: Walker, goal: Vector, sight: Sight) -> bool:
     """Return whether a person stands at the walker's goal, and the walker has come near."""
-    return math.dist((walker.x_m, walker.y_m), goal) < BESIDE_M and any(
+    return math.dist((walker.x_m, walker.y_m), goal) < STOPS_NEAR_M and any(
         math.dist(other[:2], goal) < SHOULDER_TO_SHOULDER_M
-        and math.hypot(other.vx_mps, other.vy_mps) < STILL_MPS
+        and math.hypot(other.vx_mps, other.vy_mps) < STANDING_MPS
         for other in sight.others
     )
 
 
-def led_round(
+def avoiding_step(
     walker: Walker,
     wanted: Vector,
     sight: Sight,
@@ -156,7 +160,7 @@ def led_round(
     if goal is not None:
         far_m = math.dist(at, goal)
         horizon_s = min(HORIZON_S, max(far_m / max(math.hypot(*velocity), 1e-9), tick_s))
-        if insisting and far_m < COMES_UP_M:
+        if insisting and far_m < APPROACH_M:
             others = [
                 other for other in others if math.dist(other[:2], goal) > SHOULDER_TO_SHOULDER_M
             ]
@@ -169,12 +173,12 @@ def led_round(
         others,
         horizon_s=horizon_s,
         room_m=sight.room_m,
-        walls=edges(walker, wanted, sight.event, tick_s),
+        walls=edge_half_planes(walker, wanted, sight.event, tick_s),
     )
     return wanted if (vx, vy) == velocity else (at[0] + vx * tick_s, at[1] + vy * tick_s)
 
 
-def edges(
+def edge_half_planes(
     walker: Walker, wanted: Vector, event: Event | None, tick_s: float
 ) -> tuple[HalfPlane, ...]:
     """Return half-planes of velocities that keep a person on the ground of its event.

@@ -17,18 +17,18 @@ import numpy as np
 from cosim.core.geometry import Pose, wrap_angle
 from cosim.core.state import PERSON_RADIUS_M
 from cosim.people.yielding import ROBOT_STANDS_MPS
-from cosim.results.referee import STOP_S, stands_before
+from cosim.results.referee import STOP_S, is_in_front_of_event
 from cosim.spec.events import Event, EventKind, EventQuery, EventState, SidewalkLayout, Walker
 from scenarios.events.sight import sight_of
 from scenarios.events.walking import (
-    ON_THE_MIDDLE_M,
+    MIDDLE_M,
     along_m,
     edge_m,
-    met_m,
-    spot,
-    turned,
-    walked_to,
+    meeting_offset_m,
+    turn_towards,
+    walk_to,
     walker_at,
+    world_point,
 )
 
 _TRIGGER_M: Final = 10.0
@@ -63,7 +63,7 @@ def talking_places(event: Event, lane_m: float) -> tuple[_Place, ...]:
     """Return places on a circle, two of them side by side across the robot's path."""
     radius_m = TALK_M * (1.15 if event.people == 4 else 1.0)
     angles = [math.pi / 2 + 2.0 * math.pi * k / event.people for k in range(event.people)]
-    left_m = met_m(lane_m, max(edge_m(event) - radius_m, 0.0))
+    left_m = meeting_offset_m(lane_m, max(edge_m(event) - radius_m, 0.0))
     return tuple((radius_m * math.cos(a), left_m + radius_m * math.sin(a)) for a in angles)
 
 
@@ -75,12 +75,12 @@ def queue_places(event: Event, lane_m: float) -> tuple[_Place, ...]:
 
 
 def _queue_side(event: Event, lane_m: float) -> float:
-    return math.copysign(1.0, lane_m) if abs(lane_m) > ON_THE_MIDDLE_M else event.side
+    return math.copysign(1.0, lane_m) if abs(lane_m) > MIDDLE_M else event.side
 
 
-def in_the_way(event: Event, lane_m: float) -> tuple[_Place, ...]:
+def obstructing_places(event: Event, lane_m: float) -> tuple[_Place, ...]:
     """Return the place of a single person."""
-    return ((0.0, met_m(lane_m, edge_m(event))),)
+    return ((0.0, meeting_offset_m(lane_m, edge_m(event))),)
 
 
 def _aside(event: Event, number: int) -> _Place:
@@ -105,22 +105,22 @@ def _obeyed(event: Event, state: EventState, query: EventQuery) -> bool:
 
 
 def _standing(places: _Places, facing: _Facing) -> _Step:
-    """Build the step function of people who go to `places` and face as `facing` says."""
+    """Build the step function of people who go to `places` and face as `heading_after` says."""
 
     def step(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:
         walker = state.walkers[number]
         acting = state.phase == "acting"
         tick_s = query.tick_ms / 1000
-        x_m, y_m = spot(
+        x_m, y_m = world_point(
             event, *(places(event, state.lane_m)[number] if acting else _aside(event, number))
         )
         if (walker.x_m, walker.y_m) != (x_m, y_m):
             sight = sight_of(
                 event, number, query, (query.tick - state.since_tick) * tick_s if acting else 0.0
             )
-            return walked_to(walker, x_m, y_m, event.speed_mps, sight, insisting=acting)
+            return walk_to(walker, x_m, y_m, event.speed_mps, sight, insisting=acting)
         if acting:
-            heading = turned(walker.heading_rad, facing(event, walker, query, state), tick_s)
+            heading = turn_towards(walker.heading_rad, facing(event, walker, query, state), tick_s)
             return msgspec.structs.replace(walker, heading_rad=heading)
         return walker
 
@@ -133,7 +133,9 @@ def _with_hand(step: _Step) -> _Step:
     def counted(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:
         after = step(event, state, number, query)
         pose = Pose(query.robot_x_m, query.robot_y_m, query.robot_heading_rad)
-        stands = abs(query.robot_v_mps) < ROBOT_STANDS_MPS and stands_before(pose, event, state)
+        stands = abs(query.robot_v_mps) < ROBOT_STANDS_MPS and is_in_front_of_event(
+            pose, event, state
+        )
         ticks = after.counted_ticks + 1 if stands and state.phase == "acting" else 0
         return msgspec.structs.replace(after, counted_ticks=ticks)
 
@@ -149,7 +151,7 @@ def _about(event: Event, walker: Walker, query: EventQuery, state: EventState) -
 def _inward(event: Event, walker: Walker, query: EventQuery, state: EventState) -> float:
     """Return the heading to the middle of the group."""
     places = talking_places(event, state.lane_m)
-    x_m, y_m = spot(event, 0.0, sum(left for _, left in places) / len(places))
+    x_m, y_m = world_point(event, 0.0, sum(left for _, left in places) / len(places))
     return math.atan2(y_m - walker.y_m, x_m - walker.x_m)
 
 
@@ -173,7 +175,7 @@ OBSTRUCTING: Final = EventKind(
     layout=_PASSABLE,
     trigger_m=_TRIGGER_M,
     begin=_begin,
-    step=_standing(in_the_way, _about),
+    step=_standing(obstructing_places, _about),
     ends=_ends,
     pose="look",
 )
@@ -186,7 +188,7 @@ CONVERSING: Final = EventKind(
     step=_standing(talking_places, _inward),
     ends=_ends,
     pose="talk",
-    passed_round=True,
+    passed_as_group=True,
 )
 QUEUEING: Final = EventKind(
     name="queueing",
@@ -198,14 +200,14 @@ QUEUEING: Final = EventKind(
     step=_standing(queue_places, _forward),
     ends=_ends,
     pose="queue",
-    passed_round=True,
+    passed_as_group=True,
 )
 GESTURING: Final = EventKind(
     name="gesturing",
     layout=_PASSABLE,
     trigger_m=_TRIGGER_M,
     begin=_begin,
-    step=_with_hand(_standing(in_the_way, _at_robot)),
+    step=_with_hand(_standing(obstructing_places, _at_robot)),
     ends=_obeyed,
     pose="stop",
     ends_at="stop",

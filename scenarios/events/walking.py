@@ -13,15 +13,21 @@ import numpy as np
 from cosim.core.geometry import Pose, wrap_angle
 from cosim.core.state import PERSON_RADIUS_M
 from cosim.people.steering import Vector
-from cosim.people.yielding import RobotBody, as_met, stepped_round, touches, within_reach_m
+from cosim.people.yielding import (
+    RobotBody,
+    obstacle_body,
+    reaction_distance_m,
+    stepped_around,
+    touches,
+)
 from cosim.spec.events import Event, EventQuery, Walker
-from scenarios.events.sight import Sight, led_round, place_taken
+from scenarios.events.sight import Sight, avoiding_step, goal_occupied
 
 EDGE_GAP_M = 0.1
 """Gap in metres between a person's shoulder and the edge of the sidewalk."""
 TURN_RADPS = math.pi
 """Turning rate of a person in rad/s."""
-ON_THE_MIDDLE_M = 0.3
+MIDDLE_M = 0.3
 """Lateral offset in metres up to which a robot counts as driving on the middle."""
 SLOW_MPS = 0.3
 """Speed in m/s below which motion does not change a person's heading."""
@@ -36,11 +42,11 @@ def walker_at(event: Event, along_m: float, left_m: float, facing_rad: float) ->
 
     facing_rad: Heading relative to the event's heading.
     """
-    x_m, y_m = spot(event, along_m, left_m)
+    x_m, y_m = world_point(event, along_m, left_m)
     return Walker(x_m=x_m, y_m=y_m, heading_rad=wrap_angle(event.heading_rad + facing_rad))
 
 
-def spot(event: Event, along_m: float, left_m: float) -> tuple[float, float]:
+def world_point(event: Event, along_m: float, left_m: float) -> tuple[float, float]:
     """Convert event coordinates to world metres."""
     cos, sin = math.cos(event.heading_rad), math.sin(event.heading_rad)
     return event.x_m + cos * along_m - sin * left_m, event.y_m + sin * along_m + cos * left_m
@@ -65,28 +71,28 @@ def edge_m(event: Event) -> float:
     return max(event.half_width_m - PERSON_RADIUS_M - EDGE_GAP_M, 0.0)
 
 
-def met_m(lane_m: float, room_m: float) -> float:
+def meeting_offset_m(lane_m: float, room_m: float) -> float:
     """Return the lateral offset at which to meet a robot.
 
     lane_m: The robot's lateral offset at the trigger.
     room_m: Largest offset to either side.
     """
-    return max(-room_m, min(room_m, lane_m)) if abs(lane_m) > ON_THE_MIDDLE_M else 0.0
+    return max(-room_m, min(room_m, lane_m)) if abs(lane_m) > MIDDLE_M else 0.0
 
 
-def robot_of(query: EventQuery) -> RobotBody:
+def robot_body(query: EventQuery) -> RobotBody:
     """Return the robot's body from a query."""
     pose = Pose(query.robot_x_m, query.robot_y_m, query.robot_heading_rad)
     return RobotBody(pose, (query.robot_length_m / 2, query.robot_width_m / 2), query.robot_v_mps)
 
 
-def turned(heading_rad: float, wanted_rad: float, tick_s: float) -> float:
+def turn_towards(heading_rad: float, wanted_rad: float, tick_s: float) -> float:
     """Return the heading after turning for one tick at a human rate."""
     error = wrap_angle(wanted_rad - heading_rad)
     return wrap_angle(heading_rad + max(-TURN_RADPS * tick_s, min(TURN_RADPS * tick_s, error)))
 
 
-def walked_to(
+def walk_to(
     walker: Walker,
     x_m: float,
     y_m: float,
@@ -99,7 +105,7 @@ def walked_to(
 
     insisting: Approach the point even if it is occupied; otherwise the walker stops near it.
     """
-    if not insisting and place_taken(walker, (x_m, y_m), sight):
+    if not insisting and goal_occupied(walker, (x_m, y_m), sight):
         return walker
     tick_s = sight.query.tick_ms / 1000
     dx, dy = x_m - walker.x_m, y_m - walker.y_m
@@ -109,12 +115,12 @@ def walked_to(
     heading = (
         walker.heading_rad
         if share == 1.0
-        else turned(walker.heading_rad, math.atan2(dy, dx), tick_s)
+        else turn_towards(walker.heading_rad, math.atan2(dy, dx), tick_s)
     )
-    return stepped(walker, wanted, heading, sight, goal=(x_m, y_m), insisting=insisting)
+    return step_around(walker, wanted, heading, sight, goal=(x_m, y_m), insisting=insisting)
 
 
-def walked_on(walker: Walker, heading_rad: float, speed_mps: float, sight: Sight) -> Walker:
+def walk_on(walker: Walker, heading_rad: float, speed_mps: float, sight: Sight) -> Walker:
     """Move one tick in a direction, around people and the robot."""
     tick_s = sight.query.tick_ms / 1000
     step_m = speed_mps * tick_s
@@ -122,10 +128,10 @@ def walked_on(walker: Walker, heading_rad: float, speed_mps: float, sight: Sight
         walker.x_m + math.cos(heading_rad) * step_m,
         walker.y_m + math.sin(heading_rad) * step_m,
     )
-    return stepped(walker, onward, turned(walker.heading_rad, heading_rad, tick_s), sight)
+    return step_around(walker, onward, turn_towards(walker.heading_rad, heading_rad, tick_s), sight)
 
 
-def stepped(
+def step_around(
     walker: Walker,
     wanted: Vector,
     heading_rad: float,
@@ -136,41 +142,41 @@ def stepped(
 ) -> Walker:
     """Move one step, changed in turn to avoid people, obstacles and the robot."""
     led = _round_things(
-        walker, led_round(walker, wanted, sight, goal, insisting=insisting), sight.query
+        walker, avoiding_step(walker, wanted, sight, goal, insisting=insisting), sight.query
     )
     if led != wanted:
-        heading_rad = facing(walker, led, sight)
-    x_m, y_m = _round_body(walker, led, robot_of(sight.query))
+        heading_rad = heading_after(walker, led, sight)
+    x_m, y_m = _round_body(walker, led, robot_body(sight.query))
     return msgspec.structs.replace(walker, x_m=x_m, y_m=y_m, heading_rad=heading_rad)
 
 
 def _round_things(walker: Walker, wanted: Vector, query: EventQuery) -> Vector:
     """Return where a step to `wanted` (m) ends after avoiding obstacles."""
     for thing in query.standing:
-        moved = _round_body(walker, wanted, as_met(thing))
+        moved = _round_body(walker, wanted, obstacle_body(thing))
         wanted = wanted if math.dist(wanted, moved) < _SAME_M else moved
     return wanted
 
 
 def _round_body(walker: Walker, wanted: Vector, body: RobotBody) -> Vector:
     """Return where a step to `wanted` (m) ends after avoiding a body."""
-    if math.dist(wanted, body.pose[:2]) >= within_reach_m(body):
+    if math.dist(wanted, body.pose[:2]) >= reaction_distance_m(body):
         return wanted
     start = np.array([[walker.x_m, walker.y_m]])
-    x_m, y_m = stepped_round(start, np.array([wanted]), body)[0].tolist()
+    x_m, y_m = stepped_around(start, np.array([wanted]), body)[0].tolist()
     return x_m, y_m
 
 
-def facing(walker: Walker, after: Vector, sight: Sight) -> float:
+def heading_after(walker: Walker, after: Vector, sight: Sight) -> float:
     """Return the heading after a changed step: the direction of motion, or unchanged if blocked."""
     dx, dy = after[0] - walker.x_m, after[1] - walker.y_m
     tick_s = sight.query.tick_ms / 1000
     if math.hypot(dx, dy) < SLOW_MPS * tick_s:
         return walker.heading_rad
-    return turned(walker.heading_rad, math.atan2(dy, dx), tick_s)
+    return turn_towards(walker.heading_rad, math.atan2(dy, dx), tick_s)
 
 
-def aimed(walker: Walker, query: EventQuery, commit_m: float) -> tuple[Walker, float]:
+def aim_at_robot(walker: Walker, query: EventQuery, commit_m: float) -> tuple[Walker, float]:
     """Return the walker and its heading (rad) at the robot's position.
 
     commit_m: Distance to the robot below which the walker keeps its heading.
@@ -183,32 +189,30 @@ def aimed(walker: Walker, query: EventQuery, commit_m: float) -> tuple[Walker, f
     return msgspec.structs.replace(walker, aim_rad=heading_rad) if commits else walker, heading_rad
 
 
-def pressed_on(walker: Walker, heading_rad: float, speed_mps: float, sight: Sight) -> Walker:
+def walk_straight(walker: Walker, heading_rad: float, speed_mps: float, sight: Sight) -> Walker:
     """Move one tick straight ahead without avoiding a moving robot, but around people.
 
     A walker in contact with the robot stops. One that avoids people has to aim again.
     """
     if sight.robot_stands:
-        return msgspec.structs.replace(
-            walked_on(walker, heading_rad, speed_mps, sight), aim_rad=None
-        )
-    if touches(np.array([walker.x_m, walker.y_m]), robot_of(sight.query)):
+        return msgspec.structs.replace(walk_on(walker, heading_rad, speed_mps, sight), aim_rad=None)
+    if touches(np.array([walker.x_m, walker.y_m]), robot_body(sight.query)):
         return msgspec.structs.replace(walker, blocked_ticks=walker.blocked_ticks + 1)
     step_m = speed_mps * sight.query.tick_ms / 1000
     wanted = (
         walker.x_m + math.cos(heading_rad) * step_m,
         walker.y_m + math.sin(heading_rad) * step_m,
     )
-    x_m, y_m = led = _round_things(walker, led_round(walker, wanted, sight), sight.query)
+    x_m, y_m = led = _round_things(walker, avoiding_step(walker, wanted, sight), sight.query)
     if led == wanted:
         return msgspec.structs.replace(
             walker, x_m=x_m, y_m=y_m, heading_rad=wrap_angle(heading_rad)
         )
     return msgspec.structs.replace(
-        walker, x_m=x_m, y_m=y_m, heading_rad=facing(walker, led, sight), aim_rad=None
+        walker, x_m=x_m, y_m=y_m, heading_rad=heading_after(walker, led, sight), aim_rad=None
     )
 
 
-def gave_up(walker: Walker, query: EventQuery) -> bool:
+def gives_up(walker: Walker, query: EventQuery) -> bool:
     """Return whether a person has been in contact with the robot for long enough."""
     return walker.blocked_ticks * query.tick_ms / 1000 >= _GIVES_UP_S

@@ -16,10 +16,10 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from cosim.core.child_process import ended_in_words
+from cosim.core.child_process import exit_in_words
 from cosim.core.errors import MachineError, UsageError, unwritable
-from cosim.core.framing import MOST_WIRED_BYTES, Wire
-from scenarios.ipc.deadlines import Asked, Patience, Question
+from cosim.core.framing import MAX_MESSAGE_BYTES, MessageSocket
+from scenarios.ipc.deadlines import Patience, PendingCall, PendingCallMemory
 from scenarios.ipc.messages import (
     Job,
     Message,
@@ -42,7 +42,7 @@ _CODE: Final = (
 )
 
 
-class KeptProcess:
+class ChildProcess:
     """A supervisor process and its worker (`scenarios.ipc.supervisor`).
 
     log: file of its output, None for this process's standard error.
@@ -59,16 +59,16 @@ class KeptProcess:
         serves: str,
         called: str,
         also: tuple[int, ...] = (),
-        most_bytes: int = MOST_WIRED_BYTES,
+        most_bytes: int = MAX_MESSAGE_BYTES,
     ) -> None:
         self.log = str(log)
         self.open = True
         self.called = called
-        self._asked = Asked.new()
-        self._last_asked: Question | None = None
+        self._asked = PendingCallMemory.new()
+        self._last_asked: PendingCall | None = None
         self.in_engine = False
         ours, theirs = socket.socketpair()
-        self.wire = Wire(ours, most_bytes)
+        self.wire = MessageSocket(ours, most_bytes)
         given = (theirs.fileno(), self._asked.descriptor, *also)
         path = [str(Path(entry).absolute()) for entry in sys.path]
         code = _CODE.format(path=path, serves=serves, given=given, run=os.getpid())
@@ -88,7 +88,7 @@ class KeptProcess:
             theirs.close()
 
     @property
-    def question(self) -> Question | None:
+    def question(self) -> PendingCall | None:
         """Return the pending call of the policy; after the end, the one that was pending then."""
         return self._asked.question if self.open else self._last_asked
 
@@ -153,7 +153,7 @@ class KeptProcess:
 
 
 def _in_words(code: int | None) -> str:
-    return "closed its pipe to the run" if code is None else ended_in_words(code)
+    return "closed its pipe to the run" if code is None else exit_in_words(code)
 
 
 class ProcessEnd(NamedTuple):
@@ -167,7 +167,7 @@ class ProcessEnd(NamedTuple):
     """
 
     words: str
-    question: Question | None = None
+    question: PendingCall | None = None
     in_engine: bool = False
     hung: bool = False
     allowed_s: float | None = None
@@ -181,7 +181,7 @@ class Watchdog:
     heard_s: monotonic clock of its last message.
     """
 
-    def __init__(self, process: KeptProcess, patience: Patience, silence_s: float) -> None:
+    def __init__(self, process: ChildProcess, patience: Patience, silence_s: float) -> None:
         self.process = process
         self.ready = False
         self.heard_s = time.monotonic()

@@ -10,7 +10,7 @@ import struct
 import time
 from typing import Final, NamedTuple, get_args
 
-from cosim.episode.policy_caller import LOADED_WITHIN_S, PolicyCall, when
+from cosim.episode.policy_caller import LOAD_TIMEOUT_S, PolicyCall, when
 from scenarios.ipc.shared_memory import SharedMemory
 
 _DOINGS: Final[tuple[PolicyCall, ...]] = get_args(PolicyCall)
@@ -26,7 +26,7 @@ class Patience(NamedTuple):
     """
 
     answer_s: float = 60.0
-    start_s: float = LOADED_WITHIN_S
+    start_s: float = LOAD_TIMEOUT_S
 
     def of(self, doing: PolicyCall) -> float:
         """Return the timeout of a kind of call."""
@@ -52,7 +52,7 @@ class ServerTimes(NamedTuple):
     pause_s: float = 0.05
 
 
-class Question(NamedTuple):
+class PendingCall(NamedTuple):
     """A pending call of a policy.
 
     since_s: its start on the monotonic clock, which all processes of a machine share.
@@ -72,7 +72,7 @@ class Question(NamedTuple):
         return when(self.doing, self.tick)
 
 
-class Asked(SharedMemory):
+class PendingCallMemory(SharedMemory):
     """Shared memory with the pending call: created by the run, written as `Timer` by the policy's
     process."""
 
@@ -83,7 +83,7 @@ class Asked(SharedMemory):
         _LAYOUT.pack_into(self.map, 0, 0.0, 0, 0)
 
     @property
-    def question(self) -> Question | None:
+    def question(self) -> PendingCall | None:
         """Return the pending call; None without one."""
         since_s, doing, tick = _LAYOUT.unpack_from(self.map, 0)
-        return Question(since_s, _DOINGS[doing], tick) if since_s else None
+        return PendingCall(since_s, _DOINGS[doing], tick) if since_s else None

@@ -9,7 +9,7 @@ import msgspec
 from cosim.results.record import Status
 from cosim.results.run_setup import RunSetup
 from cosim.spec.manifest import Manifest
-from cosim.spec.options import EpisodeOptions, PolicyHost, RendererAt
+from cosim.spec.options import EpisodeOptions, PolicyHost, RendererAddress
 from cosim.spec.scenario import Scenario
 from scenarios.ipc.deadlines import Patience
 
@@ -27,7 +27,7 @@ class Hello(msgspec.Struct, frozen=True, tag=True):
     policy: str
     manifest: Manifest
     source_hash: str
-    renderer: RendererAt | None = None
+    renderer: RendererAddress | None = None
     host: PolicyHost = PolicyHost()
     learner: Hello | None = None
     patience: Patience = Patience()

@@ -12,9 +12,16 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon, Polygon
 
-from bridge.policy_server import AboutEpisode, EpisodeDecoder
+from bridge.policy_server import EpisodeConstants, EpisodeDecoder
 from cosim.core.geometry import Polyline
-from cosim.core.state import People, RobotState, Signal, Vehicles, frozen, write_protected
+from cosim.core.state import (
+    People,
+    RobotState,
+    Signal,
+    Vehicles,
+    write_protect,
+    write_protected_copy,
+)
 from cosim.episode.interfaces import Observation, Privileged
 from cosim.spec.camera import Calibration, CameraPicture
 from cosim.spec.goal import decoded_goal
@@ -40,7 +47,7 @@ def encode_extra(value: object) -> object:
 def decode_extra(kind: type, packed: Any) -> Any:
     """Decode a write-protected array (a `dec_hook`)."""
     dtype, shape, data = packed
-    return write_protected(np.frombuffer(data, dtype).reshape(shape), dtype)
+    return write_protected_copy(np.frombuffer(data, dtype).reshape(shape), dtype)
 
 
 _Moment = tuple[
@@ -54,7 +61,7 @@ _decode_ground = msgspec.msgpack.Decoder(
 ).decode
 
 
-def encoded_about(seen: Observation) -> AboutEpisode:
+def encoded_about(seen: Observation) -> EpisodeConstants:
     """Encode the constants of an episode."""
     robot = {name: getattr(seen.robot, name) for name in _ROBOT_FIELDS}
     cameras = {name: one.camera for name, one in seen.pictures.items()}
@@ -66,11 +73,11 @@ def encoded_about(seen: Observation) -> AboutEpisode:
     }
     known = seen.privileged
     ground = b"" if known is None else _encode((known.route.points, shapely.to_wkb(known.free)))
-    return AboutEpisode(robot, calibrations, ground)
+    return EpisodeConstants(robot, calibrations, ground)
 
 
 def encoded_fields(seen: Observation) -> tuple[dict[str, Any], Arrays]:
-    """Encode an observation: the fields of an `AskAct`, and the arrays that belong to it."""
+    """Encode an observation: the fields of an `ActRequest`, and the arrays that belong to it."""
     arrays = {"rgb": seen.rgb, "depth": seen.depth, "labels": seen.labels}
     for name, one in seen.pictures.items():
         arrays |= {f"{name}/rgb": one.rgb, f"{name}/depth": one.depth, f"{name}/labels": one.labels}
@@ -107,7 +114,7 @@ class ObservationDecoder(EpisodeDecoder):
     makes: ClassVar[dict[str, Any]] = {
         "robot": lambda **fields: robot_called(fields["name"]),
         "camera": lambda **arrays: Calibration(
-            **{name: frozen(one) for name, one in arrays.items()}
+            **{name: write_protect(one) for name, one in arrays.items()}
         ),
         "picture": CameraPicture,
         "goal": lambda **fields: decoded_goal(fields),

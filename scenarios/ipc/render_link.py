@@ -16,9 +16,9 @@ import msgspec
 
 from bridge.policy_server import PackedArray, Refusal
 from cosim.core.errors import EngineError, RendererLost
-from cosim.core.framing import Wire
+from cosim.core.framing import MessageSocket
 from cosim.core.state import Frame, RobotState, Street
-from cosim.spec.options import RendererAt
+from cosim.spec.options import RendererAddress
 from cosim.spec.scenario import Scenario
 from scenarios.ipc.observation_codec import Arrays
 from scenarios.ipc.render_protocol import (
@@ -56,7 +56,7 @@ class RendererLink:
         self._memory: SharedMemory | None = None
         self._drawn: tuple[Arrays, dict[str, PackedArray]] = {}, {}
         self._end = socket.socket(socket.AF_UNIX)
-        self._wire = Wire(self._end)
+        self._wire = MessageSocket(self._end)
         try:
             self._end.connect(f"\0{address}")
             self._wait()
@@ -163,7 +163,7 @@ class SharedCamera:
     """This environment's camera in the shared renderer, for one scenario. Use it in a `with`
     block."""
 
-    def __init__(self, renderer: RendererAt, scenario: Scenario) -> None:
+    def __init__(self, renderer: RendererAddress, scenario: Scenario) -> None:
         self._link = link_to(renderer.address)
         self._scenario = scenario
 

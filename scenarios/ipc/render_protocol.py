@@ -8,7 +8,14 @@ from __future__ import annotations
 
 import msgspec
 
-from bridge.policy_server import AskAct, AskEnded, AskReset, PackedArray, PolicyReply, Refusal
+from bridge.policy_server import (
+    ActRequest,
+    EndRequest,
+    PackedArray,
+    PolicyReply,
+    Refusal,
+    ResetRequest,
+)
 from cosim.core.state import RobotState, Street
 from cosim.spec.scenario import Scenario
 from scenarios.ipc.observation_codec import decode_extra, encode_extra
@@ -40,7 +47,7 @@ class Rendered(msgspec.Struct, frozen=True, tag="rendered"):
     arrays: dict[str, PackedArray] = {}
 
 
-Request = Enter | Draw | AskReset | AskAct | AskEnded
+Request = Enter | Draw | ResetRequest | ActRequest | EndRequest
 Reply = Rendered | PolicyReply
 
 _encode = msgspec.msgpack.Encoder(enc_hook=encode_extra).encode

@@ -15,7 +15,7 @@ from typing import Any, Final, Self
 
 import numpy as np
 
-from bridge.policy_server import PackedArray, unpacked
+from bridge.policy_server import PackedArray, unpack_array
 from cosim.spec.goal import most_goal_bytes
 from cosim.spec.manifest import Manifest
 
@@ -63,7 +63,7 @@ class SharedMemory:
 
     def take(self, laid: dict[str, PackedArray]) -> dict[str, Any]:
         """Return copies of arrays. Raises ValueError for an invalid location."""
-        return {name: unpacked(array, self.map) for name, array in laid.items()}
+        return {name: unpack_array(array, self.map) for name, array in laid.items()}
 
     @property
     def busy(self) -> bool:

@@ -25,7 +25,7 @@ from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 
-from cosim.core.child_process import end_with
+from cosim.core.child_process import exit_with_parent
 
 PR_SET_CHILD_SUBREAPER = 36
 """Option of `prctl` by which orphans become children of this process."""
@@ -46,7 +46,7 @@ def keep_worker(serves: str, descriptors: tuple[int, ...], parent: int) -> None:
     descriptors: its arguments, first the socket to the run.
     parent: process id of the run.
     """
-    end_with(parent, signal.SIGTERM)
+    exit_with_parent(parent, signal.SIGTERM)
     ctypes.CDLL(None, use_errno=True).prctl(PR_SET_CHILD_SUBREAPER, 1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     printed, prints = os.pipe()
@@ -146,7 +146,7 @@ def _ended(number: int, frame: FrameType | None) -> None:
 def _run_worker(serves: str, descriptors: tuple[int, ...], prints: int, supervisor: int) -> None:
     """Run the worker in the forked child, until its socket is closed."""
     os.setsid()
-    end_with(supervisor)
+    exit_with_parent(supervisor)
     os.dup2(prints, 1)
     os.dup2(prints, 2)
     os.close(prints)

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Final
 
 from cosim.core.errors import MachineError, UsageError
-from cosim.core.log_event import happened
-from scenarios.ipc.child_process import WORKER, KeptProcess, ProcessEnd, Watchdog
+from cosim.core.log_event import log_event
+from scenarios.ipc.child_process import WORKER, ChildProcess, ProcessEnd, Watchdog
 from scenarios.ipc.faults import Failure
 from scenarios.ipc.messages import (
     Done,
@@ -33,9 +33,9 @@ STARTS: Final = 2
 """Number of processes in a row that may end before they are ready."""
 
 
-def start_environment(log: Path, hello: Hello) -> KeptProcess:
+def start_environment(log: Path, hello: Hello) -> ChildProcess:
     """Start an environment process on this machine."""
-    process = KeptProcess(log, WORKER, "environment")
+    process = ChildProcess(log, WORKER, "environment")
     process.send(encode_message(hello))
     return process
 
@@ -49,7 +49,7 @@ class EnvironmentSlot:
 
     ended = False
 
-    def __init__(self, start: Callable[[], KeptProcess], hello: Hello) -> None:
+    def __init__(self, start: Callable[[], ChildProcess], hello: Hello) -> None:
         self.job: Job | None = None
         self.log = ""
         self._start_process = start
@@ -145,7 +145,7 @@ class EnvironmentSlot:
             return self._failure(job, end)
         if not watchdog.ready:
             self._count_failed_start(end)
-        happened("process replaced", WARNING, log=Path(self.log).name, why=end.words)
+        log_event("process replaced", WARNING, log=Path(self.log).name, why=end.words)
         if self.job is not None:
             self.start()
         return None

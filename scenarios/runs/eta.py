@@ -36,21 +36,21 @@ RECENT: Final = 40
 """Number of newest episodes that an estimate uses, because the code and the machine change."""
 ENOUGH: Final = 3
 """Smallest number of episodes that an estimate is based on."""
-DRIVES_MPS: Final = (0.9, 1.4)
+POLICY_SPEED_MPS: Final = (0.9, 1.4)
 """Mean speed in m/s of slow and fast policies, including waits at red lights."""
-SIMULATES: Final = (3.0, 8.0)
+SIMULATION_SPEED: Final = (3.0, 8.0)
 """Simulated seconds per second of an environment process, on slow and fast cores."""
-SETS_UP_S: Final = (2.0, 10.0)
+SETUP_S: Final = (2.0, 10.0)
 """Shortest and longest time in seconds to an episode's first tick; longer if its city is new."""
-COMPARES: Final = 1.4
+COMPARISON_FACTOR: Final = 1.4
 """Duration of an episode with the comparison without the robot, relative to one without it."""
-AT_LEAST: Final = (0.6, 1.5)
+NARROWEST_RANGE: Final = (0.6, 1.5)
 """Narrowest range of an estimate as factors on its median, because other programs also run."""
 _SHARED: Final = 1.4
 """Factor on durations with more processes than were measured, which share caches and memory."""
 
 
-class Measured(msgspec.Struct, frozen=True, kw_only=True):
+class EpisodeDuration(msgspec.Struct, frozen=True, kw_only=True):
     """Durations of an episode.
 
     short: whether it ends on a failure.
@@ -91,12 +91,12 @@ def announcement(
 
     pace: see `cosim.spec.options.EpisodeOptions`.
     """
-    known = recall()
+    known = load_durations()
     cores = len(os.sched_getaffinity(0))
 
     def taken(jobs: int) -> Estimate:
         free = estimate(scenarios, known, policy, renderer, jobs, compared, cores)
-        return paced(free, scenarios, known, policy, jobs, pace) if pace else free
+        return paced_estimate(free, scenarios, known, policy, jobs, pace) if pace else free
 
     here = taken(jobs)
     length_m = sum(s.route_line.length_m for s in scenarios)
@@ -106,15 +106,15 @@ def announcement(
         f"{_episodes(len(scenarios))}, {length} of route, at most {duration(most_s)} of simulated "
         f"time. "
     )
-    words += f"About {span(here)} with --jobs {jobs}"
+    words += f"About {format_estimate(here)} with --jobs {jobs}"
     if jobs < (most := min(cores, len(scenarios))):
-        words += f", {span(taken(most))} with --jobs {most}"
+        words += f", {format_estimate(taken(most))} with --jobs {most}"
     return f"{words}: {here.basis}."
 
 
 def estimate(
     scenarios: Sequence[Scenario],
-    known: Sequence[Measured],
+    known: Sequence[EpisodeDuration],
     policy: str,
     renderer: str,
     jobs: int,
@@ -132,7 +132,7 @@ def estimate(
     samples = of_policy if len(of_policy) >= ENOUGH else any_policy
     slots = min(jobs, cores)
     slower = _SHARED if slots > max((m.jobs for m in samples), default=1) else 1.0
-    setup_s = _around([m.setup_s for m in samples]) if samples else SETS_UP_S
+    setup_s = _around([m.setup_s for m in samples]) if samples else SETUP_S
 
     def taken_s(low_s: Iterable[float], high_s: Iterable[float]) -> tuple[float, float]:
         fast, slow = (
@@ -151,15 +151,16 @@ def estimate(
     if any_policy:
         slow, fast = _around([m.simulated_s / m.work_s for m in any_policy])
         middle = statistics.median(m.simulated_s / m.work_s for m in any_policy)
-        driven = f"the policy is taken to drive at {DRIVES_MPS[0]:g} to {DRIVES_MPS[1]:g} m/s"
+        slow, fast = POLICY_SPEED_MPS
+        driven = f"the policy is taken to drive at {slow:g} to {fast:g} m/s"
         basis = f"this machine simulates {middle:.1f} s a second, {driven}"
     else:
-        slow = SIMULATES[0] / (COMPARES if compared else 1.0)
-        fast = SIMULATES[1]
+        slow = SIMULATION_SPEED[0] / (COMPARISON_FACTOR if compared else 1.0)
+        fast = SIMULATION_SPEED[1]
         basis = "a guess, as nothing is measured on this machine yet"
     spans = (
         [metres / (v * speed) for metres in lengths_m]
-        for v, speed in zip(DRIVES_MPS, (slow, fast), strict=True)
+        for v, speed in zip(POLICY_SPEED_MPS, (slow, fast), strict=True)
     )
     high_s, low_s = spans
     stuck_s = taken_s([], [s.time_limit_s / slow for s in scenarios])[1]
@@ -167,10 +168,10 @@ def estimate(
     return Estimate(*taken_s(low_s, high_s), basis)
 
 
-def paced(
+def paced_estimate(
     free: Estimate,
     scenarios: Sequence[Scenario],
-    known: Sequence[Measured],
+    known: Sequence[EpisodeDuration],
     policy: str,
     jobs: int,
     pace: float,
@@ -185,11 +186,12 @@ def paced(
         rates = _around([m.simulated_s / m.route_m for m in same])
         basis = f"as fast as {_episodes(len(same))} of '{policy}' on this machine drove, "
     else:
-        rates = (1.0 / DRIVES_MPS[1], 1.0 / DRIVES_MPS[0])
-        basis = f"the policy is taken to drive at {DRIVES_MPS[0]:g} to {DRIVES_MPS[1]:g} m/s, "
+        rates = (1.0 / POLICY_SPEED_MPS[1], 1.0 / POLICY_SPEED_MPS[0])
+        slow, fast = POLICY_SPEED_MPS
+        basis = f"the policy is taken to drive at {slow:g} to {fast:g} m/s, "
     low_s, high_s = (
         makespan([setup_s + rate * s.route_line.length_m / pace for s in scenarios], jobs)
-        for setup_s, rate in zip(SETS_UP_S, rates, strict=True)
+        for setup_s, rate in zip(SETUP_S, rates, strict=True)
     )
     if low_s <= free.low_s and high_s <= free.high_s:
         return free
@@ -209,7 +211,7 @@ def makespan(taken_s: Sequence[float], slots: int) -> float:
     return max(free_at)
 
 
-def span(found: Estimate) -> str:
+def format_estimate(found: Estimate) -> str:
     """Format an estimate, as "9 to 15 min"."""
     low, high = duration(found.low_s), duration(found.high_s)
     if low == high:
@@ -220,7 +222,7 @@ def span(found: Estimate) -> str:
 
 
 @contextmanager
-def remembered(
+def recording_durations(
     held: RunFolder, todo: Sequence[Scenario], jobs: int, pace: float = 0.0
 ) -> Iterator[None]:
     """Record the durations of the episodes of `todo` that finish in the block, also after an error.
@@ -232,16 +234,16 @@ def remembered(
     finally:
         if not pace:
             with suppress(OSError, CosimError, KeyError):
-                remember(held, todo, jobs)
+                record_durations(held, todo, jobs)
 
 
-def remember(held: RunFolder, todo: Sequence[Scenario], jobs: int) -> None:
+def record_durations(held: RunFolder, todo: Sequence[Scenario], jobs: int) -> None:
     """Add the durations of the finished episodes of a run to the file."""
     lines = []
     for scenario in todo:
         path = held.episode_folder(scenario.id) / "record.json"
         if path.exists() and (record := Record.load(path)).ended is not None:
-            one = measured(record, scenario, held.spec.policy, held.spec.counterfactual, jobs)
+            one = duration_of(record, scenario, held.spec.policy, held.spec.counterfactual, jobs)
             lines.append(msgspec.json.encode(one))
     if not lines:
         return
@@ -253,12 +255,12 @@ def remember(held: RunFolder, todo: Sequence[Scenario], jobs: int) -> None:
         write_atomic(path, b"".join(every[-EPISODES_KEPT:]), shared=True)
 
 
-def measured(
+def duration_of(
     record: Record, scenario: Scenario, policy: str, compared: bool, jobs: int
-) -> Measured:
+) -> EpisodeDuration:
     """Return the durations of an episode."""
     setup_s = record.clock["setup_s"]
-    return Measured(
+    return EpisodeDuration(
         machine=machine(),
         policy=policy,
         renderer=record.setup.renderer,
@@ -272,13 +274,13 @@ def measured(
     )
 
 
-def recall() -> list[Measured]:
+def load_durations() -> list[EpisodeDuration]:
     """Load the durations measured on this machine, the newest last. Invalid lines are skipped."""
     found = []
     with suppress(OSError):
         for line in (cache_folder() / FILE).read_bytes().splitlines():
             with suppress(msgspec.DecodeError):
-                found.append(msgspec.json.decode(line, type=Measured))
+                found.append(msgspec.json.decode(line, type=EpisodeDuration))
     here = machine()
     return [one for one in found if one.machine == here]
 
@@ -296,7 +298,9 @@ def machine() -> str:
 def _around(values: Sequence[float]) -> tuple[float, float]:
     """Return the quantiles 0.2 and 0.8 of values, widened to AT_LEAST."""
     low, middle, high = np.quantile(values, [0.2, 0.5, 0.8])
-    return float(min(low, AT_LEAST[0] * middle)), float(max(high, AT_LEAST[1] * middle))
+    return float(min(low, NARROWEST_RANGE[0] * middle)), float(
+        max(high, NARROWEST_RANGE[1] * middle)
+    )
 
 
 def _episodes(count: int) -> str:

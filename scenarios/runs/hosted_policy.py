@@ -14,26 +14,26 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 
 from bridge.policy_server import (
-    MOST_WORDS,
+    LONGEST_MESSAGE,
     UNREADABLE,
-    Answer,
-    AskAct,
-    AskEnded,
-    AskReset,
-    Begun,
+    ActReply,
+    ActRequest,
+    EndRequest,
+    EpisodeReply,
     PackedArray,
     PolicyFault,
     PolicyReply,
     Refusal,
+    ResetRequest,
     decode_reply,
 )
 from cosim.core.errors import EngineError, MachineError, PolicyError, PolicyServerLost
-from cosim.core.state import Command, Planned
+from cosim.core.state import Command, WaypointCommand
 from cosim.episode.control import check_numbers
 from cosim.episode.interfaces import Observation
-from cosim.episode.policy_caller import Driver, Timer
+from cosim.episode.policy_caller import PolicyCaller, Timer
 from cosim.spec.manifest import Manifest
-from cosim.spec.options import PolicyRuns
+from cosim.spec.options import PolicyProcess
 from scenarios.ipc.observation_codec import Arrays, encoded_about, encoded_fields
 
 
@@ -41,7 +41,7 @@ class PolicyServerBusy(PolicyServerLost):
     """Another episode has taken the server."""
 
 
-class QuestionCarrier(Protocol):
+class RequestCarrier(Protocol):
     """Carrier of requests to a policy. loses: whether the policy's side can lose an episode."""
 
     @property
@@ -50,13 +50,13 @@ class QuestionCarrier(Protocol):
     def lay(self, arrays: Arrays) -> dict[str, PackedArray]:
         """Pack the arrays of the next request."""
 
-    def ask(self, question: AskReset | AskAct) -> bytes:
+    def ask(self, question: ResetRequest | ActRequest) -> bytes:
         """Return the reply to a request.
 
         Raises PolicyFault if none will come, an EngineError if that is not the policy's fault.
         """
 
-    def tell_ended(self, question: AskEnded) -> None:
+    def report_ended(self, question: EndRequest) -> None:
         """Report the end of an episode. Raises the same errors."""
 
     def close(self) -> None:
@@ -71,7 +71,7 @@ class HostedPolicy:
     lost: whether the policy was lost when an episode had ended.
     """
 
-    def __init__(self, manifest: Manifest, carrier: QuestionCarrier, run: str) -> None:
+    def __init__(self, manifest: Manifest, carrier: RequestCarrier, run: str) -> None:
         self.manifest = manifest
         self._carrier = carrier
         self._run = run
@@ -84,7 +84,7 @@ class HostedPolicy:
         self._sign = self._run, episode_id, secrets.token_hex(8)
         self._step = -1
         self.took_ms = []
-        self._reply(AskReset(*self._sign, seed))
+        self._reply(ResetRequest(*self._sign, seed))
 
     def act(self, seen: Observation) -> Command | np.ndarray[Any, Any]:
         began_s = time.perf_counter()
@@ -92,49 +92,53 @@ class HostedPolicy:
         fields, arrays = encoded_fields(seen)
         about = encoded_about(seen) if self._step == 0 else None
         laid = self._carrier.lay(arrays)
-        answer = self._reply(AskAct(*self._sign, self._step, **fields, arrays=laid, about=about))
-        assert isinstance(answer, Answer)
+        answer = self._reply(
+            ActRequest(*self._sign, self._step, **fields, arrays=laid, about=about)
+        )
+        assert isinstance(answer, ActReply)
         self.took_ms.append(1000.0 * (time.perf_counter() - began_s))
         if answer.waypoints is None:
             return Command(answer.v_mps, answer.w_radps)
         waypoints = _array(answer.waypoints)
         if not answer.planned:
             return waypoints
-        return Planned(answer.v_mps, answer.w_radps, waypoints, self.manifest.waypoints.index)
+        return WaypointCommand(
+            answer.v_mps, answer.w_radps, waypoints, self.manifest.waypoints.index
+        )
 
-    def tell_ended(self) -> None:
+    def report_ended(self) -> None:
         """Report the end of the episode. Errors are ignored."""
         try:
-            self._carrier.tell_ended(AskEnded(*self._sign))
+            self._carrier.report_ended(EndRequest(*self._sign))
         except (PolicyFault, EngineError):
             self.lost = True
 
     def close(self) -> None:
         self._carrier.close()
 
-    def _reply(self, question: AskReset | AskAct) -> Begun | Answer:
+    def _reply(self, question: ResetRequest | ActRequest) -> EpisodeReply | ActReply:
         """Return the reply to a request. Raises PolicyFault for errors of the policy,
         PolicyServerLost for a lost episode."""
         payload = self._carrier.ask(question)
         try:
             reply: PolicyReply = decode_reply(payload)
         except UNREADABLE as error:
-            raise PolicyFault(f"sent what is no answer: {error}"[:MOST_WORDS]) from None
+            raise PolicyFault(f"sent what is no answer: {error}"[:LONGEST_MESSAGE]) from None
         if isinstance(reply, Refusal):
             fault = PolicyFault(reply.words, reply.during, reply.together)
             if not self._carrier.loses or reply.why not in ("unknown", "busy"):
                 raise fault
             lost = PolicyServerBusy if reply.why == "busy" else PolicyServerLost
             raise lost(f"the server of policy '{self.manifest.name}': {fault.words}")
-        wanted = Begun if isinstance(question, AskReset) else Answer
-        step = reply.step if isinstance(reply, Answer) else -1
+        wanted = EpisodeReply if isinstance(question, ResetRequest) else ActReply
+        step = reply.step if isinstance(reply, ActReply) else -1
         if not isinstance(reply, wanted) or reply.signature != self._sign or step != self._step:
             said = f"answered step {step} of '{reply.episode}' when it was asked step {self._step}"
             raise PolicyFault(said + ", in another attempt" * (step == self._step))
         return reply
 
 
-class HostedDriver(Driver):
+class HostedDriver(PolicyCaller):
     """Driver of a policy in another process, with the same checks of its answers.
 
     A lost server or renderer, or a machine that lacks something, is not the policy's fault.
@@ -143,7 +147,11 @@ class HostedDriver(Driver):
     _passes: ClassVar[tuple[type[Exception], ...]] = (PolicyError, EngineError, MachineError)
 
     def __init__(
-        self, policy: HostedPolicy, runs: PolicyRuns, source_hash: str, timer: Timer | None = None
+        self,
+        policy: HostedPolicy,
+        runs: PolicyProcess,
+        source_hash: str,
+        timer: Timer | None = None,
     ) -> None:
         super().__init__(policy, policy.manifest, source_hash, timer)
         self._hosted = policy
@@ -160,7 +168,7 @@ class HostedDriver(Driver):
         if self._begun:
             # A server has a second to reply; an isolated policy is timed like any call.
             with self._asked("ended", 0) if self.runs == "isolated" else nullcontext():
-                self._hosted.tell_ended()
+                self._hosted.report_ended()
         self._begun = ""
 
     @property
@@ -183,4 +191,6 @@ def _array(sent: PackedArray) -> np.ndarray[Any, Any]:
         check_numbers(sent.shape)
         return np.frombuffer(sent.data, kind).reshape(sent.shape)
     except (TypeError, ValueError, OverflowError) as error:
-        raise PolicyFault(f"answered waypoints that cannot be read: {error}"[:MOST_WORDS]) from None
+        raise PolicyFault(
+            f"answered waypoints that cannot be read: {error}"[:LONGEST_MESSAGE]
+        ) from None

@@ -16,26 +16,26 @@ import msgspec
 
 from bridge.policy_server import (
     UNREADABLE,
-    AskAct,
-    AskEnded,
-    AskReset,
+    ActRequest,
+    EndRequest,
     PackedArray,
     PolicyDesk,
     PolicyFault,
     PolicyInfo,
     Refusal,
+    ResetRequest,
     decode_info,
     encode_message,
     policy_call,
     read_request,
 )
 from cosim.core.errors import UsageError
-from cosim.core.framing import Wire
+from cosim.core.framing import MessageSocket
 from cosim.episode.manifest_checks import with_goal
-from cosim.episode.policy_caller import LOADED_WITHIN_S, Timer, Untimed
+from cosim.episode.policy_caller import LOAD_TIMEOUT_S, NoTimer, Timer
 from cosim.policies.load import checked_manifest, load_policy
 from cosim.spec.manifest import Manifest
-from scenarios.ipc.child_process import KeptProcess
+from scenarios.ipc.child_process import ChildProcess
 from scenarios.ipc.observation_codec import Arrays, ObservationDecoder
 from scenarios.ipc.shared_memory import SharedMemory, room_for
 from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy
@@ -53,7 +53,7 @@ class _PolicyProcess:
 
     def __init__(self, name: str, room: int) -> None:
         self._memory = SharedMemory.new(room)
-        self._process = KeptProcess(
+        self._process = ChildProcess(
             None, _SERVES, "policy", (self._memory.descriptor,), _MOST_BYTES
         )
         self._process.send(name.encode())
@@ -75,14 +75,14 @@ class _PolicyProcess:
     def lay(self, arrays: Arrays) -> dict[str, PackedArray]:
         return self._memory.lay(arrays)
 
-    def ask(self, question: AskReset | AskAct | AskEnded) -> bytes:
+    def ask(self, question: ResetRequest | ActRequest | EndRequest) -> bytes:
         try:
             self._process.wire.send(encode_message(question))
             return self._process.wire.receive()
         except (EOFError, OSError):
             raise self._dead() from None
 
-    def tell_ended(self, question: AskEnded) -> None:
+    def report_ended(self, question: EndRequest) -> None:
         self.ask(question)
 
     def close(self) -> None:
@@ -101,7 +101,7 @@ def isolated_driver(
     timer: Timer | None = None,
     expected: Manifest | None = None,
     run: str = "",
-    start_s: float = LOADED_WITHIN_S,
+    start_s: float = LOAD_TIMEOUT_S,
 ) -> HostedDriver:
     """Load a policy in a process of its own.
 
@@ -136,12 +136,12 @@ def serve_alone(socket_descriptor: int, call_descriptor: int, memory_descriptor:
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.close(call_descriptor)
-    wire = Wire(socket(fileno=socket_descriptor))
+    wire = MessageSocket(socket(fileno=socket_descriptor))
     memory = SharedMemory(memory_descriptor, writes=False)
     os.close(memory_descriptor)
     name = wire.receive().decode()
     try:
-        driver = load_policy(name, Untimed())
+        driver = load_policy(name, NoTimer())
     except UsageError as error:
         wire.send(encode_message(Refusal("policy", str(error))))
         return

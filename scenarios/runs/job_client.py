@@ -18,10 +18,10 @@ import msgspec
 from bridge import keys
 from bridge.codec import encode
 from cosim.core.errors import MachineError, UsageError
-from cosim.core.log_event import happened
+from cosim.core.log_event import log_event
 from cosim.spec.connection import Connection
 from cosim.spec.scenario import CityMap
-from scenarios.ipc.child_process import KeptProcess
+from scenarios.ipc.child_process import ChildProcess
 from scenarios.ipc.faults import Failure
 from scenarios.ipc.messages import Done, FrameDrawn, Hello, Message, Progress, Waits
 from scenarios.runs.environment_slot import EnvironmentSlot, new_output, start_environment
@@ -91,7 +91,7 @@ class JobClient:
         number: int,
         here: Installation,
         logs: Path,
-        start: Callable[[Path, Hello], KeptProcess] = start_environment,
+        start: Callable[[Path, Hello], ChildProcess] = start_environment,
     ) -> None:
         self._run = run
         self._number = number
@@ -238,7 +238,7 @@ class JobClient:
                 pass
 
     def _begin(self, lease: Assignment) -> None:
-        happened("claimed", scenario=lease.job.scenario.id, slot=self._number, lease=lease.lease)
+        log_event("claimed", scenario=lease.job.scenario.id, slot=self._number, lease=lease.lease)
         self._lease = lease
         self._report_at_s = time.monotonic() + REPORT_S
         where = lease.job.scenario.place
@@ -272,7 +272,7 @@ class JobClient:
     def _fail(self, failure: Failure) -> None:
         assert self._lease is not None
         event = "handed back" if failure.fault == "handed_back" else "failed"
-        happened(event, WARNING, scenario=self._lease.job.scenario.id, why=failure.why)
+        log_event(event, WARNING, scenario=self._lease.job.scenario.id, why=failure.why)
         self._failure = failure
         self._done = None
         self._said.clear()
@@ -328,7 +328,7 @@ class JobClient:
                 self._report_at_s = 0.0
         elif reply.kind != "revoked":
             if self._done is not None:
-                happened(
+                log_event(
                     "done", scenario=self._done.scenario, status=self._done.status, how=reply.kind
                 )
             self._log_sent = self._log_size

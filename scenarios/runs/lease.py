@@ -11,7 +11,7 @@ from scenarios.ipc.faults import Failure
 from scenarios.ipc.messages import Done, Message, MessageHandler
 from scenarios.runs.protocol import Reply
 
-Answer = Callable[[Reply], None]
+ReplyCallback = Callable[[Reply], None]
 
 
 def ignore(reply: Reply) -> None:
@@ -23,7 +23,7 @@ class _Reported(NamedTuple):
 
     messages: Sequence[Message]
     failure: Failure | None
-    answer: Answer
+    answer: ReplyCallback
 
     @property
     def ends(self) -> bool:
@@ -54,7 +54,7 @@ class Lease:
         self._lost = ""
 
     def take(
-        self, messages: Sequence[Message], failure: Failure | None, answer: Answer = ignore
+        self, messages: Sequence[Message], failure: Failure | None, answer: ReplyCallback = ignore
     ) -> None:
         """Take in a report. It is answered once the run has processed it, so that nothing unwritten
         is acknowledged."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from multiprocessing.connection import wait
 from pathlib import Path
 
-from cosim.episode.policy_caller import Driver
-from scenarios.ipc.child_process import KeptProcess
+from cosim.episode.policy_caller import PolicyCaller
+from scenarios.ipc.child_process import ChildProcess
 from scenarios.ipc.messages import Hello, Job, MessageHandler
 from scenarios.runs.environment_slot import EnvironmentSlot, start_environment
 from scenarios.runs.worker import run_job
@@ -28,7 +28,7 @@ class LocalProcesses:
         return ()
 
     def start(self, hello: Hello) -> EnvironmentSlot:
-        def start_next() -> KeptProcess:
+        def start_next() -> ChildProcess:
             number = self._started
             self._started = self._started + 1
             return start_environment(self._logs / f"worker-{number}.log", hello)
@@ -48,7 +48,7 @@ class InProcess:
     An episode that hangs or dies ends the run, and no timeout of an answer is enforced.
     """
 
-    def __init__(self, driver: Driver) -> None:
+    def __init__(self, driver: PolicyCaller) -> None:
         self._driver = driver
 
     def room(self, busy: int) -> int:
@@ -70,7 +70,7 @@ class _ThisProcess:
     log = "this process's own output"
     ended = False
 
-    def __init__(self, driver: Driver) -> None:
+    def __init__(self, driver: PolicyCaller) -> None:
         self._driver = driver
         self._job: Job | None = None
 

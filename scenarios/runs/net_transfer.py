@@ -17,15 +17,22 @@ from cosim.core.files import atomic_folder
 from cosim.spec.scenario import CityMap, Place
 from scenarios.places.nets import place
 from scenarios.runs.protocol import NetPart
-from sumo_nets.maps.feature_file import NAME
-from sumo_nets.maps.map_store import ABOUT, NAMES, known_maps, map_hash, map_net, maps_folder
+from sumo_nets.maps.feature_file import FEATURES_FILE
+from sumo_nets.maps.map_store import (
+    ABOUT,
+    MAP_NAME_PATTERN,
+    known_maps,
+    map_hash,
+    map_net,
+    maps_folder,
+)
 
 _PART_BYTES: Final = 2 << 20
 """Size in bytes of a part of a map."""
 _MOST_BYTES: Final = 1 << 30
 """Size limit in bytes of a map, packed and unpacked."""
 _NET: Final = "net.xml"
-_FILES: Final = (_NET, ABOUT, NAME)
+_FILES: Final = (_NET, ABOUT, FEATURES_FILE)
 
 
 def travels(where: Place) -> bool:
@@ -118,7 +125,7 @@ class Fetched:
             files = decode(opened.decompress(packed, _MOST_BYTES), dict[str, bytes])
         except zlib.error as error:
             raise EngineError(f"map '{name}' was damaged on its way: {error}") from error
-        if not NAMES.fullmatch(name) or not {_NET, ABOUT} <= files.keys() <= set(_FILES):
+        if not MAP_NAME_PATTERN.fullmatch(name) or not {_NET, ABOUT} <= files.keys() <= set(_FILES):
             raise EngineError(f"what came as map '{name}' is none")
         try:
             with atomic_folder(folder / name, existing="keep") as ready:

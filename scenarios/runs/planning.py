@@ -12,22 +12,22 @@ import msgspec
 from cosim.core.errors import UsageError
 from cosim.episode.interfaces import Policy
 from cosim.episode.manifest_checks import check_camera, with_goal
-from cosim.episode.policy_caller import Driver
-from cosim.policies.user_module import importable
-from cosim.results.run_folder import RunFolder, read_spec, refuse_unbegun
+from cosim.episode.policy_caller import PolicyCaller
+from cosim.policies.user_module import importable_name
+from cosim.results.run_folder import RunFolder, read_spec, refuse_not_begun
 from cosim.results.run_setup import RunSetup
 from cosim.results.run_spec import RunSpec, Shard
-from cosim.spec.episode_id import drawn_seed
+from cosim.spec.episode_id import random_run_seed
 from cosim.spec.options import EpisodeOptions, PolicyHost
 from cosim.spec.robot import robot_called
 from cosim.spec.run_config import RunConfig
 from cosim.spec.scenario import Scenario, Suite
 from physics.cameras.choice import camera_of_choice as chosen_camera
 from physics.cameras.choice import renderer_of
-from physics.robots import hash_of_robot
+from physics.robots import robot_hash
 from scenarios.ipc.deadlines import Patience
 from scenarios.ipc.messages import Hello
-from scenarios.runs.policy_host import known_driver
+from scenarios.runs.policy_host import inspected_driver
 from scenarios.runs.shared_renderer import check_shared
 from scenarios.runs.transport import HeldRun
 
@@ -50,7 +50,7 @@ class PlannedRun(NamedTuple):
     of_run: Sequence[Scenario]
     shard: Shard | None
     policy: str
-    driver: Driver
+    driver: PolicyCaller
     options: EpisodeOptions
     host: PolicyHost
     patience: Patience
@@ -87,7 +87,7 @@ def planned_run(
     options = EpisodeOptions.asked(config) if options is None else options
     resumed = config.out if config.resume else None
     name = (
-        importable(config.policy)
+        importable_name(config.policy)
         if policy is None
         else f"{type(policy).__module__}:{type(policy).__qualname__}"
     )
@@ -99,12 +99,14 @@ def planned_run(
     patience = Patience(config.answer_timeout, config.start_timeout)
     jobs = 1 if config.on else config.jobs or 1
     driver = (
-        known_driver(name, host, jobs, patience.start_s) if policy is None else Driver.of(policy)
+        inspected_driver(name, host, jobs, patience.start_s)
+        if policy is None
+        else PolicyCaller.of(policy)
     )
     camera = chosen_camera(options.camera) if driver.manifest.camera is not None else "bullet"
     seed = seed_of_run(options.seed, resumed)
     options = msgspec.structs.replace(options, seed=seed, camera=camera)
-    check_alone(options, jobs, config.shared_renderer)
+    check_real_time(options, jobs, config.shared_renderer)
     if config.shared_renderer:
         check_shared(driver, camera)
     return PlannedRun(config, whole, of_run, part, name, driver, options, host, patience)
@@ -141,7 +143,7 @@ def run_spec(
     whole: Suite,
     picked: Sequence[Scenario],
     policy: str,
-    driver: Driver,
+    driver: PolicyCaller,
     options: EpisodeOptions,
     shared: bool = False,
     shard: Shard | None = None,
@@ -169,7 +171,7 @@ def run_spec(
         setup = msgspec.structs.replace(setup, renderer=renderer_of(chosen_camera(options.camera)))
     return RunSpec(
         suite=whole.name,
-        robots={robot.name: hash_of_robot(robot) for robot in robots},
+        robots={robot.name: robot_hash(robot) for robot in robots},
         suite_version=whole.version,
         policy=policy,
         manifest=manifest,
@@ -181,7 +183,7 @@ def run_spec(
     )
 
 
-def check_alone(options: EpisodeOptions, jobs: int, shared: bool) -> None:
+def check_real_time(options: EpisodeOptions, jobs: int, shared: bool) -> None:
     """Check that the answers of a run in real time do not wait for those of other episodes. Raises
     UsageError."""
     if options.real_time and (jobs != 1 or shared):
@@ -197,6 +199,6 @@ def seed_of_run(requested: int | None, resumed: Path | None) -> int:
     if requested is not None:
         return requested
     if resumed is None:
-        return drawn_seed()
-    refuse_unbegun(resumed)
+        return random_run_seed()
+    refuse_not_begun(resumed)
     return read_spec(resumed).setup.seed

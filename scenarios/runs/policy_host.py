@@ -3,13 +3,13 @@ renderer."""
 
 from __future__ import annotations
 
-from bridge.policy_server import AskAct, AskEnded, AskReset, PackedArray, packed
+from bridge.policy_server import ActRequest, EndRequest, PackedArray, ResetRequest, pack_array
 from cosim.core.errors import UsageError
-from cosim.episode.policy_caller import LOADED_WITHIN_S, Driver, Timer, when
+from cosim.episode.policy_caller import LOAD_TIMEOUT_S, PolicyCaller, Timer, when
 from cosim.policies.load import REMOTE_SCHEME, load_policy
-from cosim.policies.user_module import importable
+from cosim.policies.user_module import importable_name
 from cosim.spec.manifest import Manifest
-from cosim.spec.options import PolicyHost, RendererAt
+from cosim.spec.options import PolicyHost, RendererAddress
 from scenarios.ipc.observation_codec import Arrays
 from scenarios.ipc.render_link import RendererLink, link_to
 from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy
@@ -21,8 +21,8 @@ def policy_driver(
     host: PolicyHost,
     timer: Timer | None = None,
     expected: Manifest | None = None,
-    start_s: float = LOADED_WITHIN_S,
-) -> Driver:
+    start_s: float = LOAD_TIMEOUT_S,
+) -> PolicyCaller:
     """Load a policy by its name.
 
     expected: its manifest in the run; None if only its manifest is needed.
@@ -32,7 +32,7 @@ def policy_driver(
     >>> policy_driver("route", PolicyHost()).manifest.name
     'route'
     """
-    name = importable(name)
+    name = importable_name(name)
     if name.startswith(REMOTE_SCHEME):
         # Imported only where needed: it loads Zenoh and OpenCV.
         from scenarios.runs.remote_policy import remote_driver
@@ -47,9 +47,9 @@ def policy_driver(
     return load_policy(name, timer, start_s)
 
 
-def known_driver(
-    name: str, host: PolicyHost, jobs: int = 1, start_s: float = LOADED_WITHIN_S
-) -> Driver:
+def inspected_driver(
+    name: str, host: PolicyHost, jobs: int = 1, start_s: float = LOAD_TIMEOUT_S
+) -> PolicyCaller:
     """Load a policy to inspect it before a run; connections and processes of its own are closed.
 
     Raises UsageError if its servers answer for fewer episodes at a time than there are jobs.
@@ -75,15 +75,15 @@ class _RendererCarrier:
 
     def lay(self, arrays: Arrays) -> dict[str, PackedArray]:
         link = self._linked()
-        return {name: link.laid(name, array) or packed(array) for name, array in arrays.items()}
+        return {name: link.laid(name, array) or pack_array(array) for name, array in arrays.items()}
 
-    def ask(self, question: AskReset | AskAct) -> bytes:
-        if isinstance(question, AskAct):
+    def ask(self, question: ResetRequest | ActRequest) -> bytes:
+        if isinstance(question, ActRequest):
             return self._linked().exchange(question, when("act", question.tick))
         self._link = link_to(self._address)
         return self._link.exchange(question, "reset")
 
-    def tell_ended(self, question: AskEnded) -> None:
+    def report_ended(self, question: EndRequest) -> None:
         self._linked().tell(question)
 
     def close(self) -> None:
@@ -96,7 +96,7 @@ class _RendererCarrier:
 
 
 def shared_driver(
-    manifest: Manifest, source_hash: str, renderer: RendererAt, run: str
+    manifest: Manifest, source_hash: str, renderer: RendererAddress, run: str
 ) -> HostedDriver:
     """Return the driver of a policy in the shared renderer, where the run enforces its timeouts."""
     policy = HostedPolicy(manifest, _RendererCarrier(renderer.address), run)

@@ -18,12 +18,12 @@ from typing import NamedTuple
 import msgspec
 
 from cosim.core.errors import RunError
-from cosim.core.log_event import happened
+from cosim.core.log_event import log_event
 from cosim.episode.manifest_checks import with_goal
 from cosim.results.record import Record, Status
 from cosim.results.run_folder import FailedAttempt, RunFolder
 from cosim.results.run_setup import NO_RENDERER
-from cosim.spec.episode_id import pseudonym_of
+from cosim.spec.episode_id import episode_id_of
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario
 from scenarios.ipc.faults import RULES, Failure, failure_of_result
@@ -67,7 +67,7 @@ def run_all(
         hello = msgspec.structs.replace(hello, renderer=renderer.at)
     queue = _AttemptQueue(folder, scenarios)
     pool = _Pool(folder, queue, hello, transport, options, tell, renderer)
-    happened("run begun", episodes=len(scenarios), policy=hello.policy, folder=str(folder.path))
+    log_event("run begun", episodes=len(scenarios), policy=hello.policy, folder=str(folder.path))
     try:
         while queue or pool.busy:
             while queue and transport.room(pool.busy) > 0:
@@ -114,7 +114,7 @@ class _Pool:
         self._workers[worker] = scenario
         self._folder.forget(scenario.id)
         worker.give(Job(scenario, self._options, self._setup))
-        happened("claimed", scenario=scenario.id, worker=Path(worker.log).stem)
+        log_event("claimed", scenario=scenario.id, worker=Path(worker.log).stem)
 
     def poll(self) -> None:
         """Take in the workers' messages; queue or record the scenarios that failed."""
@@ -127,7 +127,7 @@ class _Pool:
             if failure is not None and scenario is not None:
                 self._workers[worker] = None
                 if failure.fault != "policy_timeout":
-                    happened(
+                    log_event(
                         "lost",
                         WARNING,
                         worker=Path(worker.log).stem,
@@ -162,7 +162,7 @@ class _Pool:
 
     def _take(self, worker: Worker, message: Message) -> None:
         if isinstance(message, FrameDrawn):
-            self._folder.keep_frame(message.scenario, message.tick, message.png)
+            self._folder.write_frame(message.scenario, message.tick, message.png)
         elif not isinstance(message, Done | LostRenderer):
             self._tell(message)
         elif (scenario := self._workers[worker]) is not None:
@@ -253,14 +253,14 @@ class _Pool:
 
     def _give_up(self, scenario: Scenario, reason: str, status: Status) -> None:
         """Record a scenario after its last failed attempt."""
-        happened("given up", ERROR, scenario=scenario.id, why=reason, status=status)
+        log_event("given up", ERROR, scenario=scenario.id, why=reason, status=status)
         manifest = with_goal(self._hello.manifest, self._options.goal)
         record = Record.begun(scenario, manifest, self._setup)
         self._folder.keep(msgspec.structs.replace(record, status=status, reason=reason))
         self._over(scenario, status)
 
     def _over(self, scenario: Scenario, status: Status) -> None:
-        happened("done", scenario=scenario.id, status=status)
+        log_event("done", scenario=scenario.id, status=status)
         if self._renderer is not None:
             self._renderer.episode_ended()
         self._tell(Done(scenario.id, status))
@@ -282,7 +282,7 @@ class _AttemptQueue:
 
     def __init__(self, folder: RunFolder, scenarios: Sequence[Scenario]) -> None:
         self._folder = folder
-        self._waiting = deque(sorted(scenarios, key=partial(pseudonym_of, folder.spec.setup.seed)))
+        self._waiting = deque(sorted(scenarios, key=partial(episode_id_of, folder.spec.setup.seed)))
         self._failed = folder.failed_attempts()
 
     def __len__(self) -> int:
@@ -309,11 +309,11 @@ class _AttemptQueue:
         attempt = FailedAttempt(scenario.id, failure.fault == "machine_lost")
         if rule.attempts is not None:
             self._failed[attempt] += 1
-            self._folder.keep_failed_attempt(attempt)
+            self._folder.add_failed_attempt(attempt)
             if self._failed[attempt] >= rule.attempts:
                 times = f"{failure.why}, {rule.attempts} times; see logs/ in the run folder"
                 return _GivenUp(rule.status, times)
         facts = {"why": failure.why, "attempts": self._failed[attempt], "of": rule.attempts or 0}
-        happened("retried", WARNING, scenario=scenario.id, **facts)
+        log_event("retried", WARNING, scenario=scenario.id, **facts)
         self._waiting.appendleft(scenario)
         return None

@@ -21,7 +21,7 @@ from typing import Any, Final
 import msgspec
 
 from cosim.core.errors import MachineError, UsageError
-from cosim.policies.user_module import importable
+from cosim.policies.user_module import importable_name
 from cosim.results.run_spec import RunSpec
 from cosim.spec.scenario import Place
 from scenarios.ipc.child_process import raise_unable
@@ -85,7 +85,7 @@ def check_on_ray(on: str, of_here: Mapping[str, object]) -> None:
 
 
 @contextmanager
-def by_ray(on: str, jobs: int | None, policy: str, say: _Say) -> Iterator[TransportFactory]:
+def ray_carrier(on: str, jobs: int | None, policy: str, say: _Say) -> Iterator[TransportFactory]:
     """Connect to a cluster, and create the factory of its transport.
 
     jobs: number of workers, by default one for each CPU."""
@@ -323,7 +323,7 @@ class _RayWorker:
 
 def _own_module(policy: str) -> str:
     """Return the path of the package or file of a policy that is not installed; "" if it is."""
-    policy = importable(policy)
+    policy = importable_name(policy)
     name = policy.partition(":")[0].partition(".")[0] if ":" in policy else ""
     spec = importlib.util.find_spec(name) if name else None
     if spec is None:

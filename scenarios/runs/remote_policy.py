@@ -19,16 +19,16 @@ import msgspec
 import numpy as np
 
 from bridge.policy_server import (
-    MOST_MESSAGE_BYTES,
+    LARGEST_MESSAGE_BYTES,
     POLICY_PROTOCOL,
     UNREADABLE,
-    AskAct,
-    AskEnded,
-    AskReset,
+    ActRequest,
+    EndRequest,
     PackedArray,
     PolicyInfo,
+    ResetRequest,
     encode_message,
-    packed,
+    pack_array,
     policy_key,
 )
 from bridge.session import Session, open_session
@@ -37,7 +37,7 @@ from cosim.episode.manifest_checks import with_goal
 from cosim.episode.policy_caller import Timer
 from cosim.policies.load import checked_manifest
 from cosim.spec.manifest import Manifest
-from cosim.spec.options import PolicyHost, PolicyRuns
+from cosim.spec.options import PolicyHost, PolicyProcess
 from scenarios.ipc.deadlines import ServerTimes
 from scenarios.ipc.observation_codec import Arrays
 from scenarios.ipc.shared_memory import room_for
@@ -110,11 +110,11 @@ class PolicyServers:
         return {
             name: _as_jpeg(array)
             if self._jpeg and name.rpartition("/")[2] == "rgb"
-            else packed(array)
+            else pack_array(array)
             for name, array in arrays.items()
         }
 
-    def ask(self, question: AskReset | AskAct) -> bytes:
+    def ask(self, question: ResetRequest | ActRequest) -> bytes:
         unreached_since_s = None
         while True:
             how, payload = self._send(question, self.times.try_s)
@@ -130,11 +130,13 @@ class PolicyServers:
                 raise self._lost()
             time.sleep(self.times.pause_s)
 
-    def tell_ended(self, question: AskEnded) -> None:
+    def report_ended(self, question: EndRequest) -> None:
         if self._send(question, self.times.end_s)[0] not in ("answered", "refused"):
             raise self._lost()
 
-    def _send(self, question: AskReset | AskAct | AskEnded, timeout_s: float) -> tuple[str, bytes]:
+    def _send(
+        self, question: ResetRequest | ActRequest | EndRequest, timeout_s: float
+    ) -> tuple[str, bytes]:
         """Send a request once. Returns the outcome and the reply."""
         assert self._server is not None
         kind = str(question.__struct_config__.tag)
@@ -191,7 +193,7 @@ class RemoteDriver(HostedDriver):
         self,
         policy: HostedPolicy,
         servers: PolicyServers,
-        runs: PolicyRuns,
+        runs: PolicyProcess,
         source_hash: str,
         timer: Timer | None,
     ) -> None:
@@ -237,7 +239,7 @@ def remote_driver(
             info.source[:64]
             or hashlib.blake2b(f"{manifest.name}\0{manifest.version}".encode()).hexdigest()[:16]
         )
-        runs: PolicyRuns = "remote, jpeg" if info.jpeg else "remote"
+        runs: PolicyProcess = "remote, jpeg" if info.jpeg else "remote"
         driver = RemoteDriver(
             HostedPolicy(manifest, servers, host.run), servers, runs, source, timer
         )
@@ -257,10 +259,10 @@ def _check(name: str, manifest: Manifest) -> None:
             f"policy '{name}' is told what the simulator knows (privileged), and a remote "
             f"one sees only observations"
         )
-    if (size := room_for(manifest)) > MOST_MESSAGE_BYTES:
+    if (size := room_for(manifest)) > LARGEST_MESSAGE_BYTES:
         raise UsageError(
             f"policy '{name}' asks for {size / 2**20:.0f} MiB of pictures a step, and a message "
-            f"holds {MOST_MESSAGE_BYTES / 2**20:.0f} MiB: ask for smaller or fewer ones"
+            f"holds {LARGEST_MESSAGE_BYTES / 2**20:.0f} MiB: ask for smaller or fewer ones"
         )
 
 

@@ -24,15 +24,22 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from bridge.policy_server import AskAct, AskEnded, AskReset, PolicyDesk, Refusal, said_by
-from cosim.core.framing import Wire
+from bridge.policy_server import (
+    ActRequest,
+    EndRequest,
+    PolicyDesk,
+    Refusal,
+    ResetRequest,
+    error_text,
+)
+from cosim.core.framing import MessageSocket
 from cosim.results.run_setup import NO_RENDERER
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Place, Scenario
 from physics.cameras.choice import renderer_of
 from physics.dynamics.world import BulletWorld
 from physics.street.street_surface import StreetSurface
-from scenarios.ipc.deadlines import Asked
+from scenarios.ipc.deadlines import PendingCallMemory
 from scenarios.ipc.messages import Ready, decode_hello
 from scenarios.ipc.observation_codec import ObservationDecoder
 from scenarios.ipc.render_protocol import (
@@ -46,7 +53,7 @@ from scenarios.ipc.render_protocol import (
 )
 from scenarios.ipc.shared_memory import SharedMemory, room_for
 from scenarios.places.nets import place
-from scenarios.runs.worker import policy_here, said_to_run
+from scenarios.runs.worker import load_run_policy, send_to_run
 
 if TYPE_CHECKING:
     from physics.cameras.gl.atlas import Atlas, SeatKey
@@ -67,14 +74,14 @@ def serve_pictures(pipe: int, pending_call: int, listening: int) -> None:
     listening: descriptor of the socket that environments connect to.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    wire = Wire(socket.socket(fileno=pipe))
-    say = partial(said_to_run, wire, os.getpid())
+    wire = MessageSocket(socket.socket(fileno=pipe))
+    say = partial(send_to_run, wire, os.getpid())
     hello = decode_hello(wire.receive())
     assert hello.renderer is not None
     desk = None
     if hello.renderer.asks:
-        timer = Asked(pending_call)
-        policy = policy_here(hello, timer, say).policy
+        timer = PendingCallMemory(pending_call)
+        policy = load_run_policy(hello, timer, say).policy
         desk = PolicyDesk(policy, decoder=ObservationDecoder, timer=timer, forget_after_s=inf)
     with ExitStack() as stack:
         atlas = None
@@ -99,11 +106,11 @@ class _Environment:
     """
 
     def __init__(self, end: socket.socket, room: int) -> None:
-        self.wire = Wire(end)
+        self.wire = MessageSocket(end)
         self.memory = SharedMemory.new(room)
-        self.began: AskReset | None = None
+        self.began: ResetRequest | None = None
         self.seat: SeatKey | None = None
-        self.wants: Draw | AskReset | AskAct | None = None
+        self.wants: Draw | ResetRequest | ActRequest | None = None
         self.asks_next = False
         socket.send_fds(end, [b"\0"], [self.memory.descriptor])
 
@@ -171,7 +178,7 @@ class _Renderer:
         wanted = [one.wants for one in self._environments if one.wants is not None]
         if not wanted:
             return _BEAT_S
-        if self._desk is None or not all(isinstance(wants, AskAct) for wants in wanted):
+        if self._desk is None or not all(isinstance(wants, ActRequest) for wants in wanted):
             return 0.0
         expected = len(wanted) + sum(one.asks_next for one in self._environments)
         return self._desk.wait_s(len(wanted), expected, self._since_s)
@@ -217,7 +224,7 @@ class _Renderer:
             self._leave(one)
             if request.scenario is not None:
                 one.reply(self._entered(one, request.scenario))
-        elif isinstance(request, AskEnded):
+        elif isinstance(request, EndRequest):
             self._end(one)
         elif isinstance(request, Draw):
             if one.seat is None:
@@ -226,7 +233,7 @@ class _Renderer:
         elif self._desk is None:
             return False
         else:
-            if not any(isinstance(other.wants, AskAct) for other in self._environments):
+            if not any(isinstance(other.wants, ActRequest) for other in self._environments):
                 self._since_s = time.monotonic()
             one.wants = request
             one.asks_next = False
@@ -255,7 +262,7 @@ class _Renderer:
     def _end(self, one: _Environment) -> None:
         """End the policy's episode of an environment."""
         if one.began is not None and self._desk is not None:
-            self._desk.replies([AskEnded(*one.began.signature)])
+            self._desk.replies([EndRequest(*one.began.signature)])
         one.began = None
 
     def _answer(self) -> None:
@@ -263,12 +270,12 @@ class _Renderer:
         waiting = sorted(
             (one for one in self._environments if one.wants is not None), key=lambda one: one.order
         )
-        acts = [one for one in waiting if isinstance(one.wants, AskAct)]
+        acts = [one for one in waiting if isinstance(one.wants, ActRequest)]
         if len(acts) == len(waiting):
             self._ask(acts)
         self._draw([one for one in waiting if isinstance(one.wants, Draw)])
         for one in waiting:
-            if isinstance(one.wants, AskReset):
+            if isinstance(one.wants, ResetRequest):
                 self._end(one)
                 one.began = one.wants
                 self._ask([one])
@@ -305,7 +312,7 @@ class _Renderer:
             return
         for one in which:
             one.memory.busy = True
-        requests = [one.wants for one in which if isinstance(one.wants, AskReset | AskAct)]
+        requests = [one.wants for one in which if isinstance(one.wants, ResetRequest | ActRequest)]
         replies = self._desk.replies(requests, [one.memory.map for one in which])
         for one, reply in zip(which, replies, strict=True):
             one.reply(reply)
@@ -314,7 +321,7 @@ class _Renderer:
 def _refused(error: Exception) -> Refusal:
     """Print an error of the renderer itself for one environment, and return it as a message."""
     traceback.print_exception(error)
-    return Refusal("renderer", f"the shared renderer: {type(error).__name__}: {said_by(error)}")
+    return Refusal("renderer", f"the shared renderer: {type(error).__name__}: {error_text(error)}")
 
 
 @lru_cache(maxsize=_PLACES_KEPT)

@@ -16,26 +16,26 @@ import msgspec
 import pandas as pd
 
 from bridge import keys
-from bridge.session import notices_of, open_session
+from bridge.session import connection_warnings, open_session
 from cosim.core.errors import UsageError
 from cosim.core.progress import Progress
 from cosim.core.progress import ignore as ignore_progress
 from cosim.core.units import milliseconds
 from cosim.episode.interfaces import Policy
-from cosim.episode.policy_caller import Driver
-from cosim.results.run_folder import read_spec, refuse_unbegun, refuse_used
+from cosim.episode.policy_caller import PolicyCaller
+from cosim.results.run_folder import read_spec, refuse_not_begun, refuse_used
 from cosim.spec.connection import Connection
-from cosim.spec.injection import Live
-from cosim.spec.options import EpisodeOptions, Outside, PolicyHost
+from cosim.spec.injection import LiveAddress
+from cosim.spec.options import DirectorAddress, EpisodeOptions, PolicyHost
 from cosim.spec.robot import COURIER, robot_called
-from cosim.spec.run_config import RunConfig, RunEnds
+from cosim.spec.run_config import RunConfig, RunConnections
 from cosim.spec.scenario import Scenario, Suite, split_called
-from cosim.spec.selection import scenarios_chosen
+from cosim.spec.selection import select_scenarios
 from scenarios.ipc.messages import MessageHandler
 from scenarios.runs.local import InProcess, LocalProcesses
 from scenarios.runs.planning import PlannedRun, check_folder, held_run, planned_run
 from scenarios.runs.pool import run_all
-from scenarios.runs.ray_workers import by_ray, check_on_ray
+from scenarios.runs.ray_workers import check_on_ray, ray_carrier
 from scenarios.runs.shared_renderer import SharedRenderer
 from scenarios.runs.transport import HeldRun, TransportFactory
 from scenarios.suites.catalog import load_suite, with_crowd, with_robot
@@ -52,7 +52,7 @@ def ignore(message: object) -> None:
     """Default callback: ignores the message."""
 
 
-class Given(NamedTuple):
+class RunObjects(NamedTuple):
     """Objects of a Python caller, in place of names in a config. The default folder of such a run
     is temporary."""
 
@@ -158,13 +158,13 @@ def run(
         pace=options.pace,
         latency=repr(options.latency_ms) if options.latency_ms else "",
     )
-    given = Given(
+    given = RunObjects(
         suite=None if isinstance(suite, str) else suite,
         policy=None if isinstance(policy, str) else policy,
         options=options,
         host=host,
     )
-    return carry_out(config, given=given, reporter=Silent(tell))
+    return execute_run(config, given=given, reporter=Silent(tell))
 
 
 def _refuse_for_object(
@@ -182,10 +182,10 @@ def _refuse_for_object(
         )
 
 
-def carry_out(
+def execute_run(
     config: RunConfig,
     *,
-    given: Given | None = None,
+    given: RunObjects | None = None,
     reporter: Reporter = Silent(),  # noqa: B008  a frozen value
     carrier: Carrier | None = None,
 ) -> pd.DataFrame:
@@ -197,13 +197,13 @@ def carry_out(
     Raises what `run` raises.
     """
     ends = config.ends
-    for line in (line for end in ends.all for line in notices_of(end)):
+    for line in (line for end in ends.all for line in connection_warnings(end)):
         reporter.say(line)
     _check_cluster(config, given)
     if config.out is not None:
-        (refuse_unbegun if config.resume else refuse_used)(config.out)
+        (refuse_not_begun if config.resume else refuse_used)(config.out)
     whole = _loaded(config, given, reporter)
-    of_run = scenarios_chosen(
+    of_run = select_scenarios(
         whole, config.scenario, config.episodes, config.event, split_called(config.split)
     )
     plan = _planned(config, given, whole, of_run, ends)
@@ -220,7 +220,7 @@ def carry_out(
         return held.held.finish()
 
 
-def _check_cluster(config: RunConfig, given: Given | None) -> None:
+def _check_cluster(config: RunConfig, given: RunObjects | None) -> None:
     """Check that a cluster supports the options of a run. Raises UsageError."""
     if not config.on:
         return
@@ -235,7 +235,7 @@ def _check_cluster(config: RunConfig, given: Given | None) -> None:
     check_on_ray(config.on, {words[name]: asked for name, asked in of_here.items()})
 
 
-def _loaded(config: RunConfig, given: Given | None, reporter: Reporter) -> Suite:
+def _loaded(config: RunConfig, given: RunObjects | None, reporter: Reporter) -> Suite:
     """Load the suite of a run, with its robot and crowd. Raises UsageError, SpecError, MapError."""
     if given is not None and given.suite is not None:
         whole = given.suite
@@ -265,7 +265,11 @@ def _loaded(config: RunConfig, given: Given | None, reporter: Reporter) -> Suite
 
 
 def _planned(
-    config: RunConfig, given: Given | None, whole: Suite, of_run: Sequence[Scenario], ends: RunEnds
+    config: RunConfig,
+    given: RunObjects | None,
+    whole: Suite,
+    of_run: Sequence[Scenario],
+    ends: RunConnections,
 ) -> PlannedRun:
     if given is not None:
         return planned_run(
@@ -364,10 +368,10 @@ def measured_latency(
     return MeasuredLatency(float(row["answer_ms"]), float(row["latency_ms"]))
 
 
-def _workers(plan: PlannedRun, given: Given | None, reporter: Reporter) -> Carrier:
+def _workers(plan: PlannedRun, given: RunObjects | None, reporter: Reporter) -> Carrier:
     """Return the connection to the workers of a run: on Ray, this process, or child processes."""
     if plan.config.on:
-        return by_ray(plan.config.on, plan.config.jobs, plan.policy, reporter.say)
+        return ray_carrier(plan.config.on, plan.config.jobs, plan.policy, reporter.say)
     if given is not None and given.policy is not None:
         return nullcontext(partial(_in_this_process, plan.driver))
     return nullcontext(partial(_by_processes, plan.config.jobs or 1))
@@ -380,18 +384,20 @@ def _by_processes(
 
 
 def _in_this_process(
-    driver: Driver, run: HeldRun, tell: MessageHandler
+    driver: PolicyCaller, run: HeldRun, tell: MessageHandler
 ) -> AbstractContextManager[tuple[InProcess, MessageHandler]]:
     return nullcontext((InProcess(driver), tell))
 
 
 @contextmanager
-def _connected(plan: PlannedRun, folder: Path, ends: RunEnds) -> Iterator[PlannedRun]:
+def _connected(plan: PlannedRun, folder: Path, ends: RunConnections) -> Iterator[PlannedRun]:
     """Connect a run to its director and to live clients, if the config requests them."""
     options = plan.options
     named = keys.chunk(folder.name)
     if ends.director is not None:
-        outside = Outside(connection=ends.director, run=named, wait_s=plan.config.director_wait)
+        outside = DirectorAddress(
+            connection=ends.director, run=named, wait_s=plan.config.director_wait
+        )
         options = msgspec.structs.replace(options, director=outside)
     with _live(ends.live, named) as live:
         if live is not None:
@@ -400,13 +406,13 @@ def _connected(plan: PlannedRun, folder: Path, ends: RunEnds) -> Iterator[Planne
 
 
 @contextmanager
-def _live(connection: Connection | None, named: str) -> Iterator[Live | None]:
+def _live(connection: Connection | None, named: str) -> Iterator[LiveAddress | None]:
     """Open the session for live clients, and yield its address for episodes."""
     if connection is None:
         yield None
         return
     with open_session(connection) as hub:
-        yield Live(connection=hub.inside, run=named)
+        yield LiveAddress(connection=hub.inside, run=named)
 
 
 def _run_todo(

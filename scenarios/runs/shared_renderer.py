@@ -17,9 +17,9 @@ from typing import Final, NamedTuple, Self
 import msgspec
 
 from cosim.core.errors import MachineError, UsageError
-from cosim.episode.policy_caller import Driver
-from cosim.spec.options import CameraName, RendererAt
-from scenarios.ipc.child_process import KeptProcess, Watchdog
+from cosim.episode.policy_caller import PolicyCaller
+from cosim.spec.options import CameraName, RendererAddress
+from scenarios.ipc.child_process import ChildProcess, Watchdog
 from scenarios.ipc.messages import Hello, encode_message
 
 RENDERERS: Final = 3
@@ -32,7 +32,7 @@ _SERVES: Final = "scenarios.runs.renderer:serve_pictures"
 """The function of the renderer's process."""
 
 
-class End(NamedTuple):
+class RendererEnd(NamedTuple):
     """The end of a renderer, in words.
 
     unanswered_s: timeout of the policy call in seconds, if the renderer was killed for it.
@@ -53,11 +53,11 @@ class SharedRenderer:
 
     def __init__(self, logs: Path, hello: Hello, *, asks: bool) -> None:
         self._logs = logs
-        self.at = RendererAt(address=f"cosim-renderer-{secrets.token_hex(8)}", asks=asks)
+        self.at = RendererAddress(address=f"cosim-renderer-{secrets.token_hex(8)}", asks=asks)
         self._hello = msgspec.structs.replace(hello, renderer=self.at)
         self._listening = socket.socket(socket.AF_UNIX)
         self._watchdog: Watchdog | None = None
-        self._ends: list[End] = []
+        self._ends: list[RendererEnd] = []
         self._in_a_row = 0
 
     def __enter__(self) -> Self:
@@ -97,17 +97,19 @@ class SharedRenderer:
                 "while it was loaded in the renderer process: give a longer --start-timeout"
             )
         self._replace(
-            self._watchdog, End(end.words, end.allowed_s), blames_policy=end.question is not None
+            self._watchdog,
+            RendererEnd(end.words, end.allowed_s),
+            blames_policy=end.question is not None,
         )
 
-    def end_of(self, number: int) -> End | None:
+    def end_of(self, number: int) -> RendererEnd | None:
         """Return the end of the renderer with this number; None if it still runs, and only an
         environment has lost it.
 
         number: from 1; 0 for an environment that never had a reply.
         """
         if number == 0:
-            return End("the renderer process could not be reached")
+            return RendererEnd("the renderer process could not be reached")
         deadline_s = time.monotonic() + _ENDING_S
         while (
             number > len(self._ends)
@@ -124,12 +126,12 @@ class SharedRenderer:
 
     def _start(self) -> None:
         log = self._logs / f"renderer-{len(self._ends)}.log"
-        process = KeptProcess(log, _SERVES, "renderer", (self._listening.fileno(),))
+        process = ChildProcess(log, _SERVES, "renderer", (self._listening.fileno(),))
         at = msgspec.structs.replace(self.at, number=len(self._ends) + 1)
         process.send(encode_message(msgspec.structs.replace(self._hello, renderer=at)))
         self._watchdog = Watchdog(process, self._hello.patience, _SILENCE_S)
 
-    def _replace(self, watchdog: Watchdog, end: End, *, blames_policy: bool) -> None:
+    def _replace(self, watchdog: Watchdog, end: RendererEnd, *, blames_policy: bool) -> None:
         """Start another renderer. Raises UsageError or MachineError after too many failures in a
         row."""
         self._ends.append(end)
@@ -151,7 +153,7 @@ class SharedRenderer:
         self._start()
 
 
-def check_shared(driver: Driver, camera: CameraName) -> None:
+def check_shared(driver: PolicyCaller, camera: CameraName) -> None:
     """Check that a run can have a shared renderer. camera: of the run. Raises UsageError."""
     manifest = driver.manifest
     if manifest.camera is None and not driver.batches:

@@ -15,7 +15,7 @@ import msgspec
 
 from cosim.core.errors import EngineError
 from cosim.core.files import write_atomic
-from cosim.core.log_event import happened
+from cosim.core.log_event import log_event
 from cosim.results.run_folder import RunFolder
 from cosim.spec.scenario import Scenario
 from scenarios.ipc.messages import Done, Message, MessageHandler, Progress, Waits
@@ -203,7 +203,7 @@ class WorkerRegistry:
         one = self._of(worker, host)
         if (one.state, one.why) != ("turned away", why):
             self.note(f"{worker}: turned away: {why}")
-            happened("refused", WARNING, worker=worker, host=host, why=why)
+            log_event("refused", WARNING, worker=worker, host=host, why=why)
         one.state = "turned away"
         one.why = why
 
@@ -219,7 +219,7 @@ class WorkerRegistry:
 
     def note(self, words: str) -> str:
         """Add a line to the run's log, and return it."""
-        happened("noted", DEBUG, words=words)
+        log_event("noted", DEBUG, words=words)
         line = f"{datetime.now(UTC).strftime('%Y-%m-%d %H:%M:%S')} {' '.join(words.split())}"
         with (
             suppress(OSError),

@@ -18,17 +18,17 @@ from socket import socket
 
 import msgspec
 
-from bridge.policy_server import said_by
+from bridge.policy_server import error_text
 from cosim.core.clock import Clock
 from cosim.core.errors import MachineError, RendererLost, UsageError
-from cosim.core.framing import Wire
+from cosim.core.framing import MessageSocket
 from cosim.core.versions import versions
 from cosim.episode.loop import Step
-from cosim.episode.policy_caller import Driver
+from cosim.episode.policy_caller import PolicyCaller
 from cosim.policies.load import load_policy
 from cosim.results.referee import Verdict
-from cosim.spec.options import RendererAt
-from scenarios.ipc.deadlines import Asked
+from cosim.spec.options import RendererAddress
+from scenarios.ipc.deadlines import PendingCallMemory
 from scenarios.ipc.messages import (
     Done,
     FrameDrawn,
@@ -58,14 +58,14 @@ def serve_jobs(socket_descriptor: int, call_descriptor: int) -> None:
     """Run jobs until the socket closes. An exception outside an episode ends the process, which the
     run then replaces."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    wire = Wire(socket(fileno=socket_descriptor))
+    wire = MessageSocket(socket(fileno=socket_descriptor))
     home = Path.cwd()
     outputs = _open_outputs()
-    say = partial(said_to_run, wire, os.getpid())
+    say = partial(send_to_run, wire, os.getpid())
     hello = decode_hello(wire.receive())
     _import_engines(say)
-    timer = Asked(call_descriptor)
-    drivers: DriversHere | None = drivers_here(hello, timer, say)
+    timer = PendingCallMemory(call_descriptor)
+    drivers: WorkerDrivers | None = load_drivers(hello, timer, say)
     say(Ready())
     while True:
         try:
@@ -73,7 +73,7 @@ def serve_jobs(socket_descriptor: int, call_descriptor: int) -> None:
         except EOFError:
             return
         os.chdir(home)  # the policy may have changed it
-        drivers = drivers or drivers_here(hello, timer, say, again=True)
+        drivers = drivers or load_drivers(hello, timer, say, again=True)
         try:
             done, failed = run_job(job, drivers.policy, say, drivers.learner, hello.renderer)
         except MachineError as lack:
@@ -105,18 +105,18 @@ def _import_engines(say: MessageHandler) -> None:
     except (ImportError, OSError) as error:
         say(
             Unable(
-                f"{CANNOT_START} {said_by(error)}. `cosim doctor` says more", blames_policy=False
+                f"{CANNOT_START} {error_text(error)}. `cosim doctor` says more", blames_policy=False
             )
         )
         raise
 
 
 @dataclass(frozen=True)
-class DriversHere:
+class WorkerDrivers:
     """The drivers of a worker: of the run's policy, and of the learner of a collection."""
 
-    policy: Driver
-    learner: Driver | None
+    policy: PolicyCaller
+    learner: PolicyCaller | None
 
     @property
     def spent(self) -> bool:
@@ -128,23 +128,25 @@ class DriversHere:
             self.learner.close()
 
 
-def drivers_here(
-    hello: Hello, timer: Asked, say: MessageHandler, *, again: bool = False
-) -> DriversHere:
-    """Load the drivers of a worker, with the checks of `policy_here`."""
+def load_drivers(
+    hello: Hello, timer: PendingCallMemory, say: MessageHandler, *, again: bool = False
+) -> WorkerDrivers:
+    """Load the drivers of a worker, with the checks of `load_run_policy`."""
     if hello.renderer is not None and hello.renderer.asks:
-        driver: Driver = shared_driver(
+        driver: PolicyCaller = shared_driver(
             hello.manifest, hello.source_hash, hello.renderer, hello.host.run
         )
     else:
-        driver = policy_here(hello, timer, say, again=again)
+        driver = load_run_policy(hello, timer, say, again=again)
     if (learner := hello.learner) is None:
-        return DriversHere(driver, None)
+        return WorkerDrivers(driver, None)
     with _load_errors_sent(say):
-        return DriversHere(driver, _checked(load_policy(learner.policy, timer), learner, again))
+        return WorkerDrivers(driver, _checked(load_policy(learner.policy, timer), learner, again))
 
 
-def policy_here(hello: Hello, timer: Asked, say: MessageHandler, *, again: bool = False) -> Driver:
+def load_run_policy(
+    hello: Hello, timer: PendingCallMemory, say: MessageHandler, *, again: bool = False
+) -> PolicyCaller:
     """Load the policy of the run. An error, or a policy that differs from the run's, is sent to the
     run, and ends the process.
 
@@ -166,7 +168,7 @@ def _load_errors_sent(say: MessageHandler) -> Iterator[None]:
         raise
 
 
-def _checked(driver: Driver, expected: Hello, again: bool) -> Driver:
+def _checked(driver: PolicyCaller, expected: Hello, again: bool) -> PolicyCaller:
     """Return a driver if it equals that of the run. Raises UsageError."""
     if driver.source_hash != expected.source_hash:
         raise UsageError(
@@ -186,10 +188,10 @@ def _checked(driver: Driver, expected: Hello, again: bool) -> Driver:
 
 def run_job(
     job: Job,
-    driver: Driver,
+    driver: PolicyCaller,
     say: MessageHandler,
-    learner: Driver | None = None,
-    renderer: RendererAt | None = None,
+    learner: PolicyCaller | None = None,
+    renderer: RendererAddress | None = None,
 ) -> tuple[Done | LostRenderer, bool]:
     """Run one episode, and send its progress.
 
@@ -261,7 +263,7 @@ class _Watcher:
         self._say(msgspec.structs.replace(self._progress, compared=share or 0.0))
 
 
-def said_to_run(wire: Wire, worker: int, message: Message) -> None:
+def send_to_run(wire: MessageSocket, worker: int, message: Message) -> None:
     """Send a message to the run. If the run has ended, or this is a fork of the worker by its
     policy, end this process at once."""
     try:

@@ -10,7 +10,7 @@ import msgspec
 
 from cosim.core.errors import UsageError, unknown
 from cosim.spec.scenario import Suite, read_suite
-from cosim.spec.selection import scenarios_chosen
+from cosim.spec.selection import select_scenarios
 from scenarios.events import EVENT_KINDS
 
 _HERE = Path(__file__).parent
@@ -81,7 +81,7 @@ def one_scenario(
                 f"--scenario out"
             )
         whole = holding(name) if suite is None else load_suite(suite)
-        return msgspec.structs.replace(whole, scenarios=scenarios_chosen(whole, [name])), 1
+        return msgspec.structs.replace(whole, scenarios=select_scenarios(whole, [name])), 1
     if suite is not None:
         raise UsageError(
             f"{name} is a file: leave --suite out, and choose one of its scenarios by --scenario"

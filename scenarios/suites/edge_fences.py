@@ -15,7 +15,7 @@ import shapely
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Floats
 from cosim.place import overlay
-from cosim.place.barriers import barrier_along, branches, corner_of
+from cosim.place.barriers import barrier_along, corner_of, ports_to_close
 from cosim.place.street_map import SEAM_M, Port, StreetMap, Strip, union_closed
 from cosim.spec.scenario import Barrier
 
@@ -54,7 +54,7 @@ def hem(street_map: StreetMap, way: Sequence[Port]) -> tuple[Barrier, ...]:
         s for s in street_map.near("strip", ground) if isinstance(s, Strip) and s.id not in strips
     ]
     ends = [Port(s.id, end) for s in touching for end in (0, 1)]
-    ports = list(dict.fromkeys([*branches(street_map, way), *ends]))
+    ports = list(dict.fromkeys([*ports_to_close(street_map, way), *ends]))
     if not len(sides) or not ports:
         return ()
     middles = sides.mean(axis=1)

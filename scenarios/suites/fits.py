@@ -21,11 +21,11 @@ from cosim.place.street_map import StreetMap, WalkableArea
 from cosim.spec.obstacle import footprint
 from cosim.spec.robot import ROBOTS, robot_called
 from cosim.spec.scenario import MOST_PERSONS, Place, RouteCrossing, Scenario, Suite, event_faults
-from cosim.spec.spec_file import in_lines
+from cosim.spec.spec_file import join_faults
 from physics.cameras.hdri import read_hdri
 from scenarios.events import EVENT_KINDS
 from scenarios.places.nets import place
-from sumo_nets.crowd.free_space import Room
+from sumo_nets.crowd.free_space import LocalWalkableArea
 
 LOOKING: Final = "looking where the episodes take place"
 _PLACES_A_PROCESS: Final = 8
@@ -70,7 +70,7 @@ def check_places(
                     "a process that looked at places was ended: is there enough memory?"
                 ) from error
     if faults:
-        raise SpecError(f"suite '{whole.name}': {in_lines(faults)}")
+        raise SpecError(f"suite '{whole.name}': {join_faults(faults)}")
 
 
 def _deaf_to_ctrl_c() -> None:
@@ -202,7 +202,7 @@ def _crowded(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
     """Crowds that by their density are more people than one may ask for by number."""
     crowd = scenario.crowd
     if crowd.density is not None:
-        room_m2 = Room(street_map, crowd.radius_m).area_m2(*scenario.start[:2])
+        room_m2 = LocalWalkableArea(street_map, crowd.radius_m).area_m2(*scenario.start[:2])
         if (persons := round(crowd.density * room_m2 / 1000.0)) > MOST_PERSONS:
             yield (
                 f"crowd density {crowd.density:g} within {crowd.radius_m:g} m of the start "

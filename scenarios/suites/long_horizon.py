@@ -13,8 +13,8 @@ from shapely.geometry import LineString
 
 from cosim.core.errors import MapError, SpecError
 from cosim.core.geometry import Polyline
-from cosim.place.barriers import barrier_at, branches, ground_around, prove_single_path
-from cosim.place.car_paths import CAR_M, from_car_paths_m
+from cosim.place.barriers import barrier_at, ground_around, ports_to_close, prove_single_path
+from cosim.place.car_paths import CAR_WIDTH_M, distance_to_car_paths_m
 from cosim.place.map_check import on_road_shares
 from cosim.place.route_line import ROUTE_M, START_M, way_line
 from cosim.place.street_map import Lane, Port, StreetMap
@@ -254,7 +254,7 @@ def _barriers(
 ) -> tuple[Barrier, ...]:
     """Barriers that leave one path, square to their strips if possible. Raises SpecError when there
     are none."""
-    ports = branches(street_map, way)
+    ports = ports_to_close(street_map, way)
     ground = ground_around(street_map, route, way)
     barriers = tuple(barrier_at(street_map, port) for port in ports)
     try:
@@ -390,5 +390,5 @@ def on_car_paths_m(
     for crossing in crossings:
         s_m = s_m[(s_m < crossing.enter_s_m - _KERB_M) | (s_m > crossing.leave_s_m + _KERB_M)]
     xy = np.column_stack([np.interp(s_m, route.s_m, route.points[:, k]) for k in (0, 1)])
-    hit = from_car_paths_m(street_map, xy) < 0.5 * (CAR_M + robot.width_m)
+    hit = distance_to_car_paths_m(street_map, xy) < 0.5 * (CAR_WIDTH_M + robot.width_m)
     return _SAMPLE_M * float(hit.sum())

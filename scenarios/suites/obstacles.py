@@ -21,7 +21,7 @@ from shapely.geometry import LineString, MultiPolygon, Point, Polygon
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Floats, Polyline, wrap_angle
 from cosim.place import overlay
-from cosim.place.barriers import fenced, outline
+from cosim.place.barriers import outline, without_barriers
 from cosim.place.street_map import Lane, StreetMap, Strip
 from cosim.results.referee import FREE_OF_OBSTACLES_M, WAYPOINT_STEP_M
 from cosim.spec.obstacle import (
@@ -199,7 +199,7 @@ class _Room:
         self._goal = Point(scenario.goal)
         surface = StreetSurface(street_map, scenario.place.seed)
         props = [ground for ground in footprints(surface.standing(area)) if area.intersects(ground)]
-        walkable = fenced(street_map.walkable_near(area), scenario.barriers)
+        walkable = without_barriers(street_map.walkable_near(area), scenario.barriers)
         self._free = overlay.difference(
             overlay.intersection(walkable, area), overlay.union_all(props)
         )

@@ -16,7 +16,7 @@ from scenarios.events import EVENT_KINDS
 from scenarios.places.nets import place
 from scenarios.suites import long_horizon, reactive
 from scenarios.suites.drawing import passable
-from sumo_nets.maps.place_names import place_called
+from sumo_nets.maps.place_names import resolve_place
 
 _KINDS = ("long-horizon", "reactive")
 
@@ -49,7 +49,7 @@ def suite_on_map(
     for event in events:
         if event not in kinds:
             raise unknown("event", event, kinds)
-    where = place_called(called, roughness)
+    where = resolve_place(called, roughness)
     _, street_map = place(where)
     name = where.map if isinstance(where, CityMap) else where.name
     drawn = _Drawn(where, street_map, WalkGraph(street_map), name, seed, kinds, robot)

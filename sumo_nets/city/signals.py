@@ -77,7 +77,7 @@ class _Signal:
         return 1 + max([car.link for car in self.cars] + [zebra.link for zebra in self.zebras])
 
 
-def with_programs(net: bytes, rng: np.random.Generator) -> bytes:
+def with_signal_programs(net: bytes, rng: np.random.Generator) -> bytes:
     """Return the net with generated programs in place of netconvert's."""
     programs = {
         signal.id: _program(signal, rng) for signal in _signals(ET.fromstring(net)).values()

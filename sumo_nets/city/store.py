@@ -10,14 +10,14 @@ from xml.sax.saxutils import quoteattr
 
 import msgspec
 
-from cosim.core.cache import BUILDING, cache_folder, make_room, use_entry
+from cosim.core.cache import BUILDING_PREFIX, cache_folder, clean_up_if_due, use_entry
 from cosim.core.errors import MapError, unwritable
 from cosim.core.files import temp_folder, write_atomic
 from cosim.spec.scenario import City
 from sumo_nets.city.blocks import CLASSES, Point
 from sumo_nets.city.city import plan_city
 from sumo_nets.city.plan import CityPlan, Edge
-from sumo_nets.city.signals import with_programs
+from sumo_nets.city.signals import with_signal_programs
 from sumo_nets.net.netconvert import netconvert
 from sumo_nets.net.raw_file import net_content_hash, without_comments
 
@@ -37,7 +37,9 @@ _NETCONVERT = (
 def city_as_net(city: City, folder: Path) -> bytes:
     """Return the net of a city. folder: for temporary files."""
     plan = plan_city(city.seed, city.size_m, city.style)
-    return with_programs(without_comments(_converted(plan, folder).read_bytes()), plan.signal_rng)
+    return with_signal_programs(
+        without_comments(_converted(plan, folder).read_bytes()), plan.signal_rng
+    )
 
 
 def _converted(plan: CityPlan, folder: Path) -> Path:
@@ -132,9 +134,9 @@ def city_net(city: City) -> Path:
     """
     path = cache_folder() / f"{city.name}-g{GENERATOR}.net.xml"
     use_entry(path)
-    if not is_whole(path):
+    if not is_undamaged(path):
         try:
-            make_room()
+            clean_up_if_due()
             build_city(city, path)
         except OSError as error:
             raise unwritable(path, error, "set COSIM_CACHE to another folder") from error
@@ -148,7 +150,7 @@ def city_net(city: City) -> Path:
     return path
 
 
-def is_whole(path: Path) -> bool:
+def is_undamaged(path: Path) -> bool:
     """Return whether a cached net is undamaged, by the hash in its last line."""
     try:
         body, _, seal = path.read_bytes().rpartition(SEAL)
@@ -170,7 +172,8 @@ def write_city(city: City, folder: Path) -> City:
     try:
         if (
             folder.exists()
-            and not {p.name for p in folder.iterdir() if not p.name.startswith(BUILDING)} <= known
+            and not {p.name for p in folder.iterdir() if not p.name.startswith(BUILDING_PREFIX)}
+            <= known
         ):
             raise MapError(f"{folder}: is not a city's folder, and not empty: choose a new one")
         net = folder / NET_NAME
@@ -195,6 +198,6 @@ def build_city(city: City, path: Path) -> None:
     """Build a city's net at `path` atomically, so that several processes may build the same
     city. Raises OSError."""
 
-    with temp_folder(BUILDING, path.parent) as folder:
+    with temp_folder(BUILDING_PREFIX, path.parent) as folder:
         body = city_as_net(city, folder)
     write_atomic(path, body + SEAL + _seal(body), shared=True)

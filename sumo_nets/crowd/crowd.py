@@ -22,18 +22,18 @@ from cosim.core.state import (
     RobotState,
     Street,
     Vehicles,
-    frozen,
-    write_protected,
+    write_protect,
+    write_protected_copy,
 )
 from cosim.episode.interfaces import Crowd
-from cosim.people.yielding import RobotBody, Standing
+from cosim.people.yielding import RobotBody, StandingObstacles
 from cosim.place.street_map import Port, StreetMap
 from cosim.spec.events import Actor, EventReply
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import CrowdSpec
 from sumo_nets import engine
 from sumo_nets.crowd.demand import (
-    LINGER_M,
+    LEAVE_MARGIN_M,
     VEHICLE_REACH_M,
     Drivers,
     Pedestrians,
@@ -41,12 +41,12 @@ from sumo_nets.crowd.demand import (
     replayed_demand,
 )
 from sumo_nets.crowd.demand_log import Entrances
-from sumo_nets.crowd.empty_street import TICK_MS, start_of
-from sumo_nets.crowd.group_cohesion import Together
-from sumo_nets.crowd.lights import Kerbs, Signals, SumoLights
+from sumo_nets.crowd.empty_street import TICK_MS, sumo_start
+from sumo_nets.crowd.group_cohesion import GroupCohesion
+from sumo_nets.crowd.lights import Signals, SumoLights, WaitingSpots
 from sumo_nets.crowd.proxy import Proxy, Walks
-from sumo_nets.crowd.shown_people import PoseFilter, ShownPeople, cast_in_order, places_of
-from sumo_nets.engine import NearPersons, NearVehicles, sumo, translated
+from sumo_nets.crowd.shown_people import PoseFilter, ShownPeople, positions_of, sorted_actors
+from sumo_nets.engine import NearPersons, NearVehicles, sumo, sumo_errors
 
 _ROLL_TICKS = 10
 """Interval in ticks at which persons and vehicles enter and leave."""
@@ -86,7 +86,7 @@ class SumoCrowd(Crowd):
         start_xy: tuple[float, float],
         footprint_m: tuple[float, float] = COURIER.footprint_m,
         before: Entrances | None = None,
-        standing: Standing | None = None,
+        standing: StandingObstacles | None = None,
     ) -> None:
         self._net_path = net_path
         self._map = street_map
@@ -96,7 +96,7 @@ class SumoCrowd(Crowd):
         self._start_xy = start_xy
         self._half_m = (footprint_m[0] / 2, footprint_m[1] / 2)
         self._before = before
-        self._standing = Standing() if standing is None else standing
+        self._standing = StandingObstacles() if standing is None else standing
         self._street: Street | None = None
 
     def __enter__(self) -> Self:
@@ -106,10 +106,10 @@ class SumoCrowd(Crowd):
                 "process: close it first, or use another process"
             )
         _, rng_persons, rng_vehicles = np.random.default_rng(self._seed).spawn(3)
-        self._launch(*start_of(self._seed))
+        self._launch(*sumo_start(self._seed))
         SumoCrowd._running = self
         try:
-            with translated("setting up the crowd"):
+            with sumo_errors("setting up the crowd"):
                 self._populate(rng_persons, rng_vehicles)
         except BaseException:
             self.close()
@@ -150,7 +150,7 @@ class SumoCrowd(Crowd):
             leaves.
         """
         tick = self.street.tick
-        with translated(f"stepping from tick {tick}"):
+        with sumo_errors(f"stepping from tick {tick}"):
             x_m, y_m = robot.pose[:2]
             if tick % _ROLL_TICKS == 0:
                 persons, vehicles = self._found
@@ -160,7 +160,7 @@ class SumoCrowd(Crowd):
                 self._drivers.roll(x_m, y_m, _seen(sumo.vehicle.getWaitingTime, vehicles))
             if not absent:
                 self._robot.update(robot.pose)
-            cast = cast_in_order(reply.actors, self._pedestrians.ages)
+            cast = sorted_actors(reply.actors, self._pedestrians.ages)
             self._mirror(reply.actors)
             sumo.simulationStep()
             body = None if absent else RobotBody(robot.pose, self._half_m, robot.v_mps)
@@ -190,8 +190,8 @@ class SumoCrowd(Crowd):
             sumo.vehicletype.setMinGap(kind, gap_m)
         self._walks = Walks(sumo, self._map)
         self._signals = Signals(SumoLights(sumo, self._map), self._map)
-        self._kerbs = Kerbs(self._map)
-        self._together = Together(sumo, self._map.strips, TICK_MS / 1000)
+        self._kerbs = WaitingSpots(self._map)
+        self._together = GroupCohesion(sumo, self._map.strips, TICK_MS / 1000)
         self._pedestrians, self._drivers = self._demand(rng_persons, rng_vehicles)
         self._serial: Iterator[int] = count()
         self._robot = Proxy(sumo, self._walks, base="r", kind="robot", serial=self._serial)
@@ -236,7 +236,7 @@ class SumoCrowd(Crowd):
         self, tick: int, x_m: float, y_m: float, cast: list[Actor], body: RobotBody | None
     ) -> Street:
         persons = engine.persons_near(
-            x_m, y_m, self._spec.radius_m + LINGER_M, self._pedestrians.ages
+            x_m, y_m, self._spec.radius_m + LEAVE_MARGIN_M, self._pedestrians.ages
         )
         self._found = persons, vehicles = persons, engine.vehicles_near(x_m, y_m, VEHICLE_REACH_M)
         people = self._people(persons, cast, body)
@@ -247,7 +247,9 @@ class SumoCrowd(Crowd):
         if red := self._signals.red(persons.ahead):
             xy = xy.copy()
             xy[red] = self._kerbs.behind([persons.ahead[i] for i in red], xy[red])
-        shown = self._poses.update(persons.names, xy, persons.mps, _facing, body, places_of(cast))
+        shown = self._poses.update(
+            persons.names, xy, persons.mps, _facing, body, positions_of(cast)
+        )
         return self._shown.together(cast, self._pedestrians.ages, persons.names, *shown)
 
     def _vehicles(self, near: NearVehicles) -> Vehicles:
@@ -255,12 +257,14 @@ class SumoCrowd(Crowd):
         boxes."""
         if near.names != self._sized[0]:
             sizes = [self._drivers.size_m(name) for name in near.names]
-            self._sized = near.names, write_protected(sizes, shape=(len(sizes), 2))
+            self._sized = near.names, write_protected_copy(sizes, shape=(len(sizes), 2))
         size = self._sized[1]
         heading = headings_from_sumo(near.angle_deg)
         ahead = np.column_stack([np.cos(heading), np.sin(heading)])
         xy = near.xy - 0.5 * size[:, :1] * ahead
-        return Vehicles(near.names, frozen(xy), frozen(heading), frozen(near.mps), size)
+        return Vehicles(
+            near.names, write_protect(xy), write_protect(heading), write_protect(near.mps), size
+        )
 
     def _waits_at_red(self, person: str) -> bool:
         return self._signals.is_red(sumo.person.getNextEdge(person))

@@ -15,8 +15,8 @@ from cosim.place.street_map import Port, StreetMap
 from cosim.place.walk_graph import walk_graph_of
 from cosim.spec.scenario import CrowdSpec
 from sumo_nets.crowd.demand_log import Entrances, PersonEntry, VehicleEntry
-from sumo_nets.crowd.free_space import EntrySpot, Room, Spots
-from sumo_nets.crowd.group_cohesion import Together
+from sumo_nets.crowd.free_space import EntrySpot, LocalWalkableArea, Spots
+from sumo_nets.crowd.group_cohesion import GroupCohesion
 from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M, GroupDraws
 from sumo_nets.crowd.proxy import ROUND_THE_CORNER_M
 from sumo_nets.engine import Sumo
@@ -27,7 +27,7 @@ FIRST_FILL_CLEAR_M = 8.0
 """Smallest distance from the robot in the first fill, before the episode starts, metres."""
 ENTER_M = 40.0
 """Width of the outer part of the crowd's radius in which people enter, metres."""
-LINGER_M = 20.0
+LEAVE_MARGIN_M = 20.0
 """Distance beyond the crowd's radius at which a person is removed, metres."""
 STUCK_S = 60.0
 """A person that has waited longer, except at a red light, is removed, seconds."""
@@ -83,7 +83,7 @@ class Pedestrians:
         spec: CrowdSpec,
         rng: np.random.Generator,
         closed: frozenset[Port],
-        together: Together,
+        together: GroupCohesion,
     ) -> None:
         self._engine = engine
         self._entrances = entrances
@@ -102,7 +102,7 @@ class Pedestrians:
             ),
             step_m=2.0,
         )
-        self._room = None if spec.density is None else Room(street_map, spec.radius_m)
+        self._room = None if spec.density is None else LocalWalkableArea(street_map, spec.radius_m)
         self._groups = GroupDraws(spec, rng.spawn(1)[0])
 
     def fill(self, x_m: float, y_m: float) -> None:
@@ -125,7 +125,7 @@ class Pedestrians:
         at_red: returns whether a person waits at a red light.
         """
         person, radius_m = self._engine.person, self._spec.radius_m
-        fellows = self._together.fellows
+        fellows = self._together.group_of
         present = sorted(self.ages.keys() & set(person.getIDList()))
         self._together.forget(present)
         removed: set[str] = set()
@@ -199,7 +199,7 @@ class Pedestrians:
             if len(walk) == 1:
                 continue
             walk = self._one_way(walk, forward)
-            speed_mps = group.walks_at(drawn_mps)
+            speed_mps = group.speed_at(drawn_mps)
             names = [self._name(age) for age in group.ages]
             for name, xy in zip(names, places, strict=True):
                 self._add(name, spot, walk, speed_mps, xy)
@@ -349,7 +349,7 @@ def replayed_demand(
     street_map: StreetMap,
     spec: CrowdSpec,
     closed: frozenset[Port],
-    together: Together,
+    together: GroupCohesion,
 ) -> tuple[ReplayedPedestrians, ReplayedDrivers]:
     """Return pedestrians and vehicles that repeat the entries and exits of `before` at the same
     times."""

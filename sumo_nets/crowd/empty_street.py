@@ -20,7 +20,7 @@ from cosim.spec.events import Actor, EventReply
 from cosim.spec.scenario import CrowdSpec
 from sumo_nets.crowd.demand_log import Entrances
 from sumo_nets.crowd.lights import PlannedLights, Signals
-from sumo_nets.crowd.shown_people import ShownPeople, cast_in_order
+from sumo_nets.crowd.shown_people import ShownPeople, sorted_actors
 
 TICK_MS: Final = 50
 """Duration of a SUMO step, milliseconds."""
@@ -29,21 +29,21 @@ _SIGNAL_CLOCK_S: Final = 3600
 """Range of the start time of the signals, drawn from the seed, seconds."""
 
 
-def goes_by_itself(street_map: StreetMap, spec: CrowdSpec, before: Entrances | None = None) -> bool:
+def needs_no_sumo(street_map: StreetMap, spec: CrowdSpec, before: Entrances | None = None) -> bool:
     """Return whether a street does not need SUMO. before: recorded entries to replay instead of
     random ones."""
     no_crowd = spec.empty if before is None else not (before.people or before.vehicles)
-    return no_crowd and street_map.signals_by_the_clock
+    return no_crowd and street_map.signals_fixed_time
 
 
-def start_of(seed: int) -> tuple[int, int]:
+def sumo_start(seed: int) -> tuple[int, int]:
     """Return SUMO's seed and its start time in seconds."""
     rng = np.random.default_rng(seed).spawn(1)[0]
     return int(rng.integers(2**31)), int(rng.integers(_SIGNAL_CLOCK_S))
 
 
 class EmptyStreet(Crowd):
-    """A street with event pedestrians and planned signals only, see `goes_by_itself`. Use it as a
+    """A street with event pedestrians and planned signals only, see `needs_no_sumo`. Use it as a
     context manager.
 
     seed: seed of the signals' start time.
@@ -59,7 +59,7 @@ class EmptyStreet(Crowd):
         self.entrances = Entrances()
 
     def __enter__(self) -> Self:
-        self._lights = PlannedLights(self._map, start_of(self._seed)[1])
+        self._lights = PlannedLights(self._map, sumo_start(self._seed)[1])
         self._signals = Signals(self._lights, self._map)
         self._shown = ShownPeople(TICK_MS / 1000)
         self._street = self._read(0, *self._start_xy, ())
@@ -91,6 +91,6 @@ class EmptyStreet(Crowd):
     def _read(self, tick: int, x_m: float, y_m: float, actors: tuple[Actor, ...]) -> Street:
         self._lights.now_ms += TICK_MS
         people = self._shown.together(
-            cast_in_order(actors, self.entrances.ages), self.entrances.ages
+            sorted_actors(actors, self.entrances.ages), self.entrances.ages
         )
         return Street(tick, people, signals=self._signals.near(x_m, y_m))

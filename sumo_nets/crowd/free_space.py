@@ -13,11 +13,11 @@ import shapely
 from cosim.core.geometry import Floats, Polyline, Pose
 from cosim.place.street_map import StreetMap
 
-AGAIN_M: Final = 5.0
+REMEASURE_M: Final = 5.0
 """Distance that the point moves before the area is measured again, metres."""
 
 
-class Room:
+class LocalWalkableArea:
     """The walkable area within `radius_m` of a slowly moving point."""
 
     def __init__(self, street_map: StreetMap, radius_m: float) -> None:
@@ -32,7 +32,7 @@ class Room:
     def area_m2(self, x_m: float, y_m: float) -> float:
         """Return the area of sidewalks, crossings and corners around a point, m2, accurate to a
         shift of AGAIN_M."""
-        if self._at is None or math.hypot(x_m - self._at[0], y_m - self._at[1]) > AGAIN_M:
+        if self._at is None or math.hypot(x_m - self._at[0], y_m - self._at[1]) > REMEASURE_M:
             self._at = (x_m, y_m)
             disk = shapely.Point(x_m, y_m).buffer(self._radius_m)
             near = self._polygons[self._tree.query(disk, predicate="intersects")]

@@ -25,7 +25,7 @@ from sumo_nets.engine import Sumo
 _TOLERANCE_M: Final = 0.15
 """Smallest deviation from the group's middle that changes a member's speed, metres."""
 
-SLOWER_PER_M: Final = 0.3
+SPEED_CHANGE_PER_M: Final = 0.3
 """Relative speed change per metre ahead of the group's middle."""
 
 SLOWEST = 0.6
@@ -36,9 +36,9 @@ FASTEST = 1.1
 _STEPS: Final = 20.0
 """Relative speeds are rounded to 1/20 to avoid calls for small changes."""
 
-WAIT_M = 2.0
+WAIT_AHEAD_M = 2.0
 """A member farther ahead of the last one waits, metres."""
-GO_M = 1.4
+RESUME_AHEAD_M = 1.4
 """A waiting member continues when the last one is nearer, metres."""
 
 _TOO_WIDE_M: Final = 1.0
@@ -53,7 +53,7 @@ _FREE_RADIUS_M = 0.9
 _FREE_AHEAD_M = 6.0
 """Distance ahead that must be free of others for a side step, metres."""
 
-ROUGHLY: Final = 0.5
+CORNER_WEIGHT: Final = 0.5
 """Factor on distances along the way at corners, where the direction is uncertain."""
 
 _FAR_APART_M: Final = 3.0
@@ -93,7 +93,7 @@ class _Standing(Protocol):
     def y_m(self) -> float: ...
 
 
-class Together:
+class GroupCohesion:
     """The groups on the street.
 
     strips: sidewalks and crossings.
@@ -112,7 +112,7 @@ class Together:
         """The names of the members of each group."""
         return tuple(group.names for name, group in self._groups.items() if name == group.names[0])
 
-    def fellows(self, name: str) -> tuple[str, ...]:
+    def group_of(self, name: str) -> tuple[str, ...]:
         """Return all members of a person's group, the person included."""
         return self._groups[name].names if name in self._groups else (name,)
 
@@ -136,7 +136,7 @@ class Together:
 
     def leave(self, name: str) -> tuple[str, ...]:
         """Dissolve a person's group and return its members."""
-        names = self.fellows(name)
+        names = self.group_of(name)
         for fellow in names:
             self._groups.pop(fellow, None)
         return names
@@ -159,10 +159,12 @@ class Together:
         middle_m = sum(group.ahead_m.values()) / len(group.ahead_m)
         for name, ahead_m in group.ahead_m.items():
             share = 1.0
-            if ahead_m - last_m > (GO_M if group.share.get(name) == 0.0 else WAIT_M):
+            if ahead_m - last_m > (
+                RESUME_AHEAD_M if group.share.get(name) == 0.0 else WAIT_AHEAD_M
+            ):
                 share = 0.0
             elif abs(ahead_m - middle_m) > _TOLERANCE_M:
-                share = min(max(1.0 - SLOWER_PER_M * (ahead_m - middle_m), SLOWEST), FASTEST)
+                share = min(max(1.0 - SPEED_CHANGE_PER_M * (ahead_m - middle_m), SLOWEST), FASTEST)
             if share < 1.0 and self._on_crossing(name):
                 share = 1.0
             self._set_speed(group, name, round(_STEPS * share) / _STEPS)
@@ -258,7 +260,7 @@ class Together:
         Nearby members are compared along the group's direction, others by their edges of the walk.
         """
         if max(math.dist(p, q) for p, q in itertools.combinations(here.values(), 2)) < _FAR_APART_M:
-            return {name: ROUGHLY * m for name, m in ahead_m.items()}
+            return {name: CORNER_WEIGHT * m for name, m in ahead_m.items()}
         edges = {name: self._edge_index(name, group) for name in here}
         hindmost = [here[name] for name, edge in edges.items() if edge == min(edges.values())]
         return {name: min(math.dist(here[name], place) for place in hindmost) for name in here}

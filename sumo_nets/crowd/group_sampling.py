@@ -55,7 +55,7 @@ class PersonGroup(NamedTuple):
     def size(self) -> int:
         return len(self.ages)
 
-    def walks_at(self, drawn_mps: float) -> float:
+    def speed_at(self, drawn_mps: float) -> float:
         """Return the group's speed if a single person would walk at `drawn_mps`."""
         return max(drawn_mps - SLOWER_MPS * (self.size - 1), self.pace_mps[0])
 

@@ -29,7 +29,7 @@ _WALK = "Gg"
 _MS: Final = 1000
 
 
-class Showing(NamedTuple):
+class SignalState(NamedTuple):
     """State of a signal.
 
     walk: whether walking is permitted.
@@ -50,7 +50,7 @@ class Lights(Protocol):
     def now_s(self) -> float:
         """Return SUMO's time, seconds."""
 
-    def showing(self, crossing: str) -> Showing:
+    def showing(self, crossing: str) -> SignalState:
         """Return the current state of a crossing's signal."""
 
 
@@ -63,7 +63,7 @@ class Signals:
         self._signalised = frozenset(self._ids)
         middles = [street_map.strips[i].line.mean(axis=0) for i in self._ids]
         self._xy = np.array(middles, dtype=float).reshape(-1, 2)
-        self._shown: dict[str, Showing] = {}
+        self._shown: dict[str, SignalState] = {}
         self._centre: tuple[float, float] | None = None
         self._near: list[str] = []
 
@@ -100,7 +100,7 @@ class Signals:
         """Return whether a crossing has a signal that forbids walking."""
         return bool(self.red([crossing]))
 
-    def _state(self, crossing: str, now_s: float) -> Showing:
+    def _state(self, crossing: str, now_s: float) -> SignalState:
         shown = self._shown.get(crossing)
         if shown is None or now_s >= shown.until_s:
             self._shown[crossing] = shown = self._lights.showing(crossing)
@@ -124,7 +124,7 @@ class PlannedLights:
     def now_s(self) -> float:
         return self.now_ms / _MS
 
-    def showing(self, crossing: str) -> Showing:
+    def showing(self, crossing: str) -> SignalState:
         """Return the current state of a crossing's signal.
 
         SUMO switches at the end of a step, so at the exact switching time the previous state is
@@ -139,9 +139,9 @@ class PlannedLights:
         until_ms = change_ms = last_ms + ends_ms[now] - since_ms
         for k in range(now + 1, now + len(ends_ms)):
             if plan.walks[k % len(ends_ms)] != plan.walks[now]:
-                return Showing(plan.walks[now], change_ms / _MS, until_ms / _MS)
+                return SignalState(plan.walks[now], change_ms / _MS, until_ms / _MS)
             change_ms += plan.durations_ms[k % len(ends_ms)]
-        return Showing(plan.walks[now], None, until_ms / _MS)
+        return SignalState(plan.walks[now], None, until_ms / _MS)
 
 
 class SumoLights:
@@ -160,12 +160,12 @@ class SumoLights:
         self.now_s = engine.simulation.getTime
         self._phases: dict[str, tuple[tuple[float, str], ...] | None] = {}
 
-    def showing(self, crossing: str) -> Showing:
+    def showing(self, crossing: str) -> SignalState:
         light, index = self._link[crossing]
         traffic_light = self._engine.trafficlight
         next_s = traffic_light.getNextSwitch(light)
         walk = traffic_light.getRedYellowGreenState(light)[index] in _WALK
-        return Showing(
+        return SignalState(
             walk,
             self._change(light, index, walk, next_s),
             next_s if self._program(light) else self.now_s(),
@@ -206,7 +206,7 @@ _Key = tuple[str, float, float]
 """A crossing id and the position x, y in metres of a person before it."""
 
 
-class Kerbs:
+class WaitingSpots:
     """Waiting positions at the kerbs of a map, computed on demand.
 
     SUMO lets people wait at the end of a crossing. Where a crossing meets its corner at an angle,

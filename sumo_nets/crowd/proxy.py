@@ -73,7 +73,7 @@ ROUND_THE_CORNER_M = 2.0
 """SUMO may assign a proxy to the corner within this distance plus the width of a sidewalk's end,
 metres."""
 
-NEARER_M = 0.01
+LEAD_MIN_M = 0.01
 """The lines of a proxy's own place must be nearer than others by this distance, metres."""
 
 _ROUNDING_M: Final = 0.001
@@ -162,7 +162,7 @@ class Walks:
         to_own = shapely.get_coordinates(shapely.shortest_line(shapely.Point(x_m, y_m), own))
         for share in NUDGES:
             x, y = (to_own[0] + share * (to_own[1] - to_own[0])).tolist()
-            if shapely.distance(own, at := shapely.Point(x, y)) + NEARER_M < shapely.distance(
+            if shapely.distance(own, at := shapely.Point(x, y)) + LEAD_MIN_M < shapely.distance(
                 others, at
             ):
                 return x, y
@@ -313,7 +313,7 @@ class Proxy:
         if place.edge != walk.first or self._inside.radius_m == 0.0:
             return False
         if walk != self._walk or not self._compared.holds(x_m, y_m):
-            lead_m = self._walks.lead.metres(walk.first, walk.second, x_m, y_m) - NEARER_M
+            lead_m = self._walks.lead.metres(walk.first, walk.second, x_m, y_m) - LEAD_MIN_M
             self._leads = lead_m > 0.0
             self._compared = Circle(x_m, y_m, abs(lead_m) / 2.0)
         return self._leads

@@ -38,7 +38,7 @@ _MARGIN_M: Final = 1.0
 ROUNDS: Final = 8
 """Largest number of rounds of pushes."""
 
-ENOUGH_M: Final = 0.01
+MAX_OVERLAP_M: Final = 0.01
 """Rounds end when the largest overlap is smaller, metres."""
 BENDS: Final = 2
 """Number of first rounds in which pushes are bent aside."""
@@ -46,7 +46,7 @@ BENDS: Final = 2
 BEND: Final = 0.6
 """Sideways share of a push between two people who walk towards each other."""
 
-STIRS_M: Final = 0.002
+MIN_GAIN_M: Final = 0.002
 """A standing person moves only if it gets closer to its goal by this distance, metres."""
 
 Rows = NDArray[np.intp]
@@ -87,7 +87,7 @@ class NearPairs:
         self._at = at
 
 
-def kept_apart(
+def separated_positions(
     before: Floats,
     wanted: Floats,
     firm: NDArray[np.bool_],
@@ -115,7 +115,7 @@ def kept_apart(
     bend = _bend(apart, goal[other] - goal[one] - apart)
     at = _pushed(goal, one, other, shares, apart, bend)
     if stand is not None and stand.any():
-        nowhere = stand & (np.abs(goal - at) > np.abs(goal - start) - STIRS_M)
+        nowhere = stand & (np.abs(goal - at) > np.abs(goal - start) - MIN_GAIN_M)
         at = _pushed(np.where(nowhere, start, at), one, other, shares, apart, None)
     step = at - start
     at = np.where(firm, goal, start + step * (reach_m / np.maximum(np.abs(step), reach_m)))
@@ -148,7 +148,7 @@ def _pushed(
             push = push * bend
         np.add.at(at, other, shares[1] * push)
         np.subtract.at(at, one, shares[0] * push)
-        if lost.max() < ENOUGH_M:
+        if lost.max() < MAX_OVERLAP_M:
             break
     return at
 

@@ -12,11 +12,19 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats, wrap_angles
-from cosim.core.state import Age, Doing, People, PersonKind, RowLookup, frozen, write_protected
+from cosim.core.state import (
+    Age,
+    Doing,
+    People,
+    PersonKind,
+    RowLookup,
+    write_protect,
+    write_protected_copy,
+)
 from cosim.people.gait import Strides
-from cosim.people.yielding import RobotBody, Standing, comes_too_near, stepped_round
+from cosim.people.yielding import RobotBody, StandingObstacles, approaches_body, stepped_around
 from cosim.spec.events import Actor
-from sumo_nets.crowd.separation import NearPairs, kept_apart
+from sumo_nets.crowd.separation import NearPairs, separated_positions
 
 MAX_SPEED_MPS = 2.2
 """Largest displayed speed, m/s: above every walking speed, so that people catch up with SUMO."""
@@ -49,7 +57,7 @@ class PoseFilter:
     """
 
     period_s: float
-    standing: Standing = field(default_factory=Standing)
+    standing: StandingObstacles = field(default_factory=StandingObstacles)
     _rows: RowLookup = field(default_factory=RowLookup)
     _xy: Floats = field(default_factory=lambda: np.zeros((1, 2)))
     _heading: Floats = field(default_factory=lambda: np.zeros(1))
@@ -111,10 +119,10 @@ class PoseFilter:
     ) -> Floats:
         """Step around the robot and obstacles; do not move if that would lead into the robot."""
         if body is None:
-            return self.standing.stepped_round(before, shown, stand)
-        past = stepped_round(before, shown, body, stand)
-        round_both = self.standing.stepped_round(before, past, stand)
-        stays = (round_both != past).any(axis=1) & comes_too_near(before, round_both, body)
+            return self.standing.stepped_around(before, shown, stand)
+        past = stepped_around(before, shown, body, stand)
+        round_both = self.standing.stepped_around(before, past, stand)
+        stays = (round_both != past).any(axis=1) & approaches_body(before, round_both, body)
         return np.where(stays[:, None], before, round_both)
 
     def _separated(
@@ -123,9 +131,9 @@ class PoseFilter:
         firm = np.arange(len(shown) + len(others)) >= len(shown)
         stand = np.concatenate([stand, np.zeros(len(others), dtype=bool)])
         before, wanted = np.concatenate([before, others]), np.concatenate([shown, others])
-        return kept_apart(before, wanted, firm, MAX_SPEED_MPS * self.period_s, stand, self._near)[
-            : len(shown)
-        ]
+        return separated_positions(
+            before, wanted, firm, MAX_SPEED_MPS * self.period_s, stand, self._near
+        )[: len(shown)]
 
 
 _NO_VALUES: Final = np.zeros(0)
@@ -159,30 +167,30 @@ class ShownPeople:
             self._names = (*names, *(a.id for a in cast))
             kinds = [*[PersonKind.CROWD] * len(xy), *(a.kind for a in cast)]
             all_ages = [*(ages[name] for name in names), *(a.age for a in cast)]
-            self._kind = write_protected(kinds, np.int8)
-            self._age = write_protected(all_ages, np.int8)
+            self._kind = write_protected_copy(kinds, np.int8)
+            self._age = write_protected_copy(all_ages, np.int8)
         doing: list[Doing] = [
             "walk" if walks else "stand" for walks in (speed > PERSON_STANDS_MPS).tolist()
         ]
-        places = np.concatenate([xy, places_of(cast)])
+        places = np.concatenate([xy, positions_of(cast)])
         paces = np.concatenate(
             [speed, [a.speed_mps if a.pace_mps is None else a.pace_mps for a in cast]]
         )
         strides, paces = self._strides.update(self._names, places, paces, self._age)
         return People(
             self._names,
-            frozen(places),
-            frozen(np.concatenate([heading, [a.heading_rad for a in cast]])),
-            frozen(np.concatenate([speed, [a.speed_mps for a in cast]])),
+            write_protect(places),
+            write_protect(np.concatenate([heading, [a.heading_rad for a in cast]])),
+            write_protect(np.concatenate([speed, [a.speed_mps for a in cast]])),
             (*doing, *(a.doing for a in cast)),
-            frozen(strides),
-            frozen(paces),
+            write_protect(strides),
+            write_protect(paces),
             self._kind,
             self._age,
         )
 
 
-def cast_in_order(actors: tuple[Actor, ...], crowd: Mapping[str, Age]) -> list[Actor]:
+def sorted_actors(actors: tuple[Actor, ...], crowd: Mapping[str, Age]) -> list[Actor]:
     """Return actors sorted by id. Raises EngineError for duplicate ids, also with the crowd's."""
     ids = {actor.id for actor in actors}
     if len(ids) != len(actors) or ids & crowd.keys():
@@ -192,6 +200,6 @@ def cast_in_order(actors: tuple[Actor, ...], crowd: Mapping[str, Age]) -> list[A
     return sorted(actors, key=lambda actor: actor.id)
 
 
-def places_of(cast: list[Actor]) -> Floats:
+def positions_of(cast: list[Actor]) -> Floats:
     """Return the positions of actors, (N, 2) metres."""
     return np.array([(a.x_m, a.y_m) for a in cast], dtype=float).reshape(-1, 2)

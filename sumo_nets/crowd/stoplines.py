@@ -8,7 +8,7 @@ from typing import NamedTuple
 from sumo_nets.engine import sumo
 
 
-class Passed(NamedTuple):
+class StopLineCrossing(NamedTuple):
     """A vehicle that crossed a stop line.
 
     light: SUMO's letter of its link (G or g, y, r, ...).
@@ -28,7 +28,7 @@ class StopLines:
         self._next: dict[str, tuple[str, int, float]] = {}
         self._red_s: dict[tuple[str, int], float] = {}
 
-    def passed(self, vehicles: Collection[str]) -> list[Passed]:
+    def passed(self, vehicles: Collection[str]) -> list[StopLineCrossing]:
         """Return the vehicles that crossed a stop line since the last call, with the current
         state of the light."""
         next_lights = {}
@@ -51,6 +51,8 @@ class StopLines:
             # distance means a lane change at the stop line.
             next_light, _, next_m = next_lights.get(name, ("", -1, 0.0))
             if name in vehicles and away_m < 3.0 and (next_light != light or next_m > away_m + 3.0):
-                found.append(Passed(name, lit[light, link], self._red_s.get((light, link), 0.0)))
+                found.append(
+                    StopLineCrossing(name, lit[light, link], self._red_s.get((light, link), 0.0))
+                )
         self._next = next_lights
         return found

@@ -29,7 +29,9 @@ _EDGE_M = 0.05
 """Distance from the edge of the ground within which a strip's end counts as torn, metres."""
 
 
-def mend_corners(root: ET.Element, street_map: StreetMap, progress: Progress = ignore) -> list[str]:
+def repair_corners(
+    root: ET.Element, street_map: StreetMap, progress: Progress = ignore
+) -> list[str]:
     """Widen, in place, the walking areas that block a robot. Return the changes, a sentence
     each."""
     lanes = {

@@ -13,10 +13,10 @@ import shapely
 from shapely.geometry import Polygon
 
 from cosim.core.errors import MapError
-from cosim.place.street_map import LANDS, Feature, FeatureKind
+from cosim.place.street_map import LAND_KINDS, Feature, FeatureKind
 
 _SCHEMA = 1
-NAME = "features.json"
+FEATURES_FILE = "features.json"
 
 
 class _Row(msgspec.Struct, frozen=True, array_like=True):
@@ -68,7 +68,7 @@ def _feature(row: _Row) -> Feature:
     numbers = (row.x_m, row.y_m, row.heading_rad, row.height_m)
     if not all(map(math.isfinite, numbers)) or row.height_m < 0.0:
         raise ValueError(f"a {row.kind} with numbers that cannot be: {numbers}")
-    if (row.kind in ("building", *LANDS)) != (not polygon.is_empty and polygon.is_valid):
+    if (row.kind in ("building", *LAND_KINDS)) != (not polygon.is_empty and polygon.is_valid):
         raise ValueError(
             f"a {row.kind} at ({row.x_m:g}, {row.y_m:g}) whose outline does not fit it"
         )

@@ -15,8 +15,16 @@ from shapely.geometry import Point, Polygon
 
 from cosim.core.geometry import Floats
 from cosim.place import overlay
-from cosim.place.street_map import LANDS, Feature, FeatureKind, LandKind, Lane, StreetMap, Strip
-from sumo_nets.maps.osm_features import Found, Mapped
+from cosim.place.street_map import (
+    LAND_KINDS,
+    Feature,
+    FeatureKind,
+    LandKind,
+    Lane,
+    StreetMap,
+    Strip,
+)
+from sumo_nets.maps.osm_features import MappedFeature, OsmFeatures
 
 
 def utm_zone(proj: str) -> tuple[int, bool] | None:
@@ -73,8 +81,8 @@ LEFT_M2: Final = 6.0
 """Smaller remaining parts of a building are omitted, m2."""
 
 
-def fitted(
-    found: Found, location: Mapping[str, str], street_map: StreetMap
+def fit_features(
+    found: OsmFeatures, location: Mapping[str, str], street_map: StreetMap
 ) -> tuple[tuple[Feature, ...], list[str]]:
     """Return the features of a map in its net's frame, and the changes, a sentence each.
 
@@ -98,9 +106,9 @@ def fitted(
     buildings, cut_changes = _cut_buildings(
         [thing for thing in near if thing.kind == "building"], streets
     )
-    things = [thing for thing in near if thing.kind not in ("building", *LANDS)]
+    things = [thing for thing in near if thing.kind not in ("building", *LAND_KINDS)]
     standing, moved_changes = _placed(things, streets, buildings)
-    lands = _clipped([thing for thing in near if thing.kind in LANDS], street_map)
+    lands = _clipped([thing for thing in near if thing.kind in LAND_KINDS], street_map)
     kinds = Counter(feature.kind for feature in (*buildings, *standing, *lands))
     counts = [f"{count} x {kind}" for kind, count in kinds.items()]
     changes = [f"taken from the map: {', '.join(counts)}"] if counts else []
@@ -110,13 +118,13 @@ def fitted(
     return (*buildings, *standing, *lands), [*changes, *cut_changes, *moved_changes]
 
 
-def _in_zone(thing: Mapped, zone: int) -> bool:
+def _in_zone(thing: MappedFeature, zone: int) -> bool:
     """Return whether a feature is close enough to the zone's middle for the projection."""
     east = np.remainder(thing.rings[0][:, 0] - (6.0 * zone - 183.0) + 180.0, 360.0) - 180.0
     return bool((np.abs(east) < IN_ZONE_DEG).all())
 
 
-def _near_walkways(mapped: Sequence[Mapped], street_map: StreetMap) -> list[Mapped]:
+def _near_walkways(mapped: Sequence[MappedFeature], street_map: StreetMap) -> list[MappedFeature]:
     walked = [strip.polygon for strip in street_map.strips.values()]
     if not walked or not mapped:
         return []
@@ -125,16 +133,16 @@ def _near_walkways(mapped: Sequence[Mapped], street_map: StreetMap) -> list[Mapp
     return [mapped[i] for i in np.unique(hit)]
 
 
-def _outline(thing: Mapped) -> shapely.Geometry:
+def _outline(thing: MappedFeature) -> shapely.Geometry:
     """Return the geometry of a feature for distance checks: land as an area, since walkways may
     cross it."""
     ring = thing.rings[0]
-    if thing.kind in LANDS:
+    if thing.kind in LAND_KINDS:
         return shapely.make_valid(Polygon(ring))
     return shapely.LineString(ring) if len(ring) > 1 else Point(ring[0])
 
 
-def _clipped(mapped: Sequence[Mapped], street_map: StreetMap) -> list[Feature]:
+def _clipped(mapped: Sequence[MappedFeature], street_map: StreetMap) -> list[Feature]:
     """Return the pieces of land within the map, simplified to 0.1 m."""
     x0, y0, x1, y1 = street_map.bounds
     area = shapely.box(x0 - _FAR_M, y0 - _FAR_M, x1 + _FAR_M, y1 + _FAR_M)
@@ -232,7 +240,9 @@ def _closed_band(strip: Strip) -> shapely.Geometry:
     return shapely.buffer(shapely.LineString(strip.line[:, :2]), half)
 
 
-def _cut_buildings(mapped: Sequence[Mapped], streets: _Streets) -> tuple[list[Feature], list[str]]:
+def _cut_buildings(
+    mapped: Sequence[MappedFeature], streets: _Streets
+) -> tuple[list[Feature], list[str]]:
     """Return buildings without the ground of streets."""
     found: list[Feature] = []
     cut = dropped = 0
@@ -296,7 +306,7 @@ def _outside_streets(whole: Polygon, taken: shapely.Geometry) -> list[Polygon]:
 
 
 def _placed(
-    mapped: Sequence[Mapped], streets: _Streets, buildings: Sequence[Feature]
+    mapped: Sequence[MappedFeature], streets: _Streets, buildings: Sequence[Feature]
 ) -> tuple[list[Feature], list[str]]:
     """Place objects at permitted positions near the mapped ones, or omit them."""
     houses = _Index([building.polygon for building in buildings])

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 from sumo_nets.maps.levels import settle_levels
 from sumo_nets.maps.sidewalks import STREET_WIDTHS_M
-from sumo_nets.maps.signal_check import lengthen_walks, mend_signals
+from sumo_nets.maps.signal_check import extend_greens, repair_signals
 from sumo_nets.net.netconvert import sumo_home
 
 
@@ -27,12 +27,12 @@ class Rules:
 
     version: int
     widths_m: Mapping[str, float]
-    mends: tuple[Callable[[ET.Element], list[str]], ...]
+    repairs: tuple[Callable[[ET.Element], list[str]], ...]
 
 
-SUITE_RULES: Final = Rules(3, {}, (mend_signals,))
+SUITE_RULES: Final = Rules(3, {}, (repair_signals,))
 """Version for the shipped places: the suites contain the hashes of their nets."""
-NEWEST_RULES: Final = Rules(4, STREET_WIDTHS_M, (settle_levels, mend_signals, lengthen_walks))
+NEWEST_RULES: Final = Rules(4, STREET_WIDTHS_M, (settle_levels, repair_signals, extend_greens))
 """Version for all other maps."""
 
 

@@ -21,9 +21,9 @@ from cosim.core.progress import Progress, ignore
 from cosim.place.map_check import NetFacts
 from cosim.place.overlay import where_geos_failed
 from cosim.place.street_map import Feature
-from sumo_nets.maps.corner_repair import mend_corners
+from sumo_nets.maps.corner_repair import repair_corners
 from sumo_nets.maps.driving_side import left_hand_country
-from sumo_nets.maps.feature_fit import fitted
+from sumo_nets.maps.feature_fit import fit_features
 from sumo_nets.maps.import_rules import NEWEST_RULES, Rules
 from sumo_nets.maps.levels import LEVEL_KEYS, edges_of
 from sumo_nets.maps.net_steps import (
@@ -35,7 +35,7 @@ from sumo_nets.maps.net_steps import (
 )
 from sumo_nets.maps.osm_crop import Box
 from sumo_nets.maps.osm_features import osm_features
-from sumo_nets.maps.osm_file import MapFile, OsmFacts, osm_facts, unpacked
+from sumo_nets.maps.osm_file import MapFile, OsmFacts, osm_facts, unpack_map
 from sumo_nets.maps.sidewalks import (
     STREET_WIDTHS_M,
     WIDTH_LIMITS_M,
@@ -72,7 +72,7 @@ OSM_OPTIONS = (
     f"--osm.extra-attributes={','.join(LEVEL_KEYS)}",
 )
 """Options of netconvert for OpenStreetMap files."""
-BIG = 10_000
+SLOW_IMPORT_EDGES = 10_000
 """Number of streets and paths above which an import takes minutes."""
 OSM_LICENCE = (
     "Map data (c) OpenStreetMap contributors, Open Database License (ODbL) 1.0: credit them "
@@ -148,7 +148,7 @@ def convert(source: Path, folder: Path, options: Options, progress: Progress = i
     """Convert `source` to a net in the scratch `folder`. Raises MapError with a finding and a
     remedy."""
     progress(f"reading {source.name}")
-    file = unpacked(source, folder, options.bbox)
+    file = unpack_map(source, folder, options.bbox)
     work = ImportWork(
         file, folder, progress, [f"unpacked ({file.packing})"] if file.packing else []
     )
@@ -171,11 +171,11 @@ def _from_osm(work: ImportWork, options: Options) -> Converted:
     extra.append(f"--geometry.remove.keep-edges.input-file={apart}")
     types = ",".join(str(sumo_home() / "data" / "typemap" / name) for name in TYPES)
     arguments = ["--osm-files", str(file.path), "--type-files", types, *OSM_OPTIONS, *extra]
-    stage = _converting(found.roads + found.ways_on_foot, options)
+    stage = _converting(found.roads + found.footways, options)
     net = work.netconvert(stage, "full.net.xml", arguments)
     net = crop_net(work, net, options.bbox)
     changes.append(
-        f"converted {found.roads} roads and {found.ways_on_foot} paths; crossings are guessed "
+        f"converted {found.roads} roads and {found.footways} paths; crossings are guessed "
         "wherever pavements meet a road; railways and isolated streets left out, junctions and "
         "signals close together joined"
     )
@@ -193,7 +193,7 @@ def _converting(streets: int, options: Options) -> str:
     """Return the name of the conversion stage, with advice if it takes minutes."""
     advice = (
         " (--bbox west,south,east,north: a part is faster)"
-        if streets > BIG and options.bbox is None
+        if streets > SLOW_IMPORT_EDGES and options.bbox is None
         else ""
     )
     return f"converting {streets} streets and paths{advice}"
@@ -208,7 +208,7 @@ def _from_net(work: ImportWork, options: Options) -> Converted:
     )
     if not facts.edges:
         raise MapError(f"{file.source}: a net of 0 edges: export an area with streets in it")
-    if facts.edges > BIG:
+    if facts.edges > SLOW_IMPORT_EDGES:
         work.progress(_converting(facts.edges, options))
     before = frozenset(pavements(net_root(file.path)))
     net = crop_net(work, file.path, options.bbox)
@@ -262,12 +262,12 @@ def _finish(
     progress = work.progress
     progress("reading the net")
     root = net_root(net)
-    for mend in rules.mends:
+    for mend in rules.repairs:
         changes += mend(root)
     final = work.written(root, "final.net.xml")
     facts = facts_of(root)
     street_map = read_net(final)
-    if mended := mend_corners(root, street_map, progress):
+    if mended := repair_corners(root, street_map, progress):
         changes += mended
         work.written(root, "final.net.xml")
         progress("reading the net")
@@ -293,7 +293,7 @@ def _finish(
     if file.format == "osm":
         progress("placing buildings and things")
         location = root.find("location")
-        features, fit_changes = fitted(
+        features, fit_changes = fit_features(
             osm_features(file), {} if location is None else location.attrib, street_map
         )
         changes += fit_changes

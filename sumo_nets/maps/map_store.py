@@ -22,21 +22,31 @@ from cosim.core.progress import Progress, ignore
 from cosim.place.map_check import MapCheck, check_map
 from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import CityMap, Place
-from sumo_nets.maps.feature_file import NAME, read_features, with_features, write_features
+from sumo_nets.maps.feature_file import FEATURES_FILE, read_features, with_features, write_features
 from sumo_nets.maps.import_rules import NEWEST_RULES, SUITE_RULES, WHEEL_PLACES
 from sumo_nets.maps.importer import OSM_LICENCE, Options, convert
 from sumo_nets.net.net_facts import read_facts
 from sumo_nets.net.netconvert import sumo_home
-from sumo_nets.net.raw_file import head_of, net_content_hash
+from sumo_nets.net.raw_file import net_content_hash, read_head
 from sumo_nets.net.snapshot import street_map_of
 
 ABOUT = "about.json"
 OSM_CREDIT = "(c) OpenStreetMap contributors, ODbL"
 """Credit on pictures of places made from OpenStreetMap data; picture fonts have no copyright
 sign."""
-GENERIC = ("input", "map", "net", "network", "osm", "converted", "export", "planet", "osm_bbox")
+GENERIC_FILE_NAMES = (
+    "input",
+    "map",
+    "net",
+    "network",
+    "osm",
+    "converted",
+    "export",
+    "planet",
+    "osm_bbox",
+)
 """Generic file names, for which the folder's name is used instead."""
-NAMES = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
+MAP_NAME_PATTERN = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
 GAME_LICENCE = "EPL-2.0 OR GPL-2.0-or-later, with Eclipse SUMO"
 
 
@@ -63,7 +73,7 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
     net_hash: str
 
 
-class Known(msgspec.Struct, frozen=True):
+class KnownMap(msgspec.Struct, frozen=True):
     """A known place. origin: "imported" or "sumo" (in the SUMO package, imported on first use)."""
 
     name: str
@@ -89,7 +99,7 @@ def import_map(
     is stored.
     """
     name = map_name(source) if name is None else name
-    if not NAMES.fullmatch(name):
+    if not MAP_NAME_PATTERN.fullmatch(name):
         raise UsageError(
             f"'{name}' cannot name a map: use a-z, 0-9, '.', '_' and '-', at most 64 characters"
         )
@@ -108,7 +118,7 @@ def map_name(source: Path) -> str:
     stem = re.sub(r"\.(gz|bz2|pbf|xml|osm|net)$", "", source.name)
     while (shorter := re.sub(r"\.(gz|bz2|pbf|xml|osm|net)$", "", stem)) != stem:
         stem = shorter
-    if stem.lower() in GENERIC and source.resolve().parent.name:
+    if stem.lower() in GENERIC_FILE_NAMES and source.resolve().parent.name:
         stem = source.resolve().parent.name
     return re.sub(r"[^a-z0-9._-]+", "-", stem.lower()).strip("-._")[:64] or "map"
 
@@ -120,7 +130,7 @@ def map_net(place: CityMap | str) -> Path:
     """
     name = place if isinstance(place, str) else place.map
     path = maps_folder() / name / "net.xml"
-    if not NAMES.fullmatch(name) or not folder_holds(path.parent, path.name):
+    if not MAP_NAME_PATTERN.fullmatch(name) or not folder_holds(path.parent, path.name):
         supplied = _supplied()
         if name not in supplied:
             raise unknown("map", name, known_maps())
@@ -143,20 +153,20 @@ def read_map(place: CityMap | str) -> StreetMap:
     name = place if isinstance(place, str) else place.map
     path = map_net(place)
     street_map = street_map_of(path)
-    features = read_features(path.with_name(NAME))
-    known_as = with_features(street_map.net_hash, path.with_name(NAME))
+    features = read_features(path.with_name(FEATURES_FILE))
+    known_as = with_features(street_map.net_hash, path.with_name(FEATURES_FILE))
     whole = dataclasses.replace(street_map, name=name, features=features, net_hash=known_as)
-    return whole.read_of(f"{street_map.made_of}-{known_as}")
+    return whole.with_source_hash(f"{street_map.made_of}-{known_as}")
 
 
 def map_hash(net: Path) -> str:
     """Return the content hash of a map, of its net and the features next to it."""
-    return with_features(net_content_hash(net), net.with_name(NAME))
+    return with_features(net_content_hash(net), net.with_name(FEATURES_FILE))
 
 
 def file_hash(path: Path) -> str:
     """Return the SHA-256 (16 hex digits) of a file. Raises MapError when it cannot be read."""
-    head_of(path)
+    read_head(path)
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()[:16]
 
@@ -192,18 +202,18 @@ def checked_map(name: str) -> tuple[StreetMap, MapCheck, About]:
     )
 
 
-def known_maps() -> dict[str, Known]:
+def known_maps() -> dict[str, KnownMap]:
     """Return all places by name: imported maps, then nets with sidewalks from SUMO, whole and as
     crops."""
     folder = maps_folder()
     found = sorted(p.parent for p in folder.glob(f"*/{ABOUT}")) if folder.is_dir() else []
     supplied = _supplied()
     known = {
-        p.name: Known(p.name, "imported", _source_of(p.name))
+        p.name: KnownMap(p.name, "imported", _source_of(p.name))
         for p in found
         if p.name not in supplied
     }
-    return known | {name: Known(name, "sumo", path.name) for name, path in supplied.items()}
+    return known | {name: KnownMap(name, "sumo", path.name) for name, path in supplied.items()}
 
 
 def outdated(about: About) -> bool:
@@ -232,7 +242,7 @@ def _store(
                 converted = convert(source, Path(scratch), options, progress)
                 converted.net.rename(ready / "net.xml")
             if converted.features:
-                write_features(converted.features, ready / NAME)
+                write_features(converted.features, ready / FEATURES_FILE)
             about = About(
                 name=name,
                 source=source.name,

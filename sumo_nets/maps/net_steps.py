@@ -17,7 +17,7 @@ from sumo_nets.maps.osm_file import MapFile
 from sumo_nets.maps.sidewalks import set_widths
 from sumo_nets.net.net_facts import net_root, read_facts
 from sumo_nets.net.net_file import allows
-from sumo_nets.net.netconvert import complaints, netconvert, sumo_home
+from sumo_nets.net.netconvert import error_summary, netconvert, sumo_home
 
 TIMEOUT_S = 300.0
 """Timeout of each netconvert call, seconds."""
@@ -196,4 +196,4 @@ def start_sumo(file: MapFile, net: Path) -> None:
         ) from error
     if done.returncode != 0:
         ended = f"(sumo -n NET -e 1 ends with {done.returncode})"
-        raise MapError(f"{file.source}: SUMO refuses the net {ended}{complaints(done.stderr)}")
+        raise MapError(f"{file.source}: SUMO refuses the net {ended}{error_summary(done.stderr)}")

@@ -19,7 +19,7 @@ from shapely.geometry import Polygon
 
 from cosim.core.geometry import Floats
 from cosim.place.street_map import LandKind
-from sumo_nets.maps.osm_file import MapFile, scanned
+from sumo_nets.maps.osm_file import MapFile, scan_elements
 
 _STOREY_M = 3.2
 """Height of a storey, metres."""
@@ -34,7 +34,7 @@ SMALLEST_DEG2 = 1e-10
 LARGEST_DEG2 = 1e-4
 """Largest area of a building, about 1 km2, in square degrees."""
 
-STANDING: Mapping[tuple[str, str], str] = {
+POINT_OBJECTS: Mapping[tuple[str, str], str] = {
     ("natural", "tree"): "tree",
     ("highway", "street_lamp"): "lamp",
     ("amenity", "bench"): "bench",
@@ -141,7 +141,7 @@ WINDS = (
 )
 
 
-class Mapped(NamedTuple):
+class MappedFeature(NamedTuple):
     """A feature as mapped.
 
     rings: (N, 2) longitudes and latitudes; outline and holes of buildings and land, one point of
@@ -157,10 +157,10 @@ class Mapped(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class OsmFeatures:
     """All features of a file in order, and the number of omitted ones by reason."""
 
-    things: tuple[Mapped, ...]
+    things: tuple[MappedFeature, ...]
     skipped: Mapping[str, int]
 
 
@@ -212,10 +212,10 @@ class _Scan:
                 self.lands.append((self.members, self.tags))
 
 
-def osm_features(file: MapFile) -> Found:
+def osm_features(file: MapFile) -> OsmFeatures:
     """Return the features of an OSM file. Raises MapError if the file is damaged."""
     scan = _Scan()
-    scanned(file, scan)
+    scan_elements(file, scan)
     skipped: Counter[str] = Counter()
     things = [
         *_spots(scan, skipped),
@@ -223,13 +223,13 @@ def osm_features(file: MapFile) -> Found:
         *_buildings(scan, skipped),
         *_lands(scan, skipped),
     ]
-    return Found(tuple(things), dict(sorted(skipped.items())))
+    return OsmFeatures(tuple(things), dict(sorted(skipped.items())))
 
 
-def _spots(scan: _Scan, skipped: Counter[str]) -> list[Mapped]:
+def _spots(scan: _Scan, skipped: Counter[str]) -> list[MappedFeature]:
     found = []
     for name, tags in scan.spots:
-        kind = next((STANDING[pair] for pair in tags.items() if pair in STANDING), None)
+        kind = next((POINT_OBJECTS[pair] for pair in tags.items() if pair in POINT_OBJECTS), None)
         if kind is None:
             continue
         at = np.array([scan.lonlat[name]])
@@ -241,11 +241,13 @@ def _spots(scan: _Scan, skipped: Counter[str]) -> list[Mapped]:
         ):
             skipped["hydrants in the ground or on a wall"] += 1
         else:
-            found.append(Mapped(kind, (at,), _height(tags, "height", skipped), _facing(tags)))
+            found.append(
+                MappedFeature(kind, (at,), _height(tags, "height", skipped), _facing(tags))
+            )
     return found
 
 
-def _rows(scan: _Scan, skipped: Counter[str]) -> list[Mapped]:
+def _rows(scan: _Scan, skipped: Counter[str]) -> list[MappedFeature]:
     """Return evenly spaced objects along ways."""
     found = []
     for refs, tags in scan.ways.values():
@@ -266,11 +268,11 @@ def _rows(scan: _Scan, skipped: Counter[str]) -> list[Mapped]:
         spots = shapely.get_coordinates(
             shapely.line_interpolate_point(line, np.linspace(0.0, 1.0, count), normalized=True)
         )
-        found += [Mapped(kind, (at[None],), 0.0, None) for at in spots / scale]
+        found += [MappedFeature(kind, (at[None],), 0.0, None) for at in spots / scale]
     return found
 
 
-def _buildings(scan: _Scan, skipped: Counter[str]) -> list[Mapped]:
+def _buildings(scan: _Scan, skipped: Counter[str]) -> list[MappedFeature]:
     found = []
     within = {ref for members, _ in scan.areas for ref, role in members if role != "inner"}
     for name, (refs, tags) in scan.ways.items():
@@ -290,7 +292,7 @@ def _buildings(scan: _Scan, skipped: Counter[str]) -> list[Mapped]:
     return found
 
 
-def _lands(scan: _Scan, skipped: Counter[str]) -> list[Mapped]:
+def _lands(scan: _Scan, skipped: Counter[str]) -> list[MappedFeature]:
     """Return pieces of open land. Pieces with missing nodes, common at a map's edge, are only
     counted."""
     found = []
@@ -325,13 +327,13 @@ def _land(tags: Mapping[str, str]) -> LandKind | None:
 
 def _land_features(
     kind: LandKind, outlines: Sequence[shapely.Geometry], skipped: Counter[str]
-) -> list[Mapped]:
+) -> list[MappedFeature]:
     found = []
     for outline in outlines:
         if not isinstance(outline, Polygon) or not outline.is_valid:
             skipped["pieces of land whose outline crosses itself"] += 1
         elif SMALLEST_DEG2 < outline.area < LARGEST_LAND_DEG2:
-            found.append(Mapped(kind, _rings_of(outline), 0.0, None))
+            found.append(MappedFeature(kind, _rings_of(outline), 0.0, None))
     return found
 
 
@@ -372,7 +374,7 @@ def _rings(scan: _Scan, refs: Sequence[str]) -> list[Polygon] | None:
 
 def _building_features(
     outlines: Sequence[shapely.Geometry], tags: Mapping[str, str], skipped: Counter[str]
-) -> list[Mapped]:
+) -> list[MappedFeature]:
     found = []
     for outline in outlines:
         if not isinstance(outline, Polygon) or not outline.is_valid:
@@ -382,7 +384,7 @@ def _building_features(
         else:
             metres2 = outline.area * math.cos(math.radians(outline.centroid.y)) / METRE_DEG**2
             found.append(
-                Mapped(
+                MappedFeature(
                     "building", _rings_of(outline), building_height_m(tags, metres2, skipped), None
                 )
             )
@@ -398,7 +400,8 @@ def _has_walls(tags: Mapping[str, str], skipped: Counter[str]) -> bool:
         skipped["roofs, ruins and plans of buildings"] += 1
         return False
     hangs = any(
-        (metres(tags.get(key, "0")) or 0.0) > 0.0 for key in ("min_height", "building:min_level")
+        (parse_metres(tags.get(key, "0")) or 0.0) > 0.0
+        for key in ("min_height", "building:min_level")
     )
     if hangs or tags.get("layer", "0").startswith("-") or tags.get("location") == "underground":
         skipped["buildings above or under the ground"] += 1
@@ -424,14 +427,14 @@ def _height(tags: Mapping[str, str], key: str, skipped: Counter[str]) -> float:
     """Return a tag's value in metres or storeys; 0 if missing or unusable, which is counted."""
     if key not in tags:
         return 0.0
-    value = metres(tags[key])
+    value = parse_metres(tags[key])
     if value is None or not value < ABSURD_M:
         skipped["heights that cannot be read or cannot be"] += 1
         return 0.0
     return value
 
 
-def metres(value: str) -> float | None:
+def parse_metres(value: str) -> float | None:
     """Parse a length in metres or feet ("12", "12.5 m", "12,5", "40'", "40 ft"); None for other
     text."""
     text = value.strip().lower().replace(",", ".")

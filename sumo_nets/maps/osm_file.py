@@ -19,7 +19,15 @@ import numpy as np
 from cosim.core.errors import MapError
 from sumo_nets.maps.levels import is_levelled
 from sumo_nets.maps.osm_crop import Box, crop_osm
-from sumo_nets.net.raw_file import BLANK, LARGEST_BYTES, head_of, other_root, parse, pour, root_of
+from sumo_nets.net.raw_file import (
+    BLANK,
+    LARGEST_BYTES,
+    describe_root,
+    parse,
+    read_head,
+    root_of,
+    unpack_file,
+)
 
 READABLE = (
     "SUMO nets (.net.xml, .net.xml.gz) and OpenStreetMap (.osm, .osm.gz, .osm.bz2, .osm.pbf) can "
@@ -70,7 +78,7 @@ class OsmFacts:
     nodes: int
     ways: int
     roads: int
-    ways_on_foot: int
+    footways: int
     centre: tuple[float, float]
     tagged: frozenset[str]
     widths: Mapping[str, Mapping[str, str]]
@@ -78,18 +86,18 @@ class OsmFacts:
     licence: str
 
 
-def unpacked(source: Path, folder: Path, box: Box | None = None) -> MapFile:
+def unpack_map(source: Path, folder: Path, box: Box | None = None) -> MapFile:
     """Unpack `source` as plain XML into `folder`. Raises MapError if it is not a map.
 
     box: part of an OpenStreetMap file to crop, see `crop_osm`.
     """
-    head = head_of(source)
+    head = read_head(source)
     if not head:
         raise MapError(f"{source}: the file is empty; {READABLE}")
     packing = _packing(source, head)
     plain = folder / "unpacked.xml"
     if packing != "PBF":
-        pour(source, packing, plain)
+        unpack_file(source, packing, plain)
     elif box is None:
         _pbf(source, plain)
     kind = "osm" if packing == "PBF" and box is not None else _kind(source, plain)
@@ -153,7 +161,7 @@ def _kind(source: Path, plain: Path) -> Format:
         raise MapError(f"{source}: broken XML: {error}") from error
     if tag in ("net", "osm"):
         return "net" if tag == "net" else "osm"
-    raise MapError(f"{source}: not a map: {other_root(tag)}, not <net> or <osm>; {READABLE}")
+    raise MapError(f"{source}: not a map: {describe_root(tag)}, not <net> or <osm>; {READABLE}")
 
 
 @dataclass(slots=True)
@@ -249,7 +257,7 @@ class Elements(Protocol):
     def end(self, tag: str) -> None: ...
 
 
-def scanned(file: MapFile, elements: Elements) -> None:
+def scan_elements(file: MapFile, elements: Elements) -> None:
     """Pass the elements of an OSM file to `elements`. Raises MapError if the file is damaged."""
     parser = expat.ParserCreate()
     parser.StartElementHandler = elements.start
@@ -264,7 +272,7 @@ def osm_facts(file: MapFile) -> OsmFacts:
     """Read the facts of an OSM file in one pass. Raises MapError if it is damaged or has no
     street."""
     scan = _Scan()
-    scanned(file, scan)
+    scan_elements(file, scan)
     if not scan.lonlat or not scan.roads + scan.on_foot:
         raise MapError(
             f"{file.source}: an OpenStreetMap file of {len(scan.lonlat)} nodes and {scan.ways} "
@@ -289,7 +297,7 @@ def osm_facts(file: MapFile) -> OsmFacts:
         nodes=len(scan.lonlat),
         ways=scan.ways,
         roads=scan.roads,
-        ways_on_foot=scan.on_foot,
+        footways=scan.on_foot,
         centre=(lon, lat),
         tagged=frozenset(scan.tagged),
         widths=scan.widths,

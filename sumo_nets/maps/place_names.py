@@ -42,7 +42,7 @@ class _MadeCity(msgspec.Struct):
     generator: int = 0
 
 
-def place_called(name: str, roughness: float = 0.0) -> Place:
+def resolve_place(name: str, roughness: float = 0.0) -> Place:
     """Return the place for a name or path; unknown nets are imported.
 
     roughness: of its ground, 0 to 1.

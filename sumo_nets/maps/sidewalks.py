@@ -8,7 +8,7 @@ from collections import defaultdict
 from collections.abc import Collection, Mapping
 from typing import Final
 
-from sumo_nets.maps.osm_features import metres
+from sumo_nets.maps.osm_features import parse_metres
 from sumo_nets.net.net_facts import footway
 
 STREET_WIDTHS_M: Final[Mapping[str, float]] = {
@@ -147,7 +147,7 @@ def _tagged_m(
             # The direction of an edge along its further ways is unknown.
             sides = ("both", side) if way == own else ("both", "left", "right")
             keys = ["sidewalk:width", *(f"sidewalk:{of}:width" for of in sides)]
-            known = [metres(tagged[way][key]) for key in keys if key in tagged[way]]
+            known = [parse_metres(tagged[way][key]) for key in keys if key in tagged[way]]
             found += [m for m in known if m is not None and _TAGGED_M[0] <= m <= _TAGGED_M[1]]
     return min(found, default=None)
 

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from sumo_nets.city.signals import ALL_RED_S, CLEARING_MPS, WALK_S, YELLOW_S
-from sumo_nets.net.net_facts import GO, crossing_links, walks_of
+from sumo_nets.net.net_facts import GREEN_LETTERS, crossing_links, crossing_signals
 
 PLAIN_TYPES = ("static", "actuated", "delay_based")
 """Program types that run their phases in order, so that one can be added."""
@@ -27,10 +27,10 @@ _LEAVING: Final = frozenset("yYuU")
 """Letters of links that are about to stop or start."""
 
 
-def mend_signals(root: ET.Element) -> list[str]:
+def repair_signals(root: ET.Element) -> list[str]:
     """Add a phase, in place, for every crossing without green. Return the changes, a sentence
     each."""
-    never = walks_of(root).never
+    never = crossing_signals(root).never
     links = crossing_links(root)
     lengths = {
         e.get("id"): float(e[0].get("length", "0"))
@@ -86,7 +86,7 @@ def _add_walk(logic: ET.Element, waiting: dict[int, float]) -> bool:
     return True
 
 
-def lengthen_walks(root: ET.Element) -> list[str]:
+def extend_greens(root: ET.Element) -> list[str]:
     """Extend too short greens of crossings, in place. Return the changes, a sentence each.
 
     Phases and their states are unchanged, so no conflict is added. Seconds are taken from long
@@ -194,7 +194,7 @@ def _short_links(logic: ET.Element, wanted: Mapping[int, float]) -> list[int]:
 
 def _greens(states: list[str], link: int) -> list[list[int]]:
     """Return the phases of each green of a link, in cyclic order; empty for permanent green."""
-    shown = [link < len(state) and state[link] in GO for state in states]
+    shown = [link < len(state) and state[link] in GREEN_LETTERS for state in states]
     if all(shown):
         return []
     runs: list[list[int]] = []
@@ -222,7 +222,11 @@ def _lengthened(
                 return None
             after[max(steady, key=lambda p: after[p])] += math.ceil(lack_s - 1e-6)
     surplus_s = sum(after) - sum(durations)
-    spare = [p for p, state in enumerate(states) if GO & set(state) and not _LEAVING & set(state)]
+    spare = [
+        p
+        for p, state in enumerate(states)
+        if GREEN_LETTERS & set(state) and not _LEAVING & set(state)
+    ]
     for p in sorted(spare, key=lambda p: -after[p]):
         room_s = min(
             [

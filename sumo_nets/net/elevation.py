@@ -17,8 +17,8 @@ from scipy.spatial import cKDTree
 from cosim.core.geometry import Floats
 from cosim.place.street_map import Corner, Strip
 from cosim.place.terrain import (
-    CLAMPED_M,
-    FALSE_GRADE,
+    CLAMP_THRESHOLD_M,
+    IMPLAUSIBLE_GRADE,
     ROBOT_GRADE_MAX,
     WALK_GRADE_MAX,
     Elevation,
@@ -91,7 +91,7 @@ class Course:
     ring: bool = False
 
 
-class Meeting(NamedTuple):
+class CourseJunction(NamedTuple):
     """A walking area and the courses that end at it.
 
     ring: index of its outline among the courses.
@@ -102,7 +102,7 @@ class Meeting(NamedTuple):
     ports: tuple[tuple[int, int], ...]
 
 
-def course(edge: str, shape: str, on: On = "street", ring: bool = False) -> Course:
+def parse_course(edge: str, shape: str, on: On = "street", ring: bool = False) -> Course:
     """Parse a shape of points "x,y" and "x,y,z", in any mixture.
 
     netconvert omits an elevation of 0, and writes 0 for an unknown one.
@@ -119,7 +119,7 @@ def off_ground(params: Mapping[str, str], kind: str) -> bool:
     return params.get("layer", "0") not in ("0", "") or kind.endswith(("_bridge", "_tunnel"))
 
 
-def what_lies_there(kind: str, params: Mapping[str, str], apart: bool) -> On:
+def kind_at(kind: str, params: Mapping[str, str], apart: bool) -> On:
     """Return the kind of ground under an edge, from its type and params.
 
     apart: whether no vehicles drive on it.
@@ -151,7 +151,7 @@ class Profile:
     run_m: Floats
 
     @classmethod
-    def of(cls, courses: Sequence[Course], meets: Sequence[Meeting]) -> Profile:
+    def of(cls, courses: Sequence[Course], meets: Sequence[CourseJunction]) -> Profile:
         rows = []
         tails = []
         heads = []
@@ -258,13 +258,13 @@ class NetEdge(Protocol):
     params: dict[str, str]
 
 
-def land_of(
+def terrain_of_net(
     edges: Iterable[NetEdge],
     apart: Collection[str],
     walked: Mapping[str, int],
     ports: Mapping[tuple[str, int], str],
 ) -> tuple[Terrain | None, Elevation | None]:
-    """Return the terrain of a net and a report on its elevations, see `surveyed`.
+    """Return the terrain of a net and a report on its elevations, see `terrain_of_courses`.
 
     Bridges and tunnels count only if they have a walkway.
 
@@ -284,25 +284,24 @@ def land_of(
     for edge in outer:
         name = edge.attributes["id"]
         function = edge.attributes.get("function", "")
-        on = what_lies_there(
-            edge.attributes.get("type", ""), edge.params, name in apart and not function
-        )
+        on = kind_at(edge.attributes.get("type", ""), edge.params, name in apart and not function)
         if on != "raised" or name in walked:
             first[name] = len(courses)
             courses += [
-                course(name, lane["shape"], on, function == "walkingarea") for lane in edge.lanes
+                parse_course(name, lane["shape"], on, function == "walkingarea")
+                for lane in edge.lanes
             ]
     met: dict[str, list[tuple[int, int]]] = defaultdict(list)
     for (strip, end), corner in ports.items():
         if strip in first:
             met[corner].append((first[strip] + walked[strip], end))
-    return surveyed(
-        courses, [Meeting(first[corner], tuple(found)) for corner, found in met.items()]
+    return terrain_of_courses(
+        courses, [CourseJunction(first[corner], tuple(found)) for corner, found in met.items()]
     )
 
 
-def surveyed(
-    courses: Sequence[Course], meets: Sequence[Meeting] = ()
+def terrain_of_courses(
+    courses: Sequence[Course], meets: Sequence[CourseJunction] = ()
 ) -> tuple[Terrain | None, Elevation | None]:
     """Return the terrain under the courses of a net and a report on its elevations, or None and
     None.
@@ -333,7 +332,8 @@ def surveyed(
         )
     if share > FALSE_SHARE:
         return None, replace(
-            found, dropped=f"{share:.0%} of the streets' length are steeper than {FALSE_GRADE:.0%}"
+            found,
+            dropped=f"{share:.0%} of the streets' length are steeper than {IMPLAUSIBLE_GRADE:.0%}",
         )
     if np.ptp(street) < 0.5:
         return None, replace(found, dropped="it is the same everywhere")
@@ -342,7 +342,7 @@ def surveyed(
     moved = np.abs(level - nodes.z)[nodes.street]
     terrain = _terrain(nodes, level)
     return terrain, replace(
-        found, clamped=int((moved > CLAMPED_M).sum()), moved_m=float(moved.max(initial=0.0))
+        found, clamped=int((moved > CLAMP_THRESHOLD_M).sum()), moved_m=float(moved.max(initial=0.0))
     )
 
 
@@ -417,7 +417,7 @@ def false_share(courses: Sequence[Course]) -> float:
             rise = np.abs(np.diff(c.points[:, 2]))
             there = np.isfinite(rise)
             total += float(run[there].sum())
-            false += float(run[there & (rise > FALSE_GRADE * run + 0.1)].sum())
+            false += float(run[there & (rise > IMPLAUSIBLE_GRADE * run + 0.1)].sum())
     return false / total if total > 0.0 else 0.0
 
 
@@ -429,7 +429,7 @@ def _without_false_points(courses: Sequence[Course], heights: Floats) -> list[Co
     high = every[np.isfinite(heights) & (heights != 0.0)]
     gap, nearest = cKDTree(high[:, :2]).query(every[:, :2], distance_upper_bound=_ZERO_REACH_M)
     reference_m = high[np.minimum(nearest, len(high) - 1), 2]
-    every[(heights == 0.0) & (np.abs(reference_m) > FALSE_GRADE * gap + _STEP_M), 2] = np.nan
+    every[(heights == 0.0) & (np.abs(reference_m) > IMPLAUSIBLE_GRADE * gap + _STEP_M), 2] = np.nan
     out = []
     for c, points in zip(courses, np.split(every, ends), strict=True):
         if c.ring and not np.nan_to_num(points[:, 2]).any():
@@ -456,7 +456,7 @@ def _drop_zeros(points: Floats) -> None:
         at = metres_along(points)
         reference_m = np.abs(np.interp(at[zero], at[high], points[high, 2]))
         gap = np.abs(at[zero][:, None] - at[high][None]).min(axis=1)
-        points[np.flatnonzero(zero)[reference_m > FALSE_GRADE * gap + _STEP_M], 2] = np.nan
+        points[np.flatnonzero(zero)[reference_m > IMPLAUSIBLE_GRADE * gap + _STEP_M], 2] = np.nan
 
 
 def _drop_spikes(points: Floats) -> None:
@@ -469,8 +469,8 @@ def _drop_spikes(points: Floats) -> None:
     after = z[1:-1] - z[2:]
     run = np.hypot(np.diff(x), np.diff(y))
     off = np.minimum(np.abs(before), np.abs(after))
-    steep = (np.abs(before) > 2.0 * FALSE_GRADE * run[:-1]) & (
-        np.abs(after) > 2.0 * FALSE_GRADE * run[1:]
+    steep = (np.abs(before) > 2.0 * IMPLAUSIBLE_GRADE * run[:-1]) & (
+        np.abs(after) > 2.0 * IMPLAUSIBLE_GRADE * run[1:]
     )
     spikes = (before * after > 0.0) & (off > _SPIKE_M) & steep
     points[known[1:-1][spikes], 2] = np.nan

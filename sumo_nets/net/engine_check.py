@@ -37,7 +37,7 @@ _DEMAND: Final = "<routes>{}</routes>".format(
 )
 
 
-def sumo_alone() -> dict[str, str]:
+def reference_hashes() -> dict[str, str]:
     """Return hashes of netconvert's net and of SUMO's traffic on the fixed crossroads.
 
     No other SUMO may run in this process.

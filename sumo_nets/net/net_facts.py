@@ -15,13 +15,13 @@ from pathlib import Path
 import shapely
 
 from cosim.core.errors import MapError
-from cosim.place.map_check import STEEP, NetFacts
-from cosim.place.terrain import FALSE_GRADE
+from cosim.place.map_check import STEEP_GRADE, NetFacts
+from cosim.place.terrain import IMPLAUSIBLE_GRADE
 from sumo_nets.net.elevation import off_ground
 from sumo_nets.net.net_file import allows
-from sumo_nets.net.raw_file import net_bytes, other_root
+from sumo_nets.net.raw_file import describe_root, net_bytes
 
-GO = frozenset("Gg")
+GREEN_LETTERS = frozenset("Gg")
 """Letters of signal states in which a link may go."""
 
 
@@ -47,7 +47,7 @@ def net_root(path: Path) -> ET.Element:
     except (ET.ParseError, LookupError, ValueError) as error:
         raise MapError(f"{path}: broken XML: {error}") from error
     if root.tag != "net":
-        raise MapError(f"{path}: not a SUMO street net: {other_root(root.tag)}, not <net>")
+        raise MapError(f"{path}: not a SUMO street net: {describe_root(root.tag)}, not <net>")
     return root
 
 
@@ -72,7 +72,7 @@ class _Walks:
     no_program: list[str] = field(default_factory=list)
 
 
-def walks_of(root: ET.Element) -> _Walks:
+def crossing_signals(root: ET.Element) -> _Walks:
     """Classify the crossings of a net by the active signal programs (the last of each signal)."""
     programs = {logic.get("id", ""): logic for logic in root.iter("tlLogic")}
     walks = _Walks()
@@ -86,9 +86,9 @@ def walks_of(root: ET.Element) -> _Walks:
             walks.misfits.append(crossing)
             continue
         shown = {state[link] for state in states}
-        if not shown & GO:
+        if not shown & GREEN_LETTERS:
             walks.never.append(crossing)
-        elif shown <= GO:
+        elif shown <= GREEN_LETTERS:
             walks.always.append(crossing)
     return walks
 
@@ -133,11 +133,11 @@ def facts_of(root: ET.Element) -> NetFacts:
                 continue
             missing += "width" not in lane.attrib
             grade = _steepest(lane.attrib["shape"])
-            steep += grade > STEEP
-            false_grades += grade > FALSE_GRADE
+            steep += grade > STEEP_GRADE
+            false_grades += grade > IMPLAUSIBLE_GRADE
             if off_ground(params_of(edge), edge.get("type", "")):
                 levels[edge.attrib["id"]] = length_m / 1000.0
-    walks = walks_of(root)
+    walks = crossing_signals(root)
     location = root.find("location")
     return NetFacts(
         version=root.get("version", "?"),

@@ -22,9 +22,9 @@ from cosim.core.errors import MapError
 from cosim.core.geometry import Floats
 from cosim.place.overlay import where_geos_failed
 from cosim.place.street_map import Corner, Junction, Lane, Port, StreetMap, Strip
-from sumo_nets.net.elevation import land_of, off_ground, steep_ports, steep_strips
-from sumo_nets.net.outlines import areas_of, bands, close_seams, coordinates, polylines
-from sumo_nets.net.raw_file import DEEPEST, hash_of, net_bytes
+from sumo_nets.net.elevation import off_ground, steep_ports, steep_strips, terrain_of_net
+from sumo_nets.net.outlines import bands, close_seams, coordinates, polygon_parts, polylines
+from sumo_nets.net.raw_file import DEEPEST, net_bytes, net_xml_hash
 from sumo_nets.net.signal_plans import SignalPrograms
 
 LANE_M = 3.2
@@ -57,7 +57,7 @@ def read_net(path: Path) -> StreetMap:
     data = net_bytes(path)
     raw = _parse(path, data)
     try:
-        return _street_map(path, raw, hash_of(data))
+        return _street_map(path, raw, net_xml_hash(data))
     except KeyError as error:
         raise MapError(
             f"{path}: not a street net that can be read: attribute {error} is missing"
@@ -203,7 +203,7 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
         for k, (edge, lane, kind) in enumerate(driven, len(walk))
     }
     apart = {edge.attributes["id"] for edge in raw.edges if all(map(_only_walked, edge.lanes))}
-    terrain, elevation = land_of(
+    terrain, elevation = terrain_of_net(
         raw.edges, apart, {name: index for name, (_, _, index) in walk.items()}, ports
     )
     corner_ports: dict[str, list[Port]] = defaultdict(list)
@@ -311,7 +311,7 @@ def _corners(
             if shape is None
             else shape
             if isinstance(shape, Polygon)
-            else areas_of(shape, largest=False)
+            else polygon_parts(shape, largest=False)
         )
         if polygon is not None and polygon.area >= SPECK_M2:
             corners[name] = polygon
@@ -433,7 +433,7 @@ def _junctions(rows: Sequence[Attributes]) -> dict[str, Junction]:
     for row, shape in zip(
         outlined, shapely.make_valid(np.array(shapes, dtype=object)), strict=True
     ):
-        polygon = shape if isinstance(shape, Polygon) else areas_of(shape, largest=True)
+        polygon = shape if isinstance(shape, Polygon) else polygon_parts(shape, largest=True)
         if polygon is not None:
             junctions[row["id"]] = Junction(
                 row["id"], polygon, row.get("type", "").startswith("traffic_light")

@@ -13,7 +13,7 @@ from typing import Final
 
 from cosim.core.errors import MachineError, MapError
 
-WORDS = 400
+MESSAGE_CHARS = 400
 """Largest number of characters of netconvert's messages in an error."""
 _STAGES: Final = (
     (b"Parsing nodes", 0.0),
@@ -68,10 +68,10 @@ def netconvert(
             f"netconvert cannot be run: {error.strerror}: is eclipse-sumo installed?"
         ) from error
     if returncode != 0 or not output.exists():
-        raise MapError(f"netconvert failed with exit code {returncode}{complaints(messages)}")
+        raise MapError(f"netconvert failed with exit code {returncode}{error_summary(messages)}")
     # netconvert also returns 0 for an empty net.
     if b"<edge " not in output.read_bytes():
-        raise MapError(f"netconvert made a net without any edge{complaints(messages)}")
+        raise MapError(f"netconvert made a net without any edge{error_summary(messages)}")
     return output
 
 
@@ -105,11 +105,15 @@ def _run(
         return process.returncode, errors.read().decode(errors="replace")
 
 
-def complaints(output: str) -> str:
+def error_summary(output: str) -> str:
     """Summarize the messages of a SUMO program in one line: its errors, or its last line."""
     lines = [" ".join(line.split()) for line in output.splitlines() if line.strip()]
     errors = [line for line in lines if not line.startswith(("Warning", "Quitting"))]
     summary = "; ".join(
         dict.fromkeys(line.removeprefix("Error: ") for line in errors or lines[-1:])
     )
-    return f": {summary[:WORDS]}{' ...' if len(summary) > WORDS else ''}" if summary else ""
+    return (
+        f": {summary[:MESSAGE_CHARS]}{' ...' if len(summary) > MESSAGE_CHARS else ''}"
+        if summary
+        else ""
+    )

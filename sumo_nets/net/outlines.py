@@ -87,14 +87,14 @@ def bands(lines: Sequence[Floats], widths: Floats) -> list[Polygon]:
         centres, np.maximum(widths, _SHORTEST_M) / 2.0, cap_style="flat", join_style="mitre"
     )
     polygons = [
-        band if isinstance(band, Polygon) else areas_of(band, largest=True) for band in around
+        band if isinstance(band, Polygon) else polygon_parts(band, largest=True) for band in around
     ]
     if any(polygon is None or polygon.is_empty for polygon in polygons):
         raise ValueError("a shape whose band has no area")
     return polygons
 
 
-def areas_of(shape: shapely.Geometry, *, largest: bool) -> Any:
+def polygon_parts(shape: shapely.Geometry, *, largest: bool) -> Any:
     """Return the polygonal parts of a repaired shape: the largest, or all of them; None without
     any."""
     parts = [
@@ -135,8 +135,10 @@ def close_seams(
     at = [np.array([line[i, :2] for line in lines]) for i in (0, 1, -1, -2)]
 
     def both_ends(rows: slice) -> Polygons:
-        one = joined(grown[rows], at[0][rows], at[1][rows], widths_m[rows], met[0][rows])
-        return joined(one, at[2][rows], at[3][rows], widths_m[rows], met[1][rows])
+        one = extended_to_corners(
+            grown[rows], at[0][rows], at[1][rows], widths_m[rows], met[0][rows]
+        )
+        return extended_to_corners(one, at[2][rows], at[3][rows], widths_m[rows], met[1][rows])
 
     # Strips are independent, and shapely releases the GIL.
     half = len(grown) // 2
@@ -146,7 +148,7 @@ def close_seams(
         ]
 
 
-def joined(
+def extended_to_corners(
     polygons: Polygons, ends: Floats, inner: Floats, widths_m: Floats, corners: Polygons
 ) -> Polygons:
     """Extend strips at one end to the edge of their corner.

@@ -45,10 +45,10 @@ OPENERS: Mapping[str, Callable[[Path], Any]] = {
     "gzip": gzip.GzipFile,
     "bzip2": bz2.BZ2File,
 }
-BROKEN = (EOFError, zlib.error, lzma.LZMAError)
+UNPACK_ERRORS = (EOFError, zlib.error, lzma.LZMAError)
 
 
-def head_of(path: Path) -> bytes:
+def read_head(path: Path) -> bytes:
     """Return the first 64 bytes of a regular file. Raises MapError for anything else."""
     try:
         mode = path.stat().st_mode
@@ -67,10 +67,10 @@ def head_of(path: Path) -> bytes:
         raise MapError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
-def pour(source: Path, packing: str, target: Path) -> None:
+def unpack_file(source: Path, packing: str, target: Path) -> None:
     """Write `source`, unpacked, to `target`. Raises MapError if it is damaged, too large or not
     XML."""
-    with file_pieces(source, packing) as unpacked:
+    with file_chunks(source, packing) as unpacked:
         try:
             with target.open("wb") as out:
                 for piece in unpacked:
@@ -83,21 +83,21 @@ def pour(source: Path, packing: str, target: Path) -> None:
 
 def net_bytes(path: Path) -> bytes:
     """Return the XML of a .net.xml or .net.xml.gz. Raises MapError if it cannot be read."""
-    packing = "gzip" if head_of(path)[:2] == b"\x1f\x8b" else ""
+    packing = "gzip" if read_head(path)[:2] == b"\x1f\x8b" else ""
     whole = io.BytesIO()
-    with file_pieces(path, packing) as unpacked:
+    with file_chunks(path, packing) as unpacked:
         for piece in unpacked:
             whole.write(piece)
     return whole.getvalue()
 
 
 @contextmanager
-def file_pieces(source: Path, packing: str) -> Iterator[Iterator[bytes]]:
+def file_chunks(source: Path, packing: str) -> Iterator[Iterator[bytes]]:
     """Yield the content of a file in chunks. packing: "", "gzip" or "bzip2"."""
     try:
         with OPENERS[packing](source) as stream:
             yield _bounded(source, stream, source.stat().st_size)
-    except BROKEN as error:
+    except UNPACK_ERRORS as error:
         raise MapError(
             f"{source}: broken {packing} file, probably cut short: {error}: get it again"
         ) from error
@@ -149,7 +149,7 @@ def parse(parser: expat.XMLParserType, path: Path) -> None:
         raise ValueError(f"{error}: line {parser.CurrentLineNumber}") from error
 
 
-def other_root(tag: str) -> str:
+def describe_root(tag: str) -> str:
     """Describe the root element of an XML file that is not a map."""
     return f"its root element is <{tag}>" if tag in KNOWN_ROOTS else "its root element is another"
 
@@ -195,10 +195,10 @@ def without_comments(net: bytes) -> bytes:
 def net_content_hash(path: Path) -> str:
     """Return the SHA-256 (16 hex digits) of a net, without comments, schema location and line
     ends."""
-    return hash_of(net_bytes(path))
+    return net_xml_hash(net_bytes(path))
 
 
-def hash_of(data: bytes) -> str:
+def net_xml_hash(data: bytes) -> str:
     """Return the content hash of a net's XML, see `net_content_hash`."""
     bare = without_comments(data)
     # Searching for plain bytes first is much faster than the regular expression.

@@ -58,8 +58,10 @@ def street_map_of(path: Path) -> StreetMap:
         return _read(path)
     key = _key(path.name, net)
     snapshot = cache_folder() / SNAPSHOT_FOLDER / f"{key}.map"
-    street_map = cached(snapshot, lambda: _read(path), lambda made: [map_as_bytes(made)], thawed)
-    return street_map.read_of(key)
+    street_map = cached(
+        snapshot, lambda: _read(path), lambda made: [map_as_bytes(made)], map_from_bytes
+    )
+    return street_map.with_source_hash(key)
 
 
 def _read(path: Path) -> StreetMap:
@@ -93,7 +95,7 @@ def map_as_bytes(street_map: StreetMap) -> bytes:
     return msgspec.msgpack.encode(snapshot_data)
 
 
-def thawed(data: bytes | memoryview) -> StreetMap:
+def map_from_bytes(data: bytes | memoryview) -> StreetMap:
     """Deserialize the result of `map_as_bytes`."""
     with _without_gc():
         snapshot_data = msgspec.msgpack.decode(data, type=_Snapshot)

@@ -254,8 +254,8 @@ def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cos
     """A run waits for its director and says so; without one it ends with an error."""
     from cosim.core.errors import DirectorLost
     from cosim.spec.events import EventQuery
-    from cosim.spec.options import Outside
-    from scenarios.episodes.director import directed_by
+    from cosim.spec.options import DirectorAddress
+    from scenarios.episodes.director import remote_director
 
     at = f"unixsock-stream/{tmp_path}/director.sock"
     there = Connection(role="coordinator", connect=at)
@@ -279,7 +279,7 @@ def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cos
             DirectorLost,
             match=r"no director at .*director\.sock within 0\.5 s: start one with `cosim direct",
         ),
-        directed_by(Outside(connection=there, run="r", wait_s=0.5), told.append, "e"),
+        remote_director(DirectorAddress(connection=there, run="r", wait_s=0.5), told.append, "e"),
     ):
         pass
     directors: list[subprocess.Popen[str]] = []
@@ -288,8 +288,8 @@ def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cos
     )
     late.start()
     try:
-        with directed_by(
-            Outside(connection=there, run="r", wait_s=PATIENCE_S), told.append, "e"
+        with remote_director(
+            DirectorAddress(connection=there, run="r", wait_s=PATIENCE_S), told.append, "e"
         ) as director:
             assert director.react(query).tick == 0
         late.join()
@@ -308,7 +308,7 @@ def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cos
 
 def test_the_version_of_the_behaviours_covers_all_of_ours_that_they_load() -> None:
     """The modules whose source is hashed hold all that a fresh process has loaded with them."""
-    from scenarios.episodes.director import behaviours, sources
+    from scenarios.episodes.director import behaviour_version, imported_sources
 
     code = "import sys, scenarios.events; print(*sys.modules)"
     loaded = subprocess.run(
@@ -316,6 +316,8 @@ def test_the_version_of_the_behaviours_covers_all_of_ours_that_they_load() -> No
     ).stdout.split()
     ours = {name for name in loaded if name.startswith(("cosim.", "scenarios."))}
     assert (
-        {"scenarios.events.frontal", "cosim.spec.events"} < ours <= set(sources("scenarios.events"))
+        {"scenarios.events.frontal", "cosim.spec.events"}
+        < ours
+        <= set(imported_sources("scenarios.events"))
     )
-    assert len(behaviours()) == 16 and behaviours() == behaviours()
+    assert len(behaviour_version()) == 16 and behaviour_version() == behaviour_version()

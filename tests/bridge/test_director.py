@@ -17,13 +17,13 @@ from bridge.codec import encode
 from bridge.director import (
     QueryParts,
     RemoteDirector,
-    opened_query,
     serve_director,
-    signed,
-    signed_query,
+    sign,
+    sign_query,
+    verify_query,
 )
 from bridge.security import settings
-from bridge.session import LoneSession
+from bridge.session import LocalSession
 from cosim.core.errors import DirectorLost, EngineError, SpecError
 from cosim.core.state import PersonKind
 from cosim.spec.events import Actor, Event, EventQuery, EventReply, EventState, Walker
@@ -78,7 +78,7 @@ def test_an_episodes_own_director_answers_in_the_thread_that_asks() -> None:
         threads.add(threading.get_ident())
         return echo(asked)
 
-    with LoneSession() as session:
+    with LocalSession() as session:
         serve_director(session, KEY, seen, by="cafe")
         director = RemoteDirector(session, KEY, by="cafe")
         assert [director.react(query(tick)) for tick in range(100)] == [
@@ -101,7 +101,7 @@ def test_ctrl_c_while_the_own_director_answers_is_not_lost() -> None:
             raise raised.pop(0)
         return echo(asked)
 
-    with LoneSession() as session:
+    with LocalSession() as session:
         serve_director(session, KEY, broken)
         director = RemoteDirector(session, KEY)
         with pytest.raises(KeyboardInterrupt):
@@ -221,7 +221,7 @@ def test_a_director_of_other_behaviours_is_refused(tmp_path: Path, theirs: str) 
         ):
             RemoteDirector(client, KEY, by="cafe").react(query())
         lax = keys.director("test", "lax")
-        hub.serve(lax, lambda payload: signed(echo(opened_query(payload, "cafe")), theirs))
+        hub.serve(lax, lambda payload: sign(echo(verify_query(payload, "cafe")), theirs))
         with pytest.raises(DirectorLost, match=f"'{theirs}' met behaviours 'cafe'"):
             RemoteDirector(client, lax, by="cafe").react(query())
 
@@ -235,7 +235,7 @@ def test_one_director_answers_every_run_and_episode(tmp_path: Path) -> None:
         with pytest.raises(EngineError, match="ask for exactly"):
             client.ask(
                 keys.director("a", "x").replace("a", "*", 1),
-                signed_query(query(), ""),
+                sign_query(query(), ""),
                 timeout_s=PATIENCE_S,
             )
 
@@ -287,9 +287,9 @@ def test_a_query_holds_its_own_events_however_often_others_are_asked_between() -
         msgspec.structs.replace(query(k), events=(event(route_s_m=5.0 + k % 2),) * (k % 3))
         for k in range(12)
     ]
-    assert [opened_query(signed_query(one, "cafe"), "cafe") for one in queries] == queries
+    assert [verify_query(sign_query(one, "cafe"), "cafe") for one in queries] == queries
     wrong = encode(event()).replace(b"\xa2e0", b"\xa2x0")
     parts = QueryParts(msgspec.Raw(encode(query())), msgspec.Raw(b"\x91" + wrong))
     for _ in range(2):
         with pytest.raises(EngineError, match="ids of event pedestrians start with 'e'"):
-            opened_query(signed(parts, "cafe"), "cafe")
+            verify_query(sign(parts, "cafe"), "cafe")

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import msgspec
 import pytest
 
-from bridge.live import LARGEST_B, answer_to
+from bridge.live import LARGEST_B, answer_injection
 from bridge.security.authority import issue, make_authority
 from cosim.core.geometry import Polyline, Pose
 from cosim.episode.interfaces import Director
@@ -143,8 +143,10 @@ def test_points_from_the_robot_are_taken_where_it_is_when_the_pedestrian_enters(
     one = injected_people()
     robot = Pose(50.0, 50.0, math.pi / 2)
     one.react(query(0))
-    one.robot_at(RobotOnRoute(1, robot, 40.0))
-    ack = answer_to(b'{"id":"a","path":[{"ahead":15,"left":1},[60,60],{"ahead":-2.5}]}', one.offer)
+    one.set_robot(RobotOnRoute(1, robot, 40.0))
+    ack = answer_injection(
+        b'{"id":"a","path":[{"ahead":15,"left":1},[60,60],{"ahead":-2.5}]}', one.offer
+    )
     assert (ack.status, ack.tick, ack.x_m, ack.y_m) == (
         "accepted",
         1,
@@ -191,15 +193,17 @@ def test_a_refusal_says_where_the_robot_is_and_a_point_that_is_taken(
     """At the start, in a turn and near the goal: the message with either form of the point in it is
     accepted."""
     one = injected_people()
-    one.robot_at(RobotOnRoute(0, Pose(*robot[:3]), robot[3]))
-    reason = answer_to(f'{{"id":"a","path":{path}}}'.encode(), one.offer).reason
+    one.set_robot(RobotOnRoute(0, Pose(*robot[:3]), robot[3]))
+    reason = answer_injection(f'{{"id":"a","path":{path}}}'.encode(), one.offer).reason
     assert reason.startswith("path[1] is ") and "not on this map" in reason
     assert f"The robot is at [{robot[0]:.1f}, {robot[1]:.1f}]" in reason
     found = re.search(
         r"A valid point on its route is (\[.*?\]), or (\{.*?\}) from the robot", reason
     )
     assert found is not None
-    acks = [answer_to(f'{{"id":"p{i}","path":[{found[i]}]}}'.encode(), one.offer) for i in (1, 2)]
+    acks = [
+        answer_injection(f'{{"id":"p{i}","path":[{found[i]}]}}'.encode(), one.offer) for i in (1, 2)
+    ]
     assert [ack.status for ack in acks] == ["accepted", "accepted"]
     assert (
         math.dist(
@@ -283,7 +287,7 @@ def test_a_refusal_says_where_the_robot_is_and_a_point_that_is_taken(
 def test_a_message_that_makes_no_sense_is_refused_in_words(message: bytes, reason: str) -> None:
     """Nothing of it reaches the simulation."""
     one = injected_people()
-    ack = answer_to(message, one.offer)
+    ack = answer_injection(message, one.offer)
     assert ack.status == "refused" and ack.tick is None and reason in ack.reason
     assert not one.react(query(0)).actors and one.log == ()
 

@@ -12,21 +12,21 @@ import numpy as np
 import pytest
 
 from bridge.policy_server import (
-    Answer,
-    AskAct,
-    AskEnded,
-    AskReset,
-    Begun,
+    ActReply,
+    ActRequest,
+    EndRequest,
+    EpisodeReply,
     PackedArray,
     PolicyDesk,
     PolicyReply,
     Refusal,
+    ResetRequest,
     decode_reply,
     encode_message,
-    packed,
+    pack_array,
     read_request,
 )
-from cosim.core.state import STILL, Command, Planned
+from cosim.core.state import STILL, Command, WaypointCommand
 from cosim.episode.interfaces import Observation
 from cosim.spec.manifest import Manifest, WaypointRule
 from cosim.spec.robot import COURIER
@@ -72,15 +72,17 @@ class NotesMany(Notes):
         return self.does(observations)
 
 
-def act(episode: str, tick: int = 0, step: int = 0, *, reset: bool = False) -> AskAct:
-    return AskAct("r", episode, "a", step, tick, tick / 20.0, 0.0, 0.0, reset)
+def act(episode: str, tick: int = 0, step: int = 0, *, reset: bool = False) -> ActRequest:
+    return ActRequest("r", episode, "a", step, tick, tick / 20.0, 0.0, 0.0, reset)
 
 
 def began(policy: Any, *episodes: str, timer: Any = None) -> PolicyDesk:
     """A desk at which these episodes are under way."""
     desk = PolicyDesk(policy, timer=timer)
     for episode in episodes:
-        assert desk.replies([AskReset("r", episode, "a", 7)]) == [Begun("r", episode, "a")]
+        assert desk.replies([ResetRequest("r", episode, "a", 7)]) == [
+            EpisodeReply("r", episode, "a")
+        ]
     return desk
 
 
@@ -100,12 +102,12 @@ def without_line(reply: PolicyReply) -> PolicyReply:
 def test_a_batch_is_answered_in_its_order() -> None:
     """With the command of each, or its waypoints."""
     assert of_two(lambda two: [Command(0.1 * one.tick, 9.0) for one in two]) == [
-        Answer("r", "a", "a", 0, 0.2, 9.0),
-        Answer("r", "b", "a", 0, 0.4, 9.0),
+        ActReply("r", "a", "a", 0, 0.2, 9.0),
+        ActReply("r", "b", "a", 0, 0.4, 9.0),
     ]
     rows = np.array([[[0.1, 0.0]] * 3, [[0.2, 0.0]] * 3])
     for row, reply in zip(rows, of_two(lambda _: rows), strict=True):
-        assert isinstance(reply, Answer) and reply.waypoints is not None and not reply.planned
+        assert isinstance(reply, ActReply) and reply.waypoints is not None and not reply.planned
         assert bytes(reply.waypoints.data) == row.tobytes()
 
 
@@ -117,10 +119,10 @@ def test_a_bad_answer_in_a_batch_is_one_episodes_crash() -> None:
             raise SystemExit(9)
 
     good, bad = of_two(lambda _: [STILL, Command(Pretends(1.0), 0.0)])
-    assert isinstance(good, Answer)
+    assert isinstance(good, ActReply)
     assert without_line(bad) == Refusal("policy", "raised SystemExit: 9")
     good, bad = of_two(lambda _: [STILL, "left"])
-    assert isinstance(good, Answer)
+    assert isinstance(good, ActReply)
     assert bad == Refusal("policy", "answered 'left': neither a Command nor waypoints")
 
 
@@ -165,7 +167,7 @@ def test_a_policy_for_many_episodes_gets_resets_and_ends_of_each() -> None:
     desk = began(policy, "a", "b")
     policy.calls.clear()
     desk.replies([act("a", 5, reset=True), act("b", 10)])
-    desk.replies([AskEnded("r", "a", "a"), AskEnded("r", "a", "a")])
+    desk.replies([EndRequest("r", "a", "a"), EndRequest("r", "a", "a")])
     assert policy.calls == [("on_reset", "a"), "a", "b", ("ended", "a")]
     assert desk.under_way == 1
 
@@ -178,12 +180,14 @@ def test_an_on_reset_that_raises_is_the_crash_of_its_episode_alone(
     desk = began(policy, "a", "bad", "c")
     first, bad, last = desk.replies([act(name, 5, reset=True) for name in ("a", "bad", "c")])
     assert (
-        isinstance(first, Answer) and isinstance(last, Answer) and policy.calls[-2:] == ["a", "c"]
+        isinstance(first, ActReply)
+        and isinstance(last, ActReply)
+        and policy.calls[-2:] == ["a", "c"]
     )
     assert without_line(bad) == Refusal(
         "policy", "raised LookupError: no history", during="on_reset"
     )
-    assert desk.replies([AskEnded("r", "bad", "a")]) == [Begun("r", "bad", "a")]
+    assert desk.replies([EndRequest("r", "bad", "a")]) == [EpisodeReply("r", "bad", "a")]
     assert "LookupError: no such episode" in capfd.readouterr().err
 
 
@@ -198,15 +202,15 @@ def test_an_object_answers_for_one_episode_at_a_time_and_a_class_for_many() -> N
             made.append(self)
 
     one = began(Notes(), "a")
-    again, other = one.replies([AskReset("r", name, "a", 7) for name in ("a", "b")])
-    assert isinstance(again, Begun) and isinstance(other, Refusal) and other.why == "busy"
+    again, other = one.replies([ResetRequest("r", name, "a", 7) for name in ("a", "b")])
+    assert isinstance(again, EpisodeReply) and isinstance(other, Refusal) and other.why == "busy"
     many = began(Made, "a", "b")
     assert len(made) == 2
-    many.replies([AskEnded("r", "a", "a")])
-    many.replies([AskReset("r", "c", "a", 7)])
+    many.replies([EndRequest("r", "a", "a")])
+    many.replies([ResetRequest("r", "c", "a", 7)])
     assert len(made) == 2 and made[0].calls[-1] == ("reset", "c", 7)
-    rgb = {"rgb": packed(np.zeros((2, 2, 3), np.uint8))}
-    asked = AskAct("r", "b", "a", 0, 0, 0.0, 0.0, 0.0, arrays=rgb)
+    rgb = {"rgb": pack_array(np.zeros((2, 2, 3), np.uint8))}
+    asked = ActRequest("r", "b", "a", 0, 0, 0.0, 0.0, 0.0, arrays=rgb)
     first, repeated, later = many.replies([asked] * 3)
     assert first == repeated == later and made[1].calls.count("b") == 1
 
@@ -224,7 +228,7 @@ def test_a_request_that_cannot_be_decoded_is_refused() -> None:
     ):
         desk = began(policy, "a")
         (refused,) = desk.replies(
-            [AskAct("r", "a", "a", 0, 0, 0.0, 0.0, 0.0, arrays={"rgb": array})]
+            [ActRequest("r", "a", "a", 0, 0, 0.0, 0.0, 0.0, arrays={"rgb": array})]
         )
         assert isinstance(refused, Refusal) and refused.why == "message"
     assert policy.calls == [("reset", "a", 7)] * 4
@@ -239,15 +243,15 @@ class ToDesk:
         self.desk = PolicyDesk(policy, decoder=ObservationDecoder)
 
     def lay(self, arrays: dict[str, Any]) -> dict[str, PackedArray]:
-        return {name: packed(array) for name, array in arrays.items()}
+        return {name: pack_array(array) for name, array in arrays.items()}
 
-    def ask(self, question: AskReset | AskAct) -> bytes:
+    def ask(self, question: ResetRequest | ActRequest) -> bytes:
         (reply,) = self.desk.replies([read_request(encode_message(question))])
         payload = encode_message(reply)
         assert decode_reply(payload) == reply
         return payload
 
-    def tell_ended(self, question: AskEnded) -> None:
+    def report_ended(self, question: EndRequest) -> None:
         self.desk.replies([question])
 
     def close(self) -> None:
@@ -265,8 +269,8 @@ def seen(tick: int, *, reset: bool = False) -> Observation:
 def test_a_plan_with_its_command_stays_one() -> None:
     """An answer that is a command with the waypoints it follows keeps both, as in this process."""
     plan = np.array([[1.0, 0.0], [2.0, 0.5]], np.float32)
-    driver = hosted(Notes(lambda _: Planned(0.5, 0.1, plan, 1)))
+    driver = hosted(Notes(lambda _: WaypointCommand(0.5, 0.1, plan, 1)))
     driver.reset("a", 0)
     command = driver.act(seen(0))
-    assert isinstance(command, Planned) and (command.v_mps, command.w_radps) == (0.5, 0.1)
+    assert isinstance(command, WaypointCommand) and (command.v_mps, command.w_radps) == (0.5, 0.1)
     assert command.waypoints.tobytes() == plan.tobytes() and command.index == 1

@@ -18,18 +18,18 @@ import numpy as np
 import pytest
 
 from bridge.policy_server import (
-    Answer,
-    AskAct,
-    AskReset,
-    Begun,
+    ActReply,
+    ActRequest,
+    EpisodeReply,
     PolicyInfo,
     Refusal,
+    ResetRequest,
     decode_reply,
     encode_message,
     policy_key,
     serve,
 )
-from bridge.session import QueryHeard, Session, open_session
+from bridge.session import QueryResult, Session, open_session
 from cosim.core.errors import MachineError, PolicyError, PolicyServerLost, UsageError
 from cosim.core.state import Command
 from cosim.episode.interfaces import Observation
@@ -41,7 +41,7 @@ from cosim.spec.odometry import Odometry
 from cosim.spec.options import PolicyHost
 from cosim.spec.robot import COURIER
 from scenarios.ipc.deadlines import ServerTimes
-from scenarios.runs.policy_host import known_driver
+from scenarios.runs.policy_host import inspected_driver
 from scenarios.runs.remote_policy import PolicyServers, RemoteDriver, remote_driver
 from tests.conftest import PATIENCE_S, ROOT, Cosim, wait_until
 from tests.support.plain import free_port
@@ -148,7 +148,7 @@ def served(at: Connection, policy: Any, name: str = "counting", **more: Any) -> 
             self, key: str, handler: Callable[[Any], None], complete: bool
         ) -> Any:
             heard.append(handler)
-            return session.itself.declare_queryable(key, handler, complete=complete)
+            return session.zenoh_session.declare_queryable(key, handler, complete=complete)
 
     def run() -> None:
         with pytest.raises(AttributeError):
@@ -238,12 +238,12 @@ def test_a_link_cut_while_a_question_is_under_way_for_long_is_waited_for(
     ask_once = Session.ask_once
     cuts = ["one"]
 
-    def cut_once(session: Session, key: str, payload: bytes, *, timeout_s: float) -> QueryHeard:
+    def cut_once(session: Session, key: str, payload: bytes, *, timeout_s: float) -> QueryResult:
         if not cuts:
             return ask_once(session, key, payload, timeout_s=timeout_s)
         cuts.clear()
         time.sleep(0.6)
-        return QueryHeard("nobody")
+        return QueryResult("nobody")
 
     with served(hub, Counting()), driver_at(hub, times=SOON) as driver:
         driver.reset("k1", 7)
@@ -350,7 +350,7 @@ def driver_after(hub: Connection) -> Iterator[RemoteDriver]:
 def test_a_server_that_answers_wrongly_is_a_policy_that_crashed(hub: Connection) -> None:
     """Garbage, another step, another attempt, another kind of answer: in words, and never taken for
     an answer."""
-    wrong: dict[str, Callable[[AskAct], bytes]] = {
+    wrong: dict[str, Callable[[ActRequest], bytes]] = {
         "sent what is no answer": lambda one: b"\xc1 no message",
         "answered step 7 of 'k1' when it was asked step 0": lambda one: answer_to(one, step=7),
         "answered step 0 of 'k1' when it was asked step 0, in another attempt": lambda one: (
@@ -368,28 +368,28 @@ def test_a_server_that_answers_wrongly_is_a_policy_that_crashed(hub: Connection)
                 driver.act(seen_at(0))
 
 
-def answer_to(one: AskAct, **other: Any) -> bytes:
+def answer_to(one: ActRequest, **other: Any) -> bytes:
     return encode_message(
-        msgspec.structs.replace(Answer(*one.signature, one.step, 1.0, 0.0), **other)
+        msgspec.structs.replace(ActReply(*one.signature, one.step, 1.0, 0.0), **other)
     )
 
 
-def begin(one: AskAct | AskReset) -> bytes:
-    return encode_message(Begun(*one.signature))
+def begin(one: ActRequest | ResetRequest) -> bytes:
+    return encode_message(EpisodeReply(*one.signature))
 
 
 @contextmanager
-def liar(hub: Connection, answer: Callable[[AskAct], bytes]) -> Iterator[Session]:
+def liar(hub: Connection, answer: Callable[[ActRequest], bytes]) -> Iterator[Session]:
     """A server that begins as it should, and answers as it likes."""
     info = PolicyInfo("s", "wrong", {"name": "wrong"})
     below = policy_key("default", "wrong", "s")
     with open_session(hub) as session:
         session.serve(f"{below}/info", lambda _: encode_message(info), found=True)
         session.serve(
-            f"{below}/reset", lambda asked: begin(msgspec.msgpack.decode(asked, type=AskReset))
+            f"{below}/reset", lambda asked: begin(msgspec.msgpack.decode(asked, type=ResetRequest))
         )
         session.serve(
-            f"{below}/act", lambda asked: answer(msgspec.msgpack.decode(asked, type=AskAct))
+            f"{below}/act", lambda asked: answer(msgspec.msgpack.decode(asked, type=ActRequest))
         )
         yield session
 
@@ -410,7 +410,7 @@ def test_what_a_stranger_sends_is_refused_and_changes_nothing(hub: Connection) -
             b"",
             b"\xdf\xff\xff\xff\xff",
             b"\x91" * 100_000,
-            encode_message(AskAct(*sign, 0, 0, 0.0, 0.0, 0.0)),
+            encode_message(ActRequest(*sign, 0, 0, 0.0, 0.0, 0.0)),
         ):
             heard = stranger.ask_once(key, payload, timeout_s=PATIENCE_S)
             assert heard.how == "refused" and isinstance(decode_reply(heard.payload), Refusal)
@@ -445,22 +445,22 @@ def test_a_policy_that_is_not_served_or_not_enough_is_said(hub: Connection) -> N
     with pytest.raises(MachineError, match="no server of policy 'counting' at unixsock"):
         remote_driver("zenoh:counting", at, times=ServerTimes(first_found_s=0.2))
     with pytest.raises(UsageError, match="needs --policy-at ENDPOINT"):
-        known_driver("zenoh:counting", PolicyHost())
+        inspected_driver("zenoh:counting", PolicyHost())
     with pytest.raises(
         UsageError, match="--policy-at goes with --policy zenoh:NAME, not with 'route'"
     ):
-        known_driver("route", at)
+        inspected_driver("route", at)
     with (
         served(hub, Counting()),
         pytest.raises(UsageError, match="answers for 1 episodes at a time, and there are 4 jobs"),
     ):
-        known_driver("zenoh:counting", at, 4)
+        inspected_driver("zenoh:counting", at, 4)
     knows = Counting.manifest | {"privileged": True}
     with (
         served(hub, Counting(), manifest=knows),
         pytest.raises(UsageError, match="a remote one sees only observations"),
     ):
-        known_driver("zenoh:counting", at)
+        inspected_driver("zenoh:counting", at)
     wrong = Counting.manifest | {"camera": {"width": 64, "hight": 64}}
     with (
         served(hub, Counting(), manifest=wrong),
@@ -469,13 +469,13 @@ def test_a_policy_that_is_not_served_or_not_enough_is_said(hub: Connection) -> N
             match=r"unknown field of camera 'hight'\. Valid choices: .*Did you mean height",
         ),
     ):
-        known_driver("zenoh:counting", at)
+        inspected_driver("zenoh:counting", at)
     large = Counting.manifest | {"camera": {"width": 2000, "height": 2000}}
     with (
         served(hub, Counting(), manifest=large),
         pytest.raises(UsageError, match="MiB of pictures a step"),
     ):
-        known_driver("zenoh:counting", at)
+        inspected_driver("zenoh:counting", at)
 
 
 def test_a_server_beyond_this_machine_is_guarded_or_insecure_in_so_many_words() -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from cosim.cli.options import reached_by
+from cosim.cli.options import connect_options
 from cosim.spec.connection import Connection
 from tests.conftest import PATIENCE_S, Cosim
 from tests.support.documents import text_of
@@ -118,7 +118,7 @@ def test_the_printed_command_reaches_the_run(
 ) -> None:
     """The printed command has an address to connect to and the certificates of its role."""
     hub = Connection(role="coordinator", listen=listen, **how)  # type: ignore[arg-type]
-    assert reached_by(hub, "injector") == f" {words}"
+    assert connect_options(hub, "injector") == f" {words}"
 
 
 def test_the_printed_command_names_the_host_of_the_certificate(tmp_path: Path) -> None:
@@ -130,4 +130,7 @@ def test_the_printed_command_names_the_host_of_the_certificate(tmp_path: Path) -
     hub = Connection(
         role="coordinator", listen="tls/0.0.0.0:7447", tls=str(tmp_path / "certs" / "coordinator")
     )
-    assert reached_by(hub, "viewer") == f" --connect tls/hub.lan:7447 --tls {tmp_path}/certs/viewer"
+    assert (
+        connect_options(hub, "viewer")
+        == f" --connect tls/hub.lan:7447 --tls {tmp_path}/certs/viewer"
+    )

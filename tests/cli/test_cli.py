@@ -19,7 +19,7 @@ import pytest
 from cosim import run
 from cosim.core.files import write_atomic
 from cosim.place.walk_graph import WalkGraph
-from cosim.spec.episode_id import pseudonym_of
+from cosim.spec.episode_id import episode_id_of
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import ROBOTS
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, read_suite, write_suite
@@ -82,7 +82,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
             folder / f"{name}.json",
         )
     assert seed_in_order(scenarios) == int(SEED)
-    names = {pseudonym_of(int(SEED), scenario).episode: scenario.id for scenario in scenarios}
+    names = {episode_id_of(int(SEED), scenario).episode: scenario.id for scenario in scenarios}
     (folder / "names.json").write_text(json.dumps(names))
     (folder / "mine.py").write_text(POLICIES)
     return folder
@@ -487,7 +487,7 @@ def test_a_run_without_a_seed_draws_one_keeps_it_and_goes_on_with_it(
     assert list(rows(desk / "one")["run_seed"]) == [seed]
     record = json.loads((desk / "one/episodes/t-0/record.json").read_text())
     (scenario,) = read_suite(desk / "one/scenarios.json").scenarios
-    told = (seed, pseudonym_of(seed, scenario).episode)
+    told = (seed, episode_id_of(seed, scenario).episode)
     assert (record["run_seed"], record["episode"]) == told
     assert f"Seed {seed}: " in cosim(*words, "--resume", cwd=desk).stderr
     refused = cosim(*words, "--resume", "--seed", "3", cwd=desk)

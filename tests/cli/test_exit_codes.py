@@ -127,6 +127,6 @@ def test_the_documents_list_the_exit_codes() -> None:
         errors.WRONG_USE,
         errors.BROKEN_MACHINE,
         errors.INTERRUPTED,
-        errors.UNREAD,
+        errors.BROKEN_PIPE,
     ):
         assert f"\n| {code} |" in page

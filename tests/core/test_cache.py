@@ -16,8 +16,8 @@ from cosim.core.cache import (
     MAKING,
     ArrayCache,
     cache_entries,
-    forget_entries,
-    make_room,
+    clean_up,
+    clean_up_if_due,
     mapped_arrays,
 )
 from tests.conftest import PATIENCE_S, Cosim
@@ -67,12 +67,12 @@ def test_what_was_used_longest_ago_goes_beyond_the_limit(
     cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Imported maps count and stay, whatever the limit; nothing goes below it."""
-    assert len(left(cache)) == 5 and not forget_entries().entries
-    gone = forget_entries(limit_bytes=round(3.5 * MB))
+    assert len(left(cache)) == 5 and not clean_up().entries
+    gone = clean_up(limit_bytes=round(3.5 * MB))
     assert [entry.path.name for entry in gone.entries] == ["a.map", "city-1.net.xml"]
     assert gone.size_bytes == pytest.approx(2 * MB, rel=0.1)
     monkeypatch.setenv("COSIM_CACHE_LIMIT", "0")
-    make_room()
+    clean_up_if_due()
     assert left(cache) == {"maps/town"}
 
 
@@ -80,14 +80,12 @@ def test_what_a_living_process_uses_stays(cache: Path) -> None:
     """Of a process that uses the oldest entry nothing is taken away while it lives, whatever the
     limit; afterwards, however it ended, it is."""
     with user_of("city-1.net.xml") as process:
-        gone = forget_entries(limit_bytes=0)
+        gone = clean_up(limit_bytes=0)
         assert [entry.path.name for entry in gone.in_use] == ["city-1.net.xml"]
         assert left(cache) == {"maps/town", "city-1.net.xml"}
         process.kill()
         process.wait(PATIENCE_S)
-    assert [entry.path.name for entry in forget_entries(limit_bytes=0).entries] == [
-        "city-1.net.xml"
-    ]
+    assert [entry.path.name for entry in clean_up(limit_bytes=0).entries] == ["city-1.net.xml"]
     assert left(cache) == {"maps/town"} and not list((cache / ".in-use").iterdir())
 
 
@@ -97,7 +95,7 @@ def test_a_long_process_does_not_keep_what_it_used_long_ago(cache: Path) -> None
     with user_of("city-1.net.xml"):
         long_ago_s = time.time() - 7200.0
         os.utime(cache / "city-1.net.xml", (long_ago_s, long_ago_s))
-        forget_entries(limit_bytes=0)
+        clean_up(limit_bytes=0)
         assert left(cache) == {"maps/town"}
 
 
@@ -123,7 +121,7 @@ def test_processes_that_use_and_forget_at_once_do_not_hurt_one_another(cache: Pa
     for process in processes:
         said = process.communicate(timeout=PATIENCE_S)[1]
         assert process.returncode == 0, said
-    forget_entries(limit_bytes=0)
+    clean_up(limit_bytes=0)
     assert left(cache) == {"maps/town"}
     assert {path.name for path in cache.iterdir()} <= {
         "maps",
@@ -149,10 +147,10 @@ def test_who_keeps_something_makes_room_first(
     keep()
     assert "tiles/a" not in left(cache) and len(left(cache)) == 5
     os.utime(cache / "read/a.map", (0.0, 0.0))
-    make_room()
+    clean_up_if_due()
     assert "read/a.map" in left(cache)
     monkeypatch.setattr("cosim.core.cache._CLEANUP_INTERVAL_S", 0.0)
-    make_room()
+    clean_up_if_due()
     assert "read/a.map" not in left(cache)
 
 
@@ -162,7 +160,7 @@ def test_what_killed_processes_left_half_made_goes(cache: Path) -> None:
         for young in ("", "-young"):
             (cache / f"{name}{young}").mkdir()
         os.utime(cache / name, (0.0, 0.0))
-    forget_entries()
+    clean_up()
     found = sorted(path.name for path in cache.rglob(".*-x*"))
     assert found == [
         ".building-x-young",

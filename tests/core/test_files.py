@@ -17,7 +17,7 @@ import pytest
 from filelock import Timeout
 
 from cosim.core.files import (
-    MAKING,
+    UNFINISHED_PREFIX,
     atomic_file,
     atomic_folder,
     folder_holds,
@@ -141,7 +141,7 @@ def test_an_error_in_the_block_leaves_the_old_folder(tmp_path: Path) -> None:
 
 def dead_replacement(maps: Path) -> Path:
     """What a process leaves that was killed while it replaced the folder `town`."""
-    dead = maps / f"{MAKING}dead"
+    dead = maps / f"{UNFINISHED_PREFIX}dead"
     (dead / ".old" / "town").mkdir(parents=True)
     (dead / ".old" / "town" / "net.xml").write_text("<net/>")
     (dead / ".held").touch()
@@ -151,7 +151,7 @@ def dead_replacement(maps: Path) -> Path:
 def test_a_folder_that_was_being_replaced_by_a_killed_process_is_put_back(tmp_path: Path) -> None:
     """By the next process that writes there, or that reads it."""
     dead_replacement(tmp_path / "writer")
-    with temp_folder(MAKING, tmp_path / "writer"):
+    with temp_folder(UNFINISHED_PREFIX, tmp_path / "writer"):
         assert (tmp_path / "writer" / "town" / "net.xml").read_text() == "<net/>"
     dead_replacement(tmp_path / "reader")
     assert folder_holds(tmp_path / "reader" / "town", "net.xml")
@@ -193,7 +193,9 @@ while True:
         writer.wait()
     with atomic_folder(tmp_path / "other"):
         pass
-    assert {path.name for path in tmp_path.iterdir() if not path.name.startswith(MAKING)} == {
+    assert {
+        path.name for path in tmp_path.iterdir() if not path.name.startswith(UNFINISHED_PREFIX)
+    } == {
         "town",
         "other",
     }

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from cosim.core.clock import Clock
 from cosim.core.errors import PolicyError, SpecError
-from cosim.core.state import Command, Planned
+from cosim.core.state import Command, WaypointCommand
 from cosim.episode.control import command_of
 from cosim.spec.manifest import WaypointRule
 from cosim.spec.robot import COURIER, Robot
@@ -24,7 +24,7 @@ QUICK = dataclasses.replace(COURIER, w_max_radps=100.0)
 
 def of(answer: object, rule: WaypointRule = WaypointRule(), robot: Robot = COURIER) -> Command:
     command = command_of(answer, rule=rule, robot=robot)
-    assert isinstance(command, Planned) == (not isinstance(answer, Command))
+    assert isinstance(command, WaypointCommand) == (not isinstance(answer, Command))
     return Command(command.v_mps, command.w_radps)
 
 
@@ -108,13 +108,15 @@ def test_a_command_tells_the_waypoints_that_it_follows_one_of() -> None:
     """A command carries its waypoints in metres and the index of the followed one."""
     rule = WaypointRule(index=1, unit_m=0.5)
     told = command_of([[1.0, 0.5, 0.6, 0.8], [2.0, -1.0, 1.0, 0.0]], rule=rule, robot=COURIER)
-    assert isinstance(told, Planned) and told.index == 1 and told.waypoints.dtype == np.float32
+    assert (
+        isinstance(told, WaypointCommand) and told.index == 1 and told.waypoints.dtype == np.float32
+    )
     assert np.array_equal(
         told.waypoints, np.float32([[0.5, 0.25, 0.6, 0.8], [1.0, -0.5, 1.0, 0.0]])
     )
     again = command_of(told, rule=rule, robot=COURIER)
     assert (
-        isinstance(again, Planned)
+        isinstance(again, WaypointCommand)
         and again == told
         and np.array_equal(again.waypoints, told.waypoints)
     )
@@ -122,7 +124,7 @@ def test_a_command_tells_the_waypoints_that_it_follows_one_of() -> None:
         of(dataclasses.replace(told, waypoints=np.zeros(3, np.float32)))
     many = command_of([[1e300, 0.0]] * 1000, rule=WaypointRule(), robot=COURIER)
     assert (
-        isinstance(many, Planned)
+        isinstance(many, WaypointCommand)
         and many.waypoints.shape == (256, 2)
         and np.isfinite(many.waypoints).all()
     )

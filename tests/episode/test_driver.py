@@ -16,7 +16,7 @@ from cosim.core.errors import PolicyError
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import STILL, Command, People, RobotState, Signal, Vehicles
 from cosim.episode.interfaces import Observation, Privileged
-from cosim.episode.policy_caller import Driver, PolicyCall
+from cosim.episode.policy_caller import PolicyCall, PolicyCaller
 from cosim.spec.camera import Calibration, CameraPicture, CameraSpec
 from cosim.spec.goal import ImageGoal, RoutePatch
 from cosim.spec.manifest import Manifest, WaypointRule
@@ -102,7 +102,7 @@ def test_whatever_a_policy_raises_is_its_crash(deaf: None, error: BaseException,
     """Also what is no Exception, and what cannot be written down: one message with the policy's
     name and the time."""
     with pytest.raises(PolicyError) as caught:
-        Driver(Fake(raising(error))).act(seen(tick=2))
+        PolicyCaller(Fake(raising(error))).act(seen(tick=2))
     assert str(caught.value).startswith("policy 'mine' raised ") and told in without_lines(
         str(caught.value)
     )
@@ -119,7 +119,7 @@ def test_a_crash_names_the_last_line_of_the_users_code() -> None:
     with pytest.raises(
         PolicyError, match=rf"size 3 into shape \(2,\) in test_driver\.py:{line} \(act at 0\.00 s\)"
     ):
-        Driver(Fake(by_numpy)).act(seen(tick=0))
+        PolicyCaller(Fake(by_numpy)).act(seen(tick=0))
 
 
 def test_a_reset_that_raises_is_a_crash_too() -> None:
@@ -127,13 +127,13 @@ def test_a_reset_that_raises_is_a_crash_too() -> None:
     with pytest.raises(
         PolicyError, match=r"policy 'mine' raised SystemExit: 3 in test_driver\.py:\d+ \(reset\)"
     ):
-        Driver(Fake(lambda _: STILL)).reset("bad", 0)
+        PolicyCaller(Fake(lambda _: STILL)).reset("bad", 0)
 
 
 def test_ctrl_c_is_no_crash() -> None:
     """Where somebody can press it, it ends what is going on."""
     with pytest.raises(KeyboardInterrupt):
-        Driver(Fake(raising(KeyboardInterrupt()))).act(seen())
+        PolicyCaller(Fake(raising(KeyboardInterrupt()))).act(seen())
 
 
 def test_an_answer_is_read_once_and_inside_the_door() -> None:
@@ -150,11 +150,11 @@ def test_an_answer_is_read_once_and_inside_the_door() -> None:
             return next(values)
 
     with pytest.raises(PolicyError, match="raised SystemExit: 9"):
-        Driver(Fake(lambda _: Command(Pretends(1.0), 0.0))).act(seen())
+        PolicyCaller(Fake(lambda _: Command(Pretends(1.0), 0.0))).act(seen())
     values = iter([1.0, float("nan"), 99.0])
     shifty = object.__new__(Shifty)
     object.__setattr__(shifty, "w_radps", 0.0)
-    assert Driver(Fake(lambda _: shifty)).act(seen()) == Command(1.0, 0.0)
+    assert PolicyCaller(Fake(lambda _: shifty)).act(seen()) == Command(1.0, 0.0)
 
 
 def test_what_a_policy_writes_into_nobody_sees() -> None:
@@ -187,7 +187,7 @@ def test_what_a_policy_writes_into_nobody_sees() -> None:
 
     known = knowledge()
     observation = seen(known=known)
-    Driver(Fake(scribbles, dataclasses.replace(MINE, privileged=True))).act(observation)
+    PolicyCaller(Fake(scribbles, dataclasses.replace(MINE, privileged=True))).act(observation)
     assert (observation.rgb == 7).all()
     again = knowledge()
     for kind in ("people", "vehicles"):
@@ -207,7 +207,7 @@ def test_a_route_stays_the_same_object_through_an_episode() -> None:
         routes.append(observation.privileged.route)
         return STILL
 
-    driver = Driver(Fake(notes, dataclasses.replace(MINE, privileged=True)))
+    driver = PolicyCaller(Fake(notes, dataclasses.replace(MINE, privileged=True)))
     known = knowledge()
     for tick in (0, 5):
         driver.act(seen(tick, known))
@@ -228,7 +228,7 @@ def test_a_manifest_is_read_once() -> None:
         return STILL
 
     policy = Fake(greedy)
-    driver = Driver(policy)
+    driver = PolicyCaller(policy)
     for tick in range(3):
         driver.act(seen(tick, knowledge()))
     assert known == [None] * 3 and driver.manifest == MINE
@@ -242,7 +242,7 @@ def test_a_child_that_a_policy_forks_does_not_go_on_with_the_episode() -> None:
         os.fork()
         return STILL
 
-    Driver(Fake(forks)).act(seen())
+    PolicyCaller(Fake(forks)).act(seen())
     os.write(write, b"x")
     _, status = os.wait()
     assert os.read(read, 10) == b"x" and os.waitstatus_to_exitcode(status) == 1
@@ -259,7 +259,7 @@ def test_a_policy_at_work_is_timed() -> None:
         def stops(self) -> None:
             told.append(None)
 
-    driver = Driver(Fake(lambda _: STILL), timer=Notes())
+    driver = PolicyCaller(Fake(lambda _: STILL), timer=Notes())
     driver.reset("a", 0)
     driver.act(seen(0))
     driver.act(seen(5))
@@ -311,7 +311,7 @@ def test_what_a_policy_writes_into_its_goal_and_further_pictures_nobody_sees() -
         manifest.cameras["mast"] = CameraSpec(mount="mast")  # type: ignore[index]
         return STILL
 
-    driver = Driver(Fake(scribbles, manifest))
+    driver = PolicyCaller(Fake(scribbles, manifest))
     for goal in (ImageGoal(grey), RoutePatch(ones)):
         driver.act(dataclasses.replace(whole, goal=goal))
     assert (
@@ -358,14 +358,14 @@ class RemembersMany(Remembers):
 def test_on_reset_comes_before_the_act_that_follows_a_teleport() -> None:
     """on_reset is called only before the act after a teleport; an error in it is a crash."""
     policy = Remembers()
-    driver = Driver(policy)
+    driver = PolicyCaller(policy)
     for observation in (seen(0), put_back("", 5), seen(10)):
         driver.act(observation)
     driver.ended()
     assert policy.told == ["act", "on_reset", "act", "act"]
-    assert Driver(Fake(lambda one: Command(float(one.reset), 0.0))).act(put_back("", 5)) == Command(
-        1.0, 0.0
-    )
+    assert PolicyCaller(Fake(lambda one: Command(float(one.reset), 0.0))).act(
+        put_back("", 5)
+    ) == Command(1.0, 0.0)
     policy.on_reset = lambda: [][0]  # type: ignore[method-assign]
     where = r"in test_driver\.py:\d+ \(on_reset at 0\.50 s\)"
     with pytest.raises(PolicyError, match=rf"raised IndexError: list index out of range {where}"):
@@ -375,14 +375,14 @@ def test_on_reset_comes_before_the_act_that_follows_a_teleport() -> None:
 def test_a_policy_for_many_episodes_is_told_which_was_put_back_and_which_has_ended() -> None:
     """Also where it is asked for one at a time; once for each episode that has begun."""
     policy = RemembersMany()
-    driver = Driver(policy)
+    driver = PolicyCaller(policy)
     driver.ended()
     driver.reset("a", 0)
     driver.act(put_back("a", 5))
     driver.ended()
     driver.ended()
     assert policy.told == [("on_reset", "a"), "act", ("ended", "a")]
-    assert driver.batches and not Driver(Remembers()).batches
+    assert driver.batches and not PolicyCaller(Remembers()).batches
 
 
 def test_an_ended_that_raises_is_printed_and_no_crash(capfd: pytest.CaptureFixture[str]) -> None:
@@ -392,7 +392,7 @@ def test_an_ended_that_raises_is_printed_and_no_crash(capfd: pytest.CaptureFixtu
         def ended(self, episode_id: str) -> None:
             raise LookupError("no such episode")
 
-    driver = Driver(Fails())
+    driver = PolicyCaller(Fails())
     driver.reset("a", 0)
     driver.ended()
     assert "policy 'mine' raised LookupError: no such episode (ended)" in without_lines(

@@ -12,12 +12,12 @@ from cosim.episode.interfaces import Observation
 from cosim.episode.loop import Step
 from cosim.results.referee import Verdict
 from cosim.spec.camera import CameraSpec
-from cosim.spec.episode_id import pseudonym_of
+from cosim.spec.episode_id import episode_id_of
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario
 from scenarios.episodes.episode import Episode
-from scenarios.episodes.replay import Recorded, replayed
+from scenarios.episodes.replay import RecordedEpisode, replay_state_hash
 from scenarios.episodes.run_episode import run_episode
 from scenarios.tools.verify.doctor import small_scenario
 from tests.support.blind_policy import BEND, Blind
@@ -75,7 +75,7 @@ def test_waypoints_are_recorded_as_they_were_answered_and_the_record_replays(
     assert log.plan_sizes.tolist() == [0] * 5 + [8] * 5 and log.plan_index == 2
     assert np.array_equal(log.plan_points, np.tile(BEND.astype(np.float32), (5, 1)))
     assert log.command.tolist() == [[1.2, 0.0]] * 40
-    assert replayed(Recorded(scenario, record, log)) == record.state_hash
+    assert replay_state_hash(RecordedEpisode(scenario, record, log)) == record.state_hash
 
 
 def test_an_episode_stops_within_a_period_for_who_wants_to_look(scenario: Scenario) -> None:
@@ -121,7 +121,7 @@ def test_an_episode_tells_its_policy_an_opaque_name_and_a_seed(scenario: Scenari
             return AHEAD
 
     records = [run_episode(scenario, Noting(), EpisodeOptions(seed=seed)).record for seed in (1, 2)]
-    assert told == [pseudonym_of(seed, scenario) for seed in (1, 2)] and told[0] != told[1]
+    assert told == [episode_id_of(seed, scenario) for seed in (1, 2)] and told[0] != told[1]
     assert [(one.setup.seed, one.episode) for one in records] == [(1, told[0][0]), (2, told[1][0])]
     assert records[0].state_hash == records[1].state_hash
 

@@ -11,11 +11,11 @@ import pytest
 
 from cosim.core.errors import RunError
 from cosim.core.geometry import Pose
-from cosim.core.state import Command, Planned, RobotState
-from cosim.episode.command_delay import InFlight
+from cosim.core.state import Command, RobotState, WaypointCommand
+from cosim.episode.command_delay import CommandDelay
 from cosim.episode.loop import Step
 from cosim.results.log import Log
-from cosim.results.waypoint_replay import Following
+from cosim.results.waypoint_replay import WaypointReplay
 from tests.support.driven_runs import driven, short_way
 
 AHEAD = np.float32([[1.0, 0.0], [2.0, 0.5]])
@@ -24,7 +24,7 @@ TURNED = np.float32([[1.0, 0.0, 0.6, 0.8]])
 
 def log_of(*answers: tuple[int, int, Command]) -> Log:
     """Ten ticks of a log with answers: their ticks, delays, and commands."""
-    commands = InFlight()
+    commands = CommandDelay()
     for answer in answers:
         commands.answered(*answer)
     sizes, points, index = commands.plans
@@ -43,9 +43,9 @@ def test_waypoints_of_every_kind_lie_in_the_file_as_they_were_answered(tmp_path:
     """Two of them, a command, one with a heading: ragged, the missing headings NaN; a file without
     any has no word of them."""
     log = log_of(
-        (0, 0, Planned(1.0, 0.0, AHEAD, 1)),
+        (0, 0, WaypointCommand(1.0, 0.0, AHEAD, 1)),
         (4, 0, Command(1.0, 0.0)),
-        (8, 0, Planned(1.0, 0.0, TURNED, 1)),
+        (8, 0, WaypointCommand(1.0, 0.0, TURNED, 1)),
     )
     (tmp_path / "planned.npz").write_bytes(log.encoded())
     read = Log.load(tmp_path / "planned.npz")
@@ -70,7 +70,7 @@ def test_waypoints_of_every_kind_lie_in_the_file_as_they_were_answered(tmp_path:
 @pytest.mark.parametrize("name", ["plan_sizes", "plan_points", "plan_index"])
 def test_a_trajectory_with_a_part_of_its_waypoints_is_none(tmp_path: Path, name: str) -> None:
     """An array of them that is gone is refused, with the file's name."""
-    held = dataclasses.asdict(log_of((0, 0, Planned(1.0, 0.0, AHEAD, 1))))
+    held = dataclasses.asdict(log_of((0, 0, WaypointCommand(1.0, 0.0, AHEAD, 1))))
     del held[name]
     np.savez(tmp_path / "t.npz", **held)
     with pytest.raises(RunError, match=r"t\.npz: not a trajectory"):
@@ -82,8 +82,8 @@ def test_waypoints_are_followed_from_when_they_take_effect_until_others_do_or_th
 ):
     """By hand: answered at tick 0 with a delay of 2, at (1, 2) heading north; at 4 a command; at 6
     waypoints, which are on their way when the robot is put elsewhere."""
-    planned = Planned(1.0, 0.0, AHEAD, 1)
-    following = Following(
+    planned = WaypointCommand(1.0, 0.0, AHEAD, 1)
+    following = WaypointReplay(
         log_of((0, 2, planned), (4, 2, Command(1.0, 0.0)), (5, 2, planned), (6, 2, planned))
     )
     assert following.follows == 2

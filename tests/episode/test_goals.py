@@ -27,9 +27,9 @@ from cosim.spec.goal import (
     TurningGoal,
     decoded_goal,
     goals_for,
+    instruction_at,
     manoeuvres,
-    patch_around,
-    told_at,
+    route_patch_at,
 )
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import COURIER, Mount
@@ -203,7 +203,9 @@ def test_instructions_tell_turns_and_crosswalks_alone() -> None:
     heard = set()
     for one in load_suite("long-horizon").scenarios[:12]:
         ways = manoeuvres(one.route_line, one.crossings)
-        heard |= {told_at(s_m, ways) for s_m in np.arange(0.0, one.route_line.length_m).tolist()}
+        heard |= {
+            instruction_at(s_m, ways) for s_m in np.arange(0.0, one.route_line.length_m).tolist()
+        }
     assert [text for text in heard if not told.fullmatch(text)] == [] and len(heard) > 8
 
 
@@ -222,19 +224,19 @@ def test_instructions_tell_turns_and_crosswalks_alone() -> None:
 def test_what_is_a_turn(route: list[tuple[float, float]], told: list[str]) -> None:
     """Of 45 degrees one bears, of 27 one follows the sidewalk, as round a long curve."""
     assert [one.words for one in manoeuvres(Polyline(route))] == told
-    assert told_at(0.0, ()) == "Follow the sidewalk."
+    assert instruction_at(0.0, ()) == "Follow the sidewalk."
 
 
 def test_a_route_patch_has_the_route_around_the_robot() -> None:
     """Ahead is up, left is left, 0.5 m a pixel: a straight way ahead is the two columns whose
     middles are within half a metre; turned to the left of a robot it is to its right; the corner 10
     m ahead goes off to the left."""
-    pixels = patch_around(Pose(20.0, 0.0, 0.0), np.array([(-100.0, 0.0), (100.0, 0.0)]))
+    pixels = route_patch_at(Pose(20.0, 0.0, 0.0), np.array([(-100.0, 0.0), (100.0, 0.0)]))
     assert (
         pixels.shape == (80, 80) and pixels.dtype == np.uint8 and set(np.unique(pixels)) == {0, 255}
     )
     assert set(np.flatnonzero(pixels.any(axis=0))) == {39, 40} and (pixels[:, 39:41] == 255).all()
-    aside = patch_around(Pose(20.0, 4.25, 0.0), np.array([(-100.0, 0.0), (100.0, 0.0)]))
+    aside = route_patch_at(Pose(20.0, 4.25, 0.0), np.array([(-100.0, 0.0), (100.0, 0.0)]))
     assert set(np.flatnonzero(aside.any(axis=0))) == {
         47,
         48,
@@ -247,7 +249,7 @@ def test_a_route_patch_has_the_route_around_the_robot() -> None:
         rows.min() == 19 and (ahead.pixels[:19] == 0).all()
     )  # the corner: row 19 is 10.25 m ahead
     assert (ahead.pixels[19:21, :40] == 255).all() and columns.min() == 0 and columns.max() == 40
-    turned = patch_around(
+    turned = route_patch_at(
         Pose(30.0, 0.0, -NORTH), np.array(CORNER)
     )  # looking right: the corner is to the left
     assert (np.rot90(ahead.pixels, 1) == turned).all()

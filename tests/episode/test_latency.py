@@ -16,7 +16,7 @@ from cosim.cli.run_table import print_terms
 from cosim.core.errors import UsageError
 from cosim.core.geometry import Floats
 from cosim.core.state import STILL, Command
-from cosim.episode.command_delay import InFlight
+from cosim.episode.command_delay import CommandDelay
 from cosim.episode.interfaces import Observation
 from cosim.results.log import Log
 from cosim.results.record import Record
@@ -26,10 +26,10 @@ from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.run_config import RunConfig
 from cosim.spec.scenario import Scenario, Suite, write_suite
-from scenarios.episodes.replay import Recorded, replayed
+from scenarios.episodes.replay import RecordedEpisode, replay_state_hash
 from scenarios.episodes.run_episode import run_episode
 from scenarios.runs import run as suite_run
-from scenarios.runs.planning import check_alone
+from scenarios.runs.planning import check_real_time
 from scenarios.suites.catalog import load_suite
 from scenarios.tools.verify.doctor import small_scenario
 from tests.cli.terminal.test_run_table import terminal
@@ -50,7 +50,7 @@ def test_commands_take_effect_in_their_order_and_are_lost_where_the_robot_is_put
 ):
     """By hand: asked at 0, 5, 10 with 7 ticks of delay; that of 10 is on its way when the robot is
     put back."""
-    way = InFlight()
+    way = CommandDelay()
     told = [Command(float(v), 0.0) for v in (1, 2, 3)]
     way.answered(0, 7, told[0])
     assert [way.at(tick) for tick in (0, 4)] == [STILL, STILL]
@@ -79,9 +79,9 @@ def test_real_time_goes_with_one_process_and_no_latency() -> None:
     with pytest.raises(UsageError, match="leave latency_ms out"):
         EpisodeOptions(latency_ms=50.0, real_time=True)
     for jobs, shared, named in ((2, False, "2 jobs"), (1, True, "a shared renderer")):
-        check_alone(EpisodeOptions(), jobs, shared)
+        check_real_time(EpisodeOptions(), jobs, shared)
         with pytest.raises(UsageError, match=f"{named} would be timed too: take one job"):
-            check_alone(EpisodeOptions(real_time=True), jobs, shared)
+            check_real_time(EpisodeOptions(real_time=True), jobs, shared)
 
 
 def test_tables_tell_of_latency_where_there_is_any() -> None:
@@ -210,7 +210,7 @@ def test_in_real_time_answers_are_as_late_as_they_were_and_the_record_replays(
     assert np.array_equal(log.command, commands(log.answers, len(log)))
     assert record.setup.latency_ms == 50.0 * np.median(delays) and record.answer_ms is not None
     assert record.setup.latency_ms - 50.0 < record.answer_ms <= record.setup.latency_ms
-    assert replayed(Recorded(scenario, record, log)) == record.state_hash
+    assert replay_state_hash(RecordedEpisode(scenario, record, log)) == record.state_hash
 
 
 @pytest.mark.engine

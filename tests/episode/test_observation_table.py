@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from shapely.geometry.base import BaseGeometry
 
-from bridge.policy_server import AskAct, EpisodeDecoder, packed, unpacked
+from bridge.policy_server import ActRequest, EpisodeDecoder, pack_array, unpack_array
 from cosim.core.geometry import Polyline
 from cosim.core.state import Command
 from cosim.episode.interfaces import Observation
@@ -240,11 +240,11 @@ def test_the_table_holds_where_policies_are_hosted_elsewhere(seen: dict[str, Obs
 def hosted(seen: Observation) -> tuple[Observation, SimpleNamespace]:
     """What a policy gets in another process with cosim, and in one without."""
     fields, arrays = encoded_fields(dataclasses.replace(seen, privileged=None))
-    laid = {name: packed(array) for name, array in arrays.items()}
+    laid = {name: pack_array(array) for name, array in arrays.items()}
     about = encoded_about(seen)
-    asked = AskAct("r", seen.episode, "a", 0, **fields, arrays=laid, about=about)
-    came = msgspec.msgpack.decode(msgspec.msgpack.encode(asked), type=AskAct)
-    copies = {name: unpacked(array) for name, array in came.arrays.items()}
+    asked = ActRequest("r", seen.episode, "a", 0, **fields, arrays=laid, about=about)
+    came = msgspec.msgpack.decode(msgspec.msgpack.encode(asked), type=ActRequest)
+    copies = {name: unpack_array(array) for name, array in came.arrays.items()}
     afar, plain = (
         kind(seen.episode, came.about).decoded(came, copies)
         for kind in (ObservationDecoder, EpisodeDecoder)
@@ -257,7 +257,7 @@ def test_an_observation_that_is_sent_arrives_equal_to_the_bit(seen: dict[str, Ob
     """By every goal protocol: each array and number, what the simulator knows included."""
     for one in seen.values():
         fields, arrays = encoded_fields(one)
-        asked = AskAct("r", one.episode, "a", 0, **fields)
+        asked = ActRequest("r", one.episode, "a", 0, **fields)
         came = ObservationDecoder(one.episode, encoded_about(one)).decoded(asked, arrays)
         assert bytes_of(one) == bytes_of(came)
 

@@ -12,9 +12,9 @@ from cosim.cli import train
 from cosim.core.errors import RunError, UsageError
 from cosim.learning.curve import draw_curve, write_curve
 from cosim.learning.settings import (
-    Reached,
+    StepsReached,
     Training,
-    looks_after,
+    is_evaluated,
     outcome_in_words,
     planned_steps,
     rate_share,
@@ -88,12 +88,14 @@ def test_the_rate_of_learning_rises_and_falls_to_zero() -> None:
         assert shares[shares.index(max(shares)) :] == sorted(
             shares[shares.index(max(shares)) :], reverse=True
         )
-    assert [step for step in range(1, 701) if looks_after(step, 700)] == [200, 400, 600, 700]
+    assert [step for step in range(1, 701) if is_evaluated(step, 700)] == [200, 400, 600, 700]
 
 
 def test_what_a_training_has_come_to_is_said() -> None:
     """The bundle, where it stopped, and how to continue, also to another end."""
-    stopped, whole = (outcome_in_words(Path("small"), Reached(step, 300)) for step in (118, 300))
+    stopped, whole = (
+        outcome_in_words(Path("small"), StepsReached(step, 300)) for step in (118, 300)
+    )
     assert (
         "a bundle: --policy onnx:small, stopped at step 118 of 300. Continue with --resume"
         in stopped

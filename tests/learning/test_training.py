@@ -33,7 +33,7 @@ onnx = pytest.importorskip("onnx")
 
 from cosim.learning.bundle import bundle_facts, manifest_of, source_of  # noqa: E402
 from cosim.learning.examples import Examples, mirror  # noqa: E402
-from cosim.learning.graph import INPUTS, graph_of, parameters_of  # noqa: E402
+from cosim.learning.graph import INPUTS, build_graph, load_parameters  # noqa: E402
 from cosim.learning.network import CRUISE_MPS, HEIGHT_PX, WAYPOINTS, WIDTH_PX, new_parameters  # noqa: E402
 from cosim.learning.settings import Training  # noqa: E402
 from cosim.learning.training import train  # noqa: E402
@@ -220,17 +220,17 @@ def test_it_can_be_trained_on_from_the_shipped_graph_alone(
 ) -> None:
     """The graph holds the parameters that training begins with: at a rate of next to nothing it
     stays as it is."""
-    held = parameters_of(learned / "model.onnx")
+    held = load_parameters(learned / "model.onnx")
     assert train(
         [data], tmp_path / "on", replace(BRISK, begin=learned, rate=1e-12), False, ignore
     ).whole
-    for name, value in parameters_of(tmp_path / "on" / "model.onnx").items():
+    for name, value in load_parameters(tmp_path / "on" / "model.onnx").items():
         torch.testing.assert_close(value, held[name], atol=1e-6, rtol=0)
     drawn = new_parameters(3)
-    (tmp_path / "drawn.onnx").write_bytes(graph_of(drawn))
+    (tmp_path / "drawn.onnx").write_bytes(build_graph(drawn))
     assert all(
         torch.equal(value, drawn[name])
-        for name, value in parameters_of(tmp_path / "drawn.onnx").items()
+        for name, value in load_parameters(tmp_path / "drawn.onnx").items()
     )
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from cosim.core.geometry import Floats, Pose, box_disk_gap, wrap_angle
 from cosim.core.state import PERSON_RADIUS_M
-from cosim.people.yielding import RobotBody, Standing
+from cosim.people.yielding import RobotBody, StandingObstacles
 from cosim.spec.events import StandingBody
 from sumo_nets.crowd.shown_people import MAX_SPEED_MPS, MAX_TURN_RADPS, PoseFilter
 
@@ -97,7 +97,7 @@ def test_people_come_and_go() -> None:
 def test_nobody_steps_round_what_stands_into_the_robot(aside_m: float) -> None:
     """A person who passes an obstacle comes no nearer to a robot that drives on the other side."""
     half_m = 0.35, 0.275
-    standing = Standing([StandingBody(0.0, -aside_m, 0.0, 1.0, 0.6, 0.0, -1.0)])
+    standing = StandingObstacles([StandingBody(0.0, -aside_m, 0.0, 1.0, 0.6, 0.0, -1.0)])
     poses = PoseFilter(DT_S, standing)
     track = walk(3.0, MAX_SPEED_MPS) - [3.0, aside_m - 0.1]
     least_m = math.inf

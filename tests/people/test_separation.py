@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sumo_nets.crowd.separation import SHOULDERS_M, kept_apart
+from sumo_nets.crowd.separation import SHOULDERS_M, separated_positions
 
 REACH_M = 2.2 * 0.05
 
@@ -18,7 +18,7 @@ def walked(start: np.ndarray, goal: np.ndarray, firm: np.ndarray) -> list[np.nda
     for _ in range(200):
         away = goal - at
         far = np.maximum(np.hypot(*away.T), 1e-9)[:, None]
-        at = kept_apart(at, at + away / far * np.minimum(far, 0.07), firm, REACH_M)
+        at = separated_positions(at, at + away / far * np.minimum(far, 0.07), firm, REACH_M)
         track.append(at)
     return track
 
@@ -58,7 +58,7 @@ def test_who_is_alone_walks_as_it_wants() -> None:
     """Without anybody near the very same values come back."""
     before = np.array([[0.0, 0.0], [2.0, 0.0]])
     wanted = before + 0.07
-    assert kept_apart(before, wanted, np.zeros(2, dtype=bool), REACH_M) is wanted
+    assert separated_positions(before, wanted, np.zeros(2, dtype=bool), REACH_M) is wanted
 
 
 def test_who_wants_to_stand_inside_a_group_stands_still_before_it() -> None:
@@ -73,7 +73,7 @@ def test_who_wants_to_stand_inside_a_group_stands_still_before_it() -> None:
     at = start
     steps = []
     for _ in range(100):
-        to = kept_apart(at, goal, firm, REACH_M, stand)
+        to = separated_positions(at, goal, firm, REACH_M, stand)
         steps.append(float(np.hypot(*(to[3] - at[3]))))
         at = to
     assert np.hypot(*(at[:3] - at[3]).T).min() > 0.9 * SHOULDERS_M
@@ -85,7 +85,9 @@ def test_who_stands_gives_way_to_who_comes_through() -> None:
     at = np.array([[-2.0, 0.0], [0.0, 0.0]])
     for _ in range(100):
         wanted = np.array([at[0] + (0.07, 0.0), [0.0, 0.0]])
-        at = kept_apart(at, wanted, np.array([False, False]), REACH_M, np.array([False, True]))
+        at = separated_positions(
+            at, wanted, np.array([False, False]), REACH_M, np.array([False, True])
+        )
         assert np.hypot(*(at[1] - at[0])) > 0.9 * SHOULDERS_M
     assert at[0, 0] > 2.0
     assert np.hypot(*at[1]) < 0.05

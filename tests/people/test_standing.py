@@ -13,11 +13,11 @@ from shapely.geometry import Polygon, box
 
 from cosim.core.geometry import Floats
 from cosim.core.state import PERSON_RADIUS_M
-from cosim.people.yielding import Standing, standing_bodies
+from cosim.people.yielding import StandingObstacles, standing_obstacles
 from cosim.spec.events import EventQuery, Walker
 from cosim.spec.obstacle import OBSTACLE_SIZES_M, Obstacle, footprint
 from scenarios.events.sight import Sight
-from scenarios.events.walking import pressed_on, walked_on
+from scenarios.events.walking import walk_on, walk_straight
 from sumo_nets.crowd.shown_people import PoseFilter
 
 DT_S = 0.05
@@ -25,8 +25,8 @@ SIDEWALK = box(-20.0, -1.6, 20.0, 1.6)
 TOUCHES_M = 0.02
 
 
-def standing(*obstacles: Obstacle, area: Polygon = SIDEWALK) -> Standing:
-    return standing_bodies(obstacles, area)
+def standing(*obstacles: Obstacle, area: Polygon = SIDEWALK) -> StandingObstacles:
+    return standing_obstacles(obstacles, area)
 
 
 def thing(
@@ -35,7 +35,7 @@ def thing(
     return Obstacle(kind=kind, x_m=x_m, y_m=y_m, heading_rad=heading_rad, form=form)
 
 
-def shown(things: Standing, y_m: float, east: bool, seconds: float = 9.0) -> Floats:
+def shown(things: StandingObstacles, y_m: float, east: bool, seconds: float = 9.0) -> Floats:
     """(T, 2) where somebody is shown whom SUMO walks along x at y_m, straight through
     everything."""
     poses = PoseFilter(DT_S, things)
@@ -66,7 +66,7 @@ def test_the_crowd_steps_round_what_stands_in_its_way(kind: str) -> None:
             assert gap_m(track, one) > -TOUCHES_M
             assert track[-1] == pytest.approx([6.6 if east else -6.6, y_m], abs=0.1)
             assert np.hypot(*np.diff(track, axis=0).T).max() <= 0.12
-    through = shown(Standing(), 0.0, True)
+    through = shown(StandingObstacles(), 0.0, True)
     assert gap_m(through, one) < -0.2
 
 
@@ -92,7 +92,7 @@ def test_who_fits_between_two_things_goes_between_them() -> None:
     assert np.abs(shown(apart, 0.1, True)[:, 1]).max() < 0.35
 
 
-def asked(things: Standing) -> EventQuery:
+def asked(things: StandingObstacles) -> EventQuery:
     """A question with the robot far away."""
     return EventQuery(
         episode="t",
@@ -112,12 +112,12 @@ def asked(things: Standing) -> EventQuery:
 
 
 @pytest.mark.parametrize("kind", ["bike", "cafe", "fence"])
-@pytest.mark.parametrize("moves", [walked_on, pressed_on], ids=["walks", "presses"])
+@pytest.mark.parametrize("moves", [walk_on, walk_straight], ids=["walks", "presses"])
 def test_directed_people_step_round_it_too(kind: str, moves: object) -> None:
     """People of events, who know the query alone, go round what it holds and walk on; without it
     they walk through."""
     one = thing(kind, 0.0, 0.05, 1.3)
-    for things in (standing(one), Standing()):
+    for things in (standing(one), StandingObstacles()):
         walker = Walker(x_m=-3.0, y_m=0.0, heading_rad=0.0)
         track = []
         for _ in range(160):

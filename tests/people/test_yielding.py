@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cosim.core.geometry import Pose, box_disk_gap
-from cosim.people.yielding import STEP_ROUND_GAP_M, RobotBody, stepped_round
+from cosim.people.yielding import STEP_ROUND_GAP_M, RobotBody, stepped_around
 
 HALF = (0.36, 0.29)
 STEP_M = 1.4 * 0.05
@@ -32,7 +32,7 @@ def test_someone_who_walks_at_a_standing_robot_passes_it_without_touching(
     for _ in range(250):
         away = goal - xy
         far = max(float(np.hypot(*away[0])), 1e-9)
-        xy = stepped_round(xy, xy + away / far * min(STEP_M, far), RobotBody(robot, HALF))
+        xy = stepped_around(xy, xy + away / far * min(STEP_M, far), RobotBody(robot, HALF))
         nearest = min(nearest, gap(xy, robot))
     assert nearest > 0.0
     assert float(np.hypot(*(goal - xy)[0])) < 0.2
@@ -44,7 +44,7 @@ def test_a_robot_that_drives_at_somebody_hits_them() -> None:
     person = np.array([[1.0, 0.0]])
     for x_m in np.arange(0.0, 0.8, 0.1):
         assert np.array_equal(
-            stepped_round(person, person, RobotBody(Pose(x_m, 0.0, 0.0), HALF, 2.0)), person
+            stepped_around(person, person, RobotBody(Pose(x_m, 0.0, 0.0), HALF, 2.0)), person
         )
     assert gap(person, Pose(0.7, 0.0, 0.0)) < 0.0
 
@@ -53,7 +53,7 @@ def test_people_who_are_not_near_walk_as_they_want() -> None:
     """Far from the robot, beside it, and walking away from it nothing changes."""
     before = np.array([[5.0, 0.0], [0.0, 0.29 + 0.3 + STEP_ROUND_GAP_M + 0.05], [0.7, 0.0]])
     wanted = before + np.array([[-0.07, 0.0], [0.07, 0.0], [0.07, 0.0]])
-    assert np.allclose(stepped_round(before, wanted, RobotBody(Pose(0.0, 0.0, 0.0), HALF)), wanted)
+    assert np.allclose(stepped_around(before, wanted, RobotBody(Pose(0.0, 0.0, 0.0), HALF)), wanted)
 
 
 def test_who_walks_against_a_moving_robot_steps_aside_in_time() -> None:
@@ -63,7 +63,7 @@ def test_who_walks_against_a_moving_robot_steps_aside_in_time() -> None:
     nearest = math.inf
     for tick in range(80):
         robot = Pose(1.5 * 0.05 * tick, 0.0, 0.0)
-        xy = stepped_round(xy, xy - np.array([[STEP_M, 0.0]]), RobotBody(robot, HALF, 1.5))
+        xy = stepped_around(xy, xy - np.array([[STEP_M, 0.0]]), RobotBody(robot, HALF, 1.5))
         nearest = min(nearest, gap(xy, Pose(1.5 * 0.05 * (tick + 1), 0.0, 0.0)))
     assert nearest > 0.0
     assert float(xy[0, 0]) < 1.5 * 0.05 * 80 - 1.0
@@ -74,7 +74,7 @@ def test_who_walks_ahead_does_not_see_the_robot_come_from_behind() -> None:
     before = np.array([[0.8, 0.0]])
     wanted = before + np.array([[0.03, 0.0]])
     assert np.allclose(
-        stepped_round(before, wanted, RobotBody(Pose(0.0, 0.0, 0.0), HALF, 2.0)), wanted
+        stepped_around(before, wanted, RobotBody(Pose(0.0, 0.0, 0.0), HALF, 2.0)), wanted
     )
 
 
@@ -88,7 +88,7 @@ def test_who_wants_to_stand_where_the_robot_is_stands_beside_it(x_m: float) -> N
     for _ in range(100):
         away = place - xy
         step = away * (0.11 / max(float(np.hypot(*away[0])), 0.11))
-        after = stepped_round(xy, xy + step, body, np.array([True]))
+        after = stepped_around(xy, xy + step, body, np.array([True]))
         ways.append(float(np.hypot(*(after - xy)[0])))
         xy = after
     assert sum(ways[60:]) < 1e-4

@@ -22,9 +22,9 @@ from cosim.spec.camera import CameraSpec
 from cosim.spec.scenario import City
 from physics.cameras.bullet_camera import BulletCamera
 from physics.dynamics.world import BulletWorld
-from physics.ground.tiles import CURB_M, Tile, build_tile, key_at, keys_within
-from physics.street.buildings import Frontage
-from physics.street.clearance import clear_width, on_driveways
+from physics.ground.tiles import CURB_M, Tile, build_tile, tile_at, tiles_within
+from physics.street.buildings import BuildingRows
+from physics.street.clearance import clear_widths, props_on_driveways
 from physics.street.furniture import (
     KINDS,
     PROP_VARIANTS,
@@ -36,7 +36,7 @@ from physics.street.furniture import (
 from physics.street.placement import (
     CLEAR_HALF_M,
     PROP_END_GAP_M,
-    Placement,
+    PropPlacement,
     clear_half_m,
 )
 from physics.street.street_surface import StreetSurface
@@ -59,9 +59,9 @@ EMPTY = Street(0)
 SHARED = Path(os.environ.get("COSIM_SHARED", Path(__file__).parents[3] / "shared")) / "maps"
 
 
-def placed(street_map: StreetMap, seed: int) -> tuple[Placement, Frontage]:
-    frontage = Frontage(street_map, seed)
-    return Placement(street_map, seed, frontage), frontage
+def placed(street_map: StreetMap, seed: int) -> tuple[PropPlacement, BuildingRows]:
+    frontage = BuildingRows(street_map, seed)
+    return PropPlacement(street_map, seed, frontage), frontage
 
 
 def sidewalks(street_map: StreetMap) -> list[Strip]:
@@ -70,7 +70,7 @@ def sidewalks(street_map: StreetMap) -> list[Strip]:
 
 def all_props(street_map: StreetMap, seed: int) -> list[Prop]:
     placement, _ = placed(street_map, seed)
-    return [prop for strip in sidewalks(street_map) for prop in placement.on_strip(strip)]
+    return [prop for strip in sidewalks(street_map) for prop in placement.props_of_strip(strip)]
 
 
 @cache
@@ -122,13 +122,13 @@ def test_props_keep_off_what_is_not_theirs() -> None:
     zebra = MAP.strips[":c0"].polygon
     for seed in range(6):
         placement, frontage = placed(MAP, seed)
-        props = [prop for strip in sidewalks(MAP) for prop in placement.on_strip(strip)]
+        props = [prop for strip in sidewalks(MAP) for prop in placement.props_of_strip(strip)]
         ground = footprints(props)
         assert len(props) > 25
         assert shapely.distance(ground, street).min() > 0.0
         assert shapely.distance(ground, zebra).min() >= PROP_END_GAP_M
         assert len(shapely.STRtree(ground).query(ground, predicate="intersects")[0]) == len(ground)
-        houses = [b.polygon for key in keys_within(0.0, 0.0, 120.0) for b in frontage.in_tile(key)]
+        houses = [b.polygon for key in tiles_within(0.0, 0.0, 120.0) for b in frontage.in_tile(key)]
         assert not len(shapely.STRtree(houses).query(ground, predicate="intersects")[0])
         for prop, footprint in zip(props, ground, strict=True):
             strip = MAP.strips[prop.id.split(":")[1]]
@@ -154,7 +154,7 @@ def test_the_middle_of_a_sidewalk_is_free() -> None:
 def test_props_do_not_depend_on_the_order_but_on_the_seed() -> None:
     """Tiles asked for in any order hold the same props, each in one tile alone; another seed gives
     others."""
-    keys = keys_within(0.0, 0.0, 100.0)
+    keys = tiles_within(0.0, 0.0, 100.0)
     one, two, other = (placed(MAP, seed)[0] for seed in (4, 4, 5))
     forward = {key: one.in_tile(key) for key in keys}
     backward = {key: two.in_tile(key) for key in reversed(keys)}
@@ -163,7 +163,7 @@ def test_props_do_not_depend_on_the_order_but_on_the_seed() -> None:
     ids = [prop.id for props in forward.values() for prop in props]
     assert len(ids) == len(set(ids)) == len(all_props(MAP, 4))
     assert all(
-        key_at(prop.x_m, prop.y_m) == key for key, props in forward.items() for prop in props
+        tile_at(prop.x_m, prop.y_m) == key for key, props in forward.items() for prop in props
     )
 
 
@@ -172,10 +172,10 @@ def test_the_checker_finds_a_prop_in_the_way() -> None:
     middle line."""
     strip = MAP.strips["nw"]
     bench = Prop("prop:nw:0", "bench", 0, -40.0, 6.2, 0.0, 0)
-    width, bare = clear_width([strip], [bench])["nw"]
+    width, bare = clear_widths([strip], [bench])["nw"]
     assert (width, bare) == (pytest.approx(3.0 - 0.3 - 0.225), pytest.approx(3.0))
     middle = dataclasses.replace(bench, y_m=5.0)
-    assert clear_width([strip], [middle])["nw"][0] == 0.0
+    assert clear_widths([strip], [middle])["nw"][0] == 0.0
 
 
 @pytest.mark.engine
@@ -186,7 +186,7 @@ def test_generated_cities_leave_a_way(seed: int) -> None:
     street_map = city(seed)
     strips = sidewalks(street_map)
     props = all_props(street_map, seed)
-    widths = clear_width(strips, props)
+    widths = clear_widths(strips, props)
     assert min(free for free, _ in widths.values()) >= 1.2 - 1e-6
     assert len(props) > 0.06 * sum(strip.length_m for strip in strips)
 
@@ -200,14 +200,14 @@ def test_driveways_are_open(seed: int) -> None:
     strips = sidewalks(street_map)
     props = all_props(street_map, seed)
     assert sum(len(strip.driveways) for strip in strips) > 20
-    assert on_driveways(strips, props) == []
+    assert props_on_driveways(strips, props) == []
     cars = [prop for prop in props if prop.kind == "car"]
     assert cars
     for car, footprint in zip(cars, footprints(cars), strict=True):
         assert shapely.distance(footprint, street_map.strips[car.id.split(":")[1]].polygon) > 0.0
     strip = next(strip for strip in strips if strip.driveways)
     x, y, heading = Polyline(strip.line).at(strip.driveways[0])
-    assert on_driveways(strips, [Prop("prop:here:0", "bin", 0, x, y, heading, 0)]) == [
+    assert props_on_driveways(strips, [Prop("prop:here:0", "bin", 0, x, y, heading, 0)]) == [
         "prop:here:0"
     ]
 
@@ -218,7 +218,7 @@ def test_driveways_are_open(seed: int) -> None:
 def test_foreign_maps_leave_a_way(path: Path) -> None:
     """Props take nothing from a sidewalk below 1.2 m: what is narrower stays as it is."""
     street_map = read_net(path)
-    widths = clear_width(sidewalks(street_map), all_props(street_map, 3))
+    widths = clear_widths(sidewalks(street_map), all_props(street_map, 3))
     assert all(free >= min(1.2, bare) - 1e-6 for free, bare in widths.values())
 
 
@@ -227,7 +227,9 @@ def test_a_prop_stops_the_robot_and_is_named() -> None:
     """Driven at a prop the robot touches it, whatever its kind: an object, by its id; and it does
     not pass."""
     placement, _ = placed(MAP, 1)
-    chosen = {prop.kind: prop for strip in sidewalks(MAP) for prop in placement.on_strip(strip)}
+    chosen = {
+        prop.kind: prop for strip in sidewalks(MAP) for prop in placement.props_of_strip(strip)
+    }
     assert len(chosen) > 8
     with BulletWorld(StreetSurface(MAP, seed=1)) as world:
         for prop in chosen.values():
@@ -248,7 +250,7 @@ def test_a_prop_is_seen_where_it_stands() -> None:
     props = [
         prop
         for strip in sidewalks(MAP)
-        for prop in placement.on_strip(strip)
+        for prop in placement.props_of_strip(strip)
         if prop.kind in ("bin", "planter")
     ]
     with BulletCamera(

@@ -15,17 +15,17 @@ from cosim.core.cache import Arrays
 from cosim.core.geometry import Pose
 from cosim.core.state import LABELS, RobotState, Street
 from cosim.place.open_ground import GROUND_LOOKS, PLAIN_GROUND, open_ground
-from cosim.place.street_map import LANDS, Feature, StreetMap
+from cosim.place.street_map import LAND_KINDS, Feature, StreetMap
 from cosim.report.above import Sheet, draw_streets
 from cosim.spec.camera import CameraSpec
 from physics.cameras.bullet_camera import BulletCamera
 from physics.cameras.gl import context
 from physics.cameras.gl.camera import GlCamera
 from physics.dynamics.world import BulletWorld
-from physics.ground.materials import PAVINGS, SEEN_AS
-from physics.ground.tiles import SURFACES, Key, surface
+from physics.ground.materials import APPEARANCE_OVERRIDES, PAVINGS
+from physics.ground.tiles import SURFACES, Key, surface_look
 from physics.street.street_surface import StreetSurface
-from physics.street.surface import Chunk, Finish, Patch
+from physics.street.surface import Chunk, Patch, TexturedDetails
 from physics.textures.ground import SURFACE_LAYERS, layer_of
 from tests.support.tiny_street import KEYS, tiny_map
 
@@ -64,12 +64,12 @@ def walked_on(layer: str) -> bool:
 
 def walked() -> list[str]:
     """Names of all surfaces that sidewalks have."""
-    return [name for name in (*SURFACES, *PAVINGS) if surface(name)[0] == "sidewalk"]
+    return [name for name in (*SURFACES, *PAVINGS) if surface_look(name)[0] == "sidewalk"]
 
 
 def layers_of(name: str) -> set[str]:
     """Every layer that a surface may show on a map that is no generated city."""
-    shown = SEEN_AS.get(name, (name,))[0]
+    shown = APPEARANCE_OVERRIDES.get(name, (name,))[0]
     return {layer_of(shown, seed) for seed in range(60)}
 
 
@@ -84,13 +84,15 @@ def test_sidewalks_roads_and_open_ground_share_no_material_and_no_colour() -> No
         "ground",
         *(name for name in PAVINGS if name.startswith("verge:")),
     ]
-    others += [f"ground:{kind}" for kind in LANDS if kind != PLAIN_GROUND]
+    others += [f"ground:{kind}" for kind in LAND_KINDS if kind != PLAIN_GROUND]
     layers = {name: layers_of(name) for name in (*walked(), *others)}
-    colours = {name: surface(name)[1] for name in (*walked(), *others)}
-    colours |= {name: colour for name, (_, colour) in SEEN_AS.items()}
-    colours |= {f"ground:{kind}": GROUND_LOOKS[kind].seen for kind in LANDS if kind != PLAIN_GROUND}
-    assert set(GROUND_LOOKS) == set(LANDS)
-    assert all(kind in SURFACE_LAYERS for kind in LANDS if kind != PLAIN_GROUND)
+    colours = {name: surface_look(name)[1] for name in (*walked(), *others)}
+    colours |= {name: colour for name, (_, colour) in APPEARANCE_OVERRIDES.items()}
+    colours |= {
+        f"ground:{kind}": GROUND_LOOKS[kind].seen for kind in LAND_KINDS if kind != PLAIN_GROUND
+    }
+    assert set(GROUND_LOOKS) == set(LAND_KINDS)
+    assert all(kind in SURFACE_LAYERS for kind in LAND_KINDS if kind != PLAIN_GROUND)
     for one in walked():
         for other in others:
             assert not layers[one] & layers[other], (one, other)
@@ -159,7 +161,7 @@ class Looked(StreetSurface):
     def covers(self, key: Key) -> tuple[Patch, ...]:
         return tuple(map(relabelled, super().covers(key)))
 
-    def finish(self, key: Key) -> Finish:
+    def finish(self, key: Key) -> TexturedDetails:
         whole = super().finish(key)
         return dataclasses.replace(whole, laid=tuple(map(relabelled, whole.laid)))
 

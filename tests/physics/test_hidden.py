@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats, Pose
 from cosim.core.state import LABELS, People, PersonKind, Street
-from cosim.results.event_monitor import STANDARD_CAMERA, body_points, eye_of, in_picture
+from cosim.results.event_monitor import STANDARD_CAMERA, body_points, camera_position, in_picture
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import Barrier
 from physics.cameras.choice import camera_of
@@ -54,7 +54,7 @@ def test_who_is_seen_has_pixels_and_who_is_hidden_has_none(
     with BulletWorld(StreetSurface(tiny_map(), seed=0), fences) as world:
         robot = world.place(Pose(-20.0, 5.0, math.radians(heading_deg)))
         mount = COURIER.mount("front")
-        eye = eye_of(robot, mount)
+        eye = camera_position(robot, mount)
         points = body_points(eye, np.array(at), robot.z_m)
         inside = points[in_picture(robot.pose, mount, STANDARD_CAMERA, points - eye)]
         unhidden = (~world.hidden(eye, inside)).sum() / len(points)

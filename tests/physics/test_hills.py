@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from cosim.core.geometry import Polyline, Pose
-from cosim.core.state import LABELS, NOBODY, Command, Street, Vehicles
+from cosim.core.state import LABELS, NO_PEOPLE, Command, Street, Vehicles
 from cosim.place.street_map import StreetMap
 from cosim.policies.privileged.route import Route
 from cosim.spec.camera import CameraSpec
@@ -128,7 +128,7 @@ def test_vehicles_are_on_the_slope(hill: StreetMap, world: BulletWorld) -> None:
     )
     line = Polyline(lane.line)
     car = line.at(30.0)
-    street = Street(0, NOBODY, Vehicles.of(("car",), [car[:2]], [car[2]], [0.0], [[4.5, 1.8]]))
+    street = Street(0, NO_PEOPLE, Vehicles.of(("car",), [car[:2]], [car[2]], [0.0], [[4.5, 1.8]]))
     robot = world.place(Pose(*line.at(20.0)))
     with BulletCamera(world, CameraSpec(width=160, height=120)) as camera:
         labels = camera.render(robot, street).labels

@@ -18,7 +18,7 @@ from cosim.place.street_map import StreetMap
 from cosim.place.terrain import Terrain
 from cosim.spec.scenario import City
 from physics.cameras.gl.context import available
-from physics.ground.tiles import key_at, keys_within, square
+from physics.ground.tiles import tile_at, tile_bounds, tiles_within
 from physics.street import street_surface
 from physics.street import tile_cache as kept_tiles
 from physics.street.street_surface import StreetSurface
@@ -55,9 +55,9 @@ def no_more(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def hilly(street_map: StreetMap) -> StreetMap:
     heights = np.random.default_rng(1).uniform(0.0, 3.0, (30, 30)).astype(np.float32)
-    return dataclasses.replace(street_map, terrain=Terrain(-50.0, -50.0, 25.0, heights)).read_of(
-        "hilly"
-    )
+    return dataclasses.replace(
+        street_map, terrain=Terrain(-50.0, -50.0, 25.0, heights)
+    ).with_source_hash("hilly")
 
 
 def equal(one: object, other: object) -> bool:
@@ -95,13 +95,14 @@ def test_a_tile_that_is_read_is_the_one_that_is_made(
     roughness = 0.6 if ground == "rough" else 0.0
     unkept = dataclasses.replace(street_map)
     assert street_map.made_of and not unkept.made_of
-    keys = keys_within(250.0, 250.0, 15.0)
+    keys = tiles_within(250.0, 250.0, 15.0)
     made = StreetSurface(unkept, 3, roughness)
     tiles = [made._built(key) for key in keys]
     wanted = [(tile.parts, tile.low, tile.crossings, tile.relief) for tile in tiles]
     chunks, finishes = [made.chunk(key) for key in keys], [made.finish(key) for key in keys]
     points = [
-        np.random.default_rng(0).uniform(square(key)[:2], square(key)[2:], (300, 2)) for key in keys
+        np.random.default_rng(0).uniform(tile_bounds(key)[:2], tile_bounds(key)[2:], (300, 2))
+        for key in keys
     ]
     heights = [tile.height(xy) for tile, xy in zip(tiles, points, strict=True)]
     assert sum(len(chunk.buildings) for chunk in chunks) and sum(
@@ -124,7 +125,7 @@ def test_a_tile_that_is_read_is_the_one_that_is_made(
 def test_what_is_kept_of_a_place_is_of_that_place_alone(cache: Path) -> None:
     """Another seed, another roughness and a map that was changed do not get what is kept."""
     street_map = place(CITY)[1]
-    key = key_at(250.0, 250.0)
+    key = tile_at(250.0, 250.0)
     for surface in (
         StreetSurface(street_map, 3),
         StreetSurface(street_map, 4),

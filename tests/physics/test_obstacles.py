@@ -19,7 +19,7 @@ from cosim.spec.obstacle import OBSTACLE_FORMS, OBSTACLE_SIZES_M, Obstacle, foot
 from physics.cameras.bullet_camera import BulletCamera
 from physics.cameras.gl.camera import GlCamera
 from physics.dynamics.world import BulletWorld
-from physics.ground.tiles import key_at
+from physics.ground.tiles import tile_at
 from physics.street.furniture import footprints, obstacle_prop
 from physics.street.gltf import as_gltf
 from physics.street.street_surface import StreetSurface
@@ -100,7 +100,7 @@ def test_obstacles_are_exported_by_their_names(tmp_path: Path) -> None:
     surface = StreetSurface(MAP, seed=1)
     path = tmp_path / "street.glb"
     those = [ahead(kind, 3.0 + 3.0 * k) for k, kind in enumerate(KINDS)]
-    path.write_bytes(as_gltf(surface, [key_at(*START.xy)], obstacles=those))
+    path.write_bytes(as_gltf(surface, [tile_at(*START.xy)], obstacles=those))
     scene = trimesh.load_scene(path)
     for one in those:
         parts = [

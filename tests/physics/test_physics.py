@@ -28,7 +28,7 @@ from cosim.spec.scenario import Barrier
 from physics.cameras.bullet_camera import BulletCamera
 from physics.dynamics.bullet import p
 from physics.dynamics.world import BulletWorld
-from physics.robots import urdf_of
+from physics.robots import urdf_path
 from physics.street.street_surface import StreetSurface
 from tests.support.tiny_street import tiny_map
 
@@ -236,7 +236,7 @@ def test_an_unknown_robot_lists_the_known() -> None:
     """A wrong name is a usage error with the choices."""
     with pytest.raises(UsageError, match="Valid choices: courier"):
         robot_called("rover")
-    assert all(urdf_of(robot).is_file() for robot in ROBOTS.values())
+    assert all(urdf_path(robot).is_file() for robot in ROBOTS.values())
 
 
 SPEC = CameraSpec(width=96, height=96)

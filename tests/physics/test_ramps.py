@@ -14,17 +14,17 @@ from shapely.geometry import LineString
 from cosim.core.clock import Clock
 from cosim.core.errors import MapError
 from cosim.core.geometry import Polyline, Pose, wrap_angle
-from cosim.core.state import NO_VEHICLES, NOBODY, STILL, Command, Street
+from cosim.core.state import NO_PEOPLE, NO_VEHICLES, STILL, Command, Street
 from cosim.episode.interfaces import Observation, Privileged
 from cosim.episode.loop import place_on_route
-from cosim.episode.policy_caller import Driver
+from cosim.episode.policy_caller import PolicyCaller
 from cosim.place.route_line import way_line
 from cosim.place.street_map import Port, StreetMap, Strip, WalkableArea
 from cosim.policies.privileged.route import Route
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City
 from physics.dynamics.world import BulletWorld
-from physics.ground.tiles import CURB_M, RAMP_SLOPE, build_tile, key_at, square
+from physics.ground.tiles import CURB_M, RAMP_SLOPE, build_tile, tile_at, tile_bounds
 from physics.street.street_surface import StreetSurface
 from sumo_nets.city.store import city_net
 from sumo_nets.net.snapshot import street_map_of
@@ -87,7 +87,7 @@ def climb(world: BulletWorld, line: Polyline) -> Climb:
     state = world.place(Pose(*line.at(0.0)))
     street = Street(0)
     clock = Clock.for_rate(Route.manifest.rate_hz)
-    driver = Driver(Route())
+    driver = PolicyCaller(Route())
     command = STILL
     tick = 0
     free = shapely.buffer(LineString(line.points), 1.0)
@@ -96,7 +96,7 @@ def climb(world: BulletWorld, line: Polyline) -> Climb:
     reached = 0.0
     while reached < line.length_m - 0.4 and clock.time_s(tick) < 5.0 + 2.5 * line.length_m / V_MPS:
         if clock.acts(tick):
-            known = Privileged(state, line, reached, NOBODY, NO_VEHICLES, {}, (), free)
+            known = Privileged(state, line, reached, NO_PEOPLE, NO_VEHICLES, {}, (), free)
             seen = Observation(
                 tick, clock.time_s(tick), None, state.v_mps, state.w_radps, COURIER, known
             )
@@ -135,9 +135,9 @@ def test_ramps_rise_one_in_twelve_at_most(place: StreetMap) -> None:
     rng = np.random.default_rng(1)
     steep_m2 = 0.0
     whole_m2 = 0.0
-    for key in dict.fromkeys(key_at(*spot) for spot in spots):
+    for key in dict.fromkeys(tile_at(*spot) for spot in spots):
         tile = build_tile(place, key)
-        x0, y0, x1, y1 = square(key)
+        x0, y0, x1, y1 = tile_bounds(key)
         at = rng.uniform((x0, y0), (x1 - 0.1, y1 - 0.1), (4000, 2))
         rise = np.abs(tile.height(at + 0.05) - tile.height(at))
         curb = np.minimum(tile.height(at), tile.height(at + 0.05)) < 1e-9

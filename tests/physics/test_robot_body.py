@@ -11,14 +11,14 @@ import pytest
 from cosim.core.errors import EngineError, SpecError
 from cosim.spec.robot import COURIER
 from physics.cameras.gl.robot_body import robot_parts
-from physics.robots import urdf_of
+from physics.robots import urdf_path
 
 CHASSIS = re.compile(r'<box size="([\d. ]+)"\s*/>')
 
 
 def with_visual(folder: Path, shape: str) -> Path:
     """The courier, its first box shown as something else."""
-    text = urdf_of(COURIER).read_text()
+    text = urdf_path(COURIER).read_text()
     path = folder / "other.urdf"
     path.write_text(CHASSIS.sub(shape, text, count=1))
     return path
@@ -30,14 +30,14 @@ def test_a_body_from_a_file_is_drawn_like_one_of_boxes(tmp_path: Path, ending: s
     stands for."""
     import trimesh
 
-    box = CHASSIS.search(urdf_of(COURIER).read_text())
+    box = CHASSIS.search(urdf_path(COURIER).read_text())
     assert box is not None
     size = np.array(box[1].split(), dtype=float)
     trimesh.creation.box(10.0 * size).export(tmp_path / f"chassis.{ending}")
     made = robot_parts(
         with_visual(tmp_path, f'<mesh filename="chassis.{ending}" scale="0.1 0.1 0.1"/>')
     )
-    plain = robot_parts(urdf_of(COURIER))
+    plain = robot_parts(urdf_path(COURIER))
     assert [part.colour for part in made] == [part.colour for part in plain]
     for one, other in zip(made, plain, strict=True):
         assert corners(one.mesh) == corners(other.mesh)

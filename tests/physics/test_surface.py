@@ -19,7 +19,7 @@ from physics.cameras.gl.camera import GlCamera
 from physics.cameras.view import shot
 from physics.dynamics.world import BulletWorld
 from physics.ground.mesh import Mesh
-from physics.ground.tiles import Key, square
+from physics.ground.tiles import Key, tile_bounds
 from physics.street.surface import Chunk, Patch, Surface
 from physics.textures.ground import layer_of
 
@@ -55,7 +55,7 @@ class Hill(Surface):
         return np.array([height(x_m) for x_m in np.asarray(xy, dtype=float).reshape(-1, 2)[:, 0]])
 
     def chunk(self, key: Key) -> Chunk:
-        x0, y0, x1, y1 = square(key)
+        x0, y0, x1, y1 = tile_bounds(key)
         low = max(y0, -5.0)
         high = min(y1, 5.0)
         ground = []

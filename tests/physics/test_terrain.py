@@ -14,22 +14,28 @@ from hypothesis import strategies as st
 
 from cosim.core.geometry import Pose
 from cosim.place.street_map import Corner, Port
-from cosim.place.terrain import FALSE_GRADE, ROBOT_GRADE_MAX, WALK_GRADE_MAX, Elevation, Terrain
+from cosim.place.terrain import (
+    IMPLAUSIBLE_GRADE,
+    ROBOT_GRADE_MAX,
+    WALK_GRADE_MAX,
+    Elevation,
+    Terrain,
+)
 from cosim.spec.robot import COURIER
-from physics.ground.tiles import CURB_M, RAMP_SLOPE, build_tile, key_at, kind_of, square
+from physics.ground.tiles import CURB_M, RAMP_SLOPE, build_tile, ground_kind, tile_at, tile_bounds
 from physics.street.street_surface import StreetSurface
 from sumo_nets.net.elevation import (
     Course,
-    Meeting,
+    CourseJunction,
     On,
     clamped,
-    course,
+    kind_at,
+    parse_course,
     steep_ports,
     steep_strips,
-    surveyed,
-    what_lies_there,
+    terrain_of_courses,
 )
-from sumo_nets.net.snapshot import map_as_bytes, thawed
+from sumo_nets.net.snapshot import map_as_bytes, map_from_bytes
 from tests.support.tiny_street import KEYS, no_cracks, plan_areas, tiny_map, triangles
 
 HAND = Terrain(10.0, 20.0, 2.0, np.array([[0, 1, 2], [0, 1, 6]], dtype=np.float32))
@@ -84,7 +90,7 @@ def straight(
     """A course eastwards with elevations at even distances, zeros left away as netconvert does."""
     at = zip(np.linspace(0.0, length_m, len(z)), z, strict=True)
     points = [f"{x:.2f},{y_m:.2f}" + ("" if h == 0.0 else f",{h:.2f}") for x, h in at]
-    return course(edge, " ".join(points), on)
+    return parse_course(edge, " ".join(points), on)
 
 
 def along(terrain: Terrain, length_m: float = 100.0, y_m: float = 0.0) -> np.ndarray:
@@ -96,7 +102,7 @@ def along(terrain: Terrain, length_m: float = 100.0, y_m: float = 0.0) -> np.nda
 def test_points_with_and_without_elevation_mix() -> None:
     """Missing elevations, which are 0 beside 60 m, and a spike are interpolated, and counted."""
     mixed = "0,0,60 12.5,0,61 25,0 37.5,0,0 50,0,64 62.5,0,65 75,0,95 87.5,0,67 100,0,68"
-    terrain, found = surveyed([course("e", mixed)])
+    terrain, found = terrain_of_courses([parse_course("e", mixed)])
     assert terrain is not None and found is not None
     assert (found.points, found.missing, found.clamped, found.dropped) == (9, 3, 0, "")
     assert np.abs(along(terrain) - np.linspace(60.0, 68.0, 101)).max() < 0.6
@@ -104,7 +110,7 @@ def test_points_with_and_without_elevation_mix() -> None:
 
 def test_a_place_at_sea_level_keeps_its_zeros() -> None:
     """A 0 that a street can come down to is one."""
-    terrain, found = surveyed([straight([0, 0, 1, 3, 6, 9])])
+    terrain, found = terrain_of_courses([straight([0, 0, 1, 3, 6, 9])])
     assert terrain is not None and found is not None
     assert found.missing == 0
     assert abs(along(terrain)[0]) < 0.4
@@ -112,7 +118,7 @@ def test_a_place_at_sea_level_keeps_its_zeros() -> None:
 
 def test_the_land_is_level_across_a_street() -> None:
     """To the left and to the right of a rising street the land is as high as on it."""
-    terrain, _ = surveyed([straight([0, 10], y_m=y) for y in (-4.0, 0.0, 4.0)])
+    terrain, _ = terrain_of_courses([straight([0, 10], y_m=y) for y in (-4.0, 0.0, 4.0)])
     assert terrain is not None
     spots = [(x, y) for x in range(15, 86) for y in (-5.0, 0.0, 5.0)]
     rise = terrain.gradient(spots)
@@ -123,7 +129,7 @@ def test_the_land_is_level_across_a_street() -> None:
 def test_steep_streets_are_clamped_and_counted() -> None:
     """A fault of 6 m in the middle of a street becomes a ramp of the steepest grade allowed; its
     ends stay."""
-    terrain, found = surveyed([straight([20.0] * 20 + [26.0] * 20, 400.0)])
+    terrain, found = terrain_of_courses([straight([20.0] * 20 + [26.0] * 20, 400.0)])
     assert terrain is not None and found is not None
     level = along(terrain, 400.0)
     assert np.abs(np.diff(level)).max() < WALK_GRADE_MAX + 0.01
@@ -134,8 +140,8 @@ def test_steep_streets_are_clamped_and_counted() -> None:
 def test_steps_stay_steep_and_leave_the_streets_alone() -> None:
     """Steps of 50 % between two streets do not move them; the strip of the steps is one that no
     robot takes."""
-    up = course("s", "50,0,10 50,20,20", "steps")
-    terrain, found = surveyed([straight([10, 10]), up, straight([20, 20], y_m=20.0)])
+    up = parse_course("s", "50,0,10 50,20,20", "steps")
+    terrain, found = terrain_of_courses([straight([10, 10]), up, straight([20, 20], y_m=20.0)])
     assert terrain is not None and found is not None and found.clamped == 0
     assert along(terrain) == pytest.approx(10.0, abs=0.2) and along(
         terrain, y_m=20.0
@@ -153,7 +159,7 @@ def test_steps_stay_steep_and_leave_the_streets_alone() -> None:
 def test_paths_up_hills_count_as_steps_only_when_steep() -> None:
     """A path of 10 % is a walkway and keeps the bound; one of 30 % is left as it is."""
     for rise_m, moved in ((10.0, False), (30.0, False)):
-        terrain, found = surveyed([straight([0.5, 0.5 + rise_m], on="path")])
+        terrain, found = terrain_of_courses([straight([0.5, 0.5 + rise_m], on="path")])
         assert terrain is not None and found is not None and (found.clamped > 0) == moved
         assert along(terrain)[-5] - along(terrain)[5] == pytest.approx(0.9 * rise_m, rel=0.03)
 
@@ -171,27 +177,26 @@ def test_false_elevations_are_dropped() -> None:
         ([straight([7.0] * 9)], "same everywhere"),
         ([straight([30.0, 31.0] + [0.0] * 7, 20.0)], "only 2 of 9 points"),
     ):
-        terrain, found = surveyed(courses)
+        terrain, found = terrain_of_courses(courses)
         assert terrain is None and found is not None and why in found.dropped
 
 
 def test_a_flat_net_has_no_elevation() -> None:
     """Points without elevation, or with 0 alone, say nothing."""
-    assert surveyed([course("e", "0,0 9,9")]) == (None, None)
-    assert surveyed([straight([0.0, 0.0])]) == (None, None)
-    assert surveyed([]) == (None, None)
+    assert terrain_of_courses([parse_course("e", "0,0 9,9")]) == (None, None)
+    assert terrain_of_courses([straight([0.0, 0.0])]) == (None, None)
+    assert terrain_of_courses([]) == (None, None)
 
 
 def test_bridges_steps_and_paths_are_told_by_type_and_params() -> None:
     """SUMO's type names, and OSM's tags in the params."""
-    assert what_lies_there("highway.secondary_tunnel", {}, False) == "raised"
-    assert what_lies_there("highway.path", {"bridge": "yes"}, True) == "raised"
+    assert kind_at("highway.secondary_tunnel", {}, False) == "raised"
+    assert kind_at("highway.path", {"bridge": "yes"}, True) == "raised"
     assert (
-        what_lies_there("highway.service", {"tunnel": "building_passage", "layer": "0"}, False)
-        == "street"
+        kind_at("highway.service", {"tunnel": "building_passage", "layer": "0"}, False) == "street"
     )
-    assert what_lies_there("highway.steps", {}, True) == "steps"
-    assert what_lies_there("highway.footway", {}, True) == "path"
+    assert kind_at("highway.steps", {}, True) == "steps"
+    assert kind_at("highway.footway", {}, True) == "path"
 
 
 HEIGHTS = st.one_of(
@@ -216,9 +221,11 @@ def test_no_elevations_are_too_bad_to_be_read(
         for i, line in enumerate(lines)
     ]
     meets = (
-        [Meeting(0, tuple((i, i % 2) for i in range(1, len(courses))))] if len(courses) > 1 else []
+        [CourseJunction(0, tuple((i, i % 2) for i in range(1, len(courses))))]
+        if len(courses) > 1
+        else []
     )
-    terrain, found = surveyed(courses, meets)
+    terrain, found = terrain_of_courses(courses, meets)
     assert terrain is None or np.isfinite(terrain.heights).all()
     assert found is None or (terrain is None) == bool(found.dropped)
 
@@ -263,18 +270,20 @@ def test_heights_on_hills_meet_at_tile_borders_and_follow_the_mesh() -> None:
     curb's foot included."""
     left = build_tile(HILLY, (-1, -1))
     right = build_tile(HILLY, (0, -1))
-    border = np.column_stack([np.full(400, square((0, -1))[0]), np.linspace(-40.0, -1e-3, 400)])
+    border = np.column_stack(
+        [np.full(400, tile_bounds((0, -1))[0]), np.linspace(-40.0, -1e-3, 400)]
+    )
     assert np.allclose(left.height(border), right.height(border), atol=1e-9)
     for name, mesh in right.parts.items():
-        if kind_of(name) in ("road", "ramp", "sidewalk"):
+        if ground_kind(name) in ("road", "ramp", "sidewalk"):
             middle = mesh.vertices[mesh.triangles].mean(axis=1)
             assert np.abs(right.height(middle[:, :2]) - middle[:, 2]).max() < 0.02, name
 
 
 def test_ramps_rise_one_in_twelve_over_the_land() -> None:
     """Ahead of a crossing the ground is the land and the ramp's own rise, as on flat ground."""
-    flat = build_tile(tiny_map(), key_at(0.0, 5.0))
-    hilly = build_tile(HILLY, key_at(0.0, 5.0))
+    flat = build_tile(tiny_map(), tile_at(0.0, 5.0))
+    hilly = build_tile(HILLY, tile_at(0.0, 5.0))
     assert HILLY.terrain is not None
     ahead = np.column_stack([np.zeros(60), np.linspace(3.51, 6.4, 60)])
     ramp = hilly.height(ahead) - HILLY.terrain.height(ahead)
@@ -307,14 +316,14 @@ def test_nothing_floats_on_a_hill() -> None:
 def test_a_snapshot_keeps_the_land() -> None:
     """Terrain and elevation come back from a snapshot to the bit; a flat map comes back flat."""
     told = Elevation(1.5, 9.0, 20, 3, 0.01, 4, 0.5, ("a", "b"), (("c", 1),))
-    again = thawed(map_as_bytes(dataclasses.replace(HILLY, elevation=told)))
+    again = map_from_bytes(map_as_bytes(dataclasses.replace(HILLY, elevation=told)))
     assert again.terrain is not None and HILLY.terrain is not None and again.elevation == told
     assert np.array_equal(again.terrain.heights, HILLY.terrain.heights)
     assert again.terrain.heights.dtype == np.float32 and again.terrain.step_m == 2.0
     assert (
         again.steep == {"a", "b"} and Port("c", 1) in again.too_steep and len(again.too_steep) == 5
     )
-    flat = thawed(map_as_bytes(tiny_map()))
+    flat = map_from_bytes(map_as_bytes(tiny_map()))
     assert flat.terrain is None and flat.elevation is None
 
 
@@ -351,4 +360,4 @@ def test_flat_ground_is_what_it_was() -> None:
     pose = Pose(0.5, 4.0, 0.7)
     assert flat.lean(pose, COURIER.drive.span_m) == level.lean(pose, COURIER.drive.span_m)
     assert flat.road([(3.0, 1.0)], [1.0], [(4.0, 2.0)]).tolist() == [[0.0, 0.0, 0.0]]
-    assert FALSE_GRADE > ROBOT_GRADE_MAX > WALK_GRADE_MAX
+    assert IMPLAUSIBLE_GRADE > ROBOT_GRADE_MAX > WALK_GRADE_MAX

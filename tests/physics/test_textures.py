@@ -13,9 +13,15 @@ import pytest
 from cosim.core.errors import SpecError, UsageError
 from physics.ground.materials import PAVINGS
 from physics.ground.tiles import SURFACES
-from physics.textures.facades import BAY_VARIANTS, DOORS, STREETS, WALL_STYLES, facade_layers
+from physics.textures.facades import (
+    BAY_VARIANTS,
+    FRONTS_BY_NAME,
+    STREET_STYLES,
+    WALL_STYLES,
+    facade_layers,
+)
 from physics.textures.ground import GROUND_RECIPES, SURFACE_LAYERS, ground_layers, layer_of
-from physics.textures.layers import Layers, encoded, joined_layers, linear
+from physics.textures.layers import Layers, join_layers, linear_to_srgb, srgb_to_linear
 from physics.textures.walls import prop_layers, wall_layers
 
 STACKS = (ground_layers, wall_layers, prop_layers, facade_layers)
@@ -55,9 +61,9 @@ def test_textures_are_the_same_in_every_process() -> None:
 def test_a_tint_becomes_the_mean_colour() -> None:
     """texture / mean * tint has the tint as its linear mean, for every layer of ground and walls
     without a mask."""
-    tint = linear((0.5, 0.4, 0.3))
+    tint = srgb_to_linear((0.5, 0.4, 0.3))
     for layers in (ground_layers(256), wall_layers(256)):
-        albedo = linear(layers.rgba[..., :3] / 255.0) / layers.mean[:, None, None] * tint
+        albedo = srgb_to_linear(layers.rgba[..., :3] / 255.0) / layers.mean[:, None, None] * tint
         assert np.allclose(albedo.mean(axis=(1, 2)), tint, atol=2e-3)
 
 
@@ -69,12 +75,16 @@ def test_every_name_in_the_tables_is_a_layer() -> None:
     walls, facades = set(wall_layers(256).names), set(facade_layers(256).names)
     for style in WALL_STYLES.values():
         assert {*style.walls, *style.roofs} <= walls
-        fronts = {bay for name in style.fronts for bay in (DOORS[name].between, DOORS[name].door)}
+        fronts = {
+            bay
+            for name in style.fronts
+            for bay in (FRONTS_BY_NAME[name].between, FRONTS_BY_NAME[name].door)
+        }
         assert {
             f"{name}-{k}" for name in (*style.uppers, *fronts) for k in range(BAY_VARIANTS)
         } <= facades
-    assert all(1 <= front.every <= 15 for front in DOORS.values())
-    assert {name for names in STREETS.values() for name in names} <= set(WALL_STYLES)
+    assert all(1 <= front.every <= 15 for front in FRONTS_BY_NAME.values())
+    assert {name for names in STREET_STYLES.values() for name in names} <= set(WALL_STYLES)
     for surface in (*SURFACES, *PAVINGS):
         assert (
             layer_of(surface)
@@ -88,8 +98,8 @@ def test_every_name_in_the_tables_is_a_layer() -> None:
 
 def test_colours_are_decoded_as_the_standard_says() -> None:
     """sRGB 0.5 is 0.214 linear, and encoding undoes decoding."""
-    assert linear((0.0, 0.5, 1.0)) == pytest.approx([0.0, 0.21404, 1.0], abs=1e-4)
-    assert encoded(linear(np.linspace(0.0, 1.0, 11))) == pytest.approx(
+    assert srgb_to_linear((0.0, 0.5, 1.0)) == pytest.approx([0.0, 0.21404, 1.0], abs=1e-4)
+    assert linear_to_srgb(srgb_to_linear(np.linspace(0.0, 1.0, 11))) == pytest.approx(
         np.linspace(0.0, 1.0, 11), abs=1e-5
     )
 
@@ -103,6 +113,6 @@ def test_wrong_sizes_and_names_are_told() -> None:
     ):
         ground_layers(256).index("lava")
     with pytest.raises(UsageError, match="one size"):
-        joined_layers(ground_layers(256), wall_layers(512))
-    whole = joined_layers(ground_layers(256), wall_layers(256))
+        join_layers(ground_layers(256), wall_layers(512))
+    whole = join_layers(ground_layers(256), wall_layers(256))
     assert len(whole) == len(ground_layers(256)) + len(wall_layers(256))

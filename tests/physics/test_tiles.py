@@ -12,11 +12,11 @@ from physics.ground.tiles import (
     Key,
     Tile,
     build_tile,
-    key_at,
-    keys_within,
-    square,
+    tile_at,
+    tile_bounds,
+    tiles_within,
 )
-from physics.street.buildings import Frontage
+from physics.street.buildings import BuildingRows
 from tests.support.tiny_street import KEYS, no_cracks, plan_areas, tiny_map, triangles
 
 MAP = tiny_map()
@@ -47,7 +47,7 @@ def test_heights_meet_at_tile_borders(tiles: dict[Key, Tile]) -> None:
     """Two tiles agree on the height of points on their common border, on the ramps too."""
     left = tiles[(-1, -1)]
     right = tiles[(0, -1)]
-    x = square((0, -1))[0]
+    x = tile_bounds((0, -1))[0]
     border = np.column_stack([np.full(400, x), np.linspace(-20.0, -1e-3, 400)])
     assert np.allclose(left.height(border), right.height(border), atol=1e-9)
 
@@ -55,7 +55,7 @@ def test_heights_meet_at_tile_borders(tiles: dict[Key, Tile]) -> None:
 def test_the_curb_ramp_rises_one_in_twelve() -> None:
     """From the crossing's end the corner climbs 1:12 to the curb's height; the flares follow the
     same rule."""
-    tile = build_tile(MAP, key_at(0.0, 5.0))
+    tile = build_tile(MAP, tile_at(0.0, 5.0))
     ahead = tile.height([[0.0, 3.5 + d] for d in (0.001, 0.36, 0.72, 1.44, 2.0)])
     assert np.allclose(ahead, [0.0, 0.03, 0.06, 0.12, 0.12], atol=2e-4)
     mesh = tile.parts["ramp"]
@@ -93,8 +93,8 @@ def test_tiles_do_not_depend_on_the_order(tiles: dict[Key, Tile]) -> None:
 def test_buildings_line_the_street_and_keep_off_it() -> None:
     """Both sides have buildings, none over walkable ground or road, and they begin at the frontage
     distance."""
-    frontage = Frontage(MAP, seed=4)
-    built = [b for key in keys_within(0.0, 0.0, 100.0) for b in frontage.in_tile(key)]
+    frontage = BuildingRows(MAP, seed=4)
+    built = [b for key in tiles_within(0.0, 0.0, 100.0) for b in frontage.in_tile(key)]
     street = shapely.box(-80, -8, 80, 6.5)
     assert len(built) > 12
     assert {b.id.split(":")[1] for b in built} == {"nw", "ne", "sw", "se"}
@@ -105,7 +105,7 @@ def test_buildings_line_the_street_and_keep_off_it() -> None:
 
 def test_buildings_do_not_depend_on_the_order_but_on_the_seed() -> None:
     """Tiles asked for in any order hold the same buildings; another seed gives others."""
-    one, two, other = Frontage(MAP, 4), Frontage(MAP, 4), Frontage(MAP, 5)
+    one, two, other = BuildingRows(MAP, 4), BuildingRows(MAP, 4), BuildingRows(MAP, 5)
     forward = {key: one.in_tile(key) for key in KEYS}
     backward = {key: two.in_tile(key) for key in reversed(KEYS)}
     assert forward == backward

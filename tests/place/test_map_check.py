@@ -14,7 +14,7 @@ from cosim.core.errors import MapError
 from cosim.place.map_check import NetFacts, check_map
 from cosim.place.street_map import Corner, Lane, Port, StreetMap, Strip
 from cosim.place.terrain import Elevation
-from sumo_nets.net.net_facts import facts_of, walks_of
+from sumo_nets.net.net_facts import crossing_signals, facts_of
 from sumo_nets.net.net_file import read_net
 
 
@@ -179,7 +179,7 @@ def test_facts_of_a_net() -> None:
     assert facts.levels == ("b",) and facts.levels_km == pytest.approx(0.3)
     assert (facts.never_green, facts.always_green) == ((":J_c0",), (":J_c1",))
     assert (facts.misfits, facts.no_program, facts.signals) == ((":J_c2",), ("rails",), 1)
-    assert walks_of(net()).never == [":J_c0"]
+    assert crossing_signals(net()).never == [":J_c0"]
 
 
 def test_notes_say_what_is_not_used() -> None:

@@ -26,19 +26,19 @@ from cosim.policies.follow.networks import (
     weights_in_words,
 )
 from cosim.policies.follow.policy import (
+    ARC_LENGTH_M,
     GROUND_CELL_M,
-    LOOKS_M,
     Ground,
     WaitForPeople,
     best_arc,
-    boxes_of,
     command_along,
+    decode_boxes,
     turn_aside,
     walkable_pixels,
 )
 from cosim.policies.load import load_policy
 from cosim.policies.onnx.graph import Graph
-from cosim.policies.onnx.policy import in_grey
+from cosim.policies.onnx.policy import example_observation
 from cosim.spec.camera import CameraSpec
 from cosim.spec.robot import COURIER, ROBOTS, Robot
 from tests.support.graphs import tiny_graph
@@ -102,7 +102,7 @@ def test_follow_turns_back_to_the_sidewalk_and_a_mirrored_street_mirrors_its_tur
     driver = load_policy("follow")
     assert len(driver.source_hash) == 16 and str(weights) in weights_in_words()
     policy = driver.policy
-    seen = replace(in_grey(policy.manifest), goal=None, camera=CAMERA)
+    seen = replace(example_observation(policy.manifest), goal=None, camera=CAMERA)
 
     def turn(street: NDArray[np.uint8]) -> float:
         policy.reset("street", 0)
@@ -174,7 +174,7 @@ def test_boxes_are_where_the_network_says() -> None:
     told[row, :6] = 0.5, 0.25, np.log(2.0), np.log(4.0), 0.9, 0.9
     told[row + 1, :6] = -0.5, 0.25, np.log(2.0), np.log(4.0), 0.9, 0.6
     told[7, :6] = 0.0, 0.0, 0.0, 0.0, 0.9, 0.2
-    (box,) = boxes_of(told, scale=416 / 512)
+    (box,) = decode_boxes(told, scale=416 / 512)
     middle = np.array([5.5, 10.25]) * 16
     size = np.array([32.0, 64.0])
     assert np.allclose(
@@ -187,7 +187,9 @@ def test_feet_are_where_they_stand() -> None:
     horizon is left out."""
     x, y, depth = CAMERA.matrix @ (np.linalg.inv(CAMERA.on_robot) @ [4.0, 1.0, 0.0, 1.0])[:3]
     u, v = x / depth, y / depth
-    feet = GROUND.feet_of(np.array([[u - 10, v - 60, u + 10, v], [200.0, 10.0, 220.0, 60.0]]))
+    feet = GROUND.ground_positions(
+        np.array([[u - 10, v - 60, u + 10, v], [200.0, 10.0, 220.0, 60.0]])
+    )
     assert np.allclose(feet, [[4.0, 1.0]], atol=0.01)
 
 
@@ -218,7 +220,7 @@ def test_arcs_keep_to_the_middle_and_lead_to_the_goal(robot: Robot) -> None:
     wall[:, 46:] = False  # from 0.6 m to the left
     away = best_arc(wall, NOBODY, robot, None)
     back = best_arc(wall[:, ::-1], NOBODY, robot, None)
-    assert away.curvature < -0.01 and away.free_m == LOOKS_M
+    assert away.curvature < -0.01 and away.free_m == ARC_LENGTH_M
     assert back.curvature == pytest.approx(-away.curvature)
 
 
@@ -226,7 +228,7 @@ def test_it_goes_round_a_person_with_room_and_stops_before_one_without() -> None
     """The policy passes a person on open ground and stops before one in a lane of 1.4 m."""
     person = np.array([[2.5, 0.0]])
     round_him = best_arc(OPEN, person, COURIER, None)
-    assert abs(round_him.curvature) > 0.1 and round_him.free_m == LOOKS_M
+    assert abs(round_him.curvature) > 0.1 and round_him.free_m == ARC_LENGTH_M
     lane = np.zeros((80, 80), np.bool_)
     lane[:, 33:47] = True
     assert command_along(best_arc(lane, person, COURIER, None), COURIER).v_mps > 0.0

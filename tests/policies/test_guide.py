@@ -14,10 +14,10 @@ from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
 from cosim.core.geometry import Floats, Polyline, Pose
-from cosim.core.state import NO_VEHICLES, NOBODY, Command, People, RobotState
+from cosim.core.state import NO_PEOPLE, NO_VEHICLES, Command, People, RobotState
 from cosim.episode.interfaces import Observation, Privileged
 from cosim.policies.privileged.orca import Orca
-from cosim.policies.privileged.route_planner import Clearance, Guide
+from cosim.policies.privileged.route_planner import DistanceField, RoutePlanner
 from cosim.spec.robot import COURIER
 
 GAP_M = COURIER.width_m + 0.5
@@ -78,7 +78,7 @@ def passable(walk: Polygon, solid: BaseGeometry, route: Polyline) -> bool:
 
 
 def driven(
-    course: Course, pose: Pose, jump: tuple[float, Pose] | None = None, people: People = NOBODY
+    course: Course, pose: Pose, jump: tuple[float, Pose] | None = None, people: People = NO_PEOPLE
 ) -> Floats:
     """(N, 3) x, y, heading of the oracle every 0.05 s until the goal, or for 60 s. jump: it is put
     elsewhere once, when it has come so far on the route."""
@@ -135,7 +135,7 @@ def test_clearance_is_the_distance_to_the_edge() -> None:
     """To 3 cm beside what is straight, positive on free ground alone, and never positive far from
     the route."""
     course = straight(box(8.0, -0.5, 9.0, 0.5))
-    clearance = Clearance(course.free, course.route)
+    clearance = DistanceField(course.free, course.route)
     points = np.random.default_rng(0).uniform((0.5, -1.4), (19.5, 1.4), (2000, 2))
     exact = shapely.distance(course.free.boundary, shapely.points(points))
     exact = np.where(shapely.contains_xy(course.free, *points.T), exact, -exact)
@@ -150,7 +150,7 @@ def test_the_line_keeps_to_the_route_where_nothing_stands_and_goes_round_what_do
     bare = straight()
     blocked = straight(box(9.0, -1.5, 10.0, 0.45))
     lines = [
-        Guide(Clearance(c.free, c.route), c.route).from_here(c.route.points[0])
+        RoutePlanner(DistanceField(c.free, c.route), c.route).path_from(c.route.points[0])
         for c in (bare, blocked)
     ]
     assert np.abs(lines[0].points[:, 1]).max() < 0.1

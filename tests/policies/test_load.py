@@ -14,7 +14,7 @@ from cosim.core.errors import UsageError
 from cosim.episode.policy_caller import PolicyCall
 from cosim.policies import POLICIES
 from cosim.policies.load import load_policy
-from cosim.policies.user_module import importable
+from cosim.policies.user_module import importable_name
 
 GOOD = """
 from cosim.spec.camera import CameraSpec
@@ -215,7 +215,7 @@ def test_a_policy_is_named_by_its_file_or_its_module(
     work."""
     lay_out(desk)
     spelled = spelled.format(desk=desk)
-    assert importable(spelled) == imported and importable(imported) == imported
+    assert importable_name(spelled) == imported and importable_name(imported) == imported
     by_file, by_module = load_policy(spelled), load_policy(imported)
     assert (
         type(by_file.policy) is type(by_module.policy)
@@ -233,7 +233,7 @@ def test_a_name_that_is_no_file_is_left_as_it_is() -> None:
         "my_robot.policy:Mine",
         "",
     ):
-        assert importable(name) == name
+        assert importable_name(name) == name
 
 
 MISNAMED = {

@@ -14,20 +14,20 @@ from shapely.geometry import box
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import NO_VEHICLES, Doing, People, PersonKind, RobotState, Signal, Vehicles
 from cosim.episode.interfaces import Observation, Privileged
-from cosim.episode.policy_caller import Driver
+from cosim.episode.policy_caller import PolicyCaller
 from cosim.policies.privileged.orca import (
     STOP_BEFORE_M,
-    Here,
     Orca,
-    car_nearness,
-    lane_past,
-    pressed_limit,
-    stop_limit,
+    PathState,
+    best_lane_past,
+    crowd_limit,
+    gesture_limit,
+    vehicle_violation,
 )
 from cosim.policies.privileged.people_prediction import Yielding, gaps_to_people
-from cosim.policies.privileged.rollout import STEP_S, BodyDisks, Plans, Way, foresee
+from cosim.policies.privileged.rollout import STEP_S, BodyDisks, Plans, SampledPath, roll_out
 from cosim.policies.privileged.route import crossing_limit
-from cosim.policies.privileged.route_planner import Clearance
+from cosim.policies.privileged.route_planner import DistanceField
 from cosim.policies.privileged.standing_groups import distances, groups, lines
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City, CrowdSpec
@@ -77,8 +77,8 @@ def test_a_group_is_passed_round_on_the_side_with_room() -> None:
     right of both."""
     crowd = people((11.0, 1.2, 0.0, 0.0, "talk"), (11.0, -0.3, 0.0, 0.0, "talk"))
     scene = known(crowd)
-    here = Here(Way(ROUTE), scene.route_s_m, Clearance(scene.free, ROUTE))
-    lane_m = lane_past(scene, BodyDisks.of(COURIER), here, lines(crowd), 0.0)
+    here = PathState(SampledPath(ROUTE), scene.route_s_m, DistanceField(scene.free, ROUTE))
+    lane_m = best_lane_past(scene, BodyDisks.of(COURIER), here, lines(crowd), 0.0)
     assert lane_m <= -0.3 - 0.3 - 0.33 - 0.1
 
 
@@ -88,10 +88,10 @@ def test_it_comes_to_rest_before_a_hand_and_stays() -> None:
         people((12.0, 0.2, math.pi, 0.0, "stop")),
         people((12.0, 0.2, math.pi, 0.0, "stand")),
     )
-    limits = [stop_limit(known(hand, x_m)) for x_m in (3.0, 6.0, 9.0, 9.9, 10.5)]
+    limits = [gesture_limit(known(hand, x_m)) for x_m in (3.0, 6.0, 9.0, 9.9, 10.5)]
     assert limits == sorted(limits, reverse=True) and limits[-1] == 0.0 and limits[0] > 2.0
-    assert stop_limit(known(nobody, 9.9)) == math.inf
-    driver = Driver(Orca())
+    assert gesture_limit(known(nobody, 9.9)) == math.inf
+    driver = PolicyCaller(Orca())
     x_m = 3.0
     v_mps = 0.0
     for tick in range(300):
@@ -107,7 +107,7 @@ def test_it_comes_to_rest_before_a_hand_and_stays() -> None:
 def test_it_does_not_stand_long_at_a_green_that_is_too_short() -> None:
     """14 m of crossing and 13 s of green left: it stands before it for 8 s at most when the signal
     turns red."""
-    driver = Driver(Orca())
+    driver = PolicyCaller(Orca())
     x_m = 3.0
     v_mps = 1.4
     stood_s = 0.0
@@ -132,7 +132,7 @@ def test_it_comes_to_rest_before_whoever_of_the_crowd_is_right_ahead() -> None:
         here, people=dataclasses.replace(here.people, kind=np.full(1, PersonKind.CROWD.value))
     )
     limits = [
-        pressed_limit(replace(crowd, robot=RobotState(Pose(x_m, 0.0, 0.0), 1.0)), COURIER)
+        crowd_limit(replace(crowd, robot=RobotState(Pose(x_m, 0.0, 0.0), 1.0)), COURIER)
         for x_m in (3.0, 4.5, 5.1, 5.3)
     ]
     assert (
@@ -142,10 +142,10 @@ def test_it_comes_to_rest_before_whoever_of_the_crowd_is_right_ahead() -> None:
         and limits[3] > 0.1
     )
     assert (
-        pressed_limit(replace(crowd, robot=RobotState(Pose(6.0, -0.7, 0.0), 1.0)), COURIER)
+        crowd_limit(replace(crowd, robot=RobotState(Pose(6.0, -0.7, 0.0), 1.0)), COURIER)
         == math.inf
     )
-    assert pressed_limit(here, COURIER) == math.inf
+    assert crowd_limit(here, COURIER) == math.inf
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,7 @@ def test_foresight_turns_no_faster_than_the_robot() -> None:
         np.full(3, 0.9),
         np.array([0.0, 0.0, 0.6]),
     )
-    ahead = foresee(Way(ROUTE), plans, COURIER, Pose(5.0, 0.0, 0.0), 5.0, (1.4, 0.0))
+    ahead = roll_out(SampledPath(ROUTE), plans, COURIER, Pose(5.0, 0.0, 0.0), 5.0, (1.4, 0.0))
     turns = np.abs(np.diff(ahead.pose[:, 2], axis=0))
     moved = np.hypot(*np.moveaxis(np.diff(ahead.pose[:, :2], axis=0), 1, 0))
     assert turns.max() <= 0.65 * STEP_S + 1e-9 and moved.max() <= 1.4 * STEP_S + 1e-9
@@ -184,11 +184,11 @@ def test_a_car_that_brakes_counts_where_it_comes_to_rest_and_never_more_than_hal
     """At 6 m/s it needs 6 m to stop: one 12 m off does not matter, one 5 m off stands in every
     plan's way alike."""
     plans = Plans(np.array([0.0, 1.0]), np.array([1.4, 1.4]), np.full(2, 0.9), np.zeros(2))
-    ahead = foresee(Way(ROUTE), plans, COURIER, Pose(5.0, 0.0, 0.0), 5.0, (1.4, 0.0))
+    ahead = roll_out(SampledPath(ROUTE), plans, COURIER, Pose(5.0, 0.0, 0.0), 5.0, (1.4, 0.0))
     for far_m, nearness in ((12.0, 0.0), (5.0, 0.5)):
         cars = Vehicles.of(("v0",), [(7.0, far_m)], [-math.pi / 2], [6.0], [(4.4, 1.8)])
         scene = dataclasses.replace(known(people()), vehicles=cars, crossings=(("c", 4.0, 12.0),))
-        assert car_nearness(scene, BodyDisks.of(COURIER), ahead)[0] == pytest.approx(nearness)
+        assert vehicle_violation(scene, BodyDisks.of(COURIER), ahead)[0] == pytest.approx(nearness)
 
 
 def test_it_stands_for_who_comes_straight_at_it_until_they_are_past() -> None:
@@ -214,7 +214,7 @@ def test_who_is_near_may_stay_and_who_waits_does_not_turn() -> None:
     """Somebody 1.1 m ahead who is about to leave sideways counts where it is, too; 4 m off it does
     not."""
     plans = Plans(np.array([0.0, 1.5]), np.array([1.4, 0.0]), np.full(2, 0.9), np.zeros(2))
-    ahead = foresee(Way(ROUTE), plans, COURIER, Pose(5.0, 0.0, 0.0), 5.0, (1.4, 0.0))
+    ahead = roll_out(SampledPath(ROUTE), plans, COURIER, Pose(5.0, 0.0, 0.0), 5.0, (1.4, 0.0))
     assert np.ptp(ahead.pose[:, 2, 1]) == 0.0
     gaps = [
         gaps_to_people(

@@ -16,7 +16,7 @@ from cosim.core.errors import UsageError
 from cosim.core.state import Command
 from cosim.policies.load import bundle_in_words, load_policy, shipped_bundles
 from cosim.policies.onnx.manifest import read_bundle_manifest
-from cosim.policies.onnx.policy import OnnxPolicy, in_grey
+from cosim.policies.onnx.policy import OnnxPolicy, example_observation
 from cosim.spec.goal import Instruction
 
 PICTURES = Path(__file__).parent / "pictures"
@@ -79,7 +79,7 @@ def _picture(name: str) -> NDArray[np.uint8]:
 def test_dronet_turns_back_to_the_way_and_a_mirrored_street_mirrors_its_turn(weights: Path) -> None:
     """Of a robot that has turned 30 degrees away from a sidewalk with nobody on it."""
     policy = OnnxPolicy(shipped_bundles()["dronet"])
-    seen = in_grey(policy.manifest)
+    seen = example_observation(policy.manifest)
 
     def command(picture: NDArray[np.uint8]) -> Command:
         policy.reset("street", 0)
@@ -101,7 +101,7 @@ def test_openbot_turns_to_where_the_instruction_says(weights: Path) -> None:
     """Told to turn left it turns more to the left than told nothing, and to the right the other way
     round."""
     policy = OnnxPolicy(shipped_bundles()["openbot"])
-    seen = in_grey(policy.manifest)
+    seen = example_observation(policy.manifest)
 
     def turn(text: str) -> float:
         answer = policy.act(replace(seen, goal=Instruction(text)))

@@ -10,16 +10,16 @@ import pytest
 from shapely.geometry import box
 
 from cosim.core.geometry import Polyline, Pose
-from cosim.core.state import NO_VEHICLES, NOBODY, People, RobotState
+from cosim.core.state import NO_PEOPLE, NO_VEHICLES, People, RobotState
 from cosim.episode.interfaces import Privileged
 from cosim.policies.privileged.social_force import (
     DESIRED_MPS,
     RELAXATION_S,
-    bodies_m,
+    contact_distance_m,
+    edge_push,
     force,
-    from_edge,
-    from_people,
-    seen,
+    people_pushes,
+    weighted_pushes,
 )
 from cosim.spec.robot import COURIER
 
@@ -49,8 +49,8 @@ def test_a_push_is_minus_the_slope_of_the_potential(d: tuple[float, float]) -> N
         / (2 * h)
         for axis in (np.array([1.0, 0.0]), np.array([0.0, 1.0]))
     ]
-    here = person.xy[0] + at * (1.0 + bodies_m(COURIER) / math.hypot(*at))
-    assert from_people(person, COURIER, here, velocity)[0] == pytest.approx(
+    here = person.xy[0] + at * (1.0 + contact_distance_m(COURIER) / math.hypot(*at))
+    assert people_pushes(person, COURIER, here, velocity)[0] == pytest.approx(
         -np.array(slope), rel=1e-3, abs=1e-6
     )
 
@@ -58,12 +58,12 @@ def test_a_push_is_minus_the_slope_of_the_potential(d: tuple[float, float]) -> N
 def test_what_happens_behind_hardly_counts_and_pushes_lean_to_the_right() -> None:
     """A push from ahead is felt whole, one from behind by 6 %; somebody straight ahead pushes a
     little to the right."""
-    ahead, behind = seen(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([1.0, 0.0]))
+    ahead, behind = weighted_pushes(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([1.0, 0.0]))
     assert np.hypot(*ahead) == pytest.approx(1.0) and np.hypot(*behind) == pytest.approx(0.06)
     assert ahead[0] < -0.9 and -0.3 < ahead[1] < -0.2
 
 
-def scene(y_m: float, others: People = NOBODY) -> Privileged:
+def scene(y_m: float, others: People = NO_PEOPLE) -> Privileged:
     """A robot at rest beside a route along the x axis, on a walkway free 1.5 m to either side of
     it."""
     robot = RobotState(Pose(5.0, y_m, 0.0), 0.0)
@@ -78,8 +78,8 @@ def test_alone_it_is_pulled_along_its_route_and_pushed_off_edges() -> None:
         DESIRED_MPS / RELAXATION_S, rel=1e-3
     )
     near, beyond = (
-        from_edge(scene(1.3), COURIER, np.array([5.0, 1.3])),
-        from_edge(scene(1.6), COURIER, np.array([5.0, 1.6])),
+        edge_push(scene(1.3), COURIER, np.array([5.0, 1.3])),
+        edge_push(scene(1.6), COURIER, np.array([5.0, 1.6])),
     )
     assert near[0] == pytest.approx(0.0, abs=1e-9) and near[1] < 0.0
     assert beyond[1] < near[1]
@@ -89,6 +89,6 @@ def test_somebody_who_comes_from_ahead_on_the_left_pushes_back_and_to_the_right(
     """A walker 2 m ahead, 0.3 m left, coming closer."""
     alone, met = (
         force(scene(0.0, people), COURIER, np.zeros(2))
-        for people in (NOBODY, walker(7.0, 0.3, math.pi, 1.3))
+        for people in (NO_PEOPLE, walker(7.0, 0.3, math.pi, 1.3))
     )
     assert met[0] < alone[0] and met[1] < alone[1] - 0.1

@@ -14,10 +14,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from cosim.report.page.choice import most_telling, shown_of
-from cosim.report.page.page import Maps, colours_of, counts_of, page_of
+from cosim.report.page.choice import choose_failures, showable_failures
+from cosim.report.page.page import Maps, colours_of, episode_counts, render_page
 from cosim.report.page.paper import LONG_OF_PAPER, REACTIVE_OF_PAPER, UNIT_OF_PAPER
-from cosim.report.page.plots import exposure_of, near_of, plots_of
+from cosim.report.page.plots import exposure_of, people_nearby, plots_of
 from cosim.report.page.runs import ReportedRun, read_runs
 from cosim.report.page.scene import Entry, PlacePicture, Spot
 from cosim.report.page.three_tables import tables_of, warnings_of
@@ -36,8 +36,8 @@ HOSTILE = (
 def page(*folders: Path, entries: tuple[Entry, ...] = (), maps: Maps | None = None) -> str:
     """The page of runs, with nothing shown again."""
     runs = read_runs(folders)
-    maps = maps or Maps([], {}, dict(counts_of(runs)))
-    return page_of(runs, plots_of(runs, colours_of(runs)), entries, maps, "").decode()
+    maps = maps or Maps([], {}, dict(episode_counts(runs)))
+    return render_page(runs, plots_of(runs, colours_of(runs)), entries, maps, "").decode()
 
 
 class Elements(HTMLParser):
@@ -71,7 +71,7 @@ def test_a_cell_of_ours_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
     (row,) = ours.rows
     assert row.name == "mine" and row.cells[0] == (mean, low, high, 5) and mean == 0.6
     assert ours.paper is UNIT_OF_PAPER
-    text = page_of([told], [], [], Maps([], {}, {}), "").decode()
+    text = render_page([told], [], [], Maps([], {}, {}), "").decode()
     assert f">{mean:.2f}<small>{low:.2f}&ndash;{high:.2f}</small>" in text
     assert text.index("models, in another engine") < text.index("OpenPilot")
     assert text.count('class="paper"') == len(UNIT_OF_PAPER)
@@ -108,10 +108,10 @@ def test_the_gallery_shows_every_kind_and_cause_and_no_more_than_asked_for(tmp_p
     kinds = [("straight", "curve", "crosswalk")[i % 3] for i in range(38)]
     ways = [short_way(f"s-{i:03d}", structure=kind) for i, kind in enumerate(kinds)]
     runs = read_runs([run_of(tmp_path / "run", [HIT] * 38, "mine", ways)])
-    candidates = shown_of(runs)
-    picked = most_telling(candidates, 3).picks
+    candidates = showable_failures(runs)
+    picked = choose_failures(candidates, 3).picks
     assert len(candidates) == 38 and {kinds[int(one.scenario[2:])] for one in picked} == {*kinds}
-    picked, limit = most_telling(candidates, 48)
+    picked, limit = choose_failures(candidates, 48)
     assert (
         len(picked) == 36
         and len({one.scenario for one in picked}) == 36
@@ -127,7 +127,7 @@ def test_a_failure_counts_where_so_many_people_were_near() -> None:
     assert log is not None
     seen = np.array([0, 20, 40, 60, 60])
     xy = np.column_stack([log.pose[seen, 0] + [50.0, 50.0, 50.0, 3.0, -3.0], np.zeros(5)])
-    near = near_of(log.pose, seen, xy)
+    near = people_nearby(log.pose, seen, xy)
     assert near[59] == 0.0 and near[60] == near[79] == 2.0
     record = msgspec.structs.replace(
         record, failures=(failure_at(log, 70), failure_at(log, 75, "freezing"))
@@ -216,7 +216,7 @@ def test_runs_of_other_scenarios_of_a_suite_are_told_apart(tmp_path: Path) -> No
         "other", whole._replace(spec=spec, records=dict([*whole.records.items()][:2]))
     )
     assert warnings_of([first, part]).mixed == (("s", "one 3, other 2"),)
-    text = page_of([first, part], [], [], Maps([], {}, {}), "").decode()
+    text = render_page([first, part], [], [], Maps([], {}, {}), "").decode()
     assert "not all runs are of the same scenarios (one 3, other 2)" in text
 
 

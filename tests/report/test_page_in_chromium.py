@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from cosim.cli import progress
-from cosim.report.page.page import Maps, colours_of, counts_of, page_of
+from cosim.report.page.page import Maps, colours_of, episode_counts, render_page
 from cosim.report.page.plots import plots_of
 from cosim.report.page.reasons import CAUSES
 from cosim.report.page.runs import read_runs
@@ -222,14 +222,14 @@ def crowded(tmp_path_factory: pytest.TempPathFactory) -> Path:
                 words=f"way-{k} ({name}), 12.3 s: drove into <a wall>",
             )
         ]
-        for place in counts_of(runs)
+        for place in episode_counts(runs)
         for k, name in enumerate(names)
     }
     pictures = [PlacePicture(place=one, image=PIXEL, bounds=(0.0, 0.0, 50.0, 9.0)) for one in spots]
-    maps = Maps(pictures, spots, dict(counts_of(runs)))
+    maps = Maps(pictures, spots, dict(episode_counts(runs)))
     path = folder / "crowded.html"
     path.write_bytes(
-        page_of(runs, plots_of(runs, colours_of(runs)), [], maps, "nothing was shown again")
+        render_page(runs, plots_of(runs, colours_of(runs)), [], maps, "nothing was shown again")
     )
     return path
 

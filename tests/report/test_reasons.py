@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from cosim.report.page.reasons import Mishap, Other, cause_of, mishaps_of, reason_of
+from cosim.report.page.reasons import MetBody, Mishap, cause_of, mishaps_of, reason_of
 from cosim.results.record import Record, TriggeredEvent
 from cosim.results.referee import Failure
 from cosim.spec.events import Event
@@ -20,7 +20,7 @@ WAY = short_way("s-000", events=(EVENT,), structure="lateral")
 
 
 def told(
-    failure: Failure, other: Other | None = None, scenario: Scenario = WAY, **fields: object
+    failure: Failure, other: MetBody | None = None, scenario: Scenario = WAY, **fields: object
 ) -> str:
     """The reason of an episode that this failure ended."""
     record, log = episode_of(scenario, "h", HIT)
@@ -42,54 +42,54 @@ def car(speed_mps: float = 1.2) -> Failure:
     [
         (
             person(),
-            Other(0.6, 0.4, 0.0, -1.2),
+            MetBody(0.6, 0.4, 0.0, -1.2),
             "drove into a person who came from the left at 1.2 m/s",
         ),
         (
             person(),
-            Other(0.6, -0.4, 0.0, 0.8),
+            MetBody(0.6, -0.4, 0.0, 0.8),
             "drove into a person who came from the right at 0.8 m/s",
         ),
         (
             person("shared"),
-            Other(0.7, 0.0, -1.4, 0.1),
+            MetBody(0.7, 0.0, -1.4, 0.1),
             "collided with a person who came from the front at 1.4 m/s",
         ),
         (
             person(),
-            Other(0.7, 0.0, 0.6, 0.0),
+            MetBody(0.7, 0.0, 0.6, 0.0),
             "drove into a person who went ahead of it at 0.6 m/s",
         ),
         (
             person(),
-            Other(-0.7, 0.0, 1.6, 0.0),
+            MetBody(-0.7, 0.0, 1.6, 0.0),
             "collided with a person who came from behind at 1.6 m/s",
         ),
-        (person(), Other(0.6, 0.1, 0.0, 0.0), "drove into a person who stood ahead, at 1.2 m/s"),
+        (person(), MetBody(0.6, 0.1, 0.0, 0.0), "drove into a person who stood ahead, at 1.2 m/s"),
         (
             person(speed_mps=0.0),
-            Other(0.0, 0.7, 0.0, -1.0),
+            MetBody(0.0, 0.7, 0.0, -1.0),
             "was hit by a person who came from the left at 1.0 m/s",
         ),
         (
             person(speed_mps=0.0),
-            Other(0.0, 0.7, 0.0, 0.1),
+            MetBody(0.0, 0.7, 0.0, 0.1),
             "touched a person who stood to the left, both at rest",
         ),
         (
             person(speed_mps=0.0),
-            Other(0.6, 0.0, 0.5, 0.0),
+            MetBody(0.6, 0.0, 0.5, 0.0),
             "touched a person who went ahead of it at 0.5 m/s",
         ),
         (
             car(),
-            Other(1.5, 0.0, 0.0, 5.0),
+            MetBody(1.5, 0.0, 0.0, 5.0),
             "collided with a vehicle that came from the right at 5.0 m/s",
         ),
-        (car(), Other(1.5, 0.0, 0.0, 0.0), "drove into a vehicle that stood ahead, at 1.2 m/s"),
+        (car(), MetBody(1.5, 0.0, 0.0, 0.0), "drove into a vehicle that stood ahead, at 1.2 m/s"),
         (
             car(0.0),
-            Other(0.0, 2.0, 0.0, -5.0),
+            MetBody(0.0, 2.0, 0.0, -5.0),
             "was hit by a vehicle that came from the left at 5.0 m/s",
         ),
         (car(), None, "ran into a vehicle at 1.2 m/s"),
@@ -113,7 +113,7 @@ def car(speed_mps: float = 1.2) -> Failure:
     ],
 )
 def test_a_collision_tells_from_where_and_how_fast_the_other_came(
-    failure: Failure, other: Other | None, words: str
+    failure: Failure, other: MetBody | None, words: str
 ) -> None:
     """Sides are the robot's, its left is y > 0; who does not move stood; who is slower ahead went
     ahead."""
@@ -128,10 +128,10 @@ def test_a_collision_with_who_is_of_an_event_tells_when_it_began() -> None:
             id="e0", kind="lateral", passed=False, triggered_at_s=0.9, trigger_distance_m=4.0
         ),
     )
-    words = told(person(), Other(0.6, 0.4, 0.0, -1.2), events=events)
+    words = told(person(), MetBody(0.6, 0.4, 0.0, -1.2), events=events)
     assert words == "drove into a person who came from the left at 1.2 m/s, 3.1 s after the trigger"
     waiting = (TriggeredEvent(id="e0", kind="lateral", passed=False),)
-    assert told(person(), Other(0.6, 0.4, 0.0, -1.2), events=waiting).endswith(
+    assert told(person(), MetBody(0.6, 0.4, 0.0, -1.2), events=waiting).endswith(
         ", before its event began"
     )
 

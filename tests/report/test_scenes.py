@@ -11,7 +11,7 @@ import pytest
 from cosim.core.errors import RunError, UsageError
 from cosim.report.page.reasons import mishaps_of
 from physics.cameras.camera_base import WorldCamera
-from scenarios.episodes.replay import recorded, replaying
+from scenarios.episodes.replay import load_recorded, replay_episode
 from scenarios.tools.viewing.scenes import show_again, ticks_to_show
 from tests.conftest import Cosim
 
@@ -39,7 +39,7 @@ def test_failures_that_follow_one_another_share_their_pictures(
     done = []
     render = WorldCamera.render
     monkeypatch.setattr(WorldCamera, "render", lambda *told: drawn.append(0) or render(*told))
-    (last,) = mishaps_of(recorded(run, NAME).record)
+    (last,) = mishaps_of(load_recorded(run, NAME).record)
     before = last._replace(tick=last.tick - 20, failure=None)
     shown = show_again(run, NAME, [last, before], "auto", done.append)
     late, early = (one.scene.pictures for one in shown)
@@ -68,15 +68,15 @@ def test_an_episode_that_comes_out_otherwise_is_not_shown(run: Path, column: str
     np.savez(path, **held)
     try:
         with pytest.raises(RunError, match=r"not the same when it was replayed \(from 0.25 s on\)"):
-            show_again(run, NAME, mishaps_of(recorded(run, NAME).record), "auto")
+            show_again(run, NAME, mishaps_of(load_recorded(run, NAME).record), "auto")
     finally:
         path.write_bytes(kept)
 
 
 def test_a_replay_that_is_judged_alone_has_no_result(run: Path) -> None:
     """It ends when the recorded one did; what was measured in it is not to be had."""
-    told = recorded(run, NAME)
-    episode, policy = replaying(told, judged_alone=True)
+    told = load_recorded(run, NAME)
+    episode, policy = replay_episode(told, judged_alone=True)
     with episode:
         observation = episode.reset()
         while not episode.over:

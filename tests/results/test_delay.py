@@ -13,9 +13,9 @@ from cosim.results.delay import Tracks, delay_of
 from cosim.results.event_monitor import (
     STANDARD_CAMERA,
     body_points,
-    eye_of,
+    camera_position,
     in_picture,
-    went_between,
+    passed_between,
     why_unseen,
 )
 from cosim.results.record import TriggeredEvent
@@ -87,7 +87,7 @@ def test_between_two_people_is_across_the_line_between_them(
 ) -> None:
     """Two stand at y = -1 and y = 1: a step over x = 0 counts only there."""
     pair = np.array([(0.0, -1.0), (0.0, 1.0)])
-    assert went_between(np.array(before), np.array(after), pair) is between
+    assert passed_between(np.array(before), np.array(after), pair) is between
 
 
 def test_a_step_that_ends_on_the_line_is_no_way_round_it() -> None:
@@ -95,14 +95,14 @@ def test_a_step_that_ends_on_the_line_is_no_way_round_it() -> None:
     pair = np.array([(0.0, -1.0), (0.0, 1.0)])
     ways = [np.array([x, 0.0]) for x in (-0.1, 0.0, 0.1)]
     for a, b, c in (ways, ways[::-1]):
-        assert went_between(a, b, pair) is not went_between(b, c, pair)
+        assert passed_between(a, b, pair) is not passed_between(b, c, pair)
 
 
 def test_any_two_of_a_group_count() -> None:
     """Into a triangle of talkers goes over one of its sides; past it over none."""
     trio = np.array([(0.0, 0.0), (2.0, 0.0), (1.0, 2.0)])
-    assert went_between(np.array([1.0, -0.2]), np.array([1.0, 0.2]), trio)
-    assert not went_between(np.array([-0.2, -0.2]), np.array([2.2, -0.2]), trio)
+    assert passed_between(np.array([1.0, -0.2]), np.array([1.0, 0.2]), trio)
+    assert not passed_between(np.array([-0.2, -0.2]), np.array([2.2, -0.2]), trio)
 
 
 def share_in_picture(x_m: float, y_m: float) -> float:
@@ -110,7 +110,7 @@ def share_in_picture(x_m: float, y_m: float) -> float:
     standard picture."""
     robot = RobotState(Pose(0.0, 0.0, math.pi / 2))
     mount = COURIER.mount("front")
-    eye = eye_of(robot, mount)
+    eye = camera_position(robot, mount)
     points = body_points(eye, np.array([x_m, y_m]), 0.0)
     return float(in_picture(robot.pose, mount, STANDARD_CAMERA, points - eye).mean())
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cosim.results.log import Log
-from cosim.results.metrics import METRICS, EpisodeFacts, every_metric, progress_of
+from cosim.results.metrics import METRICS, EpisodeFacts, compute_metrics, progress_of
 from cosim.results.referee import Failure
 from tests.logs import log_with
 
@@ -50,7 +50,7 @@ def episode(
 
 def test_a_clean_drive_to_the_goal() -> None:
     """100 m at 1 m/s in 2,000 ticks, nobody near: the textbook values."""
-    measures = every_metric(episode(log([0.05 * (i + 1) for i in range(2000)]), ended="goal"))
+    measures = compute_metrics(episode(log([0.05 * (i + 1) for i in range(2000)]), ended="goal"))
     expected = {
         "success": 1.0,
         "goal_reached": 1.0,
@@ -81,7 +81,7 @@ def test_rates_are_per_100_m_travelled_and_of_progress() -> None:
         failure("collision", "vehicle"),
         failure("freezing"),
     )
-    measures = every_metric(episode(log(there + back), *failures))
+    measures = compute_metrics(episode(log(there + back), *failures))
     assert measures["path_length_m"] == pytest.approx(60.0)
     assert measures["progress_m"] == pytest.approx(40.0)
     assert measures["failures_per_100m"] == pytest.approx(5.0)
@@ -96,7 +96,7 @@ def test_rates_are_per_100_m_travelled_and_of_progress() -> None:
 def test_the_total_is_the_sum_of_its_parts() -> None:
     """FC = C + OL + F, as in the paper's table."""
     failures = [failure(k) for k in ("collision", "out_of_lane", "out_of_lane", "freezing")]
-    m = every_metric(episode(log([0.05 * i for i in range(1, 500)]), *failures))
+    m = compute_metrics(episode(log([0.05 * i for i in range(1, 500)]), *failures))
     parts = (m[f"{name}_per_100m"] for name in ("collisions", "out_of_lane", "freezings"))
     assert m["failures_per_100m"] == pytest.approx(sum(p for p in parts if p is not None))
 
@@ -111,18 +111,18 @@ def test_a_reset_is_neither_travel_nor_progress() -> None:
         9.0
     )
     drive = log([1.0, 2.0, 3.0, 11.0, 12.0], resets={2: 10.0})
-    assert every_metric(episode(drive))["path_length_m"] == pytest.approx(5.0)
+    assert compute_metrics(episode(drive))["path_length_m"] == pytest.approx(5.0)
 
 
 def test_a_goal_reached_with_failures_is_no_success() -> None:
     """`goal_reached` counts the arrival, `success` only a clean one."""
-    measures = every_metric(episode(log([50.0, 100.0]), failure("out_of_lane"), ended="goal"))
+    measures = compute_metrics(episode(log([50.0, 100.0]), failure("out_of_lane"), ended="goal"))
     assert (measures["goal_reached"], measures["success"]) == (1.0, 0.0)
 
 
 def test_a_rate_without_distance_is_absent_not_zero() -> None:
     """A robot that never moved has failures but no failures per 100 m, and no time to goal."""
-    measures = every_metric(episode(log([0.0] * 400), failure("freezing")))
+    measures = compute_metrics(episode(log([0.0] * 400), failure("freezing")))
     assert measures["freezings"] == 1.0
     assert measures["failures_per_100m"] is None
     assert measures["time_to_goal_s"] is None
@@ -133,7 +133,7 @@ def test_a_rate_without_distance_is_absent_not_zero() -> None:
 def test_space_metrics_have_the_signs_of_their_names() -> None:
     """At 1 m from a person the intimate space is kept and the personal space violated, at 0.4 m
     both are lost."""
-    at_1m, at_40cm = (every_metric(episode(log([0.05] * 10, person_m=d))) for d in (1.0, 0.4))
+    at_1m, at_40cm = (compute_metrics(episode(log([0.05] * 10, person_m=d))) for d in (1.0, 0.4))
     assert (at_1m["space_compliance"], at_1m["personal_space_violation"]) == (1.0, 1.0)
     assert (at_40cm["space_compliance"], at_40cm["personal_space_violation"]) == (0.0, 1.0)
     assert at_40cm["pedestrian_distance_min_m"] == 0.4
@@ -145,7 +145,7 @@ def test_time_on_the_carriageway_and_braking_vehicles_are_summed() -> None:
     one = log([0.05 * (i + 1) for i in range(100)])
     one.on_carriageway[20:50] = True
     one.vehicles_braked[25], one.vehicles_braked[40] = 2, 1
-    measures = every_metric(episode(one))
+    measures = compute_metrics(episode(one))
     assert measures["carriageway_time_s"] == pytest.approx(1.5)
     assert measures["vehicles_braked"] == 3.0
 
@@ -154,7 +154,7 @@ def test_spl_charges_detours() -> None:
     """A clean drive of 125 m for a route of 100 m has an SPL of 0.8."""
     there = [0.5 * (i + 1) for i in range(225)]
     back = [112.5 - 0.5 * (i + 1) for i in range(25)]
-    assert every_metric(episode(log(there + back), ended="goal"))["spl"] == pytest.approx(0.8)
+    assert compute_metrics(episode(log(there + back), ended="goal"))["spl"] == pytest.approx(0.8)
 
 
 def test_every_metric_is_defined_for_every_episode() -> None:
@@ -164,7 +164,7 @@ def test_every_metric_is_defined_for_every_episode() -> None:
         episode(log([0.0, 120.0]), ended="goal"),
         episode(log([1.0] * 3, person_m=0.1)),
     ):
-        values = every_metric(one)
+        values = compute_metrics(one)
         assert set(values) == set(METRICS)
         assert all(value is None or np.isfinite(value) for value in values.values())
 
@@ -173,15 +173,17 @@ def test_resets_neither_hide_nor_invent_a_failure_to_progress() -> None:
     """A jump forward does not make a standing robot progress, and a jump back does not make a
     driving one stall."""
     stands = log([0.0] * 200 + [10.0] * 200, resets={199: 10.0})
-    assert every_metric(episode(stands))["failure_to_progress"] == 4.0
+    assert compute_metrics(episode(stands))["failure_to_progress"] == 4.0
     drives = [0.05 * (i + 1) for i in range(150)] + [0.05 * (i + 1) for i in range(150)]
-    assert every_metric(episode(log(drives, resets={149: 0.0})))["failure_to_progress"] == 0.0
+    assert compute_metrics(episode(log(drives, resets={149: 0.0})))["failure_to_progress"] == 0.0
 
 
 def test_who_walks_into_a_robot_that_stands_is_counted_and_costs_it_nothing() -> None:
     """At the goal after two such contacts: a success, no collision, and two contacts."""
     facts = episode(log([0.05 * (i + 1) for i in range(2000)]), ended="goal")
-    measures = every_metric(replace(facts, walked_into=(failure("collision", "pedestrian"),) * 2))
+    measures = compute_metrics(
+        replace(facts, walked_into=(failure("collision", "pedestrian"),) * 2)
+    )
     assert [
         measures[name] for name in ("success", "collisions", "failures_per_100m", "walked_into")
     ] == [1, 0, 0, 2]
@@ -192,7 +194,7 @@ def test_accelerations_and_jerks_are_of_the_policys_periods() -> None:
     and -16 m/s3."""
     one = log([0.05] * 15)
     one.speed[:, 0] = np.repeat([0.5, 1.5, 1.5], 5)
-    measures = every_metric(episode(one))
+    measures = compute_metrics(episode(one))
     assert measures["acceleration_mean_mps2"] == pytest.approx((2.0 + 4.0 + 0.0) / 3)
     assert measures["jerk_mean_mps3"] == pytest.approx((8.0 + 16.0) / 2)
 
@@ -201,7 +203,7 @@ def test_a_reset_is_no_deceleration() -> None:
     """Put at rest at 1 m/s and driven on at 1 m/s: the jump is left out, the new start counts."""
     one = log([0.05 * (i + 1) for i in range(20)], resets={9: 0.5})
     one.speed[:, 0] = 1.0
-    assert every_metric(episode(one))["acceleration_mean_mps2"] == pytest.approx(
+    assert compute_metrics(episode(one))["acceleration_mean_mps2"] == pytest.approx(
         (4.0 + 0.0 + 4.0 + 0.0) / 4
     )
 
@@ -214,7 +216,7 @@ def test_shares_of_episodes_count_an_episode_once() -> None:
         failure("collision", "pedestrian"),
         failure("collision", "wall"),
     )
-    measures = every_metric(episode(log([1.0, 2.0]), *hits))
+    measures = compute_metrics(episode(log([1.0, 2.0]), *hits))
     assert (
         measures["pedestrian_collision"],
         measures["other_collision"],
@@ -226,7 +228,7 @@ def test_shares_of_episodes_count_an_episode_once() -> None:
 def test_the_nearest_of_a_success_is_absent_from_a_failure() -> None:
     """The paper averages it over successful episodes."""
     drive = log([50.0, 100.0], person_m=0.9)
-    good, bad = (every_metric(episode(drive, ended=ended)) for ended in ("goal", "timeout"))
+    good, bad = (compute_metrics(episode(drive, ended=ended)) for ended in ("goal", "timeout"))
     assert (
         good["pedestrian_distance_min_success_m"],
         bad["pedestrian_distance_min_success_m"],

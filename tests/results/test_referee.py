@@ -22,7 +22,7 @@ from cosim.core.state import (
     Signal,
     Street,
     Vehicles,
-    write_protected,
+    write_protected_copy,
 )
 from cosim.episode.loop import Step
 from cosim.place.street_map import WalkableArea
@@ -76,7 +76,9 @@ def step(
     """The robot ends the tick at (x, y), which is also its place on the route."""
     robot = RobotState(Pose(x_m, y_m, 0.0), speed, w_radps)
     street = Street(tick, who or people(), cars, {name: Signal(False) for name in red})
-    motion = Motion(robot, write_protected([[x_m, y_m, 0.0]] * CLOCK.substeps), tuple(contacts))
+    motion = Motion(
+        robot, write_protected_copy([[x_m, y_m, 0.0]] * CLOCK.substeps), tuple(contacts)
+    )
     return Step(tick, robot, street, x_m, None, command, events, motion, street, x_m)
 
 

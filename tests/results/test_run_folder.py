@@ -402,7 +402,7 @@ def test_nothing_of_an_earlier_attempt_stays_beside_a_crash(tmp_path: Path) -> N
     """A run killed after it wrote a trajectory and before the record: the next attempt begins with
     an empty folder."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
-        folder.keep_frame("s-0", 4, b"png")
+        folder.write_frame("s-0", 4, b"png")
         for name in ("trajectory.npz", "trajectory.npz.part", "record.json.part"):
             (folder.episode_folder("s-0") / name).write_bytes(b"of the first attempt")
     with RunFolder.resume(tmp_path / "run", SPEC) as again:

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from cosim.results.metrics import METRICS, WORST
-from cosim.results.table import interval_of, not_to_be_quoted, summary_of
+from cosim.results.table import bootstrap_interval, summary_of, why_inconclusive
 
 
 def table(*rows: tuple[float, float, float], crashed: int = 0, invalid: int = 0) -> pd.DataFrame:
@@ -56,10 +56,10 @@ def test_the_interval_is_of_episodes_drawn_again() -> None:
     """Of values it is the bootstrap of their mean; with equal weights the same; one episode has no
     spread."""
     values = np.array([0.0, 1.0, 1.0, 1.0, 0.0, 1.0])
-    assert interval_of(values) == interval_of(values, np.ones(6))
-    low, high = interval_of(values)
+    assert bootstrap_interval(values) == bootstrap_interval(values, np.ones(6))
+    low, high = bootstrap_interval(values)
     assert 0.0 <= low < values.mean() < high <= 1.0
-    assert interval_of(np.array([3.0]), np.array([2.0])) == (1.5, 1.5)
+    assert bootstrap_interval(np.array([3.0]), np.array([2.0])) == (1.5, 1.5)
 
 
 @pytest.mark.parametrize(
@@ -87,8 +87,8 @@ def test_an_invalid_episode_is_in_no_mean_and_two_in_a_hundred_spoil_a_table() -
     is to quote it."""
     few = table(*[(10.0, 0, 10.0)] * 98, invalid=2)
     assert (
-        summary_of(few, ["success"]).loc["success", "n"] == 98 and not_to_be_quoted(few, 100) == ""
+        summary_of(few, ["success"]).loc["success", "n"] == 98 and why_inconclusive(few, 100) == ""
     )
     many = table(*[(10.0, 0, 10.0)] * 97, invalid=3)
-    assert not_to_be_quoted(many, 100) == "3 of 100 scheduled episodes are invalid, more than 2 %"
-    assert not_to_be_quoted(few, 120) == "20 of 120 scheduled episodes have not ended"
+    assert why_inconclusive(many, 100) == "3 of 100 scheduled episodes are invalid, more than 2 %"
+    assert why_inconclusive(few, 120) == "20 of 120 scheduled episodes have not ended"

@@ -13,7 +13,7 @@ from cosim.core.geometry import Pose
 from cosim.core.state import STILL, Motion, People, RobotState, Signal, Street, Vehicles
 from cosim.episode.loop import Step
 from cosim.place.street_map import Corner, Lane, Located, StreetMap, Strip
-from cosim.results.traffic import OnRoad, TrafficMonitor, braking_for
+from cosim.results.traffic import RoadState, TrafficMonitor, vehicles_braking_for
 from cosim.spec.events import EventReply
 
 LINE = np.array([[20.0, -4.0], [20.0, 4.0]])
@@ -82,18 +82,18 @@ def test_a_vehicle_that_brakes_for_the_robot_counts_once() -> None:
     roadway = TrafficMonitor(MAP, 0.05)
     ticks = (0, 1, 2, 60)
     seen = [roadway.see(step(tick, 12.0, 0.5, street(8.0), street(7.85))) for tick in ticks]
-    assert seen == [OnRoad(True, 1), OnRoad(True, 0), OnRoad(True, 0), OnRoad(True, 1)]
+    assert seen == [RoadState(True, 1), RoadState(True, 0), RoadState(True, 0), RoadState(True, 1)]
 
 
 def test_only_hard_braking_for_the_next_in_the_way_counts() -> None:
     """Not 1 m/s2, not for a robot beside the way or behind, not when a person is nearer."""
     robot = Pose(12.0, 0.5, 0.0)
     person = People.of(("c0",), [[8.0, 0.0]], [0.0], [1.0], ("walk",))
-    assert braking_for(robot, street(8.0), street(7.85), 0.05) == ["v0"]
-    assert braking_for(robot, street(8.0), street(7.95), 0.05) == []
-    assert braking_for(Pose(12.0, 3.0, 0.0), street(8.0), street(7.85), 0.05) == []
-    assert braking_for(Pose(-9.0, 0.0, 0.0), street(8.0), street(7.85), 0.05) == []
-    assert braking_for(robot, street(8.0), street(7.85, people=person), 0.05) == []
+    assert vehicles_braking_for(robot, street(8.0), street(7.85), 0.05) == ["v0"]
+    assert vehicles_braking_for(robot, street(8.0), street(7.95), 0.05) == []
+    assert vehicles_braking_for(Pose(12.0, 3.0, 0.0), street(8.0), street(7.85), 0.05) == []
+    assert vehicles_braking_for(Pose(-9.0, 0.0, 0.0), street(8.0), street(7.85), 0.05) == []
+    assert vehicles_braking_for(robot, street(8.0), street(7.85, people=person), 0.05) == []
 
 
 def test_a_green_crossing_makes_nobody_brake() -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from cosim.core.geometry import Pose, box_disk_gap
-from cosim.results.event_monitor import went_between
+from cosim.results.event_monitor import passed_between
 from cosim.spec.events import Event, EventQuery, EventState
 from cosim.spec.scenario import City, CrowdSpec
 from scenarios.events import EVENT_KINDS, react
@@ -101,7 +101,7 @@ def drive(
         gaps = box_disk_gap(np.array([Pose(x_m, left_m, 0.0)]), *HALF_M, at[None])[0] - 0.3
         nearest_m = min(nearest_m, float(gaps.min()))
         if len(at) > 1 and min(ahead_m) <= 0.0 and max(ahead_m) >= before_m - x_m:
-            between |= went_between(np.array([before_m, left_m]), np.array([x_m, left_m]), at)
+            between |= passed_between(np.array([before_m, left_m]), np.array([x_m, left_m]), at)
         if nearest_m < 0.0 or (between and one.kind == "conversing" and len(at) == 2):
             break
     return Driven(nearest_m, between, states[0], seen)

@@ -20,13 +20,13 @@ from cosim.core.errors import SpecError, UsageError
 from cosim.core.packed_demos import Packed, read_packed
 from cosim.core.state import Command
 from cosim.episode.interfaces import Observation, Policy
-from cosim.episode.policy_caller import Driver
+from cosim.episode.policy_caller import PolicyCaller
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies.load import load_policy
 from cosim.results.log import Log
 from cosim.results.run_folder import DEMONSTRATION
 from cosim.spec.camera import CameraSpec
-from cosim.spec.demo_options import Collecting
+from cosim.spec.demo_options import DemoOptions
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import City, Scenario, Suite, write_suite
@@ -38,7 +38,7 @@ from scenarios.suites.unit import build_unit
 from tests.conftest import WIDE, Cosim
 
 pytestmark = pytest.mark.engine
-NOISY = Collecting(camera=CameraSpec(width=64, height=48), noise=0.3)
+NOISY = DemoOptions(camera=CameraSpec(width=64, height=48), noise=0.3)
 ASKED = (
     "collect",
     "ways.json",
@@ -110,10 +110,13 @@ def packed(desk: Desk, cosim: Cosim) -> Packed:
 
 
 def shown_here(
-    way: Scenario, expert: Driver, collecting: Collecting = NOISY, learner: Policy | None = None
+    way: Scenario,
+    expert: PolicyCaller,
+    collecting: DemoOptions = NOISY,
+    learner: Policy | None = None,
 ) -> Demonstration:
     """The demonstration of an episode that this process drives."""
-    beside = None if learner is None else Driver.of(learner)
+    beside = None if learner is None else PolicyCaller.of(learner)
     demonstrator = Demonstrator(expert, collecting, "route_point", beside)
     options = EpisodeOptions(goal="route_point", seed=0)
     outcome = run_episode(way, demonstrator, options)
@@ -269,8 +272,8 @@ class Sees:
 def test_an_expert_that_sees_keeps_its_own_camera(desk: Desk) -> None:
     """It is given pictures of its own size, and those of the collecting camera are kept."""
     expert = Sees()
-    kept = Collecting(camera=CameraSpec(width=64, height=48), rate_hz=4.0, unsolved=True)
-    shown = shown_here(desk.ways[0], Driver.of(expert), kept)
+    kept = DemoOptions(camera=CameraSpec(width=64, height=48), rate_hz=4.0, unsolved=True)
+    shown = shown_here(desk.ways[0], PolicyCaller.of(expert), kept)
     assert set(expert.shapes) == {(32, 32, 3)}
     assert len(expert.shapes) == len(shown) > 5
     assert shown.colours.sum() == len(shown) * 64 * 48 * 3
@@ -308,12 +311,12 @@ class Learner(Stands):
 def test_a_learner_drives_and_the_expert_says_what_it_should_have_done(desk: Desk) -> None:
     """It is asked at every picture, drives its share of the time, seconds at once, while each row
     has the expert's answer; the same seed gives the same bytes."""
-    kept = Collecting(
+    kept = DemoOptions(
         camera=CameraSpec(width=64, height=48), noise=0.6, learner="learner", unsolved=True
     )
     way = msgspec.structs.replace(desk.ways[0], time_limit_s=20.0)
     learner = Learner()
-    shown = shown_here(way, Driver.of(Stands()), kept, learner)
+    shown = shown_here(way, PolicyCaller.of(Stands()), kept, learner)
     assert learner.asked == sorted(set(learner.asked)) and len(learner.asked) == len(shown) > 20
     assert not shown.command.any()
     assert 0.3 < shown.disturbed.mean() < 0.9
@@ -324,7 +327,7 @@ def test_a_learner_drives_and_the_expert_says_what_it_should_have_done(desk: Des
         > 0.4
         > shown.state[1:, 0][~shown.disturbed[:-1]].mean()
     )
-    assert shown_here(way, Driver.of(Stands()), kept, learner).encoded() == shown.encoded()
+    assert shown_here(way, PolicyCaller.of(Stands()), kept, learner).encoded() == shown.encoded()
 
 
 BESIDE = """
@@ -378,7 +381,7 @@ def test_a_learner_drives_in_every_process_as_it_does_in_this_one(
     assert said.returncode == 0, said.stderr
     monkeypatch.syspath_prepend(desk.folder)
     learner = load_policy("beside:Learner")
-    kept = Collecting(
+    kept = DemoOptions(
         camera=CameraSpec(width=64, height=48), noise=0.6, learner="beside:Learner", unsolved=True
     )
     for way in (desk.ways[0], desk.ways[2]):
@@ -403,8 +406,8 @@ def test_a_learner_drives_in_every_process_as_it_does_in_this_one(
 def test_a_learner_that_would_see_something_else_is_refused() -> None:
     """With what to give; so is one beside an expert that sees by a camera of its own, and one that
     is blind."""
-    asked = Collecting(camera=CameraSpec(width=80, height=60), noise=0.6, learner="learner")
-    expert, learner = Driver.of(Stands()), Driver.of(Learner())
+    asked = DemoOptions(camera=CameraSpec(width=80, height=60), noise=0.6, learner="learner")
+    expert, learner = PolicyCaller.of(Stands()), PolicyCaller.of(Learner())
     with pytest.raises(
         UsageError,
         match=r"front, 80 x 60 px.* give --camera 64x48 --fov 75 --mount front --rate 5$",
@@ -424,9 +427,11 @@ def test_a_learner_that_would_see_something_else_is_refused() -> None:
     with pytest.raises(
         UsageError, match="'stands' is no policy that drives by one camera, speeds and a goal alone"
     ):
-        Demonstrator(expert, asked, None, Driver.of(Stands()))
+        Demonstrator(expert, asked, None, PolicyCaller.of(Stands()))
     with pytest.raises(UsageError, match="expert 'sees' sees by a camera of its own"):
-        Demonstrator(Driver.of(Sees()), msgspec.structs.replace(asked, rate_hz=4.0), None, learner)
+        Demonstrator(
+            PolicyCaller.of(Sees()), msgspec.structs.replace(asked, rate_hz=4.0), None, learner
+        )
     with pytest.raises(SpecError, match="give --noise"):
         msgspec.structs.replace(asked, noise=0.0)
 

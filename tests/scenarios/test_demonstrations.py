@@ -16,11 +16,11 @@ import pytest
 from cosim.core.errors import CosimError, RunError, SpecError
 from cosim.core.state import Command
 from cosim.spec.camera import CameraSpec
-from cosim.spec.demo_options import Collecting, demonstrating
+from cosim.spec.demo_options import DemoOptions, recording_manifest
 from cosim.spec.goal import GOALS, goal_called
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import COURIER
-from scenarios.episodes.clip import _OPTIONS, Clip, _planes_of, _rgb_of, pictures_of
+from scenarios.episodes.clip import _OPTIONS, Clip, _planes_of, _rgb_of, read_pictures
 from scenarios.episodes.demonstration import Demonstration, glimpse, waypoints_ahead
 from scenarios.episodes.demonstrator import _Bursts
 from scenarios.suites.new_scenarios import fresh, fresh_cities
@@ -111,7 +111,7 @@ def test_pictures_come_back_from_the_film_at_their_rows_and_times(
     drawn = np.concatenate([known_pictures(k, count) for k, count in enumerate(LENGTHS)]).astype(
         float
     )
-    times, seen = zip(*pictures_of(film), strict=True)
+    times, seen = zip(*read_pictures(film), strict=True)
     assert list(times) == [Fraction(k, FPS) for k in range(sum(LENGTHS))]
     off = np.array([[np.abs(one - other).mean() for other in drawn] for one in seen])
     assert off.diagonal().max() < 5.0
@@ -299,7 +299,7 @@ def test_bursts_have_their_share_of_the_time_and_are_drawn_from_the_seed() -> No
     """Over many episodes a fifth of the commands is disturbed for --noise 0.2; one seed gives one
     drive; a robot that the expert has stand is not driven on."""
     answer = Command(1.0, 0.1)
-    collecting = Collecting(noise=0.2)
+    collecting = DemoOptions(noise=0.2)
     drives = [[bursts.driven(answer, COURIER) for _ in range(60)] for bursts in _each(collecting)]
     assert drives == [
         [bursts.driven(answer, COURIER) for _ in range(60)] for bursts in _each(collecting)
@@ -310,10 +310,10 @@ def test_bursts_have_their_share_of_the_time_and_are_drawn_from_the_seed() -> No
     assert {bursts.driven(Command(0.0, 0.0), COURIER).v_mps for bursts in _each(collecting)} == {
         0.0
     }
-    assert all(bursts.driven(answer, COURIER) is answer for bursts in _each(Collecting()))
+    assert all(bursts.driven(answer, COURIER) is answer for bursts in _each(DemoOptions()))
 
 
-def _each(collecting: Collecting) -> list[_Bursts]:
+def _each(collecting: DemoOptions) -> list[_Bursts]:
     return [_Bursts(seed, collecting) for seed in range(300)]
 
 
@@ -343,17 +343,19 @@ def test_what_cannot_be_kept_is_refused(asked: dict[str, object], words: str) ->
     """A rate, a share of noise, waypoints or a size that no data set can have is told with what it
     may be."""
     with pytest.raises(SpecError, match=words):
-        Collecting(**asked)  # type: ignore[arg-type]
+        DemoOptions(**asked)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("goal", [kind.name for kind in GOALS.values() if not kind.in_data_sets])
+@pytest.mark.parametrize(
+    "goal", [kind.name for kind in GOALS.values() if not kind.has_data_set_column]
+)
 def test_goals_that_rows_cannot_tell_are_refused(goal: str) -> None:
     """Pictures as goals, and points that the expert does not drive to, are refused with what may be
     asked for."""
     with pytest.raises(
         CosimError, match="give --goal, one of none, route_point, final_point, instruction"
     ):
-        demonstrating(Manifest("p", goal=goal_called(goal)), Collecting())
+        recording_manifest(Manifest("p", goal=goal_called(goal)), DemoOptions())
 
 
 def test_an_expert_that_sees_is_asked_as_often_as_it_says() -> None:
@@ -362,9 +364,11 @@ def test_an_expert_that_sees_is_asked_as_often_as_it_says() -> None:
     with pytest.raises(
         CosimError, match="policy 'p' sees, and answers 4 times a second, not 5: give --rate 4"
     ):
-        demonstrating(Manifest("p", rate_hz=4.0), Collecting())
-    assert demonstrating(Manifest("p", rate_hz=4.0), Collecting(rate_hz=4.0)).rate_hz == 4.0
-    assert demonstrating(Manifest("p", rate_hz=20.0, camera=None), Collecting()).rate_hz == 5.0
+        recording_manifest(Manifest("p", rate_hz=4.0), DemoOptions())
+    assert recording_manifest(Manifest("p", rate_hz=4.0), DemoOptions(rate_hz=4.0)).rate_hz == 4.0
+    assert (
+        recording_manifest(Manifest("p", rate_hz=20.0, camera=None), DemoOptions()).rate_hz == 5.0
+    )
 
 
 @pytest.mark.parametrize(

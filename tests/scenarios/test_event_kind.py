@@ -32,7 +32,7 @@ from cosim.spec.scenario import City, CrowdSpec, Scenario, event_faults, read_su
 from scenarios.episodes.episode import Episode
 from scenarios.events import EVENT_KINDS
 from scenarios.events.sight import sight_of
-from scenarios.events.walking import edge_m, spot, walked_to, walker_at
+from scenarios.events.walking import edge_m, walk_to, walker_at, world_point
 from scenarios.places.nets import place
 from scenarios.suites.catalog import load_suite
 from scenarios.suites.fits import check_places
@@ -54,8 +54,8 @@ def begin(event: Event, number: int) -> Walker:
 def change_sides(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:
     """To the other edge, and back when it is over; there they stand."""
     side = (2 * number - 1) * (1 if state.phase == "acting" else -1)
-    goal = spot(event, 0.6 * number, side * edge_m(event))
-    return walked_to(state.walkers[number], *goal, event.speed_mps, sight_of(event, number, query))
+    goal = world_point(event, 0.6 * number, side * edge_m(event))
+    return walk_to(state.walkers[number], *goal, event.speed_mps, sight_of(event, number, query))
 
 
 def after_three_seconds(event: Event, state: EventState, query: EventQuery) -> bool:
@@ -72,7 +72,7 @@ SWAPPING = EventKind(
     ends=after_three_seconds,
     pose="phone",
     age=Age.CHILD,
-    passed_round=True,
+    passed_as_group=True,
 )
 NEEDS_ROOM = SidewalkLayout((16.0, 18.0), (9.0, 10.0), half_width_m=1.9)
 KINDS: EventKinds = EVENT_KINDS | {SWAPPING.name: SWAPPING}  # type: ignore[operator]

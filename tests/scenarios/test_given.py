@@ -12,7 +12,7 @@ import pytest
 from cosim.core.errors import RunError
 from cosim.core.state import Command, People, RobotState, Street
 from cosim.episode.interfaces import Observation
-from cosim.episode.policy_caller import Driver
+from cosim.episode.policy_caller import PolicyCaller
 from cosim.results.run_folder import read_spec
 from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import ImageGoal, PointGoal
@@ -66,7 +66,7 @@ def test_what_is_given_in_an_episode_holds_no_secret_and_is_what_it_says(
     """An unprivileged observation with everything that can be requested reaches nothing that only
     the simulator knows; its goal picture shows the place without people."""
     policy = Ahead(ALL)
-    driver = Driver(policy)
+    driver = PolicyCaller(policy)
     with Episode(scenario, ALL, SEED) as episode, episode.eyes(SPEC) as camera:
         first = seen = episode.reset()
         while not episode.over:

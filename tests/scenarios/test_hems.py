@@ -12,7 +12,7 @@ from shapely.geometry import LineString
 
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Polyline
-from cosim.place.barriers import barrier_at, branches, outline, prove_single_path
+from cosim.place.barriers import barrier_at, outline, ports_to_close, prove_single_path
 from cosim.place.street_map import Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import City, content_hash
@@ -41,7 +41,7 @@ def test_a_footway_across_a_sidewalk_is_fenced_off() -> None:
     """Fences at the branches leave it open; a hem closes it on both sides, names it, and keeps off
     the route."""
     street_map = laid_over(cross_map(), "path", (-15.0, -50.0), (-10.0, 50.0))
-    fences = [barrier_at(street_map, port) for port in branches(street_map, WAY)]
+    fences = [barrier_at(street_map, port) for port in ports_to_close(street_map, WAY)]
     with pytest.raises(SpecError, match="a branch is left open"):
         prove_single_path(street_map, ROUTE, fences, WAY, 0.3)
     hemmed = hem(street_map, WAY)

@@ -20,7 +20,7 @@ import pytest
 from cosim.core.errors import UsageError
 from cosim.results.record import Record
 from cosim.results.run_folder import read_records, read_spec
-from cosim.spec.episode_id import pseudonym_of
+from cosim.spec.episode_id import episode_id_of
 from cosim.spec.options import EpisodeOptions, PolicyHost
 from cosim.spec.scenario import Scenario, Suite, write_suite
 from scenarios.runs import run as suite_run
@@ -66,7 +66,7 @@ def prepare(desk: Path, names: list[str], mark: str) -> dict[str, str]:
     """Write the suite of some behaviours; return the environment of its run."""
     suite = Suite(name="hostile", version="1", scenarios=tuple(map(named, names)))
     write_suite(suite, desk / "hostile.json")
-    told = {pseudonym_of(SEED, each).episode: each.id for each in suite.scenarios}
+    told = {episode_id_of(SEED, each).episode: each.id for each in suite.scenarios}
     (desk / "names.json").write_text(json.dumps(told))
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     return {DESK: str(desk), MARK: mark, "PYTHONPATH": path}

@@ -44,7 +44,7 @@ from scenarios.runs.protocol import (
 from scenarios.runs.status import RunStatus
 from scenarios.runs.transport import HeldRun
 from scenarios.runs.zenoh_transport import workers_of_run
-from sumo_nets.net.raw_file import hash_of
+from sumo_nets.net.raw_file import net_xml_hash
 from tests.conftest import PATIENCE_S, Cosim, wait_until
 from tests.run_specs import changed, spec_of
 
@@ -454,7 +454,7 @@ def test_a_map_reaches_workers_that_lack_it(
     there, here = tmp_path / "there", tmp_path / "here"
     where = CityMap(
         map="mine",
-        net_hash=hash_of(net := b"<net>" + secrets.token_hex(3 << 20).encode() + b"</net>"),
+        net_hash=net_xml_hash(net := b"<net>" + secrets.token_hex(3 << 20).encode() + b"</net>"),
     )
     (there / "maps" / "mine").mkdir(parents=True)
     (there / "maps" / "mine" / "net.xml").write_bytes(net)

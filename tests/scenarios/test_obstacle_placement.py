@@ -15,14 +15,14 @@ from shapely.geometry import LineString, Point
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Polyline
 from cosim.core.state import PERSON_RADIUS_M, RobotState
-from cosim.place.barriers import fenced, outline
+from cosim.place.barriers import outline, without_barriers
 from cosim.place.street_map import StreetMap
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.events import EventReply
 from cosim.spec.obstacle import OBSTACLE_SIZES_M, Obstacle, footprint
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City, CrowdSpec, Scenario
-from physics.ground.tiles import keys_in
+from physics.ground.tiles import tiles_touching
 from physics.street.furniture import footprints
 from physics.street.placement import driveway_ground
 from physics.street.street_surface import StreetSurface
@@ -71,7 +71,7 @@ def eroded(scenario: Scenario, street_map: StreetMap) -> list[shapely.Geometry]:
     """What is left of the way, by other means than the builder's: each obstacle and each edge grown
     instead."""
     around = shapely.buffer(LineString(scenario.route), 10.0)
-    ground = fenced(street_map.walkable_near(around), scenario.barriers)
+    ground = without_barriers(street_map.walkable_near(around), scenario.barriers)
     half_m = 0.5 * (COURIER.width_m + TO_SPARE_M) - 1e-3
     edges = shapely.buffer(shapely.boundary(ground), half_m)
     things = [footprint(one).buffer(half_m) for one in scenario.obstacles]
@@ -120,7 +120,7 @@ def test_obstacles_stand_on_sidewalks_and_on_nothing_else() -> None:
         crossings = [s for s in street().near("strip", around) if s.kind == "crossing"]  # type: ignore[union-attr]
         others = [
             *footprints(surface.standing(around)),
-            *(house.polygon for key in keys_in(around) for house in surface.buildings(key)),
+            *(house.polygon for key in tiles_touching(around) for house in surface.buildings(key)),
             *(outline(barrier) for barrier in scenario.barriers),
             *(way for strip in sidewalks for way in driveway_ground(strip)),  # type: ignore[arg-type]
             *(piece.polygon for piece in (*crossings, *street().near("corner", around))),

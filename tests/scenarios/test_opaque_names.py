@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from cosim.results.run_folder import read_records
-from cosim.spec.episode_id import pseudonym_of
+from cosim.spec.episode_id import episode_id_of
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario, Suite
 from scenarios.episodes.episode import Episode
@@ -50,7 +50,7 @@ def test_counting_episodes_tells_a_policy_nothing() -> None:
         if one.id in ("gesturing-001", "gesturing-002")
     )
     seed = next(
-        seed for seed in range(100) if pseudonym_of(seed, second) < pseudonym_of(seed, first)
+        seed for seed in range(100) if episode_id_of(seed, second) < episode_id_of(seed, first)
     )
     taken: list[tuple[str, str]] = []
 
@@ -63,7 +63,7 @@ def test_counting_episodes_tells_a_policy_nothing() -> None:
     short = [msgspec.structs.replace(one, time_limit_s=0.5) for one in (first, second)]
     suite = Suite(name="two", version="1", scenarios=tuple(short))
     suite_run.run(suite, Noting(), options=EpisodeOptions(seed=seed))
-    names = {pseudonym_of(seed, one).episode: one.id for one in (first, second)}
+    names = {episode_id_of(seed, one).episode: one.id for one in (first, second)}
     assert (
         [names[called] for called, _ in taken]
         == [second.id, first.id]
@@ -91,6 +91,6 @@ def test_nothing_that_a_policy_can_read_of_its_process_names_the_scenario(
     read = (tmp_path / "notes").read_text()
     assert {one.status for one in read_records(tmp_path / "run")} == {"done"}
     assert (
-        all(pseudonym_of(3, one).episode in read for one in suite.scenarios) and "courier" in read
+        all(episode_id_of(3, one).episode in read for one in suite.scenarios) and "courier" in read
     )
     assert "quagga" not in read and not [event.kind for event in short.events if event.kind in read]

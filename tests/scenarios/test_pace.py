@@ -14,13 +14,13 @@ from cosim.spec.manifest import Manifest
 from cosim.spec.scenario import Scenario, Suite
 from scenarios.runs import eta as pace
 from scenarios.runs.eta import (
+    EpisodeDuration,
     Estimate,
-    Measured,
     announcement,
     estimate,
+    load_durations,
     makespan,
-    recall,
-    remembered,
+    recording_durations,
 )
 from tests.run_specs import record_of, spec_of
 from tests.support.shipped import long_ways
@@ -36,10 +36,10 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "cache"
 
 
-def episodes(count: int, **changes: object) -> list[Measured]:
+def episodes(count: int, **changes: object) -> list[EpisodeDuration]:
     """Episodes of `route` over 100 m in 75 s of simulated time, 6 simulated seconds a second, set
     up in 4 s."""
-    one = Measured(
+    one = EpisodeDuration(
         machine=pace.machine(),
         policy="route",
         renderer=GL,
@@ -55,7 +55,7 @@ def episodes(count: int, **changes: object) -> list[Measured]:
 
 
 def of(
-    known: list[Measured], policy: str = "route", jobs: int = 1, compared: bool = False
+    known: list[EpisodeDuration], policy: str = "route", jobs: int = 1, compared: bool = False
 ) -> Estimate:
     return estimate(long_ways()[:12], known, policy, GL, jobs, compared, cores=2)
 
@@ -109,17 +109,21 @@ def test_two_processes_take_about_half_and_ten_on_two_cores_no_less() -> None:
 
 @pytest.mark.parametrize("known", [[], episodes(5)], ids=["unknown", "measured"])
 @pytest.mark.parametrize("pace_x", [1.0, 2.0])
-def test_what_is_held_to_real_time_takes_that_time(known: list[Measured], pace_x: float) -> None:
+def test_what_is_held_to_real_time_takes_that_time(
+    known: list[EpisodeDuration], pace_x: float
+) -> None:
     """At 0.75 s a metre 12 episodes of 4.8 km take an hour of real time, whatever the machine can
     do.
 
     Two processes take half of that, and four on two cores a quarter, as they wait."""
     for jobs in (1, 2, 4):
         true_s = makespan([0.75 * s.route_line.length_m / pace_x for s in long_ways()[:12]], jobs)
-        found = pace.paced(of(known, jobs=jobs), long_ways()[:12], known, "route", jobs, pace_x)
+        found = pace.paced_estimate(
+            of(known, jobs=jobs), long_ways()[:12], known, "route", jobs, pace_x
+        )
         assert found.low_s < 1.1 * true_s and 0.9 * true_s < found.high_s < 3.0 * true_s
         assert f"held to {pace_x:g} x real time" in found.basis
-    assert pace.paced(of(known), long_ways()[:12], known, "route", 1, 100.0) == of(known)
+    assert pace.paced_estimate(of(known), long_ways()[:12], known, "route", 1, 100.0) == of(known)
 
 
 def test_the_line_says_episodes_way_limit_and_time() -> None:
@@ -158,12 +162,12 @@ def test_a_run_is_remembered_even_when_it_is_stopped(tmp_path: Path, cache: Path
     with (
         run_of(tmp_path / "run") as held,
         pytest.raises(KeyboardInterrupt),
-        remembered(held, long_ways()[:6], 2),
+        recording_durations(held, long_ways()[:6], 2),
     ):
         for scenario in long_ways()[:4]:
             finished(held, scenario, "crashed" if scenario is long_ways()[:12][0] else "done")
         raise KeyboardInterrupt
-    known = recall()
+    known = load_durations()
     assert [(m.route_m, m.jobs, m.work_s, m.setup_s, m.simulated_s) for m in known] == [
         (s.route_line.length_m, 2, 16.0, 4.0, 80.0) for s in long_ways()[:12][1:4]
     ]
@@ -176,9 +180,9 @@ def test_a_run_that_is_held_to_real_time_is_not_remembered(tmp_path: Path, cache
     """It took as long as it was to take, and the next estimate does not rest on that."""
     with run_of(tmp_path / "run") as held:
         finished(held, long_ways()[:12][0], "done")
-        with remembered(held, long_ways()[:12], 1, 1.0):
+        with recording_durations(held, long_ways()[:12], 1, 1.0):
             pass
-    assert recall() == []
+    assert load_durations() == []
 
 
 def test_what_is_remembered_stays_small_and_survives_damage(tmp_path: Path, cache: Path) -> None:
@@ -188,14 +192,16 @@ def test_what_is_remembered_stays_small_and_survives_damage(tmp_path: Path, cach
     path = cache / pace.FILE
     line = msgspec.json.encode(episodes(1, machine="another")[0])
     path.write_bytes(b"nonsense\n\xff\n" + (line + b"\n") * (2 * pace.EPISODES_KEPT))
-    assert recall() == []
+    assert load_durations() == []
     with run_of(tmp_path / "run") as held:
         finished(held, long_ways()[:12][0], "done")
-        with remembered(held, long_ways()[:12], 1):
+        with recording_durations(held, long_ways()[:12], 1):
             pass
-        assert len(path.read_bytes().splitlines()) == pace.EPISODES_KEPT and len(recall()) == 1
+        assert (
+            len(path.read_bytes().splitlines()) == pace.EPISODES_KEPT and len(load_durations()) == 1
+        )
         path.unlink()
         path.mkdir()
-        with remembered(held, long_ways()[:12], 1):
+        with recording_durations(held, long_ways()[:12], 1):
             pass
-    assert recall() == []
+    assert load_durations() == []

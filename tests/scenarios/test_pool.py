@@ -12,14 +12,14 @@ import msgspec
 import pytest
 
 from cosim.core.errors import MachineError
-from cosim.core.framing import Wire
+from cosim.core.framing import MessageSocket
 from cosim.episode.policy_caller import PolicyCall
 from cosim.policies.load import load_policy
 from cosim.results.record import Record
 from cosim.results.run_folder import RunFolder, read_records
-from cosim.spec.options import RendererAt
+from cosim.spec.options import RendererAddress
 from cosim.spec.scenario import City, Scenario, Suite, write_suite
-from scenarios.ipc.deadlines import Asked, Patience, Question
+from scenarios.ipc.deadlines import Patience, PendingCall, PendingCallMemory
 from scenarios.ipc.messages import (
     Done,
     FrameDrawn,
@@ -34,7 +34,7 @@ from scenarios.ipc.messages import (
 from scenarios.ipc.supervisor import BoundedLog
 from scenarios.runs import environment_slot, pool
 from scenarios.runs.environment_slot import EnvironmentSlot
-from scenarios.runs.shared_renderer import End, SharedRenderer
+from scenarios.runs.shared_renderer import RendererEnd, SharedRenderer
 from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import PATIENCE_S, Cosim, seed_in_order
 from tests.run_specs import record_of, spec_of
@@ -169,7 +169,7 @@ def test_a_first_answer_may_take_longer(
     doing: PolicyCall, answer_s: float, start_s: float, overdue: bool
 ) -> None:
     """The first answer has its own timeout, and none runs before a query."""
-    asked = Asked.new()
+    asked = PendingCallMemory.new()
     assert asked.question is None
     asked.starts(doing, 64)
     time.sleep(0.001)
@@ -196,7 +196,7 @@ class Fake:
         in_engine: bool = False,
     ) -> None:
         self.in_engine = in_engine
-        self.question = None if asks is None else Question(time.monotonic(), asks, 64)
+        self.question = None if asks is None else PendingCall(time.monotonic(), asks, 64)
         self.killed = False
         self._messages = messages
         self._ends = ends
@@ -426,22 +426,22 @@ def test_an_episode_finished_before_its_process_died_is_kept(tmp_path: Path) -> 
 class Ended(SharedRenderer):
     """A renderer whose end a test has prepared; None: it goes on."""
 
-    def __init__(self, end: End | None) -> None:
-        self.at = RendererAt(address="nowhere", asks=True)
+    def __init__(self, end: RendererEnd | None) -> None:
+        self.at = RendererAddress(address="nowhere", asks=True)
         self.end = end
 
     def tend(self) -> None:
         """It has ended already."""
 
-    def end_of(self, number: int) -> End | None:
+    def end_of(self, number: int) -> RendererEnd | None:
         return self.end
 
     def episode_ended(self) -> None:
         """It does not count."""
 
 
-HUNG = End("the renderer process was ended", 60.0)
-DIED = End("the renderer process ended with exit code 7")
+HUNG = RendererEnd("the renderer process was ended", 60.0)
+DIED = RendererEnd("the renderer process ended with exit code 7")
 
 
 @pytest.mark.parametrize(
@@ -475,7 +475,7 @@ DIED = End("the renderer process ended with exit code 7")
     ],
 )
 def test_an_episode_is_no_attempt_the_less_for_a_renderer_that_died_for_others(
-    tmp_path: Path, end: End | None, asked: str, lost: int, reason: str
+    tmp_path: Path, end: RendererEnd | None, asked: str, lost: int, reason: str
 ) -> None:
     """It is run again as often as that happens; a policy that takes the renderer down when it is
     asked for the episode has used up an attempt of it, and one that does not answer all of them."""
@@ -514,8 +514,8 @@ def test_a_job_of_any_length_reaches_a_worker_that_listens_late() -> None:
     """More than a socket holds is posted without waiting, and arrives whole, in order, as it is
     taken."""
     ours, theirs = socket.socketpair()
-    run = Wire(ours)
-    worker = Wire(theirs)
+    run = MessageSocket(ours)
+    worker = MessageSocket(theirs)
     jobs = [os.urandom(3_000_000), b"the next"]
     for job in jobs:
         run.post(job)

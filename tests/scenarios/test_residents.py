@@ -18,19 +18,19 @@ from shapely.geometry import LineString, Point
 
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Floats, Polyline, wrap_angle
-from cosim.core.state import NOBODY, PERSON_RADIUS_M, People, PersonKind
+from cosim.core.state import NO_PEOPLE, PERSON_RADIUS_M, People, PersonKind
 from cosim.place.barriers import outline
 from cosim.place.street_map import Lane, StreetMap, Strip
 from cosim.spec.events import EventQuery, EventReply
 from cosim.spec.scenario import Barrier, City, CrowdSpec, Scenario
-from physics.ground.tiles import key_at
+from physics.ground.tiles import tile_at
 from physics.street.furniture import footprints
 from physics.street.interaction_spots import spots
 from physics.street.placement import CLEAR_HALF_M
 from physics.street.street_surface import StreetSurface
-from scenarios.events.behaviour_graph import OFF_WALK_M, BehaviorGraph, behavior_graph
-from scenarios.events.resident import SPEED_MPS, STAYS_S, Resident
-from scenarios.events.resident_director import GONE_M, WITHIN_M, Residents
+from scenarios.events.behaviour_graph import OPEN_GROUND_M, BehaviorGraph, behavior_graph
+from scenarios.events.resident import SPEED_MPS, STAY_RANGES_S, Resident
+from scenarios.events.resident_director import APPEARS_WITHIN_M, REMOVED_BEYOND_M, Residents
 from scenarios.suites.catalog import load_suite, with_crowd
 from sumo_nets.city.store import city_net
 from sumo_nets.crowd.demand import SIGHT_M
@@ -74,8 +74,8 @@ def town(seed: int, style: str = "mixed") -> Town:
     graph = behavior_graph(street_map, ground, route, (fence,))
     around = LineString(route).buffer(80.0)
     x0, y0, x1, y1 = around.bounds
-    (i0, j0) = key_at(x0, y0)
-    (i1, j1) = key_at(x1, y1)
+    (i0, j0) = tile_at(x0, y0)
+    (i1, j1) = tile_at(x1, y1)
     houses = [
         b.polygon
         for i in range(i0, i1 + 1)
@@ -139,7 +139,7 @@ def lived(
 ) -> list[Moment]:
     """Residents around a robot that drives along the route, and two who stand in their way."""
     line = Polyline(of.route)
-    shown = NOBODY
+    shown = NO_PEOPLE
     moments = []
     still = of.graph.xy[[0, of.graph.waypoints // 2]]
     director = Residents(Nobody(), of.graph, count, seed, lambda: shown)
@@ -255,7 +255,7 @@ def test_who_does_something_faces_it_and_leaves_the_middle_free() -> None:
             assert (
                 min(at.distance(line) for line in middles) > CLEAR_HALF_M + PERSON_RADIUS_M - 1e-6
             )
-            assert at.distance(walk) < OFF_WALK_M + 0.01
+            assert at.distance(walk) < OPEN_GROUND_M + 0.01
     assert seen == {"bench", "window", "stop"}
 
 
@@ -293,7 +293,7 @@ def test_a_resident_walks_idles_and_does_something(three_minutes: list[Moment]) 
                 SPEED_MPS[0] <= one_of.speed_mps <= SPEED_MPS[1]
                 and one_of.shown_mps <= one_of.speed_mps + 1e-6
             )
-            assert one_of.stay_s <= max(high for _, high in STAYS_S.values())
+            assert one_of.stay_s <= max(high for _, high in STAY_RANGES_S.values())
             if one_of.phase == "interacting" and one_of.since_tick is not None:
                 spot = one.graph.spot(one_of.goal)
                 assert spot is not None and one_of.heading_rad == spot.heading_rad
@@ -348,9 +348,15 @@ def test_they_come_and_go_out_of_sight() -> None:
         here = {r.number: r for r in moment.residents}
         robot = moment.query.robot_x_m, moment.query.robot_y_m
         for number in here.keys() - before.keys():
-            assert SIGHT_M <= math.dist((here[number].x_m, here[number].y_m), robot) <= WITHIN_M
+            assert (
+                SIGHT_M
+                <= math.dist((here[number].x_m, here[number].y_m), robot)
+                <= APPEARS_WITHIN_M
+            )
         for number in before.keys() - here.keys():
-            assert math.dist((before[number].x_m, before[number].y_m), robot) > GONE_M - 0.2
+            assert (
+                math.dist((before[number].x_m, before[number].y_m), robot) > REMOVED_BEYOND_M - 0.2
+            )
         before = here
 
 
@@ -397,7 +403,7 @@ def test_an_episode_with_residents_is_replayed_and_compared() -> None:
     from cosim.place.walk_graph import WalkGraph
     from cosim.policies.load import load_policy
     from cosim.results.referee import Verdict
-    from scenarios.episodes.replay import Recorded, compared
+    from scenarios.episodes.replay import RecordedEpisode, replay_and_compare
     from scenarios.episodes.run_episode import run_episode
     from scenarios.places.nets import place
     from scenarios.suites.long_horizon import build_long_horizon
@@ -416,5 +422,5 @@ def test_an_episode_with_residents_is_replayed_and_compared() -> None:
     outcome = run_episode(scenario, load_policy("orca"), watches=[watch])
     assert outcome.log is not None and outcome.record.status == "done", outcome.record.reason
     assert len(names) >= 6 and PersonKind.RESIDENT in outcome.log.people_kind
-    state_hash, without = compared(Recorded(scenario, outcome.record, outcome.log))
+    state_hash, without = replay_and_compare(RecordedEpisode(scenario, outcome.record, outcome.log))
     assert state_hash == outcome.record.state_hash and without.people.compared > 0

@@ -17,18 +17,18 @@ from shapely.geometry import LineString, box
 
 from cosim.core.errors import RunError, SpecError, UsageError
 from cosim.core.geometry import Polyline, Pose
-from cosim.core.state import NO_VEHICLES, NOBODY, Command, People, RobotState, Signal, Street
+from cosim.core.state import NO_PEOPLE, NO_VEHICLES, Command, People, RobotState, Signal, Street
 from cosim.episode.control import command_of
 from cosim.episode.interfaces import Observation, Privileged
-from cosim.episode.policy_caller import Driver
-from cosim.place.barriers import fenced
+from cosim.episode.policy_caller import PolicyCaller
+from cosim.place.barriers import without_barriers
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies import POLICIES
-from cosim.policies.privileged.orca import Here, lane_past
-from cosim.policies.privileged.rollout import BodyDisks, Way
+from cosim.policies.privileged.orca import PathState, best_lane_past
+from cosim.policies.privileged.rollout import BodyDisks, SampledPath
 from cosim.policies.privileged.route import best_lane, crossing_limit
-from cosim.policies.privileged.route_planner import Clearance
-from cosim.policies.privileged.social_force import bodies_m
+from cosim.policies.privileged.route_planner import DistanceField
+from cosim.policies.privileged.social_force import contact_distance_m
 from cosim.policies.privileged.standing_groups import lines
 from cosim.results.run_folder import RunFolder
 from cosim.spec import robot as table
@@ -38,7 +38,7 @@ from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import COURIER, ROBOTS, SCOUT, Mount, Robot, Skid
 from cosim.spec.scenario import Suite, content_hash
 from physics.cameras.view import robot_shot
-from physics.robots import hash_of_robot, urdf_of
+from physics.robots import robot_hash, urdf_path
 from physics.street.street_surface import StreetSurface
 from scenarios.places.nets import place
 from scenarios.runs.planning import run_spec
@@ -110,7 +110,7 @@ EVERY = pytest.mark.parametrize("robot", [*ROBOTS.values(), BARROW], ids=[*ROBOT
 
 
 def seen(
-    robot: Robot, others: People = NOBODY, heading_rad: float = 0.0, v_mps: float = 0.0
+    robot: Robot, others: People = NO_PEOPLE, heading_rad: float = 0.0, v_mps: float = 0.0
 ) -> Observation:
     """A robot on a straight route along the x axis; the walkway is free 1.7 m to either side."""
     state = RobotState(Pose(5.0, 0.0, heading_rad), v_mps)
@@ -167,14 +167,17 @@ def test_a_wider_robot_keeps_farther_from_who_stands_and_a_longer_one_stops_earl
         beside = standing(8.0, 0.62 + BodyDisks.of(small).radius_m)
         known = seen(small, beside).privileged
         assert known is not None
-        here = Here(Way(known.route), known.route_s_m, Clearance(known.free, known.route))
+        here = PathState(
+            SampledPath(known.route), known.route_s_m, DistanceField(known.free, known.route)
+        )
         lanes = [
-            lane_past(known, BodyDisks.of(one), here, lines(beside), 0.0) for one in (small, large)
+            best_lane_past(known, BodyDisks.of(one), here, lines(beside), 0.0)
+            for one in (small, large)
         ]
         assert lanes[1] < lanes[0] == 0.0
         offsets = [best_lane(known, one, 0.0, patient=True)[0] for one in (small, large)]
         assert offsets[1] < offsets[0] == 0.0
-        assert bodies_m(large) - bodies_m(small) == pytest.approx(
+        assert contact_distance_m(large) - contact_distance_m(small) == pytest.approx(
             (large.length_m - small.length_m) / 2
         )
         red = dataclasses.replace(
@@ -243,9 +246,9 @@ def test_a_mount_that_the_robot_lacks_is_refused_before_anything_runs(
     assert not (tmp_path / "run").exists()
     whole = with_robot(load_suite("reactive"), barrow.name)
     spec = run_spec(
-        whole, whole.scenarios[:1], "p", Driver.of(policy), EpisodeOptions(camera="bullet")
+        whole, whole.scenarios[:1], "p", PolicyCaller.of(policy), EpisodeOptions(camera="bullet")
     )
-    assert spec.robots == {"barrow": hash_of_robot(barrow)}
+    assert spec.robots == {"barrow": robot_hash(barrow)}
 
 
 def test_a_barrier_stands_across_the_route_of_a_wider_robot(barrow: Robot) -> None:
@@ -284,15 +287,15 @@ def test_an_edited_robot_is_another_one(barrow: Robot, tmp_path: Path) -> None:
     """A number of its row and a word of its URDF are in its hash, which a resumed run is held
     against."""
     again = dataclasses.replace(barrow, urdf=str(tmp_path / "again.urdf"))
-    Path(again.urdf).write_bytes(urdf_of(barrow).read_bytes())
-    as_it_was = hash_of_robot(again)
+    Path(again.urdf).write_bytes(urdf_path(barrow).read_bytes())
+    as_it_was = robot_hash(again)
     assert (
-        hash_of_robot(dataclasses.replace(again, v_max_mps=again.v_max_mps + 0.1))
+        robot_hash(dataclasses.replace(again, v_max_mps=again.v_max_mps + 0.1))
         != as_it_was
-        == hash_of_robot(again)
+        == robot_hash(again)
     )
-    Path(again.urdf).write_bytes(urdf_of(barrow).read_bytes() + b"<!-- heavier -->")
-    assert hash_of_robot(again) != as_it_was
+    Path(again.urdf).write_bytes(urdf_path(barrow).read_bytes() + b"<!-- heavier -->")
+    assert robot_hash(again) != as_it_was
 
 
 def test_a_robot_that_is_not_there_is_refused_with_those_that_are(
@@ -320,7 +323,7 @@ def test_a_urdf_is_as_its_row_says(name: str, barrow: Robot) -> None:
     client = p.connect(p.DIRECT)
     try:
         body = p.loadURDF(
-            str(urdf_of(robot)), flags=p.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client
+            str(urdf_path(robot)), flags=p.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client
         )
         infos = [p.getJointInfo(body, j, client) for j in range(p.getNumJoints(body, client))]
         (x, y, z), _ = p.getBasePositionAndOrientation(body, client)
@@ -422,7 +425,9 @@ def test_the_one_way_is_proved_for_the_robot_that_shall_drive_it(
     built = long_horizon.build_long_horizon(where, street_map, graph, 0, "wide", barrow)
     assert built.robot == "barrow"
     route = LineString(built.route)
-    open_to_all = fenced(street_map.walkable_near(shapely.buffer(route, 20.0)), built.barriers)
+    open_to_all = without_barriers(
+        street_map.walkable_near(shapely.buffer(route, 20.0)), built.barriers
+    )
     assert shapely.buffer(open_to_all, -barrow.width_m / 2).covers(route)
     monkeypatch.setattr(long_horizon, "TRIES", 20)
     monkeypatch.setattr(long_horizon, "SEARCHES", 0)

@@ -15,11 +15,11 @@ from shapely.geometry import LineString, Point, Polygon, box
 from cosim.core.clock import Clock
 from cosim.core.errors import SpecError, UsageError
 from cosim.core.geometry import Polyline
-from cosim.core.state import NO_VEHICLES, NOBODY, RobotState, Street
+from cosim.core.state import NO_PEOPLE, NO_VEHICLES, RobotState, Street
 from cosim.episode.interfaces import Privileged
 from cosim.episode.loop import Moment, query
-from cosim.episode.policy_caller import Driver
-from cosim.place.barriers import barrier_at, branches, fenced, prove_single_path
+from cosim.episode.policy_caller import PolicyCaller
+from cosim.place.barriers import barrier_at, ports_to_close, prove_single_path, without_barriers
 from cosim.place.route_line import way_line
 from cosim.place.street_map import Corner, Lane, Port, StreetMap, Strip, WalkableArea
 from cosim.place.walk_graph import WalkGraph
@@ -36,7 +36,7 @@ from cosim.spec.scenario import (
     read_suite,
     write_suite,
 )
-from cosim.spec.selection import scenarios_chosen
+from cosim.spec.selection import select_scenarios
 from scenarios.events import EVENT_KINDS, react
 from scenarios.places.nets import place
 from scenarios.suites import long_horizon, unit
@@ -118,15 +118,15 @@ def test_scenarios_are_chosen_by_event() -> None:
     """All with an event of the kinds asked for; a kind that is not there is answered with those
     that are."""
     whole = load_suite("reactive")
-    assert {s.events[0].kind for s in scenarios_chosen(whole, kinds=["frontal", "lateral"])} == {
+    assert {s.events[0].kind for s in select_scenarios(whole, kinds=["frontal", "lateral"])} == {
         "frontal",
         "lateral",
     }
-    assert [s.events[0].kind for s in scenarios_chosen(whole, kinds=["frontal"], episodes=2)] == [
+    assert [s.events[0].kind for s in select_scenarios(whole, kinds=["frontal"], episodes=2)] == [
         "frontal"
     ] * 2
     with pytest.raises(UsageError, match=r"event 'ambush'.*frontal"):
-        scenarios_chosen(whole, kinds=["ambush"])
+        select_scenarios(whole, kinds=["ambush"])
 
 
 def test_a_suite_survives_its_file(tmp_path: Path) -> None:
@@ -182,13 +182,13 @@ def test_free_space_ends_at_furniture() -> None:
     """Where a prop stands on walkable ground it is cut out; where none does the area is the same
     object."""
     from physics.street.furniture import Prop, footprints
-    from scenarios.episodes.wiring import clear_of
+    from scenarios.episodes.wiring import without_obstacles
 
     area = cross_map().walkable
     post = Prop("prop:east:0", "lamp", 0, 20.0, 1.2, 0.0, 0)
     beside = Prop("prop:east:1", "bench", 0, 20.0, 4.0, 0.0, 0)
-    assert clear_of(area, [beside]) is area and clear_of(area, []) is area
-    free = clear_of(area, [post, beside])
+    assert without_obstacles(area, [beside]) is area and without_obstacles(area, []) is area
+    free = without_obstacles(area, [post, beside])
     assert free.area == pytest.approx(area.area - footprints([post])[0].area)
     assert not free.intersects(Point(20.0, 1.2))
 
@@ -214,7 +214,7 @@ def test_a_scenario_has_exactly_one_walkable_path(shipped: Scenario) -> None:
     _, street_map = place(scenario.place)
     route = scenario.route_line
     near = shapely.buffer(LineString(scenario.route), 200.0)
-    free = fenced(street_map.walkable_near(near), scenario.barriers)
+    free = without_barriers(street_map.walkable_near(near), scenario.barriers)
     part = next(p for p in shapely.get_parts(free) if p.covers(Point(route.points[0])))
     assert part.covers(Point(route.points[-1]))
     assert not [ring for ring in part.interiors if shapely.Polygon(ring).area > 0.25]
@@ -248,7 +248,7 @@ def cross_map(width_m: float = 3.2) -> StreetMap:
 def test_branches_are_the_ports_a_way_does_not_use() -> None:
     """On a crossroads from west to east, north and south are closed."""
     way = [Port("west", 0), Port("east", 0)]
-    assert branches(cross_map(), way) == [Port("north", 0), Port("south", 0)]
+    assert ports_to_close(cross_map(), way) == [Port("north", 0), Port("south", 0)]
 
 
 def test_the_proof_refuses_an_open_branch_and_a_closed_way() -> None:
@@ -257,7 +257,7 @@ def test_the_proof_refuses_an_open_branch_and_a_closed_way() -> None:
     street_map = cross_map()
     way = [Port("west", 0), Port("east", 0)]
     route = Polyline([(-30, 0), (30, 0)])
-    fences = [barrier_at(street_map, port) for port in branches(street_map, way)]
+    fences = [barrier_at(street_map, port) for port in ports_to_close(street_map, way)]
     part = prove_single_path(street_map, route, fences, way, 0.3)
     assert part.covers(Point(30, 0)) and not part.covers(Point(0, 30))
     across = barrier_at(street_map, Port("east", 0))
@@ -278,7 +278,7 @@ def test_the_proof_refuses_a_way_round_an_island() -> None:
         "island", street_map.bounds, street_map.strips, {"middle": holed}, {}, {}
     )
     way = [Port("west", 0), Port("east", 0)]
-    fences = [barrier_at(street_map, port) for port in branches(street_map, way)]
+    fences = [barrier_at(street_map, port) for port in ports_to_close(street_map, way)]
     with pytest.raises(SpecError, match=r"two ways remain: they lead round \(0\.1, 0\.1\)"):
         prove_single_path(street_map, Polyline([(-30, 0), (30, 0)]), fences, way, 0.2)
 
@@ -321,7 +321,7 @@ def test_a_fence_closes_its_whole_strip() -> None:
     """Each port's fence cuts its strip from its corner."""
     street_map = cross_map()
     for name in street_map.strips:
-        free = fenced(street_map.walkable, [barrier_at(street_map, Port(name, 0))])
+        free = without_barriers(street_map.walkable, [barrier_at(street_map, Port(name, 0))])
         far = Point(street_map.strips[name].line[-1] * 0.9)
         part = next(p for p in shapely.get_parts(free) if p.covers(far))
         assert not part.covers(Point(0, 0))
@@ -340,7 +340,7 @@ def test_a_slanting_fence_closes_a_crossing_that_meets_its_corner_at_an_angle() 
     far = Point(0, 40)
 
     def reached(fence: Barrier) -> bool:
-        free = fenced(street_map.walkable, [fence])
+        free = without_barriers(street_map.walkable, [fence])
         return any(
             part.covers(far) and part.covers(Point(0, -1)) for part in shapely.get_parts(free)
         )
@@ -439,7 +439,7 @@ def test_every_policy_answers_within_its_manifest(name: str, robot: Robot) -> No
     street."""
     from cosim.episode.interfaces import Observation
 
-    driver = Driver(POLICIES[name]())
+    driver = PolicyCaller(POLICIES[name]())
     Clock.for_rate(driver.manifest.rate_hz)
     route = Polyline([(0, 0), (50, 0)])
     driver.reset("t", 0)
@@ -448,7 +448,7 @@ def test_every_policy_answers_within_its_manifest(name: str, robot: Robot) -> No
             RobotState(route.at(tick * 0.05), 1.0),
             route,
             tick * 0.05,
-            NOBODY,
+            NO_PEOPLE,
             NO_VEHICLES,
             {},
             (),
@@ -462,7 +462,7 @@ def test_the_walking_graph_agrees_with_the_branches() -> None:
     """With its branches closed, a way is the only one: the graph reaches nothing else."""
     street_map = cross_map()
     graph = WalkGraph(street_map)
-    closed = frozenset(branches(street_map, [Port("west", 0), Port("east", 0)]))
+    closed = frozenset(ports_to_close(street_map, [Port("west", 0), Port("east", 0)]))
     reach = graph.reach(Port("west", 1), closed)
     assert {p.strip for p in reach.ports if np.isfinite(reach.to(p))} == {"west", "east"}
     assert all(a != b for a, b in itertools.combinations(closed, 2))

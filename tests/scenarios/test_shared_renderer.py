@@ -16,18 +16,26 @@ import numpy as np
 import pytest
 import shapely
 
-from bridge.policy_server import Answer, AskAct, AskReset, Begun, PolicyReply, Refusal, decode_reply
+from bridge.policy_server import (
+    ActReply,
+    ActRequest,
+    EpisodeReply,
+    PolicyReply,
+    Refusal,
+    ResetRequest,
+    decode_reply,
+)
 from cosim.core.errors import EngineError, PolicyError, RendererLost, UsageError
-from cosim.core.framing import Wire
+from cosim.core.framing import MessageSocket
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import NO_VEHICLES, Frame, People, RobotState, Street
 from cosim.episode.interfaces import Observation, Policy, Privileged
-from cosim.episode.policy_caller import Driver
+from cosim.episode.policy_caller import PolicyCaller
 from cosim.policies.load import load_policy
 from cosim.results.log import Log
 from cosim.results.run_folder import read_records, read_spec
 from cosim.spec.camera import CameraSpec
-from cosim.spec.episode_id import pseudonym_of
+from cosim.spec.episode_id import episode_id_of
 from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import COURIER
@@ -41,7 +49,7 @@ from scenarios.ipc.shared_memory import SharedMemory
 from scenarios.places.nets import place
 from scenarios.runs import run as suite_run
 from scenarios.runs.policy_host import shared_driver
-from scenarios.runs.shared_renderer import End, SharedRenderer, check_shared
+from scenarios.runs.shared_renderer import RendererEnd, SharedRenderer, check_shared
 from scenarios.tools.bench.cameras import busy_street
 from scenarios.tools.verify.doctor import small_scenario
 from tests.conftest import Cosim, without_lines
@@ -157,7 +165,7 @@ def test_pictures_and_labels_are_those_of_a_camera_of_ones_own(tmp_path: Path) -
             if k == 1:
                 links.pop().close()
             if k == 2:
-                links.pop().tell(AskReset("", "no policy is here", "", 0))
+                links.pop().tell(ResetRequest("", "no policy is here", "", 0))
         assert expected[0][3].rgb.tobytes() != expected[1][3].rgb.tobytes() and len(links) == 1
         with pytest.raises(
             EngineError, match="the shared renderer: UsageError: unknown map 'nowhere'"
@@ -188,7 +196,7 @@ def test_who_connects_says_that_it_waits() -> None:
             end, _ = listening.accept()
             waited.append(end)
             socket.send_fds(end, [b"\0"], [memory.descriptor])
-            Wire(end).send(encode_exchange(Rendered(1, "late")))
+            MessageSocket(end).send(encode_exchange(Rendered(1, "late")))
 
         made = RendererLink(address, accept, waiting_every_s=0.01)
         made.enter(small_scenario())
@@ -197,7 +205,7 @@ def test_who_connects_says_that_it_waits() -> None:
     memory.close()
 
 
-def knows(name: str, step: int) -> AskAct:
+def knows(name: str, step: int) -> ActRequest:
     """The request of the environment of a blind policy at a step."""
     people = People.of(("c1",), [[3.0, 0.0]], [0.0], [1.0], ("walk",))
     robot = RobotState(Pose(0.0, 0.0, 0.0), 0.5)
@@ -207,7 +215,7 @@ def knows(name: str, step: int) -> AskAct:
     )
     seen = Observation(5 * step, 0.25 * step, None, 0.5, 0.0, COURIER, known)
     fields, _ = encoded_fields(seen)
-    return AskAct("r", name, "a", step, **fields, about=None if step else encoded_about(seen))
+    return ActRequest("r", name, "a", step, **fields, about=None if step else encoded_about(seen))
 
 
 @pytest.mark.engine
@@ -219,12 +227,12 @@ def test_what_takes_the_policy_down_names_whom_it_was_asked_for(tmp_path: Path) 
         def begun(*names: str) -> list[RendererLink]:
             links = [linked(renderer) for _ in names]
             for link, name in zip(links, names, strict=True):
-                assert decode_reply(link.exchange(AskReset("r", name, "a", 0))) == Begun(
+                assert decode_reply(link.exchange(ResetRequest("r", name, "a", 0))) == EpisodeReply(
                     "r", name, "a"
                 )
             for step in (0, 1):
                 replies = together(links, names, step)
-                assert replies == [Answer("r", name, "a", step, 0.59, 0.0) for name in names]
+                assert replies == [ActReply("r", name, "a", step, 0.59, 0.0) for name in names]
             return links
 
         def together(
@@ -246,11 +254,11 @@ def test_what_takes_the_policy_down_names_whom_it_was_asked_for(tmp_path: Path) 
             driver.reset("fails-in-reset", 0)
         renderer.tend()
         ends = {
-            "hangs": End("the renderer process was ended", 1.0),
-            "exits": End(
+            "hangs": RendererEnd("the renderer process was ended", 1.0),
+            "exits": RendererEnd(
                 "the renderer process ended with exit code 7 in the policy's act at 0.50 s"
             ),
-            "closes": End("the renderer process ended with exit code 1"),
+            "closes": RendererEnd("the renderer process ended with exit code 1"),
         }
         for number, (name, end) in enumerate(ends.items(), start=1):
             honest_one, other = begun("honest", name)
@@ -307,7 +315,7 @@ def test_a_run_is_the_same_with_a_shared_renderer_that_asks_the_policy(
     ended = [line[1] for line in notes if line[0] == "ended"]
     asked = [line for line in notes if line[0] != "ended"]
     assert len({line[0] for line in asked}) == 1 and sum(len(line) - 1 for line in asked) == 8
-    called = {pseudonym_of(7, scenario).episode for scenario in scenarios_of("a", "b")}
+    called = {episode_id_of(7, scenario).episode for scenario in scenarios_of("a", "b")}
     assert set(ended) == {name for line in asked for name in line[1:]} == called and len(ended) == 2
     assert cosim("run", "small.json", *words, "--resume", cwd=tmp_path).returncode == 0
 
@@ -362,9 +370,9 @@ def test_episodes_whose_renderer_is_killed_are_run_again(
 def test_where_there_is_nothing_to_share_it_is_said() -> None:
     """A blind policy that is asked for each episode by itself, a camera that is not gl, a policy
     object: in words."""
-    check_shared(Driver(Together()), "gl")
-    check_shared(Driver(Seeing()), "gl")
-    check_shared(Driver(Knowing()), "bullet")
+    check_shared(PolicyCaller(Together()), "gl")
+    check_shared(PolicyCaller(Seeing()), "gl")
+    check_shared(PolicyCaller(Knowing()), "bullet")
     with pytest.raises(
         UsageError,
         match="policy 'orca' has no camera and no method 'act_batch': leave --shared-rend",
@@ -373,7 +381,7 @@ def test_where_there_is_nothing_to_share_it_is_said() -> None:
     with pytest.raises(
         UsageError, match="draws by OpenGL, not by the bullet camera: use --camera gl"
     ):
-        check_shared(Driver(Seeing()), "bullet")
+        check_shared(PolicyCaller(Seeing()), "bullet")
     deep = Manifest("deep", camera=CameraSpec(depth=True))
     wide = Manifest("wide", cameras={"left": CameraSpec(mount="left")})
     for manifest, what in (
@@ -383,7 +391,7 @@ def test_where_there_is_nothing_to_share_it_is_said() -> None:
         with pytest.raises(
             UsageError, match=f"policy {what}, which a shared renderer does not give"
         ):
-            check_shared(Driver(Seeing(), manifest), "gl")
+            check_shared(PolicyCaller(Seeing(), manifest), "gl")
     with pytest.raises(UsageError, match="shared_renderer=True needs a policy by its name"):
         suite_run.run(suite_of("a"), Together(), shared_renderer=True)
 

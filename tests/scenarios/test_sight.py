@@ -9,17 +9,17 @@ import math
 import numpy as np
 import pytest
 
-from cosim.core.state import NOBODY, People, PersonKind
+from cosim.core.state import NO_PEOPLE, People, PersonKind
 from cosim.people.steering import nearby_people
 from cosim.spec.events import Event, EventQuery, EventReply, EventState, NearbyPerson
 from cosim.spec.injection import Injected, Injection
 from scenarios.events import EVENT_KINDS, react
 from scenarios.events.injected_person import (
     InjectedPerson,
-    arriving,
+    actor_id,
     injected_actor,
-    injected_moved_on,
-    shown_id,
+    spawn_injected,
+    step_injected,
 )
 
 TICK_MS = 50
@@ -94,7 +94,7 @@ def told(person: InjectedPerson) -> NearbyPerson:
     """A person as it sees others of its kind."""
     one = person.walker
     return NearbyPerson(
-        shown_id(person.injection), one.x_m, one.y_m, one.vx_mps, one.vy_mps, PersonKind.INJECTED
+        actor_id(person.injection), one.x_m, one.y_m, one.vx_mps, one.vy_mps, PersonKind.INJECTED
     )
 
 
@@ -189,7 +189,7 @@ def test_an_overtaking_pedestrian_overtakes_people_too() -> None:
 
 def test_an_injected_person_goes_round_people_and_ends_beside_who_stands_at_its_end() -> None:
     """An injected person passes people on its path and ends next to the one at its end."""
-    person = arriving(
+    person = spawn_injected(
         Injected(
             tick=0, injection=Injection(id="anna", path=((0.0, 5.0), (10.0, 5.0)), stay_s=100.0)
         )
@@ -198,7 +198,7 @@ def test_an_injected_person_goes_round_people_and_ends_beside_who_stands_at_its_
     ways = []
     for tick in range(400):
         me = told(person)
-        after = injected_moved_on(person, asked(tick, 90.0, 0.0, (*standing, me)))
+        after = step_injected(person, asked(tick, 90.0, 0.0, (*standing, me)))
         assert after is not None
         person = after
         ways.append((person.walker.x_m, person.walker.y_m))
@@ -213,13 +213,11 @@ def test_guests_who_are_injected_into_one_place_at_once_part(names: str) -> None
     arrive."""
     path = ((0.0, 5.0), (10.0, 5.0))
     injected_people = [
-        arriving(Injected(tick=0, injection=Injection(id=name, path=path))) for name in names
+        spawn_injected(Injected(tick=0, injection=Injection(id=name, path=path))) for name in names
     ]
     for tick in range(120):
         seen = tuple(map(told, injected_people))
-        after = [
-            injected_moved_on(person, asked(tick, 90.0, 0.0, seen)) for person in injected_people
-        ]
+        after = [step_injected(person, asked(tick, 90.0, 0.0, seen)) for person in injected_people]
         injected_people = [person for person in after if person is not None]
         places = [(g.walker.x_m, g.walker.y_m) for g in injected_people]
         gaps = [math.dist(a, b) for a, b in itertools.combinations(places, 2)]
@@ -245,7 +243,7 @@ def test_the_director_is_told_of_those_near_the_people_it_moves_and_not_of_these
         pytest.approx((0.0, 0.5)),
     ]
     crowd = People.of(ids[:2], xy[:2], [0.0] * 2, [1.0] * 2, ("walk",) * 2)
-    assert nearby_people(crowd) == nearby_people(NOBODY) == ()
+    assert nearby_people(crowd) == nearby_people(NO_PEOPLE) == ()
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from cosim.core.state import Command
 from cosim.episode.interfaces import Observation
 from cosim.policies import POLICIES
 from cosim.policies.load import load_policy
-from cosim.results.event_monitor import Hidden
+from cosim.results.event_monitor import OcclusionTest
 from cosim.results.record import Record
 from cosim.results.rejudge import contradictions
 from cosim.spec.manifest import Manifest
@@ -91,7 +91,7 @@ def test_who_comes_by_an_event_that_nobody_could_see_has_done_nothing(
 
     def veiled(*given: object) -> None:
         *before, _, clock = given
-        hides: Hidden = lambda eye, points: points[:, 0] > -1e9  # noqa: E731
+        hides: OcclusionTest = lambda eye, points: points[:, 0] > -1e9  # noqa: E731
         begin(*before, hides, clock)  # type: ignore[arg-type]
 
     monkeypatch.setattr(Scorer, "__init__", veiled)

@@ -26,7 +26,7 @@ from cosim.spec.scenario import (
     content_hash,
     read_suite,
 )
-from cosim.spec.selection import scenarios_chosen
+from cosim.spec.selection import select_scenarios
 from scenarios.events import EVENT_KINDS
 from scenarios.places.nets import place
 from scenarios.suites.catalog import SUITES, load_suite, with_crowd
@@ -375,8 +375,8 @@ def test_the_recipes_make_what_the_benchmark_says() -> None:
 
 def test_scenarios_are_chosen_by_split() -> None:
     """`--split test` runs those of test alone; a split that no scenario is of is refused."""
-    assert {s.split for s in scenarios_chosen(honest("unit").suite, split="test")} == {"test"}
-    assert len(scenarios_chosen(honest("unit").suite, split="val")) == 264
+    assert {s.split for s in select_scenarios(honest("unit").suite, split="test")} == {"test"}
+    assert len(select_scenarios(honest("unit").suite, split="val")) == 264
 
 
 def test_added_street_life_is_marked() -> None:

@@ -11,7 +11,7 @@ import cosim
 from cosim.core.errors import MachineError
 from cosim.core.state import Command
 from cosim.episode.interfaces import Policy
-from cosim.episode.policy_caller import Driver
+from cosim.episode.policy_caller import PolicyCaller
 from cosim.results.log import Log
 from cosim.results.run_folder import read_records
 from cosim.spec.camera import CameraSpec
@@ -45,7 +45,7 @@ class Fails(Ahead):
 
 def done_here(policy: Policy, hear: MessageHandler) -> None:
     """One short scenario in this process."""
-    driver = Driver.of(policy)
+    driver = PolicyCaller.of(policy)
     worker = InProcess(driver).start(Hello("mine", driver.manifest, driver.source_hash))
     worker.give(Job(msgspec.structs.replace(small_scenario(), time_limit_s=1.0)))
     assert worker.poll(hear) is None

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cosim.core.errors import UsageError
-from cosim.spec.episode_id import drawn_seed, pseudonym_of, seed_for
+from cosim.spec.episode_id import episode_id_of, random_run_seed, seed_for
 from cosim.spec.options import EpisodeOptions
 from tests.support.shipped import all_shipped
 
@@ -21,11 +21,11 @@ from tests.support.shipped import all_shipped
 def test_no_two_runs_tell_the_same(one: int, other: int) -> None:
     """Names and seeds of all shipped scenarios are distinct within a run, and between runs of
     different seeds."""
-    called = [pseudonym_of(one, scenario) for scenario in all_shipped()]
+    called = [episode_id_of(one, scenario) for scenario in all_shipped()]
     assert len({name for name, _ in called}) == len(all_shipped()) == len(set(called))
     if one != other:
         assert not {name for name, _ in called} & {
-            pseudonym_of(other, scenario).episode for scenario in all_shipped()
+            episode_id_of(other, scenario).episode for scenario in all_shipped()
         }
 
 
@@ -34,7 +34,7 @@ def test_a_name_tells_neither_event_nor_order() -> None:
     is the suite's."""
     orders = []
     for seed in range(6):
-        names = [pseudonym_of(seed, scenario).episode for scenario in all_shipped()]
+        names = [episode_id_of(seed, scenario).episode for scenario in all_shipped()]
         assert all(re.fullmatch("k[0-9a-f]{11}", name) for name in names)
         orders.append(tuple(sorted(range(len(names)), key=names.__getitem__)))
         of_event = [
@@ -47,22 +47,22 @@ def test_a_name_tells_neither_event_nor_order() -> None:
 def test_it_is_the_same_everywhere_and_hangs_on_the_scenario_alone() -> None:
     """Fixed by hand here, so that a run that is finished by another version keeps its names."""
     scenario = all_shipped()[0]
-    assert pseudonym_of(5, scenario) == pseudonym_of(
+    assert episode_id_of(5, scenario) == episode_id_of(
         5, msgspec.structs.replace(scenario, robot="scout")
     )
-    assert pseudonym_of(5, scenario) != pseudonym_of(
+    assert episode_id_of(5, scenario) != episode_id_of(
         5, msgspec.structs.replace(scenario, suite="other")
     )
     assert (
         seed_for("policy", 5, scenario)
-        == pseudonym_of(5, scenario).seed
+        == episode_id_of(5, scenario).seed
         != seed_for("goal", 5, scenario)
     )
 
 
 def test_a_run_draws_a_seed_that_cannot_be_tried_through() -> None:
     """Each time another one, of 53 bits."""
-    drawn = [drawn_seed() for _ in range(200)]
+    drawn = [random_run_seed() for _ in range(200)]
     assert (
         len(set(drawn)) == 200 and max(drawn) > 2**48 and all(0 <= seed < 2**53 for seed in drawn)
     )

@@ -11,7 +11,7 @@ from cosim.core.errors import RunError, UsageError
 from cosim.results.run_folder import RunFolder
 from cosim.results.run_spec import RunSpec
 from cosim.spec.scenario import Suite
-from cosim.spec.selection import scenarios_chosen, selection_in_words
+from cosim.spec.selection import select_scenarios, selection_in_words
 from scenarios.suites.catalog import load_suite
 from tests.run_specs import spec_of
 
@@ -23,15 +23,15 @@ def reactive() -> Suite:
 
 def test_static_is_chosen_like_an_event(reactive: Suite) -> None:
     """The hundred scenarios without an event are found by their name, alone and beside an event."""
-    assert {s.structure for s in scenarios_chosen(reactive, kinds=["static"])} == {"static"}
-    assert len(scenarios_chosen(reactive, kinds=["static"])) == 100
-    assert len(scenarios_chosen(reactive, kinds=["frontal", "static"])) == 200
+    assert {s.structure for s in select_scenarios(reactive, kinds=["static"])} == {"static"}
+    assert len(select_scenarios(reactive, kinds=["static"])) == 100
+    assert len(select_scenarios(reactive, kinds=["frontal", "static"])) == 200
     with pytest.raises(
         UsageError, match=r"unknown event 'statik'. Valid choices: .*, static. Did you mean static"
     ):
-        scenarios_chosen(reactive, kinds=["statik"])
+        select_scenarios(reactive, kinds=["statik"])
     with pytest.raises(UsageError, match=r"--event static: suite 'unit' has no events"):
-        scenarios_chosen(load_suite("unit"), kinds=["static"])
+        select_scenarios(load_suite("unit"), kinds=["static"])
 
 
 CHOICES: dict[str, dict[str, object]] = {
@@ -54,7 +54,7 @@ CHOICES: dict[str, dict[str, object]] = {
 @pytest.mark.parametrize("words", CHOICES)
 def test_the_options_that_chose_scenarios_are_found(reactive: Suite, words: str) -> None:
     """From the ids alone: the fewest options that choose these and no others."""
-    chosen = scenarios_chosen(reactive, **CHOICES[words])  # type: ignore[arg-type]
+    chosen = select_scenarios(reactive, **CHOICES[words])  # type: ignore[arg-type]
     assert selection_in_words(reactive, [scenario.id for scenario in chosen]) == words
 
 
@@ -68,7 +68,7 @@ def test_a_run_resumed_with_another_selection_names_the_options(
         return msgspec.structs.replace(spec_of(reactive), scenarios=tuple(ids))
 
     every = [scenario.id for scenario in reactive.scenarios]
-    some = [scenario.id for scenario in scenarios_chosen(reactive, kinds=["frontal"], episodes=30)]
+    some = [scenario.id for scenario in select_scenarios(reactive, kinds=["frontal"], episodes=30)]
     with RunFolder.create(tmp_path / "run", spec(some), reactive):
         pass
     with pytest.raises(RunError) as caught:

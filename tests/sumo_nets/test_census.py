@@ -22,7 +22,14 @@ from cosim.spec.scenario import City
 from sumo_nets.city.census import BLOCKS, ZONES, _shape, census, clear_width_m, longest_walk_m
 from sumo_nets.city.city import STYLES
 from sumo_nets.city.signals import signal_faults
-from sumo_nets.city.store import SEEDS, build_city, city_net, is_whole, shipped_cities, write_city
+from sumo_nets.city.store import (
+    SEEDS,
+    build_city,
+    city_net,
+    is_undamaged,
+    shipped_cities,
+    write_city,
+)
 from sumo_nets.net.net_file import read_net
 from sumo_nets.net.raw_file import net_content_hash
 from sumo_nets.net.snapshot import street_map_of
@@ -137,7 +144,7 @@ def test_a_damaged_net_in_the_cache_is_built_again(
     path = city_net(city)
     whole = path.read_bytes()
     path.write_bytes(damage(whole))
-    assert not is_whole(path)
+    assert not is_undamaged(path)
     assert city_net(city).read_bytes() == whole
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 import shapely
 
-from cosim.core.cache import BUILDING, forget_entries
+from cosim.core.cache import BUILDING_PREFIX, clean_up
 from cosim.core.errors import MapError, UsageError
 from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import City
@@ -296,7 +296,7 @@ def test_store_builds_once_and_refuses_another_net(
     assert city_net(City(seed=9, size_m=200.0, net_hash=net_content_hash(path))) == path
     assert path.stat().st_ino == built and path.stat().st_mtime > 0.0
     assert [p.name for p in tmp_path.iterdir() if not p.name.startswith(".")] == [path.name]
-    forget_entries(limit_bytes=0)
+    clean_up(limit_bytes=0)
     assert path.exists()
     with pytest.raises(
         MapError, match=r"made on 0123456789abcdef: delete the file to build it again"
@@ -317,12 +317,12 @@ def test_processes_build_one_city_at_once(tmp_path: Path, monkeypatch: pytest.Mo
         subprocess.Popen([sys.executable, "-c", code], stdout=-1, text=True) for _ in range(3)
     )
     ends_s = time.monotonic() + PATIENCE_S
-    while not list(tmp_path.glob(f"{BUILDING}*/*")) and time.monotonic() < ends_s:
+    while not list(tmp_path.glob(f"{BUILDING_PREFIX}*/*")) and time.monotonic() < ends_s:
         time.sleep(0.01)
     dies.kill()
     dies.communicate()
     assert [other.communicate(timeout=PATIENCE_S)[0] for other in others] == ["True\n"] * 2
-    forget_entries()
+    clean_up()
     assert [path.name for path in tmp_path.iterdir() if path.name not in (".lock", ".in-use")] == [
         city_net(City(seed=9, size_m=200.0)).name
     ]

@@ -18,7 +18,7 @@ from cosim.episode.loop import Step
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies.privileged.route import bearing_to
 from cosim.results.referee import Verdict
-from cosim.results.traffic import braking_for
+from cosim.results.traffic import vehicles_braking_for
 from cosim.spec.events import Actor, EventReply
 from cosim.spec.manifest import Manifest
 from cosim.spec.scenario import City, CrowdSpec
@@ -141,7 +141,7 @@ def test_cars_brake_for_a_robot_that_walks_at_red_and_are_counted() -> None:
     slowest: dict[str, float] = {}
 
     def watch(step: Step, verdict: Verdict) -> None:
-        braking = braking_for(step.motion.robot.pose, step.street, step.street_after, 0.05)
+        braking = vehicles_braking_for(step.motion.robot.pose, step.street, step.street_after, 0.05)
         vehicles = step.street_after.vehicles
         for name, speed_mps in zip(vehicles.ids, vehicles.speed.tolist(), strict=True):
             if name in braking or name in slowest:

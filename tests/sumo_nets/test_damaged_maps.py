@@ -167,7 +167,7 @@ def test_files_meant_to_do_harm_are_refused(
 def test_lanes_and_widths_of_real_streets_are_let_through(tmp_path: Path) -> None:
     """Words, units and several values in one tag are netconvert's to read; other tags with lanes in
     them as well."""
-    from sumo_nets.maps.osm_file import osm_facts, unpacked
+    from sumo_nets.maps.osm_file import osm_facts, unpack_map
 
     path = tmp_path / "town.osm"
     for key, value in (
@@ -182,7 +182,7 @@ def test_lanes_and_widths_of_real_streets_are_let_through(tmp_path: Path) -> Non
         ("lanes:psv", "1"),
     ):
         path.write_bytes(tagged(key, value.replace('"', "&quot;")))
-        assert osm_facts(unpacked(path, tmp_path)).roads == 4
+        assert osm_facts(unpack_map(path, tmp_path)).roads == 4
 
 
 @pytest.mark.parametrize(
@@ -236,10 +236,10 @@ def test_memory_stays_bounded_while_a_bomb_is_read(tmp_path: Path) -> None:
     path.write_bytes(zeros(400, lambda data: gzip.compress(data, mtime=0)))
     with (
         pytest.raises(MapError, match="more than 200 times its size"),
-        rawfile.file_pieces(path, "gzip") as unpacked,
+        rawfile.file_chunks(path, "gzip") as unpack_map,
     ):
         most = 0
-        for piece in unpacked:
+        for piece in unpack_map:
             most += len(piece)
     assert most <= rawfile.TIMES_PACKED * path.stat().st_size < 400_000_000 / 4
 

@@ -19,7 +19,7 @@ from cosim.spec.scenario import City, CrowdSpec
 from sumo_nets.city.store import city_net
 from sumo_nets.crowd.crowd import SumoCrowd
 from sumo_nets.crowd.demand_log import Entrances
-from sumo_nets.crowd.empty_street import TICK_MS, EmptyStreet, goes_by_itself
+from sumo_nets.crowd.empty_street import TICK_MS, EmptyStreet, needs_no_sumo
 from sumo_nets.crowd.lights import Lights, PlannedLights, SumoLights
 from sumo_nets.crowd.proxy import junction_of
 from sumo_nets.engine import close, start, sumo
@@ -100,7 +100,7 @@ def test_signals_go_by_the_clock_as_they_do_in_sumo(
 ) -> None:
     """Every crossing of a city, every tick of the longest cycle: what it shows, until when, and
     when it changes."""
-    assert street_map.signals_by_the_clock
+    assert street_map.signals_fixed_time
     cycle_ms = max(
         sum(strip.plan.durations_ms) for strip in street_map.strips.values() if strip.plan
     )
@@ -185,18 +185,18 @@ def test_who_comes_and_what_decides_while_it_runs_needs_sumo(
     net: Path, street_map: StreetMap, tmp_path: Path
 ) -> None:
     """Anybody in the crowd, anybody to be let in again, or one light whose program is not plain."""
-    assert goes_by_itself(street_map, NOBODY)
-    assert goes_by_itself(street_map, CrowdSpec(density=0.0, vehicles=0, residents=3))
+    assert needs_no_sumo(street_map, NOBODY)
+    assert needs_no_sumo(street_map, CrowdSpec(density=0.0, vehicles=0, residents=3))
     for spec in (
         CrowdSpec(persons=1, vehicles=0),
         CrowdSpec(persons=0, vehicles=1),
         CrowdSpec(density=1, vehicles=0),
     ):
-        assert not goes_by_itself(street_map, spec)
+        assert not needs_no_sumo(street_map, spec)
     came = Entrances()
-    assert goes_by_itself(street_map, NOBODY, came)
+    assert needs_no_sumo(street_map, NOBODY, came)
     came.vehicles[1.0].append("v0")
-    assert not goes_by_itself(street_map, NOBODY, came)
+    assert not needs_no_sumo(street_map, NOBODY, came)
 
     unplain: tuple[Callable[[str], str], ...] = (
         lambda was: was.replace('type="static"', 'type="actuated"'),
@@ -218,7 +218,7 @@ def test_who_comes_and_what_decides_while_it_runs_needs_sumo(
         return unplain[k](was)
 
     other = read_net(rewritten(net, tmp_path / "other.net.xml", worse))
-    assert not goes_by_itself(other, NOBODY) and len(changed) == len(unplain)
+    assert not needs_no_sumo(other, NOBODY) and len(changed) == len(unplain)
     lit = [strip for strip in other.strips.values() if strip.signalised]
     assert {junction_of(strip.id) for strip in lit if strip.plan is None} == changed
     assert not {junction_of(strip.id) for strip in lit if strip.plan is not None} & changed

@@ -18,24 +18,24 @@ import shapely
 from cosim.core.errors import MapError
 from cosim.core.geometry import Pose
 from cosim.core.state import Command, Street
-from cosim.place.street_map import LANDS, Feature, Lane, StreetMap, Strip
+from cosim.place.street_map import LAND_KINDS, Feature, Lane, StreetMap, Strip
 from cosim.spec.scenario import CityMap
 from physics.dynamics.world import BulletWorld
-from physics.ground.tiles import TILE_M, keys_within
-from physics.street.buildings import Frontage, facade_meshes
-from physics.street.clearance import clear_width
+from physics.ground.tiles import TILE_M, tiles_within
+from physics.street.buildings import BuildingRows, facade_meshes
+from physics.street.clearance import clear_widths
 from physics.street.furniture import footprints
-from physics.street.mapped import HOUSES_M, MAPPED_NEAR_M, MappedThings
+from physics.street.mapped import BUILDING_EXCLUSION_M, PROP_EXCLUSION_M, MappedObjects
 from physics.street.placement import props_of
 from physics.street.street_surface import StreetSurface
-from sumo_nets.maps.feature_file import NAME, read_features, with_features, write_features
-from sumo_nets.maps.feature_fit import WALL_GAP_M, fitted, utm_xy, utm_zone
+from sumo_nets.maps.feature_file import FEATURES_FILE, read_features, with_features, write_features
+from sumo_nets.maps.feature_fit import WALL_GAP_M, fit_features, utm_xy, utm_zone
 from sumo_nets.maps.map_store import about_map, import_map, map_hash, map_net, read_map
 from sumo_nets.maps.osm_features import (
     HIGHEST_BUILDING_M,
     LOWEST_M,
-    Found,
-    Mapped,
+    MappedFeature,
+    OsmFeatures,
     building_height_m,
     osm_features,
 )
@@ -101,7 +101,7 @@ class Drawing:
         path.write_text('<osm version="0.6">\n' + "\n".join(rows) + "\n</osm>\n", encoding="utf-8")
         return path
 
-    def found(self, path: Path) -> tuple[list[Mapped], Counter[str]]:
+    def found(self, path: Path) -> tuple[list[MappedFeature], Counter[str]]:
         self.write(path)
         found = osm_features(MapFile(path, path, "osm", ""))
         return list(found.things), Counter(found.skipped)
@@ -204,7 +204,7 @@ def test_streets_win_against_what_stands_in_them(drawn: tuple[StreetMap, tuple[s
     sidewalks = [s for s in street_map.strips.values() if s.kind == "sidewalk"]
     assert all(
         free >= min(1.2, bare) - 1e-6
-        for free, bare in clear_width(sidewalks, props_of(street_map, 1)).values()
+        for free, bare in clear_widths(sidewalks, props_of(street_map, 1)).values()
     )
 
 
@@ -222,12 +222,14 @@ def test_what_lies_on_the_other_side_of_the_earth_is_left_out(
         for lon in (-180.0, -165.0, -75.0, 0.0, 105.0, 180.0)
         for lat in (-85.0, 0.0, 52.5, 85.0)
     ]
-    things = [Mapped("tree", (np.array([spot]),), 0.0, None) for spot in spots]
+    things = [MappedFeature("tree", (np.array([spot]),), 0.0, None) for spot in spots]
     square = np.array([(0.0, 0.0), (1e-3, 0.0), (1e-3, 1e-3), (0.0, 1e-3), (0.0, 0.0)])
     things += [
-        Mapped(kind, (square + spot,), 9.0, None) for spot in spots for kind in ("building", "lawn")
+        MappedFeature(kind, (square + spot,), 9.0, None)
+        for spot in spots
+        for kind in ("building", "lawn")
     ]
-    assert fitted(Found(tuple(things), {}), location, drawn[0]) == ((), [])
+    assert fit_features(OsmFeatures(tuple(things), {}), location, drawn[0]) == ((), [])
 
 
 @pytest.mark.engine
@@ -248,19 +250,24 @@ def test_nothing_is_made_up_where_the_map_shows_it(
         for place in (street_map, bare)
         for seed in range(4)
     ]
-    assert all(found[0] == 0.0 and found[1] > MAPPED_NEAR_M for found in away[:4])
-    assert min(map(min, away[4:])) < MAPPED_NEAR_M
+    assert all(found[0] == 0.0 and found[1] > PROP_EXCLUSION_M for found in away[:4])
+    assert min(map(min, away[4:])) < PROP_EXCLUSION_M
     x0, y0, x1, y1 = street_map.bounds
-    keys = keys_within(0.5 * (x0 + x1), 0.5 * (y0 + y1), 300.0)
+    keys = tiles_within(0.5 * (x0 + x1), 0.5 * (y0 + y1), 300.0)
     rows = [
-        b for key in keys for b in Frontage(street_map, 1, MappedThings(street_map)).in_tile(key)
+        b
+        for key in keys
+        for b in BuildingRows(street_map, 1, MappedObjects(street_map)).in_tile(key)
     ]
     made_up_houses = [b for b in rows if b.outline is None]
     near = shapely.union_all([f.polygon for f in street_map.features if f.kind == "building"])
     assert (
-        made_up_houses and min(shapely.distance(b.polygon, near) for b in made_up_houses) > HOUSES_M
+        made_up_houses
+        and min(shapely.distance(b.polygon, near) for b in made_up_houses) > BUILDING_EXCLUSION_M
     )
-    assert len([b for key in keys for b in Frontage(bare, 1).in_tile(key)]) > len(made_up_houses)
+    assert len([b for key in keys for b in BuildingRows(bare, 1).in_tile(key)]) > len(
+        made_up_houses
+    )
 
 
 @pytest.mark.engine
@@ -269,7 +276,7 @@ def test_land_is_shown_and_changes_nothing_that_stands_or_rolls(
 ) -> None:
     """Land use changes the look and the hash of a map, and no bit of its objects and ground."""
     street_map, changes = drawn
-    (lot,) = (f for f in street_map.features if f.kind in LANDS)
+    (lot,) = (f for f in street_map.features if f.kind in LAND_KINDS)
     assert lot.kind == "yard" and "1 x yard" in " | ".join(changes)
     assert lot.polygon.area == pytest.approx(30.0 * 50.0, rel=0.01)
     bare = dataclasses.replace(
@@ -277,7 +284,7 @@ def test_land_is_shown_and_changes_nothing_that_stands_or_rolls(
     )
     assert props_of(street_map, 1) == props_of(bare, 1)
     shown = []
-    for key in keys_within(lot.x_m, lot.y_m, 30.0):
+    for key in tiles_within(lot.x_m, lot.y_m, 30.0):
         one, other = StreetSurface(street_map, 1), StreetSurface(bare, 1)
         chunks = [surface.chunk(key) for surface in (one, other)]
         felt = [
@@ -320,7 +327,7 @@ def test_land_is_read_as_mappers_write_it(tmp_path: Path) -> None:
     drawing.way([a, c, b, d], {"leisure": "park"})
     drawing.relation([(99_998, "outer")], {"type": "multipolygon", "natural": "wood"})
     things, skipped = drawing.found(tmp_path / "land.osm")
-    lands = [thing for thing in things if thing.kind in LANDS]
+    lands = [thing for thing in things if thing.kind in LAND_KINDS]
     assert [thing.kind for thing in lands] == ["lawn", "soil", "yard", "yard", "water", "planting"]
     assert len(lands[-1].rings) == 2
     assert skipped == {
@@ -353,9 +360,9 @@ def test_a_house_is_cut_by_tiles_and_loses_nothing() -> None:
     place = lone_map(
         house((-40, 4), (40, 4), (40, 60), (10, 60), (10, 20), (-40, 20), height_m=7.5)
     )
-    things = MappedThings(place)
+    things = MappedObjects(place)
     whole = place.features[0].polygon
-    parts = [b for key in keys_within(0.0, 0.0, 2.0 * TILE_M) for b in things.buildings(key)]
+    parts = [b for key in tiles_within(0.0, 0.0, 2.0 * TILE_M) for b in things.buildings(key)]
     assert len(parts) == 3
     assert sum(b.polygon.area for b in parts) == pytest.approx(whole.area)
     assert {b.id for b in parts} == {"building:map:0"} and len({b.facade for b in parts}) == 1
@@ -389,7 +396,7 @@ def test_features_survive_their_file_and_change_the_hash(tmp_path: Path) -> None
     """Written and read they are the same; a broken file is named; a map's hash covers them."""
     lot = Feature("yard", 24.0, 4.0, polygon=shapely.box(20.0, 0.0, 29.0, 8.0))
     features = (house((0, 0), (9, 0), (9, 9), (0, 9)), Feature("tree", 3.5, -2.25, 0.1, 6.0), lot)
-    path = tmp_path / NAME
+    path = tmp_path / FEATURES_FILE
     assert read_features(path) == () and with_features("abc", path) == "abc"
     write_features(features, path)
     assert read_features(path) == features
@@ -416,13 +423,13 @@ def test_a_scenario_of_other_features_is_refused(drawn: tuple[StreetMap, tuple[s
     net = map_net("drawn")
     assert street_map.net_hash == map_hash(net) == about_map("drawn").net_hash
     assert map_net(CityMap(map="drawn", net_hash=street_map.net_hash)) == net
-    kept = net.with_name(NAME).read_bytes()
+    kept = net.with_name(FEATURES_FILE).read_bytes()
     try:
-        write_features(street_map.features[1:], net.with_name(NAME))
+        write_features(street_map.features[1:], net.with_name(FEATURES_FILE))
         with pytest.raises(MapError, match="but the scenario was made on"):
             map_net(CityMap(map="drawn", net_hash=street_map.net_hash))
     finally:
-        net.with_name(NAME).write_bytes(kept)
+        net.with_name(FEATURES_FILE).write_bytes(kept)
 
 
 @pytest.mark.parametrize(
@@ -523,5 +530,5 @@ def test_a_finely_mapped_place_is_built_as_mapped() -> None:
     assert not len(roads.query(footprints(mapped), predicate="intersects")[0])
     sidewalks = [s for s in street_map.strips.values() if s.kind == "sidewalk"]
     assert all(
-        free >= min(1.2, bare) - 1e-6 for free, bare in clear_width(sidewalks, props).values()
+        free >= min(1.2, bare) - 1e-6 for free, bare in clear_widths(sidewalks, props).values()
     )

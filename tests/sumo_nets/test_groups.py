@@ -20,7 +20,7 @@ from scenarios.suites.catalog import load_suite, with_crowd
 from scenarios.tools.bench.crowd import widest_gaps
 from sumo_nets.city.store import build_city
 from sumo_nets.crowd.crowd import SumoCrowd
-from sumo_nets.crowd.group_cohesion import Together
+from sumo_nets.crowd.group_cohesion import GroupCohesion
 from sumo_nets.crowd.group_sampling import PERSON_MPS, SLOWEST_GROUP_MPS, GroupDraws, PersonGroup
 from sumo_nets.net.net_file import read_net
 
@@ -63,7 +63,7 @@ class Walkers:
 
 def kept(walkers: Walkers, looks: int = 2) -> dict[str, float]:
     """What two who walk together at 1.3 m/s are told in some looks, half a second apart."""
-    together = Together(walkers, STRIPS, 0.05)
+    together = GroupCohesion(walkers, STRIPS, 0.05)
     together.join(tuple(walkers.at), 1.3, ("s",))
     for _ in range(looks):
         together.keep(walkers.seen())
@@ -122,7 +122,7 @@ def test_a_group_walks_abreast_where_there_is_room() -> None:
     assert np.array(three.places(0.64)) == pytest.approx(
         np.array([(0.0, 0.0), (0.0, 0.8), (0.0, 1.6)])
     )
-    assert three.walks_at(1.5) == pytest.approx(1.42) and three.walks_at(1.12) == 1.1
+    assert three.speed_at(1.5) == pytest.approx(1.42) and three.speed_at(1.12) == 1.1
 
 
 def test_who_is_ahead_slows_down_and_who_lags_hurries() -> None:
@@ -138,7 +138,7 @@ def test_who_is_far_ahead_waits() -> None:
     """Three metres ahead one waits, and walks on when the fellow is near; also if a light has
     parted them."""
     walkers = Walkers(c0=("s", 13.0, 0.0), c1=("s", 10.0, 0.64))
-    together = Together(walkers, STRIPS, 0.05)
+    together = GroupCohesion(walkers, STRIPS, 0.05)
     together.join(("c0", "c1"), 1.3, ("s", ":c", "t"))
     for _ in range(2):
         together.keep(walkers.seen())
@@ -149,7 +149,7 @@ def test_who_is_far_ahead_waits() -> None:
     assert walkers.told["c0"] > 1.0
 
     parted = Walkers(c0=("t", 11.0, 0.0), c1=("s", 10.0, 0.64))
-    together = Together(parted, STRIPS, 0.05)
+    together = GroupCohesion(parted, STRIPS, 0.05)
     together.join(("c0", "c1"), 1.3, ("s", ":c", "t"))
     for _ in range(6):
         parted.at["c0"] = ("t", parted.at["c0"][1] + 0.65, 0.0)
@@ -164,7 +164,7 @@ def test_who_walks_aside_steps_back_unless_somebody_comes() -> None:
     kept(walkers, looks=3)
     assert sorted(y for _, _, y in walkers.at.values()) in ([0.0, 1.58], [0.34, 1.92])
     walkers = Walkers(c0=("s", 20.0, 0.0), c1=("s", 20.0, 1.92))
-    together = Together(walkers, STRIPS, 0.05)
+    together = GroupCohesion(walkers, STRIPS, 0.05)
     together.join(("c0", "c1"), 1.3, ("s", ":c", "t"))
     for _ in range(3):
         together.keep({**walkers.seen(), "c9": Spot(walkers.at["c0"][1] + 3.0, 0.96)})
@@ -176,7 +176,7 @@ def test_who_has_left_is_forgotten() -> None:
     """Of three one leaves, and two are a group; the last one walks on at its own speed; two may
     leave at once."""
     walkers = Walkers(c0=("s", 11.0, 0.0), c1=("s", 10.0, 0.64), c2=("s", 10.0, 1.28))
-    together = Together(walkers, STRIPS, 0.05)
+    together = GroupCohesion(walkers, STRIPS, 0.05)
     together.join(("c0", "c1", "c2"), 1.3, ("s",))
     together.join(("c3", "c4"), 1.2, ("s",))
     for _ in range(2):
@@ -184,7 +184,7 @@ def test_who_has_left_is_forgotten() -> None:
         walkers.advance(0.65)
     assert walkers.told["c0"] < 1.3
     together.forget(["c0", "c1"])
-    assert together.groups == (("c0", "c1"),) and together.fellows("c2") == ("c2",)
+    assert together.groups == (("c0", "c1"),) and together.group_of("c2") == ("c2",)
     together.forget(["c0"])
     assert together.groups == () and walkers.told["c0"] == 1.3
 

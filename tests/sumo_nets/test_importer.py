@@ -25,7 +25,7 @@ from sumo_nets.city.store import build_city
 from sumo_nets.maps import importer
 from sumo_nets.maps import net_steps as netsteps
 from sumo_nets.maps import osm_crop as osmcrop
-from sumo_nets.maps.corner_repair import mend_corners
+from sumo_nets.maps.corner_repair import repair_corners
 from sumo_nets.maps.driving_side import left_hand_country
 from sumo_nets.maps.importer import Options
 from sumo_nets.maps.map_store import (
@@ -40,8 +40,8 @@ from sumo_nets.maps.map_store import (
     outdated,
     read_map,
 )
-from sumo_nets.maps.signal_check import lengthen_walks, mend_signals
-from sumo_nets.net.net_facts import read_facts, walks_of
+from sumo_nets.maps.signal_check import extend_greens, repair_signals
+from sumo_nets.net.net_facts import crossing_signals, read_facts
 from sumo_nets.net.net_file import read_net
 from sumo_nets.net.netconvert import netconvert
 from tests.conftest import Cosim
@@ -564,15 +564,17 @@ def test_crossings_that_never_have_green_get_a_phase() -> None:
       <connection from=":J_w0" to=":J_c0" tl="J" linkIndex="1"/>
       <connection from=":J_w0" to=":J_c1" tl="J" linkIndex="2"/></net>"""
     root = ET.fromstring(net)
-    assert walks_of(root).never == [":J_c0"]
-    assert mend_signals(root) == [
+    assert crossing_signals(root).never == [":J_c0"]
+    assert repair_signals(root) == [
         "signals that never let people cross got a walk phase at the end of each cycle: J"
     ]
     added = [(p.get("duration"), p.get("state")) for p in root.iter("phase")][3:]
     assert added == [("3", "yrr"), ("2", "rrr"), ("8", "rGr"), ("10", "rrr")]
-    assert walks_of(root).never == [] and mend_signals(root) == []
+    assert crossing_signals(root).never == [] and repair_signals(root) == []
     special = ET.fromstring(net.replace("static", "NEMA"))
-    assert "left as they are" in mend_signals(special)[0] and walks_of(special).never == [":J_c0"]
+    assert "left as they are" in repair_signals(special)[0] and crossing_signals(special).never == [
+        ":J_c0"
+    ]
 
 
 def with_ways(ways: dict[str, tuple[list[tuple[float, float]], dict[str, str]]]) -> str:
@@ -665,16 +667,16 @@ def test_greens_too_short_to_walk_are_lengthened() -> None:
       <connection from=":J_w0" to=":J_c0" tl="J" linkIndex="1"/>
       <connection from=":J_w0" to=":J_c1" tl="J" linkIndex="2"/></net>"""
     root = ET.fromstring(net)
-    (said,) = lengthen_walks(root)
+    (said,) = extend_greens(root)
     assert said.endswith("longer for 2 crossings of 1 signals, by up to 9 s; no cycle is longer")
     phases = [(p.get("duration"), p.get("state")) for p in root.iter("phase")]
     assert phases == [("31", "Grr"), ("3", "yrr"), ("14", "rGG"), ("4", "rrr")]
-    assert lengthen_walks(root) == []
+    assert extend_greens(root) == []
     full = ET.fromstring(net.replace('"40"', '"12"'))
-    assert lengthen_walks(full)[0].endswith("1 cycles are up to 7 s longer")
+    assert extend_greens(full)[0].endswith("1 cycles are up to 7 s longer")
     for other in (net.replace("static", "actuated"), net.replace('"yrr"', '"yrr" next="2"')):
         special = ET.fromstring(other)
-        assert lengthen_walks(special) == [
+        assert extend_greens(special) == [
             "green too short to walk at 1 signals, left as it is (not a fixed program): J"
         ] and ET.tostring(special) == ET.tostring(ET.fromstring(other))
 
@@ -721,7 +723,7 @@ def test_torn_corners_are_widened_and_good_ones_left_alone(tmp_path: Path) -> No
     leave = Port("a", 1)
     enter = Port("b", 0)
     assert read_net(path).corners[":J_w0"].polygon.buffer(-0.1).geom_type == "MultiPolygon"
-    assert mend_corners(root, read_net(path)) == [
+    assert repair_corners(root, read_net(path)) == [
         "1 of 2 corners were torn or pinched: widened along the ways across them"
     ]
     path.write_bytes(ET.tostring(root))
@@ -729,7 +731,7 @@ def test_torn_corners_are_widened_and_good_ones_left_alone(tmp_path: Path) -> No
     assert through_corner(mended, leave, enter)[[0, -1]].tolist() == [[10.0, 0.0], [14.0, 0.0]]
     assert mended.corners[":J_w0"].polygon.buffer(-0.4).geom_type == "Polygon"
     assert [e[0].get("shape") for e in root if e.get("id") == ":K_w0"] == ["24,-1 28,-1 28,1 24,1"]
-    assert mend_corners(root, mended) == []
+    assert repair_corners(root, mended) == []
 
 
 @pytest.mark.engine

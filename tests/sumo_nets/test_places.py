@@ -29,7 +29,7 @@ from sumo_nets.maps.map_store import (
     maps_folder,
     read_map,
 )
-from sumo_nets.maps.place_names import place_called
+from sumo_nets.maps.place_names import resolve_place
 from tests.conftest import PATIENCE_S, Cosim
 from tests.sumo_nets.test_damaged_maps import TOWN
 
@@ -57,19 +57,19 @@ def test_what_is_no_place_is_told_with_what_there_is(tmp_path: Path) -> None:
     with pytest.raises(
         UsageError, match=r"unknown map 'nowhere'.*sumo-fkk-in.*Or give a path: the folder of"
     ):
-        place_called("nowhere")
+        resolve_place("nowhere")
     with pytest.raises(UsageError, match=r"a folder without city\.json or about\.json"):
-        place_called(str(tmp_path))
+        resolve_place(str(tmp_path))
     town = tmp_path / "town.osm"
     town.write_text(TOWN)
     with pytest.raises(UsageError, match=r"import it first with `cosim map import .*town\.osm`"):
-        place_called(str(town))
+        resolve_place(str(town))
     os.mkfifo(tmp_path / "pipe.net.xml")
     with pytest.raises(MapError, match="it is a pipe, not a file"):
-        place_called(str(tmp_path / "pipe.net.xml"))
+        resolve_place(str(tmp_path / "pipe.net.xml"))
     (tmp_path / "city.json").write_text('{"city": 7}')
     with pytest.raises(MapError, match=r"city\.json: cannot be read: .*make the city again"):
-        place_called(str(tmp_path))
+        resolve_place(str(tmp_path))
 
 
 def test_suites_that_cannot_be_drawn_are_refused() -> None:
@@ -94,8 +94,8 @@ def test_names_that_lead_out_of_the_store_are_unknown() -> None:
 def test_the_folder_of_a_city_is_that_city(city: Path) -> None:
     """It is the same place as by its seed, with the hash of its net, so that a run of it needs no
     folder."""
-    where = place_called(str(city), roughness=0.2)
-    assert where == place_called(str(city / NET_NAME), roughness=0.2)
+    where = resolve_place(str(city), roughness=0.2)
+    assert where == resolve_place(str(city / NET_NAME), roughness=0.2)
     assert isinstance(where, City) and (where.seed, where.size_m, where.roughness) == (
         7,
         400.0,
@@ -117,10 +117,10 @@ def test_a_changed_city_is_a_map(city: Path, tmp_path: Path) -> None:
     shutil.copytree(city, mine)
     net = (mine / NET_NAME).read_text()
     (mine / NET_NAME).write_text(re.sub(r' speed="\d[\d.]*"', ' speed="7.77"', net))
-    where = place_called(str(mine))
+    where = resolve_place(str(mine))
     assert isinstance(where, CityMap) and about_map(where.map).source == NET_NAME
     began = (maps_folder() / where.map / ABOUT).stat().st_mtime_ns
-    assert place_called(str(mine)) == where
+    assert resolve_place(str(mine)) == where
     assert (maps_folder() / where.map / ABOUT).stat().st_mtime_ns == began
     (scenario,) = suite_on_map("long-horizon", str(mine), 0, 1).scenarios
     assert (
@@ -139,12 +139,12 @@ def test_nets_and_folders_of_maps_are_imported_under_a_name(city: Path, tmp_path
     other.parent.mkdir()
     other.write_bytes(net.read_bytes() + b"<!-- another file -->\n")
     assert (
-        place_called(str(net))
+        resolve_place(str(net))
         == CityMap(map="street")
-        == place_called(str(net))
-        == place_called("street")
+        == resolve_place(str(net))
+        == resolve_place("street")
     )
-    second = place_called(str(other))
+    second = resolve_place(str(other))
     assert (
         isinstance(second, CityMap)
         and second.map.startswith("street-")
@@ -161,11 +161,11 @@ def test_nets_and_folders_of_maps_are_imported_under_a_name(city: Path, tmp_path
     )
     about = import_map(tmp_path / "town.osm")
     assert {f.kind for f in read_map("town").features} == {"building"}
-    assert place_called(str(maps_folder() / "town")) == CityMap(map="town")
+    assert resolve_place(str(maps_folder() / "town")) == CityMap(map="town")
     elsewhere = tmp_path / "kept"
     shutil.move(maps_folder() / "town", elsewhere)
     assert (
-        place_called(str(elsewhere)) == CityMap(map="town")
+        resolve_place(str(elsewhere)) == CityMap(map="town")
         and read_map("town").net_hash == about.net_hash
     )
     assert {f.kind for f in read_map("town").features} == {"building"}
@@ -173,7 +173,7 @@ def test_nets_and_folders_of_maps_are_imported_under_a_name(city: Path, tmp_path
         (elsewhere / "net.xml").read_text().replace("13.89", "13.88")
     )
     with pytest.raises(MapError, match="it was changed since; import the changed net"):
-        place_called(str(elsewhere))
+        resolve_place(str(elsewhere))
 
 
 @pytest.mark.engine
@@ -252,4 +252,4 @@ def test_a_damaged_map_does_not_hide_the_others(
     with pytest.raises(
         UsageError, match=r"unknown map 'x'\. Valid choices: berlin-1, .* broken, .*sumo-"
     ):
-        place_called("x")
+        resolve_place("x")

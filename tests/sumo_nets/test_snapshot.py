@@ -12,7 +12,7 @@ from cosim.core.errors import MapError
 from cosim.spec.scenario import City
 from sumo_nets.city.store import city_net
 from sumo_nets.net.net_file import read_net
-from sumo_nets.net.snapshot import SNAPSHOT_FOLDER, map_as_bytes, street_map_of, thawed
+from sumo_nets.net.snapshot import SNAPSHOT_FOLDER, map_as_bytes, map_from_bytes, street_map_of
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_a_snapshot_holds_every_value_of_the_map(net: Path) -> None:
     """Ids, numbers, lines and polygons come back equal to the bit, in the same order."""
     read = read_net(net)
-    back = thawed(map_as_bytes(read))
+    back = map_from_bytes(map_as_bytes(read))
     assert map_as_bytes(back) == map_as_bytes(read)
     assert (back.name, back.bounds, back.net_hash, back.left_hand) == (
         read.name,

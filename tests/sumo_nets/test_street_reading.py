@@ -16,8 +16,8 @@ from cosim.spec.events import EventReply
 from cosim.spec.scenario import City, CrowdSpec
 from sumo_nets.city.store import city_net
 from sumo_nets.crowd.crowd import SumoCrowd
-from sumo_nets.crowd.lights import Kerbs
-from sumo_nets.crowd.proxy import KEEP_ROUTE, KEEP_ROUTE_ON_ROAD, MATCH_M, NEARER_M, Walks
+from sumo_nets.crowd.lights import WaitingSpots
+from sumo_nets.crowd.proxy import KEEP_ROUTE, KEEP_ROUTE_ON_ROAD, LEAD_MIN_M, MATCH_M, Walks
 from sumo_nets.engine import persons_near, sumo, vehicles_near
 from sumo_nets.net.snapshot import street_map_of
 
@@ -90,7 +90,7 @@ def test_where_a_sidewalk_leads_it_is_all_the_same_which_lanes_sumo_compares(
         if walk is None:
             continue
         inside = shapely.contains_xy(strip.polygon, x_m, y_m)
-        leads = bool(inside) and walks.lead.metres(walk.first, walk.second, x_m, y_m) > NEARER_M
+        leads = bool(inside) and walks.lead.metres(walk.first, walk.second, x_m, y_m) > LEAD_MIN_M
         names = {mode: f"p{k}.{mode}" for mode in (KEEP_ROUTE, KEEP_ROUTE_ON_ROAD)}
         for name in names.values():
             sumo.person.add(name, walk.first, 1.0)
@@ -115,7 +115,7 @@ def test_where_a_sidewalk_leads_it_is_all_the_same_which_lanes_sumo_compares(
 @pytest.mark.engine
 def test_who_waits_before_a_crossing_stands_on_its_nearest_corner(street_map: StreetMap) -> None:
     """A waiting spot before a crossing lies on its nearest corner."""
-    kerbs = Kerbs(street_map)
+    kerbs = WaitingSpots(street_map)
     rng = np.random.default_rng(5)
     crossings = [
         strip
@@ -127,7 +127,7 @@ def test_who_waits_before_a_crossing_stands_on_its_nearest_corner(street_map: St
     at = ends + rng.uniform(-1.5, 1.5, ends.shape)
     spots = kerbs.behind(asked, at)
     for name, wanted, spot in zip(asked, at, spots, strict=True):
-        assert np.array_equal(Kerbs(street_map).behind([name], wanted[None])[0], spot)
+        assert np.array_equal(WaitingSpots(street_map).behind([name], wanted[None])[0], spot)
         corners = [
             street_map.corners[str(corner)].polygon for corner in street_map.strips[name].corners
         ]

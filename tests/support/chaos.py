@@ -29,7 +29,7 @@ from cosim.core.errors import EngineError
 from cosim.core.state import Command
 from cosim.episode.interfaces import Observation
 from cosim.results.run_folder import read_records
-from cosim.spec.episode_id import pseudonym_of
+from cosim.spec.episode_id import episode_id_of
 from cosim.spec.manifest import Manifest
 from cosim.spec.scenario import Suite, write_suite
 from scenarios.runs.status import CONFLICT, LOG_FILE
@@ -105,7 +105,7 @@ def tiny_suite(folder: Path, episodes: int) -> None:
         ),
     )
     write_suite(suite, folder / "suite.json")
-    poison = pseudonym_of(_SEED, suite.scenarios[episodes // 2]).episode
+    poison = episode_id_of(_SEED, suite.scenarios[episodes // 2]).episode
     (folder / "poison").write_text(poison)
 
 

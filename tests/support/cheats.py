@@ -12,7 +12,7 @@ import numpy as np
 from cosim.core.state import STILL, Command
 from cosim.episode.interfaces import Observation
 from cosim.spec.camera import CameraSpec
-from cosim.spec.episode_id import pseudonym_of
+from cosim.spec.episode_id import episode_id_of
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import Mount
 from cosim.spec.scenario import Scenario
@@ -211,7 +211,7 @@ def _names() -> dict[str, Scenario]:
     found: dict[str, Scenario] = {}
     for scenario in _shipped():
         found[scenario.id] = scenario
-        found |= {pseudonym_of(seed, scenario).episode: scenario for seed in range(100)}
+        found |= {episode_id_of(seed, scenario).episode: scenario for seed in range(100)}
     return found
 
 

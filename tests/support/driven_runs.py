@@ -13,7 +13,7 @@ from cosim.core.clock import Clock
 from cosim.core.geometry import Pose
 from cosim.episode.loop import place_on_route
 from cosim.results.log import Log
-from cosim.results.metrics import EpisodeFacts, every_metric
+from cosim.results.metrics import EpisodeFacts, compute_metrics
 from cosim.results.record import Record
 from cosim.results.referee import Failure
 from cosim.results.run_folder import RunFolder
@@ -103,7 +103,7 @@ def episode_of(
         record, status="done", ended=ended, ticks=ticks, failures=failures
     )
     return msgspec.structs.replace(
-        record, measures=every_metric(EpisodeFacts.of(record, scenario, log))
+        record, measures=compute_metrics(EpisodeFacts.of(record, scenario, log))
     ), log
 
 

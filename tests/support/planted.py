@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from cosim.core.state import Planned
+from cosim.core.state import WaypointCommand
 from cosim.episode.interfaces import Observation
 from cosim.spec.camera import CameraSpec
 from cosim.spec.goal import PointGoal
@@ -197,10 +197,10 @@ class YToTheRight(Right):
 class DrivesOtherwiseThanPlanned(Right):
     """Its waypoints are right, and its command, which is what is driven, turns the other way."""
 
-    def act(self, seen: Observation) -> Planned:
+    def act(self, seen: Observation) -> WaypointCommand:
         way = super().act(seen)
         turn = math.atan2(way[0, 1], way[0, 0])
-        return Planned(float(np.hypot(*way[0])), -turn, (0.25 * way).astype(np.float32), 2)
+        return WaypointCommand(float(np.hypot(*way[0])), -turn, (0.25 * way).astype(np.float32), 2)
 
 
 class GoalIgnored(Right):

@@ -7,9 +7,9 @@ import numpy as np
 import shapely
 
 from cosim.place.street_map import Corner, Lane, Port, StreetMap, Strip
-from physics.ground.tiles import Key, Tile, keys_within, square
+from physics.ground.tiles import Key, Tile, tile_bounds, tiles_within
 
-KEYS = keys_within(0.0, 0.0, 60.0)
+KEYS = tiles_within(0.0, 0.0, 60.0)
 
 
 def tiny_map() -> StreetMap:
@@ -107,7 +107,7 @@ def no_cracks(key: Key, corners: np.ndarray) -> None:
         for a, b in zip(triangle, triangle[1:] + triangle[:1], strict=True):
             edge = frozenset((tuple(a), tuple(b)))
             edges[edge] = edges.get(edge, 0) + 1
-    x0, y0, x1, y1 = (round(1e3 * c) for c in square(key))
+    x0, y0, x1, y1 = (round(1e3 * c) for c in tile_bounds(key))
     for edge, count in edges.items():
         xs, ys = {p[0] for p in edge}, {p[1] for p in edge}
         on_border = (

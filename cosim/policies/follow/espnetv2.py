@@ -154,7 +154,7 @@ class _Builder:
             out = self._pyramid(out, f"bu_dec_l{step}", size)
         # The file contains a last activation of strided units, which the network does not use.
         unused = tuple(f"base_net.level{n}_0.eesp.module_act.weight" for n in (2, 3, 4))
-        self._weights.check_all_taken(
+        self._weights.check_all_used(
             lambda name: name in unused or name.endswith(".num_batches_tracked")
         )
         self._writer.operator("Identity", "scores", out)

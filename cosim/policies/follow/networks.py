@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from cosim.core.errors import UsageError
-from cosim.policies.onnx.graph import Graph, said_by_runtime
+from cosim.policies.onnx.graph import Graph, runtime_message
 from cosim.policies.onnx.manifest import FileFacts
 from cosim.policies.onnx.weights import NetworkFile, weights_file
 
@@ -73,7 +73,7 @@ def _answer_in_grey(
         answer = graph.ask({name: np.full(shape, 0.5, np.float32)}, [wanted])[wanted]
     except Exception as error:
         raise UsageError(
-            f"{graph.path}: cannot be run by onnxruntime: {said_by_runtime(error)}"
+            f"{graph.path}: cannot be run by onnxruntime: {runtime_message(error)}"
         ) from error
     if answer.shape != sides or not np.isfinite(answer).all():
         raise UsageError(

@@ -16,7 +16,7 @@ from cosim.episode.interfaces import Observation
 from cosim.policies.follow.networks import Networks
 from cosim.policies.onnx.graph import Graph
 from cosim.policies.onnx.inputs import PictureInput
-from cosim.policies.onnx.pictures import picture_numbers
+from cosim.policies.onnx.pictures import picture_tensor
 from cosim.spec.camera import Calibration, CameraSpec
 from cosim.spec.goal import PointGoal
 from cosim.spec.manifest import Manifest
@@ -47,7 +47,7 @@ _SPECKS: Final = 5
 def walkable_pixels(rgb: NDArray[np.uint8], network: Graph) -> NDArray[np.bool_]:
     """Return (128, 256): whether a picture (H, W, 3) shows walkable area."""
     tensor = np.ascontiguousarray(
-        picture_numbers(rgb, _STREET_INPUT).transpose(2, 0, 1)[None], np.float32
+        picture_tensor(rgb, _STREET_INPUT).transpose(2, 0, 1)[None], np.float32
     )
     kinds = network.ask({"picture": tensor}, ["scores"])["scores"][0].argmax(axis=0)
     free = np.isin(kinds, _NO_OBSTACLE).astype(np.uint8)
@@ -84,7 +84,7 @@ class Ground:
         ]
         return np.asarray(there | ~self._seen)
 
-    def feet_of(self, boxes: Floats) -> Floats:
+    def ground_positions(self, boxes: Floats) -> Floats:
         """Return (N, 2) ground positions in the robot's frame of people in boxes (N, 4).
 
         People whose feet are above the horizon or beyond `GROUND_AHEAD_M` are left out.
@@ -117,16 +117,16 @@ _OVERLAP: Final = 0.45
 """Overlap (IoU) above which the less confident of two boxes is dropped."""
 
 
-def people_in(rgb: NDArray[np.uint8], network: Graph) -> Floats:
+def detect_people(rgb: NDArray[np.uint8], network: Graph) -> Floats:
     """Return (N, 4): left, top, right and bottom in pixels of people in a picture (H, W, 3)."""
     tensor = np.ascontiguousarray(
-        picture_numbers(rgb, _PEOPLE_INPUT).transpose(2, 0, 1)[None], np.float32
+        picture_tensor(rgb, _PEOPLE_INPUT).transpose(2, 0, 1)[None], np.float32
     )
     output = network.ask({"images": tensor}, ["output"])["output"][0]
-    return boxes_of(output, _SIDE_PX / max(rgb.shape[:2]))
+    return decode_boxes(output, _SIDE_PX / max(rgb.shape[:2]))
 
 
-def boxes_of(output: NDArray[np.float32], scale: float) -> Floats:
+def decode_boxes(output: NDArray[np.float32], scale: float) -> Floats:
     """Decode the network's output (3549, 85) to boxes (N, 4): left, top, right and bottom.
 
     scale: Size of the network's input relative to the picture.
@@ -188,7 +188,7 @@ class WaitForPeople:
         return time_s - self._first_s < _WAITS_S
 
 
-LOOKS_M: Final = 5.0
+ARC_LENGTH_M: Final = 5.0
 """Length of an arc in metres."""
 _PERSON_M: Final = 0.45
 """Distance in metres to the centre of a person, in addition to `_CLEAR_M`."""
@@ -206,7 +206,7 @@ _PACE: Final = 0.8
 """Full speed as a fraction of the robot's cruising speed."""
 _ARCS: Final = 41
 """Number of arcs compared."""
-_STEPS_M: Final = np.arange(0.3, LOOKS_M, GROUND_CELL_M)
+_STEPS_M: Final = np.arange(0.3, ARC_LENGTH_M, GROUND_CELL_M)
 """Distances in metres along an arc at which it is checked."""
 _ROOM = 0.8
 """Value of space to both sides, relative to the free length."""
@@ -254,12 +254,12 @@ def best_arc(
     )
     first = np.where(blocked.any(axis=1), blocked.argmax(axis=1), len(_STEPS_M))
     free_m = np.where(
-        first < len(_STEPS_M), _STEPS_M[np.minimum(first, len(_STEPS_M) - 1)], LOOKS_M
+        first < len(_STEPS_M), _STEPS_M[np.minimum(first, len(_STEPS_M) - 1)], ARC_LENGTH_M
     )
     on_the_way = np.arange(len(_STEPS_M)) < np.maximum(first, 1)[:, None]
     mean_room = (np.minimum(rooms, _ROOM_M) * on_the_way).sum(axis=1) / on_the_way.sum(axis=1)
     end = np.arctan2(y[:, -1], x[:, -1])
-    worth = free_m / LOOKS_M + _ROOM * mean_room / _ROOM_M
+    worth = free_m / ARC_LENGTH_M + _ROOM * mean_room / _ROOM_M
     worth -= (
         _STRAIGHT * np.abs(end)
         if towards_rad is None
@@ -345,7 +345,7 @@ class Follow:
         robot, goal = observation.robot, observation.goal
         ground = Ground(camera, (rgb.shape[1], rgb.shape[0]))
         free = ground.free(walkable_pixels(rgb, self._networks.street))
-        people = ground.feet_of(people_in(rgb, self._networks.people))
+        people = ground.ground_positions(detect_people(rgb, self._networks.people))
         if self._waiting.stands(observation.time_s, people):
             return STILL
         towards = goal.bearing_rad if isinstance(goal, PointGoal) else None

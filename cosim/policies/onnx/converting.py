@@ -94,7 +94,7 @@ class PublishedArrays:
         self._unused.discard(name)
         return numbers
 
-    def check_all_taken(self, ignored: Callable[[str], bool] = lambda _: False) -> None:
+    def check_all_used(self, ignored: Callable[[str], bool] = lambda _: False) -> None:
         """Raise ValueError for arrays that were neither taken nor ignored."""
         if left := [name for name in self._unused if not ignored(name)]:
             raise ValueError(

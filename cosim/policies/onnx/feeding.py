@@ -32,7 +32,12 @@ from cosim.policies.onnx.inputs import (
     TurnInput,
     VectorInput,
 )
-from cosim.policies.onnx.pictures import axes_turned, laid_out, picture_numbers, shape_of
+from cosim.policies.onnx.pictures import (
+    combine_frames,
+    picture_tensor,
+    tensor_shape,
+    transpose_frame,
+)
 from cosim.spec.goal import PATCH_PX, Goal, ImageGoal, PointGoal, RoutePatch, TurningGoal
 
 _GOAL_IS_GIVEN: Final = "a run gives the goals that the manifest asks for"
@@ -96,18 +101,20 @@ class Feeder:
         if isinstance(one, ConstantInput) and not isinstance(one.value, tuple):
             return np.full(_whole(name, port), one.value, port.dtype)
         if isinstance(one, PixelsInput | RoutePatchInput):
-            return laid_out(self._frames(one, seen), one.layout).astype(port.dtype, copy=False)
+            return combine_frames(self._frames(one, seen), one.layout).astype(
+                port.dtype, copy=False
+            )
         return _shaped(name, self._numbers(one, seen), port)
 
     def _frames(self, one: PixelsInput | RoutePatchInput, seen: Observation) -> list[NDArray[Any]]:
-        """Return the selected frames, transposed by `axes_turned`."""
+        """Return the selected frames, transposed by `transpose_frame`."""
         now = _frame(one, seen)
         if now is None:
             assert (
                 isinstance(one, GoalPictureInput | RoutePatchInput) and one.missing is not None
             ), _GOAL_IS_GIVEN
             now = np.full(_sides(one), one.missing, np.float32)
-        now = axes_turned(now, one.layout)
+        now = transpose_frame(now, one.layout)
         return [np.zeros_like(now) if frame is None else frame for frame in self._past_of(one, now)]
 
     def _numbers(self, one: AnyInput, seen: Observation) -> NDArray[np.float64]:
@@ -157,8 +164,8 @@ def _frame(one: PixelsInput | RoutePatchInput, seen: Observation) -> NDArray[Any
     if isinstance(one, PictureInput):
         rgb = seen.pictures[one.camera].rgb if one.camera else seen.rgb
         assert rgb is not None, "the manifest asks for a camera"
-        return picture_numbers(rgb, one)
-    return picture_numbers(goal.rgb, one) if isinstance(goal, ImageGoal) else None
+        return picture_tensor(rgb, one)
+    return picture_tensor(goal.rgb, one) if isinstance(goal, ImageGoal) else None
 
 
 def _goal_values(one: GoalPointInput, goal: Goal | None) -> NDArray[np.float64]:
@@ -256,7 +263,7 @@ def _shaped(name: str, numbers: NDArray[np.float64], port: TensorPort) -> Tensor
 
 def _check_pixels(name: str, one: PixelsInput | RoutePatchInput, port: TensorPort) -> None:
     """Raise UsageError unless a picture tensor matches the shape and type of an input."""
-    shape = shape_of(_sides(one), one.frames, one.layout)
+    shape = tensor_shape(_sides(one), one.frames, one.layout)
     if len(port.shape) != len(shape) or any(
         side not in (None, there) for side, there in zip(port.shape, shape, strict=True)
     ):
@@ -264,7 +271,7 @@ def _check_pixels(name: str, one: PixelsInput | RoutePatchInput, port: TensorPor
             f"inputs.{name}: the graph wants {port.in_words}, and layout {one.layout!r} gives "
             f"{shape}: look at frames, size, colour and layout"
         )
-    if port.dtype.kind in "iu" and isinstance(one, PixelsInput) and not one.as_they_are:
+    if port.dtype.kind in "iu" and isinstance(one, PixelsInput) and not one.keeps_bytes:
         raise UsageError(
             f"inputs.{name}: the graph wants {port.in_words}, whole numbers: say scale 1, "
             f"without mean and std"

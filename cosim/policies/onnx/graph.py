@@ -67,7 +67,7 @@ class TensorPort:
         return f"{self.dtype.name} ({axes}{',' * (len(self.shape) == 1)})"
 
 
-class AskedGraph(Protocol):
+class RunnableGraph(Protocol):
     """Graph that can be run: in this process (`Graph`) or in a child (`TrialGraph`)."""
 
     path: Path
@@ -162,7 +162,7 @@ def _providers(available: Sequence[str]) -> tuple[str, ...]:
 
 def _refusal(error: Exception, version: str) -> str:
     """Describe why the runtime does not load a graph."""
-    said = said_by_runtime(error)
+    said = runtime_message(error)
     lacks = any(
         part in said
         for part in ("is not a registered function", "Could not find an implementation")
@@ -176,7 +176,7 @@ def _refusal(error: Exception, version: str) -> str:
     return f"{what} ({version}): {said}; {remedy}"
 
 
-def said_by_runtime(error: Exception) -> str:
+def runtime_message(error: Exception) -> str:
     """Return a runtime's message on one line, without codes and source locations."""
     said = _PLACES.sub("", " ".join(str(error).split()))
     return said if len(said) <= _MOST_SAID else f"{said[:_MOST_SAID]}..."

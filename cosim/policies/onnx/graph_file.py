@@ -64,7 +64,7 @@ def external_files(data: bytes) -> list[str]:
     return sorted(found)
 
 
-def weights_not_finite(data: bytes) -> list[str]:
+def non_finite_weights(data: bytes) -> list[str]:
     """Return names of weights with NaN or infinities. Raises ValueError for an invalid file.
 
     Minus infinity is allowed, because attention masks contain it.

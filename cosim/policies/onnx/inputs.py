@@ -21,7 +21,7 @@ from cosim.spec.goal import (
     TurningGoal,
     protocols_of,
 )
-from cosim.spec.validation import Counted, Ranged, Within
+from cosim.spec.validation import ItemCount, Ranged, Within
 
 _NUMBER: Final = Within(-1e9, 1e9)
 _SIDE: Final = Within(1, 4096)
@@ -72,8 +72,8 @@ class VectorInput(PastInput, frozen=True, kw_only=True):
     """
 
     values: tuple[str, ...] = ()
-    mean: Annotated[tuple[float, ...], Counted(0, 16)] = ()
-    std: Annotated[tuple[float, ...], Counted(0, 16)] = ()
+    mean: Annotated[tuple[float, ...], ItemCount(0, 16)] = ()
+    std: Annotated[tuple[float, ...], ItemCount(0, 16)] = ()
 
     def contradictions(self) -> Iterator[str]:
         yield from _normalised(self.called, self.mean, self.std, len(self.values))
@@ -104,8 +104,8 @@ class PixelsInput(PastInput, frozen=True, kw_only=True):
     resample: Literal["area", "linear", "cubic", "nearest"] = "area"
     colour: Literal["rgb", "bgr", "grey", "yuv420"] = "rgb"
     scale: Annotated[float, Within(0, 1e6, above=True)] = 255.0
-    mean: Annotated[tuple[float, ...], Counted(0, 6)] = ()
-    std: Annotated[tuple[float, ...], Counted(0, 6)] = ()
+    mean: Annotated[tuple[float, ...], ItemCount(0, 6)] = ()
+    std: Annotated[tuple[float, ...], ItemCount(0, 6)] = ()
     layout: str = "NCHW"
 
     @property
@@ -114,7 +114,7 @@ class PixelsInput(PastInput, frozen=True, kw_only=True):
         return {"grey": 1, "yuv420": 6}.get(self.colour, 3)
 
     @property
-    def as_they_are(self) -> bool:
+    def keeps_bytes(self) -> bool:
         """Whether pixels stay bytes."""
         return self.scale == 1.0 and not self.mean and not self.std
 
@@ -126,7 +126,7 @@ class PixelsInput(PastInput, frozen=True, kw_only=True):
 
     def contradictions(self) -> Iterator[str]:
         yield from _normalised(self.called, self.mean, self.std, self.channels)
-        yield layout_refusal(self.called, self.layout, T=self.frames, C=self.channels)
+        yield layout_fault(self.called, self.layout, T=self.frames, C=self.channels)
         if not all(_SIDE.low <= side <= _SIDE.high for side in self.size):
             yield f"{self.called}size must be two sides of {_SIDE} pixels, not {list(self.size)}"
         elif self.colour == "yuv420" and (self.size[0] % 2 or self.size[1] % 2):
@@ -179,7 +179,7 @@ class GoalPointInput(VectorInput, frozen=True, kw_only=True, tag="goal_point", t
             Literal["x", "-x", "y", "-y", "distance", "cos", "sin", "-sin", "bearing", "-bearing"],
             ...,
         ],
-        Counted(1, 8),
+        ItemCount(1, 8),
     ] = ("x", "y")
     unit_m: Annotated[float, Within(0, 1e6, above=True)] = 1.0
     most_m: Annotated[float | None, Within(0, 1e6, above=True)] = None
@@ -208,7 +208,7 @@ class RoutePatchInput(PastInput, frozen=True, kw_only=True, tag="route_patch", t
     missing: Annotated[float | None, _NUMBER] = None
 
     def contradictions(self) -> Iterator[str]:
-        yield layout_refusal(self.called, self.layout, T=self.frames, C=1)
+        yield layout_fault(self.called, self.layout, T=self.frames, C=1)
 
 
 class TurnInput(AnyInput, frozen=True, kw_only=True, tag="command", tag_field="what"):
@@ -220,12 +220,12 @@ class TurnInput(AnyInput, frozen=True, kw_only=True, tag="command", tag_field="w
     """
 
     made_of = TurningGoal
-    left: Annotated[tuple[float, ...], Counted(1, 16)] = (-1.0,)
-    straight: Annotated[tuple[float, ...], Counted(1, 16)] = (0.0,)
-    right: Annotated[tuple[float, ...], Counted(1, 16)] = (1.0,)
+    left: Annotated[tuple[float, ...], ItemCount(1, 16)] = (-1.0,)
+    straight: Annotated[tuple[float, ...], ItemCount(1, 16)] = (0.0,)
+    right: Annotated[tuple[float, ...], ItemCount(1, 16)] = (1.0,)
     ahead_m: Annotated[float, Within(0, 20)] = 5.0
     beyond_deg: Annotated[float, Within(0, 180)] = 30.0
-    missing: Annotated[tuple[float, ...] | None, Counted(1, 16)] = None
+    missing: Annotated[tuple[float, ...] | None, ItemCount(1, 16)] = None
 
     def contradictions(self) -> Iterator[str]:
         counts = {
@@ -240,7 +240,7 @@ class TurnInput(AnyInput, frozen=True, kw_only=True, tag="command", tag_field="w
 class SpeedsInput(VectorInput, frozen=True, kw_only=True, tag="speeds", tag_field="what"):
     """Robot's own speeds in m/s and rad/s."""
 
-    values: Annotated[tuple[Literal["v", "w", "-w"], ...], Counted(1, 8)] = ("v", "w")
+    values: Annotated[tuple[Literal["v", "w", "-w"], ...], ItemCount(1, 8)] = ("v", "w")
 
 
 class PastPositionsInput(
@@ -254,7 +254,7 @@ class PastPositionsInput(
 
     values: Annotated[
         tuple[Literal["x", "-x", "y", "-y", "cos", "sin", "-sin", "heading", "-heading"], ...],
-        Counted(1, 8),
+        ItemCount(1, 8),
     ] = ("x", "y")
     unit_m: Annotated[float, Within(0, 1e6, above=True)] = 1.0
 
@@ -294,7 +294,7 @@ _Part = GoalPointInput | SpeedsInput | PastPositionsInput | TurnInput | Constant
 class JoinedInput(AnyInput, frozen=True, kw_only=True, tag="joined", tag_field="what"):
     """Concatenated vectors."""
 
-    parts: Annotated[tuple[_Part, ...], Counted(1, 8)]
+    parts: Annotated[tuple[_Part, ...], ItemCount(1, 8)]
 
     @property
     def needs(self) -> tuple[GoalProtocol, ...]:
@@ -349,7 +349,7 @@ def axes_of(layout: str) -> list[str]:
     return [group for group in groups if group]
 
 
-def layout_refusal(called: str, layout: str, **counts: int) -> str:
+def layout_fault(called: str, layout: str, **counts: int) -> str:
     """Return the fault of a layout for given numbers of frames T and channels C; "" if valid."""
     groups = axes_of(layout)
     letters = "".join(groups)

@@ -30,7 +30,7 @@ from cosim.spec.goal import GoalProtocol
 from cosim.spec.manifest import Manifest, WaypointRule
 from cosim.spec.odometry import OdometryKind
 from cosim.spec.spec_file import read_spec_file
-from cosim.spec.validation import Named, Ranged, Text, Within, shown
+from cosim.spec.validation import PathName, Ranged, Text, Within, shown
 
 MANIFEST_FILE: Final = "manifest.json"
 EXAMPLE_FILE: Final = "example.npz"
@@ -43,7 +43,7 @@ _MOST_NAME_BYTES: Final = 255
 _HASH: Final = re.compile(r"[0-9a-f]{64}")
 
 
-def refusal_of_name(name: str) -> str:
+def file_name_fault(name: str) -> str:
     """Return the fault of a file name in a bundle's folder; "" if valid.
 
     >>> refusal_of_name("model.onnx.data"), refusal_of_name("../model.onnx")[:17]
@@ -105,7 +105,7 @@ class BundleCamera(Ranged, frozen=True, kw_only=True):
     width: Annotated[int, Within(1, 4096)]
     height: Annotated[int, Within(1, 4096)]
     fov_deg: Annotated[float, Within(0, 180, above=True)] = 75.0
-    mount: Annotated[str, Named("a mount")] = "front"
+    mount: Annotated[str, PathName("a mount")] = "front"
     crop: tuple[int, int, int, int] | None = None
 
     def contradictions(self) -> Iterator[str]:
@@ -130,11 +130,11 @@ class BundleManifest(Ranged, frozen=True, kw_only=True):
     """
 
     format: Literal[1]
-    name: Annotated[str, Named("a policy")]
-    version: Annotated[str, Named("a version")] = "1"
+    name: Annotated[str, PathName("a policy")]
+    version: Annotated[str, PathName("a version")] = "1"
     licence: Annotated[str, Text(400)] = ""
     source: Annotated[str, Text(400)] = ""
-    model: Annotated[str, Named("a file")] = "model.onnx"
+    model: Annotated[str, PathName("a file")] = "model.onnx"
     files: dict[str, FileFacts] = msgspec.field(default_factory=dict)
     rate_hz: Annotated[float, Within(0, 20, above=True)] = 4.0
     goal: GoalProtocol = "none"
@@ -174,7 +174,7 @@ class BundleManifest(Ranged, frozen=True, kw_only=True):
         )
 
     def contradictions(self) -> Iterator[str]:
-        yield from (f"files: {refusal}" for refusal in map(refusal_of_name, self.files) if refusal)
+        yield from (f"files: {refusal}" for refusal in map(file_name_fault, self.files) if refusal)
         needs = {name: one.needs for name, one in self.inputs.items() if one.needs}
         if needs and not self.goals:
             yield (

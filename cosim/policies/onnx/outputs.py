@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.errors import PolicyError, UsageError
-from cosim.core.state import STILL, Command, Planned
+from cosim.core.state import STILL, Command, WaypointCommand
 from cosim.policies.onnx.graph import Tensor, TensorPort
-from cosim.spec.manifest import HowFollowed, WaypointRule
+from cosim.spec.manifest import WaypointRule, WaypointRuleName
 from cosim.spec.robot import Robot
-from cosim.spec.validation import Counted, Ranged, Within
+from cosim.spec.validation import ItemCount, Ranged, Within
 
 _NUMBER: Final = Within(-1e9, 1e9)
 _ABOVE_0: Final = Within(0, 1e9, above=True)
@@ -76,15 +76,15 @@ class WaypointsOutput(Ranged, frozen=True, kw_only=True, tag="waypoints", tag_fi
             ],
             ...,
         ],
-        Counted(2, 64),
+        ItemCount(2, 64),
     ] = ("x", "y")
-    scale: Annotated[tuple[float, ...], Counted(0, 64)] = ()
-    offset: Annotated[tuple[float, ...], Counted(0, 64)] = ()
+    scale: Annotated[tuple[float, ...], ItemCount(0, 64)] = ()
+    offset: Annotated[tuple[float, ...], ItemCount(0, 64)] = ()
     steps: bool = False
     unit_m: Annotated[float, _ABOVE_0] = 1.0
     index: Annotated[int, Within(0, 10_000)] = 2
     dt_s: Annotated[float, _ABOVE_0] = 0.25
-    rule: HowFollowed = "shipped"
+    rule: WaypointRuleName = "shipped"
     follow: Literal["waypoint", "speeds"] = "waypoint"
     scores: str | None = None
     mixture: Mixture | None = None
@@ -202,7 +202,7 @@ GraphOutput = WaypointsOutput | WheelsOutput | SteeringOutput | CommandOutput
 PolicyAnswer = Command | NDArray[np.float64]
 
 
-def answer_of(
+def decode_answer(
     output: GraphOutput, tensors: Mapping[str, Tensor], robot: Robot, last: Command = STILL
 ) -> PolicyAnswer:
     """Decode the outputs of a graph for one observation.
@@ -263,7 +263,7 @@ def _steered(output: SteeringOutput, tensors: Mapping[str, Tensor], last: Comman
 def _waypoints(output: WaypointsOutput, tensors: Mapping[str, Tensor]) -> PolicyAnswer:
     """Return (N, 2), or (N, 4) with cosine and sine of the heading, in the output's units.
 
-    A `Planned` if the speeds are followed.
+    A `WaypointCommand` if the speeds are followed.
     """
     rows = _rows(output, tensors)
     if output.scale:
@@ -297,7 +297,7 @@ def _waypoints(output: WaypointsOutput, tensors: Mapping[str, Tensor]) -> Policy
         return answer
     answer[:, :2] *= output.unit_m
     v_mps, w_radps = (float(column(name)[output.index]) for name in ("speed", "turn"))
-    return Planned(v_mps, w_radps, answer.astype(np.float32), output.index)
+    return WaypointCommand(v_mps, w_radps, answer.astype(np.float32), output.index)
 
 
 def _rows(output: WaypointsOutput, tensors: Mapping[str, Tensor]) -> NDArray[np.float64]:

@@ -21,10 +21,10 @@ _RESAMPLED: Final = {
 }
 
 
-def picture_numbers(rgb: NDArray[np.uint8], how: PixelsInput) -> NDArray[Any]:
+def picture_tensor(rgb: NDArray[np.uint8], how: PixelsInput) -> NDArray[Any]:
     """Return a picture (H, W, 3) as (rows, columns, channels): float32, or unchanged uint8."""
     pixels = _coloured(_fitted(_cut(rgb, how), how), how.colour)
-    if how.as_they_are:
+    if how.keeps_bytes:
         return pixels
     numbers = _numbers_of_bytes(how)
     if pixels.shape[2] in (1, 3):
@@ -46,7 +46,7 @@ def _numbers_of_bytes(how: PixelsInput) -> NDArray[np.float32]:
     return numbers
 
 
-def axes_turned(frame: NDArray[Any], layout: str) -> NDArray[Any]:
+def transpose_frame(frame: NDArray[Any], layout: str) -> NDArray[Any]:
     """Transpose a frame (H, W, C) to the order of a layout, in which C may be absent.
 
     >>> axes_turned(np.zeros((64, 85, 3)), "N(TC)HW").shape
@@ -58,8 +58,8 @@ def axes_turned(frame: NDArray[Any], layout: str) -> NDArray[Any]:
     )
 
 
-def laid_out(frames: Sequence[NDArray[Any]], layout: str) -> NDArray[Any]:
-    """Combine frames from `axes_turned` to a tensor with the axes of a layout; N is 1.
+def combine_frames(frames: Sequence[NDArray[Any]], layout: str) -> NDArray[Any]:
+    """Combine frames from `transpose_frame` to a tensor with the axes of a layout; N is 1.
 
     >>> laid_out([np.zeros((3, 64, 85))] * 6, "N(TC)HW").shape
     (1, 18, 64, 85)
@@ -68,11 +68,11 @@ def laid_out(frames: Sequence[NDArray[Any]], layout: str) -> NDArray[Any]:
     stacked = np.stack(frames, axis=letters.index("T")) if "T" in letters else frames[0]
     sides = dict(zip(letters, stacked.shape, strict=False))
     return stacked.reshape(
-        shape_of((sides["H"], sides["W"], sides.get("C", 1)), len(frames), layout)
+        tensor_shape((sides["H"], sides["W"], sides.get("C", 1)), len(frames), layout)
     )
 
 
-def shape_of(sides: tuple[int, int, int], frames: int, layout: str) -> tuple[int, ...]:
+def tensor_shape(sides: tuple[int, int, int], frames: int, layout: str) -> tuple[int, ...]:
     """Return the shape of a tensor. sides: rows, columns and channels of a frame.
 
     >>> shape_of((64, 85, 3), 6, "N(TC)HW")

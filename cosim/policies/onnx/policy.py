@@ -17,15 +17,15 @@ from cosim.core.state import STILL, Command
 from cosim.episode.control import command_of
 from cosim.episode.interfaces import Observation
 from cosim.episode.manifest_checks import calibration_of
-from cosim.episode.policy_caller import LOADED_WITHIN_S
+from cosim.episode.policy_caller import LOAD_TIMEOUT_S
 from cosim.policies.onnx.feeding import Feeder
 from cosim.policies.onnx.graph import (
     NUMBERS,
-    AskedGraph,
     Graph,
+    RunnableGraph,
     Tensor,
     runs_on_cpu,
-    said_by_runtime,
+    runtime_message,
 )
 from cosim.policies.onnx.inputs import StateInput
 from cosim.policies.onnx.manifest import (
@@ -35,9 +35,9 @@ from cosim.policies.onnx.manifest import (
     BundleManifest,
     read_bundle_manifest,
 )
-from cosim.policies.onnx.outputs import PolicyAnswer, answer_of, check_outputs
+from cosim.policies.onnx.outputs import PolicyAnswer, check_outputs, decode_answer
 from cosim.policies.onnx.trial import TrialGraph
-from cosim.policies.onnx.visnavkit import EXAMPLE, METADATA, exports_in, manifest_of_export
+from cosim.policies.onnx.visnavkit import EXAMPLE, METADATA, find_exports, manifest_of_export
 from cosim.policies.onnx.weights import bundle_files
 from cosim.spec.camera import CameraPicture
 from cosim.spec.goal import GOALS
@@ -47,7 +47,7 @@ from cosim.spec.robot import COURIER
 
 
 @dataclass(frozen=True)
-class FoundBundle:
+class BundleLocation:
     """Folder and manifest of a bundle, and the path of its example."""
 
     folder: Path
@@ -55,16 +55,16 @@ class FoundBundle:
     example: Path
 
 
-def read_bundle(place: Path) -> FoundBundle:
+def read_bundle(place: Path) -> BundleLocation:
     """Find the bundle in a folder, or visnavkit's export, in a folder or by the path of its graph.
 
     Raises UsageError if there is none or more than one; SpecError for an invalid manifest.
     """
     if (place / MANIFEST_FILE).exists():
-        return FoundBundle(place, read_bundle_manifest(place), place / EXAMPLE_FILE)
+        return BundleLocation(place, read_bundle_manifest(place), place / EXAMPLE_FILE)
     if place.is_file() and (place.parent / MANIFEST_FILE).exists():
         raise UsageError(f"{place}: is a file of the bundle {place.parent}: name that")
-    exports = [place] if place.is_file() else exports_in(place)
+    exports = [place] if place.is_file() else find_exports(place)
     if len(exports) > 1:
         raise UsageError(
             f"{place}: has several bundles: name one of {', '.join(map(str, exports))}"
@@ -73,7 +73,7 @@ def read_bundle(place: Path) -> FoundBundle:
         raise UsageError(
             f"{place}: no bundle: has no {MANIFEST_FILE}, and no graph with a {METADATA} beside it"
         )
-    return FoundBundle(
+    return BundleLocation(
         exports[0].parent, manifest_of_export(exports[0]), exports[0].with_suffix(EXAMPLE)
     )
 
@@ -82,7 +82,7 @@ _GREY = 128
 """Value of all pixels of a grey picture."""
 
 
-def onnx_policy(place: Path, within_s: float | None = LOADED_WITHIN_S) -> OnnxPolicy:
+def onnx_policy(place: Path, within_s: float | None = LOAD_TIMEOUT_S) -> OnnxPolicy:
     """Load the policy of a bundle. Raises as `OnnxPolicy` does.
 
     It answers in batches if the graph's first axis is dynamic and it does not run on the CPU.
@@ -121,7 +121,7 @@ class OnnxPolicy:
     example: Path of the bundle's example.
     """
 
-    def __init__(self, place: Path, within_s: float | None = LOADED_WITHIN_S) -> None:
+    def __init__(self, place: Path, within_s: float | None = LOAD_TIMEOUT_S) -> None:
         found = read_bundle(place)
         self.bundle = found.manifest
         self.example = found.example
@@ -131,7 +131,7 @@ class OnnxPolicy:
         inputs = self.bundle.inputs.values()
         states = [one.output for one in inputs if isinstance(one, StateInput)]
         self._names = [*dict.fromkeys([*self.bundle.output.outputs, *states])]
-        with self.on_trial() as graph:
+        with self.open_graph() as graph:
             self._check(graph)
             self._memory = _Memory(Feeder(self.bundle.inputs, graph.inputs, 0))
             answered = self._try(graph)
@@ -162,7 +162,7 @@ class OnnxPolicy:
         """Return waypoints (N, 2) or (N, 4) in units of the manifest's rule, or a command."""
         return self._answers(self.graph, [self._memory], [observation])[0]
 
-    def on_trial(self) -> AbstractContextManager[Graph | TrialGraph]:
+    def open_graph(self) -> AbstractContextManager[Graph | TrialGraph]:
         """Return the graph in a child process; in this process if another one limits it."""
         if self._within_s is None:
             return nullcontext(Graph(self._files.graph))
@@ -172,7 +172,7 @@ class OnnxPolicy:
         return _Memory(Feeder(self.bundle.inputs, self.graph.inputs, seed))
 
     def _answers(
-        self, graph: AskedGraph, memories: Sequence[_Memory], seen: Sequence[Observation]
+        self, graph: RunnableGraph, memories: Sequence[_Memory], seen: Sequence[Observation]
     ) -> list[PolicyAnswer]:
         """Run the graph on one observation, or on a batch."""
         inputs = [memory.feeder.feed(one) for memory, one in zip(memories, seen, strict=True)]
@@ -191,12 +191,12 @@ class OnnxPolicy:
         self, memory: _Memory, seen: Observation, outputs: Mapping[str, Tensor]
     ) -> PolicyAnswer:
         memory.feeder.remember(outputs)
-        answer = answer_of(self.bundle.output, outputs, seen.robot, memory.last)
+        answer = decode_answer(self.bundle.output, outputs, seen.robot, memory.last)
         if isinstance(answer, Command):
             memory.last = answer
         return answer
 
-    def _check(self, graph: AskedGraph) -> None:
+    def _check(self, graph: RunnableGraph) -> None:
         """Raise UsageError unless the inputs of graph and manifest match and the outputs exist."""
         wanted = graph.inputs
         given = self.bundle.inputs
@@ -216,12 +216,12 @@ class OnnxPolicy:
                     f"{choices}"
                 )
 
-    def _try(self, graph: AskedGraph) -> bytes:
+    def _try(self, graph: RunnableGraph) -> bytes:
         """Run the graph on grey pictures and return the bytes of its outputs.
 
         Raises UsageError if the runtime fails or the answer is invalid.
         """
-        seen = in_grey(self.manifest)
+        seen = example_observation(self.manifest)
         try:
             for _ in range(2):
                 answer = self._answers(graph, [self._memory], [seen])[0]
@@ -236,14 +236,14 @@ class OnnxPolicy:
             ) from error
         except Exception as error:
             raise UsageError(
-                f"{graph.path}: cannot be run by onnxruntime: {said_by_runtime(error)}"
+                f"{graph.path}: cannot be run by onnxruntime: {runtime_message(error)}"
             ) from error
 
 
 class OnnxBatchPolicy(OnnxPolicy):
     """ONNX policy for several episodes at once (`cosim.episode.interfaces.BatchPolicy`)."""
 
-    def __init__(self, place: Path, within_s: float | None = LOADED_WITHIN_S) -> None:
+    def __init__(self, place: Path, within_s: float | None = LOAD_TIMEOUT_S) -> None:
         super().__init__(place, within_s)
         self._memories: dict[str, _Memory] = {}
 
@@ -269,7 +269,7 @@ class OnnxBatchPolicy(OnnxPolicy):
         )
 
 
-def in_grey(manifest: Manifest) -> Observation:
+def example_observation(manifest: Manifest) -> Observation:
     """Return an example observation: grey pictures, standing still, goal 10 m ahead."""
 
     def grey(size: tuple[int, int]) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
@@ -325,12 +325,12 @@ def example_differences(policy: OnnxPolicy) -> dict[str, float]:
                 f"{array.shape}, and {wanted_is}"
             )
     try:
-        with policy.on_trial() as graph:
+        with policy.open_graph() as graph:
             found = graph.ask({name: held[name] for name in graph.inputs}, list(graph.outputs))
     except UsageError:
         raise
     except Exception as error:
-        raise UsageError(f"{path}: does not fit the graph: {said_by_runtime(error)}") from error
+        raise UsageError(f"{path}: does not fit the graph: {runtime_message(error)}") from error
     for name, array in wanted.items():
         if found[name].shape != array.shape:
             raise UsageError(

@@ -17,7 +17,7 @@ import numpy as np
 
 from cosim.core.child_process import ForkedChild
 from cosim.core.errors import UsageError
-from cosim.core.framing import Wire
+from cosim.core.framing import MessageSocket
 from cosim.policies.onnx.graph import Graph, Tensor, TensorPort, import_runtime
 
 ROOM_BYTES: Final = 4 << 30
@@ -129,7 +129,7 @@ class TrialGraph:
         )
 
 
-def _serve(path: Path, wire: Wire) -> None:
+def _serve(path: Path, wire: MessageSocket) -> None:
     """Load the graph and answer requests until the wire closes, in the child."""
     try:
         graph = Graph(path)

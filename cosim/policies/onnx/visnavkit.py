@@ -107,7 +107,7 @@ def manifest_of_export(graph: Path) -> BundleManifest:
         raise UsageError(f"{path}: {error}") from error
 
 
-def exports_in(folder: Path) -> list[Path]:
+def find_exports(folder: Path) -> list[Path]:
     """Return the graphs in a folder that have visnavkit metadata."""
     found = (
         path.with_name(path.name.removesuffix(METADATA) + ".onnx")

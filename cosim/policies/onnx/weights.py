@@ -13,9 +13,9 @@ from typing import Final
 from platformdirs import user_data_path
 
 from cosim.core.errors import UsageError
-from cosim.core.files import read_within, size_within
-from cosim.policies.onnx.graph_file import external_files, weights_not_finite
-from cosim.policies.onnx.manifest import BundleManifest, FileFacts, file_facts, refusal_of_name
+from cosim.core.files import checked_size, read_limited
+from cosim.policies.onnx.graph_file import external_files, non_finite_weights
+from cosim.policies.onnx.manifest import BundleManifest, FileFacts, file_facts, file_name_fault
 
 WEIGHTS_VARIABLE: Final = "COSIM_WEIGHTS"
 """Environment variable with a folder of weights."""
@@ -97,7 +97,7 @@ def bundle_files(folder: Path, manifest: BundleManifest) -> BundleFiles:
     data = read_file(graph)
     try:
         beside = external_files(data)
-        bad = weights_not_finite(data)
+        bad = non_finite_weights(data)
     except (ValueError, RecursionError) as error:
         raise UsageError(
             f"{graph}: is no ONNX graph: {error}; {len(data)} bytes of another format, or cut off"
@@ -110,7 +110,7 @@ def bundle_files(folder: Path, manifest: BundleManifest) -> BundleFiles:
     digest = hashlib.blake2b(digest_size=32)
     size = 0
     for name in dict.fromkeys([manifest.model, *beside, *manifest.files]):
-        if name in beside and (refusal := refusal_of_name(name)):
+        if name in beside and (refusal := file_name_fault(name)):
             raise UsageError(f"{graph}: has weights in a file beside it: {refusal}")
         path = (
             _inside(graph.with_name(name), graph.parent)
@@ -143,7 +143,7 @@ def _inside(path: Path, folder: Path) -> Path:
 def read_file(path: Path, most_bytes: int = _MOST_GRAPH_BYTES) -> bytes:
     """Read a file. Raises UsageError if it is not a regular file or larger than most_bytes."""
     with _read_in_words(path):
-        return read_within(path, most_bytes)
+        return read_limited(path, most_bytes)
 
 
 @contextmanager
@@ -175,7 +175,7 @@ def _digested(path: Path, name: str, manifest: BundleManifest, digest: hashlib.b
     blake2b = hashlib.blake2b(digest_size=32)
     sha256 = hashlib.sha256()
     with _read_in_words(path):
-        size = size_within(path, _MOST_BYTES)
+        size = checked_size(path, _MOST_BYTES)
         check("bytes", size)
         digest.update(f"{name}\0{size}\0".encode())
         with path.open("rb") as file:

@@ -9,7 +9,7 @@ area and signal timing. Future motion is predicted at constant velocity (`people
 2. Adjust the velocity towards that lane by ORCA half-planes (`cosim.people.orca`) of moving people.
 The robot does all of the avoiding.
 3. Roll out many plans (`rollout`), and take the one closest to that velocity that keeps clear of
-people and stays on the free area (`Clearance`).
+people and stays on the free area (`DistanceField`).
 
 The robot limits its speed to stop before red signals, vehicles near a crossing, gestures and the
 crowd directly ahead. It stops for people who walk at it or across its path, because people walk
@@ -28,16 +28,21 @@ from cosim.core.geometry import Floats, Polyline, wrap_angles
 from cosim.core.state import DIRECTED, PERSON_RADIUS_M, Command, People
 from cosim.episode.interfaces import Observation, Privileged
 from cosim.people.orca import best_velocity, half_plane
-from cosim.policies.privileged.people_prediction import Yielding, bodies, gaps_to_people, walks
+from cosim.policies.privileged.people_prediction import (
+    Yielding,
+    bodies,
+    gaps_to_people,
+    predicted_velocities,
+)
 from cosim.policies.privileged.rollout import (
     STEP_S,
     STEP_TIMES_S,
     STEPS,
-    Ahead,
     BodyDisks,
     Plans,
-    Way,
-    foresee,
+    Rollout,
+    SampledPath,
+    roll_out,
 )
 from cosim.policies.privileged.route import (
     CAR_BRAKE_MPS2,
@@ -46,8 +51,8 @@ from cosim.policies.privileged.route import (
     car_disks,
     crossing_limit,
 )
-from cosim.policies.privileged.route_planner import Clearance, Guide
-from cosim.policies.privileged.standing_groups import distances, lines, who_stands
+from cosim.policies.privileged.route_planner import DistanceField, RoutePlanner
+from cosim.policies.privileged.standing_groups import distances, is_standing, lines
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import Robot
 
@@ -57,7 +62,7 @@ _SPEED_THIRTIETHS: Final = (28, 18, 9)
 """Speeds of plans in thirtieths of the cruising speed; the fastest is slightly below it."""
 MANOEUVRES: Final = ((0.0, 0.35), (0.0, 0.9), (0.6, 0.9), (1.2, 0.9))
 """Lane changes: delay in seconds, and lateral metres per metre."""
-OUT_OF_A_NOOK: Final = (0.0, 3.0)
+TURN_IN_PLACE_PLAN: Final = (0.0, 3.0)
 """Lane change that turns almost on the spot first, to get past a person directly ahead."""
 
 _HORIZON_S: Final = 3.0
@@ -145,12 +150,12 @@ STUCK: Final = Weights(_TIGHT_M, 2.5, 0.1, 0.5 * EDGE_COST)
 """Weights after `_PATIENCE_S` without progress: tighter paths are accepted."""
 
 
-class Here(NamedTuple):
+class PathState(NamedTuple):
     """Path to the goal, the robot's arc length on it, and the distance field."""
 
-    way: Way
+    way: SampledPath
     s_m: float
-    clearance: Clearance
+    clearance: DistanceField
 
 
 class Orca:
@@ -168,8 +173,8 @@ class Orca:
         self._led_anew_s = _LED_ANEW_S
         self._stuck_at = (math.inf, math.inf)
         self._last_time_s = 0.0
-        self._here: Here | None = None
-        self._guide: tuple[Polyline, Guide] | None = None
+        self._here: PathState | None = None
+        self._guide: tuple[Polyline, RoutePlanner] | None = None
         self._line = Polyline([(0.0, 0.0), (1.0, 0.0)])
         self._was = (math.inf, math.inf)
 
@@ -181,8 +186,8 @@ class Orca:
         self._last_time_s = observation.time_s
         robot = observation.robot
         crossing_mps = crossing_limit(known, robot)
-        rolls_up_mps = unhurried(known, robot, crossing_mps)
-        limit_mps = min(crossing_mps, rolls_up_mps, stop_limit(known), speeds_of(robot)[0])
+        rolls_up_mps = short_green_limit(known, robot, crossing_mps)
+        limit_mps = min(crossing_mps, rolls_up_mps, gesture_limit(known), speeds_of(robot)[0])
         if self._yielding.waits(known, observation.time_s):
             limit_mps = 0.0
         x_m, y_m, _ = known.robot.pose
@@ -192,23 +197,23 @@ class Orca:
             self._stuck_at = (x_m, y_m)
             self._led_anew_s = _LED_ANEW_S
 
-        limit_mps = min(limit_mps, pressed_limit(known, robot))
+        limit_mps = min(limit_mps, crowd_limit(known, robot))
         people = nearby(known)
         ends = lines(people)
         here = self._find(known, ends)
         disks = BodyDisks.of(robot)
-        aim_m = lane_past(known, disks, here, ends, self._lane_m)
-        wished = bent(known, robot, here, people, aim_m, limit_mps)
+        aim_m = best_lane_past(known, disks, here, ends, self._lane_m)
+        wished = orca_velocity(known, robot, here, people, aim_m, limit_mps)
         plans = all_plans(lanes_inside(here), [min(speed, limit_mps) for speed in speeds_of(robot)])
         state = known.robot
-        ahead = foresee(here.way, plans, robot, state.pose, here.s_m, (state.v_mps, state.w_radps))
+        ahead = roll_out(here.way, plans, robot, state.pose, here.s_m, (state.v_mps, state.w_radps))
         gaps = gaps_to_people(known, robot, ahead, people, ends)
         weights = PATIENT if self._stuck_s < _PATIENCE_S else STUCK
-        out, deeper = off_ground(known, here, ahead, robot.length_m * 2 / 7)
+        out, deeper = outside_area(known, here, ahead, robot.length_m * 2 / 7)
         cost = (
             weights.edge * out
             + _SOLID_COST * deeper
-            + _NEARNESS_COST * car_nearness(known, disks, ahead)
+            + _NEARNESS_COST * vehicle_violation(known, disks, ahead)
         )
         score = self._scores(known, here, plans, ahead, gaps, wished, aim_m, weights) - cost
         best = int(np.argmax(score))
@@ -220,9 +225,9 @@ class Orca:
     def _scores(
         self,
         known: Privileged,
-        here: Here,
+        here: PathState,
         plans: Plans,
-        ahead: Ahead,
+        ahead: Rollout,
         gaps: Floats,
         wished: Floats,
         aim_m: float,
@@ -243,15 +248,15 @@ class Orca:
         )
         return scores
 
-    def _find(self, known: Privileged, ends: Floats) -> Here:
+    def _find(self, known: Privileged, ends: Floats) -> PathState:
         """Return the robot's position on its path.
 
         The path is planned again if the robot was moved or strayed, or if standing people block it.
         """
         x_m, y_m, _ = known.robot.pose
         if self._guide is None or self._guide[0] is not known.route:
-            clearance = Clearance(known.free, known.route)
-            self._guide = (known.route, Guide(clearance, known.route))
+            clearance = DistanceField(known.free, known.route)
+            self._guide = (known.route, RoutePlanner(clearance, known.route))
             self._here = None
         here = self._here
         jumped = math.dist(self._was, (x_m, y_m)) > _JUMP_M
@@ -266,9 +271,11 @@ class Orca:
                 self._here = here._replace(s_m=s_m)
                 return self._here
         guide = self._guide[1]
-        self._line = guide.from_here(known.robot.pose.xy)
+        self._line = guide.path_from(known.robot.pose.xy)
         self._lane_m = 0.0
-        self._here = Here(Way(self._line), self._line.project(x_m, y_m)[0], guide.clearance)
+        self._here = PathState(
+            SampledPath(self._line), self._line.project(x_m, y_m)[0], guide.clearance
+        )
         return self._here
 
 
@@ -285,7 +292,7 @@ def nearby(known: Privileged) -> People:
     return people.only(np.flatnonzero(near))
 
 
-def unhurried(known: Privileged, robot: Robot, crossing_mps: float) -> float:
+def short_green_limit(known: Privileged, robot: Robot, crossing_mps: float) -> float:
     """Return the speed in m/s at which to approach a crossing whose green phase is too short.
 
     crossing_mps: The robot's `crossing_limit`.
@@ -305,7 +312,7 @@ def unhurried(known: Privileged, robot: Robot, crossing_mps: float) -> float:
     return math.inf
 
 
-def pressed_limit(known: Privileged, robot: Robot) -> float:
+def crowd_limit(known: Privileged, robot: Robot) -> float:
     """Return the speed in m/s at which the robot can stop before any person of the crowd ahead."""
     pose = known.robot.pose
     people = known.people
@@ -326,7 +333,7 @@ def pressed_limit(known: Privileged, robot: Robot) -> float:
     return max(float(speed.min()), _CREEPS_MPS)
 
 
-def stop_limit(known: Privileged) -> float:
+def gesture_limit(known: Privileged) -> float:
     """Return the speed in m/s at which the robot can stop before a stopping gesture."""
     pose = known.robot.pose
     people = known.people
@@ -343,8 +350,8 @@ def stop_limit(known: Privileged) -> float:
     return limit_mps
 
 
-def lane_past(
-    known: Privileged, disks: BodyDisks, here: Here, ends: Floats, current_m: float
+def best_lane_past(
+    known: Privileged, disks: BodyDisks, here: PathState, ends: Floats, current_m: float
 ) -> float:
     """Return the lateral offset in metres of the best lane past standing people."""
     way, s_m, clearance = here
@@ -361,8 +368,8 @@ def lane_past(
     return float(LANES_M[int(np.argmin(cost))])
 
 
-def bent(
-    known: Privileged, robot: Robot, here: Here, people: People, aim_m: float, limit_mps: float
+def orca_velocity(
+    known: Privileged, robot: Robot, here: PathState, people: People, aim_m: float, limit_mps: float
 ) -> Floats:
     """Return the velocity (2,) towards the lane without collisions within _HORIZON_S."""
     state = known.robot
@@ -376,13 +383,15 @@ def bent(
     radius_m = BodyDisks.of(robot).around_m + PERSON_RADIUS_M + _TIGHT_M
     planes = [
         half_plane(xy - state.pose.xy, mine, velocity, radius_m, _HORIZON_S, 1.0, 0.5)
-        for xy, velocity, still in zip(people.xy, walks(people), who_stands(people), strict=True)
+        for xy, velocity, still in zip(
+            people.xy, predicted_velocities(people), is_standing(people), strict=True
+        )
         if not still
     ]
     return best_velocity(planes, wish, speeds_of(robot)[0])
 
 
-def lanes_inside(here: Here) -> Floats:
+def lanes_inside(here: PathState) -> Floats:
     """Return the lanes that are partly inside the free area ahead, and the path itself."""
     along, lane = np.meshgrid(here.s_m + np.array([0.5, 1.5, 3.0, 5.0]), LANES_M)
     inside = (here.clearance.at(here.way.place(along, lane)) > _EDGE_M).any(axis=1)
@@ -403,12 +412,12 @@ def all_plans(lanes: Floats, speeds: Sequence[float]) -> Plans:
         for speed in speeds
         for delay, slope in MANOEUVRES
     ]
-    rows += [(lane, speeds[-1], OUT_OF_A_NOOK[1], OUT_OF_A_NOOK[0]) for lane in lanes]
+    rows += [(lane, speeds[-1], TURN_IN_PLACE_PLAN[1], TURN_IN_PLACE_PLAN[0]) for lane in lanes]
     rows.append((0.0, 0.0, MANOEUVRES[0][1], 0.0))
     return Plans(*np.array(rows).T)
 
 
-def car_nearness(known: Privileged, disks: BodyDisks, ahead: Ahead) -> Floats:
+def vehicle_violation(known: Privileged, disks: BodyDisks, ahead: Rollout) -> Floats:
     """Return (K,) in metres: by how much each plan violates the clearance to braking vehicles.
 
     At most CAR_DEEP_M, so that people are still compared when all plans are near a vehicle.
@@ -432,7 +441,9 @@ def car_nearness(known: Privileged, disks: BodyDisks, ahead: Ahead) -> Floats:
     return nearness
 
 
-def off_ground(known: Privileged, here: Here, ahead: Ahead, nose_m: float) -> tuple[Floats, Floats]:
+def outside_area(
+    known: Privileged, here: PathState, ahead: Rollout, nose_m: float
+) -> tuple[Floats, Floats]:
     """Return how far each plan leaves the free area.
 
     nose_m: Distance in metres from the base centre to the points checked before and behind it.

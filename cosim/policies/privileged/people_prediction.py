@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Floats, wrap_angles
 from cosim.core.state import DIRECTED, PERSON_RADIUS_M, People
 from cosim.episode.interfaces import Privileged
-from cosim.policies.privileged.rollout import STEP_TIMES_S, Ahead, BodyDisks
-from cosim.policies.privileged.standing_groups import distances, who_stands
+from cosim.policies.privileged.rollout import STEP_TIMES_S, BodyDisks, Rollout
+from cosim.policies.privileged.standing_groups import distances, is_standing
 from cosim.spec.robot import Robot
 
 _FOLLOWED: Final = 0.6
@@ -50,9 +50,9 @@ _SAME_PLACE_M: Final = 0.5
 """Metres within which the robot is in the same place."""
 
 
-def walks(people: People) -> Floats:
+def predicted_velocities(people: People) -> Floats:
     """Return (N, 2) velocities in m/s; zero for standing people."""
-    speed = np.where(who_stands(people), 0.0, people.speed)
+    speed = np.where(is_standing(people), 0.0, people.speed)
     velocity: Floats = speed[:, None] * np.column_stack(
         [np.cos(people.heading), np.sin(people.heading)]
     )
@@ -60,9 +60,9 @@ def walks(people: People) -> Floats:
 
 
 def _followed(known: Privileged, people: People) -> Floats:
-    """Return `walks` with people slowed that walk ahead in the robot's direction."""
+    """Return `predicted_velocities` with people slowed that walk ahead in the robot's direction."""
     pose = known.robot.pose
-    velocity = walks(people)
+    velocity = predicted_velocities(people)
     forward = np.array([math.cos(pose.heading_rad), math.sin(pose.heading_rad)])
     same = ((people.xy - pose.xy) @ forward > 0.3) & (velocity @ forward > 0.7 * people.speed)
     slower: Floats = np.where(same[:, None], _FOLLOWED * velocity, velocity)
@@ -70,7 +70,7 @@ def _followed(known: Privileged, people: People) -> Floats:
 
 
 def gaps_to_people(
-    known: Privileged, robot: Robot, ahead: Ahead, people: People, ends: Floats
+    known: Privileged, robot: Robot, ahead: Rollout, people: People, ends: Floats
 ) -> Floats:
     """Return (K,) in metres: the smallest gap of each plan between the body and people.
 
@@ -78,7 +78,7 @@ def gaps_to_people(
     """
     here = known.robot.pose.xy
     disks = BodyDisks.of(robot)
-    moving = ~who_stands(people)
+    moving = ~is_standing(people)
     xy = people.xy[moving] + STEP_TIMES_S[:, None, None] * _followed(known, people)[moving]
     reach_m = disks.around_m + PERSON_RADIUS_M + _REACH_M + robot.cruise_mps * STEP_TIMES_S
     xy = xy[:, (np.linalg.norm(xy - here, axis=-1) < reach_m[:, None]).any(axis=0)]
@@ -106,7 +106,7 @@ def _squared(people: Floats, x: Floats, y: Floats) -> Floats:
     return np.asarray((dx * dx + dy * dy).min(axis=-1))
 
 
-def bodies(ahead: Ahead, disks: BodyDisks) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
+def bodies(ahead: Rollout, disks: BodyDisks) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
     """Return x and y, (STEPS, K) each in metres, of the centres of both body disks."""
     x, y, heading = ahead.pose[:, 0], ahead.pose[:, 1], ahead.pose[:, 2]
     nose_x, nose_y = disks.nose_m * np.cos(heading), disks.nose_m * np.sin(heading)
@@ -118,7 +118,7 @@ def _crosses(known: Privileged, offset: Floats) -> NDArray[np.bool_]:
     pose = known.robot.pose
     people = known.people
     forward = np.array([math.cos(pose.heading_rad), math.sin(pose.heading_rad)])
-    velocity = walks(people)
+    velocity = predicted_velocities(people)
     sideways = np.abs(velocity @ [-forward[1], forward[0]]) > _SIDEWAYS * people.speed
     closing = velocity - known.robot.v_mps * forward
     speed = np.maximum(np.hypot(closing[:, 0], closing[:, 1]), 1e-6)
@@ -149,7 +149,7 @@ class Yielding:
         ahead = offset @ [cos, sin]
         near = (far < _COMES_M) & (ahead > -_PAST_M)
         comes = (off < _COMES_RAD) | _crosses(known, offset)
-        comes &= near & people.are(*DIRECTED) & ~who_stands(people) & (ahead > 0.5 * far)
+        comes &= near & people.are(*DIRECTED) & ~is_standing(people) & (ahead > 0.5 * far)
         passing = near & ((off < _LEAVES_RAD) | (far < _PAST_M))
         if math.dist(self._at, pose[:2]) > _SAME_PLACE_M:
             self._at = pose[:2]

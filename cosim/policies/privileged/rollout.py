@@ -77,7 +77,7 @@ class Plans(NamedTuple):
     delay_s: Floats
 
 
-class Way:
+class SampledPath:
     """Path sampled over arc length, extended straight beyond its end."""
 
     def __init__(self, line: Polyline) -> None:
@@ -120,7 +120,7 @@ class Way:
         return np.stack([x + lane_m * left_x, y + lane_m * left_y], axis=-1)
 
 
-class Ahead(NamedTuple):
+class Rollout(NamedTuple):
     """Rollout of K plans at STEPS times.
 
     pose: (STEPS, 3, K) x, y and heading.
@@ -133,9 +133,14 @@ class Ahead(NamedTuple):
     command: Floats
 
 
-def foresee(
-    way: Way, plans: Plans, robot: Robot, pose: Pose, s_m: float, speeds: tuple[float, float]
-) -> Ahead:
+def roll_out(
+    way: SampledPath,
+    plans: Plans,
+    robot: Robot,
+    pose: Pose,
+    s_m: float,
+    speeds: tuple[float, float],
+) -> Rollout:
     """Roll out every plan. A waiting plan does not turn either.
 
     s_m: Arc length of the robot in metres.
@@ -178,4 +183,4 @@ def foresee(
         along = along + STEP_S * (v_x * left_y - v_y * left_x)
         poses[k] = x, y, heading
         arcs[k] = along
-    return Ahead(poses, arcs, command)
+    return Rollout(poses, arcs, command)

@@ -18,7 +18,7 @@ from cosim.place import overlay
 from cosim.place.street_map import WalkableArea
 from cosim.policies.privileged.standing_groups import distances
 
-LATTICE_M: Final = 0.2
+GRID_M: Final = 0.2
 """Grid spacing in metres."""
 _BESIDE_M: Final = 4.5
 """Metres from the route covered by the field; farther points count as not free."""
@@ -26,7 +26,7 @@ _FAR_OUT_M: Final = -1.0
 """Lower bound of the signed distance in metres."""
 
 
-class Clearance:
+class DistanceField:
     """Signed distance in metres to the edge of the free area, positive inside, near a route.
 
     Exact on the grid, bilinear between.
@@ -41,7 +41,7 @@ class Clearance:
         self.columns = int(shape[1])
         self._most = shape - 2
         near = overlay.intersection(free, LineString(route.points).buffer(_BESIDE_M + 2.0))
-        depth = WalkableArea(near).signed_distance(self.cells * LATTICE_M)
+        depth = WalkableArea(near).signed_distance(self.cells * GRID_M)
         self.depth = np.full(int(shape.prod()), _FAR_OUT_M)
         self.depth[self.rows(self.cells)] = np.maximum(depth, _FAR_OUT_M)
 
@@ -52,7 +52,7 @@ class Clearance:
 
     def at(self, xy: Floats) -> Floats:
         """Return (...) distances in metres at points (..., 2)."""
-        scaled = xy / LATTICE_M - self.low
+        scaled = xy / GRID_M - self.low
         u, v = (
             np.clip(scaled[..., 0], 0.0, self._most[0]),
             np.clip(scaled[..., 1], 0.0, self._most[1]),
@@ -69,9 +69,9 @@ class Clearance:
 
     def uphill(self, xy: Floats) -> Floats:
         """Return (N, 2) gradients of the distance at points (N, 2), of length 1 at most."""
-        half = 0.5 * LATTICE_M
+        half = 0.5 * GRID_M
         ways = [
-            (self.at(xy + step) - self.at(xy - step)) / LATTICE_M
+            (self.at(xy + step) - self.at(xy - step)) / GRID_M
             for step in (np.array([half, 0.0]), np.array([0.0, half]))
         ]
         return np.stack(ways, axis=-1)
@@ -79,11 +79,11 @@ class Clearance:
 
 def _beside(route: Polyline) -> np.ndarray:
     """Return (N, 2) integer grid points near a route."""
-    count = int(_BESIDE_M / LATTICE_M)
+    count = int(_BESIDE_M / GRID_M)
     steps = np.arange(-count, count + 1)
     disk = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
     disk = disk[(disk**2).sum(axis=1) <= count * count]
-    along = np.unique(np.round(route.resampled(1.0).points / LATTICE_M).astype(int), axis=0)
+    along = np.unique(np.round(route.resampled(1.0).points / GRID_M).astype(int), axis=0)
     low = along.min(axis=0) - count
     near = np.zeros(along.max(axis=0) + count - low + 1, dtype=bool)
     for offset in disk - low:
@@ -114,16 +114,16 @@ _NEIGHBOURS: Final = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), 
 """Offsets of half of the 16 grid neighbours; the graph is undirected."""
 
 
-class Guide:
+class RoutePlanner:
     """Paths to the end of a route from any position."""
 
-    def __init__(self, clearance: Clearance, route: Polyline) -> None:
+    def __init__(self, clearance: DistanceField, route: Polyline) -> None:
         self.clearance = clearance
         self._route = route
         depth = clearance.depth[clearance.rows(clearance.cells)]
         cells = clearance.cells[depth > _LEAST_M]
         depth = depth[depth > _LEAST_M]
-        self._points = cells * LATTICE_M
+        self._points = cells * GRID_M
         self._cost = 1.0 + _TIGHT_COST * np.maximum(1.0 - depth / _WANTED_M, 0.0) ** 2
         self._cost += _ASIDE_COST * _aside(self._points, route)
         rows = clearance.rows(cells)
@@ -157,7 +157,7 @@ class Guide:
             graph, directed=False, indices=goal, return_predecessors=True
         )
 
-    def from_here(self, xy: Floats) -> Polyline:
+    def path_from(self, xy: Floats) -> Polyline:
         """Return the path from (2,) metres to the route's end; the route itself if unreachable."""
         known = np.isfinite(self._far)
         if not known.any():

@@ -37,7 +37,7 @@ PEOPLE_M: Final = 1.07
 """Range B of the repulsion by people in metres."""
 STEP_AHEAD_S: Final = 0.5
 """Delta t in seconds: relative motion over this time stretches the ellipse."""
-BEHIND: Final = 0.06
+BEHIND_WEIGHT: Final = 0.06
 """Anisotropy lambda: weight of a person directly behind."""
 LEANS_RAD: Final = math.radians(15.0)
 """Rotation of pushes in radians, so that the robot passes people straight ahead on their right."""
@@ -89,18 +89,18 @@ def force(known: Privileged, robot: Robot, velocity: Floats) -> Floats:
     ahead = known.route.at(min(known.route_s_m + _LOOK_M, known.route.length_m)).xy - here
     direction = ahead / max(math.hypot(*ahead), 1e-9)
     pull = (desired_mps(robot) * direction - velocity) / RELAXATION_S
-    pushes = seen(from_people(known.people, robot, here, velocity), direction)
-    total: Floats = pull + pushes.sum(axis=0) + from_edge(known, robot, here)
+    pushes = weighted_pushes(people_pushes(known.people, robot, here, velocity), direction)
+    total: Floats = pull + pushes.sum(axis=0) + edge_push(known, robot, here)
     return total
 
 
-def bodies_m(robot: Robot) -> float:
+def contact_distance_m(robot: Robot) -> float:
     """Return the distance in metres between the centres of the robot and a person 1 cm ahead of
     it."""
     return robot.length_m / 2 + 0.01 + PERSON_RADIUS_M
 
 
-def from_people(people: People, robot: Robot, here: Floats, velocity: Floats) -> Floats:
+def people_pushes(people: People, robot: Robot, here: Floats, velocity: Floats) -> Floats:
     """Return (N, 2) in m/s^2: the push of each person on the robot.
 
     Let d point from person to robot between their outlines, and y be the person's motion relative
@@ -112,7 +112,7 @@ def from_people(people: People, robot: Robot, here: Floats, velocity: Floats) ->
     """
     away = here - people.xy
     r = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-9)
-    away = away * (np.maximum(r - bodies_m(robot), TOUCHING_M) / r)[:, None]
+    away = away * (np.maximum(r - contact_distance_m(robot), TOUCHING_M) / r)[:, None]
     going = people.speed[:, None] * np.column_stack(
         [np.cos(people.heading), np.sin(people.heading)]
     )
@@ -128,7 +128,7 @@ def from_people(people: People, robot: Robot, here: Floats, velocity: Floats) ->
     return pushes
 
 
-def seen(pushes: Floats, direction: Floats) -> Floats:
+def weighted_pushes(pushes: Floats, direction: Floats) -> Floats:
     """Rotate pushes (N, 2) by LEANS_RAD and weight them by direction.
 
     w = lambda + (1 - lambda) (1 + cos) / 2.
@@ -136,12 +136,12 @@ def seen(pushes: Floats, direction: Floats) -> Floats:
     strength = np.maximum(np.hypot(pushes[:, 0], pushes[:, 1]), 1e-9)
     ahead = -pushes @ direction / strength
     cos, sin = math.cos(LEANS_RAD), math.sin(LEANS_RAD)
-    weight = BEHIND + (1.0 - BEHIND) * 0.5 * (1.0 + ahead)
+    weight = BEHIND_WEIGHT + (1.0 - BEHIND_WEIGHT) * 0.5 * (1.0 + ahead)
     weighed: Floats = pushes * weight[:, None] @ np.array([[cos, sin], [-sin, cos]])
     return weighed
 
 
-def from_edge(known: Privileged, robot: Robot, here: Floats) -> Floats:
+def edge_push(known: Privileged, robot: Robot, here: Floats) -> Floats:
     """Return (2,) in m/s^2: the push of the nearest edge into the free area."""
     point = shapely.Point(here)
     edge = known.free.boundary

@@ -14,23 +14,23 @@ import numpy as np
 from cosim.core.geometry import Floats
 from cosim.core.state import PERSON_RADIUS_M, People
 
-STANDS_MPS: Final = 0.15
+STANDING_MPS: Final = 0.15
 """Speed in m/s below which a person stands."""
 _GAP_M: Final = 0.9
 """Metres between shoulders below which the robot does not pass between two people."""
-FELLOWS_M: Final = 2.5
+GROUP_M: Final = 2.5
 """Metres within which talking or queueing people form a group."""
 
 
-def who_stands(people: People) -> np.ndarray:
+def is_standing(people: People) -> np.ndarray:
     """Return (N,) whether each person stands."""
-    still: np.ndarray = people.speed < STANDS_MPS
+    still: np.ndarray = people.speed < STANDING_MPS
     return still
 
 
 def groups(people: People) -> list[list[int]]:
     """Return rows of standing people, group by group; a person alone is a group of one."""
-    rows = np.flatnonzero(who_stands(people)).tolist()
+    rows = np.flatnonzero(is_standing(people)).tolist()
     left = set(rows)
     found = []
     for row in rows:
@@ -56,7 +56,7 @@ def _together(people: People, a: int, b: int) -> bool:
     return (
         people.doing[a] == people.doing[b]
         and people.doing[a] in ("talk", "queue")
-        and apart_m < FELLOWS_M
+        and apart_m < GROUP_M
     )
 
 

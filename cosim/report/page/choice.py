@@ -9,11 +9,11 @@ from typing import Final, NamedTuple
 
 from cosim.core.clock import Clock
 from cosim.report.page.reasons import Mishap, event_of, mishaps_of
-from cosim.report.page.runs import ReportedRun, example_of, place_in_words, table_of_paper
+from cosim.report.page.runs import ReportedRun, place_in_words, scenario_kind, table_of_paper
 from cosim.spec.scenario import CityMap
 
-MOST_FAILURES: Final = 48
-LEAST_FAILURES: Final = 36
+MAX_FAILURES: Final = 48
+MIN_FAILURES: Final = 36
 """Number of failures to show, if available, even without new facets."""
 _START_S: Final = 15.0
 """Cost of starting an episode and drawing a failure, in seconds of simulation."""
@@ -43,7 +43,7 @@ class FailureToShow(NamedTuple):
     place: str
 
 
-def shown_of(runs: Sequence[ReportedRun]) -> list[FailureToShow]:
+def showable_failures(runs: Sequence[ReportedRun]) -> list[FailureToShow]:
     """Return every failure that can be replayed: those of completed episodes."""
     found = []
     for number, run in enumerate(runs):
@@ -51,7 +51,7 @@ def shown_of(runs: Sequence[ReportedRun]) -> list[FailureToShow]:
             if record.status != "done" or record.ended is None:
                 continue
             scenario = run.scenarios[record.scenario.id]
-            family, kind = table_of_paper(scenario), example_of(scenario)
+            family, kind = table_of_paper(scenario), scenario_kind(scenario)
             for mishap in mishaps_of(record)[:_MAX_PER_EPISODE]:
                 event = event_of(scenario, mishap)
                 facets: set[Hashable] = {
@@ -72,16 +72,16 @@ def shown_of(runs: Sequence[ReportedRun]) -> list[FailureToShow]:
     return found
 
 
-class Chosen(NamedTuple):
+class FailureChoice(NamedTuple):
     """Failures to show, and the limit that excluded others, in words; "" if all are shown."""
 
     picks: list[FailureToShow]
     limit: str
 
 
-def most_telling(
-    candidates: Sequence[FailureToShow], most: int = MOST_FAILURES, within_s: float = WITHIN_S
-) -> Chosen:
+def choose_failures(
+    candidates: Sequence[FailureToShow], most: int = MAX_FAILURES, within_s: float = WITHIN_S
+) -> FailureChoice:
     """Choose failures greedily, the most informative first.
 
     Each choice adds the most new facets per simulated time, then a new episode, then a new place.
@@ -105,14 +105,14 @@ def most_telling(
             limit = f"--failures {most}"
         elif choice.further_s(best) > choice.room_s:
             limit = f"more than {_BUDGET_S:g} s would be simulated again"
-        elif len(choice.picked) >= LEAST_FAILURES and not best.facets - choice.seen:
+        elif len(choice.picked) >= MIN_FAILURES and not best.facets - choice.seen:
             limit = "the others show no other run, event, cause or place"
         else:
             choice.take(best)
             left.remove(best)
     if not limit and len(choice.picked) < len(candidates):
         limit = f"the others are alike, or later than --within {within_s:g} s"
-    return Chosen(choice.picked, limit)
+    return FailureChoice(choice.picked, limit)
 
 
 class _Choice:

@@ -54,7 +54,7 @@ def colours_of(runs: Sequence[ReportedRun]) -> dict[str, str]:
     return {label: RUN_COLOURS[k % len(RUN_COLOURS)] for k, label in enumerate(labels)}
 
 
-def page_of(
+def render_page(
     runs: Sequence[ReportedRun],
     plots: Sequence[Plot],
     entries: Sequence[Entry],
@@ -245,7 +245,7 @@ def _causes_of(runs: Sequence[ReportedRun]) -> Mapping[str, Counter[str]]:
     return found
 
 
-def counts_of(runs: Sequence[ReportedRun]) -> Mapping[str, tuple[int, int]]:
+def episode_counts(runs: Sequence[ReportedRun]) -> Mapping[str, tuple[int, int]]:
     """Return the number of all and of failed episodes by place, most failures first."""
     total: Counter[str] = Counter()
     failed: Counter[str] = Counter()

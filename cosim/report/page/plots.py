@@ -13,7 +13,7 @@ from cosim.core.geometry import Floats
 from cosim.core.progress import Progress, ignore
 from cosim.report.page.paper import EVENT_COLUMNS
 from cosim.report.page.reasons import CAUSES, mishaps_of
-from cosim.report.page.runs import KINDS_OF_LIGHT, PaperTable, ReportedRun, table_of_paper
+from cosim.report.page.runs import LIGHT_KINDS, PaperTable, ReportedRun, table_of_paper
 from cosim.report.page.three_tables import (
     UNIT_COLUMNS,
     MeanOfEpisodes,
@@ -22,7 +22,7 @@ from cosim.report.page.three_tables import (
     kind_in_words,
 )
 from cosim.results.record import Record, Recorder
-from cosim.results.table import interval_of
+from cosim.results.table import bootstrap_interval
 
 RUN_COLOURS: Final = (
     "#1f5fa8",
@@ -101,7 +101,7 @@ def plots_of(
             colours,
             "unit",
             "light",
-            KINDS_OF_LIGHT,
+            LIGHT_KINDS,
             "success",
             "Success by light, unit tests",
         ),
@@ -110,7 +110,7 @@ def plots_of(
             colours,
             "reactive",
             "light",
-            KINDS_OF_LIGHT,
+            LIGHT_KINDS,
             "success",
             "Success by light, people in the way",
         ),
@@ -119,7 +119,7 @@ def plots_of(
             colours,
             "long",
             "light",
-            KINDS_OF_LIGHT,
+            LIGHT_KINDS,
             "failures_per_100m",
             f"{rate} by light, long ways",
         ),
@@ -148,7 +148,7 @@ def plots_of(
     return [plot for plot in found if plot is not None]
 
 
-def near_of(pose: Floats, people_tick: NDArray[np.int64], people_xy: Floats) -> Floats:
+def people_nearby(pose: Floats, people_tick: NDArray[np.int64], people_xy: Floats) -> Floats:
     """Return (T,) the number of people within NEAR_M of the robot, recorded once a second.
 
     pose, people_tick, people_xy: columns of `Log`
@@ -194,7 +194,7 @@ def _exposures(runs: Sequence[ReportedRun], progress: Progress) -> tuple[_ByRun,
             travelled_m = track["travelled_m"]
             speed = np.abs(track["speed"][:, 0])
             if key[1] == "long":
-                people = near_of(track["pose"], track["people_tick"], track["people_xy"])
+                people = people_nearby(track["pose"], track["people_tick"], track["people_xy"])
                 near.setdefault(key, []).append(
                     exposure_of(record, travelled_m, people, _NEAR_EDGES, moving=False)
                 )
@@ -223,7 +223,7 @@ def _exposure_plot(
         )
         cells[label] = [
             MeanOfEpisodes(
-                100.0 * f.sum() / m.sum(), *interval_of(100.0 * f, m), int((m > 0).sum())
+                100.0 * f.sum() / m.sum(), *bootstrap_interval(100.0 * f, m), int((m > 0).sum())
             )
             if m.sum() >= _MIN_M
             else MeanOfEpisodes(np.nan, np.nan, np.nan, 0)

@@ -45,7 +45,7 @@ _THING_NAMES: Final = {
 }
 
 
-class Other(NamedTuple):
+class MetBody(NamedTuple):
     """Body that the robot met, in the robot's frame: x ahead and y left, metres and m/s."""
 
     x_m: float
@@ -54,7 +54,7 @@ class Other(NamedTuple):
     vy_mps: float
 
     @classmethod
-    def seen_from(cls, robot: Floats, at: Floats, velocity: Floats) -> Other:
+    def seen_from(cls, robot: Floats, at: Floats, velocity: Floats) -> MetBody:
         """Convert from the world frame. robot: (3,) x, y, heading; at, velocity: (2,)."""
         cos, sin = math.cos(robot[2]), math.sin(robot[2])
         turn = np.array([[cos, sin], [-sin, cos]])
@@ -98,7 +98,11 @@ def cause_of(failure: Failure) -> str:
 
 
 def reason_of(
-    scenario: Scenario, record: Record, mishap: Mishap, log: Log | None, other: Other | None = None
+    scenario: Scenario,
+    record: Record,
+    mishap: Mishap,
+    log: Log | None,
+    other: MetBody | None = None,
 ) -> str:
     """Return the reason of a mishap as one sentence without its full stop.
 
@@ -142,7 +146,7 @@ def event_of(scenario: Scenario, mishap: Mishap) -> Event | None:
     return matching[0] if matching else None
 
 
-def _met(failure: Failure, other: Other | None, body: str) -> str:
+def _met(failure: Failure, other: MetBody | None, body: str) -> str:
     """Describe a collision with a person or vehicle.
 
     The speed is the other's, or the robot's if the other stood.
@@ -177,7 +181,7 @@ def _side(x: float, y: float, front: str, aside: str = "to the ", behind: str = 
     return behind if angle >= 135.0 else aside + ("left" if y > 0.0 else "right")
 
 
-def _in_tracks(scenario: Scenario, failure: Failure, log: Log | None) -> Other | None:
+def _in_tracks(scenario: Scenario, failure: Failure, log: Log | None) -> MetBody | None:
     """Return the event person that was met, from the event tracks; None for any other person."""
     if log is None:
         return None
@@ -191,7 +195,7 @@ def _in_tracks(scenario: Scenario, failure: Failure, log: Log | None) -> Other |
                 since = track[track[:, 0] >= track[-1, 0] - round(_VELOCITY_SPAN_S / log.tick_s)]
                 ticks = max(since[-1, 0] - since[0, 0], 1.0)
                 velocity = (since[-1, 3:5] - since[0, 3:5]) / (ticks * log.tick_s)
-                return Other.seen_from(log.pose[failure.tick], track[-1, 3:5], velocity)
+                return MetBody.seen_from(log.pose[failure.tick], track[-1, 3:5], velocity)
     return None
 
 

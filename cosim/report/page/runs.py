@@ -27,9 +27,9 @@ PaperTable = Literal["unit", "reactive", "long"]
 failures."""
 _COLUMNS: Final = ("pose", "speed", "travelled_m", "people_tick", "people_xy")
 """Columns that plots use; loading a whole log takes four times as long."""
-OF_THE_PAPER: Final = ("unit", "reactive", "long-horizon")
+PAPER_SUITES: Final = ("unit", "reactive", "long-horizon")
 """Suites shown together with the paper's rows."""
-KINDS_OF_LIGHT: Final = ("high sun", "low sun", "overcast", "fog")
+LIGHT_KINDS: Final = ("high sun", "low sun", "overcast", "fog")
 _OVERCAST: Final = 0.8
 _LOW_SUN_DEG: Final = 20.0
 
@@ -71,7 +71,7 @@ class ReportedRun:
         of = [self.scenarios[name] for name in table["scenario"]]
         return table.assign(
             label=self.label,
-            kind=[example_of(one) for one in of],
+            kind=[scenario_kind(one) for one in of],
             family=[table_of_paper(one) for one in of],
             place=[place_in_words(one) for one in of],
             real=[isinstance(one.place, CityMap) for one in of],
@@ -123,7 +123,7 @@ def read_runs(paths: Sequence[Path], progress: Progress = ignore) -> list[Report
     alike = {policy for policy in policies if policies.count(policy) > 1}
     names = [path.name if folders.count(path.name) == 1 else str(path) for path in paths]
     labels = [
-        f"{policy}, {suite}" if suite not in OF_THE_PAPER and len(suites[policy]) > 1 else policy
+        f"{policy}, {suite}" if suite not in PAPER_SUITES and len(suites[policy]) > 1 else policy
         for suite, policy in policies
     ]
     return [
@@ -139,7 +139,7 @@ def table_of_paper(scenario: Scenario) -> PaperTable:
     return "reactive" if scenario.events or scenario.structure == "static" else "unit"
 
 
-def example_of(scenario: Scenario) -> str:
+def scenario_kind(scenario: Scenario) -> str:
     """Return the kind of a scenario: its structure, or the kind of its only event."""
     if not scenario.structure and scenario.ends_on_failure and len(scenario.events) == 1:
         return scenario.events[0].kind

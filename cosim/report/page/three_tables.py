@@ -16,8 +16,8 @@ from cosim.report.page.paper import (
     UNIT_OF_PAPER,
     Row,
 )
-from cosim.report.page.runs import OF_THE_PAPER, PaperTable, ReportedRun
-from cosim.results.table import ORACLE, not_to_be_quoted, summary_of
+from cosim.report.page.runs import PAPER_SUITES, PaperTable, ReportedRun
+from cosim.results.table import ORACLE, summary_of, why_inconclusive
 
 UNIT_COLUMNS: Final = ("straight", "curve", "crosswalk")
 _SHARES: Final = {"success": "SR", "spl": "SPL", "route_completion": "RC"}
@@ -206,7 +206,7 @@ def _other(runs: Sequence[ReportedRun]) -> ReportTable | None:
     found: dict[str, pd.DataFrame] = {}
     for run in runs:
         for (family, kind), part in run.table.groupby(["family", "kind"], sort=False):
-            if run.spec.suite not in OF_THE_PAPER or kind not in known[str(family)]:
+            if run.spec.suite not in PAPER_SUITES or kind not in known[str(family)]:
                 found[f"{run.label}: {kind}"] = part
     if not found:
         return None
@@ -228,7 +228,7 @@ def _table(
     columns: Sequence[_Column],
     paper: Mapping[str, Row],
 ) -> ReportTable | None:
-    ours = episodes_of([run for run in runs if run.spec.suite in OF_THE_PAPER], family)
+    ours = episodes_of([run for run in runs if run.spec.suite in PAPER_SUITES], family)
     return _framed(title, note, columns, ours, paper) if ours else None
 
 
@@ -279,7 +279,7 @@ def _notes(table: pd.DataFrame) -> str:
 
 def warnings_of(runs: Sequence[ReportedRun]) -> RunWarnings:
     """Return which runs are inconclusive, and which suites were run with different scenarios."""
-    reasons = [(run, not_to_be_quoted(run.table, len(run.spec.scenarios))) for run in runs]
+    reasons = [(run, why_inconclusive(run.table, len(run.spec.scenarios))) for run in runs]
     suites: dict[str, list[ReportedRun]] = {}
     for run in runs:
         suites.setdefault(run.spec.suite, []).append(run)

@@ -35,10 +35,16 @@ from physics.cameras.gl.walls import wall_layer, wall_rows, wall_shaders
 from physics.cameras.view import FORGET_M, PROP_MARGIN_M, VISIBLE_M, View
 from physics.dynamics.world import BulletWorld
 from physics.ground.mesh import Part
-from physics.ground.tiles import Key, distance_to, distances_within, keys_within, square
+from physics.ground.tiles import (
+    Key,
+    tile_bounds,
+    tile_distance,
+    tile_distances_within,
+    tiles_within,
+)
 from physics.street import props
 from physics.street.furniture import KINDS, parts_of
-from physics.street.surface import stood
+from physics.street.surface import grounded_obstacles
 
 _CELL_M: Final = 2.0
 _SECTOR_RAD: Final = math.radians(7.5)
@@ -154,10 +160,10 @@ class GlScene:
     def _stream(self, cell: tuple[int, int]) -> None:
         """Hold the tiles around a cell, the nearest first."""
         x, y = cell[0] * _CELL_M, cell[1] * _CELL_M
-        keys = [key for _, key in sorted(distances_within(x, y, VISIBLE_M + _SLACK_M))]
+        keys = [key for _, key in sorted(tile_distances_within(x, y, VISIBLE_M + _SLACK_M))]
         if keys == self._keys:
             return
-        for key in [k for k in self._tiles if distance_to(k, x, y) > FORGET_M]:
+        for key in [k for k in self._tiles if tile_distance(k, x, y) > FORGET_M]:
             del self._tiles[key]
         for key in keys:
             if key not in self._tiles:
@@ -212,7 +218,7 @@ class GlScene:
         """What stands and throws shadows in the square around its middle, seen or not."""
         still = (*middle.tolist(), *anchor.tolist())
         if still != self._still_for:
-            keys = keys_within(float(middle[0]), float(middle[1]), VISIBLE_M - STEP_M)
+            keys = tiles_within(float(middle[0]), float(middle[1]), VISIBLE_M - STEP_M)
             obstacles = _at(self._obstacles, self._obstacle_xy, anchor)
             self._standing.set(
                 *_joined([*(self._shifted(self._tiles[key]) for key in keys), obstacles])
@@ -266,7 +272,9 @@ class GlScene:
         paint = np.array([KINDS[prop.kind].paints[prop.paint] for prop, _ in furniture]).reshape(
             -1, 3
         )
-        rows = instances(xyz, [prop.drawn_rad for prop, _ in furniture], paint, LABELS["prop"])
+        rows = instances(
+            xyz, [prop.drawn_heading_rad for prop, _ in furniture], paint, LABELS["prop"]
+        )
         headings = [post.heading_rad for post in posts]
         poles = instances(
             np.column_stack([post_xy - middle, post_z]), headings, props.POLE, LABELS["signal"]
@@ -307,7 +315,7 @@ class GlScene:
         return np.array([form]), rows
 
     def _stood(self, obstacles: Sequence[Obstacle]) -> _Placed:
-        standing = stood(obstacles, self._surface)
+        standing = grounded_obstacles(obstacles, self._surface)
         if not standing:
             return _NOTHING
         form = [
@@ -316,7 +324,9 @@ class GlScene:
         ]
         paint = np.array([KINDS[prop.kind].paints[prop.paint] for prop, _ in standing])
         xyz = np.array([(0.0, 0.0, z) for _, z in standing])
-        rows = instances(xyz, [prop.drawn_rad for prop, _ in standing], paint, LABELS["prop"])
+        rows = instances(
+            xyz, [prop.drawn_heading_rad for prop, _ in standing], paint, LABELS["prop"]
+        )
         return np.array(form, dtype=np.intp), rows
 
     def _fences_now(self, anchor: Floats) -> list[_Placed]:
@@ -353,7 +363,7 @@ class GlScene:
 
 def _middle(key: Key) -> Floats:
     """(2,) of a tile, world metres."""
-    x0, y0, x1, y1 = square(key)
+    x0, y0, x1, y1 = tile_bounds(key)
     return np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
 
 

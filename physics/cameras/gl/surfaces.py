@@ -18,7 +18,7 @@ from physics.cameras.gl.corners import CornerRows
 from physics.cameras.gl.shading import FACADES_UNIT, FINISH_UNIT, SURFACES_UNIT, Pass, programs
 from physics.textures.facades import facade_layers
 from physics.textures.ground import ground_layers
-from physics.textures.layers import Layers, joined_layers
+from physics.textures.layers import Layers, join_layers
 from physics.textures.walls import prop_layers, wall_layers
 
 SIZE_PX: Final = 256
@@ -160,7 +160,7 @@ class TileLayer:
 @lru_cache(maxsize=1)
 def surfaces(context: moderngl.Context) -> Surfaces:
     """Made once in a context; they stay as long as it."""
-    flat = joined_layers(ground_layers(SIZE_PX), wall_layers(SIZE_PX), prop_layers(SIZE_PX))
+    flat = join_layers(ground_layers(SIZE_PX), wall_layers(SIZE_PX), prop_layers(SIZE_PX))
     facades = facade_layers(SIZE_PX)
     known = np.ones((LAYERS_MAX, 4), dtype=np.float32)
     known[: len(flat), :3], known[: len(flat), 3] = flat.mean, flat.metres[:, 0]

@@ -22,7 +22,7 @@ from physics.cameras.gl.shadows import SHADOW_REACH_M
 from physics.cameras.gl.shots import Shots
 from physics.cameras.view import VEHICLE_MARGIN_M
 from physics.ground.mesh import Part
-from physics.robots import urdf_of
+from physics.robots import urdf_path
 from physics.street import vehicles
 from physics.street.surface import Surface
 
@@ -102,13 +102,13 @@ class TrafficDrawing:
                 self._form(name, *size)
                 for name, size in zip(which.ids, which.size.tolist(), strict=True)
             ]
-            paints = np.array([vehicles.paint(name) for name in which.ids]).reshape(-1, 3)
+            paints = np.array([vehicles.vehicle_colour(name) for name in which.ids]).reshape(-1, 3)
             self._fleets[key] = np.array(forms, dtype=np.intp), paints
         return self._fleets[key]
 
     def _form(self, name: str, length_m: float, width_m: float) -> int:
         size = tuple(np.array([length_m, width_m]).round(1).tolist())
-        shape = vehicles.shape(name, size[0])
+        shape = vehicles.vehicle_shape(name, size[0])
         return self._forms.id(
             ("vehicle", shape, *size), partial(vehicles.vehicle_parts, shape, *size)
         )
@@ -146,7 +146,7 @@ class TrafficDrawing:
 
 
 def _robot_parts(model: Robot) -> Sequence[Part]:
-    return robot_parts(urdf_of(model))
+    return robot_parts(urdf_path(model))
 
 
 def _leaning(one: Driven) -> Floats:

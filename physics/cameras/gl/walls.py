@@ -21,7 +21,7 @@ from physics.cameras.gl.shading import FACADES_UNIT, FINISH_UNIT
 from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TileLayer, TileRows
 from physics.ground.mesh import Mesh
 from physics.ground.tiles import CURB_M
-from physics.street.building_style import NARROWEST_FRONT_M, face_of
+from physics.street.building_style import WINDOW_WALL_MIN_M, building_appearance
 from physics.street.buildings import Building, facade_meshes
 from physics.textures.facade_canvas import BAY_M, STOREY_M
 from physics.textures.facades import BAY_VARIANTS, WallStyle
@@ -136,7 +136,7 @@ def _parts(
     building: Building, style: WallStyle, surfaces: Surfaces, middle: Floats
 ) -> list[tuple[Mesh, CornerRows]]:
     """A building's walls and roof, with their rows."""
-    face = face_of(building, style)
+    face = building_appearance(building, style)
     layers, bays = surfaces.surfaces, surfaces.facades
     wall, roof = layers.index(face.wall), layers.index(face.roof)
     upper = bays.index(f"{face.upper}-0")
@@ -187,7 +187,7 @@ def _spots(mesh: Mesh, flat: NDArray[np.bool_], floor_m: float) -> tuple[Floats,
         spots[quad] = np.stack([along, up, along / width * count, up / STOREY_M], axis=1)
         storeys[quad] = (
             max(int((up.max() + 0.3) / STOREY_M), 1)
-            if width >= NARROWEST_FRONT_M and up.max() > 0.0
+            if width >= WINDOW_WALL_MIN_M and up.max() > 0.0
             else 0
         )
     return spots, storeys

@@ -147,7 +147,7 @@ def _misfit(
         return f"the way ends at {route.length_m:.1f} m"
     half_m = _half_width_m(route, at_m, street_map)
     needed_m = layout.half_width_m + wider_m(robot)
-    if not kind.passed_round:
+    if not kind.passed_as_group:
         needed_m = min(needed_m, robot.width_m / 2 + PERSON_RADIUS_M + _NARROW_M)
     if half_m <= 0.0:
         return "no sidewalk is there, but a corner or a crossing"

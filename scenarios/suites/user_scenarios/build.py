@@ -14,7 +14,7 @@ from cosim.core.errors import CosimError, MachineError, MapError, SpecError
 from cosim.core.progress import Progress, ignore
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import City, CityMap, Light, Place, Scenario, Suite
-from cosim.spec.spec_file import in_lines
+from cosim.spec.spec_file import join_faults
 from scenarios.places.nets import place
 from scenarios.suites.obstacles import with_obstacles
 from scenarios.suites.reactive import NO_CROWD
@@ -22,7 +22,7 @@ from scenarios.suites.user_scenarios.along_route import event_along, obstacle_al
 from scenarios.suites.user_scenarios.format import OwnCrowd, OwnLimits, OwnPlace, OwnScenario
 from scenarios.suites.user_scenarios.read import OwnFile, Variant
 from scenarios.suites.user_scenarios.routes import laid_way
-from sumo_nets.maps.place_names import imported_place, place_called
+from sumo_nets.maps.place_names import imported_place, resolve_place
 
 _MAKING: Final = "making the scenarios"
 _VERSION: Final = "own"
@@ -99,7 +99,7 @@ def suite_of(file: OwnFile, made: Sequence[Made]) -> Suite:
     """Join scenarios that were made of a file as a suite. Raises SpecError with everything that is
     against them."""
     if faults := dict.fromkeys(fault for one in made for fault in one.faults):
-        raise SpecError(f"{file.path}: {in_lines(list(faults), len(faults))}")
+        raise SpecError(f"{file.path}: {join_faults(list(faults), len(faults))}")
     scenarios = tuple(one.scenario for one in made if one.scenario is not None)
     return Suite(
         name=file.name, version=_VERSION, scenarios=scenarios, description=file.description
@@ -121,7 +121,7 @@ def place_of_own(own: OwnPlace) -> Place:
     try:
         if path.is_file() and not path.name.endswith((".net.xml", ".net.xml.gz")):
             return CityMap(map=imported_place(path), roughness=own.roughness)
-        return place_called(own.file, own.roughness)
+        return resolve_place(own.file, own.roughness)
     except MapError as error:
         raise MapError(f"place.file: {error}") from error
 

@@ -11,7 +11,7 @@ import msgspec
 from cosim.core.errors import CosimError, SpecError
 from cosim.core.progress import Progress, ignore
 from cosim.spec.scenario import Light, Scenario, Suite, event_faults
-from cosim.spec.spec_file import in_lines
+from cosim.spec.spec_file import join_faults
 from physics.cameras.hdri import read_hdri
 from scenarios.events import EVENT_KINDS
 from scenarios.places.nets import place
@@ -39,7 +39,7 @@ def own_faults(file: OwnFile, progress: Progress = ignore) -> list[str]:
 def checked_own(file: OwnFile, progress: Progress = ignore) -> Suite:
     """The scenarios of a file, to be run. Raises SpecError with everything that is against it."""
     if faults := own_faults(file, progress):
-        raise SpecError(f"{file.path}: {in_lines(faults, len(faults))}")
+        raise SpecError(f"{file.path}: {join_faults(faults, len(faults))}")
     return suite_of_own(file, progress)
 
 

@@ -17,7 +17,16 @@ from cosim.spec.goal import GoalProtocol
 from cosim.spec.obstacle import OBSTACLE_VARIANTS, Obstacle, ObstacleKind
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City, CrowdSpec, Light
-from cosim.spec.validation import ALONG_M, SEED, WHERE_M, Named, Points, Ranged, Text, Within
+from cosim.spec.validation import (
+    ARC_LENGTH_M,
+    COORDINATE_M,
+    SEED,
+    PathName,
+    Points,
+    Ranged,
+    Text,
+    Within,
+)
 
 STRAIGHT_M: Final = (10.0, 100.0)
 _MOST_SEEDS: Final = 1000
@@ -73,7 +82,7 @@ class OwnWay(Ranged, frozen=True, kw_only=True):
     length_m: float | None = None
     start: PointXY | None = None
     goal: PointXY | None = None
-    route: Annotated[tuple[PointXY, ...], Points(WHERE_M.low, WHERE_M.high)] = ()
+    route: Annotated[tuple[PointXY, ...], Points(COORDINATE_M.low, COORDINATE_M.high)] = ()
     fences: bool = False
     signals: Literal["any", "with", "without"] = "any"
 
@@ -101,7 +110,7 @@ class OwnWay(Ranged, frozen=True, kw_only=True):
             )
         for name in points:
             for k, where_m in enumerate(getattr(self, name)):
-                yield WHERE_M.refusal(f"way {name}[{k}]", where_m)
+                yield COORDINATE_M.refusal(f"way {name}[{k}]", where_m)
         if len(self.route) == 1 or (self.route and len(set(self.route)) == 1):
             yield "way route needs two different points or more"
         lengths = {"straight": STRAIGHT_M, "route": ROUTE_M}
@@ -132,7 +141,7 @@ class OwnEvent(Ranged, frozen=True, kw_only=True):
     sidewalk's, for kinds that come from one."""
 
     kind: str
-    at_m: Annotated[float | None, ALONG_M] = None
+    at_m: Annotated[float | None, ARC_LENGTH_M] = None
     side: Literal["left", "right"] = "left"
     people: Annotated[int | None, Within(1, 100)] = None
     speed_mps: Annotated[float, Within(0, 3, above=True)] = 1.3
@@ -147,7 +156,7 @@ class OwnObstacle(Ranged, frozen=True, kw_only=True):
     turned_deg: from the way's direction, counter-clockwise. paint: one of four."""
 
     kind: ObstacleKind
-    at_m: Annotated[float, ALONG_M]
+    at_m: Annotated[float, ARC_LENGTH_M]
     left_m: Annotated[float, Within(-20, 20)] = 0.0
     turned_deg: Annotated[float, _TURNED_DEG] = 0.0
     size: Literal["small", "middle", "large"] = "middle"
@@ -236,7 +245,7 @@ class OwnScenario(Ranged, frozen=True, kw_only=True):
     next seed. goal_protocol: what the policy is told of where to go; by default what its manifest
     asks for."""
 
-    name: Annotated[str, Named("a scenario")]
+    name: Annotated[str, PathName("a scenario")]
     description: Annotated[str, Text(1000)] = ""
     seed: Annotated[int, SEED] = 0
     seeds: Annotated[int, Within(1, _MOST_SEEDS)] = 1

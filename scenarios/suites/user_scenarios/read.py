@@ -23,7 +23,7 @@ import msgspec
 
 from cosim.core.errors import SpecError, unknown
 from cosim.spec.robot import ROBOTS
-from cosim.spec.spec_file import bare_type, faults_in, in_lines
+from cosim.spec.spec_file import bare_type, faults_in, join_faults
 from cosim.spec.validation import shown
 from scenarios.events import EVENT_KINDS
 from scenarios.suites.user_scenarios.format import OwnScenario
@@ -96,7 +96,7 @@ def read_own(path: Path) -> OwnFile:
             f"values or seeds"
         )
     if faults:
-        raise SpecError(f"{path}: {in_lines(faults, len(faults))}")
+        raise SpecError(f"{path}: {join_faults(faults, len(faults))}")
     try:
         variants = tuple(_variants(tree, axes, path.parent))
     except msgspec.ValidationError as error:

@@ -17,12 +17,12 @@ from functools import cache
 import msgspec
 import numpy as np
 
-from cosim.core.child_process import end_with
+from cosim.core.child_process import exit_with_parent
 from cosim.core.clock import Clock
 from cosim.core.errors import SpecError
 from cosim.core.progress import Progress
 from cosim.episode.loop import Step
-from cosim.episode.policy_caller import Driver
+from cosim.episode.policy_caller import PolicyCaller
 from cosim.people.yielding import ROBOT_STANDS_MPS
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies.load import load_policy
@@ -96,7 +96,7 @@ def cross_city(city: City, count: int, policy: str) -> Iterator[Crossed]:
     done = 0
     try:
         with ProcessPoolExecutor(
-            1, context, initializer=end_with, initargs=(os.getpid(),)
+            1, context, initializer=exit_with_parent, initargs=(os.getpid(),)
         ) as alone:
             scenarios = alone.submit(_drawn, city, count).result()
             names = [scenario.id for scenario in scenarios]
@@ -121,7 +121,7 @@ def _drawn(city: City, count: int) -> list[Scenario]:
 
 
 @cache
-def driver_of(policy: str) -> Driver:
+def driver_of(policy: str) -> PolicyCaller:
     """Load the policy once for all crossings of this process."""
     return load_policy(policy)
 

@@ -37,7 +37,7 @@ from cosim.core.state import (
     RobotState,
     Street,
     Vehicles,
-    write_protected,
+    write_protected_copy,
 )
 from cosim.episode.interfaces import Crowd
 from cosim.episode.loop import Step
@@ -46,7 +46,7 @@ from cosim.place.walk_graph import WalkGraph
 from cosim.policies.privileged.route import Route
 from cosim.results.referee import Verdict
 from cosim.spec.scenario import City, CrowdSpec, Scenario
-from physics.ground.tiles import key_at
+from physics.ground.tiles import tile_at
 from physics.street.furniture import footprints
 from physics.street.street_surface import StreetSurface
 from scenarios.episodes.episode import Episode
@@ -55,7 +55,7 @@ from scenarios.places.nets import place
 from scenarios.suites.long_horizon import build_long_horizon
 from scenarios.tools.bench.figures import Spent, TimedEngine
 from sumo_nets.crowd.crowd import SumoCrowd
-from sumo_nets.crowd.stoplines import Passed, StopLines
+from sumo_nets.crowd.stoplines import StopLineCrossing, StopLines
 
 THINGS_M = 60.0
 """Distance from the route within which buildings and props are examined, in metres."""
@@ -122,7 +122,7 @@ class Glider:
             wrap_angle(heading + command.w_radps * dt_s),
         )
         self._robot = RobotState(pose, command.v_mps, command.w_radps)
-        return Motion(self._robot, write_protected([pose] * substeps))
+        return Motion(self._robot, write_protected_copy([pose] * substeps))
 
 
 def watch(city: City, minutes: float, crowd: CrowdSpec) -> Watched:
@@ -204,8 +204,8 @@ def things_along(scenario: Scenario, street_map: StreetMap) -> list[tuple[str, P
     props = ground.standing(around)
     things = [(prop.kind, polygon) for prop, polygon in zip(props, footprints(props), strict=True)]
     x0, y0, x1, y1 = around.bounds
-    (i0, j0) = key_at(x0, y0)
-    (i1, j1) = key_at(x1, y1)
+    (i0, j0) = tile_at(x0, y0)
+    (i1, j1) = tile_at(x1, y1)
     keys = [(i, j) for i in range(i0, i1 + 1) for j in range(j0, j1 + 1)]
     return things + [
         ("building", building.polygon) for key in keys for building in ground.buildings(key)
@@ -278,7 +278,7 @@ class Tally:
         self._signals(street)
         self._tick = street.tick
 
-    def drove(self, passed: Iterable[Passed]) -> None:
+    def drove(self, passed: Iterable[StopLineCrossing]) -> None:
         """Take in the vehicles that drove over stop lines in the last tick."""
         for one in passed:
             self.counts["vehicles passed stop lines"] += 1

@@ -182,11 +182,11 @@ def _factor(name: str, drive: _Drive, reach: float) -> Figure:
 def _bare_query_ms() -> float:
     """Time an empty query at intervals as in an episode, so that nothing of Zenoh's is in a
     cache."""
-    from bridge.session import LoneSession
+    from bridge.session import LocalSession
 
     between = np.ones(_BETWEEN)
     found = []
-    with LoneSession() as session:
+    with LocalSession() as session:
         session.serve("bench", bytes)
         for _ in range(_QUERIES):
             between += 1.0
@@ -200,18 +200,18 @@ def _drive(size_m: float, policy: Route) -> _Drive:
     """Drive for _MEASURED_S simulated seconds in a city of a size."""
     import physics.dynamics.bullet
     import sumo_nets.engine
-    from cosim.episode.loop import Parts
+    from cosim.episode.loop import EpisodeEngines
     from scenarios.episodes.episode import Episode
 
     scenario = scenario_in(size_m)
     spent = Spent()
     engine = Spent()
-    physics.dynamics.bullet.put_physics_stopwatch(engine.timed)
-    sumo_nets.engine.put_crowd_stopwatch(engine.timed)
+    physics.dynamics.bullet.time_physics_calls(engine.timed)
+    sumo_nets.engine.time_crowd_steps(engine.timed)
 
     def timed(stage: StagedScenario) -> None:
         parts = stage.parts
-        stage.parts = Parts(
+        stage.parts = EpisodeEngines(
             cast(World, TimedEngine(parts.world, "step", "physics", spent)),
             cast(Crowd, TimedEngine(parts.crowd, "step", "crowd", spent)),
             cast(Director, TimedEngine(parts.director, "react", "bridge", spent)),
@@ -255,7 +255,7 @@ def walking(persons: int) -> list[Figure]:
         scenario_in(2000.0), crowd=CrowdSpec(persons=persons, vehicles=_VEHICLES)
     )
     line = scenario.route_line
-    sumo_nets.engine.put_crowd_stopwatch(inside.timed)
+    sumo_nets.engine.time_crowd_steps(inside.timed)
     spent_s = 0.0
     with crowd_of(scenario) as crowd:
         for tick in range(_WARM_UP_TICKS + _MEASURED_TICKS):

@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import msgspec
 
-from cosim.core.child_process import ended_in_words
+from cosim.core.child_process import exit_in_words
 from cosim.core.errors import EngineError, UsageError
 
 LESS: Final = "<="
@@ -143,7 +143,7 @@ def alone(work: Callable[[Any], Any], size: float) -> Any:
         found = mine.recv()
     except EOFError:
         process.join()
-        how = ended_in_words(process.exitcode or 0)
+        how = exit_in_words(process.exitcode or 0)
         raise EngineError(f"the process that draws or measures it {how}") from None
     finally:
         process.kill()

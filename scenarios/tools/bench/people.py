@@ -32,7 +32,7 @@ from cosim.spec.scenario import CrowdSpec
 from scenarios.episodes.wiring import sumo_crowd
 from sumo_nets.crowd.demand import VEHICLE_TYPES
 from sumo_nets.crowd.demand_log import Entrances, PersonEntry, VehicleEntry
-from sumo_nets.crowd.empty_street import TICK_MS, start_of
+from sumo_nets.crowd.empty_street import TICK_MS, sumo_start
 from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M, GroupDraws
 from sumo_nets.net.net_file import read_net
 from sumo_nets.net.netconvert import netconvert
@@ -435,7 +435,7 @@ def _round_the_block(ring: BlockRing, flow: Flow, seed: int) -> Entrances:
         for stripe in range(stripes)
     ]
     entrances = Entrances()
-    begin_s = float(start_of(seed)[1])
+    begin_s = float(sumo_start(seed)[1])
     taken: set[tuple[int, float, int]] = set()
     for cell in rng.permutation(len(cells)).tolist():
         side, at_m, stripe = cells[cell]
@@ -455,7 +455,7 @@ def _round_the_block(ring: BlockRing, flow: Flow, seed: int) -> Entrances:
         step = 1 if not flow.both_ways or rng.random() < 0.5 else -1
         walk = tuple(ring.sides[(side + step * k) % len(ring.sides)] for k in range(4 * _ROUNDS))
         angle_deg = heading_to_sumo(math.atan2(*(step * ahead[::-1]).tolist()))
-        mps = group.walks_at(float(rng.uniform(*group.pace_mps)))
+        mps = group.speed_at(float(rng.uniform(*group.pace_mps)))
         for (_, _, k), age in zip(here, group.ages, strict=True):
             x_m, y_m = (
                 start + at_m * ahead + (k - (stripes - 1) / 2) * GROUP_STRIPE_M * left
@@ -517,7 +517,7 @@ def _over_the_street(street: OpenCrosswalk, seconds: float, seed: int) -> Entran
     rng = np.random.default_rng(seed)
     draws = GroupDraws(CrowdSpec(), rng.spawn(1)[0])
     entrances = Entrances()
-    begin_s = start_of(seed)[1] + TICK_MS / 1000
+    begin_s = sumo_start(seed)[1] + TICK_MS / 1000
     kinds = list(VEHICLE_TYPES)
     shares = [share for _, _, share in VEHICLE_TYPES.values()]
 
@@ -546,7 +546,7 @@ def _over_the_street(street: OpenCrosswalk, seconds: float, seed: int) -> Entran
             entrances.ages[name] = group.ages[0]
             aside_m = float(rng.uniform(-1.2, 1.2))
             x_m, y_m = (start + at_m * ahead + aside_m * np.array([-ahead[1], ahead[0]])).tolist()
-            mps = group.walks_at(float(rng.uniform(*group.pace_mps)))
+            mps = group.speed_at(float(rng.uniform(*group.pace_mps)))
             entry2 = PersonEntry(name, walk[0], at_m, walk, _WALK_UP_M, mps, (x_m, y_m), angle_deg)
             entrances.people[at_s].append(entry2)
     return entrances

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from cosim.core.child_process import end_with, ended_in_words
+from cosim.core.child_process import exit_in_words, exit_with_parent
 from cosim.core.clock import Clock
 from cosim.core.errors import CosimError, EngineError
 from cosim.core.geometry import Floats, Polyline, Pose
@@ -31,7 +31,7 @@ from cosim.place.street_map import StreetMap
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.events import Actor, EventReply
 from cosim.spec.scenario import City, Place, Scenario
-from physics.street.clearance import clear_width, on_driveways
+from physics.street.clearance import clear_widths, props_on_driveways
 from physics.street.furniture import footprints
 from physics.street.placement import props_of
 from sumo_nets.city.census import LEAST_CLEAR_M, Census, census
@@ -76,12 +76,12 @@ def survey(city: City) -> Survey:
     props = props_of(place, city.seed)
     found = census(net, place, list(footprints(props)))
     sidewalks = [strip for strip in place.strips.values() if strip.kind == "sidewalk"]
-    widths = clear_width(sidewalks, props)
+    widths = clear_widths(sidewalks, props)
     tightest = min(widths, key=lambda strip: widths[strip][0])
     faults = list(found.faults)
     if (side_m := widths[tightest][0]) < LEAST_CLEAR_M:
         faults.append(f"sidewalk {tightest} is only {side_m:.2f} m wide beside what stands on it")
-    if blocked := on_driveways(sidewalks, props):
+    if blocked := props_on_driveways(sidewalks, props):
         faults.append(f"{len(blocked)} props stand on driveways: {', '.join(blocked[:3])}")
     memory_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
     return Survey(city.seed, found, side_m, len(props), tuple(faults), memory_mib)
@@ -141,14 +141,14 @@ def endure(where: Place, seed: int, minutes: float = 10.0, progress: Progress = 
         reason = f"SUMO showed no sign of life for {HANG_S:g} s"
     except (EOFError, ConnectionResetError):
         process.join()
-        reason = f"SUMO {ended_in_words(process.exitcode)}" if process.exitcode else ""
+        reason = f"SUMO {exit_in_words(process.exitcode)}" if process.exitcode else ""
     process.join()
     wall_s = round(time.monotonic() - began, 1)
     return msgspec.structs.replace(last, wall_s=wall_s, reason=last.reason or reason)
 
 
 def _child(pipe: Connection, where: Place, seed: int, ticks: int, parent: int) -> None:
-    end_with(parent)
+    exit_with_parent(parent)
     so_far = Endured(place=where.name)
     try:
         for so_far in simulated(where, seed, ticks):

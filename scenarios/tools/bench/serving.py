@@ -20,7 +20,7 @@ from bridge.policy_server import serve
 from cosim.core.state import Command
 from cosim.episode.interfaces import Observation
 from cosim.episode.manifest_checks import calibration_of
-from cosim.episode.policy_caller import Driver
+from cosim.episode.policy_caller import PolicyCaller
 from cosim.spec.camera import CameraSpec
 from cosim.spec.connection import Connection
 from cosim.spec.manifest import Manifest
@@ -59,7 +59,7 @@ class BlindTogether(Blind):
 
 def asking_elsewhere() -> list[Figure]:
     """Time round trips of a 512x288 picture, and answers of one server to eight clients."""
-    here = Driver(Blind())
+    here = PolicyCaller(Blind())
     isolated = isolated_driver(_NAME, expected=Blind.manifest)
     with _served() as host:
         remote = remote_driver("zenoh:blind", host)
@@ -78,7 +78,7 @@ def asking_elsewhere() -> list[Figure]:
     ]
 
 
-def _in_turns(*drivers: Driver) -> list[float]:
+def _in_turns(*drivers: PolicyCaller) -> list[float]:
     """Return the median milliseconds of an answer of each driver."""
     took: list[list[float]] = [[] for _ in drivers]
     for driver in drivers:

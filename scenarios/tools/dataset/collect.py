@@ -25,16 +25,16 @@ from cosim.core.errors import RunError, SpecError, unwritable
 from cosim.core.files import write_atomic
 from cosim.core.progress import Progress, ignore
 from cosim.core.versions import versions
-from cosim.episode.policy_caller import Driver
-from cosim.policies.user_module import importable
+from cosim.episode.policy_caller import PolicyCaller
+from cosim.policies.user_module import importable_name
 from cosim.results.record import Record
 from cosim.results.run_folder import DEMONSTRATION, RunFolder
 from cosim.results.run_spec import brief
-from cosim.spec.demo_options import Collecting
+from cosim.spec.demo_options import DemoOptions
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import City, Scenario, Suite, read_suite
 from scenarios.episodes.demonstration import Demonstration, check_parquet
-from scenarios.episodes.demonstrator import Demonstrator, learner_of
+from scenarios.episodes.demonstrator import Demonstrator, load_learner
 from scenarios.ipc.messages import Hello, MessageHandler
 from scenarios.runs.local import LocalProcesses
 from scenarios.runs.planning import run_spec
@@ -67,7 +67,7 @@ class CollectSpec(msgspec.Struct, frozen=True, kw_only=True):
     robot: str = ""
     goal: str
     seed: int
-    collecting: Collecting
+    collecting: DemoOptions
     learner_source: str = ""
     renderer: str
     versions: dict[str, str]
@@ -116,11 +116,11 @@ def _unshown(
 
 def collect(
     source: Suite | Fresh,
-    expert: Driver,
+    expert: PolicyCaller,
     policy: str,
     out: Path,
     *,
-    collecting: Collecting,
+    collecting: DemoOptions,
     options: EpisodeOptions,
     episodes: int | None = None,
     jobs: int = 1,
@@ -139,10 +139,10 @@ def collect(
     asked for, MachineError for what the machine lacks.
     """
     check_parquet()
-    policy = importable(policy)
-    collecting = msgspec.structs.replace(collecting, learner=importable(collecting.learner))
+    policy = importable_name(policy)
+    collecting = msgspec.structs.replace(collecting, learner=importable_name(collecting.learner))
     options = msgspec.structs.replace(options, collecting=collecting, seed=options.seed or 0)
-    learner = learner_of(collecting)
+    learner = load_learner(collecting)
     demonstrator = Demonstrator(expert, collecting, options.goal, learner)
     wanted = episodes or (
         len(source.structures) * len(source.seeds) if isinstance(source, Fresh) else None
@@ -204,7 +204,7 @@ class _Rounds:
         """The scenarios of a suite."""
         return () if isinstance(self.source, Fresh) else self.source.scenarios
 
-    def asked(self, episodes: int, expert: Driver) -> CollectSpec:
+    def asked(self, episodes: int, expert: PolicyCaller) -> CollectSpec:
         """What is asked for, checked as far as can be without a place. Raises UsageError."""
         some = self.all or _nowhere(self.source)
         whole = with_robot(
@@ -223,7 +223,7 @@ class _Rounds:
             robot=self.options.robot,
             goal=self.demonstrator.manifest.goal,
             seed=self.options.seed or 0,
-            collecting=self.options.collecting or Collecting(),
+            collecting=self.options.collecting or DemoOptions(),
             learner_source=""
             if (learner := self.demonstrator.learner) is None
             else learner.source_hash,

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from cosim.core.errors import RunError, SpecError
 from cosim.core.packed_demos import Packed
 from cosim.core.progress import Progress, ignore
-from scenarios.episodes.clip import pictures_of
+from scenarios.episodes.clip import read_pictures
 from scenarios.episodes.demonstration import glimpse
 from scenarios.tools.dataset.lerobot import CODEBASE_VERSION, Collected
 
@@ -50,7 +50,7 @@ class DataSet:
         first = 0
         for film in self.films:
             shown = 0
-            for time_s, rgb in pictures_of(film):
+            for time_s, rgb in read_pictures(film):
                 if time_s != Fraction(shown, fps):
                     raise RunError(
                         f"{film}: picture {shown} is shown at {float(time_s):g} s, not "

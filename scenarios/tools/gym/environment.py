@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.errors import UsageError, unknown
-from cosim.episode.interfaces import Eyes
+from cosim.episode.interfaces import ViewCamera
 from cosim.results.record import Record
 from cosim.results.run_setup import RunSetup
 from cosim.spec.camera import CameraSpec
@@ -82,7 +82,7 @@ class SidewalkEnv(gymnasium.Env[SeenParts, NDArray[Any]]):
         self._stack = ExitStack()
         self._episode: Episode | None = None
         self._period: Period | None = None
-        self._eyes: Eyes | None = None
+        self._eyes: ViewCamera | None = None
 
     def reset(
         self, *, seed: int | None = None, options: Mapping[str, Any] | None = None

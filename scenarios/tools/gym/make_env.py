@@ -11,7 +11,7 @@ from cosim.spec.manifest import Manifest
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Split, Suite
-from cosim.spec.selection import scenarios_chosen
+from cosim.spec.selection import select_scenarios
 from scenarios.suites.catalog import load_suite, with_robot
 from scenarios.tools.gym.reward import Reward, usual_reward
 
@@ -67,7 +67,7 @@ def make_env(
             "no episode of an environment is compared with its street: leave counterfactual out"
         )
     whole = with_robot(load_suite(suite) if isinstance(suite, str) else suite, options.robot)
-    picked = scenarios_chosen(whole, scenarios, None, events, split)
+    picked = select_scenarios(whole, scenarios, None, events, split)
     settled = with_goal(manifest, options.goal)
     for name in sorted({scenario.robot for scenario in picked}):
         check_camera(settled, robot_called(name), options.own_camera)

@@ -20,7 +20,7 @@ from cosim.core.state import LABELS, Command
 from cosim.episode.control import check_numbers
 from cosim.episode.interfaces import Observation
 from cosim.spec.camera import CameraPicture, CameraSpec
-from cosim.spec.goal import GOALS, Letters
+from cosim.spec.goal import GOALS, TextSpace
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import Robot
 
@@ -133,7 +133,7 @@ def _goal_space(manifest: Manifest) -> dict[str, spaces.Space[Any]]:
     if goals is None:
         return {}
     values = goals.space(manifest.picture_size)
-    if isinstance(values, Letters):
+    if isinstance(values, TextSpace):
         return {"goal": spaces.Text(values.most, charset=values.charset)}
     return {"goal": spaces.Box(values.low, values.high, values.shape, values.dtype)}
 

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from cosim.core.errors import PolicyError
 from cosim.core.progress import Progress, ignore
-from cosim.episode.policy_caller import Driver
+from cosim.episode.policy_caller import PolicyCaller
 from cosim.spec.manifest import Manifest
 from scenarios.tools.policy_check.answer_checks import (
     behind,
@@ -83,7 +83,7 @@ class CheckedPolicy(NamedTuple):
 
 
 def checked_policy(
-    driver: Driver,
+    driver: PolicyCaller,
     manifest: Manifest,
     drives: Mapping[SceneName, Drive],
     progress: Progress = ignore,

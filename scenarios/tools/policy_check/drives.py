@@ -18,7 +18,7 @@ from shapely.geometry import LineString, MultiPolygon, Polygon
 from cosim.core.clock import Clock
 from cosim.core.geometry import Polyline, Pose, wrap_angle
 from cosim.core.progress import Progress, ignore
-from cosim.core.state import NOBODY, People, PersonKind, RobotState, Street
+from cosim.core.state import NO_PEOPLE, People, PersonKind, RobotState, Street
 from cosim.episode.interfaces import Observation
 from cosim.episode.loop import Moment
 from cosim.episode.manifest_checks import check_camera
@@ -29,7 +29,12 @@ from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario
 from physics.cameras.choice import camera_of
 from physics.dynamics.world import BulletWorld
-from scenarios.episodes.wiring import CORRIDOR_M, clear_of, empty_street, known
+from scenarios.episodes.wiring import (
+    CORRIDOR_M,
+    draw_empty_street,
+    privileged_state,
+    without_obstacles,
+)
 from scenarios.places.nets import place, surface_of_place
 from scenarios.suites.catalog import load_suite
 
@@ -103,7 +108,7 @@ def _drive(
 
     @cache
     def free() -> Polygon | MultiPolygon:
-        ground = clear_of(street_map.walkable_near(around), surface.standing(around))
+        ground = without_obstacles(street_map.walkable_near(around), surface.standing(around))
         return shapely.buffer(ground, -robot.width_m / 2)
 
     with ExitStack() as stack:
@@ -116,12 +121,14 @@ def _drive(
             if spec is not None
         }
         eye = cameras.pop("", None)
-        look = None if eye is None else partial(empty_street, eye, surface, robot)
+        look = None if eye is None else partial(draw_empty_street, eye, surface, robot)
         told = replace(manifest, odometry="none" if manifest.odometry == "none" else "exact")
         observer = Observer(
-            scenario, told, 0, lambda now: known(scenario, free(), now), cameras, look
+            scenario, told, 0, lambda now: privileged_state(scenario, free(), now), cameras, look
         )
-        people = _somebody(route, 0.5 * route.length_m + _PERSON_M) if scene == "person" else NOBODY
+        people = (
+            _somebody(route, 0.5 * route.length_m + _PERSON_M) if scene == "person" else NO_PEOPLE
+        )
         seen = []
         for number in range(count):
             time_s = number / manifest.rate_hz

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.clock import Clock
-from cosim.core.state import frozen
+from cosim.core.state import write_protect
 from cosim.episode.interfaces import Observation
 from cosim.spec.camera import Calibration, CameraPicture, flipped
 from cosim.spec.goal import Goal
@@ -139,5 +139,7 @@ def _camera_in_mirror(camera: Calibration, width_px: int) -> Calibration:
     matrix = camera.matrix.copy()
     matrix[0, 2] = width_px - 1 - matrix[0, 2]
     return Calibration(
-        frozen(matrix), camera.distortion, frozen(_MIRROR @ camera.on_robot @ _MIRROR_PX)
+        write_protect(matrix),
+        camera.distortion,
+        write_protect(_MIRROR @ camera.on_robot @ _MIRROR_PX),
     )

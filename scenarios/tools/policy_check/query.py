@@ -14,9 +14,9 @@ import numpy as np
 
 from cosim.core.geometry import Floats
 from cosim.core.progress import Progress, ignore
-from cosim.core.state import Command, Planned
+from cosim.core.state import Command, WaypointCommand
 from cosim.episode.interfaces import Observation, Policy
-from cosim.episode.policy_caller import Driver
+from cosim.episode.policy_caller import PolicyCaller
 from cosim.spec.manifest import Manifest, WaypointRule
 from scenarios.tools.policy_check.drives import Drive, SceneName
 from scenarios.tools.policy_check.edits import Edit, with_goal_told
@@ -48,7 +48,7 @@ class Answered:
 
 def answered(said: object, command: Command, rule: WaypointRule) -> Answered:
     """said: the answer as it is, which became this command."""
-    if isinstance(said, Command) or not isinstance(command, Planned):
+    if isinstance(said, Command) or not isinstance(command, WaypointCommand):
         raw = said if isinstance(said, Command) else command
         return Answered(float(raw.v_mps), float(raw.w_radps), None)
     waypoints = command.waypoints.astype(float)
@@ -79,7 +79,7 @@ class Asker:
 
     def __init__(
         self,
-        driver: Driver,
+        driver: PolicyCaller,
         manifest: Manifest,
         drives: Mapping[SceneName, Drive],
         progress: Progress = ignore,
@@ -93,7 +93,7 @@ class Asker:
         self._said: object = None
         self._known: dict[tuple[SceneName, tuple[str, ...]], Answered] = {}
         self._episodes = 0
-        driver.heard_by(self._hear)
+        driver.on_answer(self._hear)
 
     def answer(self, scene: SceneName, *edits: Edit) -> Answered:
         """The answer to the last observation of a drive, with these changes. Raises PolicyError."""

@@ -20,7 +20,7 @@ from cosim.spec.events import EventQuery
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City, CrowdSpec, Scenario
 from physics.cameras.choice import camera_of_choice, renderer_of
-from scenarios.episodes.director import directed
+from scenarios.episodes.director import in_process_director
 from scenarios.episodes.episode import Episode
 from scenarios.places.nets import place
 from scenarios.suites.long_horizon import build_long_horizon
@@ -74,7 +74,7 @@ def bridge() -> str:
         robot_width_m=COURIER.width_m,
         events=(),
     )
-    with directed("doctor") as director:
+    with in_process_director("doctor") as director:
         director.react(query)
     return "a director answered over a Zenoh session"
 

@@ -15,11 +15,11 @@ import shapely
 import cosim
 from cosim.core.errors import EngineError
 from physics.cameras.driver_check import driver_alone
-from physics.dynamics.bullet import bullet_alone
+from physics.dynamics.bullet import bullet_fingerprint
 from physics.textures.facades import facade_layers
 from physics.textures.ground import ground_layers
 from physics.textures.walls import prop_layers, wall_layers
-from sumo_nets.net.engine_check import sumo_alone
+from sumo_nets.net.engine_check import reference_hashes
 
 ROOMS: Final = ("cosim", "sumo_nets", "physics", "bridge", "scenarios")
 DRIVER: Final = "OpenGL driver"
@@ -30,7 +30,7 @@ _PX: Final = 256
 def engines_alone() -> dict[str, str]:
     """What each engine makes of a task that none of our code has a hand in, as hashes; no driver
     where there is none. No SUMO may run in this process."""
-    told = {**_arithmetic(), **sumo_alone(), **bullet_alone()}
+    told = {**_arithmetic(), **reference_hashes(), **bullet_fingerprint()}
     try:
         return {**told, DRIVER: driver_alone()}
     except EngineError:

@@ -18,7 +18,7 @@ from cosim.core.progress import Progress
 from cosim.core.versions import versions
 from cosim.spec.scenario import Scenario
 from physics.cameras.choice import camera_of_choice, renderer_of
-from scenarios.episodes.run_episode import in_words
+from scenarios.episodes.run_episode import error_message
 from scenarios.suites.catalog import SUITES, load_suite
 from scenarios.tools.verify.engines import DRIVER, engines_alone, room_hashes, textures
 from scenarios.tools.verify.traces import Trace, traced
@@ -111,7 +111,7 @@ def trace_of(case: Scenario) -> Trace | str:
     try:
         return traced(case)
     except Exception as error:  # noqa: BLE001  what a wrong version of a package does is told with all the rest
-        return in_words(error)
+        return error_message(error)
 
 
 def writable(given: Given, cases: Sequence[str]) -> Given:

@@ -10,7 +10,7 @@ import shapely
 from cosim.core.errors import unwritable
 from cosim.core.progress import Progress, ignore
 from cosim.spec.scenario import Scenario
-from physics.ground.tiles import keys_in
+from physics.ground.tiles import tiles_touching
 from physics.street.gltf import as_gltf
 from physics.street.street_surface import StreetSurface
 from scenarios.places.nets import place
@@ -26,7 +26,7 @@ def export_street(scenario: Scenario, path: Path, progress: Progress = ignore) -
     progress(f"reading the street map of {scenario.place.name}")
     _, street_map = place(scenario.place)
     surface = StreetSurface(street_map, scenario.place.seed, scenario.place.roughness)
-    keys = keys_in(shapely.buffer(shapely.LineString(scenario.route), _AROUND_M))
+    keys = tiles_touching(shapely.buffer(shapely.LineString(scenario.route), _AROUND_M))
     written = as_gltf(surface, keys, scenario.barriers, progress, scenario.obstacles)
     try:
         path.write_bytes(written)

@@ -22,7 +22,7 @@ from cosim.core.errors import RunError, listed
 from cosim.core.geometry import Floats
 from cosim.core.progress import Progress, ignore
 from cosim.core.state import DIRECTED, RobotState, Street
-from cosim.episode.interfaces import Eyes
+from cosim.episode.interfaces import ViewCamera
 from cosim.episode.loop import Step
 from cosim.report import hud
 from cosim.report.encoding import Video
@@ -32,12 +32,18 @@ from cosim.report.page.reasons import mishaps_of, reason_of
 from cosim.results.record import Record
 from cosim.results.referee import Verdict
 from cosim.results.run_folder import read_records, read_spec
-from cosim.results.waypoint_replay import Following
+from cosim.results.waypoint_replay import WaypointReplay
 from cosim.spec.camera import CameraSpec
 from cosim.spec.robot import robot_called
 from cosim.spec.run_config import CameraChoice
 from physics.cameras.view import robot_shot
-from scenarios.episodes.replay import Alike, Recorded, check, recorded, replaying
+from scenarios.episodes.replay import (
+    RecordedEpisode,
+    ReplayChecker,
+    check_state_hash,
+    load_recorded,
+    replay_episode,
+)
 from scenarios.places.nets import place, surface_of_place
 from scenarios.tools.viewing.drawn_route import way_in_picture
 from scenarios.tools.viewing.look import Viewpoint, eye_behind, over
@@ -109,7 +115,7 @@ def failure_to_film(folder: Path, scenario_id: str | None) -> FilmedFailure:
             or "no episode has ended"
         )
         raise RunError(f"{folder}: no episode failed: {counts}. Name an EPISODE to film it")
-    told = recorded(folder, scenario_id or failed[0])
+    told = load_recorded(folder, scenario_id or failed[0])
     mishap = mishaps_of(told.record)[0]
     at_s = Clock().time_s(mishap.tick + 1)
     reason = reason_of(told.scenario, told.record, mishap, told.log)
@@ -138,7 +144,7 @@ def make_film(
     Raises RunError when there is no such episode, or when the replay differs; then there is no
     file.
     """
-    told = recorded(folder, scenario_id)
+    told = load_recorded(folder, scenario_id)
     scenario, log = told.scenario, told.log
     if not cut.from_s < cut.to_s:
         raise RunError(
@@ -161,18 +167,18 @@ def make_film(
     fps = round(1.0 / Clock().tick_s)
     with ExitStack() as stack:
         video = stack.enter_context(Video(output, cut.size, fps))
-        episode, policy = replaying(told, cut.camera)
+        episode, policy = replay_episode(told, cut.camera)
         stack.enter_context(episode)
         camera = stack.enter_context(episode.eyes(robot_eye(cut)))
         minimap = Minimap(street_map, scenario, episode.footprint_m)
         reel = _Reel(told, minimap, camera, video, cut, last, progress)
-        for watch in (Alike(folder, told).watch, reel.take):
+        for watch in (ReplayChecker(folder, told).watch, reel.take):
             episode.watch(watch)
         observation = episode.reset()
         while not episode.over and episode.moment.tick < last:
             observation = episode.advance(policy.act(observation))
         if episode.over:
-            check(folder, told, episode.result()[0].state_hash)
+            check_state_hash(folder, told, episode.result()[0].state_hash)
     return math.inf if last == len(log) else Clock().time_s(last)
 
 
@@ -189,9 +195,9 @@ class _Reel:
 
     def __init__(
         self,
-        told: Recorded,
+        told: RecordedEpisode,
         minimap: Minimap,
-        camera: Eyes,
+        camera: ViewCamera,
         video: Video,
         cut: Cut,
         last: int,
@@ -200,7 +206,7 @@ class _Reel:
         self._scenario = told.scenario
         self._record = told.record
         self._minimap = minimap
-        self._following = Following(told.log)
+        self._following = WaypointReplay(told.log)
         self._credit = credit_of(told.scenario.place)
         self._plan: Floats | None = None
         self._camera = camera

@@ -15,23 +15,29 @@ import msgspec
 import numpy as np
 import shapely
 
-from cosim.core.child_process import end_with
+from cosim.core.child_process import exit_with_parent
 from cosim.core.clock import Clock
 from cosim.core.errors import CosimError, unwritable
 from cosim.core.files import write_atomic
 from cosim.core.progress import Progress, ignore
 from cosim.report.above import ROUTE, Sheet, draw_streets
 from cosim.report.encoding import image_url
-from cosim.report.page.choice import MOST_FAILURES, WITHIN_S, FailureToShow, most_telling, shown_of
-from cosim.report.page.page import Maps, colours_of, counts_of, page_of
+from cosim.report.page.choice import (
+    MAX_FAILURES,
+    WITHIN_S,
+    FailureToShow,
+    choose_failures,
+    showable_failures,
+)
+from cosim.report.page.page import Maps, colours_of, episode_counts, render_page
 from cosim.report.page.plots import plots_of
 from cosim.report.page.reasons import Mishap, mishaps_of, reason_of
 from cosim.report.page.runs import (
     ReportedRun,
-    example_of,
     light_in_words,
     place_in_words,
     read_runs,
+    scenario_kind,
 )
 from cosim.report.page.scene import Entry, PlacePicture, Spot
 from cosim.spec.run_config import CameraChoice
@@ -72,7 +78,7 @@ def make_report(
     *,
     camera: CameraChoice = "auto",
     jobs: int = 2,
-    most: int = MOST_FAILURES,
+    most: int = MAX_FAILURES,
     within_s: float = WITHIN_S,
     progress: Progress = ignore,
 ) -> ReportFacts:
@@ -83,8 +89,8 @@ def make_report(
     """
     runs = read_runs(folders, progress)
     plots = plots_of(runs, colours_of(runs), progress)
-    candidates = shown_of(runs)
-    picks, limit = most_telling(candidates, most, within_s)
+    candidates = showable_failures(runs)
+    picks, limit = choose_failures(candidates, most, within_s)
     progress("starting the engines")
     episodes, lost = _episodes(runs, picks)
     context = get_context("spawn")
@@ -109,8 +115,8 @@ def make_report(
     fixed = len(msgspec.json.encode(pictures)) + _REST_BYTES
     sizes = np.array([len(msgspec.json.encode(entry)) for entry in entries], dtype=int)
     count = int((fixed + np.cumsum(sizes) <= _MOST_BYTES).sum())
-    maps = Maps(pictures, _spots(runs, picks[:count]), dict(counts_of(runs)))
-    data = page_of(runs, plots, entries[:count], maps, _note(entries[:count]))
+    maps = Maps(pictures, _spots(runs, picks[:count]), dict(episode_counts(runs)))
+    data = render_page(runs, plots, entries[:count], maps, _note(entries[:count]))
     try:
         write_atomic(output, data)
     except OSError as error:
@@ -161,7 +167,7 @@ that waits."""
 def _begin(parent: int, done: MutableSequence[float]) -> None:
     """Begin a process that shows failures again."""
     global _done
-    end_with(parent)
+    exit_with_parent(parent)
     _done = done
 
 
@@ -222,7 +228,7 @@ def _entry(run: ReportedRun, pick: FailureToShow, showing: ShownAgain | str) -> 
         label=run.label,
         suite=run.spec.suite,
         scenario=pick.scenario,
-        kind=example_of(scenario),
+        kind=scenario_kind(scenario),
         event=pick.event,
         place=pick.place,
         light=light_in_words(scenario.light),
@@ -254,7 +260,7 @@ def _begun_pictures(
         for record in run.records:
             scenario = run.scenarios[record.scenario.id]
             there.setdefault(place_in_words(scenario), []).append(scenario)
-    failed = [name for name, (_, bad) in counts_of(runs).items() if bad]
+    failed = [name for name, (_, bad) in episode_counts(runs).items() if bad]
     failed.sort(key=lambda name: not isinstance(there[name][0].place, CityMap))
     return [
         pool.submit(

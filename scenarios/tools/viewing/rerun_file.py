@@ -36,7 +36,7 @@ from cosim.core.files import atomic_file
 from cosim.core.geometry import Floats, Pose
 from cosim.core.progress import Progress, ignore
 from cosim.core.state import LABELS, PERSON_RADIUS_M, Street
-from cosim.episode.interfaces import Eyes
+from cosim.episode.interfaces import ViewCamera
 from cosim.episode.loop import Step
 from cosim.episode.manifest_checks import calibration_of
 from cosim.place.street_map import Lane
@@ -44,13 +44,19 @@ from cosim.report.above import BARRIER, OBSTACLE, ROAD, ROUTE, VERGE
 from cosim.report.legend import Rgb255
 from cosim.report.minimap import COLOURS, PLANNED, RED_SIGNAL, VEHICLE
 from cosim.results.referee import Verdict
-from cosim.results.waypoint_replay import Following
+from cosim.results.waypoint_replay import WaypointReplay
 from cosim.spec.camera import CameraSpec
 from cosim.spec.robot import robot_called
 from cosim.spec.run_config import CameraChoice
 from cosim.spec.scenario import Scenario
 from physics.street.surface import Surface
-from scenarios.episodes.replay import Alike, Recorded, check, recorded, replaying
+from scenarios.episodes.replay import (
+    RecordedEpisode,
+    ReplayChecker,
+    check_state_hash,
+    load_recorded,
+    replay_episode,
+)
 from scenarios.places.nets import place, surface_of_place
 from scenarios.tools.viewing.drawn_route import led_to
 
@@ -98,7 +104,7 @@ def record_for_rerun(
     import rerun as rr
     import rerun.blueprint as rrb
 
-    told = recorded(folder, scenario_id)
+    told = load_recorded(folder, scenario_id)
     progress("reading the street map, starting SUMO, PyBullet and the camera")
     recording = rr.RecordingStream(
         "cosim", recording_id=f"{told.record.scenario.id}-{told.record.state_hash}"
@@ -144,15 +150,15 @@ def _blueprint(rrb: Any) -> Any:
 
 
 def _replay_into(
-    tape: _Tape, folder: Path, told: Recorded, camera: CameraChoice, progress: Progress
+    tape: _Tape, folder: Path, told: RecordedEpisode, camera: CameraChoice, progress: Progress
 ) -> None:
     spec = replace(told.record.manifest.camera or _SPEC, depth=True, labels=True)
-    episode, policy = replaying(told, camera)
+    episode, policy = replay_episode(told, camera)
     with episode, episode.eyes(spec) as eyes:
         surface = surface_of_place(told.scenario.place)
         tape.begin(surface, spec)
         for watch in (
-            Alike(folder, told).watch,
+            ReplayChecker(folder, told).watch,
             lambda step, verdict: tape.tick(step, verdict, eyes),
         ):
             episode.watch(watch)
@@ -160,21 +166,21 @@ def _replay_into(
         while not episode.over:
             observation = episode.advance(policy.act(observation))
             progress(f"recording {told.scenario.id}", episode.moment.tick / len(told.log))
-        check(folder, told, episode.result()[0].state_hash)
+        check_state_hash(folder, told, episode.result()[0].state_hash)
     tape.plots()
 
 
 class _Tape:
     """Writes into a recording. rr: the package."""
 
-    def __init__(self, rr: Any, recording: Any, told: Recorded) -> None:
+    def __init__(self, rr: Any, recording: Any, told: RecordedEpisode) -> None:
         self._rr = rr
         self._to = recording
         self._told = told
         self._robot = robot_called(told.scenario.robot)
         self._triggered: set[str] = set()
         self._middles: dict[str, Floats] = {}
-        self._following = Following(told.log)
+        self._following = WaypointReplay(told.log)
         self._planned: Floats | None = None
         self._surface: Surface
 
@@ -280,7 +286,7 @@ class _Tape:
         """(N, 3) points on the ground, or so far above it."""
         return np.column_stack([xy, self._surface.heights(xy) + above_m])
 
-    def tick(self, step: Step, verdict: Verdict, eyes: Eyes) -> None:
+    def tick(self, step: Step, verdict: Verdict, eyes: ViewCamera) -> None:
         """A tick, as it is at its end."""
         rr = self._rr
         robot = step.motion.robot

@@ -15,21 +15,21 @@ import shapely
 from cosim.core.clock import Clock
 from cosim.core.geometry import Floats
 from cosim.core.state import PersonKind, Street
-from cosim.episode.interfaces import Eyes
+from cosim.episode.interfaces import ViewCamera
 from cosim.episode.loop import Step
 from cosim.place.street_map import StreetMap
 from cosim.report.above import street_areas
 from cosim.report.encoding import image_url
-from cosim.report.page.reasons import Mishap, Other
+from cosim.report.page.reasons import MetBody, Mishap
 from cosim.report.page.scene import CrossingLight, DrawnWay, Outline, Pictures, Scene, Track
 from cosim.results.referee import Verdict
-from cosim.results.waypoint_replay import Following
+from cosim.results.waypoint_replay import WaypointReplay
 from cosim.spec.camera import CameraSpec
 from cosim.spec.obstacle import footprint
 from cosim.spec.robot import robot_called
 from cosim.spec.run_config import CameraChoice
 from physics.cameras.view import robot_shot
-from scenarios.episodes.replay import Alike, Recorded, recorded, replaying
+from scenarios.episodes.replay import RecordedEpisode, ReplayChecker, load_recorded, replay_episode
 from scenarios.places.nets import place, surface_of_place
 from scenarios.tools.viewing.drawn_route import led_to, way_in_picture
 from scenarios.tools.viewing.look import eye_behind
@@ -70,7 +70,7 @@ class ShownAgain(NamedTuple):
     """A failure shown again, and whom the robot met."""
 
     scene: Scene
-    other: Other | None
+    other: MetBody | None
 
 
 def ticks_to_show(mishaps: Sequence[Mishap]) -> int:
@@ -105,13 +105,13 @@ def show_again(
 
     Raises RunError when it comes out otherwise.
     """
-    told = recorded(folder, scenario_id)
+    told = load_recorded(folder, scenario_id)
     _, street_map = place(told.scenario.place)
-    following = Following(told.log)
+    following = WaypointReplay(told.log)
     reels = [_Reel(told, mishap, following.follows) for mishap in mishaps]
     last = _last_tick(mishaps)
     with ExitStack() as stack:
-        episode, policy = replaying(told, camera, judged_alone=True)
+        episode, policy = replay_episode(told, camera, judged_alone=True)
         stack.enter_context(episode)
         spec = robots_camera(told.record.manifest.camera)
         # Each camera keeps what stands around its own place: one for both would sort that out again
@@ -120,7 +120,7 @@ def show_again(
         shots = _Shots(
             told, spec, seen, outside, set[int]().union(*map(_pictured, mishaps)), following.follows
         )
-        episode.watch(Alike(folder, told).watch)
+        episode.watch(ReplayChecker(folder, told).watch)
 
         def watch(step: Step, verdict: Verdict) -> None:
             plan = following.take(step, verdict.reset is not None)
@@ -162,14 +162,14 @@ class _Moment(NamedTuple):
 
 class _Shots:
     """The pictures of an episode, each drawn once. spec: the robot's camera; seen, outside: the
-    cameras that draw; ticks: of which there are to be pictures; follows: see `Following`."""
+    cameras that draw; ticks: of which there are to be pictures; follows: see `WaypointReplay`."""
 
     def __init__(
         self,
-        told: Recorded,
+        told: RecordedEpisode,
         spec: CameraSpec,
-        seen: Eyes,
-        outside: Eyes,
+        seen: ViewCamera,
+        outside: ViewCamera,
         ticks: Set[int],
         follows: int,
     ) -> None:
@@ -189,7 +189,7 @@ class _Shots:
         return self._moments[tick]
 
     def take(self, step: Step, plan: Floats | None) -> None:
-        """One tick. plan: the waypoints that are followed (`Following.take`)."""
+        """One tick. plan: the waypoints that are followed (`WaypointReplay.take`)."""
         robot = step.motion.robot
         street = step.street_after
         ahead = np.array([math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)])
@@ -221,9 +221,9 @@ class _Shots:
 
 
 class _Reel:
-    """Collects the moments before one failure. follows: see `Following`."""
+    """Collects the moments before one failure. follows: see `WaypointReplay`."""
 
-    def __init__(self, told: Recorded, mishap: Mishap, follows: int) -> None:
+    def __init__(self, told: RecordedEpisode, mishap: Mishap, follows: int) -> None:
         self._scenario = told.scenario
         self._mishap = mishap
         self._follows = follows
@@ -236,7 +236,7 @@ class _Reel:
         self._at: list[int] = []
 
     def take(self, step: Step, plan: Floats | None) -> None:
-        """One tick. plan: the waypoints that are followed (`Following.take`)."""
+        """One tick. plan: the waypoints that are followed (`WaypointReplay.take`)."""
         before = self._mishap.tick - step.tick
         if step.tick < self._first or before < 0:
             return
@@ -386,13 +386,13 @@ class _Reel:
         return found
 
 
-def _other(robot: Floats, track: Track, origin: Floats) -> Other:
+def _other(robot: Floats, track: Track, origin: Floats) -> MetBody:
     """Where who was met is at the end, and its velocity. robot: (6,) of the last sample."""
     at = np.array(track.at, dtype=float).reshape(-1, 3)[-_OVER_SAMPLES - 1 :]
     xy = at[:, :2] / 100.0 + origin
     span_s = Clock().time_s(_STEP_TICKS) * (len(xy) - 1)
     velocity = (xy[-1] - xy[0]) / span_s if span_s else np.zeros(2)
-    return Other.seen_from(robot[:3], xy[-1], velocity)
+    return MetBody.seen_from(robot[:3], xy[-1], velocity)
 
 
 def _whole(values: Floats) -> list[int]:

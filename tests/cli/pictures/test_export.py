@@ -10,16 +10,16 @@ import shapely
 
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import Barrier, City, Scenario, Suite, write_suite
-from physics.ground.materials import PAVINGS, SEEN_AS
-from physics.ground.tiles import SURFACES, keys_in, kind_of, square
+from physics.ground.materials import APPEARANCE_OVERRIDES, PAVINGS
+from physics.ground.tiles import SURFACES, ground_kind, tile_bounds, tiles_touching
 from physics.street.gltf import as_gltf
 from physics.street.street_surface import StreetSurface
-from physics.textures.layers import encoded, linear
+from physics.textures.layers import linear_to_srgb, srgb_to_linear
 from tests.conftest import Cosim
 from tests.support.tiny_street import tiny_map
 
 FENCE = Barrier(x_m=-3.0, y_m=5.0, heading_rad=0.0, length_m=3.0, strip="nw", end=1)
-KEYS = keys_in(shapely.box(-40.0, -6.0, 40.0, 6.0))
+KEYS = tiles_touching(shapely.box(-40.0, -6.0, 40.0, 6.0))
 GROUPS = {"surfaces", "buildings", "trees", "furniture", "signals", "barriers"}
 
 
@@ -41,10 +41,10 @@ def test_a_street_is_read_back_as_it_is(street: StreetSurface, file: Path) -> No
     import trimesh
 
     scene = trimesh.load_scene(file)
-    x0, y0, x1, y1 = np.array([square(key) for key in KEYS]).T
+    x0, y0, x1, y1 = np.array([tile_bounds(key) for key in KEYS]).T
     ground = [patch for key in KEYS for patch in street.chunk(key).ground]
     names = {patch.name for patch in ground}
-    assert len(KEYS) == 4 and {kind_of(name) for name in names} == set(SURFACES)
+    assert len(KEYS) == 4 and {ground_kind(name) for name in names} == set(SURFACES)
     for name in names:
         mesh = scene.geometry[scene.graph[name][1]]
         at = scene.graph[name][0]
@@ -59,12 +59,12 @@ def test_a_street_is_read_back_as_it_is(street: StreetSurface, file: Path) -> No
         if name in PAVINGS:
             shown = np.array(mesh.visual.material.baseColorFactor[:3]) / 255.0
             assert shown == pytest.approx(
-                linear(SEEN_AS.get(name, (name, PAVINGS[name]))[1]), abs=0.003
+                srgb_to_linear(APPEARANCE_OVERRIDES.get(name, (name, PAVINGS[name]))[1]), abs=0.003
             )
     fence = scene.geometry["barrier:red"]
     assert fence.bounds[:, 1] == pytest.approx([0.57, 1.12], abs=0.02)
     assert fence.bounds.mean(axis=0)[[0, 2]] == pytest.approx([FENCE.x_m, -FENCE.y_m], abs=0.1)
-    red, green, _ = encoded(np.array(fence.visual.material.baseColorFactor[:3]) / 255.0)
+    red, green, _ = linear_to_srgb(np.array(fence.visual.material.baseColorFactor[:3]) / 255.0)
     assert red > 0.7 and green < 0.2
 
 
@@ -94,7 +94,7 @@ def ground_of(path: Path) -> np.ndarray:  # type: ignore[type-arg]
     found = []
     for node in scene.graph.nodes_geometry:
         at, name = scene.graph[node]
-        if kind_of(node) in SURFACES:
+        if ground_kind(node) in SURFACES:
             mesh = scene.geometry[name].copy().apply_transform(at)
             found.append(mesh.triangles_center[mesh.face_normals[:, 1] > 0.9])
     x, up, back = np.concatenate(found).T

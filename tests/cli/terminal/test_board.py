@@ -9,7 +9,7 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from cosim.cli.run_progress import SETUP_M, Board, Left
+from cosim.cli.run_progress import SETUP_M, ProgressDisplay, RemainingWork
 from cosim.core.units import duration
 from scenarios.ipc.messages import Done, Progress
 from tests.support.shipped import long_ways, shipped
@@ -27,7 +27,7 @@ class Clock:
 def test_what_is_left_is_judged_by_the_way_not_by_the_count() -> None:
     """After 100 m of 100 + 300 m in 40 s about 100 s are left, not 40; before anything is done
     nothing is said."""
-    left = Left({"a": 100.0, "b": 300.0})
+    left = RemainingWork({"a": 100.0, "b": 300.0})
     assert left.seconds(3.0) is None
     left.at("a", 1.0)
     assert left.seconds(40.0) == pytest.approx(40.0 * (300.0 + SETUP_M) / (100.0 + SETUP_M))
@@ -39,11 +39,15 @@ def test_what_is_left_is_judged_by_the_way_not_by_the_count() -> None:
 
 def board_of(
     scenarios: tuple, done: tuple[str, ...] = (), **options: object
-) -> tuple[Board, Clock, io.StringIO]:
+) -> tuple[ProgressDisplay, Clock, io.StringIO]:
     clock = Clock()
     said = io.StringIO()
     console = Console(file=said, width=80)
-    return Board(scenarios, set(done), console=console, clock=clock, **options), clock, said  # type: ignore[arg-type]
+    return (
+        ProgressDisplay(scenarios, set(done), console=console, clock=clock, **options),
+        clock,
+        said,
+    )  # type: ignore[arg-type]
 
 
 def test_a_log_says_how_many_are_done_and_how_long_the_rest_takes() -> None:

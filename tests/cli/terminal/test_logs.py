@@ -11,9 +11,14 @@ import pytest
 
 from cosim.cli.console import logged
 from cosim.core.errors import MachineError, UsageError
-from cosim.core.log_event import happened
+from cosim.core.log_event import log_event
 from cosim.results.run_folder import read_records
-from cosim.results.throughput import Figures, Going, keep_figures, median_answer_ms
+from cosim.results.throughput import (
+    Throughput,
+    ThroughputTimer,
+    append_throughput,
+    median_answer_ms,
+)
 from tests.support.driven_runs import run_of
 
 
@@ -24,11 +29,11 @@ def test_what_happens_is_a_line_of_json_and_a_line_of_words(
     appended to; nothing is said outside of the block."""
     for _ in range(2):
         with logged("info", tmp_path / "log.jsonl") as counts:
-            happened("claimed", logging.DEBUG, scenario="s-0")
-            happened(
+            log_event("claimed", logging.DEBUG, scenario="s-0")
+            log_event(
                 "retried", logging.WARNING, scenario="s-0", why="its worker was lost", attempts=1
             )
-    happened("retried", scenario="later")
+    log_event("retried", scenario="later")
     told = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert len(told) == 2 and told[0].pop("time")[10] == "T"
     assert told[0] == {
@@ -64,11 +69,11 @@ def test_figures_of_a_run_are_kept_for_each_time_that_it_went_on(tmp_path: Path)
         record.ticks for record in read_records(run) if record.scenario.id != "s-000"
     )
     with logged("", None) as counts:
-        go = Going(run, ["s-001", "s-002"], counts)
-        happened("retried", scenario="s-001")
+        go = ThroughputTimer(run, ["s-001", "s-002"], counts)
+        log_event("retried", scenario="s-001")
         go.end()
     assert go.figures is not None
-    keep_figures(
+    append_throughput(
         run,
         msgspec.structs.replace(go.figures, wall_s=10.0, episodes_per_hour=720.0, times_real=1.6),
     )
@@ -88,7 +93,7 @@ def test_what_the_policy_took_for_an_answer_is_told(tmp_path: Path) -> None:
         for record, clock in zip(some, clocks, strict=True)
     ]
     assert median_answer_ms(took) == 4.0 and median_answer_ms(took[1:2]) is None
-    figures = Figures(
+    figures = Throughput(
         began="",
         wall_s=1.0,
         episodes=4,

@@ -85,9 +85,9 @@ def test_success_names_the_events_that_end_otherwise() -> None:
     assert SUCCESS_IN_WORDS in " ".join(said.getvalue().split())
     stop, rule = SUCCESS_IN_WORDS.split("(")[1:]
     assert all(kind.name in stop for kind in EVENT_KINDS.values() if kind.ends_at == "stop")
-    assert all(kind.name in rule for kind in EVENT_KINDS.values() if kind.passed_round)
+    assert all(kind.name in rule for kind in EVENT_KINDS.values() if kind.passed_as_group)
     assert sum(kind.name in SUCCESS_IN_WORDS for kind in EVENT_KINDS.values()) == sum(
-        kind.ends_at == "stop" or kind.passed_round for kind in EVENT_KINDS.values()
+        kind.ends_at == "stop" or kind.passed_as_group for kind in EVENT_KINDS.values()
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cosim.core.errors import UsageError
-from cosim.episode.policy_caller import Driver
+from cosim.episode.policy_caller import PolicyCaller
 from cosim.policies.load import load_policy
 from cosim.policies.onnx.manifest import BundleManifest, read_bundle_manifest
 from cosim.policies.onnx.policy import OnnxPolicy
@@ -106,7 +106,7 @@ def test_an_adapter_passes_the_check(
         pytest.skip("a sample is tested without --whole")
     policy = OnnxPolicy(bundle_of(name, tmp_path))
     drives = drives_for(policy.manifest, 3, camera_of_choice("auto"))
-    found = checked_policy(Driver(policy), policy.manifest, drives)
+    found = checked_policy(PolicyCaller(policy), policy.manifest, drives)
     assert {check: one for check, one in found.outcomes.items() if one.outcome == "failed"} == {}
     assert found.outcomes["picture_ignored"].outcome == found.outcomes["unit"].outcome == "passed"
     assert found.count("passed") >= 11
@@ -118,7 +118,9 @@ def test_an_adapter_with_the_wrong_side_or_unit_fails_it(tmp_path: Path) -> None
     for changes, check in (({"columns": ["y", "x"]}, "goal_mirrored"), ({"unit_m": 11.0}, "unit")):
         policy = OnnxPolicy(bundle_of("citywalker", tmp_path, **changes))
         drives = drives_for(policy.manifest, 2, camera_of_choice("auto"))
-        outcome, words = checked_policy(Driver(policy), policy.manifest, drives).outcomes[check]
+        outcome, words = checked_policy(PolicyCaller(policy), policy.manifest, drives).outcomes[
+            check
+        ]
         assert outcome == "failed", words
 
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from cosim.core.errors import PolicyError
-from cosim.core.state import STILL, Command, Planned
-from cosim.policies.onnx.outputs import GraphOutput, answer_of
+from cosim.core.state import STILL, Command, WaypointCommand
+from cosim.policies.onnx.outputs import GraphOutput, decode_answer
 from cosim.spec.robot import COURIER, SCOUT
 
 ROWS = np.array([[[1.0, 0.5], [2.0, 1.0], [3.0, 2.0]]])
@@ -21,7 +21,7 @@ WAYPOINTS = {"what": "waypoints", "name": "plan", "index": 1}
 def answered(output: dict[str, Any], last: Command = STILL, **told: Any) -> Any:
     """The answer of a graph that tells this."""
     arrays = {name: np.asarray(array, np.float32) for name, array in told.items()}
-    return answer_of(msgspec.convert(output, GraphOutput), arrays, COURIER, last)
+    return decode_answer(msgspec.convert(output, GraphOutput), arrays, COURIER, last)
 
 
 PLANS: dict[str, tuple[dict[str, Any], Any, list[list[float]]]] = {
@@ -73,7 +73,7 @@ def test_speeds_of_a_plan_can_be_followed_in_place_of_its_waypoints() -> None:
         "unit_m": 2,
     }
     answer = answered(output, plan=[[[1, 0, 0.7, 0.2], [2, 0, 0.8, 0.3]]])
-    assert isinstance(answer, Planned) and (answer.v_mps, answer.w_radps) == pytest.approx(
+    assert isinstance(answer, WaypointCommand) and (answer.v_mps, answer.w_radps) == pytest.approx(
         (0.7, 0.2)
     )
     np.testing.assert_allclose(answer.waypoints, [[2, 0], [4, 0]])
@@ -89,7 +89,9 @@ def test_wheels_turn_a_robot_by_its_track() -> None:
     }
     answer = answered(wheels, y=[[0.4, 0.5]])
     assert (answer.v_mps, answer.w_radps) == pytest.approx((0.9, 0.2 / COURIER.drive.span_m[1]))
-    other = answer_of(msgspec.convert(wheels, GraphOutput), {"y": np.array([[0.4, 0.5]])}, SCOUT)
+    other = decode_answer(
+        msgspec.convert(wheels, GraphOutput), {"y": np.array([[0.4, 0.5]])}, SCOUT
+    )
     assert isinstance(other, Command) and other.w_radps == pytest.approx(
         0.2 / SCOUT.drive.span_m[1]
     )

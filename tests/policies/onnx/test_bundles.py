@@ -14,12 +14,17 @@ from onnx import TensorProto, helper
 
 import cosim
 from cosim.core.errors import UsageError
-from cosim.core.state import Planned
+from cosim.core.state import WaypointCommand
 from cosim.episode.manifest_checks import with_goal
 from cosim.policies.load import load_policy, shipped_bundles
 from cosim.policies.onnx.graph import Graph
 from cosim.policies.onnx.manifest import file_facts
-from cosim.policies.onnx.policy import OnnxBatchPolicy, OnnxPolicy, example_differences, in_grey
+from cosim.policies.onnx.policy import (
+    OnnxBatchPolicy,
+    OnnxPolicy,
+    example_differences,
+    example_observation,
+)
 from tests.support.graphs import (
     PICTURE,
     POINT,
@@ -177,8 +182,8 @@ def test_a_bundle_is_a_policy_from_python_too(tmp_path: Path) -> None:
         f"onnx:{bundle(tmp_path, tiny_graph(bright=np.zeros((192, 1), np.float32)))}"
     )
     policy.reset("a", 0)
-    answer = policy.act(in_grey(policy.manifest))
-    assert isinstance(answer, Planned)
+    answer = policy.act(example_observation(policy.manifest))
+    assert isinstance(answer, WaypointCommand)
     np.testing.assert_allclose(answer.waypoints, [[0.2 * i, 0.0] for i in range(1, 6)], atol=1e-6)
     assert answer.v_mps == pytest.approx(0.6 / 0.25)
 
@@ -277,7 +282,7 @@ def test_off_the_cpu_a_graph_answers_for_many_episodes_at_once(
         if step == 2:
             together.on_reset("b")
             alone["b"].on_reset()
-        grey = in_grey(together.manifest)
+        grey = example_observation(together.manifest)
         asked = [
             replace(grey, episode=name, rgb=draws.integers(0, 255, (32, 32, 3)).astype(np.uint8))
             for name in "cab"

@@ -15,9 +15,9 @@ import pytest
 from onnx import ValueInfoProto, helper
 
 from cosim.core.errors import UsageError
-from cosim.core.state import Planned
+from cosim.core.state import WaypointCommand
 from cosim.policies.load import load_policy
-from cosim.policies.onnx.policy import example_differences, in_grey, read_bundle
+from cosim.policies.onnx.policy import example_differences, example_observation, read_bundle
 from tests.support.graphs import graph_bytes, port
 
 BOUNDS = np.array([[[0.0, -0.1, -0.1, 0.0, -0.9], [0.2, 0.1, 0.1, 2.8, 0.9]]], np.float32)
@@ -158,8 +158,8 @@ def test_the_graph_of_a_window_is_driven_by_the_first_speeds_of_its_best_plan(
     )
     assert manifest.camera is not None and manifest.camera.size == (32, 18)
     driver.reset("a", 0)
-    answer = driver.act(replace(in_grey(manifest), w_radps=0.25))
-    assert isinstance(answer, Planned) and answer.w_radps == pytest.approx(0.25)
+    answer = driver.act(replace(example_observation(manifest), w_radps=0.25))
+    assert isinstance(answer, WaypointCommand) and answer.w_radps == pytest.approx(0.25)
     assert answer.v_mps == pytest.approx(2.5)  # 2.8, clipped
     np.testing.assert_allclose(answer.waypoints[:, :2], [[128 / 255, 20.0]] * 8, rtol=1e-5)
 
@@ -171,7 +171,7 @@ def test_the_graph_of_a_frame_gets_its_own_features_back(tmp_path: Path) -> None
     rule = driver.manifest.waypoints
     assert (rule.index, rule.dt_s, driver.manifest.goal) == (2, 0.5, "route_point")
     driver.reset("a", 0)
-    seen = in_grey(driver.manifest)
+    seen = example_observation(driver.manifest)
     told = [driver.policy.act(seen) for _ in range(5)]
     assert [float(np.asarray(one)[0, 0]) for one in told] == [0, 1, 2, 3, 3]
     driver.reset("b", 0)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cosim.episode.interfaces import Policy
-from cosim.episode.policy_caller import Driver
+from cosim.episode.policy_caller import PolicyCaller
 from cosim.policies.onnx.policy import OnnxPolicy
 from cosim.policies.privileged.route import Route
 from physics.cameras.choice import camera_of_choice
@@ -32,7 +32,7 @@ def drives() -> Drives:
 
 
 def outcomes_of(policy: Policy, drives: Drives) -> CheckedPolicy:
-    driver = Driver(policy)
+    driver = PolicyCaller(policy)
     return checked_policy(driver, driver.manifest, drives)
 
 
@@ -55,7 +55,7 @@ def test_a_right_policy_passes_every_check(drives: Drives) -> None:
 )
 def test_a_planted_fault_is_told(check: str, fault: type[Policy], drives: Drives) -> None:
     """The check that a fault was planted for fails, and says why."""
-    driver = Driver(fault())
+    driver = PolicyCaller(fault())
     outcome, words = checked_policy(driver, driver.manifest, drives, only=(check,)).outcomes[check]
     assert outcome == "failed", words
     assert len(words) > 10
@@ -107,7 +107,7 @@ def test_the_command_says_what_it_found(cosim: Cosim, tmp_path: Path) -> None:
 def test_an_example_is_right_only_where_it_says_what_is_to_come_out(tmp_path: Path) -> None:
     """The outputs that the graph has pass, others fail, and inputs alone, as some exporters write,
     prove nothing."""
-    driver = Driver(OnnxPolicy(bundle(tmp_path, tiny_graph())))
+    driver = PolicyCaller(OnnxPolicy(bundle(tmp_path, tiny_graph())))
     inputs = {"obs": np.zeros((1, 6, 4, 8), np.float32), "goal": np.ones((1, 2), np.float32)}
     action = np.arange(1, 6)[None, :, None] / 5 * np.ones(2)
     for expected, outcome in (

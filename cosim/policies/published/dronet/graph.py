@@ -78,7 +78,7 @@ class _Layers:
         collision = write("Sigmoid", "activation_8", collision)
         write("Identity", "steering", steering)
         write("Identity", "collision_prob", collision)
-        self._weights.check_all_taken()
+        self._weights.check_all_used()
         return self._writer.whole(
             {"image": ("N", 1, _SIDE, _SIDE)}, {"steering": ("N", 1), "collision_prob": ("N", 1)}
         )
