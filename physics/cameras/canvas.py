@@ -138,8 +138,7 @@ class BulletCanvas:
         view = p.computeViewMatrix(eye_m.tolist(), target_m.tolist(), (0.0, 0.0, 1.0))
         projection = list(p.computeProjectionMatrixFOV(fov_deg, width / height, near_m, far_m))
         if self._renderer == p.ER_TINY_RENDERER:
-            # It looks through a corner of each pixel: half a pixel aside, and it looks through the
-            # middle.
+            # TinyRenderer samples a corner of each pixel; shift by half a pixel to its centre.
             projection[8] += 1.0 / width
             projection[9] += 1.0 / height
         _, _, rgba, depth, mask = p.getCameraImage(
@@ -163,7 +162,7 @@ class BulletCanvas:
 
     def _shape_of_file(self, mesh: Mesh, folder: Path) -> int:
         """Load a mesh from a file, because the EGL plugin draws only meshes from files."""
-        from trimesh import Trimesh  # only this renderer pays for its import
+        from trimesh import Trimesh  # slow import, needed by this renderer only
 
         path = folder / f"{len(list(folder.iterdir()))}.obj"
         drawn = Trimesh(mesh.vertices, mesh.triangles, vertex_normals=mesh.normals, process=False)

@@ -95,8 +95,8 @@ def clear_sky(ways: Floats, sun: Floats, turbidity: float) -> Floats:
         )
     day = _rgb(parts["x"], parts["y"], parts["Y"])
     degrees = math.degrees(rise)
-    # By day the formula's horizon is too pink and too dim beside photographs: haze is nearly white,
-    # and bright.
+    # By day, the formula's horizon is pinker and dimmer than in photographs: haze is bright and
+    # nearly white.
     white = (day @ LUMINANCE)[..., None] * _HAZE
     share = (
         0.8

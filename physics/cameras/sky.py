@@ -176,7 +176,7 @@ def _assembled(
         np.mean([irradiance(whole, np.array(way)) for way in compass], axis=0)
         + 0.7 * lamps * _LAMPS
     )
-    # What a camera meters: a bright ground, and some of the sky over the street.
+    # Metered light: a bright ground, and some of the sky over the street.
     bright = float((up + beam * max(float(sun[2]), 0.0) + 0.5 * horizon) @ LUMINANCE)
     exposure = _KEY * 2.0**light.exposure_ev * max(bright, 1e-5) ** -_ADAPTED
     glare = _disc(ways, sun, beam)
