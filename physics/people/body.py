@@ -71,7 +71,7 @@ class SkinnedBody:
 
 @dataclass(frozen=True, slots=True)
 class FarBody:
-    """Body of tubes whose rings turn towards the eye when drawn (`lofts.Tube`).
+    """Body of tubes whose rings turn towards the eye when drawn (`lofted_mesh.Tube`).
 
     middle, ahead, side: (V, 3)
     ring: (V, 4)

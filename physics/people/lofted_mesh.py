@@ -44,7 +44,7 @@ class Ring:
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """One closed surface.
+    """Closed surface.
 
     rings: from one end to the other
     coat: surface that selects the colour
@@ -265,7 +265,7 @@ def _kept(rows: bytes, wanted: int) -> Floats:
 
 
 def _fitted(table: Floats, kept: list[int]) -> Floats:
-    """Fit the kept rings to the finer shape by least squares.
+    """Fit the remaining rings to the finer shape by least squares.
 
     Straight segments between them then run through that shape, not inside it. Both ends stay fixed.
     """

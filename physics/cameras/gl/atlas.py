@@ -37,7 +37,7 @@ _Seen = Sequence[tuple[SeatKey, RobotState, Street]]
 
 
 class Atlas:
-    """One camera for several worlds. Use it in a `with` block."""
+    """Camera for several worlds. Use it in a `with` block."""
 
     def __init__(self, spec: CameraSpec) -> None:
         self._spec = spec

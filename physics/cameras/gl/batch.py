@@ -50,7 +50,7 @@ class PictureOrder(NamedTuple):
     """Request for a picture.
 
     light: as this view sees it
-    robot: None if there is none
+    robot: None without a robot
     body: the robot's body is drawn in the picture itself, not only its shadow
     """
 

@@ -1,4 +1,4 @@
-"""Rendering of people without the street, for comparison with the paper's measurements."""
+"""Rendering of people without the street, as measured by the paper."""
 
 from __future__ import annotations
 

@@ -81,7 +81,7 @@ class _Words(msgspec.Struct, array_like=True):
 
 
 class GlScene:
-    """Static street around a view; what is drawn depends on view and signals alone."""
+    """Static street around a view, as a function of view and signals alone."""
 
     def __init__(
         self, context: moderngl.Context, forms: Forms, world: BulletWorld, light: Lighting

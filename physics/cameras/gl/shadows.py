@@ -65,7 +65,7 @@ def shadow_matrix(
 
 @contextmanager
 def casting(context: moderngl.Context) -> Iterator[None]:
-    """Set the GL state for drawing shadow maps."""
+    """Set the GL state for drawing shadow maps within a `with` block."""
     context.enable_only(moderngl.DEPTH_TEST)
     context.depth_func = "<"
     context.polygon_offset = 1.5, 4.0

@@ -80,7 +80,7 @@ class Target:
         return np.asarray(rgb, dtype=np.uint8), np.asarray(label, dtype=np.uint8)
 
     def _read(self) -> moderngl.Framebuffer:
-        """Return the texture or framebuffer to read."""
+        """Return the framebuffer to read."""
         if self._parting is None:
             return self.frame
         self._parting.draw(self._colour)
