@@ -1,8 +1,8 @@
-"""BulletCamera: pictures by PyBullet's software renderer, which needs neither a GPU nor a system
-library, or on request by its EGL plugin.
+"""Camera with PyBullet's software renderer, which needs no GPU or system library, or its EGL
+plugin.
 
-A picture is a function of the robot's state and the street alone: same values, same pixels,
-whatever was drawn before.
+A picture is a function of the robot's state and the street alone.
+The same values give the same pixels, independent of previous pictures.
 """
 
 from __future__ import annotations
@@ -26,14 +26,19 @@ from physics.dynamics.world import BulletWorld
 _HAZE: Final = np.array([206.0, 216.0, 226.0], dtype=np.float32)
 _ZENITH: Final = np.array([92.0, 142.0, 205.0], dtype=np.float32)
 _TILES_MAX: Final = 150
-"""Tiles built before the renderer is started afresh: PyBullet gives the memory of drawn shapes back
-only then."""
+"""Number of built tiles before the renderer restarts.
+
+PyBullet frees the memory of drawn shapes only at a restart.
+"""
 _CLEAR_M: Final = 20.0
 _HAZE_M: Final = 110.0
 
 
 class BulletCamera(WorldCamera):
-    """The robot's camera in a world. Use it in a `with` block; the world need not be running."""
+    """Robot camera with PyBullet's renderer.
+
+    Use it in a `with` block; the world need not be running.
+    """
 
     def __init__(
         self, world: BulletWorld, spec: CameraSpec, depth: bool = False, egl: bool = False
@@ -50,7 +55,7 @@ class BulletCamera(WorldCamera):
         return self
 
     def close(self) -> None:
-        """End the renderer; a second call does nothing."""
+        """Close the renderer; a second call does nothing."""
         if self._canvas is not None:
             self._canvas.close()
             self._canvas = self._scene = None
@@ -77,7 +82,7 @@ class BulletCamera(WorldCamera):
 
 
 def _hazy(rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Colours that fade with distance, so that the end of the drawn world is no edge."""
+    """Fade colours with distance to hide the edge of the drawn world."""
     share = np.clip((depth - _CLEAR_M) / _HAZE_M, 0.0, 0.85).astype(np.float32)[..., None]
     faded: NDArray[np.uint8] = (rgb * (1.0 - share) + _HAZE * share).astype(np.uint8)
     return faded
@@ -87,8 +92,10 @@ def _hazy(rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> NDArray[np.uint
 def _sky(
     height: int, fov_deg: float, steep_rad: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """(H, 1, 3) colours where nothing is: haze at the horizon, blue above; (H, 1) which rows are
-    below it."""
+    """Return (H, 1, 3) sky colours, haze at the horizon and blue above, and a mask.
+
+    The mask (H, 1) marks the rows below the horizon.
+    """
     rows = (0.5 - (np.arange(height) + 0.5) / height) * 2.0 * math.tan(math.radians(0.5 * fov_deg))
     rise = np.arctan(rows) - steep_rad
     up = np.clip(rise / 0.7, 0.0, 1.0)[:, None, None]

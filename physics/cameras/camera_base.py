@@ -1,5 +1,4 @@
-"""WorldCamera: what the cameras of a world share: their mount, their lens, views for humans, and
-that they end."""
+"""Base class of a world's cameras: mount, lens, views for humans, and closing."""
 
 from __future__ import annotations
 
@@ -17,9 +16,9 @@ from physics.dynamics.world import BulletWorld
 
 
 class WorldCamera(ABC):
-    """The robot's camera in a world. Use it in a `with` block; the world need not be running.
+    """Robot camera in a world. Use it in a `with` block; the world need not be running.
 
-    A subclass starts its renderer on entering and draws what a `Shot` shows.
+    A subclass starts its renderer on entering and draws a `Shot`.
     """
 
     def __init__(self, world: BulletWorld, spec: CameraSpec, depth: bool) -> None:
@@ -39,15 +38,17 @@ class WorldCamera(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """End the renderer; a second call does nothing."""
+        """Close the renderer; a second call does nothing."""
 
     @abstractmethod
     def _drawn(self, taken: Shot, street: Street, robot: RobotState | None, body: bool) -> Frame:
-        """What a shot shows. body: the robot's own body is in the picture."""
+        """Draw a shot. body: the robot's own body is in the picture."""
 
     def render(self, robot: RobotState, street: Street) -> Frame:
-        """What the robot sees from its mount, through its lens; it leans with the ground, and its
-        own body is not in the picture."""
+        """Render the robot's view from its mount, through its lens.
+
+        The camera tilts with the ground, and the robot's own body is not in the picture.
+        """
         return self.through_lens(
             self._drawn(self._mounted(robot), street, robot, body=False), robot, street
         )
@@ -61,13 +62,15 @@ class WorldCamera(ABC):
         size: tuple[int, int] = (640, 480),
         fov_deg: float = 60.0,
     ) -> Frame:
-        """A view for humans from (3,) `eye_m` towards (3,) `target_m`, with the robot in it; size:
-        width, height."""
+        """Render a view for humans with the robot in it.
+
+        eye_m, target_m: (3,) camera position and point to look at
+        size: width, height in pixels
+        """
         return self._drawn(shot(eye_m, target_m, size, fov_deg), street, robot, body=True)
 
     def through_lens(self, frame: Frame, robot: RobotState, street: Street) -> Frame:
-        """What the lens makes of a picture as the robot's pinhole camera would see it; of that what
-        the policy gets."""
+        """Apply the lens to a pinhole picture of the robot's camera, and crop it for the policy."""
         whole = through(self.spec, frame, robot, self._world.surface.seed, street.tick)
         return whole if self.spec.crop is None else _cropped(whole, *self.spec.crop)
 
@@ -76,7 +79,7 @@ class WorldCamera(ABC):
 
 
 def _cropped(frame: Frame, x0: int, y0: int, x1: int, y1: int) -> Frame:
-    """A part of a picture, and of its labels and depth."""
+    """Crop a picture with its labels and depth."""
     part = slice(y0, y1), slice(x0, x1)
     labels = None if frame.labels is None else frame.labels[part].copy()
     return Frame(

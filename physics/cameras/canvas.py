@@ -1,4 +1,4 @@
-"""Canvas: what can be seen, as bodies without collision in a PyBullet client of its own."""
+"""Visible objects as bodies without collision in a separate PyBullet client."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ _LIGHT: Final = {
 
 
 class BulletCanvas:
-    """Coloured, labelled bodies and a renderer of PyBullet's: TinyRenderer, or its EGL plugin,
-    which needs OpenGL.
+    """Coloured, labelled bodies and a PyBullet renderer.
 
-    Physics never pays for them: it runs elsewhere. Raises EngineError when the plugin does not
-    start.
+    The renderer is TinyRenderer, or the EGL plugin, which needs OpenGL.
+    Physics runs in another client, so these bodies do not slow it down.
+    Raises EngineError when the plugin does not start.
     """
 
     def __init__(self, egl: bool = False) -> None:
@@ -56,7 +56,7 @@ class BulletCanvas:
             self._folder.cleanup()
 
     def shape(self, mesh: Mesh) -> int:
-        """A form that bodies can share."""
+        """Create a shape that bodies can share."""
         if self._folder is not None:
             return self._shape_of_file(mesh, Path(self._folder.name))
         with pybullet_lists(mesh.triangles, mesh.vertices, mesh.normals) as (
@@ -73,7 +73,7 @@ class BulletCanvas:
         return shape
 
     def add(self, form: Mesh | int, colour: Colour, label: str) -> int:
-        """A body with a mesh or a shared shape."""
+        """Add a body with a mesh or a shared shape."""
         shape = self.shape(form) if isinstance(form, Mesh) else form
         body: int = p.createMultiBody(
             baseMass=0.0,
@@ -87,7 +87,7 @@ class BulletCanvas:
         return body
 
     def load(self, urdf: Path, label: str) -> int:
-        """A robot in its colours."""
+        """Load a robot in its colours."""
         body: int = p.loadURDF(str(urdf), basePosition=_AWAY, physicsClientId=self._client)
         self._label(body, label)
         return body
@@ -102,7 +102,7 @@ class BulletCanvas:
     def put(
         self, body: int, at_m: Sequence[float], heading_rad: float = 0.0, about_y_rad: float = 0.0
     ) -> None:
-        """Turn a body about its own y axis, then about the vertical, and set it at (3,) metres."""
+        """Rotate a body about its y axis, then about the vertical, and move it to (3,) metres."""
         cy, sy = math.cos(0.5 * about_y_rad), math.sin(0.5 * about_y_rad)
         cz, sz = math.cos(0.5 * heading_rad), math.sin(0.5 * heading_rad)
         p.resetBasePositionAndOrientation(
@@ -115,7 +115,7 @@ class BulletCanvas:
         )
 
     def put_at(self, body: int, at_m: Sequence[float], turn: Sequence[float]) -> None:
-        """Set a body at (3,) metres, turned by a quaternion x, y, z, w."""
+        """Move a body to (3,) metres and rotate it by a quaternion x, y, z, w."""
         p.resetBasePositionAndOrientation(body, at_m, turn, self._client)
 
     def put_away(self, body: int) -> None:
@@ -130,14 +130,15 @@ class BulletCanvas:
         near_m: float,
         far_m: float,
     ) -> tuple[NDArray[np.uint8], NDArray[np.uint8], NDArray[np.float32]]:
-        """Colours (H, W, 3), labels (H, W) and depth along the view (H, W) in metres. size: width,
-        height."""
+        """Render colours (H, W, 3), labels (H, W) and depth along the view (H, W) in metres.
+
+        size: width, height in pixels
+        """
         width, height = size
         view = p.computeViewMatrix(eye_m.tolist(), target_m.tolist(), (0.0, 0.0, 1.0))
         projection = list(p.computeProjectionMatrixFOV(fov_deg, width / height, near_m, far_m))
         if self._renderer == p.ER_TINY_RENDERER:
-            # It looks through a corner of each pixel: half a pixel aside, and it looks through the
-            # middle.
+            # TinyRenderer samples a corner of each pixel; shift by half a pixel to its centre.
             projection[8] += 1.0 / width
             projection[9] += 1.0 / height
         _, _, rgba, depth, mask = p.getCameraImage(
@@ -160,8 +161,8 @@ class BulletCanvas:
         return rgb, labels, metres
 
     def _shape_of_file(self, mesh: Mesh, folder: Path) -> int:
-        """The EGL plugin draws meshes from files alone."""
-        from trimesh import Trimesh  # only this renderer pays for its import
+        """Load a mesh from a file, because the EGL plugin draws only meshes from files."""
+        from trimesh import Trimesh  # slow import, needed by this renderer only
 
         path = folder / f"{len(list(folder.iterdir()))}.obj"
         drawn = Trimesh(mesh.vertices, mesh.triangles, vertex_normals=mesh.normals, process=False)
@@ -188,8 +189,7 @@ class BulletCanvas:
 
 
 class Rigs:
-    """Interchangeable sets of bodies, lent out anew for each picture; what is not lent is out of
-    sight."""
+    """Pool of interchangeable sets of bodies, assigned per picture. Unused sets are hidden."""
 
     def __init__(self, canvas: BulletCanvas, meshes: Sequence[Mesh], label: str) -> None:
         self._canvas = canvas
@@ -200,11 +200,11 @@ class Rigs:
         self._in_sight = 0
 
     def start(self) -> None:
-        """A new picture: everything may be lent again."""
+        """Start a new picture: all sets become available."""
         self._lent = 0
 
     def lend(self) -> list[int]:
-        """One body per mesh, in their order."""
+        """Return an available set: one body per mesh, in their order."""
         if self._lent == len(self._rigs):
             grey = (0.5, 0.5, 0.5)
             self._rigs.append(
@@ -214,7 +214,7 @@ class Rigs:
         return self._rigs[self._lent - 1]
 
     def finish(self) -> None:
-        """Put away what was lent for the last picture and not for this one."""
+        """Hide the sets of the last picture that this picture does not use."""
         for rig in self._rigs[self._lent : self._in_sight]:
             for body in rig:
                 self._canvas.put_away(body)

@@ -1,7 +1,7 @@
-"""The cameras by name: `gl` where OpenGL can be had, `bullet` anywhere, `bullet-egl` on request;
-`auto` takes `gl` if it works, else `bullet`.
+"""Cameras by name: `gl` with OpenGL, `bullet` anywhere, `bullet-egl` on request.
 
-OpenGL and PyBullet are imported when a camera of theirs is asked for.
+`auto` selects `gl` where it works, otherwise `bullet`.
+OpenGL and PyBullet are imported only when a camera needs them.
 """
 
 from __future__ import annotations
@@ -21,8 +21,10 @@ if TYPE_CHECKING:
 
 
 def camera_of_choice(choice: CameraChoice) -> CameraName:
-    """The camera that a choice comes to here. Raises EngineError when it is `gl` and there is no
-    OpenGL."""
+    """Resolve a choice to the camera available here.
+
+    Raises EngineError when it is `gl` and OpenGL is missing.
+    """
     if choice == "auto":
         return "gl" if context.available() else "bullet"
     if choice == "gl":
@@ -31,8 +33,10 @@ def camera_of_choice(choice: CameraChoice) -> CameraName:
 
 
 def renderer_of(name: CameraName) -> str:
-    """What draws the pictures, as records name it: pictures are the same bits on the same renderer
-    only."""
+    """Return the renderer's name for records.
+
+    Pictures have the same bits on the same renderer only.
+    """
     return (
         context.renderer()
         if name == "gl"
@@ -48,8 +52,10 @@ def camera_of(
     light: Light | None = None,
     depth: bool = False,
 ) -> GlCamera | BulletCamera:
-    """A camera in a world, to be used in a `with` block. light: for the gl camera; the other's
-    light is always day."""
+    """Create a camera in a world, for use in a `with` block.
+
+    light: for the gl camera; the other's light is always day
+    """
     if name == "gl":
         from physics.cameras.gl.camera import GlCamera
 

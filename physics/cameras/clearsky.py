@@ -1,4 +1,4 @@
-"""The clear sky by day and at dusk: luminance and colour of every direction."""
+"""Clear sky by day and at dusk: luminance and colour of every direction."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Floats
 
 LUMINANCE: Final = np.array([0.2126, 0.7152, 0.0722])
-"""Shares of linear sRGB in luminance."""
+"""Weights of linear sRGB in luminance."""
 
 _XYZ_TO_RGB: Final = np.array(
     [[3.2406, -1.5372, -0.4986], [-0.9689, 1.8758, 0.0415], [0.0557, -0.2040, 1.0570]]
@@ -53,20 +53,25 @@ _ZENITH: Final = {
 }
 _HAZE: Final = 1.5 * np.array([0.92, 1.01, 1.12])
 _LOWEST_RAD: Final = math.radians(3.0)
-"""Below this the daylight formula is held, and dimmed to what is measured of twilight."""
+"""Sun elevation below which the daylight formula is frozen and dimmed to measured twilight."""
 _TWILIGHT_DEG: Final = (-18.0, -12.0, -6.0, -4.0, -2.0, 0.0, 3.0)
 _TWILIGHT_LOG: Final = (-6.0, -5.0, -2.75, -2.0, -1.25, -0.62, 0.0)
-"""Common logarithm of the sky's light against that at 3 degrees (after the usual tables of twilight
-illuminance: about 400 lx at sunset, 3.4 lx at -6 degrees, 0.008 lx at -12)."""
+"""Common logarithm of the sky's light relative to that at 3 degrees.
+
+It follows the usual tables of twilight illuminance: about 400 lx at sunset, 3.4 lx at -6 degrees,
+0.008 lx at -12.
+"""
 
 
 def clear_sky(ways: Floats, sun: Floats, turbidity: float) -> Floats:
-    """Radiance of a cloudless sky in directions (..., 3), as linear sRGB in kcd/m2; at the horizon
-    below it.
+    """Return the radiance of a cloudless sky in directions (..., 3), linear sRGB in kcd/m2.
 
-    A. J. Preetham, P. Shirley and B. Smits, A practical analytic model for daylight, SIGGRAPH 1999;
-    below 3 degrees of sun its light is dimmed along the measured twilight and turned blue, red near
-    where the sun went down.
+    Directions below the horizon get the value at the horizon.
+
+    A. J. Preetham, P. Shirley and B. Smits, A practical analytic model for daylight, SIGGRAPH 1999.
+    Below 3 degrees of sun elevation, the light is dimmed along the measured twilight and turned
+    blue.
+    It is red near the point of sunset.
     """
     rise = math.asin(float(np.clip(sun[2], -1.0, 1.0)))
     held = max(rise, _LOWEST_RAD)
@@ -90,8 +95,8 @@ def clear_sky(ways: Floats, sun: Floats, turbidity: float) -> Floats:
         )
     day = _rgb(parts["x"], parts["y"], parts["Y"])
     degrees = math.degrees(rise)
-    # By day the formula's horizon is too pink and too dim beside photographs: haze is nearly white,
-    # and bright.
+    # By day, the formula's horizon is pinker and dimmer than in photographs: haze is bright and
+    # nearly white.
     white = (day @ LUMINANCE)[..., None] * _HAZE
     share = (
         0.8
@@ -107,7 +112,9 @@ def clear_sky(ways: Floats, sun: Floats, turbidity: float) -> Floats:
 
 
 def _dusk(ways: Floats, at: Floats, day: Floats) -> Floats:
-    """A simple fit to the look of civil twilight: blue above, a warm band over the sun's place."""
+    """Return a simple fit of civil twilight: blue above, with a warm band over the sun's
+    position.
+    """
     level = float((day @ LUMINANCE).mean())
     height = np.maximum(ways[..., 2:], 0.0)
     side = 0.5 + 0.5 * (ways[..., :2] @ at[:2])[..., None]
@@ -119,7 +126,7 @@ def _dusk(ways: Floats, at: Floats, day: Floats) -> Floats:
 def _perez(
     terms: list[float], cos_theta: NDArray[np.floating], gamma: NDArray[np.floating]
 ) -> Floats:
-    """R. Perez's all-weather function (1993) of zenith and sun distance."""
+    """Evaluate R. Perez's all-weather function (1993) of zenith and sun distance."""
     a, b, c, d, e = terms
     return np.asarray(
         (1.0 + a * np.exp(b / cos_theta)) * (1.0 + c * np.exp(d * gamma) + e * np.cos(gamma) ** 2),
@@ -128,7 +135,7 @@ def _perez(
 
 
 def _rgb(x: Floats, y: Floats, luminance: Floats) -> Floats:
-    """CIE xyY as linear sRGB, nothing below 0."""
+    """Convert CIE xyY to linear sRGB, clipped at 0."""
     bright = np.maximum(luminance, 0.0)
     xyz = np.stack([bright * x / y, bright, bright * (1.0 - x - y) / y], axis=-1)
     return np.asarray(np.maximum(xyz @ _XYZ_TO_RGB.T, 0.0))

@@ -1,4 +1,4 @@
-"""Clouds over a clear sky: a layer of fair-weather clouds, closing to an overcast."""
+"""Clouds over a clear sky: from fair-weather clouds to an overcast."""
 
 from __future__ import annotations
 
@@ -13,17 +13,20 @@ from physics.textures.noise import Field, Noise, smooth_step
 
 _SIZE: Final = 512
 _PER_SIDE: Final = 5.0
-"""Side of the layer's repeating square, in heights of the layer."""
+"""Side of the layer's repeating square, in units of the layer's height."""
 
 
 def clouded(
     clear: Floats, ways: Floats, sun: Floats, beam: Floats, cover: float, seed: int
 ) -> tuple[Floats, float]:
-    """Radiance (H, W, 3) of the sky with clouds, and the share of the sun that they let through.
+    """Return the radiance (H, W, 3) of the sky with clouds, and the transmitted share of the sun.
 
-    clear, ways: radiance and directions of a cloudless sky; beam: (3,) sun; cover: 0 to 1. A closed
-    sky is the overcast of the CIE (P. Moon and D. E. Spencer, 1942): three times brighter at the
-    zenith than at the horizon.
+    clear, ways: radiance and directions of a cloudless sky
+    beam: (3,) sunlight
+    cover: cloud cover, 0 to 1
+
+    A full cover is the overcast of the CIE (P. Moon and D. E. Spencer, 1942).
+    It is three times brighter at the zenith than at the horizon.
     """
     if cover <= 0.0:
         return np.array(clear), 1.0
@@ -60,8 +63,7 @@ def clouded(
 
 
 def _layer(seed: int) -> Field:
-    """(S, S) noise of the layer, its values spread evenly over 0 to 1, so that a cover is a
-    threshold."""
+    """Return (S, S) noise with a uniform distribution in 0 to 1, so that a cover is a threshold."""
     noise = Noise(_SIZE, (seed, 9001))
     field = noise.distort(
         np.asarray(noise.clouds(4) + 0.6 * noise.clouds(16) + 0.15 * noise.clouds(64), np.float32),
@@ -73,7 +75,7 @@ def _layer(seed: int) -> Field:
 
 
 def _dense(layer: Field, ways: Floats, cover: float, moved: Floats) -> Field:
-    """How thick the clouds are in each direction, 0 to 1."""
+    """Return the cloud density in each direction, 0 to 1."""
     flat = ways[..., :2] / np.maximum(ways[..., 2:] + 0.12, 0.06) + moved
     at = (flat / _PER_SIDE % 1.0 * _SIZE).astype(np.float32)
     found = cv2.remap(layer, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)

@@ -1,5 +1,4 @@
-"""The OpenGL driver by itself, with a shader that is written out here: what comes out hangs on it
-alone."""
+"""Isolated check of the OpenGL driver with a fixed shader; only the driver affects the result."""
 
 from __future__ import annotations
 
@@ -28,7 +27,10 @@ void main() {
 
 
 def driver_alone() -> str:
-    """A shaded, textured, tilted square, as a hash. Raises EngineError without OpenGL."""
+    """Render a shaded, textured, tilted square and return its hash.
+
+    Raises EngineError without OpenGL.
+    """
     with context() as gl:
         program = gl.program(vertex_shader=_VERTEX, fragment_shader=_FRAGMENT)
         corners = gl.buffer(np.array([-1, -1, 1, -1, -1, 1, 1, 1], dtype="f4").tobytes())

@@ -1,4 +1,4 @@
-"""Skies of the user's: equirectangular Radiance pictures."""
+"""Loading of user-supplied skies: equirectangular Radiance pictures."""
 
 from __future__ import annotations
 
@@ -17,14 +17,16 @@ from physics.cameras.clearsky import LUMINANCE
 _Image = NDArray[np.float32]
 
 ROWS_MAX = 512
-"""Larger pictures are averaged down: a sky is seen blurred."""
+"""Rows above which pictures are averaged down; a sky appears blurred anyway."""
 _MOST_BYTES = 1 << 30
 _SPOT_RAD = math.radians(4.0)
 
 
 def read_hdri(path: str) -> _Image:
-    """(H, 2H, 3) linear radiance of a Radiance .hdr picture. Raises SpecError naming the file and
-    what is wrong."""
+    """Load (H, 2H, 3) linear radiance of a Radiance .hdr picture.
+
+    Raises SpecError naming the file and the fault.
+    """
     file = Path(path)
     if not file.is_file():
         raise SpecError(f"hdri '{path}' does not exist")
@@ -59,9 +61,12 @@ def read_hdri(path: str) -> _Image:
 
 
 def brightest(picture: _Image, ways: Floats) -> tuple[Floats, Floats, _Image]:
-    """Direction (3,) of the brightest spot above the horizon, its light (3,) as the radiance of a
-    white surface that faces it, and the picture without it: what exceeds the ring around the spot
-    is taken out."""
+    """Find the brightest spot above the horizon and remove it from the picture.
+
+    Returns its direction (3,), its light (3,), and the picture without it.
+    The light is the radiance of a white surface that faces the spot.
+    Removal subtracts the excess over the ring around the spot.
+    """
     rows = len(picture)
     light = picture.astype(float) @ LUMINANCE
     light[rows // 2 :] = 0.0

@@ -1,9 +1,7 @@
-"""Lens: what optics and sensor do to a drawn picture, as pure functions of the picture and the
-robot's state.
+"""Effects of optics and sensor on a drawn picture, as pure functions of picture and robot state.
 
-In the order of the light: the picture slides while the shutter is open (motion blur) and while rows
-are read (rolling shutter), is bent by the lens, falls off towards the corners, is counted in
-electrons, and is amplified.
+In the order of the light: motion blur while the shutter is open, rolling shutter while rows are
+read, distortion, vignetting, electron noise, and gain.
 """
 
 from __future__ import annotations
@@ -24,23 +22,22 @@ from cosim.spec.robot import Mount
 from physics.textures.layers import LINEAR_OF_SRGB_BYTE, linear_to_srgb
 
 GREY: Final = 0.18
-"""Mean linear value that auto-exposure aims at."""
+"""Target mean of auto-exposure, linear."""
 SAMPLES_MAX: Final = 8
-"""Moments of an open shutter that are averaged; one for each 1.5 pixels that the picture moves, up
-to these."""
+"""Maximum number of averaged shutter samples; there is one for each 1.5 pixels of motion."""
 
 _DRAWN_MAX: Final = 4096
 _OFFSETS: Final = 1 << 18
 _FAR_M: Final = 15.0
-"""What is not the ground is taken to be this far away: the walls of a street."""
+"""Assumed distance of everything above the ground, the walls of a street, metres."""
 _CODES: Final = (linear_to_srgb(np.arange(4097) / 4096.0) * 255.0 + 0.5).astype(np.uint8)
 Map = NDArray[np.floating[Any]]
 
 
 def drawn(spec: CameraSpec) -> CameraSpec:
-    """The pinhole camera to draw for a camera with a lens: as sharp in the middle, and wide enough
-    for every pixel.
+    """Return the pinhole camera to draw for a camera with a lens.
 
+    It is as sharp in the middle, and wide enough for every pixel.
     Raises SpecError where k1 and k2 fold the picture at this field of view.
     """
     lens = spec.lens
@@ -61,11 +58,13 @@ def drawn(spec: CameraSpec) -> CameraSpec:
 
 
 def through(spec: CameraSpec, frame: Frame, robot: RobotState, seed: int, tick: int) -> Frame:
-    """The frame of a camera with a lens, from the frame of `drawn(spec)`. Labels and depth are only
-    moved.
+    """Apply the lens to the frame of `drawn(spec)`. Labels and depth are only warped.
 
-    robot: the source of motion blur and skew; seed, tick: of the noise. Motion is that of the
-    ground plane below and of walls beside; people and vehicles blur as if they stood still.
+    robot: state for motion blur and skew
+    seed, tick: of the noise
+
+    Motion is that of the ground plane and of walls at both sides.
+    People and vehicles blur as if they stood still.
     """
     lens = spec.lens
     if lens == Lens():
@@ -112,11 +111,10 @@ def through(spec: CameraSpec, frame: Frame, robot: RobotState, seed: int, tick: 
 
 
 def exposure_gain(light: NDArray[np.floating[Any]], range_ev: float) -> float:
-    """What auto-exposure multiplies a linear picture (H, W, 3) by: its mean to GREY, within
-    +-`range_ev` stops.
+    """Return the auto-exposure gain of a linear picture (H, W, 3).
 
-    It meters the picture itself and remembers nothing, so that a picture stays a function of the
-    state.
+    The gain moves the mean to GREY, within +-`range_ev` stops.
+    It depends on this picture alone, so that a picture stays a function of the state.
     """
     mean = float(light.mean(axis=(0, 1)) @ np.array([0.2126, 0.7152, 0.0722]))
     return float(np.clip(GREY / max(mean, 1e-6), 2.0**-range_ev, 2.0**range_ev))
@@ -125,8 +123,9 @@ def exposure_gain(light: NDArray[np.floating[Any]], range_ev: float) -> float:
 def _sensed(
     light: NDArray[np.floating[Any]], spec: CameraSpec, seed: int, tick: int
 ) -> NDArray[np.floating[Any]]:
-    """Fall of light, noise of the sensor, amplification; linear in and out. The gain amplifies the
-    noise too."""
+    """Apply vignetting, sensor noise and gain; linear in and out. The gain amplifies the noise
+    too.
+    """
     lens = spec.lens
     if lens.vignette:
         light = light * _falloff(spec)[..., None]
@@ -140,7 +139,7 @@ def _sensed(
 
 
 def _moments(spec: CameraSpec, flow: Map | None) -> list[float]:
-    """Times at which an open shutter is looked through, around 0."""
+    """Return the sampling times of an open shutter, centred on 0."""
     if flow is None or not spec.lens.shutter_s:
         return [0.0]
     pixels = float(np.abs(flow).max()) * _focal_px(spec) * spec.lens.shutter_s
@@ -156,7 +155,7 @@ def _moved(
     time_s: Map,
     how: int,
 ) -> NDArray[Any]:
-    """A source picture as the lens shows it, each row at its time; `time_s` (H, 1)."""
+    """Warp a source picture by the lens and motion, each row at its time; `time_s` is (H, 1)."""
     if flow is None:
         one, two = _still(spec, source, how)
     else:
@@ -166,7 +165,7 @@ def _moved(
 
 
 def _pixels(spec: CameraSpec, source: CameraSpec, x: Map, y: Map) -> tuple[Map, Map]:
-    """Columns and rows in the source picture of rays (H, W)."""
+    """Return columns and rows of rays (H, W) in the source picture."""
     focal = np.float32(_focal_px(spec))
     return x * focal + np.float32(0.5 * source.width - 0.5), y * focal + np.float32(
         0.5 * source.height - 0.5
@@ -175,7 +174,7 @@ def _pixels(spec: CameraSpec, source: CameraSpec, x: Map, y: Map) -> tuple[Map, 
 
 @lru_cache(maxsize=8)
 def _still(spec: CameraSpec, source: CameraSpec, how: int) -> tuple[NDArray[Any], NDArray[Any]]:
-    """The lens alone, as OpenCV's fixed-point maps, which it reads faster."""
+    """Return the lens distortion as OpenCV's fixed-point maps, which are faster to apply."""
     whole: tuple[NDArray[Any], NDArray[Any]] = cv2.convertMaps(
         *_pixels(spec, source, *_rays(spec)), cv2.CV_16SC2, nninterpolation=how == cv2.INTER_NEAREST
     )
@@ -188,8 +187,7 @@ def _focal_px(spec: CameraSpec) -> float:
 
 @lru_cache(maxsize=8)
 def _rays(spec: CameraSpec) -> tuple[Map, Map]:
-    """(H, W) x to the right and y down, in focal lengths, of the ray that each pixel of the lens
-    sees.
+    """Return (H, W) x (right) and y (down) of the ray of each lens pixel, in focal lengths.
 
     D. C. Brown, Photogrammetric Engineering 37 (1971): r' = r (1 + k1 r^2 + k2 r^4), solved for r
     by Newton's method.
@@ -221,8 +219,7 @@ def _rays(spec: CameraSpec) -> tuple[Map, Map]:
 
 @lru_cache(maxsize=2)
 def _noise(seed: int, size: int) -> Map:
-    """Normal noise of a scenario: each picture takes `size` values of it from a place of its
-    own."""
+    """Return normal noise of a scenario; each picture takes `size` values at its own offset."""
     return _locked(
         np.random.default_rng([seed, 0x1E45]).standard_normal(size + _OFFSETS, dtype=np.float32)
     )
@@ -230,16 +227,17 @@ def _noise(seed: int, size: int) -> Map:
 
 @lru_cache(maxsize=8)
 def _falloff(spec: CameraSpec) -> Map:
-    """(H, W) light that arrives: 1 in the middle, cos^4 of the angle off the axis at a vignette of
-    1."""
+    """Return (H, W) transmitted light: 1 in the middle, cos^4 of the off-axis angle at a vignette
+    of 1.
+    """
     x, y = _rays(spec)
     return _locked(1.0 - spec.lens.vignette * (1.0 - (1.0 + x**2 + y**2) ** -2.0))
 
 
 @lru_cache(maxsize=8)
 def _flows(spec: CameraSpec) -> tuple[Map, Map]:
-    """(H, W, 2) how the picture moves, in focal lengths a second: per m/s ahead, and per rad/s to
-    the left.
+    """Return the optical flow (H, W, 2) in focal lengths per second, per m/s ahead and per rad/s
+    left.
 
     H. C. Longuet-Higgins and K. Prazdny, Proc. R. Soc. B 208 (1980), over a ground plane and walls
     at _FAR_M.

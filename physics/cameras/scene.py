@@ -1,5 +1,4 @@
-"""The street around a point as a canvas shows it: tiles, buildings, props, fences, signals, people,
-vehicles."""
+"""Street around a point on a canvas: tiles, buildings, props, fences, signals, people, vehicles."""
 
 from __future__ import annotations
 
@@ -35,9 +34,14 @@ from physics.textures.layers import Colour
 
 @dataclass(frozen=True, slots=True)
 class _TileBodies:
-    """A built tile. bodies: body -> where it belongs (x, y, z and heading); posts: the signals in
-    it; furniture: its props with the heights of their feet, at (N, 2) furniture_xy, drawn as far as
-    (N,) seen_m."""
+    """Bodies of a built tile.
+
+    bodies: body -> its place (x, y, z and heading)
+    posts: signals of the tile
+    furniture: props with the heights of their feet
+    furniture_xy: (N, 2) positions of the props
+    seen_m: (N,) drawing distances of the props
+    """
 
     bodies: dict[int, tuple[tuple[float, float, float], float]]
     posts: list[props.SignalPost]
@@ -47,9 +51,9 @@ class _TileBodies:
 
 
 class BulletScene:
-    """Keeps the canvas as the street around a view; what is drawn depends on view and street alone.
+    """Street around a view on a canvas; the result depends on view and street alone.
 
-    built: number of tiles made since the start.
+    built: number of tiles built since the start
     """
 
     def __init__(self, canvas: BulletCanvas, world: BulletWorld) -> None:
@@ -81,7 +85,7 @@ class BulletScene:
                 canvas.put(body, (barrier.x_m, barrier.y_m, z), barrier.heading_rad)
 
     def arrange(self, view: View, street: Street) -> None:
-        """Let the canvas hold everything that this view can show, the robot left out."""
+        """Update the canvas to everything that this view can show, without the robot."""
         self._stream(view)
         self._show_people(view, street.people, Clock().time_s(street.tick))
         self._show_vehicles(view, street.vehicles)
@@ -90,7 +94,7 @@ class BulletScene:
         self._canvas.put_away(self._robot)
 
     def show_robot(self, pose: Pose, z_m: float, roll_rad: float, pitch_rad: float) -> None:
-        """Set the robot's base frame there, until the next `arrange`."""
+        """Place the robot's base frame at a pose, until the next `arrange`."""
         h = self._model.com_height_m
         ahead = h * math.sin(pitch_rad)
         x, y = (
@@ -198,8 +202,7 @@ class BulletScene:
             rigs.finish()
 
     def _show_furniture(self, view: View) -> None:
-        """Props are lent their bodies like people: those out of the picture or far away cost
-        nothing."""
+        """Assign pooled bodies to the props in view and in range, as for people."""
         for rigs in self._furniture.values():
             rigs.start()
         for tile in (*(self._tiles[key] for key in sorted(self._shown)), self._obstacles):

@@ -1,10 +1,10 @@
-"""Sky: sun, sky light, clouds, fog and exposure of a scenario's light, as values for a camera.
+"""Sun, sky light, clouds, fog and exposure of a scenario's light, as values for a camera.
 
 Radiance is linear sRGB; 1 is a white matt surface that faces the sun outside the air. A camera
 draws
 
-    L = albedo * (ambient(n) + sun_colour * max(0, n . sun) * lit),   L = mix(fog_colour, L,
-    exp(-fog_per_m * distance))
+    L = albedo * (ambient(n) + sun_colour * max(0, n . sun) * lit)
+    L = mix(fog_colour, L, exp(-fog_per_m * distance))
     pixel = sRGB(filmic(L * exposure))
 """
 
@@ -29,27 +29,31 @@ from physics.cameras.sun import sun_direction, transmittance
 from physics.textures import noise
 
 HORIZON_FADE: Final = 0.06
-"""The sine of the angle over which the horizon fades into the ground below it."""
+"""Sine of the angle over which the horizon fades into the ground below it."""
 SKY_SIZE: Final = (256, 512)
 """Rows and columns of a procedural sky."""
 TURBIDITY: Final = 3.0
 GROUND_ALBEDO: Final = 0.2
 HOUSES: Final = 0.4
-"""What houses and trees hide of the sky over a street, weighed by the cosine: a street 1.5 times as
-wide as its houses are high. A photographed sky has its own."""
+"""Share of the sky over a street hidden by houses and trees, cosine-weighted.
+
+It assumes a street 1.5 times as wide as its houses are high. A photographed sky includes its own
+houses.
+"""
 HOUSE_ALBEDO: Final = 0.4
 
 _FULL_KLX: Final = 128.0
 _CLEAR_M: Final = 30_000.0
 _FOG_TOP_M: Final = 60.0
 _ADAPTED: Final = 0.85
-"""A camera, and an eye, make up for most of the dark, not for all of it: the power of the light
-that is undone."""
+"""Exponent of the light that exposure compensates; cameras and eyes do not fully adapt to
+darkness.
+"""
 _KEY: Final = 0.85
 _LAMPS: Final = 2.2e-4 * np.array([1.0, 0.82, 0.62])
 """Light of a lamp-lit street at night, some 28 lx."""
 _NIGHT: Final = 2.2e-4 * np.array([0.62, 0.72, 1.0])
-"""Scale of the glow of a city's sky."""
+"""Radiance scale of the glow of a city's sky."""
 
 _MADE_BY: Final = sources_hash(Path(__file__).parent, Path(noise.__file__).parent)
 
@@ -58,12 +62,18 @@ _Image = NDArray[np.float32]
 
 @dataclass(frozen=True, slots=True)
 class Sky:
-    """Light on a scene. sun: (3,) unit vector towards it, x east, y north, z up; sun_colour: (3,),
-    0 when it is down or covered. ambient: (3, 3) radiance of a white surface that looks up,
-    sideways, down, without the sun. radiance: (H, 2H, 3) float32 equirectangular: row 0 is the
-    zenith, the middle column looks east, the picture's right is clockwise: u = 0.5 - atan2(y, x) /
-    2 pi, v = 0.5 - asin(z) / pi. fog_per_m: extinction. lamps: 0 by day to 1 at night. shadows:
-    whether the sun throws any. Arrays are write-protected.
+    """Light on a scene. Arrays are write-protected.
+
+    sun: (3,) unit vector towards the sun, x east, y north, z up
+    sun_colour: (3,), 0 when the sun is below the horizon or covered
+    ambient: (3, 3) radiance of a white surface that faces up, sideways, down, without the sun
+    radiance: (H, 2H, 3) float32 equirectangular picture
+    fog_per_m: extinction per metre
+    lamps: 0 by day to 1 at night
+    shadows: the sun casts shadows
+
+    Row 0 of `radiance` is the zenith, the middle column looks east, and right is clockwise:
+    u = 0.5 - atan2(y, x) / 2 pi, v = 0.5 - asin(z) / pi.
     """
 
     sun: Floats
@@ -79,10 +89,10 @@ class Sky:
 
 @lru_cache(maxsize=8)
 def sky_of(light: Light, seed: int = 0) -> Sky:
-    """The sky of a light; seed: of the clouds. Raises SpecError naming a broken picture of the
-    user's.
+    """Compute the sky of a light. seed: of the clouds.
 
-    That of the light which a scenario has by default is baked.
+    The sky of a scenario's default light is baked.
+    Raises SpecError naming a broken picture of the user's.
     """
     if light != Light():
         return _photographed(light) if light.hdri else _procedural(light, seed)
@@ -100,7 +110,7 @@ def sky_of(light: Light, seed: int = 0) -> Sky:
 
 
 def directions(rows: int) -> Floats:
-    """(rows, 2 rows, 3) unit vectors of an equirectangular picture's pixels."""
+    """Return (rows, 2 rows, 3) unit vectors of an equirectangular picture's pixels."""
     rise = (0.5 - (np.arange(rows) + 0.5) / rows)[:, None] * math.pi
     turn = (0.5 - (np.arange(2 * rows) + 0.5) / (2 * rows))[None, :] * 2.0 * math.pi
     flat = np.cos(rise)
@@ -108,8 +118,10 @@ def directions(rows: int) -> Floats:
 
 
 def irradiance(radiance: NDArray[np.floating], towards: Floats) -> Floats:
-    """(3,) radiance of a white matt surface facing `towards`, lit by an equirectangular (H, 2H, 3)
-    picture."""
+    """Return (3,) radiance of a white matt surface facing `towards`.
+
+    radiance: equirectangular (H, 2H, 3) picture that lights it
+    """
     rows = len(radiance)
     ways = directions(rows)
     solid = (math.pi / rows) ** 2 * np.cos((0.5 - (np.arange(rows) + 0.5) / rows) * math.pi)
@@ -134,8 +146,10 @@ def _procedural(light: Light, seed: int) -> Sky:
 def _fogged(
     sky: Floats, ways: Floats, sun: Floats, beam: Floats, per_m: float
 ) -> tuple[Floats, Floats]:
-    """Sky and sun through a layer of fog; most of the light it takes comes down all the same, from
-    everywhere."""
+    """Attenuate sky and sun by a layer of fog.
+
+    Most of the attenuated light still arrives, from all directions.
+    """
     if per_m == 0.0:
         return sky, beam
     left = np.exp(-per_m * _FOG_TOP_M / np.maximum(ways[..., 2:], 0.02))
@@ -162,7 +176,7 @@ def _assembled(
         np.mean([irradiance(whole, np.array(way)) for way in compass], axis=0)
         + 0.7 * lamps * _LAMPS
     )
-    # What a camera meters: a bright ground, and some of the sky over the street.
+    # Metered light: a bright ground, and some of the sky over the street.
     bright = float((up + beam * max(float(sun[2]), 0.0) + 0.5 * horizon) @ LUMINANCE)
     exposure = _KEY * 2.0**light.exposure_ev * max(bright, 1e-5) ** -_ADAPTED
     glare = _disc(ways, sun, beam)
@@ -180,7 +194,7 @@ def _assembled(
 
 
 def _on_walls(sun: Floats, beam: Floats) -> Floats:
-    """(3,) what the sun gives a wall, on the mean over all ways that walls face."""
+    """Return (3,) sunlight on a wall, averaged over all wall orientations."""
     up = max(float(sun[2]), 0.0)
     return (
         np.asarray(beam * math.sqrt(max(1.0 - up * up, 0.0)) / math.pi) if up > 0.0 else np.zeros(3)
@@ -188,19 +202,23 @@ def _on_walls(sun: Floats, beam: Floats) -> Floats:
 
 
 def _horizon(sky: Floats, row: int) -> Floats:
-    """(3,) mean colour of the sky just over the horizon."""
+    """Return (3,) mean colour of the sky just over the horizon."""
     return np.asarray(sky[row - max(1, len(sky) // 40) : row].mean(axis=(0, 1)), dtype=float)
 
 
 def _disc(ways: Floats, sun: Floats, beam: Floats) -> Floats:
-    """The sun's glare, drawn for the eye: its light itself is `sun_colour`, and not part of the
-    ambient."""
+    """Return the visible glare of the sun.
+
+    Its light is `sun_colour` and not part of the ambient.
+    """
     apart = np.arccos(np.clip(ways @ sun, -1.0, 1.0))[..., None]
     return beam * (30.0 * np.exp(-((apart / 0.018) ** 2)) + 0.6 * np.exp(-apart / 0.10))
 
 
 def _photographed(light: Light) -> Sky:
-    """A sky from the user's picture, scaled so that a white horizontal surface has radiance 1."""
+    """Load the user's picture as a sky, scaled so that a white horizontal surface has radiance
+    1.
+    """
     picture = read_hdri(light.hdri)
     sun, spot, rest = brightest(picture, directions(len(picture)))
     up = irradiance(

@@ -1,4 +1,4 @@
-"""Where the sun is, and what the air leaves of its light."""
+"""Position of the sun, and its light after the atmosphere."""
 
 from __future__ import annotations
 
@@ -10,20 +10,24 @@ import numpy as np
 from cosim.core.geometry import Floats
 
 WAVELENGTHS_UM: Final = (0.610, 0.550, 0.465)
-"""Where the red, green and blue of sRGB are represented."""
+"""Representative wavelengths of the red, green and blue of sRGB, micrometres."""
 
 
 def declination_rad(day_of_year: float) -> float:
-    """The sun's declination: P. I. Cooper, Solar Energy 12 (1969), 23.45 deg sin(360/365 (284 +
-    n))."""
+    """Return the sun's declination: P. I. Cooper, Solar Energy 12 (1969).
+
+    The formula is 23.45 deg sin(360/365 (284 + n)).
+    """
     return math.radians(23.45) * math.sin(2.0 * math.pi * (284.0 + day_of_year) / 365.0)
 
 
 def sun_direction(hour: float, day_of_year: float, latitude_deg: float) -> Floats:
-    """(3,) unit vector towards the sun, x east, y north, z up; below the ground at night.
+    """Return the (3,) unit vector towards the sun, x east, y north, z up; below the ground at
+    night.
 
-    hour: solar time, 15 degrees of hour angle each (J. A. Duffie and W. A. Beckman, Solar
-    Engineering of Thermal Processes, chapter 1).
+    hour: solar time, 15 degrees of hour angle each
+
+    J. A. Duffie and W. A. Beckman, Solar Engineering of Thermal Processes, chapter 1.
     """
     turn = math.radians(15.0 * (hour - 12.0))
     tilt = declination_rad(day_of_year)
@@ -35,17 +39,20 @@ def sun_direction(hour: float, day_of_year: float, latitude_deg: float) -> Float
 
 
 def air_mass(elevation_rad: float) -> float:
-    """Air between here and the sun, 1 towards the zenith: F. Kasten and A. T. Young, Applied Optics
-    28 (1989)."""
+    """Return the relative air mass towards the sun, 1 at the zenith.
+
+    F. Kasten and A. T. Young, Applied Optics 28 (1989).
+    """
     degrees = max(math.degrees(elevation_rad), 0.0)
     return 1.0 / (math.sin(math.radians(degrees)) + 0.50572 * math.pow(degrees + 6.07995, -1.6364))
 
 
 def transmittance(elevation_rad: float, turbidity: float) -> Floats:
-    """(3,) share of the sun's red, green and blue that comes through clear air.
+    """Return the (3,) share of the sun's red, green and blue that clear air transmits.
 
     Rayleigh and aerosol terms as in A. J. Preetham, P. Shirley and B. Smits, SIGGRAPH 1999,
-    appendix 1. The last degree to the horizon fades out: half of the disc is gone at 0.
+    appendix 1.
+    The last degree to the horizon fades out: half of the disc is gone at 0.
     """
     mass = air_mass(elevation_rad)
     haze = 0.04608 * turbidity - 0.04586

@@ -1,5 +1,4 @@
-"""What every camera shares: where a picture is taken from, what can be in it, and how large it may
-be."""
+"""Views shared by all cameras: camera pose, visible area and limits of the picture size."""
 
 from __future__ import annotations
 
@@ -19,7 +18,7 @@ from cosim.spec.robot import Robot
 from physics.street.surface import Surface
 
 VISIBLE_M: Final = 50.0
-"""How far around the eye the ground is drawn, and what stands on it."""
+"""Radius around the eye in which the ground and objects on it are drawn, metres."""
 FORGET_M: Final = 70.0
 NEAR_PLANE_M: Final = 0.05
 FAR_PLANE_M: Final = 160.0
@@ -29,13 +28,17 @@ PROP_MARGIN_M: Final = 2.5
 SIDE_MAX: Final = 4096
 _FOV_DEG: Final = (5.0, 150.0)
 _MOUNT_M: Final = 3.0
-"""No robot carries its camera higher above the ground."""
+"""Maximum height of a robot's camera above the ground, metres."""
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """The wedge of ground that a picture shows. eye_m: (3,); heading_rad; half_angle_rad: half its
-    width; behind_m: how far behind the eye a picture from above reaches."""
+    """Wedge of ground that a picture shows.
+
+    eye_m: (3,)
+    half_angle_rad: half its horizontal width
+    behind_m: reach of a picture from above behind the eye, metres
+    """
 
     eye_m: Floats
     heading_rad: float
@@ -43,12 +46,14 @@ class View:
     behind_m: float = 0.0
 
     def rows(self, xy: Floats, margin_m: float) -> NDArray[np.intp]:
-        """Which of (N, 2) points can be in the picture, things of radius `margin_m` standing on
-        them."""
+        """Return the rows of (N, 2) points that can be visible.
+
+        margin_m: radius of the objects at the points
+        """
         return self.sees(xy, margin_m).nonzero()[0]
 
     def sees(self, xy: Floats, margin_m: float, reach_m: float = VISIBLE_M) -> NDArray[np.bool_]:
-        """Whether each of (N, 2) points can be in a picture that reaches so far."""
+        """Return a mask of (N, 2) points that can be in a picture of range `reach_m`."""
         offset = xy - self.eye_m[:2]
         cos, sin = math.cos(self.heading_rad), math.sin(self.heading_rad)
         ahead = offset @ np.array([cos, sin])
@@ -63,8 +68,12 @@ class View:
 
 @dataclass(frozen=True)
 class Shot:
-    """A picture to be taken: (3,) eye_m and target_m; width and height in pixels; vertical field of
-    view."""
+    """Picture to be taken.
+
+    eye_m, target_m: (3,)
+    size: width and height in pixels
+    fov_deg: vertical field of view
+    """
 
     eye_m: Floats
     target_m: Floats
@@ -76,13 +85,13 @@ class Shot:
 
     @property
     def steep_rad(self) -> float:
-        """How far the view points below the horizon."""
+        """Return the angle of the view below the horizon."""
         ahead = self.target_m - self.eye_m
         return math.atan2(-ahead[2], math.hypot(ahead[0], ahead[1]))
 
     @property
     def half_picture(self) -> tuple[float, float]:
-        """Tangents of the angles from the middle to the right and to the upper edge."""
+        """Return the tangents of the angles from the middle to the right and to the upper edge."""
         tall = math.tan(math.radians(0.5 * self.fov_deg))
         return tall * self.size[0] / self.size[1], tall
 
@@ -106,8 +115,10 @@ class Shot:
 
     @cached_property
     def axes(self) -> Floats:
-        """(3, 3) unit vectors right, up in the picture, ahead. A view straight down has north
-        above."""
+        """Return (3, 3) unit vectors right, up in the picture, ahead.
+
+        A view straight down has north at the top.
+        """
         x, y, z = (self.target_m - self.eye_m).tolist()
         flat = math.hypot(x, y)
         long = math.hypot(x, y, z)
@@ -117,7 +128,7 @@ class Shot:
 
 
 def check_size(width: int, height: int, fov_deg: float) -> None:
-    """Raises UsageError for a picture that nobody can mean."""
+    """Raise UsageError for an invalid picture size or field of view."""
     if not (1 <= width <= SIDE_MAX and 1 <= height <= SIDE_MAX):
         raise UsageError(
             f"a picture of {width} x {height} pixels: each side must be 1 to {SIDE_MAX}"
@@ -129,7 +140,7 @@ def check_size(width: int, height: int, fov_deg: float) -> None:
 
 
 def robot_shot(surface: Surface, model: Robot, spec: CameraSpec, robot: RobotState) -> Shot:
-    """What a robot's camera looks at from its mount; it leans with the ground."""
+    """Return the view of a robot's camera from its mount; it tilts with the ground."""
     turn = _attitude(surface, model, robot)
     mount = spec.on(model)
     x, y, z = mount.at_m
@@ -144,15 +155,14 @@ def robot_shot(surface: Surface, model: Robot, spec: CameraSpec, robot: RobotSta
 
 
 def shot(eye_m: ArrayLike, target_m: ArrayLike, size: tuple[int, int], fov_deg: float) -> Shot:
-    """A view from (3,) `eye_m` towards (3,) `target_m`."""
+    """Return a view from (3,) `eye_m` towards (3,) `target_m`."""
     return Shot(np.asarray(eye_m, dtype=float), np.asarray(target_m, dtype=float), size, fov_deg)
 
 
 def _attitude(
     surface: Surface, model: Robot, robot: RobotState
 ) -> tuple[tuple[float, float, float], ...]:
-    """Rows of the rotation from the base frame to the world: heading, and the slope of the
-    surface."""
+    """Return the rotation matrix from the base frame to the world: heading, then surface slope."""
     _, roll, pitch = surface.lean(robot.pose, model.drive.span_m)
     cz, sz = math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)
     cy = math.cos(pitch)

@@ -1,5 +1,4 @@
-"""What people wear and carry besides clothes: hair, caps, bags, backpacks, phones, as lofts on the
-man of 1.75 m."""
+"""Lofts of hair, caps, bags, backpacks and phones, modelled on the man of 1.75 m."""
 
 from __future__ import annotations
 
@@ -17,7 +16,7 @@ _HAIR: Final = (18, 11, 6, 4)
 
 
 def hair(style: Hair) -> list[Piece]:
-    """Hair about the head, in front up to the hairline."""
+    """Return the hair of a style, down to the hairline at the front."""
     nape = {"short": 1.585, "crop": 1.600, "bob": 1.515, "long": 1.40, "bun": 1.585, "tail": 1.585}[
         style
     ]
@@ -84,7 +83,7 @@ def hair(style: Hair) -> list[Piece]:
 
 
 def headgear() -> list[Piece]:
-    """A cap with a visor."""
+    """Return a cap with a visor."""
     dome = (
         (1.676, -0.006, 0.096, 0.110, 0.083),
         (1.690, -0.006, 0.101, 0.114, 0.0865),
@@ -113,7 +112,9 @@ def headgear() -> list[Piece]:
 
 
 def carried(what: Carried, loose: float = 0.0) -> list[Piece]:
-    """A shoulder bag at the left hip, a backpack, a phone in the left hand."""
+    """Return a carried object: shoulder bag at the left hip, backpack, or phone in the left
+    hand.
+    """
     if what == "bag":
         return [_bag(), _strap(loose)]
     if what == "backpack":
@@ -140,8 +141,10 @@ def _bag() -> Piece:
 
 
 def _strap(loose: float) -> Piece:
-    """From the right shoulder over chest and back to the bag: a flat loop's front and back, as one
-    thin ring."""
+    """Return the strap of the shoulder bag as one thin ring.
+
+    It runs from the right shoulder over chest and back to the bag.
+    """
     rings = []
     for share in (0.0, 0.2, 0.4, 0.6, 0.8, 1.0):
         z = 0.95 + 0.53 * share
@@ -207,7 +210,7 @@ def _shoulder_strap(left: float, loose: float) -> Piece:
 
 
 def _phone() -> Piece:
-    """Lies in the palm of the left hand, along the fingers."""
+    """Return a phone that lies in the palm of the left hand, along the fingers."""
     rings = [
         on_arm(
             0.585 + 0.145 * share,

@@ -1,4 +1,4 @@
-"""Who looks how: body, clothes and colours of a person from its name and age, always the same."""
+"""Appearance of people: body, clothes and colours as a fixed function of name and age."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ OUTFITS: Final[dict[str, tuple[Outfit, ...]]] = {
         Outfit("elder", _OLD, "coat", "long", "crop", loose_m=0.012),
     ),
 }
-"""Bodies that people have, by family."""
+"""Available outfits by family."""
 
 ALL: Final = tuple(outfit for family in OUTFITS.values() for outfit in family)
 
@@ -100,8 +100,12 @@ _Colour = tuple[int, int, int]
 
 @dataclass(frozen=True, slots=True)
 class Look:
-    """How a person looks. outfit: row of ALL; colours: (10, 3) uint8, by COATS; girth_m: how far
-    fat stands out."""
+    """Appearance of a person.
+
+    outfit: row of ALL
+    colours: (10, 3) uint8, in the order of COATS
+    girth_m: offset of the surface by body fat, metres
+    """
 
     outfit: int
     colours: NDArray[np.uint8]
@@ -109,7 +113,7 @@ class Look:
 
 
 def family_of(name: str, age: int) -> Family:
-    """Whose skeleton the person of this `Age` has."""
+    """Return the skeleton family of the person of this `Age`."""
     if age == Age.CHILD:
         return "child"
     if age == Age.ELDERLY:
@@ -119,8 +123,10 @@ def family_of(name: str, age: int) -> Family:
 
 @lru_cache(maxsize=65536)
 def look_of(name: str, age: int, seed: int = 0) -> Look:
-    """The look of the person of this `Age` called `name`; another seed dresses everybody anew, at
-    the same stature."""
+    """Return the look of the person of this `Age` called `name`.
+
+    seed: changes clothes and colours, but not stature
+    """
     family = family_of(name, age)
     choices = [outfit for outfit in OUTFITS[family] if _fits(outfit, name)]
     outfit = choices[_draw(name, seed, "outfit") % len(choices)]
@@ -146,17 +152,17 @@ def look_of(name: str, age: int, seed: int = 0) -> Look:
 
 
 def _hairs(skin: _Colour) -> tuple[str, ...]:
-    """Darker skins have darker hair."""
+    """Return the hair colours for a skin colour: darker skin has darker hair."""
     return _HAIRS if skin[0] > 0xB0 else _HAIRS[:3]
 
 
 def _fits(outfit: Outfit, name: str) -> bool:
-    """Old men and old women share a family; their clothes do not."""
+    """Return whether an outfit suits the person. Old men and women share a family, not clothes."""
     return outfit.family != "elder" or (outfit.legs == "skirt") == is_woman(name)
 
 
 def _pick(palette: tuple[str, ...], name: str, seed: int, what: str) -> _Colour:
-    """A colour of a palette, a little lighter or darker."""
+    """Pick a colour of a palette and vary its brightness slightly."""
     draw = _draw(name, seed, what)
     shade = 0.88 + 0.24 * (draw >> 16 & 0xFF) / 255.0
     code = palette[draw % len(palette)]

@@ -1,4 +1,4 @@
-"""Arms and hands as lofts on the man of 1.75 m, along a straight arm in the A pose."""
+"""Lofts of arms and hands on the man of 1.75 m, along a straight arm in the A pose."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from physics.people.skeleton import INDEX, REACH_RAD
 
 
 def arms(build: Build, sleeve: Sleeve, loose: float = 0.0) -> list[Piece]:
-    """Both arms in sleeves, and the hands."""
+    """Return both arms in sleeves, and the hands."""
     pieces: list[Piece] = []
     for side, left in (("left", 1.0), ("right", -1.0)):
         collar, shoulder, elbow, wrist = (
             f"{side}_{part}" for part in ("collar", "shoulder", "elbow", "wrist")
         )
         keys = (
-            # way along the arm from the shoulder, half depth, half width across, weights
+            # distance along the arm from the shoulder, half depth, half width across, weights
             (-0.020, 0.020, 0.014, {"spine3": 0.1, collar: 0.5, shoulder: 0.4}),
             (-0.008, 0.040, 0.030, {collar: 0.5, shoulder: 0.5}),
             (0.014, 0.053, 0.043, {collar: 0.35, shoulder: 0.65}),
@@ -66,7 +66,7 @@ def _arm(
 
 
 def _hand(side: str, left: float) -> list[Piece]:
-    """Palm, four fingers, thumb; from some way on all in one."""
+    """Return palm, four fingers and thumb. Coarse levels merge the fingers with the palm."""
     wrist = {f"{side}_wrist": 1.0}
     hand = {f"{side}_wrist": 0.25, f"{side}_hand": 0.75}
     palm = (
@@ -136,8 +136,11 @@ def on_arm(
     square: float = 2.0,
     fat: float = 0.0,
 ) -> Ring:
-    """A ring on the arm, `way` from the shoulder, off its line by `ahead` and `palm` (to the back
-    of the hand)."""
+    """Return a ring on the arm.
+
+    way: distance along the arm from the shoulder
+    ahead, palm: offsets from the arm's axis, forwards and to the back of the hand
+    """
     x, y, z = man_rest_m()[INDEX["left_shoulder"]].tolist()
     cos, sin = math.cos(float(REACH_RAD)), math.sin(float(REACH_RAD))
     at = (

@@ -1,5 +1,4 @@
-"""Bodies: skinned meshes of people at several levels of detail, put together from lofts and fitted
-to a family."""
+"""Skinned body meshes at several levels of detail, assembled from lofts and fitted to a family."""
 
 from __future__ import annotations
 
@@ -31,12 +30,12 @@ from physics.people.lofted_mesh import Piece, lofted, tube
 from physics.people.skeleton import Skeleton, model_pose
 
 COATS: Final = ("skin", "lips", "hair", "white", "dark", "top", "bottom", "shoes", "bag", "cap")
-"""What a vertex is painted as; a person has one colour for each."""
+"""Surfaces of a body; a person has one colour for each."""
 
 
 @dataclass(frozen=True, slots=True)
 class Outfit:
-    """What makes a body: family, build, clothes, hair, and what is carried."""
+    """Components of a body: family, build, clothes, hair and carried objects."""
 
     family: Family
     build: Build
@@ -51,10 +50,15 @@ class Outfit:
 
 @dataclass(frozen=True, slots=True)
 class SkinnedBody:
-    """A skinned mesh. vertices, normals (V, 3) in the A pose, x ahead, z up, soles at 0; triangles
-    (T, 3), front counter-clockwise; joints (V, 4) uint8 rows and weights (V, 4) float32 that fall
-    and sum to 1; coat (V,) uint8 rows of COATS; fat (V,) float32, how much a vertex moves out on
-    stouter people."""
+    """Skinned mesh in the A pose: x ahead, z up, soles at z = 0.
+
+    vertices, normals: (V, 3)
+    triangles: (T, 3), front counter-clockwise
+    joints: (V, 4) uint8 rows
+    weights: (V, 4) float32, descending, with sum 1
+    coat: (V,) uint8 rows of COATS
+    fat: (V,) float32, offset of a vertex on stouter people
+    """
 
     vertices: NDArray[np.float32]
     normals: NDArray[np.float32]
@@ -67,9 +71,15 @@ class SkinnedBody:
 
 @dataclass(frozen=True, slots=True)
 class FarBody:
-    """A body of tubes, whose rings are turned towards the eye when it is drawn (`lofts.Tube`).
-    middle, ahead, side (V, 3); ring (V, 4); still (V,) whose rings are not turned; ribbon (V,) of
-    outlines alone; the rest as in SkinnedBody."""
+    """Body of tubes whose rings turn towards the eye when drawn (`lofted_mesh.Tube`).
+
+    middle, ahead, side: (V, 3)
+    ring: (V, 4)
+    still: (V,) true where rings are not turned
+    ribbon: (V,) true where only an outline is drawn
+
+    All other fields are as in SkinnedBody.
+    """
 
     middle: NDArray[np.float32]
     ahead: NDArray[np.float32]
@@ -86,7 +96,7 @@ class FarBody:
 
 @lru_cache(maxsize=128)
 def body(outfit: Outfit, level: int) -> SkinnedBody:
-    """The body at a level of meshes: 0 is full detail."""
+    """Build the body at a mesh level of detail; 0 is full detail."""
     if not 0 <= level < MESH_LEVELS:
         raise ValueError(f"levels of meshes go from 0 to {MESH_LEVELS - 1}: {level}")
     surfaces = [
@@ -117,7 +127,7 @@ def body(outfit: Outfit, level: int) -> SkinnedBody:
 
 @lru_cache(maxsize=128)
 def far_body(outfit: Outfit, level: int) -> FarBody:
-    """The body at a level of tubes or ribbons, MESH_LEVELS to LEVELS - 1."""
+    """Build the body at a level of tubes or ribbons, MESH_LEVELS to LEVELS - 1."""
     if not MESH_LEVELS <= level < LEVELS:
         raise ValueError(f"levels of tubes go from {MESH_LEVELS} to {LEVELS - 1}: {level}")
     ribbon = level == RIBBONS
@@ -153,7 +163,7 @@ def far_body(outfit: Outfit, level: int) -> FarBody:
 
 @lru_cache(maxsize=64)
 def pieces(outfit: Outfit) -> tuple[Piece, ...]:
-    """The closed surfaces of a body."""
+    """Return the closed surfaces of a body."""
     build = outfit.build
     parts = torso_pieces(build, outfit.loose_m, outfit.legs)
     if outfit.legs == "skirt":
@@ -168,15 +178,17 @@ def pieces(outfit: Outfit) -> tuple[Piece, ...]:
 
 
 def strongest(weights: Floats) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """The four joints that move each of V vertices most, and their weights, which sum to 1."""
+    """Return the four joints with the largest weights of V vertices, and these weights.
+
+    The weights are normalized to sum 1.
+    """
     order = np.argsort(-weights, axis=1, kind="stable")[:, :4]
     few = np.take_along_axis(weights, order, axis=1)
     return order.astype(np.uint8), (few / few.sum(axis=1, keepdims=True)).astype(np.float32)
 
 
 def _sided(vertices: Floats, weights: Floats) -> Floats:
-    """Weights in which what a loft gives to both hips or collars goes to those of the vertex's own
-    side."""
+    """Move weights of both hips or collars to the joint on the vertex's own side."""
     out = weights.copy()
     share = np.clip(0.5 + vertices[:, 1] / 0.10, 0.0, 1.0)
     share = share * share * (3.0 - 2.0 * share)
@@ -190,8 +202,7 @@ def _sided(vertices: Floats, weights: Floats) -> Floats:
 
 
 def _fitted(vertices: Floats, weights: Floats, family: Skeleton) -> Floats:
-    """Vertices of the man moved along with their joints to where a family has them, at the family's
-    size."""
+    """Move the man's vertices with their joints to the proportions and size of a family."""
     man = Skeleton(man_rest_m(), 1.75)
     scale = family.height_m / man.height_m
     _, ours = bind_of(Skeleton(family.rest_m / scale, man.height_m), model_pose())

@@ -1,9 +1,11 @@
-"""Motion captures that ship with PyBullet, turned onto the SMPL joints.
+"""Motion captures that ship with PyBullet, converted to the SMPL joints.
 
-The files are those of DeepMimic's humanoid: a list of frames of 44 numbers: how long the frame
-lasts, the root's position and quaternion (w x y z), then chest, neck, right hip, right knee, right
-ankle, right shoulder, right elbow, and the same five of the left; knees and elbows are one angle
-about z, all others quaternions. Axes there: x ahead, y up, z right; at rest the arms hang.
+The files are those of DeepMimic's humanoid: a list of frames of 44 numbers.
+Each frame holds its duration, then the root's position and quaternion (w x y z).
+The joints follow: chest, neck, right hip, knee, ankle, shoulder, elbow, and the same five of the
+left.
+Knees and elbows are one angle about z, all others are quaternions.
+The file's axes are x ahead, y up, z right; in the rest pose the arms hang.
 """
 
 from __future__ import annotations
@@ -40,8 +42,11 @@ _HINGES: Final = ("right_knee", "right_elbow", "left_knee", "left_elbow")
 
 @dataclass(frozen=True, slots=True)
 class Capture:
-    """A captured motion. turns: (F, 24, 3, 3) of each joint against its parent; pelvis_m: (F, 3);
-    axes of the body."""
+    """Captured motion in the axes of the body.
+
+    turns: (F, 24, 3, 3) rotations of each joint relative to its parent
+    pelvis_m: (F, 3)
+    """
 
     frame_s: float
     turns: Floats
@@ -49,8 +54,10 @@ class Capture:
 
 
 def capture(name: str) -> Capture:
-    """The capture `humanoid3d_<name>` of pybullet_data. Raises EngineError naming file and
-    fault."""
+    """Load the capture `humanoid3d_<name>` of pybullet_data.
+
+    Raises EngineError naming the file and the fault.
+    """
     found = importlib.util.find_spec("pybullet_data")
     if found is None or not found.submodule_search_locations:
         raise EngineError(
@@ -62,7 +69,7 @@ def capture(name: str) -> Capture:
 
 
 def read_capture(path: Path) -> Capture:
-    """A capture from a file. Raises EngineError naming file and fault."""
+    """Read a capture from a file. Raises EngineError naming the file and the fault."""
     try:
         rows = np.array(json.loads(path.read_text())["Frames"], dtype=float)
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -76,8 +83,10 @@ def read_capture(path: Path) -> Capture:
 
 
 def _turns(rows: Floats) -> Floats:
-    """(F, 24, 3, 3) turns against the T pose: the chest's shared among three joints, the neck's
-    among two."""
+    """Return (F, 24, 3, 3) rotations relative to the T pose.
+
+    The chest's rotation is divided among three joints, the neck's among two.
+    """
     local = {name: _turn(rows, name) for name in _COLUMNS}
     turns = np.tile(np.eye(3), (len(rows), 24, 1, 1))
     for name in (
@@ -103,8 +112,10 @@ def _turns(rows: Floats) -> Floats:
 
 
 def _turn(rows: Floats, name: str) -> Floats:
-    """(F, 3) axis-angle of a joint against its parent, in our axes, both at rest with hanging
-    arms."""
+    """Return (F, 3) axis-angle vectors of a joint relative to its parent, in the body's axes.
+
+    Both rest poses have hanging arms.
+    """
     at = _COLUMNS[name]
     if name in _HINGES:
         return np.column_stack([np.zeros(len(rows)), -rows[:, at], np.zeros(len(rows))])

@@ -1,5 +1,4 @@
-"""All motions of all families, baked: the joints' matrices of every frame in one array that a
-renderer can hold."""
+"""Baked motions of all families: the joint matrices of every frame in one array for renderers."""
 
 from __future__ import annotations
 
@@ -26,18 +25,21 @@ from physics.people.skeleton import Skeleton, forward, model_pose, skinning
 STOOP_RAD: Final[Mapping[Family, float]] = MappingProxyType(
     {"man": 0.0, "woman": 0.0, "child": 0.0, "elder": 0.34}
 )
-"""How far the back is bent."""
+"""Bend of the back by family, rad."""
 _MADE_BY: Final = sources_hash(Path(__file__).parent, Path(__file__).parents[2] / "cosim/people")
 
 
 @dataclass(frozen=True, slots=True)
 class Clips:
-    """Baked motions. matrices: (R, 24, 3, 4) float32, one row per frame, loops one after another.
+    """Baked motions.
 
-    They take a vertex, as modelled, to the posed body, in the body frame (x ahead, y left, z up,
-    the ground at 0). gaits: (families, paces) first rows of strides of `stride_frames` frames;
-    gestures: name -> (families,) first rows of loops of `loop_frames` frames and `loop_s` seconds;
-    loops: the same as (gestures, families), in the order of GESTURES.
+    matrices: (R, 24, 3, 4) float32, one row per frame, loops one after another
+    gaits: (families, paces) first rows of strides of `stride_frames` frames
+    gestures: name -> (families,) first rows of loops of `loop_frames` frames and `loop_s` seconds
+    loops: the same as (gestures, families), in the order of GESTURES
+
+    A matrix maps a vertex as modelled to the posed body in the body frame.
+    The body frame is x ahead, y left, z up, with the ground at 0.
     """
 
     matrices: NDArray[np.float32]
@@ -51,15 +53,17 @@ class Clips:
 
 @lru_cache(maxsize=1)
 def own_clips() -> Clips:
-    """The motions of our own bodies."""
+    """Return the baked motions of the built-in bodies."""
     arrays = mapped_arrays("clips", _MADE_BY, _made)
     gestures = {name: arrays[name] for name in GESTURES}
     return Clips(arrays["matrices"], arrays["gaits"], gestures, np.stack(list(gestures.values())))
 
 
 def _made() -> Arrays:
-    """Every gait and gesture of our bodies: skeleton, stoop, and the (24, 3, 3) turns in which each
-    is modelled."""
+    """Build every gait and gesture of the built-in bodies.
+
+    Returns skeleton, stoop, and the (24, 3, 3) rotations of the modelled pose of each.
+    """
     bodies = [(skeleton(family), STOOP_RAD[family], model_pose()) for family in FAMILIES]
     rows: list[NDArray[np.float32]] = []
     walking = np.zeros((len(bodies), len(PACES_MPS)), dtype=np.intp)
@@ -79,7 +83,6 @@ def _made() -> Arrays:
 
 
 def bind_of(body: Skeleton, modelled: Floats) -> tuple[Floats, Floats]:
-    """Rotations (24, 3, 3) and positions (24, 3) of the joints in the pose in which a body is
-    modelled."""
+    """Return the bind pose of a body: joint rotations (24, 3, 3) and positions (24, 3)."""
     rotation, position = forward(modelled[None], body.rest_m[:1], body)
     return rotation[0], position[0]

@@ -1,4 +1,4 @@
-"""The skeletons of our own bodies: man, woman, child, elder."""
+"""Skeletons of the built-in bodies: man, woman, child, elder."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ _LEFT_HALF: Final = {
     "left_wrist": (-0.020, 0.713, 1.435),
     "left_hand": (-0.015, 0.800, 1.435),
 }
-"""A man of 1.75 m in a T."""
+"""Joints of the left half of a man of 1.75 m in the T pose, metres."""
 
 
 def skeleton(family: Family) -> Skeleton:
-    """The skeleton of a family at its own stature: 1.75, 1.64, 1.25 or 1.66 m."""
+    """Return the skeleton of a family at its own stature: 1.75, 1.64, 1.25 or 1.66 m."""
     rest = man_rest_m()
     if family == "woman":
         _narrow(rest, shoulders=0.018, hips=-0.004)
@@ -53,7 +53,7 @@ def skeleton(family: Family) -> Skeleton:
 
 
 def man_rest_m() -> Floats:
-    """(24, 3) joints of a man of 1.75 m in a T: the figure on which bodies are modelled."""
+    """Return (24, 3) joints of the man of 1.75 m in the T pose, the base of all bodies."""
     return _man_rest_m().copy()
 
 
@@ -72,7 +72,7 @@ def _rows(*parts: str) -> list[int]:
 
 
 def _narrow(rest: Floats, shoulders: float, hips: float) -> None:
-    """Move the arms and the legs in by so many metres on each side."""
+    """Move the arms and the legs inwards by `shoulders` and `hips` metres on each side."""
     for k in _rows("shoulder", "elbow", "wrist", "hand"):
         rest[k, 1] -= shoulders * np.sign(rest[k, 1])
     for k in _rows("hip", "knee"):

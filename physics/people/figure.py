@@ -1,7 +1,6 @@
-"""The figure: trunk and legs of a person as lofts, metres, modelled on a man of 1.75 m in an A
-pose.
+"""Lofts of trunk and legs, in metres, modelled on the man of 1.75 m in the A pose.
 
-x ahead, y left, z up, the soles at z = 0. Families take other proportions afterwards (`body`).
+Axes: x ahead, y left, z up, the soles at z = 0. `body` fits them to other families.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ LEVELS: Final = 5
 """Levels of detail: two of meshes, then two of tubes, then one of ribbons."""
 MESH_LEVELS: Final = 2
 RIBBONS: Final = LEVELS - 1
-"""The level of ribbons: the outlines of the tubes before it."""
+"""Level of ribbons, drawn as the outlines of the tubes of the previous level."""
 Sleeve = Literal["long", "short"]
 Legs = Literal["trousers", "shorts", "skirt", "coat"]
 
@@ -27,8 +26,13 @@ SMALL: Final = (12, 8, 6, 4)
 
 @dataclass(frozen=True, slots=True)
 class Build:
-    """Proportions of a figure. woman: 0 a man's trunk, 1 a woman's; belly_m: how far it stands out;
-    limb: factor on the thickness of limbs; head: factor on the head."""
+    """Proportions of a figure.
+
+    woman: 0 for a man's trunk, 1 for a woman's
+    belly_m: protrusion of the belly, metres
+    limb: factor on the thickness of limbs
+    head: factor on the size of the head
+    """
 
     woman: float = 0.0
     belly_m: float = 0.0
@@ -37,8 +41,10 @@ class Build:
 
 
 def torso_pieces(build: Build, loose: float = 0.0, kind: Legs = "trousers") -> list[Piece]:
-    """Shirt, jacket or coat from the hem to the neck, and the seat of the trousers. loose: metres
-    the cloth stands off."""
+    """Return shirt, jacket or coat from the hem to the neck, and the seat of the trousers.
+
+    loose: gap between cloth and body, metres
+    """
     w, b = build.woman, build.belly_m
     keys = (
         # z, x, half depth ahead, behind, half width (man), half width (woman), weights
@@ -150,7 +156,7 @@ def torso_pieces(build: Build, loose: float = 0.0, kind: Legs = "trousers") -> l
 
 
 def _rim(hem: Ring, up_m: float, size: float) -> Ring:
-    """The ring that closes a hem: a little smaller, above or below it."""
+    """Return the ring that closes a hem: slightly smaller, above or below it."""
     return upright_loft(
         (hem.at[0], 0.0, hem.at[2] + up_m),
         size * hem.ahead[0],
@@ -163,7 +169,7 @@ def _rim(hem: Ring, up_m: float, size: float) -> Ring:
 
 
 def _tails(build: Build, loose: float, hem_m: float = 0.50) -> list[Ring]:
-    """What hangs from the hips of a skirt or a coat: it follows both thighs."""
+    """Return the part of a skirt or coat below the hips; it follows both thighs."""
     w, b = build.woman, build.belly_m
     rings = []
     for z, share in ((hem_m, 0.72), (hem_m + 0.11, 0.66), (0.74, 0.52), (0.84, 0.30), (0.90, 0.10)):
@@ -176,7 +182,7 @@ def _tails(build: Build, loose: float, hem_m: float = 0.50) -> list[Ring]:
 
 
 def _seat(build: Build) -> Piece:
-    """Hips and crotch, in trousers."""
+    """Return hips and crotch in trousers."""
     w, b = build.woman, build.belly_m
     keys = (
         (0.785, -0.010, 0.040, 0.050, 0.045, {"pelvis": 0.4, "left_hip": 0.3, "right_hip": 0.3}),
@@ -210,7 +216,7 @@ def _seat(build: Build) -> Piece:
 
 
 def legs(build: Build, kind: Legs, bare: bool, loose: float = 0.0) -> list[Piece]:
-    """Both legs and shoes. bare: skin below the cloth of shorts or skirts."""
+    """Return both legs and shoes. bare: skin shows below the cloth of shorts or skirts."""
     pieces: list[Piece] = []
     for side, left in (("left", 1.0), ("right", -1.0)):
         hip, knee, ankle = f"{side}_hip", f"{side}_knee", f"{side}_ankle"

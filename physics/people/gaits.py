@@ -1,11 +1,12 @@
-"""Walking and running: captured trunk, head and arms over legs that are solved for feet which stand
-still.
+"""Walking and running: captured trunk, head and arms over legs solved for feet without sliding.
 
-A gait is one stride, from one touch of the left heel to the next, in frames at even ways along the
-ground. While a foot is down it moves back under the body by exactly that way, rolling about its
-heel, flat, and about its ball; so a body that is drawn at the phase of the way walked does not
-slide. Time of stance, roll of the foot, and the motion of trunk, head and arms are those of the
-captures; how far a capture's motion goes follows the stride.
+A gait is one stride, from one touch of the left heel to the next.
+Its frames are evenly spaced by distance along the ground.
+A foot on the ground moves back under the body by exactly this distance.
+It rolls about its heel, rests flat, and rolls about its ball.
+A body drawn at the phase of its walked distance therefore does not slide.
+Stance times, foot roll and the motion of trunk, head and arms come from the captures.
+Their amplitude depends on the stride length.
 """
 
 from __future__ import annotations
@@ -44,18 +45,22 @@ _UPPER: Final = tuple(
 )
 _SPINE: Final = (INDEX["spine1"], INDEX["spine2"], INDEX["spine3"])
 _CLOSER_RAD: Final = 0.09
-"""How much closer to the body arms are held than the slimmer captured figure's."""
+"""Angle by which arms are closer to the body than in the slimmer captured figure, rad."""
 _HEEL_M: Final = (-0.065, -0.095)
-"""Where the heel touches the ground, ahead of and above the ankle, on the reference body."""
+"""Contact point of the heel, ahead of and above the ankle, on the reference body, metres."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Style:
-    """What a gait takes from its capture. frames in a stride and the frame of the left heel's
-    touch; stride_m there.
+    """Parameters that a gait takes from its capture.
 
-    stance: share of the stride a foot is down; roll: (phase, degrees the toes are up) of the left
-    foot; lift_m of the foot in swing besides; lean: share kept of the capture's mean lean.
+    frames: number of frames in a stride
+    touch: frame in which the left heel touches the ground
+    stride_m: stride length in the capture
+    stance: share of the stride with a foot on the ground
+    roll: (phase, degrees the toes are up) of the left foot
+    lift_m: additional height of the foot in swing
+    lean: fraction of the capture's mean lean that is used
     """
 
     name: str
@@ -119,8 +124,12 @@ _RUNS_FROM_MPS: Final = 2.1
 
 @dataclass(frozen=True, slots=True)
 class _Cycle:
-    """A capture as one smooth stride whose sides are alike. mean: (24, 3) axis-angle turns; change:
-    (FRAMES, 24, 3) what is added; bob_m, sway_m: (FRAMES,) of the pelvis, up and to the left."""
+    """Capture as one smooth stride with equal left and right sides.
+
+    mean: (24, 3) axis-angle vectors
+    change: (FRAMES, 24, 3) offsets from the mean
+    bob_m, sway_m: (FRAMES,) motion of the pelvis, up and to the left
+    """
 
     mean: Floats
     change: Floats
@@ -129,10 +138,12 @@ class _Cycle:
 
 
 def gait(knot: int, skeleton: Skeleton, stoop_rad: float = 0.0) -> tuple[Floats, Floats]:
-    """The stride at the pace `cosim.people.gait.PACES_MPS[knot]`: turns (FRAMES, 24, 3, 3), pelvis
-    (FRAMES, 3) metres.
+    """Compute the stride at the pace `cosim.people.gait.PACES_MPS[knot]`.
 
-    The body stays above the origin. stoop_rad: how far the back is bent.
+    stoop_rad: bend of the back
+
+    Returns rotations (FRAMES, 24, 3, 3) and pelvis (FRAMES, 3) in metres. The body stays above the
+    origin.
     """
     style = _RUN if PACES_MPS[knot] > _RUNS_FROM_MPS else _WALK
     cycle = _cycle(style)
@@ -170,8 +181,10 @@ def _foot(
     scale: float,
     skeleton: Skeleton,
 ) -> tuple[Floats, Floats, Floats]:
-    """Ankle (FRAMES, 3) metres, turn of the foot (FRAMES, 3, 3), bend of the toes (FRAMES,) rad
-    over a stride."""
+    """Compute the motion of a foot over a stride.
+
+    Returns ankle (FRAMES, 3) in metres, foot rotation (FRAMES, 3, 3) and toe bend (FRAMES,) in rad.
+    """
     phase = (np.arange(CYCLE_FRAMES) / CYCLE_FRAMES + (0.0 if side == "left" else 0.5)) % 1.0
     left = 1.0 if side == "left" else -1.0
     warped = np.where(
@@ -216,7 +229,7 @@ def _height(
     scale: float,
     skeleton: Skeleton,
 ) -> Floats:
-    """(FRAMES,) heights of the pelvis: the capture's bob, as high as the legs reach."""
+    """Return (FRAMES,) pelvis heights: the capture's bob, limited by the reach of the legs."""
     bob = style.bounce * cycle.bob_m * scale * share**2
     room = np.full(CYCLE_FRAMES, np.inf)
     for side, (ankle, _, _) in feet.items():
@@ -255,11 +268,9 @@ def _cycle(style: _Style) -> _Cycle:
 
 
 def _smooth_loop(curves: Floats, style: _Style) -> Floats:
-    """(FRAMES, C) one stride from the touch of the left heel, as a short Fourier series: a clean
-    loop.
+    """Return (FRAMES, C) one stride from the touch of the left heel, as a short Fourier series.
 
-    curves: (frames + 1, C) of the capture; what its end misses of its beginning is spread over the
-    stride.
+    curves: (frames + 1, C) of the capture; the gap between end and start is spread over the stride
     """
     frames = style.frames
     closed = curves[:-1] - (curves[-1] - curves[0]) * (np.arange(frames) / frames - 0.5)[:, None]
@@ -271,8 +282,10 @@ def _smooth_loop(curves: Floats, style: _Style) -> Floats:
 
 
 def _periodic(keys: ArrayLike, phase: Floats) -> Floats:
-    """A smooth loop through (phase, value) keys without overshoot: cubic, level at its extremes
-    (Fritsch-Carlson)."""
+    """Interpolate (phase, value) keys as a smooth loop without overshoot.
+
+    The interpolation is cubic and level at its extremes (Fritsch-Carlson).
+    """
     table = np.asarray(keys, dtype=float)
     x = np.concatenate([table[-1:, 0] - 1.0, table[:, 0], table[:2, 0] + 1.0])
     y = np.concatenate([table[-1:, 1], table[:, 1], table[:2, 1]])

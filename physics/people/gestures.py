@@ -1,8 +1,7 @@
-"""What people do on the spot: standing, looking around, talking, queueing, the stopping hand,
-reading a phone, sitting.
+"""Gestures of people on the spot: idle, looking, talking, queueing, stopping hand, phone, sitting.
 
-Each is a loop of `LOOP_S` seconds over the SMPL joints: feet on the ground, a body that breathes
-and shifts its weight.
+Each is a loop of `LOOP_S` seconds over the SMPL joints, with feet on the ground.
+The body breathes and shifts its weight.
 """
 
 from __future__ import annotations
@@ -22,17 +21,21 @@ GESTURE_FRAMES: Final = 64
 LOOP_S: Final = 8.0
 
 SEAT_M: Final = 0.475
-"""Height of the seat under who sits."""
+"""Height of the seat under a sitting person, metres."""
 SEATED_BACK_M: Final = 0.59
-"""Who sits has the hips so far behind the point where it is: that is before the seat, where its
-legs are."""
+"""Distance of a sitting person's hips behind the person's position, metres.
+
+The position is in front of the seat, below the legs.
+"""
 
 _PHASE: Final = 2.0 * np.pi * np.arange(GESTURE_FRAMES) / GESTURE_FRAMES
 
 
 def gesture(name: str, skeleton: Skeleton, stoop_rad: float = 0.0) -> tuple[Floats, Floats]:
-    """The loop called `name`, one of GESTURES: turns (FRAMES, 24, 3, 3) and pelvis (FRAMES, 3)
-    metres."""
+    """Compute the loop called `name`, one of GESTURES.
+
+    Returns rotations (FRAMES, 24, 3, 3) and pelvis (FRAMES, 3) in metres.
+    """
     scale = skeleton.height_m / REFERENCE_M
     bends = np.zeros((GESTURE_FRAMES, 24, 3))
     breath = np.sin(2.0 * _PHASE)
@@ -68,8 +71,7 @@ def gesture(name: str, skeleton: Skeleton, stoop_rad: float = 0.0) -> tuple[Floa
 
 
 def _stand(turns: Floats, pelvis: Floats, skeleton: Skeleton, scale: float) -> None:
-    """Set both feet flat on the ground, a little apart and turned out, the left one a little
-    ahead."""
+    """Set both feet flat on the ground, apart and turned out, the left one slightly ahead."""
     for side, left in (("left", 1.0), ("right", -1.0)):
         ankle = skeleton.rest_m[INDEX[f"{side}_ankle"]]
         place = np.array([ankle[0] + 0.02 * left * scale, left * 0.105 * scale, ankle[2]])
@@ -88,8 +90,9 @@ def _stand(turns: Floats, pelvis: Floats, skeleton: Skeleton, scale: float) -> N
 
 
 def _sit(turns: Floats, pelvis: Floats, skeleton: Skeleton, scale: float) -> None:
-    """Set the hips on a seat behind the place, the shanks upright where the seat ends, both feet
-    flat on the ground."""
+    """Set the hips on a seat behind the position, the shanks upright, both feet flat on the
+    ground.
+    """
     rest = skeleton.rest_m
     hip = INDEX["left_hip"]
     hips_m = SEAT_M + 0.085 * scale
@@ -152,7 +155,7 @@ def _standing(bends: Floats) -> dict[str, Arm]:
 
 
 def _looking(bends: Floats) -> dict[str, Arm]:
-    """Turns head and shoulders to one side, holds, turns to the other."""
+    """Turn head and shoulders to one side, hold, and turn to the other side."""
     way = np.tanh(2.2 * np.sin(_PHASE)) / np.tanh(2.2)
     _bend(bends, "spine3", 0.0, 0.0, 0.20 * way)
     _bend(bends, "neck", 0.0, 0.0, 0.45 * way)
@@ -161,8 +164,10 @@ def _looking(bends: Floats) -> dict[str, Arm]:
 
 
 def _talking(bends: Floats) -> dict[str, Arm]:
-    """Speaks for half of the time, elbows at the sides, both hands before the chest, the right one
-    livelier; then listens with the hands low, and nods."""
+    """Move both hands before the chest for half of the loop, then lower them and nod.
+
+    The elbows stay at the sides; the right hand moves more.
+    """
     speaks = 0.5 + 0.5 * np.tanh(3.0 * np.sin(_PHASE)) / np.tanh(3.0)
     beat = 0.6 * np.sin(5.0 * _PHASE) + 0.4 * np.sin(8.0 * _PHASE + 1.0)
     other = 0.6 * np.sin(4.0 * _PHASE + 2.0) + 0.4 * np.sin(7.0 * _PHASE)
@@ -189,7 +194,7 @@ def _talking(bends: Floats) -> dict[str, Arm]:
 
 
 def _queueing(bends: Floats) -> dict[str, Arm]:
-    """Waits with hands joined before the body, and looks down and along the queue."""
+    """Join the hands before the body, and look down and along the queue."""
     _bend(bends, "neck", 0.0, 0.12 + 0.05 * np.sin(_PHASE), 0.10 * np.sin(2.0 * _PHASE))
     _bend(bends, "head", 0.0, 0.06, 0.25 * np.sin(_PHASE))
     return {
@@ -203,8 +208,7 @@ def _queueing(bends: Floats) -> dict[str, Arm]:
 
 
 def _stopping(bends: Floats) -> dict[str, Arm]:
-    """The right arm straight out ahead at the height of the shoulder, palm to whoever comes,
-    fingers up."""
+    """Raise the right arm straight ahead at shoulder height, palm forward, fingers up."""
     push = 0.02 * np.sin(4.0 * _PHASE)
     _bend(bends, "spine3", 0.0, -0.02, 0.16)
     _bend(bends, "neck", 0.0, 0.02, -0.10)
@@ -219,7 +223,7 @@ def _stopping(bends: Floats) -> dict[str, Arm]:
 
 
 def _phoning(bends: Floats) -> dict[str, Arm]:
-    """Holds a phone before the chest in the left hand and looks down at it."""
+    """Hold a phone before the chest in the left hand and look down at it."""
     _bend(bends, "neck", 0.0, 0.30, 0.0)
     _bend(bends, "head", 0.0, 0.28 + 0.02 * np.sin(3.0 * _PHASE), -0.06)
     return {
@@ -231,7 +235,7 @@ def _phoning(bends: Floats) -> dict[str, Arm]:
 
 
 def _sitting(bends: Floats) -> dict[str, Arm]:
-    """Leans back a little with the hands on the thighs, and watches the street."""
+    """Lean back with the hands on the thighs, and look around the street."""
     _bend(bends, "pelvis", 0.0, -0.16, 0.0)
     _bend(bends, "spine2", 0.0, 0.06, 0.0)
     _bend(bends, "neck", 0.0, 0.06, 0.16 * np.sin(_PHASE))
@@ -257,4 +261,4 @@ GESTURES: Final[Mapping[str, Callable[[Floats], dict[str, Arm]]]] = MappingProxy
         "sit": _sitting,
     }
 )
-"""What each turns of the body, and where it holds its arms."""
+"""Function of each gesture, which turns the joints of the body and directs its arms."""

@@ -1,4 +1,4 @@
-"""Neck, head and face as lofts on the man of 1.75 m."""
+"""Lofts of neck, head and face on the man of 1.75 m."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from physics.people.skeleton import INDEX
 
 
 def neck_and_head(build: Build) -> list[Piece]:
-    """Neck, head with a face, ears."""
+    """Return neck, head with a face, and ears."""
     neck = [
         upright_loft((-0.030, 0.0, 1.455), 0.055, 1.0, 0.058, {"spine3": 0.6, "neck": 0.4}),
         upright_loft((-0.026, 0.0, 1.500), 0.053, 1.05, 0.055, {"spine3": 0.25, "neck": 0.75}),
@@ -86,7 +86,7 @@ def _nose() -> list[Ring]:
 
 
 def about_head(piece: Piece, factor: float) -> Piece:
-    """A piece of the head, larger or smaller about the joint that carries it."""
+    """Scale a piece of the head about the joint that carries it."""
     if factor == 1.0:
         return piece
     centre = man_rest_m()[INDEX["head"]]

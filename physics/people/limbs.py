@@ -1,5 +1,4 @@
-"""Legs that reach the ground and arms that point somewhere: turns of joints from where hands and
-feet shall be."""
+"""Inverse kinematics of legs and arms: joint rotations from target poses of feet and hands."""
 
 from __future__ import annotations
 
@@ -10,7 +9,7 @@ from physics.people.skeleton import INDEX, Skeleton
 
 
 def unit(vectors: Floats) -> Floats:
-    """(..., 3) vectors at length 1."""
+    """Normalize (..., 3) vectors to length 1."""
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12))
 
 
@@ -23,11 +22,14 @@ def set_leg(
     toe_rad: Floats,
     skeleton: Skeleton,
 ) -> Floats:
-    """Turn hip, knee, ankle and toes of (F, 24, 3, 3) turns, in place, so that the ankle is at (F,
-    3) with the foot turned as (F, 3, 3), the toes bent up by (F,) against it. The knee points where
-    the foot and the pelvis do.
+    """Set hip, knee, ankle and toes of (F, 24, 3, 3) turns in place to reach an ankle position.
 
-    Returns by how many metres (F,) the leg is too short for that.
+    ankle_m: (F, 3)
+    foot: (F, 3, 3) rotation of the foot
+    toe_rad: (F,) bend of the toes upwards, relative to the foot
+
+    The knee points in the direction of foot and pelvis.
+    Returns (F,) metres by which the leg is too short.
     """
     hip, knee, ankle, toes = (INDEX[f"{side}_{part}"] for part in ("hip", "knee", "ankle", "foot"))
     thigh, shank = (
@@ -59,9 +61,12 @@ def set_leg(
 def set_arm(
     turns: Floats, side: str, upper: Floats, fore: Floats, fingers: Floats, thumb: Floats
 ) -> None:
-    """Turn shoulder, elbow and wrist of (F, 24, 3, 3) turns, in place: (F, 3) directions in the
-    body frame of upper arm, forearm, fingers and thumb. The forearm takes half of the hand's
-    twist."""
+    """Set shoulder, elbow and wrist of (F, 24, 3, 3) turns in place.
+
+    upper, fore, fingers, thumb: (F, 3) directions in the body frame
+
+    The forearm takes half of the hand's twist.
+    """
     collar, shoulder, elbow, wrist = (
         INDEX[f"{side}_{part}"] for part in ("collar", "shoulder", "elbow", "wrist")
     )
@@ -81,7 +86,7 @@ def set_arm(
 
 
 def about_y(angle_rad: Floats) -> Floats:
-    """(F, 3, 3) turns about the y axis; a positive angle dips what points ahead."""
+    """Return (F, 3, 3) rotations about the y axis; a positive angle lowers the x axis."""
     cos, sin, o = np.cos(angle_rad), np.sin(angle_rad), np.zeros_like(angle_rad)
     rows = [
         np.stack([cos, o, sin], -1),
@@ -92,7 +97,7 @@ def about_y(angle_rad: Floats) -> Floats:
 
 
 def about_z(angle_rad: Floats) -> Floats:
-    """(F, 3, 3) turns about the vertical."""
+    """Return (F, 3, 3) rotations about the vertical axis."""
     cos, sin, o = np.cos(angle_rad), np.sin(angle_rad), np.zeros_like(angle_rad)
     rows = [
         np.stack([cos, -sin, o], -1),
@@ -103,14 +108,13 @@ def about_z(angle_rad: Floats) -> Floats:
 
 
 def _bone(along: Floats, hinge: Floats) -> Floats:
-    """(..., 3, 3) frames whose -z is (..., 3) `along` and whose y is as near as can be to
-    `hinge`."""
+    """Return (..., 3, 3) frames with -z along `along` and y as close as possible to `hinge`."""
     z = -along
     x = unit(np.cross(np.broadcast_to(hinge, z.shape), z))
     return np.stack([x, np.cross(z, x), z], axis=-1)
 
 
 def _arm_frame(y: Floats, x: Floats) -> Floats:
-    """(F, 3, 3) frames whose y is (F, 3) and whose x is as near as can be to (F, 3)."""
+    """Return (F, 3, 3) frames with the given y, and their x as close as possible to `x`."""
     x = unit(x - y * np.sum(x * y, axis=1, keepdims=True))
     return np.stack([x, y, np.cross(x, y)], axis=-1)

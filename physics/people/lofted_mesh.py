@@ -1,9 +1,9 @@
-"""Lofts: smooth closed surfaces through rings, as fine as one asks for, with weights of joints.
+"""Lofts: smooth closed surfaces through rings, at any level of detail, with joint weights.
 
-A loft is given by a few key rings. Finer levels lay rings between them on smooth curves; coarser
-levels leave out the keys that matter least. A ring of few sides is drawn a little larger, so that
-on average over all directions it is as wide as the round ring: so levels of detail agree in their
-silhouettes.
+A loft is defined by a few key rings.
+Finer levels interpolate rings on smooth curves; coarser levels omit the least important keys.
+A ring with few sides is enlarged to match the mean width of the round ring over all directions.
+Silhouettes therefore agree between levels of detail.
 """
 
 from __future__ import annotations
@@ -25,9 +25,13 @@ Joints = Mapping[str, float]
 
 @dataclass(frozen=True, slots=True)
 class Ring:
-    """A cross-section. at: its middle; ahead, side: half axes, metres, about which it runs from
-    ahead to side; back: half axis on the other side of `ahead`, as a share of it; square: 2 is an
-    ellipse, more is nearer to a box."""
+    """Cross-section of a loft.
+
+    at: centre
+    ahead, side: half axes, metres; the angle runs from ahead to side
+    back: half axis opposite to `ahead`, as a fraction of it
+    square: exponent; 2 is an ellipse, larger values approach a box
+    """
 
     at: tuple[float, float, float]
     ahead: tuple[float, float, float]
@@ -40,9 +44,13 @@ class Ring:
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """One closed surface. rings: from one end to the other; coat: what it is painted as; sides: per
-    level, 0 leaves the piece out; rings_kept: per level, how many rings, more than there are keys
-    or fewer."""
+    """Closed surface.
+
+    rings: from one end to the other
+    coat: surface that selects the colour
+    sides: per level; 0 omits the piece
+    rings_kept: number of rings per level, more or fewer than the keys
+    """
 
     coat: str
     rings: tuple[Ring, ...]
@@ -52,8 +60,13 @@ class Piece:
 
 @dataclass(frozen=True, slots=True)
 class LoftedPiece:
-    """A piece at one level. vertices (V, 3) m; triangles (T, 3), front counter-clockwise; weights
-    (V, 24); fat (V,)."""
+    """Piece at one level of detail.
+
+    vertices: (V, 3), metres
+    triangles: (T, 3), front counter-clockwise
+    weights: (V, 24)
+    fat: (V,)
+    """
 
     vertices: Floats
     triangles: NDArray[np.int32]
@@ -62,7 +75,7 @@ class LoftedPiece:
 
 
 def lofted(piece: Piece, level: int) -> LoftedPiece:
-    """A piece at a level, closed by a fan at both ends."""
+    """Build a piece at a level of detail, closed by a fan at both ends."""
     table = _chosen(_table(piece.rings), piece.rings_kept[level])
     sides = piece.sides[level]
     boxy = sides % 8 == 0 and float(table[:, 10].mean()) > 2.8
@@ -81,14 +94,18 @@ def lofted(piece: Piece, level: int) -> LoftedPiece:
 
 @dataclass(frozen=True, slots=True)
 class Tube:
-    """A piece whose rings a renderer turns towards the eye: the first and the last corner of each
-    lie on its outline from there, those between before it, and nothing behind it, so that few
-    corners draw the outline of the round ring.
+    """Piece whose rings a renderer turns towards the eye.
 
-    middle, ahead, side: (V, 3) of the corner's ring; ring: (V, 4) back, square, cosine and sine of
-    the angle from the outline to the corner; triangles (T, 3); weights (V, 24); fat (V,). still:
-    its corners are not turned and run all around, their angles begin at `ahead`. ribbon: it is
-    nothing but its outline.
+    The first and last corner of each ring lie on its outline, the others in front of it.
+    The hidden back has no corners, so few corners draw the outline of the round ring.
+
+    middle, ahead, side: (V, 3) of the corner's ring
+    ring: (V, 4) back, square, cosine and sine of the angle from the outline to the corner
+    triangles: (T, 3)
+    weights: (V, 24)
+    fat: (V,)
+    still: corners are not turned, run all around, and have angles from `ahead`
+    ribbon: only the outline is drawn
     """
 
     middle: Floats
@@ -103,16 +120,20 @@ class Tube:
 
     @property
     def corners(self) -> Floats:
-        """(V, 3) about where the corners are when they are not turned."""
+        """Return (V, 3) approximate positions of the corners without turning."""
         return np.asarray(
             self.middle + self.ring[:, 2:3] * self.ahead + self.ring[:, 3:4] * self.side
         )
 
 
 def tube(piece: Piece, level: int, ribbon: bool = False) -> Tube:
-    """A piece at a coarse level, with an even number of sides; as a ribbon if it is an upright one.
-    One that follows both legs spreads to its sides, which rings turned towards the eye cannot show:
-    its corners stay where they are, and there are more."""
+    """Build a piece at a coarse level with an even number of sides.
+
+    ribbon: draw the piece as a ribbon if it is upright
+
+    A piece that follows both legs spreads sideways, which turned rings cannot show.
+    Its corners are not turned, and it has more of them.
+    """
     table = _chosen(_table(piece.rings), piece.rings_kept[level])
     sides = piece.sides[level]
     spreads = bool(
@@ -130,7 +151,7 @@ def tube(piece: Piece, level: int, ribbon: bool = False) -> Tube:
     way = np.abs(table[-1, :3] - table[0, :3])
     ribbon = (
         ribbon and not spreads and bool(way[2] > way[0])
-    )  # who looks along a ribbon sees nothing of it
+    )  # a ribbon is invisible when viewed edge-on
     if not spreads:
         angle = np.array([0.0, np.pi]) if ribbon else angle[: sides // 2 + 1]
         triangles = _sheet(len(table), len(angle), open_=True, capped=not ribbon)
@@ -155,8 +176,10 @@ def tube(piece: Piece, level: int, ribbon: bool = False) -> Tube:
 
 @lru_cache(maxsize=256)
 def _sheet(rings: int, sides: int, open_: bool = False, capped: bool = True) -> NDArray[np.int32]:
-    """(T, 3) triangles between rings of vertices one after another, and to the two poles behind
-    them. Rings that are open have no side from the last vertex to the first."""
+    """Return (T, 3) triangles between successive rings, and to the two poles after them.
+
+    Open rings have no side from the last vertex to the first.
+    """
     n, k = rings, sides
     around = np.arange(k)[: k - open_]
     after = ((np.arange(k) + 1) % k)[: k - open_]
@@ -189,7 +212,7 @@ def ball(
     joints: Joints,
     sides: Sequence[int],
 ) -> Piece:
-    """An ellipsoid with (x, y, z) half axes."""
+    """Return an ellipsoid with (x, y, z) half axes."""
     rings = []
     for share in (-0.97, -0.72, -0.28, 0.28, 0.72, 0.97):
         wide = float(np.sqrt(1.0 - share * share))
@@ -205,7 +228,7 @@ _ROUND: Final = 2.0 * np.pi * np.arange(64) / 64
 
 
 def _table(rings: Sequence[Ring]) -> Floats:
-    """(K, 37): middle, ahead, side, back, square, spare, weights of 24 joints, fat."""
+    """Return the rings as (K, 37): middle, ahead, side, back, square, spare, 24 weights, fat."""
     table = np.zeros((len(rings), _WIDTH))
     for row, ring in zip(table, rings, strict=True):
         row[:9] = (*ring.at, *ring.ahead, *ring.side)
@@ -216,8 +239,12 @@ def _table(rings: Sequence[Ring]) -> Floats:
 
 
 def _chosen(table: Floats, wanted: int) -> Floats:
-    """The keys, more rings on smooth curves between them, or the keys without which the shape would
-    change most. Outfits share many pieces: the answer is kept."""
+    """Resample the keys to the wanted number of rings.
+
+    More rings are interpolated on smooth curves. For fewer rings, the keys of least effect are
+    removed.
+    Results are cached, because outfits share many pieces.
+    """
     return _kept(table.tobytes(), wanted).copy()
 
 
@@ -238,8 +265,10 @@ def _kept(rows: bytes, wanted: int) -> Floats:
 
 
 def _fitted(table: Floats, kept: list[int]) -> Floats:
-    """The kept rings, moved and resized so that what is straight between them runs through the
-    finer shape, not inside it: a least squares fit. Both ends stay."""
+    """Fit the remaining rings to the finer shape by least squares.
+
+    Straight segments between them then run through that shape, not inside it. Both ends stay fixed.
+    """
     fine = _between(table, 5 * len(table))
     way = np.concatenate([[0.0], np.cumsum(_gaps(fine))])
     at = way[[int(np.argmin(np.abs(fine[:, :9] - table[k, :9]).sum(axis=1))) for k in kept]]
@@ -252,7 +281,7 @@ def _fitted(table: Floats, kept: list[int]) -> Floats:
 
 
 def _loss(table: Floats, before: int, middle: int, after: int) -> float:
-    """How much surface is displaced when the ring in the middle is left out."""
+    """Return the surface displacement caused by omitting the middle ring."""
     way = np.linalg.norm(np.diff(table[[before, middle, after], :3], axis=0), axis=1)
     share = way[0] / max(way.sum(), 1e-9)
     line = table[before, :9] * (1.0 - share) + table[after, :9] * share
@@ -260,7 +289,7 @@ def _loss(table: Floats, before: int, middle: int, after: int) -> float:
 
 
 def _between(table: Floats, wanted: int) -> Floats:
-    """`wanted` rings: the keys, and in the longest gaps points of a smooth curve through them."""
+    """Return `wanted` rings: the keys, plus points of a smooth curve in the longest gaps."""
     way = np.concatenate([[0.0], np.cumsum(_gaps(table))])
     gaps = np.diff(way).tolist()
     extra = [0] * len(gaps)
@@ -284,13 +313,13 @@ def _between(table: Floats, wanted: int) -> Floats:
 
 
 def _gaps(table: Floats) -> Floats:
-    """(K-1,) distances between rings, in place and in size."""
+    """Return (K-1,) distances between rings, in position and size."""
     step = np.diff(table[:, :9], axis=0)
     return np.asarray(np.sqrt((step**2).sum(axis=1)) + 1e-6)
 
 
 def _points(table: Floats, angle: Floats) -> Floats:
-    """(K, A, 3) points on the rings."""
+    """Return (K, A, 3) points on the rings."""
     cos, sin = np.cos(angle), np.sin(angle)
     power = (2.0 / table[:, 10])[:, None]
     x = np.sign(cos) * np.abs(cos) ** power * np.where(cos < 0.0, table[:, 9:10], 1.0)
@@ -301,8 +330,10 @@ def _points(table: Floats, angle: Floats) -> Floats:
 
 
 def _perimeters(points: Floats) -> Floats:
-    """(K,) ways round (K, A, 3) rings: the mean width of a convex ring is its perimeter over pi
-    (Cauchy)."""
+    """Return (K,) perimeters of (K, A, 3) rings.
+
+    The mean width of a convex ring is its perimeter over pi (Cauchy).
+    """
     return np.asarray(np.linalg.norm(np.roll(points, -1, axis=1) - points, axis=2).sum(axis=1))
 
 

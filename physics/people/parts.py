@@ -1,5 +1,4 @@
-"""A person as thirteen rigid parts on the same joints in the same poses, for renderers that cannot
-skin."""
+"""People as thirteen rigid parts on the same joints and poses, for renderers without skinning."""
 
 from __future__ import annotations
 
@@ -35,15 +34,18 @@ RIGID_PARTS: Final = (
     ("left_knee", "bottom"),
     ("right_knee", "bottom"),
 )
-"""The joint that carries each part, and what it is painted as."""
+"""Joint and surface of each part."""
 
 _CARRIERS: Final = [INDEX[joint] for joint, _ in RIGID_PARTS]
 
 
 @dataclass(frozen=True, slots=True)
 class _Placed:
-    """Where the parts of N people are. at_m: (N, 13, 3) metres; turn: (N, 13, 4) quaternions x, y,
-    z, w."""
+    """Poses of the parts of N people.
+
+    at_m: (N, 13, 3), metres
+    turn: (N, 13, 4) quaternions x, y, z, w
+    """
 
     at_m: Floats
     turn: Floats
@@ -51,7 +53,7 @@ class _Placed:
 
 @lru_cache(maxsize=4)
 def part_meshes(family: Family) -> tuple[Mesh, ...]:
-    """The parts of a family, about their joints, turned as the body is modelled."""
+    """Return the parts of a family about their joints, in the modelled pose."""
     body = skeleton(family)
     _, at = bind_of(body, model_pose())
     f = body.height_m / 1.75
@@ -140,7 +142,10 @@ def part_meshes(family: Family) -> tuple[Mesh, ...]:
 
 
 def placed_parts(people: People, z_m: Floats, time_s: float) -> _Placed:
-    """The parts of N people who stand at heights (N,) z_m, in their poses at `time_s`."""
+    """Return the parts of N people in their poses at `time_s`.
+
+    z_m: (N,) ground heights
+    """
     clips = own_clips()
     posed = poses(people, time_s, clips)
     matrices = posed.matrices(clips)[:, _CARRIERS].astype(float)
@@ -165,13 +170,13 @@ def placed_parts(people: People, z_m: Floats, time_s: float) -> _Placed:
 
 @lru_cache(maxsize=4)
 def _joints(family: Family) -> Floats:
-    """(13, 3) where the parts' joints are on the body as it is modelled."""
+    """Return (13, 3) joint positions of the parts on the body as modelled."""
     return bind_of(skeleton(family), model_pose())[1][_CARRIERS]
 
 
 @lru_cache(maxsize=4096)
 def part_colours(name: str, age: int) -> tuple[Colour, ...]:
-    """The colours of the parts of the person of this `Age` called `name`."""
+    """Return the colours of the parts of the person of this `Age` called `name`."""
     who = look_of(name, age)
     outfit = ALL[who.outfit]
     red, green, blue = (who.colours / 255.0).T.tolist()
@@ -191,7 +196,7 @@ def part_colours(name: str, age: int) -> tuple[Colour, ...]:
 
 
 def _quaternions(turns: Floats) -> Floats:
-    """(..., 4) quaternions x, y, z, w of (..., 3, 3) matrices that are nearly rotations."""
+    """Convert (..., 3, 3) near-rotations to (..., 4) quaternions x, y, z, w."""
     from scipy.spatial.transform import Rotation
 
     x = turns[..., 0] / np.linalg.norm(turns[..., 0], axis=-1, keepdims=True)
@@ -213,7 +218,7 @@ def _tube(
     high_radius: tuple[float, float],
     sides: int,
 ) -> Mesh:
-    """A tapered prism from one point to another; half axes ahead and across."""
+    """Return a tapered prism from one point to another; its half axes are ahead and across."""
     way = high - low
     length = float(np.linalg.norm(way))
     upright = frustum(low_radius, high_radius, 0.0, length, sides)

@@ -1,5 +1,4 @@
-"""The pose of everybody in a snapshot: a few numbers per person that say which baked frames to
-blend."""
+"""Poses of all people in a snapshot: per person, the baked frames to blend and their weights."""
 
 from __future__ import annotations
 
@@ -21,33 +20,36 @@ from physics.people.gestures import GESTURES
 _PACES: Final = np.array(PACES_MPS)
 _APART: Final = np.diff(_PACES)
 _STANDING_MPS: Final = (0.04, PACES_MPS[0])
-"""Between these paces a gesture turns into the slowest walk."""
+"""Range of paces in which a gesture blends into the slowest walk, m/s."""
 _LOOPS: Final = {name: row for row, name in enumerate(GESTURES)}
 
 
 @dataclass(frozen=True, slots=True)
 class Poses:
-    """Poses of N people. rows: (N, 4) frames in the baked array; weights: (N, 4) float32 that sum
-    to 1; scale: (N,) factor on the body's size."""
+    """Poses of N people.
+
+    rows: (N, 4) frames in the baked array
+    weights: (N, 4) float32, with sum 1
+    scale: (N,) factor on the body's size
+    """
 
     rows: NDArray[np.intp]
     weights: NDArray[np.float32]
     scale: Floats
 
     def matrices(self, clips: Clips) -> NDArray[np.float32]:
-        """(N, 24, 3, 4) matrices of the joints, blended as a renderer blends them; the scale is not
-        in them."""
+        """Return (N, 24, 3, 4) joint matrices, blended like in a renderer and without the scale."""
         frames = clips.matrices.reshape(len(clips.matrices), -1)[self.rows]
         blend = np.matmul(self.weights[:, None, :], frames)
         return np.asarray(blend.reshape(len(self.rows), 24, 3, 4))
 
 
 def poses(people: People, time_s: float, clips: Clips | None = None) -> Poses:
-    """How everybody stands or walks at `time_s`: a function of the snapshot alone.
+    """Compute the pose of every person at `time_s` as a function of the snapshot alone.
 
-    Who walks is drawn between the two strides of the paces around theirs, at the phase of the
-    strides they took; who stands does what `people.doing` says; in between, as one starts or stops,
-    the one turns into the other.
+    Walking people blend the strides of the two nearest paces, at the phase of their own strides.
+    People on the spot play the gesture of `people.doing`.
+    While a person starts or stops, both are blended.
     """
     bodies = bodies_of(people.ids, people.age.tobytes())
     loops = loops_of(people.doing)
@@ -64,8 +66,13 @@ def poses_of(
     time_s: float | Floats,
     clips: Clips,
 ) -> Poses:
-    """The poses of N people, of any number of streets. bodies: (N, 4), of `bodies_of`; pace,
-    strides: (N,), as in `People`; loops: (N,), of `loops_of`; time_s: of all or (N,)."""
+    """Compute the poses of N people, from any number of streets.
+
+    bodies: (N, 4), from `bodies_of`
+    pace, strides: (N,), as in `People`
+    loops: (N,), from `loops_of`
+    time_s: common to all, or (N,)
+    """
     family = bodies[:, 0].astype(np.intp)
     size = bodies[:, 2]
     offset = bodies[:, 3]
@@ -94,7 +101,7 @@ def poses_of(
 
     slow = (pace < _PACES[0]).nonzero()[0]
     if len(slow):
-        # Who is on the spot: the second half of the frames is a gesture.
+        # People on the spot: the second half of the frames is a gesture.
         start, end = _STANDING_MPS
         share = np.minimum(np.maximum((pace[slow] - start) / (end - start), 0.0), 1.0)
         walk = share * share * (3.0 - 2.0 * share)
@@ -111,14 +118,18 @@ def poses_of(
 
 @lru_cache(maxsize=256)
 def loops_of(doing: tuple[Doing, ...]) -> NDArray[np.intp]:
-    """(N,) rows in GESTURES of what people do when they are on the spot."""
+    """Return (N,) rows in GESTURES of the activities of people on the spot."""
     return np.array([_LOOPS["stand" if what == "walk" else what] for what in doing], dtype=np.intp)
 
 
 @lru_cache(maxsize=256)
 def bodies_of(names: tuple[str, ...], ages: bytes) -> Floats:
-    """(N, 4) of each person: row of the family, factor on the pace to that of the reference person,
-    factor on the family's body, where in a loop it is at time 0."""
+    """Return (N, 4) body parameters of people.
+
+    Columns: row of the family, factor on the pace to that of the reference person, factor on the
+    size.
+    The last column is the position in a loop at time 0.
+    """
     return np.array([_body_of(name, age) for name, age in zip(names, ages, strict=True)]).reshape(
         -1, 4
     )

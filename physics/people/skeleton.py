@@ -1,8 +1,9 @@
 """The 24 joints of the SMPL layout, forward kinematics, and linear blend skinning.
 
 Source: Loper, Mahmood, Romero, Pons-Moll, Black: SMPL, a skinned multi-person linear model, ACM TOG
-34(6), 2015, section 3. Ours are the axes: x ahead, y left, z up, metres, the soles at z = 0. The
-rest pose is a T: a joint that is not turned has the axes of the body.
+34(6), 2015, section 3.
+Our axes differ: x ahead, y left, z up, metres, the soles at z = 0.
+The rest pose is a T: a joint without rotation has the axes of the body.
 """
 
 from __future__ import annotations
@@ -78,26 +79,30 @@ MIRRORED: Final = (
 """Row of each joint's counterpart on the other side."""
 
 REACH_RAD: Final = np.deg2rad(74.0)
-"""How far the arms are let down from the T in the pose in which our bodies are modelled."""
+"""Angle by which the arms are lowered from the T in the modelled pose, rad."""
 
 
 @dataclass(frozen=True, slots=True)
 class Skeleton:
-    """Where the joints are on a body at rest. rest_m: (24, 3); height_m: from sole to crown."""
+    """Joint positions of a body at rest. rest_m: (24, 3); height_m: from sole to crown."""
 
     rest_m: Floats
     height_m: float
 
     @property
     def offsets_m(self) -> Floats:
-        """(24, 3) from each joint's parent to the joint; the pelvis from the ground below it."""
+        """Return (24, 3) offsets of joints from their parents, and of the pelvis from the
+        ground.
+        """
         rest = self.rest_m
         return np.concatenate([rest[:1], rest[1:] - rest[list(PARENTS[1:])]])
 
 
 def rodrigues(turns_rad: ArrayLike) -> Floats:
-    """(..., 3, 3) rotations about (..., 3) axis-angle vectors (paper: the exponential of a joint's
-    axis-angle)."""
+    """Return (..., 3, 3) rotations for (..., 3) axis-angle vectors.
+
+    The paper calls it the exponential of a joint's axis-angle.
+    """
     turns = np.asarray(turns_rad, dtype=float)
     angle = np.linalg.norm(turns, axis=-1)[..., None, None]
     across = np.cross(turns[..., None, :], -np.eye(3))
@@ -108,17 +113,20 @@ def rodrigues(turns_rad: ArrayLike) -> Floats:
 
 
 def axis_angle(matrices: Floats) -> Floats:
-    """(..., 3) axis-angle vectors of (..., 3, 3) rotations of less than half a turn."""
+    """Return (..., 3) axis-angle vectors of (..., 3, 3) rotations of less than half a turn."""
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_rotvec().reshape(matrices.shape[:-1])
 
 
 def forward(turns: Floats, pelvis_m: Floats, skeleton: Skeleton) -> tuple[Floats, Floats]:
-    """Joints of posed bodies: (F, 24, 3, 3) rotations and (F, 24, 3) positions in the body frame.
+    """Compute (F, 24, 3, 3) rotations and (F, 24, 3) positions of joints in the body frame.
 
-    turns: (F, 24, 3, 3) of each joint against its parent; pelvis_m: (F, 3). The product along the
-    chain of parents of [turn | offset], as the paper's world transformation of a joint.
+    turns: (F, 24, 3, 3) rotations of each joint relative to its parent
+    pelvis_m: (F, 3)
+
+    It multiplies [turn | offset] along the chain of parents, as the paper's world transformation of
+    a joint.
     """
     offsets = skeleton.offsets_m
     rotation = np.empty_like(turns)
@@ -131,8 +139,7 @@ def forward(turns: Floats, pelvis_m: Floats, skeleton: Skeleton) -> tuple[Floats
 
 
 def model_pose(reach_rad: float = float(REACH_RAD)) -> Floats:
-    """(24, 3, 3) turns of the A pose in which our bodies are modelled: the T with the arms let
-    down."""
+    """Return (24, 3, 3) rotations of the A pose of modelled bodies: the T with lowered arms."""
     turns = np.zeros((24, 3))
     turns[INDEX["left_shoulder"], 0], turns[INDEX["right_shoulder"], 0] = -reach_rad, reach_rad
     return rodrigues(turns)
@@ -141,11 +148,11 @@ def model_pose(reach_rad: float = float(REACH_RAD)) -> Floats:
 def skinning(
     rotation: Floats, position: Floats, bind: tuple[Floats, Floats]
 ) -> NDArray[np.float32]:
-    """(F, 24, 3, 4) float32 matrices that take a vertex from the pose it was modelled in to the
-    posed body.
+    """Return (F, 24, 3, 4) float32 matrices from the modelled pose to the posed body.
 
-    bind: rotations (24, 3, 3) and positions (24, 3) of the joints in the modelled pose. The paper's
-    G'(theta), which removes the transformation of the rest pose.
+    bind: rotations (24, 3, 3) and positions (24, 3) of the joints in the modelled pose
+
+    They are the paper's G'(theta), which removes the transformation of the rest pose.
     """
     turn = rotation @ np.swapaxes(bind[0], -1, -2)
     shift = position - np.einsum("fjab,jb->fja", turn, bind[1])

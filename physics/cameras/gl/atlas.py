@@ -1,10 +1,11 @@
-"""Atlas: the robots of many environments in one process, drawn together and read back at once.
+"""Joint rendering of the robots of many environments in one process, with one readback.
 
-Environments join and leave at any time, each with a place, a light and a robot of its own; a batch
-holds any of them. The pictures are those of a `GlCamera` each, bit for bit: each is drawn by itself
-and copied behind the last into one buffer on the graphics card. Waiting for that buffer is what
-costs there; one is waited for while the next is under way: `begin` the next pictures before you
-`end` the last ones.
+Environments join and leave at any time, each with a world, a light and a robot; a batch holds any
+subset.
+Each picture has the same bits as that of a separate `GlCamera`.
+It is drawn separately and copied behind the previous one into a buffer on the graphics card.
+Waiting for that buffer dominates the cost, so call `begin` for the next pictures before `end` for
+the last ones.
 """
 
 from __future__ import annotations
@@ -30,13 +31,13 @@ from physics.cameras.view import SIDE_MAX
 from physics.dynamics.world import BulletWorld
 
 SeatKey = NewType("SeatKey", int)
-"""Names an environment of an atlas, from `join` to `leave`; no other one ever gets it."""
+"""Key of an environment in an atlas, from `join` to `leave`; keys are never reused."""
 _Seen = Sequence[tuple[SeatKey, RobotState, Street]]
-"""An environment, its robot and its street, for each picture."""
+"""Environment, robot and street of each picture."""
 
 
 class Atlas:
-    """One camera for several worlds. Use it in a `with` block."""
+    """Camera for several worlds. Use it in a `with` block."""
 
     def __init__(self, spec: CameraSpec) -> None:
         self._spec = spec
@@ -69,28 +70,27 @@ class Atlas:
             self._context = None
 
     def join(self, world: BulletWorld, light: Light = NOON) -> SeatKey:
-        """Take an environment in; the world need not be running."""
-        self._running_context  # noqa: B018  an atlas that is not running says so
+        """Add an environment; the world need not be running."""
+        self._running_context  # noqa: B018  raises if the atlas is not running
         camera = GlCamera(world, self._spec, light=light)
         key = SeatKey(next(self._keys))
         self._cameras[key] = camera.__enter__()
         return key
 
     def leave(self, key: SeatKey) -> None:
-        """Free what an environment holds. Its pictures under way are handed over all the same."""
+        """Remove an environment and free its data. Its pending pictures are still delivered."""
         self._camera(key).close()
         del self._cameras[key]
 
     def render(self, seen: _Seen) -> list[Frame]:
-        """What these robots see, in this order."""
+        """Render the views of these robots, in this order."""
         self.begin(seen)
         return self.end()
 
     def begin(self, seen: _Seen) -> None:
-        """Draw what these robots see; `end` hands the pictures over.
+        """Start drawing the views of these robots; `end` returns the pictures.
 
-        Raises UsageError for an environment that is not in the atlas, and where there are too many
-        pictures.
+        Raises UsageError for an environment that is not in the atlas, and for too many pictures.
         """
         gl = self._running_context
         if len(seen) > self._most:
@@ -110,8 +110,7 @@ class Atlas:
         self._begun.append(batch)
 
     def end(self) -> list[Frame]:
-        """The pictures that began first and have not ended, in the order in which they were asked
-        for."""
+        """Return the pictures of the oldest pending `begin`, in the order of its robots."""
         with self._running_context:
             pictures = self._readback.end()
         return [

@@ -1,4 +1,4 @@
-"""What lies behind everything: the sky, and below the horizon ground without end."""
+"""Background of a picture: the sky, and infinite ground below the horizon."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ void main() {{
 
 
 class Backdrop:
-    """One triangle over the whole picture, at the far end of the depth; draw it last."""
+    """Background triangle over the whole picture at the far end of the depth; draw it last."""
 
     def __init__(self, context: moderngl.Context, sky: Sky) -> None:
         self._program = programs(context, _VERTEX, _FRAGMENT, shadows=False).colour

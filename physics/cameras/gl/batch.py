@@ -1,7 +1,7 @@
-"""A batch: pictures of any number of environments, what moves in them posed, sorted out and
-uploaded together.
+"""Batches of pictures of any number of environments.
 
-Each picture is then drawn by itself, so that it has the same bits alone and in company.
+Moving objects of all pictures are posed, culled and uploaded together.
+Each picture is then drawn separately, so that its bits do not depend on the batch.
 """
 
 from __future__ import annotations
@@ -32,12 +32,11 @@ from physics.street.surface import Surface
 
 _CLOCK: Final = Clock()
 _PEOPLE_MAX: Final = 4096
-"""People whose poses go up together; a picture of more is a batch of its own."""
+"""Maximum number of people in a batch; a picture with more is a separate batch."""
 
 
 class Stage(NamedTuple):
-    """What a camera draws with: the standing street, its shadow maps if there are any, what lies
-    behind, the light."""
+    """Resources of a camera: street scene, optional shadow maps, backdrop, light."""
 
     surface: Surface
     model: Robot
@@ -48,8 +47,12 @@ class Stage(NamedTuple):
 
 
 class PictureOrder(NamedTuple):
-    """A picture to be drawn. light: as this view sees it. robot: None where there is none; body: it
-    is in the picture itself, not its shadow alone."""
+    """Request for a picture.
+
+    light: as this view sees it
+    robot: None without a robot
+    body: the robot's body is drawn in the picture itself, not only its shadow
+    """
 
     stage: Stage
     taken: Shot
@@ -60,7 +63,7 @@ class PictureOrder(NamedTuple):
 
 
 class BatchDrawing:
-    """Draws pictures. Made once in a context; it stays as long as it."""
+    """Drawing of batches; one instance per context, with the same lifetime."""
 
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
@@ -72,14 +75,18 @@ class BatchDrawing:
     def draw(
         self, pictures: Sequence[PictureOrder], target: Target, drawn: Callable[[int], None]
     ) -> None:
-        """Draw each into the target, and say so by its number before the next. The context must be
-        held."""
+        """Draw each picture into the target.
+
+        drawn: called with the picture's number before the next one is drawn
+
+        The caller must hold the context.
+        """
         first = 0
         for few in _batches(pictures):
             self._cast(few, self._arrange(few))
             self._context.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
             self._surfaces.bind()
-            self._context.front_face = "cw"  # pictures are drawn upside down, to be read top first
+            self._context.front_face = "cw"  # draw upside down, to read the top row first
             for i, picture in enumerate(few):
                 target.clear()
                 self._draw(i, picture.stage, target)
@@ -116,7 +123,7 @@ class BatchDrawing:
         return shots
 
     def _cast(self, pictures: Sequence[PictureOrder], shots: Shots) -> None:
-        """Bring the shadow maps of all pictures up to date."""
+        """Update the shadow maps of all pictures."""
         with casting(self._context):
             for i, (one, middle, anchor) in enumerate(
                 zip(pictures, shots.middles, shots.anchors, strict=True)
@@ -133,7 +140,7 @@ class BatchDrawing:
         self._blocks.bind(2 * i)
         gl.depth_func = "<"
         self._draw_pass(i, stage, "colour")
-        # Paint changes colours alone: the ground keeps its labels and its depth.
+        # Paint changes colours only; labels and depth stay those of the ground.
         gl.polygon_offset = -1.0, -8.0
         target.use_colours()
         stage.scene.draw_paint()
@@ -151,12 +158,16 @@ class BatchDrawing:
 
 @lru_cache(maxsize=1)
 def batch_drawing(context: moderngl.Context) -> BatchDrawing:
-    """The one of a context."""
+    """Return the context's single instance."""
     return BatchDrawing(context)
 
 
 def _batches(pictures: Sequence[PictureOrder]) -> Iterator[Sequence[PictureOrder]]:
-    """The pictures in their order, in batches of at most so many people, no stage twice in one."""
+    """Split the pictures, in order, into batches.
+
+    A batch holds at most _PEOPLE_MAX people, and no stage twice. A picture with more people is a
+    separate batch.
+    """
     begun = 0
     people = 0
     stages = set[int]()

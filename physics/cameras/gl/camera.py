@@ -1,7 +1,7 @@
-"""GlCamera: pictures by OpenGL, on a GPU or on a processor that plays one.
+"""Camera with OpenGL, on a GPU or a software renderer.
 
-A picture is a function of the robot's state and the street alone: same values, same pixels on the
-same renderer, whatever was drawn before.
+A picture is a function of the robot's state and the street alone.
+The same values give the same pixels on the same renderer, independent of previous pictures.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _TARGETS_MAX: Final = 4
 
 
 class GlCamera(WorldCamera):
-    """The robot's camera in a world. Use it in a `with` block; the world need not be running."""
+    """Robot camera with OpenGL. Use it in a `with` block; the world need not be running."""
 
     def __init__(
         self, world: BulletWorld, spec: CameraSpec, depth: bool = False, light: Light = NOON
@@ -57,7 +57,7 @@ class GlCamera(WorldCamera):
         return self
 
     def close(self) -> None:
-        """Free what the camera holds; a second call does nothing."""
+        """Free the camera's resources; a second call does nothing."""
         if self._context is not None:
             with self._context:
                 self._stage.scene.release()
@@ -69,7 +69,7 @@ class GlCamera(WorldCamera):
             self._context = None
 
     def mounted_picture(self, robot: RobotState, street: Street) -> PictureOrder:
-        """What `render` shows, but for the lens, to be drawn in a batch."""
+        """Return the request for the picture of `render`, without the lens, for use in a batch."""
         return self._picture(self._mounted(robot), street, robot, body=False)
 
     def _drawn(self, taken: Shot, street: Street, robot: RobotState | None, body: bool) -> Frame:
@@ -93,7 +93,7 @@ class GlCamera(WorldCamera):
         return PictureOrder(self._stage, taken, self._light_of(taken.view), street, robot, body)
 
     def _light_of(self, view: View) -> Lighting:
-        """The light of a view, its direction to a degree."""
+        """Return the light of a view; its direction is rounded to a degree."""
         key = round(math.degrees(view.heading_rad)), round(math.degrees(view.half_angle_rad))
         if key not in self._lights:
             self._lights[key] = self._light.seen(math.radians(key[0]), math.radians(key[1]))

@@ -1,4 +1,4 @@
-"""The OpenGL context of this process: EGL without a window, on a GPU or on Mesa's llvmpipe."""
+"""OpenGL context of this process: EGL without a window, on a GPU or on Mesa's llvmpipe."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ import moderngl
 from cosim.core.errors import EngineError
 
 VERSION: Final = 430
-"""OpenGL 4.3: draws whose counts lie in a buffer."""
+"""Required version, OpenGL 4.3, for indirect draws with counts in a buffer."""
 PACKAGES: Final = "libegl1 libgl1 libegl-mesa0 libgl1-mesa-dri"
 
 
 @lru_cache(maxsize=1)
 def context() -> moderngl.Context:
-    """The one context of this process, made when first asked for. Use it in a `with` block around
-    GL calls.
+    """Return the process's single context, created on first use.
 
+    Use it in a `with` block around GL calls.
     Raises EngineError with the system packages to install.
     """
     try:
@@ -32,14 +32,14 @@ def context() -> moderngl.Context:
         ) from error
     made.__exit__(
         None, None, None
-    )  # no thread holds it: whoever draws takes it for the time of a drawing
+    )  # no thread holds the context; each drawing acquires it temporarily
     held: moderngl.Context = made
     return held
 
 
 @lru_cache(maxsize=1)
 def available() -> bool:
-    """Can the gl camera draw here?"""
+    """Return whether the gl camera works on this machine."""
     try:
         context()
     except EngineError:
@@ -49,7 +49,7 @@ def available() -> bool:
 
 @lru_cache(maxsize=1)
 def is_card(context: moderngl.Context) -> bool:
-    """Whether a graphics card draws, not the processor in its place."""
+    """Return whether the context draws on a graphics card, not on the processor."""
     return not any(
         name in context.info["GL_RENDERER"] for name in ("llvmpipe", "softpipe", "swrast", "SWR")
     )
@@ -57,8 +57,10 @@ def is_card(context: moderngl.Context) -> bool:
 
 @lru_cache(maxsize=1)
 def renderer() -> str:
-    """The renderer as it is named in records: pictures are the same bits on the same renderer
-    only."""
+    """Return the renderer's name for records.
+
+    Pictures have the same bits on the same renderer only.
+    """
     with context() as gl:
         info = gl.info
     return f"gl: {info['GL_RENDERER']}, {info['GL_VERSION']}"

@@ -1,11 +1,11 @@
-"""People for the gl camera: skinned bodies, posed on the graphics card, of all pictures of a batch
-at once.
+"""People of the gl camera: skinned bodies of all pictures of a batch, posed on the graphics card.
 
-Per batch a few numbers per person go up: four baked frames with weights, place, heading, size. A
-first small pass blends the frames and writes everybody's 24 joint matrices, in metres from the
-picture's anchor, into a texture; the vertex shaders of all passes skin with them. Bodies of all
-outfits and levels lie in one buffer; a pass of a picture is one indirect draw for those near (four
-joints per vertex) and one for those far away (two).
+Each batch uploads a few numbers per person: four baked frames with weights, place, heading, size.
+A first small pass blends the frames into 24 joint matrices per person, stored in a texture.
+They are in metres from the picture's anchor; the vertex shaders of all passes skin with them.
+Bodies of all outfits and levels are in one buffer.
+A pass of a picture is one indirect draw for near people (four joints per vertex) and one for far
+people (two).
 """
 
 from __future__ import annotations
@@ -32,16 +32,16 @@ from physics.people.figure import LEVELS, MESH_LEVELS
 from physics.people.poses import bodies_of, loops_of, poses_of
 
 LEVEL_PX: Final = (170.0, 80.0, 44.0, 32.0)
-"""Drawn height of a body, in pixels, below which the next coarser level is taken."""
+"""Drawn heights of a body, in pixels, below which the next coarser level is used."""
 CAST_M: Final = 18.0
-"""How far from the eye people throw shadows."""
+"""Maximum distance from the eye of people that cast shadows, metres."""
 
 _INSTANCE: Final = np.dtype([("person", "i4"), ("dress", "i4"), ("girth", "f4")])
-"""person: row of the posed; dress: row of the dyed."""
+"""person: row of the matrix texture; dress: row of the colour texture."""
 _ROW: Final = 3 * 24
 _CROWD_MIN: Final = 64
 _KEYS: Final = (LEVELS + 1) * len(ALL)
-"""Forms of a picture: outfits by level, and behind the last level those of shadows."""
+"""Number of forms of a picture: outfits by level, plus one level for shadows."""
 _ENDS: Final = (0, MESH_LEVELS * len(ALL), LEVELS * len(ALL), _KEYS)
 
 _POSE_VERTEX: Final = """#version 430
@@ -74,8 +74,11 @@ void main() {
 
 
 class PeopleSeen(NamedTuple):
-    """The people of a picture. heights: of the ground at (N, 2) points; shadows: whether they throw
-    any."""
+    """People of a picture.
+
+    heights: function of (N, 2) points that returns the ground height
+    shadows: people cast shadows
+    """
 
     people: People
     time_s: float
@@ -84,8 +87,12 @@ class PeopleSeen(NamedTuple):
 
 
 class _Worn(NamedTuple):
-    """(N,) outfits and girths of people, (N, coats, 3) colours, (N, 4) bodies as poses take
-    them."""
+    """Appearance of N people.
+
+    outfit, girth: (N,)
+    colours: (N, coats, 3)
+    bodies: (N, 4), as for poses
+    """
 
     outfit: NDArray[np.intp]
     girth: NDArray[np.float32]
@@ -94,7 +101,7 @@ class _Worn(NamedTuple):
 
 
 class CrowdDrawing:
-    """The people of the pictures of a batch."""
+    """Drawing of the people of the pictures of a batch."""
 
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
@@ -114,8 +121,10 @@ class CrowdDrawing:
         self._grow(_CROWD_MIN)
 
     def set(self, watched: Sequence[PeopleSeen], shots: Shots) -> None:
-        """Hold these people as the pictures will show them, each on the ground; binds a
-        framebuffer, and units 0 and 1 until all is drawn."""
+        """Upload the people of all pictures, each on the ground.
+
+        Binds a framebuffer, and texture units 0 and 1 until all pictures are drawn.
+        """
         counts = [len(one.people) for one in watched]
         self._split = [[0, 0, 0, 0]] * len(watched)
         if not sum(counts):
@@ -158,8 +167,10 @@ class CrowdDrawing:
         self._dyed.use(1)
 
     def _dress(self, who: list[tuple[tuple[str, ...], bytes]]) -> _Worn:
-        """What all of them wear, picture after picture, and their colours on the graphics card;
-        mostly it is as it was. who: names and ages."""
+        """Return the appearance of all people, and upload their colours if they changed.
+
+        who: names and ages
+        """
         if who != self._dressed:
             each = [_worn(*one) for one in who]
             self._worn = _Worn(*(np.concatenate(column) for column in zip(*each, strict=True)))
@@ -171,8 +182,10 @@ class CrowdDrawing:
         return self._worn
 
     def draw(self, stage: Pass, shadows: bool, picture: int = 0) -> None:
-        """Draw those of a picture; in the shadow maps of what moves everybody has few triangles.
-        shadows: whether they are shaded by shadow maps."""
+        """Draw the people of a picture; shadow maps of moving objects use the coarsest level.
+
+        shadows: people are shaded by shadow maps
+        """
         near, far, cast, end = self._split[picture]
         if stage == "still" or near == end:
             return
@@ -200,8 +213,10 @@ class CrowdDrawing:
         girth: NDArray[np.float32],
         dress: NDArray[np.intp],
     ) -> None:
-        """Fill the buffers of instances and of draws: picture after picture, near levels first,
-        then far ones, then shadows, which have a level of their own behind the last."""
+        """Fill the buffers of instances and draws.
+
+        The order is by picture: near levels, far levels, then shadows as an additional last level.
+        """
         in_view, casting = seen.nonzero()[0], casts.nonzero()[0]
         people = np.concatenate([in_view, casting])
         levels_ = np.concatenate([level[in_view], np.full(len(casting), LEVELS)])
@@ -219,8 +234,10 @@ class CrowdDrawing:
         self._commands.write(commands)
 
     def _start(self, form: NDArray[np.intp]) -> NDArray[np.uint32]:
-        """(F, 3) where bodies begin, by level * outfits + outfit; who casts a shadow has the
-        coarsest level."""
+        """Return (F, 3) buffer offsets of bodies, indexed by level * outfits + outfit.
+
+        Shadows use the coarsest level.
+        """
         if not self._known[form].all():
             for one in dict.fromkeys(form[~self._known[form]].tolist()):
                 level, outfit = divmod(one, len(ALL))
@@ -234,7 +251,7 @@ class CrowdDrawing:
         return self._starts[form]
 
     def _grow(self, room: int) -> None:
-        """Make room for more people."""
+        """Enlarge the buffers for more people."""
         self._release_room()
         self._room = room
         self._told = _texture(self._context, (4, room), 4, "f4")
@@ -261,8 +278,7 @@ class CrowdDrawing:
 
 
 def _heights(watched: Sequence[PeopleSeen], whose: NDArray[np.intp], xy: Floats) -> Floats:
-    """(N,) height of the ground at (N, 2) points of these pictures, in their order; each ground is
-    asked once."""
+    """Return (N,) ground heights at (N, 2) points of these pictures, with one query per ground."""
     grounds = list(dict.fromkeys(one.heights for one in watched))
     if len(grounds) == 1:
         return grounds[0](xy)
@@ -286,8 +302,11 @@ def _worn(ids: tuple[str, ...], ages: bytes) -> _Worn:
 
 
 def levels(shots: Shots, whose: NDArray[np.intp], xy: Floats, z_m: Floats) -> NDArray[np.intp]:
-    """(N,) level of detail of people at (N, 2) xy, standing at (N,) heights, by how tall they are
-    in their pictures."""
+    """Return (N,) levels of detail of people by their height in the pictures.
+
+    xy: (N, 2) positions
+    z_m: (N,) ground heights
+    """
     return np.asarray(np.searchsorted(-np.array(LEVEL_PX), -shots.tall_px(whose, xy, z_m)))
 
 

@@ -1,8 +1,8 @@
-"""Rigid things drawn by the hundred: one call for all, however many forms they have.
+"""Instanced drawing of many rigid objects in one call, for any number of forms.
 
-A form is a mesh with the colours of its parts; an instance is a form at a place, turned, with a
-paint of its own. All forms lie in one buffer, and the counts of a draw lie in another (multi-draw
-indirect).
+A form is a mesh with the colours of its parts.
+An instance is a form with a position, rotation and paint.
+All forms are in one buffer, and the counts of a draw in another (multi-draw indirect).
 """
 
 from __future__ import annotations
@@ -20,21 +20,22 @@ from physics.cameras.gl.surfaces import KNOWN, LOOKED_UP, Surfaces
 from physics.ground.mesh import Part
 
 INSTANCE: Final = np.dtype([("at", "f4", 3), ("turn", "f4", 4), ("paint", "u1", 4)])
-"""at: metres from the anchor; turn: quaternion x, y, z, w; paint: colour, and the label as its
-fourth."""
+"""at: metres from the anchor; turn: quaternion x, y, z, w; paint: colour, with the label as fourth
+channel.
+"""
 
 _OWN = 255
 _PAINT = 0
 _GLOW = 128
-"""Fourth channel of a corner's colour: its own, the instance's, or the instance's and shining.
-Where it is not its own the colour says how much light reaches the corner."""
+"""Fourth channel of a corner's colour: own colour, the instance's, or the instance's and emissive.
+
+If the colour is the instance's, rgb is the share of light that reaches the corner.
+"""
 _BARE = 255
 _LAMP = 254
-"""Fourth channel of a corner's normal, if not a layer of the surfaces: nothing lies on it, or it
-shines at night."""
+"""Fourth channel of a corner's normal besides surface layers: no surface, or emissive at night."""
 _LAMPLIGHT: Final = "6.0e-3, 4.8e-3, 3.0e-3"
-"""Radiance of a street lamp's glass as far as a camera is to see it, in the units of
-physics.cameras.sky."""
+"""Radiance of a street lamp's glass for a camera, in the units of physics.cameras.sky."""
 
 _VERTEX: Final = f"""
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour;
@@ -80,7 +81,7 @@ void main() {{
 
 
 class Forms:
-    """All forms by key, in one vertex and one index buffer; it grows when a key is new."""
+    """Registry of all forms by key, in one vertex and one index buffer; a new key extends it."""
 
     def __init__(
         self,
@@ -102,11 +103,13 @@ class Forms:
         self._buffers: tuple[moderngl.Buffer, moderngl.Buffer] | None = None
 
     def apart(self) -> Forms:
-        """None yet, with the same programs: for forms that are to go with whoever brought them."""
+        """Create an empty registry with the same programs, for forms with the lifetime of their
+        owner.
+        """
         return Forms(self._context, self._surfaces, self._programs)
 
     def programs(self, shadows: bool) -> Programs:
-        """The programs of all forms, shaded by shadow maps or not."""
+        """Return the programs of all forms. shadows: they apply shadow maps."""
         if shadows not in self._programs:
             self._programs[shadows] = made = programs(
                 self._context, KNOWN + _VERTEX, LOOKED_UP + _FRAGMENT, shadows
@@ -117,7 +120,7 @@ class Forms:
         return self._programs[shadows]
 
     def id(self, key: Hashable, parts: Callable[[], Sequence[Part]]) -> int:
-        """The number of a form; `parts` makes it when its key is new."""
+        """Return the number of a form. A new key calls `parts` to create the form."""
         if key not in self._ids:
             self._add(key, parts())
         return self._ids[key]
@@ -129,7 +132,7 @@ class Forms:
         self._indices.append(indices)
         self._ids[key] = len(self._ids)
         self._starts.append((len(self._indices[-1]), first, base))
-        by_name = sorted(self._ids, key=repr)  # an order that does not hang on what was seen first
+        by_name = sorted(self._ids, key=repr)  # order independent of insertion
         self.rank = np.zeros(len(by_name), dtype=np.int64)
         self.rank[[self._ids[name] for name in by_name]] = np.arange(len(by_name))
         self.draws = np.array(self._starts, dtype=np.uint32)
@@ -150,8 +153,10 @@ class Forms:
         return rows
 
     def buffers(self) -> tuple[moderngl.Buffer, moderngl.Buffer]:
-        """Corners and triangles of all forms; arrays bound to those of an older `version` are
-        void."""
+        """Return vertex and index buffers of all forms.
+
+        Vertex arrays bound to buffers of an older `version` are invalid.
+        """
         if self._buffers is None or self._held != self.version:
             self.release()
             first = self._context.buffer(np.concatenate(self._corners).tobytes())
@@ -166,8 +171,7 @@ class Forms:
 
 
 class Things:
-    """A set of instances in runs of one form each, replaced as a whole; a run of runs is drawn in
-    one call."""
+    """Set of instances in runs of one form each, replaced as a whole. One call draws all runs."""
 
     def __init__(self, context: moderngl.Context, forms: Forms) -> None:
         self._context = context
@@ -186,8 +190,12 @@ class Things:
         part: NDArray[np.intp] | None = None,
         parts: int = 1,
     ) -> None:
-        """(N,) numbers of forms and (N,) rows of INSTANCE. part: (N,) which of `parts` each belongs
-        to."""
+        """Replace all instances.
+
+        form: (N,) numbers of forms
+        rows: (N,) rows of INSTANCE
+        part: (N,) index of the part, below `parts`
+        """
         if not len(form):
             self._ends = [0] * (parts + 1)
             return
@@ -204,7 +212,7 @@ class Things:
         self._commands.write(commands)
 
     def draw(self, stage: Pass, shadows: bool, part: int = 0) -> None:
-        """Draw one part. shadows: whether it is shaded by shadow maps."""
+        """Draw one part. shadows: it is shaded by shadow maps."""
         first = self._ends[part]
         count = self._ends[part + 1] - self._ends[part]
         if count:
@@ -254,8 +262,12 @@ class Things:
 
 
 def runs_of(key: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.uint32]]:
-    """(N,) the order that sorts (N,) keys, the same of equal ones; (F,) the keys that there are;
-    and for each the row of an indirect draw, (F, 5), with its count and its place in that order."""
+    """Group equal keys into runs.
+
+    Returns the stable sorting order of (N,) keys, the distinct keys (F,), and indirect draws (F,
+    5).
+    Each row of a draw holds the run's count and its offset in that order.
+    """
     order = key.argsort(kind="stable")
     key = key[order]
     begins = np.empty(len(key), dtype=bool)
@@ -268,7 +280,12 @@ def runs_of(key: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp], 
 
 
 def instances(at: ArrayLike, heading: ArrayLike, paint: ArrayLike, label: int) -> CornerRows:
-    """Rows of INSTANCE. at: (N, 3) from the anchor; heading: radians; paint: (N, 3) or (3,)."""
+    """Return rows of INSTANCE.
+
+    at: (N, 3) from the anchor, metres
+    heading: rad
+    paint: (N, 3) or (3,)
+    """
     return turned_instances(at, 0.0, 0.0, heading, paint, label)
 
 
@@ -280,8 +297,11 @@ def turned_instances(
     paint: ArrayLike,
     label: int,
 ) -> CornerRows:
-    """Rows of INSTANCE, turned about x, then y, then z. at: (N, 3) from the anchor; paint: (N, 3)
-    or (3,)."""
+    """Return rows of INSTANCE, rotated about x, then y, then z.
+
+    at: (N, 3) from the anchor, metres
+    paint: (N, 3) or (3,)
+    """
     at = np.asarray(at, dtype=float).reshape(-1, 3)
     half = [0.5 * np.asarray(angle, dtype=float) for angle in (roll, pitch, heading)]
     (cx, cy, cz) = map(np.cos, half)

@@ -1,4 +1,4 @@
-"""The light of a picture as shaders take it, made from a sky."""
+"""Light of a picture for shaders, computed from a sky."""
 
 from __future__ import annotations
 
@@ -16,15 +16,22 @@ from physics.cameras.sky import Sky
 HAZE_FROM_M: Final = 20.0
 HAZE_PER_M: Final = 1.0 / 110.0
 HAZE_MOST: Final = 0.85
-"""Beside the fog of a scenario distant things fade a little in any weather, so that the end of the
-drawn world is no edge; the bullet camera does the same."""
+"""Maximum share of haze on distant objects, in any weather and in addition to fog.
+
+It hides the edge of the drawn world, as in the bullet camera.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Lighting:
-    """Linear radiances, as in physics.cameras.sky. to_sun: (3,); up, side, down: (3,) ambient of a
-    white surface that looks there; horizon: (N, 3) the sky just over the horizon, columns as in
-    physics.cameras.sky; lamps: 0 by day to 1 at night; shadows: whether there are any."""
+    """Linear radiances, as in physics.cameras.sky.
+
+    to_sun: (3,)
+    up, side, down: (3,) ambient of a white surface that faces this direction
+    horizon: (N, 3) the sky just over the horizon, columns as in physics.cameras.sky
+    lamps: 0 by day to 1 at night
+    shadows: the sun casts shadows
+    """
 
     to_sun: Floats
     sun: Floats
@@ -39,8 +46,7 @@ class Lighting:
     shadows: bool
 
     def seen(self, heading_rad: float, half_angle_rad: float) -> Lighting:
-        """The light of a picture: what is far fades into the sky that is behind it, not into the
-        sky all around."""
+        """Return the light of a picture whose fog has the colour of the sky behind it."""
         columns = len(self.horizon)
         turn = math.pi - 2.0 * math.pi * (np.arange(columns) + 0.5) / columns - heading_rad
         aside = np.abs((turn + math.pi) % (2.0 * math.pi) - math.pi)
@@ -48,7 +54,7 @@ class Lighting:
         return replace(self, fog=self.horizon[behind].mean(axis=0))
 
     def rows(self) -> list[tuple[float, ...]]:
-        """What the uniform block `Scene` holds of it, vec4 after vec4."""
+        """Return the light's rows of the uniform block `Scene`, one vec4 each."""
         return [
             (*self.to_sun, float(self.shadows)),
             (*self.sun, self.exposure),
@@ -61,7 +67,7 @@ class Lighting:
 
 
 def lighting_of(sky: Sky) -> Lighting:
-    """What a sky is to the shaders."""
+    """Convert a sky to shader values."""
     up, side, down = sky.ambient
     return Lighting(
         sky.sun,
@@ -81,13 +87,13 @@ def lighting_of(sky: Sky) -> Lighting:
 def _horizon(sky: Sky) -> Floats:
     rows = len(sky.radiance)
     around = sky.radiance[rows // 2 - max(1, rows // 40) : rows // 2].mean(axis=0, dtype=float)
-    # The sun itself is no colour of the haze.
+    # Exclude the sun from the haze colour.
     limit = 2.0 * np.median(around, axis=0)
     return np.asarray(np.minimum(around, limit))
 
 
 def sky_texture(context: moderngl.Context, radiance: NDArray[np.float32]) -> moderngl.Texture:
-    """An equirectangular picture (H, W, 3) as a texture."""
+    """Upload an equirectangular picture (H, W, 3) as a texture."""
     rows, columns, _ = radiance.shape
     texture = context.texture(
         (columns, rows),

@@ -1,5 +1,4 @@
-"""People and nothing else: what the paper measures, and what is left of a picture when the street
-is taken away."""
+"""Rendering of people without the street, as measured by the paper."""
 
 from __future__ import annotations
 
@@ -23,12 +22,14 @@ from physics.cameras.sky import sky_of
 from physics.cameras.view import shot
 
 EYE_M = 0.75
-"""Height of the eye over flat ground."""
+"""Height of the eye over flat ground, metres."""
 
 
 class PeopleAlone:
-    """Posed, skinned, shaded people before nothing. Use it in a `with` block. size: width, height
-    in pixels."""
+    """Posed, skinned, shaded people before an empty background. Use it in a `with` block.
+
+    size: width, height in pixels
+    """
 
     def __init__(self, size: tuple[int, int], fov_deg: float) -> None:
         self._size = size
@@ -57,12 +58,12 @@ class PeopleAlone:
                 thing.release()
 
     def render(self, pose: Pose, street: Street) -> Frame:
-        """The people of a street as seen from a pose."""
+        """Render the people of a street from a pose."""
         self.begin(pose, street)
         return self.end()
 
     def begin(self, pose: Pose, street: Street) -> None:
-        """Draw them; `end` hands the picture over, and the next one may begin before that."""
+        """Start drawing a picture; `end` returns it, and the next may begin before that."""
         ahead = np.array([np.cos(pose.heading_rad), np.sin(pose.heading_rad)])
         eye = np.append(pose.xy, EYE_M)
         taken = shot(eye, eye + np.append(ahead, -0.1), self._size, self._fov_deg)
@@ -85,7 +86,7 @@ class PeopleAlone:
             self._readback.copy()
 
     def end(self) -> Frame:
-        """The picture that began first and has not ended."""
+        """Return the oldest pending picture."""
         with self._context:
             return Frame(*self._readback.end()[0])
 

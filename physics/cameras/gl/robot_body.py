@@ -1,5 +1,4 @@
-"""The robot's body from the shapes of its URDF: boxes, cylinders and files of meshes in their
-colours."""
+"""Robot body from the shapes of its URDF: boxes, cylinders and mesh files in their colours."""
 
 from __future__ import annotations
 
@@ -19,8 +18,10 @@ _GREY = (0.6, 0.6, 0.6)
 
 @lru_cache(maxsize=8)
 def robot_parts(urdf: Path) -> tuple[Part, ...]:
-    """What is drawn of a robot in its base frame, wheels as they stand. Raises EngineError for an
-    unknown shape."""
+    """Return the visible parts of a robot in its base frame, with joints at zero.
+
+    Raises EngineError for an unknown shape.
+    """
     root = xml.parse(urdf).getroot()
     colours = {m.get("name", ""): _colour(m) for m in root.findall("material")}
     joints = {j.find("child").get("link", ""): j for j in root.findall("joint")}  # type: ignore[union-attr]
@@ -39,7 +40,7 @@ def robot_parts(urdf: Path) -> tuple[Part, ...]:
 
 
 def _placed(link: str, joints: dict[str, xml.Element]) -> tuple[Floats, Floats]:
-    """Rotation and position of a link in the base frame, every joint at zero."""
+    """Return rotation and position of a link in the base frame, every joint at zero."""
     turn, shift = np.eye(3), np.zeros(3)
     while link in joints:
         own_turn, own_shift = _origin(joints[link])
@@ -81,9 +82,11 @@ def _shape(visual: xml.Element, urdf: Path) -> Mesh:
 
 
 def _mesh_of_file(path: Path, scale: Floats) -> Mesh:
-    """Return all triangles of a file that trimesh reads, each flat. Raises SpecError that names the
-    file."""
-    import trimesh  # takes 0.2 s, which most robots do not need
+    """Load all triangles of a file that trimesh reads, flat shaded.
+
+    Raises SpecError naming the file.
+    """
+    import trimesh  # import takes 0.2 s, and most robots do not need it
 
     try:
         scene = trimesh.load_scene(path)

@@ -1,9 +1,8 @@
-"""The street that stands around a view for the gl camera: the same things as in
-physics.cameras.scene, as buffers.
+"""Street around a view for the gl camera: the content of physics.cameras.scene as buffers.
 
-What can be in a picture is sorted out for a whole cell of eyes and sector of headings at a time,
-with a margin, so that a robot that drives on mostly finds everything as it lies. Cell and sector
-hang on the view alone, and so does what is drawn.
+Visibility is decided for a whole cell of eyes and sector of headings, with a margin.
+A moving robot therefore mostly reuses the buffers.
+Cell and sector depend on the view alone, and so does the picture.
 """
 
 from __future__ import annotations
@@ -49,9 +48,11 @@ from physics.street.surface import grounded_obstacles
 _CELL_M: Final = 2.0
 _SECTOR_RAD: Final = math.radians(7.5)
 _SLACK_M: Final = _CELL_M * math.sqrt(0.5)
-"""How far an eye may be from the middle of its cell."""
+"""Maximum distance of an eye from the middle of its cell, metres."""
 _TILE_REACH_M: Final = 34.0
-"""A tile's farthest point from its middle, and what stands over its border."""
+"""Maximum distance of a tile's content from its middle, including objects over its border,
+metres.
+"""
 
 _Placed = tuple[NDArray[np.intp], CornerRows]
 """Numbers of forms and rows of instances."""
@@ -60,8 +61,12 @@ _NOTHING: Final[_Placed] = (np.zeros(0, dtype=np.intp), np.zeros(0, dtype=INSTAN
 
 @dataclass(frozen=True, slots=True)
 class _Tile:
-    """What a tile shows, (2,) middle in world metres, and the things that stand in it, at (N, 2)
-    thing_xy, drawn as far as (N,) seen_m; their rows are relative to the middle."""
+    """Content of a tile; its rows are relative to its middle.
+
+    middle: (2,) world metres
+    thing_xy: (N, 2) positions of its objects
+    seen_m: (N,) drawing distances of its objects
+    """
 
     middle: Floats
     ground: TileRows | None
@@ -75,14 +80,14 @@ class _Tile:
 
 
 class _Words(msgspec.Struct, array_like=True):
-    """What of a tile is no array. forms: of its props, for `parts_of`."""
+    """Data of a tile that are not arrays. forms: of its props, for `parts_of`."""
 
     forms: list[tuple[str, int, int]]
     posts: list[props.SignalPost]
 
 
 class GlScene:
-    """Keeps what stands around a view; what is drawn depends on view and signals alone."""
+    """Static street around a view, as a function of view and signals alone."""
 
     def __init__(
         self, context: moderngl.Context, forms: Forms, world: BulletWorld, light: Lighting
@@ -98,7 +103,7 @@ class GlScene:
         self._walls = wall_layer(context, walls)
         self._seen = Things(context, forms)
         self._standing = Things(context, forms)
-        self._fence_forms = forms.apart()  # there is no end of their sizes
+        self._fence_forms = forms.apart()  # the number of sizes is unlimited
         self._fenced = Things(context, self._fence_forms)
         self._tiles: dict[Key, _Tile] = {}
         self._keys: list[Key] = []
@@ -115,8 +120,10 @@ class GlScene:
         self._obstacle_xy = np.array([(o.x_m, o.y_m) for o in world.obstacles]).reshape(-1, 2)
 
     def arrange(self, view: View, middle: Floats, anchor: Floats, street: Street) -> None:
-        """Hold everything standing that a picture can show. middle: (3,) of the space with
-        shadows."""
+        """Prepare all static objects that a picture can show.
+
+        middle: (3,) of the space with shadows
+        """
         cell = round(view.eye_m[0] / _CELL_M), round(view.eye_m[1] / _CELL_M)
         if cell != self._cell:
             self._stream(cell)
@@ -132,7 +139,7 @@ class GlScene:
             self._stand(middle, anchor)
 
     def draw(self, stage: Pass) -> None:
-        """Draw what was arranged: the small first, then walls and ground from near to far."""
+        """Draw the arranged street: small objects first, then walls and ground from near to far."""
         if stage == "moving":
             return
         (self._seen if stage == "colour" else self._standing).draw(stage, self._shadows)
@@ -141,7 +148,7 @@ class GlScene:
         self._ground.draw(stage)
 
     def draw_paint(self) -> None:
-        """Draw what lies on the ground; to be drawn after it, without labels and depth."""
+        """Draw road paint after the ground, without labels and depth."""
         self._paint.draw("colour")
 
     def release(self) -> None:
@@ -158,7 +165,7 @@ class GlScene:
         self._tiles.clear()
 
     def _stream(self, cell: tuple[int, int]) -> None:
-        """Hold the tiles around a cell, the nearest first."""
+        """Load the tiles around a cell, the nearest first."""
         x, y = cell[0] * _CELL_M, cell[1] * _CELL_M
         keys = [key for _, key in sorted(tile_distances_within(x, y, VISIBLE_M + _SLACK_M))]
         if keys == self._keys:
@@ -188,7 +195,7 @@ class GlScene:
         self._placed = False
 
     def _place(self, anchor: Floats) -> None:
-        """Measure everything from an anchor."""
+        """Set the anchor that all positions are relative to."""
         self._anchor = anchor
         self._placed = True
         self._seen_for = None
@@ -201,7 +208,7 @@ class GlScene:
         self._fenced.set(*_joined([_NOTHING, *self._fences_now(anchor)]))
 
     def _choose(self, cell: tuple[int, int], sector: int, half: int | None) -> None:
-        """Take what can be in the picture of any eye in the cell that looks into the sector."""
+        """Select everything visible from any eye in the cell with a heading in the sector."""
         offset = self._stands_xy - np.multiply(cell, _CELL_M)
         chosen = np.hypot(offset[:, 0], offset[:, 1]) < self._stands_seen_m + _SLACK_M
         tiles = np.ones(len(self._keys), dtype=bool)
@@ -215,7 +222,7 @@ class GlScene:
             layer.show("colour", tiles.nonzero()[0])
 
     def _stand(self, middle: Floats, anchor: Floats) -> None:
-        """What stands and throws shadows in the square around its middle, seen or not."""
+        """Prepare the shadow casters in the square around `middle`, visible or not."""
         still = (*middle.tolist(), *anchor.tolist())
         if still != self._still_for:
             keys = tiles_within(float(middle[0]), float(middle[1]), VISIBLE_M - STEP_M)
@@ -251,7 +258,7 @@ class GlScene:
         )
 
     def _made(self, key: Key) -> Arrays:
-        """What of a tile hangs on its surface alone."""
+        """Build the data of a tile that depend on its surface alone."""
         middle = _middle(key)
         chunk, finish, posts = (
             self._surface.chunk(key),
@@ -335,7 +342,7 @@ class GlScene:
         ]
 
     def _light(self, street: Street) -> None:
-        """Let the lamp of every signal whose state is known be lit."""
+        """Turn on the lamp of every signal with a known state."""
         signals = street.signals
         shown = [
             signals[post.crossing].walk if post.crossing in signals else None
@@ -362,14 +369,16 @@ class GlScene:
 
 
 def _middle(key: Key) -> Floats:
-    """(2,) of a tile, world metres."""
+    """Return the (2,) middle of a tile, world metres."""
     x0, y0, x1, y1 = tile_bounds(key)
     return np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
 
 
 def _sector(view: View) -> tuple[int, int | None]:
-    """The sector of a heading, and half the width of what its views show, in sectors; None for all
-    around."""
+    """Return the sector of a heading, and half the width of its views in sectors.
+
+    The half width is None for views in all directions.
+    """
     half = math.ceil(view.half_angle_rad / _SECTOR_RAD + 0.5)
     if view.behind_m > 0.0 or half * _SECTOR_RAD >= 0.5 * math.pi:
         return 0, None
@@ -377,8 +386,12 @@ def _sector(view: View) -> tuple[int, int | None]:
 
 
 def _within(offset: Floats, sector: int, half: int, margin_m: float) -> NDArray[np.bool_]:
-    """Which of (N, 2) points, measured from the middle of a cell, any of its eyes can see that
-    looks into the sector, things of radius `margin_m` standing on them."""
+    """Return which of (N, 2) points are visible from any eye of a cell with a heading in the
+    sector.
+
+    offset: points relative to the middle of the cell
+    margin_m: radius of the objects at the points
+    """
     heading, aside = sector * _SECTOR_RAD, half * _SECTOR_RAD
     cos, sin = math.cos(heading), math.sin(heading)
     ahead = offset @ np.array([cos, sin])
@@ -391,7 +404,7 @@ def _lamp(walk: bool) -> list[Part]:
 
 
 def _at(placed: _Placed, xy: Floats, anchor: Floats) -> _Placed:
-    """What stands at a point or at (N, 2) points of the world, measured from an anchor."""
+    """Return objects at a point or at (N, 2) points of the world, relative to an anchor."""
     form, rows = placed
     here = rows.copy()
     here["at"][:, :2] = xy - anchor

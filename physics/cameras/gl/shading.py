@@ -1,59 +1,54 @@
-"""Shading: the GLSL that all programs share, the uniform block they read, and the passes they are
-drawn in.
+"""Common GLSL of all programs, the uniform block they read, and the render passes.
 
-A drawable's program is written once and works in every pass. `programs` puts this file's chunks
-before its code:
+A drawable's program is written once and works in every pass.
+`programs` puts this file's chunks before its code:
 
-vertex shader     reads its own attributes and ends with `gl_Position = project(at);`, where `at` is
-                  a position in
-                  metres relative to the anchor of the picture (below). Normals are in world axes.
-fragment shader   calls `show(albedo, normal, at, label)` once, or `glow(colour, label)` for what
-                  shines by itself.
-                  albedo, colour: vec3 sRGB, 0 to 1; normal: vec3, unit length or nearly; at: as in
-                  the vertex
-                  shader; label: float, an id of cosim.core.state.LABELS. `show_linear` takes a
-                  linear albedo (sRGB
-                  textures are decoded when they are read) and a radiance of the surface's own.
-                  In the shadow pass it is not run: leave the depth alone and do not discard.
+vertex shader     Reads its own attributes and ends with `gl_Position = project(at);`.
+                  at: position in metres relative to the picture's anchor (below).
+                  Normals are in world axes.
+fragment shader   Calls `show(albedo, normal, at, label)` once, or `glow(colour, label)`
+                  for emissive surfaces.
+                  albedo, colour: vec3 sRGB, 0 to 1
+                  normal: vec3, approximately unit length
+                  at: as in the vertex shader
+                  label: float, an id of cosim.core.state.LABELS
+                  `show_linear` takes a linear albedo and a radiance emitted by the surface.
+                  sRGB textures are decoded when they are read.
+                  The shadow pass skips it: do not write depth or discard.
 
-Positions are relative to the anchor, a point of the ground near the eye on a lattice of ANCHOR_M,
-so that float32 holds
-them to a hundredth of a millimetre anywhere in a city. `anchor_of(eye)` is it, in world metres:
-subtract
-it in float64 before an upload.
+Positions are relative to the anchor, a ground point near the eye on a lattice of ANCHOR_M.
+In float32 they are then accurate to 0.01 mm anywhere in a city.
+`anchor_of(eye)` returns the anchor in world metres: subtract it in float64 before an upload.
 
-The uniform block `Scene` (binding SCENE_BINDING, one for each pass of each picture, of
-`SceneBlocks`):
+Uniform block `Scene` (binding SCENE_BINDING, one per pass and picture, from `SceneBlocks`):
 
-    mat4 clip_from_at      the camera's, or the sun's in the shadow pass; `project` is all that
-                           needs it
+    mat4 clip_from_at      of the camera, or of the sun in the shadow pass; read by `project`
     mat4 shadow_from_at    to the shadow map's texture space
     vec4 eye               xyz from the anchor
-    vec4 sun               xyz towards the sun; w 1 where it throws shadows
+    vec4 sun               xyz towards the sun; w 1 where it casts shadows
     vec4 sun_light         rgb linear; w exposure
     vec4 side_light        rgb linear, ambient of an upright surface; w lamps: 0 by day to 1 at
                            night
-    vec4 tilt_light        rgb linear, what is added times the z of the normal
-    vec4 flat_light        rgb linear, what is added times the size of the z of the normal
+    vec4 tilt_light        rgb linear, added times the z of the normal
+    vec4 flat_light        rgb linear, added times the absolute z of the normal
     vec4 fog               rgb linear; w extinction per metre
-    vec4 haze              where it begins in metres, share per metre, largest share
+    vec4 haze              start in metres, share per metre, maximum share
     vec4 anchor            xy in world metres (float32: for patterns, not for geometry)
-    vec4 right, up, ahead  axes of the picture; w of right and up: tangents of half its width and
-                           height
+    vec4 right, up, ahead  axes of the picture; w of right and up: tangents of half width and height
 
-Textures: the shadow maps are bound to units STILL_UNIT (what stands) and MOVING_UNIT (what walks
-and drives), SKY_UNIT
-holds the sky, SURFACES_UNIT, FACADES_UNIT and FINISH_UNIT the textures of ground and walls; free
-for drawables are
-units 0 and 1, which people take for the time of a batch.
+Textures: the shadow maps are bound to units STILL_UNIT (static) and MOVING_UNIT (moving objects).
+SKY_UNIT holds the sky; SURFACES_UNIT, FACADES_UNIT and FINISH_UNIT those of ground and walls.
+Units 0 and 1 are free for drawables; people use them for the time of a batch.
 
-A drawable takes part in a pass by a method `draw(stage)`, drawing itself with its program of that
-stage: "colour";
-"still", the shadows of what stands, drawn anew only when the eye has moved on; "moving", the
-shadows of what moves,
-drawn for every picture. A drawable that casts no shadow of a kind returns at once. Back faces are
-culled in the
-picture; front faces are counter-clockwise as in physics.world.mesh."""
+A drawable implements `draw(stage)` and draws itself with its program of that stage:
+
+    "colour"  the picture
+    "still"   shadows of static objects, redrawn only when the eye has moved on
+    "moving"  shadows of moving objects, drawn for every picture
+
+A drawable that casts no shadow of a kind returns at once. Back faces are culled in the picture.
+Front faces are counter-clockwise as in physics.world.mesh.
+"""
 
 from __future__ import annotations
 
@@ -78,17 +73,17 @@ STILL_UNIT: Final = 6
 MOVING_UNIT: Final = 7
 ANCHOR_M: Final = 64.0
 _BLOCK_ROWS: Final = 32
-"""vec4 of a block, of which 20 are used: blocks begin where every graphics card lets them."""
+"""Rows (vec4) of a block, of which 20 are used; graphics cards require aligned starts of blocks."""
 
 
 class Programs(NamedTuple):
-    """A drawable's programs: for the picture, and for shadow maps."""
+    """Programs of a drawable: one for the picture, one for shadow maps."""
 
     colour: moderngl.Program
     shadow: moderngl.Program
 
     def uniforms(self, name: str) -> list[moderngl.Uniform | None]:
-        """A uniform of both; None where the compiler dropped it."""
+        """Return a uniform of both programs; None where the compiler removed it."""
         found = [program.get(name, None) for program in self]
         return [uniform if isinstance(uniform, moderngl.Uniform) else None for uniform in found]
 
@@ -120,7 +115,7 @@ vec4 project(vec3 at) { return clip_from_at * vec4(at, 1.0); }
 _DECODED = """
 vec3 decoded(vec3 c) { return c * (c * (c * 0.305306011 + 0.682171111) + 0.012522878); }
 """
-"""sRGB to linear: a cubic that is right to about a level."""
+"""Conversion of sRGB to linear by a cubic, accurate to about one 8-bit level."""
 
 _FRAGMENT = """
 out vec4 pixel;
@@ -173,11 +168,12 @@ _NOTHING = "#version 430\nvoid main() {}\n"
 
 @lru_cache(maxsize=64)
 def programs(context: moderngl.Context, vertex: str, fragment: str, shadows: bool) -> Programs:
-    """A drawable's programs: for the picture, and for shadow maps. vertex, fragment: GLSL without a
-    version line.
+    """Create a drawable's programs, for the picture and for shadow maps.
 
-    shadows: whether `show` looks into the shadow maps. They stay as long as the context, for all
-    who ask for the same: what a uniform is to be for one of them is set before each drawing.
+    vertex, fragment: GLSL without a version line
+    shadows: `show` reads the shadow maps
+
+    Equal programs are shared during the context's lifetime, so set their uniforms before each draw.
     """
     head = _BLOCK + ("#define SHADOWS\n" if shadows else "")
     return Programs(
@@ -192,13 +188,15 @@ def programs(context: moderngl.Context, vertex: str, fragment: str, shadows: boo
 
 
 def anchor_of(eye_m: Floats) -> Floats:
-    """(2,) the point of the anchors' lattice nearest to an eye."""
+    """Return the (2,) point of the anchors' lattice nearest to an eye."""
     return np.array([round(eye_m[0] / ANCHOR_M), round(eye_m[1] / ANCHOR_M)]) * ANCHOR_M
 
 
 def camera_matrix(shot: Shot, anchor: Floats) -> Floats:
-    """(4, 4) from metres relative to the anchor to clip space, the first row of the picture below
-    (read top first)."""
+    """Return the (4, 4) matrix from metres relative to the anchor to clip space.
+
+    The first row of the picture is at the bottom, as it is read top first.
+    """
     wide, tall = shot.half_picture
     far, near = FAR_PLANE_M, NEAR_PLANE_M
     eye = shot.eye_m - (float(anchor[0]), float(anchor[1]), 0.0)
@@ -213,7 +211,7 @@ def camera_matrix(shot: Shot, anchor: Floats) -> Floats:
 
 
 class SceneBlocks:
-    """The uniform blocks of some passes, uploaded together."""
+    """Uniform blocks of several passes, uploaded together."""
 
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
@@ -224,7 +222,7 @@ class SceneBlocks:
         self.room(1)
 
     def room(self, count: int) -> None:
-        """Let there be so many at least; what was put is void if there were fewer."""
+        """Ensure space for at least `count` blocks. Growing discards earlier blocks."""
         if count > len(self._rows):
             self.release()
             self._rows = np.zeros((2 * count, _BLOCK_ROWS, 4), dtype=np.float32)
@@ -241,7 +239,7 @@ class SceneBlocks:
         anchor: Floats,
         light: Lighting,
     ) -> None:
-        """Set one; matrices (4, 4)."""
+        """Set one block; matrices are (4, 4)."""
         rows = self._rows[place]
         self._suns[place] = None
         self._light(place, light)
@@ -252,7 +250,7 @@ class SceneBlocks:
         rows[17, 3], rows[18, 3] = taken.half_picture
 
     def put_sun(self, place: int, clip_from_at: Floats, light: Lighting) -> None:
-        """Set one for a shadow map. The same matrix again, not changed since, changes nothing."""
+        """Set one block for a shadow map. The same matrix object as before changes nothing."""
         if self._suns[place] is not clip_from_at:
             self._suns[place] = clip_from_at
             self._light(place, light)
@@ -267,7 +265,7 @@ class SceneBlocks:
         self._buffer.write(self._rows)
 
     def bind(self, place: int = 0) -> None:
-        """What is drawn next reads this one as it was uploaded last."""
+        """Bind a block, as uploaded last, for later draws."""
         assert self._buffer is not None
         each = self._rows[0].nbytes
         self._buffer.bind_to_uniform_block(SCENE_BINDING, offset=place * each, size=each)

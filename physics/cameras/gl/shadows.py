@@ -1,7 +1,8 @@
-"""Shadow maps: the street as the sun sees it, once for what stands and once for what moves.
+"""Shadow maps from the sun: one for static objects and one for moving objects.
 
-Both maps share one box around a point of a coarse lattice near the eye, set to whole texels, so
-that shadows do not swim; what stands is drawn anew only when that point changes.
+Both maps cover one box around a point of a coarse lattice near the eye.
+The box is aligned to whole texels, so that shadows do not shimmer.
+The static map is redrawn only when that point changes.
 """
 
 from __future__ import annotations
@@ -18,31 +19,32 @@ from physics.cameras.gl.lighting import Lighting
 from physics.cameras.gl.shading import MOVING_UNIT, STILL_UNIT, Pass
 
 SHADOW_REACH_M: Final = 32.0
-"""Half the side of the square that has shadows."""
+"""Half the side of the square that has shadows, metres."""
 STEP_M: Final = 8.0
-"""The lattice of the box's middles."""
+"""Spacing of the lattice of shadow box middles, metres."""
 _DEEP_M: Final = 80.0
 _STILL_PX: Final = 2048
 _MOVING_PX: Final = 512
 _SMALL_PX: Final = (300, 160)
-"""Pictures that are not higher show no difference between the still map, the moving one, and one of
-half the size."""
+"""Picture heights up to which a half-size map looks the same: static map, moving map."""
 TO_TEXTURE: Final = np.array(
     [[0.5, 0.0, 0.0, 0.5], [0.0, 0.5, 0.0, 0.5], [0.0, 0.0, 0.5, 0.5], [0.0, 0.0, 0.0, 1.0]]
 )
-"""From clip space to the space of a texture."""
+"""Matrix from clip space to texture space."""
 
 
 def middle_of(eye_m: Floats) -> Floats:
-    """(3,) world metres: the middle of the space with shadows around an eye."""
+    """Return the (3,) middle of the space with shadows around an eye, world metres."""
     return np.asarray(np.round(eye_m / STEP_M) * STEP_M)
 
 
 def shadow_matrix(
     middle: Floats, anchor: Floats, to_sun: Floats, side_px: int = _STILL_PX
 ) -> Floats:
-    """(4, 4) from metres relative to the anchor to the clip space of the maps. side_px: of the
-    finer one."""
+    """Return the (4, 4) matrix from metres relative to the anchor to the clip space of the maps.
+
+    side_px: side of the finer map
+    """
     sun = to_sun / np.linalg.norm(to_sun)
     across = np.cross((0.0, 0.0, 1.0), sun)
     across = (
@@ -63,7 +65,7 @@ def shadow_matrix(
 
 @contextmanager
 def casting(context: moderngl.Context) -> Iterator[None]:
-    """For the time in which shadow maps are drawn."""
+    """Set the GL state for drawing shadow maps within a `with` block."""
     context.enable_only(moderngl.DEPTH_TEST)
     context.depth_func = "<"
     context.polygon_offset = 1.5, 4.0
@@ -72,7 +74,7 @@ def casting(context: moderngl.Context) -> Iterator[None]:
 
 
 class ShadowMaps:
-    """Two depth pictures from the sun. high_px: of the pictures that they are for."""
+    """Two depth maps from the sun. high_px: height of the pictures that use them."""
 
     def __init__(self, context: moderngl.Context, high_px: int) -> None:
         self._context = context
@@ -97,7 +99,7 @@ class ShadowMaps:
         return texture
 
     def matrices(self, middle: Floats, anchor: Floats, light: Lighting) -> tuple[Floats, Floats]:
-        """`shadow_matrix`, and the same to the space of a texture; the last ones are kept."""
+        """Return `shadow_matrix`, and the same to texture space; the last ones are cached."""
         key = (*middle.tolist(), *anchor.tolist())
         if key != self._matrices_for:
             from_at = shadow_matrix(middle, anchor, light.to_sun, self._side_px)
@@ -108,8 +110,10 @@ class ShadowMaps:
     def draw(
         self, middle: Floats, anchor: Floats, light: Lighting, draw: Callable[[Pass], None]
     ) -> None:
-        """Bring the maps up to date, within `casting`; the scene block must hold their matrix as
-        its camera."""
+        """Update the maps, within `casting`.
+
+        The scene block must hold their matrix as its camera.
+        """
         key = (*middle.tolist(), *anchor.tolist(), *light.to_sun.tolist())
         if key != self._drawn_for:
             self._draw("still", draw)

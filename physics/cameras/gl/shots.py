@@ -1,5 +1,4 @@
-"""Shots: the views of the pictures of a batch as arrays, so that what moves in all of them is
-sorted out at once."""
+"""Views of the pictures of a batch as arrays, to cull moving objects of all pictures at once."""
 
 from __future__ import annotations
 
@@ -16,11 +15,14 @@ from physics.cameras.view import VISIBLE_M, Shot
 
 
 class Shots:
-    """N views. taken: themselves; anchors, middles: (2,) and (3,) world metres of each, as
-    `anchor_of` and `middle_of` say; anchor, middle: the same as (N, 2) and (N, 3) arrays; eye: (N,
-    3).
+    """N views.
 
-    In all methods whose: (M,) the view that is asked for each of (M, 2) points.
+    taken: the views themselves
+    anchors, middles: (2,) and (3,) world metres of each, as from `anchor_of` and `middle_of`
+    anchor, middle: the same as (N, 2) and (N, 3) arrays
+    eye: (N, 3)
+
+    In all methods, `whose` (M,) is the view of each of (M, 2) points.
     """
 
     def __init__(self, taken: Sequence[Shot]) -> None:
@@ -46,7 +48,7 @@ class Shots:
         self._alone = rows[0] if len(rows) == 1 else None
 
     def sees(self, whose: NDArray[np.intp], xy: Floats, margin_m: float) -> NDArray[np.bool_]:
-        """(M,) what `View.sees` says of each point in its view."""
+        """Return the (M,) mask of `View.sees` for each point in its view."""
         x, y, cos, sin, cos_half, sin_half, behind, _ = self._of(whose)
         dx, dy = xy[:, 0] - x, xy[:, 1] - y
         ahead = dx * cos + dy * sin
@@ -58,17 +60,20 @@ class Shots:
         )
 
     def far_m(self, whose: NDArray[np.intp], xy: Floats) -> Floats:
-        """(M,) distances of points from the eyes, over the ground."""
+        """Return (M,) horizontal distances of points from the eyes."""
         x, y, *_ = self._of(whose)
         return np.asarray(np.hypot(xy[:, 0] - x, xy[:, 1] - y))
 
     def tall_px(self, whose: NDArray[np.intp], xy: Floats, z_m: Floats) -> Floats:
-        """(M,) how tall people at points and (M,) heights are in the pictures, in pixels."""
+        """Return (M,) heights of people in the pictures, in pixels.
+
+        xy: (M, 2) positions
+        z_m: (M,) ground heights
+        """
         (*_, px) = self._of(whose)
         dz = z_m + 0.9 - self.eye[whose, 2]
         return np.asarray(px / np.maximum(np.hypot(self.far_m(whose, xy), dz), 0.1))
 
     def _of(self, whose: NDArray[np.intp]) -> Iterable[Floats] | Iterable[float]:
-        """What is known of the view of each point, column by column; of a single view one number
-        each."""
+        """Return the parameters of each point's view as columns; for a single view, as scalars."""
         return self._columns[:, whose] if self._alone is None else self._alone

@@ -1,8 +1,8 @@
-"""Bodies on the graphics card: meshes near, tubes far away, and the shaders that move them with
-their joints.
+"""Bodies on the graphics card: near meshes and far tubes, with shaders that skin them.
 
-A tube's rings are turned towards the eye in the vertex shader, so that a ring of four or six
-corners has the outline of a round one; in shadow maps they are turned towards the sun.
+The vertex shader turns a tube's rings towards the eye.
+A ring of four or six corners then has the outline of a round one.
+In shadow maps, rings turn towards the sun.
 """
 
 from __future__ import annotations
@@ -28,8 +28,7 @@ _CORNER: Final = np.dtype(
         ("coat", "u1", 4),
     ]
 )
-"""normal: as in corners._CORNER, fourth: how far fat stands out; weights: of 255; coat: row of
-COATS."""
+"""normal: as in corners._CORNER, fourth: offset by fat; weights: of 255; coat: row of COATS."""
 
 FAR_CORNER: Final = np.dtype(
     [
@@ -42,8 +41,10 @@ FAR_CORNER: Final = np.dtype(
         ("coat", "u1", 4),
     ]
 )
-"""A corner of a tube; coat: row of COATS, how far fat stands out, whether it is not turned, whether
-of a ribbon."""
+"""Corner of a tube.
+
+coat: row of COATS, offset by fat, flag for a fixed ring, flag for a ribbon
+"""
 
 _MESH_LAYOUT: Final = (
     "3f4 4f1 4u1 4f1 4u1",
@@ -128,8 +129,11 @@ void main() {{ show(albedo, normalize(normal), at, {LABELS["person"]}.0); }}
 
 
 class Skins:
-    """Bodies in one vertex and one index buffer; instances: of person, dress and girth. drawn: the
-    programs, shaded by shadow maps or not."""
+    """Bodies in one vertex and one index buffer.
+
+    instances: rows of person, dress and girth
+    drawn: the programs, with and without shadow maps
+    """
 
     def __init__(
         self,
@@ -148,7 +152,7 @@ class Skins:
         self._arrays: dict[bool, tuple[moderngl.VertexArray, moderngl.VertexArray]] = {}
 
     def start(self, outfit: int, level: int) -> tuple[int, int, int]:
-        """Take in a body: count of indices, first index, first vertex."""
+        """Load a body, and return its count of indices, first index and first vertex."""
         made = self._made(outfit, level)
         first, base = sum(map(len, self._indices)), sum(map(len, self._rows))
         self._rows.append(_corners(made) if isinstance(made, SkinnedBody) else far_corners(made))
@@ -165,7 +169,7 @@ class Skins:
         count: int,
         first: int,
     ) -> None:
-        """So many indirect draws, from the `first` on."""
+        """Draw `count` indirect draws, from `first` on."""
         if not count:
             return
         if shadows not in self._arrays:
@@ -174,7 +178,7 @@ class Skins:
         array.render_indirect(commands, moderngl.TRIANGLES, count=count, first=first)
 
     def release(self) -> None:
-        """Free what is held on the graphics card; it is made anew when needed."""
+        """Free the data on the graphics card; they are rebuilt when needed."""
         for array in (array for both in self._arrays.values() for array in both):
             array.release()
         for buffer in self._buffers:
@@ -199,7 +203,7 @@ class Skins:
 
 
 def mesh_skins(context: moderngl.Context, made: Callable[[int, int], SkinnedBody]) -> Skins:
-    """Meshes, four joints to a corner."""
+    """Create skins of meshes with four joints per corner."""
 
     def drawn(shadows: bool) -> Programs:
         return programs(context, _SKIN + _MESH, _FRAGMENT, shadows)
@@ -208,7 +212,7 @@ def mesh_skins(context: moderngl.Context, made: Callable[[int, int], SkinnedBody
 
 
 def tube_skins(context: moderngl.Context, made: Callable[[int, int], FarBody]) -> Skins:
-    """Tubes, two joints to a ring, four to one that is not turned."""
+    """Create skins of tubes with two joints per turned ring and four per fixed ring."""
 
     def drawn(shadows: bool) -> Programs:
         seen, cast = (
@@ -226,7 +230,7 @@ def tube_skins(context: moderngl.Context, made: Callable[[int, int], FarBody]) -
 
 
 def _corners(made: SkinnedBody) -> NDArray[np.void]:
-    """(V,) rows of CORNER."""
+    """Return (V,) rows of CORNER."""
     rows = np.zeros(len(made.vertices), dtype=_CORNER)
     rows["at"] = made.vertices
     rows["normal"][:, :3] = np.rint(127.0 * made.normals) + 127.0
@@ -237,7 +241,7 @@ def _corners(made: SkinnedBody) -> NDArray[np.void]:
 
 
 def far_corners(made: FarBody) -> NDArray[np.void]:
-    """(V,) rows of FAR_CORNER."""
+    """Return (V,) rows of FAR_CORNER."""
     rows = np.zeros(len(made.middle), dtype=FAR_CORNER)
     rows["middle"], rows["ahead"], rows["side"], rows["ring"] = (
         made.middle,
@@ -252,7 +256,7 @@ def far_corners(made: FarBody) -> NDArray[np.void]:
 
 
 def _bytes(weights: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """(V, 4) weights as bytes that sum to 255."""
+    """Return (V, 4) weights as bytes that sum to 255."""
     whole = np.rint(255.0 * weights).astype(np.int64)
     whole[:, 0] += 255 - whole.sum(axis=1)
     return np.asarray(whole.astype(np.uint8))

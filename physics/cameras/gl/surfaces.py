@@ -1,5 +1,6 @@
-"""The textures of ground, walls, things and facades on the graphics card, shared by all cameras of
-a process."""
+"""Textures of ground, walls, objects and facades on the graphics card, shared by all cameras of a
+process.
+"""
 
 from __future__ import annotations
 
@@ -27,19 +28,23 @@ LAYERS_MAX: Final = 72
 LOOKED_UP: Final = f"""
 layout(binding = {SURFACES_UNIT}) uniform sampler2DArray surfaces;
 """
-"""For fragment shaders: `texture(surfaces, vec3(metres / side, layer))`, still to be `decoded`."""
+"""Fragment shader code: `texture(surfaces, vec3(metres / side, layer))`, still to be `decoded`."""
 
 KNOWN: Final = f"""
 uniform vec4 layers[{LAYERS_MAX}];
 vec3 tint_of(vec3 colour, int layer) {{ return decoded(colour) / layers[layer].rgb; }}
 """
-"""For vertex shaders: of each layer its linear mean colour, and its side in metres."""
+"""Vertex shader code: for each layer, its linear mean colour and its side in metres."""
 
 
 @dataclass(frozen=True, slots=True)
 class Surfaces:
-    """surfaces: layers of ground, walls and things; facades: bays of facades; known: the uniform
-    `layers`, (LAYERS_MAX, 4)."""
+    """Textures of a context.
+
+    surfaces: layers of ground, walls and objects
+    facades: bays of facades
+    known: the uniform `layers`, (LAYERS_MAX, 4)
+    """
 
     surfaces: Layers
     facades: Layers
@@ -54,11 +59,9 @@ class Surfaces:
 
 
 class SurfaceShaders:
-    """Programs that look surfaces up, for buffers whose positions are relative to the middle of
-    their tile.
+    """Programs with surface textures, for buffers with positions relative to the tile's middle.
 
-    vertex: declares `in vec2 middle` (from the anchor), and `in vec2 middle_in_world` where it
-    needs that.
+    vertex: declares `in vec2 middle` (from the anchor), and `in vec2 middle_in_world` if needed
     """
 
     def __init__(
@@ -77,13 +80,15 @@ class SurfaceShaders:
 
 
 TileRows = tuple[CornerRows, NDArray[np.uint32]]
-"""Meshes of one tile joined in their order: rows of vertices, measured from the tile's middle, and
-triangles, flat."""
+"""Joined meshes of one tile: vertex rows relative to the tile's middle, and flat triangles."""
 
 
 class TileLayer:
-    """Meshes of the tiles around, uploaded when the tiles change; those in view are drawn in one
-    call. layout: of a row, as moderngl wants it."""
+    """Meshes of the surrounding tiles, uploaded when the tiles change.
+
+    One call draws those in view.
+    layout: of a row, for moderngl
+    """
 
     def __init__(
         self, context: moderngl.Context, shaders: SurfaceShaders, layout: tuple[str, ...]
@@ -128,12 +133,12 @@ class TileLayer:
         ]
 
     def place(self, anchor: Floats) -> None:
-        """Measure all tiles from an anchor."""
+        """Set the anchor that all tiles are relative to."""
         if self._arrays:
             self._place.write(np.hstack([self._middles - anchor, self._middles]).astype(np.float32))
 
     def show(self, stage: Pass, tiles: NDArray[np.intp]) -> None:
-        """Draw these tiles from now on, in this order."""
+        """Select the tiles to draw from now on, in this order."""
         if self._arrays:
             draws = self._draws[tiles]
             draws = draws[draws[:, 0] > 0]
@@ -159,7 +164,7 @@ class TileLayer:
 
 @lru_cache(maxsize=1)
 def surfaces(context: moderngl.Context) -> Surfaces:
-    """Made once in a context; they stay as long as it."""
+    """Return the context's textures, created once and with the same lifetime."""
     flat = join_layers(ground_layers(SIZE_PX), wall_layers(SIZE_PX), prop_layers(SIZE_PX))
     facades = facade_layers(SIZE_PX)
     known = np.ones((LAYERS_MAX, 4), dtype=np.float32)
@@ -173,7 +178,7 @@ def _array(context: moderngl.Context, texels: NDArray[np.uint8]) -> moderngl.Tex
     count, size, _, channels = texels.shape
     array = context.texture_array((size, size, count), channels, texels.tobytes())
     array.build_mipmaps()
-    # Between two levels nobody sees a step, and a processor that plays a card reads half as much.
+    # Steps between mipmap levels are invisible; a software renderer then reads half as much.
     array.filter = (
         moderngl.LINEAR_MIPMAP_LINEAR if is_card(context) else moderngl.LINEAR_MIPMAP_NEAREST,
         moderngl.LINEAR,

@@ -1,6 +1,6 @@
-"""Targets: what a picture is drawn into, and how it is read back.
+"""Render targets and their readback.
 
-Colour and label share one texture (the label is its fourth channel), so that a picture is one
+Colour and label share one texture (the label is its fourth channel), so that a picture needs one
 readback.
 """
 
@@ -20,13 +20,15 @@ from physics.cameras.gl.context import is_card
 from physics.cameras.view import FAR_PLANE_M, NEAR_PLANE_M
 
 _UNIT: Final = 8
-"""Of the texture that is parted."""
+"""Texture unit of the picture to be reordered."""
 
 
 class Target:
-    """A framebuffer of one size. size: width, height in pixels. parts_on_card: whether colours and
-    labels are parted before they are read, which costs a graphics card nothing; by default where
-    there is one."""
+    """Framebuffer of one size.
+
+    size: width, height in pixels
+    parts_on_card: separate colours and labels before the readback; default on a graphics card
+    """
 
     def __init__(
         self, context: moderngl.Context, size: tuple[int, int], parts_on_card: bool | None = None
@@ -43,30 +45,30 @@ class Target:
         self._parting = _Parting(context, size) if on_card else None
 
     def clear(self) -> None:
-        """Nothing is seen, anywhere."""
+        """Clear the target to an empty picture."""
         self.frame.use()
         self.frame.clear(depth=1.0)
 
     def use(self) -> None:
-        """Draw into it from now on."""
+        """Make it the target of later draws."""
         self.frame.use()
 
     def use_colours(self) -> None:
-        """Draw into it from now on: labels and depth keep what they hold."""
+        """Make it the target of later draws without changing labels and depth."""
         self._painted.use()
 
     def read(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Colours (H, W, 3) and labels (H, W), the top row first."""
+        """Read colours (H, W, 3) and labels (H, W), the top row first."""
         data = np.empty(4 * self.size[0] * self.size[1], dtype=np.uint8)
         self._read().read_into(data, components=4, dtype="f1")
         return self.parted(data)
 
     def copy(self, buffer: moderngl.Buffer, offset: int) -> None:
-        """Let it be copied to a place in a buffer, for `parted`, when the card comes to it."""
+        """Queue a copy of the picture into a buffer at `offset`, for `parted`."""
         self._read().read_into(buffer, components=4, dtype="f1", write_offset=offset)
 
     def parted(self, data: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Colours (H, W, 3) and labels (H, W) of a picture as it was read."""
+        """Split the read data of a picture into colours (H, W, 3) and labels (H, W)."""
         width, height = self.size
         if self._parting is not None:
             colours = data[: 3 * width * height]
@@ -78,14 +80,14 @@ class Target:
         return np.asarray(rgb, dtype=np.uint8), np.asarray(label, dtype=np.uint8)
 
     def _read(self) -> moderngl.Framebuffer:
-        """What is to be read of it."""
+        """Return the framebuffer to read."""
         if self._parting is None:
             return self.frame
         self._parting.draw(self._colour)
         return self._parting.frame
 
     def read_depth(self) -> NDArray[np.float32]:
-        """Depth along the view, (H, W) metres."""
+        """Read depth along the view, (H, W) metres."""
         width, height = self.size
         data = self.frame.read(components=1, attachment=-1, dtype="f4")
         depth = np.frombuffer(data, dtype=np.float32).reshape(height, width)
@@ -100,7 +102,7 @@ class Target:
 
 
 class _Parting:
-    """Draws a picture's bytes anew in another order: all colours, then all labels."""
+    """Reordering of a picture's bytes by a shader: all colours, then all labels."""
 
     def __init__(self, context: moderngl.Context, size: tuple[int, int]) -> None:
         self._context = context
@@ -145,12 +147,14 @@ def _parting_program(context: moderngl.Context) -> moderngl.Program:
 
 
 class Readback:
-    """Pictures on their way from the graphics card: copied behind one another into a buffer when
-    the card comes to it, fetched later, so that nobody waits for one while the next can be drawn.
-    target: what they are drawn into."""
+    """Asynchronous readback of pictures.
+
+    Pictures are queued one after another into a buffer and fetched later, while the next are drawn.
+    target: source of the pictures
+    """
 
     UNDER_WAY: Final = 2
-    """Buffers that may have begun and not ended."""
+    """Maximum number of pending buffers."""
 
     def __init__(self, context: moderngl.Context, target: Target) -> None:
         self._context = context
@@ -160,7 +164,7 @@ class Readback:
         self._begun: deque[tuple[moderngl.Buffer, int]] = deque()
 
     def begin(self, pictures: int = 1) -> None:
-        """Take a buffer for so many pictures, which are copied next."""
+        """Take a buffer for `pictures` pictures, which are copied next."""
         if not self._free:
             raise EngineError("too many pictures are under way: `end` some first")
         buffer = self._free.pop()
@@ -170,15 +174,15 @@ class Readback:
         self._begun.append((buffer, pictures))
 
     def copy(self, place: int = 0) -> None:
-        """Let the card copy the target to a place in the buffer that began last."""
+        """Queue a copy of the target to a place in the most recent buffer."""
         self._target.copy(self._begun[-1][0], place * self._each)
 
     def forget(self) -> None:
-        """Give the buffer that began last back: its pictures could not be drawn."""
+        """Return the most recent buffer after a failed drawing."""
         self._free.append(self._begun.pop()[0])
 
     def end(self) -> list[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
-        """The pictures of the buffer that began first, as `Target.read` gives them."""
+        """Return the pictures of the oldest buffer, as `Target.read` does."""
         if not self._begun:
             raise EngineError("no picture is under way: `begin` one first")
         buffer, pictures = self._begun.popleft()

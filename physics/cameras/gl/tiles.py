@@ -1,4 +1,4 @@
-"""The ground of tiles as one static buffer; its materials are laid over it by world position."""
+"""Ground of tiles as one static buffer, with materials mapped by world position."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TileLayer, Til
 from physics.street.surface import Patch
 
 _TINTED: Final = 128
-"""Added to the label of a surface whose colour tints its texture."""
+"""Offset of the label of a surface whose colour tints its texture."""
 
 _VERTEX: Final = """
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour;
@@ -44,17 +44,17 @@ void main() {
 
 
 def tile_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: bool) -> SurfaceShaders:
-    """The program of the ground of all tiles."""
+    """Create the program of the ground of all tiles."""
     return SurfaceShaders(context, surfaces, _VERTEX, _FRAGMENT, shadows)
 
 
 def ground_layer(context: moderngl.Context, shaders: SurfaceShaders) -> TileLayer:
-    """For what `ground_rows` makes."""
+    """Create the layer for rows of `ground_rows`."""
     return TileLayer(context, shaders, LAYOUT)
 
 
 def ground_rows(surfaces: Surfaces, patches: Sequence[Patch], middle: Floats) -> TileRows | None:
-    """Patches of one tile, drawn in their order. middle: (2,) world metres of the tile's."""
+    """Return patches of one tile, drawn in their order. middle: (2,) of the tile, world metres."""
     parts = []
     for patch in patches:
         here = patch.mesh.moved((*-middle, 0.0))

@@ -1,5 +1,6 @@
-"""Vehicles and robots of all pictures of a batch: sorted out together, uploaded together, drawn
-picture by picture."""
+"""Vehicles and robots of all pictures of a batch: culled and uploaded together, drawn per
+picture.
+"""
 
 from __future__ import annotations
 
@@ -31,13 +32,15 @@ _FLEETS_MAX: Final = 256
 
 
 _Placed = tuple[NDArray[np.intp], CornerRows, NDArray[np.intp]]
-"""Forms, instances, and which part of the draws each belongs to: twice the picture, and one more
-for shadows."""
+"""Forms, instances, and part numbers: twice the picture's number, plus one for shadows."""
 
 
 class Driven(NamedTuple):
-    """The vehicles of a picture, and its robot if there is one to show: seen itself, or only its
-    shadow. shadows: whether there are any."""
+    """Vehicles of a picture, and its robot if any.
+
+    body: the robot itself is visible, not only its shadow
+    shadows: they cast shadows
+    """
 
     vehicles: Vehicles
     surface: Surface
@@ -48,7 +51,7 @@ class Driven(NamedTuple):
 
 
 class TrafficDrawing:
-    """What drives in the pictures of a batch."""
+    """Drawing of vehicles and robots of the pictures of a batch."""
 
     def __init__(self, context: moderngl.Context, forms: Forms) -> None:
         self._forms = forms
@@ -56,7 +59,7 @@ class TrafficDrawing:
         self._fleets: dict[tuple[tuple[str, ...], bytes], tuple[NDArray[np.intp], Floats]] = {}
 
     def set(self, driven: Sequence[Driven], shots: Shots) -> None:
-        """Hold these vehicles and robots as the pictures will show them."""
+        """Upload the vehicles and robots of all pictures."""
         placed = [self._vehicles(driven, shots), *self._robots(driven, shots)]
         form, rows, part = (np.concatenate(column) for column in zip(*placed, strict=True))
         self._things.set(form, rows, part, 2 * len(driven))
@@ -93,7 +96,7 @@ class TrafficDrawing:
         return form[rows], placed[rows], 2 * whose[rows] + (np.arange(len(rows)) >= seen.sum())
 
     def _fleet(self, which: Vehicles) -> tuple[NDArray[np.intp], Floats]:
-        """(N,) forms of vehicles, and their (N, 3) paints."""
+        """Return (N,) forms of vehicles, and their (N, 3) paints."""
         key = which.ids, which.size.tobytes()
         if key not in self._fleets:
             if len(self._fleets) >= _FLEETS_MAX:
@@ -114,7 +117,7 @@ class TrafficDrawing:
         )
 
     def _robots(self, driven: Sequence[Driven], shots: Shots) -> list[_Placed]:
-        """The robots, each with its base frame at its pose, leaning with the ground."""
+        """Return the robots, each with its base frame at its pose, tilted with the ground."""
         forms = []
         rows = []
         parts = []
@@ -150,5 +153,5 @@ def _robot_parts(model: Robot) -> Sequence[Part]:
 
 
 def _leaning(one: Driven) -> Floats:
-    """(N, 3) height, roll and pitch of vehicles on their wheels."""
+    """Return (N, 3) height, roll and pitch of vehicles on their wheels."""
     return one.surface.road(one.vehicles.xy, one.vehicles.heading, one.vehicles.size)

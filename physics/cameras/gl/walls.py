@@ -1,9 +1,10 @@
-"""Buildings of tiles as one static buffer: walls of brick or plaster, laid over them bays of
-windows and fronts.
+"""Buildings of tiles as one static buffer: brick or plaster walls with bays of windows and fronts.
 
-What is drawn has the shape that physics.street.buildings gives it; which wall, which windows and
-which fronts a building has hangs on its name. Each bay of the upper storeys draws its own variant;
-a ground floor has one front all along, and doors at even distances."""
+The geometry is that of physics.street.buildings.
+Wall, windows and fronts of a building depend on its name.
+Each bay of the upper storeys has its own variant.
+A ground floor has one front along its length, with doors at regular distances.
+"""
 
 from __future__ import annotations
 
@@ -36,10 +37,16 @@ _CORNER: Final = np.dtype(
         ("fronts", "u1", 4),
     ]
 )
-"""normal's fourth: layer of the wall; colour's: 255 where it tints; spot: along and up in metres,
-in bays and storeys; kind: first layer of the upper storeys' windows, storeys, whether it looks to
-the street, chance; fronts: layers of the front and of its bays with doors, 16 times the bays from
-door to door and the first, chance."""
+"""Vertex of a building.
+
+normal: fourth channel is the layer of the wall
+colour: fourth channel is 255 where it tints
+spot: along and up, in metres and in bays and storeys
+kind: first layer of the upper storeys' windows, storeys, flag for a street side, random number
+fronts: layers of the front and of its bays with doors, door spacing, random number
+
+The door spacing is 16 times the bays from door to door, plus the first bay with a door.
+"""
 _LAYOUT: Final = (
     "3f 4f1 4f1 4f 4f1 4f1",
     "in_at",
@@ -51,8 +58,9 @@ _LAYOUT: Final = (
 )
 _LIT_SHARE: Final = 0.35
 _LAMPLIGHT: Final = "1.6e-3, 1.2e-3, 0.7e-3"
-"""Radiance of a lit window, in the units of physics.cameras.sky: some 60 candela per square
-metre."""
+"""Radiance of a lit window, in the units of physics.cameras.sky, about 60 candela per square
+metre.
+"""
 
 _VERTEX: Final = """
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour; in vec4 in_spot; in vec4 in_kind; in vec4 in_fronts;
@@ -109,21 +117,21 @@ void main() {{
 def wall_shaders(
     context: moderngl.Context, surfaces: Surfaces, shadows: bool, night: bool
 ) -> SurfaceShaders:
-    """The program of all buildings. night: whether some of their windows are lit."""
+    """Create the program of all buildings. night: some of their windows are lit."""
     return SurfaceShaders(
         context, surfaces, _VERTEX, ("#define NIGHT\n" if night else "") + _FRAGMENT, shadows
     )
 
 
 def wall_layer(context: moderngl.Context, shaders: SurfaceShaders) -> TileLayer:
-    """For what `wall_rows` makes."""
+    """Create the layer for rows of `wall_rows`."""
     return TileLayer(context, shaders, _LAYOUT)
 
 
 def wall_rows(
     surfaces: Surfaces, buildings: Sequence[Building], styles: Sequence[WallStyle], middle: Floats
 ) -> TileRows | None:
-    """The buildings of one tile, each of a style. middle: (2,) world metres of the tile's."""
+    """Return the buildings of one tile, each of a style. middle: (2,) of the tile, world metres."""
     parts = [
         part
         for b, style in zip(buildings, styles, strict=True)
@@ -135,7 +143,7 @@ def wall_rows(
 def _parts(
     building: Building, style: WallStyle, surfaces: Surfaces, middle: Floats
 ) -> list[tuple[Mesh, CornerRows]]:
-    """A building's walls and roof, with their rows."""
+    """Return a building's walls and roof, with their rows."""
     face = building_appearance(building, style)
     layers, bays = surfaces.surfaces, surfaces.facades
     wall, roof = layers.index(face.wall), layers.index(face.roof)
@@ -147,7 +155,7 @@ def _parts(
     found = []
     for facade, mesh in facade_meshes((building,)).items():
         if facade < 0 or not len(mesh):
-            continue  # windows of the other camera: here they are painted
+            continue  # windows of the bullet camera; here they are textures
         rows = np.zeros(len(mesh.vertices), dtype=_CORNER)
         rows["at"] = mesh.vertices - np.array([*middle, 0.0])
         rows["normal"][:, :3] = np.rint(127.0 * mesh.normals) + 127.0
@@ -157,7 +165,7 @@ def _parts(
             rows["colour"] = *np.rint(255.0 * np.array(colour)), 255.0
             rows["colour"][flat] = 0
         rows["spot"], storeys = _spots(mesh, flat, building.floor_m + CURB_M)
-        # A house of the map may stand on a corner, or in a yard: all its walls have doors.
+        # A mapped house may be on a corner or in a yard, so all its walls have doors.
         fronted = (mesh.normals @ street > 0.9) | (building.outline is not None)
         rows["kind"] = np.stack(
             [np.full(len(rows), upper), storeys, fronted, np.full(len(rows), chance[0])], 1
@@ -168,15 +176,18 @@ def _parts(
 
 
 def _spots(mesh: Mesh, flat: NDArray[np.bool_], floor_m: float) -> tuple[Floats, NDArray[np.int64]]:
-    """(V, 4) along and up each wall in metres, in bays and storeys; (V,) storeys with windows, none
-    below the floor."""
+    """Return facade coordinates (V, 4), and storeys with windows (V,), of vertices.
+
+    The coordinates are along and up each wall, in metres and in bays and storeys.
+    Storeys below the floor have no windows.
+    """
     spots = np.zeros((len(flat), 4))
     storeys = np.zeros(len(flat), dtype=np.int64)
     spots[flat, :2] = mesh.vertices[flat, :2]
     spots[flat, 3] = -1.0
     walls = np.flatnonzero(~flat).reshape(
         -1, 4
-    )  # upright faces are quads: four corners after each other
+    )  # upright faces are quads: four consecutive corners
     for quad in walls:
         normal = mesh.normals[quad[0]]
         along = mesh.vertices[quad] @ np.array([-normal[1], normal[0], 0.0])
