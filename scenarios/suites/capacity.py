@@ -1,7 +1,6 @@
-"""What a place has room for: on how many of its sidewalks, crosswalks and ways each kind of
-scenario fits.
+"""Count the sidewalks, crosswalks and routes of a place on which each kind of scenario fits.
 
-The builders themselves are asked, a few times for each place. What is found is there; more may be.
+The scenario builders are run a few times for each strip. A count is therefore a lower bound.
 """
 
 from __future__ import annotations
@@ -34,11 +33,12 @@ from scenarios.suites.reactive import event_spot, strips_of
 from scenarios.suites.unit import STRUCTURES, drawn_along, lies_on, strips_for
 
 _DRAWS: Final = 4
-"""For each place that is looked at."""
+"""Number of draws on each strip."""
 _SIDEWALKS: Final = 1000
 _SLOW: Final = 80
-"""So many of the places are looked at, spread evenly; fewer crosswalks and corners, which take
-longer."""
+"""Maximum number of crosswalks and corners that are examined, evenly spread, because they are
+slow.
+"""
 _WAYS: Final = 8
 _WAY_DRAWS: Final = 120
 
@@ -46,7 +46,7 @@ _NO_STRIP: Final = {
     "sidewalks": "no sidewalk is wide enough, apart from stairs, bridges and tunnels",
     "crosswalks": "no crosswalk is without signals",
 }
-"""Why a structure has no strip to be drawn on."""
+"""Reason that is reported if a structure has no strip."""
 
 _Way = tuple[list[Port], float, float]
 
@@ -81,7 +81,9 @@ class FitCount(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Capacity(msgspec.Struct, frozen=True, kw_only=True):
-    """Where scenarios fit: by kind of event, by structure of the unit suite, and long routes."""
+    """Capacity of a place: by kind of event, by structure of the unit suite, and for long
+    routes.
+    """
 
     events: dict[str, FitCount]
     structures: dict[str, FitCount]
@@ -89,7 +91,7 @@ class Capacity(msgspec.Struct, frozen=True, kw_only=True):
 
     @property
     def usable(self) -> bool:
-        """Whether anything fits."""
+        """Return whether any scenario fits."""
         return any(
             count.found for count in (*self.events.values(), *self.structures.values(), self.routes)
         )
@@ -147,8 +149,10 @@ def _fit_count(
 def _routes(
     street_map: StreetMap, graph: WalkGraph, rng: np.random.Generator, robot: Robot
 ) -> FitCount:
-    """Of a few ways those that make a long route; where none does, of a few more that keep off
-    roads."""
+    """Count the drawn ways that make a long route.
+
+    If none does, count a few more ways that avoid roads.
+    """
     refusals = Refusals()
     candidates = starts(street_map, graph)
     avoided = avoided_strips(street_map)
@@ -181,5 +185,5 @@ def _drawn(draw: Callable[[], _Way], refusals: Refusals) -> Iterator[_Way]:
 
 
 def _fits(draw: Callable[[], object], refusals: Refusals) -> bool:
-    """Whether a draw is not refused."""
+    """Return whether a draw succeeds; add its refusal otherwise."""
     return first_of([draw], refusals) is not None

@@ -112,10 +112,10 @@ def _picked(ids: Sequence[str], which: str | None) -> int:
 
 
 def with_crowd(whole: Suite, **asked: float | None) -> Suite:
-    """The suite with these fields of `CrowdSpec` in each scenario: another suite, whose version and
-    rows say so.
+    """Return the suite with these fields of `CrowdSpec` in each scenario.
 
-    What is None stays as it is. Raises SpecError where a crowd cannot be so.
+    It is another suite, with another version. Fields that are None stay unchanged. Raises SpecError
+    for an invalid crowd.
     """
     changes = {field: value for field, value in asked.items() if value is not None}
     if not changes:
@@ -129,8 +129,11 @@ def with_crowd(whole: Suite, **asked: float | None) -> Suite:
 
 
 def with_robot(whole: Suite, robot: str) -> Suite:
-    """The suite with this robot in each scenario: another suite, whose version says so. Itself
-    where it is there already, or `robot` is "". Raises UsageError with the valid names."""
+    """Return the suite with this robot in each scenario: another suite, with another version.
+
+    The suite is returned unchanged if it has this robot, or if `robot` is "". Raises UsageError
+    with the valid names.
+    """
     scenarios = tuple(scenario.driven_by(robot) for scenario in whole.scenarios)
     if scenarios == whole.scenarios:
         return whole

@@ -19,19 +19,19 @@ from scenarios.suites.long_horizon import TURNED_OVER_M, on_car_paths_m, on_road
 
 START_BEFORE_CROSSING_M: Final = 10.0
 AFTER_M: Final = 8.0
-"""From the start to the crossing, and from it to the goal, along the way."""
+"""Distance from the start to the crossing and from the crossing to the goal, in metres."""
 OFF_ROAD_M: Final = 1.0
 _LIMIT_S: Final = 180.0
-"""Longer than a cycle of any signal, with time to walk."""
+"""Time limit in seconds: longer than a cycle of any signal, with time to walk."""
 
 
 def build_all(
     place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, count: int
 ) -> list[Scenario]:
-    """Scenarios over `count` different signalised crossings, drawn from `seed`; the signal falls as
-    it falls.
+    """Build scenarios over `count` different signalised crossings, drawn from `seed`.
 
-    Raises MapError when the map has not so many that can be reached from sidewalks on both sides.
+    The phase of the signal is not chosen. Raises MapError if the map has fewer crossings that can
+    be reached from sidewalks on both sides.
     """
     rng = np.random.default_rng([seed, place.seed, 0xC2055])
     strips = street_map.strips
@@ -60,11 +60,10 @@ def build_all(
 def _over(
     place: Place, street_map: StreetMap, graph: WalkGraph, enter: Port, seed: int, scenario_id: str
 ) -> Scenario:
-    """The way over one crossing, entered at a port. Raises CosimError where there is none."""
+    """Build the scenario over one crossing, entered at a port. Raises CosimError if it fails."""
     way = [_beside(street_map, graph, enter, START_BEFORE_CROSSING_M), enter, enter.other]
     way.append(_beside(street_map, graph, enter.other, AFTER_M))
-    # Corners are part of the way: the line begins far enough back and is cut where it has the right
-    # length.
+    # Corners belong to the route: the line starts early enough and is cut to the right length.
     line = way_line(street_map, way, START_BEFORE_CROSSING_M, AFTER_M)
     (crossing,) = route_crossings(street_map, line, way[1:])
     from_m = crossing.enter_s_m - START_BEFORE_CROSSING_M

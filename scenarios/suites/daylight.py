@@ -12,16 +12,19 @@ from cosim.spec.scenario import Light
 from physics.cameras.sun import sun_direction
 
 LOWEST_SUN_RAD: Final = math.radians(6.0)
-"""The sun stands higher than this: no dusk, no night."""
+"""Least elevation of the sun: no dusk, no night."""
 FOG_M: Final = (150.0, 1500.0)
-"""How far one sees in fog, least and most: the other side of a street in any."""
+"""Least and largest visibility in fog, in metres: the other side of a street is always visible."""
 _FOGGY_EACH: Final = 7
-"""Of so many scenarios one has fog."""
+"""Number of scenarios of which one has fog."""
 
 
 def drawn_daylight(rng: np.random.Generator, number: int) -> Light:
-    """A light by day. number: of the scenario in its suite: quarters of the year, parts of the day,
-    skies and fog take turns, so that all come as often; the rest is drawn."""
+    """Draw a light by day.
+
+    number: of the scenario in its suite. Quarters of the year, parts of the day, skies and fog take
+    turns by it, so that all are equally frequent. Everything else is drawn.
+    """
     day = 1 + int((number % 4 + rng.random()) * 365 / 4)
     hours = np.arange(0.0, 24.0, 0.25)
     bright = np.array(

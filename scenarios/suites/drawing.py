@@ -22,23 +22,25 @@ from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M
 
 TRIES: Final = 400
 PERSON_M2: Final = 25.0
-"""Sidewalk that every person has at least, on the mean along a route; in generated cities it is
-about 29 m2."""
+"""Least mean area of sidewalk for each person along a route, in m2; about 29 in generated
+cities.
+"""
 _SAMPLE_M: Final = 20.0
 
 FREE_M2: Final = 20.0
-"""Area of sidewalk for each person, less the lane that a robot needs, on routes drawn by users; in
-cities about 21."""
+"""Area of sidewalk for each person, without the lane of the robot, on routes of users, in m2; about
+21 in generated cities.
+"""
 LARGEST_GROUP_M: Final = 3 * GROUP_STRIPE_M
-"""Width of the largest group, side by side."""
+"""Width of the largest group, side by side, in metres."""
 NARROW_M: Final = 10.0
-"""Up to this length of a route, sidewalks without room to pass a group do not count."""
+"""Length of route, in metres, up to which sidewalks without room to pass a group are ignored."""
 
 _Drawn = TypeVar("_Drawn")
 
 
 class Refusals:
-    """Why draws were refused, and how often."""
+    """Counter of the reasons for refused draws."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
@@ -109,8 +111,7 @@ def bare_scenario(
 
 
 def people_of(kind: EventKind, half_width_m: float, robot: Robot, rng: np.random.Generator) -> int:
-    """How many people a drawn event has on a sidewalk or crosswalk, so that the robot finds room
-    beside them."""
+    """Draw the number of people of an event so that the robot has room to pass them."""
     if kind.group is not None:
         return kind.group(half_width_m - 0.5 * wider_m(robot), rng)
     fewest, most = kind.people
@@ -134,10 +135,10 @@ def thinned(scenario: Scenario, street_map: StreetMap) -> Scenario:
 
 
 def passable(scenario: Scenario, street_map: StreetMap, robot: Robot = COURIER) -> Scenario:
-    """The scenario with a crowd that leaves a robot room to pass.
+    """Return the scenario with a crowd that leaves the robot room to pass.
 
-    There are as many people as fit beside the robot, and no groups where three abreast fill a
-    sidewalk of the route. The shipped suites use `thinned` alone.
+    The number of people is limited to those that leave room for the robot. Groups are removed if
+    three people abreast fill a sidewalk of the route. The shipped suites use `thinned` alone.
     """
     scenario = thinned(scenario, street_map)
     lane_m = robot.width_m + 2.0 * STEP_ROUND_GAP_M

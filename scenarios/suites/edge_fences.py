@@ -1,8 +1,8 @@
-"""Fences all along a way, for maps whose sidewalks lie over one another.
+"""Fences along both sides of a route, for maps with overlapping sidewalks.
 
-Where a foreign map draws footways beside or across pavements, ground that is walkable leads off the
-way where no port is; fences at the ports leave it open. A hem closes the way's own ground wherever
-it borders on other walkable ground.
+Some imported maps draw footways next to or across pavements. Walkable ground then leads off the
+route without a port, and fences at ports do not close it. A hem fences the ground of the route
+wherever it borders on other walkable ground.
 """
 
 from __future__ import annotations
@@ -20,30 +20,33 @@ from cosim.place.street_map import SEAM_M, Port, StreetMap, Strip, union_closed
 from cosim.spec.scenario import Barrier
 
 _NEAR_M = 3.0
-"""Ground farther from the way does not border on it."""
+"""Largest distance at which other ground borders on the route, in metres."""
 SMOOTH_M = 0.15
 _SHORTEST_M = 0.02
 _BESIDE_M = 0.5
 STRIP_M = 5.0
-"""A fence stands so far from the strip that it names as the second, and as the first, at most."""
+"""Largest distance of a fence from the strip that it names: as the second fence, and as the
+first.
+"""
 _FAR_M = 10_000.0
 MOST = 150
-"""A way that needs more fences is no way."""
+"""Largest number of fences of a route."""
 
 
 def hem(street_map: StreetMap, way: Sequence[Port]) -> tuple[Barrier, ...]:
-    """Fences wherever the ground of a way borders on walkable ground that is not the way's.
+    """Return fences wherever the ground of a route borders on other walkable ground.
 
-    Each names a port that it closes: those by which one could walk off the way, and both ends of
-    each strip that touches it, so that nobody walks through a fence. Raises SpecError when there
-    would be too many.
+    Each fence names a port that it closes. These are the ports that lead off the route, and both
+    ends of each strip that touches it. No pedestrian then walks through a fence.
+
+    Raises SpecError if too many fences are needed.
     """
     strips = {port.strip for port in way}
     corners = sorted({corner_of(street_map, port) for port in way} - {""})
     pieces = [street_map.strips[name].polygon for name in sorted(strips)]
     ground = union_closed([*pieces, *(street_map.corners[name].polygon for name in corners)])
     walkable = street_map.walkable_near(shapely.buffer(ground, _NEAR_M))
-    # What is within SEAM_M of the edge of all that is walkable borders on nothing.
+    # Ground within SEAM_M of the edge of the walkable area has no neighbour.
     border = overlay.intersection(shapely.boundary(ground), shapely.buffer(walkable, -1.2 * SEAM_M))
     sides = np.array([side for line in shapely.get_parts(border) for side in _sides(line)]).reshape(
         -1, 2, 2
@@ -65,10 +68,10 @@ def hem(street_map: StreetMap, way: Sequence[Port]) -> tuple[Barrier, ...]:
 
 
 def _named(street_map: StreetMap, sides: Floats, ports: Sequence[Port]) -> list[tuple[int, int]]:
-    """Numbers of a side and of the port that its fence closes: of the nearest strip the nearest
-    end.
+    """Return pairs of a side and the port that its fence closes: the nearer end of the nearest
+    strip.
 
-    A port that is no side's nearest is named by a second fence on the same spot, beside its strip.
+    A port that is nearest to no side is named by a second fence on the same spot, near its strip.
     """
     lines = shapely.linestrings(sides)
     beside = np.array(
@@ -78,7 +81,7 @@ def _named(street_map: StreetMap, sides: Floats, ports: Sequence[Port]) -> list[
         [street_map.strips[port.strip].line[0 if port.end == 0 else -1, :2] for port in ports]
     )
     apart = np.hypot(*(sides.mean(axis=1)[:, None] - ends[None]).transpose(2, 0, 1))
-    # Of strips that are equally near the one whose end is nearer.
+    # Of equally near strips, take the one with the nearer end.
     best = (np.round(beside, 1) * _FAR_M + apart).argmin(axis=1)
     if beside[np.arange(len(sides)), best].max() > STRIP_M:
         raise SpecError("the way borders on ground that belongs to no strip")

@@ -1,4 +1,4 @@
-"""Whether scenarios fit their places, found out before anything runs."""
+"""Checks that scenarios fit their places, before any simulation."""
 
 from __future__ import annotations
 
@@ -29,25 +29,27 @@ from sumo_nets.crowd.free_space import LocalWalkableArea
 
 LOOKING: Final = "looking where the episodes take place"
 _PLACES_A_PROCESS: Final = 8
-"""Fewer are looked at sooner than another process begins."""
+"""Number of places for each process; fewer are checked faster without another process."""
 _AROUND_M: Final = 3.0
-"""So much of a place is looked at around routes and events."""
+"""Distance around routes and events in which a place is checked, in metres."""
 _SAMPLE_M: Final = 0.5
 _EDGE_M: Final = 0.02
-"""Nearer than this to the edge of the walkable area is on it."""
+"""Distance from the edge of the walkable area, in metres, below which a point is on it."""
 BESIDE_STRIP_M: Final = 8.0
-"""So far from the strip that it closes a barrier may stand: strips end where corners begin, and
-those are wide."""
+"""Largest distance of a barrier from the strip that it closes, in metres. Strips end where corners
+begin, and corners are wide.
+"""
 
 
 def check_places(
     whole: Suite, scenarios: Sequence[Scenario], progress: Progress = ignore, jobs: int = 1
 ) -> None:
-    """Make what is needed of the places of some scenarios of a suite, and look whether each fits
-    its own: place by place, by `jobs` processes where there are many.
+    """Check that each scenario of a suite fits its place, and generate missing places.
 
-    Raises SpecError with everything that does not fit, scenario by scenario; what the machine lacks
-    as MachineError.
+    Places are checked one by one, or by `jobs` processes if there are many.
+
+    Raises SpecError with all faults, scenario by scenario. Raises MachineError if the machine lacks
+    a requirement.
     """
     there: dict[Place, list[Scenario]] = {}
     for scenario in scenarios:
@@ -74,13 +76,12 @@ def check_places(
 
 
 def _deaf_to_ctrl_c() -> None:
-    """Who started this process ends it."""
+    """Ignore Ctrl-C in this process; its parent ends it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def _misfits_at(where: Place, scenarios: Sequence[Scenario]) -> list[str]:
-    """What does not fit of scenarios that take place at one place, which is made where there is
-    none."""
+    """Return the faults of the scenarios of one place, which is generated if missing."""
     try:
         _, street_map = place(where)
     except (MapError, UsageError, SpecError) as error:
@@ -90,11 +91,9 @@ def _misfits_at(where: Place, scenarios: Sequence[Scenario]) -> list[str]:
 
 
 def misfits(scenarios: Sequence[Scenario], street_map: StreetMap) -> Iterator[str]:
-    """What does not fit of scenarios that take place on one map."""
+    """Yield the faults of scenarios that use one map."""
     spots = {(event.x_m, event.y_m) for scenario in scenarios for event in scenario.events}
-    ways = {
-        scenario.route for scenario in scenarios
-    }  # the union of many that are the same takes very long
+    ways = {scenario.route for scenario in scenarios}  # the union of many equal shapes is very slow
     near = shapely.union_all([*map(LineString, sorted(ways)), *map(Point, sorted(spots))])
     try:
         area = WalkableArea(street_map.walkable_near(shapely.buffer(near, _AROUND_M)))
@@ -116,7 +115,7 @@ def misfits(scenarios: Sequence[Scenario], street_map: StreetMap) -> Iterator[st
 
 
 def _off(scenario: Scenario, area: WalkableArea) -> Iterator[str]:
-    """Where the route first leaves the walkable area, and which events are off it."""
+    """Yield where the route first leaves the walkable area, and the events outside it."""
     line = scenario.route_line.resampled(_SAMPLE_M)
     off = np.flatnonzero(area.signed_distance(line.points) < -_EDGE_M)
     if len(off):
@@ -155,7 +154,7 @@ def _on(scenario: Scenario, crossing: RouteCrossing) -> Point:
 
 
 def _odd_barriers(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
-    """Barriers that close what is not there, stand elsewhere, or stand in the robot's way."""
+    """Yield barriers that close missing ports, are misplaced, or block the robot."""
     route = LineString(scenario.route)
     robot = ROBOTS.get(scenario.robot)
     half_width_m = 0.0 if robot is None else robot.width_m / 2
@@ -174,7 +173,7 @@ def _odd_barriers(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
 
 
 def _odd_obstacles(scenario: Scenario, area: WalkableArea) -> Iterator[str]:
-    """Obstacles that stand where nobody walks, where the robot starts, or on the goal."""
+    """Yield obstacles that are off the walkable area, at the start of the robot, or on the goal."""
     start = Point(scenario.start[:2])
     goal = Point(scenario.goal)
     robot = ROBOTS.get(scenario.robot)
@@ -191,7 +190,7 @@ def _odd_obstacles(scenario: Scenario, area: WalkableArea) -> Iterator[str]:
 
 
 def _odd_events(scenarios: Iterable[Scenario]) -> Iterator[str]:
-    """Events of no kind that there is, or not as the row of their kind says."""
+    """Yield events of unknown kinds, and those that contradict the row of their kind."""
     for scenario in scenarios:
         yield from (
             f"scenario '{scenario.id}': {fault}" for fault in event_faults(scenario, EVENT_KINDS)
@@ -212,7 +211,7 @@ def _crowded(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
 
 
 def _not_here(scenarios: Iterable[Scenario]) -> Iterator[str]:
-    """Robots and pictures of skies that there are not, each told once."""
+    """Yield each unknown robot and each missing picture of a sky once."""
     robots, skies = ({getattr(s, name): s.id for s in scenarios} for name in ("robot", "light"))
     for robot, scenario_id in robots.items():
         try:

@@ -29,30 +29,33 @@ from scenarios.suites.obstacles import with_obstacles
 from scenarios.suites.way_events import draw_events
 
 WAY_SPARE_M = 0.045
-"""The way is wider than the robot by this on either side."""
+"""Least distance between the robot and either edge of the way, in metres."""
 IN_GROUPS = 0.3
 """Share of the walkers that walk in groups of two and three."""
 
 ON_ROAD_M = 2.0
-"""So much of a route may lie on lanes that are driven on, where foreign maps draw sidewalks on the
-carriageway."""
+"""Largest length of a route on lanes for vehicles, in metres. Imported maps draw some sidewalks on
+the carriageway.
+"""
 
 TURNED_OVER_M = 0.5
-"""So much of a route may lie where cars turn, which foreign maps draw over corners."""
+"""Largest length of a route where cars turn, in metres. Imported maps draw such areas over
+corners.
+"""
 _KERB_M = 0.5
-"""A crossing's own ground ends so far beyond its line."""
+"""Distance beyond the line of a crossing at which its ground ends, in metres."""
 _SAMPLE_M = 0.5
 
 CROSSING_EVERY_M = 160.0
 LENGTH_SLACK_M = 3.0
-"""A way of a wanted length is as long as that, but for this."""
+"""Largest deviation of a way from its wanted length, in metres."""
 _END_M = 8.0
-"""A goal keeps this far from the ends of its sidewalk."""
+"""Least distance of a goal from the ends of its sidewalk, in metres."""
 
 SEARCHES = 150
-"""So many ways are searched for where no draw fits."""
+"""Number of ways that are searched if no draw fits."""
 AVOIDED_SHARE = 0.3
-"""Sidewalks with more of their area on roads are not searched."""
+"""Largest share of its area on roads with which a sidewalk is searched."""
 REMEDIES = {
     "no way of the drawn length": "the walkable pieces are too small or have too few "
     "crossings: import a larger area",
@@ -68,11 +71,11 @@ REMEDIES = {
     "": "see `cosim map check MAP -o map.png` for narrow, torn or stacked sidewalks; another "
     "--seed or a part may do",
 }
-"""What would help, by how the most frequent reason begins."""
+"""Remedies by the first words of the most frequent reason."""
 
 
 class _Draft(NamedTuple):
-    """What every draw of a scenario has in common."""
+    """Inputs that all draws of a scenario share."""
 
     place: Place
     street_map: StreetMap
@@ -97,10 +100,13 @@ def build_long_horizon(
     kinds: EventKinds = EVENT_KINDS,
     length_m: float | None = None,
 ) -> Scenario:
-    """A scenario drawn from `seed`; where no draw has exactly one path to the goal, ways are
-    searched for that can be fenced in all along. length_m: of the way; by default drawn, too.
+    """Draw a scenario from `seed`.
 
-    Raises SpecError with the reason that stands in the way most often, and what would help."""
+    If no draw has exactly one path to the goal, search for ways that can be fenced along both
+    sides. length_m: length of the way; drawn by default.
+
+    Raises SpecError with the most frequent reason and a remedy.
+    """
     rng = np.random.default_rng([seed, place.seed, 0x10E6])
     candidates = starts(street_map, graph)
     if not candidates:
@@ -184,7 +190,7 @@ def lone_route(
     way, *ends_m = drawn
     route = _line(street_map, way, *ends_m)
     if length_m is not None:
-        # Corners are cut: what that saves is walked on the last sidewalk.
+        # Corners are cut; the last sidewalk is walked farther by the distance saved.
         ends_m[1] += length_m - route.length_m
         if not _END_M <= ends_m[1] <= street_map.strips[way[-1].strip].length_m - _END_M:
             raise SpecError("no goal at the wanted distance")
@@ -312,8 +318,9 @@ def search_way(
     avoided: Set[str],
     length_m: float | None = None,
 ) -> tuple[list[Port], float, float]:
-    """As `draw_way`, but over none of the `avoided` strips, and to any goal within reach that
-    does."""
+    """Search a way as `draw_way` does, but without the `avoided` strips and to any reachable
+    goal.
+    """
     target_m = rng.uniform(*ROUTE_M) if length_m is None else length_m
     strip = street_map.strips[candidates[int(rng.integers(len(candidates)))]]
     leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)

@@ -29,9 +29,13 @@ _MOST_SEED: Final = 2**31 - 1
 
 
 class Fresh(msgspec.Struct, frozen=True, kw_only=True):
-    """Endlessly many scenarios in an order. kind: the suite that they are like; structures: take
-    turns, as its scenarios' `structure`; seeds: of the cities, which take turns after them; size_m:
-    of each city."""
+    """Endless sequence of scenarios.
+
+    kind: suite that they resemble.
+    structures: values of `structure`, which take turns.
+    seeds: seeds of the cities, which take turns after the structures.
+    size_m: side of each city, in metres.
+    """
 
     kind: str
     structures: tuple[str, ...]
@@ -41,9 +45,12 @@ class Fresh(msgspec.Struct, frozen=True, kw_only=True):
     def drawn(
         self, first: int, count: int, jobs: int = 1, progress: Progress = ignore
     ) -> list[Scenario]:
-        """So many of them from the `first` on, without those for which there is no place in their
-        city; city by city, by `jobs` processes, which makes no difference. Raises MachineError
-        where a process is ended."""
+        """Draw `count` scenarios from number `first` on, without those that have no room in their
+        city.
+
+        They are drawn city by city, by `jobs` processes; the result does not depend on `jobs`.
+        Raises MachineError if a process is killed.
+        """
         by_city: dict[int, list[int]] = {}
         for number in range(first, first + count):
             by_city.setdefault(number // len(self.structures) % len(self.seeds), []).append(number)
@@ -75,7 +82,7 @@ class Fresh(msgspec.Struct, frozen=True, kw_only=True):
         return found
 
     def _one(self, number: int) -> Scenario:
-        """One of them. Raises CosimError where there is no place for it."""
+        """Draw scenario `number`. Raises CosimError if it has no room."""
         turn, structure = divmod(number, len(self.structures))
         again, city = divmod(turn, len(self.seeds))
         called, seed = self.structures[structure], self.seeds[city]
@@ -126,5 +133,5 @@ def fresh(
 
 
 def _deaf_to_ctrl_c() -> None:
-    """Who started this process ends it."""
+    """Ignore Ctrl-C in this process; its parent ends it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,9 +1,8 @@
-"""What stands on the sidewalks of a way: drawn as such things stand, with a gap for the robot that
-is proved.
+"""Draw obstacles on the sidewalks of a route, with a gap for the robot that is proved.
 
-Where: on the sidewalks that the route leads along, at the house side, at the kerb, or on the middle
-of the way, never at corners, crossings and driveways, nor beside the start, the goal and what else
-stands there. Counts and shares are decisions of this benchmark.
+Obstacles are at the house side, at the kerb, or on the middle of the route. They are never at
+corners, crossings or driveways, nor near the start, the goal, events and furniture. Counts and
+shares are decisions of this benchmark.
 """
 
 from __future__ import annotations
@@ -39,37 +38,45 @@ from physics.street.placement import driveway_ground
 from physics.street.street_surface import StreetSurface
 
 PER_100M: Final = (4.0, 8.0)
-"""Obstacles along 100 m of sidewalk, fewest and most: each scenario draws its own density. The
-fences of a construction site count as _SITE together."""
+"""Least and largest number of obstacles along 100 m of sidewalk. Each scenario draws its own
+density. The fences of a construction site count as _SITE together.
+"""
 _SITE: Final = 2
 TO_SPARE_M: Final = 0.5
-"""Beside every obstacle there is a gap as wide as the robot and this."""
+"""Width of the gap at every obstacle in addition to the width of the robot, in metres."""
 ENDS_FREE_M: Final = 2.0
-"""From the robot's outline at the start and from the goal to the nearest obstacle."""
+"""Least distance of obstacles from the outline of the robot at the start and from the goal, in
+metres.
+"""
 EVENT_FREE_M: Final = 5.0
-"""Nothing stands so near to the place of an event."""
+"""Least distance of obstacles from the place of an event, in metres."""
 BESIDE_FREE_M: Final = 1.0
-"""Where obstacles only stand beside the way, nothing stands so near to its middle."""
+"""Least distance of obstacles from the middle of the route if none may be in the way, in metres."""
 _IN_THE_WAY: Final = 0.4
-"""Share of the groups that stand where a robot hits them that keeps to the middle of the way."""
+"""Share of the groups that are placed where a robot in the middle of the route hits them."""
 _CORNER_FREE_M: Final = 2.0
 _BEYOND_M: Final = 6.0
-"""What stands beside the way also stands so far beyond its ends."""
+"""Length beyond the ends of the route along which obstacles are placed too, in metres."""
 _APART_M: Final = 0.2
-"""Between two groups, and from what else stands there."""
+"""Least distance between two groups, and between a group and other objects, in metres."""
 _EDGE_M: Final = 0.05
 _AROUND_M: Final = 8.0
-"""So far around the route is examined: another way cannot be had there."""
+"""Distance around the route in which a path is searched, in metres."""
 _DRAWS: Final = 12
-"""For each obstacle that is wanted."""
+"""Number of draws for each obstacle."""
 
 _Side = Literal["house", "kerb"]
 
 
 class _Habit(NamedTuple):
-    """How things of a kind stand. weight: how often there is a group of them; group: fewest and
-    most in one; sides: where; turned_rad: from the street's direction, askew_rad: at most
-    further."""
+    """Placement of one kind of obstacle.
+
+    weight: relative frequency of its groups.
+    group: smallest and largest size of a group.
+    sides: possible sides of the sidewalk.
+    turned_rad: angle from the direction of the street.
+    askew_rad: largest random deviation from that angle.
+    """
 
     weight: float
     group: tuple[int, int]
@@ -137,11 +144,14 @@ def obstacles_along(
     per_100m: float | None = None,
     beside: bool = False,
 ) -> tuple[Obstacle, ...]:
-    """Obstacles for a scenario that has route, crossings, barriers and events already, beside those
-    that it has; one at least stands in the way if any fits there. per_100m: how many along 100 m of
-    its sidewalks; drawn from PER_100M where None. beside: none in the way, and at least
-    BESIDE_FREE_M from its middle. No more than it has where the way itself is no wider than the
-    gap."""
+    """Draw obstacles for a scenario that has its route, crossings, barriers and events already.
+
+    per_100m: obstacles along 100 m of its sidewalks; drawn from PER_100M if None.
+    beside: place none within BESIDE_FREE_M of the middle of the route.
+
+    Returns the obstacles of the scenario and the drawn ones. Without `beside`, at least one is in
+    the way if any fits there. None is added if the route is no wider than the gap.
+    """
     density = float(rng.uniform(*PER_100M)) if per_100m is None else per_100m
     stretches = _stretches(scenario, street_map, _BEYOND_M if beside else 0.0)
     lengths = np.array([stretch.high_m - stretch.low_m for stretch in stretches])
@@ -167,9 +177,11 @@ def obstacles_along(
 
 
 def prove_gap(scenario: Scenario, street_map: StreetMap, to_spare_m: float = TO_SPARE_M) -> None:
-    """Raises SpecError unless start and goal stay connected when all that stands in the way is
-    taken from the walkable area and the rest is eroded by half of the robot's width and to_spare_m:
-    the robot fits past every obstacle."""
+    """Check that the robot fits past every obstacle.
+
+    The obstacles are removed from the walkable area. The rest is eroded by half the width of the
+    robot and to_spare_m. Raises SpecError unless start and goal stay connected.
+    """
     room = _Room(scenario, street_map, to_spare_m=to_spare_m)
     if not room.passable(scenario.obstacles):
         what = "its obstacles leave" if scenario.obstacles else "there is"
@@ -180,7 +192,7 @@ def prove_gap(scenario: Scenario, street_map: StreetMap, to_spare_m: float = TO_
 
 
 class _Room:
-    """The ground around a route and what stands on it. gap_m: that must be left."""
+    """Ground around a route with its obstacles. gap_m: width of the gap that must be left."""
 
     def __init__(
         self,
@@ -222,7 +234,7 @@ class _Room:
         standing: Sequence[Obstacle],
         sidewalk: Polygon | MultiPolygon,
     ) -> bool:
-        """Whether a group fits on a sidewalk beside all that stands there and leaves a gap."""
+        """Return whether a group fits on a sidewalk with all other obstacles and leaves a gap."""
         grounds = [footprint(one) for one in group]
         others = [footprint(one, _APART_M) for one in standing]
         return (
@@ -236,7 +248,7 @@ class _Room:
         )
 
     def passable(self, obstacles: Iterable[Obstacle]) -> bool:
-        """Whether a way as wide as the gap leads from start to goal."""
+        """Return whether a path as wide as the gap leads from start to goal."""
         things = [footprint(one) for one in obstacles]
         left = overlay.difference(self._free, overlay.union_all(things)) if things else self._free
         parts = shapely.get_parts(shapely.buffer(left, -0.5 * self.gap_m))
@@ -244,7 +256,7 @@ class _Room:
 
 
 class _Waypoints:
-    """Where the referee may put the robot after a failure."""
+    """Waypoints to which the referee may move the robot after a failure."""
 
     def __init__(self, scenario: Scenario, robot: Robot) -> None:
         route = scenario.route_line
@@ -261,7 +273,7 @@ class _Waypoints:
             self._usable &= ~over
 
     def enough(self, obstacles: Sequence[Obstacle]) -> bool:
-        """Whether beside each waypoint that obstacles take there is one that they leave."""
+        """Return whether each waypoint that obstacles cover has a free one next to it."""
         ground = shapely.union_all([footprint(one) for one in obstacles])
         free = self._usable & (shapely.distance(self._at, ground) > self._reach_m)
         beside = np.concatenate([[False], free[:-1]]) | np.concatenate([free[1:], [False]])
@@ -271,7 +283,7 @@ class _Waypoints:
 def _drawn_group(
     stretch: _Stretch, rng: np.random.Generator, gap_m: float, *, in_the_way: bool
 ) -> tuple[Obstacle, ...]:
-    """Things of one kind that stand together; none where the sidewalk is too narrow for them."""
+    """Draw a group of obstacles of one kind; empty if the sidewalk is too narrow for them."""
     kinds = list(_HABITS)
     weights = np.array([_HABITS[kind].weight for kind in kinds])
     kind = kinds[int(rng.choice(len(kinds), p=weights / weights.sum()))]
@@ -336,7 +348,7 @@ def _counted(group: Sequence[Obstacle]) -> int:
 
 
 def _spans_m(kind: ObstacleKind, form: int, turned_rad: float) -> tuple[float, float]:
-    """How long an obstacle is along the street and across it."""
+    """Return the extent of an obstacle along the street and across it, in metres."""
     length, depth, _ = obstacle_size_m(kind, form % OBSTACLE_VARIANTS)
     cos, sin = abs(math.cos(turned_rad)), abs(math.sin(turned_rad))
     return cos * length + sin * depth, sin * length + cos * depth
@@ -373,7 +385,9 @@ def _oriented(strip: Strip) -> Polyline:
 
 
 def _streets(street_map: StreetMap, area: Polygon) -> list[shapely.Geometry]:
-    """Where nothing may stand: roads, corners and crossings with what is before them, driveways."""
+    """Return where obstacles are forbidden: roads, driveways, and corners and crossings with the
+    ground before them.
+    """
     strips = [strip for strip in street_map.near("strip", area) if isinstance(strip, Strip)]
     lanes = [
         lane

@@ -1,4 +1,6 @@
-"""Proofs that a suite's scenarios can be solved, as they lie beside it: SUITE.proof.json."""
+"""Proofs that the scenarios of a suite can be solved, stored as SUITE.proof.json next to the
+suite.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +15,10 @@ from cosim.core.files import write_atomic
 
 
 class Dropped(msgspec.Struct, frozen=True):
-    """A candidate that was not kept. reason: in a few words, the same for all that failed alike;
-    details: of this one.
+    """Rejected candidate of a scenario.
+
+    reason: short reason, the same for all candidates that failed alike.
+    details: of this candidate.
 
     >>> Dropped(1003, "collision with object", "at 7.2 m").reason
     'collision with object'
@@ -26,11 +30,10 @@ class Dropped(msgspec.Struct, frozen=True):
 
 
 class Proof(msgspec.Struct, frozen=True, kw_only=True):
-    """That a scenario is solvable: the expert came to its end without failure, with this state
-    hash.
+    """Proof that a scenario is solvable: the expert finished without failure, with this state hash.
 
-    people_m, obstacles_m: least room that it had between its body and people and obstacles, absent
-    where there are none. dropped: the candidates before this one.
+    people_m, obstacles_m: least distance of its body from people and obstacles, absent without any.
+    dropped: rejected candidates before this one.
     """
 
     scenario: str
@@ -45,8 +48,11 @@ class Proof(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Proofs(msgspec.Struct, frozen=True, kw_only=True):
-    """The proofs of a suite. first: scenarios whose first candidate was kept; dropped: candidates
-    by reason."""
+    """Proofs of a suite.
+
+    first: number of scenarios whose first candidate was accepted.
+    dropped: rejected candidates by reason.
+    """
 
     suite: str
     suite_hash: str
@@ -57,12 +63,12 @@ class Proofs(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def proofs_path(suite: Path) -> Path:
-    """Where the proofs of the suite in a file lie."""
+    """Return the path of the proofs of the suite in a file."""
     return suite.with_suffix(".proof.json")
 
 
 def read_proofs(suite: Path) -> Proofs:
-    """The proofs beside a suite's file. Raises SpecError when there are none that can be read."""
+    """Read the proofs of a suite file. Raises SpecError if they are missing or unreadable."""
     path = proofs_path(suite)
     try:
         return msgspec.json.decode(path.read_bytes(), type=Proofs)
@@ -73,7 +79,7 @@ def read_proofs(suite: Path) -> Proofs:
 
 
 def write_proofs(suite: Path, name: str, suite_hash: str, proofs: Sequence[Proof]) -> Proofs:
-    """Write the proofs beside a suite's file, one a line."""
+    """Write the proofs of a suite file, one a line."""
     reasons = Counter(dropped.reason for proof in proofs for dropped in proof.dropped)
     whole = Proofs(
         suite=name,

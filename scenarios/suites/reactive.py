@@ -1,5 +1,7 @@
-"""Builder of reactive scenarios: 10 to 20 m of way, one event on it, nobody else; ends on the first
-failure."""
+"""Builder of reactive scenarios: 10 to 20 m of route with one event and no other people.
+
+They end on the first failure.
+"""
 
 from __future__ import annotations
 
@@ -25,17 +27,17 @@ from scenarios.suites.obstacles import with_obstacles
 
 LIMIT_S = 60.0
 NO_CROWD = CrowdSpec(persons=0, vehicles=0)
-"""Nobody but the people of the event, as in the paper, and no vehicles."""
+"""Crowd without vehicles and with no people but those of the event, as in the paper."""
 BESIDE_CROSSING_M = (2.0, 5.0)
-"""Way driven before a crosswalk and after it, least and most."""
+"""Least and largest length of route before and after a crosswalk, in metres."""
 _ROOM_M = 0.35
-"""Half the width of what is walkable there."""
+"""Half the width of the walkable ground before and after a crosswalk, in metres."""
 _SHORTEST_M = 10.0
 ENDS_CLEAR_M = 6.0
-"""Way and event keep this far from the ends of their sidewalk."""
+"""Least distance of route and event from the ends of their sidewalk, in metres."""
 BEND_M = 0.15
 _SPEEDS_MPS = (1.1, 1.65)
-"""Walking speeds of the paper."""
+"""Least and largest walking speed in the paper, in m/s."""
 
 
 class EventSpot(NamedTuple):
@@ -91,8 +93,9 @@ def build_reactive(
 
 
 def strips_of(kind: EventKind, street_map: StreetMap, graph: WalkGraph) -> list[Strip]:
-    """The strips on which a kind of event may be, as far as can be told without drawing, by their
-    ids."""
+    """Return the strips on which a kind of event may fit, sorted by id. Nothing is drawn for this
+    check.
+    """
     wanted = "crossing" if kind.layout is None else "sidewalk"
     strips = [
         street_map.strips[strip_id] for strip_id in sorted(graph.main_strips - street_map.steep)
@@ -177,9 +180,11 @@ def over_crossing(
 
 
 def _straight_over(street_map: StreetMap, ends: Floats, room_m: float) -> Floats:
-    """(2, 2) m: a way straight over a crosswalk, from before its first end to beyond its second, as
-    far as one can walk straight on there with `room_m` to either side: who only drives straight
-    ahead stays on it. Raises SpecError when that is too short."""
+    """Return a straight way over a crosswalk, from before its first end to beyond its second.
+
+    It is (2, 2) in metres. It reaches as far as the ground is walkable straight on, with `room_m`
+    on either side. Raises SpecError if it is too short.
+    """
     along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
     walkable = street_map.walkable_near(
         shapely.buffer(LineString(ends), BESIDE_CROSSING_M[1] + 1.0)

@@ -33,8 +33,9 @@ _SMALL_CROPS: Final = ("ingolstadt-1", "braunschweig-1")
 _REAL_UNIT: Final = tuple(name for name in WHEEL_PLACES if name != "berlin-7")
 """Ten real places with straight ways and corners."""
 _REAL_CROSSWALKS: Final = (*(name for name in WHEEL_PLACES if name not in _SMALL_CROPS), "berlin-3")
-"""Ten crosswalks: two of them in the largest place, since the small ones have none without
-signals."""
+"""Places of ten crosswalks. The largest place has two, since small places have none without
+signals.
+"""
 _REAL_ROUTES: Final = {
     "berlin-1": 150.0,
     "berlin-3": 200.0,
@@ -49,10 +50,13 @@ _DIGITS: Final = 4
 
 @dataclass(frozen=True, kw_only=True)
 class Slot:
-    """One scenario to be made. structure: see `Scenario`; number: seed of its first candidate;
-    length_m: of a route.
+    """Recipe of one scenario.
 
-    like: name of the slot whose scenario it repeats without its events."""
+    structure: see `Scenario`.
+    number: seed of its first candidate.
+    length_m: length of a route.
+    like: name of the slot whose scenario it repeats without its events.
+    """
 
     name: str
     suite: str
@@ -66,8 +70,7 @@ class Slot:
 
 @dataclass(frozen=True, kw_only=True)
 class SuiteRecipe:
-    """How a suite is made. purpose: what it is for, in a few words; slots: its scenarios, in
-    order."""
+    """Recipe of a suite. purpose: short description; slots: recipes of its scenarios, in order."""
 
     version: str
     description: str
@@ -81,7 +84,7 @@ def candidate(slot: Slot, seed: int) -> Scenario:
     _, street_map = place(slot.where)
     drawn = RECIPES[slot.suite].draw(slot, street_map, _graph(slot.where), seed)
     rng = np.random.default_rng([seed, zlib.crc32(slot.name.encode())])
-    # Another turn for each structure, so that those of one city are not all of one hour.
+    # Each structure has another offset, so that those of one city are not all of one hour.
     light = drawn_daylight(rng, slot.number + 5 * zlib.crc32(slot.structure.encode()) % 84)
     whole = msgspec.structs.replace(drawn, light=light, split=slot.split, structure=slot.structure)
     return msgspec.convert(_in_few_digits(msgspec.to_builtins(whole)), Scenario)
@@ -98,7 +101,7 @@ def _in_few_digits(value: Any) -> Any:
 
 
 def repeated(slot: Slot, of: Scenario) -> Scenario:
-    """The scenario of a slot that repeats another one: nobody is there."""
+    """Return the scenario of a slot that repeats another one without people."""
     return msgspec.structs.replace(
         of, id=slot.name, events=(), structure=slot.structure, ends_at="goal"
     )
@@ -126,7 +129,7 @@ def _slot(suite: str, name: str, structure: str, where: Place, number: int, **mo
 
 
 def _unit_slots() -> list[Slot]:
-    """Each structure once in every city, and ten of each on real places."""
+    """Return slots with each structure once in every city and ten times on real places."""
     found = []
     for number, city in _cities():
         found += [_slot("unit", f"{one}-{city.seed:03d}", one, city, number) for one in STRUCTURES]
@@ -140,8 +143,9 @@ def _unit_slots() -> list[Slot]:
 
 
 def _reactive_slots() -> list[Slot]:
-    """Each event once in every city, and beside the first kind's the same place with nobody
-    there."""
+    """Return slots with each event once in every city, and the first kind's place also without
+    people.
+    """
     reference = next(iter(EVENT_KINDS))
     found = []
     for number, city in _cities():

@@ -31,18 +31,20 @@ def suite_on_map(
     kinds: EventKinds = EVENT_KINDS,
     robot: Robot = COURIER,
 ) -> Suite:
-    """A suite drawn on a place, by whatever the user calls it; the same arguments and net give the
-    same suite.
+    """Draw a suite on a place; the same arguments and net give the same suite.
 
-    count: of long-horizon scenarios, 1 by default; of reactive ones, whose events take turns, one
-    of each by default. events: which of them; those for which the place has no room are left out,
-    and the description says so, unless they were asked for. Where sidewalks are few or narrow,
-    fewer people walk, and none in groups: a robot could not pass. roughness: of the ground, from 0
-    (flat) to 1. kinds: the table of events that there are. robot: which one the ways are wide
-    enough for.
+    called: name that the user gives the place.
+    count: number of long-horizon scenarios, 1 by default. For reactive ones, whose events take
+    turns, one of each by default.
+    events: kinds of events. Those without room on the place are left out and listed in the
+    description, unless the user requested them.
+    roughness: of the ground, from 0 (flat) to 1.
+    kinds: table of the available events.
+    robot: robot for which the ways must be wide enough.
 
-    Raises UsageError for another kind of suite, and whatever the place or the builder has to
-    refuse.
+    Fewer people walk where sidewalks are few or narrow, and none in groups: a robot could not pass.
+
+    Raises UsageError for another kind of suite, and the errors of the place and the builder.
     """
     if kind not in _KINDS:
         raise unknown("suite for --map", kind, _KINDS)
@@ -65,7 +67,7 @@ def suite_on_map(
 
 
 class _Drawn(NamedTuple):
-    """What scenarios are drawn on. seed: of the first one."""
+    """Inputs from which scenarios are drawn. seed: of the first scenario."""
 
     where: Place
     street_map: StreetMap
@@ -76,7 +78,7 @@ class _Drawn(NamedTuple):
     robot: Robot
 
     def long(self, count: int) -> tuple[list[Scenario], list[str]]:
-        """So many long-horizon scenarios; nothing is left out."""
+        """Draw `count` long-horizon scenarios; the list of sentences is empty."""
         seeds = range(self.seed, self.seed + count)
         ids = [f"{self.name}-{seed:03d}" for seed in seeds]
         drawn_on = (self.where, self.street_map, self.graph)
@@ -87,8 +89,10 @@ class _Drawn(NamedTuple):
         ], []
 
     def reactive(self, count: int | None, asked: Sequence[str]) -> tuple[list[Scenario], list[str]]:
-        """So many reactive scenarios, their events in turn, and a sentence for each event there is
-        no room for."""
+        """Draw `count` reactive scenarios, whose events take turns.
+
+        Returns the scenarios, and a sentence for each event without room.
+        """
         kinds = [kind for kind in self.kinds.values() if kind.name in asked or not asked]
         found: list[Scenario] = []
         left_out: list[str] = []

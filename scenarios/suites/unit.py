@@ -1,5 +1,7 @@
-"""Builder of unit scenarios: 10 to 20 m straight on, round a corner or over a crosswalk, nobody
-else; ends on the first failure."""
+"""Builder of unit scenarios: 10 to 20 m straight on, round a corner or over a crosswalk.
+
+There are no people. They end on the first failure.
+"""
 
 from __future__ import annotations
 
@@ -28,13 +30,12 @@ Structure = Literal["straight", "curve", "crosswalk"]
 STRUCTURES: Final[tuple[Structure, ...]] = get_args(Structure)
 WAY_M: Final = (10.0, 20.0)
 TURN_RAD: Final = (math.radians(45.0), math.radians(150.0))
-"""A curve turns by this, at least and at most, from its first metres to its last."""
+"""Least and largest turn of a curve, from its first metres to its last."""
 _ENDS_M: Final = 2.0
-"""So much of a way, at either end, tells where it comes from and where it goes."""
+"""Length at either end of a route from which its direction is measured, in metres."""
 _OFF_ROAD_M: Final = 0.5
 _BESIDE_ROBOT_M: Final = 0.7
-"""Sidewalks are wider than the robot by this on either side: there is room for something that
-stands there."""
+"""Least distance between the robot and either edge of a sidewalk, in metres: room for an object."""
 
 
 def build_unit(
@@ -87,15 +88,16 @@ def build_unit(
 
 
 def lies_on(structure: Structure) -> Literal["sidewalk", "crossing"]:
-    """What a structure is drawn on."""
+    """Return the kind of strip on which a structure is drawn."""
     return "crossing" if structure == "crosswalk" else "sidewalk"
 
 
 def strips_for(
     structure: Structure, street_map: StreetMap, graph: WalkGraph, robot: Robot
 ) -> list[Strip]:
-    """The strips on which a structure may be, as far as can be told without drawing, by their
-    ids."""
+    """Return the strips on which a structure may fit, sorted by id. Nothing is drawn for this
+    check.
+    """
     strips = [
         street_map.strips[strip_id] for strip_id in sorted(graph.main_strips - street_map.steep)
     ]
@@ -142,7 +144,7 @@ def turn_rad(route: Polyline) -> float:
 
 
 def _may_be(strip: Strip, structure: Structure, robot: Robot) -> bool:
-    """Whether a strip does, as far as can be told without drawing."""
+    """Return whether a structure may fit on a strip. Nothing is drawn for this check."""
     if structure == "crosswalk":
         return not strip.signalised and None not in strip.corners
     return strip.width_m >= robot.width_m + 2.0 * _BESIDE_ROBOT_M
@@ -165,8 +167,11 @@ def _crosswalk(
 def _round_corner(
     street_map: StreetMap, graph: WalkGraph, strip: Strip, rng: np.random.Generator, robot: Robot
 ) -> Polyline:
-    """From a sidewalk round one of its corners to another one, which leads elsewhere. Raises
-    SpecError."""
+    """Draw a route from a sidewalk round one of its corners to another sidewalk in another
+    direction.
+
+    Raises SpecError if none fits.
+    """
     leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)
     onward = [
         port for port in graph.others(leave) if _leads_round(street_map, strip, leave, port, robot)
@@ -179,7 +184,7 @@ def _round_corner(
         min(0.5 * street_map.strips[port.strip].length_m, WAY_M[1]) for port in (leave, enter)
     )
     whole = way_line(street_map, [leave, enter], before_m, behind_m)
-    # The corner stands in the middle of the way, more or less.
+    # The corner is near the middle of the route.
     corner_s_m = whole.project(*graph.point(leave))[0]
     from_m = corner_s_m - float(rng.uniform(0.3, 0.6)) * wanted_m
     from_m = max(0.0, min(from_m, whole.length_m - wanted_m))
@@ -195,8 +200,9 @@ def _round_corner(
 def _leads_round(
     street_map: StreetMap, strip: Strip, leave: Port, port: Port, robot: Robot
 ) -> bool:
-    """Whether a port is of another sidewalk, wide enough, that leads off by as much as a curve
-    turns."""
+    """Return whether a port leads to another sidewalk that is wide enough and turns as a curve
+    does.
+    """
     other = street_map.strips[port.strip]
     if (
         other.kind != "sidewalk"
@@ -212,6 +218,6 @@ def _leads_round(
 
 
 def _heading_out(strip: Strip, port: Port) -> float:
-    """The heading of one who leaves a strip by a port."""
+    """Return the heading on leaving a strip by a port."""
     line = Polyline(strip.line[:, :2] if port.end == 1 else strip.line[::-1, :2])
     return line.at(line.length_m).heading_rad

@@ -18,14 +18,17 @@ from scenarios.suites.drawing import people_of, wider_m
 
 EVENT_EVERY_M: Final = 90.0
 BESIDE_EVENT_M: Final = 0.95
-"""Events take place on sidewalks whose halves are wider than the robot by this: there is room to
-pass."""
+"""Least difference between half the width of a sidewalk with an event and the robot, in metres. It
+leaves room to pass.
+"""
 _APART_M: Final = 45.0
-"""From one event to the next, at least."""
+"""Least distance between two events along the route, in metres."""
 _FROM_START_M = 30.0
 _FROM_GOAL_M = 20.0
 _LOOK_M: Final = 45.0
-"""So far ahead room is looked for, for one kind after the other."""
+"""Distance ahead in which room for an event is searched, for one kind after the other, in
+metres.
+"""
 _STEP_M: Final = 2.5
 BENDS_M: Final = 0.4
 _SLACK_M: Final = 2.0
@@ -35,12 +38,13 @@ _ON_CROSSWALKS: Final = 0.4
 """Share of the straight crosswalks without signals on which people come towards the robot."""
 _CROSSING_BEND_M: Final = 0.6
 _BESIDE_CROSSING_M: Final = 1.0
-"""So far before and behind such a crosswalk the way is straight, as in the scenarios of that event
-alone."""
+"""Length of straight route before and behind such a crosswalk, in metres, as in reactive
+scenarios.
+"""
 
 
 class WaySpot(NamedTuple):
-    """Where an event may be. half_length_m: of a crosswalk, else 0."""
+    """Possible place of an event. half_length_m: half the length of a crosswalk, else 0."""
 
     s_m: float
     half_width_m: float
@@ -145,8 +149,10 @@ def crosswalk_spots(
 
 
 def _has_room(kind: EventKind, spot: WaySpot, route: Polyline, robot: Robot) -> bool:
-    """Whether the sidewalk is wide enough for a kind, and straight as far before and behind as its
-    scenarios are."""
+    """Return whether the sidewalk is wide enough for a kind of event.
+
+    It must also be straight as far before and behind the event as in the scenarios of that kind.
+    """
     layout = kind.layout
     if layout is None or spot.half_width_m < layout.half_width_m + wider_m(robot):
         return False
@@ -171,7 +177,7 @@ def _sidewalk_at(
 def is_straight_between(
     route: Polyline, from_m: float, to_m: float, bend_m: float = BENDS_M
 ) -> bool:
-    """Whether the route bends by less than so much between two of its arc lengths."""
+    """Return whether the route bends by less than `bend_m` between two arc lengths."""
     chord = Polyline([route.at(from_m).xy, route.at(to_m).xy])
     between = route.points[(route.s_m > from_m) & (route.s_m < to_m)]
     return all(abs(chord.project(x, y)[1]) < bend_m for x, y in between)

@@ -1,5 +1,4 @@
-"""What stands and happens along the way of an own scenario, where its file says so: events and
-obstacles."""
+"""Events and obstacles along the route of a user scenario, as given in its file."""
 
 from __future__ import annotations
 
@@ -23,11 +22,12 @@ from scenarios.suites.user_scenarios.format import OwnEvent, OwnObstacle
 from scenarios.suites.way_events import crosswalk_spots, is_straight_between
 
 _NARROW_M: Final = 0.25
-"""A sidewalk with so much more to either side than the robot and a person take has room for one who
-stands there."""
+"""Space that a sidewalk with a standing person needs on either side of robot and person, in
+metres.
+"""
 _LOOK_EVERY_M: Final = 0.5
 _BEYOND_M: Final = 5.0
-"""So far past its place the way of an event is straight, if it does not end before."""
+"""Length after its place along which the route of an event is straight, unless it ends before."""
 
 
 def event_along(
@@ -97,8 +97,10 @@ def narrow_events(scenario: Scenario) -> Iterator[str]:
 
 
 def obstacle_along(asked: OwnObstacle, route: Polyline) -> Obstacle:
-    """The thing that a file asks for, beside the route. Raises SpecError where the way is not so
-    long."""
+    """Return the obstacle of a file at its place along the route.
+
+    Raises SpecError if the route is too short.
+    """
     if asked.at_m > route.length_m:
         raise SpecError(
             f"at_m {asked.at_m:g} is past the goal: the way is {route.length_m:.1f} m long"
@@ -109,8 +111,10 @@ def obstacle_along(asked: OwnObstacle, route: Polyline) -> Obstacle:
 def _place_of(
     asked: OwnEvent, kind: EventKind, scenario: Scenario, street_map: StreetMap, robot: Robot
 ) -> float:
-    """Where on sidewalks an event takes place: as asked, or the place that fits nearest to the
-    middle of the way."""
+    """Return the place of an event on sidewalks, in metres along the route.
+
+    It is the given place, or the suitable place nearest to the middle of the route.
+    """
     route = scenario.route_line
     if asked.at_m is not None:
         reason = _misfit(kind, asked.at_m, route, street_map, robot)
@@ -135,7 +139,7 @@ def _place_of(
 def _misfit(
     kind: EventKind, at_m: float, route: Polyline, street_map: StreetMap, robot: Robot
 ) -> str:
-    """Why an event cannot take place there, "" if it can."""
+    """Return why an event cannot take place there, or "" if it can."""
     layout = kind.layout
     assert layout is not None
     if at_m < layout.event_m[0]:
@@ -161,7 +165,7 @@ def _misfit(
 
 
 def _half_width_m(route: Polyline, at_m: float, street_map: StreetMap) -> float:
-    """Half the width of the sidewalk there, 0 where there is none."""
+    """Return half the width of the sidewalk there, in metres, or 0 without a sidewalk."""
     pose = _beyond(route, at_m)
     strip = street_map.strips.get(street_map.locate(pose.x_m, pose.y_m, 0.05).edge)
     return strip.width_m / 2 if strip is not None and strip.kind == "sidewalk" else 0.0
@@ -185,7 +189,7 @@ def _runs(at: np.ndarray, fits: np.ndarray) -> list[tuple[float, float]]:
 
 
 def _listed(spans: Sequence[tuple[float, float]]) -> str:
-    """Stretches of a way in words."""
+    """Format stretches of a route as text."""
     return ", and from ".join(
         f"{math.ceil(10 * a) / 10:g} to {math.floor(10 * b) / 10:g} m" for a, b in spans[:4]
     )

@@ -1,5 +1,7 @@
-"""From files of own scenarios to scenarios: one file, map and versions make the same ones, with the
-same hashes."""
+"""Build scenarios from files of user scenarios.
+
+The same file, map and versions give the same scenarios, with the same hashes.
+"""
 
 from __future__ import annotations
 
@@ -27,15 +29,17 @@ from sumo_nets.maps.place_names import imported_place, resolve_place
 _MAKING: Final = "making the scenarios"
 _VERSION: Final = "own"
 _NOBODYS: Final = "scenario 'own': "
-"""What begins messages about a scenario that has no name yet."""
+"""Prefix of messages about a scenario without a name."""
 _SLOWEST_MPS = 0.2
 _LEAST_S = 60.0
-"""A time limit that is not given is a minute and what the way takes at this speed."""
+"""Speed for the default time limit: one minute plus the time for the route at this speed."""
 
 
 class Made(NamedTuple):
-    """A scenario, and what is against it, as "events[0]: ...", one message each: then it is without
-    what does not fit, and None where there is no way."""
+    """Scenario of a file with its faults, such as "events[0]: ...", one message each.
+
+    scenario: without the parts that do not fit; None if no route exists.
+    """
 
     variant: Variant
     scenario: Scenario | None
@@ -43,23 +47,24 @@ class Made(NamedTuple):
 
 
 class _Street(NamedTuple):
-    """A scenario that has all but its crowd and its light, and what is against it, as `Made` has
-    them."""
+    """Scenario without its crowd and its light, with its faults as in `Made`."""
 
     scenario: Scenario | None
     faults: tuple[str, ...]
 
 
 def made_of(file: OwnFile, progress: Progress = ignore) -> Iterator[Made]:
-    """Each scenario of a file, and what is against it. What the machine lacks is raised as
-    MachineError."""
+    """Yield each scenario of a file with its faults.
+
+    Raises MachineError if the machine lacks a requirement.
+    """
     for number, variant in enumerate(file.variants):
         progress(f"{_MAKING} of {file.path.name}", number / len(file.variants))
         yield made_one(variant, file.name)
 
 
 def made_one(variant: Variant, suite: str) -> Made:
-    """One scenario of a file, and what is against it; suite: the name of the file's scenarios."""
+    """Build one scenario of a file, with its faults. suite: name of the suite of the file."""
     own = variant.own
     alike = {
         "name": "own",
@@ -91,7 +96,7 @@ def made_one(variant: Variant, suite: str) -> Made:
 
 
 def suite_of_own(file: OwnFile, progress: Progress = ignore) -> Suite:
-    """All scenarios of a file, to be run. Raises SpecError with everything that is against it."""
+    """Build the suite of all scenarios of a file. Raises SpecError with all faults."""
     return suite_of(file, list(made_of(file, progress)))
 
 

@@ -1,5 +1,4 @@
-"""Whether own scenarios can be driven: that places are there, ways exist and are free, events and
-things fit."""
+"""Checks that user scenarios can be driven: their places, routes, events and obstacles."""
 
 from __future__ import annotations
 
@@ -62,8 +61,10 @@ def _faults_on_the_street(scenario: Scenario) -> Iterator[str]:
 
 @lru_cache(maxsize=1024)
 def _narrow(street: Scenario) -> tuple[str, ...]:
-    """Where the robot does not fit: past obstacles it is to have half a metre to spare, else hardly
-    any."""
+    """Return where the robot does not fit.
+
+    It needs half a metre to spare at obstacles, and hardly any elsewhere.
+    """
     _, street_map = place(street.place)
     try:
         prove_gap(street, street_map, TO_SPARE_M if street.obstacles else 2.0 * WAY_SPARE_M)

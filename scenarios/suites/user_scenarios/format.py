@@ -38,7 +38,7 @@ PointXY = tuple[float, float]
 
 
 def _refusal_of(make: Callable[[], object]) -> str:
-    """What a spec says against being made so; "" if nothing."""
+    """Return the error of a spec's constructor, or "" if it succeeds."""
     try:
         make()
     except SpecError as error:
@@ -47,9 +47,13 @@ def _refusal_of(make: Callable[[], object]) -> str:
 
 
 class OwnPlace(Ranged, frozen=True, kw_only=True):
-    """Where it is, one of three. city: a generated one, by its seed, size_m across, of a style.
-    map: by the name that `cosim map list` gives. file: of a map, by its path from this file.
-    roughness: of the ground, 0 to 1."""
+    """Place of a scenario: one of city, map and file.
+
+    city: seed of a generated city, size_m across, of a style.
+    map: name in `cosim map list`.
+    file: path of a map, relative to this file.
+    roughness: of the ground, 0 to 1.
+    """
 
     city: Annotated[int | None, SEED] = None
     size_m: float = 1000.0
@@ -136,9 +140,12 @@ class OwnWay(Ranged, frozen=True, kw_only=True):
 
 
 class OwnEvent(Ranged, frozen=True, kw_only=True):
-    """People who meet the robot. at_m: along the way; where none is given, the place that fits
-    nearest to its middle. people: how many; by default the fewest of the kind. side: the
-    sidewalk's, for kinds that come from one."""
+    """People who meet the robot.
+
+    at_m: along the route; by default the suitable place nearest to its middle.
+    people: number; by default the least of the kind.
+    side: of the sidewalk, for kinds that come from one.
+    """
 
     kind: str
     at_m: Annotated[float | None, ARC_LENGTH_M] = None
@@ -152,8 +159,11 @@ class OwnEvent(Ranged, frozen=True, kw_only=True):
 
 
 class OwnObstacle(Ranged, frozen=True, kw_only=True):
-    """A thing that stands at_m along the way and left_m to the left of it (right below 0).
-    turned_deg: from the way's direction, counter-clockwise. paint: one of four."""
+    """Obstacle at_m along the route and left_m to the left of it (right below 0).
+
+    turned_deg: angle from the direction of the route, counter-clockwise.
+    paint: one of four.
+    """
 
     kind: ObstacleKind
     at_m: Annotated[float, ARC_LENGTH_M]
@@ -172,7 +182,7 @@ class OwnObstacle(Ranged, frozen=True, kw_only=True):
         return _SIZES.index(self.size) + OBSTACLE_VARIANTS * self.paint
 
     def standing(self, x_m: float, y_m: float, along_rad: float) -> Obstacle:
-        """The thing beside a place of a way that leads on at `along_rad`."""
+        """Return the obstacle at a point of the route with direction `along_rad`."""
         turned = math.remainder(along_rad + math.radians(self.turned_deg), 2.0 * math.pi)
         x_m = x_m - self.left_m * math.sin(along_rad)
         y_m = y_m + self.left_m * math.cos(along_rad)
@@ -181,9 +191,12 @@ class OwnObstacle(Ranged, frozen=True, kw_only=True):
 
 
 class OwnObstacles(Ranged, frozen=True, kw_only=True):
-    """What stands on the sidewalks. per_100m: drawn, so many along 100 m, each leaving room for the
-    robot and 0.5 m. beside: none of those that are drawn within 1 m of the way's middle. placed:
-    where one wants them."""
+    """Obstacles on the sidewalks.
+
+    per_100m: number of drawn obstacles along 100 m, each leaving room for the robot and 0.5 m.
+    beside: draw none within 1 m of the middle of the route.
+    placed: obstacles at given places.
+    """
 
     per_100m: Annotated[float, Within(0, 40)] = 0.0
     beside: bool = False
@@ -195,8 +208,10 @@ class OwnObstacles(Ranged, frozen=True, kw_only=True):
 
 
 class OwnCrowd(Ranged, frozen=True, kw_only=True):
-    """Who else is there, as in `CrowdSpec`; nobody by default. persons, or density: persons per
-    1000 m2."""
+    """People and vehicles, as in `CrowdSpec`; none by default.
+
+    persons, or density: persons per 1000 m2.
+    """
 
     persons: int | None = None
     density: float | None = None
@@ -227,8 +242,11 @@ class OwnCrowd(Ranged, frozen=True, kw_only=True):
 
 
 class OwnLimits(Ranged, frozen=True, kw_only=True):
-    """When it ends. time_s: by default a minute, and as long as the way takes at 0.2 m/s. ends_at:
-    the goal, or when the robot has stopped before somebody who holds out a hand."""
+    """Limits of an episode.
+
+    time_s: by default one minute plus the time for the route at 0.2 m/s.
+    ends_at: the goal, or the robot's stop before a person with a raised hand.
+    """
 
     time_s: Annotated[float | None, Within(0.1, 100_000)] = None
     goal_radius_m: Annotated[float, Within(0.1, 20)] = 1.0
@@ -241,9 +259,12 @@ class OwnLimits(Ranged, frozen=True, kw_only=True):
 
 
 class OwnScenario(Ranged, frozen=True, kw_only=True):
-    """A file of one's own. seed: of all that is drawn; seeds: so many repetitions, each with the
-    next seed. goal_protocol: what the policy is told of where to go; by default what its manifest
-    asks for."""
+    """User scenario file.
+
+    seed: of everything that is drawn.
+    seeds: number of repetitions, each with the next seed.
+    goal_protocol: form of the goal for the policy; by default that of its manifest.
+    """
 
     name: Annotated[str, PathName("a scenario")]
     description: Annotated[str, Text(1000)] = ""

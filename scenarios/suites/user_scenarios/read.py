@@ -1,11 +1,10 @@
-"""Files of own scenarios: TOML, read whole or refused with every fault at once; a list in place of
-a value is a sweep.
+"""Reader of user scenario files, in TOML. A list in place of a value is a sweep.
 
-crowd.density = [0, 10]
-seeds = 3
+    crowd.density = [0, 10]
+    seeds = 3
 
-are six scenarios: each value of each such field with each of the others, three times, with the
-seeds 0, 1, 2.
+are six scenarios: all combinations of the values, each with the seeds 0, 1 and 2. A file with
+faults is refused with all of them.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from sumo_nets.maps.map_store import known_maps
 _MOST_BYTES: Final = 1_000_000
 _MOST_SCENARIOS: Final = 5000
 _ONE_VALUE: Final = ("name", "description", "seeds")
-"""Fields that belong to the whole file."""
+"""Fields that apply to the whole file."""
 _SUITES: Final = Path(__file__).parents[1]
 _LONGEST_NAME: Final = 100
 _AT: Final = re.compile(r" - at `\$\.?([^`]*)`")
@@ -58,7 +57,7 @@ class Axis(NamedTuple):
 
 @dataclass(frozen=True)
 class Variant:
-    """One scenario of a file. at: the value of each field that is swept over."""
+    """One scenario of a file. at: value of each field of the sweep."""
 
     id: str
     own: OwnScenario
@@ -77,8 +76,10 @@ class OwnFile:
 
 
 def read_own(path: Path) -> OwnFile:
-    """The scenarios of a TOML file. Raises SpecError naming the file and every fault, with its
-    field, what was found and what may stand there."""
+    """Read the scenarios of a TOML file.
+
+    Raises SpecError with the file and every fault: its field, the value and the valid values.
+    """
     tree = _toml(path)
     axes = tuple(_axes(tree, OwnScenario, ""))
     faults = [
@@ -141,7 +142,7 @@ def _toml(path: Path) -> dict[str, Any]:
 
 
 def _axes(tree: Any, kind: Any, field: str) -> Iterator[Axis]:
-    """Where values are nested deeper than their types."""
+    """Yield the axes of the sweep: fields whose values are lists of their type."""
     kind = bare_type(kind, tree)
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         types = {one.name: one.type for one in msgspec.structs.fields(kind)}

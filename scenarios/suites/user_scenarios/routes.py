@@ -30,14 +30,14 @@ from scenarios.suites.unit import Structure, build_unit
 from scenarios.suites.user_scenarios.format import OwnWay, PointXY
 
 _NEAREST_M: Final = 8.0
-"""From a start or goal to the sidewalk that it is moved to, at most."""
+"""Largest distance between a start or goal and the sidewalk to which it is moved, in metres."""
 _END_M: Final = 0.5
-"""A start or goal keeps this far from the ends of its sidewalk."""
+"""Least distance of a start or goal from the ends of its sidewalk, in metres."""
 _EXACT_M: Final = 0.05
 _REDRAWN: Final = 20
-"""So many ways are drawn until one has signals, or has none, as is asked for."""
+"""Largest number of ways that are drawn to find one with signals, or without, as requested."""
 _ANOTHER: Final = 1_000_003
-"""From the seed of one draw to the next one's."""
+"""Difference between the seeds of consecutive draws."""
 
 
 class _Spot(NamedTuple):
@@ -47,13 +47,14 @@ class _Spot(NamedTuple):
     s_m: float
 
     def from_port(self, port: Port) -> float:
-        """How far it is from an end of its strip."""
+        """Return the distance from an end of the strip, in metres."""
         return self.s_m if port.end == 0 else self.strip.length_m - self.s_m
 
 
 def laid_way(way: OwnWay, where: Place, street_map: StreetMap, seed: int, robot: Robot) -> Scenario:
-    """A scenario along the way with nothing on it but fences. Raises CosimError where there is no
-    such way."""
+    """Build a scenario along the way with only its fences. Raises CosimError if no such way
+    exists.
+    """
     if way.kind is not None:
         return _drawn(way, where, street_map, seed, robot)
     barriers: tuple[Barrier, ...] = ()
@@ -183,8 +184,10 @@ def _along_one(start: _Spot, goal: _Spot) -> Polyline:
 
 
 def _spot(street_map: StreetMap, name: str, xy: PointXY) -> _Spot:
-    """The middle of the nearest sidewalk. Raises SpecError where that is far, with the nearest
-    there is."""
+    """Return the middle of the nearest sidewalk.
+
+    Raises SpecError, with the nearest sidewalk, if it is too far.
+    """
     strips = [
         strip
         for strip in street_map.strips.values()
@@ -210,8 +213,11 @@ def _spot(street_map: StreetMap, name: str, xy: PointXY) -> _Spot:
 def _shortest(
     street_map: StreetMap, start: _Spot, goal: _Spot, *, with_signals: bool
 ) -> list[Port]:
-    """The ports of the shortest way from one sidewalk to another, over no stairs, bridges and steep
-    land. Raises SpecError when there is none."""
+    """Return the ports of the shortest way between two sidewalks, without stairs, bridges and steep
+    land.
+
+    Raises SpecError if no way exists.
+    """
     barred = {strip.id for strip in street_map.strips.values() if strip.going != "plain"} - {
         start.strip.id
     }
@@ -240,7 +246,7 @@ def _shortest(
 
 
 def _passes_once(path: list[Port]) -> bool:
-    """Whether a way leaves its first strip and enters its last one only once."""
+    """Return whether a way leaves its first strip and enters its last one only once."""
     return len({port.strip for port in path}) * 2 == len(path) + 2
 
 

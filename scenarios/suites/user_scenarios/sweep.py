@@ -1,5 +1,6 @@
-"""What comes of a sweep: for each value of its fields the means of its episodes, as a table and as
-files."""
+"""Summary of a sweep: means of the episodes for each value of its fields, as a table and as
+files.
+"""
 
 from __future__ import annotations
 
@@ -16,14 +17,18 @@ from cosim.results.table import summary_of
 from scenarios.suites.user_scenarios.read import OwnFile, label
 
 SWEPT: Final = ("success", "spl", "route_completion", "failures_per_100m")
-"""What is printed; the file has every metric."""
+"""Metrics that are printed; the file has every metric."""
 _DRAWN: Final = (*SWEPT, "pedestrian_distance_min_m", "time_to_goal_s")
 
 
 def summary_of_sweep(own: OwnFile, table: pd.DataFrame) -> pd.DataFrame:
-    """A row for each metric at each value (of several fields: each combination), with the columns
-    of `summary_of`; the fields come first, then `episodes` and `invalid`, how many were made and
-    how many of them are owed. table: of the run, one row per episode."""
+    """Return a row for each metric at each value of the sweep, or combination of values.
+
+    table: results of the run, one row per episode.
+
+    The fields come first. `episodes` and `invalid` follow: how many scenarios were built, and how
+    many of them are missing. The other columns are those of `summary_of`.
+    """
     fields = [axis.field for axis in own.axes]
     parts = []
     for at, ids in _grouped(own):

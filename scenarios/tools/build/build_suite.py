@@ -1,6 +1,8 @@
-"""Building a suite, a process for each place: what is proved is kept scenario by scenario, so that
-a build that was stopped goes on where it was, and a process that dies or hangs costs one
-candidate."""
+"""Build a suite with a process for each place.
+
+Proofs are stored scenario by scenario, so a stopped build can be resumed. A process that dies or
+hangs costs one candidate.
+"""
 
 from __future__ import annotations
 
@@ -30,28 +32,30 @@ from scenarios.suites.recipes import RECIPES, Slot, candidate, repeated
 from scenarios.tools.build.proving import proved
 
 CANDIDATES: Final = 6
-"""Candidates of a scenario."""
+"""Largest number of candidates of a scenario."""
 _MADE_BY: Final = "made-by.txt"
 _HANGS_S: Final = {"long-horizon": 900.0}
 _HANGS_SHORT_S: Final = 240.0
-"""A candidate that takes longer is given up: many times what it takes."""
+"""Timeout of a candidate, in seconds: many times its usual duration."""
 _BEGUN: Final = 2
-"""So often a candidate is begun: once it may have been stopped with the build, twice it ends its
-process."""
+"""Largest number of starts of a candidate. The first may end with the build; a second end is its
+own fault.
+"""
 _POLL_S: Final = 0.1
 _THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 class Kept(msgspec.Struct, frozen=True):
-    """A scenario that is kept, with its proof."""
+    """Accepted scenario with its proof."""
 
     scenario: Scenario
     proof: Proof
 
 
 class _Tried(msgspec.Struct, frozen=True):
-    """How far a slot has come. begun: how often the candidate after those that were dropped was
-    begun."""
+    """Progress of a slot. begun: number of starts of the current candidate, after the rejected
+    ones.
+    """
 
     dropped: tuple[Dropped, ...] = ()
     begun: int = 0
@@ -74,14 +78,16 @@ def build_suite(
     progress: Progress = ignore,
     only: Sequence[str] = (),
 ) -> tuple[Suite, Proofs]:
-    """Build a suite at a path, its proofs beside it; any number of processes makes the same.
+    """Build a suite at a path, with its proofs; the result does not depend on the number of
+    processes.
 
-    What is proved is kept in the folder OUT.parts until the suite is whole: call it again to go on.
-    tries: candidates of each scenario. only: names of scenarios, a part of the suite for a look at
-    it.
+    tries: candidates of each scenario.
+    only: names of scenarios, to build a part of the suite for inspection.
 
-    Raises SpecError with the scenarios for which no candidate did, RunError where OUT.parts is of
-    another version.
+    Proofs are stored in the folder OUT.parts until the suite is complete. Call it again to resume.
+
+    Raises SpecError with the scenarios whose candidates all failed. Raises RunError if OUT.parts is
+    of another version.
     """
     recipe = RECIPES[name]
     folder = out.with_suffix(".parts")
@@ -112,7 +118,7 @@ def build_suite(
 
 
 def _is_like(slot: Slot, slots: Sequence[Slot], only: Sequence[str]) -> bool:
-    """Whether a slot is repeated by one of those asked for."""
+    """Return whether a requested slot repeats this slot."""
     return any(other.like == slot.name and other.name in only for other in slots)
 
 
@@ -183,7 +189,7 @@ def _run(
                 ):
                     waiting.insert(0, (worker.piece, worker.restarts + 1))
     finally:
-        # Who stops the build does not use up a candidate.
+        # Stopping the build does not use up a candidate.
         for worker in working:
             worker.process.kill()
             worker.process.join()
@@ -220,7 +226,7 @@ def _started(piece: _Piece, folder: Path, tries: int) -> BaseProcess:
 
 
 def _work(piece: _Piece, folder: Path, tries: int) -> None:
-    """In a process of its own: prove the slots of a piece that are not over."""
+    """Prove the open slots of a piece, in a worker process."""
     for slot in piece.slots:
         if not _over(folder, slot, tries):
             _fill(slot, folder, tries)
@@ -283,7 +289,7 @@ def _tried(folder: Path, name: str) -> _Tried:
 
 
 def _over(folder: Path, slot: Slot, tries: int) -> bool:
-    """Whether a slot is filled, or all its candidates were tried."""
+    """Return whether a slot is filled, or all its candidates were tried."""
     if (folder / f"{slot.name}.json").exists():
         return True
     tried = _tried(folder, slot.name)
@@ -296,7 +302,7 @@ def _kept(folder: Path, slot: Slot) -> Kept | None:
 
 
 def _line(folder: Path, slot: Slot) -> str:
-    """What became of a slot, in words."""
+    """Describe the result of a slot."""
     kept = _kept(folder, slot)
     if kept is None:
         return f"{slot.name}: NOT SOLVED; {_in_words(_tried(folder, slot.name).dropped)}"

@@ -1,5 +1,7 @@
-"""What a shipped suite claims, as far as its file and its proofs tell: counts, hashes, ways,
-spread, no duplicates."""
+"""Claims of a shipped suite that need only its file and its proofs.
+
+They concern counts, hashes, routes, spread and duplicates.
+"""
 
 from __future__ import annotations
 
@@ -24,15 +26,17 @@ from scenarios.suites.unit import STRUCTURES, TURN_RAD, WAY_M, turn_rad
 from sumo_nets.maps.import_rules import WHEEL_PLACES
 
 _APART_M: Final = 5.0
-"""Two scenarios of one structure in one place start farther apart than this, or lead elsewhere."""
+"""Least distance between the starts of two scenarios of one structure in one place, in metres. They
+may be nearer if the scenarios lead elsewhere.
+"""
 _MOST_BYTES: Final = 3_000_000
-"""Of a suite's file and its proofs."""
+"""Largest size of a suite's file and its proofs, in bytes."""
 _EDGE_M: Final = 0.6
-"""Ways of drawn lengths are as much longer or shorter than wanted, at most."""
+"""Largest deviation of a drawn length from the wanted range, in metres."""
 _STRAIGHT_RAD: Final = math.radians(10.0)
 _SPEEDS_MPS: Final = (1.1, 1.65)
 _FEWEST_EVENTS: Final = 5
-"""Of each kind on the long ways."""
+"""Least number of events of each kind on the long routes."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +50,9 @@ class Read:
 
 
 def _counts(read: Read) -> Iterator[str]:
-    """As many scenarios of each structure as the recipe says, by its names, val and test."""
+    """Check that each structure and split has the number of scenarios in the recipe, with its
+    names.
+    """
     slots = {slot.name: slot for slot in RECIPES[read.suite.name].slots}
     found = {scenario.id: scenario for scenario in read.suite.scenarios}
     yield from (f"{name}: is missing" for name in slots if name not in found)
@@ -79,8 +85,9 @@ def _test(read: Read) -> list[Scenario]:
 
 
 def _hashes(read: Read) -> Iterator[str]:
-    """Each place with its net's hash, one in all scenarios; the suite with the hash that was
-    proved."""
+    """Check that each place has one net hash in all scenarios, and the suite the hash that was
+    proved.
+    """
     nets: dict[str, set[str]] = {}
     for scenario in read.suite.scenarios:
         nets.setdefault(scenario.place.name, set()).add(scenario.place.net_hash)
@@ -97,7 +104,7 @@ def _hashes(read: Read) -> Iterator[str]:
 
 
 def _proofs(read: Read) -> Iterator[str]:
-    """Each scenario with a proof of it as it stands, by one version of the expert."""
+    """Check that each scenario has a proof of its present state, by one version of the expert."""
     if read.proofs is None:
         yield f"{read.suite.name}: has no proofs that can be read"
         return
@@ -139,8 +146,10 @@ def _lengths(read: Read) -> Iterator[str]:
 
 
 def _structures(read: Read) -> Iterator[str]:
-    """Each is what its structure says: straight, round a corner, over a crosswalk without signals,
-    its own event."""
+    """Check that each scenario matches its structure.
+
+    It is straight, round a corner, over a crosswalk without signals, or has its own event.
+    """
     for one in read.suite.scenarios:
         turn = abs(turn_rad(one.route_line))
         kinds = [event.kind for event in one.events]
@@ -163,7 +172,9 @@ def _structures(read: Read) -> Iterator[str]:
 
 
 def _street_life(read: Read) -> Iterator[str]:
-    """Nobody and no vehicle but the event's people; on long ways people, vehicles and signals."""
+    """Check that short scenarios have only people of the event, and long ones people, vehicles and
+    signals.
+    """
     for one in read.suite.scenarios:
         crowd = one.crowd
         alone = (
@@ -178,8 +189,10 @@ def _street_life(read: Read) -> Iterator[str]:
 
 
 def _events(read: Read) -> Iterator[str]:
-    """Every kind on the long ways, several times; all at the paper's walking speeds, from either
-    side."""
+    """Check that long routes have every kind of event several times.
+
+    All events have walking speeds of the paper and come from either side.
+    """
     events = [(one, event) for one in read.suite.scenarios for event in one.events]
     for one, event in events:
         if not _SPEEDS_MPS[0] <= event.speed_mps <= _SPEEDS_MPS[1]:
@@ -242,7 +255,7 @@ def _spread(read: Read) -> Iterator[str]:
 
 
 def _shares(what: str, found: Sequence[str], wanted: Sequence[str], least: float) -> Iterator[str]:
-    """What of the wanted is rarer than a share."""
+    """Yield the wanted values that are rarer than a share."""
     for name in wanted if found else ():
         if (share := found.count(name) / len(found)) < least:
             yield f"{what} {name}: {share:.1%}, less than {least:.0%}"
@@ -261,7 +274,7 @@ def _duplicates(read: Read) -> Iterator[str]:
 
 
 def _ground(scenario: Scenario) -> str:
-    """What the coordinates of a scenario are of."""
+    """Return the place to which the coordinates of a scenario refer."""
     if isinstance(scenario.place, CityMap) and scenario.place.map in WHEEL_PLACES:
         return WHEEL_PLACES[scenario.place.map].net
     return scenario.place.name
@@ -300,5 +313,6 @@ CLAIMS: Final[Mapping[str, Callable[[Read], Iterator[str]]]] = MappingProxyType(
         "size": _size,
     }
 )
-"""Name -> what is wrong with it, one line each, beginning with the scenario's name where it is
-one's."""
+"""Checks by name. Each yields one line for each fault, beginning with the scenario's name if it
+concerns one.
+"""

@@ -1,5 +1,7 @@
-"""What a shipped suite claims that its places and its expert tell: nets, one walkable path, gaps,
-proofs to the bit."""
+"""Claims of a shipped suite that need its places and its expert.
+
+They concern nets, one walkable path, gaps, and bitwise equal proofs.
+"""
 
 from __future__ import annotations
 
@@ -28,14 +30,14 @@ PLACE_CLAIMS: Final = ("nets", "fits its place", "single path", "gaps", "proofs 
 
 
 class FalseClaim(NamedTuple):
-    """What is wrong. words: beginning with the scenario's name."""
+    """Violated claim. words: message that begins with the name of the scenario."""
 
     claim: str
     words: str
 
 
 class _Look(NamedTuple):
-    """What a process looks at. proofs: of those scenarios that are driven again."""
+    """Task of a process. proofs: of the scenarios that are driven again."""
 
     where: Place
     scenarios: tuple[Scenario, ...]
@@ -43,7 +45,7 @@ class _Look(NamedTuple):
 
 
 def sample_of(suite: Suite, count: int) -> list[Scenario]:
-    """So many scenarios of each structure, always the same of one suite."""
+    """Return `count` scenarios of each structure, always the same ones of a suite."""
     rng = np.random.default_rng(int(suite.content_hash, 16) % 2**32)
     by_structure: dict[str, list[Scenario]] = {}
     for scenario in suite.scenarios:
@@ -58,10 +60,10 @@ def sample_of(suite: Suite, count: int) -> list[Scenario]:
 def faults_in_places(
     scenarios: Sequence[Scenario], driven: Sequence[str], proofs: Proofs | None, jobs: int = 1
 ) -> Iterator[FalseClaim]:
-    """What is wrong with scenarios in their places. driven: names of those that the expert drives
-    again.
+    """Yield the violated claims of scenarios in their places.
 
-    jobs: processes, one for each place; a place whose process dies is a fault.
+    driven: names of the scenarios that the expert drives again.
+    jobs: processes, one for each place. A place whose process dies is a fault.
     """
     known = {proof.scenario: proof for proof in proofs.proofs} if proofs is not None else {}
     there: dict[Place, list[Scenario]] = {}
@@ -91,7 +93,7 @@ def faults_in_places(
 
 
 def _look(look: _Look) -> list[FalseClaim]:
-    """All faults in one place."""
+    """Return all violated claims in one place."""
     try:
         _, street_map = place(look.where)
     except CosimError as error:
@@ -119,7 +121,7 @@ def _look(look: _Look) -> list[FalseClaim]:
 
 
 def ways_left(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
-    """Why it is not so that exactly one walkable path leads to the goal of a long way."""
+    """Yield why a long route has not exactly one walkable path to its goal."""
     if scenario.structure != LONG_WAY:
         return
     half_width_m = robot_called(scenario.robot).width_m / 2 + WAY_SPARE_M
@@ -136,8 +138,10 @@ def ways_left(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
 
 
 def narrow_places(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
-    """Where obstacles leave less than the robot's width and half a metre; where none stand nothing
-    is claimed."""
+    """Yield where obstacles leave less than the width of the robot and half a metre.
+
+    Without obstacles nothing is claimed.
+    """
     if not scenario.obstacles:
         return
     try:
@@ -147,7 +151,7 @@ def narrow_places(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
 
 
 def _driven(scenario: Scenario, proofs: dict[str, Proof]) -> Iterator[str]:
-    """Whether the expert comes to the same state again."""
+    """Yield a message if the expert does not reach the same state again."""
     proof = proofs[scenario.id]
     again = proved(scenario, proof.expert)
     if isinstance(again, Dropped):

@@ -85,7 +85,7 @@ def proof_of(
     people_m: float = math.inf,
     obstacles_m: float = math.inf,
 ) -> Proof:
-    """What a solved episode proves. people_m, obstacles_m: inf where there were none."""
+    """Return the proof of a solved episode. people_m, obstacles_m: inf without any."""
     return Proof(
         scenario=scenario.id,
         scenario_hash=content_hash(scenario),

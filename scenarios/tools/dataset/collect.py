@@ -1,11 +1,11 @@
-"""collect: an expert drives scenarios, and what it does and a camera sees becomes a data set.
+"""Collect a data set of an expert that drives scenarios, with the pictures of a camera.
 
-OUT/collect.json      what is collected; another command is refused
-OUT/runs/00, 01 ..    run folders, with a demonstration of each episode that is kept; a further one
-                      where the expert did
-                      not solve enough. Once the data set is whole they may be deleted
-OUT/writing           a data set in the making
-OUT/meta, data, videos   the data set; meta comes last: with it, it is whole
+OUT/collect.json      options of the collection; other options are refused
+OUT/runs/00, 01 ..    run folders, with a demonstration of each accepted episode; another one is
+                      added if too few are solved. They may be deleted once
+                      the data set is complete
+OUT/writing           unfinished data set
+OUT/meta, data, videos   the data set; meta is written last and marks it as complete
 """
 
 from __future__ import annotations
@@ -54,8 +54,11 @@ _STAGE: Final = "writing the data set"
 
 
 class CollectSpec(msgspec.Struct, frozen=True, kw_only=True):
-    """What is collected: two with the same have the same data set. scenarios: of a suite, by id, in
-    order; or fresh ones. episodes: so many are to be kept."""
+    """Options of a collection: equal options give equal data sets.
+
+    scenarios: ids of a suite, in order, or new scenarios.
+    episodes: number of episodes in the data set.
+    """
 
     suite: str
     suite_hash: str = ""
@@ -73,7 +76,7 @@ class CollectSpec(msgspec.Struct, frozen=True, kw_only=True):
     versions: dict[str, str]
 
     def refuse_other(self, asked: CollectSpec, path: Path) -> None:
-        """Raises RunError, naming the first difference, where something else is asked for now."""
+        """Raise RunError, with the first difference, if the requested options differ."""
         for name in self.__struct_fields__:
             mine, theirs = getattr(self, name), getattr(asked, name)
             if isinstance(mine, msgspec.Struct) and isinstance(theirs, msgspec.Struct):
@@ -92,9 +95,14 @@ def _refuse(path: Path, name: str, mine: object, theirs: object) -> None:
 
 @dataclass(frozen=True)
 class Gathered:
-    """What came out. kept, rows: of the data set; run: episodes that were driven; dropped: why the
-    others are not in it, and how often; spare: so many more were solved than asked for; back: what
-    reading it back showed, None where it was whole before."""
+    """Result of a collection.
+
+    kept, rows: of the data set.
+    run: episodes that were driven.
+    dropped: numbers of excluded episodes by reason.
+    spare: solved episodes beyond the requested number.
+    back: result of reading the data set back, None if it was complete before.
+    """
 
     kept: int
     rows: int
@@ -105,7 +113,7 @@ class Gathered:
 
 
 _Showing = Callable[[Sequence[Scenario], set[str]], AbstractContextManager[MessageHandler]]
-"""Shows how a run goes: of these scenarios, of which some are done."""
+"""Display of a run. Arguments: its scenarios, and the names of those that are done."""
 
 
 def _unshown(
@@ -128,15 +136,19 @@ def collect(
     showing: _Showing = _unshown,
     progress: Progress = ignore,
 ) -> Gathered:
-    """Collect demonstrations into a folder; the same arguments give the same bytes, whatever
-    `jobs`, and however often it was stopped and went on with `resume`.
+    """Collect demonstrations into a folder.
 
-    source: scenarios, in order. episodes: so many are kept, all that are solved by default. policy:
-    what the expert is called by. options: seed, robot, goal, own_camera and camera are taken.
-    showing, progress: show how it goes.
+    The same arguments give the same bytes, for any `jobs` and any number of calls with `resume`.
 
-    Raises RunError for a folder of another data set, UsageError and SpecError for what cannot be
-    asked for, MachineError for what the machine lacks.
+    source: scenarios, in order.
+    expert: driver of the robot.
+    policy: name of the expert.
+    options: seed, robot, goal, own_camera and camera are used.
+    episodes: number of episodes in the data set; by default all that are solved.
+    showing, progress: display of the run.
+
+    Raises RunError for a folder of another data set. Raises UsageError and SpecError for invalid
+    arguments, and MachineError if the machine lacks a requirement.
     """
     check_parquet()
     policy = importable_name(policy)
@@ -205,7 +217,9 @@ class _Rounds:
         return () if isinstance(self.source, Fresh) else self.source.scenarios
 
     def asked(self, episodes: int, expert: PolicyCaller) -> CollectSpec:
-        """What is asked for, checked as far as can be without a place. Raises UsageError."""
+        """Return the requested options, checked as far as possible without a place. Raises
+        UsageError.
+        """
         some = self.all or _nowhere(self.source)
         whole = with_robot(
             Suite(name="asked", version="1", scenarios=tuple(some)), self.options.robot
@@ -234,7 +248,9 @@ class _Rounds:
     def opened(
         self, stack: ExitStack, number: int, taken: int, count: int
     ) -> tuple[RunFolder | None, Sequence[Scenario]]:
-        """The run folder of a round, and its scenarios; those that it has are not drawn anew."""
+        """Return the run folder of a round and its scenarios. Scenarios of an existing folder are
+        read.
+        """
         path = self.out / _RUNS / f"{number:02d}"
         if begun := (path / "run.json").exists():
             suite = read_suite(path / "scenarios.json")
@@ -259,7 +275,7 @@ class _Rounds:
     def run(
         self, held: RunFolder, scenarios: Sequence[Scenario], hello: Hello, showing: _Showing
     ) -> None:
-        """Drive what is not driven yet."""
+        """Drive the missing episodes."""
         done = held.finished()
         todo = [one for one in scenarios if one.id not in done]
         if todo:
@@ -270,7 +286,9 @@ class _Rounds:
 
 
 def _nowhere(source: Suite | Fresh) -> list[Scenario]:
-    """A scenario of fresh ones before any is drawn: for what is checked of robot and camera."""
+    """Return a placeholder for new scenarios before any is drawn, for checks of robot and
+    camera.
+    """
     name = source.kind if isinstance(source, Fresh) else source.name
     route = ((0.0, 0.0), (12.0, 0.0))
     return [
@@ -313,7 +331,7 @@ def _open(out: Path, spec: CollectSpec, resume: bool) -> None:
 
 
 def _kept(held: RunFolder, scenarios: Sequence[Scenario], dropped: Counter[str]) -> list[Collected]:
-    """The episodes of a run of which there is a demonstration, in the order of its scenarios."""
+    """Return the episodes of a run with a demonstration, in the order of its scenarios."""
     found = []
     for scenario in scenarios:
         folder = held.episode_folder(scenario.id)
@@ -336,7 +354,7 @@ def _loaded(path: Path) -> Demonstration:
 
 
 def _why(record: Record) -> str:
-    """Why an episode is not kept, in a few words."""
+    """Return a short reason for excluding an episode."""
     if record.status != "done":
         return record.status
     if record.failures:

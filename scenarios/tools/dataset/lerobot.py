@@ -1,12 +1,13 @@
-"""A data set as the lerobot package reads it (`codebase_version` v3.0): what stands in which file.
+"""Data set in the format of the lerobot package (`codebase_version` v3.0), with these files.
 
 meta/info.json                       features by name and shape, rate, paths
 meta/stats.json                      of each feature: min, max, mean, std, count and quantiles
 meta/tasks.parquet                   the instructions
-meta/episodes/chunk-000/file-000.parquet   of each episode: length, where its rows and pictures are,
-                                           statistics; also
-                                     scenario, structure, place, seed and state hash
-meta/cosim.json                      how it was collected
+meta/episodes/chunk-000/file-000.parquet   of each episode: length, place of rows and pictures,
+                                     statistics, scenario,
+                                     structure, place, seed and
+                                     state hash
+meta/cosim.json                      options of the collection
 data/chunk-000/file-000.parquet      the rows
 videos/<key>/chunk-000/file-000.mp4  the pictures, one for each row, in its order, at index / rate
                                      seconds
@@ -37,7 +38,7 @@ _FILE: Final = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 _DATA_PATH: Final = f"data/{_FILE}.parquet"
 _VIDEO_PATH: Final = f"videos/{{video_key}}/{_FILE}.mp4"
 _TASK: Final = "Follow the sidewalk to the goal."
-"""Of rows whose goal is not an instruction."""
+"""Task of rows whose goal is not an instruction."""
 _EPISODES_PATH: Final = f"meta/episodes/{_FILE}.parquet"
 _FIRST_FILE: Final = {"chunk_index": 0, "file_index": 0}
 _CHUNK: Final = 1000
@@ -49,7 +50,7 @@ _SPEEDS: Final = ("v_mps", "w_radps")
 
 @dataclass(frozen=True)
 class Collected:
-    """An episode that is kept. load: its demonstration, read anew each time."""
+    """Accepted episode. load: reads its demonstration from the disk at each call."""
 
     scenario: Scenario
     record: Record
@@ -122,7 +123,7 @@ def write_lerobot(
 
 
 class _Place(NamedTuple):
-    """Where an episode is. columns: as `meta/episodes` tells it."""
+    """Position of an episode in the files. columns: as in `meta/episodes`."""
 
     chunk: int
     file: int
@@ -152,7 +153,7 @@ def _places(
 
 
 def _told(one: Collected) -> dict[str, Any]:
-    """What `meta/episodes` tells of an episode besides what the format asks for."""
+    """Return the columns of an episode in `meta/episodes` beyond those of the format."""
     scenario = one.scenario
     return {
         "scenario": scenario.id,
@@ -211,7 +212,7 @@ def _rows(
 
 
 def _features(rows: dict[str, Any], filmed: Filmed) -> dict[str, Any]:
-    """What info.json tells of each feature."""
+    """Return the features of info.json."""
     wide, high = filmed.size
     points = rows["waypoints"].type.list_size // 2
     named: dict[str, Sequence[str]] = {
@@ -250,7 +251,7 @@ def _features(rows: dict[str, Any], filmed: Filmed) -> dict[str, Any]:
 
 
 def _films(sizes: Sequence[int]) -> list[tuple[int, int]]:
-    """Which episodes go into one film, first and end: as many as fit, one at least."""
+    """Return the first and end episode of each film: as many as fit, at least one."""
     found = []
     first = 0
     size = 0

@@ -25,13 +25,19 @@ from scenarios.tools.dataset.lerobot import CODEBASE_VERSION, Collected
 
 _READING: Final = "reading the pictures"
 _ALIKE: Final = 8.0
-"""Of 255: the means of a picture's areas, read back and as drawn, differ by less on the mean."""
+"""Largest mean difference between the area means of a picture as read back and as drawn, of 255."""
 
 
 @dataclass(frozen=True)
 class DataSet:
-    """A data set on the disk. info: of info.json; about: how it was collected; rows: its columns;
-    films: of its videos the files, in order; episodes: of each its `scenario` and `structure`."""
+    """Data set on the disk.
+
+    info: content of info.json.
+    about: options of its collection.
+    rows: its columns.
+    films: files of its videos, in order.
+    episodes: `scenario` and `structure` of each.
+    """
 
     folder: Path
     info: dict[str, Any]
@@ -67,7 +73,7 @@ class DataSet:
 
 
 def read_data_set(folder: Path) -> DataSet:
-    """A data set but for its pictures. Raises RunError naming what is missing."""
+    """Read a data set without its pictures. Raises RunError with the missing part."""
     info_path = folder / "meta/info.json"
     try:
         info = json.loads(info_path.read_text(encoding="utf-8"))
@@ -103,9 +109,12 @@ def read_data_set(folder: Path) -> DataSet:
 
 @dataclass(frozen=True)
 class ReadBack:
-    """What came out of reading a data set back. rows, pictures: of each as many; off, off_next: by
-    how much the pictures differ from those that were drawn for their rows, and for the rows after
-    these, of 255, on the mean."""
+    """Result of reading a data set back.
+
+    rows: number of rows, which is also that of pictures.
+    off: mean difference of the pictures from those drawn for their rows, of 255.
+    off_next: the same for the rows after these.
+    """
 
     rows: int
     off: float
@@ -113,8 +122,10 @@ class ReadBack:
 
 
 def read_back(folder: Path, episodes: Sequence[Collected], progress: Progress = ignore) -> ReadBack:
-    """Hold rows and pictures of a data set against what was kept of its episodes. Raises RunError
-    where a number is another, or a picture is not that of its row."""
+    """Compare rows and pictures of a data set with the demonstrations of its episodes.
+
+    Raises RunError if a number differs, or a picture is not that of its row.
+    """
     held = read_data_set(folder)
     pictures = held.pictures()
     total = np.zeros(2)
@@ -155,7 +166,7 @@ def read_back(folder: Path, episodes: Sequence[Collected], progress: Progress = 
 
 
 _SAME: Final = ("rate_hz", "waypoint_s", "waypoints", "goal", "camera", "robot")
-"""What makes data sets fit into one file."""
+"""Requirement for data sets that are merged into one file."""
 
 
 def packed_sets(

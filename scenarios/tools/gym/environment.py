@@ -34,25 +34,28 @@ from scenarios.tools.gym.spaces import (
 from scenarios.tools.viewing.look import eye_behind
 
 _Told = dict[str, Any]
-"""What a step tells beside what is seen."""
+"""Info of a step."""
 
 _RENDER_MODES: Final = ["rgb_array"]
 _RENDERED: Final = CameraSpec(640, 360, 62.0)
 
 
 class SidewalkEnv(gymnasium.Env[SeenParts, NDArray[Any]]):
-    """Drives scenarios, each in engines of its own. Made by `cosim.make_env`, which see.
+    """Gymnasium environment that runs each scenario in new engines. See `cosim.make_env`.
 
-    `reset(seed=)` settles which scenarios follow and all that is drawn in them;
-    `options={"scenario": "straight-001"}` chooses one. A step ends `terminated` at the goal, before
-    a stopping hand, and by a failure where the scenario ends on failures; `truncated` when its time
-    is over. What ends on nothing else goes on after a failure: the robot is put back, which
-    `info["put_back"]` tells.
+    `reset(seed=)` fixes the following scenarios and everything that is drawn in them.
+    `options={"scenario": "straight-001"}` chooses one.
 
-    info: of each step `scenario`, `time_s`, `put_back`, `failures` (how many in this step); of the
-    last one also `record`, which is what a run keeps of such an episode without its wall times,
-    `metrics` by name and `is_success`. transition: of the last step, what the reward was made of.
-    One at a time drives in a process where there are people or vehicles, because SUMO runs once in
+    A step ends `terminated` at the goal, before a stopping hand, and by a failure if the scenario
+    ends on failures. It ends `truncated` at the time limit. In other scenarios the robot is put
+    back after a failure, and `info["put_back"]` is true.
+
+    info: each step has `scenario`, `time_s`, `put_back` and `failures`, their number in this step.
+    The last one also has `record`, as in a run but without wall times, `metrics` by name, and
+    `is_success`.
+    transition: input of the reward in the last step.
+
+    Only one environment with people or vehicles can run in a process, because SUMO runs once in
     each.
     """
 
@@ -175,7 +178,7 @@ class SidewalkEnv(gymnasium.Env[SeenParts, NDArray[Any]]):
 
 
 def _outcome(record: Record) -> _Told:
-    """What is told at the end of an episode."""
+    """Return the final info of an episode."""
     metrics = {name: value for name, value in record.measures.items() if value is not None}
     told = msgspec.structs.replace(record, clock={})
     return {"record": told, "metrics": metrics, "is_success": metrics.get("success") == 1.0}

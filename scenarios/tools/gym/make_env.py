@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     from scenarios.tools.gym.spaces import Actions
 
 LEARNER: Final = Manifest("learner", goal="route_point")
-"""What a learner is given unless it says otherwise: a picture of 96 x 96 four times a second, the
-next sub-goal."""
+"""Default manifest of a learner: a picture of 96 x 96 pixels four times a second, the next
+sub-goal.
+"""
 
 
 def make_env(
@@ -36,20 +37,22 @@ def make_env(
     options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
     render_mode: str | None = None,
 ) -> SidewalkEnv:
-    """An environment of Gymnasium (extra `[gym]`) of the scenarios of a suite, for a learner with
-    this manifest.
+    """Make a Gymnasium environment (extra `[gym]`) of the scenarios of a suite.
 
-    suite: one that was loaded, or a name or path as for `load_suite`. manifest: what is observed
-    and how often, as for any policy, so that what was learned can be run with it; see
-    `scenarios.tools.gym.spaces.seen_space` for the names. scenarios, events: only these ids, only
-    these kinds of events. split: of which scenarios are drawn; None for all, `test` too. actions:
-    "command" or "waypoints"; see `scenarios.tools.gym.spaces.action_space_of`. reward: what a step
-    is worth, a function of a `scenarios.tools.gym.reward.Transition`. options: how episodes are
-    run; without a seed in them each draws its own from that of `reset`. No engine starts before
+    suite: a loaded suite, or a name or path as for `load_suite`.
+    manifest: observations and their rate, as for any policy, so that the learned policy can run
+    with it. See `scenarios.tools.gym.spaces.seen_space` for the names.
+    scenarios, events: only these ids, only these kinds of events.
+    split: split of the scenarios; None for all, including `test`.
+    actions: "command" or "waypoints"; see `scenarios.tools.gym.spaces.action_space_of`.
+    reward: reward of a step, a function of a `scenarios.tools.gym.reward.Transition`.
+    options: options of the episodes. Without a seed each episode draws its own from that of
     `reset`.
 
-    Raises UsageError for names and options that there are none of, for what the robot or Gymnasium
-    cannot give, and where Gymnasium is not installed.
+    No engine starts before `reset`.
+
+    Raises UsageError for unknown names and options, for inputs that the robot or Gymnasium lacks,
+    and if Gymnasium is not installed.
 
     >>> blind = Manifest("blind", camera=None, goal="route_point")
     >>> with make_env("unit", blind, scenarios=["straight-001"]) as env:

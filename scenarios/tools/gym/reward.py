@@ -16,20 +16,26 @@ from cosim.results.referee import Ended, Failure, Verdict
 from cosim.spec.scenario import Scenario
 
 _NEAR_M: Final = 1.2
-"""Of personal space, between the middles of robot and person (`personal_space_violation`)."""
+"""Radius of personal space, between the centres of robot and person
+(`personal_space_violation`).
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Transition:
-    """What happened in one period, from one answer to the next: all that a reward is made of.
+    """Input of a reward: the period from one answer to the next.
 
-    period_s: how long it was, shorter at the end of an episode. robot, route_s_m: at its end,
-    before the robot is put back where it failed; command: the last one that held. progress_m: along
-    the reference route, negative backwards; being put back is none. acceleration_mps2,
-    turn_acceleration_radps2: root mean squares over its ticks. nearest_person_m: the least distance
-    between the middles of robot and a person, infinite where nobody is. failures: that the referee
-    counts; walked_into: contacts that people are at fault for; red_light_entries: crossings entered
-    at red. ended: how the episode ended, if it did.
+    period_s: duration, shorter at the end of an episode.
+    robot, route_s_m: at the end of the period, before the robot is put back after a failure.
+    command: the last one that was applied.
+    progress_m: along the reference route, negative backwards, without being put back.
+    acceleration_mps2, turn_acceleration_radps2: root mean squares over the ticks.
+    nearest_person_m: least distance between the centres of robot and a person, infinite without
+    people.
+    failures: failures that the referee counts.
+    walked_into: contacts that are the fault of people.
+    red_light_entries: crossings entered at red.
+    ended: reason for the end of the episode, if it ended.
     """
 
     scenario: Scenario
@@ -51,10 +57,15 @@ Reward = Callable[[Transition], float]
 
 
 def usual_reward(happened: Transition) -> float:
-    """The sum of: 1 a metre along the route; -0.1 a second; -0.05 of each m/s2 and each rad/s2 a
-    second (comfort); -0.5 a second, growing with nearness, within 1.2 m of a person; -2 for a red
-    light; -10 for each failure, and for having passed a stopping hand; 10 at the goal, or for
-    having stopped before that hand.
+    """Return the default reward, the sum of:
+
+    1 a metre along the route
+    -0.1 a second
+    -0.05 of each m/s2 and each rad/s2 a second (comfort)
+    -0.5 a second, growing with nearness, within 1.2 m of a person
+    -2 for a red light
+    -10 for each failure, and for passing a stopping hand
+    10 at the goal, or for stopping before that hand
     """
     time_s = happened.period_s
     jerking = happened.acceleration_mps2 + happened.turn_acceleration_radps2
@@ -83,7 +94,7 @@ class Period:
         self._ticks.append((step, verdict))
 
     def transition(self) -> Transition:
-        """What happened since the last one was asked for."""
+        """Return the transition since the last call."""
         ticks = self._ticks
         self._ticks = []
         steps, verdicts = [step for step, _ in ticks], [verdict for _, verdict in ticks]
@@ -114,7 +125,7 @@ class Period:
 
 
 def _nearest_m(step: Step) -> float:
-    """From the middle of the robot to that of the nearest person at the end of a tick."""
+    """Return the distance between the centres of robot and nearest person at the end of a tick."""
     people = step.street_after.people
     if not len(people):
         return math.inf

@@ -1,9 +1,8 @@
-"""What a learner sees and does, as Gymnasium's spaces: an Observation as a dictionary of arrays, an
-array as an answer.
+"""Observations and actions of a learner as Gymnasium spaces: a dictionary of arrays and an array.
 
-What is seen is what the manifest asks for, as a policy of the benchmark gets it: units, frames and
-shapes are those of `cosim.episode.interfaces.Observation`. Numbers beyond the bounds of their space
-are put at the bound.
+The manifest chooses the observations, as for a policy of the benchmark. Units, frames and shapes
+are those of `cosim.episode.interfaces.Observation`. Numbers outside the bounds of their space are
+clipped.
 """
 
 from __future__ import annotations
@@ -26,18 +25,23 @@ from cosim.spec.robot import Robot
 
 Actions = Literal["command", "waypoints"]
 SeenParts = dict[str, Any]
-"""What a learner sees: arrays, and a text where the goal is an instruction."""
+"""Observation of a learner: arrays, and a text if the goal is an instruction."""
 
 _FARTHEST_M: Final = 10_000.0
 
 
 def seen_space(manifest: Manifest, robots: Sequence[Robot]) -> spaces.Dict:
-    """The space of what is seen: always `speeds` (2,), m/s and rad/s; `picture`, `depth`, `labels`
-    where there is a camera with these, `picture_NAME` and so on for each further one; `goal` as the
-    protocol has it, a point as (2,) metres ahead and to the left; `odometry` (3,), or (2,) without
-    a heading. robots: which may drive.
+    """Return the space of observations.
 
-    Raises UsageError for a manifest that asks for what only the simulator knows.
+    robots: robots of the scenarios.
+
+        speeds            (2,), m/s and rad/s
+        picture, depth, labels   of the camera, where it has them
+        picture_NAME, ...        of each further camera
+        goal              as in the protocol; a point is (2,) metres ahead and to the left
+        odometry          (3,), or (2,) without a heading
+
+    Raises UsageError for a manifest with inputs that only the simulator knows.
     """
     if manifest.privileged:
         raise UsageError(
@@ -73,11 +77,14 @@ def seen_by(observation: Observation, space: spaces.Dict) -> SeenParts:
 
 
 def action_space_of(actions: Actions, manifest: Manifest, robots: Sequence[Robot]) -> spaces.Box:
-    """The space of answers. `command`: (2,) forward speed in m/s, from 0, and yaw rate in rad/s,
-    left positive. `waypoints`: (N, 2) ahead and to the left, in the unit of the manifest, the last
-    of which is the one followed.
+    """Return the space of actions.
 
-    Raises UsageError."""
+    `command`: (2,) forward speed in m/s, from 0, and yaw rate in rad/s, left positive.
+    `waypoints`: (N, 2) ahead and to the left, in the unit of the manifest. The last one is
+    followed.
+
+    Raises UsageError.
+    """
     v_mps, w_radps = max(one.v_max_mps for one in robots), max(one.w_max_radps for one in robots)
     if actions == "command":
         return spaces.Box(
@@ -92,8 +99,11 @@ def action_space_of(actions: Actions, manifest: Manifest, robots: Sequence[Robot
 def action_as_answer(
     action: NDArray[np.floating[Any]], space: spaces.Box
 ) -> Command | NDArray[np.floating[Any]]:
-    """What a policy would answer. Raises UsageError for an array of another shape than the space's,
-    PolicyError for one with more numbers than an answer may hold."""
+    """Convert an action to the answer of a policy.
+
+    Raises UsageError for an array of another shape than the space's. Raises PolicyError for one
+    with more numbers than an answer may hold.
+    """
     array = np.asarray(action)
     check_numbers(array.shape)
     if array.shape != space.shape:
@@ -113,7 +123,7 @@ def _pixels(shape: tuple[int, ...], most: int = 255) -> spaces.Box:
 
 
 def _cameras(manifest: Manifest) -> list[tuple[str, CameraSpec]]:
-    """How the names of each camera's pictures end, and what it is."""
+    """Return the name suffix of each camera's pictures, and the camera."""
     own = [] if manifest.camera is None else [("", manifest.camera)]
     return own + [(f"_{name}", spec) for name, spec in manifest.cameras.items()]
 

@@ -1,1 +1,1 @@
-"""What users of a policy get wrong and never notice, asked of the policy itself as a black box."""
+"""Black-box checks of a policy for mistakes that its users easily overlook."""

@@ -1,5 +1,4 @@
-"""Checks of the answers themselves: can they be driven, and does nothing but what is asked about
-change them."""
+"""Checks of the answers: they can be driven, and only relevant inputs change them."""
 
 from __future__ import annotations
 
@@ -15,14 +14,16 @@ from scenarios.tools.policy_check.outcome import CheckOutcome, doubted, failed, 
 from scenarios.tools.policy_check.query import ROUNDING, Asker, apart
 
 _FAST: Final = 1.5
-"""Times the robot's top speed: faster is no speed that anybody meant."""
+"""Ratio to the top speed of the robot above which a speed is certainly a mistake."""
 _SLOW_MPS: Final = 0.12
 _SPIN_RADPS: Final = 5.0
 _ASIDE_RAD: Final = math.radians(60.0)
 
 
 def finite(asker: Asker) -> CheckOutcome:
-    """Numbers that can be driven, also for a black and a white picture and a robot that stands."""
+    """Answers are numbers that can be driven, also for a black or white picture and a robot at
+    rest.
+    """
     asked = [(scene, "") for scene in SCENES]
     asked += [("straight", name) for name in ("black", "white", "standing")]
     edits = {"black": ALL_BLACK, "white": ALL_WHITE, "standing": AT_REST}
@@ -90,7 +91,7 @@ def put_back(asker: Asker) -> CheckOutcome:
 
 
 def time_step(asker: Asker) -> CheckOutcome:
-    """What time it is changes nothing: only the steps between observations can."""
+    """The absolute time changes nothing: only the steps between observations can."""
     differ = apart(asker.answer("left"), asker.answer("left", LATER))
     if differ > ROUNDING:
         return failed(
@@ -154,7 +155,7 @@ def behind(asker: Asker) -> CheckOutcome:
 
 
 def constant(asker: Asker) -> CheckOutcome:
-    """It answers something else to something else."""
+    """Different observations give different answers."""
     manifest = asker.manifest
     if manifest.camera is None and manifest.goal == "none" and not manifest.privileged:
         return inapplicable("it is told nothing that it could answer to")
@@ -168,7 +169,7 @@ def constant(asker: Asker) -> CheckOutcome:
 
 
 def example(asker: Asker) -> CheckOutcome:
-    """The graph of a bundle tells what its authors saw it tell."""
+    """The graph of a bundle reproduces the example of its authors."""
     from cosim.policies.onnx.policy import OnnxPolicy, example_differences
 
     policy = asker.policy

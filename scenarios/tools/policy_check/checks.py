@@ -63,15 +63,20 @@ POLICY_CHECKS: Final[Mapping[str, Callable[[Asker], CheckOutcome]]] = MappingPro
         "goal_ignored": goal_ignored,
     }
 )
-"""In the order in which they are asked: what a crash or chance would spoil comes first."""
+"""Checks in their order. Those of crashes and randomness come first, since both spoil the
+others.
+"""
 
 _BY_CHANCE: Final = ("finite", "example", "determinism", "unit", "behind")
-"""What can be told of a policy that does not answer the same twice."""
+"""Checks that apply to a policy whose answers are random."""
 
 
 class CheckedPolicy(NamedTuple):
-    """What came out, by the names of checks. asker: who may ask more. answer_ms: the median of what
-    its answers took, without first ones."""
+    """Outcomes by the names of the checks.
+
+    asker: for further queries.
+    answer_ms: median duration of the answers, without first ones, in milliseconds.
+    """
 
     asker: Asker
     outcomes: Mapping[str, CheckOutcome]

@@ -48,20 +48,23 @@ SCENES: Final[Mapping[SceneName, str]] = MappingProxyType(
     }
 )
 _SHOWN: Final = "straight-001"
-"""Of `unit`."""
+"""Scenario of the suite `unit` whose place is shown."""
 _SPEED_MPS: Final = 1.0
 _ASKEW_RAD: Final = math.radians(20.0)
 _ASIDE_M: Final = 0.5
-"""So far beside the middle of the sidewalk who drives askew is when the newest picture is taken."""
+"""Distance from the middle of the sidewalk at the newest picture of an askew drive, in metres."""
 _PERSON_M: Final = 3.0
 _FARTHEST_BACK_M: Final = 4.5
-"""What was seen from before there was seen standing."""
+"""Largest distance before the newest picture, in metres. In older observations the robot is at
+rest.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """What a policy would be given, one observation for each of its answers, oldest first; by the
-    goals of its run."""
+    """Observations for a policy, one for each of its answers, oldest first, with the goals of its
+    run.
+    """
 
     scene: SceneName
     seen: tuple[Observation, ...]
@@ -74,8 +77,10 @@ def drives_for(
     own_camera: bool = False,
     progress: Progress = ignore,
 ) -> dict[SceneName, Drive]:
-    """All scenes, `count` observations of each. Raises UsageError for a camera that the robot does
-    not have."""
+    """Return the drives of all scenes with `count` observations each.
+
+    Raises UsageError for a camera that the robot lacks.
+    """
     (shown,) = (one for one in load_suite("unit").scenarios if one.id == _SHOWN)
     shown = msgspec.structs.replace(shown, obstacles=())
     check_camera(manifest, robot_called(shown.robot), own_camera)
@@ -87,7 +92,7 @@ def drives_for(
 
 
 def _pose(route: Polyline, scene: SceneName, back_m: float) -> Pose:
-    """Where the robot is `back_m` before its newest picture."""
+    """Return the pose of the robot `back_m` before its newest picture."""
     middle = route.at(0.5 * route.length_m)
     side = {"left": -1.0, "right": 1.0}.get(scene, 0.0)
     heading = wrap_angle(middle.heading_rad + side * _ASKEW_RAD)
@@ -147,7 +152,7 @@ def _drive(
 
 
 def _somebody(route: Polyline, s_m: float) -> People:
-    """One adult who stands on the middle of the way and looks at the robot."""
+    """Return one adult in the middle of the way, facing the robot."""
     pose = route.at(s_m)
     return People.of(
         ("somebody",),

@@ -1,5 +1,6 @@
-"""What is changed of a drive before a policy is asked: mirrored, other colours, other goals, other
-pictures."""
+"""Edits of a drive before a policy is queried: mirrored, or with other colours, goals or
+pictures.
+"""
 
 from __future__ import annotations
 
@@ -18,9 +19,9 @@ from cosim.spec.camera import Calibration, CameraPicture, flipped
 from cosim.spec.goal import Goal
 
 _MIRROR: Final = np.diag([1.0, -1.0, 1.0, 1.0])
-"""Left becomes right in the robot's frame."""
+"""Transformation that exchanges left and right in the frame of the robot."""
 _MIRROR_PX: Final = np.diag([-1.0, 1.0, 1.0, 1.0])
-"""The same in a camera's."""
+"""Transformation that exchanges left and right in the frame of a camera."""
 Observations = Sequence[Observation]
 
 
@@ -32,12 +33,12 @@ class Edit(NamedTuple):
 
 
 def of_each(name: str, change: Callable[[Observation], Observation]) -> Edit:
-    """A change of every observation by itself."""
+    """Return an edit that changes each observation separately."""
     return Edit(name, lambda seen: [change(one) for one in seen])
 
 
 def in_mirror(seen: Observation) -> Observation:
-    """What the robot would see, be told and do in a mirror: left is right."""
+    """Mirror an observation: left and right are exchanged."""
     odometry = seen.odometry
     if odometry is not None:
         heading = None if odometry.heading_rad is None else -odometry.heading_rad
@@ -71,7 +72,7 @@ def with_goal_told(name: str, goal: Goal | None) -> Edit:
 
 
 def with_pictures(name: str, paint: Callable[[NDArray[np.uint8]], NDArray[np.uint8]]) -> Edit:
-    """All pictures, that of the goal as well, painted anew."""
+    """Return an edit that repaints all pictures, including that of the goal."""
 
     def painted(seen: Observation) -> Observation:
         goal = None if seen.goal is None else seen.goal.painted(paint)
@@ -100,8 +101,11 @@ LATER: Final = of_each(
 
 
 def showing(name: str, other: Observations, ages: Sequence[int] | None = None) -> Edit:
-    """The pictures of another drive, in all observations or in those of so many answers ago;
-    nothing else of it."""
+    """Return an edit that shows the pictures of another drive.
+
+    ages: ages of the replaced observations, in answers; None for all. All other fields are
+    unchanged.
+    """
 
     def change(seen: Observations) -> list[Observation]:
         edited = list(seen)
@@ -121,8 +125,7 @@ def _seeing(mine: Observation, theirs: Observation) -> Observation:
 def then(
     first: Observations, second: Observations, clock: Clock, rate_hz: float
 ) -> list[Observation]:
-    """One drive, and after it, in the same episode, the robot is put at the beginning of
-    another."""
+    """Join two drives in one episode: the robot is put back to the start of the second one."""
     period = round(1.0 / (rate_hz * clock.tick_s))
     moved = []
     for number, one in enumerate(second):

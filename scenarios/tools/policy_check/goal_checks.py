@@ -106,7 +106,7 @@ def _told(asker: Asker, goal: str) -> Answered:
 
 
 def _without(asker: Asker) -> CheckOutcome | None:
-    """Why a check of goals does not apply, if it does not."""
+    """Return the outcome of a goal check that does not apply, else None."""
     kind = GOALS[asker.manifest.goal]
     return (
         inapplicable(f"its goal says nothing of where to go: {kind.summary}")

@@ -1,4 +1,4 @@
-"""What comes out of a check."""
+"""Outcome of a check."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ CheckEnded = Literal["passed", "warning", "failed", "does not apply"]
 
 
 class CheckOutcome(NamedTuple):
-    """An outcome, and why, in words."""
+    """Outcome of a check, with its reason."""
 
     outcome: CheckEnded
     words: str
@@ -19,7 +19,7 @@ def passed(words: str) -> CheckOutcome:
 
 
 def doubted(words: str) -> CheckOutcome:
-    """What may be right, and is to be looked at."""
+    """Return the outcome of a check that may be right and needs a look."""
     return CheckOutcome("warning", words)
 
 

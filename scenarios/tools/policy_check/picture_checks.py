@@ -1,5 +1,4 @@
-"""Checks of what a policy makes of its pictures. Goals tell nothing of where to turn in all of
-them."""
+"""Checks of how a policy uses its pictures. Goals contain no turn in any of them."""
 
 from __future__ import annotations
 
@@ -14,14 +13,14 @@ from scenarios.tools.policy_check.outcome import CheckOutcome, doubted, failed, 
 from scenarios.tools.policy_check.query import ROUNDING, Answered, Asker, apart
 
 _OLDER: Final = 3.0
-"""Times the newest picture's weight: an older one that counts for more stands in its place."""
+"""Ratio to the weight of the newest picture above which an older one is taken for the newest."""
 _LEFTOVER: Final = 3.0
 _CLEAR_RAD: Final = 0.05
 _READS_RAD: Final = 0.1
 _BRAKES: Final = 0.15
 _HARDLY: Final = 0.01
 _AGREE: Final = 6.0
-"""What it does in the street and what it does in its mirror differ by less than this factor."""
+"""Largest ratio between the reactions in the street and in its mirror."""
 _ASKEW: Final[tuple[SceneName, ...]] = ("left", "right")
 _MET: Final[tuple[SceneName, ...]] = ("straight", "person")
 
@@ -53,7 +52,7 @@ def picture_ignored(asker: Asker) -> CheckOutcome:
 
 
 def frame_order(asker: Asker) -> CheckOutcome:
-    """The newest picture counts: no older one stands in its place."""
+    """The newest picture counts: it is not confused with an older one."""
     if none := _blind(asker):
         return none
     drive = asker.drives["left"]
@@ -85,7 +84,7 @@ def frame_order(asker: Asker) -> CheckOutcome:
 
 
 def colour_order(asker: Asker) -> CheckOutcome:
-    """It reads the street in its own colours, not better with red and blue exchanged."""
+    """The policy reads the street in its own colours, not better with red and blue exchanged."""
     if none := _blind(asker):
         return none
     if (
@@ -142,8 +141,7 @@ def street_mirrored(asker: Asker) -> CheckOutcome:
 
 
 def side(asker: Asker) -> CheckOutcome:
-    """Where the sidewalk leads to the left it turns farther to the left than where it leads to the
-    right."""
+    """The policy turns farther to the left if the sidewalk leads left than if it leads right."""
     if none := _blind(asker) or _aside(asker):
         return none
     reads = _steers(asker)
@@ -162,7 +160,7 @@ def side(asker: Asker) -> CheckOutcome:
 
 
 def person(asker: Asker) -> CheckOutcome:
-    """Somebody who stands in the way changes the answer."""
+    """A person in the way changes the answer."""
     if none := _blind(asker):
         return none
     clear, stands = asker.answer("straight", asker.plain), asker.answer("person", asker.plain)
@@ -173,8 +171,10 @@ def person(asker: Asker) -> CheckOutcome:
 
 
 def _steers(asker: Asker, *edits: Edit) -> tuple[float, float]:
-    """How much farther to the left it turns where the way leads left than where it leads right; and
-    in a mirror."""
+    """Return how much farther left the policy turns on a left way than on a right way.
+
+    The second value is the same in a mirror.
+    """
     turns = [
         [asker.answer(s, asker.plain, *more, *edits).turn_rad for s in _ASKEW]
         for more in _both(asker)

@@ -1,5 +1,4 @@
-"""Asking a policy about a drive, as an episode of its own: what it answers, before the robot's
-limits are put on it."""
+"""Query a policy about a drive in a separate episode, before the limits of the robot apply."""
 
 from __future__ import annotations
 
@@ -23,17 +22,20 @@ from scenarios.tools.policy_check.edits import Edit, with_goal_told
 
 _SEED: Final = 1
 _LEAST: Final = 0.1
-"""Answers of less than this (metres of a waypoint, or metres and radians in a second) are compared
-with it."""
+"""Least size with which an answer is compared: metres of a waypoint, or metres and radians in a
+second.
+"""
 ROUNDING: Final = 1e-4
-"""Answers that differ by this share at most are the same: one device, another order of sums."""
+"""Largest relative difference of equal answers: one device may sum in another order."""
 
 
 @dataclass(frozen=True, slots=True)
 class Answered:
-    """What a policy answered: how fast it wants to drive, and how far it wants to turn: the bearing
-    of the waypoint that is followed, or what it turns in a second. waypoints: (N, 2) or (N, 4) in
-    metres; None for a command, also for one with a plan beside it, which nobody drives."""
+    """Answer of a policy: its speed and its turn.
+
+    turn_rad: bearing of the waypoint that is followed, or the yaw rate of a command.
+    waypoints: (N, 2) or (N, 4) in metres; None for a command, also if it comes with a plan.
+    """
 
     v_mps: float
     turn_rad: float
@@ -41,7 +43,7 @@ class Answered:
 
     @property
     def degrees(self) -> str:
-        """The turn in words."""
+        """The turn as text."""
         turn = round(math.degrees(self.turn_rad))
         return f"{abs(turn)} deg {'left' if turn > 0 else 'right'}" if turn else "straight on"
 
@@ -61,8 +63,7 @@ def answered(said: object, command: Command, rule: WaypointRule) -> Answered:
 
 
 def apart(one: Answered, other: Answered) -> float:
-    """How much two answers differ, as a share of the larger: 0 for the same, 2 for opposite
-    ones."""
+    """Return the difference of two answers as a share of the larger: 0 if equal, 2 if opposite."""
     first, second = _numbers(one), _numbers(other)
     if first.shape != second.shape:
         return 2.0
@@ -75,7 +76,7 @@ def _numbers(one: Answered) -> Floats:
 
 
 class Asker:
-    """A policy and the drives that it is asked about. What was asked once is not asked again."""
+    """Policy with the drives of its queries. Answers are cached."""
 
     def __init__(
         self,
@@ -127,12 +128,12 @@ class Asker:
 
     @property
     def policy(self) -> Policy:
-        """What is asked."""
+        """The policy that is queried."""
         return self._driver.policy
 
     @property
     def plain(self) -> Edit:
-        """A goal that tells nothing of where to turn: straight on."""
+        """Edit that sets a goal without a turn: straight on."""
         return self.goals["ahead"]
 
     @cached_property

@@ -24,7 +24,7 @@ _WIDE_PX: Final = 480
 _BAR_PX: Final = 26
 _ABOVE_PX: Final = 110
 _ABOVE_M: Final = (6.0, 3.0)
-"""What is shown from above: so far ahead, and to either side."""
+"""Extent of the view from above: ahead and to either side, in metres."""
 _ARC_S: Final = 2.0
 _WAY: Final = (255, 210, 40)
 _FOLLOWED: Final = (255, 70, 60)

@@ -11,12 +11,13 @@ from cosim.spec.scenario import Scenario
 from scenarios.suites.catalog import SUITES, load_suite
 
 LASTS_S: Final = 10.0
-"""A case is the beginning of its scenario."""
+"""Duration of a case, in seconds: the beginning of its scenario."""
 
 
 def verified_cases() -> tuple[Scenario, ...]:
-    """Of each suite the first scenario of each structure, or kind of event; where a suite has
-    events, of those with some; the first 10 seconds.
+    """Return the first scenario of each structure, or kind of event, of each suite.
+
+    Scenarios with events are preferred. Each is cut to its first 10 seconds.
 
     >>> [case.id for case in verified_cases()][:4]
     ['straight-001', 'curve-001', 'crosswalk-001', 'obstructing-001']

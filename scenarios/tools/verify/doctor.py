@@ -1,4 +1,4 @@
-"""What `cosim doctor` checks: every engine does something real."""
+"""Checks of `cosim doctor`: every engine runs a small real task."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def bridge() -> str:
 
 
 def cameras() -> str:
-    """Which camera `--camera auto` takes, and why."""
+    """Return which camera `--camera auto` chooses, and why."""
     try:
         return f"gl works and is taken ({renderer_of(camera_of_choice('gl'))}); so does bullet"
     except EngineError as error:
@@ -88,7 +88,7 @@ def cameras() -> str:
 
 
 def frame() -> str:
-    """One frame and one step of a small city, with crowd and physics."""
+    """Run one frame and one step of a small city, with crowd and physics."""
     scenario = small_scenario()
     with Episode(scenario, Straight.manifest) as episode:
         picture = episode.reset().rgb

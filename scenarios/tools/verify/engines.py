@@ -1,5 +1,6 @@
-"""What everything stands on, asked by itself: each engine, arithmetic, the textures, the source of
-each room."""
+"""Separate checks of the foundations: each engine, arithmetic, textures, and the source of each
+package.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +29,10 @@ _PX: Final = 256
 
 
 def engines_alone() -> dict[str, str]:
-    """What each engine makes of a task that none of our code has a hand in, as hashes; no driver
-    where there is none. No SUMO may run in this process."""
+    """Return hashes of a task for each engine without code of the project.
+
+    The driver is absent if the machine has none. No SUMO may run in this process.
+    """
     told = {**_arithmetic(), **reference_hashes(), **bullet_fingerprint()}
     try:
         return {**told, DRIVER: driver_alone()}

@@ -1,4 +1,4 @@
-"""What an installation must give, as it lies beside the suites: verify.json."""
+"""Expected results of an installation, shipped as verify.json with the suites."""
 
 from __future__ import annotations
 
@@ -28,8 +28,11 @@ _SCHEMA: Final = 1
 
 
 class Given(msgspec.Struct, frozen=True, kw_only=True):
-    """What an installation gives. renderer: of the gl camera, "" without one; traces: by case, or
-    why there is none."""
+    """Results of an installation.
+
+    renderer: of the gl camera, "" without one.
+    traces: by case, or the reason for a missing trace.
+    """
 
     schema: int = _SCHEMA
     versions: dict[str, str]
@@ -63,8 +66,13 @@ class Given(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def given_here(cases: Sequence[Scenario], jobs: int, progress: Progress) -> Given:
-    """What this installation gives: `jobs` processes, or this one. progress: receives the name of
-    what runs. Raises EngineError when a process dies."""
+    """Return the results of this installation.
+
+    jobs: number of processes; this one is used for 1.
+    progress: receives the name of the running part.
+
+    Raises EngineError if a process dies.
+    """
     work: dict[str, Callable[[], Any]] = {"the engines alone": engines_alone, "textures": textures}
     work |= {case.id: partial(trace_of, case) for case in cases}
     alone, layers, *traces = (
@@ -107,7 +115,7 @@ def _done_in_processes(
 
 
 def trace_of(case: Scenario) -> Trace | str:
-    """The trace of a case; what went wrong, in words, where there is none."""
+    """Return the trace of a case, or the error message if it fails."""
     try:
         return traced(case)
     except Exception as error:  # noqa: BLE001  what a wrong version of a package does is told with all the rest
@@ -115,7 +123,7 @@ def trace_of(case: Scenario) -> Trace | str:
 
 
 def writable(given: Given, cases: Sequence[str]) -> Given:
-    """What may be shipped: all cases, each run, by both cameras. Raises RunError."""
+    """Return results that may be shipped: all cases, each run, by both cameras. Raises RunError."""
     broken = [f"{name} ({trace})" for name, trace in given.traces.items() if isinstance(trace, str)]
     lacking = [name for name in cases if name not in given.traces]
     if broken or lacking or not given.renderer:

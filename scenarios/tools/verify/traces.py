@@ -1,5 +1,6 @@
-"""Trace: a case as it came out, part by part and tick by tick: where two differ first tells what is
-to blame."""
+"""Trace of a case, part by part and tick by tick. The first difference of two traces shows its
+cause.
+"""
 
 from __future__ import annotations
 
@@ -33,28 +34,34 @@ CAMERAS: Final[tuple[CameraName, ...]] = ("bullet", "gl")
 PICTURE_AT_TICK: Final = 60
 DIGITS: Final = 3
 _BLOCKS: Final = 12
-"""A picture's small copy has so many means along each side."""
+"""Number of means along each side of the small copy of a picture."""
 _SPEC: Final = CameraSpec(width=96, height=96, fov_deg=75.0)
 
 
 class Shown(msgspec.Struct, frozen=True):
-    """What a camera showed. hash: of colours and labels; small: (12, 12, 3) uint8 means of blocks
-    of the colours, labels: (96, 96) uint8, both packed."""
+    """Picture of a camera.
+
+    hash: of colours and labels.
+    small: (12, 12, 3) uint8 means of blocks of the colours, packed.
+    labels: (96, 96) uint8, packed.
+    """
 
     hash: str
     small: str
     labels: str
 
     def beside(self, other: Shown) -> tuple[float, float]:
-        """The share of pixels of which another picture has the same label, and the largest
-        difference of a mean."""
+        """Return the share of pixels with equal labels, and the largest difference of a mean."""
         same = float((_unpacked(self.labels) == _unpacked(other.labels)).mean())
         return same, float(np.abs(_unpacked(self.small).astype(int) - _unpacked(other.small)).max())
 
 
 class Trace(msgspec.Struct, frozen=True, kw_only=True):
-    """What came out of a case. ticks: for each of PARTS three hex digits a tick, the first before
-    the first tick; pictures: by camera, of those that could be had."""
+    """Trace of a case.
+
+    ticks: for each of PARTS three hex digits a tick, the first before the first tick.
+    pictures: by camera, of the available cameras.
+    """
 
     scenario_hash: str
     ticks: dict[str, str]
@@ -98,7 +105,7 @@ PARTS: Final[Mapping[str, Callable[[Step, Verdict], list[bytes]]]] = {
     ],
     "referee": lambda _, verdict: [repr(verdict).encode()],
 }
-"""What happens in a tick, in the order in which one hangs on the other."""
+"""Parts of a tick in the order of their dependencies."""
 
 
 def traced(case: Scenario) -> Trace:
@@ -136,7 +143,7 @@ def _digits(data: list[bytes]) -> str:
 
 
 def _pictures(stage: StagedScenario, case: Scenario, step: Step) -> dict[str, Shown]:
-    """What each camera shows after a step, of those that can be had here."""
+    """Return the picture of each available camera after a step."""
     taken: dict[str, Shown] = {}
     world = stage.parts.world
     assert isinstance(world, BulletWorld)

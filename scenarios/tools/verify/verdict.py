@@ -1,4 +1,4 @@
-"""Verdict: what differs from what was shipped, what is to blame, and the remedy, in words."""
+"""Verdict: the differences from the shipped results, their cause, and the remedy, as text."""
 
 from __future__ import annotations
 
@@ -13,14 +13,16 @@ from scenarios.tools.verify.traces import DIGITS, PARTS, Trace
 
 SAME_LABELS: Final = 0.995
 SAME_LEVELS: Final = 12.0
-"""Another driver of OpenGL may label so many pixels otherwise, and a block of 8 x 8 pixels may be
-so many of 255 levels lighter or darker."""
+"""Tolerances for another driver of OpenGL: least share of equal labels, and largest difference of
+the mean of a block of 8 x 8 pixels, of 255 levels.
+"""
 _REINSTALL: Final = "pip install --require-hashes -r requirements.lock"
 
 
 class Finding(NamedTuple):
-    """One thing that was looked at. part: of BLAMES, "" where it is as shipped or says itself what
-    is to be done."""
+    """Result of one comparison. part: key of BLAMES; "" if it is as shipped or has its own
+    remedy.
+    """
 
     name: str
     fine: bool
@@ -29,7 +31,12 @@ class Finding(NamedTuple):
 
 
 class Blame(NamedTuple):
-    """What a part hangs on: engine, the task that it is asked alone; packages; rooms of ours."""
+    """Dependencies of a part.
+
+    engine: task that is checked separately.
+    packages: installed packages.
+    rooms: packages of this project.
+    """
 
     called: str
     engine: str
@@ -66,7 +73,7 @@ BLAMES: Final[Mapping[str, Blame]] = MappingProxyType(
 
 
 def findings(shipped: Given, here: Given) -> Iterator[Finding]:
-    """What was looked at, in order: packages, suites, engines alone, textures, cases."""
+    """Yield the comparisons in order: packages, suites, engines, textures, cases."""
     yield from _packages(shipped, here)
     for name, told in shipped.suites.items():
         mine = here.suites.get(name, "missing")
@@ -183,7 +190,7 @@ def _picture(
 
 
 def blamed(found: list[Finding], shipped: Given, here: Given) -> Iterator[str]:
-    """For each part that is to blame what is to blame in it, and what to do."""
+    """Yield for each differing part its cause and the remedy."""
     for part in dict.fromkeys(one.part for one in found if one.part):
         yield f"{BLAMES[part].called}: {_blame(BLAMES[part], shipped, here)}"
 

@@ -14,29 +14,34 @@ from cosim.spec.camera import Lens
 from physics.cameras.view import Shot
 
 _LEADS_S: Final = 1.5
-"""So far a command's way is drawn."""
+"""Duration for which the path of a command is drawn, in seconds."""
 _NEAREST_M: Final = 0.05
 _FARTHEST_M: Final = 100.0
-"""From the eye: what lies farther off is not drawn."""
+"""Largest distance from the eye that is drawn, in metres."""
 _PARTS: Final = 8
-"""A stretch between two points is cut into so many, to be bent with the lens and to end where the
-picture does."""
+"""Number of parts of a stretch between two points. They follow the distortion of the lens and end
+at the edge of the picture.
+"""
 _PLAIN_PX: Final = 0.3
 _BESIDE: Final = 0.05
-"""Of the picture's width; so far beyond its edge lines are kept, for their thickness."""
+"""Margin beyond the picture, as a share of its width, within which lines are drawn, for their
+thickness.
+"""
 
 
 class WayInPicture(NamedTuple):
-    """lines: pieces of the way, (M, 2) columns and rows from the picture's upper left corner;
-    points: (N, 2), NaN where a point is out of the picture."""
+    """A way in a picture.
+
+    lines: pieces of the way, (M, 2) columns and rows from the upper left corner of the picture.
+    points: (N, 2), NaN outside the picture.
+    """
 
     lines: list[Floats]
     points: Floats
 
 
 def way_in_picture(shot: Shot, lens: Lens, way: Floats) -> WayInPicture:
-    """Where (N, 3) points of the world, and the line through them, are in a picture taken through a
-    lens."""
+    """Project (N, 3) points of the world, and the line through them, into a picture of a lens."""
     wide, high = shot.size
     cuts = np.linspace(0.0, 1.0, _PARTS, endpoint=False)[:, None]
     line = np.concatenate([*(a + cuts * (b - a) for a, b in itertools.pairwise(way)), way[-1:]])

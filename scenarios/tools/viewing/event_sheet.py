@@ -1,8 +1,6 @@
-"""What the events of an episode did, measured from its recorded tracks: to be held against their
-definitions.
+"""Measurements of the events of an episode, to compare with their definitions.
 
-Everything here comes from `trajectory.npz` and the spec; nothing from what a director says of
-itself.
+They use only `trajectory.npz` and the spec, and no reports of an event director.
 """
 
 from __future__ import annotations
@@ -25,7 +23,7 @@ from scenarios.events import EVENT_KINDS
 
 STILL_M: Final = 1e-6
 LATE_M: Final = 0.005
-"""Arc length along a bend and metres driven differ by less than this in a tick."""
+"""Largest difference between arc length along a bend and metres driven in a tick."""
 COLUMNS: Final = (
     "scenario",
     "kind",
@@ -41,8 +39,10 @@ COLUMNS: Final = (
 
 
 def sheet_of_run(folder: Path, kinds: EventKinds = EVENT_KINDS) -> pd.DataFrame:
-    """One row per person of each triggered event of a run, `COLUMNS`. Raises what reading a run
-    raises."""
+    """Return one row per person of each triggered event of a run, with `COLUMNS`.
+
+    Raises the errors of reading a run.
+    """
     scenarios = {s.id: s for s in read_suite(folder / "scenarios.json", kinds).scenarios}
     rows = []
     for record in sorted(read_records(folder), key=lambda r: r.scenario.id):
@@ -55,14 +55,18 @@ def sheet_of_run(folder: Path, kinds: EventKinds = EVENT_KINDS) -> pd.DataFrame:
 def rows_of(
     scenario: Scenario, record: Record, log: Log, kinds: EventKinds = EVENT_KINDS
 ) -> list[tuple[object, ...]]:
-    """The rows of an episode.
+    """Return the rows of an episode.
 
-    trigger_m: metres along the route from the robot to the event's place at the trigger. error_m:
-    how far that is from what is stated. period_m: what the robot drove then in a tick, or came
-    forward on its route (it may cut a bend of it), the most that the error may be. speed_mps:
-    median while walking (absent for who never walks); stated_mps: of the spec. left_m: how far left
-    of the way's middle it stood or walked, most of the time. angle_deg: of its walk to the robot's
-    heading at the trigger, -180 to 180. least_m: least distance of its centre from the robot's.
+    trigger_m: metres along the route from the robot to the event's place at the trigger.
+    error_m: difference between trigger_m and the stated distance.
+    period_m: largest possible error: distance driven in a tick, or progress on the route, which may
+    cut a bend.
+    speed_mps: median while walking, absent for a person that never walks.
+    stated_mps: of the spec.
+    left_m: median offset to the left of the middle of the way, standing or walking, whichever is
+    longer.
+    angle_deg: of the walk to the heading of the robot at the trigger, -180 to 180.
+    least_m: least distance of the person's centre from the robot's.
     """
     rows: list[tuple[object, ...]] = []
     for number, event in enumerate(scenario.events):
@@ -108,10 +112,9 @@ def walked(event: Event, track: Floats, log: Log) -> tuple[float, float, float, 
 def summary(
     sheet: pd.DataFrame, kinds: EventKinds = EVENT_KINDS
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Two tables with a row per kind of event: its triggers, and how its people walked and stood;
-    ranges.
+    """Return two tables with a row per kind of event: its triggers, and the motion of its people.
 
-    off: triggers farther from what is stated than the robot's motion in a tick.
+    off: number of triggers whose error exceeds the motion of the robot in a tick.
     """
     triggers = []
     walks = []
@@ -143,7 +146,7 @@ def summary(
 
 
 def _spread(values: pd.Series[float] | Sequence[float], digits: int = 2) -> str:
-    """Least and largest of what is there; "-" for nothing."""
+    """Format the least and the largest value; "-" without values."""
     known = pd.Series(values).dropna()
     if not len(known):
         return "-"

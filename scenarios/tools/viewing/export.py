@@ -16,7 +16,7 @@ from physics.street.street_surface import StreetSurface
 from scenarios.places.nets import place
 
 _AROUND_M: Final = 30.0
-"""Tiles nearer to the route than this are written."""
+"""Largest distance of the written tiles from the route, in metres."""
 
 
 def export_street(scenario: Scenario, path: Path, progress: Progress = ignore) -> int:

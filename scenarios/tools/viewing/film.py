@@ -1,9 +1,8 @@
-"""A film of an episode: its record is replayed, tick by tick, and drawn from behind, from above or
-from the robot.
+"""Film of an episode, drawn from behind, from above or from the robot while its record is replayed.
 
-The replay is the same episode: every tick is held against the recorded trajectory, and at the end
-of the episode the state hash against the record's. A film that ends earlier is simulated no further
-than its last picture: it has no state hash to show, but every tick of it is as recorded.
+The replay is the same episode. Every tick is compared with the recorded trajectory, and at the end
+the state hash with that of the record. A film that ends earlier stops the simulation at its last
+picture. It has no state hash, but every tick of it is checked.
 """
 
 from __future__ import annotations
@@ -50,27 +49,34 @@ from scenarios.tools.viewing.look import Viewpoint, eye_behind, over
 from sumo_nets.maps.map_store import credit_of
 
 EASE_S: Final = 0.5
-"""The follower's heading lags the robot's by about this much."""
+"""Time constant with which the heading of the view follows that of the robot, in seconds."""
 SMALLEST_PX: Final = (320, 180)
 ROBOT_FOV_DEG: Final = 75.0
-"""Of the robot's camera, up and down, at 4:3; wider pictures show no more to the sides."""
+"""Vertical angle of view of the robot's camera at 4:3, in degrees. Wider pictures show no more to
+the sides.
+"""
 ROBOT_ASIDE: Final = math.tan(math.radians(ROBOT_FOV_DEG / 2)) * 4.0 / 3.0
 _FOV_DEG: Final = 62.0
-"""Of the views from behind and from above, up and down."""
+"""Vertical angle of view from behind and from above, in degrees."""
 ABOVE_REST: Final = (2.0, 0.0, 10.0)
-"""From above, when nothing happens: metres ahead and to the left of the robot that are looked at,
-height of the eye."""
+"""Resting view from above: metres ahead and to the left of the robot, and height of the eye."""
 ABOVE_HIGH_M: Final = (6.5, 12.0)
 _NEAR_M: Final = 8.0
-"""Event people this near are kept in the picture from above."""
+"""Distance within which people of events stay in the view from above, in metres."""
 BEFORE_S = 10.0
 AFTER_S = 2.0
-"""The film of a failure begins and ends so many seconds before and after it."""
+"""Time before and after a failure that its film shows, in seconds."""
 
 
 class Cut(NamedTuple):
-    """What of an episode is filmed. from_s, to_s: simulated time; size: width, height; speed: times
-    real time; camera: what draws it; view: from where."""
+    """Part of an episode that is filmed.
+
+    from_s, to_s: simulated time.
+    size: width and height in pixels.
+    speed: factor of real time.
+    camera: renderer.
+    view: viewpoint.
+    """
 
     from_s: float = 0.0
     to_s: float = math.inf
@@ -138,11 +144,10 @@ def _outcome(record: Record) -> str:
 def make_film(
     folder: Path, scenario_id: str, output: Path, cut: Cut, progress: Progress = ignore
 ) -> float:
-    """Write the film of a finished episode; the simulated second at which it ends, infinite for the
-    episode's end.
+    """Write the film of a finished episode.
 
-    Raises RunError when there is no such episode, or when the replay differs; then there is no
-    file.
+    Returns the simulated second at which it ends, infinite for the end of the episode. Raises
+    RunError if the episode does not exist or the replay differs. No file is then written.
     """
     told = load_recorded(folder, scenario_id)
     scenario, log = told.scenario, told.log
@@ -222,7 +227,7 @@ class _Reel:
         self._over: Floats = np.array(ABOVE_REST)
 
     def take(self, step: Step, verdict: Verdict) -> None:
-        """One tick of the episode; drawn if it lies within the cut."""
+        """Process one tick of the episode; draw it if it lies within the cut."""
         self._note(step, verdict)
         self._plan = self._following.take(step, verdict.reset is not None)
         robot = step.motion.robot
@@ -273,7 +278,7 @@ class _Reel:
         return image
 
     def _seen(self, robot: RobotState, street: Street) -> Image:
-        """What the robot's camera sees, with the waypoints that are followed."""
+        """Draw the view of the robot's camera, with the waypoints that are followed."""
         seen = self._camera.render(robot, street).rgb
         if self._plan is None:
             return seen
@@ -298,7 +303,7 @@ class _Reel:
         return drawn
 
     def _outside(self, view: Viewpoint, area: hud.Area, robot: RobotState, street: Street) -> Image:
-        """What somebody sees who follows the robot, behind it or above it."""
+        """Draw the view from behind the robot or from above it."""
         if view == "follow":
             eye, target = eye_behind(robot, self._ahead)
         else:
@@ -308,7 +313,7 @@ class _Reel:
         ).rgb
 
     def _note(self, step: Step, verdict: Verdict) -> None:
-        """Count failures, and choose what is captioned."""
+        """Count failures, and choose the caption."""
         for event, state in zip(self._scenario.events, step.events.states, strict=True):
             if state.phase == "acting" and event.id not in self._triggered:
                 self._triggered.add(event.id)

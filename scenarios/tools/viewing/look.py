@@ -1,5 +1,4 @@
-"""One picture of a scenario: what the robot sees, or somebody behind or above it, at a moment of an
-episode."""
+"""Draw one picture of a scenario at a moment of an episode: from the robot, behind or above."""
 
 from __future__ import annotations
 
@@ -29,8 +28,9 @@ ABOVE_M: Final = 2.5
 _AHEAD_M: Final = 3.0
 HIGH_M: Final = 24.0
 OVER_SLANT: Final = 0.22
-"""From above the eye is behind what it looks at by this share of its height: little, or a house may
-stand between."""
+"""Distance of the eye behind its target, as a share of its height. It is small, because a house may
+block the view.
+"""
 
 
 def look_at(
@@ -42,10 +42,13 @@ def look_at(
     camera_name: CameraChoice = "auto",
     progress: Progress = ignore,
 ) -> tuple[Image, float]:
-    """((H, W, 3) uint8 RGB, seconds): the picture `at_s` seconds into an episode, or at its end if
-    that comes first.
+    """Return the picture `at_s` seconds into an episode, or at its end if that comes first.
 
-    policy: who drives until then. size: width, height. progress: receives what is being done.
+    policy: name of the policy that drives until then.
+    size: width and height in pixels.
+    progress: receives the running step.
+
+    Returns ((H, W, 3) uint8 RGB, seconds).
     """
     driver = load_policy(policy)
     last = Clock().ticks(at_s)
@@ -89,11 +92,9 @@ def over(
     ahead: Floats | None = None,
     at_m: ArrayLike = (0.0, 0.0, HIGH_M),
 ) -> tuple[Floats, Floats]:
-    """(eye, target), (3,) metres: from high above, a little behind, down on the robot or what is
-    near it.
+    """Return eye and target, (3,) metres, of a view from high above and a little behind the robot.
 
-    at_m: (3,) metres ahead and to the left of the robot that are looked at, and how high the eye
-    is.
+    at_m: (3,) metres ahead and to the left of the robot at the target, and height of the eye.
     """
     way = _way(robot, ahead)
     forward_m, left_m, high_m = np.asarray(at_m, dtype=float).tolist()

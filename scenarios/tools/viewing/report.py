@@ -47,24 +47,28 @@ from scenarios.tools.viewing.scenes import ShownAgain, show_again, ticks_to_show
 from sumo_nets.maps.map_store import credit_of
 
 _MOST_BYTES: Final = 29_000_000
-"""Of the file; failures beyond it are left out of the gallery, the least telling first."""
+"""Largest size of the file, in bytes. The least informative failures beyond it are left out."""
 _REST_BYTES: Final = 8_000_000
-"""Of these for all but failures and maps: Plotly, tables, small pictures, every place of
-failure."""
+"""Bytes reserved for everything but failures and maps: Plotly, tables, small pictures and spots."""
 _MOST_MAPS: Final = 24
 _MAP_PX: Final = 1000
 _MAP_QUALITY: Final = 70
 _MARGIN_M: Final = 25.0
 _MOST_SPOTS: Final = 300
-"""Of a place."""
+"""Largest number of spots on the map of a place."""
 _TELL_EVERY_S: Final = 0.2
 _T = TypeVar("_T")
 _Bounds = tuple[float, float, float, float]
 
 
 class ReportFacts(NamedTuple):
-    """What came out: the file's size, how many failures its gallery shows of how many, and which
-    limit left out the others, "" where all are shown."""
+    """Facts about a report.
+
+    size_bytes: size of the file.
+    shown: failures in its gallery.
+    failures: all failures.
+    limit: the limit that excluded the others, "" if all are shown.
+    """
 
     size_bytes: int
     shown: int
@@ -137,7 +141,7 @@ class _Episode(NamedTuple):
 
     @property
     def ticks(self) -> int:
-        """How long it takes to show them."""
+        """Return the duration of showing its failures, in ticks."""
         return ticks_to_show(self.mishaps)
 
 
@@ -160,8 +164,7 @@ def _episodes(
 
 
 _done: MutableSequence[float] = []
-"""In a process that shows failures again: how much is done of each episode, shared with the one
-that waits."""
+"""Progress of each episode, shared between a worker process and the waiting process."""
 
 
 def _begin(parent: int, done: MutableSequence[float]) -> None:
@@ -174,7 +177,9 @@ def _begin(parent: int, done: MutableSequence[float]) -> None:
 def _shown_again(
     number: int, folder: Path, scenario_id: str, mishaps: Sequence[Mishap], camera: CameraChoice
 ) -> list[ShownAgain]:
-    """In a process of its own. number: of the episode among those that are shown."""
+    """Show failures of an episode, in a worker process. number: of the episode among those
+    shown.
+    """
 
     def took(ticks: int) -> None:
         _done[number] = ticks
@@ -185,8 +190,11 @@ def _shown_again(
 def _wait(
     futures: Sequence[Future[Any]], ticks: Sequence[int], done: Sequence[float], progress: Progress
 ) -> None:
-    """Wait for all of them. The first ones are episodes, which take so many ticks, and of which so
-    many are done."""
+    """Wait for all futures. The first ones are episodes.
+
+    ticks: duration of each episode.
+    done: number of finished ticks of each.
+    """
     left: set[Future[Any]] = set(futures)
     while left:
         left = wait(left, _TELL_EVERY_S, FIRST_COMPLETED).not_done
@@ -201,7 +209,9 @@ def _wait(
 def _showings(
     episodes: Sequence[_Episode], again: Sequence[Future[list[ShownAgain]]]
 ) -> dict[int, ShownAgain | str]:
-    """What came of every pick, by its number: the failure shown again, or why it could not be."""
+    """Return the result of every pick, by its number: the replayed failure, or why it is
+    missing.
+    """
     found: dict[int, ShownAgain | str] = {}
     for one, future in zip(episodes, again, strict=True):
         came = _outcome(future)
@@ -211,7 +221,7 @@ def _showings(
 
 
 def _outcome(future: Future[_T]) -> _T | str:
-    """What a process made, or in words why it did not."""
+    """Return the result of a process, or its error message."""
     try:
         return future.result()
     except CosimError as error:
@@ -241,7 +251,7 @@ def _entry(run: ReportedRun, pick: FailureToShow, showing: ShownAgain | str) -> 
 
 
 def _note(entries: Sequence[Entry]) -> str:
-    """How many failures could not be shown again, and why the first of them could not."""
+    """Describe how many failures could not be replayed, and why the first could not."""
     lost = [entry for entry in entries if entry.scene is None]
     if not lost:
         return ""
@@ -254,7 +264,7 @@ def _note(entries: Sequence[Entry]) -> str:
 def _begun_pictures(
     pool: ProcessPoolExecutor, runs: Sequence[ReportedRun]
 ) -> list[Future[PlacePicture]]:
-    """From above: every real place with failures, then those with the most."""
+    """Start pictures from above: of every real place with failures, then of those with the most."""
     there: dict[str, list[Scenario]] = {}
     for run in runs:
         for record in run.records:
@@ -288,7 +298,7 @@ def _bounds(scenarios: Sequence[Scenario]) -> _Bounds:
 def _place_picture(
     name: str, where: Place, bounds: _Bounds, routes: Sequence[tuple[tuple[float, float], ...]]
 ) -> PlacePicture:
-    """In a process of its own."""
+    """Draw the picture of a place, in a worker process."""
     _, street_map = place(where)
     x0, y0, x1, y1 = bounds
     sheet = Sheet(bounds, _MAP_PX / max(x1 - x0, y1 - y0))
@@ -304,7 +314,7 @@ def _place_picture(
 
 
 def _spots(runs: Sequence[ReportedRun], picks: Sequence[FailureToShow]) -> dict[str, list[Spot]]:
-    """Where everything went wrong, by place."""
+    """Return the places of all failures, by map."""
     numbers = {(pick.run, pick.scenario, pick.mishap): k for k, pick in enumerate(picks)}
     spots: dict[str, list[Spot]] = {}
     for number, run in enumerate(runs):

@@ -1,20 +1,17 @@
-"""A recording of an episode for the Rerun viewer: its record is replayed, and everything lies on
-one timeline.
+"""Recording of an episode for the Rerun viewer, made while its record is replayed.
 
     world/map/...           ground by kind, fences, obstacles, the route, the goal; static
-    world/robot             where the robot is; plan: where its command leads; camera: rgb, depth,
+    world/robot             pose of the robot; plan: path of its command; camera: rgb, depth,
                             labels
-    world/waypoints         those that its policy planned, the followed one large; only where it
-                            answered any
+    world/waypoints         waypoints of its policy, if any; the followed one is large
     world/people, vehicles  bodies by kind; people/velocity: arrows of a second
     world/signals           red and green, over the crossings near the robot
     plots/...               speed, turn, command, gap to the nearest person, way, delay of the
                             answers
-    told                    events, failures, the end, in words
+    told                    events, failures and the end, as text
 
-Timelines: `time`, simulated seconds, and `tick`. The file is there whole or not at all, and only if
-the replay came to
-the recorded state hash.
+Timelines: `time`, simulated seconds, and `tick`. The file is written only as a whole, and only if
+the replay reaches the recorded state hash.
 """
 
 from __future__ import annotations
@@ -95,11 +92,12 @@ def record_for_rerun(
     camera: CameraChoice = "auto",
     progress: Progress = ignore,
 ) -> None:
-    """Write the recording of a finished episode of a run. Pictures are those of its policy's
-    camera, or of one of 192 x 144 pixels where it has none, four a second.
+    """Write the recording of a finished episode of a run.
 
-    Raises ImportError where rerun-sdk is not installed, MachineError where the file cannot be
-    written, RunError when there is no such episode, or when the replay differs.
+    It has four pictures a second of the policy's camera, or of one of 192 x 144 pixels without one.
+
+    Raises ImportError if rerun-sdk is not installed, and MachineError if the file cannot be
+    written. Raises RunError if the episode does not exist or the replay differs.
     """
     import rerun as rr
     import rerun.blueprint as rrb
@@ -188,7 +186,7 @@ class _Tape:
         self._to.log(path, what, static=static)
 
     def begin(self, surface: Surface, spec: CameraSpec) -> None:
-        """What does not change: the map, the robot's body and camera, names of labels."""
+        """Log static data: the map, the robot's body and camera, names of labels."""
         rr = self._rr
         self._surface = surface
         self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -274,8 +272,11 @@ class _Tape:
         self._log(path, what, static)
 
     def _lying(self, shape: Polygon | MultiPolygon, level: bool) -> Floats:
-        """(3 T, 3) the corners of triangles that cover a piece of ground. level: it is as high
-        everywhere, its edges with it; there the surface may say the height of what is beside it."""
+        """Return (3 T, 3) corners of triangles that cover a piece of ground.
+
+        level: use one height for the whole piece, since its edges may have the height of
+        neighbouring ground.
+        """
         corners = _triangles(shape).reshape(-1, 2)
         if not level:
             return self._on_ground(corners)
@@ -320,7 +321,7 @@ class _Tape:
                 self._log(f"{camera}/labels", rr.SegmentationImage(frame.labels))
 
     def _waypoints(self, plan: Floats | None) -> None:
-        """Those that are followed from now on, if they are others."""
+        """Log the waypoints that are followed from now on, if they changed."""
         if plan is self._planned:
             return
         self._planned = plan
@@ -333,7 +334,7 @@ class _Tape:
         self._log("world/waypoints/points", dots)
 
     def _street(self, street: Street, robot: Pose) -> None:
-        """Who and what is near the robot."""
+        """Log people, vehicles and signals near the robot."""
         rr, people, vehicles = self._rr, street.people, street.vehicles
         near = people.only(np.flatnonzero(np.hypot(*(people.xy - robot.xy).T) < _AROUND_M))
         feet = self._on_ground(near.xy, PERSON_RADIUS_M)
@@ -366,7 +367,7 @@ class _Tape:
         self._log("world/signals", points)
 
     def _say(self, step: Step, verdict: Verdict) -> None:
-        """What happened in the tick, in words."""
+        """Log the events of the tick as text."""
         said: list[tuple[str, str]] = []
         for event, state in zip(self._told.scenario.events, step.events.states, strict=True):
             if state.phase == "acting" and event.id not in self._triggered:
@@ -382,7 +383,7 @@ class _Tape:
             self._log("told", self._rr.TextLog(words, level=level))
 
     def plots(self) -> None:
-        """What the trajectory holds of every tick."""
+        """Log the plots of the trajectory."""
         log = self._told.log
         rr = self._rr
         ticks = np.arange(1, len(log) + 1)

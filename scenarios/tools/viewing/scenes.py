@@ -1,5 +1,7 @@
-"""The last seconds before a failure, from the recorded episode run again: who was where, and what
-could be seen."""
+"""Scenes of the last seconds before a failure, from a replay of the recorded episode.
+
+They show the positions of all bodies and the pictures of the cameras.
+"""
 
 from __future__ import annotations
 
@@ -35,31 +37,31 @@ from scenarios.tools.viewing.drawn_route import led_to, way_in_picture
 from scenarios.tools.viewing.look import eye_behind
 
 SHOWN_S: Final = 10.0
-"""From above, before the failure."""
+"""Duration of the view from above, before the failure, in seconds."""
 PICTURED_S: Final = 5.0
 _STEP_TICKS: Final = 2
-"""Between samples."""
+"""Ticks between samples."""
 _PICTURE_TICKS: Final = 5
-"""Pictures are drawn at every fifth tick of the episode, and at the failure itself: failures that
-follow one another share theirs."""
+"""Interval of the pictures in ticks. There is one more at the failure. Consecutive failures share
+pictures.
+"""
 START_TICKS = 400
 PICTURE_TICKS = 10
-"""To start the engines takes as long as to simulate so many ticks, to draw one moment as long as so
-many."""
+"""Cost of starting the engines, and of drawing one moment, in simulated ticks."""
 _PEOPLE_M: Final = 25.0
 _VEHICLES_M: Final = 40.0
 _GROUND_M: Final = 22.0
-"""Beyond the robot's way."""
+"""Ground that is drawn beyond the way of the robot, in metres."""
 FOLLOW_PX: Final = (384, 216)
 _WIDEST_PX: Final = 320
 _TALLEST_PX: Final = 240
-"""Of the robot's own camera, drawn larger or smaller than the policy saw it."""
+"""Largest size of the pictures of the robot's own camera, which are scaled, in pixels."""
 _OVER_SAMPLES: Final = 4
-"""Over so many samples the velocity of who was met is taken."""
+"""Number of samples over which the velocity of a body is taken."""
 
 
 Took = Callable[[int], None]
-"""Called with how much is done so far, of `ticks_to_show`."""
+"""Callback for progress: the number of finished ticks, of `ticks_to_show`."""
 
 
 def untimed(done: int) -> None:
@@ -86,7 +88,7 @@ def _last_tick(mishaps: Sequence[Mishap]) -> int:
 
 
 def _pictured(mishap: Mishap) -> frozenset[int]:
-    """The ticks of which the scene of a failure has pictures."""
+    """Return the ticks with pictures in the scene of a failure."""
     first = max(0, mishap.tick - Clock().ticks(PICTURED_S))
     return frozenset(
         range(-(-first // _PICTURE_TICKS) * _PICTURE_TICKS, mishap.tick, _PICTURE_TICKS)
@@ -114,7 +116,7 @@ def show_again(
         episode, policy = replay_episode(told, camera, judged_alone=True)
         stack.enter_context(episode)
         spec = robots_camera(told.record.manifest.camera)
-        # Each camera keeps what stands around its own place: one for both would sort that out again
+        # Each camera caches the surroundings of its own place. A shared camera would rebuild them
         # for each picture.
         seen, outside = (stack.enter_context(episode.eyes(spec)) for _ in range(2))
         shots = _Shots(
@@ -152,8 +154,9 @@ def robots_camera(spec: CameraSpec | None) -> CameraSpec:
 
 
 class _Moment(NamedTuple):
-    """What a page shows of a tick: by the robot's camera and from behind, as data URLs, and the way
-    ahead."""
+    """Pictures of a tick on a page: by the robot's camera and from behind, as data URLs, and the
+    way ahead.
+    """
 
     robot: str
     follow: str
@@ -161,8 +164,13 @@ class _Moment(NamedTuple):
 
 
 class _Shots:
-    """The pictures of an episode, each drawn once. spec: the robot's camera; seen, outside: the
-    cameras that draw; ticks: of which there are to be pictures; follows: see `WaypointReplay`."""
+    """Pictures of an episode, each drawn once.
+
+    spec: camera of the robot.
+    seen, outside: cameras that draw.
+    ticks: ticks that are drawn.
+    follows: see `WaypointReplay`.
+    """
 
     def __init__(
         self,
@@ -189,7 +197,7 @@ class _Shots:
         return self._moments[tick]
 
     def take(self, step: Step, plan: Floats | None) -> None:
-        """One tick. plan: the waypoints that are followed (`WaypointReplay.take`)."""
+        """Process one tick. plan: the waypoints that are followed (`WaypointReplay.take`)."""
         robot = step.motion.robot
         street = step.street_after
         ahead = np.array([math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)])
@@ -204,7 +212,7 @@ class _Shots:
             )
 
     def _way(self, step: Step, plan: Floats | None) -> DrawnWay:
-        """What is followed, or where the command leads, in the robot's picture."""
+        """Return the followed waypoints, or the path of the command, in the robot's picture."""
         robot = step.motion.robot
         surface = surface_of_place(self._scenario.place)
         way = led_to(step.command, robot.pose) if plan is None else plan
@@ -236,7 +244,7 @@ class _Reel:
         self._at: list[int] = []
 
     def take(self, step: Step, plan: Floats | None) -> None:
-        """One tick. plan: the waypoints that are followed (`WaypointReplay.take`)."""
+        """Process one tick. plan: the waypoints that are followed (`WaypointReplay.take`)."""
         before = self._mishap.tick - step.tick
         if step.tick < self._first or before < 0:
             return
@@ -253,7 +261,7 @@ class _Reel:
     def showing(
         self, street_map: StreetMap, size_m: tuple[float, float], shots: _Shots
     ) -> ShownAgain:
-        """All of it, around the robot's place at the failure."""
+        """Return the whole scene, around the place of the robot at the failure."""
         track = np.array(self._robot)
         origin = np.round(track[-1, :2])
         tracks, names = self._tracks(track, origin)
@@ -298,7 +306,9 @@ class _Reel:
         return route[max(near[0] - 1, 0) : near[-1] + 2]
 
     def _tracks(self, track: Floats, origin: Floats) -> tuple[list[Track], list[str]]:
-        """Everybody who came near, while they were; a new track for who comes back."""
+        """Return the tracks of all bodies while they were near. A body that returns has a new
+        track.
+        """
         begun: dict[str, int] = {}
         rows: dict[tuple[str, int], list[tuple[float, float, float]]] = {}
         kinds: dict[tuple[str, int], tuple[str, tuple[int, int]]] = {}
@@ -387,7 +397,9 @@ class _Reel:
 
 
 def _other(robot: Floats, track: Track, origin: Floats) -> MetBody:
-    """Where who was met is at the end, and its velocity. robot: (6,) of the last sample."""
+    """Return final position and velocity of a body near the robot. robot: (6,) of the last
+    sample.
+    """
     at = np.array(track.at, dtype=float).reshape(-1, 3)[-_OVER_SAMPLES - 1 :]
     xy = at[:, :2] / 100.0 + origin
     span_s = Clock().time_s(_STEP_TICKS) * (len(xy) - 1)
