@@ -54,7 +54,9 @@ def _own(path: Path) -> Suite:
 
 
 def holding(scenario_id: str) -> Suite:
-    """The shipped suite with a scenario of this id. Raises UsageError with the valid names."""
+    """Return the shipped suite with a scenario of this id. Raises UsageError with the valid
+    names.
+    """
     ids: list[str] = []
     for name in SUITES:
         whole = load_suite(name)

@@ -89,8 +89,10 @@ def _over(
 
 
 def _beside(street_map: StreetMap, graph: WalkGraph, port: Port, length_m: float) -> Port:
-    """The nearest end of a sidewalk across the corner at a crossing's port, of a strip at least so
-    long."""
+    """Return the nearest end of a sidewalk across the corner at a crossing's port.
+
+    length_m: least length of the sidewalk.
+    """
     strips = street_map.strips
     x_m, y_m = graph.point(port)
     near = [

@@ -45,5 +45,5 @@ def drawn_daylight(rng: np.random.Generator, number: int) -> Light:
 def sun_rises_rad(
     hour: float, day_of_year: int, latitude_deg: float = Light().latitude_deg
 ) -> float:
-    """The sun's elevation above the horizon."""
+    """Return the elevation of the sun above the horizon."""
     return math.asin(float(sun_direction(hour, day_of_year, latitude_deg)[2]))

@@ -156,7 +156,7 @@ class SidewalkEnv(gymnasium.Env[SeenParts, NDArray[Any]]):
         self._stack.close()
 
     def _named(self, options: Mapping[str, Any] | None) -> Scenario | None:
-        """The scenario that the options of a reset ask for."""
+        """Return the scenario in the options of a reset."""
         for key in options or {}:
             if key != "scenario":
                 raise unknown("option of reset", str(key), ["scenario"])

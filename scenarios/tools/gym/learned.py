@@ -45,7 +45,7 @@ class LearnedPolicy:
         self._answers = action_space_of(actions, manifest, [robot])
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Nothing to forget: what it answers depends on what it sees alone."""
+        """Do nothing: answers depend only on the present observation."""
 
     def act(self, observation: Observation) -> Command | NDArray[np.floating[Any]]:
         return action_as_answer(

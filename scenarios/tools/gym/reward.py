@@ -91,7 +91,7 @@ class Period:
         self._ticks: list[tuple[Step, Verdict]] = []
 
     def watch(self, step: Step, verdict: Verdict) -> None:
-        """The next tick of an episode."""
+        """Add the next tick of an episode."""
         self._ticks.append((step, verdict))
 
     def transition(self) -> Transition:
