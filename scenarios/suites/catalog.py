@@ -1,4 +1,4 @@
-"""SUITES: what ships with the project, by name."""
+"""Catalog of the shipped suites by name, and loading of suites and single scenarios."""
 
 from __future__ import annotations
 

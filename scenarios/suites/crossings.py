@@ -1,5 +1,6 @@
-"""Builder of crossing scenarios: a few metres of sidewalk, one signalised crossing, a few metres of
-sidewalk."""
+"""Builder of crossing scenarios: one signalised crossing with a few metres of sidewalk on either
+side.
+"""
 
 from __future__ import annotations
 

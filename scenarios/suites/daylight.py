@@ -1,5 +1,7 @@
-"""Daylight of drawn scenarios: any hour, season, clouds and at times fog, as long as a person can
-read the picture."""
+"""Draw the daylight of scenarios: any hour, season and clouds, and sometimes fog.
+
+A person can always see enough in the pictures.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Drawing scenarios from a seed until one fits its place, and what every scenario along a route
-has."""
+"""Draw scenarios from a seed until one fits its place, and build the parts of all route
+scenarios.
+"""
 
 from __future__ import annotations
 

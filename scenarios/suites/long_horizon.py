@@ -1,5 +1,8 @@
-"""Builder of long-horizon scenarios: start and goal far apart in a city, one walkable path, street
-life, events."""
+"""Builder of long-horizon scenarios.
+
+Start and goal are far apart in a city with street life and events. One walkable path leads from one
+to the other.
+"""
 
 from __future__ import annotations
 

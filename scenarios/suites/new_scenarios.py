@@ -1,4 +1,4 @@
-"""Fresh: scenarios as the suites have them, drawn in generated cities that no suite uses."""
+"""New scenarios like those of the suites, drawn in generated cities that no suite uses."""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""RECIPES: what each shipped suite is made of: its scenarios by name, where each lies, and how
-candidates are drawn."""
+"""Recipes of the shipped suites: names and places of their scenarios, and how candidates are
+drawn.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,6 @@
-"""Events along a long way: on straight pieces of sidewalk with room to pass, and on crosswalks
-without signals."""
+"""Place events along a long route, on straight sidewalks with room to pass and unsignalised
+crosswalks.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
-"""OwnScenario: what a file of one's own says of a scenario, table by table, with ranges and
-defaults.
+"""Format of user scenario files: the fields of each table, with ranges and defaults.
 
-Ranges that `cosim.spec` declares are not repeated: what a table says is made into the spec, which
-checks itself.
+Ranges that `cosim.spec` declares are not repeated. Each table is converted to its spec, which
+checks them.
 """
 
 from __future__ import annotations

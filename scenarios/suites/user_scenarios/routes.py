@@ -1,4 +1,4 @@
-"""The way of an own scenario: drawn, found between two points, or as it is given."""
+"""Route of a user scenario: drawn, found between two points, or given."""
 
 from __future__ import annotations
 

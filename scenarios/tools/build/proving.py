@@ -1,4 +1,4 @@
-"""Proving a candidate: the expert drives it, and is stopped at its first failure."""
+"""Prove candidates: the expert drives each one until its end or its first failure."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Reading data sets: rows and pictures of one that `cosim collect` has made, held against each
-other, and packed."""
+"""Read data sets of `cosim collect`, compare their rows with their pictures, and pack them."""
 
 from __future__ import annotations
 

@@ -1,5 +1,7 @@
-"""SidewalkEnv: scenarios as an environment of Gymnasium. A step is a period of the policy, an
-episode an `Episode`."""
+"""Gymnasium environment of scenarios.
+
+A step is a period of the policy, an episode an `Episode`.
+"""
 
 from __future__ import annotations
 

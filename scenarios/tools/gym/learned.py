@@ -1,4 +1,4 @@
-"""LearnedPolicy: what was learned in an environment, as a policy that the benchmark runs."""
+"""Run a policy that was learned in an environment in the benchmark."""
 
 from __future__ import annotations
 
@@ -24,8 +24,9 @@ from scenarios.tools.gym.spaces import (
 
 
 class LearnedPolicy:
-    """Asks `predict` for the action in what it sees: that of the environment with the same
-    manifest, actions, robot.
+    """Policy that calls `predict` for each action.
+
+    Observations are those of the environment with the same manifest, actions and robot.
 
     >>> ahead = LearnedPolicy(lambda seen: np.float32([1.0, 0.0]), Manifest("ahead", camera=None))
     >>> ahead.manifest.name

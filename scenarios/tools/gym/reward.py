@@ -1,5 +1,4 @@
-"""Rewards: what happened between two answers of a learner, and what it is worth. No engine, nothing
-of Gymnasium."""
+"""Rewards of a learner for the period between two answers. They need no engine and no Gymnasium."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""CHECKS: every check of a policy by name, and what all of them come to."""
+"""Table of all policy checks by name, and their common result."""
 
 from __future__ import annotations
 

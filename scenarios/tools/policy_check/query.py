@@ -140,7 +140,7 @@ class Asker:
 
     @cached_property
     def goals(self) -> dict[str, Edit]:
-        """By name, as the goal's type has them (`AnyGoal.probes`)."""
+        """Edits of the goal by name, from `AnyGoal.probes`."""
         own = self.drives["straight"].seen[-1].goal
         probes = {"ahead": None} if own is None else own.probes()
         return {name: with_goal_told(name, goal) for name, goal in probes.items()}

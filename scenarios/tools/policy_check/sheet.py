@@ -1,5 +1,4 @@
-"""The picture of a check: what a policy answers in each scene, drawn into its pictures and from
-above."""
+"""Draw the answers of a policy in each scene into its pictures and into a view from above."""
 
 from __future__ import annotations
 

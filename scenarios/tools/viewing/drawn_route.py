@@ -1,4 +1,4 @@
-"""A way on the ground as the robot's camera sees it."""
+"""Project a way on the ground into the picture of the robot's camera."""
 
 from __future__ import annotations
 

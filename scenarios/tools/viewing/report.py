@@ -1,5 +1,4 @@
-"""The report of runs: reads them, shows failures again in processes of their own, and writes one
-HTML file."""
+"""Write the report of runs as one HTML file. Failures are replayed in worker processes."""
 
 from __future__ import annotations
 
