@@ -357,9 +357,8 @@ class PolicyDesk:
 
         memories: Shared memory with the arrays of each request that are not in the message.
         """
-        began = {
-            i: self._begin(one) for i, one in enumerate(requests) if isinstance(one, ResetRequest)
-        }
+        resets = [(i, one) for i, one in enumerate(requests) if isinstance(one, ResetRequest)]
+        began = {i: self._begin(one) for i, one in resets}
         new = {}
         for one, memory in zip(requests, memories or [None] * len(requests)):
             slot = self._slot(one) if isinstance(one, ActRequest) else None

@@ -151,8 +151,8 @@ def estimate(
     if any_policy:
         slow, fast = _around([m.simulated_s / m.work_s for m in any_policy])
         middle = statistics.median(m.simulated_s / m.work_s for m in any_policy)
-        slow, fast = POLICY_SPEED_MPS
-        driven = f"the policy is taken to drive at {slow:g} to {fast:g} m/s"
+        least_mps, most_mps = POLICY_SPEED_MPS
+        driven = f"the policy is taken to drive at {least_mps:g} to {most_mps:g} m/s"
         basis = f"this machine simulates {middle:.1f} s a second, {driven}"
     else:
         slow = SIMULATION_SPEED[0] / (COMPARISON_FACTOR if compared else 1.0)
@@ -187,8 +187,8 @@ def paced_estimate(
         basis = f"as fast as {_episodes(len(same))} of '{policy}' on this machine drove, "
     else:
         rates = (1.0 / POLICY_SPEED_MPS[1], 1.0 / POLICY_SPEED_MPS[0])
-        slow, fast = POLICY_SPEED_MPS
-        basis = f"the policy is taken to drive at {slow:g} to {fast:g} m/s, "
+        least_mps, most_mps = POLICY_SPEED_MPS
+        basis = f"the policy is taken to drive at {least_mps:g} to {most_mps:g} m/s, "
     low_s, high_s = (
         makespan([setup_s + rate * s.route_line.length_m / pace for s in scenarios], jobs)
         for setup_s, rate in zip(SETUP_S, rates, strict=True)

@@ -54,9 +54,10 @@ _Way = tuple[list[Port], float, float]
 class FitCount(msgspec.Struct, frozen=True, kw_only=True):
     """Places where a scenario fits.
 
-    found: of those looked at. places: how many there are, of ways only those that were drawn. what:
-    sidewalks, crosswalks or ways. why_not: the most frequent reason where none was found, else
-    empty.
+    found: number of places where it fits.
+    places: number of places; for ways only the drawn ones.
+    what: sidewalks, crosswalks or ways.
+    why_not: most frequent reason if none was found, else empty.
     """
 
     found: int
@@ -133,8 +134,10 @@ def _fit_count(
     draw: Callable[[Strip], object],
     no_strip: str = "",
 ) -> FitCount:
-    """On how many strips a draw is not refused; no more than `most` are looked at. no_strip: why
-    there are none."""
+    """Count the strips on which a draw succeeds; at most `most` are examined.
+
+    no_strip: reason for an empty list of strips.
+    """
     chosen = [strips[int(i)] for i in np.linspace(0, len(strips) - 1, min(most, len(strips)))]
     refusals = Refusals()
     found = sum(
@@ -176,7 +179,7 @@ def _routes(
 
 
 def _drawn(draw: Callable[[], _Way], refusals: Refusals) -> Iterator[_Way]:
-    """The ways of _WAY_DRAWS draws that are not refused."""
+    """Yield the ways of _WAY_DRAWS draws that are not refused."""
     for _ in range(_WAY_DRAWS):
         try:
             yield draw()

@@ -1,4 +1,4 @@
-"""SUITES: what ships with the project, by name."""
+"""Catalog of the shipped suites by name, and loading of suites and single scenarios."""
 
 from __future__ import annotations
 
@@ -54,7 +54,9 @@ def _own(path: Path) -> Suite:
 
 
 def holding(scenario_id: str) -> Suite:
-    """The shipped suite with a scenario of this id. Raises UsageError with the valid names."""
+    """Return the shipped suite with a scenario of this id. Raises UsageError with the valid
+    names.
+    """
     ids: list[str] = []
     for name in SUITES:
         whole = load_suite(name)

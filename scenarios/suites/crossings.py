@@ -1,5 +1,6 @@
-"""Builder of crossing scenarios: a few metres of sidewalk, one signalised crossing, a few metres of
-sidewalk."""
+"""Builder of crossing scenarios: one signalised crossing with a few metres of sidewalk on either
+side.
+"""
 
 from __future__ import annotations
 
@@ -89,8 +90,10 @@ def _over(
 
 
 def _beside(street_map: StreetMap, graph: WalkGraph, port: Port, length_m: float) -> Port:
-    """The nearest end of a sidewalk across the corner at a crossing's port, of a strip at least so
-    long."""
+    """Return the nearest end of a sidewalk across the corner at a crossing's port.
+
+    length_m: least length of the sidewalk.
+    """
     strips = street_map.strips
     x_m, y_m = graph.point(port)
     near = [

@@ -1,5 +1,7 @@
-"""Daylight of drawn scenarios: any hour, season, clouds and at times fog, as long as a person can
-read the picture."""
+"""Draw the daylight of scenarios: any hour, season and clouds, and sometimes fog.
+
+A person can always see enough in the pictures.
+"""
 
 from __future__ import annotations
 
@@ -45,5 +47,5 @@ def drawn_daylight(rng: np.random.Generator, number: int) -> Light:
 def sun_rises_rad(
     hour: float, day_of_year: int, latitude_deg: float = Light().latitude_deg
 ) -> float:
-    """The sun's elevation above the horizon."""
+    """Return the elevation of the sun above the horizon."""
     return math.asin(float(sun_direction(hour, day_of_year, latitude_deg)[2]))

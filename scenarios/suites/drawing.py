@@ -1,5 +1,6 @@
-"""Drawing scenarios from a seed until one fits its place, and what every scenario along a route
-has."""
+"""Draw scenarios from a seed until one fits its place, and build the parts of all route
+scenarios.
+"""
 
 from __future__ import annotations
 
@@ -54,13 +55,15 @@ class Refusals:
 
     @property
     def most_frequent(self) -> str:
-        """The reason given most often, "" without any."""
+        """Return the most frequent reason, "" without refusals."""
         return self._counts.most_common(1)[0][0] if self._counts else ""
 
 
 def first_that_fits(draw: Callable[[], Scenario], failure: str) -> Scenario:
-    """The first of TRIES draws that is not refused. Raises SpecError, `failure` and how often each
-    reason was given."""
+    """Return the first of TRIES draws that is not refused.
+
+    Raises SpecError with `failure` and the count of each reason.
+    """
     refusals = Refusals()
     found = first_of((draw for _ in range(TRIES)), refusals)
     if found is None:
@@ -69,7 +72,7 @@ def first_that_fits(draw: Callable[[], Scenario], failure: str) -> Scenario:
 
 
 def first_of(draws: Iterable[Callable[[], _Drawn]], refusals: Refusals) -> _Drawn | None:
-    """The first draw that is not refused, None when all are; refusals are counted."""
+    """Return the first draw that is not refused, or None. Refusals are counted."""
     for draw in draws:
         try:
             return draw()
@@ -92,8 +95,7 @@ def bare_scenario(
     time_limit_s: float,
     robot: Robot = COURIER,
 ) -> Scenario:
-    """A scenario from one end of a route to the other, with nothing else in it yet: its builder
-    adds that."""
+    """Build a scenario from one end of a route to the other, without any other content."""
     start = route.at(0.0)
     goal = route.at(route.length_m)
     return Scenario(
@@ -119,13 +121,15 @@ def people_of(kind: EventKind, half_width_m: float, robot: Robot, rng: np.random
 
 
 def wider_m(robot: Robot) -> float:
-    """By how much a robot is wider than the one that the layouts of events are written for."""
+    """Return the width of a robot beyond that of the robot for which event layouts are written."""
     return robot.width_m - COURIER.width_m
 
 
 def thinned(scenario: Scenario, street_map: StreetMap) -> Scenario:
-    """The scenario with no more people than the sidewalks within the crowd's radius of its route
-    have room for."""
+    """Return the scenario with no more people than fit on the sidewalks near its route.
+
+    Sidewalks within the radius of the crowd count.
+    """
     persons = min(
         scenario.crowd.persons, round(_area_around_m2(scenario, street_map, 0.0) / PERSON_M2)
     )
@@ -159,8 +163,10 @@ def passable(scenario: Scenario, street_map: StreetMap, robot: Robot = COURIER) 
 
 
 def _area_around_m2(scenario: Scenario, street_map: StreetMap, less_m: float) -> float:
-    """Mean area of sidewalk within the crowd's radius of points on the route. less_m: taken off
-    each width."""
+    """Return the mean area of sidewalk within the crowd's radius of points on the route.
+
+    less_m: subtracted from each width.
+    """
     route = Polyline(np.array(scenario.route))
     around = [
         shapely.Point(route.at(float(s_m)).xy).buffer(scenario.crowd.radius_m)

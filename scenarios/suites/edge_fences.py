@@ -94,7 +94,7 @@ def _named(street_map: StreetMap, sides: Floats, ports: Sequence[Port]) -> list[
 
 
 def _sides(line: shapely.Geometry) -> Floats:
-    """(N, 2, 2) m: the ends of the straight pieces of a line."""
+    """Return the ends of the straight pieces of a line, (N, 2, 2) m."""
     if shapely.get_dimensions(line) != 1:
         return np.empty((0, 2, 2))
     points = shapely.get_coordinates(shapely.simplify(line, SMOOTH_M))

@@ -134,7 +134,7 @@ def _off(scenario: Scenario, area: WalkableArea) -> Iterator[str]:
 
 
 def _odd_crossings(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
-    """Crossings that the map does not have, or has elsewhere."""
+    """Yield crossings that the map lacks, or has elsewhere."""
     for crossing in scenario.crossings:
         strip = street_map.strips.get(crossing.id)
         if strip is None or strip.kind != "crossing":
@@ -149,7 +149,7 @@ def _odd_crossings(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
 
 
 def _on(scenario: Scenario, crossing: RouteCrossing) -> Point:
-    """The middle of the route's way over a crossing."""
+    """Return the middle of the route on a crossing."""
     return Point(scenario.route_line.at((crossing.enter_s_m + crossing.leave_s_m) / 2).xy)
 
 
@@ -198,7 +198,7 @@ def _odd_events(scenarios: Iterable[Scenario]) -> Iterator[str]:
 
 
 def _crowded(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
-    """Crowds that by their density are more people than one may ask for by number."""
+    """Yield crowds whose density means more people than the limit for numbers."""
     crowd = scenario.crowd
     if crowd.density is not None:
         room_m2 = LocalWalkableArea(street_map, crowd.radius_m).area_m2(*scenario.start[:2])

@@ -1,5 +1,8 @@
-"""Builder of long-horizon scenarios: start and goal far apart in a city, one walkable path, street
-life, events."""
+"""Builder of long-horizon scenarios.
+
+Start and goal are far apart in a city with street life and events. One walkable path leads from one
+to the other.
+"""
 
 from __future__ import annotations
 
@@ -134,7 +137,7 @@ def build_long_horizon(
 
 
 def starts(street_map: StreetMap, graph: WalkGraph) -> list[str]:
-    """The sidewalks on which long ways start and end."""
+    """Return the sidewalks on which long ways start and end."""
     return sorted(
         strip_id
         for strip_id in graph.main_strips
@@ -150,8 +153,7 @@ def _along(
     drawn: tuple[Sequence[Port], float, float],
     fences: _Fences,
 ) -> Scenario:
-    """The scenario along a way, as `draw_way` gives it. Raises SpecError when the way does not
-    do."""
+    """Build the scenario along a way of `draw_way`. Raises SpecError if the way is unsuitable."""
     way = drawn[0]
     street_map = draft.street_map
     route, crossings, barriers = lone_route(street_map, drawn, fences, draft.robot, draft.length_m)
@@ -183,10 +185,11 @@ def lone_route(
     robot: Robot,
     length_m: float | None = None,
 ) -> tuple[Polyline, tuple[RouteCrossing, ...], tuple[Barrier, ...]]:
-    """The route along a way, as `draw_way` gives it, its crossings, and fences that leave no other
+    """Return the route along a way of `draw_way`, its crossings, and fences that leave no other
     route.
 
-    Raises SpecError when the way does not do."""
+    Raises SpecError if the way is unsuitable.
+    """
     way, *ends_m = drawn
     route = _line(street_map, way, *ends_m)
     if length_m is not None:
@@ -208,13 +211,14 @@ def lone_route(
 
 
 def _line(street_map: StreetMap, way: Sequence[Port], start_m: float, goal_m: float) -> Polyline:
-    """The route along a way, in whole centimetres."""
+    """Return the route along a way, in whole centimetres."""
     return Polyline(np.round(way_line(street_map, way, start_m, goal_m).points, 2))
 
 
 def _search(draft: _Draft, candidates: Sequence[str]) -> Iterator[Callable[[], Scenario]]:
-    """More draws: of ways that keep off roads, stairs and bridges, fenced in all along where need
-    be."""
+    """Return more draws, of ways without roads, stairs and bridges, fenced on both sides if
+    necessary.
+    """
     street_map = draft.street_map
     rng = np.random.default_rng([draft.seed, draft.place.seed, 0x10E6, 1])
     avoided = avoided_strips(street_map)
@@ -230,7 +234,7 @@ def _search(draft: _Draft, candidates: Sequence[str]) -> Iterator[Callable[[], S
 
 
 def avoided_strips(street_map: StreetMap) -> set[str]:
-    """The strips that no way is searched over: stairs, bridges, tunnels, and sidewalks on roads."""
+    """Return the strips that searches exclude: stairs, bridges, tunnels, and sidewalks on roads."""
     sidewalks = [strip for strip in street_map.strips.values() if strip.kind == "sidewalk"]
     shares = dict(
         zip([s.id for s in sidewalks], on_road_shares(street_map, sidewalks), strict=True)
@@ -245,8 +249,10 @@ def avoided_strips(street_map: StreetMap) -> set[str]:
 def fences_along(
     street_map: StreetMap, route: Polyline, way: Sequence[Port], half_width_m: float
 ) -> tuple[Barrier, ...]:
-    """Barriers at the branches where they do, else all along the way. Raises SpecError when neither
-    leave one path."""
+    """Return barriers at the branches if they suffice, else along the whole way.
+
+    Raises SpecError if neither leaves one path.
+    """
     try:
         return _barriers(street_map, route, way, half_width_m)
     except SpecError:
@@ -258,8 +264,10 @@ def fences_along(
 def _barriers(
     street_map: StreetMap, route: Polyline, way: Sequence[Port], half_width_m: float
 ) -> tuple[Barrier, ...]:
-    """Barriers that leave one path, square to their strips if possible. Raises SpecError when there
-    are none."""
+    """Return barriers that leave one path, square to their strips if possible.
+
+    Raises SpecError if no such barriers exist.
+    """
     ports = ports_to_close(street_map, way)
     ground = ground_around(street_map, route, way)
     barriers = tuple(barrier_at(street_map, port) for port in ports)
@@ -278,10 +286,12 @@ def draw_way(
     candidates: Sequence[str],
     length_m: float | None = None,
 ) -> tuple[list[Port], float, float]:
-    """(way, start_m, goal_m): a shortest way of a drawn length that crosses a street, as `way_line`
-    takes it.
+    """Draw a shortest way of a drawn length that crosses a street.
 
-    length_m: the wanted length in place of a drawn one."""
+    length_m: wanted length, instead of a drawn one.
+
+    Returns (way, start_m, goal_m), as for `way_line`.
+    """
     target_m = rng.uniform(*ROUTE_M) if length_m is None else length_m
     strip = street_map.strips[candidates[int(rng.integers(len(candidates)))]]
     leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)
@@ -356,7 +366,7 @@ def search_way(
 def route_crossings(
     street_map: StreetMap, route: Polyline, way: Sequence[Port]
 ) -> tuple[RouteCrossing, ...]:
-    """The crossings of a way, in order, with the arc lengths between which the route is on them."""
+    """Return the crossings of a way, in order, with the arc lengths of the route on them."""
     found = []
     for port in way[::2]:
         strip = street_map.strips[port.strip]
@@ -372,8 +382,9 @@ def route_crossings(
 
 
 def on_road_m(street_map: StreetMap, route: Polyline, crossings: Sequence[RouteCrossing]) -> float:
-    """Metres of a route that lie on lanes of roads, crossings and the interior of junctions
-    apart."""
+    """Return the length of a route on lanes of roads, without crossings and junctions, in
+    metres.
+    """
     s_m = np.arange(0.5, route.length_m, 1.0)
     for crossing in crossings:
         s_m = s_m[(s_m < crossing.enter_s_m - 1.0) | (s_m > crossing.leave_s_m + 1.0)]
@@ -391,8 +402,9 @@ def on_road_m(street_map: StreetMap, route: Polyline, crossings: Sequence[RouteC
 def on_car_paths_m(
     street_map: StreetMap, route: Polyline, crossings: Sequence[RouteCrossing], robot: Robot
 ) -> float:
-    """Metres of a route on which a robot is in the way of cars inside a junction, crossings
-    apart."""
+    """Return the length of a route in the path of cars inside junctions, without crossings, in
+    metres.
+    """
     s_m = np.arange(0.5 * _SAMPLE_M, route.length_m, _SAMPLE_M)
     for crossing in crossings:
         s_m = s_m[(s_m < crossing.enter_s_m - _KERB_M) | (s_m > crossing.leave_s_m + _KERB_M)]

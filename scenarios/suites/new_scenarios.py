@@ -1,4 +1,4 @@
-"""Fresh: scenarios as the suites have them, drawn in generated cities that no suite uses."""
+"""New scenarios like those of the suites, drawn in generated cities that no suite uses."""
 
 from __future__ import annotations
 
@@ -100,8 +100,10 @@ class Fresh(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def fresh_cities(words: str) -> tuple[int, ...]:
-    """The seeds that "900:940" names, 900 to 939. Raises UsageError for those of cities that a
-    suite uses."""
+    """Return the seeds of a range such as "900:940", 900 to 939.
+
+    Raises UsageError for cities that a suite uses.
+    """
     found = re.fullmatch(r"([0-9]{1,10}):([0-9]{1,10})", words, re.ASCII)
     first, end = (int(part) for part in found.groups()) if found else (0, 0)
     if not first < end <= _MOST_SEED or end - first > 10_000:
@@ -120,8 +122,10 @@ def fresh_cities(words: str) -> tuple[int, ...]:
 def fresh(
     kind: str, seeds: tuple[int, ...], structures: Sequence[str] = (), size_m: float = 2000.0
 ) -> Fresh:
-    """Scenarios like those of a suite. structures: only these. Raises UsageError with the valid
-    names."""
+    """Return new scenarios like those of a suite.
+
+    structures: only these. Raises UsageError with the valid names.
+    """
     if kind not in _KINDS:
         raise unknown("suite for --cities", kind, _KINDS)
     there = STRUCTURES if kind == "unit" else (*EVENT_KINDS, STATIC)

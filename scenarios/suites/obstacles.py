@@ -98,8 +98,9 @@ _HABITS: Final[dict[ObstacleKind, _Habit]] = {
 
 
 class _Stretch(NamedTuple):
-    """A part of a sidewalk that the route leads along, from low_m to high_m of its line; the road
-    is to the right."""
+    """Part of a sidewalk along the route, from low_m to high_m of its line. The road is to the
+    right.
+    """
 
     line: Polyline
     half_m: float
@@ -111,7 +112,7 @@ class _Stretch(NamedTuple):
     def put(
         self, kind: ObstacleKind, form: int, s_m: float, left_m: float, turned_rad: float
     ) -> Obstacle:
-        """An obstacle at an arc length of the line and so far to its left."""
+        """Return an obstacle at an arc length of the line and left_m to its left."""
         x, y, along = self.line.at(s_m)
         return Obstacle(
             kind=kind,
@@ -129,8 +130,10 @@ def with_obstacles(
     per_100m: float | None = None,
     beside: bool = False,
 ) -> Scenario:
-    """The same scenario with obstacles, drawn from its seed and its place's: see
-    `obstacles_along`."""
+    """Return the scenario with obstacles, drawn from its seed and that of its place.
+
+    See `obstacles_along`.
+    """
     rng = np.random.default_rng([scenario.seed, scenario.place.seed, 0x0B57])
     obstacles = obstacles_along(scenario, street_map, rng, per_100m=per_100m, beside=beside)
     return msgspec.structs.replace(scenario, obstacles=obstacles)
@@ -312,8 +315,9 @@ def _drawn_group(
 def _site(
     stretch: _Stretch, rng: np.random.Generator, left: float, s_m: float, form: int, gap_m: float
 ) -> tuple[Obstacle, ...]:
-    """A construction site: fences around a piece of the sidewalk, half as wide as it where the gap
-    lets them."""
+    """Draw a construction site: fences around a piece of the sidewalk, half as wide if the gap
+    permits.
+    """
     paint = form - form % OBSTACLE_VARIANTS
     lengths = [obstacle_size_m("fence", variant)[0] for variant in range(OBSTACLE_VARIANTS)]
     depth_m = obstacle_size_m("fence", 0)[1]
@@ -355,7 +359,7 @@ def _spans_m(kind: ObstacleKind, form: int, turned_rad: float) -> tuple[float, f
 
 
 def _stretches(scenario: Scenario, street_map: StreetMap, beyond_m: float) -> list[_Stretch]:
-    """The parts of sidewalks that the route leads along, `beyond_m` more at either end."""
+    """Return the parts of sidewalks along the route, with `beyond_m` more at either end."""
     route = scenario.route_line
     steps = route.resampled(1.0).points
     found: dict[str, list[float]] = {}
@@ -379,7 +383,7 @@ def _stretches(scenario: Scenario, street_map: StreetMap, beyond_m: float) -> li
 
 
 def _oriented(strip: Strip) -> Polyline:
-    """The middle line of a sidewalk with the road to its right."""
+    """Return the middle line of a sidewalk with the road to its right."""
     line = strip.line[:, :2]
     return Polyline(line if strip.road_side <= 0 else line[::-1])
 
@@ -404,7 +408,7 @@ def _streets(street_map: StreetMap, area: Polygon) -> list[shapely.Geometry]:
 
 
 def _extended(route: Polyline) -> LineString:
-    """The route and _BEYOND_M more at either end, straight on."""
+    """Return the route with _BEYOND_M more at either end, straight on."""
     ends = [(route.at(0.0), -_BEYOND_M), (route.at(route.length_m), _BEYOND_M)]
     first, last = (
         (p.x_m + d * math.cos(p.heading_rad), p.y_m + d * math.sin(p.heading_rad)) for p, d in ends

@@ -41,8 +41,11 @@ _SPEEDS_MPS = (1.1, 1.65)
 
 
 class EventSpot(NamedTuple):
-    """A way and where the event is on it. route: (N, 2) m; half_width_m, half_length_m: see
-    `Event`."""
+    """Way with the place of the event on it.
+
+    route: (N, 2) m.
+    half_width_m, half_length_m: see `Event`.
+    """
 
     route: Floats
     pose: Pose
@@ -61,8 +64,7 @@ def build_reactive(
     scenario_id: str,
     robot: Robot = COURIER,
 ) -> Scenario:
-    """A scenario of one kind of event drawn from `seed`. Raises SpecError when no place for it is
-    found."""
+    """Draw a scenario of one kind of event from `seed`. Raises SpecError if no place is found."""
     rng = np.random.default_rng([seed, place.seed, 0x4EAC7, zlib.crc32(kind.name.encode())])
     strips = strips_of(kind, street_map, graph)
     if not strips:
@@ -106,8 +108,9 @@ def strips_of(kind: EventKind, street_map: StreetMap, graph: WalkGraph) -> list[
 def event_spot(
     kind: EventKind, strip: Strip, street_map: StreetMap, rng: np.random.Generator, robot: Robot
 ) -> EventSpot:
-    """A way drawn along a strip and the place of an event on it. Raises SpecError where it does not
-    fit."""
+    """Draw a way along a strip and the place of an event on it. Raises SpecError if it does not
+    fit.
+    """
     if kind.layout is None:
         return over_crossing(street_map, strip, rng, robot)
     return along_sidewalk(kind.layout, strip, rng, robot)

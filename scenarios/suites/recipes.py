@@ -1,5 +1,6 @@
-"""RECIPES: what each shipped suite is made of: its scenarios by name, where each lies, and how
-candidates are drawn."""
+"""Recipes of the shipped suites: names and places of their scenarios, and how candidates are
+drawn.
+"""
 
 from __future__ import annotations
 
@@ -80,7 +81,7 @@ class SuiteRecipe:
 
 
 def candidate(slot: Slot, seed: int) -> Scenario:
-    """A candidate for a slot, drawn from a seed. Raises CosimError when none fits its place."""
+    """Draw a candidate for a slot from a seed. Raises CosimError if none fits its place."""
     _, street_map = place(slot.where)
     drawn = RECIPES[slot.suite].draw(slot, street_map, _graph(slot.where), seed)
     rng = np.random.default_rng([seed, zlib.crc32(slot.name.encode())])
@@ -91,8 +92,10 @@ def candidate(slot: Slot, seed: int) -> Scenario:
 
 
 def _in_few_digits(value: Any) -> Any:
-    """A spec as plain data, its numbers in as many digits as anybody can measure: a suite's file is
-    half as large."""
+    """Return a spec as plain data, with numbers rounded to measurable digits.
+
+    This halves the size of a suite's file.
+    """
     if isinstance(value, float):
         return round(value, _DIGITS)
     if isinstance(value, dict):
@@ -160,8 +163,9 @@ def _reactive_slots() -> list[Slot]:
 
 
 def _route_slots() -> list[Slot]:
-    """A way in every city, of lengths that are spread evenly and together make what the suite is to
-    make."""
+    """Return slots with a route in every city. Their lengths are evenly spread and have the wanted
+    sum.
+    """
     cities = _cities()
     mean_m = (ALL_ROUTES_M - sum(_REAL_ROUTES.values())) / len(cities)
     lengths_m = np.linspace(_SHORTEST_M, 2.0 * mean_m - _SHORTEST_M, len(cities))

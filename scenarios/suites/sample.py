@@ -1,4 +1,4 @@
-"""Suites drawn on the spot: routes on any known map, from a seed."""
+"""Draw suites of routes on any known map from a seed."""
 
 from __future__ import annotations
 

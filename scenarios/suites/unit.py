@@ -48,9 +48,11 @@ def build_unit(
     robot: Robot = COURIER,
     way_m: tuple[float, float] = WAY_M,
 ) -> Scenario:
-    """A scenario of one structure drawn from `seed`: its street's class is drawn first, so that
-    rare ones come as often as common ones. way_m: of a straight way, shortest and longest. Raises
-    SpecError when no place for it is found."""
+    """Draw a scenario of one structure from `seed`.
+
+    The class of the street is drawn first, so that all classes are equally frequent. way_m:
+    shortest and longest straight way. Raises SpecError if no place is found.
+    """
     named = zlib.crc32(f"{structure} {place.name}".encode())
     rng = np.random.default_rng([seed, place.seed, 0x0417, named])
     classes: dict[str, list[Strip]] = {}
@@ -116,7 +118,7 @@ def drawn_along(
     robot: Robot,
     way_m: tuple[float, float] = WAY_M,
 ) -> tuple[Polyline, tuple[RouteCrossing, ...]]:
-    """A route drawn along a strip, and its crossings. Raises CosimError where it does not do."""
+    """Draw a route along a strip, with its crossings. Raises CosimError if it is unsuitable."""
     if structure == "straight":
         route, crossings = _straight(strip, rng, robot, way_m)
     elif structure == "curve":
@@ -134,7 +136,7 @@ def drawn_along(
 
 
 def turn_rad(route: Polyline) -> float:
-    """By how much a route turns from its first metres to its last, left positive."""
+    """Return the turn of a route from its first metres to its last, left positive."""
     first = route.at(0.0)
     last = route.at(_ENDS_M)
     before = route.at(route.length_m - _ENDS_M)

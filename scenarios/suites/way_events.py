@@ -1,5 +1,6 @@
-"""Events along a long way: on straight pieces of sidewalk with room to pass, and on crosswalks
-without signals."""
+"""Place events along a long route, on straight sidewalks with room to pass and unsignalised
+crosswalks.
+"""
 
 from __future__ import annotations
 
@@ -60,8 +61,10 @@ def draw_events(
     robot: Robot,
     kinds: EventKinds,
 ) -> tuple[Event, ...]:
-    """Events about every EVENT_EVERY_M metres; the kinds take turns in a drawn order, each where it
-    finds its room."""
+    """Draw events about every EVENT_EVERY_M metres.
+
+    The kinds take turns in a drawn order. Each is placed where it has enough room.
+    """
     on_crosswalks = [kind for kind in kinds.values() if kind.layout is None]
     turns = [kind for kind in kinds.values() if kind.layout is not None]
     turns = [turns[int(i)] for i in rng.permutation(len(turns))]
@@ -134,8 +137,9 @@ def _apart(spot: WaySpot, chosen: Sequence[tuple[WaySpot, EventKind]]) -> bool:
 def crosswalk_spots(
     street_map: StreetMap, route: Polyline, crossings: Sequence[RouteCrossing]
 ) -> list[WaySpot]:
-    """The route's crossings without signals that it leads straight over and that are neither short
-    nor long."""
+    """Return the crossings without signals that the route crosses straight and that have a usual
+    length.
+    """
     found = []
     for crossing in crossings:
         strip = street_map.strips[crossing.id]
@@ -164,7 +168,9 @@ def _has_room(kind: EventKind, spot: WaySpot, route: Polyline, robot: Robot) -> 
 def _sidewalk_at(
     street_map: StreetMap, way: Sequence[Port], route: Polyline, s_m: float
 ) -> Strip | None:
-    """The sidewalk of the way at an arc length of the route, None on corners and crossings."""
+    """Return the sidewalk of the way at an arc length of the route, None on corners and
+    crossings.
+    """
     pose = route.at(s_m)
     strip = street_map.strips.get(street_map.locate(pose.x_m, pose.y_m, 0.05).edge)
     return (

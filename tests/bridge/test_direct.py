@@ -60,7 +60,7 @@ import sys, time
 import msgspec
 from bridge import keys
 from bridge.codec import decode, encode
-from bridge.director import opened_query, signed
+from bridge.director import verify_query, signed
 from bridge.session import open_session
 from cosim.spec.connection import Connection
 from scenarios.events import react
@@ -68,7 +68,7 @@ from scenarios.episodes.director import behaviours
 
 last = {}
 def lie(payload):
-    query = opened_query(payload, behaviours())
+    query = verify_query(payload, behaviours())
     reply, by, replace = react(query), behaviours(), msgspec.structs.replace
     before, last[query.episode] = last.get(query.episode, reply), reply
     if query.tick < 3 or query.episode == "honest":

@@ -169,7 +169,7 @@ def test_a_tick_that_does_not_end_refuses_points_from_the_robot(
 ) -> None:
     """An engine that hangs holds no client up: points of the map are taken, the others are to be
     sent again."""
-    monkeypatch.setattr(injected, "SETTLES_S", 0.01)
+    monkeypatch.setattr(injected, "TICK_TIMEOUT_S", 0.01)
     one = injected_people()
     one.react(query(0))
     ack = one.offer(InjectionRequest(id="a", path=(RelativePoint(10.0),)))

@@ -63,14 +63,12 @@ def test_another_name_is_refused_with_the_valid_ones() -> None:
         cosim.Epsiode  # noqa: B018  the access is the test
 
 
-@pytest.mark.parametrize("engine", ["SumoCrowd(", "BulletWorld("])
-def test_engines_are_made_in_one_file(engine: str) -> None:
-    """One wiring: an engine's class is called in one file of the product, and defined in
-    another."""
+def test_the_crowd_is_created_in_one_file() -> None:
+    """One module connects SUMO's crowd to episodes."""
     files = [path for top in PRODUCT for path in (ROOT / top).rglob("*.py")]
     calls = [
         str(p.relative_to(ROOT))
         for p in files
-        if re.search(rf"(?<!class )\b{re.escape(engine)}", p.read_text())
+        if re.search(r"(?<!class )\bSumoCrowd\(", p.read_text())
     ]
     assert calls == ["scenarios/episodes/wiring.py"]

@@ -13,13 +13,13 @@ from pathlib import Path
 import pytest
 
 from cosim.core.cache import (
-    MAKING,
     ArrayCache,
     cache_entries,
     clean_up,
     clean_up_if_due,
     mapped_arrays,
 )
+from cosim.core.files import UNFINISHED_PREFIX
 from tests.conftest import PATIENCE_S, Cosim
 
 MB = 10**6
@@ -110,8 +110,7 @@ def test_processes_that_use_and_forget_at_once_do_not_hurt_one_another(cache: Pa
         "entry.with_name(f'{sys.argv[1]}-{n}.map').exists()]\n    assert not gone, gone\n"
     )
     forgets = (
-        "from cosim.core.cache import forget_entries\nfor _ in range(40): "
-        "forget_entries(limit_bytes=0)"
+        "from cosim.core.cache import clean_up\nfor _ in range(40): forget_entries(limit_bytes=0)"
     )
     words = [(keeps, str(n)) for n in range(4)] + [(forgets, ""), (forgets, "")]
     processes = [
@@ -156,7 +155,12 @@ def test_who_keeps_something_makes_room_first(
 
 def test_what_killed_processes_left_half_made_goes(cache: Path) -> None:
     """After an hour; what is younger may still be in the making."""
-    for name in (f"baked/{MAKING}x", f"tiles/a/{MAKING}x", ".building-x", ".forgotten-x"):
+    for name in (
+        f"baked/{UNFINISHED_PREFIX}x",
+        f"tiles/a/{UNFINISHED_PREFIX}x",
+        ".building-x",
+        ".forgotten-x",
+    ):
         for young in ("", "-young"):
             (cache / f"{name}{young}").mkdir()
         os.utime(cache / name, (0.0, 0.0))
@@ -165,8 +169,8 @@ def test_what_killed_processes_left_half_made_goes(cache: Path) -> None:
     assert found == [
         ".building-x-young",
         ".forgotten-x-young",
-        f"{MAKING}x-young",
-        f"{MAKING}x-young",
+        f"{UNFINISHED_PREFIX}x-young",
+        f"{UNFINISHED_PREFIX}x-young",
     ]
 
 

@@ -67,7 +67,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def files_in(cache: Path) -> list[Path]:
     """The finished files of the cache."""
     parts = (*cache.glob("tiles/*/*"), *cache.glob("baked/*"))
-    return sorted(path for path in parts if not path.name.startswith(module.MAKING))
+    return sorted(path for path in parts if not path.name.startswith(module.UNFINISHED_PREFIX))
 
 
 def same(arrays: Arrays) -> bool:

@@ -22,7 +22,7 @@ def test_a_small_policy_that_ships_is_small_and_answers_without_pytorch(name: st
     process."""
     assert sum(path.stat().st_size for path in shipped_bundles()[name].iterdir()) < 8_000_000
     code = (
-        "import sys, cosim; from cosim.policies.onnx.policy import in_grey; "
+        "import sys, cosim; from cosim.policies.onnx.policy import example_observation; "
         "policy = cosim.load_policy(sys.argv[1]); policy.reset('one', 1); "
         "print(policy.act(in_grey(policy.manifest)).v_mps >= 0.0, 'torch' in sys.modules)"
     )

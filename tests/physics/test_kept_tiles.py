@@ -48,7 +48,7 @@ def no_more(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(*_: object, **__: object) -> None:
         raise EngineError("a tile was made")
 
-    for maker in ("build_tile", "covers_in", "frontage_in", "paint_in"):
+    for maker in ("build_tile", "land_covers", "frontage_in", "paint_in"):
         monkeypatch.setattr(street_surface, maker, fails)
     monkeypatch.setattr(street_surface.Placement, "in_tile", fails)
 

@@ -102,7 +102,7 @@ def test_a_package_that_is_missing_is_named_with_what_installs_it(
     (tmp_path / "file").write_bytes(b"\x20\0\0\0TFL3")
     monkeypatch.setitem(sys.modules, PACKAGES[name_of(network)], None)
     monkeypatch.setitem(sys.modules, "flatbuffers.table", None)
-    with pytest.raises(MachineError, match=r"pip install 'sidewalk-cosim\[convert\]'$"):
+    with pytest.raises(MachineError, match=r"pip install -e '\.\[convert\]' in the checkout$"):
         taking(network, b"\x20\0\0\0TFL3").write(tmp_path / "file", tmp_path)
 
 

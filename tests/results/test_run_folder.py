@@ -472,8 +472,8 @@ def test_a_run_below_a_file_is_told_which_file_and_where_else(tmp_path: Path, be
     (tmp_path / "file").touch()
     path = tmp_path / "file" / below
     told = (
-        f"{path}: cannot be written: {tmp_path / 'file'} is a file, no folder: choose a place "
-        f"beside it, like "
+        f"{path}: cannot be written: {tmp_path / 'file'} is a file, no folder: choose a path "
+        f"next to it, like "
     )
     with pytest.raises(MachineError, match=re.escape(f"{told}{tmp_path / below}")):
         RunFolder.create(path, SPEC, SUITE).__enter__()

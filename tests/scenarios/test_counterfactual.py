@@ -165,7 +165,7 @@ def test_an_episode_outlives_its_comparison(
     def fails(*_: object) -> NoReturn:
         raise KeyError("v7")
 
-    monkeypatch.setattr("scenarios.episodes.run_episode.Beside.compared", fails)
+    monkeypatch.setattr("scenarios.episodes.run_episode.CounterfactualTracker.compared", fails)
     short = msgspec.structs.replace(scenario, time_limit_s=1.0)
     outcome = run_episode(short, load_policy("orca"), EpisodeOptions(counterfactual=True))
     assert (

@@ -310,7 +310,7 @@ def test_processes_build_one_city_at_once(tmp_path: Path, monkeypatch: pytest.Mo
     removed."""
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
     code = (
-        "from sumo_nets.city.store import city_net, is_whole; from cosim.spec.scenario import City;"
+        "from sumo_nets.city.store import city_net, is_undamaged; from cosim.spec.scenario import City;"
         "print(is_whole(city_net(City(seed=9, size_m=200.0))))"
     )
     dies, *others = (

@@ -33,8 +33,10 @@ _BEYOND_M: Final = 5.0
 def event_along(
     number: int, asked: OwnEvent, scenario: Scenario, street_map: StreetMap, robot: Robot
 ) -> Event:
-    """The event that a file asks for, on the way of a scenario. Raises SpecError with the reason,
-    and where it fits."""
+    """Return the event of a file on the way of a scenario.
+
+    Raises SpecError with the reason, and the places where it fits.
+    """
     kind = EVENT_KINDS[asked.kind]
     route = scenario.route_line
     half_length_m = 0.0
@@ -82,8 +84,9 @@ def event_along(
 
 
 def narrow_events(scenario: Scenario) -> Iterator[str]:
-    """Events on sidewalks narrower than those of the suites: they take place, but may leave no room
-    to pass."""
+    """Return events on sidewalks narrower than those of the suites, which may leave no room to
+    pass.
+    """
     robot = robot_called(scenario.robot)
     for event in scenario.events:
         layout = EVENT_KINDS[event.kind].layout
@@ -172,7 +175,7 @@ def _half_width_m(route: Polyline, at_m: float, street_map: StreetMap) -> float:
 
 
 def _beyond(route: Polyline, at_m: float) -> Pose:
-    """The place at an arc length of a route, straight on past its goal."""
+    """Return the point at an arc length of a route, extended straight past its goal."""
     pose = route.at(at_m)
     past_m = max(at_m - route.length_m, 0.0)
     x_m, y_m = (
@@ -183,7 +186,7 @@ def _beyond(route: Polyline, at_m: float) -> Pose:
 
 
 def _runs(at: np.ndarray, fits: np.ndarray) -> list[tuple[float, float]]:
-    """The stretches that fit, each from its first place to its last."""
+    """Return the stretches that fit, each from its first place to its last."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], fits, [False]]).astype(int)))
     return [(float(at[first]), float(at[last - 1])) for first, last in edges.reshape(-1, 2)]
 

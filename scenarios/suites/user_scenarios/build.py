@@ -101,8 +101,7 @@ def suite_of_own(file: OwnFile, progress: Progress = ignore) -> Suite:
 
 
 def suite_of(file: OwnFile, made: Sequence[Made]) -> Suite:
-    """Join scenarios that were made of a file as a suite. Raises SpecError with everything that is
-    against them."""
+    """Join the scenarios of a file as a suite. Raises SpecError with all their faults."""
     if faults := dict.fromkeys(fault for one in made for fault in one.faults):
         raise SpecError(f"{file.path}: {join_faults(list(faults), len(faults))}")
     scenarios = tuple(one.scenario for one in made if one.scenario is not None)
@@ -112,8 +111,10 @@ def suite_of(file: OwnFile, made: Sequence[Made]) -> Suite:
 
 
 def place_of_own(own: OwnPlace) -> Place:
-    """The place that a file means; a map's file is imported when it is first used. Raises
-    UsageError, MapError."""
+    """Return the place of a file. The file of a map is imported at its first use.
+
+    Raises UsageError, MapError.
+    """
     if own.city is not None:
         return City(seed=own.city, size_m=own.size_m, style=own.style, roughness=own.roughness)
     if own.map:

@@ -23,8 +23,7 @@ from scenarios.suites.user_scenarios.read import OwnFile
 
 
 def own_faults(file: OwnFile, progress: Progress = ignore) -> list[str]:
-    """Everything that is against driving the scenarios of a file, each fault once, in the order of
-    the scenarios."""
+    """Return all faults of the scenarios of a file, each once, in the order of the scenarios."""
     found: dict[str, None] = {}
     for made in made_of(file, progress):
         told = made.faults
@@ -36,7 +35,7 @@ def own_faults(file: OwnFile, progress: Progress = ignore) -> list[str]:
 
 
 def checked_own(file: OwnFile, progress: Progress = ignore) -> Suite:
-    """The scenarios of a file, to be run. Raises SpecError with everything that is against it."""
+    """Return the scenarios of a file, ready to run. Raises SpecError with all faults."""
     if faults := own_faults(file, progress):
         raise SpecError(f"{file.path}: {join_faults(faults, len(faults))}")
     return suite_of_own(file, progress)

@@ -1,8 +1,7 @@
-"""OwnScenario: what a file of one's own says of a scenario, table by table, with ranges and
-defaults.
+"""Format of user scenario files: the fields of each table, with ranges and defaults.
 
-Ranges that `cosim.spec` declares are not repeated: what a table says is made into the spec, which
-checks itself.
+Ranges that `cosim.spec` declares are not repeated. Each table is converted to its spec, which
+checks them.
 """
 
 from __future__ import annotations
@@ -77,10 +76,14 @@ class OwnPlace(Ranged, frozen=True, kw_only=True):
 
 
 class OwnWay(Ranged, frozen=True, kw_only=True):
-    """The way, one of three. kind: drawn from the seed, length_m long. start and goal: the shortest
-    way between them, from the middle of the nearest sidewalk. route: these points. fences: close
-    all branches, so that one path is left. signals: the way leads over crossings with signals, over
-    none, or over any."""
+    """Way of a scenario: one of kind, start and goal, and route.
+
+    kind: drawn from the seed, length_m long.
+    start, goal: ends of a shortest way, moved to the middle of the nearest sidewalk.
+    route: points of the way.
+    fences: close all branches, so that one path is left.
+    signals: the crossings of the way have signals, have none, or either.
+    """
 
     kind: WayKind | None = None
     length_m: float | None = None

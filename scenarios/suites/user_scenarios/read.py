@@ -49,7 +49,7 @@ _STEP: Final = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 
 
 class Axis(NamedTuple):
-    """A field that is swept over. field: as "crowd.density" or "events[0].at_m"."""
+    """Field of a sweep. field: such as "crowd.density" or "events[0].at_m"."""
 
     field: str
     values: tuple[Any, ...]
@@ -57,7 +57,7 @@ class Axis(NamedTuple):
 
 @dataclass(frozen=True)
 class Variant:
-    """One scenario of a file. at: value of each field of the sweep."""
+    """Scenario of a file. at: value of each field of the sweep."""
 
     id: str
     own: OwnScenario
@@ -66,7 +66,7 @@ class Variant:
 
 @dataclass(frozen=True)
 class OwnFile:
-    """A file that was read. variants: one, or of a sweep all."""
+    """Parsed file. variants: all scenarios of its sweep, or one."""
 
     path: Path
     name: str
@@ -107,7 +107,7 @@ def read_own(path: Path) -> OwnFile:
 
 
 def label(value: Any) -> str:
-    """A value of a sweep, in tables."""
+    """Format a value of a sweep for tables."""
     if isinstance(value, list):
         return f"({', '.join(map(label, value))})"
     return f"{value:g}" if isinstance(value, float) else str(value)
@@ -174,8 +174,9 @@ def _depth_of_type(kind: Any) -> int:
 
 
 def _faults_of_each(tree: dict[str, Any], axes: Sequence[Axis]) -> list[str]:
-    """The faults of the file with the first value of each axis, and of each further value alone;
-    each once."""
+    """Return each fault of the file once: with the first value of each axis, then each other
+    value.
+    """
     first = tree
     for axis in axes:
         first = _with(first, axis.field, axis.values[0])
@@ -192,7 +193,7 @@ def _misread(tree: dict[str, Any]) -> Iterator[str]:
 
 
 def _in_words(fault: str, tree: dict[str, Any]) -> str:
-    """A fault with its field, and what was found there, as the file has them."""
+    """Describe a fault with its field and value, in the terms of the file."""
     at = _AT.search(fault)
     if at is None:
         return fault
@@ -220,7 +221,7 @@ def _found(tree: Any, field: str) -> Any:
 
 
 def _unknown_names(tree: dict[str, Any]) -> Iterator[str]:
-    """Names that only a table knows: of robots, events, maps, styles."""
+    """Yield unknown names of robots, events, maps and styles."""
     events = tree.get("events")
     asked: list[tuple[str, Any, Any]] = [
         ("robot", "robot", ROBOTS),
@@ -241,7 +242,7 @@ def _unknown_names(tree: dict[str, Any]) -> Iterator[str]:
 
 
 def _with(tree: Any, field: str, value: Any) -> Any:
-    """A tree with another value at a field."""
+    """Return a tree with another value at a field."""
     return _with_at(
         tree, [int(number) if number else name for name, number in _STEP.findall(field)], value
     )
@@ -269,7 +270,7 @@ def _variants(tree: dict[str, Any], axes: Sequence[Axis], folder: Path) -> Itera
 
 
 def _beside(own: OwnScenario, folder: Path) -> OwnScenario:
-    """The same with paths from the folder of its file made whole."""
+    """Return the tree with paths resolved from the folder of its file."""
     replace = msgspec.structs.replace
     place = own.place
     light = own.light
@@ -283,8 +284,9 @@ def _beside(own: OwnScenario, folder: Path) -> OwnScenario:
 
 
 def _id_of(name: str, axes: Sequence[Axis], picked: Sequence[int], seed: int | None) -> str:
-    """The name of a scenario: with the values where they make short names that differ, else with
-    their numbers."""
+    """Return the name of a scenario: with its values if these are short and distinct, else
+    numbers.
+    """
     parts = [name]
     for axis, k in zip(axes, picked, strict=True):
         words = [re.sub(r"[^A-Za-z0-9._-]+", "_", label(value)).strip("_") for value in axis.values]

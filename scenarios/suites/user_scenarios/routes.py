@@ -1,4 +1,4 @@
-"""The way of an own scenario: drawn, found between two points, or as it is given."""
+"""Route of a user scenario: drawn, found between two points, or given."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _ANOTHER: Final = 1_000_003
 
 
 class _Spot(NamedTuple):
-    """A place on the middle of a sidewalk."""
+    """Place on the middle of a sidewalk."""
 
     strip: Strip
     s_m: float
@@ -91,7 +91,9 @@ def _bare(
 
 
 def _drawn(way: OwnWay, where: Place, street_map: StreetMap, seed: int, robot: Robot) -> Scenario:
-    """A way of a kind, by the builders of the suites. Raises CosimError when no draw does."""
+    """Draw a way of a kind with the builders of the suites. Raises CosimError if no draw
+    succeeds.
+    """
     graph = walk_graph_of(street_map)
     if way.kind == "crosswalk" and way.signals == "with":
         (found,) = build_all(where, street_map, graph, seed, 1)
@@ -138,8 +140,9 @@ def _told(crossings: tuple[RouteCrossing, ...]) -> str:
 def _between(
     way: OwnWay, street_map: StreetMap, robot: Robot
 ) -> tuple[Polyline, tuple[RouteCrossing, ...], tuple[Barrier, ...]]:
-    """The shortest way from start to goal over plain ground. Raises CosimError with what would
-    help."""
+    """Return the shortest way from start to goal over plain ground. Raises CosimError with a
+    remedy.
+    """
     assert way.start is not None and way.goal is not None
     spots = []
     faults = []
@@ -173,7 +176,7 @@ def _half_m(robot: Robot) -> float:
 
 
 def _along_one(start: _Spot, goal: _Spot) -> Polyline:
-    """The way along one sidewalk."""
+    """Return the way along one sidewalk."""
     line = Polyline(start.strip.line[:, :2])
     if abs(start.s_m - goal.s_m) < 1.0:
         raise SpecError(
@@ -251,7 +254,7 @@ def _passes_once(path: list[Port]) -> bool:
 
 
 def _crossed(street_map: StreetMap, route: Polyline) -> tuple[RouteCrossing, ...]:
-    """The crossings that a route leads over from end to end."""
+    """Return the crossings that a route crosses from end to end."""
     line = LineString(route.points)
     strips = [
         s for s in street_map.near("strip", line) if isinstance(s, Strip) and s.kind == "crossing"
@@ -264,7 +267,7 @@ def _crossed(street_map: StreetMap, route: Polyline) -> tuple[RouteCrossing, ...
 
 
 def moved_m(way: OwnWay, scenario: Scenario) -> list[tuple[str, float]]:
-    """By how much start and goal were moved to the middle of a sidewalk."""
+    """Return how far start and goal were moved to the middle of a sidewalk, in metres."""
     ends: list[tuple[str, PointXY | None, Floats]] = [
         ("start", way.start, np.array(scenario.start[:2])),
         ("goal", way.goal, np.array(scenario.goal)),

@@ -59,7 +59,7 @@ def write_sweep(summary: pd.DataFrame, own: OwnFile, folder: Path) -> list[Path]
 
 
 def _grouped(own: OwnFile) -> Sequence[tuple[tuple[Any, ...], set[str]]]:
-    """The values of each combination, and the scenarios of it, in the file's order."""
+    """Return the values and the scenarios of each combination, in the order of the file."""
     groups: dict[tuple[str, ...], tuple[tuple[Any, ...], set[str]]] = {}
     for variant in own.variants:
         values = tuple(

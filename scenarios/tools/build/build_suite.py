@@ -63,7 +63,7 @@ class _Tried(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class _Piece:
-    """Scenarios of one suite in one place, in order: a process's work."""
+    """Scenarios of one suite in one place, in order: the work of a process."""
 
     suite: str
     where: Place
@@ -135,7 +135,7 @@ def _open(folder: Path, name: str) -> None:
 
 
 def _pieces(slots: Sequence[Slot]) -> list[_Piece]:
-    """The longest work first."""
+    """Return the pieces of work, longest first."""
     by_place: dict[Place, list[Slot]] = {}
     for slot in slots:
         by_place.setdefault(slot.where, []).append(slot)
@@ -233,7 +233,7 @@ def _work(piece: _Piece, folder: Path, tries: int) -> None:
 
 
 def _fill(slot: Slot, folder: Path, tries: int) -> None:
-    """Find the first candidate that the expert solves, and keep it."""
+    """Find and store the first candidate that the expert solves."""
     tried = _tried(folder, slot.name)
     dropped = list(tried.dropped)
     begun = tried.begun

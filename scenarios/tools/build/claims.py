@@ -41,8 +41,11 @@ _FEWEST_EVENTS: Final = 5
 
 @dataclass(frozen=True)
 class Read:
-    """A suite as it was read. proofs: None where there are none that can be read; path: None for
-    one made in Python."""
+    """Suite with its proofs.
+
+    proofs: None if they are missing or unreadable.
+    path: None for a suite made in Python.
+    """
 
     suite: Suite
     proofs: Proofs | None
@@ -67,7 +70,7 @@ def _counts(read: Read) -> Iterator[str]:
 
 
 def _split(read: Read) -> Iterator[str]:
-    """A fifth is test, of each structure alike, in places that val never comes to."""
+    """Check that a fifth of each structure is test, in places that val does not use."""
     for structure, those in _by(read.suite.scenarios, lambda s: s.structure).items():
         share = sum(s.split == "test" for s in those) / len(those)
         if abs(share - 0.2) > 0.5 / len(those):
@@ -127,7 +130,7 @@ def _proofs(read: Read) -> Iterator[str]:
 
 
 def _lengths(read: Read) -> Iterator[str]:
-    """10 to 20 m each; long ways more than 100 m, and 36.5 km +- 1 % in all."""
+    """Check lengths: 10 to 20 m each; long routes more than 100 m, and 36.5 km +- 1 % in all."""
     for scenario in read.suite.scenarios:
         length_m = scenario.route_line.length_m
         low, high = (
@@ -212,7 +215,9 @@ def _events(read: Read) -> Iterator[str]:
 
 
 def _spread(read: Read) -> Iterator[str]:
-    """Lengths, turns, hours, seasons and clouds spread; fog in some; light enough to see."""
+    """Check that lengths, turns, hours, seasons and clouds are spread, some with fog, all in
+    daylight.
+    """
     whole = read.suite.scenarios
     for one in whole:
         rises = sun_rises_rad(one.light.hour, one.light.day_of_year, one.light.latitude_deg)
@@ -262,7 +267,9 @@ def _shares(what: str, found: Sequence[str], wanted: Sequence[str], least: float
 
 
 def _duplicates(read: Read) -> Iterator[str]:
-    """No two of a structure on one spot, crops of one net taken together."""
+    """Check that no two scenarios of a structure are on one spot. Crops of one net count as one
+    place.
+    """
     groups = _by(read.suite.scenarios, lambda s: f"{s.structure} {_ground(s)}")
     for those in groups.values():
         for a, b in itertools.combinations(those, 2):
@@ -281,7 +288,7 @@ def _ground(scenario: Scenario) -> str:
 
 
 def _size(read: Read) -> Iterator[str]:
-    """Suite and proofs are small files."""
+    """Check that the files of suite and proofs are small."""
     if read.path is not None:
         files = [path for path in (read.path, proofs_path(read.path)) if path.exists()]
         if (size := sum(path.stat().st_size for path in files)) > _MOST_BYTES:

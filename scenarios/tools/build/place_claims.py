@@ -164,7 +164,7 @@ def _driven(scenario: Scenario, proofs: dict[str, Proof]) -> Iterator[str]:
 
 
 def _ports(scenario: Scenario, street_map: StreetMap) -> list[Port]:
-    """The ports of the strips that a route lies on."""
+    """Return the ports of the strips of a route."""
     line = scenario.route_line
     poses = [line.at(float(s_m)) for s_m in np.arange(0.0, line.length_m, 0.5)]
     strips = dict.fromkeys(street_map.locate(pose.x_m, pose.y_m, 0.05).edge for pose in poses)

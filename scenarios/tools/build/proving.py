@@ -1,4 +1,4 @@
-"""Proving a candidate: the expert drives it, and is stopped at its first failure."""
+"""Prove candidates: the expert drives each one until its end or its first failure."""
 
 from __future__ import annotations
 
@@ -26,12 +26,14 @@ _ROUNDED: Final = 3
 
 
 class _FailedError(CosimError):
-    """The expert has failed: no need to go on."""
+    """Failure of the expert, which ends the episode."""
 
 
 class _Witness:
-    """Stops an episode at its first failure, and measures how near the robot came to people and
-    obstacles."""
+    """Monitor that stops an episode at its first failure.
+
+    It measures the least distance of the robot from people and obstacles.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         robot = robot_called(scenario.robot)
@@ -43,7 +45,7 @@ class _Witness:
         self._seed = scenario.seed
 
     def see(self, step: Step, verdict: Verdict) -> None:
-        """Take in what happened in a tick. Raises _FailedError."""
+        """Process the events of a tick. Raises _FailedError."""
         for failure in verdict.failures:
             words = " with ".join(filter(None, (failure.kind, failure.other_kind)))
             self.failure = Dropped(self._seed, words, f"at {failure.route_s_m:.1f} m")
@@ -65,7 +67,7 @@ class _Witness:
 
 
 def proved(scenario: Scenario, expert: str = EXPERT) -> Proof | Dropped:
-    """The proof that the expert solves a scenario, or why it does not."""
+    """Return the proof that the expert solves a scenario, or the reason for its failure."""
     witness = _Witness(scenario)
     record = run_episode(scenario, load_policy(expert), watches=[witness.see]).record
     if witness.failure is not None:

@@ -201,7 +201,7 @@ def collect(
 
 @dataclass(frozen=True)
 class _Rounds:
-    """The runs that a data set is made of."""
+    """Runs that form a data set."""
 
     source: Suite | Fresh
     out: Path
@@ -305,7 +305,7 @@ def _nowhere(source: Suite | Fresh) -> list[Scenario]:
 
 
 def _open(out: Path, spec: CollectSpec, resume: bool) -> None:
-    """Begin a folder, or go on in it. Raises RunError for one that is of another data set."""
+    """Create a folder, or resume it. Raises RunError for one of another data set."""
     path = out / _ASKED
     try:
         if path.exists():

@@ -58,8 +58,12 @@ class Collected:
 
 
 class Filmed(NamedTuple):
-    """The pictures of a data set. eye: the camera's name; size: width, height; fps: pictures a
-    second."""
+    """Pictures of a data set.
+
+    eye: name of the camera.
+    size: width and height.
+    fps: pictures a second.
+    """
 
     eye: str
     size: tuple[int, int]
@@ -167,8 +171,10 @@ def _told(one: Collected) -> dict[str, Any]:
 def _rows(
     episodes: Sequence[Collected], filmed: Filmed
 ) -> tuple[dict[str, Any], list[int], list[int], list[str], list[dict[str, Any]]]:
-    """The columns of all rows, each episode's length and size in bytes, all tasks, and each
-    episode's statistics."""
+    """Return the columns of all rows, and of each episode its length, size in bytes and statistics.
+
+    All tasks are returned too.
+    """
     parts: list[dict[str, NDArray[Any]]] = []
     lengths = list[int]()
     sizes = list[int]()
@@ -265,14 +271,14 @@ def _films(sizes: Sequence[int]) -> list[tuple[int, int]]:
 
 
 def _column(array: NDArray[Any]) -> Any:
-    """An Arrow column; of an array (n, k) one of lists of k."""
+    """Return an Arrow column; for an array (n, k) one of lists of k."""
     if array.ndim == 1:
         return pa.array(array)
     return pa.FixedSizeListArray.from_arrays(pa.array(array.ravel()), array.shape[1])
 
 
 def _numbers(column: Any) -> NDArray[Any]:
-    """The array that a column was made of."""
+    """Return the array from which a column was made."""
     if pa.types.is_fixed_size_list(column.type):
         flat: NDArray[Any] = column.flatten().to_numpy(zero_copy_only=False)
         return flat.reshape(-1, column.type.list_size)
@@ -281,7 +287,7 @@ def _numbers(column: Any) -> NDArray[Any]:
 
 
 def _stats(array: NDArray[Any]) -> dict[str, list[Any]]:
-    """Statistics of a feature (n,) or (n, k), as lists of 1 or k."""
+    """Return statistics of a feature (n,) or (n, k), as lists of 1 or k."""
     values = array.reshape(len(array), -1).astype(np.float64)
     found = {"min": values.min(axis=0), "max": values.max(axis=0), "mean": values.mean(axis=0)}
     found |= {"std": values.std(axis=0)}
@@ -291,8 +297,10 @@ def _stats(array: NDArray[Any]) -> dict[str, list[Any]]:
 
 
 def _colour_stats(colours: NDArray[np.int64], pictures: int) -> dict[str, list[Any]]:
-    """The same of pictures, each channel from 0 to 1, as lists (3, 1, 1). colours (3, 256): how
-    often each value."""
+    """Return statistics of pictures, each channel from 0 to 1, as lists (3, 1, 1).
+
+    colours: (3, 256) count of each value.
+    """
     values = np.arange(256) / 255.0
     count = colours.sum(axis=1)
     mean = colours @ values / count

@@ -1,5 +1,4 @@
-"""Reading data sets: rows and pictures of one that `cosim collect` has made, held against each
-other, and packed."""
+"""Read data sets of `cosim collect`, compare their rows with their pictures, and pack them."""
 
 from __future__ import annotations
 
@@ -50,8 +49,10 @@ class DataSet:
         return len(self.rows["index"])
 
     def pictures(self) -> Iterator[NDArray[np.uint8]]:
-        """(H, W, 3) for each row. Raises RunError where there are fewer or more, or one is not
-        shown at its time."""
+        """Yield (H, W, 3) for each row.
+
+        Raises RunError if there are fewer or more, or one is not at its time.
+        """
         fps = int(self.info["fps"])
         first = 0
         for film in self.films:
@@ -172,9 +173,12 @@ _SAME: Final = ("rate_hz", "waypoint_s", "waypoints", "goal", "camera", "robot")
 def packed_sets(
     folders: Sequence[Path], size: tuple[int, int] | None = None, progress: Progress = ignore
 ) -> Packed:
-    """Data sets, one after another, as arrays. size: width, height of the pictures, in place of
-    their own. Raises RunError for a folder that holds none, SpecError for data sets that do not fit
-    together."""
+    """Return data sets, one after another, as arrays.
+
+    size: width and height of the pictures, instead of their own.
+
+    Raises RunError for a folder without a data set, SpecError for data sets that do not match.
+    """
     held = [read_data_set(folder) for folder in folders]
     for one, other in pairwise(held):
         for name in _SAME:

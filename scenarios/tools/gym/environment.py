@@ -1,5 +1,7 @@
-"""SidewalkEnv: scenarios as an environment of Gymnasium. A step is a period of the policy, an
-episode an `Episode`."""
+"""Gymnasium environment of scenarios.
+
+A step is a period of the policy, an episode an `Episode`.
+"""
 
 from __future__ import annotations
 
@@ -156,7 +158,7 @@ class SidewalkEnv(gymnasium.Env[SeenParts, NDArray[Any]]):
         self._stack.close()
 
     def _named(self, options: Mapping[str, Any] | None) -> Scenario | None:
-        """The scenario that the options of a reset ask for."""
+        """Return the scenario in the options of a reset."""
         for key in options or {}:
             if key != "scenario":
                 raise unknown("option of reset", str(key), ["scenario"])

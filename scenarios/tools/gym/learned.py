@@ -1,4 +1,4 @@
-"""LearnedPolicy: what was learned in an environment, as a policy that the benchmark runs."""
+"""Run a policy that was learned in an environment in the benchmark."""
 
 from __future__ import annotations
 
@@ -24,8 +24,9 @@ from scenarios.tools.gym.spaces import (
 
 
 class LearnedPolicy:
-    """Asks `predict` for the action in what it sees: that of the environment with the same
-    manifest, actions, robot.
+    """Policy that calls `predict` for each action.
+
+    Observations are those of the environment with the same manifest, actions and robot.
 
     >>> ahead = LearnedPolicy(lambda seen: np.float32([1.0, 0.0]), Manifest("ahead", camera=None))
     >>> ahead.manifest.name
@@ -45,7 +46,7 @@ class LearnedPolicy:
         self._answers = action_space_of(actions, manifest, [robot])
 
     def reset(self, episode_id: str, seed: int) -> None:
-        """Nothing to forget: what it answers depends on what it sees alone."""
+        """Do nothing: answers depend only on the present observation."""
 
     def act(self, observation: Observation) -> Command | NDArray[np.floating[Any]]:
         return action_as_answer(

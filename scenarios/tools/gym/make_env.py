@@ -1,4 +1,4 @@
-"""make_env(suite) -> an environment of Gymnasium that drives the scenarios of a suite."""
+"""Make Gymnasium environments of the scenarios of a suite."""
 
 from __future__ import annotations
 

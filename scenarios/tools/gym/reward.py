@@ -1,5 +1,4 @@
-"""Rewards: what happened between two answers of a learner, and what it is worth. No engine, nothing
-of Gymnasium."""
+"""Rewards of a learner for the period between two answers. They need no engine and no Gymnasium."""
 
 from __future__ import annotations
 
@@ -90,7 +89,7 @@ class Period:
         self._ticks: list[tuple[Step, Verdict]] = []
 
     def watch(self, step: Step, verdict: Verdict) -> None:
-        """The next tick of an episode."""
+        """Add the next tick of an episode."""
         self._ticks.append((step, verdict))
 
     def transition(self) -> Transition:

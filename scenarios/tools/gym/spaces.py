@@ -61,7 +61,7 @@ def seen_space(manifest: Manifest, robots: Sequence[Robot]) -> spaces.Dict:
 
 
 def seen_by(observation: Observation, space: spaces.Dict) -> SeenParts:
-    """An observation in its space."""
+    """Convert an observation to its space."""
     parts: SeenParts = {"speeds": (observation.v_mps, observation.w_radps)}
     pictures: list[tuple[str, Observation | CameraPicture]] = [("", observation)]
     pictures += [(f"_{name}", one) for name, one in observation.pictures.items()]
@@ -149,7 +149,7 @@ def _goal_space(manifest: Manifest) -> dict[str, spaces.Space[Any]]:
 
 
 def _within(value: Any, space: spaces.Space[Any]) -> Any:
-    """A value of a part of the space: of its type, within its bounds, its own."""
+    """Convert a value to a part of the space: copied, of its type, and clipped to its bounds."""
     if not isinstance(space, spaces.Box):
         return value
     array = np.array(value, space.dtype)

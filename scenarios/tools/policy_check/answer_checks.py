@@ -36,7 +36,7 @@ def finite(asker: Asker) -> CheckOutcome:
 
 
 def deterministic(asker: Asker) -> CheckOutcome:
-    """The same question with the same seed has the same answer."""
+    """Equal observations with the same seed give the same answer."""
     straight, left = asker.drives["straight"].seen, asker.drives["left"].seen
     answers = []
     for _ in range(2):
@@ -52,7 +52,7 @@ def deterministic(asker: Asker) -> CheckOutcome:
 
 
 def history_reset(asker: Asker) -> CheckOutcome:
-    """Nothing of an episode is left in the next one."""
+    """An episode leaves no state for the next one."""
     drives = asker.drives
     after = []
     for before in ("left", "right", "person"):
@@ -69,7 +69,7 @@ def history_reset(asker: Asker) -> CheckOutcome:
 
 
 def put_back(asker: Asker) -> CheckOutcome:
-    """Nothing of the way before the robot was put elsewhere is left."""
+    """After the robot is put back, no state of the way before is left."""
     drives = asker.drives
     clock = Clock.for_rate(asker.manifest.rate_hz)
     rate_hz = asker.manifest.rate_hz
@@ -102,8 +102,7 @@ def time_step(asker: Asker) -> CheckOutcome:
 
 
 def speed_unit(asker: Asker) -> CheckOutcome:
-    """Speeds that a robot on a sidewalk drives: a unit or a time step that is off by ten is outside
-    of them."""
+    """Speeds are plausible on a sidewalk: a unit or time step that is wrong by ten is found."""
     answers = [asker.answer(scene, asker.plain) for scene in ("straight", "left", "right")]
     fastest = max(one.v_mps for one in answers)
     most = COURIER.v_max_mps
@@ -132,7 +131,7 @@ def speed_unit(asker: Asker) -> CheckOutcome:
 
 
 def behind(asker: Asker) -> CheckOutcome:
-    """Ahead is ahead: on an empty straight sidewalk the way does not lead back, nor to the side."""
+    """On an empty straight sidewalk the way leads ahead, neither back nor to the side."""
     one = asker.answer("straight", asker.plain)
     if one.v_mps < -1e-3:
         return failed(

@@ -1,4 +1,4 @@
-"""CHECKS: every check of a policy by name, and what all of them come to."""
+"""Table of all policy checks by name, and their common result."""
 
 from __future__ import annotations
 
@@ -94,8 +94,7 @@ def checked_policy(
     progress: Progress = ignore,
     only: Collection[str] = (),
 ) -> CheckedPolicy:
-    """Ask a policy all that is to be known of it, or what these checks ask. manifest: with the
-    goals of the run."""
+    """Run all checks of a policy, or these. manifest: with the goals of the run."""
     asker = Asker(driver, manifest, drives, progress)
     outcomes: dict[str, CheckOutcome] = {}
     for name, check in POLICY_CHECKS.items():

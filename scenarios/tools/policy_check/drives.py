@@ -1,5 +1,8 @@
-"""Drives that a policy is shown: short ways along a real street of a suite, drawn by its own
-cameras, with nothing simulated. What it answers changes nothing of what it sees next."""
+"""Drives that are shown to a policy: short ways along a real street of a suite.
+
+The cameras of the policy draw them without a simulation. Its answers do not affect the next
+observation.
+"""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ Observations = Sequence[Observation]
 
 
 class Edit(NamedTuple):
-    """A change of a drive, by a name that no other change has."""
+    """Change of a drive, with a unique name."""
 
     name: str
     change: Callable[[Observations], list[Observation]]
@@ -67,7 +67,7 @@ def in_mirror(seen: Observation) -> Observation:
 
 
 def with_goal_told(name: str, goal: Goal | None) -> Edit:
-    """Another goal throughout."""
+    """Return an edit that replaces the goal of all observations."""
     return of_each(f"goal {name}", lambda seen: replace(seen, goal=goal))
 
 

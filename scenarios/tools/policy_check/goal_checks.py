@@ -1,4 +1,4 @@
-"""Checks of what a policy makes of its goal, on a straight sidewalk."""
+"""Checks of how a policy uses its goal, on a straight sidewalk."""
 
 from __future__ import annotations
 

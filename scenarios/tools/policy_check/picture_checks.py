@@ -183,7 +183,7 @@ def _steers(asker: Asker, *edits: Edit) -> tuple[float, float]:
 
 
 def _brakes(asker: Asker, *edits: Edit) -> tuple[float, float]:
-    """The share of its speed that it takes away before a person; and in a mirror."""
+    """Return the share of its speed by which the policy brakes for a person, also in a mirror."""
     speeds = [
         [asker.answer(s, asker.plain, *more, *edits).v_mps for s in _MET] for more in _both(asker)
     ]
@@ -192,7 +192,7 @@ def _brakes(asker: Asker, *edits: Edit) -> tuple[float, float]:
 
 
 def _both(asker: Asker) -> tuple[tuple[Edit, ...], tuple[Edit, ...]]:
-    """The street and its mirror; twice the street where a camera looks aside."""
+    """Return the street and its mirror; twice the street if a camera looks aside."""
     return (), () if _aside(asker) else (IN_MIRROR,)
 
 
@@ -213,7 +213,7 @@ def _blind(asker: Asker) -> CheckOutcome | None:
 
 
 def _aside(asker: Asker) -> CheckOutcome | None:
-    """A camera that looks aside sees another street in a mirror."""
+    """Return an outcome if a camera looks aside: in a mirror it sees another street."""
     for seen in asker.drives["straight"].seen[-1:]:
         for camera in [seen.camera, *(one.camera for one in seen.pictures.values())]:
             if camera is not None and (

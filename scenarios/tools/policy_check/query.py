@@ -49,7 +49,7 @@ class Answered:
 
 
 def answered(said: object, command: Command, rule: WaypointRule) -> Answered:
-    """said: the answer as it is, which became this command."""
+    """Convert a raw answer, which became this command."""
     if isinstance(said, Command) or not isinstance(command, WaypointCommand):
         raw = said if isinstance(said, Command) else command
         return Answered(float(raw.v_mps), float(raw.w_radps), None)
@@ -97,7 +97,9 @@ class Asker:
         driver.on_answer(self._hear)
 
     def answer(self, scene: SceneName, *edits: Edit) -> Answered:
-        """The answer to the last observation of a drive, with these changes. Raises PolicyError."""
+        """Return the answer to the last observation of a drive with these edits. Raises
+        PolicyError.
+        """
         key = scene, tuple(edit.name for edit in edits)
         if key not in self._known:
             seen: Sequence[Observation] = self.drives[scene].seen
@@ -107,7 +109,7 @@ class Asker:
         return self._known[key]
 
     def episode(self, seen: Sequence[Observation], seed: int = _SEED) -> list[Answered]:
-        """The answers to observations, in an episode of their own. Raises PolicyError."""
+        """Return the answers to observations in a new episode. Raises PolicyError."""
         self._episodes += 1
         name = f"check-{self._episodes:04d}"
         self._progress("asking the policy")
@@ -138,7 +140,7 @@ class Asker:
 
     @cached_property
     def goals(self) -> dict[str, Edit]:
-        """By name, as the goal's type has them (`AnyGoal.probes`)."""
+        """Edits of the goal by name, from `AnyGoal.probes`."""
         own = self.drives["straight"].seen[-1].goal
         probes = {"ahead": None} if own is None else own.probes()
         return {name: with_goal_told(name, goal) for name, goal in probes.items()}

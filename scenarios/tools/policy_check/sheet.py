@@ -1,5 +1,4 @@
-"""The picture of a check: what a policy answers in each scene, drawn into its pictures and from
-above."""
+"""Draw the answers of a policy in each scene into its pictures and into a view from above."""
 
 from __future__ import annotations
 
@@ -32,7 +31,7 @@ _MOST: Final = 64
 
 
 def check_sheet(asker: Asker) -> Image:
-    """(H, W, 3) uint8 RGB: a row for each scene, as it is and in a mirror."""
+    """Draw a row for each scene, as it is and in a mirror, (H, W, 3) uint8 RGB."""
     rows = []
     for scene in SCENES:
         seen = asker.drives[scene].seen
@@ -44,7 +43,7 @@ def check_sheet(asker: Asker) -> Image:
 
 
 def path_of(answer: Answered) -> Floats:
-    """(N, 2) metres ahead and left: its waypoints, or where its command leads within 2 s."""
+    """Return the waypoints, or the path of the command within 2 s, (N, 2) metres ahead and left."""
     if answer.waypoints is not None:
         return answer.waypoints[:_MOST, :2]
     headings = answer.turn_rad * np.linspace(0.0, _ARC_S, 11)
@@ -87,7 +86,9 @@ def _panel(
 
 
 def pixels_of(path: Floats, camera: Calibration) -> Floats:
-    """(M, 2) pixels of those points on level ground, (N, 2) metres, that lie before a camera."""
+    """Return (M, 2) pixels of those of (N, 2) points on level ground, in metres, before a
+    camera.
+    """
     ground = np.column_stack([path, np.zeros(len(path)), np.ones(len(path))])
     points = (np.linalg.inv(camera.on_robot) @ ground.T).T[:, :3]
     points = np.where(points[:, 2:] > 0.05, points, np.nan)
@@ -113,8 +114,9 @@ def _draw(picture: Image, pixels: Floats, followed: int | None) -> None:
 
 
 def _draw_above(picture: Image, path: Floats, followed: int | None) -> None:
-    """A look from above in the upper right: a line for each metre, the robot in the lower
-    middle."""
+    """Draw a view from above in the upper right: a line for each metre, the robot in the lower
+    middle.
+    """
     x0 = _WIDE_PX - _ABOVE_PX - 4
     y0 = _BAR_PX + 4
     shade(picture, (x0, y0, x0 + _ABOVE_PX, y0 + _ABOVE_PX), 0.75)

@@ -1,5 +1,4 @@
-"""Cases: the tiny scenarios by which an installation is verified, chosen from the shipped suites by
-one rule."""
+"""Short scenarios that verify an installation, chosen from the shipped suites by one rule."""
 
 from __future__ import annotations
 

@@ -34,7 +34,9 @@ def packages() -> str:
 
 
 def names() -> str:
-    """The top-level packages are ours and not another distribution's of the same name."""
+    """Check that the top-level packages are not those of another distribution with the same
+    name.
+    """
     owners = packages_distributions()
     for name in OWN:
         if (owner := set(owners.get(name, ["sidewalk-cosim"]))) != {"sidewalk-cosim"}:
@@ -104,7 +106,7 @@ def frame() -> str:
 
 
 def small_scenario() -> Scenario:
-    """A long-horizon scenario in a small city with a small crowd."""
+    """Build a long-horizon scenario in a small city with a small crowd."""
     _, street_map = place(_SMALL)
     scenario = build_long_horizon(_SMALL, street_map, WalkGraph(street_map), 0, "doctor")
     return msgspec.structs.replace(scenario, crowd=CrowdSpec(persons=10, radius_m=50.0, vehicles=4))

@@ -56,7 +56,7 @@ def _arithmetic() -> dict[str, str]:
 
 
 def textures() -> dict[str, str]:
-    """A hash of each texture by its name."""
+    """Return a hash of each texture by its name."""
     told: dict[str, str] = {}
     for stack in _STACKS:
         layers = stack(_PX)
@@ -69,8 +69,10 @@ def textures() -> dict[str, str]:
 
 
 def room_hashes(root: Path | None = None) -> dict[str, str]:
-    """A hash of the source in each room, as "physics/textures"; of what lies in none, of the top
-    folder."""
+    """Return a hash of the source of each package, such as "physics/textures".
+
+    Files outside packages count for their top folder.
+    """
     root = Path(cosim.__file__).parents[1] if root is None else root
     rooms: dict[str, list[Path]] = {}
     for top in ROOMS:

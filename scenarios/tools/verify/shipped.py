@@ -118,7 +118,7 @@ def trace_of(case: Scenario) -> Trace | str:
     """Return the trace of a case, or the error message if it fails."""
     try:
         return traced(case)
-    except Exception as error:  # noqa: BLE001  what a wrong version of a package does is told with all the rest
+    except Exception as error:  # noqa: BLE001  wrong package versions are reported too
         return error_message(error)
 
 

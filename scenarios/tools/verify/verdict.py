@@ -166,8 +166,9 @@ def _case(
 
 
 def first_difference(told: Trace, mine: Trace) -> tuple[str, int]:
-    """The part that differs first, and in which tick, -1 before the first one; "" where none
-    does."""
+    """Return the first part that differs and its tick, -1 before the first one; "" if none
+    differs.
+    """
     length = max(len(told.ticks["robot"]), len(mine.ticks["robot"]))
     for at in range(0, length, DIGITS):
         for part in PARTS:

@@ -1,4 +1,4 @@
-"""A way on the ground as the robot's camera sees it."""
+"""Project a way on the ground into the picture of the robot's camera."""
 
 from __future__ import annotations
 
@@ -63,8 +63,10 @@ def way_in_picture(shot: Shot, lens: Lens, way: Floats) -> WayInPicture:
 
 
 def _pixels(shot: Shot, lens: Lens, points: Floats) -> Floats:
-    """(N, 2) columns and rows, NaN for what no picture shows: behind the eye, or beyond where the
-    lens folds over."""
+    """Return (N, 2) columns and rows, NaN for invisible points.
+
+    These are behind the eye, or where the projection of the lens folds over.
+    """
     right, up, ahead = ((points - shot.eye_m) @ shot.axes.T).T
     seen = (ahead > _NEAREST_M) & (ahead < _FARTHEST_M)
     depth = np.where(seen, ahead, 1.0)
@@ -78,7 +80,7 @@ def _pixels(shot: Shot, lens: Lens, points: Floats) -> Floats:
 
 
 def led_to(command: Command, pose: Pose, over_s: float = _LEADS_S) -> Floats:
-    """(16, 2) metres in the world: where a command leads from a pose."""
+    """Return the path of a command from a pose, (16, 2) metres in the world."""
     at_s = np.linspace(0.0, over_s, 16)
     turn = command.w_radps * at_s / 2.0
     along = command.v_mps * at_s

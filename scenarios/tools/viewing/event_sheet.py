@@ -90,7 +90,7 @@ def rows_of(
 
 
 def walked(event: Event, track: Floats, log: Log) -> tuple[float, float, float, float]:
-    """(speed_mps, left_m, angle_deg, least_m) of one person's track (T, 5); see `rows_of`."""
+    """Return (speed_mps, left_m, angle_deg, least_m) of a person's track (T, 5); see `rows_of`."""
     xy = track[:, 3:5]
     steps = np.diff(xy, axis=0)
     far_m = np.hypot(steps[:, 0], steps[:, 1])

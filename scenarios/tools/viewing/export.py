@@ -1,4 +1,4 @@
-"""A scenario's street as a file for other programs."""
+"""Export the street of a scenario as a file for other programs."""
 
 from __future__ import annotations
 

@@ -87,8 +87,9 @@ class Cut(NamedTuple):
 
 
 class FilmedFailure(NamedTuple):
-    """The first failure of an episode: when it happened, why, and the seconds that a film of it
-    shows."""
+    """First failure of an episode: its time, its reason, and the seconds that a film of it
+    shows.
+    """
 
     scenario: str
     at_s: float
@@ -98,10 +99,9 @@ class FilmedFailure(NamedTuple):
 
 
 def failure_to_film(folder: Path, scenario_id: str | None) -> FilmedFailure:
-    """Choose the first failure of an episode; without an id, of the first failed episode in the
-    order of the run.
+    """Choose the first failure of an episode; by default of the first failed episode of the run.
 
-    Raises UsageError for an unknown episode, and RunError with the outcomes where nothing failed.
+    Raises UsageError for an unknown episode, and RunError with the outcomes if nothing failed.
     """
     records = {record.scenario.id: record for record in read_records(folder)}
     failed = [
@@ -188,7 +188,7 @@ def make_film(
 
 
 def robot_eye(cut: Cut) -> CameraSpec:
-    """The robot's camera as large as it is in the film."""
+    """Return the camera of the robot in the size of the film."""
     layout = hud.Layout.of(*cut.size)
     area = layout.view if cut.view == "robot" else layout.second
     up = min(ROBOT_ASIDE * area.height / area.width, math.tan(math.radians(ROBOT_FOV_DEG / 2)))
@@ -333,8 +333,10 @@ class _Reel:
 
 
 def _framed(robot: RobotState, street: Street) -> Floats:
-    """(3,) metres ahead and left of the robot, and height, from which it and the event people near
-    it can be seen."""
+    """Return a view of the robot and the event people near it.
+
+    It is (3,) metres ahead and left of the robot, and height.
+    """
     cos, sin = math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)
     event = street.people.are(*DIRECTED)
     offset = (street.people.xy[event] - robot.pose.xy) @ np.array([[cos, -sin], [sin, cos]])

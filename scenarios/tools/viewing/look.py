@@ -78,8 +78,10 @@ def look_at(
 
 
 def eye_behind(robot: RobotState, ahead: Floats | None = None) -> tuple[Floats, Floats]:
-    """(eye, target), (3,) metres: behind and above the robot, looking ahead. ahead: (2,), by
-    default its heading."""
+    """Return eye and target, (3,) metres, of a view from behind and above the robot, looking ahead.
+
+    ahead: (2,), by default its heading.
+    """
     way = _way(robot, ahead)
     foot = robot.pose.xy
     return np.append(foot - BEHIND_M * way, robot.z_m + ABOVE_M), np.append(

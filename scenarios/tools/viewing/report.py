@@ -1,5 +1,4 @@
-"""The report of runs: reads them, shows failures again in processes of their own, and writes one
-HTML file."""
+"""Write the report of runs as one HTML file. Failures are replayed in worker processes."""
 
 from __future__ import annotations
 
@@ -131,8 +130,7 @@ def make_report(
 
 
 class _Episode(NamedTuple):
-    """An episode that is run again. picks: numbers of the failures that it shows; mishaps: these
-    failures."""
+    """Episode that is replayed. picks: numbers of its failures; mishaps: these failures."""
 
     run: int
     scenario: str
@@ -148,8 +146,7 @@ class _Episode(NamedTuple):
 def _episodes(
     runs: Sequence[ReportedRun], picks: Sequence[FailureToShow]
 ) -> tuple[list[_Episode], dict[int, str]]:
-    """The episodes of the picks, those that take longest first; and of the picks that have none:
-    why."""
+    """Return the episodes of the picks, longest first, and the reasons for picks without one."""
     numbers: dict[tuple[int, str], list[int]] = {}
     lost: dict[int, str] = {}
     for k, pick in enumerate(picks):
@@ -168,7 +165,7 @@ _done: MutableSequence[float] = []
 
 
 def _begin(parent: int, done: MutableSequence[float]) -> None:
-    """Begin a process that shows failures again."""
+    """Initialize a process that replays failures."""
     global _done
     exit_with_parent(parent)
     _done = done
@@ -285,7 +282,7 @@ def _begun_pictures(
 
 
 def _bounds(scenarios: Sequence[Scenario]) -> _Bounds:
-    """Around their routes, in metres, no flatter than 2 to 5 either way."""
+    """Return bounds around the routes, in metres, with an aspect of at most 5 to 2."""
     route = np.concatenate([np.array(scenario.route) for scenario in scenarios])
     low = route.min(axis=0) - _MARGIN_M
     high = route.max(axis=0) + _MARGIN_M

@@ -123,7 +123,7 @@ def record_for_rerun(
 
 
 def _blueprint(rrb: Any) -> Any:
-    """Street on the left, pictures on the right, plots and words below."""
+    """Return the layout: street on the left, pictures on the right, plots and text below."""
     camera = "world/robot/camera"
     contents = ["$origin/**", "/world/robot/plan", "/world/waypoints/**"]
     pictures = rrb.Vertical(
@@ -257,7 +257,7 @@ class _Tape:
         colour: Rgb255,
         static: bool = False,
     ) -> None:
-        """Upright boxes on the ground: middle, heading, and length, width, height."""
+        """Return upright boxes on the ground from centre, heading, and length, width, height."""
         half = np.array([size for *_, size in boxes]).reshape(-1, 3) / 2
         at = self._on_ground(np.array([(x, y) for x, y, *_ in boxes]).reshape(-1, 2)) + half * (
             0.0,
@@ -284,11 +284,11 @@ class _Tape:
         return np.column_stack([corners, np.full(len(corners), self._surface.heights(inside)[0])])
 
     def _on_ground(self, xy: Floats, above_m: float = 0.0) -> Floats:
-        """(N, 3) points on the ground, or so far above it."""
+        """Return (N, 3) points above_m above the ground."""
         return np.column_stack([xy, self._surface.heights(xy) + above_m])
 
     def tick(self, step: Step, verdict: Verdict, eyes: ViewCamera) -> None:
-        """A tick, as it is at its end."""
+        """Log the state at the end of a tick."""
         rr = self._rr
         robot = step.motion.robot
         self._to.set_time("time", duration=Clock().time_s(step.tick + 1))
@@ -412,6 +412,6 @@ class _Tape:
 
 
 def _triangles(shape: Polygon | MultiPolygon) -> Floats:
-    """(T, 3, 2) triangles that cover a polygon."""
+    """Return (T, 3, 2) triangles that cover a polygon."""
     faces = shapely.get_parts(shapely.constrained_delaunay_triangles(shape))
     return shapely.get_coordinates(faces).reshape(-1, 4, 2)[:, :3]

@@ -65,11 +65,11 @@ Took = Callable[[int], None]
 
 
 def untimed(done: int) -> None:
-    """Default callback: ignores how much is done."""
+    """Ignore progress; the default callback."""
 
 
 class ShownAgain(NamedTuple):
-    """A failure shown again, and whom the robot met."""
+    """Replayed failure with the bodies near the robot."""
 
     scene: Scene
     other: MetBody | None
@@ -83,7 +83,7 @@ def ticks_to_show(mishaps: Sequence[Mishap]) -> int:
 
 
 def _last_tick(mishaps: Sequence[Mishap]) -> int:
-    """The number of ticks up to the last failure."""
+    """Return the number of ticks up to the last failure."""
     return max(mishap.tick for mishap in mishaps) + 1
 
 
@@ -139,8 +139,7 @@ def show_again(
 
 
 def robots_camera(spec: CameraSpec | None) -> CameraSpec:
-    """The policy's own camera, in a size for a page; the standard one, 4:3, for a policy that has
-    none."""
+    """Return the policy's own camera, in a size for a page, or the standard one, 4:3."""
     if spec is None:
         return CameraSpec(_WIDEST_PX, _TALLEST_PX)
     zoom = min(_WIDEST_PX / spec.width, _TALLEST_PX / spec.height)
@@ -229,7 +228,7 @@ class _Shots:
 
 
 class _Reel:
-    """Collects the moments before one failure. follows: see `WaypointReplay`."""
+    """Collector of the moments before one failure. follows: see `WaypointReplay`."""
 
     def __init__(self, told: RecordedEpisode, mishap: Mishap, follows: int) -> None:
         self._scenario = told.scenario
@@ -299,7 +298,7 @@ class _Reel:
         )
 
     def _near(self, route: Floats, where: Floats) -> Floats:
-        """The stretch of the route that can be in view."""
+        """Return the stretch of the route that can be in view."""
         near = np.flatnonzero(np.hypot(*(route - where).T) < 2.0 * _GROUND_M + SHOWN_S * 2.5)
         if not len(near):
             return route

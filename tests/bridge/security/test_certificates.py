@@ -203,7 +203,7 @@ def test_a_hub_that_does_not_fit_is_refused_in_words(
     with pytest.raises(AccessError, match="has expired on"):
         open_session(expired)
     monkeypatch.setattr(
-        "bridge.session.notices_of", lambda _: []
+        "bridge.session.connection_warnings", lambda _: []
     )  # one that listened before its certificate's end
     (trusting / "ca.pem").write_bytes(
         (other / "ca.pem").read_bytes() + (old / "ca.pem").read_bytes()
