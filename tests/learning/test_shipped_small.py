@@ -24,7 +24,7 @@ def test_a_small_policy_that_ships_is_small_and_answers_without_pytorch(name: st
     code = (
         "import sys, cosim; from cosim.policies.onnx.policy import example_observation; "
         "policy = cosim.load_policy(sys.argv[1]); policy.reset('one', 1); "
-        "print(policy.act(in_grey(policy.manifest)).v_mps >= 0.0, 'torch' in sys.modules)"
+        "print(policy.act(example_observation(policy.manifest)).v_mps >= 0.0, 'torch' in sys.modules)"
     )
     said = subprocess.run(
         [sys.executable, "-c", code, name], capture_output=True, text=True, check=True

@@ -67,7 +67,7 @@ def report(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
     assert done.returncode == 0, done.stderr
     (folder / "report.html").write_text("another page")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(progress, "AGAIN_S", 0.0)
+        patch.setattr(progress, "REPEAT_S", 0.0)
         done = cosim("report", "run", "--jobs", "1", "-o", "report.html", cwd=folder)
     assert done.returncode == 0, done.stderr
     shares = [int(share) for share in re.findall(r"showing failures again: (\d+) %", done.stderr)]

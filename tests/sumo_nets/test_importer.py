@@ -425,7 +425,7 @@ def test_large_files_are_told_of_the_box(
     tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """An import that takes minutes says so when it begins, with the option that makes it faster."""
-    monkeypatch.setattr(importer, "BIG", 5)
+    monkeypatch.setattr(importer, "SLOW_IMPORT_EDGES", 5)
     source = written(tmp_path / "town.osm", osm(blocks=2))
     done = cosim("map", "import", str(source))
     assert (

@@ -47,7 +47,7 @@ A drawable implements `draw(stage)` and draws itself with its program of that st
     "moving"  shadows of moving objects, drawn for every picture
 
 A drawable that casts no shadow of a kind returns at once. Back faces are culled in the picture.
-Front faces are counter-clockwise as in physics.world.mesh.
+Front faces are counter-clockwise as in physics.ground.mesh.
 """
 
 from __future__ import annotations
