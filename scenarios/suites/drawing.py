@@ -4,6 +4,7 @@ scenarios.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Iterable
 from typing import Final, TypeVar
@@ -11,9 +12,11 @@ from typing import Final, TypeVar
 import msgspec
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from cosim.core.errors import CosimError, SpecError
 from cosim.core.geometry import Polyline
+from cosim.core.state import PERSON_RADIUS_M
 from cosim.people.yielding import STEP_ROUND_GAP_M
 from cosim.place.street_map import StreetMap, Strip
 from cosim.spec.events import EventKind
@@ -27,15 +30,23 @@ PERSON_M2: Final = 25.0
 cities.
 """
 _SAMPLE_M: Final = 20.0
+_STEP_M: Final = 5.0
+"""Distance between the points of a route at which the room of people is measured, m."""
 
 FREE_M2: Final = 20.0
-"""Area of sidewalk for each person, without the lane of the robot, on routes of users, in m2; about
-21 in generated cities.
-"""
+"""Area of sidewalk for each person, m2, on routes drawn with `--map`: of the stripes that the robot
+leaves free."""
+CROWDED_SHARE: Final = 0.2
+"""Share of such a route on which there may be less than FREE_M2 for each person."""
+BESIDE_PERSON_M: Final = 2.0 * PERSON_RADIUS_M + 3.0 * STEP_ROUND_GAP_M
+"""Width in addition to the robot's, m, with which a person passes it and keeps a gap on every
+side."""
 LARGEST_GROUP_M: Final = 3 * GROUP_STRIPE_M
 """Width of the largest group, side by side, in metres."""
 NARROW_M: Final = 10.0
 """Length of route, in metres, up to which sidewalks without room to pass a group are ignored."""
+
+_ROUNDING: Final = 1e-6
 
 _Drawn = TypeVar("_Drawn")
 
@@ -126,27 +137,25 @@ def wider_m(robot: Robot) -> float:
 
 
 def thinned(scenario: Scenario, street_map: StreetMap) -> Scenario:
-    """Return the scenario with no more people than fit on the sidewalks near its route.
-
-    Sidewalks within the radius of the crowd count.
-    """
-    persons = min(
-        scenario.crowd.persons, round(_area_around_m2(scenario, street_map, 0.0) / PERSON_M2)
-    )
+    """The scenario with no more people than the sidewalks within the crowd's radius of its route
+    have room for."""
+    persons = min(scenario.crowd.persons, round(_area_around_m2(scenario, street_map) / PERSON_M2))
     return msgspec.structs.replace(
         scenario, crowd=msgspec.structs.replace(scenario.crowd, persons=persons)
     )
 
 
 def passable(scenario: Scenario, street_map: StreetMap, robot: Robot = COURIER) -> Scenario:
-    """Return the scenario with a crowd that leaves the robot room to pass.
+    """Return the scenario with a crowd that leaves the robot room to pass, for routes drawn with
+    `--map`.
 
-    The number of people is limited to those that leave room for the robot. Groups are removed if
-    three people abreast fill a sidewalk of the route. The shipped suites use `thinned` alone.
+    People spread evenly over the length of sidewalks, so narrow sidewalks have less room for each.
+    There are as many people as have FREE_M2 on all but CROWDED_SHARE of the route's sidewalks.
+    Nobody walks where they are narrower than `passing_width_m`.
+    There are no groups where three abreast fill a sidewalk of the route.
     """
-    scenario = thinned(scenario, street_map)
-    lane_m = robot.width_m + 2.0 * STEP_ROUND_GAP_M
     line = shapely.LineString(scenario.route)
+    lane_m = robot.width_m + 2.0 * STEP_ROUND_GAP_M
     narrow_m = sum(
         strip.polygon.intersection(line).length
         for strip in street_map.near("strip", line)
@@ -155,18 +164,55 @@ def passable(scenario: Scenario, street_map: StreetMap, robot: Robot = COURIER) 
         and strip.width_m < LARGEST_GROUP_M + lane_m
     )
     crowd = scenario.crowd
-    persons = min(crowd.persons, round(_area_around_m2(scenario, street_map, lane_m) / FREE_M2))
-    groups = crowd.groups if narrow_m <= NARROW_M else 0.0
-    return msgspec.structs.replace(
-        scenario, crowd=msgspec.structs.replace(crowd, persons=persons, groups=groups)
+    room_m2 = _room_along_m2(scenario, street_map, robot)
+    fitting = float(np.quantile(room_m2, CROWDED_SHARE, method="lower")) / FREE_M2
+    crowd = msgspec.structs.replace(
+        crowd,
+        persons=min(crowd.persons, round(fitting)),
+        groups=crowd.groups if narrow_m <= NARROW_M else 0.0,
     )
+    return msgspec.structs.replace(scenario, crowd=crowd)
 
 
-def _area_around_m2(scenario: Scenario, street_map: StreetMap, less_m: float) -> float:
-    """Return the mean area of sidewalk within the crowd's radius of points on the route.
+def passing_width_m(robot: Robot) -> float:
+    """Return the width of the narrowest sidewalk on which people pass a robot, m.
 
-    less_m: subtracted from each width.
+    People walk in stripes. One stripe must be free beside those that the robot and its gaps cover.
     """
+    return (_stripes_of(robot) + 1) * GROUP_STRIPE_M
+
+
+def _stripes_of(robot: Robot) -> int:
+    return math.ceil((robot.width_m + 2.0 * STEP_ROUND_GAP_M) / GROUP_STRIPE_M - _ROUNDING)
+
+
+def _room_along_m2(scenario: Scenario, street_map: StreetMap, robot: Robot) -> NDArray[np.float64]:
+    """Return the room of all people at points of the route that lie on sidewalks, m2.
+
+    It is the length of sidewalks within the crowd's radius, times the width that the robot leaves
+    free at the point.
+    """
+    route = scenario.route_line
+    strips = street_map.near(
+        "strip", shapely.LineString(route.points).buffer(scenario.crowd.radius_m)
+    )
+    sidewalks = [strip for strip in strips if isinstance(strip, Strip) and strip.kind == "sidewalk"]
+    lines = np.array([shapely.LineString(strip.line[:, :2]) for strip in sidewalks], dtype=object)
+    room_m2 = []
+    for s_m in np.arange(0.0, route.length_m, _STEP_M).tolist():
+        x_m, y_m = route.at(s_m).xy
+        here = street_map.strips.get(street_map.locate(x_m, y_m, 0.05).edge)
+        if here is None or here.kind != "sidewalk":
+            continue
+        around = shapely.Point(x_m, y_m).buffer(scenario.crowd.radius_m)
+        length_m = float(shapely.length(shapely.intersection(lines, around)).sum())
+        free = max(int(here.width_m / GROUP_STRIPE_M + _ROUNDING) - _stripes_of(robot), 0)
+        room_m2.append(length_m * free * GROUP_STRIPE_M)
+    return np.array(room_m2 or [0.0])
+
+
+def _area_around_m2(scenario: Scenario, street_map: StreetMap) -> float:
+    """Return the mean area of sidewalk within the crowd's radius of points on the route, m2."""
     route = Polyline(np.array(scenario.route))
     around = [
         shapely.Point(route.at(float(s_m)).xy).buffer(scenario.crowd.radius_m)
@@ -174,7 +220,7 @@ def _area_around_m2(scenario: Scenario, street_map: StreetMap, less_m: float) ->
     ]
     area_m2 = [
         sum(
-            strip.polygon.intersection(disc).area * max(1.0 - less_m / strip.width_m, 0.0)
+            strip.polygon.intersection(disc).area
             for strip in street_map.near("strip", disc)
             if isinstance(strip, Strip) and strip.kind == "sidewalk"
         )

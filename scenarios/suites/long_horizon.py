@@ -26,9 +26,16 @@ from cosim.spec.events import EventKinds
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import Barrier, CrowdSpec, Place, RouteCrossing, Scenario
 from scenarios.events import EVENT_KINDS
-from scenarios.suites.drawing import TRIES, Refusals, bare_scenario, first_of
+from scenarios.suites.drawing import (
+    BESIDE_PERSON_M,
+    TRIES,
+    Refusals,
+    bare_scenario,
+    first_of,
+    passing_width_m,
+)
 from scenarios.suites.edge_fences import hem
-from scenarios.suites.obstacles import with_obstacles
+from scenarios.suites.obstacles import TO_SPARE_M, with_obstacles
 from scenarios.suites.way_events import draw_events
 
 WAY_SPARE_M = 0.045
@@ -88,6 +95,7 @@ class _Draft(NamedTuple):
     robot: Robot
     kinds: EventKinds
     length_m: float | None
+    to_spare_m: float
 
 
 _Fences = Callable[[StreetMap, Polyline, Sequence[Port], float], tuple[Barrier, ...]]
@@ -102,19 +110,22 @@ def build_long_horizon(
     robot: Robot = COURIER,
     kinds: EventKinds = EVENT_KINDS,
     length_m: float | None = None,
+    roomy: bool = False,
 ) -> Scenario:
     """Draw a scenario from `seed`.
 
-    If no draw has exactly one path to the goal, search for ways that can be fenced along both
-    sides. length_m: length of the way; drawn by default.
+    roomy: prefer ways over sidewalks on which people can pass the robot, and leave room for a
+    person beside obstacles.
 
-    Raises SpecError with the most frequent reason and a remedy.
-    """
+    Raises SpecError with the reason that stands in the way most often, and what would help."""
     rng = np.random.default_rng([seed, place.seed, 0x10E6])
     candidates = starts(street_map, graph)
     if not candidates:
         raise MapError(f"map '{street_map.name}' has no sidewalk of {START_M:g} m to start on")
-    draft = _Draft(place, street_map, graph, seed, scenario_id, robot, kinds, length_m)
+    to_spare_m = BESIDE_PERSON_M if roomy else TO_SPARE_M
+    draft = _Draft(place, street_map, graph, seed, scenario_id, robot, kinds, length_m, to_spare_m)
+    if roomy and (found := _on_wide_sidewalks(draft, candidates)) is not None:
+        return found
     drawn, searched = Refusals(), Refusals()
     draws = (
         lambda: _along(
@@ -134,6 +145,27 @@ def build_long_horizon(
         )
         raise SpecError(f"{failure}, and none was found by searching ({searched}): {remedy}")
     return found
+
+
+def _on_wide_sidewalks(draft: _Draft, candidates: Sequence[str]) -> Scenario | None:
+    """Return a scenario on sidewalks that are all wide enough for people to pass the robot.
+
+    None where no sidewalk is narrower, or no way over wide ones is found.
+    """
+    street_map = draft.street_map
+    least_m = passing_width_m(draft.robot)
+    strips = street_map.strips.values()
+    narrow = {strip.id for strip in strips if strip.kind == "sidewalk" and strip.width_m < least_m}
+    wide = [strip for strip in candidates if strip not in narrow]
+    if not narrow or not wide:
+        return None
+    rng = np.random.default_rng([draft.seed, draft.place.seed, 0x10E6, 2])
+
+    def draw() -> Scenario:
+        way = draw_way(street_map, draft.graph, rng, wide, draft.length_m, narrow)
+        return _along(draft, rng, way, _barriers)
+
+    return first_of((draw for _ in range(TRIES)), Refusals())
 
 
 def starts(street_map: StreetMap, graph: WalkGraph) -> list[str]:
@@ -175,7 +207,9 @@ def _along(
         "crowd": CrowdSpec(groups=IN_GROUPS),
         "structure": "route",
     }
-    return with_obstacles(msgspec.structs.replace(bare, **parts), street_map)
+    return with_obstacles(
+        msgspec.structs.replace(bare, **parts), street_map, to_spare_m=draft.to_spare_m
+    )
 
 
 def lone_route(
@@ -285,18 +319,17 @@ def draw_way(
     rng: np.random.Generator,
     candidates: Sequence[str],
     length_m: float | None = None,
+    avoided: Set[str] = frozenset(),
 ) -> tuple[list[Port], float, float]:
     """Draw a shortest way of a drawn length that crosses a street.
 
-    length_m: wanted length, instead of a drawn one.
-
-    Returns (way, start_m, goal_m), as for `way_line`.
-    """
+    length_m: the wanted length in place of a drawn one. avoided: strips that it does not lead
+    over."""
     target_m = rng.uniform(*ROUTE_M) if length_m is None else length_m
     strip = street_map.strips[candidates[int(rng.integers(len(candidates)))]]
     leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)
     start_m = float(rng.uniform(0.4, 0.7)) * strip.length_m
-    closed = street_map.too_steep | {leave.other}
+    closed = street_map.too_steep | {leave.other} | _ports_of(avoided)
     reach = graph.reach(leave, closed, limit_m=target_m + 60.0)
     goals = [
         port
@@ -335,11 +368,7 @@ def search_way(
     strip = street_map.strips[candidates[int(rng.integers(len(candidates)))]]
     leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)
     start_m = float(rng.uniform(0.4, 0.7)) * strip.length_m
-    closed = (
-        street_map.too_steep
-        | {leave.other}
-        | {port for s in avoided for port in (Port(s, 0), Port(s, 1))}
-    )
+    closed = street_map.too_steep | {leave.other} | _ports_of(avoided)
     reach = graph.reach(leave, closed, limit_m=target_m + 60.0)
     ends = set(candidates)
     goals = [
@@ -361,6 +390,11 @@ def search_way(
                 float(rng.uniform(0.4, 0.7)) * street_map.strips[goals[i].strip].length_m,
             )
     raise SpecError("no way of the drawn length crosses a street every 160 m")
+
+
+def _ports_of(strips: Set[str]) -> set[Port]:
+    """Return both ends of each strip."""
+    return {port for strip in strips for port in (Port(strip, 0), Port(strip, 1))}
 
 
 def route_crossings(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 from cosim.core.errors import MapError, SpecError, unknown
@@ -33,14 +34,12 @@ def suite_on_map(
 ) -> Suite:
     """Draw a suite on a place; the same arguments and net give the same suite.
 
-    called: name that the user gives the place.
-    count: number of long-horizon scenarios, 1 by default. For reactive ones, whose events take
-    turns, one of each by default.
-    events: kinds of events. Those without room on the place are left out and listed in the
-    description, unless the user requested them.
-    roughness: of the ground, from 0 (flat) to 1.
-    kinds: table of the available events.
-    robot: robot for which the ways must be wide enough.
+    count: of long-horizon scenarios, 1 by default; of reactive ones, whose events take turns, one
+    of each by default. events: which of them; those for which the place has no room are left out,
+    and the description says so, unless they were asked for. Where sidewalks are few or narrow,
+    fewer people walk, and none in groups; long routes prefer wide sidewalks: see `passable` and
+    `build_long_horizon`. roughness: of the ground, from 0 (flat) to 1. kinds: the table of events
+    that there are. robot: which one the ways are wide enough for.
 
     Fewer people walk where sidewalks are few or narrow, and none in groups: a robot could not pass.
 
@@ -81,11 +80,11 @@ class _Drawn(NamedTuple):
         """Draw `count` long-horizon scenarios; the list of sentences is empty."""
         seeds = range(self.seed, self.seed + count)
         ids = [f"{self.name}-{seed:03d}" for seed in seeds]
-        drawn_on = (self.where, self.street_map, self.graph)
-        build = long_horizon.build_long_horizon
+        build = partial(
+            long_horizon.build_long_horizon, self.where, self.street_map, self.graph, roomy=True
+        )
         return [
-            build(*drawn_on, seed, name, self.robot, self.kinds)
-            for seed, name in zip(seeds, ids, strict=True)
+            build(seed, name, self.robot, self.kinds) for seed, name in zip(seeds, ids, strict=True)
         ], []
 
     def reactive(self, count: int | None, asked: Sequence[str]) -> tuple[list[Scenario], list[str]]:

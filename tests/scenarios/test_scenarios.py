@@ -172,7 +172,7 @@ def test_fewer_people_walk_where_sidewalks_are_few() -> None:
     """On a small map there are fewer people than in a city, and no more than were asked for where
     there is room."""
     (scenario,) = suite_on_map("long-horizon", "sumo-fkk-in", 1, 1).scenarios
-    assert 20 <= scenario.crowd.persons <= 40
+    assert 5 <= scenario.crowd.persons <= 20
     ten = msgspec.structs.replace(scenario.crowd, persons=10)
     few = msgspec.structs.replace(scenario, crowd=ten)
     assert thinned(few, read_map("sumo-fkk-in")) == few
