@@ -109,9 +109,7 @@ def test_processes_that_use_and_forget_at_once_do_not_hurt_one_another(cache: Pa
         "part.replace(entry)\n    use_entry(entry)\n    gone = [n for n in range(k) if not "
         "entry.with_name(f'{sys.argv[1]}-{n}.map').exists()]\n    assert not gone, gone\n"
     )
-    forgets = (
-        "from cosim.core.cache import clean_up\nfor _ in range(40): forget_entries(limit_bytes=0)"
-    )
+    forgets = "from cosim.core.cache import clean_up\nfor _ in range(40): clean_up(limit_bytes=0)"
     words = [(keeps, str(n)) for n in range(4)] + [(forgets, ""), (forgets, "")]
     processes = [
         subprocess.Popen([sys.executable, "-c", *word], stderr=subprocess.PIPE, text=True)

@@ -48,9 +48,9 @@ def no_more(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(*_: object, **__: object) -> None:
         raise EngineError("a tile was made")
 
-    for maker in ("build_tile", "land_covers", "frontage_in", "paint_in"):
+    for maker in ("build_tile", "land_covers", "frontage_covers", "tile_markings"):
         monkeypatch.setattr(street_surface, maker, fails)
-    monkeypatch.setattr(street_surface.Placement, "in_tile", fails)
+    monkeypatch.setattr(street_surface.PropPlacement, "in_tile", fails)
 
 
 def hilly(street_map: StreetMap) -> StreetMap:
