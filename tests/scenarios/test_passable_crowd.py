@@ -21,7 +21,7 @@ from scenarios.suites.drawing import (
 from scenarios.suites.long_horizon import build_long_horizon
 from scenarios.suites.obstacles import prove_gap, with_obstacles
 from scenarios.suites.sample import suite_on_map
-from sumo_nets.maps.place_names import place_called
+from sumo_nets.maps.place_names import resolve_place
 from tests.scenarios.test_scenarios import cross_map
 
 
@@ -68,7 +68,7 @@ def test_routes_on_maps_keep_to_wide_sidewalks() -> None:
 @pytest.mark.engine
 def test_obstacles_on_maps_leave_room_for_a_person_beside_the_robot() -> None:
     """Obstacles drawn for maps leave such a gap; those of the suites leave the robot's alone."""
-    where = place_called("sumo-fkk-in", 0.0)
+    where = resolve_place("sumo-fkk-in", 0.0)
     _, street_map = place(where)
     suites, maps = (
         build_long_horizon(where, street_map, WalkGraph(street_map), 0, "one", roomy=roomy)
