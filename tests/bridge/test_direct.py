@@ -60,25 +60,25 @@ import sys, time
 import msgspec
 from bridge import keys
 from bridge.codec import decode, encode
-from bridge.director import verify_query, signed
+from bridge.director import verify_query, sign
 from bridge.session import open_session
 from cosim.spec.connection import Connection
 from scenarios.events import react
-from scenarios.episodes.director import behaviours
+from scenarios.episodes.director import behaviour_version
 
 last = {}
 def lie(payload):
-    query = verify_query(payload, behaviours())
-    reply, by, replace = react(query), behaviours(), msgspec.structs.replace
+    query = verify_query(payload, behaviour_version())
+    reply, by, replace = react(query), behaviour_version(), msgspec.structs.replace
     before, last[query.episode] = last.get(query.episode, reply), reply
     if query.tick < 3 or query.episode == "honest":
-        return signed(reply, by)
+        return sign(reply, by)
     match query.episode:
-        case "late": return signed(before, by)
-        case "many": return signed(replace(reply, states=reply.states * 1000), by)
+        case "late": return sign(before, by)
+        case "many": return sign(replace(reply, states=reply.states * 1000), by)
         case "noise": return b"\\x93\\x01" * 100
-        case "other-code": return signed(reply, "0" * 16)
-        case "huge": return signed(reply, "x" * 10_000_000)
+        case "other-code": return sign(reply, "0" * 16)
+        case "huge": return sign(reply, "x" * 10_000_000)
     raise RuntimeError("no idea")
 
 with open_session(Connection(role="director", listen=sys.argv[1])) as hub:
