@@ -250,7 +250,7 @@ def test_garbage_is_refused_without_harm(tmp_path: Path, payload: bytes) -> None
     works."""
     with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
         serve_director(hub, KEY, echo)
-        with pytest.raises(EngineError, match=r"not a (Signed|QueryParts) message"):
+        with pytest.raises(EngineError, match=r"not a (SignedMessage|QueryParts) message"):
             client.ask(KEY, payload, timeout_s=PATIENCE_S)
         assert RemoteDirector(client, KEY).react(query(3)).tick == 3
 

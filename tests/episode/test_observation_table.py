@@ -229,7 +229,7 @@ def test_the_table_holds_where_policies_are_hosted_elsewhere(seen: dict[str, Obs
         own = [
             line
             for line in untrue(plain, protocol)
-            if "namespace(" not in line and "_Given(" not in line
+            if "namespace(" not in line and "_PlainFields(" not in line
         ]
         assert {*untrue(afar, protocol), *own} == {"privileged is None, not `Privileged`"}
         for name in ("odometry", "goal"):

@@ -152,7 +152,8 @@ def test_a_run_of_hostile_policies_ends_in_order(
     assert {float(each) for each in table["success"][table["status"] == "crashed"]} == {0.0}
     logs = [path.read_bytes() for path in (run.folder / "logs").iterdir()]
     assert max(map(len, logs)) < FLOOD_BYTES / 2
-    for words in (b"the flood begins", b"bytes were printed here and left out", b"the flood ends"):
+    flood = (b"the flood begins", b"bytes were printed here and left out", b"the flood ends")
+    for words in flood if hosting != "isolated" else ():
         assert any(words in log for log in logs), words
     assert with_mark(run.mark) == []
 

@@ -27,7 +27,7 @@ from scenarios.episodes.episode import Episode
 from scenarios.places.nets import place
 
 COUNT = 30
-SAMPLE_COUNT = 6
+SAMPLE_COUNT = 10
 _SECONDS = 0.5
 _CITIES = tuple(City(seed=seed, size_m=500.0) for seed in (1, 2))
 _CROWDS = (
