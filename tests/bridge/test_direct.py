@@ -222,7 +222,7 @@ def test_a_director_that_lies_spoils_its_episodes_and_no_other(
     says = {
         "late": "it answered tick 2 of 'late'",
         "many": "it answered with 1000 states for 1 events",
-        "noise": "not a Signed message",
+        "noise": "not a SignedMessage message",
         "other-code": "run and director must be started from the same code",
         "huge": "Expected `str` of length <= 64",
         "raises": "RuntimeError: no idea",
