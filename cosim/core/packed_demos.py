@@ -1,28 +1,24 @@
 """Packed demonstrations: plain arrays in one .npz, for training with numpy alone.
 
-`cosim dataset pack DIR -o FILE.npz` writes it of what `cosim collect` has collected. Its arrays, N
-rows, one for each
-picture, episode after episode and in order of time:
+`cosim dataset pack DIR -o FILE.npz` writes it from the output of `cosim collect`. It has N rows,
+one for each picture, ordered by episode and time:
 
-frames      (N, H, W, 3) uint8     the picture, RGB
-state       (N, 2) float32         the robot's own speeds at the picture: v m/s, w rad/s
-goal        (N, 2) float32         what the robot is told: x ahead, y to the left, metres; NaN where
-            it is told no point
-command     (N, 2) float32         the expert's answer to the picture, clipped to the robot's
-            limits: v m/s, w rad/s
-waypoints   (N, K, 2) float32      where the robot is 1, 2 .. K times `waypoint_s` later, in its
-            frame at the picture:
-                                   x ahead, y to the left, metres
-driven      (N,) int32             how many of the waypoints were driven, by the expert alone,
-            before the episode ended
-                                   or somebody disturbed the drive; the others go on by the expert's
-                                   command there
-disturbed   (N,) bool              another command than the expert's was driven after the picture
-            (`--noise`)
-episode     (N,) int32             from 0
-frame       (N,) int32             from 0 in each episode; the picture was taken frame / rate_hz
-            seconds after its start
-meta        () str                 JSON, see `Packed.meta`
+| array     | type                     | meaning                                                   |
+|-----------|--------------------------|-----------------------------------------------------------|
+| frames    | (N, H, W, 3) uint8       | RGB picture                                               |
+| state     | (N, 2) float32           | speeds of the robot at the picture: v m/s, w rad/s        |
+| goal      | (N, 2) float32           | point goal: x ahead, y left, metres; NaN without one      |
+| command   | (N, 2) float32           | expert's answer within the robot's limits: v m/s, w rad/s |
+| waypoints | (N, K, 2) float32        | robot after 1 .. K times `waypoint_s`: x ahead, y left    |
+| driven    | (N,) int32               | number of waypoints driven by the expert alone            |
+| disturbed | (N,) bool                | whether another command was driven (`--noise`)            |
+| episode   | (N,) int32               | number of the episode, from 0                             |
+| frame     | (N,) int32               | number of the picture in its episode, from 0              |
+| meta      | () str                   | JSON, see `Packed.meta`                                   |
+
+Waypoints are metres in the robot's frame at the picture. Those after `driven` extrapolate the
+expert's command, because the episode ended or the drive was disturbed. A picture is taken frame /
+rate_hz seconds after the episode's start.
 """
 
 from __future__ import annotations

@@ -175,7 +175,7 @@ class StreetMap:
 
     bounds: x0, y0, x1, y1 in metres.
     net_hash: content hash of the net and of its features, if any.
-    features: mapped objects beside the streets; none of them is in the way.
+    features: mapped objects off the walkable area.
     terrain: None if the place is flat.
     elevation: how the net's elevations were processed, None without any.
     planned: whether it is a generated city, whose net names the class of each street.

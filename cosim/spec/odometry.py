@@ -26,9 +26,12 @@ ODOMETRY: Final[Mapping[str, str]] = MappingProxyType(
 
 
 class Odometry(msgspec.Struct, frozen=True):
-    """Where the robot takes itself to be: metres ahead and to the left of its start, heading
-    counter-clockwise from the
-    start's, None for gps. Nothing in it tells where on the map that is.
+    """Estimated pose relative to the start: metres ahead and to the left, heading
+    counter-clockwise.
+
+    heading_rad: None for gps.
+
+    It does not reveal the position on the map.
 
     >>> pose = Odometry(12.0, 0.5, heading_rad=0.1)
     >>> pose.x_m, np.asarray(pose)

@@ -3,7 +3,7 @@
     python scenarios/examples/learn_straight_on.py --minutes 30 --processes 2 --out learned
 
 It sees 48 x 48 pixels, its speeds and the next sub-goal; the streets are those of `static` of
-`reactive`, with nobody in them. In the beginning it stands still on average, and turns at random.
+`reactive` without pedestrians. At first it stops on average, and turns at random.
 FOLDER/curve.csv tells how it goes on, FOLDER/curve.png shows it, FOLDER/model.zip is what was
 learned; then it is scored as any policy is, in places that it has never seen.
 """
@@ -34,7 +34,7 @@ _LATEST = 50
 
 
 def static_streets(split: str) -> list[str]:
-    """The ids of the streets with nobody in them."""
+    """Return the ids of the scenarios without pedestrians."""
     whole = cosim.load_suite("reactive").scenarios
     return [one.id for one in whole if (one.structure, one.split) == ("static", split)]
 
@@ -122,8 +122,10 @@ def _drawn_curve(curve: Path, output: Path) -> None:
 def learn(
     minutes: float, processes: int, out: Path, seed: int, steps: int = 10**9, rollout: int = 256
 ) -> LearnedPolicy:
-    """What was learned in so much time, or so many steps if these are done before, with its curve
-    in a folder."""
+    """Train for a time or a number of steps, whichever ends first.
+
+    Writes the curve to `out`, and returns the policy.
+    """
     torch.set_num_threads(1)
     out.mkdir(parents=True, exist_ok=True)
     envs = SubprocVecEnv([static_env] * processes, start_method="spawn")

@@ -137,8 +137,7 @@ def wider_m(robot: Robot) -> float:
 
 
 def thinned(scenario: Scenario, street_map: StreetMap) -> Scenario:
-    """The scenario with no more people than the sidewalks within the crowd's radius of its route
-    have room for."""
+    """Return the scenario with no more people than fit on the sidewalks near its route."""
     persons = min(scenario.crowd.persons, round(_area_around_m2(scenario, street_map) / PERSON_M2))
     return msgspec.structs.replace(
         scenario, crowd=msgspec.structs.replace(scenario.crowd, persons=persons)
@@ -177,7 +176,7 @@ def passable(scenario: Scenario, street_map: StreetMap, robot: Robot = COURIER) 
 def passing_width_m(robot: Robot) -> float:
     """Return the width of the narrowest sidewalk on which people pass a robot, m.
 
-    People walk in stripes. One stripe must be free beside those that the robot and its gaps cover.
+    People walk in stripes. One stripe must stay free of the robot and its gaps.
     """
     return (_stripes_of(robot) + 1) * GROUP_STRIPE_M
 

@@ -114,10 +114,15 @@ def build_long_horizon(
 ) -> Scenario:
     """Draw a scenario from `seed`.
 
-    roomy: prefer ways over sidewalks on which people can pass the robot, and leave room for a
-    person beside obstacles.
+    If no draw has exactly one path to the goal, search for ways that can be fenced along both
+    sides.
 
-    Raises SpecError with the reason that stands in the way most often, and what would help."""
+    length_m: length of the way; drawn by default.
+    roomy: prefer sidewalks on which people can pass the robot, and leave room for a person to pass
+        obstacles.
+
+    Raises SpecError with the most frequent reason and a remedy.
+    """
     rng = np.random.default_rng([seed, place.seed, 0x10E6])
     candidates = starts(street_map, graph)
     if not candidates:
@@ -323,8 +328,11 @@ def draw_way(
 ) -> tuple[list[Port], float, float]:
     """Draw a shortest way of a drawn length that crosses a street.
 
-    length_m: the wanted length in place of a drawn one. avoided: strips that it does not lead
-    over."""
+    length_m: wanted length, instead of a drawn one.
+    avoided: strips that the way must not use.
+
+    Returns (way, start_m, goal_m), as for `way_line`.
+    """
     target_m = rng.uniform(*ROUTE_M) if length_m is None else length_m
     strip = street_map.strips[candidates[int(rng.integers(len(candidates)))]]
     leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)

@@ -151,11 +151,15 @@ def obstacles_along(
     beside: bool = False,
     to_spare_m: float = TO_SPARE_M,
 ) -> tuple[Obstacle, ...]:
-    """Obstacles for a scenario that has route, crossings, barriers and events already, beside those
-    that it has; one at least stands in the way if any fits there. per_100m: how many along 100 m of
-    its sidewalks; drawn from PER_100M where None. beside: none in the way, and at least
-    BESIDE_FREE_M from its middle. to_spare_m: by how much the gap is wider than the robot. No more
-    than it has where the way itself is no wider than the gap."""
+    """Draw obstacles for a scenario that has its route, crossings, barriers and events already.
+
+    per_100m: obstacles along 100 m of its sidewalks; drawn from PER_100M if None.
+    beside: place none within BESIDE_FREE_M of the middle of the route.
+    to_spare_m: width of the gap in addition to the robot's.
+
+    Returns the obstacles of the scenario and the drawn ones. Without `beside`, at least one is in
+    the way if any fits there. None is added if the route is no wider than the gap.
+    """
     density = float(rng.uniform(*PER_100M)) if per_100m is None else per_100m
     stretches = _stretches(scenario, street_map, _BEYOND_M if beside else 0.0)
     lengths = np.array([stretch.high_m - stretch.low_m for stretch in stretches])

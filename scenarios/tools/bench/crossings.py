@@ -39,12 +39,14 @@ _SIZE_M = 2000.0
 
 
 class Crossed(msgspec.Struct, frozen=True, kw_only=True):
-    """One crossing driven over. ended: "crashed" when it was not. waited_s: how long the robot
-    stood before red.
+    """Result of driving over one crossing.
 
-    red_entries, vehicles_braked, carriageway_s: the robot's. failures: what failed, and with whom
-    it collided. counts, at_red: of the street around, see `Tally`; entered: the signalised
-    crossings that somebody entered there.
+    ended: end of the episode; "crashed" if it did not reach one.
+    waited_s: seconds that the robot waited at red.
+    red_entries, vehicles_braked, carriageway_s: of the robot.
+    failures: failures, with the kind of body in collisions.
+    counts, at_red: of the surrounding street, see `Tally`.
+    entered: signalised crossings that a pedestrian entered.
     """
 
     scenario: str
@@ -66,7 +68,7 @@ class Crossed(msgspec.Struct, frozen=True, kw_only=True):
 def cross_all(
     crossings: int, cities: int, policy: str, jobs: int, progress: Progress
 ) -> list[Crossed]:
-    """Drive over so many crossings, spread over cities, `jobs` cities at a time."""
+    """Drive over crossings spread over cities, `jobs` cities at a time."""
     if cities > crossings:
         raise SpecError(
             f"{crossings} crossings cannot lie in {cities} cities: ask for fewer cities"
@@ -90,7 +92,7 @@ def cross_all(
 
 
 def cross_city(city: City, count: int, policy: str) -> Iterator[Crossed]:
-    """Drive over so many crossings of one city, one after another, in a process of its own."""
+    """Drive over crossings of one city, one after another, in a new process."""
     context = multiprocessing.get_context("spawn")
     names = [""] * count
     done = 0

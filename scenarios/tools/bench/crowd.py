@@ -83,11 +83,13 @@ APART_M: Final = 2.0
 
 
 class Watched(msgspec.Struct, frozen=True, kw_only=True):
-    """Observations of one city. counts: see `Tally`. crossings: signalised ones that somebody
-    entered.
+    """Observations of one city.
 
-    crowd_ms: CPU milliseconds of a step of the crowd, on the mean. group_gaps_m: every half second,
-    of each group, how far its loneliest member is from its nearest fellow.
+    counts: see `Tally`.
+    crossings: signalised crossings that a pedestrian entered.
+    crowd_ms: mean CPU milliseconds of a step of the crowd.
+    group_gaps_m: for each group, every half second, the largest distance of a member to its
+        nearest fellow.
     """
 
     place: str
@@ -126,7 +128,7 @@ class Glider:
 
 
 def watch(city: City, minutes: float, crowd: CrowdSpec) -> Watched:
-    """Watch the crowd of a city for so many simulated minutes."""
+    """Watch the crowd of a city for a number of simulated minutes."""
     _, street_map = place(city)
     graph = WalkGraph(street_map)
     clock = Clock.for_rate(Route.manifest.rate_hz)
