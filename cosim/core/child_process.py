@@ -54,11 +54,16 @@ class ForkedChild:
     def __init__(self, serves: Callable[[MessageSocket], None], room_bytes: int) -> None:
         ours, theirs = socket.socketpair()
         parent = os.getpid()
-        self._pid = os.fork()
-        if self._pid == 0:
-            ours.close()
-            _run_child(serves, theirs, parent, room_bytes)
-        theirs.close()
+        # Python drops an exception that is raised in its own calls after a fork, Ctrl-C included.
+        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            self._pid = os.fork()
+            if self._pid == 0:
+                ours.close()
+                _run_child(serves, theirs, parent, room_bytes)
+            theirs.close()
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         self.wire = MessageSocket(ours)
 
     def close(self) -> None:
