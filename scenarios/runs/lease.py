@@ -7,15 +7,12 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+from cosim.core.progress import ignore
 from scenarios.ipc.faults import Failure
 from scenarios.ipc.messages import Done, Message, MessageHandler
 from scenarios.runs.protocol import Reply
 
 ReplyCallback = Callable[[Reply], None]
-
-
-def ignore(reply: Reply) -> None:
-    """Default callback: ignores the reply."""
 
 
 class _Reported(NamedTuple):

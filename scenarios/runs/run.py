@@ -18,8 +18,7 @@ import pandas as pd
 from bridge import keys
 from bridge.session import connection_warnings, open_session
 from cosim.core.errors import UsageError
-from cosim.core.progress import Progress
-from cosim.core.progress import ignore as ignore_progress
+from cosim.core.progress import Progress, ignore
 from cosim.core.units import milliseconds
 from cosim.episode.interfaces import Policy
 from cosim.episode.policy_caller import PolicyCaller
@@ -46,10 +45,6 @@ Carrier = AbstractContextManager[TransportFactory]
 """Connection to the workers of a run."""
 _VEHICLES_SHARE = 2 / 3
 """Number of vehicles for each person of a crowd that is set by an option."""
-
-
-def ignore(message: object) -> None:
-    """Default callback: ignores the message."""
 
 
 class RunObjects(NamedTuple):
@@ -89,7 +84,7 @@ class Silent(NamedTuple):
     def say(self, words: str) -> None: ...
 
     def stage(self, words: str) -> AbstractContextManager[Progress]:
-        return nullcontext(ignore_progress)
+        return nullcontext(ignore)
 
     def planned(self, plan: PlannedRun) -> None: ...
 
