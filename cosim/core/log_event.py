@@ -13,6 +13,6 @@ LOGGER.propagate = False
 def log_event(event: str, level: int = logging.INFO, /, **facts: object) -> None:
     """Log an event with its facts. Without a log handler this costs next to nothing.
 
-    >>> happened("retried", logging.WARNING, scenario="frontal-001", why="its worker was lost")
+    >>> log_event("retried", logging.WARNING, scenario="frontal-001", why="its worker was lost")
     """
     LOGGER.log(level, event, extra={"facts": facts})

@@ -125,7 +125,7 @@ class Elevation:
     points: number of points of all shapes.
     missing: number of points without an elevation, or with an impossible 0 or spike.
     false_share: share of the streets' length that is steeper than any real street.
-    clamped: number of points moved by more than CLAMPED_M to satisfy WALK_GRADE_MAX.
+    clamped: number of points moved by more than CLAMP_THRESHOLD_M to satisfy WALK_GRADE_MAX.
     moved_m: largest correction.
     steep: strips that robots must not use.
     closed: ends of other strips that robots must not pass, as strip and 0 or 1.

@@ -7,8 +7,8 @@ camera, at most SEEN_WITHIN_M away. Visibility is tested by rays, so it does not
 renderer and also exists for policies without a camera.
 
 The paper's table has rules beyond the goal: the robot passes around the whole group of `conversing`
-and the whole line of `queueing` (`EventKind.passed_round`), never between two people. `gesturing`
-ends its episode at a stop: see the referee.
+and the whole line of `queueing` (`EventKind.passed_as_group`), never between two people.
+`gesturing` ends its episode at a stop: see the referee.
 """
 
 from __future__ import annotations

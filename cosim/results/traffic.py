@@ -3,7 +3,7 @@
 - carriageway: the base centre is on a road outside the crossings, or on a crossing at red, between
   the ends of its line. The strip that joins a crossing to its kerb is no road, nor is a sidewalk or
   corner that overlaps a lane. The inside of a junction is road.
-- braked: a vehicle slows down by more than BRAKES_MPS2 while the robot, without right of way, is
+- braked: a vehicle slows down by more than BRAKING_MPS2 while the robot, without right of way, is
   the nearest body straight ahead of it. It counts once until the vehicle has not braked for
   _APART_S. At a green crossing vehicles stop for their own red light or for pedestrians, so nothing
   is counted.

@@ -31,7 +31,7 @@ def episode_id_of(run_seed: int, scenario: Scenario) -> EpisodeId:
     """Return the id and seed of a scenario in a run. They depend only on run seed and scenario.
 
     >>> from scenarios.suites.catalog import load_suite
-    >>> pseudonym_of(1, load_suite("reactive").scenarios[0]).episode[0]
+    >>> episode_id_of(1, load_suite("reactive").scenarios[0]).episode[0]
     'k'
     """
     return EpisodeId(

@@ -221,7 +221,7 @@ class EventKind:
     step: returns person `number` one tick later, from the trigger on.
     ends: returns whether the event is over. Then its people walk away and are removed out of sight.
     pose, age: activity of people who stand during the event, and their age.
-    passed_round: whether the robot must pass round the whole group.
+    passed_as_group: whether the robot must pass round the whole group.
     ends_at: end of a reactive scenario: the goal, or a stop before the people.
     """
 

@@ -352,9 +352,9 @@ class GoalKind(NamedTuple):
     summary: one line for `cosim list` and the documentation.
     type: class of its goals; None for no goals.
     draw: returns the goals of an episode.
-    of_camera: whether the goals are camera pictures, so that the policy needs a camera.
+    needs_camera: whether the goals are camera pictures, so that the policy needs a camera.
     noise: whether the goals carry no information.
-    in_data_sets: whether a data set has a column for the goals (`cosim collect`).
+    has_data_set_column: whether a data set has a column for the goals (`cosim collect`).
     """
 
     name: GoalProtocol
@@ -499,7 +499,7 @@ def instruction_at(route_s_m: float, steps: Sequence[Manoeuvre]) -> str:
     Distances are rounded to 5 m.
 
     >>> ways = manoeuvres(Polyline([(0, 0), (40, 0), (40, 20)]))
-    >>> told_at(29.0, ways), told_at(39.0, ways)
+    >>> instruction_at(29.0, ways), instruction_at(39.0, ways)
     ('Follow the sidewalk. In 10 m, turn left.', 'Turn left.')
     """
     due = [one.words for one in steps if one.s_m - _DUE_M <= route_s_m < one.end_s_m]

@@ -38,7 +38,7 @@ def read_spec_file(path: Path, kind: type[Spec]) -> Spec:
     """Load the spec of a JSON file.
 
     Raises SpecError with the file, and the place and valid values of each error, one a line. At
-    most MOST_TOLD errors are listed.
+    most MOST_LISTED_FAULTS errors are listed.
     """
     try:
         if path.exists() and not path.is_file():

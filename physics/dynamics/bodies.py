@@ -389,7 +389,7 @@ def _wall_box(
 ) -> tuple[tuple[float, float], float, tuple[float, float, float]]:
     """Return centre, heading and size of a wall.
 
-    The wall is WALL_M thick; its outer face is on the line, with the outside on the right.
+    The wall is WALL_THICKNESS_M thick. Its outer face is on the line, the outside on the right.
     """
     x0, y0, x1, y1 = wall
     length, heading = math.hypot(x1 - x0, y1 - y0), math.atan2(y1 - y0, x1 - x0)

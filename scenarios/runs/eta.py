@@ -296,7 +296,7 @@ def machine() -> str:
 
 
 def _around(values: Sequence[float]) -> tuple[float, float]:
-    """Return the quantiles 0.2 and 0.8 of values, widened to AT_LEAST."""
+    """Return the quantiles 0.2 and 0.8 of values, widened to NARROWEST_RANGE."""
     low, middle, high = np.quantile(values, [0.2, 0.5, 0.8])
     return float(min(low, NARROWEST_RANGE[0] * middle)), float(
         max(high, NARROWEST_RANGE[1] * middle)

@@ -121,7 +121,7 @@ class Pedestrians:
         """Remove persons that are far away or stuck, with their groups; let others enter; keep
         groups together.
 
-        seen: persons within the crowd's radius plus LINGER_M.
+        seen: persons within the crowd's radius plus LEAVE_MARGIN_M.
         at_red: returns whether a person waits at a red light.
         """
         person, radius_m = self._engine.person, self._spec.radius_m

@@ -31,7 +31,7 @@ class LocalWalkableArea:
 
     def area_m2(self, x_m: float, y_m: float) -> float:
         """Return the area of sidewalks, crossings and corners around a point, m2, accurate to a
-        shift of AGAIN_M."""
+        shift of REMEASURE_M."""
         if self._at is None or math.hypot(x_m - self._at[0], y_m - self._at[1]) > REMEASURE_M:
             self._at = (x_m, y_m)
             disk = shapely.Point(x_m, y_m).buffer(self._radius_m)

@@ -21,7 +21,7 @@ class Rules:
 
     version: recorded in the description of each imported map.
     widths_m: widths of guessed sidewalks by street class; empty for netconvert's widths.
-    mends: repairs of the finished net, in place and in this order; each returns its changes, a
+    repairs: repairs of the finished net, in place and in this order; each returns its changes, a
         sentence each.
     """
 

@@ -68,7 +68,7 @@ class MapFile:
 class OsmFacts:
     """Facts of an OSM file.
 
-    roads, ways_on_foot: counts of highway ways.
+    roads, footways: counts of highway ways.
     centre: median longitude and latitude of its nodes, degrees.
     tagged: ids of roads with tags on their sidewalks.
     widths: tags of roads with widths of their sidewalks, by road id.

@@ -48,7 +48,8 @@ _MARGIN_M: Final = 80.0
 KNOWN_SHARE: Final = 0.5
 """Elevations are dropped if a smaller share of the points has a plausible one."""
 FALSE_SHARE: Final = 0.15
-"""Elevations are dropped if a larger share of the streets' length is steeper than FALSE_GRADE."""
+"""Share of the streets' length that may be steeper than IMPLAUSIBLE_GRADE; beyond it, elevations
+are dropped."""
 DEEPEST_M: Final = -450.0
 """Lowest plausible elevation of a street, metres."""
 HIGHEST_M: Final = 5500.0
@@ -408,7 +409,7 @@ def _steep(terrain: Terrain, lines: Sequence[Floats], half_m: Sequence[float]) -
 
 
 def false_share(courses: Sequence[Course]) -> float:
-    """Return the share of the streets' length that is steeper than FALSE_GRADE, without steps
+    """Return the share of the streets' length that is steeper than IMPLAUSIBLE_GRADE, without steps
     and bridges."""
     total = false = 0.0
     for c in courses:

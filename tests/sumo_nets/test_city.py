@@ -311,13 +311,14 @@ def test_processes_build_one_city_at_once(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
     code = (
         "from sumo_nets.city.store import city_net, is_undamaged; from cosim.spec.scenario import City;"
-        "print(is_whole(city_net(City(seed=9, size_m=200.0))))"
+        "print(is_undamaged(city_net(City(seed=9, size_m=200.0))))"
     )
     dies, *others = (
         subprocess.Popen([sys.executable, "-c", code], stdout=-1, text=True) for _ in range(3)
     )
     ends_s = time.monotonic() + PATIENCE_S
-    while not list(tmp_path.glob(f"{BUILDING_PREFIX}*/*")) and time.monotonic() < ends_s:
+    while not list(tmp_path.glob(f"{BUILDING_PREFIX}*/*")):
+        assert dies.poll() is None and time.monotonic() < ends_s
         time.sleep(0.01)
     dies.kill()
     dies.communicate()

@@ -46,7 +46,7 @@ _HASH: Final = re.compile(r"[0-9a-f]{64}")
 def file_name_fault(name: str) -> str:
     """Return the fault of a file name in a bundle's folder; "" if valid.
 
-    >>> refusal_of_name("model.onnx.data"), refusal_of_name("../model.onnx")[:17]
+    >>> file_name_fault("model.onnx.data"), file_name_fault("../model.onnx")[:17]
     ('', "'../model.onnx' i")
     """
     if (

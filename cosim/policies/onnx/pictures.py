@@ -49,7 +49,7 @@ def _numbers_of_bytes(how: PixelsInput) -> NDArray[np.float32]:
 def transpose_frame(frame: NDArray[Any], layout: str) -> NDArray[Any]:
     """Transpose a frame (H, W, C) to the order of a layout, in which C may be absent.
 
-    >>> axes_turned(np.zeros((64, 85, 3)), "N(TC)HW").shape
+    >>> transpose_frame(np.zeros((64, 85, 3)), "N(TC)HW").shape
     (3, 64, 85)
     """
     order = [letter for letter in "".join(axes_of(layout)) if letter in "HWC"]
@@ -61,7 +61,7 @@ def transpose_frame(frame: NDArray[Any], layout: str) -> NDArray[Any]:
 def combine_frames(frames: Sequence[NDArray[Any]], layout: str) -> NDArray[Any]:
     """Combine frames from `transpose_frame` to a tensor with the axes of a layout; N is 1.
 
-    >>> laid_out([np.zeros((3, 64, 85))] * 6, "N(TC)HW").shape
+    >>> combine_frames([np.zeros((3, 64, 85))] * 6, "N(TC)HW").shape
     (1, 18, 64, 85)
     """
     letters = "".join(axes_of(layout)).replace("N", "")
@@ -75,7 +75,7 @@ def combine_frames(frames: Sequence[NDArray[Any]], layout: str) -> NDArray[Any]:
 def tensor_shape(sides: tuple[int, int, int], frames: int, layout: str) -> tuple[int, ...]:
     """Return the shape of a tensor. sides: rows, columns and channels of a frame.
 
-    >>> shape_of((64, 85, 3), 6, "N(TC)HW")
+    >>> tensor_shape((64, 85, 3), 6, "N(TC)HW")
     (1, 18, 64, 85)
     """
     counts = {"N": 1, "T": frames} | dict(zip("HWC", sides, strict=True))

@@ -85,7 +85,7 @@ def choose_failures(
     """Choose failures greedily, the most informative first.
 
     Each choice adds the most new facets per simulated time, then a new episode, then a new place.
-    The choice ends without new facets, but not below LEAST_FAILURES. It stays within _BUDGET_S of
+    The choice ends without new facets, but not below MIN_FAILURES. It stays within _BUDGET_S of
     simulation. Failures later than within_s of their episode are skipped, except its first.
     """
     alike: Counter[frozenset[Hashable]] = Counter()

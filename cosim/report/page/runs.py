@@ -155,7 +155,7 @@ def place_in_words(scenario: Scenario) -> str:
 
 
 def light_in_words(light: Light) -> str:
-    """Return one of KINDS_OF_LIGHT: fog before clouds before the sun's elevation."""
+    """Return one of LIGHT_KINDS: fog before clouds before the sun's elevation."""
     if light.fog_m is not None:
         return "fog"
     if light.cloud_cover >= _OVERCAST:
