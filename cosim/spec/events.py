@@ -35,7 +35,11 @@ class Event(Ranged, frozen=True, kw_only=True):
     route_s_m: arc length of the place on the reference route.
     people: number of people.
     speed_mps: walking speed.
-    side: side of the sidewalk, left (1) or right (-1).
+    side: side of the sidewalk, left (1) or right (-1), on which they wait or from which they come.
+    free_side: side on which the robot can pass people who stand; 0 if their places leave it open.
+    trigger_m: distance before the event along the route at which it begins; None for the kind's.
+    patience_s: time for which a person waits in front of a standing robot.
+    decoy: whether nothing that matters to the robot happens after the trigger.
     """
 
     id: str
@@ -49,6 +53,10 @@ class Event(Ranged, frozen=True, kw_only=True):
     side: Literal[-1, 1] = 1
     people: Annotated[int, Within(0, 100)] = 1
     half_length_m: Annotated[float, Within(0, 50)] = 0.0
+    free_side: Literal[-1, 0, 1] = 0
+    trigger_m: Annotated[float | None, Within(-10, 60)] = None
+    patience_s: Annotated[float, Within(0, 60)] = 2.5
+    decoy: bool = False
 
     @property
     def called(self) -> str:

@@ -231,6 +231,10 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
     route: reference route from start to goal.
     structure: what the scenario is an example of: straight, curve, crosswalk, an event kind,
         static, route, or "".
+    decoy_of: id of the scenario whose decoy this is, or "". A decoy equals it until its event
+        begins, and then needs another response of the robot.
+    go_on_mps: least mean speed of the robot from the trigger to 1 m past the person, in a decoy in
+        which it has no reason to stop; 0 without this rule.
 
     >>> Scenario(
     ...     id="a", suite="mine", place=City(seed=1, size_m=500.0), seed=0,
@@ -263,6 +267,8 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
     light: Light = Light()
     split: Split = "val"
     structure: Annotated[str, _NAME] = ""
+    decoy_of: Annotated[str, _NAME] = ""
+    go_on_mps: Annotated[float, Within(0, 10)] = 0.0
     schema: int = _SCHEMA
 
     @property
@@ -339,6 +345,10 @@ class Suite(Ranged, frozen=True, kw_only=True):
         if twice := sorted(name for name, count in times.items() if count > 1):
             more = f" and {len(twice) - 5} more" if len(twice) > 5 else ""
             yield f"suite '{self.name}' lists scenarios twice: {', '.join(twice[:5])}{more}"
+        events = {one.id for one in self.scenarios if not one.decoy_of}
+        for one in self.scenarios:
+            if one.decoy_of and one.decoy_of not in events:
+                yield f"{one.called}decoy_of names no scenario of the suite: {shown(one.decoy_of)}"
 
     @property
     def content_hash(self) -> str:
