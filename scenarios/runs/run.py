@@ -34,7 +34,6 @@ from scenarios.ipc.messages import MessageHandler
 from scenarios.runs.local import InProcess, LocalProcesses
 from scenarios.runs.planning import PlannedRun, check_folder, held_run, planned_run
 from scenarios.runs.pool import run_all
-from scenarios.runs.ray_workers import check_on_ray, ray_carrier
 from scenarios.runs.shared_renderer import SharedRenderer
 from scenarios.runs.transport import HeldRun, TransportFactory
 from scenarios.suites.catalog import load_suite, with_crowd, with_robot
@@ -219,6 +218,8 @@ def _check_cluster(config: RunConfig, given: RunObjects | None) -> None:
     """Check that a cluster supports the options of a run. Raises UsageError."""
     if not config.on:
         return
+    from scenarios.runs.ray_workers import check_on_ray  # slow: the importer of maps comes with it
+
     of_here: dict[str, Any] = {
         "shared_renderer": config.shared_renderer,
         "real_time": config.real_time,
@@ -366,6 +367,8 @@ def measured_latency(
 def _workers(plan: PlannedRun, given: RunObjects | None, reporter: Reporter) -> Carrier:
     """Return the connection to the workers of a run: on Ray, this process, or child processes."""
     if plan.config.on:
+        from scenarios.runs.ray_workers import ray_carrier
+
         return ray_carrier(plan.config.on, plan.config.jobs, plan.policy, reporter.say)
     if given is not None and given.policy is not None:
         return nullcontext(partial(_in_this_process, plan.driver))

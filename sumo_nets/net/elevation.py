@@ -9,10 +9,9 @@ from itertools import combinations
 from typing import Final, Literal, NamedTuple, Protocol
 
 import numpy as np
+import scipy  # its parts are loaded when first used
 import shapely
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, uniform_filter
-from scipy.spatial import cKDTree
 
 from cosim.core.geometry import Floats
 from cosim.place.street_map import Corner, Strip
@@ -169,7 +168,7 @@ class Profile:
                 tails.append(start + np.arange(n - 1))
                 heads.append(start + np.arange(1, n))
         at = np.concatenate(rows)
-        tree = cKDTree(at[:, :2])
+        tree = scipy.spatial.cKDTree(at[:, :2])
         pairs = tree.query_pairs(_JOIN_M, output_type="ndarray")
         near = np.abs(at[pairs[:, 0], 2] - at[pairs[:, 1], 2]) <= SAME_LEVEL_M
         tails.append(pairs[near, 0])
@@ -428,7 +427,9 @@ def _without_false_points(courses: Sequence[Course], heights: Floats) -> list[Co
     ends = np.cumsum([len(c.points) for c in courses])[:-1]
     every = np.column_stack([np.concatenate([c.points[:, :2] for c in courses]), heights])
     high = every[np.isfinite(heights) & (heights != 0.0)]
-    gap, nearest = cKDTree(high[:, :2]).query(every[:, :2], distance_upper_bound=_ZERO_REACH_M)
+    gap, nearest = scipy.spatial.cKDTree(high[:, :2]).query(
+        every[:, :2], distance_upper_bound=_ZERO_REACH_M
+    )
     reference_m = high[np.minimum(nearest, len(high) - 1), 2]
     every[(heights == 0.0) & (np.abs(reference_m) > IMPLAUSIBLE_GRADE * gap + _STEP_M), 2] = np.nan
     out = []
@@ -502,10 +503,10 @@ def _terrain(nodes: Profile, level: Floats) -> Terrain:
         surface[free] = _mean_heights(grid[free], nodes.xy[which], level[which], reach_m)
     land: Floats = surface.reshape(rows, columns)
     open_land = ~np.isfinite(land)
-    _, (j, i) = distance_transform_edt(open_land, return_indices=True)
+    _, (j, i) = scipy.ndimage.distance_transform_edt(open_land, return_indices=True)
     land = land[j, i]
     for _ in range(_FILL_ROUNDS):
-        land = np.where(open_land, uniform_filter(land, 3, mode="nearest"), land)
+        land = np.where(open_land, scipy.ndimage.uniform_filter(land, 3, mode="nearest"), land)
     datum = float(np.floor(land.min()))
     heights = (land - datum).astype(np.float32)
     heights.flags.writeable = False
@@ -521,7 +522,7 @@ def _mean_heights(grid: Floats, xy: Floats, level: Floats, reach_m: float) -> Fl
     out = np.full(len(grid), np.nan)
     if not len(xy):
         return out
-    tree = cKDTree(xy)
+    tree = scipy.spatial.cKDTree(xy)
     gap, nearest = (np.asarray(each) for each in tree.query(grid, distance_upper_bound=reach_m))
     pinned = np.flatnonzero(np.isfinite(gap))
     count = min(_NEIGHBOURS, len(xy))
