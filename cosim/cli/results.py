@@ -52,7 +52,7 @@ def compare(
 ) -> None:
     """Compare runs with the first one, paired by scenario.
 
-    Prints differences with bootstrap intervals over the suite, and by event, structure and split.
+    Prints differences with their intervals over the suite, and by event, structure and split.
     Lists the scenarios whose result flipped.
     """
     from cosim.report.compared import FORMATS
