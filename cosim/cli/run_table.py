@@ -272,7 +272,7 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
         return
     people = bool(table["pedestrian_distance_min_m"].notna().any())
     columns = WITH_PEOPLE if people else WITHOUT_PEOPLE
-    crashed = ["crash-\ned"] if crashed_in(table) else []
+    crashed = ["crash"] if crashed_in(table) else []
     heads = ("n", *crashed, "SR", "95 % of SR", *(head for _, head in columns), "in-\nvalid")
     rows = []
     for kind in named:
@@ -284,13 +284,14 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
         shares = (success.in_words, success.interval_in_words(".."), *(e.in_words for e in rest))
         rows.append((kind, *counts, *shares, f"{(part['status'] == 'invalid').sum()}"))
     tables.show(out, [*tables.names(""), *tables.figures(*heads)], rows)
+    unknown = "; - unknown, because an episode crashed" if crashed else ""
     out.print(
         "n episodes that are scored; hit a person, hit else, left lane, broke rule: share of "
         "these; nearest: least distance to a person's centre, mean over episodes, of wins: over "
-        "those that succeeded; SPL success by path length"
+        f"those that succeeded; SPL success by path length{unknown}"
         if people
         else "n episodes that are scored; hit else, left lane: share of these; SPL success "
-        "weighted by path length"
+        f"weighted by path length{unknown}"
     )
 
 

@@ -107,10 +107,17 @@ def summary_table(runs: Sequence[ReportedRun], colours: Mapping[str, str]) -> Re
     rows = []
     for run in runs:
         invalid = int((run.table["status"] == "invalid").sum())
-        cells = tuple(cell_of(run.table, metric) for metric in _FIRST)
-        about = {"suite": run.spec.suite, "colour": colours[run.label]}
-        counts = {"scored": len(run.table) - invalid, "crashed": crashed_in(run.table)}
-        rows.append(TableRow(run.label, cells, **counts, invalid=invalid, **about))
+        rows.append(
+            TableRow(
+                run.label,
+                tuple(cell_of(run.table, metric) for metric in _FIRST),
+                suite=run.spec.suite,
+                colour=colours[run.label],
+                scored=len(run.table) - invalid,
+                crashed=crashed_in(run.table),
+                invalid=invalid,
+            )
+        )
     note = (
         "SR success; RC share of the route done; FC failures per 100 m travelled, pooled; V mean "
         f"speed. Small figures are 95 % intervals; below {MIN_N} episodes there are only counts. A "
