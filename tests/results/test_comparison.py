@@ -250,6 +250,20 @@ def test_who_crashes_is_compared_at_its_worst_and_has_no_rates(runs: Path) -> No
     )
 
 
+def test_who_crashes_in_every_episode_is_better_in_nothing(runs: Path, tmp_path: Path) -> None:
+    """Against a policy that fails everywhere: no rate and no other mean, nothing better; SR as low,
+    route completion and speed lower."""
+    bad, crashing = (
+        run_of(tmp_path / how, [how] * 20, how, several(20)) for how in (HIT, "crashed")
+    )
+    told = compare_runs([bad, crashing])
+    assert {*told.differences["verdict"]} <= {"worse", "within noise", "too few", "differs", ""}
+    whole = told.differences[told.differences["group"] == "s"].set_index("metric")
+    assert whole.loc[["route_completion", "velocity_mean_mps"], "verdict"].eq("worse").all()
+    assert whole.loc["success", ["value_after", "verdict"]].tolist() == [0.0, "within noise"]
+    assert not len(told.flipped)
+
+
 def test_a_comparison_is_printed_and_written(runs: Path, tmp_path: Path, cosim: Cosim) -> None:
     """CSV holds every metric in full; Markdown and LaTeX the tables that are printed; the same each
     time."""
