@@ -133,11 +133,11 @@ def print_means(out: Console, table: pd.DataFrame) -> None:
     ]
     tables.show(out, [*tables.names("over all episodes"), *tables.figures(*_MEAN_HEADS)], rows)
     crashed = crashed_in(table)
-    missing = f"; none, because {crashed} crashed" if crashed else ""
+    failed = f"; no rates: {crashed} crashed, which counts as SR, RC, SPL and V of 0"
     out.print(
         f"rates are pooled: all failures on all metres, of an episode at most "
-        f"{RATED_PER_PROGRESS:g} x its progress + {RATED_EXTRA_M:g} m{missing}; a crashed episode "
-        f"counts as failed, with SR, RC, SPL and V of 0; below {MIN_N} episodes only counts"
+        f"{RATED_PER_PROGRESS:g} x its progress + {RATED_EXTRA_M:g} m{failed if crashed else ''}; "
+        f"below {MIN_N} episodes only counts"
     )
     print_by_split(out, table)
 

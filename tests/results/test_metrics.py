@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cosim.results.log import Log
-from cosim.results.metrics import METRICS, EpisodeFacts, compute_metrics, progress_of
+from cosim.results.metrics import METRICS, POOLED, EpisodeFacts, compute_metrics, progress_of
 from cosim.results.referee import Failure
 from tests.logs import log_with
 
@@ -114,6 +114,8 @@ def test_rates_count_a_detour_up_to_a_bound() -> None:
         assert rates == pytest.approx([100.0 * least / 135.0] * 2), name
     for name in ("failures_per_100m_progress", "failures_per_100m_route"):
         assert circling[name] == pytest.approx(straight[name]) == 4.0
+    pooled_on = {metres for _, metres in POOLED.values()}
+    assert pooled_on == {"rated_m", "progress_m", "route_length_m"}
 
 
 def test_who_circles_without_getting_on_has_ten_metres() -> None:
