@@ -11,13 +11,20 @@ from rich.console import Console
 
 from cosim.cli import tables
 from cosim.core.units import milliseconds
+from cosim.results.intervals import MIN_N, Estimate
 from cosim.results.log import holds_waypoints
-from cosim.results.metrics import COUNTERFACTUAL, SUCCESS_IN_WORDS
+from cosim.results.metrics import (
+    COUNTERFACTUAL,
+    RATED_EXTRA_M,
+    RATED_PER_PROGRESS,
+    SUCCESS_IN_WORDS,
+)
 from cosim.results.table import (
     INJECTED,
+    crashed_in,
+    estimate_of,
     injections_in_words,
     policy_in_words,
-    summary_of,
     why_inconclusive,
 )
 from cosim.spec.scenario import Scenario, read_suite
@@ -120,25 +127,24 @@ def print_means(out: Console, table: pd.DataFrame) -> None:
     """Print the means over all episodes of a run."""
     if not len(table):
         return
-    summary = summary_of(table, [name for name, _ in MEANS]).iterrows()
     rows = [
-        (f"{name} ({head})" if head else name, *_mean_cells(row))
-        for (name, head), (_, row) in zip(MEANS, summary, strict=True)
+        (f"{name} ({head})" if head else name, *_mean_cells(estimate_of(table, name)))
+        for name, head in MEANS
     ]
     tables.show(out, [*tables.names("over all episodes"), *tables.figures(*_MEAN_HEADS)], rows)
-    crashed = int((table["status"] == "crashed").sum())
-    missing = f"; none, because {crashed} crashed" if crashed else ""
+    crashed = crashed_in(table)
+    failed = f"; no rates: {crashed} crashed, which counts as SR, RC, SPL and V of 0"
     out.print(
-        f"rates are pooled: all failures on all metres{missing}; what crashed counts as the "
-        f"worst elsewhere"
+        f"rates are pooled: all failures on all metres, of an episode at most "
+        f"{RATED_PER_PROGRESS:g} x its progress + {RATED_EXTRA_M:g} m{failed if crashed else ''}; "
+        f"below {MIN_N} episodes only counts"
     )
     print_by_split(out, table)
 
 
-def _mean_cells(row: pd.Series[float]) -> tuple[str, str, str]:
-    """Return mean, interval and number of episodes from a row of `summary_of`, as text."""
-    interval = f"{value_in_words(row['low'])} to {value_in_words(row['high'])}" if row["n"] else "-"
-    return value_in_words(row["mean"]), interval, f"{row['n']:.0f}"
+def _mean_cells(estimate: Estimate) -> tuple[str, str, str]:
+    """Return mean, interval and number of episodes as text."""
+    return estimate.in_words, estimate.interval_in_words(), f"{estimate.n}"
 
 
 def print_statuses(out: Console, table: pd.DataFrame, scheduled: int) -> None:
@@ -233,10 +239,7 @@ def print_delays(out: Console, table: pd.DataFrame) -> None:
     """Print the delays caused by the robot, per episode; nothing without `--counterfactual`."""
     if not set(COUNTERFACTUAL) <= set(table.columns):
         return
-    rows = [
-        (str(name), *_mean_cells(row))
-        for name, row in summary_of(table, tuple(COUNTERFACTUAL)).iterrows()
-    ]
+    rows = [(name, *_mean_cells(estimate_of(table, name))) for name in COUNTERFACTUAL]
     first = tables.names("against the same street without the robot")
     tables.show(out, [*first, *tables.figures("per episode", *_MEAN_HEADS[1:])], rows)
 
@@ -260,30 +263,35 @@ def has_single_event(scenario: Scenario) -> bool:
 
 
 def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -> None:
-    """Print a row of means per kind of scenario; nothing for fewer than two kinds."""
+    """Print a row of means per kind of scenario; nothing for fewer than two kinds.
+
+    A column counts crashed episodes if there are any.
+    """
     named = [kind for kind in dict.fromkeys(kinds.values()) if kind]
     if len(named) < 2:
         return
     people = bool(table["pedestrian_distance_min_m"].notna().any())
     columns = WITH_PEOPLE if people else WITHOUT_PEOPLE
-    heads = ("n", "SR", "95 % of SR", *(head for _, head in columns), "in-\nvalid")
+    crashed = ["crash"] if crashed_in(table) else []
+    heads = ("n", *crashed, "SR", "95 % of SR", *(head for _, head in columns), "in-\nvalid")
     rows = []
     for kind in named:
         part = table[table["scenario"].map(kinds) == kind]
-        means = summary_of(part, ("success", *(name for name, _ in columns)))
-        low, high, scored = (float(means[column].iloc[0]) for column in ("low", "high", "n"))
-        interval = f"{low:.2f}..{high:.2f}" if scored else "-"
-        success, *rest = (value_in_words(mean) for mean in means["mean"])
-        invalid = str((part["status"] == "invalid").sum())
-        rows.append((kind, f"{scored:.0f}", success, interval, *rest, invalid))
+        success, *rest = (
+            estimate_of(part, name) for name in ("success", *(name for name, _ in columns))
+        )
+        counts = f"{success.n}", *([f"{crashed_in(part)}"] if crashed else [])
+        shares = (success.in_words, success.interval_in_words(".."), *(e.in_words for e in rest))
+        rows.append((kind, *counts, *shares, f"{(part['status'] == 'invalid').sum()}"))
     tables.show(out, [*tables.names(""), *tables.figures(*heads)], rows)
+    unknown = "; - unknown, because an episode crashed" if crashed else ""
     out.print(
         "n episodes that are scored; hit a person, hit else, left lane, broke rule: share of "
         "these; nearest: least distance to a person's centre, mean over episodes, of wins: over "
-        "those that succeeded; SPL success by path length"
+        f"those that succeeded; SPL success by path length{unknown}"
         if people
         else "n episodes that are scored; hit else, left lane: share of these; SPL success "
-        "weighted by path length"
+        f"weighted by path length{unknown}"
     )
 
 
@@ -294,12 +302,11 @@ def print_by_split(out: Console, table: pd.DataFrame) -> None:
     names = ("success", "route_completion", "failures_per_100m")
     rows = []
     for split, part in table.groupby("split", sort=False):
-        means = summary_of(part, names)
+        means = [estimate_of(part, name) for name in names]
         cells = (
-            f"{value_in_words(row['mean'])} "
-            f"{value_in_words(row['low'])}..{value_in_words(row['high'])}"
-            for _, row in means.iterrows()
+            f"{one.in_words} {one.interval_in_words('..')}" if one.has_interval else one.in_words
+            for one in means
         )
-        rows.append((str(split), f"{means['n'].iloc[0]:.0f}", *cells))
-    heads = ("n", "SR, 95 %", "RC, 95 %", "FC /100m, 95 %")
+        rows.append((str(split), f"{means[0].n}", f"{crashed_in(part)}", *cells))
+    heads = ("n", "crashed", "SR, 95 %", "RC, 95 %", "FC /100m, 95 %")
     tables.show(out, [*tables.names("split"), *tables.figures(*heads)], rows)

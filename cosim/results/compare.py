@@ -16,10 +16,16 @@ from scipy.special import ndtr, stdtrit
 from cosim.core.errors import RunError, UsageError
 from cosim.core.geometry import Floats
 from cosim.results.finished_run import WholeRun, read_whole_run
-from cosim.results.metrics import COUNTERFACTUAL, METRICS, POOLED, RATE_NEEDS_M
+from cosim.results.intervals import BOOTSTRAP, CONFIDENCE, MIN_N, counts_in_words
+from cosim.results.metrics import (
+    COUNTERFACTUAL,
+    METRICS,
+    POOLED,
+    RATE_NEEDS_M,
+    UNKNOWN_WITH_CRASH,
+)
 from cosim.results.table import (
-    BOOTSTRAP,
-    CONFIDENCE,
+    crashed_in,
     injections_in_words,
     numeric_column,
     table_of,
@@ -29,14 +35,14 @@ from cosim.spec.scenario import Scenario
 
 MIN_CHANGED: Final = 6
 """Minimum number of changed pairs for a verdict."""
-PairedVerdict = Literal["within noise", "too few", "better", "worse", "differs"]
+PairedVerdict = Literal["within noise", "too few", "better", "worse", "differs", ""]
 
 
 class PairedDifference(NamedTuple):
     """Difference of a metric between two runs, paired by scenario.
 
     before, after: means over the pairs in which both runs have a value; NaN without such pairs
-    low, high: bounds of the interval of after - before
+    low, high: bounds of the interval of after - before; NaN below MIN_N pairs
     n: number of these pairs
     changed: number of pairs whose values differ; for a rate, only pairs with at least one count
     """
@@ -53,8 +59,13 @@ class PairedDifference(NamedTuple):
         return self.after - self.before
 
     def verdict(self, higher_is_better: bool | None) -> PairedVerdict:
-        """Return the verdict in words. higher_is_better: None if neither direction is better."""
-        if not self.n or self.low <= 0.0 <= self.high:
+        """Return the verdict in words; "" below MIN_N pairs.
+
+        higher_is_better: None if neither direction is better
+        """
+        if self.n < MIN_N:
+            return ""
+        if self.low <= 0.0 <= self.high:
             return "within noise"
         if self.changed < MIN_CHANGED:
             return "too few"
@@ -74,7 +85,7 @@ def difference_of_means(before: Floats, after: Floats) -> PairedDifference:
     changes = after - before
     if not n:
         return _NO_PAIRS
-    low, high = _interval(changes[_draws(n)].sum(axis=1) / n, n) if changes.any() else (0.0, 0.0)
+    low, high = _interval(changes[_draws(n)].sum(axis=1) / n if changes.any() else changes, n)
     return PairedDifference(
         float(before.mean()), float(after.mean()), low, high, n, int(np.count_nonzero(changes))
     )
@@ -100,7 +111,7 @@ def difference_of_rates(
     differs = (counted != counted_after) | (metres != metres_after)
     changed = int((differs & ((counted > 0.0) | (counted_after > 0.0))).sum())
     if not differs.any() or not (counted.any() or counted_after.any()):
-        return PairedDifference(*rates, 0.0, 0.0, n, 0)
+        return PairedDifference(*rates, *_interval(np.zeros(n), n), n, 0)
     drawn = [column[_draws(n)].sum(axis=1) for column in columns]
     moved = (drawn[1] > 0.0) & (drawn[3] > 0.0)
     counted, metres, counted_after, metres_after = (column[moved] for column in drawn)
@@ -109,8 +120,8 @@ def difference_of_rates(
 
 
 def _interval(differences: Floats, n: int) -> tuple[float, float]:
-    """Return the confidence interval of differences drawn from n pairs; NaN for a single pair."""
-    if n < 2 or not len(differences):
+    """Return the interval of differences drawn from n pairs; NaN below MIN_N pairs."""
+    if n < MIN_N or not len(differences):
         return math.nan, math.nan
     # Expanded percentile interval: the plain one is too narrow for small n.
     t = stdtrit(n - 1, 0.5 + CONFIDENCE / 2)
@@ -137,6 +148,8 @@ DIFFERENCES: Final = (
     "n",
     "value_before",
     "value_after",
+    "counts_before",
+    "counts_after",
     "difference",
     "low",
     "high",
@@ -255,25 +268,43 @@ def differences_of(
         for name in names:
             paired = _difference(name, *pair)
             unit, better = METRICS[name][:2] if name in METRICS else (COUNTERFACTUAL[name], None)
-            verdict = paired.verdict(better if judged else None) if paired.n else ""
+            verdict = paired.verdict(better if judged else None)
             key = (before.label, after.label, by, group, name, unit)
-            means = (paired.before, paired.after, paired.difference)
+            means = (paired.before, paired.after, *_counts(name, *pair), paired.difference)
             interval = (paired.low, paired.high)
             rows.append((*key, paired.n, *means, *interval, paired.changed, verdict))
     return pd.DataFrame(rows, columns=list(DIFFERENCES))
 
 
 def _difference(name: str, before: pd.DataFrame, after: pd.DataFrame) -> PairedDifference:
-    """Return the paired difference of a metric; a rate is undefined if a policy crashed."""
+    """Return the paired difference of a metric, without pairs if a crash leaves it unknown."""
+    if name in UNKNOWN_WITH_CRASH and (crashed_in(before) or crashed_in(after)):
+        return _NO_PAIRS
     if name not in POOLED:
         return difference_of_means(numeric_column(before, name), numeric_column(after, name))
-    if "crashed" in {*before["status"], *after["status"]}:
-        return _NO_PAIRS
     counted, metres = POOLED[name]
     one, other = (
         (numeric_column(table, counted), numeric_column(table, metres)) for table in (before, after)
     )
     return difference_of_rates(one, other)
+
+
+def _counts(name: str, before: pd.DataFrame, after: pd.DataFrame) -> tuple[str, str]:
+    """Return the counts of a share or rate in each run, over pairs in which both have a value.
+
+    "" for other means, and without such a pair.
+    """
+    columns = POOLED.get(name, (name,))
+    values = np.array(
+        [numeric_column(table, column) for table in (before, after) for column in columns]
+    )
+    values = values[:, ~np.isnan(values).any(axis=0)]
+    n = values.shape[1]
+    if not n or not (name in POOLED or (name in METRICS and METRICS[name].share)):
+        return "", ""
+    sums = values.sum(axis=1).reshape(2, -1)
+    one, other = (counts_in_words(counted, n, *metres) for counted, *metres in sums.tolist())
+    return one, other
 
 
 def flipped_between(before: ComparedRun, after: ComparedRun) -> pd.DataFrame:
@@ -359,8 +390,8 @@ def _notes(runs: Sequence[WholeRun], compared: Sequence[ComparedRun]) -> Iterato
         crashed = sum(record.status == "crashed" for record in run.records.values())
         if crashed:
             yield (
-                f"{other.label}: {crashed} crashed, counted as the worst there is; groups with "
-                f"them have no rates"
+                f"{other.label}: {crashed} crashed, counted as failed, with SR, RC, SPL and V of "
+                f"0; groups with them have neither rates nor other means"
             )
         if terms := _differing_terms(compared[0], other):
             yield (
