@@ -28,6 +28,7 @@ from cosim.core.geometry import Floats, Polyline, wrap_angles
 from cosim.core.state import DIRECTED, PERSON_RADIUS_M, Command, People
 from cosim.episode.interfaces import Observation, Privileged
 from cosim.people.orca import best_velocity, half_plane
+from cosim.place.car_paths import STOP_SHORT_M
 from cosim.policies.privileged.people_prediction import (
     Yielding,
     bodies,
@@ -47,7 +48,6 @@ from cosim.policies.privileged.rollout import (
 from cosim.policies.privileged.route import (
     CAR_BRAKE_MPS2,
     SEEN_M,
-    STOP_SHORT_M,
     car_disks,
     crossing_limit,
 )
