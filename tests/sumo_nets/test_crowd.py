@@ -210,7 +210,7 @@ def test_people_walk_on_where_a_standing_robot_blocks_the_sidewalk(tmp_path: Pat
     least_m = math.inf
     spec = CrowdSpec(persons=14, radius_m=60.0, vehicles=0)
     with SumoCrowd(net, street_map, spec, 9, OPEN, pose.xy) as crowd:
-        for tick in range(1000):
+        for tick in range(500):
             people = crowd.step(at(pose), reply(tick)).people
             near = np.hypot(*(people.xy - pose.xy).T) < 4.0
             gap_m = box_disk_gap(np.array([pose]), 0.35, 0.275, people.xy[None])[0]
@@ -221,7 +221,7 @@ def test_people_walk_on_where_a_standing_robot_blocks_the_sidewalk(tmp_path: Pat
                 if side == -first:
                     passed[first] += 1
                     came[people.ids[i]] = side
-    assert min(passed.values()) >= 2 and least_m > 0.05
+    assert min(passed.values()) >= 1 and least_m > 0.05
 
 
 def test_an_absent_robot_is_walked_through(place: Place) -> None:
