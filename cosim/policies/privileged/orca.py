@@ -12,7 +12,7 @@ The robot does all of the avoiding.
 people and stays on the free area (`DistanceField`).
 
 The robot limits its speed to stop before red signals, vehicles near a crossing, gestures and the
-crowd directly ahead. It stops for people who walk at it or across its path, because people walk
+crowd directly ahead. Before a crossing it waits where no car turns. It stops for people who walk at it or across its path, because people walk
 around a standing robot. If a green phase is too short, it approaches slowly.
 """
 
@@ -161,7 +161,7 @@ class PathState(NamedTuple):
 class Orca:
     """Oracle that predicts, yields, avoids groups and obeys gestures; privileged."""
 
-    manifest = Manifest("orca", version="4", rate_hz=5.0, camera=None, privileged=True)
+    manifest = Manifest("orca", version="5", rate_hz=5.0, camera=None, privileged=True)
 
     def __init__(self) -> None:
         self.reset("", 0)

@@ -68,7 +68,7 @@ SEEN_M = 11.0
 class Route:
     """Follows the reference route like a careful pedestrian; privileged."""
 
-    manifest = Manifest("route", version="1", rate_hz=10.0, privileged=True)
+    manifest = Manifest("route", version="2", rate_hz=10.0, privileged=True)
 
     def __init__(self) -> None:
         self.reset("", 0)
