@@ -107,6 +107,7 @@ class SumoCrowd(Crowd):
         self._before = before
         self._standing = StandingObstacles() if standing is None else standing
         self._street: Street | None = None
+        self._stood_ticks = 0
 
     def __enter__(self) -> Self:
         if SumoCrowd._running is not None:
@@ -207,7 +208,6 @@ class SumoCrowd(Crowd):
         self._pedestrians, self._drivers = self._demand(rng_persons, rng_vehicles)
         self._serial: Iterator[int] = count()
         self._robot = Proxy(sumo, self._walks, base="r", kind="robot", serial=self._serial)
-        self._stood_ticks = 0
         self._actors: dict[str, Proxy] = {}
         self._poses = PoseFilter(TICK_MS / 1000, self._standing)
         self._shown = ShownPeople(TICK_MS / 1000)

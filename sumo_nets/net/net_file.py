@@ -433,7 +433,9 @@ def _driveways(points: str, line: Floats) -> tuple[float, ...]:
 
 
 def _junctions(
-    rows: Sequence[Attributes], walks: Sequence[Polygon], lanes: Sequence[Polygon]
+    rows: Sequence[Attributes],
+    walks: Sequence[Polygon | MultiPolygon],
+    lanes: Sequence[Polygon],
 ) -> dict[str, Junction]:
     outlined = [
         row for row in rows if row.get("type") != "internal" and row.get("shape", "").count(" ") > 1
