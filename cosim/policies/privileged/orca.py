@@ -12,8 +12,9 @@ The robot does all of the avoiding.
 people and stays on the free area (`DistanceField`).
 
 The robot limits its speed to stop before red signals, vehicles near a crossing, gestures and the
-crowd directly ahead. Before a crossing it waits where no car turns. It stops for people who walk at it or across its path, because people walk
-around a standing robot. If a green phase is too short, it approaches slowly.
+crowd directly ahead. Before a crossing it waits where no car turns. It stops for people who walk at
+it or across its path, because people walk around a standing robot. If a green phase is too short,
+it approaches slowly.
 """
 
 from __future__ import annotations
