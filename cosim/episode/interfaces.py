@@ -29,6 +29,8 @@ class Privileged:
     crossings: id, first and last arc length of each crossing on the route.
     free: positions of the base centre with half the robot's width of clearance, within the walkable
         area and outside barriers.
+    waits_m: for each crossing the arc length at which to wait before it, outside the paths of
+        turning cars. Empty: directly before each crossing.
     """
 
     robot: RobotState
@@ -39,6 +41,7 @@ class Privileged:
     signals: Mapping[str, Signal]
     crossings: tuple[tuple[str, float, float], ...]
     free: Polygon | MultiPolygon
+    waits_m: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

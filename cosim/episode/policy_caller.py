@@ -212,6 +212,7 @@ class PolicyCaller:
             },
             crossings=known.crossings,
             free=known.free,
+            waits_m=known.waits_m,
         )
 
 

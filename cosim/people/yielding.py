@@ -192,6 +192,24 @@ class StandingObstacles:
                 wanted = stepped_around(before, wanted, self._footprints[i], stand)
         return wanted
 
+    def closing(self, body: RobotBody) -> RobotBody:
+        """Return a standing robot with its `closed` side towards the nearest obstacle.
+
+        It has none if a person fits between the robot and every obstacle.
+        """
+        at = np.array([body.pose.xy])
+        rows = self._rows(at, math.hypot(*body.half_m) + _ROOM_M)
+        if not rows:
+            return body
+        ground = _outline(body)
+        gaps_m = [shapely.distance(ground, _outline(self._footprints[i])) for i in rows]
+        nearest = int(np.argmin(gaps_m))
+        if gaps_m[nearest] >= _ROOM_M:
+            return body
+        to_side = self._xy[rows[nearest]] - at[0]
+        side = (to_side / max(float(np.hypot(*to_side)), 1e-9)).tolist()
+        return body._replace(closed=(side[0], side[1]))
+
     def _rows(self, xy: Floats, margin_m: float) -> list[int]:
         gap = xy[:, None] - self._xy[None]
         near = (gap * gap).sum(axis=2) < (self._reach_m + margin_m) ** 2
@@ -225,6 +243,13 @@ def standing_obstacles(
         long, wide = float(np.hypot(*ahead)), float(np.hypot(*aside))
         bodies.append(StandingBody(x_m, y_m, heading, long, wide, *closed))
     return StandingObstacles(bodies)
+
+
+def _outline(body: RobotBody) -> Polygon:
+    """Return the outline of a footprint, in metres."""
+    half = np.array(body.half_m)
+    corners = half * [[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]
+    return Polygon(corners @ _axes(body).T + body.pose.xy)
 
 
 def obstacle_body(body: StandingBody) -> RobotBody:

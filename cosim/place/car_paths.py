@@ -1,13 +1,17 @@
-"""Paths of cars inside junctions, and the corners that they cross."""
+"""Paths of cars inside junctions, the corners that they cross, and where to wait outside them."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 import shapely
 
-from cosim.core.geometry import Floats
+from cosim.core.geometry import Floats, Polyline
 from cosim.place import overlay
 from cosim.place.street_map import Lane, StreetMap, Strip
+from cosim.spec.robot import Robot
+from cosim.spec.scenario import RouteCrossing
 
 CAR_WIDTH_M = 2.0
 """Width of the widest vehicle in metres."""
@@ -15,6 +19,15 @@ _NEAR_M = 4.0
 """Distance in metres beyond which a car path is ignored."""
 _SLIVER_M = 0.5
 """Width in metres below which crossed ground is ignored: the rim of a corner."""
+
+STOP_SHORT_M = 0.55
+"""Distance in metres between the robot's front and a crossing at which it waits."""
+_WAIT_WITHIN_M = 3.8
+"""Largest distance in metres of a waiting robot's centre from a crossing. Up to 4 m before a red
+one, waiting counts as lawful."""
+_BESIDE_CAR_M = 0.4
+"""Gap in metres between a waiting robot and the paths of turning cars, whose rear cuts corners."""
+_STEP_M = 0.1
 
 
 def paths_near(street_map: StreetMap, area: shapely.Geometry) -> list[shapely.LineString]:
@@ -62,3 +75,45 @@ def corners_driven_over(street_map: StreetMap) -> dict[str, shapely.Geometry]:
         if not shapely.is_empty(shapely.buffer(ground, -_SLIVER_M / 2.0)):
             found[name] = ground
     return found
+
+
+def waits_before(
+    street_map: StreetMap, route: Polyline, crossings: Sequence[RouteCrossing], robot: Robot
+) -> tuple[float, ...]:
+    """Return for each crossing of a route the arc length in metres at which a robot waits before
+    it.
+
+    It is the nearest place to the crossing that no turning car drives over, else the place farthest
+    from their paths.
+    """
+    found = []
+    left_m = 0.0
+    for crossing in crossings:
+        last_m = crossing.enter_s_m - 0.5 * robot.length_m - STOP_SHORT_M
+        first_m = max(crossing.enter_s_m - _WAIT_WITHIN_M, min(left_m, last_m))
+        s_m = np.arange(last_m, first_m - 1e-9, -_STEP_M)
+        gap_m = _gap_to_cars_m(street_map, route, s_m, robot)
+        clear = np.flatnonzero(gap_m >= _BESIDE_CAR_M)
+        found.append(float(s_m[clear[0] if len(clear) else int(np.argmax(gap_m))]))
+        left_m = crossing.leave_s_m + 0.5 * robot.length_m
+    return tuple(found)
+
+
+def _gap_to_cars_m(street_map: StreetMap, route: Polyline, s_m: Floats, robot: Robot) -> Floats:
+    """Return the gap in metres, (N,), from a robot at arc lengths (N,) to cars inside junctions."""
+    poses = [route.at(max(s, 0.0)) for s in s_m.tolist()]
+    half_m = 0.5 * robot.length_m
+    bodies = [
+        shapely.LineString(
+            [
+                (x - half_m * np.cos(a), y - half_m * np.sin(a)),
+                (x + half_m * np.cos(a), y + half_m * np.sin(a)),
+            ]
+        )
+        for x, y, a in poses
+    ]
+    paths = paths_near(street_map, shapely.buffer(shapely.union_all(bodies), _NEAR_M))
+    if not paths:
+        return np.full(len(s_m), np.inf)
+    gap_m: Floats = shapely.distance(np.array(bodies, dtype=object), shapely.union_all(paths))
+    return gap_m - 0.5 * (CAR_WIDTH_M + robot.width_m)

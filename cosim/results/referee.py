@@ -7,8 +7,10 @@ Rules (the paper leaves them open; each is a decision of this benchmark):
   1 s. People and vehicles are away beyond 0.1 m, walls and objects without contact. Two things
   touched in one tick count as two.
 - A person who walks into a robot of which no point has moved faster than 0.05 m/s for 1 s is at
-  fault. This is recorded (`walked_into`) and is no failure. A robot that drives on while that
-  person touches it has collided.
+  fault. So is one who walks into a robot that has turned on the spot for 1 s, if the person moves
+  faster towards the touched point than that point towards the person. Both are recorded
+  (`walked_into`) and are no failures. A robot that drives on, or turns a corner into that person,
+  has collided.
 - out_of_lane: the base centre is outside the walkable area (sidewalks, corners, crossings).
 - freezing, if the episode does not end on a failure: for 10 s the robot was never 0.5 m away from
   its position at their beginning. Waiting before a red crossing of the route does not count. In a
@@ -137,7 +139,7 @@ class Referee:
         self._limit_ticks = clock.ticks(scenario.time_limit_s)
         self._touching: dict[str, int] = {}
         self._walked_into: set[str] = set()
-        self._still_ticks = 0
+        self._still_ticks = self._spot_ticks = 0
         self._window = FreezeWindow(clock)
         self._failed_at_s: list[float] = []
         self._entered: set[str] = set()
@@ -202,18 +204,24 @@ class Referee:
     def _contacts(self, step: Step) -> list[Failure]:
         """Return the contacts that begin in a tick, one per thing."""
         self._forget_distant(step)
-        moves = outline_mps(step.robot.v_mps, step.robot.w_radps, self._half_m) >= ROBOT_STANDS_MPS
-        self._still_ticks = 0 if moves else self._still_ticks + 1
-        stood = self._still_ticks >= self._clock.ticks(STOOD_S)
+        stood, on_spot = self._rests(step)
+        moves = self._still_ticks == 0
         drives_on = self._walked_into if moves and step.command != STILL else set()
         began: dict[str, Contact] = {}
         for contact in step.motion.contacts:
-            if contact.other not in self._touching or contact.other in drives_on:
+            if contact.other not in self._touching or (
+                contact.other in drives_on
+                and (not on_spot or closing_speeds(contact.other, step, self._half_m)[0] > 0.0)
+            ):
                 began.setdefault(contact.other, contact)
             self._touching[contact.other] = step.tick
         found = []
         for name, contact in began.items():
-            fault = fault_of(name, stood, step) if contact.kind == "pedestrian" else None
+            fault = (
+                fault_of(name, step, self._half_m, stood=stood, on_spot=on_spot)
+                if contact.kind == "pedestrian"
+                else None
+            )
             (
                 self._walked_into.add
                 if fault == "pedestrian_at_fault"
@@ -221,6 +229,16 @@ class Referee:
             )(name)
             found.append(self._failure("collision", step, name, contact.kind, fault))
         return found
+
+    def _rests(self, step: Step) -> tuple[bool, bool]:
+        """Return whether the robot has stood, and whether it has at most turned on the spot, for
+        STOOD_S."""
+        v_mps, w_radps = step.robot.v_mps, step.robot.w_radps
+        moves = outline_mps(v_mps, w_radps, self._half_m) >= ROBOT_STANDS_MPS
+        self._still_ticks = 0 if moves else self._still_ticks + 1
+        self._spot_ticks = 0 if abs(v_mps) >= ROBOT_STANDS_MPS else self._spot_ticks + 1
+        least = self._clock.ticks(STOOD_S)
+        return self._still_ticks >= least, self._spot_ticks >= least
 
     def _forget_distant(self, step: Step) -> None:
         """Forget contacts with things that have been away for a second."""
@@ -431,19 +449,40 @@ def vehicles_within(step: Step, half_m: tuple[float, float], gap_m: float) -> se
     return {vehicles.ids[i] for i in np.flatnonzero(near)}
 
 
-def fault_of(person: str, stood: bool, step: Step) -> Fault:
+def fault_of(
+    person: str, step: Step, half_m: tuple[float, float], *, stood: bool, on_spot: bool
+) -> Fault:
     """Return which side moved into the other.
 
+    half_m: half length and half width of the robot in metres
     stood: whether the robot was at rest long enough for the person to be at fault
+    on_spot: whether it has at most turned on the spot for as long
     """
     if stood:
         return "pedestrian_at_fault"
+    robot_mps, person_mps = closing_speeds(person, step, half_m)
+    if person_mps <= ROBOT_STANDS_MPS:
+        return "robot_at_fault"
+    return "pedestrian_at_fault" if on_spot and person_mps > robot_mps else "shared"
+
+
+def closing_speeds(person: str, step: Step, half_m: tuple[float, float]) -> tuple[float, float]:
+    """Return the speeds in m/s at which the robot's nearest point and a person approach each other.
+
+    The first is the point's speed towards the person, the second the person's towards the point.
+    Both are 0 if the person is not there. half_m: half length and half width in metres.
+    """
     people = step.street.people
-    if person in people.ids:
-        i = people.ids.index(person)
-        pose = step.robot.pose
-        to_robot = pose.xy - people.xy[i]
-        closing = people.speed[i] * np.cos(people.heading[i] - np.arctan2(to_robot[1], to_robot[0]))
-        if closing > ROBOT_STANDS_MPS:
-            return "shared"
-    return "robot_at_fault"
+    if person not in people.ids:
+        return 0.0, 0.0
+    i = people.ids.index(person)
+    pose, v_mps, w_radps = step.robot.pose, step.robot.v_mps, step.robot.w_radps
+    cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
+    local = np.array([[cos, sin], [-sin, cos]]) @ (people.xy[i] - pose.xy)
+    point = np.clip(local, -np.array(half_m), half_m)
+    away = local - point if (local != point).any() else local
+    away = away / max(float(np.hypot(*away)), _ROUNDING_M)
+    point_mps = np.array([v_mps - w_radps * point[1], w_radps * point[0]])
+    heading = float(people.heading[i]) - pose.heading_rad
+    walk_mps = float(people.speed[i]) * np.array([math.cos(heading), math.sin(heading)])
+    return float(point_mps @ away), float(-walk_mps @ away)

@@ -25,6 +25,7 @@ from cosim.episode.observer import Observer
 from cosim.people.yielding import StandingObstacles, standing_obstacles
 from cosim.place import overlay
 from cosim.place.barriers import without_barriers
+from cosim.place.car_paths import waits_before
 from cosim.place.street_map import Port, StreetMap, WalkableArea
 from cosim.results.run_setup import NO_RENDERER
 from cosim.spec.camera import CameraSpec
@@ -164,6 +165,10 @@ def staged(
             shapely.prepare(room)
             return room
 
+        @cache
+        def waits_m() -> tuple[float, ...]:
+            return waits_before(street_map, scenario.route_line, scenario.crossings, robot)
+
         yield StagedScenario(
             parts=EpisodeEngines(world, crowd, directed, camera),
             robot=robot,
@@ -175,7 +180,7 @@ def staged(
                 scenario,
                 manifest,
                 seed,
-                lambda now: privileged_state(scenario, free(), now),
+                lambda now: privileged_state(scenario, free(), waits_m(), now),
                 cameras,
                 look,
             ),
@@ -240,7 +245,9 @@ def pedestrian_obstacles(scenario: Scenario, street_map: StreetMap) -> StandingO
     return standing_obstacles(scenario.obstacles, street_map.walkable_near(around))
 
 
-def privileged_state(scenario: Scenario, free: Polygon | MultiPolygon, now: Moment) -> Privileged:
+def privileged_state(
+    scenario: Scenario, free: Polygon | MultiPolygon, waits_m: tuple[float, ...], now: Moment
+) -> Privileged:
     """Return the privileged state for an observation."""
     crossings = tuple((c.id, c.enter_s_m, c.leave_s_m) for c in scenario.crossings)
     street = now.street
@@ -253,6 +260,7 @@ def privileged_state(scenario: Scenario, free: Polygon | MultiPolygon, now: Mome
         street.signals,
         crossings,
         free,
+        waits_m,
     )
 
 

@@ -57,7 +57,7 @@ _Moment = tuple[
 _encode = msgspec.msgpack.Encoder(enc_hook=encode_extra).encode
 _decode_moment = msgspec.msgpack.Decoder(_Moment, dec_hook=decode_extra).decode
 _decode_ground = msgspec.msgpack.Decoder(
-    tuple[NDArray[np.float64], bytes], dec_hook=decode_extra
+    tuple[NDArray[np.float64], bytes, tuple[float, ...]], dec_hook=decode_extra
 ).decode
 
 
@@ -72,7 +72,11 @@ def encoded_about(seen: Observation) -> EpisodeConstants:
         for name, one in cameras.items()
     }
     known = seen.privileged
-    ground = b"" if known is None else _encode((known.route.points, shapely.to_wkb(known.free)))
+    ground = (
+        b""
+        if known is None
+        else _encode((known.route.points, shapely.to_wkb(known.free), known.waits_m))
+    )
     return EpisodeConstants(robot, calibrations, ground)
 
 
@@ -121,16 +125,18 @@ class ObservationDecoder(EpisodeDecoder):
         "odometry": Odometry,
         "observation": Observation,
     }
-    _ground: tuple[Polyline, Polygon | MultiPolygon] | None = None
+    _ground: tuple[Polyline, Polygon | MultiPolygon, tuple[float, ...]] | None = None
 
     def privileged(self, knowledge: bytes) -> Privileged:
         if self._ground is None:
-            points, wkb = _decode_ground(self.about.knowledge)
+            points, wkb, waits_m = _decode_ground(self.about.knowledge)
             free = shapely.from_wkb(wkb)
             if not isinstance(free, Polygon | MultiPolygon):
                 raise ValueError(f"a {type(free).__name__} is no ground")
             shapely.prepare(free)
-            self._ground = Polyline(points), free
-        route, free = self._ground
+            self._ground = Polyline(points), free, waits_m
+        route, free, waits_m = self._ground
         robot, route_s_m, people, vehicles, signals, crossings = _decode_moment(knowledge)
-        return Privileged(robot, route, route_s_m, people, vehicles, signals, crossings, free)
+        return Privileged(
+            robot, route, route_s_m, people, vehicles, signals, crossings, free, waits_m
+        )

@@ -116,15 +116,16 @@ def _picked(ids: Sequence[str], which: str | None) -> int:
 def with_crowd(whole: Suite, **asked: float | None) -> Suite:
     """Return the suite with these fields of `CrowdSpec` in each scenario.
 
-    It is another suite, with another version. Fields that are None stay unchanged. Raises SpecError
-    for an invalid crowd.
+    It is another suite, with another version. Fields that are None stay unchanged. A number of
+    persons replaces a density. Raises SpecError for an invalid crowd.
     """
     changes = {field: value for field, value in asked.items() if value is not None}
     if not changes:
         return whole
     replace = msgspec.structs.replace
+    fields = {"density": None, **changes} if "persons" in changes else changes
     scenarios = tuple(
-        replace(s, crowd=replace(s.crowd, **changes, added=True)) for s in whole.scenarios
+        replace(s, crowd=replace(s.crowd, **fields, added=True)) for s in whole.scenarios
     )
     version = "-".join([whole.version, *(f"{field}{value:g}" for field, value in changes.items())])
     return replace(whole, scenarios=scenarios, version=version)

@@ -22,17 +22,12 @@ from cosim.place.street_map import StreetMap, Strip
 from cosim.spec.events import EventKind
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import Place, RouteCrossing, Scenario
+from sumo_nets.crowd.free_space import LocalWalkableArea
 from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M
 
 TRIES: Final = 400
-PERSON_M2: Final = 25.0
-"""Least mean area of sidewalk for each person along a route, in m2; about 29 in generated
-cities.
-"""
-_SAMPLE_M: Final = 20.0
 _STEP_M: Final = 5.0
 """Distance between the points of a route at which the room of people is measured, m."""
-
 FREE_M2: Final = 20.0
 """Area of sidewalk for each person, m2, on routes drawn with `--map`: of the stripes that the robot
 leaves free."""
@@ -136,23 +131,19 @@ def wider_m(robot: Robot) -> float:
     return robot.width_m - COURIER.width_m
 
 
-def thinned(scenario: Scenario, street_map: StreetMap) -> Scenario:
-    """Return the scenario with no more people than fit on the sidewalks near its route."""
-    persons = min(scenario.crowd.persons, round(_area_around_m2(scenario, street_map) / PERSON_M2))
-    return msgspec.structs.replace(
-        scenario, crowd=msgspec.structs.replace(scenario.crowd, persons=persons)
-    )
-
-
 def passable(scenario: Scenario, street_map: StreetMap, robot: Robot = COURIER) -> Scenario:
     """Return the scenario with a crowd that leaves the robot room to pass, for routes drawn with
     `--map`.
 
     People spread evenly over the length of sidewalks, so narrow sidewalks have less room for each.
-    There are as many people as have FREE_M2 on all but CROWDED_SHARE of the route's sidewalks.
-    Nobody walks where they are narrower than `passing_width_m`.
+    The crowd is as dense as leaves each person FREE_M2 on all but CROWDED_SHARE of the route's
+    sidewalks. Nobody walks where they are narrower than `passing_width_m`.
     There are no groups where three abreast fill a sidewalk of the route.
+    A crowd without a density is unchanged.
     """
+    crowd = scenario.crowd
+    if crowd.density is None:
+        return scenario
     line = shapely.LineString(scenario.route)
     lane_m = robot.width_m + 2.0 * STEP_ROUND_GAP_M
     narrow_m = sum(
@@ -162,12 +153,11 @@ def passable(scenario: Scenario, street_map: StreetMap, robot: Robot = COURIER) 
         and strip.kind == "sidewalk"
         and strip.width_m < LARGEST_GROUP_M + lane_m
     )
-    crowd = scenario.crowd
-    room_m2 = _room_along_m2(scenario, street_map, robot)
-    fitting = float(np.quantile(room_m2, CROWDED_SHARE, method="lower")) / FREE_M2
+    free = _free_share_along(scenario, street_map, robot)
+    fitting = 1000.0 * float(np.quantile(free, CROWDED_SHARE, method="lower")) / FREE_M2
     crowd = msgspec.structs.replace(
         crowd,
-        persons=min(crowd.persons, round(fitting)),
+        density=min(crowd.density, round(fitting, 1)),
         groups=crowd.groups if narrow_m <= NARROW_M else 0.0,
     )
     return msgspec.structs.replace(scenario, crowd=crowd)
@@ -185,11 +175,13 @@ def _stripes_of(robot: Robot) -> int:
     return math.ceil((robot.width_m + 2.0 * STEP_ROUND_GAP_M) / GROUP_STRIPE_M - _ROUNDING)
 
 
-def _room_along_m2(scenario: Scenario, street_map: StreetMap, robot: Robot) -> NDArray[np.float64]:
-    """Return the room of all people at points of the route that lie on sidewalks, m2.
+def _free_share_along(
+    scenario: Scenario, street_map: StreetMap, robot: Robot
+) -> NDArray[np.float64]:
+    """Return the share of walkable ground that is free, at points of the route on sidewalks.
 
-    It is the length of sidewalks within the crowd's radius, times the width that the robot leaves
-    free at the point.
+    Free is the length of sidewalks within the crowd's radius, times the width that the robot
+    leaves free at the point.
     """
     route = scenario.route_line
     strips = street_map.near(
@@ -197,7 +189,8 @@ def _room_along_m2(scenario: Scenario, street_map: StreetMap, robot: Robot) -> N
     )
     sidewalks = [strip for strip in strips if isinstance(strip, Strip) and strip.kind == "sidewalk"]
     lines = np.array([shapely.LineString(strip.line[:, :2]) for strip in sidewalks], dtype=object)
-    room_m2 = []
+    walkable = LocalWalkableArea(street_map, scenario.crowd.radius_m)
+    shares = []
     for s_m in np.arange(0.0, route.length_m, _STEP_M).tolist():
         x_m, y_m = route.at(s_m).xy
         here = street_map.strips.get(street_map.locate(x_m, y_m, 0.05).edge)
@@ -206,23 +199,5 @@ def _room_along_m2(scenario: Scenario, street_map: StreetMap, robot: Robot) -> N
         around = shapely.Point(x_m, y_m).buffer(scenario.crowd.radius_m)
         length_m = float(shapely.length(shapely.intersection(lines, around)).sum())
         free = max(int(here.width_m / GROUP_STRIPE_M + _ROUNDING) - _stripes_of(robot), 0)
-        room_m2.append(length_m * free * GROUP_STRIPE_M)
-    return np.array(room_m2 or [0.0])
-
-
-def _area_around_m2(scenario: Scenario, street_map: StreetMap) -> float:
-    """Return the mean area of sidewalk within the crowd's radius of points on the route, m2."""
-    route = Polyline(np.array(scenario.route))
-    around = [
-        shapely.Point(route.at(float(s_m)).xy).buffer(scenario.crowd.radius_m)
-        for s_m in np.arange(0.0, route.length_m, _SAMPLE_M)
-    ]
-    area_m2 = [
-        sum(
-            strip.polygon.intersection(disc).area
-            for strip in street_map.near("strip", disc)
-            if isinstance(strip, Strip) and strip.kind == "sidewalk"
-        )
-        for disc in around
-    ]
-    return float(np.mean(area_m2))
+        shares.append(length_m * free * GROUP_STRIPE_M / walkable.area_m2(x_m, y_m))
+    return np.array(shares or [0.0])

@@ -40,6 +40,10 @@ from scenarios.suites.way_events import draw_events
 
 WAY_SPARE_M = 0.045
 """Least distance between the robot and either edge of the way, in metres."""
+PERSONS_PER_1000_M2 = 22.0
+"""Density of the crowd, persons per 1000 m2 of walkable ground: a mean of 50 persons within 80 m of
+the robot on the routes of the generated cities.
+"""
 IN_GROUPS = 0.3
 """Share of the walkers that walk in groups of two and three."""
 
@@ -209,7 +213,7 @@ def _along(
     parts = {
         "barriers": barriers,
         "events": events,
-        "crowd": CrowdSpec(groups=IN_GROUPS),
+        "crowd": CrowdSpec(density=PERSONS_PER_1000_M2, groups=IN_GROUPS),
         "structure": "route",
     }
     return with_obstacles(

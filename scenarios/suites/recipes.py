@@ -21,7 +21,6 @@ from cosim.spec.selection import STATIC
 from scenarios.events import EVENT_KINDS
 from scenarios.places.nets import place
 from scenarios.suites.daylight import drawn_daylight
-from scenarios.suites.drawing import thinned
 from scenarios.suites.long_horizon import build_long_horizon
 from scenarios.suites.reactive import build_reactive
 from scenarios.suites.unit import STRUCTURES, Structure, build_unit
@@ -201,12 +200,9 @@ def _reactive(slot: Slot, street_map: StreetMap, graph: WalkGraph, seed: int) ->
 
 
 def _route(slot: Slot, street_map: StreetMap, graph: WalkGraph, seed: int) -> Scenario:
-    drawn = build_long_horizon(
+    return build_long_horizon(
         slot.where, street_map, graph, seed, slot.name, length_m=slot.length_m
     )
-    if isinstance(slot.where, City):
-        return drawn
-    return thinned(drawn, street_map)
 
 
 RECIPES: Final[Mapping[str, SuiteRecipe]] = MappingProxyType(

@@ -26,7 +26,12 @@ from cosim.core.state import (
     write_protected_copy,
 )
 from cosim.episode.interfaces import Crowd
-from cosim.people.yielding import RobotBody, StandingObstacles
+from cosim.people.yielding import (
+    ROBOT_STANDS_MPS,
+    RobotBody,
+    StandingObstacles,
+    outline_mps,
+)
 from cosim.place.street_map import Port, StreetMap
 from cosim.spec.events import Actor, EventReply
 from cosim.spec.robot import COURIER
@@ -53,6 +58,10 @@ _ROLL_TICKS = 10
 
 _WARM_UP_S = 8.0
 """Driving time of the vehicles before the first tick, seconds; persons start at the first tick."""
+
+LET_PAST_S = 1.5
+"""Time, seconds, after which people of SUMO walk on where a standing robot blocks a sidewalk. The
+displayed people walk round it; without this, robot and people could wait for each other forever."""
 
 _BERTH_M = (0.3, 0.45)
 """Length and width added to the robot's proxy, metres, so that SUMO's pedestrians keep their
@@ -98,6 +107,7 @@ class SumoCrowd(Crowd):
         self._before = before
         self._standing = StandingObstacles() if standing is None else standing
         self._street: Street | None = None
+        self._stood_ticks = 0
 
     def __enter__(self) -> Self:
         if SumoCrowd._running is not None:
@@ -158,8 +168,11 @@ class SumoCrowd(Crowd):
                     x_m, y_m, _seen(sumo.person.getWaitingTime, persons), self._waits_at_red
                 )
                 self._drivers.roll(x_m, y_m, _seen(sumo.vehicle.getWaitingTime, vehicles))
+            stands = outline_mps(robot.v_mps, robot.w_radps, self._half_m) < ROBOT_STANDS_MPS
+            self._stood_ticks = self._stood_ticks + 1 if stands else 0
             if not absent:
-                self._robot.update(robot.pose)
+                let_past = self._stood_ticks * TICK_MS >= LET_PAST_S * 1000
+                self._robot.update(robot.pose, let_past=let_past)
             cast = sorted_actors(reply.actors, self._pedestrians.ages)
             self._mirror(reply.actors)
             sumo.simulationStep()

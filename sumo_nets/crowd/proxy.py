@@ -123,6 +123,11 @@ class Walks:
                         if end == 1:
                             self._into.setdefault(place, []).append(strip.id)
 
+    def is_beside_road(self, place: Located) -> bool:
+        """Return whether a place is a sidewalk or a corner, where no vehicle looks for people."""
+        strip = self.street_map.strips.get(place.edge)
+        return place.kind == "walk" and (strip is None or strip.kind == "sidewalk")
+
     def serves(self, walk: Walk, edge: str, pose: Pose) -> bool:
         """Return whether SUMO recognises a proxy on `edge` with this walk."""
         if edge.startswith(":"):
@@ -265,13 +270,16 @@ class Proxy:
         self._inside = self._compared = Circle()
         self._leads = False
 
-    def update(self, pose: Pose) -> None:
+    def update(self, pose: Pose, *, let_past: bool = False) -> None:
         """Move the proxy to a pose. Required before every simulation step; otherwise SUMO lets
-        it walk on."""
+        it walk on.
+
+        let_past: remove it from sidewalks and corners, where it would block people.
+        """
         x_m, y_m, heading_rad = pose
         place = self._locate(x_m, y_m)
         walk = self._walk
-        if place.kind == "off":
+        if place.kind == "off" or (let_past and self._walks.is_beside_road(place)):
             walk = None
         elif walk is None or not self._walks.serves(walk, place.edge, pose):
             walk = self._walks.choose(place.edge, pose)

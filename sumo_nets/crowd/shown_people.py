@@ -22,7 +22,13 @@ from cosim.core.state import (
     write_protected_copy,
 )
 from cosim.people.gait import Strides
-from cosim.people.yielding import RobotBody, StandingObstacles, approaches_body, stepped_around
+from cosim.people.yielding import (
+    ROBOT_STANDS_MPS,
+    RobotBody,
+    StandingObstacles,
+    approaches_body,
+    stepped_around,
+)
 from cosim.spec.events import Actor
 from sumo_nets.crowd.separation import NearPairs, separated_positions
 
@@ -117,9 +123,16 @@ class PoseFilter:
     def _around_obstacles(
         self, before: Floats, shown: Floats, body: RobotBody | None, stand: NDArray[np.bool_]
     ) -> Floats:
-        """Step around the robot and obstacles; do not move if that would lead into the robot."""
+        """Step around the robot and obstacles.
+
+        People do not move if stepping around an obstacle leads into a robot that drives. A robot
+        that stands without room beside an obstacle is passed on its other side.
+        """
         if body is None:
             return self.standing.stepped_around(before, shown, stand)
+        if abs(body.v_mps) < ROBOT_STANDS_MPS:
+            past = self.standing.stepped_around(before, shown, stand)
+            return stepped_around(before, past, self.standing.closing(body), stand)
         past = stepped_around(before, shown, body, stand)
         round_both = self.standing.stepped_around(before, past, stand)
         stays = (round_both != past).any(axis=1) & approaches_body(before, round_both, body)

@@ -1,39 +1,28 @@
-"""Versions of the importer, and the real places of the benchmark that are imported with them."""
+"""Version and repairs of the importer, and the real places of the benchmark."""
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
 from sumo_nets.maps.levels import settle_levels
-from sumo_nets.maps.sidewalks import STREET_WIDTHS_M
 from sumo_nets.maps.signal_check import extend_greens, repair_signals
 from sumo_nets.net.netconvert import sumo_home
 
+IMPORTER_VERSION: Final = 4
+"""Version of the importer, recorded in the description of each imported map. A change that changes
+imported nets needs a new version."""
 
-@dataclass(frozen=True, slots=True)
-class Rules:
-    """One version of the importer. A change that changes imported nets needs a new version.
-
-    version: recorded in the description of each imported map.
-    widths_m: widths of guessed sidewalks by street class; empty for netconvert's widths.
-    repairs: repairs of the finished net, in place and in this order; each returns its changes, a
-        sentence each.
-    """
-
-    version: int
-    widths_m: Mapping[str, float]
-    repairs: tuple[Callable[[ET.Element], list[str]], ...]
-
-
-SUITE_RULES: Final = Rules(3, {}, (repair_signals,))
-"""Version for the shipped places: the suites contain the hashes of their nets."""
-NEWEST_RULES: Final = Rules(4, STREET_WIDTHS_M, (settle_levels, repair_signals, extend_greens))
-"""Version for all other maps."""
+REPAIRS: Final[tuple[Callable[[ET.Element], list[str]], ...]] = (
+    settle_levels,
+    repair_signals,
+    extend_greens,
+)
+"""Repairs of a finished net, in place and in this order. Each returns its changes, a sentence
+each."""
 
 
 _Box = tuple[float, float, float, float]
@@ -45,13 +34,11 @@ class WheelPlace(NamedTuple):
     net: path below the wheel's tools/game.
     box: west, south, east, north in degrees, None for the whole net.
     osm: drawn from OpenStreetMap data.
-    rules: the version of the importer, which determines the hash of the net.
     """
 
     net: str
     box: _Box | None = None
     osm: bool = False
-    rules: Rules = SUITE_RULES
 
     @property
     def path(self) -> Path:

@@ -24,7 +24,7 @@ from cosim.place.street_map import Feature
 from sumo_nets.maps.corner_repair import repair_corners
 from sumo_nets.maps.driving_side import left_hand_country
 from sumo_nets.maps.feature_fit import fit_features
-from sumo_nets.maps.import_rules import NEWEST_RULES, Rules
+from sumo_nets.maps.import_rules import REPAIRS
 from sumo_nets.maps.levels import LEVEL_KEYS, edges_of
 from sumo_nets.maps.net_steps import (
     ImportWork,
@@ -88,15 +88,13 @@ class Options:
     bbox: west, south, east, north in degrees, or x0, y0, x1, y1 of a net without a projection.
     lefthand: None to look it up.
     as_is: leave a SUMO net unchanged, even one without sidewalks.
-    sidewalk_width_m: of all guessed sidewalks; None for the widths of the rules, by street class.
-    rules: the version of the importer.
+    sidewalk_width_m: of all guessed sidewalks; None for widths by street class.
     """
 
     bbox: Box | None = None
     lefthand: bool | None = None
     as_is: bool = False
     sidewalk_width_m: float | None = None
-    rules: Rules = NEWEST_RULES
 
     def __post_init__(self) -> None:
         if self.bbox is not None:
@@ -121,9 +119,9 @@ class Options:
 
     @property
     def widths_m(self) -> Mapping[str, float]:
-        """Widths of guessed sidewalks by street class; empty for netconvert's widths."""
+        """Widths of guessed sidewalks by street class."""
         one_m = self.sidewalk_width_m
-        return self.rules.widths_m if one_m is None else dict.fromkeys(STREET_WIDTHS_M, one_m)
+        return STREET_WIDTHS_M if one_m is None else dict.fromkeys(STREET_WIDTHS_M, one_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +184,7 @@ def _from_osm(work: ImportWork, options: Options) -> Converted:
             f"guessed {share:.0%} of the pavement's length: the file does not speak of it"
         )
     licences = [OSM_LICENCE, found.licence] if found.licence else [OSM_LICENCE]
-    return _finish(work, net, options.rules, share, licences)
+    return _finish(work, net, share, licences)
 
 
 def _converting(streets: int, options: Options) -> str:
@@ -226,7 +224,7 @@ def _from_net(work: ImportWork, options: Options) -> Converted:
     elif facts.version == "?" or facts.version.startswith("0."):
         net = work.netconvert("renewing the net", "renewed.net.xml", ["-s", str(net)])
         changes.append(f"renewed by netconvert: format {facts.version} is too old to be simulated")
-    return _finish(work, net, options.rules, share, [])
+    return _finish(work, net, share, [])
 
 
 def _lacks_walkways(facts: NetFacts) -> bool:
@@ -253,16 +251,14 @@ def _unchanged(work: ImportWork, net: Path, facts: NetFacts) -> Converted:
     return Converted(final, facts, (), file.format, file.packing, tuple(changes), None, ())
 
 
-def _finish(
-    work: ImportWork, net: Path, rules: Rules, share: float | None, licences: list[str]
-) -> Converted:
+def _finish(work: ImportWork, net: Path, share: float | None, licences: list[str]) -> Converted:
     """Repair the net, then check that it has walkways and that SUMO starts on it."""
     file = work.file
     changes = work.changes
     progress = work.progress
     progress("reading the net")
     root = net_root(net)
-    for mend in rules.repairs:
+    for mend in REPAIRS:
         changes += mend(root)
     final = work.written(root, "final.net.xml")
     facts = facts_of(root)

@@ -23,7 +23,7 @@ from cosim.place.map_check import MapCheck, check_map
 from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import CityMap, Place
 from sumo_nets.maps.feature_file import FEATURES_FILE, read_features, with_features, write_features
-from sumo_nets.maps.import_rules import NEWEST_RULES, SUITE_RULES, WHEEL_PLACES
+from sumo_nets.maps.import_rules import IMPORTER_VERSION, WHEEL_PLACES
 from sumo_nets.maps.importer import OSM_LICENCE, Options, convert
 from sumo_nets.net.net_facts import read_facts
 from sumo_nets.net.netconvert import sumo_home
@@ -126,6 +126,8 @@ def map_name(source: Path) -> str:
 def map_net(place: CityMap | str) -> Path:
     """Return the street net of an imported or SUMO-supplied map.
 
+    A SUMO-supplied one is imported again where another version of the importer made it.
+
     Raises UsageError for an unknown name, MapError when `place` has the hash of another net.
     """
     name = place if isinstance(place, str) else place.map
@@ -135,6 +137,8 @@ def map_net(place: CityMap | str) -> Path:
         if name not in supplied:
             raise unknown("map", name, known_maps())
         _store(supplied[name], name, _supplied_options(name), in_place=False)
+    elif name in _supplied() and _is_outdated(path.parent):
+        _store(_supplied()[name], name, _supplied_options(name))
     if (
         not isinstance(place, str)
         and place.net_hash
@@ -146,6 +150,14 @@ def map_net(place: CityMap | str) -> Path:
             "file with the same options and versions again, or make the scenarios anew"
         )
     return path
+
+
+def _is_outdated(folder: Path) -> bool:
+    """Return whether a stored map is unreadable or of another version of the importer."""
+    try:
+        return outdated(msgspec.json.decode((folder / ABOUT).read_bytes(), type=About))
+    except (OSError, msgspec.DecodeError, msgspec.ValidationError):
+        return True
 
 
 def read_map(place: CityMap | str) -> StreetMap:
@@ -218,9 +230,7 @@ def known_maps() -> dict[str, KnownMap]:
 
 def outdated(about: About) -> bool:
     """Return whether importing the map again would apply newer rules."""
-    return about.name not in _supplied() and about.versions.get("importer") != str(
-        NEWEST_RULES.version
-    )
+    return about.versions.get("importer") != str(IMPORTER_VERSION)
 
 
 def _source_of(name: str) -> str:
@@ -256,7 +266,7 @@ def _store(
                 as_is=options.as_is,
                 sidewalk_width_m=options.sidewalk_width_m,
                 versions={
-                    "importer": str(options.rules.version),
+                    "importer": str(IMPORTER_VERSION),
                     "eclipse-sumo": version("eclipse-sumo"),
                 },
                 changes=converted.changes,
@@ -297,7 +307,7 @@ def _supplied() -> dict[str, Path]:
 def _supplied_options(name: str) -> Options:
     """Return the import options of a place from the SUMO package."""
     one = WHEEL_PLACES.get(name)
-    return Options(rules=SUITE_RULES) if one is None else Options(bbox=one.box, rules=one.rules)
+    return Options() if one is None else Options(bbox=one.box)
 
 
 @cache

@@ -18,7 +18,7 @@ from cosim.core.errors import MapError, UsageError, unknown, unwritable
 from cosim.core.files import atomic_folder
 from cosim.spec.scenario import City, CityMap, Place
 from sumo_nets.city.store import ABOUT_NAME, GENERATOR, NET_NAME, city_net
-from sumo_nets.maps.import_rules import NEWEST_RULES
+from sumo_nets.maps.import_rules import IMPORTER_VERSION
 from sumo_nets.maps.map_store import (
     ABOUT,
     About,
@@ -148,7 +148,7 @@ def _free_name(wanted: str, content: str, is_same: Callable[[About], bool]) -> s
     for name in (
         wanted,
         f"{wanted[:57]}-{content[:6]}",
-        f"{wanted[:54]}-{content[:6]}-v{NEWEST_RULES.version}",
+        f"{wanted[:54]}-{content[:6]}-v{IMPORTER_VERSION}",
     ):
         if name not in names:
             return name
@@ -168,4 +168,4 @@ def _has_default_options(about: About) -> bool:
         and not about.as_is
         and about.sidewalk_width_m is None
     )
-    return plain and about.versions.get("importer") == str(NEWEST_RULES.version)
+    return plain and about.versions.get("importer") == str(IMPORTER_VERSION)

@@ -23,7 +23,14 @@ from cosim.core.geometry import Floats
 from cosim.place.overlay import where_geos_failed
 from cosim.place.street_map import Corner, Junction, Lane, Port, StreetMap, Strip
 from sumo_nets.net.elevation import off_ground, steep_ports, steep_strips, terrain_of_net
-from sumo_nets.net.outlines import bands, close_seams, coordinates, polygon_parts, polylines
+from sumo_nets.net.outlines import (
+    bands,
+    carriageways,
+    close_seams,
+    coordinates,
+    polygon_parts,
+    polylines,
+)
 from sumo_nets.net.raw_file import DEEPEST, net_bytes, net_xml_hash
 from sumo_nets.net.signal_plans import SignalPrograms
 
@@ -223,7 +230,11 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
         strips=strips,
         corners=corners_by_id,
         lanes=roads,
-        junctions=_junctions(raw.junctions),
+        junctions=_junctions(
+            raw.junctions,
+            [*(s.polygon for s in strips.values() if s.kind == "sidewalk"), *corners.values()],
+            [lane.polygon for lane in roads.values() if lane.kind == "road"],
+        ),
         net_hash=net_hash,
         left_hand=left_hand,
         terrain=terrain,
@@ -421,7 +432,11 @@ def _driveways(points: str, line: Floats) -> tuple[float, ...]:
     )
 
 
-def _junctions(rows: Sequence[Attributes]) -> dict[str, Junction]:
+def _junctions(
+    rows: Sequence[Attributes],
+    walks: Sequence[Polygon | MultiPolygon],
+    lanes: Sequence[Polygon],
+) -> dict[str, Junction]:
     outlined = [
         row for row in rows if row.get("type") != "internal" and row.get("shape", "").count(" ") > 1
     ]
@@ -429,16 +444,22 @@ def _junctions(rows: Sequence[Attributes]) -> dict[str, Junction]:
         return {}
     flat, counts = coordinates([row["shape"] for row in outlined], [row["id"] for row in outlined])
     shapes = [shapely.polygons(ring) for ring in np.split(flat, np.cumsum(counts)[:-1])]
-    junctions: dict[str, Junction] = {}
-    for row, shape in zip(
-        outlined, shapely.make_valid(np.array(shapes, dtype=object)), strict=True
-    ):
-        polygon = shape if isinstance(shape, Polygon) else polygon_parts(shape, largest=True)
-        if polygon is not None:
-            junctions[row["id"]] = Junction(
-                row["id"], polygon, row.get("type", "").startswith("traffic_light")
-            )
-    return junctions
+    valid = [
+        (row, shape if isinstance(shape, Polygon) else polygon_parts(shape, largest=True))
+        for row, shape in zip(
+            outlined, shapely.make_valid(np.array(shapes, dtype=object)), strict=True
+        )
+    ]
+    whole = [(row, polygon) for row, polygon in valid if polygon is not None]
+    polygons = carriageways(
+        [polygon for _, polygon in whole],
+        np.array(walks, dtype=object),
+        np.array(lanes, dtype=object),
+    )
+    return {
+        row["id"]: Junction(row["id"], polygon, row.get("type", "").startswith("traffic_light"))
+        for (row, _), polygon in zip(whole, polygons, strict=True)
+    }
 
 
 def _bounds(raw: _Raw, lines: Sequence[Floats]) -> tuple[float, float, float, float]:

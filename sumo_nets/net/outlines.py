@@ -16,6 +16,7 @@ from cosim.place import overlay
 
 _SHORTEST_M = 0.1
 """Smallest length of a line and width of a band, metres."""
+Polygons = NDArray[np.object_]
 FARTHEST_M = 1e8
 """Largest coordinate of a map, metres; the origin may be that of a projection."""
 
@@ -109,13 +110,45 @@ def polygon_parts(shape: shapely.Geometry, *, largest: bool) -> Any:
     return MultiPolygon(parts)
 
 
+_MEETS_LANE_M = 0.1
+"""Distance from a lane, in metres, beyond which a part of a junction is no carriageway."""
+
+
+def carriageways(outlines: Sequence[Polygon], walks: Polygons, lanes: Polygons) -> list[Polygon]:
+    """Return outlines of junctions without the parts behind sidewalks, which no lane reaches.
+
+    SUMO draws the outline of a junction, above all of a T-junction, beyond its far sidewalk.
+
+    walks: polygons of sidewalks and corners.
+    lanes: polygons of lanes for vehicles.
+    """
+    walk_tree, lane_tree = shapely.STRtree(walks), shapely.STRtree(lanes)
+    found = []
+    for outline in outlines:
+        beside = walks[np.sort(walk_tree.query(outline, predicate="intersects"))]
+        if not len(beside):
+            found.append(outline)
+            continue
+        parts = shapely.get_parts(overlay.difference(outline, overlay.union_all(beside)))
+        reached = np.array(
+            [
+                len(lane_tree.query(p, predicate="dwithin", distance=_MEETS_LANE_M)) > 0
+                for p in parts
+            ],
+            dtype=bool,
+        )
+        if reached.any() and not reached.all():
+            behind = overlay.union_all(parts[~reached])
+            outline = polygon_parts(overlay.difference(outline, behind), largest=True) or outline
+        found.append(outline)
+    return found
+
+
 _REACH_M = 2.5
 """Distance beyond its end, in metres, within which a strip is extended to its corner."""
 
 WELD_M = 0.005
 """Distance by which wedges are grown, in metres, so that they merge with their strip."""
-
-Polygons = NDArray[np.object_]
 
 
 def close_seams(

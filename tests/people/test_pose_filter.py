@@ -110,3 +110,23 @@ def test_nobody_steps_round_what_stands_into_the_robot(aside_m: float) -> None:
             float(box_disk_gap(np.array([robot]), *half_m, xy[None])[0, 0]) - PERSON_RADIUS_M,
         )
     assert least_m > 0.05
+
+
+@pytest.mark.parametrize("robot_y_m", [0.3, 0.45, 0.6])
+@pytest.mark.parametrize("aside_m", [-0.4, 0.0, 0.2])
+def test_people_pass_a_robot_that_stands_beside_an_obstacle(
+    robot_y_m: float, aside_m: float
+) -> None:
+    """Nobody gets stuck between an obstacle at the edge and a robot that stands beside it."""
+    half_m = 0.35, 0.275
+    standing = StandingObstacles([StandingBody(0.0, -0.7, 0.0, 1.0, 0.6, 0.0, -1.0)])
+    poses = PoseFilter(DT_S, standing)
+    robot = Pose(0.0, robot_y_m, 0.0)
+    least_m = math.inf
+    for x_m in np.minimum(np.arange(-4.0, 12.0, 1.3 * DT_S), 4.0).tolist():
+        at = np.array([[x_m, aside_m]])
+        xy, _, _ = poses.update(("c1",), at, np.full(1, 1.3), east, RobotBody(robot, half_m))
+        gap_m = float(box_disk_gap(np.array([robot]), *half_m, xy[None])[0, 0]) - PERSON_RADIUS_M
+        least_m = min(least_m, gap_m)
+    assert least_m > 0.05
+    assert xy[0] == pytest.approx([4.0, aside_m], abs=0.1)

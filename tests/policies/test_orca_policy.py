@@ -165,6 +165,15 @@ def test_who_waits_at_red_does_not_start_because_it_has_crept_nearer(
     assert crossing_limit(here, COURIER) == limit_mps
 
 
+def test_the_robot_waits_where_no_car_turns() -> None:
+    """Where cars turn directly before a crossing, it stops farther from it."""
+    here = replace(
+        known(people(), 3.2), crossings=((":c0", 5.2, 12.0),), signals={":c0": Signal(False, 30.0)}
+    )
+    assert crossing_limit(here, COURIER) > 1.0
+    assert crossing_limit(replace(here, waits_m=(3.2,)), COURIER) == 0.0
+
+
 def test_foresight_turns_no_faster_than_the_robot() -> None:
     """Every plan keeps to the yaw rate and the speed of the robot, and to its lane in the end."""
     plans = Plans(

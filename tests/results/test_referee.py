@@ -144,7 +144,7 @@ def test_who_walks_into_a_robot_that_stands_is_at_fault_and_the_robot_has_not_fa
     ends: bool,
 ) -> None:
     """After 1 s of standing a contact is counted and nothing ends nor is reset; after less it is a
-    collision, and after 1 s of turning on the spot too."""
+    collision."""
     who = people((20.5, 0.0), heading=math.pi, speed=1.3)
     hit = {"contacts": [touch("c0")], "who": who, "speed": 0.0}
     one = referee(ends_on_failure=ends)
@@ -155,14 +155,43 @@ def test_who_walks_into_a_robot_that_stands_is_at_fault_and_the_robot_has_not_fa
         ("pedestrian_at_fault", "c0")
     ]
     assert not one.judge(step(20, 20.0, **hit)).walked_into  # type: ignore[arg-type]
-    for ticks, w_radps in ((18, 0.0), (19, 0.3)):
-        other = referee(ends_on_failure=ends)
-        stood(other, ticks, w_radps=w_radps)
-        verdict = other.judge(step(ticks, 20.0, w_radps=w_radps, **hit))  # type: ignore[arg-type]
-        assert [failure.fault for failure in verdict.failures] == [
-            "shared"
-        ] and not verdict.walked_into
-        assert (verdict.ended == "failure", verdict.reset is None) == (ends, ends)
+    other = referee(ends_on_failure=ends)
+    stood(other, 18)
+    verdict = other.judge(step(18, 20.0, **hit))  # type: ignore[arg-type]
+    assert [failure.fault for failure in verdict.failures] == ["shared"] and not verdict.walked_into
+    assert (verdict.ended == "failure", verdict.reset is None) == (ends, ends)
+
+
+def test_beside_a_robot_that_turns_on_the_spot_the_one_who_moves_into_the_other_is_at_fault() -> (
+    None
+):
+    """A walker is at fault; the robot is if its corner swings into a standing person, or if it has
+    turned for less than 1 s."""
+    corner = {"contacts": [touch("c0")], "speed": 0.0}
+
+    def fault(mps: float, w_radps: float, ticks: int = 19) -> str | None:
+        one = referee()
+        who = people((20.3, 0.55), heading=-math.pi / 2, speed=mps)
+        stood(one, ticks, w_radps=w_radps)
+        verdict = one.judge(step(ticks, 20.0, w_radps=w_radps, who=who, **corner))  # type: ignore[arg-type]
+        (contact,) = verdict.failures or verdict.walked_into
+        assert bool(verdict.walked_into) == (contact.fault == "pedestrian_at_fault")
+        return contact.fault
+
+    assert fault(1.3, 0.6) == fault(1.3, -0.6) == "pedestrian_at_fault"
+    assert fault(0.0, 0.6) == "robot_at_fault"
+    assert fault(0.1, 0.6) == fault(1.3, 0.6, ticks=18) == "shared"
+    one = referee()
+    who = people((20.3, 0.55), heading=-math.pi / 2, speed=1.3)
+    stood(one, 19, w_radps=-0.6)
+    assert one.judge(step(19, 20.0, w_radps=-0.6, who=who, **corner)).walked_into  # type: ignore[arg-type]
+    away = step(20, 20.0, w_radps=-0.6, who=who, command=Command(0.0, -0.6), **corner)  # type: ignore[arg-type]
+    assert not one.judge(away).failures
+    into = step(
+        21, 20.0, w_radps=0.6, who=people((20.3, 0.55)), command=Command(0.0, 0.6), **corner
+    )  # type: ignore[arg-type]
+    (failure,) = one.judge(into).failures
+    assert failure.fault == "robot_at_fault"
 
 
 def test_a_robot_that_drives_on_through_who_has_walked_into_it_collides() -> None:

@@ -16,7 +16,6 @@ from scenarios.suites.drawing import (
     bare_scenario,
     passable,
     passing_width_m,
-    thinned,
 )
 from scenarios.suites.long_horizon import build_long_horizon
 from scenarios.suites.obstacles import prove_gap, with_obstacles
@@ -28,19 +27,16 @@ from tests.scenarios.test_scenarios import cross_map
 def test_a_drawn_crowd_fits_beside_the_robot() -> None:
     """The narrower the sidewalks, the fewer people walk; where nobody can pass the robot nobody
     walks."""
-    for width_m, persons, groups in ((3.2, 15, 0.3), (2.0, 5, 0.0), (1.5, 0, 0.0), (1.2, 0, 0.0)):
+    for width_m, density, groups in ((3.2, 22.0, 0.3), (2.0, 15.0, 0.0), (1.5, 0.0, 0.0)):
         street_map = cross_map(width_m)
         route = Polyline([(-30, 0), (30, 0)])
         city = City(seed=1)
         bare = bare_scenario(
             route, (), city, street_map, suite="s", seed=1, scenario_id="s", time_limit_s=60.0
         )
-        drawn = msgspec.structs.replace(bare, crowd=CrowdSpec(persons=50, groups=0.3))
+        drawn = msgspec.structs.replace(bare, crowd=CrowdSpec(density=22.0, groups=0.3))
         crowd = passable(drawn, street_map, COURIER).crowd
-        assert (crowd.persons, crowd.groups) == (persons, groups)
-        assert thinned(drawn, street_map).crowd.groups == 0.3, (
-            "the shipped places keep their groups"
-        )
+        assert crowd.groups == groups and crowd.density == pytest.approx(density, abs=1.0)
 
 
 def test_people_need_a_stripe_beside_the_robot() -> None:
@@ -62,7 +58,7 @@ def test_routes_on_maps_keep_to_wide_sidewalks() -> None:
         widths = [
             strip.width_m for strip in strips if strip is not None and strip.kind == "sidewalk"
         ]
-        assert min(widths) >= passing_width_m(COURIER) and scenario.crowd.persons > 0
+        assert min(widths) >= passing_width_m(COURIER) and (scenario.crowd.density or 0.0) > 0.0
 
 
 @pytest.mark.engine
@@ -87,4 +83,4 @@ def test_obstacles_on_maps_leave_room_for_a_person_beside_the_robot() -> None:
 def test_suites_drawn_on_narrow_maps_have_no_groups() -> None:
     """A long route on a net with sidewalks of 2 m gets a crowd without groups."""
     (scenario,) = suite_on_map("long-horizon", "sumo-fkk-in", 1, 1).scenarios
-    assert scenario.crowd.persons and scenario.crowd.groups == 0.0
+    assert scenario.crowd.density and scenario.crowd.groups == 0.0

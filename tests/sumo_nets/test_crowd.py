@@ -12,8 +12,8 @@ import shapely
 from shapely.ops import substring
 
 from cosim.core.errors import EngineError
-from cosim.core.geometry import Floats, Polyline, Pose
-from cosim.core.state import Age, PersonKind, RobotState, Street
+from cosim.core.geometry import Floats, Polyline, Pose, box_disk_gap
+from cosim.core.state import PERSON_RADIUS_M, Age, PersonKind, RobotState, Street
 from cosim.place.street_map import Corner, Lane, Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.events import Actor, EventReply
@@ -192,6 +192,36 @@ def test_people_keep_a_distance_from_a_standing_robot(place: Place) -> None:
             passed |= {name for name, gap in zip(street.people.ids, near, strict=True) if gap < 2.5}
     assert len(passed) >= 5
     assert nearest >= 0.5
+
+
+def test_people_walk_on_where_a_standing_robot_blocks_the_sidewalk(tmp_path: Path) -> None:
+    """On a sidewalk of 1.5 m they pass a robot in its middle, on either way, without touching
+    it."""
+    nodes, edges, net = (tmp_path / name for name in ("n.nod.xml", "e.edg.xml", "street.net.xml"))
+    nodes.write_text('<n><node id="a" x="0" y="0"/><node id="b" x="100" y="0"/></n>')
+    edge = '<edge id="{0}" from="{0[0]}" to="{0[1]}" numLanes="1" sidewalkWidth="1.5"/>'
+    edges.write_text("<e>" + "".join(edge.format(way) for way in ("ab", "ba")) + "</e>")
+    netconvert(["-n", str(nodes), "-e", str(edges), "--walkingareas"], net)
+    street_map = read_net(net)
+    pose = Polyline(street_map.strips["ab"].line[:, :2]).at(50.0)
+    ahead = np.array([math.cos(pose.heading_rad), math.sin(pose.heading_rad)])
+    came: dict[str, float] = {}
+    passed = {-1.0: 0, 1.0: 0}
+    least_m = math.inf
+    spec = CrowdSpec(persons=14, radius_m=60.0, vehicles=0)
+    with SumoCrowd(net, street_map, spec, 9, OPEN, pose.xy) as crowd:
+        for tick in range(500):
+            people = crowd.step(at(pose), reply(tick)).people
+            near = np.hypot(*(people.xy - pose.xy).T) < 4.0
+            gap_m = box_disk_gap(np.array([pose]), 0.35, 0.275, people.xy[None])[0]
+            least_m = min(least_m, float(gap_m.min(initial=math.inf)) - PERSON_RADIUS_M)
+            for i in np.flatnonzero(near).tolist():
+                side = float(np.sign((people.xy[i] - pose.xy) @ ahead))
+                first = came.setdefault(people.ids[i], side)
+                if side == -first:
+                    passed[first] += 1
+                    came[people.ids[i]] = side
+    assert min(passed.values()) >= 1 and least_m > 0.05
 
 
 def test_an_absent_robot_is_walked_through(place: Place) -> None:

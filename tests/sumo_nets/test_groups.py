@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -200,6 +201,9 @@ def test_a_suite_can_be_asked_for_groups() -> None:
         and asked.content_hash != shipped.content_hash
     )
     assert with_crowd(shipped, groups=None) is shipped
+    first = msgspec.structs.replace(shipped.scenarios[0], crowd=CrowdSpec(density=20.0))
+    dense = with_crowd(msgspec.structs.replace(shipped, scenarios=(first,)), persons=12)
+    assert (dense.scenarios[0].crowd.persons, dense.scenarios[0].crowd.density) == (12, None)
     with pytest.raises(SpecError, match=r"give groups of 0\.2 or more"):
         with_crowd(shipped, children=0.1)
 

@@ -7,11 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 
 from cosim.core.errors import MapError
 from cosim.place.street_map import Port
+from cosim.spec.scenario import City
+from sumo_nets.city.store import city_net
 from sumo_nets.net.net_file import read_net
 from sumo_nets.net.raw_file import net_content_hash
+from sumo_nets.net.snapshot import street_map_of
 
 NET = """<?xml version="1.0" encoding="UTF-8"?>
 <!-- generated on 2020-01-01 in /somewhere -->
@@ -231,3 +235,18 @@ def test_unreadable_files_are_refused(tmp_path: Path) -> None:
     cut.write_bytes(gzip.compress(NET.encode())[:200])
     with pytest.raises(MapError, match="broken gzip file"):
         read_net(cut)
+
+
+@pytest.mark.engine
+def test_no_carriageway_is_behind_a_sidewalk() -> None:
+    """Every part of a junction between its sidewalks and corners is reached by a lane; SUMO draws
+    outlines of T-junctions beyond the far sidewalk."""
+    street_map = street_map_of(city_net(City(seed=2, size_m=600.0)))
+    strips = [s.polygon for s in street_map.strips.values() if s.kind == "sidewalk"]
+    walks = shapely.STRtree([*strips, *(c.polygon for c in street_map.corners.values())])
+    lanes = shapely.union_all([lane.polygon for lane in street_map.lanes.values()])
+    for junction in street_map.junctions.values():
+        beside = walks.geometries[walks.query(junction.polygon, predicate="intersects")]
+        parts = shapely.get_parts(junction.polygon.difference(shapely.union_all(beside)))
+        wide = [p for p in parts if not shapely.is_empty(p.buffer(-0.02))]
+        assert all(part.distance(lanes) < 0.2 for part in wide), junction.id

@@ -12,8 +12,9 @@ The robot does all of the avoiding.
 people and stays on the free area (`DistanceField`).
 
 The robot limits its speed to stop before red signals, vehicles near a crossing, gestures and the
-crowd directly ahead. It stops for people who walk at it or across its path, because people walk
-around a standing robot. If a green phase is too short, it approaches slowly.
+crowd directly ahead. Before a crossing it waits where no car turns. It stops for people who walk at
+it or across its path, because people walk around a standing robot. If a green phase is too short,
+it approaches slowly.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from cosim.core.geometry import Floats, Polyline, wrap_angles
 from cosim.core.state import DIRECTED, PERSON_RADIUS_M, Command, People
 from cosim.episode.interfaces import Observation, Privileged
 from cosim.people.orca import best_velocity, half_plane
+from cosim.place.car_paths import STOP_SHORT_M
 from cosim.policies.privileged.people_prediction import (
     Yielding,
     bodies,
@@ -47,7 +49,6 @@ from cosim.policies.privileged.rollout import (
 from cosim.policies.privileged.route import (
     CAR_BRAKE_MPS2,
     SEEN_M,
-    STOP_SHORT_M,
     car_disks,
     crossing_limit,
 )
@@ -161,7 +162,7 @@ class PathState(NamedTuple):
 class Orca:
     """Oracle that predicts, yields, avoids groups and obeys gestures; privileged."""
 
-    manifest = Manifest("orca", version="4", rate_hz=5.0, camera=None, privileged=True)
+    manifest = Manifest("orca", version="5", rate_hz=5.0, camera=None, privileged=True)
 
     def __init__(self) -> None:
         self.reset("", 0)

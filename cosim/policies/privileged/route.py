@@ -16,6 +16,7 @@ from cosim.core.geometry import Floats, Polyline, wrap_angle
 from cosim.core.state import PERSON_RADIUS_M, Command
 from cosim.episode.control import clipped
 from cosim.episode.interfaces import Observation, Privileged
+from cosim.place.car_paths import STOP_SHORT_M
 from cosim.policies.privileged.rollout import BodyDisks
 from cosim.spec.manifest import Manifest
 from cosim.spec.robot import Robot
@@ -42,9 +43,6 @@ BRAKE_MPS2 = 1.2
 """Deceleration in m/s^2 before a crossing."""
 CAR_BRAKE_MPS2 = 3.0
 """Assumed deceleration of vehicles in m/s^2."""
-STOP_SHORT_M = 0.55
-"""Metres between the robot's front and a crossing at which it waits."""
-
 HELD_MPS = 0.1
 """Speed in m/s below which the robot has stopped at red, so creeping closer does not start it."""
 CAR_RADIUS_M = 1.1
@@ -70,7 +68,7 @@ SEEN_M = 11.0
 class Route:
     """Follows the reference route like a careful pedestrian; privileged."""
 
-    manifest = Manifest("route", version="1", rate_hz=10.0, privileged=True)
+    manifest = Manifest("route", version="2", rate_hz=10.0, privileged=True)
 
     def __init__(self) -> None:
         self.reset("", 0)
@@ -125,10 +123,14 @@ def bearing_to(known: Privileged, offset_m: float) -> float:
 
 
 def crossing_limit(known: Privileged, robot: Robot) -> float:
-    """Return the speed in m/s at which the robot can stop before a crossing it must not enter."""
+    """Return the speed in m/s at which the robot can stop before a crossing it must not enter.
+
+    It stops outside the paths of turning cars.
+    """
     half_m = robot.length_m / 2
     crosses_mps = robot.cruise_mps * 13 / 15
-    for crossing_id, enter_s_m, leave_s_m in known.crossings:
+    waits_m = known.waits_m or [enter - half_m - STOP_SHORT_M for _, enter, _ in known.crossings]
+    for (crossing_id, enter_s_m, leave_s_m), wait_s_m in zip(known.crossings, waits_m, strict=True):
         before_m = enter_s_m - known.route_s_m
         if not 0.0 < before_m < 8.0:
             continue
@@ -142,7 +144,7 @@ def crossing_limit(known: Privileged, robot: Robot) -> float:
             may_enter = not car_coming(known, enter_s_m, leave_s_m)
         waits = before_m > half_m or (signal is not None and known.robot.v_mps < HELD_MPS)
         if not may_enter and waits:
-            room_m = before_m - (half_m + STOP_SHORT_M)
+            room_m = wait_s_m - known.route_s_m
             return (
                 math.sqrt(2.0 * min(BRAKE_MPS2, robot.acceleration_mps2) * room_m)
                 if room_m > 0.05

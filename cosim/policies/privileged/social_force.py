@@ -60,7 +60,7 @@ _NEAR_M: Final = 8.0
 class SocialForce:
     """Social force model (Helbing and Molnar 1995) along the reference route; privileged."""
 
-    manifest = Manifest("social_force", version="2", rate_hz=10.0, camera=None, privileged=True)
+    manifest = Manifest("social_force", version="3", rate_hz=10.0, camera=None, privileged=True)
 
     def reset(self, episode_id: str, seed: int) -> None:
         """Do nothing: the policy has no state."""

@@ -132,7 +132,12 @@ def _drive(
         look = None if eye is None else partial(draw_empty_street, eye, surface, robot)
         told = replace(manifest, odometry="none" if manifest.odometry == "none" else "exact")
         observer = Observer(
-            scenario, told, 0, lambda now: privileged_state(scenario, free(), now), cameras, look
+            scenario,
+            told,
+            0,
+            lambda now: privileged_state(scenario, free(), (), now),
+            cameras,
+            look,
         )
         people = (
             _somebody(route, 0.5 * route.length_m + _PERSON_M) if scene == "person" else NO_PEOPLE
