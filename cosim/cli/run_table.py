@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 import pandas as pd
@@ -11,7 +11,15 @@ from rich.console import Console
 
 from cosim.cli import tables
 from cosim.core.units import milliseconds
-from cosim.results.discerned import DISCERNED, DISCERNED_IN_WORDS, has_decoys, is_decoy, pairs_of
+from cosim.results.discerned import (
+    DISCERNED,
+    DISCERNED_IN_WORDS,
+    has_decoys,
+    is_decoy,
+    pairs_of,
+    with_discerned,
+    without_decoys,
+)
 from cosim.results.log import holds_waypoints
 from cosim.results.metrics import COUNTERFACTUAL, SUCCESS_IN_WORDS
 from cosim.results.table import (
@@ -68,8 +76,7 @@ LETTERS = {
 UNITS = {"FC": "/100m", "C": "/100m", "OL": "/100m", "F": "/100m", "V": "m/s"}
 COUNTS = (("collisions", "collisions"), ("out_of_lane", "out of lane"), ("freezings", "freezings"))
 MEANS = (*SHOWN[:3], ("failures_per_100m_route", ""), *SHOWN[3:], ("spl", "SPL"))
-"""Metrics in the table of means of a run, with their letters; with decoys also `_D`."""
-_D = (DISCERNED, "D")
+"""Metrics in the table of means of a run, with their letters."""
 WITHOUT_PEOPLE = (
     ("spl", "SPL"),
     ("route_completion", "RC"),
@@ -111,9 +118,7 @@ def print_table(
     print_terms(out, table, folder)
     counted = "/".join(name for _, name in COUNTS)
     shown = [letter for letter in LETTERS if letter != "D" or has_decoys(table)]
-    out.print(
-        "; ".join(f"{letter} {LETTERS[letter]}" for letter in shown) + f"; counts: {counted}"
-    )
+    out.print("; ".join(f"{letter} {LETTERS[letter]}" for letter in shown) + f"; counts: {counted}")
     print_means(out, table)
     print_delays(out, table)
     print_statuses(out, table, scheduled)
@@ -123,15 +128,15 @@ def print_means(out: Console, table: pd.DataFrame) -> None:
     """Print the means over all episodes of a run."""
     if not len(table):
         return
-    means = _with_d(MEANS, table)
-    summary = summary_of(table, [name for name, _ in means]).iterrows()
+    means = with_discerned(dict(MEANS), has_decoys(table))
+    summary = summary_of(table, [*means]).iterrows()
     rows = [
         (f"{name} ({head})" if head else name, *_mean_cells(row))
-        for (name, head), (_, row) in zip(means, summary, strict=True)
+        for (name, head), (_, row) in zip(means.items(), summary, strict=True)
     ]
-    over = "over all events" if has_decoys(table) else "over all episodes"
+    over = "over all but decoys" if has_decoys(table) else "over all episodes"
     tables.show(out, [*tables.names(over), *tables.figures(*_MEAN_HEADS)], rows)
-    crashed = int((table["status"] == "crashed").sum())
+    crashed = int((without_decoys(table)["status"] == "crashed").sum())
     missing = f"; none, because {crashed} crashed" if crashed else ""
     out.print(
         f"rates are pooled: all failures on all metres{missing}; what crashed counts as the "
@@ -140,12 +145,6 @@ def print_means(out: Console, table: pd.DataFrame) -> None:
     if has_decoys(table):
         out.print(f"decoys count in D alone, over {pairs_of(table).in_words}", highlight=False)
     print_by_split(out, table)
-
-
-def _with_d(metrics: Sequence[tuple[str, str]], table: pd.DataFrame) -> list[tuple[str, str]]:
-    """Return metrics with their heads; `discerned` after the first if a table has decoys."""
-    first, *others = metrics
-    return [first, *[_D] * has_decoys(table), *others]
 
 
 def _mean_cells(row: pd.Series[float]) -> tuple[str, str, str]:
@@ -313,16 +312,16 @@ def print_by_split(out: Console, table: pd.DataFrame) -> None:
     """Print means of `val` and `test` separately if a run has both."""
     if "split" not in table or table["split"].nunique() < 2:
         return
-    shown = (("success", "SR"), ("route_completion", "RC"), ("failures_per_100m", "FC /100m"))
-    columns = _with_d(shown, table)
+    shown = {"success": "SR", "route_completion": "RC", "failures_per_100m": "FC /100m"}
+    columns = with_discerned(shown, has_decoys(table))
     rows = []
     for split, part in table.groupby("split", sort=False):
-        means = summary_of(part, [name for name, _ in columns])
+        means = summary_of(part, [*columns])
         cells = (
             f"{value_in_words(row['mean'])} "
             f"{value_in_words(row['low'])}..{value_in_words(row['high'])}"
             for _, row in means.iterrows()
         )
         rows.append((str(split), f"{means['n'].iloc[0]:.0f}", *cells))
-    heads = ("n", *(f"{head}, 95 %" for _, head in columns))
+    heads = ("n", *(f"{head}, 95 %" for head in columns.values()))
     tables.show(out, [*tables.names("split"), *tables.figures(*heads)], rows)

@@ -38,7 +38,12 @@ _SUITE_METRICS: Final = (
     "clearance_min_m",
     "time_to_goal_s",
 )
-_GROUP_METRICS: Final = {"success": "SR", DISCERNED: "D", "route_completion": "RC", "failures_per_100m": "FC"}
+_GROUP_METRICS: Final = {
+    "success": "SR",
+    DISCERNED: "D",
+    "route_completion": "RC",
+    "failures_per_100m": "FC",
+}
 _LATEX_ESCAPES: Final = {
     "\\": r"\textbackslash{}",
     "{": r"\{",
@@ -133,8 +138,9 @@ def how_to_read(result: RunComparison) -> str:
         f"not, but fewer than {MIN_CHANGED} scenarios changed (of a rate: of those with a "
         "failure). Differs: it does not, and there is no verdict. One interval in twenty misses "
         f"by chance alone: {shown} stand in these tables, {in_all} in a .csv, a row for every "
-        f"metric of every group. SR {SUCCESS_IN_WORDS}; {of_d}RC share of the route done; FC failures "
-        "per 100 m travelled; the scenarios of an event are those that have one on their way."
+        f"metric of every group. SR {SUCCESS_IN_WORDS}; {of_d}RC share of the route done; FC "
+        "failures per 100 m travelled; the scenarios of an event are those that have one on their "
+        "way."
     )
 
 

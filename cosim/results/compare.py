@@ -15,7 +15,13 @@ from scipy.special import ndtr, stdtrit
 
 from cosim.core.errors import RunError, UsageError
 from cosim.core.geometry import Floats
-from cosim.results.discerned import DISCERNED, has_decoys, pairs_of, without_decoys
+from cosim.results.discerned import (
+    DISCERNED,
+    has_decoys,
+    pairs_of,
+    with_discerned,
+    without_decoys,
+)
 from cosim.results.finished_run import WholeRun, read_whole_run
 from cosim.results.metrics import COUNTERFACTUAL, METRICS, POOLED, RATE_NEEDS_M
 from cosim.results.table import (
@@ -263,14 +269,13 @@ def differences_of(
 
 
 def _common_metrics(before: pd.DataFrame, after: pd.DataFrame) -> list[str]:
-    """Return the metrics of both tables; `discerned` after the first if both have decoys."""
-    common = [
-        name
+    """Return the metrics of both tables, `discerned` only if both have decoys."""
+    common = {
+        name: ""
         for name in (*METRICS, *COUNTERFACTUAL)
         if name in before.columns and name in after.columns
-    ]
-    decoys = has_decoys(before) and has_decoys(after)
-    return [*common[:1], *[DISCERNED] * decoys, *common[1:]]
+    }
+    return [*with_discerned(common, has_decoys(before) and has_decoys(after))]
 
 
 def _unit_and_direction(name: str) -> tuple[str, bool | None]:
@@ -339,7 +344,7 @@ def _check_suites(one: WholeRun, other: WholeRun) -> None:
         what = (
             "the same suite"
             if spec.suite != other_spec.suite
-            else "the same version of it (edited, robot, --crowd?)"
+            else "the same version of it (former suite, edited, robot, --crowd?)"
         )
         raise RunError(
             f"{other.path} is of suite '{other_spec.suite}' {other_spec.suite_version} "

@@ -6,6 +6,7 @@ only if both members were run. All other means of a run are over scenarios witho
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -69,6 +70,20 @@ def has_decoys(table: pd.DataFrame) -> bool:
 def without_decoys(table: pd.DataFrame) -> pd.DataFrame:
     """Return the rows that are no decoys."""
     return table[~is_decoy(table)]
+
+
+def with_discerned(heads: Mapping[str, str], decoys: bool) -> dict[str, str]:
+    """Return metrics with their heads; `discerned` after success if there are decoys.
+
+    >>> list(with_discerned({"success": "SR", "spl": "SPL"}, decoys=True))
+    ['success', 'discerned', 'spl']
+    """
+    found: dict[str, str] = {}
+    for metric, head in heads.items():
+        found[metric] = head
+        if metric == "success" and decoys:
+            found[DISCERNED] = "D"
+    return found
 
 
 def pairs_of(table: pd.DataFrame) -> Pairs:

@@ -95,8 +95,6 @@ class PassingWindow:
                 self._passed[person] = True
                 continue
             ahead_m = self._route.project(*people[person].tolist(), near)[0] - route_s_m
-            self._passed[person] = (
-                ahead_m > AHEAD_M if self._from_behind else ahead_m <= -PAST_M
-            )
+            self._passed[person] = ahead_m > AHEAD_M if self._from_behind else ahead_m <= -PAST_M
         if all(self._passed):
             self.end = tick + 1

@@ -11,7 +11,13 @@ import pandas as pd
 
 from cosim.core.errors import listed
 from cosim.core.geometry import Floats
-from cosim.results.discerned import DISCERNED, has_decoys, pairs_of, without_decoys
+from cosim.results.discerned import (
+    DISCERNED,
+    has_decoys,
+    pairs_of,
+    with_discerned,
+    without_decoys,
+)
 from cosim.results.metrics import COUNTERFACTUAL, METRICS, POOLED, RATE_NEEDS_M, WORST
 from cosim.results.record import RECORD_FILE, Record
 
@@ -147,9 +153,8 @@ def summary_of(table: pd.DataFrame, names: Sequence[str] = ()) -> pd.DataFrame:
 
 
 def metrics_of(table: pd.DataFrame) -> tuple[str, ...]:
-    """Return the metrics that a table has: after success, `discerned` if it has decoys."""
-    first, *others = METRICS
-    return (first, *[DISCERNED] * has_decoys(table), *others)
+    """Return the metrics of a table, `discerned` only if it has decoys."""
+    return tuple(with_discerned(dict.fromkeys(METRICS, ""), has_decoys(table)))
 
 
 def _summary(table: pd.DataFrame, name: str) -> tuple[float, float, float, int]:
