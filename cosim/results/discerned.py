@@ -32,8 +32,7 @@ class Pairs(NamedTuple):
     @property
     def values(self) -> Floats:
         """Return the values of the pairs without invalid members."""
-        values: Floats = self.solved.dropna().to_numpy(dtype=np.float64)
-        return values
+        return np.asarray(self.solved.dropna(), dtype=float)
 
     @property
     def invalid(self) -> int:
