@@ -10,7 +10,7 @@ import msgspec
 import pandas as pd
 import pytest
 
-from cosim.core.errors import RunError
+from cosim.core.errors import RunError, SpecError
 from cosim.core.progress import ignore
 from cosim.report.compared import as_latex, as_markdown
 from cosim.report.page.page import Maps, colours_of, render_page
@@ -23,7 +23,8 @@ from cosim.results.merge import merge_runs
 from cosim.results.run_folder import read_records
 from cosim.results.table import summary_of, table_of
 from cosim.spec.events import Event
-from cosim.spec.scenario import Scenario
+from cosim.spec.scenario import Scenario, Suite, read_suite, write_suite
+from scenarios.events import EVENT_KINDS
 from tests.conftest import Cosim
 from tests.support.driven_runs import HIT, run_of, short_way, with_decoys
 
@@ -190,12 +191,8 @@ def test_runs_of_the_former_suite_are_refused(runs: Path, tmp_path: Path) -> Non
 
 
 def test_a_decoy_of_nothing_is_refused_in_a_whole_suite_alone(tmp_path: Path) -> None:
-    """A part of a suite, as in a run folder, may lack the event; a suite's file may not, and no
-    decoy has a decoy."""
-    from cosim.core.errors import SpecError
-    from cosim.spec.scenario import Suite, read_suite, write_suite
-    from scenarios.events import EVENT_KINDS
-
+    """A part of a suite, as in a run folder, may lack the event; a suite's file may not. No decoy
+    has a decoy, and one that ends at a stop has no go-on rule."""
     part = Suite(name="reactive", version="1", scenarios=PAIRS[1:])
     write_suite(part, tmp_path / "s.json")
     assert len(read_suite(tmp_path / "s.json").scenarios) == 19
@@ -206,3 +203,5 @@ def test_a_decoy_of_nothing_is_refused_in_a_whole_suite_alone(tmp_path: Path) ->
     again = msgspec.structs.replace(PAIRS[0], id="x", decoy_of=PAIRS[1].id)
     with pytest.raises(SpecError, match="scenario 'x': decoy_of names another decoy"):
         Suite(name="reactive", version="1", scenarios=(*PAIRS, again))
+    with pytest.raises(SpecError, match="go_on_mps needs an event to pass"):
+        msgspec.structs.replace(PAIRS[1], ends_at="stop")
