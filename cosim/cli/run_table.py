@@ -11,6 +11,15 @@ from rich.console import Console
 
 from cosim.cli import tables
 from cosim.core.units import milliseconds
+from cosim.results.discerned import (
+    DISCERNED,
+    DISCERNED_IN_WORDS,
+    has_decoys,
+    is_decoy,
+    pairs_of,
+    with_discerned,
+    without_decoys,
+)
 from cosim.results.intervals import MIN_N, Estimate
 from cosim.results.log import holds_waypoints
 from cosim.results.metrics import (
@@ -62,6 +71,7 @@ SHOWN = (
 )
 LETTERS = {
     "SR": SUCCESS_IN_WORDS,
+    "D": DISCERNED_IN_WORDS,
     "RC": "share of the route done",
     "FC": "failures per 100 m travelled",
     "C": "collisions per 100 m travelled",
@@ -69,7 +79,7 @@ LETTERS = {
     "F": "freezings per 100 m travelled",
     "V": "mean speed",
 }
-"""Meaning of each letter, the same in every table."""
+"""Meaning of each letter, the same in every table; `D` only where there are decoys."""
 UNITS = {"FC": "/100m", "C": "/100m", "OL": "/100m", "F": "/100m", "V": "m/s"}
 COUNTS = (("collisions", "collisions"), ("out_of_lane", "out of lane"), ("freezings", "freezings"))
 MEANS = (*SHOWN[:3], ("failures_per_100m_route", ""), *SHOWN[3:], ("spl", "SPL"))
@@ -114,10 +124,8 @@ def print_table(
     tables.show(out, columns, rows)
     print_terms(out, table, folder)
     counted = "/".join(name for _, name in COUNTS)
-    out.print(
-        "; ".join(f"{letter} {meaning}" for letter, meaning in LETTERS.items())
-        + f"; counts: {counted}"
-    )
+    shown = [letter for letter in LETTERS if letter != "D" or has_decoys(table)]
+    out.print("; ".join(f"{letter} {LETTERS[letter]}" for letter in shown) + f"; counts: {counted}")
     print_means(out, table)
     print_delays(out, table)
     print_statuses(out, table, scheduled)
@@ -127,18 +135,22 @@ def print_means(out: Console, table: pd.DataFrame) -> None:
     """Print the means over all episodes of a run."""
     if not len(table):
         return
+    means = with_discerned(dict(MEANS), has_decoys(table))
     rows = [
         (f"{name} ({head})" if head else name, *_mean_cells(estimate_of(table, name)))
-        for name, head in MEANS
+        for name, head in means.items()
     ]
-    tables.show(out, [*tables.names("over all episodes"), *tables.figures(*_MEAN_HEADS)], rows)
-    crashed = crashed_in(table)
+    over = "over all but decoys" if has_decoys(table) else "over all episodes"
+    tables.show(out, [*tables.names(over), *tables.figures(*_MEAN_HEADS)], rows)
+    crashed = crashed_in(without_decoys(table))
     failed = f"; no rates: {crashed} crashed, which counts as SR, RC, SPL and V of 0"
     out.print(
         f"rates are pooled: all failures on all metres, of an episode at most "
         f"{RATED_PER_PROGRESS:g} x its progress + {RATED_EXTRA_M:g} m{failed if crashed else ''}; "
         f"below {MIN_N} episodes only counts"
     )
+    if has_decoys(table):
+        out.print(f"decoys count in D alone, over {pairs_of(table).in_words}", highlight=False)
     print_by_split(out, table)
 
 
@@ -152,7 +164,8 @@ def print_statuses(out: Console, table: pd.DataFrame, scheduled: int) -> None:
     parts = {status: table[table["status"] == status] for status in ("done", "crashed", "invalid")}
     scored = len(parts["done"]) + len(parts["crashed"])
     counts = f"scheduled {scheduled}, scored {scored}, of these crashed {len(parts['crashed'])}"
-    out.print(f"{counts}; invalid {len(parts['invalid'])}")
+    decoys = f"; of all rows {is_decoy(table).sum()} are decoys" if has_decoys(table) else ""
+    out.print(f"{counts}; invalid {len(parts['invalid'])}{decoys}")
     for _, row in pd.concat([parts["crashed"], parts["invalid"]]).iterrows():
         out.print(
             f"{row['status']} {row['scenario']}: {row['reason']}",
@@ -272,17 +285,21 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
         return
     people = bool(table["pedestrian_distance_min_m"].notna().any())
     columns = WITH_PEOPLE if people else WITHOUT_PEOPLE
-    crashed = ["crash"] if crashed_in(table) else []
-    heads = ("n", *crashed, "SR", "95 % of SR", *(head for _, head in columns), "in-\nvalid")
+    d_heads = ("D", "95 % of D", "pairs") if has_decoys(table) else ()
+    crashed = ["crash"] if crashed_in(without_decoys(table)) else []
+    shown = ("n", *crashed, "SR", "95 % of SR", *d_heads)
+    heads = (*shown, *(head for _, head in columns), "in-\nvalid")
     rows = []
     for kind in named:
         part = table[table["scenario"].map(kinds) == kind]
         success, *rest = (
             estimate_of(part, name) for name in ("success", *(name for name, _ in columns))
         )
-        counts = f"{success.n}", *([f"{crashed_in(part)}"] if crashed else [])
-        shares = (success.in_words, success.interval_in_words(".."), *(e.in_words for e in rest))
-        rows.append((kind, *counts, *shares, f"{(part['status'] == 'invalid').sum()}"))
+        counts = f"{success.n}", *([f"{crashed_in(without_decoys(part))}"] if crashed else [])
+        of_d = _d_cells(part) if d_heads else ()
+        shares = (success.in_words, success.interval_in_words(".."), *of_d)
+        means = (estimate.in_words for estimate in rest)
+        rows.append((kind, *counts, *shares, *means, f"{(part['status'] == 'invalid').sum()}"))
     tables.show(out, [*tables.names(""), *tables.figures(*heads)], rows)
     unknown = "; - unknown, because an episode crashed" if crashed else ""
     out.print(
@@ -295,18 +312,26 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
     )
 
 
+def _d_cells(part: pd.DataFrame) -> tuple[str, str, str]:
+    """Return D, its interval and the number of pairs, as text."""
+    estimate = estimate_of(part, DISCERNED)
+    return estimate.in_words, estimate.interval_in_words(".."), f"{estimate.n}"
+
+
 def print_by_split(out: Console, table: pd.DataFrame) -> None:
     """Print means of `val` and `test` separately if a run has both."""
     if "split" not in table or table["split"].nunique() < 2:
         return
-    names = ("success", "route_completion", "failures_per_100m")
+    shown = {"success": "SR", "route_completion": "RC", "failures_per_100m": "FC /100m"}
+    columns = with_discerned(shown, has_decoys(table))
     rows = []
     for split, part in table.groupby("split", sort=False):
-        means = [estimate_of(part, name) for name in names]
+        means = [estimate_of(part, name) for name in columns]
         cells = (
             f"{one.in_words} {one.interval_in_words('..')}" if one.has_interval else one.in_words
             for one in means
         )
-        rows.append((str(split), f"{means[0].n}", f"{crashed_in(part)}", *cells))
-    heads = ("n", "crashed", "SR, 95 %", "RC, 95 %", "FC /100m, 95 %")
+        crashed = f"{crashed_in(without_decoys(part))}"
+        rows.append((str(split), f"{means[0].n}", crashed, *cells))
+    heads = ("n", "crashed", *(f"{head}, 95 %" for head in columns.values()))
     tables.show(out, [*tables.names("split"), *tables.figures(*heads)], rows)

@@ -15,6 +15,13 @@ from scipy.special import ndtr, stdtrit
 
 from cosim.core.errors import RunError, UsageError
 from cosim.core.geometry import Floats
+from cosim.results.discerned import (
+    DISCERNED,
+    has_decoys,
+    pairs_of,
+    with_discerned,
+    without_decoys,
+)
 from cosim.results.finished_run import WholeRun, read_whole_run
 from cosim.results.intervals import BOOTSTRAP, CONFIDENCE, MIN_N, counts_in_words
 from cosim.results.metrics import (
@@ -251,14 +258,12 @@ def differences_of(
 
     names: metrics; all that both runs have if empty
     judged: False to report "differs" instead of better or worse
+
+    Decoys count in `discerned` alone, which is paired by event and decoy.
     """
     table_before, table_after = (run.table.set_index("scenario") for run in (before, after))
     ids = [name for name in table_before.index if name in table_after.index]
-    names = names or [
-        name
-        for name in (*METRICS, *COUNTERFACTUAL)
-        if name in table_before.columns and name in table_after.columns
-    ]
+    names = names or _common_metrics(table_before, table_after)
     rows = []
     for (by, group), members in groups.items():
         inside = [name for name in ids if name in members]
@@ -267,7 +272,7 @@ def differences_of(
         pair = table_before.loc[inside], table_after.loc[inside]
         for name in names:
             paired = _difference(name, *pair)
-            unit, better = METRICS[name][:2] if name in METRICS else (COUNTERFACTUAL[name], None)
+            unit, better = _unit_and_direction(name)
             verdict = paired.verdict(better if judged else None)
             key = (before.label, after.label, by, group, name, unit)
             means = (paired.before, paired.after, *_counts(name, *pair), paired.difference)
@@ -276,17 +281,47 @@ def differences_of(
     return pd.DataFrame(rows, columns=list(DIFFERENCES))
 
 
+def _common_metrics(before: pd.DataFrame, after: pd.DataFrame) -> list[str]:
+    """Return the metrics of both tables, `discerned` only if both have decoys."""
+    common = {
+        name: ""
+        for name in (*METRICS, *COUNTERFACTUAL)
+        if name in before.columns and name in after.columns
+    }
+    return [*with_discerned(common, has_decoys(before) and has_decoys(after))]
+
+
+def _unit_and_direction(name: str) -> tuple[str, bool | None]:
+    """Return the unit of a metric, and whether higher is better; None if neither is."""
+    if name == DISCERNED:
+        return "", True
+    return METRICS[name][:2] if name in METRICS else (COUNTERFACTUAL[name], None)
+
+
 def _difference(name: str, before: pd.DataFrame, after: pd.DataFrame) -> PairedDifference:
     """Return the paired difference of a metric, without pairs if a crash leaves it unknown."""
-    if name in UNKNOWN_WITH_CRASH and (crashed_in(before) or crashed_in(after)):
+    if name in UNKNOWN_WITH_CRASH and any(
+        crashed_in(without_decoys(table)) for table in (before, after)
+    ):
         return _NO_PAIRS
     if name not in POOLED:
-        return difference_of_means(numeric_column(before, name), numeric_column(after, name))
-    counted, metres = POOLED[name]
-    one, other = (
-        (numeric_column(table, counted), numeric_column(table, metres)) for table in (before, after)
-    )
-    return difference_of_rates(one, other)
+        return difference_of_means(*_paired_columns(name, before, after))
+    counted, metres, counted_after, metres_after = _paired_columns(name, before, after)
+    return difference_of_rates((counted, metres), (counted_after, metres_after))
+
+
+def _paired_columns(name: str, before: pd.DataFrame, after: pd.DataFrame) -> list[Floats]:
+    """Return the values (N,) of a metric in both tables; of a rate counts and metres of each.
+
+    N counts scenarios without decoys, or for `discerned` pairs of an event and its decoy.
+    """
+    tables = before, after
+    if name == DISCERNED:
+        solved = [pairs_of(table.reset_index()).solved for table in tables]
+        both = solved[0].index.intersection(solved[1].index)
+        return [np.asarray(pairs[both], dtype=float) for pairs in solved]
+    columns = POOLED.get(name, (name,))
+    return [numeric_column(without_decoys(table), column) for table in tables for column in columns]
 
 
 def _counts(name: str, before: pd.DataFrame, after: pd.DataFrame) -> tuple[str, str]:
@@ -294,13 +329,11 @@ def _counts(name: str, before: pd.DataFrame, after: pd.DataFrame) -> tuple[str, 
 
     "" for other means, and without such a pair.
     """
-    columns = POOLED.get(name, (name,))
-    values = np.array(
-        [numeric_column(table, column) for table in (before, after) for column in columns]
-    )
+    values = np.array(_paired_columns(name, before, after))
     values = values[:, ~np.isnan(values).any(axis=0)]
     n = values.shape[1]
-    if not n or not (name in POOLED or (name in METRICS and METRICS[name].share)):
+    is_share = name == DISCERNED or (name in METRICS and METRICS[name].share)
+    if not n or not (name in POOLED or is_share):
         return "", ""
     sums = values.sum(axis=1).reshape(2, -1)
     one, other = (counts_in_words(counted, n, *metres) for counted, *metres in sums.tolist())
@@ -348,7 +381,7 @@ def _check_suites(one: WholeRun, other: WholeRun) -> None:
         what = (
             "the same suite"
             if spec.suite != other_spec.suite
-            else "the same version of it (edited, robot, --crowd?)"
+            else "the same version of it (former suite, edited, robot, --crowd?)"
         )
         raise RunError(
             f"{other.path} is of suite '{other_spec.suite}' {other_spec.suite_version} "
@@ -385,6 +418,9 @@ def _notes(runs: Sequence[WholeRun], compared: Sequence[ComparedRun]) -> Iterato
             (record.nonstandard for record in run.records.values() if record.nonstandard), ""
         ):
             yield f"{other.label} is nonstandard: {nonstandard}"
+        pairs = pairs_of(other.table)
+        if pairs.invalid or pairs.single:
+            yield f"{other.label}: D is over {pairs.in_words}"
         if words := injections_in_words(other.table):
             yield f"{other.label}: {words}"
         crashed = sum(record.status == "crashed" for record in run.records.values())

@@ -11,6 +11,13 @@ import pandas as pd
 
 from cosim.core.errors import listed
 from cosim.core.geometry import Floats
+from cosim.results.discerned import (
+    DISCERNED,
+    has_decoys,
+    pairs_of,
+    with_discerned,
+    without_decoys,
+)
 from cosim.results.intervals import (
     NO_ESTIMATE,
     Estimate,
@@ -39,6 +46,7 @@ _ORDER = (
     "seed",
     "split",
     "structure",
+    "decoy_of",
     "crowd_added",
     "run_seed",
     "episode",
@@ -137,10 +145,19 @@ def policy_in_words(name: str, privileged: bool) -> str:
     return f"{name} ({'oracle, ' * (name == ORACLE)}privileged)" if privileged else name
 
 
-def summary_of(table: pd.DataFrame, names: Sequence[str] = tuple(METRICS)) -> pd.DataFrame:
-    """Summarize each metric over episodes: one row (`Estimate`) per metric, the index."""
+def summary_of(table: pd.DataFrame, names: Sequence[str] = ()) -> pd.DataFrame:
+    """Summarize each metric over episodes: one row (`Estimate`) per metric, the index.
+
+    names: metrics; `metrics_of` the table if empty
+    """
+    names = names or metrics_of(table)
     rows = [estimate_of(table, name) for name in names]
     return pd.DataFrame(rows, index=pd.Index(names, name="metric"), columns=list(Estimate._fields))
+
+
+def metrics_of(table: pd.DataFrame) -> tuple[str, ...]:
+    """Return the metrics of a table, `discerned` only if it has decoys."""
+    return tuple(with_discerned(dict.fromkeys(METRICS, ""), has_decoys(table)))
 
 
 def estimate_of(table: pd.DataFrame, name: str) -> Estimate:
@@ -148,7 +165,11 @@ def estimate_of(table: pd.DataFrame, name: str) -> Estimate:
 
     Rates are pooled (`cosim.results.metrics.POOLED`): all counts divided by all metres. A metric
     without values has n = 0, and so has one that a crash leaves unknown (`UNKNOWN_WITH_CRASH`).
+    Decoys count in `discerned` alone, which is over pairs (`cosim.results.discerned`).
     """
+    if name == DISCERNED:
+        return estimate_of_share(pairs_of(table).values)
+    table = without_decoys(table)
     if name in UNKNOWN_WITH_CRASH and crashed_in(table):
         return NO_ESTIMATE
     if name not in POOLED:
