@@ -43,7 +43,7 @@ def _ends(event: Event, state: EventState, query: EventQuery) -> bool:
 
 FRONTAL: Final = EventKind(
     name="frontal",
-    layout=SidewalkLayout((18.0, 20.0), (21.0, 22.0)),
+    layout=SidewalkLayout((18.0, 20.0), (21.0, 22.0), after_m=-4.0),
     trigger_m=20.0,
     begin=_begin,
     step=_step,

@@ -121,7 +121,7 @@ def _ends(event: Event, state: EventState, query: EventQuery) -> bool:
 
 OVERTAKING: Final = EventKind(
     name="overtaking",
-    layout=SidewalkLayout((18.0, 20.0), (1.5, 3.0), half_width_m=1.4),
+    layout=SidewalkLayout((18.0, 20.0), (1.5, 3.0), half_width_m=1.4, after_m=8.0),
     trigger_m=-1.0,
     begin=_begin,
     step=_step,
