@@ -392,6 +392,10 @@ def event_faults(scenario: Scenario, kinds: EventKinds, place: str = "$") -> Ite
                 f"{event.called}people of '{event.kind}' must be {allowed}, not "
                 f"{shown(event.people)} - at `{at}`"
             )
+        if event.decoy and kinds[event.kind].decoy is None:
+            yield f"{event.called}'{event.kind}' has no behaviour of decoys - at `{at}.decoy`"
+        if event.free_side and not kinds[event.kind].has_free_side:
+            yield f"{event.called}free_side of '{event.kind}' must be 0 - at `{at}.free_side`"
         if (kinds[event.kind].layout is None) != (event.half_length_m > 0.0):
             crossings = " and ".join(
                 f"'{kind.name}'" for kind in kinds.values() if kind.layout is None
