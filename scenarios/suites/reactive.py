@@ -27,7 +27,7 @@ from cosim.spec.obstacle import Obstacle
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import CrowdSpec, Place, RouteCrossing, Scenario
 from scenarios.suites.drawing import bare_scenario, first_that_fits, people_of, wider_m
-from scenarios.suites.gates import Gate, drawn_gate
+from scenarios.suites.gate_fences import Gate, drawn_gate
 from scenarios.suites.lanes import with_lanes_blocked
 from scenarios.suites.long_horizon import route_crossings
 
