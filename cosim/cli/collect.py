@@ -45,6 +45,7 @@ _OF_COLLECT = Fields(
         "event",
         "scenario",
         "split",
+        "no_decoys",
         "map",
         "policy",
         "robot",
@@ -61,6 +62,7 @@ _OF_COLLECT = Fields(
         "event": _EVENT_HELP,
         "scenario": "Only this scenario; may be repeated.",
         "split": "Only scenarios of val, or of test.",
+        "no_decoys": "Leave out the decoys of a suite.",
         "map": "Draw on this place: a map, a folder, a net.",
         "policy": "The expert: a baseline, or your own as my.py:Class.",
         "goal": "Goal protocol: none, route_point, final_point, instruction.",
@@ -266,7 +268,9 @@ def _source(config: RunConfig, demo: DemoConfig) -> Suite | Fresh:
             )
     split = split_called(config.split)
     whole = with_robot(load_suite(config.suite), config.robot)
-    chosen = select_scenarios(whole, config.scenario, None, config.event, split)
+    chosen = select_scenarios(
+        whole, config.scenario, None, config.event, split, decoys=not config.no_decoys
+    )
     return msgspec.structs.replace(whole, scenarios=chosen)
 
 

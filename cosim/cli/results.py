@@ -275,8 +275,9 @@ def print_episode(out: Console, record: Record) -> None:
     from cosim.core.clock import Clock
     from cosim.results.metrics import COUNTERFACTUAL, METRICS
 
+    decoy_of = f" (decoy of {record.scenario.decoy_of})" if record.scenario.decoy_of else ""
     out.print(
-        f"{record.scenario.id}: {record.status} {record.ended or ''} {record.reason}",
+        f"{record.scenario.id}{decoy_of}: {record.status} {record.ended or ''} {record.reason}",
         soft_wrap=True,
         markup=False,
     )
@@ -314,7 +315,14 @@ def print_episode(out: Console, record: Record) -> None:
             if event.triggered_at_s is None
             else f"triggered at {event.triggered_at_s:.2f} s"
         )
-        out.print(f"  event {event.id} {event.kind}: {at}")
+        passing = (
+            ""
+            if event.passed_at_s is None
+            else f", passed at {event.passed_at_s:.2f} s: on average {event.passing_mps:.2f} m/s, "
+            f"longest stop {event.stopped_s:.2f} s"
+        )
+        broken = ", rule broken" if event.rule_met is False else ""
+        out.print(f"  event {event.id} {event.kind}: {at}{passing}{broken}")
     units = {name: metric.unit for name, metric in METRICS.items()}
     units |= {name: unit for name, unit in COUNTERFACTUAL.items() if name in record.measures}
     rows = [(name, value_in_words(record.measures.get(name)), unit) for name, unit in units.items()]

@@ -11,6 +11,15 @@ from rich.console import Console
 
 from cosim.cli import tables
 from cosim.core.units import milliseconds
+from cosim.results.discerned import (
+    DISCERNED,
+    DISCERNED_IN_WORDS,
+    has_decoys,
+    is_decoy,
+    pairs_of,
+    with_discerned,
+    without_decoys,
+)
 from cosim.results.log import holds_waypoints
 from cosim.results.metrics import COUNTERFACTUAL, SUCCESS_IN_WORDS
 from cosim.results.table import (
@@ -55,6 +64,7 @@ SHOWN = (
 )
 LETTERS = {
     "SR": SUCCESS_IN_WORDS,
+    "D": DISCERNED_IN_WORDS,
     "RC": "share of the route done",
     "FC": "failures per 100 m travelled",
     "C": "collisions per 100 m travelled",
@@ -62,7 +72,7 @@ LETTERS = {
     "F": "freezings per 100 m travelled",
     "V": "mean speed",
 }
-"""Meaning of each letter, the same in every table."""
+"""Meaning of each letter, the same in every table; `D` only where there are decoys."""
 UNITS = {"FC": "/100m", "C": "/100m", "OL": "/100m", "F": "/100m", "V": "m/s"}
 COUNTS = (("collisions", "collisions"), ("out_of_lane", "out of lane"), ("freezings", "freezings"))
 MEANS = (*SHOWN[:3], ("failures_per_100m_route", ""), *SHOWN[3:], ("spl", "SPL"))
@@ -107,10 +117,8 @@ def print_table(
     tables.show(out, columns, rows)
     print_terms(out, table, folder)
     counted = "/".join(name for _, name in COUNTS)
-    out.print(
-        "; ".join(f"{letter} {meaning}" for letter, meaning in LETTERS.items())
-        + f"; counts: {counted}"
-    )
+    shown = [letter for letter in LETTERS if letter != "D" or has_decoys(table)]
+    out.print("; ".join(f"{letter} {LETTERS[letter]}" for letter in shown) + f"; counts: {counted}")
     print_means(out, table)
     print_delays(out, table)
     print_statuses(out, table, scheduled)
@@ -120,18 +128,22 @@ def print_means(out: Console, table: pd.DataFrame) -> None:
     """Print the means over all episodes of a run."""
     if not len(table):
         return
-    summary = summary_of(table, [name for name, _ in MEANS]).iterrows()
+    means = with_discerned(dict(MEANS), has_decoys(table))
+    summary = summary_of(table, [*means]).iterrows()
     rows = [
         (f"{name} ({head})" if head else name, *_mean_cells(row))
-        for (name, head), (_, row) in zip(MEANS, summary, strict=True)
+        for (name, head), (_, row) in zip(means.items(), summary, strict=True)
     ]
-    tables.show(out, [*tables.names("over all episodes"), *tables.figures(*_MEAN_HEADS)], rows)
-    crashed = int((table["status"] == "crashed").sum())
+    over = "over all but decoys" if has_decoys(table) else "over all episodes"
+    tables.show(out, [*tables.names(over), *tables.figures(*_MEAN_HEADS)], rows)
+    crashed = int((without_decoys(table)["status"] == "crashed").sum())
     missing = f"; none, because {crashed} crashed" if crashed else ""
     out.print(
         f"rates are pooled: all failures on all metres{missing}; what crashed counts as the "
         f"worst elsewhere"
     )
+    if has_decoys(table):
+        out.print(f"decoys count in D alone, over {pairs_of(table).in_words}", highlight=False)
     print_by_split(out, table)
 
 
@@ -146,7 +158,8 @@ def print_statuses(out: Console, table: pd.DataFrame, scheduled: int) -> None:
     parts = {status: table[table["status"] == status] for status in ("done", "crashed", "invalid")}
     scored = len(parts["done"]) + len(parts["crashed"])
     counts = f"scheduled {scheduled}, scored {scored}, of these crashed {len(parts['crashed'])}"
-    out.print(f"{counts}; invalid {len(parts['invalid'])}")
+    decoys = f"; of all rows {is_decoy(table).sum()} are decoys" if has_decoys(table) else ""
+    out.print(f"{counts}; invalid {len(parts['invalid'])}{decoys}")
     for _, row in pd.concat([parts["crashed"], parts["invalid"]]).iterrows():
         out.print(
             f"{row['status']} {row['scenario']}: {row['reason']}",
@@ -266,7 +279,8 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
         return
     people = bool(table["pedestrian_distance_min_m"].notna().any())
     columns = WITH_PEOPLE if people else WITHOUT_PEOPLE
-    heads = ("n", "SR", "95 % of SR", *(head for _, head in columns), "in-\nvalid")
+    d_heads = ("D", "95 % of D", "pairs") if has_decoys(table) else ()
+    heads = ("n", "SR", "95 % of SR", *d_heads, *(head for _, head in columns), "in-\nvalid")
     rows = []
     for kind in named:
         part = table[table["scenario"].map(kinds) == kind]
@@ -274,8 +288,9 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
         low, high, scored = (float(means[column].iloc[0]) for column in ("low", "high", "n"))
         interval = f"{low:.2f}..{high:.2f}" if scored else "-"
         success, *rest = (value_in_words(mean) for mean in means["mean"])
+        of_d = _d_cells(part) if d_heads else ()
         invalid = str((part["status"] == "invalid").sum())
-        rows.append((kind, f"{scored:.0f}", success, interval, *rest, invalid))
+        rows.append((kind, f"{scored:.0f}", success, interval, *of_d, *rest, invalid))
     tables.show(out, [*tables.names(""), *tables.figures(*heads)], rows)
     out.print(
         "n episodes that are scored; hit a person, hit else, left lane, broke rule: share of "
@@ -287,19 +302,26 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
     )
 
 
+def _d_cells(part: pd.DataFrame) -> tuple[str, str, str]:
+    """Return D, its interval and the number of pairs, as text."""
+    mean, low, high, n = summary_of(part, [DISCERNED]).iloc[0]
+    return value_in_words(mean), f"{low:.2f}..{high:.2f}" if n else "-", f"{n:.0f}"
+
+
 def print_by_split(out: Console, table: pd.DataFrame) -> None:
     """Print means of `val` and `test` separately if a run has both."""
     if "split" not in table or table["split"].nunique() < 2:
         return
-    names = ("success", "route_completion", "failures_per_100m")
+    shown = {"success": "SR", "route_completion": "RC", "failures_per_100m": "FC /100m"}
+    columns = with_discerned(shown, has_decoys(table))
     rows = []
     for split, part in table.groupby("split", sort=False):
-        means = summary_of(part, names)
+        means = summary_of(part, [*columns])
         cells = (
             f"{value_in_words(row['mean'])} "
             f"{value_in_words(row['low'])}..{value_in_words(row['high'])}"
             for _, row in means.iterrows()
         )
         rows.append((str(split), f"{means['n'].iloc[0]:.0f}", *cells))
-    heads = ("n", "SR, 95 %", "RC, 95 %", "FC /100m, 95 %")
+    heads = ("n", *(f"{head}, 95 %" for head in columns.values()))
     tables.show(out, [*tables.names("split"), *tables.figures(*heads)], rows)

@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple
 import pandas as pd
 
 from cosim.results.compare import MIN_CHANGED, ComparedRun, RunComparison
+from cosim.results.discerned import DISCERNED, DISCERNED_IN_WORDS
 from cosim.results.metrics import SUCCESS_IN_WORDS
 from cosim.results.table import BOOTSTRAP
 
@@ -18,6 +19,7 @@ _HLINES: Final[list[Any]] = [
 """Rules of a LaTeX table that need no package."""
 _SUITE_METRICS: Final = (
     "success",
+    DISCERNED,
     "goal_reached",
     "route_completion",
     "spl",
@@ -36,7 +38,12 @@ _SUITE_METRICS: Final = (
     "clearance_min_m",
     "time_to_goal_s",
 )
-_GROUP_METRICS: Final = {"success": "SR", "route_completion": "RC", "failures_per_100m": "FC"}
+_GROUP_METRICS: Final = {
+    "success": "SR",
+    DISCERNED: "D",
+    "route_completion": "RC",
+    "failures_per_100m": "FC",
+}
 _LATEX_ESCAPES: Final = {
     "\\": r"\textbackslash{}",
     "{": r"\{",
@@ -123,14 +130,17 @@ def how_to_read(result: RunComparison) -> str:
     tables = [table for other in result.others for table in tables_of_comparison(result, other)]
     shown = sum(row[-3] != "-" for table in tables for row in table.rows)
     in_all = int(result.differences["low"].notna().sum())
+    has_d = bool((result.differences["metric"] == DISCERNED).any())
+    of_d = f"D {DISCERNED_IN_WORDS}, paired by event and decoy; " if has_d else ""
     return (
         "Paired by scenario, rates pooled; intervals by drawing scenarios again in pairs, "
         f"{BOOTSTRAP} times, always the same. Within noise: the interval holds 0. Too few: it does "
         f"not, but fewer than {MIN_CHANGED} scenarios changed (of a rate: of those with a "
         "failure). Differs: it does not, and there is no verdict. One interval in twenty misses "
         f"by chance alone: {shown} stand in these tables, {in_all} in a .csv, a row for every "
-        f"metric of every group. SR {SUCCESS_IN_WORDS}; RC share of the route done; FC failures "
-        "per 100 m travelled; the scenarios of an event are those that have one on their way."
+        f"metric of every group. SR {SUCCESS_IN_WORDS}; {of_d}RC share of the route done; FC "
+        "failures per 100 m travelled; the scenarios of an event are those that have one on their "
+        "way."
     )
 
 

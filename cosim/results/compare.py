@@ -15,6 +15,13 @@ from scipy.special import ndtr, stdtrit
 
 from cosim.core.errors import RunError, UsageError
 from cosim.core.geometry import Floats
+from cosim.results.discerned import (
+    DISCERNED,
+    has_decoys,
+    pairs_of,
+    with_discerned,
+    without_decoys,
+)
 from cosim.results.finished_run import WholeRun, read_whole_run
 from cosim.results.metrics import COUNTERFACTUAL, METRICS, POOLED, RATE_NEEDS_M
 from cosim.results.table import (
@@ -238,14 +245,12 @@ def differences_of(
 
     names: metrics; all that both runs have if empty
     judged: False to report "differs" instead of better or worse
+
+    Decoys count in `discerned` alone, which is paired by event and decoy.
     """
     table_before, table_after = (run.table.set_index("scenario") for run in (before, after))
     ids = [name for name in table_before.index if name in table_after.index]
-    names = names or [
-        name
-        for name in (*METRICS, *COUNTERFACTUAL)
-        if name in table_before.columns and name in table_after.columns
-    ]
+    names = names or _common_metrics(table_before, table_after)
     rows = []
     for (by, group), members in groups.items():
         inside = [name for name in ids if name in members]
@@ -254,7 +259,7 @@ def differences_of(
         pair = table_before.loc[inside], table_after.loc[inside]
         for name in names:
             paired = _difference(name, *pair)
-            unit, better = METRICS[name][:2] if name in METRICS else (COUNTERFACTUAL[name], None)
+            unit, better = _unit_and_direction(name)
             verdict = paired.verdict(better if judged else None) if paired.n else ""
             key = (before.label, after.label, by, group, name, unit)
             means = (paired.before, paired.after, paired.difference)
@@ -263,8 +268,30 @@ def differences_of(
     return pd.DataFrame(rows, columns=list(DIFFERENCES))
 
 
+def _common_metrics(before: pd.DataFrame, after: pd.DataFrame) -> list[str]:
+    """Return the metrics of both tables, `discerned` only if both have decoys."""
+    common = {
+        name: ""
+        for name in (*METRICS, *COUNTERFACTUAL)
+        if name in before.columns and name in after.columns
+    }
+    return [*with_discerned(common, has_decoys(before) and has_decoys(after))]
+
+
+def _unit_and_direction(name: str) -> tuple[str, bool | None]:
+    """Return the unit of a metric, and whether higher is better; None if neither is."""
+    if name == DISCERNED:
+        return "", True
+    return METRICS[name][:2] if name in METRICS else (COUNTERFACTUAL[name], None)
+
+
 def _difference(name: str, before: pd.DataFrame, after: pd.DataFrame) -> PairedDifference:
     """Return the paired difference of a metric; a rate is undefined if a policy crashed."""
+    if name == DISCERNED:
+        one, other = (pairs_of(table.reset_index()).solved for table in (before, after))
+        both = one.index.intersection(other.index)
+        return difference_of_means(one[both].to_numpy(float), other[both].to_numpy(float))
+    before, after = without_decoys(before), without_decoys(after)
     if name not in POOLED:
         return difference_of_means(numeric_column(before, name), numeric_column(after, name))
     if "crashed" in {*before["status"], *after["status"]}:
@@ -317,7 +344,7 @@ def _check_suites(one: WholeRun, other: WholeRun) -> None:
         what = (
             "the same suite"
             if spec.suite != other_spec.suite
-            else "the same version of it (edited, robot, --crowd?)"
+            else "the same version of it (former suite, edited, robot, --crowd?)"
         )
         raise RunError(
             f"{other.path} is of suite '{other_spec.suite}' {other_spec.suite_version} "
@@ -354,6 +381,9 @@ def _notes(runs: Sequence[WholeRun], compared: Sequence[ComparedRun]) -> Iterato
             (record.nonstandard for record in run.records.values() if record.nonstandard), ""
         ):
             yield f"{other.label} is nonstandard: {nonstandard}"
+        pairs = pairs_of(other.table)
+        if pairs.invalid or pairs.single:
+            yield f"{other.label}: D is over {pairs.in_words}"
         if words := injections_in_words(other.table):
             yield f"{other.label}: {words}"
         crashed = sum(record.status == "crashed" for record in run.records.values())

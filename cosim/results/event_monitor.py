@@ -8,7 +8,8 @@ renderer and also exists for policies without a camera.
 
 The paper's table has rules beyond the goal: the robot passes around the whole group of `conversing`
 and the whole line of `queueing` (`EventKind.passed_as_group`), never between two people.
-`gesturing` ends its episode at a stop: see the referee.
+`gesturing` ends its episode at a stop: see the referee. Decoys have the rule of
+`cosim.results.go_on`.
 """
 
 from __future__ import annotations
@@ -24,7 +25,9 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Floats, Pose
 from cosim.core.state import PersonKind, RobotState
 from cosim.episode.loop import Step
+from cosim.results.go_on import Passing, PassingWindow, is_measured, passing_of
 from cosim.results.record import Record, TriggeredEvent
+from cosim.results.referee import Ended
 from cosim.spec.camera import CameraSpec
 from cosim.spec.events import Event, EventKinds, EventState
 from cosim.spec.robot import Mount, Robot
@@ -70,6 +73,15 @@ class EventMonitor:
         self._hidden = hidden
         self._passed_round = [kinds[event.kind].passed_as_group for event in scenario.events]
         self._tick_ms = tick_ms
+        self._go_on_mps = scenario.go_on_mps
+        self._windows = [
+            PassingWindow(scenario.route_line, event, kinds[event.kind])
+            if is_measured(event, scenario)
+            else None
+            for event in scenario.events
+        ]
+        self._route_s_m: list[float] = []
+        self._v_mps: list[float] = []
         self._states: tuple[EventState, ...] = ()
         self._seen = [False] * len(self._events)
         self._went_between = [False] * len(self._events)
@@ -81,6 +93,8 @@ class EventMonitor:
         """Process one tick."""
         self._states = step.events.states
         self._furthest_m = max(self._furthest_m, step.route_s_after_m)
+        self._route_s_m.append(step.route_s_after_m)
+        self._v_mps.append(step.motion.robot.v_mps)
         people = step.street_after.people
         rows = np.flatnonzero(people.are(PersonKind.EVENT)).tolist()
         shown = {people.ids[row]: people.xy[row] for row in rows}
@@ -89,6 +103,9 @@ class EventMonitor:
         for i, (event, state) in enumerate(zip(self._events, self._states, strict=True)):
             places = {k: shown[name] for k, name in enumerate(event.names) if name in shown}
             self._track(step.tick, i, places)
+            window = self._windows[i]
+            if window is not None and state.triggered_tick is not None:
+                window.see(step.tick, step.route_s_after_m, places)
             if state.phase not in ("acting", "over"):
                 continue
             bodies = np.array(list(places.values())).reshape(-1, 2)
@@ -121,29 +138,48 @@ class EventMonitor:
         """Return (E, 5) from each person's first move: tick, event, person, x m, y m."""
         return np.array(self._tracks, dtype=float).reshape(-1, 5)
 
-    def outcomes(self) -> tuple[TriggeredEvent, ...]:
-        """Return the outcome of each event."""
-        return tuple(
-            TriggeredEvent(
-                id=event.id,
-                kind=event.kind,
-                passed=self._furthest_m >= event.route_s_m + PASSED_M,
-                triggered_at_s=None
-                if state.triggered_tick is None
-                else state.triggered_tick * self._tick_ms / 1000,
-                trigger_distance_m=state.trigger_distance_m,
-                seen=seen,
-                rule_met=not between if judged else None,
-            )
-            for event, state, seen, judged, between in zip(
-                self._events,
-                self._states,
-                self._seen,
-                self._passed_round,
-                self._went_between,
-                strict=True,
-            )
+    def outcomes(self, ended: Ended | None) -> tuple[TriggeredEvent, ...]:
+        """Return the outcome of each event. ended: how the episode ended"""
+        return tuple(self._outcome(i, ended) for i in range(len(self._events)))
+
+    def _outcome(self, i: int, ended: Ended | None) -> TriggeredEvent:
+        event, state = self._events[i], self._states[i]
+        end, passing = self._passing(i, ended)
+        rules = [not self._went_between[i]] if self._passed_round[i] else []
+        if self._go_on_mps > 0.0:
+            rules.append(passing is not None and passing.goes_on(self._go_on_mps))
+        return TriggeredEvent(
+            id=event.id,
+            kind=event.kind,
+            passed=self._furthest_m >= event.route_s_m + PASSED_M,
+            triggered_at_s=self._time_s(state.triggered_tick),
+            trigger_distance_m=state.trigger_distance_m,
+            seen=self._seen[i],
+            rule_met=all(rules) if rules else None,
+            passed_at_s=self._time_s(end),
+            passing_mps=None if passing is None else passing.mean_mps,
+            stopped_s=None if passing is None else passing.stopped_s,
         )
+
+    def _passing(self, i: int, ended: Ended | None) -> tuple[int | None, Passing | None]:
+        """Return the end of an event's window and the motion in it; None if not passed.
+
+        The goal ends the window: whoever is still ahead has not kept the robot from it.
+        """
+        window, first = self._windows[i], self._states[i].triggered_tick
+        if window is None or first is None:
+            return None, None
+        end = window.end
+        if end is None and ended == "goal":
+            end = len(self._route_s_m)
+        if end is None:
+            return None, None
+        tick_s = self._tick_ms / 1000
+        s_m, v_mps = np.array(self._route_s_m), np.array(self._v_mps)
+        return end, passing_of(s_m, v_mps, tick_s, first, end)
+
+    def _time_s(self, tick: int | None) -> float | None:
+        return None if tick is None else tick * self._tick_ms / 1000
 
 
 def camera_position(robot: RobotState, mount: Mount) -> Floats:

@@ -92,7 +92,7 @@ def goal_reached(episode: EpisodeFacts) -> float:
 
 SUCCESS_IN_WORDS = (
     "success: the goal reached in time (of gesturing: the stop made) without a failure or a "
-    "broken rule (of conversing and queueing: pass round them)"
+    "broken rule (of conversing and queueing: pass round them; of decoys: go on)"
 )
 
 

@@ -43,7 +43,10 @@ class TriggeredEvent(msgspec.Struct, frozen=True, kw_only=True):
 
     triggered_at_s, trigger_distance_m: None if the trigger never fired
     seen: whether the standard camera saw one of its people (`cosim.results.event_monitor`)
-    rule_met: whether the robot obeyed the event's rule; None without a rule
+    rule_met: whether the robot obeyed the event's rules; None without a rule
+    passed_at_s: end of the window of the go-on rule (`cosim.results.go_on`), which begins at the
+        trigger; None if the robot did not pass, or in other events than decoys
+    passing_mps, stopped_s: mean speed along the route and longest stop in this window
     """
 
     id: str
@@ -53,6 +56,9 @@ class TriggeredEvent(msgspec.Struct, frozen=True, kw_only=True):
     trigger_distance_m: float | None = None
     seen: bool = False
     rule_met: bool | None = None
+    passed_at_s: float | None = None
+    passing_mps: float | None = None
+    stopped_s: float | None = None
 
 
 class RedLightEntry(msgspec.Struct, frozen=True):
@@ -66,6 +72,7 @@ class ScenarioFacts(msgspec.Struct, frozen=True, kw_only=True):
     """Identity of an episode's scenario.
 
     hash: content hash of the whole spec
+    decoy_of: id of the scenario whose decoy it is, "" for any other
     crowd_added: whether the crowd is not the suite's own (`CrowdSpec.added`)
     """
 
@@ -75,6 +82,7 @@ class ScenarioFacts(msgspec.Struct, frozen=True, kw_only=True):
     seed: int
     split: Split = "val"
     structure: str = ""
+    decoy_of: str = ""
     crowd_added: bool = False
     robot: str
 
@@ -88,6 +96,7 @@ class ScenarioFacts(msgspec.Struct, frozen=True, kw_only=True):
             seed=scenario.seed,
             split=scenario.split,
             structure=scenario.structure,
+            decoy_of=scenario.decoy_of,
             crowd_added=scenario.crowd.added,
             robot=scenario.robot,
         )
@@ -190,7 +199,7 @@ RECORD_FILE = FlatFile(
     {"scenario": ScenarioFacts, "setup": RunSetup, "manifest": Manifest},
     """
     scenario=scenario.id scenario_hash=scenario.hash suite suite_hash seed=scenario.seed
-    split structure crowd_added run_seed=setup.seed episode robot policy=manifest.name
+    split structure decoy_of crowd_added run_seed=setup.seed episode robot policy=manifest.name
     policy_version=manifest.version policy_source policy_runs waypoints camera cameras rate_hz
     nonstandard goal_protocol=manifest.goal odometry privileged latency_ms real_time renderer
     versions status reason ended ticks state_hash measures failures walked_into

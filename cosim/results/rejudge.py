@@ -1,8 +1,8 @@
 """Check a record against the trajectory that was recorded with it.
 
 The trajectory determines its duration, position and speed at each failure, resets, progress,
-freezings and the end. Contacts, leaving the walkable area, red light entries and event outcomes
-need the engines; they are taken from the record.
+freezings, the end, and the go-on rule between trigger and passing. Contacts, leaving the walkable
+area, red light entries and other event outcomes need the engines; they are taken from the record.
 """
 
 from __future__ import annotations
@@ -17,8 +17,9 @@ from cosim.core.geometry import Floats, Polyline
 from cosim.episode.command_delay import median_ms
 from cosim.episode.loop import ROUTE_WINDOW_M
 from cosim.people.yielding import ROBOT_STANDS_MPS
+from cosim.results.go_on import Passing, is_measured, passing_of
 from cosim.results.log import Log
-from cosim.results.record import Record
+from cosim.results.record import Record, TriggeredEvent
 from cosim.results.referee import STOP_S, Ended, FreezeWindow, at_goal, is_loop, near_goal
 from cosim.spec.scenario import Scenario
 
@@ -49,6 +50,7 @@ def contradictions(record: Record, scenario: Scenario, log: Log) -> Iterator[Con
     yield from _red_light_entries(record, scenario, log)
     yield from _progress(scenario, log)
     yield from _freezings(record, scenario, log)
+    yield from _passings(record, scenario, log)
     if record.ended not in (ends := _ends(record, scenario, log)):
         yield Contradiction("ended", record.ended, " or ".join(ends) or "not yet over")
 
@@ -171,6 +173,38 @@ def _freezings(record: Record, scenario: Scenario, log: Log) -> Iterator[Contrad
             return
         if kind is not None:
             window.clear()
+
+
+def _passings(record: Record, scenario: Scenario, log: Log) -> Iterator[Contradiction]:
+    """Check the go-on rule in the windows of the record, which the goal ends at the latest.
+
+    A group may break its other rule where the robot goes on.
+    """
+    outcomes = {outcome.id: outcome for outcome in record.events}
+    for event in (event for event in scenario.events if is_measured(event, scenario)):
+        outcome = outcomes.get(event.id)
+        if outcome is None:
+            yield Contradiction(f"event {event.id}", None, "an event of the scenario")
+            continue
+        triggered = outcome.triggered_at_s is not None
+        if record.ended == "goal" and triggered and outcome.passed_at_s is None:
+            yield Contradiction(f"passed_at_s of event {event.id}", None, "at the goal or before")
+        passing = _passing(outcome, log)
+        recorded = outcome.passing_mps, outcome.stopped_s
+        if recorded != (shown := (None, None) if passing is None else tuple(passing)):
+            yield Contradiction(f"passing_mps, stopped_s of event {event.id}", recorded, shown)
+        if scenario.go_on_mps > 0.0:
+            goes_on = passing is not None and passing.goes_on(scenario.go_on_mps)
+            if outcome.rule_met is not goes_on and (event.people == 1 or not goes_on):
+                yield Contradiction(f"rule_met of event {event.id}", outcome.rule_met, goes_on)
+
+
+def _passing(outcome: TriggeredEvent, log: Log) -> Passing | None:
+    """Return the motion in an event's window; None without one."""
+    if outcome.triggered_at_s is None or outcome.passed_at_s is None:
+        return None
+    first, end = (round(at / log.tick_s) for at in (outcome.triggered_at_s, outcome.passed_at_s))
+    return passing_of(log.route_s_m, log.speed[:, 0], log.tick_s, first, end)
 
 
 def _ends(record: Record, scenario: Scenario, log: Log) -> list[Ended]:

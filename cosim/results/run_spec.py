@@ -34,7 +34,10 @@ _SUITE_HINT = (
 
 
 class Shard(msgspec.Struct, frozen=True):
-    """Part of a run: every `of`-th scenario, from the `number`-th on, counted from 1."""
+    """Part of a run: every `of`-th scenario, from the `number`-th on, counted from 1.
+
+    A decoy is in the shard of its scenario.
+    """
 
     number: int
     of: int

@@ -11,6 +11,13 @@ import pandas as pd
 
 from cosim.core.errors import listed
 from cosim.core.geometry import Floats
+from cosim.results.discerned import (
+    DISCERNED,
+    has_decoys,
+    pairs_of,
+    with_discerned,
+    without_decoys,
+)
 from cosim.results.metrics import COUNTERFACTUAL, METRICS, POOLED, RATE_NEEDS_M, WORST
 from cosim.results.record import RECORD_FILE, Record
 
@@ -25,6 +32,7 @@ _ORDER = (
     "seed",
     "split",
     "structure",
+    "decoy_of",
     "crowd_added",
     "run_seed",
     "episode",
@@ -125,22 +133,33 @@ def policy_in_words(name: str, privileged: bool) -> str:
     return f"{name} ({'oracle, ' * (name == ORACLE)}privileged)" if privileged else name
 
 
-def summary_of(table: pd.DataFrame, names: Sequence[str] = tuple(METRICS)) -> pd.DataFrame:
+def summary_of(table: pd.DataFrame, names: Sequence[str] = ()) -> pd.DataFrame:
     """Summarize each metric over episodes: mean, bootstrap interval and number of values n.
+
+    names: metrics; `metrics_of` the table if empty
+
+    Decoys count in `discerned` alone, which is over pairs (`cosim.results.discerned`).
 
     Columns: mean, low, high, n; index: metric. Rates are pooled (`cosim.results.metrics.POOLED`):
         all counts divided by all metres, bootstrapped over episodes. A metric without values is NaN
         with n = 0. So is a rate if a policy crashed, since failures after the crash are unknown.
     """
-    rows = [_summary(table, name) for name in names]
+    names = names or metrics_of(table)
+    events = without_decoys(table)
+    rows = [_summary(table if name == DISCERNED else events, name) for name in names]
     return pd.DataFrame(
         rows, index=pd.Index(names, name="metric"), columns=["mean", "low", "high", "n"]
     )
 
 
+def metrics_of(table: pd.DataFrame) -> tuple[str, ...]:
+    """Return the metrics of a table, `discerned` only if it has decoys."""
+    return tuple(with_discerned(dict.fromkeys(METRICS, ""), has_decoys(table)))
+
+
 def _summary(table: pd.DataFrame, name: str) -> tuple[float, float, float, int]:
     if name not in POOLED:
-        values = numeric_column(table, name)
+        values = pairs_of(table).values if name == DISCERNED else numeric_column(table, name)
         values = values[~np.isnan(values)]
         return (
             float(values.mean()) if len(values) else np.nan,

@@ -66,10 +66,12 @@ class RunConfig:
         Option("A suite (see `cosim list`) or the path of a suite's .json file.", argument=True),
     ] = ""
     episodes: Annotated[
-        int | None, Option("Run only the first N scenarios.", least=1, panel=_CHOICE)
+        int | None,
+        Option("Run only the first N scenarios, with their decoys.", least=1, panel=_CHOICE),
     ] = None
     scenario: Annotated[
-        tuple[str, ...], Option("Run only this scenario; may be repeated.", panel=_CHOICE)
+        tuple[str, ...],
+        Option("Run only this scenario, without its decoy; may be repeated.", panel=_CHOICE),
     ] = ()
     event: Annotated[
         tuple[str, ...],
@@ -81,6 +83,10 @@ class RunConfig:
     split: Annotated[
         str | None, Option("Run only scenarios of val, or of test.", panel=_CHOICE)
     ] = None
+    no_decoys: Annotated[
+        bool,
+        Option("Leave out the decoys, and with them `discerned` (D).", panel=_CHOICE),
+    ] = False
     policy: Annotated[
         str,
         Option(
@@ -133,8 +139,8 @@ class RunConfig:
     shard: Annotated[
         str,
         Option(
-            "Run only every N-th scenario, from the I-th; needs --seed. `cosim merge` joins all N"
-            " runs.",
+            "Run only every N-th scenario, from the I-th, with their decoys; needs --seed. `cosim "
+            "merge` joins all N runs.",
             metavar="I/N",
             panel=_WHERE,
         ),

@@ -345,10 +345,10 @@ class Suite(Ranged, frozen=True, kw_only=True):
         if twice := sorted(name for name, count in times.items() if count > 1):
             more = f" and {len(twice) - 5} more" if len(twice) > 5 else ""
             yield f"suite '{self.name}' lists scenarios twice: {', '.join(twice[:5])}{more}"
-        events = {one.id for one in self.scenarios if not one.decoy_of}
+        decoys = {one.id for one in self.scenarios if one.decoy_of}
         for one in self.scenarios:
-            if one.decoy_of and one.decoy_of not in events:
-                yield f"{one.called}decoy_of names no scenario of the suite: {shown(one.decoy_of)}"
+            if one.decoy_of in decoys:
+                yield f"{one.called}decoy_of names another decoy: {shown(one.decoy_of)}"
 
     @property
     def content_hash(self) -> str:
@@ -413,6 +413,14 @@ def event_faults(scenario: Scenario, kinds: EventKinds, place: str = "$") -> Ite
         )
 
 
+def decoy_faults(suite: Suite) -> Iterator[str]:
+    """Yield the errors of a whole suite whose decoys lack their scenario; a part may lack it."""
+    events = {one.id for one in suite.scenarios if not one.decoy_of}
+    for one in suite.scenarios:
+        if one.decoy_of and one.decoy_of not in events:
+            yield f"{one.called}decoy_of names no scenario of the suite: {shown(one.decoy_of)}"
+
+
 def read_suite(path: Path, kinds: EventKinds | None = None) -> Suite:
     """Load the suite of a JSON file. Raises SpecError with file, field and valid choices.
 
@@ -427,7 +435,7 @@ def read_suite(path: Path, kinds: EventKinds | None = None) -> Suite:
         faults_by_scenario = (
             event_faults(one, kinds, f"$.scenarios[{i}]") for i, one in enumerate(suite.scenarios)
         )
-        if faults := list(chain.from_iterable(faults_by_scenario)):
+        if faults := [*chain.from_iterable(faults_by_scenario), *decoy_faults(suite)]:
             raise SpecError(f"{path}: {join_faults(faults)}")
     return suite
 

@@ -21,19 +21,27 @@ def select_scenarios(
     episodes: int | None = None,
     kinds: Sequence[str] = (),
     split: str | None = None,
+    decoys: bool = True,
 ) -> tuple[Scenario, ...]:
     """Return the selected scenarios of a suite. Raises UsageError with the valid names.
 
-    ids: ids of scenarios; none for all.
-    episodes: number of scenarios, from the first.
+    ids: ids of scenarios, without their decoys; none for all.
+    episodes: number of scenarios, from the first; their decoys are selected too, not counted.
     kinds: event kinds, or `static`.
     split: val or test; None for both.
+    decoys: whether decoys are selected.
     """
     by_id = {scenario.id: scenario for scenario in whole.scenarios}
     for scenario_id in ids:
         if scenario_id not in by_id:
             raise unknown("scenario", scenario_id, by_id)
     picked = [by_id[i] for i in dict.fromkeys(ids)] or list(whole.scenarios)
+    if not decoys:
+        picked = [s for s in picked if not s.decoy_of]
+        if not picked:
+            raise UsageError(
+                f"--no-decoys: only decoys of suite '{whole.name}' are chosen: leave it out"
+            )
     available = {kind: None for scenario in picked for kind in _kinds_of(scenario)}
     for kind in kinds:
         if kind not in available and not available:
@@ -51,7 +59,16 @@ def select_scenarios(
             raise UsageError(
                 f"suite '{whole.name}' has no scenarios of split '{split}' among those chosen"
             )
-    return tuple(picked[:episodes])
+    first = {s.id for pair in pairs_of(picked)[:episodes] for s in pair}
+    return tuple(s for s in picked if s.id in first)
+
+
+def pairs_of(scenarios: Sequence[Scenario]) -> list[tuple[Scenario, ...]]:
+    """Return scenarios with their decoys behind them; a decoy alone if its scenario is missing."""
+    groups: dict[str, list[Scenario]] = {s.id: [s] for s in scenarios if not s.decoy_of}
+    for decoy in (s for s in scenarios if s.decoy_of):
+        groups.setdefault(decoy.decoy_of, []).append(decoy)
+    return [*map(tuple, groups.values())]
 
 
 def selection_in_words(whole: Suite, ids: Sequence[str]) -> str:
@@ -84,21 +101,29 @@ def _options_for(whole: Suite, ids: Sequence[str]) -> list[str]:
     ]
     every = tuple(kind for kind in known if any(kind in kinds for kinds in each))
     common = [(kind,) for kind in known if all(kind in kinds for kinds in each)]
-    choices = product((None, *get_args(Split)), ((), *common, every), (None, len(ids)))
-    for split, kinds, episodes in sorted(choices, key=lambda one: sum(map(bool, one))):
+    no_decoys = (
+        (False, True) if any(scenario.decoy_of for scenario in whole.scenarios) else (False,)
+    )
+    choices = product(
+        (None, *get_args(Split)), ((), *common, every), (None, len(pairs_of(picked))), no_decoys
+    )
+    for split, kinds, episodes, without in sorted(choices, key=lambda one: sum(map(bool, one))):
         try:
-            found = select_scenarios(whole, (), episodes, kinds, split)
+            found = select_scenarios(whole, (), episodes, kinds, split, not without)
         except UsageError:
             continue
         if {scenario.id for scenario in found} == {*ids}:
-            return _as_options(kinds, split, episodes)
+            return _as_options(kinds, split, episodes, without)
     return [f"--scenario {name}" for name in ids] if len(ids) <= _MOST_NAMED else []
 
 
-def _as_options(kinds: Iterable[str], split: str | None, episodes: int | None) -> list[str]:
+def _as_options(
+    kinds: Iterable[str], split: str | None, episodes: int | None, no_decoys: bool
+) -> list[str]:
     options = [f"--event {kind}" for kind in kinds]
     options += [f"--split {split}"] if split else []
-    return options + ([f"--episodes {episodes}"] if episodes else [])
+    options += [f"--episodes {episodes}"] if episodes else []
+    return options + ["--no-decoys"] * no_decoys
 
 
 def _kinds_of(scenario: Scenario) -> set[str]:

@@ -80,7 +80,7 @@ class Scorer:
                 "this episode was judged alone, nothing of it was recorded: it has no result"
             )
         scenario = self._scenario
-        events = self._monitor.outcomes()
+        events = self._monitor.outcomes(self._verdict.ended)
         log = self._recorder.log(self._monitor.tracks, commands)
         setup = begun.setup
         if setup.real_time:

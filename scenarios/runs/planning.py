@@ -22,6 +22,7 @@ from cosim.spec.options import EpisodeOptions, PolicyHost
 from cosim.spec.robot import robot_called
 from cosim.spec.run_config import RunConfig
 from cosim.spec.scenario import Scenario, Suite
+from cosim.spec.selection import pairs_of
 from physics.cameras.choice import camera_of_choice as chosen_camera
 from physics.cameras.choice import renderer_of
 from physics.robots import robot_hash
@@ -58,7 +59,9 @@ class PlannedRun(NamedTuple):
     @property
     def picked(self) -> Sequence[Scenario]:
         """The scenarios that are run here."""
-        return self.of_run if self.shard is None else self.shard.share(self.of_run)
+        if self.shard is None:
+            return self.of_run
+        return [one for pair in self.shard.share(pairs_of(self.of_run)) for one in pair]
 
     @property
     def spec(self) -> RunSpec:
@@ -91,7 +94,7 @@ def planned_run(
         if policy is None
         else f"{type(policy).__module__}:{type(policy).__qualname__}"
     )
-    part = Shard.called(config.shard, len(of_run)) if config.shard else None
+    part = Shard.called(config.shard, len(pairs_of(of_run))) if config.shard else None
     if part is not None and options.seed is None and resumed is None:
         raise UsageError(
             "--shard needs --seed: shards are of one run, which has one seed: give the same to each"

@@ -102,6 +102,7 @@ def run(
     episodes: int | None = None,
     scenarios: Sequence[str] = (),
     events: Sequence[str] = (),
+    decoys: bool = True,
     shard: str = "",
     jobs: int | None = None,
     on: str = "",
@@ -118,6 +119,7 @@ def run(
     policy: an object, which drives in this process; or a name, as "my.py:Class", which drives in
         `jobs` processes that survive its errors.
     episodes, scenarios, events: run only the first episodes, these ids, these kinds of events.
+    decoys: whether the decoys of these are run too; never with `scenarios`, which names each.
     shard: run only a part of them, as "1/4", of a run with a seed; `cosim merge` joins the parts.
     on: a Ray cluster ("ray", "auto", "ray://HOST:10001"), by default with a worker for each CPU.
     out: the run folder; without one only the table is returned.
@@ -142,6 +144,7 @@ def run(
         episodes=episodes,
         scenario=tuple(scenarios),
         event=tuple(events),
+        no_decoys=not decoys,
         shard=shard,
         jobs=jobs,
         on=on,
@@ -199,7 +202,12 @@ def execute_run(
         (refuse_not_begun if config.resume else refuse_used)(config.out)
     whole = _loaded(config, given, reporter)
     of_run = select_scenarios(
-        whole, config.scenario, config.episodes, config.event, split_called(config.split)
+        whole,
+        config.scenario,
+        config.episodes,
+        config.event,
+        split_called(config.split),
+        decoys=not config.no_decoys,
     )
     plan = _planned(config, given, whole, of_run, ends)
     reporter.planned(plan)

@@ -359,7 +359,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "an edited suite": (
         lambda run: other_suite(run, "s"),
-        "run both on the same version of it (edited, robot, --crowd?)",
+        "run both on the same version of it (former suite, edited, robot, --crowd?)",
     ),
     "no run": (
         lambda run: (run / "run.json").unlink(),

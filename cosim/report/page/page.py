@@ -19,6 +19,7 @@ from cosim.report.page.reasons import CAUSES, mishaps_of
 from cosim.report.page.runs import ReportedRun, place_in_words
 from cosim.report.page.scene import Entry, PlacePicture, Spot
 from cosim.report.page.three_tables import summary_table, tables_of, warnings_of
+from cosim.results.discerned import is_decoy
 from cosim.results.log import holds_waypoints
 from cosim.results.table import injections_in_words, policy_in_words
 from cosim.results.throughput import median_answer_ms
@@ -195,13 +196,15 @@ def _facts(run: ReportedRun) -> dict[str, str]:
         else "not told"
     )
     took_ms = median_answer_ms(run.records)
+    decoys = int(is_decoy(run.table).sum())
+    of_these = f", of these {decoys} decoys" if decoys else ""
     has_waypoints = any(map(holds_waypoints, run.path.glob("episodes/*/trajectory.npz")))
     called = policy_in_words(spec.manifest.name, run.records[0].manifest.privileged)
     return {
         "policy": f"{called} {spec.manifest.version} ({spec.policy})",
         "its source": spec.setup.policy_source or "not told",
         "suite": f"{spec.suite} {spec.suite_version}, {spec.setup.suite_hash}",
-        "scenarios": f"{len(spec.scenarios)} scheduled, {len(run.records)} ended",
+        "scenarios": f"{len(spec.scenarios)} scheduled, {len(run.records)} ended{of_these}",
         "metric schema": str(run.table["metric_schema"].iloc[0]),
         "camera": f"{run.table['camera'].iloc[0]}, at {spec.manifest.rate_hz:g} Hz",
         "drawn by": spec.setup.renderer,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from html import escape
+from itertools import compress
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from cosim.report.page.three_tables import (
     episodes_of,
     kind_in_words,
 )
+from cosim.results.discerned import DISCERNED
 from cosim.results.record import Record, Recorder
 from cosim.results.table import bootstrap_interval
 
@@ -60,6 +62,8 @@ _SPEED_WORDS: Final = ("below 0.25", "0.25 to 0.75", "0.75 to 1.25", "1.25 to 1.
 _MIN_M: Final = 20.0
 """Least distance travelled, metres, for a rate."""
 _BAR_PX: Final = 40
+_SHARES: Final = ("success", DISCERNED)
+"""Metrics that are shares; the others of the plots are rates."""
 _FAMILIES: Final[Mapping[PaperTable, str]] = {
     "unit": "unit tests",
     "reactive": "people in the way",
@@ -93,6 +97,15 @@ def plots_of(
         ),
         _metric_plot(
             runs, colours, "reactive", "kind", EVENT_COLUMNS, "success", "Success by event"
+        ),
+        _metric_plot(
+            runs,
+            colours,
+            "reactive",
+            "kind",
+            EVENT_COLUMNS,
+            DISCERNED,
+            "Discerned by event: solved with its decoy",
         ),
         _endings_plot(runs),
         _cause_rates_plot(runs),
@@ -184,12 +197,15 @@ _ByRun = dict[tuple[str, PaperTable], list[Exposure]]
 
 
 def _exposures(runs: Sequence[ReportedRun], progress: Progress) -> tuple[_ByRun, _ByRun]:
-    """Return exposures by people nearby and by speed, of every episode with a trajectory."""
+    """Return exposures by people nearby and by speed, of every episode with a trajectory that is no
+    decoy."""
     near: _ByRun = {}
     fast: _ByRun = {}
     for number, run in enumerate(runs):
         progress("reading trajectories", number / len(runs))
         for record, track in run.tracks():
+            if record.scenario.decoy_of:
+                continue
             key = run.label, table_of_paper(run.scenarios[record.scenario.id])
             travelled_m = track["travelled_m"]
             speed = np.abs(track["speed"][:, 0])
@@ -252,13 +268,17 @@ def _metric_plot(
     present = [
         value for value in order if any((table[column] == value).any() for table in tables.values())
     ]
-    if len(present) < 2:
-        return None
     cells = {
         label: [cell_of(table[table[column] == value], metric) for value in present]
         for label, table in tables.items()
     }
-    share = metric == "success"
+    if metric == DISCERNED:
+        paired = [any(row[k].n for row in cells.values()) for k in range(len(present))]
+        present = [*compress(present, paired)]
+        cells = {label: [*compress(row, paired)] for label, row in cells.items()}
+    if len(present) < 2:
+        return None
+    share = metric in _SHARES
     note = (
         "Points are means, bars 95 % intervals; hover for figures."
         if share
@@ -268,7 +288,7 @@ def _metric_plot(
     return Plot(
         title,
         note,
-        _points(cells, colours, words, "success" if share else "per 100 m", share=share),
+        _points(cells, colours, words, metric if share else "per 100 m", share=share),
     )
 
 
@@ -368,7 +388,8 @@ def _endings_plot(runs: Sequence[ReportedRun]) -> Plot | None:
         for record in run.records:
             family = table_of_paper(run.scenarios[record.scenario.id])
             if family != "long":
-                row = rows.setdefault(f"{escape(run.label)}<br>{_FAMILIES[family]}", {})
+                words = "decoys" if record.scenario.decoy_of else _FAMILIES[family]
+                row = rows.setdefault(f"{escape(run.label)}<br>{words}", {})
                 went = mishaps_of(record)
                 what = (
                     "invalid"

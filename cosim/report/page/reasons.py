@@ -9,6 +9,7 @@ import numpy as np
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Floats
+from cosim.results.go_on import STOP_S
 from cosim.results.log import Log
 from cosim.results.record import Record, TriggeredEvent
 from cosim.results.referee import FREEZE_MOVE_M, FREEZE_WINDOW_S, Failure
@@ -238,6 +239,8 @@ def _nearest(log: Log | None, tick: int) -> str:
 def _missed_goal(scenario: Scenario, record: Record) -> str:
     """Describe an episode that failed without a failure of the referee."""
     done = 100.0 * (record.measures.get("route_completion") or 0.0)
+    if record.ended == "goal" and scenario.go_on_mps > 0.0:
+        return _did_not_go_on(scenario, record)
     if record.ended == "goal":
         return "came to the goal, but went between people that it should have passed round"
     if record.ended == "failure":
@@ -246,4 +249,18 @@ def _missed_goal(scenario: Scenario, record: Record) -> str:
         return f"made no stop before the stopping hand within {scenario.time_limit_s:.0f} s"
     return (
         f"ran out of time after {scenario.time_limit_s:.0f} s, with {done:.0f} % of the route done"
+    )
+
+
+def _did_not_go_on(scenario: Scenario, record: Record) -> str:
+    """Describe how the robot broke the go-on rule of a decoy, at its slowest event."""
+    passed = [event for event in record.events if event.passing_mps is not None]
+    if not passed:
+        return "came to the goal, but did not go on past the person of its decoy"
+    slowest = min(passed, key=lambda event: event.passing_mps or 0.0)
+    if (stopped_s := slowest.stopped_s or 0.0) >= STOP_S:
+        return f"stopped for {stopped_s:.1f} s, though nothing was in its way"
+    return (
+        f"passed at {slowest.passing_mps:.2f} m/s on average, where at least "
+        f"{scenario.go_on_mps:.2f} m/s was needed"
     )

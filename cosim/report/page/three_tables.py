@@ -17,6 +17,14 @@ from cosim.report.page.paper import (
     Row,
 )
 from cosim.report.page.runs import PAPER_SUITES, PaperTable, ReportedRun
+from cosim.results.discerned import (
+    DISCERNED,
+    DISCERNED_IN_WORDS,
+    has_decoys,
+    is_decoy,
+    pairs_of,
+    with_discerned,
+)
 from cosim.results.table import ORACLE, summary_of, why_inconclusive
 
 UNIT_COLUMNS: Final = ("straight", "curve", "crosswalk")
@@ -34,6 +42,10 @@ _FIRST: Final = {
     "failures_per_100m": "FC /100 m",
     "velocity_mean_mps": "V m/s",
 }
+_DISCERNED_TITLE: Final = (
+    "People in the way: discerned",
+    "Share of pairs of an event and its decoy in which both were solved. The paper has no decoys.",
+)
 _PLACES: Final = ((False, "Generated places"), (True, "Real places"))
 
 
@@ -115,19 +127,24 @@ def tables_of(runs: Sequence[ReportedRun]) -> list[ReportTable]:
 
 def summary_table(runs: Sequence[ReportedRun], colours: Mapping[str, str]) -> ReportTable:
     """Return a table with one row of main figures per run. colours: by run label."""
+    decoys = any(has_decoys(run.table) for run in runs)
+    first = with_discerned(_FIRST, decoys)
     rows = []
     for run in runs:
         invalid = int((run.table["status"] == "invalid").sum())
-        cells = tuple(cell_of(run.table, metric) for metric in _FIRST)
+        cells = tuple(cell_of(run.table, metric) for metric in first)
         about = {"suite": run.spec.suite, "colour": colours[run.label]}
         rows.append(
             TableRow(run.label, cells, scored=len(run.table) - invalid, invalid=invalid, **about)
         )
+    of_d = f"D {DISCERNED_IN_WORDS}; " if decoys else ""
     note = (
-        "SR success; RC share of the route done; FC failures per 100 m travelled, pooled; V mean "
-        "speed. Small figures are 95 % bootstrap intervals over episodes."
+        f"SR success; {of_d}RC share of the route done; FC failures per 100 m travelled, pooled; "
+        "V mean speed. Small figures are 95 % bootstrap intervals over episodes."
+        + " Decoys are scored, but count in D alone."
+        * decoys
     )
-    heads = ("scored", "invalid", *_FIRST.values())
+    heads = ("scored", "invalid", *first.values())
     return ReportTable("All episodes of each run", note, heads, tuple(rows))
 
 
@@ -180,11 +197,13 @@ def _reactive(runs: Sequence[ReportedRun]) -> Iterable[ReportTable | None]:
             "Least distance between centres, mean over the episodes that succeeded.",
         ),
     }
+    if any(has_decoys(run.table) for run in runs):
+        titles = {"success": titles["success"], DISCERNED: _DISCERNED_TITLE} | titles
     for metric, (title, note) in titles.items():
         columns = [
             _Column("", "", kind_in_words(kind), {"kind": kind}, metric) for kind in EVENT_COLUMNS
         ]
-        yield _table(title, note, runs, "reactive", columns, REACTIVE_OF_PAPER[metric])
+        yield _table(title, note, runs, "reactive", columns, REACTIVE_OF_PAPER.get(metric, {}))
 
 
 def _long(runs: Sequence[ReportedRun]) -> ReportTable | None:
@@ -210,7 +229,8 @@ def _other(runs: Sequence[ReportedRun]) -> ReportTable | None:
                 found[f"{run.label}: {kind}"] = part
     if not found:
         return None
-    columns = [_Column("", "", head, {}, metric) for metric, head in (_SHARES | RATES).items()]
+    shown = with_discerned(_SHARES | RATES, any(map(has_decoys, found.values())))
+    columns = [_Column("", "", head, {}, metric) for metric, head in shown.items()]
     return _framed(
         "Other suites and kinds",
         "As above, by what the scenarios are examples of.",
@@ -268,8 +288,10 @@ def _part(table: pd.DataFrame, column: _Column) -> pd.DataFrame:
 
 
 def _notes(table: pd.DataFrame) -> str:
-    """Return the notes of a row: number of episodes, privileged policy, nonstandard camera."""
-    notes = [f"{len(table)} episode{'s' * (len(table) != 1)}"]
+    """Return the notes of a row: number of episodes and pairs, privileged, nonstandard camera."""
+    episodes = int((~is_decoy(table)).sum())
+    notes = [f"{episodes} episode{'s' * (episodes != 1)}"]
+    notes += [pairs_of(table).in_words] * has_decoys(table)
     notes += ["crowd added"] * bool(table["crowd_added"].any())
     if table["privileged"].any():
         notes.append("oracle, privileged" if ORACLE in {*table["policy"]} else "privileged")
