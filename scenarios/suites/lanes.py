@@ -134,6 +134,8 @@ def with_lanes_blocked(scenario: Scenario, kind: EventKind, street_map: StreetMa
             reason = "obstacles cover two waypoints in a row"
         elif not all(site.room.passable(obstacles, people) for people in site.standing):
             reason = "no gap is left"
+        elif len(site.standing) > 1 and site.room.shares_way(obstacles, site.standing):
+            reason = "one way is free on both sides of the people"
         else:
             return msgspec.structs.replace(scenario, obstacles=obstacles)
     raise SpecError(reason)

@@ -211,6 +211,7 @@ class Room:
         robot = robot_called(scenario.robot)
         area = shapely.buffer(LineString(scenario.route), AROUND_M)
         self.gap_m = robot.width_m + to_spare_m
+        self._width_m = robot.width_m
         self._start = Point(scenario.start[:2])
         self._goal = Point(scenario.goal)
         surface = StreetSurface(street_map, scenario.place.seed)
@@ -233,11 +234,29 @@ class Room:
 
         people: ground of people who stand.
         """
-        free = self.free_ground(obstacles, people)
-        parts = shapely.get_parts(shapely.buffer(free, -0.5 * self.gap_m))
+        free = self._free_ground(obstacles, people)
+        return self._connects(shapely.buffer(free, -0.5 * self.gap_m))
+
+    def shares_way(
+        self, obstacles: Sequence[Obstacle], people: Iterable[Sequence[shapely.Geometry]]
+    ) -> bool:
+        """Return whether the robot can drive one way from start to goal among all groups of people.
+
+        Each group is there in another episode.
+        """
+        half_m = 0.5 * self._width_m
+        grounds = [shapely.buffer(self._free_ground(obstacles, group), -half_m) for group in people]
+        common = grounds[0]
+        for ground in grounds[1:]:
+            common = overlay.intersection(common, ground)
+        return self._connects(common)
+
+    def _connects(self, ground: shapely.Geometry) -> bool:
+        """Return whether one part of the ground has both start and goal."""
+        parts = shapely.get_parts(ground)
         return any(part.covers(self._start) and part.covers(self._goal) for part in parts)
 
-    def free_ground(
+    def _free_ground(
         self, obstacles: Iterable[Obstacle], people: Iterable[shapely.Geometry] = ()
     ) -> Polygon | MultiPolygon:
         """Return the walkable ground without furniture, obstacles and people."""

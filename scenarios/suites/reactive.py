@@ -54,7 +54,7 @@ _ASLANT: Final = tuple(
 """Ways over a crosswalk that are tried in this order: angle to its line, offset from its middle in
 metres.
 """
-ENDS_CLEAR_M = 2.0
+ENDS_CLEAR_M = 6.0
 """Least distance of route and event from the ends of their sidewalk, in metres."""
 BEND_M = 0.15
 _SPEEDS_MPS = (1.1, 1.65)
@@ -253,7 +253,7 @@ def _along(
     sin, cos = math.sin(pose.heading_rad), math.cos(pose.heading_rad)
     aside = pose.x_m - found.left_m * sin, pose.y_m + found.left_m * cos
     return EventSpot(
-        _stepped(line, wanted.length_m),
+        stepped(line, wanted.length_m),
         Pose(*aside, pose.heading_rad),
         event_m,
         found.half_m,
@@ -278,6 +278,24 @@ def event_range_m(trigger_m: float, after_m: float, length_m: float) -> tuple[fl
     return max(trigger_m, 0.0) + _BEFORE_TRIGGER_M, length_m - after_m
 
 
+def event_share(scenario: Scenario, kind: EventKind) -> float:
+    """Return the position of a scenario's event, as a share of the range in which it fits.
+
+    It is 0.5 if the range is too small to draw from.
+    """
+    (event,) = scenario.events
+    length_m = scenario.route_line.length_m
+    if kind.layout is None or kind.trigger_m is None:
+        low_m = ROUND_CROSSING_M[0] + event.half_length_m
+        high_m = length_m - ROUND_CROSSING_M[1] - event.half_length_m
+    else:
+        trigger_m = kind.trigger_m if event.trigger_m is None else event.trigger_m
+        low_m, high_m = event_range_m(trigger_m, kind.layout.after_m, length_m)
+    if high_m - low_m < 0.9 * _BAND_M:
+        return 0.5
+    return (event.route_s_m - low_m) / (high_m - low_m)
+
+
 def straight_along(strip: Strip, length_m: float, rng: np.random.Generator) -> Polyline:
     """Draw a straight line of a length along a sidewalk. Raises SpecError if none fits."""
     line = strip.line[:, :2] if rng.random() < 0.5 else strip.line[::-1, :2]
@@ -293,8 +311,10 @@ def straight_along(strip: Strip, length_m: float, rng: np.random.Generator) -> P
     return chord
 
 
-def _stepped(line: Polyline, length_m: float) -> Floats:
-    """Return points of a straight line, about a metre apart, rounded to millimetres."""
+def stepped(line: Polyline, length_m: float) -> Floats:
+    """Return points of a straight line up to a length, (N, 2), about a metre apart, in whole
+    millimetres.
+    """
     steps = np.linspace(0.0, length_m, math.ceil(length_m) + 1)
     return np.round([line.at(float(s)).xy for s in steps], 3)
 
@@ -317,7 +337,7 @@ def _over(
     near = (one for one in street_map.near("strip", line) if isinstance(one, Strip))
     if any(one.kind == "crossing" and one.polygon.intersects(line) for one in near if one != strip):
         raise SpecError("the way leads over two crossings")
-    return _spot_over(street_map, strip, leave, Polyline(_stepped(route, route.length_m)))
+    return _spot_over(street_map, strip, leave, Polyline(stepped(route, route.length_m)))
 
 
 def _crossed(strip: Strip, rng: np.random.Generator) -> tuple[Literal[0, 1], Floats]:
