@@ -162,7 +162,8 @@ class _Site:
     def standing(self) -> list[list[Polygon]]:
         """Ground of the people who stand, for each free side."""
         (event,) = self._scenario.events
-        sides: tuple[int, ...] = (1, -1) if event.free_side else (0,)
+        blocks = event.free_side and self._kind.blocked is not None
+        sides: tuple[int, ...] = (1, -1) if blocks else (event.free_side,)
         return [
             standing_ground(msgspec.structs.replace(event, free_side=side), self._kind)
             for side in sides
