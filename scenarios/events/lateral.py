@@ -50,6 +50,8 @@ COMMIT_M: Final = 1.5
 """Gap in metres between the robot and its path below which the person keeps its direction."""
 STOPS_SHORT_M: Final = 0.22
 """Gap in metres between the person of a decoy and the robot's path."""
+STOPS_BEFORE_M: Final = 2.6
+"""Distance in metres of the robot's centre at which the person of a decoy has stopped, at last."""
 
 
 class _Meeting:
@@ -129,9 +131,11 @@ def _decoy_step(event: Event, state: EventState, number: int, query: EventQuery)
     room_m = 0.5 * query.robot_width_m + PERSON_RADIUS_M + STOPS_SHORT_M
     line_m = event.side * left_m(event, query.robot_x_m, query.robot_y_m)
     short_m = min(max(line_m + room_m, 0.0), edge_m(event))
-    if robot_stands(query) or event.side * left_m(event, walker.x_m, walker.y_m) <= short_m:
+    meeting = _Meeting(walker, across_rad, query)
+    stops = meeting.ahead_m <= STOPS_BEFORE_M
+    if stops or event.side * left_m(event, walker.x_m, walker.y_m) <= short_m:
         return walker
-    pace_mps = _Meeting(walker, across_rad, query).pace_mps(query)
+    pace_mps = event.speed_mps if robot_stands(query) else meeting.pace_mps(query)
     return walk_to(walker, *world_point(event, 0.0, event.side * short_m), pace_mps, sight)
 
 
