@@ -47,7 +47,7 @@ def print_names(out: Console) -> None:
     for name in SUITES:
         whole = load_suite(name)
         out.print(
-            f"suite   {name}  {len(whole.scenarios)} scenarios, version {whole.version}, "
+            f"suite   {name}  {_counts_in_words(whole)}, version {whole.version}, "
             f"{whole.content_hash}"
         )
     for one in ROBOTS.values():
@@ -69,6 +69,12 @@ def print_names(out: Console) -> None:
         out.print(f"goal    {goal.name}  {goal.summary}", soft_wrap=True)
 
 
+def _counts_in_words(suite: Suite) -> str:
+    """Return the number of scenarios of a suite, and how many of them are decoys."""
+    decoys = sum(bool(s.decoy_of) for s in suite.scenarios)
+    return f"{len(suite.scenarios)} scenarios" + (f" ({decoys} decoys)" if decoys else "")
+
+
 def print_scenarios(out: Console, suite: Suite) -> None:
     """Print a row per scenario of a suite."""
     columns = [
@@ -77,6 +83,8 @@ def print_scenarios(out: Console, suite: Suite) -> None:
         *tables.figures("route\nm", "cross-\nings"),
     ]
     columns += [*tables.labels("events"), *tables.figures("bar-\nriers", "limit\ns")]
+    has_decoys = any(s.decoy_of for s in suite.scenarios)
+    columns += tables.labels("decoy of") if has_decoys else []
     rows = []
     for s in suite.scenarios:
         events = s.events[0].kind if len(s.events) == 1 else str(len(s.events))
@@ -86,7 +94,8 @@ def print_scenarios(out: Console, suite: Suite) -> None:
             events,
             str(len(s.barriers)),
         )
-        rows.append((s.id, s.place.name, *numbers, f"{s.time_limit_s:.0f}"))
+        decoy_of = [s.decoy_of or "-"] if has_decoys else []
+        rows.append((s.id, s.place.name, *numbers, f"{s.time_limit_s:.0f}", *decoy_of))
     tables.show(out, columns, rows)
 
 
@@ -226,8 +235,10 @@ def list_suites() -> None:
     for name in SUITES:
         suite = load_suite(name)
         test = sum(scenario.split == "test" for scenario in suite.scenarios)
-        counts = (str(len(suite.scenarios)), str(len(suite.scenarios) - test), str(test))
+        decoys = sum(bool(scenario.decoy_of) for scenario in suite.scenarios)
+        numbers = len(suite.scenarios), len(suite.scenarios) - test, test, decoys
+        counts = (*map(str, numbers),)
         rows.append((name, *counts, suite.version, suite.content_hash, RECIPES[name].purpose))
-    columns = [*tables.names("suite"), *tables.figures("scenarios", "val", "test")]
+    columns = [*tables.names("suite"), *tables.figures("scenarios", "val", "test", "decoys")]
     columns += [*tables.labels("version", "hash"), *tables.words("for")]
     tables.show(out, columns, rows)

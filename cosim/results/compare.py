@@ -288,9 +288,9 @@ def _unit_and_direction(name: str) -> tuple[str, bool | None]:
 def _difference(name: str, before: pd.DataFrame, after: pd.DataFrame) -> PairedDifference:
     """Return the paired difference of a metric; a rate is undefined if a policy crashed."""
     if name == DISCERNED:
-        one, other = (pairs_of(table.reset_index()).solved for table in (before, after))
-        both = one.index.intersection(other.index)
-        return difference_of_means(one[both].to_numpy(float), other[both].to_numpy(float))
+        solved = [pairs_of(table.reset_index()).solved for table in (before, after)]
+        both = solved[0].index.intersection(solved[1].index)
+        return difference_of_means(*(np.asarray(pairs[both], dtype=float) for pairs in solved))
     before, after = without_decoys(before), without_decoys(after)
     if name not in POOLED:
         return difference_of_means(numeric_column(before, name), numeric_column(after, name))

@@ -32,8 +32,7 @@ class Pairs(NamedTuple):
     @property
     def values(self) -> Floats:
         """Return the values of the pairs without invalid members."""
-        values = self.solved.to_numpy(dtype=float)
-        return values[~np.isnan(values)]
+        return np.asarray(self.solved.dropna(), dtype=float)
 
     @property
     def invalid(self) -> int:
@@ -98,6 +97,7 @@ def pairs_of(table: pd.DataFrame) -> Pairs:
     both = decoys.merge(
         events, left_on=["suite_hash", "decoy_of"], right_on=["suite_hash", "scenario"]
     )
-    solved = np.minimum(both["solved_x"], both["solved_y"]).set_axis(both["scenario_x"])
+    members = both.set_index("scenario_x")[["solved_x", "solved_y"]]
+    solved = members.min(axis=1, skipna=False)
     paired = both["scenario_y"].nunique()
     return Pairs(solved, len(decoys) - len(both) + len(events) - paired)

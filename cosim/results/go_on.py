@@ -94,7 +94,8 @@ class PassingWindow:
             if person not in people:
                 self._passed[person] = True
                 continue
-            ahead_m = self._route.project(*people[person].tolist(), near)[0] - route_s_m
+            x_m, y_m = people[person].tolist()
+            ahead_m = self._route.project(x_m, y_m, near)[0] - route_s_m
             self._passed[person] = ahead_m > AHEAD_M if self._from_behind else ahead_m <= -PAST_M
         if all(self._passed):
             self.end = tick + 1

@@ -312,6 +312,8 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
         for called, field, s_m, beyond_m in places:
             if s_m > length_m + beyond_m:
                 yield f"{self.called}{called}{field} is {s_m:g}, but the route ends at {length_m:g}"
+        if self.go_on_mps > 0.0 and (not self.events or self.ends_at == "stop"):
+            yield f"{self.called}go_on_mps needs an event to pass, and ends_at 'goal'"
         names = Counter(name for event in self.events for name in event.names)
         if twice := sorted(name for name, count in names.items() if count > 1):
             yield f"{self.called}two events have a pedestrian '{twice[0]}': give one another id"

@@ -9,9 +9,10 @@ import pytest
 
 from cosim.core.errors import RunError, UsageError
 from cosim.results.run_folder import RunFolder
-from cosim.results.run_spec import RunSpec
+from cosim.results.run_spec import RunSpec, Shard
+from cosim.spec.episode_id import episode_id_of
 from cosim.spec.scenario import Suite
-from cosim.spec.selection import select_scenarios, selection_in_words
+from cosim.spec.selection import pairs_of, select_scenarios, selection_in_words
 from scenarios.suites.catalog import load_suite
 from tests.run_specs import spec_of
 
@@ -80,3 +81,84 @@ def test_a_run_resumed_with_another_selection_names_the_options(
     )
     apart = spec(some).apart(spec(every))
     assert apart is not None and (apart.mine, apart.theirs) == ("30", f"900, with {every[0]}")
+
+
+def with_decoys_of(reactive: Suite) -> Suite:
+    """Ten scenarios of four kinds; all but `static` have a decoy, and all decoys are at the end."""
+    few = [
+        one
+        for one in reactive.scenarios
+        if one.id[-4:] in ("-001", "-002") and one.structure in _FEW
+    ]
+    decoys = [
+        msgspec.structs.replace(one, id=f"{one.id}-decoy", decoy_of=one.id)
+        for one in few
+        if one.events
+    ]
+    return msgspec.structs.replace(reactive, scenarios=(*few, *decoys))
+
+
+_FEW = ("frontal", "lateral", "gesturing", "obstructing", "static")
+PAIRED_CHOICES: dict[str, dict[str, object]] = {
+    "18 of 18 (all)": {},
+    "10 of 18 (--no-decoys)": {"decoys": False},
+    "4 of 18 (--event frontal)": {"kinds": ["frontal"]},
+    "2 of 18 (--event frontal --no-decoys)": {"kinds": ["frontal"], "decoys": False},
+    "2 of 18 (--event frontal --episodes 1)": {"kinds": ["frontal"], "episodes": 1},
+    "2 of 18 (--event static)": {"kinds": ["static"]},
+    "3 of 18 (--episodes 3 --no-decoys)": {"episodes": 3, "decoys": False},
+    "1 of 18 (--scenario frontal-002-decoy)": {"ids": ["frontal-002-decoy"]},
+    "2 of 18 (--scenario lateral-001 --scenario frontal-002-decoy)": {
+        "ids": ["lateral-001", "frontal-002-decoy"]
+    },
+}
+
+
+@pytest.mark.parametrize("words", PAIRED_CHOICES)
+def test_decoys_are_chosen_with_their_scenarios(reactive: Suite, words: str) -> None:
+    """By kind, number and split, unless they are left out; an id chooses one alone. The options
+    are found from the ids."""
+    whole = with_decoys_of(reactive)
+    chosen = select_scenarios(whole, **PAIRED_CHOICES[words])  # type: ignore[arg-type]
+    assert selection_in_words(whole, [scenario.id for scenario in chosen]) == words
+
+
+def test_episodes_counts_pairs_wherever_their_decoys_are(reactive: Suite) -> None:
+    """Three scenarios and their decoys, in the order of the suite; `static` has none."""
+    whole = with_decoys_of(reactive)
+    chosen = select_scenarios(whole, episodes=3)
+    first = [one.id for one in whole.scenarios[:3]]
+    decoys = [one.id for one in whole.scenarios if one.decoy_of in first]
+    assert [one.id for one in chosen] == [*first, *decoys] and decoys
+    with pytest.raises(UsageError, match="--no-decoys: only decoys of suite 'reactive' are chosen"):
+        select_scenarios(whole, ["frontal-001-decoy"], decoys=False)
+
+
+def test_shards_keep_pairs_together(reactive: Suite) -> None:
+    """However many they are, each scenario is in one shard, its decoy in the same."""
+    pairs = pairs_of(with_decoys_of(reactive).scenarios)
+    assert sorted(map(len, pairs)) == [1] * 2 + [2] * 8
+    for of in (2, 3, 7):
+        parts = [
+            [one for pair in Shard(number, of).share(pairs) for one in pair]
+            for number in range(1, of + 1)
+        ]
+        ids = [one.id for part in parts for one in part]
+        assert len(ids) == len({*ids}) == 18
+        assert all(
+            one.decoy_of in {other.id for other in part}
+            for part in parts
+            for one in part
+            if one.decoy_of
+        )
+
+
+def test_nothing_that_a_policy_gets_tells_a_decoy(reactive: Suite) -> None:
+    """Ids, seeds and order of a pair are drawn independently of each other: over many seeds of a
+    run, each of them puts the decoy first in about half of all pairs."""
+    pairs = [pair for pair in pairs_of(with_decoys_of(reactive).scenarios) if len(pair) == 2]
+    told = [[episode_id_of(seed, one) for one in pair] for seed in range(250) for pair in pairs]
+    for values in (told, [[one.seed for one in pair] for pair in told]):
+        decoy_first = sum(decoy < event for event, decoy in values)
+        assert 900 < decoy_first < 1100
+    assert all(len(one.episode) == 12 for pair in told for one in pair)

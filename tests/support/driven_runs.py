@@ -107,13 +107,25 @@ def episode_of(
     ), log
 
 
+def with_decoys(*ways: Scenario) -> tuple[Scenario, ...]:
+    """Scenarios, each followed by its decoy."""
+    return tuple(
+        one
+        for way in ways
+        for one in (
+            way,
+            msgspec.structs.replace(way, id=f"{way.id}-decoy", decoy_of=way.id, go_on_mps=0.5),
+        )
+    )
+
+
 def run_of(
     path: Path, hows: Sequence[str], policy: str = "p", scenarios: Sequence[Scenario] = ()
 ) -> Path:
     """A finished run of one short way after the other, each as `episode_of` says; s-000, s-001 and
     so on."""
     ways = tuple(scenarios) or tuple(short_way(f"s-{i:03d}") for i in range(len(hows)))
-    suite = Suite(name="s", version="1", scenarios=ways)
+    suite = Suite(name=ways[0].suite, version="1", scenarios=ways)
     with RunFolder.create(path, spec_of(suite, policy), suite) as folder:
         for way, how in zip(ways, hows, strict=True):
             record, log = episode_of(way, suite.content_hash, how, policy)

@@ -42,7 +42,7 @@ def make_env(
     suite: a loaded suite, or a name or path as for `load_suite`.
     manifest: observations and their rate, as for any policy, so that the learned policy can run
     with it. See `scenarios.tools.gym.spaces.seen_space` for the names.
-    scenarios, events: only these ids, only these kinds of events.
+    scenarios, events: only these ids, only these kinds of events. Decoys are scenarios like others.
     split: split of the scenarios; None for all, including `test`.
     actions: "command" or "waypoints"; see `scenarios.tools.gym.spaces.action_space_of`.
     reward: reward of a step, a function of a `scenarios.tools.gym.reward.Transition`.

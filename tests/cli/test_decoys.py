@@ -1,0 +1,57 @@
+"""Decoys on the command line: which are run, with which shards, and what their table says."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import pandas as pd
+import pytest
+
+from cosim.spec.scenario import write_suite
+from scenarios.suites.catalog import load_suite
+from tests.conftest import Cosim
+
+
+@pytest.fixture
+def few(tmp_path: Path) -> Path:
+    """Two scenarios of `reactive` that are over after a second, and their decoys at the end."""
+    whole = load_suite("reactive")
+    events = [
+        msgspec.structs.replace(one, time_limit_s=1.0)
+        for one in whole.scenarios
+        if one.id in ("lateral-001", "overtaking-001")
+    ]
+    decoys = [
+        msgspec.structs.replace(one, id=f"{one.id}-decoy", decoy_of=one.id, go_on_mps=0.6)
+        for one in events
+    ]
+    path = tmp_path / "few.json"
+    write_suite(msgspec.structs.replace(whole, scenarios=(*events, *decoys)), path)
+    return path
+
+
+@pytest.mark.engine
+def test_decoys_run_with_their_scenarios(few: Path, tmp_path: Path, cosim: Cosim) -> None:
+    """In each shard pairs alone, which merged have D; one alone by its id, none with --no-decoys; a
+    run is resumed with its own choice; `cosim score` and `cosim list` know decoys."""
+
+    always = ("run", few.name, "--policy", "stop", "--seed", "7")
+
+    def run(name: str, *words: str) -> set[str]:
+        said = cosim(*always, "--out", name, *words, cwd=tmp_path)
+        assert said.returncode == 0, said
+        return {*pd.read_csv(tmp_path / name / "results.csv")["scenario"]}
+
+    assert run("1", "--shard", "1/2") == {"lateral-001", "lateral-001-decoy"}
+    assert run("2", "--shard", "2/2") == {"overtaking-001", "overtaking-001-decoy"}
+    said = cosim("merge", "1", "2", "--out", "both", cwd=tmp_path)
+    assert said.returncode == 0 and "decoys count in D alone, over 2 pairs" in said.stdout, said
+    assert cosim("score", "both", cwd=tmp_path).returncode == 0
+    assert run("events", "--no-decoys") == {"lateral-001", "overtaking-001"}
+    assert run("one", "--scenario", "lateral-001-decoy") == {"lateral-001-decoy"}
+    assert run("one", "--scenario", "lateral-001-decoy", "--resume") == {"lateral-001-decoy"}
+    said = cosim(*always, "--out", "events", "--resume", cwd=tmp_path)
+    assert "2 of 4 (--no-decoys), now asked for is 4 of 4 (all)" in said.stderr, said
+    said = cosim("list", few.name, cwd=tmp_path)
+    assert "decoy of" in said.stdout and "lateral-001-decoy" in said.stdout

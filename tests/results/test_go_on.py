@@ -1,0 +1,205 @@
+"""The go-on rule of decoys: where its window ends, what breaks it, and how a record is checked."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import msgspec
+import numpy as np
+import pytest
+
+from cosim.core.geometry import Polyline
+from cosim.core.state import Command
+from cosim.report.page.reasons import mishaps_of, reason_of
+from cosim.results.go_on import STOP_S, Passing, PassingWindow, passing_of
+from cosim.results.log import Log
+from cosim.results.record import Record
+from cosim.results.rejudge import contradictions
+from cosim.spec.events import (
+    Event,
+    EventKind,
+    EventQuery,
+    EventState,
+    SidewalkLayout,
+    Walker,
+)
+from cosim.spec.manifest import Manifest
+from cosim.spec.scenario import Scenario
+from scenarios.episodes.episode import Episode
+from scenarios.events import EVENT_KINDS
+from scenarios.events.walking import edge_m, walker_at
+from scenarios.suites.catalog import load_suite
+
+ROUTE = Polyline(((0.0, 0.0), (30.0, 0.0)))
+EVENT = Event(
+    id="e0", kind="lateral", x_m=10.0, y_m=0.0, heading_rad=0.0, route_s_m=10.0, half_width_m=1.6
+)
+
+
+def window_end(
+    kind: str, robot_mps: float, person: Callable[[float], float | None], **fields: object
+) -> int | None:
+    """The tick after the window of a robot from 8 m on; person: arc length at a time, None for
+    gone."""
+    event = msgspec.structs.replace(EVENT, **fields)
+    window = PassingWindow(ROUTE, event, EVENT_KINDS[kind])
+    for tick in range(200):
+        at_s = (tick + 1) / 20
+        place = person(at_s)
+        people = {} if place is None else {0: np.array([place, 1.0])}
+        window.see(tick, 8.0 + robot_mps * at_s, people)
+    return window.end
+
+
+def test_the_window_ends_one_metre_past_the_person() -> None:
+    """Of one who stands at 10 m: at 11 m, after 60 ticks of 0.05 m; of one who walks on ahead,
+    never; of one who leaves the street, then."""
+    assert window_end("lateral", 1.0, lambda s: 10.0) == 60
+    assert window_end("lateral", 1.0, lambda s: 10.0 + 1.2 * s) is None
+    assert window_end("lateral", 1.0, lambda s: None if s > 2.0 else 10.0 + s) == 41
+    assert window_end("lateral", 0.1, lambda s: 10.0) is None
+
+
+def test_the_window_of_one_who_overtakes_ends_when_they_are_ahead() -> None:
+    """From 1 m behind at 2 m/s past a robot at 1 m/s: 3 m ahead after 4 s; the robot is ahead of
+    them at first, which ends nothing. A trigger of the scenario's own decides like the kind's."""
+    overtakes = lambda s: 7.0 + 2.0 * s  # noqa: E731
+    assert window_end("overtaking", 1.0, overtakes) == 81
+    assert window_end("lateral", 1.0, overtakes, trigger_m=-1.0) == 81
+    assert window_end("overtaking", 2.0, overtakes) is None
+
+
+def test_mean_speed_and_stops_are_those_of_the_window() -> None:
+    """Ticks before and after it count neither; backwards is slower than a stop; 0.45 s is none."""
+    v_mps = np.array([0.0] * 20 + [2.0] * 10 + [0.0] * 9 + [2.0] * 21 + [0.0] * 40)
+    route_s_m = np.cumsum(v_mps) * 0.05
+    assert passing_of(route_s_m, v_mps, 0.05, 20, 60) == pytest.approx((3.1 / 2.0, 0.45))
+    assert passing_of(route_s_m, v_mps, 0.05, 20, 101) is None
+    longer = np.where(np.arange(100) == 39, -1.0, v_mps)
+    found = passing_of(np.cumsum(longer) * 0.05, longer, 0.05, 20, 60)
+    assert found is not None and found.stopped_s == pytest.approx(STOP_S)
+    assert found.mean_mps > 1.4 and not found.goes_on(1.0)
+    assert Passing(1.0, 0.45).goes_on(1.0) and not Passing(0.99, 0.0).goes_on(1.0)
+
+
+def stands(event: Event, number: int) -> Walker:
+    """At the edge of the sidewalk."""
+    return walker_at(event, 0.0, edge_m(event), math.pi)
+
+
+def stays(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:
+    return state.walkers[number]
+
+
+WAVING = EventKind(
+    name="waving",
+    layout=SidewalkLayout((16.0, 18.0), (9.0, 10.0)),
+    trigger_m=8.0,
+    begin=stands,
+    step=stays,
+    ends=lambda event, state, query: query.route_s_m > event.route_s_m + 3.0,
+)
+GO_ON_MPS = 0.8
+
+
+def waving() -> Scenario:
+    """A decoy: somebody waves at the edge of a sidewalk of `reactive`."""
+    (one,) = (s for s in load_suite("reactive").scenarios if s.id == "obstructing-001")
+    (event,) = one.events
+    return msgspec.structs.replace(
+        one,
+        id=f"{one.id}-decoy",
+        decoy_of=one.id,
+        go_on_mps=GO_ON_MPS,
+        obstacles=(),
+        events=(msgspec.structs.replace(event, kind="waving", decoy=True, side=1),),
+    )
+
+
+def drive(scenario: Scenario, speed: Callable[[float, float], float]) -> tuple[Record, Log]:
+    """An episode at a speed by time, s, and arc length, m, straight ahead."""
+    kinds = {**EVENT_KINDS, WAVING.name: WAVING}
+    with Episode(scenario, Manifest("ahead", camera=None), kinds=kinds) as episode:
+        episode.reset()
+        while not episode.over:
+            s_m = episode.moment.route_s_m
+            episode.advance(Command(speed(episode.time_s, s_m), 0.0))
+        return episode.result()
+
+
+@pytest.mark.engine
+def test_a_decoy_is_solved_by_going_on_and_by_nothing_else() -> None:
+    """At 1.2 m/s it is; a stop breaks the rule at any mean speed, a crawl without a stop, too. All
+    reach the goal in time without a failure, and the files say the same."""
+    scenario = waving()
+    (event,) = scenario.events
+    record, log = drive(scenario, lambda time_s, s_m: 1.2)
+    (passed,) = record.events
+    assert (record.status, record.ended, passed.rule_met) == ("done", "goal", True), record
+    assert record.measures["success"] == 1.0 and record.scenario.decoy_of == "obstructing-001"
+    assert passed.passed_at_s is not None and passed.passing_mps == pytest.approx(1.2, abs=0.1)
+    end = round(passed.passed_at_s / log.tick_s) - 1
+    assert log.route_s_m[end] == pytest.approx(event.route_s_m + 1.0, abs=0.1)
+    assert not [*contradictions(record, scenario, log)]
+
+    paused: list[float] = []
+
+    def stops(time_s: float, s_m: float) -> float:
+        if s_m > event.route_s_m - 3.0 and (not paused or time_s - paused[0] < 2.0):
+            paused.append(time_s)
+            return 0.0
+        return 2.4
+
+    broken = {"stopped for": stops, "passed at 0.5": lambda time_s, s_m: 0.55}
+    for words, speed in broken.items():
+        record, log = drive(scenario, speed)
+        (passed,) = record.events
+        assert (record.status, record.ended, record.failures) == ("done", "goal", ()), words
+        assert passed.rule_met is False and record.measures["success"] == 0.0
+        assert record.measures["broke_rule"] == 1.0
+        assert ((passed.passing_mps or 0.0) > GO_ON_MPS) == (words == "stopped for")
+        (mishap,) = mishaps_of(record)
+        assert words in reason_of(scenario, record, mishap, log)
+        assert not [*contradictions(record, scenario, log)]
+        better = msgspec.structs.replace(passed, rule_met=True)
+        edited = msgspec.structs.replace(record, events=(better,))
+        assert [one.what for one in contradictions(edited, scenario, log)] == [
+            "rule_met of event e0"
+        ]
+        faster = msgspec.structs.replace(passed, stopped_s=0.0, passing_mps=2.0, rule_met=True)
+        edited = msgspec.structs.replace(record, events=(faster,))
+        assert [one.what for one in contradictions(edited, scenario, log)] == [
+            "passing_mps, stopped_s of event e0",
+            "rule_met of event e0",
+        ]
+        early = msgspec.structs.replace(passed, passed_at_s=None)
+        edited = msgspec.structs.replace(record, events=(early,))
+        assert "passed_at_s of event e0" in [c.what for c in contradictions(edited, scenario, log)]
+
+
+@pytest.mark.engine
+def test_a_robot_that_never_passes_has_not_gone_on() -> None:
+    """It stays before the person until the time is over: no window ends, and the rule is not
+    met; without the rule it is none."""
+    scenario = msgspec.structs.replace(waving(), time_limit_s=9.0)
+    (event,) = scenario.events
+    waits = lambda time_s, s_m: 0.0 if s_m > event.route_s_m - 3.0 else 1.5  # noqa: E731
+    record, log = drive(scenario, waits)
+    (outcome,) = record.events
+    assert (record.ended, outcome.passed_at_s, outcome.rule_met) == ("timeout", None, False)
+    assert outcome.triggered_at_s is not None and not [*contradictions(record, scenario, log)]
+    record, _ = drive(msgspec.structs.replace(scenario, go_on_mps=0.0), waits)
+    assert record.events[0].rule_met is None
+
+
+@pytest.mark.engine
+def test_a_decoy_that_nobody_could_see_is_invalid(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same rule as for an event: the goal without a failure, and nothing to be seen."""
+    scenario = waving()
+    unseen = dataclasses.replace(WAVING, trigger_m=0.01)
+    monkeypatch.setitem(globals(), "WAVING", unseen)
+    record, _ = drive(scenario, lambda time_s, s_m: 1.2)
+    assert (record.status, record.ended) == ("invalid", "goal")
+    assert "event e0 (waving) never triggered" in record.reason
