@@ -63,6 +63,8 @@ PATIENCE_S: Final = (2.0, 4.0)
 """Least and largest time for which a person waits in front of a standing robot."""
 _TRIGGER_SHARE: Final = (0.6, 1.0)
 """Least and largest trigger distance, as a share of the kind's."""
+_NEAREST_TRIGGER_M: Final = 3.0
+"""Least trigger distance in metres, if the kind's is larger: people must be in the picture."""
 _BEFORE_TRIGGER_M: Final = 1.0
 """Least length of route before the trigger, in metres."""
 _BAND_M: Final = 1.0
@@ -267,6 +269,7 @@ def _drawn_trigger_m(
 ) -> float:
     """Draw the distance before an event at which it begins, short enough for the route."""
     low_m, high_m = sorted(share * kind_m for share in _TRIGGER_SHARE)
+    low_m = max(low_m, min(kind_m, _NEAREST_TRIGGER_M))
     most_m = length_m - after_m - _BEFORE_TRIGGER_M - _BAND_M
     if most_m < low_m:
         raise SpecError("the route is too short for the event")
