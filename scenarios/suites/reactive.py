@@ -57,6 +57,8 @@ metres.
 ENDS_CLEAR_M = 6.0
 """Least distance of route and event from the ends of their sidewalk, in metres."""
 BEND_M = 0.15
+_STEP_M: Final = 3.0
+"""Distance between the points of a straight route, in metres: the suite's file stays small."""
 _SPEEDS_MPS = (1.1, 1.65)
 """Least and largest walking speed in the paper, in m/s."""
 PATIENCE_S: Final = (2.0, 4.0)
@@ -255,7 +257,7 @@ def _along(
     sin, cos = math.sin(pose.heading_rad), math.cos(pose.heading_rad)
     aside = pose.x_m - found.left_m * sin, pose.y_m + found.left_m * cos
     return EventSpot(
-        stepped(line, wanted.length_m),
+        stepped(line, wanted.length_m, _STEP_M),
         Pose(*aside, pose.heading_rad),
         event_m,
         found.half_m,
@@ -314,11 +316,11 @@ def straight_along(strip: Strip, length_m: float, rng: np.random.Generator) -> P
     return chord
 
 
-def stepped(line: Polyline, length_m: float) -> Floats:
-    """Return points of a straight line up to a length, (N, 2), about a metre apart, in whole
+def stepped(line: Polyline, length_m: float, step_m: float = 1.0) -> Floats:
+    """Return points of a straight line up to a length, (N, 2), at most step_m apart, in whole
     millimetres.
     """
-    steps = np.linspace(0.0, length_m, math.ceil(length_m) + 1)
+    steps = np.linspace(0.0, length_m, math.ceil(length_m / step_m) + 1)
     return np.round([line.at(float(s)).xy for s in steps], 3)
 
 
@@ -340,7 +342,7 @@ def _over(
     near = (one for one in street_map.near("strip", line) if isinstance(one, Strip))
     if any(one.kind == "crossing" and one.polygon.intersects(line) for one in near if one != strip):
         raise SpecError("the way leads over two crossings")
-    return _spot_over(street_map, strip, leave, Polyline(stepped(route, route.length_m)))
+    return _spot_over(street_map, strip, leave, Polyline(stepped(route, route.length_m, _STEP_M)))
 
 
 def _crossed(strip: Strip, rng: np.random.Generator) -> tuple[Literal[0, 1], Floats]:
