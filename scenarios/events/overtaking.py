@@ -27,7 +27,6 @@ from cosim.spec.events import (
 )
 from scenarios.events.sight import Sight, sight_of
 from scenarios.events.walking import (
-    MET_M,
     along_m,
     distance_m,
     edge_m,
@@ -63,7 +62,7 @@ _CREEPS_MPS: Final = 0.1
 _EASES_MPS2: Final = 0.6
 """Acceleration in m/s^2 with which its speed follows the robot's after cutting in."""
 YIELDED_S: Final = 5.0
-"""Seconds without an approach after which the robot counts as having let it in."""
+"""Seconds without an approach after which a robot that moves counts as having let it in."""
 _NEARER_M: Final = 0.1
 """Metres by which the lead must shrink to count as an approach."""
 _COMMIT_M: Final = 0.5
@@ -72,8 +71,10 @@ _TO_LINE_M: Final = 0.4
 """Look-ahead distance in metres at which it aims for the robot's line after cutting in."""
 _CLEAR_AHEAD_M: Final = 5.0
 """Lead in metres at which the person of a decoy has overtaken."""
-_LOOK_AHEAD_M: Final = 1.5
-"""Metres ahead on its line that it aims at."""
+_LOOK_AHEAD_M: Final = 1.2
+"""Metres ahead on its line that it aims at, while the robot moves."""
+_CUTS_SHORT_M: Final = 0.4
+"""The same while the robot stands."""
 
 
 def _begin(event: Event, number: int) -> Walker:
@@ -87,7 +88,7 @@ def _step(event: Event, state: EventState, number: int, query: EventQuery) -> Wa
         return walk_on(walker, event.heading_rad, event.speed_mps, sight)
     if walker.pace_mps is not None:
         return _before_robot(event, waiting_for_robot(event, walker, query), query, sight)
-    if robot_stands(query):
+    if robot_stands(query) and walker.aim_rad is None:
         return walker
     lead_m = _lead_m(event, walker, query)
     line_m = left_m(event, query.robot_x_m, query.robot_y_m)
@@ -100,16 +101,17 @@ def _step(event: Event, state: EventState, number: int, query: EventQuery) -> Wa
         and abs(left_m(event, walker.x_m, walker.y_m) - line_m) < ON_LINE_M
     ):
         return msgspec.structs.replace(walker, pace_mps=_slowed_mps(query))
-    aim = world_point(event, along_m(event, walker.x_m, walker.y_m) + _LOOK_AHEAD_M, line_m)
+    ahead_m = _CUTS_SHORT_M if robot_stands(query) else _LOOK_AHEAD_M
+    aim = world_point(event, along_m(event, walker.x_m, walker.y_m) + ahead_m, line_m)
     return walk_to(walker, *aim, _passing_mps(event, query), sight)
 
 
 def _before_robot(event: Event, walker: Walker, query: EventQuery, sight: Sight) -> Walker:
     """Move one tick in front of the robot: slowly, and on its line until the robot is near."""
-    walker = _eased(event, walker, query)
-    assert walker.pace_mps is not None
     if robot_stands(query):
         return walker
+    walker = _eased(event, walker, query)
+    assert walker.pace_mps is not None
     heading_rad = event.heading_rad
     if distance_m(walker, query) > query.robot_length_m / 2 + PERSON_RADIUS_M + _COMMIT_M:
         room_m = event.half_width_m - PERSON_RADIUS_M
@@ -169,8 +171,7 @@ def _ends(event: Event, state: EventState, query: EventQuery) -> bool:
     (walker,) = state.walkers
     passed = walker.pace_mps is not None and _lead_m(event, walker, query) < -1.0
     waited = walker.counted_ticks * query.tick_ms / 1000 >= YIELDED_S
-    near = distance_m(walker, query) <= MET_M
-    return passed or (waited and near) or lost_patience(event, walker, query)
+    return passed or waited or lost_patience(event, walker, query)
 
 
 OVERTAKING: Final = EventKind(

@@ -178,8 +178,8 @@ def test_an_event_that_makes_no_sense_is_refused() -> None:
 
 
 def test_a_frontal_pedestrian_does_not_push_the_robot() -> None:
-    """It runs into a standing robot, stops there, and after a while goes round it and on, never
-    inside its outline."""
+    """It runs into a robot whose wheels turn in vain, stops there, and after its patience goes round
+    it and on, never inside its outline."""
     one = event("frontal")
     states: tuple[EventState, ...] = ()
     gaps = []
@@ -189,7 +189,7 @@ def test_a_frontal_pedestrian_does_not_push_the_robot() -> None:
         away = np.abs([states[0].walkers[0].x_m - 35.0, states[0].walkers[0].y_m]) - (0.35, 0.275)
         gaps.append(float(np.hypot(*np.maximum(away, 0.0))) - 0.3)
     assert -0.065 < min(gaps) <= 0.01
-    assert sum(gap <= 0.01 for gap in gaps) == pytest.approx(40, abs=8)
+    assert sum(gap <= 0.01 for gap in gaps) == pytest.approx(50, abs=8)
     assert states[0].phase == "gone" and states[0].walkers[0].x_m < 33.0
 
 
