@@ -52,7 +52,7 @@ def compare(
 ) -> None:
     """Compare runs with the first one, paired by scenario.
 
-    Prints differences with bootstrap intervals over the suite, and by event, structure and split.
+    Prints differences with their intervals over the suite, and by event, structure and split.
     Lists the scenarios whose result flipped.
     """
     from cosim.report.compared import FORMATS
@@ -228,7 +228,7 @@ def show(
 ) -> None:
     """Show the table of a run, finished or not, or one episode as a picture from above."""
     from cosim.cli.run_table import kinds_of, print_by_kind, print_table
-    from cosim.results.finished_run import check_record_file
+    from cosim.results.finished_run import check_record_file, other_schema
     from cosim.results.run_folder import read_records, read_spec
     from cosim.results.table import table_of
 
@@ -250,6 +250,12 @@ def show(
         table = table_of(records.values())
         print_table(out, table, len(spec.scenarios), folder)
         print_by_kind(out, table, kinds_of(folder))
+        if words := next(filter(None, map(other_schema, records.values())), ""):
+            out.print(
+                f"{words}: its values are shown as recorded, and pooled rates may be missing",
+                soft_wrap=True,
+                highlight=False,
+            )
         return
     if episode not in records:
         raise unknown(f"finished episode in {folder}", episode, records)

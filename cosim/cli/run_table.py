@@ -20,13 +20,20 @@ from cosim.results.discerned import (
     with_discerned,
     without_decoys,
 )
+from cosim.results.intervals import MIN_N, Estimate
 from cosim.results.log import holds_waypoints
-from cosim.results.metrics import COUNTERFACTUAL, SUCCESS_IN_WORDS
+from cosim.results.metrics import (
+    COUNTERFACTUAL,
+    RATED_EXTRA_M,
+    RATED_PER_PROGRESS,
+    SUCCESS_IN_WORDS,
+)
 from cosim.results.table import (
     INJECTED,
+    crashed_in,
+    estimate_of,
     injections_in_words,
     policy_in_words,
-    summary_of,
     why_inconclusive,
 )
 from cosim.spec.scenario import Scenario, read_suite
@@ -129,28 +136,27 @@ def print_means(out: Console, table: pd.DataFrame) -> None:
     if not len(table):
         return
     means = with_discerned(dict(MEANS), has_decoys(table))
-    summary = summary_of(table, [*means]).iterrows()
     rows = [
-        (f"{name} ({head})" if head else name, *_mean_cells(row))
-        for (name, head), (_, row) in zip(means.items(), summary, strict=True)
+        (f"{name} ({head})" if head else name, *_mean_cells(estimate_of(table, name)))
+        for name, head in means.items()
     ]
     over = "over all but decoys" if has_decoys(table) else "over all episodes"
     tables.show(out, [*tables.names(over), *tables.figures(*_MEAN_HEADS)], rows)
-    crashed = int((without_decoys(table)["status"] == "crashed").sum())
-    missing = f"; none, because {crashed} crashed" if crashed else ""
+    crashed = crashed_in(without_decoys(table))
+    failed = f"; no rates: {crashed} crashed, which counts as SR, RC, SPL and V of 0"
     out.print(
-        f"rates are pooled: all failures on all metres{missing}; what crashed counts as the "
-        f"worst elsewhere"
+        f"rates are pooled: all failures on all metres, of an episode at most "
+        f"{RATED_PER_PROGRESS:g} x its progress + {RATED_EXTRA_M:g} m{failed if crashed else ''}; "
+        f"below {MIN_N} episodes only counts"
     )
     if has_decoys(table):
         out.print(f"decoys count in D alone, over {pairs_of(table).in_words}", highlight=False)
     print_by_split(out, table)
 
 
-def _mean_cells(row: pd.Series[float]) -> tuple[str, str, str]:
-    """Return mean, interval and number of episodes from a row of `summary_of`, as text."""
-    interval = f"{value_in_words(row['low'])} to {value_in_words(row['high'])}" if row["n"] else "-"
-    return value_in_words(row["mean"]), interval, f"{row['n']:.0f}"
+def _mean_cells(estimate: Estimate) -> tuple[str, str, str]:
+    """Return mean, interval and number of episodes as text."""
+    return estimate.in_words, estimate.interval_in_words(), f"{estimate.n}"
 
 
 def print_statuses(out: Console, table: pd.DataFrame, scheduled: int) -> None:
@@ -246,10 +252,7 @@ def print_delays(out: Console, table: pd.DataFrame) -> None:
     """Print the delays caused by the robot, per episode; nothing without `--counterfactual`."""
     if not set(COUNTERFACTUAL) <= set(table.columns):
         return
-    rows = [
-        (str(name), *_mean_cells(row))
-        for name, row in summary_of(table, tuple(COUNTERFACTUAL)).iterrows()
-    ]
+    rows = [(name, *_mean_cells(estimate_of(table, name))) for name in COUNTERFACTUAL]
     first = tables.names("against the same street without the robot")
     tables.show(out, [*first, *tables.figures("per episode", *_MEAN_HEADS[1:])], rows)
 
@@ -273,39 +276,46 @@ def has_single_event(scenario: Scenario) -> bool:
 
 
 def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -> None:
-    """Print a row of means per kind of scenario; nothing for fewer than two kinds."""
+    """Print a row of means per kind of scenario; nothing for fewer than two kinds.
+
+    A column counts crashed episodes if there are any.
+    """
     named = [kind for kind in dict.fromkeys(kinds.values()) if kind]
     if len(named) < 2:
         return
     people = bool(table["pedestrian_distance_min_m"].notna().any())
     columns = WITH_PEOPLE if people else WITHOUT_PEOPLE
     d_heads = ("D", "95 % of D", "pairs") if has_decoys(table) else ()
-    heads = ("n", "SR", "95 % of SR", *d_heads, *(head for _, head in columns), "in-\nvalid")
+    crashed = ["crash"] if crashed_in(without_decoys(table)) else []
+    shown = ("n", *crashed, "SR", "95 % of SR", *d_heads)
+    heads = (*shown, *(head for _, head in columns), "in-\nvalid")
     rows = []
     for kind in named:
         part = table[table["scenario"].map(kinds) == kind]
-        means = summary_of(part, ("success", *(name for name, _ in columns)))
-        low, high, scored = (float(means[column].iloc[0]) for column in ("low", "high", "n"))
-        interval = f"{low:.2f}..{high:.2f}" if scored else "-"
-        success, *rest = (value_in_words(mean) for mean in means["mean"])
+        success, *rest = (
+            estimate_of(part, name) for name in ("success", *(name for name, _ in columns))
+        )
+        counts = f"{success.n}", *([f"{crashed_in(without_decoys(part))}"] if crashed else [])
         of_d = _d_cells(part) if d_heads else ()
-        invalid = str((part["status"] == "invalid").sum())
-        rows.append((kind, f"{scored:.0f}", success, interval, *of_d, *rest, invalid))
+        shares = (success.in_words, success.interval_in_words(".."), *of_d)
+        means = (estimate.in_words for estimate in rest)
+        rows.append((kind, *counts, *shares, *means, f"{(part['status'] == 'invalid').sum()}"))
     tables.show(out, [*tables.names(""), *tables.figures(*heads)], rows)
+    unknown = "; - unknown, because an episode crashed" if crashed else ""
     out.print(
         "n episodes that are scored; hit a person, hit else, left lane, broke rule: share of "
         "these; nearest: least distance to a person's centre, mean over episodes, of wins: over "
-        "those that succeeded; SPL success by path length"
+        f"those that succeeded; SPL success by path length{unknown}"
         if people
         else "n episodes that are scored; hit else, left lane: share of these; SPL success "
-        "weighted by path length"
+        f"weighted by path length{unknown}"
     )
 
 
 def _d_cells(part: pd.DataFrame) -> tuple[str, str, str]:
     """Return D, its interval and the number of pairs, as text."""
-    mean, low, high, n = summary_of(part, [DISCERNED]).iloc[0]
-    return value_in_words(mean), f"{low:.2f}..{high:.2f}" if n else "-", f"{n:.0f}"
+    estimate = estimate_of(part, DISCERNED)
+    return estimate.in_words, estimate.interval_in_words(".."), f"{estimate.n}"
 
 
 def print_by_split(out: Console, table: pd.DataFrame) -> None:
@@ -316,12 +326,12 @@ def print_by_split(out: Console, table: pd.DataFrame) -> None:
     columns = with_discerned(shown, has_decoys(table))
     rows = []
     for split, part in table.groupby("split", sort=False):
-        means = summary_of(part, [*columns])
+        means = [estimate_of(part, name) for name in columns]
         cells = (
-            f"{value_in_words(row['mean'])} "
-            f"{value_in_words(row['low'])}..{value_in_words(row['high'])}"
-            for _, row in means.iterrows()
+            f"{one.in_words} {one.interval_in_words('..')}" if one.has_interval else one.in_words
+            for one in means
         )
-        rows.append((str(split), f"{means['n'].iloc[0]:.0f}", *cells))
-    heads = ("n", *(f"{head}, 95 %" for head in columns.values()))
+        crashed = f"{crashed_in(without_decoys(part))}"
+        rows.append((str(split), f"{means[0].n}", crashed, *cells))
+    heads = ("n", "crashed", *(f"{head}, 95 %" for head in columns.values()))
     tables.show(out, [*tables.names("split"), *tables.figures(*heads)], rows)

@@ -310,27 +310,32 @@ def _print_run(own: OwnFile, tables: Sequence[pd.DataFrame], path: Path) -> None
 
 def _print_sweep(summary: pd.DataFrame, fields: list[str]) -> None:
     """Print the means of a sweep, a row per value, with intervals below."""
+    from cosim.results.intervals import MIN_N, Estimate
     from cosim.results.metrics import SUCCESS_IN_WORDS
     from scenarios.suites.user_scenarios.sweep import SWEPT
 
     columns = [
         *tables.names(*(field.replace(".", ".\n") for field in fields)),
-        *tables.figures("n"),
+        *tables.figures("n", "crashed"),
     ]
     columns += tables.labels("SR", "SPL", "RC", "FC /100m")
     shown = []
     for values, rows in summary.groupby(fields, sort=False):
         means = rows.set_index("metric").loc[list(SWEPT)]
-        cells = [
-            "-" if row["n"] == 0 else f"{row['mean']:.2f}\n{row['low']:.2f}..{row['high']:.2f}"
-            for _, row in means.iterrows()
+        estimates = [
+            Estimate(*row) for row in means[list(Estimate._fields)].itertuples(index=False)
         ]
-        scored = f"{means['n'].max():.0f}"
-        shown.append((*(f"{value}" for value in values), scored, *cells))
+        cells = [
+            f"{one.in_words}\n{one.interval_in_words('..')}" if one.has_interval else one.in_words
+            for one in estimates
+        ]
+        counts = f"{max(one.n for one in estimates)}", f"{means['crashed'].iloc[0]}"
+        shown.append((*(f"{value}" for value in values), *counts, *cells))
     tables.show(out, columns, shown)
     out.print(
         f"n episodes that are scored; SR {SUCCESS_IN_WORDS}; SPL the same by path length; RC share "
-        "of the route done; FC all failures on all metres, per 100 m; below: 95 % intervals"
+        "of the route done; FC all failures on all metres, per 100 m; below: 95 % intervals, or "
+        f"only counts of less than {MIN_N} episodes"
     )
 
 

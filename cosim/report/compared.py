@@ -10,8 +10,8 @@ import pandas as pd
 
 from cosim.results.compare import MIN_CHANGED, ComparedRun, RunComparison
 from cosim.results.discerned import DISCERNED, DISCERNED_IN_WORDS
+from cosim.results.intervals import BOOTSTRAP, MIN_N
 from cosim.results.metrics import SUCCESS_IN_WORDS
-from cosim.results.table import BOOTSTRAP
 
 _HLINES: Final[list[Any]] = [
     {"selector": f"{rule}rule", "props": ":hline"} for rule in ("top", "mid", "bottom")
@@ -99,6 +99,9 @@ def tables_of_comparison(result: RunComparison, other: ComparedRun) -> tuple[Tex
 
 
 def _figures(row: Mapping[Hashable, Any]) -> tuple[str, ...]:
+    """Return both values, their difference, its interval, n and verdict; of few pairs counts."""
+    if row["n"] < MIN_N and row["counts_before"]:
+        return (row["counts_before"], row["counts_after"], "-", "-", f"{row['n']}", row["verdict"])
     interval = "-" if pd.isna(row["low"]) else f"{_signed(row['low'])} to {_signed(row['high'])}"
     values = (_plain(row["value_before"]), _plain(row["value_after"]), _signed(row["difference"]))
     return (*values, interval, f"{row['n']}", row["verdict"])
@@ -134,7 +137,8 @@ def how_to_read(result: RunComparison) -> str:
     of_d = f"D {DISCERNED_IN_WORDS}, paired by event and decoy; " if has_d else ""
     return (
         "Paired by scenario, rates pooled; intervals by drawing scenarios again in pairs, "
-        f"{BOOTSTRAP} times, always the same. Within noise: the interval holds 0. Too few: it does "
+        f"{BOOTSTRAP} times, always the same; below {MIN_N} scenarios only counts, and no verdict. "
+        "Within noise: the interval holds 0. Too few: it does "
         f"not, but fewer than {MIN_CHANGED} scenarios changed (of a rate: of those with a "
         "failure). Differs: it does not, and there is no verdict. One interval in twenty misses "
         f"by chance alone: {shown} stand in these tables, {in_all} in a .csv, a row for every "

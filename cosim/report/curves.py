@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from cosim.core.errors import MachineError
+from cosim.results.intervals import MIN_N
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -115,7 +116,10 @@ def draw_curves(
         columns = min(len(names), 4, max(1, _LEGEND_LETTERS // (6 + max(map(len, names)))))
         figure.legend(handles, names, loc="outside lower center", ncols=columns, fontsize=9)
     figure.suptitle(
-        textwrap.fill(f"{title}: means with 95 % intervals", _TITLE_LETTERS), fontsize=12
+        textwrap.fill(
+            f"{title}: means with 95 % intervals from {MIN_N} episodes on", _TITLE_LETTERS
+        ),
+        fontsize=12,
     )
     picture = io.BytesIO()
     figure.savefig(picture, format="png")

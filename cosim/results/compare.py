@@ -23,10 +23,16 @@ from cosim.results.discerned import (
     without_decoys,
 )
 from cosim.results.finished_run import WholeRun, read_whole_run
-from cosim.results.metrics import COUNTERFACTUAL, METRICS, POOLED, RATE_NEEDS_M
+from cosim.results.intervals import BOOTSTRAP, CONFIDENCE, MIN_N, counts_in_words
+from cosim.results.metrics import (
+    COUNTERFACTUAL,
+    METRICS,
+    POOLED,
+    RATE_NEEDS_M,
+    UNKNOWN_WITH_CRASH,
+)
 from cosim.results.table import (
-    BOOTSTRAP,
-    CONFIDENCE,
+    crashed_in,
     injections_in_words,
     numeric_column,
     table_of,
@@ -36,14 +42,14 @@ from cosim.spec.scenario import Scenario
 
 MIN_CHANGED: Final = 6
 """Minimum number of changed pairs for a verdict."""
-PairedVerdict = Literal["within noise", "too few", "better", "worse", "differs"]
+PairedVerdict = Literal["within noise", "too few", "better", "worse", "differs", ""]
 
 
 class PairedDifference(NamedTuple):
     """Difference of a metric between two runs, paired by scenario.
 
     before, after: means over the pairs in which both runs have a value; NaN without such pairs
-    low, high: bounds of the interval of after - before
+    low, high: bounds of the interval of after - before; NaN below MIN_N pairs
     n: number of these pairs
     changed: number of pairs whose values differ; for a rate, only pairs with at least one count
     """
@@ -60,8 +66,13 @@ class PairedDifference(NamedTuple):
         return self.after - self.before
 
     def verdict(self, higher_is_better: bool | None) -> PairedVerdict:
-        """Return the verdict in words. higher_is_better: None if neither direction is better."""
-        if not self.n or self.low <= 0.0 <= self.high:
+        """Return the verdict in words; "" below MIN_N pairs.
+
+        higher_is_better: None if neither direction is better
+        """
+        if self.n < MIN_N:
+            return ""
+        if self.low <= 0.0 <= self.high:
             return "within noise"
         if self.changed < MIN_CHANGED:
             return "too few"
@@ -81,7 +92,7 @@ def difference_of_means(before: Floats, after: Floats) -> PairedDifference:
     changes = after - before
     if not n:
         return _NO_PAIRS
-    low, high = _interval(changes[_draws(n)].sum(axis=1) / n, n) if changes.any() else (0.0, 0.0)
+    low, high = _interval(changes[_draws(n)].sum(axis=1) / n if changes.any() else changes, n)
     return PairedDifference(
         float(before.mean()), float(after.mean()), low, high, n, int(np.count_nonzero(changes))
     )
@@ -107,7 +118,7 @@ def difference_of_rates(
     differs = (counted != counted_after) | (metres != metres_after)
     changed = int((differs & ((counted > 0.0) | (counted_after > 0.0))).sum())
     if not differs.any() or not (counted.any() or counted_after.any()):
-        return PairedDifference(*rates, 0.0, 0.0, n, 0)
+        return PairedDifference(*rates, *_interval(np.zeros(n), n), n, 0)
     drawn = [column[_draws(n)].sum(axis=1) for column in columns]
     moved = (drawn[1] > 0.0) & (drawn[3] > 0.0)
     counted, metres, counted_after, metres_after = (column[moved] for column in drawn)
@@ -116,8 +127,8 @@ def difference_of_rates(
 
 
 def _interval(differences: Floats, n: int) -> tuple[float, float]:
-    """Return the confidence interval of differences drawn from n pairs; NaN for a single pair."""
-    if n < 2 or not len(differences):
+    """Return the interval of differences drawn from n pairs; NaN below MIN_N pairs."""
+    if n < MIN_N or not len(differences):
         return math.nan, math.nan
     # Expanded percentile interval: the plain one is too narrow for small n.
     t = stdtrit(n - 1, 0.5 + CONFIDENCE / 2)
@@ -144,6 +155,8 @@ DIFFERENCES: Final = (
     "n",
     "value_before",
     "value_after",
+    "counts_before",
+    "counts_after",
     "difference",
     "low",
     "high",
@@ -260,9 +273,9 @@ def differences_of(
         for name in names:
             paired = _difference(name, *pair)
             unit, better = _unit_and_direction(name)
-            verdict = paired.verdict(better if judged else None) if paired.n else ""
+            verdict = paired.verdict(better if judged else None)
             key = (before.label, after.label, by, group, name, unit)
-            means = (paired.before, paired.after, paired.difference)
+            means = (paired.before, paired.after, *_counts(name, *pair), paired.difference)
             interval = (paired.low, paired.high)
             rows.append((*key, paired.n, *means, *interval, paired.changed, verdict))
     return pd.DataFrame(rows, columns=list(DIFFERENCES))
@@ -286,21 +299,45 @@ def _unit_and_direction(name: str) -> tuple[str, bool | None]:
 
 
 def _difference(name: str, before: pd.DataFrame, after: pd.DataFrame) -> PairedDifference:
-    """Return the paired difference of a metric; a rate is undefined if a policy crashed."""
-    if name == DISCERNED:
-        solved = [pairs_of(table.reset_index()).solved for table in (before, after)]
-        both = solved[0].index.intersection(solved[1].index)
-        return difference_of_means(*(np.asarray(pairs[both], dtype=float) for pairs in solved))
-    before, after = without_decoys(before), without_decoys(after)
-    if name not in POOLED:
-        return difference_of_means(numeric_column(before, name), numeric_column(after, name))
-    if "crashed" in {*before["status"], *after["status"]}:
+    """Return the paired difference of a metric, without pairs if a crash leaves it unknown."""
+    if name in UNKNOWN_WITH_CRASH and any(
+        crashed_in(without_decoys(table)) for table in (before, after)
+    ):
         return _NO_PAIRS
-    counted, metres = POOLED[name]
-    one, other = (
-        (numeric_column(table, counted), numeric_column(table, metres)) for table in (before, after)
-    )
-    return difference_of_rates(one, other)
+    if name not in POOLED:
+        return difference_of_means(*_paired_columns(name, before, after))
+    counted, metres, counted_after, metres_after = _paired_columns(name, before, after)
+    return difference_of_rates((counted, metres), (counted_after, metres_after))
+
+
+def _paired_columns(name: str, before: pd.DataFrame, after: pd.DataFrame) -> list[Floats]:
+    """Return the values (N,) of a metric in both tables; of a rate counts and metres of each.
+
+    N counts scenarios without decoys, or for `discerned` pairs of an event and its decoy.
+    """
+    tables = before, after
+    if name == DISCERNED:
+        solved = [pairs_of(table.reset_index()).solved for table in tables]
+        both = solved[0].index.intersection(solved[1].index)
+        return [np.asarray(pairs[both], dtype=float) for pairs in solved]
+    columns = POOLED.get(name, (name,))
+    return [numeric_column(without_decoys(table), column) for table in tables for column in columns]
+
+
+def _counts(name: str, before: pd.DataFrame, after: pd.DataFrame) -> tuple[str, str]:
+    """Return the counts of a share or rate in each run, over pairs in which both have a value.
+
+    "" for other means, and without such a pair.
+    """
+    values = np.array(_paired_columns(name, before, after))
+    values = values[:, ~np.isnan(values).any(axis=0)]
+    n = values.shape[1]
+    is_share = name == DISCERNED or (name in METRICS and METRICS[name].share)
+    if not n or not (name in POOLED or is_share):
+        return "", ""
+    sums = values.sum(axis=1).reshape(2, -1)
+    one, other = (counts_in_words(counted, n, *metres) for counted, *metres in sums.tolist())
+    return one, other
 
 
 def flipped_between(before: ComparedRun, after: ComparedRun) -> pd.DataFrame:
@@ -389,8 +426,8 @@ def _notes(runs: Sequence[WholeRun], compared: Sequence[ComparedRun]) -> Iterato
         crashed = sum(record.status == "crashed" for record in run.records.values())
         if crashed:
             yield (
-                f"{other.label}: {crashed} crashed, counted as the worst there is; groups with "
-                f"them have no rates"
+                f"{other.label}: {crashed} crashed, counted as failed, with SR, RC, SPL and V of "
+                f"0; groups with them have neither rates nor other means"
             )
         if terms := _differing_terms(compared[0], other):
             yield (

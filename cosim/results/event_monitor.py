@@ -164,7 +164,7 @@ class EventMonitor:
     def _passing(self, i: int, ended: Ended | None) -> tuple[int | None, Passing | None]:
         """Return the end of an event's window and the motion in it; None if not passed.
 
-        The goal ends the window: whoever is still ahead has not kept the robot from it.
+        The goal ends the window: people still ahead did not keep the robot from it.
         """
         window, first = self._windows[i], self._states[i].triggered_tick
         if window is None or first is None:

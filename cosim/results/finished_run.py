@@ -98,12 +98,21 @@ def read_record(file: Path) -> Record:
         raise RunError(f"{error}: {RUN_AGAIN}") from error
 
 
+def other_schema(record: Record) -> str:
+    """Return in words that measures have another metric schema than this version; "" if not."""
+    if (schema := record.setup.metric_schema) == METRIC_SCHEMA:
+        return ""
+    recorded = f"metric schema {schema}" if schema else _UNKNOWN_SCHEMA
+    return (
+        f"the measures of '{record.scenario.id}' are of {recorded}; this version has "
+        f"{METRIC_SCHEMA}"
+    )
+
+
 def _check_schema(path: Path, record: Record) -> None:
     """Raise RunError if the measures have another metric schema."""
-    if (schema := record.setup.metric_schema) != METRIC_SCHEMA:
-        recorded = f"metric schema {schema}" if schema else _UNKNOWN_SCHEMA
+    if words := other_schema(record):
         raise RunError(
-            f"{path}: the measures of '{record.scenario.id}' are of {recorded}; this version has "
-            f"{METRIC_SCHEMA}, and "
-            "other definitions are not compared: run it again with this version"
+            f"{path}: {words}, and other definitions are not compared: run it again with this "
+            "version"
         )

@@ -27,6 +27,10 @@ PROGRESS_WINDOW_S = 5.0
 PROGRESS_MIN_M = 0.1
 RATE_NEEDS_M = 1.0
 """Least distance, metres, for a rate per 100 m."""
+RATED_PER_PROGRESS = 1.25
+"""Metres per metre of progress that count for rates: room for walking round people and things."""
+RATED_EXTRA_M = 10.0
+"""Metres of an episode that count for rates beyond RATED_PER_PROGRESS times its progress."""
 
 
 @dataclass(frozen=True)
@@ -70,9 +74,10 @@ class Metric(NamedTuple):
     unit: "" if dimensionless
     higher_is_better: None if neither direction is better
     of: computes the value
-    worst: value of an episode whose policy crashed, so that crashing gains nothing; None if there
-        is no worst value, then a run with a crash has no mean
+    worst: value of an episode whose policy crashed, so that crashing gains nothing. None if a
+        crash says nothing of it; if one direction is better, a run with a crash then has no mean
     pooled: for a rate, the metric counted and the metres it is counted on
+    share: whether each value is 0 or 1, so that the mean is a share of episodes
 
     A rate over several episodes divides all counts by all metres. A mean of rates would let an
     episode of 2 m outweigh one of 400 m, and skip policies that never moved.
@@ -83,6 +88,7 @@ class Metric(NamedTuple):
     of: Callable[[EpisodeFacts], float | None]
     worst: float | None = None
     pooled: tuple[str, str] | None = None
+    share: bool = False
 
 
 def goal_reached(episode: EpisodeFacts) -> float:
@@ -127,6 +133,14 @@ def progress_of(route_s_m: np.ndarray, reset_s_m: np.ndarray) -> float:
         if not np.isnan(reset_to_m):
             furthest = max(furthest, reset_to_m)
     return gained
+
+
+def rated_m(episode: EpisodeFacts) -> float:
+    """Return the distance that rates refer to: `travelled_m`, at most 1.25 x progress + 10 m.
+
+    The bound keeps detours round people, and gains nothing for a robot that circles.
+    """
+    return min(travelled_m(episode), RATED_PER_PROGRESS * progress_m(episode) + RATED_EXTRA_M)
 
 
 def route_completion(episode: EpisodeFacts) -> float:
@@ -293,30 +307,30 @@ def per_100m(
 
 METRICS: Mapping[str, Metric] = MappingProxyType(
     {
-        "success": Metric("", True, success, worst=0.0),
-        "goal_reached": Metric("", True, goal_reached, worst=0.0),
+        "success": Metric("", True, success, worst=0.0, share=True),
+        "goal_reached": Metric("", True, goal_reached, worst=0.0, share=True),
         "route_completion": Metric("", True, route_completion, worst=0.0),
         "spl": Metric("", True, spl, worst=0.0),
         "failures_per_100m": Metric(
-            "1/100 m", False, per_100m("", travelled_m), pooled=("failures", "path_length_m")
+            "1/100 m", False, per_100m("", rated_m), pooled=("failures", "rated_m")
         ),
         "collisions_per_100m": Metric(
             "1/100 m",
             False,
-            per_100m("collision", travelled_m),
-            pooled=("collisions", "path_length_m"),
+            per_100m("collision", rated_m),
+            pooled=("collisions", "rated_m"),
         ),
         "out_of_lane_per_100m": Metric(
             "1/100 m",
             False,
-            per_100m("out_of_lane", travelled_m),
-            pooled=("out_of_lane", "path_length_m"),
+            per_100m("out_of_lane", rated_m),
+            pooled=("out_of_lane", "rated_m"),
         ),
         "freezings_per_100m": Metric(
             "1/100 m",
             False,
-            per_100m("freezing", travelled_m),
-            pooled=("freezings", "path_length_m"),
+            per_100m("freezing", rated_m),
+            pooled=("freezings", "rated_m"),
         ),
         "failures_per_100m_progress": Metric(
             "1/100 m", False, per_100m("", progress_m), pooled=("failures", "progress_m")
@@ -335,11 +349,13 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
         "collisions_wall": Metric("", False, collisions_with("wall")),
         "collisions_object": Metric("", False, collisions_with("object")),
         "walked_into": Metric("", None, lambda episode: float(len(episode.walked_into))),
-        "pedestrian_collision": Metric("", False, any_of(collisions_with("pedestrian")), worst=1.0),
-        "other_collision": Metric("", False, any_of(collisions_with_others), worst=1.0),
-        "left_lane": Metric("", False, any_of(count("out_of_lane")), worst=1.0),
+        "pedestrian_collision": Metric(
+            "", False, any_of(collisions_with("pedestrian")), share=True
+        ),
+        "other_collision": Metric("", False, any_of(collisions_with_others), share=True),
+        "left_lane": Metric("", False, any_of(count("out_of_lane")), share=True),
         "broke_rule": Metric(
-            "", False, any_of(lambda episode: float(episode.rules_broken)), worst=1.0
+            "", False, any_of(lambda episode: float(episode.rules_broken)), share=True
         ),
         "red_light_entries": Metric("", False, lambda episode: float(episode.red_light_entries)),
         "carriageway_time_s": Metric("s", False, carriageway_time_s),
@@ -348,13 +364,14 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
         "pedestrian_distance_min_success_m": Metric("m", True, pedestrian_distance_min_success_m),
         "clearance_min_m": Metric("m", True, clearance_min_m),
         "time_to_collision_min_s": Metric("s", True, time_to_collision_min_s),
-        "space_compliance": Metric("", True, space_compliance, worst=0.0),
-        "personal_space_violation": Metric("", False, personal_space_violation, worst=1.0),
+        "space_compliance": Metric("", True, space_compliance),
+        "personal_space_violation": Metric("", False, personal_space_violation),
         "stalled_time_s": Metric("s", False, stalled_time_s),
         "failure_to_progress": Metric("", False, failure_to_progress),
         "acceleration_mean_mps2": Metric("m/s2", False, mean_acceleration_mps2),
         "jerk_mean_mps3": Metric("m/s3", False, mean_jerk_mps3),
         "path_length_m": Metric("m", None, travelled_m),
+        "rated_m": Metric("m", None, rated_m),
         "route_length_m": Metric("m", None, route_length_m),
         "progress_m": Metric("m", True, progress_m),
         "time_s": Metric("s", None, time_s),
@@ -369,7 +386,16 @@ POOLED: Mapping[str, tuple[str, str]] = MappingProxyType(
 WORST: Mapping[str, float] = MappingProxyType(
     {name: metric.worst for name, metric in METRICS.items() if metric.worst is not None}
 )
-"""Measures of an episode whose policy crashed; an invalid episode has none."""
+"""Measures of an episode whose policy crashed; an invalid episode has none.
+
+A crash is a failure that covers no route. What it would have touched or left is unknown.
+"""
+UNKNOWN_WITH_CRASH: frozenset[str] = frozenset(
+    name
+    for name, metric in METRICS.items()
+    if metric.worst is None and metric.higher_is_better is not None
+)
+"""Metrics without a mean if a policy crashed: it could have ended episodes that went badly."""
 
 COUNTERFACTUAL: Mapping[str, str] = MappingProxyType(
     {"people_delay_s": "s", "people_compared": "", "vehicles_delay_s": "s", "vehicles_compared": ""}

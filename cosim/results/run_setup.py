@@ -7,7 +7,7 @@ import msgspec
 from cosim.core.versions import versions
 from cosim.spec.options import EpisodeOptions, PolicyProcess
 
-METRIC_SCHEMA = 3
+METRIC_SCHEMA = 4
 """Version of the metric definitions; results of other schemas are not compared."""
 NO_RENDERER = "none"
 """Renderer name of an episode whose policy has no camera."""

@@ -18,7 +18,21 @@ from cosim.results.discerned import (
     with_discerned,
     without_decoys,
 )
-from cosim.results.metrics import COUNTERFACTUAL, METRICS, POOLED, RATE_NEEDS_M, WORST
+from cosim.results.intervals import (
+    NO_ESTIMATE,
+    Estimate,
+    estimate_of_mean,
+    estimate_of_rate,
+    estimate_of_share,
+)
+from cosim.results.metrics import (
+    COUNTERFACTUAL,
+    METRICS,
+    POOLED,
+    RATE_NEEDS_M,
+    UNKNOWN_WITH_CRASH,
+    WORST,
+)
 from cosim.results.record import RECORD_FILE, Record
 
 _ORDER = (
@@ -74,8 +88,6 @@ COLUMNS = (*_ORDER, *(key for key in RECORD_FILE.keys if key not in {*_ORDER, *_
 `_RECORD_ONLY`."""
 ORACLE = "orca"
 """Policy used to prove suites; it has privileged knowledge and does not compete."""
-BOOTSTRAP = 2000
-CONFIDENCE = 0.95
 MAX_INVALID_SHARE = 0.02
 """Share of scheduled episodes; with more invalid ones, a run is inconclusive."""
 INJECTED = "injected"
@@ -134,22 +146,13 @@ def policy_in_words(name: str, privileged: bool) -> str:
 
 
 def summary_of(table: pd.DataFrame, names: Sequence[str] = ()) -> pd.DataFrame:
-    """Summarize each metric over episodes: mean, bootstrap interval and number of values n.
+    """Summarize each metric over episodes: one row (`Estimate`) per metric, the index.
 
     names: metrics; `metrics_of` the table if empty
-
-    Decoys count in `discerned` alone, which is over pairs (`cosim.results.discerned`).
-
-    Columns: mean, low, high, n; index: metric. Rates are pooled (`cosim.results.metrics.POOLED`):
-        all counts divided by all metres, bootstrapped over episodes. A metric without values is NaN
-        with n = 0. So is a rate if a policy crashed, since failures after the crash are unknown.
     """
     names = names or metrics_of(table)
-    events = without_decoys(table)
-    rows = [_summary(table if name == DISCERNED else events, name) for name in names]
-    return pd.DataFrame(
-        rows, index=pd.Index(names, name="metric"), columns=["mean", "low", "high", "n"]
-    )
+    rows = [estimate_of(table, name) for name in names]
+    return pd.DataFrame(rows, index=pd.Index(names, name="metric"), columns=list(Estimate._fields))
 
 
 def metrics_of(table: pd.DataFrame) -> tuple[str, ...]:
@@ -157,48 +160,38 @@ def metrics_of(table: pd.DataFrame) -> tuple[str, ...]:
     return tuple(with_discerned(dict.fromkeys(METRICS, ""), has_decoys(table)))
 
 
-def _summary(table: pd.DataFrame, name: str) -> tuple[float, float, float, int]:
+def estimate_of(table: pd.DataFrame, name: str) -> Estimate:
+    """Return the mean of a metric over the episodes of a table, with its interval.
+
+    Rates are pooled (`cosim.results.metrics.POOLED`): all counts divided by all metres. A metric
+    without values has n = 0, and so has one that a crash leaves unknown (`UNKNOWN_WITH_CRASH`).
+    Decoys count in `discerned` alone, which is over pairs (`cosim.results.discerned`).
+    """
+    if name == DISCERNED:
+        return estimate_of_share(pairs_of(table).values)
+    table = without_decoys(table)
+    if name in UNKNOWN_WITH_CRASH and crashed_in(table):
+        return NO_ESTIMATE
     if name not in POOLED:
-        values = pairs_of(table).values if name == DISCERNED else numeric_column(table, name)
+        values = numeric_column(table, name)
         values = values[~np.isnan(values)]
-        return (
-            float(values.mean()) if len(values) else np.nan,
-            *bootstrap_interval(values),
-            len(values),
-        )
+        is_share = name in METRICS and METRICS[name].share
+        return estimate_of_share(values) if is_share else estimate_of_mean(values)
     counted, metres = (numeric_column(table, column) for column in POOLED[name])
     known = ~(np.isnan(counted) | np.isnan(metres))
-    if (table["status"] == "crashed").any() or metres[known].sum() < RATE_NEEDS_M:
-        return np.nan, np.nan, np.nan, 0
-    counted, metres = counted[known], metres[known]
-    return (
-        100.0 * counted.sum() / metres.sum(),
-        *bootstrap_interval(100.0 * counted, metres),
-        len(counted),
-    )
+    if metres[known].sum() < RATE_NEEDS_M:
+        return NO_ESTIMATE
+    return estimate_of_rate(counted[known], metres[known])
+
+
+def crashed_in(table: pd.DataFrame) -> int:
+    """Return the number of episodes whose policy crashed."""
+    return int((table["status"] == "crashed").sum())
 
 
 def numeric_column(table: pd.DataFrame, name: str) -> Floats:
     """Return a column as numbers; NaN if empty."""
     return np.asarray(pd.to_numeric(table[name], errors="coerce"), dtype=float)
-
-
-def bootstrap_interval(values: Floats, weights: Floats | None = None) -> tuple[float, float]:
-    """Return the percentile bootstrap interval of the mean at CONFIDENCE; NaN without values.
-
-    weights: if given, the interval of sum(values) / sum(weights)
-
-    The draws are always the same.
-    """
-    if not len(values):
-        return float("nan"), float("nan")
-    draws = np.random.default_rng(0).integers(len(values), size=(BOOTSTRAP, len(values)))
-    over = np.full(len(values), 1.0) if weights is None else weights
-    drawn = over[draws].sum(axis=1)
-    means = values[draws].sum(axis=1)[drawn > 0.0] / drawn[drawn > 0.0]
-    tail = (1.0 - CONFIDENCE) / 2
-    low, high = np.quantile(means, [tail, 1.0 - tail])
-    return float(low), float(high)
 
 
 def injections_in_words(table: pd.DataFrame) -> str:

@@ -432,9 +432,12 @@ def event_faults(scenario: Scenario, kinds: EventKinds, place: str = "$") -> Ite
 def decoy_faults(suite: Suite) -> Iterator[str]:
     """Yield the errors of a whole suite whose decoys lack their scenario; a part may lack it."""
     events = {one.id for one in suite.scenarios if not one.decoy_of}
-    for one in suite.scenarios:
+    for i, one in enumerate(suite.scenarios):
         if one.decoy_of and one.decoy_of not in events:
-            yield f"{one.called}decoy_of names no scenario of the suite: {shown(one.decoy_of)}"
+            yield (
+                f"{one.called}decoy_of names no scenario of the suite: {shown(one.decoy_of)} - at "
+                f"`$.scenarios[{i}].decoy_of`"
+            )
 
 
 def read_suite(path: Path, kinds: EventKinds | None = None) -> Suite:

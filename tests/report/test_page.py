@@ -20,7 +20,7 @@ from cosim.report.page.paper import LONG_OF_PAPER, REACTIVE_OF_PAPER, UNIT_OF_PA
 from cosim.report.page.plots import exposure_of, people_nearby, plots_of
 from cosim.report.page.runs import ReportedRun, read_runs
 from cosim.report.page.scene import Entry, PlacePicture, Spot
-from cosim.report.page.three_tables import tables_of, warnings_of
+from cosim.report.page.three_tables import summary_table, tables_of, warnings_of
 from cosim.results.run_folder import RunFolder, read_spec
 from cosim.results.table import summary_of
 from cosim.spec.scenario import read_suite
@@ -66,10 +66,10 @@ def test_a_cell_of_ours_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
     (own,) = read_runs([run_of(tmp_path / "run", ["goal", HIT, HIT, "goal", "goal"], "mine")])
     spec = msgspec.structs.replace(own.spec, suite="unit")
     told = ReportedRun("mine", own.whole._replace(spec=spec))
-    mean, low, high, _ = summary_of(told.table, ["success"]).iloc[0]
+    mean, low, high = summary_of(told.table, ["success"]).iloc[0][["mean", "low", "high"]]
     ours = next(table for table in tables_of([told]) if table.title == "Unit tests")
     (row,) = ours.rows
-    assert row.name == "mine" and row.cells[0] == (mean, low, high, 5) and mean == 0.6
+    assert row.name == "mine" and row.cells[0][:4] == (mean, low, high, 5) and mean == 0.6
     assert ours.paper is UNIT_OF_PAPER
     text = render_page([told], [], [], Maps([], {}, {}), "").decode()
     assert f">{mean:.2f}<small>{low:.2f}&ndash;{high:.2f}</small>" in text
@@ -77,6 +77,28 @@ def test_a_cell_of_ours_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
     assert text.count('class="paper"') == len(UNIT_OF_PAPER)
     (other,) = tables_of([own])
     assert not other.paper and [row.name for row in other.rows] == ["mine: straight"]
+
+
+def test_below_five_episodes_a_report_has_counts_and_no_error_bars(tmp_path: Path) -> None:
+    """Of four curves the page gives counts and the plot a bare point, of six straight ways both
+    have an interval; crashes have a column."""
+    ways = [short_way(f"s-{k}", structure="curve" if k < 4 else "straight") for k in range(10)]
+    hows = ["goal", HIT, "goal", "goal", "crashed", *["goal"] * 5]
+    (own,) = read_runs([run_of(tmp_path / "run", hows, "mine", ways)])
+    (plot,) = [p for p in plots_of([own], {"mine": "red"}) if p.title == "Success by structure"]
+    (trace,) = plot.figure["data"]
+    assert dict(zip(trace["y"], trace["customdata"], strict=True)) == {
+        "straight": "0.83 (0.44 to 0.97), n = 6",
+        "curve": "3/4, n = 4",
+    }
+    assert trace["error_x"]["array"] == [0.1366, None] and trace["x"] == [0.8333, 0.75]
+    assert trace["error_x"]["arrayminus"][1] is None
+    summary = summary_table([own], {"mine": "red"})
+    assert summary.heads[:3] == ("scored", "crashed", "invalid")
+    assert (summary.rows[0].scored, summary.rows[0].crashed, summary.rows[0].invalid) == (10, 1, 0)
+    text = render_page([own], [plot], [], Maps([], {}, {}), "").decode()
+    assert '<td title="n = 4">3/4</td>' in text and "nan" not in text.split("<script")[0]
+    assert "1 crashed" in text and "<td>10</td><td>1</td><td>0</td>" in text
 
 
 @pytest.mark.skipif(not PAPER.exists(), reason="the paper is not here")
@@ -190,7 +212,7 @@ def test_long_ways_on_which_a_policy_crashed_are_told_beside_their_rates(tmp_pat
         ]
     )
     far = {
-        n: msgspec.structs.replace(r, measures=r.measures | {"path_length_m": 50.0})
+        n: msgspec.structs.replace(r, measures=r.measures | {"rated_m": 50.0})
         for n, r in runs[0].whole.records.items()
     }
     shaky = ReportedRun("shaky", runs[0].whole._replace(records=far))

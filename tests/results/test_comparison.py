@@ -10,6 +10,7 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 
@@ -19,6 +20,7 @@ from cosim.results.compare import (
     compare_runs,
     groups_of,
 )
+from cosim.results.metrics import METRICS, WORST
 from cosim.results.run_folder import RunFolder, read_records, read_spec
 from cosim.spec.camera import CameraSpec
 from cosim.spec.events import Event
@@ -209,12 +211,13 @@ def rewritten(run: Path, target: Path, of: str = "", **fields: object) -> Path:
 
 
 def test_a_run_is_within_noise_of_itself(runs: Path, cosim: Cosim) -> None:
-    """In every metric and group, and nothing flipped; of a name twice the second has a number."""
+    """In every metric and group, without a verdict below five scenarios, and nothing flipped; of a
+    name twice the second has a number."""
     told = compare_runs([runs / "a", runs / "a"])
-    assert set(told.differences.loc[told.differences["n"] > 0, "verdict"]) == {"within noise"}
-    assert (
-        told.differences.loc[told.differences["n"] > 0, ["difference", "low", "high"]] == 0.0
-    ).all(axis=None)
+    enough, few = (told.differences[told.differences["n"].between(*of)] for of in ((5, 99), (1, 4)))
+    assert {*enough["verdict"]} == {"within noise"} and {*few["verdict"]} == {""}
+    assert (enough[["difference", "low", "high"]] == 0.0).all(axis=None)
+    assert few[["low", "high"]].isna().all(axis=None) and {*few["group"]} == {"test"}
     assert not len(told.flipped) and told.notes == () and told.others[0].label == "a (2)"
     said = cosim("compare", str(runs / "a"), str(runs / "a"))
     assert said.returncode == 0 and "better" not in said.stdout and "worse" not in said.stdout
@@ -222,8 +225,8 @@ def test_a_run_is_within_noise_of_itself(runs: Path, cosim: Cosim) -> None:
 
 
 def test_who_crashes_is_compared_at_its_worst_and_has_no_rates(runs: Path) -> None:
-    """A crash counts as failed, and takes the rates of its groups away; an invalid episode is in no
-    pair; both told."""
+    """A crash counts as failed, and takes all else of its groups away, so that no metric with a
+    direction gains by it; an invalid episode is in no pair; both told."""
     told = compare_runs([runs / "a", runs / "c"])
     assert (
         row(told, "success", after="c")["n"] == 19
@@ -234,12 +237,31 @@ def test_who_crashes_is_compared_at_its_worst_and_has_no_rates(runs: Path) -> No
         and row(told, "failures_per_100m", "straight", "c")["n"] == 9
     )
     assert not len(told.flipped)
+    whole = told.differences[told.differences["group"] == "s"].set_index("metric")
+    ranked = [name for name, metric in METRICS.items() if metric.higher_is_better is not None]
+    assert {*whole.index[whole["n"] > 0].intersection(ranked)} == {*WORST}
+    assert "better" not in {*told.differences["verdict"]}
     assert (
-        "c: 1 crashed, counted as the worst there is; groups with them have no rates" in told.notes
+        "c: 1 crashed, counted as failed, with SR, RC, SPL and V of 0; groups with them have "
+        "neither rates nor other means" in told.notes
     )
     assert (
         "c is not to be quoted: 1 of 20 scheduled episodes are invalid, more than 2 %" in told.notes
     )
+
+
+def test_who_crashes_in_every_episode_is_better_in_nothing(runs: Path, tmp_path: Path) -> None:
+    """Against a policy that fails everywhere: no rate and no other mean, nothing better; SR as low,
+    route completion and speed lower."""
+    bad, crashing = (
+        run_of(tmp_path / how, [how] * 20, how, several(20)) for how in (HIT, "crashed")
+    )
+    told = compare_runs([bad, crashing])
+    assert {*told.differences["verdict"]} <= {"worse", "within noise", "too few", "differs", ""}
+    whole = told.differences[told.differences["group"] == "s"].set_index("metric")
+    assert whole.loc[["route_completion", "velocity_mean_mps"], "verdict"].eq("worse").all()
+    assert whole.loc["success", ["value_after", "verdict"]].tolist() == [0.0, "within noise"]
+    assert not len(told.flipped)
 
 
 def test_a_comparison_is_printed_and_written(runs: Path, tmp_path: Path, cosim: Cosim) -> None:
@@ -271,6 +293,26 @@ def test_a_comparison_is_printed_and_written(runs: Path, tmp_path: Path, cosim: 
     )
     assert files[1].read_text() == as_markdown(told) and files[2].read_text() == as_latex(told)
     assert not [*tmp_path.glob("*.part")]
+
+
+def test_below_five_scenarios_a_comparison_shows_counts(runs: Path) -> None:
+    """Four scenarios of `test`: solved of all, failures in metres, neither interval nor verdict, in
+    every format; the .csv has the counts of larger groups, too."""
+    told = compare_runs([runs / "a", runs / "b"])
+    of_test = row(told, "success", "test")
+    assert (of_test["counts_before"], of_test["counts_after"]) == ("2/4", "4/4")
+    assert np.isnan(of_test["low"]) and of_test["verdict"] == ""
+    (_, grouped) = tables_of_comparison(told, told.others[0])
+    by_metric = {cells[1]: cells[2:] for cells in grouped.rows if cells[0] == "test"}
+    assert by_metric["SR"] == ("2/4", "4/4", "-", "-", "4", "")
+    assert by_metric["FC"] == ("2 in 24 m", "0 in 32 m", "-", "-", "4", "")
+    assert by_metric["RC"][0] == "0.72" and by_metric["RC"][-3:] == ("-", "4", "")
+    assert "| test     | SR | 2/4 | 4/4 |" in re.sub(" +", " ", as_markdown(told)).replace(
+        "| test |", "| test     |"
+    )
+    assert "test & SR & 2/4 & 4/4 & - & - & 4 &" in as_latex(told)
+    assert row(told, "success")["counts_after"] == "18/20"
+    assert row(told, "route_completion")["counts_after"] == ""
 
 
 def test_names_are_escaped(runs: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cosim.results.log import Log
-from cosim.results.metrics import METRICS, EpisodeFacts, compute_metrics, progress_of
+from cosim.results.metrics import METRICS, POOLED, EpisodeFacts, compute_metrics, progress_of
 from cosim.results.referee import Failure
 from tests.logs import log_with
 
@@ -91,6 +91,43 @@ def test_rates_are_per_100_m_travelled_and_of_progress() -> None:
     assert (measures["collisions_pedestrian"], measures["collisions_vehicle"]) == (1.0, 1.0)
     assert measures["route_completion"] == pytest.approx(0.4)
     assert (measures["success"], measures["spl"]) == (0.0, 0.0)
+
+
+def test_rates_count_a_detour_up_to_a_bound() -> None:
+    """100 m of progress are rated as at most 135 m: walking round somebody counts, 400 m of circles
+    do not; speed and path length are of all metres."""
+    ahead = [0.1 * (i + 1) for i in range(500)]
+    circles = [50.0 - 0.1 * (i % 2) for i in range(4001)]
+    onward = [50.0 + 0.1 * (i + 1) for i in range(500)]
+    hits = (failure("collision", "wall"),) * 2 + (failure("out_of_lane"), failure("freezing"))
+    straight, round_someone, circling, longer = (
+        compute_metrics(episode(log(ahead + circles[:n] + onward), *hits))
+        for n in (0, 101, 4001, 2001)
+    )
+    assert [m["rated_m"] for m in (straight, round_someone, circling, longer)] == pytest.approx(
+        [100.0, 110.0, 135.0, 135.0]
+    )
+    assert circling["path_length_m"] == pytest.approx(500.0)
+    assert circling["velocity_mean_mps"] == pytest.approx(2.0, abs=1e-3)
+    for name, least in {"collisions": 2, "out_of_lane": 1, "freezings": 1, "failures": 4}.items():
+        rates = [m[f"{name}_per_100m"] for m in (circling, longer)]
+        assert rates == pytest.approx([100.0 * least / 135.0] * 2), name
+    for name in ("failures_per_100m_progress", "failures_per_100m_route"):
+        assert circling[name] == pytest.approx(straight[name]) == 4.0
+    pooled_on = {metres for _, metres in POOLED.values()}
+    assert pooled_on == {"rated_m", "progress_m", "route_length_m"}
+
+
+def test_who_circles_without_getting_on_has_ten_metres() -> None:
+    """400 s of circles at the start, or after a reset: a failure on 10 m, not on 400."""
+    circles = [0.1 * (i % 2) for i in range(8000)]
+    stuck = compute_metrics(episode(log(circles), failure("collision", "wall")))
+    assert stuck["path_length_m"] == pytest.approx(799.9) and stuck["progress_m"] == 0.1
+    assert stuck["rated_m"] == pytest.approx(10.125)
+    again = log([*circles, *[30.0 + s for s in circles]], resets={7999: 30.0})
+    put_on = compute_metrics(episode(again, failure("collision", "wall")))
+    assert put_on["rated_m"] == pytest.approx(10.25)
+    assert put_on["collisions_per_100m"] == pytest.approx(100.0 / 10.25)
 
 
 def test_the_total_is_the_sum_of_its_parts() -> None:

@@ -430,18 +430,16 @@ def test_an_episode_whose_row_was_lost_to_a_kill_is_taken_in(tmp_path: Path) -> 
 
 
 def test_a_crashed_episode_counts_as_a_failure(tmp_path: Path) -> None:
-    """Crashed episodes stay in the means as the worst there is, and are absent where there is no
-    worst."""
+    """Crashed episodes stay in SR, RC, SPL and V as 0; whom they would have hit is unknown, and so
+    is every other mean with a direction."""
     crashed = msgspec.structs.replace(record("s-1", status="crashed"), measures={}, reason="boom")
     table = table_of([record("s-0"), crashed])
     summary = summary_of(table)
     assert summary.loc["success", "mean"] == 0.5
     assert summary.loc["success", "n"] == 2
-    assert (
-        summary.loc["velocity_mean_mps", "mean"],
-        summary.loc["pedestrian_collision", "mean"],
-    ) == (0.0, 1.0)
-    assert summary.loc["stalled_time_s", "n"] == 0
+    assert summary.loc["velocity_mean_mps", "mean"] == 0.0
+    assert table.loc[1, ["pedestrian_collision", "other_collision", "left_lane"]].isna().all()
+    assert not summary.loc[["pedestrian_collision", "stalled_time_s"], "n"].any()
 
 
 def test_a_folder_without_a_run_is_named(tmp_path: Path) -> None:

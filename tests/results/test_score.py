@@ -315,6 +315,8 @@ def test_another_metric_schema_is_refused(tmp_path: Path, cosim: Cosim) -> None:
         f"{run}: the measures of 's-000' are of metric schema {METRIC_SCHEMA - 1}; this version has"
         in told
     )
+    shown = cosim("show", str(run))
+    assert shown.returncode == 0 and "its values are shown as recorded" in shown.stdout
     rewrite(run, "s-000", lambda record: record.pop("metric_schema"))
     assert "are of an earlier version, which did not tell its metric schema" in refusal(cosim, run)
 

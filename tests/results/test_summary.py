@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cosim.results.metrics import METRICS, WORST
-from cosim.results.table import bootstrap_interval, summary_of, why_inconclusive
+from cosim.results.metrics import METRICS, UNKNOWN_WITH_CRASH, WORST
+from cosim.results.table import summary_of, why_inconclusive
 
 
 def table(*rows: tuple[float, float, float], crashed: int = 0, invalid: int = 0) -> pd.DataFrame:
@@ -20,6 +20,7 @@ def table(*rows: tuple[float, float, float], crashed: int = 0, invalid: int = 0)
         | {
             "status": "done",
             "path_length_m": m,
+            "rated_m": m,
             "failures": n,
             "route_length_m": way,
             "success": float(n == 0),
@@ -39,8 +40,7 @@ def test_a_rate_of_a_run_is_all_failures_on_all_metres() -> None:
     summary = summary_of(three, ["failures_per_100m", "failures_per_100m_route"])
     assert summary["mean"].tolist() == pytest.approx([100 * 29 / 402, 100 * 29 / 800])
     assert summary["n"].tolist() == [3, 3]
-    low, high = summary.loc["failures_per_100m", ["low", "high"]]
-    assert low < 100 * 29 / 402 < high
+    assert summary["counted"].tolist() == [29, 29] and summary["metres"].tolist() == [402, 800]
 
 
 def test_a_robot_that_never_moved_has_no_rate_but_failures_on_its_route() -> None:
@@ -52,16 +52,6 @@ def test_a_robot_that_never_moved_has_no_rate_but_failures_on_its_route() -> Non
     )
 
 
-def test_the_interval_is_of_episodes_drawn_again() -> None:
-    """Of values it is the bootstrap of their mean; with equal weights the same; one episode has no
-    spread."""
-    values = np.array([0.0, 1.0, 1.0, 1.0, 0.0, 1.0])
-    assert bootstrap_interval(values) == bootstrap_interval(values, np.ones(6))
-    low, high = bootstrap_interval(values)
-    assert 0.0 <= low < values.mean() < high <= 1.0
-    assert bootstrap_interval(np.array([3.0]), np.array([2.0])) == (1.5, 1.5)
-
-
 @pytest.mark.parametrize(
     "name", ["failures_per_100m", "failures_per_100m_route", "collisions_per_100m"]
 )
@@ -71,15 +61,37 @@ def test_who_crashes_before_it_fails_has_no_rate(name: str) -> None:
     assert np.isnan(summary_of(table(*rows, crashed=1), [name]).loc[name, "mean"])
 
 
-def test_crashing_improves_no_mean() -> None:
-    """Each metric that has a mean with a crash in the run is there at its worst for it."""
-    for name, worst in WORST.items():
-        better = METRICS[name].higher_is_better
+def test_crashing_improves_no_metric_that_is_ranked() -> None:
+    """Beside an episode that went badly, and alone: a crash makes each such mean worse, or there is
+    none."""
+    for name, metric in METRICS.items():
+        if metric.higher_is_better is None:
+            continue
+        worst = WORST.get(name)
+        assert (worst is None) == (name in UNKNOWN_WITH_CRASH), name
         one = table((300.0, 0, 300.0), crashed=1)
         one.loc[0, name] = 0.4
-        mean = float(summary_of(one, [name]).loc[name, "mean"])
-        assert mean < 0.4 if better else mean > 0.4, name
-        assert worst == (0.0 if better else 1.0)
+        both, crash = (summary_of(part, [name]).loc[name] for part in (one, one[1:]))
+        if worst is None:
+            assert both["n"] == crash["n"] == 0 and np.isnan([both["mean"], crash["mean"]]).all()
+        else:
+            assert metric.higher_is_better and crash["mean"] == worst == 0.0, name
+            assert both["mean"] == 0.2, name
+
+
+def test_a_crash_touches_and_leaves_nothing() -> None:
+    """No person, thing, edge or rule of a crashed episode is counted, and its row has no count of
+    them."""
+    assert {*WORST} == {"success", "goal_reached", "route_completion", "spl", "velocity_mean_mps"}
+    shares = {name for name, metric in METRICS.items() if metric.share}
+    assert shares == {
+        "success",
+        "goal_reached",
+        "pedestrian_collision",
+        "other_collision",
+        "left_lane",
+        "broke_rule",
+    }
 
 
 def test_an_invalid_episode_is_in_no_mean_and_two_in_a_hundred_spoil_a_table() -> None:

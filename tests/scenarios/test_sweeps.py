@@ -42,7 +42,7 @@ def swept() -> tuple[OwnFile, pd.DataFrame]:
     table["scenario"], table["status"] = [variant.id for variant in own.variants], "done"
     dense = np.array([variant.at["crowd.density"] == 20 for variant in own.variants])
     failed = dense & (np.arange(len(dense)) % 2 == 0)
-    table["success"], table["failures"], table["path_length_m"] = 1.0 - failed, 1.0 * failed, 40.0
+    table["success"], table["failures"], table["rated_m"] = 1.0 - failed, 1.0 * failed, 40.0
     return own, table
 
 
@@ -58,7 +58,7 @@ def test_a_sweep_gives_what_the_summary_of_a_run_gives_for_each_value(
         ids = [variant.id for variant in own.variants if variant.at["crowd.density"] == density]
         alone = summary_of(table[table["scenario"].isin(ids)])
         pd.testing.assert_frame_equal(
-            summary.loc[density][["mean", "low", "high", "n"]], alone, check_dtype=False
+            summary.loc[density][list(alone.columns)], alone, check_dtype=False
         )
     assert (
         summary.loc[(0, "success"), "mean"] == 1.0
@@ -77,9 +77,10 @@ def test_a_sweep_is_written_whole_or_not_at_all(
     summary = summary_of_sweep(own, table)
     assert [path.name for path in write_sweep(summary, own, tmp_path)] == ["sweep.csv", "sweep.png"]
     read = pd.read_csv(tmp_path / "sweep.csv")
-    assert set(read["metric"]) == set(METRICS) and list(read.columns)[:3] == [
+    assert set(read["metric"]) == set(METRICS) and list(read.columns)[:4] == [
         "crowd.density",
         "episodes",
+        "crashed",
         "invalid",
     ]
     assert (tmp_path / "sweep.png").read_bytes().startswith(b"\x89PNG")
@@ -162,7 +163,7 @@ def test_a_sweep_is_one_command(examples: Path, cosim: Cosim) -> None:
     ran = cosim(*words, cwd=examples)
     assert ran.returncode == 0, ran.stderr
     head, *_ = (line for line in ran.stdout.splitlines() if "SR" in line)
-    assert head.split() == ["density", "n", "SR", "SPL", "RC", "FC", "/100m"]
+    assert head.split() == ["density", "n", "crashed", "SR", "SPL", "RC", "FC", "/100m"]
     assert {"run.json", "results.csv", "sweep.csv", "sweep.png"} <= {
         path.name for path in (examples / "swept").iterdir()
     }

@@ -10,7 +10,7 @@ import pytest
 from cosim.core.errors import RunError, UsageError
 from cosim.results.run_folder import RunFolder
 from cosim.results.run_spec import RunSpec, Shard
-from cosim.spec.episode_id import episode_id_of
+from cosim.spec.episode_id import episode_id_of, seed_for
 from cosim.spec.scenario import Suite
 from cosim.spec.selection import pairs_of, select_scenarios, selection_in_words
 from scenarios.suites.catalog import load_suite
@@ -158,7 +158,12 @@ def test_nothing_that_a_policy_gets_tells_a_decoy(reactive: Suite) -> None:
     run, each of them puts the decoy first in about half of all pairs."""
     pairs = [pair for pair in pairs_of(with_decoys_of(reactive).scenarios) if len(pair) == 2]
     told = [[episode_id_of(seed, one) for one in pair] for seed in range(250) for pair in pairs]
-    for values in (told, [[one.seed for one in pair] for pair in told]):
+    drawn = [
+        [[seed_for(purpose, seed, one) for one in pair] for seed in range(250) for pair in pairs]
+        for purpose in ("policy", "goal", "odometry")
+    ]
+    assert drawn[0] == [[one.seed for one in pair] for pair in told]
+    for values in (told, *drawn):
         decoy_first = sum(decoy < event for event, decoy in values)
         assert 900 < decoy_first < 1100
     assert all(len(one.episode) == 12 for pair in told for one in pair)

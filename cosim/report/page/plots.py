@@ -17,14 +17,13 @@ from cosim.report.page.reasons import CAUSES, mishaps_of
 from cosim.report.page.runs import LIGHT_KINDS, PaperTable, ReportedRun, table_of_paper
 from cosim.report.page.three_tables import (
     UNIT_COLUMNS,
-    MeanOfEpisodes,
     cell_of,
     episodes_of,
     kind_in_words,
 )
 from cosim.results.discerned import DISCERNED
+from cosim.results.intervals import MIN_N, NO_ESTIMATE, Estimate, estimate_of_rate
 from cosim.results.record import Record, Recorder
-from cosim.results.table import bootstrap_interval
 
 RUN_COLOURS: Final = (
     "#1f5fa8",
@@ -143,8 +142,8 @@ def plots_of(
     for (label, family), parts in fast.items():
         speed["long ways" if family == "long" else "short ways"].setdefault(label, []).extend(parts)
     note = (
-        "Pooled over episodes that ended: failures that happened so, on metres driven so; bars "
-        "are 95 % intervals."
+        "Pooled over episodes that ended: failures that happened so, on metres driven so, scaled "
+        f"to those that count for rates; bars are 95 % intervals, from {MIN_N} episodes on."
     )
     moving = f"{note} Without freezings, which happen at no speed."
     found.append(
@@ -207,7 +206,7 @@ def _exposures(runs: Sequence[ReportedRun], progress: Progress) -> tuple[_ByRun,
             if record.scenario.decoy_of:
                 continue
             key = run.label, table_of_paper(run.scenarios[record.scenario.id])
-            travelled_m = track["travelled_m"]
+            travelled_m = track["travelled_m"] * _rated_share(record)
             speed = np.abs(track["speed"][:, 0])
             if key[1] == "long":
                 people = people_nearby(track["pose"], track["people_tick"], track["people_xy"])
@@ -221,6 +220,12 @@ def _exposures(runs: Sequence[ReportedRun], progress: Progress) -> tuple[_ByRun,
     return near, fast
 
 
+def _rated_share(record: Record) -> float:
+    """Return the share of the metres of an episode that counts for rates."""
+    travelled_m = record.measures.get("path_length_m") or 0.0
+    return (record.measures.get("rated_m") or 0.0) / travelled_m if travelled_m else 1.0
+
+
 def _exposure_plot(
     of: Mapping[str, list[Exposure]],
     colours: Mapping[str, str],
@@ -231,18 +236,16 @@ def _exposure_plot(
     """Return the plot of failure rates by bin; None without a failure."""
     if not any(part.failures.any() for parts in of.values() for part in parts):
         return None
-    cells: dict[str, list[MeanOfEpisodes]] = {}
+    cells: dict[str, list[Estimate]] = {}
     for label, parts in of.items():
         failures, metres = (
             np.array([p.failures for p in parts]),
             np.array([p.metres for p in parts]),
         )
         cells[label] = [
-            MeanOfEpisodes(
-                100.0 * f.sum() / m.sum(), *bootstrap_interval(100.0 * f, m), int((m > 0).sum())
-            )
+            estimate_of_rate(f[(m > 0.0) | (f > 0.0)], m[(m > 0.0) | (f > 0.0)])
             if m.sum() >= _MIN_M
-            else MeanOfEpisodes(np.nan, np.nan, np.nan, 0)
+            else NO_ESTIMATE
             for f, m in zip(failures.T, metres.T, strict=True)
         ]
     present = [k for k in range(len(words)) if any(row[k].n for row in cells.values())]
@@ -280,9 +283,9 @@ def _metric_plot(
         return None
     share = metric in _SHARES
     note = (
-        "Points are means, bars 95 % intervals; hover for figures."
+        f"Points are means, bars 95 % intervals, from {MIN_N} episodes on; hover for figures."
         if share
-        else "Pooled; bars are 95 % intervals."
+        else f"Pooled; bars are 95 % intervals, from {MIN_N} episodes on."
     )
     words = [escape(kind_in_words(value)) for value in present]
     return Plot(
@@ -293,7 +296,7 @@ def _metric_plot(
 
 
 def _points(
-    cells: Mapping[str, Sequence[MeanOfEpisodes]],
+    cells: Mapping[str, Sequence[Estimate]],
     colours: Mapping[str, str],
     words: Sequence[str],
     axis: str,
@@ -323,15 +326,12 @@ def _points(
                     "symmetric": False,
                     "thickness": 1.6,
                     "width": 0,
-                    "array": [round(cell.high - cell.mean, 4) for _, cell in shown],
-                    "arrayminus": [round(cell.mean - cell.low, 4) for _, cell in shown],
+                    "array": [_bar(cell, cell.high - cell.mean) for _, cell in shown],
+                    "arrayminus": [_bar(cell, cell.mean - cell.low) for _, cell in shown],
                 },
                 "marker": {"size": 9, "color": colours[label]},
-                "customdata": [
-                    [round(cell.low, 3), round(cell.high, 3), cell.n] for _, cell in shown
-                ],
-                "hovertemplate": "%{y}<br>%{x:.2f} (%{customdata[0]:.2f} to %{customdata[1]:.2f}),"
-                " n = %{customdata[2]}",
+                "customdata": [_hover_of(cell) for _, cell in shown],
+                "hovertemplate": "%{y}<br>%{customdata}",
             }
         )
     scale = {"range": [-0.02, 1.02], "tickformat": ".1f"} if share else {"rangemode": "tozero"}
@@ -350,6 +350,16 @@ def _points(
             },
         },
     }
+
+
+def _bar(cell: Estimate, length: float) -> float | None:
+    """Return the length of an error bar; None without an interval."""
+    return round(length, 4) if cell.has_interval else None
+
+
+def _hover_of(cell: Estimate) -> str:
+    interval = f" ({cell.interval_in_words()})" if cell.has_interval else ""
+    return f"{cell.in_words}{interval}, n = {cell.n}"
 
 
 def _stacked(rows: Mapping[str, Mapping[str, float]], axis: str, form: str) -> dict[str, Any]:
@@ -424,7 +434,7 @@ def _cause_rates_plot(runs: Sequence[ReportedRun]) -> Plot | None:
             crashed.setdefault(run.label, []).append(record.status == "crashed")
             if record.status == "done":
                 metres[run.label] = metres.get(run.label, 0.0) + (
-                    record.measures.get("path_length_m") or 0.0
+                    record.measures.get("rated_m") or 0.0
                 )
                 row = counts.setdefault(run.label, {})
                 for mishap in mishaps_of(record):

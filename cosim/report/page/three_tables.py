@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby, pairwise
 from typing import Final, NamedTuple
 
-import numpy as np
 import pandas as pd
 
 from cosim.report.page.paper import (
@@ -25,7 +24,8 @@ from cosim.results.discerned import (
     pairs_of,
     with_discerned,
 )
-from cosim.results.table import ORACLE, summary_of, why_inconclusive
+from cosim.results.intervals import MIN_N, NO_ESTIMATE, Estimate
+from cosim.results.table import ORACLE, crashed_in, estimate_of, why_inconclusive
 
 UNIT_COLUMNS: Final = ("straight", "curve", "crosswalk")
 _SHARES: Final = {"success": "SR", "spl": "SPL", "route_completion": "RC"}
@@ -49,18 +49,6 @@ _DISCERNED_TITLE: Final = (
 _PLACES: Final = ((False, "Generated places"), (True, "Real places"))
 
 
-class MeanOfEpisodes(NamedTuple):
-    """Mean with its interval over n episodes."""
-
-    mean: float
-    low: float
-    high: float
-    n: int
-
-
-_NOTHING: Final = MeanOfEpisodes(np.nan, np.nan, np.nan, 0)
-
-
 class TableRow(NamedTuple):
     """Row of figures.
 
@@ -69,11 +57,12 @@ class TableRow(NamedTuple):
     """
 
     name: str
-    cells: tuple[MeanOfEpisodes, ...]
+    cells: tuple[Estimate, ...]
     notes: str = ""
     suite: str = ""
     colour: str = ""
     scored: int = 0
+    crashed: int = 0
     invalid: int = 0
 
 
@@ -132,28 +121,31 @@ def summary_table(runs: Sequence[ReportedRun], colours: Mapping[str, str]) -> Re
     rows = []
     for run in runs:
         invalid = int((run.table["status"] == "invalid").sum())
-        cells = tuple(cell_of(run.table, metric) for metric in first)
-        about = {"suite": run.spec.suite, "colour": colours[run.label]}
         rows.append(
-            TableRow(run.label, cells, scored=len(run.table) - invalid, invalid=invalid, **about)
+            TableRow(
+                run.label,
+                tuple(cell_of(run.table, metric) for metric in first),
+                suite=run.spec.suite,
+                colour=colours[run.label],
+                scored=len(run.table) - invalid,
+                crashed=crashed_in(run.table),
+                invalid=invalid,
+            )
         )
     of_d = f"D {DISCERNED_IN_WORDS}; " if decoys else ""
     note = (
         f"SR success; {of_d}RC share of the route done; FC failures per 100 m travelled, pooled; "
-        "V mean speed. Small figures are 95 % bootstrap intervals over episodes."
-        + " Decoys are scored, but count in D alone."
-        * decoys
+        f"V mean speed. Small figures are 95 % intervals; below {MIN_N} episodes there are only "
+        "counts. A crashed episode counts as failed, with SR, RC and V of 0; a run with one has "
+        "no rates." + " Decoys are scored, but count in D alone." * decoys
     )
-    heads = ("scored", "invalid", *first.values())
+    heads = ("scored", "crashed", "invalid", *first.values())
     return ReportTable("All episodes of each run", note, heads, tuple(rows))
 
 
-def cell_of(table: pd.DataFrame, metric: str) -> MeanOfEpisodes:
+def cell_of(table: pd.DataFrame, metric: str) -> Estimate:
     """Return the mean of a metric over the rows of a table."""
-    if not len(table):
-        return _NOTHING
-    mean, low, high, n = summary_of(table, [metric]).iloc[0]
-    return MeanOfEpisodes(float(mean), float(low), float(high), int(n))
+    return estimate_of(table, metric) if len(table) else NO_ESTIMATE
 
 
 def episodes_of(runs: Iterable[ReportedRun], family: PaperTable) -> dict[str, pd.DataFrame]:
@@ -288,10 +280,12 @@ def _part(table: pd.DataFrame, column: _Column) -> pd.DataFrame:
 
 
 def _notes(table: pd.DataFrame) -> str:
-    """Return the notes of a row: number of episodes and pairs, privileged, nonstandard camera."""
+    """Return the notes of a row: episodes, pairs, crashes, privileged, nonstandard camera."""
     episodes = int((~is_decoy(table)).sum())
     notes = [f"{episodes} episode{'s' * (episodes != 1)}"]
     notes += [pairs_of(table).in_words] * has_decoys(table)
+    if crashed := crashed_in(table):
+        notes.append(f"{crashed} crashed")
     notes += ["crowd added"] * bool(table["crowd_added"].any())
     if table["privileged"].any():
         notes.append("oracle, privileged" if ORACLE in {*table["policy"]} else "privileged")

@@ -13,7 +13,7 @@ import pandas as pd
 from cosim.core.errors import unwritable
 from cosim.core.files import write_atomic
 from cosim.report.curves import draw_curves
-from cosim.results.table import summary_of
+from cosim.results.table import crashed_in, summary_of
 from scenarios.suites.user_scenarios.read import OwnFile, label
 
 SWEPT: Final = ("success", "spl", "route_completion", "failures_per_100m")
@@ -26,8 +26,8 @@ def summary_of_sweep(own: OwnFile, table: pd.DataFrame) -> pd.DataFrame:
 
     table: results of the run, one row per episode.
 
-    The fields come first. `episodes` and `invalid` follow: how many scenarios were built, and how
-    many of them are missing. The other columns are those of `summary_of`.
+    The fields come first. `episodes`, `crashed` and `invalid` follow: how many scenarios were
+    built, and how many of them crashed or are invalid. The other columns are those of `summary_of`.
     """
     fields = [axis.field for axis in own.axes]
     parts = []
@@ -37,7 +37,8 @@ def summary_of_sweep(own: OwnFile, table: pd.DataFrame) -> pd.DataFrame:
         for place, field in enumerate(fields):
             part.insert(place, field, [at[place]] * len(part))
         part.insert(len(fields), "episodes", len(ids))
-        part.insert(len(fields) + 1, "invalid", int((rows["status"] == "invalid").sum()))
+        part.insert(len(fields) + 1, "crashed", crashed_in(rows))
+        part.insert(len(fields) + 2, "invalid", int((rows["status"] == "invalid").sum()))
         parts.append(part)
     return pd.concat(parts, ignore_index=True)
 

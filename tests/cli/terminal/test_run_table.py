@@ -102,25 +102,25 @@ def test_of_many_valid_names_the_likely_ones_are_listed() -> None:
 
 
 def test_val_and_test_stand_apart() -> None:
-    """A run with both has a row for each; a run of one has none."""
+    """A run with both has a row for each, with its crashes, and counts below five episodes; a run
+    of one has none."""
     rows = [
         dict.fromkeys(METRICS, 1.0)
         | {
             "scenario": f"s-{i}",
-            "status": "done",
+            "status": "crashed" if i == 2 else "done",
+            "reason": "",
             "ended": "goal",
             "split": split,
-            "success": float(split == "val"),
+            "success": float(split == "val" and i != 2),
         }
-        for i, split in enumerate(("val", "val", "test"))
+        for i, split in enumerate(("val",) * 6 + ("test",) * 3)
     ]
     out, said = terminal()
-    print_table(out, pd.DataFrame(rows), 3)
-    assert re.search(r"^ +val +2 +1\.00 ", said.getvalue(), re.MULTILINE)
-    assert (
-        re.search(r"^ +test +1 +0\.00 ", said.getvalue(), re.MULTILINE)
-        and "…" not in said.getvalue()
-    )
+    print_table(out, pd.DataFrame(rows), 9)
+    assert re.search(r"^ +val +6 +1 +0\.83 0\.44\.\.0\.97 ", said.getvalue(), re.MULTILINE)
+    assert re.search(r"^ +test +3 +0 +0/3 +1\.00 +3 in 3 m ", said.getvalue(), re.MULTILINE)
+    assert "…" not in said.getvalue()
     out, said = terminal()
     print_table(out, pd.DataFrame(rows[:2]), 2)
     assert "split" not in said.getvalue()
@@ -221,3 +221,29 @@ def test_the_next_commands_are_printed_with_the_runs_folder() -> None:
     ]
     assert told(("a", "goal", 1.0))[1] == "cosim film 'runs/my run' a -o film.mp4"
     assert told(("a", None, 0.0)) == ["Next:", report]
+
+
+def test_few_episodes_are_counted_and_crashes_have_a_column() -> None:
+    """Of one episode there is no interval, and no rate but failures in metres; a kind with a crash
+    has a count of it, and none of the people that were hit."""
+    ways = [short_way(f"s-{k}", structure=("straight", "curve")[k % 2]) for k in range(4)]
+
+    def told(*hows: str) -> str:
+        records = [episode_of(way, "h", how)[0] for way, how in zip(ways, hows, strict=False)]
+        out, said = terminal()
+        print_table(out, table_of(records), len(records))
+        print_by_kind(out, table_of(records), {way.id: way.structure for way in ways})
+        return said.getvalue()
+
+    one = told("goal")
+    assert re.search(r"success \(SR\) +1/1 +- +1 ", one)
+    assert re.search(r"collisions_per_100m \(C\) +0 in 8 m +- +1 ", one)
+    assert re.search(r"velocity_mean_mps \(V\) +1\.00 +- +1 ", one)
+    assert not re.search(r"\d to \d|\d\.\.\d", one) and "crash " not in one
+    several = told("goal", "goal", "goal", "crashed")
+    assert re.search(r"success \(SR\) +3/4 +- +4 ", several)
+    assert re.search(r"velocity_mean_mps \(V\) +0\.75 ", several)
+    assert re.search(r"failures_per_100m \(FC\) +- +- +0 ", several)
+    assert re.search(r"straight +2 +0 +2/2 +- +1\.00 +0/2 ", several)
+    assert re.search(r"curve +2 +1 +1/2 +- +0\.50 +- +- ", several)
+    assert "- unknown, because an episode crashed" in " ".join(several.split())

@@ -18,6 +18,7 @@ from cosim.cli.run_table import COUNTS, SHOWN, WITH_PEOPLE, print_by_kind, print
 from cosim.cli.scenario import _print_sweep
 from cosim.cli.suites import print_scenarios
 from cosim.results.compare import DIFFERENCES, FLIPPED, ComparedRun, RunComparison
+from cosim.results.intervals import Estimate
 from cosim.results.metrics import COUNTERFACTUAL, METRICS
 from cosim.results.table import COLUMNS as KEYS
 from cosim.spec.scenario import Suite
@@ -33,12 +34,13 @@ LONG = "sumo-fokr-bs-demo-ped_crossing-003"
 
 
 def episodes() -> pd.DataFrame:
-    """Two episodes with long names, two digits before every point, dozens of failures, and the
-    robot's cost."""
+    """Twelve episodes with long names, two digits before every point, dozens of failures, and the
+    robot's cost; all succeed and touch everything."""
     row = dict.fromkeys((*KEYS, *METRICS, *COUNTERFACTUAL), 34.56) | {
         name: 120.0 for name, _ in COUNTS
     }
     row |= {name: 34.56 for name, _ in (*SHOWN, *WITH_PEOPLE)}
+    row |= {name: 1.0 for name, metric in METRICS.items() if metric.share}
     words = {
         "status": "done",
         "ended": "timeout",
@@ -54,20 +56,23 @@ def episodes() -> pd.DataFrame:
         "policy_runs": "in-process",
     }
     return pd.DataFrame(
-        [row | words | {"scenario": f"{LONG}{i}", "split": ("val", "test")[i]} for i in range(2)]
+        [
+            row | words | {"scenario": f"{LONG}{i:x}", "split": ("val", "test")[i % 2]}
+            for i in range(12)
+        ]
     )
 
 
 def of_run(out: Console) -> None:
     table = episodes()
-    print_table(out, table, 2)
+    print_table(out, table, 12)
     print_by_kind(
-        out, table, dict(zip(table["scenario"], ("ped_crossing", "conversing"), strict=True))
+        out, table, dict(zip(table["scenario"], ("ped_crossing", "conversing") * 6, strict=True))
     )
 
 
 def of_comparison(out: Console) -> None:
-    figures = (200, -34.567, 34.567, 69.134, -12.345, 81.479, 100, "within noise")
+    figures = (200, -34.567, 34.567, "", "", 69.134, -12.345, 81.479, 100, "within noise")
     rows = [
         ("a", "b", by, LONG, name, "", *figures) for by in ("suite", "event") for name in METRICS
     ]
@@ -87,10 +92,10 @@ def of_sweep(out: Console) -> None:
             "crowd.density": 12.5,
             "events.kind": "ped_crossing",
             "obstacles.per_100m": 3.5,
+            "crashed": 3,
             "metric": name,
-            "n": 200,
         }
-        | {"mean": 34.56, "low": -34.56, "high": 34.56}
+        | Estimate(34.56, -34.56, 34.56, 200)._asdict()
         for name in SWEPT
     ]
     _print_sweep(pd.DataFrame(rows), ["crowd.density", "events.kind", "obstacles.per_100m"])
@@ -114,7 +119,7 @@ def of_suite(out: Console) -> None:
 
 
 TABLES: dict[str, tuple[Callable[[Console], None], Sequence[str]]] = {
-    "run": (of_run, ("34.56", "120/120/120", "34.56 to 34.56", "34.56..34.56")),
+    "run": (of_run, ("34.56", "120/120/120", "34.56 to 34.56", "0.61..1.00")),
     "comparison": (
         of_comparison,
         ("-34.57", "34.57", "+69.13", "-12.35 to +81.48", "200", "within noise"),
