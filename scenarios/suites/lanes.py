@@ -96,7 +96,7 @@ def walkable_width_m(route: Polyline, street_map: StreetMap) -> tuple[float, flo
             )
             for x, y, on in at
         ]
-        starts = shapely.points([pose.xy for pose in at])
+        starts = [Point(pose.xy) for pose in at]
         inside = shapely.intersection(rays, walkable)
         reached = [_reach_m(part, start) for part, start in zip(inside, starts, strict=True)]
         found.append(float(np.median(reached)))
@@ -159,7 +159,7 @@ class _Site:
         return Room(self._scenario, self._street_map)
 
     @cached_property
-    def standing(self) -> list[list[Polygon]]:
+    def standing(self) -> list[list[shapely.Geometry]]:
         """Ground of the people who stand, for each free side."""
         (event,) = self._scenario.events
         blocks = event.free_side and self._kind.blocked is not None
@@ -288,7 +288,7 @@ def _span(route: Polyline, ground: Polygon) -> tuple[float, float]:
     return float(s_m.min()), float(s_m.max())
 
 
-def standing_ground(event: Event, kind: EventKind) -> list[Polygon]:
+def standing_ground(event: Event, kind: EventKind) -> list[shapely.Geometry]:
     """Return the ground that people of an event with a free side block; none for other events."""
     if kind.blocked is None or not event.free_side:
         return []

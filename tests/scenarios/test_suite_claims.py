@@ -58,7 +58,7 @@ def honest(name: str) -> Read:
     proofs."""
     kinds = [*EVENT_KINDS]
     slots = {slot.name: slot for slot in RECIPES[name].slots}
-    scenarios = []
+    scenarios: list[Scenario] = []
     for number, slot in enumerate(slots.values()):
         if slot.decoy_of:
             made = decoy_of(scenarios[-1])
@@ -217,7 +217,17 @@ def nearer(scenario: Scenario, share: float) -> Scenario:
         for s in np.linspace(0.0, share * scenario.route_line.length_m, 21)
     ]
     route = tuple((float(x), float(y)) for x, y in points)
-    return replace(scenario, goal=route[-1], route=route, crossings=(), events=())
+    bare = {"crossings": (), "events": (), "go_on_mps": 0.0}
+    return replace(scenario, goal=route[-1], route=route, **bare)
+
+
+def bent(scenario: Scenario) -> dict[str, object]:
+    """Its route with a turn of 20 degrees in the middle."""
+    (x_m, y_m), half_m = scenario.start[:2], 0.5 * scenario.route_line.length_m
+    turn_rad = math.radians(20.0)
+    middle = (x_m + half_m, y_m)
+    goal = (middle[0] + half_m * math.cos(turn_rad), y_m + half_m * math.sin(turn_rad))
+    return {"route": ((x_m, y_m), middle, goal), "goal": goal}
 
 
 def moved(scenario: Scenario, s_m: float) -> Scenario:
@@ -292,6 +302,11 @@ def broken() -> dict[str, tuple[str, Read, str]]:
             "structures",
             one(unit, curve, structure="straight"),
             "is no 'straight'",
+        ),
+        "an-event-round-a-bend": (
+            "structures",
+            one(reactive, 0, **bent(first)),
+            "is no 'obstructing': turns 20 degrees",
         ),
         "a-crosswalk-with-signals": (
             "structures",

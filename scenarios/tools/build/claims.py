@@ -37,8 +37,8 @@ _MOST_BYTES: Final = 3_000_000
 """Largest size of a suite's file and its proofs, in bytes."""
 _EDGE_M: Final = 0.6
 """Largest deviation of a drawn length from the wanted range, in metres."""
-_MEAN_APART_M: Final = 1.5
-"""Largest difference between the mean lengths of one kind and of all kinds, in metres."""
+_LENGTHS_APART_M: Final = 1.5
+"""Largest difference between the lengths of one kind and of all, in metres: means and ranges."""
 _THIRDS: Final = ("first third", "middle third", "last third")
 _LEAST_THIRD: Final = 0.2
 _LEAST_SIDE: Final = 0.4
@@ -154,21 +154,34 @@ def _lengths(read: Read) -> Iterator[str]:
         if not low_m - _EDGE_M < length_m < high_m + _EDGE_M:
             yield f"{scenario.id}: is {length_m:.1f} m long"
     short = [scenario for scenario in read.suite.scenarios if _is_reactive(scenario)]
-    if short:
-        whole_m = float(np.mean([one.route_line.length_m for one in short]))
-        for structure, those in _by(short, lambda s: s.structure).items():
-            mean_m = float(np.mean([one.route_line.length_m for one in those]))
-            if abs(mean_m - whole_m) > _MEAN_APART_M:
-                yield (
-                    f"{structure}: its ways are {mean_m:.1f} m long on average, those of all kinds "
-                    f"{whole_m:.1f} m"
-                )
+    yield from _other_lengths(short)
     routes_m = sum(s.route_line.length_m for s in read.suite.scenarios if s.structure == LONG_WAY)
     if routes_m and abs(routes_m / ALL_ROUTES_M - 1.0) > 0.01:
         yield (
             f"{read.suite.name}: its ways are {routes_m / 1000:.2f} km in all, not "
             f"{ALL_ROUTES_M / 1000:g} +- 1 %"
         )
+
+
+def _other_lengths(scenarios: Sequence[Scenario]) -> Iterator[str]:
+    """Yield the structures whose lengths are distributed otherwise than those of all."""
+    lengths_m = {
+        structure: [one.route_line.length_m for one in those]
+        for structure, those in _by(scenarios, lambda s: s.structure).items()
+    }
+    every_m = [length_m for those in lengths_m.values() for length_m in those]
+    measures: list[tuple[str, Callable[[list[float]], float]]] = [
+        ("on average", lambda those: float(np.mean(those))),
+        ("at least", min),
+        ("at most", max),
+    ]
+    for structure, those_m in lengths_m.items():
+        for words, measure in measures:
+            if abs(measure(those_m) - measure(every_m)) > _LENGTHS_APART_M:
+                yield (
+                    f"{structure}: its ways are {measure(those_m):.1f} m long {words}, those of "
+                    f"all kinds {measure(every_m):.1f} m"
+                )
 
 
 def _is_reactive(scenario: Scenario) -> bool:
@@ -270,7 +283,8 @@ def _limits(read: Read) -> Iterator[str]:
 def _structures(read: Read) -> Iterator[str]:
     """Check that each scenario matches its structure.
 
-    It is straight, round a corner, over a crosswalk without signals, or has its own event.
+    It is straight, round a corner, over a crosswalk without signals, or straight with its own
+    event.
     """
     for one in read.suite.scenarios:
         turn = abs(turn_rad(one.route_line))
@@ -279,10 +293,10 @@ def _structures(read: Read) -> Iterator[str]:
             "straight": turn <= _STRAIGHT_RAD and not one.crossings and not kinds,
             "curve": TURN_RAD[0] <= turn <= TURN_RAD[1] and not one.crossings and not kinds,
             "crosswalk": len(one.crossings) == 1 and not one.crossings[0].signalised and not kinds,
-            STATIC: not kinds,
+            STATIC: not kinds and turn <= _STRAIGHT_RAD,
             LONG_WAY: bool(one.crossings) and bool(one.barriers),
         }
-        if not says.get(one.structure, kinds == [one.structure]):
+        if not says.get(one.structure, kinds == [one.structure] and turn <= _STRAIGHT_RAD):
             yield (
                 f"{one.id}: is no '{one.structure}': turns {math.degrees(turn):.0f} degrees, "
                 f"events {kinds}"
