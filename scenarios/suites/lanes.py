@@ -22,7 +22,7 @@ from cosim.place import overlay
 from cosim.place.street_map import Lane, StreetMap, Strip
 from cosim.spec.events import Event, EventKind
 from cosim.spec.obstacle import OBSTACLE_FORMS, OBSTACLE_SIZES_M, Obstacle, footprint
-from cosim.spec.robot import robot_called
+from cosim.spec.robot import Robot, robot_called
 from cosim.spec.scenario import Scenario
 from physics.street.placement import driveway_ground
 from scenarios.suites.obstacles import APART_M, AROUND_M, EDGE_M, Room, spans_m
@@ -39,6 +39,10 @@ EVENT_M: Final = 2.0
 """Least distance of obstacles from the place of an event on a sidewalk, in metres."""
 _WAITING_M: Final = 0.3
 """Least distance of obstacles from people who wait for the event to begin, in metres."""
+_MEETING_M: Final = (2.5, 4.0)
+"""Length before and behind the place where the robot meets people who come towards it, in metres,
+on which their side is clear of obstacles.
+"""
 _CROSSING_M: Final = 0.5
 """Least distance of obstacles from crossings, in metres."""
 _AFTER_M: Final = 1.6
@@ -184,7 +188,7 @@ class _Site:
             *(shapely.buffer(prop, APART_M) for prop in self.room.props),
             shapely.buffer(Point(scenario.start[:2]), start_m),
             shapely.buffer(Point(scenario.goal), ENDS_M),
-            *_event_ground(scenario.events[0], self._kind),
+            *_event_ground(scenario.events[0], self._kind, self.robot),
         ]
         walkable = shapely.buffer(street_map.walkable_near(area), -EDGE_M)
         free: Polygon = overlay.difference(walkable, overlay.union_all(taken))
@@ -192,13 +196,31 @@ class _Site:
         return free
 
 
-def _event_ground(event: Event, kind: EventKind) -> Iterator[Polygon]:
-    """Yield the ground that the people of an event need before it begins."""
+def _event_ground(event: Event, kind: EventKind, robot: Robot) -> Iterator[Polygon]:
+    """Yield the ground that the people of an event need.
+
+    Those who come towards the robot need the side to which they step aside in a decoy.
+    """
+    if kind.layout is not None and kind.layout.after_m < 0.0 and event.trigger_m is not None:
+        share = event.speed_mps / (event.speed_mps + robot.cruise_mps)
+        yield _beside(event, -share * event.trigger_m)
     for number in range(event.people):
         walker = kind.begin(event, number)
         yield shapely.buffer(Point(walker.x_m, walker.y_m), PERSON_RADIUS_M + _WAITING_M)
     if kind.layout is not None:
         yield shapely.buffer(Point(event.x_m, event.y_m), EVENT_M)
+
+
+def _beside(event: Event, meets_m: float) -> Polygon:
+    """Return the event's side of the way around a place along its heading."""
+    cos, sin = math.cos(event.heading_rad), math.sin(event.heading_rad)
+    ahead_m = meets_m - _MEETING_M[0], meets_m + _MEETING_M[1]
+    aside_m = 0.0, event.side * event.half_width_m
+    points = [
+        (event.x_m + cos * on_m - sin * left_m, event.y_m + sin * on_m + cos * left_m)
+        for on_m, left_m in itertools.product(ahead_m, aside_m)
+    ]
+    return shapely.MultiPoint(points).convex_hull
 
 
 class _Shape(NamedTuple):
