@@ -129,6 +129,8 @@ def with_lanes_blocked(scenario: Scenario, kind: EventKind, street_map: StreetMa
     named = zlib.crc32(kind.name.encode())
     rng = np.random.default_rng([scenario.seed, scenario.place.seed, 0x1A7E, named])
     site = _Site(scenario, kind, street_map)
+    if len(site.standing) > 1 and site.room.shares_way(scenario.obstacles, site.standing):
+        raise SpecError("one way is free on both sides of the people")
     reason = "no obstacles block every lane"
     for _ in range(_DRAWS):
         if not (things := _drawn(site, scenario.obstacles, rng)):
@@ -138,8 +140,6 @@ def with_lanes_blocked(scenario: Scenario, kind: EventKind, street_map: StreetMa
             reason = "obstacles cover two waypoints in a row"
         elif not all(site.room.passable(obstacles, people) for people in site.standing):
             reason = "no gap is left"
-        elif len(site.standing) > 1 and site.room.shares_way(obstacles, site.standing):
-            reason = "one way is free on both sides of the people"
         else:
             return msgspec.structs.replace(scenario, obstacles=obstacles)
     raise SpecError(reason)

@@ -34,7 +34,7 @@ class Proof(msgspec.Struct, frozen=True, kw_only=True):
 
     people_m, obstacles_m: least distance of its body from people and obstacles, absent without any.
     passing_mps: its mean speed past the person of a decoy (`cosim.results.go_on`), absent without.
-    dropped: rejected candidates before this one.
+    dropped: rejected candidates before this one; none for a decoy, which has no own candidates.
     """
 
     scenario: str

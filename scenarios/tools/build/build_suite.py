@@ -257,7 +257,8 @@ def _fill(slot: Slot, folder: Path, tries: int) -> None:
             dropped.append(msgspec.structs.replace(found, seed=seed))
             continue
         for one, proof in reversed(found):  # the decoy first: the scenario's file ends the slot
-            kept = Kept(one, msgspec.structs.replace(proof, dropped=tuple(dropped)))
+            before = () if one.decoy_of else tuple(dropped)
+            kept = Kept(one, msgspec.structs.replace(proof, dropped=before))
             write_atomic(folder / f"{one.id}.json", msgspec.json.encode(kept))
         _trying(folder, slot.name).unlink()
         return
