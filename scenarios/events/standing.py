@@ -191,7 +191,7 @@ def _obeyed(event: Event, state: EventState, query: EventQuery) -> bool:
 
 
 def _standing(places: _Places, facing: _Facing, aside: _Asides = _aside) -> _Step:
-    """Build the step function of people who go from `aside` to `places` and face as `facing` says."""
+    """Build the step function of people who go to `places`, and back to `aside`."""
 
     def step(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:
         walker = state.walkers[number]
