@@ -22,8 +22,10 @@ from scenarios.events.walking import (
     along_m,
     come_at_robot,
     edge_m,
+    lead_to_meeting_m,
     left_m,
     lost_patience,
+    robots_line_m,
     turn_towards,
     waiting_for_robot,
     walk_on,
@@ -91,7 +93,7 @@ def _to_robots_line(event: Event, walker: Walker, query: EventQuery) -> tuple[Wa
     late = gap_m < query.robot_length_m / 2 + PERSON_RADIUS_M + COMMIT_M
     if late and walker.aim_rad is not None:
         return walker, walker.aim_rad
-    line_m = max(-edge_m(event), min(edge_m(event), left_m(event, query.robot_x_m, query.robot_y_m)))
+    line_m = robots_line_m(event, query, lead_to_meeting_m(gap_m, query))
     turn_rad = math.atan2(left_m(event, walker.x_m, walker.y_m) - line_m, TO_LINE_M)
     return msgspec.structs.replace(walker, aim_rad=turn_rad), turn_rad
 

@@ -1,4 +1,7 @@
-"""`frontal`: walks at the robot's current position, commits to a line late, passes and walks on.
+"""`frontal`: walks at the robot, commits to a line late, passes and walks on.
+
+It aims ahead of the robot by up to a second's way, because a robot that changes lanes would
+otherwise pass the line to its current position.
 
 A person who avoids others on the way takes aim again. While the robot stands farther away than
 MET_M, the person waits. Before a robot that stands nearer it stops, waits for its patience, and

@@ -33,6 +33,7 @@ from scenarios.events.walking import (
     left_m,
     lost_patience,
     robot_stands,
+    robots_line_m,
     waiting_for_robot,
     walk_on,
     walk_straight,
@@ -65,10 +66,12 @@ YIELDED_S: Final = 5.0
 """Seconds without an approach after which a robot that moves counts as having let it in."""
 _NEARER_M: Final = 0.1
 """Metres by which the lead must shrink to count as an approach."""
-_COMMIT_M: Final = 0.5
+_COMMIT_M: Final = 0.3
 """Gap in metres to the robot below which it no longer follows the robot's line."""
-_TO_LINE_M: Final = 0.4
-"""Look-ahead distance in metres at which it aims for the robot's line after cutting in."""
+_TO_LINE_S: Final = 0.4
+"""Time in seconds in which it steps back to the robot's line after cutting in."""
+_SIDEWAYS_MPS: Final = 1.2
+"""Highest speed in m/s at which it does so."""
 _CLEAR_AHEAD_M: Final = 5.0
 """Lead in metres at which the person of a decoy has overtaken."""
 _LOOK_AHEAD_M: Final = 1.2
@@ -112,12 +115,13 @@ def _before_robot(event: Event, walker: Walker, query: EventQuery, sight: Sight)
         return walker
     walker = _eased(event, walker, query)
     assert walker.pace_mps is not None
-    heading_rad = event.heading_rad
+    sideways_mps = 0.0
     if distance_m(walker, query) > query.robot_length_m / 2 + PERSON_RADIUS_M + _COMMIT_M:
-        room_m = event.half_width_m - PERSON_RADIUS_M
-        line_m = max(-room_m, min(room_m, left_m(event, query.robot_x_m, query.robot_y_m)))
-        heading_rad += math.atan2(line_m - left_m(event, walker.x_m, walker.y_m), _TO_LINE_M)
-    return walk_straight(walker, heading_rad, walker.pace_mps, sight)
+        line_m = robots_line_m(event, query, max(_lead_m(event, walker, query), 0.0))
+        off_m = line_m - left_m(event, walker.x_m, walker.y_m)
+        sideways_mps = max(-_SIDEWAYS_MPS, min(_SIDEWAYS_MPS, off_m / _TO_LINE_S))
+    heading_rad = event.heading_rad + math.atan2(sideways_mps, walker.pace_mps)
+    return walk_straight(walker, heading_rad, math.hypot(sideways_mps, walker.pace_mps), sight)
 
 
 def _decoy_step(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:

@@ -33,7 +33,7 @@ from cosim.spec.events import (
 )
 from cosim.spec.robot import COURIER
 from scenarios.events.gates import gate_half_m
-from scenarios.events.sight import sight_of
+from scenarios.events.sight import SMALL_GAPS_AFTER_S, sight_of
 from scenarios.events.walking import (
     MIDDLE_M,
     along_m,
@@ -63,7 +63,7 @@ CLOSED_M: Final = 0.25
 """Gap in metres between people and the edge on the closed side, too narrow for any robot."""
 BESIDE_M: Final = 0.9
 """Lateral distance in metres between the robot's line and a person who gestures beside it."""
-_WALKS_FOR: Final = 0.7
+_WALKS_FOR: Final = 0.55
 """Fraction of the time until the fastest robot arrives in which people reach the closed side."""
 _FASTEST_MPS: Final = 3.0
 """Highest speed in m/s at which they walk there."""
@@ -191,7 +191,7 @@ def _obeyed(event: Event, state: EventState, query: EventQuery) -> bool:
 
 
 def _standing(places: _Places, facing: _Facing, aside: _Asides = _aside) -> _Step:
-    """Build the step function of people who go from `aside` to `places`, facing as `facing` says."""
+    """Build the step function of people who go to `places`, and back to `aside`."""
 
     def step(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:
         walker = state.walkers[number]
@@ -200,9 +200,9 @@ def _standing(places: _Places, facing: _Facing, aside: _Asides = _aside) -> _Ste
         place, waits_at = places(event, state.lane_m)[number], aside(event, number)
         x_m, y_m = world_point(event, *(place if acting else waits_at))
         if (walker.x_m, walker.y_m) != (x_m, y_m):
-            sight = sight_of(
-                event, number, query, (query.tick - state.since_tick) * tick_s if acting else 0.0
-            )
+            walked_s = (query.tick - state.since_tick) * tick_s if acting else 0.0
+            in_hurry_s = SMALL_GAPS_AFTER_S if acting and event.free_side else 0.0
+            sight = sight_of(event, number, query, walked_s + in_hurry_s)
             pace_mps = _pace_mps(event, place, waits_at) if acting else event.speed_mps
             return walk_to(walker, x_m, y_m, pace_mps, sight, insisting=acting)
         if acting:

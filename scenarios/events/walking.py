@@ -38,6 +38,10 @@ _SAME_M = 1e-9
 MET_M = 2.5
 """Distance in metres between the centres of a person and a standing robot that have met. People who
 come at a robot that stands farther away wait for it to come."""
+_LEAD_S = 1.0
+"""Time in seconds for which people who walk at the robot expect it to keep its course, at most."""
+_WALKS_MPS = 1.3
+"""Walking speed in m/s by which they estimate the time until they meet."""
 _STANDOFF_M = 0.45
 """Gap in metres before a standing robot at which a person waits."""
 
@@ -182,18 +186,35 @@ def heading_after(walker: Walker, after: Vector, sight: Sight) -> float:
 
 
 def aim_at_robot(walker: Walker, query: EventQuery, commit_m: float) -> tuple[Walker, float]:
-    """Return the walker and its heading (rad) at the robot's position.
+    """Return the walker and its heading (rad) at the robot, ahead of it by the way to the meeting.
 
     commit_m: Distance to the robot below which the walker keeps its heading while the robot moves.
     """
-    dx, dy = query.robot_x_m - walker.x_m, query.robot_y_m - walker.y_m
     if robot_stands(query):
         walker = msgspec.structs.replace(walker, aim_rad=None)
     if walker.aim_rad is not None:
         return walker, walker.aim_rad
+    far_m = distance_m(walker, query)
+    lead_m = lead_to_meeting_m(far_m, query)
+    dx = query.robot_x_m + lead_m * math.cos(query.robot_heading_rad) - walker.x_m
+    dy = query.robot_y_m + lead_m * math.sin(query.robot_heading_rad) - walker.y_m
     heading_rad = math.atan2(dy, dx)
-    commits = math.hypot(dx, dy) <= commit_m and not robot_stands(query)
+    commits = far_m <= commit_m and not robot_stands(query)
     return msgspec.structs.replace(walker, aim_rad=heading_rad) if commits else walker, heading_rad
+
+
+def lead_to_meeting_m(far_m: float, query: EventQuery) -> float:
+    """Return how far in metres the robot drives until it meets a person who comes towards it."""
+    v_mps = max(query.robot_v_mps, 0.0)
+    meets_s = max(far_m - query.robot_length_m, 0.0) / (v_mps + _WALKS_MPS)
+    return v_mps * min(meets_s, _LEAD_S)
+
+
+def robots_line_m(event: Event, query: EventQuery, ahead_m: float) -> float:
+    """Return the lateral offset (m) of a point ahead of the robot, inside the way."""
+    turn_rad = query.robot_heading_rad - event.heading_rad
+    line_m = left_m(event, query.robot_x_m, query.robot_y_m) + ahead_m * math.sin(turn_rad)
+    return max(-edge_m(event), min(edge_m(event), line_m))
 
 
 def robot_stands(query: EventQuery) -> bool:

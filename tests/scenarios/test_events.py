@@ -116,8 +116,8 @@ def test_an_obstructing_pedestrian_waits_aside_then_stands_in_the_middle_and_lea
 
 
 def test_a_frontal_pedestrian_walks_at_the_robot_until_it_commits_to_a_line() -> None:
-    """It aims at the robot's current place, keeps its speed, and from the commitment distance on
-    keeps its line."""
+    """It aims ahead of the robot by the way to their meeting, keeps its speed, and from the
+    commitment distance on keeps its line."""
     one = event("frontal")
     states: tuple[EventState, ...] = ()
     headings = []
@@ -135,7 +135,8 @@ def test_a_frontal_pedestrian_walks_at_the_robot_until_it_commits_to_a_line() ->
             moved = math.hypot(now.x_m - before.x_m, now.y_m - before.y_m)
             assert moved == pytest.approx(1.2 * 0.05)
             if gap > COMMIT_M:
-                aim = math.atan2(y_m - before.y_m, x_m - before.x_m)
+                lead_m = min((gap - 0.7) / 2.3, 1.0)
+                aim = math.atan2(y_m - before.y_m, x_m + lead_m - before.x_m)
                 assert math.cos(now.heading_rad - aim) == pytest.approx(1.0)
             else:
                 headings.append(now.heading_rad)
