@@ -196,7 +196,7 @@ class _Site:
         return free
 
 
-def _event_ground(event: Event, kind: EventKind, robot: Robot) -> Iterator[Polygon]:
+def _event_ground(event: Event, kind: EventKind, robot: Robot) -> Iterator[shapely.Geometry]:
     """Yield the ground that the people of an event need.
 
     Those who come towards the robot need the side to which they step aside in a decoy.
@@ -211,7 +211,7 @@ def _event_ground(event: Event, kind: EventKind, robot: Robot) -> Iterator[Polyg
         yield shapely.buffer(Point(event.x_m, event.y_m), EVENT_M)
 
 
-def _beside(event: Event, meets_m: float) -> Polygon:
+def _beside(event: Event, meets_m: float) -> shapely.Geometry:
     """Return the event's side of the way around a place along its heading."""
     cos, sin = math.cos(event.heading_rad), math.sin(event.heading_rad)
     ahead_m = meets_m - _MEETING_M[0], meets_m + _MEETING_M[1]

@@ -34,7 +34,7 @@ LONG = "sumo-fokr-bs-demo-ped_crossing-003"
 
 
 def episodes() -> pd.DataFrame:
-    """Twelve episodes with long names, two digits before every point, dozens of failures, and the
+    """Twelve episodes and their decoys with long names, two digits before every point, dozens of failures, and the
     robot's cost; all succeed and touch everything."""
     row = dict.fromkeys((*KEYS, *METRICS, *COUNTERFACTUAL), 34.56) | {
         name: 120.0 for name, _ in COUNTS
@@ -57,18 +57,24 @@ def episodes() -> pd.DataFrame:
     }
     return pd.DataFrame(
         [
-            row | words | {"scenario": f"{LONG}{i:x}", "split": ("val", "test")[i % 2]}
+            row
+            | words
+            | {
+                "scenario": f"{LONG}{i:x}{end}",
+                "split": ("val", "test")[i % 2],
+                "decoy_of": f"{LONG}{i:x}" * bool(end),
+            }
             for i in range(12)
+            for end in ("", "-decoy")
         ]
     )
 
 
 def of_run(out: Console) -> None:
     table = episodes()
-    print_table(out, table, 12)
-    print_by_kind(
-        out, table, dict(zip(table["scenario"], ("ped_crossing", "conversing") * 6, strict=True))
-    )
+    print_table(out, table, 24)
+    kinds = [kind for kind in ("ped_crossing", "conversing") * 6 for _ in range(2)]
+    print_by_kind(out, table, dict(zip(table["scenario"], kinds, strict=True)))
 
 
 def of_comparison(out: Console) -> None:
