@@ -345,7 +345,7 @@ SCHEDULES = {
 def test_a_schedule_of_stops_and_swerves_seldom_suits_an_event(
     kind: str, schedule: Schedule
 ) -> None:
-    """Of 12 places of the event along the route at most 4 suit it, in the time of a suite."""
+    """Of 12 places of the event along the route at most 3 suit it, in the time of a suite."""
     rng = np.random.default_rng(5)
     solved = 0
     for before_m in np.linspace(7.0, 25.0, 12).tolist():
@@ -357,4 +357,4 @@ def test_a_schedule_of_stops_and_swerves_seldom_suits_an_event(
         )
         limit_s = 1.5 * ((before_m + 13.0) / 1.4 + 6.0) + 3.0
         solved += outcome(one, schedule, before_m, limit_s) == "solved"
-    assert solved <= 4
+    assert solved <= 3
