@@ -16,6 +16,7 @@ from cosim.results.event_monitor import passed_between
 from cosim.spec.events import Event, EventQuery, EventState
 from cosim.spec.scenario import City, CrowdSpec
 from scenarios.events import EVENT_KINDS, react
+from tests.support.blind_motion import Schedule, outcome
 from tests.support.cheats import BLIND_MPS, Crawl, EdgeDriver, Stander
 
 TICK_S = 0.05
@@ -328,3 +329,32 @@ def test_blind_policies_do_not_solve_events_and_who_stands_has_not_failed(
     assert [failure.fault in ("robot_at_fault", "shared") for failure in record.failures] == [
         True
     ] * (not stands)
+
+
+SCHEDULES = {
+    "one stop of 8 s": Schedule(1.5, [(10.0, 8.0)]),
+    "stops every 2 m": Schedule(1.5, [(2.0 * k, 2.2) for k in range(1, 14)]),
+    "one swerve": Schedule(1.5, lanes=[(7.0, -1.1), (14.0, 0.0)]),
+    "slow weaving": Schedule(1.0, lanes=[(2.0 * k, 0.7 * (-1) ** k) for k in range(20)]),
+    "fast swerves": Schedule(2.5, lanes=[(6.0 * k, 0.8 * (-1) ** k) for k in range(8)]),
+}
+
+
+@pytest.mark.parametrize("kind", ["lateral", "overtaking", "frontal", "ped_crossing"])
+@pytest.mark.parametrize("schedule", SCHEDULES.values(), ids=SCHEDULES)
+def test_a_schedule_of_stops_and_swerves_seldom_suits_an_event(
+    kind: str, schedule: Schedule
+) -> None:
+    """Of 12 places of the event along the route at most 3 suit it, in the time of a suite."""
+    rng = np.random.default_rng(5)
+    solved = 0
+    for before_m in np.linspace(7.0, 25.0, 12).tolist():
+        one = msgspec.structs.replace(
+            event(kind, 1.6, 3 if kind == "ped_crossing" else 1, side=int(rng.choice([-1, 1]))),
+            x_m=0.0,
+            speed_mps=float(rng.uniform(1.1, 1.65)),
+            patience_s=float(rng.uniform(2.0, 4.0)),
+        )
+        limit_s = 1.5 * ((before_m + 13.0) / 1.4 + 6.0) + 3.0
+        solved += outcome(one, schedule, before_m, limit_s) == "solved"
+    assert solved <= 3
