@@ -20,9 +20,23 @@ from cosim.core.geometry import Floats, Pose
 PERSON_RADIUS_M = 0.3
 """Radius of every pedestrian's collision cylinder, in metres."""
 
-Doing = Literal["walk", "stand", "look", "talk", "queue", "stop", "phone", "sit"]
-"""Activity that a pedestrian's body shows. "stop" raises a hand; "sit" uses a seat behind the
-person's position."""
+Doing = Literal[
+    "walk",
+    "stand",
+    "look",
+    "talk",
+    "queue",
+    "stop",
+    "phone",
+    "sit",
+    "wave",
+    "call",
+    "point",
+    "scratch",
+]
+"""Activity that a pedestrian's body shows. "stop" holds out a hand; "sit" uses a seat behind the
+person's position; "phone" looks at a telephone, "call" holds one to the ear; "point" points to the
+side, "scratch" scratches the head."""
 
 
 class PersonKind(IntEnum):

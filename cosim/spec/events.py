@@ -17,6 +17,7 @@ from typing import Annotated, Final, Literal, NamedTuple
 import msgspec
 import numpy as np
 
+from cosim.core.errors import SpecError
 from cosim.core.state import PERSON_RADIUS_M, Age, Doing, PersonKind
 from cosim.spec.validation import ARC_LENGTH_M, COORDINATE_M, HEADING_RAD, Ranged, Within, shown
 
@@ -81,7 +82,7 @@ class Walker(msgspec.Struct, frozen=True, kw_only=True):
     """State of one person in an event.
 
     aim_rad, pace_mps: heading and speed that the person has committed to, if any.
-    blocked_ticks: time that the person has been blocked by the robot.
+    blocked_ticks: time that the robot has stood before the person, or touched it.
     counted_ticks: duration so far of the condition that ends the event.
     nearest_m: least distance of the robot behind the person, since it slowed down.
     vx_mps, vy_mps: velocity of the last step.
@@ -208,11 +209,29 @@ class SidewalkLayout(NamedTuple):
     event_m: least and largest distance from the start to the event, beyond the range of its
         trigger.
     half_width_m: least half width of the sidewalk.
+    gate_half_m: least and largest half width of the way at an event with a free side, for a robot
+        of `COURIER`'s width; None if any width fits. Wider sidewalks need fences there.
+    after_m: least length of route behind the event in a reactive scenario; negative if its place
+        may be beyond the goal.
     """
 
     way_m: tuple[float, float]
     event_m: tuple[float, float]
     half_width_m: float = 1.3
+    gate_half_m: tuple[float, float] | None = None
+    after_m: float = 2.0
+
+
+class Decoy(NamedTuple):
+    """Behaviour of an event with `Event.decoy` from the trigger on, in place of the kind's.
+
+    step, ends: as in `EventKind`.
+    poses: activities of people who stand; one is chosen by the event's place.
+    """
+
+    step: Callable[[Event, EventState, int, EventQuery], Walker]
+    ends: Callable[[Event, EventState, EventQuery], bool]
+    poses: tuple[Doing, ...] = ("stand",)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -231,6 +250,11 @@ class EventKind:
     pose, age: activity of people who stand during the event, and their age.
     passed_as_group: whether the robot must pass round the whole group.
     ends_at: end of a reactive scenario: the goal, or a stop before the people.
+    blocked: returns the lateral interval (right, left) in metres that people of an event with a
+        free side block, left positive; None for people who block none.
+    has_free_side: whether a suite draws `Event.free_side`. People who block no side then stand
+        beside the robot's way.
+    decoy: behaviour of its decoys; None if a decoy is the event with the other side free.
     """
 
     name: str
@@ -245,6 +269,22 @@ class EventKind:
     age: Age = Age.ADULT
     passed_as_group: bool = False
     ends_at: Literal["goal", "stop"] = "goal"
+    blocked: Callable[[Event], tuple[float, float]] | None = None
+    has_free_side: bool = False
+    decoy: Decoy | None = None
+
+    def decoy_of(self, event: Event) -> Event:
+        """Return the event's decoy, equal to it until the trigger.
+
+        Raises SpecError if the kind has no decoys, or the event no free side to mirror.
+        """
+        if self.decoy is not None:
+            return msgspec.structs.replace(event, decoy=True)
+        if self.blocked is None:
+            raise SpecError(f"events of kind '{self.name}' have no decoys")
+        if event.free_side == 0:
+            raise SpecError(f"{event.called}its decoy needs free_side -1 or 1, not 0")
+        return msgspec.structs.replace(event, free_side=-event.free_side)
 
 
 EventKinds = Mapping[str, EventKind]

@@ -6,6 +6,7 @@ A spec is complete: it determines its episode bit for bit, in any process.
 from __future__ import annotations
 
 import hashlib
+import math
 from collections import Counter
 from collections.abc import Iterator
 from functools import cached_property
@@ -38,6 +39,7 @@ from cosim.spec.validation import (
 
 _SCHEMA = 1
 """Version of the scenario files; other versions are refused."""
+_TICKS_PER_S = 20
 _SHORTEST_M = 1.0
 """Minimum length of a reference route in metres."""
 _LONGEST_M = 20_000.0
@@ -321,8 +323,20 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
         return Pose(*self.start)
 
     def driven_by(self, robot: str) -> Scenario:
-        """Return the scenario with another robot; unchanged if `robot` is "". Raises UsageError."""
-        return msgspec.structs.replace(self, robot=robot_called(robot).name) if robot else self
+        """Return the scenario with another robot; unchanged if `robot` is "". Raises UsageError.
+
+        The limits of scenarios that end on a failure scale with the cruise speeds of both robots.
+        """
+        if not robot or robot == self.robot:
+            return self
+        faster = robot_called(robot).cruise_mps / robot_called(self.robot).cruise_mps
+        limits = {
+            "time_limit_s": math.ceil(self.time_limit_s / faster * _TICKS_PER_S - 1e-6)
+            / _TICKS_PER_S,
+            "go_on_mps": self.go_on_mps * faster,
+        }
+        scaled = limits if self.ends_on_failure else {}
+        return msgspec.structs.replace(self, robot=robot, **scaled)
 
     @cached_property
     def route_line(self) -> Polyline:
@@ -394,6 +408,10 @@ def event_faults(scenario: Scenario, kinds: EventKinds, place: str = "$") -> Ite
                 f"{event.called}people of '{event.kind}' must be {allowed}, not "
                 f"{shown(event.people)} - at `{at}`"
             )
+        if event.decoy and kinds[event.kind].decoy is None:
+            yield f"{event.called}'{event.kind}' has no behaviour of decoys - at `{at}.decoy`"
+        if event.free_side and not kinds[event.kind].has_free_side:
+            yield f"{event.called}free_side of '{event.kind}' must be 0 - at `{at}.free_side`"
         if (kinds[event.kind].layout is None) != (event.half_length_m > 0.0):
             crossings = " and ".join(
                 f"'{kind.name}'" for kind in kinds.values() if kind.layout is None

@@ -1,4 +1,4 @@
-"""Gestures of people on the spot: idle, looking, talking, queueing, stopping hand, phone, sitting.
+"""Gestures of people on the spot: idle, looking, talking, queueing, sitting, gestures of the arms.
 
 Each is a loop of `LOOP_S` seconds over the SMPL joints, with feet on the ground.
 The body breathes and shifts its weight.
@@ -250,6 +250,54 @@ def _sitting(bends: Floats) -> dict[str, Arm]:
     }
 
 
+def _waving(bends: Floats) -> dict[str, Arm]:
+    """Raise the right hand above the head and swing the forearm from side to side."""
+    swing = np.sin(8.0 * _PHASE)
+    _bend(bends, "spine3", 0.0, -0.02, 0.05)
+    _bend(bends, "right_collar", 0.10, 0.0, 0.0)
+    o = np.zeros(GESTURE_FRAMES)
+    upper = np.column_stack([o + 0.15, o - 1.0, o + 0.35])
+    fore = np.column_stack([o + 0.15, -0.10 + 0.55 * swing, o + 1.0])
+    fingers = np.column_stack([o + 0.05, -0.10 + 0.75 * swing, o + 1.0])
+    return {"left": _hanging(1.0), "right": (upper, fore, fingers, np.array([0.0, 1.0, 0.2]))}
+
+
+def _calling(bends: Floats) -> dict[str, Arm]:
+    """Hold a phone to the left ear, the elbow low and aside."""
+    nod = 0.03 * np.sin(3.0 * _PHASE)
+    _bend(bends, "neck", -0.06, 0.04, 0.0)
+    _bend(bends, "head", -0.12, 0.02 + nod, 0.18 * np.sin(_PHASE))
+    return {
+        "left": _ways(
+            (0.45, 0.62, -0.85), (0.05, -0.45, 1.0), (-0.15, -0.25, 1.0), (0.35, -0.6, 0.5)
+        ),
+        "right": _hanging(-1.0),
+    }
+
+
+def _pointing(bends: Floats) -> dict[str, Arm]:
+    """Hold the right arm straight out to the side, and look there and back."""
+    way = np.tanh(2.2 * np.sin(_PHASE)) / np.tanh(2.2)
+    _bend(bends, "neck", 0.0, 0.0, -0.25 + 0.25 * way)
+    _bend(bends, "head", 0.0, 0.0, -0.25 + 0.25 * way)
+    o = np.zeros(GESTURE_FRAMES)
+    lift = 0.08 + 0.03 * np.sin(2.0 * _PHASE)
+    upper = np.column_stack([o + 0.12, o - 1.0, lift])
+    fore = np.column_stack([o + 0.08, o - 1.0, lift])
+    return {"left": _hanging(1.0), "right": (upper, fore, fore, np.array([0.6, 0.0, 0.8]))}
+
+
+def _scratching(bends: Floats) -> dict[str, Arm]:
+    """Hold the right hand on the head, the elbow out to the side, and scratch."""
+    rub = 0.06 * np.sin(12.0 * _PHASE)
+    _bend(bends, "head", 0.10, 0.08, 0.0)
+    o = np.zeros(GESTURE_FRAMES)
+    upper = np.column_stack([o + 0.35, o - 1.0, o + 0.45])
+    fore = np.column_stack([o - 0.30, 0.75 + rub, 0.80 + rub])
+    fingers = np.column_stack([o - 0.25, 1.0 + rub, o - 0.05])
+    return {"left": _hanging(1.0), "right": (upper, fore, fingers, np.array([-0.4, 0.2, -0.6]))}
+
+
 GESTURES: Final[Mapping[str, Callable[[Floats], dict[str, Arm]]]] = MappingProxyType(
     {
         "stand": _standing,
@@ -259,6 +307,10 @@ GESTURES: Final[Mapping[str, Callable[[Floats], dict[str, Arm]]]] = MappingProxy
         "stop": _stopping,
         "phone": _phoning,
         "sit": _sitting,
+        "wave": _waving,
+        "call": _calling,
+        "point": _pointing,
+        "scratch": _scratching,
     }
 )
 """Function of each gesture, which turns the joints of the body and directs its arms."""

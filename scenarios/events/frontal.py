@@ -1,7 +1,13 @@
-"""`frontal`: walks at the robot's current position, commits to a line, passes and walks on.
+"""`frontal`: walks at the robot, commits to a line late, passes and walks on.
 
-A person who avoids others on the way takes aim again. A robot that has stood for a second is
-avoided. A person who touches the robot stops, waits, gives up and walks around it.
+It aims ahead of the robot by up to a second's way, because a robot that changes lanes would
+otherwise pass the line to its current position.
+
+A person who avoids others on the way takes aim again. While the robot stands farther away than
+MET_M, the person waits. Before a robot that stands nearer it stops, waits for its patience, and
+walks round it.
+
+Its decoy walks in the same way, keeps to its own side of the way in good time, and passes.
 """
 
 from __future__ import annotations
@@ -9,12 +15,36 @@ from __future__ import annotations
 import math
 from typing import Final
 
-from cosim.spec.events import Event, EventKind, EventQuery, EventState, SidewalkLayout, Walker
+from cosim.spec.events import (
+    Decoy,
+    Event,
+    EventKind,
+    EventQuery,
+    EventState,
+    SidewalkLayout,
+    Walker,
+)
 from scenarios.events.sight import sight_of
-from scenarios.events.walking import aim_at_robot, gives_up, walk_on, walk_straight, walker_at
+from scenarios.events.walking import (
+    aim_at_robot,
+    along_m,
+    come_at_robot,
+    distance_m,
+    edge_m,
+    lost_patience,
+    waiting_for_robot,
+    walk_on,
+    walk_to,
+    walker_at,
+    world_point,
+)
 
-COMMIT_M: Final = 5.0
+COMMIT_M: Final = 2.0
 """Distance in metres to the robot below which the person stops aiming and keeps its line."""
+KEEPS_ASIDE_M: Final = 7.0
+"""Distance in metres to the robot below which the person of a decoy keeps to its side."""
+_LOOK_AHEAD_M: Final = 1.2
+"""Metres ahead on its side that the person of a decoy aims at."""
 
 
 def _begin(event: Event, number: int) -> Walker:
@@ -27,25 +57,39 @@ def _step(event: Event, state: EventState, number: int, query: EventQuery) -> Wa
     on_rad = event.heading_rad + math.pi
     if state.phase == "over":
         return walk_on(walker, on_rad, event.speed_mps, sight)
-    walker, heading_rad = (
-        (walker, on_rad) if sight.robot_stands else aim_at_robot(walker, query, COMMIT_M)
-    )
-    return walk_straight(walker, heading_rad, event.speed_mps, sight)
+    walker, heading_rad = aim_at_robot(waiting_for_robot(event, walker, query), query, COMMIT_M)
+    return come_at_robot(walker, heading_rad, event.speed_mps, sight)
+
+
+def _decoy_step(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:
+    walker = state.walkers[number]
+    if state.phase == "acting" and distance_m(walker, query) > KEEPS_ASIDE_M:
+        return _step(event, state, number, query)
+    ahead_m = along_m(event, walker.x_m, walker.y_m) - _LOOK_AHEAD_M
+    aside = world_point(event, ahead_m, event.side * edge_m(event))
+    return walk_to(walker, *aside, event.speed_mps, sight_of(event, number, query))
 
 
 def _ends(event: Event, state: EventState, query: EventQuery) -> bool:
     (walker,) = state.walkers
-    dx, dy = query.robot_x_m - walker.x_m, query.robot_y_m - walker.y_m
-    back_rad = event.heading_rad + math.pi
-    passed = dx * math.cos(back_rad) + dy * math.sin(back_rad) < -1.0
-    return passed or gives_up(walker, query)
+    return _passed(event, walker, query) or lost_patience(event, walker, query)
+
+
+def _decoy_ends(event: Event, state: EventState, query: EventQuery) -> bool:
+    return _passed(event, state.walkers[0], query)
+
+
+def _passed(event: Event, walker: Walker, query: EventQuery) -> bool:
+    here_m = along_m(event, walker.x_m, walker.y_m)
+    return here_m < along_m(event, query.robot_x_m, query.robot_y_m) - 1.0
 
 
 FRONTAL: Final = EventKind(
     name="frontal",
-    layout=SidewalkLayout((18.0, 20.0), (21.0, 22.0)),
+    layout=SidewalkLayout((18.0, 20.0), (21.0, 22.0), after_m=-4.0),
     trigger_m=20.0,
     begin=_begin,
     step=_step,
     ends=_ends,
+    decoy=Decoy(_decoy_step, _decoy_ends),
 )

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
+import zlib
 from types import MappingProxyType
 from typing import Final
 
 import msgspec
 
 from cosim.core.errors import SpecError
-from cosim.core.state import PersonKind
-from cosim.people.yielding import ROBOT_STANDS_MPS, outline_mps
+from cosim.core.state import Doing, PersonKind
 from cosim.spec.events import (
     Actor,
+    Decoy,
     Event,
     EventKind,
     EventKinds,
@@ -26,7 +27,7 @@ from scenarios.events.frontal import FRONTAL
 from scenarios.events.lateral import LATERAL
 from scenarios.events.overtaking import OVERTAKING
 from scenarios.events.standing import CONVERSING, GESTURING, OBSTRUCTING, QUEUEING
-from scenarios.events.walking import left_m
+from scenarios.events.walking import left_m, robot_stands
 
 _ROWS = (OBSTRUCTING, CONVERSING, QUEUEING, FRONTAL, LATERAL, OVERTAKING, PED_CROSSING, GESTURING)
 EVENT_KINDS: Final[EventKinds] = MappingProxyType({kind.name: kind for kind in _ROWS})
@@ -88,10 +89,11 @@ def _advance(kind: EventKind, event: Event, state: EventState, query: EventQuery
     if state.phase == "gone":
         return state
     state = msgspec.structs.replace(
-        state, robot_stood_ticks=state.robot_stood_ticks + 1 if _stands(query) else 0
+        state, robot_stood_ticks=state.robot_stood_ticks + 1 if robot_stands(query) else 0
     )
     if state.phase == "waiting":
-        gap_m = _triggered_m(kind.trigger_m, event, query)
+        own_m = event.trigger_m
+        gap_m = _triggered_m(kind.trigger_m if own_m is None else own_m, event, query)
         if gap_m is None:
             return state
         state = msgspec.structs.replace(
@@ -107,18 +109,32 @@ def _advance(kind: EventKind, event: Event, state: EventState, query: EventQuery
         for w in state.walkers
     ):
         return msgspec.structs.replace(state, phase="gone", since_tick=query.tick)
-    if state.phase == "acting" and kind.ends(event, state, query):
+    acts = _acts(kind, event)
+    if state.phase == "acting" and acts.ends(event, state, query):
         state = msgspec.structs.replace(state, phase="over", since_tick=query.tick)
-    after = (kind.step(event, state, number, query) for number in range(event.people))
+    after = (acts.step(event, state, number, query) for number in range(event.people))
     walkers = tuple(
         _timed(old, new, query.tick_ms) for old, new in zip(state.walkers, after, strict=True)
     )
     return msgspec.structs.replace(state, walkers=walkers)
 
 
-def _stands(query: EventQuery) -> bool:
-    half_m = query.robot_length_m / 2, query.robot_width_m / 2
-    return outline_mps(query.robot_v_mps, query.robot_w_radps, half_m) < ROBOT_STANDS_MPS
+def _acts(kind: EventKind, event: Event) -> EventKind | Decoy:
+    """Return the row with an event's behaviour. Raises SpecError for a decoy without one."""
+    if not event.decoy:
+        return kind
+    if kind.decoy is None:
+        raise SpecError(f"{event.called}'{event.kind}' has no behaviour of decoys")
+    return kind.decoy
+
+
+def pose_of(kind: EventKind, event: Event) -> Doing:
+    """Return the activity of people who stand during an event."""
+    acts = _acts(kind, event)
+    if isinstance(acts, EventKind):
+        return acts.pose
+    place = f"{event.id} {event.x_m:.3f} {event.y_m:.3f}"
+    return acts.poses[zlib.crc32(place.encode()) % len(acts.poses)]
 
 
 def _timed(old: Walker, new: Walker, tick_ms: int) -> Walker:
@@ -134,7 +150,7 @@ def _timed(old: Walker, new: Walker, tick_ms: int) -> Walker:
 def _shown(
     kind: EventKind, event: Event, before: EventState, after: EventState, query: EventQuery
 ) -> list[Actor]:
-    pose = kind.pose if after.phase == "acting" else "stand"
+    pose = pose_of(kind, event) if after.phase == "acting" else "stand"
     actors = []
     for name, old, new in zip(event.names, before.walkers, after.walkers, strict=True):
         moved_m = math.hypot(new.x_m - old.x_m, new.y_m - old.y_m)

@@ -45,16 +45,21 @@ AVOIDANCE_SHARE = 0.5
 class Sight(NamedTuple):
     """Knowledge of one person: the query, other people nearby, and the event whose area bounds it.
 
-    others: Other people, and the robot if it has stood long enough.
+    people: Other people.
+    robot: The robot as neighbours if it has stood long enough to be avoided like an obstacle.
     room_m: Gap in metres to others where possible.
-    robot_stands: Whether the robot has stood long enough to be avoided like an obstacle.
     """
 
     query: EventQuery
-    others: Sequence[Neighbour] = ()
+    people: Sequence[Neighbour] = ()
     event: Event | None = None
     room_m: float = PASSING_DISTANCE_M
-    robot_stands: bool = False
+    robot: Sequence[Neighbour] = ()
+
+    @property
+    def others(self) -> list[Neighbour]:
+        """People and robot to avoid."""
+        return [*self.people, *self.robot]
 
 
 def sight_of(event: Event, number: int, query: EventQuery, waited_s: float = 0.0) -> Sight:
@@ -75,7 +80,7 @@ def sight_of(event: Event, number: int, query: EventQuery, waited_s: float = 0.0
     room_m = PASSING_DISTANCE_M if waited_s < SMALL_GAPS_AFTER_S else SHOULDER_TO_SHOULDER_M
     ticks = max((state.robot_stood_ticks for state in query.states), default=0)
     stands = ticks * query.tick_ms >= 1000 * STOOD_S
-    return Sight(query, others + standing_robot(query) if stands else others, event, room_m, stands)
+    return Sight(query, others, event, room_m, standing_robot(query) if stands else ())
 
 
 def standing_robot(query: EventQuery) -> list[Neighbour]:

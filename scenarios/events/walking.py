@@ -14,8 +14,10 @@ from cosim.core.geometry import Pose, wrap_angle
 from cosim.core.state import PERSON_RADIUS_M
 from cosim.people.steering import Vector
 from cosim.people.yielding import (
+    ROBOT_STANDS_MPS,
     RobotBody,
     obstacle_body,
+    outline_mps,
     reaction_distance_m,
     stepped_around,
     touches,
@@ -33,8 +35,15 @@ SLOW_MPS = 0.3
 """Speed in m/s below which motion does not change a person's heading."""
 _SAME_M = 1e-9
 """Metres below which two positions are equal."""
-_GIVES_UP_S = 2.0
-"""Seconds of contact with the robot after which a person walks around it."""
+MET_M = 2.5
+"""Distance in metres between the centres of a person and a standing robot that have met. People who
+come at a robot that stands farther away wait for it to come."""
+_LEAD_S = 1.0
+"""Time in seconds for which people who walk at the robot expect it to keep its course, at most."""
+_WALKS_MPS = 1.3
+"""Walking speed in m/s by which they estimate the time until they meet."""
+_STANDOFF_M = 0.45
+"""Gap in metres before a standing robot at which a person waits."""
 
 
 def walker_at(event: Event, along_m: float, left_m: float, facing_rad: float) -> Walker:
@@ -177,33 +186,93 @@ def heading_after(walker: Walker, after: Vector, sight: Sight) -> float:
 
 
 def aim_at_robot(walker: Walker, query: EventQuery, commit_m: float) -> tuple[Walker, float]:
-    """Return the walker and its heading (rad) at the robot's position.
+    """Return the walker and its heading (rad) at the robot, ahead of it by the way to the meeting.
 
-    commit_m: Distance to the robot below which the walker keeps its heading.
+    commit_m: Distance to the robot below which the walker keeps its heading while the robot moves.
     """
-    dx, dy = query.robot_x_m - walker.x_m, query.robot_y_m - walker.y_m
+    if robot_stands(query):
+        walker = msgspec.structs.replace(walker, aim_rad=None)
     if walker.aim_rad is not None:
         return walker, walker.aim_rad
+    far_m = distance_m(walker, query)
+    lead_m = lead_to_meeting_m(far_m, query)
+    dx = query.robot_x_m + lead_m * math.cos(query.robot_heading_rad) - walker.x_m
+    dy = query.robot_y_m + lead_m * math.sin(query.robot_heading_rad) - walker.y_m
     heading_rad = math.atan2(dy, dx)
-    commits = math.hypot(dx, dy) <= commit_m
+    commits = far_m <= commit_m and not robot_stands(query)
     return msgspec.structs.replace(walker, aim_rad=heading_rad) if commits else walker, heading_rad
 
 
-def walk_straight(walker: Walker, heading_rad: float, speed_mps: float, sight: Sight) -> Walker:
+def lead_to_meeting_m(far_m: float, query: EventQuery) -> float:
+    """Return how far in metres the robot drives until it meets a person who comes towards it."""
+    v_mps = max(query.robot_v_mps, 0.0)
+    meets_s = max(far_m - query.robot_length_m, 0.0) / (v_mps + _WALKS_MPS)
+    return v_mps * min(meets_s, _LEAD_S)
+
+
+def robots_line_m(event: Event, query: EventQuery, ahead_m: float) -> float:
+    """Return the lateral offset (m) of a point ahead of the robot, inside the way."""
+    turn_rad = query.robot_heading_rad - event.heading_rad
+    line_m = left_m(event, query.robot_x_m, query.robot_y_m) + ahead_m * math.sin(turn_rad)
+    return max(-edge_m(event), min(edge_m(event), line_m))
+
+
+def robot_stands(query: EventQuery) -> bool:
+    """Return whether no point of the robot moves."""
+    half_m = query.robot_length_m / 2, query.robot_width_m / 2
+    return outline_mps(query.robot_v_mps, query.robot_w_radps, half_m) < ROBOT_STANDS_MPS
+
+
+def waiting_for_robot(event: Event, walker: Walker, query: EventQuery) -> Walker:
+    """Return the walker with the ticks counted for which the robot has stood within MET_M of it.
+
+    A robot in contact counts, too. After the event's patience the count is not reset.
+    """
+    if lost_patience(event, walker, query):
+        return walker
+    met = robot_stands(query) and distance_m(walker, query) <= MET_M
+    blocks = met or touches(np.array([walker.x_m, walker.y_m]), robot_body(query))
+    return msgspec.structs.replace(walker, blocked_ticks=walker.blocked_ticks + 1 if blocks else 0)
+
+
+def lost_patience(event: Event, walker: Walker, query: EventQuery) -> bool:
+    """Return whether the robot has blocked a person for as long as the person waits."""
+    blocked = walker.blocked_ticks
+    return blocked > 0 and blocked * query.tick_ms >= 1000 * event.patience_s
+
+
+def distance_m(walker: Walker, query: EventQuery) -> float:
+    """Return the distance in metres between the centres of a person and the robot."""
+    return math.hypot(query.robot_x_m - walker.x_m, query.robot_y_m - walker.y_m)
+
+
+def come_at_robot(walker: Walker, heading_rad: float, speed_mps: float, sight: Sight) -> Walker:
     """Move one tick straight ahead without avoiding a moving robot, but around people.
+
+    If the robot stands, the walker stops short of it, or stays where it is if they have not met.
+    """
+    query = sight.query
+    if robot_stands(query):
+        near = touches(np.array([walker.x_m, walker.y_m]), robot_body(query), _STANDOFF_M)
+        if near or distance_m(walker, query) > MET_M:
+            return walker
+    return walk_straight(walker, heading_rad, speed_mps, sight)
+
+
+def walk_straight(walker: Walker, heading_rad: float, speed_mps: float, sight: Sight) -> Walker:
+    """Move one tick straight ahead without avoiding the robot, but around people.
 
     A walker in contact with the robot stops. One that avoids people has to aim again.
     """
-    if sight.robot_stands:
-        return msgspec.structs.replace(walk_on(walker, heading_rad, speed_mps, sight), aim_rad=None)
     if touches(np.array([walker.x_m, walker.y_m]), robot_body(sight.query)):
-        return msgspec.structs.replace(walker, blocked_ticks=walker.blocked_ticks + 1)
+        return walker
     step_m = speed_mps * sight.query.tick_ms / 1000
     wanted = (
         walker.x_m + math.cos(heading_rad) * step_m,
         walker.y_m + math.sin(heading_rad) * step_m,
     )
-    x_m, y_m = led = _round_things(walker, avoiding_step(walker, wanted, sight), sight.query)
+    people = sight._replace(robot=())
+    x_m, y_m = led = _round_things(walker, avoiding_step(walker, wanted, people), sight.query)
     if led == wanted:
         return msgspec.structs.replace(
             walker, x_m=x_m, y_m=y_m, heading_rad=wrap_angle(heading_rad)
@@ -211,8 +280,3 @@ def walk_straight(walker: Walker, heading_rad: float, speed_mps: float, sight: S
     return msgspec.structs.replace(
         walker, x_m=x_m, y_m=y_m, heading_rad=heading_after(walker, led, sight), aim_rad=None
     )
-
-
-def gives_up(walker: Walker, query: EventQuery) -> bool:
-    """Return whether a person has been in contact with the robot for long enough."""
-    return walker.blocked_ticks * query.tick_ms / 1000 >= _GIVES_UP_S

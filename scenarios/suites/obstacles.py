@@ -57,10 +57,10 @@ _IN_THE_WAY: Final = 0.4
 _CORNER_FREE_M: Final = 2.0
 _BEYOND_M: Final = 6.0
 """Length beyond the ends of the route along which obstacles are placed too, in metres."""
-_APART_M: Final = 0.2
+APART_M: Final = 0.2
 """Least distance between two groups, and between a group and other objects, in metres."""
-_EDGE_M: Final = 0.05
-_AROUND_M: Final = 8.0
+EDGE_M: Final = 0.05
+AROUND_M: Final = 8.0
 """Distance around the route in which a path is searched, in metres."""
 _DRAWS: Final = 12
 """Number of draws for each obstacle."""
@@ -163,7 +163,7 @@ def obstacles_along(
     density = float(rng.uniform(*PER_100M)) if per_100m is None else per_100m
     stretches = _stretches(scenario, street_map, _BEYOND_M if beside else 0.0)
     lengths = np.array([stretch.high_m - stretch.low_m for stretch in stretches])
-    room = _Room(scenario, street_map, beside=beside, to_spare_m=to_spare_m)
+    room = _Sites(scenario, street_map, beside=beside, to_spare_m=to_spare_m)
     standing = scenario.obstacles
     if not stretches or not room.passable(standing):
         return standing
@@ -190,7 +190,7 @@ def prove_gap(scenario: Scenario, street_map: StreetMap, to_spare_m: float = TO_
     The obstacles are removed from the walkable area. The rest is eroded by half the width of the
     robot and to_spare_m. Raises SpecError unless start and goal stay connected.
     """
-    room = _Room(scenario, street_map, to_spare_m=to_spare_m)
+    room = Room(scenario, street_map, to_spare_m)
     if not room.passable(scenario.obstacles):
         what = "its obstacles leave" if scenario.obstacles else "there is"
         raise SpecError(
@@ -199,32 +199,83 @@ def prove_gap(scenario: Scenario, street_map: StreetMap, to_spare_m: float = TO_
         )
 
 
-class _Room:
-    """Ground around a route with its obstacles. gap_m: width of the gap that must be left."""
+class Room:
+    """Ground around a route. gap_m: width of the gap that obstacles must leave.
+
+    props: footprints of the furniture near the route.
+    """
 
     def __init__(
-        self,
-        scenario: Scenario,
-        street_map: StreetMap,
-        *,
-        beside: bool = False,
-        to_spare_m: float = TO_SPARE_M,
+        self, scenario: Scenario, street_map: StreetMap, to_spare_m: float = TO_SPARE_M
     ) -> None:
         robot = robot_called(scenario.robot)
-        route = scenario.route_line
-        line = LineString(scenario.route)
-        area = shapely.buffer(line, _AROUND_M)
+        area = shapely.buffer(LineString(scenario.route), AROUND_M)
         self.gap_m = robot.width_m + to_spare_m
+        self._width_m = robot.width_m
         self._start = Point(scenario.start[:2])
         self._goal = Point(scenario.goal)
         surface = StreetSurface(street_map, scenario.place.seed)
-        props = [ground for ground in footprints(surface.standing(area)) if area.intersects(ground)]
+        standing = footprints(surface.standing(area))
+        self.props = [ground for ground in standing if area.intersects(ground)]
         walkable = without_barriers(street_map.walkable_near(area), scenario.barriers)
         self._free = overlay.difference(
-            overlay.intersection(walkable, area), overlay.union_all(props)
+            overlay.intersection(walkable, area), overlay.union_all(self.props)
         )
+        self._waypoints = _Waypoints(scenario, robot)
+
+    def keeps_resets(self, obstacles: Sequence[Obstacle]) -> bool:
+        """Return whether each waypoint that obstacles cover has a free one next to it."""
+        return self._waypoints.enough(obstacles)
+
+    def passable(
+        self, obstacles: Iterable[Obstacle], people: Iterable[shapely.Geometry] = ()
+    ) -> bool:
+        """Return whether a path as wide as the gap leads from start to goal.
+
+        people: ground of people who stand.
+        """
+        free = self._free_ground(obstacles, people)
+        return self._connects(shapely.buffer(free, -0.5 * self.gap_m))
+
+    def shares_way(
+        self, obstacles: Sequence[Obstacle], people: Iterable[Sequence[shapely.Geometry]]
+    ) -> bool:
+        """Return whether the robot can drive one way from start to goal among all groups of people.
+
+        Each group is there in another episode.
+        """
+        half_m = 0.5 * self._width_m
+        grounds = [shapely.buffer(self._free_ground(obstacles, group), -half_m) for group in people]
+        common = grounds[0]
+        for ground in grounds[1:]:
+            common = overlay.intersection(common, ground)
+        return self._connects(common)
+
+    def _connects(self, ground: shapely.Geometry) -> bool:
+        """Return whether one part of the ground has both start and goal."""
+        parts = shapely.get_parts(ground)
+        return any(part.covers(self._start) and part.covers(self._goal) for part in parts)
+
+    def _free_ground(
+        self, obstacles: Iterable[Obstacle], people: Iterable[shapely.Geometry] = ()
+    ) -> Polygon | MultiPolygon:
+        """Return the walkable ground without furniture, obstacles and people."""
+        things = [*(footprint(one) for one in obstacles), *people]
+        free: Polygon | MultiPolygon = self._free
+        return overlay.difference(free, overlay.union_all(things)) if things else free
+
+
+class _Sites(Room):
+    """Room with the ground on which no obstacle of a route may be placed."""
+
+    def __init__(
+        self, scenario: Scenario, street_map: StreetMap, *, beside: bool, to_spare_m: float
+    ) -> None:
+        super().__init__(scenario, street_map, to_spare_m)
+        robot = robot_called(scenario.robot)
+        area = shapely.buffer(LineString(scenario.route), AROUND_M)
         fences = [outline(barrier) for barrier in scenario.barriers]
-        taken = [shapely.buffer(thing, _APART_M) for thing in (*props, *fences)]
+        taken = [shapely.buffer(thing, APART_M) for thing in (*self.props, *fences)]
         taken += _streets(street_map, area)
         taken += [shapely.buffer(self._start, ENDS_FREE_M + 0.5 * math.hypot(*robot.footprint_m))]
         taken += [shapely.buffer(self._goal, ENDS_FREE_M)]
@@ -232,9 +283,9 @@ class _Room:
             shapely.buffer(Point(event.x_m, event.y_m), EVENT_FREE_M) for event in scenario.events
         ]
         if beside:
-            taken.append(shapely.buffer(_extended(route), BESIDE_FREE_M, cap_style="flat"))
+            line = _extended(scenario.route_line)
+            taken.append(shapely.buffer(line, BESIDE_FREE_M, cap_style="flat"))
         self._taken = shapely.STRtree(taken)
-        self._waypoints = _Waypoints(scenario, robot)
 
     def takes(
         self,
@@ -244,23 +295,16 @@ class _Room:
     ) -> bool:
         """Return whether a group fits on a sidewalk with all other obstacles and leaves a gap."""
         grounds = [footprint(one) for one in group]
-        others = [footprint(one, _APART_M) for one in standing]
+        others = [footprint(one, APART_M) for one in standing]
         return (
             bool(group)
             and all(sidewalk.contains_properly(ground) for ground in grounds)
             and not len(self._taken.query(grounds, predicate="intersects")[0])
             and not any(ground.intersects(other) for ground in grounds for other in others)
             and not any(one.intersects(other) for one, other in itertools.combinations(grounds, 2))
-            and self._waypoints.enough((*standing, *group))
+            and self.keeps_resets((*standing, *group))
             and self.passable((*standing, *group))
         )
-
-    def passable(self, obstacles: Iterable[Obstacle]) -> bool:
-        """Return whether a path as wide as the gap leads from start to goal."""
-        things = [footprint(one) for one in obstacles]
-        left = overlay.difference(self._free, overlay.union_all(things)) if things else self._free
-        parts = shapely.get_parts(shapely.buffer(left, -0.5 * self.gap_m))
-        return any(part.covers(self._start) and part.covers(self._goal) for part in parts)
 
 
 class _Waypoints:
@@ -308,8 +352,8 @@ def _drawn_group(
         turned = habit.turned_rad + float(rng.uniform(-habit.askew_rad, habit.askew_rad))
         if kind != "bin":
             form = int(rng.integers(OBSTACLE_FORMS))
-        along_m, across_m = _spans_m(kind, form, turned)
-        at_edge_m = stretch.half_m - _EDGE_M - 0.5 * across_m - float(rng.uniform(0.0, 0.15))
+        along_m, across_m = spans_m(kind, form, turned)
+        at_edge_m = stretch.half_m - EDGE_M - 0.5 * across_m - float(rng.uniform(0.0, 0.15))
         away_m = max(inner_m, -0.5 * across_m) + 0.5 * across_m if in_the_way else at_edge_m
         s_m += 0.5 * along_m if group else 0.0
         group.append(stretch.put(kind, form, s_m, left * min(away_m, at_edge_m), turned))
@@ -326,13 +370,13 @@ def _site(
     paint = form - form % OBSTACLE_VARIANTS
     lengths = [obstacle_size_m("fence", variant)[0] for variant in range(OBSTACLE_VARIANTS)]
     depth_m = obstacle_size_m("fence", 0)[1]
-    widest_m = min(stretch.half_m + 0.1, 2.0 * stretch.half_m - gap_m - depth_m - 2.0 * _EDGE_M)
+    widest_m = min(stretch.half_m + 0.1, 2.0 * stretch.half_m - gap_m - depth_m - 2.0 * EDGE_M)
     fitting = [variant for variant, length in enumerate(lengths) if length <= widest_m]
     if not fitting:
         return ()
     wide_m = lengths[fitting[-1]]
     count = int(rng.integers(1, 3))
-    outer_m = stretch.half_m - _EDGE_M
+    outer_m = stretch.half_m - EDGE_M
     inner_m = outer_m - wide_m
     long_m = count * (lengths[-1] + 0.05)
     ends = [
@@ -356,7 +400,7 @@ def _counted(group: Sequence[Obstacle]) -> int:
     return _SITE if group and group[0].kind == "fence" else len(group)
 
 
-def _spans_m(kind: ObstacleKind, form: int, turned_rad: float) -> tuple[float, float]:
+def spans_m(kind: ObstacleKind, form: int, turned_rad: float) -> tuple[float, float]:
     """Return the extent of an obstacle along the street and across it, in metres."""
     length, depth, _ = obstacle_size_m(kind, form % OBSTACLE_VARIANTS)
     cos, sin = abs(math.cos(turned_rad)), abs(math.sin(turned_rad))
@@ -406,7 +450,7 @@ def _streets(street_map: StreetMap, area: Polygon) -> list[shapely.Geometry]:
     crossings = [strip.polygon for strip in strips if strip.kind == "crossing"]
     corners = [corner.polygon for corner in street_map.near("corner", area)]
     return [
-        *(shapely.buffer(lane.polygon, -_EDGE_M) for lane in lanes),
+        *(shapely.buffer(lane.polygon, -EDGE_M) for lane in lanes),
         *(shapely.buffer(piece, _CORNER_FREE_M) for piece in (*crossings, *corners)),
         *(way for strip in strips for way in driveway_ground(strip)),
     ]

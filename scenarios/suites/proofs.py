@@ -33,7 +33,8 @@ class Proof(msgspec.Struct, frozen=True, kw_only=True):
     """Proof that a scenario is solvable: the expert finished without failure, with this state hash.
 
     people_m, obstacles_m: least distance of its body from people and obstacles, absent without any.
-    dropped: rejected candidates before this one.
+    passing_mps: its mean speed past the person of a decoy (`cosim.results.go_on`), absent without.
+    dropped: rejected candidates before this one; none for a decoy, which has no own candidates.
     """
 
     scenario: str
@@ -44,6 +45,7 @@ class Proof(msgspec.Struct, frozen=True, kw_only=True):
     time_s: float
     people_m: float | None = None
     obstacles_m: float | None = None
+    passing_mps: float | None = None
     dropped: tuple[Dropped, ...] = ()
 
 

@@ -6,13 +6,14 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from types import MappingProxyType
-from typing import Any, Final, cast
+from typing import Any, Final, cast, get_args
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.place.street_map import StreetMap
 from cosim.place.walk_graph import WalkGraph
@@ -21,8 +22,9 @@ from cosim.spec.selection import STATIC
 from scenarios.events import EVENT_KINDS
 from scenarios.places.nets import place
 from scenarios.suites.daylight import drawn_daylight
+from scenarios.suites.decoys import DECOY
 from scenarios.suites.long_horizon import build_long_horizon
-from scenarios.suites.reactive import build_reactive
+from scenarios.suites.reactive import LIMIT_S, WAY_M, Wanted, build_reactive
 from scenarios.suites.unit import STRUCTURES, Structure, build_unit
 from sumo_nets.city.store import SEEDS, TEST_SEEDS
 from sumo_nets.maps.import_rules import WHEEL_PLACES
@@ -56,6 +58,8 @@ class Slot:
     number: seed of its first candidate.
     length_m: length of a route.
     like: name of the slot whose scenario it repeats without its events.
+    decoy_of: name of the slot with whose scenario its own is drawn and proved.
+    wanted: what is drawn before the place of a reactive scenario.
     """
 
     name: str
@@ -66,6 +70,8 @@ class Slot:
     number: int
     length_m: float = 0.0
     like: str = ""
+    decoy_of: str = ""
+    wanted: Wanted | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +111,12 @@ def _in_few_digits(value: Any) -> Any:
 def repeated(slot: Slot, of: Scenario) -> Scenario:
     """Return the scenario of a slot that repeats another one without people."""
     return msgspec.structs.replace(
-        of, id=slot.name, events=(), structure=slot.structure, ends_at="goal"
+        of,
+        id=slot.name,
+        events=(),
+        structure=slot.structure,
+        ends_at="goal",
+        time_limit_s=LIMIT_S,
     )
 
 
@@ -145,20 +156,51 @@ def _unit_slots() -> list[Slot]:
 
 
 def _reactive_slots() -> list[Slot]:
-    """Return slots with each event once in every city, and the first kind's place also without
-    people.
+    """Return slots with each event and its decoy once in every city, and the first kind's place
+    also without people.
     """
     reference = next(iter(EVENT_KINDS))
+    wanted = {kind: _wanted(kind) for kind in EVENT_KINDS}
     found = []
     for number, city in _cities():
-        found += [
-            _slot("reactive", f"{kind}-{city.seed:03d}", kind, city, number) for kind in EVENT_KINDS
-        ]
+        for kind in EVENT_KINDS:
+            name = f"{kind}-{city.seed:03d}"
+            of_kind = wanted[kind][city.seed]
+            one = _slot("reactive", name, kind, city, number, wanted=of_kind)
+            found += [one, replace(one, name=name + DECOY, decoy_of=name)]
         like = f"{reference}-{city.seed:03d}"
         found.append(
             _slot("reactive", f"{STATIC}-{city.seed:03d}", STATIC, city, number, like=like)
         )
     return found
+
+
+def _wanted(kind: str) -> dict[int, Wanted]:
+    """Return what is drawn before the place, by the seed of the city.
+
+    In each split, lengths and positions are evenly spread, and sides equally frequent. Each
+    property has its own generator.
+    """
+    found: dict[int, Wanted] = {}
+    for split in get_args(Split):
+        seeds = [city.seed for _, city in _cities() if _split_of(city) == split]
+        named = zlib.crc32(f"{kind} {split}".encode())
+        rngs = [np.random.default_rng([named, purpose]) for purpose in range(4)]
+        count = len(seeds)
+        lengths_m = WAY_M[0] + (WAY_M[1] - WAY_M[0]) * _even(rngs[0].permutation(count))
+        shares = _even(rngs[1].permutation(count))
+        sides, free_sides = (1 - 2 * (rng.permutation(count) % 2) for rng in rngs[2:])
+        for one in zip(seeds, lengths_m.tolist(), shares.tolist(), sides, free_sides, strict=True):
+            seed, length_m, share, side, free_side = one
+            found[seed] = Wanted(
+                round(length_m, 2), share, 1 if side > 0 else -1, 1 if free_side > 0 else -1
+            )
+    return found
+
+
+def _even(ranks: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the middles of equal parts of the interval from 0 to 1, in the order of ranks."""
+    return (ranks + 0.5) / len(ranks)
 
 
 def _route_slots() -> list[Slot]:
@@ -195,7 +237,13 @@ def _unit(slot: Slot, street_map: StreetMap, graph: WalkGraph, seed: int) -> Sce
 
 def _reactive(slot: Slot, street_map: StreetMap, graph: WalkGraph, seed: int) -> Scenario:
     return build_reactive(
-        EVENT_KINDS[slot.structure], slot.where, street_map, graph, seed, slot.name
+        EVENT_KINDS[slot.structure],
+        slot.where,
+        street_map,
+        graph,
+        seed,
+        slot.name,
+        wanted=slot.wanted,
     )
 
 
@@ -217,11 +265,11 @@ RECIPES: Final[Mapping[str, SuiteRecipe]] = MappingProxyType(
             draw=_unit,
         ),
         "reactive": SuiteRecipe(
-            version="1.0",
-            description="10 to 20 m of way with one event of pedestrians on it and nobody else: "
-            "100 of each event in the same cities, and as reference 100 with nobody there. Ends "
-            "on the first failure.",
-            purpose="eight events of pedestrians",
+            version="2.0",
+            description="12 to 30 m of straight way with one event of pedestrians on it and nobody "
+            "else: 100 of each event in the same cities, each with a decoy, and as reference 100 "
+            "with nobody there. No straight lane is free. Ends on the first failure.",
+            purpose="eight events of pedestrians, with decoys",
             slots=_reactive_slots(),
             draw=_reactive,
         ),

@@ -18,13 +18,18 @@ from cosim.core.geometry import Polyline, wrap_angle
 from cosim.place.route_line import way_line
 from cosim.place.street_map import Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
-from cosim.spec.events import SidewalkLayout
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import Place, RouteCrossing, Scenario
 from scenarios.suites.drawing import TRIES, Refusals, bare_scenario, first_of
 from scenarios.suites.long_horizon import TURNED_OVER_M, on_car_paths_m, on_road_m
 from scenarios.suites.obstacles import with_obstacles
-from scenarios.suites.reactive import LIMIT_S, NO_CROWD, along_sidewalk, over_crossing
+from scenarios.suites.reactive import (
+    LIMIT_S,
+    NO_CROWD,
+    over_crossing,
+    stepped,
+    straight_along,
+)
 
 Structure = Literal["straight", "curve", "crosswalk"]
 STRUCTURES: Final[tuple[Structure, ...]] = get_args(Structure)
@@ -120,7 +125,7 @@ def drawn_along(
 ) -> tuple[Polyline, tuple[RouteCrossing, ...]]:
     """Draw a route along a strip, with its crossings. Raises CosimError if it is unsuitable."""
     if structure == "straight":
-        route, crossings = _straight(strip, rng, robot, way_m)
+        route, crossings = _straight(strip, rng, way_m)
     elif structure == "curve":
         route = _round_corner(street_map, graph, strip, rng, robot)
         crossings = ()
@@ -153,10 +158,10 @@ def _may_be(strip: Strip, structure: Structure, robot: Robot) -> bool:
 
 
 def _straight(
-    strip: Strip, rng: np.random.Generator, robot: Robot, way_m: tuple[float, float]
+    strip: Strip, rng: np.random.Generator, way_m: tuple[float, float]
 ) -> tuple[Polyline, tuple[RouteCrossing, ...]]:
-    layout = SidewalkLayout(way_m, (0.0, 0.0), robot.width_m / 2 + _BESIDE_ROBOT_M)
-    return Polyline(along_sidewalk(layout, strip, rng, robot).route), ()
+    length_m = float(rng.uniform(*way_m))
+    return Polyline(stepped(straight_along(strip, length_m, rng), length_m)), ()
 
 
 def _crosswalk(

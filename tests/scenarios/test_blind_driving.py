@@ -16,6 +16,7 @@ from cosim.results.event_monitor import passed_between
 from cosim.spec.events import Event, EventQuery, EventState
 from cosim.spec.scenario import City, CrowdSpec
 from scenarios.events import EVENT_KINDS, react
+from tests.support.blind_motion import Schedule, outcome
 from tests.support.cheats import BLIND_MPS, Crawl, EdgeDriver, Stander
 
 TICK_S = 0.05
@@ -155,10 +156,10 @@ def test_who_drives_by_fits_and_starts_meets_those_who_cross_or_cut_in(
 
 @pytest.mark.parametrize("kind", ["lateral", "overtaking"])
 def test_who_stops_before_one_who_crosses_or_cuts_in_has_let_it_go(kind: str) -> None:
-    """However late it stops, if it stands until they have gone on: it is not touched, and the event
-    is over."""
+    """However late it stops near them, if it stands until they have gone on: it is not touched, and
+    the event is over."""
     meets_s = len(drive(event(kind), lambda _: 1.0, 44.0, 30.0).seen) * TICK_S
-    for early_s in (0.6, 1.0, 1.5, 2.5):
+    for early_s in (0.6, 1.0, 1.5):
         driven = drive(
             event(kind), lambda t_s, at_s=meets_s - early_s: float(t_s < at_s), 44.0, 40.0
         )  # type: ignore[misc]
@@ -221,15 +222,29 @@ def test_a_stopping_hand_is_let_down_when_the_robot_has_stood_before_it_for_two_
         assert (driven.state.phase == "over") is obeyed
 
 
+@pytest.mark.parametrize("kind", ["lateral", "overtaking", "frontal", "ped_crossing"])
+def test_who_stops_too_early_has_not_let_anybody_go(kind: str) -> None:
+    """They wait, too, and whoever drives on after 9 s meets them."""
+    meets_s = len(drive(event(kind), lambda _: 1.0, 44.0, 30.0).seen) * TICK_S
+    early_s = {"overtaking": 4.5}.get(kind, 2.9)
+    stops_s = meets_s - early_s
+    stood = drive(event(kind), lambda t_s: float(t_s < stops_s), 44.0, stops_s + 20.0)
+    assert stood.gap_m > 0.0 and stood.state.phase == "acting"
+    driven = drive(
+        event(kind), lambda t_s: float(not stops_s <= t_s < stops_s + 9.0), 44.0, stops_s + 40.0
+    )
+    assert driven.gap_m < 0.0
+
+
 @pytest.mark.parametrize("speed_mps", [1.1, 1.65])
 @pytest.mark.parametrize("left_m", [0.0, 0.4, -0.7])
 def test_who_comes_towards_a_robot_that_stands_walks_round_it(
     left_m: float, speed_mps: float
 ) -> None:
-    """From wherever it stopped, at least a second before they meet, it is passed at a distance, and
-    the walker goes on."""
-    for drives_s in (0.5, 3.0, 5.0):
+    """If it has stopped near the walker, it is passed at a distance, and the walker goes on."""
+    for stops_m in (1.4, 1.9, 2.3):
         one = event("frontal", 1.9, speed_mps=speed_mps)
+        drives_s = (20.0 - stops_m) / (1.2 + speed_mps)
         driven = drive(one, lambda t_s, d=drives_s: 1.2 if t_s < d else 0.0, 30.0, 40.0, left_m)  # type: ignore[misc]
         assert driven.gap_m > 0.02
         assert driven.state.walkers[0].x_m < 30.0
@@ -257,7 +272,7 @@ def test_who_overtakes_is_faster_than_the_robot_and_passes_close_by(v_mps: float
 
 @pytest.mark.parametrize("v_mps", [0.8, 1.5, 2.5])
 def test_who_overtakes_is_not_touched_by_a_robot_that_slows_down_and_walks_on(v_mps: float) -> None:
-    """Nor by one that stands the whole time, which it passes."""
+    """Nor by one that stands: beside it the person waits, in front of it the person goes on."""
     cuts_s = next(
         tick * TICK_S
         for tick, (_, state) in enumerate(
@@ -265,7 +280,11 @@ def test_who_overtakes_is_not_touched_by_a_robot_that_slows_down_and_walks_on(v_
         )
         if state.walkers[0].aim_rad is not None
     )
-    for stops_s, slow_mps in ((cuts_s + 0.5, 0.1), (2.2 / v_mps, 0.0)):
+    for stops_s, slow_mps, goes_on in (
+        (cuts_s + 0.5, 0.1, True),
+        (cuts_s + 1.0, 0.0, True),
+        (2.2 / v_mps, 0.0, False),
+    ):
         driven = drive(
             event("overtaking"),
             lambda t_s, s=stops_s, v=slow_mps: v_mps if t_s < s else v,
@@ -273,7 +292,7 @@ def test_who_overtakes_is_not_touched_by_a_robot_that_slows_down_and_walks_on(v_
             30.0,
         )  # type: ignore[misc]
         assert driven.gap_m > 0.05
-        assert driven.state.phase in ("over", "gone")
+        assert (driven.state.phase in ("over", "gone")) is goes_on
 
 
 @pytest.mark.engine
@@ -310,3 +329,32 @@ def test_blind_policies_do_not_solve_events_and_who_stands_has_not_failed(
     assert [failure.fault in ("robot_at_fault", "shared") for failure in record.failures] == [
         True
     ] * (not stands)
+
+
+SCHEDULES = {
+    "one stop of 8 s": Schedule(1.5, [(10.0, 8.0)]),
+    "stops every 2 m": Schedule(1.5, [(2.0 * k, 2.2) for k in range(1, 14)]),
+    "one swerve": Schedule(1.5, lanes=[(7.0, -1.1), (14.0, 0.0)]),
+    "slow weaving": Schedule(1.0, lanes=[(2.0 * k, 0.7 * (-1) ** k) for k in range(20)]),
+    "fast swerves": Schedule(2.5, lanes=[(6.0 * k, 0.8 * (-1) ** k) for k in range(8)]),
+}
+
+
+@pytest.mark.parametrize("kind", ["lateral", "overtaking", "frontal", "ped_crossing"])
+@pytest.mark.parametrize("schedule", SCHEDULES.values(), ids=SCHEDULES)
+def test_a_schedule_of_stops_and_swerves_seldom_suits_an_event(
+    kind: str, schedule: Schedule
+) -> None:
+    """Of 12 places of the event along the route at most 3 suit it, in the time of a suite."""
+    rng = np.random.default_rng(5)
+    solved = 0
+    for before_m in np.linspace(7.0, 25.0, 12).tolist():
+        one = msgspec.structs.replace(
+            event(kind, 1.6, 3 if kind == "ped_crossing" else 1, side=int(rng.choice([-1, 1]))),
+            x_m=0.0,
+            speed_mps=float(rng.uniform(1.1, 1.65)),
+            patience_s=float(rng.uniform(2.0, 4.0)),
+        )
+        limit_s = 1.5 * ((before_m + 13.0) / 1.4 + 6.0) + 3.0
+        solved += outcome(one, schedule, before_m, limit_s) == "solved"
+    assert solved <= 3

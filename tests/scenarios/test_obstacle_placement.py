@@ -25,7 +25,6 @@ from physics.ground.tiles import tiles_touching
 from physics.street.furniture import footprints
 from physics.street.placement import driveway_ground
 from physics.street.street_surface import StreetSurface
-from scenarios.events import EVENT_KINDS
 from scenarios.suites.long_horizon import build_long_horizon
 from scenarios.suites.obstacles import (
     BESIDE_FREE_M,
@@ -35,8 +34,8 @@ from scenarios.suites.obstacles import (
     TO_SPARE_M,
     obstacles_along,
     prove_gap,
+    with_obstacles,
 )
-from scenarios.suites.reactive import build_reactive
 from tests.scenarios.test_scenarios import cross_map
 
 SMALL = City(seed=1, size_m=500.0)
@@ -152,21 +151,16 @@ def test_who_follows_the_middle_of_the_way_hits_something() -> None:
 
 
 @pytest.mark.engine
-def test_reactive_scenarios_have_them_beside_the_way() -> None:
-    """The band about the middle stays free, and the place of the event."""
-    graph = WalkGraph(street())
+def test_obstacles_can_be_wanted_beside_the_way_alone() -> None:
+    """The band about the middle stays free, and the place of an event."""
     found = 0
-    for name in ("frontal", "queueing", "lateral"):
-        for seed in SEEDS:
-            scenario = build_reactive(
-                EVENT_KINDS[name], SMALL, street(), graph, seed, f"{name}-{seed}"
-            )
-            (event,) = scenario.events
-            for one in scenario.obstacles:
-                assert footprint(one).distance(LineString(scenario.route)) >= BESIDE_FREE_M - 1e-6
-                assert footprint(one).distance(Point(event.x_m, event.y_m)) >= EVENT_FREE_M - 0.1
-            found += len(scenario.obstacles)
-            prove_gap(scenario, street())
+    for way in ways():
+        bare = msgspec.structs.replace(way, obstacles=())
+        scenario = with_obstacles(bare, street(), beside=True)
+        for one in scenario.obstacles:
+            assert footprint(one).distance(LineString(scenario.route)) >= BESIDE_FREE_M - 1e-6
+        found += len(scenario.obstacles)
+        prove_gap(scenario, street())
     assert found > 3
 
 

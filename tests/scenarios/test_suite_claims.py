@@ -31,8 +31,10 @@ from scenarios.events import EVENT_KINDS
 from scenarios.places.nets import place
 from scenarios.suites.catalog import SUITES, load_suite, with_crowd
 from scenarios.suites.daylight import drawn_daylight
+from scenarios.suites.decoys import DECOY, decoy_of, limited
 from scenarios.suites.long_horizon import build_long_horizon
 from scenarios.suites.proofs import Dropped, Proof, Proofs, read_proofs, write_proofs
+from scenarios.suites.reactive import Wanted, event_range_m
 from scenarios.suites.recipes import LONG_WAY, RECIPES, Slot
 from scenarios.suites.unit import STRUCTURES, TURN_RAD, build_unit, turn_rad
 from scenarios.tools.build.build_suite import build_suite
@@ -44,6 +46,9 @@ from sumo_nets.maps.map_store import about_map, known_maps
 from tests.conftest import Cosim
 
 SMALL = City(seed=1, size_m=500.0)
+EXPERT_S = 9.0
+EXPERT_MPS = 1.2
+BIN = Obstacle(kind="bin", x_m=0.0, y_m=3.0, heading_rad=0.0)
 replace = msgspec.structs.replace
 
 
@@ -52,18 +57,26 @@ def honest(name: str) -> Read:
     """A suite of the recipe's slots that keeps every claim of its file, drawn on no map, with
     proofs."""
     kinds = [*EVENT_KINDS]
-    scenarios = tuple(
-        of_slot(slot, number, kinds) for number, slot in enumerate(RECIPES[name].slots)
-    )
-    suite = Suite(name=name, version="1", scenarios=scenarios)
+    slots = {slot.name: slot for slot in RECIPES[name].slots}
+    scenarios: list[Scenario] = []
+    for number, slot in enumerate(slots.values()):
+        if slot.decoy_of:
+            made = decoy_of(scenarios[-1])
+        else:
+            made = of_slot(slot, slots.get(slot.like, slot), number, kinds)
+        scenarios.append(limited(made, EXPERT_S, EXPERT_MPS))
+    suite = Suite(name=name, version="1", scenarios=tuple(scenarios))
     return Read(suite, proofs_of(suite))
 
 
-def of_slot(slot: Slot, number: int, kinds: list[str]) -> Scenario:
-    """A scenario as the slot's name promises it."""
+def of_slot(slot: Slot, like: Slot, number: int, kinds: list[str]) -> Scenario:
+    """A scenario as the slot's name promises it. like: the slot whose scenario it repeats, or it
+    itself."""
     rng = np.random.default_rng(number)
     long = slot.structure == LONG_WAY
+    wanted = like.wanted
     length_m = slot.length_m if long else float(rng.uniform(10.0, 20.0))
+    length_m = length_m if wanted is None else wanted.length_m
     x_m = 100.0 * number
     route = np.column_stack([x_m + np.linspace(0.0, length_m, 21), np.zeros(21)])
     if slot.structure == "curve":
@@ -93,7 +106,8 @@ def of_slot(slot: Slot, number: int, kinds: list[str]) -> Scenario:
         route=tuple((x, y) for x, y in line.points.tolist()),
         crossings=(crossing,) if long or slot.structure == "crosswalk" else (),
         barriers=(barrier,) if long else (),
-        events=tuple(event_of(kind, number) for kind in names),
+        obstacles=() if wanted is None else (BIN, BIN),
+        events=tuple(event_of(kind, number, wanted) for kind in names),
         crowd=CrowdSpec() if long else CrowdSpec(persons=0, vehicles=0),
         time_limit_s=3000.0 if long else 60.0,
         ends_on_failure=not long,
@@ -103,9 +117,10 @@ def of_slot(slot: Slot, number: int, kinds: list[str]) -> Scenario:
     )
 
 
-def event_of(kind: str, number: int) -> Event:
-    side = 1 if number // 9 % 2 else -1
-    return Event(
+def event_of(kind: str, number: int, wanted: Wanted | None = None) -> Event:
+    """An event of a kind, where its slot wants it."""
+    row = EVENT_KINDS[kind]
+    event = Event(
         id="e0",
         kind=kind,
         x_m=0.0,
@@ -113,8 +128,24 @@ def event_of(kind: str, number: int) -> Event:
         heading_rad=0.0,
         route_s_m=5.0,
         half_width_m=1.5,
-        side=side,
+        side=1 if number // 9 % 2 else -1,
         speed_mps=1.3,
+    )
+    if wanted is None:
+        return event
+    trigger_m = None if row.trigger_m is None else 0.6 * row.trigger_m
+    half_length_m = 3.0 if row.layout is None else 0.0
+    if row.layout is None or trigger_m is None:
+        low_m, high_m = 6.5, wanted.length_m - 5.3
+    else:
+        low_m, high_m = event_range_m(trigger_m, row.layout.after_m, wanted.length_m)
+    return replace(
+        event,
+        route_s_m=low_m + wanted.share * max(high_m - low_m, 0.0),
+        half_length_m=half_length_m,
+        trigger_m=trigger_m,
+        side=wanted.side,
+        free_side=wanted.free_side if row.has_free_side else 0,
     )
 
 
@@ -126,7 +157,8 @@ def proofs_of(suite: Suite) -> Proofs:
             expert="orca",
             expert_version="1",
             state_hash="00",
-            time_s=9.0,
+            time_s=EXPERT_S,
+            passing_mps=EXPERT_MPS if s.decoy_of else None,
         )
         for s in suite.scenarios
     )
@@ -185,7 +217,27 @@ def nearer(scenario: Scenario, share: float) -> Scenario:
         for s in np.linspace(0.0, share * scenario.route_line.length_m, 21)
     ]
     route = tuple((float(x), float(y)) for x, y in points)
-    return replace(scenario, goal=route[-1], route=route, crossings=(), events=())
+    bare = {"crossings": (), "events": (), "go_on_mps": 0.0}
+    return replace(scenario, goal=route[-1], route=route, **bare)
+
+
+def bent(scenario: Scenario) -> dict[str, object]:
+    """Its route with a turn of 20 degrees in the middle."""
+    (x_m, y_m), half_m = scenario.start[:2], 0.5 * scenario.route_line.length_m
+    turn_rad = math.radians(20.0)
+    middle = (x_m + half_m, y_m)
+    goal = (middle[0] + half_m * math.cos(turn_rad), y_m + half_m * math.sin(turn_rad))
+    return {"route": ((x_m, y_m), middle, goal), "goal": goal}
+
+
+def moved(scenario: Scenario, s_m: float) -> Scenario:
+    """Its events moved to an arc length."""
+    return replace(scenario, events=tuple(replace(e, route_s_m=s_m) for e in scenario.events))
+
+
+def sided(scenario: Scenario, **sides: int) -> Scenario:
+    """Its events with other sides."""
+    return replace(scenario, events=tuple(replace(e, **sides) for e in scenario.events))
 
 
 def spot_of(read: Read, index: int, other: int) -> Read:
@@ -205,6 +257,9 @@ def broken() -> dict[str, tuple[str, Read, str]]:
     curve = next(i for i, s in enumerate(unit.suite.scenarios) if s.structure == "curve")
     crosswalk = next(i for i, s in enumerate(unit.suite.scenarios) if s.structure == "crosswalk")
     night = replace(unit.suite.scenarios[0].light, hour=23.0)
+    first = reactive.suite.scenarios[0]
+    lateral = next(i for i, s in enumerate(reactive.suite.scenarios) if s.id == "lateral-001-decoy")
+    static = next(i for i, s in enumerate(reactive.suite.scenarios) if s.structure == "static")
     return {
         "one-missing": ("counts", of(unit, list(unit.suite.scenarios[1:])), "is missing"),
         "one-of-another-structure": ("counts", one(unit, 0, structure="curve"), "not ('straight'"),
@@ -248,6 +303,11 @@ def broken() -> dict[str, tuple[str, Read, str]]:
             one(unit, curve, structure="straight"),
             "is no 'straight'",
         ),
+        "an-event-round-a-bend": (
+            "structures",
+            one(reactive, 0, **bent(first)),
+            "is no 'obstructing': turns 20 degrees",
+        ),
         "a-crosswalk-with-signals": (
             "structures",
             one(
@@ -264,7 +324,7 @@ def broken() -> dict[str, tuple[str, Read, str]]:
         ),
         "somebody-in-static": (
             "structures",
-            one(reactive, 8, events=(event_of("frontal", 1),)),
+            one(reactive, static, events=(event_of("frontal", 1),)),
             "is no 'static'",
         ),
         "a-long-way-without-barriers": ("structures", one(long, 0, barriers=()), "is no 'route'"),
@@ -273,7 +333,69 @@ def broken() -> dict[str, tuple[str, Read, str]]:
             one(unit, 0, ends_on_failure=False),
             "does not end",
         ),
-        "another-time-limit": ("structures", one(unit, 0, time_limit_s=90.0), "not 60"),
+        "kinds-of-other-lengths": (
+            "lengths",
+            all_of(reactive, lambda s: nearer(s, 0.8) if s.structure == "lateral" else s),
+            "lateral: its ways are 16.8 m long on average",
+        ),
+        "always-at-the-end": (
+            "positions",
+            all_of(reactive, lambda s: moved(s, s.route_line.length_m - 3.0)),
+            "lateral: positions in the first third: 0.0%",
+        ),
+        "an-event-before-its-trigger": (
+            "positions",
+            one(reactive, 0, events=(replace(first.events[0], route_s_m=2.0),)),
+            "does not fit where it is",
+        ),
+        "all-free-on-the-left": (
+            "sides",
+            all_of(reactive, lambda s: sided(s, free_side=1)),
+            "queueing: free side on the right: 0.0%",
+        ),
+        "all-come-from-the-left": (
+            "sides",
+            all_of(reactive, lambda s: sided(s, side=1)),
+            "lateral: come from the right: 0.0%",
+        ),
+        "no-free-side": (
+            "sides",
+            one(reactive, 0, events=(replace(first.events[0], free_side=0),)),
+            "has no free side",
+        ),
+        "one-obstacle": ("obstacles", one(reactive, 0, obstacles=(BIN,)), "has 1 obstacles"),
+        "no-decoys": (
+            "decoys",
+            of(reactive, [s for s in reactive.suite.scenarios if not s.decoy_of]),
+            "has no decoy",
+        ),
+        "a-decoy-elsewhere": (
+            "decoys",
+            one(reactive, 1, obstacles=(BIN, BIN, BIN)),
+            "differs from obstructing-001 in obstacles",
+        ),
+        "a-decoy-that-is-its-event": (
+            "decoys",
+            one(reactive, 1, events=first.events),
+            "differs from obstructing-001 in events",
+        ),
+        "a-decoy-of-static": (
+            "decoys",
+            one(reactive, 1, decoy_of="static-001"),
+            "has a decoy, but no event",
+        ),
+        "a-limit-below-the-experts-time": (
+            "limits",
+            one(unit, 0, time_limit_s=8.0),
+            "its time limit of 8 s is below the expert's 9 s",
+        ),
+        "another-time-limit": ("limits", one(unit, 0, time_limit_s=60.0), "is 60 s, not 16.5"),
+        "another-limit-of-a-decoy": (
+            "limits",
+            one(reactive, 1, time_limit_s=16.5),
+            "is 16.5 s, not 14.7",
+        ),
+        "no-go-on-rule": ("limits", one(reactive, lateral, go_on_mps=0.0), "is 0, not 0.72"),
         "walkers-in-a-reactive-one": (
             "street life",
             one(reactive, 0, crowd=CrowdSpec(persons=12)),
@@ -358,10 +480,10 @@ def test_a_large_file_is_found_out(tmp_path: Path) -> None:
 
 
 def test_the_recipes_make_what_the_benchmark_says() -> None:
-    """330, 900 and 105 scenarios; a fifth in cities and crops of their own; eleven real places;
+    """330, 1700 and 105 scenarios; a fifth in cities and crops of their own; eleven real places;
     36.5 km."""
     counts = {name: len(recipe.slots) for name, recipe in RECIPES.items()}
-    assert counts == {"unit": 330, "reactive": 900, "long-horizon": 105}
+    assert counts == {"unit": 330, "reactive": 1700, "long-horizon": 105}
     for recipe in RECIPES.values():
         assert sum(slot.split == "test" for slot in recipe.slots) * 5 == len(recipe.slots)
         assert len({slot.name for slot in recipe.slots}) == len(recipe.slots)
@@ -371,6 +493,8 @@ def test_the_recipes_make_what_the_benchmark_says() -> None:
     )
     statics = [slot for slot in RECIPES["reactive"].slots if slot.like]
     assert len(statics) == 100 and {slot.structure for slot in statics} == {"static"}
+    decoys = [slot for slot in RECIPES["reactive"].slots if slot.decoy_of]
+    assert len(decoys) == 800 and all(slot.name == slot.decoy_of + DECOY for slot in decoys)
 
 
 def test_scenarios_are_chosen_by_split() -> None:

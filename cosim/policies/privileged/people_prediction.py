@@ -32,8 +32,17 @@ _SOON: Final = 4
 """Number of steps for which that prediction is used."""
 _DARTS_M: Final = 0.15
 """Length in metres of the step aside."""
-_COMES_M: Final = 4.5
-"""Metres within which the robot yields to people of events; the crowd would wait, too."""
+_COMES_M: Final = 3.3
+"""Metres within which the robot yields to people of events who walk at it. Stopping farther away
+gains nothing: they wait, too. The crowd would wait anyway."""
+_CROSSES_M: Final = 2.0
+"""Metres ahead within which it yields to people of events who cross."""
+_PASSES_M: Final = 4.5
+"""Metres within which it keeps waiting for them to pass."""
+_MET_STANDING_M: Final = 2.4
+"""Metres beyond which people who stand wait for the robot to come nearer."""
+_STAND_S: Final = 4.6
+"""Seconds that a person stands before the robot stops waiting: longer than people's patience."""
 _COMES_RAD: Final = 0.12
 """Heading error in radians below which a person walks straight at the robot."""
 _SIDEWAYS: Final = 0.7
@@ -44,7 +53,7 @@ _LEAVES_RAD: Final = 1.7
 """Heading error in radians above which a person walks away."""
 _PAST_M: Final = 1.4
 """Distance in metres up to which a person that walks away may still turn back to the robot."""
-_WAITS_S: Final = 7.0
+_WAITS_S: Final = 10.0
 """Longest wait in seconds in one place."""
 _SAME_PLACE_M: Final = 0.5
 """Metres within which the robot is in the same place."""
@@ -135,6 +144,7 @@ class Yielding:
 
     def __init__(self) -> None:
         self._for: set[str] = set()
+        self._stood_since: dict[str, float] = {}
         self._at = (math.inf, math.inf)
         self._since_s = 0.0
 
@@ -147,10 +157,18 @@ class Yielding:
         cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
         off = np.abs(wrap_angles(people.heading - np.arctan2(-offset[:, 1], -offset[:, 0])))
         ahead = offset @ [cos, sin]
-        near = (far < _COMES_M) & (ahead > -_PAST_M)
-        comes = (off < _COMES_RAD) | _crosses(known, offset)
-        comes &= near & people.are(*DIRECTED) & ~is_standing(people) & (ahead > 0.5 * far)
-        passing = near & ((off < _LEAVES_RAD) | (far < _PAST_M))
+        comes = (off < _COMES_RAD) & (far < _COMES_M)
+        comes |= _crosses(known, offset) & (ahead < _CROSSES_M)
+        comes &= people.are(*DIRECTED) & ~is_standing(people) & (ahead > 0.5 * far)
+        passing = (far < _PASSES_M) & (ahead > -_PAST_M)
+        passing &= (off < _LEAVES_RAD) | (far < _PAST_M)
+        still = is_standing(people)
+        self._stood_since = {
+            people.ids[row]: self._stood_since.get(people.ids[row], time_s)
+            for row in np.flatnonzero(still)
+        }
+        stays = np.array([time_s - self._stood_since.get(one, time_s) for one in people.ids])
+        passing &= ~still | ((far < _MET_STANDING_M) & (stays < _STAND_S))
         if math.dist(self._at, pose[:2]) > _SAME_PLACE_M:
             self._at = pose[:2]
             self._since_s = time_s

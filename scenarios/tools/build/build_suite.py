@@ -27,9 +27,10 @@ from cosim.core.errors import CosimError, RunError, SpecError
 from cosim.core.files import write_atomic
 from cosim.core.progress import Progress, ignore
 from cosim.spec.scenario import Place, Scenario, Suite, write_suite
+from scenarios.suites.decoys import decoy_of, has_decoy
 from scenarios.suites.proofs import Dropped, Proof, Proofs, write_proofs
-from scenarios.suites.recipes import RECIPES, Slot, candidate, repeated
-from scenarios.tools.build.proving import proved
+from scenarios.suites.recipes import RECIPES, Slot, SuiteRecipe, candidate, repeated
+from scenarios.tools.build.proving import accepted
 
 CANDIDATES: Final = 6
 """Largest number of candidates of a scenario."""
@@ -91,11 +92,7 @@ def build_suite(
     """
     recipe = RECIPES[name]
     folder = out.with_suffix(".parts")
-    slots = [
-        slot
-        for slot in recipe.slots
-        if not only or slot.name in only or _is_like(slot, recipe.slots, only)
-    ]
+    slots = _with_needed(recipe, only) if only else list(recipe.slots)
     _open(folder, name)
     for line, done in _run(_pieces(slots), folder, jobs, tries):
         progress(f"{done}/{len(slots)} {line}", done / len(slots))
@@ -117,9 +114,12 @@ def build_suite(
     return suite, write_proofs(out, name, suite.content_hash, [one.proof for one in whole])
 
 
-def _is_like(slot: Slot, slots: Sequence[Slot], only: Sequence[str]) -> bool:
-    """Return whether a requested slot repeats this slot."""
-    return any(other.like == slot.name and other.name in only for other in slots)
+def _with_needed(recipe: SuiteRecipe, only: Sequence[str]) -> list[Slot]:
+    """Return the slots of these names, the slots that they repeat, and the decoys of all."""
+    named = {slot.name: slot for slot in recipe.slots}
+    needed = [named[name] for name in only if name in named]
+    names = {name for slot in needed for name in (slot.decoy_of or slot.name, slot.like)}
+    return [slot for slot in recipe.slots if {slot.name, slot.decoy_of} & (names - {""})]
 
 
 def _open(folder: Path, name: str) -> None:
@@ -252,17 +252,36 @@ def _fill(slot: Slot, folder: Path, tries: int) -> None:
         except CosimError as error:
             dropped.append(Dropped(seed, "none drawn", str(error)[:300]))
             continue
-        found = proved(scenario)
+        found = _accepted(scenario)
         if isinstance(found, Dropped):
             dropped.append(msgspec.structs.replace(found, seed=seed))
             continue
-        kept = Kept(scenario, msgspec.structs.replace(found, dropped=tuple(dropped)))
-        write_atomic(folder / f"{slot.name}.json", msgspec.json.encode(kept))
+        for one, proof in reversed(found):  # the decoy first: the scenario's file ends the slot
+            before = () if one.decoy_of else tuple(dropped)
+            kept = Kept(one, msgspec.structs.replace(proof, dropped=before))
+            write_atomic(folder / f"{one.id}.json", msgspec.json.encode(kept))
         _trying(folder, slot.name).unlink()
         return
 
 
+def _accepted(scenario: Scenario) -> list[tuple[Scenario, Proof]] | Dropped:
+    """Return a scenario, and its decoy if it is to have one, or why the expert fails in either."""
+    first = accepted(scenario)
+    if isinstance(first, Dropped):
+        return first
+    if not has_decoy(scenario):
+        return [first]
+    decoy = accepted(
+        msgspec.structs.replace(decoy_of(first[0]), time_limit_s=scenario.time_limit_s)
+    )
+    if isinstance(decoy, Dropped):
+        return msgspec.structs.replace(decoy, reason=f"decoy: {decoy.reason}")
+    return [first, decoy]
+
+
 def _drawn(slot: Slot, folder: Path, seed: int) -> Scenario:
+    if slot.decoy_of:
+        raise SpecError(f"'{slot.decoy_of}', whose decoy it is, was not solved")
     if not slot.like:
         return candidate(slot, seed)
     path = folder / f"{slot.like}.json"

@@ -20,7 +20,11 @@ from cosim.spec.scenario import City, CityMap, Scenario, Suite, content_hash
 from cosim.spec.selection import STATIC
 from scenarios.events import EVENT_KINDS
 from scenarios.suites.daylight import FOG_M, LOWEST_SUN_RAD, sun_rises_rad
+from scenarios.suites.decoys import differing_fields, has_decoy, least_pace_mps, time_limit_s
+from scenarios.suites.lanes import THINGS
 from scenarios.suites.proofs import Proofs, proofs_path
+from scenarios.suites.reactive import WAY_M as REACTIVE_WAY_M
+from scenarios.suites.reactive import event_share
 from scenarios.suites.recipes import ALL_ROUTES_M, LONG_WAY, RECIPES
 from scenarios.suites.unit import STRUCTURES, TURN_RAD, WAY_M, turn_rad
 from sumo_nets.maps.import_rules import WHEEL_PLACES
@@ -33,6 +37,15 @@ _MOST_BYTES: Final = 3_000_000
 """Largest size of a suite's file and its proofs, in bytes."""
 _EDGE_M: Final = 0.6
 """Largest deviation of a drawn length from the wanted range, in metres."""
+_LENGTHS_APART_M: Final = 1.5
+"""Largest difference between the lengths of one kind and of all, in metres: means and ranges."""
+_THIRDS: Final = ("first third", "middle third", "last third")
+_LEAST_THIRD: Final = 0.2
+_LEAST_SIDE: Final = 0.4
+_SHARE_EDGE: Final = 0.1
+"""Largest deviation of a position from the range of shares, by which crosswalks are measured."""
+_LIMIT_EDGE_S: Final = 1e-6
+_PACE_EDGE_MPS: Final = 1e-6
 _STRAIGHT_RAD: Final = math.radians(10.0)
 _SPEEDS_MPS: Final = (1.1, 1.65)
 _FEWEST_EVENTS: Final = 5
@@ -130,16 +143,18 @@ def _proofs(read: Read) -> Iterator[str]:
 
 
 def _lengths(read: Read) -> Iterator[str]:
-    """Check lengths: 10 to 20 m each; long routes more than 100 m, and 36.5 km +- 1 % in all."""
+    """Check lengths: 10 to 20 m in `unit`, 12 to 30 m in `reactive`; long routes more than 100 m,
+    and 36.5 km +- 1 % in all.
+
+    All kinds of reactive scenarios have the same distribution of lengths.
+    """
     for scenario in read.suite.scenarios:
         length_m = scenario.route_line.length_m
-        low, high = (
-            (100.0, math.inf)
-            if scenario.structure == LONG_WAY
-            else (WAY_M[0] - _EDGE_M, WAY_M[1] + _EDGE_M)
-        )
-        if not low < length_m < high:
+        low_m, high_m = _wanted_length_m(scenario)
+        if not low_m - _EDGE_M < length_m < high_m + _EDGE_M:
             yield f"{scenario.id}: is {length_m:.1f} m long"
+    short = [scenario for scenario in read.suite.scenarios if _is_reactive(scenario)]
+    yield from _other_lengths(short)
     routes_m = sum(s.route_line.length_m for s in read.suite.scenarios if s.structure == LONG_WAY)
     if routes_m and abs(routes_m / ALL_ROUTES_M - 1.0) > 0.01:
         yield (
@@ -148,10 +163,128 @@ def _lengths(read: Read) -> Iterator[str]:
         )
 
 
+def _other_lengths(scenarios: Sequence[Scenario]) -> Iterator[str]:
+    """Yield the structures whose lengths are distributed otherwise than those of all."""
+    lengths_m = {
+        structure: [one.route_line.length_m for one in those]
+        for structure, those in _by(scenarios, lambda s: s.structure).items()
+    }
+    every_m = [length_m for those in lengths_m.values() for length_m in those]
+    measures: list[tuple[str, Callable[[list[float]], float]]] = [
+        ("on average", lambda those: float(np.mean(those))),
+        ("at least", min),
+        ("at most", max),
+    ]
+    for structure, those_m in lengths_m.items():
+        for words, measure in measures:
+            if abs(measure(those_m) - measure(every_m)) > _LENGTHS_APART_M:
+                yield (
+                    f"{structure}: its ways are {measure(those_m):.1f} m long {words}, those of "
+                    f"all kinds {measure(every_m):.1f} m"
+                )
+
+
+def _is_reactive(scenario: Scenario) -> bool:
+    return scenario.structure == STATIC or scenario.structure in EVENT_KINDS
+
+
+def _wanted_length_m(scenario: Scenario) -> tuple[float, float]:
+    if scenario.structure == LONG_WAY:
+        return 100.0, math.inf
+    return REACTIVE_WAY_M if _is_reactive(scenario) else WAY_M
+
+
+def _positions(read: Read) -> Iterator[str]:
+    """Check that events are evenly spread over the positions that fit on their routes."""
+    for kind, those in _by(_events_alone(read), lambda s: s.structure).items():
+        found = []
+        for scenario in those:
+            share = event_share(scenario, EVENT_KINDS[kind])
+            if not -_SHARE_EDGE <= share <= 1.0 + _SHARE_EDGE:
+                yield f"{scenario.id}: its event does not fit where it is on the route"
+            found.append(_THIRDS[min(max(int(3.0 * share), 0), 2)])
+        yield from _shares(f"{kind}: positions in the", found, _THIRDS, _LEAST_THIRD)
+
+
+def _sides(read: Read) -> Iterator[str]:
+    """Check that the free side and the side of walkers are left and right equally often."""
+    for kind, those in _by(_events_alone(read), lambda s: s.structure).items():
+        for what, sides in (
+            ("come from the", [one.events[0].side for one in those]),
+            ("free side on the", [one.events[0].free_side for one in those]),
+        ):
+            if any(sides):
+                names = ["left" if side > 0 else "right" for side in sides]
+                yield from _shares(f"{kind}: {what}", names, ("left", "right"), _LEAST_SIDE)
+        if EVENT_KINDS[kind].has_free_side:
+            yield from (
+                f"{one.id}: its event has no free side"
+                for one in those
+                if not one.events[0].free_side
+            )
+
+
+def _events_alone(read: Read) -> list[Scenario]:
+    """Return the reactive scenarios with an event, without decoys."""
+    return [
+        one
+        for one in read.suite.scenarios
+        if one.structure in EVENT_KINDS and one.events and not one.decoy_of
+    ]
+
+
+def _obstacles(read: Read) -> Iterator[str]:
+    """Check that reactive scenarios have 2 to 4 obstacles."""
+    for one in read.suite.scenarios:
+        if _is_reactive(one) and not THINGS[0] <= len(one.obstacles) <= THINGS[1]:
+            yield f"{one.id}: has {len(one.obstacles)} obstacles, not {THINGS[0]} to {THINGS[1]}"
+
+
+def _decoys(read: Read) -> Iterator[str]:
+    """Check that each reactive scenario with an event has one decoy, equal but for its response."""
+    decoys = _by([one for one in read.suite.scenarios if one.decoy_of], lambda s: s.decoy_of)
+    for one in read.suite.scenarios:
+        those = decoys.pop(one.id, [])
+        if one.structure in EVENT_KINDS and has_decoy(one) and not those:
+            yield f"{one.id}: has no decoy: build the suite again, with decoys"
+        elif those and not has_decoy(one):
+            yield f"{one.id}: has a decoy, but no event"
+        for decoy in those if one.events else ():
+            if different := differing_fields(one, decoy):
+                yield (
+                    f"{decoy.id}: differs from {one.id} in {', '.join(different)}: a decoy may "
+                    f"differ in its event's free side or decoy, its id and its limits alone"
+                )
+    yield from (f"{those[0].id}: is the decoy of no scenario" for those in decoys.values())
+
+
+def _limits(read: Read) -> Iterator[str]:
+    """Check that the limits of short scenarios follow from their proofs."""
+    proofs = {proof.scenario: proof for proof in read.proofs.proofs} if read.proofs else {}
+    for one in read.suite.scenarios:
+        proof = proofs.get(one.id)
+        if proof is None or not one.ends_on_failure:
+            continue
+        limit_s = time_limit_s(one, proof.time_s)
+        if one.time_limit_s < proof.time_s:
+            yield (
+                f"{one.id}: its time limit of {one.time_limit_s:g} s is below the expert's "
+                f"{proof.time_s:g} s: it should be {limit_s:g} s"
+            )
+        elif abs(one.time_limit_s - limit_s) > _LIMIT_EDGE_S:
+            yield f"{one.id}: its time limit is {one.time_limit_s:g} s, not {limit_s:g}"
+        pace_mps = least_pace_mps(one, proof.passing_mps)
+        if any(event.decoy for event in one.events) and not pace_mps:
+            yield f"{one.id}: its proof has no speed past the person, as decoys need"
+        elif abs(one.go_on_mps - pace_mps) > _PACE_EDGE_MPS:
+            yield f"{one.id}: its go_on_mps is {one.go_on_mps:g}, not {pace_mps:g}"
+
+
 def _structures(read: Read) -> Iterator[str]:
     """Check that each scenario matches its structure.
 
-    It is straight, round a corner, over a crosswalk without signals, or has its own event.
+    It is straight, round a corner, over a crosswalk without signals, or straight with its own
+    event.
     """
     for one in read.suite.scenarios:
         turn = abs(turn_rad(one.route_line))
@@ -160,18 +293,16 @@ def _structures(read: Read) -> Iterator[str]:
             "straight": turn <= _STRAIGHT_RAD and not one.crossings and not kinds,
             "curve": TURN_RAD[0] <= turn <= TURN_RAD[1] and not one.crossings and not kinds,
             "crosswalk": len(one.crossings) == 1 and not one.crossings[0].signalised and not kinds,
-            STATIC: not kinds,
+            STATIC: not kinds and turn <= _STRAIGHT_RAD,
             LONG_WAY: bool(one.crossings) and bool(one.barriers),
         }
-        if not says.get(one.structure, kinds == [one.structure]):
+        if not says.get(one.structure, kinds == [one.structure] and turn <= _STRAIGHT_RAD):
             yield (
                 f"{one.id}: is no '{one.structure}': turns {math.degrees(turn):.0f} degrees, "
                 f"events {kinds}"
             )
         if one.ends_on_failure != (one.structure != LONG_WAY):
             yield f"{one.id}: {'ends' if one.ends_on_failure else 'does not end'} on a failure"
-        if one.structure != LONG_WAY and one.time_limit_s != 60.0:
-            yield f"{one.id}: its time limit is {one.time_limit_s:g} s, not 60"
 
 
 def _street_life(read: Read) -> Iterator[str]:
@@ -270,7 +401,8 @@ def _duplicates(read: Read) -> Iterator[str]:
     """Check that no two scenarios of a structure are on one spot. Crops of one net count as one
     place.
     """
-    groups = _by(read.suite.scenarios, lambda s: f"{s.structure} {_ground(s)}")
+    whole = [one for one in read.suite.scenarios if not one.decoy_of]
+    groups = _by(whole, lambda s: f"{s.structure} {_ground(s)}")
     for those in groups.values():
         for a, b in itertools.combinations(those, 2):
             starts, goals = (
@@ -315,6 +447,11 @@ CLAIMS: Final[Mapping[str, Callable[[Read], Iterator[str]]]] = MappingProxyType(
         "structures": _structures,
         "street life": _street_life,
         "events": _events,
+        "positions": _positions,
+        "sides": _sides,
+        "obstacles": _obstacles,
+        "decoys": _decoys,
+        "limits": _limits,
         "spread": _spread,
         "duplicates": _duplicates,
         "size": _size,

@@ -18,15 +18,28 @@ from cosim.place.barriers import prove_single_path
 from cosim.place.street_map import Port, StreetMap
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Place, Scenario, Suite
+from cosim.spec.selection import STATIC
+from scenarios.events import EVENT_KINDS
+from scenarios.events.gates import gate_faults
 from scenarios.places.nets import place
+from scenarios.suites.decoys import DECOY
 from scenarios.suites.fits import misfits
+from scenarios.suites.lanes import LANES, free_lanes, standing_ground
 from scenarios.suites.long_horizon import WAY_SPARE_M
-from scenarios.suites.obstacles import prove_gap
+from scenarios.suites.obstacles import Room, prove_gap
 from scenarios.suites.proofs import Dropped, Proof, Proofs
 from scenarios.suites.recipes import LONG_WAY
 from scenarios.tools.build.proving import proved
 
-PLACE_CLAIMS: Final = ("nets", "fits its place", "single path", "gaps", "proofs to the bit")
+PLACE_CLAIMS: Final = (
+    "nets",
+    "fits its place",
+    "single path",
+    "gaps",
+    "lanes",
+    "mirrors",
+    "proofs to the bit",
+)
 
 
 class FalseClaim(NamedTuple):
@@ -112,6 +125,14 @@ def _look(look: _Look) -> list[FalseClaim]:
             FalseClaim("gaps", f"{scenario.id}: {words}")
             for words in narrow_places(scenario, street_map)
         ]
+        faults += [
+            FalseClaim("lanes", f"{scenario.id}: {words}")
+            for words in straight_lanes(scenario, street_map)
+        ]
+        faults += [
+            FalseClaim("mirrors", f"{scenario.id}: {words}")
+            for words in common_ways(scenario, street_map)
+        ]
         if scenario.id in proofs:
             faults += [
                 FalseClaim("proofs to the bit", f"{scenario.id}: {words}")
@@ -148,6 +169,38 @@ def narrow_places(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
         prove_gap(scenario, street_map)
     except CosimError as error:
         yield str(error)
+
+
+def straight_lanes(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
+    """Yield the straight lanes that a reactive scenario leaves free from start to goal."""
+    if scenario.structure != STATIC and scenario.structure not in EVENT_KINDS:
+        return
+    if free := free_lanes(scenario, street_map):
+        where = ", ".join(f"{left_m:+.2f}" for left_m in free)
+        yield f"{len(free)} of {LANES} straight lanes are free, {where} m to the left of the route"
+
+
+def common_ways(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
+    """Yield whether one way solves a scenario and the decoy that is its mirror, or none solves one.
+
+    Both ways are as wide as the robot, among people who stand.
+    """
+    if scenario.structure not in EVENT_KINDS or scenario.decoy_of:
+        return
+    kind = EVENT_KINDS[scenario.structure]
+    for event in scenario.events:
+        if kind.blocked is None or not event.free_side:
+            continue
+        yield from gate_faults(kind, event, robot_called(scenario.robot).width_m)
+        sides = [standing_ground(one, kind) for one in (event, kind.decoy_of(event))]
+        room = Room(scenario, street_map)
+        for people, name in zip(
+            sides, (scenario.id, f"its decoy {scenario.id}{DECOY}"), strict=True
+        ):
+            if not room.passable(scenario.obstacles, people):
+                yield f"{name}: people and obstacles leave no gap of {room.gap_m:.2f} m"
+        if room.shares_way(scenario.obstacles, sides):
+            yield "one way from start to goal is free both in it and in its decoy"
 
 
 def _driven(scenario: Scenario, proofs: dict[str, Proof]) -> Iterator[str]:

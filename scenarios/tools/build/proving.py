@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Final
 
+import msgspec
 import numpy as np
 import shapely
 
@@ -19,10 +20,14 @@ from cosim.spec.obstacle import footprint
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario, content_hash
 from scenarios.episodes.run_episode import run_episode
+from scenarios.suites.decoys import limited
 from scenarios.suites.proofs import Dropped, Proof
 
 EXPERT: Final = "orca"
 _ROUNDED: Final = 3
+_PASSING_DIGITS: Final = 4
+_ANY_MPS: Final = 1e-3
+"""Speed of the go-on rule for the expert, whose own speed the rule follows."""
 
 
 class _FailedError(CosimError):
@@ -66,6 +71,19 @@ class _Witness:
         return shapely.Polygon(corners @ np.array([[cos, sin], [-sin, cos]]) + (x_m, y_m))
 
 
+def accepted(scenario: Scenario) -> tuple[Scenario, Proof] | Dropped:
+    """Return a scenario that the expert solves, with its limits and proof, or why it fails.
+
+    The expert must also meet the go-on rule of a decoy, at any speed but without a stop.
+    """
+    rule = {"go_on_mps": _ANY_MPS} if any(event.decoy for event in scenario.events) else {}
+    found = proved(msgspec.structs.replace(scenario, **rule))
+    if isinstance(found, Dropped):
+        return found
+    whole = limited(scenario, found.time_s, found.passing_mps)
+    return whole, msgspec.structs.replace(found, scenario_hash=content_hash(whole))
+
+
 def proved(scenario: Scenario, expert: str = EXPERT) -> Proof | Dropped:
     """Return the proof that the expert solves a scenario, or the reason for its failure."""
     witness = _Witness(scenario)
@@ -76,6 +94,8 @@ def proved(scenario: Scenario, expert: str = EXPERT) -> Proof | Dropped:
         return Dropped(scenario.seed, record.status, record.reason[:300])
     if record.measures["success"] != 1.0:
         done = record.measures["route_completion"] or 0.0
+        if any(event.rule_met is False for event in record.events):
+            return Dropped(scenario.seed, "rule of its event not met", f"at {done:.2f} of the way")
         return Dropped(scenario.seed, f"ended by {record.ended}", f"{done:.2f} of the way done")
     return proof_of(scenario, record, expert, witness.people_m, witness.obstacles_m)
 
@@ -88,6 +108,7 @@ def proof_of(
     obstacles_m: float = math.inf,
 ) -> Proof:
     """Return the proof of a solved episode. people_m, obstacles_m: inf without any."""
+    passing_mps = next((event.passing_mps for event in record.events), None)
     return Proof(
         scenario=scenario.id,
         scenario_hash=content_hash(scenario),
@@ -97,4 +118,5 @@ def proof_of(
         time_s=record.measures["time_s"] or 0.0,
         people_m=round(people_m, _ROUNDED) if math.isfinite(people_m) else None,
         obstacles_m=round(obstacles_m, _ROUNDED) if math.isfinite(obstacles_m) else None,
+        passing_mps=None if passing_mps is None else round(passing_mps, _PASSING_DIGITS),
     )

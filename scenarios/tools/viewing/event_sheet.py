@@ -76,7 +76,9 @@ def rows_of(
         first = int(tracks[0, 0])
         before = max(first - 1, 0)
         trigger_m = event.route_s_m - float(log.route_s_m[before] if first else 0.0)
-        stated_m = kinds[event.kind].trigger_m
+        stated_m = event.trigger_m
+        if stated_m is None:
+            stated_m = kinds[event.kind].trigger_m
         if stated_m is None:
             stated_m = event.half_length_m
         came_m = float(log.route_s_m[before] - log.route_s_m[before - 1]) if before else 0.0

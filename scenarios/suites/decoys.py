@@ -1,0 +1,84 @@
+"""Decoys of reactive scenarios, and the limits that follow from the proofs of the expert."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import msgspec
+
+from cosim.spec.events import EventKinds
+from cosim.spec.scenario import Scenario
+from scenarios.events import EVENT_KINDS
+
+DECOY: Final = "-decoy"
+"""End of a decoy's id, after that of its scenario."""
+LIMIT_FACTOR: Final = 1.5
+"""Time limit of a short scenario as a multiple of the expert's time, without LIMIT_MORE_S."""
+DECOY_FACTOR: Final = 1.3
+"""The same for decoys."""
+LIMIT_MORE_S: Final = 3.0
+GO_ON_SHARE: Final = 0.6
+"""Least mean speed past the person of a decoy, as a share of the expert's."""
+_TICKS_PER_S: Final = 20
+_GO_ON_DIGITS: Final = 4
+
+
+def decoy_of(scenario: Scenario, kinds: EventKinds = EVENT_KINDS) -> Scenario:
+    """Return the decoy of a scenario: equal until its event begins, and ending at the goal.
+
+    Raises SpecError if a kind of its events has no decoys.
+    """
+    return msgspec.structs.replace(
+        scenario,
+        id=scenario.id + DECOY,
+        decoy_of=scenario.id,
+        events=tuple(kinds[event.kind].decoy_of(event) for event in scenario.events),
+        ends_at="goal",
+    )
+
+
+def has_decoy(scenario: Scenario) -> bool:
+    """Return whether a scenario must have a decoy: short ones with an event."""
+    return scenario.ends_on_failure and bool(scenario.events) and not scenario.decoy_of
+
+
+def differing_fields(scenario: Scenario, decoy: Scenario) -> list[str]:
+    """Return the fields in which a decoy differs from its scenario, but must not."""
+    should = msgspec.structs.replace(
+        decoy_of(scenario), time_limit_s=decoy.time_limit_s, go_on_mps=decoy.go_on_mps
+    )
+    return [
+        name for name in decoy.__struct_fields__ if getattr(decoy, name) != getattr(should, name)
+    ]
+
+
+def time_limit_s(scenario: Scenario, expert_s: float) -> float:
+    """Return the time limit of a short scenario that the expert solves in expert_s, whole ticks."""
+    factor = DECOY_FACTOR if scenario.decoy_of else LIMIT_FACTOR
+    ticks = math.ceil((factor * expert_s + LIMIT_MORE_S) * _TICKS_PER_S - 1e-6)
+    return ticks / _TICKS_PER_S
+
+
+def least_pace_mps(scenario: Scenario, expert_mps: float | None) -> float:
+    """Return `go_on_mps` of a scenario past whose person the expert drives at expert_mps.
+
+    It is 0 for all scenarios but decoys in which nothing happens.
+    """
+    if expert_mps is None or not any(event.decoy for event in scenario.events):
+        return 0.0
+    return round(GO_ON_SHARE * expert_mps, _GO_ON_DIGITS)
+
+
+def limited(scenario: Scenario, expert_s: float, expert_mps: float | None) -> Scenario:
+    """Return the scenario with the limits that follow from its proof.
+
+    Scenarios that do not end on a failure keep their limits.
+    """
+    if not scenario.ends_on_failure:
+        return scenario
+    return msgspec.structs.replace(
+        scenario,
+        time_limit_s=time_limit_s(scenario, expert_s),
+        go_on_mps=least_pace_mps(scenario, expert_mps),
+    )

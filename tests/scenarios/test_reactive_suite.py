@@ -1,0 +1,172 @@
+"""Reactive scenarios: routes, gates, obstacles in every lane, decoys and their limits."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import shapely
+from shapely.geometry import Point
+
+from cosim.core.errors import SpecError
+from cosim.core.geometry import Pose
+from cosim.place.walk_graph import WalkGraph
+from cosim.spec.obstacle import footprint
+from cosim.spec.robot import COURIER, SCOUT
+from cosim.spec.scenario import City, Scenario
+from scenarios.events import EVENT_KINDS
+from scenarios.places.nets import place
+from scenarios.suites.decoys import decoy_of, differing_fields, limited
+from scenarios.suites.gate_fences import drawn_gate
+from scenarios.suites.lanes import ENDS_M, free_lanes
+from scenarios.suites.obstacles import prove_gap
+from scenarios.suites.proofs import read_proofs
+from scenarios.suites.reactive import Wanted, build_reactive, event_share
+from scenarios.suites.recipes import RECIPES
+from scenarios.tools.build.build_suite import build_suite
+from scenarios.tools.build.claims import CLAIMS, Read
+from scenarios.tools.build.place_claims import common_ways, faults_in_places, straight_lanes
+
+SMALL = City(seed=1, size_m=500.0)
+WANTED = Wanted(19.0, 0.7, -1, 1)
+replace = msgspec.structs.replace
+
+
+@cache
+def drawn(kind: str, seed: int = 0) -> Scenario:
+    """A scenario of a kind with the wanted length, position and sides."""
+    _, street_map = place(SMALL)
+    graph = WalkGraph(street_map)
+    return build_reactive(EVENT_KINDS[kind], SMALL, street_map, graph, seed, kind, wanted=WANTED)
+
+
+@pytest.mark.parametrize("kind", EVENT_KINDS)
+def test_a_reactive_scenario_is_as_wanted_and_no_straight_lane_is_free(kind: str) -> None:
+    """Length, position and sides are those drawn before the place; 2 to 4 obstacles block nine
+    lanes, leave the gap, and are clear of start and goal."""
+    _, street_map = place(SMALL)
+    scenario = drawn(kind)
+    (event,) = scenario.events
+    assert scenario.route_line.length_m == pytest.approx(WANTED.length_m, abs=0.01)
+    assert event_share(scenario, EVENT_KINDS[kind]) == pytest.approx(WANTED.share, abs=0.03)
+    assert (event.side, event.free_side) == (-1, EVENT_KINDS[kind].has_free_side)
+    assert 2.0 <= event.patience_s <= 4.0
+    assert 2 <= len(scenario.obstacles) <= 4 and free_lanes(scenario, street_map) == []
+    assert list(straight_lanes(scenario, street_map)) == list(common_ways(scenario, street_map))
+    prove_gap(scenario, street_map)
+    for one in scenario.obstacles:
+        assert footprint(one).distance(Point(scenario.start[:2])) > ENDS_M
+    graph = WalkGraph(street_map)
+    again = build_reactive(EVENT_KINDS[kind], SMALL, street_map, graph, 0, kind, wanted=WANTED)
+    assert again == scenario
+
+
+def test_a_free_lane_is_found_out() -> None:
+    """Without one of its obstacles a lane of the scenario is free."""
+    _, street_map = place(SMALL)
+    scenario = drawn("lateral")
+    fewer = replace(scenario, obstacles=scenario.obstacles[:1])
+    (words,) = straight_lanes(fewer, street_map)
+    assert "straight lanes are free" in words
+    assert "lanes" in {fault.claim for fault in faults_in_places([fewer], [], None)}
+
+
+def test_a_way_that_solves_event_and_decoy_is_found_out() -> None:
+    """Without the fences of its gate one way passes the people on both sides."""
+    _, street_map = place(SMALL)
+    found = [drawn("obstructing", seed) for seed in range(4)]
+    scenario = next(s for s in found if any(one.kind == "fence" for one in s.obstacles))
+    assert list(common_ways(scenario, street_map)) == []
+    (event,) = scenario.events
+    open_gate = replace(event, half_width_m=event.half_width_m + 0.5)
+    faults = list(common_ways(replace(scenario, events=(open_gate,)), street_map))
+    assert any("are free in the event and in its mirror" in words for words in faults)
+    unfenced = replace(scenario, obstacles=())
+    assert any("one way" in words for words in common_ways(unfenced, street_map))
+    assert "mirrors" in {fault.claim for fault in faults_in_places([unfenced], [], None)}
+
+
+@pytest.mark.parametrize("sidewalk_half_m", [1.0, 1.3, 1.6, 2.24, 2.88])
+def test_fences_close_a_sidewalk_to_the_gate(sidewalk_half_m: float) -> None:
+    """Nothing but the gate is wider than 0.1 m, and no fence leaves the sidewalk."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        gate = drawn_gate((0.95, 1.15), sidewalk_half_m, Pose(0.0, 0.0, 0.0), rng, COURIER)
+        whole = shapely.box(-1.0, -sidewalk_half_m, 1.0, sidewalk_half_m)
+        grounds = [footprint(one) for one in gate.fences]
+        bands = [shapely.box(-1.0, g.bounds[1], 1.0, g.bounds[3]) for g in grounds]
+        assert all(abs(y) <= sidewalk_half_m for band in bands for y in band.bounds[1::2])
+        left = shapely.get_parts(whole.difference(shapely.union_all(bands)))
+        wide = [one.bounds for one in left if one.bounds[3] - one.bounds[1] > 0.1]
+        low_m, high_m = gate.left_m - gate.half_m, gate.left_m + gate.half_m
+        assert len(wide) == 1 and wide[0][1::2] == pytest.approx((low_m, high_m), abs=0.01)
+        inner = [min(abs(y - gate.left_m) for _, y in g.exterior.coords) for g in grounds]
+        assert inner == pytest.approx([gate.half_m] * len(grounds), abs=0.01)
+    with pytest.raises(SpecError, match="too wide"):
+        drawn_gate((0.95, 1.15), 4.0, Pose(0.0, 0.0, 0.0), rng, COURIER)
+
+
+@pytest.mark.parametrize("kind", EVENT_KINDS)
+def test_a_decoy_equals_its_scenario_but_for_the_response(kind: str) -> None:
+    """It ends at the goal; its free side is the other one, or nothing happens in it."""
+    scenario = drawn(kind)
+    decoy = decoy_of(scenario)
+    (event,), (other,) = scenario.events, decoy.events
+    mirrored = EVENT_KINDS[kind].decoy is None
+    assert (decoy.id, decoy.decoy_of, decoy.ends_at) == (f"{kind}-decoy", kind, "goal")
+    assert other.decoy == (not mirrored)
+    assert other.free_side == (-event.free_side if mirrored else event.free_side)
+    assert differing_fields(scenario, limited(decoy, 9.0, 1.0)) == []
+    assert differing_fields(scenario, replace(decoy, seed=9, obstacles=())) == ["seed", "obstacles"]
+
+
+def test_limits_follow_from_the_experts_time_and_the_robots_speed() -> None:
+    """1.5 times and 3 s for events, 1.3 times for decoys, in whole ticks; a faster robot has
+    less time, and a long route keeps its limit."""
+    scenario, decoy = drawn("lateral"), decoy_of(drawn("lateral"))
+    assert limited(scenario, 10.01, None).time_limit_s == 18.05
+    quick = limited(decoy, 10.0, 1.25)
+    assert (quick.time_limit_s, quick.go_on_mps) == (16.0, 0.75)
+    assert limited(decoy_of(drawn("queueing")), 10.0, 1.25).go_on_mps == 0.0
+    faster = SCOUT.cruise_mps / COURIER.cruise_mps
+    scout = quick.driven_by("scout")
+    assert (scout.time_limit_s, scout.go_on_mps) == (12.0, 0.75 * faster)
+    assert scout.driven_by("scout") == scout and quick.driven_by("courier") == quick
+    long = replace(scenario, ends_on_failure=False)
+    assert limited(long, 10.0, None) == long
+    assert long.driven_by("scout").time_limit_s == long.time_limit_s
+
+
+def test_the_slots_spread_lengths_positions_and_sides_evenly() -> None:
+    """In each split every kind has the same lengths and positions, and each side half of the
+    times; lengths, positions and sides are not correlated."""
+    slots = [slot for slot in RECIPES["reactive"].slots if slot.wanted and not slot.decoy_of]
+    for kind in EVENT_KINDS:
+        for split, count in (("val", 80), ("test", 20)):
+            those = [s.wanted for s in slots if s.structure == kind and s.split == split]
+            wanted = np.array([one for one in those if one is not None])
+            assert len(wanted) == count
+            lengths_m = 12.0 + 18.0 * (np.arange(count) + 0.5) / count
+            assert np.allclose(np.sort(wanted[:, 0]), lengths_m, atol=0.01)
+            assert np.allclose(np.sort(wanted[:, 1]), (np.arange(count) + 0.5) / count)
+            assert abs(wanted[:, 2:].sum(axis=0)).max() <= 1
+            apart = np.corrcoef(wanted.T) - np.eye(4)
+            assert abs(apart).max() < 3.3 / math.sqrt(count)
+
+
+@pytest.mark.engine
+def test_a_pair_is_built_and_proved_together(tmp_path: Path) -> None:
+    """Asked for an event, its decoy is built too; both proofs hold, and their limits follow."""
+    out = tmp_path / "reactive.json"
+    suite, proofs = build_suite("reactive", out, only=["obstructing-001"])
+    assert [one.id for one in suite.scenarios] == ["obstructing-001", "obstructing-001-decoy"]
+    read = Read(suite, proofs, out)
+    for claim in ("decoys", "limits", "proofs", "obstacles"):
+        assert list(CLAIMS[claim](read)) == []
+    assert all(one.time_limit_s < 60.0 for one in suite.scenarios)
+    driven = [suite.scenarios[1].id]
+    assert list(faults_in_places(suite.scenarios, driven, read_proofs(out))) == []
