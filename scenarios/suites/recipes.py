@@ -256,7 +256,7 @@ def _route(slot: Slot, street_map: StreetMap, graph: WalkGraph, seed: int) -> Sc
 RECIPES: Final[Mapping[str, SuiteRecipe]] = MappingProxyType(
     {
         "unit": SuiteRecipe(
-            version="1.0",
+            version="2.0",
             description="10 to 20 m straight on, round a corner or over a crosswalk, past things "
             "that stand there; nobody else. 100 of each in generated cities, 10 of each on real "
             "places. Ends on the first failure.",
@@ -274,7 +274,7 @@ RECIPES: Final[Mapping[str, SuiteRecipe]] = MappingProxyType(
             draw=_reactive,
         ),
         "long-horizon": SuiteRecipe(
-            version="1.0",
+            version="2.0",
             description="105 ways of more than 100 m, 36.5 km in all, 5 of them on real places; "
             "exactly one walkable path; crowd, signals, vehicles, obstacles and events on the "
             "way. Never ends on a failure.",
