@@ -192,11 +192,11 @@ def test_a_car_that_brakes_counts_where_it_comes_to_rest_and_never_more_than_hal
 
 
 def test_it_stands_for_who_comes_straight_at_it_until_they_are_past() -> None:
-    """From 4.5 m, while they go round it, at most seven seconds in one place; not for who comes
-    past it or is far."""
+    """From 3.3 m, while they go round it, at most ten seconds in one place; not for who comes past
+    it or is far, nor for who stands longer than people's patience."""
     at_it, round_it, past_it = (
         people((x_m, y_m, heading, 1.4, "walk"))
-        for x_m, y_m, heading in ((9.0, 0.0, math.pi), (6.5, 0.6, 2.4), (3.5, 1.0, 2.9))
+        for x_m, y_m, heading in ((8.2, 0.0, math.pi), (6.5, 0.6, 2.4), (3.5, 1.0, 2.9))
     )
     yielding = Yielding()
     assert not yielding.waits(known(round_it), 0.0)
@@ -205,8 +205,13 @@ def test_it_stands_for_who_comes_straight_at_it_until_they_are_past() -> None:
         True,
         False,
     ]
-    assert yielding.waits(known(round_it), 6.9) and not yielding.waits(known(at_it), 7.1)
-    for x_m, heading in ((9.0, math.pi - 0.3), (9.0, 0.0), (10.0, math.pi)):
+    assert yielding.waits(known(round_it), 9.9) and not yielding.waits(known(at_it), 10.1)
+    patient = Yielding()
+    stays = known(people((7.0, 0.0, math.pi, 0.0, "stand")))
+    assert patient.waits(known(at_it), 0.0)
+    assert patient.waits(stays, 0.5) and patient.waits(stays, 4.8)
+    assert not patient.waits(stays, 5.2)
+    for x_m, heading in ((8.0, math.pi - 0.3), (8.0, 0.0), (9.0, math.pi)):
         assert not Yielding().waits(known(people((x_m, 0.0, heading, 1.4, "walk"))), 1.0)
 
 
