@@ -14,7 +14,7 @@ import pytest
 from cosim.core.geometry import Pose, box_disk_gap
 from cosim.results.event_monitor import passed_between
 from cosim.spec.events import Event, EventQuery, EventState
-from cosim.spec.scenario import City, CrowdSpec
+from cosim.spec.scenario import City
 from scenarios.events import EVENT_KINDS, react
 from tests.support.blind_motion import Schedule, outcome
 from tests.support.cheats import BLIND_MPS, Crawl, EdgeDriver, Stander
@@ -307,8 +307,8 @@ def test_who_overtakes_is_not_touched_by_a_robot_that_slows_down_and_walks_on(v_
 def test_blind_policies_do_not_solve_events_and_who_stands_has_not_failed(
     kind: str, policy: Crawl
 ) -> None:
-    """A blind policy that drives collides and is at fault or shares it; one that stands waits until
-    its time is up."""
+    """Where nothing but people is in the way, a blind policy that drives collides and is at fault
+    or shares it; one that stands waits until its time is up."""
     from cosim.place.walk_graph import WalkGraph
     from scenarios.episodes.run_episode import run_episode
     from scenarios.places.nets import place
@@ -320,7 +320,8 @@ def test_blind_policies_do_not_solve_events_and_who_stands_has_not_failed(
     stands = isinstance(policy, Stander)
     scenario = msgspec.structs.replace(
         whole,
-        crowd=CrowdSpec(persons=0, vehicles=0),
+        obstacles=(),
+        events=tuple(msgspec.structs.replace(event, free_side=0) for event in whole.events),
         time_limit_s=25.0 if stands else whole.time_limit_s,
     )
     record = run_episode(scenario, policy).record
