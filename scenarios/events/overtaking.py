@@ -42,9 +42,9 @@ from scenarios.events.walking import (
     world_point,
 )
 
-_FASTER_MPS: Final = 0.8
+_FASTER_MPS: Final = 1.4
 """Speed difference to the robot in m/s while overtaking."""
-_FASTEST_MPS: Final = 3.3
+_FASTEST_MPS: Final = 4.0
 """Highest speed in m/s, a jogger's pace."""
 WAITS_ASIDE_M: Final = 1.2
 """Largest distance in metres from the middle of the sidewalk where it waits."""
@@ -180,7 +180,7 @@ def _ends(event: Event, state: EventState, query: EventQuery) -> bool:
 
 OVERTAKING: Final = EventKind(
     name="overtaking",
-    layout=SidewalkLayout((18.0, 20.0), (1.5, 3.0), half_width_m=1.4, after_m=8.0),
+    layout=SidewalkLayout((18.0, 20.0), (1.5, 3.0), half_width_m=1.4, after_m=10.0),
     trigger_m=-1.0,
     begin=_begin,
     step=_step,
