@@ -1,0 +1,102 @@
+"""What an isolated policy may read: Python and its packages, the system's libraries, the policy's
+own folder, and what `--policy-data` names."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+from importlib.machinery import PathFinder
+from pathlib import Path
+from typing import Final
+
+import bridge
+import cosim
+import physics
+import scenarios
+import sumo_nets
+from cosim.core.errors import UsageError
+from cosim.policies.load import FOLLOW, ONNX_SCHEME, shipped_bundles
+from cosim.policies.onnx.weights import weight_folders
+from cosim.spec.options import PolicyHost
+from scenarios.ipc.sandbox import Sandbox
+
+_OF_SYSTEM: Final = (
+    *("/usr", "/lib", "/lib32", "/lib64", "/bin", "/sbin", "/nix/store"),
+    *("/etc/ld.so.cache", "/etc/ld.so.conf", "/etc/ld.so.conf.d", "/etc/alternatives"),
+    *("/etc/localtime", "/etc/fonts"),
+)
+"""Libraries and programs of the system, and what they read."""
+_PACKAGE_FOLDERS: Final = ("site-packages", "dist-packages")
+_OWN: Final = (cosim, bridge, scenarios, physics, sumo_nets)
+"""Packages of this project."""
+_SUITES: Final = str(Path(scenarios.__path__[0], "suites").resolve())
+"""Folder of the suites, which a policy may not read."""
+_GB: Final = 10**9
+
+
+def sandbox_for(name: str, kind: str, host: PolicyHost) -> Sandbox:
+    """Return the sandbox of a policy.
+
+    kind: of `scenarios.ipc.sandbox.KINDS`.
+    Raises UsageError if the policy's own folder is one that an isolated policy may not read.
+    """
+    hidden = (_SUITES, *(os.path.realpath(path) for path in host.hidden))
+    around = tuple(os.path.dirname(path) for path in hidden[1:])
+    reads = [(path, hidden) for path in (*_of_python(), *_OF_SYSTEM, *host.data)]
+    for folder in _own_folders(name):
+        real = os.path.realpath(folder)
+        # Other runs lie beside the run: they are hidden, too, unless the policy itself does.
+        others = [path for path in around if not Path(real).is_relative_to(path)]
+        reads.append((str(folder), (*hidden, *others)))
+    imports = dict.fromkeys(os.path.abspath(entry) for entry in ("", *sys.path))
+    return Sandbox(kind, tuple(reads), tuple(imports), int(_GB * host.memory_gb))
+
+
+def name_inside(name: str) -> str:
+    """Return a policy's name as it loads from any working folder.
+
+    >>> name_inside("onnx:/net")
+    'onnx:/net'
+    """
+    if not name.startswith(ONNX_SCHEME):
+        return name
+    return ONNX_SCHEME + os.path.abspath(Path(name.removeprefix(ONNX_SCHEME)).expanduser())
+
+
+def _of_python() -> list[str]:
+    """Return the folders of Python and of all installed packages, and this project's packages."""
+    found = [sys.prefix, sys.base_prefix, sys.exec_prefix, sys.executable]
+    found += [entry for entry in sys.path if Path(entry).name in _PACKAGE_FOLDERS]
+    return [*found, *(folder for package in _OWN for folder in package.__path__)]
+
+
+def _own_folders(name: str) -> list[Path]:
+    """Return a policy's own folder, or the folders of its package, and those of its weights.
+
+    Raises UsageError.
+    """
+    if name.startswith(ONNX_SCHEME):
+        return [_narrow(name, Path(name_inside(name).removeprefix(ONNX_SCHEME))), *weight_folders()]
+    if ":" not in name:
+        return weight_folders() if name == FOLLOW or name in shipped_bundles() else []
+    top = name.partition(":")[0].partition(".")[0]
+    found = PathFinder.find_spec(top, ["", *sys.path])
+    if found is None:  # loading says so
+        return []
+    if found.submodule_search_locations is not None:
+        return [_narrow(name, Path(folder)) for folder in found.submodule_search_locations]
+    return [] if found.origin is None else [_narrow(name, Path(found.origin).parent)]
+
+
+def _narrow(name: str, folder: Path) -> Path:
+    """Return a policy's folder. Raises UsageError if it holds what is none of a policy's."""
+    real = folder.resolve()
+    shared = [Path(tempfile.gettempdir()), Path("/tmp"), Path("/var/tmp"), Path("/dev/shm")]
+    for one in (Path.home(), *shared):
+        if one.resolve().is_relative_to(real):
+            raise UsageError(
+                f"policy '{name}' is in {folder}, which --isolated does not show to a policy: put "
+                "it in a folder of its own, with the files that it reads"
+            )
+    return folder
