@@ -42,7 +42,9 @@ class ConfiguredCommand(TyperCommand):
     """Command of a `RunConfig` whose options with a bare value may be named without one."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        options = {one.name: option_of(RunConfig, one.name) for one in dataclasses.fields(RunConfig)}
+        options = {
+            one.name: option_of(RunConfig, one.name) for one in dataclasses.fields(RunConfig)
+        }
         bare = {_flag(name, one): one.bare for name, one in options.items() if one.bare}
         return super().parse_args(ctx, [f"{a}={bare[a]}" if a in bare else a for a in args])
 

@@ -22,12 +22,22 @@ import stat
 import struct
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final, NamedTuple, NoReturn
+from typing import Final, NamedTuple, NoReturn
 
 from scenarios.ipc import seccomp
+from scenarios.ipc.kernel_calls import (
+    DEATH_SIGNAL,
+    DUMPABLE,
+    SandboxError,
+    call,
+    drop_privileges,
+    filter_calls,
+    prctl,
+)
+from scenarios.ipc.sandbox_files import devices, has_gpu, linked_imports, visible
 
 KINDS: Final = ("namespaces", "landlock")
 """Kinds of sandboxes, the stronger first."""
@@ -46,6 +56,8 @@ _MOST_FILES: Final = 1 << 20
 """Number above all descriptors."""
 _SCRATCH: Final = "size=1g"
 """Size of each of the folders in memory that may be written."""
+_WORK: Final = Path("/tmp/policy")
+"""Working folder in namespaces."""
 _USERS: Final = range(61184, 65520)
 """User ids for sandboxes that root starts, which no account has (systemd's dynamic users)."""
 _PASSED: Final = ("LANG", "LANGUAGE", "TZ", "PATH", "LD_LIBRARY_PATH", "PYTHONHASHSEED")
@@ -54,12 +66,7 @@ _PASSED_BEGINNINGS: Final = (
     *("CUDA_", "CUBLAS_", "CUDNN_", "NVIDIA_"),
 )
 """Environment variables that a policy gets, by name and by the beginning of the name."""
-_DEVICES: Final = ("null", "zero", "full", "random", "urandom")
-_OF_GPU: Final = ("nvidia", "dri")
-"""Beginnings of the names of a GPU's devices."""
-_BELOW_GPU: Final = ("/sys/bus/pci", "/sys/devices/pci*", "/sys/module/nvidia*")
-_OF_SYSTEM: Final = ("/sys/devices/system/cpu", "/sys/devices/system/node")
-_PROC: Final = ("/proc/cpuinfo", "/proc/meminfo", "/proc/devices", "/proc/driver/nvidia")
+_PROC: Final = [Path("/proc", one) for one in ("cpuinfo", "meminfo", "devices", "driver/nvidia")]
 """What may be read of /proc under Landlock, where no process may have a private one."""
 
 
@@ -78,18 +85,6 @@ class Sandbox(NamedTuple):
     memory_bytes: int
 
 
-class SandboxError(Exception):
-    """A step of the set-up that failed, with its reason."""
-
-
-def has_gpu() -> bool:
-    """Return whether this machine has an NVIDIA GPU's device."""
-    return Path("/dev/nvidiactl").exists()
-
-
-# --- system calls
-
-_LIBC: Final = ctypes.CDLL(None, use_errno=True)
 _NEW_USER, _NEW_MOUNTS, _NEW_IPC, _NEW_PIDS, _NEW_NET = (
     *(0x10000000, 0x00020000, 0x08000000),
     *(0x20000000, 0x40000000),
@@ -99,34 +94,14 @@ _NO_SETUID, _NO_DEVICES, _NO_EXEC = 2, 4, 8
 """Flags of `mount`, and of `mount_setattr`."""
 _READ_ONLY: Final = 1
 _HERE, _EMPTY_PATH, _ALL_BELOW, _CLONE, _CLOSE_ON_EXEC = -100, 0x1000, 0x8000, 1, 0o2000000
-_DEATH_SIGNAL, _DUMPABLE, _KEEP_CAPABILITIES, _DROP_BOUND, _NO_PRIVILEGES, _AMBIENT = (
-    *(1, 4, 8),
-    *(24, 38, 47),
-)
-"""Operations of `prctl`."""
-_READ_ANY: Final = 2
-"""The capability to read files of any user."""
+_FROM_DESCRIPTOR: Final = 4
+"""Flags of calls about copied mounts."""
 
 
-def _call(step: str, name: str, *given: Any) -> int:
-    """Make a system call. Raises SandboxError that names the step."""
-    numbers = seccomp.NUMBERS[name]
-    number = numbers[seccomp.MACHINES[platform.machine()][0]]
-    sent = [ctypes.c_long(one) if isinstance(one, int) else one for one in given]
-    made: int = _LIBC.syscall(ctypes.c_long(number or -1), *sent)
-    if made < 0:
-        raise SandboxError(f"{step}: {os.strerror(ctypes.get_errno())}")
-    return made
-
-
-def _prctl(step: str, *given: int) -> None:
-    if _LIBC.prctl(*map(ctypes.c_ulong, (*given, *[0] * (5 - len(given))))) != 0:
-        raise SandboxError(f"{step}: {os.strerror(ctypes.get_errno())}")
-
-
-def _mount(kind: str, at: str, flags: int, options: str = "") -> None:
+def _mount(kind: str, at: Path, flags: int, options: str = "") -> None:
     step = f"mount {kind} at {at}"
-    _call(step, "mount", kind.encode(), at.encode(), kind.encode(), flags, options.encode())
+    given = kind.encode(), os.fsencode(at), kind.encode(), flags, options.encode()
+    call(step, "mount", *given)
 
 
 # --- outside
@@ -248,7 +223,7 @@ def _set_up(sandbox: Sandbox, inside: _Inside, waits: int) -> NoReturn:
 
 def _end_with_parent(inside: _Inside) -> None:
     """Let this process be killed when its parent dies. The parent's end of the pipe is checked."""
-    _prctl("set the signal of the parent's death", _DEATH_SIGNAL, 9)
+    prctl("set the signal of the parent's death", DEATH_SIGNAL, 9)
     poll = select.poll()
     poll.register(inside.status, 0)
     if poll.poll(0):
@@ -259,7 +234,7 @@ def _enter_namespaces(sandbox: Sandbox, inside: _Inside, waits: int) -> None:
     """Create the namespaces, and fork their first process."""
     user = _user()
     flags = _NEW_USER | _NEW_MOUNTS | _NEW_IPC | _NEW_PIDS | _NEW_NET
-    _call("create user, mount, PID, IPC and network namespaces", "unshare", flags)
+    call("create user, mount, PID, IPC and network namespaces", "unshare", flags)
     _end_with_parent(inside)
     inside.say("maps")
     if not os.read(waits, 1):
@@ -271,18 +246,18 @@ def _enter_namespaces(sandbox: Sandbox, inside: _Inside, waits: int) -> None:
         return
     _end_with_parent(inside)
     _build_root(sandbox, user)
-    _drop_privileges(user, reads_any=user is not None)
+    drop_privileges(user)
     _end_with_parent(inside)
     rules = [*seccomp.EVERYWHERE, *seccomp.IN_NAMESPACES]
-    _filter_calls(rules)
+    filter_calls(rules)
     # The policy may not see or trace the first process, which has this program's memory.
-    _prctl("forbid to be traced", _DUMPABLE, 0)
+    prctl("forbid to be traced", DUMPABLE, 0)
     waits, begun = os.pipe()
     policy = os.fork()
     if policy == 0:
         os.setsid()
         _limit(sandbox, PROCESSES)
-        _exec(sandbox, sandbox.imports, inside._replace(begun=begun), "/tmp/policy")
+        _exec(sandbox, sandbox.imports, inside._replace(begun=begun), _WORK)
     os.close(begun)
     os.read(waits, 1)
     inside.say("started")
@@ -296,85 +271,90 @@ def _enter_namespaces(sandbox: Sandbox, inside: _Inside, waits: int) -> None:
 
 def _build_root(sandbox: Sandbox, user: int | None) -> None:
     """Replace the root folder by one in memory that has only what may be read."""
-    _call("make mounts private", "mount", b"none", b"/", None, _RECURSIVE | _PRIVATE, None)
-    held = [(path, _opened_tree(path)) for path in _devices()]
-    root = "/dev"  # where all sources but the devices can be reached while the root is built
+    call("make mounts private", "mount", b"none", b"/", None, _RECURSIVE | _PRIVATE, None)
+    held = [(path, _opened_tree(path)) for path in devices()]
+    root = Path("/dev")  # where all sources but the devices can be reached meanwhile
     _mount("tmpfs", root, _NO_SETUID | _NO_DEVICES, "mode=755,size=16m")
-    for folder, options in (("/tmp", "mode=1777"), ("/dev/shm", "mode=1777"), ("/proc", "")):
-        os.makedirs(root + folder)
-        if options:
-            _mount("tmpfs", root + folder, _NO_SETUID | _NO_DEVICES, f"{options},{_SCRATCH}")
+    for folder in ("tmp", "dev/shm", "proc"):
+        (root / folder).mkdir(parents=True)
+    for folder in ("tmp", "dev/shm"):
+        _mount("tmpfs", root / folder, _NO_SETUID | _NO_DEVICES, f"mode=1777,{_SCRATCH}")
     # Without a private /proc, which container runtimes may forbid, there is none.
     with suppress(SandboxError):
         flags = _READ_ONLY | _NO_SETUID | _NO_DEVICES | _NO_EXEC
-        _mount("proc", f"{root}/proc", flags, "hidepid=2")
-    leaves, links = _visible(sandbox)
+        _mount("proc", root / "proc", flags, "hidepid=2")
+    leaves, links = visible(sandbox.reads)
     for path in leaves:
         _attach(_opened_tree(path), path, root)
     for path, tree in held:
         _attach(tree, path, root, device=True)
     for path, target in links.items():
-        os.makedirs(os.path.dirname(root + path), exist_ok=True)
-        os.symlink(target, root + path)
-    os.mkdir(f"{root}/tmp/policy", 0o700)
+        _there(path, root).parent.mkdir(parents=True, exist_ok=True)
+        _there(path, root).symlink_to(target)
+    work = _there(_WORK, root)
+    work.mkdir(0o700)
     if user is not None:
-        os.chown(f"{root}/tmp/policy", user, user)
+        os.chown(work, user, user)
     os.chdir(root)
-    _call("change the root folder", "pivot_root", b".", b".")
-    _call("unmount the former root folder", "umount2", b".", _DETACH)
+    call("change the root folder", "pivot_root", b".", b".")
+    call("unmount the former root folder", "umount2", b".", _DETACH)
     os.chdir("/")
     _restrict_mount(_HERE, "/", _READ_ONLY, 0)
 
 
-def _opened_tree(path: str) -> int:
+def _there(path: Path, root: Path) -> Path:
+    """Return a path below another root."""
+    return root / path.relative_to("/")
+
+
+def _opened_tree(path: Path) -> int:
     """Return a copy of the mounts at a path, which are attached elsewhere."""
     flags = _CLONE | _CLOSE_ON_EXEC | _ALL_BELOW
-    return _call(f"copy the mount of {path}", "open_tree", _HERE, path.encode(), flags)
+    return call(f"copy the mount of {path}", "open_tree", _HERE, os.fsencode(path), flags)
 
 
-def _attach(tree: int, path: str, root: str, *, device: bool = False) -> None:
+def _attach(tree: int, path: Path, root: Path, *, device: bool = False) -> None:
     """Show what is at a path at the same path below another root, read-only."""
-    at = root + path
-    os.makedirs(os.path.dirname(at), exist_ok=True)
+    at = _there(path, root)
+    at.parent.mkdir(parents=True, exist_ok=True)
     if stat.S_ISDIR(os.fstat(tree).st_mode):
-        os.makedirs(at, exist_ok=True)
+        at.mkdir(exist_ok=True)
     else:
-        os.close(os.open(at, os.O_CREAT | os.O_WRONLY, 0o600))
+        at.touch()
     flags = _NO_SETUID | (0 if device else _READ_ONLY | _NO_DEVICES)
     _restrict_mount(tree, "", flags, _EMPTY_PATH | _ALL_BELOW)
-    moved = (tree, b"", _HERE, at.encode(), 4)
-    _call(f"show {path}", "move_mount", *moved)
+    call(f"show {path}", "move_mount", tree, b"", _HERE, os.fsencode(at), _FROM_DESCRIPTOR)
     os.close(tree)
 
 
 def _restrict_mount(folder: int, path: str, attributes: int, flags: int) -> None:
     given = ctypes.create_string_buffer(struct.pack("QQQQ", attributes, 0, 0, 0))
     step = f"restrict the mount {path}"
-    _call(step, "mount_setattr", folder, path.encode(), flags, given, 32)
+    call(step, "mount_setattr", folder, path.encode(), flags, given, 32)
 
 
 def _enter_landlock(sandbox: Sandbox, inside: _Inside) -> None:
     """Restrict this process, and become the policy."""
     user = _user()
     version = _landlock_version()
-    work = f"{inside.folder}/work"
-    os.mkdir(work, 0o700)
-    leaves, _ = _visible(sandbox)
-    imports = _linked_imports(sandbox, leaves, f"{inside.folder}/imports")
-    os.chmod(inside.folder, 0o755)
+    folder = Path(inside.folder)
+    work, links = folder / "work", folder / "imports"
+    work.mkdir(0o700)
+    links.mkdir()
+    leaves, _ = visible(sandbox.reads)
+    imports = linked_imports(sandbox.imports, leaves, links)
+    folder.chmod(0o755)
     if user is not None:
         os.chown(work, user, user)
-    rules = _landlock_rules(
-        [*leaves, *_PROC, f"{inside.folder}/imports"], [*_devices(), work], version
-    )
+    rules = _landlock_rules([*leaves, *_PROC, links], [*devices(), work], version)
     threads = 0 if user is not None else _threads_of_user()
-    _drop_privileges(user, reads_any=user is not None)
+    drop_privileges(user)
     _end_with_parent(inside)
     _limit(sandbox, PROCESSES + threads)
-    _call("restrict files (Landlock)", "landlock_restrict_self", rules, 0)
+    call("restrict files (Landlock)", "landlock_restrict_self", rules, 0)
     os.close(rules)
     calls = [*seccomp.EVERYWHERE, *seccomp.UNDER_LANDLOCK]
-    _filter_calls(calls + (seccomp.without_signals(os.getpid()) if version < 6 else []))
+    filter_calls(calls + (seccomp.without_signals(os.getpid()) if version < 6 else []))
     _exec(sandbox, imports, inside, work)
 
 
@@ -385,19 +365,19 @@ _LEAST_LANDLOCK: Final = 3
 
 
 def _landlock_version() -> int:
-    version = _call("find Landlock", "landlock_create_ruleset", None, 0, 1)
+    version = call("find Landlock", "landlock_create_ruleset", None, 0, 1)
     if version < _LEAST_LANDLOCK:
         raise SandboxError(f"Landlock has version {version} here, and {_LEAST_LANDLOCK} is needed")
     return version
 
 
-def _landlock_rules(reads: list[str], writes: list[str], version: int) -> int:
+def _landlock_rules(reads: list[Path], writes: list[Path], version: int) -> int:
     """Return a set of rules that denies all else: files, TCP, and from version 6 on signals and
     abstract sockets."""
     every = (1 << (16 if version >= 5 else 15)) - 1
     handled = [every, 3 if version >= 4 else 0, 3 if version >= 6 else 0]
     given = struct.pack("QQQ", *handled)[: 24 if version >= 6 else 16 if version >= 4 else 8]
-    rules = _call("make Landlock's rules", "landlock_create_ruleset", given, len(given), 0)
+    rules = call("make Landlock's rules", "landlock_create_ruleset", given, len(given), 0)
     of_file = (_EXECUTE | _WRITE | _READ | _TRUNCATE | _DEVICE_CALLS) & every
     for path, rights in (
         *((path, _EXECUTE | _READ | _LIST) for path in reads),
@@ -410,28 +390,9 @@ def _landlock_rules(reads: list[str], writes: list[str], version: int) -> int:
         if not stat.S_ISDIR(os.fstat(opened).st_mode):
             rights &= of_file
         rule = struct.pack("=Qi", rights, opened)
-        _call(f"allow {path} (Landlock)", "landlock_add_rule", rules, 1, rule, 0)
+        call(f"allow {path} (Landlock)", "landlock_add_rule", rules, 1, rule, 0)
         os.close(opened)
     return rules
-
-
-def _linked_imports(sandbox: Sandbox, leaves: list[str], folder: str) -> tuple[str, ...]:
-    """Replace import folders that may not be read as a whole by folders of links."""
-    found = []
-    os.mkdir(folder)
-    shown = set(leaves)
-    for number, entry in enumerate(sandbox.imports):
-        real = os.path.realpath(entry)
-        if not _below(real, shown):
-            farm = os.path.join(folder, str(number))
-            for leaf in leaves:
-                if leaf.startswith(f"{real.rstrip('/')}/"):
-                    link = os.path.join(farm, os.path.relpath(leaf, real))
-                    os.makedirs(os.path.dirname(link), exist_ok=True)
-                    os.symlink(leaf, link)
-            entry = farm
-        found.append(entry)
-    return tuple(found)
 
 
 def _threads_of_user() -> int:
@@ -447,115 +408,9 @@ def _threads_of_user() -> int:
 # --- both kinds
 
 
-def _visible(sandbox: Sandbox) -> tuple[list[str], dict[str, str]]:
-    """Return the paths that may be read with all below them, and the links on the way to them."""
-    leaves: set[str] = set()
-    links: dict[str, str] = {}
-    gpu = _globbed(_BELOW_GPU) if has_gpu() else []
-    for path, without in (*sandbox.reads, *((one, ()) for one in (*_OF_SYSTEM, *gpu))):
-        if not os.path.exists(path):
-            continue
-        links |= _links_to(path)
-        for leaf in _leaves(os.path.realpath(path), without):
-            if os.path.islink(leaf):
-                links[leaf] = os.readlink(leaf)
-            leaves.add(leaf)
-    leaves -= links.keys()
-    outer = sorted(one for one in leaves if not _below(os.path.dirname(one), leaves))
-    shown = set(outer)
-    return outer, {at: to for at, to in links.items() if not _below(at, shown)}
-
-
-def _below(path: str, among: set[str]) -> bool:
-    """Return whether a path or a folder above it is among some."""
-    while path not in among:
-        path, above = os.path.dirname(path), path
-        if path == above:
-            return False
-    return True
-
-
-def _leaves(path: str, without: tuple[str, ...]) -> Iterator[str]:
-    """Yield a path, or where something below it may not be read, what is left of it."""
-    if _below(path, set(without)):
-        return
-    if not any(one.startswith(f"{path.rstrip('/')}/") for one in without):
-        yield path
-        return
-    for child in sorted(entry.path for entry in os.scandir(path)):
-        if os.path.islink(child):
-            yield child
-        else:
-            yield from _leaves(child, without)
-
-
-def _links_to(path: str) -> dict[str, str]:
-    """Return the symbolic links on the way to a path, with their targets."""
-    found: dict[str, str] = {}
-    at = "/"
-    for part in Path(path).parts[1:]:
-        step = os.path.join(at, part)
-        if os.path.islink(step):
-            found[step] = os.readlink(step)
-            found |= _links_to(os.path.normpath(os.path.join(at, found[step])))
-            step = os.path.realpath(step)
-        at = step
-    return found
-
-
-def _devices() -> list[str]:
-    """Return the devices that a policy may use."""
-    names = [*_DEVICES]
-    if has_gpu():
-        names += [name for name in os.listdir("/dev") if name.startswith(_OF_GPU)]
-    return [f"/dev/{name}" for name in names if os.path.exists(f"/dev/{name}")]
-
-
-def _globbed(patterns: tuple[str, ...]) -> list[str]:
-    return [str(path) for one in patterns for path in Path("/").glob(one.removeprefix("/"))]
-
-
 def _user() -> int | None:
     """Return the user id of a sandbox that root starts; None for other users, who keep theirs."""
     return _USERS[os.getpid() % len(_USERS)] if os.geteuid() == 0 else None
-
-
-def _drop_privileges(user: int | None, *, reads_any: bool) -> None:
-    """Give up all rights of this process, for good. Root becomes a user without an account, who may
-    read files of any user where the sandbox shows them, if root may."""
-    kept = 0
-    if user is not None:
-        kept = (1 << _READ_ANY) & _permitted() if reads_any else 0
-    for capability in range(64):
-        if not kept >> capability & 1:
-            with suppress(SandboxError):  # of an older kernel, or not root's
-                _prctl("drop capabilities", _DROP_BOUND, capability)
-    if user is not None:
-        _prctl("keep a capability", _KEEP_CAPABILITIES, 1)
-        os.setgroups([])
-        os.setresgid(user, user, user)
-        os.setresuid(user, user, user)
-    head = ctypes.create_string_buffer(struct.pack("Ii", 0x20080522, 0))
-    sets = ctypes.create_string_buffer(struct.pack("6I", kept, kept, kept, 0, 0, 0))
-    if _LIBC.capset(head, sets) != 0:
-        raise SandboxError(f"drop capabilities: {os.strerror(ctypes.get_errno())}")
-    if kept:
-        _prctl("keep a capability", _AMBIENT, 2, _READ_ANY)
-    _prctl("forbid new privileges", _NO_PRIVILEGES, 1)
-
-
-def _permitted() -> int:
-    """Return the lower 32 permitted capabilities of this process, as bits."""
-    head = ctypes.create_string_buffer(struct.pack("Ii", 0x20080522, 0))
-    sets = ctypes.create_string_buffer(24)
-    return int(struct.unpack("6I", sets.raw)[1]) if _LIBC.capget(head, sets) == 0 else 0
-
-
-def _filter_calls(rules: list[seccomp.Rule]) -> None:
-    try:
-        seccomp.installed(rules, platform.machine())
-    except OSError as error:
-        raise SandboxError(f"filter system calls (seccomp): {error.strerror}") from None
 
 
 def _limit(sandbox: Sandbox, processes: int) -> None:
@@ -581,24 +436,24 @@ def _close_all_but(kept: set[int]) -> None:
     os.closerange(last + 1, _MOST_FILES)
 
 
-def _environment(work: str) -> dict[str, str]:
+def _environment(work: Path) -> dict[str, str]:
     passed = {
         name: value
         for name, value in os.environ.items()
         if name in _PASSED or name.startswith(_PASSED_BEGINNINGS)
     }
-    own = dict.fromkeys(("HOME", "TMPDIR", "PWD"), work) | dict.fromkeys(
+    own = dict.fromkeys(("HOME", "TMPDIR", "PWD"), str(work)) | dict.fromkeys(
         ("USER", "LOGNAME"), "policy"
     )
     return passed | own | {"PYTHONDONTWRITEBYTECODE": "1"}
 
 
-def _exec(sandbox: Sandbox, imports: tuple[str, ...], inside: _Inside, work: str) -> NoReturn:
+def _exec(sandbox: Sandbox, imports: tuple[str, ...], inside: _Inside, work: Path) -> NoReturn:
     """Become Python with the policy, with no descriptors but its output and its connection."""
     module, _, function = inside.serves.partition(":")
     given = inside.descriptors
     code = (
-        f"import sys; sys.path[:] = {[work, *imports]!r}; from {module} import {function}; "
+        f"import sys; sys.path[:] = {[str(work), *imports]!r}; from {module} import {function}; "
         f"{function}{given!r}"
     )
     kept = {0, 1, 2, *given}

@@ -42,14 +42,14 @@ def sandbox_for(name: str, kind: str, host: PolicyHost) -> Sandbox:
     Raises UsageError if the policy's own folder is one that an isolated policy may not read.
     """
     hidden = (_SUITES, *(os.path.realpath(path) for path in host.hidden))
-    around = tuple(os.path.dirname(path) for path in hidden[1:])
+    around = tuple(str(Path(path).parent) for path in hidden[1:])
     reads = [(path, hidden) for path in (*_of_python(), *_OF_SYSTEM, *host.data)]
     for folder in _own_folders(name):
         real = os.path.realpath(folder)
         # Other runs lie beside the run: they are hidden, too, unless the policy itself does.
         others = [path for path in around if not Path(real).is_relative_to(path)]
         reads.append((str(folder), (*hidden, *others)))
-    imports = dict.fromkeys(os.path.abspath(entry) for entry in ("", *sys.path))
+    imports = dict.fromkeys(str(Path(entry).absolute()) for entry in ("", *sys.path))
     return Sandbox(kind, tuple(reads), tuple(imports), int(_GB * host.memory_gb))
 
 
@@ -61,7 +61,7 @@ def name_inside(name: str) -> str:
     """
     if not name.startswith(ONNX_SCHEME):
         return name
-    return ONNX_SCHEME + os.path.abspath(Path(name.removeprefix(ONNX_SCHEME)).expanduser())
+    return f"{ONNX_SCHEME}{Path(name.removeprefix(ONNX_SCHEME)).expanduser().absolute()}"
 
 
 def _of_python() -> list[str]:

@@ -166,7 +166,11 @@ def _refuse_for_object(
     policy: Policy | str, jobs: int | None, on: str, host: PolicyHost, shared: bool
 ) -> None:
     """Check that a policy object is not used with other processes. Raises UsageError."""
-    needs = {f"jobs={jobs}": jobs not in (None, 1), f"on='{on}'": on != "", "host": host.isolated != "no"}
+    needs = {
+        f"jobs={jobs}": jobs not in (None, 1),
+        f"on='{on}'": on != "",
+        "host": host.isolated != "no",
+    }
     asked = next(
         (words for words, is_asked in needs.items() if is_asked), "shared_renderer=True" * shared
     )
