@@ -60,13 +60,7 @@ _WORK: Final = Path("/tmp/policy")
 """Working folder in namespaces."""
 _USERS: Final = range(61184, 65520)
 """User ids for sandboxes that root starts, which no account has (systemd's dynamic users)."""
-_PASSED: Final = ("LANG", "LANGUAGE", "TZ", "PATH", "LD_LIBRARY_PATH", "PYTHONHASHSEED")
-_PASSED_BEGINNINGS: Final = (
-    *("LC_", "OMP_", "MKL_", "OPENBLAS_", "NPY_", "GOTO_", "BLIS_", "KMP_", "GLIBC_TUNABLES"),
-    *("CUDA_", "CUBLAS_", "CUDNN_", "NVIDIA_"),
-)
-"""Environment variables that a policy gets, by name and by the beginning of the name."""
-_PROC: Final = [Path("/proc", one) for one in ("cpuinfo", "meminfo", "devices", "driver/nvidia")]
+_PROC: Final = [Path("/proc", one) for one in ("cpuinfo", "meminfo")]
 """What may be read of /proc under Landlock, where no process may have a private one."""
 
 
@@ -76,12 +70,14 @@ class Sandbox(NamedTuple):
     kind: of `KINDS`.
     reads: paths that may be read, each with paths below it that may not.
     imports: folders from which Python imports.
+    environment: names and values of environment variables.
     memory_bytes: limit of each process's memory.
     """
 
     kind: str
     reads: tuple[tuple[str, tuple[str, ...]], ...]
     imports: tuple[str, ...]
+    environment: tuple[tuple[str, str], ...]
     memory_bytes: int
 
 
@@ -272,7 +268,7 @@ def _enter_namespaces(sandbox: Sandbox, inside: _Inside, waits: int) -> None:
 def _build_root(sandbox: Sandbox, user: int | None) -> None:
     """Replace the root folder by one in memory that has only what may be read."""
     call("make mounts private", "mount", b"none", b"/", None, _RECURSIVE | _PRIVATE, None)
-    held = [(path, _opened_tree(path)) for path in devices()]
+    held = [(path, _opened_tree(path)) for path in devices(gpu=True)]
     root = Path("/dev")  # where all sources but the devices can be reached meanwhile
     _mount("tmpfs", root, _NO_SETUID | _NO_DEVICES, "mode=755,size=16m")
     for folder in ("tmp", "dev/shm", "proc"):
@@ -346,7 +342,8 @@ def _enter_landlock(sandbox: Sandbox, inside: _Inside) -> None:
     folder.chmod(0o755)
     if user is not None:
         os.chown(work, user, user)
-    rules = _landlock_rules([*leaves, *_PROC, links], [*devices(), work], version)
+    # CUDA does not start under Landlock.
+    rules = _landlock_rules([*leaves, *_PROC, links], [*devices(gpu=False), work], version)
     threads = 0 if user is not None else _threads_of_user()
     drop_privileges(user)
     _end_with_parent(inside)
@@ -436,16 +433,11 @@ def _close_all_but(kept: set[int]) -> None:
     os.closerange(last + 1, _MOST_FILES)
 
 
-def _environment(work: Path) -> dict[str, str]:
-    passed = {
-        name: value
-        for name, value in os.environ.items()
-        if name in _PASSED or name.startswith(_PASSED_BEGINNINGS)
-    }
+def _environment(sandbox: Sandbox, work: Path) -> dict[str, str]:
     own = dict.fromkeys(("HOME", "TMPDIR", "PWD"), str(work)) | dict.fromkeys(
         ("USER", "LOGNAME"), "policy"
     )
-    return passed | own | {"PYTHONDONTWRITEBYTECODE": "1"}
+    return dict(sandbox.environment) | own | {"PYTHONDONTWRITEBYTECODE": "1"}
 
 
 def _exec(sandbox: Sandbox, imports: tuple[str, ...], inside: _Inside, work: Path) -> NoReturn:
@@ -463,6 +455,6 @@ def _exec(sandbox: Sandbox, imports: tuple[str, ...], inside: _Inside, work: Pat
     os.chdir(work)
     python = sys.executable
     try:
-        os.execve(python, [python, "-P", "-c", code], _environment(work))
+        os.execve(python, [python, "-P", "-c", code], _environment(sandbox, work))
     except OSError as error:
         raise SandboxError(f"start {python}: {error.strerror}") from None

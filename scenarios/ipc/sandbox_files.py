@@ -10,11 +10,8 @@ from typing import Final
 Reads = Iterable[tuple[str, tuple[str, ...]]]
 """Paths that may be read, each with paths below it that may not."""
 _DEVICES: Final = ("null", "zero", "full", "random", "urandom")
-_OF_GPU: Final = ("nvidia", "dri")
-"""Beginnings of the names of a GPU's devices."""
 _OF_SYSTEM: Final = ("/sys/devices/system/cpu", "/sys/devices/system/node")
-_OF_SYSTEM_WITH_GPU: Final = ("sys/bus/pci", "sys/devices/pci*", "sys/module/nvidia*")
-"""What libraries read of the hardware: patterns below the root folder."""
+"""What libraries read of the hardware."""
 
 
 def has_gpu() -> bool:
@@ -22,11 +19,9 @@ def has_gpu() -> bool:
     return Path("/dev/nvidiactl").exists()
 
 
-def devices() -> list[Path]:
-    """Return the devices that a policy may use."""
-    found = [Path("/dev", name) for name in _DEVICES]
-    if has_gpu():
-        found += [path for path in Path("/dev").iterdir() if path.name.startswith(_OF_GPU)]
+def devices(*, gpu: bool) -> list[Path]:
+    """Return the devices that a policy may use. gpu: those of NVIDIA included."""
+    found = [*map(Path("/dev").joinpath, _DEVICES), *(Path("/dev").glob("nvidia*") if gpu else ())]
     return [path for path in found if path.exists()]
 
 
@@ -35,9 +30,7 @@ def visible(reads: Reads) -> tuple[list[Path], dict[Path, Path]]:
     their targets."""
     leaves: set[Path] = set()
     links: dict[Path, Path] = {}
-    gpu = _OF_SYSTEM_WITH_GPU if has_gpu() else ()
-    hardware = [*_OF_SYSTEM, *(str(path) for one in gpu for path in Path("/").glob(one))]
-    for path, without in (*reads, *((one, ()) for one in hardware)):
+    for path, without in (*reads, *((one, ()) for one in _OF_SYSTEM)):
         if not Path(path).exists():
             continue
         links |= _links_to(Path(path))

@@ -149,6 +149,15 @@ def isolated_driver(
     )
 
 
+def sandbox_lacks(kind: Isolation) -> str:
+    """Return the step of a sandbox's set-up that fails on this machine, and why; "" if none."""
+    try:
+        _driver("straight", None, None, PolicyHost(), kind, LOAD_TIMEOUT_S).close()
+    except _NoSandbox as lacking:
+        return str(lacking)
+    return ""
+
+
 def kind_of(runs: PolicyProcess) -> Isolation | None:
     """Return the kind of sandbox of a recorded place; None for other places.
 

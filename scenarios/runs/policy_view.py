@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
+from collections.abc import Iterator
 from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Final
@@ -17,7 +18,8 @@ import scenarios
 import sumo_nets
 from cosim.core.errors import UsageError
 from cosim.policies.load import FOLLOW, ONNX_SCHEME, shipped_bundles
-from cosim.policies.onnx.weights import weight_folders
+from cosim.policies.onnx.graph import PROVIDERS_VARIABLE
+from cosim.policies.onnx.weights import WEIGHTS_VARIABLE, weight_folders
 from cosim.spec.options import PolicyHost
 from scenarios.ipc.sandbox import Sandbox
 
@@ -32,6 +34,16 @@ _OWN: Final = (cosim, bridge, scenarios, physics, sumo_nets)
 """Packages of this project."""
 _SUITES: Final = str(Path(scenarios.__path__[0], "suites").resolve())
 """Folder of the suites, which a policy may not read."""
+_PASSED: Final = (
+    *("LANG", "LANGUAGE", "TZ", "PATH", "LD_LIBRARY_PATH", "PYTHONHASHSEED", "GLIBC_TUNABLES"),
+    PROVIDERS_VARIABLE,
+)
+_PASSED_BEGINNINGS: Final = (
+    *("LC_", "OMP_", "MKL_", "OPENBLAS_", "NPY_", "GOTO_", "BLIS_", "KMP_"),
+    *("CUDA_", "CUBLAS_", "CUDNN_", "NVIDIA_"),
+)
+"""Environment variables that a policy gets, by name and by the beginning of the name: language,
+paths of libraries, and what determines arithmetic."""
 _GB: Final = 10**9
 
 
@@ -50,7 +62,8 @@ def sandbox_for(name: str, kind: str, host: PolicyHost) -> Sandbox:
         others = [path for path in around if not Path(real).is_relative_to(path)]
         reads.append((str(folder), (*hidden, *others)))
     imports = dict.fromkeys(str(Path(entry).absolute()) for entry in ("", *sys.path))
-    return Sandbox(kind, tuple(reads), tuple(imports), int(_GB * host.memory_gb))
+    memory_bytes = int(_GB * host.memory_gb)
+    return Sandbox(kind, tuple(reads), tuple(imports), tuple(_environment()), memory_bytes)
 
 
 def name_inside(name: str) -> str:
@@ -62,6 +75,16 @@ def name_inside(name: str) -> str:
     if not name.startswith(ONNX_SCHEME):
         return name
     return f"{ONNX_SCHEME}{Path(name.removeprefix(ONNX_SCHEME)).expanduser().absolute()}"
+
+
+def _environment() -> Iterator[tuple[str, str]]:
+    """Yield the environment variables that a policy gets."""
+    for name, value in os.environ.items():
+        if name in _PASSED or name.startswith(_PASSED_BEGINNINGS):
+            yield name, value
+    *named, users = weight_folders()
+    yield "XDG_DATA_HOME", str(users.parents[1].absolute())
+    yield from ((WEIGHTS_VARIABLE, str(folder.absolute())) for folder in named)
 
 
 def _of_python() -> list[str]:

@@ -16,12 +16,12 @@ import msgspec
 import psutil
 import pytest
 
-from cosim.core.errors import MachineError, UsageError
+from cosim.core.errors import UsageError
 from cosim.policies.load import load_policy
 from cosim.spec.options import PolicyHost
 from cosim.spec.run_config import Isolation
 from scenarios.ipc.sandbox import KINDS
-from scenarios.runs.isolated_policy import isolated_driver
+from scenarios.runs.isolated_policy import isolated_driver, sandbox_lacks
 from tests.conftest import ROOT
 from tests.support.graphs import bundle, tiny_graph
 
@@ -100,10 +100,8 @@ those that either kind may give."""
 def kind(request: pytest.FixtureRequest) -> Isolation:
     """A kind of sandbox that the kernel offers."""
     one: Isolation = request.param
-    try:
-        isolated_driver("straight", host=PolicyHost(isolated=one)).close()
-    except MachineError as error:
-        pytest.skip(str(error))
+    if why := sandbox_lacks(one):
+        pytest.skip(f"this kernel offers no {one}: {why}")
     return one
 
 
