@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -22,7 +23,7 @@ from cosim.spec.options import PolicyHost
 from cosim.spec.run_config import Isolation
 from scenarios.ipc.sandbox import KINDS
 from scenarios.runs.isolated_policy import isolated_driver, sandbox_lacks
-from tests.conftest import ROOT
+from tests.conftest import ROOT, Cosim
 from tests.support.graphs import bundle, tiny_graph
 
 NO_FILE = {"ENOENT", "EACCES"}
@@ -264,3 +265,40 @@ except MachineError as error:
     if len(denied) == 2:
         assert "namespaces: create user, mount, PID, IPC and network namespaces" in done.stdout
         assert "landlock: find Landlock: Operation not permitted" in done.stdout
+
+
+def test_without_landlocks_scope_a_process_signals_only_itself() -> None:
+    """The rules for older kernels: a signal to the parent fails, and abort works."""
+    code = """
+import os
+from scenarios.ipc.kernel_calls import filter_calls, prctl
+from scenarios.ipc.seccomp import without_signals
+prctl("forbid new privileges", 38, 1)
+filter_calls(without_signals(os.getpid()))
+try:
+    os.kill(os.getppid(), 0)
+except PermissionError:
+    print("denied", flush=True)
+os.abort()
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT)
+    assert (done.stdout, done.returncode) == ("denied\n", -signal.SIGABRT)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--policy-data", "."), "--policy-data goes with --isolated"),
+        (("--isolated=weak", "--policy-memory", "2"), "--policy-memory goes with --isolated"),
+        (("--isolated", "--policy-data", "nowhere"), "--policy-data nowhere: there is no such"),
+        (("--isolated=strong",), "'strong' is not one of"),
+        (("--isolated",), "an isolated one sees only observations"),
+    ],
+    ids=["alone", "weak", "missing", "kind", "privileged"],
+)
+def test_options_of_isolation_are_checked(
+    words: tuple[str, ...], said: str, cosim: Cosim, tmp_path: Path
+) -> None:
+    """Before anything runs; `--isolated` takes no value without "="."""
+    done = cosim("run", *words, "reactive", "--policy", "route", cwd=tmp_path)
+    assert done.returncode == 2 and said in done.stderr, done.stderr
