@@ -17,6 +17,7 @@ import platform
 import resource
 import select
 import shutil
+import signal
 import socket
 import stat
 import struct
@@ -140,8 +141,19 @@ def start(
     for descriptor in (status, waits, *descriptors[1:]):
         os.close(descriptor)
     ended = _watched(child, heard, goes, descriptors[0], refuse)
-    code = os.waitpid(child, 0)[1]
+    code = _status_of(child)
     return code if ended is None else ended
+
+
+def _status_of(child: int) -> int:
+    """Wait for a child, and reap others; return its wait status. Stopped ones are continued."""
+    while True:
+        ended, code = os.waitpid(-1, os.WUNTRACED)
+        if os.WIFSTOPPED(code):
+            with suppress(ProcessLookupError):
+                os.kill(ended, signal.SIGCONT)
+        elif ended == child:
+            return code
 
 
 def _watched(
@@ -219,7 +231,7 @@ def _set_up(sandbox: Sandbox, inside: _Inside, waits: int) -> NoReturn:
 
 def _end_with_parent(inside: _Inside) -> None:
     """Let this process be killed when its parent dies. The parent's end of the pipe is checked."""
-    prctl("set the signal of the parent's death", DEATH_SIGNAL, 9)
+    prctl("set the signal of the parent's death", DEATH_SIGNAL, signal.SIGKILL)
     poll = select.poll()
     poll.register(inside.status, 0)
     if poll.poll(0):
@@ -258,11 +270,8 @@ def _enter_namespaces(sandbox: Sandbox, inside: _Inside, waits: int) -> None:
     os.read(waits, 1)
     inside.say("started")
     _close_all_but({inside.status})
-    while True:
-        ended, code = os.wait()
-        if ended == policy:
-            inside.say(f"ended {code}")
-            os._exit(0)
+    inside.say(f"ended {_status_of(policy)}")
+    os._exit(0)
 
 
 def _build_root(sandbox: Sandbox, user: int | None) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import re
 import signal
+import sys
 from contextlib import ExitStack, suppress
 from socket import socket
 from typing import Final, cast
@@ -208,6 +209,7 @@ def serve_alone(socket_descriptor: int, call_descriptor: int, memory_descriptor:
 
 def serve_inside(socket_descriptor: int, memory_descriptor: int) -> None:
     """Answer requests, in a sandbox."""
+    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
     _serve(socket_descriptor, memory_descriptor, boxed=True)
 
 

@@ -73,6 +73,7 @@ OUTCOMES: dict[str, object] = {
     "signal parent": NO_PROCESS,
     "signal victim": NO_PROCESS,
     "signal first": DENIED | {"done"},  # in namespaces its own first one, which ignores it
+    "stop itself": "done",  # and it is continued
     "signal group": NO_PROCESS,
     "limit victim": NO_PROCESS,
     "slow victim": NO_PROCESS,

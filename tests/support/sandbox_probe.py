@@ -211,6 +211,7 @@ ATTEMPTS: dict[str, Callable[[dict[str, Any]], object]] = {
     "signal parent": lambda given: _kills(given["parent"], 0),
     "signal victim": lambda given: _kills(given["victim"], signal.SIGKILL),
     "signal first": lambda given: _kills(1, signal.SIGKILL),
+    "stop itself": lambda given: _kills(os.getpid(), signal.SIGSTOP),
     "signal group": lambda given: _kills(-given["parent"], 0),
     "limit victim": lambda given: called("prlimit64", given["victim"], 7, 0, 0),
     "slow victim": lambda given: called("setpriority", 0, given["victim"], 19),
