@@ -7,15 +7,11 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterator
-from importlib.machinery import PathFinder
+from importlib.machinery import ModuleSpec, PathFinder
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
-import bridge
-import cosim
-import physics
-import scenarios
-import sumo_nets
 from cosim.core.errors import UsageError
 from cosim.policies.load import FOLLOW, ONNX_SCHEME, shipped_bundles
 from cosim.policies.onnx.graph import PROVIDERS_VARIABLE
@@ -30,9 +26,9 @@ _OF_SYSTEM: Final = (
 )
 """Libraries and programs of the system, and what they read."""
 _PACKAGE_FOLDERS: Final = ("site-packages", "dist-packages")
-_OWN: Final = (cosim, bridge, scenarios, physics, sumo_nets)
+_OWN: Final = ("cosim", "bridge", "scenarios", "physics", "sumo_nets")
 """Packages of this project."""
-_SUITES: Final = str(Path(scenarios.__path__[0], "suites").resolve())
+_SUITES: Final = str(Path(__file__).resolve().parents[1] / "suites")
 """Folder of the suites, which a policy may not read."""
 _PASSED: Final = (
     *("LANG", "LANGUAGE", "TZ", "PATH", "LD_LIBRARY_PATH", "PYTHONHASHSEED", "GLIBC_TUNABLES"),
@@ -91,7 +87,8 @@ def _of_python() -> list[str]:
     """Return the folders of Python and of all installed packages, and this project's packages."""
     found = [sys.prefix, sys.base_prefix, sys.exec_prefix, sys.executable]
     found += [entry for entry in sys.path if Path(entry).name in _PACKAGE_FOLDERS]
-    return [*found, *(folder for package in _OWN for folder in package.__path__)]
+    specs = map(find_spec, _OWN)  # found without being imported
+    return [*found, *(folder for one in specs for folder in _folders(one))]
 
 
 def _own_folders(name: str) -> list[Path]:
@@ -105,11 +102,15 @@ def _own_folders(name: str) -> list[Path]:
         return weight_folders() if name == FOLLOW or name in shipped_bundles() else []
     top = name.partition(":")[0].partition(".")[0]
     found = PathFinder.find_spec(top, ["", *sys.path])
-    if found is None:  # loading says so
-        return []
-    if found.submodule_search_locations is not None:
-        return [_narrow(name, Path(folder)) for folder in found.submodule_search_locations]
-    return [] if found.origin is None else [_narrow(name, Path(found.origin).parent)]
+    folders = _folders(found)
+    if not folders and found is not None and found.origin is not None:
+        folders = [str(Path(found.origin).parent)]
+    return [_narrow(name, Path(folder)) for folder in folders]
+
+
+def _folders(spec: ModuleSpec | None) -> list[str]:
+    """Return the folders of a package; none of a module, or of what is missing."""
+    return [] if spec is None else list(spec.submodule_search_locations or ())
 
 
 def _narrow(name: str, folder: Path) -> Path:
