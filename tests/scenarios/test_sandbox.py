@@ -205,7 +205,7 @@ def test_a_policy_in_a_sandbox_reaches_nothing_outside(
     assert [path.name for path in (desk / "own/runs/now").iterdir()] == ["run.json"]
 
 
-def test_a_policy_that_lacks_a_file_is_told_how_to_get_it(kind: Isolation, desk: Path) -> None:
+def test_the_error_of_a_missing_file_names_the_remedy(kind: Isolation, desk: Path) -> None:
     """The error names `--policy-data`, with which the policy loads."""
     host = PolicyHost(isolated=kind)
     with pytest.raises(UsageError, match=r"outside\.txt.*--policy-data PATH"):
