@@ -10,8 +10,9 @@ from types import MappingProxyType
 from typing import Annotated, Any, NamedTuple, get_type_hints
 
 import typer
+from typer.core import TyperCommand
 
-from cosim.spec.run_config import Option
+from cosim.spec.run_config import Option, RunConfig, option_of
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
@@ -35,6 +36,17 @@ class Fields(NamedTuple):
     flag: Mapping[str, str] = _NOTHING
     required: Collection[str] = ()
     panels: bool = False
+
+
+class ConfiguredCommand(TyperCommand):
+    """Command of a `RunConfig` whose options with a bare value may be named without one."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        options = {
+            one.name: option_of(RunConfig, one.name) for one in dataclasses.fields(RunConfig)
+        }
+        bare = {_flag(name, one): one.bare for name, one in options.items() if one.bare}
+        return super().parse_args(ctx, [f"{a}={bare[a]}" if a in bare else a for a in args])
 
 
 def configured(command: Callable[..., None]) -> Callable[..., None]:
@@ -103,6 +115,11 @@ def _parameters(config: Any, fields: Fields) -> Iterator[inspect.Parameter]:
         )
 
 
+def _flag(name: str, option: Option) -> str:
+    """Return the name of a field's option on the command line."""
+    return option.flag or f"--{name.replace('_', '-')}"
+
+
 def _without_none(kind: Any) -> Any:
     """Return the type of a required option: `T` for `T | None`."""
     parts = [part for part in getattr(kind, "__args__", ()) if part is not type(None)]
@@ -114,7 +131,7 @@ def _typer_parameter(name: str, kind: Any, option: Option, fields: Fields) -> An
     words = fields.help.get(name, option.help)
     if option.argument:
         return typer.Argument(help=words, metavar=option.metavar)
-    flag = fields.flag.get(name) or option.flag or f"--{name.replace('_', '-')}"
+    flag = fields.flag.get(name) or _flag(name, option)
     own_default = name in fields.default or name in fields.required
     return typer.Option(
         flag,

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli.generated_options import Fields, configured
+from cosim.cli.generated_options import ConfiguredCommand, Fields, configured
 from cosim.spec.run_config import RunConfig
 
 run_app = typer.Typer()
@@ -14,6 +14,7 @@ run_app = typer.Typer()
 
 @run_app.command(
     "run",
+    cls=ConfiguredCommand,
     epilog="Examples:  \n`cosim run long-horizon --policy route --episodes 2`  \n`cosim run "
     "reactive --event frontal --event lateral --policy orca`  \n`cosim run long-horizon --policy "
     "orca --episodes 2 --residents 8`  \n`cosim run long-horizon --robot scout --episodes 2`  "
@@ -21,7 +22,7 @@ run_app = typer.Typer()
     "long-horizon --policy my.py:Mine --out runs/mine --resume`  \n`cosim run long-horizon "
     "--policy my.py:Mine --jobs 10 --shared-renderer`  \n`cosim run reactive --policy orca --seed "
     "7 --shard 1/4 --out runs/1`: see `cosim merge`  \n`cosim run long-horizon --policy "
-    "my.py:Mine --isolated`  \n`cosim run reactive --policy my.py:Mine --on "
+    "my.py:Mine --isolated --policy-data weights`  \n`cosim run reactive --policy my.py:Mine --on "
     "ray://head.lan:10001`, or `--on ray`  \n`cosim run long-horizon --policy zenoh:mine "
     "--policy-at tcp/127.0.0.1:7449`: see `cosim serve`  \n`cosim run reactive --policy "
     "onnx:my_network --goal route_point`  \n`cosim run long-horizon --policy my.py:Mine --goal "

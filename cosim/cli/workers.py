@@ -18,7 +18,7 @@ from rich.text import Text
 
 from cosim.cli import tables
 from cosim.cli.console import LogJson, LogLevel, logged, notice, out
-from cosim.cli.generated_options import Fields, configured
+from cosim.cli.generated_options import ConfiguredCommand, Fields, configured
 from cosim.cli.options import DEFAULT, MANY, Insecure, Tls
 from cosim.core.errors import INTERRUPTED, EngineError, RunError, UsageError
 from cosim.core.log_event import log_event
@@ -44,6 +44,7 @@ _LOCAL_ONLY = {
 
 @coordinator_app.command(
     "coordinator",
+    cls=ConfiguredCommand,
     rich_help_panel=MANY,
     epilog="Examples:  \n`cosim coordinator reactive --policy orca --out runs/mine`, and on the "
     "same machine `cosim worker --jobs 2`  \n`cosim coordinator reactive --policy orca --out "

@@ -9,6 +9,7 @@ import signal
 import socket
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 from cosim.core.framing import MessageSocket
@@ -103,9 +104,9 @@ def _run_child(
         null_device = os.open(os.devnull, os.O_RDWR)
         for descriptor in range(3):
             os.dup2(null_device, descriptor)
-        pages = int(Path("/proc/self/statm").read_text().split()[0])
-        most = pages * resource.getpagesize() + room_bytes
-        _limit(resource.RLIMIT_AS, most)
+        with suppress(OSError):  # a sandbox without /proc has its own limit
+            pages = int(Path("/proc/self/statm").read_text().split()[0])
+            _limit(resource.RLIMIT_AS, pages * resource.getpagesize() + room_bytes)
         _limit(resource.RLIMIT_CORE, 0)
         serves(MessageSocket(end))
         code = 0

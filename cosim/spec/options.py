@@ -13,25 +13,46 @@ from cosim.spec.demo_options import DemoOptions
 from cosim.spec.episode_id import check_seed
 from cosim.spec.goal import GoalProtocol, goal_called
 from cosim.spec.injection import Injected, LiveAddress
-from cosim.spec.run_config import MOST_LATENCY_MS, CameraChoice, RunConfig
+from cosim.spec.run_config import (
+    MOST_LATENCY_MS,
+    POLICY_MEMORY_GB,
+    CameraChoice,
+    Isolation,
+    RunConfig,
+)
 
-PolicyProcess = Literal["in-process", "isolated", "remote", "remote, jpeg"]
-"""Process that runs a policy: the simulator's, an isolated one on the same machine, or a server
-over Zenoh. "remote, jpeg" means that its pictures may have been sent as JPEG."""
+PolicyProcess = Literal[
+    "in-process",
+    "isolated: namespaces",
+    "isolated: landlock",
+    "isolated: weak",
+    "isolated",
+    "remote",
+    "remote, jpeg",
+]
+"""Process that runs a policy: the simulator's, an isolated one on the same machine with the kind of
+its sandbox, or a server over Zenoh. "isolated" is the weak kind, in older records. "remote, jpeg"
+means that its pictures may have been sent as JPEG."""
 
 
 class PolicyHost(msgspec.Struct, frozen=True, kw_only=True):
     """Location of a run's policy.
 
-    isolated: run it in a process of its own.
+    isolated: run it in a process of its own, in a sandbox of this kind.
+    data: paths that an isolated policy may read, beside its own folder.
+    memory_gb: limit of the memory of each of its processes.
+    hidden: folders of this machine that it may not read, even in its own folder.
     servers: connections to the servers of a remote policy.
     run: name of the run, part of each query's key so that runs are not confused.
 
-    >>> PolicyHost(isolated=True).servers
+    >>> PolicyHost(isolated="auto").servers
     ()
     """
 
-    isolated: bool = False
+    isolated: Isolation = "no"
+    data: tuple[str, ...] = ()
+    memory_gb: float = POLICY_MEMORY_GB
+    hidden: tuple[str, ...] = ()
     servers: tuple[Connection, ...] = ()
     run: str = ""
 

@@ -12,6 +12,10 @@ from cosim.spec.connection import Connection, connecting, listening
 
 CameraChoice = Literal["auto", "gl", "bullet", "bullet-egl"]
 """Renderers of `--camera`; auto selects gl where it works."""
+Isolation = Literal["no", "auto", "namespaces", "landlock", "weak"]
+"""Kinds of `--isolated`: "auto" is the strongest sandbox that the kernel offers, "weak" none."""
+POLICY_MEMORY_GB = 16.0
+"""Default limit of the memory of a process of an isolated policy, in GB."""
 MEASURED = "measured"
 """Value of `--latency` that measures the latency before the run."""
 MOST_LATENCY_MS = 10_000.0
@@ -28,6 +32,7 @@ class Option(NamedTuple):
     least, most: range of a number.
     default: description of the default, if the value is not enough.
     argument: whether it is a positional argument.
+    bare: value of the option without one; another value then needs "=".
     panel: heading of its group in the help.
     """
 
@@ -38,6 +43,7 @@ class Option(NamedTuple):
     most: float | None = None
     default: str = ""
     argument: bool = False
+    bare: str = ""
     panel: str = ""
 
 
@@ -121,13 +127,34 @@ class RunConfig:
         ),
     ] = ()
     isolated: Annotated[
-        bool,
+        Isolation,
         Option(
-            "Run the policy in a process of its own, which gets only observations and cannot "
-            "access the simulator.",
+            "Run the policy in a sandbox: it gets observations, and reads only its own folder. "
+            "Also --isolated=namespaces, =landlock, or =weak: only another process.",
+            metavar="[=KIND]",
+            default="no",
+            bare="auto",
             panel=_POLICY,
         ),
-    ] = False
+    ] = "no"
+    policy_data: Annotated[
+        tuple[str, ...],
+        Option(
+            "File or folder that an --isolated policy may read, beside its own folder; may be "
+            "repeated.",
+            metavar="PATH",
+            panel=_POLICY,
+        ),
+    ] = ()
+    policy_memory: Annotated[
+        float,
+        Option(
+            "Memory limit of each process of an --isolated policy, in GB.",
+            metavar="GB",
+            least=0.5,
+            panel=_POLICY,
+        ),
+    ] = POLICY_MEMORY_GB
     shared_renderer: Annotated[
         bool,
         Option(
@@ -362,11 +389,24 @@ class RunConfig:
             raise UsageError(
                 "--shard with --latency measured: each would measure another: give milliseconds"
             )
+        if self.isolated in ("no", "weak") and (self.policy_data or self._limits_memory):
+            option = "--policy-data" if self.policy_data else "--policy-memory"
+            raise UsageError(
+                f"{option} goes with --isolated: another policy may read every file, and has no "
+                "limit of memory"
+            )
+        for path in self.policy_data:
+            if not Path(path).exists():
+                raise UsageError(f"--policy-data {path}: there is no such file or folder")
         if self.roughness is not None and self.map is None:
             raise UsageError(
                 "--roughness goes with --map: a suite says itself how rough the ground of "
                 "its places is"
             )
+
+    @property
+    def _limits_memory(self) -> bool:
+        return self.policy_memory != POLICY_MEMORY_GB
 
     @property
     def latency_ms(self) -> float | None:

@@ -29,6 +29,7 @@ from scenarios.ipc.messages import (
     decode_message,
     encode_message,
 )
+from scenarios.ipc.sandbox import Sandbox
 
 WORKER: Final = "scenarios.runs.worker:serve_jobs"
 """The function of an environment process."""
@@ -38,7 +39,7 @@ _FAULTS: Final = tuple(-fault for fault in (SIGABRT, SIGBUS, SIGFPE, SIGILL, SIG
 """Exit codes of a process that crashed in compiled code."""
 _CODE: Final = (
     "import sys; sys.path[:] = {path!r}; from scenarios.ipc.supervisor import keep_worker; "
-    "keep_worker({serves!r}, {given}, {run})"
+    "keep_worker({serves!r}, {given}, {run}, {sandbox})"
 )
 
 
@@ -50,6 +51,7 @@ class ChildProcess:
     called: kind of the process, for messages.
     also: further descriptors to pass on.
     most_bytes: size limit of a message from it.
+    sandbox: sandbox in which it runs, without the memory of the pending call.
     open: whether it is not known to have ended.
     """
 
@@ -60,6 +62,7 @@ class ChildProcess:
         called: str,
         also: tuple[int, ...] = (),
         most_bytes: int = MAX_MESSAGE_BYTES,
+        sandbox: Sandbox | None = None,
     ) -> None:
         self.log = str(log)
         self.open = True
@@ -69,9 +72,11 @@ class ChildProcess:
         self.in_engine = False
         ours, theirs = socket.socketpair()
         self.wire = MessageSocket(ours, most_bytes)
-        given = (theirs.fileno(), self._asked.descriptor, *also)
+        call = () if sandbox is not None else (self._asked.descriptor,)
+        given = (theirs.fileno(), *call, *also)
         path = [str(Path(entry).absolute()) for entry in sys.path]
-        code = _CODE.format(path=path, serves=serves, given=given, run=os.getpid())
+        boxed = None if sandbox is None else tuple(sandbox)
+        code = _CODE.format(path=path, serves=serves, given=given, run=os.getpid(), sandbox=boxed)
         try:
             with nullcontext(2) if log is None else log.open("ab") as printed:
                 self._child = subprocess.Popen(

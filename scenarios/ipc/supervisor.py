@@ -23,7 +23,9 @@ import time
 from collections import deque
 from contextlib import suppress
 from pathlib import Path
+from socket import socket
 from types import FrameType
+from typing import Any
 
 from cosim.core.child_process import exit_with_parent
 
@@ -37,7 +39,9 @@ KILLING_S = 10.0
 """Timeout in seconds for the end of killed processes, which the kernel may delay."""
 
 
-def keep_worker(serves: str, descriptors: tuple[int, ...], parent: int) -> None:
+def keep_worker(
+    serves: str, descriptors: tuple[int, ...], parent: int, sandbox: tuple[Any, ...] | None = None
+) -> None:
     """Run one worker, and end with its exit code or signal.
 
     Its output goes to this process's standard output.
@@ -45,16 +49,22 @@ def keep_worker(serves: str, descriptors: tuple[int, ...], parent: int) -> None:
     serves: function that the worker runs, as module:name.
     descriptors: its arguments, first the socket to the run.
     parent: process id of the run.
+    sandbox: values of the `Sandbox` in which it runs, if any.
     """
     exit_with_parent(parent, signal.SIGTERM)
     ctypes.CDLL(None, use_errno=True).prctl(PR_SET_CHILD_SUBREAPER, 1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     printed, prints = os.pipe()
     supervisor = os.getpid()
+    boxed = None if sandbox is None else _Boxed(sandbox)
     pid = os.fork()
     if pid == 0:
         os.close(printed)
-        _run_worker(serves, descriptors, prints, supervisor)
+        _begin_worker(prints, supervisor)
+        if boxed is not None:
+            _end_as(boxed.run(serves, descriptors))
+        module, _, function = serves.partition(":")
+        getattr(importlib.import_module(module), function)(*descriptors)
         return
     for descriptor in (*descriptors, prints):
         os.close(descriptor)
@@ -67,6 +77,8 @@ def keep_worker(serves: str, descriptors: tuple[int, ...], parent: int) -> None:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     kill_children()
     log.join(KILLING_S)
+    if boxed is not None:
+        boxed.close()
     _end_as(status)
 
 
@@ -143,16 +155,46 @@ def _ended(number: int, frame: FrameType | None) -> None:
     raise _Ended
 
 
-def _run_worker(serves: str, descriptors: tuple[int, ...], prints: int, supervisor: int) -> None:
-    """Run the worker in the forked child, until its socket is closed."""
+class _Boxed:
+    """Sandbox of a worker, and its folder outside."""
+
+    def __init__(self, values: tuple[Any, ...]) -> None:
+        # Imported only where needed: most workers have no sandbox.
+        from scenarios.ipc.sandbox import Sandbox, work_folder
+
+        self._sandbox = Sandbox(*values)
+        self._folder = work_folder(self._sandbox)
+
+    def run(self, serves: str, descriptors: tuple[int, ...]) -> int:
+        """Run the worker inside; return its wait status."""
+        from scenarios.ipc.sandbox import start
+
+        return start(self._sandbox, serves, descriptors, self._folder, _refuse)
+
+    def close(self) -> None:
+        """Remove the folder."""
+        from scenarios.ipc.sandbox import remove_work_folder
+
+        remove_work_folder(self._folder)
+
+
+def _refuse(connection: socket, why: str) -> None:
+    """Report that a sandbox cannot be set up, as the worker's first message."""
+    from bridge.policy_server import Refusal, encode_message
+    from cosim.core.framing import MessageSocket
+
+    with suppress(OSError):
+        MessageSocket(connection).send(encode_message(Refusal("sandbox", why)))
+
+
+def _begin_worker(prints: int, supervisor: int) -> None:
+    """Begin the worker in the forked child: its session, its end and its output."""
     os.setsid()
     exit_with_parent(supervisor)
     os.dup2(prints, 1)
     os.dup2(prints, 2)
     os.close(prints)
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
-    module, _, function = serves.partition(":")
-    getattr(importlib.import_module(module), function)(*descriptors)
 
 
 def _status_of(pid: int) -> int:

@@ -167,16 +167,20 @@ class HostedDriver(PolicyCaller):
     def ended(self) -> None:
         if self._begun:
             # A server has a second to reply; an isolated policy is timed like any call.
-            with self._asked("ended", 0) if self.runs == "isolated" else nullcontext():
+            with self._asked("ended", 0) if self._isolated else nullcontext():
                 self._hosted.report_ended()
         self._begun = ""
 
     @property
     def spent(self) -> bool:
-        return self.runs == "isolated" and self._hosted.lost
+        return self._isolated and self._hosted.lost
 
     def close(self) -> None:
         self._hosted.close()
+
+    @property
+    def _isolated(self) -> bool:
+        return self.runs.startswith("isolated")
 
     def _own(self, observation: Observation) -> Observation:
         return observation  # the message is a copy

@@ -1,16 +1,19 @@
 """Isolated policies: a policy in a supervised process of its own, and its client.
 
 Requests go over a socket, arrays through memory shared with the environment's process only. The
-policy's process loads no engine, and has no data of the run but observations.
+policy's process loads no engine, and has no data of the run but observations. It runs in a sandbox
+(`scenarios.ipc.sandbox`), unless its kind is "weak".
 """
 
 from __future__ import annotations
 
 import os
+import re
 import signal
+import sys
 from contextlib import ExitStack, suppress
 from socket import socket
-from typing import Final
+from typing import Final, cast
 
 import msgspec
 
@@ -29,33 +32,52 @@ from bridge.policy_server import (
     policy_call,
     read_request,
 )
-from cosim.core.errors import UsageError
+from cosim.core.errors import MachineError, UsageError
 from cosim.core.framing import MessageSocket
 from cosim.episode.manifest_checks import with_goal
 from cosim.episode.policy_caller import LOAD_TIMEOUT_S, NoTimer, Timer
 from cosim.policies.load import checked_manifest, load_policy
 from cosim.spec.manifest import Manifest
+from cosim.spec.options import PolicyHost, PolicyProcess
+from cosim.spec.run_config import Isolation
 from scenarios.ipc.child_process import ChildProcess
 from scenarios.ipc.observation_codec import Arrays, ObservationDecoder
+from scenarios.ipc.sandbox import KINDS, Sandbox
 from scenarios.ipc.shared_memory import SharedMemory, room_for
 from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy
+from scenarios.runs.policy_view import name_inside, sandbox_for
 
 _SERVES: Final = "scenarios.runs.isolated_policy:serve_alone"
-"""The function of the policy's process."""
+_SERVES_INSIDE: Final = "scenarios.runs.isolated_policy:serve_inside"
+"""The functions of the policy's process, without and with a sandbox."""
+_RUNS: Final[dict[Isolation, PolicyProcess]] = {
+    "namespaces": "isolated: namespaces",
+    "landlock": "isolated: landlock",
+    "weak": "isolated: weak",
+}
+"""What a row records, by kind."""
+_LACKS_A_FILE: Final = re.compile(
+    r"Errno (1|2|13)\]|No such file|NO_SUCHFILE|Permission denied|No module named|not exist"
+)
+"""Words of errors that a file outside of the sandbox may have caused."""
 _MOST_BYTES: Final = 4 << 20
 """Size limit of an answer in bytes."""
 
 
 class _PolicyProcess:
-    """Carrier of requests to a child process. room: bytes for the arrays of an observation."""
+    """Carrier of requests to a child process.
+
+    room: bytes for the arrays of an observation.
+    sandbox: None for the weak kind.
+    """
 
     loses = False
 
-    def __init__(self, name: str, room: int) -> None:
+    def __init__(self, name: str, room: int, sandbox: Sandbox | None) -> None:
         self._memory = SharedMemory.new(room)
-        self._process = ChildProcess(
-            None, _SERVES, "policy", (self._memory.descriptor,), _MOST_BYTES
-        )
+        serves = _SERVES if sandbox is None else _SERVES_INSIDE
+        also = (self._memory.descriptor,)
+        self._process = ChildProcess(None, serves, "policy", also, _MOST_BYTES, sandbox)
         self._process.send(name.encode())
         self._open = True
 
@@ -96,28 +118,75 @@ class _PolicyProcess:
         return PolicyFault(f"gave no answer: {self._process.end()}")
 
 
+class _NoSandbox(Exception):
+    """The kernel does not offer a kind of sandbox, and why."""
+
+
 def isolated_driver(
     name: str,
     timer: Timer | None = None,
     expected: Manifest | None = None,
-    run: str = "",
+    host: PolicyHost = PolicyHost(isolated="auto"),  # noqa: B008  a frozen value
     start_s: float = LOAD_TIMEOUT_S,
 ) -> HostedDriver:
     """Load a policy in a process of its own.
 
     expected: its manifest in the run, by which shared memory is sized; None if it is not queried.
+    host: the kind of its sandbox, and what it may read; "auto" is the first kind that works.
     start_s: timeout of loading in seconds, used without a timer.
-    Raises UsageError as `load_policy` does, and for a privileged policy.
+    Raises UsageError as `load_policy` does, and for a privileged policy. Raises MachineError if the
+    kernel does not offer the sandbox.
     """
+    kinds = KINDS if host.isolated == "auto" else (host.isolated,)
+    why = []
+    for kind in kinds:
+        try:
+            return _driver(name, timer, expected, host, cast(Isolation, kind), start_s)
+        except _NoSandbox as lacking:
+            why.append(f"{kind}: {lacking}")
+    raise MachineError(
+        f"--isolated: this machine offers no sandbox ({'; '.join(why)}). --isolated=weak runs the "
+        "policy in another process, which can read your files and end the run"
+    )
+
+
+def sandbox_lacks(kind: Isolation) -> str:
+    """Return the step of a sandbox's set-up that fails on this machine, and why; "" if none."""
+    try:
+        _driver("straight", None, None, PolicyHost(), kind, LOAD_TIMEOUT_S).close()
+    except _NoSandbox as lacking:
+        return str(lacking)
+    return ""
+
+
+def kind_of(runs: PolicyProcess) -> Isolation | None:
+    """Return the kind of sandbox of a recorded place; None for other places.
+
+    >>> kind_of("isolated: landlock")
+    'landlock'
+    """
+    return next((kind for kind, words in _RUNS.items() if words == runs), None)
+
+
+def _driver(
+    name: str,
+    timer: Timer | None,
+    expected: Manifest | None,
+    host: PolicyHost,
+    kind: Isolation,
+    start_s: float,
+) -> HostedDriver:
+    """Load a policy with one kind of sandbox. Raises _NoSandbox, UsageError."""
+    sandbox = None if kind == "weak" else sandbox_for(name, kind, host)
     with ExitStack() as stack, policy_call("loading", timer=timer, passes=(BaseException,)):
-        process = _PolicyProcess(name, room_for(expected))
+        process = _PolicyProcess(name_inside(name), room_for(expected), sandbox)
         stack.callback(process.close)
         try:
             info = process.info(start_s if timer is None else None)
         except PolicyFault as fault:
             raise UsageError(f"policy '{name}' cannot be loaded: it {fault.words}") from None
         if isinstance(info, Refusal):
-            raise UsageError(info.words)
+            raise _NoSandbox(info.words) if info.why == "sandbox" else UsageError(info.words)
         manifest = with_goal(checked_manifest(name, info.manifest), None)
         if manifest.privileged:
             raise UsageError(
@@ -125,17 +194,29 @@ def isolated_driver(
                 "isolated one sees only observations: leave --isolated out"
             )
         stack.pop_all()
-    return HostedDriver(HostedPolicy(manifest, process, run), "isolated", info.source[:64], timer)
+    policy = HostedPolicy(manifest, process, host.run)
+    return HostedDriver(policy, _RUNS[kind], info.source[:64], timer)
 
 
 def serve_alone(socket_descriptor: int, call_descriptor: int, memory_descriptor: int) -> None:
-    """Answer requests until the socket closes. The first message is the policy's name, replied to
-    with its info.
+    """Answer requests, without a sandbox.
 
     call_descriptor: not used, because the environment's process enforces the timeouts.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.close(call_descriptor)
+    _serve(socket_descriptor, memory_descriptor, boxed=False)
+
+
+def serve_inside(socket_descriptor: int, memory_descriptor: int) -> None:
+    """Answer requests, in a sandbox."""
+    sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
+    _serve(socket_descriptor, memory_descriptor, boxed=True)
+
+
+def _serve(socket_descriptor: int, memory_descriptor: int, *, boxed: bool) -> None:
+    """Answer requests until the socket closes. The first message is the policy's name, replied to
+    with its info."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     wire = MessageSocket(socket(fileno=socket_descriptor))
     memory = SharedMemory(memory_descriptor, writes=False)
     os.close(memory_descriptor)
@@ -143,7 +224,7 @@ def serve_alone(socket_descriptor: int, call_descriptor: int, memory_descriptor:
     try:
         driver = load_policy(name, NoTimer())
     except UsageError as error:
-        wire.send(encode_message(Refusal("policy", str(error))))
+        wire.send(encode_message(_with_remedy(Refusal("policy", str(error)), boxed)))
         return
     desk = PolicyDesk(driver.policy, decoder=ObservationDecoder, batch=False)
     info = PolicyInfo("", name, msgspec.to_builtins(driver.manifest), driver.source_hash)
@@ -151,4 +232,17 @@ def serve_alone(socket_descriptor: int, call_descriptor: int, memory_descriptor:
     with suppress(EOFError):
         while True:
             (reply,) = desk.replies([read_request(wire.receive())], [memory.map])
+            if isinstance(reply, Refusal):
+                reply = _with_remedy(reply, boxed)
             wire.send(encode_message(reply))
+
+
+def _with_remedy(refusal: Refusal, boxed: bool) -> Refusal:
+    """Say how a policy in a sandbox gets the file that it may lack."""
+    if not boxed or not _LACKS_A_FILE.search(refusal.words):
+        return refusal
+    remedy = (
+        "; an isolated policy begins in an empty folder and reads only its own: name other files "
+        "by --policy-data PATH"
+    )
+    return msgspec.structs.replace(refusal, words=refusal.words + remedy)

@@ -28,7 +28,7 @@ from physics.cameras.choice import renderer_of
 from physics.robots import robot_hash
 from scenarios.ipc.deadlines import Patience
 from scenarios.ipc.messages import Hello
-from scenarios.runs.policy_host import inspected_driver
+from scenarios.runs.policy_host import inspected_driver, settled_host
 from scenarios.runs.shared_renderer import check_shared
 from scenarios.runs.transport import HeldRun
 
@@ -106,6 +106,7 @@ def planned_run(
         if policy is None
         else PolicyCaller.of(policy)
     )
+    host = settled_host(host, driver)
     camera = chosen_camera(options.camera) if driver.manifest.camera is not None else "bullet"
     seed = seed_of_run(options.seed, resumed)
     options = msgspec.structs.replace(options, seed=seed, camera=camera)
@@ -129,7 +130,7 @@ def held_run(plan: PlannedRun, folder: Path) -> Iterator[HeldRun]:
         plan.policy,
         plan.driver.manifest,
         plan.driver.source_hash,
-        host=plan.host,
+        host=msgspec.structs.replace(plan.host, hidden=(str(folder.absolute()),)),
         patience=plan.patience,
     )
     with held:

@@ -3,6 +3,8 @@ renderer."""
 
 from __future__ import annotations
 
+import msgspec
+
 from bridge.policy_server import ActRequest, EndRequest, PackedArray, ResetRequest, pack_array
 from cosim.core.errors import UsageError
 from cosim.episode.policy_caller import LOAD_TIMEOUT_S, PolicyCaller, Timer, when
@@ -13,7 +15,7 @@ from cosim.spec.options import PolicyHost, RendererAddress
 from scenarios.ipc.observation_codec import Arrays
 from scenarios.ipc.render_link import RendererLink, link_to
 from scenarios.runs.hosted_policy import HostedDriver, HostedPolicy
-from scenarios.runs.isolated_policy import isolated_driver
+from scenarios.runs.isolated_policy import isolated_driver, kind_of
 
 
 def policy_driver(
@@ -37,14 +39,21 @@ def policy_driver(
         # Imported only where needed: it loads Zenoh and OpenCV.
         from scenarios.runs.remote_policy import remote_driver
 
-        if host.isolated:
+        if host.isolated != "no":
             raise UsageError(f"policy '{name}' is elsewhere anyway: leave --isolated out")
         return remote_driver(name, host, timer)
     if host.servers:
         raise UsageError(f"--policy-at goes with --policy {REMOTE_SCHEME}NAME, not with '{name}'")
-    if host.isolated:
-        return isolated_driver(name, timer, expected, host.run, start_s)
+    if host.isolated != "no":
+        return isolated_driver(name, timer, expected, host, start_s)
     return load_policy(name, timer, start_s)
+
+
+def settled_host(host: PolicyHost, driver: PolicyCaller) -> PolicyHost:
+    """Return a host with the kind of sandbox that a policy has, which every process of its run then
+    uses."""
+    kind = kind_of(driver.runs)
+    return host if kind is None else msgspec.structs.replace(host, isolated=kind)
 
 
 def inspected_driver(

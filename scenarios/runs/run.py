@@ -125,7 +125,7 @@ def run(
     resume: continue the run in `out`.
     shared_renderer: draw in one process for all others, which also queries a policy with
         `act_batch` (`BatchPolicy`).
-    host: where a named policy is queried: `PolicyHost(isolated=True)` gives it its own process.
+    host: where a named policy is queried: `PolicyHost(isolated="auto")` gives it a sandbox.
     options: options of the episodes; without a seed it is random, or that of the resumed run.
     tell: called with the messages of workers.
 
@@ -168,7 +168,11 @@ def _refuse_for_object(
     policy: Policy | str, jobs: int | None, on: str, host: PolicyHost, shared: bool
 ) -> None:
     """Check that a policy object is not used with other processes. Raises UsageError."""
-    needs = {f"jobs={jobs}": jobs not in (None, 1), f"on='{on}'": on != "", "host": host.isolated}
+    needs = {
+        f"jobs={jobs}": jobs not in (None, 1),
+        f"on='{on}'": on != "",
+        "host": host.isolated != "no",
+    }
     asked = next(
         (words for words, is_asked in needs.items() if is_asked), "shared_renderer=True" * shared
     )
@@ -279,7 +283,14 @@ def _planned(
         return planned_run(
             config, whole, of_run, policy=given.policy, options=given.options, host=given.host
         )
-    host = PolicyHost(isolated=config.isolated, servers=ends.servers, run=token_hex(8))
+    host = PolicyHost(
+        isolated=config.isolated,
+        data=tuple(str(Path(path).absolute()) for path in config.policy_data),
+        memory_gb=config.policy_memory,
+        hidden=() if config.out is None else (str(config.out.absolute()),),
+        servers=ends.servers,
+        run=token_hex(8),
+    )
     return planned_run(config, whole, of_run, host=host)
 
 

@@ -52,11 +52,16 @@ def test_a_policy_by_its_file_is_the_one_by_its_module(desk: Path, cosim: Cosim)
         f"Next:\n  cosim film {out} --failure -o film.mp4\n  cosim report {out} -o report.html\n"
         in said.stderr
     )
+    spec = json.loads((desk / "run/run.json").read_text())
+    kind = spec["policy_runs"]
+    assert kind in ("isolated: namespaces", "isolated: landlock") and spec["policy"] == "far:Far"
+    row = f"policy far; at 4 Hz; goal route_point; odometry wheel; policy {kind}; seed"
+    assert row in said.stdout
+    weak = cosim(*(*by_file[:4], "--isolated=weak", *by_file[5:]), "--resume", cwd=desk)
     assert (
-        "policy far; at 4 Hz; goal route_point; odometry wheel; policy isolated; seed"
-        in said.stdout
-    )
-    assert json.loads((desk / "run/run.json").read_text())["policy"] == "far:Far"
+        weak.returncode == 2
+        and f"its policy_runs is {kind}, now asked for is isolated: weak" in weak.stderr
+    ), weak.stderr
     by_module = ("run", suite, "--policy", "far:Far", "--isolated", "--out", out, "--resume")
     again = cosim(*by_module, cwd=desk / "deeper")
     assert again.returncode == 0 and "1 of 1 episodes are finished already" in again.stderr, (

@@ -95,7 +95,7 @@ def here(tmp_path_factory: pytest.TempPathFactory, fresh_cosim: Cosim) -> War:
 @pytest.fixture(scope="module")
 def isolated(tmp_path_factory: pytest.TempPathFactory, fresh_cosim: Cosim) -> War:
     outcome = {name: deed.isolated for name, deed in DEEDS.items() if deed.isolated is not None}
-    return war(tmp_path_factory.mktemp("isolated"), fresh_cosim, outcome, "--isolated")
+    return war(tmp_path_factory.mktemp("isolated"), fresh_cosim, outcome, "--isolated=weak")
 
 
 def with_mark(mark: str) -> list[int]:
@@ -132,7 +132,7 @@ def test_a_hostile_policy_is_recorded_for_what_it_did(
     attempts = {name: 1 if hosting == "isolated" else DEEDS[name].attempts for name in run.outcome}
     assert began == attempts
     assert {record.setup.policy_runs for record in run.records.values()} == {
-        "in-process" if hosting == "here" else "isolated"
+        "in-process" if hosting == "here" else "isolated: weak"
     }
 
 
@@ -183,8 +183,8 @@ def test_pictures_are_kept_as_they_were_drawn(here: War) -> None:
 def test_an_isolated_policy_sees_nothing_of_the_simulator(isolated: War) -> None:
     """Its process holds no engine and nothing of the street, and SUMO has no person there."""
     assert json.loads((isolated.folder.parent / "peeked.json").read_text()) == []
-    assert read_spec(isolated.folder).setup.policy_runs == "isolated"
-    assert "policy isolated" in isolated.said.stdout
+    assert read_spec(isolated.folder).setup.policy_runs == "isolated: weak"
+    assert "policy isolated: weak" in isolated.said.stdout
 
 
 @pytest.mark.engine
@@ -248,4 +248,4 @@ def test_isolated_what_cannot_be_loaded_is_said(
     said = cosim("run", "unit", "--policy", "route", "--isolated", "--episodes", "1", cwd=tmp_path)
     assert said.returncode == 2 and "is told what the simulator knows (privileged)" in said.stderr
     with pytest.raises(UsageError, match="needs a policy by its name"):
-        suite_run.run("unit", Honest(), host=PolicyHost(isolated=True))
+        suite_run.run("unit", Honest(), host=PolicyHost(isolated="auto"))

@@ -60,7 +60,7 @@ class BlindTogether(Blind):
 def asking_elsewhere() -> list[Figure]:
     """Time round trips of a 512x288 picture, and answers of one server to eight clients."""
     here = PolicyCaller(Blind())
-    isolated = isolated_driver(_NAME, expected=Blind.manifest)
+    isolated = isolated_driver(_NAME, expected=Blind.manifest, host=PolicyHost(isolated="auto"))
     with _served() as host:
         remote = remote_driver("zenoh:blind", host)
         here_ms, isolated_ms, remote_ms = _in_turns(here, isolated, remote)

@@ -22,7 +22,9 @@ from cosim.spec.scenario import City, CrowdSpec, Scenario
 from physics.cameras.choice import camera_of_choice, renderer_of
 from scenarios.episodes.director import in_process_director
 from scenarios.episodes.episode import Episode
+from scenarios.ipc.sandbox import KINDS
 from scenarios.places.nets import place
+from scenarios.runs.isolated_policy import sandbox_lacks
 from scenarios.suites.long_horizon import build_long_horizon
 
 _SMALL = City(seed=1, size_m=500.0)
@@ -112,6 +114,16 @@ def small_scenario() -> Scenario:
     return msgspec.structs.replace(scenario, crowd=CrowdSpec(persons=10, radius_m=50.0, vehicles=4))
 
 
+def sandbox() -> str:
+    """Return which kinds of sandboxes `--isolated` finds, and what the others lack."""
+    lacks = {kind: sandbox_lacks(kind) for kind in KINDS}
+    works = [kind for kind, why in lacks.items() if not why]
+    found = f"--isolated takes {works[0]}" if works else "none; --isolated=weak protects less"
+    also = [f"{kind} works, too" for kind in works[1:]]
+    missing = [f"no {kind}: {why}" for kind, why in lacks.items() if why]
+    return "; ".join([found, *also, *missing])
+
+
 CHECKS: Mapping[str, Callable[[], str]] = MappingProxyType(
     {
         "packages": packages,
@@ -121,5 +133,6 @@ CHECKS: Mapping[str, Callable[[], str]] = MappingProxyType(
         "bridge": bridge,
         "cameras": cameras,
         "frame": frame,
+        "sandbox": sandbox,
     }
 )
