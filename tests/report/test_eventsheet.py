@@ -100,7 +100,7 @@ def test_a_run_of_one_event_and_its_sheet_as_a_user_asks_for_them(
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)
     graph = WalkGraph(street_map)
-    fields = {"crowd": CrowdSpec(persons=4, radius_m=50.0, vehicles=0), "time_limit_s": 9.0}
+    fields = {"crowd": CrowdSpec(persons=4, radius_m=50.0, vehicles=0), "time_limit_s": 30.0}
     made = []
     for kind in ("frontal", "gesturing"):
         whole = build_reactive(EVENT_KINDS[kind], city, street_map, graph, 1, kind)
