@@ -38,6 +38,13 @@ class Part(Ranged, frozen=True, kw_only=True):
     by: Position = "start"
     every: Annotated[float, _AT] = 0.0
 
+    @property
+    def place_in_words(self) -> str:
+        """Position in words."""
+        unit = {"start": " m", "goal": " m before the goal", "share": " of the way", "clock": " s"}
+        every = f" and every {self.every:g}{unit[self.by]}" if self.every else ""
+        return f"at {self.at:g}{unit[self.by]}{every}"
+
 
 class Stop(Part, frozen=True, kw_only=True):
     """Stop for some seconds; with speeds, a fixed command in place of the schedule.
@@ -99,6 +106,21 @@ class Schedule(Ranged, frozen=True, kw_only=True):
                         f"{self.called}{kind}[{number}] is placed by '{part.by}', which needs "
                         f'"goal": "final_point", not "{self.goal}"'
                     )
+
+    @property
+    def in_words(self) -> str:
+        """Speeds, stops and lanes in words.
+
+        >>> Schedule(name="one", lanes=(LaneChange(at=7.0, to_m=-1.35),)).in_words
+        '1.2 m/s; lane -1.35 m at 7 m'
+        """
+        words = [f"{self.v_mps:g} m/s"]
+        words += [f"{one.to_mps:g} m/s {one.place_in_words}" for one in self.speeds]
+        for stop in self.stops:
+            turn = f" turning at {stop.w_radps:g} rad/s" if stop.w_radps else ""
+            words.append(f"stop {stop.for_s:g} s{turn} {stop.place_in_words}")
+        words += [f"lane {one.to_m:g} m {one.place_in_words}" for one in self.lanes]
+        return "; ".join(words)
 
     @property
     def digest(self) -> str:
