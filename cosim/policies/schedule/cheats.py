@@ -37,9 +37,7 @@ def _crawlers() -> Iterator[Schedule]:
 def _sprinters() -> Iterator[Schedule]:
     for v_mps in (1.6, 2.0, 2.5):
         yield Schedule(name=f"sprint-{v_mps:g}", v_mps=v_mps)
-    yield Schedule(
-        name="crawl-then-sprint", v_mps=0.5, speeds=(SpeedChange(at=10.0, to_mps=2.5),)
-    )
+    yield Schedule(name="crawl-then-sprint", v_mps=0.5, speeds=(SpeedChange(at=10.0, to_mps=2.5),))
 
 
 def _standers() -> Iterator[Schedule]:
