@@ -20,6 +20,8 @@ ScheduleGoal = Literal["none", "final_point", "route_point", "route_patch"]
 """Goal protocols that a schedule can follow."""
 GOAL_POSITIONS: Final[tuple[Position, ...]] = ("goal", "share")
 """Positions that need the distance to the goal, so the protocol `final_point`."""
+BEST_BLIND: Final = "best blind schedule found"
+"""Name of the row of a suite's exploitability in tables."""
 MOST_STOPS: Final = 5
 MOST_LANES: Final = 4
 
