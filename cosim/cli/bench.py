@@ -356,7 +356,7 @@ def bench(
             "--out",
             metavar="FOLDER",
             help="For `exploit`: where evaluations are stored, and continued; default: "
-            "exploit/SUITE.",
+            "runs/exploit-SUITE.",
         ),
     ] = None,
     write: Annotated[

@@ -20,10 +20,11 @@ from cosim.report.page.paper import LONG_OF_PAPER, REACTIVE_OF_PAPER, UNIT_OF_PA
 from cosim.report.page.plots import exposure_of, people_nearby, plots_of
 from cosim.report.page.runs import ReportedRun, read_runs
 from cosim.report.page.scene import Entry, PlacePicture, Spot
-from cosim.report.page.three_tables import tables_of, warnings_of
+from cosim.report.page.three_tables import MeanOfEpisodes, tables_of, warnings_of
 from cosim.results.run_folder import RunFolder, read_spec
 from cosim.results.table import summary_of
 from cosim.spec.scenario import read_suite
+from cosim.spec.schedule import BEST_BLIND
 from tests.conftest import ROOT, Cosim
 from tests.support.driven_runs import HIT, episode_of, failure_at, run_of, short_way
 
@@ -77,6 +78,23 @@ def test_a_cell_of_ours_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
     assert text.count('class="paper"') == len(UNIT_OF_PAPER)
     (other,) = tables_of([own])
     assert not other.paper and [row.name for row in other.rows] == ["mine: straight"]
+
+
+def test_blind_schedules_are_a_row_of_the_tables_of_success(tmp_path: Path) -> None:
+    """With the share of each kind that was searched, below the runs of that suite alone."""
+    (own,) = read_runs([run_of(tmp_path / "run", ["goal", HIT], "mine")])
+    told = ReportedRun(
+        "mine", own.whole._replace(spec=msgspec.structs.replace(own.spec, suite="unit"))
+    )
+    share = MeanOfEpisodes(0.95, 0.76, 0.99, 20)
+    blind = {"unit": {"straight": share}}
+    ours = next(table for table in tables_of([told], blind) if table.title == "Unit tests")
+    mine, row = ours.rows
+    assert row.name == BEST_BLIND and row.cells[0] == share and len(row.cells) == len(mine.cells)
+    assert sum(cell.n > 0 for cell in row.cells) == 1
+    text = render_page([told], [], [], Maps([], {}, {}), "", blind).decode()
+    assert text.index(BEST_BLIND) < text.index("models, in another engine")
+    assert BEST_BLIND not in render_page([own], [], [], Maps([], {}, {}), "", blind).decode()
 
 
 @pytest.mark.skipif(not PAPER.exists(), reason="the paper is not here")
