@@ -39,6 +39,7 @@ def print_names(out: Console) -> None:
     from cosim.policies.follow.networks import weights_in_words
     from cosim.policies.follow.policy import Follow
     from cosim.policies.load import bundle_in_words, shipped_bundles
+    from cosim.policies.schedule.cheats import CHEATS
     from cosim.results.table import policy_in_words
     from cosim.spec.goal import GOALS
     from cosim.spec.robot import ROBOTS
@@ -65,6 +66,10 @@ def print_names(out: Console) -> None:
         out.print(f"policy  {name}  {bundle_in_words(folder)}", soft_wrap=True)
     about = (Follow.__doc__ or "").splitlines()[0]
     out.print(f"policy  {Follow.manifest.name}  {about} {weights_in_words()}", soft_wrap=True)
+    out.print(
+        f"policy  schedule:NAME  Drives an open-loop schedule, blind: {', '.join(CHEATS)}",
+        soft_wrap=True,
+    )
     for goal in GOALS.values():
         out.print(f"goal    {goal.name}  {goal.summary}", soft_wrap=True)
 
