@@ -84,13 +84,17 @@ def _swervers() -> Iterator[Schedule]:
 def _turners() -> Iterator[Schedule]:
     yield Schedule(name="spin", stops=_every(0.0, 1000.0, w_radps=_TURN_RADPS))
     yield Schedule(name="spin-every-3-m", stops=_every(3.0, _ROUND_S, w_radps=_TURN_RADPS))
-    circle = {"v_mps": 0.5, "w_radps": _TURN_RADPS}
-    yield Schedule(name="circle-every-5-m", stops=_every(5.0, _ROUND_S, **circle))
     yield Schedule(
-        name="circle-at-start", v_mps=1.2, stops=(Stop(at=1.0, for_s=40 * _ROUND_S, **circle),)
+        name="circle-every-5-m", stops=_every(5.0, _ROUND_S, v_mps=0.5, w_radps=_TURN_RADPS)
     )
-    wide = {"v_mps": 1.0, "w_radps": _TURN_RADPS}
-    yield Schedule(name="circle-wide-every-10-m", stops=_every(10.0, _ROUND_S, **wide))
+    yield Schedule(
+        name="circle-at-start",
+        stops=(Stop(at=1.0, for_s=40 * _ROUND_S, v_mps=0.5, w_radps=_TURN_RADPS),),
+    )
+    yield Schedule(
+        name="circle-wide-every-10-m",
+        stops=_every(10.0, _ROUND_S, v_mps=1.0, w_radps=_TURN_RADPS),
+    )
 
 
 _ROWS: Final = (
